@@ -1,0 +1,159 @@
+#pragma once
+
+#include <cstdint>
+#include <functional>
+#include <map>
+#include <memory>
+#include <optional>
+#include <span>
+#include <string>
+#include <string_view>
+#include <vector>
+
+#include <Eigen/Core>
+
+namespace gp2 {
+
+class ExpressionGraph;
+
+/// What a node of an expression computes from its operands a, b.
+enum class Operation : std::uint8_t {
+  constant,   // a number
+  variable,   // a named symbol
+  add,        // a + b
+  subtract,   // a − b
+  multiply,   // a · b
+  divide,     // a / b
+  negate,     // −a
+  power,      // a ^ b
+  sin, cos, tan, asin, acos, atan, sinh, cosh, tanh, exp, log, sqrt, abs,
+  sign,       // −1, 0 or 1
+  atan2,      // atan2(a, b)
+  min, max,
+  /// a · b, but 0 wherever a = 0, whatever b is. It appears in derivatives only: d√u = u̇ ⊗ 1/(2√u) is 0, not NaN, along a
+  /// direction in which u does not change.
+  multiply_or_zero,
+};
+
+/// A node of an ExpressionGraph: a cheap value, valid as long as its graph lives. Two expressions of one graph are structurally equal
+/// exactly when they compare equal (the graph is hash-consed).
+class Expression {
+ public:
+  Expression() = default;
+
+  [[nodiscard]] Operation operation() const;
+  [[nodiscard]] bool is_constant() const { return operation() == Operation::constant; }
+  [[nodiscard]] bool is_constant(double value) const;
+  [[nodiscard]] double constant_value() const;           // of a constant
+  [[nodiscard]] const std::string& variable_name() const;  // of a variable
+  [[nodiscard]] Expression left() const;                 // operand a
+  [[nodiscard]] Expression right() const;                // operand b, of a binary operation
+  [[nodiscard]] std::uint32_t id() const { return id_; }  // position in the graph; operands come before what uses them
+  [[nodiscard]] ExpressionGraph& graph() const { return *graph_; }
+  friend bool operator==(const Expression& a, const Expression& b) { return a.graph_ == b.graph_ && a.id_ == b.id_; }
+
+ private:
+  friend class ExpressionGraph;
+  Expression(ExpressionGraph* graph, std::uint32_t id) : graph_(graph), id_(id) {}
+  ExpressionGraph* graph_ = nullptr;
+  std::uint32_t id_ = 0;
+};
+
+/// Hash-consed expressions in deterministic order: the same calls build the same nodes, so the same text gives the same bits on every
+/// run. Local simplification only (0·x, 1·x, x + 0, x − x, 0/x, constants, −(−x), x^0, x^1, √ for x^0.5, c₁·(c₂·x)); signs rise out of
+/// sums and products (a + (−b) = a − b, (−a)·b = −(a·b)), which is exact in floating point; nothing is expanded or reordered.
+/// What would fold to ∞ or NaN stays, so that evaluation shows it.
+///
+/// @throws InputError from any operation that would grow the graph past `max_nodes`, from a constant that is not finite, and from
+///   operands of different graphs.
+class ExpressionGraph {
+ public:
+  static constexpr std::size_t max_nodes = 1'000'000;
+
+  ExpressionGraph();
+  ExpressionGraph(const ExpressionGraph&) = delete;
+  ExpressionGraph& operator=(const ExpressionGraph&) = delete;
+  ~ExpressionGraph();
+
+  Expression constant(double value);
+  Expression variable(std::string_view name);  // the same node for the same name
+  Expression apply(Operation operation, Expression a);
+  Expression apply(Operation operation, Expression a, Expression b);
+
+  /// ∂e/∂x. Shared subexpressions are differentiated once.
+  Expression differentiate(Expression e, Expression x);
+
+  /// e with every variable in `replacements` replaced, all at once.
+  Expression substitute(Expression e, const std::map<std::string, Expression>& replacements);
+
+  /// Names of the variables e depends on, sorted.
+  [[nodiscard]] std::vector<std::string> variables_of(Expression e) const;
+  [[nodiscard]] bool depends_on(Expression e, Expression x) const;
+  [[nodiscard]] std::size_t size() const;
+
+ private:
+  friend class Expression;
+  friend class Tape;
+  struct Implementation;
+  std::unique_ptr<Implementation> implementation_;
+};
+
+Expression operator+(Expression a, Expression b);
+Expression operator-(Expression a, Expression b);
+Expression operator*(Expression a, Expression b);
+Expression operator/(Expression a, Expression b);
+Expression operator-(Expression a);
+
+/// Reads `text` into `graph`: numbers, + − * / ^ (right-associative, binds tighter than unary minus: -x^2 = −(x²)), parentheses, pi, and
+/// sin cos tan asin acos atan atan2 sinh cosh tanh exp log sqrt abs sign min max.
+///
+/// @param resolve  gives the expression a symbol stands for, or nothing when the name is unknown.
+/// @param known_names  names to suggest from when a symbol is unknown ("unknown symbol 'dq4', did you mean 'dq3'?").
+/// @throws InputError with the column in the text, the rule and the mend. Texts above 65536 characters or nested deeper than 200 are
+///   refused.
+Expression parse_expression(std::string_view text, ExpressionGraph& graph,
+                            const std::function<std::optional<Expression>(std::string_view)>& resolve,
+                            std::span<const std::string> known_names);
+
+enum class Notation : std::uint8_t { text, latex, c };
+
+/// e written out with no more parentheses than needed; `text` reads back to the same expression. In LaTeX q1 → q_{1}, dq1 →
+/// \dot{q}_{1}, ddq1 → \ddot{q}_{1}, greek names → symbols. multiply_or_zero prints as a product, in C with its guard.
+///
+/// @throws InputError when the text would exceed 16 777 216 characters.
+std::string to_string(Expression e, Notation notation = Notation::text);
+
+/// A flat evaluation program for several expressions at many points at once, with common subexpressions computed once.
+class Tape {
+ public:
+  Tape() = default;
+
+  /// @param inputs  variables in the order of the rows of `evaluate`'s argument.
+  /// @throws InputError when an output depends on a variable that is not among the inputs.
+  Tape(std::span<const Expression> outputs, std::span<const Expression> inputs);
+
+  /// @param values   (n_first_inputs × N): the first inputs, one column per point.
+  /// @param shared   the remaining inputs, the same at every point.
+  /// @param results  (n_outputs × N), one column per point; resized.
+  void evaluate(const Eigen::Ref<const Eigen::MatrixXd>& values, const Eigen::Ref<const Eigen::VectorXd>& shared,
+                Eigen::MatrixXd& results) const;
+
+  [[nodiscard]] int n_outputs() const { return static_cast<int>(outputs_.size()); }
+  [[nodiscard]] bool uses_input(int index) const { return uses_input_[static_cast<std::size_t>(index)]; }
+  [[nodiscard]] std::size_t n_instructions() const { return instructions_.size(); }
+
+ private:
+  struct Instruction {
+    Operation operation;
+    std::int32_t exponent;  // for `power` with a small integer exponent; else 0 and b is used
+    std::uint32_t result, a, b;  // slots
+  };
+  std::vector<Instruction> instructions_;
+  std::vector<std::pair<std::uint32_t, double>> constants_;      // slot, value
+  std::vector<std::pair<std::uint32_t, std::uint32_t>> inputs_;  // slot, input index (used ones only)
+  std::vector<std::uint32_t> outputs_;                           // slot of each output
+  std::vector<bool> uses_input_;
+  std::uint32_t n_slots_ = 0;
+};
+
+}  // namespace gp2

@@ -1,0 +1,87 @@
+#pragma once
+
+#include <span>
+#include <string>
+#include <string_view>
+#include <vector>
+
+#include <Eigen/Core>
+
+namespace gp2 {
+
+/// A scalar covariance function of D features, a sum of products of these, with Δ_d = φ_d − φ'_d and r² = Σ_d (Δ_d/ℓ_d)²:
+///
+///     se        exp(−½ r²)
+///     matern32  (1 + √3 r) exp(−√3 r)
+///     matern52  (1 + √5 r + 5/3 r²) exp(−√5 r)
+///     rq        (1 + r²/(2α))^(−α)
+///     periodic  exp(−2 Σ_d sin²(π Δ_d/p_d)/ℓ_d²)
+///     linear    Σ_d φ_d φ'_d/ℓ_d²
+///     constant  1
+///
+/// The first term of a sum has amplitude 1 (the latent's signal standard deviation scales the whole); term k ≥ 2 is multiplied by
+/// w_k², its amplitude relative to the first. All parameters are positive. Sources: Rasmussen & Williams 2006, ch. 4.
+class Kernel {
+ public:
+  enum class Primitive { se, matern32, matern52, rq, periodic, linear, constant };
+  enum class ParameterKind {
+    lengthscale,           // ℓ_d, in the unit of feature d
+    periodic_lengthscale,  // ℓ_d of `periodic`, dimensionless
+    period,                // p_d, in the unit of feature d
+    shape,                 // α
+    amplitude,             // w_k
+  };
+
+  struct Parameter {
+    ParameterKind kind;
+    int feature;       // d, of a lengthscale or period; else −1
+    std::string name;  // "lengthscale(q1)", "periodic.lengthscale(q1)" where the kernel has several factors, "linear.amplitude"
+  };
+
+  Kernel() = default;
+
+  /// @param text      sums and products of the names above: "se", "se + linear*periodic"
+  /// @param features  the D feature names, for the names of the parameters
+  /// @throws InputError naming what was found and the kernels there are.
+  static Kernel parse(std::string_view text, std::span<const std::string> features);
+
+  [[nodiscard]] const std::string& text() const { return text_; }
+  [[nodiscard]] int n_features() const { return n_features_; }
+  [[nodiscard]] const std::vector<Parameter>& parameters() const { return parameters_; }
+
+  /// Reused memory of `evaluate` and `add_gradient`.
+  struct Workspace {
+    Eigen::ArrayXXd columns;
+  };
+
+  /// k(φ_i, φ') for the rows φ_i of `features`.
+  ///
+  /// @param features  (n × D), one row per point
+  /// @param point     (D)
+  /// @param values    parameters, in the order of parameters()
+  /// @param out       (n)
+  void evaluate(const Eigen::Ref<const Eigen::MatrixXd>& features, const Eigen::Ref<const Eigen::VectorXd>& point,
+                const Eigen::Ref<const Eigen::VectorXd>& values, Eigen::Ref<Eigen::VectorXd> out, Workspace& workspace) const;
+
+  /// Adds Σ_i w_i ∂k(φ_i, φ')/∂log v_p to gradient[p] for every parameter v_p.
+  void add_gradient(const Eigen::Ref<const Eigen::MatrixXd>& features, const Eigen::Ref<const Eigen::VectorXd>& point,
+                    const Eigen::Ref<const Eigen::VectorXd>& values, const Eigen::Ref<const Eigen::VectorXd>& w,
+                    Eigen::Ref<Eigen::VectorXd> gradient, Workspace& workspace) const;
+
+ private:
+  struct Factor {
+    Primitive primitive;
+    int first_parameter;
+  };
+  struct Term {
+    int amplitude;  // index of w_k, −1 for the first term
+    std::vector<Factor> factors;
+  };
+
+  std::string text_;
+  int n_features_ = 0;
+  std::vector<Term> terms_;
+  std::vector<Parameter> parameters_;
+};
+
+}  // namespace gp2

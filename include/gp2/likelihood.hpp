@@ -1,0 +1,70 @@
+#pragma once
+
+#include <memory>
+#include <optional>
+#include <vector>
+
+#include <Eigen/Core>
+
+#include "gp2/observations.hpp"
+#include "gp2/prior.hpp"
+
+namespace gp2 {
+
+/// Everything about a prior and its observations that can be tuned, in physical units; also the shape of its gradient.
+struct ModelValues {
+  std::vector<Eigen::VectorXd> kernel;         // per latent: the kernel's parameters
+  std::vector<Eigen::VectorXd> signal_stddev;  // per latent: s (p_a)
+  std::vector<Eigen::VectorXd> noise_stddev;   // per Observations: σ (d)
+  Eigen::VectorXd parameters;                  // of the system: θ
+};
+
+/// The negative log marginal likelihood of observations under a prior, in its reduced, jitter-free form, and its exact gradient.
+///
+/// With W = S^{-1/2}G = Q R (Q orthonormal, r = rank), e = S^{-1/2}(y − d − Gμ) and ỹ = Qᵀe at each observation,
+///
+///     −log p(y) = −log N(ỹ; 0, K̃ + I) + ½ Σ‖(I − QQᵀ)e‖² + ½ Σ log|S| + ½ Σ (dim y − r) log 2π,
+///     K̃_ij      = Σ_a R_i E_a(x_i) k_a,ij E_a(x_j)ᵀ R_jᵀ.
+///
+/// The factored matrix has Σ r rows and eigenvalues ≥ 1: nothing is ever added to its diagonal. Thread-safe.
+class Likelihood {
+ public:
+  struct Options {
+    std::vector<int> gradient_parameters;  // indices of the system's parameters whose derivative `evaluate` gives
+    bool noise_gradient = false;           // whether it gives the derivatives in the noise
+  };
+
+  /// @param initial  values at which everything that has no gradient stays: fixed noise and parameters are reduced once, here.
+  /// @throws InputError when M is not positive definite or the constraints contradict each other at an observed state, under `initial`.
+  Likelihood(Prior prior, std::vector<Observations> observations, const ModelValues& initial, Options options);
+  ~Likelihood();
+  Likelihood(Likelihood&&) noexcept;
+
+  /// Memory reused between calls; one per thread.
+  class Workspace {
+   public:
+    Workspace();
+    ~Workspace();
+
+   private:
+    friend class Likelihood;
+    struct Implementation;
+    std::unique_ptr<Implementation> implementation_;
+  };
+
+  /// −log p(y | values): +∞ where M is not positive definite, the constraints contradict each other, or the factorisation fails.
+  ///
+  /// @param gradient  when not null, receives ∂/∂log of kernel parameters, signal and noise standard deviations, and ∂/∂θ of the
+  ///                  parameters asked for (zero elsewhere). Left as it was when the value is +∞.
+  double evaluate(const ModelValues& values, ModelValues* gradient, Workspace& workspace) const;
+
+  [[nodiscard]] const Prior& prior() const;
+  [[nodiscard]] const std::vector<Observations>& observations() const;
+  [[nodiscard]] int reduced_size() const;  // Σ r, under the initial values
+
+ private:
+  struct Implementation;
+  std::unique_ptr<Implementation> implementation_;
+};
+
+}  // namespace gp2

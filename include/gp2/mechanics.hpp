@@ -1,0 +1,101 @@
+#pragma once
+
+#include <optional>
+#include <string>
+#include <vector>
+
+#include <Eigen/Cholesky>
+#include <Eigen/Core>
+
+#include "gp2/system.hpp"
+
+namespace gp2 {
+
+/// The Udwadia–Kalaba equation at one state (Geist & Trimpe 2020, eq. 4):
+///
+///     ddq = L b + T ā,    L = M⁻¹Aᵀ(A M⁻¹Aᵀ)⁺,    T = I − L A,
+///
+/// computed without forming A M⁻¹Aᵀ: with M = C Cᵀ and B = A C⁻ᵀ, rows of B scaled to unit norm, a rank-revealing QR of Bᵀ gives
+/// orthonormal bases of range(Bᵀ) and of its complement Z, and T = C⁻ᵀ Z Zᵀ Cᵀ. Any number of rows, redundant ones too.
+class UdwadiaKalaba {
+ public:
+  /// Directions of range(Bᵀ) whose pivot is below this fraction of the largest count as redundant.
+  static constexpr double rank_tolerance = 1e-10;
+  /// @param M  mass matrix        (nq × nq), symmetric positive definite
+  /// @param A  constraint matrix  (nc × nq)
+  /// @param b  constraint vector  (nc)
+  UdwadiaKalaba(const Eigen::Ref<const Eigen::MatrixXd>& M, const Eigen::Ref<const Eigen::MatrixXd>& A,
+                const Eigen::Ref<const Eigen::VectorXd>& b);
+
+  /// Whether M is positive definite to working precision; when it is not, nothing below is valid.
+  [[nodiscard]] bool mass_is_positive_definite() const { return mass_is_positive_definite_; }
+  [[nodiscard]] int rank() const { return rank_; }                  // of A
+  [[nodiscard]] int n_zero_rows() const { return n_zero_rows_; }    // rows of A that vanish at this state; they are dropped
+  [[nodiscard]] double inconsistency() const { return inconsistency_; }  // largest |A L b − b|, rows of B of unit norm
+  [[nodiscard]] double size_of_b() const { return size_of_b_; }          // largest |b|, rows of B of unit norm
+
+  [[nodiscard]] const Eigen::MatrixXd& T() const { return T_; }    // (nq × nq)
+  [[nodiscard]] const Eigen::VectorXd& Lb() const { return Lb_; }  // (nq) [ddq]
+
+  /// L as a matrix (nq × nc). With redundant rows it is one of the generalised inverses with A L A = A; only L b is unique.
+  [[nodiscard]] Eigen::MatrixXd L() const;
+
+  /// M⁻¹ v.
+  [[nodiscard]] Eigen::MatrixXd solve_mass(const Eigen::Ref<const Eigen::MatrixXd>& v) const { return mass_factor_.solve(v); }
+
+  /// The constrained acceleration of an unconstrained one, L b + T ā, with one step of refinement onto A ddq = b.
+  [[nodiscard]] Eigen::VectorXd constrain(const Eigen::Ref<const Eigen::VectorXd>& a_bar) const;
+
+  struct Derivative {
+    Eigen::MatrixXd T;   // dT     (nq × nq)
+    Eigen::VectorXd Lb;  // d(L b) (nq)
+  };
+  /// dT and d(L b) for changes dM, dA, db that keep the rank of A:
+  ///
+  ///     d(L b) = T M⁻¹(dAᵀ Λb − dM L b) + L (db − dA L b),    Λ = (A M⁻¹Aᵀ)⁺
+  ///     dT     = −T M⁻¹(dAᵀ Λ A − dM (I − T)) − L dA T
+  [[nodiscard]] Derivative differentiate(const Eigen::Ref<const Eigen::MatrixXd>& dM, const Eigen::Ref<const Eigen::MatrixXd>& dA,
+                                         const Eigen::Ref<const Eigen::VectorXd>& db) const;
+
+ private:
+  bool mass_is_positive_definite_ = true;
+  int rank_ = 0;
+  int n_zero_rows_ = 0;
+  double inconsistency_ = 0;
+  double size_of_b_ = 0;
+  Eigen::LLT<Eigen::MatrixXd> mass_factor_;
+  Eigen::VectorXd row_scale_;       // 1 / norm of each row of B, 0 for a zero row
+  Eigen::MatrixXd A_unit_;          // rows of A so scaled      (nc × nq)
+  Eigen::VectorXd b_unit_;          // b so scaled              (nc)
+  Eigen::MatrixXd L_unit_;          // L of the scaled rows     (nq × nc)
+  Eigen::MatrixXd T_;
+  Eigen::VectorXd Lb_;
+};
+
+/// The Udwadia–Kalaba equation at N states.
+struct MechanicsBatch {
+  /// At a state, |A L b − b| above this fraction of the largest b of the batch means that the constraints contradict each other.
+  static constexpr double consistency_tolerance = 1e-6;
+
+  SystemValues values;
+  std::vector<UdwadiaKalaba> projections;
+
+  /// What makes the numbers unusable: the first state at which M is not positive definite or the constraints are inconsistent.
+  struct Fault {
+    int state = 0;
+    std::string text;
+  };
+  std::optional<Fault> fault;
+};
+
+/// @param states      (system.layout().size() × N)
+/// @param parameters  (system.parameters().size())
+MechanicsBatch evaluate_mechanics(const System& system, const Eigen::Ref<const Eigen::MatrixXd>& states,
+                                  const Eigen::Ref<const Eigen::VectorXd>& parameters);
+
+/// The same, where a fault is an error.
+/// @throws InputError naming the state and the rule.
+MechanicsBatch require_mechanics(const System& system, const Eigen::Ref<const Eigen::MatrixXd>& states,
+                                 const Eigen::Ref<const Eigen::VectorXd>& parameters);
+
+}  // namespace gp2

@@ -1,0 +1,86 @@
+#pragma once
+
+#include <memory>
+#include <span>
+#include <string>
+#include <vector>
+
+#include <Eigen/Core>
+
+#include "gp2/expression.hpp"
+#include "gp2/kernel.hpp"
+#include "gp2/mechanics.hpp"
+
+namespace gp2 {
+
+/// A group of p independent zero-mean scalar Gaussian processes f(φ(x)) that share one kernel, act on ā through the directions
+/// E(x) (nq × p) and have signal standard deviations s_1 … s_p: they add E(x) diag(s) f(φ(x)) to ā.
+struct Latent {
+  enum class Base {
+    acceleration,  // E = B
+    force,         // E = M⁻¹B
+  };
+
+  /// How a parameter of the kernel starts and is bounded, relative to its default scale (design of the scales: training.hpp).
+  struct Range {
+    double initial = 0;  // 0: the protocol's default
+    double lower = 0;    // 0: the protocol's default
+    double upper = 0;    // 0: the protocol's default
+  };
+
+  std::string name;
+  Kernel kernel;
+  std::vector<std::string> feature_names;  // φ(x), D of them
+  Tape features;                           // state -> φ; holds no parameters
+  Base base = Base::acceleration;
+  std::vector<std::string> column_names;   // p of them, for the names of the signal standard deviations
+  Tape directions;                         // state, parameters -> B (nq × p), column-major; unused where B = I
+  std::vector<Tape> direction_derivatives;  // one per parameter of the system -> ∂B/∂p
+  bool directions_are_identity = true;     // B = I, p = nq
+  Range lengthscale, signal_stddev;
+
+  [[nodiscard]] int size() const { return static_cast<int>(column_names.size()); }  // p
+  [[nodiscard]] int n_features() const { return static_cast<int>(feature_names.size()); }
+};
+
+/// A Gaussian process prior on the unconstrained acceleration (Geist & Trimpe 2020, sec. 4):
+///
+///     ā(x) = μ(x) + Σ_a E_a(x) diag(s_a) f_a(φ_a(x))
+///
+/// Immutable and cheap to copy.
+struct Prior {
+  enum class Mean {
+    zero,   // μ = 0
+    force,  // μ = M⁻¹F, the paper's μ_ā = a(x, θ)
+  };
+
+  std::shared_ptr<const System> system;
+  std::vector<Latent> latents;
+  Mean mean = Mean::zero;
+
+  /// Which entries of a state the prior and the mechanics read (size layout().size()): the columns a data set must have.
+  [[nodiscard]] std::vector<bool> reads() const;
+};
+
+/// μ and E at N states, or their derivatives in one parameter.
+struct PriorValues {
+  Eigen::MatrixXd mean;                     // μ    (nq × N)
+  std::vector<Eigen::MatrixXd> directions;  // E_a  (nq·p_a × N), column-major blocks, without the signal standard deviations
+
+  [[nodiscard]] Eigen::Map<const Eigen::MatrixXd> E(std::size_t latent, int i) const {
+    return {directions[latent].col(i).data(), mean.rows(), directions[latent].rows() / mean.rows()};
+  }
+};
+
+/// φ_a at N states (N × D_a), one row per state: the layout kernels read.
+Eigen::MatrixXd evaluate_features(const Latent& latent, const Eigen::Ref<const Eigen::MatrixXd>& states);
+
+PriorValues evaluate_prior(const Prior& prior, const Eigen::Ref<const Eigen::MatrixXd>& states,
+                           const Eigen::Ref<const Eigen::VectorXd>& parameters, const MechanicsBatch& mechanics);
+
+/// ∂μ/∂p and ∂E_a/∂p for parameter p = system parameters()[index], given the values and the system's derivative there.
+PriorValues differentiate_prior(const Prior& prior, const Eigen::Ref<const Eigen::MatrixXd>& states,
+                                const Eigen::Ref<const Eigen::VectorXd>& parameters, const MechanicsBatch& mechanics,
+                                const PriorValues& values, const SystemValues& derivative, int index);
+
+}  // namespace gp2

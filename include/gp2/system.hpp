@@ -1,0 +1,117 @@
+#pragma once
+
+#include <optional>
+#include <string>
+#include <utility>
+#include <vector>
+
+#include <Eigen/Core>
+
+namespace gp2 {
+
+/// Where each quantity of a state stands in its column of numbers x = [q; dq; t; u]. A batch of N states is a matrix (size() × N).
+/// An entry that no expression of the model reads may be NaN ("not measured").
+struct StateLayout {
+  int nq = 0;  // coordinates
+  int nu = 0;  // inputs
+
+  [[nodiscard]] int q(int j) const { return j; }
+  [[nodiscard]] int dq(int j) const { return nq + j; }
+  [[nodiscard]] int t() const { return 2 * nq; }
+  [[nodiscard]] int u(int k) const { return 2 * nq + 1 + k; }
+  [[nodiscard]] int size() const { return 2 * nq + 1 + nu; }
+};
+
+/// A number of the model that may be estimated from data.
+struct Parameter {
+  std::string name;
+  double value = 0;
+  std::optional<std::pair<double, double>> bounds;  // hard limits when estimated
+  bool estimate = false;                            // the model file's wish; a fit may override it
+};
+
+/// A coordinate and the names its velocity and acceleration go by.
+struct Coordinate {
+  std::string name;    // q1
+  bool angle = false;  // a feature of this name means its sine and cosine
+
+  [[nodiscard]] std::string velocity() const { return "d" + name; }
+  [[nodiscard]] std::string acceleration() const { return "dd" + name; }
+};
+
+/// M, A, b, F, or their derivatives in one parameter, at N states: column i of each member is state i, matrices column-major.
+struct SystemValues {
+  using ConstBlock = Eigen::Map<const Eigen::MatrixXd>;
+  using ConstColumn = Eigen::Ref<const Eigen::VectorXd>;
+
+  Eigen::MatrixXd mass;               // M  (nq·nq × N)
+  Eigen::MatrixXd constraint_matrix;  // A  (nc·nq × N)
+  Eigen::MatrixXd constraint_vector;  // b  (nc × N)
+  Eigen::MatrixXd force;              // F  (nq × N) [N or N m]
+
+  [[nodiscard]] int n_states() const { return static_cast<int>(force.cols()); }
+  [[nodiscard]] ConstBlock M(int i) const { return {mass.col(i).data(), force.rows(), force.rows()}; }
+  [[nodiscard]] ConstBlock A(int i) const {
+    return {constraint_matrix.col(i).data(), constraint_vector.rows(), force.rows()};
+  }
+  [[nodiscard]] ConstColumn b(int i) const { return constraint_vector.col(i); }
+  [[nodiscard]] ConstColumn F(int i) const { return force.col(i); }
+};
+
+/// What a reader of a state asks for; see System::reads.
+enum class SystemPart { mechanics /* M, A, b */, force, residuals };
+
+/// A constrained mechanical system: M(q,t) ddq = F + constraint forces, subject to A(q,dq,t) ddq = b(q,dq,t).
+/// Immutable; every member function may be called from several threads at once.
+class System {
+ public:
+  System(std::string name, std::vector<Coordinate> coordinates, std::vector<std::string> inputs, std::vector<Parameter> parameters,
+         std::vector<std::string> constraint_labels);
+  virtual ~System() = default;
+  System(const System&) = delete;
+  System& operator=(const System&) = delete;
+
+  [[nodiscard]] const std::string& name() const { return name_; }
+  [[nodiscard]] const std::vector<Coordinate>& coordinates() const { return coordinates_; }
+  [[nodiscard]] const std::vector<std::string>& inputs() const { return inputs_; }
+  [[nodiscard]] const std::vector<Parameter>& parameters() const { return parameters_; }
+  [[nodiscard]] const std::vector<std::string>& constraint_labels() const { return constraint_labels_; }  // one per row of A
+  [[nodiscard]] int nq() const { return static_cast<int>(coordinates_.size()); }
+  [[nodiscard]] int nc() const { return static_cast<int>(constraint_labels_.size()); }
+  [[nodiscard]] StateLayout layout() const { return {nq(), static_cast<int>(inputs_.size())}; }
+  [[nodiscard]] std::vector<std::string> state_names() const;   // q1 … dq1 … t u1 …, in the order of the layout
+  [[nodiscard]] Eigen::VectorXd parameter_values() const;       // the model's own values
+  [[nodiscard]] int parameter_index(const std::string& name) const;  // −1 when there is none
+
+  /// M, A, b, F at N states.
+  /// @param states      (layout().size() × N)
+  /// @param parameters  (parameters().size())
+  [[nodiscard]] virtual SystemValues evaluate(const Eigen::Ref<const Eigen::MatrixXd>& states,
+                                              const Eigen::Ref<const Eigen::VectorXd>& parameters) const = 0;
+
+  /// ∂M/∂p, ∂A/∂p, ∂b/∂p, ∂F/∂p at N states, exact, for parameter p = parameters()[index].
+  [[nodiscard]] virtual SystemValues differentiate(const Eigen::Ref<const Eigen::MatrixXd>& states,
+                                                   const Eigen::Ref<const Eigen::VectorXd>& parameters, int index) const = 0;
+
+  /// How far states are off the constraints: rows of `residual_labels()` × N; zero on the constraint.
+  [[nodiscard]] virtual Eigen::MatrixXd residuals(const Eigen::Ref<const Eigen::MatrixXd>& states,
+                                                  const Eigen::Ref<const Eigen::VectorXd>& parameters) const = 0;
+  struct Residual {
+    int row = 0;           // of A
+    bool velocity = false;  // ċ = 0 or a velocity-level constraint; otherwise c = 0
+    std::string text;
+  };
+  [[nodiscard]] virtual const std::vector<Residual>& residual_labels() const = 0;
+
+  /// Which entries of a state the named part reads (size layout().size()).
+  [[nodiscard]] virtual std::vector<bool> reads(SystemPart part) const = 0;
+
+ private:
+  std::string name_;
+  std::vector<Coordinate> coordinates_;
+  std::vector<std::string> inputs_;
+  std::vector<Parameter> parameters_;
+  std::vector<std::string> constraint_labels_;
+};
+
+}  // namespace gp2

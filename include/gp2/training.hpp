@@ -1,0 +1,140 @@
+#pragma once
+
+#include <atomic>
+#include <cstdint>
+#include <functional>
+#include <optional>
+#include <string>
+#include <vector>
+
+#include <Eigen/Core>
+
+#include "gp2/likelihood.hpp"
+#include "gp2/posterior.hpp"
+
+namespace gp2 {
+
+/// One number that training adjusts, in physical units. All but system parameters are positive and optimised as logarithms.
+struct Hyperparameter {
+  enum class Kind {
+    kernel,               // parameter `index` of the kernel of latent `owner`
+    signal_stddev,        // s_index of latent `owner`
+    shared_signal_stddev,  // one factor for all s of latent `owner`, times `scale`
+    noise_stddev,         // σ_index of Observations `owner`
+    parameter,            // θ_index of the system
+  };
+
+  Kind kind = Kind::kernel;
+  int owner = 0;
+  int index = 0;
+  std::string name;
+  std::string unit;
+  double value = 0;  // where the first restart starts; the fitted value in a FitReport
+  double lower = 0, upper = 0;
+  Eigen::VectorXd scale;  // of a shared signal standard deviation: its unit per column
+
+  /// Weak log-normal hyper-prior: ½ (log(value/median)/log_stddev)² is added to the objective; none where log_stddev = 0.
+  double median = 0, log_stddev = 0;
+
+  [[nodiscard]] bool is_positive() const { return kind != Kind::parameter; }
+  /// Within 1e-6 of a bound, on the scale it is optimised on.
+  [[nodiscard]] bool at_bound() const;
+};
+
+/// How hyperparameters start, are bounded and weighed.
+struct Protocol {
+  enum class Name {
+    standard,  // one signal standard deviation per column, wide bounds, weak hyper-priors
+    paper,     // Geist & Trimpe 2020: one shared signal standard deviation in [0.5, 10] × output spread, lengthscales in
+               // [0.5, 20] × feature spread, estimated parameters within ±0.02 of the model's value, no hyper-prior
+  };
+  Name name = Name::standard;
+  bool hyperprior = true;  // of the standard protocol
+
+  /// The standard protocol's ranges, relative to the default scales, and hyper-priors; see docs/priors.md for how they were chosen.
+  struct Standard {
+    static constexpr double lengthscale_initial = 3, lengthscale_lower = 0.05, lengthscale_upper = 500;
+    static constexpr double lengthscale_median = 5, lengthscale_log_stddev = 1.5;
+    static constexpr double signal_initial = 1, signal_lower = 1e-3, signal_upper = 1e3;
+    static constexpr double signal_median = 1, signal_log_stddev = 1.5;
+    static constexpr double noise_lower = 1e-6, noise_upper = 2;
+    static constexpr double noise_log_stddev = 2;
+  };
+};
+
+/// The default scales of a data set, from which hyperparameters start and by which they are bounded.
+struct Scales {
+  std::vector<Eigen::VectorXd> feature_stddev;  // per latent (D)
+  std::vector<Eigen::VectorXd> feature_range;   // per latent (D), largest minus smallest
+  std::vector<Eigen::VectorXd> signal_stddev;   // per latent (p): σ_j, M_jj σ_j, or σ̄ / rms(E column)
+  std::vector<Eigen::VectorXd> output_stddev;   // per Observations (d)
+};
+
+/// σ_j = std of the observed ddq_j; for an unobserved j, σ_j = √(mean over observed i of M_ii σ_i²/M_jj), M at its median.
+Scales default_scales(const Prior& prior, const std::vector<Observations>& observations);
+
+/// Everything tunable: kernels and signals of every latent, noise where it is estimated, and the named parameters of the system.
+///
+/// @param estimated  names of system parameters to estimate
+/// @throws InputError for an unknown name, or a parameter of value 0 without bounds.
+std::vector<Hyperparameter> default_hyperparameters(const Prior& prior, const std::vector<Observations>& observations,
+                                                    const std::vector<std::string>& estimated, const Protocol& protocol);
+
+/// The values that `hyperparameters` stand for; what they leave out keeps the model's value.
+ModelValues model_values(const Prior& prior, const std::vector<Observations>& observations,
+                         const std::vector<Hyperparameter>& hyperparameters);
+
+/// What the optimiser tells while it runs.
+struct Progress {
+  int restart = 0, n_restarts = 0;
+  int iteration = 0;
+  double best = 0;  // lowest objective so far, over all restarts
+  double seconds = 0;
+  double fraction = 0;  // of the work, estimated
+};
+
+struct FitOptions {
+  int n_restarts = 5;         // runs of the optimiser; the first starts at the hyperparameters' own values
+  int max_iterations = 1000;  // per restart; 0: condition at the starting values
+  std::uint64_t seed = 0;     // of the other starting points
+  int n_threads = 0;          // 0: as many as the machine has; results do not depend on it
+  double gradient_tolerance = 1e-5;   // stop when the projected gradient's largest entry is below
+  double reduction_tolerance = 1e-12;  // stop when an iteration lowers the objective by less, relatively
+  std::function<void(const Progress&)> progress;  // called from worker threads, one at a time
+  const std::atomic<bool>* stop = nullptr;        // set: return the best so far
+};
+
+/// How one run of the optimiser ended.
+struct RestartReport {
+  double objective = 0;  // negative log likelihood plus hyper-priors; +∞ where no finite start was found
+  double negative_log_likelihood = 0;
+  int iterations = 0, evaluations = 0, failed_evaluations = 0;
+  bool converged = false;
+  std::string termination;  // which inequality stopped it
+};
+
+struct FitReport {
+  std::vector<Hyperparameter> hyperparameters;  // fitted values
+  double negative_log_likelihood = 0;           // physical units, all constants, without hyper-prior
+  double objective = 0;
+  bool converged = false;
+  std::string termination;
+  int iterations = 0;  // of the best restart
+  int best_restart = 0;
+  std::vector<RestartReport> restarts;
+  double seconds = 0;
+};
+
+struct Fit {
+  Posterior posterior;
+  FitReport report;
+};
+
+/// Maximises the posterior density of the hyperparameters (marginal likelihood times hyper-priors) by L-BFGS-B from several starting
+/// points, and conditions the prior there. Same seed, same bits, for any number of threads.
+///
+/// @throws InputError, NumericalError  as Likelihood and Posterior; NumericalError when no restart reached a finite likelihood.
+Fit fit(const Prior& prior, const std::vector<Observations>& observations, const std::vector<Hyperparameter>& hyperparameters,
+        const FitOptions& options = {});
+
+}  // namespace gp2

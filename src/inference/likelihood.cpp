@@ -1,0 +1,236 @@
+#include "gp2/likelihood.hpp"
+
+#include <cmath>
+#include <limits>
+#include <numbers>
+
+#include "gp2/error.hpp"
+#include "inference/lapack.hpp"
+#include "inference/reduction.hpp"
+
+namespace gp2 {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+
+VectorXd row_stddev(const Eigen::Ref<const MatrixXd>& values) {
+  const VectorXd mean = values.rowwise().mean();
+  return (values.colwise() - mean).rowwise().squaredNorm().array().sqrt() / std::sqrt(static_cast<double>(values.cols()));
+}
+
+struct Likelihood::Implementation {
+  Prior prior;
+  std::vector<Observations> observations;
+  Options options;
+  std::vector<std::vector<MatrixXd>> features;  // [group][latent] (N × D)
+
+  // kept when nothing they depend on can change
+  std::optional<std::vector<ObservationModel>> fixed_models;
+  std::optional<Reduction> fixed_reduction;
+  std::vector<MatrixXd> fixed_features;
+  int initial_size = 0;
+};
+
+struct Likelihood::Workspace::Implementation {
+  MatrixXd K;                // K̃ + I, then its factor, then its inverse
+  std::vector<MatrixXd> k;   // per latent (N × N)
+  std::vector<MatrixXd> Z;   // per latent: R_i E_a diag(s)
+  std::vector<MatrixXd> V;   // per latent: V_i,a, rows as Z
+  MatrixXd H;                // ⟨P_ij − α̃_iα̃_jᵀ, Z_i Z_jᵀ⟩ (N × N)
+  VectorXd S;                // a column of P − α̃α̃ᵀ
+  VectorXd alpha;            // α̃
+  Kernel::Workspace kernel;
+};
+
+Likelihood::Workspace::Workspace() : implementation_(std::make_unique<Implementation>()) {}
+Likelihood::Workspace::~Workspace() = default;
+
+Likelihood::Likelihood(Prior prior, std::vector<Observations> observations, const ModelValues& initial, Options options)
+    : implementation_(std::make_unique<Implementation>()) {
+  Implementation& self = *implementation_;
+  self.prior = std::move(prior);
+  self.observations = std::move(observations);
+  self.options = std::move(options);
+  for (const Observations& group : self.observations) {
+    require_mechanics(*self.prior.system, group.states, initial.parameters);
+  }
+  self.features = features_by_group(self.prior, self.observations);
+  auto models = model_observations(self.prior, self.observations, initial.parameters, self.options.gradient_parameters);
+  Reduction reduction = reduce(self.prior, self.observations, *models, initial.noise_stddev);
+  self.initial_size = static_cast<int>(reduction.size());
+  if (!self.options.gradient_parameters.empty()) return;
+  if (!self.options.noise_gradient) {
+    self.fixed_features = sorted_features(self.features, reduction);
+    self.fixed_reduction = std::move(reduction);
+  }
+  self.fixed_models = std::move(models);
+}
+
+Likelihood::~Likelihood() = default;
+Likelihood::Likelihood(Likelihood&&) noexcept = default;
+
+const Prior& Likelihood::prior() const { return implementation_->prior; }
+const std::vector<Observations>& Likelihood::observations() const { return implementation_->observations; }
+int Likelihood::reduced_size() const { return implementation_->initial_size; }
+
+namespace {
+
+ModelValues zero_gradient(const ModelValues& values) {
+  ModelValues gradient = values;
+  for (VectorXd& v : gradient.kernel) v.setZero();
+  for (VectorXd& v : gradient.signal_stddev) v.setZero();
+  for (VectorXd& v : gradient.noise_stddev) v.setZero();
+  gradient.parameters.setZero();
+  return gradient;
+}
+
+// One sweep over the lower triangle of P − α̃α̃ᵀ for latent a: H (both orders of a pair folded into the lower triangle), the signal
+// standard deviations' gradient ½ Σ_ij k_ij ⟨S_ij, ∂(Z_i Z_jᵀ)/∂log s⟩, and, where wanted, V_i = Σ_j S_ij Z_j k_ji.
+void contract(const Reduction& reduction, const MatrixXd& P, const VectorXd& alpha, const MatrixXd& k, const MatrixXd& Z, MatrixXd& H,
+              VectorXd& signal_gradient, MatrixXd* V, VectorXd& S) {
+  const Index n_samples = static_cast<Index>(reduction.samples.size());
+  if (H.rows() != n_samples) H.resize(n_samples, n_samples);
+  H.setZero();
+  if (V != nullptr) V->setZero(Z.rows(), Z.cols());
+  for (int cj = 0; cj < reduction.n_components(); ++cj) {
+    for (Index j = 0; j < reduction.count[static_cast<std::size_t>(cj)]; ++j) {
+      const Index column = reduction.offset[static_cast<std::size_t>(cj)] + j;
+      const auto z = Z.row(column).transpose();
+      for (int ci = cj; ci < reduction.n_components(); ++ci) {
+        const Index first = ci == cj ? j : 0;
+        const Index n = reduction.count[static_cast<std::size_t>(ci)] - first;
+        if (n <= 0) continue;
+        const Index row = reduction.offset[static_cast<std::size_t>(ci)] + first;
+        auto s = S.head(n);
+        // each stored entry off the diagonal stands for two
+        s = 2 * (P.col(column).segment(row, n) - alpha[column] * alpha.segment(row, n));
+        if (ci == cj) s[0] *= 0.5;
+        const auto rows = Z.middleRows(row, n);
+        H.col(j).segment(first, n) += s.cwiseProduct(rows.lazyProduct(z));
+        s = s.cwiseProduct(k.col(j).segment(first, n));
+        const VectorXd projected = rows.transpose() * s;
+        signal_gradient += projected.cwiseProduct(z);
+        if (V != nullptr) {
+          V->middleRows(row, n).noalias() += 0.5 * s * z.transpose();
+          V->row(column) += 0.5 * projected.transpose();
+        }
+      }
+    }
+  }
+  for (Index j = 0; j < n_samples; ++j) {
+    H.col(j).tail(n_samples - j - 1) += H.row(j).tail(n_samples - j - 1).transpose();
+  }
+}
+
+}  // namespace
+
+double Likelihood::evaluate(const ModelValues& values, ModelValues* gradient, Workspace& workspace) const {
+  constexpr double infinity = std::numeric_limits<double>::infinity();
+  const Implementation& self = *implementation_;
+  Workspace::Implementation& work = *workspace.implementation_;
+  const std::size_t n_latents = self.prior.latents.size();
+
+  // observations under these parameters and noise
+  std::optional<std::vector<ObservationModel>> own_models;
+  if (!self.fixed_models) {
+    own_models = model_observations(self.prior, self.observations, values.parameters,
+                                    gradient != nullptr ? self.options.gradient_parameters : std::vector<int>{});
+    if (!own_models) return infinity;
+  }
+  const std::vector<ObservationModel>& models = own_models ? *own_models : *self.fixed_models;
+  std::optional<Reduction> own_reduction;
+  std::vector<MatrixXd> own_features;
+  if (!self.fixed_reduction) {
+    own_reduction = reduce(self.prior, self.observations, models, values.noise_stddev);
+    own_features = sorted_features(self.features, *own_reduction);
+  }
+  const Reduction& reduction = own_reduction ? *own_reduction : *self.fixed_reduction;
+  const std::vector<MatrixXd>& features = own_reduction ? own_features : self.fixed_features;
+
+  // K̃ + I = L Lᵀ
+  work.Z.resize(n_latents);
+  for (std::size_t a = 0; a < n_latents; ++a) work.Z[a] = reduction.directions[a] * values.signal_stddev[a].asDiagonal();
+  assemble(self.prior, reduction, features, work.Z, values.kernel, work.K, work.k);
+  if (!lapack::factorise(work.K)) return infinity;
+
+  // −log N(ỹ; 0, K̃ + I)
+  work.alpha = reduction.y;
+  lapack::solve_lower(work.K, false, work.alpha);
+  const double value = reduction.constant + 0.5 * work.alpha.squaredNorm() + work.K.diagonal().array().log().sum();
+  if (!std::isfinite(value)) return infinity;
+  if (gradient == nullptr) return value;
+  lapack::solve_lower(work.K, true, work.alpha);
+  lapack::invert_factored(work.K);
+
+  *gradient = zero_gradient(values);
+  const bool needs_V = self.options.noise_gradient || !self.options.gradient_parameters.empty();
+  work.S.resize(static_cast<Index>(reduction.samples.size()));
+  work.V.resize(n_latents);
+  const Index n_samples = static_cast<Index>(reduction.samples.size());
+  for (std::size_t a = 0; a < n_latents; ++a) {
+    contract(reduction, work.K, work.alpha, work.k[a], work.Z[a], work.H, gradient->signal_stddev[a], needs_V ? &work.V[a] : nullptr,
+             work.S);
+    for (Index j = 0; j < n_samples; ++j) {
+      self.prior.latents[a].kernel.add_gradient(features[a].bottomRows(n_samples - j), features[a].row(j).transpose(),
+                                                values.kernel[a], work.H.col(j).tail(n_samples - j), gradient->kernel[a], work.kernel);
+    }
+    gradient->kernel[a] *= 0.5;
+  }
+  if (!needs_V) return value;
+
+  // what θ and the noise change at each sample: ∂NLL/∂e, ∂NLL/∂W, ∂NLL/∂E
+  std::vector<MatrixXd> latent_mean(n_latents);  // Σ_j k_ij Z_jᵀ α̃_j, one row per sample
+  for (std::size_t a = 0; a < n_latents; ++a) {
+    latent_mean[a] = work.k[a] * latent_weights(reduction, work.Z[a], work.alpha);
+  }
+  for (Index i = 0; i < n_samples; ++i) {
+    const Reduction::Sample& sample = reduction.samples[static_cast<std::size_t>(i)];
+    const std::size_t group = static_cast<std::size_t>(sample.group);
+    const ObservationModel& model = models[group];
+    const Index rank = sample.R.rows();
+    const VectorXd whitening = values.noise_stddev[group].cwiseInverse();
+    const auto rows_of = [&](const MatrixXd& reduced) {
+      MatrixXd rows(rank, reduced.cols());
+      for (Index c = 0; c < rank; ++c) rows.row(c) = reduced.row(reduction.offset[static_cast<std::size_t>(c)] + i);
+      return rows;
+    };
+
+    // α_i = Q_i α̃_i + (I − Q_iQ_iᵀ) e_i
+    const VectorXd d_e = sample.Q * rows_of(work.alpha) + sample.e_out;
+    // ∂NLL/∂W_i = Q_i Σ_a V_i,a E_aᵀ − (I − Q_iQ_iᵀ) e_i (posterior mean of ā − μ)ᵀ
+    MatrixXd V_E = MatrixXd::Zero(rank, sample.R.cols());
+    VectorXd mean = VectorXd::Zero(sample.R.cols());
+    std::vector<MatrixXd> V(n_latents);
+    for (std::size_t a = 0; a < n_latents; ++a) {
+      const MatrixXd E = model.values.prior.E(a, sample.index) * values.signal_stddev[a].asDiagonal();
+      V[a] = rows_of(work.V[a]);
+      V_E += V[a] * E.transpose();
+      mean += E * latent_mean[a].row(i).transpose();
+    }
+    const MatrixXd d_W = sample.Q * V_E - sample.e_out * mean.transpose();
+
+    // S^{-1/2} scales the rows of W and e
+    if (self.options.noise_gradient) {
+      const MatrixXd W = whitening.asDiagonal() * model.values.view.G(sample.index);
+      gradient->noise_stddev[group].array() +=
+          1 - d_e.array() * sample.e.array() - d_W.cwiseProduct(W).rowwise().sum().array();
+    }
+    for (std::size_t p = 0; p < self.options.gradient_parameters.size(); ++p) {
+      const ObservationModel::Values& d = model.derivatives[p];
+      const auto dG = d.view.G(sample.index);
+      // de = −S^{-1/2}(dd + dG μ + G dμ)
+      const VectorXd de = -whitening.cwiseProduct(d.view.offset.col(sample.index) + dG * model.values.prior.mean.col(sample.index) +
+                                                  model.values.view.G(sample.index) * d.prior.mean.col(sample.index));
+      double slope = d_e.dot(de) + d_W.cwiseProduct(whitening.asDiagonal() * dG).sum();
+      for (std::size_t a = 0; a < n_latents; ++a) {
+        const MatrixXd dE = d.prior.E(a, sample.index) * values.signal_stddev[a].asDiagonal();
+        slope += (sample.R.transpose() * V[a]).cwiseProduct(dE).sum();
+      }
+      gradient->parameters[self.options.gradient_parameters[p]] += slope;
+    }
+  }
+  return value;
+}
+
+}  // namespace gp2

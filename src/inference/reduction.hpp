@@ -1,0 +1,69 @@
+#pragma once
+
+#include <optional>
+#include <vector>
+
+#include "gp2/likelihood.hpp"
+
+namespace gp2 {
+
+/// What the parameters θ decide about one Observations: G, d of its view and μ, E of the prior, with their derivatives in the
+/// parameters asked for.
+struct ObservationModel {
+  struct Values {
+    ViewValues view;
+    PriorValues prior;
+  };
+  Values values;
+  std::vector<Values> derivatives;  // one per gradient parameter
+  std::vector<int> max_rank;        // of G, per state
+};
+
+/// @returns nothing when the mechanics fail at a state (M not positive definite, contradicting constraints).
+std::optional<std::vector<ObservationModel>> model_observations(const Prior& prior, const std::vector<Observations>& observations,
+                                                                const Eigen::VectorXd& parameters,
+                                                                const std::vector<int>& gradient_parameters);
+
+/// Observations whitened by their noise and split: W = S^{-1/2}G = Q R, e = S^{-1/2}(y − d − Gμ), ỹ = Qᵀe.
+///
+/// Samples are sorted by falling rank and numbers stored component by component: row (c, k) of every reduced vector belongs to
+/// component c of sorted sample k and stands at offset[c] + k, for k < count[c]. So each pair of components is one dense block.
+struct Reduction {
+  struct Sample {
+    int group, index;       // Observations it is of, column in it
+    Eigen::MatrixXd Q, R;   // (d × r), (r × nq)
+    Eigen::VectorXd e;      // (d)
+    Eigen::VectorXd e_out;  // (I − QQᵀ) e
+  };
+  std::vector<Sample> samples;               // sorted
+  std::vector<Eigen::Index> count, offset;   // per component; offset has one more entry, the reduced size
+  Eigen::VectorXd y;                         // ỹ
+  std::vector<Eigen::MatrixXd> directions;   // per latent: rows R_i E_a(x_i), without s  (size × p_a)
+  double constant = 0;                       // ½ Σ‖(I − QQᵀ)e‖² + ½ Σ log|S| + ½ Σ dim y log 2π
+
+  [[nodiscard]] Eigen::Index size() const { return offset.back(); }
+  [[nodiscard]] int n_components() const { return static_cast<int>(count.size()); }
+};
+
+Reduction reduce(const Prior& prior, const std::vector<Observations>& observations, const std::vector<ObservationModel>& models,
+                 const std::vector<Eigen::VectorXd>& noise_stddev);
+
+/// φ_a at the states of each Observations: [group][latent] (N × D_a).
+std::vector<std::vector<Eigen::MatrixXd>> features_by_group(const Prior& prior, const std::vector<Observations>& observations);
+
+/// φ_a of every sample, in the order of the reduction (N × D_a).
+std::vector<Eigen::MatrixXd> sorted_features(const std::vector<std::vector<Eigen::MatrixXd>>& features_by_group,
+                                             const Reduction& reduction);
+
+/// β_j = Z_jᵀ α̃_j, one row per sample (N × p_a).
+Eigen::MatrixXd latent_weights(const Reduction& reduction, const Eigen::MatrixXd& Z, const Eigen::VectorXd& alpha);
+
+/// K̃ + I in the lower triangle, and k_a between all samples (N × N).
+///
+/// @param Z       per latent: rows R_i E_a(x_i) diag(s_a)
+/// @param kernel  per latent: the kernel's parameters
+void assemble(const Prior& prior, const Reduction& reduction, const std::vector<Eigen::MatrixXd>& features,
+              const std::vector<Eigen::MatrixXd>& Z, const std::vector<Eigen::VectorXd>& kernel, Eigen::MatrixXd& K,
+              std::vector<Eigen::MatrixXd>& k);
+
+}  // namespace gp2

@@ -1,0 +1,35 @@
+#include "gp2/system.hpp"
+
+namespace gp2 {
+
+System::System(std::string name, std::vector<Coordinate> coordinates, std::vector<std::string> inputs,
+               std::vector<Parameter> parameters, std::vector<std::string> constraint_labels)
+    : name_(std::move(name)),
+      coordinates_(std::move(coordinates)),
+      inputs_(std::move(inputs)),
+      parameters_(std::move(parameters)),
+      constraint_labels_(std::move(constraint_labels)) {}
+
+std::vector<std::string> System::state_names() const {
+  std::vector<std::string> names;
+  for (const Coordinate& coordinate : coordinates_) names.push_back(coordinate.name);
+  for (const Coordinate& coordinate : coordinates_) names.push_back(coordinate.velocity());
+  names.emplace_back("t");
+  names.insert(names.end(), inputs_.begin(), inputs_.end());
+  return names;
+}
+
+Eigen::VectorXd System::parameter_values() const {
+  Eigen::VectorXd values(static_cast<Eigen::Index>(parameters_.size()));
+  for (Eigen::Index k = 0; k < values.size(); ++k) values[k] = parameters_[static_cast<std::size_t>(k)].value;
+  return values;
+}
+
+int System::parameter_index(const std::string& name) const {
+  for (std::size_t k = 0; k < parameters_.size(); ++k) {
+    if (parameters_[k].name == name) return static_cast<int>(k);
+  }
+  return -1;
+}
+
+}  // namespace gp2

@@ -1,0 +1,140 @@
+#include <algorithm>
+#include <cmath>
+
+#include <Eigen/QR>
+#include <fmt/format.h>
+
+#include "gp2/error.hpp"
+#include "gp2/mechanics.hpp"
+
+namespace gp2 {
+
+using Eigen::MatrixXd;
+using Eigen::Ref;
+using Eigen::VectorXd;
+
+namespace {
+
+// "at state 3 (q1 = 0.1, dq1 = 2): …", with the entries that are known
+std::string describe_fault(const System& system, const Ref<const MatrixXd>& states, const MechanicsBatch::Fault& fault) {
+  const std::vector<std::string> names = system.state_names();
+  std::string where;
+  for (Eigen::Index row = 0; row < states.rows(); ++row) {
+    const double value = states(row, fault.state);
+    if (std::isnan(value)) continue;
+    where += fmt::format("{}{} = {:.6g}", where.empty() ? "" : ", ", names[static_cast<std::size_t>(row)], value);
+  }
+  return fmt::format("system '{}': {} at state {} ({})", system.name(), fault.text, fault.state + 1, where);
+}
+
+}  // namespace
+
+UdwadiaKalaba::UdwadiaKalaba(const Ref<const MatrixXd>& M, const Ref<const MatrixXd>& A, const Ref<const VectorXd>& b)
+    : mass_factor_(M) {
+  const Eigen::Index nq = M.rows();
+  const Eigen::Index nc = A.rows();
+  // LLT stops at a pivot ≤ 0; a pivot lost to rounding is as good as none
+  const auto pivots = mass_factor_.matrixLLT().diagonal().array();
+  if (mass_factor_.info() != Eigen::Success || !M.allFinite() ||
+      (pivots.square() <= 1e-14 * M.diagonal().array().abs()).any()) {
+    mass_is_positive_definite_ = false;
+    return;
+  }
+
+  // Bᵀ = C⁻¹Aᵀ, its columns (the rows of B) scaled to unit norm; rows of A that vanish are dropped
+  MatrixXd Bt = mass_factor_.matrixL().solve(A.transpose());
+  row_scale_ = Bt.colwise().norm();
+  for (double& scale : row_scale_) {
+    if (scale == 0) ++n_zero_rows_;
+    scale = scale == 0 ? 0 : 1 / scale;
+  }
+  Bt = Bt * row_scale_.asDiagonal();
+  A_unit_ = row_scale_.asDiagonal() * A;
+  b_unit_ = row_scale_.cwiseProduct(b);
+
+  // Bᵀ P = [Y Z] [R; 0]: Y spans range(Bᵀ), Z its complement
+  Eigen::ColPivHouseholderQR<MatrixXd> qr;
+  qr.setThreshold(rank_tolerance);
+  qr.compute(Bt);
+  rank_ = nc == 0 ? 0 : static_cast<int>(qr.rank());
+  const MatrixXd basis = nc == 0 ? MatrixXd::Identity(nq, nq) : MatrixXd(qr.householderQ());
+  const auto Y = basis.leftCols(rank_);
+  const auto Z = basis.rightCols(nq - rank_);
+
+  // T = C⁻ᵀ Z Zᵀ Cᵀ
+  T_ = mass_factor_.matrixU().solve(Z * (mass_factor_.matrixL() * Z).transpose());
+
+  // L = C⁻ᵀ B⁺ with B⁺ = Y (Rᵀ)⁺ Pᵀ
+  L_unit_ = MatrixXd::Zero(nq, nc);
+  if (rank_ > 0) {
+    const MatrixXd Rt = qr.matrixR().topRows(rank_).triangularView<Eigen::Upper>().toDenseMatrix().transpose();
+    const MatrixXd Rt_pinv = rank_ == nc ? MatrixXd(Rt.triangularView<Eigen::Lower>().solve(MatrixXd::Identity(nc, nc)))
+                                         : MatrixXd(Rt.householderQr().solve(MatrixXd::Identity(nc, nc)));
+    L_unit_ = mass_factor_.matrixU().solve(Y * Rt_pinv * qr.colsPermutation().transpose());
+  }
+  Lb_ = L_unit_ * b_unit_;
+
+  // b must lie in range(A); a dropped row is 0 = b_k
+  VectorXd residual = A_unit_ * Lb_ - b_unit_;
+  for (Eigen::Index k = 0; k < nc; ++k) {
+    if (row_scale_[k] == 0) residual[k] = b[k];
+  }
+  inconsistency_ = nc == 0 ? 0 : residual.lpNorm<Eigen::Infinity>();
+  size_of_b_ = nc == 0 ? 0 : b_unit_.lpNorm<Eigen::Infinity>();
+}
+
+MatrixXd UdwadiaKalaba::L() const { return L_unit_ * row_scale_.asDiagonal(); }
+
+VectorXd UdwadiaKalaba::constrain(const Ref<const VectorXd>& a_bar) const {
+  VectorXd ddq = Lb_ + T_ * a_bar;
+  ddq += L_unit_ * (b_unit_ - A_unit_ * ddq);
+  return ddq;
+}
+
+UdwadiaKalaba::Derivative UdwadiaKalaba::differentiate(const Ref<const MatrixXd>& dM, const Ref<const MatrixXd>& dA,
+                                                       const Ref<const VectorXd>& db) const {
+  // any fixed scaling of the rows gives the same T and L b, so the unit rows serve: dA → D dA, db → D db
+  const MatrixXd dA_unit = row_scale_.asDiagonal() * dA;
+  const VectorXd db_unit = row_scale_.cwiseProduct(db);
+  const MatrixXd M_L = mass_factor_.reconstructedMatrix() * L_unit_;
+  const MatrixXd Lambda = L_unit_.transpose() * M_L;  // (A M⁻¹Aᵀ)⁺ = LᵀM L
+  const MatrixXd I_minus_T = L_unit_ * A_unit_;
+  Derivative d;
+  d.Lb = T_ * mass_factor_.solve(dA_unit.transpose() * (Lambda * b_unit_) - dM * Lb_) + L_unit_ * (db_unit - dA_unit * Lb_);
+  d.T = -T_ * mass_factor_.solve(dA_unit.transpose() * (Lambda * A_unit_) - dM * I_minus_T) - L_unit_ * (dA_unit * T_);
+  return d;
+}
+
+MechanicsBatch evaluate_mechanics(const System& system, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters) {
+  MechanicsBatch batch{system.evaluate(states, parameters), {}, std::nullopt};
+  const int n_states = batch.values.n_states();
+  batch.projections.reserve(static_cast<std::size_t>(n_states));
+  double size_of_b = 0;
+  for (int i = 0; i < n_states; ++i) {
+    const UdwadiaKalaba& projection = batch.projections.emplace_back(batch.values.M(i), batch.values.A(i), batch.values.b(i));
+    if (!projection.mass_is_positive_definite()) {
+      batch.fault = {i, "the mass matrix M is not positive definite"};
+      return batch;
+    }
+    if (!batch.values.A(i).allFinite() || !batch.values.b(i).allFinite()) {
+      batch.fault = {i, "A or b is not a finite number"};
+      return batch;
+    }
+    size_of_b = std::max(size_of_b, projection.size_of_b());
+  }
+  for (int i = 0; i < n_states; ++i) {
+    if (batch.projections[static_cast<std::size_t>(i)].inconsistency() > MechanicsBatch::consistency_tolerance * size_of_b) {
+      batch.fault = {i, "the constraints contradict each other: no acceleration satisfies A ddq = b"};
+      return batch;
+    }
+  }
+  return batch;
+}
+
+MechanicsBatch require_mechanics(const System& system, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters) {
+  MechanicsBatch batch = evaluate_mechanics(system, states, parameters);
+  if (batch.fault) throw InputError(describe_fault(system, states, *batch.fault));
+  return batch;
+}
+
+}  // namespace gp2

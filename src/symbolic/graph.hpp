@@ -1,0 +1,173 @@
+#pragma once
+
+// The inside of an ExpressionGraph, and the arithmetic that constant folding and the evaluation tape share.
+
+#include <bit>
+#include <cmath>
+#include <cstdlib>
+#include <deque>
+#include <map>
+#include <optional>
+#include <span>
+#include <string>
+#include <unordered_map>
+#include <utility>
+#include <vector>
+
+#include "gp2/expression.hpp"
+
+namespace gp2 {
+
+namespace internal {
+
+struct Node {
+  Operation operation = Operation::constant;
+  std::uint32_t a = 0;  // id of the first operand; of a variable: index of its name
+  std::uint32_t b = 0;  // id of the second operand
+  double value = 0;     // of a constant
+};
+
+constexpr bool is_leaf(Operation operation) {
+  return operation == Operation::constant || operation == Operation::variable;
+}
+
+constexpr bool is_binary(Operation operation) {
+  switch (operation) {
+    case Operation::add:
+    case Operation::subtract:
+    case Operation::multiply:
+    case Operation::divide:
+    case Operation::power:
+    case Operation::atan2:
+    case Operation::min:
+    case Operation::max:
+    case Operation::multiply_or_zero:
+      return true;
+    default:
+      return false;
+  }
+}
+
+constexpr bool is_commutative(Operation operation) {
+  return operation == Operation::add || operation == Operation::multiply || operation == Operation::min ||
+         operation == Operation::max;
+}
+
+/// The exponent n when uⁿ is computed by repeated squaring: a non-zero integer, |n| ≤ 64.
+inline std::optional<int> small_integer(double exponent) {
+  if (exponent == 0 || std::abs(exponent) > 64 || exponent != std::trunc(exponent)) return std::nullopt;
+  return static_cast<int>(exponent);
+}
+
+/// r_i = a_iⁿ by repeated squaring, lane by lane; r and a do not overlap.
+inline void integer_power(int n, std::ptrdiff_t lanes, const double* a, double* r) {
+  constexpr std::ptrdiff_t max_lanes = 64;
+  double square[max_lanes];
+  for (std::ptrdiff_t i = 0; i < lanes; ++i) square[i] = a[i];
+  for (std::ptrdiff_t i = 0; i < lanes; ++i) r[i] = 1;
+  for (int rest = std::abs(n); rest > 0; rest /= 2) {
+    if (rest % 2 == 1) {
+      for (std::ptrdiff_t i = 0; i < lanes; ++i) r[i] *= square[i];
+    }
+    for (std::ptrdiff_t i = 0; i < lanes; ++i) square[i] *= square[i];
+  }
+  if (n < 0) {
+    for (std::ptrdiff_t i = 0; i < lanes; ++i) r[i] = 1 / r[i];
+  }
+}
+
+/// Calls `use` with the arithmetic of `operation` as a function (double a, double b) -> double; unary ones ignore b. NaN stays
+/// NaN.
+template <class Use>
+void with_arithmetic(Operation operation, Use&& use) {
+  switch (operation) {
+    case Operation::constant:
+    case Operation::variable:
+      return;
+    case Operation::add:
+      return use([](double a, double b) { return a + b; });
+    case Operation::subtract:
+      return use([](double a, double b) { return a - b; });
+    case Operation::multiply:
+      return use([](double a, double b) { return a * b; });
+    case Operation::divide:
+      return use([](double a, double b) { return a / b; });
+    case Operation::negate:
+      return use([](double a, double) { return -a; });
+    case Operation::power:
+      return use([](double a, double b) { return std::pow(a, b); });
+    case Operation::sin:
+      return use([](double a, double) { return std::sin(a); });
+    case Operation::cos:
+      return use([](double a, double) { return std::cos(a); });
+    case Operation::tan:
+      return use([](double a, double) { return std::tan(a); });
+    case Operation::asin:
+      return use([](double a, double) { return std::asin(a); });
+    case Operation::acos:
+      return use([](double a, double) { return std::acos(a); });
+    case Operation::atan:
+      return use([](double a, double) { return std::atan(a); });
+    case Operation::sinh:
+      return use([](double a, double) { return std::sinh(a); });
+    case Operation::cosh:
+      return use([](double a, double) { return std::cosh(a); });
+    case Operation::tanh:
+      return use([](double a, double) { return std::tanh(a); });
+    case Operation::exp:
+      return use([](double a, double) { return std::exp(a); });
+    case Operation::log:
+      return use([](double a, double) { return std::log(a); });
+    case Operation::sqrt:
+      return use([](double a, double) { return std::sqrt(a); });
+    case Operation::abs:
+      return use([](double a, double) { return std::abs(a); });
+    case Operation::sign:
+      return use([](double a, double) { return a > 0 ? 1.0 : a < 0 ? -1.0 : a; });
+    case Operation::atan2:
+      return use([](double a, double b) { return std::atan2(a, b); });
+    case Operation::min:
+      return use([](double a, double b) { return (a != a) | (a < b) ? a : b; });
+    case Operation::max:
+      return use([](double a, double b) { return (a != a) | (a > b) ? a : b; });
+    case Operation::multiply_or_zero:
+      return use([](double a, double b) {
+        const double product = a * b;
+        return a == 0 ? 0.0 : product;
+      });
+  }
+}
+
+}  // namespace internal
+
+struct ExpressionGraph::Implementation {
+  std::vector<internal::Node> nodes;  // operands come before what uses them
+  std::deque<std::string> names;      // of the variables, in order of appearance; references to them stay valid
+  std::map<std::string, std::uint32_t, std::less<>> variable_ids;
+
+  /// The id of `node`, which is stored unless an equal one is there already.
+  std::uint32_t intern(const internal::Node& node);
+
+  /// Ids of everything the roots are made of, themselves included, ascending: operands before what uses them.
+  [[nodiscard]] std::vector<std::uint32_t> reachable(std::span<const std::uint32_t> roots) const;
+
+ private:
+  struct Key {
+    Operation operation;
+    std::uint32_t a, b;
+    std::uint64_t value;  // bits, so that equal keys mean identical constants
+    bool operator==(const Key&) const = default;
+  };
+  struct KeyHash {
+    std::size_t operator()(const Key& key) const {
+      std::uint64_t hash = key.value ^ (static_cast<std::uint64_t>(key.operation) << 56);
+      for (const std::uint64_t part : {std::uint64_t{key.a}, std::uint64_t{key.b}}) {
+        hash = (hash ^ (hash >> 29) ^ part) * 0x9e3779b97f4a7c15ULL;
+      }
+      return static_cast<std::size_t>(hash ^ (hash >> 32));
+    }
+  };
+  std::unordered_map<Key, std::uint32_t, KeyHash> ids_;  // looked up, never iterated
+};
+
+}  // namespace gp2

@@ -1,0 +1,348 @@
+#include <fmt/format.h>
+
+#include <algorithm>
+#include <charconv>
+#include <numbers>
+#include <numeric>
+#include <utility>
+
+#include "gp2/error.hpp"
+#include "gp2/expression.hpp"
+#include "symbolic/functions.hpp"
+
+namespace gp2 {
+
+using internal::find_function;
+using internal::Function;
+using internal::functions;
+
+namespace {
+
+constexpr std::size_t max_length = 65536;
+constexpr int max_depth = 200;
+
+// not <cctype>: these do not depend on the locale
+bool is_digit(char c) {
+  return c >= '0' && c <= '9';
+}
+bool is_letter(char c) {
+  return (c >= 'a' && c <= 'z') || (c >= 'A' && c <= 'Z') || c == '_';
+}
+bool is_space(char c) {
+  return c == ' ' || c == '\t' || c == '\n' || c == '\r';
+}
+
+/// Levenshtein distance: the least number of characters inserted, removed or changed between a and b.
+std::size_t edit_distance(std::string_view a, std::string_view b) {
+  std::vector<std::size_t> row(b.size() + 1);
+  std::iota(row.begin(), row.end(), std::size_t{0});
+  for (std::size_t i = 1; i <= a.size(); ++i) {
+    std::size_t diagonal = std::exchange(row[0], i);
+    for (std::size_t j = 1; j <= b.size(); ++j) {
+      const std::size_t change = diagonal + (a[i - 1] == b[j - 1] ? 0 : 1);
+      diagonal = std::exchange(row[j], std::min({row[j] + 1, row[j - 1] + 1, change}));
+    }
+  }
+  return row.back();
+}
+
+/// ", did you mean 'dq3'?" for the candidate nearest to `name`; at a tie the one with more of its beginning, then the later one.
+/// Empty if none is near.
+template <class Names>
+std::string suggestion(std::string_view name, const Names& candidates) {
+  if (name.size() > 64) return "";
+  std::size_t nearest = (name.size() + 2) / 3, longest_start = 0;
+  std::string_view best;
+  for (const std::string_view candidate : candidates) {
+    if (candidate.size() > 64) continue;
+    const std::size_t distance = edit_distance(name, candidate);
+    const auto differs = std::mismatch(name.begin(), name.end(), candidate.begin(), candidate.end()).first;
+    const auto start = static_cast<std::size_t>(differs - name.begin());
+    if (distance > nearest || (distance == nearest && start < longest_start)) continue;
+    nearest = distance;
+    longest_start = start;
+    best = candidate;
+  }
+  return best.empty() ? "" : fmt::format(", did you mean '{}'?", best);
+}
+
+template <class Names>
+std::string joined(const Names& names, std::string_view separator) {
+  std::string text;
+  for (const std::string_view name : names) text.append(text.empty() ? "" : separator).append(name);
+  return text;
+}
+
+/// Recursive descent, one function per rule of the grammar:
+///
+///     sum     = product { ("+" | "-") product }
+///     product = factor { ("*" | "/") factor }
+///     factor  = ("-" | "+") factor | power
+///     power   = atom [ "^" factor ]
+///     atom    = number | symbol | function "(" sum { "," sum } ")" | "(" sum ")"
+class Parser {
+ public:
+  Parser(std::string_view text, ExpressionGraph& graph, const std::function<std::optional<Expression>(std::string_view)>& resolve,
+         std::span<const std::string> known_names)
+      : text_(text), graph_(graph), resolve_(resolve), known_names_(known_names) {}
+
+  Expression parse() {
+    if (text_.size() > max_length) {
+      throw InputError(fmt::format("the expression has {} characters, at most {} are allowed; give its parts names of their own",
+                                   text_.size(), max_length));
+    }
+    skip_space();
+    if (at_end()) fail(0, "the expression is empty; write a number, a symbol or a formula such as 2*q1");
+    const Expression result = sum();
+    if (!at_end()) fail_after_operand();
+    return result;
+  }
+
+ private:
+  /// Refuses the text when it nests too deep; lives as long as one level.
+  class Level {
+   public:
+    explicit Level(Parser& parser) : depth_(parser.depth_) {
+      if (++depth_ > max_depth) {
+        parser.fail(parser.position_,
+                    fmt::format("parentheses, functions, signs and powers are nested deeper than {}; give inner "
+                                "parts names of their own",
+                                max_depth));
+      }
+    }
+    ~Level() { --depth_; }
+    Level(const Level&) = delete;
+    Level& operator=(const Level&) = delete;
+
+   private:
+    int& depth_;
+  };
+
+  Expression sum() {
+    Expression result = product();
+    while (peek() == '+' || peek() == '-') {
+      const char sign = take();
+      const Expression right = product();
+      result = sign == '+' ? result + right : result - right;
+    }
+    return result;
+  }
+
+  Expression product() {
+    Expression result = factor();
+    while (peek() == '*' || peek() == '/') {
+      if (text_.substr(position_, 2) == "**") fail(position_, "found '**'; a power is written ^");
+      const char sign = take();
+      const Expression right = factor();
+      result = sign == '*' ? result * right : result / right;
+    }
+    return result;
+  }
+
+  Expression factor() {
+    if (peek() != '-' && peek() != '+') return power();
+    const Level level(*this);
+    const char sign = take();
+    const Expression operand = factor();
+    return sign == '-' ? -operand : operand;
+  }
+
+  Expression power() {
+    const Expression base = atom();
+    if (peek() != '^') return base;
+    const Level level(*this);
+    take();
+    return graph_.apply(Operation::power, base, factor());
+  }
+
+  Expression atom() {
+    const char c = peek();
+    if (is_digit(c) || c == '.') return number();
+    if (is_letter(c)) return symbol_or_call();
+    if (c != '(') {
+      fail(position_, fmt::format("found {} where a number, a symbol, a function or '(' must stand", found()));
+    }
+    const Level level(*this);
+    const std::size_t open = position_;
+    take();
+    const Expression inside = sum();
+    close(open);
+    return inside;
+  }
+
+  Expression number() {
+    const std::size_t start = position_;
+    double value = 0;
+    const auto [end, error] = std::from_chars(text_.data() + start, text_.data() + text_.size(), value);
+    if (error == std::errc::invalid_argument) fail(start, "found '.' without digits; a number is written as 2, 0.5, .5 or 1e-3");
+    position_ = static_cast<std::size_t>(end - text_.data());
+    const std::string_view written = text_.substr(start, position_ - start);
+    if (error == std::errc::result_out_of_range) {
+      fail(start, fmt::format("the number {} does not fit a double (2.2e-308 to 1.8e308 in size)", shortened(written)));
+    }
+    if (position_ < text_.size() && text_[position_] == '.') {
+      fail(position_, fmt::format("found a second '.' in the number {}.; write one decimal point", shortened(written)));
+    }
+    // 2q1, 2(q1 + 1): the most common slip
+    if (position_ < text_.size() && (is_letter(text_[position_]) || text_[position_] == '(')) {
+      std::size_t stop = position_ + 1;
+      while (stop < text_.size() && (is_letter(text_[stop]) || is_digit(text_[stop]))) ++stop;
+      const std::string right =
+          text_[position_] == '(' ? std::string("(...)") : shortened(text_.substr(position_, stop - position_));
+      fail(position_, fmt::format("found '{}' right after a number; a product needs its sign, write {}*{}", right,
+                                  shortened(written), right));
+    }
+    skip_space();
+    return graph_.constant(value);
+  }
+
+  Expression symbol_or_call() {
+    const std::size_t start = position_;
+    while (position_ < text_.size() && (is_letter(text_[position_]) || is_digit(text_[position_]))) ++position_;
+    const std::string_view name = text_.substr(start, position_ - start);
+    skip_space();
+    if (peek() == '(') return call(name, start);
+
+    if (name == "pi") return graph_.constant(std::numbers::pi);
+    if (const auto resolved = resolve_(name)) return *resolved;
+    if (find_function(name) != nullptr) fail(start, fmt::format("the function '{}' has no argument; write {}(...)", name, name));
+    std::string mend = suggestion(name, known_names_);
+    if (mend.empty()) mend = "; known here: " + (known_names_.empty() ? "none" : joined(known_names_, ", "));
+    fail(start, fmt::format("unknown symbol '{}'{}", shortened(name), mend));
+  }
+
+  Expression call(std::string_view name, std::size_t start) {
+    const Level level(*this);
+    const Function* const function = find_function(name);
+    if (function == nullptr) {
+      if (name == "pi" || resolve_(name)) {
+        fail(position_, fmt::format("found '(' right after '{}', which is not a function; a product is written {}*(...)",
+                                    shortened(name), shortened(name)));
+      }
+      std::vector<std::string_view> names;
+      for (const Function& known : functions) names.push_back(known.text);
+      const std::string mend = suggestion(name, names);
+      fail(start, fmt::format("unknown function '{}'{} Functions are {}", shortened(name), mend.empty() ? "." : mend,
+                              joined(names, " ")));
+    }
+
+    const std::size_t open = position_;
+    take();
+    std::vector<Expression> arguments;
+    if (peek() != ')') {
+      arguments.push_back(sum());
+      while (peek() == ',') {
+        take();
+        arguments.push_back(sum());
+      }
+    }
+    close(open);
+
+    const auto require = [&](bool right_count, std::string_view takes) {
+      if (!right_count) fail(start, fmt::format("{} takes {}, got {}", name, takes, arguments.size()));
+    };
+    switch (function->operation) {
+      case Operation::atan2:
+        require(arguments.size() == 2, "2 arguments");
+        return graph_.apply(Operation::atan2, arguments[0], arguments[1]);
+      case Operation::min:
+      case Operation::max:
+        require(arguments.size() >= 2, "2 or more arguments");
+        return std::accumulate(arguments.begin() + 1, arguments.end(), arguments[0],
+                               [&](Expression a, Expression b) { return graph_.apply(function->operation, a, b); });
+      default:
+        require(arguments.size() == 1, "1 argument");
+        return graph_.apply(function->operation, arguments[0]);
+    }
+  }
+
+  void close(std::size_t open) {
+    if (peek() != ')') {
+      if (!at_end() && peek() != ',') fail_if_no_operator();
+      fail(position_, fmt::format("found {} where ')' must close the '(' of column {}", found(), column(open)));
+    }
+    take();
+  }
+
+  [[noreturn]] void fail_after_operand() {
+    if (peek() == ')') fail(position_, "found ')' without a '(' before it; remove it or add the '('");
+    if (peek() == ',') fail(position_, "found ',' outside a function; write one expression, with '.' as the decimal point");
+    fail_if_no_operator();
+    fail(position_, fmt::format("found {} where an operator + - * / ^ or the end must stand", found()));
+  }
+
+  void fail_if_no_operator() {
+    if (is_letter(peek()) || is_digit(peek()) || peek() == '.' || peek() == '(') {
+      fail(position_, fmt::format("found {} where an operator must stand; a product is written with *", found()));
+    }
+  }
+
+  /// What stands at the position, in words. A character no expression can hold is an error of its own.
+  std::string found() {
+    if (at_end()) return "the end of the text";
+    const auto byte = static_cast<unsigned char>(text_[position_]);
+    if (is_letter(peek()) || is_digit(peek())) {
+      std::size_t stop = position_;
+      while (stop < text_.size() && (is_letter(text_[stop]) || is_digit(text_[stop]))) ++stop;
+      return fmt::format("'{}'", shortened(text_.substr(position_, stop - position_)));
+    }
+    constexpr std::string_view known = "+-*/^().,";
+    if (known.find(peek()) != std::string_view::npos) return fmt::format("'{}'", peek());
+    if (peek() == '=') fail(position_, "found '='; write an equation left = right as the expression left - (right)");
+    if (peek() == '[' || peek() == '{') fail(position_, fmt::format("found '{}'; group with ( )", peek()));
+    constexpr std::string_view allowed = "allowed are letters a-z A-Z, digits, _ and + - * / ^ ( ) , .";
+    if (byte >= 0x80) {
+      // one UTF-8 character: its first byte and those that continue it
+      std::size_t stop = position_ + 1;
+      while (stop < text_.size() && (static_cast<unsigned char>(text_[stop]) & 0xC0U) == 0x80U && stop < position_ + 4) ++stop;
+      fail(position_, byte >= 0xC2 && stop > position_ + 1 ? fmt::format("character '{}' has no meaning here; {}",
+                                                                         text_.substr(position_, stop - position_), allowed)
+                                                           : fmt::format("byte 0x{:02X} is not UTF-8 text; {}", byte, allowed));
+    }
+    if (byte < 0x20 || byte == 0x7F)
+      fail(position_, fmt::format("control character 0x{:02X} has no meaning here; {}", byte, allowed));
+    fail(position_, fmt::format("character '{}' has no meaning here; {}", peek(), allowed));
+  }
+
+  static std::string shortened(std::string_view text) {
+    return text.size() <= 40 ? std::string(text) : std::string(text.substr(0, 37)) + "...";
+  }
+
+  /// Columns count characters, not bytes.
+  [[nodiscard]] std::size_t column(std::size_t position) const {
+    return 1 + static_cast<std::size_t>(std::count_if(text_.begin(), text_.begin() + static_cast<std::ptrdiff_t>(position),
+                                                      [](char c) { return (static_cast<unsigned char>(c) & 0xC0U) != 0x80U; }));
+  }
+
+  [[noreturn]] void fail(std::size_t position, const std::string& message) const {
+    throw InputError(fmt::format("column {}: {}", column(position), message));
+  }
+
+  [[nodiscard]] bool at_end() const { return position_ >= text_.size(); }
+  [[nodiscard]] char peek() const { return at_end() ? '\0' : text_[position_]; }
+  void skip_space() {
+    while (!at_end() && is_space(text_[position_])) ++position_;
+  }
+  char take() {
+    const char c = text_[position_++];
+    skip_space();
+    return c;
+  }
+
+  std::string_view text_;
+  ExpressionGraph& graph_;
+  const std::function<std::optional<Expression>(std::string_view)>& resolve_;
+  std::span<const std::string> known_names_;
+  std::size_t position_ = 0;
+  int depth_ = 0;
+};
+
+}  // namespace
+
+Expression parse_expression(std::string_view text, ExpressionGraph& graph,
+                            const std::function<std::optional<Expression>(std::string_view)>& resolve,
+                            std::span<const std::string> known_names) {
+  return Parser(text, graph, resolve, known_names).parse();
+}
+
+}  // namespace gp2

@@ -1,0 +1,137 @@
+#include <fmt/format.h>
+
+#include <algorithm>
+#include <limits>
+#include <unordered_map>
+
+#include "gp2/error.hpp"
+#include "gp2/expression.hpp"
+#include "symbolic/graph.hpp"
+
+namespace gp2 {
+
+namespace {
+
+constexpr Eigen::Index block_size = 64;  // points evaluated together
+
+}  // namespace
+
+Tape::Tape(std::span<const Expression> outputs, std::span<const Expression> inputs) : uses_input_(inputs.size(), false) {
+  if (outputs.empty()) return;
+  ExpressionGraph& graph = outputs.front().graph();
+  const std::vector<internal::Node>& nodes = graph.implementation_->nodes;
+
+  std::unordered_map<std::uint32_t, std::uint32_t> input_index;  // by id of the variable
+  for (std::size_t i = 0; i < inputs.size(); ++i) {
+    if (&inputs[i].graph() != &graph || inputs[i].operation() != Operation::variable) {
+      throw InputError(fmt::format("tape: input {} must be a variable of the graph of the outputs", i + 1));
+    }
+    input_index.emplace(inputs[i].id(), static_cast<std::uint32_t>(i));
+  }
+  std::vector<std::uint32_t> roots;
+  for (const Expression& output : outputs) {
+    if (&output.graph() != &graph) throw InputError("tape: all outputs must belong to one graph");
+    roots.push_back(output.id());
+  }
+  const std::vector<std::uint32_t> order = graph.implementation_->reachable(roots);
+
+  // the position in `order` at which each value is read last; outputs are kept to the end
+  const auto exponent_of = [&](const internal::Node& node) {
+    const bool constant_exponent = node.operation == Operation::power && nodes[node.b].operation == Operation::constant;
+    return constant_exponent ? internal::small_integer(nodes[node.b].value).value_or(0) : 0;
+  };
+  const auto reads_b = [&](const internal::Node& node) { return internal::is_binary(node.operation) && exponent_of(node) == 0; };
+  std::unordered_map<std::uint32_t, std::size_t> last_read;
+  for (std::size_t k = 0; k < order.size(); ++k) {
+    const internal::Node& node = nodes[order[k]];
+    if (!internal::is_leaf(node.operation)) last_read[node.a] = k;
+    if (reads_b(node)) last_read[node.b] = k;
+  }
+  for (const std::uint32_t id : roots) last_read[id] = std::numeric_limits<std::size_t>::max();
+
+  // one slot per constant and input; those of intermediate values are used again after their last read
+  std::unordered_map<std::uint32_t, std::uint32_t> slots;
+  std::vector<std::uint32_t> free_slots;
+  for (std::size_t k = 0; k < order.size(); ++k) {
+    const std::uint32_t id = order[k];
+    const internal::Node& node = nodes[id];
+    if (!last_read.contains(id)) continue;  // the exponent of an integer power
+    if (node.operation == Operation::variable) {
+      const auto index = input_index.find(id);
+      if (index == input_index.end()) {
+        throw InputError(fmt::format("tape: an output depends on '{}', which is not among the inputs; add it to them",
+                                     graph.implementation_->names[node.a]));
+      }
+      uses_input_[index->second] = true;
+      inputs_.emplace_back(n_slots_, index->second);
+      slots[id] = n_slots_++;
+    } else if (node.operation == Operation::constant) {
+      constants_.emplace_back(n_slots_, node.value);
+      slots[id] = n_slots_++;
+    } else {
+      // the result never shares a slot with its operands: these are freed afterwards
+      if (free_slots.empty()) free_slots.push_back(n_slots_++);
+      const std::uint32_t result = free_slots.back();
+      free_slots.pop_back();
+      slots[id] = result;
+      const std::uint32_t operand_b = reads_b(node) ? node.b : node.a;
+      instructions_.push_back({node.operation, exponent_of(node), result, slots.at(node.a), slots.at(operand_b)});
+      const auto release = [&](std::uint32_t operand) {
+        if (last_read.at(operand) == k && !internal::is_leaf(nodes[operand].operation)) free_slots.push_back(slots.at(operand));
+      };
+      release(node.a);
+      if (operand_b != node.a) release(operand_b);
+    }
+  }
+  for (const std::uint32_t id : roots) outputs_.push_back(slots.at(id));
+}
+
+void Tape::evaluate(const Eigen::Ref<const Eigen::MatrixXd>& values, const Eigen::Ref<const Eigen::VectorXd>& shared,
+                    Eigen::MatrixXd& results) const {
+  const Eigen::Index n_first = values.rows();
+  const Eigen::Index n_points = values.cols();
+  if (n_first + shared.size() != static_cast<Eigen::Index>(uses_input_.size())) {
+    throw InputError(fmt::format("tape: evaluate needs {} inputs, got {} per point and {} shared", uses_input_.size(), n_first,
+                                 shared.size()));
+  }
+  results.resize(n_outputs(), n_points);
+
+  // kept between calls, so that repeated evaluation allocates nothing
+  thread_local std::vector<double> workspace;
+  const Eigen::Index stride = std::min(block_size, n_points);
+  workspace.resize(std::max(workspace.size(), static_cast<std::size_t>(n_slots_ * stride)));
+  const auto slot = [&, data = workspace.data()](std::uint32_t index) { return data + index * stride; };
+
+  // what every block shares
+  for (const auto& [index, value] : constants_) std::fill_n(slot(index), stride, value);
+  for (const auto& [index, input] : inputs_) {
+    if (input >= n_first) std::fill_n(slot(index), stride, shared[input - n_first]);
+  }
+
+  for (Eigen::Index start = 0; start < n_points; start += block_size) {
+    const Eigen::Index lanes = std::min(block_size, n_points - start);
+    for (const auto& [index, input] : inputs_) {
+      if (input >= n_first) continue;
+      double* const x = slot(index);
+      for (Eigen::Index i = 0; i < lanes; ++i) x[i] = values(input, start + i);
+    }
+    for (const Instruction& instruction : instructions_) {
+      double* const r = slot(instruction.result);
+      const double* const a = slot(instruction.a);
+      const double* const b = slot(instruction.b);
+      if (instruction.exponent != 0) {
+        internal::integer_power(instruction.exponent, lanes, a, r);
+        continue;
+      }
+      internal::with_arithmetic(instruction.operation, [&](auto f) {
+        for (Eigen::Index i = 0; i < lanes; ++i) r[i] = f(a[i], b[i]);
+      });
+    }
+    for (std::size_t output = 0; output < outputs_.size(); ++output) {
+      const double* const r = slot(outputs_[output]);
+      for (Eigen::Index i = 0; i < lanes; ++i) results(static_cast<Eigen::Index>(output), start + i) = r[i];
+    }
+  }
+}
+
+}  // namespace gp2

@@ -1,0 +1,319 @@
+#include <algorithm>
+#include <cmath>
+
+#include <fmt/format.h>
+
+#include "gp2/error.hpp"
+#include "gp2/training.hpp"
+
+namespace gp2 {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+using Kind = Hyperparameter::Kind;
+using Standard = Protocol::Standard;
+
+bool Hyperparameter::at_bound() const {
+  const double tolerance = 1e-6;
+  if (is_positive()) {
+    return std::log(value / lower) <= tolerance || std::log(upper / value) <= tolerance;
+  }
+  return value - lower <= tolerance * (upper - lower) || upper - value <= tolerance * (upper - lower);
+}
+
+namespace {
+
+// rows of every group side by side
+template <typename Member>
+MatrixXd side_by_side(const std::vector<Observations>& observations, const Member& member) {
+  Index n = 0;
+  for (const Observations& group : observations) n += member(group).cols();
+  MatrixXd all(member(observations.front()).rows(), n);
+  Index first = 0;
+  for (const Observations& group : observations) {
+    const auto& part = member(group);
+    all.middleCols(first, part.cols()) = part;
+    first += part.cols();
+  }
+  return all;
+}
+
+double median(std::vector<double> values) {
+  const auto middle = values.begin() + static_cast<std::ptrdiff_t>(values.size() / 2);
+  std::nth_element(values.begin(), middle, values.end());
+  return *middle;
+}
+
+// a spread that bounds and starting points can be multiples of, even where the data do not vary
+double usable(double spread, double fallback) { return spread > 0 && std::isfinite(spread) ? spread : fallback; }
+
+// σ_j of every coordinate: measured where ddq_j is observed, otherwise by equal kinetic scale √(mean M_ii σ_i² / M_jj)
+VectorXd coordinate_scales(const System& system, const std::vector<Observations>& observations, const VectorXd& mass_diagonal) {
+  VectorXd variance = VectorXd::Constant(system.nq(), -1);
+  for (const Observations& group : observations) {
+    const VectorXd stddev = row_stddev(group.values);
+    for (Index k = 0; k < stddev.size(); ++k) {
+      double& entry = variance[group.view.rows[static_cast<std::size_t>(k)]];
+      entry = std::max(entry, stddev[k] * stddev[k]);
+    }
+  }
+  double kinetic = 0;
+  int n_observed = 0;
+  for (Index j = 0; j < variance.size(); ++j) {
+    if (variance[j] < 0) continue;
+    kinetic += mass_diagonal[j] * variance[j];
+    ++n_observed;
+  }
+  kinetic = usable(kinetic / std::max(n_observed, 1), 1);
+  VectorXd sigma(system.nq());
+  for (Index j = 0; j < sigma.size(); ++j) {
+    const double equal_kinetic = std::sqrt(kinetic / mass_diagonal[j]);
+    sigma[j] = variance[j] < 0 ? equal_kinetic : usable(std::sqrt(variance[j]), equal_kinetic);
+  }
+  return sigma;
+}
+
+}  // namespace
+
+Scales default_scales(const Prior& prior, const std::vector<Observations>& observations) {
+  const System& system = *prior.system;
+  const MatrixXd states = side_by_side(observations, [](const Observations& group) -> const MatrixXd& { return group.states; });
+  const MechanicsBatch mechanics = require_mechanics(system, states, system.parameter_values());
+  const PriorValues values = evaluate_prior(prior, states, system.parameter_values(), mechanics);
+
+  VectorXd mass_diagonal(system.nq());
+  for (Index j = 0; j < mass_diagonal.size(); ++j) {
+    std::vector<double> entries;
+    for (int i = 0; i < mechanics.values.n_states(); ++i) entries.push_back(mechanics.values.M(i)(j, j));
+    mass_diagonal[j] = median(std::move(entries));
+  }
+  const VectorXd sigma = coordinate_scales(system, observations, mass_diagonal);
+
+  Scales scales;
+  for (std::size_t a = 0; a < prior.latents.size(); ++a) {
+    const Latent& latent = prior.latents[a];
+    const MatrixXd features = evaluate_features(latent, states).transpose();
+    VectorXd stddev = row_stddev(features);
+    VectorXd range = features.rowwise().maxCoeff() - features.rowwise().minCoeff();
+    for (Index d = 0; d < stddev.size(); ++d) {
+      const double magnitude = usable(features.row(d).cwiseAbs().maxCoeff(), 1);
+      // a feature that is constant to rounding has no spread of its own
+      stddev[d] = stddev[d] > 1e-12 * magnitude ? stddev[d] : magnitude;
+      range[d] = range[d] > 1e-12 * magnitude ? range[d] : magnitude;
+    }
+    scales.feature_stddev.push_back(std::move(stddev));
+    scales.feature_range.push_back(std::move(range));
+
+    VectorXd signal(latent.size());
+    if (latent.directions_are_identity) {
+      signal = latent.base == Latent::Base::force ? VectorXd(mass_diagonal.cwiseProduct(sigma)) : sigma;
+    } else {
+      for (Index l = 0; l < signal.size(); ++l) {
+        const auto column = values.directions[a].middleRows(l * system.nq(), system.nq());
+        const double rms = std::sqrt(column.squaredNorm() / static_cast<double>(column.size()));
+        signal[l] = sigma.mean() / usable(rms, 1);
+      }
+    }
+    scales.signal_stddev.push_back(std::move(signal));
+  }
+  for (const Observations& group : observations) {
+    VectorXd stddev = row_stddev(group.values);
+    for (Index k = 0; k < stddev.size(); ++k) stddev[k] = usable(stddev[k], sigma[group.view.rows[static_cast<std::size_t>(k)]]);
+    scales.output_stddev.push_back(std::move(stddev));
+  }
+  return scales;
+}
+
+namespace {
+
+void add_kernel_parameters(const Latent& latent, int owner, const std::string& prefix, const Scales& scales, const Protocol& protocol,
+                           std::vector<Hyperparameter>& out) {
+  const bool paper = protocol.name == Protocol::Name::paper;
+  const auto choose = [](double own, double standard) { return own > 0 ? own : standard; };
+  const Latent::Range& range = latent.lengthscale;
+  for (std::size_t p = 0; p < latent.kernel.parameters().size(); ++p) {
+    const Kernel::Parameter& parameter = latent.kernel.parameters()[p];
+    Hyperparameter h;
+    h.kind = Kind::kernel;
+    h.owner = owner;
+    h.index = static_cast<int>(p);
+    h.name = prefix + parameter.name;
+    double scale = 1, initial = 1, lower = 1e-3, upper = 1e3, median = 1;
+    switch (parameter.kind) {
+      case Kernel::ParameterKind::lengthscale:
+      case Kernel::ParameterKind::periodic_lengthscale:
+        initial = choose(range.initial, paper ? 1 : Standard::lengthscale_initial);
+        lower = choose(range.lower, paper ? 0.5 : Standard::lengthscale_lower);
+        upper = choose(range.upper, paper ? 20 : Standard::lengthscale_upper);
+        median = Standard::lengthscale_median;
+        if (parameter.kind == Kernel::ParameterKind::lengthscale) {
+          scale = scales.feature_stddev[static_cast<std::size_t>(owner)][parameter.feature];
+          h.unit = latent.feature_names[static_cast<std::size_t>(parameter.feature)];
+        }
+        break;
+      case Kernel::ParameterKind::period:
+        scale = scales.feature_range[static_cast<std::size_t>(owner)][parameter.feature];
+        h.unit = latent.feature_names[static_cast<std::size_t>(parameter.feature)];
+        initial = median = 0.5;
+        lower = 0.02;
+        upper = 20;
+        break;
+      case Kernel::ParameterKind::shape:
+      case Kernel::ParameterKind::amplitude:
+        break;
+    }
+    h.value = std::clamp(initial, lower, upper) * scale;
+    h.lower = lower * scale;
+    h.upper = upper * scale;
+    if (!paper && protocol.hyperprior) {
+      h.median = median * scale;
+      h.log_stddev = Standard::lengthscale_log_stddev;
+    }
+    if (h.unit.empty()) h.unit = "1";
+    out.push_back(std::move(h));
+  }
+}
+
+void add_signal_stddevs(const Latent& latent, int owner, const std::string& prefix, const Scales& scales, const Protocol& protocol,
+                        std::vector<Hyperparameter>& out) {
+  const VectorXd& scale = scales.signal_stddev[static_cast<std::size_t>(owner)];
+  const Latent::Range& range = latent.signal_stddev;
+  const auto choose = [](double own, double standard) { return own > 0 ? own : standard; };
+  if (protocol.name == Protocol::Name::paper) {
+    Hyperparameter h;
+    h.kind = Kind::shared_signal_stddev;
+    h.owner = owner;
+    h.name = prefix + "signal_stddev";
+    h.unit = "output spread";
+    h.lower = choose(range.lower, 0.5);
+    h.upper = choose(range.upper, 10);
+    h.value = std::clamp(choose(range.initial, 1), h.lower, h.upper);
+    h.scale = scale;
+    out.push_back(std::move(h));
+    return;
+  }
+  for (int l = 0; l < latent.size(); ++l) {
+    const std::string& column = latent.column_names[static_cast<std::size_t>(l)];
+    Hyperparameter h;
+    h.kind = Kind::signal_stddev;
+    h.owner = owner;
+    h.index = l;
+    h.name = fmt::format("{}signal_stddev({})", prefix, column);
+    h.unit = column;
+    h.value = choose(range.initial, Standard::signal_initial) * scale[l];
+    h.lower = choose(range.lower, Standard::signal_lower) * scale[l];
+    h.upper = choose(range.upper, Standard::signal_upper) * scale[l];
+    if (protocol.hyperprior) {
+      h.median = Standard::signal_median * scale[l];
+      h.log_stddev = Standard::signal_log_stddev;
+    }
+    out.push_back(std::move(h));
+  }
+}
+
+}  // namespace
+
+std::vector<Hyperparameter> default_hyperparameters(const Prior& prior, const std::vector<Observations>& observations,
+                                                    const std::vector<std::string>& estimated, const Protocol& protocol) {
+  const Scales scales = default_scales(prior, observations);
+  const System& system = *prior.system;
+  std::vector<Hyperparameter> out;
+  for (std::size_t a = 0; a < prior.latents.size(); ++a) {
+    const std::string prefix = prior.latents.size() == 1 ? "" : prior.latents[a].name + ".";
+    add_kernel_parameters(prior.latents[a], static_cast<int>(a), prefix, scales, protocol, out);
+    add_signal_stddevs(prior.latents[a], static_cast<int>(a), prefix, scales, protocol, out);
+  }
+
+  for (std::size_t g = 0; g < observations.size(); ++g) {
+    if (!observations[g].estimate_noise) continue;
+    const std::vector<std::string> names = observations[g].view.names(system);
+    for (std::size_t k = 0; k < names.size(); ++k) {
+      Hyperparameter h;
+      h.kind = Kind::noise_stddev;
+      h.owner = static_cast<int>(g);
+      h.index = static_cast<int>(k);
+      h.name = fmt::format("noise_stddev({})", names[k]);
+      h.unit = names[k];
+      const double spread = scales.output_stddev[g][static_cast<Index>(k)];
+      h.lower = Standard::noise_lower * spread;
+      h.upper = Standard::noise_upper * spread;
+      h.value = std::clamp(observations[g].noise_stddev[static_cast<Index>(k)], h.lower, h.upper);
+      if (protocol.hyperprior && protocol.name == Protocol::Name::standard) {
+        h.median = h.value;
+        h.log_stddev = Standard::noise_log_stddev;
+      }
+      out.push_back(std::move(h));
+    }
+  }
+
+  for (const std::string& name : estimated) {
+    const int index = system.parameter_index(name);
+    if (index < 0) {
+      std::string known;
+      for (const Parameter& parameter : system.parameters()) known += (known.empty() ? "" : ", ") + parameter.name;
+      throw InputError(fmt::format("--estimate: the model '{}' has no parameter '{}'; it has: {}", system.name(), name,
+                                   known.empty() ? "none" : known));
+    }
+    const Parameter& parameter = system.parameters()[static_cast<std::size_t>(index)];
+    Hyperparameter h;
+    h.kind = Kind::parameter;
+    h.index = index;
+    h.name = name;
+    h.unit = "of " + name;
+    h.value = parameter.value;
+    if (protocol.name == Protocol::Name::paper) {
+      h.lower = parameter.value - 0.02;
+      h.upper = parameter.value + 0.02;
+      if (parameter.bounds) {
+        h.lower = std::max(h.lower, parameter.bounds->first);
+        h.upper = std::min(h.upper, parameter.bounds->second);
+      }
+    } else if (parameter.bounds) {
+      std::tie(h.lower, h.upper) = *parameter.bounds;
+    } else if (parameter.value != 0) {
+      // half to twice the value
+      h.lower = std::min(0.5 * parameter.value, 2 * parameter.value);
+      h.upper = std::max(0.5 * parameter.value, 2 * parameter.value);
+    } else {
+      throw InputError(fmt::format("parameter '{}' is 0 and has no bounds: write {} = {{ value = 0, bounds = [lower, upper] }}", name,
+                                   name));
+    }
+    out.push_back(std::move(h));
+  }
+  return out;
+}
+
+ModelValues model_values(const Prior& prior, const std::vector<Observations>& observations,
+                         const std::vector<Hyperparameter>& hyperparameters) {
+  ModelValues values;
+  for (const Latent& latent : prior.latents) {
+    values.kernel.push_back(VectorXd::Ones(static_cast<Index>(latent.kernel.parameters().size())));
+    values.signal_stddev.push_back(VectorXd::Ones(latent.size()));
+  }
+  for (const Observations& group : observations) values.noise_stddev.push_back(group.noise_stddev);
+  values.parameters = prior.system->parameter_values();
+  for (const Hyperparameter& h : hyperparameters) {
+    const auto owner = static_cast<std::size_t>(h.owner);
+    switch (h.kind) {
+      case Kind::kernel:
+        values.kernel[owner][h.index] = h.value;
+        break;
+      case Kind::signal_stddev:
+        values.signal_stddev[owner][h.index] = h.value;
+        break;
+      case Kind::shared_signal_stddev:
+        values.signal_stddev[owner] = h.value * h.scale;
+        break;
+      case Kind::noise_stddev:
+        values.noise_stddev[owner][h.index] = h.value;
+        break;
+      case Kind::parameter:
+        values.parameters[h.index] = h.value;
+        break;
+    }
+  }
+  return values;
+}
+
+}  // namespace gp2

@@ -1,0 +1,32 @@
+#pragma once
+
+#include <functional>
+#include <string>
+
+#include <Eigen/Core>
+
+namespace gp2 {
+
+struct LbfgsbOptions {
+  int max_iterations = 1000;
+  int memory = 10;  // pairs kept for the Hessian
+  double gradient_tolerance = 1e-5;
+  double reduction_tolerance = 1e-12;
+  /// Called after each iteration with its number and value; false stops.
+  std::function<bool(int, double)> iteration = [](int, double) { return true; };
+};
+
+struct LbfgsbResult {
+  Eigen::VectorXd x;
+  double value = 0;  // +∞ when it was +∞ at the start
+  int iterations = 0, evaluations = 0, failed_evaluations = 0;
+  bool converged = false;
+  std::string termination;
+};
+
+/// Minimises f over the box [lower, upper] with the original L-BFGS-B 3.0 (Zhu, Byrd, Lu, Nocedal 1997; Morales, Nocedal 2011). Every
+/// run owns its memory: re-entrant. f(x, gradient) may be +∞ away from the start: such a step is shortened tenfold.
+LbfgsbResult minimise(const std::function<double(const Eigen::VectorXd&, Eigen::VectorXd&)>& f, const Eigen::VectorXd& start,
+                      const Eigen::VectorXd& lower, const Eigen::VectorXd& upper, const LbfgsbOptions& options);
+
+}  // namespace gp2
