@@ -127,9 +127,9 @@ void with_arithmetic(Operation operation, Use&& use) {
     case Operation::atan2:
       return use([](double a, double b) { return std::atan2(a, b); });
     case Operation::min:
-      return use([](double a, double b) { return (a != a) | (a < b) ? a : b; });
+      return use([](double a, double b) { return ((a != a) | (a < b)) ? a : b; });
     case Operation::max:
-      return use([](double a, double b) { return (a != a) | (a > b) ? a : b; });
+      return use([](double a, double b) { return ((a != a) | (a > b)) ? a : b; });
     case Operation::multiply_or_zero:
       return use([](double a, double b) {
         const double product = a * b;

@@ -115,7 +115,7 @@ TEST_F(ParserTest, ErrorsSayWhereWhatTheRuleAndTheMend) {
       {"2*mas", "column 3: unknown symbol 'mas', did you mean 'mass'?"},
       {"temperature", "column 1: unknown symbol 'temperature'; known here: q1, q2, dq1, dq2, dq3, mass"},
       {"sin + 1", "column 1: the function 'sin' has no argument; write sin(...)"},
-      {"sine(q1)", "column 1: unknown function 'sine', did you mean 'sin'? Functions are " + functions},
+      {"sqr(q1)", "column 1: unknown function 'sqr', did you mean 'sqrt'? Functions are " + functions},
       {"frobnicate(q1)", "column 1: unknown function 'frobnicate'. Functions are " + functions},
       {"atan2(q1)", "column 1: atan2 takes 2 arguments, got 1"},
       {"1 + sin(q1, q2)", "column 5: sin takes 1 argument, got 2"},

@@ -1,0 +1,46 @@
+#pragma once
+
+#include <filesystem>
+#include <string>
+#include <string_view>
+#include <vector>
+
+namespace gp2 {
+
+/// A table of comma-separated values with one header line. Cells stay text until they are asked for as numbers, so columns that are
+/// not needed may hold anything.
+class CsvTable {
+ public:
+  /// @throws InputError naming file and line: unreadable or empty file, no data rows, ragged row, repeated or empty column name.
+  static CsvTable read(const std::filesystem::path& path);
+  /// @param name  stands for the file in messages
+  static CsvTable parse(std::string_view text, std::string name);
+
+  [[nodiscard]] const std::string& name() const { return name_; }
+  [[nodiscard]] const std::vector<std::string>& header() const { return header_; }
+  [[nodiscard]] int n_rows() const { return static_cast<int>(cells_.size() / header_.size()); }
+  [[nodiscard]] int n_columns() const { return static_cast<int>(header_.size()); }
+  [[nodiscard]] int find(std::string_view column) const;  // −1 when there is none
+  [[nodiscard]] const std::string& cell(int row, int column) const;
+
+  /// @throws InputError naming file, line and column when the cell is not a finite number.
+  [[nodiscard]] double number(int row, int column) const;
+
+ private:
+  std::string name_;
+  std::vector<std::string> header_;
+  std::vector<std::string> cells_;  // row after row
+  std::vector<int> lines_;          // line in the file of each row
+};
+
+/// The shortest text that reads back to the same double.
+std::string shortest(double value);
+
+/// Writes `content` to a file whole or not at all: into a temporary file beside it, flushed, then renamed over `path`.
+/// @throws InputError naming the path when that fails; an old file at `path` is then intact.
+void write_file(const std::filesystem::path& path, std::string_view content);
+
+/// The content of a file. @throws InputError when it cannot be read.
+std::string read_file(const std::filesystem::path& path);
+
+}  // namespace gp2

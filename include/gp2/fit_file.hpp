@@ -1,0 +1,37 @@
+#pragma once
+
+#include <filesystem>
+#include <string>
+#include <vector>
+
+#include "gp2/model_file.hpp"
+#include "gp2/training.hpp"
+
+namespace gp2 {
+
+/// A fitted model as a file: the model's text, the options its prior was made with, the data and the hyperparameters. The posterior
+/// is computed anew from these, so a file loaded gives the same bits as before it was saved.
+struct FitFile {
+  static constexpr int format_version = 1;
+
+  ModelFile model;
+  PriorOptions prior_options;
+  std::string data_source;  // where the data came from, for people
+  std::vector<Observations> observations;
+  FitReport report;  // with the fitted hyperparameters
+
+  [[nodiscard]] Prior prior() const { return make_prior(model, prior_options); }
+  /// The prior conditioned on the data, under the fitted hyperparameters.
+  [[nodiscard]] Posterior posterior() const;
+
+  /// Written whole or not at all. @throws InputError when that fails.
+  void write(const std::filesystem::path& path) const;
+  /// @throws InputError naming the file and what is wrong: not a fit, of a newer format, cut short, or with values out of place.
+  static FitFile read(const std::filesystem::path& path);
+};
+
+/// Starting values for hyperparameters by name, from {"name": value, …} or a FitFile.
+/// @throws InputError naming the file, an unknown name (with those there are), or a value outside its bounds.
+void read_start_values(const std::filesystem::path& path, std::vector<Hyperparameter>& hyperparameters);
+
+}  // namespace gp2

@@ -1,0 +1,46 @@
+#pragma once
+
+#include <map>
+#include <set>
+#include <string>
+#include <vector>
+
+#include <Eigen/Core>
+
+#include "gp2/csv.hpp"
+#include "gp2/system.hpp"
+
+namespace gp2 {
+
+/// Finds a system's states and accelerations in a log by the names of its columns, in any order. A name is looked up as given by
+/// `columns`, then as itself, then under its aliases: for coordinate q1: velocity qd1, v1, qvel1, acceleration qdd1, a1, qacc1;
+/// for any coordinate NAME: NAME_dot and NAME_ddot; for input u1: tau1; for t: time, timestamp.
+class LogReader {
+ public:
+  /// @param columns  the model's name -> the log's name. Naming a coordinate also names its velocity dX and acceleration ddX.
+  LogReader(const CsvTable& table, const System& system, const std::map<std::string, std::string>& columns = {});
+
+  /// (layout size × N); entries that `reads` leaves out are NaN.
+  /// @throws InputError naming a column that is missing, with those there are.
+  [[nodiscard]] Eigen::MatrixXd states(const std::vector<bool>& reads);
+
+  /// Named columns of the model, say ddq1 and ddq3 (names.size() × N).
+  [[nodiscard]] Eigen::MatrixXd values(const std::vector<std::string>& names);
+
+  [[nodiscard]] bool has(const std::string& name) const { return find(name) >= 0; }
+  [[nodiscard]] const std::map<std::string, std::string>& aliases_used() const { return aliases_used_; }  // model's -> log's name
+  [[nodiscard]] std::vector<std::string> unused_columns() const;  // after the reading is done
+
+ private:
+  [[nodiscard]] int find(const std::string& name) const;
+  [[nodiscard]] int require(const std::string& name);
+
+  const CsvTable& table_;
+  const System& system_;
+  std::map<std::string, std::string> columns_;
+  std::map<std::string, std::vector<std::string>> aliases_;
+  std::map<std::string, std::string> aliases_used_;
+  std::set<int> used_;
+};
+
+}  // namespace gp2

@@ -1,0 +1,79 @@
+#pragma once
+
+#include <filesystem>
+#include <map>
+#include <memory>
+#include <optional>
+#include <string>
+#include <string_view>
+#include <utility>
+#include <vector>
+
+#include <Eigen/Core>
+
+#include "gp2/prior.hpp"
+#include "gp2/symbolic_system.hpp"
+
+namespace gp2 {
+
+/// A mechanical system and its prior as text (TOML; docs/model-files.md has every key).
+class ModelFile {
+ public:
+  /// @throws InputError with file, line, key, the rule, the value got and the mend.
+  static ModelFile read(const std::filesystem::path& path);
+  /// @param name  stands for the file in messages
+  static ModelFile parse(std::string text, std::string name);
+
+  /// A [[latent]] as written.
+  struct LatentText {
+    std::string name;
+    std::string kernel;
+    std::vector<std::string> features;
+    Latent::Base base = Latent::Base::acceleration;
+    std::vector<std::vector<Expression>> directions;  // B (nq rows × p), empty: the identity
+    Latent::Range lengthscale, signal_stddev;
+    int line = 0;
+  };
+
+  struct Noise {
+    std::vector<double> stddev;  // per coordinate; empty when the file has no [noise]
+    bool estimate = false;
+  };
+
+  /// One entry of [sampling]: a uniform range, or an expression of other entries.
+  struct SamplingRule {
+    std::string name;
+    std::optional<std::pair<double, double>> range;
+    Expression value;  // where there is no range
+    int line = 0;
+  };
+
+  std::string name;  // for messages
+  std::string text;  // the file's content
+  std::shared_ptr<const SymbolicSystem> system;
+  std::vector<LatentText> latents;
+  Noise noise;
+  std::vector<Expression> truth;               // added to M⁻¹F; nq entries, or none without [truth]
+  std::vector<SamplingRule> sampling;          // in an order in which each can be computed; empty without [sampling]
+  std::map<std::string, double> newton_start;  // [sampling] start
+  std::map<std::string, std::string> columns;  // the model's name -> the name in logs
+
+  /// An expression of the model's symbols and [let] names.
+  [[nodiscard]] Expression expression(std::string_view text) const;
+
+ private:
+  std::map<std::string, Expression, std::less<>> symbols_;
+  friend class ModelReader;
+};
+
+struct PriorOptions {
+  Prior::Mean mean = Prior::Mean::zero;
+  std::optional<Latent::Base> base;  // replaces the directions of the model's latent by the identity or M⁻¹
+  bool raw_angles = false;           // a feature that is an angle stays as it is instead of its sine and cosine
+};
+
+/// The prior of a model file.
+/// @throws InputError when a kernel or feature is wrong, or `base` is asked for and the model has several latents.
+Prior make_prior(const ModelFile& model, const PriorOptions& options = {});
+
+}  // namespace gp2

@@ -1,0 +1,79 @@
+#pragma once
+
+#include <memory>
+#include <string>
+#include <vector>
+
+#include "gp2/expression.hpp"
+#include "gp2/system.hpp"
+
+namespace gp2 {
+
+/// The variables of a constrained mechanical system in an expression graph.
+struct SystemSymbols {
+  std::vector<Expression> q, dq, ddq, u, parameters;
+  Expression t;
+
+  SystemSymbols(ExpressionGraph& graph, const std::vector<Coordinate>& coordinates, const std::vector<std::string>& inputs,
+                const std::vector<Parameter>& parameters);
+  [[nodiscard]] std::vector<Expression> state() const;                 // in the order of StateLayout
+  [[nodiscard]] std::vector<Expression> state_and_parameters() const;  // inputs of most tapes
+};
+
+/// One row of A ddq = b, derived from a constraint.
+struct ConstraintRow {
+  enum class Level {
+    position,      // c(q, t) = 0, differentiated twice along the motion
+    velocity,      // c(q, dq, t) = 0, differentiated once
+    acceleration,  // c(q, dq, ddq, t, u) = 0, linear in ddq
+  };
+  Level level;
+  std::string text;             // c as written
+  std::vector<Expression> A;    // (nq)
+  Expression b;
+  std::vector<Expression> residuals;  // position: c and ċ; velocity: c; acceleration: none
+};
+
+/// Derives a row of A and b from the expression c of a constraint c = 0.
+///
+/// @throws InputError when c depends on what its level does not allow, has no ddq to act on, or is not linear in ddq.
+ConstraintRow derive_constraint(ConstraintRow::Level level, Expression c, std::string text, const SystemSymbols& symbols);
+
+/// A System given by expressions: M(q,t), F(q,dq,t,u) and constraint rows, with exact derivatives in every parameter.
+class SymbolicSystem final : public System {
+ public:
+  struct Definition {
+    std::string name;
+    std::vector<Coordinate> coordinates;
+    std::vector<std::string> inputs;
+    std::vector<Parameter> parameters;
+    std::shared_ptr<ExpressionGraph> graph;
+    std::vector<std::vector<Expression>> mass;  // (nq × nq)
+    std::vector<Expression> force;              // (nq)
+    std::vector<ConstraintRow> constraints;
+  };
+  explicit SymbolicSystem(Definition definition);
+
+  [[nodiscard]] SystemValues evaluate(const Eigen::Ref<const Eigen::MatrixXd>& states,
+                                      const Eigen::Ref<const Eigen::VectorXd>& parameters) const override;
+  [[nodiscard]] SystemValues differentiate(const Eigen::Ref<const Eigen::MatrixXd>& states,
+                                           const Eigen::Ref<const Eigen::VectorXd>& parameters, int index) const override;
+  [[nodiscard]] Eigen::MatrixXd residuals(const Eigen::Ref<const Eigen::MatrixXd>& states,
+                                          const Eigen::Ref<const Eigen::VectorXd>& parameters) const override;
+  [[nodiscard]] const std::vector<Residual>& residual_labels() const override { return residual_labels_; }
+  [[nodiscard]] std::vector<bool> reads(SystemPart part) const override;
+
+  [[nodiscard]] const Definition& definition() const { return definition_; }
+
+ private:
+  [[nodiscard]] SystemValues run(const Tape& tape, const Eigen::Ref<const Eigen::MatrixXd>& states,
+                                 const Eigen::Ref<const Eigen::VectorXd>& parameters) const;
+
+  Definition definition_;
+  Tape values_;                    // M, A, b, F
+  std::vector<Tape> derivatives_;  // the same, per parameter
+  Tape mechanics_, force_, residuals_;
+  std::vector<Residual> residual_labels_;
+};
+
+}  // namespace gp2

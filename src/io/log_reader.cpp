@@ -1,0 +1,108 @@
+#include "gp2/log_reader.hpp"
+
+#include <limits>
+
+#include <fmt/format.h>
+#include <fmt/ranges.h>
+
+#include "gp2/error.hpp"
+
+namespace gp2 {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+
+namespace {
+
+// "1" of "q1" for prefix "q"; empty when the name is not prefix + digits
+std::string number_after(const std::string& prefix, const std::string& name) {
+  if (!name.starts_with(prefix) || name.size() == prefix.size()) return "";
+  const std::string rest = name.substr(prefix.size());
+  return rest.find_first_not_of("0123456789") == std::string::npos ? rest : "";
+}
+
+}  // namespace
+
+LogReader::LogReader(const CsvTable& table, const System& system, const std::map<std::string, std::string>& columns)
+    : table_(table), system_(system), columns_(columns) {
+  for (const Coordinate& coordinate : system.coordinates()) {
+    // a renamed coordinate brings its derivatives along
+    if (const auto renamed = columns.find(coordinate.name); renamed != columns.end()) {
+      columns_.emplace(coordinate.velocity(), "d" + renamed->second);
+      columns_.emplace(coordinate.acceleration(), "dd" + renamed->second);
+    }
+    const std::string number = number_after("q", coordinate.name);
+    if (!number.empty()) {
+      aliases_[coordinate.velocity()] = {"qd" + number, "v" + number, "qvel" + number};
+      aliases_[coordinate.acceleration()] = {"qdd" + number, "a" + number, "qacc" + number};
+    }
+    aliases_[coordinate.velocity()].push_back(coordinate.name + "_dot");
+    aliases_[coordinate.acceleration()].push_back(coordinate.name + "_ddot");
+  }
+  for (const std::string& input : system.inputs()) {
+    const std::string number = number_after("u", input);
+    if (!number.empty()) aliases_[input] = {"tau" + number};
+    if (input == "u") aliases_[input] = {"tau"};
+  }
+  aliases_["t"] = {"time", "timestamp"};
+}
+
+int LogReader::find(const std::string& name) const {
+  if (const auto renamed = columns_.find(name); renamed != columns_.end()) {
+    if (const int column = table_.find(renamed->second); column >= 0) return column;
+  }
+  if (const int column = table_.find(name); column >= 0) return column;
+  if (const auto aliases = aliases_.find(name); aliases != aliases_.end()) {
+    for (const std::string& alias : aliases->second) {
+      if (const int column = table_.find(alias); column >= 0) return column;
+    }
+  }
+  return -1;
+}
+
+int LogReader::require(const std::string& name) {
+  const int column = find(name);
+  if (column < 0) {
+    std::vector<std::string> tried = {name};
+    if (const auto renamed = columns_.find(name); renamed != columns_.end()) tried.insert(tried.begin(), renamed->second);
+    if (const auto aliases = aliases_.find(name); aliases != aliases_.end()) {
+      tried.insert(tried.end(), aliases->second.begin(), aliases->second.end());
+    }
+    throw InputError(fmt::format("{}: missing column '{}' (looked for {}); the file has: {}. Rename it, or give --map LOGNAME={}",
+                                 table_.name(), name, fmt::join(tried, ", "), fmt::join(table_.header(), ", "), name));
+  }
+  used_.insert(column);
+  const std::string& found = table_.header()[static_cast<std::size_t>(column)];
+  if (found != name) aliases_used_[name] = found;
+  return column;
+}
+
+MatrixXd LogReader::states(const std::vector<bool>& reads) {
+  const std::vector<std::string> names = system_.state_names();
+  MatrixXd states = MatrixXd::Constant(static_cast<Index>(names.size()), table_.n_rows(), std::numeric_limits<double>::quiet_NaN());
+  for (std::size_t k = 0; k < names.size(); ++k) {
+    if (!reads[k]) continue;
+    const int column = require(names[k]);
+    for (int row = 0; row < table_.n_rows(); ++row) states(static_cast<Index>(k), row) = table_.number(row, column);
+  }
+  return states;
+}
+
+MatrixXd LogReader::values(const std::vector<std::string>& names) {
+  MatrixXd values(static_cast<Index>(names.size()), table_.n_rows());
+  for (std::size_t k = 0; k < names.size(); ++k) {
+    const int column = require(names[k]);
+    for (int row = 0; row < table_.n_rows(); ++row) values(static_cast<Index>(k), row) = table_.number(row, column);
+  }
+  return values;
+}
+
+std::vector<std::string> LogReader::unused_columns() const {
+  std::vector<std::string> unused;
+  for (int column = 0; column < table_.n_columns(); ++column) {
+    if (!used_.contains(column)) unused.push_back(table_.header()[static_cast<std::size_t>(column)]);
+  }
+  return unused;
+}
+
+}  // namespace gp2

@@ -1,0 +1,678 @@
+#include "gp2/model_file.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <fstream>
+#include <iterator>
+#include <set>
+#include <sstream>
+
+#include <fmt/format.h>
+#include <fmt/ranges.h>
+#include <toml++/toml.h>
+
+#include "gp2/error.hpp"
+#include "training/random.hpp"
+
+namespace gp2 {
+
+using Level = ConstraintRow::Level;
+
+namespace {
+
+constexpr std::size_t max_file_size = 1 << 20;
+
+bool is_identifier(std::string_view name) {
+  const auto letter = [](char c) { return (c >= 'a' && c <= 'z') || (c >= 'A' && c <= 'Z') || c == '_'; };
+  if (name.empty() || !letter(name.front())) return false;
+  return std::all_of(name.begin(), name.end(), [&](char c) { return letter(c) || (c >= '0' && c <= '9'); });
+}
+
+int line_of(const toml::node& node) { return static_cast<int>(node.source().begin.line); }
+
+}  // namespace
+
+/// Reads the tables of a model file one after the other; every complaint carries file, line and key.
+class ModelReader {
+ public:
+  ModelReader(const toml::table& root, ModelFile& model) : root_(root), model_(model) {}
+
+  void read() {
+    only_keys(root_, "", {"name", "coordinates", "inputs", "parameters", "let", "mechanics", "constraints", "latent", "noise",
+                          "truth", "sampling", "columns"});
+    definition_.graph = std::make_shared<ExpressionGraph>();
+    definition_.name = root_.contains("name") ? text(*root_.get("name"), "name") : model_.name;
+    read_coordinates();
+    read_inputs();
+    read_parameters();
+    declare_symbols();
+    read_let();
+    read_mechanics();
+    read_constraints();
+    try {
+      model_.system = std::make_shared<const SymbolicSystem>(definition_);
+    } catch (const InputError& error) {
+      throw InputError(fmt::format("{}: {}", model_.name, error.what()));
+    }
+    check_mass_symmetry();
+    read_latents();
+    read_noise();
+    read_truth();
+    read_sampling();
+    read_columns();
+  }
+
+ private:
+  [[noreturn]] void fail(const toml::node& node, const std::string& key, const std::string& message) const {
+    fail(line_of(node), key, message);
+  }
+  [[noreturn]] void fail(int line, const std::string& key, const std::string& message) const {
+    throw InputError(fmt::format("{}:{}: {}: {}", model_.name, line, key, message));
+  }
+
+  // ---- pieces of TOML -------------------------------------------------------------------------------------------------------------
+
+  void only_keys(const toml::table& table, const std::string& where, const std::vector<std::string>& known) const {
+    for (const auto& [key, node] : table) {
+      if (std::find(known.begin(), known.end(), key.str()) == known.end()) {
+        fail(node, where.empty() ? std::string(key.str()) : where + "." + std::string(key.str()),
+             fmt::format("unknown key; known here: {}", fmt::join(known, ", ")));
+      }
+    }
+  }
+
+  const toml::table& table(const toml::node& node, const std::string& key) const {
+    if (!node.is_table()) fail(node, key, "expected a table");
+    return *node.as_table();
+  }
+
+  const toml::array& array(const toml::node& node, const std::string& key) const {
+    if (!node.is_array()) fail(node, key, "expected an array [ … ]");
+    return *node.as_array();
+  }
+
+  std::string text(const toml::node& node, const std::string& key) const {
+    if (!node.is_string()) fail(node, key, "expected a text in quotes");
+    return node.as_string()->get();
+  }
+
+  double number(const toml::node& node, const std::string& key) const {
+    const std::optional<double> value = node.is_number() ? node.value<double>() : std::nullopt;
+    if (!value || !std::isfinite(*value)) fail(node, key, "expected a finite number");
+    return *value;
+  }
+
+  bool boolean(const toml::node& node, const std::string& key) const {
+    if (!node.is_boolean()) fail(node, key, "expected true or false");
+    return node.as_boolean()->get();
+  }
+
+  std::pair<double, double> range(const toml::node& node, const std::string& key) const {
+    const toml::array& pair = array(node, key);
+    if (pair.size() != 2) fail(node, key, fmt::format("expected [lower, upper], got {} numbers", pair.size()));
+    const double lower = number(*pair.get(0), key);
+    const double upper = number(*pair.get(1), key);
+    if (!(lower < upper)) fail(node, key, fmt::format("the lower end {} must be below the upper end {}", lower, upper));
+    return {lower, upper};
+  }
+
+  // an expression given as text or as a number
+  Expression expression(const toml::node& node, const std::string& key) const {
+    if (node.is_number()) return definition_.graph->constant(number(node, key));
+    try {
+      return model_.expression(text(node, key));
+    } catch (const InputError& error) {
+      const std::string what = error.what();
+      if (what.starts_with(model_.name + ":")) throw;
+      fail(node, key, what);
+    }
+  }
+
+  // ---- the tables of a model ------------------------------------------------------------------------------------------------------
+
+  void declare(const std::string& name, const toml::node& node, const std::string& key) {
+    static const std::set<std::string> reserved = {"pi",   "sin",  "cos",  "tan", "asin", "acos", "atan", "atan2", "sinh",
+                                                   "cosh", "tanh", "exp",  "log", "sqrt", "abs",  "sign", "min",   "max"};
+    if (!is_identifier(name)) {
+      fail(node, key, fmt::format("'{}' is not a name: use letters, digits and _, beginning with a letter", name));
+    }
+    if (reserved.contains(name)) fail(node, key, fmt::format("'{}' is the name of a function or constant; choose another", name));
+    if (!names_.insert(name).second) fail(node, key, fmt::format("the name '{}' is taken already; choose another", name));
+  }
+
+  void read_coordinates() {
+    if (!root_.contains("coordinates")) fail(1, "coordinates", R"(missing; write coordinates = ["q1", "q2"])");
+    const toml::node& node = *root_.get("coordinates");
+    names_.insert("t");
+    for (const toml::node& entry : array(node, "coordinates")) {
+      Coordinate coordinate;
+      if (entry.is_table()) {
+        only_keys(*entry.as_table(), "coordinates", {"name", "angle"});
+        if (!entry.as_table()->contains("name")) fail(entry, "coordinates", R"(expected { name = "q1", angle = true })");
+        coordinate.name = text(*entry.as_table()->get("name"), "coordinates.name");
+        if (entry.as_table()->contains("angle")) coordinate.angle = boolean(*entry.as_table()->get("angle"), "coordinates.angle");
+      } else {
+        coordinate.name = text(entry, "coordinates");
+      }
+      declare(coordinate.name, entry, "coordinates");
+      declare(coordinate.velocity(), entry, "coordinates");
+      declare(coordinate.acceleration(), entry, "coordinates");
+      definition_.coordinates.push_back(coordinate);
+    }
+    if (definition_.coordinates.empty()) fail(node, "coordinates", "a system needs at least one coordinate");
+  }
+
+  void read_inputs() {
+    if (!root_.contains("inputs")) return;
+    for (const toml::node& entry : array(*root_.get("inputs"), "inputs")) {
+      definition_.inputs.push_back(text(entry, "inputs"));
+      declare(definition_.inputs.back(), entry, "inputs");
+    }
+  }
+
+  void read_parameters() {
+    if (!root_.contains("parameters")) return;
+    // TOML tables are sorted by key here; the file's own order reads better
+    std::vector<std::pair<std::string, const toml::node*>> entries;
+    for (const auto& [name, node] : table(*root_.get("parameters"), "parameters")) entries.emplace_back(name.str(), &node);
+    std::stable_sort(entries.begin(), entries.end(), [](const auto& a, const auto& b) {
+      const auto& from = a.second->source().begin;
+      const auto& to = b.second->source().begin;
+      return std::pair(from.line, from.column) < std::pair(to.line, to.column);
+    });
+    for (const auto& [name, node] : entries) {
+      const std::string key = "parameters." + name;
+      declare(name, *node, key);
+      Parameter parameter{name, 0, std::nullopt, false};
+      if (node->is_table()) {
+        const toml::table& entry = *node->as_table();
+        only_keys(entry, key, {"value", "bounds", "estimate"});
+        if (!entry.contains("value")) fail(*node, key, "missing value; write { value = 1.0, bounds = [0.5, 2.0], estimate = true }");
+        parameter.value = number(*entry.get("value"), key + ".value");
+        if (entry.contains("bounds")) parameter.bounds = range(*entry.get("bounds"), key + ".bounds");
+        if (entry.contains("estimate")) parameter.estimate = boolean(*entry.get("estimate"), key + ".estimate");
+        if (parameter.bounds && (parameter.value < parameter.bounds->first || parameter.value > parameter.bounds->second)) {
+          fail(*node, key, fmt::format("the value {} is outside its bounds [{}, {}]", parameter.value, parameter.bounds->first,
+                                       parameter.bounds->second));
+        }
+      } else {
+        parameter.value = number(*node, key);
+      }
+      definition_.parameters.push_back(parameter);
+    }
+  }
+
+  void declare_symbols() {
+    symbols_.emplace(*definition_.graph, definition_.coordinates, definition_.inputs, definition_.parameters);
+    for (Expression symbol : symbols_->state_and_parameters()) model_.symbols_.emplace(symbol.variable_name(), symbol);
+    for (Expression symbol : symbols_->ddq) model_.symbols_.emplace(symbol.variable_name(), symbol);
+  }
+
+  // names may stand in any order and use each other, but not in a circle
+  void read_let() {
+    if (!root_.contains("let")) return;
+    const toml::table& let = table(*root_.get("let"), "let");
+    for (const auto& [name, node] : let) declare(std::string(name.str()), node, "let." + std::string(name.str()));
+    std::set<std::string> open;
+    const auto resolve = [&](const auto& self, const std::string& name) -> void {
+      const toml::node& node = *let.get(name);
+      const std::string key = "let." + name;
+      if (!open.insert(name).second) fail(node, key, "defined in terms of itself");
+      if (open.size() > 200) fail(node, key, "nested deeper than 200 names");
+      Expression value;
+      if (node.is_number()) {
+        value = definition_.graph->constant(number(node, key));
+      } else {
+        const std::string written = text(node, key);
+        // define what it uses first
+        for (const auto& [other, other_node] : let) {
+          const std::string other_name(other.str());
+          if (!model_.symbols_.contains(other_name) && mentions(written, other_name)) self(self, other_name);
+        }
+        value = expression(node, key);
+      }
+      model_.symbols_.emplace(name, value);
+      open.erase(name);
+    };
+    for (const auto& [name, node] : let) {
+      if (!model_.symbols_.contains(std::string(name.str()))) resolve(resolve, std::string(name.str()));
+    }
+  }
+
+  // whether `name` stands in `written` as a whole word
+  static bool mentions(const std::string& written, const std::string& name) {
+    const auto in_word = [](char c) { return std::isalnum(static_cast<unsigned char>(c)) || c == '_'; };
+    for (std::size_t at = written.find(name); at != std::string::npos; at = written.find(name, at + 1)) {
+      const std::size_t end = at + name.size();
+      if ((at == 0 || !in_word(written[at - 1])) && (end == written.size() || !in_word(written[end]))) return true;
+    }
+    return false;
+  }
+
+  void read_mechanics() {
+    const std::size_t nq = definition_.coordinates.size();
+    if (!root_.contains("mechanics")) fail(1, "mechanics", "missing; a model needs [mechanics] with mass = [[…], …]");
+    const toml::table& mechanics = table(*root_.get("mechanics"), "mechanics");
+    only_keys(mechanics, "mechanics", {"mass", "force"});
+    if (!mechanics.contains("mass")) fail(mechanics, "mechanics", "missing mass = [[…], …]");
+
+    mass_node_ = mechanics.get("mass");
+    const toml::array& rows = array(*mass_node_, "mechanics.mass");
+    if (rows.size() != nq) {
+      fail(*mass_node_, "mechanics.mass", fmt::format("expected {} rows, one per coordinate, got {}", nq, rows.size()));
+    }
+    for (std::size_t i = 0; i < nq; ++i) {
+      const std::string key = fmt::format("mechanics.mass row {}", i + 1);
+      const toml::array& entries = array(*rows.get(i), key);
+      if (entries.size() != nq) fail(entries, key, fmt::format("expected {} entries, got {}", nq, entries.size()));
+      definition_.mass.emplace_back();
+      for (std::size_t j = 0; j < nq; ++j) {
+        const std::string entry_key = fmt::format("mechanics.mass row {} column {}", i + 1, j + 1);
+        const Expression entry = expression(*entries.get(j), entry_key);
+        for (const auto* group : {&symbols_->dq, &symbols_->ddq, &symbols_->u}) {
+          allow_only(*entries.get(j), entry_key, entry, *group, "the mass matrix may depend on coordinates, t and parameters only");
+        }
+        definition_.mass.back().push_back(entry);
+      }
+    }
+
+    if (mechanics.contains("force")) {
+      const toml::node& node = *mechanics.get("force");
+      const toml::array& force = array(node, "mechanics.force");
+      if (force.size() != nq) {
+        fail(node, "mechanics.force", fmt::format("expected {} entries, one per coordinate, got {}", nq, force.size()));
+      }
+      for (std::size_t j = 0; j < nq; ++j) {
+        const std::string key = fmt::format("mechanics.force entry {}", j + 1);
+        const Expression entry = expression(*force.get(j), key);
+        allow_only(*force.get(j), key, entry, symbols_->ddq, "a force may not depend on accelerations");
+        definition_.force.push_back(entry);
+      }
+    } else {
+      definition_.force.assign(nq, definition_.graph->constant(0));
+    }
+  }
+
+  void allow_only(const toml::node& node, const std::string& key, Expression e, const std::vector<Expression>& forbidden,
+                  const char* rule) const {
+    for (Expression symbol : forbidden) {
+      if (definition_.graph->depends_on(e, symbol)) {
+        fail(node, key, fmt::format("{}, but this entry depends on '{}'", rule, symbol.variable_name()));
+      }
+    }
+  }
+
+  // M = Mᵀ: as written, or else at random points
+  void check_mass_symmetry() const {
+    std::vector<Expression> differences;
+    std::vector<std::pair<std::size_t, std::size_t>> where;
+    for (std::size_t i = 0; i < definition_.mass.size(); ++i) {
+      for (std::size_t j = 0; j < i; ++j) {
+        if (definition_.mass[i][j] == definition_.mass[j][i]) continue;
+        differences.push_back(definition_.mass[i][j] - definition_.mass[j][i]);
+        differences.push_back(definition_.mass[i][j]);
+        where.emplace_back(i, j);
+      }
+    }
+    if (differences.empty()) return;
+    constexpr int n_points = 10;
+    RandomStream random(1);
+    Eigen::MatrixXd points(model_.system->layout().size(), n_points);
+    for (double& value : points.reshaped()) value = 2 * random.uniform() - 1;
+    Eigen::MatrixXd values;
+    Tape(differences, symbols_->state_and_parameters()).evaluate(points, model_.system->parameter_values(), values);
+    for (std::size_t k = 0; k < where.size(); ++k) {
+      for (int i = 0; i < n_points; ++i) {
+        const double difference = values(static_cast<Eigen::Index>(2 * k), i);
+        const double size = values(static_cast<Eigen::Index>(2 * k + 1), i);
+        if (std::abs(difference) > 1e-10 * std::abs(size)) {
+          const auto [row, column] = where[k];
+          fail(*mass_node_, "mechanics.mass",
+               fmt::format("not symmetric: row {} column {} is {}, but row {} column {} is {}", row + 1, column + 1,
+                           to_string(definition_.mass[row][column]), column + 1, row + 1, to_string(definition_.mass[column][row])));
+        }
+      }
+    }
+  }
+
+  void read_constraints() {
+    if (!root_.contains("constraints")) return;
+    const toml::table& constraints = table(*root_.get("constraints"), "constraints");
+    only_keys(constraints, "constraints", {"position", "velocity", "acceleration"});
+    const std::pair<const char*, Level> levels[] = {
+        {"position", Level::position}, {"velocity", Level::velocity}, {"acceleration", Level::acceleration}};
+    for (const auto& [level_name, level] : levels) {
+      if (!constraints.contains(level_name)) continue;
+      const toml::array& rows = array(*constraints.get(level_name), fmt::format("constraints.{}", level_name));
+      for (std::size_t k = 0; k < rows.size(); ++k) {
+        const toml::node& node = *rows.get(k);
+        const std::string key = fmt::format("constraints.{} entry {}", level_name, k + 1);
+        const Expression c = expression(node, key);
+        try {
+          definition_.constraints.push_back(
+              derive_constraint(level, c, node.is_string() ? text(node, key) : to_string(c), *symbols_));
+        } catch (const InputError& error) {
+          fail(node, key, error.what());
+        }
+      }
+    }
+  }
+
+  Latent::Range latent_range(const toml::table& latent, const std::string& name) const {
+    Latent::Range out;
+    if (!latent.contains(name)) return out;
+    const std::string key = "latent." + name;
+    const toml::table& entry = table(*latent.get(name), key);
+    only_keys(entry, key, {"initial", "bounds"});
+    if (entry.contains("bounds")) std::tie(out.lower, out.upper) = range(*entry.get("bounds"), key + ".bounds");
+    if (entry.contains("initial")) out.initial = number(*entry.get("initial"), key + ".initial");
+    if (out.lower < 0 || out.initial < 0 || (entry.contains("bounds") && out.lower == 0)) {
+      fail(entry, key, "values are relative to the default scale and must be positive");
+    }
+    if (out.initial > 0 && out.upper > 0 && (out.initial < out.lower || out.initial > out.upper)) {
+      fail(entry, key, fmt::format("initial = {} is outside bounds = [{}, {}]", out.initial, out.lower, out.upper));
+    }
+    return out;
+  }
+
+  void read_latents() {
+    if (!root_.contains("latent")) {
+      add_default_latent();
+      return;
+    }
+    std::set<std::string> names;
+    for (const toml::node& node : array(*root_.get("latent"), "latent")) {
+      const toml::table& entry = table(node, "latent");
+      only_keys(entry, "latent", {"name", "kernel", "features", "directions", "lengthscale", "signal_stddev"});
+      ModelFile::LatentText latent;
+      latent.line = line_of(node);
+      latent.name = entry.contains("name") ? text(*entry.get("name"), "latent.name")
+                                           : fmt::format("latent {}", model_.latents.size() + 1);
+      if (!names.insert(latent.name).second) fail(node, "latent.name", fmt::format("'{}' is taken already", latent.name));
+      latent.kernel = entry.contains("kernel") ? text(*entry.get("kernel"), "latent.kernel") : "se";
+      if (!entry.contains("features")) fail(node, "latent", R"(missing features = ["q1", …])");
+      for (const toml::node& feature : array(*entry.get("features"), "latent.features")) {
+        const Expression value = expression(feature, "latent.features");
+        allow_only(feature, "latent.features", value, symbols_->parameters,
+                   "a feature may not depend on parameters (write their numbers)");
+        allow_only(feature, "latent.features", value, symbols_->ddq, "a feature may not depend on accelerations");
+        latent.features.push_back(feature.is_string() ? text(feature, "latent.features") : to_string(value));
+      }
+      if (latent.features.empty()) fail(node, "latent.features", "a latent needs at least one feature");
+      if (entry.contains("directions")) read_directions(*entry.get("directions"), latent);
+      latent.lengthscale = latent_range(entry, "lengthscale");
+      latent.signal_stddev = latent_range(entry, "signal_stddev");
+      try {
+        static_cast<void>(Kernel::parse(latent.kernel, latent.features));
+      } catch (const InputError& error) {
+        fail(node, "latent.kernel", error.what());
+      }
+      model_.latents.push_back(std::move(latent));
+    }
+    if (model_.latents.empty()) add_default_latent();
+  }
+
+  // one squared-exponential latent on the acceleration, over everything a state has but the time
+  void add_default_latent() {
+    ModelFile::LatentText latent;
+    latent.name = "unconstrained acceleration";
+    latent.kernel = "se";
+    latent.line = 1;
+    for (Expression symbol : symbols_->state()) {
+      if (!(symbol == symbols_->t)) latent.features.push_back(symbol.variable_name());
+    }
+    model_.latents.push_back(std::move(latent));
+  }
+
+  // "acceleration", "force", [[…], …] (nq rows), or { force = [[…], …] }
+  void read_directions(const toml::node& node, ModelFile::LatentText& latent) const {
+    const std::string key = "latent.directions";
+    const toml::node* matrix = &node;
+    if (node.is_string()) {
+      const std::string value = text(node, key);
+      if (value != "acceleration" && value != "force") {
+        fail(node, key, fmt::format("expected \"acceleration\", \"force\" or a matrix of expressions, got \"{}\"", value));
+      }
+      latent.base = value == "force" ? Latent::Base::force : Latent::Base::acceleration;
+      return;
+    }
+    if (node.is_table()) {
+      only_keys(*node.as_table(), key, {"force", "acceleration"});
+      if (node.as_table()->size() != 1) fail(node, key, "expected { force = [[…], …] } or { acceleration = [[…], …] }");
+      latent.base = node.as_table()->contains("force") ? Latent::Base::force : Latent::Base::acceleration;
+      matrix = &node.as_table()->begin()->second;
+    }
+    const toml::array& rows = array(*matrix, key);
+    const std::size_t nq = definition_.coordinates.size();
+    if (rows.size() != nq) fail(*matrix, key, fmt::format("expected {} rows, one per coordinate, got {}", nq, rows.size()));
+    for (const toml::node& row_node : rows) {
+      const toml::array& row = array(row_node, key);
+      if (row.empty() || row.size() != array(*rows.get(0), key).size()) {
+        fail(row_node, key, "every row needs the same number of entries, at least one");
+      }
+      latent.directions.emplace_back();
+      for (const toml::node& entry : row) {
+        const Expression value = expression(entry, key);
+        allow_only(entry, key, value, symbols_->ddq, "a direction may not depend on accelerations");
+        latent.directions.back().push_back(value);
+      }
+    }
+  }
+
+  void read_noise() {
+    if (!root_.contains("noise")) return;
+    const toml::table& noise = table(*root_.get("noise"), "noise");
+    only_keys(noise, "noise", {"ddq"});
+    if (!noise.contains("ddq")) return;
+    const toml::node* node = noise.get("ddq");
+    if (node->is_table()) {
+      const toml::table& entry = *node->as_table();
+      only_keys(entry, "noise.ddq", {"estimate", "initial"});
+      if (entry.contains("estimate")) model_.noise.estimate = boolean(*entry.get("estimate"), "noise.ddq.estimate");
+      if (!entry.contains("initial")) fail(entry, "noise.ddq", "missing initial: where the estimate starts");
+      node = entry.get("initial");
+    }
+    const std::size_t nq = definition_.coordinates.size();
+    if (node->is_array()) {
+      for (const toml::node& entry : *node->as_array()) model_.noise.stddev.push_back(number(entry, "noise.ddq"));
+      if (model_.noise.stddev.size() != nq) {
+        fail(*node, "noise.ddq", fmt::format("expected one value or {}, one per coordinate, got {}", nq, model_.noise.stddev.size()));
+      }
+    } else {
+      model_.noise.stddev.assign(nq, number(*node, "noise.ddq"));
+    }
+    for (double stddev : model_.noise.stddev) {
+      if (!(stddev > 0)) fail(*node, "noise.ddq", fmt::format("a noise standard deviation must be positive, got {}", stddev));
+    }
+  }
+
+  void read_truth() {
+    if (!root_.contains("truth")) return;
+    const toml::table& truth = table(*root_.get("truth"), "truth");
+    only_keys(truth, "truth", {"acceleration"});
+    if (!truth.contains("acceleration")) fail(truth, "truth", "missing acceleration = [ … ]");
+    const toml::array& rows = array(*truth.get("acceleration"), "truth.acceleration");
+    const std::size_t nq = definition_.coordinates.size();
+    if (rows.size() != nq) {
+      fail(rows, "truth.acceleration", fmt::format("expected {} entries, one per coordinate, got {}", nq, rows.size()));
+    }
+    for (const toml::node& row : rows) {
+      model_.truth.push_back(expression(row, "truth.acceleration"));
+      allow_only(row, "truth.acceleration", model_.truth.back(), symbols_->ddq, "the true acceleration may not depend on itself");
+    }
+  }
+
+  void read_sampling() {
+    if (!root_.contains("sampling")) return;
+    const toml::table& sampling = table(*root_.get("sampling"), "sampling");
+    // names that are not of the state are auxiliary draws, visible to expressions here only
+    std::set<std::string> drawable;
+    for (Expression symbol : symbols_->state()) drawable.insert(symbol.variable_name());
+    const auto visible = model_.symbols_;
+    for (const auto& [key, node] : sampling) {
+      const std::string name(key.str());
+      if (name == "start" || drawable.contains(name)) continue;
+      declare(name, node, "sampling." + name);
+      model_.symbols_.emplace(name, definition_.graph->variable(name));
+    }
+
+    std::vector<ModelFile::SamplingRule> rules;
+    for (const auto& [key, node] : sampling) {
+      const std::string name(key.str());
+      const std::string where = "sampling." + name;
+      if (name == "start") {
+        for (const auto& [coordinate, value] : table(node, where)) {
+          const std::string coordinate_name(coordinate.str());
+          const bool known = std::any_of(definition_.coordinates.begin(), definition_.coordinates.end(), [&](const Coordinate& c) {
+            return c.name == coordinate_name || c.velocity() == coordinate_name;
+          });
+          if (!known) fail(value, where, fmt::format("'{}' is neither a coordinate nor a velocity", coordinate_name));
+          model_.newton_start[coordinate_name] = number(value, where + "." + coordinate_name);
+        }
+        continue;
+      }
+      ModelFile::SamplingRule rule{name, std::nullopt, {}, line_of(node)};
+      if (node.is_array()) {
+        rule.range = range(node, where);
+      } else {
+        rule.value = expression(node, where);
+        allow_only(node, where, rule.value, symbols_->ddq, "a sample may not depend on accelerations");
+      }
+      rules.push_back(std::move(rule));
+    }
+    model_.symbols_ = visible;
+    sort_rules(std::move(rules));
+  }
+
+  // each rule after those it uses
+  void sort_rules(std::vector<ModelFile::SamplingRule> rules) {
+    while (!rules.empty()) {
+      const auto ready = std::find_if(rules.begin(), rules.end(), [&](const ModelFile::SamplingRule& rule) {
+        return rule.range || std::none_of(rules.begin(), rules.end(), [&](const ModelFile::SamplingRule& other) {
+                 return definition_.graph->depends_on(rule.value, definition_.graph->variable(other.name));
+               });
+      });
+      if (ready == rules.end()) {
+        fail(rules.front().line, "sampling." + rules.front().name, "depends on itself, directly or through other entries");
+      }
+      model_.sampling.push_back(std::move(*ready));
+      rules.erase(ready);
+    }
+  }
+
+  void read_columns() {
+    if (!root_.contains("columns")) return;
+    for (const auto& [key, node] : table(*root_.get("columns"), "columns")) {
+      const std::string name(key.str());
+      const auto symbol = model_.symbols_.find(name);
+      const bool of_state = symbol != model_.symbols_.end() && symbol->second.operation() == Operation::variable &&
+                            symbol->second.variable_name() == name;
+      if (!of_state) fail(node, "columns." + name, "not a coordinate, velocity, acceleration, input or t of this model");
+      model_.columns[name] = text(node, "columns." + name);
+    }
+  }
+
+  const toml::table& root_;
+  ModelFile& model_;
+  SymbolicSystem::Definition definition_;
+  std::set<std::string> names_;
+  std::optional<SystemSymbols> symbols_;
+  const toml::node* mass_node_ = nullptr;
+};
+
+ModelFile ModelFile::read(const std::filesystem::path& path) {
+  std::ifstream file(path, std::ios::binary);
+  if (!file) throw InputError(fmt::format("{}: cannot be read; is the path right?", path.string()));
+  file.seekg(0, std::ios::end);
+  const auto size = file.tellg();
+  if (size < 0 || static_cast<std::size_t>(size) > max_file_size) {
+    throw InputError(fmt::format("{}: not a model file, or larger than {} bytes", path.string(), max_file_size));
+  }
+  file.seekg(0);
+  return parse(std::string(std::istreambuf_iterator<char>(file), {}), path.string());
+}
+
+ModelFile ModelFile::parse(std::string text, std::string name) {
+  ModelFile model;
+  model.name = std::move(name);
+  model.text = std::move(text);
+  if (model.text.size() > max_file_size) {
+    throw InputError(fmt::format("{}: larger than {} bytes, which no model needs", model.name, max_file_size));
+  }
+  try {
+    const toml::table root = toml::parse(model.text, model.name);
+    ModelReader(root, model).read();
+  } catch (const toml::parse_error& error) {
+    throw InputError(fmt::format("{}:{}: not valid TOML: {}", model.name, error.source().begin.line, error.description()));
+  }
+  return model;
+}
+
+Expression ModelFile::expression(std::string_view written) const {
+  std::vector<std::string> known;
+  for (const auto& [symbol, value] : symbols_) known.push_back(symbol);
+  ExpressionGraph& graph = symbols_.begin()->second.graph();
+  return parse_expression(
+      written, graph,
+      [&](std::string_view symbol) -> std::optional<Expression> {
+        const auto found = symbols_.find(symbol);
+        return found == symbols_.end() ? std::nullopt : std::optional(found->second);
+      },
+      known);
+}
+
+Prior make_prior(const ModelFile& model, const PriorOptions& options) {
+  const SymbolicSystem& system = *model.system;
+  ExpressionGraph& graph = *system.definition().graph;
+  const SystemSymbols symbols(graph, system.coordinates(), system.inputs(), system.parameters());
+  if (options.base && model.latents.size() > 1) {
+    throw InputError(fmt::format("{}: --prior replaces the directions of the one [[latent]], but this model has {}: edit the model "
+                                 "file instead",
+                                 model.name, model.latents.size()));
+  }
+
+  Prior prior{model.system, {}, options.mean};
+  for (const ModelFile::LatentText& text : model.latents) {
+    Latent latent;
+    latent.name = text.name;
+    latent.base = options.base.value_or(text.base);
+    latent.lengthscale = text.lengthscale;
+    latent.signal_stddev = text.signal_stddev;
+    std::vector<Expression> features;
+    for (const std::string& feature : text.features) {
+      const bool angle = !options.raw_angles && std::any_of(system.coordinates().begin(), system.coordinates().end(),
+                                                            [&](const Coordinate& c) { return c.angle && c.name == feature; });
+      const std::vector<std::string> written =
+          angle ? std::vector<std::string>{"sin(" + feature + ")", "cos(" + feature + ")"} : std::vector<std::string>{feature};
+      for (const std::string& expression : written) {
+        latent.feature_names.push_back(expression);
+        features.push_back(model.expression(expression));
+      }
+    }
+    latent.features = Tape(features, symbols.state());
+    latent.kernel = Kernel::parse(text.kernel, latent.feature_names);
+
+    latent.directions_are_identity = text.directions.empty() || options.base.has_value();
+    if (latent.directions_are_identity) {
+      for (const Coordinate& coordinate : system.coordinates()) {
+        latent.column_names.push_back(latent.base == Latent::Base::force ? "force_" + coordinate.name : coordinate.acceleration());
+      }
+    } else {
+      std::vector<Expression> entries;
+      for (std::size_t column = 0; column < text.directions.front().size(); ++column) {
+        latent.column_names.push_back(fmt::format("direction {}", column + 1));
+        for (const std::vector<Expression>& row : text.directions) entries.push_back(row[column]);
+      }
+      latent.directions = Tape(entries, symbols.state_and_parameters());
+      for (Expression parameter : symbols.parameters) {
+        std::vector<Expression> derivatives;
+        for (Expression entry : entries) derivatives.push_back(graph.differentiate(entry, parameter));
+        latent.direction_derivatives.emplace_back(derivatives, symbols.state_and_parameters());
+      }
+    }
+    prior.latents.push_back(std::move(latent));
+  }
+  return prior;
+}
+
+}  // namespace gp2

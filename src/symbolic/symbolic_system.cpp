@@ -1,0 +1,201 @@
+#include "gp2/symbolic_system.hpp"
+
+#include <fmt/format.h>
+
+#include "gp2/error.hpp"
+
+namespace gp2 {
+
+using Eigen::MatrixXd;
+using Eigen::Ref;
+using Eigen::VectorXd;
+using Level = ConstraintRow::Level;
+
+SystemSymbols::SystemSymbols(ExpressionGraph& graph, const std::vector<Coordinate>& coordinates,
+                             const std::vector<std::string>& inputs, const std::vector<Parameter>& system_parameters)
+    : t(graph.variable("t")) {
+  for (const Coordinate& coordinate : coordinates) {
+    q.push_back(graph.variable(coordinate.name));
+    dq.push_back(graph.variable(coordinate.velocity()));
+    ddq.push_back(graph.variable(coordinate.acceleration()));
+  }
+  for (const std::string& input : inputs) u.push_back(graph.variable(input));
+  for (const Parameter& parameter : system_parameters) parameters.push_back(graph.variable(parameter.name));
+}
+
+std::vector<Expression> SystemSymbols::state() const {
+  std::vector<Expression> state = q;
+  state.insert(state.end(), dq.begin(), dq.end());
+  state.push_back(t);
+  state.insert(state.end(), u.begin(), u.end());
+  return state;
+}
+
+std::vector<Expression> SystemSymbols::state_and_parameters() const {
+  std::vector<Expression> all = state();
+  all.insert(all.end(), parameters.begin(), parameters.end());
+  return all;
+}
+
+namespace {
+
+void forbid(Expression c, const std::vector<Expression>& symbols, const char* level, const char* allowed) {
+  for (Expression symbol : symbols) {
+    if (c.graph().depends_on(c, symbol)) {
+      throw InputError(fmt::format("a {}-level constraint may depend on {} only, but this one depends on '{}'", level, allowed,
+                                   symbol.variable_name()));
+    }
+  }
+}
+
+// Σ_j ∂e/∂x_j ẋ_j
+Expression rate(Expression e, const std::vector<Expression>& x, const std::vector<Expression>& dx) {
+  ExpressionGraph& graph = e.graph();
+  Expression sum = graph.constant(0);
+  for (std::size_t j = 0; j < x.size(); ++j) sum = sum + graph.differentiate(e, x[j]) * dx[j];
+  return sum;
+}
+
+}  // namespace
+
+ConstraintRow derive_constraint(Level level, Expression c, std::string text, const SystemSymbols& symbols) {
+  ExpressionGraph& graph = c.graph();
+  ConstraintRow row{level, std::move(text), {}, c, {}};
+  Expression bias = c;  // the part of the differentiated constraint that has no ddq
+  const std::vector<Expression>* acted_on = &symbols.ddq;
+  switch (level) {
+    case Level::position: {
+      forbid(c, symbols.dq, "position", "coordinates, t and parameters");
+      forbid(c, symbols.ddq, "position", "coordinates, t and parameters");
+      forbid(c, symbols.u, "position", "coordinates, t and parameters");
+      // ċ = c_q dq + c_t,  c̈ = c_q ddq + (ċ)_q dq + (ċ)_t
+      const Expression c_rate = rate(c, symbols.q, symbols.dq) + graph.differentiate(c, symbols.t);
+      bias = rate(c_rate, symbols.q, symbols.dq) + graph.differentiate(c_rate, symbols.t);
+      row.residuals = {c, c_rate};
+      acted_on = &symbols.q;
+      break;
+    }
+    case Level::velocity:
+      forbid(c, symbols.ddq, "velocity", "coordinates, velocities, t and parameters");
+      forbid(c, symbols.u, "velocity", "coordinates, velocities, t and parameters");
+      // ċ = c_dq ddq + c_q dq + c_t
+      bias = rate(c, symbols.q, symbols.dq) + graph.differentiate(c, symbols.t);
+      row.residuals = {c};
+      acted_on = &symbols.dq;
+      break;
+    case Level::acceleration: {
+      std::map<std::string, Expression> at_rest;
+      for (Expression acceleration : symbols.ddq) at_rest.emplace(acceleration.variable_name(), graph.constant(0));
+      bias = graph.substitute(c, at_rest);
+      break;
+    }
+  }
+
+  bool acts = false;
+  for (Expression symbol : *acted_on) {
+    const Expression entry = graph.differentiate(c, symbol);
+    for (Expression acceleration : symbols.ddq) {
+      if (graph.depends_on(entry, acceleration)) {
+        throw InputError(fmt::format("an acceleration-level constraint must be linear in the accelerations, but the factor of '{}' "
+                                     "depends on '{}'",
+                                     symbol.variable_name(), acceleration.variable_name()));
+      }
+    }
+    acts = acts || !entry.is_constant(0);
+    row.A.push_back(entry);
+  }
+  if (!acts) {
+    throw InputError(fmt::format("the constraint does not depend on any {}: it cannot act on the motion",
+                                 level == Level::position   ? "coordinate"
+                                 : level == Level::velocity ? "velocity"
+                                                            : "acceleration"));
+  }
+  row.b = -bias;
+  return row;
+}
+
+namespace {
+
+// M (column-major), A (column-major), b, F in one list
+std::vector<Expression> outputs_of(const SymbolicSystem::Definition& definition) {
+  std::vector<Expression> outputs;
+  const std::size_t nq = definition.coordinates.size();
+  for (std::size_t j = 0; j < nq; ++j) {
+    for (std::size_t i = 0; i < nq; ++i) outputs.push_back(definition.mass[i][j]);
+  }
+  for (std::size_t j = 0; j < nq; ++j) {
+    for (const ConstraintRow& row : definition.constraints) outputs.push_back(row.A[j]);
+  }
+  for (const ConstraintRow& row : definition.constraints) outputs.push_back(row.b);
+  outputs.insert(outputs.end(), definition.force.begin(), definition.force.end());
+  return outputs;
+}
+
+std::vector<std::string> labels_of(const SymbolicSystem::Definition& definition) {
+  std::vector<std::string> labels;
+  for (const ConstraintRow& row : definition.constraints) labels.push_back(row.text);
+  return labels;
+}
+
+}  // namespace
+
+SymbolicSystem::SymbolicSystem(Definition definition)
+    : System(definition.name, definition.coordinates, definition.inputs, definition.parameters, labels_of(definition)),
+      definition_(std::move(definition)) {
+  ExpressionGraph& graph = *definition_.graph;
+  const SystemSymbols symbols(graph, coordinates(), inputs(), parameters());
+  const std::vector<Expression> tape_inputs = symbols.state_and_parameters();
+
+  const std::vector<Expression> outputs = outputs_of(definition_);
+  values_ = Tape(outputs, tape_inputs);
+  mechanics_ = Tape(std::span(outputs).first(outputs.size() - definition_.force.size()), tape_inputs);
+  force_ = Tape(definition_.force, tape_inputs);
+  for (Expression parameter : symbols.parameters) {
+    std::vector<Expression> derivatives;
+    derivatives.reserve(outputs.size());
+    for (Expression output : outputs) derivatives.push_back(graph.differentiate(output, parameter));
+    derivatives_.emplace_back(derivatives, tape_inputs);
+  }
+
+  std::vector<Expression> residuals;
+  for (std::size_t k = 0; k < definition_.constraints.size(); ++k) {
+    const ConstraintRow& row = definition_.constraints[k];
+    for (std::size_t r = 0; r < row.residuals.size(); ++r) {
+      const bool velocity = row.level == Level::velocity || r == 1;
+      residuals.push_back(row.residuals[r]);
+      residual_labels_.push_back({static_cast<int>(k), velocity, (r == 1 ? "d/dt of " : "") + row.text});
+    }
+  }
+  residuals_ = Tape(residuals, tape_inputs);
+}
+
+SystemValues SymbolicSystem::run(const Tape& tape, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters) const {
+  MatrixXd all;
+  tape.evaluate(states, parameters, all);
+  const Eigen::Index n_mass = nq() * nq();
+  const Eigen::Index n_A = nc() * nq();
+  return {all.topRows(n_mass), all.middleRows(n_mass, n_A), all.middleRows(n_mass + n_A, nc()), all.bottomRows(nq())};
+}
+
+SystemValues SymbolicSystem::evaluate(const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters) const {
+  return run(values_, states, parameters);
+}
+
+SystemValues SymbolicSystem::differentiate(const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters, int index) const {
+  return run(derivatives_[static_cast<std::size_t>(index)], states, parameters);
+}
+
+MatrixXd SymbolicSystem::residuals(const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters) const {
+  MatrixXd values;
+  residuals_.evaluate(states, parameters, values);
+  return values;
+}
+
+std::vector<bool> SymbolicSystem::reads(SystemPart part) const {
+  const Tape& tape = part == SystemPart::mechanics ? mechanics_ : part == SystemPart::force ? force_ : residuals_;
+  std::vector<bool> reads;
+  for (int k = 0; k < layout().size(); ++k) reads.push_back(tape.uses_input(k));
+  return reads;
+}
+
+}  // namespace gp2
