@@ -62,7 +62,10 @@ class ModelFile {
   [[nodiscard]] Expression expression(std::string_view text) const;
 
  private:
+  void define(const std::string& symbol, Expression value);
+
   std::map<std::string, Expression, std::less<>> symbols_;
+  std::vector<std::string> symbol_names_;  // to suggest from when a symbol is unknown
   friend class ModelReader;
 };
 

@@ -1,18 +1,21 @@
 #include "gp2/csv.hpp"
 
-#include <charconv>
+#include <fcntl.h>
+#include <fmt/format.h>
+#include <sys/stat.h>
+#include <unistd.h>
+
+#include <algorithm>
+#include <atomic>
 #include <cerrno>
+#include <charconv>
 #include <cmath>
 #include <cstring>
 #include <fstream>
 #include <iterator>
+#include <optional>
 #include <set>
 #include <system_error>
-
-#include <sys/stat.h>
-#include <unistd.h>
-
-#include <fmt/format.h>
 
 #include "gp2/error.hpp"
 
@@ -24,17 +27,61 @@ std::string_view trim(std::string_view text) {
   const auto is_space = [](char c) { return c == ' ' || c == '\t' || c == '\r'; };
   while (!text.empty() && is_space(text.front())) text.remove_prefix(1);
   while (!text.empty() && is_space(text.back())) text.remove_suffix(1);
-  if (text.size() >= 2 && text.front() == '"' && text.back() == '"') text = text.substr(1, text.size() - 2);
   return text;
 }
 
-std::vector<std::string> split(std::string_view line) {
+// the cell at the front of `line`, which is left with what follows its comma; nothing when a quote is not closed properly
+std::optional<std::string> take_cell(std::string_view& line) {
+  const std::size_t start = std::min(line.find_first_not_of(" \t"), line.size());
+  if (line.substr(start, 1) != "\"") {
+    const std::size_t end = std::min(line.find(','), line.size());
+    std::string cell(trim(line.substr(0, end)));
+    line.remove_prefix(end);
+    return cell;
+  }
+  line.remove_prefix(start + 1);
+  std::string cell;
+  while (true) {
+    const std::size_t quote = line.find('"');
+    if (quote == std::string_view::npos) return std::nullopt;
+    cell += line.substr(0, quote);
+    line.remove_prefix(quote + 1);
+    if (!line.starts_with('"')) break;
+    cell += '"';  // two quotes stand for one
+    line.remove_prefix(1);
+  }
+  const std::size_t end = std::min(line.find(','), line.size());
+  if (!trim(line.substr(0, end)).empty()) return std::nullopt;
+  line.remove_prefix(end);
+  return cell;
+}
+
+// the cells of a line; nothing when a quote is not closed properly
+std::optional<std::vector<std::string>> split(std::string_view line) {
   std::vector<std::string> cells;
   while (true) {
-    const std::size_t end = line.find(',');
-    cells.emplace_back(trim(line.substr(0, end)));
-    if (end == std::string_view::npos) return cells;
-    line.remove_prefix(end + 1);
+    std::optional<std::string> cell = take_cell(line);
+    if (!cell) return std::nullopt;
+    cells.push_back(std::move(*cell));
+    if (line.empty()) return cells;
+    line.remove_prefix(1);  // the comma
+  }
+}
+
+// names that are there, once each
+void check_header(const std::vector<std::string>& header, const std::string& where) {
+  if (header.size() == 1 && header[0].find_first_of(";\t") != std::string::npos) {
+    throw InputError(fmt::format("{}: the header is not separated by commas but by '{}'; write commas, and '.' as the decimal point",
+                                 where, header[0].find(';') != std::string::npos ? ";" : "tab"));
+  }
+  std::set<std::string_view> seen;
+  for (std::size_t k = 0; k < header.size(); ++k) {
+    if (header[k].empty()) {
+      throw InputError(fmt::format("{}: column {} of the header has no name; name it, or remove a comma too many", where, k + 1));
+    }
+    if (!seen.insert(header[k]).second) {
+      throw InputError(fmt::format("{}: the column '{}' stands twice in the header; rename or remove one", where, header[k]));
+    }
   }
 }
 
@@ -45,7 +92,7 @@ CsvTable CsvTable::read(const std::filesystem::path& path) { return parse(read_f
 CsvTable CsvTable::parse(std::string_view text, std::string name) {
   CsvTable table;
   table.name_ = std::move(name);
-  if (text.starts_with("\xef\xbb\xbf")) text.remove_prefix(3);
+  if (text.starts_with("\xef\xbb\xbf")) text.remove_prefix(3);  // the byte order mark of some spreadsheets
   int line_number = 0;
   while (!text.empty()) {
     const std::size_t end = text.find('\n');
@@ -53,26 +100,24 @@ CsvTable CsvTable::parse(std::string_view text, std::string name) {
     text.remove_prefix(end == std::string_view::npos ? text.size() : end + 1);
     ++line_number;
     if (trim(line).empty()) continue;
-    std::vector<std::string> cells = split(line);
+    const std::string where = fmt::format("{}:{}", table.name_, line_number);
+    std::optional<std::vector<std::string>> cells = split(trim(line));
+    if (!cells) throw InputError(fmt::format("{}: a quote \" is not closed before the comma or the end of the line", where));
     if (table.header_.empty()) {
-      std::set<std::string_view> seen;
-      for (const std::string& column : cells) {
-        if (column.empty()) throw InputError(fmt::format("{}:{}: the header has an empty column name", table.name_, line_number));
-        if (!seen.insert(column).second) {
-          throw InputError(fmt::format("{}:{}: the column '{}' stands twice in the header", table.name_, line_number, column));
-        }
-      }
-      table.header_ = std::move(cells);
+      check_header(*cells, where);
+      table.header_ = std::move(*cells);
       continue;
     }
-    if (cells.size() != table.header_.size()) {
-      throw InputError(fmt::format("{}:{}: ragged row: {} cells, but the header has {} columns", table.name_, line_number,
-                                   cells.size(), table.header_.size()));
+    if (cells->size() != table.header_.size()) {
+      throw InputError(fmt::format("{}: ragged row: {} cells, but the header has {} columns", where, cells->size(),
+                                   table.header_.size()));
     }
-    table.cells_.insert(table.cells_.end(), std::make_move_iterator(cells.begin()), std::make_move_iterator(cells.end()));
+    table.cells_.insert(table.cells_.end(), std::make_move_iterator(cells->begin()), std::make_move_iterator(cells->end()));
     table.lines_.push_back(line_number);
   }
-  if (table.header_.empty()) throw InputError(fmt::format("{}: the file is empty; expected a header line and data rows", table.name_));
+  if (table.header_.empty()) {
+    throw InputError(fmt::format("{}: the file is empty; expected a header line and data rows", table.name_));
+  }
   if (table.lines_.empty()) throw InputError(fmt::format("{}: no data rows after the header", table.name_));
   return table;
 }
@@ -89,16 +134,20 @@ const std::string& CsvTable::cell(int row, int column) const {
 }
 
 double CsvTable::number(int row, int column) const {
+  const auto fail = [&](const std::string& what) {
+    throw InputError(fmt::format("{}:{}: column '{}': {}", name_, lines_[static_cast<std::size_t>(row)],
+                                 header_[static_cast<std::size_t>(column)], what));
+  };
   const std::string& text = cell(row, column);
-  const char* first = text.data();
-  const char* last = first + text.size();
-  if (first != last && *first == '+') ++first;
+  std::string_view digits = trim(text);
+  if (digits.empty()) fail("the cell is empty; a number is needed here");
+  // from_chars knows no plus sign
+  if (digits.starts_with('+') && !digits.starts_with("+-")) digits.remove_prefix(1);
   double value = 0;
-  const auto [end, error] = std::from_chars(first, last, value);
-  if (first == last || end != last || error != std::errc() || !std::isfinite(value)) {
-    throw InputError(fmt::format("{}:{}: column '{}': '{}' is not a finite number", name_, lines_[static_cast<std::size_t>(row)],
-                                 header_[static_cast<std::size_t>(column)], text));
-  }
+  const auto [end, error] = std::from_chars(digits.data(), digits.data() + digits.size(), value);
+  const bool whole = end == digits.data() + digits.size();
+  if (whole && error == std::errc::result_out_of_range) fail(fmt::format("'{}' does not fit a double (5e-324 to 1.8e308)", text));
+  if (!whole || error != std::errc() || !std::isfinite(value)) fail(fmt::format("'{}' is not a finite number", text));
   return value;
 }
 
@@ -108,37 +157,79 @@ std::string shortest(double value) {
   return std::string(buffer, result.ptr);
 }
 
-void write_file(const std::filesystem::path& path, std::string_view content) {
-  const auto fail = [&](const char* what) {
-    throw InputError(fmt::format("{}: {}: {}", path.string(), what, std::strerror(errno)));
-  };
-  std::string temporary = path.string() + ".XXXXXX";
-  const int file = mkstemp(temporary.data());
-  if (file < 0) fail("cannot be written");
-  std::size_t done = 0;
-  bool good = fchmod(file, 0644) == 0;
-  while (good && done < content.size()) {
-    const ssize_t n = ::write(file, content.data() + done, content.size() - done);
-    if (n < 0 && errno == EINTR) continue;
-    good = n >= 0;
-    if (good) done += static_cast<std::size_t>(n);
+namespace {
+
+// Opens a new file beside `path`, with the permissions that the process gives to new files; −1 and errno when that fails.
+int open_beside(const std::string& path, std::string& temporary) {
+  static std::atomic<unsigned> counter = 0;  // threads of one process must not meet
+  while (true) {
+    temporary = fmt::format("{}.{}-{}.tmp", path, getpid(), counter++);
+    const int file = open(temporary.c_str(), O_WRONLY | O_CREAT | O_EXCL | O_CLOEXEC, 0666);
+    if (file >= 0 || errno != EEXIST) return file;
   }
-  good = good && fsync(file) == 0;
+}
+
+// all of `content`; false and errno when that fails
+bool write_all(int file, std::string_view content) {
+  while (!content.empty()) {
+    const ssize_t n = ::write(file, content.data(), content.size());
+    if (n < 0 && errno == EINTR) continue;
+    if (n < 0) return false;
+    content.remove_prefix(static_cast<std::size_t>(n));
+  }
+  return true;
+}
+
+}  // namespace
+
+void write_file(const std::filesystem::path& path, std::string_view content) {
+  const auto require = [&](bool good) {
+    if (!good) throw InputError(fmt::format("{}: cannot be written: {}", path.string(), std::strerror(errno)));
+  };
+  // a link stays; what it points at is replaced
+  std::error_code no_such_file;
+  const std::filesystem::path resolved = std::filesystem::canonical(path, no_such_file);
+  const std::string target = no_such_file ? path.string() : resolved.string();
+
+  struct stat old = {};
+  const bool exists = stat(target.c_str(), &old) == 0;
+  if (exists && S_ISDIR(old.st_mode)) {
+    errno = EISDIR;
+    require(false);
+  }
+  // /dev/stdout, a pipe: nothing to replace, and a rename would destroy the device
+  if (exists && !S_ISREG(old.st_mode)) {
+    const int device = open(target.c_str(), O_WRONLY | O_CLOEXEC);
+    require(device >= 0);
+    const bool good = write_all(device, content);
+    require(close(device) == 0 && good);
+    return;
+  }
+
+  std::string temporary;
+  const int file = open_beside(target, temporary);
+  require(file >= 0);
+  bool good = !exists || fchmod(file, old.st_mode & 07777) == 0;
+  good = good && write_all(file, content) && fsync(file) == 0;
   good = close(file) == 0 && good;
-  good = good && std::rename(temporary.c_str(), path.c_str()) == 0;
+  good = good && std::rename(temporary.c_str(), target.c_str()) == 0;
   if (!good) {
     const int reason = errno;
     unlink(temporary.c_str());
     errno = reason;
-    fail("cannot be written");
+    require(false);
   }
 }
 
 std::string read_file(const std::filesystem::path& path) {
-  std::ifstream file(path, std::ios::binary);
-  if (!file || std::filesystem::is_directory(path)) {
-    throw InputError(fmt::format("{}: cannot be read; is the path right?", path.string()));
+  const auto fail = [&] { throw InputError(fmt::format("{}: cannot be read: {}", path.string(), std::strerror(errno))); };
+  std::error_code unknown;
+  if (std::filesystem::is_directory(path, unknown)) {
+    errno = EISDIR;
+    fail();
   }
+  std::ifstream file(path, std::ios::binary);
+  if (!file) fail();
   return {std::istreambuf_iterator<char>(file), {}};
 }
 

@@ -1,9 +1,10 @@
 #include "gp2/log_reader.hpp"
 
-#include <limits>
-
 #include <fmt/format.h>
 #include <fmt/ranges.h>
+
+#include <algorithm>
+#include <limits>
 
 #include "gp2/error.hpp"
 
@@ -25,16 +26,21 @@ std::string number_after(const std::string& prefix, const std::string& name) {
 
 LogReader::LogReader(const CsvTable& table, const System& system, const std::map<std::string, std::string>& columns)
     : table_(table), system_(system), columns_(columns) {
+  std::vector<std::string> own_names = system.state_names();
+  for (const Coordinate& coordinate : system.coordinates()) own_names.push_back(coordinate.acceleration());
+
   for (const Coordinate& coordinate : system.coordinates()) {
     // a renamed coordinate brings its derivatives along
     if (const auto renamed = columns.find(coordinate.name); renamed != columns.end()) {
       columns_.emplace(coordinate.velocity(), "d" + renamed->second);
       columns_.emplace(coordinate.acceleration(), "dd" + renamed->second);
+      aliases_[coordinate.velocity()] = {renamed->second + "_dot"};
+      aliases_[coordinate.acceleration()] = {renamed->second + "_ddot"};
     }
     const std::string number = number_after("q", coordinate.name);
     if (!number.empty()) {
-      aliases_[coordinate.velocity()] = {"qd" + number, "v" + number, "qvel" + number};
-      aliases_[coordinate.acceleration()] = {"qdd" + number, "a" + number, "qacc" + number};
+      for (const char* velocity : {"qd", "v", "qvel"}) aliases_[coordinate.velocity()].push_back(velocity + number);
+      for (const char* acceleration : {"qdd", "a", "qacc"}) aliases_[coordinate.acceleration()].push_back(acceleration + number);
     }
     aliases_[coordinate.velocity()].push_back(coordinate.name + "_dot");
     aliases_[coordinate.acceleration()].push_back(coordinate.name + "_ddot");
@@ -45,6 +51,12 @@ LogReader::LogReader(const CsvTable& table, const System& system, const std::map
     if (input == "u") aliases_[input] = {"tau"};
   }
   aliases_["t"] = {"time", "timestamp"};
+  // in a model with a coordinate v1, the column v1 is that coordinate, not the velocity of q1
+  for (auto& [name, aliases] : aliases_) {
+    std::erase_if(aliases, [&](const std::string& alias) {
+      return std::find(own_names.begin(), own_names.end(), alias) != own_names.end();
+    });
+  }
 }
 
 int LogReader::find(const std::string& name) const {

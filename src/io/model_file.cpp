@@ -1,16 +1,15 @@
 #include "gp2/model_file.hpp"
 
-#include <algorithm>
-#include <cmath>
-#include <fstream>
-#include <iterator>
-#include <set>
-#include <sstream>
-
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 #include <toml++/toml.h>
 
+#include <algorithm>
+#include <cmath>
+#include <set>
+#include <sstream>
+
+#include "gp2/csv.hpp"
 #include "gp2/error.hpp"
 #include "training/random.hpp"
 
@@ -29,6 +28,91 @@ bool is_identifier(std::string_view name) {
 }
 
 int line_of(const toml::node& node) { return static_cast<int>(node.source().begin.line); }
+
+// a value as the file has it, to show what was got
+std::string written(const toml::node& node) {
+  if (node.is_table()) return "a table";
+  std::ostringstream text;
+  node.visit([&](const auto& value) { text << value; });
+  std::string shown = text.str();
+  return shown.size() <= 60 ? shown : shown.substr(0, 57) + "...";
+}
+
+// TOML tables are sorted by name here; the file's own order reads better and is the order in which complaints come
+std::vector<std::pair<std::string, const toml::node*>> entries_of(const toml::table& table) {
+  std::vector<std::pair<std::string, const toml::node*>> entries;
+  for (const auto& [name, node] : table) entries.emplace_back(name.str(), &node);
+  std::stable_sort(entries.begin(), entries.end(), [](const auto& a, const auto& b) {
+    const auto& from = a.second->source().begin;
+    const auto& to = b.second->source().begin;
+    return std::pair(from.line, from.column) < std::pair(to.line, to.column);
+  });
+  return entries;
+}
+
+// the names in an expression's text: words that begin with a letter
+std::set<std::string> words_of(std::string_view text) {
+  const auto in_word = [](char c) {
+    return (c >= 'a' && c <= 'z') || (c >= 'A' && c <= 'Z') || (c >= '0' && c <= '9') || c == '_';
+  };
+  std::set<std::string> words;
+  for (std::size_t at = 0; at < text.size();) {
+    std::size_t end = at;
+    while (end < text.size() && in_word(text[end])) ++end;
+    if (const std::string_view word = text.substr(at, end - at); is_identifier(word)) words.emplace(word);
+    at = std::max(end, at + 1);
+  }
+  return words;
+}
+
+// Positions 0 … n−1 such that each comes after those it uses, or the positions of a circle.
+struct Order {
+  std::vector<std::size_t> positions;
+  std::vector<std::size_t> circle;
+};
+
+Order order_by_use(const std::vector<std::vector<std::size_t>>& uses) {
+  enum class Mark { untouched, open, done };
+  std::vector<Mark> marks(uses.size(), Mark::untouched);
+  Order order;
+  // depth first, on a stack of our own: a chain of names may be as long as the file
+  std::vector<std::pair<std::size_t, std::size_t>> path;  // position, how many of its uses have been visited
+  for (std::size_t root = 0; root < uses.size(); ++root) {
+    if (marks[root] == Mark::untouched) path.emplace_back(root, 0);
+    while (!path.empty()) {
+      const std::size_t at = path.back().first;
+      marks[at] = Mark::open;
+      if (path.back().second == uses[at].size()) {
+        marks[at] = Mark::done;
+        order.positions.push_back(at);
+        path.pop_back();
+        continue;
+      }
+      const std::size_t next = uses[at][path.back().second++];
+      if (marks[next] == Mark::untouched) path.emplace_back(next, 0);
+      if (marks[next] == Mark::open) {
+        const auto start = std::find_if(path.begin(), path.end(), [&](const auto& step) { return step.first == next; });
+        for (auto step = start; step != path.end(); ++step) order.circle.push_back(step->first);
+        return order;
+      }
+    }
+  }
+  return order;
+}
+
+// a feature that is an angle becomes its sine and cosine
+std::vector<std::string> expand_angle(const std::string& feature, const std::vector<Coordinate>& coordinates) {
+  const bool angle =
+      std::any_of(coordinates.begin(), coordinates.end(), [&](const Coordinate& c) { return c.angle && c.name == feature; });
+  if (!angle) return {feature};
+  return {fmt::format("sin({})", feature), fmt::format("cos({})", feature)};
+}
+
+// a complaint that names its file, line and key already
+class LocatedError : public InputError {
+ public:
+  using InputError::InputError;
+};
 
 }  // namespace
 
@@ -49,11 +133,7 @@ class ModelReader {
     read_let();
     read_mechanics();
     read_constraints();
-    try {
-      model_.system = std::make_shared<const SymbolicSystem>(definition_);
-    } catch (const InputError& error) {
-      throw InputError(fmt::format("{}: {}", model_.name, error.what()));
-    }
+    model_.system = std::make_shared<const SymbolicSystem>(definition_);
     check_mass_symmetry();
     read_latents();
     read_noise();
@@ -67,49 +147,49 @@ class ModelReader {
     fail(line_of(node), key, message);
   }
   [[noreturn]] void fail(int line, const std::string& key, const std::string& message) const {
-    throw InputError(fmt::format("{}:{}: {}: {}", model_.name, line, key, message));
+    throw LocatedError(fmt::format("{}:{}: {}: {}", model_.name, line, key, message));
   }
 
   // ---- pieces of TOML -------------------------------------------------------------------------------------------------------------
 
   void only_keys(const toml::table& table, const std::string& where, const std::vector<std::string>& known) const {
-    for (const auto& [key, node] : table) {
-      if (std::find(known.begin(), known.end(), key.str()) == known.end()) {
-        fail(node, where.empty() ? std::string(key.str()) : where + "." + std::string(key.str()),
+    for (const auto& [key, node] : entries_of(table)) {
+      if (std::find(known.begin(), known.end(), key) == known.end()) {
+        fail(*node, where.empty() ? key : fmt::format("{}.{}", where, key),
              fmt::format("unknown key; known here: {}", fmt::join(known, ", ")));
       }
     }
   }
 
   const toml::table& table(const toml::node& node, const std::string& key) const {
-    if (!node.is_table()) fail(node, key, "expected a table");
+    if (!node.is_table()) fail(node, key, fmt::format("expected a table, got {}", written(node)));
     return *node.as_table();
   }
 
   const toml::array& array(const toml::node& node, const std::string& key) const {
-    if (!node.is_array()) fail(node, key, "expected an array [ … ]");
+    if (!node.is_array()) fail(node, key, fmt::format("expected an array [ … ], got {}", written(node)));
     return *node.as_array();
   }
 
   std::string text(const toml::node& node, const std::string& key) const {
-    if (!node.is_string()) fail(node, key, "expected a text in quotes");
+    if (!node.is_string()) fail(node, key, fmt::format("expected a text in quotes, got {}", written(node)));
     return node.as_string()->get();
   }
 
   double number(const toml::node& node, const std::string& key) const {
     const std::optional<double> value = node.is_number() ? node.value<double>() : std::nullopt;
-    if (!value || !std::isfinite(*value)) fail(node, key, "expected a finite number");
+    if (!value || !std::isfinite(*value)) fail(node, key, fmt::format("expected a finite number, got {}", written(node)));
     return *value;
   }
 
   bool boolean(const toml::node& node, const std::string& key) const {
-    if (!node.is_boolean()) fail(node, key, "expected true or false");
+    if (!node.is_boolean()) fail(node, key, fmt::format("expected true or false, got {}", written(node)));
     return node.as_boolean()->get();
   }
 
   std::pair<double, double> range(const toml::node& node, const std::string& key) const {
     const toml::array& pair = array(node, key);
-    if (pair.size() != 2) fail(node, key, fmt::format("expected [lower, upper], got {} numbers", pair.size()));
+    if (pair.size() != 2) fail(node, key, fmt::format("expected [lower, upper], got {}", written(node)));
     const double lower = number(*pair.get(0), key);
     const double upper = number(*pair.get(1), key);
     if (!(lower < upper)) fail(node, key, fmt::format("the lower end {} must be below the upper end {}", lower, upper));
@@ -119,14 +199,15 @@ class ModelReader {
   // an expression given as text or as a number
   Expression expression(const toml::node& node, const std::string& key) const {
     if (node.is_number()) return definition_.graph->constant(number(node, key));
+    if (!node.is_string()) fail(node, key, fmt::format("expected an expression in quotes, or a number, got {}", written(node)));
     try {
       return model_.expression(text(node, key));
     } catch (const InputError& error) {
-      const std::string what = error.what();
-      if (what.starts_with(model_.name + ":")) throw;
-      fail(node, key, what);
+      fail(node, key, fmt::format("{} in \"{}\"", error.what(), shortened(text(node, key))));
     }
   }
+
+  static std::string shortened(const std::string& text) { return text.size() <= 60 ? text : text.substr(0, 57) + "..."; }
 
   // ---- the tables of a model ------------------------------------------------------------------------------------------------------
 
@@ -172,16 +253,8 @@ class ModelReader {
 
   void read_parameters() {
     if (!root_.contains("parameters")) return;
-    // TOML tables are sorted by key here; the file's own order reads better
-    std::vector<std::pair<std::string, const toml::node*>> entries;
-    for (const auto& [name, node] : table(*root_.get("parameters"), "parameters")) entries.emplace_back(name.str(), &node);
-    std::stable_sort(entries.begin(), entries.end(), [](const auto& a, const auto& b) {
-      const auto& from = a.second->source().begin;
-      const auto& to = b.second->source().begin;
-      return std::pair(from.line, from.column) < std::pair(to.line, to.column);
-    });
-    for (const auto& [name, node] : entries) {
-      const std::string key = "parameters." + name;
+    for (const auto& [name, node] : entries_of(table(*root_.get("parameters"), "parameters"))) {
+      const std::string key = fmt::format("parameters.{}", name);
       declare(name, *node, key);
       Parameter parameter{name, 0, std::nullopt, false};
       if (node->is_table()) {
@@ -204,49 +277,46 @@ class ModelReader {
 
   void declare_symbols() {
     symbols_.emplace(*definition_.graph, definition_.coordinates, definition_.inputs, definition_.parameters);
-    for (Expression symbol : symbols_->state_and_parameters()) model_.symbols_.emplace(symbol.variable_name(), symbol);
-    for (Expression symbol : symbols_->ddq) model_.symbols_.emplace(symbol.variable_name(), symbol);
+    for (Expression symbol : symbols_->state_and_parameters()) model_.define(symbol.variable_name(), symbol);
+    for (Expression symbol : symbols_->ddq) model_.define(symbol.variable_name(), symbol);
   }
 
   // names may stand in any order and use each other, but not in a circle
   void read_let() {
     if (!root_.contains("let")) return;
-    const toml::table& let = table(*root_.get("let"), "let");
-    for (const auto& [name, node] : let) declare(std::string(name.str()), node, "let." + std::string(name.str()));
-    std::set<std::string> open;
-    const auto resolve = [&](const auto& self, const std::string& name) -> void {
-      const toml::node& node = *let.get(name);
-      const std::string key = "let." + name;
-      if (!open.insert(name).second) fail(node, key, "defined in terms of itself");
-      if (open.size() > 200) fail(node, key, "nested deeper than 200 names");
-      Expression value;
-      if (node.is_number()) {
-        value = definition_.graph->constant(number(node, key));
-      } else {
-        const std::string written = text(node, key);
-        // define what it uses first
-        for (const auto& [other, other_node] : let) {
-          const std::string other_name(other.str());
-          if (!model_.symbols_.contains(other_name) && mentions(written, other_name)) self(self, other_name);
-        }
-        value = expression(node, key);
+    const auto entries = entries_of(table(*root_.get("let"), "let"));
+    std::map<std::string, std::size_t> position;
+    for (const auto& [name, node] : entries) {
+      declare(name, *node, fmt::format("let.{}", name));
+      position.emplace(name, position.size());
+    }
+    std::vector<std::vector<std::size_t>> uses;
+    for (const auto& [name, node] : entries) {
+      uses.emplace_back();
+      if (!node->is_string()) continue;
+      for (const std::string& word : words_of(node->as_string()->get())) {
+        if (const auto other = position.find(word); other != position.end()) uses.back().push_back(other->second);
       }
-      model_.symbols_.emplace(name, value);
-      open.erase(name);
-    };
-    for (const auto& [name, node] : let) {
-      if (!model_.symbols_.contains(std::string(name.str()))) resolve(resolve, std::string(name.str()));
+    }
+    const Order order = order_by_use(uses);
+    if (!order.circle.empty()) {
+      const auto& [name, node] = entries[order.circle.front()];
+      fail(*node, fmt::format("let.{}", name), "defined in terms of itself" + circle_text(order.circle, entries));
+    }
+    for (const std::size_t k : order.positions) {
+      const auto& [name, node] = entries[k];
+      model_.define(name, expression(*node, fmt::format("let.{}", name)));
     }
   }
 
-  // whether `name` stands in `written` as a whole word
-  static bool mentions(const std::string& written, const std::string& name) {
-    const auto in_word = [](char c) { return std::isalnum(static_cast<unsigned char>(c)) || c == '_'; };
-    for (std::size_t at = written.find(name); at != std::string::npos; at = written.find(name, at + 1)) {
-      const std::size_t end = at + name.size();
-      if ((at == 0 || !in_word(written[at - 1])) && (end == written.size() || !in_word(written[end]))) return true;
-    }
-    return false;
+  // ": a uses b uses a"
+  template <class Entries>
+  static std::string circle_text(const std::vector<std::size_t>& circle, const Entries& entries) {
+    constexpr std::size_t enough = 8;
+    std::string text = ": ";
+    for (std::size_t k = 0; k < std::min(circle.size(), enough); ++k) text += fmt::format("{} uses ", entries[circle[k]].first);
+    if (circle.size() > enough) text += "… uses ";
+    return text + entries[circle.front()].first;
   }
 
   void read_mechanics() {
@@ -295,8 +365,9 @@ class ModelReader {
 
   void allow_only(const toml::node& node, const std::string& key, Expression e, const std::vector<Expression>& forbidden,
                   const char* rule) const {
+    const std::vector<std::string> used = definition_.graph->variables_of(e);
     for (Expression symbol : forbidden) {
-      if (definition_.graph->depends_on(e, symbol)) {
+      if (std::binary_search(used.begin(), used.end(), symbol.variable_name())) {
         fail(node, key, fmt::format("{}, but this entry depends on '{}'", rule, symbol.variable_name()));
       }
     }

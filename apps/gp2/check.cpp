@@ -1,0 +1,96 @@
+#include "gp2/check.hpp"
+
+#include <limits>
+#include <memory>
+
+#include <fmt/format.h>
+#include <fmt/ranges.h>
+
+#include "command.hpp"
+#include "gp2/csv.hpp"
+#include "gp2/error.hpp"
+#include "gp2/generate.hpp"
+#include "gp2/log_reader.hpp"
+
+namespace gp2::command {
+
+namespace {
+
+struct Arguments {
+  std::string model, data, map;
+};
+
+int print(const std::vector<Finding>& findings) {
+  int n_errors = 0;
+  for (const Finding& finding : findings) {
+    const char* mark = finding.level == Finding::Level::good ? "ok     " : finding.level == Finding::Level::warning ? "warning" : "ERROR  ";
+    fmt::print("{}  {}\n", mark, finding.text);
+    if (finding.level == Finding::Level::error) ++n_errors;
+  }
+  return n_errors;
+}
+
+// the log's states and accelerations; a column that is missing is an error only where the model cannot do without
+struct Log {
+  Eigen::MatrixXd states, accelerations;
+};
+
+Log read_log(const ModelFile& model, const Arguments& arguments) {
+  const CsvTable table = CsvTable::read(arguments.data);
+  std::map<std::string, std::string> columns = parse_map(arguments.map);
+  columns.insert(model.columns.begin(), model.columns.end());
+  LogReader reader(table, *model.system, columns);
+  std::vector<bool> reads = make_prior(model).reads();
+  const std::vector<std::string> names = model.system->state_names();
+  for (std::size_t k = 0; k < reads.size(); ++k) reads[k] = reads[k] || reader.has(names[k]);
+  Log log{reader.states(reads),
+          Eigen::MatrixXd::Constant(model.system->nq(), table.n_rows(), std::numeric_limits<double>::quiet_NaN())};
+  std::vector<std::string> missing;
+  for (int j = 0; j < model.system->nq(); ++j) {
+    const std::string name = model.system->coordinates()[static_cast<std::size_t>(j)].acceleration();
+    if (reader.has(name)) {
+      log.accelerations.row(j) = reader.values({name});
+    } else {
+      missing.push_back(name);
+    }
+  }
+  fmt::print("ok       {}: {} rows, every column found that the model reads\n", arguments.data, table.n_rows());
+  if (!missing.empty()) fmt::print("warning  not in the log: {}; fit with --observe for the others\n", fmt::join(missing, ", "));
+  for (const auto& [name, found] : reader.aliases_used()) fmt::print("ok       column '{}' taken as {}\n", found, name);
+  const std::vector<std::string> unused = reader.unused_columns();
+  if (!unused.empty()) fmt::print("ok       columns not needed: {}\n", fmt::join(unused, ", "));
+  return log;
+}
+
+void run(const Arguments& arguments) {
+  const ModelFile model = ModelFile::read(arguments.model);
+  const System& system = *model.system;
+  fmt::print("ok       {}: '{}', {} coordinates, {} constraints\n", arguments.model, system.name(), system.nq(), system.nc());
+  int n_errors = 0;
+  if (!arguments.data.empty()) {
+    const Log log = read_log(model, arguments);
+    n_errors += print(check_system(system, log.states, system.parameter_values()));
+    if (n_errors == 0) n_errors += print(check_data(system, log.states, system.parameter_values(), log.accelerations));
+  } else if (!model.sampling.empty() && !model.truth.empty()) {
+    const GeneratedData data = generate(model, {100, 1, Eigen::VectorXd::Zero(system.nq())});
+    n_errors += print(check_system(system, data.states, system.parameter_values()));
+  } else {
+    fmt::print("warning  no --data and no [sampling] in the model: nothing to evaluate it at\n");
+  }
+  if (n_errors > 0) throw InputError(fmt::format("{}: {} of the checks failed", arguments.model, n_errors));
+}
+
+}  // namespace
+
+void add_check(CLI::App& app) {
+  CLI::App* command = app.add_subcommand(
+      "check", "Is a model well-posed, and does a log fit it? Rank, definiteness, derivatives, data on the constraint, dependent columns");
+  auto arguments = std::make_shared<Arguments>();
+  command->add_option("MODEL", arguments->model, "model file")->required();
+  command->add_option("--data", arguments->data, "CSV log (default: states drawn from the model's [sampling])");
+  command->add_option("--map", arguments->map, "columns by other names, LOGNAME=MODELNAME,…");
+  command->footer("Example:\n  gp2 check models/double_pendulum.toml --data train.csv");
+  command->callback([arguments] { run(*arguments); });
+}
+
+}  // namespace gp2::command

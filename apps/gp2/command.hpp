@@ -1,0 +1,29 @@
+#pragma once
+
+#include <map>
+#include <string>
+#include <vector>
+
+#include <CLI/CLI.hpp>
+
+namespace gp2::command {
+
+// One function per subcommand: declares its arguments; its callback does the work.
+void add_show(CLI::App& app);
+void add_check(CLI::App& app);
+void add_generate(CLI::App& app);
+void add_fit(CLI::App& app);
+void add_predict(CLI::App& app);
+void add_evaluate(CLI::App& app);
+
+/// "theta1=q3,theta2=q6" -> model's name -> log's name.
+/// @throws InputError when it is not of that form.
+std::map<std::string, std::string> parse_map(const std::string& text);
+
+/// "a,b" -> {"a", "b"}; empty for "" .
+std::vector<std::string> parse_list(const std::string& text);
+
+/// Prints talk to stderr, a line each.
+void talk(const std::vector<std::string>& notes);
+
+}  // namespace gp2::command

@@ -1,0 +1,167 @@
+#include <cmath>
+#include <cstdio>
+#include <memory>
+
+#include <unistd.h>
+
+#include <fmt/format.h>
+#include <fmt/ranges.h>
+#include <nlohmann/json.hpp>
+
+#include "command.hpp"
+#include "gp2/csv.hpp"
+#include "gp2/error.hpp"
+#include "gp2/fit_problem.hpp"
+
+namespace gp2::command {
+
+namespace {
+
+using Json = nlohmann::ordered_json;
+
+struct Arguments {
+  std::string model, data, map, observe, mean = "zero", prior, noise, protocol = "default", hyperprior = "default", start, output;
+  std::optional<std::string> estimate;
+  int restarts = 5, max_iterations = 1000, threads = 0;
+  std::optional<int> max_points;
+  std::uint64_t seed = 0;
+  bool json = false;
+};
+
+FitProblemOptions problem_options(const Arguments& arguments) {
+  FitProblemOptions options;
+  options.columns = parse_map(arguments.map);
+  options.observe = parse_list(arguments.observe);
+  options.mean = arguments.mean == "force" ? Prior::Mean::force : Prior::Mean::zero;
+  if (!arguments.prior.empty()) options.base = arguments.prior == "force" ? Latent::Base::force : Latent::Base::acceleration;
+  if (arguments.estimate) {
+    options.estimate = *arguments.estimate == "none" ? std::vector<std::string>{} : parse_list(*arguments.estimate);
+  }
+  if (arguments.noise == "estimate") {
+    options.estimate_noise = true;
+  } else if (!arguments.noise.empty()) {
+    double value = 0;
+    if (!CLI::detail::lexical_cast(arguments.noise, value) || !(value > 0) || !std::isfinite(value)) {
+      throw InputError(fmt::format("--noise-std: expected a positive number or 'estimate', got '{}'", arguments.noise));
+    }
+    options.noise_stddev = value;
+  }
+  options.protocol.name = arguments.protocol == "paper" ? Protocol::Name::paper : Protocol::Name::standard;
+  options.protocol.hyperprior = arguments.hyperprior == "default";
+  options.max_points = arguments.max_points;
+  options.seed = arguments.seed;
+  return options;
+}
+
+// one line that rewrites itself, on a terminal only
+void print_progress(const Progress& p) {
+  const double left = p.fraction > 0 ? p.seconds * (1 - p.fraction) / p.fraction : 0;
+  fmt::print(stderr, "\rgp2: restart {}/{}  iteration {}  best {:.4f}  about {:.0f} s left   ", p.restart + 1, p.n_restarts, p.iteration,
+             p.best, left);
+  std::fflush(stderr);
+}
+
+Json to_json(const FitReport& report) {
+  Json hyperparameters = Json::array();
+  for (const Hyperparameter& h : report.hyperparameters) {
+    hyperparameters.push_back({{"name", h.name},
+                               {"value", h.value},
+                               {"lower", h.lower},
+                               {"upper", h.upper},
+                               {"unit", h.unit},
+                               {"at_bound", h.at_bound()}});
+  }
+  return {{"nll", report.negative_log_likelihood},
+          {"termination", report.termination},
+          {"converged", report.converged},
+          {"iterations", report.iterations},
+          {"seconds", report.seconds},
+          {"hyperparameters", hyperparameters}};
+}
+
+void print_text(const FitReport& report) {
+  fmt::print("negative log likelihood {:.6f}\n", report.negative_log_likelihood);
+  fmt::print("{} after {} iterations ({} restarts, best: {}), {:.2f} s\n", report.termination, report.iterations, report.restarts.size(),
+             report.best_restart + 1, report.seconds);
+  for (const Hyperparameter& h : report.hyperparameters) {
+    fmt::print("  {:<34} {:>13.6g}   [{:.3g}, {:.3g}]{}\n", h.name, h.value, h.lower, h.upper, h.at_bound() ? "   at its bound" : "");
+  }
+}
+
+void run(const Arguments& arguments) {
+  if (arguments.restarts < 1) throw InputError(fmt::format("--restarts: must be positive, got {}", arguments.restarts));
+  if (arguments.max_iterations < 0) throw InputError("--max-iterations: must not be negative");
+  if (arguments.max_points && *arguments.max_points < 1) throw InputError("--max-points: must be positive");
+  if (arguments.threads < 0) throw InputError("--threads: must not be negative");
+  FitFile file;
+  file.model = ModelFile::read(arguments.model);
+  const CsvTable log = CsvTable::read(arguments.data);
+  FitProblem problem = make_fit_problem(file.model, log, problem_options(arguments));
+  if (!arguments.start.empty()) read_start_values(arguments.start, problem.hyperparameters);
+  talk(problem.notes);
+
+  FitOptions options;
+  options.n_restarts = arguments.restarts;
+  options.max_iterations = arguments.max_iterations;
+  options.seed = arguments.seed;
+  options.n_threads = arguments.threads;
+  const bool terminal = isatty(STDERR_FILENO) != 0;
+  if (terminal) options.progress = print_progress;
+  Fit result = fit(problem.prior, problem.observations, problem.hyperparameters, options);
+  if (terminal) fmt::print(stderr, "\r\033[K");
+
+  std::vector<std::string> at_bound;
+  for (const Hyperparameter& h : result.report.hyperparameters) {
+    if (h.at_bound() && h.kind == Hyperparameter::Kind::noise_stddev) at_bound.push_back(h.name);
+  }
+  if (!at_bound.empty()) {
+    talk({fmt::format("warning: {} ended at a bound: the columns may not be independent measurements; see gp2 check",
+                      fmt::join(at_bound, ", "))});
+  }
+  file.prior_options = problem.prior_options;
+  file.data_source = arguments.data;
+  file.observations = std::move(problem.observations);
+  file.report = result.report;
+  file.write(arguments.output);
+  if (arguments.json) {
+    fmt::print("{}\n", to_json(result.report).dump(2));
+  } else {
+    print_text(result.report);
+  }
+}
+
+}  // namespace
+
+void add_fit(CLI::App& app) {
+  CLI::App* command = app.add_subcommand("fit", "Fit a model to a log of states and accelerations");
+  auto a = std::make_shared<Arguments>();
+  command->add_option("MODEL", a->model, "model file")->required();
+  command->add_option("--data", a->data, "CSV log; columns are found by name, in any order")->required();
+  command->add_option("--map", a->map, "columns by other names, LOGNAME=MODELNAME,…: theta1=q3 also brings dtheta1, ddtheta1");
+  command->add_option("--observe", a->observe, "accelerations to learn from, ddq3,ddq6 (default: all)");
+  command->add_option("--mean", a->mean, "prior mean of the unconstrained acceleration: zero, or force = M⁻¹F of the model")
+      ->check(CLI::IsMember({"zero", "force"}))
+      ->capture_default_str();
+  command->add_option("--prior", a->prior, "put the model's latent on the acceleration or on the force (default: as the model says)")
+      ->check(CLI::IsMember({"acceleration", "force"}));
+  command->add_option("--estimate", a->estimate, "parameters to estimate, p1,p2, or none (default: those the model says)");
+  command->add_option("--noise-std", a->noise, "noise standard deviation of every observed ddq, or 'estimate' (default: as the model says)");
+  command->add_option("--protocol", a->protocol, "default, or paper: the set-up of Geist & Trimpe 2020")
+      ->check(CLI::IsMember({"default", "paper"}))
+      ->capture_default_str();
+  command->add_option("--hyperprior", a->hyperprior, "weak log-normal hyper-priors, or none: maximum likelihood")
+      ->check(CLI::IsMember({"default", "none"}))
+      ->capture_default_str();
+  command->add_option("--restarts", a->restarts, "runs of the optimiser; the first starts at the model's values")->capture_default_str();
+  command->add_option("--max-iterations", a->max_iterations, "per run; 0 conditions at the starting values")->capture_default_str();
+  command->add_option("--start", a->start, "starting values: {\"name\": value, …} as JSON, or a FIT.json");
+  command->add_option("--max-points", a->max_points, "take this many rows, the first of a shuffle by --seed");
+  command->add_option("--seed", a->seed, "of restarts and --max-points")->capture_default_str();
+  command->add_option("--threads", a->threads, "0: as many as the machine has; results do not depend on it")->capture_default_str();
+  command->add_flag("--json", a->json, "report as JSON on stdout");
+  command->add_option("-o,--output", a->output, "fitted model to write (JSON)")->required();
+  command->footer("Example:\n  gp2 fit models/surface.toml --data train.csv --mean force -o fit.json");
+  command->callback([a] { run(*a); });
+}
+
+}  // namespace gp2::command

@@ -1,0 +1,109 @@
+#include <memory>
+
+#include <fmt/format.h>
+#include <fmt/ranges.h>
+
+#include "command.hpp"
+#include "gp2/model_file.hpp"
+
+namespace gp2::command {
+
+namespace {
+
+struct Arguments {
+  std::string model;
+  bool latex = false;
+};
+
+std::string matrix_text(const std::vector<std::vector<Expression>>& rows) {
+  // columns aligned
+  std::vector<std::size_t> widths;
+  for (const auto& row : rows) {
+    widths.resize(std::max(widths.size(), row.size()));
+    for (std::size_t j = 0; j < row.size(); ++j) widths[j] = std::max(widths[j], to_string(row[j]).size());
+  }
+  std::string out;
+  for (const auto& row : rows) {
+    out += "  [";
+    for (std::size_t j = 0; j < row.size(); ++j) out += fmt::format("{}{:<{}}", j == 0 ? " " : "   ", to_string(row[j]), widths[j]);
+    out += " ]\n";
+  }
+  return out.empty() ? "  (no rows)\n" : out;
+}
+
+std::string matrix_latex(const char* name, const std::vector<std::vector<Expression>>& rows) {
+  std::string out = fmt::format("{} = \\begin{{bmatrix}}\n", name);
+  for (std::size_t i = 0; i < rows.size(); ++i) {
+    std::vector<std::string> entries;
+    for (Expression entry : rows[i]) entries.push_back(to_string(entry, Notation::latex));
+    out += fmt::format("  {}{}\n", fmt::join(entries, " & "), i + 1 < rows.size() ? " \\\\" : "");
+  }
+  return out + "\\end{bmatrix}\n";
+}
+
+void print_latex(const SymbolicSystem::Definition& definition, const std::vector<std::vector<Expression>>& A,
+                 const std::vector<std::vector<Expression>>& b, const std::vector<std::vector<Expression>>& F) {
+  fmt::print("\\begin{{align*}}\n{}\\\\\n{}\\\\\n{}\\\\\n{}\\end{{align*}}\n", matrix_latex("M", definition.mass), matrix_latex("F", F),
+             matrix_latex("A", A), matrix_latex("b", b));
+}
+
+void print_text(const ModelFile& model, const std::vector<std::vector<Expression>>& A, const std::vector<std::vector<Expression>>& b,
+                const std::vector<std::vector<Expression>>& F) {
+  const SymbolicSystem& system = *model.system;
+  fmt::print("{}\n  {} coordinates, {} inputs, {} constraints\n", system.name(), system.nq(), system.inputs().size(), system.nc());
+  fmt::print("\nmass matrix M\n{}", matrix_text(system.definition().mass));
+  fmt::print("\nknown force F\n{}", matrix_text(F));
+  fmt::print("\nconstraints A ddq = b\n");
+  for (const ConstraintRow& row : system.definition().constraints) {
+    const char* level = row.level == ConstraintRow::Level::position   ? "position"
+                        : row.level == ConstraintRow::Level::velocity ? "velocity"
+                                                                      : "acceleration";
+    fmt::print("  {} = 0   ({} level)\n", row.text, level);
+  }
+  fmt::print("A\n{}b\n{}", matrix_text(A), matrix_text(b));
+  fmt::print("\nparameters\n");
+  for (const Parameter& parameter : system.parameters()) {
+    fmt::print("  {:<12} {}", parameter.name, parameter.value);
+    if (parameter.bounds) fmt::print("   in [{}, {}]", parameter.bounds->first, parameter.bounds->second);
+    fmt::print("{}\n", parameter.estimate ? "   estimated" : "");
+  }
+  const Prior prior = make_prior(model);
+  for (std::size_t a = 0; a < prior.latents.size(); ++a) {
+    const Latent& latent = prior.latents[a];
+    fmt::print("\nlatent '{}'\n  kernel      {}\n  features    {}\n  acts on     {}\n", latent.name, latent.kernel.text(),
+               fmt::join(latent.feature_names, ", "), fmt::join(latent.column_names, ", "));
+    if (!latent.directions_are_identity) {
+      fmt::print("  directions{}\n{}", latent.base == Latent::Base::force ? " (forces)" : "",
+                 matrix_text(model.latents[a].directions));
+    }
+  }
+}
+
+void run(const Arguments& arguments) {
+  const ModelFile model = ModelFile::read(arguments.model);
+  const SymbolicSystem::Definition& definition = model.system->definition();
+  std::vector<std::vector<Expression>> A, b, F;
+  for (const ConstraintRow& row : definition.constraints) {
+    A.push_back(row.A);
+    b.push_back({row.b});
+  }
+  for (Expression entry : definition.force) F.push_back({entry});
+  if (arguments.latex) {
+    print_latex(definition, A, b, F);
+  } else {
+    print_text(model, A, b, F);
+  }
+}
+
+}  // namespace
+
+void add_show(CLI::App& app) {
+  CLI::App* command = app.add_subcommand("show", "Print the derived A, b, M, F, the parameters and the features of a model");
+  auto arguments = std::make_shared<Arguments>();
+  command->add_option("MODEL", arguments->model, "model file")->required();
+  command->add_flag("--latex", arguments->latex, "as LaTeX");
+  command->footer("Example:\n  gp2 show models/surface.toml");
+  command->callback([arguments] { run(*arguments); });
+}
+
+}  // namespace gp2::command

@@ -1,0 +1,59 @@
+#pragma once
+
+#include <optional>
+#include <string>
+#include <vector>
+
+#include <Eigen/Core>
+
+#include "gp2/system.hpp"
+
+namespace gp2 {
+
+/// One thing a check looked at.
+struct Finding {
+  enum class Level { good, warning, error };
+  Level level = Level::good;
+  std::string text;
+};
+
+/// The largest violation of a position- or velocity-level constraint over a batch of states.
+struct ConstraintViolation {
+  double relative = 0;  // |c| / Σ_j |A_j| spread(q_j), spread over the batch; velocities for velocity-level rows
+  double value = 0;     // c itself
+  int state = 0;
+  std::string constraint;
+};
+
+/// States that are off the constraint by more than this fraction of its scale deserve a warning.
+inline constexpr double constraint_violation_tolerance = 1e-6;
+
+/// @returns nothing when the system has no such constraint, or the states lack what it reads.
+std::optional<ConstraintViolation> largest_violation(const System& system, const Eigen::Ref<const Eigen::MatrixXd>& states,
+                                                     const Eigen::Ref<const Eigen::VectorXd>& parameters);
+
+/// Whether measured accelerations obey A ddq = b to rounding: then they were computed from each other, and only nq − rank(A) of them
+/// are independent measurements. Treating all as independent makes an estimated noise collapse to zero.
+///
+/// @param accelerations  (nq × N)
+/// @returns the rows of ddq to observe instead (the best-conditioned independent set); nothing when the columns are independent.
+std::optional<std::vector<int>> dependent_columns(const System& system, const Eigen::Ref<const Eigen::MatrixXd>& states,
+                                                  const Eigen::Ref<const Eigen::VectorXd>& parameters,
+                                                  const Eigen::Ref<const Eigen::MatrixXd>& accelerations);
+
+/// Is the system well-posed at these states? M symmetric positive definite, A of constant rank and not nearly zero, b in the range of
+/// A, derivatives in the parameters equal to finite differences, A and b equal to the second derivative of the constraints along a
+/// motion.
+///
+/// @param states  (layout size × N), as good as on the constraint
+std::vector<Finding> check_system(const System& system, const Eigen::Ref<const Eigen::MatrixXd>& states,
+                                  const Eigen::Ref<const Eigen::VectorXd>& parameters);
+
+/// How a log fits the system: states on the constraint, accelerations on A ddq = b, independent columns.
+///
+/// @param accelerations  (nq × N); NaN rows where not measured
+std::vector<Finding> check_data(const System& system, const Eigen::Ref<const Eigen::MatrixXd>& states,
+                                const Eigen::Ref<const Eigen::VectorXd>& parameters,
+                                const Eigen::Ref<const Eigen::MatrixXd>& accelerations);
+
+}  // namespace gp2

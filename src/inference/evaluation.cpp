@@ -1,0 +1,106 @@
+#include "gp2/evaluation.hpp"
+
+#include <cmath>
+#include <limits>
+#include <numbers>
+
+namespace gp2 {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::Ref;
+using Eigen::VectorXd;
+
+namespace {
+
+constexpr double not_a_number = std::numeric_limits<double>::quiet_NaN();
+
+// mean negative log density and share inside ±1.96 σ of Gaussian marginals
+struct Calibration {
+  double sum = 0;
+  int inside = 0, n = 0;
+
+  void add(double error, double stddev) {
+    const double z = error / stddev;
+    sum += 0.5 * z * z + std::log(stddev) + 0.5 * std::log(2 * std::numbers::pi);
+    constexpr double z95 = 1.959963984540054;
+    if (std::abs(z) <= z95) ++inside;
+    ++n;
+  }
+  [[nodiscard]] double nlpd() const { return n == 0 ? not_a_number : sum / n; }
+  [[nodiscard]] double coverage() const { return n == 0 ? not_a_number : static_cast<double>(inside) / n; }
+};
+
+// where training observed row `row` of ddq: its spread and its noise, NaN when it did not
+struct Trained {
+  double spread = not_a_number, noise = not_a_number;
+};
+
+Trained trained(const Posterior& posterior, int row) {
+  for (std::size_t g = 0; g < posterior.observations().size(); ++g) {
+    const Observations& group = posterior.observations()[g];
+    if (group.view.quantity != View::Quantity::constrained_acceleration) continue;
+    for (int k = 0; k < group.view.size(); ++k) {
+      if (group.view.rows[static_cast<std::size_t>(k)] == row) {
+        return {row_stddev(group.values)[k], posterior.values().noise_stddev[g][k]};
+      }
+    }
+  }
+  return {};
+}
+
+}  // namespace
+
+double max_constraint_error(const System& system, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters,
+                            const Ref<const MatrixXd>& accelerations) {
+  const SystemValues values = system.evaluate(states, parameters);
+  double worst = 0;
+  for (int i = 0; i < values.n_states() && system.nc() > 0; ++i) {
+    worst = std::max(worst, (values.A(i) * accelerations.col(i) - values.b(i)).cwiseAbs().maxCoeff());
+  }
+  return worst;
+}
+
+Evaluation evaluate_predictions(const Posterior& posterior, const Ref<const MatrixXd>& states, const std::vector<int>& rows,
+                                const Ref<const MatrixXd>& targets) {
+  const System& system = *posterior.prior().system;
+  const View all = View::all(View::Quantity::constrained_acceleration, system);
+  const Posterior::Marginal prediction = posterior.marginal(all, states);
+  const MatrixXd stddev = prediction.stddev();
+
+  Evaluation e;
+  e.n = static_cast<int>(states.cols());
+  e.outputs = View{View::Quantity::constrained_acceleration, rows}.names(system);
+  e.rmse.resize(static_cast<Index>(rows.size()));
+  const VectorXd test_spread = row_stddev(targets);
+  Calibration measured, latent;
+  double normalised = 0;
+  for (std::size_t k = 0; k < rows.size(); ++k) {
+    const Index row = rows[k];
+    const VectorXd error = (targets.row(static_cast<Index>(k)) - prediction.mean.row(row)).transpose();
+    e.rmse[static_cast<Index>(k)] = std::sqrt(error.squaredNorm() / e.n);
+    const Trained training = trained(posterior, rows[k]);
+    normalised += e.rmse[static_cast<Index>(k)] / training.spread;
+    // what rounding leaves of a variance that is zero
+    const double zero = 1e-10 * test_spread[static_cast<Index>(k)];
+    for (int i = 0; i < e.n; ++i) {
+      if (std::isfinite(training.noise)) measured.add(error[i], std::hypot(stddev(row, i), training.noise));
+      if (stddev(row, i) > zero) {
+        latent.add(error[i], stddev(row, i));
+      } else {
+        ++e.n_zero_variance;
+      }
+    }
+  }
+  e.rmse_normalised = normalised / static_cast<double>(rows.size());
+  e.nrmse = e.rmse.norm() / test_spread.norm();
+  e.max_constraint_error = max_constraint_error(system, states, system.parameter_values(), prediction.mean);
+  e.max_constraint_error_fitted = max_constraint_error(system, states, posterior.values().parameters, prediction.mean);
+  e.nlpd = measured.nlpd();
+  e.coverage95 = measured.coverage();
+  e.nlpd_latent = latent.nlpd();
+  e.coverage95_latent = latent.coverage();
+  return e;
+}
+
+}  // namespace gp2

@@ -1,0 +1,345 @@
+#include "gp2/check.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <numeric>
+
+#include <Eigen/Eigenvalues>
+#include <Eigen/SVD>
+#include <fmt/format.h>
+#include <fmt/ranges.h>
+
+#include "gp2/mechanics.hpp"
+
+namespace gp2 {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::Ref;
+using Eigen::VectorXd;
+
+namespace {
+
+using Level = Finding::Level;
+
+// standard deviation of a row, or its magnitude where it does not vary; 0 where it is not measured
+double spread(const Ref<const Eigen::RowVectorXd>& row) {
+  if (row.hasNaN() || row.size() == 0) return 0;
+  const double stddev = std::sqrt((row.array() - row.mean()).square().mean());
+  const double magnitude = row.cwiseAbs().maxCoeff();
+  return stddev > 1e-12 * magnitude ? stddev : magnitude;
+}
+
+// calls visit(subset) for every subset of `size` out of 0 … n − 1, in lexicographic order
+template <typename Visit>
+void for_each_subset(int n, int size, const Visit& visit) {
+  std::vector<int> subset(static_cast<std::size_t>(size));
+  std::iota(subset.begin(), subset.end(), 0);
+  while (true) {
+    visit(subset);
+    int k = size - 1;
+    while (k >= 0 && subset[static_cast<std::size_t>(k)] == n - size + k) --k;
+    if (k < 0) return;
+    ++subset[static_cast<std::size_t>(k)];
+    for (int later = k + 1; later < size; ++later) subset[static_cast<std::size_t>(later)] = subset[static_cast<std::size_t>(later - 1)] + 1;
+  }
+}
+
+double binomial(int n, int k) {
+  double value = 1;
+  for (int i = 0; i < k; ++i) value *= static_cast<double>(n - i) / (i + 1);
+  return value;
+}
+
+// the smallest singular value of the given rows of T, in units of the spread, over the states
+double worst_conditioning(const std::vector<MatrixXd>& scaled_T, const std::vector<int>& rows) {
+  double worst = std::numeric_limits<double>::infinity();
+  for (const MatrixXd& T : scaled_T) {
+    const MatrixXd some = T(rows, Eigen::all);
+    worst = std::min(worst, Eigen::JacobiSVD<MatrixXd>(some).singularValues().minCoeff());
+  }
+  return worst;
+}
+
+// `size` rows of ddq that determine the others at every state, as well-conditioned as can be found
+std::vector<int> independent_rows(const std::vector<MatrixXd>& scaled_T, int size) {
+  const int nq = static_cast<int>(scaled_T.front().rows());
+  std::vector<int> best;
+  double best_value = -1;
+  constexpr double max_subsets = 2000;
+  if (binomial(nq, size) <= max_subsets) {
+    for_each_subset(nq, size, [&](const std::vector<int>& subset) {
+      const double value = worst_conditioning(scaled_T, subset);
+      if (value > best_value) {
+        best_value = value;
+        best = subset;
+      }
+    });
+    return best;
+  }
+  // too many subsets: grow one, row by row
+  while (static_cast<int>(best.size()) < size) {
+    int next = -1;
+    best_value = -1;
+    for (int row = 0; row < nq; ++row) {
+      if (std::find(best.begin(), best.end(), row) != best.end()) continue;
+      std::vector<int> candidate = best;
+      candidate.push_back(row);
+      const double value = worst_conditioning(scaled_T, candidate);
+      if (value > best_value) {
+        best_value = value;
+        next = row;
+      }
+    }
+    best.push_back(next);
+  }
+  std::sort(best.begin(), best.end());
+  return best;
+}
+
+}  // namespace
+
+std::optional<ConstraintViolation> largest_violation(const System& system, const Ref<const MatrixXd>& states,
+                                                     const Ref<const VectorXd>& parameters) {
+  const MatrixXd residuals = system.residuals(states, parameters);
+  const SystemValues values = system.evaluate(states, parameters);
+  const StateLayout layout = system.layout();
+  std::optional<ConstraintViolation> worst;
+  for (Index k = 0; k < residuals.rows(); ++k) {
+    if (residuals.row(k).hasNaN()) continue;  // not measured
+    const System::Residual& label = system.residual_labels()[static_cast<std::size_t>(k)];
+    double scale = 0;
+    for (int j = 0; j < system.nq(); ++j) {
+      double weight = 0;
+      for (int i = 0; i < values.n_states(); ++i) weight = std::max(weight, std::abs(values.A(i)(label.row, j)));
+      scale += weight * spread(states.row(label.velocity ? layout.dq(j) : layout.q(j)));
+    }
+    Index state = 0;
+    const double value = residuals.row(k).cwiseAbs().maxCoeff(&state);
+    const double relative = value / (scale > 0 ? scale : 1);
+    if (!worst || relative > worst->relative) worst = {relative, value, static_cast<int>(state), label.text};
+  }
+  return worst;
+}
+
+std::optional<std::vector<int>> dependent_columns(const System& system, const Ref<const MatrixXd>& states,
+                                                  const Ref<const VectorXd>& parameters, const Ref<const MatrixXd>& accelerations) {
+  const MechanicsBatch mechanics = evaluate_mechanics(system, states, parameters);
+  if (mechanics.fault || system.nc() == 0 || accelerations.hasNaN()) return std::nullopt;
+  // a log with 7 digits or more of a computed quantity; measured accelerations are never that good
+  constexpr double tolerance = 1e-6;
+  int rank = 0;
+  for (int i = 0; i < mechanics.values.n_states(); ++i) {
+    const MatrixXd A = mechanics.values.A(i);
+    const VectorXd b = mechanics.values.b(i);
+    const VectorXd residual = A * accelerations.col(i) - b;
+    const VectorXd size = A.cwiseAbs() * accelerations.col(i).cwiseAbs() + b.cwiseAbs();
+    if (((residual.array().abs() > tolerance * size.array())).any()) return std::nullopt;
+    rank = std::max(rank, mechanics.projections[static_cast<std::size_t>(i)].rank());
+  }
+  if (rank == 0) return std::nullopt;
+
+  VectorXd scale(system.nq());
+  for (Index j = 0; j < scale.size(); ++j) scale[j] = std::max(spread(accelerations.row(j)), 1e-300);
+  std::vector<MatrixXd> scaled_T;
+  constexpr int max_states = 50;
+  const int stride = std::max(1, mechanics.values.n_states() / max_states);
+  for (int i = 0; i < mechanics.values.n_states(); i += stride) {
+    scaled_T.emplace_back(scale.cwiseInverse().asDiagonal() * mechanics.projections[static_cast<std::size_t>(i)].T() *
+                          scale.asDiagonal());
+  }
+  return independent_rows(scaled_T, system.nq() - rank);
+}
+
+namespace {
+
+// M, A, b: definite, of constant rank, consistent
+void check_mechanics(const System& system, const MechanicsBatch& mechanics, std::vector<Finding>& findings) {
+  double worst_condition = 0, asymmetry = 0;
+  for (int i = 0; i < mechanics.values.n_states(); ++i) {
+    const MatrixXd M = mechanics.values.M(i);
+    asymmetry = std::max(asymmetry, (M - M.transpose()).cwiseAbs().maxCoeff() / M.cwiseAbs().maxCoeff());
+    const VectorXd eigenvalues = Eigen::SelfAdjointEigenSolver<MatrixXd>(M, Eigen::EigenvaluesOnly).eigenvalues();
+    worst_condition = std::max(worst_condition, eigenvalues.maxCoeff() / eigenvalues.minCoeff());
+  }
+  findings.push_back({asymmetry > 1e-10 ? Level::error : Level::good,
+                      fmt::format("mass matrix: positive definite at all {} states, condition number up to {:.3g}",
+                                  mechanics.values.n_states(), worst_condition)});
+  if (asymmetry > 1e-10) findings.back().text = fmt::format("mass matrix: not symmetric (relative difference {:.3g})", asymmetry);
+  if (system.nc() == 0) {
+    findings.push_back({Level::warning, "constraints: none; T = I, and ddq is the unconstrained acceleration"});
+    return;
+  }
+
+  int lowest = system.nc(), highest = 0, zero_rows = 0;
+  for (const UdwadiaKalaba& projection : mechanics.projections) {
+    lowest = std::min(lowest, projection.rank());
+    highest = std::max(highest, projection.rank());
+    zero_rows += projection.n_zero_rows();
+  }
+  if (lowest != highest) {
+    findings.push_back({Level::warning, fmt::format("constraints: the rank of A changes over the states, from {} to {} of {} rows", lowest,
+                                                    highest, system.nc())});
+  } else if (highest < system.nc()) {
+    findings.push_back({Level::good, fmt::format("constraints: rank {} of {} rows: {} redundant, which is allowed", highest,
+                                                 system.nc(), system.nc() - highest)});
+  } else {
+    findings.push_back({Level::good, fmt::format("constraints: {} rows, independent at every state", system.nc())});
+  }
+  if (highest >= system.nq()) {
+    findings.push_back({Level::warning, "constraints: they leave no freedom (rank = number of coordinates): nothing is left to learn"});
+  }
+  if (zero_rows > 0) {
+    findings.push_back({Level::warning, fmt::format("constraints: a row of A vanishes {} times; it is dropped there", zero_rows)});
+  }
+
+  // a row that nearly vanishes somewhere decides the direction of its force from rounding
+  for (int row = 0; row < system.nc(); ++row) {
+    std::vector<double> sizes;
+    for (int i = 0; i < mechanics.values.n_states(); ++i) sizes.push_back(mechanics.values.A(i).row(row).norm());
+    std::vector<double> sorted = sizes;
+    std::nth_element(sorted.begin(), sorted.begin() + static_cast<std::ptrdiff_t>(sorted.size() / 2), sorted.end());
+    const double usual = sorted[sorted.size() / 2];
+    const auto smallest = std::min_element(sizes.begin(), sizes.end());
+    if (*smallest > 0 && *smallest < 1e-6 * usual) {
+      findings.push_back({Level::warning, fmt::format("constraint '{}': its row of A is {:.2g} of its usual size at state {}; write the "
+                                                      "constraint so that the row does not vanish",
+                                                      system.constraint_labels()[static_cast<std::size_t>(row)], *smallest / usual,
+                                                      smallest - sizes.begin() + 1)});
+    }
+  }
+}
+
+// exact derivatives in the parameters against central differences
+void check_parameter_derivatives(const System& system, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters,
+                                 std::vector<Finding>& findings) {
+  double worst = 0;
+  std::string worst_name;
+  for (int p = 0; p < static_cast<int>(system.parameters().size()); ++p) {
+    // a step of ε^(1/3) balances truncation and rounding: about 1e-10 of the values is left
+    const double step = 6e-6 * std::max(std::abs(parameters[p]), 1e-3);
+    VectorXd above = parameters, below = parameters;
+    above[p] += step;
+    below[p] -= step;
+    const SystemValues d = system.differentiate(states, parameters, p);
+    const SystemValues high = system.evaluate(states, above);
+    const SystemValues low = system.evaluate(states, below);
+    const auto compare = [&](const MatrixXd& exact, const MatrixXd& up, const MatrixXd& down, const MatrixXd& value) {
+      for (Index k = 0; k < exact.size(); ++k) {
+        const double difference = (up.reshaped()[k] - down.reshaped()[k]) / (above[p] - below[p]);
+        if (!std::isfinite(difference) || !std::isfinite(exact.reshaped()[k])) continue;
+        const double size = std::abs(exact.reshaped()[k]) + 1e-4 * std::abs(value.reshaped()[k]) / std::max(std::abs(parameters[p]), 1e-3);
+        const double error = std::abs(difference - exact.reshaped()[k]) / std::max(size, 1e-12);
+        if (error > worst) {
+          worst = error;
+          worst_name = system.parameters()[static_cast<std::size_t>(p)].name;
+        }
+      }
+    };
+    const SystemValues value = system.evaluate(states, parameters);
+    compare(d.mass, high.mass, low.mass, value.mass);
+    compare(d.constraint_matrix, high.constraint_matrix, low.constraint_matrix, value.constraint_matrix);
+    compare(d.constraint_vector, high.constraint_vector, low.constraint_vector, value.constraint_vector);
+    compare(d.force, high.force, low.force, value.force);
+  }
+  if (system.parameters().empty()) return;
+  findings.push_back({worst > 1e-4 ? Level::error : Level::good,
+                      fmt::format("derivatives of M, A, b, F in the parameters: equal to central differences to {:.1e}{}", worst,
+                                  worst_name.empty() ? "" : " (largest for '" + worst_name + "')")});
+}
+
+// A ddq − b against the second difference of each constraint along q(t + h) = q + h dq + ½h² ddq
+void check_motion(const System& system, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters,
+                  std::vector<Finding>& findings) {
+  if (system.residual_labels().empty()) return;
+  const StateLayout layout = system.layout();
+  const SystemValues values = system.evaluate(states, parameters);
+  // an arbitrary acceleration of the size of the velocities
+  MatrixXd ddq = states.middleRows(layout.dq(0), layout.nq).unaryExpr([](double v) { return std::isnan(v) ? 0.0 : 0.7 * v + 0.3; });
+  const double h = 1e-4;
+  const auto moved = [&](double step) {
+    MatrixXd x = states;
+    for (int j = 0; j < layout.nq; ++j) {
+      x.row(layout.q(j)) += step * states.row(layout.dq(j)) + 0.5 * step * step * ddq.row(j);
+      x.row(layout.dq(j)) += step * ddq.row(j);
+    }
+    x.row(layout.t()).array() += step;
+    return system.residuals(x, parameters);
+  };
+  const MatrixXd now = system.residuals(states, parameters);
+  const MatrixXd difference = (moved(h) - moved(-h)) / (2 * h);
+  double worst = 0;
+  std::string worst_label;
+  for (Index k = 0; k < now.rows(); ++k) {
+    const System::Residual& label = system.residual_labels()[static_cast<std::size_t>(k)];
+    for (Index i = 0; i < now.cols(); ++i) {
+      // d/dt of a velocity-level residual is A ddq − b; d/dt of a position-level one is the residual that follows it
+      double expected = 0, size = 1e-12;
+      if (label.velocity) {
+        const auto A = values.A(static_cast<int>(i)).row(label.row);
+        const double b = values.b(static_cast<int>(i))[label.row];
+        expected = A.dot(ddq.col(i)) - b;
+        size += A.cwiseAbs().dot(ddq.col(i).cwiseAbs()) + std::abs(b);
+      } else {
+        expected = now(k + 1, i);
+        for (int j = 0; j < layout.nq; ++j) {
+          const double rate = values.A(static_cast<int>(i))(label.row, j) * states(layout.dq(j), i);
+          if (std::isfinite(rate)) size += std::abs(rate);
+        }
+      }
+      const double error = std::abs(difference(k, i) - expected) / size;
+      if (std::isfinite(error) && error > worst) {
+        worst = error;
+        worst_label = label.text;
+      }
+    }
+  }
+  findings.push_back({worst > 1e-3 ? Level::warning : Level::good,
+                      fmt::format("A and b: equal to differences of the constraints along a motion to {:.1e}{}", worst,
+                                  worst > 1e-3 ? " (largest for '" + worst_label + "')" : "")});
+}
+
+}  // namespace
+
+std::vector<Finding> check_system(const System& system, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters) {
+  std::vector<Finding> findings;
+  const MechanicsBatch mechanics = evaluate_mechanics(system, states, parameters);
+  if (mechanics.fault) {
+    findings.push_back({Level::error, fmt::format("{} at state {}", mechanics.fault->text, mechanics.fault->state + 1)});
+    return findings;
+  }
+  check_mechanics(system, mechanics, findings);
+  check_parameter_derivatives(system, states, parameters, findings);
+  check_motion(system, states, parameters, findings);
+  return findings;
+}
+
+std::vector<Finding> check_data(const System& system, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters,
+                                const Ref<const MatrixXd>& accelerations) {
+  std::vector<Finding> findings;
+  if (const auto violation = largest_violation(system, states, parameters)) {
+    findings.push_back({violation->relative > constraint_violation_tolerance ? Level::warning : Level::good,
+                        fmt::format("data on the constraint: off by {:.2g} at most, {:.1e} of its scale ('{}', row {})", violation->value,
+                                    violation->relative, violation->constraint, violation->state + 1)});
+  }
+  if (accelerations.hasNaN() || system.nc() == 0) return findings;
+
+  const SystemValues values = system.evaluate(states, parameters);
+  VectorXd rms = VectorXd::Zero(system.nc());
+  for (int i = 0; i < values.n_states(); ++i) rms += (values.A(i) * accelerations.col(i) - values.b(i)).cwiseAbs2();
+  rms = (rms / values.n_states()).cwiseSqrt();
+  for (Index k = 0; k < rms.size(); ++k) {
+    findings.push_back({Level::good, fmt::format("measured ddq on A ddq = b: rms residual {:.3g} for '{}' (noise, if the model is right)",
+                                                 rms[k], system.constraint_labels()[static_cast<std::size_t>(k)])});
+  }
+  if (const auto rows = dependent_columns(system, states, parameters, accelerations)) {
+    std::vector<std::string> names;
+    for (int row : *rows) names.push_back(system.coordinates()[static_cast<std::size_t>(row)].acceleration());
+    findings.push_back({Level::warning, fmt::format("dependent columns: the {} accelerations obey A ddq = b to rounding, so only {} of them are "
+                                                    "independent measurements: fit with --observe {}",
+                                                    system.nq(), rows->size(), fmt::join(names, ","))});
+  }
+  return findings;
+}
+
+}  // namespace gp2

@@ -1,0 +1,90 @@
+#include <gtest/gtest.h>
+
+#include "gp2/symbolic_system.hpp"
+#include "test_models.hpp"
+
+// A and b against the motion they come from.
+namespace gp2 {
+namespace {
+
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+
+constexpr std::uint64_t seed = 20202;
+
+class ConstraintRows : public testing::TestWithParam<std::string> {};
+INSTANTIATE_TEST_SUITE_P(EveryModel, ConstraintRows, testing::ValuesIn(test::every_model()), test::model_test_name);
+
+// Along q(τ) = q + dq τ + ½ ddq τ², with any ddq: d/dτ of a velocity-level residual (or of ċ) is A ddq − b.
+TEST_P(ConstraintRows, TheirResidualChangesAlongTheMotionAsAAndBSay) {
+  const System& system = *test::model(GetParam()).system;
+  const StateLayout layout = system.layout();
+  const VectorXd parameters = system.parameter_values();
+  RandomStream random(seed);
+  int n_compared = 0;
+  for (const test::StateFamily& family : test::state_families(GetParam(), seed)) {
+    const SystemValues values = system.evaluate(family.states, parameters);
+    for (int i = 0; i < values.n_states(); ++i) {
+      SCOPED_TRACE(fmt::format("{}, state {} of those {}, seed {}", GetParam(), i, family.name, seed));
+      const VectorXd x = family.states.col(i);
+      const VectorXd ddq = test::random_vector(layout.nq, random);
+      const auto residuals_at = [&](double tau) -> VectorXd {
+        VectorXd moved = x;
+        moved.head(layout.nq) += tau * x.segment(layout.nq, layout.nq) + 0.5 * tau * tau * ddq;
+        moved.segment(layout.nq, layout.nq) += tau * ddq;
+        moved[layout.t()] += tau;
+        return system.residuals(moved, parameters).col(0);
+      };
+      // the trigonometric functions turn by |dq| τ; faster states change over shorter times
+      const double speed = x.segment(layout.nq, layout.nq).array().isNaN().select(0, x.segment(layout.nq, layout.nq).array().abs()).maxCoeff();
+      // intermediate terms of a residual are larger than the residual, which is zero on the constraint
+      const double precision = 64 * test::eps * (1 + x.array().isNaN().select(0, x.array().abs()).maxCoeff());
+      const VectorXd now = residuals_at(0);
+      test::Difference difference = test::central_difference(residuals_at, 0, 1 / (1 + 2 * speed), precision);
+      difference.error.array() += precision * (1 + speed) * (1 + speed) / std::pow(test::eps, 0.2);
+      for (std::size_t k = 0; k < system.residual_labels().size(); ++k) {
+        const System::Residual& label = system.residual_labels()[k];
+        const auto index = static_cast<Eigen::Index>(k);
+        if (label.velocity) {
+          const double expected = values.A(i).row(label.row) * ddq - values.b(i)[label.row];
+          EXPECT_NEAR(difference.value[index], expected, difference.error[index]) << label.text;
+          EXPECT_LE(difference.error[index], 1e-4 * (1 + std::abs(expected)) * (1 + speed) * (1 + speed)) << "the quotient is too coarse to test anything";
+          ++n_compared;
+        } else {
+          // the residual after a position is its rate
+          EXPECT_NEAR(difference.value[index], now[index + 1], difference.error[index]) << label.text;
+        }
+      }
+    }
+  }
+  EXPECT_GT(n_compared, 0);
+}
+
+TEST(ConstraintRowsTest, AnAccelerationLevelConstraintIsTakenAsWritten) {
+  const ModelFile model = ModelFile::parse(R"(
+name        = "two carts"
+coordinates = ["x", "y"]
+inputs      = ["u"]
+[parameters]
+c = 2.0
+[mechanics]
+mass  = [["1", "0"], ["0", "1"]]
+force = ["0", "0"]
+[constraints]
+acceleration = ["c*ddx + sin(x)*ddy - u*dy^2 + t"]
+[[latent]]
+kernel     = "se"
+features   = ["x"]
+directions = "acceleration"
+)",
+                                           "two carts");
+  const VectorXd state = (VectorXd(6) << 0.3, -1, 0.5, 2, 0.25, 1.5).finished();  // x y dx dy t u
+  const SystemValues values = model.system->evaluate(state, model.system->parameter_values());
+  EXPECT_EQ(values.A(0)(0, 0), 2.0);
+  EXPECT_DOUBLE_EQ(values.A(0)(0, 1), std::sin(0.3));
+  EXPECT_DOUBLE_EQ(values.b(0)[0], 1.5 * 4 - 0.25);
+  EXPECT_TRUE(model.system->residual_labels().empty());
+}
+
+}  // namespace
+}  // namespace gp2

@@ -1,0 +1,90 @@
+#include <gmock/gmock.h>
+#include <gtest/gtest.h>
+
+#include "gp2/error.hpp"
+#include "gp2/mechanics.hpp"
+#include "gp2/model_file.hpp"
+
+// What the mechanics refuse, and that they say where.
+namespace gp2 {
+namespace {
+
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+using testing::AllOf;
+using testing::HasSubstr;
+
+ModelFile model(const std::string& mass, const std::string& constraints) {
+  return ModelFile::parse(fmt::format(R"(
+name        = "cart"
+coordinates = ["x", "y"]
+[mechanics]
+mass  = {}
+force = ["0", "0"]
+[constraints]
+{}
+[[latent]]
+kernel     = "se"
+features   = ["x"]
+directions = "acceleration"
+)",
+                                      mass, constraints),
+                          "cart");
+}
+
+// x = 1, x = 2, … at rest
+MatrixXd states(const std::vector<double>& x) {
+  MatrixXd states = MatrixXd::Zero(5, static_cast<Eigen::Index>(x.size()));
+  for (std::size_t i = 0; i < x.size(); ++i) states(0, static_cast<Eigen::Index>(i)) = x[i];
+  return states;
+}
+
+std::string message(const ModelFile& model, const MatrixXd& states) {
+  try {
+    require_mechanics(*model.system, states, model.system->parameter_values());
+  } catch (const InputError& error) {
+    return error.what();
+  }
+  return "no error";
+}
+
+TEST(MechanicsFaults, ContradictoryConstraintsAreAnErrorThatNamesTheState) {
+  // ẍ = 0 and ẍ = x: they agree at x = 0 only
+  const ModelFile contradictory = model(R"([["1", "0"], ["0", "1"]])", R"(acceleration = ["ddx", "ddx - x"])");
+  EXPECT_THAT(message(contradictory, states({0, 3})),
+              AllOf(HasSubstr("cart"), HasSubstr("contradict"), HasSubstr("state 2"), HasSubstr("x = 3")));
+  EXPECT_EQ(message(contradictory, states({0})), "no error");
+}
+
+TEST(MechanicsFaults, ARowThatVanishesWhileItsRightHandSideDoesNotIsAContradiction) {
+  const ModelFile vanishing = model(R"([["1", "0"], ["0", "1"]])", R"(acceleration = ["x*ddx - 1"])");
+  EXPECT_THAT(message(vanishing, states({2, 1, 0})), AllOf(HasSubstr("contradict"), HasSubstr("state 3")));
+  EXPECT_THAT(message(vanishing, states({0})), HasSubstr("contradict"));
+}
+
+TEST(MechanicsFaults, AMassMatrixThatIsNotPositiveDefiniteIsAnErrorThatNamesTheState) {
+  const ModelFile indefinite = model(R"([["1", "x"], ["x", "1"]])", R"(position = ["y"])");
+  EXPECT_EQ(message(indefinite, states({0.5, -0.9})), "no error");
+  EXPECT_THAT(message(indefinite, states({0.5, 2, 3})),
+              AllOf(HasSubstr("mass matrix"), HasSubstr("not positive definite"), HasSubstr("state 2"), HasSubstr("x = 2")));
+  // singular, negative and not a number are no better
+  EXPECT_THAT(message(indefinite, states({1})), HasSubstr("not positive definite"));
+  EXPECT_THAT(message(model(R"([["-1", "0"], ["0", "1"]])", R"(position = ["y"])"), states({1})), HasSubstr("not positive definite"));
+  EXPECT_THAT(message(model(R"([["log(x)", "0"], ["0", "1"]])", R"(position = ["y"])"), states({-1})),
+              HasSubstr("not positive definite"));
+}
+
+TEST(MechanicsFaults, AConstraintThatIsNotANumberIsAnErrorThatNamesTheState) {
+  const ModelFile broken = model(R"([["1", "0"], ["0", "1"]])", R"(acceleration = ["ddy + sqrt(x)*ddx"])");
+  EXPECT_THAT(message(broken, states({1, -1})), AllOf(HasSubstr("finite"), HasSubstr("state 2"), HasSubstr("x = -1")));
+}
+
+TEST(MechanicsFaults, TheCheckedEvaluationReportsTheSameFaultAsAValue) {
+  const ModelFile indefinite = model(R"([["1", "x"], ["x", "1"]])", R"(position = ["y"])");
+  const MechanicsBatch batch = evaluate_mechanics(*indefinite.system, states({0, 2}), VectorXd());
+  ASSERT_TRUE(batch.fault);
+  EXPECT_EQ(batch.fault->state, 1);
+}
+
+}  // namespace
+}  // namespace gp2
