@@ -31,7 +31,8 @@ struct Latent {
   std::string name;
   Kernel kernel;
   std::vector<std::string> feature_names;  // φ(x), D of them
-  Tape features;                           // state -> φ; holds no parameters
+  Tape features;                           // state -> φ; parameters in it keep the model's values
+  std::vector<int> feature_parameters;     // the system's parameters that φ uses: they cannot be estimated
   Base base = Base::acceleration;
   std::vector<std::string> column_names;   // p of them, for the names of the signal standard deviations
   Tape directions;                         // state, parameters -> B (nq × p), column-major; unused where B = I

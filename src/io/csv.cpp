@@ -71,8 +71,9 @@ std::optional<std::vector<std::string>> split(std::string_view line) {
 // names that are there, once each
 void check_header(const std::vector<std::string>& header, const std::string& where) {
   if (header.size() == 1 && header[0].find_first_of(";\t") != std::string::npos) {
-    throw InputError(fmt::format("{}: the header is not separated by commas but by '{}'; write commas, and '.' as the decimal point",
-                                 where, header[0].find(';') != std::string::npos ? ";" : "tab"));
+    throw InputError(
+        fmt::format("{}: the header is not separated by commas but by '{}'; write commas, and '.' as the decimal point", where,
+                    header[0].find(';') != std::string::npos ? ";" : "tab"));
   }
   std::set<std::string_view> seen;
   for (std::size_t k = 0; k < header.size(); ++k) {
@@ -87,7 +88,9 @@ void check_header(const std::vector<std::string>& header, const std::string& whe
 
 }  // namespace
 
-CsvTable CsvTable::read(const std::filesystem::path& path) { return parse(read_file(path), path.string()); }
+CsvTable CsvTable::read(const std::filesystem::path& path) {
+  return parse(read_file(path), path.string());
+}
 
 CsvTable CsvTable::parse(std::string_view text, std::string name) {
   CsvTable table;
@@ -109,8 +112,8 @@ CsvTable CsvTable::parse(std::string_view text, std::string name) {
       continue;
     }
     if (cells->size() != table.header_.size()) {
-      throw InputError(fmt::format("{}: ragged row: {} cells, but the header has {} columns", where, cells->size(),
-                                   table.header_.size()));
+      throw InputError(
+          fmt::format("{}: ragged row: {} cells, but the header has {} columns", where, cells->size(), table.header_.size()));
     }
     table.cells_.insert(table.cells_.end(), std::make_move_iterator(cells->begin()), std::make_move_iterator(cells->end()));
     table.lines_.push_back(line_number);

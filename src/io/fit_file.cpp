@@ -1,11 +1,15 @@
 #include "gp2/fit_file.hpp"
 
-#include <cmath>
-#include <limits>
-
 #include <fmt/format.h>
 #include <fmt/ranges.h>
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <limits>
 #include <nlohmann/json.hpp>
+#include <set>
+#include <tuple>
 
 #include "gp2/csv.hpp"
 #include "gp2/error.hpp"
@@ -19,29 +23,69 @@ using Eigen::VectorXd;
 using Json = nlohmann::ordered_json;
 using Kind = Hyperparameter::Kind;
 
-NLOHMANN_JSON_SERIALIZE_ENUM(Hyperparameter::Kind, {{Kind::kernel, "kernel"},
-                                                    {Kind::signal_stddev, "signal_stddev"},
-                                                    {Kind::shared_signal_stddev, "shared_signal_stddev"},
-                                                    {Kind::noise_stddev, "noise_stddev"},
-                                                    {Kind::parameter, "parameter"}})
-
 namespace {
 
 constexpr const char* format_name = "gp2 fit";
 
+// a choice and its name in the file
+template <class Choice>
+using Named = std::pair<Choice, const char*>;
+
+constexpr std::array<Named<Kind>, 5> kinds = {{{Kind::kernel, "kernel"},
+                                               {Kind::signal_stddev, "signal_stddev"},
+                                               {Kind::shared_signal_stddev, "shared_signal_stddev"},
+                                               {Kind::noise_stddev, "noise_stddev"},
+                                               {Kind::parameter, "parameter"}}};
+constexpr std::array<Named<Prior::Mean>, 2> means = {{{Prior::Mean::zero, "zero"}, {Prior::Mean::force, "force"}}};
+constexpr std::array<Named<std::optional<Latent::Base>>, 3> directions = {
+    {{std::nullopt, "model"}, {Latent::Base::acceleration, "acceleration"}, {Latent::Base::force, "force"}}};
+constexpr std::array<Named<View::Quantity>, 2> quantities = {
+    {{View::Quantity::constrained_acceleration, "constrained"}, {View::Quantity::unconstrained_acceleration, "unconstrained"}}};
+
+template <class Choice, std::size_t n>
+const char* name_of(const std::array<Named<Choice>, n>& choices, Choice choice) {
+  return std::find_if(choices.begin(), choices.end(), [&](const auto& known) { return known.first == choice; })->second;
+}
+
+template <class Choice, std::size_t n>
+Choice choice_from(const Json& json, const std::array<Named<Choice>, n>& choices, const char* what) {
+  const auto name = json.get<std::string>();
+  const auto known = std::find_if(choices.begin(), choices.end(), [&](const auto& other) { return name == other.second; });
+  if (known == choices.end()) throw InputError(fmt::format("'{}' is no {}", name, what));
+  return known->first;
+}
+
+// a whole number, where Json itself would round or wrap
+int integer(const Json& json) {
+  constexpr auto largest = std::numeric_limits<int>::max();
+  if (!json.is_number_integer()) throw InputError(fmt::format("{} stands where a whole number must", json.dump()));
+  if (std::abs(json.get<double>()) > largest) throw InputError(fmt::format("{} is too large", json.dump()));
+  return json.get<int>();
+}
+
+double number(const Json& json) {
+  if (!json.is_number()) throw InputError(fmt::format("{} stands where a number must", json.dump()));
+  return json.get<double>();
+}
+
 Json parse_json(const std::filesystem::path& path) {
   Json json = Json::parse(read_file(path), nullptr, false);
   if (json.is_discarded()) {
-    throw InputError(fmt::format("{}: not valid JSON: the file is cut short or damaged; write it again with gp2 fit", path.string()));
+    throw InputError(
+        fmt::format("{}: not valid JSON: the file is cut short or damaged; write it again with gp2 fit", path.string()));
   }
   return json;
 }
 
-Json vector_json(const VectorXd& values) { return std::vector<double>(values.begin(), values.end()); }
+Json vector_json(const VectorXd& values) {
+  return std::vector<double>(values.begin(), values.end());
+}
 
 VectorXd vector_from(const Json& json) {
-  const auto values = json.get<std::vector<double>>();
-  return Eigen::Map<const VectorXd>(values.data(), static_cast<Index>(values.size()));
+  if (!json.is_array()) throw InputError("expected an array of numbers");
+  VectorXd values(static_cast<Index>(json.size()));
+  std::transform(json.begin(), json.end(), values.begin(), number);
+  return values;
 }
 
 // one named array per row; rows that are not measured (NaN) are left out
@@ -54,21 +98,36 @@ Json rows_json(const MatrixXd& matrix, const std::vector<std::string>& names) {
   return json;
 }
 
-MatrixXd rows_from(const Json& json, const std::vector<std::string>& names, Index n) {
-  MatrixXd matrix = MatrixXd::Constant(static_cast<Index>(names.size()), n, std::numeric_limits<double>::quiet_NaN());
+MatrixXd rows_from(const Json& json, const std::vector<std::string>& names, const std::vector<bool>& needed, Index n) {
+  if (!json.is_object()) throw InputError("expected an object of named arrays");
+  // sizes first: a damaged n must not ask for memory
   for (const auto& [name, values] : json.items()) {
-    const auto row = std::find(names.begin(), names.end(), name);
-    if (row == names.end()) throw InputError(fmt::format("'{}' is not of this model", name));
-    const VectorXd entries = vector_from(values);
-    if (entries.size() != n) throw InputError(fmt::format("'{}' has {} values, expected {}", name, entries.size(), n));
-    matrix.row(row - names.begin()) = entries;
+    if (std::find(names.begin(), names.end(), name) == names.end())
+      throw InputError(fmt::format("'{}' is not of this model", name));
+    if (!values.is_array() || values.size() != static_cast<std::size_t>(n)) {
+      throw InputError(fmt::format("'{}' has {} values, expected {}", name, values.size(), n));
+    }
+  }
+  for (std::size_t k = 0; k < names.size(); ++k) {
+    if (needed[k] && !json.contains(names[k])) throw InputError(fmt::format("the values of '{}' are missing", names[k]));
+  }
+  MatrixXd matrix = MatrixXd::Constant(static_cast<Index>(names.size()), n, std::numeric_limits<double>::quiet_NaN());
+  for (std::size_t k = 0; k < names.size(); ++k) {
+    if (json.contains(names[k])) matrix.row(static_cast<Index>(k)) = vector_from(json.at(names[k]));
   }
   return matrix;
 }
 
 Json hyperparameter_json(const Hyperparameter& h) {
-  Json json = {{"name", h.name}, {"value", h.value}, {"lower", h.lower},   {"upper", h.upper}, {"unit", h.unit},
-               {"at_bound", h.at_bound()}, {"kind", h.kind},   {"owner", h.owner}, {"index", h.index}};
+  Json json = {{"name", h.name},
+               {"value", h.value},
+               {"lower", h.lower},
+               {"upper", h.upper},
+               {"unit", h.unit},
+               {"at_bound", h.at_bound()},
+               {"kind", name_of(kinds, h.kind)},
+               {"owner", h.owner},
+               {"index", h.index}};
   if (h.scale.size() > 0) json["scale"] = vector_json(h.scale);
   if (h.log_stddev > 0) json["hyperprior"] = {{"median", h.median}, {"log_stddev", h.log_stddev}};
   return json;
@@ -77,55 +136,63 @@ Json hyperparameter_json(const Hyperparameter& h) {
 Hyperparameter hyperparameter_from(const Json& json) {
   Hyperparameter h;
   json.at("name").get_to(h.name);
-  json.at("value").get_to(h.value);
-  json.at("lower").get_to(h.lower);
-  json.at("upper").get_to(h.upper);
   json.at("unit").get_to(h.unit);
-  json.at("kind").get_to(h.kind);
-  json.at("owner").get_to(h.owner);
-  json.at("index").get_to(h.index);
+  h.value = number(json.at("value"));
+  h.lower = number(json.at("lower"));
+  h.upper = number(json.at("upper"));
+  h.kind = choice_from(json.at("kind"), kinds, "kind of hyperparameter");
+  h.owner = integer(json.at("owner"));
+  h.index = integer(json.at("index"));
   if (json.contains("scale")) h.scale = vector_from(json.at("scale"));
   if (json.contains("hyperprior")) {
-    json.at("hyperprior").at("median").get_to(h.median);
-    json.at("hyperprior").at("log_stddev").get_to(h.log_stddev);
+    h.median = number(json.at("hyperprior").at("median"));
+    h.log_stddev = number(json.at("hyperprior").at("log_stddev"));
   }
-  if (!std::isfinite(h.value) || (h.is_positive() && !(h.value > 0))) {
+  if ((h.is_positive() && !(h.value > 0)) || !(h.scale.array() > 0).all()) {
     throw InputError(fmt::format("hyperparameter '{}' has the impossible value {}", h.name, h.value));
   }
   return h;
 }
 
-// indices from a file must point at what the model has
-void check_hyperparameter(const Hyperparameter& h, const Prior& prior, const std::vector<Observations>& observations) {
-  const auto inside = [](int index, std::size_t size) { return index >= 0 && static_cast<std::size_t>(index) < size; };
-  bool good = true;
-  switch (h.kind) {
-    case Kind::kernel:
-      good = inside(h.owner, prior.latents.size()) &&
-             inside(h.index, prior.latents[static_cast<std::size_t>(h.owner)].kernel.parameters().size());
-      break;
-    case Kind::signal_stddev:
-      good = inside(h.owner, prior.latents.size()) &&
-             inside(h.index, prior.latents[static_cast<std::size_t>(h.owner)].column_names.size());
-      break;
-    case Kind::shared_signal_stddev:
-      good = inside(h.owner, prior.latents.size()) &&
-             h.scale.size() == prior.latents[static_cast<std::size_t>(h.owner)].size();
-      break;
-    case Kind::noise_stddev:
-      good = inside(h.owner, observations.size()) &&
-             inside(h.index, observations[static_cast<std::size_t>(h.owner)].view.rows.size());
-      break;
-    case Kind::parameter:
-      good = inside(h.index, prior.system->parameters().size());
-      break;
+// every hyperparameter belongs to something the model has, once, and every kernel and signal has its values
+void check_hyperparameters(const std::vector<Hyperparameter>& hyperparameters, const Prior& prior,
+                           const std::vector<Observations>& observations) {
+  std::set<std::tuple<Kind, int, int>> open;  // kind, owner, index
+  std::set<std::tuple<Kind, int, int>> optional;
+  const auto add = [](auto& set, Kind kind, std::size_t owner, std::size_t size) {
+    for (std::size_t k = 0; k < size; ++k) set.emplace(kind, static_cast<int>(owner), static_cast<int>(k));
+  };
+  for (std::size_t a = 0; a < prior.latents.size(); ++a) {
+    add(open, Kind::kernel, a, prior.latents[a].kernel.parameters().size());
+    add(open, Kind::signal_stddev, a, prior.latents[a].column_names.size());
   }
-  if (!good) throw InputError(fmt::format("hyperparameter '{}' belongs to nothing in this model", h.name));
+  for (std::size_t group = 0; group < observations.size(); ++group) {
+    add(optional, Kind::noise_stddev, group, observations[group].view.rows.size());
+  }
+  add(optional, Kind::parameter, 0, prior.system->parameters().size());
+
+  for (const Hyperparameter& h : hyperparameters) {
+    bool good = false;
+    if (h.kind == Kind::shared_signal_stddev) {
+      good = h.owner >= 0 && h.owner < static_cast<int>(prior.latents.size()) &&
+             h.scale.size() == prior.latents[static_cast<std::size_t>(h.owner)].size();
+      for (Index k = 0; good && k < h.scale.size(); ++k) {
+        good = open.erase({Kind::signal_stddev, h.owner, static_cast<int>(k)}) == 1;
+      }
+    } else {
+      good = open.erase({h.kind, h.owner, h.index}) + optional.erase({h.kind, h.owner, h.index}) == 1;
+    }
+    if (!good) throw InputError(fmt::format("hyperparameter '{}' belongs to nothing in this model, or stands twice", h.name));
+  }
+  if (!open.empty()) {
+    const auto [kind, owner, index] = *open.begin();
+    throw InputError(fmt::format("{} {} of latent '{}' has no value", name_of(kinds, kind), index + 1,
+                                 prior.latents[static_cast<std::size_t>(owner)].name));
+  }
 }
 
 Json observations_json(const Observations& group, const System& system) {
-  const bool constrained = group.view.quantity == View::Quantity::constrained_acceleration;
-  return {{"view", constrained ? "constrained" : "unconstrained"},
+  return {{"view", name_of(quantities, group.view.quantity)},
           {"rows", group.view.rows},
           {"n", group.n_data()},
           {"noise_stddev", vector_json(group.noise_stddev)},
@@ -134,37 +201,56 @@ Json observations_json(const Observations& group, const System& system) {
           {"values", rows_json(group.values, group.view.names(system))}};
 }
 
-Observations observations_from(const Json& json, const System& system) {
+Observations observations_from(const Json& json, const Prior& prior) {
+  const System& system = *prior.system;
   Observations group;
-  const std::string view = json.at("view").get<std::string>();
-  if (view != "constrained" && view != "unconstrained") throw InputError(fmt::format("unknown view '{}'", view));
-  group.view.quantity =
-      view == "constrained" ? View::Quantity::constrained_acceleration : View::Quantity::unconstrained_acceleration;
-  json.at("rows").get_to(group.view.rows);
-  for (int row : group.view.rows) {
-    if (row < 0 || row >= system.nq()) throw InputError(fmt::format("row {} of a view is outside 0 … {}", row, system.nq() - 1));
+  group.view.quantity = choice_from(json.at("view"), quantities, "view");
+  for (const Json& row : json.at("rows")) {
+    const int index = integer(row);
+    if (index < 0 || index >= system.nq())
+      throw InputError(fmt::format("row {} of a view is outside 0 … {}", index, system.nq() - 1));
+    if (std::find(group.view.rows.begin(), group.view.rows.end(), index) != group.view.rows.end()) {
+      throw InputError(fmt::format("row {} of a view stands twice", index));
+    }
+    group.view.rows.push_back(index);
   }
-  const Index n = json.at("n").get<Index>();
+  if (group.view.rows.empty()) throw InputError("a view without rows");
+  const int n = integer(json.at("n"));
+  if (n < 1) throw InputError(fmt::format("{} observations are not possible", n));
   group.noise_stddev = vector_from(json.at("noise_stddev"));
   if (group.noise_stddev.size() != group.view.size() || !(group.noise_stddev.array() > 0).all()) {
     throw InputError("noise_stddev must hold one positive number per row of the view");
   }
   json.at("estimate_noise").get_to(group.estimate_noise);
-  if (n < 1 || n > 10'000'000) throw InputError(fmt::format("{} observations are not possible", n));
-  group.states = rows_from(json.at("states"), system.state_names(), n);
-  group.values = rows_from(json.at("values"), group.view.names(system), n);
-  if (group.values.hasNaN()) throw InputError("values are missing");
+  // values come first: they bound what a damaged n can claim
+  group.values = rows_from(json.at("values"), group.view.names(system), std::vector<bool>(group.view.rows.size(), true), n);
+  group.states = rows_from(json.at("states"), system.state_names(), prior.reads(), n);
   return group;
 }
 
+// a restart without a finite start has the objective ∞, which JSON has not: null
+Json number_or_null(double value) {
+  return std::isfinite(value) ? Json(value) : Json();
+}
+
+double number_or_infinity(const Json& json) {
+  return json.is_null() ? std::numeric_limits<double>::infinity() : number(json);
+}
+
 Json restart_json(const RestartReport& r) {
-  return {{"objective", std::isfinite(r.objective) ? Json(r.objective) : Json()},
-          {"nll", std::isfinite(r.negative_log_likelihood) ? Json(r.negative_log_likelihood) : Json()},
+  return {{"objective", number_or_null(r.objective)},
+          {"nll", number_or_null(r.negative_log_likelihood)},
           {"iterations", r.iterations},
           {"evaluations", r.evaluations},
           {"failed_evaluations", r.failed_evaluations},
           {"converged", r.converged},
           {"termination", r.termination}};
+}
+
+RestartReport restart_from(const Json& json) {
+  return {number_or_infinity(json.at("objective")), number_or_infinity(json.at("nll")),     integer(json.at("iterations")),
+          integer(json.at("evaluations")),          integer(json.at("failed_evaluations")), json.at("converged").get<bool>(),
+          json.at("termination").get<std::string>()};
 }
 
 }  // namespace
@@ -180,10 +266,8 @@ void FitFile::write(const std::filesystem::path& path) const {
   json["version"] = format_version;
   json["library"] = version();
   json["model"] = {{"name", model.name}, {"text", model.text}};
-  json["prior"] = {{"mean", prior_options.mean == Prior::Mean::force ? "force" : "zero"},
-                   {"directions", !prior_options.base                                  ? "model"
-                                  : *prior_options.base == Latent::Base::force ? "force"
-                                                                                       : "acceleration"},
+  json["prior"] = {{"mean", name_of(means, prior_options.mean)},
+                   {"directions", name_of(directions, prior_options.base)},
                    {"raw_angles", prior_options.raw_angles}};
   json["hyperparameters"] = Json::array();
   for (const Hyperparameter& h : report.hyperparameters) json["hyperparameters"].push_back(hyperparameter_json(h));
@@ -198,7 +282,8 @@ void FitFile::write(const std::filesystem::path& path) const {
   json["data_source"] = data_source;
   json["observations"] = Json::array();
   for (const Observations& group : observations) json["observations"].push_back(observations_json(group, *model.system));
-  write_file(path, json.dump(1) + "\n");
+  // a path in `data_source` may hold bytes that are no text
+  write_file(path, json.dump(1, ' ', false, Json::error_handler_t::replace) + "\n");
 }
 
 FitFile FitFile::read(const std::filesystem::path& path) {
@@ -208,7 +293,7 @@ FitFile FitFile::read(const std::filesystem::path& path) {
     if (!json.is_object() || !json.contains("format") || json.at("format") != format_name) {
       throw InputError("not a fit written by gp2");
     }
-    const int file_version = json.at("version").get<int>();
+    const int file_version = integer(json.at("version"));
     if (file_version > format_version) {
       throw InputError(fmt::format("of format {}, but this gp2 ({}) reads up to {}: use a newer gp2", file_version, version(),
                                    format_version));
@@ -216,33 +301,23 @@ FitFile FitFile::read(const std::filesystem::path& path) {
     if (file_version < 1) throw InputError(fmt::format("format {} does not exist", file_version));
     fit.model = ModelFile::parse(json.at("model").at("text"), json.at("model").at("name"));
     const Json& prior_json = json.at("prior");
-    fit.prior_options.mean = prior_json.at("mean") == "force" ? Prior::Mean::force : Prior::Mean::zero;
-    if (prior_json.at("directions") != "model") {
-      fit.prior_options.base = prior_json.at("directions") == "force" ? Latent::Base::force : Latent::Base::acceleration;
-    }
+    fit.prior_options.mean = choice_from(prior_json.at("mean"), means, "prior mean");
+    fit.prior_options.base = choice_from(prior_json.at("directions"), directions, "choice of directions");
     prior_json.at("raw_angles").get_to(fit.prior_options.raw_angles);
     json.at("data_source").get_to(fit.data_source);
-    for (const Json& group : json.at("observations")) fit.observations.push_back(observations_from(group, *fit.model.system));
-    if (fit.observations.empty()) throw InputError("no observations");
     const Prior prior = fit.prior();
-    for (const Json& h : json.at("hyperparameters")) {
-      fit.report.hyperparameters.push_back(hyperparameter_from(h));
-      check_hyperparameter(fit.report.hyperparameters.back(), prior, fit.observations);
-    }
+    for (const Json& group : json.at("observations")) fit.observations.push_back(observations_from(group, prior));
+    if (fit.observations.empty()) throw InputError("no observations");
+    for (const Json& h : json.at("hyperparameters")) fit.report.hyperparameters.push_back(hyperparameter_from(h));
+    check_hyperparameters(fit.report.hyperparameters, prior, fit.observations);
     const Json& report = json.at("report");
-    report.at("nll").get_to(fit.report.negative_log_likelihood);
-    report.at("objective").get_to(fit.report.objective);
+    fit.report.negative_log_likelihood = number(report.at("nll"));
+    fit.report.objective = number(report.at("objective"));
     report.at("converged").get_to(fit.report.converged);
     report.at("termination").get_to(fit.report.termination);
-    report.at("iterations").get_to(fit.report.iterations);
-    report.at("best_restart").get_to(fit.report.best_restart);
-    for (const Json& r : report.at("restarts")) {
-      const auto number = [&](const char* key) {
-        return r.at(key).is_null() ? std::numeric_limits<double>::infinity() : r.at(key).get<double>();
-      };
-      fit.report.restarts.push_back({number("objective"), number("nll"), r.at("iterations"), r.at("evaluations"),
-                                     r.at("failed_evaluations"), r.at("converged"), r.at("termination")});
-    }
+    fit.report.iterations = integer(report.at("iterations"));
+    fit.report.best_restart = integer(report.at("best_restart"));
+    for (const Json& restart : report.at("restarts")) fit.report.restarts.push_back(restart_from(restart));
   } catch (const Json::exception& error) {
     throw InputError(fmt::format("{}: not a whole fit file: {}", path.string(), error.what()));
   } catch (const InputError& error) {
@@ -259,28 +334,33 @@ void read_start_values(const std::filesystem::path& path, std::vector<Hyperparam
     for (const Hyperparameter& h : FitFile::read(path).report.hyperparameters) values.emplace_back(h.name, h.value);
   } else if (json.is_object()) {
     for (const auto& [name, value] : json.items()) {
-      if (!value.is_number()) throw InputError(fmt::format("{}: '{}' is not a number", path.string(), name));
+      if (!value.is_number())
+        throw InputError(fmt::format("{}: '{}' is not a number but {}", path.string(), name, value.type_name()));
       values.emplace_back(name, value.get<double>());
     }
   } else {
     throw InputError(fmt::format("{}: expected {{\"name\": value, …}} or a file written by gp2 fit", path.string()));
   }
 
+  std::vector<Hyperparameter> started = hyperparameters;
   for (const auto& [name, value] : values) {
-    const auto h = std::find_if(hyperparameters.begin(), hyperparameters.end(), [&](const auto& known) { return known.name == name; });
-    if (h == hyperparameters.end()) {
+    const auto h = std::find_if(started.begin(), started.end(), [&](const auto& known) { return known.name == name; });
+    if (h == started.end()) {
       // a fit may have had more to tune than this one; a hand-written value must mean something
       if (is_fit) continue;
       std::vector<std::string> known;
-      for (const Hyperparameter& other : hyperparameters) known.push_back(other.name);
-      throw InputError(fmt::format("{}: unknown hyperparameter '{}'; this fit has: {}", path.string(), name, fmt::join(known, ", ")));
+      for (const Hyperparameter& other : started) known.push_back(other.name);
+      throw InputError(
+          fmt::format("{}: unknown hyperparameter '{}'; this fit has: {}", path.string(), name, fmt::join(known, ", ")));
     }
+    // a value printed with a few digits less may lie a rounding outside
     const double tolerance = 1e-9 * (h->is_positive() ? std::abs(value) : h->upper - h->lower);
     if (!(value >= h->lower - tolerance && value <= h->upper + tolerance)) {
       throw InputError(fmt::format("{}: {} = {} is outside its bounds [{}, {}]", path.string(), name, value, h->lower, h->upper));
     }
-    h->value = std::min(std::max(value, h->lower), h->upper);
+    h->value = std::clamp(value, h->lower, h->upper);
   }
+  hyperparameters = std::move(started);
 }
 
 }  // namespace gp2

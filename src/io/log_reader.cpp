@@ -91,7 +91,8 @@ int LogReader::require(const std::string& name) {
 
 MatrixXd LogReader::states(const std::vector<bool>& reads) {
   const std::vector<std::string> names = system_.state_names();
-  MatrixXd states = MatrixXd::Constant(static_cast<Index>(names.size()), table_.n_rows(), std::numeric_limits<double>::quiet_NaN());
+  MatrixXd states =
+      MatrixXd::Constant(static_cast<Index>(names.size()), table_.n_rows(), std::numeric_limits<double>::quiet_NaN());
   for (std::size_t k = 0; k < names.size(); ++k) {
     if (!reads[k]) continue;
     const int column = require(names[k]);

@@ -27,7 +27,9 @@ bool is_identifier(std::string_view name) {
   return std::all_of(name.begin(), name.end(), [&](char c) { return letter(c) || (c >= '0' && c <= '9'); });
 }
 
-int line_of(const toml::node& node) { return static_cast<int>(node.source().begin.line); }
+int line_of(const toml::node& node) {
+  return static_cast<int>(node.source().begin.line);
+}
 
 // a value as the file has it, to show what was got
 std::string written(const toml::node& node) {
@@ -122,8 +124,9 @@ class ModelReader {
   ModelReader(const toml::table& root, ModelFile& model) : root_(root), model_(model) {}
 
   void read() {
-    only_keys(root_, "", {"name", "coordinates", "inputs", "parameters", "let", "mechanics", "constraints", "latent", "noise",
-                          "truth", "sampling", "columns"});
+    only_keys(root_, "",
+              {"name", "coordinates", "inputs", "parameters", "let", "mechanics", "constraints", "latent", "noise", "truth",
+               "sampling", "columns"});
     definition_.graph = std::make_shared<ExpressionGraph>();
     definition_.name = root_.contains("name") ? text(*root_.get("name"), "name") : model_.name;
     read_coordinates();
@@ -150,7 +153,8 @@ class ModelReader {
     throw LocatedError(fmt::format("{}:{}: {}: {}", model_.name, line, key, message));
   }
 
-  // ---- pieces of TOML -------------------------------------------------------------------------------------------------------------
+  // ---- pieces of TOML
+  // -------------------------------------------------------------------------------------------------------------
 
   void only_keys(const toml::table& table, const std::string& where, const std::vector<std::string>& known) const {
     for (const auto& [key, node] : entries_of(table)) {
@@ -209,11 +213,12 @@ class ModelReader {
 
   static std::string shortened(const std::string& text) { return text.size() <= 60 ? text : text.substr(0, 57) + "..."; }
 
-  // ---- the tables of a model ------------------------------------------------------------------------------------------------------
+  // ---- the tables of a model
+  // ------------------------------------------------------------------------------------------------------
 
   void declare(const std::string& name, const toml::node& node, const std::string& key) {
-    static const std::set<std::string> reserved = {"pi",   "sin",  "cos",  "tan", "asin", "acos", "atan", "atan2", "sinh",
-                                                   "cosh", "tanh", "exp",  "log", "sqrt", "abs",  "sign", "min",   "max"};
+    static const std::set<std::string> reserved = {"pi",   "sin",  "cos", "tan", "asin", "acos", "atan", "atan2", "sinh",
+                                                   "cosh", "tanh", "exp", "log", "sqrt", "abs",  "sign", "min",   "max"};
     if (!is_identifier(name)) {
       fail(node, key, fmt::format("'{}' is not a name: use letters, digits and _, beginning with a letter", name));
     }
@@ -260,13 +265,15 @@ class ModelReader {
       if (node->is_table()) {
         const toml::table& entry = *node->as_table();
         only_keys(entry, key, {"value", "bounds", "estimate"});
-        if (!entry.contains("value")) fail(*node, key, "missing value; write { value = 1.0, bounds = [0.5, 2.0], estimate = true }");
+        if (!entry.contains("value"))
+          fail(*node, key, "missing value; write { value = 1.0, bounds = [0.5, 2.0], estimate = true }");
         parameter.value = number(*entry.get("value"), key + ".value");
         if (entry.contains("bounds")) parameter.bounds = range(*entry.get("bounds"), key + ".bounds");
         if (entry.contains("estimate")) parameter.estimate = boolean(*entry.get("estimate"), key + ".estimate");
         if (parameter.bounds && (parameter.value < parameter.bounds->first || parameter.value > parameter.bounds->second)) {
-          fail(*node, key, fmt::format("the value {} is outside its bounds [{}, {}]", parameter.value, parameter.bounds->first,
-                                       parameter.bounds->second));
+          fail(*node, key,
+               fmt::format("the value {} is outside its bounds [{}, {}]", parameter.value, parameter.bounds->first,
+                           parameter.bounds->second));
         }
       } else {
         parameter.value = number(*node, key);
@@ -340,7 +347,8 @@ class ModelReader {
         const std::string entry_key = fmt::format("mechanics.mass row {} column {}", i + 1, j + 1);
         const Expression entry = expression(*entries.get(j), entry_key);
         for (const auto* group : {&symbols_->dq, &symbols_->ddq, &symbols_->u}) {
-          allow_only(*entries.get(j), entry_key, entry, *group, "the mass matrix may depend on coordinates, t and parameters only");
+          allow_only(*entries.get(j), entry_key, entry, *group,
+                     "the mass matrix may depend on coordinates, t and parameters only");
         }
         definition_.mass.back().push_back(entry);
       }
@@ -373,34 +381,27 @@ class ModelReader {
     }
   }
 
-  // M = Mᵀ: as written, or else at random points
+  // M = Mᵀ at random points, to rounding: entries may be written differently on the two sides
   void check_mass_symmetry() const {
-    std::vector<Expression> differences;
-    std::vector<std::pair<std::size_t, std::size_t>> where;
-    for (std::size_t i = 0; i < definition_.mass.size(); ++i) {
-      for (std::size_t j = 0; j < i; ++j) {
-        if (definition_.mass[i][j] == definition_.mass[j][i]) continue;
-        differences.push_back(definition_.mass[i][j] - definition_.mass[j][i]);
-        differences.push_back(definition_.mass[i][j]);
-        where.emplace_back(i, j);
-      }
-    }
-    if (differences.empty()) return;
     constexpr int n_points = 10;
     RandomStream random(1);
     Eigen::MatrixXd points(model_.system->layout().size(), n_points);
     for (double& value : points.reshaped()) value = 2 * random.uniform() - 1;
-    Eigen::MatrixXd values;
-    Tape(differences, symbols_->state_and_parameters()).evaluate(points, model_.system->parameter_values(), values);
-    for (std::size_t k = 0; k < where.size(); ++k) {
-      for (int i = 0; i < n_points; ++i) {
-        const double difference = values(static_cast<Eigen::Index>(2 * k), i);
-        const double size = values(static_cast<Eigen::Index>(2 * k + 1), i);
-        if (std::abs(difference) > 1e-10 * std::abs(size)) {
-          const auto [row, column] = where[k];
+    const SystemValues values = model_.system->evaluate(points, model_.system->parameter_values());
+    const auto entry = [&](Eigen::Index row, Eigen::Index column) {
+      return written(
+          *mass_node_->as_array()->get(static_cast<std::size_t>(row))->as_array()->get(static_cast<std::size_t>(column)));
+    };
+    for (int i = 0; i < n_points; ++i) {
+      const auto M = values.M(i);
+      for (Eigen::Index row = 0; row < M.rows(); ++row) {
+        for (Eigen::Index column = 0; column < row; ++column) {
+          // a positive definite M has M_rc² < M_rr M_cc
+          const double size = std::max(std::abs(M(row, column)), std::sqrt(std::abs(M(row, row) * M(column, column))));
+          if (std::abs(M(row, column) - M(column, row)) <= 1e-10 * size || !std::isfinite(size)) continue;
           fail(*mass_node_, "mechanics.mass",
-               fmt::format("not symmetric: row {} column {} is {}, but row {} column {} is {}", row + 1, column + 1,
-                           to_string(definition_.mass[row][column]), column + 1, row + 1, to_string(definition_.mass[column][row])));
+               fmt::format("not symmetric: row {} column {} is {}, but row {} column {} is {}; write the same on both sides",
+                           column + 1, row + 1, entry(column, row), row + 1, column + 1, entry(row, column)));
         }
       }
     }
@@ -435,10 +436,19 @@ class ModelReader {
     const std::string key = "latent." + name;
     const toml::table& entry = table(*latent.get(name), key);
     only_keys(entry, key, {"initial", "bounds"});
-    if (entry.contains("bounds")) std::tie(out.lower, out.upper) = range(*entry.get("bounds"), key + ".bounds");
-    if (entry.contains("initial")) out.initial = number(*entry.get("initial"), key + ".initial");
-    if (out.lower < 0 || out.initial < 0 || (entry.contains("bounds") && out.lower == 0)) {
-      fail(entry, key, "values are relative to the default scale and must be positive");
+    const auto require_positive = [&](const char* what, double value) {
+      if (!(value > 0)) {
+        fail(*entry.get(what), fmt::format("{}.{}", key, what),
+             fmt::format("values are factors of the default scale and must be positive, got {}", value));
+      }
+    };
+    if (entry.contains("bounds")) {
+      std::tie(out.lower, out.upper) = range(*entry.get("bounds"), key + ".bounds");
+      require_positive("bounds", out.lower);
+    }
+    if (entry.contains("initial")) {
+      out.initial = number(*entry.get("initial"), key + ".initial");
+      require_positive("initial", out.initial);
     }
     if (out.initial > 0 && out.upper > 0 && (out.initial < out.lower || out.initial > out.upper)) {
       fail(entry, key, fmt::format("initial = {} is outside bounds = [{}, {}]", out.initial, out.lower, out.upper));
@@ -451,23 +461,28 @@ class ModelReader {
       add_default_latent();
       return;
     }
+    if (root_.get("latent")->is_table())
+      fail(*root_.get("latent"), "latent", "write [[latent]], with two brackets: there may be several");
     std::set<std::string> names;
     for (const toml::node& node : array(*root_.get("latent"), "latent")) {
       const toml::table& entry = table(node, "latent");
       only_keys(entry, "latent", {"name", "kernel", "features", "directions", "lengthscale", "signal_stddev"});
       ModelFile::LatentText latent;
       latent.line = line_of(node);
-      latent.name = entry.contains("name") ? text(*entry.get("name"), "latent.name")
-                                           : fmt::format("latent {}", model_.latents.size() + 1);
+      latent.name =
+          entry.contains("name") ? text(*entry.get("name"), "latent.name") : fmt::format("latent {}", model_.latents.size() + 1);
       if (!names.insert(latent.name).second) fail(node, "latent.name", fmt::format("'{}' is taken already", latent.name));
       latent.kernel = entry.contains("kernel") ? text(*entry.get("kernel"), "latent.kernel") : "se";
       if (!entry.contains("features")) fail(node, "latent", R"(missing features = ["q1", …])");
+      std::set<std::string> expanded;
       for (const toml::node& feature : array(*entry.get("features"), "latent.features")) {
         const Expression value = expression(feature, "latent.features");
-        allow_only(feature, "latent.features", value, symbols_->parameters,
-                   "a feature may not depend on parameters (write their numbers)");
         allow_only(feature, "latent.features", value, symbols_->ddq, "a feature may not depend on accelerations");
         latent.features.push_back(feature.is_string() ? text(feature, "latent.features") : to_string(value));
+        // lengthscales go by the names of features
+        for (const std::string& name : expand_angle(latent.features.back(), definition_.coordinates)) {
+          if (!expanded.insert(name).second) fail(feature, "latent.features", fmt::format("'{}' stands twice; remove one", name));
+        }
       }
       if (latent.features.empty()) fail(node, "latent.features", "a latent needs at least one feature");
       if (entry.contains("directions")) read_directions(*entry.get("directions"), latent);
@@ -502,7 +517,8 @@ class ModelReader {
     if (node.is_string()) {
       const std::string value = text(node, key);
       if (value != "acceleration" && value != "force") {
-        fail(node, key, fmt::format("expected \"acceleration\", \"force\" or a matrix of expressions, got \"{}\"", value));
+        fail(node, key,
+             fmt::format(R"(expected "acceleration", "force" or a matrix of expressions [[…], …], got "{}")", shortened(value)));
       }
       latent.base = value == "force" ? Latent::Base::force : Latent::Base::acceleration;
       return;
@@ -547,7 +563,8 @@ class ModelReader {
     if (node->is_array()) {
       for (const toml::node& entry : *node->as_array()) model_.noise.stddev.push_back(number(entry, "noise.ddq"));
       if (model_.noise.stddev.size() != nq) {
-        fail(*node, "noise.ddq", fmt::format("expected one value or {}, one per coordinate, got {}", nq, model_.noise.stddev.size()));
+        fail(*node, "noise.ddq",
+             fmt::format("expected one value or {}, one per coordinate, got {}", nq, model_.noise.stddev.size()));
       }
     } else {
       model_.noise.stddev.assign(nq, number(*node, "noise.ddq"));
@@ -580,66 +597,76 @@ class ModelReader {
     std::set<std::string> drawable;
     for (Expression symbol : symbols_->state()) drawable.insert(symbol.variable_name());
     const auto visible = model_.symbols_;
-    for (const auto& [key, node] : sampling) {
-      const std::string name(key.str());
+    const auto visible_names = model_.symbol_names_;
+    for (const auto& [name, node] : entries_of(sampling)) {
       if (name == "start" || drawable.contains(name)) continue;
-      declare(name, node, "sampling." + name);
-      model_.symbols_.emplace(name, definition_.graph->variable(name));
+      declare(name, *node, fmt::format("sampling.{}", name));
+      model_.define(name, definition_.graph->variable(name));
     }
 
     std::vector<ModelFile::SamplingRule> rules;
-    for (const auto& [key, node] : sampling) {
-      const std::string name(key.str());
-      const std::string where = "sampling." + name;
+    for (const auto& [name, node] : entries_of(sampling)) {
+      const std::string key = fmt::format("sampling.{}", name);
       if (name == "start") {
-        for (const auto& [coordinate, value] : table(node, where)) {
-          const std::string coordinate_name(coordinate.str());
-          const bool known = std::any_of(definition_.coordinates.begin(), definition_.coordinates.end(), [&](const Coordinate& c) {
-            return c.name == coordinate_name || c.velocity() == coordinate_name;
-          });
-          if (!known) fail(value, where, fmt::format("'{}' is neither a coordinate nor a velocity", coordinate_name));
-          model_.newton_start[coordinate_name] = number(value, where + "." + coordinate_name);
-        }
+        read_newton_start(table(*node, key));
         continue;
       }
-      ModelFile::SamplingRule rule{name, std::nullopt, {}, line_of(node)};
-      if (node.is_array()) {
-        rule.range = range(node, where);
+      ModelFile::SamplingRule rule{name, std::nullopt, {}, line_of(*node)};
+      if (node->is_array()) {
+        rule.range = range(*node, key);
       } else {
-        rule.value = expression(node, where);
-        allow_only(node, where, rule.value, symbols_->ddq, "a sample may not depend on accelerations");
+        rule.value = expression(*node, key);
+        allow_only(*node, key, rule.value, symbols_->ddq, "a sample may not depend on accelerations");
       }
       rules.push_back(std::move(rule));
     }
     model_.symbols_ = visible;
+    model_.symbol_names_ = visible_names;
     sort_rules(std::move(rules));
+  }
+
+  void read_newton_start(const toml::table& start) {
+    for (const auto& [name, node] : entries_of(start)) {
+      const std::string key = fmt::format("sampling.start.{}", name);
+      const bool known = std::any_of(definition_.coordinates.begin(), definition_.coordinates.end(),
+                                     [&](const Coordinate& c) { return c.name == name || c.velocity() == name; });
+      if (!known) fail(*node, key, fmt::format("'{}' is neither a coordinate nor a velocity of this model", name));
+      model_.newton_start[name] = number(*node, key);
+    }
   }
 
   // each rule after those it uses
   void sort_rules(std::vector<ModelFile::SamplingRule> rules) {
-    while (!rules.empty()) {
-      const auto ready = std::find_if(rules.begin(), rules.end(), [&](const ModelFile::SamplingRule& rule) {
-        return rule.range || std::none_of(rules.begin(), rules.end(), [&](const ModelFile::SamplingRule& other) {
-                 return definition_.graph->depends_on(rule.value, definition_.graph->variable(other.name));
-               });
-      });
-      if (ready == rules.end()) {
-        fail(rules.front().line, "sampling." + rules.front().name, "depends on itself, directly or through other entries");
+    std::map<std::string, std::size_t> position;
+    for (const ModelFile::SamplingRule& rule : rules) position.emplace(rule.name, position.size());
+    std::vector<std::vector<std::size_t>> uses(rules.size());
+    std::vector<std::pair<std::string, int>> entries;
+    for (std::size_t k = 0; k < rules.size(); ++k) {
+      entries.emplace_back(rules[k].name, rules[k].line);
+      if (rules[k].range) continue;
+      for (const std::string& name : definition_.graph->variables_of(rules[k].value)) {
+        if (const auto other = position.find(name); other != position.end()) uses[k].push_back(other->second);
       }
-      model_.sampling.push_back(std::move(*ready));
-      rules.erase(ready);
     }
+    const Order order = order_by_use(uses);
+    if (!order.circle.empty()) {
+      const auto& [name, line] = entries[order.circle.front()];
+      fail(line, fmt::format("sampling.{}", name), "drawn in terms of itself" + circle_text(order.circle, entries));
+    }
+    for (const std::size_t k : order.positions) model_.sampling.push_back(std::move(rules[k]));
   }
 
   void read_columns() {
     if (!root_.contains("columns")) return;
-    for (const auto& [key, node] : table(*root_.get("columns"), "columns")) {
-      const std::string name(key.str());
-      const auto symbol = model_.symbols_.find(name);
-      const bool of_state = symbol != model_.symbols_.end() && symbol->second.operation() == Operation::variable &&
-                            symbol->second.variable_name() == name;
-      if (!of_state) fail(node, "columns." + name, "not a coordinate, velocity, acceleration, input or t of this model");
-      model_.columns[name] = text(node, "columns." + name);
+    std::set<std::string> known, taken;
+    for (Expression symbol : symbols_->state()) known.insert(symbol.variable_name());
+    for (Expression symbol : symbols_->ddq) known.insert(symbol.variable_name());
+    for (const auto& [name, node] : entries_of(table(*root_.get("columns"), "columns"))) {
+      const std::string key = fmt::format("columns.{}", name);
+      if (!known.contains(name)) fail(*node, key, "not a coordinate, velocity, acceleration, input or t of this model");
+      const std::string column = text(*node, key);
+      if (!taken.insert(column).second) fail(*node, key, fmt::format("the column '{}' is another name's already", column));
+      model_.columns[name] = column;
     }
   }
 
@@ -652,15 +679,12 @@ class ModelReader {
 };
 
 ModelFile ModelFile::read(const std::filesystem::path& path) {
-  std::ifstream file(path, std::ios::binary);
-  if (!file) throw InputError(fmt::format("{}: cannot be read; is the path right?", path.string()));
-  file.seekg(0, std::ios::end);
-  const auto size = file.tellg();
-  if (size < 0 || static_cast<std::size_t>(size) > max_file_size) {
-    throw InputError(fmt::format("{}: not a model file, or larger than {} bytes", path.string(), max_file_size));
+  std::error_code unknown;  // of a pipe, say; then `parse` looks at the size
+  const auto size = std::filesystem::file_size(path, unknown);
+  if (!unknown && size > max_file_size) {
+    throw InputError(fmt::format("{}: {} bytes; a model file has at most {}", path.string(), size, max_file_size));
   }
-  file.seekg(0);
-  return parse(std::string(std::istreambuf_iterator<char>(file), {}), path.string());
+  return parse(read_file(path), path.string());
 }
 
 ModelFile ModelFile::parse(std::string text, std::string name) {
@@ -668,20 +692,26 @@ ModelFile ModelFile::parse(std::string text, std::string name) {
   model.name = std::move(name);
   model.text = std::move(text);
   if (model.text.size() > max_file_size) {
-    throw InputError(fmt::format("{}: larger than {} bytes, which no model needs", model.name, max_file_size));
+    throw InputError(fmt::format("{}: {} bytes; a model file has at most {}", model.name, model.text.size(), max_file_size));
   }
   try {
     const toml::table root = toml::parse(model.text, model.name);
     ModelReader(root, model).read();
   } catch (const toml::parse_error& error) {
     throw InputError(fmt::format("{}:{}: not valid TOML: {}", model.name, error.source().begin.line, error.description()));
+  } catch (const LocatedError&) {
+    throw;
+  } catch (const InputError& error) {
+    throw InputError(fmt::format("{}: {}", model.name, error.what()));
   }
   return model;
 }
 
+void ModelFile::define(const std::string& symbol, Expression value) {
+  if (symbols_.emplace(symbol, value).second) symbol_names_.push_back(symbol);
+}
+
 Expression ModelFile::expression(std::string_view written) const {
-  std::vector<std::string> known;
-  for (const auto& [symbol, value] : symbols_) known.push_back(symbol);
   ExpressionGraph& graph = symbols_.begin()->second.graph();
   return parse_expression(
       written, graph,
@@ -689,7 +719,7 @@ Expression ModelFile::expression(std::string_view written) const {
         const auto found = symbols_.find(symbol);
         return found == symbols_.end() ? std::nullopt : std::optional(found->second);
       },
-      known);
+      symbol_names_);
 }
 
 Prior make_prior(const ModelFile& model, const PriorOptions& options) {
@@ -697,10 +727,16 @@ Prior make_prior(const ModelFile& model, const PriorOptions& options) {
   ExpressionGraph& graph = *system.definition().graph;
   const SystemSymbols symbols(graph, system.coordinates(), system.inputs(), system.parameters());
   if (options.base && model.latents.size() > 1) {
-    throw InputError(fmt::format("{}: --prior replaces the directions of the one [[latent]], but this model has {}: edit the model "
-                                 "file instead",
-                                 model.name, model.latents.size()));
+    throw InputError(
+        fmt::format("{}: --prior replaces the directions of the one [[latent]], but this model has {}: edit the model "
+                    "file instead",
+                    model.name, model.latents.size()));
   }
+
+  // features keep the parameters' own values: kernels would otherwise have to be differentiated in θ
+  std::map<std::string, Expression> parameter_values;
+  for (const Parameter& parameter : system.parameters())
+    parameter_values.emplace(parameter.name, graph.constant(parameter.value));
 
   Prior prior{model.system, {}, options.mean};
   for (const ModelFile::LatentText& text : model.latents) {
@@ -711,13 +747,14 @@ Prior make_prior(const ModelFile& model, const PriorOptions& options) {
     latent.signal_stddev = text.signal_stddev;
     std::vector<Expression> features;
     for (const std::string& feature : text.features) {
-      const bool angle = !options.raw_angles && std::any_of(system.coordinates().begin(), system.coordinates().end(),
-                                                            [&](const Coordinate& c) { return c.angle && c.name == feature; });
-      const std::vector<std::string> written =
-          angle ? std::vector<std::string>{"sin(" + feature + ")", "cos(" + feature + ")"} : std::vector<std::string>{feature};
-      for (const std::string& expression : written) {
+      for (const std::string& expression :
+           options.raw_angles ? std::vector<std::string>{feature} : expand_angle(feature, system.coordinates())) {
         latent.feature_names.push_back(expression);
-        features.push_back(model.expression(expression));
+        const Expression feature_value = model.expression(expression);
+        for (std::size_t k = 0; k < symbols.parameters.size(); ++k) {
+          if (graph.depends_on(feature_value, symbols.parameters[k])) latent.feature_parameters.push_back(static_cast<int>(k));
+        }
+        features.push_back(graph.substitute(feature_value, parameter_values));
       }
     }
     latent.features = Tape(features, symbols.state());
@@ -726,7 +763,8 @@ Prior make_prior(const ModelFile& model, const PriorOptions& options) {
     latent.directions_are_identity = text.directions.empty() || options.base.has_value();
     if (latent.directions_are_identity) {
       for (const Coordinate& coordinate : system.coordinates()) {
-        latent.column_names.push_back(latent.base == Latent::Base::force ? "force_" + coordinate.name : coordinate.acceleration());
+        latent.column_names.push_back(latent.base == Latent::Base::force ? "force_" + coordinate.name
+                                                                         : coordinate.acceleration());
       }
     } else {
       std::vector<Expression> entries;

@@ -2,6 +2,8 @@
 
 namespace gp2 {
 
-const char* version() { return GP2_VERSION; }
+const char* version() {
+  return GP2_VERSION;
+}
 
 }  // namespace gp2

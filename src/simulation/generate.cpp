@@ -1,11 +1,12 @@
 #include "gp2/generate.hpp"
 
+#include <fmt/format.h>
+#include <fmt/ranges.h>
+
+#include <Eigen/QR>
 #include <algorithm>
 #include <cmath>
 #include <limits>
-
-#include <Eigen/QR>
-#include <fmt/format.h>
 
 #include "gp2/error.hpp"
 #include "gp2/mechanics.hpp"
@@ -16,99 +17,285 @@ namespace gp2 {
 using Eigen::Index;
 using Eigen::MatrixXd;
 using Eigen::VectorXd;
+using Level = ConstraintRow::Level;
 
 namespace {
 
-// Coordinates (or velocities) that a set of equations r(x) = 0 decides, by Newton's method
+/// Coordinates (or velocities) that a set of equations r(x) = 0 decides, by Newton's method.
 class Completion {
  public:
-  // `equations` of the model's constraints, solved for those of `candidates` that [sampling] does not give
-  Completion(const ModelFile& model, const std::vector<Expression>& equations, const std::vector<Expression>& candidates,
-             int first_index, const std::vector<bool>& given, const std::vector<Expression>& tape_inputs) {
+  struct Equation {
+    Expression value;
+    std::string text;
+  };
+
+  /// @param candidates   the coordinates, or the velocities, in the order of the state
+  /// @param first_index  of the candidates in the state
+  /// @param given        which entries of the state [sampling] gives; what it does not, but an equation has, is solved for
+  Completion(const ModelFile& model, std::vector<Equation> equations, const std::vector<Expression>& candidates, int first_index,
+             const std::vector<bool>& given, const std::vector<Expression>& tape_inputs)
+      : model_(model), equations_(std::move(equations)) {
     ExpressionGraph& graph = *model.system->definition().graph;
     std::vector<Expression> outputs;
+    for (const Equation& equation : equations_) outputs.push_back(equation.value);
     for (std::size_t j = 0; j < candidates.size(); ++j) {
-      const int index = first_index + static_cast<int>(j);
-      const bool decided = std::any_of(equations.begin(), equations.end(),
-                                       [&](Expression equation) { return graph.depends_on(equation, candidates[j]); });
-      if (given[static_cast<std::size_t>(index)] || !decided) continue;
-      unknowns_.push_back(index);
-      const auto start = model.newton_start.find(candidates[j].variable_name());
+      const bool decided = std::any_of(equations_.begin(), equations_.end(),
+                                       [&](const Equation& equation) { return graph.depends_on(equation.value, candidates[j]); });
+      if (!decided) continue;
+      for (const Equation& equation : equations_) outputs.push_back(graph.differentiate(equation.value, candidates[j]));
+      variables_.push_back(first_index + static_cast<int>(j));
+      if (given[static_cast<std::size_t>(variables_.back())]) continue;
+      const std::string& name = candidates[j].variable_name();
+      const auto start = model.newton_start.find(name);
+      unknown_columns_.push_back(static_cast<int>(variables_.size()) - 1);
+      unknowns_.push_back(variables_.back());
       start_.push_back(start == model.newton_start.end() ? 0 : start->second);
-      names_.push_back(candidates[j].variable_name());
+      names_.push_back(name);
     }
-    outputs = equations;
-    for (int unknown : unknowns_) {
-      for (Expression equation : equations) {
-        outputs.push_back(graph.differentiate(equation, candidates[static_cast<std::size_t>(unknown - first_index)]));
-      }
-    }
-    n_equations_ = static_cast<Index>(equations.size());
     tape_ = Tape(outputs, tape_inputs);
   }
 
-  [[nodiscard]] const std::vector<int>& unknowns() const { return unknowns_; }
+  [[nodiscard]] const std::vector<int>& unknowns() const { return unknowns_; }  // entries of the state
 
+  /// Solves for the unknowns from their start values, to rounding.
   void solve(MatrixXd& state, const VectorXd& parameters, int sample) const {
-    if (unknowns_.empty()) return;
-    for (std::size_t k = 0; k < unknowns_.size(); ++k) state(unknowns_[k], 0) = start_[k];
-    const Index n_unknowns = static_cast<Index>(unknowns_.size());
-    MatrixXd values;
-    constexpr int max_iterations = 100;
-    for (int iteration = 0; iteration < max_iterations; ++iteration) {
-      tape_.evaluate(state, parameters, values);
-      const VectorXd residual = values.col(0).head(n_equations_);
-      const MatrixXd jacobian = values.col(0).tail(n_equations_ * n_unknowns).reshaped(n_equations_, n_unknowns);
-      if (!residual.allFinite() || !jacobian.allFinite()) break;
-      Eigen::CompleteOrthogonalDecomposition<MatrixXd> decomposition;
-      decomposition.setThreshold(1e-10);
-      decomposition.compute(jacobian);
-      if (decomposition.rank() < n_unknowns) {
-        throw InputError(fmt::format("[sampling]: the constraints do not decide {} of {} ({}); draw some of them", n_unknowns,
-                                     n_unknowns == 1 ? "it" : "them", fmt::join(names_, ", ")));
-      }
-      const VectorXd step = decomposition.solve(residual);
-      double size = 1;
-      for (std::size_t k = 0; k < unknowns_.size(); ++k) {
-        state(unknowns_[k], 0) -= step[static_cast<Index>(k)];
-        size = std::max(size, std::abs(state(unknowns_[k], 0)));
-      }
-      // quadratic convergence: after a step this small the next would be rounding
-      if (step.lpNorm<Eigen::Infinity>() <= 1e-9 * size) {
-        polish(state, parameters);
-        return;
-      }
-    }
-    throw NumericalError(fmt::format("[sampling]: Newton's method did not reach the constraints for {} at sample {}; give a better "
-                                     "[sampling] start = {{ {} = … }}",
-                                     fmt::join(names_, ", "), sample + 1, names_.front()));
+    if (equations_.empty()) return;
+    state(unknowns_, 0) = Eigen::Map<const VectorXd>(start_.data(), static_cast<Index>(start_.size()));
+    if (!unknowns_.empty()) iterate(state, parameters, sample);
+    check(state, parameters, sample);
   }
 
  private:
-  // two more steps, to rounding
-  void polish(MatrixXd& state, const VectorXd& parameters) const {
+  struct Linearisation {
+    VectorXd residual;  // r
+    MatrixXd jacobian;  // ∂r/∂x, for x among `variables_`
+  };
+
+  [[nodiscard]] Linearisation linearise(const MatrixXd& state, const VectorXd& parameters) const {
     MatrixXd values;
-    for (int step = 0; step < 2; ++step) {
-      tape_.evaluate(state, parameters, values);
-      const MatrixXd jacobian =
-          values.col(0).tail(n_equations_ * static_cast<Index>(unknowns_.size())).reshaped(n_equations_, unknowns_.size());
-      const VectorXd correction = jacobian.completeOrthogonalDecomposition().solve(values.col(0).head(n_equations_));
-      for (std::size_t k = 0; k < unknowns_.size(); ++k) state(unknowns_[k], 0) -= correction[static_cast<Index>(k)];
+    tape_.evaluate(state, parameters, values);
+    const auto n_equations = static_cast<Index>(equations_.size());
+    const auto n_variables = static_cast<Index>(variables_.size());
+    return {values.col(0).head(n_equations), values.col(0).tail(n_equations * n_variables).reshaped(n_equations, n_variables)};
+  }
+
+  void iterate(MatrixXd& state, const VectorXd& parameters, int sample) const {
+    constexpr int max_iterations = 100;
+    int polishing = 0;
+    for (int iteration = 0; iteration < max_iterations; ++iteration) {
+      const Linearisation at = linearise(state, parameters);
+      if (!at.residual.allFinite() || !at.jacobian.allFinite()) break;
+      Eigen::CompleteOrthogonalDecomposition<MatrixXd> decomposition;
+      decomposition.setThreshold(1e-10);
+      decomposition.compute(at.jacobian(Eigen::all, unknown_columns_));
+      if (decomposition.rank() < static_cast<Index>(unknowns_.size())) {
+        throw InputError(fmt::format(
+            "{}: [sampling]: at {} the constraints decide only {} of the {} unknowns {}: draw some of them, "
+            "or start elsewhere, start = {{ {} = … }}",
+            model_.name, describe(state), decomposition.rank(), unknowns_.size(), fmt::join(names_, ", "), names_.front()));
+      }
+      const VectorXd step = decomposition.solve(at.residual);
+      state(unknowns_, 0) -= step;
+      // quadratic convergence: after a step this small the next is rounding; two of those, to reach it
+      const double size = std::max(1.0, state(unknowns_, 0).lpNorm<Eigen::Infinity>());
+      if (step.lpNorm<Eigen::Infinity>() <= 1e-9 * size && polishing++ == 2) return;
+    }
+    throw NumericalError(
+        fmt::format("{}: [sampling]: Newton's method did not reach the constraints for {} at sample {}; give a "
+                    "better start = {{ {} = … }}",
+                    model_.name, fmt::join(names_, ", "), sample + 1, names_.front()));
+  }
+
+  // With fewer unknowns than equations, Newton's method ends where they are violated least.
+  void check(const MatrixXd& state, const VectorXd& parameters, int sample) const {
+    const Linearisation at = linearise(state, parameters);
+    const VectorXd size = state(variables_, 0).cwiseAbs().cwiseMax(1);
+    const VectorXd scale = at.jacobian.cwiseAbs() * size;
+    for (Index k = 0; k < at.residual.size(); ++k) {
+      if (std::abs(at.residual[k]) <= 1e-9 * scale[k]) continue;
+      throw InputError(
+          fmt::format("{}: [sampling]: sample {} ({}) is off the constraint \"{}\" by {:.3g}: leave one more of {} to be "
+                      "solved from the constraints",
+                      model_.name, sample + 1, describe(state), equations_[static_cast<std::size_t>(k)].text, at.residual[k],
+                      fmt::join(names_of(variables_), ", ")));
     }
   }
 
-  std::vector<int> unknowns_;  // entries of the state
-  std::vector<double> start_;
-  std::vector<std::string> names_;
-  Index n_equations_ = 0;
-  Tape tape_;  // r, then ∂r/∂unknown column by column
+  [[nodiscard]] std::vector<std::string> names_of(const std::vector<int>& entries) const {
+    const std::vector<std::string> all = model_.system->state_names();
+    std::vector<std::string> names;
+    for (int entry : entries) names.push_back(all[static_cast<std::size_t>(entry)]);
+    return names;
+  }
+
+  // "q1 = 0.1, q2 = 2"
+  [[nodiscard]] std::string describe(const MatrixXd& state) const {
+    const std::vector<std::string> names = names_of(variables_);
+    std::vector<std::string> parts;
+    for (std::size_t k = 0; k < names.size(); ++k) parts.push_back(fmt::format("{} = {:.6g}", names[k], state(variables_[k], 0)));
+    return fmt::format("{}", fmt::join(parts, ", "));
+  }
+
+  const ModelFile& model_;
+  std::vector<Equation> equations_;
+  std::vector<int> variables_;        // entries of the state that the equations depend on
+  std::vector<int> unknowns_;         // those to solve for
+  std::vector<int> unknown_columns_;  // their positions among variables_
+  std::vector<double> start_;         // per unknown
+  std::vector<std::string> names_;    // per unknown
+  Tape tape_;                         // r, then ∂r/∂variable column by column
 };
+
+/// Draws one state after the other by the rules of [sampling].
+class Sampler {
+ public:
+  explicit Sampler(const ModelFile& model)
+      : model_(model),
+        parameters_(model.system->parameter_values()),
+        symbols_(*model.system->definition().graph, model.system->coordinates(), model.system->inputs(),
+                 model.system->parameters()) {
+    place_rules();
+    add_completions();
+    schedule_rules();
+    check_known();
+  }
+
+  [[nodiscard]] const std::vector<bool>& known() const { return known_; }
+
+  [[nodiscard]] VectorXd draw(RandomStream& random, int sample) const {
+    MatrixXd state = MatrixXd::Constant(n_varying_, 1, std::numeric_limits<double>::quiet_NaN());
+    apply_rules(Stage::before_positions, random, state, sample);
+    positions_->solve(state, parameters_, sample);
+    apply_rules(Stage::after_positions, random, state, sample);
+    velocities_->solve(state, parameters_, sample);
+    apply_rules(Stage::after_velocities, random, state, sample);
+    return state.col(0).head(model_.system->layout().size());
+  }
+
+ private:
+  enum class Stage { before_positions, after_positions, after_velocities };
+
+  // tape inputs: the state, the auxiliary draws, the parameters
+  void place_rules() {
+    const std::vector<std::string> names = model_.system->state_names();
+    known_.assign(names.size(), false);
+    tape_inputs_ = symbols_.state();
+    for (const ModelFile::SamplingRule& rule : model_.sampling) {
+      const auto of_state = std::find(names.begin(), names.end(), rule.name);
+      if (of_state != names.end()) {
+        target_.push_back(static_cast<int>(of_state - names.begin()));
+        known_[static_cast<std::size_t>(target_.back())] = true;
+      } else {
+        target_.push_back(static_cast<int>(tape_inputs_.size()));
+        tape_inputs_.push_back(graph().variable(rule.name));
+      }
+    }
+    n_varying_ = static_cast<Index>(tape_inputs_.size());
+    tape_inputs_.insert(tape_inputs_.end(), symbols_.parameters.begin(), symbols_.parameters.end());
+  }
+
+  void add_completions() {
+    std::vector<Completion::Equation> position_equations, velocity_equations;
+    for (const ConstraintRow& row : model_.system->definition().constraints) {
+      if (row.level == Level::position) {
+        position_equations.push_back({row.residuals[0], row.text});
+        velocity_equations.push_back({row.residuals[1], "d/dt of " + row.text});
+      } else if (row.level == Level::velocity) {
+        velocity_equations.push_back({row.residuals[0], row.text});
+      }
+    }
+    const StateLayout layout = model_.system->layout();
+    positions_.emplace(model_, std::move(position_equations), symbols_.q, layout.q(0), known_, tape_inputs_);
+    velocities_.emplace(model_, std::move(velocity_equations), symbols_.dq, layout.dq(0), known_, tape_inputs_);
+    for (const Completion* completion : {&*positions_, &*velocities_}) {
+      for (int unknown : completion->unknowns()) known_[static_cast<std::size_t>(unknown)] = true;
+    }
+  }
+
+  // a rule that needs what is solved from the constraints waits until it is there
+  void schedule_rules() {
+    std::map<std::string, Stage> available;
+    for (int unknown : positions_->unknowns()) available[name_of(unknown)] = Stage::after_positions;
+    for (int unknown : velocities_->unknowns()) available[name_of(unknown)] = Stage::after_velocities;
+    for (const ModelFile::SamplingRule& rule : model_.sampling) {
+      Stage stage = Stage::before_positions;
+      if (!rule.range) {
+        for (const std::string& name : graph().variables_of(rule.value)) {
+          if (const auto from = available.find(name); from != available.end()) stage = std::max(stage, from->second);
+        }
+      }
+      available[rule.name] = stage;
+      stage_.push_back(stage);
+      tapes_.push_back(rule.range ? Tape() : Tape(std::span(&rule.value, 1), tape_inputs_));
+    }
+  }
+
+  // everything that the true motion and the constraints read must be known
+  void check_known() const {
+    const SymbolicSystem& system = *model_.system;
+    const Tape truth(model_.truth, symbols_.state_and_parameters());
+    const std::vector<bool> mechanics = system.reads(SystemPart::mechanics);
+    const std::vector<bool> force = system.reads(SystemPart::force);
+    const std::vector<bool> residuals = system.reads(SystemPart::residuals);
+    for (std::size_t k = 0; k < known_.size(); ++k) {
+      const bool reads = mechanics[k] || force[k] || residuals[k] || truth.uses_input(static_cast<int>(k));
+      if (reads && !known_[k]) {
+        const std::string name = name_of(static_cast<int>(k));
+        throw InputError(
+            fmt::format("{}: [sampling] says nothing of '{}', which the model reads, and no constraint decides it: add {} "
+                        "= [lower, upper]",
+                        model_.name, name, name));
+      }
+    }
+  }
+
+  void apply_rules(Stage stage, RandomStream& random, MatrixXd& state, int sample) const {
+    MatrixXd value;
+    for (std::size_t r = 0; r < model_.sampling.size(); ++r) {
+      if (stage_[r] != stage) continue;
+      const ModelFile::SamplingRule& rule = model_.sampling[r];
+      if (rule.range) {
+        state(target_[r], 0) = rule.range->first + random.uniform() * (rule.range->second - rule.range->first);
+        continue;
+      }
+      tapes_[r].evaluate(state, parameters_, value);
+      state(target_[r], 0) = value(0, 0);
+      if (!std::isfinite(value(0, 0))) {
+        throw InputError(fmt::format("{}:{}: sampling.{}: {} is not a finite number at sample {}", model_.name, rule.line,
+                                     rule.name, to_string(rule.value), sample + 1));
+      }
+    }
+  }
+
+  [[nodiscard]] ExpressionGraph& graph() const { return *model_.system->definition().graph; }
+  [[nodiscard]] const std::string& name_of(int entry) const {
+    return tape_inputs_[static_cast<std::size_t>(entry)].variable_name();
+  }
+
+  const ModelFile& model_;
+  VectorXd parameters_;
+  SystemSymbols symbols_;
+  std::vector<bool> known_;              // entries of the state that are drawn or solved for
+  std::vector<Expression> tape_inputs_;  // the first n_varying_ are drawn or solved for, the parameters follow
+  Index n_varying_ = 0;
+  std::vector<int> target_;   // of each rule: its row among the tape inputs
+  std::vector<Stage> stage_;  // of each rule
+  std::vector<Tape> tapes_;   // of each rule
+  std::optional<Completion> positions_, velocities_;
+};
+
+void require_truth(const ModelFile& model) {
+  if (model.truth.empty()) {
+    throw InputError(
+        fmt::format("{}: missing [truth] acceleration = [ … ]: what is added to M⁻¹ force, \"0\" where nothing is", model.name));
+  }
+}
 
 }  // namespace
 
 MatrixXd true_acceleration(const ModelFile& model, const Eigen::Ref<const MatrixXd>& states) {
   const SymbolicSystem& system = *model.system;
-  if (model.truth.empty()) throw InputError(fmt::format("{}: missing [truth] acceleration = [ … ]", model.name));
+  require_truth(model);
   const SystemSymbols symbols(*system.definition().graph, system.coordinates(), system.inputs(), system.parameters());
   const VectorXd parameters = system.parameter_values();
   const MechanicsBatch mechanics = require_mechanics(system, states, parameters);
@@ -127,101 +314,24 @@ MatrixXd true_acceleration(const ModelFile& model, const Eigen::Ref<const Matrix
 
 GeneratedData generate(const ModelFile& model, const GenerateOptions& options) {
   const SymbolicSystem& system = *model.system;
-  if (model.sampling.empty()) throw InputError(fmt::format("{}: missing [sampling]: where states are drawn from", model.name));
-  if (model.truth.empty()) throw InputError(fmt::format("{}: missing [truth] acceleration = [ … ]", model.name));
-  ExpressionGraph& graph = *system.definition().graph;
-  const SystemSymbols symbols(graph, system.coordinates(), system.inputs(), system.parameters());
-  const StateLayout layout = system.layout();
-  const std::vector<std::string> names = system.state_names();
-  const VectorXd parameters = system.parameter_values();
-
-  // tape inputs: the state, the auxiliary draws, the parameters
-  GeneratedData data;
-  data.known.assign(names.size(), false);
-  std::vector<Expression> tape_inputs = symbols.state();
-  std::vector<int> target;  // of each rule: its row among the tape inputs
-  for (const ModelFile::SamplingRule& rule : model.sampling) {
-    const auto of_state = std::find(names.begin(), names.end(), rule.name);
-    if (of_state != names.end()) {
-      target.push_back(static_cast<int>(of_state - names.begin()));
-      data.known[static_cast<std::size_t>(target.back())] = true;
-    } else {
-      target.push_back(static_cast<int>(tape_inputs.size()));
-      tape_inputs.push_back(graph.variable(rule.name));
-    }
+  if (model.sampling.empty()) {
+    throw InputError(fmt::format("{}: missing [sampling]: where states are drawn from, say q1 = [-1, 1]", model.name));
   }
-  const Index n_varying = static_cast<Index>(tape_inputs.size());
-  tape_inputs.insert(tape_inputs.end(), symbols.parameters.begin(), symbols.parameters.end());
-
-  // rules that need a coordinate or velocity solved from the constraints wait until it is there
-  std::vector<Expression> position_equations, velocity_equations;
-  for (const ConstraintRow& row : system.definition().constraints) {
-    if (row.level == ConstraintRow::Level::position) {
-      position_equations.push_back(row.residuals[0]);
-      velocity_equations.push_back(row.residuals[1]);
-    } else if (row.level == ConstraintRow::Level::velocity) {
-      velocity_equations.push_back(row.residuals[0]);
-    }
-  }
-  const Completion positions(model, position_equations, symbols.q, layout.q(0), data.known, tape_inputs);
-  const Completion velocities(model, velocity_equations, symbols.dq, layout.dq(0), data.known, tape_inputs);
-  const auto solved_later = [&](const ModelFile::SamplingRule& rule, const Completion& completion) {
-    return !rule.range && std::any_of(completion.unknowns().begin(), completion.unknowns().end(), [&](int unknown) {
-      return graph.depends_on(rule.value, tape_inputs[static_cast<std::size_t>(unknown)]);
-    });
-  };
-  std::vector<int> stage;  // 0: before positions are solved, 1: after them, 2: after velocities
-  std::vector<Tape> tapes;
-  for (std::size_t r = 0; r < model.sampling.size(); ++r) {
-    const ModelFile::SamplingRule& rule = model.sampling[r];
-    int needed = solved_later(rule, velocities) ? 2 : solved_later(rule, positions) ? 1 : 0;
-    for (std::size_t earlier = 0; earlier < r; ++earlier) {
-      if (!rule.range && graph.depends_on(rule.value, graph.variable(model.sampling[earlier].name))) {
-        needed = std::max(needed, stage[earlier]);
-      }
-    }
-    stage.push_back(needed);
-    tapes.push_back(rule.range ? Tape() : Tape(std::span(&rule.value, 1), tape_inputs));
-  }
-  for (const Completion* completion : {&positions, &velocities}) {
-    for (int unknown : completion->unknowns()) data.known[static_cast<std::size_t>(unknown)] = true;
+  require_truth(model);
+  if (options.n < 1) throw InputError(fmt::format("generate: n must be at least 1, got {}", options.n));
+  if (options.noise_stddev.size() != system.nq() || !(options.noise_stddev.array() >= 0).all() ||
+      !options.noise_stddev.allFinite()) {
+    throw InputError(fmt::format("generate: noise_stddev must hold {} finite numbers ≥ 0, one per coordinate", system.nq()));
   }
 
-  // everything the true motion reads must be known
-  const Tape truth(model.truth, symbols.state_and_parameters());
-  const std::vector<bool> mechanics_reads = system.reads(SystemPart::mechanics);
-  const std::vector<bool> force_reads = system.reads(SystemPart::force);
-  for (std::size_t k = 0; k < names.size(); ++k) {
-    if (!data.known[k] && (mechanics_reads[k] || force_reads[k] || truth.uses_input(static_cast<int>(k)))) {
-      throw InputError(fmt::format("{}: [sampling] says nothing of '{}', which the model reads, and no constraint decides it",
-                                   model.name, names[k]));
-    }
-  }
-
+  const Sampler sampler(model);
   RandomStream random(options.seed);
-  data.states.resize(layout.size(), options.n);
-  for (int i = 0; i < options.n; ++i) {
-    MatrixXd sample = MatrixXd::Constant(n_varying, 1, std::numeric_limits<double>::quiet_NaN());
-    MatrixXd value;
-    const auto apply_rules = [&](int current_stage) {
-      for (std::size_t r = 0; r < model.sampling.size(); ++r) {
-        if (stage[r] != current_stage) continue;
-        if (const auto& range = model.sampling[r].range) {
-          sample(target[r], 0) = range->first + random.uniform() * (range->second - range->first);
-        } else {
-          tapes[r].evaluate(sample, parameters, value);
-          sample(target[r], 0) = value(0, 0);
-        }
-      }
-    };
-    apply_rules(0);
-    positions.solve(sample, parameters, i);
-    apply_rules(1);
-    velocities.solve(sample, parameters, i);
-    apply_rules(2);
-    data.states.col(i) = sample.col(0).head(layout.size());
-  }
+  GeneratedData data;
+  data.known = sampler.known();
+  data.states.resize(system.layout().size(), options.n);
+  for (int i = 0; i < options.n; ++i) data.states.col(i) = sampler.draw(random, i);
   data.accelerations = true_acceleration(model, data.states);
+  // noise comes last, so that states are the same for any noise
   for (int i = 0; i < options.n; ++i) {
     for (Index j = 0; j < data.accelerations.rows(); ++j) {
       if (options.noise_stddev[j] > 0) data.accelerations(j, i) += options.noise_stddev[j] * random.normal();

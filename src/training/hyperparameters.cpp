@@ -255,6 +255,14 @@ std::vector<Hyperparameter> default_hyperparameters(const Prior& prior, const st
       throw InputError(fmt::format("--estimate: the model '{}' has no parameter '{}'; it has: {}", system.name(), name,
                                    known.empty() ? "none" : known));
     }
+    for (const Latent& latent : prior.latents) {
+      const std::vector<int>& used = latent.feature_parameters;
+      if (std::find(used.begin(), used.end(), index) != used.end()) {
+        throw InputError(fmt::format("--estimate: parameter '{}' stands in a feature of the latent '{}', and features hold no estimated "
+                                     "parameters; write the feature without it, or leave it out",
+                                     name, latent.name));
+      }
+    }
     const Parameter& parameter = system.parameters()[static_cast<std::size_t>(index)];
     Hyperparameter h;
     h.kind = Kind::parameter;
