@@ -4,7 +4,6 @@
 #include <gtest/gtest.h>
 
 #include <Eigen/Core>
-
 #include <algorithm>
 #include <cmath>
 #include <filesystem>
@@ -39,13 +38,21 @@ inline std::vector<std::string> model_files(const std::vector<std::string>& fold
   std::sort(files.begin(), files.end());
   return files;
 }
-inline std::vector<std::string> every_model() { return model_files({"models", "experiments"}); }
-inline std::vector<std::string> library_models() { return model_files({"models"}); }
+inline std::vector<std::string> every_model() {
+  return model_files({"models", "experiments"});
+}
+inline std::vector<std::string> library_models() {
+  return model_files({"models"});
+}
 
-inline std::string stem(const std::string& file) { return std::filesystem::path(file).stem().string(); }
+inline std::string stem(const std::string& file) {
+  return std::filesystem::path(file).stem().string();
+}
 
 /// Name of a parameterised test: the model's.
-inline std::string model_test_name(const testing::TestParamInfo<std::string>& info) { return stem(info.param); }
+inline std::string model_test_name(const testing::TestParamInfo<std::string>& info) {
+  return stem(info.param);
+}
 
 /// A model file of the checkout, read once.
 inline const ModelFile& model(const std::string& file) {
@@ -156,8 +163,8 @@ struct Difference {
   Eigen::VectorXd value, error;
 };
 
-/// d f/dx by the central difference of fourth order, with steps h and h/2 where h = ε^(1/5)·scale balances truncation against rounding.
-/// `error` is twice what the two steps differ by, plus the rounding of f over the step.
+/// d f/dx by the central difference of fourth order, with steps h and h/2 where h = ε^(1/5)·scale balances truncation against
+/// rounding. `error` is twice what the two steps differ by, plus the rounding of f over the step.
 ///
 /// @param f          double -> VectorXd
 /// @param scale      over which f changes

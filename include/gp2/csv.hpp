@@ -7,8 +7,8 @@
 
 namespace gp2 {
 
-/// A table of comma-separated values with one header line. Cells stay text until they are asked for as numbers, so columns that are
-/// not needed may hold anything.
+/// A table of comma-separated values with one header line. Cells may be quoted; blank lines are skipped. Cells stay text until
+/// they are asked for as numbers, so columns that are not needed may hold anything.
 class CsvTable {
  public:
   /// @throws InputError naming file and line: unreadable or empty file, no data rows, ragged row, repeated or empty column name.
@@ -36,7 +36,9 @@ class CsvTable {
 /// The shortest text that reads back to the same double.
 std::string shortest(double value);
 
-/// Writes `content` to a file whole or not at all: into a temporary file beside it, flushed, then renamed over `path`.
+/// Writes `content` to a file whole or not at all: into a temporary file beside it, flushed, then renamed over `path`. A link
+/// stays and its target is replaced; an old file's permissions are kept; a device or pipe, say /dev/stdout, is written to as it
+/// is.
 /// @throws InputError naming the path when that fails; an old file at `path` is then intact.
 void write_file(const std::filesystem::path& path, std::string_view content);
 

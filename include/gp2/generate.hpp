@@ -1,8 +1,7 @@
 #pragma once
 
-#include <cstdint>
-
 #include <Eigen/Core>
+#include <cstdint>
 
 #include "gp2/model_file.hpp"
 
@@ -22,7 +21,8 @@ struct GenerateOptions {
 };
 
 /// Draws states, solving the constraints for coordinates and velocities that [sampling] leaves open, and measures them.
-/// @throws InputError when [sampling] or [truth] is missing, or leaves open what the constraints do not decide.
+/// @throws InputError when [sampling] or [truth] is missing, leaves open what the constraints do not decide, or puts a state off
+///   the constraints; when n < 1 or noise_stddev is not of nq finite numbers ≥ 0.
 /// @throws NumericalError when Newton's method does not reach the constraints.
 GeneratedData generate(const ModelFile& model, const GenerateOptions& options);
 

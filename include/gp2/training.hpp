@@ -51,14 +51,16 @@ struct Protocol {
   Name name = Name::standard;
   bool hyperprior = true;  // of the standard protocol
 
-  /// The standard protocol's ranges, relative to the default scales, and hyper-priors; see docs/priors.md for how they were chosen.
+  /// The standard protocol's ranges, relative to the default scales, and hyper-priors; docs/priors.md says how they were chosen.
   struct Standard {
-    static constexpr double lengthscale_initial = 3, lengthscale_lower = 0.05, lengthscale_upper = 500;
-    static constexpr double lengthscale_median = 5, lengthscale_log_stddev = 1.5;
-    static constexpr double signal_initial = 1, signal_lower = 1e-3, signal_upper = 1e3;
-    static constexpr double signal_median = 1, signal_log_stddev = 1.5;
+    static constexpr double lengthscale_initial = 3, lengthscale_lower = 0.05, lengthscale_upper = 1e6;
+    static constexpr double lengthscale_median = 100, lengthscale_log_stddev = 4;
+    static constexpr double signal_initial = 1, signal_lower = 1e-3, signal_upper = 1e5;
+    static constexpr double signal_median = 1, signal_log_stddev = 4;
+    static constexpr double shape_log_stddev = 1.5;  // of α, periods and relative amplitudes
     static constexpr double noise_lower = 1e-6, noise_upper = 2;
     static constexpr double noise_log_stddev = 2;
+    static constexpr double start_log_stddev = 1.5;  // of random starts about the first one
   };
 };
 
@@ -121,6 +123,7 @@ struct FitReport {
   std::string termination;
   int iterations = 0;  // of the best restart
   int best_restart = 0;
+  int n_escapes = 0;  // times the scan from the best optimum found a lower one
   std::vector<RestartReport> restarts;
   double seconds = 0;
 };
@@ -131,7 +134,8 @@ struct Fit {
 };
 
 /// Maximises the posterior density of the hyperparameters (marginal likelihood times hyper-priors) by L-BFGS-B from several starting
-/// points, and conditions the prior there. Same seed, same bits, for any number of threads.
+/// points. From the best optimum each hyperparameter is then scanned over its box by itself, the others held, and the optimiser runs
+/// again from the lowest point found: an optimum in a corner of the box often hides a lower one. The prior is conditioned there. Same seed, same bits, for any number of threads.
 ///
 /// @throws InputError, NumericalError  as Likelihood and Posterior; NumericalError when no restart reached a finite likelihood.
 Fit fit(const Prior& prior, const std::vector<Observations>& observations, const std::vector<Hyperparameter>& hyperparameters,

@@ -55,16 +55,27 @@ Choice choice_from(const Json& json, const std::array<Named<Choice>, n>& choices
   return known->first;
 }
 
+// a value to show in a message
+std::string shown(const Json& json) {
+  return json.is_structured() ? json.type_name() : json.dump();
+}
+
 // a whole number, where Json itself would round or wrap
 int integer(const Json& json) {
   constexpr auto largest = std::numeric_limits<int>::max();
-  if (!json.is_number_integer()) throw InputError(fmt::format("{} stands where a whole number must", json.dump()));
-  if (std::abs(json.get<double>()) > largest) throw InputError(fmt::format("{} is too large", json.dump()));
+  if (!json.is_number_integer()) throw InputError(fmt::format("{} stands where a whole number must", shown(json)));
+  if (std::abs(json.get<double>()) > largest) throw InputError(fmt::format("{} is too large", shown(json)));
   return json.get<int>();
 }
 
+// an array, where a loop would also take other values
+const Json& array(const Json& json) {
+  if (!json.is_array()) throw InputError(fmt::format("{} stands where an array must", shown(json)));
+  return json;
+}
+
 double number(const Json& json) {
-  if (!json.is_number()) throw InputError(fmt::format("{} stands where a number must", json.dump()));
+  if (!json.is_number()) throw InputError(fmt::format("{} stands where a number must", shown(json)));
   return json.get<double>();
 }
 
@@ -82,8 +93,7 @@ Json vector_json(const VectorXd& values) {
 }
 
 VectorXd vector_from(const Json& json) {
-  if (!json.is_array()) throw InputError("expected an array of numbers");
-  VectorXd values(static_cast<Index>(json.size()));
+  VectorXd values(static_cast<Index>(array(json).size()));
   std::transform(json.begin(), json.end(), values.begin(), number);
   return values;
 }
@@ -205,7 +215,7 @@ Observations observations_from(const Json& json, const Prior& prior) {
   const System& system = *prior.system;
   Observations group;
   group.view.quantity = choice_from(json.at("view"), quantities, "view");
-  for (const Json& row : json.at("rows")) {
+  for (const Json& row : array(json.at("rows"))) {
     const int index = integer(row);
     if (index < 0 || index >= system.nq())
       throw InputError(fmt::format("row {} of a view is outside 0 … {}", index, system.nq() - 1));
@@ -306,9 +316,9 @@ FitFile FitFile::read(const std::filesystem::path& path) {
     prior_json.at("raw_angles").get_to(fit.prior_options.raw_angles);
     json.at("data_source").get_to(fit.data_source);
     const Prior prior = fit.prior();
-    for (const Json& group : json.at("observations")) fit.observations.push_back(observations_from(group, prior));
+    for (const Json& group : array(json.at("observations"))) fit.observations.push_back(observations_from(group, prior));
     if (fit.observations.empty()) throw InputError("no observations");
-    for (const Json& h : json.at("hyperparameters")) fit.report.hyperparameters.push_back(hyperparameter_from(h));
+    for (const Json& h : array(json.at("hyperparameters"))) fit.report.hyperparameters.push_back(hyperparameter_from(h));
     check_hyperparameters(fit.report.hyperparameters, prior, fit.observations);
     const Json& report = json.at("report");
     fit.report.negative_log_likelihood = number(report.at("nll"));
@@ -317,7 +327,7 @@ FitFile FitFile::read(const std::filesystem::path& path) {
     report.at("termination").get_to(fit.report.termination);
     fit.report.iterations = integer(report.at("iterations"));
     fit.report.best_restart = integer(report.at("best_restart"));
-    for (const Json& restart : report.at("restarts")) fit.report.restarts.push_back(restart_from(restart));
+    for (const Json& restart : array(report.at("restarts"))) fit.report.restarts.push_back(restart_from(restart));
   } catch (const Json::exception& error) {
     throw InputError(fmt::format("{}: not a whole fit file: {}", path.string(), error.what()));
   } catch (const InputError& error) {

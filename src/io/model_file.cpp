@@ -31,13 +31,20 @@ int line_of(const toml::node& node) {
   return static_cast<int>(node.source().begin.line);
 }
 
+// at most 60 bytes of a text, cut between characters
+std::string shortened(const std::string& text) {
+  if (text.size() <= 60) return text;
+  std::size_t end = 57;
+  while (end > 0 && (static_cast<unsigned char>(text[end]) & 0xC0U) == 0x80U) --end;
+  return text.substr(0, end) + "...";
+}
+
 // a value as the file has it, to show what was got
 std::string written(const toml::node& node) {
   if (node.is_table()) return "a table";
   std::ostringstream text;
   node.visit([&](const auto& value) { text << value; });
-  std::string shown = text.str();
-  return shown.size() <= 60 ? shown : shown.substr(0, 57) + "...";
+  return shortened(text.str());
 }
 
 // TOML tables are sorted by name here; the file's own order reads better and is the order in which complaints come
@@ -207,11 +214,9 @@ class ModelReader {
     try {
       return model_.expression(text(node, key));
     } catch (const InputError& error) {
-      fail(node, key, fmt::format("{} in \"{}\"", error.what(), shortened(text(node, key))));
+      fail(node, key, fmt::format("\"{}\", {}", shortened(text(node, key)), error.what()));
     }
   }
-
-  static std::string shortened(const std::string& text) { return text.size() <= 60 ? text : text.substr(0, 57) + "..."; }
 
   // ---- the tables of a model
   // ------------------------------------------------------------------------------------------------------
@@ -434,7 +439,11 @@ class ModelReader {
     Latent::Range out;
     if (!latent.contains(name)) return out;
     const std::string key = "latent." + name;
-    const toml::table& entry = table(*latent.get(name), key);
+    if (!latent.get(name)->is_table()) {
+      fail(*latent.get(name), key,
+           fmt::format("expected a table such as {{ initial = 1, bounds = [0.1, 10] }}, got {}", written(*latent.get(name))));
+    }
+    const toml::table& entry = *latent.get(name)->as_table();
     only_keys(entry, key, {"initial", "bounds"});
     const auto require_positive = [&](const char* what, double value) {
       if (!(value > 0)) {
@@ -491,7 +500,7 @@ class ModelReader {
       try {
         static_cast<void>(Kernel::parse(latent.kernel, latent.features));
       } catch (const InputError& error) {
-        fail(node, "latent.kernel", error.what());
+        fail(entry.contains("kernel") ? *entry.get("kernel") : node, "latent.kernel", error.what());
       }
       model_.latents.push_back(std::move(latent));
     }

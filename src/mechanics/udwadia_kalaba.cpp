@@ -55,9 +55,12 @@ UdwadiaKalaba::UdwadiaKalaba(const Ref<const MatrixXd>& M, const Ref<const Matri
   // Bᵀ P = [Y Z] [R; 0]: Y spans range(Bᵀ), Z its complement
   Eigen::ColPivHouseholderQR<MatrixXd> qr;
   qr.setThreshold(rank_tolerance);
-  qr.compute(Bt);
-  rank_ = nc == 0 ? 0 : static_cast<int>(qr.rank());
-  const MatrixXd basis = nc == 0 ? MatrixXd::Identity(nq, nq) : MatrixXd(qr.householderQ());
+  MatrixXd basis = MatrixXd::Identity(nq, nq);
+  if (nc > 0) {
+    qr.compute(Bt);
+    rank_ = static_cast<int>(qr.rank());
+    basis = qr.householderQ();
+  }
   const auto Y = basis.leftCols(rank_);
   const auto Z = basis.rightCols(nq - rank_);
 

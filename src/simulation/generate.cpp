@@ -7,6 +7,9 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <map>
+#include <optional>
+#include <span>
 
 #include "gp2/error.hpp"
 #include "gp2/mechanics.hpp"

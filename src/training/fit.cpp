@@ -1,7 +1,9 @@
 #include <algorithm>
+#include <atomic>
 #include <chrono>
 #include <cmath>
 #include <limits>
+#include <exception>
 #include <mutex>
 #include <random>
 #include <thread>
@@ -61,11 +63,12 @@ double gather(const Hyperparameter& h, const ModelValues& gradient) {
   return 0;
 }
 
-// a random start: from the hyper-prior where there is one, else even in the box (in logarithms for positive values)
+// a random start: log-normal about the first start where there is a hyper-prior, else even in the box (in logarithms for positive
+// values)
 std::vector<Hyperparameter> draw_start(std::vector<Hyperparameter> hyperparameters, RandomStream& random) {
   for (Hyperparameter& h : hyperparameters) {
     if (h.log_stddev > 0) {
-      h.value = std::clamp(h.median * std::exp(h.log_stddev * random.normal()), h.lower, h.upper);
+      h.value = std::clamp(h.value * std::exp(Protocol::Standard::start_log_stddev * random.normal()), h.lower, h.upper);
     } else {
       const double lower = to_internal(h, h.lower);
       h.value = from_internal(h, lower + random.uniform() * (to_internal(h, h.upper) - lower));
@@ -85,7 +88,12 @@ class Training {
         likelihood_(prior, observations, model_values(prior, observations, hyperparameters), likelihood_options(hyperparameters)),
         reports_(static_cast<std::size_t>(n_restarts())),
         results_(static_cast<std::size_t>(n_restarts())),
-        fractions_(static_cast<std::size_t>(n_restarts()), 0.0) {}
+        fractions_(static_cast<std::size_t>(n_restarts()), 0.0) {
+    for (const Hyperparameter& h : hyperparameters) {
+      box_.lower.push_back(to_internal(h, h.lower));
+      box_.upper.push_back(to_internal(h, h.upper));
+    }
+  }
 
   [[nodiscard]] int n_restarts() const {
     return options_.max_iterations == 0 || hyperparameters_.empty() ? 1 : std::max(1, options_.n_restarts);
@@ -93,24 +101,9 @@ class Training {
 
   void run() {
     const lapack::SingleThread single_thread;
-    int n_threads = options_.n_threads > 0 ? options_.n_threads : static_cast<int>(std::thread::hardware_concurrency());
-    n_threads = std::clamp(n_threads, 1, n_restarts());
-    std::atomic<int> next = 0;
-    const auto work = [&] {
-      for (int restart = next++; restart < n_restarts(); restart = next++) {
-        try {
-          run_restart(restart);
-        } catch (...) {
-          const std::scoped_lock lock(mutex_);
-          if (!failure_) failure_ = std::current_exception();
-        }
-      }
-    };
-    std::vector<std::jthread> helpers;
-    for (int k = 1; k < n_threads; ++k) helpers.emplace_back(work);
-    work();
-    helpers.clear();
-    if (failure_) std::rethrow_exception(failure_);
+    in_parallel(n_restarts(), [&](int restart) { run_restart(restart); });
+    constexpr int max_escapes = 5;
+    while (n_escapes_ < max_escapes && options_.max_iterations > 0 && !stopped() && escape()) ++n_escapes_;
   }
 
   // the lowest objective; of equal ones the first
@@ -121,6 +114,7 @@ class Training {
   }
   [[nodiscard]] const std::vector<RestartReport>& reports() const { return reports_; }
   [[nodiscard]] const std::vector<Hyperparameter>& result(std::size_t restart) const { return results_[restart]; }
+  [[nodiscard]] int n_escapes() const { return n_escapes_; }
 
  private:
   static Likelihood::Options likelihood_options(const std::vector<Hyperparameter>& hyperparameters) {
@@ -132,6 +126,34 @@ class Training {
     return options;
   }
 
+  [[nodiscard]] bool stopped() const { return options_.stop != nullptr && options_.stop->load(); }
+
+  // calls work(0) … work(n − 1), each once, on as many threads as allowed
+  template <typename Work>
+  void in_parallel(int n, const Work& work) const {
+    int n_threads = options_.n_threads > 0 ? options_.n_threads : static_cast<int>(std::thread::hardware_concurrency());
+    n_threads = std::clamp(n_threads, 1, n);
+    std::atomic<int> next = 0;
+    std::mutex mutex;
+    std::exception_ptr failure;
+    const auto run = [&] {
+      for (int k = next++; k < n; k = next++) {
+        try {
+          work(k);
+        } catch (...) {
+          const std::scoped_lock lock(mutex);
+          if (!failure) failure = std::current_exception();
+        }
+      }
+    };
+    {
+      std::vector<std::jthread> helpers;
+      for (int k = 1; k < n_threads; ++k) helpers.emplace_back(run);
+      run();
+    }
+    if (failure) std::rethrow_exception(failure);
+  }
+
   std::vector<Hyperparameter> at(const VectorXd& x) const {
     std::vector<Hyperparameter> hyperparameters = hyperparameters_;
     for (std::size_t k = 0; k < hyperparameters.size(); ++k) {
@@ -140,51 +162,92 @@ class Training {
     return hyperparameters;
   }
 
-  double objective(const VectorXd& x, VectorXd& gradient, Likelihood::Workspace& workspace) const {
+  double objective(const VectorXd& x, VectorXd* gradient, Likelihood::Workspace& workspace) const {
     const std::vector<Hyperparameter> hyperparameters = at(x);
     ModelValues model_gradient;
-    const double value = likelihood_.evaluate(model_values(prior_, observations_, hyperparameters), &model_gradient, workspace);
+    const double value = likelihood_.evaluate(model_values(prior_, observations_, hyperparameters),
+                                              gradient == nullptr ? nullptr : &model_gradient, workspace);
     if (!std::isfinite(value)) return value;
-    for (std::size_t k = 0; k < hyperparameters.size(); ++k) {
-      gradient[static_cast<Index>(k)] = gather(hyperparameters[k], model_gradient);
+    for (std::size_t k = 0; gradient != nullptr && k < hyperparameters.size(); ++k) {
+      (*gradient)[static_cast<Index>(k)] = gather(hyperparameters[k], model_gradient);
     }
-    return value + hyperprior(hyperparameters, &gradient);
+    return value + hyperprior(hyperparameters, gradient);
   }
 
-  void run_restart(int restart) {
-    const auto index = static_cast<std::size_t>(restart);
-    const Index n = static_cast<Index>(hyperparameters_.size());
-    VectorXd lower(n), upper(n), start(n);
-    RandomStream random(options_.seed, static_cast<std::uint64_t>(restart));
-    Likelihood::Workspace workspace;
+  LbfgsbResult optimise(int restart, const std::vector<Hyperparameter>& from, Likelihood::Workspace& workspace) {
     LbfgsbOptions options;
     options.max_iterations = options_.max_iterations;
     options.gradient_tolerance = options_.gradient_tolerance;
     options.reduction_tolerance = options_.reduction_tolerance;
     options.iteration = [&](int iteration, double value) { return report_iteration(restart, iteration, value); };
+    const Index n = static_cast<Index>(from.size());
+    VectorXd start(n);
+    for (Index k = 0; k < n; ++k) start[k] = to_internal(from[static_cast<std::size_t>(k)], from[static_cast<std::size_t>(k)].value);
+    return minimise([&](const VectorXd& x, VectorXd& gradient) { return objective(x, &gradient, workspace); }, start,
+                    Eigen::Map<const VectorXd>(box_.lower.data(), n), Eigen::Map<const VectorXd>(box_.upper.data(), n), options);
+  }
 
+  void store(std::size_t restart, const LbfgsbResult& result) {
+    results_[restart] = options_.max_iterations == 0 ? hyperparameters_ : at(result.x);
+    RestartReport& report = reports_[restart];
+    report.objective = result.value;
+    report.negative_log_likelihood = result.value - hyperprior(results_[restart], nullptr);
+    report.iterations += result.iterations;
+    report.evaluations += result.evaluations;
+    report.failed_evaluations += result.failed_evaluations;
+    report.converged = result.converged;
+    report.termination = result.termination;
+  }
+
+  // scans each hyperparameter over its box from the best optimum; true when the optimiser got lower from the best point of the scan
+  bool escape() {
+    const std::size_t from = best();
+    if (!std::isfinite(reports_[from].objective) || hyperparameters_.empty()) return false;
+    constexpr int n_points = 9;
+    const Index n = static_cast<Index>(hyperparameters_.size());
+    VectorXd x(n);
+    for (Index k = 0; k < n; ++k) {
+      const Hyperparameter& h = results_[from][static_cast<std::size_t>(k)];
+      x[k] = to_internal(h, h.value);
+    }
+    const auto moved = [&](int trial) {
+      VectorXd there = x;
+      const auto k = static_cast<std::size_t>(trial / n_points);
+      there[trial / n_points] = box_.lower[k] + (box_.upper[k] - box_.lower[k]) * (trial % n_points + 1) / (n_points + 1);
+      return there;
+    };
+    std::vector<double> values(static_cast<std::size_t>(n) * n_points);
+    in_parallel(static_cast<int>(values.size()), [&](int trial) {
+      if (stopped()) return;
+      Likelihood::Workspace workspace;
+      values[static_cast<std::size_t>(trial)] = objective(moved(trial), nullptr, workspace);
+    });
+    if (stopped()) return false;
+    reports_[from].evaluations += static_cast<int>(values.size());
+    const auto lowest = std::min_element(values.begin(), values.end());
+    const double before = reports_[from].objective;
+    if (!(*lowest < before)) return false;
+    Likelihood::Workspace workspace;
+    const LbfgsbResult result = optimise(static_cast<int>(from), at(moved(static_cast<int>(lowest - values.begin()))), workspace);
+    if (!(result.value < before)) return false;
+    store(from, result);
+    // a gain below this is the tail of the same optimum
+    return before - result.value > 1e-6 * (1 + std::abs(before));
+  }
+
+  void run_restart(int restart) {
+    RandomStream random(options_.seed, static_cast<std::uint64_t>(restart));
+    Likelihood::Workspace workspace;
     // a random start may lie where M is not positive definite: draw again, a few times
     constexpr int max_draws = 20;
     LbfgsbResult result;
     for (int draw = 0; draw < max_draws; ++draw) {
-      const std::vector<Hyperparameter> from = restart == 0 ? hyperparameters_ : draw_start(hyperparameters_, random);
-      for (Index k = 0; k < n; ++k) {
-        const Hyperparameter& h = from[static_cast<std::size_t>(k)];
-        lower[k] = to_internal(h, h.lower);
-        upper[k] = to_internal(h, h.upper);
-        start[k] = to_internal(h, h.value);
-      }
-      result = minimise([&](const VectorXd& x, VectorXd& gradient) { return objective(x, gradient, workspace); }, start, lower, upper,
-                        options);
+      result = optimise(restart, restart == 0 ? hyperparameters_ : draw_start(hyperparameters_, random), workspace);
       if (std::isfinite(result.value) || restart == 0) break;
     }
-
-    results_[index] = options_.max_iterations == 0 ? hyperparameters_ : at(result.x);
-    const double without_prior = result.value - hyperprior(results_[index], nullptr);
-    reports_[index] = {result.value,       without_prior,    result.iterations, result.evaluations, result.failed_evaluations,
-                       result.converged, result.termination};
+    store(static_cast<std::size_t>(restart), result);
     const std::scoped_lock lock(mutex_);
-    fractions_[index] = 1;
+    fractions_[static_cast<std::size_t>(restart)] = 1;
   }
 
   bool report_iteration(int restart, int iteration, double value) {
@@ -198,7 +261,7 @@ class Training {
       const double seconds = std::chrono::duration<double>(std::chrono::steady_clock::now() - start_).count();
       options_.progress({restart, n_restarts(), iteration, best_, seconds, done / static_cast<double>(fractions_.size())});
     }
-    return options_.stop == nullptr || !options_.stop->load();
+    return !stopped();
   }
 
   const Prior& prior_;
@@ -208,11 +271,14 @@ class Training {
   Likelihood likelihood_;
   std::vector<RestartReport> reports_;
   std::vector<std::vector<Hyperparameter>> results_;
+  struct {
+    std::vector<double> lower, upper;
+  } box_;  // as the optimiser sees it
+  int n_escapes_ = 0;
 
   std::mutex mutex_;  // guards what follows
   std::vector<double> fractions_;
   double best_ = std::numeric_limits<double>::infinity();
-  std::exception_ptr failure_;
   std::chrono::steady_clock::time_point start_ = std::chrono::steady_clock::now();
 };
 
@@ -236,6 +302,7 @@ Fit fit(const Prior& prior, const std::vector<Observations>& observations, const
   report.termination = winner.termination;
   report.iterations = winner.iterations;
   report.best_restart = static_cast<int>(best);
+  report.n_escapes = training.n_escapes();
   report.restarts = training.reports();
   Posterior posterior(prior, observations, model_values(prior, observations, report.hyperparameters));
   report.seconds = std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();

@@ -139,7 +139,7 @@ void add_kernel_parameters(const Latent& latent, int owner, const std::string& p
     h.owner = owner;
     h.index = static_cast<int>(p);
     h.name = prefix + parameter.name;
-    double scale = 1, initial = 1, lower = 1e-3, upper = 1e3, median = 1;
+    double scale = 1, initial = 1, lower = 1e-3, upper = 1e3, median = 1, log_stddev = Standard::shape_log_stddev;
     switch (parameter.kind) {
       case Kernel::ParameterKind::lengthscale:
       case Kernel::ParameterKind::periodic_lengthscale:
@@ -147,6 +147,7 @@ void add_kernel_parameters(const Latent& latent, int owner, const std::string& p
         lower = choose(range.lower, paper ? 0.5 : Standard::lengthscale_lower);
         upper = choose(range.upper, paper ? 20 : Standard::lengthscale_upper);
         median = Standard::lengthscale_median;
+        log_stddev = Standard::lengthscale_log_stddev;
         if (parameter.kind == Kernel::ParameterKind::lengthscale) {
           scale = scales.feature_stddev[static_cast<std::size_t>(owner)][parameter.feature];
           h.unit = latent.feature_names[static_cast<std::size_t>(parameter.feature)];
@@ -168,7 +169,7 @@ void add_kernel_parameters(const Latent& latent, int owner, const std::string& p
     h.upper = upper * scale;
     if (!paper && protocol.hyperprior) {
       h.median = median * scale;
-      h.log_stddev = Standard::lengthscale_log_stddev;
+      h.log_stddev = log_stddev;
     }
     if (h.unit.empty()) h.unit = "1";
     out.push_back(std::move(h));

@@ -36,7 +36,8 @@ TEST_P(ConstraintRows, TheirResidualChangesAlongTheMotionAsAAndBSay) {
         return system.residuals(moved, parameters).col(0);
       };
       // the trigonometric functions turn by |dq| τ; faster states change over shorter times
-      const double speed = x.segment(layout.nq, layout.nq).array().isNaN().select(0, x.segment(layout.nq, layout.nq).array().abs()).maxCoeff();
+      const double speed =
+          x.segment(layout.nq, layout.nq).array().isNaN().select(0, x.segment(layout.nq, layout.nq).array().abs()).maxCoeff();
       // intermediate terms of a residual are larger than the residual, which is zero on the constraint
       const double precision = 64 * test::eps * (1 + x.array().isNaN().select(0, x.array().abs()).maxCoeff());
       const VectorXd now = residuals_at(0);
@@ -48,7 +49,8 @@ TEST_P(ConstraintRows, TheirResidualChangesAlongTheMotionAsAAndBSay) {
         if (label.velocity) {
           const double expected = values.A(i).row(label.row) * ddq - values.b(i)[label.row];
           EXPECT_NEAR(difference.value[index], expected, difference.error[index]) << label.text;
-          EXPECT_LE(difference.error[index], 1e-4 * (1 + std::abs(expected)) * (1 + speed) * (1 + speed)) << "the quotient is too coarse to test anything";
+          EXPECT_LE(difference.error[index], 1e-4 * (1 + std::abs(expected)) * (1 + speed) * (1 + speed))
+              << "the quotient is too coarse to test anything";
           ++n_compared;
         } else {
           // the residual after a position is its rate
@@ -61,7 +63,7 @@ TEST_P(ConstraintRows, TheirResidualChangesAlongTheMotionAsAAndBSay) {
 }
 
 TEST(ConstraintRowsTest, AnAccelerationLevelConstraintIsTakenAsWritten) {
-  const ModelFile model = ModelFile::parse(R"(
+  const ModelFile model = ModelFile::parse(R"toml(
 name        = "two carts"
 coordinates = ["x", "y"]
 inputs      = ["u"]
@@ -76,7 +78,7 @@ acceleration = ["c*ddx + sin(x)*ddy - u*dy^2 + t"]
 kernel     = "se"
 features   = ["x"]
 directions = "acceleration"
-)",
+)toml",
                                            "two carts");
   const VectorXd state = (VectorXd(6) << 0.3, -1, 0.5, 2, 0.25, 1.5).finished();  // x y dx dy t u
   const SystemValues values = model.system->evaluate(state, model.system->parameter_values());

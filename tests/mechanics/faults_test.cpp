@@ -1,3 +1,4 @@
+#include <fmt/format.h>
 #include <gmock/gmock.h>
 #include <gtest/gtest.h>
 
@@ -15,7 +16,7 @@ using testing::AllOf;
 using testing::HasSubstr;
 
 ModelFile model(const std::string& mass, const std::string& constraints) {
-  return ModelFile::parse(fmt::format(R"(
+  return ModelFile::parse(fmt::format(R"toml(
 name        = "cart"
 coordinates = ["x", "y"]
 [mechanics]
@@ -27,7 +28,7 @@ force = ["0", "0"]
 kernel     = "se"
 features   = ["x"]
 directions = "acceleration"
-)",
+)toml",
                                       mass, constraints),
                           "cart");
 }
@@ -69,8 +70,9 @@ TEST(MechanicsFaults, AMassMatrixThatIsNotPositiveDefiniteIsAnErrorThatNamesTheS
               AllOf(HasSubstr("mass matrix"), HasSubstr("not positive definite"), HasSubstr("state 2"), HasSubstr("x = 2")));
   // singular, negative and not a number are no better
   EXPECT_THAT(message(indefinite, states({1})), HasSubstr("not positive definite"));
-  EXPECT_THAT(message(model(R"([["-1", "0"], ["0", "1"]])", R"(position = ["y"])"), states({1})), HasSubstr("not positive definite"));
-  EXPECT_THAT(message(model(R"([["log(x)", "0"], ["0", "1"]])", R"(position = ["y"])"), states({-1})),
+  EXPECT_THAT(message(model(R"([["-1", "0"], ["0", "1"]])", R"(position = ["y"])"), states({1})),
+              HasSubstr("not positive definite"));
+  EXPECT_THAT(message(model(R"-([["log(x)", "0"], ["0", "1"]])-", R"(position = ["y"])"), states({-1})),
               HasSubstr("not positive definite"));
 }
 

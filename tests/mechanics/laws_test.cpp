@@ -20,7 +20,8 @@ struct Case {
   MatrixXd M, A;
   VectorXd b;
   UdwadiaKalaba projection;
-  double rounding;  // of T and L: each comes from a handful of products and triangular solves with the factor of M: ε · 32 n · κ(M)
+  double
+      rounding;  // of T and L: each comes from a handful of products and triangular solves with the factor of M: ε · 32 n · κ(M)
 };
 
 double condition(const MatrixXd& M) {
@@ -28,7 +29,9 @@ double condition(const MatrixXd& M) {
   return values[values.size() - 1] / values[0];
 }
 
-double largest(const MatrixXd& matrix) { return matrix.size() == 0 ? 0 : matrix.cwiseAbs().maxCoeff(); }
+double largest(const MatrixXd& matrix) {
+  return matrix.size() == 0 ? 0 : matrix.cwiseAbs().maxCoeff();
+}
 
 MatrixXd with_row(const MatrixXd& A, const Eigen::RowVectorXd& row) {
   MatrixXd extended(A.rows() + 1, A.cols());
@@ -76,7 +79,8 @@ TEST_P(MechanicsLaws, TheProjectionIsAProjectionThatIsSymmetricInTheMetricOfM) {
     EXPECT_LE(largest(T * T - T), c.rounding * scale * scale);
     EXPECT_LE(largest(c.M * T - T.transpose() * c.M), c.rounding * largest(c.M) * scale);
     // its trace is the number of free directions
-    EXPECT_NEAR(T.trace(), static_cast<double>(T.rows() - c.projection.rank()), c.rounding * scale * static_cast<double>(T.rows()));
+    EXPECT_NEAR(T.trace(), static_cast<double>(T.rows() - c.projection.rank()),
+                c.rounding * scale * static_cast<double>(T.rows()));
   });
 }
 
@@ -87,7 +91,8 @@ TEST_P(MechanicsLaws, LIsAGeneralisedInverseOfAWhichTurnsBIntoAnAcceleration) {
     for (Eigen::Index row = 0; row < c.A.rows(); ++row) {
       const double size = largest(c.A.row(row));
       EXPECT_LE(largest(c.A.row(row) * LA - c.A.row(row)), c.rounding * size * (1 + largest(LA)));
-      // a redundant row agrees with the others as far as the state satisfies the constraints: 16 ε times sizes of order one or less
+      // a redundant row agrees with the others as far as the state satisfies the constraints: 16 ε times sizes of order one or
+      // less
       EXPECT_NEAR(c.A.row(row) * c.projection.Lb(), c.b[row],
                   c.rounding * (size * largest(c.projection.Lb()) + std::abs(c.b[row]) + largest(c.b)));
     }
@@ -145,7 +150,8 @@ TEST_P(MechanicsLaws, TheConstrainedAccelerationSolvesTheEquationsOfMotionWithMu
     const Eigen::JacobiSVD<MatrixXd> svd(kkt);
     const double kkt_condition = svd.singularValues()[0] / svd.singularValues()[n + m - 1];
     const VectorXd ddq = kkt.fullPivLu().solve(right).head(n);
-    const double tolerance = (c.rounding + 8 * eps * static_cast<double>(n + m) * kkt_condition) * (largest(ddq) + largest(a_bar));
+    const double tolerance =
+        (c.rounding + 8 * eps * static_cast<double>(n + m) * kkt_condition) * (largest(ddq) + largest(a_bar));
     EXPECT_LE(largest(c.projection.constrain(a_bar) - ddq), tolerance);
     EXPECT_LE(largest(c.projection.Lb() + c.projection.T() * a_bar - ddq), tolerance);
   });
@@ -167,8 +173,7 @@ TEST_P(MechanicsLaws, NoAdmissibleAccelerationIsCloserToTheUnconstrainedOneThanG
       // of the size of the acceleration, so that the growth wᵀM w stands out of the rounding of the cost
       const VectorXd w = (1 + largest(ddq)) * free * test::random_vector(free.cols(), random).normalized();
       EXPECT_GT(cost(ddq + w), cost(ddq));
-      EXPECT_LE(std::abs(w.dot(c.M * (ddq - a_bar))),
-                c.rounding * largest(c.M) * w.norm() * (ddq.norm() + a_bar.norm()));
+      EXPECT_LE(std::abs(w.dot(c.M * (ddq - a_bar))), c.rounding * largest(c.M) * w.norm() * (ddq.norm() + a_bar.norm()));
     }
   });
 }
@@ -180,6 +185,33 @@ TEST(UdwadiaKalabaTest, WithoutConstraintsTheMotionIsTheUnconstrainedOne) {
   EXPECT_LE(largest(projection.T() - MatrixXd::Identity(2, 2)), 4 * eps);
   EXPECT_EQ(largest(projection.Lb()), 0);
   EXPECT_EQ(projection.L().cols(), 0);
+}
+
+TEST(UdwadiaKalabaTest, TheConstrainedAccelerationMeetsTheConstraintToRoundingWhateverTheConditionOfM) {
+  SCOPED_TRACE(fmt::format("seed {}", seed));
+  RandomStream random(seed);
+  for (int trial = 0; trial < 50; ++trial) {
+    // κ(M) = 1e6
+    MatrixXd V(4, 4);
+    for (double& entry : V.reshaped()) entry = random.normal();
+    const MatrixXd Q = V.householderQr().householderQ();
+    const MatrixXd M = Q * Eigen::Vector4d(1, 1e-2, 1e-4, 1e-6).asDiagonal() * Q.transpose();
+    MatrixXd A(2, 4);
+    for (double& entry : A.reshaped()) entry = random.normal();
+    const VectorXd b = test::random_vector(2, random);
+    const UdwadiaKalaba projection(0.5 * (M + M.transpose()), A, b);
+    const VectorXd ddq = projection.constrain(1e3 * test::random_vector(4, random));
+    // the sums A ddq themselves round at ε of their terms
+    EXPECT_LE(largest(A * ddq - b), 32 * eps * ((A.cwiseAbs() * ddq.cwiseAbs()).maxCoeff() + largest(b)));
+  }
+}
+
+TEST(UdwadiaKalabaTest, AMassMatrixThatIsPositiveByRoundingOnlyIsNotPositiveDefinite) {
+  const MatrixXd M = (MatrixXd(2, 2) << 1, 1, 1, 1 + 4 * eps).finished();
+  EXPECT_FALSE(UdwadiaKalaba(M, MatrixXd::Ones(1, 2), VectorXd::Zero(1)).mass_is_positive_definite());
+  // small by its unit is another thing
+  const MatrixXd small = Eigen::Vector2d(1, 1e-20).asDiagonal();
+  EXPECT_TRUE(UdwadiaKalaba(small, MatrixXd::Ones(1, 2), VectorXd::Zero(1)).mass_is_positive_definite());
 }
 
 TEST(UdwadiaKalabaTest, AFullyConstrainedSystemHasNoFreedomLeft) {

@@ -36,7 +36,9 @@ VectorXd stack(const MatrixXd& T, const VectorXd& Lb) {
 
 // Rows of the slider-crank that are redundant on its constraint only become independent once r or l moves at a fixed state: the
 // derivative at constant rank is that of the loop's own two rows.
-int n_rows_to_use(const std::string& file, const System& system) { return test::stem(file) == "slider_crank" ? 2 : system.nc(); }
+int n_rows_to_use(const std::string& file, const System& system) {
+  return test::stem(file) == "slider_crank" ? 2 : system.nc();
+}
 
 TEST_P(ParameterDerivatives, OfTheProjectionMatchDifferences) {
   const System& system = *test::model(GetParam()).system;
@@ -106,7 +108,8 @@ TEST_P(ParameterDerivatives, OfARedundantSetAreThoseOfTheSetWithoutItsRedundantR
       const auto one = minimal.differentiate(d.M(i), dA, db), two = redundant.differentiate(d.M(i), dA2, db2);
       const VectorXd expected = stack(one.T, one.Lb);
       // products of three operators of the mechanics: ε · κ(M) · their sizes, with κ(M) < 1000
-      const double tolerance = 1e5 * test::eps * (1 + expected.lpNorm<Eigen::Infinity>() + stack(minimal.T(), minimal.Lb()).lpNorm<Eigen::Infinity>());
+      const double tolerance =
+          1e5 * test::eps * (1 + expected.lpNorm<Eigen::Infinity>() + stack(minimal.T(), minimal.Lb()).lpNorm<Eigen::Infinity>());
       EXPECT_LE((stack(two.T, two.Lb) - expected).lpNorm<Eigen::Infinity>(), tolerance);
     }
   }

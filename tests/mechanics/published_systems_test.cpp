@@ -41,7 +41,7 @@ INSTANTIATE_TEST_SUITE_P(
                     Published{"unicycle_u_ignored", "experiments/unicycle_published.toml", {"R", "Ic"}},
                     Published{"unicycle_u_applied", "models/unicycle.toml", {"R", "Ic"}},
                     Published{"duffing", "experiments/duffing_published.toml", {"k1", "k2", "c1", "c2", "A0", "alpha", "omega"}}),
-    [](const auto& info) { return info.param.key; });
+    [](const auto& instance) { return instance.param.key; });
 
 TEST_P(PublishedSystems, HaveThePublishedMatricesAndAccelerations) {
   if (const auto absent = test::why_reference_is_absent()) GTEST_SKIP() << *absent;
@@ -93,7 +93,8 @@ TEST_P(PublishedSystems, HaveThePublishedMatricesAndAccelerations) {
   const MatrixXd truth = true_acceleration(model, states);
   for (std::size_t k = 0; k < n; ++k) {
     const VectorXd ddq = vector(expected["ddq"][k]);
-    EXPECT_LE((truth.col(static_cast<Eigen::Index>(k)) - ddq).cwiseAbs().maxCoeff(), 1024 * test::eps * (1 + ddq.cwiseAbs().maxCoeff()));
+    EXPECT_LE((truth.col(static_cast<Eigen::Index>(k)) - ddq).cwiseAbs().maxCoeff(),
+              1024 * test::eps * (1 + ddq.cwiseAbs().maxCoeff()));
   }
 }
 

@@ -45,7 +45,8 @@ TEST_F(Views, OfSomeRowsAreThoseRowsInTheirOrder) {
   EXPECT_EQ(VectorXd(part.G(1).row(1)), VectorXd(whole.G(1).row(0)));
   EXPECT_EQ(part.offset(0, 3), whole.offset(2, 3));
   const SystemValues d = system.differentiate(states, parameters, 2);
-  EXPECT_EQ(VectorXd(differentiate_view(some, mechanics, d).G(1).row(0)), VectorXd(differentiate_view(all, mechanics, d).G(1).row(2)));
+  EXPECT_EQ(VectorXd(differentiate_view(some, mechanics, d).G(1).row(0)),
+            VectorXd(differentiate_view(all, mechanics, d).G(1).row(2)));
 }
 
 TEST_F(Views, AreNamedAfterTheirCoordinates) {

@@ -1,0 +1,172 @@
+#include <gtest/gtest.h>
+
+#include "inference/problems.hpp"
+
+// The analytic gradient against differences, for every hyperparameter of every problem.
+namespace gp2 {
+namespace {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+using test::Problem;
+
+constexpr std::uint64_t seed = 40402;
+
+class Gradient {
+ public:
+  explicit Gradient(const Problem& problem) : problem_(problem), likelihood_(make(problem)) {
+    value_ = likelihood_.evaluate(problem.values, &gradient_, workspace_);
+  }
+
+  [[nodiscard]] const ModelValues& analytic() const { return gradient_; }
+
+  // `member` picks the number out of ModelValues; positive ones are differentiated in their logarithm
+  template <typename Member>
+  void expect_match(const std::string& name, double analytic, const Member& member, bool positive) {
+    SCOPED_TRACE(name);
+    const double value = member(problem_.values);
+    const auto at = [&](double x) -> VectorXd {
+      ModelValues moved = problem_.values;
+      member(moved) = positive ? std::exp(x) : x;
+      return VectorXd::Constant(1, likelihood_.evaluate(moved, nullptr, workspace_));
+    };
+    const double scale = positive ? 0.5 : 0.05 * (value == 0 ? 1 : std::abs(value));
+    // rounding of the value: ε times the condition number (the tests' noise keeps it near a hundred)
+    const test::Difference difference =
+        test::central_difference(at, positive ? std::log(value) : value, scale, 64 * test::eps * (1 + condition_ / 100));
+    EXPECT_TRUE(std::isfinite(analytic));
+    EXPECT_TRUE(test::matches(VectorXd::Constant(1, analytic), difference));
+    if (std::abs(analytic) > 10 * difference.error[0]) ++n_nonzero_;
+    // in units of the value's change over the parameter's own scale
+    EXPECT_LE(difference.error[0] * scale, 1e-5 * (1 + std::abs(value_) + std::abs(analytic) * scale))
+        << "the quotient is too coarse";
+  }
+
+  [[nodiscard]] int n_nonzero() const { return n_nonzero_; }
+
+ private:
+  static Likelihood make(const Problem& problem) {
+    Likelihood::Options options;
+    options.noise_gradient = true;
+    for (int p = 0; p < static_cast<int>(problem.values.parameters.size()); ++p) options.gradient_parameters.push_back(p);
+    return {problem.prior, problem.observations, problem.values, options};
+  }
+
+  const Problem& problem_;
+  Likelihood likelihood_;
+  Likelihood::Workspace workspace_;
+  ModelValues gradient_;
+  double value_ = 0;
+  double condition_ = test::condition(problem_);
+  int n_nonzero_ = 0;
+};
+
+bool estimable(const Problem& p, const std::string& parameter) {
+  return std::find(p.not_estimable.begin(), p.not_estimable.end(), parameter) == p.not_estimable.end();
+}
+
+class LikelihoodGradient : public testing::TestWithParam<std::string> {};
+
+std::vector<std::string> problem_names() {
+  std::vector<std::string> names;
+  for (const std::string& file : test::library_models()) names.push_back(test::stem(file));
+  names.insert(names.end(), {"a row that vanishes", "friction"});
+  return names;
+}
+
+INSTANTIATE_TEST_SUITE_P(EveryModel, LikelihoodGradient, testing::ValuesIn(problem_names()), [](const auto& instance) {
+  std::string name = instance.param;
+  std::replace(name.begin(), name.end(), ' ', '_');
+  return name;
+});
+
+TEST_P(LikelihoodGradient, MatchesDifferencesInEveryHyperparameter) {
+  int n_problems = 0;
+  for (const Problem& p : test::problems(9, seed)) {
+    if (!p.name.starts_with(GetParam())) continue;
+    ++n_problems;
+    SCOPED_TRACE(fmt::format("{}, mean {}, seed {}", p.name, static_cast<int>(p.prior.mean), seed));
+    Gradient gradient(p);
+    int n_expected_nonzero = 0;
+    for (std::size_t a = 0; a < p.prior.latents.size(); ++a) {
+      for (Index k = 0; k < p.values.kernel[a].size(); ++k) {
+        gradient.expect_match(
+            p.prior.latents[a].name + ": " + p.prior.latents[a].kernel.parameters()[static_cast<std::size_t>(k)].name,
+            gradient.analytic().kernel[a][k], [&](auto& v) -> auto& { return v.kernel[a][k]; }, true);
+      }
+      for (Index l = 0; l < p.values.signal_stddev[a].size(); ++l) {
+        gradient.expect_match(
+            fmt::format("{}: signal of {}", p.prior.latents[a].name,
+                        p.prior.latents[a].column_names[static_cast<std::size_t>(l)]),
+            gradient.analytic().signal_stddev[a][l], [&](auto& v) -> auto& { return v.signal_stddev[a][l]; }, true);
+      }
+      n_expected_nonzero += static_cast<int>(p.values.kernel[a].size());
+    }
+    for (std::size_t g = 0; g < p.observations.size(); ++g) {
+      for (Index k = 0; k < p.values.noise_stddev[g].size(); ++k) {
+        gradient.expect_match(
+            fmt::format("noise {} of group {}", k, g),
+            gradient.analytic().noise_stddev[g][k], [&](auto& v) -> auto& { return v.noise_stddev[g][k]; }, true);
+        ++n_expected_nonzero;
+      }
+    }
+    EXPECT_GE(gradient.n_nonzero(), n_expected_nonzero / 2) << "a gradient that is zero tests nothing";
+    const int before = gradient.n_nonzero();
+    for (Index k = 0; k < p.values.parameters.size(); ++k) {
+      const std::string& name = p.prior.system->parameters()[static_cast<std::size_t>(k)].name;
+      if (!estimable(p, name)) continue;
+      gradient.expect_match(
+          "parameter " + name, gradient.analytic().parameters[k], [&](auto& v) -> auto& { return v.parameters[k]; }, false);
+    }
+    // ā itself knows nothing of the system unless through μ or the directions
+    const bool sees_mechanics =
+        p.prior.mean == Prior::Mean::force || p.observations[0].view.quantity == View::Quantity::constrained_acceleration;
+    if (sees_mechanics) {
+      EXPECT_GT(gradient.n_nonzero(), before);
+    }
+  }
+  EXPECT_GT(n_problems, 0);
+}
+
+TEST(LikelihoodGradientTest, IsAllThatWasAskedForAndZeroElsewhere) {
+  const Problem p = test::problems(9, seed).front();
+  Likelihood::Workspace workspace;
+  ModelValues gradient;
+  Likelihood(p.prior, p.observations, p.values, {}).evaluate(p.values, &gradient, workspace);
+  EXPECT_TRUE(gradient.parameters.isZero(0));
+  EXPECT_TRUE(gradient.noise_stddev[0].isZero(0));
+  EXPECT_FALSE(gradient.kernel[0].isZero(0));
+  EXPECT_EQ(gradient.parameters.size(), p.values.parameters.size());
+
+  // the same numbers whether or not the rest is asked for
+  Likelihood::Options options;
+  options.noise_gradient = true;
+  options.gradient_parameters = {1};
+  ModelValues more;
+  Likelihood(p.prior, p.observations, p.values, options).evaluate(p.values, &more, workspace);
+  EXPECT_EQ(more.kernel, gradient.kernel);
+  EXPECT_EQ(more.signal_stddev, gradient.signal_stddev);
+  EXPECT_EQ(more.parameters[0], 0);
+}
+
+TEST(LikelihoodGradientTest, IsFiniteWhenEverySampleIsAtRest) {
+  for (Problem p : test::problems(9, seed)) {
+    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, seed));
+    const StateLayout layout = p.prior.system->layout();
+    for (Observations& group : p.observations) group.states.middleRows(layout.dq(0), layout.nq).setZero();
+    Likelihood::Options options;
+    options.noise_gradient = true;
+    for (int k = 0; k < static_cast<int>(p.values.parameters.size()); ++k) options.gradient_parameters.push_back(k);
+    Likelihood::Workspace workspace;
+    ModelValues gradient;
+    EXPECT_TRUE(std::isfinite(Likelihood(p.prior, p.observations, p.values, options).evaluate(p.values, &gradient, workspace)));
+    for (const VectorXd& g : gradient.kernel) EXPECT_TRUE(g.allFinite());
+    for (const VectorXd& g : gradient.signal_stddev) EXPECT_TRUE(g.allFinite());
+    for (const VectorXd& g : gradient.noise_stddev) EXPECT_TRUE(g.allFinite());
+    EXPECT_TRUE(gradient.parameters.allFinite());
+  }
+}
+
+}  // namespace
+}  // namespace gp2

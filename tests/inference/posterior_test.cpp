@@ -1,0 +1,264 @@
+#include "gp2/posterior.hpp"
+
+#include <gtest/gtest.h>
+
+#include "gp2/error.hpp"
+#include "inference/problems.hpp"
+
+namespace gp2 {
+namespace {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+using test::Problem;
+using test::Quantity;
+
+constexpr std::uint64_t seed = 40403;
+
+// views of a problem's system to predict: everything, and some rows in another order
+std::vector<View> views_of(const Problem& p) {
+  const System& system = *p.prior.system;
+  return {View::all(Quantity::constrained_acceleration, system), View::all(Quantity::unconstrained_acceleration, system),
+          View{Quantity::constrained_acceleration, {system.nq() - 1, 0}}};
+}
+
+double largest(const MatrixXd& matrix) {
+  return matrix.size() == 0 ? 0 : matrix.cwiseAbs().maxCoeff();
+}
+
+// ε times the condition number of K̃ + I, after mechanics with κ(M) of some hundreds
+double rounding(const Problem& p) {
+  return 1e4 * test::eps * test::condition(p);
+}
+
+TEST(PosteriorTest, IsTheTextbookGaussianProcess) {
+  for (const Problem& p : test::problems(9, seed)) {
+    const Posterior posterior(p.prior, p.observations, p.values);
+    for (const View& view : views_of(p)) {
+      SCOPED_TRACE(fmt::format("{}, view {}×{}, seed {}", p.name, static_cast<int>(view.quantity), view.size(), seed));
+      const auto [mean, covariance] = test::dense_posterior(p, view, p.queries);
+      const Posterior::Joint joint = posterior.joint(view, p.queries);
+      EXPECT_LE(largest(joint.mean - mean), rounding(p) * (1 + largest(mean)));
+      EXPECT_LE(largest(joint.covariance - covariance), rounding(p) * (1 + largest(covariance)));
+      EXPECT_LT(rounding(p), 1e-6) << "too badly conditioned to test anything";
+    }
+  }
+}
+
+TEST(PosteriorTest, MarginalsAreTheDiagonalBlocksOfTheJoint) {
+  for (const Problem& p : test::problems(9, seed)) {
+    const Posterior posterior(p.prior, p.observations, p.values);
+    for (const View& view : views_of(p)) {
+      SCOPED_TRACE(fmt::format("{}, seed {}", p.name, seed));
+      const Posterior::Joint joint = posterior.joint(view, p.queries);
+      const Posterior::Marginal marginal = posterior.marginal(view, p.queries);
+      const Index d = view.size();
+      EXPECT_EQ(posterior.mean(view, p.queries), marginal.mean);
+      const double tolerance = rounding(p) * (1 + largest(joint.covariance));
+      for (Index i = 0; i < p.queries.cols(); ++i) {
+        EXPECT_LE(largest(joint.mean.segment(i * d, d) - marginal.mean.col(i)), rounding(p) * (1 + largest(marginal.mean)));
+        EXPECT_LE(largest(joint.covariance.block(i * d, i * d, d, d) - marginal.covariance.col(i).reshaped(d, d)), tolerance);
+        for (Index k = 0; k < d; ++k) {
+          EXPECT_NEAR(marginal.stddev()(k, i) * marginal.stddev()(k, i), std::max(0.0, joint.covariance(i * d + k, i * d + k)),
+                      tolerance);
+        }
+      }
+      EXPECT_EQ(joint.covariance, MatrixXd(joint.covariance.transpose()));
+    }
+  }
+}
+
+TEST(PosteriorTest, MarginalsDoNotDependOnHowManyStatesAreAskedForAtOnce) {
+  // more states than one block of triangular solves holds
+  const Problem p = test::problems(9, seed).front();
+  const System& system = *p.prior.system;
+  const MatrixXd many = test::draw(test::model(test::library_models().front()), 150, seed + 1).states;
+  const View view = View::all(Quantity::constrained_acceleration, system);
+  const Posterior posterior(p.prior, p.observations, p.values);
+  const Posterior::Marginal at_once = posterior.marginal(view, many);
+  for (Index i : {Index{0}, Index{63}, Index{64}, Index{149}}) {
+    const Posterior::Marginal alone = posterior.marginal(view, many.col(i));
+    EXPECT_LE(largest(at_once.mean.col(i) - alone.mean), rounding(p) * (1 + largest(alone.mean)));
+    EXPECT_LE(largest(at_once.covariance.col(i) - alone.covariance), rounding(p) * (1 + largest(alone.covariance)));
+  }
+}
+
+TEST(PosteriorTest, ObeysTheConstraintInMeanAndCovariance) {
+  for (const Problem& p : test::problems(9, seed)) {
+    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, seed));
+    const System& system = *p.prior.system;
+    const View view = View::all(Quantity::constrained_acceleration, system);
+    const Posterior posterior(p.prior, p.observations, p.values);
+    const MechanicsBatch mechanics = require_mechanics(system, p.queries, p.values.parameters);
+    const Posterior::Marginal marginal = posterior.marginal(view, p.queries);
+    const Posterior::Joint joint = posterior.joint(view, p.queries);
+    const Index nq = system.nq();
+    // what T has of rounding: ε κ(M), whatever the condition of the regression
+    const double tolerance = 1e5 * test::eps;
+    MatrixXd A_all = MatrixXd::Zero(system.nc() * p.queries.cols(), nq * p.queries.cols());
+    const MatrixXd a_bar = posterior.mean(View::all(Quantity::unconstrained_acceleration, system), p.queries);
+    const MatrixXd a_bar_variance =
+        posterior.marginal(View::all(Quantity::unconstrained_acceleration, system), p.queries).covariance;
+    for (int i = 0; i < mechanics.values.n_states(); ++i) {
+      const MatrixXd A = mechanics.values.A(i);
+      const VectorXd b = mechanics.values.b(i);
+      // rows count by their own size
+      const VectorXd size = A.rowwise().norm().cwiseMax(1e-300);
+      const VectorXd error = (A * marginal.mean.col(i) - b).cwiseQuotient(size);
+      EXPECT_LE(largest(error),
+                tolerance * (1 + largest(marginal.mean.col(i)) + largest(a_bar.col(i)) + largest(b.cwiseQuotient(size))));
+      const MatrixXd A_unit = size.cwiseInverse().asDiagonal() * A;
+      EXPECT_LE(largest(A_unit * marginal.covariance.col(i).reshaped(nq, nq) * A_unit.transpose()),
+                tolerance * (1 + largest(marginal.covariance.col(i)) + largest(a_bar_variance.col(i))));
+      A_all.block(i * system.nc(), i * nq, system.nc(), nq) = A_unit;
+    }
+    EXPECT_LE(largest(A_all * joint.covariance), tolerance * (1 + largest(joint.covariance) + largest(a_bar_variance)));
+  }
+}
+
+TEST(PosteriorTest, FarFromTheDataIsThePrior) {
+  for (const char* file : {"models/surface.toml", "models/unicycle.toml", "models/duffing.toml"}) {
+    for (const Problem& p : test::problems(9, seed)) {
+      if (p.prior.system != test::model(file).system) continue;
+      SCOPED_TRACE(fmt::format("{}, seed {}", p.name, seed));
+      MatrixXd far = p.queries;
+      const StateLayout layout = p.prior.system->layout();
+      far.row(layout.dq(0)).array() += 1e4;  // a feature of each
+      const View view = View::all(Quantity::constrained_acceleration, *p.prior.system);
+      const test::DenseView prior = test::dense_view(p.prior, p.values, view, far);
+      const VectorXd mean = prior.mean.cast<double>();
+      const MatrixXd covariance = test::dense_covariance(p.prior, p.values, prior, prior).cast<double>();
+      const Posterior::Joint joint = Posterior(p.prior, p.observations, p.values).joint(view, far);
+      EXPECT_LE(largest(joint.mean - mean), 1e5 * test::eps * (1 + largest(mean)));
+      EXPECT_LE(largest(joint.covariance - covariance), 1e5 * test::eps * (1 + largest(covariance)));
+    }
+  }
+}
+
+TEST(PosteriorTest, MeetsItsDataAsTheNoiseVanishes) {
+  for (const char* file : {"models/surface.toml", "models/unicycle.toml"}) {
+    const ModelFile& model = test::model(file);
+    const GeneratedData data = test::draw(model, 15, seed);
+    const View view = View::all(Quantity::constrained_acceleration, *model.system);
+    const Prior prior = make_prior(model);
+    RandomStream random(seed);
+    double previous = std::numeric_limits<double>::infinity();
+    for (double noise : {1e-1, 1e-3, 1e-5}) {
+      std::vector<Observations> observations{{data.states, view, data.accelerations, VectorXd::Constant(3, noise), false}};
+      RandomStream same(seed);
+      ModelValues values = test::random_values(prior, observations, same);
+      const Posterior posterior(prior, observations, values);
+      const double error = largest(posterior.mean(view, data.states) - data.accelerations);
+      // the smoother leaves S (K + S)⁻¹ (y − m); the observations' own covariance stands on some 1e-3 at least
+      EXPECT_LT(error, 1e5 * noise * noise + 1e-9) << file << ", noise " << noise;
+      EXPECT_LT(error, previous);
+      previous = error;
+      const Posterior::Marginal marginal = posterior.marginal(view, data.states);
+      EXPECT_LE(marginal.stddev().maxCoeff(), 2 * noise) << "no more uncertain than the measurement";
+    }
+  }
+}
+
+TEST(PosteriorTest, LearnsAnAccelerationThatWasNeverMeasured) {
+  // ddq1 and ddq2 of the surface fix ddq3: with A and b known, the constraint says the rest
+  const ModelFile& model = test::model("models/surface.toml");
+  const GeneratedData data = test::draw(model, 15, seed);
+  const Prior prior = make_prior(model);
+  const View two{Quantity::constrained_acceleration, {0, 1}};
+  std::vector<Observations> observations{{data.states, two, data.accelerations.topRows(2), VectorXd::Constant(2, 1e-5), false}};
+  RandomStream random(seed);
+  const Posterior posterior(prior, observations, test::random_values(prior, observations, random));
+  const MatrixXd mean = posterior.mean(View::all(Quantity::constrained_acceleration, *model.system), data.states);
+  // ddq3 = −(A₁ ddq1 + A₂ ddq2 − b)/A₃ carries their errors, times slopes of the surface below one
+  const double measured_error = largest((mean - data.accelerations).topRows(2));
+  EXPECT_LE(largest((mean - data.accelerations).row(2)), 2 * measured_error + 1e-12);
+  EXPECT_LE(measured_error, 1e-4);
+}
+
+TEST(PosteriorTest, AVarianceThatRoundingMadeNegativeIsZeroAndCounted) {
+  // at the data, what is left of the variance is 1e-18 of the signal's: less than the rounding of what is taken away
+  const ModelFile& model = test::model("models/surface.toml");
+  const GeneratedData data = test::draw(model, 15, seed);
+  const Prior prior = make_prior(model);
+  const View view = View::all(Quantity::unconstrained_acceleration, *model.system);
+  std::vector<Observations> observations{{data.states, view, data.accelerations, VectorXd::Constant(3, 1e-9), false}};
+  RandomStream random(seed);
+  const Posterior::Marginal marginal =
+      Posterior(prior, observations, test::random_values(prior, observations, random)).marginal(view, data.states);
+  const MatrixXd stddev = marginal.stddev();
+  EXPECT_TRUE(stddev.allFinite());
+  EXPECT_GT(marginal.n_clipped, 0) << "nothing was tested";
+  // others came out as exactly zero
+  EXPECT_GE((stddev.array() == 0).count(), marginal.n_clipped);
+}
+
+TEST(PosteriorTest, OfASystemWithoutConstraintsIsAPlainGaussianProcess) {
+  const ModelFile model = ModelFile::parse(R"toml(
+name        = "free mass"
+coordinates = ["x", "y"]
+[parameters]
+m = 2.0
+[mechanics]
+mass  = [["m", "0.3"], ["0.3", "1"]]
+force = ["-m*x", "0"]
+[[latent]]
+kernel     = "se"
+features   = ["x", "dy"]
+directions = "force"
+)toml",
+                                           "free mass");
+  RandomStream random(seed);
+  MatrixXd states(5, 12);
+  for (double& entry : states.reshaped()) entry = random.normal();
+  Problem p{"free mass", make_prior(model, {Prior::Mean::force, std::nullopt, false}), {}, {}, states.rightCols(3), {}};
+  const View view = View::all(Quantity::constrained_acceleration, *model.system);
+  p.observations.push_back(test::observe(model, view, states.leftCols(9), random));
+  p.values = test::random_values(p.prior, p.observations, random);
+  const Posterior posterior(p.prior, p.observations, p.values);
+  EXPECT_EQ(posterior.reduced_size(), 9 * 2);
+  const double dense = test::dense_negative_log_likelihood(p);
+  EXPECT_NEAR(posterior.negative_log_likelihood(), dense, rounding(p) * std::abs(dense));
+  EXPECT_EQ(posterior.mean(view, p.queries),
+            posterior.mean(View::all(Quantity::unconstrained_acceleration, *model.system), p.queries));
+}
+
+TEST(PosteriorTest, KnowsWhatItWasMadeOf) {
+  const Problem p = test::problems(9, seed).front();
+  const Posterior posterior(p.prior, p.observations, p.values);
+  EXPECT_EQ(posterior.observations()[0].values, p.observations[0].values);
+  EXPECT_EQ(posterior.values().kernel, p.values.kernel);
+  EXPECT_EQ(posterior.prior().system, p.prior.system);
+  EXPECT_EQ(posterior.reduced_size(), Likelihood(p.prior, p.observations, p.values, {}).reduced_size());
+}
+
+TEST(PosteriorTest, RefusesToPredictWhereTheMassMatrixIsIndefinite) {
+  const ModelFile model = ModelFile::parse(R"toml(
+name        = "cart"
+coordinates = ["x", "y"]
+[mechanics]
+mass  = [["1", "x"], ["x", "1"]]
+force = ["0", "0"]
+[constraints]
+position = ["y"]
+[[latent]]
+kernel     = "se"
+features   = ["x"]
+directions = "acceleration"
+)toml",
+                                           "cart");
+  const Prior prior = make_prior(model);
+  const View view = View::all(Quantity::constrained_acceleration, *model.system);
+  MatrixXd states = MatrixXd::Zero(5, 2);
+  states(0, 0) = 0.5;
+  std::vector<Observations> observations{{states, view, MatrixXd::Zero(2, 2), VectorXd::Ones(2), false}};
+  const Posterior posterior(prior, observations, {{VectorXd::Ones(1)}, {VectorXd::Ones(2)}, {VectorXd::Ones(2)}, VectorXd()});
+  EXPECT_NO_THROW(posterior.mean(view, states));
+  states(0, 1) = 2;
+  EXPECT_THROW(posterior.mean(view, states), InputError);
+  EXPECT_THROW(posterior.marginal(view, states), InputError);
+  EXPECT_THROW(posterior.joint(view, states), InputError);
+}
+
+}  // namespace
+}  // namespace gp2

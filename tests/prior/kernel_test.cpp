@@ -1,0 +1,236 @@
+#include "gp2/kernel.hpp"
+
+#include <gmock/gmock.h>
+#include <gtest/gtest.h>
+
+#include <Eigen/Eigenvalues>
+
+#include "gp2/error.hpp"
+#include "test_models.hpp"
+
+namespace gp2 {
+namespace {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+using testing::AllOf;
+using testing::HasSubstr;
+
+constexpr std::uint64_t seed = 30301;
+const std::vector<std::string> two_features = {"a", "b"};
+
+// parameters between 0.5 and 2
+VectorXd random_parameters(const Kernel& kernel, RandomStream& random) {
+  VectorXd values(static_cast<Index>(kernel.parameters().size()));
+  for (double& value : values) value = std::exp2(2 * random.uniform() - 1);
+  return values;
+}
+
+MatrixXd random_points(Index n, Index n_features, RandomStream& random) {
+  MatrixXd points(n, n_features);
+  for (double& entry : points.reshaped()) entry = random.normal();
+  return points;
+}
+
+double value_at(const Kernel& kernel, const VectorXd& x, const VectorXd& y, const VectorXd& values) {
+  VectorXd out(1);
+  Kernel::Workspace workspace;
+  kernel.evaluate(x.transpose(), y, values, out, workspace);
+  return out[0];
+}
+
+std::vector<std::string> names_of(const Kernel& kernel) {
+  std::vector<std::string> names;
+  for (const Kernel::Parameter& parameter : kernel.parameters()) names.push_back(parameter.name);
+  return names;
+}
+
+// The formulas as kernel.hpp prints them, in extended precision. v: the primitive's own parameters.
+long double printed_formula(const std::string& primitive, const VectorXd& x, const VectorXd& y, const double* v) {
+  if (primitive == "constant") return 1;
+  const Index n = x.size();
+  long double r2 = 0, sines = 0, products = 0;
+  for (Index d = 0; d < n; ++d) {
+    const long double delta = static_cast<long double>(x[d]) - y[d];
+    r2 += (delta / v[d]) * (delta / v[d]);
+    products += static_cast<long double>(x[d]) * y[d] / (static_cast<long double>(v[d]) * v[d]);
+    if (primitive == "periodic") {
+      const long double sine = std::sin(std::numbers::pi_v<long double> * delta / v[n + d]);
+      sines += sine * sine / (static_cast<long double>(v[d]) * v[d]);
+    }
+  }
+  const long double r = std::sqrt(r2);
+  if (primitive == "se") return std::exp(-r2 / 2);
+  if (primitive == "matern32") return (1 + std::sqrt(3.0L) * r) * std::exp(-std::sqrt(3.0L) * r);
+  if (primitive == "matern52") return (1 + std::sqrt(5.0L) * r + 5 * r2 / 3) * std::exp(-std::sqrt(5.0L) * r);
+  if (primitive == "rq") return std::pow(1 + r2 / (2 * static_cast<long double>(v[n])), -static_cast<long double>(v[n]));
+  if (primitive == "periodic") return std::exp(-2 * sines);
+  return products;
+}
+
+class KernelPrimitives : public testing::TestWithParam<std::string> {};
+INSTANTIATE_TEST_SUITE_P(Each, KernelPrimitives,
+                         testing::Values("se", "matern32", "matern52", "rq", "periodic", "linear", "constant"),
+                         [](const auto& instance) { return instance.param; });
+
+TEST_P(KernelPrimitives, AreTheirPrintedFormulas) {
+  SCOPED_TRACE(fmt::format("seed {}", seed));
+  RandomStream random(seed);
+  const Kernel kernel = Kernel::parse(GetParam(), two_features);
+  for (int trial = 0; trial < 200; ++trial) {
+    const VectorXd values = random_parameters(kernel, random);
+    const VectorXd x = test::random_vector(2, random), y = test::random_vector(2, random);
+    // exp(−z) carries the rounding of z, which is below 100 here
+    const auto expected = static_cast<double>(printed_formula(GetParam(), x, y, values.data()));
+    EXPECT_NEAR(value_at(kernel, x, y, values), expected, 256 * test::eps * std::max(1.0, std::abs(expected)));
+    EXPECT_NEAR(value_at(kernel, y, x, values), value_at(kernel, x, y, values),
+                16 * test::eps * std::max(1.0, std::abs(expected)));
+  }
+}
+
+TEST_P(KernelPrimitives, AreOneAtNoDistanceUnlessLinear) {
+  if (GetParam() == "linear") return;
+  const Kernel kernel = Kernel::parse(GetParam(), two_features);
+  const VectorXd x = Eigen::Vector2d(0.3, -7);
+  EXPECT_EQ(value_at(kernel, x, x, VectorXd::Constant(static_cast<Index>(kernel.parameters().size()), 0.7)), 1.0);
+}
+
+TEST(KernelTest, SumsAndProductsCombineTheirPartsAndAmplitudesScaleLaterTerms) {
+  SCOPED_TRACE(fmt::format("seed {}", seed));
+  RandomStream random(seed);
+  const Kernel kernel = Kernel::parse(" se*linear + periodic + rq * matern32*constant", two_features);
+  EXPECT_EQ(names_of(kernel),
+            (std::vector<std::string>{"se.lengthscale(a)", "se.lengthscale(b)", "linear.lengthscale(a)", "linear.lengthscale(b)",
+                                      "periodic.lengthscale(a)", "periodic.lengthscale(b)", "periodic.period(a)",
+                                      "periodic.period(b)", "periodic.amplitude", "rq.lengthscale(a)", "rq.lengthscale(b)",
+                                      "rq.alpha", "matern32.lengthscale(a)", "matern32.lengthscale(b)", "rq.amplitude"}));
+  for (int trial = 0; trial < 100; ++trial) {
+    const VectorXd v = random_parameters(kernel, random);
+    const VectorXd x = test::random_vector(2, random), y = test::random_vector(2, random);
+    const long double expected =
+        printed_formula("se", x, y, &v[0]) * printed_formula("linear", x, y, &v[2]) +
+        static_cast<long double>(v[8]) * v[8] * printed_formula("periodic", x, y, &v[4]) +
+        static_cast<long double>(v[14]) * v[14] * printed_formula("rq", x, y, &v[9]) * printed_formula("matern32", x, y, &v[12]);
+    EXPECT_NEAR(value_at(kernel, x, y, v), static_cast<double>(expected),
+                512 * test::eps * (10 + std::abs(static_cast<double>(expected))));
+  }
+}
+
+TEST(KernelTest, ManyPointsAtOnceAreThePointsOneByOne) {
+  RandomStream random(seed);
+  for (const char* text : {"matern52", "se + linear*periodic"}) {
+    const Kernel kernel = Kernel::parse(text, two_features);
+    const VectorXd values = random_parameters(kernel, random);
+    const MatrixXd points = random_points(9, 2, random);
+    Kernel::Workspace workspace;
+    VectorXd out(9);
+    kernel.evaluate(points, points.row(4).transpose(), values, out, workspace);
+    for (Index i = 0; i < 9; ++i) {
+      EXPECT_NEAR(out[i], value_at(kernel, points.row(i), points.row(4), values),
+                  16 * test::eps * std::max(1.0, std::abs(out[i])));
+    }
+  }
+}
+
+class KernelGradients : public testing::TestWithParam<std::string> {};
+INSTANTIATE_TEST_SUITE_P(Each, KernelGradients,
+                         testing::Values("se", "matern32", "matern52", "rq", "periodic", "linear", "constant",
+                                         "se + linear*periodic", "rq*matern32 + matern52*periodic + constant", "se + se*se"),
+                         [](const auto& instance) { return fmt::format("Kernel{}", instance.index); });
+
+TEST_P(KernelGradients, MatchDifferencesInTheLogarithmOfEveryParameter) {
+  SCOPED_TRACE(fmt::format("kernel {}, seed {}", GetParam(), seed));
+  RandomStream random(seed);
+  const Kernel kernel = Kernel::parse(GetParam(), two_features);
+  const VectorXd values = random_parameters(kernel, random);
+  MatrixXd points = random_points(7, 2, random);
+  const VectorXd point = points.row(3);  // one pair at no distance, where a Matérn kernel's r has no derivative
+  const VectorXd w = test::random_vector(7, random);
+  const auto weighted_sum = [&](const VectorXd& at) -> VectorXd {
+    VectorXd out(7);
+    Kernel::Workspace workspace;
+    kernel.evaluate(points, point, at, out, workspace);
+    return VectorXd::Constant(1, w.dot(out));
+  };
+  const VectorXd before = VectorXd::Constant(values.size(), 0.25);
+  VectorXd gradient = before;
+  Kernel::Workspace workspace;
+  kernel.add_gradient(points, point, values, w, gradient, workspace);
+  for (Index p = 0; p < values.size(); ++p) {
+    SCOPED_TRACE(kernel.parameters()[static_cast<std::size_t>(p)].name);
+    const test::Difference difference = test::central_difference(
+        [&](double log_value) {
+          VectorXd moved = values;
+          moved[p] = std::exp(log_value);
+          return weighted_sum(moved);
+        },
+        // a kernel whose terms cancel is rounded as they are
+        std::log(values[p]), 0.5, 256 * test::eps);
+    const VectorXd added = VectorXd::Constant(1, gradient[p] - before[p]);
+    EXPECT_TRUE(test::matches(added, difference));
+    EXPECT_GT(std::abs(added[0]), 1e3 * difference.error[0]) << "a gradient that is zero tests nothing";
+  }
+}
+
+class KernelGrams : public testing::TestWithParam<std::string> {};
+INSTANTIATE_TEST_SUITE_P(Each, KernelGrams,
+                         testing::Values("se", "matern32", "matern52", "rq", "periodic", "linear", "constant",
+                                         "se + linear*periodic"),
+                         [](const auto& instance) { return fmt::format("Kernel{}", instance.index); });
+
+TEST_P(KernelGrams, ArePositiveSemidefinite) {
+  RandomStream random(seed);
+  const Kernel kernel = Kernel::parse(GetParam(), two_features);
+  for (int trial = 0; trial < 10; ++trial) {
+    SCOPED_TRACE(fmt::format("kernel {}, seed {}, trial {}", GetParam(), seed, trial));
+    const VectorXd values = random_parameters(kernel, random);
+    const MatrixXd points = random_points(25, 2, random);
+    MatrixXd gram(25, 25);
+    Kernel::Workspace workspace;
+    for (Index j = 0; j < 25; ++j) kernel.evaluate(points, points.row(j).transpose(), values, gram.col(j), workspace);
+    const VectorXd eigenvalues = Eigen::SelfAdjointEigenSolver<MatrixXd>(gram).eigenvalues();
+    // each entry is off by some ε of its terms: eigenvalues by at most 25 of them
+    EXPECT_GE(eigenvalues[0], -25 * 64 * test::eps * gram.cwiseAbs().maxCoeff());
+  }
+}
+
+TEST(KernelTest, ParameterNamesCarryTheKernelOnlyWhereThereAreSeveral) {
+  EXPECT_EQ(names_of(Kernel::parse("se", two_features)), (std::vector<std::string>{"lengthscale(a)", "lengthscale(b)"}));
+  EXPECT_EQ(names_of(Kernel::parse("rq", two_features)), (std::vector<std::string>{"lengthscale(a)", "lengthscale(b)", "alpha"}));
+  EXPECT_EQ(names_of(Kernel::parse("constant", two_features)), std::vector<std::string>{});
+  const std::vector<std::string> one = {"q"};
+  EXPECT_EQ(names_of(Kernel::parse("se + linear", one)),
+            (std::vector<std::string>{"se.lengthscale(q)", "linear.lengthscale(q)", "linear.amplitude"}));
+  EXPECT_EQ(names_of(Kernel::parse("se + se", one)),
+            (std::vector<std::string>{"se1.lengthscale(q)", "se2.lengthscale(q)", "se2.amplitude"}));
+}
+
+TEST(KernelTest, EveryParameterKnowsItsKindAndFeature) {
+  const Kernel kernel = Kernel::parse("periodic + rq", two_features);
+  using Kind = Kernel::ParameterKind;
+  const std::vector<Kind> kinds = {Kind::periodic_lengthscale, Kind::periodic_lengthscale, Kind::period, Kind::period,
+                                   Kind::lengthscale,          Kind::lengthscale,          Kind::shape,  Kind::amplitude};
+  const std::vector<int> features = {0, 1, 0, 1, 0, 1, -1, -1};
+  ASSERT_EQ(kernel.parameters().size(), kinds.size());
+  for (std::size_t p = 0; p < kinds.size(); ++p) {
+    EXPECT_EQ(kernel.parameters()[p].kind, kinds[p]);
+    EXPECT_EQ(kernel.parameters()[p].feature, features[p]);
+  }
+}
+
+TEST(KernelTest, AnUnknownOrEmptyKernelIsAnErrorThatNamesThoseThereAre) {
+  for (const char* text : {"rbf", "", "se +", "se**linear", "se - linear", "2*se", "SE"}) {
+    SCOPED_TRACE(text);
+    try {
+      Kernel::parse(text, two_features);
+      ADD_FAILURE() << "no error";
+    } catch (const InputError& error) {
+      EXPECT_THAT(error.what(),
+                  AllOf(HasSubstr(text), HasSubstr("unknown kernel"), HasSubstr("matern52"), HasSubstr("periodic")));
+    }
+  }
+}
+
+}  // namespace
+}  // namespace gp2

@@ -1,0 +1,266 @@
+#include "gp2/generate.hpp"
+
+#include <fmt/format.h>
+#include <gmock/gmock.h>
+
+#include "gp2/error.hpp"
+#include "io/io_testing.hpp"
+#include "test_models.hpp"
+
+namespace gp2 {
+namespace {
+
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+using test::input_error_of;
+using testing::AllOf;
+using testing::EndsWith;
+using testing::HasSubstr;
+using testing::StartsWith;
+
+/// Whether the bits are the same; NaN equals NaN.
+bool identical(const MatrixXd& a, const MatrixXd& b) {
+  return a.rows() == b.rows() && a.cols() == b.cols() &&
+         ((a.array() == b.array()) || (a.array().isNaN() && b.array().isNaN())).all();
+}
+
+GeneratedData noise_free(const ModelFile& model, int n = 200, std::uint64_t seed = 1) {
+  return generate(model, {n, seed, VectorXd::Zero(model.system->nq())});
+}
+
+// ---- every model file
+
+class Generate : public testing::TestWithParam<std::string> {};
+INSTANTIATE_TEST_SUITE_P(EveryModel, Generate, testing::ValuesIn(test::every_model()), test::model_test_name);
+
+TEST_P(Generate, TheSameSeedGivesTheSameBitsAndAnotherSeedOthers) {
+  const ModelFile& model = test::model(GetParam());
+  const VectorXd noise = VectorXd::Constant(model.system->nq(), 0.1);
+  const GeneratedData a = generate(model, {20, 5, noise}), b = generate(model, {20, 5, noise}),
+                      c = generate(model, {20, 6, noise});
+  EXPECT_TRUE(identical(a.states, b.states));
+  EXPECT_TRUE(identical(a.accelerations, b.accelerations));
+  EXPECT_FALSE(identical(a.states, c.states));
+  EXPECT_FALSE(identical(a.accelerations, c.accelerations));
+  // noise comes after the states
+  EXPECT_TRUE(identical(a.states, noise_free(model, 20, 5).states));
+}
+
+TEST_P(Generate, StatesSatisfyTheConstraintsToRounding) {
+  const ModelFile& model = test::model(GetParam());
+  const MatrixXd states = noise_free(model).states;
+  const System& system = *model.system;
+  const VectorXd parameters = system.parameter_values();
+  const MatrixXd residuals = system.residuals(states, parameters);
+  ASSERT_GT(residuals.rows(), 0);
+  // what the residuals change by when every entry of the state does by its size
+  MatrixXd scale = MatrixXd::Ones(residuals.rows(), residuals.cols());
+  for (Eigen::Index k = 0; k < states.rows(); ++k) {
+    if (states.row(k).hasNaN()) continue;
+    MatrixXd moved = states;
+    moved.row(k) *= 1 + 1e-3;
+    scale += (system.residuals(moved, parameters) - residuals).cwiseAbs() / 1e-3;
+  }
+  EXPECT_LT((residuals.array() / scale.array()).abs().maxCoeff(), 20 * test::eps);
+}
+
+TEST_P(Generate, NoiseFreeAccelerationsSatisfyTheConstraintsAndAreTheTruth) {
+  const ModelFile& model = test::model(GetParam());
+  const GeneratedData data = noise_free(model);
+  EXPECT_TRUE(identical(data.accelerations, true_acceleration(model, data.states)));
+  const SystemValues values = model.system->evaluate(data.states, model.system->parameter_values());
+  for (int i = 0; i < data.states.cols(); ++i) {
+    const VectorXd ddq = data.accelerations.col(i);
+    const VectorXd scale = values.A(i).cwiseAbs() * ddq.cwiseAbs() + values.b(i).cwiseAbs();
+    const VectorXd error = values.A(i) * ddq - values.b(i);
+    for (Eigen::Index k = 0; k < error.size(); ++k)
+      EXPECT_LE(std::abs(error[k]), 50 * test::eps * (scale[k] + 1)) << "state " << i + 1;
+  }
+}
+
+TEST_P(Generate, WhatIsKnownIsFiniteAndTheRestIsNaN) {
+  const ModelFile& model = test::model(GetParam());
+  const GeneratedData data = noise_free(model, 10);
+  ASSERT_EQ(data.known.size(), static_cast<std::size_t>(model.system->layout().size()));
+  for (std::size_t k = 0; k < data.known.size(); ++k) {
+    const auto row = data.states.row(static_cast<Eigen::Index>(k)).array();
+    EXPECT_TRUE(data.known[k] ? row.isFinite().all() : row.isNaN().all()) << model.system->state_names()[k];
+  }
+  EXPECT_TRUE(data.accelerations.allFinite());
+}
+
+TEST_P(Generate, RangesAreFilledEvenly) {
+  const ModelFile& model = test::model(GetParam());
+  const std::vector<std::string> names = model.system->state_names();
+  constexpr int n = 4000;
+  const MatrixXd states = noise_free(model, n).states;
+  for (const ModelFile::SamplingRule& rule : model.sampling) {
+    const auto name = std::find(names.begin(), names.end(), rule.name);
+    if (!rule.range || name == names.end()) continue;
+    const auto [lower, upper] = *rule.range;
+    VectorXd u = (states.row(name - names.begin()).transpose().array() - lower) / (upper - lower);
+    std::sort(u.begin(), u.end());
+    EXPECT_GE(u[0], 0);
+    EXPECT_LT(u[n - 1], 1);
+    // Kolmogorov and Smirnov: √n · distance exceeds 2.2 once in 8000 times
+    double distance = 0;
+    for (int i = 0; i < n; ++i) distance = std::max(distance, std::abs(u[i] - (i + 0.5) / n));
+    EXPECT_LT(distance * std::sqrt(n), 2.2) << rule.name;
+  }
+}
+
+// ---- noise
+
+TEST(GenerateNoise, HasTheStatedStandardDeviationInEachOutput) {
+  const ModelFile& model = test::model("models/surface.toml");
+  constexpr int n = 20000;
+  const Eigen::Vector3d stddev(0.1, 0, 3);
+  const MatrixXd noise = generate(model, {n, 1, stddev}).accelerations - noise_free(model, n).accelerations;
+  EXPECT_TRUE((noise.row(1).array() == 0).all());
+  for (const int j : {0, 2}) {
+    // five standard errors
+    EXPECT_NEAR(noise.row(j).mean(), 0, 5 * stddev[j] / std::sqrt(n));
+    EXPECT_NEAR(std::sqrt(noise.row(j).squaredNorm() / n), stddev[j], 5 * stddev[j] / std::sqrt(2.0 * n));
+  }
+  EXPECT_NEAR(noise.row(0).dot(noise.row(2)) / (n * 0.3), 0, 5 / std::sqrt(n));
+}
+
+TEST(GenerateNoise, OfTheWrongSizeOrSignIsRefused) {
+  const ModelFile& model = test::model("models/surface.toml");
+  const std::string rule = "generate: noise_stddev must hold 3 finite numbers ≥ 0, one per coordinate";
+  EXPECT_EQ(input_error_of([&] { generate(model, {5, 1, VectorXd::Zero(2)}); }), rule);
+  EXPECT_EQ(input_error_of([&] { generate(model, {5, 1, Eigen::Vector3d(0, -1, 0)}); }), rule);
+  EXPECT_EQ(input_error_of([&] { generate(model, {5, 1, Eigen::Vector3d(0, NAN, 0)}); }), rule);
+  EXPECT_EQ(input_error_of([&] { generate(model, {5, 1, Eigen::Vector3d(0, INFINITY, 0)}); }), rule);
+  EXPECT_EQ(input_error_of([&] { generate(model, {0, 1, VectorXd::Zero(3)}); }), "generate: n must be at least 1, got 0");
+}
+
+// ---- rules of [sampling]
+
+// a bead on a circle of radius 2, and a free coordinate that only the truth may read
+ModelFile circle(const std::string& sampling, const std::string& truth = "[\"0\", \"0\", \"0\"]") {
+  return ModelFile::parse(
+      "coordinates = [\"x\", \"y\", \"z\"]\ninputs = [\"u\"]\n[mechanics]\n"
+      "mass = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]\n[constraints]\nposition = [\"x^2 + y^2 - 4\"]\n[truth]\n"
+      "acceleration = " +
+          truth + "\n[sampling]\n" + sampling,
+      "circle.toml");
+}
+enum Entry { x, y, z, dx, dy, dz, t, u };
+
+TEST(GenerateSampling, CoordinatesThatAreSolvedForTakeTheBranchOfTheStart) {
+  for (const double sign : {1.0, -1.0}) {
+    const ModelFile model = circle(fmt::format("x = [-1, 1]\ndx = [-1, 1]\nstart = {{ y = {} }}\n", sign));
+    const GeneratedData data = noise_free(model, 50);
+    EXPECT_GT((sign * data.states.row(y)).minCoeff(), 1.7);
+    EXPECT_LT((data.states.row(x).array().square() + data.states.row(y).array().square() - 4).abs().maxCoeff(), 1e-14);
+    EXPECT_LT(
+        (data.states.row(x).array() * data.states.row(dx).array() + data.states.row(y).array() * data.states.row(dy).array())
+            .abs()
+            .maxCoeff(),
+        1e-14);
+    EXPECT_EQ(data.known, (std::vector<bool>{true, true, false, true, true, false, false, false}));
+  }
+}
+
+TEST(GenerateSampling, RulesMayUseAuxiliaryDrawsAndWhatIsSolvedFor) {
+  const ModelFile model =
+      circle("x = \"r*0.5\"\nr = [-1, 1]\ndx = \"s\"\ns = \"2*y\"\nstart = { y = 1 }\nz = \"dy + 1\"\nt = 3\nu = \"t + s\"\n");
+  const MatrixXd states = noise_free(model, 20).states;
+  EXPECT_LE(states.row(x).cwiseAbs().maxCoeff(), 0.5);
+  EXPECT_TRUE(identical(states.row(dx), 2 * states.row(y)));
+  EXPECT_TRUE(identical(states.row(z), (states.row(dy).array() + 1).matrix()));
+  EXPECT_TRUE((states.row(t).array() == 3).all());
+  EXPECT_TRUE(identical(states.row(u), (states.row(dx).array() + 3).matrix()));
+}
+
+TEST(GenerateSampling, RedundantConstraintsAreSolvedTogether) {
+  const GeneratedData data = noise_free(test::model("models/slider_crank.toml"), 20);
+  EXPECT_TRUE(std::all_of(data.known.begin(), data.known.end() - 2, [](bool known) { return known; }));  // all but t
+}
+
+TEST(GenerateSampling, TheUnicycleNeedsNoPosition) {
+  const GeneratedData data = noise_free(test::model("models/unicycle.toml"), 5);
+  EXPECT_TRUE(data.states.topRows(2).array().isNaN().all());
+  EXPECT_FALSE(data.known[0]);
+  EXPECT_FALSE(data.known[1]);
+  EXPECT_TRUE(data.known[2]);
+}
+
+std::string error_of(const ModelFile& model) {
+  return input_error_of([&] { noise_free(model, 5); });
+}
+
+TEST(GenerateSampling, WithoutSamplingOrTruthThereIsNoData) {
+  const std::string text = "coordinates = [\"x\"]\n[mechanics]\nmass = [[1]]\n[constraints]\nposition = [\"x - t\"]\n";
+  EXPECT_EQ(error_of(ModelFile::parse(text + "[truth]\nacceleration = [0]\n", "m.toml")),
+            "m.toml: missing [sampling]: where states are drawn from, say q1 = [-1, 1]");
+  const ModelFile without_truth = ModelFile::parse(text + "[sampling]\nt = [0, 1]\n", "m.toml");
+  const std::string missing_truth =
+      "m.toml: missing [truth] acceleration = [ … ]: what is added to M⁻¹ force, \"0\" where nothing is";
+  EXPECT_EQ(error_of(without_truth), missing_truth);
+  EXPECT_EQ(input_error_of([&] { true_acceleration(without_truth, MatrixXd::Zero(3, 1)); }), missing_truth);
+}
+
+TEST(GenerateSampling, WhatNeitherRulesNorConstraintsDecideIsNamed) {
+  EXPECT_EQ(
+      error_of(circle("x = [-1, 1]\ndx = [-1, 1]\nstart = { y = 1 }\n", "[\"0\", \"0\", \"-u\"]")),
+      "circle.toml: [sampling] says nothing of 'u', which the model reads, and no constraint decides it: add u = [lower, upper]");
+  EXPECT_THAT(
+      error_of(circle("dx = [-1, 1]\nstart = { x = 1, y = 1 }\n")),
+      StartsWith("circle.toml: [sampling]: at x = 1, y = 1 the constraints decide only 1 of the 2 unknowns x, y: draw some"));
+  // a constraint that reads t although A and b do not
+  EXPECT_THAT(error_of(ModelFile::parse(
+                  "coordinates = [\"x\"]\n[mechanics]\nmass = [[1]]\n[constraints]\nposition = [\"x - t\"]\n[truth]\n"
+                  "acceleration = [0]\n[sampling]\na = [0, 1]\n",
+                  "m.toml")),
+              HasSubstr("says nothing of 't'"));
+}
+
+TEST(GenerateSampling, ASingularStartIsNamedWithTheMend) {
+  EXPECT_THAT(error_of(circle("x = [-1, 1]\ndx = [-1, 1]\n")),
+              AllOf(HasSubstr("y = 0 the constraints decide only 0 of the 1 unknowns y"),
+                    EndsWith("or start elsewhere, start = { y = … }")));
+}
+
+TEST(GenerateSampling, StatesDrawnOffTheConstraintAreRefused) {
+  EXPECT_THAT(
+      error_of(circle("x = [-1, 1]\ny = [-1, 1]\ndx = [-1, 1]\n")),
+      AllOf(StartsWith("circle.toml: [sampling]: sample 1 (x = "), HasSubstr("is off the constraint \"x^2 + y^2 - 4\" by "),
+            EndsWith("leave one more of x, y to be solved from the constraints")));
+  EXPECT_THAT(error_of(circle("x = [-1, 1]\ndx = [-1, 1]\ndy = [-1, 1]\nstart = { y = 1 }\n")),
+              HasSubstr("is off the constraint \"d/dt of x^2 + y^2 - 4\" by "));
+}
+
+TEST(GenerateSampling, ContradictingConstraintsAreRefused) {
+  // least squares has a solution, the constraints have none
+  EXPECT_THAT(error_of(ModelFile::parse(
+                  "coordinates = [\"x\"]\n[mechanics]\nmass = [[1]]\n[constraints]\nposition = [\"x - 1\", \"x - 2\"]\n"
+                  "[truth]\nacceleration = [0]\n[sampling]\nt = [0, 1]\n",
+                  "m.toml")),
+              HasSubstr("is off the constraint"));
+}
+
+TEST(GenerateSampling, AConstraintOutOfReachIsANumericalError) {
+  try {
+    noise_free(circle("x = [3, 4]\ndx = [-1, 1]\nstart = { y = 1 }\n"), 5);
+    FAIL() << "no circle of radius 2 passes there";
+  } catch (const NumericalError& error) {
+    EXPECT_THAT(error.what(),
+                AllOf(StartsWith("circle.toml: [sampling]: Newton's method did not reach the constraints for y at sample 1"),
+                      EndsWith("start = { y = … }")));
+  }
+}
+
+TEST(GenerateSampling, ARuleThatIsNoNumberIsNamedWithItsLine) {
+  EXPECT_EQ(error_of(circle("x = \"log(a)\"\na = [-2, -1]\ndx = 0\nstart = { y = 1 }\n")),
+            "circle.toml:10: sampling.x: log(a) is not a finite number at sample 1");
+}
+
+TEST(GenerateSampling, ATruthThatIsNoNumberIsNamed) {
+  EXPECT_EQ(error_of(circle("x = [-1, 1]\ndx = 0\nstart = { y = 1 }\n", "[\"0\", \"0\", \"log(-1 - x^2)\"]")),
+            "circle.toml: the true acceleration is not a finite number at sample 1");
+}
+
+}  // namespace
+}  // namespace gp2

@@ -1,0 +1,266 @@
+#include <gmock/gmock.h>
+#include <gtest/gtest.h>
+
+#include <atomic>
+
+#include "gp2/error.hpp"
+#include "gp2/training.hpp"
+#include "test_models.hpp"
+
+namespace gp2 {
+namespace {
+
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+using testing::HasSubstr;
+using Kind = Hyperparameter::Kind;
+
+constexpr std::uint64_t seed = 50502;
+
+struct Problem {
+  Prior prior;
+  std::vector<Observations> observations;
+  std::vector<Hyperparameter> hyperparameters;
+};
+
+Problem problem(const std::string& file, int n, const std::vector<std::string>& estimated = {}, const Protocol& protocol = {},
+                bool estimate_noise = false, double noise_stddev = 0.05) {
+  const ModelFile& model = test::model(file);
+  GenerateOptions options{n, seed, {}};
+  options.noise_stddev = VectorXd::Constant(model.system->nq(), noise_stddev);
+  const GeneratedData data = generate(model, options);
+  Problem p{make_prior(model), {}, {}};
+  p.observations.push_back({data.states, View::all(View::Quantity::constrained_acceleration, *model.system), data.accelerations,
+                            options.noise_stddev, estimate_noise});
+  p.hyperparameters = default_hyperparameters(p.prior, p.observations, estimated, protocol);
+  return p;
+}
+
+FitOptions quick() {
+  FitOptions options;
+  options.n_restarts = 3;
+  options.max_iterations = 15;
+  options.n_threads = 1;
+  options.seed = 5;
+  return options;
+}
+
+std::vector<double> values_of(const std::vector<Hyperparameter>& hyperparameters) {
+  std::vector<double> values;
+  for (const Hyperparameter& h : hyperparameters) values.push_back(h.value);
+  return values;
+}
+
+// the objective by its definition: likelihood plus hyper-priors
+double objective(const Problem& p, const std::vector<Hyperparameter>& hyperparameters) {
+  const ModelValues values = model_values(p.prior, p.observations, hyperparameters);
+  double sum = Posterior(p.prior, p.observations, values).negative_log_likelihood();
+  for (const Hyperparameter& h : hyperparameters) {
+    if (h.log_stddev > 0) sum += 0.5 * std::pow(std::log(h.value / h.median) / h.log_stddev, 2);
+  }
+  return sum;
+}
+
+TEST(FitTest, GivesTheSameBitsForAnyNumberOfThreads) {
+  const Problem p = problem("models/unicycle.toml", 25, {"R"}, {}, true);
+  std::vector<std::vector<double>> values;
+  std::vector<MatrixXd> means;
+  std::vector<std::vector<double>> objectives;
+  for (int n_threads : {1, 2, 3}) {
+    FitOptions options = quick();
+    options.n_threads = n_threads;
+    const Fit result = fit(p.prior, p.observations, p.hyperparameters, options);
+    values.push_back(values_of(result.report.hyperparameters));
+    means.push_back(result.posterior.mean(p.observations[0].view, p.observations[0].states));
+    objectives.emplace_back();
+    for (const RestartReport& restart : result.report.restarts) objectives.back().push_back(restart.objective);
+  }
+  EXPECT_EQ(values[0], values[1]);
+  EXPECT_EQ(values[0], values[2]);
+  EXPECT_EQ(means[0], means[1]);
+  EXPECT_EQ(means[0], means[2]);
+  EXPECT_EQ(objectives[0], objectives[1]);
+  EXPECT_EQ(objectives[0], objectives[2]);
+}
+
+TEST(FitTest, AnotherSeedDrawsOtherStarts) {
+  const Problem p = problem("models/duffing.toml", 15);
+  FitOptions options = quick();
+  options.max_iterations = 1;
+  const FitReport one = fit(p.prior, p.observations, p.hyperparameters, options).report;
+  options.seed = 6;
+  const FitReport other = fit(p.prior, p.observations, p.hyperparameters, options).report;
+  EXPECT_EQ(one.restarts[0].objective, other.restarts[0].objective) << "the first starts where it is told to";
+  EXPECT_NE(one.restarts[1].objective, other.restarts[1].objective);
+  EXPECT_NE(one.restarts[1].objective, one.restarts[2].objective);
+}
+
+TEST(FitTest, NoIterationsConditionsAtTheStart) {
+  const Problem p = problem("models/surface.toml", 20, {"p1"});
+  FitOptions options = quick();
+  options.max_iterations = 0;
+  const Fit result = fit(p.prior, p.observations, p.hyperparameters, options);
+  EXPECT_EQ(values_of(result.report.hyperparameters), values_of(p.hyperparameters));
+  EXPECT_EQ(result.report.restarts.size(), 1u);
+  EXPECT_EQ(result.report.iterations, 0);
+  EXPECT_FALSE(result.report.converged);
+  EXPECT_NEAR(result.report.negative_log_likelihood, result.posterior.negative_log_likelihood(),
+              1e-9 * std::abs(result.report.negative_log_likelihood));
+  const Posterior there(p.prior, p.observations, model_values(p.prior, p.observations, p.hyperparameters));
+  EXPECT_EQ(result.posterior.mean(p.observations[0].view, p.observations[0].states),
+            there.mean(p.observations[0].view, p.observations[0].states));
+}
+
+TEST(FitTest, ReportsTheObjectiveAtTheValuesItReturns) {
+  for (const char* file : {"models/duffing.toml", "models/unicycle.toml"}) {
+    for (const Protocol& protocol :
+         {Protocol{}, Protocol{Protocol::Name::paper, true}, Protocol{Protocol::Name::standard, false}}) {
+      SCOPED_TRACE(fmt::format("{}, protocol {}, hyper-prior {}, seed {}", file, static_cast<int>(protocol.name),
+                               protocol.hyperprior, seed));
+      const Problem p = problem(file, 20, {}, protocol, true);
+      const FitReport report = fit(p.prior, p.observations, p.hyperparameters, quick()).report;
+      const double start = objective(p, p.hyperparameters);
+      const double end = objective(p, report.hyperparameters);
+      // two evaluations of one likelihood, whose condition number is below 1e7 at this noise
+      EXPECT_NEAR(report.objective, end, 1e-7 * (1 + std::abs(end)));
+      EXPECT_LT(end, start);
+      double best = std::numeric_limits<double>::infinity();
+      for (const RestartReport& restart : report.restarts) best = std::min(best, restart.objective);
+      EXPECT_EQ(report.objective, best);
+      EXPECT_EQ(report.restarts[static_cast<std::size_t>(report.best_restart)].objective, best);
+      if (protocol.name == Protocol::Name::paper || !protocol.hyperprior) {
+        EXPECT_EQ(report.objective, report.negative_log_likelihood);
+      }
+      for (const Hyperparameter& h : report.hyperparameters) EXPECT_TRUE(h.lower <= h.value && h.value <= h.upper) << h.name;
+    }
+  }
+}
+
+TEST(FitTest, ConvergesToAPointWhoseProjectedGradientIsBelowTheTolerance) {
+  for (const Protocol& protocol : {Protocol{}, Protocol{Protocol::Name::paper, true}}) {
+    // noise of a tenth of the signal, so that the objective's rounding does not hide a gradient of 1e-3
+    Problem p = problem("models/duffing.toml", 20, {"A0"}, protocol, true, 5);
+    for (Hyperparameter& h : p.hyperparameters) {
+      // a box far from width one
+      if (h.kind == Kind::parameter) std::tie(h.lower, h.upper) = std::pair(-20.0, 30.0);
+    }
+    FitOptions options = quick();
+    options.n_restarts = 1;
+    options.max_iterations = 2000;
+    options.gradient_tolerance = 1e-3;
+    options.reduction_tolerance = 0;
+    const FitReport report = fit(p.prior, p.observations, p.hyperparameters, options).report;
+    ASSERT_TRUE(report.converged) << report.termination;
+    EXPECT_THAT(report.termination, HasSubstr("gradient"));
+    int n_inside = 0;
+    for (std::size_t k = 0; k < report.hyperparameters.size(); ++k) {
+      const Hyperparameter& h = report.hyperparameters[k];
+      if (h.at_bound()) continue;
+      ++n_inside;
+      // on the scale the optimiser works on: the logarithm, or the width of the box
+      const auto at = [&](double x) -> VectorXd {
+        std::vector<Hyperparameter> moved = report.hyperparameters;
+        moved[k].value = h.is_positive() ? std::exp(x) : h.lower + x * (h.upper - h.lower);
+        return VectorXd::Constant(1, objective(p, moved));
+      };
+      const double x = h.is_positive() ? std::log(h.value) : (h.value - h.lower) / (h.upper - h.lower);
+      // the likelihood at this noise is rounded at some 1e-12 of itself
+      const test::Difference slope = test::central_difference(at, x, h.is_positive() ? 0.5 : 0.01, 1e-12);
+      EXPECT_LE(std::abs(slope.value[0]), options.gradient_tolerance + slope.error[0]) << h.name;
+      EXPECT_LE(slope.error[0], 1e-2) << h.name;
+    }
+    EXPECT_GE(n_inside, 3);
+  }
+}
+
+TEST(FitTest, FindsTheParametersOfTheConstraintThatMadeTheData) {
+  const ModelFile& model = test::model("models/duffing.toml");
+  Problem p = problem("models/duffing.toml", 40, {"A0", "omega"});
+  const int A0 = model.system->parameter_index("A0"), omega = model.system->parameter_index("omega");
+  for (Hyperparameter& h : p.hyperparameters) {
+    if (h.kind == Kind::parameter && h.index == A0) h.value = 1.15;
+    if (h.kind == Kind::parameter && h.index == omega) h.value = 6.35;
+  }
+  FitOptions options = quick();
+  options.n_restarts = 1;
+  options.max_iterations = 300;
+  const ModelValues fitted = fit(p.prior, p.observations, p.hyperparameters, options).posterior.values();
+  // forty measurements of b, of noise 0.05·√2 on an amplitude of some 40: five standard errors and more
+  EXPECT_NEAR(fitted.parameters[A0], 1.0, 5e-3);
+  EXPECT_NEAR(fitted.parameters[omega], 6.283185307179586, 2e-2);
+}
+
+TEST(FitTest, StopsWhenAskedAndReturnsTheBestSoFar) {
+  const Problem p = problem("models/surface.toml", 20);
+  std::atomic<bool> stop = false;
+  FitOptions options = quick();
+  options.max_iterations = 1000;
+  options.n_restarts = 1;
+  options.stop = &stop;
+  options.progress = [&](const Progress& progress) {
+    if (progress.iteration == 4) stop = true;
+  };
+  const FitReport report = fit(p.prior, p.observations, p.hyperparameters, options).report;
+  EXPECT_EQ(report.iterations, 4);
+  EXPECT_FALSE(report.converged);
+  EXPECT_THAT(report.termination, HasSubstr("stopped on request"));
+  EXPECT_LT(report.objective, objective(p, p.hyperparameters));
+}
+
+TEST(FitTest, TellsItsProgressOneCallAtATime) {
+  const Problem p = problem("models/duffing.toml", 15);
+  FitOptions options = quick();
+  options.n_threads = 3;
+  std::atomic<int> inside = 0;
+  int n_calls = 0;
+  double best = std::numeric_limits<double>::infinity();
+  options.progress = [&](const Progress& progress) {
+    EXPECT_EQ(++inside, 1);
+    ++n_calls;
+    EXPECT_LE(progress.best, best);
+    best = progress.best;
+    EXPECT_EQ(progress.n_restarts, 3);
+    EXPECT_TRUE(progress.fraction >= 0 && progress.fraction <= 1);
+    EXPECT_GE(progress.seconds, 0);
+    --inside;
+  };
+  const FitReport report = fit(p.prior, p.observations, p.hyperparameters, options).report;
+  int n_iterations = 0;
+  for (const RestartReport& restart : report.restarts) n_iterations += restart.iterations;
+  EXPECT_EQ(n_calls, n_iterations);
+  EXPECT_EQ(best, report.objective);
+}
+
+TEST(FitTest, DrawsAStartAgainWhereTheMassMatrixIsIndefinite) {
+  Problem p = problem("models/unicycle.toml", 15, {"Ic"});
+  for (Hyperparameter& h : p.hyperparameters) {
+    // M is positive definite above m R² = 0.0025 only: half of the box
+    if (h.kind == Kind::parameter) {
+      h.lower = -0.02;
+      h.upper = 0.025;
+    }
+  }
+  FitOptions options = quick();
+  options.n_restarts = 8;
+  options.max_iterations = 2;
+  const FitReport report = fit(p.prior, p.observations, p.hyperparameters, options).report;
+  for (const RestartReport& restart : report.restarts) EXPECT_TRUE(std::isfinite(restart.objective)) << restart.termination;
+}
+
+TEST(FitTest, RefusesAStartAtWhichTheMassMatrixIsIndefinite) {
+  Problem p = problem("models/unicycle.toml", 15, {"Ic"});
+  for (Hyperparameter& h : p.hyperparameters) {
+    if (h.kind == Kind::parameter) h.value = h.lower = 0.001;
+  }
+  EXPECT_THROW(fit(p.prior, p.observations, p.hyperparameters, quick()), InputError);
+}
+
+TEST(FitTest, WithoutHyperparametersItConditions) {
+  const Problem p = problem("models/duffing.toml", 15);
+  const Fit result = fit(p.prior, p.observations, {}, quick());
+  EXPECT_EQ(result.report.restarts.size(), 1u);
+  EXPECT_TRUE(std::isfinite(result.report.negative_log_likelihood));
+}
+
+}  // namespace
+}  // namespace gp2

@@ -1,0 +1,286 @@
+#include <gmock/gmock.h>
+#include <gtest/gtest.h>
+
+#include <set>
+
+#include "gp2/error.hpp"
+#include "gp2/training.hpp"
+#include "test_models.hpp"
+
+namespace gp2 {
+namespace {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+using testing::AllOf;
+using testing::HasSubstr;
+using Kind = Hyperparameter::Kind;
+
+constexpr std::uint64_t seed = 50501;
+
+std::vector<Observations> observe(const ModelFile& model, int n, bool estimate_noise, std::vector<int> rows = {}) {
+  const GeneratedData data = test::draw(model, n, seed);
+  View view = View::all(View::Quantity::constrained_acceleration, *model.system);
+  if (!rows.empty()) view.rows = rows;
+  MatrixXd values(view.size(), n);
+  for (int k = 0; k < view.size(); ++k) values.row(k) = data.accelerations.row(view.rows[static_cast<std::size_t>(k)]);
+  return {{data.states, view, values, 0.1 * row_stddev(values), estimate_noise}};
+}
+
+const Hyperparameter& find(const std::vector<Hyperparameter>& all, const std::string& name) {
+  for (const Hyperparameter& h : all) {
+    if (h.name == name) return h;
+  }
+  throw std::runtime_error("no hyperparameter " + name);
+}
+
+// the standard deviation by its definition
+double stddev(const VectorXd& values) {
+  return std::sqrt((values.array() - values.mean()).square().mean());
+}
+
+// a few roundings
+void expect_same(double got, double want) {
+  EXPECT_NEAR(got, want, 64 * test::eps * std::abs(want));
+}
+
+TEST(HyperparametersTest, ThePaperProtocolHasThePapersBox) {
+  const ModelFile& model = test::model("experiments/surface_published.toml");
+  const Prior prior = make_prior(model, {Prior::Mean::zero, std::nullopt, true});
+  const std::vector<Observations> observations = observe(model, 60, false);
+  const auto all = default_hyperparameters(prior, observations, {"p1", "p4", "p7"}, {Protocol::Name::paper, true});
+  ASSERT_EQ(all.size(), 9u + 1u + 3u);
+  const MatrixXd features = evaluate_features(prior.latents[0], observations[0].states);
+  for (int d = 0; d < 9; ++d) {
+    const Hyperparameter& h = all[static_cast<std::size_t>(d)];
+    SCOPED_TRACE(h.name);
+    EXPECT_EQ(h.name, "lengthscale(" + prior.latents[0].feature_names[static_cast<std::size_t>(d)] + ")");
+    EXPECT_EQ(h.kind, Kind::kernel);
+    EXPECT_EQ(h.index, d);
+    const double spread = stddev(features.col(d));
+    expect_same(h.lower, 0.5 * spread);
+    expect_same(h.upper, 20 * spread);
+    expect_same(h.value, spread);
+    EXPECT_EQ(h.log_stddev, 0) << "no hyper-prior";
+  }
+  const Hyperparameter& signal = find(all, "signal_stddev");
+  EXPECT_EQ(signal.kind, Kind::shared_signal_stddev);
+  EXPECT_EQ(signal.lower, 0.5);
+  EXPECT_EQ(signal.upper, 10);
+  ASSERT_EQ(signal.scale.size(), 3);
+  for (int j = 0; j < 3; ++j) expect_same(signal.scale[j], stddev(observations[0].values.row(j)));
+  EXPECT_EQ(find(all, "p1").lower, 0.08 - 0.02);
+  EXPECT_EQ(find(all, "p1").upper, 0.08 + 0.02);
+  EXPECT_EQ(find(all, "p4").lower, -0.02) << "a value of zero, too";
+  EXPECT_EQ(find(all, "p4").upper, 0.02);
+  EXPECT_EQ(find(all, "p7").upper, 3.0 + 0.02);
+  EXPECT_EQ(find(all, "p1").log_stddev, 0);
+}
+
+TEST(HyperparametersTest, ThePaperProtocolKeepsToTheFilesBounds) {
+  const ModelFile& model = test::model("models/unicycle.toml");
+  const Prior prior = make_prior(model);
+  const auto all = default_hyperparameters(prior, observe(model, 30, false), {"R", "Ic"}, {Protocol::Name::paper, true});
+  EXPECT_EQ(find(all, "R").lower, 0.05 - 0.02);
+  EXPECT_EQ(find(all, "R").upper, 0.05 + 0.02);
+  EXPECT_EQ(find(all, "Ic").lower, 0.005145) << "where M stays positive definite";
+  EXPECT_EQ(find(all, "Ic").upper, 0.02 + 0.02);
+}
+
+TEST(HyperparametersTest, TheStandardProtocolHasItsOwnBoxAndHyperPriors) {
+  const ModelFile& model = test::model("models/unicycle.toml");
+  const Prior prior = make_prior(model);
+  const std::vector<Observations> observations = observe(model, 40, true);
+  const auto all = default_hyperparameters(prior, observations, {"R"}, {});
+  using Standard = Protocol::Standard;
+  ASSERT_EQ(all.size(), 7u + 3u + 3u + 1u);
+  const double spread = stddev(evaluate_features(prior.latents[0], observations[0].states).col(2));
+  const Hyperparameter& lengthscale = find(all, "lengthscale(sin(q3))");
+  expect_same(lengthscale.value, Standard::lengthscale_initial * spread);
+  expect_same(lengthscale.lower, Standard::lengthscale_lower * spread);
+  expect_same(lengthscale.upper, Standard::lengthscale_upper * spread);
+  expect_same(lengthscale.median, Standard::lengthscale_median * spread);
+  EXPECT_EQ(lengthscale.log_stddev, Standard::lengthscale_log_stddev);
+  const double output = stddev(observations[0].values.row(2));
+  const Hyperparameter& signal = find(all, "signal_stddev(ddq3)");
+  EXPECT_EQ(signal.kind, Kind::signal_stddev);
+  expect_same(signal.value, output);
+  expect_same(signal.lower, 1e-3 * output);
+  const Hyperparameter& noise = find(all, "noise_stddev(ddq3)");
+  EXPECT_EQ(noise.kind, Kind::noise_stddev);
+  expect_same(noise.value, 0.1 * output);
+  expect_same(noise.lower, 1e-6 * output);
+  expect_same(noise.upper, 2 * output);
+  expect_same(noise.median, 0.1 * output);
+  EXPECT_EQ(find(all, "R").lower, 0.01);
+  EXPECT_EQ(find(all, "R").upper, 0.07);
+  for (const Hyperparameter& h : default_hyperparameters(prior, observations, {}, {Protocol::Name::standard, false})) {
+    EXPECT_EQ(h.log_stddev, 0) << h.name;
+  }
+}
+
+TEST(HyperparametersTest, AFixedNoiseIsNoHyperparameter) {
+  const ModelFile& model = test::model("models/duffing.toml");
+  for (const Hyperparameter& h : default_hyperparameters(make_prior(model), observe(model, 20, false), {}, {})) {
+    EXPECT_NE(h.kind, Kind::noise_stddev);
+    EXPECT_NE(h.kind, Kind::parameter);
+  }
+}
+
+TEST(HyperparametersTest, NamesAreUnique) {
+  for (const std::string& file : test::every_model()) {
+    const ModelFile& model = test::model(file);
+    const Prior prior = make_prior(model);
+    std::set<int> in_features;
+    for (const Latent& latent : prior.latents)
+      in_features.insert(latent.feature_parameters.begin(), latent.feature_parameters.end());
+    std::vector<std::string> parameters;
+    for (const Parameter& parameter : model.system->parameters()) {
+      if (!in_features.contains(model.system->parameter_index(parameter.name))) parameters.push_back(parameter.name);
+    }
+    std::set<std::string> names;
+    for (const Hyperparameter& h : default_hyperparameters(prior, observe(model, 12, true), parameters, {})) {
+      EXPECT_TRUE(names.insert(h.name).second) << file << ": " << h.name;
+      EXPECT_TRUE(h.lower <= h.value && h.value <= h.upper) << file << ": " << h.name;
+      EXPECT_TRUE(std::isfinite(h.lower) && std::isfinite(h.upper) && h.lower < h.upper) << file << ": " << h.name;
+      EXPECT_FALSE(h.unit.empty()) << file << ": " << h.name;
+      EXPECT_TRUE(h.lower > 0 || !h.is_positive()) << file << ": " << h.name;
+    }
+  }
+}
+
+TEST(HyperparametersTest, AParameterThatIsNotThereOrHasNoRangeIsAnError) {
+  const ModelFile model = ModelFile::parse(R"toml(
+name        = "cart"
+coordinates = ["x", "y"]
+[parameters]
+m = 2.0
+tilt = 0.0
+[mechanics]
+mass  = [["m", "0"], ["0", "m"]]
+force = ["tilt", "0"]
+[constraints]
+position = ["y"]
+[[latent]]
+kernel     = "se"
+features   = ["x"]
+directions = "acceleration"
+)toml",
+                                           "cart");
+  RandomStream random(seed);
+  MatrixXd states(5, 10), values(2, 10);
+  for (double& entry : states.reshaped()) entry = random.normal();
+  for (double& entry : values.reshaped()) entry = random.normal();
+  const std::vector<Observations> observations{
+      {states, View::all(View::Quantity::constrained_acceleration, *model.system), values, VectorXd::Ones(2), false}};
+  const Prior prior = make_prior(model);
+  const auto message = [&](const std::string& name) -> std::string {
+    try {
+      default_hyperparameters(prior, observations, {name}, {});
+    } catch (const InputError& error) {
+      return error.what();
+    }
+    return "no error";
+  };
+  EXPECT_THAT(message("mass"), AllOf(HasSubstr("'mass'"), HasSubstr("m, tilt")));
+  EXPECT_THAT(message("tilt"), AllOf(HasSubstr("'tilt'"), HasSubstr("bounds")));
+  const auto all = default_hyperparameters(prior, observations, {"m"}, {});
+  EXPECT_EQ(find(all, "m").lower, 1.0) << "half";
+  EXPECT_EQ(find(all, "m").upper, 4.0) << "to twice the value";
+}
+
+TEST(HyperparametersTest, AParameterThatStandsInAFeatureCannotBeEstimated) {
+  const ModelFile& model = test::model("models/arm_on_moving_plane.toml");
+  const Prior prior = make_prior(model);
+  const std::vector<Observations> observations = observe(model, 10, false);
+  EXPECT_NO_THROW(default_hyperparameters(prior, observations, {"m2"}, {}));
+  try {
+    default_hyperparameters(prior, observations, {"l1"}, {});
+    ADD_FAILURE() << "no error";
+  } catch (const InputError& error) {
+    EXPECT_THAT(error.what(), AllOf(HasSubstr("'l1'"), HasSubstr("feature"), HasSubstr("friction of the tip")));
+  }
+}
+
+TEST(HyperparametersTest, TheScaleOfAnUnobservedAccelerationComesFromEqualKineticScale) {
+  const ModelFile& model = test::model("models/double_pendulum.toml");
+  const std::vector<Observations> observations = observe(model, 50, false, {2, 5});
+  const Scales scales = default_scales(make_prior(model), observations);
+  const VectorXd p = model.system->parameter_values();
+  const auto parameter = [&](const char* name) { return p[model.system->parameter_index(name)]; };
+  const double s3 = stddev(observations[0].values.row(0)), s6 = stddev(observations[0].values.row(1));
+  const double kinetic = (parameter("I1") * s3 * s3 + parameter("I2") * s6 * s6) / 2;
+  // force scale of coordinate j: M_jj σ_j
+  const VectorXd& force = scales.signal_stddev[0];
+  expect_same(force[2], parameter("I1") * s3);
+  expect_same(force[5], parameter("I2") * s6);
+  expect_same(force[0], parameter("m1") * std::sqrt(kinetic / parameter("m1")));
+  expect_same(force[4], parameter("m2") * std::sqrt(kinetic / parameter("m2")));
+}
+
+TEST(HyperparametersTest, AFeatureThatDoesNotVaryStillHasAScale) {
+  const ModelFile& model = test::model("models/surface.toml");
+  std::vector<Observations> observations = observe(model, 20, false);
+  const StateLayout layout = model.system->layout();
+  observations[0].states.row(layout.u(0)).setZero();
+  observations[0].states.row(layout.u(1)).setConstant(3);
+  const Scales scales = default_scales(make_prior(model), observations);
+  EXPECT_EQ(scales.feature_stddev[0][6], 1);
+  EXPECT_EQ(scales.feature_stddev[0][7], 3);
+}
+
+TEST(HyperparametersTest, ModelValuesPutEachNumberInItsPlace) {
+  const ModelFile& model = test::model("models/arm_on_moving_plane.toml");
+  const Prior prior = make_prior(model);
+  const std::vector<Observations> observations = observe(model, 20, true);
+  auto all = default_hyperparameters(prior, observations, {"m2"}, {});
+  for (std::size_t k = 0; k < all.size(); ++k) all[k].value = 1 + static_cast<double>(k);
+  const ModelValues values = model_values(prior, observations, all);
+  for (const Hyperparameter& h : all) {
+    const auto owner = static_cast<std::size_t>(h.owner);
+    const double stored = h.kind == Kind::kernel          ? values.kernel[owner][h.index]
+                          : h.kind == Kind::signal_stddev ? values.signal_stddev[owner][h.index]
+                          : h.kind == Kind::noise_stddev  ? values.noise_stddev[owner][h.index]
+                                                          : values.parameters[h.index];
+    EXPECT_EQ(stored, h.value) << h.name;
+  }
+  EXPECT_EQ(values.parameters[model.system->parameter_index("m1")], 2.0) << "what is not estimated keeps its value";
+
+  Hyperparameter shared;
+  shared.kind = Kind::shared_signal_stddev;
+  shared.owner = 1;
+  shared.value = 3;
+  shared.scale = Eigen::Vector2d(1, 0.5);
+  EXPECT_EQ(model_values(prior, observations, {shared}).signal_stddev[1], Eigen::Vector2d(3, 1.5));
+  EXPECT_EQ(model_values(prior, observations, {shared}).noise_stddev[0], observations[0].noise_stddev);
+}
+
+TEST(HyperparametersTest, ABoundIsReportedWhenItIsHit) {
+  Hyperparameter positive;
+  positive.lower = 1e-3;
+  positive.upper = 1e3;
+  for (double value : {1e-3, 1e-3 * (1 + 1e-7), 1e3, 1e3 * (1 - 1e-7)}) {
+    positive.value = value;
+    EXPECT_TRUE(positive.at_bound()) << value;
+  }
+  for (double value : {1e-3 * (1 + 1e-5), 1.0, 1e3 * (1 - 1e-5)}) {
+    positive.value = value;
+    EXPECT_FALSE(positive.at_bound()) << value;
+  }
+  Hyperparameter parameter;
+  parameter.kind = Kind::parameter;
+  parameter.lower = -1;
+  parameter.upper = 1;
+  for (double value : {-1.0, -1 + 1e-6, 1.0}) {
+    parameter.value = value;
+    EXPECT_TRUE(parameter.at_bound()) << value;
+  }
+  for (double value : {-1 + 1e-5, 0.0, 1 - 1e-5}) {
+    parameter.value = value;
+    EXPECT_FALSE(parameter.at_bound()) << value;
+  }
+}
+
+}  // namespace
+}  // namespace gp2
