@@ -90,9 +90,13 @@ TEST(FitTest, AnotherSeedDrawsOtherStarts) {
   const FitReport one = fit(p.prior, p.observations, p.hyperparameters, options).report;
   options.seed = 6;
   const FitReport other = fit(p.prior, p.observations, p.hyperparameters, options).report;
-  EXPECT_EQ(one.restarts[0].objective, other.restarts[0].objective) << "the first starts where it is told to";
   EXPECT_NE(one.restarts[1].objective, other.restarts[1].objective);
   EXPECT_NE(one.restarts[1].objective, one.restarts[2].objective);
+  // the first restart starts where it is told to, whatever the seed
+  options.n_restarts = 1;
+  const double alone = fit(p.prior, p.observations, p.hyperparameters, options).report.objective;
+  options.seed = 5;
+  EXPECT_EQ(fit(p.prior, p.observations, p.hyperparameters, options).report.objective, alone);
 }
 
 TEST(FitTest, NoIterationsConditionsAtTheStart) {
@@ -143,6 +147,8 @@ TEST(FitTest, ConvergesToAPointWhoseProjectedGradientIsBelowTheTolerance) {
     for (Hyperparameter& h : p.hyperparameters) {
       // a box far from width one
       if (h.kind == Kind::parameter) std::tie(h.lower, h.upper) = std::pair(-20.0, 30.0);
+      // room for the shared factor, which would otherwise end at its bound
+      if (h.kind == Kind::shared_signal_stddev) std::tie(h.lower, h.upper) = std::pair(1e-3, 1e3);
     }
     FitOptions options = quick();
     options.n_restarts = 1;
