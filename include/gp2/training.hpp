@@ -54,9 +54,9 @@ struct Protocol {
   /// The standard protocol's ranges, relative to the default scales, and hyper-priors; docs/priors.md says how they were chosen.
   struct Standard {
     static constexpr double lengthscale_initial = 3, lengthscale_lower = 0.05, lengthscale_upper = 1e6;
-    static constexpr double lengthscale_median = 100, lengthscale_log_stddev = 4;
+    static constexpr double lengthscale_median = 300, lengthscale_log_stddev = 4;
     static constexpr double signal_initial = 1, signal_lower = 1e-3, signal_upper = 1e5;
-    static constexpr double signal_median = 1, signal_log_stddev = 4;
+    static constexpr double signal_median = 1, signal_log_stddev = 3;
     static constexpr double shape_log_stddev = 1.5;  // of α, periods and relative amplitudes
     static constexpr double noise_lower = 1e-6, noise_upper = 2;
     static constexpr double noise_log_stddev = 2;

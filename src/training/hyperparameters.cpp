@@ -171,7 +171,7 @@ void add_kernel_parameters(const Latent& latent, int owner, const std::string& p
       h.median = median * scale;
       h.log_stddev = log_stddev;
     }
-    if (h.unit.empty()) h.unit = "1";
+    if (h.unit.empty()) h.unit = std::string("1");
     out.push_back(std::move(h));
   }
 }
