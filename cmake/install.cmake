@@ -11,7 +11,7 @@ set(gp2_cmake_dir ${CMAKE_INSTALL_LIBDIR}/cmake/gp2)
 install(TARGETS gp2 EXPORT gp2Targets)
 install(DIRECTORY ${PROJECT_SOURCE_DIR}/include/gp2 DESTINATION ${CMAKE_INSTALL_INCLUDEDIR} FILES_MATCHING PATTERN "*.hpp")
 install(DIRECTORY ${PROJECT_SOURCE_DIR}/models/ DESTINATION ${CMAKE_INSTALL_DATADIR}/gp2/models FILES_MATCHING PATTERN "*.toml")
-install(FILES ${PROJECT_SOURCE_DIR}/LICENSE DESTINATION ${CMAKE_INSTALL_DOCDIR})
+install(FILES ${PROJECT_SOURCE_DIR}/LICENSE ${PROJECT_SOURCE_DIR}/THIRD_PARTY.md DESTINATION ${CMAKE_INSTALL_DOCDIR})
 if(TARGET gp2_command)
   set_target_properties(gp2_command PROPERTIES INSTALL_RPATH "$ORIGIN/../${CMAKE_INSTALL_LIBDIR}")
   install(TARGETS gp2_command)
@@ -22,5 +22,5 @@ configure_package_config_file(${CMAKE_CURRENT_LIST_DIR}/gp2Config.cmake.in ${PRO
                               INSTALL_DESTINATION ${gp2_cmake_dir})
 write_basic_package_version_file(${PROJECT_BINARY_DIR}/gp2ConfigVersion.cmake COMPATIBILITY SameMinorVersion)
 install(FILES ${PROJECT_BINARY_DIR}/gp2Config.cmake ${PROJECT_BINARY_DIR}/gp2ConfigVersion.cmake
-              ${CMAKE_CURRENT_LIST_DIR}/FindOpenBLAS.cmake ${CMAKE_CURRENT_LIST_DIR}/FindLBFGSB.cmake
+              ${CMAKE_CURRENT_LIST_DIR}/FindOpenBLAS.cmake
         DESTINATION ${gp2_cmake_dir})

@@ -1,4 +1,5 @@
 #include <cstdio>
+#include <filesystem>
 
 #include <fmt/format.h>
 
@@ -25,9 +26,23 @@ std::map<std::string, std::string> parse_map(const std::string& text) {
     if (equals == std::string::npos || equals == 0 || equals + 1 == item.size()) {
       throw InputError(fmt::format("--map: '{}' is not LOGNAME=MODELNAME, say theta1=q3", item));
     }
-    columns[item.substr(equals + 1)] = item.substr(0, equals);
+    const std::string name = item.substr(equals + 1);
+    const auto [twice, is_new] = columns.emplace(name, item.substr(0, equals));
+    if (!is_new) throw InputError(fmt::format("--map: '{}' is given two columns, '{}' and '{}'", name, twice->second, item.substr(0, equals)));
   }
   return columns;
+}
+
+CLI::Validator not_negative() {
+  const auto check = [](const std::string& text) { return text.starts_with('-') ? "must not be negative, got " + text : std::string(); };
+  return {check, ""};
+}
+
+void require_folder(const std::string& output) {
+  const std::filesystem::path folder = std::filesystem::path(output).parent_path();
+  if (!folder.empty() && !std::filesystem::is_directory(folder)) {
+    throw InputError(fmt::format("-o {}: there is no folder '{}'; make it first", output, folder.string()));
+  }
 }
 
 void talk(const std::vector<std::string>& notes) {

@@ -9,8 +9,8 @@
 #include "command.hpp"
 #include "gp2/csv.hpp"
 #include "gp2/error.hpp"
+#include "gp2/fit_problem.hpp"
 #include "gp2/generate.hpp"
-#include "gp2/log_reader.hpp"
 
 namespace gp2::command {
 
@@ -37,9 +37,7 @@ struct Log {
 
 Log read_log(const ModelFile& model, const Arguments& arguments) {
   const CsvTable table = CsvTable::read(arguments.data);
-  std::map<std::string, std::string> columns = parse_map(arguments.map);
-  columns.insert(model.columns.begin(), model.columns.end());
-  LogReader reader(table, *model.system, columns);
+  LogReader reader = open_log(model, table, parse_map(arguments.map));
   std::vector<bool> reads = make_prior(model).reads();
   const std::vector<std::string> names = model.system->state_names();
   for (std::size_t k = 0; k < reads.size(); ++k) reads[k] = reads[k] || reader.has(names[k]);

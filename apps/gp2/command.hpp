@@ -23,6 +23,12 @@ std::map<std::string, std::string> parse_map(const std::string& text);
 /// "a,b" -> {"a", "b"}; empty for "" .
 std::vector<std::string> parse_list(const std::string& text);
 
+/// For unsigned options: CLI11 would take -1 for the largest number there is.
+CLI::Validator not_negative();
+
+/// @throws InputError when the folder of a file to be written does not exist: better said before an hour of work than after.
+void require_folder(const std::string& output);
+
 /// Prints talk to stderr, a line each.
 void talk(const std::vector<std::string>& notes);
 

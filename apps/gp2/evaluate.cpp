@@ -9,7 +9,6 @@
 #include "command.hpp"
 #include "gp2/csv.hpp"
 #include "gp2/fit_problem.hpp"
-#include "gp2/log_reader.hpp"
 
 namespace gp2::command {
 
@@ -62,17 +61,13 @@ std::vector<std::string> observed_outputs(const FitFile& fit) {
 
 void run(const Arguments& arguments) {
   const FitFile fit = FitFile::read(arguments.fit);
-  const System& system = *fit.model.system;
   const CsvTable table = CsvTable::read(arguments.data);
   std::vector<std::string> outputs = parse_list(arguments.outputs);
   if (outputs.empty()) outputs = observed_outputs(fit);
-  const std::vector<int> rows = acceleration_rows(system, outputs, "--outputs");
-  std::map<std::string, std::string> columns = parse_map(arguments.map);
-  const LogStates log = read_log_states(fit.prior(), fit.model, table, columns, outputs);
+  const std::vector<int> rows = acceleration_rows(*fit.model.system, outputs, "--outputs");
+  const LogStates log = read_log_states(fit.prior(), fit.model, table, parse_map(arguments.map), outputs);
   talk(log.notes);
-  columns.insert(fit.model.columns.begin(), fit.model.columns.end());
-  const Eigen::MatrixXd targets = LogReader(table, system, columns).values(outputs);
-  const Evaluation evaluation = evaluate_predictions(fit.posterior(), log.states, rows, targets);
+  const Evaluation evaluation = evaluate_predictions(fit.posterior(), log.states, rows, log.accelerations);
   if (arguments.json) {
     fmt::print("{}\n", to_json(evaluation).dump(2));
   } else {

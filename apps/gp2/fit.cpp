@@ -53,8 +53,11 @@ FitProblemOptions problem_options(const Arguments& arguments) {
   return options;
 }
 
-// one line that rewrites itself, on a terminal only
+// one line that rewrites itself, on a terminal only, ten times a second
 void print_progress(const Progress& p) {
+  static double last = -1;
+  if (last >= 0 && p.seconds - last < 0.1) return;
+  last = p.seconds;
   const double left = p.fraction > 0 ? p.seconds * (1 - p.fraction) / p.fraction : 0;
   fmt::print(stderr, "\rgp2: restart {}/{}  iteration {}  best {:.4f}  about {:.0f} s left   ", p.restart + 1, p.n_restarts, p.iteration,
              p.best, left);
@@ -73,7 +76,6 @@ Json to_json(const FitReport& report) {
   }
   return {{"nll", report.negative_log_likelihood},
           {"termination", report.termination},
-          {"converged", report.converged},
           {"iterations", report.iterations},
           {"seconds", report.seconds},
           {"hyperparameters", hyperparameters}};
@@ -90,9 +92,16 @@ void print_text(const FitReport& report) {
 
 void run(const Arguments& arguments) {
   if (arguments.restarts < 1) throw InputError(fmt::format("--restarts: must be positive, got {}", arguments.restarts));
-  if (arguments.max_iterations < 0) throw InputError("--max-iterations: must not be negative");
-  if (arguments.max_points && *arguments.max_points < 1) throw InputError("--max-points: must be positive");
-  if (arguments.threads < 0) throw InputError("--threads: must not be negative");
+  if (arguments.max_iterations < 0) {
+    throw InputError(fmt::format("--max-iterations: must not be negative, got {}", arguments.max_iterations));
+  }
+  if (arguments.max_points && *arguments.max_points < 1) {
+    throw InputError(fmt::format("--max-points: must be positive, got {}", *arguments.max_points));
+  }
+  if (arguments.threads < 0) {
+    throw InputError(fmt::format("--threads: must be positive, or 0 for as many as the machine has; got {}", arguments.threads));
+  }
+  require_folder(arguments.output);
   FitFile file;
   file.model = ModelFile::read(arguments.model);
   const CsvTable log = CsvTable::read(arguments.data);
@@ -123,6 +132,7 @@ void run(const Arguments& arguments) {
   file.observations = std::move(problem.observations);
   file.report = result.report;
   file.write(arguments.output);
+  talk({fmt::format("{}: fit of '{}' to {} rows", arguments.output, file.model.system->name(), file.observations.front().n_data())});
   if (arguments.json) {
     fmt::print("{}\n", to_json(result.report).dump(2));
   } else {
@@ -156,7 +166,7 @@ void add_fit(CLI::App& app) {
   command->add_option("--max-iterations", a->max_iterations, "per run; 0 conditions at the starting values")->capture_default_str();
   command->add_option("--start", a->start, "starting values: {\"name\": value, …} as JSON, or a FIT.json");
   command->add_option("--max-points", a->max_points, "take this many rows, the first of a shuffle by --seed");
-  command->add_option("--seed", a->seed, "of restarts and --max-points")->capture_default_str();
+  command->add_option("--seed", a->seed, "of restarts and --max-points")->check(not_negative())->capture_default_str();
   command->add_option("--threads", a->threads, "0: as many as the machine has; results do not depend on it")->capture_default_str();
   command->add_flag("--json", a->json, "report as JSON on stdout");
   command->add_option("-o,--output", a->output, "fitted model to write (JSON)")->required();

@@ -3,6 +3,7 @@
 #include <memory>
 
 #include <fmt/format.h>
+#include <fmt/ranges.h>
 
 #include "command.hpp"
 #include "gp2/csv.hpp"
@@ -31,28 +32,36 @@ Eigen::VectorXd noise_of(const ModelFile& model, const std::optional<double>& gi
   return Eigen::Map<const Eigen::VectorXd>(model.noise.stddev.data(), nq);
 }
 
+// the columns that the model reads, then the accelerations
+std::string csv_of(const GeneratedData& data, const System& system) {
+  const std::vector<std::string> names = system.state_names();
+  std::string csv;
+  std::vector<std::string> line;
+  const auto end_line = [&] {
+    csv += fmt::format("{}\n", fmt::join(line, ","));
+    line.clear();
+  };
+  for (std::size_t k = 0; k < names.size(); ++k) {
+    if (data.known[k]) line.push_back(names[k]);
+  }
+  for (const Coordinate& coordinate : system.coordinates()) line.push_back(coordinate.acceleration());
+  end_line();
+  for (Eigen::Index i = 0; i < data.states.cols(); ++i) {
+    for (std::size_t k = 0; k < names.size(); ++k) {
+      if (data.known[k]) line.push_back(shortest(data.states(static_cast<Eigen::Index>(k), i)));
+    }
+    for (const double value : data.accelerations.col(i)) line.push_back(shortest(value));
+    end_line();
+  }
+  return csv;
+}
+
 void run(const Arguments& arguments) {
   if (arguments.n < 1) throw InputError(fmt::format("--n: must be positive, got {}", arguments.n));
   const ModelFile model = ModelFile::read(arguments.model);
   const GeneratedData data = generate(model, {arguments.n, arguments.seed, noise_of(model, arguments.noise_stddev)});
 
-  const std::vector<std::string> names = model.system->state_names();
-  std::string csv;
-  for (std::size_t k = 0; k < names.size(); ++k) {
-    if (data.known[k]) csv += names[k] + ",";
-  }
-  for (int j = 0; j < model.system->nq(); ++j) {
-    csv += (j == 0 ? "" : ",") + model.system->coordinates()[static_cast<std::size_t>(j)].acceleration();
-  }
-  csv += "\n";
-  for (Eigen::Index i = 0; i < data.states.cols(); ++i) {
-    for (std::size_t k = 0; k < names.size(); ++k) {
-      if (data.known[k]) csv += shortest(data.states(static_cast<Eigen::Index>(k), i)) + ",";
-    }
-    for (Eigen::Index j = 0; j < data.accelerations.rows(); ++j) csv += (j == 0 ? "" : ",") + shortest(data.accelerations(j, i));
-    csv += "\n";
-  }
-  write_file(arguments.output, csv);
+  write_file(arguments.output, csv_of(data, *model.system));
   talk({fmt::format("{}: {} rows of '{}'", arguments.output, arguments.n, model.system->name())});
 }
 
@@ -63,7 +72,7 @@ void add_generate(CLI::App& app) {
   auto arguments = std::make_shared<Arguments>();
   command->add_option("MODEL", arguments->model, "model file")->required();
   command->add_option("--n", arguments->n, "number of rows")->required();
-  command->add_option("--seed", arguments->seed, "of the random numbers")->capture_default_str();
+  command->add_option("--seed", arguments->seed, "of the random numbers")->check(not_negative())->capture_default_str();
   command->add_option("--noise-std", arguments->noise_stddev,
                       "standard deviation of the noise on every ddq; 0 gives the truth (default: the model's [noise])");
   command->add_option("-o,--output", arguments->output, "CSV file to write")->required();

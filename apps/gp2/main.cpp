@@ -1,7 +1,9 @@
+#include <algorithm>
 #include <cstdio>
 #include <exception>
 
 #include <fmt/format.h>
+#include <fmt/ranges.h>
 
 #include "command.hpp"
 #include "gp2/error.hpp"
@@ -11,6 +13,21 @@ namespace {
 
 constexpr int exit_numerical = 1;
 constexpr int exit_bad_input = 2;
+
+int failed(int exit_code, const std::string& text) {
+  std::fflush(stdout);  // where both go to one terminal or file, the results came first
+  fmt::print(stderr, "gp2: {}\n", text);
+  return exit_code;
+}
+
+// CLI11 would only say that a command is missing
+void require_known_command(const CLI::App& app, int argc, char** argv) {
+  if (argc < 2 || argv[1][0] == '-') return;
+  std::vector<std::string> names;
+  for (const CLI::App* command : app.get_subcommands(nullptr)) names.push_back(command->get_name());
+  if (std::find(names.begin(), names.end(), argv[1]) != names.end()) return;
+  throw CLI::ParseError(fmt::format("there is no command '{}'; there are: {}", argv[1], fmt::join(names, ", ")), exit_bad_input);
+}
 
 }  // namespace
 
@@ -34,26 +51,22 @@ int main(int argc, char** argv) {
   gp2::command::add_evaluate(app);
 
   try {
+    require_known_command(app, argc, argv);
     app.parse(argc, argv);
   } catch (const CLI::CallForHelp& help) {
     return app.exit(help);
   } catch (const CLI::CallForVersion& version) {
     return app.exit(version);
   } catch (const CLI::ParseError& error) {
-    fmt::print(stderr, "gp2: error: {}\nRun gp2 --help, or gp2 COMMAND --help.\n", error.what());
-    return exit_bad_input;
+    return failed(exit_bad_input, fmt::format("error: {}\nRun gp2 --help, or gp2 COMMAND --help.", error.what()));
   } catch (const gp2::InputError& error) {
-    fmt::print(stderr, "gp2: error: {}\n", error.what());
-    return exit_bad_input;
+    return failed(exit_bad_input, fmt::format("error: {}", error.what()));
   } catch (const gp2::NumericalError& error) {
-    fmt::print(stderr, "gp2: numerical failure: {}\n", error.what());
-    return exit_numerical;
+    return failed(exit_numerical, fmt::format("numerical failure: {}", error.what()));
   } catch (const std::bad_alloc&) {
-    fmt::print(stderr, "gp2: numerical failure: not enough memory; take fewer points (--max-points)\n");
-    return exit_numerical;
+    return failed(exit_numerical, "numerical failure: not enough memory; take fewer points (--max-points)");
   } catch (const std::exception& error) {
-    fmt::print(stderr, "gp2: internal error: {}\n", error.what());
-    return exit_numerical;
+    return failed(exit_numerical, fmt::format("internal error: {}", error.what()));
   }
   return 0;
 }

@@ -1,6 +1,8 @@
+#include <algorithm>
 #include <memory>
 
 #include <fmt/format.h>
+#include <fmt/ranges.h>
 
 #include "command.hpp"
 #include "gp2/csv.hpp"
@@ -48,19 +50,45 @@ NewColumns predict(const Posterior& posterior, const View& view, const Eigen::Ma
   return out;
 }
 
-// the input as it was, then the new columns; an input column of a new name is kept as NAME_input
+// a cell that reads back as `text`
+std::string quoted(const std::string& text) {
+  const bool plain = text.find_first_of(",\"") == std::string::npos && !text.starts_with(' ') && !text.ends_with(' ');
+  if (plain) return text;
+  std::string cell = "\"";
+  for (char c : text) cell.append(c == '"' ? 2 : 1, c);  // a quote is written twice
+  return cell += '"';
+}
+
+// Input columns of the names of new ones become NAME_input; NAME_input_input where the input is itself such an output.
+std::vector<std::string> kept_names(const std::vector<std::string>& input, const std::vector<std::string>& added) {
+  const auto holds = [](const std::vector<std::string>& names, const std::string& name) {
+    return std::find(names.begin(), names.end(), name) != names.end();
+  };
+  std::vector<std::string> kept = input;
+  for (std::string& name : kept) {
+    if (!holds(added, name)) continue;
+    std::string other = name + "_input";
+    while (holds(kept, other) || holds(added, other)) other += "_input";
+    name = other;
+  }
+  return kept;
+}
+
+// the input as it was, then the new columns
 std::string joined(const CsvTable& input, const NewColumns& added) {
   std::string csv;
-  for (const std::string& name : input.header()) {
-    const bool taken = std::find(added.names.begin(), added.names.end(), name) != added.names.end();
-    csv += name + (taken ? "_input," : ",");
-  }
-  for (std::size_t k = 0; k < added.names.size(); ++k) csv += (k == 0 ? "" : ",") + added.names[k];
-  csv += "\n";
+  std::vector<std::string> line;
+  const auto end_line = [&] {
+    csv += fmt::format("{}\n", fmt::join(line, ","));
+    line.clear();
+  };
+  for (const std::string& name : kept_names(input.header(), added.names)) line.push_back(quoted(name));
+  line.insert(line.end(), added.names.begin(), added.names.end());
+  end_line();
   for (int i = 0; i < input.n_rows(); ++i) {
-    for (int column = 0; column < input.n_columns(); ++column) csv += input.cell(i, column) + ",";
-    for (Eigen::Index k = 0; k < added.values.rows(); ++k) csv += (k == 0 ? "" : ",") + shortest(added.values(k, i));
-    csv += "\n";
+    for (int column = 0; column < input.n_columns(); ++column) line.push_back(quoted(input.cell(i, column)));
+    for (const double value : added.values.col(i)) line.push_back(shortest(value));
+    end_line();
   }
   return csv;
 }

@@ -60,8 +60,9 @@ class Expression {
 };
 
 /// Hash-consed expressions in deterministic order: the same calls build the same nodes, so the same text gives the same bits on every
-/// run. Local simplification only (0·x, 1·x, x + 0, x − x, 0/x, constants, −(−x), x^0, x^1, √ for x^0.5, c₁·(c₂·x)); signs rise out of
-/// sums and products (a + (−b) = a − b, (−a)·b = −(a·b)), which is exact in floating point; nothing is expanded or reordered.
+/// run. Local simplification only (0·x, 1·x, x + 0, x − x, 0/x, constants, −(−x), x^0, x^1, √ for x^0.5); signs rise out of sums and
+/// products (a + (−b) = a − b, (−a)·b = −(a·b)), which is exact in floating point, and constant factors to the front of products,
+/// where they become one (u·(c·v) = c·(u·v)); nothing else is expanded or reordered.
 /// What would fold to ∞ or NaN stays, so that evaluation shows it.
 ///
 /// @throws InputError from any operation that would grow the graph past `max_nodes`, from a constant that is not finite, and from

@@ -7,6 +7,7 @@
 
 #include "gp2/csv.hpp"
 #include "gp2/fit_file.hpp"
+#include "gp2/log_reader.hpp"
 #include "gp2/model_file.hpp"
 #include "gp2/training.hpp"
 
@@ -40,13 +41,18 @@ struct FitProblem {
 ///   precision.
 FitProblem make_fit_problem(const ModelFile& model, const CsvTable& log, const FitProblemOptions& options);
 
+/// A reader of a log that knows the columns by `columns` (model's name -> log's name), then by the model's own [columns].
+/// @throws InputError when `columns` names what the model or the log does not have.
+LogReader open_log(const ModelFile& model, const CsvTable& log, const std::map<std::string, std::string>& columns);
+
 /// States of a log for a prior, with the columns that only the constraint residuals read where the log has them.
 struct LogStates {
   Eigen::MatrixXd states;
+  Eigen::MatrixXd accelerations;  // those asked for (accelerations × N)
   std::vector<std::string> notes;
 };
 LogStates read_log_states(const Prior& prior, const ModelFile& model, const CsvTable& log,
-                          const std::map<std::string, std::string>& columns, const std::vector<std::string>& also = {});
+                          const std::map<std::string, std::string>& columns, const std::vector<std::string>& accelerations = {});
 
 /// Indices of named accelerations; all of them when `names` is empty.
 /// @throws InputError listing the accelerations there are.

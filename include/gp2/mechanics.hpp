@@ -68,6 +68,7 @@ class UdwadiaKalaba {
   Eigen::MatrixXd A_unit_;          // rows of A so scaled      (nc × nq)
   Eigen::VectorXd b_unit_;          // b so scaled              (nc)
   Eigen::MatrixXd L_unit_;          // L of the scaled rows     (nq × nc)
+  Eigen::MatrixXd ML_unit_;         // M L of the scaled rows   (nq × nc)
   Eigen::MatrixXd T_;
   Eigen::VectorXd Lb_;
 };

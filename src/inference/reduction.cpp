@@ -27,11 +27,6 @@ std::optional<std::vector<ObservationModel>> model_observations(const Prior& pri
           {differentiate_view(group.view, mechanics, d),
            differentiate_prior(prior, group.states, parameters, mechanics, model.values.prior, d, parameter)});
     }
-    // rounding must not invent directions that the constraint has taken away
-    for (const UdwadiaKalaba& projection : mechanics.projections) {
-      const bool constrained = group.view.quantity == View::Quantity::constrained_acceleration;
-      model.max_rank.push_back(std::min(group.view.size(), prior.system->nq() - (constrained ? projection.rank() : 0)));
-    }
   }
   return models;
 }
@@ -50,7 +45,7 @@ Reduction reduce(const Prior& prior, const std::vector<Observations>& observatio
       Eigen::ColPivHouseholderQR<MatrixXd> qr;
       qr.setThreshold(UdwadiaKalaba::rank_tolerance);
       qr.compute(W);
-      const Index rank = std::min<Index>(qr.rank(), models[g].max_rank[static_cast<std::size_t>(i)]);
+      const Index rank = qr.rank();
       Reduction::Sample sample{static_cast<int>(g), i, {}, {}, {}, {}};
       sample.Q = qr.householderQ() * MatrixXd::Identity(group.view.size(), rank);
       sample.R = sample.Q.transpose() * W;

@@ -16,7 +16,6 @@ struct ObservationModel {
   };
   Values values;
   std::vector<Values> derivatives;  // one per gradient parameter
-  std::vector<int> max_rank;        // of G, per state
 };
 
 /// @returns nothing when the mechanics fail at a state (M not positive definite, contradicting constraints).

@@ -3,13 +3,14 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <numeric>
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
 #include "gp2/check.hpp"
 #include "gp2/error.hpp"
-#include "gp2/log_reader.hpp"
+#include "gp2/mechanics.hpp"
 #include "training/random.hpp"
 
 namespace gp2 {
@@ -26,10 +27,26 @@ std::vector<std::string> all_accelerations(const System& system) {
   return names;
 }
 
-// the command line's renaming wins over the model file's
-std::map<std::string, std::string> merged_columns(const ModelFile& model, std::map<std::string, std::string> columns) {
-  columns.insert(model.columns.begin(), model.columns.end());
-  return columns;
+// A renaming that finds nothing is a slip of the pen: the model's [columns] may name columns that this log lacks, --map may not.
+void check_columns(const System& system, const CsvTable& log, const std::map<std::string, std::string>& columns) {
+  std::vector<std::string> known = system.state_names();
+  for (const std::string& name : all_accelerations(system)) known.push_back(name);
+  for (const auto& [name, column] : columns) {
+    if (std::find(known.begin(), known.end(), name) == known.end()) {
+      throw InputError(fmt::format("--map {}={}: '{}' is neither a state nor an acceleration of '{}'; it has: {}", column, name, name,
+                                   system.name(), fmt::join(known, ", ")));
+    }
+    // a log may lack a coordinate that nothing reads, but then it has the coordinate's derivatives
+    std::vector<std::string> meant = {column};
+    const auto& coordinates = system.coordinates();
+    if (std::any_of(coordinates.begin(), coordinates.end(), [&name = name](const auto& one) { return one.name == name; })) {
+      meant = {column, "d" + column, "dd" + column, column + "_dot", column + "_ddot"};
+    }
+    if (std::none_of(meant.begin(), meant.end(), [&](const std::string& one) { return log.find(one) >= 0; })) {
+      throw InputError(fmt::format("--map {}={}: {} has no column '{}'; it has: {}", column, name, log.name(), column,
+                                   fmt::join(log.header(), ", ")));
+    }
+  }
 }
 
 void note_reading(const LogReader& reader, const CsvTable& log, std::vector<std::string>& notes) {
@@ -54,17 +71,29 @@ MatrixXd states_of(const Prior& prior, LogReader& reader) {
   return reader.states(reads);
 }
 
-void take_subset(int n, std::uint64_t seed, MatrixXd& states, MatrixXd& accelerations) {
-  std::vector<int> order = RandomStream(seed).permutation(static_cast<int>(states.cols()));
-  order.resize(static_cast<std::size_t>(n));
-  states = MatrixXd(states(Eigen::all, order));
-  accelerations = MatrixXd(accelerations(Eigen::all, order));
+// the first n of a shuffle of 0 … size − 1; all in order when n is no less
+std::vector<int> chosen_rows(int size, int n, std::uint64_t seed) {
+  std::vector<int> rows(static_cast<std::size_t>(size));
+  std::iota(rows.begin(), rows.end(), 0);
+  if (n >= size) return rows;
+  rows = RandomStream(seed).permutation(size);
+  rows.resize(static_cast<std::size_t>(n));
+  return rows;
+}
+
+// the likelihood would refuse these states too, but it does not know their rows in the log
+void require_mechanics_at(const System& system, const MatrixXd& states, const std::vector<int>& rows, const CsvTable& log) {
+  const MechanicsBatch mechanics = evaluate_mechanics(system, states, system.parameter_values());
+  if (!mechanics.fault) return;
+  throw InputError(fmt::format("{}: data row {}: {} ('{}' with the model's parameters; see gp2 check)", log.name(),
+                               rows[static_cast<std::size_t>(mechanics.fault->state)] + 1, mechanics.fault->text, system.name()));
 }
 
 // σ of each observed row; refused where ε‖K̃‖ ≪ 1 could not hold at signals of the data's size
 VectorXd noise_of(const ModelFile& model, const FitProblemOptions& options, const Observations& group, bool estimate) {
   const VectorXd spread = row_stddev(group.values);
   const std::vector<std::string> names = group.view.names(*model.system);
+  const std::string source = options.noise_stddev ? "--noise-std" : model.name + ": [noise] ddq";
   VectorXd stddev(group.view.size());
   for (Index k = 0; k < stddev.size(); ++k) {
     const auto row = static_cast<std::size_t>(group.view.rows[static_cast<std::size_t>(k)]);
@@ -81,15 +110,15 @@ VectorXd noise_of(const ModelFile& model, const FitProblemOptions& options, cons
                                    model.name, name));
     }
     if (!(stddev[k] > 0) || !std::isfinite(stddev[k])) {
-      throw InputError(fmt::format("--noise-std: the noise standard deviation of {} must be positive, got {}", name, stddev[k]));
+      throw InputError(fmt::format("{}: the noise standard deviation of {} must be positive, got {}", source, name, stddev[k]));
     }
     // ‖K̃‖ ≤ N (signal/noise)²; a hundredth of the digits must be left
     const double smallest =
         spread[k] * std::sqrt(static_cast<double>(group.n_data()) * std::numeric_limits<double>::epsilon() / 0.01);
     if (!estimate && stddev[k] < smallest) {
-      throw InputError(fmt::format("--noise-std: the noise standard deviation {} of {} is too small for double precision beside a spread "
+      throw InputError(fmt::format("{}: the noise standard deviation {} of {} is too small for double precision beside a spread "
                                    "of {:.3g}; the smallest usable value is {:.2g}",
-                                   stddev[k], name, spread[k], smallest));
+                                   source, stddev[k], name, spread[k], smallest));
     }
   }
   return stddev;
@@ -113,11 +142,17 @@ std::vector<int> acceleration_rows(const System& system, const std::vector<std::
   return rows;
 }
 
+LogReader open_log(const ModelFile& model, const CsvTable& log, const std::map<std::string, std::string>& columns) {
+  check_columns(*model.system, log, columns);
+  std::map<std::string, std::string> all = columns;
+  all.insert(model.columns.begin(), model.columns.end());
+  return {log, *model.system, all};
+}
+
 LogStates read_log_states(const Prior& prior, const ModelFile& model, const CsvTable& log,
-                          const std::map<std::string, std::string>& columns, const std::vector<std::string>& also) {
-  LogReader reader(log, *prior.system, merged_columns(model, columns));
-  LogStates out{states_of(prior, reader), {}};
-  for (const std::string& name : also) static_cast<void>(reader.values({name}));
+                          const std::map<std::string, std::string>& columns, const std::vector<std::string>& accelerations) {
+  LogReader reader = open_log(model, log, columns);
+  LogStates out{states_of(prior, reader), reader.values(accelerations), {}};
   note_reading(reader, log, out.notes);
   note_violation(*prior.system, out.states, log, out.notes);
   return out;
@@ -135,7 +170,7 @@ FitProblem make_fit_problem(const ModelFile& model, const CsvTable& log, const F
   const System& system = *model.system;
 
   // the log
-  LogReader reader(log, system, merged_columns(model, options.columns));
+  LogReader reader = open_log(model, log, options.columns);
   Observations group;
   group.states = states_of(problem.prior, reader);
   group.view = {View::Quantity::constrained_acceleration, acceleration_rows(system, options.observe, "--observe")};
@@ -147,19 +182,22 @@ FitProblem make_fit_problem(const ModelFile& model, const CsvTable& log, const F
   note_reading(reader, log, problem.notes);
   note_violation(system, group.states, log, problem.notes);
   if (all_values.size() > 0) {
-    const auto rows = dependent_columns(system, group.states, system.parameter_values(), all_values);
-    if (rows && observed.size() > rows->size()) {
+    const auto independent = dependent_columns(system, group.states, system.parameter_values(), all_values);
+    if (independent && observed.size() > independent->size()) {
       std::vector<std::string> names;
-      for (int row : *rows) names.push_back(every[static_cast<std::size_t>(row)]);
+      for (int row : *independent) names.push_back(every[static_cast<std::size_t>(row)]);
       problem.notes.push_back(fmt::format("warning: {}: the accelerations obey A ddq = b to rounding: they are not {} independent "
                                           "measurements but {}; observe independent rows only, say --observe {}",
-                                          log.name(), every.size(), rows->size(), fmt::join(names, ",")));
+                                          log.name(), every.size(), independent->size(), fmt::join(names, ",")));
     }
   }
-  if (options.max_points && *options.max_points < group.n_data()) {
-    take_subset(*options.max_points, options.seed, group.states, group.values);
-    problem.notes.push_back(fmt::format("{} of {} rows taken, by seed {}", *options.max_points, log.n_rows(), options.seed));
+  const std::vector<int> rows = chosen_rows(log.n_rows(), options.max_points.value_or(log.n_rows()), options.seed);
+  if (static_cast<int>(rows.size()) < log.n_rows()) {
+    group.states = MatrixXd(group.states(Eigen::all, rows));
+    group.values = MatrixXd(group.values(Eigen::all, rows));
+    problem.notes.push_back(fmt::format("{} of {} rows taken, by seed {}", rows.size(), log.n_rows(), options.seed));
   }
+  require_mechanics_at(system, group.states, rows, log);
 
   // noise, and what is tuned
   const bool model_estimates = model.noise.estimate && !options.noise_stddev;

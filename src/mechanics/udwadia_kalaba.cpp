@@ -75,6 +75,7 @@ UdwadiaKalaba::UdwadiaKalaba(const Ref<const MatrixXd>& M, const Ref<const Matri
                                          : MatrixXd(Rt.householderQr().solve(MatrixXd::Identity(nc, nc)));
     L_unit_ = mass_factor_.matrixU().solve(Y * Rt_pinv * qr.colsPermutation().transpose());
   }
+  ML_unit_ = M * L_unit_;
   Lb_ = L_unit_ * b_unit_;
 
   // b must lie in range(A); a dropped row is 0 = b_k
@@ -96,15 +97,14 @@ VectorXd UdwadiaKalaba::constrain(const Ref<const VectorXd>& a_bar) const {
 
 UdwadiaKalaba::Derivative UdwadiaKalaba::differentiate(const Ref<const MatrixXd>& dM, const Ref<const MatrixXd>& dA,
                                                        const Ref<const VectorXd>& db) const {
-  // any fixed scaling of the rows gives the same T and L b, so the unit rows serve: dA → D dA, db → D db
+  // any fixed scaling of the rows gives the same T and L b, so the unit rows serve: dA → D dA, db → D db. Since M L = AᵀΛ,
+  // ΛA = (M L)ᵀ and Λb = (M L)ᵀ L b
   const MatrixXd dA_unit = row_scale_.asDiagonal() * dA;
   const VectorXd db_unit = row_scale_.cwiseProduct(db);
-  const MatrixXd M_L = mass_factor_.reconstructedMatrix() * L_unit_;
-  const MatrixXd Lambda = L_unit_.transpose() * M_L;  // (A M⁻¹Aᵀ)⁺ = LᵀM L
-  const MatrixXd I_minus_T = L_unit_ * A_unit_;
+  const MatrixXd T_M_inverse = mass_factor_.solve(T_.transpose()).transpose();
   Derivative d;
-  d.Lb = T_ * mass_factor_.solve(dA_unit.transpose() * (Lambda * b_unit_) - dM * Lb_) + L_unit_ * (db_unit - dA_unit * Lb_);
-  d.T = -T_ * mass_factor_.solve(dA_unit.transpose() * (Lambda * A_unit_) - dM * I_minus_T) - L_unit_ * (dA_unit * T_);
+  d.Lb = T_M_inverse * (dA_unit.transpose() * (ML_unit_.transpose() * Lb_) - dM * Lb_) + L_unit_ * (db_unit - dA_unit * Lb_);
+  d.T = T_M_inverse * (dM * (L_unit_ * A_unit_) - dA_unit.transpose() * ML_unit_.transpose()) - L_unit_ * (dA_unit * T_);
   return d;
 }
 

@@ -112,16 +112,19 @@ std::optional<double> fold(Operation operation, double a, double b) {
   return std::isfinite(value) ? std::optional(value) : std::nullopt;
 }
 
-/// c·(c₂·u) = (c·c₂)·u, when e = c₂·u or u·c₂ and the product of the constants is a usable number.
-std::optional<Expression> merge_factors(Expression c, Expression e) {
-  if (!c.is_constant() || e.operation() != Operation::multiply) return std::nullopt;
-  const bool constant_first = e.left().is_constant();
-  const Expression c2 = constant_first ? e.left() : e.right();
-  const Expression u = constant_first ? e.right() : e.left();
-  if (!c2.is_constant()) return std::nullopt;
-  const auto product = fold(Operation::multiply, c.constant_value(), c2.constant_value());
-  if (!product || *product == 0) return std::nullopt;
-  return c.graph().constant(*product) * u;
+/// A product with its constant factor c in front, and only one: u·c = c·u, c·(c₂·u) = (c·c₂)·u, u·(c·v) = c·(u·v).
+std::optional<Expression> constant_first(Expression a, Expression b) {
+  const auto has_factor = [](Expression e) { return e.operation() == Operation::multiply && e.left().is_constant(); };
+  if (a.is_constant()) {
+    if (!has_factor(b)) return std::nullopt;
+    const auto product = fold(Operation::multiply, a.constant_value(), b.left().constant_value());
+    if (!product || *product == 0) return std::nullopt;
+    return a.graph().constant(*product) * b.right();
+  }
+  if (b.is_constant()) return b * a;
+  if (has_factor(a)) return a.left() * (a.right() * b);
+  if (has_factor(b)) return b.left() * (a * b.right());
+  return std::nullopt;
 }
 
 /// A simpler expression equal to `a operation b`, if a local rule gives one. Signs rise out of sums and products ((−a)·b =
@@ -149,8 +152,7 @@ std::optional<Expression> simplify(Operation operation, Expression a, Expression
       if (b.is_constant(1)) return a;
       if (has_minus(a)) return -((-a) * b);
       if (has_minus(b)) return -(a * (-b));
-      if (const auto merged = merge_factors(a, b)) return merged;
-      if (const auto merged = merge_factors(b, a)) return merged;
+      if (const auto product = constant_first(a, b)) return product;
       break;
     case Operation::divide:
       if (a.is_constant(0) && !b.is_constant(0)) return graph.constant(0);

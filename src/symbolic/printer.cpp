@@ -123,7 +123,9 @@ Written write(Expression e, Notation notation) {
       [[fallthrough]];
     case Operation::multiply: {
       const char* const times = !latex ? "*" : starts_with_number(e.right()) ? " \\cdot " : " \\, ";
-      return {{{e.left(), in_product}, times, {e.right(), in_power}}, in_product};
+      // c*u*v reads back as c·(u·v), and in LaTeX no one asks which product came first; C computes from the left
+      const bool plain_chain = latex || (!c && e.left().is_constant() && e.right().operation() == Operation::multiply);
+      return {{{e.left(), in_product}, times, {e.right(), plain_chain ? in_product : in_power}}, in_product};
     }
     case Operation::divide:
       if (latex) return {{"\\frac{", {e.left(), in_sum}, "}{", {e.right(), in_sum}, "}"}, in_product};

@@ -127,6 +127,8 @@ Scales default_scales(const Prior& prior, const std::vector<Observations>& obser
 
 namespace {
 
+std::string unit_of(const std::string& quantity) { return fmt::format("unit of {}", quantity); }
+
 void add_kernel_parameters(const Latent& latent, int owner, const std::string& prefix, const Scales& scales, const Protocol& protocol,
                            std::vector<Hyperparameter>& out) {
   const bool paper = protocol.name == Protocol::Name::paper;
@@ -150,12 +152,12 @@ void add_kernel_parameters(const Latent& latent, int owner, const std::string& p
         log_stddev = Standard::lengthscale_log_stddev;
         if (parameter.kind == Kernel::ParameterKind::lengthscale) {
           scale = scales.feature_stddev[static_cast<std::size_t>(owner)][parameter.feature];
-          h.unit = latent.feature_names[static_cast<std::size_t>(parameter.feature)];
+          h.unit = unit_of(latent.feature_names[static_cast<std::size_t>(parameter.feature)]);
         }
         break;
       case Kernel::ParameterKind::period:
         scale = scales.feature_range[static_cast<std::size_t>(owner)][parameter.feature];
-        h.unit = latent.feature_names[static_cast<std::size_t>(parameter.feature)];
+        h.unit = unit_of(latent.feature_names[static_cast<std::size_t>(parameter.feature)]);
         initial = median = 0.5;
         lower = 0.02;
         upper = 20;
@@ -186,7 +188,7 @@ void add_signal_stddevs(const Latent& latent, int owner, const std::string& pref
     h.kind = Kind::shared_signal_stddev;
     h.owner = owner;
     h.name = prefix + "signal_stddev";
-    h.unit = "output spread";
+    h.unit = "default scale of each column";
     h.lower = choose(range.lower, 0.5);
     h.upper = choose(range.upper, 10);
     h.value = std::clamp(choose(range.initial, 1), h.lower, h.upper);
@@ -201,7 +203,7 @@ void add_signal_stddevs(const Latent& latent, int owner, const std::string& pref
     h.owner = owner;
     h.index = l;
     h.name = fmt::format("{}signal_stddev({})", prefix, column);
-    h.unit = column;
+    h.unit = unit_of(column);
     h.value = choose(range.initial, Standard::signal_initial) * scale[l];
     h.lower = choose(range.lower, Standard::signal_lower) * scale[l];
     h.upper = choose(range.upper, Standard::signal_upper) * scale[l];
@@ -235,7 +237,7 @@ std::vector<Hyperparameter> default_hyperparameters(const Prior& prior, const st
       h.owner = static_cast<int>(g);
       h.index = static_cast<int>(k);
       h.name = fmt::format("noise_stddev({})", names[k]);
-      h.unit = names[k];
+      h.unit = unit_of(names[k]);
       const double spread = scales.output_stddev[g][static_cast<Index>(k)];
       h.lower = Standard::noise_lower * spread;
       h.upper = Standard::noise_upper * spread;
@@ -269,7 +271,7 @@ std::vector<Hyperparameter> default_hyperparameters(const Prior& prior, const st
     h.kind = Kind::parameter;
     h.index = index;
     h.name = name;
-    h.unit = "of " + name;
+    h.unit = unit_of(name);
     h.value = parameter.value;
     if (protocol.name == Protocol::Name::paper) {
       h.lower = parameter.value - 0.02;

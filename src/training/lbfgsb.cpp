@@ -1,5 +1,6 @@
 #include "training/lbfgsb.hpp"
 
+#include <algorithm>
 #include <array>
 #include <cmath>
 #include <cstring>
@@ -7,14 +8,25 @@
 #include <string_view>
 #include <vector>
 
-// Debian's liblbfgsb ships no header; Fortran passes the lengths of task and csave last
-extern "C" void setulb_(const int* n, const int* m, double* x, const double* l, const double* u, const int* nbd, double* f, double* g,
-                        const double* factr, const double* pgtol, double* wa, int* iwa, char* task, const int* iprint, char* csave,
-                        int* lsave, int* isave, double* dsave, std::size_t task_length, std::size_t csave_length);
+// setulb of L-BFGS-B, renamed by cmake/QuietLBFGSB.cmake and not exported; Fortran passes the lengths of task and csave last
+extern "C" [[gnu::visibility("hidden")]] void gp2_setulb_(const int* n, const int* m, double* x, const double* l, const double* u,
+                                                          const int* nbd, double* f, double* g, const double* factr,
+                                                          const double* pgtol, double* wa, int* iwa, char* task,
+                                                          const int* iprint, char* csave, int* lsave, int* isave, double* dsave,
+                                                          std::size_t task_length, std::size_t csave_length);
 
 namespace gp2 {
 
 using Eigen::VectorXd;
+
+namespace {
+
+// A line search that fails after an iteration with at most this relative reduction has met the rounding errors of the objective.
+constexpr double rounding_level = 1e-9;
+
+double relative_reduction(double from, double to) { return (from - to) / std::max({std::abs(from), std::abs(to), 1.0}); }
+
+}  // namespace
 
 LbfgsbResult minimise(const std::function<double(const VectorXd&, VectorXd&)>& f, const VectorXd& start, const VectorXd& lower,
                       const VectorXd& upper, const LbfgsbOptions& options) {
@@ -24,7 +36,7 @@ LbfgsbResult minimise(const std::function<double(const VectorXd&, VectorXd&)>& f
   VectorXd gradient = VectorXd::Zero(n);
   result.value = f(result.x, gradient);
   result.evaluations = 1;
-  if (!std::isfinite(result.value)) {
+  if (!std::isfinite(result.value) || !gradient.allFinite()) {
     result.value = std::numeric_limits<double>::infinity();
     result.termination = "no finite value at the start";
     return result;
@@ -55,10 +67,12 @@ LbfgsbResult minimise(const std::function<double(const VectorXd&, VectorXd&)>& f
   double value = result.value;
   VectorXd best_gradient = gradient;
   bool first_evaluation = true;
+  double last_reduction = std::numeric_limits<double>::infinity();
+  int failed_before_search = 0;
   while (true) {
-    setulb_(&n, &m, x.data(), lower.data(), upper.data(), both_bounds.data(), &value, gradient.data(), &factr,
-            &options.gradient_tolerance, wa.data(), iwa.data(), task.data(), &quiet, csave.data(), lsave.data(), isave.data(),
-            dsave.data(), text_length, text_length);
+    gp2_setulb_(&n, &m, x.data(), lower.data(), upper.data(), both_bounds.data(), &value, gradient.data(), &factr,
+                &options.gradient_tolerance, wa.data(), iwa.data(), task.data(), &quiet, csave.data(), lsave.data(), isave.data(),
+                dsave.data(), text_length, text_length);
     if (task_is("FG")) {
       // the first request is for the start, which is known
       if (first_evaluation) {
@@ -67,7 +81,7 @@ LbfgsbResult minimise(const std::function<double(const VectorXd&, VectorXd&)>& f
       }
       value = f(x, gradient);
       ++result.evaluations;
-      if (!std::isfinite(value)) {
+      if (!std::isfinite(value) || !gradient.allFinite()) {
         // answer with the parabola along the step that has the known value and slope at the last iterate and its minimum at a
         // tenth of the step: the line search goes there
         ++result.failed_evaluations;
@@ -77,6 +91,10 @@ LbfgsbResult minimise(const std::function<double(const VectorXd&, VectorXd&)>& f
         gradient = step * (-9 * slope / step.squaredNorm());
       }
     } else if (task_is("NEW_X")) {
+      // only an f that answers differently at the same x can rise; L-BFGS-B stops on the next call, the better point is kept
+      if (value > result.value) continue;
+      last_reduction = relative_reduction(result.value, value);
+      failed_before_search = result.failed_evaluations;
       result.x = x;
       result.value = value;
       best_gradient = gradient;
@@ -101,6 +119,9 @@ LbfgsbResult minimise(const std::function<double(const VectorXd&, VectorXd&)>& f
   } else if (task_is("CONVERGENCE: REL")) {
     result.converged = true;
     result.termination = "the relative reduction of the objective fell below its tolerance";
+  } else if (last_reduction <= rounding_level && result.failed_evaluations == failed_before_search) {
+    result.converged = true;
+    result.termination = "the objective cannot be lowered further in double precision";
   } else {
     result.termination = "the line search could not lower the objective further (" +
                          std::string(text.substr(0, text.find_last_not_of(' ') + 1)) + ")";

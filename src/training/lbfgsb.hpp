@@ -17,15 +17,16 @@ struct LbfgsbOptions {
 };
 
 struct LbfgsbResult {
-  Eigen::VectorXd x;
-  double value = 0;  // +∞ when it was +∞ at the start
+  Eigen::VectorXd x;  // the best accepted iterate
+  double value = 0;   // +∞ when it was +∞ at the start
   int iterations = 0, evaluations = 0, failed_evaluations = 0;
-  bool converged = false;
+  bool converged = false;  // a tolerance was met, or the objective was lowered down to its rounding errors
   std::string termination;
 };
 
-/// Minimises f over the box [lower, upper] with the original L-BFGS-B 3.0 (Zhu, Byrd, Lu, Nocedal 1997; Morales, Nocedal 2011). Every
-/// run owns its memory: re-entrant. f(x, gradient) may be +∞ away from the start: such a step is shortened tenfold.
+/// Minimises f over the box [lower, upper] with the original L-BFGS-B 3.0 (Zhu, Byrd, Lu, Nocedal 1997; Morales, Nocedal 2011).
+/// Every run owns its memory: re-entrant. f(x, gradient) may be +∞ or not a number away from the start: such a step is shortened
+/// tenfold. Prints nothing.
 LbfgsbResult minimise(const std::function<double(const Eigen::VectorXd&, Eigen::VectorXd&)>& f, const Eigen::VectorXd& start,
                       const Eigen::VectorXd& lower, const Eigen::VectorXd& upper, const LbfgsbOptions& options);
 

@@ -1,26 +1,46 @@
-// Uses an installed gp2 from outside: reads an expression, differentiates it, evaluates both.
-#include <array>
+// An outside project: the main job through the installed headers and library alone.
 #include <cmath>
 #include <cstdio>
-#include <gp2/expression.hpp>
-#include <span>
-#include <string>
-#include <string_view>
+
+#include <Eigen/Core>
+
+#include "gp2/evaluation.hpp"
+#include "gp2/generate.hpp"
+#include "gp2/training.hpp"
+#include "gp2/version.hpp"
 
 int main() {
-  gp2::ExpressionGraph graph;
-  const auto q = graph.variable("q");
-  const auto e = gp2::parse_expression(
-      "q^2 + sin(q)", graph, [&](std::string_view) { return q; }, std::span<const std::string>{});
-  const auto de_dq = graph.differentiate(e, q);
-
-  const std::array<gp2::Expression, 2> outputs{e, de_dq};
-  const std::array<gp2::Expression, 1> inputs{q};
-  Eigen::MatrixXd results;
-  gp2::Tape(outputs, inputs).evaluate(Eigen::MatrixXd::Constant(1, 1, 0.5), Eigen::VectorXd(), results);
-
-  std::printf("d/dq (%s) = %s = %.15g at q = 0.5\n", gp2::to_string(e).c_str(), gp2::to_string(de_dq).c_str(), results(1, 0));
-  const bool right =
-      std::abs(results(0, 0) - (0.25 + std::sin(0.5))) < 1e-15 && std::abs(results(1, 0) - (1 + std::cos(0.5))) < 1e-15;
-  return right ? 0 : 1;
+  const gp2::ModelFile model = gp2::ModelFile::parse(R"(
+coordinates = ["x", "y"]
+[parameters]
+m = 2.0
+slope = 0.5
+[mechanics]
+mass  = [["m", "0"], ["0", "m"]]
+force = ["0", "-9.81*m"]
+[constraints]
+position = ["y - slope*x"]
+[[latent]]
+features = ["dx"]
+[truth]
+acceleration = ["-0.3*dx", "-0.3*dy"]
+[sampling]
+x  = [-1, 1]
+dx = [-2, 2]
+)",
+                                                     "a bead on a wire");
+  const gp2::GeneratedData data = gp2::generate(model, {50, 1, Eigen::Vector2d(0.01, 0.01)});
+  const gp2::Prior prior = gp2::make_prior(model, {gp2::Prior::Mean::force, std::nullopt, false});
+  const gp2::View view = gp2::View::all(gp2::View::Quantity::constrained_acceleration, *model.system);
+  const std::vector<gp2::Observations> observations = {
+      {data.states, view, data.accelerations, Eigen::Vector2d(0.01, 0.01), false}};
+  const gp2::Fit fit = gp2::fit(prior, observations, gp2::default_hyperparameters(prior, observations, {}, {}));
+  const gp2::Evaluation evaluation =
+      gp2::evaluate_predictions(fit.posterior, data.states, view.rows, gp2::true_acceleration(model, data.states));
+  std::printf("gp2 %s: nll %.3f, rmse / spread %.2g, max |A ddq - b| %.1e\n", gp2::version(), fit.report.negative_log_likelihood,
+              evaluation.rmse_normalised, evaluation.max_constraint_error);
+  return std::isfinite(fit.report.negative_log_likelihood) && evaluation.rmse_normalised < 0.05 &&
+                 evaluation.max_constraint_error < 1e-12
+             ? 0
+             : 1;
 }

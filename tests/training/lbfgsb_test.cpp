@@ -2,7 +2,11 @@
 
 #include <gmock/gmock.h>
 #include <gtest/gtest.h>
+#include <unistd.h>
 
+#include <cmath>
+#include <cstdio>
+#include <cstdlib>
 #include <limits>
 #include <thread>
 
@@ -27,8 +31,31 @@ double rosenbrock(const VectorXd& x, VectorXd& gradient) {
   return value;
 }
 
-VectorXd constant(int n, double value) {
-  return VectorXd::Constant(n, value);
+VectorXd constant(int n, double value) { return VectorXd::Constant(n, value); }
+
+// L-BFGS-B as its authors wrote it reports an ascent direction with a print statement: here for every fifth seed
+TEST(LbfgsbDeathTest, NeverWritesToStandardOutput) {
+  const auto run = [] {
+    // in a process of its own, because the Fortran runtime writes when the process ends
+    std::fflush(stdout);
+    if (dup2(STDERR_FILENO, STDOUT_FILENO) < 0) std::exit(1);
+    LbfgsbOptions options;
+    options.gradient_tolerance = 0;
+    options.reduction_tolerance = 0;
+    for (int seed = 0; seed < 100; ++seed) {
+      // a narrow valley, some of whose minima lie on a bound, with a small error in the gradient
+      const auto valley = [&](const VectorXd& x, VectorXd& gradient) {
+        const double along = x[0] - std::sin(seed), across = x[1] - 0.9 * x[0] - std::sin(seed + 1);
+        gradient = Eigen::Vector2d(along - 0.9e10 * across, 1e10 * across);
+        gradient[0] += 1e-6 * std::sin(1e3 * (2 * x[0] + x[1]));
+        gradient[1] += 1e-6 * std::sin(1e3 * (x[0] + 2 * x[1]) + seed);
+        return 1 + 0.5 * along * along + 0.5e10 * across * across;
+      };
+      minimise(valley, constant(2, -0.5), constant(2, -1), constant(2, 1), options);
+    }
+    std::exit(0);
+  };
+  EXPECT_EXIT(run(), testing::ExitedWithCode(0), testing::IsEmpty());
 }
 
 TEST(LbfgsbTest, FindsTheMinimumInsideTheBox) {
@@ -105,11 +132,83 @@ TEST(LbfgsbTest, EndsAtTheEdgeOfAnInfiniteRegionWithTheBestPointItSaw) {
     return value;
   };
   const LbfgsbResult result = minimise(cut, constant(2, -0.5), constant(2, -3), constant(2, 3), {});
+  EXPECT_FALSE(result.converged) << result.termination;
   EXPECT_LE(result.x[0], 0.5);
   VectorXd gradient(2);
   EXPECT_EQ(result.value, rosenbrock(result.x, gradient)) << "value and point belong together";
   EXPECT_LT(result.value, 0.5) << "close to the edge, where it is a quarter";
   EXPECT_GE(result.value, best);
+}
+
+TEST(LbfgsbTest, CallsTheRoundingErrorsOfTheObjectiveConvergence) {
+  LbfgsbOptions options;
+  options.gradient_tolerance = 0;
+  options.reduction_tolerance = 0;
+  int n_rounding = 0;
+  for (int seed = 0; seed < 100; ++seed) {
+    // 1 + Rosenbrock's function as it would come from a computation that loses four digits
+    const auto rounded = [&](const VectorXd& x, VectorXd& gradient) {
+      const double value = 1 + rosenbrock(x, gradient);
+      return value + 1e-12 * std::sin(1e12 * (x[0] + 2 * x[1]) + seed);
+    };
+    double lowest = infinity;
+    options.iteration = [&](int, double value) {
+      lowest = std::min(lowest, value);
+      return true;
+    };
+    const LbfgsbResult result = minimise(rounded, constant(2, -0.5), constant(2, -3), constant(2, 3), options);
+    EXPECT_TRUE(result.converged) << "seed " << seed << ": " << result.termination;
+    EXPECT_LE((result.x - constant(2, 1)).cwiseAbs().maxCoeff(), 1e-4) << "seed " << seed;
+    EXPECT_EQ(result.value, lowest) << "seed " << seed;
+    VectorXd gradient(2);
+    EXPECT_EQ(result.value, rounded(result.x, gradient)) << "seed " << seed << ": value and point belong together";
+    n_rounding += result.termination == "the objective cannot be lowered further in double precision";
+  }
+  EXPECT_GT(n_rounding, 0) << "nothing was tested";
+}
+
+TEST(LbfgsbTest, AWrongGradientIsNoConvergence) {
+  const auto wrong = [](const VectorXd& x, VectorXd& gradient) {
+    const double value = rosenbrock(x, gradient);
+    gradient = -gradient;
+    return value;
+  };
+  const LbfgsbResult result = minimise(wrong, constant(2, -0.5), constant(2, -3), constant(2, 3), {});
+  EXPECT_FALSE(result.converged);
+  EXPECT_THAT(result.termination, HasSubstr("the line search could not lower the objective further"));
+  EXPECT_EQ(result.x, constant(2, -0.5));
+}
+
+TEST(LbfgsbTest, KeepsTheLowestIterateOfAFunctionThatAnswersDifferentlyEachTime) {
+  LbfgsbOptions options;
+  options.gradient_tolerance = 0;
+  options.reduction_tolerance = 0;
+  double lowest = infinity;
+  options.iteration = [&](int, double value) {
+    EXPECT_LE(value, lowest) << "an iteration never raises the value";
+    lowest = value;
+    return true;
+  };
+  int call = 0;
+  const auto drifting = [&](const VectorXd& x, VectorXd& gradient) { return rosenbrock(x, gradient) + 1e-6 * std::sin(++call); };
+  const LbfgsbResult result = minimise(drifting, constant(2, -0.5), constant(2, -3), constant(2, 3), options);
+  EXPECT_EQ(result.value, lowest);
+}
+
+TEST(LbfgsbTest, AGradientThatIsNotANumberCountsAsInfinite) {
+  int n_broken = 0;
+  const auto broken = [&](const VectorXd& x, VectorXd& gradient) {
+    const double value = rosenbrock(x, gradient);
+    if (x[0] > 1.2) {
+      gradient[1] = std::nan("");
+      ++n_broken;
+    }
+    return value;
+  };
+  const LbfgsbResult result = minimise(broken, constant(2, -1), constant(2, -3), constant(2, 30), {});
+  EXPECT_LE((result.x - constant(2, 1)).cwiseAbs().maxCoeff(), 1e-4);
+  EXPECT_EQ(result.failed_evaluations, n_broken);
+  EXPECT_FALSE(minimise(broken, constant(2, 2), constant(2, -3), constant(2, 30), {}).converged);
 }
 
 TEST(LbfgsbTest, ANotANumberCountsAsInfinite) {

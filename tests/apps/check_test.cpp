@@ -1,0 +1,129 @@
+#include <gmock/gmock.h>
+#include <gtest/gtest.h>
+
+#include "apps/command_line.hpp"
+#include "test_models.hpp"
+
+namespace gp2::test {
+namespace {
+
+using testing::HasSubstr;
+using testing::Not;
+
+class Check : public testing::TestWithParam<std::string> {};
+
+TEST_P(Check, FindsNothingWrongWithAShippedModelAndItsData) {
+  const Desk desk;
+  const Outcome alone = desk.run("gp2 check " + GetParam());
+  EXPECT_EQ(alone.status, 0) << alone.out << alone.err;
+  EXPECT_THAT(alone.out, Not(HasSubstr("ERROR")));
+  EXPECT_THAT(alone.out, Not(HasSubstr("warning")));
+  desk.done("gp2 generate " + GetParam() + " --n 25 --noise-std 0.01 -o log.csv");
+  const Outcome with_data = desk.run("gp2 check " + GetParam() + " --data log.csv");
+  EXPECT_EQ(with_data.status, 0) << with_data.out << with_data.err;
+  EXPECT_THAT(with_data.out, HasSubstr("log.csv: 25 rows"));
+  EXPECT_THAT(with_data.out, Not(HasSubstr("ERROR")));
+  EXPECT_THAT(with_data.out, Not(HasSubstr("warning")));
+}
+
+INSTANTIATE_TEST_SUITE_P(OfEveryModel, Check, testing::ValuesIn(every_model()), model_test_name);
+
+TEST(Check, WarnsOfAccelerationsThatWereComputedFromEachOther) {
+  const Desk desk;
+  desk.done("gp2 generate models/double_pendulum.toml --n 25 --noise-std 0 -o log.csv");
+  const Outcome checked = desk.done("gp2 check models/double_pendulum.toml --data log.csv");
+  EXPECT_THAT(checked.out, testing::ContainsRegex("warning +dependent columns: the 6 accelerations .* only 2 .* --observe ddq[0-9],ddq[0-9]"));
+  const std::string fit = "gp2 fit models/double_pendulum.toml --data log.csv --max-iterations 0 -o fit.json";
+  EXPECT_THAT(desk.done(fit).err, HasSubstr("warning: log.csv: the accelerations obey A ddq = b to rounding"));
+  EXPECT_THAT(desk.done(fit + " --observe ddq3,ddq6").err, Not(HasSubstr("warning")));
+}
+
+TEST(Check, WarnsOfStatesOffTheConstraint) {
+  const Desk desk;
+  desk.done("gp2 generate models/surface.toml --n 25 -o good.csv");
+  // the fourth row's q3 lifted off the surface
+  const CsvTable good = desk.table("good.csv");
+  std::string csv = "q1,q2,q3,dq1,dq2,dq3,u1,u2,u3,ddq1,ddq2,ddq3\n";
+  for (int i = 0; i < good.n_rows(); ++i) {
+    for (int column = 0; column < good.n_columns(); ++column) {
+      const double lift = i == 3 && column == good.find("q3") ? 0.01 : 0;
+      csv += column == 0 ? "" : ",";
+      csv += shortest(good.number(i, column) + lift);
+    }
+    csv += "\n";
+  }
+  desk.write("log.csv", csv);
+  const Outcome checked = desk.done("gp2 check models/surface.toml --data log.csv");
+  EXPECT_THAT(checked.out, testing::ContainsRegex("warning +data on the constraint: off by 0.01 .*row 4"));
+  desk.done("gp2 fit models/surface.toml --data good.csv --max-iterations 0 -o fit.json");
+  for (const char* line : {"gp2 fit models/surface.toml --data log.csv --max-iterations 0 -o other.json",
+                           "gp2 predict fit.json --states log.csv -o prediction.csv", "gp2 evaluate fit.json --data log.csv"}) {
+    EXPECT_THAT(desk.done(line).err, testing::ContainsRegex("warning: log.csv: states are off the constraint: .* -?0.01 at data row 4"));
+  }
+}
+
+TEST(Check, SaysWhichAccelerationsTheLogLacks) {
+  const Desk desk;
+  desk.done("gp2 generate models/surface.toml --n 25 -o log.csv");
+  desk.write("log.csv", replaced(desk.read("log.csv"), ",ddq2,", ",vertical_comment,"));
+  const Outcome checked = desk.done("gp2 check models/surface.toml --data log.csv");
+  EXPECT_THAT(checked.out, HasSubstr("not in the log: ddq2; fit with --observe"));
+  EXPECT_THAT(checked.out, HasSubstr("columns not needed: vertical_comment"));
+}
+
+/// A particle on a line with a changed mass matrix or constraint.
+std::string particle(const std::string& mass, const std::string& acceleration) {
+  return R"(
+name = "particle"
+coordinates = ["q1", "q2"]
+[mechanics]
+mass = )" + mass + R"(
+force = ["0", "0"]
+[constraints]
+acceleration = )" + acceleration + R"(
+[[latent]]
+name = "force"
+kernel = "se"
+features = ["q1"]
+directions = "acceleration"
+[noise]
+ddq = 0.1
+)";
+}
+
+TEST(Check, FailsWhereTheModelIsNotWellPosedAndSaysAtWhichState) {
+  const Desk desk;
+  desk.write("log.csv", "q1,q2,ddq1,ddq2\n1,0,0.1,0\n2,0,0.2,0.1\n-1,0,0.2,0.1\n3,1,0.1,0\n");
+  struct Broken {
+    const char* name;
+    std::string text, finding;
+  };
+  for (const Broken& one : {Broken{"indefinite.toml", particle(R"([["q1", "0"], ["0", "1"]])", R"(["ddq2"])"),
+                                   "mass matrix M is not positive definite at state 3"},
+                            Broken{"contradiction.toml", particle(R"([["1", "0"], ["0", "1"]])", R"x(["ddq2 - q1", "ddq2 - abs(q1)"])x"),
+                                   "constraints contradict each other: no acceleration satisfies A ddq = b at state 3"}}) {
+    SCOPED_TRACE(one.name);
+    desk.write(one.name, one.text);
+    const Outcome checked = desk.run(std::string("gp2 check ") + one.name + " --data log.csv");
+    EXPECT_EQ(checked.status, 2);
+    EXPECT_THAT(checked.out, testing::AllOf(HasSubstr("ERROR"), HasSubstr(one.finding)));
+    EXPECT_THAT(checked.err, HasSubstr(std::string(one.name) + ": 1 of the checks failed"));
+  }
+}
+
+TEST(Check, WarnsOfARowThatVanishes) {
+  const Desk desk;
+  desk.write("model.toml", particle(R"([["1", "0"], ["0", "1"]])", R"(["q1*ddq2"])"));
+  desk.write("log.csv", "q1,q2,ddq1,ddq2\n1,0,0.1,0\n2,0,0.2,0.1\n1e-9,0,0.2,0.1\n3,1,0.1,0\n");
+  EXPECT_THAT(desk.done("gp2 check model.toml --data log.csv").out,
+              testing::ContainsRegex("warning +constraint .*of its usual size at state 3"));
+}
+
+TEST(Check, WithoutSamplingOrDataSaysThatNothingWasEvaluated) {
+  const Desk desk;
+  desk.write("model.toml", particle(R"([["1", "0"], ["0", "1"]])", R"(["ddq2"])"));
+  EXPECT_THAT(desk.done("gp2 check model.toml").out, HasSubstr("no --data and no [sampling]"));
+}
+
+}  // namespace
+}  // namespace gp2::test
