@@ -28,13 +28,17 @@ std::map<std::string, std::string> parse_map(const std::string& text) {
     }
     const std::string name = item.substr(equals + 1);
     const auto [twice, is_new] = columns.emplace(name, item.substr(0, equals));
-    if (!is_new) throw InputError(fmt::format("--map: '{}' is given two columns, '{}' and '{}'", name, twice->second, item.substr(0, equals)));
+    if (!is_new)
+      throw InputError(
+          fmt::format("--map: '{}' is given two columns, '{}' and '{}'", name, twice->second, item.substr(0, equals)));
   }
   return columns;
 }
 
 CLI::Validator not_negative() {
-  const auto check = [](const std::string& text) { return text.starts_with('-') ? "must not be negative, got " + text : std::string(); };
+  const auto check = [](const std::string& text) {
+    return text.starts_with('-') ? "must not be negative, got " + text : std::string();
+  };
   return {check, ""};
 }
 

@@ -23,7 +23,9 @@ struct Arguments {
 int print(const std::vector<Finding>& findings) {
   int n_errors = 0;
   for (const Finding& finding : findings) {
-    const char* mark = finding.level == Finding::Level::good ? "ok     " : finding.level == Finding::Level::warning ? "warning" : "ERROR  ";
+    const char* mark = finding.level == Finding::Level::good      ? "ok     "
+                       : finding.level == Finding::Level::warning ? "warning"
+                                                                  : "ERROR  ";
     fmt::print("{}  {}\n", mark, finding.text);
     if (finding.level == Finding::Level::error) ++n_errors;
   }
@@ -82,7 +84,8 @@ void run(const Arguments& arguments) {
 
 void add_check(CLI::App& app) {
   CLI::App* command = app.add_subcommand(
-      "check", "Is a model well-posed, and does a log fit it? Rank, definiteness, derivatives, data on the constraint, dependent columns");
+      "check",
+      "Is a model well-posed, and does a log fit it? Rank, definiteness, derivatives, data on the constraint, dependent columns");
   auto arguments = std::make_shared<Arguments>();
   command->add_option("MODEL", arguments->model, "model file")->required();
   command->add_option("--data", arguments->data, "CSV log (default: states drawn from the model's [sampling])");

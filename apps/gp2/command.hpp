@@ -6,6 +6,9 @@
 
 #include <CLI/CLI.hpp>
 
+#include "gp2/csv.hpp"
+#include "gp2/error.hpp"
+
 namespace gp2::command {
 
 // One function per subcommand: declares its arguments; its callback does the work.
@@ -28,6 +31,16 @@ CLI::Validator not_negative();
 
 /// @throws InputError when the folder of a file to be written does not exist: better said before an hour of work than after.
 void require_folder(const std::string& output);
+
+/// work(), with the log named in what it throws: a posterior knows the number of a state only.
+template <typename Work>
+auto at_states_of(const CsvTable& log, const Work& work) {
+  try {
+    return work();
+  } catch (const InputError& error) {
+    throw InputError(log.name() + ": " + error.what());
+  }
+}
 
 /// Prints talk to stderr, a line each.
 void talk(const std::vector<std::string>& notes);

@@ -40,14 +40,15 @@ Json to_json(const Evaluation& e) {
 }
 
 void print_text(const Evaluation& e) {
-  for (std::size_t k = 0; k < e.outputs.size(); ++k) fmt::print("rmse {:<22} {:.6g}\n", e.outputs[k], e.rmse[static_cast<Eigen::Index>(k)]);
+  for (std::size_t k = 0; k < e.outputs.size(); ++k)
+    fmt::print("rmse {:<22} {:.6g}\n", e.outputs[k], e.rmse[static_cast<Eigen::Index>(k)]);
   fmt::print("rmse / training std         {:.6g}   (mean over outputs)\n", e.rmse_normalised);
   fmt::print("nrmse                       {:.6g}   (rms error / rms of the test spreads)\n", e.nrmse);
   fmt::print("max |A ddq - b|             {:.3g}   (model's parameters; fitted ones: {:.3g})\n", e.max_constraint_error,
              e.max_constraint_error_fitted);
   fmt::print("nlpd, 95 % coverage         {:.4g}, {:.3g}   (with measurement noise)\n", e.nlpd, e.coverage95);
-  fmt::print("the same, noise-free        {:.4g}, {:.3g}   ({} marginals without variance left out)\n", e.nlpd_latent, e.coverage95_latent,
-             e.n_zero_variance);
+  fmt::print("the same, noise-free        {:.4g}, {:.3g}   ({} marginals without variance left out)\n", e.nlpd_latent,
+             e.coverage95_latent, e.n_zero_variance);
   fmt::print("points                      {}\n", e.n);
 }
 
@@ -67,7 +68,9 @@ void run(const Arguments& arguments) {
   const std::vector<int> rows = acceleration_rows(*fit.model.system, outputs, "--outputs");
   const LogStates log = read_log_states(fit.prior(), fit.model, table, parse_map(arguments.map), outputs);
   talk(log.notes);
-  const Evaluation evaluation = evaluate_predictions(fit.posterior(), log.states, rows, log.accelerations);
+  const Posterior posterior = fit.posterior();
+  const Evaluation evaluation =
+      at_states_of(table, [&] { return evaluate_predictions(posterior, log.states, rows, log.accelerations); });
   if (arguments.json) {
     fmt::print("{}\n", to_json(evaluation).dump(2));
   } else {
@@ -78,11 +81,13 @@ void run(const Arguments& arguments) {
 }  // namespace
 
 void add_evaluate(CLI::App& app) {
-  CLI::App* command = app.add_subcommand("evaluate", "Compare predictions of the constrained acceleration with measured or true values");
+  CLI::App* command =
+      app.add_subcommand("evaluate", "Compare predictions of the constrained acceleration with measured or true values");
   auto arguments = std::make_shared<Arguments>();
   command->add_option("FIT.json", arguments->fit, "file written by gp2 fit")->required();
   command->add_option("--data", arguments->data, "CSV with states and accelerations")->required();
-  command->add_option("--outputs", arguments->outputs, "accelerations to compare, ddq3,ddq6 (default: those observed in training)");
+  command->add_option("--outputs", arguments->outputs,
+                      "accelerations to compare, ddq3,ddq6 (default: those observed in training)");
   command->add_option("--map", arguments->map, "columns by other names, LOGNAME=MODELNAME,…");
   command->add_flag("--json", arguments->json, "figures as JSON on stdout");
   command->footer("Example:\n  gp2 evaluate fit.json --data test.csv --json");

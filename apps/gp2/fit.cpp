@@ -1,5 +1,7 @@
+#include <algorithm>
 #include <cmath>
 #include <cstdio>
+#include <limits>
 #include <memory>
 
 #include <unistd.h>
@@ -53,14 +55,36 @@ FitProblemOptions problem_options(const Arguments& arguments) {
   return options;
 }
 
+// Bounds are the optimiser's: where it does not run, a start outside of them is taken, and they are widened to hold it.
+void read_start(const Arguments& arguments, FitProblem& problem) {
+  if (arguments.max_iterations > 0) {
+    read_start_values(arguments.start, problem.hyperparameters);
+    return;
+  }
+  const std::vector<Hyperparameter> bounded = problem.hyperparameters;
+  for (Hyperparameter& h : problem.hyperparameters) {
+    h.lower = h.is_positive() ? std::numeric_limits<double>::min() : std::numeric_limits<double>::lowest();
+    h.upper = std::numeric_limits<double>::max();
+  }
+  read_start_values(arguments.start, problem.hyperparameters);
+  for (std::size_t k = 0; k < bounded.size(); ++k) {
+    Hyperparameter& h = problem.hyperparameters[k];
+    h.lower = std::min(bounded[k].lower, h.value);
+    h.upper = std::max(bounded[k].upper, h.value);
+    if (h.lower == bounded[k].lower && h.upper == bounded[k].upper) continue;
+    problem.notes.push_back(fmt::format("{}: {} = {} is outside its bounds [{:.6g}, {:.6g}]; taken, as nothing is optimised",
+                                        arguments.start, h.name, h.value, bounded[k].lower, bounded[k].upper));
+  }
+}
+
 // one line that rewrites itself, on a terminal only, ten times a second
 void print_progress(const Progress& p) {
   static double last = -1;
   if (last >= 0 && p.seconds - last < 0.1) return;
   last = p.seconds;
   const double left = p.fraction > 0 ? p.seconds * (1 - p.fraction) / p.fraction : 0;
-  fmt::print(stderr, "\rgp2: restart {}/{}  iteration {}  best {:.4f}  about {:.0f} s left   ", p.restart + 1, p.n_restarts, p.iteration,
-             p.best, left);
+  fmt::print(stderr, "\rgp2: restart {}/{}  iteration {}  best {:.4f}  about {:.0f} s left   ", p.restart + 1, p.n_restarts,
+             p.iteration, p.best, left);
   std::fflush(stderr);
 }
 
@@ -83,10 +107,11 @@ Json to_json(const FitReport& report) {
 
 void print_text(const FitReport& report) {
   fmt::print("negative log likelihood {:.6f}\n", report.negative_log_likelihood);
-  fmt::print("{} after {} iterations ({} restarts, best: {}), {:.2f} s\n", report.termination, report.iterations, report.restarts.size(),
-             report.best_restart + 1, report.seconds);
+  fmt::print("{} after {} iterations ({} restarts, best: {}), {:.2f} s\n", report.termination, report.iterations,
+             report.restarts.size(), report.best_restart + 1, report.seconds);
   for (const Hyperparameter& h : report.hyperparameters) {
-    fmt::print("  {:<34} {:>13.6g}   [{:.3g}, {:.3g}]{}\n", h.name, h.value, h.lower, h.upper, h.at_bound() ? "   at its bound" : "");
+    fmt::print("  {:<34} {:>13.6g}   [{:.3g}, {:.3g}]{}\n", h.name, h.value, h.lower, h.upper,
+               h.at_bound() ? "   at its bound" : "");
   }
 }
 
@@ -106,7 +131,7 @@ void run(const Arguments& arguments) {
   file.model = ModelFile::read(arguments.model);
   const CsvTable log = CsvTable::read(arguments.data);
   FitProblem problem = make_fit_problem(file.model, log, problem_options(arguments));
-  if (!arguments.start.empty()) read_start_values(arguments.start, problem.hyperparameters);
+  if (!arguments.start.empty()) read_start(arguments, problem);
   talk(problem.notes);
 
   FitOptions options;
@@ -132,7 +157,8 @@ void run(const Arguments& arguments) {
   file.observations = std::move(problem.observations);
   file.report = result.report;
   file.write(arguments.output);
-  talk({fmt::format("{}: fit of '{}' to {} rows", arguments.output, file.model.system->name(), file.observations.front().n_data())});
+  talk({fmt::format("{}: fit of '{}' to {} rows", arguments.output, file.model.system->name(),
+                    file.observations.front().n_data())});
   if (arguments.json) {
     fmt::print("{}\n", to_json(result.report).dump(2));
   } else {
@@ -152,22 +178,27 @@ void add_fit(CLI::App& app) {
   command->add_option("--mean", a->mean, "prior mean of the unconstrained acceleration: zero, or force = M⁻¹F of the model")
       ->check(CLI::IsMember({"zero", "force"}))
       ->capture_default_str();
-  command->add_option("--prior", a->prior, "put the model's latent on the acceleration or on the force (default: as the model says)")
+  command
+      ->add_option("--prior", a->prior, "put the model's latent on the acceleration or on the force (default: as the model says)")
       ->check(CLI::IsMember({"acceleration", "force"}));
   command->add_option("--estimate", a->estimate, "parameters to estimate, p1,p2, or none (default: those the model says)");
-  command->add_option("--noise-std", a->noise, "noise standard deviation of every observed ddq, or 'estimate' (default: as the model says)");
+  command->add_option("--noise-std", a->noise,
+                      "noise standard deviation of every observed ddq, or 'estimate' (default: as the model says)");
   command->add_option("--protocol", a->protocol, "default, or paper: the set-up of Geist & Trimpe 2020")
       ->check(CLI::IsMember({"default", "paper"}))
       ->capture_default_str();
   command->add_option("--hyperprior", a->hyperprior, "weak log-normal hyper-priors, or none: maximum likelihood")
       ->check(CLI::IsMember({"default", "none"}))
       ->capture_default_str();
-  command->add_option("--restarts", a->restarts, "runs of the optimiser; the first starts at the model's values")->capture_default_str();
-  command->add_option("--max-iterations", a->max_iterations, "per run; 0 conditions at the starting values")->capture_default_str();
+  command->add_option("--restarts", a->restarts, "runs of the optimiser; the first starts at the model's values")
+      ->capture_default_str();
+  command->add_option("--max-iterations", a->max_iterations, "per run; 0 conditions at the starting values")
+      ->capture_default_str();
   command->add_option("--start", a->start, "starting values: {\"name\": value, …} as JSON, or a FIT.json");
   command->add_option("--max-points", a->max_points, "take this many rows, the first of a shuffle by --seed");
   command->add_option("--seed", a->seed, "of restarts and --max-points")->check(not_negative())->capture_default_str();
-  command->add_option("--threads", a->threads, "0: as many as the machine has; results do not depend on it")->capture_default_str();
+  command->add_option("--threads", a->threads, "0: as many as the machine has; results do not depend on it")
+      ->capture_default_str();
   command->add_flag("--json", a->json, "report as JSON on stdout");
   command->add_option("-o,--output", a->output, "fitted model to write (JSON)")->required();
   command->footer("Example:\n  gp2 fit models/surface.toml --data train.csv --mean force -o fit.json");

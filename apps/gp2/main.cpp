@@ -33,7 +33,8 @@ void require_known_command(const CLI::App& app, int argc, char** argv) {
 
 int main(int argc, char** argv) {
   CLI::App app{
-      "Learn the dynamics of constrained mechanical systems from measured data, with predictions that obey the constraints exactly."};
+      "Learn the dynamics of constrained mechanical systems from measured data, with predictions that obey the constraints "
+      "exactly."};
   app.name("gp2");
   app.require_subcommand(1);
   app.set_version_flag("--version", gp2::version());

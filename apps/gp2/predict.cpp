@@ -99,10 +99,11 @@ void run(const Arguments& arguments) {
   const LogStates log = read_log_states(fit.prior(), fit.model, table, parse_map(arguments.map));
   talk(log.notes);
   const Posterior posterior = fit.posterior();
-  const View view = View::all(arguments.view == "constrained" ? View::Quantity::constrained_acceleration
-                                                              : View::Quantity::unconstrained_acceleration,
-                              *fit.model.system);
-  write_file(arguments.output, joined(table, predict(posterior, view, log.states, arguments.covariance)));
+  const View view = View::all(
+      arguments.view == "constrained" ? View::Quantity::constrained_acceleration : View::Quantity::unconstrained_acceleration,
+      *fit.model.system);
+  const NewColumns predictions = at_states_of(table, [&] { return predict(posterior, view, log.states, arguments.covariance); });
+  write_file(arguments.output, joined(table, predictions));
   talk({fmt::format("{}: {} predictions of the {} acceleration", arguments.output, table.n_rows(), arguments.view)});
 }
 
@@ -116,7 +117,8 @@ void add_predict(CLI::App& app) {
   command->add_option("--view", arguments->view, "constrained: ddq1 …; unconstrained: abar_q1 …")
       ->check(CLI::IsMember({"constrained", "unconstrained"}))
       ->capture_default_str();
-  command->add_option("--cov", arguments->covariance, "none; std: NAME_std; full: also cov_NAME1_NAME2. Without measurement noise")
+  command
+      ->add_option("--cov", arguments->covariance, "none; std: NAME_std; full: also cov_NAME1_NAME2. Without measurement noise")
       ->check(CLI::IsMember({"none", "std", "full"}))
       ->capture_default_str();
   command->add_option("--map", arguments->map, "columns by other names, LOGNAME=MODELNAME,…");

@@ -25,7 +25,8 @@ std::string matrix_text(const std::vector<std::vector<Expression>>& rows) {
   std::string out;
   for (const auto& row : rows) {
     out += "  [";
-    for (std::size_t j = 0; j < row.size(); ++j) out += fmt::format("{}{:<{}}", j == 0 ? " " : "   ", to_string(row[j]), widths[j]);
+    for (std::size_t j = 0; j < row.size(); ++j)
+      out += fmt::format("{}{:<{}}", j == 0 ? " " : "   ", to_string(row[j]), widths[j]);
     out += " ]\n";
   }
   return out.empty() ? "  (no rows)\n" : out;
@@ -43,14 +44,15 @@ std::string matrix_latex(const char* name, const std::vector<std::vector<Express
 
 void print_latex(const SymbolicSystem::Definition& definition, const std::vector<std::vector<Expression>>& A,
                  const std::vector<std::vector<Expression>>& b, const std::vector<std::vector<Expression>>& F) {
-  fmt::print("\\begin{{align*}}\n{}\\\\\n{}\\\\\n{}\\\\\n{}\\end{{align*}}\n", matrix_latex("M", definition.mass), matrix_latex("F", F),
-             matrix_latex("A", A), matrix_latex("b", b));
+  fmt::print("\\begin{{align*}}\n{}\\\\\n{}\\\\\n{}\\\\\n{}\\end{{align*}}\n", matrix_latex("M", definition.mass),
+             matrix_latex("F", F), matrix_latex("A", A), matrix_latex("b", b));
 }
 
-void print_text(const ModelFile& model, const std::vector<std::vector<Expression>>& A, const std::vector<std::vector<Expression>>& b,
-                const std::vector<std::vector<Expression>>& F) {
+void print_text(const ModelFile& model, const std::vector<std::vector<Expression>>& A,
+                const std::vector<std::vector<Expression>>& b, const std::vector<std::vector<Expression>>& F) {
   const SymbolicSystem& system = *model.system;
-  fmt::print("{}\n  {} coordinates, {} inputs, {} constraints\n", system.name(), system.nq(), system.inputs().size(), system.nc());
+  fmt::print("{}\n  {} coordinates, {} inputs, {} constraints\n", system.name(), system.nq(), system.inputs().size(),
+             system.nc());
   fmt::print("\nmass matrix M\n{}", matrix_text(system.definition().mass));
   fmt::print("\nknown force F\n{}", matrix_text(F));
   fmt::print("\nconstraints A ddq = b\n");

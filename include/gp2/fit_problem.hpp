@@ -15,15 +15,15 @@ namespace gp2 {
 
 /// What a person asks of a fit beyond the model and the log.
 struct FitProblemOptions {
-  std::map<std::string, std::string> columns;        // model's name -> log's name, before the model's own [columns]
-  std::vector<std::string> observe;                  // accelerations to observe; empty: all of them
+  std::map<std::string, std::string> columns;  // model's name -> log's name, before the model's own [columns]
+  std::vector<std::string> observe;            // accelerations to observe; empty: all of them
   Prior::Mean mean = Prior::Mean::zero;
   std::optional<Latent::Base> base;                  // replaces the directions of the model's latent
   std::optional<std::vector<std::string>> estimate;  // parameters; not given: those the model wants estimated
   std::optional<double> noise_stddev;                // for every observed row; not given: the model's [noise]
   bool estimate_noise = false;
   Protocol protocol;
-  std::optional<int> max_points;                     // the first of a shuffle by `seed`
+  std::optional<int> max_points;  // the first of a shuffle by `seed`
   std::uint64_t seed = 0;
 };
 

@@ -74,7 +74,7 @@ struct PriorOptions {
   bool raw_angles = false;           // a feature that is an angle stays as it is instead of its sine and cosine
 };
 
-/// The prior of a model file.
+/// The prior of a model file. Not to be called from several threads for one model: its expression graph grows.
 /// @throws InputError when a kernel or feature is wrong, or `base` is asked for and the model has several latents.
 Prior make_prior(const ModelFile& model, const PriorOptions& options = {});
 

@@ -11,9 +11,9 @@
 
 namespace gp2 {
 
-/// A prior conditioned on observations (Geist & Trimpe 2020, eq. 7 and 8, through the reduced form of likelihood.hpp). Every quantity
-/// is noise-free: the latent one, not the next measurement. Projections are applied last, so constrained means obey A ddq = b, and
-/// their covariances A Σ Aᵀ = 0, to rounding. Immutable, cheap to copy, thread-safe.
+/// A prior conditioned on observations (Geist & Trimpe 2020, eq. 6 and 7 under the prior of eq. 8, through the reduced form of
+/// likelihood.hpp). Every quantity is noise-free: the latent one, not the next measurement. Projections are applied last, so
+/// constrained means obey A ddq = b, and their covariances A Σ Aᵀ = 0, to rounding. Immutable, cheap to copy, thread-safe.
 class Posterior {
  public:
   /// @throws InputError when M is not positive definite or the constraints contradict each other at an observed state.

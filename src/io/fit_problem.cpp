@@ -33,8 +33,8 @@ void check_columns(const System& system, const CsvTable& log, const std::map<std
   for (const std::string& name : all_accelerations(system)) known.push_back(name);
   for (const auto& [name, column] : columns) {
     if (std::find(known.begin(), known.end(), name) == known.end()) {
-      throw InputError(fmt::format("--map {}={}: '{}' is neither a state nor an acceleration of '{}'; it has: {}", column, name, name,
-                                   system.name(), fmt::join(known, ", ")));
+      throw InputError(fmt::format("--map {}={}: '{}' is neither a state nor an acceleration of '{}'; it has: {}", column, name,
+                                   name, system.name(), fmt::join(known, ", ")));
     }
     // a log may lack a coordinate that nothing reads, but then it has the coordinate's derivatives
     std::vector<std::string> meant = {column};
@@ -58,8 +58,9 @@ void note_reading(const LogReader& reader, const CsvTable& log, std::vector<std:
 void note_violation(const System& system, const MatrixXd& states, const CsvTable& log, std::vector<std::string>& notes) {
   const auto violation = largest_violation(system, states, system.parameter_values());
   if (!violation || violation->relative <= constraint_violation_tolerance) return;
-  notes.push_back(fmt::format("warning: {}: states are off the constraint: '{}' is {:.3g} at data row {}, {:.1e} of its scale; see gp2 check",
-                              log.name(), violation->constraint, violation->value, violation->state + 1, violation->relative));
+  notes.push_back(
+      fmt::format("warning: {}: states are off the constraint: '{}' is {:.3g} at data row {}, {:.1e} of its scale; see gp2 check",
+                  log.name(), violation->constraint, violation->value, violation->state + 1, violation->relative));
 }
 
 // columns a prior needs, and those that only tell whether a state is on the constraint
@@ -105,9 +106,10 @@ VectorXd noise_of(const ModelFile& model, const FitProblemOptions& options, cons
     } else if (estimate) {
       stddev[k] = 0.05 * (spread[k] > 0 ? spread[k] : 1);
     } else {
-      throw InputError(fmt::format("{}: the noise of {} is not known: write [noise] ddq = … in the model, or give --noise-std S or "
-                                   "--noise-std estimate",
-                                   model.name, name));
+      throw InputError(
+          fmt::format("{}: the noise of {} is not known: write [noise] ddq = … in the model, or give --noise-std S or "
+                      "--noise-std estimate",
+                      model.name, name));
     }
     if (!(stddev[k] > 0) || !std::isfinite(stddev[k])) {
       throw InputError(fmt::format("{}: the noise standard deviation of {} must be positive, got {}", source, name, stddev[k]));
@@ -116,9 +118,10 @@ VectorXd noise_of(const ModelFile& model, const FitProblemOptions& options, cons
     const double smallest =
         spread[k] * std::sqrt(static_cast<double>(group.n_data()) * std::numeric_limits<double>::epsilon() / 0.01);
     if (!estimate && stddev[k] < smallest) {
-      throw InputError(fmt::format("{}: the noise standard deviation {} of {} is too small for double precision beside a spread "
-                                   "of {:.3g}; the smallest usable value is {:.2g}",
-                                   source, stddev[k], name, spread[k], smallest));
+      throw InputError(
+          fmt::format("{}: the noise standard deviation {} of {} is too small for double precision beside a spread "
+                      "of {:.3g}; the smallest usable value is {:.2g}",
+                      source, stddev[k], name, spread[k], smallest));
     }
   }
   return stddev;
@@ -136,7 +139,8 @@ std::vector<int> acceleration_rows(const System& system, const std::vector<std::
                                    fmt::join(known, ", ")));
     }
     const int row = static_cast<int>(found - known.begin());
-    if (std::find(rows.begin(), rows.end(), row) != rows.end()) throw InputError(fmt::format("{}: '{}' stands twice", option, name));
+    if (std::find(rows.begin(), rows.end(), row) != rows.end())
+      throw InputError(fmt::format("{}: '{}' stands twice", option, name));
     rows.push_back(row);
   }
   return rows;
@@ -186,9 +190,10 @@ FitProblem make_fit_problem(const ModelFile& model, const CsvTable& log, const F
     if (independent && observed.size() > independent->size()) {
       std::vector<std::string> names;
       for (int row : *independent) names.push_back(every[static_cast<std::size_t>(row)]);
-      problem.notes.push_back(fmt::format("warning: {}: the accelerations obey A ddq = b to rounding: they are not {} independent "
-                                          "measurements but {}; observe independent rows only, say --observe {}",
-                                          log.name(), every.size(), independent->size(), fmt::join(names, ",")));
+      problem.notes.push_back(
+          fmt::format("warning: {}: the accelerations obey A ddq = b to rounding: they are not {} independent "
+                      "measurements but {}; observe independent rows only, say --observe {}",
+                      log.name(), every.size(), independent->size(), fmt::join(names, ",")));
     }
   }
   const std::vector<int> rows = chosen_rows(log.n_rows(), options.max_points.value_or(log.n_rows()), options.seed);

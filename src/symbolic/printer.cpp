@@ -99,6 +99,13 @@ bool starts_with_number(Expression e) {
   return e.is_constant();
 }
 
+/// Whether c*e, written without parentheses, reads back to c·e: e = u·v·… whose first factor is neither a quotient nor a number.
+bool continues_product(Expression e) {
+  if (e.operation() != Operation::multiply) return false;
+  while (e.operation() == Operation::multiply) e = e.left();
+  return e.operation() != Operation::divide && !e.is_constant();
+}
+
 /// e in terms of its operands.
 Written write(Expression e, Notation notation) {
   const bool latex = notation == Notation::latex;
@@ -124,7 +131,7 @@ Written write(Expression e, Notation notation) {
     case Operation::multiply: {
       const char* const times = !latex ? "*" : starts_with_number(e.right()) ? " \\cdot " : " \\, ";
       // c*u*v reads back as c·(u·v), and in LaTeX no one asks which product came first; C computes from the left
-      const bool plain_chain = latex || (!c && e.left().is_constant() && e.right().operation() == Operation::multiply);
+      const bool plain_chain = latex || (!c && e.left().is_constant() && continues_product(e.right()));
       return {{{e.left(), in_product}, times, {e.right(), plain_chain ? in_product : in_power}}, in_product};
     }
     case Operation::divide:

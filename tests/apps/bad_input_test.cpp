@@ -49,26 +49,45 @@ const std::string constraint = R"(position = ["p1*q1^2 + p2*q2^2 + p3*q1*q2 + p4
 
 const std::vector<BadInput> bad_inputs = {
     // the model
-    {"UnknownSymbol", model_with(R"("u2", "u3 - m*g")", R"("ux2", "u3 - m*g")"), fit_line,
+    {"UnknownSymbol",
+     model_with(R"("u2", "u3 - m*g")", R"("ux2", "u3 - m*g")"),
+     fit_line,
      {"model.toml:20", "mechanics.force entry 2", "unknown symbol 'ux2'", "did you mean 'u2'"}},
-    {"MassMatrixOfWrongShape", model_with(mass, R"(mass = [["m", "0"], ["0", "m"]])"), fit_line,
+    {"MassMatrixOfWrongShape",
+     model_with(mass, R"(mass = [["m", "0"], ["0", "m"]])"),
+     fit_line,
      {"model.toml:19", "mechanics.mass", "expected 3 rows", "got 2"}},
-    {"MassMatrixNotSymmetric", model_with(mass, R"(mass = [["m", "0.1", "0"], ["0", "m", "0"], ["0", "0", "m"]])"), fit_line,
+    {"MassMatrixNotSymmetric",
+     model_with(mass, R"(mass = [["m", "0.1", "0"], ["0", "m", "0"], ["0", "0", "m"]])"),
+     fit_line,
      {"model.toml:19", "mechanics.mass", "not symmetric", "'0.1'", "write the same on both sides"}},
-    {"MassMatrixNotPositiveDefinite", model_with(mass, R"(mass = [["q1 + 1.5", "0", "0"], ["0", "m", "0"], ["0", "0", "m"]])"), fit_line,
+    {"MassMatrixNotPositiveDefinite",
+     model_with(mass, R"(mass = [["q1 + 1.5", "0", "0"], ["0", "m", "0"], ["0", "0", "m"]])"),
+     fit_line,
      {"train.csv: data row ", "mass matrix M is not positive definite", "gp2 check"}},
-    {"AccelerationRowNotLinear", model_with(constraint, R"(acceleration = ["ddq1^2 - ddq2"])"), fit_line,
+    {"AccelerationRowNotLinear",
+     model_with(constraint, R"(acceleration = ["ddq1^2 - ddq2"])"),
+     fit_line,
      {"model.toml:23", "constraints.acceleration entry 1", "linear", "'ddq1'"}},
-    {"ContradictingConstraints", model_with(constraint, R"(acceleration = ["ddq1 - q2", "ddq1 - q2 - 1"])"), fit_line,
+    {"ContradictingConstraints",
+     model_with(constraint, R"(acceleration = ["ddq1 - q2", "ddq1 - q2 - 1"])"),
+     fit_line,
      {"train.csv: data row 1", "contradict each other"}},
-    {"NoiseOfZeroInTheModel", model_with("ddq = 0.1", "ddq = 0"), fit_line, {"model.toml:32", "noise.ddq", "must be positive", "got 0"}},
-    {"NoiseTooSmallInTheModel", model_with("ddq = 0.1", "ddq = 1e-12"), fit_line,
+    {"NoiseOfZeroInTheModel",
+     model_with("ddq = 0.1", "ddq = 0"),
+     fit_line,
+     {"model.toml:32", "noise.ddq", "must be positive", "got 0"}},
+    {"NoiseTooSmallInTheModel",
+     model_with("ddq = 0.1", "ddq = 1e-12"),
+     fit_line,
      {"model.toml: [noise] ddq", "1e-12", "too small for double precision", "smallest usable value"}},
     {"NoNoiseAnywhere", model_with("ddq = 0.1", ""), fit_line, {"model.toml", "noise of ddq1 is not known", "--noise-std"}},
     {"NotToml", model_with("[mechanics]", "[mechanics"), fit_line, {"model.toml:18"}},
     {"ModelAbsent", nothing, "gp2 fit absent.toml --data train.csv -o old.json", {"absent.toml: cannot be read"}},
     // the log
-    {"MissingColumn", log_with([](const std::string& log) { return replaced(log, ",dq2,", ",other,"); }), fit_line,
+    {"MissingColumn",
+     log_with([](const std::string& log) { return replaced(log, ",dq2,", ",other,"); }),
+     fit_line,
      {"train.csv", "missing column 'dq2'", "looked for dq2, qd2", "other", "--map LOGNAME=dq2"}},
     {"CellNotANumber", log_with_cell(5, "1.2.3"), fit_line, {"train.csv:5", "column 'q1'", "'1.2.3' is not a finite number"}},
     {"CellNan", log_with_cell(4, "NaN"), fit_line, {"train.csv:4", "column 'q1'", "'NaN' is not a finite number"}},
@@ -76,12 +95,17 @@ const std::vector<BadInput> bad_inputs = {
     {"CellEmpty", log_with_cell(2, ""), predict_line, {"train.csv:2", "column 'q1'", "the cell is empty"}},
     {"RaggedRow", log_with_cell(6, "1,2"), fit_line, {"train.csv:6", "ragged row: 13 cells", "12 columns"}},
     {"EmptyFile", log_with([](const std::string&) { return ""; }), fit_line, {"train.csv", "the file is empty"}},
-    {"NoRows", log_with([](const std::string& log) { return log.substr(0, log.find('\n') + 1); }), fit_line, {"train.csv", "no data rows"}},
-    {"Semicolons", log_with([](std::string log) {
+    {"NoRows",
+     log_with([](const std::string& log) { return log.substr(0, log.find('\n') + 1); }),
+     fit_line,
+     {"train.csv", "no data rows"}},
+    {"Semicolons",
+     log_with([](std::string log) {
        std::replace(log.begin(), log.end(), ',', ';');
        return log;
      }),
-     fit_line, {"train.csv:1", "not separated by commas but by ';'"}},
+     fit_line,
+     {"train.csv:1", "not separated by commas but by ';'"}},
     {"LogAbsent", nothing, "gp2 fit model.toml --data absent.csv -o old.json", {"absent.csv: cannot be read"}},
     // options
     {"NoiseTooSmall", nothing, fit_line + " --noise-std 1e-12", {"--noise-std", "1e-12", "too small", "smallest usable value"}},
@@ -89,23 +113,34 @@ const std::vector<BadInput> bad_inputs = {
     {"ObserveUnknown", nothing, fit_line + " --observe ddq1,ddq4", {"--observe", "'ddq4'", "it has: ddq1, ddq2, ddq3"}},
     {"ObserveTwice", nothing, fit_line + " --observe ddq1,ddq1", {"--observe", "'ddq1' stands twice"}},
     {"OutputsUnknown", nothing, "gp2 evaluate fit.json --data train.csv --outputs ddq4", {"--outputs", "'ddq4'"}},
-    {"FolderAbsent", nothing, "gp2 fit model.toml --data train.csv -o absent/fit.json", {"absent/fit.json", "no folder 'absent'"}},
+    {"FolderAbsent",
+     nothing,
+     "gp2 fit model.toml --data train.csv -o absent/fit.json",
+     {"absent/fit.json", "no folder 'absent'"}},
     {"OutputIsAFolder", nothing, "gp2 predict fit.json --states train.csv -o models", {"models: cannot be written"}},
     {"GenerateNone", nothing, "gp2 generate model.toml --n 0 -o old.csv", {"--n: must be positive, got 0"}},
-    {"GenerateNegativeNoise", nothing, "gp2 generate model.toml --n 5 --noise-std -1 -o old.csv", {"--noise-std", "negative, got -1"}},
+    {"GenerateNegativeNoise",
+     nothing,
+     "gp2 generate model.toml --n 5 --noise-std -1 -o old.csv",
+     {"--noise-std", "negative, got -1"}},
     {"GenerateWithoutTruth", model_with("[truth]", "[unused]"), "gp2 generate model.toml --n 5 -o old.csv", {"model.toml"}},
     // the fit
     {"FitOfANewerFormat",
      [](const Desk& desk) { desk.write("fit.json", replaced(desk.read("fit.json"), R"("version": 1)", R"("version": 99)")); },
-     predict_line, {"fit.json", "format 99", "use a newer gp2"}},
+     predict_line,
+     {"fit.json", "format 99", "use a newer gp2"}},
     {"FitCutShort",
      [](const Desk& desk) { desk.write("fit.json", desk.read("fit.json").substr(0, 3000)); },
-     predict_line, {"fit.json", "cut short", "gp2 fit"}},
+     predict_line,
+     {"fit.json", "cut short", "gp2 fit"}},
     {"FitCutShortWhenEvaluated",
      [](const Desk& desk) { desk.write("fit.json", desk.read("fit.json").substr(0, 3000)); },
-     "gp2 evaluate fit.json --data train.csv --json", {"fit.json", "cut short"}},
+     "gp2 evaluate fit.json --data train.csv --json",
+     {"fit.json", "cut short"}},
     {"NotAFit", nothing, "gp2 predict other.json --states train.csv -o old.csv", {"other.json", "not a fit"}},
-    {"PredictMissingColumn", log_with([](const std::string& log) { return replaced(log, ",u3,", ",other,"); }), predict_line,
+    {"PredictMissingColumn",
+     log_with([](const std::string& log) { return replaced(log, ",u3,", ",other,"); }),
+     predict_line,
      {"train.csv", "missing column 'u3'"}},
 };
 
@@ -140,13 +175,8 @@ TEST_P(BadInputTo, IsRefusedWithItsPlaceAndItsMend) {
 
 INSTANTIATE_TEST_SUITE_P(TheCommand, BadInputTo, testing::ValuesIn(bad_inputs), [](const auto& one) { return one.param.name; });
 
-// A log whose columns are read by name says which row of the file is at fault, also where --max-points has shuffled it.
-TEST(BadRow, IsNamedByItsPlaceInTheLogAlsoAfterAShuffle) {
-  const Desk desk;
-  std::string csv = "q1,q2,ddq1,ddq2\n";
-  for (int row = 1; row <= 20; ++row) csv += (row == 13 ? "-1" : "1") + std::string(",0,0.1,0\n");
-  desk.write("log.csv", csv);
-  desk.write("model.toml", R"(
+/// A mass that is negative where q1 is.
+constexpr const char* variable_mass = R"(
 name = "particle"
 coordinates = ["q1", "q2"]
 [mechanics]
@@ -161,17 +191,41 @@ features = ["q1", "q2"]
 directions = "acceleration"
 [noise]
 ddq = 0.1
-)");
+)";
+
+TEST(BadRow, IsNamedByItsPlaceInTheLogAlsoAfterAShuffle) {
+  const Desk desk;
+  std::string csv = "q1,q2,ddq1,ddq2\n";
+  for (int row = 1; row <= 20; ++row) csv += (row == 13 ? "-1" : "1") + std::string(",0,0.1,0\n");
+  desk.write("log.csv", csv);
+  desk.write("model.toml", variable_mass);
   int n_refused = 0;
   for (int seed = 0; seed < 6; ++seed) {
-    const Outcome outcome =
-        desk.run("gp2 fit model.toml --data log.csv --max-points 10 --max-iterations 0 -o fit.json --seed " + std::to_string(seed));
+    const Outcome outcome = desk.run("gp2 fit model.toml --data log.csv --max-points 10 --max-iterations 0 -o fit.json --seed " +
+                                     std::to_string(seed));
     if (outcome.status == 0) continue;
     EXPECT_THAT(outcome.err, HasSubstr("log.csv: data row 13: the mass matrix M is not positive definite"));
     ++n_refused;
   }
   EXPECT_GT(n_refused, 0);
   EXPECT_LT(n_refused, 6);
+}
+
+TEST(BadRow, IsNamedWhenPredictionsFailThere) {
+  const Desk desk;
+  desk.write("model.toml", variable_mass);
+  desk.write("log.csv", "q1,q2,ddq1,ddq2\n1,0,0.1,0\n2,0,0.3,0\n3,0,0.2,0\n");
+  desk.done("gp2 fit model.toml --data log.csv --max-iterations 0 -o fit.json");
+  desk.write("states.csv", "q1,q2,ddq1,ddq2\n1,0,0.1,0\n-2,0,0.3,0\n");
+  for (const char* line : {"gp2 predict fit.json --states states.csv -o prediction.csv",
+                           "gp2 predict fit.json --states states.csv --view unconstrained --cov full -o prediction.csv",
+                           "gp2 evaluate fit.json --data states.csv"}) {
+    const Outcome outcome = desk.run(line);
+    EXPECT_EQ(outcome.status, 2);
+    EXPECT_THAT(outcome.err, HasSubstr("states.csv: "));
+    EXPECT_THAT(outcome.err, HasSubstr("the mass matrix M is not positive definite at state 2 (q1 = -2"));
+    EXPECT_FALSE(desk.has("prediction.csv"));
+  }
 }
 
 }  // namespace

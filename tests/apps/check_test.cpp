@@ -32,7 +32,8 @@ TEST(Check, WarnsOfAccelerationsThatWereComputedFromEachOther) {
   const Desk desk;
   desk.done("gp2 generate models/double_pendulum.toml --n 25 --noise-std 0 -o log.csv");
   const Outcome checked = desk.done("gp2 check models/double_pendulum.toml --data log.csv");
-  EXPECT_THAT(checked.out, testing::ContainsRegex("warning +dependent columns: the 6 accelerations .* only 2 .* --observe ddq[0-9],ddq[0-9]"));
+  EXPECT_THAT(checked.out,
+              testing::ContainsRegex("warning +dependent columns: the 6 accelerations .* only 2 .* --observe ddq[0-9],ddq[0-9]"));
   const std::string fit = "gp2 fit models/double_pendulum.toml --data log.csv --max-iterations 0 -o fit.json";
   EXPECT_THAT(desk.done(fit).err, HasSubstr("warning: log.csv: the accelerations obey A ddq = b to rounding"));
   EXPECT_THAT(desk.done(fit + " --observe ddq3,ddq6").err, Not(HasSubstr("warning")));
@@ -58,7 +59,8 @@ TEST(Check, WarnsOfStatesOffTheConstraint) {
   desk.done("gp2 fit models/surface.toml --data good.csv --max-iterations 0 -o fit.json");
   for (const char* line : {"gp2 fit models/surface.toml --data log.csv --max-iterations 0 -o other.json",
                            "gp2 predict fit.json --states log.csv -o prediction.csv", "gp2 evaluate fit.json --data log.csv"}) {
-    EXPECT_THAT(desk.done(line).err, testing::ContainsRegex("warning: log.csv: states are off the constraint: .* -?0.01 at data row 4"));
+    EXPECT_THAT(desk.done(line).err,
+                testing::ContainsRegex("warning: log.csv: states are off the constraint: .* -?0.01 at data row 4"));
   }
 }
 
@@ -77,10 +79,12 @@ std::string particle(const std::string& mass, const std::string& acceleration) {
 name = "particle"
 coordinates = ["q1", "q2"]
 [mechanics]
-mass = )" + mass + R"(
+mass = )" +
+         mass + R"(
 force = ["0", "0"]
 [constraints]
-acceleration = )" + acceleration + R"(
+acceleration = )" +
+         acceleration + R"(
 [[latent]]
 name = "force"
 kernel = "se"
@@ -98,10 +102,11 @@ TEST(Check, FailsWhereTheModelIsNotWellPosedAndSaysAtWhichState) {
     const char* name;
     std::string text, finding;
   };
-  for (const Broken& one : {Broken{"indefinite.toml", particle(R"([["q1", "0"], ["0", "1"]])", R"(["ddq2"])"),
-                                   "mass matrix M is not positive definite at state 3"},
-                            Broken{"contradiction.toml", particle(R"([["1", "0"], ["0", "1"]])", R"x(["ddq2 - q1", "ddq2 - abs(q1)"])x"),
-                                   "constraints contradict each other: no acceleration satisfies A ddq = b at state 3"}}) {
+  for (const Broken& one :
+       {Broken{"indefinite.toml", particle(R"([["q1", "0"], ["0", "1"]])", R"(["ddq2"])"),
+               "mass matrix M is not positive definite at state 3"},
+        Broken{"contradiction.toml", particle(R"([["1", "0"], ["0", "1"]])", R"x(["ddq2 - q1", "ddq2 - abs(q1)"])x"),
+               "constraints contradict each other: no acceleration satisfies A ddq = b at state 3"}}) {
     SCOPED_TRACE(one.name);
     desk.write(one.name, one.text);
     const Outcome checked = desk.run(std::string("gp2 check ") + one.name + " --data log.csv");

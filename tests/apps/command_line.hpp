@@ -35,8 +35,8 @@ class Desk {
   /// Runs a line of shell.
   Outcome run(const std::string& line) const {
     const std::string path = std::filesystem::path(GP2_COMMAND).parent_path().string();
-    const std::string script = "cd '" + folder_.path().string() + "' && PATH='" + path + "':$PATH && { " + line +
-                               "\n} >.stdout 2>.stderr </dev/null";
+    const std::string script =
+        "cd '" + folder_.path().string() + "' && PATH='" + path + "':$PATH && { " + line + "\n} >.stdout 2>.stderr </dev/null";
     const int status = std::system(script.c_str());
     if (!WIFEXITED(status)) throw std::runtime_error("not ended by itself: " + line);
     return {WEXITSTATUS(status), read(".stdout"), read(".stderr")};

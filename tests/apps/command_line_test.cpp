@@ -40,8 +40,9 @@ TEST(CommandLine, WhatIsNotKnownExitsWith2AndPointsAtTheHelp) {
   const Desk desk;
   for (const char* line :
        {"gp2", "gp2 fti", "gp2 show models/surface.toml --latx", "gp2 show", "gp2 generate models/surface.toml -o a.csv",
-        "gp2 fit models/surface.toml --data a.csv --mean gravity -o fit.json", "gp2 generate models/surface.toml --n ten -o a.csv",
-        "gp2 fit models/surface.toml --data a.csv --seed -1 -o fit.json", "gp2 show models/surface.toml models/duffing.toml"}) {
+        "gp2 fit models/surface.toml --data a.csv --mean gravity -o fit.json",
+        "gp2 generate models/surface.toml --n ten -o a.csv", "gp2 fit models/surface.toml --data a.csv --seed -1 -o fit.json",
+        "gp2 show models/surface.toml models/duffing.toml"}) {
     SCOPED_TRACE(line);
     const Outcome outcome = desk.run(line);
     EXPECT_EQ(outcome.status, 2) << outcome.err;
@@ -54,7 +55,8 @@ TEST(CommandLine, ShowPrintsTheDerivedConstraint) {
   const Desk desk;
   const Outcome text = desk.done("gp2 show models/unicycle.toml");
   EXPECT_EQ(text.err, "");
-  for (const char* part : {"mass matrix M", "known force F", "constraints A ddq = b", "sin(q3)", "parameters", "Ic", "latent", "features"}) {
+  for (const char* part :
+       {"mass matrix M", "known force F", "constraints A ddq = b", "sin(q3)", "parameters", "Ic", "latent", "features"}) {
     EXPECT_THAT(text.out, HasSubstr(part));
   }
   EXPECT_THAT(desk.done("gp2 show models/unicycle.toml --latex").out, HasSubstr("\\begin{bmatrix}"));
@@ -63,7 +65,8 @@ TEST(CommandLine, ShowPrintsTheDerivedConstraint) {
 TEST(CommandLine, JsonStandsAloneOnStdoutWithTheContractedKeys) {
   const Desk desk;
   desk.done("gp2 generate models/surface.toml --n 20 -o train.csv");
-  const Outcome fit = desk.done("gp2 fit models/surface.toml --data train.csv --max-iterations 3 --restarts 1 --json -o fit.json");
+  const Outcome fit =
+      desk.done("gp2 fit models/surface.toml --data train.csv --max-iterations 3 --restarts 1 --json -o fit.json");
   EXPECT_THAT(keys(fit.json()), ElementsAre("hyperparameters", "iterations", "nll", "seconds", "termination"));
   ASSERT_EQ(fit.json()["hyperparameters"].size(), 12u);
   for (const auto& one : fit.json()["hyperparameters"]) {

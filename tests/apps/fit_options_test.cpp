@@ -79,6 +79,19 @@ TEST_F(FitCommand, StartContinuesFromAFit) {
   EXPECT_EQ(again["hyperparameters"], first["hyperparameters"]);
 }
 
+TEST_F(FitCommand, StartMayLieOutsideTheBoundsWhereNothingIsOptimised) {
+  desk.write("far.json", R"json({"lengthscale(q2)": 500})json");
+  const std::string line = "gp2 fit models/surface.toml --data train.csv --protocol paper --start far.json --json -o fit.json";
+  EXPECT_EQ(desk.run(line).status, 2);
+  const Outcome taken = desk.done(line + " --max-iterations 0");
+  EXPECT_THAT(taken.err, HasSubstr("lengthscale(q2) = 500 is outside its bounds"));
+  EXPECT_EQ(value(taken.json(), "lengthscale(q2)"), 500);
+  EXPECT_EQ(FitFile::read(desk / "fit.json").report.hyperparameters.at(1).value, 500);
+  desk.write("negative.json", R"json({"lengthscale(q2)": -1})json");
+  EXPECT_EQ(desk.run("gp2 fit models/surface.toml --data train.csv --start negative.json --max-iterations 0 -o no.json").status,
+            2);
+}
+
 TEST_F(FitCommand, StartRefusesWhatItDoesNotKnowOrMayNotTake) {
   desk.write("unknown.json", R"json({"lengthscale(q9)": 1})json");
   EXPECT_THAT(refusal("--start unknown.json"),
@@ -92,7 +105,8 @@ TEST_F(FitCommand, StartRefusesWhatItDoesNotKnowOrMayNotTake) {
 
 TEST_F(FitCommand, MaxPointsTakesTheFirstRowsOfAShuffleBySeed) {
   const std::vector<int> order = RandomStream(7).permutation(30);
-  const Outcome outcome = desk.done("gp2 fit models/surface.toml --data train.csv --max-points 8 --seed 7 --max-iterations 0 -o fit.json");
+  const Outcome outcome =
+      desk.done("gp2 fit models/surface.toml --data train.csv --max-points 8 --seed 7 --max-iterations 0 -o fit.json");
   EXPECT_THAT(outcome.err, HasSubstr("8 of 30 rows taken, by seed 7"));
   const Observations group = FitFile::read(desk / "fit.json").observations.at(0);
   ASSERT_EQ(group.n_data(), 8);
@@ -118,7 +132,8 @@ TEST_F(FitCommand, EstimateChoosesTheParameters) {
   EXPECT_EQ(two.size(), nothing.size() + 2);
   EXPECT_TRUE(two.contains("p1") && two.contains("p5"));
   // a model that wants it, and a person who does not
-  desk.write("eager.toml", replaced(desk.read("models/surface.toml"), "bounds = [0.04, 0.16]", "bounds = [0.04, 0.16], estimate = true"));
+  desk.write("eager.toml",
+             replaced(desk.read("models/surface.toml"), "bounds = [0.04, 0.16]", "bounds = [0.04, 0.16], estimate = true"));
   const std::string line = "gp2 fit eager.toml --data train.csv --max-iterations 0 --json -o fit.json";
   EXPECT_TRUE(names(desk.done(line).json()).contains("p1"));
   EXPECT_EQ(names(desk.done(line + " --estimate none").json()), nothing);
@@ -203,8 +218,8 @@ TEST_F(FitCommand, MapBringsTheDerivativesAlong) {
 }
 
 TEST_F(FitCommand, MapRefusesNamesThatNobodyHas) {
-  EXPECT_THAT(refusal("--map height=q3"), testing::AllOf(HasSubstr("--map height=q3"), HasSubstr("train.csv has no column 'height'"),
-                                                         HasSubstr("q1, q2, q3")));
+  EXPECT_THAT(refusal("--map height=q3"), testing::AllOf(HasSubstr("--map height=q3"),
+                                                         HasSubstr("train.csv has no column 'height'"), HasSubstr("q1, q2, q3")));
   EXPECT_THAT(refusal("--map q3=theta9"), testing::AllOf(HasSubstr("--map q3=theta9"), HasSubstr("'theta9' is neither")));
   EXPECT_THAT(refusal("--map q3"), HasSubstr("'q3' is not LOGNAME=MODELNAME"));
   EXPECT_THAT(refusal("--map q3=q1,q2=q1"), HasSubstr("'q1' is given two columns"));

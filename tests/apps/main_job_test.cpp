@@ -54,8 +54,8 @@ class MainJob : public testing::Test {
 TEST_F(MainJob, PredictsEveryRowInOrderAfterTheInputColumns) {
   desk.done("gp2 predict fit.json --states test.csv -o prediction.csv");
   const CsvTable test = desk.table("test.csv"), prediction = desk.table("prediction.csv");
-  EXPECT_THAT(prediction.header(), ElementsAre("q1", "q2", "q3", "dq1", "dq2", "dq3", "u1", "u2", "u3", "ddq1_input", "ddq2_input",
-                                               "ddq3_input", "ddq1", "ddq2", "ddq3"));
+  EXPECT_THAT(prediction.header(), ElementsAre("q1", "q2", "q3", "dq1", "dq2", "dq3", "u1", "u2", "u3", "ddq1_input",
+                                               "ddq2_input", "ddq3_input", "ddq1", "ddq2", "ddq3"));
   ASSERT_EQ(prediction.n_rows(), test.n_rows());
   for (int i = 0; i < test.n_rows(); ++i) {
     for (int column = 0; column < test.n_columns(); ++column) EXPECT_EQ(prediction.cell(i, column), test.cell(i, column));
@@ -73,7 +73,8 @@ TEST_F(MainJob, WritesTheLibrarysDoublesToTheLastBit) {
   const Posterior::Marginal expected = in.fit.posterior().marginal(view, in.states);
   EXPECT_EQ(columns(prediction, outputs), expected.mean);
   EXPECT_EQ(columns(prediction, {"ddq1_std", "ddq2_std", "ddq3_std"}), expected.stddev());
-  EXPECT_EQ(columns(prediction, {"cov_ddq1_ddq1", "cov_ddq1_ddq2", "cov_ddq1_ddq3"}), expected.covariance(std::vector{0, 3, 6}, Eigen::all));
+  EXPECT_EQ(columns(prediction, {"cov_ddq1_ddq1", "cov_ddq1_ddq2", "cov_ddq1_ddq3"}),
+            expected.covariance(std::vector{0, 3, 6}, Eigen::all));
   EXPECT_EQ(columns(prediction, {"cov_ddq2_ddq2", "cov_ddq2_ddq3"}), expected.covariance(std::vector{4, 7}, Eigen::all));
   EXPECT_EQ(columns(prediction, {"cov_ddq3_ddq3"}), expected.covariance(std::vector{8}, Eigen::all));
   // the shortest form that reads back to the same double
@@ -139,7 +140,6 @@ TEST_F(MainJob, PredictsWhereOnlyTheStateIsKnown) {
   desk.write("state.csv", csv);
   EXPECT_EQ(desk.run("gp2 predict fit.json --states state.csv -o prediction.csv").status, 0);
 }
-
 
 double average_log_density(const MatrixXd& error, const MatrixXd& stddev) {
   return (0.5 * (error.array() / stddev.array()).square() + stddev.array().log() + 0.5 * std::log(2 * std::numbers::pi)).mean();

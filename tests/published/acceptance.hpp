@@ -69,6 +69,8 @@ inline double median(std::vector<double> values) {
   return values.size() % 2 == 1 ? values[half] : (values[half - 1] + values[half]) / 2;
 }
 
-inline nlohmann::json reference_json(const std::string& name) { return nlohmann::json::parse(std::ifstream(reference_file(name))); }
+inline nlohmann::json reference_json(const std::string& name) {
+  return nlohmann::json::parse(std::ifstream(reference_file(name)));
+}
 
 }  // namespace gp2::test

@@ -12,7 +12,7 @@ namespace {
 struct Promise {
   std::string system;
   Prior::Mean mean;
-  double error;          // rmse_normalised, of the mean over published runs and of the median over new data sets
+  double error;            // rmse_normalised, of the mean over published runs and of the median over new data sets
   double published_worst;  // of a published run; 0: not promised
 };
 
@@ -71,14 +71,12 @@ TEST_P(DefaultProtocol, HasNoBadOptimumAmongTwentyNewDataSets) {
   }
 }
 
-INSTANTIATE_TEST_SUITE_P(OfEverySystem, DefaultProtocol,
-                         testing::Values(Promise{"surface", Prior::Mean::zero, 0.035, 0},
-                                         Promise{"unicycle", Prior::Mean::zero, 0.031, 0},
-                                         Promise{"duffing", Prior::Mean::zero, 0.0008, 0},
-                                         Promise{"surface", Prior::Mean::force, 0.025, 0},
-                                         Promise{"unicycle", Prior::Mean::force, 0.027, 0.035},
-                                         Promise{"duffing", Prior::Mean::force, 0.0010, 0}),
-                         promise_name);
+INSTANTIATE_TEST_SUITE_P(
+    OfEverySystem, DefaultProtocol,
+    testing::Values(Promise{"surface", Prior::Mean::zero, 0.035, 0}, Promise{"unicycle", Prior::Mean::zero, 0.031, 0},
+                    Promise{"duffing", Prior::Mean::zero, 0.0008, 0}, Promise{"surface", Prior::Mean::force, 0.025, 0},
+                    Promise{"unicycle", Prior::Mean::force, 0.027, 0.035}, Promise{"duffing", Prior::Mean::force, 0.0010, 0}),
+    promise_name);
 
 }  // namespace
 }  // namespace gp2::test

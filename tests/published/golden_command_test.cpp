@@ -64,7 +64,8 @@ TEST_P(GoldenCommand, ReproducesLikelihoodsAndPredictions) {
         desk.done(fmt::format("gp2 fit {} --data '{}' --protocol paper --mean {} --estimate {} --noise-std {} --start start.json "
                               "--max-iterations 0 --json -o fit.json",
                               model_of(system), reference_file(golden["train_csv"].get<std::string>()).string(),
-                              with_mean ? "force" : "zero", estimated.empty() ? "none" : fmt::format("{}", fmt::join(estimated, ",")),
+                              with_mean ? "force" : "zero",
+                              estimated.empty() ? "none" : fmt::format("{}", fmt::join(estimated, ",")),
                               golden["theta"]["noise_std"][0].get<double>()))
             .json();
     double jacobian = 0;

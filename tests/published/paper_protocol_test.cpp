@@ -45,8 +45,9 @@ TEST_P(PaperProtocol, ReachesTheConvergedOptimaOfThePublishedRuns) {
   std::vector<double> ours, theirs;  // errors of the runs that ended in the same optimum
   for (int run = 0; run < 5; ++run) {
     SCOPED_TRACE(fmt::format("{} {} run {}", variant.system, variant.name, run));
-    const Score result = score(model(model_of(variant.system)), reference_file(fmt::format("train/{}_run{}.csv", variant.system, run)),
-                               reference_file("grid/" + variant.system + "_grid.csv"), options, 20);
+    const Score result =
+        score(model(model_of(variant.system)), reference_file(fmt::format("train/{}_run{}.csv", variant.system, run)),
+              reference_file("grid/" + variant.system + "_grid.csv"), options, 20);
     const nlohmann::json& known = converged.at(static_cast<std::size_t>(run));
     ASSERT_EQ(known["run"], run);
     const double lower_by = known["nll"].get<double>() - result.normalised_likelihood(100);
@@ -72,9 +73,10 @@ TEST(PaperProtocolCommand, IsTheLibrarys) {
   if (const auto absent = why_reference_is_absent()) GTEST_SKIP() << *absent;
   const Desk desk;
   const auto train = reference_file("train/unicycle_run0.csv"), grid = reference_file("grid/unicycle_grid.csv");
-  const nlohmann::json report = desk.done("gp2 fit experiments/unicycle_published.toml --data '" + train.string() +
-                                          "' --protocol paper --mean force --estimate R,Ic --restarts 20 --threads 2 --json -o fit.json")
-                                    .json();
+  const nlohmann::json report =
+      desk.done("gp2 fit experiments/unicycle_published.toml --data '" + train.string() +
+                "' --protocol paper --mean force --estimate R,Ic --restarts 20 --threads 2 --json -o fit.json")
+          .json();
   const nlohmann::json figures = desk.done("gp2 evaluate fit.json --data '" + grid.string() + "' --json").json();
   FitProblemOptions options;
   options.mean = Prior::Mean::force;

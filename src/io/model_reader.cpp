@@ -1,0 +1,527 @@
+#include "io/model_reader.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <optional>
+#include <set>
+
+#include <fmt/format.h>
+#include <fmt/ranges.h>
+
+#include "gp2/error.hpp"
+#include "io/name_order.hpp"
+#include "io/toml_reader.hpp"
+#include "training/random.hpp"
+
+namespace gp2 {
+
+using Level = ConstraintRow::Level;
+
+/// Reads the tables of a model file one after the other; every complaint carries file, line and key.
+class ModelReader : private TomlReader {
+ public:
+  ModelReader(const toml::table& root, ModelFile& model) : TomlReader(model.name), root_(root), model_(model) {}
+
+  void read() {
+    only_keys(root_, "",
+              {"name", "coordinates", "inputs", "parameters", "let", "mechanics", "constraints", "latent", "noise", "truth",
+               "sampling", "columns"});
+    definition_.graph = std::make_shared<ExpressionGraph>();
+    definition_.name = root_.contains("name") ? text(*root_.get("name"), "name") : model_.name;
+    read_coordinates();
+    read_inputs();
+    read_parameters();
+    declare_symbols();
+    read_let();
+    read_mechanics();
+    read_constraints();
+    model_.system = std::make_shared<const SymbolicSystem>(definition_);
+    check_mass_symmetry();
+    read_latents();
+    read_noise();
+    read_truth();
+    read_sampling();
+    read_columns();
+  }
+
+ private:
+  // an expression given as text or as a number
+  Expression expression(const toml::node& node, const std::string& key) const {
+    if (node.is_number()) return definition_.graph->constant(number(node, key));
+    if (!node.is_string()) fail(node, key, fmt::format("expected an expression in quotes, or a number, got {}", written(node)));
+    try {
+      return model_.expression(text(node, key));
+    } catch (const InputError& error) {
+      fail(node, key, fmt::format("\"{}\", {}", shortened(text(node, key)), error.what()));
+    }
+  }
+
+  void declare(const std::string& name, const toml::node& node, const std::string& key) {
+    static const std::set<std::string> reserved = {"pi",   "sin",  "cos", "tan", "asin", "acos", "atan", "atan2", "sinh",
+                                                   "cosh", "tanh", "exp", "log", "sqrt", "abs",  "sign", "min",   "max"};
+    if (!is_identifier(name)) {
+      fail(node, key, fmt::format("'{}' is not a name: use letters, digits and _, beginning with a letter", name));
+    }
+    if (reserved.contains(name)) fail(node, key, fmt::format("'{}' is the name of a function or constant; choose another", name));
+    if (!names_.insert(name).second) fail(node, key, fmt::format("the name '{}' is taken already; choose another", name));
+  }
+
+  void read_coordinates() {
+    if (!root_.contains("coordinates")) fail(1, "coordinates", R"(missing; write coordinates = ["q1", "q2"])");
+    const toml::node& node = *root_.get("coordinates");
+    names_.insert("t");
+    for (const toml::node& entry : array(node, "coordinates")) {
+      Coordinate coordinate;
+      if (entry.is_table()) {
+        only_keys(*entry.as_table(), "coordinates", {"name", "angle"});
+        if (!entry.as_table()->contains("name")) fail(entry, "coordinates", R"(expected { name = "q1", angle = true })");
+        coordinate.name = text(*entry.as_table()->get("name"), "coordinates.name");
+        if (entry.as_table()->contains("angle")) coordinate.angle = boolean(*entry.as_table()->get("angle"), "coordinates.angle");
+      } else {
+        coordinate.name = text(entry, "coordinates");
+      }
+      declare(coordinate.name, entry, "coordinates");
+      declare(coordinate.velocity(), entry, "coordinates");
+      declare(coordinate.acceleration(), entry, "coordinates");
+      definition_.coordinates.push_back(coordinate);
+    }
+    if (definition_.coordinates.empty()) fail(node, "coordinates", "a system needs at least one coordinate");
+  }
+
+  void read_inputs() {
+    if (!root_.contains("inputs")) return;
+    for (const toml::node& entry : array(*root_.get("inputs"), "inputs")) {
+      definition_.inputs.push_back(text(entry, "inputs"));
+      declare(definition_.inputs.back(), entry, "inputs");
+    }
+  }
+
+  void read_parameters() {
+    if (!root_.contains("parameters")) return;
+    for (const auto& [name, node] : entries_of(table(*root_.get("parameters"), "parameters"))) {
+      const std::string key = fmt::format("parameters.{}", name);
+      declare(name, *node, key);
+      Parameter parameter{name, 0, std::nullopt, false};
+      if (node->is_table()) {
+        const toml::table& entry = *node->as_table();
+        only_keys(entry, key, {"value", "bounds", "estimate"});
+        if (!entry.contains("value"))
+          fail(*node, key, "missing value; write { value = 1.0, bounds = [0.5, 2.0], estimate = true }");
+        parameter.value = number(*entry.get("value"), key + ".value");
+        if (entry.contains("bounds")) parameter.bounds = range(*entry.get("bounds"), key + ".bounds");
+        if (entry.contains("estimate")) parameter.estimate = boolean(*entry.get("estimate"), key + ".estimate");
+        if (parameter.bounds && (parameter.value < parameter.bounds->first || parameter.value > parameter.bounds->second)) {
+          fail(*node, key,
+               fmt::format("the value {} is outside its bounds [{}, {}]", parameter.value, parameter.bounds->first,
+                           parameter.bounds->second));
+        }
+      } else {
+        parameter.value = number(*node, key);
+      }
+      definition_.parameters.push_back(parameter);
+    }
+  }
+
+  void declare_symbols() {
+    symbols_.emplace(*definition_.graph, definition_.coordinates, definition_.inputs, definition_.parameters);
+    for (Expression symbol : symbols_->state_and_parameters()) model_.define(symbol.variable_name(), symbol);
+    for (Expression symbol : symbols_->ddq) model_.define(symbol.variable_name(), symbol);
+  }
+
+  // names may stand in any order and use each other, but not in a circle
+  void read_let() {
+    if (!root_.contains("let")) return;
+    const auto entries = entries_of(table(*root_.get("let"), "let"));
+    std::map<std::string, std::size_t> position;
+    for (const auto& [name, node] : entries) {
+      declare(name, *node, fmt::format("let.{}", name));
+      position.emplace(name, position.size());
+    }
+    std::vector<std::vector<std::size_t>> uses;
+    for (const auto& [name, node] : entries) {
+      uses.emplace_back();
+      if (!node->is_string()) continue;
+      for (const std::string& word : words_of(node->as_string()->get())) {
+        if (const auto other = position.find(word); other != position.end()) uses.back().push_back(other->second);
+      }
+    }
+    const Order order = order_by_use(uses);
+    if (!order.circle.empty()) {
+      const auto& [name, node] = entries[order.circle.front()];
+      fail(*node, fmt::format("let.{}", name), "defined in terms of itself" + circle_text(order.circle, entries));
+    }
+    for (const std::size_t k : order.positions) {
+      const auto& [name, node] = entries[k];
+      model_.define(name, expression(*node, fmt::format("let.{}", name)));
+    }
+  }
+
+  // ": a uses b uses a"
+  template <class Entries>
+  static std::string circle_text(const std::vector<std::size_t>& circle, const Entries& entries) {
+    constexpr std::size_t enough = 8;
+    std::string text = ": ";
+    for (std::size_t k = 0; k < std::min(circle.size(), enough); ++k) text += fmt::format("{} uses ", entries[circle[k]].first);
+    if (circle.size() > enough) text += "… uses ";
+    return text + entries[circle.front()].first;
+  }
+
+  void read_mechanics() {
+    const std::size_t nq = definition_.coordinates.size();
+    if (!root_.contains("mechanics")) fail(1, "mechanics", "missing; a model needs [mechanics] with mass = [[…], …]");
+    const toml::table& mechanics = table(*root_.get("mechanics"), "mechanics");
+    only_keys(mechanics, "mechanics", {"mass", "force"});
+    if (!mechanics.contains("mass")) fail(mechanics, "mechanics", "missing mass = [[…], …]");
+
+    mass_node_ = mechanics.get("mass");
+    const toml::array& rows = array(*mass_node_, "mechanics.mass");
+    if (rows.size() != nq) {
+      fail(*mass_node_, "mechanics.mass", fmt::format("expected {} rows, one per coordinate, got {}", nq, rows.size()));
+    }
+    for (std::size_t i = 0; i < nq; ++i) {
+      const std::string key = fmt::format("mechanics.mass row {}", i + 1);
+      const toml::array& entries = array(*rows.get(i), key);
+      if (entries.size() != nq) fail(entries, key, fmt::format("expected {} entries, got {}", nq, entries.size()));
+      definition_.mass.emplace_back();
+      for (std::size_t j = 0; j < nq; ++j) {
+        const std::string entry_key = fmt::format("mechanics.mass row {} column {}", i + 1, j + 1);
+        const Expression entry = expression(*entries.get(j), entry_key);
+        for (const auto* group : {&symbols_->dq, &symbols_->ddq, &symbols_->u}) {
+          allow_only(*entries.get(j), entry_key, entry, *group,
+                     "the mass matrix may depend on coordinates, t and parameters only");
+        }
+        definition_.mass.back().push_back(entry);
+      }
+    }
+
+    if (mechanics.contains("force")) {
+      const toml::node& node = *mechanics.get("force");
+      const toml::array& force = array(node, "mechanics.force");
+      if (force.size() != nq) {
+        fail(node, "mechanics.force", fmt::format("expected {} entries, one per coordinate, got {}", nq, force.size()));
+      }
+      for (std::size_t j = 0; j < nq; ++j) {
+        const std::string key = fmt::format("mechanics.force entry {}", j + 1);
+        const Expression entry = expression(*force.get(j), key);
+        allow_only(*force.get(j), key, entry, symbols_->ddq, "a force may not depend on accelerations");
+        definition_.force.push_back(entry);
+      }
+    } else {
+      definition_.force.assign(nq, definition_.graph->constant(0));
+    }
+  }
+
+  void allow_only(const toml::node& node, const std::string& key, Expression e, const std::vector<Expression>& forbidden,
+                  const char* rule) const {
+    const std::vector<std::string> used = definition_.graph->variables_of(e);
+    for (Expression symbol : forbidden) {
+      if (std::binary_search(used.begin(), used.end(), symbol.variable_name())) {
+        fail(node, key, fmt::format("{}, but this entry depends on '{}'", rule, symbol.variable_name()));
+      }
+    }
+  }
+
+  // M = Mᵀ at random points, to rounding: entries may be written differently on the two sides
+  void check_mass_symmetry() const {
+    constexpr int n_points = 10;
+    RandomStream random(1);
+    Eigen::MatrixXd points(model_.system->layout().size(), n_points);
+    for (double& value : points.reshaped()) value = 2 * random.uniform() - 1;
+    const SystemValues values = model_.system->evaluate(points, model_.system->parameter_values());
+    const auto entry = [&](Eigen::Index row, Eigen::Index column) {
+      return written(
+          *mass_node_->as_array()->get(static_cast<std::size_t>(row))->as_array()->get(static_cast<std::size_t>(column)));
+    };
+    for (int i = 0; i < n_points; ++i) {
+      const auto M = values.M(i);
+      for (Eigen::Index row = 0; row < M.rows(); ++row) {
+        for (Eigen::Index column = 0; column < row; ++column) {
+          // a positive definite M has M_rc² < M_rr M_cc
+          const double size = std::max(std::abs(M(row, column)), std::sqrt(std::abs(M(row, row) * M(column, column))));
+          if (std::abs(M(row, column) - M(column, row)) <= 1e-10 * size || !std::isfinite(size)) continue;
+          fail(*mass_node_, "mechanics.mass",
+               fmt::format("not symmetric: row {} column {} is {}, but row {} column {} is {}; write the same on both sides",
+                           column + 1, row + 1, entry(column, row), row + 1, column + 1, entry(row, column)));
+        }
+      }
+    }
+  }
+
+  void read_constraints() {
+    if (!root_.contains("constraints")) return;
+    const toml::table& constraints = table(*root_.get("constraints"), "constraints");
+    only_keys(constraints, "constraints", {"position", "velocity", "acceleration"});
+    const std::pair<const char*, Level> levels[] = {
+        {"position", Level::position}, {"velocity", Level::velocity}, {"acceleration", Level::acceleration}};
+    for (const auto& [level_name, level] : levels) {
+      if (!constraints.contains(level_name)) continue;
+      const toml::array& rows = array(*constraints.get(level_name), fmt::format("constraints.{}", level_name));
+      for (std::size_t k = 0; k < rows.size(); ++k) {
+        const toml::node& node = *rows.get(k);
+        const std::string key = fmt::format("constraints.{} entry {}", level_name, k + 1);
+        const Expression c = expression(node, key);
+        try {
+          definition_.constraints.push_back(
+              derive_constraint(level, c, node.is_string() ? text(node, key) : to_string(c), *symbols_));
+        } catch (const InputError& error) {
+          fail(node, key, error.what());
+        }
+      }
+    }
+  }
+
+  Latent::Range latent_range(const toml::table& latent, const std::string& name) const {
+    Latent::Range out;
+    if (!latent.contains(name)) return out;
+    const std::string key = "latent." + name;
+    if (!latent.get(name)->is_table()) {
+      fail(*latent.get(name), key,
+           fmt::format("expected a table such as {{ initial = 1, bounds = [0.1, 10] }}, got {}", written(*latent.get(name))));
+    }
+    const toml::table& entry = *latent.get(name)->as_table();
+    only_keys(entry, key, {"initial", "bounds"});
+    const auto require_positive = [&](const char* what, double value) {
+      if (!(value > 0)) {
+        fail(*entry.get(what), fmt::format("{}.{}", key, what),
+             fmt::format("values are factors of the default scale and must be positive, got {}", value));
+      }
+    };
+    if (entry.contains("bounds")) {
+      std::tie(out.lower, out.upper) = range(*entry.get("bounds"), key + ".bounds");
+      require_positive("bounds", out.lower);
+    }
+    if (entry.contains("initial")) {
+      out.initial = number(*entry.get("initial"), key + ".initial");
+      require_positive("initial", out.initial);
+    }
+    if (out.initial > 0 && out.upper > 0 && (out.initial < out.lower || out.initial > out.upper)) {
+      fail(entry, key, fmt::format("initial = {} is outside bounds = [{}, {}]", out.initial, out.lower, out.upper));
+    }
+    return out;
+  }
+
+  void read_latents() {
+    if (!root_.contains("latent")) {
+      add_default_latent();
+      return;
+    }
+    if (root_.get("latent")->is_table())
+      fail(*root_.get("latent"), "latent", "write [[latent]], with two brackets: there may be several");
+    std::set<std::string> names;
+    for (const toml::node& node : array(*root_.get("latent"), "latent")) {
+      const toml::table& entry = table(node, "latent");
+      only_keys(entry, "latent", {"name", "kernel", "features", "directions", "lengthscale", "signal_stddev"});
+      ModelFile::LatentText latent;
+      latent.line = line_of(node);
+      latent.name =
+          entry.contains("name") ? text(*entry.get("name"), "latent.name") : fmt::format("latent {}", model_.latents.size() + 1);
+      if (!names.insert(latent.name).second) fail(node, "latent.name", fmt::format("'{}' is taken already", latent.name));
+      latent.kernel = entry.contains("kernel") ? text(*entry.get("kernel"), "latent.kernel") : "se";
+      if (!entry.contains("features")) fail(node, "latent", R"(missing features = ["q1", …])");
+      std::set<std::string> expanded;
+      for (const toml::node& feature : array(*entry.get("features"), "latent.features")) {
+        const Expression value = expression(feature, "latent.features");
+        allow_only(feature, "latent.features", value, symbols_->ddq, "a feature may not depend on accelerations");
+        latent.features.push_back(feature.is_string() ? text(feature, "latent.features") : to_string(value));
+        // lengthscales go by the names of features
+        for (const std::string& name : expand_angle(latent.features.back(), definition_.coordinates)) {
+          if (!expanded.insert(name).second) fail(feature, "latent.features", fmt::format("'{}' stands twice; remove one", name));
+        }
+      }
+      if (latent.features.empty()) fail(node, "latent.features", "a latent needs at least one feature");
+      if (entry.contains("directions")) read_directions(*entry.get("directions"), latent);
+      latent.lengthscale = latent_range(entry, "lengthscale");
+      latent.signal_stddev = latent_range(entry, "signal_stddev");
+      try {
+        static_cast<void>(Kernel::parse(latent.kernel, latent.features));
+      } catch (const InputError& error) {
+        fail(entry.contains("kernel") ? *entry.get("kernel") : node, "latent.kernel", error.what());
+      }
+      model_.latents.push_back(std::move(latent));
+    }
+    if (model_.latents.empty()) add_default_latent();
+  }
+
+  // one squared-exponential latent on the acceleration, over everything a state has but the time
+  void add_default_latent() {
+    ModelFile::LatentText latent;
+    latent.name = "unconstrained acceleration";
+    latent.kernel = "se";
+    latent.line = 1;
+    for (Expression symbol : symbols_->state()) {
+      if (!(symbol == symbols_->t)) latent.features.push_back(symbol.variable_name());
+    }
+    model_.latents.push_back(std::move(latent));
+  }
+
+  // "acceleration", "force", [[…], …] (nq rows), or { force = [[…], …] }
+  void read_directions(const toml::node& node, ModelFile::LatentText& latent) const {
+    const std::string key = "latent.directions";
+    const toml::node* matrix = &node;
+    if (node.is_string()) {
+      const std::string value = text(node, key);
+      if (value != "acceleration" && value != "force") {
+        fail(node, key,
+             fmt::format(R"(expected "acceleration", "force" or a matrix of expressions [[…], …], got "{}")", shortened(value)));
+      }
+      latent.base = value == "force" ? Latent::Base::force : Latent::Base::acceleration;
+      return;
+    }
+    if (node.is_table()) {
+      only_keys(*node.as_table(), key, {"force", "acceleration"});
+      if (node.as_table()->size() != 1) fail(node, key, "expected { force = [[…], …] } or { acceleration = [[…], …] }");
+      latent.base = node.as_table()->contains("force") ? Latent::Base::force : Latent::Base::acceleration;
+      matrix = &node.as_table()->begin()->second;
+    }
+    const toml::array& rows = array(*matrix, key);
+    const std::size_t nq = definition_.coordinates.size();
+    if (rows.size() != nq) fail(*matrix, key, fmt::format("expected {} rows, one per coordinate, got {}", nq, rows.size()));
+    for (const toml::node& row_node : rows) {
+      const toml::array& row = array(row_node, key);
+      if (row.empty() || row.size() != array(*rows.get(0), key).size()) {
+        fail(row_node, key, "every row needs the same number of entries, at least one");
+      }
+      latent.directions.emplace_back();
+      for (const toml::node& entry : row) {
+        const Expression value = expression(entry, key);
+        allow_only(entry, key, value, symbols_->ddq, "a direction may not depend on accelerations");
+        latent.directions.back().push_back(value);
+      }
+    }
+  }
+
+  void read_noise() {
+    if (!root_.contains("noise")) return;
+    const toml::table& noise = table(*root_.get("noise"), "noise");
+    only_keys(noise, "noise", {"ddq"});
+    if (!noise.contains("ddq")) return;
+    const toml::node* node = noise.get("ddq");
+    if (node->is_table()) {
+      const toml::table& entry = *node->as_table();
+      only_keys(entry, "noise.ddq", {"estimate", "initial"});
+      if (entry.contains("estimate")) model_.noise.estimate = boolean(*entry.get("estimate"), "noise.ddq.estimate");
+      if (!entry.contains("initial")) fail(entry, "noise.ddq", "missing initial: where the estimate starts");
+      node = entry.get("initial");
+    }
+    const std::size_t nq = definition_.coordinates.size();
+    if (node->is_array()) {
+      for (const toml::node& entry : *node->as_array()) model_.noise.stddev.push_back(number(entry, "noise.ddq"));
+      if (model_.noise.stddev.size() != nq) {
+        fail(*node, "noise.ddq",
+             fmt::format("expected one value or {}, one per coordinate, got {}", nq, model_.noise.stddev.size()));
+      }
+    } else {
+      model_.noise.stddev.assign(nq, number(*node, "noise.ddq"));
+    }
+    for (double stddev : model_.noise.stddev) {
+      if (!(stddev > 0)) fail(*node, "noise.ddq", fmt::format("a noise standard deviation must be positive, got {}", stddev));
+    }
+  }
+
+  void read_truth() {
+    if (!root_.contains("truth")) return;
+    const toml::table& truth = table(*root_.get("truth"), "truth");
+    only_keys(truth, "truth", {"acceleration"});
+    if (!truth.contains("acceleration")) fail(truth, "truth", "missing acceleration = [ … ]");
+    const toml::array& rows = array(*truth.get("acceleration"), "truth.acceleration");
+    const std::size_t nq = definition_.coordinates.size();
+    if (rows.size() != nq) {
+      fail(rows, "truth.acceleration", fmt::format("expected {} entries, one per coordinate, got {}", nq, rows.size()));
+    }
+    for (const toml::node& row : rows) {
+      model_.truth.push_back(expression(row, "truth.acceleration"));
+      allow_only(row, "truth.acceleration", model_.truth.back(), symbols_->ddq, "the true acceleration may not depend on itself");
+    }
+  }
+
+  void read_sampling() {
+    if (!root_.contains("sampling")) return;
+    const toml::table& sampling = table(*root_.get("sampling"), "sampling");
+    // names that are not of the state are auxiliary draws, visible to expressions here only
+    std::set<std::string> drawable;
+    for (Expression symbol : symbols_->state()) drawable.insert(symbol.variable_name());
+    const auto visible = model_.symbols_;
+    const auto visible_names = model_.symbol_names_;
+    for (const auto& [name, node] : entries_of(sampling)) {
+      if (name == "start" || drawable.contains(name)) continue;
+      declare(name, *node, fmt::format("sampling.{}", name));
+      model_.define(name, definition_.graph->variable(name));
+    }
+
+    std::vector<ModelFile::SamplingRule> rules;
+    for (const auto& [name, node] : entries_of(sampling)) {
+      const std::string key = fmt::format("sampling.{}", name);
+      if (name == "start") {
+        read_newton_start(table(*node, key));
+        continue;
+      }
+      ModelFile::SamplingRule rule{name, std::nullopt, {}, line_of(*node)};
+      if (node->is_array()) {
+        rule.range = range(*node, key);
+      } else {
+        rule.value = expression(*node, key);
+        allow_only(*node, key, rule.value, symbols_->ddq, "a sample may not depend on accelerations");
+      }
+      rules.push_back(std::move(rule));
+    }
+    model_.symbols_ = visible;
+    model_.symbol_names_ = visible_names;
+    sort_rules(std::move(rules));
+  }
+
+  void read_newton_start(const toml::table& start) {
+    for (const auto& [name, node] : entries_of(start)) {
+      const std::string key = fmt::format("sampling.start.{}", name);
+      const bool known = std::any_of(definition_.coordinates.begin(), definition_.coordinates.end(),
+                                     [&](const Coordinate& c) { return c.name == name || c.velocity() == name; });
+      if (!known) fail(*node, key, fmt::format("'{}' is neither a coordinate nor a velocity of this model", name));
+      model_.newton_start[name] = number(*node, key);
+    }
+  }
+
+  // each rule after those it uses
+  void sort_rules(std::vector<ModelFile::SamplingRule> rules) {
+    std::map<std::string, std::size_t> position;
+    for (const ModelFile::SamplingRule& rule : rules) position.emplace(rule.name, position.size());
+    std::vector<std::vector<std::size_t>> uses(rules.size());
+    std::vector<std::pair<std::string, int>> entries;
+    for (std::size_t k = 0; k < rules.size(); ++k) {
+      entries.emplace_back(rules[k].name, rules[k].line);
+      if (rules[k].range) continue;
+      for (const std::string& name : definition_.graph->variables_of(rules[k].value)) {
+        if (const auto other = position.find(name); other != position.end()) uses[k].push_back(other->second);
+      }
+    }
+    const Order order = order_by_use(uses);
+    if (!order.circle.empty()) {
+      const auto& [name, line] = entries[order.circle.front()];
+      fail(line, fmt::format("sampling.{}", name), "drawn in terms of itself" + circle_text(order.circle, entries));
+    }
+    for (const std::size_t k : order.positions) model_.sampling.push_back(std::move(rules[k]));
+  }
+
+  void read_columns() {
+    if (!root_.contains("columns")) return;
+    std::set<std::string> known, taken;
+    for (Expression symbol : symbols_->state()) known.insert(symbol.variable_name());
+    for (Expression symbol : symbols_->ddq) known.insert(symbol.variable_name());
+    for (const auto& [name, node] : entries_of(table(*root_.get("columns"), "columns"))) {
+      const std::string key = fmt::format("columns.{}", name);
+      if (!known.contains(name)) fail(*node, key, "not a coordinate, velocity, acceleration, input or t of this model");
+      const std::string column = text(*node, key);
+      if (!taken.insert(column).second) fail(*node, key, fmt::format("the column '{}' is another name's already", column));
+      model_.columns[name] = column;
+    }
+  }
+
+  const toml::table& root_;
+  ModelFile& model_;
+  SymbolicSystem::Definition definition_;
+  std::set<std::string> names_;
+  std::optional<SystemSymbols> symbols_;
+  const toml::node* mass_node_ = nullptr;
+};
+
+void read_model(const toml::table& root, ModelFile& model) { ModelReader(root, model).read(); }
+
+}  // namespace gp2

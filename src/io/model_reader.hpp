@@ -1,0 +1,19 @@
+#pragma once
+
+#include <string>
+#include <vector>
+
+#include <toml++/toml.h>
+
+#include "gp2/model_file.hpp"
+
+namespace gp2 {
+
+/// Fills a model, which has its name and text already, from the tables of its file.
+/// @throws InputError with line and key, but for what SymbolicSystem says.
+void read_model(const toml::table& root, ModelFile& model);
+
+/// A feature that is an angle becomes its sine and cosine; another stays.
+std::vector<std::string> expand_angle(const std::string& feature, const std::vector<Coordinate>& coordinates);
+
+}  // namespace gp2

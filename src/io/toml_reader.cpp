@@ -1,0 +1,94 @@
+#include "io/toml_reader.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <optional>
+#include <sstream>
+
+#include <fmt/format.h>
+#include <fmt/ranges.h>
+
+namespace gp2 {
+
+int line_of(const toml::node& node) {
+  return static_cast<int>(node.source().begin.line);
+}
+
+std::string shortened(const std::string& text) {
+  if (text.size() <= 60) return text;
+  std::size_t end = 57;
+  while (end > 0 && (static_cast<unsigned char>(text[end]) & 0xC0U) == 0x80U) --end;
+  return text.substr(0, end) + "...";
+}
+
+std::string written(const toml::node& node) {
+  if (node.is_table()) return "a table";
+  std::ostringstream text;
+  node.visit([&](const auto& value) { text << value; });
+  return shortened(text.str());
+}
+
+std::vector<std::pair<std::string, const toml::node*>> entries_of(const toml::table& table) {
+  std::vector<std::pair<std::string, const toml::node*>> entries;
+  for (const auto& [name, node] : table) entries.emplace_back(name.str(), &node);
+  std::stable_sort(entries.begin(), entries.end(), [](const auto& a, const auto& b) {
+    const auto& from = a.second->source().begin;
+    const auto& to = b.second->source().begin;
+    return std::pair(from.line, from.column) < std::pair(to.line, to.column);
+  });
+  return entries;
+}
+
+void TomlReader::fail(const toml::node& node, const std::string& key, const std::string& message) const {
+  fail(line_of(node), key, message);
+}
+
+void TomlReader::fail(int line, const std::string& key, const std::string& message) const {
+  throw LocatedError(fmt::format("{}:{}: {}: {}", name_, line, key, message));
+}
+
+void TomlReader::only_keys(const toml::table& table, const std::string& where, const std::vector<std::string>& known) const {
+  for (const auto& [key, node] : entries_of(table)) {
+    if (std::find(known.begin(), known.end(), key) == known.end()) {
+      fail(*node, where.empty() ? key : fmt::format("{}.{}", where, key),
+           fmt::format("unknown key; known here: {}", fmt::join(known, ", ")));
+    }
+  }
+}
+
+const toml::table& TomlReader::table(const toml::node& node, const std::string& key) const {
+  if (!node.is_table()) fail(node, key, fmt::format("expected a table, got {}", written(node)));
+  return *node.as_table();
+}
+
+const toml::array& TomlReader::array(const toml::node& node, const std::string& key) const {
+  if (!node.is_array()) fail(node, key, fmt::format("expected an array [ … ], got {}", written(node)));
+  return *node.as_array();
+}
+
+std::string TomlReader::text(const toml::node& node, const std::string& key) const {
+  if (!node.is_string()) fail(node, key, fmt::format("expected a text in quotes, got {}", written(node)));
+  return node.as_string()->get();
+}
+
+double TomlReader::number(const toml::node& node, const std::string& key) const {
+  const std::optional<double> value = node.is_number() ? node.value<double>() : std::nullopt;
+  if (!value || !std::isfinite(*value)) fail(node, key, fmt::format("expected a finite number, got {}", written(node)));
+  return *value;
+}
+
+bool TomlReader::boolean(const toml::node& node, const std::string& key) const {
+  if (!node.is_boolean()) fail(node, key, fmt::format("expected true or false, got {}", written(node)));
+  return node.as_boolean()->get();
+}
+
+std::pair<double, double> TomlReader::range(const toml::node& node, const std::string& key) const {
+  const toml::array& pair = array(node, key);
+  if (pair.size() != 2) fail(node, key, fmt::format("expected [lower, upper], got {}", written(node)));
+  const double lower = number(*pair.get(0), key);
+  const double upper = number(*pair.get(1), key);
+  if (!(lower < upper)) fail(node, key, fmt::format("the lower end {} must be below the upper end {}", lower, upper));
+  return {lower, upper};
+}
+
+}  // namespace gp2
