@@ -1,12 +1,12 @@
 #pragma once
 
-#include <fmt/core.h>
-
 #include <cstdlib>
 #include <filesystem>
 #include <optional>
 #include <stdexcept>
 #include <string>
+
+#include <fmt/core.h>
 
 // Where tests find data that is not part of the repository. GP2_REFERENCE_DIR and GP2_REAL_DIR name the folders; when a variable
 // is not set, ../shared/reference and ../shared/real beside the checkout are used if they exist. A promised file that is missing
@@ -61,25 +61,13 @@ inline constexpr DataFolder reference_data{"GP2_REFERENCE_DIR", "../shared/refer
 inline constexpr DataFolder real_data{"GP2_REAL_DIR", "../shared/real", "measured data of real machines not found"};
 
 /// Published data and results of the paper.
-inline std::optional<std::string> why_reference_is_absent() {
-  return reference_data.why_absent();
-}
-inline std::filesystem::path reference_dir() {
-  return reference_data.directory();
-}
-inline std::filesystem::path reference_file(const std::filesystem::path& name) {
-  return reference_data.file(name);
-}
+inline std::optional<std::string> why_reference_is_absent() { return reference_data.why_absent(); }
+inline std::filesystem::path reference_dir() { return reference_data.directory(); }
+inline std::filesystem::path reference_file(const std::filesystem::path& name) { return reference_data.file(name); }
 
 /// Measurements of real machines.
-inline std::optional<std::string> why_real_is_absent() {
-  return real_data.why_absent();
-}
-inline std::filesystem::path real_dir() {
-  return real_data.directory();
-}
-inline std::filesystem::path real_file(const std::filesystem::path& name) {
-  return real_data.file(name);
-}
+inline std::optional<std::string> why_real_is_absent() { return real_data.why_absent(); }
+inline std::filesystem::path real_dir() { return real_data.directory(); }
+inline std::filesystem::path real_file(const std::filesystem::path& name) { return real_data.file(name); }
 
 }  // namespace gp2::test

@@ -1,9 +1,5 @@
 #pragma once
 
-#include <fmt/core.h>
-#include <gtest/gtest.h>
-
-#include <Eigen/Core>
 #include <algorithm>
 #include <cmath>
 #include <filesystem>
@@ -12,6 +8,10 @@
 #include <numbers>
 #include <string>
 #include <vector>
+
+#include <Eigen/Core>
+#include <fmt/core.h>
+#include <gtest/gtest.h>
 
 #include "gp2/csv.hpp"
 #include "gp2/generate.hpp"
@@ -38,21 +38,13 @@ inline std::vector<std::string> model_files(const std::vector<std::string>& fold
   std::sort(files.begin(), files.end());
   return files;
 }
-inline std::vector<std::string> every_model() {
-  return model_files({"models", "experiments"});
-}
-inline std::vector<std::string> library_models() {
-  return model_files({"models"});
-}
+inline std::vector<std::string> every_model() { return model_files({"models", "experiments"}); }
+inline std::vector<std::string> library_models() { return model_files({"models"}); }
 
-inline std::string stem(const std::string& file) {
-  return std::filesystem::path(file).stem().string();
-}
+inline std::string stem(const std::string& file) { return std::filesystem::path(file).stem().string(); }
 
 /// Name of a parameterised test: the model's.
-inline std::string model_test_name(const testing::TestParamInfo<std::string>& info) {
-  return stem(info.param);
-}
+inline std::string model_test_name(const testing::TestParamInfo<std::string>& info) { return stem(info.param); }
 
 /// A model file of the checkout, read once.
 inline const ModelFile& model(const std::string& file) {

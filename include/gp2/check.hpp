@@ -32,8 +32,8 @@ inline constexpr double constraint_violation_tolerance = 1e-6;
 std::optional<ConstraintViolation> largest_violation(const System& system, const Eigen::Ref<const Eigen::MatrixXd>& states,
                                                      const Eigen::Ref<const Eigen::VectorXd>& parameters);
 
-/// Whether measured accelerations obey A ddq = b to rounding: then they were computed from each other, and only nq − rank(A) of them
-/// are independent measurements. Treating all as independent makes an estimated noise collapse to zero.
+/// Whether measured accelerations obey A ddq = b to rounding: then they were computed from each other, and only nq − rank(A) of
+/// them are independent measurements. Treating all as independent makes an estimated noise collapse to zero.
 ///
 /// @param accelerations  (nq × N)
 /// @returns the rows of ddq to observe instead (the best-conditioned independent set); nothing when the columns are independent.
@@ -41,9 +41,9 @@ std::optional<std::vector<int>> dependent_columns(const System& system, const Ei
                                                   const Eigen::Ref<const Eigen::VectorXd>& parameters,
                                                   const Eigen::Ref<const Eigen::MatrixXd>& accelerations);
 
-/// Is the system well-posed at these states? M symmetric positive definite, A of constant rank and not nearly zero, b in the range of
-/// A, derivatives in the parameters equal to finite differences, A and b equal to the second derivative of the constraints along a
-/// motion.
+/// Is the system well-posed at these states? M symmetric positive definite, A of constant rank and not nearly zero, b in the
+/// range of A, derivatives in the parameters equal to finite differences, A and b equal to the second derivative of the
+/// constraints along a motion.
 ///
 /// @param states  (layout size × N), as good as on the constraint
 std::vector<Finding> check_system(const System& system, const Eigen::Ref<const Eigen::MatrixXd>& states,

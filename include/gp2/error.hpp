@@ -17,7 +17,8 @@ class InputError : public Error {
   using Error::Error;
 };
 
-/// The input is well-formed but the numbers cannot be computed (say no restart reached a finite likelihood). The command exits with 1.
+/// The input is well-formed but the numbers cannot be computed (say no restart reached a finite likelihood). The command exits
+/// with 1.
 class NumericalError : public Error {
  public:
   using Error::Error;

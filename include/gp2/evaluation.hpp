@@ -12,11 +12,11 @@ namespace gp2 {
 /// How well a posterior predicts measured constrained accelerations.
 struct Evaluation {
   std::vector<std::string> outputs;
-  Eigen::VectorXd rmse;                 // per output, physical units
-  double rmse_normalised = 0;           // mean over outputs of rmse / training std (Geist & Trimpe 2020, table 1); NaN when an
-                                        // output was not observed in training
-  double nrmse = 0;                     // rms over outputs and points / rms of the test stds
-  double max_constraint_error = 0;      // max |A ddq − b| over points and rows, with the model's own parameters
+  Eigen::VectorXd rmse;                    // per output, physical units
+  double rmse_normalised = 0;              // mean over outputs of rmse / training std (Geist & Trimpe 2020, table 1); NaN when an
+                                           // output was not observed in training
+  double nrmse = 0;                        // rms over outputs and points / rms of the test stds
+  double max_constraint_error = 0;         // max |A ddq − b| over points and rows, with the model's own parameters
   double max_constraint_error_fitted = 0;  // the same with the fitted parameters
   // per-output Gaussian marginals; NaN when there is nothing to average
   double nlpd = 0, coverage95 = 0;                // of measurements: noise included

@@ -18,25 +18,38 @@ class ExpressionGraph;
 
 /// What a node of an expression computes from its operands a, b.
 enum class Operation : std::uint8_t {
-  constant,   // a number
-  variable,   // a named symbol
-  add,        // a + b
-  subtract,   // a − b
-  multiply,   // a · b
-  divide,     // a / b
-  negate,     // −a
-  power,      // a ^ b
-  sin, cos, tan, asin, acos, atan, sinh, cosh, tanh, exp, log, sqrt, abs,
-  sign,       // −1, 0 or 1
-  atan2,      // atan2(a, b)
-  min, max,
+  constant,  // a number
+  variable,  // a named symbol
+  add,       // a + b
+  subtract,  // a − b
+  multiply,  // a · b
+  divide,    // a / b
+  negate,    // −a
+  power,     // a ^ b
+  sin,
+  cos,
+  tan,
+  asin,
+  acos,
+  atan,
+  sinh,
+  cosh,
+  tanh,
+  exp,
+  log,
+  sqrt,
+  abs,
+  sign,   // −1, 0 or 1
+  atan2,  // atan2(a, b)
+  min,
+  max,
   /// a · b, but 0 wherever a = 0, whatever b is. It appears in derivatives only: d√u = u̇ ⊗ 1/(2√u) is 0, not NaN, along a
   /// direction in which u does not change.
   multiply_or_zero,
 };
 
-/// A node of an ExpressionGraph: a cheap value, valid as long as its graph lives. Two expressions of one graph are structurally equal
-/// exactly when they compare equal (the graph is hash-consed).
+/// A node of an ExpressionGraph: a cheap value, valid as long as its graph lives. Two expressions of one graph are structurally
+/// equal exactly when they compare equal (the graph is hash-consed).
 class Expression {
  public:
   Expression() = default;
@@ -44,11 +57,11 @@ class Expression {
   [[nodiscard]] Operation operation() const;
   [[nodiscard]] bool is_constant() const { return operation() == Operation::constant; }
   [[nodiscard]] bool is_constant(double value) const;
-  [[nodiscard]] double constant_value() const;           // of a constant
+  [[nodiscard]] double constant_value() const;             // of a constant
   [[nodiscard]] const std::string& variable_name() const;  // of a variable
-  [[nodiscard]] Expression left() const;                 // operand a
-  [[nodiscard]] Expression right() const;                // operand b, of a binary operation
-  [[nodiscard]] std::uint32_t id() const { return id_; }  // position in the graph; operands come before what uses them
+  [[nodiscard]] Expression left() const;                   // operand a
+  [[nodiscard]] Expression right() const;                  // operand b, of a binary operation
+  [[nodiscard]] std::uint32_t id() const { return id_; }   // position in the graph; operands come before what uses them
   [[nodiscard]] ExpressionGraph& graph() const { return *graph_; }
   friend bool operator==(const Expression& a, const Expression& b) { return a.graph_ == b.graph_ && a.id_ == b.id_; }
 
@@ -59,11 +72,11 @@ class Expression {
   std::uint32_t id_ = 0;
 };
 
-/// Hash-consed expressions in deterministic order: the same calls build the same nodes, so the same text gives the same bits on every
-/// run. Local simplification only (0·x, 1·x, x + 0, x − x, 0/x, constants, −(−x), x^0, x^1, √ for x^0.5); signs rise out of sums and
-/// products (a + (−b) = a − b, (−a)·b = −(a·b)), which is exact in floating point, and constant factors to the front of products,
-/// where they become one (u·(c·v) = c·(u·v)); nothing else is expanded or reordered.
-/// What would fold to ∞ or NaN stays, so that evaluation shows it.
+/// Hash-consed expressions in deterministic order: the same calls build the same nodes, so the same text gives the same bits on
+/// every run. Local simplification only (0·x, 1·x, x + 0, x − x, 0/x, constants, −(−x), x^0, x^1, √ for x^0.5); signs rise out of
+/// sums and products (a + (−b) = a − b, (−a)·b = −(a·b)), which is exact in floating point, and constant factors to the front of
+/// products, where they become one (u·(c·v) = c·(u·v)); nothing else is expanded or reordered. What would fold to ∞ or NaN stays,
+/// so that evaluation shows it.
 ///
 /// @throws InputError from any operation that would grow the graph past `max_nodes`, from a constant that is not finite, and from
 ///   operands of different graphs.
@@ -105,12 +118,13 @@ Expression operator*(Expression a, Expression b);
 Expression operator/(Expression a, Expression b);
 Expression operator-(Expression a);
 
-/// Reads `text` into `graph`: numbers, + − * / ^ (right-associative, binds tighter than unary minus: -x^2 = −(x²)), parentheses, pi, and
-/// sin cos tan asin acos atan atan2 sinh cosh tanh exp log sqrt abs sign min max.
+/// Reads `text` into `graph`: numbers, + − * / ^ (right-associative, binds tighter than unary minus: -x^2 = −(x²)), parentheses,
+/// pi, and sin cos tan asin acos atan atan2 sinh cosh tanh exp log sqrt abs sign min max.
 ///
 /// @param resolve  gives the expression a symbol stands for, or nothing when the name is unknown.
 /// @param known_names  names to suggest from when a symbol is unknown ("unknown symbol 'dq4', did you mean 'dq3'?").
-/// @throws InputError with the column in the text, the rule and the mend. Texts above 65536 characters or nested deeper than 200 are
+/// @throws InputError with the column in the text, the rule and the mend. Texts above 65536 characters or nested deeper than 200
+/// are
 ///   refused.
 Expression parse_expression(std::string_view text, ExpressionGraph& graph,
                             const std::function<std::optional<Expression>(std::string_view)>& resolve,
@@ -146,7 +160,7 @@ class Tape {
  private:
   struct Instruction {
     Operation operation;
-    std::int32_t exponent;  // for `power` with a small integer exponent; else 0 and b is used
+    std::int32_t exponent;       // for `power` with a small integer exponent; else 0 and b is used
     std::uint32_t result, a, b;  // slots
   };
   std::vector<Instruction> instructions_;

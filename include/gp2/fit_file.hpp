@@ -9,8 +9,8 @@
 
 namespace gp2 {
 
-/// A fitted model as a file: the model's text, the options its prior was made with, the data and the hyperparameters. The posterior
-/// is computed anew from these, so a file loaded gives the same bits as before it was saved.
+/// A fitted model as a file: the model's text, the options its prior was made with, the data and the hyperparameters. The
+/// posterior is computed anew from these, so a file loaded gives the same bits as before it was saved.
 struct FitFile {
   static constexpr int format_version = 1;
 

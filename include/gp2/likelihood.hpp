@@ -35,7 +35,8 @@ class Likelihood {
   };
 
   /// @param initial  values at which everything that has no gradient stays: fixed noise and parameters are reduced once, here.
-  /// @throws InputError when M is not positive definite or the constraints contradict each other at an observed state, under `initial`.
+  /// @throws InputError when M is not positive definite or the constraints contradict each other at an observed state, under
+  /// `initial`.
   Likelihood(Prior prior, std::vector<Observations> observations, const ModelValues& initial, Options options);
   ~Likelihood();
   Likelihood(Likelihood&&) noexcept;

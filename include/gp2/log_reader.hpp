@@ -1,10 +1,11 @@
 #pragma once
 
-#include <Eigen/Core>
 #include <map>
 #include <set>
 #include <string>
 #include <vector>
+
+#include <Eigen/Core>
 
 #include "gp2/csv.hpp"
 #include "gp2/system.hpp"

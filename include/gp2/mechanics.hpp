@@ -29,8 +29,8 @@ class UdwadiaKalaba {
 
   /// Whether M is positive definite to working precision; when it is not, nothing below is valid.
   [[nodiscard]] bool mass_is_positive_definite() const { return mass_is_positive_definite_; }
-  [[nodiscard]] int rank() const { return rank_; }                  // of A
-  [[nodiscard]] int n_zero_rows() const { return n_zero_rows_; }    // rows of A that vanish at this state; they are dropped
+  [[nodiscard]] int rank() const { return rank_; }                       // of A
+  [[nodiscard]] int n_zero_rows() const { return n_zero_rows_; }         // rows of A that vanish at this state; they are dropped
   [[nodiscard]] double inconsistency() const { return inconsistency_; }  // largest |A L b − b|, rows of B of unit norm
   [[nodiscard]] double size_of_b() const { return size_of_b_; }          // largest |b|, rows of B of unit norm
 
@@ -64,11 +64,11 @@ class UdwadiaKalaba {
   double inconsistency_ = 0;
   double size_of_b_ = 0;
   Eigen::LLT<Eigen::MatrixXd> mass_factor_;
-  Eigen::VectorXd row_scale_;       // 1 / norm of each row of B, 0 for a zero row
-  Eigen::MatrixXd A_unit_;          // rows of A so scaled      (nc × nq)
-  Eigen::VectorXd b_unit_;          // b so scaled              (nc)
-  Eigen::MatrixXd L_unit_;          // L of the scaled rows     (nq × nc)
-  Eigen::MatrixXd ML_unit_;         // M L of the scaled rows   (nq × nc)
+  Eigen::VectorXd row_scale_;  // 1 / norm of each row of B, 0 for a zero row
+  Eigen::MatrixXd A_unit_;     // rows of A so scaled      (nc × nq)
+  Eigen::VectorXd b_unit_;     // b so scaled              (nc)
+  Eigen::MatrixXd L_unit_;     // L of the scaled rows     (nq × nc)
+  Eigen::MatrixXd ML_unit_;    // M L of the scaled rows   (nq × nc)
   Eigen::MatrixXd T_;
   Eigen::VectorXd Lb_;
 };

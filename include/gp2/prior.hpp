@@ -34,10 +34,10 @@ struct Latent {
   Tape features;                           // state -> φ; parameters in it keep the model's values
   std::vector<int> feature_parameters;     // the system's parameters that φ uses: they cannot be estimated
   Base base = Base::acceleration;
-  std::vector<std::string> column_names;   // p of them, for the names of the signal standard deviations
-  Tape directions;                         // state, parameters -> B (nq × p), column-major; unused where B = I
+  std::vector<std::string> column_names;    // p of them, for the names of the signal standard deviations
+  Tape directions;                          // state, parameters -> B (nq × p), column-major; unused where B = I
   std::vector<Tape> direction_derivatives;  // one per parameter of the system -> ∂B/∂p
-  bool directions_are_identity = true;     // B = I, p = nq
+  bool directions_are_identity = true;      // B = I, p = nq
   Range lengthscale, signal_stddev;
 
   [[nodiscard]] int size() const { return static_cast<int>(column_names.size()); }  // p

@@ -28,8 +28,8 @@ struct ConstraintRow {
     acceleration,  // c(q, dq, ddq, t, u) = 0, linear in ddq
   };
   Level level;
-  std::string text;             // c as written
-  std::vector<Expression> A;    // (nq)
+  std::string text;           // c as written
+  std::vector<Expression> A;  // (nq)
   Expression b;
   std::vector<Expression> residuals;  // position: c and ċ; velocity: c; acceleration: none
 };

@@ -9,8 +9,8 @@
 
 namespace gp2 {
 
-/// Where each quantity of a state stands in its column of numbers x = [q; dq; t; u]. A batch of N states is a matrix (size() × N).
-/// An entry that no expression of the model reads may be NaN ("not measured").
+/// Where each quantity of a state stands in its column of numbers x = [q; dq; t; u]. A batch of N states is a matrix (size() ×
+/// N). An entry that no expression of the model reads may be NaN ("not measured").
 struct StateLayout {
   int nq = 0;  // coordinates
   int nu = 0;  // inputs
@@ -51,9 +51,7 @@ struct SystemValues {
 
   [[nodiscard]] int n_states() const { return static_cast<int>(force.cols()); }
   [[nodiscard]] ConstBlock M(int i) const { return {mass.col(i).data(), force.rows(), force.rows()}; }
-  [[nodiscard]] ConstBlock A(int i) const {
-    return {constraint_matrix.col(i).data(), constraint_vector.rows(), force.rows()};
-  }
+  [[nodiscard]] ConstBlock A(int i) const { return {constraint_matrix.col(i).data(), constraint_vector.rows(), force.rows()}; }
   [[nodiscard]] ConstColumn b(int i) const { return constraint_vector.col(i); }
   [[nodiscard]] ConstColumn F(int i) const { return force.col(i); }
 };
@@ -65,8 +63,8 @@ enum class SystemPart { mechanics /* M, A, b */, force, residuals };
 /// Immutable; every member function may be called from several threads at once.
 class System {
  public:
-  System(std::string name, std::vector<Coordinate> coordinates, std::vector<std::string> inputs, std::vector<Parameter> parameters,
-         std::vector<std::string> constraint_labels);
+  System(std::string name, std::vector<Coordinate> coordinates, std::vector<std::string> inputs,
+         std::vector<Parameter> parameters, std::vector<std::string> constraint_labels);
   virtual ~System() = default;
   System(const System&) = delete;
   System& operator=(const System&) = delete;
@@ -79,8 +77,8 @@ class System {
   [[nodiscard]] int nq() const { return static_cast<int>(coordinates_.size()); }
   [[nodiscard]] int nc() const { return static_cast<int>(constraint_labels_.size()); }
   [[nodiscard]] StateLayout layout() const { return {nq(), static_cast<int>(inputs_.size())}; }
-  [[nodiscard]] std::vector<std::string> state_names() const;   // q1 … dq1 … t u1 …, in the order of the layout
-  [[nodiscard]] Eigen::VectorXd parameter_values() const;       // the model's own values
+  [[nodiscard]] std::vector<std::string> state_names() const;        // q1 … dq1 … t u1 …, in the order of the layout
+  [[nodiscard]] Eigen::VectorXd parameter_values() const;            // the model's own values
   [[nodiscard]] int parameter_index(const std::string& name) const;  // −1 when there is none
 
   /// M, A, b, F at N states.
@@ -97,7 +95,7 @@ class System {
   [[nodiscard]] virtual Eigen::MatrixXd residuals(const Eigen::Ref<const Eigen::MatrixXd>& states,
                                                   const Eigen::Ref<const Eigen::VectorXd>& parameters) const = 0;
   struct Residual {
-    int row = 0;           // of A
+    int row = 0;            // of A
     bool velocity = false;  // ċ = 0 or a velocity-level constraint; otherwise c = 0
     std::string text;
   };

@@ -17,11 +17,11 @@ namespace gp2 {
 /// One number that training adjusts, in physical units. All but system parameters are positive and optimised as logarithms.
 struct Hyperparameter {
   enum class Kind {
-    kernel,               // parameter `index` of the kernel of latent `owner`
-    signal_stddev,        // s_index of latent `owner`
+    kernel,                // parameter `index` of the kernel of latent `owner`
+    signal_stddev,         // s_index of latent `owner`
     shared_signal_stddev,  // one factor for all s of latent `owner`, times `scale`
-    noise_stddev,         // σ_index of Observations `owner`
-    parameter,            // θ_index of the system
+    noise_stddev,          // σ_index of Observations `owner`
+    parameter,             // θ_index of the system
   };
 
   Kind kind = Kind::kernel;
@@ -96,12 +96,12 @@ struct Progress {
 };
 
 struct FitOptions {
-  int n_restarts = 5;         // runs of the optimiser; the first starts at the hyperparameters' own values
-  int max_iterations = 1000;  // per restart; 0: condition at the starting values
-  std::uint64_t seed = 0;     // of the other starting points
-  int n_threads = 0;          // 0: as many as the machine has; results do not depend on it
-  double gradient_tolerance = 1e-5;   // stop when the projected gradient's largest entry is below
-  double reduction_tolerance = 1e-12;  // stop when an iteration lowers the objective by less, relatively
+  int n_restarts = 5;                             // runs of the optimiser; the first starts at the hyperparameters' own values
+  int max_iterations = 1000;                      // per restart; 0: condition at the starting values
+  std::uint64_t seed = 0;                         // of the other starting points
+  int n_threads = 0;                              // 0: as many as the machine has; results do not depend on it
+  double gradient_tolerance = 1e-5;               // stop when the projected gradient's largest entry is below
+  double reduction_tolerance = 1e-12;             // stop when an iteration lowers the objective by less, relatively
   std::function<void(const Progress&)> progress;  // called from worker threads, one at a time
   const std::atomic<bool>* stop = nullptr;        // set: return the best so far
 };
@@ -133,9 +133,10 @@ struct Fit {
   FitReport report;
 };
 
-/// Maximises the posterior density of the hyperparameters (marginal likelihood times hyper-priors) by L-BFGS-B from several starting
-/// points. From the best optimum each hyperparameter is then scanned over its box by itself, the others held, and the optimiser runs
-/// again from the lowest point found: an optimum in a corner of the box often hides a lower one. The prior is conditioned there. Same seed, same bits, for any number of threads.
+/// Maximises the posterior density of the hyperparameters (marginal likelihood times hyper-priors) by L-BFGS-B from several
+/// starting points. From the best optimum each hyperparameter is then scanned over its box by itself, the others held, and the
+/// optimiser runs again from the lowest point found: an optimum in a corner of the box often hides a lower one. The prior is
+/// conditioned there. Same seed, same bits, for any number of threads.
 ///
 /// @throws InputError, NumericalError  as Likelihood and Posterior; NumericalError when no restart reached a finite likelihood.
 Fit fit(const Prior& prior, const std::vector<Observations>& observations, const std::vector<Hyperparameter>& hyperparameters,

@@ -34,7 +34,8 @@ void solve_lower(const Eigen::MatrixXd& L, bool transposed, Eigen::Ref<Eigen::Ma
   const int n_columns = static_cast<int>(B.cols());
   const int ldb = static_cast<int>(B.outerStride());
   const double one = 1;
-  if (n > 0 && n_columns > 0) dtrsm_("L", "L", transposed ? "T" : "N", "N", &n, &n_columns, &one, L.data(), &n, B.data(), &ldb, 1, 1, 1, 1);
+  if (n > 0 && n_columns > 0)
+    dtrsm_("L", "L", transposed ? "T" : "N", "N", &n, &n_columns, &one, L.data(), &n, B.data(), &ldb, 1, 1, 1, 1);
 }
 
 SingleThread::SingleThread() {

@@ -5,8 +5,9 @@
 extern "C" {
 void dpotrf_(const char* uplo, const int* n, double* a, const int* lda, int* info, std::size_t);
 void dpotri_(const char* uplo, const int* n, double* a, const int* lda, int* info, std::size_t);
-void dtrsm_(const char* side, const char* uplo, const char* trans, const char* diag, const int* m, const int* n, const double* alpha,
-            const double* a, const int* lda, double* b, const int* ldb, std::size_t, std::size_t, std::size_t, std::size_t);
+void dtrsm_(const char* side, const char* uplo, const char* trans, const char* diag, const int* m, const int* n,
+            const double* alpha, const double* a, const int* lda, double* b, const int* ldb, std::size_t, std::size_t,
+            std::size_t, std::size_t);
 }
 
 namespace gp2::lapack {
@@ -20,8 +21,8 @@ void invert_factored(Eigen::MatrixXd& L);
 /// B ← L⁻¹ B, or L⁻ᵀ B.
 void solve_lower(const Eigen::MatrixXd& L, bool transposed, Eigen::Ref<Eigen::MatrixXd> B);
 
-/// While any of these lives, OpenBLAS computes on the calling thread only: our threads and its own do not fight, and sums keep their
-/// order. The previous setting returns with the last one.
+/// While any of these lives, OpenBLAS computes on the calling thread only: our threads and its own do not fight, and sums keep
+/// their order. The previous setting returns with the last one.
 class SingleThread {
  public:
   SingleThread();

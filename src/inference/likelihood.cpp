@@ -33,13 +33,13 @@ struct Likelihood::Implementation {
 };
 
 struct Likelihood::Workspace::Implementation {
-  MatrixXd K;                // K̃ + I, then its factor, then its inverse
-  std::vector<MatrixXd> k;   // per latent (N × N)
-  std::vector<MatrixXd> Z;   // per latent: R_i E_a diag(s)
-  std::vector<MatrixXd> V;   // per latent: V_i,a, rows as Z
-  MatrixXd H;                // ⟨P_ij − α̃_iα̃_jᵀ, Z_i Z_jᵀ⟩ (N × N)
-  VectorXd S;                // a column of P − α̃α̃ᵀ
-  VectorXd alpha;            // α̃
+  MatrixXd K;               // K̃ + I, then its factor, then its inverse
+  std::vector<MatrixXd> k;  // per latent (N × N)
+  std::vector<MatrixXd> Z;  // per latent: R_i E_a diag(s)
+  std::vector<MatrixXd> V;  // per latent: V_i,a, rows as Z
+  MatrixXd H;               // ⟨P_ij − α̃_iα̃_jᵀ, Z_i Z_jᵀ⟩ (N × N)
+  VectorXd S;               // a column of P − α̃α̃ᵀ
+  VectorXd alpha;           // α̃
   Kernel::Workspace kernel;
 };
 
@@ -87,8 +87,8 @@ ModelValues zero_gradient(const ModelValues& values) {
 
 // One sweep over the lower triangle of P − α̃α̃ᵀ for latent a: H (both orders of a pair folded into the lower triangle), the signal
 // standard deviations' gradient ½ Σ_ij k_ij ⟨S_ij, ∂(Z_i Z_jᵀ)/∂log s⟩, and, where wanted, V_i = Σ_j S_ij Z_j k_ji.
-void contract(const Reduction& reduction, const MatrixXd& P, const VectorXd& alpha, const MatrixXd& k, const MatrixXd& Z, MatrixXd& H,
-              VectorXd& signal_gradient, MatrixXd* V, VectorXd& S) {
+void contract(const Reduction& reduction, const MatrixXd& P, const VectorXd& alpha, const MatrixXd& k, const MatrixXd& Z,
+              MatrixXd& H, VectorXd& signal_gradient, MatrixXd* V, VectorXd& S) {
   const Index n_samples = static_cast<Index>(reduction.samples.size());
   if (H.rows() != n_samples) H.resize(n_samples, n_samples);
   H.setZero();
@@ -169,11 +169,12 @@ double Likelihood::evaluate(const ModelValues& values, ModelValues* gradient, Wo
   work.V.resize(n_latents);
   const Index n_samples = static_cast<Index>(reduction.samples.size());
   for (std::size_t a = 0; a < n_latents; ++a) {
-    contract(reduction, work.K, work.alpha, work.k[a], work.Z[a], work.H, gradient->signal_stddev[a], needs_V ? &work.V[a] : nullptr,
-             work.S);
+    contract(reduction, work.K, work.alpha, work.k[a], work.Z[a], work.H, gradient->signal_stddev[a],
+             needs_V ? &work.V[a] : nullptr, work.S);
     for (Index j = 0; j < n_samples; ++j) {
       self.prior.latents[a].kernel.add_gradient(features[a].bottomRows(n_samples - j), features[a].row(j).transpose(),
-                                                values.kernel[a], work.H.col(j).tail(n_samples - j), gradient->kernel[a], work.kernel);
+                                                values.kernel[a], work.H.col(j).tail(n_samples - j), gradient->kernel[a],
+                                                work.kernel);
     }
     gradient->kernel[a] *= 0.5;
   }
@@ -213,15 +214,15 @@ double Likelihood::evaluate(const ModelValues& values, ModelValues* gradient, Wo
     // S^{-1/2} scales the rows of W and e
     if (self.options.noise_gradient) {
       const MatrixXd W = whitening.asDiagonal() * model.values.view.G(sample.index);
-      gradient->noise_stddev[group].array() +=
-          1 - d_e.array() * sample.e.array() - d_W.cwiseProduct(W).rowwise().sum().array();
+      gradient->noise_stddev[group].array() += 1 - d_e.array() * sample.e.array() - d_W.cwiseProduct(W).rowwise().sum().array();
     }
     for (std::size_t p = 0; p < self.options.gradient_parameters.size(); ++p) {
       const ObservationModel::Values& d = model.derivatives[p];
       const auto dG = d.view.G(sample.index);
       // de = −S^{-1/2}(dd + dG μ + G dμ)
-      const VectorXd de = -whitening.cwiseProduct(d.view.offset.col(sample.index) + dG * model.values.prior.mean.col(sample.index) +
-                                                  model.values.view.G(sample.index) * d.prior.mean.col(sample.index));
+      const VectorXd de =
+          -whitening.cwiseProduct(d.view.offset.col(sample.index) + dG * model.values.prior.mean.col(sample.index) +
+                                  model.values.view.G(sample.index) * d.prior.mean.col(sample.index));
       double slope = d_e.dot(de) + d_W.cwiseProduct(whitening.asDiagonal() * dG).sum();
       for (std::size_t a = 0; a < n_latents; ++a) {
         const MatrixXd dE = d.prior.E(a, sample.index) * values.signal_stddev[a].asDiagonal();

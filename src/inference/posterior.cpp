@@ -52,7 +52,8 @@ Query prepare(const Prior& prior, const ModelValues& values, const View& view, c
 VectorXd mean_at(const Posterior::Implementation& self, const Query& query, int i, Kernel::Workspace& workspace, VectorXd& k) {
   VectorXd a_bar = query.prior.mean.col(i);
   for (std::size_t a = 0; a < self.prior.latents.size(); ++a) {
-    self.prior.latents[a].kernel.evaluate(self.features[a], query.features[a].row(i).transpose(), self.values.kernel[a], k, workspace);
+    self.prior.latents[a].kernel.evaluate(self.features[a], query.features[a].row(i).transpose(), self.values.kernel[a], k,
+                                          workspace);
     a_bar += query.prior.E(a, i) * self.values.signal_stddev[a].cwiseProduct(self.beta[a].transpose() * k);
   }
   return query.view.G(i) * a_bar + query.view.offset.col(i);
@@ -63,7 +64,8 @@ void cross_covariance(const Posterior::Implementation& self, const Query& query,
                       Ref<MatrixXd> out) {
   out.setZero();
   for (std::size_t a = 0; a < self.prior.latents.size(); ++a) {
-    self.prior.latents[a].kernel.evaluate(self.features[a], query.features[a].row(i).transpose(), self.values.kernel[a], k, workspace);
+    self.prior.latents[a].kernel.evaluate(self.features[a], query.features[a].row(i).transpose(), self.values.kernel[a], k,
+                                          workspace);
     const MatrixXd Z_loading = self.Z[a] * query.loading(self.values, a, i).transpose();
     for (int c = 0; c < self.reduction.n_components(); ++c) {
       const Index n = self.reduction.count[static_cast<std::size_t>(c)];
@@ -78,8 +80,8 @@ MatrixXd prior_covariance(const Posterior::Implementation& self, const Query& qu
   MatrixXd covariance = MatrixXd::Zero(query.view.offset.rows(), query.view.offset.rows());
   VectorXd k(1);
   for (std::size_t a = 0; a < self.prior.latents.size(); ++a) {
-    self.prior.latents[a].kernel.evaluate(query.features[a].row(i), query.features[a].row(j).transpose(), self.values.kernel[a], k,
-                                          workspace);
+    self.prior.latents[a].kernel.evaluate(query.features[a].row(i), query.features[a].row(j).transpose(), self.values.kernel[a],
+                                          k, workspace);
     covariance += k[0] * query.loading(self.values, a, i) * query.loading(self.values, a, j).transpose();
   }
   return covariance;
@@ -106,13 +108,13 @@ Posterior::Posterior(Prior prior, std::vector<Observations> observations, ModelV
   std::vector<MatrixXd> k;
   assemble(self->prior, self->reduction, self->features, self->Z, self->values.kernel, self->L, k);
   if (!lapack::factorise(self->L)) {
-    throw NumericalError("the covariance of the observations cannot be factored in double precision: the noise is too small for the "
-                         "signal; use a larger noise standard deviation");
+    throw NumericalError(
+        "the covariance of the observations cannot be factored in double precision: the noise is too small for the "
+        "signal; use a larger noise standard deviation");
   }
   VectorXd alpha = self->reduction.y;
   lapack::solve_lower(self->L, false, alpha);
-  self->negative_log_likelihood =
-      self->reduction.constant + 0.5 * alpha.squaredNorm() + self->L.diagonal().array().log().sum();
+  self->negative_log_likelihood = self->reduction.constant + 0.5 * alpha.squaredNorm() + self->L.diagonal().array().log().sum();
   lapack::solve_lower(self->L, true, alpha);
 
   for (const MatrixXd& Z : self->Z) self->beta.push_back(latent_weights(self->reduction, Z, alpha));

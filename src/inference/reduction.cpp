@@ -64,7 +64,8 @@ Reduction reduce(const Prior& prior, const std::vector<Observations>& observatio
   reduction.offset.push_back(0);
   for (Index c = 0; !reduction.samples.empty() && c < reduction.samples.front().R.rows(); ++c) {
     Index count = 0;
-    while (count < static_cast<Index>(reduction.samples.size()) && reduction.samples[static_cast<std::size_t>(count)].R.rows() > c) {
+    while (count < static_cast<Index>(reduction.samples.size()) &&
+           reduction.samples[static_cast<std::size_t>(count)].R.rows() > c) {
       ++count;
     }
     reduction.count.push_back(count);
@@ -119,8 +120,8 @@ std::vector<MatrixXd> sorted_features(const std::vector<std::vector<MatrixXd>>& 
   return sorted;
 }
 
-void assemble(const Prior& prior, const Reduction& reduction, const std::vector<MatrixXd>& features, const std::vector<MatrixXd>& Z,
-              const std::vector<VectorXd>& kernel, MatrixXd& K, std::vector<MatrixXd>& k) {
+void assemble(const Prior& prior, const Reduction& reduction, const std::vector<MatrixXd>& features,
+              const std::vector<MatrixXd>& Z, const std::vector<VectorXd>& kernel, MatrixXd& K, std::vector<MatrixXd>& k) {
   const Index n_samples = static_cast<Index>(reduction.samples.size());
   const Index size = reduction.size();
   if (K.rows() != size || K.cols() != size) K.resize(size, size);

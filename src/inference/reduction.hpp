@@ -34,11 +34,11 @@ struct Reduction {
     Eigen::VectorXd e;      // (d)
     Eigen::VectorXd e_out;  // (I − QQᵀ) e
   };
-  std::vector<Sample> samples;               // sorted
-  std::vector<Eigen::Index> count, offset;   // per component; offset has one more entry, the reduced size
-  Eigen::VectorXd y;                         // ỹ
-  std::vector<Eigen::MatrixXd> directions;   // per latent: rows R_i E_a(x_i), without s  (size × p_a)
-  double constant = 0;                       // ½ Σ‖(I − QQᵀ)e‖² + ½ Σ log|S| + ½ Σ dim y log 2π
+  std::vector<Sample> samples;              // sorted
+  std::vector<Eigen::Index> count, offset;  // per component; offset has one more entry, the reduced size
+  Eigen::VectorXd y;                        // ỹ
+  std::vector<Eigen::MatrixXd> directions;  // per latent: rows R_i E_a(x_i), without s  (size × p_a)
+  double constant = 0;                      // ½ Σ‖(I − QQᵀ)e‖² + ½ Σ log|S| + ½ Σ dim y log 2π
 
   [[nodiscard]] Eigen::Index size() const { return offset.back(); }
   [[nodiscard]] int n_components() const { return static_cast<int>(count.size()); }

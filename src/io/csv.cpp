@@ -1,10 +1,5 @@
 #include "gp2/csv.hpp"
 
-#include <fcntl.h>
-#include <fmt/format.h>
-#include <sys/stat.h>
-#include <unistd.h>
-
 #include <algorithm>
 #include <atomic>
 #include <cerrno>
@@ -16,6 +11,12 @@
 #include <optional>
 #include <set>
 #include <system_error>
+
+#include <fcntl.h>
+#include <sys/stat.h>
+#include <unistd.h>
+
+#include <fmt/format.h>
 
 #include "gp2/error.hpp"
 
@@ -88,9 +89,7 @@ void check_header(const std::vector<std::string>& header, const std::string& whe
 
 }  // namespace
 
-CsvTable CsvTable::read(const std::filesystem::path& path) {
-  return parse(read_file(path), path.string());
-}
+CsvTable CsvTable::read(const std::filesystem::path& path) { return parse(read_file(path), path.string()); }
 
 CsvTable CsvTable::parse(std::string_view text, std::string name) {
   CsvTable table;

@@ -1,15 +1,15 @@
 #include "gp2/fit_file.hpp"
 
-#include <fmt/format.h>
-#include <fmt/ranges.h>
-
 #include <algorithm>
 #include <array>
 #include <cmath>
 #include <limits>
-#include <nlohmann/json.hpp>
 #include <set>
 #include <tuple>
+
+#include <fmt/format.h>
+#include <fmt/ranges.h>
+#include <nlohmann/json.hpp>
 
 #include "gp2/csv.hpp"
 #include "gp2/error.hpp"
@@ -56,9 +56,7 @@ Choice choice_from(const Json& json, const std::array<Named<Choice>, n>& choices
 }
 
 // a value to show in a message
-std::string shown(const Json& json) {
-  return json.is_structured() ? json.type_name() : json.dump();
-}
+std::string shown(const Json& json) { return json.is_structured() ? json.type_name() : json.dump(); }
 
 // a whole number, where Json itself would round or wrap
 int integer(const Json& json) {
@@ -88,9 +86,7 @@ Json parse_json(const std::filesystem::path& path) {
   return json;
 }
 
-Json vector_json(const VectorXd& values) {
-  return std::vector<double>(values.begin(), values.end());
-}
+Json vector_json(const VectorXd& values) { return std::vector<double>(values.begin(), values.end()); }
 
 VectorXd vector_from(const Json& json) {
   VectorXd values(static_cast<Index>(array(json).size()));
@@ -239,13 +235,9 @@ Observations observations_from(const Json& json, const Prior& prior) {
 }
 
 // a restart without a finite start has the objective ∞, which JSON has not: null
-Json number_or_null(double value) {
-  return std::isfinite(value) ? Json(value) : Json();
-}
+Json number_or_null(double value) { return std::isfinite(value) ? Json(value) : Json(); }
 
-double number_or_infinity(const Json& json) {
-  return json.is_null() ? std::numeric_limits<double>::infinity() : number(json);
-}
+double number_or_infinity(const Json& json) { return json.is_null() ? std::numeric_limits<double>::infinity() : number(json); }
 
 Json restart_json(const RestartReport& r) {
   return {{"objective", number_or_null(r.objective)},

@@ -10,9 +10,7 @@
 
 namespace gp2 {
 
-int line_of(const toml::node& node) {
-  return static_cast<int>(node.source().begin.line);
-}
+int line_of(const toml::node& node) { return static_cast<int>(node.source().begin.line); }
 
 std::string shortened(const std::string& text) {
   if (text.size() <= 60) return text;

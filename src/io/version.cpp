@@ -2,8 +2,6 @@
 
 namespace gp2 {
 
-const char* version() {
-  return GP2_VERSION;
-}
+const char* version() { return GP2_VERSION; }
 
 }  // namespace gp2

@@ -4,10 +4,10 @@
 #include <cmath>
 #include <numeric>
 
-#include <Eigen/Eigenvalues>
-#include <Eigen/SVD>
 #include <fmt/format.h>
 #include <fmt/ranges.h>
+#include <Eigen/Eigenvalues>
+#include <Eigen/SVD>
 
 #include "gp2/mechanics.hpp"
 
@@ -41,7 +41,8 @@ void for_each_subset(int n, int size, const Visit& visit) {
     while (k >= 0 && subset[static_cast<std::size_t>(k)] == n - size + k) --k;
     if (k < 0) return;
     ++subset[static_cast<std::size_t>(k)];
-    for (int later = k + 1; later < size; ++later) subset[static_cast<std::size_t>(later)] = subset[static_cast<std::size_t>(later - 1)] + 1;
+    for (int later = k + 1; later < size; ++later)
+      subset[static_cast<std::size_t>(later)] = subset[static_cast<std::size_t>(later - 1)] + 1;
   }
 }
 
@@ -123,7 +124,8 @@ std::optional<ConstraintViolation> largest_violation(const System& system, const
 }
 
 std::optional<std::vector<int>> dependent_columns(const System& system, const Ref<const MatrixXd>& states,
-                                                  const Ref<const VectorXd>& parameters, const Ref<const MatrixXd>& accelerations) {
+                                                  const Ref<const VectorXd>& parameters,
+                                                  const Ref<const MatrixXd>& accelerations) {
   const MechanicsBatch mechanics = evaluate_mechanics(system, states, parameters);
   if (mechanics.fault || system.nc() == 0 || accelerations.hasNaN()) return std::nullopt;
   // a log with 7 digits or more of a computed quantity; measured accelerations are never that good
@@ -178,8 +180,9 @@ void check_mechanics(const System& system, const MechanicsBatch& mechanics, std:
     zero_rows += projection.n_zero_rows();
   }
   if (lowest != highest) {
-    findings.push_back({Level::warning, fmt::format("constraints: the rank of A changes over the states, from {} to {} of {} rows", lowest,
-                                                    highest, system.nc())});
+    findings.push_back(
+        {Level::warning, fmt::format("constraints: the rank of A changes over the states, from {} to {} of {} rows", lowest,
+                                     highest, system.nc())});
   } else if (highest < system.nc()) {
     findings.push_back({Level::good, fmt::format("constraints: rank {} of {} rows: {} redundant, which is allowed", highest,
                                                  system.nc(), system.nc() - highest)});
@@ -187,10 +190,12 @@ void check_mechanics(const System& system, const MechanicsBatch& mechanics, std:
     findings.push_back({Level::good, fmt::format("constraints: {} rows, independent at every state", system.nc())});
   }
   if (highest >= system.nq()) {
-    findings.push_back({Level::warning, "constraints: they leave no freedom (rank = number of coordinates): nothing is left to learn"});
+    findings.push_back(
+        {Level::warning, "constraints: they leave no freedom (rank = number of coordinates): nothing is left to learn"});
   }
   if (zero_rows > 0) {
-    findings.push_back({Level::warning, fmt::format("constraints: a row of A vanishes {} times; it is dropped there", zero_rows)});
+    findings.push_back(
+        {Level::warning, fmt::format("constraints: a row of A vanishes {} times; it is dropped there", zero_rows)});
   }
 
   // a row that nearly vanishes somewhere decides the direction of its force from rounding
@@ -202,10 +207,11 @@ void check_mechanics(const System& system, const MechanicsBatch& mechanics, std:
     const double usual = sorted[sorted.size() / 2];
     const auto smallest = std::min_element(sizes.begin(), sizes.end());
     if (*smallest > 0 && *smallest < 1e-6 * usual) {
-      findings.push_back({Level::warning, fmt::format("constraint '{}': its row of A is {:.2g} of its usual size at state {}; write the "
-                                                      "constraint so that the row does not vanish",
-                                                      system.constraint_labels()[static_cast<std::size_t>(row)], *smallest / usual,
-                                                      smallest - sizes.begin() + 1)});
+      findings.push_back(
+          {Level::warning, fmt::format("constraint '{}': its row of A is {:.2g} of its usual size at state {}; write the "
+                                       "constraint so that the row does not vanish",
+                                       system.constraint_labels()[static_cast<std::size_t>(row)], *smallest / usual,
+                                       smallest - sizes.begin() + 1)});
     }
   }
 }
@@ -228,7 +234,8 @@ void check_parameter_derivatives(const System& system, const Ref<const MatrixXd>
       for (Index k = 0; k < exact.size(); ++k) {
         const double difference = (up.reshaped()[k] - down.reshaped()[k]) / (above[p] - below[p]);
         if (!std::isfinite(difference) || !std::isfinite(exact.reshaped()[k])) continue;
-        const double size = std::abs(exact.reshaped()[k]) + 1e-4 * std::abs(value.reshaped()[k]) / std::max(std::abs(parameters[p]), 1e-3);
+        const double size =
+            std::abs(exact.reshaped()[k]) + 1e-4 * std::abs(value.reshaped()[k]) / std::max(std::abs(parameters[p]), 1e-3);
         const double error = std::abs(difference - exact.reshaped()[k]) / std::max(size, 1e-12);
         if (error > worst) {
           worst = error;
@@ -255,7 +262,8 @@ void check_motion(const System& system, const Ref<const MatrixXd>& states, const
   const StateLayout layout = system.layout();
   const SystemValues values = system.evaluate(states, parameters);
   // an arbitrary acceleration of the size of the velocities
-  MatrixXd ddq = states.middleRows(layout.dq(0), layout.nq).unaryExpr([](double v) { return std::isnan(v) ? 0.0 : 0.7 * v + 0.3; });
+  MatrixXd ddq =
+      states.middleRows(layout.dq(0), layout.nq).unaryExpr([](double v) { return std::isnan(v) ? 0.0 : 0.7 * v + 0.3; });
   const double h = 1e-4;
   const auto moved = [&](double step) {
     MatrixXd x = states;
@@ -301,7 +309,8 @@ void check_motion(const System& system, const Ref<const MatrixXd>& states, const
 
 }  // namespace
 
-std::vector<Finding> check_system(const System& system, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters) {
+std::vector<Finding> check_system(const System& system, const Ref<const MatrixXd>& states,
+                                  const Ref<const VectorXd>& parameters) {
   std::vector<Finding> findings;
   const MechanicsBatch mechanics = evaluate_mechanics(system, states, parameters);
   if (mechanics.fault) {
@@ -319,8 +328,8 @@ std::vector<Finding> check_data(const System& system, const Ref<const MatrixXd>&
   std::vector<Finding> findings;
   if (const auto violation = largest_violation(system, states, parameters)) {
     findings.push_back({violation->relative > constraint_violation_tolerance ? Level::warning : Level::good,
-                        fmt::format("data on the constraint: off by {:.2g} at most, {:.1e} of its scale ('{}', row {})", violation->value,
-                                    violation->relative, violation->constraint, violation->state + 1)});
+                        fmt::format("data on the constraint: off by {:.2g} at most, {:.1e} of its scale ('{}', row {})",
+                                    violation->value, violation->relative, violation->constraint, violation->state + 1)});
   }
   if (accelerations.hasNaN() || system.nc() == 0) return findings;
 
@@ -329,15 +338,17 @@ std::vector<Finding> check_data(const System& system, const Ref<const MatrixXd>&
   for (int i = 0; i < values.n_states(); ++i) rms += (values.A(i) * accelerations.col(i) - values.b(i)).cwiseAbs2();
   rms = (rms / values.n_states()).cwiseSqrt();
   for (Index k = 0; k < rms.size(); ++k) {
-    findings.push_back({Level::good, fmt::format("measured ddq on A ddq = b: rms residual {:.3g} for '{}' (noise, if the model is right)",
-                                                 rms[k], system.constraint_labels()[static_cast<std::size_t>(k)])});
+    findings.push_back(
+        {Level::good, fmt::format("measured ddq on A ddq = b: rms residual {:.3g} for '{}' (noise, if the model is right)",
+                                  rms[k], system.constraint_labels()[static_cast<std::size_t>(k)])});
   }
   if (const auto rows = dependent_columns(system, states, parameters, accelerations)) {
     std::vector<std::string> names;
     for (int row : *rows) names.push_back(system.coordinates()[static_cast<std::size_t>(row)].acceleration());
-    findings.push_back({Level::warning, fmt::format("dependent columns: the {} accelerations obey A ddq = b to rounding, so only {} of them are "
-                                                    "independent measurements: fit with --observe {}",
-                                                    system.nq(), rows->size(), fmt::join(names, ","))});
+    findings.push_back(
+        {Level::warning, fmt::format("dependent columns: the {} accelerations obey A ddq = b to rounding, so only {} of them are "
+                                     "independent measurements: fit with --observe {}",
+                                     system.nq(), rows->size(), fmt::join(names, ","))});
   }
   return findings;
 }

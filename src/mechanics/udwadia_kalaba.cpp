@@ -1,8 +1,8 @@
 #include <algorithm>
 #include <cmath>
 
-#include <Eigen/QR>
 #include <fmt/format.h>
+#include <Eigen/QR>
 
 #include "gp2/error.hpp"
 #include "gp2/mechanics.hpp"
@@ -35,8 +35,7 @@ UdwadiaKalaba::UdwadiaKalaba(const Ref<const MatrixXd>& M, const Ref<const Matri
   const Eigen::Index nc = A.rows();
   // LLT stops at a pivot ≤ 0; a pivot lost to rounding is as good as none
   const auto pivots = mass_factor_.matrixLLT().diagonal().array();
-  if (mass_factor_.info() != Eigen::Success || !M.allFinite() ||
-      (pivots.square() <= 1e-14 * M.diagonal().array().abs()).any()) {
+  if (mass_factor_.info() != Eigen::Success || !M.allFinite() || (pivots.square() <= 1e-14 * M.diagonal().array().abs()).any()) {
     mass_is_positive_definite_ = false;
     return;
   }
@@ -108,7 +107,8 @@ UdwadiaKalaba::Derivative UdwadiaKalaba::differentiate(const Ref<const MatrixXd>
   return d;
 }
 
-MechanicsBatch evaluate_mechanics(const System& system, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters) {
+MechanicsBatch evaluate_mechanics(const System& system, const Ref<const MatrixXd>& states,
+                                  const Ref<const VectorXd>& parameters) {
   MechanicsBatch batch{system.evaluate(states, parameters), {}, std::nullopt};
   const int n_states = batch.values.n_states();
   batch.projections.reserve(static_cast<std::size_t>(n_states));

@@ -70,8 +70,8 @@ void squared_distance(const Ref<const MatrixXd>& features, const Ref<const Vecto
 }
 
 // a primitive's value from r² (stationary) or from the features, into `out`
-void evaluate_primitive(Primitive primitive, const Ref<const MatrixXd>& features, const Ref<const VectorXd>& point, const double* v,
-                        Ref<ArrayXd> out) {
+void evaluate_primitive(Primitive primitive, const Ref<const MatrixXd>& features, const Ref<const VectorXd>& point,
+                        const double* v, Ref<ArrayXd> out) {
   const Index n_features = features.cols();
   if (is_stationary(primitive)) squared_distance(features, point, v, out);
   switch (primitive) {
@@ -109,8 +109,8 @@ void evaluate_primitive(Primitive primitive, const Ref<const MatrixXd>& features
 
 // adds Σ_i weight_i ∂(primitive)/∂log v to gradient; `value` is the primitive's value and `scratch` is overwritten
 void add_primitive_gradient(Primitive primitive, const Ref<const MatrixXd>& features, const Ref<const VectorXd>& point,
-                            const double* v, const Ref<const ArrayXd>& value, const Ref<const ArrayXd>& weight, Ref<ArrayXd> scratch,
-                            double* gradient) {
+                            const double* v, const Ref<const ArrayXd>& value, const Ref<const ArrayXd>& weight,
+                            Ref<ArrayXd> scratch, double* gradient) {
   const Index n_features = features.cols();
   const auto delta = [&](Index d) { return features.col(d).array() - point[d]; };
   switch (primitive) {
@@ -140,8 +140,8 @@ void add_primitive_gradient(Primitive primitive, const Ref<const MatrixXd>& feat
         const double inverse_period = std::numbers::pi / v[n_features + d];
         const double inverse_square = 1 / (v[d] * v[d]);
         gradient[d] += (scratch * (delta(d) * inverse_period).sin().square()).sum() * inverse_square;
-        gradient[n_features + d] += 0.5 * (scratch * (2 * inverse_period * delta(d)).sin() * delta(d)).sum() * inverse_period *
-                                    inverse_square;
+        gradient[n_features + d] +=
+            0.5 * (scratch * (2 * inverse_period * delta(d)).sin() * delta(d)).sum() * inverse_period * inverse_square;
       }
       return;
     case Primitive::linear:
@@ -193,11 +193,13 @@ Kernel Kernel::parse(std::string_view text, std::span<const std::string> feature
       if (primitive == Primitive::constant) continue;
       for (std::size_t d = 0; d < features.size(); ++d) {
         kernel.parameters_.push_back(
-            {primitive == Primitive::periodic ? ParameterKind::periodic_lengthscale : ParameterKind::lengthscale, static_cast<int>(d), fmt::format("{}lengthscale({})", prefix, features[d])});
+            {primitive == Primitive::periodic ? ParameterKind::periodic_lengthscale : ParameterKind::lengthscale,
+             static_cast<int>(d), fmt::format("{}lengthscale({})", prefix, features[d])});
       }
       if (primitive == Primitive::periodic) {
         for (std::size_t d = 0; d < features.size(); ++d) {
-          kernel.parameters_.push_back({ParameterKind::period, static_cast<int>(d), fmt::format("{}period({})", prefix, features[d])});
+          kernel.parameters_.push_back(
+              {ParameterKind::period, static_cast<int>(d), fmt::format("{}period({})", prefix, features[d])});
         }
       }
       if (primitive == Primitive::rq) kernel.parameters_.push_back({ParameterKind::shape, -1, prefix + "alpha"});
@@ -233,8 +235,9 @@ void Kernel::evaluate(const Ref<const MatrixXd>& features, const Ref<const Vecto
   }
 }
 
-void Kernel::add_gradient(const Ref<const MatrixXd>& features, const Ref<const VectorXd>& point, const Ref<const VectorXd>& values,
-                          const Ref<const VectorXd>& w, Ref<VectorXd> gradient, Workspace& workspace) const {
+void Kernel::add_gradient(const Ref<const MatrixXd>& features, const Ref<const VectorXd>& point,
+                          const Ref<const VectorXd>& values, const Ref<const VectorXd>& w, Ref<VectorXd> gradient,
+                          Workspace& workspace) const {
   const Index n = features.rows();
   std::size_t n_factors = 1;
   for (const Term& term : terms_) n_factors = std::max(n_factors, term.factors.size());
@@ -246,7 +249,8 @@ void Kernel::add_gradient(const Ref<const MatrixXd>& features, const Ref<const V
 
   for (const Term& term : terms_) {
     for (std::size_t f = 0; f < term.factors.size(); ++f) {
-      evaluate_primitive(term.factors[f].primitive, features, point, values.data() + term.factors[f].first_parameter, factor_value(f));
+      evaluate_primitive(term.factors[f].primitive, features, point, values.data() + term.factors[f].first_parameter,
+                         factor_value(f));
     }
     const double amplitude = term.amplitude < 0 ? 1 : values[term.amplitude] * values[term.amplitude];
     for (std::size_t f = 0; f < term.factors.size(); ++f) {

@@ -13,8 +13,8 @@ namespace {
 Map<MatrixXd> block(MatrixXd& matrix, int i, Index rows) { return {matrix.col(i).data(), rows, matrix.rows() / rows}; }
 
 // B(x) at N states, from its tape or the identity
-MatrixXd evaluate_base(const Latent& latent, const Tape& tape, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters,
-                       Index nq) {
+MatrixXd evaluate_base(const Latent& latent, const Tape& tape, const Ref<const MatrixXd>& states,
+                       const Ref<const VectorXd>& parameters, Index nq) {
   if (latent.directions_are_identity) {
     const MatrixXd identity = MatrixXd::Identity(nq, nq);
     return identity.reshaped().replicate(1, states.cols());
@@ -79,8 +79,8 @@ PriorValues differentiate_prior(const Prior& prior, const Ref<const MatrixXd>& s
   // dμ = M⁻¹(dF − dM μ)
   if (prior.mean == Prior::Mean::force) {
     for (int i = 0; i < n_states; ++i) {
-      d.mean.col(i) = mechanics.projections[static_cast<std::size_t>(i)].solve_mass(derivative.F(i) -
-                                                                                    derivative.M(i) * values.mean.col(i));
+      d.mean.col(i) =
+          mechanics.projections[static_cast<std::size_t>(i)].solve_mass(derivative.F(i) - derivative.M(i) * values.mean.col(i));
     }
   }
   for (std::size_t a = 0; a < prior.latents.size(); ++a) {

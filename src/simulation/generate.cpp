@@ -1,15 +1,15 @@
 #include "gp2/generate.hpp"
 
-#include <fmt/format.h>
-#include <fmt/ranges.h>
-
-#include <Eigen/QR>
 #include <algorithm>
 #include <cmath>
 #include <limits>
 #include <map>
 #include <optional>
 #include <span>
+
+#include <fmt/format.h>
+#include <fmt/ranges.h>
+#include <Eigen/QR>
 
 #include "gp2/error.hpp"
 #include "gp2/mechanics.hpp"

@@ -1,13 +1,13 @@
 #include "gp2/expression.hpp"
 
-#include <fmt/format.h>
-
 #include <algorithm>
 #include <array>
 #include <cassert>
 #include <string>
 #include <unordered_map>
 #include <unordered_set>
+
+#include <fmt/format.h>
 
 #include "gp2/error.hpp"
 #include "symbolic/graph.hpp"
@@ -49,13 +49,9 @@ std::vector<std::uint32_t> ExpressionGraph::Implementation::reachable(std::span<
 
 // ---------------------------------------------------------------------------------------------------------------- Expression
 
-Operation Expression::operation() const {
-  return graph_->implementation_->nodes[id_].operation;
-}
+Operation Expression::operation() const { return graph_->implementation_->nodes[id_].operation; }
 
-bool Expression::is_constant(double value) const {
-  return is_constant() && constant_value() == value;
-}
+bool Expression::is_constant(double value) const { return is_constant() && constant_value() == value; }
 
 double Expression::constant_value() const {
   assert(is_constant());
@@ -77,28 +73,16 @@ Expression Expression::right() const {
   return {graph_, graph_->implementation_->nodes[id_].b};
 }
 
-Expression operator+(Expression a, Expression b) {
-  return a.graph().apply(Operation::add, a, b);
-}
-Expression operator-(Expression a, Expression b) {
-  return a.graph().apply(Operation::subtract, a, b);
-}
-Expression operator*(Expression a, Expression b) {
-  return a.graph().apply(Operation::multiply, a, b);
-}
-Expression operator/(Expression a, Expression b) {
-  return a.graph().apply(Operation::divide, a, b);
-}
-Expression operator-(Expression a) {
-  return a.graph().apply(Operation::negate, a);
-}
+Expression operator+(Expression a, Expression b) { return a.graph().apply(Operation::add, a, b); }
+Expression operator-(Expression a, Expression b) { return a.graph().apply(Operation::subtract, a, b); }
+Expression operator*(Expression a, Expression b) { return a.graph().apply(Operation::multiply, a, b); }
+Expression operator/(Expression a, Expression b) { return a.graph().apply(Operation::divide, a, b); }
+Expression operator-(Expression a) { return a.graph().apply(Operation::negate, a); }
 
 namespace {
 
 /// Whether e is written with a leading minus: −u, or a negative constant. Then -e is simpler than e.
-bool has_minus(Expression e) {
-  return e.operation() == Operation::negate || (e.is_constant() && e.constant_value() < 0);
-}
+bool has_minus(Expression e) { return e.operation() == Operation::negate || (e.is_constant() && e.constant_value() < 0); }
 
 /// What `operation` makes of two constants, unless that is infinite or NaN: such a node stays, so that evaluating it shows the
 /// error.
@@ -183,9 +167,7 @@ std::optional<Expression> simplify(Operation operation, Expression a, Expression
 ExpressionGraph::ExpressionGraph() : implementation_(std::make_unique<Implementation>()) {}
 ExpressionGraph::~ExpressionGraph() = default;
 
-std::size_t ExpressionGraph::size() const {
-  return implementation_->nodes.size();
-}
+std::size_t ExpressionGraph::size() const { return implementation_->nodes.size(); }
 
 Expression ExpressionGraph::constant(double value) {
   if (!std::isfinite(value)) throw InputError(fmt::format("expressions: a constant must be finite, got {}", value));

@@ -27,9 +27,7 @@ struct Node {
   double value = 0;     // of a constant
 };
 
-constexpr bool is_leaf(Operation operation) {
-  return operation == Operation::constant || operation == Operation::variable;
-}
+constexpr bool is_leaf(Operation operation) { return operation == Operation::constant || operation == Operation::variable; }
 
 constexpr bool is_binary(Operation operation) {
   switch (operation) {

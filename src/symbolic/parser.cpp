@@ -1,10 +1,10 @@
-#include <fmt/format.h>
-
 #include <algorithm>
 #include <charconv>
 #include <numbers>
 #include <numeric>
 #include <utility>
+
+#include <fmt/format.h>
 
 #include "gp2/error.hpp"
 #include "gp2/expression.hpp"
@@ -22,15 +22,9 @@ constexpr std::size_t max_length = 65536;
 constexpr int max_depth = 200;
 
 // not <cctype>: these do not depend on the locale
-bool is_digit(char c) {
-  return c >= '0' && c <= '9';
-}
-bool is_letter(char c) {
-  return (c >= 'a' && c <= 'z') || (c >= 'A' && c <= 'Z') || c == '_';
-}
-bool is_space(char c) {
-  return c == ' ' || c == '\t' || c == '\n' || c == '\r';
-}
+bool is_digit(char c) { return c >= '0' && c <= '9'; }
+bool is_letter(char c) { return (c >= 'a' && c <= 'z') || (c >= 'A' && c <= 'Z') || c == '_'; }
+bool is_space(char c) { return c == ' ' || c == '\t' || c == '\n' || c == '\r'; }
 
 /// Levenshtein distance: the least number of characters inserted, removed or changed between a and b.
 std::size_t edit_distance(std::string_view a, std::string_view b) {

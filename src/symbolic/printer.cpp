@@ -1,11 +1,11 @@
-#include <fmt/format.h>
-
 #include <algorithm>
 #include <array>
 #include <charconv>
 #include <iterator>
 #include <numbers>
 #include <utility>
+
+#include <fmt/format.h>
 
 #include "gp2/error.hpp"
 #include "gp2/expression.hpp"

@@ -96,9 +96,10 @@ ConstraintRow derive_constraint(Level level, Expression c, std::string text, con
     const Expression entry = graph.differentiate(c, symbol);
     for (Expression acceleration : symbols.ddq) {
       if (graph.depends_on(entry, acceleration)) {
-        throw InputError(fmt::format("an acceleration-level constraint must be linear in the accelerations, but the factor of '{}' "
-                                     "depends on '{}'",
-                                     symbol.variable_name(), acceleration.variable_name()));
+        throw InputError(
+            fmt::format("an acceleration-level constraint must be linear in the accelerations, but the factor of '{}' "
+                        "depends on '{}'",
+                        symbol.variable_name(), acceleration.variable_name()));
       }
     }
     acts = acts || !entry.is_constant(0);
@@ -169,7 +170,8 @@ SymbolicSystem::SymbolicSystem(Definition definition)
   residuals_ = Tape(residuals, tape_inputs);
 }
 
-SystemValues SymbolicSystem::run(const Tape& tape, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters) const {
+SystemValues SymbolicSystem::run(const Tape& tape, const Ref<const MatrixXd>& states,
+                                 const Ref<const VectorXd>& parameters) const {
   MatrixXd all;
   tape.evaluate(states, parameters, all);
   const Eigen::Index n_mass = nq() * nq();
@@ -181,7 +183,8 @@ SystemValues SymbolicSystem::evaluate(const Ref<const MatrixXd>& states, const R
   return run(values_, states, parameters);
 }
 
-SystemValues SymbolicSystem::differentiate(const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters, int index) const {
+SystemValues SymbolicSystem::differentiate(const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters,
+                                           int index) const {
   return run(derivatives_[static_cast<std::size_t>(index)], states, parameters);
 }
 

@@ -1,8 +1,8 @@
-#include <fmt/format.h>
-
 #include <algorithm>
 #include <limits>
 #include <unordered_map>
+
+#include <fmt/format.h>
 
 #include "gp2/error.hpp"
 #include "gp2/expression.hpp"

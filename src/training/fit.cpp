@@ -2,8 +2,8 @@
 #include <atomic>
 #include <chrono>
 #include <cmath>
-#include <limits>
 #include <exception>
+#include <limits>
 #include <mutex>
 #include <random>
 #include <thread>
@@ -182,7 +182,8 @@ class Training {
     options.iteration = [&](int iteration, double value) { return report_iteration(restart, iteration, value); };
     const Index n = static_cast<Index>(from.size());
     VectorXd start(n);
-    for (Index k = 0; k < n; ++k) start[k] = to_internal(from[static_cast<std::size_t>(k)], from[static_cast<std::size_t>(k)].value);
+    for (Index k = 0; k < n; ++k)
+      start[k] = to_internal(from[static_cast<std::size_t>(k)], from[static_cast<std::size_t>(k)].value);
     return minimise([&](const VectorXd& x, VectorXd& gradient) { return objective(x, &gradient, workspace); }, start,
                     Eigen::Map<const VectorXd>(box_.lower.data(), n), Eigen::Map<const VectorXd>(box_.upper.data(), n), options);
   }
@@ -199,7 +200,8 @@ class Training {
     report.termination = result.termination;
   }
 
-  // scans each hyperparameter over its box from the best optimum; true when the optimiser got lower from the best point of the scan
+  // scans each hyperparameter over its box from the best optimum; true when the optimiser got lower from the best point of the
+  // scan
   bool escape() {
     const std::size_t from = best();
     if (!std::isfinite(reports_[from].objective) || hyperparameters_.empty()) return false;

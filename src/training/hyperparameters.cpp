@@ -129,8 +129,8 @@ namespace {
 
 std::string unit_of(const std::string& quantity) { return fmt::format("unit of {}", quantity); }
 
-void add_kernel_parameters(const Latent& latent, int owner, const std::string& prefix, const Scales& scales, const Protocol& protocol,
-                           std::vector<Hyperparameter>& out) {
+void add_kernel_parameters(const Latent& latent, int owner, const std::string& prefix, const Scales& scales,
+                           const Protocol& protocol, std::vector<Hyperparameter>& out) {
   const bool paper = protocol.name == Protocol::Name::paper;
   const auto choose = [](double own, double standard) { return own > 0 ? own : standard; };
   const Latent::Range& range = latent.lengthscale;
@@ -178,8 +178,8 @@ void add_kernel_parameters(const Latent& latent, int owner, const std::string& p
   }
 }
 
-void add_signal_stddevs(const Latent& latent, int owner, const std::string& prefix, const Scales& scales, const Protocol& protocol,
-                        std::vector<Hyperparameter>& out) {
+void add_signal_stddevs(const Latent& latent, int owner, const std::string& prefix, const Scales& scales,
+                        const Protocol& protocol, std::vector<Hyperparameter>& out) {
   const VectorXd& scale = scales.signal_stddev[static_cast<std::size_t>(owner)];
   const Latent::Range& range = latent.signal_stddev;
   const auto choose = [](double own, double standard) { return own > 0 ? own : standard; };
@@ -261,9 +261,10 @@ std::vector<Hyperparameter> default_hyperparameters(const Prior& prior, const st
     for (const Latent& latent : prior.latents) {
       const std::vector<int>& used = latent.feature_parameters;
       if (std::find(used.begin(), used.end(), index) != used.end()) {
-        throw InputError(fmt::format("--estimate: parameter '{}' stands in a feature of the latent '{}', and features hold no estimated "
-                                     "parameters; write the feature without it, or leave it out",
-                                     name, latent.name));
+        throw InputError(
+            fmt::format("--estimate: parameter '{}' stands in a feature of the latent '{}', and features hold no estimated "
+                        "parameters; write the feature without it, or leave it out",
+                        name, latent.name));
       }
     }
     const Parameter& parameter = system.parameters()[static_cast<std::size_t>(index)];
@@ -287,8 +288,8 @@ std::vector<Hyperparameter> default_hyperparameters(const Prior& prior, const st
       h.lower = std::min(0.5 * parameter.value, 2 * parameter.value);
       h.upper = std::max(0.5 * parameter.value, 2 * parameter.value);
     } else {
-      throw InputError(fmt::format("parameter '{}' is 0 and has no bounds: write {} = {{ value = 0, bounds = [lower, upper] }}", name,
-                                   name));
+      throw InputError(
+          fmt::format("parameter '{}' is 0 and has no bounds: write {} = {{ value = 0, bounds = [lower, upper] }}", name, name));
     }
     out.push_back(std::move(h));
   }

@@ -23,14 +23,10 @@ std::vector<View> views_of(const Problem& p) {
           View{Quantity::constrained_acceleration, {system.nq() - 1, 0}}};
 }
 
-double largest(const MatrixXd& matrix) {
-  return matrix.size() == 0 ? 0 : matrix.cwiseAbs().maxCoeff();
-}
+double largest(const MatrixXd& matrix) { return matrix.size() == 0 ? 0 : matrix.cwiseAbs().maxCoeff(); }
 
 // ε times the condition number of K̃ + I, after mechanics with κ(M) of some hundreds
-double rounding(const Problem& p) {
-  return 1e4 * test::eps * test::condition(p);
-}
+double rounding(const Problem& p) { return 1e4 * test::eps * test::condition(p); }
 
 TEST(PosteriorTest, IsTheTextbookGaussianProcess) {
   for (const Problem& p : test::problems(9, seed)) {

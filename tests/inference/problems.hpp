@@ -1,11 +1,12 @@
 #pragma once
 
-#include <Eigen/Dense>
 #include <numbers>
 #include <optional>
 #include <string>
 #include <utility>
 #include <vector>
+
+#include <Eigen/Dense>
 
 #include "gp2/likelihood.hpp"
 #include "gp2/model_file.hpp"

@@ -1,14 +1,15 @@
 #include "gp2/csv.hpp"
 
-#include <gmock/gmock.h>
-#include <sys/stat.h>
-#include <unistd.h>
-
 #include <bit>
 #include <cmath>
 #include <limits>
 #include <random>
 #include <thread>
+
+#include <sys/stat.h>
+#include <unistd.h>
+
+#include <gmock/gmock.h>
 
 #include "io/io_testing.hpp"
 
@@ -22,14 +23,10 @@ using testing::EndsWith;
 using testing::HasSubstr;
 using testing::StartsWith;
 
-CsvTable parse(std::string_view text) {
-  return CsvTable::parse(text, "log.csv");
-}
+CsvTable parse(std::string_view text) { return CsvTable::parse(text, "log.csv"); }
 
 /// The number in the only cell of a column x.
-double number_in(const std::string& cell) {
-  return parse("x,y\n" + cell + ",0\n").number(0, 0);
-}
+double number_in(const std::string& cell) { return parse("x,y\n" + cell + ",0\n").number(0, 0); }
 
 // ---- tables
 

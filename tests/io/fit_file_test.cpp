@@ -1,10 +1,10 @@
 #include "gp2/fit_file.hpp"
 
-#include <fmt/format.h>
-#include <gmock/gmock.h>
-
 #include <functional>
 #include <limits>
+
+#include <fmt/format.h>
+#include <gmock/gmock.h>
 #include <nlohmann/json.hpp>
 
 #include "gp2/generate.hpp"
@@ -80,9 +80,7 @@ TEST_P(FitFileOf, PredictsTheSameBitsAfterItWasWrittenAndRead) {
   EXPECT_NEAR(read.posterior().negative_log_likelihood(), nll, 1e-9 * (1 + std::abs(nll)));
 }
 
-const ModelFile& unicycle() {
-  return test::model("models/unicycle.toml");
-}
+const ModelFile& unicycle() { return test::model("models/unicycle.toml"); }
 
 TEST(FitFile, EveryChoiceOfPriorAndProtocolSurvives) {
   for (const Prior::Mean mean : {Prior::Mean::zero, Prior::Mean::force}) {

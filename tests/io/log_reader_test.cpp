@@ -1,8 +1,8 @@
 #include "gp2/log_reader.hpp"
 
-#include <gmock/gmock.h>
-
 #include <cmath>
+
+#include <gmock/gmock.h>
 
 #include "gp2/model_file.hpp"
 #include "io/io_testing.hpp"

@@ -1,9 +1,9 @@
 #include "gp2/model_file.hpp"
 
+#include <chrono>
+
 #include <fmt/format.h>
 #include <gmock/gmock.h>
-
-#include <chrono>
 
 #include "gp2/csv.hpp"
 #include "io/io_testing.hpp"
@@ -31,9 +31,7 @@ m = { value = 2.0, bounds = [1, 3] }
 mass = [["m", "0"], ["0", "1"]]
 )";
 
-ModelFile parse(const std::string& text) {
-  return ModelFile::parse(text, "m.toml");
-}
+ModelFile parse(const std::string& text) { return ModelFile::parse(text, "m.toml"); }
 std::string error_of(const std::string& text) {
   return input_error_of([&] { parse(text); });
 }
@@ -47,12 +45,8 @@ std::string replaced(std::string text, const std::string& from, const std::strin
 std::string with_coordinates(const std::string& coordinates) {
   return replaced(base, R"(["q1", { name = "q2", angle = true }])", coordinates);
 }
-std::string with_mass(const std::string& mass) {
-  return replaced(base, R"([["m", "0"], ["0", "1"]])", mass);
-}
-std::string with_parameter(const std::string& m) {
-  return replaced(base, "m = { value = 2.0, bounds = [1, 3] }", m);
-}
+std::string with_mass(const std::string& mass) { return replaced(base, R"([["m", "0"], ["0", "1"]])", mass); }
+std::string with_parameter(const std::string& m) { return replaced(base, "m = { value = 2.0, bounds = [1, 3] }", m); }
 
 /// `outer` n times around `inner`.
 std::string nested(const std::string& left, const std::string& inner, const std::string& right, int n) {
@@ -84,9 +78,7 @@ TEST_P(ShippedModel, IsReadWhole) {
   }
 }
 
-TEST(ModelFile, AtLeastNineModelsComeWithTheLibrary) {
-  EXPECT_GE(test::every_model().size(), 9U);
-}
+TEST(ModelFile, AtLeastNineModelsComeWithTheLibrary) { EXPECT_GE(test::every_model().size(), 9U); }
 
 // ---- what a model means
 
@@ -273,15 +265,11 @@ struct Complaint {
   std::string message;  // without "m.toml:"
 };
 
-void PrintTo(const Complaint& complaint, std::ostream* out) {
-  *out << complaint.what;
-}
+void PrintTo(const Complaint& complaint, std::ostream* out) { *out << complaint.what; }
 
 class RefusedModel : public testing::TestWithParam<Complaint> {};
 
-TEST_P(RefusedModel, NamesTheLineTheKeyAndTheMend) {
-  EXPECT_EQ(error_of(GetParam().text), "m.toml:" + GetParam().message);
-}
+TEST_P(RefusedModel, NamesTheLineTheKeyAndTheMend) { EXPECT_EQ(error_of(GetParam().text), "m.toml:" + GetParam().message); }
 
 std::vector<Complaint> complaints() {
   const std::string latent = base + "[[latent]]\n";

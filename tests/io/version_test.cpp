@@ -5,9 +5,7 @@
 namespace gp2 {
 namespace {
 
-TEST(Version, IsThreeNumbersWithPoints) {
-  EXPECT_THAT(version(), testing::MatchesRegex("[0-9]+\\.[0-9]+\\.[0-9]+"));
-}
+TEST(Version, IsThreeNumbersWithPoints) { EXPECT_THAT(version(), testing::MatchesRegex("[0-9]+\\.[0-9]+\\.[0-9]+")); }
 
 }  // namespace
 }  // namespace gp2

@@ -1,6 +1,5 @@
-#include <gtest/gtest.h>
-
 #include <Eigen/Dense>
+#include <gtest/gtest.h>
 
 #include "gp2/mechanics.hpp"
 #include "test_models.hpp"
@@ -29,9 +28,7 @@ double condition(const MatrixXd& M) {
   return values[values.size() - 1] / values[0];
 }
 
-double largest(const MatrixXd& matrix) {
-  return matrix.size() == 0 ? 0 : matrix.cwiseAbs().maxCoeff();
-}
+double largest(const MatrixXd& matrix) { return matrix.size() == 0 ? 0 : matrix.cwiseAbs().maxCoeff(); }
 
 MatrixXd with_row(const MatrixXd& A, const Eigen::RowVectorXd& row) {
   MatrixXd extended(A.rows() + 1, A.cols());

@@ -1,7 +1,7 @@
-#include <gtest/gtest.h>
-
 #include <map>
 #include <set>
+
+#include <gtest/gtest.h>
 
 #include "gp2/mechanics.hpp"
 #include "test_models.hpp"
@@ -36,9 +36,7 @@ VectorXd stack(const MatrixXd& T, const VectorXd& Lb) {
 
 // Rows of the slider-crank that are redundant on its constraint only become independent once r or l moves at a fixed state: the
 // derivative at constant rank is that of the loop's own two rows.
-int n_rows_to_use(const std::string& file, const System& system) {
-  return test::stem(file) == "slider_crank" ? 2 : system.nc();
-}
+int n_rows_to_use(const std::string& file, const System& system) { return test::stem(file) == "slider_crank" ? 2 : system.nc(); }
 
 TEST_P(ParameterDerivatives, OfTheProjectionMatchDifferences) {
   const System& system = *test::model(GetParam()).system;

@@ -1,7 +1,7 @@
-#include <gtest/gtest.h>
+#include <fstream>
 
 #include <Eigen/Dense>
-#include <fstream>
+#include <gtest/gtest.h>
 #include <nlohmann/json.hpp>
 
 #include "gp2/mechanics.hpp"

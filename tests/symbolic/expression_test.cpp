@@ -1,8 +1,8 @@
 #include "gp2/expression.hpp"
 
-#include <gtest/gtest.h>
-
 #include <limits>
+
+#include <gtest/gtest.h>
 
 #include "gp2/error.hpp"
 #include "random_expression.hpp"

@@ -1,11 +1,11 @@
 // GiNaC, an independent computer algebra system, evaluates the same random expressions and their derivatives with 40 digits.
 
-#include <ginac/ginac.h>
-#include <gtest/gtest.h>
-
 #include <algorithm>
 #include <limits>
 #include <unordered_map>
+
+#include <ginac/ginac.h>
+#include <gtest/gtest.h>
 
 #include "gp2/expression.hpp"
 #include "random_expression.hpp"

@@ -1,8 +1,8 @@
-#include <gtest/gtest.h>
-
 #include <algorithm>
 #include <chrono>
 #include <clocale>
+
+#include <gtest/gtest.h>
 
 #include "gp2/error.hpp"
 #include "gp2/expression.hpp"

@@ -1,8 +1,8 @@
-#include <gtest/gtest.h>
-
 #include <bit>
 #include <cstdint>
 #include <thread>
+
+#include <gtest/gtest.h>
 
 #include "gp2/error.hpp"
 #include "gp2/expression.hpp"
@@ -14,9 +14,7 @@ namespace {
 constexpr unsigned seed = 11;
 
 /// The bits of x; one pattern stands for every NaN.
-std::uint64_t bits(double x) {
-  return std::isnan(x) ? ~std::uint64_t{0} : std::bit_cast<std::uint64_t>(x);
-}
+std::uint64_t bits(double x) { return std::isnan(x) ? ~std::uint64_t{0} : std::bit_cast<std::uint64_t>(x); }
 
 /// Many random outputs (and their derivatives) of x1, x2 per point and x3, x4 shared.
 class TapeTest : public testing::Test {

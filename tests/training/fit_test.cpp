@@ -1,7 +1,7 @@
+#include <atomic>
+
 #include <gmock/gmock.h>
 #include <gtest/gtest.h>
-
-#include <atomic>
 
 #include "gp2/error.hpp"
 #include "gp2/training.hpp"

@@ -1,7 +1,7 @@
+#include <set>
+
 #include <gmock/gmock.h>
 #include <gtest/gtest.h>
-
-#include <set>
 
 #include "gp2/error.hpp"
 #include "gp2/training.hpp"
@@ -36,14 +36,10 @@ const Hyperparameter& find(const std::vector<Hyperparameter>& all, const std::st
 }
 
 // the standard deviation by its definition
-double stddev(const VectorXd& values) {
-  return std::sqrt((values.array() - values.mean()).square().mean());
-}
+double stddev(const VectorXd& values) { return std::sqrt((values.array() - values.mean()).square().mean()); }
 
 // a few roundings
-void expect_same(double got, double want) {
-  EXPECT_NEAR(got, want, 64 * test::eps * std::abs(want));
-}
+void expect_same(double got, double want) { EXPECT_NEAR(got, want, 64 * test::eps * std::abs(want)); }
 
 TEST(HyperparametersTest, ThePaperProtocolHasThePapersBox) {
   const ModelFile& model = test::model("experiments/surface_published.toml");

@@ -1,8 +1,8 @@
 #include "training/random.hpp"
 
-#include <gtest/gtest.h>
-
 #include <algorithm>
+
+#include <gtest/gtest.h>
 
 namespace gp2 {
 namespace {
