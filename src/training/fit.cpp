@@ -103,7 +103,7 @@ class Training {
     const lapack::SingleThread single_thread;
     in_parallel(n_restarts(), [&](int restart) { run_restart(restart); });
     constexpr int max_escapes = 5;
-    while (n_escapes_ < max_escapes && options_.max_iterations > 0 && !stopped() && escape()) ++n_escapes_;
+    while (n_escapes_ < max_escapes && !stopped() && escape()) ++n_escapes_;
   }
 
   // the lowest objective; of equal ones the first
@@ -176,7 +176,8 @@ class Training {
 
   LbfgsbResult optimise(int restart, const std::vector<Hyperparameter>& from, Likelihood::Workspace& workspace) {
     LbfgsbOptions options;
-    options.max_iterations = options_.max_iterations;
+    options.max_iterations =
+        options_.max_iterations - reports_[static_cast<std::size_t>(restart)].iterations;  // an escape goes on
     options.gradient_tolerance = options_.gradient_tolerance;
     options.reduction_tolerance = options_.reduction_tolerance;
     options.iteration = [&](int iteration, double value) { return report_iteration(restart, iteration, value); };
@@ -205,6 +206,7 @@ class Training {
   bool escape() {
     const std::size_t from = best();
     if (!std::isfinite(reports_[from].objective) || hyperparameters_.empty()) return false;
+    if (reports_[from].iterations >= options_.max_iterations) return false;
     constexpr int n_points = 9;
     const Index n = static_cast<Index>(hyperparameters_.size());
     VectorXd x(n);

@@ -1,9 +1,9 @@
-#include <gmock/gmock.h>
-#include <gtest/gtest.h>
-
 #include <algorithm>
 #include <functional>
 #include <ostream>
+
+#include <gmock/gmock.h>
+#include <gtest/gtest.h>
 
 #include "apps/command_line.hpp"
 

@@ -1,12 +1,13 @@
 #pragma once
 
-#include <sys/wait.h>
-
 #include <cstdlib>
 #include <filesystem>
-#include <nlohmann/json.hpp>
 #include <stdexcept>
 #include <string>
+
+#include <sys/wait.h>
+
+#include <nlohmann/json.hpp>
 
 #include "gp2/csv.hpp"
 #include "io/io_testing.hpp"

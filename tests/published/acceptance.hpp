@@ -3,10 +3,11 @@
 #include <algorithm>
 #include <fstream>
 #include <map>
-#include <nlohmann/json.hpp>
 #include <numeric>
 #include <string>
 #include <vector>
+
+#include <nlohmann/json.hpp>
 
 #include "gp2/evaluation.hpp"
 #include "gp2/fit_problem.hpp"
