@@ -146,10 +146,11 @@ void run(const Arguments& arguments) {
 
   std::vector<std::string> at_bound;
   for (const Hyperparameter& h : result.report.hyperparameters) {
-    if (h.at_bound() && h.kind == Hyperparameter::Kind::noise_stddev) at_bound.push_back(h.name);
+    const bool collapsed = h.kind == Hyperparameter::Kind::noise_stddev && h.at_bound() && h.value < 2 * h.lower;
+    if (collapsed) at_bound.push_back(h.name);
   }
   if (!at_bound.empty()) {
-    talk({fmt::format("warning: {} ended at a bound: the columns may not be independent measurements; see gp2 check",
+    talk({fmt::format("warning: {} ended at the lower bound: the columns may not be independent measurements; see gp2 check",
                       fmt::join(at_bound, ", "))});
   }
   file.prior_options = problem.prior_options;

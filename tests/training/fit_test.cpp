@@ -196,6 +196,44 @@ TEST(FitTest, FindsTheParametersOfTheConstraintThatMadeTheData) {
   EXPECT_NEAR(fitted.parameters[omega], 6.283185307179586, 2e-2);
 }
 
+TEST(FitTest, FindsTheMinimumInASharedSignalStandardDeviation) {
+  Problem p = problem("models/surface.toml", 20, {}, {Protocol::Name::paper, false});
+  // by itself, with a wide box: the minimum is inside
+  p.hyperparameters = {p.hyperparameters.back()};
+  ASSERT_EQ(p.hyperparameters[0].kind, Kind::shared_signal_stddev);
+  p.hyperparameters[0].lower = 1e-2;
+  p.hyperparameters[0].upper = 1e3;
+  const Fit result = fit(p.prior, p.observations, p.hyperparameters, quick());
+  const double lowest = objective(p, result.report.hyperparameters);
+  for (double factor : {0.98, 1.02}) {
+    std::vector<Hyperparameter> beside = result.report.hyperparameters;
+    beside[0].value *= factor;
+    EXPECT_GT(objective(p, beside), lowest) << "at " << factor << " of the fitted value";
+  }
+}
+
+TEST(FitTest, EscapesFromACornerWhereTheGradientVanishes) {
+  // with almost no signal nothing depends on anything: every run that starts there stays
+  Problem p = problem("models/surface.toml", 30, {}, {Protocol::Name::standard, false});
+  FitOptions options = quick();
+  options.n_restarts = 1;
+  options.max_iterations = 200;
+  const double expected = fit(p.prior, p.observations, p.hyperparameters, options).report.objective;
+  for (Hyperparameter& h : p.hyperparameters) {
+    if (h.kind != Kind::signal_stddev) continue;
+    h.lower *= 1e-6;
+    h.value = h.lower;
+  }
+  const FitReport report = fit(p.prior, p.observations, p.hyperparameters, options).report;
+  EXPECT_GE(report.n_escapes, 1);
+  EXPECT_NEAR(report.objective, expected, 0.5);
+  EXPECT_NEAR(report.objective, objective(p, report.hyperparameters), 1e-9 * std::abs(report.objective));
+
+  // the limit of iterations holds for the run and its escapes together
+  options.max_iterations = 3;
+  EXPECT_LE(fit(p.prior, p.observations, p.hyperparameters, options).report.iterations, 3);
+}
+
 TEST(FitTest, StopsWhenAskedAndReturnsTheBestSoFar) {
   const Problem p = problem("models/surface.toml", 20);
   std::atomic<bool> stop = false;
