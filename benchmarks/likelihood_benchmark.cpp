@@ -1,8 +1,8 @@
 // The negative log likelihood and its gradient (likelihood.hpp) beside their lower limit: LAPACK's dpotrf + dpotri of the same
 // reduced matrix. One thread. Read the ratio of the two rows of one N, in one run.
 
-#include <Eigen/Core>
 #include <benchmark/benchmark.h>
+#include <Eigen/Core>
 
 #include "gp2/generate.hpp"
 #include "gp2/training.hpp"

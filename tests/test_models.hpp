@@ -9,9 +9,9 @@
 #include <string>
 #include <vector>
 
-#include <Eigen/Core>
 #include <fmt/core.h>
 #include <gtest/gtest.h>
+#include <Eigen/Core>
 
 #include "gp2/csv.hpp"
 #include "gp2/generate.hpp"

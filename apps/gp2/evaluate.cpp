@@ -66,7 +66,8 @@ void run(const Arguments& arguments) {
   std::vector<std::string> outputs = parse_list(arguments.outputs);
   if (outputs.empty()) outputs = observed_outputs(fit);
   const std::vector<int> rows = acceleration_rows(*fit.model.system, outputs, "--outputs");
-  const LogStates log = read_log_states(fit.prior(), fit.model, table, parse_map(arguments.map), outputs);
+  const View view = View::all(View::Quantity::constrained_acceleration, *fit.model.system);
+  const LogStates log = read_log_states(fit.prior(), view, fit.model, table, parse_map(arguments.map), outputs);
   talk(log.notes);
   const Posterior posterior = fit.posterior();
   const Evaluation evaluation =

@@ -1,5 +1,6 @@
 #include <algorithm>
 #include <memory>
+#include <optional>
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
@@ -15,7 +16,35 @@ namespace {
 
 struct Arguments {
   std::string fit, states, view = "constrained", covariance = "none", output, map;
+  std::optional<std::string> latent;
+  std::optional<double> time_step;
 };
+
+// what the arguments ask to see
+View view_of(const Arguments& arguments, const Prior& prior) {
+  View view = View::all(*View::quantity_of(arguments.view), *prior.system);
+  if (view.size() == 0) throw InputError(fmt::format("--view {}: '{}' has no constraints", arguments.view, prior.system->name()));
+  const bool needs_step = view.quantity == View::Quantity::next_velocity;
+  if (needs_step != arguments.time_step.has_value()) {
+    throw InputError(needs_step ? "--view next-velocity needs the time step: --dt SECONDS"
+                                : "--dt goes with --view next-velocity");
+  }
+  if (needs_step) {
+    view.time_step = *arguments.time_step;
+    if (!(view.time_step > 0)) throw InputError(fmt::format("--dt: must be positive, got {}", view.time_step));
+  }
+  if (arguments.latent) {
+    std::vector<std::string> names;
+    for (const Latent& latent : prior.latents) names.push_back(latent.name);
+    const auto found = std::find(names.begin(), names.end(), *arguments.latent);
+    if (found == names.end()) {
+      throw InputError(
+          fmt::format("--latent: no latent is called '{}'; there is: {}", *arguments.latent, fmt::join(names, ", ")));
+    }
+    view.latent = static_cast<int>(found - names.begin());
+  }
+  return view;
+}
 
 // names of the new columns, and their values, one row per state
 struct NewColumns {
@@ -24,7 +53,9 @@ struct NewColumns {
 };
 
 NewColumns predict(const Posterior& posterior, const View& view, const Eigen::MatrixXd& states, const std::string& covariance) {
-  const std::vector<std::string> names = view.names(*posterior.prior().system);
+  const Prior& prior = posterior.prior();
+  const std::string latent = view.latent < 0 ? "" : prior.latents[static_cast<std::size_t>(view.latent)].name;
+  const std::vector<std::string> names = view.names(*prior.system, latent);
   const Eigen::Index d = view.size();
   NewColumns out{names, {}};
   if (covariance == "none") {
@@ -96,15 +127,13 @@ std::string joined(const CsvTable& input, const NewColumns& added) {
 void run(const Arguments& arguments) {
   const FitFile fit = FitFile::read(arguments.fit);
   const CsvTable table = CsvTable::read(arguments.states);
-  const LogStates log = read_log_states(fit.prior(), fit.model, table, parse_map(arguments.map));
-  talk(log.notes);
   const Posterior posterior = fit.posterior();
-  const View view = View::all(
-      arguments.view == "constrained" ? View::Quantity::constrained_acceleration : View::Quantity::unconstrained_acceleration,
-      *fit.model.system);
+  const View view = view_of(arguments, posterior.prior());
+  const LogStates log = read_log_states(posterior.prior(), view, fit.model, table, parse_map(arguments.map));
+  talk(log.notes);
   const NewColumns predictions = at_states_of(table, [&] { return predict(posterior, view, log.states, arguments.covariance); });
   write_file(arguments.output, joined(table, predictions));
-  talk({fmt::format("{}: {} predictions of the {} acceleration", arguments.output, table.n_rows(), arguments.view)});
+  talk({fmt::format("{}: {} predictions, view {}", arguments.output, table.n_rows(), arguments.view)});
 }
 
 }  // namespace
@@ -114,9 +143,14 @@ void add_predict(CLI::App& app) {
   auto arguments = std::make_shared<Arguments>();
   command->add_option("FIT.json", arguments->fit, "file written by gp2 fit")->required();
   command->add_option("--states", arguments->states, "CSV with the states; one output row per input row")->required();
-  command->add_option("--view", arguments->view, "constrained: ddq1 …; unconstrained: abar_q1 …")
-      ->check(CLI::IsMember({"constrained", "unconstrained"}))
+  command
+      ->add_option("--view", arguments->view,
+                   "constrained: ddq1 …; unconstrained: abar_q1 …; constraint-force: fc_q1 …; multipliers: lambda1 …; "
+                   "next-velocity: dq1_next …, with --dt")
+      ->check(CLI::IsMember(View::quantity_words()))
       ->capture_default_str();
+  command->add_option("--dt", arguments->time_step, "time step of next-velocity [s]");
+  command->add_option("--latent", arguments->latent, "only what this latent adds to the view, by its name: NAME@LATENT");
   command
       ->add_option("--cov", arguments->covariance, "none; std: NAME_std; full: also cov_NAME1_NAME2. Without measurement noise")
       ->check(CLI::IsMember({"none", "std", "full"}))

@@ -45,13 +45,13 @@ FitProblem make_fit_problem(const ModelFile& model, const CsvTable& log, const F
 /// @throws InputError when `columns` names what the model or the log does not have.
 LogReader open_log(const ModelFile& model, const CsvTable& log, const std::map<std::string, std::string>& columns);
 
-/// States of a log for a prior, with the columns that only the constraint residuals read where the log has them.
+/// States of a log for a prior and a view, with the columns that only the constraint residuals read where the log has them.
 struct LogStates {
   Eigen::MatrixXd states;
   Eigen::MatrixXd accelerations;  // those asked for (accelerations × N)
   std::vector<std::string> notes;
 };
-LogStates read_log_states(const Prior& prior, const ModelFile& model, const CsvTable& log,
+LogStates read_log_states(const Prior& prior, const View& view, const ModelFile& model, const CsvTable& log,
                           const std::map<std::string, std::string>& columns, const std::vector<std::string>& accelerations = {});
 
 /// Indices of named accelerations; all of them when `names` is empty.

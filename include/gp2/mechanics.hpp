@@ -40,6 +40,12 @@ class UdwadiaKalaba {
   /// L as a matrix (nq × nc). With redundant rows it is one of the generalised inverses with A L A = A; only L b is unique.
   [[nodiscard]] Eigen::MatrixXd L() const;
 
+  /// (A M⁻¹Aᵀ)⁺ of the rows as written, where they are independent (nc × nc).
+  [[nodiscard]] Eigen::MatrixXd Lambda() const;
+
+  /// K with λ = K Aᵀλ (nc × nq). Of the multipliers of redundant rows it gives those of minimum norm.
+  [[nodiscard]] Eigen::MatrixXd multipliers_of_force() const;
+
   /// M⁻¹ v.
   [[nodiscard]] Eigen::MatrixXd solve_mass(const Eigen::Ref<const Eigen::MatrixXd>& v) const { return mass_factor_.solve(v); }
 
@@ -56,6 +62,10 @@ class UdwadiaKalaba {
   ///     dT     = −T M⁻¹(dAᵀ Λ A − dM (I − T)) − L dA T
   [[nodiscard]] Derivative differentiate(const Eigen::Ref<const Eigen::MatrixXd>& dM, const Eigen::Ref<const Eigen::MatrixXd>& dA,
                                          const Eigen::Ref<const Eigen::VectorXd>& db) const;
+
+  /// dΛ = −(Λ dA L + (Λ dA L)ᵀ − Lᵀ dM L), where the rows of A are independent.
+  [[nodiscard]] Eigen::MatrixXd differentiate_Lambda(const Eigen::Ref<const Eigen::MatrixXd>& dM,
+                                                     const Eigen::Ref<const Eigen::MatrixXd>& dA) const;
 
  private:
   bool mass_is_positive_definite_ = true;

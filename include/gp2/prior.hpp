@@ -68,6 +68,9 @@ struct PriorValues {
   Eigen::MatrixXd mean;                     // μ    (nq × N)
   std::vector<Eigen::MatrixXd> directions;  // E_a  (nq·p_a × N), column-major blocks, without the signal standard deviations
 
+  /// Leaves what one latent adds to ā: no μ, no other latent.
+  void keep_only(std::size_t latent);
+
   [[nodiscard]] Eigen::Map<const Eigen::MatrixXd> E(std::size_t latent, int i) const {
     return {directions[latent].col(i).data(), mean.rows(), directions[latent].rows() / mean.rows()};
   }

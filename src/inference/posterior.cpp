@@ -10,7 +10,6 @@
 namespace gp2 {
 
 using Eigen::Index;
-using Eigen::Map;
 using Eigen::MatrixXd;
 using Eigen::Ref;
 using Eigen::VectorXd;
@@ -43,7 +42,8 @@ struct Query {
 
 Query prepare(const Prior& prior, const ModelValues& values, const View& view, const Ref<const MatrixXd>& states) {
   const MechanicsBatch mechanics = require_mechanics(*prior.system, states, values.parameters);
-  Query query{evaluate_view(view, mechanics), evaluate_prior(prior, states, values.parameters, mechanics), {}};
+  Query query{evaluate_view(view, mechanics, states), evaluate_prior(prior, states, values.parameters, mechanics), {}};
+  if (view.latent >= 0) query.prior.keep_only(static_cast<std::size_t>(view.latent));
   for (const Latent& latent : prior.latents) query.features.push_back(evaluate_features(latent, states));
   return query;
 }
@@ -103,7 +103,7 @@ Posterior::Posterior(Prior prior, std::vector<Observations> observations, ModelV
 
   const lapack::SingleThread single_thread;
   for (std::size_t a = 0; a < self->prior.latents.size(); ++a) {
-    self->Z.push_back(self->reduction.directions[a] * self->values.signal_stddev[a].asDiagonal());
+    self->Z.emplace_back(self->reduction.directions[a] * self->values.signal_stddev[a].asDiagonal());
   }
   std::vector<MatrixXd> k;
   assemble(self->prior, self->reduction, self->features, self->Z, self->values.kernel, self->L, k);

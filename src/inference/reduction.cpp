@@ -20,12 +20,17 @@ std::optional<std::vector<ObservationModel>> model_observations(const Prior& pri
     const MechanicsBatch mechanics = evaluate_mechanics(*prior.system, group.states, parameters);
     if (mechanics.fault) return std::nullopt;
     ObservationModel& model = models.emplace_back();
-    model.values = {evaluate_view(group.view, mechanics), evaluate_prior(prior, group.states, parameters, mechanics)};
+    model.values = {evaluate_view(group.view, mechanics, group.states),
+                    evaluate_prior(prior, group.states, parameters, mechanics)};
     for (int parameter : gradient_parameters) {
       const SystemValues d = prior.system->differentiate(group.states, parameters, parameter);
       model.derivatives.push_back(
           {differentiate_view(group.view, mechanics, d),
            differentiate_prior(prior, group.states, parameters, mechanics, model.values.prior, d, parameter)});
+    }
+    if (group.view.latent >= 0) {
+      model.values.prior.keep_only(static_cast<std::size_t>(group.view.latent));
+      for (ObservationModel::Values& d : model.derivatives) d.prior.keep_only(static_cast<std::size_t>(group.view.latent));
     }
   }
   return models;

@@ -39,8 +39,6 @@ constexpr std::array<Named<Kind>, 5> kinds = {{{Kind::kernel, "kernel"},
 constexpr std::array<Named<Prior::Mean>, 2> means = {{{Prior::Mean::zero, "zero"}, {Prior::Mean::force, "force"}}};
 constexpr std::array<Named<std::optional<Latent::Base>>, 3> directions = {
     {{std::nullopt, "model"}, {Latent::Base::acceleration, "acceleration"}, {Latent::Base::force, "force"}}};
-constexpr std::array<Named<View::Quantity>, 2> quantities = {
-    {{View::Quantity::constrained_acceleration, "constrained"}, {View::Quantity::unconstrained_acceleration, "unconstrained"}}};
 
 template <class Choice, std::size_t n>
 const char* name_of(const std::array<Named<Choice>, n>& choices, Choice choice) {
@@ -198,8 +196,10 @@ void check_hyperparameters(const std::vector<Hyperparameter>& hyperparameters, c
 }
 
 Json observations_json(const Observations& group, const System& system) {
-  return {{"view", name_of(quantities, group.view.quantity)},
+  return {{"view", View::word(group.view.quantity)},
           {"rows", group.view.rows},
+          {"time_step", group.view.time_step},
+          {"latent", group.view.latent},
           {"n", group.n_data()},
           {"noise_stddev", vector_json(group.noise_stddev)},
           {"estimate_noise", group.estimate_noise},
@@ -210,11 +210,22 @@ Json observations_json(const Observations& group, const System& system) {
 Observations observations_from(const Json& json, const Prior& prior) {
   const System& system = *prior.system;
   Observations group;
-  group.view.quantity = choice_from(json.at("view"), quantities, "view");
+  const auto word = json.at("view").get<std::string>();
+  const std::optional<View::Quantity> quantity = View::quantity_of(word);
+  if (!quantity) throw InputError(fmt::format("'{}' is no view", word));
+  group.view.quantity = *quantity;
+  group.view.time_step = number(json.at("time_step"));
+  if (*quantity == View::Quantity::next_velocity && !(group.view.time_step > 0)) {
+    throw InputError("the time_step of next-velocity must be positive");
+  }
+  group.view.latent = integer(json.at("latent"));
+  if (group.view.latent < -1 || group.view.latent >= static_cast<int>(prior.latents.size())) {
+    throw InputError(fmt::format("latent {} of a view is outside -1 … {}", group.view.latent, prior.latents.size() - 1));
+  }
+  const int n_rows = View::all(*quantity, system).size();
   for (const Json& row : array(json.at("rows"))) {
     const int index = integer(row);
-    if (index < 0 || index >= system.nq())
-      throw InputError(fmt::format("row {} of a view is outside 0 … {}", index, system.nq() - 1));
+    if (index < 0 || index >= n_rows) throw InputError(fmt::format("row {} of a view is outside 0 … {}", index, n_rows - 1));
     if (std::find(group.view.rows.begin(), group.view.rows.end(), index) != group.view.rows.end()) {
       throw InputError(fmt::format("row {} of a view stands twice", index));
     }
@@ -230,7 +241,10 @@ Observations observations_from(const Json& json, const Prior& prior) {
   json.at("estimate_noise").get_to(group.estimate_noise);
   // values come first: they bound what a damaged n can claim
   group.values = rows_from(json.at("values"), group.view.names(system), std::vector<bool>(group.view.rows.size(), true), n);
-  group.states = rows_from(json.at("states"), system.state_names(), prior.reads(), n);
+  std::vector<bool> reads = prior.reads();
+  const std::vector<bool> of_view = group.view.reads(system);
+  for (std::size_t k = 0; k < reads.size(); ++k) reads[k] = reads[k] || of_view[k];
+  group.states = rows_from(json.at("states"), system.state_names(), reads, n);
   return group;
 }
 
@@ -346,7 +360,7 @@ void read_start_values(const std::filesystem::path& path, std::vector<Hyperparam
 
   std::vector<Hyperparameter> started = hyperparameters;
   for (const auto& [name, value] : values) {
-    const auto h = std::find_if(started.begin(), started.end(), [&](const auto& known) { return known.name == name; });
+    const auto h = std::find_if(started.begin(), started.end(), [&name = name](const auto& known) { return known.name == name; });
     if (h == started.end()) {
       // a fit may have had more to tune than this one; a hand-written value must mean something
       if (is_fit) continue;

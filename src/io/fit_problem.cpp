@@ -63,12 +63,13 @@ void note_violation(const System& system, const MatrixXd& states, const CsvTable
                   log.name(), violation->constraint, violation->value, violation->state + 1, violation->relative));
 }
 
-// columns a prior needs, and those that only tell whether a state is on the constraint
-MatrixXd states_of(const Prior& prior, LogReader& reader) {
+// columns a prior and a view need, and those that only tell whether a state is on the constraint
+MatrixXd states_of(const Prior& prior, const View& view, LogReader& reader) {
   std::vector<bool> reads = prior.reads();
+  const std::vector<bool> of_view = view.reads(*prior.system);
   const std::vector<bool> residuals = prior.system->reads(SystemPart::residuals);
   const std::vector<std::string> names = prior.system->state_names();
-  for (std::size_t k = 0; k < reads.size(); ++k) reads[k] = reads[k] || (residuals[k] && reader.has(names[k]));
+  for (std::size_t k = 0; k < reads.size(); ++k) reads[k] = reads[k] || of_view[k] || (residuals[k] && reader.has(names[k]));
   return reader.states(reads);
 }
 
@@ -153,10 +154,10 @@ LogReader open_log(const ModelFile& model, const CsvTable& log, const std::map<s
   return {log, *model.system, all};
 }
 
-LogStates read_log_states(const Prior& prior, const ModelFile& model, const CsvTable& log,
+LogStates read_log_states(const Prior& prior, const View& view, const ModelFile& model, const CsvTable& log,
                           const std::map<std::string, std::string>& columns, const std::vector<std::string>& accelerations) {
   LogReader reader = open_log(model, log, columns);
-  LogStates out{states_of(prior, reader), reader.values(accelerations), {}};
+  LogStates out{states_of(prior, view, reader), reader.values(accelerations), {}};
   note_reading(reader, log, out.notes);
   note_violation(*prior.system, out.states, log, out.notes);
   return out;
@@ -176,8 +177,8 @@ FitProblem make_fit_problem(const ModelFile& model, const CsvTable& log, const F
   // the log
   LogReader reader = open_log(model, log, options.columns);
   Observations group;
-  group.states = states_of(problem.prior, reader);
-  group.view = {View::Quantity::constrained_acceleration, acceleration_rows(system, options.observe, "--observe")};
+  group.view = {View::Quantity::constrained_acceleration, acceleration_rows(system, options.observe, "--observe"), 0, -1};
+  group.states = states_of(problem.prior, group.view, reader);
   const std::vector<std::string> observed = group.view.names(system);
   const std::vector<std::string> every = all_accelerations(system);
   const bool complete = std::all_of(every.begin(), every.end(), [&](const std::string& name) { return reader.has(name); });

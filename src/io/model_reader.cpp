@@ -473,7 +473,7 @@ class ModelReader : private TomlReader {
     for (const auto& [name, node] : entries_of(start)) {
       const std::string key = fmt::format("sampling.start.{}", name);
       const bool known = std::any_of(definition_.coordinates.begin(), definition_.coordinates.end(),
-                                     [&](const Coordinate& c) { return c.name == name || c.velocity() == name; });
+                                     [&name = name](const Coordinate& c) { return c.name == name || c.velocity() == name; });
       if (!known) fail(*node, key, fmt::format("'{}' is neither a coordinate nor a velocity of this model", name));
       model_.newton_start[name] = number(*node, key);
     }

@@ -3,6 +3,7 @@
 
 #include <fmt/format.h>
 #include <Eigen/QR>
+#include <Eigen/SVD>
 
 #include "gp2/error.hpp"
 #include "gp2/mechanics.hpp"
@@ -87,6 +88,28 @@ UdwadiaKalaba::UdwadiaKalaba(const Ref<const MatrixXd>& M, const Ref<const Matri
 }
 
 MatrixXd UdwadiaKalaba::L() const { return L_unit_ * row_scale_.asDiagonal(); }
+
+MatrixXd UdwadiaKalaba::Lambda() const {
+  return row_scale_.asDiagonal() * (L_unit_.transpose() * ML_unit_) * row_scale_.asDiagonal();
+}
+
+MatrixXd UdwadiaKalaba::multipliers_of_force() const {
+  // Lᵀ Aᵀλ = ΛA M⁻¹Aᵀ λ solves Aᵀλ = f
+  const MatrixXd solution = row_scale_.asDiagonal() * L_unit_.transpose();
+  const Eigen::Index nc = row_scale_.size();
+  if (rank_ == nc) return solution;
+  // redundant rows: take away what lies in the null space of Aᵀ. Of the unit rows its basis is clear; D brings it to the rows as
+  // written
+  const Eigen::JacobiSVD<MatrixXd> svd(A_unit_.transpose(), Eigen::ComputeFullV);
+  const MatrixXd null_space = row_scale_.asDiagonal() * svd.matrixV().rightCols(nc - rank_);
+  return solution - null_space * null_space.completeOrthogonalDecomposition().solve(solution);
+}
+
+MatrixXd UdwadiaKalaba::differentiate_Lambda(const Ref<const MatrixXd>& dM, const Ref<const MatrixXd>& dA) const {
+  const MatrixXd L = this->L();
+  const MatrixXd Lambda_dA_L = Lambda() * (dA * L);
+  return L.transpose() * dM * L - Lambda_dA_L - Lambda_dA_L.transpose();
+}
 
 VectorXd UdwadiaKalaba::constrain(const Ref<const VectorXd>& a_bar) const {
   VectorXd ddq = Lb_ + T_ * a_bar;

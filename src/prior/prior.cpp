@@ -42,6 +42,13 @@ std::vector<bool> Prior::reads() const {
   return reads;
 }
 
+void PriorValues::keep_only(std::size_t latent) {
+  mean.setZero();
+  for (std::size_t a = 0; a < directions.size(); ++a) {
+    if (a != latent) directions[a].setZero();
+  }
+}
+
 MatrixXd evaluate_features(const Latent& latent, const Ref<const MatrixXd>& states) {
   MatrixXd features;
   latent.features.evaluate(states, VectorXd(), features);

@@ -38,8 +38,9 @@ std::vector<std::uint32_t> ExpressionGraph::Implementation::reachable(std::span<
     if (seen.insert(id).second) found.push_back(id);
   };
   for (const std::uint32_t id : roots) visit(id);
-  for (std::size_t next = 0; next < found.size(); ++next) {
-    const Node& node = nodes[found[next]];
+  std::size_t next = 0;
+  while (next < found.size()) {
+    const Node& node = nodes[found[next++]];
     if (!is_leaf(node.operation)) visit(node.a);
     if (is_binary(node.operation)) visit(node.b);
   }

@@ -174,8 +174,8 @@ SystemValues SymbolicSystem::run(const Tape& tape, const Ref<const MatrixXd>& st
                                  const Ref<const VectorXd>& parameters) const {
   MatrixXd all;
   tape.evaluate(states, parameters, all);
-  const Eigen::Index n_mass = nq() * nq();
-  const Eigen::Index n_A = nc() * nq();
+  const auto n_mass = static_cast<Eigen::Index>(nq()) * nq();
+  const auto n_A = static_cast<Eigen::Index>(nc()) * nq();
   return {all.topRows(n_mass), all.middleRows(n_mass, n_A), all.middleRows(n_mass + n_A, nc()), all.bottomRows(nq())};
 }
 

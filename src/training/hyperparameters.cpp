@@ -300,8 +300,8 @@ ModelValues model_values(const Prior& prior, const std::vector<Observations>& ob
                          const std::vector<Hyperparameter>& hyperparameters) {
   ModelValues values;
   for (const Latent& latent : prior.latents) {
-    values.kernel.push_back(VectorXd::Ones(static_cast<Index>(latent.kernel.parameters().size())));
-    values.signal_stddev.push_back(VectorXd::Ones(latent.size()));
+    values.kernel.emplace_back(VectorXd::Ones(static_cast<Index>(latent.kernel.parameters().size())));
+    values.signal_stddev.emplace_back(VectorXd::Ones(latent.size()));
   }
   for (const Observations& group : observations) values.noise_stddev.push_back(group.noise_stddev);
   values.parameters = prior.system->parameter_values();

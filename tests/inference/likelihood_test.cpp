@@ -88,7 +88,8 @@ TEST(LikelihoodTest, ARowThatSaysNothingNewChangesNothing) {
   Likelihood::Options options;
   options.gradient_parameters = {2, 3};
   for (Problem p : test::problems(12, seed)) {
-    if (!p.name.starts_with("surface")) continue;
+    // the multipliers of a row written twice are other numbers: each row carries its share
+    if (!p.name.starts_with("surface") || p.name.ends_with("multipliers")) continue;
     SCOPED_TRACE(fmt::format("{}, seed {}", p.name, seed));
     ModelValues gradient, gradient_doubled;
     Likelihood::Workspace workspace;

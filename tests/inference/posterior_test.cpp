@@ -19,8 +19,17 @@ constexpr std::uint64_t seed = 40403;
 // views of a problem's system to predict: everything, and some rows in another order
 std::vector<View> views_of(const Problem& p) {
   const System& system = *p.prior.system;
-  return {View::all(Quantity::constrained_acceleration, system), View::all(Quantity::unconstrained_acceleration, system),
-          View{Quantity::constrained_acceleration, {system.nq() - 1, 0}}};
+  std::vector<View> views = {
+      View::all(Quantity::constrained_acceleration, system), View::all(Quantity::unconstrained_acceleration, system),
+      View{Quantity::constrained_acceleration, {system.nq() - 1, 0}}, View::all(Quantity::constraint_force, system)};
+  if (system.nc() > 0) views.push_back(View::all(Quantity::multipliers, system));
+  if (!p.queries.middleRows(system.nq(), system.nq()).hasNaN()) {
+    views.push_back(View::all(Quantity::next_velocity, system));
+    views.back().time_step = 0.1;
+  }
+  views.push_back(View::all(Quantity::constrained_acceleration, system));
+  views.back().latent = static_cast<int>(p.prior.latents.size()) - 1;
+  return views;
 }
 
 double largest(const MatrixXd& matrix) { return matrix.size() == 0 ? 0 : matrix.cwiseAbs().maxCoeff(); }
@@ -39,6 +48,23 @@ TEST(PosteriorTest, IsTheTextbookGaussianProcess) {
       EXPECT_LE(largest(joint.covariance - covariance), rounding(p) * (1 + largest(covariance)));
       EXPECT_LT(rounding(p), 1e-6) << "too badly conditioned to test anything";
     }
+  }
+}
+
+TEST(PosteriorTest, TheLatentsAddUpToTheWhole) {
+  for (const Problem& p : test::problems(9, seed)) {
+    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, seed));
+    const System& system = *p.prior.system;
+    const Posterior posterior(p.prior, p.observations, p.values);
+    View view = View::all(Quantity::unconstrained_acceleration, system);
+    const MatrixXd whole = posterior.mean(view, p.queries);
+    MatrixXd sum =
+        evaluate_prior(p.prior, p.queries, p.values.parameters, require_mechanics(system, p.queries, p.values.parameters)).mean;
+    for (std::size_t a = 0; a < p.prior.latents.size(); ++a) {
+      view.latent = static_cast<int>(a);
+      sum += posterior.mean(view, p.queries);
+    }
+    EXPECT_LE(largest(sum - whole), 1e-13 * (1 + largest(whole) + largest(sum)));
   }
 }
 

@@ -209,6 +209,22 @@ inline std::vector<Problem> problems(int n, std::uint64_t seed) {
     add("friction, two latents, one state at rest", m, {mean, std::nullopt, false}, states,
         {View::all(Quantity::constrained_acceleration, *m.system), View{Quantity::unconstrained_acceleration, {1}}});
   }
+  for (const std::string& file : library_models()) {
+    const ModelFile& m = model(file);
+    const MatrixXd states = draw(m, n + 3, seed).states;
+    const std::string name = stem(file);
+    View next = View::all(Quantity::next_velocity, *m.system);
+    next.time_step = 0.1;
+    View alone = View::all(Quantity::unconstrained_acceleration, *m.system);
+    alone.latent = static_cast<int>(m.latents.size()) - 1;
+    add(name + ", constraint force and one latent alone", m, {Prior::Mean::force, std::nullopt, false}, states,
+        {View::all(Quantity::constraint_force, *m.system), alone});
+    if (!states.middleRows(m.system->nq(), m.system->nq()).hasNaN()) add(name + ", next velocity", m, {}, states, {next});
+    // multipliers of redundant rows are not differentiable
+    if (m.system->nc() > 0 && m.system->name().find("redundant") == std::string::npos) {
+      add(name + ", multipliers", m, {}, states, {View::all(Quantity::multipliers, *m.system)});
+    }
+  }
   return all;
 }
 
@@ -249,17 +265,38 @@ inline DenseView dense_view(const Prior& prior, const ModelValues& values, const
     if (A.rows() > 0) L = M_inverse * A.transpose() * pseudo_inverse(A * M_inverse * A.transpose());
     Extended T = Extended::Identity(nq, nq);
     if (A.rows() > 0) T -= L * A;
-    const bool constrained = view.quantity == Quantity::constrained_acceleration;
-    Extended G(view.size(), nq);
-    ExtendedVector offset(view.size());
     const ExtendedVector Lb = A.rows() > 0 ? ExtendedVector(L * b) : ExtendedVector(ExtendedVector::Zero(nq));
-    for (int row = 0; row < view.size(); ++row) {
-      const int from = view.rows[static_cast<std::size_t>(row)];
-      G.row(row) = constrained ? Extended(T.row(from)) : Extended(Extended::Identity(nq, nq).row(from));
-      offset[row] = constrained ? Lb[from] : 0;
+    const Extended identity = Extended::Identity(nq, nq);
+    const Extended M = mechanics.M(i).cast<long double>();
+    Extended all_G = identity;
+    ExtendedVector all_d = ExtendedVector::Zero(nq);
+    switch (view.quantity) {
+      case Quantity::constrained_acceleration:
+        all_G = T;
+        all_d = Lb;
+        break;
+      case Quantity::unconstrained_acceleration:
+        break;
+      case Quantity::constraint_force:
+        all_G = M * (T - identity);
+        all_d = M * Lb;
+        break;
+      case Quantity::multipliers: {
+        const Extended K = pseudo_inverse(mechanics.A(i).transpose().cast<long double>());
+        all_G = K * M * (T - identity);
+        all_d = K * M * Lb;
+        break;
+      }
+      case Quantity::next_velocity:
+        all_G = view.time_step * T;
+        all_d = states.col(i).segment(nq, nq).cast<long double>() + view.time_step * Lb;
+        break;
     }
+    const Extended G = all_G(view.rows, Eigen::all);
+    const ExtendedVector offset =
+        view.latent >= 0 ? ExtendedVector(ExtendedVector::Zero(view.size())) : ExtendedVector(all_d(view.rows));
     ExtendedVector mean = ExtendedVector::Zero(nq);
-    if (prior.mean == Prior::Mean::force) mean = M_inverse * mechanics.F(i).cast<long double>();
+    if (prior.mean == Prior::Mean::force && view.latent < 0) mean = M_inverse * mechanics.F(i).cast<long double>();
     dense.mean.segment(i * view.size(), view.size()) = G * mean + offset;
     std::vector<Extended>& loadings = dense.loading.emplace_back();
     for (std::size_t a = 0; a < prior.latents.size(); ++a) {
@@ -271,6 +308,7 @@ inline DenseView dense_view(const Prior& prior, const ModelValues& values, const
         E = Extended(entries.reshaped(nq, latent.size()).cast<long double>());
       }
       if (latent.base == Latent::Base::force) E = M_inverse * E;
+      if (view.latent >= 0 && view.latent != static_cast<int>(a)) E.setZero();
       loadings.push_back(G * E * values.signal_stddev[a].cast<long double>().asDiagonal());
     }
   }

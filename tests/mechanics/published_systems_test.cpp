@@ -1,7 +1,7 @@
 #include <fstream>
 
-#include <Eigen/Dense>
 #include <gtest/gtest.h>
+#include <Eigen/Dense>
 #include <nlohmann/json.hpp>
 
 #include "gp2/mechanics.hpp"

@@ -1,8 +1,8 @@
 #include "gp2/kernel.hpp"
 
-#include <Eigen/Eigenvalues>
 #include <gmock/gmock.h>
 #include <gtest/gtest.h>
+#include <Eigen/Eigenvalues>
 
 #include "gp2/error.hpp"
 #include "test_models.hpp"

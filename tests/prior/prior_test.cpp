@@ -1,8 +1,8 @@
 #include "gp2/prior.hpp"
 
-#include <Eigen/Dense>
 #include <gmock/gmock.h>
 #include <gtest/gtest.h>
+#include <Eigen/Dense>
 
 #include "gp2/error.hpp"
 #include "test_models.hpp"
