@@ -48,6 +48,11 @@ const std::string mass = R"(mass  = [["m", "0", "0"], ["0", "m", "0"], ["0", "0"
 const std::string constraint = R"(position = ["p1*q1^2 + p2*q2^2 + p3*q1*q2 + p4*cos(p5*q1) - q3"])";
 
 const std::vector<BadInput> bad_inputs = {
+    // the view
+    {"NextVelocityWithoutATimeStep", nothing, predict_line + " --view next-velocity", {"--view next-velocity", "--dt SECONDS"}},
+    {"ATimeStepForAnotherView", nothing, predict_line + " --dt 0.1", {"--dt goes with --view next-velocity"}},
+    {"ATimeStepBackwards", nothing, predict_line + " --view next-velocity --dt -1", {"--dt", "must be positive", "-1"}},
+    {"UnknownLatent", nothing, predict_line + " --latent drag", {"--latent", "'drag'", "there is: unconstrained acceleration"}},
     // the model
     {"UnknownSymbol",
      model_with(R"("u2", "u3 - m*g")", R"("ux2", "u3 - m*g")"),

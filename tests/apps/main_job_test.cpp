@@ -42,7 +42,8 @@ class MainJob : public testing::Test {
   };
   [[nodiscard]] Read read(const std::string& states) const {
     FitFile fit = FitFile::read(desk / "fit.json");
-    MatrixXd values = read_log_states(fit.prior(), fit.model, desk.table(states), {}).states;
+    const View view = View::all(View::Quantity::constrained_acceleration, *fit.model.system);
+    MatrixXd values = read_log_states(fit.prior(), view, fit.model, desk.table(states), {}).states;
     return {std::move(fit), std::move(values)};
   }
 
@@ -80,6 +81,40 @@ TEST_F(MainJob, WritesTheLibrarysDoublesToTheLastBit) {
   // the shortest form that reads back to the same double
   for (int column = 12; column < prediction.n_columns(); ++column) {
     EXPECT_EQ(prediction.cell(0, column), shortest(prediction.number(0, column)));
+  }
+}
+
+TEST_F(MainJob, PredictsEveryViewUnderItsName) {
+  struct Case {
+    std::string options;
+    View::Quantity quantity;
+    double time_step;
+    int latent;
+    std::vector<std::string> names;
+  };
+  const std::string latent = "'unconstrained acceleration'";
+  const std::vector<Case> cases = {
+      {"--view constraint-force", View::Quantity::constraint_force, 0, -1, {"fc_q1", "fc_q2", "fc_q3"}},
+      {"--view multipliers", View::Quantity::multipliers, 0, -1, {"lambda1"}},
+      {"--view next-velocity --dt 0.01", View::Quantity::next_velocity, 0.01, -1, {"dq1_next", "dq2_next", "dq3_next"}},
+      {"--view unconstrained --latent " + latent,
+       View::Quantity::unconstrained_acceleration,
+       0,
+       0,
+       {"abar_q1@unconstrained acceleration", "abar_q2@unconstrained acceleration", "abar_q3@unconstrained acceleration"}}};
+  for (const Case& one : cases) {
+    SCOPED_TRACE(one.options);
+    desk.done("gp2 predict fit.json --states test.csv --cov std -o view.csv " + one.options);
+    const Read in = read("test.csv");
+    View view = View::all(one.quantity, *in.fit.model.system);
+    view.time_step = one.time_step;
+    view.latent = one.latent;
+    const Posterior::Marginal expected = in.fit.posterior().marginal(view, in.states);
+    const CsvTable prediction = desk.table("view.csv");
+    EXPECT_EQ(columns(prediction, one.names), expected.mean);
+    std::vector<std::string> stddevs;
+    for (const std::string& name : one.names) stddevs.push_back(name + "_std");
+    EXPECT_EQ(columns(prediction, stddevs), expected.stddev());
   }
 }
 

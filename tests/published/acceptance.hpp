@@ -55,7 +55,8 @@ inline Score score(const ModelFile& model, const std::filesystem::path& train, c
   options.n_threads = 2;
   const Fit result = fit(problem.prior, problem.observations, problem.hyperparameters, options);
   const Observations& observed = problem.observations.front();
-  const LogStates grid = read_log_states(problem.prior, model, CsvTable::read(test), {}, observed.view.names(*model.system));
+  const LogStates grid =
+      read_log_states(problem.prior, observed.view, model, CsvTable::read(test), {}, observed.view.names(*model.system));
   return {result.report, evaluate_predictions(result.posterior, grid.states, observed.view.rows, grid.accelerations),
           row_stddev(observed.values)};
 }
