@@ -277,9 +277,9 @@ directions = "acceleration"
   const Posterior posterior(prior, observations, {{VectorXd::Ones(1)}, {VectorXd::Ones(2)}, {VectorXd::Ones(2)}, VectorXd()});
   EXPECT_NO_THROW(posterior.mean(view, states));
   states(0, 1) = 2;
-  EXPECT_THROW(posterior.mean(view, states), InputError);
-  EXPECT_THROW(posterior.marginal(view, states), InputError);
-  EXPECT_THROW(posterior.joint(view, states), InputError);
+  EXPECT_THROW(static_cast<void>(posterior.mean(view, states)), InputError);
+  EXPECT_THROW(static_cast<void>(posterior.marginal(view, states)), InputError);
+  EXPECT_THROW(static_cast<void>(posterior.joint(view, states)), InputError);
 }
 
 }  // namespace

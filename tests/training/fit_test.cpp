@@ -226,7 +226,9 @@ TEST(FitTest, EscapesFromACornerWhereTheGradientVanishes) {
   }
   const FitReport report = fit(p.prior, p.observations, p.hyperparameters, options).report;
   EXPECT_GE(report.n_escapes, 1);
-  EXPECT_NEAR(report.objective, expected, 0.5);
+  // the way out need not lead to the lowest minimum of all, but to one of its kind
+  const double corner = objective(p, p.hyperparameters);
+  EXPECT_LT(report.objective - expected, 0.01 * (corner - expected));
   EXPECT_NEAR(report.objective, objective(p, report.hyperparameters), 1e-9 * std::abs(report.objective));
 
   // the limit of iterations holds for the run and its escapes together
