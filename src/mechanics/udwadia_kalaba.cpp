@@ -95,7 +95,7 @@ MatrixXd UdwadiaKalaba::Lambda() const {
 
 MatrixXd UdwadiaKalaba::multipliers_of_force() const {
   // Lᵀ Aᵀλ = ΛA M⁻¹Aᵀ λ solves Aᵀλ = f
-  const MatrixXd solution = row_scale_.asDiagonal() * L_unit_.transpose();
+  MatrixXd solution = row_scale_.asDiagonal() * L_unit_.transpose();
   const Eigen::Index nc = row_scale_.size();
   if (rank_ == nc) return solution;
   // redundant rows: take away what lies in the null space of Aᵀ. Of the unit rows its basis is clear; D brings it to the rows as
