@@ -123,6 +123,57 @@ void contract(const Reduction& reduction, const MatrixXd& P, const VectorXd& alp
   }
 }
 
+// What θ and the noise change at sample i: ∂NLL/∂e, ∂NLL/∂W and ∂NLL/∂E there, and the chain rule on to σ and θ.
+//
+// latent_mean: per latent Σ_j k_ij Z_jᵀ α̃_j, one row per sample
+void add_sample_gradient(const Likelihood::Options& options, const std::vector<ObservationModel>& models,
+                         const Reduction& reduction, const ModelValues& values, Index i, const VectorXd& alpha,
+                         const std::vector<MatrixXd>& all_V, const std::vector<MatrixXd>& latent_mean, ModelValues& gradient) {
+  const Reduction::Sample& sample = reduction.samples[static_cast<std::size_t>(i)];
+  const std::size_t group = static_cast<std::size_t>(sample.group);
+  const ObservationModel& model = models[group];
+  const Index rank = sample.R.rows();
+  const VectorXd whitening = values.noise_stddev[group].cwiseInverse();
+  const auto rows_of = [&](const auto& reduced) {
+    MatrixXd rows(rank, reduced.cols());
+    for (Index c = 0; c < rank; ++c) rows.row(c) = reduced.row(reduction.offset[static_cast<std::size_t>(c)] + i);
+    return rows;
+  };
+
+  // α_i = Q_i α̃_i + (I − Q_iQ_iᵀ) e_i
+  const VectorXd d_e = sample.Q * rows_of(alpha) + sample.e_out;
+  // ∂NLL/∂W_i = Q_i Σ_a V_i,a E_aᵀ − (I − Q_iQ_iᵀ) e_i (posterior mean of ā − μ)ᵀ
+  MatrixXd V_E = MatrixXd::Zero(rank, sample.R.cols());
+  VectorXd mean = VectorXd::Zero(sample.R.cols());
+  std::vector<MatrixXd> V(all_V.size());
+  for (std::size_t a = 0; a < all_V.size(); ++a) {
+    const MatrixXd E = model.values.prior.E(a, sample.index) * values.signal_stddev[a].asDiagonal();
+    V[a] = rows_of(all_V[a]);
+    V_E += V[a] * E.transpose();
+    mean += E * latent_mean[a].row(i).transpose();
+  }
+  const MatrixXd d_W = sample.Q * V_E - sample.e_out * mean.transpose();
+
+  // S^{-1/2} scales the rows of W and e
+  if (options.noise_gradient) {
+    const MatrixXd W = whitening.asDiagonal() * model.values.view.G(sample.index);
+    gradient.noise_stddev[group].array() += 1 - d_e.array() * sample.e.array() - d_W.cwiseProduct(W).rowwise().sum().array();
+  }
+  for (std::size_t p = 0; p < options.gradient_parameters.size(); ++p) {
+    const ObservationModel::Values& d = model.derivatives[p];
+    const auto dG = d.view.G(sample.index);
+    // de = −S^{-1/2}(dd + dG μ + G dμ)
+    const VectorXd de = -whitening.cwiseProduct(d.view.offset.col(sample.index) + dG * model.values.prior.mean.col(sample.index) +
+                                                model.values.view.G(sample.index) * d.prior.mean.col(sample.index));
+    double slope = d_e.dot(de) + d_W.cwiseProduct(whitening.asDiagonal() * dG).sum();
+    for (std::size_t a = 0; a < all_V.size(); ++a) {
+      const MatrixXd dE = d.prior.E(a, sample.index) * values.signal_stddev[a].asDiagonal();
+      slope += (sample.R.transpose() * V[a]).cwiseProduct(dE).sum();
+    }
+    gradient.parameters[options.gradient_parameters[p]] += slope;
+  }
+}
+
 }  // namespace
 
 double Likelihood::evaluate(const ModelValues& values, ModelValues* gradient, Workspace& workspace) const {
@@ -180,56 +231,12 @@ double Likelihood::evaluate(const ModelValues& values, ModelValues* gradient, Wo
   }
   if (!needs_V) return value;
 
-  // what θ and the noise change at each sample: ∂NLL/∂e, ∂NLL/∂W, ∂NLL/∂E
-  std::vector<MatrixXd> latent_mean(n_latents);  // Σ_j k_ij Z_jᵀ α̃_j, one row per sample
+  std::vector<MatrixXd> latent_mean(n_latents);
   for (std::size_t a = 0; a < n_latents; ++a) {
     latent_mean[a] = work.k[a] * latent_weights(reduction, work.Z[a], work.alpha);
   }
   for (Index i = 0; i < n_samples; ++i) {
-    const Reduction::Sample& sample = reduction.samples[static_cast<std::size_t>(i)];
-    const std::size_t group = static_cast<std::size_t>(sample.group);
-    const ObservationModel& model = models[group];
-    const Index rank = sample.R.rows();
-    const VectorXd whitening = values.noise_stddev[group].cwiseInverse();
-    const auto rows_of = [&](const MatrixXd& reduced) {
-      MatrixXd rows(rank, reduced.cols());
-      for (Index c = 0; c < rank; ++c) rows.row(c) = reduced.row(reduction.offset[static_cast<std::size_t>(c)] + i);
-      return rows;
-    };
-
-    // α_i = Q_i α̃_i + (I − Q_iQ_iᵀ) e_i
-    const VectorXd d_e = sample.Q * rows_of(work.alpha) + sample.e_out;
-    // ∂NLL/∂W_i = Q_i Σ_a V_i,a E_aᵀ − (I − Q_iQ_iᵀ) e_i (posterior mean of ā − μ)ᵀ
-    MatrixXd V_E = MatrixXd::Zero(rank, sample.R.cols());
-    VectorXd mean = VectorXd::Zero(sample.R.cols());
-    std::vector<MatrixXd> V(n_latents);
-    for (std::size_t a = 0; a < n_latents; ++a) {
-      const MatrixXd E = model.values.prior.E(a, sample.index) * values.signal_stddev[a].asDiagonal();
-      V[a] = rows_of(work.V[a]);
-      V_E += V[a] * E.transpose();
-      mean += E * latent_mean[a].row(i).transpose();
-    }
-    const MatrixXd d_W = sample.Q * V_E - sample.e_out * mean.transpose();
-
-    // S^{-1/2} scales the rows of W and e
-    if (self.options.noise_gradient) {
-      const MatrixXd W = whitening.asDiagonal() * model.values.view.G(sample.index);
-      gradient->noise_stddev[group].array() += 1 - d_e.array() * sample.e.array() - d_W.cwiseProduct(W).rowwise().sum().array();
-    }
-    for (std::size_t p = 0; p < self.options.gradient_parameters.size(); ++p) {
-      const ObservationModel::Values& d = model.derivatives[p];
-      const auto dG = d.view.G(sample.index);
-      // de = −S^{-1/2}(dd + dG μ + G dμ)
-      const VectorXd de =
-          -whitening.cwiseProduct(d.view.offset.col(sample.index) + dG * model.values.prior.mean.col(sample.index) +
-                                  model.values.view.G(sample.index) * d.prior.mean.col(sample.index));
-      double slope = d_e.dot(de) + d_W.cwiseProduct(whitening.asDiagonal() * dG).sum();
-      for (std::size_t a = 0; a < n_latents; ++a) {
-        const MatrixXd dE = d.prior.E(a, sample.index) * values.signal_stddev[a].asDiagonal();
-        slope += (sample.R.transpose() * V[a]).cwiseProduct(dE).sum();
-      }
-      gradient->parameters[self.options.gradient_parameters[p]] += slope;
-    }
+    add_sample_gradient(self.options, models, reduction, values, i, work.alpha, work.V, latent_mean, *gradient);
   }
   return value;
 }
