@@ -41,6 +41,16 @@ UdwadiaKalaba::UdwadiaKalaba(const Ref<const MatrixXd>& M, const Ref<const Matri
     return;
   }
 
+  if (nc == 0) {
+    A_unit_ = A;
+    b_unit_ = b;
+    L_unit_.resize(nq, 0);
+    ML_unit_.resize(nq, 0);
+    T_ = MatrixXd::Identity(nq, nq);
+    Lb_ = VectorXd::Zero(nq);
+    return;
+  }
+
   // Bᵀ = C⁻¹Aᵀ, its columns (the rows of B) scaled to unit norm; rows of A that vanish are dropped
   MatrixXd Bt = mass_factor_.matrixL().solve(A.transpose());
   row_scale_ = Bt.colwise().norm();
@@ -55,12 +65,9 @@ UdwadiaKalaba::UdwadiaKalaba(const Ref<const MatrixXd>& M, const Ref<const Matri
   // Bᵀ P = [Y Z] [R; 0]: Y spans range(Bᵀ), Z its complement
   Eigen::ColPivHouseholderQR<MatrixXd> qr;
   qr.setThreshold(rank_tolerance);
-  MatrixXd basis = MatrixXd::Identity(nq, nq);
-  if (nc > 0) {
-    qr.compute(Bt);
-    rank_ = static_cast<int>(qr.rank());
-    basis = qr.householderQ();
-  }
+  qr.compute(Bt);
+  rank_ = static_cast<int>(qr.rank());
+  const MatrixXd basis = qr.householderQ();
   const auto Y = basis.leftCols(rank_);
   const auto Z = basis.rightCols(nq - rank_);
 
@@ -83,8 +90,8 @@ UdwadiaKalaba::UdwadiaKalaba(const Ref<const MatrixXd>& M, const Ref<const Matri
   for (Eigen::Index k = 0; k < nc; ++k) {
     if (row_scale_[k] == 0) residual[k] = b[k];
   }
-  inconsistency_ = nc == 0 ? 0 : residual.lpNorm<Eigen::Infinity>();
-  size_of_b_ = nc == 0 ? 0 : b_unit_.lpNorm<Eigen::Infinity>();
+  inconsistency_ = residual.lpNorm<Eigen::Infinity>();
+  size_of_b_ = b_unit_.lpNorm<Eigen::Infinity>();
 }
 
 MatrixXd UdwadiaKalaba::L() const { return L_unit_ * row_scale_.asDiagonal(); }
