@@ -67,9 +67,10 @@ TEST(CommandLine, JsonStandsAloneOnStdoutWithTheContractedKeys) {
   desk.done("gp2 generate models/surface.toml --n 20 -o train.csv");
   const Outcome fit =
       desk.done("gp2 fit models/surface.toml --data train.csv --max-iterations 3 --restarts 1 --json -o fit.json");
-  EXPECT_THAT(keys(fit.json()), ElementsAre("hyperparameters", "iterations", "nll", "seconds", "termination"));
-  ASSERT_EQ(fit.json()["hyperparameters"].size(), 12u);
-  for (const auto& one : fit.json()["hyperparameters"]) {
+  const auto report = fit.json();
+  EXPECT_THAT(keys(report), ElementsAre("hyperparameters", "iterations", "nll", "seconds", "termination"));
+  ASSERT_EQ(report["hyperparameters"].size(), 12u);
+  for (const auto& one : report["hyperparameters"]) {
     EXPECT_THAT(keys(one), ElementsAre("at_bound", "lower", "name", "unit", "upper", "value"));
   }
   const Outcome evaluation = desk.done("gp2 evaluate fit.json --data train.csv --json");
