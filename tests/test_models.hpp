@@ -17,7 +17,7 @@
 #include "gp2/generate.hpp"
 #include "gp2/mechanics.hpp"
 #include "gp2/model_file.hpp"
-#include "training/random.hpp"
+#include "prior/random.hpp"
 
 // The models that laws are tested on, the states they are tested at, and the difference quotients they are tested against.
 namespace gp2::test {

@@ -49,6 +49,26 @@ void require_folder(const std::string& output) {
   }
 }
 
+View PredictedSystem::view(View::Quantity quantity) const {
+  View view = View::all(quantity, *prior.system);
+  view.setting = setting;
+  return view;
+}
+
+PredictedSystem predicted_system(const FitFile& fit, const std::string& path) {
+  if (path.empty()) return {fit.model, nullptr, fit.prior()};
+  ModelFile other = ModelFile::read(path);
+  std::shared_ptr<const Setting> setting = make_setting(fit.model, other, fit.prior_options);
+  Prior prior = setting->prior;
+  return {std::move(other), std::move(setting), std::move(prior)};
+}
+
+std::pair<std::string, std::string> split_at_system(const std::string& text) {
+  const std::size_t at = text.rfind('@');
+  if (at == std::string::npos || !text.ends_with(".toml")) return {text, ""};
+  return {text.substr(0, at), text.substr(at + 1)};
+}
+
 void talk(const std::vector<std::string>& notes) {
   for (const std::string& note : notes) fmt::print(stderr, "gp2: {}\n", note);
 }

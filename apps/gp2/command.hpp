@@ -1,13 +1,17 @@
 #pragma once
 
 #include <map>
+#include <memory>
 #include <string>
+#include <utility>
 #include <vector>
 
 #include <CLI/CLI.hpp>
 
 #include "gp2/csv.hpp"
 #include "gp2/error.hpp"
+#include "gp2/fit_file.hpp"
+#include "gp2/generate.hpp"
 
 namespace gp2::command {
 
@@ -17,11 +21,16 @@ void add_check(CLI::App& app);
 void add_generate(CLI::App& app);
 void add_fit(CLI::App& app);
 void add_predict(CLI::App& app);
+void add_simulate(CLI::App& app);
 void add_evaluate(CLI::App& app);
+void add_reproduce(CLI::App& app);
 
 /// "theta1=q3,theta2=q6" -> model's name -> log's name.
 /// @throws InputError when it is not of that form.
 std::map<std::string, std::string> parse_map(const std::string& text);
+
+/// Columns: the entries of a state that the model reads, then the accelerations.
+std::string to_csv(const GeneratedData& data, const System& system);
 
 /// "a,b" -> {"a", "b"}; empty for "" .
 std::vector<std::string> parse_list(const std::string& text);
@@ -41,6 +50,27 @@ auto at_states_of(const CsvTable& log, const Work& work) {
     throw InputError(log.name() + ": " + error.what());
   }
 }
+
+/// The system under which a fit predicts.
+struct PredictedSystem {
+  ModelFile model;
+  std::shared_ptr<const Setting> setting;  // null: the fit's own
+  Prior prior;                             // of that system
+
+  /// Every row of a quantity there.
+  [[nodiscard]] View view(View::Quantity quantity) const;
+};
+
+/// @param path  of --system: another model file; empty: the fit's own
+/// @throws InputError when that model does not fit (make_setting).
+PredictedSystem predicted_system(const FitFile& fit, const std::string& path);
+
+inline constexpr const char* system_help =
+    "model file of another system with the same coordinates, inputs and latents: predict under its constraints, masses and "
+    "parameters";
+
+/// "LOG@OTHER.toml" -> {"LOG", "OTHER.toml"}, split at the last @; {text, ""} where what follows it does not end in .toml.
+std::pair<std::string, std::string> split_at_system(const std::string& text);
 
 /// Prints talk to stderr, a line each.
 void talk(const std::vector<std::string>& notes);

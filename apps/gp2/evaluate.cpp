@@ -17,7 +17,7 @@ namespace {
 using Json = nlohmann::ordered_json;
 
 struct Arguments {
-  std::string fit, data, outputs, map;
+  std::string fit, data, outputs, map, system;
   bool json = false;
 };
 
@@ -66,12 +66,13 @@ void run(const Arguments& arguments) {
   std::vector<std::string> outputs = parse_list(arguments.outputs);
   if (outputs.empty()) outputs = observed_outputs(fit);
   const std::vector<int> rows = acceleration_rows(*fit.model.system, outputs, "--outputs");
-  const View view = View::all(View::Quantity::constrained_acceleration, *fit.model.system);
-  const LogStates log = read_log_states(fit.prior(), view, fit.model, table, parse_map(arguments.map), outputs);
+  const PredictedSystem system = predicted_system(fit, arguments.system);
+  const View view = system.view(View::Quantity::constrained_acceleration);
+  const LogStates log = read_log_states(system.prior, view, system.model, table, parse_map(arguments.map), outputs);
   talk(log.notes);
   const Posterior posterior = fit.posterior();
   const Evaluation evaluation =
-      at_states_of(table, [&] { return evaluate_predictions(posterior, log.states, rows, log.accelerations); });
+      at_states_of(table, [&] { return evaluate_predictions(posterior, log.states, rows, log.accelerations, system.setting); });
   if (arguments.json) {
     fmt::print("{}\n", to_json(evaluation).dump(2));
   } else {
@@ -89,6 +90,7 @@ void add_evaluate(CLI::App& app) {
   command->add_option("--data", arguments->data, "CSV with states and accelerations")->required();
   command->add_option("--outputs", arguments->outputs,
                       "accelerations to compare, ddq3,ddq6 (default: those observed in training)");
+  command->add_option("--system", arguments->system, system_help);
   command->add_option("--map", arguments->map, "columns by other names, LOGNAME=MODELNAME,…");
   command->add_flag("--json", arguments->json, "figures as JSON on stdout");
   command->footer("Example:\n  gp2 evaluate fit.json --data test.csv --json");

@@ -22,9 +22,13 @@ namespace {
 using Json = nlohmann::ordered_json;
 
 struct Arguments {
-  std::string model, data, map, observe, mean = "zero", prior, noise, protocol = "default", hyperprior = "default", start, output;
+  std::string model, map, observe, mean = "zero", prior, baseline, noise, protocol = "default", hyperprior = "default", start,
+                                   output;
+  std::vector<std::string> data, also;
+  std::optional<double> also_noise, time_step;
   std::optional<std::string> estimate;
-  int restarts = 5, max_iterations = 1000, threads = 0;
+  std::optional<int> restarts;
+  int max_iterations = 1000, threads = 0;
   std::optional<int> max_points;
   std::uint64_t seed = 0;
   bool json = false;
@@ -36,6 +40,7 @@ FitProblemOptions problem_options(const Arguments& arguments) {
   options.observe = parse_list(arguments.observe);
   options.mean = arguments.mean == "force" ? Prior::Mean::force : Prior::Mean::zero;
   if (!arguments.prior.empty()) options.base = arguments.prior == "force" ? Latent::Base::force : Latent::Base::acceleration;
+  if (!arguments.baseline.empty()) options.baseline = Baseline::kind_of(arguments.baseline);
   if (arguments.estimate) {
     options.estimate = *arguments.estimate == "none" ? std::vector<std::string>{} : parse_list(*arguments.estimate);
   }
@@ -51,8 +56,29 @@ FitProblemOptions problem_options(const Arguments& arguments) {
   options.protocol.name = arguments.protocol == "paper" ? Protocol::Name::paper : Protocol::Name::standard;
   options.protocol.hyperprior = arguments.hyperprior == "default";
   options.max_points = arguments.max_points;
+  options.also_noise_stddev = arguments.also_noise;
+  options.time_step = arguments.time_step;
   options.seed = arguments.seed;
   return options;
+}
+
+// LOG or LOG@OTHER.toml
+Log read_log(const std::string& text) {
+  const auto [path, model] = split_at_system(text);
+  return {CsvTable::read(path), model.empty() ? nullptr : std::make_shared<const ModelFile>(ModelFile::read(model))};
+}
+
+// VIEW:LOG or VIEW@LATENT:LOG
+Knowledge read_knowledge(const std::string& text) {
+  const std::size_t colon = text.find(':');
+  const std::string view = text.substr(0, std::min(colon, text.size()));
+  const std::size_t at = view.find('@');
+  const std::optional<View::Quantity> quantity = View::quantity_of(view.substr(0, at));
+  if (colon == std::string::npos || !quantity) {
+    throw InputError(fmt::format("--also: '{}' is not VIEW:FILE.csv or VIEW@LATENT:FILE.csv with VIEW one of {}", text,
+                                 fmt::join(View::quantity_words(), ", ")));
+  }
+  return {*quantity, at == std::string::npos ? "" : view.substr(at + 1), read_log(text.substr(colon + 1))};
 }
 
 // Bounds are the optimiser's: where it does not run, a start outside of them is taken, and they are widened to hold it.
@@ -116,7 +142,9 @@ void print_text(const FitReport& report) {
 }
 
 void run(const Arguments& arguments) {
-  if (arguments.restarts < 1) throw InputError(fmt::format("--restarts: must be positive, got {}", arguments.restarts));
+  if (arguments.restarts && *arguments.restarts < 1) {
+    throw InputError(fmt::format("--restarts: must be positive, got {}", *arguments.restarts));
+  }
   if (arguments.max_iterations < 0) {
     throw InputError(fmt::format("--max-iterations: must not be negative, got {}", arguments.max_iterations));
   }
@@ -129,19 +157,24 @@ void run(const Arguments& arguments) {
   require_folder(arguments.output);
   FitFile file;
   file.model = ModelFile::read(arguments.model);
-  const CsvTable log = CsvTable::read(arguments.data);
-  FitProblem problem = make_fit_problem(file.model, log, problem_options(arguments));
+  std::vector<Log> logs;
+  for (const std::string& text : arguments.data) logs.push_back(read_log(text));
+  std::vector<Knowledge> also;
+  for (const std::string& text : arguments.also) also.push_back(read_knowledge(text));
+  FitProblem problem = make_fit_problem(file.model, logs, also, problem_options(arguments));
   if (!arguments.start.empty()) read_start(arguments, problem);
   talk(problem.notes);
 
-  FitOptions options;
-  options.n_restarts = arguments.restarts;
+  const std::optional<Baseline>& baseline = problem.prior_options.baseline;
+  FitOptions options = baseline ? baseline_fit_options() : FitOptions{};
+  options.n_restarts = arguments.restarts.value_or(options.n_restarts);
   options.max_iterations = arguments.max_iterations;
   options.seed = arguments.seed;
   options.n_threads = arguments.threads;
   const bool terminal = isatty(STDERR_FILENO) != 0;
   if (terminal) options.progress = print_progress;
-  Fit result = fit(problem.prior, problem.observations, problem.hyperparameters, options);
+  Fit result = baseline ? fit_baseline(baseline->kind, problem.prior, problem.observations, problem.hyperparameters, options)
+                        : fit(problem.prior, problem.observations, problem.hyperparameters, options);
   if (terminal) fmt::print(stderr, "\r\033[K");
 
   std::vector<std::string> at_bound;
@@ -154,12 +187,16 @@ void run(const Arguments& arguments) {
                       fmt::join(at_bound, ", "))});
   }
   file.prior_options = problem.prior_options;
-  file.data_source = arguments.data;
+  std::vector<std::string> sources = arguments.data;
+  sources.insert(sources.end(), arguments.also.begin(), arguments.also.end());
+  file.data_source = fmt::format("{}", fmt::join(sources, ", "));
   file.observations = std::move(problem.observations);
+  file.systems = std::move(problem.systems);
   file.report = result.report;
   file.write(arguments.output);
-  talk({fmt::format("{}: fit of '{}' to {} rows", arguments.output, file.model.system->name(),
-                    file.observations.front().n_data())});
+  int n_rows = 0;
+  for (const Observations& group : file.observations) n_rows += group.n_data();
+  talk({fmt::format("{}: fit of '{}' to {} rows", arguments.output, file.model.system->name(), n_rows)});
   if (arguments.json) {
     fmt::print("{}\n", to_json(result.report).dump(2));
   } else {
@@ -173,7 +210,23 @@ void add_fit(CLI::App& app) {
   CLI::App* command = app.add_subcommand("fit", "Fit a model to a log of states and accelerations");
   auto a = std::make_shared<Arguments>();
   command->add_option("MODEL", a->model, "model file")->required();
-  command->add_option("--data", a->data, "CSV log; columns are found by name, in any order")->required();
+  command
+      ->add_option("--data", a->data,
+                   "CSV log; columns are found by name, in any order. Several: --data A.csv --data B.csv@OTHER.toml, where B was "
+                   "measured on the system of another model file")
+      ->required()
+      ->allow_extra_args(false)
+      ->type_name("LOG[@OTHER.toml]");
+  command
+      ->add_option(
+          "--also", a->also,
+          "another quantity, measured or known, say unconstrained:rest.csv with abar_q1 …: the columns that are there are "
+          "observed. May be given several times")
+      ->allow_extra_args(false)
+      ->type_name("VIEW[@LATENT]:CSV[@OTHER.toml]");
+  command->add_option("--also-noise-std", a->also_noise,
+                      "noise standard deviation of what --also gives (default, for accelerations: the model's [noise])");
+  command->add_option("--dt", a->time_step, "time step of --also next-velocity [s]");
   command->add_option("--map", a->map, "columns by other names, LOGNAME=MODELNAME,…: theta1=q3 also brings dtheta1, ddtheta1");
   command->add_option("--observe", a->observe, "accelerations to learn from, ddq3,ddq6 (default: all)");
   command->add_option("--mean", a->mean, "prior mean of the unconstrained acceleration: zero, or force = M⁻¹F of the model")
@@ -182,6 +235,10 @@ void add_fit(CLI::App& app) {
   command
       ->add_option("--prior", a->prior, "put the model's latent on the acceleration or on the force (default: as the model says)")
       ->check(CLI::IsMember({"acceleration", "force"}));
+  command
+      ->add_option("--baseline", a->baseline,
+                   "learn ddq without mechanics: se (independent outputs), icm or lmc (multi-output), from the model's features")
+      ->check(CLI::IsMember(Baseline::words()));
   command->add_option("--estimate", a->estimate, "parameters to estimate, p1,p2, or none (default: those the model says)");
   command->add_option("--noise-std", a->noise,
                       "noise standard deviation of every observed ddq, or 'estimate' (default: as the model says)");
@@ -191,12 +248,12 @@ void add_fit(CLI::App& app) {
   command->add_option("--hyperprior", a->hyperprior, "weak log-normal hyper-priors, or none: maximum likelihood")
       ->check(CLI::IsMember({"default", "none"}))
       ->capture_default_str();
-  command->add_option("--restarts", a->restarts, "runs of the optimiser; the first starts at the model's values")
-      ->capture_default_str();
+  command->add_option("--restarts", a->restarts,
+                      "runs of the optimiser; the first starts at the model's values (default: 5; of a baseline 30)");
   command->add_option("--max-iterations", a->max_iterations, "per run; 0 conditions at the starting values")
       ->capture_default_str();
   command->add_option("--start", a->start, "starting values: {\"name\": value, …} as JSON, or a FIT.json");
-  command->add_option("--max-points", a->max_points, "take this many rows, the first of a shuffle by --seed");
+  command->add_option("--max-points", a->max_points, "take this many rows of each log, the first of a shuffle by --seed");
   command->add_option("--seed", a->seed, "of restarts and --max-points")->check(not_negative())->capture_default_str();
   command->add_option("--threads", a->threads, "0: as many as the machine has; results do not depend on it")
       ->capture_default_str();

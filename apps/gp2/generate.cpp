@@ -14,8 +14,8 @@ namespace gp2::command {
 namespace {
 
 struct Arguments {
-  std::string model, output;
-  int n = 0;
+  std::string model, output, grid;
+  std::optional<int> n;
   std::uint64_t seed = 1;
   std::optional<double> noise_stddev;
 };
@@ -32,8 +32,35 @@ Eigen::VectorXd noise_of(const ModelFile& model, const std::optional<double>& gi
   return Eigen::Map<const Eigen::VectorXd>(model.noise.stddev.data(), nq);
 }
 
-// the columns that the model reads, then the accelerations
-std::string csv_of(const GeneratedData& data, const System& system) {
+std::map<std::string, int> grid_of(const std::string& text) {
+  std::map<std::string, int> grid;
+  for (const std::string& item : parse_list(text)) {
+    const std::size_t equals = item.find('=');
+    int points = 0;
+    if (equals == std::string::npos || equals == 0 || !CLI::detail::lexical_cast(item.substr(equals + 1), points)) {
+      throw InputError(fmt::format("--grid: '{}' is not RANGE=POINTS, say q1=5", item));
+    }
+    if (!grid.emplace(item.substr(0, equals), points).second) {
+      throw InputError(fmt::format("--grid: '{}' stands twice", item.substr(0, equals)));
+    }
+  }
+  return grid;
+}
+
+void run(const Arguments& arguments) {
+  if (arguments.n.has_value() != arguments.grid.empty()) throw InputError("generate: give either --n or --grid");
+  if (arguments.n && *arguments.n < 1) throw InputError(fmt::format("--n: must be positive, got {}", *arguments.n));
+  const ModelFile model = ModelFile::read(arguments.model);
+  const GeneratedData data = generate(
+      model, {arguments.n.value_or(1), arguments.seed, noise_of(model, arguments.noise_stddev), grid_of(arguments.grid)});
+
+  write_file(arguments.output, to_csv(data, *model.system));
+  talk({fmt::format("{}: {} rows of '{}'", arguments.output, data.states.cols(), model.system->name())});
+}
+
+}  // namespace
+
+std::string to_csv(const GeneratedData& data, const System& system) {
   const std::vector<std::string> names = system.state_names();
   std::string csv;
   std::vector<std::string> line;
@@ -56,22 +83,13 @@ std::string csv_of(const GeneratedData& data, const System& system) {
   return csv;
 }
 
-void run(const Arguments& arguments) {
-  if (arguments.n < 1) throw InputError(fmt::format("--n: must be positive, got {}", arguments.n));
-  const ModelFile model = ModelFile::read(arguments.model);
-  const GeneratedData data = generate(model, {arguments.n, arguments.seed, noise_of(model, arguments.noise_stddev)});
-
-  write_file(arguments.output, csv_of(data, *model.system));
-  talk({fmt::format("{}: {} rows of '{}'", arguments.output, arguments.n, model.system->name())});
-}
-
-}  // namespace
-
 void add_generate(CLI::App& app) {
   CLI::App* command = app.add_subcommand("generate", "Draw states from a model's [sampling] and measure its [truth]");
   auto arguments = std::make_shared<Arguments>();
   command->add_option("MODEL", arguments->model, "model file")->required();
-  command->add_option("--n", arguments->n, "number of rows")->required();
+  command->add_option("--n", arguments->n, "number of rows, drawn at random");
+  command->add_option("--grid", arguments->grid,
+                      "a grid instead: the number of points of every range, q1=5,dq1=3,…; use with --noise-std 0 for test data");
   command->add_option("--seed", arguments->seed, "of the random numbers")->check(not_negative())->capture_default_str();
   command->add_option("--noise-std", arguments->noise_stddev,
                       "standard deviation of the noise on every ddq; 0 gives the truth (default: the model's [noise])");

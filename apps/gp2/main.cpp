@@ -49,7 +49,9 @@ int main(int argc, char** argv) {
   gp2::command::add_generate(app);
   gp2::command::add_fit(app);
   gp2::command::add_predict(app);
+  gp2::command::add_simulate(app);
   gp2::command::add_evaluate(app);
+  gp2::command::add_reproduce(app);
 
   try {
     require_known_command(app, argc, argv);

@@ -1,4 +1,5 @@
 #include <algorithm>
+#include <cstdint>
 #include <memory>
 #include <optional>
 
@@ -15,14 +16,18 @@ namespace gp2::command {
 namespace {
 
 struct Arguments {
-  std::string fit, states, view = "constrained", covariance = "none", output, map;
+  std::string fit, states, view = "constrained", covariance = "none", output, map, system;
   std::optional<std::string> latent;
   std::optional<double> time_step;
+  int n_samples = 0;
+  std::uint64_t seed = 0;
+  bool unconditioned = false;
 };
 
 // what the arguments ask to see
-View view_of(const Arguments& arguments, const Prior& prior) {
-  View view = View::all(*View::quantity_of(arguments.view), *prior.system);
+View view_of(const Arguments& arguments, const PredictedSystem& system, const Prior& home) {
+  const Prior& prior = system.prior;
+  View view = system.view(*View::quantity_of(arguments.view));
   if (view.size() == 0) throw InputError(fmt::format("--view {}: '{}' has no constraints", arguments.view, prior.system->name()));
   const bool needs_step = view.quantity == View::Quantity::next_velocity;
   if (needs_step != arguments.time_step.has_value()) {
@@ -35,7 +40,7 @@ View view_of(const Arguments& arguments, const Prior& prior) {
   }
   if (arguments.latent) {
     std::vector<std::string> names;
-    for (const Latent& latent : prior.latents) names.push_back(latent.name);
+    for (const Latent& latent : home.latents) names.push_back(latent.name);
     const auto found = std::find(names.begin(), names.end(), *arguments.latent);
     if (found == names.end()) {
       throw InputError(
@@ -55,7 +60,7 @@ struct NewColumns {
 NewColumns predict(const Posterior& posterior, const View& view, const Eigen::MatrixXd& states, const std::string& covariance) {
   const Prior& prior = posterior.prior();
   const std::string latent = view.latent < 0 ? "" : prior.latents[static_cast<std::size_t>(view.latent)].name;
-  const std::vector<std::string> names = view.names(*prior.system, latent);
+  const std::vector<std::string> names = view.names(*prior_of(prior, view).system, latent);
   const Eigen::Index d = view.size();
   NewColumns out{names, {}};
   if (covariance == "none") {
@@ -79,6 +84,19 @@ NewColumns predict(const Posterior& posterior, const View& view, const Eigen::Ma
     }
   }
   return out;
+}
+
+// NAME_sample1 … of every name, then NAME_sample2 …: draws of the view at all states together
+void add_samples(NewColumns& columns, const Posterior& posterior, const View& view, const Eigen::MatrixXd& states, int n_samples,
+                 std::uint64_t seed) {
+  const Eigen::MatrixXd samples = posterior.sample({{view, states}}, n_samples, seed);
+  const Eigen::Index d = view.size(), first = columns.values.rows();
+  const std::vector<std::string> names(columns.names.begin(), columns.names.begin() + d);
+  columns.values.conservativeResize(first + d * n_samples, Eigen::NoChange);
+  for (int s = 0; s < n_samples; ++s) {
+    for (const std::string& name : names) columns.names.push_back(fmt::format("{}_sample{}", name, s + 1));
+    columns.values.middleRows(first + d * s, d) = samples.col(s).reshaped(d, states.cols());
+  }
 }
 
 // a cell that reads back as `text`
@@ -127,11 +145,13 @@ std::string joined(const CsvTable& input, const NewColumns& added) {
 void run(const Arguments& arguments) {
   const FitFile fit = FitFile::read(arguments.fit);
   const CsvTable table = CsvTable::read(arguments.states);
-  const Posterior posterior = fit.posterior();
-  const View view = view_of(arguments, posterior.prior());
-  const LogStates log = read_log_states(posterior.prior(), view, fit.model, table, parse_map(arguments.map));
+  const Posterior posterior = arguments.unconditioned ? fit.posterior().without_data() : fit.posterior();
+  const PredictedSystem system = predicted_system(fit, arguments.system);
+  const View view = view_of(arguments, system, posterior.prior());
+  const LogStates log = read_log_states(system.prior, view, system.model, table, parse_map(arguments.map));
   talk(log.notes);
-  const NewColumns predictions = at_states_of(table, [&] { return predict(posterior, view, log.states, arguments.covariance); });
+  NewColumns predictions = at_states_of(table, [&] { return predict(posterior, view, log.states, arguments.covariance); });
+  if (arguments.n_samples > 0) add_samples(predictions, posterior, view, log.states, arguments.n_samples, arguments.seed);
   write_file(arguments.output, joined(table, predictions));
   talk({fmt::format("{}: {} predictions, view {}", arguments.output, table.n_rows(), arguments.view)});
 }
@@ -155,6 +175,15 @@ void add_predict(CLI::App& app) {
       ->add_option("--cov", arguments->covariance, "none; std: NAME_std; full: also cov_NAME1_NAME2. Without measurement noise")
       ->check(CLI::IsMember({"none", "std", "full"}))
       ->capture_default_str();
+  CLI::Option* samples =
+      command->add_option("--samples", arguments->n_samples, "draws of all rows together: NAME_sample1 … NAME_sampleS")
+          ->check(CLI::PositiveNumber);
+  command->add_option("--seed", arguments->seed, "of the samples; same seed, same samples")
+      ->check(not_negative())
+      ->needs(samples)
+      ->capture_default_str();
+  command->add_flag("--unconditioned", arguments->unconditioned, "predict from the prior, as if there had been no data");
+  command->add_option("--system", arguments->system, system_help);
   command->add_option("--map", arguments->map, "columns by other names, LOGNAME=MODELNAME,…");
   command->add_option("-o,--output", arguments->output, "CSV file to write")->required();
   command->footer("Example:\n  gp2 predict fit.json --states states.csv --cov std -o prediction.csv");

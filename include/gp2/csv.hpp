@@ -16,6 +16,9 @@ class CsvTable {
   /// @param name  stands for the file in messages
   static CsvTable parse(std::string_view text, std::string name);
 
+  /// The table without the rows after the first n.
+  [[nodiscard]] CsvTable first_rows(int n) const;
+
   [[nodiscard]] const std::string& name() const { return name_; }
   [[nodiscard]] const std::vector<std::string>& header() const { return header_; }
   [[nodiscard]] int n_rows() const { return static_cast<int>(cells_.size() / header_.size()); }

@@ -1,5 +1,6 @@
 #pragma once
 
+#include <memory>
 #include <string>
 #include <vector>
 
@@ -16,7 +17,7 @@ struct Evaluation {
   double rmse_normalised = 0;              // mean over outputs of rmse / training std (Geist & Trimpe 2020, table 1); NaN when an
                                            // output was not observed in training
   double nrmse = 0;                        // rms over outputs and points / rms of the test stds
-  double max_constraint_error = 0;         // max |A ddq − b| over points and rows, with the model's own parameters
+  double max_constraint_error = 0;         // max |A ddq − b| over points and rows, with the parameters as in the model file
   double max_constraint_error_fitted = 0;  // the same with the fitted parameters
   // per-output Gaussian marginals; NaN when there is nothing to average
   double nlpd = 0, coverage95 = 0;                // of measurements: noise included
@@ -28,8 +29,10 @@ struct Evaluation {
 /// @param states   (layout size × N)
 /// @param rows     of ddq that are compared
 /// @param targets  (rows × N)
+/// @param setting  the other system under which they were measured; null: the prior's own
 Evaluation evaluate_predictions(const Posterior& posterior, const Eigen::Ref<const Eigen::MatrixXd>& states,
-                                const std::vector<int>& rows, const Eigen::Ref<const Eigen::MatrixXd>& targets);
+                                const std::vector<int>& rows, const Eigen::Ref<const Eigen::MatrixXd>& targets,
+                                const std::shared_ptr<const Setting>& setting = nullptr);
 
 /// max |A ddq − b| over states and rows of A.
 /// @param accelerations  (nq × N)

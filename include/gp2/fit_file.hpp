@@ -1,6 +1,7 @@
 #pragma once
 
 #include <filesystem>
+#include <memory>
 #include <string>
 #include <vector>
 
@@ -12,19 +13,21 @@ namespace gp2 {
 /// A fitted model as a file: the model's text, the options its prior was made with, the data and the hyperparameters. The
 /// posterior is computed anew from these, so a file loaded gives the same bits as before it was saved.
 struct FitFile {
-  static constexpr int format_version = 1;
+  static constexpr int format_version = 2;  // 2: observations of other systems; others are written as 1
 
   ModelFile model;
   PriorOptions prior_options;
   std::string data_source;  // where the data came from, for people
   std::vector<Observations> observations;
+  /// Per Observations: the model file of its view's setting; null where it has none. May be shorter.
+  std::vector<std::shared_ptr<const ModelFile>> systems;
   FitReport report;  // with the fitted hyperparameters
 
   [[nodiscard]] Prior prior() const { return make_prior(model, prior_options); }
   /// The prior conditioned on the data, under the fitted hyperparameters.
   [[nodiscard]] Posterior posterior() const;
 
-  /// Written whole or not at all. @throws InputError when that fails.
+  /// Written whole or not at all. @throws InputError when that fails, or `systems` lacks the model file of a setting.
   void write(const std::filesystem::path& path) const;
   /// @throws InputError naming the file and what is wrong: not a fit, of a newer format, cut short, or with values out of place.
   static FitFile read(const std::filesystem::path& path);

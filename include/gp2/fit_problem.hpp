@@ -1,6 +1,7 @@
 #pragma once
 
 #include <map>
+#include <memory>
 #include <optional>
 #include <string>
 #include <vector>
@@ -13,17 +14,33 @@
 
 namespace gp2 {
 
-/// What a person asks of a fit beyond the model and the log.
+/// Measurements as a table, and the system they were taken on.
+struct Log {
+  CsvTable table;
+  std::shared_ptr<const ModelFile> model = nullptr;  // of that system; null: the model that is fitted
+};
+
+/// Another quantity that is measured or known at some states: the columns of its rows that the table holds, at least one.
+struct Knowledge {
+  View::Quantity quantity = View::Quantity::unconstrained_acceleration;
+  std::string latent;  // only what this latent adds, by its name; empty: everything
+  Log log;
+};
+
+/// What a person asks of a fit beyond the model and its logs.
 struct FitProblemOptions {
   std::map<std::string, std::string> columns;  // model's name -> log's name, before the model's own [columns]
   std::vector<std::string> observe;            // accelerations to observe; empty: all of them
   Prior::Mean mean = Prior::Mean::zero;
   std::optional<Latent::Base> base;                  // replaces the directions of the model's latent
+  std::optional<Baseline::Kind> baseline;            // learns ddq without mechanics, instead of the model's latents
   std::optional<std::vector<std::string>> estimate;  // parameters; not given: those the model wants estimated
   std::optional<double> noise_stddev;                // for every observed row; not given: the model's [noise]
   bool estimate_noise = false;
   Protocol protocol;
-  std::optional<int> max_points;  // the first of a shuffle by `seed`
+  std::optional<int> max_points;            // of each log: the first of a shuffle by `seed`
+  std::optional<double> also_noise_stddev;  // of every row that is known; not given: [noise], where it is an acceleration
+  std::optional<double> time_step;          // Δt of a known next velocity
   std::uint64_t seed = 0;
 };
 
@@ -31,14 +48,18 @@ struct FitProblemOptions {
 struct FitProblem {
   PriorOptions prior_options;
   Prior prior;
-  std::vector<Observations> observations;
+  std::vector<Observations> observations;                 // of each log, then of each knowledge
+  std::vector<std::shared_ptr<const ModelFile>> systems;  // per Observations: its model where that is another; for FitFile
   std::vector<Hyperparameter> hyperparameters;
   std::vector<std::string> notes;  // what a person should know: columns taken by alias, states off the constraint, …
 };
 
-/// Reads a log into a fit of a model.
-/// @throws InputError for missing columns, bad cells, unknown names, noise that is missing, not positive, or too small for double
-///   precision.
+/// Reads logs of accelerations, and what else is known, into a fit of a model.
+/// @throws InputError for missing columns, bad cells, unknown names, a log's model that does not fit (make_setting), noise that
+/// is
+///   missing, not positive, or too small for double precision.
+FitProblem make_fit_problem(const ModelFile& model, const std::vector<Log>& logs, const std::vector<Knowledge>& also,
+                            const FitProblemOptions& options);
 FitProblem make_fit_problem(const ModelFile& model, const CsvTable& log, const FitProblemOptions& options);
 
 /// A reader of a log that knows the columns by `columns` (model's name -> log's name), then by the model's own [columns].

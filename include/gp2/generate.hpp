@@ -1,6 +1,10 @@
 #pragma once
 
 #include <cstdint>
+#include <map>
+#include <memory>
+#include <string>
+#include <vector>
 
 #include <Eigen/Core>
 
@@ -19,15 +23,35 @@ struct GenerateOptions {
   int n = 100;
   std::uint64_t seed = 1;
   Eigen::VectorXd noise_stddev;  // (nq), ≥ 0
+  /// A grid instead of n draws: the number of points of every range in [sampling], evenly from end to end.
+  std::map<std::string, int> grid = {};
 };
 
 /// Draws states, solving the constraints for coordinates and velocities that [sampling] leaves open, and measures them.
-/// @throws InputError when [sampling] or [truth] is missing, leaves open what the constraints do not decide, or puts a state off
+/// @throws InputError when the grid leaves out a range or names another; when [sampling] or [truth] is missing, leaves open what the constraints do not decide, or puts a state off
 ///   the constraints; when n < 1 or noise_stddev is not of nq finite numbers ≥ 0.
 /// @throws NumericalError when Newton's method does not reach the constraints.
 GeneratedData generate(const ModelFile& model, const GenerateOptions& options);
 
+/// The motion of a model as it is written: ddq = L b + T (M⁻¹F + truth), truth = 0 without [truth]. Compiled once, for many
+/// calls.
+class ModelMotion {
+ public:
+  explicit ModelMotion(const ModelFile& model);
+
+  /// @param states  (layout size × N)
+  /// @return (nq × N), not finite where the truth is not
+  /// @throws InputError when M is not positive definite or the constraints contradict each other at a state.
+  [[nodiscard]] Eigen::MatrixXd acceleration(const Eigen::Ref<const Eigen::MatrixXd>& states) const;
+
+ private:
+  std::shared_ptr<const SymbolicSystem> system_;
+  Eigen::VectorXd parameters_;
+  Tape truth_;
+};
+
 /// The true acceleration L b + T (M⁻¹F + truth) at given states (nq × N).
+/// @throws InputError when there is no [truth], or it is not finite at a state.
 Eigen::MatrixXd true_acceleration(const ModelFile& model, const Eigen::Ref<const Eigen::MatrixXd>& states);
 
 }  // namespace gp2

@@ -49,6 +49,17 @@ class Kernel {
   [[nodiscard]] int n_features() const { return n_features_; }
   [[nodiscard]] const std::vector<Parameter>& parameters() const { return parameters_; }
 
+  /// The sum of products it is.
+  struct Factor {
+    Primitive primitive;
+    int first_parameter;  // index of ℓ_1; periods or α follow the lengthscales
+  };
+  struct Term {
+    int amplitude;  // index of w_k, −1 for the first term
+    std::vector<Factor> factors;
+  };
+  [[nodiscard]] const std::vector<Term>& terms() const { return terms_; }
+
   /// Reused memory of `evaluate` and `add_gradient`.
   struct Workspace {
     Eigen::ArrayXXd columns;
@@ -69,15 +80,6 @@ class Kernel {
                     Eigen::Ref<Eigen::VectorXd> gradient, Workspace& workspace) const;
 
  private:
-  struct Factor {
-    Primitive primitive;
-    int first_parameter;
-  };
-  struct Term {
-    int amplitude;  // index of w_k, −1 for the first term
-    std::vector<Factor> factors;
-  };
-
   std::string text_;
   int n_features_ = 0;
   std::vector<Term> terms_;

@@ -14,9 +14,14 @@ namespace gp2 {
 /// Everything about a prior and its observations that can be tuned, in physical units; also the shape of its gradient.
 struct ModelValues {
   std::vector<Eigen::VectorXd> kernel;         // per latent: the kernel's parameters
-  std::vector<Eigen::VectorXd> signal_stddev;  // per latent: s (p_a)
+  std::vector<Eigen::VectorXd> signal_stddev;  // per latent: s (p_a); ones where the directions are learned
+  std::vector<Eigen::MatrixXd> mixing;         // per latent: C = [W, diag(√κ)] of learned directions; may be left empty
   std::vector<Eigen::VectorXd> noise_stddev;   // per Observations: σ (d)
   Eigen::VectorXd parameters;                  // of the system: θ
+
+  [[nodiscard]] bool is_learned(std::size_t a) const { return a < mixing.size() && mixing[a].size() > 0; }
+  /// C_a of latent a (p_a × functions).
+  [[nodiscard]] Eigen::MatrixXd loading(std::size_t a) const;
 };
 
 /// The negative log marginal likelihood of observations under a prior, in its reduced, jitter-free form, and its exact gradient.
@@ -24,7 +29,7 @@ struct ModelValues {
 /// With W = S^{-1/2}G = Q R (Q orthonormal, r = rank), e = S^{-1/2}(y − d − Gμ) and ỹ = Qᵀe at each observation,
 ///
 ///     −log p(y) = −log N(ỹ; 0, K̃ + I) + ½ Σ‖(I − QQᵀ)e‖² + ½ Σ log|S| + ½ Σ (dim y − r) log 2π,
-///     K̃_ij      = Σ_a R_i E_a(x_i) k_a,ij E_a(x_j)ᵀ R_jᵀ.
+///     K̃_ij      = Σ_a R_i E_a(x_i) C_a k_a,ij C_aᵀE_a(x_j)ᵀ R_jᵀ.
 ///
 /// The factored matrix has Σ r rows and eigenvalues ≥ 1: nothing is ever added to its diagonal. Thread-safe.
 class Likelihood {
@@ -55,8 +60,8 @@ class Likelihood {
 
   /// −log p(y | values): +∞ where M is not positive definite, the constraints contradict each other, or the factorisation fails.
   ///
-  /// @param gradient  when not null, receives ∂/∂log of kernel parameters, signal and noise standard deviations, and ∂/∂θ of the
-  ///                  parameters asked for (zero elsewhere). Left as it was when the value is +∞.
+  /// @param gradient  when not null, receives ∂/∂log of kernel parameters, signal and noise standard deviations, ∂/∂C of learned
+  ///                  directions, and ∂/∂θ of the parameters asked for (zero elsewhere). Left as it was when the value is +∞.
   double evaluate(const ModelValues& values, ModelValues* gradient, Workspace& workspace) const;
 
   [[nodiscard]] const Prior& prior() const;

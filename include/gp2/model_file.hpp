@@ -11,6 +11,7 @@
 
 #include <Eigen/Core>
 
+#include "gp2/baseline.hpp"
 #include "gp2/prior.hpp"
 #include "gp2/symbolic_system.hpp"
 
@@ -53,6 +54,7 @@ class ModelFile {
   std::shared_ptr<const SymbolicSystem> system;
   std::vector<LatentText> latents;
   Noise noise;
+  std::optional<Expression> potential;         // V(q, t) [J], for the energy that `simulate` reports
   std::vector<Expression> truth;               // added to M⁻¹F; nq entries, or none without [truth]
   std::vector<SamplingRule> sampling;          // in an order in which each can be computed; empty without [sampling]
   std::map<std::string, double> newton_start;  // [sampling] start
@@ -71,12 +73,20 @@ class ModelFile {
 
 struct PriorOptions {
   Prior::Mean mean = Prior::Mean::zero;
-  std::optional<Latent::Base> base;  // replaces the directions of the model's latent by the identity or M⁻¹
-  bool raw_angles = false;           // a feature that is an angle stays as it is instead of its sine and cosine
+  std::optional<Latent::Base> base;       // replaces the directions of the model's latent by the identity or M⁻¹
+  bool raw_angles = false;                // a feature that is an angle stays as it is instead of its sine and cosine
+  std::optional<Baseline> baseline = {};  // replaces latents, mean, constraints; of the model it keeps the features, angles raw
 };
 
 /// The prior of a model file. Not to be called from several threads for one model: its expression graph grows.
 /// @throws InputError when a kernel or feature is wrong, or `base` is asked for and the model has several latents.
 Prior make_prior(const ModelFile& model, const PriorOptions& options = {});
+
+/// The system of `other` as a setting for the latents of `home`. A parameter that `other` marks `estimate = true` and `home` has
+/// by the same name is one and the same; every other keeps the value of its own file. As make_prior, not to be called from
+/// several threads for one model.
+/// @throws InputError naming what differs: coordinates, inputs, the number of latents, or a latent's kernel, features or
+///   directions; and when a parameter that is one and the same stands in a feature of `other`.
+std::shared_ptr<const Setting> make_setting(const ModelFile& home, const ModelFile& other, const PriorOptions& options = {});
 
 }  // namespace gp2

@@ -1,6 +1,7 @@
 #pragma once
 
 #include <memory>
+#include <optional>
 #include <span>
 #include <string>
 #include <vector>
@@ -10,11 +11,14 @@
 #include "gp2/expression.hpp"
 #include "gp2/kernel.hpp"
 #include "gp2/mechanics.hpp"
+#include "gp2/view.hpp"
 
 namespace gp2 {
 
-/// A group of p independent zero-mean scalar Gaussian processes f(φ(x)) that share one kernel, act on ā through the directions
-/// E(x) (nq × p) and have signal standard deviations s_1 … s_p: they add E(x) diag(s) f(φ(x)) to ā.
+/// A group of independent zero-mean scalar Gaussian processes f(φ(x)) that share one kernel and act on ā through the p directions
+/// E(x) (nq × p) and a loading C: they add E(x) C f(φ(x)) to ā. C is diag(s), the signal standard deviations s_1 … s_p of p
+/// processes, or, where the directions are learned, C = [W, diag(√κ)] (p × (rank + p)): E C CᵀEᵀ = E (WWᵀ + diag κ) Eᵀ is the
+/// coregionalisation matrix of multi-output models.
 struct Latent {
   enum class Base {
     acceleration,  // E = B
@@ -38,35 +42,59 @@ struct Latent {
   Tape directions;                          // state, parameters -> B (nq × p), column-major; unused where B = I
   std::vector<Tape> direction_derivatives;  // one per parameter of the system -> ∂B/∂p
   bool directions_are_identity = true;      // B = I, p = nq
+  std::optional<int> learned_rank;          // columns of W; not given: C = diag(s)
+  bool kernel_is_fixed = false;             // the kernel's parameters are 1, in the units that its features have
   Range lengthscale, signal_stddev;
 
   [[nodiscard]] int size() const { return static_cast<int>(column_names.size()); }  // p
   [[nodiscard]] int n_features() const { return static_cast<int>(feature_names.size()); }
+  [[nodiscard]] int n_functions() const { return size() + learned_rank.value_or(0); }  // columns of C
 };
 
 /// A Gaussian process prior on the unconstrained acceleration (Geist & Trimpe 2020, sec. 4):
 ///
-///     ā(x) = μ(x) + Σ_a E_a(x) diag(s_a) f_a(φ_a(x))
+///     ā(x) = μ(x) + Σ_a E_a(x) C_a f_a(φ_a(x))
 ///
 /// Immutable and cheap to copy.
 struct Prior {
   enum class Mean {
-    zero,   // μ = 0
-    force,  // μ = M⁻¹F, the paper's μ_ā = a(x, θ)
+    zero,      // μ = 0
+    force,     // μ = M⁻¹F, the paper's μ_ā = a(x, θ)
+    constant,  // μ = constant_mean
   };
 
   std::shared_ptr<const System> system;
   std::vector<Latent> latents;
   Mean mean = Mean::zero;
+  Eigen::VectorXd constant_mean;  // (nq), of Mean::constant
+  /// Where the prior ignores constraints, which `system` then lacks (baseline.hpp): the system with them. Null: `system` has all.
+  std::shared_ptr<const System> constrained_system = nullptr;
+
+  /// The system whose constraints predictions are held against.
+  [[nodiscard]] const System& judge() const { return constrained_system ? *constrained_system : *system; }
 
   /// Which entries of a state the prior and the mechanics read (size layout().size()): the columns a data set must have.
   [[nodiscard]] std::vector<bool> reads() const;
 };
 
+/// Another system in which the latents of a prior act: other constraints, masses or parameters, with the same coordinates and
+/// inputs (Geist & Trimpe 2020, eq. 10).
+struct Setting {
+  Prior prior;              // as many latents as the prior at home, with the same kernels, features and numbers of directions
+  std::vector<int> shared;  // per parameter of its system: which parameter at home it is; −1: it has its own value
+
+  /// The parameters there, given those at home.
+  [[nodiscard]] Eigen::VectorXd parameters(const Eigen::Ref<const Eigen::VectorXd>& home) const;
+};
+
+/// What a view looks at: the prior of its setting, or the one at home; and the parameters there.
+const Prior& prior_of(const Prior& home, const View& view);
+Eigen::VectorXd parameters_of(const View& view, const Eigen::Ref<const Eigen::VectorXd>& home);
+
 /// μ and E at N states, or their derivatives in one parameter.
 struct PriorValues {
   Eigen::MatrixXd mean;                     // μ    (nq × N)
-  std::vector<Eigen::MatrixXd> directions;  // E_a  (nq·p_a × N), column-major blocks, without the signal standard deviations
+  std::vector<Eigen::MatrixXd> directions;  // E_a  (nq·p_a × N), column-major blocks, without the loadings C_a
 
   /// Leaves what one latent adds to ā: no μ, no other latent.
   void keep_only(std::size_t latent);

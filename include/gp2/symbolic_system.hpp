@@ -65,6 +65,9 @@ class SymbolicSystem final : public System {
 
   [[nodiscard]] const Definition& definition() const { return definition_; }
 
+  /// The same coordinates, inputs, parameters, M and F, where nothing constrains the motion: ddq = ā.
+  [[nodiscard]] std::shared_ptr<const SymbolicSystem> without_constraints() const;
+
  private:
   [[nodiscard]] SystemValues run(const Tape& tape, const Eigen::Ref<const Eigen::MatrixXd>& states,
                                  const Eigen::Ref<const Eigen::VectorXd>& parameters) const;

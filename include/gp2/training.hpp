@@ -14,7 +14,8 @@
 
 namespace gp2 {
 
-/// One number that training adjusts, in physical units. All but system parameters are positive and optimised as logarithms.
+/// One number that training adjusts, in physical units. All but system parameters and entries of W are positive and optimised as
+/// logarithms.
 struct Hyperparameter {
   enum class Kind {
     kernel,                // parameter `index` of the kernel of latent `owner`
@@ -22,6 +23,8 @@ struct Hyperparameter {
     shared_signal_stddev,  // one factor for all s of latent `owner`, times `scale`
     noise_stddev,          // σ_index of Observations `owner`
     parameter,             // θ_index of the system
+    mixing,                // W_jl of latent `owner`, index = j + p l; optimised in units of `scale`
+    sqrt_kappa,            // √κ_index of latent `owner`
   };
 
   Kind kind = Kind::kernel;
@@ -31,12 +34,12 @@ struct Hyperparameter {
   std::string unit;
   double value = 0;  // where the first restart starts; the fitted value in a FitReport
   double lower = 0, upper = 0;
-  Eigen::VectorXd scale;  // of a shared signal standard deviation: its unit per column
+  Eigen::VectorXd scale;  // of a shared signal standard deviation: its unit per column; of W and √κ: their unit
 
   /// Weak log-normal hyper-prior: ½ (log(value/median)/log_stddev)² is added to the objective; none where log_stddev = 0.
   double median = 0, log_stddev = 0;
 
-  [[nodiscard]] bool is_positive() const { return kind != Kind::parameter; }
+  [[nodiscard]] bool is_positive() const { return kind != Kind::parameter && kind != Kind::mixing; }
   /// Within 1e-6 of a bound, on the scale it is optimised on.
   [[nodiscard]] bool at_bound() const;
 };
@@ -136,7 +139,8 @@ struct Fit {
 /// Maximises the posterior density of the hyperparameters (marginal likelihood times hyper-priors) by L-BFGS-B from several
 /// starting points. From the best optimum each hyperparameter is then scanned over its box by itself, the others held, and the
 /// optimiser runs again from the lowest point found: an optimum in a corner of the box often hides a lower one. The prior is
-/// conditioned there. Same seed, same bits, for any number of threads.
+/// conditioned there. Mixing matrices that start at zero, a stationary point, stay there in every run and are let go from the best.
+/// Same seed, same bits, for any number of threads.
 ///
 /// @throws InputError, NumericalError  as Likelihood and Posterior; NumericalError when no restart reached a finite likelihood.
 Fit fit(const Prior& prior, const std::vector<Observations>& observations, const std::vector<Hyperparameter>& hyperparameters,

@@ -1,5 +1,6 @@
 #pragma once
 
+#include <memory>
 #include <optional>
 #include <string>
 #include <string_view>
@@ -10,6 +11,8 @@
 #include "gp2/mechanics.hpp"
 
 namespace gp2 {
+
+struct Setting;
 
 /// A quantity that is affine in the unconstrained acceleration ā at a state: G(x) ā(x) + d(x).
 struct View {
@@ -26,6 +29,8 @@ struct View {
   double time_step = 0;   // Δt of next_velocity [s]
   /// What one latent alone adds: G E_a f_a, without μ and d. −1: everything.
   int latent = -1;
+  /// The quantity as it is under another system (Geist & Trimpe 2020, eq. 10): prior.hpp. Null: the prior's own system.
+  std::shared_ptr<const Setting> setting = nullptr;
 
   /// Every row of a quantity.
   static View all(Quantity quantity, const System& system);

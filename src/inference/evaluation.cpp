@@ -31,22 +31,25 @@ struct Calibration {
   [[nodiscard]] double coverage() const { return n == 0 ? not_a_number : static_cast<double>(inside) / n; }
 };
 
-// where training observed row `row` of ddq: its spread and its noise, NaN when it did not
+// where training observed row `row` of ddq: its spread over all such observations and the noise of the first, NaN when it did not
 struct Trained {
   double spread = not_a_number, noise = not_a_number;
 };
 
 Trained trained(const Posterior& posterior, int row) {
+  Trained trained;
+  std::vector<double> values;
   for (std::size_t g = 0; g < posterior.observations().size(); ++g) {
     const Observations& group = posterior.observations()[g];
-    if (group.view.quantity != View::Quantity::constrained_acceleration) continue;
+    if (group.view.quantity != View::Quantity::constrained_acceleration || group.view.latent >= 0) continue;
     for (int k = 0; k < group.view.size(); ++k) {
-      if (group.view.rows[static_cast<std::size_t>(k)] == row) {
-        return {row_stddev(group.values)[k], posterior.values().noise_stddev[g][k]};
-      }
+      if (group.view.rows[static_cast<std::size_t>(k)] != row) continue;
+      if (values.empty()) trained.noise = posterior.values().noise_stddev[g][k];
+      values.insert(values.end(), group.values.row(k).begin(), group.values.row(k).end());
     }
   }
-  return {};
+  if (!values.empty()) trained.spread = row_stddev(Eigen::Map<Eigen::RowVectorXd>(values.data(), std::ssize(values)))[0];
+  return trained;
 }
 
 }  // namespace
@@ -56,15 +59,18 @@ double max_constraint_error(const System& system, const Ref<const MatrixXd>& sta
   const SystemValues values = system.evaluate(states, parameters);
   double worst = 0;
   for (int i = 0; i < values.n_states() && system.nc() > 0; ++i) {
-    worst = std::max(worst, (values.A(i) * accelerations.col(i) - values.b(i)).cwiseAbs().maxCoeff());
+    const VectorXd error = values.A(i) * accelerations.col(i) - values.b(i);
+    if (error.hasNaN()) return not_a_number;  // a baseline needs no measurement of what only the constraint reads
+    worst = std::max(worst, error.cwiseAbs().maxCoeff());
   }
   return worst;
 }
 
 Evaluation evaluate_predictions(const Posterior& posterior, const Ref<const MatrixXd>& states, const std::vector<int>& rows,
-                                const Ref<const MatrixXd>& targets) {
-  const System& system = *posterior.prior().system;
-  const View all = View::all(View::Quantity::constrained_acceleration, system);
+                                const Ref<const MatrixXd>& targets, const std::shared_ptr<const Setting>& setting) {
+  View all = View::all(View::Quantity::constrained_acceleration, *posterior.prior().system);
+  all.setting = setting;
+  const System& system = prior_of(posterior.prior(), all).judge();
   const Posterior::Marginal prediction = posterior.marginal(all, states);
   const MatrixXd stddev = prediction.stddev();
 
@@ -95,7 +101,8 @@ Evaluation evaluate_predictions(const Posterior& posterior, const Ref<const Matr
   e.rmse_normalised = normalised / static_cast<double>(rows.size());
   e.nrmse = e.rmse.norm() / test_spread.norm();
   e.max_constraint_error = max_constraint_error(system, states, system.parameter_values(), prediction.mean);
-  e.max_constraint_error_fitted = max_constraint_error(system, states, posterior.values().parameters, prediction.mean);
+  e.max_constraint_error_fitted =
+      max_constraint_error(system, states, parameters_of(all, posterior.values().parameters), prediction.mean);
   e.nlpd = measured.nlpd();
   e.coverage95 = measured.coverage();
   e.nlpd_latent = latent.nlpd();

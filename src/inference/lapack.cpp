@@ -23,6 +23,19 @@ bool factorise(Eigen::MatrixXd& A) {
   return info == 0;
 }
 
+PivotedFactor factorise_semidefinite(Eigen::MatrixXd A) {
+  const int n = static_cast<int>(A.rows());
+  PivotedFactor factor{Eigen::MatrixXd(n, 0), std::vector<int>(static_cast<std::size_t>(n))};
+  if (n == 0) return factor;
+  int rank = 0, info = 0;
+  const double tolerance = -1;  // n ε times the largest entry of the diagonal
+  Eigen::VectorXd work(2 * n);
+  dpstrf_("L", &n, A.data(), &n, factor.rows.data(), &rank, &tolerance, work.data(), &info, 1);
+  for (int& row : factor.rows) --row;  // Fortran counts from 1
+  factor.L = A.leftCols(rank).triangularView<Eigen::Lower>();
+  return factor;
+}
+
 void invert_factored(Eigen::MatrixXd& L) {
   const int n = static_cast<int>(L.rows());
   int info = 0;

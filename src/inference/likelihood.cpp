@@ -19,6 +19,11 @@ VectorXd row_stddev(const Eigen::Ref<const MatrixXd>& values) {
   return (values.colwise() - mean).rowwise().squaredNorm().array().sqrt() / std::sqrt(static_cast<double>(values.cols()));
 }
 
+MatrixXd ModelValues::loading(std::size_t a) const {
+  if (is_learned(a)) return mixing[a];
+  return signal_stddev[a].asDiagonal();
+}
+
 struct Likelihood::Implementation {
   Prior prior;
   std::vector<Observations> observations;
@@ -33,13 +38,14 @@ struct Likelihood::Implementation {
 };
 
 struct Likelihood::Workspace::Implementation {
-  MatrixXd K;               // K̃ + I, then its factor, then its inverse
-  std::vector<MatrixXd> k;  // per latent (N × N)
-  std::vector<MatrixXd> Z;  // per latent: R_i E_a diag(s)
-  std::vector<MatrixXd> V;  // per latent: V_i,a, rows as Z
-  MatrixXd H;               // ⟨P_ij − α̃_iα̃_jᵀ, Z_i Z_jᵀ⟩ (N × N)
-  VectorXd S;               // a column of P − α̃α̃ᵀ
-  VectorXd alpha;           // α̃
+  MatrixXd K;                // K̃ + I, then its factor, then its inverse
+  std::vector<MatrixXd> k;   // per latent (N × N)
+  std::vector<MatrixXd> Z;   // per latent: R_i E_a C_a
+  std::vector<MatrixXd> V;   // per latent: V_i,a, rows as Z
+  MatrixXd H;                // ⟨P_ij − α̃_iα̃_jᵀ, Z_i Z_jᵀ⟩ (N × N)
+  VectorXd S;                // a column of P − α̃α̃ᵀ
+  VectorXd column_gradient;  // in a factor of each column of Z
+  VectorXd alpha;            // α̃
   Kernel::Workspace kernel;
 };
 
@@ -53,7 +59,7 @@ Likelihood::Likelihood(Prior prior, std::vector<Observations> observations, cons
   self.observations = std::move(observations);
   self.options = std::move(options);
   for (const Observations& group : self.observations) {
-    require_mechanics(*self.prior.system, group.states, initial.parameters);
+    require_mechanics(*prior_of(self.prior, group.view).system, group.states, parameters_of(group.view, initial.parameters));
   }
   self.features = features_by_group(self.prior, self.observations);
   auto models = model_observations(self.prior, self.observations, initial.parameters, self.options.gradient_parameters);
@@ -61,7 +67,7 @@ Likelihood::Likelihood(Prior prior, std::vector<Observations> observations, cons
   self.initial_size = static_cast<int>(reduction.size());
   if (!self.options.gradient_parameters.empty()) return;
   if (!self.options.noise_gradient) {
-    self.fixed_features = sorted_features(self.features, reduction);
+    self.fixed_features = sorted_features(self.prior, self.features, reduction);
     self.fixed_reduction = std::move(reduction);
   }
   self.fixed_models = std::move(models);
@@ -80,18 +86,20 @@ ModelValues zero_gradient(const ModelValues& values) {
   ModelValues gradient = values;
   for (VectorXd& v : gradient.kernel) v.setZero();
   for (VectorXd& v : gradient.signal_stddev) v.setZero();
+  for (MatrixXd& C : gradient.mixing) C.setZero();
   for (VectorXd& v : gradient.noise_stddev) v.setZero();
   gradient.parameters.setZero();
   return gradient;
 }
 
-// One sweep over the lower triangle of P − α̃α̃ᵀ for latent a: H (both orders of a pair folded into the lower triangle), the signal
-// standard deviations' gradient ½ Σ_ij k_ij ⟨S_ij, ∂(Z_i Z_jᵀ)/∂log s⟩, and, where wanted, V_i = Σ_j S_ij Z_j k_ji.
+// One sweep over the lower triangle of P − α̃α̃ᵀ for latent a: H (both orders of a pair folded into the lower triangle), the
+// gradient ½ Σ_ij k_ij ⟨S_ij, ∂(Z_i Z_jᵀ)/∂log⟩ in a factor of each column of Z, and, where wanted, V_i = Σ_j S_ij Z_j k_ji.
 void contract(const Reduction& reduction, const MatrixXd& P, const VectorXd& alpha, const MatrixXd& k, const MatrixXd& Z,
-              MatrixXd& H, VectorXd& signal_gradient, MatrixXd* V, VectorXd& S) {
+              MatrixXd& H, VectorXd& column_gradient, MatrixXd* V, VectorXd& S) {
   const Index n_samples = static_cast<Index>(reduction.samples.size());
   if (H.rows() != n_samples) H.resize(n_samples, n_samples);
   H.setZero();
+  column_gradient.setZero(Z.cols());
   if (V != nullptr) V->setZero(Z.rows(), Z.cols());
   for (int cj = 0; cj < reduction.n_components(); ++cj) {
     for (Index j = 0; j < reduction.count[static_cast<std::size_t>(cj)]; ++j) {
@@ -110,7 +118,7 @@ void contract(const Reduction& reduction, const MatrixXd& P, const VectorXd& alp
         H.col(j).segment(first, n) += s.cwiseProduct(rows.lazyProduct(z));
         s = s.cwiseProduct(k.col(j).segment(first, n));
         const VectorXd projected = rows.transpose() * s;
-        signal_gradient += projected.cwiseProduct(z);
+        column_gradient += projected.cwiseProduct(z);
         if (V != nullptr) {
           V->middleRows(row, n).noalias() += 0.5 * s * z.transpose();
           V->row(column) += 0.5 * projected.transpose();
@@ -121,6 +129,39 @@ void contract(const Reduction& reduction, const MatrixXd& P, const VectorXd& alp
   for (Index j = 0; j < n_samples; ++j) {
     H.col(j).tail(n_samples - j - 1) += H.row(j).tail(n_samples - j - 1).transpose();
   }
+}
+
+// The same for a latent whose Z_i is the same at every sample, Z (components × functions): a sum over pairs of samples is then
+// one number per pair of components. Returns Σ_ij S_ij k_ij, so that ∂NLL/∂C = DᵀGD C where Z = D C (components × components).
+MatrixXd contract_alike(const Reduction& reduction, const MatrixXd& P, const VectorXd& alpha, const MatrixXd& k,
+                        const MatrixXd& Z, MatrixXd& H, VectorXd& S) {
+  const Index n_samples = static_cast<Index>(reduction.samples.size());
+  if (H.rows() != n_samples) H.resize(n_samples, n_samples);
+  H.setZero();
+  const MatrixXd products = Z * Z.transpose();
+  MatrixXd G = MatrixXd::Zero(Z.rows(), Z.rows());
+  for (Index cj = 0; cj < Z.rows(); ++cj) {
+    for (Index ci = cj; ci < Z.rows(); ++ci) {
+      for (Index j = 0; j < n_samples; ++j) {
+        const Index column = cj * n_samples + j;
+        const Index first = ci == cj ? j : 0;
+        const Index n = n_samples - first;
+        auto s = S.head(n);
+        // each stored entry off the diagonal stands for two
+        s = 2 * (P.col(column).segment(ci * n_samples + first, n) - alpha[column] * alpha.segment(ci * n_samples + first, n));
+        if (ci == cj) s[0] *= 0.5;
+        H.col(j).segment(first, n) += products(ci, cj) * s;
+        G(ci, cj) += s.dot(k.col(j).segment(first, n));
+      }
+      if (ci == cj) continue;
+      G(ci, cj) *= 0.5;
+      G(cj, ci) = G(ci, cj);
+    }
+  }
+  for (Index j = 0; j < n_samples; ++j) {
+    H.col(j).tail(n_samples - j - 1) += H.row(j).tail(n_samples - j - 1).transpose();
+  }
+  return G;
 }
 
 // What θ and the noise change at sample i: ∂NLL/∂e, ∂NLL/∂W and ∂NLL/∂E there, and the chain rule on to σ and θ.
@@ -147,7 +188,7 @@ void add_sample_gradient(const Likelihood::Options& options, const std::vector<O
   VectorXd mean = VectorXd::Zero(sample.R.cols());
   std::vector<MatrixXd> V(all_V.size());
   for (std::size_t a = 0; a < all_V.size(); ++a) {
-    const MatrixXd E = model.values.prior.E(a, sample.index) * values.signal_stddev[a].asDiagonal();
+    const MatrixXd E = model.values.prior.E(a, sample.index) * values.loading(a);
     V[a] = rows_of(all_V[a]);
     V_E += V[a] * E.transpose();
     mean += E * latent_mean[a].row(i).transpose();
@@ -167,7 +208,7 @@ void add_sample_gradient(const Likelihood::Options& options, const std::vector<O
                                                 model.values.view.G(sample.index) * d.prior.mean.col(sample.index));
     double slope = d_e.dot(de) + d_W.cwiseProduct(whitening.asDiagonal() * dG).sum();
     for (std::size_t a = 0; a < all_V.size(); ++a) {
-      const MatrixXd dE = d.prior.E(a, sample.index) * values.signal_stddev[a].asDiagonal();
+      const MatrixXd dE = d.prior.E(a, sample.index) * values.loading(a);
       slope += (sample.R.transpose() * V[a]).cwiseProduct(dE).sum();
     }
     gradient.parameters[options.gradient_parameters[p]] += slope;
@@ -194,14 +235,14 @@ double Likelihood::evaluate(const ModelValues& values, ModelValues* gradient, Wo
   std::vector<MatrixXd> own_features;
   if (!self.fixed_reduction) {
     own_reduction = reduce(self.prior, self.observations, models, values.noise_stddev);
-    own_features = sorted_features(self.features, *own_reduction);
+    own_features = sorted_features(self.prior, self.features, *own_reduction);
   }
   const Reduction& reduction = own_reduction ? *own_reduction : *self.fixed_reduction;
   const std::vector<MatrixXd>& features = own_reduction ? own_features : self.fixed_features;
 
   // K̃ + I = L Lᵀ
   work.Z.resize(n_latents);
-  for (std::size_t a = 0; a < n_latents; ++a) work.Z[a] = reduction.directions[a] * values.signal_stddev[a].asDiagonal();
+  for (std::size_t a = 0; a < n_latents; ++a) work.Z[a] = reduction.directions[a] * values.loading(a);
   assemble(self.prior, reduction, features, work.Z, values.kernel, work.K, work.k);
   if (!lapack::factorise(work.K)) return infinity;
 
@@ -220,8 +261,23 @@ double Likelihood::evaluate(const ModelValues& values, ModelValues* gradient, Wo
   work.V.resize(n_latents);
   const Index n_samples = static_cast<Index>(reduction.samples.size());
   for (std::size_t a = 0; a < n_latents; ++a) {
-    contract(reduction, work.K, work.alpha, work.k[a], work.Z[a], work.H, gradient->signal_stddev[a],
-             needs_V ? &work.V[a] : nullptr, work.S);
+    const bool learned = values.is_learned(a);
+    if (reduction.learned_alike[a] && !needs_V) {
+      // the first row of each component
+      const auto rows = Eigen::seqN(0, reduction.n_components(), n_samples);
+      const MatrixXd D = reduction.directions[a](rows, Eigen::all);
+      const MatrixXd G = contract_alike(reduction, work.K, work.alpha, work.k[a], D * values.loading(a), work.H, work.S);
+      gradient->mixing[a] = D.transpose() * G * D * values.loading(a);
+    } else {
+      contract(reduction, work.K, work.alpha, work.k[a], work.Z[a], work.H, work.column_gradient,
+               needs_V || learned ? &work.V[a] : nullptr, work.S);
+      if (learned) {
+        gradient->mixing[a].noalias() = reduction.directions[a].transpose() * work.V[a];
+      } else {
+        gradient->signal_stddev[a] = work.column_gradient;
+      }
+    }
+    if (self.prior.latents[a].kernel_is_fixed || values.kernel[a].size() == 0) continue;
     for (Index j = 0; j < n_samples; ++j) {
       self.prior.latents[a].kernel.add_gradient(features[a].bottomRows(n_samples - j), features[a].row(j).transpose(),
                                                 values.kernel[a], work.H.col(j).tail(n_samples - j), gradient->kernel[a],

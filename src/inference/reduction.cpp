@@ -12,21 +12,46 @@ using Eigen::Index;
 using Eigen::MatrixXd;
 using Eigen::VectorXd;
 
+namespace {
+
+// which parameter of the viewed system the one at home is, −1: none
+int index_there(const View& view, int parameter) {
+  if (!view.setting) return parameter;
+  const std::vector<int>& shared = view.setting->shared;
+  const auto found = std::find(shared.begin(), shared.end(), parameter);
+  return found == shared.end() ? -1 : static_cast<int>(found - shared.begin());
+}
+
+ObservationModel::Values zero_like(ObservationModel::Values values) {
+  values.view.matrix.setZero();
+  values.view.offset.setZero();
+  values.prior.mean.setZero();
+  for (MatrixXd& E : values.prior.directions) E.setZero();
+  return values;
+}
+
+}  // namespace
+
 std::optional<std::vector<ObservationModel>> model_observations(const Prior& prior, const std::vector<Observations>& observations,
                                                                 const VectorXd& parameters,
                                                                 const std::vector<int>& gradient_parameters) {
   std::vector<ObservationModel> models;
   for (const Observations& group : observations) {
-    const MechanicsBatch mechanics = evaluate_mechanics(*prior.system, group.states, parameters);
+    const Prior& there = prior_of(prior, group.view);
+    const VectorXd theta = parameters_of(group.view, parameters);
+    const MechanicsBatch mechanics = evaluate_mechanics(*there.system, group.states, theta);
     if (mechanics.fault) return std::nullopt;
     ObservationModel& model = models.emplace_back();
-    model.values = {evaluate_view(group.view, mechanics, group.states),
-                    evaluate_prior(prior, group.states, parameters, mechanics)};
+    model.values = {evaluate_view(group.view, mechanics, group.states), evaluate_prior(there, group.states, theta, mechanics)};
     for (int parameter : gradient_parameters) {
-      const SystemValues d = prior.system->differentiate(group.states, parameters, parameter);
-      model.derivatives.push_back(
-          {differentiate_view(group.view, mechanics, d),
-           differentiate_prior(prior, group.states, parameters, mechanics, model.values.prior, d, parameter)});
+      const int index = index_there(group.view, parameter);
+      if (index < 0) {
+        model.derivatives.push_back(zero_like(model.values));
+        continue;
+      }
+      const SystemValues d = there.system->differentiate(group.states, theta, index);
+      model.derivatives.push_back({differentiate_view(group.view, mechanics, d),
+                                   differentiate_prior(there, group.states, theta, mechanics, model.values.prior, d, index)});
     }
     if (group.view.latent >= 0) {
       model.values.prior.keep_only(static_cast<std::size_t>(group.view.latent));
@@ -90,6 +115,14 @@ Reduction reduce(const Prior& prior, const std::vector<Observations>& observatio
       }
     }
   }
+  for (std::size_t a = 0; a < prior.latents.size(); ++a) {
+    bool alike = prior.latents[a].learned_rank.has_value();
+    for (std::size_t c = 0; alike && c < reduction.count.size(); ++c) {
+      const auto block = reduction.directions[a].middleRows(reduction.offset[c], reduction.count[c]);
+      alike = reduction.count[c] == reduction.count.front() && (block.rowwise() - block.row(0)).isZero(0);
+    }
+    reduction.learned_alike.push_back(alike);
+  }
   return reduction;
 }
 
@@ -97,7 +130,9 @@ std::vector<std::vector<MatrixXd>> features_by_group(const Prior& prior, const s
   std::vector<std::vector<MatrixXd>> features;
   for (const Observations& group : observations) {
     std::vector<MatrixXd>& of_group = features.emplace_back();
-    for (const Latent& latent : prior.latents) of_group.push_back(evaluate_features(latent, group.states));
+    for (const Latent& latent : prior_of(prior, group.view).latents) {
+      of_group.push_back(evaluate_features(latent, group.states));
+    }
   }
   return features;
 }
@@ -112,11 +147,11 @@ MatrixXd latent_weights(const Reduction& reduction, const MatrixXd& Z, const Vec
   return beta;
 }
 
-std::vector<MatrixXd> sorted_features(const std::vector<std::vector<MatrixXd>>& features_by_group, const Reduction& reduction) {
+std::vector<MatrixXd> sorted_features(const Prior& prior, const std::vector<std::vector<MatrixXd>>& features_by_group,
+                                      const Reduction& reduction) {
   std::vector<MatrixXd> sorted;
-  const std::size_t n_latents = features_by_group.empty() ? 0 : features_by_group.front().size();
-  for (std::size_t a = 0; a < n_latents; ++a) {
-    MatrixXd& features = sorted.emplace_back(static_cast<Index>(reduction.samples.size()), features_by_group.front()[a].cols());
+  for (std::size_t a = 0; a < prior.latents.size(); ++a) {
+    MatrixXd& features = sorted.emplace_back(static_cast<Index>(reduction.samples.size()), prior.latents[a].n_features());
     for (Index k = 0; k < features.rows(); ++k) {
       const Reduction::Sample& sample = reduction.samples[static_cast<std::size_t>(k)];
       features.row(k) = features_by_group[static_cast<std::size_t>(sample.group)][a].row(sample.index);
@@ -152,11 +187,21 @@ void assemble(const Prior& prior, const Reduction& reduction, const std::vector<
         const Index row = reduction.offset[static_cast<std::size_t>(ci)] + first;
         auto out = K.col(column).segment(row, n);
         for (std::size_t a = 0; a < prior.latents.size(); ++a) {
+          const auto k_column = k[a].col(j).segment(first, n);
+          if (reduction.learned_alike[a]) {
+            const double product = Z[a].row(row).dot(Z[a].row(column));
+            if (a == 0) {
+              out = product * k_column;
+            } else {
+              out += product * k_column;
+            }
+            continue;
+          }
           const auto products = Z[a].middleRows(row, n).lazyProduct(Z[a].row(column).transpose());
           if (a == 0) {
-            out = k[a].col(j).segment(first, n).cwiseProduct(products);
+            out = k_column.cwiseProduct(products);
           } else {
-            out += k[a].col(j).segment(first, n).cwiseProduct(products);
+            out += k_column.cwiseProduct(products);
           }
         }
       }

@@ -37,7 +37,8 @@ struct Reduction {
   std::vector<Sample> samples;              // sorted
   std::vector<Eigen::Index> count, offset;  // per component; offset has one more entry, the reduced size
   Eigen::VectorXd y;                        // ỹ
-  std::vector<Eigen::MatrixXd> directions;  // per latent: rows R_i E_a(x_i), without s  (size × p_a)
+  std::vector<Eigen::MatrixXd> directions;  // per latent: rows R_i E_a(x_i), without C  (size × p_a)
+  std::vector<bool> learned_alike;          // per latent: C is learned, and R_i E_a(x_i) is the same at every sample
   double constant = 0;                      // ½ Σ‖(I − QQᵀ)e‖² + ½ Σ log|S| + ½ Σ dim y log 2π
 
   [[nodiscard]] Eigen::Index size() const { return offset.back(); }
@@ -51,15 +52,16 @@ Reduction reduce(const Prior& prior, const std::vector<Observations>& observatio
 std::vector<std::vector<Eigen::MatrixXd>> features_by_group(const Prior& prior, const std::vector<Observations>& observations);
 
 /// φ_a of every sample, in the order of the reduction (N × D_a).
-std::vector<Eigen::MatrixXd> sorted_features(const std::vector<std::vector<Eigen::MatrixXd>>& features_by_group,
+std::vector<Eigen::MatrixXd> sorted_features(const Prior& prior,
+                                             const std::vector<std::vector<Eigen::MatrixXd>>& features_by_group,
                                              const Reduction& reduction);
 
-/// β_j = Z_jᵀ α̃_j, one row per sample (N × p_a).
+/// β_j = Z_jᵀ α̃_j, one row per sample (N × functions of a).
 Eigen::MatrixXd latent_weights(const Reduction& reduction, const Eigen::MatrixXd& Z, const Eigen::VectorXd& alpha);
 
 /// K̃ + I in the lower triangle, and k_a between all samples (N × N).
 ///
-/// @param Z       per latent: rows R_i E_a(x_i) diag(s_a)
+/// @param Z       per latent: rows R_i E_a(x_i) C_a
 /// @param kernel  per latent: the kernel's parameters
 void assemble(const Prior& prior, const Reduction& reduction, const std::vector<Eigen::MatrixXd>& features,
               const std::vector<Eigen::MatrixXd>& Z, const std::vector<Eigen::VectorXd>& kernel, Eigen::MatrixXd& K,

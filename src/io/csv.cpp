@@ -124,6 +124,14 @@ CsvTable CsvTable::parse(std::string_view text, std::string name) {
   return table;
 }
 
+CsvTable CsvTable::first_rows(int n) const {
+  CsvTable table = *this;
+  const auto rows = static_cast<std::size_t>(std::clamp(n, 0, n_rows()));
+  table.cells_.resize(rows * header_.size());
+  table.lines_.resize(rows);
+  return table;
+}
+
 int CsvTable::find(std::string_view column) const {
   for (std::size_t k = 0; k < header_.size(); ++k) {
     if (header_[k] == column) return static_cast<int>(k);

@@ -31,11 +31,13 @@ constexpr const char* format_name = "gp2 fit";
 template <class Choice>
 using Named = std::pair<Choice, const char*>;
 
-constexpr std::array<Named<Kind>, 5> kinds = {{{Kind::kernel, "kernel"},
+constexpr std::array<Named<Kind>, 7> kinds = {{{Kind::kernel, "kernel"},
                                                {Kind::signal_stddev, "signal_stddev"},
                                                {Kind::shared_signal_stddev, "shared_signal_stddev"},
                                                {Kind::noise_stddev, "noise_stddev"},
-                                               {Kind::parameter, "parameter"}}};
+                                               {Kind::parameter, "parameter"},
+                                               {Kind::mixing, "mixing"},
+                                               {Kind::sqrt_kappa, "sqrt_kappa"}}};
 constexpr std::array<Named<Prior::Mean>, 2> means = {{{Prior::Mean::zero, "zero"}, {Prior::Mean::force, "force"}}};
 constexpr std::array<Named<std::optional<Latent::Base>>, 3> directions = {
     {{std::nullopt, "model"}, {Latent::Base::acceleration, "acceleration"}, {Latent::Base::force, "force"}}};
@@ -152,7 +154,8 @@ Hyperparameter hyperparameter_from(const Json& json) {
     h.median = number(json.at("hyperprior").at("median"));
     h.log_stddev = number(json.at("hyperprior").at("log_stddev"));
   }
-  if ((h.is_positive() && !(h.value > 0)) || !(h.scale.array() > 0).all()) {
+  const bool needs_scale = h.kind == Kind::mixing || h.kind == Kind::sqrt_kappa;
+  if ((h.is_positive() && !(h.value > 0)) || !(h.scale.array() > 0).all() || (needs_scale && h.scale.size() != 1)) {
     throw InputError(fmt::format("hyperparameter '{}' has the impossible value {}", h.name, h.value));
   }
   return h;
@@ -167,8 +170,14 @@ void check_hyperparameters(const std::vector<Hyperparameter>& hyperparameters, c
     for (std::size_t k = 0; k < size; ++k) set.emplace(kind, static_cast<int>(owner), static_cast<int>(k));
   };
   for (std::size_t a = 0; a < prior.latents.size(); ++a) {
-    add(open, Kind::kernel, a, prior.latents[a].kernel.parameters().size());
-    add(open, Kind::signal_stddev, a, prior.latents[a].column_names.size());
+    const Latent& latent = prior.latents[a];
+    if (!latent.kernel_is_fixed) add(open, Kind::kernel, a, latent.kernel.parameters().size());
+    if (latent.learned_rank) {
+      add(open, Kind::mixing, a, latent.column_names.size() * static_cast<std::size_t>(*latent.learned_rank));
+      add(open, Kind::sqrt_kappa, a, latent.column_names.size());
+    } else {
+      add(open, Kind::signal_stddev, a, latent.column_names.size());
+    }
   }
   for (std::size_t group = 0; group < observations.size(); ++group) {
     add(optional, Kind::noise_stddev, group, observations[group].view.rows.size());
@@ -195,21 +204,48 @@ void check_hyperparameters(const std::vector<Hyperparameter>& hyperparameters, c
   }
 }
 
-Json observations_json(const Observations& group, const System& system) {
-  return {{"view", View::word(group.view.quantity)},
-          {"rows", group.view.rows},
-          {"time_step", group.view.time_step},
-          {"latent", group.view.latent},
-          {"n", group.n_data()},
-          {"noise_stddev", vector_json(group.noise_stddev)},
-          {"estimate_noise", group.estimate_noise},
-          {"states", rows_json(group.states, system.state_names())},
-          {"values", rows_json(group.values, group.view.names(system))}};
+Json model_json(const ModelFile& model) { return {{"name", model.name}, {"text", model.text}}; }
+
+ModelFile model_from(const Json& json) { return ModelFile::parse(json.at("text"), json.at("name")); }
+
+/// @param other  the model file of its view's setting; null: none
+Json baseline_json(const Baseline& baseline) {
+  return {{"kind", Baseline::word(baseline.kind)},
+          {"output_mean", vector_json(baseline.output_mean)},
+          {"feature_mean", vector_json(baseline.feature_mean)},
+          {"feature_stddev", vector_json(baseline.feature_stddev)}};
 }
 
-Observations observations_from(const Json& json, const Prior& prior) {
-  const System& system = *prior.system;
+Baseline baseline_from(const Json& json) {
+  const auto word = json.at("kind").get<std::string>();
+  const std::optional<Baseline::Kind> kind = Baseline::kind_of(word);
+  if (!kind) throw InputError(fmt::format("'{}' is no baseline; there is: {}", word, fmt::join(Baseline::words(), ", ")));
+  Baseline baseline{*kind, vector_from(json.at("output_mean")), vector_from(json.at("feature_mean")),
+                    vector_from(json.at("feature_stddev"))};
+  if (!(baseline.feature_stddev.array() > 0).all()) throw InputError("feature_stddev of a baseline must be positive");
+  return baseline;
+}
+
+Json observations_json(const Observations& group, const Prior& home, const ModelFile* other) {
+  const System& system = *prior_of(home, group.view).system;
+  Json json = {{"view", View::word(group.view.quantity)},
+               {"rows", group.view.rows},
+               {"time_step", group.view.time_step},
+               {"latent", group.view.latent},
+               {"n", group.n_data()},
+               {"noise_stddev", vector_json(group.noise_stddev)},
+               {"estimate_noise", group.estimate_noise},
+               {"states", rows_json(group.states, system.state_names())},
+               {"values", rows_json(group.values, group.view.names(system))}};
+  if (other != nullptr) json["system"] = model_json(*other);
+  return json;
+}
+
+Observations observations_from(const Json& json, const Prior& home, std::shared_ptr<const Setting> setting) {
   Observations group;
+  group.view.setting = std::move(setting);
+  const Prior& prior = prior_of(home, group.view);
+  const System& system = *prior.system;
   const auto word = json.at("view").get<std::string>();
   const std::optional<View::Quantity> quantity = View::quantity_of(word);
   if (!quantity) throw InputError(fmt::format("'{}' is no view", word));
@@ -279,12 +315,15 @@ Posterior FitFile::posterior() const {
 void FitFile::write(const std::filesystem::path& path) const {
   Json json;
   json["format"] = format_name;
-  json["version"] = format_version;
+  const bool at_home =
+      std::all_of(observations.begin(), observations.end(), [](const auto& group) { return !group.view.setting; });
+  json["version"] = at_home ? 1 : format_version;
   json["library"] = version();
-  json["model"] = {{"name", model.name}, {"text", model.text}};
+  json["model"] = model_json(model);
   json["prior"] = {{"mean", name_of(means, prior_options.mean)},
                    {"directions", name_of(directions, prior_options.base)},
                    {"raw_angles", prior_options.raw_angles}};
+  if (prior_options.baseline) json["prior"]["baseline"] = baseline_json(*prior_options.baseline);
   json["hyperparameters"] = Json::array();
   for (const Hyperparameter& h : report.hyperparameters) json["hyperparameters"].push_back(hyperparameter_json(h));
   json["report"] = {{"nll", report.negative_log_likelihood},
@@ -297,7 +336,14 @@ void FitFile::write(const std::filesystem::path& path) const {
   for (const RestartReport& restart : report.restarts) json["report"]["restarts"].push_back(restart_json(restart));
   json["data_source"] = data_source;
   json["observations"] = Json::array();
-  for (const Observations& group : observations) json["observations"].push_back(observations_json(group, *model.system));
+  const Prior home = prior();
+  for (std::size_t g = 0; g < observations.size(); ++g) {
+    const ModelFile* other = observations[g].view.setting && g < systems.size() ? systems[g].get() : nullptr;
+    if (observations[g].view.setting && other == nullptr) {
+      throw InputError(fmt::format("{}: the model file of the system of observations {} is not given", path.string(), g + 1));
+    }
+    json["observations"].push_back(observations_json(observations[g], home, other));
+  }
   // a path in `data_source` may hold bytes that are no text
   write_file(path, json.dump(1, ' ', false, Json::error_handler_t::replace) + "\n");
 }
@@ -315,14 +361,23 @@ FitFile FitFile::read(const std::filesystem::path& path) {
                                    format_version));
     }
     if (file_version < 1) throw InputError(fmt::format("format {} does not exist", file_version));
-    fit.model = ModelFile::parse(json.at("model").at("text"), json.at("model").at("name"));
+    fit.model = model_from(json.at("model"));
     const Json& prior_json = json.at("prior");
     fit.prior_options.mean = choice_from(prior_json.at("mean"), means, "prior mean");
     fit.prior_options.base = choice_from(prior_json.at("directions"), directions, "choice of directions");
     prior_json.at("raw_angles").get_to(fit.prior_options.raw_angles);
+    if (prior_json.contains("baseline")) fit.prior_options.baseline = baseline_from(prior_json.at("baseline"));
     json.at("data_source").get_to(fit.data_source);
     const Prior prior = fit.prior();
-    for (const Json& group : array(json.at("observations"))) fit.observations.push_back(observations_from(group, prior));
+    for (const Json& group : array(json.at("observations"))) {
+      std::shared_ptr<const Setting> setting;
+      std::shared_ptr<const ModelFile>& system = fit.systems.emplace_back();
+      if (group.contains("system")) {
+        system = std::make_shared<const ModelFile>(model_from(group.at("system")));
+        setting = make_setting(fit.model, *system, fit.prior_options);
+      }
+      fit.observations.push_back(observations_from(group, prior, std::move(setting)));
+    }
     if (fit.observations.empty()) throw InputError("no observations");
     for (const Json& h : array(json.at("hyperparameters"))) fit.report.hyperparameters.push_back(hyperparameter_from(h));
     check_hyperparameters(fit.report.hyperparameters, prior, fit.observations);

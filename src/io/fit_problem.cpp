@@ -11,7 +11,8 @@
 #include "gp2/check.hpp"
 #include "gp2/error.hpp"
 #include "gp2/mechanics.hpp"
-#include "training/random.hpp"
+#include "io/baseline_prior.hpp"
+#include "prior/random.hpp"
 
 namespace gp2 {
 
@@ -27,8 +28,9 @@ std::vector<std::string> all_accelerations(const System& system) {
   return names;
 }
 
-// A renaming that finds nothing is a slip of the pen: the model's [columns] may name columns that this log lacks, --map may not.
-void check_columns(const System& system, const CsvTable& log, const std::map<std::string, std::string>& columns) {
+// A renaming that finds nothing is a slip of the pen: the model's [columns] may name columns that these logs lack, --map may not.
+void check_columns(const System& system, const std::vector<const CsvTable*>& logs,
+                   const std::map<std::string, std::string>& columns) {
   std::vector<std::string> known = system.state_names();
   for (const std::string& name : all_accelerations(system)) known.push_back(name);
   for (const auto& [name, column] : columns) {
@@ -42,11 +44,18 @@ void check_columns(const System& system, const CsvTable& log, const std::map<std
     if (std::any_of(coordinates.begin(), coordinates.end(), [&name = name](const auto& one) { return one.name == name; })) {
       meant = {column, "d" + column, "dd" + column, column + "_dot", column + "_ddot"};
     }
-    if (std::none_of(meant.begin(), meant.end(), [&](const std::string& one) { return log.find(one) >= 0; })) {
-      throw InputError(fmt::format("--map {}={}: {} has no column '{}'; it has: {}", column, name, log.name(), column,
-                                   fmt::join(log.header(), ", ")));
+    std::vector<std::string> lacking;
+    for (const CsvTable* log : logs) {
+      if (std::any_of(meant.begin(), meant.end(), [&](const std::string& one) { return log->find(one) >= 0; })) break;
+      lacking.push_back(fmt::format("{} has no column '{}'; it has: {}", log->name(), column, fmt::join(log->header(), ", ")));
     }
+    if (lacking.size() == logs.size()) throw InputError(fmt::format("--map {}={}: {}", column, name, fmt::join(lacking, "; ")));
   }
+}
+
+std::map<std::string, std::string> columns_of(const ModelFile& model, std::map<std::string, std::string> columns) {
+  columns.insert(model.columns.begin(), model.columns.end());
+  return columns;
 }
 
 void note_reading(const LogReader& reader, const CsvTable& log, std::vector<std::string>& notes) {
@@ -55,21 +64,26 @@ void note_reading(const LogReader& reader, const CsvTable& log, std::vector<std:
   if (!unused.empty()) notes.push_back(fmt::format("{}: columns not needed: {}", log.name(), fmt::join(unused, ", ")));
 }
 
-void note_violation(const System& system, const MatrixXd& states, const CsvTable& log, std::vector<std::string>& notes) {
-  const auto violation = largest_violation(system, states, system.parameter_values());
+void note_violation(const System& system, const MatrixXd& states, const VectorXd& parameters, const CsvTable& log,
+                    std::vector<std::string>& notes) {
+  const auto violation = largest_violation(system, states, parameters);
   if (!violation || violation->relative <= constraint_violation_tolerance) return;
   notes.push_back(
       fmt::format("warning: {}: states are off the constraint: '{}' is {:.3g} at data row {}, {:.1e} of its scale; see gp2 check",
                   log.name(), violation->constraint, violation->value, violation->state + 1, violation->relative));
 }
 
-// columns a prior and a view need, and those that only tell whether a state is on the constraint
+// columns a prior and a view need, and those that only tell whether a state or a prediction is on the constraint
 MatrixXd states_of(const Prior& prior, const View& view, LogReader& reader) {
   std::vector<bool> reads = prior.reads();
   const std::vector<bool> of_view = view.reads(*prior.system);
-  const std::vector<bool> residuals = prior.system->reads(SystemPart::residuals);
+  std::vector<bool> judged = prior.judge().reads(SystemPart::residuals);
+  if (prior.constrained_system) {
+    const std::vector<bool> constraints = prior.constrained_system->reads(SystemPart::mechanics);
+    for (std::size_t k = 0; k < judged.size(); ++k) judged[k] = judged[k] || constraints[k];
+  }
   const std::vector<std::string> names = prior.system->state_names();
-  for (std::size_t k = 0; k < reads.size(); ++k) reads[k] = reads[k] || of_view[k] || (residuals[k] && reader.has(names[k]));
+  for (std::size_t k = 0; k < reads.size(); ++k) reads[k] = reads[k] || of_view[k] || (judged[k] && reader.has(names[k]));
   return reader.states(reads);
 }
 
@@ -83,15 +97,55 @@ std::vector<int> chosen_rows(int size, int n, std::uint64_t seed) {
   return rows;
 }
 
-// the likelihood would refuse these states too, but it does not know their rows in the log
-void require_mechanics_at(const System& system, const MatrixXd& states, const std::vector<int>& rows, const CsvTable& log) {
-  const MechanicsBatch mechanics = evaluate_mechanics(system, states, system.parameter_values());
-  if (!mechanics.fault) return;
-  throw InputError(fmt::format("{}: data row {}: {} ('{}' with the model's parameters; see gp2 check)", log.name(),
-                               rows[static_cast<std::size_t>(mechanics.fault->state)] + 1, mechanics.fault->text, system.name()));
+// The system that a log was taken on, as its observations see it.
+struct Place {
+  const ModelFile& model;
+  std::shared_ptr<const ModelFile> other;  // null: at home
+  std::shared_ptr<const Setting> setting;  // null: at home
+  const Prior& prior;
+  VectorXd parameters;
+
+  [[nodiscard]] const System& system() const { return *prior.system; }
+};
+
+Place place_of(const ModelFile& home, const Prior& prior, const PriorOptions& options, const Log& log) {
+  if (!log.model) return {home, nullptr, nullptr, prior, home.system->parameter_values()};
+  std::shared_ptr<const Setting> setting = make_setting(home, *log.model, options);
+  const Prior& there = setting->prior;
+  VectorXd parameters = setting->parameters(home.system->parameter_values());
+  return {*log.model, log.model, std::move(setting), there, std::move(parameters)};
 }
 
-// σ of each observed row; refused where ε‖K̃‖ ≪ 1 could not hold at signals of the data's size
+// the likelihood would refuse these states too, but it does not know their rows in the log
+void require_mechanics_at(const Place& place, const MatrixXd& states, const std::vector<int>& rows, const CsvTable& log) {
+  const MechanicsBatch mechanics = evaluate_mechanics(place.system(), states, place.parameters);
+  if (!mechanics.fault) return;
+  throw InputError(fmt::format("{}: data row {}: {} ('{}' with the model's parameters; see gp2 check)", log.name(),
+                               rows[static_cast<std::size_t>(mechanics.fault->state)] + 1, mechanics.fault->text,
+                               place.system().name()));
+}
+
+// σ of a row of a group; refused where ε‖K̃‖ ≪ 1 could not hold at a signal of the given size
+struct NoiseRule {
+  std::string source, name;  // where σ comes from; the row
+  double signal = 0;         // its size
+  int n_data = 0;
+
+  void require(double stddev, bool estimated) const {
+    if (!(stddev > 0) || !std::isfinite(stddev)) {
+      throw InputError(fmt::format("{}: the noise standard deviation of {} must be positive, got {}", source, name, stddev));
+    }
+    // ‖K̃‖ ≤ N (signal/noise)²; a hundredth of the digits must be left
+    const double smallest = signal * std::sqrt(static_cast<double>(n_data) * std::numeric_limits<double>::epsilon() / 0.01);
+    if (!estimated && stddev < smallest) {
+      throw InputError(
+          fmt::format("{}: the noise standard deviation {} of {} is too small for double precision beside a spread "
+                      "of {:.3g}; the smallest usable value is {:.2g}",
+                      source, stddev, name, signal, smallest));
+    }
+  }
+};
+
 VectorXd noise_of(const ModelFile& model, const FitProblemOptions& options, const Observations& group, bool estimate) {
   const VectorXd spread = row_stddev(group.values);
   const std::vector<std::string> names = group.view.names(*model.system);
@@ -112,20 +166,193 @@ VectorXd noise_of(const ModelFile& model, const FitProblemOptions& options, cons
                       "--noise-std estimate",
                       model.name, name));
     }
-    if (!(stddev[k] > 0) || !std::isfinite(stddev[k])) {
-      throw InputError(fmt::format("{}: the noise standard deviation of {} must be positive, got {}", source, name, stddev[k]));
-    }
-    // ‖K̃‖ ≤ N (signal/noise)²; a hundredth of the digits must be left
-    const double smallest =
-        spread[k] * std::sqrt(static_cast<double>(group.n_data()) * std::numeric_limits<double>::epsilon() / 0.01);
-    if (!estimate && stddev[k] < smallest) {
-      throw InputError(
-          fmt::format("{}: the noise standard deviation {} of {} is too small for double precision beside a spread "
-                      "of {:.3g}; the smallest usable value is {:.2g}",
-                      source, stddev[k], name, spread[k], smallest));
-    }
+    NoiseRule{source, name, spread[k], group.n_data()}.require(stddev[k], estimate);
   }
   return stddev;
+}
+
+// Size of G ā in each row of a view: the spread of the values or, for those that hardly vary, as exact zeros, what the prior
+// expects: its standard deviation, root mean square over the states, with the signals at their default scales.
+VectorXd signal_size(const Place& place, const Observations& group, const std::vector<VectorXd>& signal_stddev) {
+  const MechanicsBatch mechanics = require_mechanics(place.system(), group.states, place.parameters);
+  const ViewValues view = evaluate_view(group.view, mechanics, group.states);
+  PriorValues prior = evaluate_prior(place.prior, group.states, place.parameters, mechanics);
+  if (group.view.latent >= 0) prior.keep_only(static_cast<std::size_t>(group.view.latent));
+  VectorXd variance = VectorXd::Zero(group.view.size());
+  for (int i = 0; i < group.n_data(); ++i) {
+    for (std::size_t a = 0; a < signal_stddev.size(); ++a) {
+      variance += (view.G(i) * prior.E(a, i) * signal_stddev[a].asDiagonal()).rowwise().squaredNorm();
+    }
+  }
+  return (variance / group.n_data()).cwiseSqrt().cwiseMax(row_stddev(group.values - view.offset));
+}
+
+// accelerations measured
+Observations read_log(const Place& place, const Log& log, const FitProblemOptions& options, std::vector<std::string>& notes) {
+  const System& system = place.system();
+  LogReader reader(log.table, system, columns_of(place.model, options.columns));
+  Observations group;
+  group.view = {View::Quantity::constrained_acceleration, acceleration_rows(system, options.observe, "--observe"), 0, -1,
+                place.setting};
+  group.states = states_of(place.prior, group.view, reader);
+  const std::vector<std::string> observed = group.view.names(system);
+  const std::vector<std::string> every = all_accelerations(system);
+  const bool complete = std::all_of(every.begin(), every.end(), [&](const std::string& name) { return reader.has(name); });
+  group.values = reader.values(observed);
+  const MatrixXd all_values = complete && system.nc() > 0 ? reader.values(every) : MatrixXd();
+  note_reading(reader, log.table, notes);
+  note_violation(system, group.states, place.parameters, log.table, notes);
+  if (all_values.size() > 0) {
+    const auto independent = dependent_columns(system, group.states, place.parameters, all_values);
+    if (independent && observed.size() > independent->size()) {
+      std::vector<std::string> names;
+      for (int row : *independent) names.push_back(every[static_cast<std::size_t>(row)]);
+      notes.push_back(
+          fmt::format("warning: {}: the accelerations obey A ddq = b to rounding: they are not {} independent "
+                      "measurements but {}; observe independent rows only, say --observe {}",
+                      log.table.name(), every.size(), independent->size(), fmt::join(names, ",")));
+    }
+  }
+  const int n_rows = log.table.n_rows();
+  const std::vector<int> rows = chosen_rows(n_rows, options.max_points.value_or(n_rows), options.seed);
+  if (static_cast<int>(rows.size()) < n_rows) {
+    group.states = MatrixXd(group.states(Eigen::all, rows));
+    group.values = MatrixXd(group.values(Eigen::all, rows));
+    notes.push_back(fmt::format("{}: {} of {} rows taken, by seed {}", log.table.name(), rows.size(), n_rows, options.seed));
+  }
+  require_mechanics_at(place, group.states, rows, log.table);
+
+  const bool model_estimates = place.model.noise.estimate && !options.noise_stddev;
+  group.estimate_noise = options.protocol.name != Protocol::Name::paper && (options.estimate_noise || model_estimates);
+  group.noise_stddev = noise_of(place.model, options, group, group.estimate_noise);
+  return group;
+}
+
+int latent_of(const Prior& prior, const std::string& name, const std::string& option) {
+  std::vector<std::string> names;
+  for (const Latent& latent : prior.latents) names.push_back(latent.name);
+  const auto found = std::find(names.begin(), names.end(), name);
+  if (found == names.end()) {
+    throw InputError(fmt::format("{}: no latent is called '{}'; there is: {}", option, name, fmt::join(names, ", ")));
+  }
+  return static_cast<int>(found - names.begin());
+}
+
+// what else is measured or known, its noise not yet
+Observations read_knowledge(const Place& place, const Prior& home, const Knowledge& knowledge, const FitProblemOptions& options,
+                            std::vector<std::string>& notes) {
+  const System& system = place.system();
+  const CsvTable& table = knowledge.log.table;
+  const std::string option = "--also " + View::word(knowledge.quantity);
+  Observations group;
+  group.view = View::all(knowledge.quantity, system);
+  group.view.setting = place.setting;
+  if (!knowledge.latent.empty()) group.view.latent = latent_of(home, knowledge.latent, option);
+  if (knowledge.quantity == View::Quantity::next_velocity) {
+    if (!options.time_step) throw InputError(option + " needs the time step: --dt SECONDS");
+    if (!(*options.time_step > 0)) throw InputError(fmt::format("--dt: must be positive, got {}", *options.time_step));
+    group.view.time_step = *options.time_step;
+  }
+
+  // the rows whose columns are there
+  LogReader reader(table, system, columns_of(place.model, options.columns));
+  const std::vector<std::string> every = group.view.names(system, knowledge.latent);
+  std::vector<std::string> names;
+  std::vector<int> rows;
+  for (std::size_t k = 0; k < every.size(); ++k) {
+    if (!reader.has(every[k])) continue;
+    names.push_back(every[k]);
+    rows.push_back(group.view.rows[k]);
+  }
+  if (every.empty()) throw InputError(fmt::format("{}: '{}' has no constraints", option, system.name()));
+  if (rows.empty()) {
+    throw InputError(fmt::format("{}: {} has none of the columns {}; it has: {}", option, table.name(), fmt::join(every, ", "),
+                                 fmt::join(table.header(), ", ")));
+  }
+  group.view.rows = std::move(rows);
+  group.values = reader.values(names);
+  group.states = states_of(place.prior, group.view, reader);
+  note_reading(reader, table, notes);
+  note_violation(system, group.states, place.parameters, table, notes);
+  require_mechanics_at(place, group.states, chosen_rows(table.n_rows(), table.n_rows(), 0), table);
+  return group;
+}
+
+VectorXd noise_of_knowledge(const Place& place, const Knowledge& knowledge, const FitProblemOptions& options,
+                            const Observations& group, const std::vector<VectorXd>& signal_stddev) {
+  using Quantity = View::Quantity;
+  const bool is_acceleration =
+      knowledge.quantity == Quantity::constrained_acceleration || knowledge.quantity == Quantity::unconstrained_acceleration;
+  const std::vector<double>& of_model = place.model.noise.stddev;
+  if (!options.also_noise_stddev && (!is_acceleration || of_model.empty())) {
+    throw InputError(fmt::format("--also {}: {}: its noise is not known: give --also-noise-std S", View::word(knowledge.quantity),
+                                 knowledge.log.table.name()));
+  }
+  const std::string source = options.also_noise_stddev ? "--also-noise-std" : place.model.name + ": [noise] ddq";
+  const std::vector<std::string> names = group.view.names(place.system(), knowledge.latent);
+  const VectorXd signal = signal_size(place, group, signal_stddev);
+  VectorXd stddev(group.view.size());
+  for (Index k = 0; k < stddev.size(); ++k) {
+    const auto row = static_cast<std::size_t>(k);
+    stddev[k] = options.also_noise_stddev ? *options.also_noise_stddev : of_model[static_cast<std::size_t>(group.view.rows[row])];
+    NoiseRule{source, names[row], signal[k], group.n_data()}.require(stddev[k], false);
+  }
+  return stddev;
+}
+
+// what a baseline cannot have
+void require_baseline_options(const FitProblemOptions& options, const std::vector<Log>& logs,
+                              const std::vector<Knowledge>& also) {
+  const auto refuse = [&](bool asked, const char* rule, const char* option) {
+    if (asked) throw InputError(fmt::format("--baseline {} {}: leave out {}", Baseline::word(*options.baseline), rule, option));
+  };
+  refuse(options.mean != Prior::Mean::zero, "has the mean of the training data as prior mean", "--mean");
+  refuse(options.base.has_value(), "has its prior on ddq", "--prior");
+  refuse(options.estimate && !options.estimate->empty(), "knows no parameters of the system", "--estimate");
+  refuse(!options.observe.empty(), "learns every acceleration", "--observe");
+  refuse(options.estimate_noise, "has fixed noise", "--noise-std estimate");
+  refuse(!also.empty() || options.time_step || options.also_noise_stddev, "knows ddq only", "--also");
+  const bool elsewhere = std::any_of(logs.begin(), logs.end(), [](const Log& log) { return log.model != nullptr; });
+  refuse(elsewhere, "knows no system", "@OTHER.toml");
+}
+
+// the same under every protocol
+FitProblem make_baseline_problem(const ModelFile& model, const std::vector<Log>& logs, FitProblemOptions options) {
+  options.protocol.name = Protocol::Name::paper;  // fixed noise
+  FitProblem problem;
+  problem.prior_options.raw_angles = true;
+  problem.prior_options.baseline = unstandardised(model, *options.baseline);
+  problem.prior = make_prior(model, problem.prior_options);
+  for (const Log& log : logs) {
+    const Place place = place_of(model, problem.prior, problem.prior_options, log);
+    problem.observations.push_back(read_log(place, log, options, problem.notes));
+    problem.systems.push_back(nullptr);
+  }
+  problem.prior_options.baseline = standardised_by(problem.observations, problem.prior.latents.front(), *options.baseline);
+  problem.prior = make_prior(model, problem.prior_options);
+  problem.hyperparameters = baseline_hyperparameters(problem.prior, problem.observations);
+  return problem;
+}
+
+// which parameters the systems have in common is decided by other files: worth a word
+void note_parameters(const ModelFile& home, const Place& place, const std::vector<std::string>& estimated,
+                     std::vector<std::string>& notes) {
+  if (!place.setting) return;
+  const std::vector<Parameter>& parameters = place.system().parameters();
+  for (std::size_t k = 0; k < parameters.size(); ++k) {
+    const std::string& name = parameters[k].name;
+    if (parameters[k].estimate && place.setting->shared[k] < 0) {
+      notes.push_back(fmt::format("{}: parameter '{}' is marked estimate = true, but '{}' has none of that name: it stays {}",
+                                  place.model.name, name, home.name, parameters[k].value));
+    }
+    const bool tuned = std::find(estimated.begin(), estimated.end(), name) != estimated.end();
+    if (tuned && place.setting->shared[k] < 0) {
+      notes.push_back(
+          fmt::format("{}: parameter '{}' stays {} there while it is estimated in '{}'; mark it estimate = true "
+                      "there if it is one and the same",
+                      place.model.name, name, parameters[k].value, home.name));
+    }
+  }
 }
 
 }  // namespace
@@ -148,10 +375,8 @@ std::vector<int> acceleration_rows(const System& system, const std::vector<std::
 }
 
 LogReader open_log(const ModelFile& model, const CsvTable& log, const std::map<std::string, std::string>& columns) {
-  check_columns(*model.system, log, columns);
-  std::map<std::string, std::string> all = columns;
-  all.insert(model.columns.begin(), model.columns.end());
-  return {log, *model.system, all};
+  check_columns(*model.system, {&log}, columns);
+  return {log, *model.system, columns_of(model, columns)};
 }
 
 LogStates read_log_states(const Prior& prior, const View& view, const ModelFile& model, const CsvTable& log,
@@ -159,67 +384,73 @@ LogStates read_log_states(const Prior& prior, const View& view, const ModelFile&
   LogReader reader = open_log(model, log, columns);
   LogStates out{states_of(prior, view, reader), reader.values(accelerations), {}};
   note_reading(reader, log, out.notes);
-  note_violation(*prior.system, out.states, log, out.notes);
+  note_violation(*prior.system, out.states, prior.system->parameter_values(), log, out.notes);
   return out;
 }
 
-FitProblem make_fit_problem(const ModelFile& model, const CsvTable& log, const FitProblemOptions& options) {
+FitProblem make_fit_problem(const ModelFile& model, const std::vector<Log>& logs, const std::vector<Knowledge>& also,
+                            const FitProblemOptions& options) {
+  if (options.baseline) {
+    require_baseline_options(options, logs, also);
+    std::vector<const CsvTable*> tables;
+    for (const Log& log : logs) tables.push_back(&log.table);
+    check_columns(*model.system, tables, options.columns);
+    return make_baseline_problem(model, logs, options);
+  }
   const bool paper = options.protocol.name == Protocol::Name::paper;
   if (paper && options.estimate_noise) throw InputError("--protocol paper has fixed noise: leave out --noise-std estimate");
   if (paper && options.base == Latent::Base::force) {
     throw InputError("--protocol paper has its prior on the acceleration: leave out --prior force");
   }
   FitProblem problem;
-  problem.prior_options = {options.mean, paper ? std::optional(Latent::Base::acceleration) : options.base, paper};
+  problem.prior_options.mean = options.mean;
+  problem.prior_options.base = paper ? std::optional(Latent::Base::acceleration) : options.base;
+  problem.prior_options.raw_angles = paper;
   problem.prior = make_prior(model, problem.prior_options);
-  const System& system = *model.system;
+  std::vector<const CsvTable*> tables;
+  for (const Log& log : logs) tables.push_back(&log.table);
+  for (const Knowledge& knowledge : also) tables.push_back(&knowledge.log.table);
+  check_columns(*model.system, tables, options.columns);
 
-  // the log
-  LogReader reader = open_log(model, log, options.columns);
-  Observations group;
-  group.view = {View::Quantity::constrained_acceleration, acceleration_rows(system, options.observe, "--observe"), 0, -1};
-  group.states = states_of(problem.prior, group.view, reader);
-  const std::vector<std::string> observed = group.view.names(system);
-  const std::vector<std::string> every = all_accelerations(system);
-  const bool complete = std::all_of(every.begin(), every.end(), [&](const std::string& name) { return reader.has(name); });
-  group.values = reader.values(observed);
-  MatrixXd all_values = complete && system.nc() > 0 ? reader.values(every) : MatrixXd();
-  note_reading(reader, log, problem.notes);
-  note_violation(system, group.states, log, problem.notes);
-  if (all_values.size() > 0) {
-    const auto independent = dependent_columns(system, group.states, system.parameter_values(), all_values);
-    if (independent && observed.size() > independent->size()) {
-      std::vector<std::string> names;
-      for (int row : *independent) names.push_back(every[static_cast<std::size_t>(row)]);
-      problem.notes.push_back(
-          fmt::format("warning: {}: the accelerations obey A ddq = b to rounding: they are not {} independent "
-                      "measurements but {}; observe independent rows only, say --observe {}",
-                      log.name(), every.size(), independent->size(), fmt::join(names, ",")));
-    }
-  }
-  const std::vector<int> rows = chosen_rows(log.n_rows(), options.max_points.value_or(log.n_rows()), options.seed);
-  if (static_cast<int>(rows.size()) < log.n_rows()) {
-    group.states = MatrixXd(group.states(Eigen::all, rows));
-    group.values = MatrixXd(group.values(Eigen::all, rows));
-    problem.notes.push_back(fmt::format("{} of {} rows taken, by seed {}", rows.size(), log.n_rows(), options.seed));
-  }
-  require_mechanics_at(system, group.states, rows, log);
-
-  // noise, and what is tuned
-  const bool model_estimates = model.noise.estimate && !options.noise_stddev;
-  group.estimate_noise = !paper && (options.estimate_noise || model_estimates);
-  group.noise_stddev = noise_of(model, options, group, group.estimate_noise);
-  problem.observations.push_back(std::move(group));
+  // what is tuned
   std::vector<std::string> estimate;
   if (options.estimate) {
     estimate = *options.estimate;
   } else {
-    for (const Parameter& parameter : system.parameters()) {
+    for (const Parameter& parameter : model.system->parameters()) {
       if (parameter.estimate) estimate.push_back(parameter.name);
+    }
+  }
+
+  // what is measured
+  const auto place_at = [&](const Log& log) {
+    Place place = place_of(model, problem.prior, problem.prior_options, log);
+    note_parameters(model, place, estimate, problem.notes);
+    problem.systems.push_back(place.other);
+    return place;
+  };
+  for (const Log& log : logs) problem.observations.push_back(read_log(place_at(log), log, options, problem.notes));
+
+  // what else is known; its noise is judged by the size of the measured signals
+  const bool needs_step = std::any_of(
+      also.begin(), also.end(), [](const Knowledge& knowledge) { return knowledge.quantity == View::Quantity::next_velocity; });
+  if (options.time_step && !needs_step) throw InputError("--dt goes with --also next-velocity:FILE.csv");
+  if (options.also_noise_stddev && also.empty()) throw InputError("--also-noise-std goes with --also VIEW:FILE.csv");
+  if (!also.empty()) {
+    const std::vector<VectorXd> signal_stddev = default_scales(problem.prior, problem.observations).signal_stddev;
+    for (const Knowledge& knowledge : also) {
+      const Place place = place_at(knowledge.log);
+      Observations group = read_knowledge(place, problem.prior, knowledge, options, problem.notes);
+      group.noise_stddev = noise_of_knowledge(place, knowledge, options, group, signal_stddev);
+      problem.observations.push_back(std::move(group));
     }
   }
   problem.hyperparameters = default_hyperparameters(problem.prior, problem.observations, estimate, options.protocol);
   return problem;
+}
+
+FitProblem make_fit_problem(const ModelFile& model, const CsvTable& log, const FitProblemOptions& options) {
+  return make_fit_problem(model, {Log{log}}, {}, options);
 }
 
 }  // namespace gp2

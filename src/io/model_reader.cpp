@@ -11,7 +11,7 @@
 #include "gp2/error.hpp"
 #include "io/name_order.hpp"
 #include "io/toml_reader.hpp"
-#include "training/random.hpp"
+#include "prior/random.hpp"
 
 namespace gp2 {
 
@@ -42,6 +42,7 @@ class ModelReader : private TomlReader {
     read_truth();
     read_sampling();
     read_columns();
+    read_potential();
   }
 
  private:
@@ -170,7 +171,7 @@ class ModelReader : private TomlReader {
     const std::size_t nq = definition_.coordinates.size();
     if (!root_.contains("mechanics")) fail(1, "mechanics", "missing; a model needs [mechanics] with mass = [[…], …]");
     const toml::table& mechanics = table(*root_.get("mechanics"), "mechanics");
-    only_keys(mechanics, "mechanics", {"mass", "force"});
+    only_keys(mechanics, "mechanics", {"mass", "force", "potential"});
     if (!mechanics.contains("mass")) fail(mechanics, "mechanics", "missing mass = [[…], …]");
 
     mass_node_ = mechanics.get("mass");
@@ -208,6 +209,18 @@ class ModelReader : private TomlReader {
       }
     } else {
       definition_.force.assign(nq, definition_.graph->constant(0));
+    }
+  }
+
+  // last, so that M, A, b and F are built the same way with it and without
+  void read_potential() {
+    const toml::table& mechanics = *root_.get("mechanics")->as_table();
+    if (!mechanics.contains("potential")) return;
+    const toml::node& node = *mechanics.get("potential");
+    model_.potential = expression(node, "mechanics.potential");
+    for (const auto* group : {&symbols_->dq, &symbols_->ddq, &symbols_->u}) {
+      allow_only(node, "mechanics.potential", *model_.potential, *group,
+                 "the potential may depend on coordinates, t and parameters only");
     }
   }
 

@@ -91,7 +91,7 @@ ViewValues collect(const View& view, const MechanicsBatch& mechanics, const At& 
 
 View View::all(Quantity quantity, const System& system) {
   const int size = quantity == Quantity::multipliers ? system.nc() : system.nq();
-  View view{quantity, std::vector<int>(static_cast<std::size_t>(size)), 0, -1};
+  View view{quantity, std::vector<int>(static_cast<std::size_t>(size))};
   std::iota(view.rows.begin(), view.rows.end(), 0);
   return view;
 }

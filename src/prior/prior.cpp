@@ -42,6 +42,20 @@ std::vector<bool> Prior::reads() const {
   return reads;
 }
 
+VectorXd Setting::parameters(const Ref<const VectorXd>& home) const {
+  VectorXd parameters = prior.system->parameter_values();
+  for (std::size_t k = 0; k < shared.size(); ++k) {
+    if (shared[k] >= 0) parameters[static_cast<Index>(k)] = home[shared[k]];
+  }
+  return parameters;
+}
+
+const Prior& prior_of(const Prior& home, const View& view) { return view.setting ? view.setting->prior : home; }
+
+VectorXd parameters_of(const View& view, const Ref<const VectorXd>& home) {
+  return view.setting ? view.setting->parameters(home) : VectorXd(home);
+}
+
 void PriorValues::keep_only(std::size_t latent) {
   mean.setZero();
   for (std::size_t a = 0; a < directions.size(); ++a) {
@@ -60,6 +74,7 @@ PriorValues evaluate_prior(const Prior& prior, const Ref<const MatrixXd>& states
   const Index nq = prior.system->nq();
   const int n_states = static_cast<int>(states.cols());
   PriorValues values{MatrixXd::Zero(nq, n_states), {}};
+  if (prior.mean == Prior::Mean::constant) values.mean = prior.constant_mean.replicate(1, n_states);
   if (prior.mean == Prior::Mean::force) {
     for (int i = 0; i < n_states; ++i) {
       values.mean.col(i) = mechanics.projections[static_cast<std::size_t>(i)].solve_mass(mechanics.values.F(i));

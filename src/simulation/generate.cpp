@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <functional>
 #include <limits>
 #include <map>
 #include <optional>
@@ -13,7 +14,7 @@
 
 #include "gp2/error.hpp"
 #include "gp2/mechanics.hpp"
-#include "training/random.hpp"
+#include "prior/random.hpp"
 
 namespace gp2 {
 
@@ -165,13 +166,16 @@ class Sampler {
 
   [[nodiscard]] const std::vector<bool>& known() const { return known_; }
 
-  [[nodiscard]] VectorXd draw(RandomStream& random, int sample) const {
+  /// Where in its range, from 0 to 1, a rule of the model's sampling is drawn.
+  using Fraction = std::function<double(std::size_t rule)>;
+
+  [[nodiscard]] VectorXd draw(const Fraction& fraction, int sample) const {
     MatrixXd state = MatrixXd::Constant(n_varying_, 1, std::numeric_limits<double>::quiet_NaN());
-    apply_rules(Stage::before_positions, random, state, sample);
+    apply_rules(Stage::before_positions, fraction, state, sample);
     positions_->solve(state, parameters_, sample);
-    apply_rules(Stage::after_positions, random, state, sample);
+    apply_rules(Stage::after_positions, fraction, state, sample);
     velocities_->solve(state, parameters_, sample);
-    apply_rules(Stage::after_velocities, random, state, sample);
+    apply_rules(Stage::after_velocities, fraction, state, sample);
     return state.col(0).head(model_.system->layout().size());
   }
 
@@ -252,13 +256,13 @@ class Sampler {
     }
   }
 
-  void apply_rules(Stage stage, RandomStream& random, MatrixXd& state, int sample) const {
+  void apply_rules(Stage stage, const Fraction& fraction, MatrixXd& state, int sample) const {
     MatrixXd value;
     for (std::size_t r = 0; r < model_.sampling.size(); ++r) {
       if (stage_[r] != stage) continue;
       const ModelFile::SamplingRule& rule = model_.sampling[r];
       if (rule.range) {
-        state(target_[r], 0) = rule.range->first + random.uniform() * (rule.range->second - rule.range->first);
+        state(target_[r], 0) = rule.range->first + fraction(r) * (rule.range->second - rule.range->first);
         continue;
       }
       tapes_[r].evaluate(state, parameters_, value);
@@ -296,24 +300,88 @@ void require_truth(const ModelFile& model) {
 
 }  // namespace
 
-MatrixXd true_acceleration(const ModelFile& model, const Eigen::Ref<const MatrixXd>& states) {
-  const SymbolicSystem& system = *model.system;
-  require_truth(model);
-  const SystemSymbols symbols(*system.definition().graph, system.coordinates(), system.inputs(), system.parameters());
-  const VectorXd parameters = system.parameter_values();
-  const MechanicsBatch mechanics = require_mechanics(system, states, parameters);
-  MatrixXd truth;
-  Tape(model.truth, symbols.state_and_parameters()).evaluate(states, parameters, truth);
-  MatrixXd accelerations(system.nq(), states.cols());
+ModelMotion::ModelMotion(const ModelFile& model) : system_(model.system), parameters_(model.system->parameter_values()) {
+  const SystemSymbols symbols(*system_->definition().graph, system_->coordinates(), system_->inputs(), system_->parameters());
+  truth_ = Tape(model.truth, symbols.state_and_parameters());
+}
+
+MatrixXd ModelMotion::acceleration(const Eigen::Ref<const MatrixXd>& states) const {
+  const MechanicsBatch mechanics = require_mechanics(*system_, states, parameters_);
+  MatrixXd truth = MatrixXd::Zero(system_->nq(), states.cols());
+  if (truth_.n_outputs() > 0) truth_.evaluate(states, parameters_, truth);
+  MatrixXd accelerations(system_->nq(), states.cols());
   for (int i = 0; i < static_cast<int>(states.cols()); ++i) {
     const UdwadiaKalaba& projection = mechanics.projections[static_cast<std::size_t>(i)];
     accelerations.col(i) = projection.constrain(projection.solve_mass(mechanics.values.F(i)) + truth.col(i));
+  }
+  return accelerations;
+}
+
+MatrixXd true_acceleration(const ModelFile& model, const Eigen::Ref<const MatrixXd>& states) {
+  require_truth(model);
+  MatrixXd accelerations = ModelMotion(model).acceleration(states);
+  for (int i = 0; i < static_cast<int>(states.cols()); ++i) {
     if (!accelerations.col(i).allFinite()) {
       throw InputError(fmt::format("{}: the true acceleration is not a finite number at sample {}", model.name, i + 1));
     }
   }
   return accelerations;
 }
+
+namespace {
+
+// points of every range of [sampling], in its order; 0 where a rule is an expression
+std::vector<int> grid_points(const ModelFile& model, const std::map<std::string, int>& grid) {
+  std::vector<int> points;
+  std::vector<std::string> ranges;
+  double total = 1;
+  for (const ModelFile::SamplingRule& rule : model.sampling) {
+    points.push_back(0);
+    if (!rule.range) continue;
+    ranges.push_back(rule.name);
+    const auto found = grid.find(rule.name);
+    if (found == grid.end()) {
+      throw InputError(fmt::format("grid: no number of points for '{}': every range of [sampling] needs one", rule.name));
+    }
+    if (found->second < 1) {
+      throw InputError(fmt::format("grid: '{}' must have at least 1 point, got {}", rule.name, found->second));
+    }
+    points.back() = found->second;
+    total *= found->second;
+  }
+  for (const auto& [name, n] : grid) {
+    if (std::find(ranges.begin(), ranges.end(), name) == ranges.end()) {
+      throw InputError(
+          fmt::format("grid: '{}' is not a range of [sampling] in {}; ranges: {}", name, model.name, fmt::join(ranges, ", ")));
+    }
+  }
+  constexpr double largest = 1e7;
+  if (total > largest) throw InputError(fmt::format("grid: {:.3g} points are more than {:.0e}", total, largest));
+  return points;
+}
+
+// even points over every range, ends included, the last range fastest; the middle where there is one point
+MatrixXd grid_states(const ModelFile& model, const Sampler& sampler, const std::map<std::string, int>& grid) {
+  const std::vector<int> points = grid_points(model, grid);
+  int n = 1;
+  for (const int of_rule : points) n *= std::max(of_rule, 1);
+  MatrixXd states(model.system->layout().size(), n);
+  std::vector<int> index(points.size());
+  for (int i = 0; i < n; ++i) {
+    for (int rule = static_cast<int>(points.size()) - 1, rest = i; rule >= 0; --rule) {
+      const auto r = static_cast<std::size_t>(rule);
+      index[r] = rest % std::max(points[r], 1);
+      rest /= std::max(points[r], 1);
+    }
+    const auto fraction = [&](std::size_t rule) {
+      return points[rule] == 1 ? 0.5 : static_cast<double>(index[rule]) / (points[rule] - 1);
+    };
+    states.col(i) = sampler.draw(fraction, i);
+  }
+  return states;
+}
+
+}  // namespace
 
 GeneratedData generate(const ModelFile& model, const GenerateOptions& options) {
   const SymbolicSystem& system = *model.system;
@@ -331,11 +399,16 @@ GeneratedData generate(const ModelFile& model, const GenerateOptions& options) {
   RandomStream random(options.seed);
   GeneratedData data;
   data.known = sampler.known();
-  data.states.resize(system.layout().size(), options.n);
-  for (int i = 0; i < options.n; ++i) data.states.col(i) = sampler.draw(random, i);
+  if (options.grid.empty()) {
+    data.states.resize(system.layout().size(), options.n);
+    const auto fraction = [&](std::size_t) { return random.uniform(); };
+    for (int i = 0; i < options.n; ++i) data.states.col(i) = sampler.draw(fraction, i);
+  } else {
+    data.states = grid_states(model, sampler, options.grid);
+  }
   data.accelerations = true_acceleration(model, data.states);
   // noise comes last, so that states are the same for any noise
-  for (int i = 0; i < options.n; ++i) {
+  for (Index i = 0; i < data.accelerations.cols(); ++i) {
     for (Index j = 0; j < data.accelerations.rows(); ++j) {
       if (options.noise_stddev[j] > 0) data.accelerations(j, i) += options.noise_stddev[j] * random.normal();
     }

@@ -194,6 +194,12 @@ MatrixXd SymbolicSystem::residuals(const Ref<const MatrixXd>& states, const Ref<
   return values;
 }
 
+std::shared_ptr<const SymbolicSystem> SymbolicSystem::without_constraints() const {
+  Definition free = definition_;
+  free.constraints.clear();
+  return std::make_shared<const SymbolicSystem>(std::move(free));
+}
+
 std::vector<bool> SymbolicSystem::reads(SystemPart part) const {
   const Tape& tape = part == SystemPart::mechanics ? mechanics_ : part == SystemPart::force ? force_ : residuals_;
   std::vector<bool> reads;

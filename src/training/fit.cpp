@@ -6,13 +6,14 @@
 #include <limits>
 #include <mutex>
 #include <random>
+#include <set>
 #include <thread>
 
 #include "gp2/error.hpp"
 #include "gp2/training.hpp"
 #include "inference/lapack.hpp"
+#include "prior/random.hpp"
 #include "training/lbfgsb.hpp"
-#include "training/random.hpp"
 
 namespace gp2 {
 
@@ -22,12 +23,14 @@ using Kind = Hyperparameter::Kind;
 
 namespace {
 
-// what the optimiser sees of a hyperparameter: its logarithm, or θ measured in widths of its box
+// what the optimiser sees of a hyperparameter: its logarithm, θ measured in widths of its box, an entry of W in its unit
 double to_internal(const Hyperparameter& h, double value) {
+  if (h.kind == Kind::mixing) return value / h.scale[0];
   return h.is_positive() ? std::log(value) : (value - h.lower) / (h.upper - h.lower);
 }
 
 double from_internal(const Hyperparameter& h, double x) {
+  if (h.kind == Kind::mixing) return std::clamp(x * h.scale[0], h.lower, h.upper);
   const double value = h.is_positive() ? std::exp(x) : h.lower + x * (h.upper - h.lower);
   return std::clamp(value, h.lower, h.upper);
 }
@@ -59,15 +62,37 @@ double gather(const Hyperparameter& h, const ModelValues& gradient) {
       return gradient.noise_stddev[owner][h.index];
     case Kind::parameter:
       return gradient.parameters[h.index] * (h.upper - h.lower);
+    case Kind::mixing:
+      return gradient.mixing[owner].reshaped()[h.index] * h.scale[0];
+    case Kind::sqrt_kappa:
+      return gradient.mixing[owner].rightCols(gradient.mixing[owner].rows())(h.index, h.index) * h.value;
   }
   return 0;
 }
 
+// latents that have a W, but W = 0
+std::set<int> unmixed_latents(const std::vector<Hyperparameter>& hyperparameters) {
+  std::set<int> unmixed;
+  for (const Hyperparameter& h : hyperparameters) {
+    if (h.kind == Kind::mixing) unmixed.insert(h.owner);
+  }
+  for (const Hyperparameter& h : hyperparameters) {
+    if (h.kind == Kind::mixing && h.value != 0) unmixed.erase(h.owner);
+  }
+  return unmixed;
+}
+
 // a random start: log-normal about the first start where there is a hyper-prior, else even in the box (in logarithms for positive
-// values)
+// values). The box of a mixing matrix is no more than a limit: its entries are drawn about their unit. Matrices
+// that are zero at the first start stay zero (see Training::release).
 std::vector<Hyperparameter> draw_start(std::vector<Hyperparameter> hyperparameters, RandomStream& random) {
+  const std::set<int> unmixed = unmixed_latents(hyperparameters);
   for (Hyperparameter& h : hyperparameters) {
-    if (h.log_stddev > 0) {
+    if (h.kind == Kind::mixing) {
+      if (!unmixed.contains(h.owner)) h.value = std::clamp(h.scale[0] * random.normal(), h.lower, h.upper);
+    } else if (h.kind == Kind::sqrt_kappa) {
+      h.value = std::clamp(h.scale[0] * std::exp(random.normal()), h.lower, h.upper);
+    } else if (h.log_stddev > 0) {
       h.value = std::clamp(h.value * std::exp(Protocol::Standard::start_log_stddev * random.normal()), h.lower, h.upper);
     } else {
       const double lower = to_internal(h, h.lower);
@@ -102,6 +127,7 @@ class Training {
   void run() {
     const lapack::SingleThread single_thread;
     in_parallel(n_restarts(), [&](int restart) { run_restart(restart); });
+    release();
     constexpr int max_escapes = 5;
     while (n_escapes_ < max_escapes && !stopped() && escape()) ++n_escapes_;
   }
@@ -214,13 +240,19 @@ class Training {
       const Hyperparameter& h = results_[from][static_cast<std::size_t>(k)];
       x[k] = to_internal(h, h.value);
     }
+    // the box of a mixing matrix is no more than a limit, too wide to scan
+    std::vector<std::size_t> scanned;
+    for (std::size_t k = 0; k < hyperparameters_.size(); ++k) {
+      if (hyperparameters_[k].kind != Kind::mixing && hyperparameters_[k].kind != Kind::sqrt_kappa) scanned.push_back(k);
+    }
+    if (scanned.empty()) return false;
     const auto moved = [&](int trial) {
       VectorXd there = x;
-      const auto k = static_cast<std::size_t>(trial / n_points);
-      there[trial / n_points] = box_.lower[k] + (box_.upper[k] - box_.lower[k]) * (trial % n_points + 1) / (n_points + 1);
+      const std::size_t k = scanned[static_cast<std::size_t>(trial / n_points)];
+      there[static_cast<Index>(k)] = box_.lower[k] + (box_.upper[k] - box_.lower[k]) * (trial % n_points + 1) / (n_points + 1);
       return there;
     };
-    std::vector<double> values(static_cast<std::size_t>(n) * n_points);
+    std::vector<double> values(scanned.size() * n_points);
     in_parallel(static_cast<int>(values.size()), [&](int trial) {
       if (stopped()) return;
       Likelihood::Workspace workspace;
@@ -252,6 +284,29 @@ class Training {
     store(static_cast<std::size_t>(restart), result);
     const std::scoped_lock lock(mutex_);
     fractions_[static_cast<std::size_t>(restart)] = 1;
+  }
+
+  // Where W of a latent is zero so is its gradient: every run stays in that smaller model, which has fewer optima. From the best
+  // of them W is let go.
+  void release() {
+    const std::size_t from = best();
+    const std::set<int> unmixed = unmixed_latents(results_[from]);
+    if (unmixed.empty() || stopped() || reports_[from].iterations >= options_.max_iterations) return;
+    constexpr int n_draws = 4;
+    constexpr double size = 0.1;
+    std::vector<LbfgsbResult> drawn(n_draws);
+    in_parallel(n_draws, [&](int draw) {
+      RandomStream random(options_.seed, static_cast<std::uint64_t>(n_restarts() + draw));
+      std::vector<Hyperparameter> start = results_[from];
+      for (Hyperparameter& h : start) {
+        if (h.kind == Kind::mixing && unmixed.contains(h.owner)) h.value = size * h.scale[0] * random.normal();
+      }
+      Likelihood::Workspace workspace;
+      drawn[static_cast<std::size_t>(draw)] = optimise(static_cast<int>(from), start, workspace);
+    });
+    const auto lowest =
+        std::min_element(drawn.begin(), drawn.end(), [](const auto& a, const auto& b) { return a.value < b.value; });
+    if (lowest->value < reports_[from].objective) store(from, *lowest);
   }
 
   bool report_iteration(int restart, int iteration, double value) {

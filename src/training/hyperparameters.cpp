@@ -1,5 +1,6 @@
 #include <algorithm>
 #include <cmath>
+#include <optional>
 
 #include <fmt/format.h>
 
@@ -24,15 +25,12 @@ bool Hyperparameter::at_bound() const {
 
 namespace {
 
-// rows of every group side by side
-template <typename Member>
-MatrixXd side_by_side(const std::vector<Observations>& observations, const Member& member) {
+MatrixXd side_by_side(const std::vector<MatrixXd>& parts) {
   Index n = 0;
-  for (const Observations& group : observations) n += member(group).cols();
-  MatrixXd all(member(observations.front()).rows(), n);
+  for (const MatrixXd& part : parts) n += part.cols();
+  MatrixXd all(parts.front().rows(), n);
   Index first = 0;
-  for (const Observations& group : observations) {
-    const auto& part = member(group);
+  for (const MatrixXd& part : parts) {
     all.middleCols(first, part.cols()) = part;
     first += part.cols();
   }
@@ -48,14 +46,36 @@ double median(std::vector<double> values) {
 // a spread that bounds and starting points can be multiples of, even where the data do not vary
 double usable(double spread, double fallback) { return spread > 0 && std::isfinite(spread) ? spread : fallback; }
 
+// what a group says of the accelerations' spread, per row of its view; nothing where the view is of another kind
+std::optional<VectorXd> acceleration_stddev(const Observations& group, const VectorXd& mass_diagonal) {
+  using Quantity = View::Quantity;
+  if (group.view.latent >= 0) return std::nullopt;
+  VectorXd stddev = row_stddev(group.values);
+  switch (group.view.quantity) {
+    case Quantity::constrained_acceleration:
+    case Quantity::unconstrained_acceleration:
+      return stddev;
+    case Quantity::constraint_force:
+      return VectorXd(stddev.cwiseQuotient(mass_diagonal(group.view.rows)));
+    case Quantity::multipliers:
+      return std::nullopt;
+    case Quantity::next_velocity: {
+      const Index nq = mass_diagonal.size();
+      const MatrixXd dq = group.states.middleRows(nq, nq)(group.view.rows, Eigen::all);
+      return VectorXd(row_stddev(group.values - dq) / group.view.time_step);
+    }
+  }
+  return std::nullopt;
+}
+
 // σ_j of every coordinate: measured where ddq_j is observed, otherwise by equal kinetic scale √(mean M_ii σ_i² / M_jj)
 VectorXd coordinate_scales(const System& system, const std::vector<Observations>& observations, const VectorXd& mass_diagonal) {
   VectorXd variance = VectorXd::Constant(system.nq(), -1);
   for (const Observations& group : observations) {
-    const VectorXd stddev = row_stddev(group.values);
-    for (Index k = 0; k < stddev.size(); ++k) {
+    const std::optional<VectorXd> stddev = acceleration_stddev(group, mass_diagonal);
+    for (Index k = 0; stddev && k < stddev->size(); ++k) {
       double& entry = variance[group.view.rows[static_cast<std::size_t>(k)]];
-      entry = std::max(entry, stddev[k] * stddev[k]);
+      entry = std::max(entry, (*stddev)[k] * (*stddev)[k]);
     }
   }
   double kinetic = 0;
@@ -78,26 +98,35 @@ VectorXd coordinate_scales(const System& system, const std::vector<Observations>
 
 Scales default_scales(const Prior& prior, const std::vector<Observations>& observations) {
   const System& system = *prior.system;
-  const MatrixXd states = side_by_side(observations, [](const Observations& group) -> const MatrixXd& { return group.states; });
-  const MechanicsBatch mechanics = require_mechanics(system, states, system.parameter_values());
-  const PriorValues values = evaluate_prior(prior, states, system.parameter_values(), mechanics);
-
-  VectorXd mass_diagonal(system.nq());
-  for (Index j = 0; j < mass_diagonal.size(); ++j) {
-    std::vector<double> entries;
-    for (int i = 0; i < mechanics.values.n_states(); ++i) entries.push_back(mechanics.values.M(i)(j, j));
-    mass_diagonal[j] = median(std::move(entries));
+  std::vector<std::vector<MatrixXd>> features(prior.latents.size()), directions(prior.latents.size());
+  std::vector<std::vector<double>> mass(static_cast<std::size_t>(system.nq()));
+  for (const Observations& group : observations) {
+    const Prior& there = prior_of(prior, group.view);
+    const VectorXd parameters = parameters_of(group.view, system.parameter_values());
+    const MechanicsBatch mechanics = require_mechanics(*there.system, group.states, parameters);
+    PriorValues values = evaluate_prior(there, group.states, parameters, mechanics);
+    for (std::size_t a = 0; a < prior.latents.size(); ++a) {
+      features[a].push_back(evaluate_features(there.latents[a], group.states).transpose());
+      directions[a].push_back(std::move(values.directions[a]));
+    }
+    for (std::size_t j = 0; j < mass.size(); ++j) {
+      const auto row = static_cast<Index>(j);
+      for (int i = 0; i < group.n_data(); ++i) mass[j].push_back(mechanics.values.M(i)(row, row));
+    }
   }
+  VectorXd mass_diagonal(system.nq());
+  for (std::size_t j = 0; j < mass.size(); ++j) mass_diagonal[static_cast<Index>(j)] = median(std::move(mass[j]));
   const VectorXd sigma = coordinate_scales(system, observations, mass_diagonal);
 
   Scales scales;
   for (std::size_t a = 0; a < prior.latents.size(); ++a) {
     const Latent& latent = prior.latents[a];
-    const MatrixXd features = evaluate_features(latent, states).transpose();
-    VectorXd stddev = row_stddev(features);
-    VectorXd range = features.rowwise().maxCoeff() - features.rowwise().minCoeff();
+    const MatrixXd features_of = side_by_side(features[a]);
+    const MatrixXd directions_of = side_by_side(directions[a]);
+    VectorXd stddev = row_stddev(features_of);
+    VectorXd range = features_of.rowwise().maxCoeff() - features_of.rowwise().minCoeff();
     for (Index d = 0; d < stddev.size(); ++d) {
-      const double magnitude = usable(features.row(d).cwiseAbs().maxCoeff(), 1);
+      const double magnitude = usable(features_of.row(d).cwiseAbs().maxCoeff(), 1);
       // a feature that is constant to rounding has no spread of its own
       stddev[d] = stddev[d] > 1e-12 * magnitude ? stddev[d] : magnitude;
       range[d] = range[d] > 1e-12 * magnitude ? range[d] : magnitude;
@@ -110,7 +139,7 @@ Scales default_scales(const Prior& prior, const std::vector<Observations>& obser
       signal = latent.base == Latent::Base::force ? VectorXd(mass_diagonal.cwiseProduct(sigma)) : sigma;
     } else {
       for (Index l = 0; l < signal.size(); ++l) {
-        const auto column = values.directions[a].middleRows(l * system.nq(), system.nq());
+        const auto column = directions_of.middleRows(l * system.nq(), system.nq());
         const double rms = std::sqrt(column.squaredNorm() / static_cast<double>(column.size()));
         signal[l] = sigma.mean() / usable(rms, 1);
       }
@@ -119,7 +148,11 @@ Scales default_scales(const Prior& prior, const std::vector<Observations>& obser
   }
   for (const Observations& group : observations) {
     VectorXd stddev = row_stddev(group.values);
-    for (Index k = 0; k < stddev.size(); ++k) stddev[k] = usable(stddev[k], sigma[group.view.rows[static_cast<std::size_t>(k)]]);
+    for (Index k = 0; k < stddev.size(); ++k) {
+      const auto row = static_cast<std::size_t>(group.view.rows[static_cast<std::size_t>(k)]);
+      const bool per_coordinate = group.view.quantity != View::Quantity::multipliers;
+      stddev[k] = usable(stddev[k], per_coordinate ? sigma[static_cast<Index>(row)] : 1);
+    }
     scales.output_stddev.push_back(std::move(stddev));
   }
   return scales;
@@ -237,6 +270,7 @@ std::vector<Hyperparameter> default_hyperparameters(const Prior& prior, const st
       h.owner = static_cast<int>(g);
       h.index = static_cast<int>(k);
       h.name = fmt::format("noise_stddev({})", names[k]);
+      if (g > 0) h.name += fmt::format("#{}", g + 1);  // of the second log, the third, …
       h.unit = unit_of(names[k]);
       const double spread = scales.output_stddev[g][static_cast<Index>(k)];
       h.lower = Standard::noise_lower * spread;
@@ -302,6 +336,8 @@ ModelValues model_values(const Prior& prior, const std::vector<Observations>& ob
   for (const Latent& latent : prior.latents) {
     values.kernel.emplace_back(VectorXd::Ones(static_cast<Index>(latent.kernel.parameters().size())));
     values.signal_stddev.emplace_back(VectorXd::Ones(latent.size()));
+    values.mixing.emplace_back();
+    if (latent.learned_rank) values.mixing.back().setZero(latent.size(), latent.n_functions());
   }
   for (const Observations& group : observations) values.noise_stddev.push_back(group.noise_stddev);
   values.parameters = prior.system->parameter_values();
@@ -322,6 +358,12 @@ ModelValues model_values(const Prior& prior, const std::vector<Observations>& ob
         break;
       case Kind::parameter:
         values.parameters[h.index] = h.value;
+        break;
+      case Kind::mixing:
+        values.mixing[owner].reshaped()[h.index] = h.value;
+        break;
+      case Kind::sqrt_kappa:
+        values.mixing[owner].rightCols(values.mixing[owner].rows())(h.index, h.index) = h.value;
         break;
     }
   }

@@ -6,7 +6,7 @@
 
 #include "apps/command_line.hpp"
 #include "gp2/fit_file.hpp"
-#include "training/random.hpp"
+#include "prior/random.hpp"
 
 namespace gp2::test {
 namespace {

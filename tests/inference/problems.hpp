@@ -89,6 +89,47 @@ directions = [["c^2*dx + k"], ["m"]]
   return model;
 }
 
+/// `text` with every `from` changed to `to`.
+inline std::string changed(std::string text, const std::vector<std::pair<std::string, std::string>>& changes) {
+  for (const auto& [from, to] : changes) {
+    const std::size_t place = text.find(from);
+    if (place == std::string::npos) throw std::runtime_error("not in the text: " + from);
+    text.replace(place, from.size(), to);
+  }
+  return text;
+}
+
+/// Another, heavier particle on another surface; m, p1 and p5 are those of models/surface.toml.
+inline const ModelFile& another_surface() {
+  static const ModelFile other = ModelFile::parse(
+      changed(model("models/surface.toml").text,
+              {{"m  = 3.0", "m  = { value = 3.0, estimate = true }"},
+               {"[[\"m\", \"0\", \"0\"]", "[[\"1.5*m\", \"0.2\", \"0\"]"},
+               {"[\"0\", \"m\", \"0\"]", "[\"0.2\", \"m\", \"0\"]"},
+               {"bounds = [0.04, 0.16] }", "bounds = [0.04, 0.16], estimate = true }"},
+               {"bounds = [2.5, 3.5] }", "bounds = [2.5, 3.5], estimate = true }"},
+               {"p4 = { value = 0.1", "p4 = { value = 0.15"},
+               {"p1*q1^2 + p2*q2^2 + p3*q1*q2 + p4*cos(p5*q1) - q3", "p1*q1*q2 - 3*p2*q2 + p4*sin(p5*q2) - q3"}}),
+      "another surface");
+  return other;
+}
+
+/// The sledge with another mass on a runner that is turned; c and k are those of model_with_friction().
+inline const ModelFile& another_sledge() {
+  static const ModelFile other = ModelFile::parse(
+      changed(model_with_friction().text, {{"m = 2.0", "m = 2.6"},
+                                           {"c = 0.7", "c = { value = 0.7, estimate = true }"},
+                                           {"k = 1.5", "k = { value = 1.5, estimate = true }"},
+                                           {"dx*cos(heading) - e*dheading", "dx*sin(heading) + k*dx - e*dheading"}}),
+      "another sledge");
+  return other;
+}
+
+inline View under(View view, std::shared_ptr<const Setting> setting) {
+  view.setting = std::move(setting);
+  return view;
+}
+
 inline ModelValues random_values(const Prior& prior, const std::vector<Observations>& observations, RandomStream& random) {
   ModelValues values;
   for (const Latent& latent : prior.latents) {
@@ -206,8 +247,24 @@ inline std::vector<Problem> problems(int n, std::uint64_t seed) {
     const ModelFile& m = model_with_friction();
     MatrixXd states = random_states(m);
     states.col(0).segment(m.system->nq(), m.system->nq()).setZero();
-    add("friction, two latents, one state at rest", m, {mean, std::nullopt, false}, states,
-        {View::all(Quantity::constrained_acceleration, *m.system), View{Quantity::unconstrained_acceleration, {1}}});
+    const PriorOptions options{mean, std::nullopt, false};
+    const View ddq = View::all(Quantity::constrained_acceleration, *m.system);
+    add("friction, two latents, one state at rest", m, options, states, {ddq, View{Quantity::unconstrained_acceleration, {1}}});
+    const auto elsewhere = make_setting(m, another_sledge(), options);
+    View alone = under(View{Quantity::constraint_force, {1, 0}}, elsewhere);
+    alone.latent = 1;
+    add("friction, pooled with another sledge", m, options, states, {ddq, under(ddq, elsewhere), alone});
+  }
+  for (Prior::Mean mean : {Prior::Mean::zero, Prior::Mean::force}) {
+    const ModelFile& m = model("models/surface.toml");
+    const MatrixXd states = draw(m, n + 3, seed).states;
+    for (const auto base : {Latent::Base::acceleration, Latent::Base::force}) {
+      const PriorOptions options{mean, base, false};
+      const auto elsewhere = make_setting(m, another_surface(), options);
+      const View ddq = View::all(Quantity::constrained_acceleration, *m.system);
+      add("surface, pooled with another surface", m, options, states,
+          {ddq, under(ddq, elsewhere), under(View{Quantity::unconstrained_acceleration, {2, 0}}, elsewhere)});
+    }
   }
   for (const std::string& file : library_models()) {
     const ModelFile& m = model(file);
@@ -244,10 +301,12 @@ inline Extended pseudo_inverse(const Extended& matrix) {
   return svd.matrixV() * inverse.asDiagonal() * svd.matrixU().transpose();
 }
 
-inline DenseView dense_view(const Prior& prior, const ModelValues& values, const View& view, const MatrixXd& states) {
+inline DenseView dense_view(const Prior& home, const ModelValues& values, const View& view, const MatrixXd& states) {
+  const Prior& prior = prior_of(home, view);
+  const VectorXd parameters = parameters_of(view, values.parameters);
   const System& system = *prior.system;
   const Index nq = system.nq();
-  const SystemValues mechanics = system.evaluate(states, values.parameters);
+  const SystemValues mechanics = system.evaluate(states, parameters);
   DenseView dense{ExtendedVector(view.size() * states.cols()), {}, {}};
   for (const Latent& latent : prior.latents) dense.features.push_back(evaluate_features(latent, states));
   for (int i = 0; i < static_cast<int>(states.cols()); ++i) {
@@ -304,7 +363,7 @@ inline DenseView dense_view(const Prior& prior, const ModelValues& values, const
       Extended E = Extended::Identity(nq, nq);
       if (!latent.directions_are_identity) {
         MatrixXd entries;
-        latent.directions.evaluate(states.col(i), values.parameters, entries);
+        latent.directions.evaluate(states.col(i), parameters, entries);
         E = Extended(entries.reshaped(nq, latent.size()).cast<long double>());
       }
       if (latent.base == Latent::Base::force) E = M_inverse * E;

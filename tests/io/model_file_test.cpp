@@ -281,7 +281,8 @@ std::vector<Complaint> complaints() {
        "7: friction: unknown key; known here: name, coordinates, inputs, parameters, let, mechanics, constraints, latent, noise, "
        "truth, "
        "sampling, columns"},
-      {"FirstOfSeveralUnknownKeys", base + "zeta = 1\nalpha = 2\n", "7: mechanics.zeta: unknown key; known here: mass, force"},
+      {"FirstOfSeveralUnknownKeys", base + "zeta = 1\nalpha = 2\n",
+       "7: mechanics.zeta: unknown key; known here: mass, force, potential"},
       {"NameIsNoText", "name = 3\n" + base, "1: name: expected a text in quotes, got 3"},
       {"ParametersAreNoTable", "parameters = 3\ncoordinates = [\"q1\"]\n", "1: parameters: expected a table, got 3"},
       // coordinates
@@ -351,6 +352,8 @@ std::vector<Complaint> complaints() {
        "6: mechanics.mass row 2 column 2: \"2m\", column 2: found 'm' right after a number; a product needs its sign, write 2*m"},
       {"MassEntryIsABoolean", with_mass("[[true, \"0\"], [\"0\", \"1\"]]"),
        "6: mechanics.mass row 1 column 1: expected an expression in quotes, or a number, got true"},
+      {"PotentialOfAVelocity", base + "potential = \"dq1^2\"\n",
+       "7: mechanics.potential: the potential may depend on coordinates, t and parameters only, but this entry depends on 'dq1'"},
       {"ForceOfTheWrongLength", base + "force = [\"0\"]\n", "7: mechanics.force: expected 2 entries, one per coordinate, got 1"},
       {"ForceOfAnAcceleration", base + "force = [\"0\", \"ddq1\"]\n",
        "7: mechanics.force entry 2: a force may not depend on accelerations, but this entry depends on 'ddq1'"},

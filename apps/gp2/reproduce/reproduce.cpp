@@ -1,0 +1,95 @@
+#include <array>
+#include <filesystem>
+#include <memory>
+
+#include <fmt/format.h>
+
+#include "command.hpp"
+#include "gp2/error.hpp"
+#include "reproduce/experiment.hpp"
+
+namespace gp2::command {
+
+namespace {
+
+struct Arguments {
+  std::string what, protocol = "both", data, output, experiments;
+  std::optional<int> runs;
+  int threads = 0;
+};
+
+struct Experiment {
+  const char* name;
+  void (*run)(const ReproduceOptions& options);
+};
+
+constexpr std::array<Experiment, 6> experiments = {{{"table1", reproduce_table1},
+                                                    {"fig3a", reproduce_fig3a},
+                                                    {"fig3b", reproduce_fig3b},
+                                                    {"fig3c", reproduce_fig3c},
+                                                    {"figS7", reproduce_figS7},
+                                                    {"learning-curve", reproduce_learning_curve}}};
+
+// the definitions: as told, beside an installed command, or in the source the command was built from
+std::filesystem::path definitions(const std::string& told) {
+  if (!told.empty()) {
+    if (!std::filesystem::is_directory(told)) throw InputError(fmt::format("--experiments: there is no folder '{}'", told));
+    return told;
+  }
+  std::error_code error;
+  const std::filesystem::path command = std::filesystem::read_symlink("/proc/self/exe", error);
+  for (const std::filesystem::path& folder :
+       {command.parent_path() / GP2_EXPERIMENTS_FROM_BIN, std::filesystem::path(GP2_EXPERIMENTS_IN_SOURCE)}) {
+    if (std::filesystem::is_directory(folder)) return folder.lexically_normal();
+  }
+  throw InputError("the definitions of the experiments are not where this command was installed: give --experiments DIR");
+}
+
+void run(const Arguments& arguments) {
+  ReproduceOptions options;
+  options.experiments = definitions(arguments.experiments);
+  if (!arguments.data.empty()) {
+    if (!std::filesystem::is_directory(arguments.data)) {
+      throw InputError(fmt::format("--data: there is no folder '{}'", arguments.data));
+    }
+    options.data = arguments.data;
+  }
+  options.output = arguments.output;
+  if (arguments.protocol != "default") options.protocols.push_back(Protocol::Name::paper);
+  if (arguments.protocol != "paper") options.protocols.push_back(Protocol::Name::standard);
+  options.runs = arguments.runs;
+  options.threads = arguments.threads;
+  std::error_code error;
+  std::filesystem::create_directories(options.output, error);
+  if (error) throw InputError(fmt::format("-o {}: the folder cannot be made: {}", arguments.output, error.message()));
+  for (const Experiment& experiment : experiments) {
+    if (arguments.what != "all" && arguments.what != experiment.name) continue;
+    experiment.run(options);
+    talk({fmt::format("{}: {} is done", options.output.string(), experiment.name)});
+  }
+}
+
+}  // namespace
+
+void add_reproduce(CLI::App& app) {
+  CLI::App* command = app.add_subcommand("reproduce", "Rebuild the tables and figures of Geist & Trimpe 2020, and more");
+  auto arguments = std::make_shared<Arguments>();
+  std::vector<std::string> names = {"all"};
+  for (const Experiment& experiment : experiments) names.emplace_back(experiment.name);
+  command->add_option("WHAT", arguments->what, "which")->required()->check(CLI::IsMember(names));
+  command
+      ->add_option("--protocol", arguments->protocol,
+                   "how GP² is trained: paper, default, or both; the other methods are the same under each")
+      ->check(CLI::IsMember({"paper", "default", "both"}))
+      ->capture_default_str();
+  command->add_option("--data", arguments->data,
+                      "folder of the published observations; without it they are drawn from the same distributions");
+  command->add_option("--runs", arguments->runs, "data sets (default: 10, or those that --data holds)");
+  command->add_option("--threads", arguments->threads, "0: as many as the machine has")->check(not_negative());
+  command->add_option("--experiments", arguments->experiments, "folder of the definitions (default: those of gp2)");
+  command->add_option("-o,--output", arguments->output, "folder for numbers (CSV, JSON) and pictures (SVG, PNG)")->required();
+  command->footer("Example:\n  gp2 reproduce table1 --runs 2 -o results");
+  command->callback([arguments] { run(*arguments); });
+}
+
+}  // namespace gp2::command

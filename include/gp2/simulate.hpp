@@ -1,0 +1,99 @@
+#pragma once
+
+#include <functional>
+#include <vector>
+
+#include <Eigen/Core>
+
+#include "gp2/model_file.hpp"
+#include "gp2/system.hpp"
+
+namespace gp2 {
+
+/// ddq at one state [q; dq; t; u]: a model's own, a posterior mean, or one sample of a posterior.
+using Acceleration = std::function<Eigen::VectorXd(const Eigen::Ref<const Eigen::VectorXd>& state)>;
+
+/// Inputs over time: zero, or a table that is linear in between and held at its ends.
+class InputSignal {
+ public:
+  InputSignal() = default;  // zero
+  /// @param times   (K), strictly increasing
+  /// @param values  (nu × K)
+  /// @throws InputError when the sizes differ, K = 0, times do not increase, or a number is not finite.
+  InputSignal(Eigen::VectorXd times, Eigen::MatrixXd values);
+
+  [[nodiscard]] bool is_zero() const { return times_.size() == 0; }
+  [[nodiscard]] int size() const { return static_cast<int>(values_.rows()); }  // nu; 0 of the zero signal
+
+  /// u(t).
+  void evaluate(double t, Eigen::Ref<Eigen::VectorXd> u) const;
+  /// The first time after t at which a slope changes; +∞ when there is none.
+  [[nodiscard]] double next_kink(double t) const;
+
+ private:
+  Eigen::VectorXd times_;
+  Eigen::MatrixXd values_;
+  std::vector<double> kinks_;
+};
+
+struct SimulateOptions {
+  Eigen::VectorXd times;             // at which states are written, strictly increasing; the first is the start [s]
+  double relative_tolerance = 1e-6;  // of a step's error estimate, in each of q and dq
+  double absolute_tolerance = 1e-9;  // in the units of q and dq
+  bool project = true;               // onto position and velocity constraints, after each step and where states are written
+  InputSignal inputs;                // u(t)
+  int max_steps = 1'000'000;         // accepted and rejected
+  double initial_step = 0;           // [s]; 0: found from the first two accelerations
+};
+
+/// A motion at the times asked for.
+struct Trajectory {
+  Eigen::VectorXd times;          // (N) [s]
+  Eigen::MatrixXd states;         // [q; dq; t; u] (layout size × N)
+  Eigen::MatrixXd accelerations;  // ddq there (nq × N)
+
+  double max_position_drift = 0;       // largest |c| of position constraints at the written times
+  double max_velocity_drift = 0;       // largest |dc/dt|, or |c| of velocity constraints, there
+  double start_position_residual = 0;  // the same at the start as it was given
+  double start_velocity_residual = 0;
+  double start_displacement = 0;  // by how much the projection of the start changed an entry of q or dq, at most
+
+  int steps = 0;           // accepted
+  int rejected_steps = 0;  // error above the tolerance, or no finite acceleration
+  int evaluations = 0;     // of the acceleration
+  double seconds = 0;      // wall time
+};
+
+/// Integrates ddq = acceleration(q, dq, t, u(t)) with the adaptive Dormand–Prince pair 5(4) and its dense output.
+///
+/// An accepted step, its error estimated before, is projected onto the constraints: with c the residuals of position level and
+/// their rows A, q ← q − M⁻¹Aᵀ(A M⁻¹Aᵀ)⁺c until |c| is rounding, then dq the same way, so that the state moves as little as can
+/// be in the metric of M. The first stage is evaluated anew where that changed the state. Written states, interpolated between
+/// steps, are projected too. Steps end at the kinks of the inputs, so that no pulse is stepped over. Redundant constraints mean
+/// nothing off the constraint: the stages of such systems are evaluated at their projections, with `project` or without.
+///
+/// @param parameters  of the system's constraints and mass matrix (system.parameters().size())
+/// @param start       [q; dq; …] (layout size), t and u are set from the options. Off the constraint it is projected, or taken as
+///                    it is without `project`; the trajectory reports both.
+/// @throws InputError when sizes, times or tolerances are wrong.
+/// @throws NumericalError, with the time, when a projection does not converge, the acceleration is not finite or cannot be
+///   computed, the step size underflows, or max_steps is reached.
+Trajectory simulate(const System& system, const Eigen::VectorXd& parameters, const Acceleration& acceleration,
+                    const Eigen::Ref<const Eigen::VectorXd>& start, const SimulateOptions& options);
+
+/// Moves a state onto the position and velocity constraints, by the least distance in the metric of M, without changing the
+/// coordinates and velocities that are held.
+/// @param held  entries of the state that stay as they are (layout size); none when empty
+/// @throws NumericalError, naming the time and the residual, when Newton's method does not reach the constraints.
+Eigen::VectorXd project_onto_constraints(const System& system, const Eigen::VectorXd& parameters,
+                                         const Eigen::Ref<const Eigen::VectorXd>& state, const std::vector<bool>& held = {});
+
+/// The acceleration of a model as it is written: L b + T (M⁻¹F + truth), truth = 0 without [truth].
+Acceleration model_acceleration(const ModelFile& model);
+
+/// Kinetic and potential energy ½ dqᵀM dq + V of a model with [mechanics] potential, at N states (N) [J].
+/// @throws InputError when the model has none.
+Eigen::VectorXd mechanical_energy(const ModelFile& model, const Eigen::VectorXd& parameters,
+                                  const Eigen::Ref<const Eigen::MatrixXd>& states);
+
+}  // namespace gp2

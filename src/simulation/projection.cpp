@@ -1,0 +1,128 @@
+#include "simulation/projection.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+
+#include <fmt/format.h>
+
+#include "gp2/error.hpp"
+#include "gp2/mechanics.hpp"
+#include "gp2/simulate.hpp"
+
+namespace gp2 {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::Ref;
+using Eigen::VectorXd;
+
+ConstraintProjection::ConstraintProjection(const System& system, VectorXd parameters, const std::vector<bool>& held)
+    : system_(system), parameters_(std::move(parameters)), position_(level_of(false, held)), velocity_(level_of(true, held)) {}
+
+ConstraintProjection::Level ConstraintProjection::level_of(bool velocity, const std::vector<bool>& held) const {
+  Level level;
+  level.first = velocity ? system_.layout().dq(0) : system_.layout().q(0);
+  const std::vector<System::Residual>& labels = system_.residual_labels();
+  for (std::size_t k = 0; k < labels.size(); ++k) {
+    if (labels[k].velocity != velocity) continue;
+    level.residuals.push_back(static_cast<int>(k));
+    level.rows.push_back(labels[k].row);
+  }
+  for (int j = 0; j < system_.nq(); ++j) {
+    const int entry = level.first + j;
+    if (held.empty() || !held[static_cast<std::size_t>(entry)]) level.free.push_back(j);
+  }
+  return level;
+}
+
+bool ConstraintProjection::apply(VectorXd& state) const {
+  const bool moved = apply(position_, state);
+  return apply(velocity_, state) || moved;
+}
+
+bool ConstraintProjection::apply(const Level& level, VectorXd& state) const {
+  if (level.residuals.empty()) return false;
+  const VectorXd before = state;
+  if (!newton(level, state)) return false;
+  if (level.rows.size() < 2) return true;
+
+  // Of redundant rows the rank is right on the constraint only. Off it a row that should say nothing new moves the state along
+  // the constraint as well; that part is taken back: x ← x + T (x_before − x)
+  const SystemValues values = system_.evaluate(state, parameters_);
+  const auto n_rows = static_cast<Index>(level.rows.size());
+  const UdwadiaKalaba here(values.M(0)(level.free, level.free), values.A(0)(level.rows, level.free), VectorXd::Zero(n_rows));
+  if (!here.mass_is_positive_definite() || here.rank() == n_rows) return true;
+  std::vector<int> entries = level.free;
+  for (int& entry : entries) entry += level.first;
+  const VectorXd back = here.T() * (before(entries) - state(entries));
+  state(entries) += back;
+  newton(level, state);
+  return true;
+}
+
+// x ← x − M⁻¹Aᵀ(A M⁻¹Aᵀ)⁺c, until c is rounding; x is q or dq, A = ∂c/∂q, which is also ∂ċ/∂dq
+bool ConstraintProjection::newton(const Level& level, VectorXd& state) const {
+  constexpr int max_iterations = 100;
+  constexpr double at_rounding = 0.5 * std::numeric_limits<double>::epsilon();
+  constexpr double converging = 1e-9;  // Newton's method is quadratic here: where it gains no more, rounding is reached
+  // Velocities are brought to rounding of their own size: near rest b, quadratic in them, would else contradict itself.
+  const double least_size = level.first == system_.layout().q(0) ? 1 : 0;
+  double previous = std::numeric_limits<double>::infinity();
+  for (int iteration = 0; iteration < max_iterations; ++iteration) {
+    const SystemValues values = system_.evaluate(state, parameters_);
+    const VectorXd c = system_.residuals(state, parameters_)(level.residuals, 0);
+    const MatrixXd A = values.A(0)(level.rows, Eigen::all);
+    if (!c.allFinite() || !A.allFinite()) fail(level, state);
+
+    // |c| against what a relative change of x makes of it
+    const VectorXd x = state.segment(level.first, system_.nq()).cwiseAbs();
+    const VectorXd scale = A.cwiseAbs() * x.cwiseMax(least_size);
+    if ((c.array().abs() <= at_rounding * scale.array()).all()) return iteration > 0;
+    const VectorXd coarse_scale = A.cwiseAbs() * x.cwiseMax(1);
+    double off = 0;
+    for (Index k = 0; k < c.size(); ++k) {
+      off = std::max(off, std::abs(c[k]) / (coarse_scale[k] > 0 ? coarse_scale[k] : 1));
+    }
+    if (off <= converging && (off >= previous / 2 || level.free.empty())) return iteration > 0;
+    if (level.free.empty()) fail(level, state);
+    previous = off;
+
+    const UdwadiaKalaba step(values.M(0)(level.free, level.free), A(Eigen::all, level.free), c);
+    if (!step.mass_is_positive_definite()) fail(level, state);
+    for (std::size_t j = 0; j < level.free.size(); ++j) {
+      state[level.first + level.free[j]] -= step.Lb()[static_cast<Index>(j)];
+    }
+  }
+  fail(level, state);
+}
+
+void ConstraintProjection::fail(const Level& level, const VectorXd& state) const {
+  const VectorXd all = system_.residuals(state, parameters_).col(0);
+  const auto size = [&](int k) { return std::isfinite(all[k]) ? std::abs(all[k]) : std::numeric_limits<double>::infinity(); };
+  const int worst =
+      *std::max_element(level.residuals.begin(), level.residuals.end(), [&](int a, int b) { return size(a) < size(b); });
+  throw NumericalError(fmt::format(
+      "system '{}': the projection onto the constraints did not converge at t = {:.6g}: \"{}\" is off by {:.3g}", system_.name(),
+      state[system_.layout().t()], system_.residual_labels()[static_cast<std::size_t>(worst)].text, all[worst]));
+}
+
+double ConstraintProjection::largest_residual(const Ref<const MatrixXd>& states, bool velocity) const {
+  const std::vector<int>& rows = velocity ? velocity_.residuals : position_.residuals;
+  if (rows.empty()) return 0;
+  return system_.residuals(states, parameters_)(rows, Eigen::all).cwiseAbs().maxCoeff();
+}
+
+VectorXd project_onto_constraints(const System& system, const VectorXd& parameters, const Ref<const VectorXd>& state,
+                                  const std::vector<bool>& held) {
+  const int size = system.layout().size();
+  if (state.size() != size || (!held.empty() && static_cast<int>(held.size()) != size)) {
+    throw InputError(fmt::format("project_onto_constraints: a state of '{}' has {} entries, got {}{}", system.name(), size,
+                                 state.size(), held.empty() ? "" : fmt::format(" and {} marks of what is held", held.size())));
+  }
+  VectorXd projected = state;
+  ConstraintProjection(system, parameters, held).apply(projected);
+  return projected;
+}
+
+}  // namespace gp2

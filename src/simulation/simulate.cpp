@@ -1,0 +1,328 @@
+#include "gp2/simulate.hpp"
+
+#include <algorithm>
+#include <chrono>
+#include <cmath>
+#include <limits>
+#include <optional>
+#include <string>
+
+#include <fmt/format.h>
+#include <boost/numeric/odeint/stepper/controlled_runge_kutta.hpp>
+#include <boost/numeric/odeint/stepper/runge_kutta_dopri5.hpp>
+
+#include "gp2/error.hpp"
+#include "gp2/generate.hpp"
+#include "gp2/mechanics.hpp"
+#include "simulation/projection.hpp"
+
+namespace gp2 {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::Ref;
+using Eigen::VectorXd;
+
+namespace {
+
+namespace odeint = boost::numeric::odeint;
+
+// [q; dq] and its derivative, as odeint keeps them
+using Phase = std::vector<double>;
+using Stepper = odeint::runge_kutta_dopri5<Phase>;
+using ErrorChecker = odeint::default_error_checker<double, Stepper::algebra_type, Stepper::operations_type>;
+using ControlledStepper = odeint::controlled_runge_kutta<Stepper, ErrorChecker>;
+
+// a stage at which there is no acceleration: the step is tried again, smaller
+struct StageFault {
+  std::string text;
+};
+
+bool is_finite(const Phase& phase) {
+  return std::all_of(phase.begin(), phase.end(), [](double x) { return std::isfinite(x); });
+}
+
+class Integration {
+ public:
+  Integration(const System& system, const VectorXd& parameters, const Acceleration& acceleration, const SimulateOptions& options)
+      : layout_(system.layout()),
+        acceleration_(acceleration),
+        options_(options),
+        projection_(system, parameters),
+        stepper_(ErrorChecker(options.absolute_tolerance, options.relative_tolerance, 1, 0)),
+        state_(VectorXd::Zero(layout_.size())) {}
+
+  Trajectory run(const Ref<const VectorXd>& start, bool redundant) {
+    project_stages_ = redundant;
+    const Index n = options_.times.size();
+    out_.times = options_.times;
+    out_.states.resize(layout_.size(), n);
+    out_.accelerations.resize(layout_.nq, n);
+    t_ = options_.times[0];
+    x_.assign(start.begin(), start.begin() + layout_.t());  // t follows q and dq
+    dxdt_.resize(x_.size());
+    derivative_or_throw();
+    write(0, x_, dxdt_);
+
+    double step = options_.initial_step > 0 ? options_.initial_step : first_step();
+    Index next = 1;
+    while (next < n) {
+      if (out_.steps + out_.rejected_steps >= options_.max_steps) {
+        throw NumericalError(fmt::format(
+            "simulate: {} steps reach no further than t = {:.6g} of {:.6g}: loosen the tolerances, or allow more steps",
+            options_.max_steps, t_, t_end()));
+      }
+      // a step ends where an input has a kink, and at the end
+      const double limit = std::min(options_.inputs.next_kink(t_), t_end());
+      const bool to_limit = step >= limit - t_;
+      double t_new = t_, tried = to_limit ? limit - t_ : step;
+      if (!try_step(t_new, tried)) {
+        step = tried;
+        require_step(step);
+        continue;
+      }
+      step = to_limit ? std::max(step, tried) : tried;
+      if (to_limit) t_new = limit;
+      next = write_within(next, t_new);
+      advance(t_new);
+      if (next < n && options_.times[next] == t_new) write(next++, x_, dxdt_);
+    }
+    return std::move(out_);
+  }
+
+ private:
+  [[nodiscard]] double t_end() const { return options_.times[options_.times.size() - 1]; }
+
+  // [q; dq; t; u(t)] in state_
+  void expand(const Phase& x, double t) {
+    std::copy(x.begin(), x.end(), state_.begin());
+    state_[layout_.t()] = t;
+    options_.inputs.evaluate(t, state_.tail(layout_.nu));
+  }
+
+  // whether the projection changed x
+  bool project(Phase& x, double t) {
+    expand(x, t);
+    if (!projection_.apply(state_)) return false;
+    std::copy_n(state_.begin(), x.size(), x.begin());
+    return true;
+  }
+
+  void derivative(const Phase& x, Phase& dxdt, double t) {
+    if (!is_finite(x)) throw StageFault{"the state is not finite"};
+    expand(x, t);
+    VectorXd ddq;
+    try {
+      if (project_stages_) projection_.apply(state_);
+      ddq = acceleration_(state_);
+    } catch (const Error& error) {
+      throw StageFault{error.what()};
+    }
+    ++out_.evaluations;
+    if (ddq.size() != layout_.nq) {
+      throw InputError(
+          fmt::format("simulate: the acceleration has {} entries, the system {} coordinates", ddq.size(), layout_.nq));
+    }
+    if (!ddq.allFinite()) throw StageFault{"the acceleration is not a finite number"};
+    std::copy_n(x.begin() + layout_.nq, layout_.nq, dxdt.begin());
+    std::copy(ddq.begin(), ddq.end(), dxdt.begin() + layout_.nq);
+  }
+
+  // at (x_, t_), where there is no smaller step to try
+  void derivative_or_throw() {
+    try {
+      derivative(x_, dxdt_, t_);
+    } catch (const StageFault& fault) {
+      throw NumericalError(fmt::format("simulate: no acceleration at t = {:.6g}: {}", t_, fault.text));
+    }
+  }
+
+  // One step of the size `step`, which becomes that of the next one, or of the next try.
+  bool try_step(double& t_new, double& step) {
+    x_new_.resize(x_.size());
+    dxdt_new_.resize(x_.size());
+    const double tried = step;
+    try {
+      const auto result = stepper_.try_step([this](const Phase& x, Phase& dxdt, double t) { derivative(x, dxdt, t); }, x_, dxdt_,
+                                            t_new, x_new_, dxdt_new_, step);
+      if (result == odeint::success) {
+        ++out_.steps;
+        return true;
+      }
+      fault_.reset();
+    } catch (const StageFault& fault) {
+      fault_ = fault;
+      step = tried / 4;
+    }
+    ++out_.rejected_steps;
+    return false;
+  }
+
+  void require_step(double step) const {
+    const double smallest = 16 * std::numeric_limits<double>::epsilon() * std::max(std::abs(t_), std::abs(t_end()));
+    if (step > smallest) return;
+    throw NumericalError(fmt::format("simulate: the step size fell to {:.2g} s at t = {:.6g}: {}", step, t_,
+                                     fault_ ? fault_->text : "the tolerances cannot be met there"));
+  }
+
+  // Hairer, Nørsett & Wanner, Solving Ordinary Differential Equations I, sec. II.4
+  double first_step() {
+    const double span = t_end() - t_;
+    const auto size = [&](const auto& entry) {
+      double largest = 0;
+      for (std::size_t k = 0; k < x_.size(); ++k) {
+        const double scale = options_.absolute_tolerance + options_.relative_tolerance * std::abs(x_[k]);
+        largest = std::max(largest, std::abs(entry(k)) / scale);
+      }
+      return largest;
+    };
+    const double d0 = size([&](std::size_t k) { return x_[k]; });
+    const double d1 = size([&](std::size_t k) { return dxdt_[k]; });
+    const double h0 = std::min(span, d0 < 1e-5 || d1 < 1e-5 ? 1e-6 : 0.01 * d0 / d1);
+    Phase x1 = x_, dxdt1(x_.size());
+    for (std::size_t k = 0; k < x_.size(); ++k) x1[k] += h0 * dxdt_[k];
+    try {
+      derivative(x1, dxdt1, t_ + h0);
+    } catch (const StageFault&) {
+      return h0;
+    }
+    const double d2 = size([&](std::size_t k) { return dxdt1[k] - dxdt_[k]; }) / h0;
+    const double steepest = std::max(d1, d2);
+    const double h1 = steepest <= 1e-15 ? std::max(1e-6, h0 * 1e-3) : std::pow(0.01 / steepest, 0.2);
+    return std::min({100 * h0, h1, span});
+  }
+
+  // the times before the end of the step, from its dense output
+  Index write_within(Index next, double t_new) {
+    Phase x(x_.size()), dxdt(x_.size());
+    for (; next < options_.times.size() && options_.times[next] < t_new; ++next) {
+      const double t = options_.times[next];
+      stepper_.stepper().calc_state(t, x, x_, dxdt_, t_, x_new_, dxdt_new_, t_new);
+      if (options_.project) project(x, t);
+      try {
+        derivative(x, dxdt, t);
+      } catch (const StageFault& fault) {
+        throw NumericalError(fmt::format("simulate: no acceleration at t = {:.6g}: {}", t, fault.text));
+      }
+      write(next, x, dxdt);
+    }
+    return next;
+  }
+
+  void advance(double t_new) {
+    std::swap(x_, x_new_);
+    std::swap(dxdt_, dxdt_new_);
+    t_ = t_new;
+    if (options_.project && project(x_, t_)) derivative_or_throw();
+  }
+
+  void write(Index row, const Phase& x, const Phase& dxdt) {
+    expand(x, options_.times[row]);
+    out_.states.col(row) = state_;
+    std::copy(dxdt.begin() + layout_.nq, dxdt.end(), out_.accelerations.col(row).begin());
+  }
+
+  const StateLayout layout_;
+  const Acceleration& acceleration_;
+  const SimulateOptions& options_;
+  const ConstraintProjection projection_;
+  ControlledStepper stepper_;
+  bool project_stages_ = false;
+  VectorXd state_;  // scratch
+  double t_ = 0;
+  Phase x_, dxdt_, x_new_, dxdt_new_;
+  std::optional<StageFault> fault_;  // of the last try
+  Trajectory out_;
+};
+
+void require_options(const SimulateOptions& options, const System& system) {
+  const VectorXd& times = options.times;
+  if (times.size() < 2)
+    throw InputError(fmt::format("simulate: at least two times are needed, the start and the end, got {}", times.size()));
+  if (!times.allFinite()) throw InputError("simulate: a time is not a finite number");
+  for (Index k = 1; k < times.size(); ++k) {
+    if (times[k] > times[k - 1]) continue;
+    throw InputError(fmt::format("simulate: times must increase, but {} follows {}", times[k], times[k - 1]));
+  }
+  const auto require_positive = [](const char* what, double value) {
+    if (!(value > 0) || !std::isfinite(value))
+      throw InputError(fmt::format("simulate: {} must be positive, got {}", what, value));
+  };
+  require_positive("the relative tolerance", options.relative_tolerance);
+  require_positive("the absolute tolerance", options.absolute_tolerance);
+  if (!(options.initial_step >= 0) || !std::isfinite(options.initial_step)) {
+    throw InputError(fmt::format("simulate: the initial step must not be negative, got {}", options.initial_step));
+  }
+  if (options.max_steps < 1) throw InputError(fmt::format("simulate: max_steps must be at least 1, got {}", options.max_steps));
+  if (!options.inputs.is_zero() && options.inputs.size() != system.layout().nu) {
+    throw InputError(fmt::format("simulate: the table of inputs has {} rows, the system {} inputs", options.inputs.size(),
+                                 system.layout().nu));
+  }
+}
+
+// whether some rows of A follow from the others; they show it on the constraint
+bool has_redundant_rows(const System& system, const VectorXd& parameters, const ConstraintProjection& projection,
+                        VectorXd state) {
+  if (system.nc() < 2) return false;
+  projection.apply(state);
+  const MechanicsBatch mechanics = evaluate_mechanics(system, state, parameters);
+  return !mechanics.projections.empty() && mechanics.projections[0].mass_is_positive_definite() &&
+         mechanics.projections[0].rank() < system.nc();
+}
+
+}  // namespace
+
+Trajectory simulate(const System& system, const VectorXd& parameters, const Acceleration& acceleration,
+                    const Ref<const VectorXd>& start, const SimulateOptions& options) {
+  const auto clock_start = std::chrono::steady_clock::now();
+  const StateLayout layout = system.layout();
+  if (parameters.size() != static_cast<Index>(system.parameters().size())) {
+    throw InputError(
+        fmt::format("simulate: '{}' has {} parameters, got {}", system.name(), system.parameters().size(), parameters.size()));
+  }
+  if (start.size() != layout.size() || !start.head(2 * layout.nq).allFinite()) {
+    throw InputError(
+        fmt::format("simulate: the start must be a state of {} entries, coordinates and velocities finite", layout.size()));
+  }
+  require_options(options, system);
+
+  const ConstraintProjection projection(system, parameters);
+  VectorXd state = start;
+  state[layout.t()] = options.times[0];
+  options.inputs.evaluate(options.times[0], state.tail(layout.nu));
+  const double position_residual = projection.largest_residual(state, false);
+  const double velocity_residual = projection.largest_residual(state, true);
+  if (options.project) projection.apply(state);
+  const bool redundant = has_redundant_rows(system, parameters, projection, state);
+
+  Trajectory out = Integration(system, parameters, acceleration, options).run(state, redundant);
+  out.start_position_residual = position_residual;
+  out.start_velocity_residual = velocity_residual;
+  out.start_displacement = (state - start).head(2 * layout.nq).lpNorm<Eigen::Infinity>();
+  out.max_position_drift = projection.largest_residual(out.states, false);
+  out.max_velocity_drift = projection.largest_residual(out.states, true);
+  out.seconds = std::chrono::duration<double>(std::chrono::steady_clock::now() - clock_start).count();
+  return out;
+}
+
+Acceleration model_acceleration(const ModelFile& model) {
+  return
+      [motion = ModelMotion(model)](const Ref<const VectorXd>& state) -> VectorXd { return motion.acceleration(state).col(0); };
+}
+
+VectorXd mechanical_energy(const ModelFile& model, const VectorXd& parameters, const Ref<const MatrixXd>& states) {
+  const SymbolicSystem& system = *model.system;
+  if (!model.potential) throw InputError(fmt::format("{}: no energy without [mechanics] potential = \"…\"", model.name));
+  const SystemSymbols symbols(*system.definition().graph, system.coordinates(), system.inputs(), system.parameters());
+  MatrixXd potential;
+  Tape(std::span(&*model.potential, 1), symbols.state_and_parameters()).evaluate(states, parameters, potential);
+  VectorXd energy = potential.row(0).transpose();
+  const SystemValues values = system.evaluate(states, parameters);
+  for (int i = 0; i < static_cast<int>(states.cols()); ++i) {
+    const auto dq = states.col(i).segment(system.layout().dq(0), system.nq());
+    energy[i] += 0.5 * dq.dot(values.M(i) * dq);
+  }
+  return energy;
+}
+
+}  // namespace gp2

@@ -1,0 +1,244 @@
+#include <cmath>
+#include <set>
+
+#include <fmt/format.h>
+#include <gmock/gmock.h>
+#include <gtest/gtest.h>
+
+#include "apps/command_line.hpp"
+
+namespace gp2::test {
+namespace {
+
+using testing::ElementsAre;
+using testing::HasSubstr;
+
+const std::string figure_start = "--start q1=0.4,q2=0.8,dq1=0.8,dq2=1";
+
+double number(const CsvTable& table, int row, const std::string& column) { return table.number(row, table.find(column)); }
+
+/// A desk with a small log of the surface, and a fit at its starting values.
+class SimulateFit : public testing::Test {
+ protected:
+  void SetUp() override {
+    desk.done("gp2 generate models/surface.toml --n 60 --seed 1 -o train.csv");
+    desk.done("gp2 fit models/surface.toml --data train.csv --max-iterations 0 --restarts 1 -o fit.json");
+  }
+  Desk desk;
+};
+
+TEST(SimulateModelCommand, WritesAHundredRowsOnTheConstraint) {
+  const Desk desk;
+  const Outcome outcome = desk.done("gp2 simulate models/surface.toml " + figure_start + " --t-end 6 --json -o motion.csv");
+  EXPECT_TRUE(outcome.said("gp2: start: from the constraints q3 = 0.0970358, dq3 = -0.0404894")) << outcome.err;
+  const auto report = outcome.json();
+  EXPECT_LE(report["max_position_drift"], 1e-12);
+  EXPECT_LE(report["max_velocity_drift"], 1e-12);
+  EXPECT_GT(report["steps"], 10);
+  EXPECT_GE(report["seconds"], 0);
+  EXPECT_EQ(report["leaves_data_at"], nullptr);
+
+  const CsvTable motion = desk.table("motion.csv");
+  EXPECT_THAT(motion.header(),
+              ElementsAre("t", "q1", "q2", "q3", "dq1", "dq2", "dq3", "ddq1", "ddq2", "ddq3", "u1", "u2", "u3", "energy"));
+  ASSERT_EQ(motion.n_rows(), 100);
+  EXPECT_EQ(number(motion, 0, "t"), 0);
+  EXPECT_EQ(number(motion, 99, "t"), 6);
+  EXPECT_EQ(number(motion, 0, "q1"), 0.4);
+  EXPECT_EQ(number(motion, 0, "dq2"), 1);
+  // ½ m |dq|² + m g q3; friction takes of it
+  EXPECT_NEAR(number(motion, 0, "energy"), 1.5 * (0.8 * 0.8 + 1 + 0.0404894 * 0.0404894) + 3 * 9.81 * 0.0970358, 1e-5);
+  EXPECT_LT(number(motion, 99, "energy"), number(motion, 0, "energy"));
+  EXPECT_GT(report["max_energy_drift"], 0);
+}
+
+TEST(SimulateModelCommand, WithoutProjectionDriftsAndSaysSo) {
+  const Desk desk;
+  const auto drift = [&](const std::string& options) -> double {
+    return desk.done("gp2 simulate models/surface.toml " + figure_start + " --t-end 6 --json -o motion.csv " + options)
+        .json()["max_position_drift"];
+  };
+  const double loose = drift("--project off --rtol 1e-4 --atol 1e-4"), tight = drift("--project off --rtol 1e-7 --atol 1e-7");
+  EXPECT_GT(loose, 1e-6);
+  EXPECT_GT(tight, 1e-9);
+  EXPECT_LT(tight, loose / 100);
+  EXPECT_LE(drift("--rtol 1e-4 --atol 1e-4"), 1e-12);
+}
+
+TEST(SimulateModelCommand, WritesTheTimesAskedForAndTheEnd) {
+  const Desk desk;
+  const auto times = [&](const std::string& options) {
+    desk.done("gp2 simulate models/unicycle.toml --start dq1=1 -o motion.csv " + options);
+    const CsvTable motion = desk.table("motion.csv");
+    std::vector<double> t;
+    for (int i = 0; i < motion.n_rows(); ++i) t.push_back(number(motion, i, "t"));
+    return t;
+  };
+  EXPECT_THAT(times("--t-end 1 --dt 0.25"), ElementsAre(0, 0.25, 0.5, 0.75, 1));
+  EXPECT_THAT(times("--t-end 1 --dt 0.4"), ElementsAre(0, 0.4, 0.8, 1));
+  EXPECT_THAT(times("--t-end 1 --dt 4"), ElementsAre(0, 1));
+  EXPECT_THAT(times("--t-start 2 --t-end 3 --dt 0.5"), ElementsAre(2, 2.5, 3));
+  EXPECT_EQ(times("--t-end 0.3 --dt 0.1").size(), 4);
+}
+
+TEST(SimulateModelCommand, StartsFromTheFirstRowOfALog) {
+  const Desk desk;
+  desk.write("log.csv", "time,theta,q2,q3,dq1,dq2,dq3,note\n2,0.1,0.5,0,1,0,0,7\n9,9,9,9,9,9,9,9\n");
+  desk.done("gp2 simulate models/unicycle.toml --start log.csv --map theta=q1 --t-end 3 -o motion.csv");
+  const CsvTable motion = desk.table("motion.csv");
+  EXPECT_EQ(number(motion, 0, "t"), 2);
+  EXPECT_EQ(number(motion, 0, "q1"), 0.1);
+  EXPECT_EQ(number(motion, 0, "q2"), 0.5);
+  EXPECT_EQ(number(motion, 0, "dq1"), 1);
+  // a motion may be continued from its own last row: ddq, u and energy are not of a start
+  desk.done("{ head -1 motion.csv; tail -1 motion.csv; } > last.csv");
+  desk.done("gp2 simulate models/unicycle.toml --start last.csv --t-end 4 -o second.csv");
+  desk.done("gp2 simulate models/unicycle.toml --start log.csv --map theta=q1 --t-end 4 -o whole.csv");
+  const CsvTable second = desk.table("second.csv"), whole = desk.table("whole.csv");
+  for (const char* name : {"q1", "q2", "q3", "dq1", "dq2"}) {
+    EXPECT_NEAR(number(second, 99, name), number(whole, 99, name), 1e-5) << name;
+  }
+}
+
+TEST(SimulateModelCommand, AStartOffTheConstraintsIsProjectedOrLeftAndReported) {
+  const Desk desk;
+  const std::string command = "gp2 simulate models/surface.toml --start q1=0.4,q2=0.8,q3=0.2 --t-end 0.1 --json -o motion.csv ";
+  const Outcome projected = desk.done(command);
+  EXPECT_TRUE(projected.said("leaves no solution of the constraints")) << projected.err;
+  EXPECT_TRUE(projected.said("start: projected onto the constraints, which moves it by up to")) << projected.err;
+  EXPECT_GT(projected.json()["start_displacement"], 0.01);
+  EXPECT_NEAR(projected.json()["start_position_residual"], 0.2 - 0.0970358, 1e-6);
+  const Outcome left = desk.done(command + "--project off");
+  EXPECT_TRUE(left.said("start: off the constraints by |c| = 0.103, |dc/dt| = 0, and left there")) << left.err;
+  EXPECT_EQ(number(desk.table("motion.csv"), 0, "q3"), 0.2);
+  EXPECT_EQ(left.json()["start_displacement"], 0);
+}
+
+TEST(SimulateModelCommand, AssemblesAMechanismFromTheStartOfItsSampling) {
+  const Desk desk;
+  desk.done("gp2 simulate models/slider_crank.toml --start q1=0.5,dq1=4 --t-end 1 -o motion.csv");
+  const CsvTable motion = desk.table("motion.csv");
+  EXPECT_EQ(number(motion, 0, "q1"), 0.5);
+  EXPECT_NEAR(number(motion, 0, "q2"), -std::asin(std::sin(0.5) / 3), 1e-12);
+  EXPECT_NEAR(number(motion, 0, "q3"), 0.1 * std::cos(0.5) + std::sqrt(0.09 - 0.01 * std::pow(std::sin(0.5), 2)), 1e-12);
+}
+
+TEST(SimulateModelCommand, FollowsTheInputsOfATable) {
+  const Desk desk;
+  desk.write("inputs.csv", "t,u1,u2\n0,1,0\n1,1,0\n2,0,0.01\n5,0,0\n");
+  desk.done("gp2 simulate models/unicycle.toml --start q3=0 --inputs inputs.csv --t-end 4 --dt 0.5 -o motion.csv");
+  const CsvTable motion = desk.table("motion.csv");
+  EXPECT_EQ(number(motion, 0, "u1"), 1);
+  EXPECT_EQ(number(motion, 3, "u1"), 0.5);
+  EXPECT_EQ(number(motion, 4, "u2"), 0.01);
+  EXPECT_GT(number(motion, 8, "q1"), 1);
+  EXPECT_GT(number(motion, 8, "q3"), 0.01);
+}
+
+TEST_F(SimulateFit, StaysOnTheConstraintAndWritesItsUncertainty) {
+  const auto report = desk.done("gp2 simulate fit.json " + figure_start + " --t-end 6 --json -o motion.csv").json();
+  EXPECT_LE(report["max_position_drift"], 1e-12);
+  EXPECT_LE(report["max_velocity_drift"], 1e-12);
+  const CsvTable motion = desk.table("motion.csv");
+  EXPECT_THAT(motion.header(), ElementsAre("t", "q1", "q2", "q3", "dq1", "dq2", "dq3", "ddq1", "ddq2", "ddq3", "u1", "u2", "u3",
+                                           "ddq1_std", "ddq2_std", "ddq3_std", "energy"));
+  EXPECT_GT(number(motion, 50, "ddq1_std"), 0);
+  // the same numbers as predict's
+  desk.done("gp2 predict fit.json --states motion.csv --cov std -o prediction.csv");
+  const CsvTable prediction = desk.table("prediction.csv");
+  for (const int row : {0, 42, 99}) {
+    for (const char* name : {"ddq1", "ddq2", "ddq3"}) {
+      EXPECT_NEAR(number(motion, row, name), number(prediction, row, name), 1e-12);
+    }
+    EXPECT_NEAR(number(motion, row, "ddq2_std"), number(prediction, row, "ddq2_std"), 1e-12);
+  }
+}
+
+TEST_F(SimulateFit, SaysWhenTheMotionLeavesTheData) {
+  const Outcome inside = desk.done("gp2 simulate fit.json --start q1=0,q2=0 --t-end 0.01 --json -o motion.csv");
+  EXPECT_EQ(inside.json()["leaves_data_at"], nullptr) << inside.err;
+  EXPECT_FALSE(inside.said("leaves the region"));
+  const Outcome outside = desk.done("gp2 simulate fit.json --start q1=20,q2=30 --t-end 0.01 --json -o motion.csv");
+  EXPECT_EQ(outside.json()["leaves_data_at"], 0);
+  EXPECT_TRUE(outside.said("warning: the motion leaves the region of the data at t = 0: the standard deviation of ddq"))
+      << outside.err;
+}
+
+TEST_F(SimulateFit, AnEnsembleOfSamplesStaysOnTheConstraint) {
+  const std::string command = "gp2 simulate fit.json " + figure_start + " --t-end 0.5 --dt 0.1 --samples 3 --json ";
+  const auto report = desk.done(command + "--seed 4 -o a.csv").json();
+  EXPECT_LE(report["max_position_drift"], 1e-12);
+  EXPECT_LE(report["max_velocity_drift"], 1e-12);
+  const CsvTable ensemble = desk.table("a.csv");
+  EXPECT_EQ(ensemble.header()[0], "sample");
+  ASSERT_EQ(ensemble.n_rows(), 18);
+  std::set<double> ends;
+  for (int k = 0; k < 3; ++k) {
+    EXPECT_EQ(number(ensemble, 6 * k, "sample"), k);
+    EXPECT_EQ(number(ensemble, 6 * k, "t"), 0);
+    EXPECT_EQ(number(ensemble, 6 * k, "q1"), 0.4);
+    ends.insert(number(ensemble, 6 * k + 5, "q1"));
+  }
+  EXPECT_EQ(ends.size(), 3);
+  desk.done(command + "--seed 4 -o b.csv");
+  desk.done(command + "--seed 5 -o c.csv");
+  EXPECT_EQ(desk.read("a.csv"), desk.read("b.csv"));
+  EXPECT_NE(desk.read("a.csv"), desk.read("c.csv"));
+}
+
+TEST(SimulateRefusals, NameTheOptionTheRuleAndTheValue) {
+  const Desk desk;
+  desk.write("short.csv", "t,u1,u2\n0,0,0\n1,0,0\n");
+  desk.write("back.csv", "t,u1,u2\n0,0,0\n1,0,0\n1,0,0\n");
+  desk.write("one.csv", "t,u1\n0,0\n1,0\n");
+  desk.write("other.csv", "a,b\n0,0\n");
+  const std::vector<std::pair<std::string, std::string>> refusals = {
+      {"--start q9=1 --t-end 1",
+       "--start: 'q9' is no coordinate or velocity of 'unicycle'; there are: q1, q2, q3, dq1, dq2, dq3"},
+      {"--start u1=1 --t-end 1", "--start: 'u1' is no coordinate or velocity"},
+      {"--start q1=1x --t-end 1", "--start: q1 = '1x' is not a finite number"},
+      {"--start q1=inf --t-end 1", "--start: q1 = 'inf' is not a finite number"},
+      {"--start q1= --t-end 1", "--start: q1 = '' is not a finite number"},
+      {"--start q1=1,q1=2 --t-end 1", "--start: 'q1' is given twice"},
+      {"--start q1=1,q2 --t-end 1", "--start: 'q2' is not NAME=VALUE, say q1=0.4"},
+      {"--start missing.csv --t-end 1", "missing.csv"},
+      {"--start other.csv --t-end 1", "--start: other.csv has none of the columns q1, q2, q3, dq1, dq2, dq3"},
+      {"--start q1=0 --t-end 0", "--t-end: must be after the start 0, got 0"},
+      {"--start q1=0 --t-start 2 --t-end 1", "--t-end: must be after the start 2, got 1"},
+      {"--start q1=0 --t-start nan --t-end 1", "--t-start: must be a finite number, got nan"},
+      {"--start q1=0 --t-end 1 --dt 0", "--dt: must be positive, got 0"},
+      {"--start q1=0 --t-end 1 --dt 1e-9", "--dt: 1e-09 would write 1e+09 rows; at most 1e+07 are written"},
+      {"--start q1=0 --t-end 1 --rtol 0", "--rtol: must be positive, got 0"},
+      {"--start q1=0 --t-end 1 --atol -1", "--atol: must be positive, got -1"},
+      {"--start q1=0 --t-end 1 --samples 0", "--samples: must be at least 1, got 0"},
+      {"--start q1=0 --t-end 1 --samples 3", "--samples: a model has no posterior to draw from; give a FIT.json"},
+      {"--start q1=0 --t-end 2 --inputs short.csv", "short.csv: times 0 to 1 do not cover the motion from 0 to 2"},
+      {"--start q1=0 --t-end 1 --inputs back.csv", "back.csv: inputs: times must increase, but 1 follows 1"},
+      {"--start q1=0 --t-end 1 --inputs one.csv", "one.csv: missing column 'u2'"},
+  };
+  for (const auto& [options, text] : refusals) {
+    const Outcome outcome = desk.run("gp2 simulate models/unicycle.toml " + options + " -o motion.csv");
+    EXPECT_EQ(outcome.status, 2) << options;
+    EXPECT_THAT(outcome.err, HasSubstr(text)) << options;
+    EXPECT_FALSE(desk.has("motion.csv")) << options;
+  }
+  const Outcome folder = desk.run("gp2 simulate models/unicycle.toml --start q1=0 --t-end 1 -o no/such/motion.csv");
+  EXPECT_EQ(folder.status, 2);
+  EXPECT_THAT(folder.err, HasSubstr("there is no folder 'no/such'"));
+  const Outcome inputs = desk.run("gp2 simulate models/duffing.toml --start q1=0 --t-end 1 --inputs short.csv -o motion.csv");
+  EXPECT_THAT(inputs.err, HasSubstr("--inputs: 'controlled Duffing oscillator' has no inputs"));
+}
+
+TEST(SimulateRefusals, AMotionThatCannotBeContinuedExitsWith1AndNamesTheTime) {
+  const Desk desk;
+  // ẍ = 2 x ẋ from x = ẋ = 1 is infinite at t = 1
+  desk.write("blow.toml", "coordinates = [\"x\"]\n[mechanics]\nmass = [[1]]\nforce = [\"2*x*dx\"]\n");
+  const Outcome outcome = desk.run("gp2 simulate blow.toml --start x=1,dx=1 --t-end 3 -o motion.csv");
+  EXPECT_EQ(outcome.status, 1);
+  EXPECT_THAT(outcome.err, HasSubstr("numerical failure: simulate: the step size fell to"));
+  EXPECT_THAT(outcome.err, HasSubstr("at t = 1:"));
+  EXPECT_FALSE(desk.has("motion.csv"));
+}
+
+}  // namespace
+}  // namespace gp2::test

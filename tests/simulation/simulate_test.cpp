@@ -1,0 +1,553 @@
+#include "gp2/simulate.hpp"
+
+#include <cmath>
+#include <limits>
+
+#include <fmt/format.h>
+#include <gmock/gmock.h>
+#include <nlohmann/json.hpp>
+
+#include "gp2/error.hpp"
+#include "gp2/posterior.hpp"
+#include "gp2/training.hpp"
+#include "io/io_testing.hpp"
+#include "reference_data.hpp"
+#include "test_models.hpp"
+
+namespace gp2 {
+namespace {
+
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+using test::input_error_of;
+using testing::AllOf;
+using testing::HasSubstr;
+using testing::StartsWith;
+
+/// What f throws as NumericalError, or "" when it does not throw.
+template <class F>
+std::string numerical_error_of(F f) {
+  try {
+    f();
+  } catch (const NumericalError& error) {
+    return error.what();
+  }
+  return "";
+}
+
+VectorXd times(double t_end, int n, double t_start = 0) { return VectorXd::LinSpaced(n, t_start, t_end); }
+
+/// A state of a model from a few of its entries; the rest is 0.
+VectorXd state_of(const ModelFile& model, const std::vector<std::pair<std::string, double>>& entries) {
+  const std::vector<std::string> names = model.system->state_names();
+  VectorXd state = VectorXd::Zero(model.system->layout().size());
+  for (const auto& [name, value] : entries) {
+    const auto found = std::find(names.begin(), names.end(), name);
+    if (found == names.end()) throw std::runtime_error(name);
+    state[found - names.begin()] = value;
+  }
+  return state;
+}
+
+/// The same, where entries not given are solved from the constraints.
+VectorXd solved_state(const ModelFile& model, const std::vector<std::pair<std::string, double>>& entries) {
+  std::vector<bool> held;
+  for (const std::string& name : model.system->state_names()) {
+    held.push_back(std::any_of(entries.begin(), entries.end(), [&](const auto& entry) { return entry.first == name; }));
+  }
+  return project_onto_constraints(*model.system, model.system->parameter_values(), state_of(model, entries), held);
+}
+
+Trajectory simulate_model(const ModelFile& model, const VectorXd& start, const SimulateOptions& options) {
+  return simulate(*model.system, model.system->parameter_values(), model_acceleration(model), start, options);
+}
+
+SimulateOptions with_tolerance(const VectorXd& times, double tolerance, bool project = true) {
+  SimulateOptions options;
+  options.times = times;
+  options.relative_tolerance = options.absolute_tolerance = tolerance;
+  options.project = project;
+  return options;
+}
+
+const ModelFile& surface() { return test::model("models/surface.toml"); }
+const ModelFile& published_surface() { return test::model("experiments/surface_published.toml"); }
+
+/// The start of the paper's figure 3 c.
+VectorXd figure_start() { return solved_state(surface(), {{"q1", 0.4}, {"q2", 0.8}, {"dq1", 0.8}, {"dq2", 1}}); }
+
+// ---- a body without constraints
+
+ModelFile oscillator(double damping = 0) {
+  return ModelFile::parse(fmt::format("coordinates = [\"x\"]\ninputs = [\"f\"]\n[mechanics]\nmass = [[1]]\n"
+                                      "force = [\"f - x - {}*dx\"]\npotential = \"x^2/2\"\n",
+                                      damping),
+                          "oscillator.toml");
+}
+
+TEST(Simulate, FollowsAnOscillatorThatHasNoConstraint) {
+  const ModelFile model = oscillator();
+  const Trajectory out = simulate_model(model, state_of(model, {{"x", 1}}), with_tolerance(times(10, 101), 1e-10));
+  for (int i = 0; i < out.states.cols(); ++i) {
+    const double t = out.times[i];
+    EXPECT_EQ(out.states(2, i), t);
+    EXPECT_NEAR(out.states(0, i), std::cos(t), 1e-8);
+    EXPECT_NEAR(out.states(1, i), -std::sin(t), 1e-8);
+    EXPECT_EQ(out.accelerations(0, i), -out.states(0, i));
+  }
+  EXPECT_EQ(out.max_position_drift, 0);
+  EXPECT_EQ(out.max_velocity_drift, 0);
+  EXPECT_GT(out.steps, 20);
+  EXPECT_GE(out.evaluations, 6 * out.steps);
+}
+
+TEST(Simulate, InterpolatesBetweenStepsAsWellAsItSteps) {
+  const ModelFile model = oscillator();
+  const auto error = [&](double tolerance) {
+    const Trajectory out = simulate_model(model, state_of(model, {{"x", 1}}), with_tolerance(times(10, 1001), tolerance));
+    EXPECT_LT(out.steps, 500);  // most times lie within a step
+    return (out.states.row(0).transpose().array() - out.times.array().cos()).abs().maxCoeff();
+  };
+  for (const double tolerance : {1e-4, 1e-6, 1e-8}) EXPECT_LT(error(tolerance), 30 * tolerance);
+}
+
+TEST(Simulate, ReachesTheSameStateWhateverIsWritten) {
+  const ModelFile& model = surface();
+  const Trajectory few = simulate_model(model, figure_start(), with_tolerance(times(6, 2), 1e-6));
+  const Trajectory many = simulate_model(model, figure_start(), with_tolerance(times(6, 301), 1e-6));
+  EXPECT_EQ(few.states.col(1), many.states.col(300));
+  EXPECT_EQ(few.steps, many.steps);
+}
+
+// ---- inputs
+
+TEST(SimulateInputs, AreLinearBetweenTheTimesOfTheTableAndHeldAtItsEnds) {
+  const InputSignal signal(Eigen::Vector3d(1, 2, 4), (MatrixXd(2, 3) << 0, 1, -1, 5, 5, 5).finished());
+  const auto at = [&](double t) {
+    VectorXd u(2);
+    signal.evaluate(t, u);
+    return u;
+  };
+  EXPECT_EQ(at(0), Eigen::Vector2d(0, 5));
+  EXPECT_EQ(at(1), Eigen::Vector2d(0, 5));
+  EXPECT_EQ(at(1.25), Eigen::Vector2d(0.25, 5));
+  EXPECT_EQ(at(2), Eigen::Vector2d(1, 5));
+  EXPECT_EQ(at(3), Eigen::Vector2d(0, 5));
+  EXPECT_EQ(at(9), Eigen::Vector2d(-1, 5));
+  EXPECT_EQ(signal.next_kink(0), 1);
+  EXPECT_EQ(signal.next_kink(1), 2);
+  EXPECT_EQ(signal.next_kink(4), std::numeric_limits<double>::infinity());
+  VectorXd u = VectorXd::Ones(2);
+  InputSignal().evaluate(3, u);
+  EXPECT_EQ(u, VectorXd::Zero(2));
+}
+
+TEST(SimulateInputs, HaveNoKinkWhereTheTableGoesOnStraight) {
+  const VectorXd t = times(10, 1001);
+  const InputSignal ramp(t, 3 * t.transpose());
+  EXPECT_EQ(ramp.next_kink(-1), 0);
+  EXPECT_EQ(ramp.next_kink(0), 10);
+}
+
+TEST(SimulateInputs, AShortPulseIsNotSteppedOver) {
+  // at rest for 50 s; then a triangle of 10 ms and area 1 N s sets the unit mass off at 1 m/s
+  const ModelFile model =
+      ModelFile::parse("coordinates = [\"x\"]\ninputs = [\"f\"]\n[mechanics]\nmass = [[1]]\nforce = [\"f\"]\n", "mass.toml");
+  SimulateOptions options = with_tolerance(Eigen::Vector2d(0, 100), 1e-9);
+  options.inputs = InputSignal(Eigen::Vector3d(50, 50.005, 50.01), Eigen::RowVector3d(0, 200, 0));
+  const Trajectory out = simulate_model(model, VectorXd::Zero(4), options);
+  EXPECT_NEAR(out.states(1, 1), 1, 1e-12);
+  EXPECT_NEAR(out.states(0, 1), 49.995, 1e-10);
+}
+
+TEST(SimulateInputs, MustFitTheSystemAndBeInOrder) {
+  const MatrixXd two = MatrixXd::Zero(1, 2);
+  EXPECT_EQ(input_error_of([&] { InputSignal(Eigen::Vector2d(1, 1), two); }), "inputs: times must increase, but 1 follows 1");
+  EXPECT_EQ(input_error_of([&] { InputSignal(Eigen::Vector3d(1, 2, 3), two); }),
+            "inputs: 3 times for 2 columns of values; give as many, at least one");
+  EXPECT_EQ(input_error_of([&] { InputSignal(Eigen::Vector2d(1, NAN), two); }),
+            "inputs: a time or a value is not a finite number");
+  SimulateOptions options = with_tolerance(times(1, 2), 1e-6);
+  options.inputs = InputSignal(Eigen::Vector2d(0, 1), two);
+  EXPECT_EQ(input_error_of([&] { simulate_model(surface(), figure_start(), options); }),
+            "simulate: the table of inputs has 1 rows, the system 3 inputs");
+}
+
+// ---- the published trajectory
+
+TEST(SimulateSurface, FollowsTheAccurateSolutionOfThePublishedFigure) {
+  if (const auto absent = test::why_reference_is_absent()) GTEST_SKIP() << *absent;
+  const auto figure = nlohmann::json::parse(read_file(test::reference_file("fig_c.json")));
+  const auto& accurate = figure.at("accurate_analytic_states");
+  const auto initial = figure.at("setup").at("initial_state_on_surface").get<std::vector<double>>();
+  const int n = static_cast<int>(accurate.size());
+  const double step = figure.at("setup").at("step").get<double>();
+  VectorXd start = VectorXd::Zero(published_surface().system->layout().size());
+  std::copy(initial.begin(), initial.end(), start.begin());
+  EXPECT_LT((start - figure_start()).lpNorm<Eigen::Infinity>(), 1e-15);
+  for (const bool project : {true, false}) {
+    const Trajectory out = simulate_model(published_surface(), start, with_tolerance(times(n * step, n + 1), 1e-12, project));
+    double error = 0;
+    for (int i = 0; i < n; ++i) {
+      const auto row = accurate.at(static_cast<std::size_t>(i)).get<std::vector<double>>();
+      for (int k = 0; k < 6; ++k) error = std::max(error, std::abs(out.states(k, i + 1) - row[static_cast<std::size_t>(k)]));
+    }
+    RecordProperty(project ? "error_projected" : "error", fmt::format("{:.3g}", error));
+    EXPECT_LT(error, 1e-8) << (project ? "projected" : "not projected");
+  }
+}
+
+// ---- constraints
+
+TEST(SimulateSurface, StaysOnTheConstraintToRoundingOverAnyHorizon) {
+  for (const double t_end : {6.0, 600.0}) {
+    for (const double tolerance : {1e-3, 1e-6}) {
+      const Trajectory out = simulate_model(surface(), figure_start(), with_tolerance(times(t_end, 601), tolerance));
+      EXPECT_LE(out.max_position_drift, 1e-12) << t_end;
+      EXPECT_LE(out.max_velocity_drift, 1e-12) << t_end;
+      const MatrixXd c = surface().system->residuals(out.states, surface().system->parameter_values());
+      EXPECT_EQ(c.row(0).cwiseAbs().maxCoeff(), out.max_position_drift);
+      EXPECT_EQ(c.row(1).cwiseAbs().maxCoeff(), out.max_velocity_drift);
+    }
+  }
+}
+
+/// log(drift₁/drift₂) / log(h₁/h₂), h the mean step, between two tolerances.
+double order_of_drift(const std::function<Trajectory(double)>& run, double coarse, double fine) {
+  const Trajectory a = run(coarse), b = run(fine);
+  return std::log(a.max_position_drift / b.max_position_drift) / std::log(static_cast<double>(b.steps) / a.steps);
+}
+
+TEST(SimulateSurface, WithoutProjectionDriftFallsAtTheOrderOfTheIntegrator) {
+  const auto run = [&](double tolerance) {
+    return simulate_model(surface(), figure_start(), with_tolerance(times(6, 2), tolerance, false));
+  };
+  const double order = order_of_drift(run, 1e-6, 1e-10);
+  EXPECT_GT(order, 4.5);
+  EXPECT_LT(order, 7);  // what one step adds to c is of order 6
+  EXPECT_GT(run(1e-5).max_position_drift, 1e-7);
+}
+
+class SimulateModel : public testing::TestWithParam<std::string> {};
+INSTANTIATE_TEST_SUITE_P(EveryModel, SimulateModel, testing::ValuesIn(test::every_model()), test::model_test_name);
+
+TEST_P(SimulateModel, StaysOnItsConstraintsAndProjectionChangesNothingElse) {
+  const ModelFile& model = test::model(GetParam());
+  VectorXd start = test::draw(model, 1, 3).states.col(0);
+  start = start.array().isNaN().select(0, start);
+  const double t0 = start[model.system->layout().t()];
+  const auto run = [&](double tolerance, bool project) {
+    return simulate_model(model, start, with_tolerance(times(t0 + 0.5, 26, t0), tolerance, project));
+  };
+  const Trajectory accurate = run(1e-11, false);
+  const Trajectory projected = run(1e-8, true);
+  const VectorXd size = accurate.states.cwiseAbs().rowwise().maxCoeff().cwiseMax(1);
+  // constraint rows of these models have entries of the size of the state at most
+  EXPECT_LE(projected.max_position_drift, 50 * test::eps * size.maxCoeff() * size.maxCoeff());
+  EXPECT_LE(projected.max_velocity_drift, 50 * test::eps * size.maxCoeff() * size.maxCoeff());
+  for (int i = 0; i < accurate.states.cols(); ++i) {
+    const VectorXd error = (projected.states.col(i) - accurate.states.col(i)).cwiseQuotient(size);
+    EXPECT_LT(error.lpNorm<Eigen::Infinity>(), 3e-6) << "row " << i;
+  }
+  EXPECT_LT(run(1e-11, true).start_displacement, 1e-12 * size.maxCoeff());
+}
+
+TEST_P(SimulateModel, IsTheSameToTheBitEachTime) {
+  const ModelFile& model = test::model(GetParam());
+  VectorXd start = test::draw(model, 1, 4).states.col(0);
+  start = start.array().isNaN().select(0, start);
+  const auto run = [&] { return simulate_model(model, start, with_tolerance(times(0.3, 7), 1e-7)); };
+  const Trajectory a = run(), b = run();
+  EXPECT_EQ(a.states, b.states);
+  EXPECT_EQ(a.accelerations, b.accelerations);
+}
+
+TEST(SimulateRedundant, ASliderCrankTurnsAsItDoesWithoutTheRedundantRow) {
+  const ModelFile& redundant = test::model("models/slider_crank.toml");
+  std::string text = redundant.text;
+  const std::string row = ",\n            \"(q3 - r*cos(q1))^2 + (r*sin(q1))^2 - l^2\"";
+  text.erase(text.find(row), row.size());
+  const ModelFile plain = ModelFile::parse(text, "plain.toml");
+  const VectorXd start = solved_state(plain, {{"q1", 0.3}, {"dq1", 5}});
+  ASSERT_GT(start[2], 0.3);  // the slider is on its side of the axle
+  for (const bool project : {true, false}) {
+    const auto options = with_tolerance(times(2, 41), 1e-9, project);
+    const Trajectory a = simulate_model(redundant, start, options), b = simulate_model(plain, start, options);
+    EXPECT_LT((a.states - b.states).cwiseAbs().maxCoeff(), 1e-6) << project;
+    EXPECT_GT((a.states.col(40) - a.states.col(0)).cwiseAbs().maxCoeff(), 1);
+    if (project) {
+      EXPECT_LE(a.max_position_drift, 1e-14);
+      EXPECT_LE(a.max_velocity_drift, 1e-13);
+    } else {
+      EXPECT_GT(a.max_position_drift, 1e-12);
+    }
+  }
+}
+
+TEST(SimulateUnicycle, RollsWithoutSlipAndNeedsNoPosition) {
+  const ModelFile& model = test::model("models/unicycle.toml");
+  SimulateOptions options = with_tolerance(times(20, 201), 1e-7);
+  options.inputs = InputSignal(Eigen::Vector3d(0, 5, 10), (MatrixXd(2, 3) << 0.3, 0.3, 0.3, 0, 0.02, -0.02).finished());
+  const Trajectory out = simulate_model(model, VectorXd::Zero(9), options);
+  EXPECT_EQ(out.max_position_drift, 0);  // it has no position constraint
+  EXPECT_LE(out.max_velocity_drift, 1e-14);
+  EXPECT_GT(out.states.topRows(3).rowwise().maxCoeff().minCoeff(), 0.5);  // it did move
+  // positions are the integral of velocities
+  for (int i = 1; i + 1 < out.states.cols(); ++i) {
+    const double dt = out.times[i + 1] - out.times[i];
+    for (int j = 0; j < 3; ++j) {
+      // Simpson's rule needs the middle; Hermite's uses accelerations: ∫dq = dt (dq₀ + dq₁)/2 + dt² (ddq₀ − ddq₁)/12 + O(dt⁵)
+      const double integral = dt * (out.states(3 + j, i) + out.states(3 + j, i + 1)) / 2 +
+                              dt * dt * (out.accelerations(j, i) - out.accelerations(j, i + 1)) / 12;
+      EXPECT_NEAR(out.states(j, i + 1) - out.states(j, i), integral, 1e-5);
+    }
+  }
+}
+
+TEST(SimulateDuffing, FollowsAConstraintThatMovesWithTime) {
+  const ModelFile& model = test::model("models/duffing.toml");
+  const VectorXd start = solved_state(model, {{"q2", 0.5}, {"dq2", 0}});
+  EXPECT_NEAR(start[2], 2 * M_PI, 1e-12);  // d/dt of A0 exp(−αt) sin(ωt) at 0
+  const Trajectory out = simulate_model(model, start, with_tolerance(times(5, 101), 1e-8));
+  for (int i = 0; i < out.states.cols(); ++i) {
+    EXPECT_NEAR(out.states(0, i) - out.states(1, i), std::exp(-0.3 * out.times[i]) * std::sin(2 * M_PI * out.times[i]), 1e-14);
+  }
+  EXPECT_LE(out.max_velocity_drift, 1e-13);
+}
+
+// ---- energy
+
+ModelFile pendulum() {
+  return ModelFile::parse(
+      "coordinates = [\"x\", \"y\"]\n[parameters]\nm = 2\nl = 1\n[mechanics]\nmass = [[\"m\", 0], [0, \"m\"]]\n"
+      "force = [0, \"-m*9.81\"]\npotential = \"m*9.81*y\"\n[constraints]\nposition = [\"x^2 + y^2 - l^2\"]\n",
+      "pendulum.toml");
+}
+
+TEST(SimulateEnergy, OfAnUndampedPendulumIsKeptToTheTolerance) {
+  const ModelFile model = pendulum();
+  const VectorXd start = solved_state(model, {{"x", 0.8}, {"y", -0.6}});
+  double before = 1;
+  for (const double tolerance : {1e-5, 1e-7, 1e-9}) {
+    const Trajectory out = simulate_model(model, start, with_tolerance(times(20, 401), tolerance));
+    const VectorXd energy = mechanical_energy(model, model.system->parameter_values(), out.states);
+    EXPECT_NEAR(energy[0], -2 * 9.81 * 0.6, 1e-13);
+    const double drift = (energy.array() - energy[0]).abs().maxCoeff();
+    EXPECT_LT(drift, 1e4 * tolerance);
+    EXPECT_LT(drift, before / 20);
+    before = drift;
+    EXPECT_LE(out.max_position_drift, 20 * test::eps);
+  }
+}
+
+TEST_P(SimulateModel, PotentialIsTheOneOfTheForcesThatWrite) {
+  // without inputs, speeds and [truth], a force field is −∂V/∂q
+  const ModelFile& model = test::model(GetParam());
+  if (!model.potential || test::stem(GetParam()) == "duffing") GTEST_SKIP() << "no potential of F alone";
+  VectorXd state = test::draw(model, 1, 3).states.col(0);
+  state = state.array().isNaN().select(0, state);
+  state.tail(state.size() - model.system->nq()).setZero();
+  const VectorXd parameters = model.system->parameter_values();
+  const VectorXd force = model.system->evaluate(state, parameters).F(0);
+  for (int j = 0; j < model.system->nq(); ++j) {
+    const auto energy = [&](double x) -> VectorXd {
+      VectorXd moved = state;
+      moved[j] = x;
+      return mechanical_energy(model, parameters, moved);
+    };
+    EXPECT_TRUE(test::matches(-force.segment(j, 1), test::central_difference(energy, state[j], 1))) << j;
+  }
+}
+
+TEST(SimulateEnergy, NeedsAPotential) {
+  const ModelFile& model = test::model("models/unicycle.toml");
+  EXPECT_THAT(input_error_of([&] { mechanical_energy(model, model.system->parameter_values(), VectorXd::Zero(9)); }),
+              HasSubstr("unicycle.toml: no energy without [mechanics] potential"));
+}
+
+// ---- the start
+
+TEST(SimulateStart, OffTheConstraintIsProjectedAndReported) {
+  VectorXd start = figure_start();
+  start[2] += 1e-3;
+  start[5] -= 2e-3;
+  const Trajectory out = simulate_model(surface(), start, with_tolerance(times(0.1, 3), 1e-6));
+  EXPECT_NEAR(out.start_position_residual, 1e-3, 1e-12);
+  EXPECT_GT(out.start_velocity_residual, 1e-3);
+  EXPECT_GT(out.start_displacement, 1e-4);
+  EXPECT_LE(out.start_displacement, 2e-3);
+  EXPECT_LE(out.max_position_drift, 1e-15);
+}
+
+TEST(SimulateStart, OffTheConstraintIsTakenAsItIsWithoutProjection) {
+  VectorXd start = figure_start();
+  start[2] += 1e-3;
+  const Trajectory out = simulate_model(surface(), start, with_tolerance(times(0.1, 3), 1e-6, false));
+  EXPECT_EQ(out.states.col(0).head(6), start.head(6));
+  EXPECT_EQ(out.start_displacement, 0);
+  EXPECT_NEAR(out.start_position_residual, 1e-3, 1e-12);
+  EXPECT_NEAR(out.max_position_drift, 1e-3, 1e-5);
+}
+
+TEST(SimulateStart, IsMovedAsLittleAsCanBeInTheMetricOfM) {
+  // a bead on a line x + y = 0 whose second coordinate is 9 times as heavy: it moves a ninth as far
+  const ModelFile model = ModelFile::parse(
+      "coordinates = [\"x\", \"y\"]\n[mechanics]\nmass = [[1, 0], [0, 9]]\n[constraints]\nposition = [\"x + y\"]\n", "line.toml");
+  const VectorXd moved = project_onto_constraints(*model.system, VectorXd(), state_of(model, {{"x", 1}, {"dy", 10}}));
+  EXPECT_NEAR(moved[0], 0.1, 1e-15);
+  EXPECT_NEAR(moved[1], -0.1, 1e-15);
+  EXPECT_NEAR(moved[2], -9, 1e-14);
+  EXPECT_NEAR(moved[3], 9, 1e-14);
+}
+
+TEST(SimulateStart, KeepsWhatIsHeld) {
+  const ModelFile& model = test::model("models/double_pendulum.toml");
+  const VectorXd state = solved_state(model, {{"q3", 2.5}, {"q6", 4}, {"dq3", 1}, {"dq6", -3}});
+  EXPECT_EQ(state[2], 2.5);
+  EXPECT_EQ(state[5], 4);
+  EXPECT_EQ(state[8], 1);
+  EXPECT_EQ(state[11], -3);
+  EXPECT_LT(model.system->residuals(state, model.system->parameter_values()).lpNorm<Eigen::Infinity>(), 1e-15);
+}
+
+TEST(SimulateStart, ThatCannotBePutOnTheConstraintSaysWhere) {
+  const ModelFile model = pendulum();
+  // x = 2 is out of reach of a rod of 1 m
+  EXPECT_THAT(numerical_error_of([&] {
+                solved_state(model, {{"x", 2}});
+              }),
+              AllOf(HasSubstr("the projection onto the constraints did not converge at t = 0: \"x^2 + y^2 - l^2\" is off by")));
+  EXPECT_THAT(numerical_error_of([&] { solved_state(model, {{"x", 2}, {"y", 0}}); }), HasSubstr("is off by 3"));
+  EXPECT_EQ(input_error_of([&] { project_onto_constraints(*model.system, VectorXd::Zero(2), VectorXd::Zero(3)); }),
+            "project_onto_constraints: a state of 'pendulum.toml' has 5 entries, got 3");
+  EXPECT_EQ(input_error_of([&] { project_onto_constraints(*model.system, VectorXd::Zero(2), VectorXd::Zero(5), {true}); }),
+            "project_onto_constraints: a state of 'pendulum.toml' has 5 entries, got 5 and 1 marks of what is held");
+}
+
+// ---- faults
+
+TEST(SimulateFaults, WrongOptionsAreRefused) {
+  const ModelFile model = oscillator();
+  const VectorXd start = VectorXd::Zero(4);
+  const auto refusal = [&](const std::function<void(SimulateOptions&)>& change) {
+    SimulateOptions options = with_tolerance(times(1, 2), 1e-6);
+    change(options);
+    return input_error_of([&] { simulate_model(model, start, options); });
+  };
+  EXPECT_EQ(refusal([](auto& o) { o.times = times(1, 1); }),
+            "simulate: at least two times are needed, the start and the end, got 1");
+  EXPECT_EQ(refusal([](auto& o) { o.times = Eigen::Vector2d(1, 0.5); }), "simulate: times must increase, but 0.5 follows 1");
+  EXPECT_EQ(refusal([](auto& o) { o.times[1] = NAN; }), "simulate: a time is not a finite number");
+  EXPECT_EQ(refusal([](auto& o) { o.relative_tolerance = 0; }), "simulate: the relative tolerance must be positive, got 0");
+  EXPECT_EQ(refusal([](auto& o) { o.absolute_tolerance = NAN; }), "simulate: the absolute tolerance must be positive, got nan");
+  EXPECT_EQ(refusal([](auto& o) { o.initial_step = -1; }), "simulate: the initial step must not be negative, got -1");
+  EXPECT_EQ(refusal([](auto& o) { o.max_steps = 0; }), "simulate: max_steps must be at least 1, got 0");
+  const SimulateOptions good = with_tolerance(times(1, 2), 1e-6);
+  EXPECT_EQ(input_error_of([&] { simulate_model(model, VectorXd::Zero(3), good); }),
+            "simulate: the start must be a state of 4 entries, coordinates and velocities finite");
+  EXPECT_EQ(input_error_of([&] { simulate_model(model, Eigen::Vector4d(NAN, 0, 0, 0), good); }),
+            "simulate: the start must be a state of 4 entries, coordinates and velocities finite");
+  EXPECT_EQ(input_error_of([&] { simulate(*model.system, VectorXd::Zero(1), model_acceleration(model), start, good); }),
+            "simulate: 'oscillator.toml' has 0 parameters, got 1");
+  EXPECT_EQ(input_error_of([&] {
+              simulate(
+                  *model.system, VectorXd(), [](const auto&) { return VectorXd::Zero(2); }, start, good);
+            }),
+            "simulate: the acceleration has 2 entries, the system 1 coordinates");
+}
+
+// accelerations of a free body, of a function of [x; dx; t; u]
+std::string fault_of(const std::function<double(const VectorXd&)>& acceleration, const SimulateOptions& options) {
+  const ModelFile model = oscillator();
+  return numerical_error_of([&] {
+    simulate(
+        *model.system, VectorXd(), [&](const auto& x) { return VectorXd::Constant(1, acceleration(x)); },
+        Eigen::Vector4d(1, 1, 0, 0), options);
+  });
+}
+
+TEST(SimulateFaults, AccelerationsThatAreNotFiniteNameTheTime) {
+  const SimulateOptions options = with_tolerance(times(3, 4), 1e-6);
+  EXPECT_EQ(fault_of([](const VectorXd&) { return NAN; }, options),
+            "simulate: no acceleration at t = 0: the acceleration is not a finite number");
+  EXPECT_THAT(
+      fault_of([](const VectorXd& x) { return x[2] > 1.5 ? INFINITY : 0.0; }, options),
+      AllOf(StartsWith("simulate: the step size fell to"), HasSubstr("s at t = 1.5: the acceleration is not a finite number")));
+  EXPECT_THAT(fault_of([](const VectorXd& x) -> double { throw InputError(fmt::format("no mass at {:.2g}", x[2])); }, options),
+              "simulate: no acceleration at t = 0: no mass at 0");
+}
+
+TEST(SimulateFaults, AMotionThatEndsInASingularityNamesTheTime) {
+  // ẋ = x², from x = 1: infinite at t = 1
+  EXPECT_THAT(fault_of([](const VectorXd& x) { return 2 * x[0] * x[1]; }, with_tolerance(times(3, 4), 1e-6)),
+              AllOf(StartsWith("simulate: the step size fell to"), HasSubstr("s at t = 1: ")));
+}
+
+TEST(SimulateFaults, AJumpThatTheTolerancesCannotMeetIsReported) {
+  // an acceleration that chatters faster than any step
+  int call = 0;
+  EXPECT_THAT(fault_of([&](const VectorXd&) { return ++call % 2 == 0 ? 1e12 : -1e12; }, with_tolerance(times(1, 2), 1e-12)),
+              AllOf(StartsWith("simulate: the step size fell to"), HasSubstr("the tolerances cannot be met there")));
+}
+
+TEST(SimulateFaults, TooManyStepsNameTheTimeReached) {
+  SimulateOptions options = with_tolerance(times(100, 2), 1e-10);
+  options.max_steps = 50;
+  EXPECT_THAT(fault_of([](const VectorXd& x) { return -x[0]; }, options),
+              AllOf(StartsWith("simulate: 50 steps reach no further than t = "),
+                    HasSubstr("of 100: loosen the tolerances, or allow more steps")));
+}
+
+TEST(SimulateFaults, ASmallerStepIsTriedBeforeGivingUp) {
+  // stages of the first, far too large step lie where there is no acceleration
+  const ModelFile model = oscillator();
+  SimulateOptions options = with_tolerance(times(1, 2), 1e-8);
+  options.initial_step = 1;
+  const Trajectory out = simulate(
+      *model.system, VectorXd(), [](const auto& x) { return VectorXd::Constant(1, x[0] > 1.3 ? NAN : -30 * x[0]); },
+      Eigen::Vector4d(1, 2, 0, 0), options);
+  EXPECT_GT(out.rejected_steps, 0);
+  EXPECT_NEAR(out.states(0, 1), std::cos(std::sqrt(30)) + 2 / std::sqrt(30) * std::sin(std::sqrt(30)), 1e-6);
+}
+
+// ---- a learned model
+
+TEST(SimulatePosterior, StaysOnTheConstraintAndDriftsNoMoreThanTheAnalyticModelWithoutProjection) {
+  // GP² with plausible hyperparameters, not fitted: the drift has nothing to do with how good it is
+  const ModelFile& model = surface();
+  const Prior prior = make_prior(model);
+  const GeneratedData data = generate(model, {100, 1, VectorXd::Constant(3, 0.1)});
+  const Observations observations{data.states, View::all(View::Quantity::constrained_acceleration, *model.system),
+                                  data.accelerations, VectorXd::Constant(3, 0.1)};
+  ModelValues values;
+  values.kernel = {VectorXd::Constant(prior.latents[0].n_features(), 3.0)};
+  values.signal_stddev = {VectorXd::Constant(3, 5.0)};
+  values.noise_stddev = {VectorXd::Constant(3, 0.1)};
+  values.parameters = model.system->parameter_values();
+  const Posterior posterior(prior, {observations}, values);
+  const View view = View::all(View::Quantity::constrained_acceleration, *model.system);
+  const Acceleration learned = [&](const auto& state) -> VectorXd { return posterior.mean(view, state).col(0); };
+  const auto run = [&](const Acceleration& acceleration, double t_end, double tolerance, bool project) {
+    return simulate(*model.system, values.parameters, acceleration, figure_start(),
+                    with_tolerance(times(t_end, 101), tolerance, project));
+  };
+
+  for (const double t_end : {6.0, 600.0}) {
+    const Trajectory out = run(learned, t_end, 1e-6, true);
+    EXPECT_LE(out.max_position_drift, 1e-12);
+    EXPECT_LE(out.max_velocity_drift, 1e-12);
+  }
+  for (const double tolerance : {1e-5, 1e-6, 1e-7}) {
+    const double drift = run(learned, 6, tolerance, false).max_position_drift;
+    const double analytic = run(model_acceleration(model), 6, tolerance, false).max_position_drift;
+    RecordProperty(fmt::format("drift_at_{}", tolerance), fmt::format("{:.3g} against {:.3g}", drift, analytic));
+    EXPECT_LE(drift, 2 * analytic) << tolerance;
+    EXPECT_GT(drift, 0);
+  }
+  const double order = order_of_drift([&](double tolerance) { return run(learned, 6, tolerance, false); }, 1e-6, 1e-10);
+  EXPECT_GT(order, 4.5);
+  EXPECT_LT(order, 7);
+}
+
+}  // namespace
+}  // namespace gp2
