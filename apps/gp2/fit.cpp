@@ -22,8 +22,8 @@ namespace {
 using Json = nlohmann::ordered_json;
 
 struct Arguments {
-  std::string model, map, observe, mean = "zero", prior, baseline, noise, protocol = "default", hyperprior = "default", start,
-                                   output;
+  std::string model, map, observe, mean = "zero", prior, baseline, noise, protocol = "default", hyperprior = "default",
+                                   discrepancy = "default", start, output;
   std::vector<std::string> data, also;
   std::optional<double> also_noise, time_step;
   std::optional<std::string> estimate;
@@ -55,6 +55,7 @@ FitProblemOptions problem_options(const Arguments& arguments) {
   }
   options.protocol.name = arguments.protocol == "paper" ? Protocol::Name::paper : Protocol::Name::standard;
   options.protocol.hyperprior = arguments.hyperprior == "default";
+  options.discrepancy = arguments.discrepancy == "default";
   options.max_points = arguments.max_points;
   options.also_noise_stddev = arguments.also_noise;
   options.time_step = arguments.time_step;
@@ -246,6 +247,10 @@ void add_fit(CLI::App& app) {
       ->check(CLI::IsMember({"default", "paper"}))
       ->capture_default_str();
   command->add_option("--hyperprior", a->hyperprior, "weak log-normal hyper-priors, or none: maximum likelihood")
+      ->check(CLI::IsMember({"default", "none"}))
+      ->capture_default_str();
+  command
+      ->add_option("--discrepancy", a->discrepancy, "a small latent for what the kernel would rule out (docs/priors.md), or none")
       ->check(CLI::IsMember({"default", "none"}))
       ->capture_default_str();
   command->add_option("--restarts", a->restarts,

@@ -38,6 +38,9 @@ struct FitProblemOptions {
   std::optional<double> noise_stddev;                // for every observed row; not given: the model's [noise]
   bool estimate_noise = false;
   Protocol protocol;
+  /// A discrepancy latent beside the model's one, where that acts in every direction, under the standard protocol with
+  /// hyper-priors.
+  bool discrepancy = true;
   std::optional<int> max_points;            // of each log: the first of a shuffle by `seed`
   std::optional<double> also_noise_stddev;  // of every row that is known; not given: [noise], where it is an acceleration
   std::optional<double> time_step;          // Δt of a known next velocity

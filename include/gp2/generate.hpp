@@ -28,7 +28,8 @@ struct GenerateOptions {
 };
 
 /// Draws states, solving the constraints for coordinates and velocities that [sampling] leaves open, and measures them.
-/// @throws InputError when the grid leaves out a range or names another; when [sampling] or [truth] is missing, leaves open what the constraints do not decide, or puts a state off
+/// @throws InputError when the grid leaves out a range or names another; when [sampling] or [truth] is missing, leaves open what
+/// the constraints do not decide, or puts a state off
 ///   the constraints; when n < 1 or noise_stddev is not of nq finite numbers ≥ 0.
 /// @throws NumericalError when Newton's method does not reach the constraints.
 GeneratedData generate(const ModelFile& model, const GenerateOptions& options);

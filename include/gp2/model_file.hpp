@@ -71,11 +71,20 @@ class ModelFile {
   friend class ModelReader;
 };
 
+/// What the model's kernel would rule out without reason: a second latent of fixed, short lengthscales and a size below the
+/// noise. It hardly moves the mean, but keeps a standard deviation where the fit would call an effect absent that the data cannot
+/// see.
+struct Discrepancy {
+  Eigen::VectorXd lengthscale;  // of each feature of the model's latent (D)
+  Eigen::VectorXd stddev;       // of each acceleration (nq)
+};
+
 struct PriorOptions {
   Prior::Mean mean = Prior::Mean::zero;
   std::optional<Latent::Base> base;       // replaces the directions of the model's latent by the identity or M⁻¹
   bool raw_angles = false;                // a feature that is an angle stays as it is instead of its sine and cosine
   std::optional<Baseline> baseline = {};  // replaces latents, mean, constraints; of the model it keeps the features, angles raw
+  std::optional<Discrepancy> discrepancy = {};  // beside the model's one latent
 };
 
 /// The prior of a model file. Not to be called from several threads for one model: its expression graph grows.

@@ -44,6 +44,7 @@ struct Latent {
   bool directions_are_identity = true;      // B = I, p = nq
   std::optional<int> learned_rank;          // columns of W; not given: C = diag(s)
   bool kernel_is_fixed = false;             // the kernel's parameters are 1, in the units that its features have
+  bool signal_is_fixed = false;             // s = 1, in the units that its directions have
   Range lengthscale, signal_stddev;
 
   [[nodiscard]] int size() const { return static_cast<int>(column_names.size()); }  // p

@@ -63,7 +63,9 @@ struct Protocol {
     static constexpr double shape_log_stddev = 1.5;  // of α, periods and relative amplitudes
     static constexpr double noise_lower = 1e-6, noise_upper = 2;
     static constexpr double noise_log_stddev = 2;
-    static constexpr double start_log_stddev = 1.5;  // of random starts about the first one
+    static constexpr double discrepancy_lengthscale = 1.25;  // of the feature's spread
+    static constexpr double discrepancy_stddev = 0.4;        // of the noise
+    static constexpr double start_log_stddev = 1.5;          // of random starts about the first one
   };
 };
 
@@ -73,6 +75,7 @@ struct Scales {
   std::vector<Eigen::VectorXd> feature_range;   // per latent (D), largest minus smallest
   std::vector<Eigen::VectorXd> signal_stddev;   // per latent (p): σ_j, M_jj σ_j, or σ̄ / rms(E column)
   std::vector<Eigen::VectorXd> output_stddev;   // per Observations (d)
+  Eigen::VectorXd acceleration_stddev;          // σ (nq)
 };
 
 /// σ_j = std of the observed ddq_j; for an unobserved j, σ_j = √(mean over observed i of M_ii σ_i²/M_jj), M at its median.
@@ -139,8 +142,8 @@ struct Fit {
 /// Maximises the posterior density of the hyperparameters (marginal likelihood times hyper-priors) by L-BFGS-B from several
 /// starting points. From the best optimum each hyperparameter is then scanned over its box by itself, the others held, and the
 /// optimiser runs again from the lowest point found: an optimum in a corner of the box often hides a lower one. The prior is
-/// conditioned there. Mixing matrices that start at zero, a stationary point, stay there in every run and are let go from the best.
-/// Same seed, same bits, for any number of threads.
+/// conditioned there. Mixing matrices that start at zero, a stationary point, stay there in every run and are let go from the
+/// best. Same seed, same bits, for any number of threads.
 ///
 /// @throws InputError, NumericalError  as Likelihood and Posterior; NumericalError when no restart reached a finite likelihood.
 Fit fit(const Prior& prior, const std::vector<Observations>& observations, const std::vector<Hyperparameter>& hyperparameters,

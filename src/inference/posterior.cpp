@@ -67,6 +67,11 @@ VectorXd mean_at(const Posterior::Implementation& self, const Query& query, int 
   return query.view.G(i) * a_bar + query.view.offset.col(i);
 }
 
+// covariance − crossᵀ cross, in the lower triangle; without observations Eigen would divide by 0
+void subtract_explained(MatrixXd& covariance, const MatrixXd& cross) {
+  if (cross.rows() > 0) covariance.selfadjointView<Eigen::Lower>().rankUpdate(cross.transpose(), -1);
+}
+
 // Every latent function at a set of points, stacked: function l of latent a at point j stands at first[a] + l·points + j.
 struct LatentPoints {
   std::vector<MatrixXd> features;          // per latent (points × D), each point once
@@ -136,7 +141,7 @@ LatentGaussian latent_posterior(const Posterior::Implementation& self, const Lat
     }
   }
   lapack::solve_lower(self.L, false, cross);
-  out.covariance.selfadjointView<Eigen::Lower>().rankUpdate(cross.transpose(), -1);
+  subtract_explained(out.covariance, cross);
   return out;
 }
 
@@ -258,7 +263,7 @@ Posterior::Joint Posterior::joint(const std::vector<ViewAt>& quantities) const {
     }
   }
   lapack::solve_lower(self.L, false, cross);
-  joint.covariance.selfadjointView<Eigen::Lower>().rankUpdate(cross.transpose(), -1);
+  subtract_explained(joint.covariance, cross);
   joint.covariance.triangularView<Eigen::StrictlyUpper>() = joint.covariance.transpose();
   return joint;
 }

@@ -175,7 +175,7 @@ void check_hyperparameters(const std::vector<Hyperparameter>& hyperparameters, c
     if (latent.learned_rank) {
       add(open, Kind::mixing, a, latent.column_names.size() * static_cast<std::size_t>(*latent.learned_rank));
       add(open, Kind::sqrt_kappa, a, latent.column_names.size());
-    } else {
+    } else if (!latent.signal_is_fixed) {
       add(open, Kind::signal_stddev, a, latent.column_names.size());
     }
   }
@@ -214,6 +214,14 @@ Json baseline_json(const Baseline& baseline) {
           {"output_mean", vector_json(baseline.output_mean)},
           {"feature_mean", vector_json(baseline.feature_mean)},
           {"feature_stddev", vector_json(baseline.feature_stddev)}};
+}
+
+Discrepancy discrepancy_from(const Json& json) {
+  Discrepancy discrepancy{vector_from(json.at("lengthscale")), vector_from(json.at("stddev"))};
+  if (!(discrepancy.lengthscale.array() > 0).all() || !(discrepancy.stddev.array() > 0).all()) {
+    throw InputError("lengthscale and stddev of the discrepancy must be positive");
+  }
+  return discrepancy;
 }
 
 Baseline baseline_from(const Json& json) {
@@ -324,6 +332,10 @@ void FitFile::write(const std::filesystem::path& path) const {
                    {"directions", name_of(directions, prior_options.base)},
                    {"raw_angles", prior_options.raw_angles}};
   if (prior_options.baseline) json["prior"]["baseline"] = baseline_json(*prior_options.baseline);
+  if (prior_options.discrepancy) {
+    json["prior"]["discrepancy"] = {{"lengthscale", vector_json(prior_options.discrepancy->lengthscale)},
+                                    {"stddev", vector_json(prior_options.discrepancy->stddev)}};
+  }
   json["hyperparameters"] = Json::array();
   for (const Hyperparameter& h : report.hyperparameters) json["hyperparameters"].push_back(hyperparameter_json(h));
   json["report"] = {{"nll", report.negative_log_likelihood},
@@ -366,6 +378,7 @@ FitFile FitFile::read(const std::filesystem::path& path) {
     fit.prior_options.mean = choice_from(prior_json.at("mean"), means, "prior mean");
     fit.prior_options.base = choice_from(prior_json.at("directions"), directions, "choice of directions");
     prior_json.at("raw_angles").get_to(fit.prior_options.raw_angles);
+    if (prior_json.contains("discrepancy")) fit.prior_options.discrepancy = discrepancy_from(prior_json.at("discrepancy"));
     if (prior_json.contains("baseline")) fit.prior_options.baseline = baseline_from(prior_json.at("baseline"));
     json.at("data_source").get_to(fit.data_source);
     const Prior prior = fit.prior();

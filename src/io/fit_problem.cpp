@@ -355,6 +355,35 @@ void note_parameters(const ModelFile& home, const Place& place, const std::vecto
   }
 }
 
+bool has_discrepancy(const FitProblem& problem, const FitProblemOptions& options) {
+  const bool standard = options.protocol.name == Protocol::Name::standard && options.protocol.hyperprior;
+  return options.discrepancy && standard && problem.prior.latents.size() == 1 &&
+         problem.prior.latents.front().directions_are_identity;
+}
+
+// a share of the noise, as the fit starts with it, in each acceleration; where one is not measured, of its spread the same share
+// as in the others
+Discrepancy discrepancy_of(const FitProblem& problem) {
+  const Scales scales = default_scales(problem.prior, problem.observations);
+  VectorXd noise = VectorXd::Zero(scales.acceleration_stddev.size());
+  double share = 0;
+  int n_shares = 0;
+  for (const Observations& group : problem.observations) {
+    if (group.view.quantity != View::Quantity::constrained_acceleration) continue;
+    for (Index k = 0; k < group.noise_stddev.size(); ++k) {
+      const int row = group.view.rows[static_cast<std::size_t>(k)];
+      noise[row] = std::max(noise[row], group.noise_stddev[k]);
+      share += group.noise_stddev[k] / scales.acceleration_stddev[row];
+      ++n_shares;
+    }
+  }
+  for (Index j = 0; j < noise.size(); ++j) {
+    if (noise[j] == 0) noise[j] = share / n_shares * scales.acceleration_stddev[j];
+  }
+  return {Protocol::Standard::discrepancy_lengthscale * scales.feature_stddev.front(),
+          Protocol::Standard::discrepancy_stddev * noise};
+}
+
 }  // namespace
 
 std::vector<int> acceleration_rows(const System& system, const std::vector<std::string>& names, const std::string& option) {
@@ -443,6 +472,14 @@ FitProblem make_fit_problem(const ModelFile& model, const std::vector<Log>& logs
       Observations group = read_knowledge(place, problem.prior, knowledge, options, problem.notes);
       group.noise_stddev = noise_of_knowledge(place, knowledge, options, group, signal_stddev);
       problem.observations.push_back(std::move(group));
+    }
+  }
+  if (has_discrepancy(problem, options)) {
+    problem.prior_options.discrepancy = discrepancy_of(problem);
+    problem.prior = make_prior(model, problem.prior_options);
+    for (std::size_t g = 0; g < problem.observations.size(); ++g) {
+      const std::shared_ptr<const ModelFile>& other = problem.systems[g];
+      if (other) problem.observations[g].view.setting = make_setting(model, *other, problem.prior_options);
     }
   }
   problem.hyperparameters = default_hyperparameters(problem.prior, problem.observations, estimate, options.protocol);

@@ -72,6 +72,40 @@ Expression ModelFile::expression(std::string_view written) const {
       symbol_names_);
 }
 
+namespace {
+
+// features in units of the lengthscales, directions of the standard deviations: nothing is left to tune
+Latent make_discrepancy(const SymbolicSystem& system, const SystemSymbols& symbols, const Latent& beside,
+                        std::vector<Expression> features, const Discrepancy& discrepancy) {
+  ExpressionGraph& graph = *system.definition().graph;
+  if (discrepancy.lengthscale.size() != beside.n_features() || discrepancy.stddev.size() != system.nq()) {
+    throw InputError(fmt::format("a discrepancy must hold {} lengthscales and {} standard deviations, got {} and {}",
+                                 beside.n_features(), system.nq(), discrepancy.lengthscale.size(), discrepancy.stddev.size()));
+  }
+  Latent latent;
+  latent.name = "discrepancy";
+  latent.feature_names = beside.feature_names;
+  latent.feature_parameters = beside.feature_parameters;
+  for (std::size_t d = 0; d < features.size(); ++d) {
+    features[d] = features[d] / graph.constant(discrepancy.lengthscale[static_cast<Eigen::Index>(d)]);
+  }
+  latent.features = Tape(features, symbols.state());
+  latent.kernel = Kernel::parse("se", latent.feature_names);
+  latent.kernel_is_fixed = latent.signal_is_fixed = true;
+  const int nq = system.nq();
+  std::vector<Expression> directions(static_cast<std::size_t>(nq) * static_cast<std::size_t>(nq), graph.constant(0));
+  latent.direction_derivatives.assign(system.parameters().size(), Tape(directions, symbols.state_and_parameters()));
+  for (int j = 0; j < nq; ++j) {
+    latent.column_names.push_back(system.coordinates()[static_cast<std::size_t>(j)].acceleration());
+    directions[static_cast<std::size_t>(j * nq + j)] = graph.constant(discrepancy.stddev[j]);
+  }
+  latent.directions_are_identity = false;
+  latent.directions = Tape(directions, symbols.state_and_parameters());
+  return latent;
+}
+
+}  // namespace
+
 Prior make_prior(const ModelFile& model, const PriorOptions& options) {
   if (options.baseline) return make_baseline_prior(model, *options.baseline);
   const SymbolicSystem& system = *model.system;
@@ -89,6 +123,7 @@ Prior make_prior(const ModelFile& model, const PriorOptions& options) {
   for (const Parameter& parameter : system.parameters())
     parameter_values.emplace(parameter.name, graph.constant(parameter.value));
 
+  std::optional<Latent> discrepancy;
   Prior prior{model.system, {}, options.mean, {}};
   for (const ModelFile::LatentText& text : model.latents) {
     Latent latent;
@@ -111,6 +146,10 @@ Prior make_prior(const ModelFile& model, const PriorOptions& options) {
     latent.features = Tape(features, symbols.state());
     latent.kernel = Kernel::parse(text.kernel, latent.feature_names);
 
+    if (options.discrepancy && &text == &model.latents.front()) {
+      discrepancy = make_discrepancy(system, symbols, latent, features, *options.discrepancy);
+    }
+
     latent.directions_are_identity = text.directions.empty() || options.base.has_value();
     if (latent.directions_are_identity) {
       for (const Coordinate& coordinate : system.coordinates()) {
@@ -132,6 +171,7 @@ Prior make_prior(const ModelFile& model, const PriorOptions& options) {
     }
     prior.latents.push_back(std::move(latent));
   }
+  if (discrepancy) prior.latents.push_back(std::move(*discrepancy));
   return prior;
 }
 

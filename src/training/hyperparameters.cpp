@@ -155,6 +155,7 @@ Scales default_scales(const Prior& prior, const std::vector<Observations>& obser
     }
     scales.output_stddev.push_back(std::move(stddev));
   }
+  scales.acceleration_stddev = sigma;
   return scales;
 }
 
@@ -255,8 +256,12 @@ std::vector<Hyperparameter> default_hyperparameters(const Prior& prior, const st
   const Scales scales = default_scales(prior, observations);
   const System& system = *prior.system;
   std::vector<Hyperparameter> out;
+  const auto is_fixed = [](const Latent& latent) { return latent.kernel_is_fixed && latent.signal_is_fixed; };
+  const auto n_fixed = std::count_if(prior.latents.begin(), prior.latents.end(), is_fixed);
+  const bool one_is_tuned = static_cast<std::ptrdiff_t>(prior.latents.size()) - n_fixed == 1;
   for (std::size_t a = 0; a < prior.latents.size(); ++a) {
-    const std::string prefix = prior.latents.size() == 1 ? "" : prior.latents[a].name + ".";
+    if (is_fixed(prior.latents[a])) continue;
+    const std::string prefix = one_is_tuned ? "" : prior.latents[a].name + ".";
     add_kernel_parameters(prior.latents[a], static_cast<int>(a), prefix, scales, protocol, out);
     add_signal_stddevs(prior.latents[a], static_cast<int>(a), prefix, scales, protocol, out);
   }

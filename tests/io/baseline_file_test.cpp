@@ -29,8 +29,7 @@ FitFile fit_of(Baseline::Kind kind) {
   const GeneratedData data = generate(fit.model, {8, 3, noise_stddev});
   fit.observations.push_back({data.states, View::all(View::Quantity::constrained_acceleration, *fit.model.system),
                               data.accelerations, noise_stddev, false});
-  Index n_features = 0;
-  for (const std::string& feature : fit.model.latents.front().features) n_features += feature.empty() ? 0 : 1;
+  const auto n_features = static_cast<Index>(fit.model.latents.front().features.size());
   fit.prior_options.raw_angles = true;
   fit.prior_options.baseline = {kind, VectorXd::Zero(fit.model.system->nq()), VectorXd::Zero(n_features),
                                 VectorXd::Ones(n_features)};
@@ -72,7 +71,6 @@ TEST(BaselineFile, ThatIsDamagedIsRefused) {
     const auto path = folder.write("damaged.json", json.dump());
     return test::input_error_of([&] { FitFile::read(path); });
   };
-  Json same = whole;
   EXPECT_EQ(refusal([](Json&) {}), "");
   EXPECT_THAT(refusal([](Json& j) { j["prior"]["baseline"]["kind"] = "gp"; }),
               AllOf(HasSubstr("damaged.json"), HasSubstr("'gp' is no baseline"), HasSubstr("se, icm, lmc")));
