@@ -1,4 +1,4 @@
-# Installs the library, its headers, the command, the models, and the package that find_package(gp2) reads.
+# Installs the library, its headers, the command, the models, the experiments, and the package that find_package(gp2) reads.
 option(GP2_INSTALL "Install gp2 along with the project" ${PROJECT_IS_TOP_LEVEL})
 if(NOT GP2_INSTALL)
   return()
@@ -11,6 +11,8 @@ set(gp2_cmake_dir ${CMAKE_INSTALL_LIBDIR}/cmake/gp2)
 install(TARGETS gp2 EXPORT gp2Targets)
 install(DIRECTORY ${PROJECT_SOURCE_DIR}/include/gp2 DESTINATION ${CMAKE_INSTALL_INCLUDEDIR} FILES_MATCHING PATTERN "*.hpp")
 install(DIRECTORY ${PROJECT_SOURCE_DIR}/models/ DESTINATION ${CMAKE_INSTALL_DATADIR}/gp2/models FILES_MATCHING PATTERN "*.toml")
+install(DIRECTORY ${PROJECT_SOURCE_DIR}/experiments/ DESTINATION ${CMAKE_INSTALL_DATADIR}/gp2/experiments
+        FILES_MATCHING PATTERN "*.toml" PATTERN "*.gp")
 install(FILES ${PROJECT_SOURCE_DIR}/LICENSE ${PROJECT_SOURCE_DIR}/THIRD_PARTY.md DESTINATION ${CMAKE_INSTALL_DOCDIR})
 if(TARGET gp2_command)
   set_target_properties(gp2_command PROPERTIES INSTALL_RPATH "$ORIGIN/../${CMAKE_INSTALL_LIBDIR}")

@@ -29,6 +29,9 @@ void add_reproduce(CLI::App& app);
 /// @throws InputError when it is not of that form.
 std::map<std::string, std::string> parse_map(const std::string& text);
 
+/// A cell of a CSV file that reads back as `text`.
+std::string csv_cell(const std::string& text);
+
 /// Columns: the entries of a state that the model reads, then the accelerations.
 std::string to_csv(const GeneratedData& data, const System& system);
 

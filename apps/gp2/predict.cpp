@@ -99,15 +99,6 @@ void add_samples(NewColumns& columns, const Posterior& posterior, const View& vi
   }
 }
 
-// a cell that reads back as `text`
-std::string quoted(const std::string& text) {
-  const bool plain = text.find_first_of(",\"") == std::string::npos && !text.starts_with(' ') && !text.ends_with(' ');
-  if (plain) return text;
-  std::string cell = "\"";
-  for (char c : text) cell.append(c == '"' ? 2 : 1, c);  // a quote is written twice
-  return cell += '"';
-}
-
 // Input columns of the names of new ones become NAME_input; NAME_input_input where the input is itself such an output.
 std::vector<std::string> kept_names(const std::vector<std::string>& input, const std::vector<std::string>& added) {
   const auto holds = [](const std::vector<std::string>& names, const std::string& name) {
@@ -131,11 +122,11 @@ std::string joined(const CsvTable& input, const NewColumns& added) {
     csv += fmt::format("{}\n", fmt::join(line, ","));
     line.clear();
   };
-  for (const std::string& name : kept_names(input.header(), added.names)) line.push_back(quoted(name));
+  for (const std::string& name : kept_names(input.header(), added.names)) line.push_back(csv_cell(name));
   line.insert(line.end(), added.names.begin(), added.names.end());
   end_line();
   for (int i = 0; i < input.n_rows(); ++i) {
-    for (int column = 0; column < input.n_columns(); ++column) line.push_back(quoted(input.cell(i, column)));
+    for (int column = 0; column < input.n_columns(); ++column) line.push_back(csv_cell(input.cell(i, column)));
     for (const double value : added.values.col(i)) line.push_back(shortest(value));
     end_line();
   }

@@ -194,23 +194,26 @@ void add_sample_gradient(const Likelihood::Options& options, const std::vector<O
     mean += E * latent_mean[a].row(i).transpose();
   }
   const MatrixXd d_W = sample.Q * V_E - sample.e_out * mean.transpose();
+  const auto G = model.values.view.G(sample.index);
 
   // S^{-1/2} scales the rows of W and e
   if (options.noise_gradient) {
-    const MatrixXd W = whitening.asDiagonal() * model.values.view.G(sample.index);
+    const MatrixXd W = whitening.asDiagonal() * G;
     gradient.noise_stddev[group].array() += 1 - d_e.array() * sample.e.array() - d_W.cwiseProduct(W).rowwise().sum().array();
   }
+  if (options.gradient_parameters.empty()) return;
+
+  // e = S^{-1/2}(y − d − Gμ) and W = S^{-1/2}G: ∂NLL/∂d, ∂NLL/∂G, ∂NLL/∂μ and ∂NLL/∂E
+  const VectorXd d_offset = -whitening.cwiseProduct(d_e);
+  const MatrixXd d_G = whitening.asDiagonal() * d_W + d_offset * model.values.prior.mean.col(sample.index).transpose();
+  const VectorXd d_mean = G.transpose() * d_offset;
+  std::vector<MatrixXd>& d_E = V;
+  for (std::size_t a = 0; a < d_E.size(); ++a) d_E[a] = sample.R.transpose() * V[a] * values.loading(a).transpose();
   for (std::size_t p = 0; p < options.gradient_parameters.size(); ++p) {
     const ObservationModel::Values& d = model.derivatives[p];
-    const auto dG = d.view.G(sample.index);
-    // de = −S^{-1/2}(dd + dG μ + G dμ)
-    const VectorXd de = -whitening.cwiseProduct(d.view.offset.col(sample.index) + dG * model.values.prior.mean.col(sample.index) +
-                                                model.values.view.G(sample.index) * d.prior.mean.col(sample.index));
-    double slope = d_e.dot(de) + d_W.cwiseProduct(whitening.asDiagonal() * dG).sum();
-    for (std::size_t a = 0; a < all_V.size(); ++a) {
-      const MatrixXd dE = d.prior.E(a, sample.index) * values.loading(a);
-      slope += (sample.R.transpose() * V[a]).cwiseProduct(dE).sum();
-    }
+    double slope = d_offset.dot(d.view.offset.col(sample.index)) + d_G.cwiseProduct(d.view.G(sample.index)).sum() +
+                   d_mean.dot(d.prior.mean.col(sample.index));
+    for (std::size_t a = 0; a < d_E.size(); ++a) slope += d_E[a].cwiseProduct(d.prior.E(a, sample.index)).sum();
     gradient.parameters[options.gradient_parameters[p]] += slope;
   }
 }

@@ -218,13 +218,16 @@ std::string difference(const Prior& home, const Prior& other) {
 }  // namespace
 
 std::shared_ptr<const Setting> make_setting(const ModelFile& home, const ModelFile& other, const PriorOptions& options) {
-  const Prior at_home = make_prior(home, options);
-  Setting setting{make_prior(other, options), {}};
-  const std::string text = difference(at_home, setting.prior);
+  // a discrepancy is sized for the features at home: first see whether they are the same there
+  PriorOptions without_discrepancy = options;
+  without_discrepancy.discrepancy.reset();
+  const Prior at_home = make_prior(home, without_discrepancy);
+  const std::string text = difference(at_home, make_prior(other, without_discrepancy));
   if (!text.empty()) {
     throw InputError(fmt::format("{}: another system of '{}' must have the same coordinates, inputs and latents, but {}",
                                  other.name, home.name, text));
   }
+  Setting setting{make_prior(other, options), {}};
   const std::vector<Parameter>& parameters = setting.prior.system->parameters();
   for (const Parameter& parameter : parameters) {
     setting.shared.push_back(parameter.estimate ? at_home.system->parameter_index(parameter.name) : -1);

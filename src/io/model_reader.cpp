@@ -329,6 +329,8 @@ class ModelReader : private TomlReader {
       latent.name =
           entry.contains("name") ? text(*entry.get("name"), "latent.name") : fmt::format("latent {}", model_.latents.size() + 1);
       if (!names.insert(latent.name).second) fail(node, "latent.name", fmt::format("'{}' is taken already", latent.name));
+      if (latent.name == "discrepancy")
+        fail(node, "latent.name", "'discrepancy' is the name of the latent that gp2 adds; take another");
       latent.kernel = entry.contains("kernel") ? text(*entry.get("kernel"), "latent.kernel") : "se";
       if (!entry.contains("features")) fail(node, "latent", R"(missing features = ["q1", …])");
       std::set<std::string> expanded;

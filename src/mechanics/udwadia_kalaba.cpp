@@ -129,11 +129,12 @@ UdwadiaKalaba::Derivative UdwadiaKalaba::differentiate(const Ref<const MatrixXd>
   // any fixed scaling of the rows gives the same T and L b, so the unit rows serve: dA → D dA, db → D db. Since M L = AᵀΛ,
   // ΛA = (M L)ᵀ and Λb = (M L)ᵀ L b
   const MatrixXd dA_unit = row_scale_.asDiagonal() * dA;
-  const VectorXd db_unit = row_scale_.cwiseProduct(db);
-  const MatrixXd T_M_inverse = mass_factor_.solve(T_.transpose()).transpose();
+  MatrixXd force = dA_unit.transpose() * ML_unit_.transpose();  // dAᵀΛA − dM L A, and L A L b = L b
+  if (!dM.isZero(0)) force -= dM * (L_unit_ * A_unit_);
+  const MatrixXd T_M_inverse_force = T_ * mass_factor_.solve(force);
   Derivative d;
-  d.Lb = T_M_inverse * (dA_unit.transpose() * (ML_unit_.transpose() * Lb_) - dM * Lb_) + L_unit_ * (db_unit - dA_unit * Lb_);
-  d.T = T_M_inverse * (dM * (L_unit_ * A_unit_) - dA_unit.transpose() * ML_unit_.transpose()) - L_unit_ * (dA_unit * T_);
+  d.Lb = T_M_inverse_force * Lb_ + L_unit_ * (row_scale_.cwiseProduct(db) - dA_unit * Lb_);
+  d.T = -T_M_inverse_force - L_unit_ * (dA_unit * T_);
   return d;
 }
 

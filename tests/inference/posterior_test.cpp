@@ -274,7 +274,7 @@ directions = "acceleration"
   MatrixXd states = MatrixXd::Zero(5, 2);
   states(0, 0) = 0.5;
   std::vector<Observations> observations{{states, view, MatrixXd::Zero(2, 2), VectorXd::Ones(2), false}};
-  const Posterior posterior(prior, observations, {{VectorXd::Ones(1)}, {VectorXd::Ones(2)}, {VectorXd::Ones(2)}, VectorXd()});
+  const Posterior posterior(prior, observations, {{VectorXd::Ones(1)}, {VectorXd::Ones(2)}, {}, {VectorXd::Ones(2)}, VectorXd()});
   EXPECT_NO_THROW(static_cast<void>(posterior.mean(view, states)));
   states(0, 1) = 2;
   EXPECT_THROW(static_cast<void>(posterior.mean(view, states)), InputError);

@@ -92,6 +92,33 @@ TEST(Csv, AFileWithoutDataIsRefused) {
   EXPECT_EQ(input_error_of([] { parse("q1,q2\n"); }), "log.csv: no data rows after the header");
 }
 
+TEST(Csv, TheFirstRowsAreATableOfTheirOwn) {
+  const CsvTable table = parse("q1,q2\n1,2\n\n3,x\n5,6\n");
+  const CsvTable first = table.first_rows(2);
+  EXPECT_EQ(first.name(), "log.csv");
+  EXPECT_THAT(first.header(), ElementsAre("q1", "q2"));
+  ASSERT_EQ(first.n_rows(), 2);
+  EXPECT_EQ(first.number(0, 1), 2);
+  EXPECT_EQ(first.number(1, 0), 3);
+  EXPECT_EQ(first.find("q2"), 1);
+  // lines are still those of the file
+  EXPECT_EQ(input_error_of([&] { static_cast<void>(first.number(1, 1)); }), "log.csv:4: column 'q2': 'x' is not a finite number");
+  EXPECT_EQ(table.n_rows(), 3);
+}
+
+TEST(Csv, TheFirstRowsAreNoMoreThanThereAre) {
+  const CsvTable table = parse("q1\n1\n2\n");
+  for (const int n : {2, 3, 1000000}) {
+    const CsvTable first = table.first_rows(n);
+    ASSERT_EQ(first.n_rows(), 2) << n;
+    EXPECT_EQ(first.number(1, 0), 2);
+  }
+  for (const int n : {0, -1}) {
+    EXPECT_EQ(table.first_rows(n).n_rows(), 0) << n;
+    EXPECT_EQ(table.first_rows(n).n_columns(), 1) << n;
+  }
+}
+
 // ---- numbers
 
 TEST(Csv, NumbersMayHaveASignAnExponentAndSpacesInQuotes) {

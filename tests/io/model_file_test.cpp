@@ -392,6 +392,8 @@ std::vector<Complaint> complaints() {
       {"LatentOfNoFeature", latent + "features = []\n", "7: latent.features: a latent needs at least one feature"},
       {"LatentNameTwice", latent + "name = \"a\"\n" + features + "[[latent]]\nname = \"a\"\n" + features,
        "10: latent.name: 'a' is taken already"},
+      {"LatentNamedDiscrepancy", latent + "name = \"discrepancy\"\n" + features,
+       "7: latent.name: 'discrepancy' is the name of the latent that gp2 adds; take another"},
       {"FeatureOfAnAcceleration", latent + "features = [\"ddq1\"]\n",
        "8: latent.features: a feature may not depend on accelerations, but this entry depends on 'ddq1'"},
       {"FeatureTwice", latent + "features = [\"q1\", \"q1\"]\n", "8: latent.features: 'q1' stands twice; remove one"},

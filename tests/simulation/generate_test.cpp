@@ -5,6 +5,7 @@
 
 #include "gp2/error.hpp"
 #include "io/io_testing.hpp"
+#include "reference_data.hpp"
 #include "test_models.hpp"
 
 namespace gp2 {
@@ -14,6 +15,7 @@ using Eigen::MatrixXd;
 using Eigen::VectorXd;
 using test::input_error_of;
 using testing::AllOf;
+using testing::ElementsAre;
 using testing::EndsWith;
 using testing::HasSubstr;
 using testing::StartsWith;
@@ -260,6 +262,87 @@ TEST(GenerateSampling, ARuleThatIsNoNumberIsNamedWithItsLine) {
 TEST(GenerateSampling, ATruthThatIsNoNumberIsNamed) {
   EXPECT_EQ(error_of(circle("x = [-1, 1]\ndx = 0\nstart = { y = 1 }\n", "[\"0\", \"0\", \"log(-1 - x^2)\"]")),
             "circle.toml: the true acceleration is not a finite number at sample 1");
+}
+
+// ---- grids
+
+GeneratedData grid_of(const ModelFile& model, const std::map<std::string, int>& points, std::uint64_t seed = 1) {
+  return generate(model, {1, seed, VectorXd::Zero(model.system->nq()), points});
+}
+
+struct PublishedGrid {
+  std::string system;
+  std::map<std::string, int> points;
+};
+
+class GenerateGrid : public testing::TestWithParam<PublishedGrid> {};
+INSTANTIATE_TEST_SUITE_P(
+    EverySystem, GenerateGrid,
+    testing::Values(PublishedGrid{"surface", {{"q1", 5}, {"q2", 5}, {"dq1", 3}, {"dq2", 3}, {"u1", 3}, {"u2", 3}, {"u3", 3}}},
+                    PublishedGrid{"unicycle", {{"v", 5}, {"q3", 8}, {"dq3", 3}, {"u1", 3}, {"u2", 3}}},
+                    PublishedGrid{"duffing", {{"q1", 10}, {"dq1", 10}, {"t", 10}}}),
+    [](const auto& instance) { return instance.param.system; });
+
+TEST_P(GenerateGrid, IsThePublishedOneRowByRow) {
+  if (const auto absent = test::why_reference_is_absent()) GTEST_SKIP() << *absent;
+  const ModelFile& model = test::model("experiments/" + GetParam().system + "_published.toml");
+  const GeneratedData grid = grid_of(model, GetParam().points);
+  const CsvTable published = CsvTable::read(test::reference_file("grid/" + GetParam().system + "_grid.csv"));
+  ASSERT_EQ(grid.states.cols(), published.n_rows());
+  int n_compared = 0;
+  const auto compare = [&](const std::string& name, const auto& row) {
+    const int column = published.find(name);
+    if (column < 0) return;
+    ++n_compared;
+    const double scale = std::max(1.0, row.cwiseAbs().maxCoeff());
+    for (int i = 0; i < published.n_rows(); ++i) {
+      ASSERT_NEAR(row[i], published.number(i, column), 1e-12 * scale) << name << " in row " << i + 1;
+    }
+  };
+  const std::vector<std::string> names = model.system->state_names();
+  for (std::size_t k = 0; k < names.size(); ++k) compare(names[k], grid.states.row(static_cast<Eigen::Index>(k)));
+  for (int j = 0; j < model.system->nq(); ++j) {
+    compare(model.system->coordinates()[static_cast<std::size_t>(j)].acceleration(), grid.accelerations.row(j));
+  }
+  EXPECT_EQ(n_compared, published.n_columns());
+}
+
+TEST(GenerateGrid, RunsTheLastRangeFastestFromEndToEnd) {
+  const ModelFile model = circle("x = [-1, 1]\nw = [0, 3]\ndx = \"2*w\"\nz = [5, 7]\nstart = { y = 1 }\n");
+  const MatrixXd states = grid_of(model, {{"z", 1}, {"w", 3}, {"x", 2}}).states;
+  const auto row = [&](Entry entry) { return std::vector<double>(states.row(entry).begin(), states.row(entry).end()); };
+  EXPECT_THAT(row(x), ElementsAre(-1, -1, -1, 1, 1, 1));
+  EXPECT_THAT(row(dx), ElementsAre(0, 3, 6, 0, 3, 6));                                  // by an auxiliary range
+  EXPECT_THAT(row(z), ElementsAre(6, 6, 6, 6, 6, 6));                                   // one point is the middle
+  EXPECT_LT((states.row(y).array() - std::sqrt(3.0)).abs().maxCoeff(), 4 * test::eps);  // solved for, as ever
+}
+
+TEST(GenerateGrid, TakesNothingFromTheSeedButTheNoise) {
+  const ModelFile& model = test::model("models/surface.toml");
+  const std::map<std::string, int> points = {{"q1", 2}, {"q2", 2}, {"dq1", 1}, {"dq2", 1}, {"u1", 1}, {"u2", 1}, {"u3", 2}};
+  const GeneratedData a = grid_of(model, points, 1), b = grid_of(model, points, 2);
+  EXPECT_TRUE(identical(a.states, b.states));
+  EXPECT_TRUE(identical(a.accelerations, b.accelerations));
+  EXPECT_TRUE(identical(a.accelerations, true_acceleration(model, a.states)));
+  EXPECT_EQ(a.known, noise_free(model, 1).known);
+  const VectorXd noise = VectorXd::Constant(3, 0.1);
+  const GeneratedData noisy = generate(model, {1, 1, noise, points}), other = generate(model, {1, 2, noise, points});
+  EXPECT_TRUE(identical(noisy.states, a.states));
+  EXPECT_FALSE(identical(noisy.accelerations, other.accelerations));
+}
+
+TEST(GenerateGrid, ThatIsNoneIsRefused) {
+  const ModelFile model = circle("x = [-1, 1]\ndx = [-1, 1]\nz = \"x\"\nstart = { y = 1 }\n");
+  const auto refused = [&](const std::map<std::string, int>& points) { return input_error_of([&] { grid_of(model, points); }); };
+  EXPECT_EQ(refused({{"x", 2}, {"dx", 2}}), "");
+  EXPECT_EQ(refused({{"x", 2}}), "grid: no number of points for 'dx': every range of [sampling] needs one");
+  EXPECT_EQ(refused({{"x", 2}, {"dx", 2}, {"q1", 2}}), "grid: 'q1' is not a range of [sampling] in circle.toml; ranges: x, dx");
+  EXPECT_EQ(refused({{"x", 2}, {"dx", 2}, {"z", 2}}), "grid: 'z' is not a range of [sampling] in circle.toml; ranges: x, dx");
+  EXPECT_EQ(refused({{"x", 0}, {"dx", 2}}), "grid: 'x' must have at least 1 point, got 0");
+  EXPECT_EQ(refused({{"x", 2}, {"dx", -3}}), "grid: 'dx' must have at least 1 point, got -3");
+  EXPECT_EQ(refused({{"x", 10000}, {"dx", 10000}}), "grid: 1e+08 points are more than 1e+07");
+  // beyond what an int counts
+  EXPECT_EQ(refused({{"x", 2000000000}, {"dx", 2000000000}}), "grid: 4e+18 points are more than 1e+07");
 }
 
 }  // namespace

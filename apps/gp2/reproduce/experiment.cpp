@@ -80,8 +80,18 @@ bool Section::flag(const std::string& key) const {
   return has(key) && value_of<bool>(node_->find(key), where_ + key, "true or false");
 }
 
-std::vector<double> Section::numbers(const std::string& key) const {
-  return list_of<double>(node_->find(key), where_ + key, "numbers");
+std::string Section::mean() const {
+  std::string word = text("mean", "zero");
+  if (word != "zero" && word != "force") throw InputError(fmt::format("{}mean must be zero or force, got '{}'", where_, word));
+  return word;
+}
+
+std::vector<double> Section::numbers(const std::string& key, std::optional<std::size_t> how_many) const {
+  std::vector<double> numbers = list_of<double>(node_->find(key), where_ + key, "numbers");
+  if (how_many && numbers.size() != *how_many) {
+    throw InputError(fmt::format("{}{} must be a list of {} numbers, got {}", where_, key, *how_many, numbers.size()));
+  }
+  return numbers;
 }
 
 std::vector<bool> Section::flags(const std::string& key) const {
@@ -129,11 +139,11 @@ std::map<std::string, int> grid_of(const Section& section) {
 
 }  // namespace
 
-ExperimentSystem::ExperimentSystem(const Section& section, const std::filesystem::path& experiments)
+ExperimentSystem::ExperimentSystem(const Section& section, const std::filesystem::path& experiments,
+                                   const std::vector<Method>& methods)
     : name(section.text("name")), model(ModelFile::read(experiments / section.text("model"))) {
-  if (section.has("parameters")) {
-    const Section of_mean = section.section("parameters");
-    for (const std::string& mean : of_mean.keys()) parameters[mean] = of_mean.texts(mean);
+  for (const Method& method : methods) {
+    if (method.estimate) parameters[method.mean] = section.section("parameters").texts(method.mean);
   }
   GenerateOptions options;
   options.noise_stddev = VectorXd::Zero(model.system->nq());
@@ -146,7 +156,9 @@ ExperimentSystem::ExperimentSystem(const Section& section, const std::filesystem
 namespace {
 
 std::filesystem::path published(const std::filesystem::path& data, const std::string& pattern, int run) {
-  return data / fmt::format(fmt::runtime(pattern), run);
+  std::string name = pattern;
+  if (const std::size_t place = name.find("{}"); place != std::string::npos) name.replace(place, 2, std::to_string(run));
+  return data / name;
 }
 
 }  // namespace
@@ -172,8 +184,8 @@ Line line_of(const Section& line, const ModelFile& model) {
     if (std::find(states.begin(), states.end(), drawn.name) == states.end()) continue;
     ModelFile::SamplingRule rule{drawn.name, std::nullopt, model.expression("0"), 0};
     if (line.is_list(drawn.name)) {
-      const std::vector<double> ends = line.numbers(drawn.name);
-      rule.range = std::pair(ends.at(0), ends.at(1));
+      const std::vector<double> ends = line.numbers(drawn.name, 2);
+      rule.range = std::pair(ends[0], ends[1]);
       options.grid[drawn.name] = line.integer("points");
       out.name = drawn.name;
       ranges.push_back(std::move(rule));
@@ -196,6 +208,9 @@ int number_of_runs(const std::string& pattern, const std::optional<std::filesyst
                    int defined) {
   if (asked && *asked < 1) throw InputError(fmt::format("--runs: must be positive, got {}", *asked));
   if (!data) return asked.value_or(defined);
+  if (pattern.find("{}") == std::string::npos) {
+    throw InputError(fmt::format("'{}', of published observations, must hold {{}} for the number of the run", pattern));
+  }
   int present = 0;
   while (std::filesystem::exists(published(*data, pattern, present))) ++present;
   if (present == 0) {

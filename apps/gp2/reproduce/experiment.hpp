@@ -11,6 +11,7 @@
 #include <Eigen/Core>
 
 #include "gp2/csv.hpp"
+#include "gp2/error.hpp"
 #include "gp2/fit_problem.hpp"
 #include "gp2/model_file.hpp"
 #include "gp2/training.hpp"
@@ -38,10 +39,11 @@ class Section {
   [[nodiscard]] bool is_list(const std::string& key) const;
   [[nodiscard]] std::string text(const std::string& key) const;  // or of a number
   [[nodiscard]] std::string text(const std::string& key, const std::string& otherwise) const;
+  [[nodiscard]] std::string mean() const;  // the prior mean: "zero" where it is not given, or "force"
   [[nodiscard]] double number(const std::string& key) const;
   [[nodiscard]] int integer(const std::string& key) const;
   [[nodiscard]] bool flag(const std::string& key) const;  // false where it is not given
-  [[nodiscard]] std::vector<double> numbers(const std::string& key) const;
+  [[nodiscard]] std::vector<double> numbers(const std::string& key, std::optional<std::size_t> how_many = std::nullopt) const;
   [[nodiscard]] std::vector<bool> flags(const std::string& key) const;
   [[nodiscard]] std::vector<std::string> texts(const std::string& key) const;
   [[nodiscard]] Section section(const std::string& key) const;
@@ -54,6 +56,20 @@ class Section {
   std::string where_;  // for messages: file and key
 };
 
+/// A way to predict accelerations, as a [[method]] defines it.
+struct Method {
+  std::string name;
+  bool is_truth = false;                   // the analytic equation itself
+  std::optional<Baseline::Kind> baseline;  // otherwise GP²
+  std::string mean = "zero";
+  bool estimate = false;  // the system's parameters
+  std::map<Protocol::Name, int> n_restarts;
+  double reduction_tolerance = FitOptions().reduction_tolerance;  // where the optimiser stops
+
+  /// Whether its training differs between the protocols.
+  [[nodiscard]] bool has_protocol() const { return !is_truth && !baseline; }
+};
+
 /// One system of an experiment: its model, and the grid that predictions are tested on.
 struct ExperimentSystem {
   std::string name;
@@ -62,7 +78,8 @@ struct ExperimentSystem {
   Eigen::MatrixXd grid_states, grid_truth;                     // (layout size × points), (nq × points), noise-free
 
   /// @param section  name, model, grid, parameters
-  ExperimentSystem(const Section& section, const std::filesystem::path& experiments);
+  /// @param methods  for which `parameters` must say what to estimate
+  ExperimentSystem(const Section& section, const std::filesystem::path& experiments, const std::vector<Method>& methods);
 };
 
 /// Noisy observations of a run as a log: the published file, or drawn from the same distributions by the number of the run.
@@ -83,18 +100,6 @@ Line line_of(const Section& line, const ModelFile& model);
 int number_of_runs(const std::string& pattern, const std::optional<std::filesystem::path>& data, std::optional<int> asked,
                    int defined);
 
-/// A way to predict accelerations, as a [[method]] defines it.
-struct Method {
-  std::string name;
-  bool is_truth = false;                   // the analytic equation itself
-  std::optional<Baseline::Kind> baseline;  // otherwise GP²
-  std::string mean = "zero";
-  bool estimate = false;  // the system's parameters
-  std::map<Protocol::Name, int> n_restarts;
-
-  /// Whether its training differs between the protocols.
-  [[nodiscard]] bool has_protocol() const { return !is_truth && !baseline; }
-};
 Method method_of(const Section& section, const Section& restarts);
 std::vector<Method> methods_of(const Section& definition);
 
@@ -118,8 +123,14 @@ struct Score {
 Score score_of(const ExperimentSystem& system, const Method& method, Protocol::Name protocol, const CsvTable& log, int run,
                int n_threads, std::optional<int> train_at_most = std::nullopt);
 
+/// A picture that is not drawn, of numbers that are written.
+class PictureError : public InputError {
+ public:
+  using InputError::InputError;
+};
+
 /// Draws DIR/name.svg and DIR/name.png with gnuplot, by the script name.gp beside the definitions; it reads DIR/name….csv.
-/// @throws InputError when there is no gnuplot, or it fails; the numbers are written by then.
+/// @throws PictureError when there is no gnuplot, or it fails.
 void plot(const ReproduceOptions& options, const std::string& name);
 
 /// A line of progress that the next one overwrites; on a terminal only. "" ends it.

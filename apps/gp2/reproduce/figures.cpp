@@ -36,7 +36,7 @@ struct TrainedFigure {
  private:
   static Method method(const Section& section, const Section& restarts) {
     Method method;
-    method.mean = section.text("mean");
+    method.mean = section.mean();
     method.n_restarts = {{Protocol::Name::paper, restarts.integer("paper")},
                          {Protocol::Name::standard, restarts.integer("default")}};
     return method;

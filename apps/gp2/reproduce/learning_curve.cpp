@@ -34,7 +34,7 @@ void reproduce_learning_curve(const ReproduceOptions& options) {
 
   Table runs, summary;
   for (const Section& section : definition.sections("system")) {
-    const ExperimentSystem system(section, options.experiments);
+    const ExperimentSystem system(section, options.experiments, methods);
     // [method][size][run]
     std::vector<std::vector<std::vector<double>>> errors(methods.size(), std::vector<std::vector<double>>(sizes.size()));
     for (int run = 0; run < n_runs; ++run) {

@@ -26,7 +26,7 @@ Method method_of(const Section& section, const Section& restarts) {
                                    fmt::join(Baseline::words(), ", ")));
     }
   }
-  method.mean = section.text("mean", "zero");
+  method.mean = section.mean();
   method.estimate = section.flag("estimate");
   method.n_restarts = {{Protocol::Name::paper, restarts.integer(method.baseline ? "baseline" : "paper")},
                        {Protocol::Name::standard, restarts.integer(method.baseline ? "baseline" : "default")}};
@@ -37,6 +37,7 @@ std::vector<Method> methods_of(const Section& definition) {
   std::vector<Method> methods;
   for (const Section& section : definition.sections("method")) {
     methods.push_back(method_of(section, definition.section("restarts")));
+    if (definition.has("reduction_tolerance")) methods.back().reduction_tolerance = definition.number("reduction_tolerance");
   }
   return methods;
 }
@@ -92,6 +93,7 @@ Trained train(const ModelFile& model, const std::vector<std::string>& estimate, 
   fit_options.n_restarts = method.n_restarts.at(protocol);
   fit_options.seed = options.seed;
   fit_options.n_threads = n_threads;
+  if (!method.baseline) fit_options.reduction_tolerance = method.reduction_tolerance;
   Fit result = method.baseline
                    ? fit_baseline(*method.baseline, problem.prior, problem.observations, problem.hyperparameters, fit_options)
                    : fit(problem.prior, problem.observations, problem.hyperparameters, fit_options);

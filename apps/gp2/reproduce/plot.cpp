@@ -8,7 +8,6 @@
 
 #include <fmt/format.h>
 
-#include "gp2/error.hpp"
 #include "reproduce/experiment.hpp"
 
 extern char** environ;  // NOLINT(readability-redundant-declaration): POSIX leaves it to the program
@@ -32,7 +31,7 @@ int run_program(std::vector<std::string> words) {
   pid_t child = 0;
   const int failure = posix_spawnp(&child, arguments.front(), nullptr, nullptr, arguments.data(), environ);
   if (failure == ENOENT) return -1;
-  if (failure != 0) throw InputError(fmt::format("{} cannot be started: {}", words.front(), std::strerror(failure)));
+  if (failure != 0) throw PictureError(fmt::format("{} cannot be started: {}", words.front(), std::strerror(failure)));
   int status = 0;
   while (waitpid(child, &status, 0) < 0 && errno == EINTR) {
   }
@@ -52,12 +51,12 @@ void plot(const ReproduceOptions& options, const std::string& name) {
                                           quoted(options.output.string()), terminal, quoted(output));
     const int status = run_program({"gnuplot", "-e", setup, script});
     if (status == -1) {
-      throw InputError(
+      throw PictureError(
           fmt::format("{}: the numbers are written, but there is no gnuplot to draw the picture: install the Debian "
                       "package gnuplot-nox",
                       options.output.string()));
     }
-    if (status != 0) throw InputError(fmt::format("{}: gnuplot failed (exit code {}); its message is above", script, status));
+    if (status != 0) throw PictureError(fmt::format("{}: gnuplot failed (exit code {}); its message is above", script, status));
   }
 }
 

@@ -1,8 +1,10 @@
 #include <array>
 #include <filesystem>
 #include <memory>
+#include <vector>
 
 #include <fmt/format.h>
+#include <fmt/ranges.h>
 
 #include "command.hpp"
 #include "gp2/error.hpp"
@@ -62,11 +64,18 @@ void run(const Arguments& arguments) {
   std::error_code error;
   std::filesystem::create_directories(options.output, error);
   if (error) throw InputError(fmt::format("-o {}: the folder cannot be made: {}", arguments.output, error.message()));
+  // hours of numbers do not wait for a picture
+  std::vector<std::string> not_drawn;
   for (const Experiment& experiment : experiments) {
     if (arguments.what != "all" && arguments.what != experiment.name) continue;
-    experiment.run(options);
-    talk({fmt::format("{}: {} is done", options.output.string(), experiment.name)});
+    try {
+      experiment.run(options);
+      talk({fmt::format("{}: {} is done", options.output.string(), experiment.name)});
+    } catch (const PictureError& picture) {
+      if (not_drawn.empty() || not_drawn.back() != picture.what()) not_drawn.emplace_back(picture.what());
+    }
   }
+  if (!not_drawn.empty()) throw InputError(fmt::format("{}", fmt::join(not_drawn, "\n")));
 }
 
 }  // namespace

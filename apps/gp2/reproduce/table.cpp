@@ -5,6 +5,7 @@
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
+#include "command.hpp"
 #include "gp2/csv.hpp"
 
 namespace gp2::command {
@@ -14,7 +15,7 @@ namespace {
 std::string cell(const Table::Row& value) {
   if (value.is_null()) return "";
   if (value.is_number_float()) return shortest(value.get<double>());
-  return value.is_string() ? value.get<std::string>() : value.dump();
+  return value.is_string() ? csv_cell(value.get<std::string>()) : value.dump();
 }
 
 }  // namespace

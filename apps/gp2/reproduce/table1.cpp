@@ -53,7 +53,7 @@ std::vector<double> published_errors(const Json& published, const std::string& s
 
 Json published_table(const std::optional<std::filesystem::path>& data) {
   if (!data || !std::filesystem::exists(*data / "table1.json")) return Json::object();
-  const Json json = Json::parse(read_file(*data / "table1.json"), nullptr, false);
+  Json json = Json::parse(read_file(*data / "table1.json"), nullptr, false);
   if (json.is_discarded()) throw InputError(fmt::format("{}: not valid JSON", (*data / "table1.json").string()));
   return json;
 }
@@ -99,10 +99,10 @@ Table::Row cell_of(const std::vector<Cell>& runs, std::size_t method_index, cons
     if (of_system.has(first.method)) {
       const Section printed = of_system.section(first.method);
       if (printed.has("rmse")) {
-        const std::vector<double> rmse = printed.numbers("rmse");
-        row["printed_rmse_mean"] = rmse.at(0);
-        row["printed_rmse_min"] = rmse.at(1);
-        row["printed_rmse_max"] = rmse.at(2);
+        const std::vector<double> rmse = printed.numbers("rmse", 3);
+        row["printed_rmse_mean"] = rmse[0];
+        row["printed_rmse_min"] = rmse[1];
+        row["printed_rmse_max"] = rmse[2];
       }
       row["printed_max_constraint_error"] = printed.number("max_constraint_error");
     }
@@ -144,16 +144,19 @@ void reproduce_table1(const ReproduceOptions& options) {
   const std::vector<Method> methods = methods_of(definition);
   const Json published = published_table(options.data);
   std::vector<Cell> cells;
-  // the slowest is known beforehand: too many runs asked for is said before the first fit
+  // what is wrong with the definition, or too many runs asked for, is said before the first fit
   std::vector<int> n_runs;
+  std::vector<ExperimentSystem> systems;
   const std::vector<Section> sections = definition.sections("system");
   for (const Section& section : sections) {
     n_runs.push_back(number_of_runs(section.text("data"), options.data, options.runs, definition.integer("runs")));
+    systems.emplace_back(section, options.experiments, methods);
   }
+  const int n = definition.integer("n");
   for (std::size_t s = 0; s < sections.size(); ++s) {
-    const ExperimentSystem system(sections[s], options.experiments);
+    const ExperimentSystem& system = systems[s];
     for (int run = 0; run < n_runs[s]; ++run) {
-      const CsvTable log = observations_of(system.model, sections[s].text("data"), options.data, run, definition.integer("n"));
+      const CsvTable log = observations_of(system.model, sections[s].text("data"), options.data, run, n);
       for (const Method& method : methods) {
         talk_over(fmt::format("table1: {} run {}/{}: {}", system.name, run + 1, n_runs[s], method.name));
         // a method that knows no protocol is trained once, and stands under each
@@ -169,6 +172,7 @@ void reproduce_table1(const ReproduceOptions& options) {
 
   Table runs, summary;
   for (const Cell& cell : cells) runs.add(row_of(cell));
+  runs.write(options.output / "table1");
   for (const Protocol::Name protocol : options.protocols) {
     for (const Section& section : sections) {
       for (std::size_t m = 0; m < methods.size(); ++m) {
@@ -180,7 +184,6 @@ void reproduce_table1(const ReproduceOptions& options) {
       }
     }
   }
-  runs.write(options.output / "table1");
   summary.write(options.output / "table1_cells");
   print(summary.rows());
   plot(options, "table1");
