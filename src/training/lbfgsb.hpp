@@ -9,7 +9,7 @@ namespace gp2 {
 
 struct LbfgsbOptions {
   int max_iterations = 1000;
-  int memory = 10;  // pairs kept for the Hessian
+  int memory = 30;  // pairs kept for the Hessian; with as many as there are hyperparameters a fit takes a quarter of the steps
   double gradient_tolerance = 1e-5;
   double reduction_tolerance = 1e-12;
   /// Called after each iteration with its number and value; false stops.
