@@ -19,7 +19,7 @@ struct Arguments {
   std::string fit, states, view = "constrained", covariance = "none", output, map, system;
   std::optional<std::string> latent;
   std::optional<double> time_step;
-  int n_samples = 0;
+  std::optional<int> n_samples;
   std::uint64_t seed = 0;
   bool unconditioned = false;
 };
@@ -134,6 +134,9 @@ std::string joined(const CsvTable& input, const NewColumns& added) {
 }
 
 void run(const Arguments& arguments) {
+  if (arguments.n_samples && *arguments.n_samples < 1) {
+    throw InputError(fmt::format("--samples: must be at least 1, got {}", *arguments.n_samples));
+  }
   const FitFile fit = FitFile::read(arguments.fit);
   const CsvTable table = CsvTable::read(arguments.states);
   const Posterior posterior = arguments.unconditioned ? fit.posterior().without_data() : fit.posterior();
@@ -142,7 +145,7 @@ void run(const Arguments& arguments) {
   const LogStates log = read_log_states(system.prior, view, system.model, table, parse_map(arguments.map));
   talk(log.notes);
   NewColumns predictions = at_states_of(table, [&] { return predict(posterior, view, log.states, arguments.covariance); });
-  if (arguments.n_samples > 0) add_samples(predictions, posterior, view, log.states, arguments.n_samples, arguments.seed);
+  if (arguments.n_samples) add_samples(predictions, posterior, view, log.states, *arguments.n_samples, arguments.seed);
   write_file(arguments.output, joined(table, predictions));
   talk({fmt::format("{}: {} predictions, view {}", arguments.output, table.n_rows(), arguments.view)});
 }
@@ -167,8 +170,7 @@ void add_predict(CLI::App& app) {
       ->check(CLI::IsMember({"none", "std", "full"}))
       ->capture_default_str();
   CLI::Option* samples =
-      command->add_option("--samples", arguments->n_samples, "draws of all rows together: NAME_sample1 … NAME_sampleS")
-          ->check(CLI::PositiveNumber);
+      command->add_option("--samples", arguments->n_samples, "draws of all rows together: NAME_sample1 … NAME_sampleS");
   command->add_option("--seed", arguments->seed, "of the samples; same seed, same samples")
       ->check(not_negative())
       ->needs(samples)

@@ -86,8 +86,8 @@ TEST_F(PredictSamples, RefuseWrongNumbers) {
     EXPECT_FALSE(desk.has("none.csv"));
     return outcome.err;
   };
-  EXPECT_THAT(refusal("--samples 0"), HasSubstr("--samples"));
-  EXPECT_THAT(refusal("--samples -3"), HasSubstr("--samples"));
+  EXPECT_THAT(refusal("--samples 0"), HasSubstr("--samples: must be at least 1, got 0"));
+  EXPECT_THAT(refusal("--samples -3"), HasSubstr("--samples: must be at least 1, got -3"));
   EXPECT_THAT(refusal("--samples 2 --seed -1"), HasSubstr("--seed"));
   EXPECT_THAT(refusal("--seed 1"), HasSubstr("--seed requires --samples"));
 }
