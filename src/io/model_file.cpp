@@ -92,12 +92,12 @@ Latent make_discrepancy(const SymbolicSystem& system, const SystemSymbols& symbo
   latent.features = Tape(features, symbols.state());
   latent.kernel = Kernel::parse("se", latent.feature_names);
   latent.kernel_is_fixed = latent.signal_is_fixed = true;
-  const int nq = system.nq();
-  std::vector<Expression> directions(static_cast<std::size_t>(nq) * static_cast<std::size_t>(nq), graph.constant(0));
+  const auto nq = static_cast<std::size_t>(system.nq());
+  std::vector<Expression> directions(nq * nq, graph.constant(0));
   latent.direction_derivatives.assign(system.parameters().size(), Tape(directions, symbols.state_and_parameters()));
-  for (int j = 0; j < nq; ++j) {
-    latent.column_names.push_back(system.coordinates()[static_cast<std::size_t>(j)].acceleration());
-    directions[static_cast<std::size_t>(j * nq + j)] = graph.constant(discrepancy.stddev[j]);
+  for (std::size_t j = 0; j < nq; ++j) {
+    latent.column_names.push_back(system.coordinates()[j].acceleration());
+    directions[j * nq + j] = graph.constant(discrepancy.stddev[static_cast<Eigen::Index>(j)]);
   }
   latent.directions_are_identity = false;
   latent.directions = Tape(directions, symbols.state_and_parameters());
