@@ -166,16 +166,14 @@ void run(const Arguments& arguments) {
   if (!arguments.start.empty()) read_start(arguments, problem);
   talk(problem.notes);
 
-  const std::optional<Baseline>& baseline = problem.prior_options.baseline;
-  FitOptions options = baseline ? baseline_fit_options() : FitOptions{};
+  FitOptions options = default_fit_options(problem);
   options.n_restarts = arguments.restarts.value_or(options.n_restarts);
   options.max_iterations = arguments.max_iterations;
   options.seed = arguments.seed;
   options.n_threads = arguments.threads;
   const bool terminal = isatty(STDERR_FILENO) != 0;
   if (terminal) options.progress = print_progress;
-  Fit result = baseline ? fit_baseline(baseline->kind, problem.prior, problem.observations, problem.hyperparameters, options)
-                        : fit(problem.prior, problem.observations, problem.hyperparameters, options);
+  Fit result = fit(problem, options);
   if (terminal) fmt::print(stderr, "\r\033[K");
 
   std::vector<std::string> at_bound;

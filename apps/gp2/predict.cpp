@@ -38,16 +38,7 @@ View view_of(const Arguments& arguments, const PredictedSystem& system, const Pr
     view.time_step = *arguments.time_step;
     if (!(view.time_step > 0)) throw InputError(fmt::format("--dt: must be positive, got {}", view.time_step));
   }
-  if (arguments.latent) {
-    std::vector<std::string> names;
-    for (const Latent& latent : home.latents) names.push_back(latent.name);
-    const auto found = std::find(names.begin(), names.end(), *arguments.latent);
-    if (found == names.end()) {
-      throw InputError(
-          fmt::format("--latent: no latent is called '{}'; there is: {}", *arguments.latent, fmt::join(names, ", ")));
-    }
-    view.latent = static_cast<int>(found - names.begin());
-  }
+  if (arguments.latent) view.latent = latent_index(home, *arguments.latent, "--latent");
   return view;
 }
 

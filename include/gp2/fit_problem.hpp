@@ -65,6 +65,15 @@ FitProblem make_fit_problem(const ModelFile& model, const std::vector<Log>& logs
                             const FitProblemOptions& options);
 FitProblem make_fit_problem(const ModelFile& model, const CsvTable& log, const FitProblemOptions& options);
 
+/// How a problem is fitted unless told otherwise: a baseline has options of its own.
+FitOptions default_fit_options(const FitProblem& problem);
+
+/// fit() or, of a baseline, fit_baseline().
+Fit fit(const FitProblem& problem, const FitOptions& options);
+
+/// Which latent of a prior has a name. @throws InputError naming `option` and the latents there are.
+int latent_index(const Prior& prior, const std::string& name, const std::string& option);
+
 /// A reader of a log that knows the columns by `columns` (model's name -> log's name), then by the model's own [columns].
 /// @throws InputError when `columns` names what the model or the log does not have.
 LogReader open_log(const ModelFile& model, const CsvTable& log, const std::map<std::string, std::string>& columns);

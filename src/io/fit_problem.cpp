@@ -228,16 +228,6 @@ Observations read_log(const Place& place, const Log& log, const FitProblemOption
   return group;
 }
 
-int latent_of(const Prior& prior, const std::string& name, const std::string& option) {
-  std::vector<std::string> names;
-  for (const Latent& latent : prior.latents) names.push_back(latent.name);
-  const auto found = std::find(names.begin(), names.end(), name);
-  if (found == names.end()) {
-    throw InputError(fmt::format("{}: no latent is called '{}'; there is: {}", option, name, fmt::join(names, ", ")));
-  }
-  return static_cast<int>(found - names.begin());
-}
-
 // what else is measured or known, its noise not yet
 Observations read_knowledge(const Place& place, const Prior& home, const Knowledge& knowledge, const FitProblemOptions& options,
                             std::vector<std::string>& notes) {
@@ -247,7 +237,7 @@ Observations read_knowledge(const Place& place, const Prior& home, const Knowled
   Observations group;
   group.view = View::all(knowledge.quantity, system);
   group.view.setting = place.setting;
-  if (!knowledge.latent.empty()) group.view.latent = latent_of(home, knowledge.latent, option);
+  if (!knowledge.latent.empty()) group.view.latent = latent_index(home, knowledge.latent, option);
   if (knowledge.quantity == View::Quantity::next_velocity) {
     if (!options.time_step) throw InputError(option + " needs the time step: --dt SECONDS");
     if (!(*options.time_step > 0)) throw InputError(fmt::format("--dt: must be positive, got {}", *options.time_step));
@@ -401,6 +391,26 @@ std::vector<int> acceleration_rows(const System& system, const std::vector<std::
     rows.push_back(row);
   }
   return rows;
+}
+
+int latent_index(const Prior& prior, const std::string& name, const std::string& option) {
+  std::vector<std::string> names;
+  for (const Latent& latent : prior.latents) names.push_back(latent.name);
+  const auto found = std::find(names.begin(), names.end(), name);
+  if (found == names.end()) {
+    throw InputError(fmt::format("{}: no latent is called '{}'; there is: {}", option, name, fmt::join(names, ", ")));
+  }
+  return static_cast<int>(found - names.begin());
+}
+
+FitOptions default_fit_options(const FitProblem& problem) {
+  return problem.prior_options.baseline ? baseline_fit_options() : FitOptions{};
+}
+
+Fit fit(const FitProblem& problem, const FitOptions& options) {
+  const std::optional<Baseline>& baseline = problem.prior_options.baseline;
+  return baseline ? fit_baseline(baseline->kind, problem.prior, problem.observations, problem.hyperparameters, options)
+                  : fit(problem.prior, problem.observations, problem.hyperparameters, options);
 }
 
 LogReader open_log(const ModelFile& model, const CsvTable& log, const std::map<std::string, std::string>& columns) {

@@ -89,14 +89,12 @@ Trained train(const ModelFile& model, const std::vector<std::string>& estimate, 
   options.baseline = method.baseline;
   options.seed = static_cast<std::uint64_t>(run);
   FitProblem problem = make_fit_problem(model, log, options);
-  FitOptions fit_options;
+  FitOptions fit_options = default_fit_options(problem);
   fit_options.n_restarts = method.n_restarts.at(protocol);
   fit_options.seed = options.seed;
   fit_options.n_threads = n_threads;
   if (!method.baseline) fit_options.reduction_tolerance = method.reduction_tolerance;
-  Fit result = method.baseline
-                   ? fit_baseline(*method.baseline, problem.prior, problem.observations, problem.hyperparameters, fit_options)
-                   : fit(problem.prior, problem.observations, problem.hyperparameters, fit_options);
+  Fit result = fit(problem, fit_options);
   return {std::move(problem), std::move(result)};
 }
 
