@@ -72,9 +72,9 @@ CsvTable log_of(const ModelFile& model, int n = 12, std::uint64_t seed = 3) {
     add(system.coordinates()[static_cast<std::size_t>(j)].acceleration(), data.accelerations.row(j));
   }
   std::string text;
-  for (std::size_t k = 0; k < names.size(); ++k) text += (k == 0 ? "" : ",") + names[k];
+  for (std::size_t k = 0; k < names.size(); ++k) text += fmt::format("{}{}", k == 0 ? "" : ",", names[k]);
   for (int i = 0; i < n; ++i) {
-    for (Index k = 0; k < values.rows(); ++k) text += (k == 0 ? "\n" : ",") + shortest(values(k, i));
+    for (Index k = 0; k < values.rows(); ++k) text += fmt::format("{}{}", k == 0 ? "\n" : ",", shortest(values(k, i)));
   }
   return CsvTable::parse(text, "log.csv");
 }
