@@ -71,8 +71,9 @@ void run(const Arguments& arguments) {
   const LogStates log = read_log_states(system.prior, view, system.model, table, parse_map(arguments.map), outputs);
   talk(log.notes);
   const Posterior posterior = fit.posterior();
-  const Evaluation evaluation =
-      at_states_of(table, [&] { return evaluate_predictions(posterior, log.states, rows, log.accelerations, system.setting); });
+  const Evaluation evaluation = at_states_of(table, [&] {
+    return evaluate_predictions(posterior, log.states, rows, log.accelerations, system.setting, /*n_threads=*/0);
+  });
   if (arguments.json) {
     fmt::print("{}\n", to_json(evaluation).dump(2));
   } else {

@@ -1,11 +1,16 @@
 #include <algorithm>
 #include <cstdio>
 #include <exception>
+#include <string>
+#include <utility>
+#include <vector>
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
+#include "blas_choice.hpp"
 #include "command.hpp"
+#include "gp2/blas.hpp"
 #include "gp2/error.hpp"
 #include "gp2/version.hpp"
 
@@ -20,6 +25,32 @@ int failed(int exit_code, const std::string& text) {
   return exit_code;
 }
 
+// of --version --verbose
+std::string build_and_machine() {
+  const gp2::BlasReport blas = gp2::blas_report();
+  const gp2::ProcessorFeatures features = gp2::processor_features();
+#ifdef __clang__
+  const std::string compiler = __VERSION__;
+#else
+  const std::string compiler = "g++ " __VERSION__;
+#endif
+  std::vector<std::pair<std::string, std::string>> rows = {
+      {"version", gp2::version()},
+      {"compiler", compiler},
+      {"BLAS library", blas.library},
+      {"BLAS kernel", blas.kernel.empty() ? "unknown" : blas.kernel + ", chosen by " + gp2::command::blas_kernel_chosen_by()},
+      {"BLAS threads", std::to_string(blas.n_threads)},
+      {"processor", features.avx512 ? "AVX-512, AVX2, FMA"
+                    : features.avx2 ? "AVX2, FMA"
+                                    : "neither AVX-512 nor AVX2"},
+  };
+  // what gp2 has already asked for need not be advised
+  if (!blas.advice.empty() && gp2::command::blas_kernel_chosen_by() != "gp2") rows.emplace_back("advice", blas.advice);
+  std::string text;
+  for (const auto& [name, value] : rows) text += fmt::format("{}{:<14}{}", text.empty() ? "" : "\n", name, value);
+  return text;
+}
+
 // CLI11 would only say that a command is missing
 void require_known_command(const CLI::App& app, int argc, char** argv) {
   if (argc < 2 || argv[1][0] == '-') return;
@@ -32,12 +63,17 @@ void require_known_command(const CLI::App& app, int argc, char** argv) {
 }  // namespace
 
 int main(int argc, char** argv) {
+  gp2::command::choose_blas_kernel(argv);
   CLI::App app{
       "Learn the dynamics of constrained mechanical systems from measured data, with predictions that obey the constraints "
       "exactly."};
   app.name("gp2");
   app.require_subcommand(1);
-  app.set_version_flag("--version", gp2::version());
+  bool verbose = false;
+  CLI::Option* verbose_flag =
+      app.add_flag("--verbose", verbose, "With --version: also the compiler, the BLAS and what it uses of the processor");
+  const auto version_text = [&verbose]() -> std::string { return verbose ? build_and_machine() : gp2::version(); };
+  verbose_flag->needs(app.set_version_flag("--version", version_text));
   app.footer(
       "Example:\n"
       "  gp2 generate models/surface.toml --n 100 -o train.csv\n"

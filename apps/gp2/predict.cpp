@@ -55,10 +55,10 @@ NewColumns predict(const Posterior& posterior, const View& view, const Eigen::Ma
   const Eigen::Index d = view.size();
   NewColumns out{names, {}};
   if (covariance == "none") {
-    out.values = posterior.mean(view, states);
+    out.values = posterior.mean(view, states, /*n_threads=*/0);
     return out;
   }
-  const Posterior::Marginal prediction = posterior.marginal(view, states);
+  const Posterior::Marginal prediction = posterior.marginal(view, states, /*n_threads=*/0);
   if (prediction.n_clipped > 0) {
     talk({fmt::format("{} variances were negative by rounding and set to 0", prediction.n_clipped)});
   }

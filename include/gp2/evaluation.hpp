@@ -30,9 +30,10 @@ struct Evaluation {
 /// @param rows     of ddq that are compared
 /// @param targets  (rows × N)
 /// @param setting  the other system under which they were measured; null: the prior's own
+/// @param n_threads  as in Posterior::marginal
 Evaluation evaluate_predictions(const Posterior& posterior, const Eigen::Ref<const Eigen::MatrixXd>& states,
                                 const std::vector<int>& rows, const Eigen::Ref<const Eigen::MatrixXd>& targets,
-                                const std::shared_ptr<const Setting>& setting = nullptr);
+                                const std::shared_ptr<const Setting>& setting = nullptr, int n_threads = 1);
 
 /// max |A ddq − b| over states and rows of A.
 /// @param accelerations  (nq × N)

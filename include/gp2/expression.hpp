@@ -97,6 +97,12 @@ class ExpressionGraph {
   /// ∂e/∂x. Shared subexpressions are differentiated once.
   Expression differentiate(Expression e, Expression x);
 
+  /// ∂e/∂x of several expressions, what they share differentiated once.
+  std::vector<Expression> differentiate(std::span<const Expression> expressions, Expression x);
+
+  /// The same expressions in this graph: those of another graph are copied as they are.
+  std::vector<Expression> copy(std::span<const Expression> expressions);
+
   /// e with every variable in `replacements` replaced, all at once.
   Expression substitute(Expression e, const std::map<std::string, Expression>& replacements);
 
@@ -153,11 +159,30 @@ class Tape {
   void evaluate(const Eigen::Ref<const Eigen::MatrixXd>& values, const Eigen::Ref<const Eigen::VectorXd>& shared,
                 Eigen::MatrixXd& results) const;
 
+  /// The same, the outputs spread over several matrices with N columns and n_outputs rows in all: the first outputs fill the
+  /// rows of the first matrix, and so on.
+  void evaluate(const Eigen::Ref<const Eigen::MatrixXd>& values, const Eigen::Ref<const Eigen::VectorXd>& shared,
+                std::span<Eigen::Ref<Eigen::MatrixXd>> results) const;
+
+  /// Memory of `evaluate_at`, which holds the constants and the shared inputs (the last ones).
+  [[nodiscard]] Eigen::VectorXd make_workspace(const Eigen::Ref<const Eigen::VectorXd>& shared) const;
+
+  /// At one point after another: allocates nothing, and is as quick for one point as `evaluate` for many.
+  /// @param point      (n_first_inputs), not checked
+  /// @param workspace  from `make_workspace`; of one thread
+  /// @param results    (n_outputs)
+  void evaluate_at(const Eigen::Ref<const Eigen::VectorXd>& point, Eigen::VectorXd& workspace,
+                   Eigen::Ref<Eigen::VectorXd> results) const;
+
   [[nodiscard]] int n_outputs() const { return static_cast<int>(outputs_.size()); }
   [[nodiscard]] bool uses_input(int index) const { return uses_input_[static_cast<std::size_t>(index)]; }
   [[nodiscard]] std::size_t n_instructions() const { return instructions_.size(); }
 
  private:
+  template <typename Output>
+  void run(const Eigen::Ref<const Eigen::MatrixXd>& values, const Eigen::Ref<const Eigen::VectorXd>& shared,
+           const Output& output_at) const;
+
   struct Instruction {
     Operation operation;
     std::int32_t exponent;       // for `power` with a small integer exponent; else 0 and b is used
@@ -169,6 +194,22 @@ class Tape {
   std::vector<std::uint32_t> outputs_;                           // slot of each output
   std::vector<bool> uses_input_;
   std::uint32_t n_slots_ = 0;
+};
+
+/// The derivatives of expressions y in the variables of a state x that do not vanish identically.
+struct StateDerivatives {
+  struct Entry {
+    int output = 0;       // i of y_i
+    int state_index = 0;  // k of x_k
+  };
+  std::vector<Entry> entries;  // sorted by k, then i
+  Tape tape;                   // inputs -> ∂y_i/∂x_k, one output per entry
+
+  StateDerivatives() = default;
+  /// @param expressions  y
+  /// @param inputs       of the tape: x, then what else y depends on
+  /// @param n_states     size of x
+  StateDerivatives(std::span<const Expression> expressions, std::span<const Expression> inputs, int n_states);
 };
 
 }  // namespace gp2

@@ -53,35 +53,29 @@ class Kernel {
   struct Factor {
     Primitive primitive;
     int first_parameter;  // index of ℓ_1; periods or α follow the lengthscales
+    int first_column;     // of its D, where the features are scaled for each factor (constant has none)
   };
   struct Term {
     int amplitude;  // index of w_k, −1 for the first term
     std::vector<Factor> factors;
   };
   [[nodiscard]] const std::vector<Term>& terms() const { return terms_; }
+  [[nodiscard]] int n_scaled_columns() const { return n_scaled_columns_; }
 
-  /// Reused memory of `evaluate` and `add_gradient`.
-  struct Workspace {
-    Eigen::ArrayXXd columns;
-  };
-
-  /// k(φ_i, φ') for the rows φ_i of `features`.
+  /// k(φ_i, φ'_j) between two sets of points.
   ///
-  /// @param features  (n × D), one row per point
-  /// @param point     (D)
-  /// @param values    parameters, in the order of parameters()
-  /// @param out       (n)
-  void evaluate(const Eigen::Ref<const Eigen::MatrixXd>& features, const Eigen::Ref<const Eigen::VectorXd>& point,
-                const Eigen::Ref<const Eigen::VectorXd>& values, Eigen::Ref<Eigen::VectorXd> out, Workspace& workspace) const;
-
-  /// Adds Σ_i w_i ∂k(φ_i, φ')/∂log v_p to gradient[p] for every parameter v_p.
-  void add_gradient(const Eigen::Ref<const Eigen::MatrixXd>& features, const Eigen::Ref<const Eigen::VectorXd>& point,
-                    const Eigen::Ref<const Eigen::VectorXd>& values, const Eigen::Ref<const Eigen::VectorXd>& w,
-                    Eigen::Ref<Eigen::VectorXd> gradient, Workspace& workspace) const;
+  /// @param left    (n × D), one row per point
+  /// @param right   (m × D)
+  /// @param values  parameters, in the order of parameters()
+  /// @returns (n × m)
+  [[nodiscard]] Eigen::MatrixXd evaluate(const Eigen::Ref<const Eigen::MatrixXd>& left,
+                                         const Eigen::Ref<const Eigen::MatrixXd>& right,
+                                         const Eigen::Ref<const Eigen::VectorXd>& values) const;
 
  private:
   std::string text_;
   int n_features_ = 0;
+  int n_scaled_columns_ = 0;
   std::vector<Term> terms_;
   std::vector<Parameter> parameters_;
 };

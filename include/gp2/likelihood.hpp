@@ -46,10 +46,12 @@ class Likelihood {
   ~Likelihood();
   Likelihood(Likelihood&&) noexcept;
 
-  /// Memory reused between calls; one per thread.
+  /// Memory reused between calls; one per thread that calls.
   class Workspace {
    public:
-    Workspace();
+    /// @param n_threads  that one evaluation may use, where there are samples enough for it to pay. The sums keep their order
+    ///                   whatever it is; a factorisation of more than 2000 rows on several threads is rounded differently.
+    explicit Workspace(int n_threads = 1);
     ~Workspace();
 
    private:

@@ -4,7 +4,6 @@
 #include <string>
 #include <vector>
 
-#include <Eigen/Cholesky>
 #include <Eigen/Core>
 
 #include "gp2/system.hpp"
@@ -17,15 +16,34 @@ namespace gp2 {
 ///
 /// computed without forming A M⁻¹Aᵀ: with M = C Cᵀ and B = A C⁻ᵀ, rows of B scaled to unit norm, a rank-revealing QR of Bᵀ gives
 /// orthonormal bases of range(Bᵀ) and of its complement Z, and T = C⁻ᵀ Z Zᵀ Cᵀ. Any number of rows, redundant ones too.
+///
+/// For control loops, `compute` takes one object to the next state. Const member functions may be called from several threads.
 class UdwadiaKalaba {
  public:
   /// Directions of range(Bᵀ) whose pivot is below this fraction of the largest count as redundant.
   static constexpr double rank_tolerance = 1e-10;
+
+  UdwadiaKalaba() = default;
   /// @param M  mass matrix        (nq × nq), symmetric positive definite
   /// @param A  constraint matrix  (nc × nq)
   /// @param b  constraint vector  (nc)
   UdwadiaKalaba(const Eigen::Ref<const Eigen::MatrixXd>& M, const Eigen::Ref<const Eigen::MatrixXd>& A,
-                const Eigen::Ref<const Eigen::VectorXd>& b);
+                const Eigen::Ref<const Eigen::VectorXd>& b) {
+    compute(M, A, b);
+  }
+
+  /// The same at another state. Allocates nothing where the sizes are those of the call before.
+  void compute(const Eigen::Ref<const Eigen::MatrixXd>& M, const Eigen::Ref<const Eigen::MatrixXd>& A,
+               const Eigen::Ref<const Eigen::VectorXd>& b);
+
+  /// Memory of the functions below that take one: they allocate nothing where the sizes are those of the call before. One
+  /// workspace serves any number of objects, of one thread.
+  class Workspace {
+    friend class UdwadiaKalaba;
+    Eigen::VectorXd rows_;                           // (nc)
+    Eigen::MatrixXd square_, force_, wide_, tall_;   // (nq × nq), (nq × nq), (nc × nq), (nq × nc)
+    Eigen::MatrixXd Lambda_, Lambda_bar_, product_;  // (nc × nc)
+  };
 
   /// Whether M is positive definite to working precision; when it is not, nothing below is valid.
   [[nodiscard]] bool mass_is_positive_definite() const { return mass_is_positive_definite_; }
@@ -39,6 +57,8 @@ class UdwadiaKalaba {
 
   /// L as a matrix (nq × nc). With redundant rows it is one of the generalised inverses with A L A = A; only L b is unique.
   [[nodiscard]] Eigen::MatrixXd L() const;
+  /// The same, written to L (nq × nc). Allocates nothing.
+  void write_L(Eigen::Ref<Eigen::MatrixXd> L) const { L = L_unit_ * row_scale_.asDiagonal(); }
 
   /// (A M⁻¹Aᵀ)⁺ of the rows as written, where they are independent (nc × nc).
   [[nodiscard]] Eigen::MatrixXd Lambda() const;
@@ -47,10 +67,14 @@ class UdwadiaKalaba {
   [[nodiscard]] Eigen::MatrixXd multipliers_of_force() const;
 
   /// M⁻¹ v.
-  [[nodiscard]] Eigen::MatrixXd solve_mass(const Eigen::Ref<const Eigen::MatrixXd>& v) const { return mass_factor_.solve(v); }
+  [[nodiscard]] Eigen::MatrixXd solve_mass(const Eigen::Ref<const Eigen::MatrixXd>& v) const;
+  /// v := M⁻¹ v, v (nq × any). Allocates nothing.
+  void solve_mass_in_place(Eigen::Ref<Eigen::MatrixXd> v) const;
 
   /// The constrained acceleration of an unconstrained one, L b + T ā, with one step of refinement onto A ddq = b.
   [[nodiscard]] Eigen::VectorXd constrain(const Eigen::Ref<const Eigen::VectorXd>& a_bar) const;
+  /// The same, written to ddq (nq), which must not overlap a_bar.
+  void constrain(const Eigen::Ref<const Eigen::VectorXd>& a_bar, Eigen::Ref<Eigen::VectorXd> ddq, Workspace& workspace) const;
 
   struct Derivative {
     Eigen::MatrixXd T;   // dT     (nq × nq)
@@ -67,20 +91,45 @@ class UdwadiaKalaba {
   [[nodiscard]] Eigen::MatrixXd differentiate_Lambda(const Eigen::Ref<const Eigen::MatrixXd>& dM,
                                                      const Eigen::Ref<const Eigen::MatrixXd>& dA) const;
 
+  /// Sensitivities of a scalar s, ds = M̄ : dM + Ā : dA + b̄ · db, to which the adjoints below add.
+  struct Adjoint {
+    Eigen::Ref<Eigen::MatrixXd> M;  // M̄  (nq × nq), not symmetrised
+    Eigen::Ref<Eigen::MatrixXd> A;  // Ā  (nc × nq)
+    Eigen::Ref<Eigen::VectorXd> b;  // b̄  (nc)
+  };
+  /// `differentiate` in reverse: from ds = T̄ : dT + L̄b · d(L b), with v = L̄b and X = M⁻¹Tᵀ(T̄ − v (L b)ᵀ),
+  ///
+  ///     M̄ += X (L A)ᵀ,    Ā −= Λ A Xᵀ + Lᵀ(T̄ Tᵀ + v (L b)ᵀ),    b̄ += Lᵀv.
+  ///
+  /// @param T_bar   (nq × nq)
+  /// @param Lb_bar  (nq)
+  void add_adjoint(const Eigen::Ref<const Eigen::MatrixXd>& T_bar, const Eigen::Ref<const Eigen::VectorXd>& Lb_bar,
+                   Adjoint adjoint, Workspace& workspace) const;
+
+  /// `differentiate_Lambda` in reverse: from ds = Λ̄ : dΛ,  M̄ += L Λ̄ Lᵀ,  Ā −= Λ (Λ̄ + Λ̄ᵀ) Lᵀ.
+  /// @param Lambda_bar  (nc × nc)
+  void add_Lambda_adjoint(const Eigen::Ref<const Eigen::MatrixXd>& Lambda_bar, Adjoint adjoint, Workspace& workspace) const;
+
  private:
+  void decompose_rows();
   bool mass_is_positive_definite_ = true;
   int rank_ = 0;
   int n_zero_rows_ = 0;
   double inconsistency_ = 0;
   double size_of_b_ = 0;
-  Eigen::LLT<Eigen::MatrixXd> mass_factor_;
-  Eigen::VectorXd row_scale_;  // 1 / norm of each row of B, 0 for a zero row
-  Eigen::MatrixXd A_unit_;     // rows of A so scaled      (nc × nq)
-  Eigen::VectorXd b_unit_;     // b so scaled              (nc)
-  Eigen::MatrixXd L_unit_;     // L of the scaled rows     (nq × nc)
-  Eigen::MatrixXd ML_unit_;    // M L of the scaled rows   (nq × nc)
+  Eigen::MatrixXd mass_factor_;  // C in the lower triangle  (nq × nq)
+  Eigen::VectorXd row_scale_;    // 1 / norm of each row of B, 0 for a zero row
+  Eigen::MatrixXd A_unit_;       // rows of A so scaled      (nc × nq)
+  Eigen::VectorXd b_unit_;       // b so scaled              (nc)
+  Eigen::MatrixXd L_unit_;       // L of the scaled rows     (nq × nc)
+  Eigen::MatrixXd ML_unit_;      // M L of the scaled rows   (nq × nc)
   Eigen::MatrixXd T_;
   Eigen::VectorXd Lb_;
+  // memory of the decompositions
+  Eigen::VectorXd residual_;                  // (nc)
+  Eigen::MatrixXd rows_, R_transposed_;       // (nq × nc), (nc × min(nq, nc))
+  Eigen::VectorXd reflection_, reflection2_;  // (min(nq, nc))
+  Eigen::VectorXi order_, order2_;            // (nc), (min(nq, nc))
 };
 
 /// The Udwadia–Kalaba equation at N states.
@@ -103,6 +152,11 @@ struct MechanicsBatch {
 /// @param parameters  (system.parameters().size())
 MechanicsBatch evaluate_mechanics(const System& system, const Eigen::Ref<const Eigen::MatrixXd>& states,
                                   const Eigen::Ref<const Eigen::VectorXd>& parameters);
+
+/// The same, into the memory of an earlier batch: allocates nothing where the sizes are the same. After a fault, what belongs to
+/// later states is left as it was.
+void evaluate_mechanics(const System& system, const Eigen::Ref<const Eigen::MatrixXd>& states,
+                        const Eigen::Ref<const Eigen::VectorXd>& parameters, MechanicsBatch& batch);
 
 /// The same, where a fault is an error.
 /// @throws InputError naming the state and the rule.

@@ -24,15 +24,18 @@ struct ViewAt {
 /// A prior conditioned on observations (Geist & Trimpe 2020, eq. 6 and 7 under the prior of eq. 8, through the reduced form of
 /// likelihood.hpp). Every quantity is noise-free: the latent one, not the next measurement. Projections are applied last, so
 /// constrained means and samples obey A ddq = b, and covariances A Σ Aᵀ = 0, to rounding. Without observations it is the prior.
-/// Immutable, cheap to copy, thread-safe.
+/// Immutable, cheap to copy, thread-safe. One that is given away can grow and shrink with its data: update, remove_oldest.
 class Posterior {
  public:
   /// @throws InputError when M is not positive definite or the constraints contradict each other at an observed state.
   /// @throws NumericalError when the covariance cannot be factored in double precision (noise too small).
   Posterior(Prior prior, std::vector<Observations> observations, ModelValues values);
 
-  /// E[view] at N states (d × N).
-  [[nodiscard]] Eigen::MatrixXd mean(const View& view, const Eigen::Ref<const Eigen::MatrixXd>& states) const;
+  /// E[view] at N states (d × N). A state's result is the same, to the bit, whatever other states are asked for and however many
+  /// threads work.
+  /// @param n_threads  that may work on it; 0: as many as the machine has
+  /// @throws InputError as require_mechanics.
+  [[nodiscard]] Eigen::MatrixXd mean(const View& view, const Eigen::Ref<const Eigen::MatrixXd>& states, int n_threads = 1) const;
 
   struct Marginal {
     Eigen::MatrixXd mean;        // (d × N)
@@ -41,8 +44,10 @@ class Posterior {
 
     [[nodiscard]] Eigen::MatrixXd stddev() const;  // (d × N)
   };
-  /// Mean and covariance of the view at each state by itself.
-  [[nodiscard]] Marginal marginal(const View& view, const Eigen::Ref<const Eigen::MatrixXd>& states) const;
+  /// Mean and covariance of the view at each state by itself. The mean is that of mean(), to the bit. The covariance is the same
+  /// for any number of threads; which other states are asked for may change its last digits, since triangular systems are solved
+  /// for blocks of states.
+  [[nodiscard]] Marginal marginal(const View& view, const Eigen::Ref<const Eigen::MatrixXd>& states, int n_threads = 1) const;
 
   struct Joint {
     Eigen::VectorXd mean;        // quantity after quantity, in each state after state
@@ -69,9 +74,39 @@ class Posterior {
   struct Implementation;  // posterior.cpp
 
  private:
+  friend class Predictor;
   friend PathwiseSamples sample_paths(const Posterior& posterior, int n_samples, const PathwiseOptions& options);
+  friend Posterior update(Posterior&& posterior, Observations added);
+  friend Posterior remove_oldest(Posterior&& posterior, int n);
+
+  explicit Posterior(std::shared_ptr<const Implementation> implementation);
+  // this one's where nobody else holds it, else a copy
+  [[nodiscard]] std::shared_ptr<Implementation> own_implementation() const;
 
   std::shared_ptr<const Implementation> implementation_;
 };
+
+/// The posterior of more observations, by extending its factor: O(n²) operations for each new number, where the reduced size is n
+/// and a posterior built anew takes O(n³). The same as that one to rounding. Hyperparameters and parameters of the system are
+/// held, and with them all scales.
+///
+///     posterior = update(std::move(posterior), {.states = x, .view = ddq, .values = y, .noise_stddev = sigma});
+///
+/// The noise of the new observations is their own noise_stddev, as it stands; that of earlier ones is values().noise_stddev.
+/// Where both view and noise are those of an earlier group of observations() the new ones join it behind its last; else they are
+/// a new group, with its noise in values(). So Posterior(prior(), observations(), values()) is always the posterior built anew.
+///
+/// In place where no copy of `posterior` is held, by a Predictor or PathwiseSamples either; else a copy is changed and the others
+/// stay what they are. Memory is drawn for the factor only when what was set aside is full, and then for half as many rows again.
+///
+/// @throws InputError when shapes do not fit, values are not finite or noise is not positive, and as the constructor; it and
+/// NumericalError leave `posterior` as it was. Otherwise it is empty, as after any move.
+[[nodiscard]] Posterior update(Posterior&& posterior, Observations added);
+
+/// The posterior without the n observed states that were added first; those given to the constructor count in their order, group
+/// after group. Rows leave the factor by plane rotations, O(n²) operations each, as stable as a posterior built anew. A group of
+/// which nothing is left stays, without states, and keeps its noise. In place and otherwise as update.
+/// @throws InputError when there are fewer; `posterior` is left as it was.
+[[nodiscard]] Posterior remove_oldest(Posterior&& posterior, int n);
 
 }  // namespace gp2

@@ -38,13 +38,15 @@ struct Latent {
   Tape features;                           // state -> φ; parameters in it keep the model's values
   std::vector<int> feature_parameters;     // the system's parameters that φ uses: they cannot be estimated
   Base base = Base::acceleration;
-  std::vector<std::string> column_names;    // p of them, for the names of the signal standard deviations
-  Tape directions;                          // state, parameters -> B (nq × p), column-major; unused where B = I
-  std::vector<Tape> direction_derivatives;  // one per parameter of the system -> ∂B/∂p
-  bool directions_are_identity = true;      // B = I, p = nq
-  std::optional<int> learned_rank;          // columns of W; not given: C = diag(s)
-  bool kernel_is_fixed = false;             // the kernel's parameters are 1, in the units that its features have
-  bool signal_is_fixed = false;             // s = 1, in the units that its directions have
+  std::vector<std::string> column_names;         // p of them, for the names of the signal standard deviations
+  Tape directions;                               // state, parameters -> B (nq × p), column-major; unused where B = I
+  std::vector<Tape> direction_derivatives;       // one per parameter of the system -> ∂B/∂p
+  StateDerivatives feature_state_derivatives;    // state -> ∂φ/∂x
+  StateDerivatives direction_state_derivatives;  // state, parameters -> ∂B/∂x; none where B = I
+  bool directions_are_identity = true;           // B = I, p = nq
+  std::optional<int> learned_rank;               // columns of W; not given: C = diag(s)
+  bool kernel_is_fixed = false;                  // the kernel's parameters are 1, in the units that its features have
+  bool signal_is_fixed = false;                  // s = 1, in the units that its directions have
   Range lengthscale, signal_stddev;
 
   [[nodiscard]] int size() const { return static_cast<int>(column_names.size()); }  // p

@@ -1,6 +1,7 @@
 #pragma once
 
 #include <memory>
+#include <mutex>
 #include <string>
 #include <vector>
 
@@ -53,9 +54,18 @@ class SymbolicSystem final : public System {
     std::vector<ConstraintRow> constraints;
   };
   explicit SymbolicSystem(Definition definition);
+  ~SymbolicSystem() override;
+  SymbolicSystem(const SymbolicSystem&) = delete;
+  SymbolicSystem& operator=(const SymbolicSystem&) = delete;
 
   [[nodiscard]] SystemValues evaluate(const Eigen::Ref<const Eigen::MatrixXd>& states,
                                       const Eigen::Ref<const Eigen::VectorXd>& parameters) const override;
+  void evaluate_into(const Eigen::Ref<const Eigen::MatrixXd>& states, const Eigen::Ref<const Eigen::VectorXd>& parameters,
+                     SystemValues& values) const override;
+  /// Its derivatives are exact; it allocates nothing. The first call with `derivatives` takes them, in a graph of the system's
+  /// own.
+  [[nodiscard]] std::unique_ptr<StateEvaluator> make_evaluator(const Eigen::Ref<const Eigen::VectorXd>& parameters,
+                                                               bool derivatives) const override;
   [[nodiscard]] SystemValues differentiate(const Eigen::Ref<const Eigen::MatrixXd>& states,
                                            const Eigen::Ref<const Eigen::VectorXd>& parameters, int index) const override;
   [[nodiscard]] Eigen::MatrixXd residuals(const Eigen::Ref<const Eigen::MatrixXd>& states,
@@ -69,14 +79,19 @@ class SymbolicSystem final : public System {
   [[nodiscard]] std::shared_ptr<const SymbolicSystem> without_constraints() const;
 
  private:
-  [[nodiscard]] SystemValues run(const Tape& tape, const Eigen::Ref<const Eigen::MatrixXd>& states,
-                                 const Eigen::Ref<const Eigen::VectorXd>& parameters) const;
+  class Evaluator;
+  struct StateTape;  // M, A, b, F and their derivatives in the state
+  [[nodiscard]] const StateTape& state_tape() const;
+  void run(const Tape& tape, const Eigen::Ref<const Eigen::MatrixXd>& states, const Eigen::Ref<const Eigen::VectorXd>& parameters,
+           SystemValues& values) const;
 
   Definition definition_;
   Tape values_;                    // M, A, b, F
   std::vector<Tape> derivatives_;  // the same, per parameter
   Tape mechanics_, force_, residuals_;
   std::vector<Residual> residual_labels_;
+  std::unique_ptr<StateTape> state_tape_;  // filled when first asked for, hence
+  mutable std::once_flag state_tape_is_filled_;
 };
 
 }  // namespace gp2

@@ -1,5 +1,6 @@
 #pragma once
 
+#include <memory>
 #include <optional>
 #include <string>
 #include <utility>
@@ -56,6 +57,8 @@ struct SystemValues {
   [[nodiscard]] ConstColumn F(int i) const { return force.col(i); }
 };
 
+class StateEvaluator;
+
 /// What a reader of a state asks for; see System::reads.
 enum class SystemPart { mechanics /* M, A, b */, force, residuals };
 
@@ -86,6 +89,16 @@ class System {
   /// @param parameters  (parameters().size())
   [[nodiscard]] virtual SystemValues evaluate(const Eigen::Ref<const Eigen::MatrixXd>& states,
                                               const Eigen::Ref<const Eigen::VectorXd>& parameters) const = 0;
+
+  /// The same, into the memory of earlier values. SymbolicSystem allocates nothing where the sizes are the same.
+  virtual void evaluate_into(const Eigen::Ref<const Eigen::MatrixXd>& states, const Eigen::Ref<const Eigen::VectorXd>& parameters,
+                             SystemValues& values) const;
+
+  /// M, A, b, F at one state after another, and where asked their derivatives in the state; see state_evaluator.hpp, which also
+  /// says what this default does and how exact it is.
+  /// @param parameters  (parameters().size())
+  [[nodiscard]] virtual std::unique_ptr<StateEvaluator> make_evaluator(const Eigen::Ref<const Eigen::VectorXd>& parameters,
+                                                                       bool derivatives) const;
 
   /// ∂M/∂p, ∂A/∂p, ∂b/∂p, ∂F/∂p at N states, exact, for parameter p = parameters()[index].
   [[nodiscard]] virtual SystemValues differentiate(const Eigen::Ref<const Eigen::MatrixXd>& states,

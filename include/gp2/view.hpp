@@ -44,6 +44,8 @@ struct View {
   [[nodiscard]] std::vector<bool> reads(const System& system) const;
 
   [[nodiscard]] int size() const { return static_cast<int>(rows.size()); }
+  /// The same rows of the same quantity, under the same Setting object.
+  bool operator==(const View&) const = default;
   /// ddq1 … (constrained), abar_q1 … (unconstrained), fc_q1 … (constraint force), lambda1 … (multipliers), dq1_next … (next
   /// velocity), with @LATENT behind where one latent is viewed alone.
   /// @param latent_name  of that latent

@@ -67,11 +67,12 @@ double max_constraint_error(const System& system, const Ref<const MatrixXd>& sta
 }
 
 Evaluation evaluate_predictions(const Posterior& posterior, const Ref<const MatrixXd>& states, const std::vector<int>& rows,
-                                const Ref<const MatrixXd>& targets, const std::shared_ptr<const Setting>& setting) {
+                                const Ref<const MatrixXd>& targets, const std::shared_ptr<const Setting>& setting,
+                                int n_threads) {
   View all = View::all(View::Quantity::constrained_acceleration, *posterior.prior().system);
   all.setting = setting;
   const System& system = prior_of(posterior.prior(), all).judge();
-  const Posterior::Marginal prediction = posterior.marginal(all, states);
+  const Posterior::Marginal prediction = posterior.marginal(all, states, n_threads);
   const MatrixXd stddev = prediction.stddev();
 
   Evaluation e;

@@ -6,10 +6,16 @@
 
 extern "C" {
 void dpotrf_(const char* uplo, const int* n, double* a, const int* lda, int* info, std::size_t);
+void dlauum_(const char* uplo, const int* n, double* a, const int* lda, int* info, std::size_t);
 void dpotri_(const char* uplo, const int* n, double* a, const int* lda, int* info, std::size_t);
 void dpstrf_(const char* uplo, const int* n, double* a, const int* lda, int* pivot, int* rank, const double* tolerance,
              double* work, int* info, std::size_t);
+void dtrsv_(const char* uplo, const char* trans, const char* diag, const int* n, const double* a, const int* lda, double* x,
+            const int* incx, std::size_t, std::size_t, std::size_t);
 void dtrsm_(const char* side, const char* uplo, const char* trans, const char* diag, const int* m, const int* n,
+            const double* alpha, const double* a, const int* lda, double* b, const int* ldb, std::size_t, std::size_t,
+            std::size_t, std::size_t);
+void dtrmm_(const char* side, const char* uplo, const char* trans, const char* diag, const int* m, const int* n,
             const double* alpha, const double* a, const int* lda, double* b, const int* ldb, std::size_t, std::size_t,
             std::size_t, std::size_t);
 }
@@ -17,7 +23,7 @@ void dtrsm_(const char* side, const char* uplo, const char* trans, const char* d
 namespace gp2::lapack {
 
 /// A = L Lᵀ in the lower triangle, in place; false when A is not positive definite.
-bool factorise(Eigen::MatrixXd& A);
+bool factorise(Eigen::Ref<Eigen::MatrixXd> A);
 
 /// Pᵀ A P = L Lᵀ of a positive semidefinite A, with the largest of what is left as the next pivot, down to its size times ε.
 struct PivotedFactor {
@@ -26,11 +32,12 @@ struct PivotedFactor {
 };
 PivotedFactor factorise_semidefinite(Eigen::MatrixXd A);
 
-/// The lower triangle of A⁻¹ from that of L, in place.
-void invert_factored(Eigen::MatrixXd& L);
+/// The lower triangle of A⁻¹ from that of L, in place: (L⁻¹)ᵀL⁻¹. Faster than dpotri, whose triangular inverse is slow up to a
+/// size of some hundred.
+void invert_factored(Eigen::Ref<Eigen::MatrixXd> L);
 
 /// B ← L⁻¹ B, or L⁻ᵀ B.
-void solve_lower(const Eigen::MatrixXd& L, bool transposed, Eigen::Ref<Eigen::MatrixXd> B);
+void solve_lower(const Eigen::Ref<const Eigen::MatrixXd>& L, bool transposed, Eigen::Ref<Eigen::MatrixXd> B);
 
 /// While any of these lives, OpenBLAS computes on the calling thread only: our threads and its own do not fight, and sums keep
 /// their order. The previous setting returns with the last one.
@@ -40,6 +47,18 @@ class SingleThread {
   ~SingleThread();
   SingleThread(const SingleThread&) = delete;
   SingleThread& operator=(const SingleThread&) = delete;
+};
+
+/// While it lives inside a SingleThread, and no other thread uses OpenBLAS, OpenBLAS computes on n threads: for one large matrix.
+class ManyThreads {
+ public:
+  explicit ManyThreads(int n_threads);
+  ~ManyThreads();
+  ManyThreads(const ManyThreads&) = delete;
+  ManyThreads& operator=(const ManyThreads&) = delete;
+
+ private:
+  bool changed_ = false;
 };
 
 }  // namespace gp2::lapack

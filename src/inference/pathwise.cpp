@@ -8,6 +8,7 @@
 #include "inference/lapack.hpp"
 #include "inference/posterior_implementation.hpp"
 #include "prior/random_features.hpp"
+#include "prior/simd.hpp"
 
 namespace gp2 {
 
@@ -22,7 +23,7 @@ namespace {
 struct LatentPath {
   RandomFeatures features;
   MatrixXd weights;  // W (features × functions)
-  MatrixXd beta;     // β (N × functions)
+  MatrixXd beta;     // β (N, padded × functions)
 };
 
 LatentPath draw_prior_path(const Posterior::Implementation& posterior, std::size_t a, int n_features, RandomStream& random) {
@@ -35,18 +36,19 @@ LatentPath draw_prior_path(const Posterior::Implementation& posterior, std::size
 
 // ỹ − Σ_a Z_a f̃_a − ε, what is left of the data to explain
 VectorXd misfit(const Posterior::Implementation& posterior, const std::vector<LatentPath>& paths, RandomStream& random) {
-  VectorXd misfit = posterior.reduction.y;
+  VectorXd misfit = posterior.y;
   for (std::size_t a = 0; a < paths.size(); ++a) {
     const LatentPath& path = paths[a];
+    const Posterior::Implementation::LatentAtSamples& latent = posterior.latents[a];
     VectorXd psi(path.features.size());
-    for (Index k = 0; k < posterior.features[a].rows(); ++k) {
-      path.features.evaluate(posterior.features[a].row(k).transpose(), psi);
+    for (std::size_t j = 0; j < posterior.samples.size(); ++j) {
+      const Index sample = static_cast<Index>(j);
+      path.features.evaluate(latent.kernel.features().row(sample).transpose(), psi);
       const VectorXd f = path.weights.transpose() * psi;
-      // the components of this observation: the samples are sorted by falling rank
-      for (int c = 0; c < posterior.reduction.n_components(); ++c) {
-        if (k >= posterior.reduction.count[static_cast<std::size_t>(c)]) break;
-        const Index row = posterior.reduction.offset[static_cast<std::size_t>(c)] + k;
-        misfit[row] -= posterior.Z[a].row(row) * f;
+      for (std::size_t c = 0; c < posterior.row_of.size(); ++c) {
+        if (posterior.row_of[c][j] < 0) continue;
+        const auto Z = latent.Z.row(sample).segment(static_cast<Index>(c) * f.size(), f.size());
+        misfit[posterior.row_of[c][j]] -= Z * f;
       }
     }
   }
@@ -73,25 +75,28 @@ MatrixXd PathwiseSamples::evaluate(int sample, const View& view, const Ref<const
   const Posterior::Implementation& posterior = *implementation_->posterior;
   const std::vector<LatentPath>& paths = implementation_->samples[static_cast<std::size_t>(sample)];
   const Query query = make_query(posterior, view, states);
-  Kernel::Workspace workspace;
-  VectorXd psi, k;
-  MatrixXd a_bar = query.prior.mean;
+  std::vector<MatrixXd> f(paths.size());
+  KernelColumns::Workspace workspace;
+  VectorXd psi, point, k, sums;
   for (std::size_t a = 0; a < paths.size(); ++a) {
-    if (view.latent >= 0 && view.latent != static_cast<int>(a)) continue;
+    if (!query.needs(a)) continue;
     const LatentPath& path = paths[a];
+    const KernelColumns& kernel = posterior.latents[a].kernel;
     psi.resize(path.features.size());
-    VectorXd f(path.weights.cols());
-    for (int i = 0; i < query.size(); ++i) {
-      const VectorXd point = query.features[a].row(i);
-      path.features.evaluate(point, psi);
-      f.noalias() = path.weights.transpose() * psi;
-      posterior.kernel_at(a, point, k, workspace);
-      f.noalias() += path.beta.transpose() * k;
-      a_bar.col(i) += query.prior.E(a, i) * (query.C[a] * f);
+    k.resize(kernel.n_rows());
+    sums.resize(path.weights.cols());
+    f[a].resize(path.weights.cols(), query.size());
+    for (Index i = 0; i < query.size(); ++i) {
+      path.features.evaluate(query.features[a].row(i).transpose(), psi);
+      f[a].col(i).noalias() = path.weights.transpose() * psi;
+      kernel.scale(query.features[a].row(i).transpose(), point);
+      kernel.evaluate(0, k.size(), point, k.data(), workspace);
+      simd::loops().weighted_sums(k.size(), sums.size(), k.data(), path.beta.data(), k.size(), sums.data());
+      f[a].col(i) += sums;
     }
   }
-  MatrixXd values = query.view.offset;
-  for (int i = 0; i < query.size(); ++i) values.col(i) += query.view.G(i) * a_bar.col(i);
+  MatrixXd values(view.size(), query.size());
+  query.view_of(posterior, f, values);
   return values;
 }
 
@@ -106,7 +111,7 @@ PathwiseSamples sample_paths(const Posterior& posterior, int n_samples, const Pa
 
   // solved in blocks that are always as wide, so that the bits of a sample do not depend on how many there are
   constexpr int block_size = 8;
-  MatrixXd alpha = MatrixXd::Zero(conditioned.reduction.size(), block_size);
+  MatrixXd alpha = MatrixXd::Zero(conditioned.factor.size(), block_size);
   for (int first = 0; first < n_samples; first += block_size) {
     const int end = std::min(first + block_size, n_samples);
     for (int s = first; s < end; ++s) {
@@ -117,12 +122,11 @@ PathwiseSamples sample_paths(const Posterior& posterior, int n_samples, const Pa
       }
       alpha.col(s - first) = misfit(conditioned, paths, random);
     }
-    lapack::solve_lower(conditioned.L, false, alpha);
-    lapack::solve_lower(conditioned.L, true, alpha);
+    lapack::solve_lower(conditioned.factor.L(), false, alpha);
+    lapack::solve_lower(conditioned.factor.L(), true, alpha);
     for (int s = first; s < end; ++s) {
       for (std::size_t a = 0; a < conditioned.prior.latents.size(); ++a) {
-        self->samples[static_cast<std::size_t>(s)][a].beta =
-            latent_weights(conditioned.reduction, conditioned.Z[a], alpha.col(s - first));
+        self->samples[static_cast<std::size_t>(s)][a].beta = conditioned.latent_weights(a, alpha.col(s - first));
       }
     }
   }

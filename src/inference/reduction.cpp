@@ -6,10 +6,14 @@
 
 #include <Eigen/QR>
 
+#include "inference/parallel.hpp"
+#include "prior/simd.hpp"
+
 namespace gp2 {
 
 using Eigen::Index;
 using Eigen::MatrixXd;
+using Eigen::Ref;
 using Eigen::VectorXd;
 
 namespace {
@@ -160,54 +164,82 @@ std::vector<MatrixXd> sorted_features(const Prior& prior, const std::vector<std:
   return sorted;
 }
 
-void assemble(const Prior& prior, const Reduction& reduction, const std::vector<MatrixXd>& features,
-              const std::vector<MatrixXd>& Z, const std::vector<VectorXd>& kernel, MatrixXd& K, std::vector<MatrixXd>& k) {
+MatrixXd by_component(const Reduction& reduction, const MatrixXd& rows) {
   const Index n_samples = static_cast<Index>(reduction.samples.size());
-  const Index size = reduction.size();
-  if (K.rows() != size || K.cols() != size) K.resize(size, size);
-  k.resize(prior.latents.size());
-  Kernel::Workspace workspace;
-  for (std::size_t a = 0; a < prior.latents.size(); ++a) {
-    if (k[a].rows() != n_samples) k[a].resize(n_samples, n_samples);
-    for (Index j = 0; j < n_samples; ++j) {
-      prior.latents[a].kernel.evaluate(features[a].bottomRows(n_samples - j), features[a].row(j).transpose(), kernel[a],
-                                       k[a].col(j).tail(n_samples - j), workspace);
-    }
-    k[a].triangularView<Eigen::StrictlyUpper>() = k[a].transpose();
+  MatrixXd padded = MatrixXd::Zero(simd::padded(n_samples), reduction.n_components() * rows.cols());
+  for (int c = 0; c < reduction.n_components(); ++c) {
+    const Index n = reduction.count[static_cast<std::size_t>(c)];
+    padded.block(0, c * rows.cols(), n, rows.cols()) = rows.middleRows(reduction.offset[static_cast<std::size_t>(c)], n);
   }
+  return padded;
+}
 
-  // K̃[(c,i),(c',j)] = Σ_a k_a,ij Σ_l Z_a[(c,i),l] Z_a[(c',j),l], by columns of the lower triangle
-  for (int cj = 0; cj < reduction.n_components(); ++cj) {
-    for (Index j = 0; j < reduction.count[static_cast<std::size_t>(cj)]; ++j) {
-      const Index column = reduction.offset[static_cast<std::size_t>(cj)] + j;
-      for (int ci = cj; ci < reduction.n_components(); ++ci) {
-        const Index first = ci == cj ? j : 0;
-        const Index n = reduction.count[static_cast<std::size_t>(ci)] - first;
-        if (n <= 0) continue;
-        const Index row = reduction.offset[static_cast<std::size_t>(ci)] + first;
-        auto out = K.col(column).segment(row, n);
-        for (std::size_t a = 0; a < prior.latents.size(); ++a) {
-          const auto k_column = k[a].col(j).segment(first, n);
-          if (reduction.learned_alike[a]) {
-            const double product = Z[a].row(row).dot(Z[a].row(column));
-            if (a == 0) {
-              out = product * k_column;
-            } else {
-              out += product * k_column;
-            }
-            continue;
+void assemble(const Reduction& reduction, const std::vector<KernelColumns>& kernels, const std::vector<MatrixXd>& Z,
+              int n_threads, Ref<MatrixXd> K) {
+  const simd::Loops<double>& loops = simd::loops();
+  const Index n_samples = static_cast<Index>(reduction.samples.size());
+  const int n_components = reduction.n_components();
+  const int n_tiles = static_cast<int>((n_samples + tile_size - 1) / tile_size);
+  std::vector<Index> n_functions;
+  for (const MatrixXd& rows : Z) n_functions.push_back(rows.cols() / std::max(n_components, 1));
+
+  parallel_for(n_tiles, n_threads, [&](int column_of_tiles, int) {
+    const Index J = column_of_tiles * tile_size;
+    const Index nj = std::min(tile_size, n_samples - J);
+    std::vector<MatrixXd> k(kernels.size(), MatrixXd(tile_size, tile_size)), k_transposed = k;
+    VectorXd out(tile_size), z(n_functions.empty() ? 0 : *std::max_element(n_functions.begin(), n_functions.end())), point;
+    KernelColumns::Workspace workspace;
+
+    // column `other` of component `right` at rows [first, first + n) of component `left`: Σ_a k_a Σ_l Z_a Z_a
+    const auto products = [&](const std::vector<MatrixXd>& k_of, Index k_column, Index skip, int left, Index first, Index n,
+                              int right, Index other) {
+      std::fill_n(out.data() + skip, n - skip, 0.0);
+      for (std::size_t a = 0; a < Z.size(); ++a) {
+        const Index m = n_functions[a];
+        for (Index l = 0; l < m; ++l) z[l] = Z[a](other, right * m + l);
+        loops.add_scaled_products(n - skip, m, k_of[a].col(k_column).data() + skip, Z[a].col(left * m).data() + first + skip,
+                                  Z[a].rows(), z.data(), out.data() + skip);
+      }
+    };
+
+    for (Index I = J; I < n_samples; I += tile_size) {
+      const bool diagonal = I == J;
+      const Index ni = std::min(tile_size, n_samples - I);
+      for (std::size_t a = 0; a < kernels.size(); ++a) {
+        for (Index j = 0; j < nj; ++j) {
+          const Index skip = diagonal ? whole_vectors_before(j) : 0;
+          kernels[a].scale(J + j, point);
+          kernels[a].evaluate(I + skip, simd::padded(ni) - skip, point, k[a].col(j).data() + skip, workspace);
+        }
+        if (n_components > 1) k_transposed[a].topLeftCorner(nj, ni) = k[a].topLeftCorner(ni, nj).transpose();
+      }
+      for (int right = 0; right < n_components; ++right) {
+        for (int left = right; left < n_components; ++left) {
+          const Index row = reduction.offset[static_cast<std::size_t>(left)];
+          const Index column = reduction.offset[static_cast<std::size_t>(right)];
+          // rows in I, columns in J
+          const Index n_rows = std::min(ni, reduction.count[static_cast<std::size_t>(left)] - I);
+          const Index n_columns = std::min(nj, reduction.count[static_cast<std::size_t>(right)] - J);
+          for (Index j = 0; j < n_columns; ++j) {
+            const Index first = diagonal ? j : 0;
+            if (n_rows <= first) break;
+            products(k, j, diagonal ? whole_vectors_before(j) : 0, left, I, simd::padded(n_rows), right, J + j);
+            K.col(column + J + j).segment(row + I + first, n_rows - first) = out.segment(first, n_rows - first);
           }
-          const auto products = Z[a].middleRows(row, n).lazyProduct(Z[a].row(column).transpose());
-          if (a == 0) {
-            out = k_column.cwiseProduct(products);
-          } else {
-            out += k_column.cwiseProduct(products);
+          if (left == right) continue;
+          // rows in J, columns in I: on the diagonal what stands above that of its block
+          const Index n_columns_I = std::min(ni, reduction.count[static_cast<std::size_t>(right)] - I);
+          for (Index i = 0; i < n_columns_I; ++i) {
+            const Index n = std::min(diagonal ? i : nj, reduction.count[static_cast<std::size_t>(left)] - J);
+            if (n <= 0) continue;
+            products(k_transposed, i, 0, left, J, simd::padded(n), right, I + i);
+            K.col(column + I + i).segment(row + J, n) = out.head(n);
           }
         }
       }
-      K(column, column) += 1;
     }
-  }
+  });
+  K.diagonal().array() += 1;
 }
 
 }  // namespace gp2

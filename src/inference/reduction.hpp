@@ -4,6 +4,8 @@
 #include <vector>
 
 #include "gp2/likelihood.hpp"
+#include "prior/kernel_columns.hpp"
+#include "prior/simd.hpp"
 
 namespace gp2 {
 
@@ -59,12 +61,22 @@ std::vector<Eigen::MatrixXd> sorted_features(const Prior& prior,
 /// β_j = Z_jᵀ α̃_j, one row per sample (N × functions of a).
 Eigen::MatrixXd latent_weights(const Reduction& reduction, const Eigen::MatrixXd& Z, const Eigen::VectorXd& alpha);
 
-/// K̃ + I in the lower triangle, and k_a between all samples (N × N).
+/// Reduced rows laid out for the loops over samples: column c·(columns of `rows`) + l holds entry l of component c of each
+/// sample, in the order of the reduction, zero where a sample has no such component, and padded to whole vectors (simd.hpp).
+Eigen::MatrixXd by_component(const Reduction& reduction, const Eigen::MatrixXd& rows);
+
+/// Pairs of samples are worked off in square tiles of this size, so that the kernel between them is computed once and stays near.
+inline constexpr Eigen::Index tile_size = 64;
+
+/// Rows above the diagonal that a column of a tile on the diagonal may leave out, in whole vectors.
+constexpr Eigen::Index whole_vectors_before(Eigen::Index j) { return j / simd::lanes<double> * simd::lanes<double>; }
+
+/// K̃ + I in the lower triangle. What stands above the diagonal is left alone.
 ///
-/// @param Z       per latent: rows R_i E_a(x_i) C_a
-/// @param kernel  per latent: the kernel's parameters
-void assemble(const Prior& prior, const Reduction& reduction, const std::vector<Eigen::MatrixXd>& features,
-              const std::vector<Eigen::MatrixXd>& Z, const std::vector<Eigen::VectorXd>& kernel, Eigen::MatrixXd& K,
-              std::vector<Eigen::MatrixXd>& k);
+/// @param kernels  per latent: its kernel between the samples
+/// @param Z        per latent: rows R_i E_a(x_i) C_a, by component
+/// @param K        (reduction.size() × reduction.size())
+void assemble(const Reduction& reduction, const std::vector<KernelColumns>& kernels, const std::vector<Eigen::MatrixXd>& Z,
+              int n_threads, Eigen::Ref<Eigen::MatrixXd> K);
 
 }  // namespace gp2

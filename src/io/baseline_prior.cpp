@@ -5,6 +5,7 @@
 #include <fmt/format.h>
 
 #include "gp2/error.hpp"
+#include "io/latent_tapes.hpp"
 
 namespace gp2 {
 
@@ -45,7 +46,7 @@ struct Parts {
     Latent latent;
     latent.name = std::move(name);
     latent.feature_names = names;
-    latent.features = Tape(features, symbols.state());
+    set_features(latent, features, symbols);
     latent.kernel = Kernel::parse(kernel, latent.feature_names);
     return latent;
   }
@@ -75,12 +76,11 @@ Prior make_baseline_prior(const ModelFile& model, const Baseline& baseline) {
       const std::string output = system.coordinates()[j].acceleration();
       Latent latent = parts.latent(output, "se", parts.raw);
       latent.column_names = {output};
-      latent.directions_are_identity = false;
       std::vector<Expression> unit(n_outputs, graph.constant(0));
       const Tape zero(unit, parts.symbols.state_and_parameters());
       latent.direction_derivatives.assign(system.parameters().size(), zero);
       unit[j] = graph.constant(1);
-      latent.directions = Tape(unit, parts.symbols.state_and_parameters());
+      set_directions(latent, unit, parts.symbols);
       prior.latents.push_back(std::move(latent));
     }
     return prior;

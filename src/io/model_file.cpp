@@ -10,6 +10,7 @@
 #include "gp2/csv.hpp"
 #include "gp2/error.hpp"
 #include "io/baseline_prior.hpp"
+#include "io/latent_tapes.hpp"
 #include "io/model_reader.hpp"
 #include "io/toml_reader.hpp"
 
@@ -89,7 +90,7 @@ Latent make_discrepancy(const SymbolicSystem& system, const SystemSymbols& symbo
   for (std::size_t d = 0; d < features.size(); ++d) {
     features[d] = features[d] / graph.constant(discrepancy.lengthscale[static_cast<Eigen::Index>(d)]);
   }
-  latent.features = Tape(features, symbols.state());
+  set_features(latent, features, symbols);
   latent.kernel = Kernel::parse("se", latent.feature_names);
   latent.kernel_is_fixed = latent.signal_is_fixed = true;
   const auto nq = static_cast<std::size_t>(system.nq());
@@ -99,8 +100,7 @@ Latent make_discrepancy(const SymbolicSystem& system, const SystemSymbols& symbo
     latent.column_names.push_back(system.coordinates()[j].acceleration());
     directions[j * nq + j] = graph.constant(discrepancy.stddev[static_cast<Eigen::Index>(j)]);
   }
-  latent.directions_are_identity = false;
-  latent.directions = Tape(directions, symbols.state_and_parameters());
+  set_directions(latent, directions, symbols);
   return latent;
 }
 
@@ -143,7 +143,7 @@ Prior make_prior(const ModelFile& model, const PriorOptions& options) {
         features.push_back(graph.substitute(feature_value, parameter_values));
       }
     }
-    latent.features = Tape(features, symbols.state());
+    set_features(latent, features, symbols);
     latent.kernel = Kernel::parse(text.kernel, latent.feature_names);
 
     if (options.discrepancy && &text == &model.latents.front()) {
@@ -162,7 +162,7 @@ Prior make_prior(const ModelFile& model, const PriorOptions& options) {
         latent.column_names.push_back(fmt::format("direction {}", column + 1));
         for (const std::vector<Expression>& row : text.directions) entries.push_back(row[column]);
       }
-      latent.directions = Tape(entries, symbols.state_and_parameters());
+      set_directions(latent, entries, symbols);
       for (Expression parameter : symbols.parameters) {
         std::vector<Expression> derivatives;
         for (Expression entry : entries) derivatives.push_back(graph.differentiate(entry, parameter));

@@ -288,9 +288,13 @@ Expression derivative(Expression e, Expression da, Expression db) {
 
 }  // namespace
 
-Expression ExpressionGraph::differentiate(Expression e, Expression x) {
+Expression ExpressionGraph::differentiate(Expression e, Expression x) { return differentiate(std::span(&e, 1), x).front(); }
+
+std::vector<Expression> ExpressionGraph::differentiate(std::span<const Expression> expressions, Expression x) {
   if (x.operation() != Operation::variable) throw InputError("expressions: a derivative is taken with respect to a variable");
   const Expression zero = constant(0);
+  std::vector<std::uint32_t> roots;
+  for (const Expression e : expressions) roots.push_back(e.id_);
 
   // forwards through the operands, so that depth costs no stack; nodes missing from the map do not depend on x
   std::unordered_map<std::uint32_t, Expression> derivatives{{x.id_, constant(1)}};
@@ -298,7 +302,7 @@ Expression ExpressionGraph::differentiate(Expression e, Expression x) {
     const auto found = derivatives.find(id);
     return found == derivatives.end() ? zero : found->second;
   };
-  for (const std::uint32_t id : implementation_->reachable(std::array{e.id_})) {
+  for (const std::uint32_t id : implementation_->reachable(roots)) {
     const Node node = implementation_->nodes[id];
     if (is_leaf(node.operation)) continue;
     const Expression da = derivative_of(node.a);
@@ -306,7 +310,34 @@ Expression ExpressionGraph::differentiate(Expression e, Expression x) {
     if (da == zero && db == zero) continue;
     derivatives.emplace(id, derivative({this, id}, da, db));
   }
-  return derivative_of(e.id_);
+  std::vector<Expression> results;
+  for (const std::uint32_t id : roots) results.push_back(derivative_of(id));
+  return results;
+}
+
+std::vector<Expression> ExpressionGraph::copy(std::span<const Expression> expressions) {
+  if (expressions.empty()) return {};
+  const ExpressionGraph& source = expressions.front().graph();
+  std::vector<std::uint32_t> roots;
+  for (const Expression e : expressions) {
+    if (e.graph_ != &source) throw InputError("expressions: what is copied belongs to different graphs; copy each on its own");
+    roots.push_back(e.id_);
+  }
+  // as they are, without simplification, which they have been through
+  std::unordered_map<std::uint32_t, std::uint32_t> copies;
+  for (const std::uint32_t id : source.implementation_->reachable(roots)) {
+    Node node = source.implementation_->nodes[id];
+    if (node.operation == Operation::variable) {
+      copies[id] = variable(source.implementation_->names[node.a]).id_;
+      continue;
+    }
+    if (!is_leaf(node.operation)) node.a = copies.at(node.a);
+    if (is_binary(node.operation)) node.b = copies.at(node.b);
+    copies[id] = implementation_->intern(node);
+  }
+  std::vector<Expression> results;
+  for (const std::uint32_t id : roots) results.push_back({this, copies.at(id)});
+  return results;
 }
 
 Expression ExpressionGraph::substitute(Expression e, const std::map<std::string, Expression>& replacements) {

@@ -1,11 +1,16 @@
 #include "gp2/symbolic_system.hpp"
 
+#include <array>
+
 #include <fmt/format.h>
 
 #include "gp2/error.hpp"
+#include "gp2/state_evaluator.hpp"
+#include "symbolic/state_derivatives.hpp"
 
 namespace gp2 {
 
+using Eigen::Index;
 using Eigen::MatrixXd;
 using Eigen::Ref;
 using Eigen::VectorXd;
@@ -140,6 +145,14 @@ std::vector<std::string> labels_of(const SymbolicSystem::Definition& definition)
 
 }  // namespace
 
+// The derivatives are taken in a graph of their own: that of the definition may be growing elsewhere.
+struct SymbolicSystem::StateTape {
+  std::unique_ptr<ExpressionGraph> graph = std::make_unique<ExpressionGraph>();
+  std::vector<Expression> outputs, inputs;  // until the derivatives are taken
+  std::vector<StateDerivatives::Entry> derivatives;
+  Tape tape;  // M, A, b, F, then the derivatives
+};
+
 SymbolicSystem::SymbolicSystem(Definition definition)
     : System(definition.name, definition.coordinates, definition.inputs, definition.parameters, labels_of(definition)),
       definition_(std::move(definition)) {
@@ -168,24 +181,75 @@ SymbolicSystem::SymbolicSystem(Definition definition)
     }
   }
   residuals_ = Tape(residuals, tape_inputs);
+
+  state_tape_ = std::make_unique<StateTape>();
+  state_tape_->inputs = state_tape_->graph->copy(tape_inputs);
+  state_tape_->outputs = state_tape_->graph->copy(outputs);
 }
 
-SystemValues SymbolicSystem::run(const Tape& tape, const Ref<const MatrixXd>& states,
-                                 const Ref<const VectorXd>& parameters) const {
-  MatrixXd all;
-  tape.evaluate(states, parameters, all);
-  const auto n_mass = static_cast<Eigen::Index>(nq()) * nq();
-  const auto n_A = static_cast<Eigen::Index>(nc()) * nq();
-  return {all.topRows(n_mass), all.middleRows(n_mass, n_A), all.middleRows(n_mass + n_A, nc()), all.bottomRows(nq())};
+SymbolicSystem::~SymbolicSystem() = default;
+
+void SymbolicSystem::run(const Tape& tape, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters,
+                         SystemValues& values) const {
+  values.mass.resize(Index{nq()} * nq(), states.cols());
+  values.constraint_matrix.resize(Index{nc()} * nq(), states.cols());
+  values.constraint_vector.resize(nc(), states.cols());
+  values.force.resize(nq(), states.cols());
+  std::array<Ref<MatrixXd>, 4> parts{values.mass, values.constraint_matrix, values.constraint_vector, values.force};
+  tape.evaluate(states, parameters, parts);
 }
 
 SystemValues SymbolicSystem::evaluate(const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters) const {
-  return run(values_, states, parameters);
+  SystemValues values;
+  run(values_, states, parameters, values);
+  return values;
+}
+
+void SymbolicSystem::evaluate_into(const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters,
+                                   SystemValues& values) const {
+  run(values_, states, parameters, values);
 }
 
 SystemValues SymbolicSystem::differentiate(const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters,
                                            int index) const {
-  return run(derivatives_[static_cast<std::size_t>(index)], states, parameters);
+  SystemValues values;
+  run(derivatives_[static_cast<std::size_t>(index)], states, parameters, values);
+  return values;
+}
+
+class SymbolicSystem::Evaluator final : public StateEvaluator {
+ public:
+  Evaluator(const SymbolicSystem& system, const Ref<const VectorXd>& parameters, const Tape& tape,
+            std::span<const StateDerivatives::Entry> derivatives)
+      : StateEvaluator(system, parameters, derivatives), tape_(tape), workspace_(tape.make_workspace(parameters)) {}
+
+ private:
+  void evaluate_all(const Ref<const VectorXd>& state) override { tape_.evaluate_at(state, workspace_, all_values()); }
+
+  const Tape& tape_;
+  VectorXd workspace_;
+};
+
+const SymbolicSystem::StateTape& SymbolicSystem::state_tape() const {
+  std::call_once(state_tape_is_filled_, [this] {
+    StateTape& out = *state_tape_;
+    const internal::DerivativeExpressions derivatives =
+        internal::state_derivatives(out.outputs, std::span(out.inputs).first(static_cast<std::size_t>(layout().size())));
+    std::vector<Expression> all = out.outputs;
+    all.insert(all.end(), derivatives.expressions.begin(), derivatives.expressions.end());
+    out.tape = Tape(all, out.inputs);
+    out.derivatives = derivatives.entries;
+    out.outputs.clear();
+    out.inputs.clear();
+    out.graph.reset();
+  });
+  return *state_tape_;
+}
+
+std::unique_ptr<StateEvaluator> SymbolicSystem::make_evaluator(const Ref<const VectorXd>& parameters, bool derivatives) const {
+  if (!derivatives) return std::make_unique<Evaluator>(*this, parameters, values_, std::span<const StateDerivatives::Entry>());
+  const StateTape& all = state_tape();
+  return std::make_unique<Evaluator>(*this, parameters, all.tape, all.derivatives);
 }
 
 MatrixXd SymbolicSystem::residuals(const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters) const {

@@ -7,12 +7,18 @@
 #include "gp2/error.hpp"
 #include "gp2/expression.hpp"
 #include "symbolic/graph.hpp"
+#include "symbolic/state_derivatives.hpp"
 
 namespace gp2 {
 
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::Ref;
+using Eigen::VectorXd;
+
 namespace {
 
-constexpr Eigen::Index block_size = 64;  // points evaluated together
+constexpr Index block_size = 64;  // points evaluated together
 
 }  // namespace
 
@@ -86,19 +92,18 @@ Tape::Tape(std::span<const Expression> outputs, std::span<const Expression> inpu
   for (const std::uint32_t id : roots) outputs_.push_back(slots.at(id));
 }
 
-void Tape::evaluate(const Eigen::Ref<const Eigen::MatrixXd>& values, const Eigen::Ref<const Eigen::VectorXd>& shared,
-                    Eigen::MatrixXd& results) const {
-  const Eigen::Index n_first = values.rows();
-  const Eigen::Index n_points = values.cols();
-  if (n_first + shared.size() != static_cast<Eigen::Index>(uses_input_.size())) {
+template <typename Output>
+void Tape::run(const Ref<const MatrixXd>& values, const Ref<const VectorXd>& shared, const Output& output_at) const {
+  const Index n_first = values.rows();
+  const Index n_points = values.cols();
+  if (n_first + shared.size() != static_cast<Index>(uses_input_.size())) {
     throw InputError(fmt::format("tape: evaluate needs {} inputs, got {} per point and {} shared", uses_input_.size(), n_first,
                                  shared.size()));
   }
-  results.resize(n_outputs(), n_points);
 
   // kept between calls, so that repeated evaluation allocates nothing
   thread_local std::vector<double> workspace;
-  const Eigen::Index stride = std::min(block_size, n_points);
+  const Index stride = std::min(block_size, n_points);
   workspace.resize(std::max(workspace.size(), static_cast<std::size_t>(n_slots_ * stride)));
   const auto slot = [&, data = workspace.data()](std::uint32_t index) { return data + index * stride; };
 
@@ -108,12 +113,12 @@ void Tape::evaluate(const Eigen::Ref<const Eigen::MatrixXd>& values, const Eigen
     if (input >= n_first) std::fill_n(slot(index), stride, shared[input - n_first]);
   }
 
-  for (Eigen::Index start = 0; start < n_points; start += block_size) {
-    const Eigen::Index lanes = std::min(block_size, n_points - start);
+  for (Index start = 0; start < n_points; start += block_size) {
+    const Index lanes = std::min(block_size, n_points - start);
     for (const auto& [index, input] : inputs_) {
       if (input >= n_first) continue;
       double* const x = slot(index);
-      for (Eigen::Index i = 0; i < lanes; ++i) x[i] = values(input, start + i);
+      for (Index i = 0; i < lanes; ++i) x[i] = values(input, start + i);
     }
     for (const Instruction& instruction : instructions_) {
       double* const r = slot(instruction.result);
@@ -124,14 +129,88 @@ void Tape::evaluate(const Eigen::Ref<const Eigen::MatrixXd>& values, const Eigen
         continue;
       }
       internal::with_arithmetic(instruction.operation, [&](auto f) {
-        for (Eigen::Index i = 0; i < lanes; ++i) r[i] = f(a[i], b[i]);
+        for (Index i = 0; i < lanes; ++i) r[i] = f(a[i], b[i]);
       });
     }
     for (std::size_t output = 0; output < outputs_.size(); ++output) {
       const double* const r = slot(outputs_[output]);
-      for (Eigen::Index i = 0; i < lanes; ++i) results(static_cast<Eigen::Index>(output), start + i) = r[i];
+      const auto [first, step] = output_at(output);
+      for (Index i = 0; i < lanes; ++i) first[(start + i) * step] = r[i];
     }
   }
+}
+
+void Tape::evaluate(const Ref<const MatrixXd>& values, const Ref<const VectorXd>& shared, MatrixXd& results) const {
+  results.resize(n_outputs(), values.cols());
+  run(values, shared, [&](std::size_t output) { return std::pair(results.data() + output, results.rows()); });
+}
+
+void Tape::evaluate(const Ref<const MatrixXd>& values, const Ref<const VectorXd>& shared,
+                    std::span<Ref<MatrixXd>> results) const {
+  // outputs are asked for in order, and again in each block
+  std::size_t part = 0, first_of_part = 0;
+  run(values, shared, [&](std::size_t output) {
+    if (output == 0) part = first_of_part = 0;
+    while (output - first_of_part >= static_cast<std::size_t>(results[part].rows())) {
+      first_of_part += static_cast<std::size_t>(results[part++].rows());
+    }
+    return std::pair(results[part].data() + (output - first_of_part), results[part].outerStride());
+  });
+}
+
+VectorXd Tape::make_workspace(const Ref<const VectorXd>& shared) const {
+  const Index n_inputs = static_cast<Index>(uses_input_.size());
+  if (shared.size() > n_inputs) {
+    throw InputError(fmt::format("tape: make_workspace takes at most the {} inputs, got {} shared", n_inputs, shared.size()));
+  }
+  VectorXd workspace = VectorXd::Zero(n_slots_);
+  for (const auto& [index, value] : constants_) workspace[index] = value;
+  for (const auto& [index, input] : inputs_) {
+    if (input >= n_inputs - shared.size()) workspace[index] = shared[input - (n_inputs - shared.size())];
+  }
+  return workspace;
+}
+
+void Tape::evaluate_at(const Ref<const VectorXd>& point, VectorXd& workspace, Ref<VectorXd> results) const {
+  double* const slot = workspace.data();
+  for (const auto& [index, input] : inputs_) {
+    if (input < point.size()) slot[index] = point[input];
+  }
+  for (const Instruction& instruction : instructions_) {
+    double& r = slot[instruction.result];
+    const double a = slot[instruction.a];
+    if (instruction.exponent == 2) {
+      r = a * a;
+    } else if (instruction.exponent != 0) {
+      internal::integer_power(instruction.exponent, 1, &a, &r);
+    } else {
+      internal::with_arithmetic(instruction.operation, [&, b = slot[instruction.b]](auto f) { r = f(a, b); });
+    }
+  }
+  double* result = results.data();
+  for (const std::uint32_t index : outputs_) *result++ = slot[index];
+}
+
+internal::DerivativeExpressions internal::state_derivatives(std::span<const Expression> expressions,
+                                                            std::span<const Expression> state) {
+  DerivativeExpressions out;
+  if (expressions.empty()) return out;
+  for (std::size_t k = 0; k < state.size(); ++k) {
+    const std::vector<Expression> derivatives = state[k].graph().differentiate(expressions, state[k]);
+    for (std::size_t i = 0; i < derivatives.size(); ++i) {
+      if (derivatives[i].is_constant(0)) continue;
+      out.entries.push_back({static_cast<int>(i), static_cast<int>(k)});
+      out.expressions.push_back(derivatives[i]);
+    }
+  }
+  return out;
+}
+
+StateDerivatives::StateDerivatives(std::span<const Expression> expressions, std::span<const Expression> inputs, int n_states) {
+  internal::DerivativeExpressions derivatives =
+      internal::state_derivatives(expressions, inputs.first(static_cast<std::size_t>(n_states)));
+  tape = Tape(derivatives.expressions, inputs);
+  entries = std::move(derivatives.entries);
 }
 
 }  // namespace gp2

@@ -2,16 +2,15 @@
 #include <atomic>
 #include <chrono>
 #include <cmath>
-#include <exception>
 #include <limits>
 #include <mutex>
 #include <random>
 #include <set>
-#include <thread>
 
 #include "gp2/error.hpp"
 #include "gp2/training.hpp"
 #include "inference/lapack.hpp"
+#include "inference/parallel.hpp"
 #include "prior/random.hpp"
 #include "training/lbfgsb.hpp"
 
@@ -126,7 +125,8 @@ class Training {
 
   void run() {
     const lapack::SingleThread single_thread;
-    in_parallel(n_restarts(), [&](int restart) { run_restart(restart); });
+    // restarts side by side; where there is one alone, its evaluations share the threads
+    parallel_for(n_restarts(), n_threads_, [&](int restart, int) { run_restart(restart, n_restarts() == 1 ? n_threads_ : 1); });
     release();
     constexpr int max_escapes = 5;
     while (n_escapes_ < max_escapes && !stopped() && escape()) ++n_escapes_;
@@ -153,32 +153,6 @@ class Training {
   }
 
   [[nodiscard]] bool stopped() const { return options_.stop != nullptr && options_.stop->load(); }
-
-  // calls work(0) … work(n − 1), each once, on as many threads as allowed
-  template <typename Work>
-  void in_parallel(int n, const Work& work) const {
-    int n_threads = options_.n_threads > 0 ? options_.n_threads : static_cast<int>(std::thread::hardware_concurrency());
-    n_threads = std::clamp(n_threads, 1, n);
-    std::atomic<int> next = 0;
-    std::mutex mutex;
-    std::exception_ptr failure;
-    const auto run = [&] {
-      for (int k = next++; k < n; k = next++) {
-        try {
-          work(k);
-        } catch (...) {
-          const std::scoped_lock lock(mutex);
-          if (!failure) failure = std::current_exception();
-        }
-      }
-    };
-    {
-      std::vector<std::jthread> helpers;
-      for (int k = 1; k < n_threads; ++k) helpers.emplace_back(run);
-      run();
-    }
-    if (failure) std::rethrow_exception(failure);
-  }
 
   std::vector<Hyperparameter> at(const VectorXd& x) const {
     std::vector<Hyperparameter> hyperparameters = hyperparameters_;
@@ -253,7 +227,7 @@ class Training {
       return there;
     };
     std::vector<double> values(scanned.size() * n_points);
-    in_parallel(static_cast<int>(values.size()), [&](int trial) {
+    parallel_for(static_cast<int>(values.size()), n_threads_, [&](int trial, int) {
       if (stopped()) return;
       Likelihood::Workspace workspace;
       values[static_cast<std::size_t>(trial)] = objective(moved(trial), nullptr, workspace);
@@ -263,7 +237,7 @@ class Training {
     const auto lowest = std::min_element(values.begin(), values.end());
     const double before = reports_[from].objective;
     if (!(*lowest < before)) return false;
-    Likelihood::Workspace workspace;
+    Likelihood::Workspace workspace(n_threads_);
     const LbfgsbResult result = optimise(static_cast<int>(from), at(moved(static_cast<int>(lowest - values.begin()))), workspace);
     if (!(result.value < before)) return false;
     store(from, result);
@@ -271,9 +245,9 @@ class Training {
     return before - result.value > 1e-6 * (1 + std::abs(before));
   }
 
-  void run_restart(int restart) {
+  void run_restart(int restart, int n_threads) {
     RandomStream random(options_.seed, static_cast<std::uint64_t>(restart));
-    Likelihood::Workspace workspace;
+    Likelihood::Workspace workspace(n_threads);
     // a random start may lie where M is not positive definite: draw again, a few times
     constexpr int max_draws = 20;
     LbfgsbResult result;
@@ -295,7 +269,7 @@ class Training {
     constexpr int n_draws = 4;
     constexpr double size = 0.1;
     std::vector<LbfgsbResult> drawn(n_draws);
-    in_parallel(n_draws, [&](int draw) {
+    parallel_for(n_draws, n_threads_, [&](int draw, int) {
       RandomStream random(options_.seed, static_cast<std::uint64_t>(n_restarts() + draw));
       std::vector<Hyperparameter> start = results_[from];
       for (Hyperparameter& h : start) {
@@ -327,6 +301,7 @@ class Training {
   const std::vector<Observations>& observations_;
   const std::vector<Hyperparameter>& hyperparameters_;
   const FitOptions& options_;
+  int n_threads_ = thread_count(options_.n_threads);
   Likelihood likelihood_;
   std::vector<RestartReport> reports_;
   std::vector<std::vector<Hyperparameter>> results_;

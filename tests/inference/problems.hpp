@@ -379,12 +379,11 @@ inline Extended dense_covariance(const Prior& prior, const ModelValues& values, 
   const Index dx = x.mean.size() / n, dy = y.mean.size() / m;
   Extended covariance = Extended::Zero(x.mean.size(), y.mean.size());
   for (std::size_t a = 0; a < prior.latents.size(); ++a) {
-    Kernel::Workspace workspace;
-    VectorXd k(n);
+    const MatrixXd k = prior.latents[a].kernel.evaluate(x.features[a], y.features[a], values.kernel[a]);
     for (Index j = 0; j < m; ++j) {
-      prior.latents[a].kernel.evaluate(x.features[a], y.features[a].row(j).transpose(), values.kernel[a], k, workspace);
       for (Index i = 0; i < n; ++i) {
-        covariance.block(i * dx, j * dy, dx, dy) += static_cast<long double>(k[i]) * x.loading[static_cast<std::size_t>(i)][a] *
+        covariance.block(i * dx, j * dy, dx, dy) += static_cast<long double>(k(i, j)) *
+                                                    x.loading[static_cast<std::size_t>(i)][a] *
                                                     y.loading[static_cast<std::size_t>(j)][a].transpose();
       }
     }

@@ -5,6 +5,8 @@
 #include <Eigen/Eigenvalues>
 
 #include "gp2/error.hpp"
+#include "prior/kernel_columns.hpp"
+#include "prior/simd.hpp"
 #include "test_models.hpp"
 
 namespace gp2 {
@@ -33,10 +35,7 @@ MatrixXd random_points(Index n, Index n_features, RandomStream& random) {
 }
 
 double value_at(const Kernel& kernel, const VectorXd& x, const VectorXd& y, const VectorXd& values) {
-  VectorXd out(1);
-  Kernel::Workspace workspace;
-  kernel.evaluate(x.transpose(), y, values, out, workspace);
-  return out[0];
+  return kernel.evaluate(x.transpose(), y.transpose(), values)(0, 0);
 }
 
 std::vector<std::string> names_of(const Kernel& kernel) {
@@ -122,15 +121,33 @@ TEST(KernelTest, ManyPointsAtOnceAreThePointsOneByOne) {
     const Kernel kernel = Kernel::parse(text, two_features);
     const VectorXd values = random_parameters(kernel, random);
     const MatrixXd points = random_points(9, 2, random);
-    Kernel::Workspace workspace;
-    VectorXd out(9);
-    kernel.evaluate(points, points.row(4).transpose(), values, out, workspace);
+    const VectorXd out = kernel.evaluate(points, points.row(4), values);
     for (Index i = 0; i < 9; ++i) {
       EXPECT_NEAR(out[i], value_at(kernel, points.row(i), points.row(4), values),
                   16 * test::eps * std::max(1.0, std::abs(out[i])));
     }
   }
 }
+
+// a kernel between points and one more
+struct Columns {
+  KernelColumns of_points;
+  VectorXd point, k;
+
+  Columns(const Kernel& kernel, const MatrixXd& points, const VectorXd& values, const VectorXd& other)
+      : of_points(kernel, points, values), k(of_points.n_rows()) {
+    KernelColumns::Workspace workspace;
+    of_points.scale(other, point);
+    of_points.evaluate(0, n(), point, k.data(), workspace);
+  }
+  [[nodiscard]] Index n() const { return of_points.n_rows(); }
+  // with zeros where no point is
+  [[nodiscard]] VectorXd padded(const VectorXd& w) const {
+    VectorXd padded = VectorXd::Zero(n());
+    padded.head(w.size()) = w;
+    return padded;
+  }
+};
 
 class KernelGradients : public testing::TestWithParam<std::string> {};
 INSTANTIATE_TEST_SUITE_P(Each, KernelGradients,
@@ -147,15 +164,16 @@ TEST_P(KernelGradients, MatchDifferencesInTheLogarithmOfEveryParameter) {
   const VectorXd point = points.row(3);  // one pair at no distance, where a Matérn kernel's r has no derivative
   const VectorXd w = test::random_vector(7, random);
   const auto weighted_sum = [&](const VectorXd& at) -> VectorXd {
-    VectorXd out(7);
-    Kernel::Workspace workspace;
-    kernel.evaluate(points, point, at, out, workspace);
-    return VectorXd::Constant(1, w.dot(out));
+    return VectorXd::Constant(1, w.dot(kernel.evaluate(points, point.transpose(), at).col(0)));
   };
+  const Columns columns(kernel, points, values, point);
   const VectorXd before = VectorXd::Constant(values.size(), 0.25);
-  VectorXd gradient = before;
-  Kernel::Workspace workspace;
-  kernel.add_gradient(points, point, values, w, gradient, workspace);
+  MatrixXd sums = MatrixXd::Zero(simd::lanes<double>, values.size());
+  sums.row(0) = before.transpose();
+  KernelColumns::Workspace workspace;
+  const VectorXd padded_w = columns.padded(w);
+  columns.of_points.add_gradient(0, columns.n(), columns.point, columns.k.data(), padded_w.data(), sums, workspace);
+  const VectorXd gradient = sums.colwise().sum();
   for (Index p = 0; p < values.size(); ++p) {
     SCOPED_TRACE(kernel.parameters()[static_cast<std::size_t>(p)].name);
     const test::Difference difference = test::central_difference(
@@ -172,6 +190,32 @@ TEST_P(KernelGradients, MatchDifferencesInTheLogarithmOfEveryParameter) {
   }
 }
 
+TEST_P(KernelGradients, MatchDifferencesInEveryFeatureOfAPoint) {
+  SCOPED_TRACE(fmt::format("kernel {}, seed {}", GetParam(), seed));
+  RandomStream random(seed);
+  const Kernel kernel = Kernel::parse(GetParam(), two_features);
+  const VectorXd values = random_parameters(kernel, random);
+  const MatrixXd points = random_points(21, 2, random);
+  const VectorXd point = random_points(1, 2, random).row(0);
+  const Columns columns(kernel, points, values, point);
+  MatrixXd W = MatrixXd::Zero(columns.n(), 3);
+  W.topRows(21) = random_points(21, 3, random);
+  MatrixXd gradient(2, 3);
+  KernelColumns::Workspace workspace;
+  columns.of_points.differentiate(0, columns.n(), columns.point, columns.k.data(), W.data(), columns.n(), 3, gradient.data(),
+                                  workspace);
+  for (Index d = 0; d < 2; ++d) {
+    const test::Difference difference = test::central_difference(
+        [&](double value) -> VectorXd {
+          VectorXd moved = point;
+          moved[d] = value;
+          return W.topRows(21).transpose() * kernel.evaluate(points, moved.transpose(), values).col(0);
+        },
+        point[d], 0.5, 1024 * test::eps);
+    EXPECT_TRUE(test::matches(gradient.row(d).transpose(), difference)) << "feature " << d;
+  }
+}
+
 class KernelGrams : public testing::TestWithParam<std::string> {};
 INSTANTIATE_TEST_SUITE_P(Each, KernelGrams,
                          testing::Values("se", "matern32", "matern52", "rq", "periodic", "linear", "constant",
@@ -185,9 +229,7 @@ TEST_P(KernelGrams, ArePositiveSemidefinite) {
     SCOPED_TRACE(fmt::format("kernel {}, seed {}, trial {}", GetParam(), seed, trial));
     const VectorXd values = random_parameters(kernel, random);
     const MatrixXd points = random_points(25, 2, random);
-    MatrixXd gram(25, 25);
-    Kernel::Workspace workspace;
-    for (Index j = 0; j < 25; ++j) kernel.evaluate(points, points.row(j).transpose(), values, gram.col(j), workspace);
+    const MatrixXd gram = kernel.evaluate(points, points, values);
     const VectorXd eigenvalues = Eigen::SelfAdjointEigenSolver<MatrixXd>(gram).eigenvalues();
     // each entry is off by some ε of its terms: eigenvalues by at most 25 of them
     EXPECT_GE(eigenvalues[0], -25 * 64 * test::eps * gram.cwiseAbs().maxCoeff());

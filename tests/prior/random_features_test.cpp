@@ -32,9 +32,7 @@ Case make_case(const std::string& text) {
   c.values.resize(static_cast<Index>(c.kernel.parameters().size()));
   for (double& value : c.values) value = std::exp2(2 * random.uniform() - 1);
   for (double& entry : c.points.reshaped()) entry = 0.7 * random.normal();
-  Kernel::Workspace workspace;
-  for (Index j = 0; j < 4; ++j)
-    c.kernel.evaluate(c.points, c.points.row(j).transpose(), c.values, c.covariance.col(j), workspace);
+  c.covariance = c.kernel.evaluate(c.points, c.points, c.values);
   return c;
 }
 

@@ -300,6 +300,32 @@ TEST_F(ExpressionTest, GraphsDoNotMix) {
             "expressions: the operand belongs to another graph; build all operands in one graph");
 }
 
+TEST_F(ExpressionTest, ACopyReadsAsTheOriginal) {
+  ExpressionGraph other;
+  other.variable("z");
+  const std::vector<Expression> originals{read("x^3 - 2*sin(x*y)/z"), read("-(x*y)"), graph.constant(0.25), x};
+  const std::vector<Expression> copies = other.copy(originals);
+  ASSERT_EQ(copies.size(), originals.size());
+  for (std::size_t k = 0; k < copies.size(); ++k) {
+    EXPECT_EQ(&copies[k].graph(), &other);
+    EXPECT_EQ(to_string(copies[k]), to_string(originals[k]));
+  }
+  // in its own graph an expression is its own copy
+  EXPECT_EQ(graph.copy(originals), originals);
+  EXPECT_TRUE(other.copy({}).empty());
+  EXPECT_EQ(error_of([&] {
+              graph.copy(std::vector{x, other.variable("x")});
+            }),
+            "expressions: what is copied belongs to different graphs; copy each on its own");
+}
+
+TEST_F(ExpressionTest, SeveralExpressionsAreDifferentiatedAsEachAlone) {
+  const std::vector<Expression> expressions{read("x^3*y"), read("sin(x*y)"), y, x};
+  const std::vector<Expression> derivatives = graph.differentiate(expressions, x);
+  ASSERT_EQ(derivatives.size(), expressions.size());
+  for (std::size_t k = 0; k < expressions.size(); ++k) EXPECT_EQ(derivatives[k], graph.differentiate(expressions[k], x));
+}
+
 TEST_F(ExpressionTest, DerivativesAreTakenWithRespectToVariables) {
   EXPECT_EQ(error_of([&] { graph.differentiate(x * y, x + y); }),
             "expressions: a derivative is taken with respect to a variable");

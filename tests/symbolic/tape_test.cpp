@@ -1,9 +1,12 @@
+#include <array>
 #include <bit>
 #include <cstdint>
 #include <thread>
+#include <tuple>
 
 #include <gtest/gtest.h>
 
+#include "allocation_count.hpp"
 #include "gp2/error.hpp"
 #include "gp2/expression.hpp"
 #include "random_expression.hpp"
@@ -111,6 +114,53 @@ TEST_F(TapeTest, ThreadsShareATape) {
   }
 }
 
+TEST_F(TapeTest, OnePointAfterAnotherGivesTheBitsOfABatchAndAllocatesNothing) {
+  const Eigen::MatrixXd expected = evaluate(values);
+  Eigen::VectorXd workspace = tape.make_workspace(shared);
+  Eigen::MatrixXd results(tape.n_outputs(), n_points);
+  EXPECT_EQ(test::allocations_of([&] {
+              for (Eigen::Index point = 0; point < n_points; ++point)
+                tape.evaluate_at(values.col(point), workspace, results.col(point));
+            }),
+            0U);
+  for (Eigen::Index k = 0; k < results.size(); ++k) EXPECT_EQ(bits(results.data()[k]), bits(expected.data()[k]));
+}
+
+TEST_F(TapeTest, OutputsMayBeSpreadOverSeveralMatrices) {
+  const Eigen::MatrixXd expected = evaluate(values);
+  Eigen::MatrixXd first(7, n_points), none(0, n_points), second(1, n_points), rest(tape.n_outputs() - 8, n_points);
+  std::array<Eigen::Ref<Eigen::MatrixXd>, 4> parts{first, none, second, rest};
+  tape.evaluate(values, shared, parts);
+  Eigen::MatrixXd together(tape.n_outputs(), n_points);
+  together << first, second, rest;
+  for (Eigen::Index k = 0; k < together.size(); ++k) EXPECT_EQ(bits(together.data()[k]), bits(expected.data()[k]));
+}
+
+TEST_F(TapeTest, StateDerivativesAreTheEntriesOfTheJacobianThatDoNotVanish) {
+  const StateDerivatives derivatives(outputs, random.variables, 2);
+  Eigen::MatrixXd sparse;
+  derivatives.tape.evaluate(values, shared, sparse);
+  std::size_t next = 0;
+  for (int k = 0; k < 2; ++k) {
+    for (int i = 0; i < tape.n_outputs(); ++i) {
+      const Expression derivative =
+          graph.differentiate(outputs[static_cast<std::size_t>(i)], random.variables[static_cast<std::size_t>(k)]);
+      if (derivative.is_constant(0)) continue;
+      ASSERT_LT(next, derivatives.entries.size());
+      EXPECT_EQ(derivatives.entries[next].output, i);
+      EXPECT_EQ(derivatives.entries[next].state_index, k);
+      Eigen::MatrixXd alone;
+      Tape(std::span(&derivative, 1), random.variables).evaluate(values, shared, alone);
+      for (Eigen::Index point = 0; point < n_points; ++point) {
+        EXPECT_EQ(bits(sparse(static_cast<Eigen::Index>(next), point)), bits(alone(0, point)));
+      }
+      ++next;
+    }
+  }
+  EXPECT_EQ(next, derivatives.entries.size());
+  EXPECT_LT(next, static_cast<std::size_t>(2 * tape.n_outputs()));
+}
+
 TEST_F(TapeTest, NoPointsGiveNoResults) {
   const Eigen::MatrixXd results = evaluate(Eigen::MatrixXd(2, 0));
   EXPECT_EQ(results.rows(), tape.n_outputs());
@@ -205,6 +255,10 @@ TEST(Tape, ErrorsNameTheFault) {
               Tape(std::vector{x * y}, std::vector{x, y}).evaluate(Eigen::MatrixXd(1, 3), Eigen::VectorXd(2), results);
             }),
             "tape: evaluate needs 2 inputs, got 1 per point and 2 shared");
+  EXPECT_EQ(error_of([&] {
+              std::ignore = Tape(std::vector{x * y}, std::vector{x, y}).make_workspace(Eigen::VectorXd::Zero(3));
+            }),
+            "tape: make_workspace takes at most the 2 inputs, got 3 shared");
 }
 
 }  // namespace

@@ -1,0 +1,42 @@
+#pragma once
+
+#include <string>
+#include <string_view>
+
+namespace gp2 {
+
+/// Vector instructions that the processor has and the operating system saves between threads. All false off x86.
+struct ProcessorFeatures {
+  bool avx2 = false;    // AVX2 and FMA
+  bool avx512 = false;  // AVX-512 F, CD, BW, DQ and VL
+};
+
+/// Those of this machine.
+ProcessorFeatures processor_features();
+
+/// The kernel to ask OpenBLAS for, by the environment variable OPENBLAS_CORETYPE.
+///
+/// OpenBLAS holds its routines once for each of many processors, the kernels, and takes the one made for the processor that it
+/// recognises. What it does not recognise, or a setting that has come with the environment, may leave it with a kernel for
+/// narrower vectors than the processor has.
+///
+/// @param kernel_in_use  its name as OpenBLAS has it, say "Haswell"
+/// @return "SkylakeX" with AVX-512 and "Haswell" with AVX2 where the kernel in use does not use these instructions; "" where it
+///         does, or is not known. Kernels for AMD's processors of 2011 to 2015, whose vector units are narrower than their
+///         instructions, are left in place there.
+std::string_view recommended_kernel(std::string_view kernel_in_use, const ProcessorFeatures& features);
+
+/// The BLAS library that this process computes with.
+struct BlasReport {
+  std::string library;         // "OpenBLAS 0.3.21"; "unknown" when it is another one
+  std::string kernel;          // "Haswell"; "" when the library does not say
+  int n_threads = 1;           // it may use at most
+  std::string fastest_kernel;  // to set instead, see recommended_kernel(); "" when the one in use is as good
+  std::string advice;          // what to set and why, one line; "" when there is nothing to mend
+};
+
+/// What the library says about itself. Neither this nor anything else in gp2's library changes a setting for the whole process:
+/// OpenBLAS reads OPENBLAS_CORETYPE when it is loaded, so only who starts the process can choose.
+BlasReport blas_report();
+
+}  // namespace gp2

@@ -1,0 +1,48 @@
+#pragma once
+
+#include <algorithm>
+#include <atomic>
+#include <exception>
+#include <mutex>
+#include <thread>
+#include <vector>
+
+namespace gp2 {
+
+/// 0 means as many as the machine has.
+inline int thread_count(int wanted) {
+  return wanted > 0 ? wanted : std::max(1, static_cast<int>(std::thread::hardware_concurrency()));
+}
+
+/// Calls work(task, thread) once for every task 0 … n_tasks − 1, in an order that differs from run to run, on the calling thread
+/// and up to n_threads − 1 others; thread 0 … n_threads − 1 is the one that works. The first exception is thrown again when all
+/// are done.
+template <typename Work>
+void parallel_for(int n_tasks, int n_threads, const Work& work) {
+  n_threads = std::clamp(n_threads, 1, std::max(n_tasks, 1));
+  if (n_threads == 1) {
+    for (int task = 0; task < n_tasks; ++task) work(task, 0);
+    return;
+  }
+  std::atomic<int> next = 0;
+  std::mutex mutex;
+  std::exception_ptr failure;
+  const auto run = [&](int thread) {
+    for (int task = next++; task < n_tasks; task = next++) {
+      try {
+        work(task, thread);
+      } catch (...) {
+        const std::scoped_lock lock(mutex);
+        if (!failure) failure = std::current_exception();
+      }
+    }
+  };
+  {
+    std::vector<std::jthread> helpers;
+    for (int thread = 1; thread < n_threads; ++thread) helpers.emplace_back(run, thread);
+    run(0);
+  }
+  if (failure) std::rethrow_exception(failure);
+}
+
+}  // namespace gp2

@@ -1,0 +1,228 @@
+#include <gtest/gtest.h>
+#include <Eigen/Dense>
+
+#include "allocation_count.hpp"
+#include "gp2/mechanics.hpp"
+#include "test_models.hpp"
+
+// One object, one batch, from state to state: the same numbers as new ones, and no allocation.
+namespace gp2 {
+namespace {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+using test::eps;
+
+constexpr std::uint64_t seed = 20301;
+
+MatrixXd random_matrix(Index rows, Index cols, RandomStream& random) {
+  MatrixXd matrix(rows, cols);
+  for (double& entry : matrix.reshaped()) entry = random.normal();
+  return matrix;
+}
+
+/// M with κ(M) of order ten, A of n_rows rows of which the last n_redundant follow from the others, and b to match.
+struct Problem {
+  MatrixXd M, A;
+  VectorXd b;
+};
+
+Problem random_problem(Index nq, Index n_rows, Index n_redundant, RandomStream& random) {
+  const MatrixXd V = random_matrix(nq, nq, random);
+  Problem p{V * V.transpose() / static_cast<double>(nq) + MatrixXd::Identity(nq, nq), random_matrix(n_rows, nq, random),
+            test::random_vector(n_rows, random)};
+  const Index n_free = n_rows - n_redundant;
+  const MatrixXd weights = random_matrix(n_redundant, n_free, random);
+  p.A.bottomRows(n_redundant) = weights * p.A.topRows(n_free);
+  p.b.tail(n_redundant) = weights * p.b.head(n_free);
+  return p;
+}
+
+struct Size {
+  Index nq, n_rows, n_redundant;
+};
+const std::vector<Size> sizes = {{3, 1, 0}, {4, 2, 0}, {4, 3, 1},   {3, 3, 0},   {2, 5, 3},
+                                 {5, 0, 0}, {9, 9, 8}, {20, 12, 2}, {60, 40, 10}};
+
+TEST(AllocationCountTest, SeesNewAndEigen) {
+  MatrixXd matrix;
+  EXPECT_EQ(test::allocations_of([&] { matrix.resize(3, 3); }), 1U);
+  std::vector<double> numbers;
+  EXPECT_EQ(test::allocations_of([&] { numbers.resize(5); }), 1U);
+  EXPECT_EQ(test::allocations_of([&] { matrix.setZero(); }), 0U);
+}
+
+TEST(UdwadiaKalabaReuse, GivesWhatTheTextbookGives) {
+  SCOPED_TRACE(fmt::format("seed {}", seed));
+  RandomStream random(seed);
+  UdwadiaKalaba projection;
+  for (const Size& size : sizes) {
+    SCOPED_TRACE(fmt::format("{} coordinates, {} rows, {} redundant", size.nq, size.n_rows, size.n_redundant));
+    const Problem p = random_problem(size.nq, size.n_rows, size.n_redundant, random);
+    projection.compute(p.M, p.A, p.b);
+    EXPECT_EQ(projection.rank(), size.n_rows - size.n_redundant);
+    const MatrixXd M_inverse = p.M.inverse();
+    const MatrixXd W = p.A * M_inverse * p.A.transpose();
+    // forming W squares the condition of A, a few hundred at worst here
+    const MatrixXd W_pinv = size.n_rows == 0 ? MatrixXd(0, 0) : MatrixXd(W.completeOrthogonalDecomposition().pseudoInverse());
+    const MatrixXd L = M_inverse * p.A.transpose() * W_pinv;
+    const MatrixXd T = MatrixXd::Identity(size.nq, size.nq) - L * p.A;
+    const double tolerance = 1e6 * eps * static_cast<double>(size.nq);
+    EXPECT_LE((projection.T() - T).cwiseAbs().maxCoeff(), tolerance);
+    EXPECT_LE((projection.Lb() - L * p.b).cwiseAbs().maxCoeff(), tolerance * (1 + p.b.norm()));
+    const VectorXd v = test::random_vector(size.nq, random);
+    EXPECT_LE((projection.solve_mass(v) - M_inverse * v).cwiseAbs().maxCoeff(), tolerance);
+    if (size.n_redundant == 0 && size.n_rows > 0) {
+      EXPECT_LE((projection.L() - L).cwiseAbs().maxCoeff(), tolerance * (1 + L.norm()));
+      EXPECT_LE((projection.Lambda() - W_pinv).cwiseAbs().maxCoeff(), tolerance * (1 + W_pinv.norm()));
+    }
+  }
+}
+
+TEST(UdwadiaKalabaReuse, GivesTheBitsOfANewObjectWhateverCameBefore) {
+  SCOPED_TRACE(fmt::format("seed {}", seed));
+  RandomStream random(seed, 1);
+  UdwadiaKalaba reused;
+  for (int trial = 0; trial < 3; ++trial) {
+    for (const Size& size : sizes) {
+      const Problem p = random_problem(size.nq, size.n_rows, size.n_redundant, random);
+      reused.compute(p.M, p.A, p.b);
+      const UdwadiaKalaba fresh(p.M, p.A, p.b);
+      EXPECT_EQ(reused.rank(), fresh.rank());
+      EXPECT_EQ(reused.inconsistency(), fresh.inconsistency());
+      EXPECT_EQ(reused.T(), fresh.T());
+      EXPECT_EQ(reused.Lb(), fresh.Lb());
+      EXPECT_EQ(reused.L(), fresh.L());
+      // what fails leaves no trace
+      reused.compute(-p.M, p.A, p.b);
+      EXPECT_FALSE(reused.mass_is_positive_definite());
+    }
+  }
+}
+
+TEST(UdwadiaKalabaReuse, AllocatesNothingWhereTheSizesAreThoseOfTheCallBefore) {
+  SCOPED_TRACE(fmt::format("seed {}", seed));
+  RandomStream random(seed, 2);
+  for (const Size& size : sizes) {
+    SCOPED_TRACE(fmt::format("{} coordinates, {} rows, {} redundant", size.nq, size.n_rows, size.n_redundant));
+    const Problem p = random_problem(size.nq, size.n_rows, size.n_redundant, random);
+    const Problem other = random_problem(size.nq, size.n_rows, size.n_redundant == 0 ? 0 : size.n_redundant - 1, random);
+    const VectorXd a_bar = test::random_vector(size.nq, random);
+    const MatrixXd T_bar = random_matrix(size.nq, size.nq, random), Lambda_bar = random_matrix(size.n_rows, size.n_rows, random);
+    MatrixXd M_bar = 0 * p.M, A_bar = 0 * p.A;
+    VectorXd ddq(size.nq), b_bar = 0 * p.b;
+    UdwadiaKalaba projection;
+    UdwadiaKalaba::Workspace workspace;
+    const auto use = [&] {
+      for (const Problem* problem : {&p, &other}) {
+        projection.compute(problem->M, problem->A, problem->b);
+        projection.constrain(a_bar, ddq, workspace);
+        projection.solve_mass_in_place(ddq);
+        projection.add_adjoint(T_bar, a_bar, {M_bar, A_bar, b_bar}, workspace);
+        projection.add_Lambda_adjoint(Lambda_bar, {M_bar, A_bar, b_bar}, workspace);
+      }
+    };
+    use();
+    EXPECT_EQ(test::allocations_of(use), 0U);
+  }
+}
+
+class BatchReuse : public testing::TestWithParam<std::string> {};
+INSTANTIATE_TEST_SUITE_P(EveryModel, BatchReuse, testing::ValuesIn(test::every_model()), test::model_test_name);
+
+TEST_P(BatchReuse, GivesTheBitsOfANewBatchAndAllocatesNothing) {
+  const System& system = *test::model(GetParam()).system;
+  const VectorXd parameters = system.parameter_values();
+  const MatrixXd first = test::draw(test::model(GetParam()), 100, seed).states;
+  const MatrixXd second = test::draw(test::model(GetParam()), 100, seed + 1).states;
+  MechanicsBatch reused;
+  evaluate_mechanics(system, first, parameters, reused);
+  EXPECT_EQ(test::allocations_of([&] { evaluate_mechanics(system, second, parameters, reused); }), 0U);
+  const MechanicsBatch fresh = evaluate_mechanics(system, second, parameters);
+  EXPECT_EQ(reused.values.mass, fresh.values.mass);
+  EXPECT_EQ(reused.values.constraint_matrix, fresh.values.constraint_matrix);
+  ASSERT_EQ(reused.projections.size(), fresh.projections.size());
+  for (std::size_t i = 0; i < fresh.projections.size(); ++i) {
+    EXPECT_EQ(reused.projections[i].T(), fresh.projections[i].T());
+    EXPECT_EQ(reused.projections[i].Lb(), fresh.projections[i].Lb());
+  }
+}
+
+TEST(BatchReuseTest, AFaultIsForgottenAtTheNextStates) {
+  const ModelFile model = ModelFile::parse(R"(
+name = "indefinite"
+coordinates = ["x"]
+[mechanics]
+mass = [["x"]]
+force = ["0"]
+[constraints]
+acceleration = ["ddx - 1"]
+[[latent]]
+kernel = "se"
+features = ["x"]
+directions = "acceleration"
+)",
+                                           "indefinite.toml");
+  MechanicsBatch batch;
+  evaluate_mechanics(*model.system, Eigen::Vector3d(-1, 0, 0), VectorXd(), batch);
+  ASSERT_TRUE(batch.fault);
+  EXPECT_EQ(batch.fault->text, "the mass matrix M is not positive definite");
+  evaluate_mechanics(*model.system, Eigen::Vector3d(1, 0, 0), VectorXd(), batch);
+  EXPECT_FALSE(batch.fault);
+  EXPECT_EQ(batch.projections[0].Lb()[0], 1);
+}
+
+// s = T̄ : T + L̄b · L b and s = Λ̄ : Λ, differentiated forwards and in reverse
+TEST(UdwadiaKalabaAdjoint, AgreesWithTheDerivativesForwards) {
+  SCOPED_TRACE(fmt::format("seed {}", seed));
+  RandomStream random(seed, 3);
+  UdwadiaKalaba::Workspace workspace;
+  for (const Size& size : sizes) {
+    SCOPED_TRACE(fmt::format("{} coordinates, {} rows, {} redundant", size.nq, size.n_rows, size.n_redundant));
+    Problem p = random_problem(size.nq, size.n_rows, size.n_redundant, random);
+    // rows of very different sizes
+    for (Index k = 0; k < size.n_rows; ++k) {
+      const double factor = std::pow(10.0, 2 * random.uniform() - 1);
+      p.A.row(k) *= factor;
+      p.b[k] *= factor;
+    }
+    const UdwadiaKalaba projection(p.M, p.A, p.b);
+    const MatrixXd T_bar = random_matrix(size.nq, size.nq, random), Lambda_bar = random_matrix(size.n_rows, size.n_rows, random);
+    const VectorXd Lb_bar = test::random_vector(size.nq, random);
+    // it adds to what is there
+    MatrixXd M_bar = MatrixXd::Ones(size.nq, size.nq), A_bar = MatrixXd::Ones(size.n_rows, size.nq);
+    VectorXd b_bar = VectorXd::Ones(size.n_rows);
+    projection.add_adjoint(T_bar, Lb_bar, {M_bar, A_bar, b_bar}, workspace);
+    MatrixXd M_bar_Lambda = 0 * p.M, A_bar_Lambda = 0 * p.A;
+    VectorXd b_bar_Lambda = 0 * p.b;
+    projection.add_Lambda_adjoint(Lambda_bar, {M_bar_Lambda, A_bar_Lambda, b_bar_Lambda}, workspace);
+
+    for (int trial = 0; trial < 5; ++trial) {
+      const MatrixXd half = random_matrix(size.nq, size.nq, random);
+      const MatrixXd dM = half + half.transpose();
+      MatrixXd dA = random_matrix(size.n_rows, size.nq, random);
+      const VectorXd db = test::random_vector(size.n_rows, random);
+      const auto change = [&](const MatrixXd& M_, const MatrixXd& A_, const VectorXd& b_) {
+        return M_.cwiseProduct(dM).sum() + A_.cwiseProduct(dA).sum() + b_.dot(db);
+      };
+      const auto magnitude = [&](const MatrixXd& M_, const MatrixXd& A_, const VectorXd& b_) {
+        return M_.cwiseAbs().cwiseProduct(dM.cwiseAbs()).sum() + A_.cwiseAbs().cwiseProduct(dA.cwiseAbs()).sum() +
+               b_.cwiseAbs().dot(db.cwiseAbs());
+      };
+      // chains of products whose factors are of condition a few hundred
+      const double relative = 1e4 * eps * static_cast<double>(size.nq);
+      const UdwadiaKalaba::Derivative d = projection.differentiate(dM, dA, db);
+      EXPECT_NEAR(change(M_bar, A_bar, b_bar) - (dM.sum() + dA.sum() + db.sum()),
+                  T_bar.cwiseProduct(d.T).sum() + Lb_bar.dot(d.Lb), relative * (1 + magnitude(M_bar, A_bar, b_bar)));
+      if (size.n_redundant == 0) {
+        EXPECT_NEAR(change(M_bar_Lambda, A_bar_Lambda, b_bar_Lambda),
+                    Lambda_bar.cwiseProduct(projection.differentiate_Lambda(dM, dA)).sum(),
+                    relative * (1 + magnitude(M_bar_Lambda, A_bar_Lambda, b_bar_Lambda)));
+      }
+    }
+  }
+}
+
+}  // namespace
+}  // namespace gp2
