@@ -1,5 +1,5 @@
-// The negative log likelihood and its gradient (likelihood.hpp) beside their lower limit: LAPACK's dpotrf + dpotri of the same
-// reduced matrix. One thread. Read the ratio of the two rows of one N, in one run.
+// The negative log likelihood and its gradient (likelihood.hpp) beside what factoring and inverting the same reduced matrix
+// costs: by LAPACK's dpotrf + dpotri, and by ours. Read the ratio of two rows of one N, in one run.
 
 #include <benchmark/benchmark.h>
 #include <Eigen/Core>
@@ -7,6 +7,7 @@
 #include "gp2/generate.hpp"
 #include "gp2/training.hpp"
 #include "inference/lapack.hpp"
+#include "inference/reduction.hpp"
 
 namespace {
 
@@ -26,7 +27,8 @@ struct Problem {
   }
 };
 
-void likelihood_and_gradient(benchmark::State& state, const std::vector<std::string>& estimated, bool estimate_noise) {
+void likelihood_and_gradient(benchmark::State& state, const std::vector<std::string>& estimated, bool estimate_noise,
+                             int n_threads = 1) {
   const gp2::lapack::SingleThread single_thread;
   const Problem problem(static_cast<int>(state.range(0)), estimated, estimate_noise);
   gp2::Likelihood::Options options;
@@ -34,19 +36,40 @@ void likelihood_and_gradient(benchmark::State& state, const std::vector<std::str
   for (const std::string& name : estimated) options.gradient_parameters.push_back(problem.model.system->parameter_index(name));
   const gp2::ModelValues values = gp2::model_values(problem.prior, problem.observations, problem.hyperparameters);
   const gp2::Likelihood likelihood(problem.prior, problem.observations, values, options);
-  gp2::Likelihood::Workspace workspace;
+  gp2::Likelihood::Workspace workspace(n_threads);
   gp2::ModelValues gradient;
   for (auto _ : state) benchmark::DoNotOptimize(likelihood.evaluate(values, &gradient, workspace));
 }
 
 void known_parameters(benchmark::State& state) { likelihood_and_gradient(state, {}, false); }
+void known_parameters_two_threads(benchmark::State& state) { likelihood_and_gradient(state, {}, false, 2); }
 void estimated_noise(benchmark::State& state) { likelihood_and_gradient(state, {}, true); }
 void estimated_parameters(benchmark::State& state) { likelihood_and_gradient(state, {"p1", "p2", "p3", "p4", "p5"}, false); }
 
-// the limit: K̃ + I = L Lᵀ and its inverse
-void dpotrf_dpotri(benchmark::State& state) {
+// K̃ + I alone, on 1 or 2 threads
+void assembly(benchmark::State& state) {
+  const Problem problem(static_cast<int>(state.range(0)), {}, false);
+  const gp2::ModelValues values = gp2::model_values(problem.prior, problem.observations, problem.hyperparameters);
+  std::vector<gp2::ObservationModel> models;
+  gp2::model_observations(problem.prior, problem.observations, values.parameters, {}, models);
+  gp2::Reduction reduction;
+  gp2::reduce(problem.prior, problem.observations, models, values.noise_stddev, reduction);
+  const auto features =
+      gp2::sorted_features(problem.prior, gp2::features_by_group(problem.prior, problem.observations), reduction);
+  const std::vector<gp2::KernelColumns> kernels = {{problem.prior.latents[0].kernel, features[0], values.kernel[0]}};
+  const std::vector<Eigen::MatrixXd> Z = {gp2::by_component(reduction, reduction.directions[0] * values.loading(0))};
+  Eigen::MatrixXd K(reduction.size(), reduction.size());
+  for (auto _ : state) {
+    gp2::assemble(reduction, kernels, Z, static_cast<int>(state.range(1)), K);
+    benchmark::DoNotOptimize(K.data());
+  }
+}
+
+// what assembly and gradient come on top of: K̃ + I = L Lᵀ and its inverse
+void factor_and_inverse(benchmark::State& state, bool by_lapack, int n_threads) {
   const gp2::lapack::SingleThread single_thread;
-  const Eigen::Index size = 2 * state.range(0);
+  const gp2::lapack::ManyThreads many_threads(n_threads);
+  const int size = 2 * static_cast<int>(state.range(0));
   const Eigen::MatrixXd points = Eigen::MatrixXd::Random(size, 9);
   Eigen::MatrixXd K(size, size);
   for (Eigen::Index j = 0; j < size; ++j) {
@@ -59,15 +82,29 @@ void dpotrf_dpotri(benchmark::State& state) {
     work = K;
     state.ResumeTiming();
     gp2::lapack::factorise(work);
-    gp2::lapack::invert_factored(work);
+    if (by_lapack) {
+      int info = 0;
+      dpotri_("L", &size, work.data(), &size, &info, 1);
+    } else {
+      gp2::lapack::invert_factored(work);
+    }
     benchmark::DoNotOptimize(work.data());
   }
 }
 
-BENCHMARK(dpotrf_dpotri)->Arg(100)->Arg(300)->Arg(1000)->Unit(benchmark::kMillisecond);
-BENCHMARK(known_parameters)->Arg(100)->Arg(300)->Arg(1000)->Unit(benchmark::kMillisecond);
-BENCHMARK(estimated_noise)->Arg(100)->Unit(benchmark::kMillisecond);
-BENCHMARK(estimated_parameters)->Arg(100)->Unit(benchmark::kMillisecond);
+void dpotrf_dpotri(benchmark::State& state) { factor_and_inverse(state, true, 1); }
+void dpotrf_and_our_inverse(benchmark::State& state) { factor_and_inverse(state, false, 1); }
+
+const std::vector<int64_t> sizes = {100, 300, 1000, 3000};
+
+BENCHMARK(dpotrf_dpotri)->ArgsProduct({sizes})->Unit(benchmark::kMillisecond);
+BENCHMARK(dpotrf_and_our_inverse)->ArgsProduct({sizes})->Unit(benchmark::kMillisecond);
+BENCHMARK(known_parameters)->ArgsProduct({sizes})->Unit(benchmark::kMillisecond);
+BENCHMARK(known_parameters_two_threads)->Arg(1000)->Arg(3000)->UseRealTime()->Unit(benchmark::kMillisecond);
+BENCHMARK(estimated_noise)->ArgsProduct({sizes})->Unit(benchmark::kMillisecond);
+BENCHMARK(estimated_parameters)->ArgsProduct({sizes})->Unit(benchmark::kMillisecond);
+BENCHMARK(assembly)->Args({1000, 1})->Args({1000, 2})->Args({3000, 1})->Args({3000, 2})->UseRealTime()->Unit(
+    benchmark::kMillisecond);
 
 }  // namespace
 

@@ -48,9 +48,11 @@ struct Likelihood::Implementation {
 
 struct Likelihood::Workspace::Implementation {
   int n_threads = 1;
-  std::shared_ptr<const char> owner;   // identity of the likelihood whose data stands below; held, so that no other can have it
-  MatrixXd K;                          // K̃ + I, then its factor, then its inverse
-  std::vector<KernelColumns> kernels;  // per latent, between the samples in the order of
+  std::shared_ptr<const char> owner;     // identity of the likelihood whose data stands below; held, so that no other can have it
+  std::vector<ObservationModel> models;  // where parameters are estimated
+  Reduction reduction;                   // where parameters or the noise are
+  MatrixXd K;                            // K̃ + I, then its factor, then its inverse
+  std::vector<KernelColumns> kernels;    // per latent, between the samples in the order of
   std::vector<std::pair<int, int>> sample_ids;  // … these (group, index)
   std::vector<MatrixXd> D;                      // per latent: R_i E_a, by component
   std::vector<MatrixXd> Z;                      // per latent: R_i E_a C_a, by component
@@ -101,8 +103,10 @@ Likelihood::Likelihood(Prior prior, std::vector<Observations> observations, cons
     require_mechanics(*prior_of(self.prior, group.view).system, group.states, parameters_of(group.view, initial.parameters));
   }
   self.features = features_by_group(self.prior, self.observations);
-  auto models = model_observations(self.prior, self.observations, initial.parameters, self.options.gradient_parameters);
-  Reduction reduction = reduce(self.prior, self.observations, *models, initial.noise_stddev);
+  std::vector<ObservationModel> models;
+  model_observations(self.prior, self.observations, initial.parameters, self.options.gradient_parameters, models);
+  Reduction reduction;
+  reduce(self.prior, self.observations, models, initial.noise_stddev, reduction);
   self.initial_size = static_cast<int>(reduction.size());
   if (!self.options.gradient_parameters.empty()) return;
   if (!self.options.noise_gradient) self.fixed_reduction = std::move(reduction);
@@ -381,58 +385,82 @@ class PairSweep {
   std::vector<MatrixXd> beta_;
 };
 
-// What θ and the noise change at sample i: ∂NLL/∂e, ∂NLL/∂W and ∂NLL/∂E there, and the chain rule on to σ and θ.
-//
-void add_sample_gradient(const Likelihood::Options& options, const std::vector<ObservationModel>& models,
-                         const Reduction& reduction, const ModelValues& values, Index i, const VectorXd& alpha,
-                         const PairSums& sums, ModelValues& gradient) {
-  const Reduction::Sample& sample = reduction.samples[static_cast<std::size_t>(i)];
-  const std::size_t group = static_cast<std::size_t>(sample.group);
-  const ObservationModel& model = models[group];
-  const Index rank = sample.R.rows();
-  const VectorXd whitening = values.noise_stddev[group].cwiseInverse();
-
-  // α_i = Q_i α̃_i + (I − Q_iQ_iᵀ) e_i
-  VectorXd alpha_i(rank);
-  for (Index c = 0; c < rank; ++c) alpha_i[c] = alpha[reduction.offset[static_cast<std::size_t>(c)] + i];
-  const VectorXd d_e = sample.Q * alpha_i + sample.e_out;
-  // ∂NLL/∂W_i = Q_i Σ_a V_i,a E_aᵀ − (I − Q_iQ_iᵀ) e_i (posterior mean of ā − μ)ᵀ
-  MatrixXd V_E = MatrixXd::Zero(rank, sample.R.cols());
-  VectorXd mean = VectorXd::Zero(sample.R.cols());
-  std::vector<MatrixXd> V(sums.latents.size());
-  for (std::size_t a = 0; a < V.size(); ++a) {
-    const PairSums::OfLatent& of_latent = sums.latents[a];
-    const MatrixXd E = model.values.prior.E(a, sample.index) * values.loading(a);
-    const Index m = of_latent.mean.cols();
-    V[a].resize(rank, m);
-    for (Index c = 0; c < rank; ++c) V[a].row(c) = of_latent.V.row(i).segment(c * m, m);
-    V_E += V[a] * E.transpose();
-    mean += E * of_latent.mean.row(i).transpose();
+// What θ and the noise change at one sample: ∂NLL/∂e, ∂NLL/∂W and ∂NLL/∂E there, and the chain rule on to σ and θ.
+class SampleGradient {
+ public:
+  SampleGradient(const Likelihood::Options& options, const std::vector<ObservationModel>& models, const Reduction& reduction,
+                 const ModelValues& values, const VectorXd& alpha, const PairSums& sums)
+      : options_(options), models_(models), reduction_(reduction), alpha_(alpha), sums_(sums), V_(sums.latents.size()) {
+    for (const VectorXd& noise : values.noise_stddev) whitening_.push_back(noise.cwiseInverse());
+    for (std::size_t a = 0; a < V_.size(); ++a) loading_.push_back(values.loading(a));
   }
-  const MatrixXd d_W = sample.Q * V_E - sample.e_out * mean.transpose();
-  const auto G = model.values.view.G(sample.index);
 
-  // S^{-1/2} scales the rows of W and e
-  if (options.noise_gradient) {
-    const MatrixXd W = whitening.asDiagonal() * G;
-    gradient.noise_stddev[group].array() += 1 - d_e.array() * sample.e.array() - d_W.cwiseProduct(W).rowwise().sum().array();
-  }
-  if (options.gradient_parameters.empty()) return;
+  void add(Index i, ModelValues& gradient) {
+    const Reduction::Sample& sample = reduction_.samples[static_cast<std::size_t>(i)];
+    const std::size_t group = static_cast<std::size_t>(sample.group);
+    const ObservationModel& model = models_[group];
+    const VectorXd& whitening = whitening_[group];
+    const Index rank = sample.R.rows();
 
-  // e = S^{-1/2}(y − d − Gμ) and W = S^{-1/2}G: ∂NLL/∂d, ∂NLL/∂G, ∂NLL/∂μ and ∂NLL/∂E
-  const VectorXd d_offset = -whitening.cwiseProduct(d_e);
-  const MatrixXd d_G = whitening.asDiagonal() * d_W + d_offset * model.values.prior.mean.col(sample.index).transpose();
-  const VectorXd d_mean = G.transpose() * d_offset;
-  std::vector<MatrixXd>& d_E = V;
-  for (std::size_t a = 0; a < d_E.size(); ++a) d_E[a] = sample.R.transpose() * V[a] * values.loading(a).transpose();
-  for (std::size_t p = 0; p < options.gradient_parameters.size(); ++p) {
-    const ObservationModel::Values& d = model.derivatives[p];
-    double slope = d_offset.dot(d.view.offset.col(sample.index)) + d_G.cwiseProduct(d.view.G(sample.index)).sum() +
-                   d_mean.dot(d.prior.mean.col(sample.index));
-    for (std::size_t a = 0; a < d_E.size(); ++a) slope += d_E[a].cwiseProduct(d.prior.E(a, sample.index)).sum();
-    gradient.parameters[options.gradient_parameters[p]] += slope;
+    // α_i = Q_i α̃_i + (I − Q_iQ_iᵀ) e_i
+    alpha_i_.resize(rank);
+    for (Index c = 0; c < rank; ++c) alpha_i_[c] = alpha_[reduction_.offset[static_cast<std::size_t>(c)] + i];
+    d_e_ = sample.e_out;
+    d_e_.noalias() += sample.Q.lazyProduct(alpha_i_);
+    // ∂NLL/∂W_i = Q_i Σ_a V_i,a E_aᵀ − (I − Q_iQ_iᵀ) e_i (posterior mean of ā − μ)ᵀ
+    V_E_.setZero(rank, sample.R.cols());
+    mean_.setZero(sample.R.cols());
+    for (std::size_t a = 0; a < V_.size(); ++a) {
+      const PairSums::OfLatent& of_latent = sums_.latents[a];
+      E_.noalias() = model.values.prior.E(a, sample.index).lazyProduct(loading_[a]);
+      const Index m = of_latent.mean.cols();
+      V_[a].resize(rank, m);
+      for (Index c = 0; c < rank; ++c) V_[a].row(c) = of_latent.V.row(i).segment(c * m, m);
+      V_E_.noalias() += V_[a].lazyProduct(E_.transpose());
+      mean_.noalias() += E_.lazyProduct(of_latent.mean.row(i).transpose());
+    }
+    d_W_.noalias() = sample.Q.lazyProduct(V_E_);
+    d_W_.noalias() -= sample.e_out.lazyProduct(mean_.transpose());
+    const auto G = model.values.view.G(sample.index);
+
+    // S^{-1/2} scales the rows of W and e
+    if (options_.noise_gradient) {
+      gradient.noise_stddev[group].array() +=
+          1 - d_e_.array() * sample.e.array() - whitening.array() * d_W_.cwiseProduct(G).rowwise().sum().array();
+    }
+    if (options_.gradient_parameters.empty()) return;
+
+    // e = S^{-1/2}(y − d − Gμ) and W = S^{-1/2}G: ∂NLL/∂d, ∂NLL/∂G, ∂NLL/∂μ and ∂NLL/∂E
+    d_offset_ = -whitening.cwiseProduct(d_e_);
+    d_G_ = whitening.asDiagonal() * d_W_;
+    d_G_.noalias() += d_offset_.lazyProduct(model.values.prior.mean.col(sample.index).transpose());
+    d_mean_.noalias() = G.transpose().lazyProduct(d_offset_);
+    for (std::size_t a = 0; a < V_.size(); ++a) {
+      E_.noalias() = sample.R.transpose().lazyProduct(V_[a]);
+      V_[a].noalias() = E_.lazyProduct(loading_[a].transpose());  // now ∂NLL/∂E_a
+    }
+    for (std::size_t p = 0; p < options_.gradient_parameters.size(); ++p) {
+      const ObservationModel::Values& d = model.derivatives[p];
+      double slope = d_offset_.dot(d.view.offset.col(sample.index)) + d_G_.cwiseProduct(d.view.G(sample.index)).sum() +
+                     d_mean_.dot(d.prior.mean.col(sample.index));
+      for (std::size_t a = 0; a < V_.size(); ++a) slope += V_[a].cwiseProduct(d.prior.E(a, sample.index)).sum();
+      gradient.parameters[options_.gradient_parameters[p]] += slope;
+    }
   }
-}
+
+ private:
+  const Likelihood::Options& options_;
+  const std::vector<ObservationModel>& models_;
+  const Reduction& reduction_;
+  const VectorXd& alpha_;
+  const PairSums& sums_;
+  std::vector<VectorXd> whitening_;  // per group: S^{-1/2}
+  std::vector<MatrixXd> loading_;    // per latent: C_a
+  // memory used again at each sample
+  std::vector<MatrixXd> V_;
+  MatrixXd V_E_, E_, d_W_, d_G_;
+  VectorXd alpha_i_, d_e_, mean_, d_offset_, d_mean_;
+};
 
 }  // namespace
 
@@ -443,17 +471,15 @@ double Likelihood::evaluate(const ModelValues& values, ModelValues* gradient, Wo
   const std::size_t n_latents = self.prior.latents.size();
 
   // observations under these parameters and noise
-  std::optional<std::vector<ObservationModel>> own_models;
-  if (!self.fixed_models) {
-    own_models = model_observations(self.prior, self.observations, values.parameters,
-                                    gradient != nullptr ? self.options.gradient_parameters : std::vector<int>{});
-    if (!own_models) return infinity;
+  if (!self.fixed_models &&
+      !model_observations(self.prior, self.observations, values.parameters,
+                          gradient != nullptr ? self.options.gradient_parameters : std::vector<int>{}, work.models)) {
+    return infinity;
   }
-  const std::vector<ObservationModel>& models = own_models ? *own_models : *self.fixed_models;
-  std::optional<Reduction> own_reduction;
-  if (!self.fixed_reduction) own_reduction = reduce(self.prior, self.observations, models, values.noise_stddev);
-  const Reduction& reduction = own_reduction ? *own_reduction : *self.fixed_reduction;
-  work.prepare(self, reduction, own_reduction.has_value(), values);
+  const std::vector<ObservationModel>& models = self.fixed_models ? *self.fixed_models : work.models;
+  if (!self.fixed_reduction) reduce(self.prior, self.observations, models, values.noise_stddev, work.reduction);
+  const Reduction& reduction = self.fixed_reduction ? *self.fixed_reduction : work.reduction;
+  work.prepare(self, reduction, !self.fixed_reduction, values);
 
   // K̃ + I = L Lᵀ
   const int n_threads = reduction.samples.size() >= many_samples ? work.n_threads : 1;
@@ -507,9 +533,8 @@ double Likelihood::evaluate(const ModelValues& values, ModelValues* gradient, Wo
     }
   }
   if (!needs_V) return value;
-  for (Index i = 0; i < static_cast<Index>(reduction.samples.size()); ++i) {
-    add_sample_gradient(self.options, models, reduction, values, i, alpha, sums, *gradient);
-  }
+  SampleGradient of_sample(self.options, models, reduction, values, alpha, sums);
+  for (Index i = 0; i < static_cast<Index>(reduction.samples.size()); ++i) of_sample.add(i, *gradient);
   return value;
 }
 

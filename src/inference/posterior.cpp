@@ -213,14 +213,15 @@ void add_prior_covariance(double k, const double* left, const double* right, Ind
 
 void Posterior::Implementation::add_samples(const std::vector<Observations>& groups, const std::vector<VectorXd>& noise_stddev,
                                             int first_group) {
-  const auto models = model_observations(prior, groups, values.parameters, {});
-  if (!models) {
+  std::vector<ObservationModel> models;
+  if (!model_observations(prior, groups, values.parameters, {}, models)) {
     for (const Observations& group : groups) {
       static_cast<void>(
           require_mechanics(*prior_of(prior, group.view).system, group.states, parameters_of(group.view, values.parameters)));
     }
   }
-  const Reduction reduction = reduce(prior, groups, *models, noise_stddev);
+  Reduction reduction;
+  reduce(prior, groups, models, noise_stddev, reduction);
   const std::vector<MatrixXd> features = sorted_features(prior, features_by_group(prior, groups), reduction);
   const Index n_old = static_cast<Index>(samples.size()), n_new = static_cast<Index>(reduction.samples.size());
   std::vector<KernelColumns> kernels;

@@ -4,9 +4,8 @@
 #include <cmath>
 #include <numbers>
 
-#include <Eigen/QR>
-
 #include "inference/parallel.hpp"
+#include "mechanics/pivoted_qr.hpp"
 #include "prior/simd.hpp"
 
 namespace gp2 {
@@ -36,17 +35,19 @@ ObservationModel::Values zero_like(ObservationModel::Values values) {
 
 }  // namespace
 
-std::optional<std::vector<ObservationModel>> model_observations(const Prior& prior, const std::vector<Observations>& observations,
-                                                                const VectorXd& parameters,
-                                                                const std::vector<int>& gradient_parameters) {
-  std::vector<ObservationModel> models;
-  for (const Observations& group : observations) {
+bool model_observations(const Prior& prior, const std::vector<Observations>& observations, const VectorXd& parameters,
+                        const std::vector<int>& gradient_parameters, std::vector<ObservationModel>& models) {
+  models.resize(observations.size());
+  for (std::size_t g = 0; g < observations.size(); ++g) {
+    const Observations& group = observations[g];
+    ObservationModel& model = models[g];
     const Prior& there = prior_of(prior, group.view);
     const VectorXd theta = parameters_of(group.view, parameters);
-    const MechanicsBatch mechanics = evaluate_mechanics(*there.system, group.states, theta);
-    if (mechanics.fault) return std::nullopt;
-    ObservationModel& model = models.emplace_back();
-    model.values = {evaluate_view(group.view, mechanics, group.states), evaluate_prior(there, group.states, theta, mechanics)};
+    evaluate_mechanics(*there.system, group.states, theta, model.mechanics);
+    if (model.mechanics.fault) return false;
+    model.values = {evaluate_view(group.view, model.mechanics, group.states),
+                    evaluate_prior(there, group.states, theta, model.mechanics)};
+    model.derivatives.clear();
     for (int parameter : gradient_parameters) {
       const int index = index_there(group.view, parameter);
       if (index < 0) {
@@ -54,48 +55,65 @@ std::optional<std::vector<ObservationModel>> model_observations(const Prior& pri
         continue;
       }
       const SystemValues d = there.system->differentiate(group.states, theta, index);
-      model.derivatives.push_back({differentiate_view(group.view, mechanics, d),
-                                   differentiate_prior(there, group.states, theta, mechanics, model.values.prior, d, index)});
+      model.derivatives.push_back(
+          {differentiate_view(group.view, model.mechanics, d),
+           differentiate_prior(there, group.states, theta, model.mechanics, model.values.prior, d, index)});
     }
     if (group.view.latent >= 0) {
       model.values.prior.keep_only(static_cast<std::size_t>(group.view.latent));
       for (ObservationModel::Values& d : model.derivatives) d.prior.keep_only(static_cast<std::size_t>(group.view.latent));
     }
   }
-  return models;
+  return true;
 }
 
-Reduction reduce(const Prior& prior, const std::vector<Observations>& observations, const std::vector<ObservationModel>& models,
-                 const std::vector<VectorXd>& noise_stddev) {
-  Reduction reduction;
+void reduce(const Prior& prior, const std::vector<Observations>& observations, const std::vector<ObservationModel>& models,
+            const std::vector<VectorXd>& noise_stddev, Reduction& reduction) {
+  std::size_t n_samples = 0;
+  for (const Observations& group : observations) n_samples += static_cast<std::size_t>(group.n_data());
+  reduction.samples.resize(n_samples);
+  reduction.constant = 0;
+  MatrixXd W, factors;
+  VectorXd reflection;
+  Eigen::VectorXi order;
+  std::size_t k = 0;
   for (std::size_t g = 0; g < observations.size(); ++g) {
     const Observations& group = observations[g];
     const VectorXd whitening = noise_stddev[g].cwiseInverse();
     const double log_det_S_half = noise_stddev[g].array().log().sum();
+    const Index d = group.view.size();
     for (int i = 0; i < group.n_data(); ++i) {
       // W P = Q R', so R = Qᵀ W
-      const MatrixXd G = models[g].values.view.G(i);
-      const MatrixXd W = whitening.asDiagonal() * G;
-      Eigen::ColPivHouseholderQR<MatrixXd> qr;
-      qr.setThreshold(UdwadiaKalaba::rank_tolerance);
-      qr.compute(W);
-      const Index rank = qr.rank();
-      Reduction::Sample sample{static_cast<int>(g), i, {}, {}, {}, {}};
-      sample.Q = qr.householderQ() * MatrixXd::Identity(group.view.size(), rank);
-      sample.R = sample.Q.transpose() * W;
-      sample.e = whitening.cwiseProduct(group.values.col(i) - models[g].values.view.offset.col(i) -
-                                        G * models[g].values.prior.mean.col(i));
-      sample.e_out = sample.e - sample.Q * (sample.Q.transpose() * sample.e);
-      reduction.constant += 0.5 * sample.e_out.squaredNorm() + log_det_S_half +
-                            0.5 * static_cast<double>(group.view.size()) * std::log(2 * std::numbers::pi);
-      reduction.samples.push_back(std::move(sample));
+      Reduction::Sample& sample = reduction.samples[k++];
+      sample.group = static_cast<int>(g);
+      sample.index = i;
+      const auto G = models[g].values.view.G(i);
+      W.noalias() = whitening.asDiagonal() * G;
+      factors = W;
+      reflection.resize(std::min(W.rows(), W.cols()));
+      order.resize(W.cols());
+      const Index rank = internal::pivoted_qr(factors, reflection, order, UdwadiaKalaba::rank_tolerance);
+      sample.Q.setIdentity(d, rank);
+      internal::apply_Q(factors, reflection, rank, sample.Q);
+      sample.R.noalias() = sample.Q.transpose().lazyProduct(W);
+      sample.e = group.values.col(i) - models[g].values.view.offset.col(i);
+      sample.e.noalias() -= G.lazyProduct(models[g].values.prior.mean.col(i));
+      sample.e.array() *= whitening.array();
+      sample.y.noalias() = sample.Q.transpose().lazyProduct(sample.e);
+      sample.e_out = sample.e;
+      sample.e_out.noalias() -= sample.Q.lazyProduct(sample.y);
+      reduction.constant +=
+          0.5 * sample.e_out.squaredNorm() + log_det_S_half + 0.5 * static_cast<double>(d) * std::log(2 * std::numbers::pi);
     }
   }
 
   // component c belongs to the samples of rank > c: a prefix once they are sorted
-  std::stable_sort(reduction.samples.begin(), reduction.samples.end(),
-                   [](const Reduction::Sample& a, const Reduction::Sample& b) { return a.R.rows() > b.R.rows(); });
-  reduction.offset.push_back(0);
+  const auto falls = [](const Reduction::Sample& a, const Reduction::Sample& b) { return a.R.rows() > b.R.rows(); };
+  if (!std::is_sorted(reduction.samples.begin(), reduction.samples.end(), falls)) {
+    std::stable_sort(reduction.samples.begin(), reduction.samples.end(), falls);
+  }
+  reduction.count.clear();
+  reduction.offset.assign(1, 0);
   for (Index c = 0; !reduction.samples.empty() && c < reduction.samples.front().R.rows(); ++c) {
     Index count = 0;
     while (count < static_cast<Index>(reduction.samples.size()) &&
@@ -107,18 +125,22 @@ Reduction reduce(const Prior& prior, const std::vector<Observations>& observatio
   }
 
   reduction.y.resize(reduction.size());
-  for (const Latent& latent : prior.latents) reduction.directions.emplace_back(reduction.size(), latent.size());
-  for (Index k = 0; k < static_cast<Index>(reduction.samples.size()); ++k) {
-    const Reduction::Sample& sample = reduction.samples[static_cast<std::size_t>(k)];
-    const VectorXd y = sample.Q.transpose() * sample.e;
-    for (Index c = 0; c < y.size(); ++c) reduction.y[reduction.offset[static_cast<std::size_t>(c)] + k] = y[c];
+  reduction.directions.resize(prior.latents.size());
+  for (std::size_t a = 0; a < prior.latents.size(); ++a) {
+    reduction.directions[a].resize(reduction.size(), prior.latents[a].size());
+  }
+  MatrixXd RE;
+  for (Index s = 0; s < static_cast<Index>(reduction.samples.size()); ++s) {
+    const Reduction::Sample& sample = reduction.samples[static_cast<std::size_t>(s)];
+    for (Index c = 0; c < sample.y.size(); ++c) reduction.y[reduction.offset[static_cast<std::size_t>(c)] + s] = sample.y[c];
     for (std::size_t a = 0; a < prior.latents.size(); ++a) {
-      const MatrixXd RE = sample.R * models[static_cast<std::size_t>(sample.group)].values.prior.E(a, sample.index);
-      for (Index c = 0; c < y.size(); ++c) {
-        reduction.directions[a].row(reduction.offset[static_cast<std::size_t>(c)] + k) = RE.row(c);
+      RE.noalias() = sample.R.lazyProduct(models[static_cast<std::size_t>(sample.group)].values.prior.E(a, sample.index));
+      for (Index c = 0; c < RE.rows(); ++c) {
+        reduction.directions[a].row(reduction.offset[static_cast<std::size_t>(c)] + s) = RE.row(c);
       }
     }
   }
+  reduction.learned_alike.clear();
   for (std::size_t a = 0; a < prior.latents.size(); ++a) {
     bool alike = prior.latents[a].learned_rank.has_value();
     for (std::size_t c = 0; alike && c < reduction.count.size(); ++c) {
@@ -127,7 +149,6 @@ Reduction reduce(const Prior& prior, const std::vector<Observations>& observatio
     }
     reduction.learned_alike.push_back(alike);
   }
-  return reduction;
 }
 
 std::vector<std::vector<MatrixXd>> features_by_group(const Prior& prior, const std::vector<Observations>& observations) {

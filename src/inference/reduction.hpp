@@ -18,12 +18,13 @@ struct ObservationModel {
   };
   Values values;
   std::vector<Values> derivatives;  // one per gradient parameter
+  MechanicsBatch mechanics;         // that they come from
 };
 
-/// @returns nothing when the mechanics fail at a state (M not positive definite, contradicting constraints).
-std::optional<std::vector<ObservationModel>> model_observations(const Prior& prior, const std::vector<Observations>& observations,
-                                                                const Eigen::VectorXd& parameters,
-                                                                const std::vector<int>& gradient_parameters);
+/// @param models  receives one per Observations; what it held is memory to be used again
+/// @returns whether the mechanics hold at every state (M positive definite, constraints without contradiction).
+bool model_observations(const Prior& prior, const std::vector<Observations>& observations, const Eigen::VectorXd& parameters,
+                        const std::vector<int>& gradient_parameters, std::vector<ObservationModel>& models);
 
 /// Observations whitened by their noise and split: W = S^{-1/2}G = Q R, e = S^{-1/2}(y − d − Gμ), ỹ = Qᵀe.
 ///
@@ -34,6 +35,7 @@ struct Reduction {
     int group, index;       // Observations it is of, column in it
     Eigen::MatrixXd Q, R;   // (d × r), (r × nq)
     Eigen::VectorXd e;      // (d)
+    Eigen::VectorXd y;      // Qᵀe (r)
     Eigen::VectorXd e_out;  // (I − QQᵀ) e
   };
   std::vector<Sample> samples;              // sorted
@@ -47,8 +49,9 @@ struct Reduction {
   [[nodiscard]] int n_components() const { return static_cast<int>(count.size()); }
 };
 
-Reduction reduce(const Prior& prior, const std::vector<Observations>& observations, const std::vector<ObservationModel>& models,
-                 const std::vector<Eigen::VectorXd>& noise_stddev);
+/// @param reduction  receives the result; what it held is memory to be used again
+void reduce(const Prior& prior, const std::vector<Observations>& observations, const std::vector<ObservationModel>& models,
+            const std::vector<Eigen::VectorXd>& noise_stddev, Reduction& reduction);
 
 /// φ_a at the states of each Observations: [group][latent] (N × D_a).
 std::vector<std::vector<Eigen::MatrixXd>> features_by_group(const Prior& prior, const std::vector<Observations>& observations);

@@ -1,0 +1,396 @@
+#include "gp2/predictor.hpp"
+
+#include <cmath>
+#include <limits>
+#include <optional>
+#include <thread>
+
+#include <gmock/gmock.h>
+#include <gtest/gtest.h>
+
+#include "allocation_count.hpp"
+#include "gp2/error.hpp"
+#include "gp2/state_evaluator.hpp"
+#include "inference/sampling.hpp"
+
+// One state at a time must give what a posterior gives for many.
+namespace gp2 {
+namespace {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+using test::eps;
+using test::largest;
+using test::Problem;
+using test::Quantity;
+using testing::HasSubstr;
+using Status = Predictor::Status;
+using Storage = Predictor::Storage;
+
+constexpr std::uint64_t seed = 50505;
+
+const std::vector<Problem>& problems() {
+  static const std::vector<Problem> all = test::problems(21, seed);
+  return all;
+}
+
+// every view of a predictor, with some rows and with one latent alone too, and those under other systems
+std::vector<View> views_of(const Problem& p) {
+  std::vector<View> views;
+  const System& system = *p.prior.system;
+  for (const Quantity quantity : {Quantity::constrained_acceleration, Quantity::unconstrained_acceleration,
+                                  Quantity::constraint_force, Quantity::next_velocity}) {
+    View view = View::all(quantity, system);
+    if (quantity == Quantity::next_velocity) view.time_step = 0.1;
+    views.push_back(view);
+    View alone = view;
+    alone.latent = static_cast<int>(p.prior.latents.size()) - 1;
+    views.push_back(alone);
+    view.rows = {system.nq() - 1, 0};
+    views.push_back(view);
+  }
+  for (const Observations& group : p.observations) {
+    if (group.view.setting && group.view.quantity != Quantity::multipliers) views.push_back(group.view);
+  }
+  return views;
+}
+
+std::string describe(const Problem& p, const View& view) {
+  return fmt::format("{}, {} ({} rows, latent {}{}), seed {}", p.name, View::word(view.quantity), view.size(), view.latent,
+                     view.setting ? ", elsewhere" : "", seed);
+}
+
+MatrixXd known(const MatrixXd& states) { return states.array().isNaN().select(0, states); }
+
+// one prediction of each kind
+struct Prediction {
+  VectorXd mean, stddev;
+  MatrixXd jacobian;
+  Status status;
+
+  Prediction(const Predictor& predictor, const VectorXd& state, Predictor::Workspace& workspace)
+      : mean(predictor.view().size()), stddev(mean.size()), jacobian(mean.size(), state.size()) {
+    VectorXd again(mean.size());
+    status = predictor.mean_and_jacobian(state, mean, jacobian, workspace);
+    EXPECT_EQ(predictor.mean_and_stddev(state, again, stddev, workspace), status);
+    if (status == Status::ok) {
+      EXPECT_EQ(again, mean);
+    }
+  }
+};
+
+TEST(PredictorTest, IsThePosteriorInEveryView) {
+  for (const Problem& p : problems()) {
+    const Posterior posterior(p.prior, p.observations, p.values);
+    const MatrixXd states = known(p.queries);
+    for (const Posterior& of : {posterior, posterior.without_data()}) {
+      for (const View& view : views_of(p)) {
+        SCOPED_TRACE(describe(p, view));
+        const Predictor predictor(of, view);
+        Predictor::Workspace workspace = predictor.make_workspace();
+        for (Index i = 0; i < states.cols(); ++i) {
+          const Posterior::Marginal expected = of.marginal(view, states.col(i));
+          const Prediction prediction(predictor, states.col(i), workspace);
+          ASSERT_EQ(prediction.status, Status::ok);
+          EXPECT_LE(largest(prediction.mean - expected.mean), 1e4 * eps * (1 + largest(expected.mean)));
+          // the variance is a difference of numbers of the size of the prior's
+          const MatrixXd prior = posterior.without_data().marginal(view, states.col(i)).stddev();
+          for (Index r = 0; r < view.size(); ++r) {
+            EXPECT_NEAR(prediction.stddev[r] * prediction.stddev[r], expected.covariance(r * (view.size() + 1), 0),
+                        1e4 * eps * (prior(r) * prior(r) + eps));
+          }
+        }
+      }
+    }
+  }
+}
+
+TEST(PredictorTest, DifferentiatesExactly) {
+  double size = 0;
+  for (const Problem& p : problems()) {
+    // off the constraint its rows contradict each other
+    if (p.prior.system->name().find("redundant") != std::string::npos) continue;
+    const Posterior posterior(p.prior, p.observations, p.values);
+    for (const View& view : views_of(p)) {
+      const Predictor predictor(posterior, view);
+      Predictor::Workspace workspace = predictor.make_workspace();
+      for (Index i = 0; i < 2; ++i) {
+        SCOPED_TRACE(fmt::format("{}, state {}", describe(p, view), i));
+        // off the constraint too
+        RandomStream random(seed, static_cast<std::uint64_t>(i));
+        VectorXd state = known(p.queries.col(i)) + 0.02 * test::random_vector(p.queries.rows(), random);
+        const Prediction prediction(predictor, state, workspace);
+        ASSERT_EQ(prediction.status, Status::ok);
+        for (Index k = 0; k < state.size(); ++k) {
+          const auto mean_at = [&](double x) {
+            VectorXd moved = state, mean(view.size());
+            moved[k] = x;
+            EXPECT_EQ(predictor.mean(moved, mean, workspace), Status::ok);
+            return mean;
+          };
+          EXPECT_TRUE(matches(prediction.jacobian.col(k), test::central_difference(mean_at, state[k], 0.02, 1e3 * eps)))
+              << "entry " << k << " of the state";
+        }
+        size = std::max(size, largest(prediction.jacobian));
+      }
+    }
+  }
+  EXPECT_GT(size, 1);
+}
+
+TEST(PredictorTest, ObeysTheConstraintAndItsDerivativeInBothPrecisions) {
+  for (const Problem& p : problems()) {
+    const System& system = *p.prior.system;
+    if (system.nc() == 0 || system.name().find("redundant") != std::string::npos) continue;
+    SCOPED_TRACE(p.name);
+    const Posterior posterior(p.prior, p.observations, p.values);
+    const auto at = system.make_evaluator(p.values.parameters, true);
+    for (const Storage storage : {Storage::double_precision, Storage::single_precision}) {
+      const Predictor predictor(posterior, View::all(Quantity::constrained_acceleration, system), {.storage = storage});
+      Predictor::Workspace workspace = predictor.make_workspace();
+      const MatrixXd states = known(p.queries);
+      for (const VectorXd state : states.colwise()) {
+        const Prediction prediction(predictor, state, workspace);
+        at->evaluate(state);
+        const double scale = 1 + largest(at->A());
+        EXPECT_LE(largest(at->A() * prediction.mean - at->b()), 100 * eps * scale * (1 + largest(prediction.mean)));
+        // dA ddq + A dddq = db
+        MatrixXd residual = at->A() * prediction.jacobian;
+        MatrixXd sizes = at->A().cwiseAbs() * prediction.jacobian.cwiseAbs();
+        for (std::size_t e = 0; e < at->derivatives().size(); ++e) {
+          const auto [quantity, i, j, k] = at->derivatives()[e];
+          const double value = at->derivative_values()[static_cast<Index>(e)];
+          double added = 0;
+          if (quantity == StateEvaluator::Quantity::constraint_matrix) added = value * prediction.mean[j];
+          if (quantity == StateEvaluator::Quantity::constraint_vector) added = -value;
+          residual.row(i)[k] += added;
+          if (quantity != StateEvaluator::Quantity::mass && quantity != StateEvaluator::Quantity::force) {
+            sizes(i, k) += std::abs(added);
+          }
+        }
+        // a row that vanishes at this state demands nothing of the motion, and its derivative nothing either
+        for (Index row = 0; row < residual.rows(); ++row) {
+          if (at->A().row(row).isZero(0)) continue;
+          EXPECT_LE(largest(residual.row(row)), 1e3 * eps * (1 + largest(prediction.jacobian) + largest(sizes)) * scale);
+        }
+      }
+    }
+  }
+}
+
+TEST(PredictorTest, AllocatesNothing) {
+  for (const Problem& p : problems()) {
+    const Posterior posterior(p.prior, p.observations, p.values);
+    for (const View& view : views_of(p)) {
+      for (const Storage storage : {Storage::double_precision, Storage::single_precision}) {
+        SCOPED_TRACE(describe(p, view));
+        const Predictor predictor(posterior, view, {.storage = storage});
+        Predictor::Workspace workspace = predictor.make_workspace();
+        const MatrixXd states = known(p.queries);
+        VectorXd mean(view.size()), stddev(view.size());
+        MatrixXd jacobian(view.size(), states.rows());
+        int n_good = 0;
+        const std::size_t n_allocations = test::allocations_of([&] {
+          for (Index i = 0; i < states.cols(); ++i) {
+            n_good += predictor.mean_and_jacobian(states.col(i), mean, jacobian, workspace) == Status::ok ? 1 : 0;
+            n_good += predictor.mean_and_stddev(states.col(i), mean, stddev, workspace) == Status::ok ? 1 : 0;
+            n_good += predictor.mean(states.col(i), mean, workspace) == Status::ok ? 1 : 0;
+          }
+        });
+        EXPECT_EQ(n_allocations, 0U);
+        EXPECT_EQ(n_good, 3 * states.cols());
+      }
+    }
+  }
+}
+
+TEST(PredictorTest, GivesTheSameBitsOnSeveralThreadsAndOutlivesItsPosterior) {
+  const Problem& p = problems().front();
+  const View view = View::all(Quantity::constrained_acceleration, *p.prior.system);
+  std::optional<Posterior> posterior(Posterior(p.prior, p.observations, p.values));
+  const Predictor predictor(*posterior, view);
+  const MatrixXd expected = posterior->mean(view, p.observations[0].states);
+  posterior.reset();
+  constexpr int n_threads = 4;
+  std::vector<MatrixXd> results(n_threads);
+  std::vector<std::thread> threads;
+  for (MatrixXd& result : results) {
+    threads.emplace_back([&predictor, &result, &states = p.observations[0].states] {
+      Predictor::Workspace workspace = Predictor(predictor).make_workspace();
+      for (int repeat = 0; repeat < 20; ++repeat) {
+        result.resize(0, 0);
+        for (const VectorXd state : states.colwise()) {
+          const Prediction prediction(predictor, state, workspace);
+          result.conservativeResize(predictor.view().size(), result.cols() + 2 + state.size());
+          result.rightCols(2 + state.size()) << prediction.mean, prediction.stddev, prediction.jacobian;
+        }
+      }
+    });
+  }
+  for (std::thread& thread : threads) thread.join();
+  for (const MatrixXd& result : results) EXPECT_EQ(result, results.front());
+  const Index stride = 2 + p.queries.rows();
+  for (Index i = 0; i < expected.cols(); ++i) {
+    EXPECT_LE(largest(results.front().col(i * stride) - expected.col(i)), 1e4 * eps * (1 + largest(expected)));
+  }
+}
+
+TEST(PredictorTest, InSinglePrecisionIsOffByNoMoreThanItSays) {
+  std::optional<Problem> found;
+  for (const Problem& p : test::problems(61, seed)) {
+    if (p.name == "surface, every row") found = p;
+  }
+  ASSERT_TRUE(found);
+  const Problem& p = *found;
+  const Posterior posterior(p.prior, p.observations, p.values);
+  const View view = View::all(Quantity::unconstrained_acceleration, *p.prior.system);
+  const Predictor exact(posterior, view), rounded(posterior, view, {.storage = Storage::single_precision});
+  Predictor::Workspace of_exact = exact.make_workspace(), of_rounded = rounded.make_workspace();
+
+  // β of f_1 … f_3 from the textbook
+  const test::DenseObservations dense = test::dense_observations(p);
+  const test::ExtendedVector alpha = Eigen::LLT<test::Extended>(dense.covariance).solve(dense.residual);
+  const VectorXd lengthscale = p.values.kernel[0];
+  const MatrixXd points = dense.views[0].features[0] * lengthscale.cwiseInverse().asDiagonal();
+  const Eigen::RowVectorXd centre = points.colwise().mean();
+  const double N = static_cast<double>(points.rows()), D = static_cast<double>(points.cols());
+  const double e = std::numeric_limits<float>::epsilon() / 2;
+  const Posterior prior = posterior.without_data();
+  for (const VectorXd state : p.queries.colwise()) {
+    const Eigen::RowVectorXd point = evaluate_features(p.prior.latents[0], state) * lengthscale.cwiseInverse().asDiagonal();
+    double R = (point - centre).norm();
+    for (Index j = 0; j < points.rows(); ++j) R = std::max(R, (points.row(j) - centre).norm());
+    VectorXd bound = VectorXd::Zero(3);
+    for (Index j = 0; j < points.rows(); ++j) {
+      const double r2 = (points.row(j) - point).squaredNorm();
+      const VectorXd beta =
+          (dense.views[0].loading[static_cast<std::size_t>(j)][0].transpose() * alpha.segment(3 * j, 3)).cast<double>();
+      bound += e * std::exp(-r2 / 2) * beta.cwiseAbs() * (N / 16 + 16 + r2 * (D + 4) + 4 * std::sqrt(r2) * R);
+    }
+    bound = bound.cwiseProduct(p.values.signal_stddev[0]);
+    const Prediction in_double(exact, state, of_exact), in_single(rounded, state, of_rounded);
+    const MatrixXd prior_stddev = prior.marginal(view, state).stddev();
+    for (Index r = 0; r < 3; ++r) {
+      EXPECT_NEAR(in_single.mean[r], in_double.mean[r], bound[r]);
+      EXPECT_LE(bound[r], 1e-4 * prior_stddev(r));
+      const double off = in_single.stddev[r] * in_single.stddev[r] - in_double.stddev[r] * in_double.stddev[r];
+      EXPECT_LE(std::abs(off), std::sqrt(3 * N) * 4 * e * prior_stddev(r) * prior_stddev(r));
+      EXPECT_LE(largest(in_single.jacobian.row(r) - in_double.jacobian.row(r)), 1e-4 * (1 + largest(in_double.jacobian)));
+    }
+    EXPECT_NE(in_single.mean, in_double.mean);
+  }
+}
+
+TEST(PredictorTest, InSinglePrecisionIsThePosteriorUnderEveryKernel) {
+  for (const Problem& p : problems()) {
+    const Posterior posterior(p.prior, p.observations, p.values);
+    const View view = View::all(Quantity::unconstrained_acceleration, *p.prior.system);
+    SCOPED_TRACE(p.name);
+    const Predictor exact(posterior, view), rounded(posterior, view, {.storage = Storage::single_precision});
+    Predictor::Workspace of_exact = exact.make_workspace(), of_rounded = rounded.make_workspace();
+    const MatrixXd states = known(p.queries);
+    for (const VectorXd state : states.colwise()) {
+      const Prediction in_double(exact, state, of_exact), in_single(rounded, state, of_rounded);
+      EXPECT_LE(largest(in_single.mean - in_double.mean), 1e-4 * (1 + largest(in_double.mean) + largest(in_double.stddev)));
+      EXPECT_LE(largest(in_single.stddev - in_double.stddev), 1e-3 * (1 + largest(in_double.stddev)));
+      EXPECT_LE(largest(in_single.jacobian - in_double.jacobian), 1e-4 * (1 + largest(in_double.jacobian)));
+    }
+  }
+}
+
+Posterior prior_of_one_point(const std::string& mass, const std::string& constraints) {
+  const ModelFile model = ModelFile::parse(fmt::format(R"toml(
+name        = "a point"
+coordinates = ["x", "y"]
+[mechanics]
+mass  = [["{}", "0"], ["0", "1"]]
+force = ["0", "0"]
+[constraints]
+acceleration = [{}]
+[[latent]]
+kernel     = "se"
+features   = ["x"]
+directions = "acceleration"
+)toml",
+                                                       mass, constraints),
+                                           "a point");
+  return {make_prior(model), {}, {{VectorXd::Ones(1)}, {VectorXd::Ones(2)}, {}, {}, VectorXd()}};
+}
+
+TEST(PredictorTest, TellsWhatIsWrongWithAStateAndGoesOn) {
+  const auto expect = [](const Posterior& posterior, const VectorXd& bad, Status status) {
+    const Predictor predictor(posterior);
+    Predictor::Workspace workspace = predictor.make_workspace();
+    VectorXd mean(2), stddev(2);
+    MatrixXd jacobian(2, 5);
+    const VectorXd good = VectorXd::Ones(5);
+    EXPECT_EQ(predictor.mean(good, mean, workspace), Status::ok);
+    const VectorXd before = mean;
+    const std::size_t n_allocations = test::allocations_of([&] {
+      EXPECT_EQ(predictor.mean(bad, mean, workspace), status);
+      EXPECT_TRUE(mean.array().isNaN().all());
+      mean.setZero();
+      EXPECT_EQ(predictor.mean_and_stddev(bad, mean, stddev, workspace), status);
+      EXPECT_TRUE(mean.array().isNaN().all() && stddev.array().isNaN().all());
+      mean.setZero();
+      EXPECT_EQ(predictor.mean_and_jacobian(bad, mean, jacobian, workspace), status);
+      EXPECT_TRUE(mean.array().isNaN().all() && jacobian.array().isNaN().all());
+    });
+    EXPECT_EQ(n_allocations, 0U);
+    EXPECT_EQ(predictor.mean(good, mean, workspace), Status::ok);
+    EXPECT_EQ(mean, before);
+  };
+  const VectorXd zero = VectorXd::Zero(5);
+  VectorXd unknown = VectorXd::Ones(5);
+  unknown[0] = std::numeric_limits<double>::quiet_NaN();
+  expect(prior_of_one_point("x", "\"ddx - y\""), zero, Status::mass_not_positive_definite);
+  expect(prior_of_one_point("1", "\"ddx - x\", \"ddx - 1\""), zero, Status::contradicting_constraints);
+  expect(prior_of_one_point("x", "\"ddx - y\""), unknown, Status::not_finite);
+  expect(prior_of_one_point("1", "\"ddx - 1/x\""), zero, Status::not_finite);
+  expect(prior_of_one_point("1", "\"ddy - y\""), unknown, Status::not_finite);
+}
+
+template <typename Call>
+std::string error_of(const Call& call) {
+  try {
+    call();
+  } catch (const InputError& error) {
+    return error.what();
+  }
+  return "";
+}
+
+TEST(PredictorTest, NamesWhatIsWrongWithAnArgument) {
+  const Posterior posterior = test::surface_posterior(seed);
+  const System& system = *posterior.prior().system;
+  EXPECT_THAT(error_of([&] { Predictor(posterior, View::all(Quantity::multipliers, system)); }),
+              HasSubstr("multipliers are not predicted; view the constraint force"));
+  EXPECT_THAT(error_of([&] { Predictor(posterior, {.rows = {3}}); }), HasSubstr("rows of the view are 0 … 2, got 3"));
+  EXPECT_THAT(error_of([&] { Predictor(posterior, {.rows = {0}, .latent = 1}); }), HasSubstr("1 latents, numbered from 0"));
+  const Predictor bare(posterior, View::all(Quantity::constrained_acceleration, system), {.stddev = false, .jacobian = false});
+  const Predictor other(posterior);
+  Predictor::Workspace workspace = bare.make_workspace();
+  VectorXd state = VectorXd::Zero(system.layout().size()), mean(3), stddev(3), two(2), short_state(2);
+  MatrixXd jacobian(3, state.size()), narrow(3, 2), low(2, state.size());
+  const auto ignore = [](Status) {};
+  EXPECT_THAT(error_of([&] { ignore(bare.mean_and_stddev(state, mean, stddev, workspace)); }), HasSubstr("Options::stddev"));
+  EXPECT_THAT(error_of([&] { ignore(bare.mean_and_jacobian(state, mean, jacobian, workspace)); }),
+              HasSubstr("Options::jacobian"));
+  EXPECT_THAT(error_of([&] { ignore(other.mean(state, mean, workspace)); }), HasSubstr("the workspace is of another predictor"));
+  EXPECT_THAT(error_of([&] { ignore(bare.mean(short_state, mean, workspace)); }), HasSubstr("a state is of size 10, got 2"));
+  EXPECT_THAT(error_of([&] { ignore(bare.mean(state, two, workspace)); }), HasSubstr("the mean is of size 3, got 2"));
+  Predictor::Workspace full = other.make_workspace();
+  EXPECT_THAT(error_of([&] { ignore(other.mean_and_stddev(state, mean, two, full)); }),
+              HasSubstr("the standard deviation is of size 3, got 2"));
+  EXPECT_THAT(error_of([&] { ignore(other.mean_and_jacobian(state, mean, low, full)); }),
+              HasSubstr("a column of the Jacobian is of size 3, got 2"));
+  EXPECT_THAT(error_of([&] { ignore(other.mean_and_jacobian(state, mean, narrow, full)); }),
+              HasSubstr("a row of the Jacobian is of size 10, got 2"));
+  workspace = std::move(full);
+  EXPECT_EQ(other.mean(state, mean, workspace), Status::ok);
+  EXPECT_TRUE(other.options().stddev);
+}
+
+}  // namespace
+}  // namespace gp2
