@@ -1,6 +1,11 @@
 // The negative log likelihood and its gradient (likelihood.hpp) beside what factoring and inverting the same reduced matrix
 // costs: by LAPACK's dpotrf + dpotri, and by ours. Read the ratio of two rows of one N, in one run.
 
+#include <fstream>
+
+#include <sys/resource.h>
+#include <unistd.h>
+
 #include <benchmark/benchmark.h>
 #include <Eigen/Core>
 
@@ -10,6 +15,20 @@
 #include "inference/reduction.hpp"
 
 namespace {
+
+double resident_megabytes() {
+  std::ifstream pages("/proc/self/statm");
+  double all = 0, resident = 0;
+  pages >> all >> resident;
+  return resident * static_cast<double>(sysconf(_SC_PAGESIZE)) / 1e6;
+}
+
+// of the process so far: sizes must rise for it to say something about the last
+double peak_megabytes() {
+  rusage usage{};
+  getrusage(RUSAGE_SELF, &usage);
+  return static_cast<double>(usage.ru_maxrss) * 1024 / 1e6;
+}
 
 // the surface model with N observations; nq − nc = 2 numbers remain of each
 struct Problem {
@@ -95,6 +114,16 @@ void factor_and_inverse(benchmark::State& state, bool by_lapack, int n_threads) 
 void dpotrf_dpotri(benchmark::State& state) { factor_and_inverse(state, true, 1); }
 void dpotrf_and_our_inverse(benchmark::State& state) { factor_and_inverse(state, false, 1); }
 
+// the same from small to large, with the memory of the process beside that of the factored matrix
+void scaling(benchmark::State& state) {
+  const int n_threads = static_cast<int>(state.range(1));
+  const double before = resident_megabytes();
+  likelihood_and_gradient(state, {}, false, n_threads);
+  const double factored = 4.0 * static_cast<double>(state.range(0) * state.range(0)) * sizeof(double) / 1e6;
+  state.counters["factored_MB"] = factored;
+  state.counters["memory_ratio"] = (peak_megabytes() - before) / factored;
+}
+
 const std::vector<int64_t> sizes = {100, 300, 1000, 3000};
 
 BENCHMARK(dpotrf_dpotri)->ArgsProduct({sizes})->Unit(benchmark::kMillisecond);
@@ -105,6 +134,8 @@ BENCHMARK(estimated_noise)->ArgsProduct({sizes})->Unit(benchmark::kMillisecond);
 BENCHMARK(estimated_parameters)->ArgsProduct({sizes})->Unit(benchmark::kMillisecond);
 BENCHMARK(assembly)->Args({1000, 1})->Args({1000, 2})->Args({3000, 1})->Args({3000, 2})->UseRealTime()->Unit(
     benchmark::kMillisecond);
+
+BENCHMARK(scaling)->ArgsProduct({{100, 200, 500, 1000, 2000, 5000, 10000}, {1, 2}})->UseRealTime()->Unit(benchmark::kMillisecond);
 
 }  // namespace
 

@@ -43,6 +43,7 @@ std::string build_and_machine() {
       {"processor", features.avx512 ? "AVX-512, AVX2, FMA"
                     : features.avx2 ? "AVX2, FMA"
                                     : "neither AVX-512 nor AVX2"},
+      {"own loops", gp2::instruction_set()},
   };
   // what gp2 has already asked for need not be advised
   if (!blas.advice.empty() && gp2::command::blas_kernel_chosen_by() != "gp2") rows.emplace_back("advice", blas.advice);

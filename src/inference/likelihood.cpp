@@ -48,11 +48,11 @@ struct Likelihood::Implementation {
 
 struct Likelihood::Workspace::Implementation {
   int n_threads = 1;
-  std::shared_ptr<const char> owner;     // identity of the likelihood whose data stands below; held, so that no other can have it
-  std::vector<ObservationModel> models;  // where parameters are estimated
-  Reduction reduction;                   // where parameters or the noise are
-  MatrixXd K;                            // K̃ + I, then its factor, then its inverse
-  std::vector<KernelColumns> kernels;    // per latent, between the samples in the order of
+  std::shared_ptr<const char> owner;  // identity of the likelihood whose data stands below; held, so that no other can have it
+  std::vector<ObservationModel> own_models;     // where parameters are estimated
+  Reduction own_reduction;                      // where parameters or the noise are
+  MatrixXd K;                                   // K̃ + I, then its factor, then its inverse
+  std::vector<KernelColumns> kernels;           // per latent, between the samples in the order of
   std::vector<std::pair<int, int>> sample_ids;  // … these (group, index)
   std::vector<MatrixXd> D;                      // per latent: R_i E_a, by component
   std::vector<MatrixXd> Z;                      // per latent: R_i E_a C_a, by component
@@ -473,12 +473,12 @@ double Likelihood::evaluate(const ModelValues& values, ModelValues* gradient, Wo
   // observations under these parameters and noise
   if (!self.fixed_models &&
       !model_observations(self.prior, self.observations, values.parameters,
-                          gradient != nullptr ? self.options.gradient_parameters : std::vector<int>{}, work.models)) {
+                          gradient != nullptr ? self.options.gradient_parameters : std::vector<int>{}, work.own_models)) {
     return infinity;
   }
-  const std::vector<ObservationModel>& models = self.fixed_models ? *self.fixed_models : work.models;
-  if (!self.fixed_reduction) reduce(self.prior, self.observations, models, values.noise_stddev, work.reduction);
-  const Reduction& reduction = self.fixed_reduction ? *self.fixed_reduction : work.reduction;
+  const std::vector<ObservationModel>& models = self.fixed_models ? *self.fixed_models : work.own_models;
+  if (!self.fixed_reduction) reduce(self.prior, self.observations, models, values.noise_stddev, work.own_reduction);
+  const Reduction& reduction = self.fixed_reduction ? *self.fixed_reduction : work.own_reduction;
   work.prepare(self, reduction, !self.fixed_reduction, values);
 
   // K̃ + I = L Lᵀ

@@ -228,6 +228,14 @@ void check_view(const View& view, const Prior& prior) {
   }
 }
 
+template <typename Numbers>
+bool is_finite(const Numbers& numbers) {
+  // 0·x is 0 of a finite number only
+  double sum = 0;
+  for (const double number : numbers.reshaped()) sum += 0 * number;
+  return sum == 0;
+}
+
 void check_size(std::string_view what, Index got, Index wanted) {
   if (got != wanted) throw InputError(fmt::format("Predictor: {} is of size {}, got {}", what, wanted, got));
 }
@@ -279,8 +287,7 @@ Predictor::Workspace::Implementation::Implementation(std::shared_ptr<const Predi
   projection.constrain(a_bar, a, refinement);
 
   const Index n_samples = self.row_of.empty() ? 0 : static_cast<Index>(self.row_of.front().size());
-  self.with_data(*this, [&](const auto& data, auto& memory) {
-    using T = typename std::decay_t<decltype(memory.k)>::Scalar;
+  self.with_data(*this, [&]<typename T>(const Data<T>&, Memory<T>& memory) {
     const Index n_rows = simd::padded<T>(n_samples);
     Index widest = 1;  // of columns summed at once
     for (const Term& term : self.terms) {
@@ -325,7 +332,6 @@ Predictor::Workspace::Implementation::Implementation(std::shared_ptr<const Predi
       memory.products.setZero(n_rows);
       memory.cross.setZero(simd::padded<T>(self.reduced_size), n_columns);
     }
-    static_cast<void>(data);
   });
 }
 
@@ -392,13 +398,7 @@ void add_product(const VectorXd& B, const VectorXd& v, VectorXd& sum) {
 Status Predictor::Implementation::evaluate(const Ref<const VectorXd>& state, StateEvaluator& at,
                                            Workspace::Implementation& w) const {
   at.evaluate(state);
-  const auto finite = [](const auto& numbers) {
-    // 0·x is 0 of a finite number only
-    double sum = 0;
-    for (Index i = 0; i < numbers.size(); ++i) sum += 0 * numbers.data()[i];
-    return sum == 0;
-  };
-  if (!finite(at.M()) || !finite(at.A()) || !finite(at.b())) return Status::not_finite;
+  if (!is_finite(at.M()) || !is_finite(at.A()) || !is_finite(at.b())) return Status::not_finite;
   w.projection.compute(at.M(), at.A(), at.b());
   if (!w.projection.mass_is_positive_definite()) return Status::mass_not_positive_definite;
   if (w.projection.inconsistency() > MechanicsBatch::consistency_tolerance * w.projection.size_of_b()) {
@@ -409,12 +409,14 @@ Status Predictor::Implementation::evaluate(const Ref<const VectorXd>& state, Sta
   if (is_whole() && prior.mean == Prior::Mean::constant) w.a_bar = prior.constant_mean;
   w.force.setZero();
   if (has_mean_force()) w.force = at.F();
+  bool all_features = true;  // are finite; without observations ā does not show it
   with_data(w, [&]<typename T>(const Data<T>& data, Memory<T>& memory) {
     for (std::size_t a = 0; a < terms.size(); ++a) {
       const Term& term = terms[a];
       const Latent& of = latent(term);
       Workspace::Implementation::AtState& here = w.terms[a];
       of.features.evaluate_at(state, here.features_tape, here.features);
+      all_features = all_features && is_finite(here.features);
       term.kernel.scale(here.features, here.point);
       T* const k = memory.k.col(static_cast<Index>(a)).data();
       evaluate_kernel<T>(term, data.latents[a], w, here.point, memory, k);
@@ -430,7 +432,7 @@ Status Predictor::Implementation::evaluate(const Ref<const VectorXd>& state, Sta
     w.projection.solve_mass_in_place(w.a_of_force);
     w.a_bar += w.a_of_force;
   }
-  return finite(w.a_bar) ? Status::ok : Status::not_finite;
+  return is_finite(w.a_bar) && all_features ? Status::ok : Status::not_finite;
 }
 
 void Predictor::Implementation::write_mean(const Ref<const VectorXd>& state, const StateEvaluator& at,
@@ -566,7 +568,7 @@ void Predictor::Implementation::write_stddev(const StateEvaluator& at, Workspace
       }
     }
   });
-  for (Index r = 0; r < d; ++r) stddev[r] = std::sqrt(std::max(0.0, w.variance[r]));
+  for (Index r = 0; r < d; ++r) stddev[r] = w.variance[r] < 0 ? 0 : std::sqrt(w.variance[r]);
 }
 
 // With a = T ā + L b, b = 0 for one latent alone:
@@ -707,12 +709,12 @@ void check_arguments(const Predictor::Implementation* predictor, const Ref<const
 Status Predictor::mean(const Ref<const VectorXd>& state, Ref<VectorXd> mean, Workspace& workspace) const {
   check_arguments(implementation_.get(), state, mean, workspace.implementation_.get());
   Workspace::Implementation& w = *workspace.implementation_;
-  const Status status = implementation_->evaluate(state, *w.values, w);
+  Status status = implementation_->evaluate(state, *w.values, w);
   if (status == Status::ok) {
     implementation_->write_mean(state, *w.values, w, mean);
-  } else {
-    mean.setConstant(not_a_number);
+    if (!is_finite(mean)) status = Status::not_finite;
   }
+  if (status != Status::ok) mean.setConstant(not_a_number);
   return status;
 }
 
@@ -720,7 +722,7 @@ Status Predictor::mean_and_stddev(const Ref<const VectorXd>& state, Ref<VectorXd
                                   Workspace& workspace) const {
   if (!options().stddev) throw InputError("Predictor: it was made without Options::stddev");
   check_size("the standard deviation", stddev.size(), view().size());
-  const Status status = this->mean(state, mean, workspace);
+  const Status status = this->mean(state, std::move(mean), workspace);
   if (status == Status::ok) {
     implementation_->write_stddev(*workspace.implementation_->values, *workspace.implementation_, stddev);
   } else {
@@ -737,11 +739,13 @@ Status Predictor::mean_and_jacobian(const Ref<const VectorXd>& state, Ref<Vector
   check_size("a row of the Jacobian", jacobian.cols(), state.size());
   Workspace::Implementation& w = *workspace.implementation_;
   StateEvaluator& at = *w.values_and_derivatives;
-  const Status status = implementation_->evaluate(state, at, w);
+  Status status = implementation_->evaluate(state, at, w);
   if (status == Status::ok) {
     implementation_->write_mean(state, at, w, mean);
     implementation_->write_jacobian(state, at, w, jacobian);
-  } else {
+    if (!is_finite(mean) || !is_finite(jacobian)) status = Status::not_finite;
+  }
+  if (status != Status::ok) {
     mean.setConstant(not_a_number);
     jacobian.setConstant(not_a_number);
   }

@@ -162,16 +162,6 @@ std::vector<std::vector<MatrixXd>> features_by_group(const Prior& prior, const s
   return features;
 }
 
-MatrixXd latent_weights(const Reduction& reduction, const MatrixXd& Z, const VectorXd& alpha) {
-  MatrixXd beta = MatrixXd::Zero(static_cast<Index>(reduction.samples.size()), Z.cols());
-  for (int c = 0; c < reduction.n_components(); ++c) {
-    const Index n = reduction.count[static_cast<std::size_t>(c)];
-    const Index offset = reduction.offset[static_cast<std::size_t>(c)];
-    beta.topRows(n) += alpha.segment(offset, n).asDiagonal() * Z.middleRows(offset, n);
-  }
-  return beta;
-}
-
 std::vector<MatrixXd> sorted_features(const Prior& prior, const std::vector<std::vector<MatrixXd>>& features_by_group,
                                       const Reduction& reduction) {
   std::vector<MatrixXd> sorted;

@@ -61,9 +61,6 @@ std::vector<Eigen::MatrixXd> sorted_features(const Prior& prior,
                                              const std::vector<std::vector<Eigen::MatrixXd>>& features_by_group,
                                              const Reduction& reduction);
 
-/// β_j = Z_jᵀ α̃_j, one row per sample (N × functions of a).
-Eigen::MatrixXd latent_weights(const Reduction& reduction, const Eigen::MatrixXd& Z, const Eigen::VectorXd& alpha);
-
 /// Reduced rows laid out for the loops over samples: column c·(columns of `rows`) + l holds entry l of component c of each
 /// sample, in the order of the reduction, zero where a sample has no such component, and padded to whole vectors (simd.hpp).
 Eigen::MatrixXd by_component(const Reduction& reduction, const Eigen::MatrixXd& rows);

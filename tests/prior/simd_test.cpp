@@ -125,6 +125,15 @@ TEST_P(SimdLoops, DistancesAndSumsAreWhatTheirFormulasSay) {
       }
       VectorXd differences(c.D);
       loops.weighted_differences(c.n, c.D, c.w.data(), c.x.data(), c.x.rows(), c.p.data(), differences.data());
+      MatrixXd products(c.D, c.m);
+      loops.difference_products(c.n, c.D, c.m, c.w.data(), c.B.data(), c.B.rows(), c.x.data(), c.x.rows(), c.p.data(),
+                                products.data());
+      for (Index l = 0; l < c.m; ++l) {
+        for (Index d = 0; d < c.D; ++d) {
+          const VectorXd terms = c.w.cwiseProduct(c.columns().col(l)).cwiseProduct(delta.col(d));
+          EXPECT_NEAR(products(d, l), terms.sum(), tolerance(terms));
+        }
+      }
       MatrixXd squares = MatrixXd::Ones(simd::lanes<double>, c.D);
       loops.add_weighted_squares(c.n, c.D, c.w.data(), c.x.data(), c.x.rows(), c.p.data(), squares.data());
       for (Index d = 0; d < c.D; ++d) {
