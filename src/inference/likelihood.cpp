@@ -391,7 +391,7 @@ class SampleGradient {
   SampleGradient(const Likelihood::Options& options, const std::vector<ObservationModel>& models, const Reduction& reduction,
                  const ModelValues& values, const VectorXd& alpha, const PairSums& sums)
       : options_(options), models_(models), reduction_(reduction), alpha_(alpha), sums_(sums), V_(sums.latents.size()) {
-    for (const VectorXd& noise : values.noise_stddev) whitening_.push_back(noise.cwiseInverse());
+    for (const VectorXd& noise : values.noise_stddev) whitening_.emplace_back(noise.cwiseInverse());
     for (std::size_t a = 0; a < V_.size(); ++a) loading_.push_back(values.loading(a));
   }
 

@@ -1,6 +1,7 @@
 #include <gtest/gtest.h>
 
 #include "inference/problems.hpp"
+#include "inference/reduction.hpp"
 
 // The analytic gradient against differences, for every hyperparameter of every problem.
 namespace gp2 {
@@ -81,52 +82,88 @@ INSTANTIATE_TEST_SUITE_P(EveryModel, LikelihoodGradient, testing::ValuesIn(probl
   return name;
 });
 
+void expect_gradient(const Problem& p) {
+  SCOPED_TRACE(fmt::format("{}, mean {}, seed {}", p.name, static_cast<int>(p.prior.mean), seed));
+  Gradient gradient(p);
+  int n_expected_nonzero = 0;
+  for (std::size_t a = 0; a < p.prior.latents.size(); ++a) {
+    for (Index k = 0; k < p.values.kernel[a].size(); ++k) {
+      gradient.expect_match(
+          p.prior.latents[a].name + ": " + p.prior.latents[a].kernel.parameters()[static_cast<std::size_t>(k)].name,
+          gradient.analytic().kernel[a][k], [&](auto& v) -> auto& { return v.kernel[a][k]; }, true);
+    }
+    for (Index l = 0; l < p.values.signal_stddev[a].size(); ++l) {
+      gradient.expect_match(
+          fmt::format("{}: signal of {}", p.prior.latents[a].name, p.prior.latents[a].column_names[static_cast<std::size_t>(l)]),
+          gradient.analytic().signal_stddev[a][l], [&](auto& v) -> auto& { return v.signal_stddev[a][l]; }, true);
+    }
+    n_expected_nonzero += static_cast<int>(p.values.kernel[a].size());
+  }
+  for (std::size_t g = 0; g < p.observations.size(); ++g) {
+    for (Index k = 0; k < p.values.noise_stddev[g].size(); ++k) {
+      gradient.expect_match(
+          fmt::format("noise {} of group {}", k, g),
+          gradient.analytic().noise_stddev[g][k], [&](auto& v) -> auto& { return v.noise_stddev[g][k]; }, true);
+      ++n_expected_nonzero;
+    }
+  }
+  EXPECT_GE(gradient.n_nonzero(), n_expected_nonzero / 2) << "a gradient that is zero tests nothing";
+  const int before = gradient.n_nonzero();
+  for (Index k = 0; k < p.values.parameters.size(); ++k) {
+    const std::string& name = p.prior.system->parameters()[static_cast<std::size_t>(k)].name;
+    if (!estimable(p, name)) continue;
+    gradient.expect_match(
+        "parameter " + name, gradient.analytic().parameters[k], [&](auto& v) -> auto& { return v.parameters[k]; }, false);
+  }
+  // ā itself knows nothing of the system unless through μ or the directions
+  const bool sees_mechanics =
+      p.prior.mean == Prior::Mean::force || p.observations[0].view.quantity == View::Quantity::constrained_acceleration;
+  if (sees_mechanics) {
+    EXPECT_GT(gradient.n_nonzero(), before);
+  }
+}
+
 TEST_P(LikelihoodGradient, MatchesDifferencesInEveryHyperparameter) {
   int n_problems = 0;
   for (const Problem& p : test::problems(9, seed)) {
     if (!p.name.starts_with(GetParam())) continue;
     ++n_problems;
-    SCOPED_TRACE(fmt::format("{}, mean {}, seed {}", p.name, static_cast<int>(p.prior.mean), seed));
-    Gradient gradient(p);
-    int n_expected_nonzero = 0;
-    for (std::size_t a = 0; a < p.prior.latents.size(); ++a) {
-      for (Index k = 0; k < p.values.kernel[a].size(); ++k) {
-        gradient.expect_match(
-            p.prior.latents[a].name + ": " + p.prior.latents[a].kernel.parameters()[static_cast<std::size_t>(k)].name,
-            gradient.analytic().kernel[a][k], [&](auto& v) -> auto& { return v.kernel[a][k]; }, true);
-      }
-      for (Index l = 0; l < p.values.signal_stddev[a].size(); ++l) {
-        gradient.expect_match(
-            fmt::format("{}: signal of {}", p.prior.latents[a].name,
-                        p.prior.latents[a].column_names[static_cast<std::size_t>(l)]),
-            gradient.analytic().signal_stddev[a][l], [&](auto& v) -> auto& { return v.signal_stddev[a][l]; }, true);
-      }
-      n_expected_nonzero += static_cast<int>(p.values.kernel[a].size());
-    }
-    for (std::size_t g = 0; g < p.observations.size(); ++g) {
-      for (Index k = 0; k < p.values.noise_stddev[g].size(); ++k) {
-        gradient.expect_match(
-            fmt::format("noise {} of group {}", k, g),
-            gradient.analytic().noise_stddev[g][k], [&](auto& v) -> auto& { return v.noise_stddev[g][k]; }, true);
-        ++n_expected_nonzero;
-      }
-    }
-    EXPECT_GE(gradient.n_nonzero(), n_expected_nonzero / 2) << "a gradient that is zero tests nothing";
-    const int before = gradient.n_nonzero();
-    for (Index k = 0; k < p.values.parameters.size(); ++k) {
-      const std::string& name = p.prior.system->parameters()[static_cast<std::size_t>(k)].name;
-      if (!estimable(p, name)) continue;
-      gradient.expect_match(
-          "parameter " + name, gradient.analytic().parameters[k], [&](auto& v) -> auto& { return v.parameters[k]; }, false);
-    }
-    // ā itself knows nothing of the system unless through μ or the directions
-    const bool sees_mechanics =
-        p.prior.mean == Prior::Mean::force || p.observations[0].view.quantity == View::Quantity::constrained_acceleration;
-    if (sees_mechanics) {
-      EXPECT_GT(gradient.n_nonzero(), before);
-    }
+    expect_gradient(p);
   }
   EXPECT_GT(n_problems, 0);
+}
+
+// the sums over pairs of samples go tile by tile: here are several, and samples whose ranks differ
+TEST(LikelihoodGradientTest, MatchesDifferencesOverSeveralTiles) {
+  int n_problems = 0;
+  for (const Problem& p : test::problems(3 + 2 * static_cast<int>(tile_size) + 11, seed)) {
+    if (!p.name.starts_with("a row that vanishes")) continue;
+    ++n_problems;
+    expect_gradient(p);
+  }
+  EXPECT_GT(n_problems, 0);
+}
+
+TEST(LikelihoodGradientTest, IsTheSameToTheBitOnAnyNumberOfThreads) {
+  for (const Problem& p : test::problems(3 + 530, seed)) {
+    if (!p.name.starts_with("a row that vanishes") && !p.name.starts_with("friction")) continue;
+    SCOPED_TRACE(p.name);
+    Likelihood::Options options;
+    options.noise_gradient = true;
+    options.gradient_parameters = {0};
+    const Likelihood likelihood(p.prior, p.observations, p.values, options);
+    ASSERT_LT(likelihood.reduced_size(), 2000) << "larger matrices are factored on several threads";
+    ModelValues gradient, other;
+    Likelihood::Workspace one(1), three(3);
+    EXPECT_EQ(likelihood.evaluate(p.values, &gradient, one), likelihood.evaluate(p.values, &other, three));
+    for (std::size_t a = 0; a < gradient.kernel.size(); ++a) {
+      EXPECT_EQ(gradient.kernel[a], other.kernel[a]);
+      EXPECT_EQ(gradient.signal_stddev[a], other.signal_stddev[a]);
+    }
+    for (std::size_t g = 0; g < gradient.noise_stddev.size(); ++g) EXPECT_EQ(gradient.noise_stddev[g], other.noise_stddev[g]);
+    EXPECT_EQ(gradient.parameters, other.parameters);
+    break;
+  }
 }
 
 TEST(LikelihoodGradientTest, IsAllThatWasAskedForAndZeroElsewhere) {

@@ -160,14 +160,11 @@ TEST(PredictorTest, ObeysTheConstraintAndItsDerivativeInBothPrecisions) {
         MatrixXd sizes = at->A().cwiseAbs() * prediction.jacobian.cwiseAbs();
         for (std::size_t e = 0; e < at->derivatives().size(); ++e) {
           const auto [quantity, i, j, k] = at->derivatives()[e];
-          const double value = at->derivative_values()[static_cast<Index>(e)];
-          double added = 0;
-          if (quantity == StateEvaluator::Quantity::constraint_matrix) added = value * prediction.mean[j];
-          if (quantity == StateEvaluator::Quantity::constraint_vector) added = -value;
-          residual.row(i)[k] += added;
-          if (quantity != StateEvaluator::Quantity::mass && quantity != StateEvaluator::Quantity::force) {
-            sizes(i, k) += std::abs(added);
-          }
+          const bool is_of_A = quantity == StateEvaluator::Quantity::constraint_matrix;
+          if (!is_of_A && quantity != StateEvaluator::Quantity::constraint_vector) continue;
+          const double added = at->derivative_values()[static_cast<Index>(e)] * (is_of_A ? prediction.mean[j] : -1);
+          residual(i, k) += added;
+          sizes(i, k) += std::abs(added);
         }
         // a row that vanishes at this state demands nothing of the motion, and its derivative nothing either
         for (Index row = 0; row < residual.rows(); ++row) {
