@@ -84,6 +84,18 @@ void assembly(benchmark::State& state) {
   }
 }
 
+// a fit of eight restarts side by side, stopped after 20 iterations each
+void restarts(benchmark::State& state) {
+  const Problem problem(static_cast<int>(state.range(0)), {}, false);
+  gp2::FitOptions options;
+  options.n_restarts = 8;
+  options.max_iterations = 20;
+  options.n_threads = static_cast<int>(state.range(1));
+  for (auto _ : state) {
+    benchmark::DoNotOptimize(gp2::fit(problem.prior, problem.observations, problem.hyperparameters, options).report.objective);
+  }
+}
+
 // what assembly and gradient come on top of: K̃ + I = L Lᵀ and its inverse
 void factor_and_inverse(benchmark::State& state, bool by_lapack, int n_threads) {
   const gp2::lapack::SingleThread single_thread;
@@ -135,6 +147,7 @@ BENCHMARK(estimated_parameters)->ArgsProduct({sizes})->Unit(benchmark::kMillisec
 BENCHMARK(assembly)->Args({1000, 1})->Args({1000, 2})->Args({3000, 1})->Args({3000, 2})->UseRealTime()->Unit(
     benchmark::kMillisecond);
 
+BENCHMARK(restarts)->Args({300, 1})->Args({300, 2})->UseRealTime()->Unit(benchmark::kMillisecond);
 BENCHMARK(scaling)->ArgsProduct({{100, 200, 500, 1000, 2000, 5000, 10000}, {1, 2}})->UseRealTime()->Unit(benchmark::kMillisecond);
 
 }  // namespace

@@ -96,7 +96,7 @@ class Posterior {
 /// Where both view and noise are those of an earlier group of observations() the new ones join it behind its last; else they are
 /// a new group, with its noise in values(). So Posterior(prior(), observations(), values()) is always the posterior built anew.
 ///
-/// In place where no copy of `posterior` is held, by a Predictor or PathwiseSamples either; else a copy is changed and the others
+/// In place where no copy of `posterior` is held, by PathwiseSamples either; else a copy is changed and the others
 /// stay what they are. Memory is drawn for the factor only when what was set aside is full, and then for half as many rows again.
 ///
 /// @throws InputError when shapes do not fit, values are not finite or noise is not positive, and as the constructor; it and

@@ -148,6 +148,9 @@ struct Predictor::Implementation {
   Status evaluate(const Ref<const VectorXd>& state, StateEvaluator& at, Workspace::Implementation& w) const;
   void write_mean(const Ref<const VectorXd>& state, const StateEvaluator& at, Workspace::Implementation& w,
                   Ref<VectorXd> mean) const;
+  // both; NaN in the mean where the state cannot be evaluated
+  Status evaluate_mean(const Ref<const VectorXd>& state, StateEvaluator& at, Workspace::Implementation& w,
+                       Ref<VectorXd>& mean) const;
   void write_stddev(const StateEvaluator& at, Workspace::Implementation& w, Ref<VectorXd> stddev) const;
   void write_jacobian(const Ref<const VectorXd>& state, const StateEvaluator& at, Workspace::Implementation& w,
                       Ref<MatrixXd> jacobian) const;
@@ -235,6 +238,8 @@ bool is_finite(const Numbers& numbers) {
   for (const double number : numbers.reshaped()) sum += 0 * number;
   return sum == 0;
 }
+
+constexpr double not_a_number = std::numeric_limits<double>::quiet_NaN();
 
 void check_size(std::string_view what, Index got, Index wanted) {
   if (got != wanted) throw InputError(fmt::format("Predictor: {} is of size {}, got {}", what, wanted, got));
@@ -688,12 +693,21 @@ Predictor::Workspace::~Workspace() = default;
 Predictor::Workspace::Workspace(Workspace&&) noexcept = default;
 Predictor::Workspace& Predictor::Workspace::operator=(Workspace&&) noexcept = default;
 
+Status Predictor::Implementation::evaluate_mean(const Ref<const VectorXd>& state, StateEvaluator& at,
+                                                Workspace::Implementation& w, Ref<VectorXd>& mean) const {
+  Status status = evaluate(state, at, w);
+  if (status == Status::ok) {
+    write_mean(state, at, w, mean);
+    if (!is_finite(mean)) status = Status::not_finite;
+  }
+  if (status != Status::ok) mean.setConstant(not_a_number);
+  return status;
+}
+
 const View& Predictor::view() const { return implementation_->view; }
 const Predictor::Options& Predictor::options() const { return implementation_->options; }
 
 namespace {
-
-constexpr double not_a_number = std::numeric_limits<double>::quiet_NaN();
 
 void check_arguments(const Predictor::Implementation* predictor, const Ref<const VectorXd>& state, const Ref<VectorXd>& mean,
                      const Predictor::Workspace::Implementation* workspace) {
@@ -709,22 +723,18 @@ void check_arguments(const Predictor::Implementation* predictor, const Ref<const
 Status Predictor::mean(const Ref<const VectorXd>& state, Ref<VectorXd> mean, Workspace& workspace) const {
   check_arguments(implementation_.get(), state, mean, workspace.implementation_.get());
   Workspace::Implementation& w = *workspace.implementation_;
-  Status status = implementation_->evaluate(state, *w.values, w);
-  if (status == Status::ok) {
-    implementation_->write_mean(state, *w.values, w, mean);
-    if (!is_finite(mean)) status = Status::not_finite;
-  }
-  if (status != Status::ok) mean.setConstant(not_a_number);
-  return status;
+  return implementation_->evaluate_mean(state, *w.values, w, mean);
 }
 
 Status Predictor::mean_and_stddev(const Ref<const VectorXd>& state, Ref<VectorXd> mean, Ref<VectorXd> stddev,
                                   Workspace& workspace) const {
   if (!options().stddev) throw InputError("Predictor: it was made without Options::stddev");
   check_size("the standard deviation", stddev.size(), view().size());
-  const Status status = this->mean(state, std::move(mean), workspace);
+  check_arguments(implementation_.get(), state, mean, workspace.implementation_.get());
+  Workspace::Implementation& w = *workspace.implementation_;
+  const Status status = implementation_->evaluate_mean(state, *w.values, w, mean);
   if (status == Status::ok) {
-    implementation_->write_stddev(*workspace.implementation_->values, *workspace.implementation_, stddev);
+    implementation_->write_stddev(*w.values, w, stddev);
   } else {
     stddev.setConstant(not_a_number);
   }
@@ -739,16 +749,15 @@ Status Predictor::mean_and_jacobian(const Ref<const VectorXd>& state, Ref<Vector
   check_size("a row of the Jacobian", jacobian.cols(), state.size());
   Workspace::Implementation& w = *workspace.implementation_;
   StateEvaluator& at = *w.values_and_derivatives;
-  Status status = implementation_->evaluate(state, at, w);
+  Status status = implementation_->evaluate_mean(state, at, w, mean);
   if (status == Status::ok) {
-    implementation_->write_mean(state, at, w, mean);
     implementation_->write_jacobian(state, at, w, jacobian);
-    if (!is_finite(mean) || !is_finite(jacobian)) status = Status::not_finite;
+    if (!is_finite(jacobian)) {
+      mean.setConstant(not_a_number);
+      status = Status::not_finite;
+    }
   }
-  if (status != Status::ok) {
-    mean.setConstant(not_a_number);
-    jacobian.setConstant(not_a_number);
-  }
+  if (status != Status::ok) jacobian.setConstant(not_a_number);
   return status;
 }
 

@@ -45,8 +45,8 @@ template <typename T>
 struct Vector {
   static constexpr Size width = GP2_SIMD_BYTES / static_cast<Size>(sizeof(T));
   static_assert(lanes<T> % width == 0);
-  typedef T Type __attribute__((vector_size(GP2_SIMD_BYTES)));
-  typedef typename Exponential<T>::Integer Bits __attribute__((vector_size(GP2_SIMD_BYTES)));
+  using Type __attribute__((vector_size(GP2_SIMD_BYTES))) = T;
+  using Bits __attribute__((vector_size(GP2_SIMD_BYTES))) = typename Exponential<T>::Integer;
 
   static inline Type load(const T* x) {
     Type v;
