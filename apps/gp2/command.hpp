@@ -23,6 +23,7 @@ void add_fit(CLI::App& app);
 void add_predict(CLI::App& app);
 void add_simulate(CLI::App& app);
 void add_evaluate(CLI::App& app);
+void add_report(CLI::App& app);
 void add_reproduce(CLI::App& app);
 
 /// "theta1=q3,theta2=q6" -> model's name -> log's name.

@@ -1,7 +1,6 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdio>
-#include <limits>
 #include <memory>
 
 #include <unistd.h>
@@ -82,28 +81,6 @@ Knowledge read_knowledge(const std::string& text) {
   return {*quantity, at == std::string::npos ? "" : view.substr(at + 1), read_log(text.substr(colon + 1))};
 }
 
-// Bounds are the optimiser's: where it does not run, a start outside of them is taken, and they are widened to hold it.
-void read_start(const Arguments& arguments, FitProblem& problem) {
-  if (arguments.max_iterations > 0) {
-    read_start_values(arguments.start, problem.hyperparameters);
-    return;
-  }
-  const std::vector<Hyperparameter> bounded = problem.hyperparameters;
-  for (Hyperparameter& h : problem.hyperparameters) {
-    h.lower = h.is_positive() ? std::numeric_limits<double>::min() : std::numeric_limits<double>::lowest();
-    h.upper = std::numeric_limits<double>::max();
-  }
-  read_start_values(arguments.start, problem.hyperparameters);
-  for (std::size_t k = 0; k < bounded.size(); ++k) {
-    Hyperparameter& h = problem.hyperparameters[k];
-    h.lower = std::min(bounded[k].lower, h.value);
-    h.upper = std::max(bounded[k].upper, h.value);
-    if (h.lower == bounded[k].lower && h.upper == bounded[k].upper) continue;
-    problem.notes.push_back(fmt::format("{}: {} = {} is outside its bounds [{:.6g}, {:.6g}]; taken, as nothing is optimised",
-                                        arguments.start, h.name, h.value, bounded[k].lower, bounded[k].upper));
-  }
-}
-
 // one line that rewrites itself, on a terminal only, ten times a second
 void print_progress(const Progress& p) {
   static double last = -1;
@@ -163,7 +140,7 @@ void run(const Arguments& arguments) {
   std::vector<Knowledge> also;
   for (const std::string& text : arguments.also) also.push_back(read_knowledge(text));
   FitProblem problem = make_fit_problem(file.model, logs, also, problem_options(arguments));
-  if (!arguments.start.empty()) read_start(arguments, problem);
+  if (!arguments.start.empty()) read_start(arguments.start, arguments.max_iterations, problem);
   talk(problem.notes);
 
   FitOptions options = default_fit_options(problem);
@@ -176,15 +153,7 @@ void run(const Arguments& arguments) {
   Fit result = fit(problem, options);
   if (terminal) fmt::print(stderr, "\r\033[K");
 
-  std::vector<std::string> at_bound;
-  for (const Hyperparameter& h : result.report.hyperparameters) {
-    const bool collapsed = h.kind == Hyperparameter::Kind::noise_stddev && h.at_bound() && h.value < 2 * h.lower;
-    if (collapsed) at_bound.push_back(h.name);
-  }
-  if (!at_bound.empty()) {
-    talk({fmt::format("warning: {} ended at the lower bound: the columns may not be independent measurements; see gp2 check",
-                      fmt::join(at_bound, ", "))});
-  }
+  talk(notes_of(result.report));
   file.prior_options = problem.prior_options;
   std::vector<std::string> sources = arguments.data;
   sources.insert(sources.end(), arguments.also.begin(), arguments.also.end());

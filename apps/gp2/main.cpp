@@ -88,6 +88,7 @@ int main(int argc, char** argv) {
   gp2::command::add_predict(app);
   gp2::command::add_simulate(app);
   gp2::command::add_evaluate(app);
+  gp2::command::add_report(app);
   gp2::command::add_reproduce(app);
 
   try {

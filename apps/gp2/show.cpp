@@ -48,9 +48,8 @@ void print_latex(const SymbolicSystem::Definition& definition, const std::vector
              matrix_latex("F", F), matrix_latex("A", A), matrix_latex("b", b));
 }
 
-void print_text(const ModelFile& model, const std::vector<std::vector<Expression>>& A,
+void print_text(const ModelFile& model, const SymbolicSystem& system, const std::vector<std::vector<Expression>>& A,
                 const std::vector<std::vector<Expression>>& b, const std::vector<std::vector<Expression>>& F) {
-  const SymbolicSystem& system = *model.system;
   fmt::print("{}\n  {} coordinates, {} inputs, {} constraints\n", system.name(), system.nq(), system.inputs().size(),
              system.nc());
   fmt::print("\nmass matrix M\n{}", matrix_text(system.definition().mass));
@@ -83,7 +82,8 @@ void print_text(const ModelFile& model, const std::vector<std::vector<Expression
 
 void run(const Arguments& arguments) {
   const ModelFile model = ModelFile::read(arguments.model);
-  const SymbolicSystem::Definition& definition = model.system->definition();
+  const SymbolicSystem& system = require_symbolic_system(model);
+  const SymbolicSystem::Definition& definition = system.definition();
   std::vector<std::vector<Expression>> A, b, F;
   for (const ConstraintRow& row : definition.constraints) {
     A.push_back(row.A);
@@ -93,7 +93,7 @@ void run(const Arguments& arguments) {
   if (arguments.latex) {
     print_latex(definition, A, b, F);
   } else {
-    print_text(model, A, b, F);
+    print_text(model, system, A, b, F);
   }
 }
 

@@ -63,17 +63,11 @@ std::map<std::string, std::string> columns_of(const ModelFile& model, const std:
   return columns;
 }
 
-/// The start as it was given: which entries, and their values.
-struct Start {
-  Eigen::VectorXd state;    // 0 where not given
-  std::vector<bool> given;  // (layout size)
-};
-
 // "q1=0.4,dq1=0.8"
-Start parse_start(const std::string& text, const System& system) {
+StartingPoint parse_start(const std::string& text, const System& system) {
   const std::vector<std::string> names = system.state_names();
   const std::ptrdiff_t n_motion = system.layout().t();  // coordinates and velocities come first
-  Start start{Eigen::VectorXd::Zero(system.layout().size()), std::vector<bool>(names.size(), false)};
+  StartingPoint start{Eigen::VectorXd::Zero(system.layout().size()), std::vector<bool>(names.size(), false)};
   for (const std::string& item : parse_list(text)) {
     const std::size_t equals = item.find('=');
     if (equals == std::string::npos) throw InputError(fmt::format("--start: '{}' is not NAME=VALUE, say q1=0.4", item));
@@ -97,11 +91,11 @@ Start parse_start(const std::string& text, const System& system) {
 }
 
 // the first row of a log: what it has of coordinates, velocities and t
-Start read_start(const std::string& file, const ModelFile& model, const std::string& map) {
+StartingPoint read_start(const std::string& file, const ModelFile& model, const std::string& map) {
   const CsvTable table = CsvTable::read(file);
   LogReader reader(table, *model.system, columns_of(model, map));
   const std::vector<std::string> names = model.system->state_names();
-  Start start{Eigen::VectorXd::Zero(model.system->layout().size()), std::vector<bool>(names.size(), false)};
+  StartingPoint start{Eigen::VectorXd::Zero(model.system->layout().size()), std::vector<bool>(names.size(), false)};
   std::vector<std::string> found;
   for (int k = 0; k <= model.system->layout().t(); ++k) {
     if (!reader.has(names[static_cast<std::size_t>(k)])) continue;
@@ -118,39 +112,6 @@ Start read_start(const std::string& file, const ModelFile& model, const std::str
     if (start.given[k]) start.state[static_cast<Eigen::Index>(k)] = row[next++];
   }
   return start;
-}
-
-// "q3 = 0.097, dq3 = -0.04"
-std::string listed(const std::vector<std::string>& names, const Eigen::VectorXd& state, const std::vector<int>& entries) {
-  std::vector<std::string> parts;
-  for (const int k : entries) parts.push_back(fmt::format("{} = {:.6g}", names[static_cast<std::size_t>(k)], state[k]));
-  return fmt::format("{}", fmt::join(parts, ", "));
-}
-
-// Coordinates and velocities that are not given follow from the constraints, the given ones held. Where the given ones leave no
-// solution, they stay as they are: it is the simulation's to project them, or not.
-Eigen::VectorXd complete(Start start, const Subject& subject) {
-  const System& system = subject.system();
-  const std::vector<std::string> names = system.state_names();
-  std::vector<int> open;
-  for (int k = 0; k < 2 * system.nq(); ++k) {
-    if (start.given[static_cast<std::size_t>(k)]) continue;
-    open.push_back(k);
-    const auto newton_start = subject.model.newton_start.find(names[static_cast<std::size_t>(k)]);
-    if (newton_start != subject.model.newton_start.end()) start.state[k] = newton_start->second;
-  }
-  if (open.empty()) return start.state;
-  Eigen::VectorXd state;
-  try {
-    state = project_onto_constraints(system, subject.parameters, start.state, start.given);
-  } catch (const NumericalError& error) {
-    talk({fmt::format("--start: what is given leaves no solution of the constraints ({})", error.what())});
-    return start.state;
-  }
-  std::vector<int> solved;
-  std::copy_if(open.begin(), open.end(), std::back_inserter(solved), [&](int k) { return state[k] != start.state[k]; });
-  if (!solved.empty()) talk({fmt::format("start: from the constraints {}", listed(names, state, solved))});
-  return state;
 }
 
 InputSignal read_inputs(const Arguments& arguments, const ModelFile& model, double t_start, double t_end) {
@@ -350,7 +311,7 @@ void run(const Arguments& arguments) {
 
   const System& system = subject.system();
   const bool listed_start = arguments.start.find('=') != std::string::npos;
-  Start start = listed_start ? parse_start(arguments.start, system) : read_start(arguments.start, subject.model, arguments.map);
+  StartingPoint start = listed_start ? parse_start(arguments.start, system) : read_start(arguments.start, subject.model, arguments.map);
   const double t_start = arguments.t_start.value_or(start.state[system.layout().t()]);
   SimulateOptions options;
   options.times = times_of(t_start, *arguments.t_end, arguments.time_step);
@@ -359,7 +320,9 @@ void run(const Arguments& arguments) {
   options.project = arguments.project == "on";
   options.inputs = read_inputs(arguments, subject.model, t_start, *arguments.t_end);
   start.state[system.layout().t()] = t_start;
-  const Eigen::VectorXd state = complete(std::move(start), subject);
+  std::vector<std::string> notes;
+  const Eigen::VectorXd state = complete_start(subject.model, subject.parameters, std::move(start), notes);
+  talk(notes);
 
   std::vector<Motion> motions;
   const auto add_motion = [&](const Acceleration& acceleration) {

@@ -15,6 +15,9 @@ class CsvTable {
   static CsvTable read(const std::filesystem::path& path);
   /// @param name  stands for the file in messages
   static CsvTable parse(std::string_view text, std::string name);
+  /// From cells, row after row; a row's place in messages is the line it would have in a file.
+  /// @throws InputError as parse, and when the cells do not fill the last row.
+  static CsvTable from_cells(std::string name, std::vector<std::string> header, std::vector<std::string> cells);
 
   /// The table without the rows after the first n.
   [[nodiscard]] CsvTable first_rows(int n) const;

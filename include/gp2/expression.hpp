@@ -136,10 +136,11 @@ Expression parse_expression(std::string_view text, ExpressionGraph& graph,
                             const std::function<std::optional<Expression>(std::string_view)>& resolve,
                             std::span<const std::string> known_names);
 
-enum class Notation : std::uint8_t { text, latex, c };
+enum class Notation : std::uint8_t { text, latex, c, mathml };
 
 /// e written out with no more parentheses than needed; `text` reads back to the same expression. In LaTeX q1 → q_{1}, dq1 →
-/// \dot{q}_{1}, ddq1 → \ddot{q}_{1}, greek names → symbols. multiply_or_zero prints as a product, in C with its guard.
+/// \dot{q}_{1}, ddq1 → \ddot{q}_{1}, greek names → symbols, and so in MathML, where the elements of one <mrow> are given.
+/// multiply_or_zero prints as a product, in C with its guard.
 ///
 /// @throws InputError when the text would exceed 16 777 216 characters.
 std::string to_string(Expression e, Notation notation = Notation::text);

@@ -13,7 +13,8 @@ namespace gp2 {
 /// A fitted model as a file: the model's text, the options its prior was made with, the data and the hyperparameters. The
 /// posterior is computed anew from these, so a file loaded gives the same bits as before it was saved.
 struct FitFile {
-  static constexpr int format_version = 2;  // 2: observations of other systems; others are written as 1
+  /// 3: mechanics that are code; 2: observations of other systems; others are written as 1.
+  static constexpr int format_version = 3;
 
   ModelFile model;
   PriorOptions prior_options;
@@ -31,6 +32,11 @@ struct FitFile {
   void write(const std::filesystem::path& path) const;
   /// @throws InputError naming the file and what is wrong: not a fit, of a newer format, cut short, or with values out of place.
   static FitFile read(const std::filesystem::path& path);
+  /// The same of a fit whose mechanics are code: it holds what its model declares, and is told the code again. The code must be
+  /// that of the fit, for the posterior to be.
+  /// @param mechanics  asked for every model of the file whose mechanics are code; the declaration's name tells which
+  /// @throws InputError also when there is no such model.
+  static FitFile read(const std::filesystem::path& path, const MechanicsSource& mechanics);
 };
 
 /// Starting values for hyperparameters by name, from {"name": value, …} or a FitFile.

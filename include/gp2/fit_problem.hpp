@@ -1,5 +1,6 @@
 #pragma once
 
+#include <filesystem>
 #include <map>
 #include <memory>
 #include <optional>
@@ -70,6 +71,13 @@ FitOptions default_fit_options(const FitProblem& problem);
 
 /// fit() or, of a baseline, fit_baseline().
 Fit fit(const FitProblem& problem, const FitOptions& options);
+
+/// Starting values from a file, as read_start_values. Bounds are the optimiser's: where it does not run, at max_iterations 0, a
+/// start outside of them is taken; they are widened to hold it, and the notes say so.
+void read_start(const std::filesystem::path& path, int max_iterations, FitProblem& problem);
+
+/// What a person should know of a fit: noise that ended at its lower bound.
+std::vector<std::string> notes_of(const FitReport& report);
 
 /// Which latent of a prior has a name. @throws InputError naming `option` and the latents there are.
 int latent_index(const Prior& prior, const std::string& name, const std::string& option);

@@ -27,7 +27,8 @@ struct GenerateOptions {
   std::map<std::string, int> grid = {};
 };
 
-/// Draws states, solving the constraints for coordinates and velocities that [sampling] leaves open, and measures them.
+/// Draws states, solving the constraints for coordinates and velocities that [sampling] leaves open, and measures them. Of a
+/// system that gives no residuals there is nothing to solve: [sampling] must give all it reads, on its constraints.
 /// @throws InputError when the grid leaves out a range or names another; when [sampling] or [truth] is missing, leaves open what
 /// the constraints do not decide, or puts a state off
 ///   the constraints; when n < 1 or noise_stddev is not of nq finite numbers ≥ 0.
@@ -46,7 +47,7 @@ class ModelMotion {
   [[nodiscard]] Eigen::MatrixXd acceleration(const Eigen::Ref<const Eigen::MatrixXd>& states) const;
 
  private:
-  std::shared_ptr<const SymbolicSystem> system_;
+  std::shared_ptr<const System> system_;
   Eigen::VectorXd parameters_;
   Tape truth_;
 };

@@ -1,6 +1,7 @@
 #pragma once
 
 #include <filesystem>
+#include <functional>
 #include <map>
 #include <memory>
 #include <optional>
@@ -17,13 +18,24 @@
 
 namespace gp2 {
 
-/// A mechanical system and its prior as text (TOML; docs/model-files.md has every key).
+/// Code that gives the equations of a system, which a model file only declares: a CallableSystem, say, or a System of one's own.
+/// What it returns must go by the coordinates, inputs and parameters declared.
+using MechanicsSource = std::function<std::shared_ptr<const System>(const SystemDeclaration& declaration)>;
+
+/// A mechanical system and its prior as text (TOML; docs/model-files.md has every key). The equations of the system may come from
+/// code instead; everything else is the same then.
 class ModelFile {
  public:
   /// @throws InputError with file, line, key, the rule, the value got and the mend.
   static ModelFile read(const std::filesystem::path& path);
   /// @param name  stands for the file in messages
   static ModelFile parse(std::string text, std::string name);
+
+  /// The same of a file without [mechanics] and [constraints]: M, A, b and F come from code.
+  /// @throws InputError also when the file has one of the two, or `mechanics` is empty, returns nothing, or a system that goes by
+  ///   other coordinates, inputs or parameters.
+  static ModelFile read(const std::filesystem::path& path, const MechanicsSource& mechanics);
+  static ModelFile parse(std::string text, std::string name, const MechanicsSource& mechanics);
 
   /// A [[latent]] as written.
   struct LatentText {
@@ -49,9 +61,11 @@ class ModelFile {
     int line = 0;
   };
 
-  std::string name;  // for messages
-  std::string text;  // the file's content
-  std::shared_ptr<const SymbolicSystem> system;
+  std::string name;                        // for messages
+  std::string text;                        // the file's content
+  bool mechanics_are_code = false;         // M, A, b and F come from a MechanicsSource, not from the text
+  std::shared_ptr<ExpressionGraph> graph;  // of every expression here
+  std::shared_ptr<const System> system;
   std::vector<LatentText> latents;
   Noise noise;
   std::optional<Expression> potential;         // V(q, t) [J], for the energy that `simulate` reports
@@ -63,6 +77,12 @@ class ModelFile {
   /// An expression of the model's symbols and [let] names.
   [[nodiscard]] Expression expression(std::string_view text) const;
 
+  /// The variables of the system in `graph`.
+  [[nodiscard]] SystemSymbols symbols() const;
+
+  /// The system as expressions of `graph`; null where its mechanics are code.
+  [[nodiscard]] const SymbolicSystem* symbolic_system() const;
+
  private:
   void define(const std::string& symbol, Expression value);
 
@@ -70,6 +90,9 @@ class ModelFile {
   std::vector<std::string> symbol_names_;  // to suggest from when a symbol is unknown
   friend class ModelReader;
 };
+
+/// The system of a model as expressions. @throws InputError where its mechanics are code.
+const SymbolicSystem& require_symbolic_system(const ModelFile& model);
 
 /// What the model's kernel would rule out without reason: a second latent of fixed, short lengthscales and a size below the
 /// noise. It hardly moves the mean, but keeps a standard deviation where the fit would call an effect absent that the data cannot

@@ -10,8 +10,8 @@
 namespace gp2 {
 
 /// Predictions of one view at one state after another, for control loops: mean, standard deviation, and the mean's Jacobian in
-/// the state. They allocate nothing, take no locks and call no BLAS, as long as the system is a SymbolicSystem (which every model
-/// file is); any other may allocate where it evaluates M, A, b, F.
+/// the state. They allocate nothing, take no locks and call no BLAS, as long as the system is a SymbolicSystem (which every
+/// [mechanics] of a model file is); any other may allocate where it evaluates M, A, b, F.
 ///
 /// With β of posterior.hpp and X = L⁻¹ of the factored matrix L Lᵀ = K̃ + I,
 ///

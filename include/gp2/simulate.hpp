@@ -88,6 +88,19 @@ Trajectory simulate(const System& system, const Eigen::VectorXd& parameters, con
 Eigen::VectorXd project_onto_constraints(const System& system, const Eigen::VectorXd& parameters,
                                          const Eigen::Ref<const Eigen::VectorXd>& state, const std::vector<bool>& held = {});
 
+/// A start of which not every coordinate and velocity is given.
+struct StartingPoint {
+  Eigen::VectorXd state;    // (layout size)
+  std::vector<bool> given;  // (layout size)
+};
+
+/// The state at which a motion starts: coordinates and velocities that are not given follow from the constraints, the given ones
+/// held; Newton's method starts for them at the model's newton_start, or at what `start` has. Where what is given leaves no
+/// solution the start stays as it is, for simulate() to project or not.
+/// @param notes  what was solved for, or why not, is added
+Eigen::VectorXd complete_start(const ModelFile& model, const Eigen::VectorXd& parameters, StartingPoint start,
+                               std::vector<std::string>& notes);
+
 /// The acceleration of a model as it is written: L b + T (M⁻¹F + truth), truth = 0 without [truth].
 Acceleration model_acceleration(const ModelFile& model);
 

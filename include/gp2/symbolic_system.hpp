@@ -23,11 +23,7 @@ struct SystemSymbols {
 
 /// One row of A ddq = b, derived from a constraint.
 struct ConstraintRow {
-  enum class Level {
-    position,      // c(q, t) = 0, differentiated twice along the motion
-    velocity,      // c(q, dq, t) = 0, differentiated once
-    acceleration,  // c(q, dq, ddq, t, u) = 0, linear in ddq
-  };
+  using Level = ConstraintLevel;
   Level level;
   std::string text;           // c as written
   std::vector<Expression> A;  // (nq)
@@ -72,11 +68,9 @@ class SymbolicSystem final : public System {
                                           const Eigen::Ref<const Eigen::VectorXd>& parameters) const override;
   [[nodiscard]] const std::vector<Residual>& residual_labels() const override { return residual_labels_; }
   [[nodiscard]] std::vector<bool> reads(SystemPart part) const override;
+  [[nodiscard]] std::shared_ptr<const System> without_constraints() const override;
 
   [[nodiscard]] const Definition& definition() const { return definition_; }
-
-  /// The same coordinates, inputs, parameters, M and F, where nothing constrains the motion: ddq = ā.
-  [[nodiscard]] std::shared_ptr<const SymbolicSystem> without_constraints() const;
 
  private:
   class Evaluator;

@@ -40,6 +40,21 @@ struct Coordinate {
   [[nodiscard]] std::string acceleration() const { return "dd" + name; }
 };
 
+/// What a system goes by, but for its equations.
+struct SystemDeclaration {
+  std::string name;
+  std::vector<Coordinate> coordinates;
+  std::vector<std::string> inputs;
+  std::vector<Parameter> parameters;
+};
+
+/// At which level a constraint is given.
+enum class ConstraintLevel {
+  position,      // c(q, t) = 0, differentiated twice along the motion
+  velocity,      // c(q, dq, t) = 0, differentiated once
+  acceleration,  // c(q, dq, ddq, t, u) = 0, linear in ddq
+};
+
 /// M, A, b, F, or their derivatives in one parameter, at N states: column i of each member is state i, matrices column-major.
 struct SystemValues {
   using ConstBlock = Eigen::Map<const Eigen::MatrixXd>;
@@ -100,7 +115,8 @@ class System {
   [[nodiscard]] virtual std::unique_ptr<StateEvaluator> make_evaluator(const Eigen::Ref<const Eigen::VectorXd>& parameters,
                                                                        bool derivatives) const;
 
-  /// ∂M/∂p, ∂A/∂p, ∂b/∂p, ∂F/∂p at N states, exact, for parameter p = parameters()[index].
+  /// ∂M/∂p, ∂A/∂p, ∂b/∂p, ∂F/∂p at N states for parameter p = parameters()[index]: exact, but where a CallableSystem says
+  /// otherwise.
   [[nodiscard]] virtual SystemValues differentiate(const Eigen::Ref<const Eigen::MatrixXd>& states,
                                                    const Eigen::Ref<const Eigen::VectorXd>& parameters, int index) const = 0;
 
@@ -116,6 +132,9 @@ class System {
 
   /// Which entries of a state the named part reads (size layout().size()).
   [[nodiscard]] virtual std::vector<bool> reads(SystemPart part) const = 0;
+
+  /// The same coordinates, inputs, parameters, M and F, where nothing constrains the motion: ddq = ā.
+  [[nodiscard]] virtual std::shared_ptr<const System> without_constraints() const = 0;
 
  private:
   std::string name_;

@@ -25,10 +25,8 @@ struct Parts {
   std::vector<std::string> names;
   std::vector<Expression> raw;
 
-  explicit Parts(const ModelFile& model)
-      : symbols(*model.system->definition().graph, model.system->coordinates(), model.system->inputs(),
-                model.system->parameters()) {
-    ExpressionGraph& graph = *model.system->definition().graph;
+  explicit Parts(const ModelFile& model) : symbols(model.symbols()) {
+    ExpressionGraph& graph = *model.graph;
     std::map<std::string, Expression> parameter_values;
     for (const Parameter& parameter : model.system->parameters()) {
       parameter_values.emplace(parameter.name, graph.constant(parameter.value));
@@ -61,8 +59,8 @@ Baseline unstandardised(const ModelFile& model, Baseline::Kind kind) {
 }
 
 Prior make_baseline_prior(const ModelFile& model, const Baseline& baseline) {
-  const SymbolicSystem& system = *model.system;
-  ExpressionGraph& graph = *system.definition().graph;
+  const System& system = *model.system;
+  ExpressionGraph& graph = *model.graph;
   const Parts parts(model);
   const auto n_outputs = static_cast<std::size_t>(system.nq());
   require_size(baseline.output_mean, n_outputs, "output_mean", "outputs");

@@ -8,6 +8,7 @@
 #include <cstring>
 #include <fstream>
 #include <iterator>
+#include <numeric>
 #include <optional>
 #include <set>
 #include <system_error>
@@ -121,6 +122,22 @@ CsvTable CsvTable::parse(std::string_view text, std::string name) {
     throw InputError(fmt::format("{}: the file is empty; expected a header line and data rows", table.name_));
   }
   if (table.lines_.empty()) throw InputError(fmt::format("{}: no data rows after the header", table.name_));
+  return table;
+}
+
+CsvTable CsvTable::from_cells(std::string name, std::vector<std::string> header, std::vector<std::string> cells) {
+  if (header.empty()) throw InputError(fmt::format("{}: there are no columns", name));
+  check_header(header, name);
+  if (cells.empty()) throw InputError(fmt::format("{}: there are no rows", name));
+  if (cells.size() % header.size() != 0) {
+    throw InputError(fmt::format("{}: {} cells do not make rows of {} columns", name, cells.size(), header.size()));
+  }
+  CsvTable table;
+  table.name_ = std::move(name);
+  table.header_ = std::move(header);
+  table.cells_ = std::move(cells);
+  table.lines_.resize(table.cells_.size() / table.header_.size());
+  std::iota(table.lines_.begin(), table.lines_.end(), 2);  // the header is line 1
   return table;
 }
 

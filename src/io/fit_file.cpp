@@ -204,11 +204,32 @@ void check_hyperparameters(const std::vector<Hyperparameter>& hyperparameters, c
   }
 }
 
-Json model_json(const ModelFile& model) { return {{"name", model.name}, {"text", model.text}}; }
+constexpr const char* code = "code";
 
-ModelFile model_from(const Json& json) { return ModelFile::parse(json.at("text"), json.at("name")); }
+Json model_json(const ModelFile& model) {
+  Json json = {{"name", model.name}, {"text", model.text}};
+  if (model.mechanics_are_code) json["mechanics"] = code;
+  return json;
+}
 
-/// @param other  the model file of its view's setting; null: none
+bool mechanics_are_code(const Json& model) {
+  if (!model.contains("mechanics")) return false;
+  if (model.at("mechanics") != code) throw InputError(fmt::format("mechanics as {} are not known", shown(model.at("mechanics"))));
+  return true;
+}
+
+/// @param mechanics  null: not given
+ModelFile model_from(const Json& json, const MechanicsSource* mechanics) {
+  if (!mechanics_are_code(json)) return ModelFile::parse(json.at("text"), json.at("name"));
+  if (mechanics == nullptr) {
+    throw InputError(
+        fmt::format("the mechanics of its model '{}' are code, which a file cannot hold: read it where that code is, with "
+                    "FitFile::read(path, mechanics)",
+                    json.at("name").get<std::string>()));
+  }
+  return ModelFile::parse(json.at("text"), json.at("name"), *mechanics);
+}
+
 Json baseline_json(const Baseline& baseline) {
   return {{"kind", Baseline::word(baseline.kind)},
           {"output_mean", vector_json(baseline.output_mean)},
@@ -234,6 +255,7 @@ Baseline baseline_from(const Json& json) {
   return baseline;
 }
 
+/// @param other  the model file of its view's setting; null: none
 Json observations_json(const Observations& group, const Prior& home, const ModelFile* other) {
   const System& system = *prior_of(home, group.view).system;
   Json json = {{"view", View::word(group.view.quantity)},
@@ -325,7 +347,10 @@ void FitFile::write(const std::filesystem::path& path) const {
   json["format"] = format_name;
   const bool at_home =
       std::all_of(observations.begin(), observations.end(), [](const auto& group) { return !group.view.setting; });
-  json["version"] = at_home ? 1 : format_version;
+  const bool with_code = model.mechanics_are_code || std::any_of(systems.begin(), systems.end(), [](const auto& other) {
+                           return other && other->mechanics_are_code;
+                         });
+  json["version"] = with_code ? 3 : at_home ? 1 : 2;
   json["library"] = version();
   json["model"] = model_json(model);
   json["prior"] = {{"mean", name_of(means, prior_options.mean)},
@@ -360,20 +385,25 @@ void FitFile::write(const std::filesystem::path& path) const {
   write_file(path, json.dump(1, ' ', false, Json::error_handler_t::replace) + "\n");
 }
 
-FitFile FitFile::read(const std::filesystem::path& path) {
+namespace {
+
+bool is_fit(const Json& json) { return json.is_object() && json.contains("format") && json.at("format") == format_name; }
+
+/// @param mechanics  null: not given
+FitFile read_fit(const std::filesystem::path& path, const MechanicsSource* mechanics) {
+  constexpr int format_version = FitFile::format_version;
   const Json json = parse_json(path);
   FitFile fit;
   try {
-    if (!json.is_object() || !json.contains("format") || json.at("format") != format_name) {
-      throw InputError("not a fit written by gp2");
-    }
+    if (!is_fit(json)) throw InputError("not a fit written by gp2");
     const int file_version = integer(json.at("version"));
     if (file_version > format_version) {
       throw InputError(fmt::format("of format {}, but this gp2 ({}) reads up to {}: use a newer gp2", file_version, version(),
                                    format_version));
     }
     if (file_version < 1) throw InputError(fmt::format("format {} does not exist", file_version));
-    fit.model = model_from(json.at("model"));
+    fit.model = model_from(json.at("model"), mechanics);
+    bool code_is_used = fit.model.mechanics_are_code;
     const Json& prior_json = json.at("prior");
     fit.prior_options.mean = choice_from(prior_json.at("mean"), means, "prior mean");
     fit.prior_options.base = choice_from(prior_json.at("directions"), directions, "choice of directions");
@@ -386,12 +416,16 @@ FitFile FitFile::read(const std::filesystem::path& path) {
       std::shared_ptr<const Setting> setting;
       std::shared_ptr<const ModelFile>& system = fit.systems.emplace_back();
       if (group.contains("system")) {
-        system = std::make_shared<const ModelFile>(model_from(group.at("system")));
+        system = std::make_shared<const ModelFile>(model_from(group.at("system"), mechanics));
+        code_is_used = code_is_used || system->mechanics_are_code;
         setting = make_setting(fit.model, *system, fit.prior_options);
       }
       fit.observations.push_back(observations_from(group, prior, std::move(setting)));
     }
     if (fit.observations.empty()) throw InputError("no observations");
+    if (mechanics != nullptr && !code_is_used) {
+      throw InputError("mechanics are given as code, but this fit has them as text: read it without");
+    }
     for (const Json& h : array(json.at("hyperparameters"))) fit.report.hyperparameters.push_back(hyperparameter_from(h));
     check_hyperparameters(fit.report.hyperparameters, prior, fit.observations);
     const Json& report = json.at("report");
@@ -410,12 +444,37 @@ FitFile FitFile::read(const std::filesystem::path& path) {
   return fit;
 }
 
+}  // namespace
+
+FitFile FitFile::read(const std::filesystem::path& path) { return read_fit(path, nullptr); }
+
+FitFile FitFile::read(const std::filesystem::path& path, const MechanicsSource& mechanics) { return read_fit(path, &mechanics); }
+
+namespace {
+
+// Of a fit whose mechanics are code the hyperparameters alone are read: there is no model to hold them against.
+std::vector<Hyperparameter> hyperparameters_of(const std::filesystem::path& path, const Json& json) {
+  const bool with_code = json.contains("model") && json.at("model").is_object() && json.at("model").contains("mechanics");
+  if (!with_code) return FitFile::read(path).report.hyperparameters;
+  std::vector<Hyperparameter> hyperparameters;
+  try {
+    for (const Json& h : array(json.at("hyperparameters"))) hyperparameters.push_back(hyperparameter_from(h));
+  } catch (const Json::exception& error) {
+    throw InputError(fmt::format("{}: not a whole fit file: {}", path.string(), error.what()));
+  } catch (const InputError& error) {
+    throw InputError(fmt::format("{}: {}", path.string(), error.what()));
+  }
+  return hyperparameters;
+}
+
+}  // namespace
+
 void read_start_values(const std::filesystem::path& path, std::vector<Hyperparameter>& hyperparameters) {
   const Json json = parse_json(path);
   std::vector<std::pair<std::string, double>> values;
-  const bool is_fit = json.is_object() && json.contains("format") && json.at("format") == format_name;
-  if (is_fit) {
-    for (const Hyperparameter& h : FitFile::read(path).report.hyperparameters) values.emplace_back(h.name, h.value);
+  const bool of_fit = is_fit(json);
+  if (of_fit) {
+    for (const Hyperparameter& h : hyperparameters_of(path, json)) values.emplace_back(h.name, h.value);
   } else if (json.is_object()) {
     for (const auto& [name, value] : json.items()) {
       if (!value.is_number())
@@ -431,7 +490,7 @@ void read_start_values(const std::filesystem::path& path, std::vector<Hyperparam
     const auto h = std::find_if(started.begin(), started.end(), [&name = name](const auto& known) { return known.name == name; });
     if (h == started.end()) {
       // a fit may have had more to tune than this one; a hand-written value must mean something
-      if (is_fit) continue;
+      if (of_fit) continue;
       std::vector<std::string> known;
       for (const Hyperparameter& other : started) known.push_back(other.name);
       throw InputError(

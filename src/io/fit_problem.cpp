@@ -403,6 +403,38 @@ int latent_index(const Prior& prior, const std::string& name, const std::string&
   return static_cast<int>(found - names.begin());
 }
 
+void read_start(const std::filesystem::path& path, int max_iterations, FitProblem& problem) {
+  if (max_iterations > 0) {
+    read_start_values(path, problem.hyperparameters);
+    return;
+  }
+  const std::vector<Hyperparameter> bounded = problem.hyperparameters;
+  for (Hyperparameter& h : problem.hyperparameters) {
+    h.lower = h.is_positive() ? std::numeric_limits<double>::min() : std::numeric_limits<double>::lowest();
+    h.upper = std::numeric_limits<double>::max();
+  }
+  read_start_values(path, problem.hyperparameters);
+  for (std::size_t k = 0; k < bounded.size(); ++k) {
+    Hyperparameter& h = problem.hyperparameters[k];
+    h.lower = std::min(bounded[k].lower, h.value);
+    h.upper = std::max(bounded[k].upper, h.value);
+    if (h.lower == bounded[k].lower && h.upper == bounded[k].upper) continue;
+    problem.notes.push_back(fmt::format("{}: {} = {} is outside its bounds [{:.6g}, {:.6g}]; taken, as nothing is optimised",
+                                        path.string(), h.name, h.value, bounded[k].lower, bounded[k].upper));
+  }
+}
+
+std::vector<std::string> notes_of(const FitReport& report) {
+  std::vector<std::string> collapsed;
+  for (const Hyperparameter& h : report.hyperparameters) {
+    const bool at_lower = h.at_bound() && h.value < 2 * h.lower;
+    if (h.kind == Hyperparameter::Kind::noise_stddev && at_lower) collapsed.push_back(h.name);
+  }
+  if (collapsed.empty()) return {};
+  return {fmt::format("warning: {} ended at the lower bound: the columns may not be independent measurements; see gp2 check",
+                      fmt::join(collapsed, ", "))};
+}
+
 FitOptions default_fit_options(const FitProblem& problem) {
   return problem.prior_options.baseline ? baseline_fit_options() : FitOptions{};
 }

@@ -29,16 +29,19 @@ std::vector<std::string> expand_angle(const std::string& feature, const std::vec
   return {fmt::format("sin({})", feature), fmt::format("cos({})", feature)};
 }
 
-ModelFile ModelFile::read(const std::filesystem::path& path) {
+namespace {
+
+std::string read_text(const std::filesystem::path& path) {
   std::error_code unknown;  // of a pipe, say; then `parse` looks at the size
   const auto size = std::filesystem::file_size(path, unknown);
   if (!unknown && size > max_file_size) {
     throw InputError(fmt::format("{}: {} bytes; a model file has at most {}", path.string(), size, max_file_size));
   }
-  return parse(read_file(path), path.string());
+  return read_file(path);
 }
 
-ModelFile ModelFile::parse(std::string text, std::string name) {
+/// @param mechanics  null: they stand in the text
+ModelFile parse_model(std::string text, std::string name, const MechanicsSource* mechanics) {
   ModelFile model;
   model.name = std::move(name);
   model.text = std::move(text);
@@ -47,7 +50,7 @@ ModelFile ModelFile::parse(std::string text, std::string name) {
   }
   try {
     const toml::table root = toml::parse(model.text, model.name);
-    read_model(root, model);
+    read_model(root, mechanics, model);
   } catch (const toml::parse_error& error) {
     throw InputError(fmt::format("{}:{}: not valid TOML: {}", model.name, error.source().begin.line, error.description()));
   } catch (const LocatedError&) {
@@ -58,14 +61,27 @@ ModelFile ModelFile::parse(std::string text, std::string name) {
   return model;
 }
 
+}  // namespace
+
+ModelFile ModelFile::read(const std::filesystem::path& path) { return parse(read_text(path), path.string()); }
+
+ModelFile ModelFile::read(const std::filesystem::path& path, const MechanicsSource& mechanics) {
+  return parse(read_text(path), path.string(), mechanics);
+}
+
+ModelFile ModelFile::parse(std::string text, std::string name) { return parse_model(std::move(text), std::move(name), nullptr); }
+
+ModelFile ModelFile::parse(std::string text, std::string name, const MechanicsSource& mechanics) {
+  return parse_model(std::move(text), std::move(name), &mechanics);
+}
+
 void ModelFile::define(const std::string& symbol, Expression value) {
   if (symbols_.emplace(symbol, value).second) symbol_names_.push_back(symbol);
 }
 
 Expression ModelFile::expression(std::string_view written) const {
-  ExpressionGraph& graph = symbols_.begin()->second.graph();
   return parse_expression(
-      written, graph,
+      written, *graph,
       [&](std::string_view symbol) -> std::optional<Expression> {
         const auto found = symbols_.find(symbol);
         return found == symbols_.end() ? std::nullopt : std::optional(found->second);
@@ -73,12 +89,29 @@ Expression ModelFile::expression(std::string_view written) const {
       symbol_names_);
 }
 
+SystemSymbols ModelFile::symbols() const { return {*graph, system->coordinates(), system->inputs(), system->parameters()}; }
+
+const SymbolicSystem* ModelFile::symbolic_system() const {
+  // code may give a system of expressions too, but of another graph
+  const auto* symbolic = dynamic_cast<const SymbolicSystem*>(system.get());
+  return symbolic != nullptr && symbolic->definition().graph == graph ? symbolic : nullptr;
+}
+
+const SymbolicSystem& require_symbolic_system(const ModelFile& model) {
+  if (const SymbolicSystem* system = model.symbolic_system()) return *system;
+  throw InputError(
+      fmt::format("{}: the mechanics of '{}' are code: there are no expressions of M, A, b and F; only a model file with "
+                  "[mechanics] has them",
+                  model.name, model.system->name()));
+}
+
 namespace {
 
 // features in units of the lengthscales, directions of the standard deviations: nothing is left to tune
-Latent make_discrepancy(const SymbolicSystem& system, const SystemSymbols& symbols, const Latent& beside,
+Latent make_discrepancy(const ModelFile& model, const SystemSymbols& symbols, const Latent& beside,
                         std::vector<Expression> features, const Discrepancy& discrepancy) {
-  ExpressionGraph& graph = *system.definition().graph;
+  const System& system = *model.system;
+  ExpressionGraph& graph = *model.graph;
   if (discrepancy.lengthscale.size() != beside.n_features() || discrepancy.stddev.size() != system.nq()) {
     throw InputError(fmt::format("a discrepancy must hold {} lengthscales and {} standard deviations, got {} and {}",
                                  beside.n_features(), system.nq(), discrepancy.lengthscale.size(), discrepancy.stddev.size()));
@@ -108,9 +141,9 @@ Latent make_discrepancy(const SymbolicSystem& system, const SystemSymbols& symbo
 
 Prior make_prior(const ModelFile& model, const PriorOptions& options) {
   if (options.baseline) return make_baseline_prior(model, *options.baseline);
-  const SymbolicSystem& system = *model.system;
-  ExpressionGraph& graph = *system.definition().graph;
-  const SystemSymbols symbols(graph, system.coordinates(), system.inputs(), system.parameters());
+  const System& system = *model.system;
+  ExpressionGraph& graph = *model.graph;
+  const SystemSymbols symbols = model.symbols();
   if (options.base && model.latents.size() > 1) {
     throw InputError(
         fmt::format("{}: --prior replaces the directions of the one [[latent]], but this model has {}: edit the model "
@@ -147,7 +180,7 @@ Prior make_prior(const ModelFile& model, const PriorOptions& options) {
     latent.kernel = Kernel::parse(text.kernel, latent.feature_names);
 
     if (options.discrepancy && &text == &model.latents.front()) {
-      discrepancy = make_discrepancy(system, symbols, latent, features, *options.discrepancy);
+      discrepancy = make_discrepancy(model, symbols, latent, features, *options.discrepancy);
     }
 
     latent.directions_are_identity = text.directions.empty() || options.base.has_value();

@@ -20,29 +20,34 @@ using Level = ConstraintRow::Level;
 /// Reads the tables of a model file one after the other; every complaint carries file, line and key.
 class ModelReader : private TomlReader {
  public:
-  ModelReader(const toml::table& root, ModelFile& model) : TomlReader(model.name), root_(root), model_(model) {}
+  ModelReader(const toml::table& root, const MechanicsSource* mechanics, ModelFile& model)
+      : TomlReader(model.name), root_(root), source_(mechanics), model_(model) {}
 
   void read() {
     only_keys(root_, "",
               {"name", "coordinates", "inputs", "parameters", "let", "mechanics", "constraints", "latent", "noise", "truth",
                "sampling", "columns"});
-    definition_.graph = std::make_shared<ExpressionGraph>();
+    definition_.graph = model_.graph = std::make_shared<ExpressionGraph>();
     definition_.name = root_.contains("name") ? text(*root_.get("name"), "name") : model_.name;
     read_coordinates();
     read_inputs();
     read_parameters();
     declare_symbols();
     read_let();
-    read_mechanics();
-    read_constraints();
-    model_.system = std::make_shared<const SymbolicSystem>(definition_);
-    check_mass_symmetry();
+    if (source_ != nullptr) {
+      ask_for_mechanics();
+    } else {
+      read_mechanics();
+      read_constraints();
+      model_.system = std::make_shared<const SymbolicSystem>(definition_);
+      check_mass_symmetry();
+    }
     read_latents();
     read_noise();
     read_truth();
     read_sampling();
     read_columns();
-    read_potential();
+    if (source_ == nullptr) read_potential();
   }
 
  private:
@@ -165,6 +170,49 @@ class ModelReader : private TomlReader {
     for (std::size_t k = 0; k < std::min(circle.size(), enough); ++k) text += fmt::format("{} uses ", entries[circle[k]].first);
     if (circle.size() > enough) text += "… uses ";
     return text + entries[circle.front()].first;
+  }
+
+  void ask_for_mechanics() {
+    for (const char* key : {"mechanics", "constraints"}) {
+      if (root_.contains(key)) {
+        fail(*root_.get(key), key,
+             fmt::format("the mechanics of this model are given as code: remove [{}], or read the file without that code", key));
+      }
+    }
+    if (!*source_) throw InputError("the code that is to give the mechanics is an empty function");
+    model_.mechanics_are_code = true;
+    model_.system = (*source_)({definition_.name, definition_.coordinates, definition_.inputs, definition_.parameters});
+    if (!model_.system) throw InputError("the code that is to give the mechanics returned no system");
+    require_as_declared(*model_.system);
+  }
+
+  // the rest of the file speaks of what it declares itself
+  void require_as_declared(const System& system) const {
+    const auto require_same = [](const char* what, const std::string& declared, const std::string& got) {
+      if (declared == got) return;
+      throw InputError(
+          fmt::format("the system that code returned has the {} {}, but this file declares {}; give it those of "
+                      "the declaration",
+                      what, got.empty() ? "(none)" : got, declared.empty() ? "(none)" : declared));
+    };
+    const auto coordinates = [](const std::vector<Coordinate>& all) {
+      std::vector<std::string> names;
+      for (const Coordinate& c : all) names.push_back(c.angle ? c.name + " (an angle)" : c.name);
+      return fmt::format("{}", fmt::join(names, ", "));
+    };
+    const auto parameters = [](const std::vector<Parameter>& all) {
+      std::vector<std::string> names;
+      for (const Parameter& p : all) {
+        names.push_back(fmt::format("{} = {}", p.name, p.value));
+        if (p.bounds) names.back() += fmt::format(" in [{}, {}]", p.bounds->first, p.bounds->second);
+        if (p.estimate) names.back() += " (estimated)";
+      }
+      return fmt::format("{}", fmt::join(names, ", "));
+    };
+    require_same("coordinates", coordinates(definition_.coordinates), coordinates(system.coordinates()));
+    require_same("inputs", fmt::format("{}", fmt::join(definition_.inputs, ", ")),
+                 fmt::format("{}", fmt::join(system.inputs(), ", ")));
+    require_same("parameters", parameters(definition_.parameters), parameters(system.parameters()));
   }
 
   void read_mechanics() {
@@ -530,6 +578,7 @@ class ModelReader : private TomlReader {
   }
 
   const toml::table& root_;
+  const MechanicsSource* source_;  // null: the mechanics are text
   ModelFile& model_;
   SymbolicSystem::Definition definition_;
   std::set<std::string> names_;
@@ -537,6 +586,8 @@ class ModelReader : private TomlReader {
   const toml::node* mass_node_ = nullptr;
 };
 
-void read_model(const toml::table& root, ModelFile& model) { ModelReader(root, model).read(); }
+void read_model(const toml::table& root, const MechanicsSource* mechanics, ModelFile& model) {
+  ModelReader(root, mechanics, model).read();
+}
 
 }  // namespace gp2

@@ -280,26 +280,32 @@ void check_motion(const System& system, const Ref<const MatrixXd>& states, const
   std::string worst_label;
   for (Index k = 0; k < now.rows(); ++k) {
     const System::Residual& label = system.residual_labels()[static_cast<std::size_t>(k)];
+    // errors relative to the largest over the states: at one that rests there is nothing to be relative to
+    double error = 0, size = 0;
     for (Index i = 0; i < now.cols(); ++i) {
       // d/dt of a velocity-level residual is A ddq − b; d/dt of a position-level one is the residual that follows it
-      double expected = 0, size = 1e-12;
+      const auto A = values.A(static_cast<int>(i)).row(label.row);
+      double expected = 0, size_here = 0;
       if (label.velocity) {
-        const auto A = values.A(static_cast<int>(i)).row(label.row);
         const double b = values.b(static_cast<int>(i))[label.row];
         expected = A.dot(ddq.col(i)) - b;
-        size += A.cwiseAbs().dot(ddq.col(i).cwiseAbs()) + std::abs(b);
+        size_here = A.cwiseAbs().dot(ddq.col(i).cwiseAbs()) + std::abs(b);
       } else {
         expected = now(k + 1, i);
+        size_here = std::abs(expected);
         for (int j = 0; j < layout.nq; ++j) {
-          const double rate = values.A(static_cast<int>(i))(label.row, j) * states(layout.dq(j), i);
-          if (std::isfinite(rate)) size += std::abs(rate);
+          const double rate = A[j] * states(layout.dq(j), i);
+          if (std::isfinite(rate)) size_here += std::abs(rate);
         }
       }
-      const double error = std::abs(difference(k, i) - expected) / size;
-      if (std::isfinite(error) && error > worst) {
-        worst = error;
-        worst_label = label.text;
-      }
+      const double error_here = std::abs(difference(k, i) - expected);
+      if (!std::isfinite(error_here) || !std::isfinite(size_here)) continue;
+      error = std::max(error, error_here);
+      size = std::max(size, size_here);
+    }
+    if (error > worst * size && size > 0) {
+      worst = error / size;
+      worst_label = label.text;
     }
   }
   findings.push_back({worst > 1e-3 ? Level::warning : Level::good,

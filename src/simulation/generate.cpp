@@ -25,69 +25,111 @@ using Level = ConstraintRow::Level;
 
 namespace {
 
-/// Coordinates (or velocities) that a set of equations r(x) = 0 decides, by Newton's method.
+struct Linearisation {
+  VectorXd residual;  // r
+  MatrixXd jacobian;  // ∂r/∂x, a column for each of the variables
+};
+
+/// Equations r(x) = 0 in coordinates, or in velocities.
+struct Equations {
+  std::vector<std::string> texts;  // one per equation
+  std::vector<int> variables;      // the coordinates, or velocities, that the equations depend on: entries of the state
+  std::function<Linearisation(const MatrixXd& state, const VectorXd& parameters)> linearise;
+};
+
+/// Equations given by expressions.
+/// @param candidates   the coordinates, or the velocities, in the order of the state
+/// @param first_index  of the candidates in the state
+Equations equations_of(const std::vector<std::pair<Expression, std::string>>& residuals,
+                       const std::vector<Expression>& candidates, int first_index, const std::vector<Expression>& tape_inputs,
+                       ExpressionGraph& graph) {
+  Equations out;
+  std::vector<Expression> outputs;
+  for (const auto& [residual, text] : residuals) {
+    outputs.push_back(residual);
+    out.texts.push_back(text);
+  }
+  for (std::size_t j = 0; j < candidates.size(); ++j) {
+    const bool decided = std::any_of(residuals.begin(), residuals.end(),
+                                     [&](const auto& residual) { return graph.depends_on(residual.first, candidates[j]); });
+    if (!decided) continue;
+    for (const auto& [residual, text] : residuals) outputs.push_back(graph.differentiate(residual, candidates[j]));
+    out.variables.push_back(first_index + static_cast<int>(j));
+  }
+  const auto n_equations = static_cast<Index>(residuals.size()), n_variables = static_cast<Index>(out.variables.size());
+  out.linearise = [tape = Tape(outputs, tape_inputs), n_equations, n_variables](const MatrixXd& state,
+                                                                                const VectorXd& parameters) -> Linearisation {
+    MatrixXd values;
+    tape.evaluate(state, parameters, values);
+    return {values.col(0).head(n_equations), values.col(0).tail(n_equations * n_variables).reshaped(n_equations, n_variables)};
+  };
+  return out;
+}
+
+/// The position residuals of any system, or its velocity residuals. Their rows of A are ∂c/∂q, which is also ∂ċ/∂dq.
+Equations equations_of(const System& system, bool velocity) {
+  Equations out;
+  std::vector<int> residuals, rows, columns;
+  for (std::size_t k = 0; k < system.residual_labels().size(); ++k) {
+    const System::Residual& label = system.residual_labels()[k];
+    if (label.velocity != velocity) continue;
+    out.texts.push_back(label.text);
+    residuals.push_back(static_cast<int>(k));
+    rows.push_back(label.row);
+  }
+  if (residuals.empty()) return out;
+  const StateLayout layout = system.layout();
+  const std::vector<bool> reads = system.reads(SystemPart::residuals);
+  for (int j = 0; j < system.nq(); ++j) {
+    const int entry = velocity ? layout.dq(j) : layout.q(j);
+    if (!reads[static_cast<std::size_t>(entry)]) continue;
+    out.variables.push_back(entry);
+    columns.push_back(j);
+  }
+  out.linearise = [&system, residuals, rows, columns](const MatrixXd& state, const VectorXd& parameters) -> Linearisation {
+    // what is not known yet does not matter to these residuals, but code need not bear a NaN
+    const VectorXd head = state.col(0).head(system.layout().size());
+    const MatrixXd known = head.array().isNaN().select(0, head);
+    const SystemValues values = system.evaluate(known, parameters);
+    return {system.residuals(known, parameters)(residuals, 0), values.A(0)(rows, columns)};
+  };
+  return out;
+}
+
+/// Coordinates (or velocities) that a set of equations decides, by Newton's method.
 class Completion {
  public:
-  struct Equation {
-    Expression value;
-    std::string text;
-  };
-
-  /// @param candidates   the coordinates, or the velocities, in the order of the state
-  /// @param first_index  of the candidates in the state
-  /// @param given        which entries of the state [sampling] gives; what it does not, but an equation has, is solved for
-  Completion(const ModelFile& model, std::vector<Equation> equations, const std::vector<Expression>& candidates, int first_index,
-             const std::vector<bool>& given, const std::vector<Expression>& tape_inputs)
+  /// @param given  which entries of the state [sampling] gives; what it does not, but an equation has, is solved for
+  Completion(const ModelFile& model, Equations equations, const std::vector<bool>& given)
       : model_(model), equations_(std::move(equations)) {
-    ExpressionGraph& graph = *model.system->definition().graph;
-    std::vector<Expression> outputs;
-    for (const Equation& equation : equations_) outputs.push_back(equation.value);
-    for (std::size_t j = 0; j < candidates.size(); ++j) {
-      const bool decided = std::any_of(equations_.begin(), equations_.end(),
-                                       [&](const Equation& equation) { return graph.depends_on(equation.value, candidates[j]); });
-      if (!decided) continue;
-      for (const Equation& equation : equations_) outputs.push_back(graph.differentiate(equation.value, candidates[j]));
-      variables_.push_back(first_index + static_cast<int>(j));
-      if (given[static_cast<std::size_t>(variables_.back())]) continue;
-      const std::string& name = candidates[j].variable_name();
-      const auto start = model.newton_start.find(name);
-      unknown_columns_.push_back(static_cast<int>(variables_.size()) - 1);
-      unknowns_.push_back(variables_.back());
+    const std::vector<std::string> state_names = model.system->state_names();
+    for (std::size_t k = 0; k < equations_.variables.size(); ++k) {
+      const auto entry = static_cast<std::size_t>(equations_.variables[k]);
+      if (given[entry]) continue;
+      const auto start = model.newton_start.find(state_names[entry]);
+      unknown_columns_.push_back(static_cast<int>(k));
+      unknowns_.push_back(equations_.variables[k]);
       start_.push_back(start == model.newton_start.end() ? 0 : start->second);
-      names_.push_back(name);
+      names_.push_back(state_names[entry]);
     }
-    tape_ = Tape(outputs, tape_inputs);
   }
 
   [[nodiscard]] const std::vector<int>& unknowns() const { return unknowns_; }  // entries of the state
 
   /// Solves for the unknowns from their start values, to rounding.
   void solve(MatrixXd& state, const VectorXd& parameters, int sample) const {
-    if (equations_.empty()) return;
+    if (equations_.texts.empty()) return;
     state(unknowns_, 0) = Eigen::Map<const VectorXd>(start_.data(), static_cast<Index>(start_.size()));
     if (!unknowns_.empty()) iterate(state, parameters, sample);
     check(state, parameters, sample);
   }
 
  private:
-  struct Linearisation {
-    VectorXd residual;  // r
-    MatrixXd jacobian;  // ∂r/∂x, for x among `variables_`
-  };
-
-  [[nodiscard]] Linearisation linearise(const MatrixXd& state, const VectorXd& parameters) const {
-    MatrixXd values;
-    tape_.evaluate(state, parameters, values);
-    const auto n_equations = static_cast<Index>(equations_.size());
-    const auto n_variables = static_cast<Index>(variables_.size());
-    return {values.col(0).head(n_equations), values.col(0).tail(n_equations * n_variables).reshaped(n_equations, n_variables)};
-  }
-
   void iterate(MatrixXd& state, const VectorXd& parameters, int sample) const {
     constexpr int max_iterations = 100;
     int polishing = 0;
     for (int iteration = 0; iteration < max_iterations; ++iteration) {
-      const Linearisation at = linearise(state, parameters);
+      const Linearisation at = equations_.linearise(state, parameters);
       if (!at.residual.allFinite() || !at.jacobian.allFinite()) break;
       Eigen::CompleteOrthogonalDecomposition<MatrixXd> decomposition;
       decomposition.setThreshold(1e-10);
@@ -112,16 +154,16 @@ class Completion {
 
   // With fewer unknowns than equations, Newton's method ends where they are violated least.
   void check(const MatrixXd& state, const VectorXd& parameters, int sample) const {
-    const Linearisation at = linearise(state, parameters);
-    const VectorXd size = state(variables_, 0).cwiseAbs().cwiseMax(1);
+    const Linearisation at = equations_.linearise(state, parameters);
+    const VectorXd size = state(equations_.variables, 0).cwiseAbs().cwiseMax(1);
     const VectorXd scale = at.jacobian.cwiseAbs() * size;
     for (Index k = 0; k < at.residual.size(); ++k) {
       if (std::abs(at.residual[k]) <= 1e-9 * scale[k]) continue;
       throw InputError(
           fmt::format("{}: [sampling]: sample {} ({}) is off the constraint \"{}\" by {:.3g}: leave one more of {} to be "
                       "solved from the constraints",
-                      model_.name, sample + 1, describe(state), equations_[static_cast<std::size_t>(k)].text, at.residual[k],
-                      fmt::join(names_of(variables_), ", ")));
+                      model_.name, sample + 1, describe(state), equations_.texts[static_cast<std::size_t>(k)], at.residual[k],
+                      fmt::join(names_of(equations_.variables), ", ")));
     }
   }
 
@@ -134,30 +176,27 @@ class Completion {
 
   // "q1 = 0.1, q2 = 2"
   [[nodiscard]] std::string describe(const MatrixXd& state) const {
-    const std::vector<std::string> names = names_of(variables_);
+    const std::vector<std::string> names = names_of(equations_.variables);
     std::vector<std::string> parts;
-    for (std::size_t k = 0; k < names.size(); ++k) parts.push_back(fmt::format("{} = {:.6g}", names[k], state(variables_[k], 0)));
+    for (std::size_t k = 0; k < names.size(); ++k) {
+      parts.push_back(fmt::format("{} = {:.6g}", names[k], state(equations_.variables[k], 0)));
+    }
     return fmt::format("{}", fmt::join(parts, ", "));
   }
 
   const ModelFile& model_;
-  std::vector<Equation> equations_;
-  std::vector<int> variables_;        // entries of the state that the equations depend on
-  std::vector<int> unknowns_;         // those to solve for
-  std::vector<int> unknown_columns_;  // their positions among variables_
+  Equations equations_;
+  std::vector<int> unknowns_;         // entries of the state to solve for
+  std::vector<int> unknown_columns_;  // their positions among the variables of the equations
   std::vector<double> start_;         // per unknown
   std::vector<std::string> names_;    // per unknown
-  Tape tape_;                         // r, then ∂r/∂variable column by column
 };
 
 /// Draws one state after the other by the rules of [sampling].
 class Sampler {
  public:
   explicit Sampler(const ModelFile& model)
-      : model_(model),
-        parameters_(model.system->parameter_values()),
-        symbols_(*model.system->definition().graph, model.system->coordinates(), model.system->inputs(),
-                 model.system->parameters()) {
+      : model_(model), parameters_(model.system->parameter_values()), symbols_(model.symbols()) {
     place_rules();
     add_completions();
     schedule_rules();
@@ -202,18 +241,23 @@ class Sampler {
   }
 
   void add_completions() {
-    std::vector<Completion::Equation> position_equations, velocity_equations;
-    for (const ConstraintRow& row : model_.system->definition().constraints) {
-      if (row.level == Level::position) {
-        position_equations.push_back({row.residuals[0], row.text});
-        velocity_equations.push_back({row.residuals[1], "d/dt of " + row.text});
-      } else if (row.level == Level::velocity) {
-        velocity_equations.push_back({row.residuals[0], row.text});
+    if (const SymbolicSystem* symbolic = model_.symbolic_system()) {
+      std::vector<std::pair<Expression, std::string>> positions, velocities;
+      for (const ConstraintRow& row : symbolic->definition().constraints) {
+        if (row.level == Level::position) {
+          positions.emplace_back(row.residuals[0], row.text);
+          velocities.emplace_back(row.residuals[1], "d/dt of " + row.text);
+        } else if (row.level == Level::velocity) {
+          velocities.emplace_back(row.residuals[0], row.text);
+        }
       }
+      const StateLayout layout = model_.system->layout();
+      positions_.emplace(model_, equations_of(positions, symbols_.q, layout.q(0), tape_inputs_, graph()), known_);
+      velocities_.emplace(model_, equations_of(velocities, symbols_.dq, layout.dq(0), tape_inputs_, graph()), known_);
+    } else {
+      positions_.emplace(model_, equations_of(*model_.system, false), known_);
+      velocities_.emplace(model_, equations_of(*model_.system, true), known_);
     }
-    const StateLayout layout = model_.system->layout();
-    positions_.emplace(model_, std::move(position_equations), symbols_.q, layout.q(0), known_, tape_inputs_);
-    velocities_.emplace(model_, std::move(velocity_equations), symbols_.dq, layout.dq(0), known_, tape_inputs_);
     for (const Completion* completion : {&*positions_, &*velocities_}) {
       for (int unknown : completion->unknowns()) known_[static_cast<std::size_t>(unknown)] = true;
     }
@@ -239,7 +283,7 @@ class Sampler {
 
   // everything that the true motion and the constraints read must be known
   void check_known() const {
-    const SymbolicSystem& system = *model_.system;
+    const System& system = *model_.system;
     const Tape truth(model_.truth, symbols_.state_and_parameters());
     const std::vector<bool> mechanics = system.reads(SystemPart::mechanics);
     const std::vector<bool> force = system.reads(SystemPart::force);
@@ -274,7 +318,7 @@ class Sampler {
     }
   }
 
-  [[nodiscard]] ExpressionGraph& graph() const { return *model_.system->definition().graph; }
+  [[nodiscard]] ExpressionGraph& graph() const { return *model_.graph; }
   [[nodiscard]] const std::string& name_of(int entry) const {
     return tape_inputs_[static_cast<std::size_t>(entry)].variable_name();
   }
@@ -301,8 +345,7 @@ void require_truth(const ModelFile& model) {
 }  // namespace
 
 ModelMotion::ModelMotion(const ModelFile& model) : system_(model.system), parameters_(model.system->parameter_values()) {
-  const SystemSymbols symbols(*system_->definition().graph, system_->coordinates(), system_->inputs(), system_->parameters());
-  truth_ = Tape(model.truth, symbols.state_and_parameters());
+  truth_ = Tape(model.truth, model.symbols().state_and_parameters());
 }
 
 MatrixXd ModelMotion::acceleration(const Eigen::Ref<const MatrixXd>& states) const {
@@ -384,7 +427,7 @@ MatrixXd grid_states(const ModelFile& model, const Sampler& sampler, const std::
 }  // namespace
 
 GeneratedData generate(const ModelFile& model, const GenerateOptions& options) {
-  const SymbolicSystem& system = *model.system;
+  const System& system = *model.system;
   if (model.sampling.empty()) {
     throw InputError(fmt::format("{}: missing [sampling]: where states are drawn from, say q1 = [-1, 1]", model.name));
   }

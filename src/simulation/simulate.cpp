@@ -311,11 +311,10 @@ Acceleration model_acceleration(const ModelFile& model) {
 }
 
 VectorXd mechanical_energy(const ModelFile& model, const VectorXd& parameters, const Ref<const MatrixXd>& states) {
-  const SymbolicSystem& system = *model.system;
+  const System& system = *model.system;
   if (!model.potential) throw InputError(fmt::format("{}: no energy without [mechanics] potential = \"…\"", model.name));
-  const SystemSymbols symbols(*system.definition().graph, system.coordinates(), system.inputs(), system.parameters());
   MatrixXd potential;
-  Tape(std::span(&*model.potential, 1), symbols.state_and_parameters()).evaluate(states, parameters, potential);
+  Tape(std::span(&*model.potential, 1), model.symbols().state_and_parameters()).evaluate(states, parameters, potential);
   VectorXd energy = potential.row(0).transpose();
   const SystemValues values = system.evaluate(states, parameters);
   for (int i = 0; i < static_cast<int>(states.cols()); ++i) {

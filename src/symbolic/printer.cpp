@@ -43,7 +43,28 @@ std::string shortest(double value) {
   return {buffer.data(), end};
 }
 
+/// A number in MathML: its sign is an operator, a power of ten is raised.
+Written write_mathml_number(double value) {
+  std::string digits = shortest(std::abs(value));
+  Binding binding = atomic;
+  std::string text;
+  const std::size_t exponent = digits.find('e');
+  if (std::abs(value) == std::numbers::pi) {
+    text = "<mi>π</mi>";
+  } else if (exponent == std::string::npos) {
+    text = fmt::format("<mn>{}</mn>", digits);
+  } else {
+    const int power_of_ten = std::stoi(digits.substr(exponent + 1));
+    text = fmt::format("<mn>{}</mn><mo>·</mo><msup><mn>10</mn><mn>{}{}</mn></msup>", digits.substr(0, exponent),
+                       power_of_ten < 0 ? "−" : "", std::abs(power_of_ten));
+    binding = in_product;
+  }
+  if (!std::signbit(value)) return {{text}, binding};
+  return {{fmt::format("<mrow><mo>−</mo>{}</mrow>", text)}, in_product};
+}
+
 Written write_number(double value, Notation notation) {
+  if (notation == Notation::mathml) return write_mathml_number(value);
   if (notation != Notation::c && std::abs(value) == std::numbers::pi) {
     return {{value < 0 ? "-" : "", notation == Notation::latex ? "\\pi" : "pi"}, value < 0 ? in_product : atomic};
   }
@@ -60,34 +81,69 @@ Written write_number(double value, Notation notation) {
   return {{digits}, binding};
 }
 
-/// "theta" → "\theta"; a single letter as it is; nothing for other words.
-std::optional<std::string> latex_symbol(std::string_view word) {
-  static constexpr std::array greek{"alpha", "beta",   "gamma",   "delta", "epsilon", "zeta",  "eta",   "theta",  "iota",
-                                    "kappa", "lambda", "mu",      "nu",    "xi",      "rho",   "sigma", "tau",    "upsilon",
-                                    "phi",   "chi",    "psi",     "omega", "Gamma",   "Delta", "Theta", "Lambda", "Xi",
-                                    "Pi",    "Sigma",  "Upsilon", "Phi",   "Psi",     "Omega"};
+/// "theta" → "\theta" or, in MathML, "θ"; a single letter as it is; nothing for other words.
+std::optional<std::string> symbol_of(std::string_view word, Notation notation) {
+  using Greek = std::pair<std::string_view, std::string_view>;
+  static constexpr std::array greek{
+      Greek{"alpha", "α"},  Greek{"beta", "β"},  Greek{"gamma", "γ"},   Greek{"delta", "δ"}, Greek{"epsilon", "ε"},
+      Greek{"zeta", "ζ"},   Greek{"eta", "η"},   Greek{"theta", "θ"},   Greek{"iota", "ι"},  Greek{"kappa", "κ"},
+      Greek{"lambda", "λ"}, Greek{"mu", "μ"},    Greek{"nu", "ν"},      Greek{"xi", "ξ"},    Greek{"rho", "ρ"},
+      Greek{"sigma", "σ"},  Greek{"tau", "τ"},   Greek{"upsilon", "υ"}, Greek{"phi", "φ"},   Greek{"chi", "χ"},
+      Greek{"psi", "ψ"},    Greek{"omega", "ω"}, Greek{"Gamma", "Γ"},   Greek{"Delta", "Δ"}, Greek{"Theta", "Θ"},
+      Greek{"Lambda", "Λ"}, Greek{"Xi", "Ξ"},    Greek{"Pi", "Π"},      Greek{"Sigma", "Σ"}, Greek{"Upsilon", "Υ"},
+      Greek{"Phi", "Φ"},    Greek{"Psi", "Ψ"},   Greek{"Omega", "Ω"}};
   if (word.size() == 1 && word != "_") return std::string(word);
-  if (std::find(greek.begin(), greek.end(), word) != greek.end()) return fmt::format("\\{}", word);
-  return std::nullopt;
+  const auto* const found = std::find_if(greek.begin(), greek.end(), [&](const Greek& one) { return one.first == word; });
+  if (found == greek.end()) return std::nullopt;
+  return notation == Notation::mathml ? std::string(found->second) : fmt::format("\\{}", word);
+}
+
+/// A variable's name, taken apart: its symbol or else its word, its index, and how many dots it bears.
+struct NameParts {
+  std::optional<std::string> symbol;
+  std::string word, index;
+  int n_dots = 0;
+};
+
+NameParts name_parts(std::string_view name, Notation notation) {
+  const std::size_t word_end = name.find_last_not_of("0123456789") + 1;
+  std::string_view word = name.substr(0, word_end);
+  NameParts parts{std::nullopt, "", std::string(name.substr(word_end)), 0};
+  if (word.size() > 1 && word.ends_with('_') && !parts.index.empty()) word.remove_suffix(1);
+  parts.word = word;
+
+  parts.symbol = symbol_of(word, notation);
+  for (const std::string_view dots : {"dd", "d"}) {
+    if (parts.symbol || !word.starts_with(dots)) continue;
+    parts.symbol = symbol_of(word.substr(dots.size()), notation);
+    parts.n_dots = parts.symbol ? static_cast<int>(dots.size()) : 0;
+  }
+  return parts;
 }
 
 /// q1 → q_{1}, dq1 → \dot{q}_{1}, ddq1 → \ddot{q}_{1}, theta → \theta, mass_rod → \mathrm{mass\_rod}.
 std::string latex_name(std::string_view name) {
-  const std::size_t word_end = name.find_last_not_of("0123456789") + 1;
-  std::string_view word = name.substr(0, word_end);
-  const std::string index = word_end < name.size() ? fmt::format("_{{{}}}", name.substr(word_end)) : "";
-  if (word.size() > 1 && word.ends_with('_') && !index.empty()) word.remove_suffix(1);
-
-  if (const auto symbol = latex_symbol(word)) return *symbol + index;
-  if (word.starts_with("dd")) {
-    if (const auto symbol = latex_symbol(word.substr(2))) return fmt::format("\\ddot{{{}}}{}", *symbol, index);
-  }
-  if (word.starts_with('d')) {
-    if (const auto symbol = latex_symbol(word.substr(1))) return fmt::format("\\dot{{{}}}{}", *symbol, index);
-  }
+  const NameParts parts = name_parts(name, Notation::latex);
+  const std::string index = parts.index.empty() ? "" : fmt::format("_{{{}}}", parts.index);
+  if (parts.n_dots > 0) return fmt::format("\\{}{{{}}}{}", parts.n_dots == 2 ? "ddot" : "dot", *parts.symbol, index);
+  if (parts.symbol) return *parts.symbol + index;
   std::string escaped;
-  for (const char c : word) escaped += c == '_' ? std::string("\\_") : std::string(1, c);
+  for (const char c : parts.word) escaped += c == '_' ? std::string("\\_") : std::string(1, c);
   return fmt::format("\\mathrm{{{}}}{}", escaped, index);
+}
+
+/// The same in MathML, where a name of several letters stands upright by itself.
+std::string mathml_name(std::string_view name) {
+  const NameParts parts = name_parts(name, Notation::mathml);
+  std::string escaped;
+  for (const char c : parts.symbol.value_or(parts.word)) {
+    escaped += c == '<' ? "&lt;" : c == '>' ? "&gt;" : c == '&' ? "&amp;" : std::string(1, c);
+  }
+  // combining dots: every font has them, while accents over <mi> need one for mathematics
+  const std::string symbol =
+      parts.n_dots == 0 ? fmt::format("<mi>{}</mi>", escaped)
+                        : fmt::format("<mi mathvariant=\"italic\">{}{}</mi>", escaped, parts.n_dots == 2 ? "\u0308" : "\u0307");
+  return parts.index.empty() ? symbol : fmt::format("<msub>{}<mn>{}</mn></msub>", symbol, parts.index);
 }
 
 /// Whether the LaTeX of a product starting with e starts with a digit.
@@ -106,8 +162,51 @@ bool continues_product(Expression e) {
   return e.operation() != Operation::divide && !e.is_constant();
 }
 
+/// Parentheses around what stands between, and the name of a function before them.
+/// Not stretchy: around indices and powers browsers make them taller than the eye needs.
+constexpr const char* mathml_open = "<mrow><mo stretchy=\"false\">(</mo>";
+constexpr const char* mathml_close = "<mo stretchy=\"false\">)</mo></mrow>";
+
+/// e in terms of its operands, in MathML: what belongs together is an element, so fewer parentheses are needed.
+Written write_mathml(Expression e) {
+  switch (e.operation()) {
+    case Operation::constant:
+      return write_mathml_number(e.constant_value());
+    case Operation::variable:
+      return {{mathml_name(e.variable_name())}, atomic};
+    case Operation::add:
+      return {{{e.left(), in_sum}, "<mo>+</mo>", {e.right(), in_product}}, in_sum};
+    case Operation::subtract:
+      return {{{e.left(), in_sum}, "<mo>−</mo>", {e.right(), in_product}}, in_sum};
+    case Operation::negate:
+      return {{"<mrow><mo>−</mo>", {e.left(), in_product}, "</mrow>"}, in_product};
+    case Operation::multiply:
+    case Operation::multiply_or_zero: {
+      // a thin space around the invisible times; a dot between numbers
+      const char* const times = starts_with_number(e.right()) ? "<mo>·</mo>" : "<mo lspace=\"0.16em\" rspace=\"0\">&#x2062;</mo>";
+      return {{{e.left(), in_product}, times, {e.right(), in_product}}, in_product};
+    }
+    case Operation::divide:
+      return {{"<mfrac><mrow>", {e.left(), in_sum}, "</mrow><mrow>", {e.right(), in_sum}, "</mrow></mfrac>"}, in_product};
+    case Operation::power:
+      return {{"<msup><mrow>", {e.left(), atomic}, "</mrow><mrow>", {e.right(), in_sum}, "</mrow></msup>"}, in_power};
+    case Operation::sqrt:
+      return {{"<msqrt>", {e.left(), in_sum}, "</msqrt>"}, atomic};
+    case Operation::abs:
+      return {{"<mrow><mo>|</mo>", {e.left(), in_sum}, "<mo>|</mo></mrow>"}, atomic};
+    default:
+      break;
+  }
+  const internal::Function& function = *internal::find_function(e.operation());
+  const std::string open = fmt::format("<mrow><mi>{}</mi><mo>&#x2061;</mo>{}", function.text, mathml_open);
+  const std::string close = std::string(mathml_close) + "</mrow>";
+  if (!internal::is_binary(e.operation())) return {{open, {e.left(), in_sum}, close}, atomic};
+  return {{open, {e.left(), in_sum}, "<mo>,</mo>", {e.right(), in_sum}, close}, atomic};
+}
+
 /// e in terms of its operands.
 Written write(Expression e, Notation notation) {
+  if (notation == Notation::mathml) return write_mathml(e);
   const bool latex = notation == Notation::latex;
   const bool c = notation == Notation::c;
   const Operation operation = e.operation();
@@ -181,8 +280,9 @@ Written write(Expression e, Notation notation) {
 }  // namespace
 
 std::string to_string(Expression e, Notation notation) {
-  const char* const open = notation == Notation::latex ? "\\left(" : "(";
-  const char* const close = notation == Notation::latex ? "\\right)" : ")";
+  const bool mathml = notation == Notation::mathml;
+  const char* const open = mathml ? mathml_open : notation == Notation::latex ? "\\left(" : "(";
+  const char* const close = mathml ? mathml_close : notation == Notation::latex ? "\\right)" : ")";
   std::string text;
   // what is still to be written, the next piece last: no recursion, so that depth costs no stack
   std::vector<Piece> rest{{e, in_sum}};

@@ -258,7 +258,7 @@ MatrixXd SymbolicSystem::residuals(const Ref<const MatrixXd>& states, const Ref<
   return values;
 }
 
-std::shared_ptr<const SymbolicSystem> SymbolicSystem::without_constraints() const {
+std::shared_ptr<const System> SymbolicSystem::without_constraints() const {
   Definition free = definition_;
   free.constraints.clear();
   return std::make_shared<const SymbolicSystem>(std::move(free));

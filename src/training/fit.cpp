@@ -181,6 +181,7 @@ class Training {
     options.gradient_tolerance = options_.gradient_tolerance;
     options.reduction_tolerance = options_.reduction_tolerance;
     options.iteration = [&](int iteration, double value) { return report_iteration(restart, iteration, value); };
+    options.stop = [&] { return stopped(); };
     const Index n = static_cast<Index>(from.size());
     VectorXd start(n);
     for (Index k = 0; k < n; ++k)
@@ -246,6 +247,12 @@ class Training {
   }
 
   void run_restart(int restart, int n_threads) {
+    if (restart > 0 && stopped()) {
+      constexpr double infinity = std::numeric_limits<double>::infinity();
+      reports_[static_cast<std::size_t>(restart)] = {
+          .objective = infinity, .negative_log_likelihood = infinity, .termination = "not begun: stopped on request"};
+      return;
+    }
     RandomStream random(options_.seed, static_cast<std::uint64_t>(restart));
     Likelihood::Workspace workspace(n_threads);
     // a random start may lie where M is not positive definite: draw again, a few times
@@ -253,7 +260,7 @@ class Training {
     LbfgsbResult result;
     for (int draw = 0; draw < max_draws; ++draw) {
       result = optimise(restart, restart == 0 ? hyperparameters_ : draw_start(hyperparameters_, random), workspace);
-      if (std::isfinite(result.value) || restart == 0) break;
+      if (std::isfinite(result.value) || restart == 0 || stopped()) break;
     }
     store(static_cast<std::size_t>(restart), result);
     const std::scoped_lock lock(mutex_);

@@ -79,6 +79,10 @@ LbfgsbResult minimise(const std::function<double(const VectorXd&, VectorXd&)>& f
         first_evaluation = false;
         continue;
       }
+      if (options.stop()) {
+        result.termination = "stopped on request";
+        return result;
+      }
       value = f(x, gradient);
       ++result.evaluations;
       if (!std::isfinite(value) || !gradient.allFinite()) {

@@ -14,6 +14,8 @@ struct LbfgsbOptions {
   double reduction_tolerance = 1e-12;
   /// Called after each iteration with its number and value; false stops.
   std::function<bool(int, double)> iteration = [](int, double) { return true; };
+  /// Asked before each evaluation but that of the start; true stops.
+  std::function<bool()> stop = [] { return false; };
 };
 
 struct LbfgsbResult {

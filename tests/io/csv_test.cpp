@@ -25,6 +25,10 @@ using testing::StartsWith;
 
 CsvTable parse(std::string_view text) { return CsvTable::parse(text, "log.csv"); }
 
+CsvTable from_cells(std::vector<std::string> header, std::vector<std::string> cells) {
+  return CsvTable::from_cells("frame", std::move(header), std::move(cells));
+}
+
 /// The number in the only cell of a column x.
 double number_in(const std::string& cell) { return parse("x,y\n" + cell + ",0\n").number(0, 0); }
 
@@ -117,6 +121,23 @@ TEST(Csv, TheFirstRowsAreNoMoreThanThereAre) {
     EXPECT_EQ(table.first_rows(n).n_rows(), 0) << n;
     EXPECT_EQ(table.first_rows(n).n_columns(), 1) << n;
   }
+}
+
+TEST(Csv, IsMadeOfCellsToo) {
+  const CsvTable table = from_cells({"q1", "q2"}, {"1", "2", "-3.5e-2", "nan"});
+  EXPECT_EQ(table.n_rows(), 2);
+  EXPECT_EQ(table.number(1, 0), -3.5e-2);
+  EXPECT_EQ(input_error_of([&] { static_cast<void>(table.number(1, 1)); }),
+            "frame:3: column 'q2': 'nan' is not a finite number");
+}
+
+TEST(Csv, RefusesCellsThatAreNoTable) {
+  EXPECT_EQ(input_error_of([] { static_cast<void>(from_cells({}, {"1"})); }), "frame: there are no columns");
+  EXPECT_EQ(input_error_of([] { static_cast<void>(from_cells({"q1"}, {})); }), "frame: there are no rows");
+  EXPECT_EQ(input_error_of([] { static_cast<void>(from_cells({"q1", "q2"}, {"1", "2", "3"})); }),
+            "frame: 3 cells do not make rows of 2 columns");
+  EXPECT_THAT(input_error_of([] { static_cast<void>(from_cells({"q1", "q1"}, {"1", "2"})); }),
+              HasSubstr("the column 'q1' stands twice"));
 }
 
 // ---- numbers

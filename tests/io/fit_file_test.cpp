@@ -224,8 +224,8 @@ TEST_F(DamagedFit, OtherFilesAreRefused) {
 }
 
 TEST_F(DamagedFit, ANewerFormatIsRefusedWithBothVersions) {
-  EXPECT_EQ(error_after([](Json& json) { json["version"] = 3; }),
-            fmt::format("of format 3, but this gp2 ({}) reads up to 2: use a newer gp2", version()));
+  EXPECT_EQ(error_after([](Json& json) { json["version"] = 4; }),
+            fmt::format("of format 4, but this gp2 ({}) reads up to 3: use a newer gp2", version()));
   EXPECT_EQ(error_after([](Json& json) {
               // whatever else a newer format changes
               json = Json{{"format", "gp2 fit"}, {"version", 7}};

@@ -245,7 +245,7 @@ TEST(ModelFile, ExpressionsOfAModelMayUseItsLetNames) {
 TEST(ModelFile, TheSameTextGivesTheSameSystem) {
   const auto written_out = [](const ModelFile& model) {
     std::string all;
-    for (const ConstraintRow& row : model.system->definition().constraints) {
+    for (const ConstraintRow& row : model.symbolic_system()->definition().constraints) {
       for (Expression entry : row.A) all += to_string(entry) + "\n";
       all += to_string(row.b) + "\n";
     }

@@ -169,7 +169,7 @@ TEST_P(StateEvaluators, OfTwoThreadsDoNotDisturbEachOther) {
 /// A system that knows nothing of expressions.
 class OpaqueSystem final : public System {
  public:
-  explicit OpaqueSystem(const SymbolicSystem& inside)
+  explicit OpaqueSystem(const System& inside)
       : System(inside.name(), inside.coordinates(), inside.inputs(), inside.parameters(), inside.constraint_labels()),
         inside_(inside) {}
   SystemValues evaluate(const Eigen::Ref<const MatrixXd>& states, const Eigen::Ref<const VectorXd>& parameters) const override {
@@ -184,9 +184,10 @@ class OpaqueSystem final : public System {
   }
   const std::vector<Residual>& residual_labels() const override { return inside_.residual_labels(); }
   std::vector<bool> reads(SystemPart part) const override { return inside_.reads(part); }
+  std::shared_ptr<const System> without_constraints() const override { return inside_.without_constraints(); }
 
  private:
-  const SymbolicSystem& inside_;
+  const System& inside_;
 };
 
 TEST_P(StateEvaluators, OfAnySystemTakeDifferencesOfTheStatedError) {

@@ -253,6 +253,26 @@ TEST(FitTest, StopsWhenAskedAndReturnsTheBestSoFar) {
   EXPECT_LT(report.objective, objective(p, p.hyperparameters));
 }
 
+TEST(FitTest, BeginsNoFurtherRestartOnceItIsAskedToStop) {
+  const Problem p = problem("models/surface.toml", 20);
+  std::atomic<bool> stop = false;
+  FitOptions options = quick();
+  options.max_iterations = 1000;
+  options.n_restarts = 50;
+  options.n_threads = 1;
+  options.stop = &stop;
+  options.progress = [&](const Progress&) { stop = true; };
+  const FitReport report = fit(p.prior, p.observations, p.hyperparameters, options).report;
+  EXPECT_EQ(report.best_restart, 0);
+  EXPECT_EQ(report.iterations, 1);
+  ASSERT_EQ(report.restarts.size(), 50U);
+  for (std::size_t k = 1; k < report.restarts.size(); ++k) {
+    EXPECT_EQ(report.restarts[k].evaluations, 0);
+    EXPECT_EQ(report.restarts[k].objective, std::numeric_limits<double>::infinity());
+    EXPECT_EQ(report.restarts[k].termination, "not begun: stopped on request");
+  }
+}
+
 TEST(FitTest, TellsItsProgressOneCallAtATime) {
   const Problem p = problem("models/duffing.toml", 15);
   FitOptions options = quick();

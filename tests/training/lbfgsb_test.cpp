@@ -288,6 +288,18 @@ TEST(LbfgsbTest, TheCallbackSeesEveryIterationAndCanStop) {
   EXPECT_THAT(result.termination, HasSubstr("stopped on request"));
 }
 
+TEST(LbfgsbTest, StopsBeforeTheNextEvaluationWithTheBestSoFar) {
+  LbfgsbOptions options;
+  int asked = 0;
+  options.stop = [&] { return ++asked > 6; };
+  const LbfgsbResult result = minimise(rosenbrock, constant(5, -1), constant(5, -2), constant(5, 2), options);
+  EXPECT_EQ(result.evaluations, 7) << "that of the start, then six";
+  EXPECT_FALSE(result.converged);
+  EXPECT_THAT(result.termination, HasSubstr("stopped on request"));
+  Eigen::VectorXd gradient(5);
+  EXPECT_EQ(result.value, rosenbrock(result.x, gradient));
+}
+
 TEST(LbfgsbTest, RunsInSeveralThreadsAtOnceAsInOne) {
   const auto run = [](int n) { return minimise(rosenbrock, constant(n, -0.7), constant(n, -3), constant(n, 3), {}); };
   std::vector<LbfgsbResult> results(8);

@@ -1,0 +1,199 @@
+#include <algorithm>
+#include <cmath>
+
+#include <fmt/format.h>
+#include <fmt/ranges.h>
+
+#include "report/report_data.hpp"
+
+namespace gp2::command {
+
+namespace {
+
+using Level = Advice::Level;
+
+// a feature that moves the acceleration by less than this, in spreads, over its own spread hardly matters
+constexpr double irrelevant = 0.01;
+
+bool is_collapsed_noise(const Hyperparameter& h) {
+  return h.kind == Hyperparameter::Kind::noise_stddev && h.at_bound() && h.value < 2 * h.lower;
+}
+
+bool hardly_matters(const Relevance& one) { return std::max(one.relevance, one.effect.value_or(one.relevance)) < irrelevant; }
+
+void optimiser_advice(const FitReport& report, std::vector<Advice>& advice) {
+  const bool never_ran = report.iterations == 0 && !report.converged;
+  if (never_ran) {
+    advice.push_back({Level::note, fmt::format("Nothing was optimised: {}.", report.termination),
+                      "All figures below are of the starting values. Leave out --max-iterations 0 to fit."});
+  } else if (!report.converged) {
+    advice.push_back({Level::warning, fmt::format("The optimiser did not converge: {}.", report.termination),
+                      "Fit again with a larger --max-iterations, or with --start of this file to go on from here."});
+  }
+  if (never_ran) return;
+  int n_finite = 0, n_best = 0;
+  for (const RestartReport& restart : report.restarts) {
+    if (!std::isfinite(restart.objective)) continue;
+    ++n_finite;
+    // a unit of the objective is a factor e of the posterior density
+    if (restart.objective < report.objective + 1) ++n_best;
+  }
+  const int n_failed = static_cast<int>(report.restarts.size()) - n_finite;
+  if (n_failed > 0) {
+    advice.push_back({Level::note, fmt::format("{} of {} restarts found no finite start.", n_failed, report.restarts.size()),
+                      "Look at the bounds in the model file: a random start within them was no possible system."});
+  }
+  if (n_finite >= 3 && n_best <= 1) {
+    advice.push_back({Level::note,
+                      n_best == 1 ? fmt::format("Only one of {} restarts reached the optimum taken.", report.restarts.size())
+                                  : "No restart reached the optimum taken: a scan from the best of them found it.",
+                      "There may be a better one that none has reached: fit with more --restarts and compare the objective."});
+  }
+}
+
+void bound_advice(const Report& report, std::vector<Advice>& advice) {
+  std::vector<std::string> collapsed, others;
+  for (const Hyperparameter& h : report.fit.report.hyperparameters) {
+    if (!h.at_bound()) continue;
+    const bool lower = h.value - h.lower < h.upper - h.value;
+    if (is_collapsed_noise(h)) {
+      collapsed.push_back(h.name);
+    } else if (h.kind == Hyperparameter::Kind::parameter) {
+      advice.push_back(
+          {Level::warning,
+           fmt::format("The parameter {} ended at its {} bound, {:.6g}.", h.name, lower ? "lower" : "upper", h.value),
+           fmt::format("If the true value may lie beyond, widen its bounds in the model file; if not, the data do "
+                       "not determine it or a part of the model is missing: fix it (--estimate without {}) and "
+                       "look at the residuals.",
+                       h.name)});
+    } else if (h.kind == Hyperparameter::Kind::kernel && !lower && h.name.find("lengthscale") != std::string::npos) {
+      // the feature does not matter at all: said below
+    } else {
+      others.push_back(fmt::format("{} ({} bound, {:.4g})", h.name, lower ? "lower" : "upper", h.value));
+    }
+  }
+  if (!collapsed.empty()) {
+    advice.push_back({Level::warning,
+                      fmt::format("The noise collapsed: {} ended at the lower bound.", fmt::join(collapsed, ", ")),
+                      "The fit takes the data as exact, and its bands are not to be trusted. The columns may follow from each "
+                      "other (gp2 check tells; fit with --observe), or be smoothed or computed instead of measured; or give the "
+                      "noise you know with --noise-std."});
+  }
+  if (!others.empty()) {
+    advice.push_back({Level::note, fmt::format("At a bound: {}.", fmt::join(others, ", ")),
+                      "Widen the bounds of the latent in the model file if you have no reason for them; a very short lengthscale "
+                      "means that the fit explains noise by wiggles."});
+  }
+}
+
+void relevance_advice(const Report& report, std::vector<Advice>& advice) {
+  if (report.fit.report.iterations == 0) return;  // starting values say nothing
+  std::vector<std::string> latents;
+  for (const Relevance& one : report.relevance) {
+    if (std::find(latents.begin(), latents.end(), one.latent) == latents.end()) latents.push_back(one.latent);
+  }
+  for (const std::string& latent : latents) {
+    std::vector<std::string> features;
+    std::ptrdiff_t n = 0;
+    for (const Relevance& one : report.relevance) {
+      if (one.latent != latent) continue;
+      ++n;
+      if (hardly_matters(one)) features.push_back(one.feature);
+    }
+    if (features.empty()) continue;
+    if (std::ssize(features) == n) {
+      advice.push_back({Level::note, fmt::format("No feature of '{}' matters: it is as good as constant.", latent),
+                        "The known part of the model explains the data already, or the features are not those that count."});
+    } else {
+      advice.push_back(
+          {Level::note,
+           fmt::format("Of '{}', the {} {} hardly {}: the lengthscale is far beyond the spread in the data.", latent,
+                       features.size() == 1 ? "feature" : "features", fmt::join(features, ", "),
+                       features.size() == 1 ? "matters" : "matter"),
+           "Left out of the latent's features, the model is smaller and faster; or, if you expect an effect, take data "
+           "with more variation there."});
+    }
+  }
+}
+
+void constraint_advice(const Report& report, std::vector<Advice>& advice) {
+  std::vector<std::string> names;
+  const ReportData* worst = nullptr;
+  for (const ReportData& data : report.data) {
+    if (!data.violation || data.violation->relative <= constraint_violation_tolerance) continue;
+    names.push_back(data.name);
+    if (worst == nullptr || data.violation->relative > worst->violation->relative) worst = &data;
+  }
+  if (worst == nullptr) return;
+  const ConstraintViolation& violation = *worst->violation;
+  advice.push_back(
+      {violation.relative > 1e-2 ? Level::warning : Level::note,
+       fmt::format("States of the {} data are off the constraint. The farthest, row {} of {}: {} = {:.3g}, {:.2g} of "
+                   "its scale.",
+                   fmt::join(names, " and "), violation.state + 1, worst->name, violation.constraint, violation.value,
+                   violation.relative),
+       "A little is measurement noise, or parameters that were estimated, and does no harm. Much means wrong units, "
+       "signs or offsets of a column, or wrong parameters of the constraint: estimate them with --estimate."});
+}
+
+void independence_advice(const Report& report, std::vector<Advice>& advice) {
+  for (const ReportData& data : report.data) {
+    if (data.independent.empty()) continue;
+    advice.push_back(
+        {Level::warning,
+         fmt::format("The accelerations of the {} data follow from each other: they obey the constraint to rounding.", data.name),
+         fmt::format("They are not independent measurements. Fit with --observe {}.", fmt::join(data.independent, ","))});
+  }
+}
+
+void test_advice(const ReportData& data, const ReportData* training, std::vector<Advice>& advice) {
+  const Evaluation& e = data.evaluation;
+  constexpr double nominal = 0.95;
+  // three standard deviations of the share of n independent points, and no less than what anyone would act on
+  const double tolerance = std::max(0.03, 3 * std::sqrt(nominal * (1 - nominal) / std::max(e.n, 1)));
+  if (std::isfinite(e.coverage95) && e.coverage95 < nominal - tolerance) {
+    advice.push_back({Level::warning,
+                      fmt::format("Over-confident: {:.1f} % of the test data lie within the 95 % bands.", 100 * e.coverage95),
+                      "The test goes where training has not been, the noise is set too small (--noise-std estimate), or a "
+                      "feature is missing. Residuals against each feature show which; take training data there."});
+  } else if (std::isfinite(e.coverage95) && e.coverage95 > nominal + tolerance) {
+    const bool noise_free = std::isfinite(e.coverage95_latent) && std::abs(e.coverage95_latent - nominal) <= tolerance;
+    advice.push_back(
+        {Level::note, fmt::format("Too cautious: {:.1f} % of the test data lie within the 95 % bands.", 100 * e.coverage95),
+         noise_free ? "The test data seem to be free of noise: judge by the noise-free coverage, which is as it should be."
+                    : "If the test data hold measurement noise, that of the model is too large: --noise-std estimate."});
+  }
+  if (training == nullptr || training->outputs != data.outputs) return;
+  const double ratio = e.rmse.norm() / training->evaluation.rmse.norm();
+  const bool beyond_noise = (e.rmse.array() > 2 * data.noise_stddev.array()).any();
+  if (ratio > 3 && beyond_noise) {
+    advice.push_back(
+        {Level::warning, fmt::format("Test errors are {:.1f} times those of training.", ratio),
+         "The test goes beyond the states of training, or training has too few points. Compare the pictures of both: "
+         "where the band is wide, more training data help most."});
+  }
+}
+
+}  // namespace
+
+std::vector<Advice> learning_advice(const Report& report) {
+  std::vector<Advice> advice;
+  optimiser_advice(report.fit.report, advice);
+  bound_advice(report, advice);
+  constraint_advice(report, advice);
+  independence_advice(report, advice);
+  for (const ReportData& data : report.data) {
+    if (data.is_test) test_advice(data, report.data.front().is_test ? nullptr : &report.data.front(), advice);
+  }
+  relevance_advice(report, advice);
+  std::stable_sort(advice.begin(), advice.end(), [](const Advice& a, const Advice& b) { return a.level > b.level; });
+  if (advice.empty()) {
+    advice.push_back({Level::good, "Nothing to mend was found.",
+                      report.data.empty() || !report.data.back().is_test
+                          ? "The training data cannot show everything: give --data of a run that the fit has not seen."
+                          : "Look at the pictures all the same: no rule sees what an eye sees."});
+  }
+  return advice;
+}
+
+}  // namespace gp2::command

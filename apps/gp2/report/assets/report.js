@@ -1,0 +1,683 @@
+"use strict";
+// Fills the page from the JSON in #report. Text enters through textContent only, formulas as parsed XML.
+(() => {
+  const report = JSON.parse(document.getElementById("report").textContent);
+  const byId = (id) => document.getElementById(id);
+
+  /** An element with attributes (class, text, …) and children; what is null is left out. */
+  function make(tag, attributes = {}, ...children) {
+    const element = document.createElement(tag);
+    for (const [name, value] of Object.entries(attributes)) {
+      if (value === null || value === undefined) continue;
+      if (name === "text") element.textContent = value;
+      else element.setAttribute(name, value);
+    }
+    element.append(...children.filter((child) => child !== null && child !== undefined));
+    return element;
+  }
+
+  const missing = "–";
+  /** As printf's %.6g writes it. */
+  function format(value, digits = 6) {
+    if (value === null || value === undefined || !Number.isFinite(value)) return missing;
+    if (value === 0) return "0";
+    const exponent = Math.floor(Math.log10(Math.abs(Number(value.toPrecision(digits)))));
+    if (exponent < -4 || exponent >= digits) {
+      const [mantissa, power] = value.toExponential(digits - 1).split("e");
+      return `${mantissa.replace(/\.?0+$/, "")}e${power}`;
+    }
+    const text = value.toPrecision(digits);
+    return text.includes(".") ? text.replace(/\.?0+$/, "") : text;
+  }
+  const percent = (share) => (share === null || share === undefined ? missing : `${format(100 * share, 3)} %`);
+  const rms = (values) => {
+    const known = values.filter((value) => value !== null);
+    return Math.sqrt(known.reduce((sum, value) => sum + value * value, 0) / Math.max(known.length, 1));
+  };
+
+  // ---- tables -------------------------------------------------------------------------------------------------------------
+
+  /** columns: {label, number, wrap}; a cell is a number (shown to six digits), text, or a node. */
+  function table(caption, columns, rows, mark = () => false) {
+    const head = make("tr", {}, ...columns.map((column) => make("th", { scope: "col", class: column.number ? "number" : null, text: column.label })));
+    const body = rows.map((row, r) =>
+      make("tr", { class: mark(r) ? "marked" : null }, ...row.map((value, k) => {
+        const numeric = columns[k].number;
+        const cell = make(k === 0 ? "th" : "td", { class: numeric ? "number" : columns[k].wrap ? "wrap" : null, scope: k === 0 ? "row" : null });
+        if (value instanceof Node) cell.append(value);
+        else if (typeof value === "number") {
+          cell.textContent = format(value);
+          cell.setAttribute("data-value", String(value));
+          cell.title = String(value);
+        } else cell.textContent = value === null || value === undefined ? missing : value;
+        return cell;
+      })));
+    const scroll = make("div", { class: "scroll" }, make("table", { "aria-label": caption }, make("thead", {}, head), make("tbody", {}, ...body)));
+    return scrollable(scroll, caption);
+  }
+
+  /** A box that scrolls sideways can be reached by keyboard exactly while it has something to scroll. */
+  function scrollable(box, label) {
+    new ResizeObserver(() => {
+      const overflows = box.scrollWidth > box.clientWidth + 1;
+      if (overflows) {
+        box.tabIndex = 0;
+        box.setAttribute("role", "region");
+        box.setAttribute("aria-label", `${label}, scrolls sideways`);
+      } else {
+        for (const name of ["tabindex", "role", "aria-label"]) box.removeAttribute(name);
+      }
+    }).observe(box);
+    return box;
+  }
+
+  const badge = (text, kind = "") => make("span", { class: `badge ${kind}`, text });
+
+  function formula(xml, label) {
+    const parsed = new DOMParser().parseFromString(xml, "application/xml");
+    return scrollable(make("div", { class: "scroll formula" }, document.importNode(parsed.documentElement, true)), label);
+  }
+
+  function definitions(rows) {
+    const list = make("dl", { class: "rows" });
+    for (const [label, value] of rows) list.append(make("dt", { text: label }), make("dd", {}, value));
+    return list;
+  }
+
+  // ---- what was fitted ----------------------------------------------------------------------------------------------------
+
+  const { fit, model } = report;
+  const test = report.data.find((data) => data.test);
+
+  function fillHeader() {
+    const rows = report.observations.reduce((sum, group) => sum + group.n, 0);
+    byId("lead").textContent = `Fitted to ${rows} rows of ${report.source} by gp2 ${report.library}; file of ${report.date}.`;
+    const tiles = [["Optimiser", fit.converged ? "converged" : fit.iterations === 0 ? "did not run" : "not converged", `${fit.iterations} iterations, best of ${fit.restarts.length} restarts`],
+      ["Negative log likelihood", format(fit.nll), `of ${rows} rows`]];
+    const shown = test || report.data[0];
+    if (shown) {
+      const e = shown.figures;
+      tiles.push([`Error, ${shown.name}`, e.rmse_normalised === null ? format(e.nrmse, 3) : format(e.rmse_normalised, 3), e.rmse_normalised === null ? "rms error / spread" : "rms error / training spread"],
+        [`95 % coverage, ${shown.name}`, percent(e.coverage95), "measurement noise included"],
+        ["Constraint error", format(e.max_constraint_error_fitted, 2), "largest |A q̈ − b|"]);
+    }
+    byId("tiles").append(...tiles.map(([label, value, more]) =>
+      make("div", {}, make("dt", { text: label }), make("dd", {}, value, make("small", { text: more })))));
+    for (const section of document.querySelectorAll("main section")) {
+      byId("sections").append(make("li", {}, make("a", { href: `#${section.id}`, text: section.querySelector("h2").textContent })));
+    }
+    byId("colophon").textContent = `Written by gp2 ${report.version}. Model files carry no units: axes are in the units of the log. This file is complete; it loads nothing.`;
+  }
+
+  function fillAdvice() {
+    const words = { warning: "To mend", note: "Good to know", good: "All well" };
+    byId("advice-list").append(...report.advice.map((one) =>
+      make("li", { class: one.level }, make("span", { class: "kind", text: words[one.level] }),
+        make("p", { class: "found", text: one.text }), make("p", { text: one.mend }))));
+  }
+
+  function fillModel() {
+    const rows = [["model file", make("code", { text: model.file })], ["coordinates", model.coordinates.join(", ")]];
+    if (model.inputs.length) rows.push(["inputs", model.inputs.join(", ")]);
+    rows.push(...report.prior);
+    for (const group of report.observations) {
+      const noise = group.noise.map((value) => format(value, 4));
+      const same = noise.every((value) => value === noise[0]);
+      rows.push(["learned from", `${group.names.join(", ")} at ${group.n} states${group.system ? ` of '${group.system}'` : ""}; noise ${same ? noise[0] : noise.join(", ")}${group.estimated ? ", estimated" : ""}`]);
+    }
+    if (report.truth) rows.push(["truth", `[truth] of '${report.truth}'`]);
+    byId("model-summary").append(definitions(rows));
+
+    const constraints = byId("constraints");
+    if (!model.constraints.length) {
+      constraints.append(make("p", { class: "muted", text: "None: the acceleration is the unconstrained one." }));
+    } else {
+      constraints.append(table("Constraints as written", [{ label: "as written" }, { label: "level" }],
+        model.constraints.map((row) => [make("code", { text: `${row.text} = 0` }), row.level])));
+      constraints.append(make("p", { text: "Differentiated along the motion they become A q̈ = b with" }));
+      for (const name of ["A", "b"]) {
+        constraints.append(model[name] ? formula(model[name], `The matrix ${name}`) : make("p", { class: "muted", text: `${name} is too long to typeset: gp2 show prints it.` }));
+      }
+    }
+
+    const bound = (row) => (row.at_bound ? badge("at its bound") : "");
+    const estimated = report.parameters.some((row) => row.fitted !== undefined);
+    const parameters = byId("parameters");
+    if (!report.parameters.length) {
+      parameters.append(make("p", { class: "muted", text: "None." }));
+    } else if (!estimated) {
+      parameters.append(table("Parameters of the system", [{ label: "parameter" }, { label: "held at", number: true }], report.parameters.map((row) => [row.name, row.model])));
+    } else {
+      parameters.append(table("Parameters of the system", [{ label: "parameter" }, { label: "in the model file", number: true }, { label: "fitted", number: true }, { label: "lower bound", number: true }, { label: "upper bound", number: true }, { label: "" }],
+        report.parameters.map((row) => [row.name, row.model, row.fitted === undefined ? "held" : row.fitted, row.lower, row.upper, bound(row)]), (r) => report.parameters[r].at_bound));
+    }
+    byId("hyperparameters").append(table("Hyperparameters", [{ label: "name" }, { label: "value", number: true }, { label: "lower bound", number: true }, { label: "upper bound", number: true }, { label: "unit" }, { label: "" }],
+      report.hyperparameters.map((row) => [row.name, row.value, row.lower, row.upper, row.unit, bound(row)]), (r) => report.hyperparameters[r].at_bound));
+  }
+
+  function fillOptimiser() {
+    const again = fit.restarts[fit.best_restart];
+    byId("optimiser-lead").textContent = `${fit.termination.charAt(0).toUpperCase()}${fit.termination.slice(1)}, after ${fit.iterations} iterations. ` +
+      `Negative log likelihood ${format(fit.nll)}; with hyper-priors, the objective, ${format(fit.objective)}.` +
+      (again && again.objective !== null && again.objective - fit.objective > 1e-9 * Math.abs(fit.objective) ? " A scan from the best restart found a lower optimum than the restarts." : "");
+    byId("restarts").append(table("Restarts of the optimiser", [{ label: "restart" }, { label: "objective", number: true }, { label: "neg. log likelihood", number: true }, { label: "iterations", number: true }, { label: "evaluations", number: true }, { label: "failed", number: true }, { label: "why it stopped", wrap: true }],
+      fit.restarts.map((one, k) => [k === fit.best_restart ? make("span", {}, `${k + 1} `, badge("best", "good")) : String(k + 1), one.objective === null ? "∞" : one.objective, one.nll === null ? "∞" : one.nll, one.iterations, one.evaluations, one.failed, one.termination])));
+  }
+
+  function fillFigures() {
+    if (!report.data.length) {
+      byId("figures").append(make("p", { class: "muted", text: "The fit learned from no acceleration; give --data to compare with one." }));
+      return;
+    }
+    const outputs = [...new Set(report.data.flatMap((data) => data.outputs))];
+    const of = (get) => report.data.map((data) => get(data.figures));
+    const at = (list, output) => of((e) => { const k = e.outputs.indexOf(output); return k < 0 ? null : e[list][k]; });
+    const rows = [["points", ...of((e) => e.n)]];
+    for (const output of outputs) rows.push([`rmse ${output}`, ...at("rmse", output)]);
+    if (report.truth) for (const output of outputs) rows.push([`rmse ${output}, truth`, ...at("rmse_to_truth", output)]);
+    rows.push(["rmse / training std", ...of((e) => e.rmse_normalised)],
+      ["nrmse", ...of((e) => e.nrmse)],
+      ["nlpd, with noise", ...of((e) => e.nlpd)],
+      ["95 % coverage, with noise", ...of((e) => e.coverage95)],
+      ["nlpd, without noise", ...of((e) => e.nlpd_latent)],
+      ["95 % coverage, without noise", ...of((e) => e.coverage95_latent)],
+      ["max |A q̈ − b|, model", ...of((e) => e.max_constraint_error)],
+      ["max |A q̈ − b|, fitted", ...of((e) => e.max_constraint_error_fitted)]);
+    byId("figures").append(table("Figures of quality", [{ label: "figure" }, ...report.data.map((data) => ({ label: data.name, number: true }))], rows));
+    byId("figures").append(make("dl", { class: "rows muted" }, ...[
+      ["rmse", "root mean square error, in the units of the output" + (report.truth ? "; “truth” compares with the true acceleration, free of noise" : "")],
+      ["rmse / training std", "mean over outputs"], ["nrmse", "rms error over the rms of the spreads of these data"],
+      ["nlpd, coverage", "mean negative log density, and share within the central 95 %; “with noise” is right for measurements, “without noise” for targets free of noise"],
+      ["max |A q̈ − b|", "of the predicted mean, with the parameters of the model file and with the fitted ones"],
+    ].flatMap(([label, value]) => [make("dt", { text: label }), make("dd", { text: value })])));
+    const list = report.data.map((data) => `${data.name}: ${data.source}`).join("; ");
+    byId("figures").append(make("p", { class: "muted", text: `Data – ${list}.` }));
+  }
+
+  // ---- charts -------------------------------------------------------------------------------------------------------------
+
+  const live = new Map();  // host -> what to do to take its chart away
+  const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+  const font = '12px system-ui, -apple-system, "Segoe UI", Roboto, "Noto Sans", "DejaVu Sans", sans-serif';
+
+  function clear(host) {
+    if (live.has(host)) live.get(host)();
+    live.delete(host);
+    host.replaceChildren();
+  }
+
+  function padded(min, max, share) {
+    if (min === null || max === null || !Number.isFinite(min) || !Number.isFinite(max)) return [0, 1];
+    const pad = max > min ? share * (max - min) : Math.abs(max) * 0.1 || 1;
+    return [min - pad, max + pad];
+  }
+
+  function frame(host, spec) {
+    const legend = spec.series.length > 1 || spec.band ? make("ul", { class: "legend" }, ...spec.series.flatMap((series) => {
+      const items = [make("li", {}, make("span", { class: `swatch ${series.kind === "line" ? "line" : series.hollow ? "hollow" : ""}`, style: `background:${colour(series.colour)};border-color:${colour(series.colour)}` }), series.label)];
+      if (series.low) items.push(make("li", {}, make("span", { class: "swatch band", style: `background:${colour("--band")}` }), "±2 std"));
+      return items;
+    })) : null;
+    const plot = make("div", { class: "plot", role: "img", "aria-label": `${spec.title}. ${spec.summary}` });
+    const readout = make("div", { class: "readout", "aria-hidden": "true" });
+    host.append(make("figure", {}, make("figcaption", {}, make("strong", { text: spec.title }), make("span", { class: "summary", text: spec.summary })), legend, plot, readout));
+    return { plot, readout };
+  }
+
+  /**
+   * A chart by uPlot. spec: {title, summary, x: {label, values}, y: {label, log, zero}, square, diagonal, height, trace,
+   * series: [{label, values, colour, kind: "points" | "line", hollow, low, high}]}; low and high are a band or error bars.
+   * trace: a line from point to point in the order of the data.
+   */
+  function chart(host, spec) {
+    clear(host);
+    const { plot, readout } = frame(host, spec);
+    const order = spec.x.values.map((_, i) => i).filter((i) => spec.x.values[i] !== null);
+    order.sort((a, b) => spec.x.values[a] - spec.x.values[b]);
+    const pick = (values) => order.map((i) => values[i]);
+    const data = [pick(spec.x.values)];
+    const series = [{}];
+    const bands = [];
+    const bars = [];
+    for (const one of spec.series) {
+      const ink = colour(one.colour);
+      const size = (order.length > 400 ? 0.7 : 1) * (one.size || 5);
+      if (one.low) {
+        const hidden = { points: { show: false }, stroke: "transparent", width: 0 };
+        if (one.kind !== "line") hidden.paths = () => null;
+        series.push({ ...hidden, label: "" }, { ...hidden, label: "" });
+        data.push(pick(one.high), pick(one.low));
+        if (one.kind === "line") bands.push({ series: [series.length - 2, series.length - 1], fill: colour("--band") });
+        else bars.push({ high: series.length - 2, low: series.length - 1, ink });
+      }
+      series.push(one.kind === "line"
+        ? { label: one.label, stroke: ink, width: 1.75, dash: one.dash, points: { show: false } }
+        : { label: one.label, stroke: ink, paths: () => null, points: { show: true, space: 0, size, width: one.hollow ? 1.4 : 0, stroke: ink, fill: one.hollow ? "transparent" : ink } });
+      data.push(pick(one.values));
+    }
+    const ratio = () => devicePixelRatio || 1;
+    // horizontal, vertical or sloping lines behind the points, and error bars
+    const behind = (u) => {
+      const { ctx } = u;
+      ctx.save();
+      ctx.beginPath();
+      ctx.rect(u.bbox.left, u.bbox.top, u.bbox.width, u.bbox.height);
+      ctx.clip();
+      ctx.lineWidth = ratio();
+      if (spec.diagonal || spec.y.zero) {
+        const { min, max } = u.scales.x;
+        ctx.strokeStyle = colour("--muted");
+        ctx.beginPath();
+        ctx.moveTo(u.valToPos(min, "x", true), u.valToPos(spec.diagonal ? min : 0, "y", true));
+        ctx.lineTo(u.valToPos(max, "x", true), u.valToPos(spec.diagonal ? max : 0, "y", true));
+        ctx.stroke();
+      }
+      if (spec.trace) {
+        ctx.strokeStyle = colour("--c1");
+        ctx.globalAlpha = 0.5;
+        ctx.beginPath();
+        spec.x.values.forEach((x, i) => ctx.lineTo(u.valToPos(x, "x", true), u.valToPos(spec.series[0].values[i], "y", true)));
+        ctx.stroke();
+      }
+      for (const { high, low, ink } of bars) {
+        ctx.strokeStyle = ink;
+        ctx.globalAlpha = 0.35;
+        ctx.lineWidth = 1.5 * ratio();
+        ctx.beginPath();
+        u.data[0].forEach((x, i) => {
+          if (u.data[high][i] === null || u.data[low][i] === null) return;
+          const at = u.valToPos(x, "x", true);
+          ctx.moveTo(at, u.valToPos(u.data[high][i], "y", true));
+          ctx.lineTo(at, u.valToPos(u.data[low][i], "y", true));
+        });
+        ctx.stroke();
+      }
+      ctx.restore();
+    };
+    const both = spec.square ? padded(...data.flat().filter((v) => v !== null).reduce(([low, high], v) => [Math.min(low, v), Math.max(high, v)], [Infinity, -Infinity]), 0.05) : null;
+    const width = () => Math.max(plot.clientWidth, 120);
+    const height = () => (spec.square ? Math.min(width(), 340) : spec.height || (width() < 480 ? 240 : 280));
+    const axis = (label, extra) => ({
+      label, font, labelFont: font, labelSize: 20, stroke: colour("--muted"), grid: { stroke: colour("--grid"), width: 1 }, ticks: { stroke: colour("--grid"), width: 1, size: 4 },
+      values: (u, splits) => splits.map((v) => (v === null || v === undefined ? "" : format(v, 4))), ...extra });
+    const yRange = (u, min, max) => {
+      if (both) return both;
+      if (spec.y.range) return spec.y.range;
+      if (spec.y.zero && min !== null) { const top = Math.max(Math.abs(min), Math.abs(max)); return padded(-top, top, 0.08); }
+      return padded(min, max, 0.08);
+    };
+    // lines at powers of ten only, six at most
+    const decades = (u) => {
+      const first = Math.ceil(Math.log10(u.scales.y.min) - 1e-9), last = Math.floor(Math.log10(u.scales.y.max) + 1e-9);
+      const step = Math.max(1, Math.ceil((last - first) / 6));
+      return numbers(Math.max(last - first + 1, 0)).filter((k) => k % step === 0).map((k) => 10 ** (first + k));
+    };
+    const chartOptions = {
+      width: width(), height: height(), series, bands, padding: [8, 10, 0, 0],
+      legend: { show: false },
+      cursor: { drag: { x: true, y: false }, points: { size: 8 } },
+      scales: { x: { time: false, range: (u, min, max) => both || spec.x.range || padded(min, max, 0.03) }, y: spec.y.log ? { distr: 3 } : { range: yRange } },
+      axes: [axis(spec.x.label, { size: 34 }), axis(spec.y.label, spec.y.log ? { size: 50, splits: decades } : { size: 50 })],
+      hooks: {
+        drawAxes: [behind],
+        setCursor: [(u) => {
+          const i = u.cursor.idx;
+          if (i === null || i === undefined) { readout.textContent = ""; return; }
+          const parts = u.series.slice(1).map((one, k) => [one.label, u.data[k + 1][i]]).filter(([label, value]) => label && value !== null && value !== undefined);
+          readout.textContent = [`${spec.x.label} ${format(u.data[0][i], 4)}`, ...parts.map(([label, value]) => `${label} ${format(value, 4)}`)].join("  ·  ");
+        }],
+      },
+    };
+    const u = new uPlot(chartOptions, data, plot);
+    const watch = new ResizeObserver(() => {
+      if (Math.abs(u.width - width()) > 1) u.setSize({ width: width(), height: height() });
+    });
+    watch.observe(plot);
+    live.set(host, () => { watch.disconnect(); u.destroy(); });
+  }
+
+  function note(host, text) {
+    clear(host);
+    host.append(make("p", { class: "muted", text }));
+  }
+
+  function options(select, names, keep) {
+    select.replaceChildren(...names.map(([value, label]) => make("option", { value, text: label })));
+    if (names.some(([value]) => value === keep)) select.value = keep;
+  }
+
+  let data = test || report.data[0];
+  const numbers = (n) => Array.from({ length: n }, (_, i) => i);
+  /** time where the data have it, else the number of the row */
+  function along() {
+    const t = data.columns.t;
+    if (t && t.some((value) => value !== t[0])) return { label: "t [s]", values: t, ordered: t.every((value, i) => i === 0 || value >= t[i - 1]) };
+    return { label: "row", values: data.measured[0].map((_, i) => 1 + i * data.stride), ordered: false };
+  }
+  const predictedOutput = (k) => data.predicted[data.rows[k]];
+
+  function drawResiduals() {
+    const name = byId("residual-feature").value;
+    const x = name === "" ? along() : { label: name, values: data.columns[name] };
+    const host = byId("residual-charts");
+    while (host.children.length > data.outputs.length) { clear(host.lastChild); host.lastChild.remove(); }
+    while (host.children.length < data.outputs.length) host.append(make("div"));
+    data.outputs.forEach((output, k) => {
+      const values = data.measured[k].map((value, i) => value - predictedOutput(k)[i]);
+      const noise = data.noise[k];
+      chart(host.children[k], {
+        title: output, summary: `rms ${format(rms(values), 3)}${noise === null ? "" : `, fitted noise ${format(noise, 3)}`}`,
+        x, y: { label: `measured − predicted ${output}`, zero: true }, series: [{ label: "residual", values, colour: "--c1", kind: "points" }],
+      });
+    });
+  }
+
+  function drawScatter() {
+    const truth = byId("scatter-against").value === "truth";
+    const host = byId("scatter-charts");
+    while (host.children.length > data.outputs.length) { clear(host.lastChild); host.lastChild.remove(); }
+    while (host.children.length < data.outputs.length) host.append(make("div"));
+    data.outputs.forEach((output, k) => {
+      const reference = truth ? data.truth[data.rows[k]] : data.measured[k];
+      const rmse = truth ? data.figures.rmse_to_truth[k] : data.figures.rmse[k];
+      chart(host.children[k], {
+        title: output, summary: `rmse ${format(rmse, 3)}; on the line the prediction is exact`, square: true, diagonal: true,
+        x: { label: `${truth ? "true" : "measured"} ${output}`, values: reference }, y: { label: `predicted ${output}` },
+        series: [{ label: "predicted", values: predictedOutput(k), colour: "--c1", kind: "points" }],
+      });
+    });
+  }
+
+  function drawCalibration() {
+    const host = byId("calibration-chart");
+    const k = Number(byId("calibration-output").value);
+    const shares = data.coverage[k];
+    if (shares.every((share) => share === null)) return note(host, "The noise of this output is not known: training did not observe it.");
+    const at95 = shares[data.levels.indexOf(0.95)];
+    chart(host, {
+      title: `Coverage, ${data.name} data`, summary: `${percent(at95)} of the measurements lie within their 95 % interval.`,
+      x: { label: "nominal probability", values: data.levels, range: [0, 1] }, y: { label: "share of measurements", range: [0, 1] }, diagonal: true, height: 320,
+      series: [{ label: "share within", values: shares, colour: "--c1", kind: "line" }],
+    });
+  }
+
+  function drawConstraint() {
+    const host = byId("constraint-chart");
+    if (!data.constraint_error.length) return note(host, "The system has no constraints.");
+    if (data.constraint_error.flat().every((value) => value === null)) return note(host, "The data lack what the constraint reads.");
+    const x = along();
+    const floor = 1e-18;
+    const worst = Math.max(...data.constraint_error.flat());
+    const palette = ["--c1", "--c2", "--c3", "--c4"];
+    chart(host, {
+      title: `|A q̈ − b|, ${data.name} data`, summary: `At most ${format(worst, 2)}; zeros are drawn at ${floor}.`, x, y: { label: "|A q̈ − b|", log: true },
+      series: data.constraint_error.map((row, k) => ({ label: `row ${k + 1}`, values: row.map((v) => (v === null ? null : Math.max(v, floor))), colour: palette[k % 4], hollow: k >= 4, kind: "points" })),
+    });
+  }
+
+  function drawAccelerations() {
+    const j = Number(byId("acceleration-output").value);
+    const x = along();
+    const kind = x.ordered ? "line" : "points";
+    const coordinate = model.coordinates[j];
+    const band = (mean, std, sign) => mean.map((value, i) => (value === null || std[i] === null ? null : value + sign * 2 * std[i]));
+    const withBand = (label, mean, std) => ({ label, values: mean, colour: "--c1", kind, low: band(mean, std, -1), high: band(mean, std, 1) });
+    const series = [withBand("predicted", data.predicted[j], data.stddev[j])];
+    const k = data.rows.indexOf(j);
+    if (k >= 0) series.unshift({ label: "measured", values: data.measured[k], colour: "--c2", kind: "points", hollow: true, size: 8 });
+    if (data.truth) series.push({ label: "true", values: data.truth[j], colour: "--c3", kind, size: 2.5, dash: [6, 4] });
+    const width = 2 * rms(data.stddev[j]);
+    chart(byId("constrained-chart"), {
+      title: `Constrained acceleration dd${coordinate}`, summary: `Band of ±${format(width, 3)} on average${k < 0 ? "; not measured in these data" : ""}.`, x, y: { label: `dd${coordinate}` }, series, band: true,
+    });
+    chart(byId("unconstrained-chart"), {
+      title: `Unconstrained acceleration ā of ${coordinate}`, summary: `Band of ±${format(2 * rms(data.unconstrained_stddev[j]), 3)} on average. What the constraint hides of ā the data cannot show.`,
+      x, y: { label: `ā ${coordinate}` }, series: [withBand("ā", data.unconstrained[j], data.unconstrained_stddev[j])], band: true,
+    });
+  }
+
+  // ---- where the data are: phase planes, and three coordinates in space ---------------------------------------------------
+
+  let yaw = -0.7, pitch = 0.42;
+
+  function drawSpace(host, names, surface) {
+    clear(host);
+    const points = data.columns[names[0]].map((_, i) => names.map((name) => data.columns[name][i]));
+    const sheets = surface ? surface.sheets : [];
+    const range = names.map((name, axis) => {
+      const known = data.columns[name].slice();
+      if (surface && axis === surface.solved) for (const sheet of sheets) known.push(...sheet.flat().filter((value) => value !== null));
+      if (surface && axis !== surface.solved) known.push(...(axis === surface.first ? surface.first_grid : surface.second_grid));
+      return [known.reduce((a, b) => Math.min(a, b)), known.reduce((a, b) => Math.max(a, b))];
+    });
+    const scaled = (value, axis) => (range[axis][1] > range[axis][0] ? (2 * (value - range[axis][0])) / (range[axis][1] - range[axis][0]) - 1 : 0);
+    const summary = `${points.length} states${surface ? " and the surface on which the constraint holds" : ""}. Drag, or focus and press the arrow keys, to turn.`;
+    const canvas = make("canvas", { class: "space3d", tabindex: "0", role: "img", "aria-label": `Coordinates ${names.join(", ")} in space. ${summary}` });
+    host.append(make("figure", {}, make("figcaption", {}, make("strong", { text: `Coordinates ${names.join(", ")}` }), make("span", { class: "summary", text: summary })), canvas));
+    const grid = (sheet, i, j) => {
+      if (sheet[i][j] === null) return null;
+      const p = [0, 0, 0];
+      p[surface.first] = scaled(surface.first_grid[i], surface.first);
+      p[surface.second] = scaled(surface.second_grid[j], surface.second);
+      p[surface.solved] = scaled(sheet[i][j], surface.solved);
+      return p;
+    };
+    const cells = [];
+    for (const sheet of sheets) {
+      for (let i = 0; i + 1 < sheet.length; ++i) {
+        for (let j = 0; j + 1 < sheet[i].length; ++j) {
+          const corners = [grid(sheet, i, j), grid(sheet, i + 1, j), grid(sheet, i + 1, j + 1), grid(sheet, i, j + 1)];
+          if (corners.every((corner) => corner !== null)) cells.push(corners);
+        }
+      }
+    }
+    const cloud = points.map((p) => p.map(scaled));
+
+    function draw() {
+      const scale = devicePixelRatio || 1;
+      const width = canvas.clientWidth, height = canvas.clientHeight;
+      canvas.width = Math.round(width * scale);
+      canvas.height = Math.round(height * scale);
+      const ctx = canvas.getContext("2d");
+      ctx.scale(scale, scale);
+      const [cy, sy, cp, sp] = [Math.cos(yaw), Math.sin(yaw), Math.cos(pitch), Math.sin(pitch)];
+      // as large as fits whatever the turn about the vertical
+      const reach = 1.12;  // of the box with perspective
+      const size = Math.min((width / 2 - 34) / (Math.SQRT2 * reach), (height / 2 - 30) / ((Math.SQRT2 * Math.abs(sp) + cp) * reach));
+      const project = ([x, y, z]) => {
+        const right = cy * x - sy * y, away = sy * x + cy * y;
+        const depth = cp * away - sp * z;
+        const zoom = 1 / (1 + 0.13 * depth);
+        return [width / 2 + size * right * zoom, height / 2 - size * (sp * away + cp * z) * zoom, depth];
+      };
+      // the box; its lowest edges and its leftmost upright one bear the labels
+      ctx.font = font;
+      ctx.textAlign = "center";
+      ctx.textBaseline = "middle";
+      ctx.lineWidth = 1;
+      const labelled = [];
+      for (let axis = 0; axis < 3; ++axis) {
+        const edges = [[-1, -1], [-1, 1], [1, -1], [1, 1]].map(([u, v]) => [-1, 1].map((end) => {
+          const p = [0, 0, 0];
+          p[axis] = end;
+          p[(axis + 1) % 3] = u;
+          p[(axis + 2) % 3] = v;
+          return project(p);
+        }));
+        ctx.strokeStyle = colour("--line");
+        for (const [from, to] of edges) {
+          ctx.beginPath();
+          ctx.moveTo(from[0], from[1]);
+          ctx.lineTo(to[0], to[1]);
+          ctx.stroke();
+        }
+        const rank = axis === 2 ? ([from, to]) => from[0] + to[0] : ([from, to]) => -(from[1] + to[1]);
+        labelled.push(edges.reduce((best, edge) => (rank(edge) < rank(best) ? edge : best)));
+      }
+      const faces = cells.map((corners) => { const at = corners.map(project); return [at, at.reduce((sum, p) => sum + p[2], 0)]; });
+      faces.sort((a, b) => b[1] - a[1]);
+      ctx.fillStyle = colour("--mesh");
+      ctx.strokeStyle = colour("--mesh-line");
+      ctx.lineWidth = 0.6;
+      for (const [at] of faces) {
+        ctx.beginPath();
+        at.forEach((p, i) => (i === 0 ? ctx.moveTo(p[0], p[1]) : ctx.lineTo(p[0], p[1])));
+        ctx.closePath();
+        ctx.fill();
+        ctx.stroke();
+      }
+      ctx.fillStyle = colour("--c1");
+      ctx.strokeStyle = colour("--c1");
+      const shown = cloud.map(project);
+      if (along().ordered) {
+        ctx.globalAlpha = 0.6;
+        ctx.beginPath();
+        shown.forEach((p, i) => (i === 0 ? ctx.moveTo(p[0], p[1]) : ctx.lineTo(p[0], p[1])));
+        ctx.stroke();
+      }
+      for (const p of shown) {
+        ctx.globalAlpha = 0.85 - 0.3 * Math.max(-1, Math.min(1, p[2]));
+        ctx.beginPath();
+        ctx.arc(p[0], p[1], shown.length > 400 ? 2 : 3, 0, 2 * Math.PI);
+        ctx.fill();
+      }
+      ctx.globalAlpha = 1;
+      labelled.forEach(([from, to], axis) => {
+        const middle = [(from[0] + to[0]) / 2, (from[1] + to[1]) / 2];
+        // outwards, square to the edge
+        let out = [to[1] - from[1], from[0] - to[0]];
+        const long = Math.hypot(...out) || 1;
+        const side = out[0] * (middle[0] - width / 2) + out[1] * (middle[1] - height / 2) < 0 ? -1 : 1;
+        out = out.map((part) => (side * part) / long);
+        ctx.strokeStyle = colour("--muted");
+        ctx.beginPath();
+        ctx.moveTo(from[0], from[1]);
+        ctx.lineTo(to[0], to[1]);
+        ctx.stroke();
+        ctx.fillStyle = colour("--text");
+        ctx.fillText(names[axis], middle[0] + 20 * out[0], middle[1] + 16 * out[1]);
+        ctx.fillStyle = colour("--muted");
+        for (const [share, value] of [[0.06, range[axis][0]], [0.94, range[axis][1]]]) {
+          ctx.fillText(format(value, 3), from[0] + share * (to[0] - from[0]) + 20 * out[0], from[1] + share * (to[1] - from[1]) + 14 * out[1]);
+        }
+      });
+    }
+    const turn = (right, up) => { yaw += right; pitch = Math.max(-1.5, Math.min(1.5, pitch + up)); draw(); };
+    canvas.addEventListener("keydown", (event) => {
+      const step = { ArrowLeft: [-0.09, 0], ArrowRight: [0.09, 0], ArrowUp: [0, 0.09], ArrowDown: [0, -0.09] }[event.key];
+      if (!step) return;
+      event.preventDefault();
+      turn(...step);
+    });
+    canvas.addEventListener("pointerdown", (event) => canvas.setPointerCapture(event.pointerId));
+    canvas.addEventListener("pointermove", (event) => {
+      if (canvas.hasPointerCapture(event.pointerId)) turn(event.movementX * 0.008, event.movementY * 0.008);
+    });
+    const watch = new ResizeObserver(draw);
+    watch.observe(canvas);
+    live.set(host, () => watch.disconnect());
+    draw();
+  }
+
+  function motionViews() {
+    const known = model.coordinates.filter((name) => data.columns[name]);
+    const views = [];
+    for (let first = 0; first + 2 < known.length && first < 4; ++first) {
+      const names = known.slice(first, first + 3);
+      views.push([`space ${first}`, `${names.join(", ")} in space`, names]);
+    }
+    for (const name of model.coordinates) {
+      if (data.columns[name] && data.columns[`d${name}`]) views.push([`phase ${name}`, `phase plane ${name}, d${name}`, [name, `d${name}`]]);
+    }
+    if (known.length === 2) views.push(["plane", `${known[0]}, ${known[1]}`, known]);
+    // coordinates that the model does not read: velocities against each other
+    const rates = model.coordinates.map((name) => `d${name}`).filter((name) => data.columns[name]);
+    if (!views.length) for (let k = 1; k < rates.length; ++k) views.push([`rates ${k}`, `${rates[0]}, ${rates[k]}`, [rates[0], rates[k]]]);
+    return views;
+  }
+
+  function drawMotion() {
+    const host = byId("motion-chart");
+    const view = motionViews().find(([value]) => value === byId("motion-view").value);
+    if (!view) return note(host, "The data hold no coordinate with its velocity.");
+    const names = view[2];
+    if (names.length === 3) {
+      const whole = report.surface && model.coordinates.length === 3 && !/^training [2-9]/.test(data.name);
+      return drawSpace(host, names, whole ? report.surface : null);
+    }
+    const ordered = along().ordered;
+    chart(host, {
+      title: `${names[0]}, ${names[1]}`, summary: `${data.n} states of the ${data.name} data${ordered ? ", one after another in time" : ""}.`, height: 360, trace: ordered,
+      x: { label: names[0], values: data.columns[names[0]] }, y: { label: names[1] }, series: [{ label: names[1], values: data.columns[names[1]], colour: "--c1", kind: "points" }],
+    });
+  }
+
+  function fillRelevance() {
+    const host = byId("relevance-bars");
+    if (!report.relevance.length) return note(host, "The kernels have no lengthscales.");
+    const largest = Math.max(...report.relevance.map((one) => one.relevance || 0));
+    const several = new Set(report.relevance.map((one) => one.latent)).size > 1;
+    const rows = [...report.relevance].sort((a, b) => (a.latent === b.latent ? b.relevance - a.relevance : 0));
+    const bar = (one) => make("span", { class: "track" }, make("span", { class: "fill", style: `width:${(100 * one.relevance) / largest}%` }));
+    const built = table("Relevance of the features", [{ label: "feature" }, { label: "relevance" }, { label: "", number: true }, { label: "effect", number: true }, { label: "lengthscale", number: true }, { label: "spread", number: true }],
+      rows.map((one) => [several ? `${one.feature} (${one.latent})` : one.feature, bar(one), one.relevance, one.effect, one.lengthscale, one.spread].map((value) => (typeof value === "number" ? make("span", { text: format(value, 3), title: String(value), "data-value": String(value) }) : value))));
+    built.querySelector("table").classList.add("bars");
+    for (const row of built.querySelectorAll("tbody tr")) row.children[1].classList.add("bar");
+    host.append(built);
+  }
+
+  // ---- controls -----------------------------------------------------------------------------------------------------------
+
+  function drawAll() {
+    drawResiduals();
+    drawScatter();
+    drawCalibration();
+    drawConstraint();
+    drawAccelerations();
+    drawMotion();
+  }
+
+  function fillControls() {
+    const feature = byId("residual-feature");
+    options(feature, [...data.features.filter((name) => data.columns[name]).map((name) => [name, name]), ["", along().label === "row" ? "row of the log" : "time"]], feature.value || data.features[0]);
+    const against = byId("scatter-against");
+    options(against, data.truth ? [["measured", "measured"], ["truth", "true"]] : [["measured", "measured"]], against.value);
+    byId("scatter-controls").hidden = !data.truth;
+    const calibration = byId("calibration-output");
+    options(calibration, [[String(data.outputs.length), "all outputs"], ...data.outputs.map((name, k) => [String(k), name])], calibration.value);
+    const acceleration = byId("acceleration-output");
+    options(acceleration, model.coordinates.map((name, j) => [String(j), name]), acceleration.value);
+    const motion = byId("motion-view");
+    options(motion, motionViews().map(([value, label]) => [value, label]), motion.value);
+    byId("motion-controls").hidden = motion.options.length < 2;
+  }
+
+  function start() {
+    if (!data) {
+      for (const part of document.querySelectorAll("#data-choice, #pictures section:not(#relevance)")) part.remove();
+      byId("pictures").append(make("p", { class: "muted", text: "No pictures: the fit learned from no acceleration, and no --data was given." }));
+    }
+    fillHeader();
+    fillAdvice();
+    fillModel();
+    fillOptimiser();
+    fillFigures();
+    fillRelevance();
+    if (!data) return;
+    const choice = byId("data-choice");
+    report.data.forEach((one, k) => {
+      const input = make("input", { type: "radio", name: "data", value: String(k), id: `data-${k}` });
+      input.checked = one === data;
+      input.addEventListener("change", () => { data = one; fillControls(); drawAll(); });
+      choice.append(make("label", { for: `data-${k}` }, input, `${one.name} (${one.n}${one.stride > 1 ? `, every ${one.stride}th drawn` : ""})`));
+    });
+    fillControls();
+    for (const [id, draw] of [["residual-feature", drawResiduals], ["scatter-against", drawScatter], ["calibration-output", drawCalibration], ["acceleration-output", drawAccelerations], ["motion-view", drawMotion]]) {
+      byId(id).addEventListener("change", draw);
+    }
+    drawAll();
+    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", drawAll);
+  }
+
+  start();
+})();

@@ -1,0 +1,354 @@
+#include "report/report_data.hpp"
+
+#include <algorithm>
+#include <array>
+#include <chrono>
+#include <cmath>
+#include <filesystem>
+#include <limits>
+#include <numbers>
+
+#include <fmt/chrono.h>
+#include <fmt/format.h>
+#include <fmt/ranges.h>
+#include <nlohmann/json.hpp>
+
+#include "command.hpp"
+#include "gp2/error.hpp"
+#include "gp2/fit_problem.hpp"
+#include "gp2/generate.hpp"
+
+namespace gp2::command {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::Ref;
+using Eigen::VectorXd;
+
+namespace {
+
+constexpr double not_a_number = std::numeric_limits<double>::quiet_NaN();
+
+// the day a file was written, in UTC
+std::string date_of(const std::filesystem::path& path) {
+  const auto written = std::chrono::file_clock::to_sys(std::filesystem::last_write_time(path));
+  const auto seconds = std::chrono::time_point_cast<std::chrono::seconds>(written);
+  return fmt::format("{:%Y-%m-%d}", fmt::gmtime(std::chrono::system_clock::to_time_t(seconds)));
+}
+
+// the fitted noise of a row of ddq: that of the first training data that have it, as in evaluate_predictions
+double noise_of(const Posterior& posterior, int row) {
+  for (std::size_t g = 0; g < posterior.observations().size(); ++g) {
+    const View& view = posterior.observations()[g].view;
+    if (view.quantity != View::Quantity::constrained_acceleration || view.latent >= 0) continue;
+    const auto found = std::find(view.rows.begin(), view.rows.end(), row);
+    if (found != view.rows.end()) return posterior.values().noise_stddev[g][found - view.rows.begin()];
+  }
+  return not_a_number;
+}
+
+// predictions and figures at states with measured accelerations
+ReportData data_at(const Posterior& posterior, const MatrixXd& states, const std::vector<int>& rows, const MatrixXd& measured,
+                   const std::shared_ptr<const Setting>& setting) {
+  ReportData data;
+  data.rows = rows;
+  data.states = states;
+  data.measured = measured;
+  View view = View::all(View::Quantity::constrained_acceleration, *posterior.prior().system);
+  view.setting = setting;
+  const Prior& prior = prior_of(posterior.prior(), view);
+  const System& judge = prior.judge();
+  const VectorXd parameters = parameters_of(view, posterior.values().parameters);
+  data.outputs = View{View::Quantity::constrained_acceleration, rows}.names(judge);
+  data.noise_stddev.resize(std::ssize(rows));
+  for (std::size_t k = 0; k < rows.size(); ++k) data.noise_stddev[static_cast<Index>(k)] = noise_of(posterior, rows[k]);
+
+  data.evaluation = evaluate_predictions(posterior, states, rows, measured, setting, /*n_threads=*/0);
+  Posterior::Marginal prediction = posterior.marginal(view, states, /*n_threads=*/0);
+  data.predicted = prediction.mean;
+  data.stddev = prediction.stddev();
+  view.quantity = View::Quantity::unconstrained_acceleration;
+  prediction = posterior.marginal(view, states, /*n_threads=*/0);
+  data.unconstrained = prediction.mean;
+  data.unconstrained_stddev = prediction.stddev();
+
+  const SystemValues values = judge.evaluate(states, parameters);
+  data.constraint_error.resize(judge.nc(), states.cols());
+  for (int i = 0; i < values.n_states() && judge.nc() > 0; ++i) {
+    data.constraint_error.col(i) = (values.A(i) * data.predicted.col(i) - values.b(i)).cwiseAbs();
+  }
+  if (judge.nc() > 0) data.violation = largest_violation(judge, states, parameters);
+
+  for (const Latent& latent : prior.latents) {
+    if (latent.kernel_is_fixed) continue;
+    const MatrixXd features = evaluate_features(latent, states);
+    for (int d = 0; d < latent.n_features(); ++d) {
+      const std::string& name = latent.feature_names[static_cast<std::size_t>(d)];
+      const bool known =
+          std::any_of(data.features.begin(), data.features.end(), [&](const auto& one) { return one.first == name; });
+      if (!known) data.features.emplace_back(name, features.col(d));
+    }
+  }
+  return data;
+}
+
+// Where all accelerations are outputs and A ddq = b holds for them to rounding: those to observe instead.
+std::vector<std::string> independent_outputs(const System& system, const VectorXd& parameters, const ReportData& data) {
+  if (std::ssize(data.rows) != system.nq() || system.nc() == 0 || data.evaluation.n == 0) return {};
+  MatrixXd accelerations(system.nq(), data.measured.cols());
+  for (std::size_t k = 0; k < data.rows.size(); ++k) accelerations.row(data.rows[k]) = data.measured.row(static_cast<Index>(k));
+  const SystemValues values = system.evaluate(data.states, parameters);
+  if (values.constraint_matrix.hasNaN() || values.constraint_vector.hasNaN()) return {};
+  const std::optional<std::vector<int>> rows = dependent_columns(system, data.states, parameters, accelerations);
+  if (!rows) return {};
+  return View{View::Quantity::constrained_acceleration, *rows}.names(system);
+}
+
+std::vector<ReportData> training_data(const FitFile& fit, const Posterior& posterior) {
+  std::vector<ReportData> all;
+  for (std::size_t g = 0; g < fit.observations.size(); ++g) {
+    const Observations& group = fit.observations[g];
+    if (group.view.quantity != View::Quantity::constrained_acceleration || group.view.latent >= 0) continue;
+    ReportData data = data_at(posterior, group.states, group.view.rows, group.values, group.view.setting);
+    data.name = all.empty() ? "training" : fmt::format("training {}", all.size() + 1);
+    const bool elsewhere = g < fit.systems.size() && fit.systems[g];
+    data.source = elsewhere ? fmt::format("measured on '{}'", fit.systems[g]->system->name()) : fit.data_source;
+    data.independent = independent_outputs(prior_of(posterior.prior(), group.view).judge(),
+                                           parameters_of(group.view, posterior.values().parameters), data);
+    all.push_back(std::move(data));
+  }
+  return all;
+}
+
+std::vector<std::string> observed_outputs(const std::vector<ReportData>& training) {
+  return training.empty() ? std::vector<std::string>{} : training.front().outputs;
+}
+
+ReportData test_data(const ReportOptions& options, const FitFile& fit, const Posterior& posterior,
+                     const std::vector<std::string>& observed, std::vector<std::string>& notes) {
+  const CsvTable table = CsvTable::read(options.data);
+  const std::vector<int> rows = acceleration_rows(*fit.model.system, observed, "--data");
+  View view{View::Quantity::constrained_acceleration, rows};
+  const Prior& prior = posterior.prior();
+  const View all = View::all(View::Quantity::constrained_acceleration, *prior.system);
+  const LogStates log = read_log_states(prior, all, fit.model, table, options.columns, view.names(*fit.model.system));
+  notes.insert(notes.end(), log.notes.begin(), log.notes.end());
+  ReportData data = at_states_of(table, [&] { return data_at(posterior, log.states, rows, log.accelerations, nullptr); });
+  data.name = "test";
+  data.source = options.data;
+  data.is_test = true;
+  // what the fit does not read may still be drawn, and be read by the truth
+  LogReader reader = open_log(fit.model, table, options.columns);
+  const std::vector<std::string> names = fit.model.system->state_names();
+  for (std::size_t k = 0; k < names.size(); ++k) {
+    if (!data.states.row(static_cast<Index>(k)).hasNaN() || !reader.has(names[k])) continue;
+    std::vector<bool> only(names.size(), false);
+    only[k] = true;
+    try {
+      data.states.row(static_cast<Index>(k)) = reader.states(only).row(static_cast<Index>(k));
+    } catch (const InputError&) {
+      // not numbers: then it is not drawn
+    }
+  }
+  return data;
+}
+
+void add_truth(const ReportOptions& options, Report& report) {
+  const ModelFile truth = ModelFile::read(options.truth);
+  const System& home = *report.fit.model.system;
+  if (truth.truth.empty()) {
+    throw InputError(
+        fmt::format("--truth {}: has no [truth]; give a model file that says what the true acceleration is", options.truth));
+  }
+  if (truth.system->state_names() != home.state_names()) {
+    throw InputError(fmt::format("--truth {}: its state is {}, that of the fit is {}; coordinates and inputs must be the same",
+                                 options.truth, fmt::join(truth.system->state_names(), " "), fmt::join(home.state_names(), " ")));
+  }
+  const ModelMotion motion(truth);
+  bool any = false;
+  for (ReportData& data : report.data) {
+    data.truth = motion.acceleration(data.states);
+    for (Index i = 0; i < data.truth.cols(); ++i) {
+      if (data.truth.col(i).allFinite()) {
+        any = true;
+      } else {
+        data.truth.col(i).setConstant(not_a_number);
+      }
+    }
+  }
+  if (!any) {
+    throw InputError(
+        fmt::format("--truth {}: not finite at any state of the data; the fit keeps only the columns its model reads, "
+                    "so give a --data with all that the truth reads",
+                    options.truth));
+  }
+  report.truth_source = truth.system->name();
+}
+
+std::vector<Relevance> relevance_of(const Posterior& posterior) {
+  std::vector<Relevance> all;
+  const Prior& prior = posterior.prior();
+  const ModelValues& values = posterior.values();
+  const Scales scales = default_scales(prior, posterior.observations());
+  for (std::size_t a = 0; a < prior.latents.size(); ++a) {
+    const Latent& latent = prior.latents[a];
+    if (latent.kernel_is_fixed) continue;
+    double largest_signal = 0;
+    for (Index j = 0; j < values.signal_stddev[a].size(); ++j) {
+      largest_signal = std::max(largest_signal, values.signal_stddev[a][j] / scales.signal_stddev[a][j]);
+    }
+    for (std::size_t p = 0; p < latent.kernel.parameters().size(); ++p) {
+      const Kernel::Parameter& parameter = latent.kernel.parameters()[p];
+      const bool periodic = parameter.kind == Kernel::ParameterKind::periodic_lengthscale;
+      if (parameter.kind != Kernel::ParameterKind::lengthscale && !periodic) continue;
+      Relevance one{latent.name, latent.feature_names[static_cast<std::size_t>(parameter.feature)]};
+      one.lengthscale = values.kernel[a][static_cast<Index>(p)];
+      one.spread = scales.feature_stddev[a][parameter.feature];
+      one.relevance = (periodic ? 1 : one.spread) / one.lengthscale;
+      if (!values.is_learned(a)) one.effect = largest_signal * one.relevance;
+      all.push_back(std::move(one));
+    }
+  }
+  return all;
+}
+
+}  // namespace
+
+VectorXd ReportData::rmse_to_truth() const {
+  VectorXd rmse = VectorXd::Constant(std::ssize(rows), not_a_number);
+  for (std::size_t k = 0; k < rows.size() && truth.cols() > 0; ++k) {
+    double sum = 0;
+    int n = 0;
+    for (Index i = 0; i < truth.cols(); ++i) {
+      const double error = truth(rows[k], i) - predicted(rows[k], i);
+      if (!std::isfinite(error)) continue;
+      sum += error * error;
+      ++n;
+    }
+    if (n > 0) rmse[static_cast<Index>(k)] = std::sqrt(sum / n);
+  }
+  return rmse;
+}
+
+MatrixXd coverage(const ReportData& data, const Ref<const VectorXd>& levels) {
+  const Index d = std::ssize(data.rows), n = data.measured.cols();
+  MatrixXd share = MatrixXd::Zero(levels.size(), d + 1);
+  int n_known = 0;
+  for (Index k = 0; k < d; ++k) {
+    const Index row = data.rows[static_cast<std::size_t>(k)];
+    if (!std::isfinite(data.noise_stddev[k])) {
+      share.col(k).setConstant(not_a_number);
+      continue;
+    }
+    ++n_known;
+    for (Index i = 0; i < n; ++i) {
+      const double z = (data.measured(k, i) - data.predicted(row, i)) / std::hypot(data.stddev(row, i), data.noise_stddev[k]);
+      // the central interval that just holds the measurement
+      const double probability = std::erf(std::abs(z) / std::numbers::sqrt2);
+      for (Index l = 0; l < levels.size(); ++l) share(l, k) += probability <= levels[l] ? 1 : 0;
+    }
+    share.col(d) += share.col(k);
+    share.col(k) /= static_cast<double>(n);
+  }
+  if (n_known == 0) {
+    share.col(d).setConstant(not_a_number);
+  } else {
+    share.col(d) /= static_cast<double>(n) * n_known;
+  }
+  return share;
+}
+
+std::optional<ConstraintSurface> constraint_surface(const SymbolicSystem& system, const Ref<const VectorXd>& parameters,
+                                                    const Ref<const MatrixXd>& states) {
+  if (system.nq() != 3 || states.cols() < 2 || states.topRows(3).hasNaN()) return std::nullopt;
+  int row = -1;
+  const std::vector<ConstraintRow>& constraints = system.definition().constraints;
+  for (std::size_t k = 0; k < constraints.size(); ++k) {
+    if (constraints[k].level != ConstraintRow::Level::position) continue;
+    if (row >= 0) return std::nullopt;  // a curve or a point
+    row = static_cast<int>(k);
+  }
+  if (row < 0) return std::nullopt;
+  const Expression c = constraints[static_cast<std::size_t>(row)].residuals.front();
+  const std::vector<std::string> read = c.graph().variables_of(c);
+  if (std::find(read.begin(), read.end(), "t") != read.end()) return std::nullopt;
+  const std::vector<System::Residual>& labels = system.residual_labels();
+  const auto label = std::find_if(labels.begin(), labels.end(), [&](const auto& one) { return one.row == row && !one.velocity; });
+
+  // solve for the coordinate in which c is never flat over the data: A's row is ∂c/∂q
+  const SystemValues values = system.evaluate(states, parameters);
+  Eigen::Vector3d steepness = Eigen::Vector3d::Constant(std::numeric_limits<double>::infinity());
+  for (int i = 0; i < values.n_states(); ++i) {
+    const Eigen::Vector3d slope = values.A(i).row(row).cwiseAbs().transpose();
+    steepness = steepness.cwiseMin(slope / std::max(slope.maxCoeff(), std::numeric_limits<double>::min()));
+  }
+  ConstraintSurface surface;
+  steepness.maxCoeff(&surface.solved);
+  surface.first = surface.solved == 0 ? 1 : 0;
+  surface.second = surface.solved == 2 ? 1 : 2;
+
+  constexpr Index n_grid = 25, n_scan = 41;
+  const auto range = [&](int coordinate, double margin, Index n) -> VectorXd {
+    const double low = states.row(coordinate).minCoeff(), high = states.row(coordinate).maxCoeff();
+    const double pad = margin * std::max(high - low, 1e-9 * std::abs(high) + 1e-300);
+    return VectorXd::LinSpaced(n, low - pad, high + pad);
+  };
+  surface.first_grid = range(surface.first, 0.08, n_grid);
+  surface.second_grid = range(surface.second, 0.08, n_grid);
+  const VectorXd scan = range(surface.solved, 0.6, n_scan);
+  MatrixXd probes = MatrixXd::Zero(system.layout().size(), n_grid * n_grid * n_scan);
+  Index column = 0;
+  for (const double first : surface.first_grid) {
+    for (const double second : surface.second_grid) {
+      for (const double solved : scan) {
+        probes(surface.first, column) = first;
+        probes(surface.second, column) = second;
+        probes(surface.solved, column++) = solved;
+      }
+    }
+  }
+  const Eigen::RowVectorXd residual = system.residuals(probes, parameters).row(label - labels.begin());
+
+  // every change of sign is a point of the surface; the straight line between its ends is exact where c is linear in the
+  // coordinate
+  for (Index i = 0; i < n_grid; ++i) {
+    for (Index j = 0; j < n_grid; ++j) {
+      std::size_t sheet = 0;
+      const Index first = (i * n_grid + j) * n_scan;
+      for (Index s = 0; s + 1 < n_scan; ++s) {
+        const double here = residual[first + s], next = residual[first + s + 1];
+        if (!(here * next < 0 || here == 0)) continue;
+        if (sheet == surface.sheets.size()) surface.sheets.emplace_back(MatrixXd::Constant(n_grid, n_grid, not_a_number));
+        surface.sheets[sheet++](i, j) = here == 0 ? scan[s] : scan[s] + (scan[s + 1] - scan[s]) * here / (here - next);
+      }
+    }
+  }
+  if (surface.sheets.empty()) return std::nullopt;
+  return surface;
+}
+
+Report collect_report(const ReportOptions& options, std::vector<std::string>& notes) {
+  Report report;
+  report.fit = FitFile::read(options.fit);
+  report.library = nlohmann::json::parse(read_file(options.fit)).value("library", "");
+  report.file_date = date_of(options.fit);
+  const Posterior posterior = report.fit.posterior();
+  report.data = training_data(report.fit, posterior);
+  report.relevance = relevance_of(posterior);
+  if (!options.data.empty()) {
+    report.data.push_back(test_data(options, report.fit, posterior, observed_outputs(report.data), notes));
+  }
+  if (!options.truth.empty()) add_truth(options, report);
+  if (const SymbolicSystem* system = report.fit.model.symbolic_system(); system != nullptr && !report.data.empty()) {
+    MatrixXd q(system->layout().size(), 0);
+    for (const ReportData& data : report.data) {
+      if (&data != &report.data.front() && !data.is_test) continue;  // other systems have other surfaces
+      q.conservativeResize(Eigen::NoChange, q.cols() + data.states.cols());
+      q.rightCols(data.states.cols()) = data.states;
+    }
+    report.surface = constraint_surface(*system, posterior.values().parameters, q);
+  }
+  return report;
+}
+
+}  // namespace gp2::command

@@ -1,0 +1,110 @@
+#pragma once
+
+#include <map>
+#include <optional>
+#include <string>
+#include <vector>
+
+#include <Eigen/Core>
+
+#include "gp2/check.hpp"
+#include "gp2/evaluation.hpp"
+#include "gp2/fit_file.hpp"
+
+namespace gp2::command {
+
+/// How much one feature of a latent matters.
+struct Relevance {
+  std::string latent, feature;
+  double lengthscale = 0;
+  double spread = 0;     // standard deviation over the training data
+  double relevance = 0;  // spread / lengthscale; 1 / lengthscale of a periodic kernel, whose lengthscale has no unit
+  /// Largest over the latent's columns of s · relevance / the column's default scale: what the latent changes by over one spread,
+  /// in spreads of the acceleration. An effect that is nearly linear has a long lengthscale and a large s: this sees it, the
+  /// relevance does not. Nothing where directions are learned.
+  std::optional<double> effect = std::nullopt;
+};
+
+/// Measured accelerations at N states, d outputs of them, and what the fit says there. Standard deviations are without noise.
+struct ReportData {
+  std::string name;    // "training", "training 2", "test"
+  std::string source;  // where it came from, for people
+  bool is_test = false;
+  Evaluation evaluation;
+  std::vector<std::string> outputs;      // d
+  std::vector<int> rows;                 // of ddq, d
+  Eigen::MatrixXd states;                // (layout size × N), NaN where not kept
+  Eigen::MatrixXd measured;              // (d × N)
+  Eigen::VectorXd noise_stddev;          // fitted noise of each output (d); NaN where training did not observe it
+  Eigen::MatrixXd predicted, stddev;     // ddq  (nq × N)
+  Eigen::MatrixXd unconstrained;         // ā    (nq × N)
+  Eigen::MatrixXd unconstrained_stddev;  //      (nq × N)
+  Eigen::MatrixXd constraint_error;      // |A ddq − b| of the predicted mean, fitted parameters (nc × N)
+  Eigen::MatrixXd truth;                 // the true ddq (nq × N), NaN where unknown; empty without --truth
+  std::vector<std::pair<std::string, Eigen::VectorXd>> features;  // φ by name (N each)
+  std::optional<ConstraintViolation> violation;
+  std::vector<std::string> independent;  // accelerations to observe instead, where the outputs follow from each other
+
+  /// Root mean square of truth − predicted per output (d); NaN where the truth is not known.
+  [[nodiscard]] Eigen::VectorXd rmse_to_truth() const;
+};
+
+/// Share of measurements within the central interval of nominal probability p, measurement noise included.
+///
+/// @param levels  p (K)
+/// @returns (K × d + 1): each output, then all of them; NaN columns where the noise is not known
+Eigen::MatrixXd coverage(const ReportData& data, const Eigen::Ref<const Eigen::VectorXd>& levels);
+
+/// The points of a position constraint c(q) = 0 in three coordinates, as sheets over a grid in two of them.
+struct ConstraintSurface {
+  int first = 0, second = 1, solved = 2;    // coordinates: grid directions, and the one solved for
+  Eigen::VectorXd first_grid, second_grid;  // (n), (m)
+  std::vector<Eigen::MatrixXd> sheets;      // (n × m), NaN where there is no point
+};
+
+/// @returns nothing unless there are three coordinates and one position-level constraint that no time enters
+std::optional<ConstraintSurface> constraint_surface(const SymbolicSystem& system,
+                                                    const Eigen::Ref<const Eigen::VectorXd>& parameters,
+                                                    const Eigen::Ref<const Eigen::MatrixXd>& states);
+
+/// A thing to know or to do, in plain words.
+struct Advice {
+  enum class Level { good, note, warning };
+  Level level = Level::note;
+  std::string text;  // what was found
+  std::string mend;  // what to do
+};
+
+/// Everything on the page.
+struct Report {
+  FitFile fit;
+  std::string library;    // the version that fitted
+  std::string file_date;  // of the fit file, YYYY-MM-DD
+  std::vector<ReportData> data;
+  std::vector<Relevance> relevance;
+  std::optional<ConstraintSurface> surface;
+  std::string truth_source;  // the model of --truth
+};
+
+struct ReportOptions {
+  std::string fit;                             // FIT.json
+  std::string data;                            // CSV of a test; empty: none
+  std::string truth;                           // model file that tells the true acceleration; empty: none
+  std::map<std::string, std::string> columns;  // of --map
+};
+
+/// Predicts, evaluates and collects.
+/// @param notes  receives what a person should know
+/// @throws InputError for files that cannot be read or do not fit each other.
+Report collect_report(const ReportOptions& options, std::vector<std::string>& notes);
+
+/// What the figures say about how to go on, most pressing first.
+std::vector<Advice> learning_advice(const Report& report);
+
+/// The report for the page's script: JSON in which no text can end a script element.
+std::string report_json(const Report& report);
+
+/// The page: one HTML file that needs nothing else.
+std::string report_page(const Report& report);
+
+}  // namespace gp2::command

@@ -1,0 +1,352 @@
+#include <algorithm>
+#include <cmath>
+#include <limits>
+
+#include <fmt/format.h>
+#include <fmt/ranges.h>
+#include <nlohmann/json.hpp>
+
+#include "gp2/csv.hpp"
+#include "gp2/error.hpp"
+#include "gp2/version.hpp"
+#include "report/assets.hpp"
+#include "report/report_data.hpp"
+
+namespace gp2::command {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+
+namespace {
+
+using Json = nlohmann::ordered_json;
+
+// more points than these are not drawn: an even selection is
+constexpr Index max_drawn = 2000;
+
+Json number(double value) { return std::isfinite(value) ? Json(value) : Json(); }
+
+// for pictures: six digits
+Json rounded(double value) { return std::isfinite(value) ? Json(std::stod(fmt::format("{:.6g}", value))) : Json(); }
+
+template <typename Row>
+Json row_json(const Row& row, Index stride = 1) {
+  Json array = Json::array();
+  for (Index i = 0; i < row.size(); i += stride) array.push_back(rounded(row[i]));
+  return array;
+}
+
+Json rows_json(const MatrixXd& matrix, Index stride = 1) {
+  Json rows = Json::array();
+  for (Index k = 0; k < matrix.rows(); ++k) rows.push_back(row_json(matrix.row(k), stride));
+  return rows;
+}
+
+std::string matrix_mathml(const char* name, const std::vector<std::vector<Expression>>& rows) {
+  constexpr std::size_t longest = 60'000;  // characters; beyond it nobody reads the matrix
+  std::string body;
+  for (const auto& row : rows) {
+    body += "<mtr>";
+    for (const Expression entry : row) body += "<mtd><mrow>" + to_string(entry, Notation::mathml) + "</mrow></mtd>";
+    body += "</mtr>";
+    if (body.size() > longest) return "";
+  }
+  return fmt::format(
+      "<math xmlns=\"http://www.w3.org/1998/Math/MathML\" display=\"block\"><mrow><mi>{}</mi><mo>=</mo><mrow><mo>[</mo><mtable>{}"
+      "</mtable><mo>]</mo></mrow></mrow></math>",
+      name, body);
+}
+
+const char* level_word(ConstraintRow::Level level) {
+  return level == ConstraintRow::Level::position   ? "position"
+         : level == ConstraintRow::Level::velocity ? "velocity"
+                                                   : "acceleration";
+}
+
+Json model_json(const FitFile& fit) {
+  const System& system = *fit.model.system;
+  std::vector<std::vector<Expression>> A, b;
+  Json constraints = Json::array();
+  if (const SymbolicSystem* symbolic = fit.model.symbolic_system()) {
+    for (const ConstraintRow& row : symbolic->definition().constraints) {
+      A.push_back(row.A);
+      b.push_back({row.b});
+      constraints.push_back({{"text", row.text}, {"level", level_word(row.level)}});
+    }
+  } else {
+    for (const std::string& label : system.constraint_labels())
+      constraints.push_back({{"text", label}, {"level", "given by code"}});
+  }
+  Json coordinates = Json::array();
+  for (const Coordinate& coordinate : system.coordinates()) coordinates.push_back(coordinate.name);
+  return {{"name", system.name()},
+          {"file", fit.model.name},
+          {"coordinates", coordinates},
+          {"inputs", system.inputs()},
+          {"constraints", constraints},
+          {"A", A.empty() ? "" : matrix_mathml("A", A)},
+          {"b", b.empty() ? "" : matrix_mathml("b", b)}};
+}
+
+Json prior_json(const FitFile& fit) {
+  Json rows = Json::array();
+  const auto add = [&rows](const std::string& label, const std::string& value) { rows.push_back({label, value}); };
+  const Prior prior = fit.prior();
+  if (fit.prior_options.baseline) {
+    add("baseline", fmt::format("{}: learns ddq without mechanics", Baseline::word(fit.prior_options.baseline->kind)));
+  }
+  add("mean of ā", prior.mean == Prior::Mean::force      ? "M⁻¹F, the model's known force"
+                   : prior.mean == Prior::Mean::constant ? "constant, the mean of the training data"
+                                                         : "zero");
+  for (const Latent& latent : prior.latents) {
+    if (latent.kernel_is_fixed) {
+      add("latent " + latent.name, "small and fixed: what the kernel would rule out without reason");
+      continue;
+    }
+    add("latent " + latent.name,
+        fmt::format("{} of {}; acts on {}{}", latent.kernel.text(), fmt::join(latent.feature_names, ", "),
+                    fmt::join(latent.column_names, ", "), latent.base == Latent::Base::force ? " (forces)" : ""));
+  }
+  return rows;
+}
+
+Json observations_json(const FitFile& fit) {
+  const Prior home = fit.prior();
+  const ModelValues values = model_values(home, fit.observations, fit.report.hyperparameters);
+  Json groups = Json::array();
+  for (std::size_t g = 0; g < fit.observations.size(); ++g) {
+    const Observations& group = fit.observations[g];
+    const std::string latent = group.view.latent < 0 ? "" : home.latents[static_cast<std::size_t>(group.view.latent)].name;
+    Json noise = Json::array();
+    for (const double one : values.noise_stddev[g]) noise.push_back(number(one));
+    groups.push_back({{"names", group.view.names(*prior_of(home, group.view).system, latent)},
+                      {"n", group.n_data()},
+                      {"system", g < fit.systems.size() && fit.systems[g] ? fit.systems[g]->system->name() : ""},
+                      {"noise", noise},
+                      {"estimated", group.estimate_noise}});
+  }
+  return groups;
+}
+
+Json parameters_json(const FitFile& fit) {
+  Json rows = Json::array();
+  for (const Parameter& parameter : fit.model.system->parameters()) {
+    Json row = {{"name", parameter.name}, {"model", parameter.value}};
+    for (const Hyperparameter& h : fit.report.hyperparameters) {
+      if (h.kind != Hyperparameter::Kind::parameter || h.name != parameter.name) continue;
+      row["fitted"] = h.value;
+      row["lower"] = h.lower;
+      row["upper"] = h.upper;
+      row["at_bound"] = h.at_bound();
+    }
+    rows.push_back(row);
+  }
+  return rows;
+}
+
+Json hyperparameters_json(const FitReport& report) {
+  Json rows = Json::array();
+  for (const Hyperparameter& h : report.hyperparameters) {
+    rows.push_back({{"name", h.name},
+                    {"value", h.value},
+                    {"lower", h.lower},
+                    {"upper", h.upper},
+                    {"unit", h.unit},
+                    {"at_bound", h.at_bound()}});
+  }
+  return rows;
+}
+
+Json fit_json(const FitReport& report) {
+  Json restarts = Json::array();
+  for (const RestartReport& one : report.restarts) {
+    restarts.push_back({{"objective", number(one.objective)},
+                        {"nll", number(one.negative_log_likelihood)},
+                        {"iterations", one.iterations},
+                        {"evaluations", one.evaluations},
+                        {"failed", one.failed_evaluations},
+                        {"converged", one.converged},
+                        {"termination", one.termination}});
+  }
+  return {{"nll", report.negative_log_likelihood},
+          {"objective", report.objective},
+          {"converged", report.converged},
+          {"termination", report.termination},
+          {"iterations", report.iterations},
+          {"best_restart", report.best_restart},
+          {"restarts", restarts}};
+}
+
+Json figures_json(const ReportData& data) {
+  const Evaluation& e = data.evaluation;
+  const VectorXd truth = data.rmse_to_truth();
+  Json rmse = Json::array(), rmse_to_truth = Json::array();
+  for (Index k = 0; k < e.rmse.size(); ++k) {
+    rmse.push_back(number(e.rmse[k]));
+    rmse_to_truth.push_back(number(truth[k]));
+  }
+  return {{"outputs", data.outputs},
+          {"rmse", rmse},
+          {"rmse_to_truth", rmse_to_truth},
+          {"rmse_normalised", number(e.rmse_normalised)},
+          {"nrmse", number(e.nrmse)},
+          {"max_constraint_error", number(e.max_constraint_error)},
+          {"max_constraint_error_fitted", number(e.max_constraint_error_fitted)},
+          {"nlpd", number(e.nlpd)},
+          {"coverage95", number(e.coverage95)},
+          {"nlpd_latent", number(e.nlpd_latent)},
+          {"coverage95_latent", number(e.coverage95_latent)},
+          {"n_zero_variance", e.n_zero_variance},
+          {"n", e.n}};
+}
+
+VectorXd nominal_levels() {
+  VectorXd levels(21);
+  levels << VectorXd::LinSpaced(20, 0, 0.95), 0.99;
+  return levels;
+}
+
+Json data_json(const Report& report, const ReportData& data) {
+  const System& system = *report.fit.model.system;
+  const Index n = data.measured.cols();
+  const Index stride = (n + max_drawn - 1) / max_drawn;
+  const std::vector<std::string> names = system.state_names();
+  Json columns = Json::object();
+  for (std::size_t k = 0; k < names.size(); ++k) {
+    const auto row = data.states.row(static_cast<Index>(k));
+    if (!row.hasNaN()) columns[names[k]] = row_json(row, stride);
+  }
+  Json features = Json::array();
+  for (const auto& [name, values] : data.features) {
+    features.push_back(name);
+    if (!columns.contains(name)) columns[name] = row_json(values, stride);
+  }
+  const VectorXd levels = nominal_levels();
+  Json noise = Json::array();
+  for (const double one : data.noise_stddev) noise.push_back(number(one));
+  Json json = {{"name", data.name},
+               {"source", data.source},
+               {"test", data.is_test},
+               {"n", n},
+               {"stride", stride},
+               {"outputs", data.outputs},
+               {"rows", data.rows},
+               {"features", features},
+               {"figures", figures_json(data)},
+               {"noise", noise},
+               {"levels", row_json(levels)},
+               {"coverage", rows_json(coverage(data, levels).transpose())},
+               {"columns", columns},
+               {"measured", rows_json(data.measured, stride)},
+               {"predicted", rows_json(data.predicted, stride)},
+               {"stddev", rows_json(data.stddev, stride)},
+               {"unconstrained", rows_json(data.unconstrained, stride)},
+               {"unconstrained_stddev", rows_json(data.unconstrained_stddev, stride)},
+               {"constraint_error", rows_json(data.constraint_error, stride)}};
+  if (data.truth.cols() > 0) json["truth"] = rows_json(data.truth, stride);
+  return json;
+}
+
+Json relevance_json(const std::vector<Relevance>& all) {
+  Json rows = Json::array();
+  for (const Relevance& one : all) {
+    rows.push_back({{"latent", one.latent},
+                    {"feature", one.feature},
+                    {"lengthscale", one.lengthscale},
+                    {"spread", one.spread},
+                    {"relevance", number(one.relevance)},
+                    {"effect", one.effect ? number(*one.effect) : Json()}});
+  }
+  return rows;
+}
+
+Json surface_json(const ConstraintSurface& surface) {
+  Json sheets = Json::array();
+  for (const MatrixXd& sheet : surface.sheets) sheets.push_back(rows_json(sheet));
+  return {{"first", surface.first},
+          {"second", surface.second},
+          {"solved", surface.solved},
+          {"first_grid", row_json(surface.first_grid)},
+          {"second_grid", row_json(surface.second_grid)},
+          {"sheets", sheets}};
+}
+
+Json advice_json(const std::vector<Advice>& all) {
+  Json rows = Json::array();
+  for (const Advice& one : all) {
+    const char* level = one.level == Advice::Level::warning ? "warning" : one.level == Advice::Level::note ? "note" : "good";
+    rows.push_back({{"level", level}, {"text", one.text}, {"mend", one.mend}});
+  }
+  return rows;
+}
+
+void replace_all(std::string& text, std::string_view from, std::string_view to) {
+  for (std::size_t at = text.find(from); at != std::string::npos; at = text.find(from, at + to.size())) {
+    text.replace(at, from.size(), to);
+  }
+}
+
+// text between tags
+std::string html_text(std::string text) {
+  replace_all(text, "&", "&amp;");
+  replace_all(text, "<", "&lt;");
+  replace_all(text, ">", "&gt;");
+  return text;
+}
+
+}  // namespace
+
+std::string report_json(const Report& report) {
+  Json json = {{"version", version()},
+               {"library", report.library},
+               {"date", report.file_date},
+               {"source", report.fit.data_source},
+               {"truth", report.truth_source},
+               {"model", model_json(report.fit)},
+               {"prior", prior_json(report.fit)},
+               {"observations", observations_json(report.fit)},
+               {"parameters", parameters_json(report.fit)},
+               {"hyperparameters", hyperparameters_json(report.fit.report)},
+               {"fit", fit_json(report.fit.report)},
+               {"advice", advice_json(learning_advice(report))},
+               {"relevance", relevance_json(report.relevance)},
+               {"data", Json::array()}};
+  for (const ReportData& data : report.data) json["data"].push_back(data_json(report, data));
+  if (report.surface) json["surface"] = surface_json(*report.surface);
+  std::string text = json.dump(-1, ' ', /*ensure_ascii=*/true, Json::error_handler_t::replace);
+  // a < stands in strings only; written so it can neither end the element nor open a comment
+  replace_all(text, "<", "\\u003c");
+  return text;
+}
+
+std::string report_page(const Report& report) {
+  const std::vector<std::pair<std::string_view, std::string>> parts = {
+      {"{{title}}", html_text(report.fit.model.system->name())},
+      {"{{uplot_css}}", std::string(assets::uplot_css)},
+      {"{{style}}", std::string(assets::report_css)},
+      {"{{uplot_license}}", std::string(assets::uplot_license)},
+      {"{{uplot}}", std::string(assets::uplot_js)},
+      {"{{script}}", std::string(assets::report_js)},
+      {"{{data}}", report_json(report)},
+  };
+  // one pass over the template, so that what is put in is never read for marks
+  std::string page;
+  std::string_view rest = assets::page_html;
+  while (!rest.empty()) {
+    const std::size_t mark = std::min(rest.find("{{"), rest.size());
+    page += rest.substr(0, mark);
+    rest.remove_prefix(mark);
+    const auto part = std::find_if(parts.begin(), parts.end(), [&](const auto& one) { return rest.starts_with(one.first); });
+    if (part == parts.end()) {
+      page += rest.substr(0, 2);
+      rest.remove_prefix(std::min<std::size_t>(2, rest.size()));
+    } else {
+      page += part->second;
+      rest.remove_prefix(part->first.size());
+    }
+  }
+  return page;
+}
+
+}  // namespace gp2::command

@@ -1,0 +1,63 @@
+"""Learn the dynamics of constrained mechanical systems from data.
+
+    system = gp2.System.load("surface.toml")
+    posterior = gp2.fit(system, "log.csv", mean="force")
+    prediction = posterior.predict("test.csv")  # .mean, .std, .cov
+
+Every prediction obeys the constraint A(q, dq, t) ddq = b(q, dq, t) to rounding (Geist & Trimpe 2020). Arrays of states are
+(n, len(system.state_names)), with the columns q, dq, t, u.
+"""
+
+from gp2._gp2 import (
+    Evaluation,
+    Finding,
+    FitReport,
+    Hyperparameter,
+    InputError,
+    Knowledge,
+    Log,
+    Mechanics,
+    Motion,
+    NumericalError,
+    Posterior,
+    Prediction,
+    Predictor,
+    Progress,
+    RestartReport,
+    System,
+    Table,
+    __version__,
+    blas_report,
+    check,
+    fit,
+    load,
+    read_csv,
+    simulate,
+)
+
+__all__ = [
+    "Evaluation",
+    "Finding",
+    "FitReport",
+    "Hyperparameter",
+    "InputError",
+    "Knowledge",
+    "Log",
+    "Mechanics",
+    "Motion",
+    "NumericalError",
+    "Posterior",
+    "Prediction",
+    "Predictor",
+    "Progress",
+    "RestartReport",
+    "System",
+    "Table",
+    "__version__",
+    "blas_report",
+    "check",
+    "fit",
+    "load",
+    "read_csv",
+    "simulate",
+]

@@ -1,0 +1,79 @@
+"""The text of a model file (TOML) from Python values."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from numbers import Integral, Real
+from typing import Any
+
+
+def model_text(
+    *,
+    coordinates: Sequence[Any],
+    mass: Sequence[Sequence[Any]] | None = None,
+    name: str | None = None,
+    inputs: Sequence[str] = (),
+    parameters: Mapping[str, Any] | None = None,
+    let: Mapping[str, Any] | None = None,
+    force: Sequence[Any] | None = None,
+    potential: Any = None,
+    constraints: Any = (),
+    latents: Sequence[Mapping[str, Any]] = (),
+    noise: Any = None,
+    truth: Any = None,
+    sampling: Mapping[str, Any] | None = None,
+    columns: Mapping[str, str] | None = None,
+) -> str:
+    mechanics = {"mass": mass, "force": force, "potential": potential}
+    if not isinstance(constraints, Mapping):
+        constraints = {"position": constraints} if constraints else {}
+    if noise is not None and not (isinstance(noise, Mapping) and "ddq" in noise):
+        noise = {"ddq": noise}
+    if truth is not None and not isinstance(truth, Mapping):
+        truth = {"acceleration": truth}
+
+    lines = [f"name = {_value(name)}"] if name is not None else []
+    lines += [f"coordinates = {_value(coordinates)}", f"inputs = {_value(inputs)}"]
+    tables = {
+        "parameters": parameters,
+        "let": let,
+        "mechanics": mechanics,
+        "constraints": constraints,
+        "noise": noise,
+        "truth": truth,
+        "sampling": sampling,
+        "columns": columns,
+    }
+    for table, entries in tables.items():
+        if written := _entries(entries or {}):
+            lines += ["", f"[{table}]", *written]
+    for latent in latents:
+        lines += ["", "[[latent]]", *_entries(latent)]
+    return "\n".join(lines) + "\n"
+
+
+def _entries(table: Mapping[str, Any]) -> list[str]:
+    return [f"{_key(key)} = {_value(value)}" for key, value in table.items() if value is not None]
+
+
+def _key(key: str) -> str:
+    return key if key.isidentifier() and key.isascii() else json.dumps(key)
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    if isinstance(value, Integral):
+        return repr(int(value))
+    if isinstance(value, Real):
+        return repr(float(value))
+    if isinstance(value, Mapping):
+        return "{ " + ", ".join(_entries(value)) + " }"
+    if hasattr(value, "tolist"):  # of NumPy
+        value = value.tolist()
+    if isinstance(value, Sequence):
+        return "[" + ", ".join(_value(entry) for entry in value) + "]"
+    raise TypeError(f"a model holds text, numbers, lists and mappings, not {type(value).__name__}: {value!r}")

@@ -1,0 +1,268 @@
+"""A scikit-learn estimator around gp2.fit.
+
+    model = GP2Regressor("surface.toml", mean="force").fit(X, y)
+    ddq, std = model.predict(X, return_std=True)
+"""
+
+from __future__ import annotations
+
+import copyreg
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
+from sklearn.utils import check_random_state
+from sklearn.utils.validation import check_is_fitted
+
+import gp2
+
+try:
+    from sklearn.utils.validation import validate_data
+except ImportError:  # scikit-learn before 1.6
+
+    def validate_data(estimator, *arguments, **options):
+        return estimator._validate_data(*arguments, **options)
+
+
+def _read_system(text: str, name: str) -> gp2.System:
+    return gp2.System.parse(text, name)
+
+
+def _reduce_system(system: gp2.System):
+    try:
+        _read_system(system.text, system.name)
+    except gp2.InputError as error:  # of System.from_callables
+        raise TypeError(f"'{system.name}' cannot be pickled: its mechanics are functions") from error
+    return _read_system, (system.text, system.name)
+
+
+# clone() copies the parameters of an estimator, joblib pickles them. A system never changes: it is its own copy, and travels as
+# text. pprint, by which an estimator shows them, wants a __repr__ with a hash; that of a class from C++ has none
+gp2.System.__deepcopy__ = lambda self, memo: self
+gp2.System.__repr__ = lambda self, _repr=gp2.System.__repr__: _repr(self)
+copyreg.pickle(gp2.System, _reduce_system)
+
+
+class GP2Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
+    """Learn accelerations ddq = f(q, dq, t, u) that obey the constraints of a mechanical system (Geist & Trimpe 2020).
+
+    X holds states. An array has the columns of `system.state_names`: q, dq, t, u. A pandas frame has columns by these names, in
+    any order; one that the system does not read may be missing. y holds measured accelerations: an array with the columns of
+    `system.acceleration_names` or of `observe`, (n,) where it is one, or a frame by name, whose columns are what is observed.
+    Predictions have the shape and the columns of y.
+
+    Parameters
+    ----------
+    system : gp2.System, path of a model file, or None
+        None knows no mechanics: an ordinary Gaussian process from the columns of X to each of y, with one kernel for all.
+    mean, prior, baseline, estimate, discrepancy
+        As in gp2.fit.
+    observe : names of accelerations, the columns of y; default: those of y where it is a frame, else all.
+    noise_std : standard deviation of y, or 'estimate'; default: the system's, which for None is estimated.
+    n_restarts : runs of the optimiser; default: 5, of a baseline 30.
+    max_iterations : of each run; 0 keeps the starting values.
+    n_threads : 0 stands for all cores. The result does not depend on it.
+    random_state : int, RandomState or None: the starts of the runs. Same int, same bits.
+
+    Attributes
+    ----------
+    posterior_ : gp2.Posterior, which can do more: other views, transfer, simulation.
+    system_ : gp2.System
+    outputs_ : names of the columns of y
+    log_marginal_likelihood_value_ : log p(y) at the fitted values, without hyper-prior
+    n_features_in_, feature_names_in_ : as scikit-learn has them
+
+    Where it differs from sklearn.gaussian_process.GaussianProcessRegressor: y (n, 1) is predicted as (n, 1), not (n,); before
+    fit, predict raises NotFittedError; samples of several outputs belong together, so that each obeys the constraint;
+    random_state is 0 unless given. Standard deviations and covariances are those of the function, without measurement noise.
+    """
+
+    def __init__(
+        self,
+        system=None,
+        *,
+        mean="zero",
+        prior=None,
+        baseline=None,
+        observe=None,
+        noise_std=None,
+        estimate=None,
+        discrepancy=True,
+        n_restarts=None,
+        max_iterations=1000,
+        n_threads=0,
+        random_state=0,
+    ):
+        self.system = system
+        self.mean = mean
+        self.prior = prior
+        self.baseline = baseline
+        self.observe = observe
+        self.noise_std = noise_std
+        self.estimate = estimate
+        self.discrepancy = discrepancy
+        self.n_restarts = n_restarts
+        self.max_iterations = max_iterations
+        self.n_threads = n_threads
+        self.random_state = random_state
+
+    def fit(self, X, y) -> GP2Regressor:
+        """Fit to states X (n, len(state_names)) and accelerations y (n, nq) or (n,).
+
+        Raises gp2.InputError, a ValueError, where X, y, the options and the system do not go together; gp2.NumericalError.
+        """
+        system = self._given_system()
+        if system is not None:
+            outputs = self._outputs(system, y)
+            y = _columns_by_name(y, outputs)
+        X, y = validate_data(self, X, y, dtype=np.float64, multi_output=True, y_numeric=True, ensure_min_samples=2)
+        rows = y.reshape(len(y), -1).astype(np.float64)
+        self.system_ = _system_without_mechanics(X.shape[1], rows) if system is None else system
+        self.outputs_ = self.system_.acceleration_names if system is None else outputs
+        self._is_flat = y.ndim == 1
+        self._columns = self._columns_in_state(X)
+        if rows.shape[1] != len(self.outputs_):
+            raise gp2.InputError(f"y: expected columns {', '.join(self.outputs_)}; got shape {y.shape}")
+
+        names = self.system_.acceleration_names
+        accelerations = np.full((len(rows), len(names)), np.nan)
+        accelerations[:, self._rows_of_view()] = rows
+        self.posterior_ = gp2.fit(
+            self.system_,
+            (self._states(X), accelerations),
+            observe=self.outputs_ if len(self.outputs_) < len(names) else [],
+            mean=self.mean,
+            prior=self.prior,
+            baseline=self.baseline,
+            noise_std=self.noise_std,
+            estimate=self.estimate,
+            discrepancy=self.discrepancy,
+            restarts=self.n_restarts,
+            max_iterations=self.max_iterations,
+            threads=self.n_threads,
+            seed=_seed(self.random_state),
+        )
+        self.log_marginal_likelihood_value_ = -self.posterior_.negative_log_likelihood
+        return self
+
+    def predict(self, X, return_std: bool = False, return_cov: bool = False):
+        """Mean (n, d), or (n,) for a flat y; then its standard deviation, of that shape, or its covariance.
+
+        The covariance (n, n, d), or (n, n), is that of each output over all states. `posterior_.predict` has the one between the
+        outputs at each state, `posterior_.joint` both.
+        """
+        if return_std and return_cov:
+            raise ValueError("return_std, return_cov: at most one of them")
+        states = self._checked_states(X)
+        rows = self._rows_of_view()
+        if return_cov:
+            n, nq = len(states), len(self.system_.acceleration_names)
+            mean, covariance = self.posterior_.joint(states)
+            blocks = covariance.reshape(n, nq, n, nq)[:, rows, :, rows]  # (d, n, n)
+            return self._as_y(mean.reshape(n, nq)[:, rows]), self._as_y(np.moveaxis(blocks, 0, -1))
+        prediction = self.posterior_.predict(states, mean_only=not return_std, threads=self.n_threads)
+        mean = self._as_y(prediction.mean[:, rows])
+        return (mean, self._as_y(prediction.std[:, rows])) if return_std else mean
+
+    def sample_y(self, X, n_samples: int = 1, random_state=0) -> np.ndarray:
+        """Functions drawn from the posterior, at X: (n, d, n_samples), or (n, n_samples) for a flat y."""
+        states = self._checked_states(X)
+        samples = self.posterior_.sample(states, n_samples, seed=_seed(random_state))[:, :, self._rows_of_view()]
+        samples = np.transpose(samples, (1, 2, 0))
+        return samples[:, 0] if self._is_flat else samples
+
+    def score(self, X, y, sample_weight=None) -> float:
+        """R² of the prediction, the mean over the columns of y."""
+        check_is_fitted(self)
+        return super().score(X, y if self.system is None else _columns_by_name(y, self.outputs_), sample_weight)
+
+    def _given_system(self) -> gp2.System | None:
+        return self.system if self.system is None or isinstance(self.system, gp2.System) else gp2.System.load(self.system)
+
+    def _outputs(self, system: gp2.System, y) -> list[str]:
+        names = system.acceleration_names
+        if self.observe is not None:
+            what, outputs = "observe", [self.observe] if isinstance(self.observe, str) else list(self.observe)
+        else:
+            what, outputs = "y", list(y.columns) if hasattr(y, "columns") else names
+        unknown = [str(name) for name in outputs if name not in names]
+        if unknown:
+            raise gp2.InputError(f"{what}: {', '.join(unknown)}: no acceleration of '{system.name}': {', '.join(names)}")
+        return outputs
+
+    def _columns_in_state(self, X: np.ndarray) -> list[int]:
+        names = self.system_.state_names
+        if self.system is None:
+            return [names.index(name) for name in self.system_.inputs]
+        given = getattr(self, "feature_names_in_", names)
+        unknown = [name for name in given if name not in names]
+        if unknown:
+            raise gp2.InputError(f"X: {', '.join(unknown)}: no part of a state of '{self.system_.name}': {', '.join(names)}")
+        if X.shape[1] != len(given):
+            raise gp2.InputError(f"X: expected {len(names)} columns, {', '.join(names)}; got {X.shape[1]} feature(s)")
+        return [names.index(name) for name in given]
+
+    def _states(self, X: np.ndarray) -> np.ndarray:
+        states = np.full((len(X), len(self.system_.state_names)), np.nan)
+        states[:, self._columns] = X
+        return states
+
+    def _checked_states(self, X) -> np.ndarray:
+        check_is_fitted(self)
+        return self._states(validate_data(self, X, dtype=np.float64, reset=False))
+
+    def _rows_of_view(self) -> list[int]:
+        return [self.system_.acceleration_names.index(name) for name in self.outputs_]
+
+    def _as_y(self, values: np.ndarray) -> np.ndarray:
+        return values[..., 0] if self._is_flat else values
+
+    # a posterior travels as the text of its file
+    def __getstate__(self) -> dict[str, Any]:
+        state = dict(super().__getstate__())
+        if "posterior_" in state:
+            with tempfile.TemporaryDirectory() as folder:
+                path = Path(folder, "fit.json")
+                state["posterior_"].save(path)
+                state["posterior_"] = path.read_bytes()
+        return state
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        state = dict(state)
+        if "posterior_" in state:
+            with tempfile.TemporaryDirectory() as folder:
+                path = Path(folder, "fit.json")
+                path.write_bytes(state["posterior_"])
+                state["posterior_"] = gp2.load(path)
+        super().__setstate__(state)
+
+
+def _system_without_mechanics(n_features: int, y: np.ndarray) -> gp2.System:
+    """Unit masses without constraints, pushed by functions of free inputs."""
+    features = [f"x{k + 1}" for k in range(n_features)]
+    outputs = [f"y{k + 1}" for k in range(y.shape[1])]
+    return gp2.System(
+        name="without mechanics",
+        coordinates=outputs,
+        inputs=features,
+        mass=np.eye(len(outputs)),
+        latents=[{"features": features}],
+        noise={"estimate": True, "initial": 0.1 * (y.std() or 1.0)},
+    )
+
+
+def _columns_by_name(y, names: list[str]):
+    if not hasattr(y, "columns"):
+        return y
+    missing = [name for name in names if name not in y.columns]
+    if missing:
+        raise gp2.InputError(f"y: no column {', '.join(missing)}; it has: {', '.join(map(str, y.columns))}")
+    return y[names]
+
+
+def _seed(random_state) -> int:
+    if isinstance(random_state, (int, np.integer)):
+        return int(random_state)
+    return int(check_random_state(random_state).randint(2**31))

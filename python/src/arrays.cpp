@@ -1,0 +1,99 @@
+#include "arrays.hpp"
+
+#include <memory>
+#include <new>
+
+#include <fmt/format.h>
+#include <fmt/ranges.h>
+
+#include "gp2/error.hpp"
+
+namespace gp2::python {
+
+namespace {
+
+using DoubleArray = py::array_t<double, py::array::c_style>;
+
+std::string shape_text(const py::array& array) {
+  std::vector<py::ssize_t> shape(array.shape(), array.shape() + array.ndim());
+  return fmt::format("({}{})", fmt::join(shape, ", "), shape.size() == 1 ? "," : "");
+}
+
+// itself where it holds C-contiguous doubles
+DoubleArray doubles(const py::object& object, const std::string& what) {
+  const py::array array = py::array::ensure(object);
+  if (!array) {
+    PyErr_Clear();
+    throw py::type_error(fmt::format("{}: expected an array of numbers, got {}", what, std::string(py::str(object.get_type()))));
+  }
+  const char kind = array.dtype().kind();
+  if (kind != 'f' && kind != 'i' && kind != 'u') {
+    throw py::type_error(
+        fmt::format("{}: expected an array of real numbers, got one of dtype {}", what, std::string(py::str(array.dtype()))));
+  }
+  DoubleArray values = py::array_t<double, py::array::c_style | py::array::forcecast>::ensure(array);
+  if (!values) throw std::bad_alloc();
+  return values;
+}
+
+// an array that owns `values`
+template <typename Values>
+py::array own(Values values, const std::vector<py::ssize_t>& shape) {
+  auto* kept = new Values(std::move(values));
+  const py::capsule owner(kept, [](void* memory) { delete static_cast<Values*>(memory); });
+  return py::array_t<double>(shape, kept->data(), owner);
+}
+
+}  // namespace
+
+Rows::Rows(const py::object& array, const std::vector<std::string>& names, const std::string& what)
+    : array_(doubles(array, what)) {
+  const auto d = static_cast<py::ssize_t>(names.size());
+  if (array_.ndim() != 2 || array_.shape(1) != d) {
+    const bool one = array_.ndim() == 1 && array_.shape(0) == d;
+    throw InputError(fmt::format("{}: expected shape (n, {}), columns {}; got {}{}", what, d, fmt::join(names, ", "),
+                                 shape_text(array_), one ? "; of one row write array[None, :]" : ""));
+  }
+}
+
+Eigen::Map<const Eigen::MatrixXd> Rows::matrix() const { return {array_.data(), array_.shape(1), array_.shape(0)}; }
+
+py::array_t<double, py::array::c_style> vector_argument(const py::object& array, Eigen::Index size, const std::string& what) {
+  DoubleArray values = doubles(array, what);
+  if (values.ndim() != 1 || values.shape(0) != size) {
+    throw InputError(fmt::format("{}: expected shape ({},), got {}", what, size, shape_text(values)));
+  }
+  return values;
+}
+
+py::array_t<double, py::array::c_style> vector_argument(const py::object& array, const std::string& what) {
+  DoubleArray values = doubles(array, what);
+  if (values.ndim() != 1) throw InputError(fmt::format("{}: expected shape (n,), got {}", what, shape_text(values)));
+  return values;
+}
+
+bool is_array(const py::object& data) {
+  if (py::isinstance<py::list>(data) || py::isinstance<py::tuple>(data)) return true;
+  return py::hasattr(data, "shape") && !py::hasattr(data, "keys");
+}
+
+py::array to_rows(Eigen::MatrixXd columns) {
+  const std::vector<py::ssize_t> shape = {columns.cols(), columns.rows()};
+  return own(std::move(columns), shape);
+}
+
+py::array to_matrices(const Eigen::MatrixXd& blocks, Eigen::Index rows, Eigen::Index columns) {
+  Eigen::MatrixXd row_major(blocks.rows(), blocks.cols());
+  for (Eigen::Index i = 0; i < blocks.cols(); ++i) {
+    row_major.col(i).reshaped(columns, rows) = blocks.col(i).reshaped(rows, columns).transpose();
+  }
+  const std::vector<py::ssize_t> shape = {blocks.cols(), rows, columns};
+  return own(std::move(row_major), shape);
+}
+
+py::array to_vector(Eigen::VectorXd values) {
+  const std::vector<py::ssize_t> shape = {values.size()};
+  return own(std::move(values), shape);
+}
+
+}  // namespace gp2::python

@@ -1,0 +1,45 @@
+#pragma once
+
+#include <string>
+#include <vector>
+
+#include <pybind11/numpy.h>
+#include <pybind11/pybind11.h>
+#include <Eigen/Core>
+
+#include "gp2/system.hpp"
+
+namespace gp2::python {
+
+namespace py = pybind11;
+
+/// Numbers as the library takes them: column i is row i of a NumPy array (n, d). C-contiguous doubles are looked at in place, all
+/// else that holds real numbers is converted.
+class Rows {
+ public:
+  /// @param what  stands for the argument in messages
+  /// @throws py::type_error when the array does not hold real numbers; InputError when it is not (n, names.size()).
+  Rows(const py::object& array, const std::vector<std::string>& names, const std::string& what);
+
+  [[nodiscard]] Eigen::Map<const Eigen::MatrixXd> matrix() const;  // (d × n)
+
+ private:
+  py::array_t<double, py::array::c_style> array_;
+};
+
+/// A vector of `size` numbers. @throws as Rows.
+py::array_t<double, py::array::c_style> vector_argument(const py::object& array, Eigen::Index size, const std::string& what);
+
+/// The same of any size.
+py::array_t<double, py::array::c_style> vector_argument(const py::object& array, const std::string& what);
+
+/// Whether an argument is an array rather than a table: a list or tuple, or what has a shape, but no named columns.
+bool is_array(const py::object& data);
+
+/// (n, d) from a matrix (d × n), whose memory it takes over.
+py::array to_rows(Eigen::MatrixXd columns);
+/// (n, r, c) from a matrix of n columns, each a column-major matrix (r × c).
+py::array to_matrices(const Eigen::MatrixXd& blocks, Eigen::Index rows, Eigen::Index columns);
+py::array to_vector(Eigen::VectorXd values);
+
+}  // namespace gp2::python

@@ -1,0 +1,121 @@
+#pragma once
+
+#include <atomic>
+#include <chrono>
+#include <exception>
+#include <future>
+#include <map>
+#include <memory>
+#include <optional>
+#include <string>
+#include <vector>
+
+#include <pybind11/pybind11.h>
+#include <Eigen/Core>
+
+#include "arrays.hpp"
+#include "gp2/csv.hpp"
+#include "gp2/error.hpp"
+#include "gp2/fit_file.hpp"
+#include "gp2/model_file.hpp"
+#include "gp2/posterior.hpp"
+
+namespace gp2::python {
+
+// One function per group of classes; each adds them to the module.
+void add_table(py::module_& module);
+void add_system(py::module_& module);
+void add_posterior(py::module_& module);
+void add_fit(py::module_& module);
+void add_predictor(py::module_& module);
+
+/// gp2.System: a model file.
+struct PySystem {
+  std::shared_ptr<const ModelFile> model;
+  MechanicsSource mechanics = {};  // where they are Python functions
+
+  [[nodiscard]] const System& system() const { return *model->system; }
+};
+
+/// System.from_callables.
+void add_callables(py::class_<PySystem>& system);
+
+/// gp2.Posterior: what a fit file holds, conditioned.
+struct PyPosterior {
+  FitFile file;  // without observations: those of `posterior`, which may grow
+  Posterior posterior;
+  std::vector<std::string> notes;
+  MechanicsSource mechanics = {};  // of the system, as in PySystem
+
+  [[nodiscard]] const System& system() const { return *file.model.system; }
+};
+
+/// A str, bytes or os.PathLike.
+std::string path_argument(const py::object& path);
+
+/// A table from a gp2.Table, a path, a pandas frame, or a mapping of column names to arrays.
+/// @param what  stands for the argument in messages
+CsvTable to_table(const py::object& data, const std::string& what);
+
+/// The model's name -> the log's name. @throws py::type_error
+std::map<std::string, std::string> columns_argument(const py::object& columns);
+
+/// @throws InputError when there is a value and it is smaller.
+void require_at_least(int smallest, const std::optional<int>& value, const char* what);
+
+/// Tells the notes of a reading: warnings through Python's warnings, the rest through the logger "gp2".
+void tell(const std::vector<std::string>& notes);
+
+/// States of an array (n, layout size), looked at in place where they are C-contiguous doubles, or of a table by column names.
+class States {
+ public:
+  /// @throws InputError when an entry that the prior or the view reads is not finite; as Rows and read_log_states.
+  States(const py::object& data, const Prior& prior, const View& view, const ModelFile& model, const py::object& columns);
+
+  [[nodiscard]] Eigen::Map<const Eigen::MatrixXd> matrix() const;  // (layout size × n)
+
+  /// work(), with the table named in what it throws: a posterior knows the number of a state only.
+  template <typename Work>
+  auto named(const Work& work) const {
+    try {
+      return work();
+    } catch (const InputError& error) {
+      if (array_) throw;
+      throw InputError(table_ + ": " + error.what());
+    }
+  }
+
+ private:
+  std::optional<Rows> array_;
+  Eigen::MatrixXd read_;
+  std::string table_;
+};
+
+/// A view by its word. @throws InputError listing the words.
+View::Quantity quantity_argument(const std::string& word);
+
+/// work(), in another thread and without the GIL. This thread looks for signals and calls poll() twenty times a second; a signal
+/// whose handler raises sets `stop`, after which work() is waited for.
+/// @param raised  what the handler raised, if it did
+template <typename Work, typename Poll>
+auto run_interruptibly(const Work& work, std::atomic<bool>& stop, std::exception_ptr& raised, const Poll& poll) {
+  auto result = std::async(std::launch::async, work);
+  while (true) {
+    bool ready = false;
+    {
+      const py::gil_scoped_release release;
+      ready = result.wait_for(std::chrono::milliseconds(50)) == std::future_status::ready;
+    }
+    if (ready) return result.get();
+    if (raised) continue;
+    try {
+      if (PyErr_CheckSignals() != 0) throw py::error_already_set();
+      poll();
+    } catch (...) {
+      raised = std::current_exception();
+      stop = true;
+    }
+  }
+}
+
+}  // namespace gp2::python

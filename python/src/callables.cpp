@@ -1,0 +1,209 @@
+// Systems whose mechanics are Python functions.
+
+#include "gp2/callable_system.hpp"
+
+#include <fmt/format.h>
+#include <fmt/ranges.h>
+#include <pybind11/stl.h>
+
+#include "arrays.hpp"
+#include "bindings.hpp"
+#include "gp2/error.hpp"
+
+namespace gp2::python {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+
+namespace {
+
+/// A Python function that C++ may copy, call and let go of without the GIL.
+class Function {
+ public:
+  explicit Function(py::object function)
+      : function_(new py::object(std::move(function)), [](py::object* last) {
+          const py::gil_scoped_acquire acquire;
+          delete last;
+        }) {}
+
+  /// with the GIL held
+  template <typename... Arguments>
+  py::object operator()(Arguments&&... arguments) const {
+    return (*function_)(std::forward<Arguments>(arguments)...);
+  }
+
+ private:
+  std::shared_ptr<py::object> function_;
+};
+
+using Shape = std::vector<py::ssize_t>;
+
+/// What a function returned for one quantity, as doubles. @throws InputError naming function, quantity and shapes.
+py::array_t<double, py::array::c_style> returned(const py::object& object, const char* function, const char* quantity,
+                                                 const char* wanted, const Shape& shape) {
+  const py::array array = py::array::ensure(object);
+  if (!array) PyErr_Clear();
+  const bool fits = array && Shape(array.shape(), array.shape() + array.ndim()) == shape;
+  const char kind = fits ? array.dtype().kind() : 'O';
+  if (!fits || (kind != 'f' && kind != 'i' && kind != 'u')) {
+    std::string got = std::string(py::str(py::type::of(object)));
+    if (array) {
+      got = fmt::format("({}) of {}", fmt::join(array.shape(), array.shape() + array.ndim(), ", "),
+                        std::string(py::str(array.dtype())));
+    }
+    throw InputError(fmt::format("{}: {} must be numbers of shape {} = ({}), got {}", function, quantity, wanted,
+                                 fmt::join(shape, ", "), got));
+  }
+  return py::array_t<double, py::array::c_style | py::array::forcecast>::ensure(array);
+}
+
+py::dict by_name(const std::vector<Parameter>& parameters, const CallableSystem::Parameters& values) {
+  py::dict out;
+  for (std::size_t k = 0; k < parameters.size(); ++k) out[py::str(parameters[k].name)] = values[static_cast<Index>(k)];
+  return out;
+}
+
+/// (M, A, b, F) of a function. M and A hold a row-major matrix per state, SystemValues column-major ones.
+SystemValues values_of(const py::object& result, const char* function, Index n, Index nq, Index nc) {
+  if (!py::isinstance<py::sequence>(result) || py::len(result) != 4) {
+    throw InputError(fmt::format("{}: expected (M, A, b, F), got {}", function, std::string(py::str(py::type::of(result)))));
+  }
+  const py::sequence parts = result;
+  SystemValues values;
+  const auto matrices = [&](const py::object& part, const char* quantity, const char* wanted, Index rows) {
+    MatrixXd blocks(rows * nq, n);
+    if (rows == 0) return blocks;  // of A where nothing constrains: may be None
+    const auto array = returned(part, function, quantity, wanted, {n, rows, nq});
+    const Eigen::Map<const MatrixXd> row_major(array.data(), rows * nq, n);
+    for (Index i = 0; i < n; ++i) blocks.col(i).reshaped(rows, nq) = row_major.col(i).reshaped(nq, rows).transpose();
+    return blocks;
+  };
+  const auto vectors = [&](const py::object& part, const char* quantity, const char* wanted, Index rows) {
+    if (rows == 0) return MatrixXd(0, n);
+    const auto array = returned(part, function, quantity, wanted, {n, rows});
+    return MatrixXd(Eigen::Map<const MatrixXd>(array.data(), rows, n));
+  };
+  values.mass = matrices(parts[0], "M", "(n, nq, nq)", nq);
+  values.constraint_matrix = matrices(parts[1], "A", "(n, nc, nq)", nc);
+  values.constraint_vector = vectors(parts[2], "b", "(n, nc)", nc);
+  values.force = vectors(parts[3], "F", "(n, nq)", nq);
+  return values;
+}
+
+// names of rows of A, or {"position": names, "velocity": names, "acceleration": names}
+std::vector<CallableSystem::Constraint> constraints_of(const py::object& given) {
+  std::vector<CallableSystem::Constraint> constraints;
+  const auto add = [&](const py::handle names, ConstraintLevel level) {
+    for (const auto& name : names.cast<std::vector<std::string>>()) constraints.push_back({name, level});
+  };
+  if (!py::isinstance<py::dict>(given)) {
+    add(given, ConstraintLevel::acceleration);
+    return constraints;
+  }
+  for (const auto& [key, names] : given.cast<py::dict>()) {
+    const auto word = key.cast<std::string>();
+    if (word == "position") {
+      add(names, ConstraintLevel::position);
+    } else if (word == "velocity") {
+      add(names, ConstraintLevel::velocity);
+    } else if (word == "acceleration") {
+      add(names, ConstraintLevel::acceleration);
+    } else {
+      throw InputError(fmt::format("constraints: expected 'position', 'velocity' or 'acceleration', got '{}'", word));
+    }
+  }
+  return constraints;
+}
+
+MechanicsSource source_of(const py::object& mechanics, const py::object& constraints, const py::object& derivatives,
+                          const py::object& residuals, const std::optional<std::vector<std::string>>& reads) {
+  const std::vector<CallableSystem::Constraint> rows = constraints_of(constraints);
+  const auto nc = static_cast<Index>(rows.size());
+  Index n_residuals = 0;
+  for (const CallableSystem::Constraint& row : rows) {
+    n_residuals += row.level == ConstraintLevel::position ? 2 : row.level == ConstraintLevel::velocity ? 1 : 0;
+  }
+  const auto optional = [](const py::object& function) {
+    return function.is_none() ? std::nullopt : std::optional(Function(function));
+  };
+  return [=, mechanics = Function(mechanics), derivatives = optional(derivatives),
+          residuals = optional(residuals)](const SystemDeclaration& declaration) {
+    CallableSystem::Definition definition;
+    definition.declaration = declaration;
+    definition.constraints = rows;
+    definition.mechanics_reads = definition.force_reads = definition.residuals_read = reads;
+    const auto nq = static_cast<Index>(declaration.coordinates.size());
+    const std::vector<Parameter> parameters = declaration.parameters;
+    using States = CallableSystem::States;
+    using Parameters = CallableSystem::Parameters;
+    definition.evaluate = [=](const States& states, const Parameters& values) {
+      const py::gil_scoped_acquire acquire;
+      return values_of(mechanics(to_rows(states), by_name(parameters, values)), "mechanics", states.cols(), nq, nc);
+    };
+    if (derivatives) {
+      definition.differentiate = [=](const States& states, const Parameters& values, int index) {
+        const py::gil_scoped_acquire acquire;
+        const std::string& name = parameters[static_cast<std::size_t>(index)].name;
+        return values_of((*derivatives)(to_rows(states), by_name(parameters, values), name), "derivatives", states.cols(), nq,
+                         nc);
+      };
+    }
+    if (residuals) {
+      definition.residuals = [=](const States& states, const Parameters& values) -> MatrixXd {
+        const py::gil_scoped_acquire acquire;
+        const py::object result = (*residuals)(to_rows(states), by_name(parameters, values));
+        const auto array = returned(result, "residuals", "the result", "(n, rows)", {states.cols(), n_residuals});
+        return Eigen::Map<const MatrixXd>(array.data(), n_residuals, states.cols());
+      };
+    }
+    return std::make_shared<const CallableSystem>(std::move(definition));
+  };
+}
+
+PySystem from_callables(const py::object& mechanics, const py::object& constraints, const py::object& derivatives,
+                        const py::object& residuals, const std::optional<std::vector<std::string>>& reads,
+                        const py::kwargs& kwargs) {
+  const auto require_function = [](const py::object& given, const char* name) {
+    if (PyCallable_Check(given.ptr()) == 1) return;
+    throw py::type_error(fmt::format("{}: expected a function, got {}", name, std::string(py::str(py::type::of(given)))));
+  };
+  require_function(mechanics, "mechanics");
+  if (!derivatives.is_none()) require_function(derivatives, "derivatives");
+  if (!residuals.is_none()) require_function(residuals, "residuals");
+  for (const char* key : {"mass", "force"}) {
+    if (kwargs.contains(key)) throw InputError(fmt::format("{}: the mechanics are code here; leave it out", key));
+  }
+  const py::object text = py::module_::import("gp2._model_text").attr("model_text")(**kwargs);
+  MechanicsSource source = source_of(mechanics, constraints, derivatives, residuals, reads);
+  auto model = std::make_shared<const ModelFile>(ModelFile::parse(text.cast<std::string>(), "System.from_callables(…)", source));
+  return {std::move(model), std::move(source)};
+}
+
+}  // namespace
+
+void add_callables(py::class_<PySystem>& system) {
+  using namespace py::literals;
+  system.def_static("from_callables", &from_callables, "mechanics"_a, "constraints"_a = py::tuple(), "derivatives"_a = py::none(),
+                    "residuals"_a = py::none(), "reads"_a = py::none(),
+                    R"(A system whose equations are functions, say of Pinocchio, MuJoCo or Drake.
+
+mechanics(states, parameters) -> (M, A, b, F)
+    states (n, len(state_names)), parameters {name: value}; M (n, nq, nq), A (n, nc, nq), b (n, nc), F (n, nq); A and b may be
+    None where nothing constrains
+constraints
+    names of the rows of A; or {"position": […], "velocity": […], "acceleration": […]}, rows in that order
+derivatives(states, parameters, name) -> (dM, dA, db, dF)
+    in one parameter, exact; default: central differences
+residuals(states, parameters) -> (n, rows)
+    c and dc/dt of each constraint at position level, c of each at velocity level; without them motions are not projected
+reads
+    names of the entries of a state that the functions read; a log needs these columns. Default: all, t too
+
+Every other keyword is that of System: coordinates, inputs, parameters, latents, noise, …; mass and force are left out.
+What the functions return is checked at every call. They are called with the interpreter's lock, one at a time. A fit of such a
+system is saved without them: gp2.load(path, system=this).
+
+Raises InputError naming the function, what was expected and what it returned.)");
+}
+
+}  // namespace gp2::python

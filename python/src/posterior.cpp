@@ -1,0 +1,608 @@
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <thread>
+
+#include <fmt/format.h>
+#include <fmt/ranges.h>
+#include <pybind11/stl.h>
+
+#include "arrays.hpp"
+#include "bindings.hpp"
+#include "gp2/error.hpp"
+#include "gp2/evaluation.hpp"
+#include "gp2/fit_problem.hpp"
+#include "gp2/pathwise.hpp"
+#include "gp2/simulate.hpp"
+
+namespace gp2::python {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+
+namespace {
+
+// ---------------------------------------------------------------- views
+
+/// What is looked at: a view, and the model of the system under which.
+struct Look {
+  View view;
+  const ModelFile* model = nullptr;
+  Prior prior;  // of that system
+  std::vector<std::string> names;
+};
+
+/// The keywords that name a view.
+struct ViewArguments {
+  std::string quantity = "constrained";
+  const PySystem* system = nullptr;
+  std::optional<std::string> latent;
+  std::optional<double> time_step;
+};
+
+// text that is the same is the same system; functions cannot be compared, but the system that they made can
+bool is_same(const ModelFile& a, const ModelFile& b) {
+  return a.system == b.system || (!a.mechanics_are_code && !b.mechanics_are_code && a.text == b.text);
+}
+
+Look look(const PyPosterior& self, const ViewArguments& arguments) {
+  const Prior& home = self.posterior.prior();
+  Look out{View{}, &self.file.model, home, {}};
+  const View::Quantity quantity = quantity_argument(arguments.quantity);
+  if (arguments.system != nullptr && !is_same(*arguments.system->model, self.file.model)) {
+    out.model = arguments.system->model.get();
+    const std::shared_ptr<const Setting> setting = make_setting(self.file.model, *out.model, self.file.prior_options);
+    out.prior = setting->prior;
+    out.view = View::all(quantity, *out.prior.system);
+    out.view.setting = setting;
+  } else {
+    out.view = View::all(quantity, *home.system);
+  }
+  if (out.view.size() == 0)
+    throw InputError(fmt::format("view '{}': '{}' has no constraints", arguments.quantity, out.prior.system->name()));
+  const bool needs_step = quantity == View::Quantity::next_velocity;
+  if (needs_step != arguments.time_step.has_value()) {
+    throw InputError(needs_step ? "view 'next-velocity' needs the time step dt [s]" : "dt goes with view 'next-velocity'");
+  }
+  if (needs_step) {
+    out.view.time_step = *arguments.time_step;
+    if (!(out.view.time_step > 0)) throw InputError(fmt::format("dt: must be positive, got {}", out.view.time_step));
+  }
+  if (arguments.latent) out.view.latent = latent_index(home, *arguments.latent, "latent");
+  out.names = out.view.names(*out.prior.system, arguments.latent.value_or(""));
+  return out;
+}
+
+// ---------------------------------------------------------------- predictions
+
+struct Prediction {
+  py::array mean;
+  std::optional<py::array> std, cov;
+  std::vector<std::string> names;
+  int n_clipped = 0;
+};
+
+/// States between two looks for Ctrl-C: some tenths of a second of work, in whole blocks of what the library takes at once.
+Index states_between_signals(const Posterior& posterior, bool mean_only, Index d, int n_threads) {
+  const auto n = static_cast<double>(posterior.reduced_size());
+  const double operations_per_state = mean_only ? 100 * (n + 1) : static_cast<double>(d) * n * (n + 100) + 1;
+  const double threads = n_threads > 0 ? n_threads : std::max(1U, std::thread::hardware_concurrency());
+  constexpr double block = 256, most_blocks = 1000;
+  return static_cast<Index>(block * std::clamp(std::floor(1e9 * threads / operations_per_state / block), 1.0, most_blocks));
+}
+
+Prediction predict(const PyPosterior& self, const py::object& data, const ViewArguments& arguments, bool mean_only,
+                   const py::object& columns, int n_threads) {
+  require_at_least(0, n_threads, "threads");
+  const Look at = look(self, arguments);
+  const States states(data, at.prior, at.view, *at.model, columns);
+  const auto x = states.matrix();
+  const Index d = at.view.size(), n = x.cols();
+  MatrixXd mean(d, n), stddev(mean_only ? 0 : d, n), covariance(mean_only ? 0 : d * d, n);
+  Prediction out;
+  const Posterior posterior = self.posterior;  // stays as it is, whatever another Python thread does with self
+  const Index most = states_between_signals(posterior, mean_only, d, n_threads);
+  for (Index first = 0; first < n; first += most) {
+    const Index size = std::min(most, n - first);
+    states.named([&] {
+      const py::gil_scoped_release release;
+      try {
+        if (mean_only) {
+          mean.middleCols(first, size) = posterior.mean(at.view, x.middleCols(first, size), n_threads);
+        } else {
+          const Posterior::Marginal block = posterior.marginal(at.view, x.middleCols(first, size), n_threads);
+          mean.middleCols(first, size) = block.mean;
+          stddev.middleCols(first, size) = block.stddev();
+          covariance.middleCols(first, size) = block.covariance;
+          out.n_clipped += block.n_clipped;
+        }
+      } catch (const InputError&) {
+        // once more, to name the state by its number among all
+        static_cast<void>(posterior.mean(at.view, x.leftCols(first + size), n_threads));
+        throw;
+      }
+    });
+    if (PyErr_CheckSignals() != 0) throw py::error_already_set();
+  }
+  out.names = at.names;
+  out.mean = to_rows(std::move(mean));
+  if (!mean_only) {
+    out.std = to_rows(std::move(stddev));
+    out.cov = to_matrices(covariance, d, d);
+  }
+  return out;
+}
+
+py::array asked_for(const std::optional<py::array>& values) {
+  if (!values) throw py::attribute_error("this prediction was made with mean_only=True");
+  return *values;
+}
+
+py::tuple joint(const PyPosterior& self, const py::object& data, const ViewArguments& arguments, const py::object& columns) {
+  const Look at = look(self, arguments);
+  const States states(data, at.prior, at.view, *at.model, columns);
+  const Posterior posterior = self.posterior;
+  Posterior::Joint result = states.named([&] {
+    const py::gil_scoped_release release;
+    return posterior.joint(at.view, states.matrix());
+  });
+  const Index size = result.mean.size();
+  return py::make_tuple(to_vector(std::move(result.mean)), to_rows(std::move(result.covariance.reshaped(size, size))));
+}
+
+py::array sample(const PyPosterior& self, const py::object& data, int n_samples, std::uint64_t seed,
+                 const ViewArguments& arguments, const py::object& columns) {
+  require_at_least(1, n_samples, "n_samples");
+  const Look at = look(self, arguments);
+  const States states(data, at.prior, at.view, *at.model, columns);
+  const Posterior posterior = self.posterior;
+  MatrixXd samples = states.named([&] {
+    const py::gil_scoped_release release;
+    return posterior.sample({{at.view, states.matrix()}}, n_samples, seed);
+  });
+  const Index d = at.view.size(), n = states.matrix().cols();
+  return to_rows(std::move(samples)).attr("reshape")(n_samples, n, d);
+}
+
+// ---------------------------------------------------------------- figures
+
+Evaluation evaluate(const PyPosterior& self, const py::object& data, const PySystem* system,
+                    const std::vector<std::string>& outputs, const py::object& columns, int n_threads) {
+  require_at_least(0, n_threads, "threads");
+  const Look at = look(self, {"constrained", system, std::nullopt, std::nullopt});
+  std::vector<std::string> names = outputs;
+  for (const Observations& group : self.posterior.observations()) {
+    if (!names.empty()) break;
+    if (group.view.quantity == View::Quantity::constrained_acceleration) names = group.view.names(self.system());
+  }
+  const std::vector<int> rows = acceleration_rows(self.system(), names, "outputs");
+  const CsvTable table = to_table(data, "data");
+  const LogStates log = read_log_states(at.prior, at.view, *at.model, table, columns_argument(columns), names);
+  tell(log.notes);
+  const Posterior posterior = self.posterior;
+  try {
+    const py::gil_scoped_release release;
+    return evaluate_predictions(posterior, log.states, rows, log.accelerations, at.view.setting, n_threads);
+  } catch (const InputError& error) {
+    throw InputError(table.name() + ": " + error.what());
+  }
+}
+
+// ---------------------------------------------------------------- data that grow
+
+// Changes are in place and under the interpreter's lock: other Python threads see them before or after. But mechanics that are
+// Python functions let go of the lock while they are called, so that a copy must be changed.
+std::optional<Posterior> kept_by_others(const PyPosterior& self) {
+  return self.file.model.mechanics_are_code ? std::optional(self.posterior) : std::nullopt;
+}
+
+void update_with(PyPosterior& self, const py::object& data, const std::vector<std::string>& observe,
+                 const std::optional<double>& noise_stddev, const py::object& columns) {
+  const System& system = self.system();
+  const std::vector<Observations>& groups = self.posterior.observations();
+  const auto at_home = std::find_if(groups.begin(), groups.end(), [](const Observations& group) {
+    return group.view.quantity == View::Quantity::constrained_acceleration && group.view.setting == nullptr;
+  });
+  Observations added;
+  added.view = View::all(View::Quantity::constrained_acceleration, system);
+  std::vector<std::string> names = observe;
+  if (names.empty() && at_home != groups.end()) names = at_home->view.names(system);
+  added.view.rows = acceleration_rows(system, names, "observe");
+  if (names.empty()) names = added.view.names(system);
+
+  // the noise that the fit has for these rows, unless told otherwise
+  added.noise_stddev = VectorXd::Constant(added.view.size(), noise_stddev.value_or(std::numeric_limits<double>::quiet_NaN()));
+  if (!noise_stddev) {
+    if (at_home == groups.end() || at_home->view.rows != added.view.rows) {
+      throw InputError("noise_std: these accelerations were not observed in the fit; give their noise standard deviation");
+    }
+    added.noise_stddev = self.posterior.values().noise_stddev[static_cast<std::size_t>(at_home - groups.begin())];
+  }
+  LogStates log = read_log_states(self.posterior.prior(), added.view, self.file.model, to_table(data, "data"),
+                                  columns_argument(columns), names);
+  tell(log.notes);
+  added.states = std::move(log.states);
+  added.values = std::move(log.accelerations);
+  const std::optional<Posterior> kept = kept_by_others(self);
+  self.posterior = update(std::move(self.posterior), std::move(added));
+}
+
+// ---------------------------------------------------------------- motion
+
+struct Motion {
+  Trajectory trajectory;
+  std::optional<MatrixXd> stddev;
+};
+
+std::map<std::string, double> start_values(const py::object& start) {
+  try {
+    return start.cast<std::map<std::string, double>>();
+  } catch (const py::cast_error&) {
+    throw py::type_error(
+        fmt::format("start: expected a dict of names to numbers, or all of q and dq, got {}", std::string(py::repr(start))));
+  }
+}
+
+/// A start by names, what is not named following from the constraints; or all of q and dq.
+VectorXd start_state(const ModelFile& model, const VectorXd& parameters, const py::object& start, double t_start) {
+  const System& system = *model.system;
+  const StateLayout layout = system.layout();
+  VectorXd state = VectorXd::Zero(layout.size());
+  state[layout.t()] = t_start;
+  if (is_array(start)) {
+    const auto values = vector_argument(start, 2 * layout.nq, "start");
+    state.head(2 * layout.nq) = Eigen::Map<const VectorXd>(values.data(), 2 * layout.nq);
+    if (!state.allFinite()) throw InputError("start: not all numbers are finite");
+    return state;
+  }
+  StartingPoint point{state, std::vector<bool>(static_cast<std::size_t>(layout.size()), false)};
+  const std::vector<std::string> names = system.state_names();
+  for (const auto& [name, value] : start_values(start)) {
+    const auto found = std::find(names.begin(), names.begin() + layout.t(), name);
+    if (found == names.begin() + layout.t()) {
+      throw InputError(fmt::format("start: '{}' is no coordinate or velocity of '{}'; there are: {}", name, system.name(),
+                                   fmt::join(names.begin(), names.begin() + layout.t(), ", ")));
+    }
+    if (!std::isfinite(value)) throw InputError(fmt::format("start: {} = {} is not a finite number", name, value));
+    const auto k = found - names.begin();
+    point.state[k] = value;
+    point.given[static_cast<std::size_t>(k)] = true;
+  }
+  std::vector<std::string> notes;
+  state = complete_start(model, parameters, std::move(point), notes);
+  tell(notes);
+  return state;
+}
+
+struct SimulateArguments {
+  py::object start, times, inputs;
+  double relative_tolerance = 1e-6, absolute_tolerance = 1e-9;
+  bool project = true;
+};
+
+InputSignal input_signal(const System& system, const py::object& inputs) {
+  if (inputs.is_none()) return {};
+  if (system.inputs().empty()) throw InputError(fmt::format("inputs: '{}' has no inputs", system.name()));
+  const CsvTable table = to_table(inputs, "inputs");
+  LogReader reader(table, system);
+  return {reader.values({"t"}).row(0).transpose(), reader.values(system.inputs())};
+}
+
+/// Motions of accelerations, one after the other; Ctrl-C ends them.
+std::vector<Motion> simulate_all(const ModelFile& model, const VectorXd& parameters,
+                                 const std::vector<Acceleration>& accelerations, const SimulateArguments& arguments) {
+  const System& system = *model.system;
+  SimulateOptions options;
+  const auto times = vector_argument(arguments.times, "times");
+  if (times.size() == 0) throw InputError("times: expected the times [s] at which states are wanted; the first is the start");
+  options.times = Eigen::Map<const VectorXd>(times.data(), times.size());
+  options.relative_tolerance = arguments.relative_tolerance;
+  options.absolute_tolerance = arguments.absolute_tolerance;
+  options.project = arguments.project;
+  options.inputs = input_signal(system, arguments.inputs);
+  const VectorXd start = start_state(model, parameters, arguments.start, options.times[0]);
+
+  std::atomic<bool> stop = false;
+  std::exception_ptr raised;
+  struct Stopped {};
+  std::vector<Motion> motions;
+  try {
+    motions = run_interruptibly(
+        [&] {
+          std::vector<Motion> out;
+          for (const Acceleration& acceleration : accelerations) {
+            const Acceleration stoppable = [&](const Eigen::Ref<const VectorXd>& x) {
+              if (stop) throw Stopped();
+              return acceleration(x);
+            };
+            out.push_back({simulate(system, parameters, stoppable, start, options), std::nullopt});
+          }
+          return out;
+        },
+        stop, raised, [] {});
+  } catch (const Stopped&) {
+  }
+  if (raised) std::rethrow_exception(raised);
+  return motions;
+}
+
+py::object simulate_posterior(const PyPosterior& self, const SimulateArguments& arguments, const std::optional<int>& n_samples,
+                              std::uint64_t seed) {
+  const View view = View::all(View::Quantity::constrained_acceleration, self.system());
+  const Posterior posterior = self.posterior;
+  const VectorXd parameters = posterior.values().parameters;
+  std::vector<Acceleration> accelerations;
+  std::optional<PathwiseSamples> samples;
+  if (n_samples) {
+    require_at_least(1, *n_samples, "n_samples");
+    const py::gil_scoped_release release;
+    samples = sample_paths(posterior, *n_samples, {.seed = seed});
+  }
+  for (int k = 0; k < n_samples.value_or(1); ++k) {
+    accelerations.emplace_back([&, k](const Eigen::Ref<const VectorXd>& x) -> VectorXd {
+      return samples ? samples->evaluate(k, view, x).col(0) : posterior.mean(view, x).col(0);
+    });
+  }
+  std::vector<Motion> motions = simulate_all(self.file.model, parameters, accelerations, arguments);
+  if (n_samples) return py::cast(std::move(motions));
+  {
+    const py::gil_scoped_release release;
+    motions[0].stddev = posterior.marginal(view, motions[0].trajectory.states, /*n_threads=*/0).stddev();
+  }
+  return py::cast(std::move(motions[0]));
+}
+
+// ---------------------------------------------------------------- files
+
+// the mechanics of a fit whose mechanics are Python functions are those of `system`
+PyPosterior load(const py::object& path, const PySystem* system) {
+  const bool functions = system != nullptr && system->mechanics;
+  FitFile file = functions ? FitFile::read(path_argument(path), system->mechanics) : FitFile::read(path_argument(path));
+  Posterior posterior = file.posterior();
+  file.observations.clear();
+  return {std::move(file), std::move(posterior), {}, functions ? system->mechanics : MechanicsSource()};
+}
+
+void save(const PyPosterior& self, const py::object& path) {
+  FitFile file = self.file;
+  file.observations = self.posterior.observations();
+  file.write(path_argument(path));
+}
+
+template <typename Class>
+void define_report(Class& report) {
+  report.def_readonly("hyperparameters", &FitReport::hyperparameters, "Fitted values, list of Hyperparameter.")
+      .def_readonly("negative_log_likelihood", &FitReport::negative_log_likelihood,
+                    "-log p(y), physical units, all constants, without hyper-prior.")
+      .def_readonly("objective", &FitReport::objective, "With hyper-priors: what was minimised.")
+      .def_readonly("converged", &FitReport::converged)
+      .def_readonly("termination", &FitReport::termination, "Which inequality stopped the optimiser.")
+      .def_readonly("iterations", &FitReport::iterations, "Of the best restart.")
+      .def_readonly("best_restart", &FitReport::best_restart)
+      .def_readonly("restarts", &FitReport::restarts, "How each run ended, list of RestartReport.")
+      .def_readonly("seconds", &FitReport::seconds)
+      .def("__getitem__",
+           [](const FitReport& self, const std::string& name) {
+             for (const Hyperparameter& h : self.hyperparameters) {
+               if (h.name == name) return h.value;
+             }
+             throw py::key_error(name);
+           })
+      .def("__repr__", [](const FitReport& self) {
+        std::string text = fmt::format("negative log likelihood {:.6f}\n{} after {} iterations ({} restarts, best: {}), {:.2f} s",
+                                       self.negative_log_likelihood, self.termination, self.iterations, self.restarts.size(),
+                                       self.best_restart + 1, self.seconds);
+        for (const Hyperparameter& h : self.hyperparameters) {
+          text += fmt::format("\n  {:<34} {:>13.6g}   [{:.3g}, {:.3g}]{}", h.name, h.value, h.lower, h.upper,
+                              h.at_bound() ? "   at its bound" : "");
+        }
+        return text;
+      });
+}
+
+}  // namespace
+
+void add_posterior(py::module_& module) {
+  py::class_<Hyperparameter>(module, "Hyperparameter", "One number that training adjusts, in physical units.")
+      .def_readonly("name", &Hyperparameter::name)
+      .def_readonly("unit", &Hyperparameter::unit)
+      .def_readonly("value", &Hyperparameter::value)
+      .def_readonly("lower", &Hyperparameter::lower)
+      .def_readonly("upper", &Hyperparameter::upper)
+      .def_property_readonly("at_bound", &Hyperparameter::at_bound)
+      .def("__repr__", [](const Hyperparameter& h) {
+        return fmt::format("<{} = {:.6g} in [{:.3g}, {:.3g}]{}>", h.name, h.value, h.lower, h.upper,
+                           h.at_bound() ? ", at its bound" : "");
+      });
+  py::class_<RestartReport>(module, "RestartReport", "How one run of the optimiser ended.")
+      .def_readonly("objective", &RestartReport::objective)
+      .def_readonly("negative_log_likelihood", &RestartReport::negative_log_likelihood)
+      .def_readonly("iterations", &RestartReport::iterations)
+      .def_readonly("evaluations", &RestartReport::evaluations)
+      .def_readonly("failed_evaluations", &RestartReport::failed_evaluations)
+      .def_readonly("converged", &RestartReport::converged)
+      .def_readonly("termination", &RestartReport::termination);
+  py::class_<FitReport> report(module, "FitReport", "How a fit went; report['name'] is a fitted hyperparameter.");
+  define_report(report);
+
+  py::class_<Prediction>(module, "Prediction", "A view at n states, of d rows: the latent quantity, without measurement noise.")
+      .def_readonly("mean", &Prediction::mean, "(n, d)")
+      .def_property_readonly(
+          "std", [](const Prediction& p) { return asked_for(p.std); }, "Standard deviations (n, d).")
+      .def_property_readonly(
+          "cov", [](const Prediction& p) { return asked_for(p.cov); }, "Covariance at each state (n, d, d).")
+      .def_readonly("names", &Prediction::names, "Of the d rows, as the columns of gp2 predict.")
+      .def_readonly("n_clipped", &Prediction::n_clipped, "Variances that rounding made negative; they are 0.")
+      .def("__repr__", [](const Prediction& p) {
+        return fmt::format("<gp2.Prediction of {} at {} states>", fmt::join(p.names, ", "), p.mean.shape(0));
+      });
+
+  py::class_<Evaluation>(module, "Evaluation", "How well a posterior predicts measured accelerations.")
+      .def_readonly("outputs", &Evaluation::outputs)
+      .def_property_readonly(
+          "rmse", [](const Evaluation& e) { return to_vector(e.rmse); }, "Per output, physical units.")
+      .def_readonly("rmse_normalised", &Evaluation::rmse_normalised, "Mean over outputs of rmse / training std.")
+      .def_readonly("nrmse", &Evaluation::nrmse, "Rms error over rms of the test spreads.")
+      .def_readonly("max_constraint_error", &Evaluation::max_constraint_error, "max |A ddq - b|, the model's parameters.")
+      .def_readonly("max_constraint_error_fitted", &Evaluation::max_constraint_error_fitted, "The same with the fitted ones.")
+      .def_readonly("nlpd", &Evaluation::nlpd, "Negative log predictive density of measurements.")
+      .def_readonly("coverage95", &Evaluation::coverage95, "Share of measurements in their 95 % intervals.")
+      .def_readonly("nlpd_latent", &Evaluation::nlpd_latent, "The same of noise-free targets.")
+      .def_readonly("coverage95_latent", &Evaluation::coverage95_latent)
+      .def_readonly("n_zero_variance", &Evaluation::n_zero_variance,
+                    "Marginals without variance, left out of the latent figures.")
+      .def_readonly("n", &Evaluation::n);
+
+  py::class_<Motion>(module, "Motion", "A motion at the times asked for.")
+      .def_property_readonly(
+          "t", [](const Motion& m) { return to_vector(m.trajectory.times); }, "(n) [s]")
+      .def_property_readonly(
+          "states", [](const Motion& m) { return to_rows(m.trajectory.states); }, "(n, len(state_names))")
+      .def_property_readonly(
+          "q", [](const Motion& m) { return to_rows(m.trajectory.states.topRows(m.trajectory.accelerations.rows())); }, "(n, nq)")
+      .def_property_readonly(
+          "dq",
+          [](const Motion& m) {
+            const Index nq = m.trajectory.accelerations.rows();
+            return to_rows(m.trajectory.states.middleRows(nq, nq));
+          },
+          "(n, nq)")
+      .def_property_readonly(
+          "ddq", [](const Motion& m) { return to_rows(m.trajectory.accelerations); }, "(n, nq)")
+      .def_property_readonly(
+          "std",
+          [](const Motion& m) -> py::object {
+            if (!m.stddev) return py::none();
+            return to_rows(*m.stddev);
+          },
+          "Of ddq along the mean's motion (n, nq); None of a model's own motion or a sample's.")
+      .def_property_readonly("max_position_drift", [](const Motion& m) { return m.trajectory.max_position_drift; })
+      .def_property_readonly("max_velocity_drift", [](const Motion& m) { return m.trajectory.max_velocity_drift; })
+      .def_property_readonly("steps", [](const Motion& m) { return m.trajectory.steps; })
+      .def_property_readonly("rejected_steps", [](const Motion& m) { return m.trajectory.rejected_steps; })
+      .def_property_readonly("evaluations", [](const Motion& m) { return m.trajectory.evaluations; });
+
+  using namespace py::literals;
+  const auto view_arguments = [](const std::string& view, const PySystem* system, const std::optional<std::string>& latent,
+                                 const std::optional<double>& dt) {
+    return ViewArguments{view, system, latent, dt};
+  };
+  py::class_<PyPosterior>(module, "Posterior", "A prior conditioned on data. Made by gp2.fit or gp2.load.")
+      .def_static("load", &load, "path"_a, "system"_a = nullptr,
+                  "As gp2.load.\n\nRaises InputError naming the file and what is wrong.")
+      .def("save", &save, "path"_a, "Write a FIT.json, whole or not at all. Loaded again it gives the same bits.")
+      .def_property_readonly("system",
+                             [](const PyPosterior& self) {
+                               return PySystem{std::make_shared<const ModelFile>(self.file.model), self.mechanics};
+                             })
+      .def_property_readonly(
+          "report", [](const PyPosterior& self) { return self.file.report; }, "How the fit went.")
+      .def_readonly("notes", &PyPosterior::notes, "What the reading of the data had to say.")
+      .def_property_readonly("n_data",
+                             [](const PyPosterior& self) {
+                               int n = 0;
+                               for (const Observations& group : self.posterior.observations()) n += group.n_data();
+                               return n;
+                             })
+      .def_property_readonly("negative_log_likelihood",
+                             [](const PyPosterior& self) { return self.posterior.negative_log_likelihood(); })
+      .def_property_readonly(
+          "parameters",
+          [](const PyPosterior& self) {
+            py::dict values;
+            const std::vector<Parameter>& parameters = self.system().parameters();
+            for (std::size_t k = 0; k < parameters.size(); ++k) {
+              values[py::str(parameters[k].name)] = self.posterior.values().parameters[static_cast<Index>(k)];
+            }
+            return values;
+          },
+          "The system's parameters, with the fitted values of those that were estimated.")
+      .def(
+          "predict",
+          [=](const PyPosterior& self, const py::object& states, const std::string& view, const PySystem* system,
+              const std::optional<std::string>& latent, const std::optional<double>& dt, bool mean_only,
+              const py::object& columns, int threads) {
+            return predict(self, states, view_arguments(view, system, latent, dt), mean_only, columns, threads);
+          },
+          "states"_a, "view"_a = "constrained", py::kw_only(), "system"_a = nullptr, "latent"_a = py::none(), "dt"_a = py::none(),
+          "mean_only"_a = false, "columns"_a = py::none(), "threads"_a = 0,
+          R"(Predict a view at states (n, len(state_names)), or at those of a table by column names.
+
+view       'constrained': ddq (d = nq); 'unconstrained': the acceleration without constraints; 'constraint-force': A'λ;
+           'multipliers': λ (d = nc); 'next-velocity': dq + dt ddq
+system     another System with the same coordinates, inputs and latents: under its constraints, masses and parameters
+latent     only what this latent adds, by its name
+mean_only  leaves out std and cov, which cost more by two orders
+
+Returns a Prediction with mean (n, d), std (n, d), cov (n, d, d).
+Raises InputError for states that are not finite where they are read, or contradict the constraints.)")
+      .def(
+          "joint",
+          [=](const PyPosterior& self, const py::object& states, const std::string& view, const PySystem* system,
+              const std::optional<std::string>& latent, const std::optional<double>& dt,
+              const py::object& columns) { return joint(self, states, view_arguments(view, system, latent, dt), columns); },
+          "states"_a, "view"_a = "constrained", py::kw_only(), "system"_a = nullptr, "latent"_a = py::none(), "dt"_a = py::none(),
+          "columns"_a = py::none(), "Mean (n d) and covariance (n d, n d) of all states together, state after state.")
+      .def(
+          "sample",
+          [=](const PyPosterior& self, const py::object& states, int n_samples, std::uint64_t seed, const std::string& view,
+              const PySystem* system, const std::optional<std::string>& latent, const std::optional<double>& dt,
+              const py::object& columns) {
+            return sample(self, states, n_samples, seed, view_arguments(view, system, latent, dt), columns);
+          },
+          "states"_a, "n_samples"_a = 1, "seed"_a = 0, "view"_a = "constrained", py::kw_only(), "system"_a = nullptr,
+          "latent"_a = py::none(), "dt"_a = py::none(), "columns"_a = py::none(),
+          "Draws of a view at all states together (n_samples, n, d). Each obeys A ddq = b. Same seed, same samples.")
+      .def("evaluate", &evaluate, "data"_a, "system"_a = nullptr, "outputs"_a = std::vector<std::string>(),
+           "columns"_a = py::none(), "threads"_a = 0, "Compare with measured or true accelerations: the figures of gp2 evaluate.")
+      .def("update", &update_with, "data"_a, "observe"_a = std::vector<std::string>(), "noise_std"_a = py::none(),
+           "columns"_a = py::none(),
+           "Add measured accelerations, in place: O(N²) per row. Hyperparameters, parameters and scales are held.")
+      .def(
+          "remove_oldest",
+          [](PyPosterior& self, int n) {
+            const std::optional<Posterior> kept = kept_by_others(self);
+            self.posterior = remove_oldest(std::move(self.posterior), n);
+          },
+          "n"_a = 1, "Remove the n observed states that were added first, in place.")
+      .def(
+          "without_data",
+          [](const PyPosterior& self) {
+            return PyPosterior{self.file, self.posterior.without_data(), {}, self.mechanics};
+          },
+          "The prior under the same hyperparameters.")
+      .def(
+          "simulate",
+          [](const PyPosterior& self, const py::object& start, const py::object& times, const py::object& inputs,
+             const std::optional<int>& n_samples, std::uint64_t seed, double rtol, double atol, bool project) {
+            return simulate_posterior(self, {start, times, inputs, rtol, atol, project}, n_samples, seed);
+          },
+          "start"_a, "times"_a, "inputs"_a = py::none(), py::kw_only(), "n_samples"_a = py::none(), "seed"_a = 0, "rtol"_a = 1e-6,
+          "atol"_a = 1e-9, "project"_a = true,
+          R"(Integrate the mean's motion, or n_samples motions, each of one function drawn from the posterior.
+
+start   {"q1": 0.4, "dq1": 1.0}: what is not named follows from the constraints; or all of q and dq
+times   at which states are wanted (n) [s]; the first is the start
+inputs  a table with t and every input, linear in between; default: zero
+
+Returns a Motion, or with n_samples a list of them. Raises NumericalError, with the time, when it cannot go on.)")
+      .def("__repr__", [](const PyPosterior& self) { return fmt::format("<gp2.Posterior of '{}'>", self.system().name()); });
+
+  module.def("load", &load, "path"_a, "system"_a = nullptr,
+             "Read a FIT.json: a Posterior.\n\nsystem: of System.from_callables, where the fit was of that one; its functions "
+             "are not in the "
+             "file.\n\nRaises InputError naming the file and what is wrong.");
+  module.def(
+      "simulate",
+      [](const PySystem& system, const py::object& start, const py::object& times, const py::object& inputs, double rtol,
+         double atol, bool project) {
+        return simulate_all(*system.model, system.system().parameter_values(), {model_acceleration(*system.model)},
+                            {start, times, inputs, rtol, atol, project})
+            .front();
+      },
+      "system"_a, "start"_a, "times"_a, "inputs"_a = py::none(), py::kw_only(), "rtol"_a = 1e-6, "atol"_a = 1e-9,
+      "project"_a = true, "Integrate a system by its own force and [truth]. As Posterior.simulate.");
+}
+
+}  // namespace gp2::python

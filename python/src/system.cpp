@@ -1,0 +1,295 @@
+#include <limits>
+
+#include <fmt/format.h>
+#include <fmt/ranges.h>
+#include <pybind11/stl.h>
+
+#include "arrays.hpp"
+#include "bindings.hpp"
+#include "gp2/check.hpp"
+#include "gp2/error.hpp"
+#include "gp2/fit_problem.hpp"
+#include "gp2/generate.hpp"
+
+namespace gp2::python {
+
+namespace {
+
+std::vector<std::string> acceleration_names(const System& system) {
+  std::vector<std::string> names;
+  for (const Coordinate& coordinate : system.coordinates()) names.push_back(coordinate.acceleration());
+  return names;
+}
+
+std::vector<std::string> coordinate_names(const System& system) {
+  std::vector<std::string> names;
+  for (const Coordinate& coordinate : system.coordinates()) names.push_back(coordinate.name);
+  return names;
+}
+
+// the model's own values, with those given by name
+Eigen::VectorXd parameter_values(const System& system, const std::map<std::string, double>& given) {
+  Eigen::VectorXd values = system.parameter_values();
+  for (const auto& [name, value] : given) {
+    const int index = system.parameter_index(name);
+    if (index < 0) {
+      std::vector<std::string> names;
+      for (const Parameter& parameter : system.parameters()) names.push_back(parameter.name);
+      throw InputError(
+          fmt::format("parameters: '{}' has no parameter '{}'; it has: {}", system.name(), name, fmt::join(names, ", ")));
+    }
+    values[index] = value;
+  }
+  return values;
+}
+
+py::dict parameters_of(const System& system) {
+  py::dict values;
+  for (const Parameter& parameter : system.parameters()) values[py::str(parameter.name)] = parameter.value;
+  return values;
+}
+
+/// M, A, b, F at n states.
+struct Mechanics {
+  py::array M, A, b, F;
+};
+
+Mechanics evaluate(const PySystem& self, const py::object& states, const std::map<std::string, double>& parameters) {
+  const System& system = self.system();
+  const Rows rows(states, system.state_names(), "states");
+  SystemValues values = system.evaluate(rows.matrix(), parameter_values(system, parameters));
+  return {to_matrices(values.mass, system.nq(), system.nq()), to_matrices(values.constraint_matrix, system.nc(), system.nq()),
+          to_rows(std::move(values.constraint_vector)), to_rows(std::move(values.force))};
+}
+
+CsvTable generate_table(const PySystem& self, int n, std::uint64_t seed, std::optional<double> noise_stddev,
+                        const std::map<std::string, int>& grid) {
+  const ModelFile& model = *self.model;
+  const System& system = self.system();
+  GenerateOptions options{n, seed, Eigen::VectorXd::Zero(system.nq()), grid};
+  if (noise_stddev) {
+    options.noise_stddev.setConstant(*noise_stddev);
+  } else if (!model.noise.stddev.empty()) {
+    options.noise_stddev = Eigen::Map<const Eigen::VectorXd>(model.noise.stddev.data(), system.nq());
+  }
+  const GeneratedData data = generate(model, options);
+  const std::vector<std::string> names = system.state_names();
+  std::vector<std::string> header, cells;
+  for (std::size_t k = 0; k < names.size(); ++k) {
+    if (data.known[k]) header.push_back(names[k]);
+  }
+  for (const std::string& name : acceleration_names(system)) header.push_back(name);
+  for (Eigen::Index i = 0; i < data.states.cols(); ++i) {
+    for (std::size_t k = 0; k < names.size(); ++k) {
+      if (data.known[k]) cells.push_back(shortest(data.states(static_cast<Eigen::Index>(k), i)));
+    }
+    for (const double value : data.accelerations.col(i)) cells.push_back(shortest(value));
+  }
+  return CsvTable::from_cells(fmt::format("data of '{}'", system.name()), std::move(header), std::move(cells));
+}
+
+py::list findings_list(const std::vector<Finding>& findings) {
+  py::list list;
+  for (const Finding& finding : findings) list.append(finding);
+  return list;
+}
+
+// what the model reads, and what else the log has of a state; the rest is NaN
+Eigen::MatrixXd all_states(const ModelFile& model, LogReader& reader) {
+  std::vector<bool> reads = make_prior(model).reads();
+  const std::vector<std::string> names = model.system->state_names();
+  for (std::size_t k = 0; k < reads.size(); ++k) reads[k] = reads[k] || reader.has(names[k]);
+  return reader.states(reads);
+}
+
+// the findings of gp2 check
+py::list check(const PySystem& self, const py::object& data, const py::object& columns) {
+  const ModelFile& model = *self.model;
+  const System& system = self.system();
+  const Eigen::VectorXd parameters = system.parameter_values();
+  if (data.is_none()) {
+    if (model.sampling.empty() || model.truth.empty()) {
+      throw InputError("check: no data, and no sampling and truth in the model: nothing to evaluate it at");
+    }
+    const GeneratedData drawn = generate(model, {100, 1, Eigen::VectorXd::Zero(system.nq())});
+    return findings_list(check_system(system, drawn.states, parameters));
+  }
+  const CsvTable table = to_table(data, "data");
+  LogReader reader = open_log(model, table, columns_argument(columns));
+  const Eigen::MatrixXd states = all_states(model, reader);
+  Eigen::MatrixXd accelerations =
+      Eigen::MatrixXd::Constant(system.nq(), table.n_rows(), std::numeric_limits<double>::quiet_NaN());
+  const std::vector<std::string> measured = acceleration_names(system);
+  for (std::size_t j = 0; j < measured.size(); ++j) {
+    if (reader.has(measured[j])) accelerations.row(static_cast<Eigen::Index>(j)) = reader.values({measured[j]});
+  }
+  std::vector<Finding> findings = check_system(system, states, parameters);
+  const auto is_error = [](const Finding& finding) { return finding.level == Finding::Level::error; };
+  if (std::none_of(findings.begin(), findings.end(), is_error)) {
+    const std::vector<Finding> more = check_data(system, states, parameters, accelerations);
+    findings.insert(findings.end(), more.begin(), more.end());
+  }
+  return findings_list(findings);
+}
+
+const char* word(Finding::Level level) {
+  return level == Finding::Level::good ? "ok" : level == Finding::Level::warning ? "warning" : "error";
+}
+
+}  // namespace
+
+std::map<std::string, std::string> columns_argument(const py::object& columns) {
+  if (columns.is_none()) return {};
+  try {
+    return columns.cast<std::map<std::string, std::string>>();
+  } catch (const py::cast_error&) {
+    throw py::type_error(
+        fmt::format("columns: expected a dict of the model's names to the log's, got {}", std::string(py::repr(columns))));
+  }
+}
+
+View::Quantity quantity_argument(const std::string& given) {
+  const std::optional<View::Quantity> quantity = View::quantity_of(given);
+  if (!quantity)
+    throw InputError(fmt::format("view: expected one of {}, got '{}'", fmt::join(View::quantity_words(), ", "), given));
+  return *quantity;
+}
+
+void tell(const std::vector<std::string>& notes) {
+  const std::string mark = "warning: ";
+  for (const std::string& note : notes) {
+    if (note.starts_with(mark)) {
+      if (PyErr_WarnEx(PyExc_UserWarning, note.substr(mark.size()).c_str(), 1) != 0) throw py::error_already_set();
+    } else {
+      py::module_::import("logging").attr("getLogger")("gp2").attr("info")("%s", note);
+    }
+  }
+}
+
+States::States(const py::object& data, const Prior& prior, const View& view, const ModelFile& model, const py::object& columns) {
+  const System& system = *prior.system;
+  if (!is_array(data)) {
+    const CsvTable table = to_table(data, "states");
+    LogStates log = read_log_states(prior, view, model, table, columns_argument(columns));
+    tell(log.notes);
+    table_ = table.name();
+    read_ = std::move(log.states);
+    return;
+  }
+  const std::vector<std::string> names = system.state_names();
+  array_.emplace(data, names, "states");
+  const auto states = matrix();
+  std::vector<bool> reads = prior.reads();
+  const std::vector<bool> of_view = view.reads(system);
+  for (std::size_t k = 0; k < reads.size(); ++k) {
+    if (!reads[k] && !of_view[k]) continue;
+    for (Eigen::Index i = 0; i < states.cols(); ++i) {
+      const double value = states(static_cast<Eigen::Index>(k), i);
+      if (std::isfinite(value)) continue;
+      throw InputError(fmt::format("states: row {}, column {} ({}): {} is not a finite number", i, k, names[k], value));
+    }
+  }
+}
+
+Eigen::Map<const Eigen::MatrixXd> States::matrix() const {
+  if (array_) return array_->matrix();
+  return {read_.data(), read_.rows(), read_.cols()};
+}
+
+void add_system(py::module_& module) {
+  py::class_<Mechanics>(module, "Mechanics", "M(q,t) ddq = F + constraint forces, subject to A ddq = b, at n states.")
+      .def_readonly("M", &Mechanics::M, "Mass matrix (n, nq, nq).")
+      .def_readonly("A", &Mechanics::A, "Constraint matrix (n, nc, nq).")
+      .def_readonly("b", &Mechanics::b, "Constraint vector (n, nc).")
+      .def_readonly("F", &Mechanics::F, "Known part of the applied force (n, nq) [N or N m].");
+
+  py::class_<Finding>(module, "Finding", "One thing a check looked at.")
+      .def_property_readonly(
+          "level", [](const Finding& finding) { return word(finding.level); }, "'ok', 'warning' or 'error'.")
+      .def_readonly("text", &Finding::text)
+      .def("__repr__", [](const Finding& finding) { return fmt::format("{}: {}", word(finding.level), finding.text); });
+
+  py::class_<PySystem> system(module, "System", R"(A constrained mechanical system and its prior.
+
+System.load("surface.toml") reads a model file; System(coordinates=…, mass=…, …) takes the same from strings and numbers:
+
+    gp2.System(
+        coordinates=["x", "z"],                  # or {"name": "q1", "angle": True}
+        inputs=["push"],
+        parameters={"m": 0.2, "h": {"value": 0.5, "bounds": [0.3, 0.7], "estimate": True}},
+        mass=[["m", "0"], ["0", "m"]],
+        force=["push", "-9.81*m"],               # the known part of the applied force
+        constraints=["z - h*x^2"],               # = 0; or {"position": […], "velocity": […], "acceleration": […]}
+        latents=[{"features": ["x", "dx"]}],     # the unknown; default: one on the acceleration, of the whole state
+        noise=0.05,                              # standard deviation of a measured ddq
+    )
+
+Further keywords: name, let, potential, truth, sampling, columns. Each is the table of that name in a model file.
+
+Raises InputError with the key, the rule, the value got and the mend.)");
+  add_callables(system);
+  system
+      .def(py::init([](const py::kwargs& kwargs) {
+        const py::object text = py::module_::import("gp2._model_text").attr("model_text")(**kwargs);
+        return PySystem{std::make_shared<const ModelFile>(ModelFile::parse(text.cast<std::string>(), "System(…)"))};
+      }))
+      .def_static(
+          "load",
+          [](const py::object& path) {
+            return PySystem{std::make_shared<const ModelFile>(ModelFile::read(path_argument(path)))};
+          },
+          py::arg("path"), "Read a model file.\n\nRaises InputError with file, line, key, the rule, the value got and the mend.")
+      .def_static(
+          "parse",
+          [](const std::string& text, const std::string& name) {
+            return PySystem{std::make_shared<const ModelFile>(ModelFile::parse(text, name))};
+          },
+          py::arg("text"), py::arg("name") = "text", "The same from the text of a model file; `name` stands for it in messages.")
+      .def_property_readonly("name", [](const PySystem& self) { return self.system().name(); })
+      .def_property_readonly(
+          "text", [](const PySystem& self) { return self.model->text; }, "The model file's text.")
+      .def_property_readonly("coordinates", [](const PySystem& self) { return coordinate_names(self.system()); })
+      .def_property_readonly("inputs", [](const PySystem& self) { return self.system().inputs(); })
+      .def_property_readonly(
+          "parameters", [](const PySystem& self) { return parameters_of(self.system()); }, "Name to value.")
+      .def_property_readonly(
+          "constraints", [](const PySystem& self) { return self.system().constraint_labels(); }, "As written; one per row of A.")
+      .def_property_readonly(
+          "state_names", [](const PySystem& self) { return self.system().state_names(); },
+          "Columns of an array of states: q, dq, t, u.")
+      .def_property_readonly(
+          "acceleration_names", [](const PySystem& self) { return acceleration_names(self.system()); },
+          "Columns of an array of accelerations: ddq.")
+      .def("evaluate", &evaluate, py::arg("states"), py::arg("parameters") = py::dict(),
+           "M, A, b, F at states (n, len(state_names)), with parameters by name where they are not the model's own.")
+      .def(
+          "true_acceleration",
+          [](const PySystem& self, const py::object& states) {
+            return to_rows(true_acceleration(*self.model, Rows(states, self.system().state_names(), "states").matrix()));
+          },
+          py::arg("states"),
+          "ddq of the model as it is written, with its [truth] (n, nq).\n\nRaises InputError when there is no [truth].")
+      .def("generate", &generate_table, py::arg("n"), py::arg("seed") = 1, py::arg("noise_std") = py::none(),
+           py::arg("grid") = py::dict(),
+           "Draw states from the model's [sampling] and measure ddq: a Table.\n\n"
+           "noise_std: of ddq; default: the model's own. grid: points per range instead of n draws.")
+      .def(
+          "states",
+          [](const PySystem& self, const py::object& data, const py::object& columns) {
+            const CsvTable table = to_table(data, "data");
+            LogReader reader = open_log(*self.model, table, columns_argument(columns));
+            return to_rows(all_states(*self.model, reader));
+          },
+          py::arg("data"), py::arg("columns") = py::none(),
+          "States (n, len(state_names)) of a table by its column names. What the model does not read may be missing: NaN.")
+      .def("__repr__", [](const PySystem& self) {
+        return fmt::format("<gp2.System '{}': coordinates {}; {} constraints>", self.system().name(),
+                           fmt::join(coordinate_names(self.system()), ", "), self.system().nc());
+      });
+
+  module.def("check", &check, py::arg("system"), py::arg("data") = py::none(), py::arg("columns") = py::none(),
+             "Is a system well-posed, and does a log fit it? A list of Finding: rank, definiteness, derivatives; data on the\n"
+             "constraint, dependent columns. Without data at states drawn from the model's [sampling].");
+}
+
+}  // namespace gp2::python

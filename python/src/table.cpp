@@ -1,0 +1,94 @@
+#include <fmt/format.h>
+#include <fmt/ranges.h>
+#include <pybind11/stl.h>
+
+#include "arrays.hpp"
+#include "bindings.hpp"
+#include "gp2/error.hpp"
+
+namespace gp2::python {
+
+namespace {
+
+// a column as cells that read back to the same numbers
+std::vector<std::string> cells_of(const py::object& column, const std::string& what) {
+  const py::array array = py::array::ensure(column);
+  if (!array || array.ndim() != 1) {
+    PyErr_Clear();
+    throw InputError(fmt::format("{}: expected one-dimensional", what));
+  }
+  std::vector<std::string> cells;
+  cells.reserve(static_cast<std::size_t>(array.size()));
+  const char kind = array.dtype().kind();
+  if (kind == 'f' || kind == 'i' || kind == 'u') {
+    const auto numbers = py::array_t<double, py::array::forcecast>::ensure(array);
+    for (py::ssize_t i = 0; i < numbers.size(); ++i) cells.push_back(shortest(numbers.at(i)));
+  } else {  // text, or what must not be read
+    for (const py::handle cell : array) cells.emplace_back(py::str(cell));
+  }
+  return cells;
+}
+
+py::array column_of(const CsvTable& table, const std::string& name) {
+  const int column = table.find(name);
+  if (column < 0) {
+    throw py::key_error(fmt::format("{} has no column '{}'; it has: {}", table.name(), name, fmt::join(table.header(), ", ")));
+  }
+  Eigen::VectorXd values(table.n_rows());
+  for (int i = 0; i < table.n_rows(); ++i) values[i] = table.number(i, column);
+  return to_vector(std::move(values));
+}
+
+}  // namespace
+
+std::string path_argument(const py::object& path) { return py::bytes(py::module_::import("os").attr("fsencode")(path)); }
+
+CsvTable to_table(const py::object& data, const std::string& what) {
+  if (py::isinstance<CsvTable>(data)) return data.cast<CsvTable>();
+  const bool is_path = py::isinstance<py::str>(data) || py::hasattr(data, "__fspath__");
+  if (is_path) return CsvTable::read(path_argument(data));
+  if (!py::hasattr(data, "keys")) {
+    throw py::type_error(
+        fmt::format("{}: expected a gp2.Table, the path of a CSV file, a pandas frame, or a mapping of column "
+                    "names to arrays; got {}",
+                    what, std::string(py::str(py::type::of(data)))));
+  }
+  std::vector<std::string> header;
+  std::vector<std::vector<std::string>> columns;
+  for (const py::handle key : data.attr("keys")()) {
+    header.emplace_back(py::str(key));
+    columns.push_back(cells_of(data[key], fmt::format("{}['{}']", what, header.back())));
+    if (columns.back().size() != columns.front().size()) {
+      throw InputError(fmt::format("{}: the columns differ in length: '{}' has {}, '{}' has {}", what, header.front(),
+                                   columns.front().size(), header.back(), columns.back().size()));
+    }
+  }
+  std::vector<std::string> cells;
+  for (std::size_t i = 0; !columns.empty() && i < columns.front().size(); ++i) {
+    for (auto& column : columns) cells.push_back(std::move(column[i]));
+  }
+  return CsvTable::from_cells(what, std::move(header), std::move(cells));
+}
+
+void add_table(py::module_& module) {
+  py::class_<CsvTable>(module, "Table", "Columns by name, as read from a CSV file. A mapping of names to arrays (n,).")
+      .def(py::init([](const py::object& columns, const std::string& name) { return to_table(columns, name); }),
+           py::arg("columns"), py::arg("name") = "data",
+           "From a pandas frame, a mapping of column names to arrays of one length, or the path of a CSV file.")
+      .def_property_readonly("name", &CsvTable::name, "Stands for the table in messages.")
+      .def_property_readonly("columns", &CsvTable::header, "Names of the columns, in their order.")
+      .def("keys", &CsvTable::header, "Names of the columns, in their order.")
+      .def("__len__", &CsvTable::n_rows)
+      .def("__contains__", [](const CsvTable& table, const std::string& name) { return table.find(name) >= 0; })
+      .def("__getitem__", &column_of, py::arg("name"),
+           "A column (n,).\n\nRaises KeyError when there is none, InputError when a cell is not a finite number.")
+      .def("__repr__", [](const CsvTable& table) {
+        return fmt::format("<gp2.Table '{}': {} rows of {}>", table.name(), table.n_rows(), fmt::join(table.header(), ", "));
+      });
+  module.def(
+      "read_csv", [](const py::object& path) { return CsvTable::read(path_argument(path)); }, py::arg("path"),
+      "Read a CSV file with one header line.\n\nRaises InputError naming file and line: unreadable or empty file, ragged row,\n"
+      "repeated or empty column name. Cells are looked at when they are used.");
+}
+
+}  // namespace gp2::python

@@ -1,0 +1,242 @@
+#include "gp2/callable_system.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+
+#include <fmt/format.h>
+#include <fmt/ranges.h>
+
+#include "gp2/error.hpp"
+
+namespace gp2 {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+
+namespace {
+
+std::vector<std::string> labels_of(const std::vector<CallableSystem::Constraint>& constraints) {
+  std::vector<std::string> labels;
+  for (const CallableSystem::Constraint& constraint : constraints) labels.push_back(constraint.text);
+  return labels;
+}
+
+std::vector<bool> marks_of(const std::optional<std::vector<std::string>>& read, const char* what, const System& system) {
+  const std::vector<std::string> names = system.state_names();
+  if (!read) return std::vector<bool>(names.size(), true);
+  std::vector<bool> marks(names.size(), false);
+  for (const std::string& name : *read) {
+    const auto found = std::find(names.begin(), names.end(), name);
+    if (found == names.end()) {
+      throw InputError(fmt::format("system '{}': {}: '{}' is no entry of the state, which has {}", system.name(), what, name,
+                                   fmt::join(names, ", ")));
+    }
+    marks[static_cast<std::size_t>(found - names.begin())] = true;
+  }
+  return marks;
+}
+
+// whether every entry that is read is a finite number
+bool is_known(const Eigen::Ref<const VectorXd>& state, const std::vector<bool>& reads) {
+  for (Index k = 0; k < state.size(); ++k) {
+    if (reads[static_cast<std::size_t>(k)] && !std::isfinite(state[k])) return false;
+  }
+  return true;
+}
+
+}  // namespace
+
+CallableSystem::CallableSystem(Definition definition)
+    : System(definition.declaration.name, definition.declaration.coordinates, definition.declaration.inputs,
+             definition.declaration.parameters, labels_of(definition.constraints)),
+      definition_(std::move(definition)),
+      mechanics_reads_(marks_of(definition_.mechanics_reads, "mechanics_reads", *this)),
+      force_reads_(marks_of(definition_.force_reads, "force_reads", *this)),
+      residuals_read_(marks_of(definition_.residuals_read, "residuals_read", *this)) {
+  if (nq() == 0) throw InputError(fmt::format("system '{}': a system needs at least one coordinate", name()));
+  if (!definition_.evaluate) throw InputError(fmt::format("system '{}': evaluate is an empty function", name()));
+  if (!definition_.residuals) return;
+  for (int row = 0; row < nc(); ++row) {
+    const Constraint& constraint = definition_.constraints[static_cast<std::size_t>(row)];
+    if (constraint.level == ConstraintLevel::acceleration) continue;
+    residual_labels_.push_back({row, constraint.level == ConstraintLevel::velocity, constraint.text});
+    if (constraint.level == ConstraintLevel::position) residual_labels_.push_back({row, true, "d/dt of " + constraint.text});
+  }
+  if (residual_labels_.empty()) {
+    throw InputError(
+        fmt::format("system '{}': residuals are given, but none of its {} constraints is at position or velocity "
+                    "level; say the levels, or leave out the residuals",
+                    name(), nc()));
+  }
+}
+
+void CallableSystem::require_shapes(const char* function, const SystemValues& values, Index n_states) const {
+  const auto require = [&](const char* what, const char* shape, const MatrixXd& got, Index rows) {
+    if (got.rows() == rows && got.cols() == n_states) return;
+    throw InputError(
+        fmt::format("system '{}': {} returned {} of the shape {} × {}, expected {} × {} ({} × N, with nq = {} coordinates, "
+                    "nc = {} constraints, N = {} states)",
+                    name(), function, what, got.rows(), got.cols(), rows, n_states, shape, nq(), nc(), n_states));
+  };
+  require("mass M", "nq·nq", values.mass, Index{nq()} * nq());
+  require("constraint_matrix A", "nc·nq", values.constraint_matrix, Index{nc()} * nq());
+  require("constraint_vector b", "nc", values.constraint_vector, nc());
+  require("force F", "nq", values.force, nq());
+}
+
+void CallableSystem::require_finite(const char* function, const SystemValues& values, const States& states) const {
+  const auto require = [&](const char* what, const MatrixXd& all, Index i) {
+    if (all.col(i).allFinite()) return;
+    throw InputError(
+        fmt::format("system '{}': {} returned {} with a number that is not finite at state {}, where all that is read is finite",
+                    name(), function, what, i + 1));
+  };
+  for (Index i = 0; i < states.cols(); ++i) {
+    if (is_known(states.col(i), force_reads_)) require("force F", values.force, i);
+    if (!is_known(states.col(i), mechanics_reads_)) continue;
+    require("mass M", values.mass, i);
+    require("constraint_matrix A", values.constraint_matrix, i);
+    require("constraint_vector b", values.constraint_vector, i);
+  }
+}
+
+void CallableSystem::require_symmetry(const char* function, const SystemValues& values, int i, bool derivative) const {
+  const auto M = values.M(i);
+  const double largest = M.cwiseAbs().maxCoeff();
+  for (Index row = 0; row < M.rows(); ++row) {
+    for (Index column = 0; column < row; ++column) {
+      // a positive definite M has M_rc² < M_rr M_cc; its derivative has no such bound
+      const double diagonal = std::sqrt(std::abs(M(row, row) * M(column, column)));
+      const double size = derivative ? largest : std::max(std::abs(M(row, column)), diagonal);
+      if (!(std::abs(M(row, column) - M(column, row)) > 1e-10 * size)) continue;
+      throw InputError(
+          fmt::format("system '{}': {} returned a mass M that is not symmetric at state {}: row {} column {} is {}, but row {} "
+                      "column {} is {}",
+                      name(), function, i + 1, column + 1, row + 1, M(column, row), row + 1, column + 1, M(row, column)));
+    }
+  }
+}
+
+SystemValues CallableSystem::evaluate(const States& states, const Parameters& parameters) const {
+  SystemValues values = definition_.evaluate(states, parameters);
+  require_shapes("evaluate", values, states.cols());
+  // at other parameters a fit may be on the way through: the likelihood is +∞ there
+  if (parameters == parameter_values()) require_finite("evaluate", values, states);
+  for (int i = 0; i < values.n_states(); ++i) require_symmetry("evaluate", values, i, false);
+  return values;
+}
+
+SystemValues CallableSystem::differentiate(const States& states, const Parameters& parameters, int index) const {
+  if (!definition_.differentiate) {
+    SystemValues values = difference(states, parameters, index);
+    require_finite(
+        fmt::format("the difference of evaluate in '{}'", this->parameters()[static_cast<std::size_t>(index)].name).c_str(),
+        values, states);
+    return values;
+  }
+  SystemValues values = definition_.differentiate(states, parameters, index);
+  require_shapes("differentiate", values, states.cols());
+  require_finite("differentiate", values, states);
+  for (int i = 0; i < values.n_states(); ++i) require_symmetry("differentiate", values, i, true);
+  return values;
+}
+
+namespace {
+
+// over which a parameter of the value p changes what depends on it
+double scale_of(const Parameter& parameter, double p) {
+  const std::optional<std::pair<double, double>>& bounds = parameter.bounds;
+  if (bounds && (bounds->first > 0 || bounds->second < 0) && p != 0) return std::abs(p);
+  const double scale = std::max(std::abs(p), std::abs(parameter.value));
+  if (scale > 0) return scale;
+  const double widest = bounds ? std::max(std::abs(bounds->first), std::abs(bounds->second)) : 0;
+  return widest > 0 ? widest : 1;
+}
+
+// a x + b y
+SystemValues combined(double a, const SystemValues& x, double b, const SystemValues& y) {
+  return {a * x.mass + b * y.mass, a * x.constraint_matrix + b * y.constraint_matrix,
+          a * x.constraint_vector + b * y.constraint_vector, a * x.force + b * y.force};
+}
+
+}  // namespace
+
+SystemValues CallableSystem::difference(const States& states, const Parameters& parameters, int index) const {
+  const Parameter& parameter = this->parameters()[static_cast<std::size_t>(index)];
+  const double p = parameters[index];
+  double h = std::cbrt(std::numeric_limits<double>::epsilon()) * scale_of(parameter, p);
+  h = (p + h) - p;  // as rounded
+  const auto at = [&](double value) {
+    VectorXd moved = parameters;
+    moved[index] = value;
+    return evaluate(states, moved);
+  };
+  const auto allowed = [&](double value) {
+    return !parameter.bounds || (parameter.bounds->first <= value && value <= parameter.bounds->second);
+  };
+  const bool above = allowed(p + h), below = allowed(p - h);
+  if (above == below) return combined(1 / (2 * h), at(p + h), -1 / (2 * h), at(p - h));
+  // (−3 f(p) + 4 f(p + h) − f(p + 2h)) / 2h
+  if (below) h = -h;
+  return combined(1, combined(-3 / (2 * h), at(p), 2 / h, at(p + h)), -1 / (2 * h), at(p + 2 * h));
+}
+
+MatrixXd CallableSystem::residuals(const States& states, const Parameters& parameters) const {
+  const auto n_rows = static_cast<Index>(residual_labels_.size());
+  if (n_rows == 0) return MatrixXd(0, states.cols());
+  MatrixXd values = definition_.residuals(states, parameters);
+  if (values.rows() != n_rows || values.cols() != states.cols()) {
+    std::vector<std::string> rows;
+    for (const Residual& label : residual_labels_) rows.push_back(label.text);
+    throw InputError(fmt::format(
+        "system '{}': residuals returned the shape {} × {}, expected {} × {}: a row for each of {}; a column for each "
+        "of the N = {} states",
+        name(), values.rows(), values.cols(), n_rows, states.cols(), fmt::join(rows, ", "), states.cols()));
+  }
+  for (Index i = 0; i < states.cols(); ++i) {
+    if (values.col(i).allFinite() || !is_known(states.col(i), residuals_read_)) continue;
+    throw InputError(
+        fmt::format("system '{}': residuals returned a number that is not finite at state {}, where all that is read is finite",
+                    name(), i + 1));
+  }
+  return values;
+}
+
+std::vector<bool> CallableSystem::reads(SystemPart part) const {
+  switch (part) {
+    case SystemPart::mechanics:
+      return mechanics_reads_;
+    case SystemPart::force:
+      return force_reads_;
+    case SystemPart::residuals:
+      break;
+  }
+  // without residuals nothing is read
+  return residual_labels_.empty() ? std::vector<bool>(residuals_read_.size(), false) : residuals_read_;
+}
+
+std::shared_ptr<const System> CallableSystem::without_constraints() const {
+  const auto freed = [](SystemValues values) {
+    values.constraint_matrix.resize(0, values.n_states());
+    values.constraint_vector.resize(0, values.n_states());
+    return values;
+  };
+  const auto whole = std::make_shared<const CallableSystem>(definition_);
+  Definition free = definition_;
+  free.constraints.clear();
+  free.residuals = nullptr;
+  free.evaluate = [whole, freed](const States& states, const Parameters& parameters) {
+    return freed(whole->evaluate(states, parameters));
+  };
+  // without derivatives of its own, the free system takes differences of its own
+  if (definition_.differentiate) {
+    free.differentiate = [whole, freed](const States& states, const Parameters& parameters, int index) {
+      return freed(whole->differentiate(states, parameters, index));
+    };
+  }
+  return std::make_shared<const CallableSystem>(std::move(free));
+}
+
+}  // namespace gp2

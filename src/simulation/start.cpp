@@ -1,0 +1,48 @@
+#include <algorithm>
+#include <iterator>
+
+#include <fmt/format.h>
+#include <fmt/ranges.h>
+
+#include "gp2/error.hpp"
+#include "gp2/simulate.hpp"
+
+namespace gp2 {
+
+namespace {
+
+// "q3 = 0.097, dq3 = -0.04"
+std::string listed(const std::vector<std::string>& names, const Eigen::VectorXd& state, const std::vector<int>& entries) {
+  std::vector<std::string> parts;
+  for (const int k : entries) parts.push_back(fmt::format("{} = {:.6g}", names[static_cast<std::size_t>(k)], state[k]));
+  return fmt::format("{}", fmt::join(parts, ", "));
+}
+
+}  // namespace
+
+Eigen::VectorXd complete_start(const ModelFile& model, const Eigen::VectorXd& parameters, StartingPoint start,
+                               std::vector<std::string>& notes) {
+  const System& system = *model.system;
+  const std::vector<std::string> names = system.state_names();
+  std::vector<int> open;
+  for (int k = 0; k < 2 * system.nq(); ++k) {
+    if (start.given[static_cast<std::size_t>(k)]) continue;
+    open.push_back(k);
+    const auto newton_start = model.newton_start.find(names[static_cast<std::size_t>(k)]);
+    if (newton_start != model.newton_start.end()) start.state[k] = newton_start->second;
+  }
+  if (open.empty()) return start.state;
+  Eigen::VectorXd state;
+  try {
+    state = project_onto_constraints(system, parameters, start.state, start.given);
+  } catch (const NumericalError& error) {
+    notes.push_back(fmt::format("--start: what is given leaves no solution of the constraints ({})", error.what()));
+    return start.state;
+  }
+  std::vector<int> solved;
+  std::copy_if(open.begin(), open.end(), std::back_inserter(solved), [&](int k) { return state[k] != start.state[k]; });
+  if (!solved.empty()) notes.push_back(fmt::format("start: from the constraints {}", listed(names, state, solved)));
+  return state;
+}
+
+}  // namespace gp2

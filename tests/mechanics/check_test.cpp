@@ -1,0 +1,64 @@
+#include "gp2/check.hpp"
+
+#include <gmock/gmock.h>
+
+#include "gp2/callable_system.hpp"
+#include "gp2/model_file.hpp"
+
+namespace gp2 {
+namespace {
+
+using Eigen::MatrixXd;
+using testing::HasSubstr;
+
+// a bead on a wire: at rest, and moving along it
+MatrixXd bead_states() {
+  MatrixXd states = MatrixXd::Zero(5, 3);  // x z dx dz t
+  states.col(0) << 0.4, 0.08, 0, 0, 0;
+  states.col(1) << 0.4, 0.08, 1.5, 0.6, 0;
+  states.col(2) << -0.8, 0.32, -0.7, 0.56, 1;
+  return states;
+}
+
+ModelFile bead() {
+  return ModelFile::parse(R"(
+coordinates = ["x", "z"]
+[mechanics]
+mass = [["1", "0"], ["0", "1"]]
+[constraints]
+position = ["z - 0.5*x^2"]
+)",
+                          "a bead on a wire");
+}
+
+Finding motion_finding(const System& system, const MatrixXd& states) {
+  for (Finding& finding : check_system(system, states, system.parameter_values())) {
+    if (finding.text.starts_with("A and b:")) return finding;
+  }
+  return {Finding::Level::error, "not looked at"};
+}
+
+TEST(Check, AStateAtRestIsNoFaultOfAAndB) {
+  const ModelFile model = bead();
+  EXPECT_EQ(motion_finding(*model.system, bead_states()).level, Finding::Level::good);
+  EXPECT_EQ(motion_finding(*model.system, bead_states().leftCols(1)).level, Finding::Level::good);
+}
+
+TEST(Check, AWrongBIsFound) {
+  const ModelFile model = bead();
+  CallableSystem::Definition wrong;
+  wrong.declaration = {"wrong", model.system->coordinates(), {}, {}};
+  wrong.constraints = {{"wire", ConstraintLevel::position}};
+  wrong.evaluate = [&](const auto& states, const auto& parameters) {
+    SystemValues values = model.system->evaluate(states, parameters);
+    values.constraint_vector *= 1.01;
+    return values;
+  };
+  wrong.residuals = [&](const auto& states, const auto& parameters) { return model.system->residuals(states, parameters); };
+  const Finding finding = motion_finding(CallableSystem(wrong), bead_states());
+  EXPECT_EQ(finding.level, Finding::Level::warning);
+  EXPECT_THAT(finding.text, HasSubstr("largest for 'd/dt of wire'"));
+}
+
+}  // namespace
+}  // namespace gp2

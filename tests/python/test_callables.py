@@ -1,0 +1,169 @@
+"""Systems whose mechanics are Python functions."""
+
+import gp2
+import numpy as np
+import pytest
+
+from conftest import MODELS
+
+SURFACE_KEYS = {
+    "coordinates": ["q1", "q2", "q3"],
+    "inputs": ["u1", "u2", "u3"],
+    "latents": [{"features": ["q1", "q2", "q3", "dq1", "dq2", "dq3", "u1", "u2", "u3"]}],
+    "noise": 0.1,
+}
+
+
+@pytest.fixture(scope="module")
+def surface():
+    return gp2.System.load(MODELS / "surface.toml")
+
+
+@pytest.fixture(scope="module")
+def log(surface):
+    return surface.generate(40, noise_std=0.1)
+
+
+def parameters(**other):
+    return {"m": 3.0, "g": 9.81, "p1": 0.08, "p2": 0.05, "p3": 0.05, "p4": 0.1, "p5": 3.0, **other}
+
+
+def as_functions(surface, constraints=("surface",), mechanics=None, **keywords):
+    """The surface again, its equations evaluated by a function."""
+
+    def evaluate(states, values):
+        at = surface.evaluate(states, values)
+        return at.M, at.A, at.b, at.F
+
+    names = surface.state_names
+    reads = [name for name in names if name != "t"]
+    keywords = {"parameters": parameters(), "reads": reads, **SURFACE_KEYS, **keywords}
+    return gp2.System.from_callables(mechanics or evaluate, constraints, **keywords)
+
+
+def test_functions_give_the_same_fit_as_text(surface, log):
+    system = as_functions(surface)
+    options = {"mean": "force", "restarts": 2, "estimate": []}
+    by_text, by_functions = gp2.fit(surface, log, **options), gp2.fit(system, log, **options)
+    assert by_functions.report.objective == by_text.report.objective
+    states = surface.states(surface.generate(20, seed=2, noise_std=0))
+    for view in ["constrained", "unconstrained", "constraint-force", "multipliers"]:
+        a, b = by_text.predict(states, view), by_functions.predict(states, view)
+        np.testing.assert_array_equal(a.mean, b.mean)
+        np.testing.assert_array_equal(a.cov, b.cov)
+    # exact in the text, central differences of the function: step³ᐟ² of rounding
+    exact = gp2.Predictor(by_text).mean_and_jacobian(states[0])[1]
+    differences = gp2.Predictor(by_functions).mean_and_jacobian(states[0])[1]
+    np.testing.assert_allclose(differences, exact, atol=1e-7 * np.abs(exact).max())
+
+
+def test_parameter_is_estimated_with_exact_derivatives_and_without(surface, log):
+    """M, A, b, F are linear in p1 for this surface: differences are exact but for rounding."""
+
+    def derivatives(states, values, name):
+        assert name == "p1"
+        step = 0.01
+        low, high = (surface.evaluate(states, {**values, name: values[name] + s}) for s in (-step, step))
+        return tuple((getattr(high, part) - getattr(low, part)) / (2 * step) for part in "MAbF")
+
+    bounded = parameters(p1={"value": 0.07, "bounds": [0.04, 0.12]})
+    options = {"mean": "force", "restarts": 1, "estimate": ["p1"]}
+    given = gp2.fit(as_functions(surface, parameters=bounded, derivatives=derivatives), log, **options)
+    differenced = gp2.fit(as_functions(surface, parameters=bounded), log, **options)
+    assert given.report.objective == pytest.approx(differenced.report.objective, abs=1e-4)
+    assert given.parameters["p1"] == pytest.approx(differenced.parameters["p1"], abs=1e-4)
+    assert given.parameters["p1"] == pytest.approx(0.08, abs=0.005)
+
+
+def test_simulate_stays_on_constraints_with_residuals(surface):
+    h = 0.5
+
+    def mechanics(states, values):
+        x, dx = states[:, 0], states[:, 2]
+        n = len(states)
+        mass = np.broadcast_to(0.2 * np.eye(2), (n, 2, 2))
+        rows = np.stack([-2 * h * x, np.ones(n)], axis=1)[:, None, :]
+        force = np.broadcast_to([0.0, -9.81 * 0.2], (n, 2))
+        return mass, rows, (2 * h * dx**2)[:, None], force
+
+    def residuals(states, values):
+        x, z, dx, dz = states[:, :4].T
+        return np.stack([z - h * x**2, dz - 2 * h * x * dx], axis=1)
+
+    wire = gp2.System.from_callables(
+        mechanics, {"position": ["wire"]}, residuals=residuals, coordinates=["x", "z"], truth=["0", "0"]
+    )
+    motion = gp2.simulate(wire, {"x": 0.9}, np.linspace(0, 5, 11))
+    assert motion.q[0, 1] == pytest.approx(h * 0.81, abs=1e-12)  # from the constraint
+    assert motion.max_position_drift < 1e-12
+    text = gp2.System(
+        coordinates=["x", "z"],
+        mass=[["0.2", "0"], ["0", "0.2"]],
+        force=["0", "-9.81*0.2"],
+        constraints=[f"z - {h}*x^2"],
+        truth=["0", "0"],
+    )
+    np.testing.assert_allclose(motion.q, gp2.simulate(text, {"x": 0.9}, np.linspace(0, 5, 11)).q, atol=1e-9)
+
+
+def test_fit_is_saved_without_the_functions_and_loaded_with_them(surface, log, tmp_path):
+    system = as_functions(surface)
+    posterior = gp2.fit(system, log, max_iterations=0)
+    posterior.save(tmp_path / "fit.json")
+    states = surface.states(log)
+    for loaded in [gp2.load(tmp_path / "fit.json", system), gp2.load(tmp_path / "fit.json", system=posterior.system)]:
+        np.testing.assert_array_equal(loaded.predict(states).cov, posterior.predict(states).cov)
+    with pytest.raises(gp2.InputError, match="are code, which a file cannot hold"):
+        gp2.load(tmp_path / "fit.json")
+
+
+def test_several_threads_take_turns_in_the_functions(surface, log):
+    system = as_functions(surface, parameters=parameters(p1={"value": 0.08, "bounds": [0.06, 0.1]}))
+    options = {"estimate": ["p1"], "restarts": 3, "max_iterations": 5}
+    one, two = (gp2.fit(system, log, threads=threads, **options) for threads in (1, 2))
+    assert one.report.objective == two.report.objective
+
+
+def returning(values):
+    return lambda states, parameters: values(len(states))
+
+
+@pytest.mark.parametrize(
+    ("values", "text"),
+    [
+        (lambda n: None, "mechanics: expected (M, A, b, F), got <class 'NoneType'>"),
+        (lambda n: (np.eye(3), None, None, None), "M must be numbers of shape (n, nq, nq) = (40, 3, 3), got (3, 3)"),
+        (lambda n: (np.ones((n, 3, 3)), None, None, None), "A must be numbers of shape (n, nc, nq) = (40, 1, 3), got"),
+        (lambda n: (np.full((n, 3, 3), "x"), None, None, None), "M must be numbers of shape"),
+    ],
+)
+def test_wrong_returns_are_named(surface, log, values, text):
+    system = as_functions(surface, mechanics=returning(values))
+    with pytest.raises(gp2.InputError) as error:
+        gp2.fit(system, log)
+    assert text in str(error.value)
+
+
+def test_exceptions_of_functions_arrive_as_they_are(surface, log):
+    calls = []
+
+    def fails_later(states, values):
+        calls.append(len(states))
+        if len(calls) > 5:
+            raise LookupError("of my own")
+        at = surface.evaluate(states, values)
+        return at.M, at.A, at.b, at.F
+
+    bounded = parameters(p1={"value": 0.08, "bounds": [0.06, 0.1]})
+    with pytest.raises(LookupError, match="of my own"):
+        gp2.fit(as_functions(surface, mechanics=fails_later, parameters=bounded), log, estimate=["p1"])
+    assert len(calls) > 5
+
+
+def test_what_is_no_system_is_refused(surface):
+    with pytest.raises(TypeError, match="mechanics: expected a function, got <class 'int'>"):
+        as_functions(surface, mechanics=3)
+    with pytest.raises(gp2.InputError, match="mass: the mechanics are code here; leave it out"):
+        as_functions(surface, mass=[["1"]])
+    with pytest.raises(gp2.InputError, match="expected 'position', 'velocity' or 'acceleration', got 'loop'"):
+        as_functions(surface, constraints={"loop": ["x"]})

@@ -1,0 +1,331 @@
+"""What a posterior does beside predicting: joint, samples, motions, growing data, files."""
+
+import threading
+
+import numpy as np
+import pytest
+
+import gp2
+from conftest import columns_of
+
+
+def assert_on_constraint(system, states, ddq, parameters, tolerance=1e-12):
+    mechanics = system.evaluate(states, parameters)
+    A, b = mechanics.A, mechanics.b
+    error = np.einsum("nij,...nj->...ni", A, ddq) - b
+    scale = np.einsum("nij,...nj->...ni", np.abs(A), np.abs(ddq)) + np.abs(b)
+    assert (np.abs(error) <= tolerance * scale).all()
+
+
+def test_means_and_samples_obey_the_constraint(posterior, arm, arm_states):
+    fitted = posterior.parameters
+    assert fitted["m2"] != arm.parameters["m2"]
+    assert_on_constraint(arm, arm_states, posterior.predict(arm_states).mean, fitted)
+    samples = posterior.sample(arm_states, 50, seed=2)
+    assert samples.std(axis=0).min() > 0
+    assert_on_constraint(arm, arm_states, samples, fitted)
+
+
+def test_joint_has_the_marginals_on_its_diagonal(posterior, arm_states):
+    mean, covariance = posterior.joint(arm_states)
+    prediction = posterior.predict(arm_states)
+    np.testing.assert_allclose(mean.reshape(-1, 2), prediction.mean, rtol=1e-12, atol=1e-12 * np.abs(mean).max())
+    np.testing.assert_allclose(covariance, covariance.T, rtol=1e-12, atol=1e-14)
+    blocks = np.array([covariance[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] for i in range(len(arm_states))])
+    np.testing.assert_allclose(blocks, prediction.cov, rtol=0, atol=1e-9 * np.abs(covariance).max())
+
+
+def test_samples_are_draws_of_joint_and_repeat_with_their_seed(posterior, arm_states):
+    mean, covariance = posterior.joint(arm_states)
+    samples = posterior.sample(arm_states, 4000, seed=5).reshape(4000, -1)
+    spread = np.sqrt(np.diag(covariance))
+    assert (np.abs(samples.mean(axis=0) - mean) < 5 * spread / np.sqrt(4000)).all()  # five standard errors
+    np.testing.assert_allclose(np.cov(samples.T), covariance, rtol=0, atol=0.1 * np.outer(spread, spread).max())
+    np.testing.assert_array_equal(posterior.sample(arm_states, 2, seed=5), posterior.sample(arm_states, 2, seed=5))
+    assert (posterior.sample(arm_states, 2, seed=5) != posterior.sample(arm_states, 2, seed=6)).any()
+
+
+def test_the_number_of_threads_changes_no_bit(posterior, arm):
+    states = arm.states(arm.generate(300, seed=9))
+    one, three = posterior.predict(states, threads=1), posterior.predict(states, threads=3)
+    np.testing.assert_array_equal(one.mean, three.mean)
+    np.testing.assert_array_equal(one.cov, three.cov)
+    with pytest.raises(gp2.InputError, match="threads: must be at least 0, got -1"):
+        posterior.predict(states, threads=-1)
+
+
+def test_python_threads_predict_at_the_same_time_as_the_data_grow(posterior, arm):
+    states = arm.states(arm.generate(200, seed=9))
+    before = posterior.predict(states, mean_only=True).mean
+    failures = []
+
+    def predict():
+        try:
+            for _ in range(20):
+                assert np.isfinite(posterior.predict(states, mean_only=True).mean).all()
+                posterior.joint(states[:5])
+        except BaseException as error:  # noqa: BLE001  # told by the main thread
+            failures.append(error)
+
+    threads = [threading.Thread(target=predict) for _ in range(3)]
+    for thread in threads:
+        thread.start()
+    more = arm.generate(20, seed=10)
+    for k in range(20):
+        posterior.update({name: values[k : k + 1] for name, values in columns_of(more).items()})
+        posterior.remove_oldest()
+    for thread in threads:
+        thread.join()
+    assert not failures
+    assert (posterior.predict(states, mean_only=True).mean != before).any()
+
+
+# ---------------------------------------------------------------- data that grow
+
+
+def test_update_is_the_fit_of_all_data_under_the_same_hyperparameters(arm, arm_log, arm_states, tmp_path):
+    first, more = ({name: values[part] for name, values in columns_of(arm_log).items()} for part in (slice(20), slice(20, 30)))
+    posterior = gp2.fit(arm, first, max_iterations=0)
+    posterior.save(tmp_path / "first.json")
+    posterior.update(more)
+    assert posterior.n_data == 30
+    anew = gp2.fit(arm, arm_log, start=tmp_path / "first.json", max_iterations=0)
+    updated, expected = posterior.predict(arm_states), anew.predict(arm_states)
+    np.testing.assert_allclose(updated.mean, expected.mean, rtol=0, atol=1e-10 * np.abs(expected.mean).max())
+    np.testing.assert_allclose(updated.cov, expected.cov, rtol=0, atol=1e-10 * np.abs(expected.cov).max())
+
+    # and the file of a posterior that has grown holds the data it has
+    posterior.save(tmp_path / "grown.json")
+    loaded = gp2.load(tmp_path / "grown.json")
+    assert loaded.n_data == 30
+    np.testing.assert_allclose(
+        loaded.predict(arm_states).mean, updated.mean, rtol=0, atol=1e-10 * np.abs(updated.mean).max()
+    )
+
+
+def test_removed_data_are_as_if_they_had_not_been(arm, arm_log, arm_states, tmp_path):
+    posterior = gp2.fit(arm, arm_log, max_iterations=0)
+    posterior.save(tmp_path / "all.json")
+    posterior.remove_oldest(12)
+    assert posterior.n_data == 18
+    rest = {name: values[12:] for name, values in columns_of(arm_log).items()}
+    anew = gp2.fit(arm, rest, start=tmp_path / "all.json", max_iterations=0)
+    # scales are held, those of another fit are its own data's; what starts by value is equal
+    expected = anew.predict(arm_states).mean
+    np.testing.assert_allclose(posterior.predict(arm_states).mean, expected, rtol=0, atol=1e-10 * np.abs(expected).max())
+    with pytest.raises(gp2.InputError, match="there are 18 observed states"):
+        posterior.remove_oldest(19)
+    assert posterior.n_data == 18
+
+
+def test_a_refused_update_leaves_the_posterior_as_it_was(posterior, arm_log, arm_states):
+    before = posterior.predict(arm_states).cov
+    bad = {name: values[:2] for name, values in columns_of(arm_log).items()}
+    bad["ddelbow"] = np.array([0.1, np.nan])
+    with pytest.raises(gp2.InputError, match="ddelbow"):
+        posterior.update(bad)
+    with pytest.raises(gp2.InputError, match="noise_std: these accelerations were not observed in the fit"):
+        posterior.update(arm_log, observe=["ddelbow"])
+    np.testing.assert_array_equal(posterior.predict(arm_states).cov, before)
+
+
+def test_without_data_it_is_the_prior(posterior, arm_states):
+    prior = posterior.without_data()
+    assert prior.n_data == 0
+    assert (prior.predict(arm_states).std > posterior.predict(arm_states).std).any()
+
+
+# ---------------------------------------------------------------- files, figures, motion
+
+
+def test_a_loaded_fit_gives_the_same_bits(arm, arm_log, arm_states, tmp_path):
+    posterior = gp2.fit(arm, arm_log, mean="force", estimate=["m2"], restarts=1, max_iterations=5)
+    posterior.save(tmp_path / "fit.json")
+    for loaded in (gp2.load(tmp_path / "fit.json"), gp2.Posterior.load(str(tmp_path / "fit.json"))):
+        for view in ("constrained", "unconstrained", "constraint-force", "multipliers"):
+            ours, theirs = posterior.predict(arm_states, view), loaded.predict(arm_states, view)
+            np.testing.assert_array_equal(ours.mean, theirs.mean)
+            np.testing.assert_array_equal(ours.cov, theirs.cov)
+        assert loaded.report["m2"] == posterior.report["m2"]
+        assert loaded.negative_log_likelihood == posterior.negative_log_likelihood
+        assert loaded.system.text == arm.text
+        loaded.save(tmp_path / "again.json")
+        assert (tmp_path / "again.json").read_bytes() == (tmp_path / "fit.json").read_bytes()
+
+
+def test_a_start_out_of_bounds_is_taken_where_nothing_is_optimised(arm, arm_log, tmp_path):
+    start = tmp_path / "start.json"
+    start.write_text('{"m2": 2.5}', encoding="utf-8")
+    posterior = gp2.fit(arm, arm_log, estimate=["m2"], start=start, max_iterations=0)
+    assert posterior.parameters["m2"] == 2.5
+    assert any("m2 = 2.5 is outside its bounds [1, 2]; taken" in note for note in posterior.notes)
+    with pytest.raises(gp2.InputError, match="m2 = 2.5 is outside its bounds"):
+        gp2.fit(arm, arm_log, estimate=["m2"], start=start)
+
+
+def test_noise_that_collapses_is_warned_of(oscillator):
+    exact = oscillator.generate(6, noise_std=0)
+    twice = {name: np.repeat(exact[name], 2) for name in exact.columns}
+    with pytest.warns(UserWarning, match="ended at the lower bound: the columns may not be independent measurements"):
+        posterior = gp2.fit(oscillator, twice, noise_std="estimate", restarts=1, hyperprior=False)
+    assert "ended at the lower bound" in posterior.notes[-1]
+
+
+def test_the_report_tells_how_the_fit_went(posterior):
+    report = posterior.report
+    names = [h.name for h in report.hyperparameters]
+    assert "m2" in names
+    assert report["m2"] == posterior.parameters["m2"]
+    with pytest.raises(KeyError):
+        report["m7"]
+    assert len(report.restarts) == 1
+    assert report.termination in repr(report)
+    assert all(h.lower <= h.value <= h.upper for h in report.hyperparameters)
+
+
+def test_figures_against_true_accelerations(posterior, arm):
+    test = arm.generate(100, seed=21, noise_std=0)
+    figures = posterior.evaluate(test)
+    error = posterior.predict(test).mean - np.column_stack([test[name] for name in figures.outputs])
+    np.testing.assert_allclose(figures.rmse, np.sqrt((error**2).mean(axis=0)), rtol=1e-12)
+    assert figures.n == 100
+    assert figures.outputs == arm.acceleration_names
+    assert figures.max_constraint_error_fitted < 1e-10
+    assert posterior.evaluate(test, outputs=["ddelbow"]).rmse.shape == (1,)
+
+
+def test_the_predictor_gives_what_predict_gives(posterior, arm_states):
+    for view, dt in [("constrained", None), ("unconstrained", None), ("constraint-force", None), ("next-velocity", 0.01)]:
+        predictor = gp2.Predictor(posterior, view, dt=dt)
+        expected = posterior.predict(arm_states, view, dt=dt)
+        scale = np.abs(expected.mean).max()
+        for k, state in enumerate(arm_states):
+            mean, std = predictor.mean_and_std(state)
+            np.testing.assert_allclose(mean, expected.mean[k], rtol=0, atol=1e-12 * scale)
+            np.testing.assert_array_equal(predictor.mean(state), mean)
+            np.testing.assert_allclose(std**2, expected.std[k] ** 2, rtol=0, atol=1e-9 * np.square(expected.std).max())
+
+
+def test_the_predictors_jacobian_is_the_derivative(posterior, arm_states):
+    predictor = gp2.Predictor(posterior)
+    state, step = arm_states[0], 1e-6
+    mean, jacobian = predictor.mean_and_jacobian(state)
+    assert jacobian.shape == (2, 7)
+    differences = [
+        (predictor.mean(state + step * e) - predictor.mean(state - step * e)) / (2 * step) for e in np.eye(len(state))
+    ]
+    np.testing.assert_allclose(jacobian, np.transpose(differences), rtol=0, atol=1e-6 * np.abs(jacobian).max())
+    assert np.abs(jacobian).max() > 0
+    single = gp2.Predictor(posterior, storage="single", std=False, jacobian=False)
+    np.testing.assert_allclose(single.mean(state), mean, rtol=0, atol=1e-3 * np.abs(mean).max())
+
+
+def test_the_predictors_options_are_checked(posterior):
+    for options, text in [
+        ({"view": "position"}, "view: expected one of constrained"),
+        ({"view": "multipliers"}, "multipliers"),
+        ({"dt": 0.1}, "dt goes with view 'next-velocity'"),
+        ({"view": "next-velocity"}, "needs the time step dt [s]"),
+        ({"storage": "half"}, "storage: expected 'double' or 'single', got 'half'"),
+    ]:
+        with pytest.raises(gp2.InputError) as caught:
+            gp2.Predictor(posterior, **options)
+        assert text in str(caught.value)
+
+
+def test_a_motion_stays_on_the_constraint(posterior, arm):
+    times = np.linspace(0, 0.5, 26)
+    motion = posterior.simulate({"shoulder": 0.9, "dshoulder": 0.2}, times)
+    np.testing.assert_array_equal(motion.t, times)
+    assert motion.states.shape == (26, 7)
+    np.testing.assert_array_equal(motion.states, np.column_stack([motion.q, motion.dq, times, np.zeros((26, 2))]))
+    np.testing.assert_allclose(motion.ddq, posterior.predict(motion.states).mean, rtol=1e-12)
+    np.testing.assert_allclose(motion.std, posterior.predict(motion.states).std, rtol=1e-9, atol=1e-9)
+    assert motion.max_position_drift < 1e-12
+    assert motion.steps > 0
+    again = posterior.simulate(motion.states[0, :4], times)
+    np.testing.assert_allclose(again.q, motion.q, rtol=0, atol=1e-9)
+    assert gp2.simulate(arm, {"shoulder": 0.9}, times).std is None
+
+
+def test_sampled_motions_differ_and_repeat_with_their_seed(posterior):
+    def q(seed):
+        return [m.q for m in posterior.simulate({"shoulder": 0.9}, [0, 0.2], n_samples=3, seed=seed)]
+
+    first = q(4)
+    assert len(first) == 3
+    assert (first[0][-1] != first[1][-1]).any()
+    np.testing.assert_array_equal(first, q(4))
+
+
+def test_inputs_move_the_motion(posterior):
+    start, times = {"shoulder": 0.9}, [0, 0.1, 0.2]
+    pushed = posterior.simulate(start, times, inputs={"t": [0, 1], "tau1": [1, 1], "tau2": [0, 0]})
+    assert (pushed.states[:, -2] == 1).all()
+    assert (pushed.q[-1] != posterior.simulate(start, times).q[-1]).any()
+
+
+@pytest.mark.parametrize(
+    ("start", "times", "error", "text"),
+    [
+        ({"wrist": 1}, [0, 1], gp2.InputError, "start: 'wrist' is no coordinate or velocity of 'two-link arm on a moving plane'"),
+        ({"elbow": np.nan}, [0, 1], gp2.InputError, "start: elbow = nan is not a finite number"),
+        ([0.9, 0, 0], [0, 1], gp2.InputError, "start: expected shape (4,), got (3,)"),
+        (0.9, [0, 1], TypeError, "start: expected a dict of names to numbers, or all of q and dq, got 0.9"),
+        ({"elbow": "x"}, [0, 1], TypeError, "start: expected a dict of names to numbers"),
+        ({"shoulder": 0.9}, [], gp2.InputError, "times: expected the times [s]"),
+        ({"shoulder": 0.9}, [0, 1j], TypeError, "times: expected an array of real numbers"),
+        ({"shoulder": 0.9}, [[0, 1]], gp2.InputError, "times: expected shape (n,), got (1, 2)"),
+        ({"shoulder": 0.9}, [0, np.nan], gp2.InputError, "a time is not a finite number"),
+        ({"shoulder": 0.9}, [0, 0], gp2.InputError, "times must increase"),
+    ],
+)
+def test_a_motion_that_cannot_start_says_why(start, times, error, text, posterior):
+    with pytest.raises(error) as caught:
+        posterior.simulate(start, times)
+    assert text in str(caught.value)
+
+
+# ---------------------------------------------------------------- systems
+
+
+def test_a_system_of_strings_is_that_of_the_file_it_stands_for(arm):
+    again = gp2.System.parse(arm.text)
+    assert again.text == arm.text
+    built = gp2.System(
+        name="bead on a wire", coordinates=["x", "z"], inputs=["push"],
+        parameters={"m": 0.2, "h": {"value": 0.5, "bounds": [0.3, 0.7], "estimate": True}},
+        mass=[["m", "0"], ["0", "m"]], force=["push", "-9.81*m"], constraints=["z - h*x^2"],
+        latents=[{"features": ["x", "dx"]}], noise=0.05,
+    )  # fmt: skip
+    assert built.state_names == ["x", "z", "dx", "dz", "t", "push"]
+    assert built.acceleration_names == ["ddx", "ddz"]
+    assert built.constraints == ["z - h*x^2"]
+    mechanics = built.evaluate([[0.5, 0.125, 2, 1, 0, 3]], {"h": 0.6})
+    np.testing.assert_allclose(mechanics.M, [[[0.2, 0], [0, 0.2]]])
+    np.testing.assert_allclose(mechanics.A, [[[-2 * 0.6 * 0.5, 1]]])
+    np.testing.assert_allclose(mechanics.b, [[2 * 0.6 * 2**2]])
+    np.testing.assert_allclose(mechanics.F, [[3, -9.81 * 0.2]])
+    parsed = gp2.System.parse(built.text)
+    np.testing.assert_array_equal(parsed.evaluate([[0.5, 0.125, 2, 1, 0, 3]]).b, built.evaluate([[0.5, 0.125, 2, 1, 0, 3]]).b)
+
+
+def test_true_accelerations_are_those_of_generated_data_without_noise(arm):
+    data = arm.generate(6, seed=2, noise_std=0)
+    np.testing.assert_array_equal(arm.true_acceleration(arm.states(data)), np.column_stack([data["ddshoulder"], data["ddelbow"]]))
+
+
+def test_a_check_finds_what_is_wrong(arm, arm_log):
+    assert {finding.level for finding in gp2.check(arm, arm_log)} <= {"ok", "warning"}
+    off = columns_of(arm_log)
+    off["elbow"] = off["elbow"] + 0.1
+    levels = [finding.level for finding in gp2.check(arm, off)]
+    assert set(levels) & {"warning", "error"}
+    assert all(finding.text in repr(finding) for finding in gp2.check(arm))
+
+
+def test_the_blas_in_use_is_told():
+    report = gp2.blas_report()
+    assert set(report) == {"library", "kernel", "threads", "fastest_kernel", "advice"}
+    assert report["library"]
+    assert report["threads"] >= 1

@@ -1,0 +1,152 @@
+"""Logs go by the names of their columns: paths, tables, pandas frames, mappings."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import gp2
+from conftest import columns_of, write_csv
+
+
+@pytest.fixture
+def frame(arm_log):
+    return pd.DataFrame(columns_of(arm_log))
+
+
+def cov_of(system, data, states, **options):
+    return gp2.fit(system, data, max_iterations=0, **options).predict(states).cov
+
+
+def test_every_kind_of_table_is_the_same_log(arm, arm_log, arm_states, frame, tmp_path):
+    expected = cov_of(arm, arm_log, arm_states)
+    path = write_csv(tmp_path / "log.csv", arm_log)
+    shuffled = frame[reversed(frame.columns)].assign(comment="text that nobody reads")
+    for what, data in {
+        "frame": frame,
+        "frame with another order and more columns": shuffled,
+        "frame with another index": frame.set_index(np.arange(len(frame)) * 7),
+        "mapping of arrays": columns_of(arm_log),
+        "mapping of lists": {name: values.tolist() for name, values in columns_of(arm_log).items()},
+        "path": path,
+        "text of a path": str(path),
+        "table of a path": gp2.read_csv(path),
+        "table of a frame": gp2.Table(frame),
+        "list of one": [frame],
+        "Log": gp2.Log(frame),
+    }.items():
+        np.testing.assert_array_equal(cov_of(arm, data, arm_states), expected, err_msg=what)
+
+
+def test_states_are_found_by_name(posterior, arm, frame):
+    expected = posterior.predict(arm.states(frame)).mean
+    np.testing.assert_array_equal(posterior.predict(frame).mean, expected)
+    np.testing.assert_array_equal(posterior.predict(frame[reversed(frame.columns)]).mean, expected)
+
+
+def test_columns_of_other_names_are_found_by_alias(posterior, arm, frame):
+    renamed = frame.rename(columns={"shoulder": "theta1", "dshoulder": "dtheta1", "ddshoulder": "ddtheta1"})
+    alias = {"shoulder": "theta1"}
+    expected = posterior.predict(frame).mean
+    np.testing.assert_array_equal(posterior.predict(renamed, columns=alias).mean, expected)
+    np.testing.assert_array_equal(arm.states(renamed, columns=alias), arm.states(frame))
+    with pytest.raises(gp2.InputError, match="shoulder"):
+        posterior.predict(renamed)
+    with pytest.raises(TypeError, match="columns: expected a dict of the model's names to the log's, got 3"):
+        posterior.predict(frame, columns=3)
+
+
+def test_several_logs_are_learnt_from_together(arm, frame, arm_states):
+    first, second = frame[:12], frame[12:]
+    both = gp2.fit(arm, [first, second], max_iterations=0)
+    assert both.n_data == len(frame)
+    expected = both.predict(arm_states)
+    np.testing.assert_array_equal(cov_of(arm, [gp2.Log(first), gp2.Table(second)], arm_states), expected.cov)
+
+    faster = gp2.System.parse(arm.text.replace("w  = 4.0", "w  = 5.0"))
+    with pytest.warns(UserWarning, match="off the constraint"):
+        elsewhere = gp2.fit(arm, [first, gp2.Log(second, system=faster)], max_iterations=0)
+    assert (elsewhere.predict(arm_states).mean != expected.mean).any()
+
+
+def test_other_quantities_are_learnt_from_too(arm, frame, arm_states):
+    rest = {name: np.array([value]) for name, value in frame.iloc[0].items()}
+    rest |= {"abar_shoulder": np.array([0.5]), "abar_elbow": np.array([-0.5])}
+    also = [gp2.Knowledge("unconstrained", rest)]
+    posterior = gp2.fit(arm, frame, also=also, also_noise_std=1e-3, max_iterations=0)
+    assert posterior.n_data == len(frame) + 1
+    without = gp2.fit(arm, frame, max_iterations=0)
+    error, error_without = (p.predict(frame[:1], "unconstrained").mean - [0.5, -0.5] for p in (posterior, without))
+    assert np.abs(error).max() < 0.02 < np.abs(error_without).max()
+    with pytest.raises(gp2.InputError, match="view: expected one of"):
+        gp2.fit(arm, frame, also=[gp2.Knowledge("position", rest)])
+
+
+def test_a_table_is_a_mapping_of_names_to_arrays(arm_log):
+    assert len(arm_log) == 30
+    assert arm_log.keys() == arm_log.columns
+    assert "elbow" in arm_log
+    assert "wrist" not in arm_log
+    assert arm_log["elbow"].shape == (30,)
+    assert "30 rows of shoulder, elbow" in repr(arm_log)
+    with pytest.raises(KeyError, match="no column 'wrist'; it has: shoulder"):
+        arm_log["wrist"]
+    column = arm_log["elbow"]
+    column[:] = 0
+    assert (arm_log["elbow"] != 0).any()
+    back = pd.DataFrame(columns_of(arm_log))
+    np.testing.assert_array_equal(back["elbow"], arm_log["elbow"])
+
+
+def test_numbers_go_through_a_table_unchanged():
+    values = np.array([0.1, 1 / 3, 5e-324, -1.7976931348623157e308, 2**53 + 2])
+    np.testing.assert_array_equal(gp2.Table({"x": values})["x"], values)
+    np.testing.assert_array_equal(gp2.Table({"x": np.arange(3, dtype=np.int8)})["x"], [0, 1, 2])
+    np.testing.assert_array_equal(gp2.Table({"x": values[::2]})["x"], values[::2])
+
+
+@pytest.mark.parametrize(
+    ("columns", "error", "text"),
+    [
+        ({"x": [1, 2], "y": [1]}, gp2.InputError, "data: the columns differ in length: 'x' has 2, 'y' has 1"),
+        ({"x": [[1, 2]]}, gp2.InputError, "data['x']: expected one-dimensional"),
+        (3, TypeError, "data: expected a gp2.Table, the path of a CSV file, a pandas frame, or a mapping"),
+        (np.zeros((2, 2)), TypeError, "got <class 'numpy.ndarray'>"),
+    ],
+)
+def test_what_is_no_table_is_refused(columns, error, text):
+    with pytest.raises(error) as caught:
+        gp2.Table(columns)
+    assert text in str(caught.value)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, "abc", None, True, 1j, pd.NA])
+def test_cells_that_are_no_number_are_refused_when_they_are_used(value, posterior, frame):
+    frame = frame.astype({"elbow": object})
+    frame.loc[4, "elbow"] = value
+    with pytest.raises(gp2.InputError, match="elbow"):
+        posterior.predict(frame)
+    frame.insert(0, "unread", [value] * len(frame))
+    with pytest.raises(gp2.InputError, match="elbow"):
+        posterior.predict(frame)
+
+
+def test_a_state_without_prediction_is_named_with_its_table(tmp_path):
+    system = gp2.System(
+        coordinates=["x"], mass=[["x"]], latents=[{"features": ["dx"]}], noise=0.1, truth=["dx"],
+        sampling={"x": [1, 2], "dx": [-1, 1]},
+    )  # fmt: skip
+    posterior = gp2.fit(system, system.generate(5), max_iterations=0)
+    path = write_csv(tmp_path / "bad.csv", {"x": np.array([1.0, -1.0]), "dx": np.zeros(2), "ddx": np.zeros(2)})
+    for call in (posterior.predict, posterior.joint, posterior.sample, posterior.evaluate):
+        with pytest.raises(gp2.InputError, match=r"bad\.csv: system .* at state 2"):
+            call(path)
+
+
+def test_a_path_may_be_bytes_and_hold_any_character(arm_log, tmp_path):
+    path = write_csv(tmp_path / "Größe ü.csv", arm_log)
+    for name in (path, str(path), str(path).encode()):
+        assert len(gp2.read_csv(name)) == 30
+    with pytest.raises(gp2.InputError, match="missing.csv"):
+        gp2.read_csv(tmp_path / "missing.csv")
+    with pytest.raises(TypeError):
+        gp2.read_csv(3)

@@ -1,0 +1,197 @@
+#include <limits>
+
+#include <gmock/gmock.h>
+#include <gtest/gtest.h>
+
+#include "report/report_data.hpp"
+
+namespace gp2::command {
+namespace {
+
+using testing::AllOf;
+using testing::ElementsAre;
+using testing::Field;
+using testing::HasSubstr;
+using testing::IsEmpty;
+using testing::Not;
+using testing::UnorderedElementsAre;
+
+using Level = Advice::Level;
+
+auto advises(Level level, const std::string& text, const std::string& mend) {
+  return AllOf(Field(&Advice::level, level), Field(&Advice::text, HasSubstr(text)), Field(&Advice::mend, HasSubstr(mend)));
+}
+
+Hyperparameter hyperparameter(Hyperparameter::Kind kind, const std::string& name, double value, double lower, double upper) {
+  Hyperparameter h;
+  h.kind = kind;
+  h.name = name;
+  h.value = value;
+  h.lower = lower;
+  h.upper = upper;
+  return h;
+}
+
+// a fit with nothing to mend
+Report good_report() {
+  Report report;
+  FitReport& fit = report.fit.report;
+  fit.converged = true;
+  fit.termination = "the projected gradient fell below its tolerance";
+  fit.iterations = 20;
+  fit.objective = 10;
+  for (int k = 0; k < 3; ++k) {
+    RestartReport restart;
+    restart.objective = 10 + 0.1 * k;
+    restart.converged = true;
+    fit.restarts.push_back(restart);
+  }
+  report.relevance = {{"friction", "dq1", 2, 1, 0.5, 0.7}};
+  return report;
+}
+
+ReportData good_data(const std::string& name) {
+  ReportData data;
+  data.name = name;
+  data.is_test = name == "test";
+  data.outputs = {"ddq1"};
+  data.rows = {0};
+  data.noise_stddev = Eigen::VectorXd::Constant(1, 0.1);
+  data.evaluation.n = 1000;
+  data.evaluation.rmse = Eigen::VectorXd::Constant(1, 0.1);
+  data.evaluation.coverage95 = 0.95;
+  data.evaluation.coverage95_latent = 0.5;
+  return data;
+}
+
+TEST(Advice, OfAGoodFitIsToTestItOrToLook) {
+  Report report = good_report();
+  EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::good, "Nothing to mend", "--data")));
+  report.data = {good_data("training"), good_data("test")};
+  EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::good, "Nothing to mend", "pictures")));
+}
+
+TEST(Advice, TellsThatTheOptimiserDidNotConverge) {
+  Report report = good_report();
+  report.fit.report.converged = false;
+  report.fit.report.termination = "the limit of iterations was reached";
+  EXPECT_THAT(learning_advice(report),
+              ElementsAre(advises(Level::warning, "did not converge: the limit of iterations", "--max-iterations")));
+}
+
+TEST(Advice, TellsThatNothingWasOptimisedAndThenSaysNothingOfRelevance) {
+  Report report = good_report();
+  report.fit.report.converged = false;
+  report.fit.report.iterations = 0;
+  report.relevance = {{"friction", "dq1", 1e6, 1, 1e-6, 1e-6}};
+  EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::note, "Nothing was optimised", "--max-iterations 0")));
+}
+
+TEST(Advice, TellsOfRestartsThatFailedOrDisagree) {
+  Report report = good_report();
+  report.fit.report.restarts[1].objective = 15;
+  report.fit.report.restarts[2].objective = 12;
+  EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::note, "Only one of 3 restarts", "--restarts")));
+  report.fit.report.objective = 5;
+  EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::note, "No restart reached", "--restarts")));
+  report.fit.report.objective = 10;
+  report.fit.report.restarts[1].objective = std::numeric_limits<double>::infinity();
+  EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::note, "1 of 3 restarts found no finite start", "bounds")));
+}
+
+TEST(Advice, NamesAParameterAtItsBound) {
+  Report report = good_report();
+  report.fit.report.hyperparameters = {hyperparameter(Hyperparameter::Kind::parameter, "p1", 0.1, 0.06, 0.1),
+                                       hyperparameter(Hyperparameter::Kind::parameter, "p2", 0.08, 0.06, 0.1)};
+  EXPECT_THAT(learning_advice(report),
+              ElementsAre(advises(Level::warning, "p1 ended at its upper bound, 0.1.", "widen its bounds")));
+}
+
+TEST(Advice, TellsANoiseThatCollapsedFromOneAtItsUpperBound) {
+  Report report = good_report();
+  report.fit.report.hyperparameters = {hyperparameter(Hyperparameter::Kind::noise_stddev, "noise_stddev(ddq1)", 1e-6, 1e-6, 2)};
+  EXPECT_THAT(learning_advice(report),
+              ElementsAre(advises(Level::warning, "The noise collapsed: noise_stddev(ddq1)", "--observe")));
+  report.fit.report.hyperparameters.front().value = 2;
+  EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::note, "noise_stddev(ddq1) (upper bound, 2)", "Widen")));
+}
+
+TEST(Advice, NamesFeaturesThatHardlyMatterButNotThoseWithALinearEffect) {
+  Report report = good_report();
+  report.relevance.push_back({"friction", "q1", 1e6, 1, 1e-6, 1e-5});
+  report.relevance.push_back({"friction", "u1", 1e3, 1, 1e-3, 0.8});  // a long lengthscale and a large signal: linear
+  EXPECT_THAT(learning_advice(report), ElementsAre(AllOf(advises(Level::note, "the feature q1 hardly matters", "smaller"),
+                                                         Field(&Advice::text, Not(HasSubstr("u1"))))));
+  report.relevance = {report.relevance[1]};
+  EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::note, "No feature of 'friction' matters", "known part")));
+}
+
+TEST(Advice, ALengthscaleAtItsUpperBoundIsOnlyAnIrrelevantFeature) {
+  Report report = good_report();
+  report.fit.report.hyperparameters = {hyperparameter(Hyperparameter::Kind::kernel, "lengthscale(q1)", 1e6, 0.05, 1e6)};
+  report.relevance.push_back({"friction", "q1", 1e6, 1, 1e-6, 1e-5});
+  EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::note, "q1 hardly matters", "")));
+  report.fit.report.hyperparameters.front().value = 0.05;
+  EXPECT_THAT(learning_advice(report), UnorderedElementsAre(advises(Level::note, "lengthscale(q1) (lower bound, 0.05)", "short"),
+                                                            advises(Level::note, "q1 hardly matters", "")));
+}
+
+TEST(Advice, TellsOfDataOffTheConstraintByHowFarTheyAre) {
+  Report report = good_report();
+  report.data = {good_data("training")};
+  report.data[0].violation = ConstraintViolation{1e-9, 1e-9, 3, "q1 - q2"};
+  EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::good, "", "")));
+  report.data[0].violation->relative = 1e-4;
+  EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::note, "of the training data are off the constraint", "units")));
+  report.data[0].violation->relative = 0.3;
+  report.data.push_back(good_data("test"));
+  report.data[1].violation = ConstraintViolation{1e-3, 1e-3, 5, "q1 - q2"};
+  EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::warning, "of the training and test data", "")));
+  EXPECT_THAT(learning_advice(report),
+              ElementsAre(advises(Level::warning, "row 4 of training: q1 - q2 = 1e-09, 0.3", "--estimate")));
+}
+
+TEST(Advice, TellsOfColumnsThatFollowFromEachOther) {
+  Report report = good_report();
+  report.data = {good_data("training")};
+  report.data[0].independent = {"ddq1", "ddq3"};
+  EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::warning, "follow from each other", "--observe ddq1,ddq3")));
+}
+
+TEST(Advice, JudgesTheCoverageOfTheTestByItsSize) {
+  Report report = good_report();
+  report.data = {good_data("training"), good_data("test")};
+  report.data[0].evaluation.coverage95 = 0.5;  // training says nothing
+  Evaluation& test = report.data[1].evaluation;
+  test.coverage95 = 0.90;
+  EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::warning, "Over-confident: 90.0 %", "noise")));
+  test.n = 30;  // three standard deviations of the share are 0.12
+  EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::good, "", "")));
+  test.n = 1000;
+  test.coverage95 = 0.999;
+  EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::note, "Too cautious: 99.9 %", "--noise-std estimate")));
+  test.coverage95_latent = 0.95;
+  EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::note, "Too cautious: 99.9 %", "free of noise")));
+}
+
+TEST(Advice, TellsThatTheTestGoesBeyondTraining) {
+  Report report = good_report();
+  report.data = {good_data("training"), good_data("test")};
+  report.data[1].evaluation.rmse[0] = 0.5;
+  EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::warning, "5.0 times those of training", "band")));
+  // errors below twice the noise are noise
+  report.data[0].evaluation.rmse[0] = 0.01;
+  report.data[1].evaluation.rmse[0] = 0.15;
+  EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::good, "", "")));
+}
+
+TEST(Advice, PutsWarningsFirst) {
+  Report report = good_report();
+  report.relevance.push_back({"friction", "q1", 1e6, 1, 1e-6, 1e-5});
+  report.data = {good_data("training")};
+  report.data[0].independent = {"ddq1"};
+  EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::warning, "", ""), advises(Level::note, "", "")));
+}
+
+}  // namespace
+}  // namespace gp2::command

@@ -1,0 +1,261 @@
+// The page of gp2 report, seen with a headless Chromium. Run by run-page-test, which sets GP2_COMMAND and CHROMIUM.
+import assert from "node:assert/strict";
+import { execFileSync } from "node:child_process";
+import { mkdtempSync, readFileSync, rmSync, statSync, writeFileSync } from "node:fs";
+import { tmpdir } from "node:os";
+import { dirname, join } from "node:path";
+import { after, before, test } from "node:test";
+import { fileURLToPath, pathToFileURL } from "node:url";
+import { chromium } from "playwright-core";
+
+const models = join(dirname(fileURLToPath(import.meta.url)), "../../models");
+const folder = mkdtempSync(join(tmpdir(), "gp2_report_"));
+const gp2 = (...args) => execFileSync(process.env.GP2_COMMAND, args, { cwd: folder, encoding: "utf8", stdio: ["ignore", "pipe", "pipe"] });
+const json = (name) => JSON.parse(readFileSync(join(folder, name), "utf8"));
+
+// what a person who wishes ill could call a model
+const hostile = `</script><img src=x onerror="document.title='broken'"><!-- {{data}} "quoted" & \\u003c`;
+
+let browser;
+
+before(async () => {
+  for (const model of ["surface", "duffing", "unicycle"]) {
+    const file = join(models, `${model}.toml`);
+    gp2("generate", file, "--n", "100", "--seed", "1", "-o", `${model}.csv`);
+    gp2("generate", file, "--n", "60", "--seed", "2", "-o", `${model}_test.csv`);
+    gp2("fit", file, "--data", `${model}.csv`, "--mean", "force", "--restarts", "3", "-o", `${model}.json`);
+    gp2("report", `${model}.json`, "--data", `${model}_test.csv`, "--truth", file, "-o", `${model}.html`);
+  }
+  writeFileSync(join(folder, "hostile.toml"),
+    readFileSync(join(models, "unicycle.toml"), "utf8").replace(/^name .*$/m, () => `name = ${JSON.stringify(hostile)}`));
+  gp2("fit", "hostile.toml", "--data", "unicycle.csv", "--max-iterations", "0", "-o", "hostile.json");
+  gp2("report", "hostile.json", "-o", "hostile.html");
+  const args = process.getuid?.() === 0 ? ["--no-sandbox"] : [];
+  browser = await chromium.launch({ executablePath: process.env.CHROMIUM, args });
+});
+
+after(async () => {
+  await browser?.close();
+  rmSync(folder, { recursive: true, force: true });
+});
+
+/** An open page; close() fails where the page complained or asked for anything beside its own file. */
+async function open(name, { width = 1200, scheme = "light", pictures = true } = {}) {
+  const page = await browser.newPage({ viewport: { width, height: 900 }, colorScheme: scheme });
+  const complaints = [], requests = [];
+  page.on("console", (message) => { if (["error", "warning"].includes(message.type())) complaints.push(message.text()); });
+  page.on("pageerror", (error) => complaints.push(String(error)));
+  page.on("dialog", (dialog) => { complaints.push(`dialog ${dialog.message()}`); dialog.dismiss(); });
+  const own = pathToFileURL(join(folder, name)).href;
+  page.on("request", (request) => { if (request.url().split("#")[0] !== own && !request.url().startsWith("data:")) requests.push(request.url()); });
+  await page.goto(own);
+  if (pictures) await page.waitForFunction(() => document.querySelectorAll("canvas").length > 0);
+  await settled(page);
+  return {
+    page,
+    async close() {
+      await page.close();
+      assert.deepEqual(complaints, [], "complaints in the console");
+      assert.deepEqual(requests, [], "requests");
+    },
+  };
+}
+
+// charts are drawn in a microtask, and again when their size is known
+const settled = (page) => page.evaluate(() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => setTimeout(done, 50)))));
+
+/** Per canvas: its title, and how many pixels have the colour of the data. */
+const inked = (page) => page.evaluate(() => {
+  const [r, g, b] = getComputedStyle(document.documentElement).getPropertyValue("--c1").trim().match(/[0-9a-f]{2}/gi).map((part) => parseInt(part, 16));
+  return [...document.querySelectorAll("canvas")].map((canvas) => {
+    // of a copy: reading the page's own canvas would slow it down, and it would complain
+    const copy = new OffscreenCanvas(canvas.width, canvas.height).getContext("2d", { willReadFrequently: true });
+    copy.drawImage(canvas, 0, 0);
+    const { data } = copy.getImageData(0, 0, canvas.width, canvas.height);
+    let count = 0;
+    for (let i = 0; i < data.length; i += 4) {
+      if (data[i + 3] > 80 && Math.abs(data[i] - r) + Math.abs(data[i + 1] - g) + Math.abs(data[i + 2] - b) < 60) ++count;
+    }
+    return { title: canvas.closest("figure").querySelector("strong").textContent, count };
+  });
+});
+
+/** The exact numbers of a table, by the header of their row. */
+const numbers = (page, host) => page.evaluate((id) => Object.fromEntries([...document.querySelectorAll(`#${id} tbody tr`)].map((row) =>
+  [row.children[0].textContent.trim(), [...row.querySelectorAll("[data-value]")].map((cell) => Number(cell.dataset.value))])), host);
+
+for (const model of ["surface", "duffing", "unicycle"]) {
+  test(`every chart of ${model} shows data, in a light and a dark theme and after every choice`, async () => {
+    for (const scheme of ["light", "dark"]) {
+      const { page, close } = await open(`${model}.html`, { scheme });
+      const outputs = json(`${model}.json`).observations[0].rows.length;
+      const charts = await inked(page);
+      assert.equal(charts.length, 2 * outputs + 5, "residuals and scatter per output, calibration, constraint error, two accelerations, motion");
+      for (const { title, count } of charts) assert.ok(count > 20, `${title}: ${count} pixels in ${scheme}`);
+      for (const select of scheme === "dark" ? [] : await page.locator("select:visible").all()) {
+        for (const value of await select.locator("option").evaluateAll((all) => all.map((one) => one.value))) {
+          await select.selectOption(value);
+          await settled(page);
+          for (const { title, count } of await inked(page)) assert.ok(count > 20, `${title}: ${count} pixels`);
+        }
+      }
+      await page.getByLabel(/^training/).check();
+      await settled(page);
+      for (const { title, count } of await inked(page)) assert.ok(count > 20, `${title} of training: ${count} pixels`);
+      await close();
+    }
+  });
+
+  test(`the tables of ${model} carry the numbers of the fit and of gp2 evaluate`, async () => {
+    const { page, close } = await open(`${model}.html`);
+    const fit = json(`${model}.json`);
+    const hyperparameters = await numbers(page, "hyperparameters");
+    assert.equal(Object.keys(hyperparameters).length, fit.hyperparameters.length);
+    for (const one of fit.hyperparameters) assert.deepEqual(hyperparameters[one.name], [one.value, one.lower, one.upper], one.name);
+    const restarts = await numbers(page, "restarts");
+    const best = (k) => (k === fit.report.best_restart ? `${k + 1} best` : String(k + 1));
+    assert.deepEqual(fit.report.restarts.map((_, k) => restarts[best(k)]), fit.report.restarts.map((one) => [one.objective, one.nll, one.iterations, one.evaluations, one.failed_evaluations]));
+    const lead = await page.locator("#optimiser-lead").textContent();
+    assert.ok(lead.toLowerCase().includes(fit.report.termination.toLowerCase()), lead);
+    assert.ok(lead.includes(String(Number(fit.report.nll.toPrecision(6)))), lead);
+
+    const figures = await numbers(page, "figures");
+    const told = ["", "_test"].map((suffix) => JSON.parse(gp2("evaluate", `${model}.json`, "--data", `${model}${suffix}.csv`, "--json")));
+    const row = (get) => told.map(get);
+    const near = (actual, expected, name) => {
+      assert.equal(actual.length, expected.length, name);
+      actual.forEach((value, k) => assert.ok(Math.abs(value - expected[k]) <= 1e-9 * Math.abs(expected[k]), `${name}: ${value}, ${expected[k]}`));
+    };
+    for (const output of Object.keys(told[0].rmse)) near(figures[`rmse ${output}`], row((e) => e.rmse[output]), output);
+    near(figures["rmse / training std"], row((e) => e.rmse_normalised), "rmse_normalised");
+    near(figures["nrmse"], row((e) => e.nrmse), "nrmse");
+    near(figures["nlpd, with noise"], row((e) => e.nlpd), "nlpd");
+    near(figures["95 % coverage, with noise"], row((e) => e.coverage95), "coverage95");
+    assert.deepEqual(figures["max |A q̈ − b|, fitted"], row((e) => e.max_constraint_error_fitted));
+    assert.deepEqual(figures.points, [100, 60]);
+    await close();
+  });
+}
+
+test("the derived constraint is typeset", async () => {
+  const { page, close } = await open("surface.html");
+  const formulas = await page.locator(".formula math").evaluateAll((all) => all.map((one) => [one.namespaceURI, one.textContent, one.getBoundingClientRect().height]));
+  assert.equal(formulas.length, 2);
+  for (const [namespace, text, height] of formulas) {
+    assert.equal(namespace, "http://www.w3.org/1998/Math/MathML");
+    assert.match(text, /^[Ab]=/);
+    assert.ok(height > 10);
+  }
+  await close();
+});
+
+test("Tab reaches every control and shows where it is", async () => {
+  const { page, close } = await open("surface.html", { width: 360 });
+  // of a group of radio buttons one is a stop, the checked one
+  const expected = await page.evaluate(() => [...document.querySelectorAll("a[href], button, input, select, summary, [tabindex='0']")]
+    .filter((one) => one.offsetParent !== null || one.classList.contains("skip"))
+    .filter((one) => one.type !== "radio" || one.checked)
+    .map((one, k) => { one.dataset.stop = String(k); return String(k); }));
+  const reached = new Set();
+  for (let k = 0; k < expected.length + 5; ++k) {
+    await page.keyboard.press("Tab");
+    const [stop, outline] = await page.evaluate(() => [document.activeElement.dataset.stop, getComputedStyle(document.activeElement).outlineStyle]);
+    if (stop === undefined) continue;
+    reached.add(stop);
+    assert.notEqual(outline, "none", `stop ${stop} shows no focus`);
+  }
+  assert.deepEqual(expected.filter((stop) => !reached.has(stop)), []);
+  await close();
+});
+
+test("the arrow keys and the mouse turn the picture in space", async () => {
+  const { page, close } = await open("surface.html");
+  const canvas = page.locator("canvas.space3d");
+  const picture = () => canvas.evaluate((one) => one.toDataURL());
+  const first = await picture();
+  await canvas.focus();
+  await page.keyboard.press("ArrowRight");
+  const second = await picture();
+  assert.notEqual(first, second);
+  await canvas.scrollIntoViewIfNeeded();
+  const box = await canvas.boundingBox();
+  await page.mouse.move(box.x + 100, box.y + 100);
+  await page.mouse.down();
+  await page.mouse.move(box.x + 180, box.y + 120, { steps: 4 });
+  await page.mouse.up();
+  assert.notEqual(second, await picture());
+  await close();
+});
+
+for (const model of ["surface", "duffing", "unicycle"]) {
+  test(`${model} fits a phone: nothing reaches beyond 360 pixels`, async () => {
+    const { page, close } = await open(`${model}.html`, { width: 360 });
+    assert.equal(await page.evaluate(() => document.documentElement.scrollWidth), 360);
+    await close();
+  });
+}
+
+test("the theme follows the system, also while the page is open", async () => {
+  const { page, close } = await open("surface.html");
+  const background = () => page.evaluate(() => getComputedStyle(document.body).backgroundColor.match(/\d+/g).slice(0, 3).map(Number));
+  const light = await background();
+  assert.ok(light.every((part) => part > 200), String(light));
+  await page.emulateMedia({ colorScheme: "dark" });
+  await settled(page);
+  const dark = await background();
+  assert.ok(dark.every((part) => part < 60), String(dark));
+  for (const { title, count } of await inked(page)) assert.ok(count > 20, `${title}: ${count} pixels in the dark`);
+  await close();
+});
+
+test("pictures and tables have names for those who do not see them", async () => {
+  const { page, close } = await open("surface.html");
+  const nameless = await page.evaluate(() => [...document.querySelectorAll("[role=img], table, nav, [role=region]")]
+    .filter((one) => !(one.getAttribute("aria-label") || "").trim()).length +
+    [...document.querySelectorAll("select")].filter((one) => one.labels.length === 0).length);
+  assert.equal(nameless, 0);
+  assert.deepEqual(await page.locator("h1").count(), 1);
+  await close();
+});
+
+test("the name of a model stays text", async () => {
+  const { page, close } = await open("hostile.html");
+  assert.equal(await page.locator("h1").textContent(), hostile);
+  assert.equal(await page.title(), `${hostile} – gp2 report`);
+  assert.equal(await page.locator("img").count(), 0);
+  await close();
+});
+
+test("a fit to 1000 rows with 1000 rows of test makes at most 2 MB", async () => {
+  const file = join(models, "surface.toml");
+  gp2("generate", file, "--n", "1000", "--seed", "3", "-o", "large.csv");
+  gp2("generate", file, "--n", "1000", "--seed", "4", "-o", "large_test.csv");
+  gp2("fit", file, "--data", "large.csv", "--max-iterations", "0", "-o", "large.json");
+  gp2("report", "large.json", "--data", "large_test.csv", "--truth", file, "-o", "large.html");
+  const { size } = statSync(join(folder, "large.html"));
+  assert.ok(size <= 2e6, `${size} bytes`);
+  const { page, close } = await open("large.html");
+  for (const { title, count } of await inked(page)) assert.ok(count > 20, `${title}: ${count} pixels`);
+  await close();
+});
+
+test("a fit that learned from no acceleration has a page without pictures", async () => {
+  // the same numbers, said to be of the unconstrained acceleration
+  const fit = json("unicycle.json");
+  const [group] = fit.observations;
+  group.view = "unconstrained";
+  for (const name of ["q1", "q2", "q3"]) {
+    group.values[`abar_${name}`] = group.values[`dd${name}`];
+    delete group.values[`dd${name}`];
+  }
+  writeFileSync(join(folder, "no_pictures.json"), JSON.stringify(fit));
+  gp2("report", "no_pictures.json", "-o", "no_pictures.html");
+  const { page, close } = await open("no_pictures.html", { pictures: false });
+  assert.equal(await page.locator("canvas").count(), 0);
+  assert.ok(await page.getByText("No pictures").isVisible());
+  assert.ok((await page.locator("#relevance-bars tbody tr").count()) > 0);
+  for (const target of await page.locator("nav a").evaluateAll((all) => all.map((one) => one.getAttribute("href")))) {
+    assert.equal(await page.locator(target).count(), 1, target);
+  }
+  await close();
+});
