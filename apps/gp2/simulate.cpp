@@ -311,7 +311,8 @@ void run(const Arguments& arguments) {
 
   const System& system = subject.system();
   const bool listed_start = arguments.start.find('=') != std::string::npos;
-  StartingPoint start = listed_start ? parse_start(arguments.start, system) : read_start(arguments.start, subject.model, arguments.map);
+  StartingPoint start =
+      listed_start ? parse_start(arguments.start, system) : read_start(arguments.start, subject.model, arguments.map);
   const double t_start = arguments.t_start.value_or(start.state[system.layout().t()]);
   SimulateOptions options;
   options.times = times_of(t_start, *arguments.t_end, arguments.time_step);

@@ -8,6 +8,7 @@ Every prediction obeys the constraint A(q, dq, t) ddq = b(q, dq, t) to rounding 
 (n, len(system.state_names)), with the columns q, dq, t, u.
 """
 
+from gp2 import _objects as _objects
 from gp2._gp2 import (
     Evaluation,
     Finding,

@@ -6,9 +6,6 @@
 
 from __future__ import annotations
 
-import copyreg
-import tempfile
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,25 +21,6 @@ except ImportError:  # scikit-learn before 1.6
 
     def validate_data(estimator, *arguments, **options):
         return estimator._validate_data(*arguments, **options)
-
-
-def _read_system(text: str, name: str) -> gp2.System:
-    return gp2.System.parse(text, name)
-
-
-def _reduce_system(system: gp2.System):
-    try:
-        _read_system(system.text, system.name)
-    except gp2.InputError as error:  # of System.from_callables
-        raise TypeError(f"'{system.name}' cannot be pickled: its mechanics are functions") from error
-    return _read_system, (system.text, system.name)
-
-
-# clone() copies the parameters of an estimator, joblib pickles them. A system never changes: it is its own copy, and travels as
-# text. pprint, by which an estimator shows them, wants a __repr__ with a hash; that of a class from C++ has none
-gp2.System.__deepcopy__ = lambda self, memo: self
-gp2.System.__repr__ = lambda self, _repr=gp2.System.__repr__: _repr(self)
-copyreg.pickle(gp2.System, _reduce_system)
 
 
 class GP2Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
@@ -218,25 +196,6 @@ class GP2Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     def _as_y(self, values: np.ndarray) -> np.ndarray:
         return values[..., 0] if self._is_flat else values
-
-    # a posterior travels as the text of its file
-    def __getstate__(self) -> dict[str, Any]:
-        state = dict(super().__getstate__())
-        if "posterior_" in state:
-            with tempfile.TemporaryDirectory() as folder:
-                path = Path(folder, "fit.json")
-                state["posterior_"].save(path)
-                state["posterior_"] = path.read_bytes()
-        return state
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        state = dict(state)
-        if "posterior_" in state:
-            with tempfile.TemporaryDirectory() as folder:
-                path = Path(folder, "fit.json")
-                path.write_bytes(state["posterior_"])
-                state["posterior_"] = gp2.load(path)
-        super().__setstate__(state)
 
 
 def _system_without_mechanics(n_features: int, y: np.ndarray) -> gp2.System:

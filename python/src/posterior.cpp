@@ -452,7 +452,15 @@ void add_posterior(py::module_& module) {
       .def_readonly("coverage95_latent", &Evaluation::coverage95_latent)
       .def_readonly("n_zero_variance", &Evaluation::n_zero_variance,
                     "Marginals without variance, left out of the latent figures.")
-      .def_readonly("n", &Evaluation::n);
+      .def_readonly("n", &Evaluation::n)
+      .def("__repr__", [](const Evaluation& e) {
+        std::string rmse;
+        for (std::size_t k = 0; k < e.outputs.size(); ++k) {
+          rmse += fmt::format("{}rmse {} {:.4g}", k == 0 ? "" : ", ", e.outputs[k], e.rmse[static_cast<Index>(k)]);
+        }
+        return fmt::format("<gp2.Evaluation at {} points: {}; nrmse {:.4g}; max |A ddq - b| {:.2g}>", e.n, rmse, e.nrmse,
+                           e.max_constraint_error_fitted);
+      });
 
   py::class_<Motion>(module, "Motion", "A motion at the times asked for.")
       .def_property_readonly(

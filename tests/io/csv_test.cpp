@@ -127,16 +127,19 @@ TEST(Csv, IsMadeOfCellsToo) {
   const CsvTable table = from_cells({"q1", "q2"}, {"1", "2", "-3.5e-2", "nan"});
   EXPECT_EQ(table.n_rows(), 2);
   EXPECT_EQ(table.number(1, 0), -3.5e-2);
-  EXPECT_EQ(input_error_of([&] { static_cast<void>(table.number(1, 1)); }),
-            "frame:3: column 'q2': 'nan' is not a finite number");
+  EXPECT_EQ(input_error_of([&] { static_cast<void>(table.number(1, 1)); }), "frame:3: column 'q2': 'nan' is not a finite number");
 }
 
 TEST(Csv, RefusesCellsThatAreNoTable) {
   EXPECT_EQ(input_error_of([] { static_cast<void>(from_cells({}, {"1"})); }), "frame: there are no columns");
   EXPECT_EQ(input_error_of([] { static_cast<void>(from_cells({"q1"}, {})); }), "frame: there are no rows");
-  EXPECT_EQ(input_error_of([] { static_cast<void>(from_cells({"q1", "q2"}, {"1", "2", "3"})); }),
+  EXPECT_EQ(input_error_of([] {
+              static_cast<void>(from_cells({"q1", "q2"}, {"1", "2", "3"}));
+            }),
             "frame: 3 cells do not make rows of 2 columns");
-  EXPECT_THAT(input_error_of([] { static_cast<void>(from_cells({"q1", "q1"}, {"1", "2"})); }),
+  EXPECT_THAT(input_error_of([] {
+                static_cast<void>(from_cells({"q1", "q1"}, {"1", "2"}));
+              }),
               HasSubstr("the column 'q1' stands twice"));
 }
 

@@ -1,0 +1,45 @@
+"""Copies, pickles and texts of the objects."""
+
+import copy
+import pickle
+import pprint
+
+import numpy as np
+import pytest
+
+import gp2
+
+
+def test_posterior_survives_a_pickle_to_the_bit(posterior, arm_states):
+    for other in [pickle.loads(pickle.dumps(posterior)), copy.deepcopy(posterior)]:
+        np.testing.assert_array_equal(other.predict(arm_states).cov, posterior.predict(arm_states).cov)
+
+
+def test_copy_of_a_posterior_keeps_its_data_when_the_other_grows(posterior, arm):
+    other = copy.copy(posterior)
+    other.update(arm.generate(5, seed=9))
+    assert other.n_data == posterior.n_data + 5
+
+
+def test_system_is_its_own_copy_and_travels_as_text(arm):
+    assert copy.copy(arm) is arm and copy.deepcopy([arm])[0] is arm
+    assert pickle.loads(pickle.dumps(arm)).text == arm.text
+
+
+def test_what_holds_functions_cannot_be_pickled():
+    def free_mass(states, parameters):
+        n = len(states)
+        return np.ones((n, 1, 1)), None, None, np.zeros((n, 1))
+
+    system = gp2.System.from_callables(free_mass, name="a mass", coordinates=["x"], noise=0.1, reads=["x", "dx"])
+    posterior = gp2.fit(system, {"x": [0.0, 1.0], "dx": [1.0, 0.5], "ddx": [0.1, 0.2]}, max_iterations=0)
+    for thing in [system, posterior]:
+        with pytest.raises(TypeError, match="'a mass' cannot be pickled: its mechanics are functions"):
+            pickle.dumps(thing)
+
+
+def test_texts_say_what_a_thing_is_and_pprint_takes_them(posterior, arm, arm_log):
+    evaluation = posterior.evaluate(arm_log)
+    assert f"nrmse {evaluation.nrmse:.4g}" in repr(evaluation)
+    for thing in [arm, arm_log, posterior, evaluation, posterior.report, posterior.report.hyperparameters]:
+        assert pprint.pformat(thing) == repr(thing) or isinstance(thing, list)
