@@ -71,6 +71,8 @@ CsvTable generate_table(const PySystem& self, int n, std::uint64_t seed, std::op
     options.noise_stddev.setConstant(*noise_stddev);
   } else if (!model.noise.stddev.empty()) {
     options.noise_stddev = Eigen::Map<const Eigen::VectorXd>(model.noise.stddev.data(), system.nq());
+  } else {
+    throw InputError(fmt::format("{}: no [noise] ddq to draw from; give noise_std (0 for the truth)", model.name));
   }
   const GeneratedData data = generate(model, options);
   const std::vector<std::string> names = system.state_names();

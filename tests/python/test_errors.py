@@ -181,3 +181,10 @@ def test_warnings_are_pythons_and_notes_go_to_the_logger(posterior, arm, arm_log
     with caplog.at_level(logging.INFO, logger="gp2"):
         posterior.predict(renamed, columns={"shoulder": "theta1"})
     assert "theta1" in caplog.text
+
+
+def test_noise_that_is_not_given_is_not_taken_for_none():
+    keys = {"coordinates": ["x"], "mass": [["1"]], "truth": ["0"], "sampling": {"x": [-1, 1], "dx": [-1, 1]}}
+    with pytest.raises(gp2.InputError, match=r"no \[noise\] ddq to draw from; give noise_std \(0 for the truth\)"):
+        gp2.System(**keys).generate(3)
+    assert len(gp2.System(**keys).generate(3, noise_std=0)) == 3
