@@ -32,30 +32,15 @@ int print(const std::vector<Finding>& findings) {
   return n_errors;
 }
 
-// the log's states and accelerations; a column that is missing is an error only where the model cannot do without
-struct Log {
-  Eigen::MatrixXd states, accelerations;
-};
-
-Log read_log(const ModelFile& model, const Arguments& arguments) {
+// a column that is missing is an error only where the model cannot do without
+WholeLog read_log(const ModelFile& model, const Arguments& arguments) {
   const CsvTable table = CsvTable::read(arguments.data);
   LogReader reader = open_log(model, table, parse_map(arguments.map));
-  std::vector<bool> reads = make_prior(model).reads();
-  const std::vector<std::string> names = model.system->state_names();
-  for (std::size_t k = 0; k < reads.size(); ++k) reads[k] = reads[k] || reader.has(names[k]);
-  Log log{reader.states(reads),
-          Eigen::MatrixXd::Constant(model.system->nq(), table.n_rows(), std::numeric_limits<double>::quiet_NaN())};
-  std::vector<std::string> missing;
-  for (int j = 0; j < model.system->nq(); ++j) {
-    const std::string name = model.system->coordinates()[static_cast<std::size_t>(j)].acceleration();
-    if (reader.has(name)) {
-      log.accelerations.row(j) = reader.values({name});
-    } else {
-      missing.push_back(name);
-    }
-  }
+  WholeLog log = read_whole_log(model, reader);
   fmt::print("ok       {}: {} rows, every column found that the model reads\n", arguments.data, table.n_rows());
-  if (!missing.empty()) fmt::print("warning  not in the log: {}; fit with --observe for the others\n", fmt::join(missing, ", "));
+  if (!log.missing.empty()) {
+    fmt::print("warning  not in the log: {}; fit with --observe for the others\n", fmt::join(log.missing, ", "));
+  }
   for (const auto& [name, found] : reader.aliases_used()) fmt::print("ok       column '{}' taken as {}\n", found, name);
   const std::vector<std::string> unused = reader.unused_columns();
   if (!unused.empty()) fmt::print("ok       columns not needed: {}\n", fmt::join(unused, ", "));
@@ -68,7 +53,7 @@ void run(const Arguments& arguments) {
   fmt::print("ok       {}: '{}', {} coordinates, {} constraints\n", arguments.model, system.name(), system.nq(), system.nc());
   int n_errors = 0;
   if (!arguments.data.empty()) {
-    const Log log = read_log(model, arguments);
+    const WholeLog log = read_log(model, arguments);
     n_errors += print(check_system(system, log.states, system.parameter_values()));
     if (n_errors == 0) n_errors += print(check_data(system, log.states, system.parameter_values(), log.accelerations));
   } else if (!model.sampling.empty() && !model.truth.empty()) {

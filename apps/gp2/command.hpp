@@ -33,9 +33,6 @@ std::map<std::string, std::string> parse_map(const std::string& text);
 /// A cell of a CSV file that reads back as `text`.
 std::string csv_cell(const std::string& text);
 
-/// Columns: the entries of a state that the model reads, then the accelerations.
-std::string to_csv(const GeneratedData& data, const System& system);
-
 /// "a,b" -> {"a", "b"}; empty for "" .
 std::vector<std::string> parse_list(const std::string& text);
 

@@ -54,34 +54,19 @@ void run(const Arguments& arguments) {
   const GeneratedData data = generate(
       model, {arguments.n.value_or(1), arguments.seed, noise_of(model, arguments.noise_stddev), grid_of(arguments.grid)});
 
-  write_file(arguments.output, to_csv(data, *model.system));
+  const CsvTable table = as_table(data, *model.system, arguments.output);
+  std::string csv = fmt::format("{}\n", fmt::join(table.header(), ","));
+  for (int row = 0; row < table.n_rows(); ++row) {
+    for (int column = 0; column < table.n_columns(); ++column) {
+      csv += table.cell(row, column);
+      csv += column + 1 < table.n_columns() ? ',' : '\n';
+    }
+  }
+  write_file(arguments.output, csv);
   talk({fmt::format("{}: {} rows of '{}'", arguments.output, data.states.cols(), model.system->name())});
 }
 
 }  // namespace
-
-std::string to_csv(const GeneratedData& data, const System& system) {
-  const std::vector<std::string> names = system.state_names();
-  std::string csv;
-  std::vector<std::string> line;
-  const auto end_line = [&] {
-    csv += fmt::format("{}\n", fmt::join(line, ","));
-    line.clear();
-  };
-  for (std::size_t k = 0; k < names.size(); ++k) {
-    if (data.known[k]) line.push_back(names[k]);
-  }
-  for (const Coordinate& coordinate : system.coordinates()) line.push_back(coordinate.acceleration());
-  end_line();
-  for (Eigen::Index i = 0; i < data.states.cols(); ++i) {
-    for (std::size_t k = 0; k < names.size(); ++k) {
-      if (data.known[k]) line.push_back(shortest(data.states(static_cast<Eigen::Index>(k), i)));
-    }
-    for (const double value : data.accelerations.col(i)) line.push_back(shortest(value));
-    end_line();
-  }
-  return csv;
-}
 
 void add_generate(CLI::App& app) {
   CLI::App* command = app.add_subcommand("generate", "Draw states from a model's [sampling] and measure its [truth]");

@@ -197,8 +197,7 @@ std::string csv_of(const std::vector<Motion>& motions, const Subject& subject, b
     csv += fmt::format("{}\n", fmt::join(line, ","));
     line.clear();
   };
-  std::vector<std::string> accelerations;
-  for (const Coordinate& coordinate : system.coordinates()) accelerations.push_back(coordinate.acceleration());
+  const std::vector<std::string> accelerations = system.acceleration_names();
   if (with_sample) line.emplace_back("sample");
   line.emplace_back("t");
   line.insert(line.end(), names.begin(), names.begin() + layout.t());

@@ -95,6 +95,15 @@ struct LogStates {
 LogStates read_log_states(const Prior& prior, const View& view, const ModelFile& model, const CsvTable& log,
                           const std::map<std::string, std::string>& columns, const std::vector<std::string>& accelerations = {});
 
+/// All that a log has of states and accelerations.
+struct WholeLog {
+  Eigen::MatrixXd states;            // NaN where neither the model reads an entry nor the log has it (layout size × N)
+  Eigen::MatrixXd accelerations;     // NaN where not in the log (nq × N)
+  std::vector<std::string> missing;  // accelerations that are not in the log
+};
+/// @throws InputError for a missing column that the model's prior reads.
+WholeLog read_whole_log(const ModelFile& model, LogReader& reader);
+
 /// Indices of named accelerations; all of them when `names` is empty.
 /// @throws InputError listing the accelerations there are.
 std::vector<int> acceleration_rows(const System& system, const std::vector<std::string>& names, const std::string& option);

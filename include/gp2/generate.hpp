@@ -8,6 +8,7 @@
 
 #include <Eigen/Core>
 
+#include "gp2/csv.hpp"
 #include "gp2/model_file.hpp"
 
 namespace gp2 {
@@ -34,6 +35,10 @@ struct GenerateOptions {
 ///   the constraints; when n < 1 or noise_stddev is not of nq finite numbers ≥ 0.
 /// @throws NumericalError when Newton's method does not reach the constraints.
 GeneratedData generate(const ModelFile& model, const GenerateOptions& options);
+
+/// Columns: the known entries of a state, then the accelerations.
+/// @param name  stands for the table in messages
+CsvTable as_table(const GeneratedData& data, const System& system, std::string name);
 
 /// The motion of a model as it is written: ddq = L b + T (M⁻¹F + truth), truth = 0 without [truth]. Compiled once, for many
 /// calls.

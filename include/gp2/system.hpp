@@ -95,9 +95,10 @@ class System {
   [[nodiscard]] int nq() const { return static_cast<int>(coordinates_.size()); }
   [[nodiscard]] int nc() const { return static_cast<int>(constraint_labels_.size()); }
   [[nodiscard]] StateLayout layout() const { return {nq(), static_cast<int>(inputs_.size())}; }
-  [[nodiscard]] std::vector<std::string> state_names() const;        // q1 … dq1 … t u1 …, in the order of the layout
-  [[nodiscard]] Eigen::VectorXd parameter_values() const;            // the model's own values
-  [[nodiscard]] int parameter_index(const std::string& name) const;  // −1 when there is none
+  [[nodiscard]] std::vector<std::string> state_names() const;         // q1 … dq1 … t u1 …, in the order of the layout
+  [[nodiscard]] std::vector<std::string> acceleration_names() const;  // ddq1 …
+  [[nodiscard]] Eigen::VectorXd parameter_values() const;             // the model's own values
+  [[nodiscard]] int parameter_index(const std::string& name) const;   // −1 when there is none
 
   /// M, A, b, F at N states.
   /// @param states      (layout().size() × N)

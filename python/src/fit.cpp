@@ -33,8 +33,7 @@ Log log_of(const py::object& data, const std::optional<PySystem>& system, const 
 // a table of states and accelerations, columns by the model's names; entries that are not measured (NaN) are left out
 CsvTable table_of(const py::tuple& arrays, const System& system) {
   if (arrays.size() != 2) throw InputError(fmt::format("data: expected (states, accelerations), got {} arrays", arrays.size()));
-  std::vector<std::string> accelerations;
-  for (const Coordinate& coordinate : system.coordinates()) accelerations.push_back(coordinate.acceleration());
+  const std::vector<std::string> accelerations = system.acceleration_names();
   const Rows states(arrays[0], system.state_names(), "states"), ddq(arrays[1], accelerations, "accelerations");
   if (states.matrix().cols() != ddq.matrix().cols()) {
     throw InputError(fmt::format("data: {} states, but {} accelerations", states.matrix().cols(), ddq.matrix().cols()));

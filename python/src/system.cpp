@@ -15,12 +15,6 @@ namespace gp2::python {
 
 namespace {
 
-std::vector<std::string> acceleration_names(const System& system) {
-  std::vector<std::string> names;
-  for (const Coordinate& coordinate : system.coordinates()) names.push_back(coordinate.acceleration());
-  return names;
-}
-
 std::vector<std::string> coordinate_names(const System& system) {
   std::vector<std::string> names;
   for (const Coordinate& coordinate : system.coordinates()) names.push_back(coordinate.name);
@@ -74,34 +68,13 @@ CsvTable generate_table(const PySystem& self, int n, std::uint64_t seed, std::op
   } else {
     throw InputError(fmt::format("{}: no [noise] ddq to draw from; give noise_std (0 for the truth)", model.name));
   }
-  const GeneratedData data = generate(model, options);
-  const std::vector<std::string> names = system.state_names();
-  std::vector<std::string> header, cells;
-  for (std::size_t k = 0; k < names.size(); ++k) {
-    if (data.known[k]) header.push_back(names[k]);
-  }
-  for (const std::string& name : acceleration_names(system)) header.push_back(name);
-  for (Eigen::Index i = 0; i < data.states.cols(); ++i) {
-    for (std::size_t k = 0; k < names.size(); ++k) {
-      if (data.known[k]) cells.push_back(shortest(data.states(static_cast<Eigen::Index>(k), i)));
-    }
-    for (const double value : data.accelerations.col(i)) cells.push_back(shortest(value));
-  }
-  return CsvTable::from_cells(fmt::format("data of '{}'", system.name()), std::move(header), std::move(cells));
+  return as_table(generate(model, options), system, fmt::format("data of '{}'", system.name()));
 }
 
 py::list findings_list(const std::vector<Finding>& findings) {
   py::list list;
   for (const Finding& finding : findings) list.append(finding);
   return list;
-}
-
-// what the model reads, and what else the log has of a state; the rest is NaN
-Eigen::MatrixXd all_states(const ModelFile& model, LogReader& reader) {
-  std::vector<bool> reads = make_prior(model).reads();
-  const std::vector<std::string> names = model.system->state_names();
-  for (std::size_t k = 0; k < reads.size(); ++k) reads[k] = reads[k] || reader.has(names[k]);
-  return reader.states(reads);
 }
 
 // the findings of gp2 check
@@ -118,17 +91,11 @@ py::list check(const PySystem& self, const py::object& data, const py::object& c
   }
   const CsvTable table = to_table(data, "data");
   LogReader reader = open_log(model, table, columns_argument(columns));
-  const Eigen::MatrixXd states = all_states(model, reader);
-  Eigen::MatrixXd accelerations =
-      Eigen::MatrixXd::Constant(system.nq(), table.n_rows(), std::numeric_limits<double>::quiet_NaN());
-  const std::vector<std::string> measured = acceleration_names(system);
-  for (std::size_t j = 0; j < measured.size(); ++j) {
-    if (reader.has(measured[j])) accelerations.row(static_cast<Eigen::Index>(j)) = reader.values({measured[j]});
-  }
-  std::vector<Finding> findings = check_system(system, states, parameters);
+  const WholeLog log = read_whole_log(model, reader);
+  std::vector<Finding> findings = check_system(system, log.states, parameters);
   const auto is_error = [](const Finding& finding) { return finding.level == Finding::Level::error; };
   if (std::none_of(findings.begin(), findings.end(), is_error)) {
-    const std::vector<Finding> more = check_data(system, states, parameters, accelerations);
+    const std::vector<Finding> more = check_data(system, log.states, parameters, log.accelerations);
     findings.insert(findings.end(), more.begin(), more.end());
   }
   return findings_list(findings);
@@ -260,7 +227,7 @@ Raises InputError with the key, the rule, the value got and the mend.)");
           "state_names", [](const PySystem& self) { return self.system().state_names(); },
           "Columns of an array of states: q, dq, t, u.")
       .def_property_readonly(
-          "acceleration_names", [](const PySystem& self) { return acceleration_names(self.system()); },
+          "acceleration_names", [](const PySystem& self) { return self.system().acceleration_names(); },
           "Columns of an array of accelerations: ddq.")
       .def("evaluate", &evaluate, py::arg("states"), py::arg("parameters") = py::dict(),
            "M, A, b, F at states (n, len(state_names)), with parameters by name where they are not the model's own.")
@@ -280,7 +247,7 @@ Raises InputError with the key, the rule, the value got and the mend.)");
           [](const PySystem& self, const py::object& data, const py::object& columns) {
             const CsvTable table = to_table(data, "data");
             LogReader reader = open_log(*self.model, table, columns_argument(columns));
-            return to_rows(all_states(*self.model, reader));
+            return to_rows(read_whole_log(*self.model, reader).states);
           },
           py::arg("data"), py::arg("columns") = py::none(),
           "States (n, len(state_names)) of a table by its column names. What the model does not read may be missing: NaN.")

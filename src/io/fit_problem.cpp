@@ -22,17 +22,11 @@ using Eigen::VectorXd;
 
 namespace {
 
-std::vector<std::string> all_accelerations(const System& system) {
-  std::vector<std::string> names;
-  for (const Coordinate& coordinate : system.coordinates()) names.push_back(coordinate.acceleration());
-  return names;
-}
-
 // A renaming that finds nothing is a slip of the pen: the model's [columns] may name columns that these logs lack, --map may not.
 void check_columns(const System& system, const std::vector<const CsvTable*>& logs,
                    const std::map<std::string, std::string>& columns) {
   std::vector<std::string> known = system.state_names();
-  for (const std::string& name : all_accelerations(system)) known.push_back(name);
+  for (const std::string& name : system.acceleration_names()) known.push_back(name);
   for (const auto& [name, column] : columns) {
     if (std::find(known.begin(), known.end(), name) == known.end()) {
       throw InputError(fmt::format("--map {}={}: '{}' is neither a state nor an acceleration of '{}'; it has: {}", column, name,
@@ -196,7 +190,7 @@ Observations read_log(const Place& place, const Log& log, const FitProblemOption
                 place.setting};
   group.states = states_of(place.prior, group.view, reader);
   const std::vector<std::string> observed = group.view.names(system);
-  const std::vector<std::string> every = all_accelerations(system);
+  const std::vector<std::string> every = system.acceleration_names();
   const bool complete = std::all_of(every.begin(), every.end(), [&](const std::string& name) { return reader.has(name); });
   group.values = reader.values(observed);
   const MatrixXd all_values = complete && system.nc() > 0 ? reader.values(every) : MatrixXd();
@@ -377,7 +371,7 @@ Discrepancy discrepancy_of(const FitProblem& problem) {
 }  // namespace
 
 std::vector<int> acceleration_rows(const System& system, const std::vector<std::string>& names, const std::string& option) {
-  const std::vector<std::string> known = all_accelerations(system);
+  const std::vector<std::string> known = system.acceleration_names();
   std::vector<int> rows;
   for (const std::string& name : names.empty() ? known : names) {
     const auto found = std::find(known.begin(), known.end(), name);
@@ -457,6 +451,26 @@ LogStates read_log_states(const Prior& prior, const View& view, const ModelFile&
   note_reading(reader, log, out.notes);
   note_violation(*prior.system, out.states, prior.system->parameter_values(), log, out.notes);
   return out;
+}
+
+WholeLog read_whole_log(const ModelFile& model, LogReader& reader) {
+  const System& system = *model.system;
+  std::vector<bool> reads = make_prior(model).reads();
+  const std::vector<std::string> names = system.state_names();
+  for (std::size_t k = 0; k < reads.size(); ++k) reads[k] = reads[k] || reader.has(names[k]);
+  WholeLog log;
+  log.states = reader.states(reads);
+  log.accelerations = MatrixXd::Constant(system.nq(), log.states.cols(), std::numeric_limits<double>::quiet_NaN());
+  Index row = 0;
+  for (const std::string& name : system.acceleration_names()) {
+    if (reader.has(name)) {
+      log.accelerations.row(row) = reader.values({name});
+    } else {
+      log.missing.push_back(name);
+    }
+    ++row;
+  }
+  return log;
 }
 
 FitProblem make_fit_problem(const ModelFile& model, const std::vector<Log>& logs, const std::vector<Knowledge>& also,

@@ -19,6 +19,12 @@ std::vector<std::string> System::state_names() const {
   return names;
 }
 
+std::vector<std::string> System::acceleration_names() const {
+  std::vector<std::string> names;
+  for (const Coordinate& coordinate : coordinates_) names.push_back(coordinate.acceleration());
+  return names;
+}
+
 Eigen::VectorXd System::parameter_values() const {
   Eigen::VectorXd values(static_cast<Eigen::Index>(parameters_.size()));
   for (Eigen::Index k = 0; k < values.size(); ++k) values[k] = parameters_[static_cast<std::size_t>(k)].value;

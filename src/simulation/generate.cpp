@@ -459,4 +459,20 @@ GeneratedData generate(const ModelFile& model, const GenerateOptions& options) {
   return data;
 }
 
+CsvTable as_table(const GeneratedData& data, const System& system, std::string name) {
+  const std::vector<std::string> names = system.state_names(), accelerations = system.acceleration_names();
+  std::vector<std::string> header, cells;
+  for (std::size_t k = 0; k < names.size(); ++k) {
+    if (data.known[k]) header.push_back(names[k]);
+  }
+  header.insert(header.end(), accelerations.begin(), accelerations.end());
+  for (Index i = 0; i < data.states.cols(); ++i) {
+    for (std::size_t k = 0; k < names.size(); ++k) {
+      if (data.known[k]) cells.push_back(shortest(data.states(static_cast<Index>(k), i)));
+    }
+    for (const double value : data.accelerations.col(i)) cells.push_back(shortest(value));
+  }
+  return CsvTable::from_cells(std::move(name), std::move(header), std::move(cells));
+}
+
 }  // namespace gp2

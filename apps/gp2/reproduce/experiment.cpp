@@ -170,8 +170,7 @@ CsvTable observations_of(const ModelFile& model, const std::string& pattern, con
   options.n = n;
   options.seed = static_cast<std::uint64_t>(run) + 1;
   options.noise_stddev = Eigen::Map<const VectorXd>(model.noise.stddev.data(), model.system->nq());
-  return CsvTable::parse(to_csv(generate(model, options), *model.system),
-                         fmt::format("{}, generated run {}", model.system->name(), run));
+  return as_table(generate(model, options), *model.system, fmt::format("{}, generated run {}", model.system->name(), run));
 }
 
 Line line_of(const Section& line, const ModelFile& model) {
