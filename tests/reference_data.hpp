@@ -8,9 +8,9 @@
 
 #include <fmt/core.h>
 
-// Where tests find data that is not part of the repository. GP2_REFERENCE_DIR and GP2_REAL_DIR name the folders; when a variable
-// is not set, ../shared/reference and ../shared/real beside the checkout are used if they exist. A promised file that is missing
-// fails the test; without a promise (no variable, no default folder) the test is skipped:
+// Where tests find data that is not part of the repository. GP2_REFERENCE_DIR, GP2_REAL_DIR and GP2_ROBOTS_DIR name the folders;
+// when a variable is not set, ../shared/reference, ../shared/real and ../shared/robots beside the checkout are used if they
+// exist. A promised file that is missing fails the test; without a promise (no variable, no default folder) the test is skipped:
 //
 //   if (const auto absent = why_reference_is_absent()) GTEST_SKIP() << *absent;
 //   const auto path = reference_file("train/surface_run0.csv");
@@ -59,6 +59,7 @@ struct DataFolder {
 
 inline constexpr DataFolder reference_data{"GP2_REFERENCE_DIR", "../shared/reference", "published data not found"};
 inline constexpr DataFolder real_data{"GP2_REAL_DIR", "../shared/real", "measured data of real machines not found"};
+inline constexpr DataFolder robot_data{"GP2_ROBOTS_DIR", "../shared/robots", "published descriptions of robots not found"};
 
 /// Published data and results of the paper.
 inline std::optional<std::string> why_reference_is_absent() { return reference_data.why_absent(); }
@@ -69,5 +70,9 @@ inline std::filesystem::path reference_file(const std::filesystem::path& name) {
 inline std::optional<std::string> why_real_is_absent() { return real_data.why_absent(); }
 inline std::filesystem::path real_dir() { return real_data.directory(); }
 inline std::filesystem::path real_file(const std::filesystem::path& name) { return real_data.file(name); }
+
+/// URDF files of real robots.
+inline std::optional<std::string> why_robots_are_absent() { return robot_data.why_absent(); }
+inline std::filesystem::path robot_file(const std::filesystem::path& name) { return robot_data.file(name); }
 
 }  // namespace gp2::test

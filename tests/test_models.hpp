@@ -17,6 +17,7 @@
 #include "gp2/generate.hpp"
 #include "gp2/mechanics.hpp"
 #include "gp2/model_file.hpp"
+#include "gp2/robot.hpp"
 #include "prior/random.hpp"
 
 // The models that laws are tested on, the states they are tested at, and the difference quotients they are tested against.
@@ -30,7 +31,9 @@ inline std::vector<std::string> model_files(const std::vector<std::string>& fold
   for (const std::string& folder : folders) {
     for (const auto& entry : std::filesystem::directory_iterator(std::filesystem::path(GP2_SOURCE_DIR) / folder)) {
       // experiments/ may hold TOML files of other kinds
-      if (entry.path().extension() == ".toml" && read_file(entry.path()).find("[mechanics]") != std::string::npos) {
+      const std::string text = entry.path().extension() == ".toml" ? read_file(entry.path()) : "";
+      const bool is_readable = text.find("\nrobot ") == std::string::npos || can_read_robots();
+      if (text.find("[mechanics]") != std::string::npos && is_readable) {
         files.push_back(folder + "/" + entry.path().filename().string());
       }
     }

@@ -41,6 +41,11 @@ WholeLog read_log(const ModelFile& model, const Arguments& arguments) {
   if (!log.missing.empty()) {
     fmt::print("warning  not in the log: {}; fit with --observe for the others\n", fmt::join(log.missing, ", "));
   }
+  if (!log.stated.empty()) {
+    std::vector<std::string> names;
+    for (const int row : log.stated) names.push_back(model.system->acceleration_names()[static_cast<std::size_t>(row)]);
+    fmt::print("ok       noise of each value: {}, which a fit observes\n", fmt::join(names, ", "));
+  }
   for (const auto& [name, found] : reader.aliases_used()) fmt::print("ok       column '{}' taken as {}\n", found, name);
   const std::vector<std::string> unused = reader.unused_columns();
   if (!unused.empty()) fmt::print("ok       columns not needed: {}\n", fmt::join(unused, ", "));
@@ -51,16 +56,20 @@ void run(const Arguments& arguments) {
   const ModelFile model = ModelFile::read(arguments.model);
   const System& system = *model.system;
   fmt::print("ok       {}: '{}', {} coordinates, {} constraints\n", arguments.model, system.name(), system.nq(), system.nc());
+  if (model.robot) {
+    for (const std::string& note : model.robot->notes) fmt::print("ok       {}\n", note);
+  }
   int n_errors = 0;
   if (!arguments.data.empty()) {
     const WholeLog log = read_log(model, arguments);
     n_errors += print(check_system(system, log.states, system.parameter_values()));
-    if (n_errors == 0) n_errors += print(check_data(system, log.states, system.parameter_values(), log.accelerations));
-  } else if (!model.sampling.empty() && !model.truth.empty()) {
+    if (n_errors == 0)
+      n_errors += print(check_data(system, log.states, system.parameter_values(), log.accelerations, log.stated));
+  } else if ((!model.sampling.empty() || model.motion) && !model.truth.empty()) {
     const GeneratedData data = generate(model, {100, 1, Eigen::VectorXd::Zero(system.nq())});
     n_errors += print(check_system(system, data.states, system.parameter_values()));
   } else {
-    fmt::print("warning  no --data and no [sampling] in the model: nothing to evaluate it at\n");
+    fmt::print("warning  no --data, and neither [sampling] nor [motion] in the model: nothing to evaluate it at\n");
   }
   if (n_errors > 0) throw InputError(fmt::format("{}: {} of the checks failed", arguments.model, n_errors));
 }
@@ -73,7 +82,7 @@ void add_check(CLI::App& app) {
       "Is a model well-posed, and does a log fit it? Rank, definiteness, derivatives, data on the constraint, dependent columns");
   auto arguments = std::make_shared<Arguments>();
   command->add_option("MODEL", arguments->model, "model file")->required();
-  command->add_option("--data", arguments->data, "CSV log (default: states drawn from the model's [sampling])");
+  command->add_option("--data", arguments->data, "CSV log (default: states of the model's [sampling] or [motion])");
   command->add_option("--map", arguments->map, "columns by other names, LOGNAME=MODELNAME,…");
   command->footer("Example:\n  gp2 check models/double_pendulum.toml --data train.csv");
   command->callback([arguments] { run(*arguments); });

@@ -19,6 +19,8 @@ namespace gp2::command {
 void add_show(CLI::App& app);
 void add_check(CLI::App& app);
 void add_generate(CLI::App& app);
+void add_derive(CLI::App& app);
+void add_resample(CLI::App& app);
 void add_fit(CLI::App& app);
 void add_predict(CLI::App& app);
 void add_simulate(CLI::App& app);

@@ -196,7 +196,8 @@ void add_fit(CLI::App& app) {
                       "noise standard deviation of what --also gives (default, for accelerations: the model's [noise])");
   command->add_option("--dt", a->time_step, "time step of --also next-velocity [s]");
   command->add_option("--map", a->map, "columns by other names, LOGNAME=MODELNAME,…: theta1=q3 also brings dtheta1, ddtheta1");
-  command->add_option("--observe", a->observe, "accelerations to learn from, ddq3,ddq6 (default: all)");
+  command->add_option("--observe", a->observe,
+                      "accelerations to learn from, ddq3,ddq6 (default: those with a column NAME_std in the log, or all)");
   command->add_option("--mean", a->mean, "prior mean of the unconstrained acceleration: zero, or force = M⁻¹F of the model")
       ->check(CLI::IsMember({"zero", "force"}))
       ->capture_default_str();
@@ -208,8 +209,9 @@ void add_fit(CLI::App& app) {
                    "learn ddq without mechanics: se (independent outputs), icm or lmc (multi-output), from the model's features")
       ->check(CLI::IsMember(Baseline::words()));
   command->add_option("--estimate", a->estimate, "parameters to estimate, p1,p2, or none (default: those the model says)");
-  command->add_option("--noise-std", a->noise,
-                      "noise standard deviation of every observed ddq, or 'estimate' (default: as the model says)");
+  command->add_option(
+      "--noise-std", a->noise,
+      "noise standard deviation of every observed ddq, or 'estimate' (default: as the log's NAME_std or the model says)");
   command->add_option("--protocol", a->protocol, "default, or paper: the set-up of Geist & Trimpe 2020")
       ->check(CLI::IsMember({"default", "paper"}))
       ->capture_default_str();

@@ -84,6 +84,8 @@ int main(int argc, char** argv) {
   gp2::command::add_show(app);
   gp2::command::add_check(app);
   gp2::command::add_generate(app);
+  gp2::command::add_derive(app);
+  gp2::command::add_resample(app);
   gp2::command::add_fit(app);
   gp2::command::add_predict(app);
   gp2::command::add_simulate(app);

@@ -12,21 +12,28 @@ namespace {
 
 struct Arguments {
   std::string model;
-  bool latex = false;
+  bool latex = false, full = false;
 };
 
-std::string matrix_text(const std::vector<std::vector<Expression>>& rows) {
+// the expressions of a robot fill books
+std::string entry_text(Expression e, bool full) {
+  constexpr double readable = 100;
+  const ExpressionSize size = e.graph().size_of(e);
+  return full || size.written <= readable ? to_string(e) : fmt::format("({} operations)", size.operations);
+}
+
+std::string matrix_text(const std::vector<std::vector<Expression>>& rows, bool full) {
   // columns aligned
   std::vector<std::size_t> widths;
   for (const auto& row : rows) {
     widths.resize(std::max(widths.size(), row.size()));
-    for (std::size_t j = 0; j < row.size(); ++j) widths[j] = std::max(widths[j], to_string(row[j]).size());
+    for (std::size_t j = 0; j < row.size(); ++j) widths[j] = std::max(widths[j], entry_text(row[j], full).size());
   }
   std::string out;
   for (const auto& row : rows) {
     out += "  [";
     for (std::size_t j = 0; j < row.size(); ++j)
-      out += fmt::format("{}{:<{}}", j == 0 ? " " : "   ", to_string(row[j]), widths[j]);
+      out += fmt::format("{}{:<{}}", j == 0 ? " " : "   ", entry_text(row[j], full), widths[j]);
     out += " ]\n";
   }
   return out.empty() ? "  (no rows)\n" : out;
@@ -48,12 +55,23 @@ void print_latex(const SymbolicSystem::Definition& definition, const std::vector
              matrix_latex("F", F), matrix_latex("A", A), matrix_latex("b", b));
 }
 
+void print_robot(const RobotDescription& robot) {
+  const auto names = [](const auto& things) {
+    std::vector<std::string> out;
+    for (const auto& thing : things) out.push_back(thing.name);
+    return out.empty() ? "none" : fmt::format("{}", fmt::join(out, ", "));
+  };
+  fmt::print("\nrobot {}\n  bodies      {}\n  sites       {}\n", robot.name, names(robot.bodies), names(robot.sites));
+  for (const std::string& note : robot.notes) fmt::print("  {}\n", note);
+}
+
 void print_text(const ModelFile& model, const SymbolicSystem& system, const std::vector<std::vector<Expression>>& A,
-                const std::vector<std::vector<Expression>>& b, const std::vector<std::vector<Expression>>& F) {
+                const std::vector<std::vector<Expression>>& b, const std::vector<std::vector<Expression>>& F, bool full) {
   fmt::print("{}\n  {} coordinates, {} inputs, {} constraints\n", system.name(), system.nq(), system.inputs().size(),
              system.nc());
-  fmt::print("\nmass matrix M\n{}", matrix_text(system.definition().mass));
-  fmt::print("\nknown force F\n{}", matrix_text(F));
+  if (model.robot) print_robot(*model.robot);
+  fmt::print("\nmass matrix M\n{}", matrix_text(system.definition().mass, full));
+  fmt::print("\nknown force F\n{}", matrix_text(F, full));
   fmt::print("\nconstraints A ddq = b\n");
   for (const ConstraintRow& row : system.definition().constraints) {
     const char* level = row.level == ConstraintRow::Level::position   ? "position"
@@ -61,7 +79,7 @@ void print_text(const ModelFile& model, const SymbolicSystem& system, const std:
                                                                       : "acceleration";
     fmt::print("  {} = 0   ({} level)\n", row.text, level);
   }
-  fmt::print("A\n{}b\n{}", matrix_text(A), matrix_text(b));
+  fmt::print("A\n{}b\n{}", matrix_text(A, full), matrix_text(b, full));
   fmt::print("\nparameters\n");
   for (const Parameter& parameter : system.parameters()) {
     fmt::print("  {:<12} {}", parameter.name, parameter.value);
@@ -75,7 +93,7 @@ void print_text(const ModelFile& model, const SymbolicSystem& system, const std:
                fmt::join(latent.feature_names, ", "), fmt::join(latent.column_names, ", "));
     if (!latent.directions_are_identity) {
       fmt::print("  directions{}\n{}", latent.base == Latent::Base::force ? " (forces)" : "",
-                 matrix_text(model.latents[a].directions));
+                 matrix_text(model.latents[a].directions, full));
     }
   }
 }
@@ -93,7 +111,7 @@ void run(const Arguments& arguments) {
   if (arguments.latex) {
     print_latex(definition, A, b, F);
   } else {
-    print_text(model, system, A, b, F);
+    print_text(model, system, A, b, F, arguments.full);
   }
 }
 
@@ -104,6 +122,7 @@ void add_show(CLI::App& app) {
   auto arguments = std::make_shared<Arguments>();
   command->add_option("MODEL", arguments->model, "model file")->required();
   command->add_flag("--latex", arguments->latex, "as LaTeX");
+  command->add_flag("--full", arguments->full, "long expressions too, which otherwise are counted");
   command->footer("Example:\n  gp2 show models/surface.toml");
   command->callback([arguments] { run(*arguments); });
 }

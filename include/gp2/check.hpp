@@ -52,8 +52,9 @@ std::vector<Finding> check_system(const System& system, const Eigen::Ref<const E
 /// How a log fits the system: states on the constraint, accelerations on A ddq = b, independent columns.
 ///
 /// @param accelerations  (nq × N); NaN rows where not measured
+/// @param stated         rows of ddq whose standard deviations the log states: those that a fit observes; empty: all
 std::vector<Finding> check_data(const System& system, const Eigen::Ref<const Eigen::MatrixXd>& states,
                                 const Eigen::Ref<const Eigen::VectorXd>& parameters,
-                                const Eigen::Ref<const Eigen::MatrixXd>& accelerations);
+                                const Eigen::Ref<const Eigen::MatrixXd>& accelerations, const std::vector<int>& stated = {});
 
 }  // namespace gp2

@@ -16,6 +16,12 @@ namespace gp2 {
 
 class ExpressionGraph;
 
+/// How large an expression is.
+struct ExpressionSize {
+  std::size_t operations = 0;  // different ones: what evaluating it takes
+  double written = 0;          // operations, numbers and symbols when it is written out, what is shared each time
+};
+
 /// What a node of an expression computes from its operands a, b.
 enum class Operation : std::uint8_t {
   constant,  // a number
@@ -109,6 +115,7 @@ class ExpressionGraph {
   /// Names of the variables e depends on, sorted.
   [[nodiscard]] std::vector<std::string> variables_of(Expression e) const;
   [[nodiscard]] bool depends_on(Expression e, Expression x) const;
+  [[nodiscard]] ExpressionSize size_of(Expression e) const;
   [[nodiscard]] std::size_t size() const;
 
  private:
@@ -125,7 +132,8 @@ Expression operator/(Expression a, Expression b);
 Expression operator-(Expression a);
 
 /// Reads `text` into `graph`: numbers, + − * / ^ (right-associative, binds tighter than unary minus: -x^2 = −(x²)), parentheses,
-/// pi, and sin cos tan asin acos atan atan2 sinh cosh tanh exp log sqrt abs sign min max.
+/// pi, and sin cos tan asin acos atan atan2 sinh cosh tanh exp log sqrt abs sign min max. site("tip").z, with a name in quotes
+/// (single ones too), numbers after it and a component, is one symbol.
 ///
 /// @param resolve  gives the expression a symbol stands for, or nothing when the name is unknown.
 /// @param known_names  names to suggest from when a symbol is unknown ("unknown symbol 'dq4', did you mean 'dq3'?").

@@ -31,13 +31,13 @@ struct Knowledge {
 /// What a person asks of a fit beyond the model and its logs.
 struct FitProblemOptions {
   std::map<std::string, std::string> columns;  // model's name -> log's name, before the model's own [columns]
-  std::vector<std::string> observe;            // accelerations to observe; empty: all of them
+  std::vector<std::string> observe;            // accelerations to observe; empty: those whose deviations the log states, or all
   Prior::Mean mean = Prior::Mean::zero;
   std::optional<Latent::Base> base;                  // replaces the directions of the model's latent
   std::optional<Baseline::Kind> baseline;            // learns ddq without mechanics, instead of the model's latents
   std::optional<std::vector<std::string>> estimate;  // parameters; not given: those the model wants estimated
-  std::optional<double> noise_stddev;                // for every observed row; not given: the model's [noise]
-  bool estimate_noise = false;
+  std::optional<double> noise_stddev;                // for every observed row; not given: the log's own, or the model's [noise]
+  bool estimate_noise = false;                       // of what the log states: a factor
   Protocol protocol;
   /// A discrepancy latent beside the model's one, where that acts in every direction, under the standard protocol with
   /// hyper-priors.
@@ -58,7 +58,8 @@ struct FitProblem {
   std::vector<std::string> notes;  // what a person should know: columns taken by alias, states off the constraint, …
 };
 
-/// Reads logs of accelerations, and what else is known, into a fit of a model.
+/// Reads logs of accelerations, and what else is known, into a fit of a model. A log with a column NAME_std beside an
+/// acceleration states the noise of each of its values.
 /// @throws InputError for missing columns, bad cells, unknown names, a log's model that does not fit (make_setting), noise that
 /// is
 ///   missing, not positive, or too small for double precision.
@@ -100,8 +101,9 @@ struct WholeLog {
   Eigen::MatrixXd states;            // NaN where neither the model reads an entry nor the log has it (layout size × N)
   Eigen::MatrixXd accelerations;     // NaN where not in the log (nq × N)
   std::vector<std::string> missing;  // accelerations that are not in the log
+  std::vector<int> stated;           // rows of accelerations whose standard deviations the log states
 };
-/// @throws InputError for a missing column that the model's prior reads.
+/// @throws InputError for a missing column that the model's prior reads, and as LogReader::stddevs.
 WholeLog read_whole_log(const ModelFile& model, LogReader& reader);
 
 /// Indices of named accelerations; all of them when `names` is empty.

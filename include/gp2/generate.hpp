@@ -40,7 +40,7 @@ GeneratedData generate(const ModelFile& model, const GenerateOptions& options);
 /// @param name  stands for the table in messages
 CsvTable as_table(const GeneratedData& data, const System& system, std::string name);
 
-/// The motion of a model as it is written: ddq = L b + T (M⁻¹F + truth), truth = 0 without [truth]. Compiled once, for many
+/// The motion of a model as it is written: ddq = L b + T (M⁻¹(F + truth.force) + truth.acceleration), both 0 without [truth]. Compiled once, for many
 /// calls.
 class ModelMotion {
  public:
@@ -54,7 +54,7 @@ class ModelMotion {
  private:
   std::shared_ptr<const System> system_;
   Eigen::VectorXd parameters_;
-  Tape truth_;
+  Tape truth_, truth_force_;
 };
 
 /// The true acceleration L b + T (M⁻¹F + truth) at given states (nq × N).

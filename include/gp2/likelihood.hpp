@@ -16,7 +16,7 @@ struct ModelValues {
   std::vector<Eigen::VectorXd> kernel;         // per latent: the kernel's parameters
   std::vector<Eigen::VectorXd> signal_stddev;  // per latent: s (p_a); ones where the directions are learned
   std::vector<Eigen::MatrixXd> mixing;         // per latent: C = [W, diag(√κ)] of learned directions; may be left empty
-  std::vector<Eigen::VectorXd> noise_stddev;   // per Observations: σ (d)
+  std::vector<Eigen::VectorXd> noise_stddev;   // per Observations: σ (d), of values with a noise of their own the common factor
   Eigen::VectorXd parameters;                  // of the system: θ
 
   [[nodiscard]] bool is_learned(std::size_t a) const { return a < mixing.size() && mixing[a].size() > 0; }

@@ -25,16 +25,30 @@ class LogReader {
   /// @throws InputError naming a column that is missing, with those there are.
   [[nodiscard]] Eigen::MatrixXd states(const std::vector<bool>& reads);
 
+  /// The same, but a cell that is empty or not finite is NaN.
+  [[nodiscard]] Eigen::MatrixXd states_with_gaps(const std::vector<bool>& reads);
+
   /// Named columns of the model, say ddq1 and ddq3 (names.size() × N).
   [[nodiscard]] Eigen::MatrixXd values(const std::vector<std::string>& names);
 
+  /// The column with the standard deviation of each value of a named column of the model: the log's name of that with _std
+  /// behind; empty when there is none.
+  [[nodiscard]] std::string stddev_column(const std::string& name) const;
+  /// (names.size() × N)
+  /// @throws InputError naming file, line and column of a standard deviation that is not positive and finite.
+  [[nodiscard]] Eigen::MatrixXd stddevs(const std::vector<std::string>& names);
+
   [[nodiscard]] bool has(const std::string& name) const { return find(name) >= 0; }
+  /// Where a name of the model stands in the table; it counts as used then. −1 when it is not there.
+  [[nodiscard]] int column(const std::string& name) { return has(name) ? require(name) : -1; }
   [[nodiscard]] const std::map<std::string, std::string>& aliases_used() const { return aliases_used_; }  // model's -> log's name
   [[nodiscard]] std::vector<std::string> unused_columns() const;  // after the reading is done
 
  private:
   [[nodiscard]] int find(const std::string& name) const;
   [[nodiscard]] int require(const std::string& name);
+  using Number = double (CsvTable::*)(int row, int column) const;
+  [[nodiscard]] Eigen::MatrixXd read_states(const std::vector<bool>& reads, Number number);
 
   const CsvTable& table_;
   const System& system_;

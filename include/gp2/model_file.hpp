@@ -14,9 +14,15 @@
 
 #include "gp2/baseline.hpp"
 #include "gp2/prior.hpp"
+#include "gp2/robot.hpp"
 #include "gp2/symbolic_system.hpp"
 
 namespace gp2 {
+
+class RobotExpressions;
+
+/// What stands in for the file that a model file names as its robot.
+using RobotSource = std::function<RobotDescription(const std::string& file)>;
 
 /// Code that gives the equations of a system, which a model file only declares: a CallableSystem, say, or a System of one's own.
 /// What it returns must go by the coordinates, inputs and parameters declared.
@@ -28,8 +34,9 @@ class ModelFile {
  public:
   /// @throws InputError with file, line, key, the rule, the value got and the mend.
   static ModelFile read(const std::filesystem::path& path);
-  /// @param name  stands for the file in messages
+  /// @param name  stands for the file in messages; its folder is where a relative robot = "FILE" is looked for
   static ModelFile parse(std::string text, std::string name);
+  static ModelFile parse(std::string text, std::string name, const RobotSource& robot);
 
   /// The same of a file without [mechanics] and [constraints]: M, A, b and F come from code.
   /// @throws InputError also when the file has one of the two, or `mechanics` is empty, returns nothing, or a system that goes by
@@ -61,20 +68,41 @@ class ModelFile {
     int line = 0;
   };
 
+  /// [motion]: how the system is driven while it is sampled. A task y(q) follows straight lines between random targets.
+  struct Motion {
+    enum class Profile { smooth /* of least jerk */, trapezoid /* of the speed */ };
+    struct Target {
+      std::string text;
+      ConstraintRow row;                               // of y: A = J, b = −J̇ dq, residuals y and ẏ
+      std::optional<std::pair<double, double>> range;  // of the targets; none: y stays where it starts
+    };
+    double rate = 0;                    // samples per second [Hz]
+    std::pair<double, double> segment;  // how long a line takes [s]
+    Profile profile = Profile::smooth;
+    double natural_frequency = 0;  // ω of the controller [rad/s]
+    double damping_ratio = 1;      // ζ
+    std::vector<Target> targets;
+    std::map<std::string, double> start;  // where it begins, before it is moved onto the constraints
+  };
+
   std::string name;                        // for messages
   std::string text;                        // the file's content
   bool mechanics_are_code = false;         // M, A, b and F come from a MechanicsSource, not from the text
+  std::optional<RobotDescription> robot;   // that the model file names
   std::shared_ptr<ExpressionGraph> graph;  // of every expression here
   std::shared_ptr<const System> system;
   std::vector<LatentText> latents;
   Noise noise;
   std::optional<Expression> potential;         // V(q, t) [J], for the energy that `simulate` reports
   std::vector<Expression> truth;               // added to M⁻¹F; nq entries, or none without [truth]
+  std::vector<Expression> truth_force;         // added to F; likewise
   std::vector<SamplingRule> sampling;          // in an order in which each can be computed; empty without [sampling]
   std::map<std::string, double> newton_start;  // [sampling] start
+  std::optional<Motion> motion;                // instead of sampling
   std::map<std::string, std::string> columns;  // the model's name -> the name in logs
 
-  /// An expression of the model's symbols and [let] names.
+  /// An expression of the model's symbols and [let] names. Points of its robot, site("tip").z say, become what they are in
+  /// coordinates and velocities.
   [[nodiscard]] Expression expression(std::string_view text) const;
 
   /// The variables of the system in `graph`.
@@ -85,7 +113,9 @@ class ModelFile {
 
  private:
   void define(const std::string& symbol, Expression value);
+  [[nodiscard]] Expression parse_symbols(std::string_view text) const;  // points of the robot stay as they are
 
+  std::shared_ptr<RobotExpressions> robot_expressions_;  // null without a robot
   std::map<std::string, Expression, std::less<>> symbols_;
   std::vector<std::string> symbol_names_;  // to suggest from when a symbol is unknown
   friend class ModelReader;

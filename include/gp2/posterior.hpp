@@ -92,9 +92,10 @@ class Posterior {
 ///
 ///     posterior = update(std::move(posterior), {.states = x, .view = ddq, .values = y, .noise_stddev = sigma});
 ///
-/// The noise of the new observations is their own noise_stddev, as it stands; that of earlier ones is values().noise_stddev.
-/// Where both view and noise are those of an earlier group of observations() the new ones join it behind its last; else they are
-/// a new group, with its noise in values(). So Posterior(prior(), observations(), values()) is always the posterior built anew.
+/// The noise of the new observations is their own, as it stands; that of earlier ones is by values().noise_stddev.
+/// Where both view and noise_stddev are those of an earlier group of observations() the new ones join it behind its last, if both
+/// have a noise_scale or neither has; else they are a new group, with its noise in values(). So Posterior(prior(),
+/// observations(), values()) is always the posterior built anew.
 ///
 /// In place where no copy of `posterior` is held, by PathwiseSamples either; else a copy is changed and the others
 /// stay what they are. Memory is drawn for the factor only when what was set aside is full, and then for half as many rows again.

@@ -59,7 +59,7 @@ class SymbolicSystem final : public System {
   void evaluate_into(const Eigen::Ref<const Eigen::MatrixXd>& states, const Eigen::Ref<const Eigen::VectorXd>& parameters,
                      SystemValues& values) const override;
   /// Its derivatives are exact; it allocates nothing. The first call with `derivatives` takes them, in a graph of the system's
-  /// own.
+  /// own. Where they would be more than ExpressionGraph::max_nodes, for robots of some 40 joints in a row, it takes differences.
   [[nodiscard]] std::unique_ptr<StateEvaluator> make_evaluator(const Eigen::Ref<const Eigen::VectorXd>& parameters,
                                                                bool derivatives) const override;
   [[nodiscard]] SystemValues differentiate(const Eigen::Ref<const Eigen::MatrixXd>& states,

@@ -108,6 +108,7 @@ struct FitOptions {
   int n_threads = 0;                              // 0: as many as the machine has; results do not depend on it
   double gradient_tolerance = 1e-5;               // stop when the projected gradient's largest entry is below
   double reduction_tolerance = 1e-12;             // stop when an iteration lowers the objective by less, relatively
+  int max_escapes = 5;                            // scans for lower optima from the best one
   std::function<void(const Progress&)> progress;  // called from worker threads, one at a time
   const std::atomic<bool>* stop = nullptr;        // set: return the best so far
 };

@@ -33,6 +33,7 @@ from gp2._gp2 import (
     fit,
     load,
     read_csv,
+    resample,
     simulate,
 )
 
@@ -60,5 +61,6 @@ __all__ = [
     "fit",
     "load",
     "read_csv",
+    "resample",
     "simulate",
 ]

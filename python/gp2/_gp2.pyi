@@ -54,25 +54,28 @@ class System:
     def __init__(
         self,
         *,
-        coordinates: Sequence[str | Mapping[str, Any]],
+        coordinates: Sequence[str | Mapping[str, Any]] | None = None,
         mass: Sequence[Sequence[_Text]] | npt.NDArray[Any] | None = None,
+        robot: _Path | None = None,
         name: str | None = None,
         inputs: Sequence[str] = (),
         parameters: Mapping[str, float | Mapping[str, Any]] | None = None,
         let: Mapping[str, _Text] | None = None,
         force: Sequence[_Text] | None = None,
+        force_on: Mapping[str, _Text] | None = None,
         potential: _Text | None = None,
         constraints: Sequence[_Text] | Mapping[str, Sequence[_Text]] = (),
         latents: Sequence[Mapping[str, Any]] = (),
         noise: float | Sequence[float] | Mapping[str, Any] | None = None,
-        truth: Sequence[_Text] | Mapping[str, Sequence[_Text]] | None = None,
+        truth: Sequence[_Text] | Mapping[str, Any] | None = None,
         sampling: Mapping[str, Any] | None = None,
+        motion: Mapping[str, Any] | None = None,
         columns: Mapping[str, str] | None = None,
     ) -> None: ...
     @staticmethod
     def load(path: _Path) -> System: ...
     @staticmethod
-    def parse(text: str, name: str = "text") -> System: ...
+    def parse(text: str, name: str = "text", robot: str | None = None) -> System: ...
     @staticmethod
     def from_callables(
         mechanics: Callable[[_Array, _Parameters], _Matrices],
@@ -86,6 +89,8 @@ class System:
     def name(self) -> str: ...
     @property
     def text(self) -> str: ...
+    @property
+    def robot(self) -> str | None: ...
     @property
     def coordinates(self) -> list[str]: ...
     @property
@@ -383,6 +388,15 @@ def fit(
 ) -> Posterior: ...
 def load(path: _Path, system: System | None = None) -> Posterior: ...
 def read_csv(path: _Path) -> Table: ...
+def resample(
+    system: System,
+    data: _Table,
+    n: int,
+    *,
+    features: Sequence[str] = [],
+    seed: int | None = None,
+    columns: Mapping[str, str] | None = None,
+) -> Table: ...
 def simulate(
     system: System,
     start: Mapping[str, float] | npt.ArrayLike,

@@ -5,27 +5,31 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from numbers import Integral, Real
+from os import PathLike, fspath
 from typing import Any
 
 
 def model_text(
     *,
-    coordinates: Sequence[Any],
+    coordinates: Sequence[Any] | None = None,
     mass: Sequence[Sequence[Any]] | None = None,
+    robot: str | PathLike[str] | None = None,
     name: str | None = None,
     inputs: Sequence[str] = (),
     parameters: Mapping[str, Any] | None = None,
     let: Mapping[str, Any] | None = None,
     force: Sequence[Any] | None = None,
+    force_on: Mapping[str, Any] | None = None,
     potential: Any = None,
     constraints: Any = (),
     latents: Sequence[Mapping[str, Any]] = (),
     noise: Any = None,
     truth: Any = None,
     sampling: Mapping[str, Any] | None = None,
+    motion: Mapping[str, Any] | None = None,
     columns: Mapping[str, str] | None = None,
 ) -> str:
-    mechanics = {"mass": mass, "force": force, "potential": potential}
+    mechanics = {"mass": mass, "force": force, "force_on": force_on, "potential": potential}
     if not isinstance(constraints, Mapping):
         constraints = {"position": constraints} if constraints else {}
     if noise is not None and not (isinstance(noise, Mapping) and "ddq" in noise):
@@ -34,7 +38,11 @@ def model_text(
         truth = {"acceleration": truth}
 
     lines = [f"name = {_value(name)}"] if name is not None else []
-    lines += [f"coordinates = {_value(coordinates)}", f"inputs = {_value(inputs)}"]
+    if robot is not None:
+        lines.append(f"robot = {_value(fspath(robot))}")
+    if coordinates is not None or robot is None:
+        lines.append(f"coordinates = {_value(coordinates or [])}")
+    lines.append(f"inputs = {_value(inputs)}")
     tables = {
         "parameters": parameters,
         "let": let,
@@ -43,6 +51,7 @@ def model_text(
         "noise": noise,
         "truth": truth,
         "sampling": sampling,
+        "motion": motion,
         "columns": columns,
     }
     for table, entries in tables.items():

@@ -10,17 +10,17 @@ from typing import Any
 from gp2 import _gp2
 
 
-def _read_system(text: str, name: str) -> _gp2.System:
-    return _gp2.System.parse(text, name)
+def _read_system(text: str, name: str, robot: str | None = None) -> _gp2.System:
+    return _gp2.System.parse(text, name, robot)
 
 
 # a system travels as text
 def _reduce_system(system: _gp2.System) -> tuple[Any, ...]:
     try:
-        _read_system(system.text, system.name)
+        _read_system(system.text, system.name, system.robot)
     except _gp2.InputError as error:  # of System.from_callables
         raise TypeError(f"'{system.name}' cannot be pickled: its mechanics are functions") from error
-    return _read_system, (system.text, system.name)
+    return _read_system, (system.text, system.name, system.robot)
 
 
 def _read_posterior(content: bytes) -> _gp2.Posterior:

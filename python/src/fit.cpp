@@ -268,11 +268,12 @@ void add_fit(py::module_& module) {
 data        a path, Table, pandas frame or mapping with columns named as the model's (or aliases); or (states, accelerations),
             arrays (n, len(state_names)) and (n, nq), columns of NaN being "not measured"; or a list of these and of Log
 also        list of Knowledge: other quantities, measured or known
-observe     accelerations to learn from; default: all
+observe     accelerations to learn from; default: those with a column ddNAME_std, or all
 mean        'zero', or 'force': the model's known force is relied on
 prior       'acceleration' or 'force': where the latent acts; default: as the model says
 baseline    'se', 'icm' or 'lmc': learn ddq without mechanics
-noise_std   standard deviation of every observed ddq, or 'estimate'; default: the model's
+noise_std   standard deviation of every observed ddq, or 'estimate'; default: of each value, where data have columns
+            ddNAME_std, or the model's
 estimate    names of parameters; default: those the model wants estimated
 columns     {model's name: log's name}
 restarts    runs of the optimiser; default: 5, of a baseline 30

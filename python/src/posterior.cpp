@@ -211,16 +211,28 @@ void update_with(PyPosterior& self, const py::object& data, const std::vector<st
   added.view.rows = acceleration_rows(system, names, "observe");
   if (names.empty()) names = added.view.names(system);
 
-  // the noise that the fit has for these rows, unless told otherwise
+  const CsvTable table = to_table(data, "data");
+  LogStates log = read_log_states(self.posterior.prior(), added.view, self.file.model, table, columns_argument(columns), names);
+
+  // the noise that the fit has for these rows, unless told otherwise; where it is a factor of stated ones, the log states them
   added.noise_stddev = VectorXd::Constant(added.view.size(), noise_stddev.value_or(std::numeric_limits<double>::quiet_NaN()));
   if (!noise_stddev) {
     if (at_home == groups.end() || at_home->view.rows != added.view.rows) {
       throw InputError("noise_std: these accelerations were not observed in the fit; give their noise standard deviation");
     }
     added.noise_stddev = self.posterior.values().noise_stddev[static_cast<std::size_t>(at_home - groups.begin())];
+    if (at_home->has_noise_scale()) {
+      LogReader reader = open_log(self.file.model, table, columns_argument(columns));
+      for (const std::string& name : names) {
+        if (!reader.stddev_column(name).empty()) continue;
+        throw InputError(
+            fmt::format("noise_std: in the fit each value of {} has a noise of its own; give that of these in a column "
+                        "{}_std, or one for all",
+                        name, name));
+      }
+      added.noise_scale = reader.stddevs(names);
+    }
   }
-  LogStates log = read_log_states(self.posterior.prior(), added.view, self.file.model, to_table(data, "data"),
-                                  columns_argument(columns), names);
   tell(log.notes);
   added.states = std::move(log.states);
   added.values = std::move(log.accelerations);

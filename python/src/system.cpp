@@ -10,6 +10,7 @@
 #include "gp2/error.hpp"
 #include "gp2/fit_problem.hpp"
 #include "gp2/generate.hpp"
+#include "gp2/resample.hpp"
 
 namespace gp2::python {
 
@@ -71,6 +72,16 @@ CsvTable generate_table(const PySystem& self, int n, std::uint64_t seed, std::op
   return as_table(generate(model, options), system, fmt::format("data of '{}'", system.name()));
 }
 
+CsvTable resample_table(const PySystem& self, const py::object& data, int n, const std::vector<std::string>& features,
+                        const std::optional<std::uint64_t>& seed, const py::object& columns) {
+  const CsvTable table = to_table(data, "data");
+  std::vector<std::string> cells;
+  for (const int row : resample(*self.model, table, {n, features, seed, columns_argument(columns)}).rows) {
+    for (int column = 0; column < table.n_columns(); ++column) cells.push_back(table.cell(row, column));
+  }
+  return CsvTable::from_cells(table.name(), table.header(), std::move(cells));
+}
+
 py::list findings_list(const std::vector<Finding>& findings) {
   py::list list;
   for (const Finding& finding : findings) list.append(finding);
@@ -83,7 +94,7 @@ py::list check(const PySystem& self, const py::object& data, const py::object& c
   const System& system = self.system();
   const Eigen::VectorXd parameters = system.parameter_values();
   if (data.is_none()) {
-    if (model.sampling.empty() || model.truth.empty()) {
+    if ((model.sampling.empty() && !model.motion) || model.truth.empty()) {
       throw InputError("check: no data, and no sampling and truth in the model: nothing to evaluate it at");
     }
     const GeneratedData drawn = generate(model, {100, 1, Eigen::VectorXd::Zero(system.nq())});
@@ -95,7 +106,7 @@ py::list check(const PySystem& self, const py::object& data, const py::object& c
   std::vector<Finding> findings = check_system(system, log.states, parameters);
   const auto is_error = [](const Finding& finding) { return finding.level == Finding::Level::error; };
   if (std::none_of(findings.begin(), findings.end(), is_error)) {
-    const std::vector<Finding> more = check_data(system, log.states, parameters, log.accelerations);
+    const std::vector<Finding> more = check_data(system, log.states, parameters, log.accelerations, log.stated);
     findings.insert(findings.end(), more.begin(), more.end());
   }
   return findings_list(findings);
@@ -193,7 +204,8 @@ System.load("surface.toml") reads a model file; System(coordinates=…, mass=…
         noise=0.05,                              # standard deviation of a measured ddq
     )
 
-Further keywords: name, let, potential, truth, sampling, columns. Each is the table of that name in a model file.
+Further keywords: name, let, potential, truth, sampling, motion, columns. Each is the table of that name in a model file.
+With robot="arm.xml" (MJCF or URDF) coordinates are its joints unless given, and mass is its own; docs/robots.md.
 
 Raises InputError with the key, the rule, the value got and the mend.)");
   add_callables(system);
@@ -210,10 +222,17 @@ Raises InputError with the key, the rule, the value got and the mend.)");
           py::arg("path"), "Read a model file.\n\nRaises InputError with file, line, key, the rule, the value got and the mend.")
       .def_static(
           "parse",
-          [](const std::string& text, const std::string& name) {
-            return PySystem{std::make_shared<const ModelFile>(ModelFile::parse(text, name))};
+          [](const std::string& text, const std::string& name, const std::optional<std::string>& robot) {
+            if (!robot) return PySystem{std::make_shared<const ModelFile>(ModelFile::parse(text, name))};
+            const RobotSource source = [&](const std::string&) { return robot_from_json(*robot); };
+            return PySystem{std::make_shared<const ModelFile>(ModelFile::parse(text, name, source))};
           },
-          py::arg("text"), py::arg("name") = "text", "The same from the text of a model file; `name` stands for it in messages.")
+          py::arg("text"), py::arg("name") = "text", py::arg("robot") = py::none(),
+          "The same from the text of a model file; `name` stands for it in messages, `robot` (see the property) for its file.")
+      .def_property_readonly(
+          "robot",
+          [](const PySystem& self) { return self.model->robot ? std::optional(to_json(*self.model->robot)) : std::nullopt; },
+          "The robot of the model as JSON text; None without one.")
       .def_property_readonly("name", [](const PySystem& self) { return self.system().name(); })
       .def_property_readonly(
           "text", [](const PySystem& self) { return self.model->text; }, "The model file's text.")
@@ -259,6 +278,12 @@ Raises InputError with the key, the rule, the value got and the mend.)");
   module.def("check", &check, py::arg("system"), py::arg("data") = py::none(), py::arg("columns") = py::none(),
              "Is a system well-posed, and does a log fit it? A list of Finding: rank, definiteness, derivatives; data on the\n"
              "constraint, dependent columns. Without data at states drawn from the model's [sampling].");
+  module.def(
+      "resample", &resample_table, py::arg("system"), py::arg("data"), py::arg("n"), py::kw_only(),
+      py::arg("features") = std::vector<std::string>(), py::arg("seed") = py::none(), py::arg("columns") = py::none(),
+      "The n rows of a table that cover its states best, whole, in the order of choice: farthest points in the features of\n"
+      "the system's first latent, or in expressions given, each divided by its standard deviation. The first is the row\n"
+      "nearest to the mean or, with a seed, a random one. Rows without a number in some feature are left out.");
 }
 
 }  // namespace gp2::python

@@ -31,7 +31,8 @@ struct Calibration {
   [[nodiscard]] double coverage() const { return n == 0 ? not_a_number : static_cast<double>(inside) / n; }
 };
 
-// where training observed row `row` of ddq: its spread over all such observations and the noise of the first, NaN when it did not
+// where training observed row `row` of ddq: its spread over all such observations and the usual noise of the first, NaN when it
+// did not
 struct Trained {
   double spread = not_a_number, noise = not_a_number;
 };
@@ -44,7 +45,7 @@ Trained trained(const Posterior& posterior, int row) {
     if (group.view.quantity != View::Quantity::constrained_acceleration || group.view.latent >= 0) continue;
     for (int k = 0; k < group.view.size(); ++k) {
       if (group.view.rows[static_cast<std::size_t>(k)] != row) continue;
-      if (values.empty()) trained.noise = posterior.values().noise_stddev[g][k];
+      if (values.empty()) trained.noise = group.usual_noise(posterior.values().noise_stddev[g])[k];
       values.insert(values.end(), group.values.row(k).begin(), group.values.row(k).end());
     }
   }

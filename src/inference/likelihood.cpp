@@ -6,6 +6,8 @@
 #include <numbers>
 #include <utility>
 
+#include <fmt/format.h>
+
 #include "gp2/error.hpp"
 #include "inference/lapack.hpp"
 #include "inference/parallel.hpp"
@@ -21,6 +23,38 @@ using Eigen::VectorXd;
 VectorXd row_stddev(const Eigen::Ref<const MatrixXd>& values) {
   const VectorXd mean = values.rowwise().mean();
   return (values.colwise() - mean).rowwise().squaredNorm().array().sqrt() / std::sqrt(static_cast<double>(values.cols()));
+}
+
+VectorXd Observations::noise_at(const Eigen::Ref<const VectorXd>& stddev, Index i) const {
+  if (!has_noise_scale()) return stddev;
+  return stddev.cwiseProduct(noise_scale.col(i));
+}
+
+VectorXd Observations::usual_noise(const Eigen::Ref<const VectorXd>& stddev) const {
+  if (!has_noise_scale()) return stddev;
+  VectorXd usual = stddev;
+  for (Index k = 0; k < usual.size(); ++k) {
+    VectorXd scale = noise_scale.row(k);
+    const auto middle = scale.begin() + scale.size() / 2;
+    std::nth_element(scale.begin(), middle, scale.end());
+    usual[k] *= *middle;
+  }
+  return usual;
+}
+
+void Observations::require_noise_scale() const {
+  if (!has_noise_scale()) return;
+  if (noise_scale.rows() != values.rows() || noise_scale.cols() != values.cols()) {
+    throw InputError(
+        fmt::format("noise_scale must hold one number for each of the {} × {} values, got {} × {}; leave it empty where "
+                    "each row has one noise",
+                    values.rows(), values.cols(), noise_scale.rows(), noise_scale.cols()));
+  }
+  for (const double scale : noise_scale.reshaped()) {
+    if (scale > 0 && std::isfinite(scale)) continue;
+    throw InputError(
+        fmt::format("noise_scale must be positive and finite, got {}; leave out values that are worth nothing", scale));
+  }
 }
 
 MatrixXd ModelValues::loading(std::size_t a) const {
@@ -100,6 +134,7 @@ Likelihood::Likelihood(Prior prior, std::vector<Observations> observations, cons
   self.observations = std::move(observations);
   self.options = std::move(options);
   for (const Observations& group : self.observations) {
+    group.require_noise_scale();
     require_mechanics(*prior_of(self.prior, group.view).system, group.states, parameters_of(group.view, initial.parameters));
   }
   self.features = features_by_group(self.prior, self.observations);
@@ -388,10 +423,17 @@ class PairSweep {
 // What θ and the noise change at one sample: ∂NLL/∂e, ∂NLL/∂W and ∂NLL/∂E there, and the chain rule on to σ and θ.
 class SampleGradient {
  public:
-  SampleGradient(const Likelihood::Options& options, const std::vector<ObservationModel>& models, const Reduction& reduction,
-                 const ModelValues& values, const VectorXd& alpha, const PairSums& sums)
-      : options_(options), models_(models), reduction_(reduction), alpha_(alpha), sums_(sums), V_(sums.latents.size()) {
-    for (const VectorXd& noise : values.noise_stddev) whitening_.emplace_back(noise.cwiseInverse());
+  SampleGradient(const Likelihood::Options& options, const std::vector<Observations>& observations,
+                 const std::vector<ObservationModel>& models, const Reduction& reduction, const ModelValues& values,
+                 const VectorXd& alpha, const PairSums& sums)
+      : options_(options),
+        observations_(observations),
+        models_(models),
+        reduction_(reduction),
+        noise_stddev_(values.noise_stddev),
+        alpha_(alpha),
+        sums_(sums),
+        V_(sums.latents.size()) {
     for (std::size_t a = 0; a < V_.size(); ++a) loading_.push_back(values.loading(a));
   }
 
@@ -399,7 +441,7 @@ class SampleGradient {
     const Reduction::Sample& sample = reduction_.samples[static_cast<std::size_t>(i)];
     const std::size_t group = static_cast<std::size_t>(sample.group);
     const ObservationModel& model = models_[group];
-    const VectorXd& whitening = whitening_[group];
+    whitening_ = observations_[group].noise_at(noise_stddev_[group], sample.index).cwiseInverse();
     const Index rank = sample.R.rows();
 
     // α_i = Q_i α̃_i + (I − Q_iQ_iᵀ) e_i
@@ -423,16 +465,16 @@ class SampleGradient {
     d_W_.noalias() -= sample.e_out.lazyProduct(mean_.transpose());
     const auto G = model.values.view.G(sample.index);
 
-    // S^{-1/2} scales the rows of W and e
+    // S^{-1/2} scales the rows of W and e, and σ_k the whole row k of S^{1/2}
     if (options_.noise_gradient) {
       gradient.noise_stddev[group].array() +=
-          1 - d_e_.array() * sample.e.array() - whitening.array() * d_W_.cwiseProduct(G).rowwise().sum().array();
+          1 - d_e_.array() * sample.e.array() - whitening_.array() * d_W_.cwiseProduct(G).rowwise().sum().array();
     }
     if (options_.gradient_parameters.empty()) return;
 
     // e = S^{-1/2}(y − d − Gμ) and W = S^{-1/2}G: ∂NLL/∂d, ∂NLL/∂G, ∂NLL/∂μ and ∂NLL/∂E
-    d_offset_ = -whitening.cwiseProduct(d_e_);
-    d_G_ = whitening.asDiagonal() * d_W_;
+    d_offset_ = -whitening_.cwiseProduct(d_e_);
+    d_G_ = whitening_.asDiagonal() * d_W_;
     d_G_.noalias() += d_offset_.lazyProduct(model.values.prior.mean.col(sample.index).transpose());
     d_mean_.noalias() = G.transpose().lazyProduct(d_offset_);
     for (std::size_t a = 0; a < V_.size(); ++a) {
@@ -450,15 +492,17 @@ class SampleGradient {
 
  private:
   const Likelihood::Options& options_;
+  const std::vector<Observations>& observations_;
   const std::vector<ObservationModel>& models_;
   const Reduction& reduction_;
+  const std::vector<VectorXd>& noise_stddev_;
   const VectorXd& alpha_;
   const PairSums& sums_;
-  std::vector<VectorXd> whitening_;  // per group: S^{-1/2}
-  std::vector<MatrixXd> loading_;    // per latent: C_a
+  std::vector<MatrixXd> loading_;  // per latent: C_a
   // memory used again at each sample
   std::vector<MatrixXd> V_;
   MatrixXd V_E_, E_, d_W_, d_G_;
+  VectorXd whitening_;  // S^{-1/2}
   VectorXd alpha_i_, d_e_, mean_, d_offset_, d_mean_;
 };
 
@@ -533,7 +577,7 @@ double Likelihood::evaluate(const ModelValues& values, ModelValues* gradient, Wo
     }
   }
   if (!needs_V) return value;
-  SampleGradient of_sample(self.options, models, reduction, values, alpha, sums);
+  SampleGradient of_sample(self.options, self.observations, models, reduction, values, alpha, sums);
   for (Index i = 0; i < static_cast<Index>(reduction.samples.size()); ++i) of_sample.add(i, *gradient);
   return value;
 }

@@ -97,9 +97,9 @@ void Posterior::Implementation::finish() {
 
 namespace {
 
-// ½ ‖(I − QQᵀ)e‖² + ½ log|S| + ½ dim y log 2π of one sample
-double constant_of(const Reduction::Sample& sample, const VectorXd& noise_stddev) {
-  return 0.5 * sample.e_out.squaredNorm() + noise_stddev.array().log().sum() +
+// ½ ‖(I − QQᵀ)e‖² + ½ log|S| + ½ dim y log 2π of one sample, S = diag(noise²)
+double constant_of(const Reduction::Sample& sample, const VectorXd& noise) {
+  return 0.5 * sample.e_out.squaredNorm() + noise.array().log().sum() +
          0.5 * static_cast<double>(sample.e.size()) * std::log(2 * std::numbers::pi);
 }
 
@@ -213,6 +213,7 @@ void add_prior_covariance(double k, const double* left, const double* right, Ind
 
 void Posterior::Implementation::add_samples(const std::vector<Observations>& groups, const std::vector<VectorXd>& noise_stddev,
                                             int first_group) {
+  for (const Observations& group : groups) group.require_noise_scale();
   std::vector<ObservationModel> models;
   if (!model_observations(prior, groups, values.parameters, {}, models)) {
     for (const Observations& group : groups) {
@@ -286,7 +287,8 @@ void Posterior::Implementation::add_samples(const std::vector<Observations>& gro
   next_number = number.back();
   for (const Reduction::Sample& sample : reduction.samples) {
     const std::size_t group = static_cast<std::size_t>(sample.group);
-    samples.push_back({first_group + sample.group, number[group] + sample.index, constant_of(sample, noise_stddev[group])});
+    const VectorXd noise = groups[group].noise_at(noise_stddev[group], sample.index);
+    samples.push_back({first_group + sample.group, number[group] + sample.index, constant_of(sample, noise)});
   }
 }
 
@@ -606,6 +608,11 @@ void check_added(const Prior& prior, const Observations& added) {
   if (!added.values.allFinite()) {
     throw InputError("update: `values` must be finite, got one that is not; leave out states without a measurement");
   }
+  try {
+    added.require_noise_scale();
+  } catch (const InputError& error) {
+    throw InputError(std::string("update: ") + error.what());
+  }
   if (added.noise_stddev.size() != added.view.size()) {
     throw InputError(
         fmt::format("update: `noise_stddev` must have one number for each of the view's {} rows, got {}; that of "
@@ -640,14 +647,17 @@ Posterior update(Posterior&& posterior, Observations added) {
 
   // the group that has this view and noise, or one of its own
   std::size_t group = 0;
-  while (group < self->observations.size() &&
-         !(self->observations[group].view == added.view && self->values.noise_stddev[group] == added.noise_stddev)) {
-    ++group;
-  }
+  const auto belongs = [&] {
+    const Observations& there = self->observations[group];
+    return there.view == added.view && self->values.noise_stddev[group] == added.noise_stddev &&
+           there.has_noise_scale() == added.has_noise_scale();
+  };
+  while (group < self->observations.size() && !belongs()) ++group;
   self->add_samples({added}, {added.noise_stddev}, static_cast<int>(group));
   if (group < self->observations.size()) {
     append_columns(self->observations[group].states, added.states);
     append_columns(self->observations[group].values, added.values);
+    if (added.has_noise_scale()) append_columns(self->observations[group].noise_scale, added.noise_scale);
   } else {
     self->values.noise_stddev.push_back(added.noise_stddev);
     self->observations.push_back(std::move(added));
@@ -681,6 +691,7 @@ Posterior remove_oldest(Posterior&& posterior, int n) {
   for (std::size_t group = 0; group < n_gone.size(); ++group) {
     erase_first_columns(self->observations[group].states, n_gone[group]);
     erase_first_columns(self->observations[group].values, n_gone[group]);
+    if (self->observations[group].has_noise_scale()) erase_first_columns(self->observations[group].noise_scale, n_gone[group]);
   }
   self->finish();
   posterior.implementation_.reset();

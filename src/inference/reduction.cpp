@@ -74,15 +74,20 @@ void reduce(const Prior& prior, const std::vector<Observations>& observations, c
   reduction.samples.resize(n_samples);
   reduction.constant = 0;
   MatrixXd W, factors;
-  VectorXd reflection;
+  VectorXd reflection, noise;
   Eigen::VectorXi order;
   std::size_t k = 0;
   for (std::size_t g = 0; g < observations.size(); ++g) {
     const Observations& group = observations[g];
-    const VectorXd whitening = noise_stddev[g].cwiseInverse();
-    const double log_det_S_half = noise_stddev[g].array().log().sum();
+    VectorXd whitening = noise_stddev[g].cwiseInverse();
+    double log_det_S_half = noise_stddev[g].array().log().sum();
     const Index d = group.view.size();
     for (int i = 0; i < group.n_data(); ++i) {
+      if (group.has_noise_scale()) {
+        noise = group.noise_at(noise_stddev[g], i);
+        whitening = noise.cwiseInverse();
+        log_det_S_half = noise.array().log().sum();
+      }
       // W P = Q R', so R = Qᵀ W
       Reduction::Sample& sample = reduction.samples[k++];
       sample.group = static_cast<int>(g);

@@ -8,6 +8,7 @@
 #include <cstring>
 #include <fstream>
 #include <iterator>
+#include <limits>
 #include <numeric>
 #include <optional>
 #include <set>
@@ -160,11 +161,13 @@ const std::string& CsvTable::cell(int row, int column) const {
   return cells_[static_cast<std::size_t>(row) * header_.size() + static_cast<std::size_t>(column)];
 }
 
+std::string CsvTable::place(int row, int column) const {
+  return fmt::format("{}:{}: column '{}'", name_, lines_[static_cast<std::size_t>(row)],
+                     header_[static_cast<std::size_t>(column)]);
+}
+
 double CsvTable::number(int row, int column) const {
-  const auto fail = [&](const std::string& what) {
-    throw InputError(fmt::format("{}:{}: column '{}': {}", name_, lines_[static_cast<std::size_t>(row)],
-                                 header_[static_cast<std::size_t>(column)], what));
-  };
+  const auto fail = [&](const std::string& what) { throw InputError(fmt::format("{}: {}", place(row, column), what)); };
   const std::string& text = cell(row, column);
   std::string_view digits = trim(text);
   if (digits.empty()) fail("the cell is empty; a number is needed here");
@@ -176,6 +179,15 @@ double CsvTable::number(int row, int column) const {
   if (whole && error == std::errc::result_out_of_range) fail(fmt::format("'{}' does not fit a double (5e-324 to 1.8e308)", text));
   if (!whole || error != std::errc() || !std::isfinite(value)) fail(fmt::format("'{}' is not a finite number", text));
   return value;
+}
+
+double CsvTable::number_or_nan(int row, int column) const {
+  std::string_view text = trim(cell(row, column));
+  if (text.starts_with('+')) text.remove_prefix(1);
+  double value = 0;
+  const auto [end, error] = std::from_chars(text.data(), text.data() + text.size(), value);
+  const bool is_gap = text.empty() || (end == text.data() + text.size() && error == std::errc() && !std::isfinite(value));
+  return is_gap ? std::numeric_limits<double>::quiet_NaN() : number(row, column);
 }
 
 std::string shortest(double value) {

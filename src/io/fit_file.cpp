@@ -209,6 +209,7 @@ constexpr const char* code = "code";
 Json model_json(const ModelFile& model) {
   Json json = {{"name", model.name}, {"text", model.text}};
   if (model.mechanics_are_code) json["mechanics"] = code;
+  if (model.robot) json["robot"] = Json::parse(to_json(*model.robot));
   return json;
 }
 
@@ -220,7 +221,11 @@ bool mechanics_are_code(const Json& model) {
 
 /// @param mechanics  null: not given
 ModelFile model_from(const Json& json, const MechanicsSource* mechanics) {
-  if (!mechanics_are_code(json)) return ModelFile::parse(json.at("text"), json.at("name"));
+  if (!mechanics_are_code(json)) {
+    if (!json.contains("robot")) return ModelFile::parse(json.at("text"), json.at("name"));
+    return ModelFile::parse(json.at("text"), json.at("name"),
+                            RobotSource([&](const std::string&) { return robot_from_json(json.at("robot").dump()); }));
+  }
   if (mechanics == nullptr) {
     throw InputError(
         fmt::format("the mechanics of its model '{}' are code, which a file cannot hold: read it where that code is, with "
@@ -267,6 +272,7 @@ Json observations_json(const Observations& group, const Prior& home, const Model
                {"estimate_noise", group.estimate_noise},
                {"states", rows_json(group.states, system.state_names())},
                {"values", rows_json(group.values, group.view.names(system))}};
+  if (group.has_noise_scale()) json["noise_scale"] = rows_json(group.noise_scale, group.view.names(system));
   if (other != nullptr) json["system"] = model_json(*other);
   return json;
 }
@@ -306,7 +312,12 @@ Observations observations_from(const Json& json, const Prior& home, std::shared_
   }
   json.at("estimate_noise").get_to(group.estimate_noise);
   // values come first: they bound what a damaged n can claim
-  group.values = rows_from(json.at("values"), group.view.names(system), std::vector<bool>(group.view.rows.size(), true), n);
+  const std::vector<bool> every(group.view.rows.size(), true);
+  group.values = rows_from(json.at("values"), group.view.names(system), every, n);
+  if (json.contains("noise_scale")) {
+    group.noise_scale = rows_from(json.at("noise_scale"), group.view.names(system), every, n);
+    group.require_noise_scale();
+  }
   std::vector<bool> reads = prior.reads();
   const std::vector<bool> of_view = group.view.reads(system);
   for (std::size_t k = 0; k < reads.size(); ++k) reads[k] = reads[k] || of_view[k];
@@ -350,7 +361,11 @@ void FitFile::write(const std::filesystem::path& path) const {
   const bool with_code = model.mechanics_are_code || std::any_of(systems.begin(), systems.end(), [](const auto& other) {
                            return other && other->mechanics_are_code;
                          });
-  json["version"] = with_code ? 3 : at_home ? 1 : 2;
+  const bool with_noise_scale =
+      std::any_of(observations.begin(), observations.end(), [](const auto& group) { return group.has_noise_scale(); });
+  const bool with_robot =
+      model.robot || std::any_of(systems.begin(), systems.end(), [](const auto& other) { return other && other->robot; });
+  json["version"] = with_robot ? 5 : with_noise_scale ? 4 : with_code ? 3 : at_home ? 1 : 2;
   json["library"] = version();
   json["model"] = model_json(model);
   json["prior"] = {{"mean", name_of(means, prior_options.mean)},

@@ -125,21 +125,73 @@ struct NoiseRule {
   double signal = 0;         // its size
   int n_data = 0;
 
+  // ‖K̃‖ ≤ Σ_i (signal/noise_i)²; a hundredth of the digits must be left
+  static constexpr double largest_norm = 0.01 / std::numeric_limits<double>::epsilon();
+
+  [[nodiscard]] double smallest() const { return signal * std::sqrt(static_cast<double>(n_data) / largest_norm); }
+
+  /// @param rows  of the log, of each value
+  void require_each(const Eigen::RowVectorXd& stddev, const std::vector<int>& rows) const {
+    if ((signal / stddev.array()).square().sum() <= largest_norm) return;
+    Index worst = 0;
+    const double least = stddev.minCoeff(&worst);
+    throw InputError(
+        fmt::format("{}: data row {}: the noise standard deviation {} of {} is too small for double precision beside a spread of "
+                    "{:.3g}; the smallest usable value is {:.2g}",
+                    source, rows[static_cast<std::size_t>(worst)] + 1, least, name, signal, smallest()));
+  }
+
   void require(double stddev, bool estimated) const {
     if (!(stddev > 0) || !std::isfinite(stddev)) {
       throw InputError(fmt::format("{}: the noise standard deviation of {} must be positive, got {}", source, name, stddev));
     }
-    // ‖K̃‖ ≤ N (signal/noise)²; a hundredth of the digits must be left
-    const double smallest = signal * std::sqrt(static_cast<double>(n_data) * std::numeric_limits<double>::epsilon() / 0.01);
-    if (!estimated && stddev < smallest) {
+    if (!estimated && stddev < smallest()) {
       throw InputError(
           fmt::format("{}: the noise standard deviation {} of {} is too small for double precision beside a spread "
                       "of {:.3g}; the smallest usable value is {:.2g}",
-                      source, stddev, name, signal, smallest));
+                      source, stddev, name, signal, smallest()));
     }
   }
 };
 
+// the accelerations whose standard deviations the log states, for each value
+std::vector<std::string> stated_accelerations(const System& system, const LogReader& reader) {
+  std::vector<std::string> stated = system.acceleration_names();
+  std::erase_if(stated, [&](const std::string& name) { return reader.stddev_column(name).empty(); });
+  return stated;
+}
+
+std::vector<std::string> stddev_columns(const std::vector<std::string>& names, const LogReader& reader) {
+  std::vector<std::string> columns;
+  for (const std::string& name : names) columns.push_back(reader.stddev_column(name));
+  return columns;
+}
+
+// σ of each value where the log states it, NaN elsewhere (d × N); empty when it states none, or --noise-std overrides them
+MatrixXd stated_noise(const std::vector<std::string>& observed, const FitProblemOptions& options, LogReader& reader,
+                      const CsvTable& log, std::vector<std::string>& notes) {
+  std::vector<std::string> stated;
+  for (const std::string& name : observed) {
+    if (!reader.stddev_column(name).empty()) stated.push_back(name);
+  }
+  if (stated.empty()) return {};
+  const std::vector<std::string> columns = stddev_columns(stated, reader);
+  if (options.noise_stddev) {
+    notes.push_back(fmt::format("{}: --noise-std {} stands for the deviations in {}", log.name(), *options.noise_stddev,
+                                fmt::join(columns, ", ")));
+    return {};
+  }
+  MatrixXd stddev =
+      MatrixXd::Constant(static_cast<Index>(observed.size()), log.n_rows(), std::numeric_limits<double>::quiet_NaN());
+  for (std::size_t k = 0; k < observed.size(); ++k) {
+    if (!reader.stddev_column(observed[k]).empty()) stddev.row(static_cast<Index>(k)) = reader.stddevs({observed[k]});
+  }
+  notes.push_back(fmt::format("{}: the noise of each value is that in {}{}", log.name(), fmt::join(columns, ", "),
+                              options.estimate_noise ? ", times a factor that is estimated" : ""));
+  return stddev;
+}
+
+// σ of each row or, where the log states it, a factor of it
 VectorXd noise_of(const ModelFile& model, const FitProblemOptions& options, const Observations& group, bool estimate) {
   const VectorXd spread = row_stddev(group.values);
   const std::vector<std::string> names = group.view.names(*model.system);
@@ -148,6 +200,10 @@ VectorXd noise_of(const ModelFile& model, const FitProblemOptions& options, cons
   for (Index k = 0; k < stddev.size(); ++k) {
     const auto row = static_cast<std::size_t>(group.view.rows[static_cast<std::size_t>(k)]);
     const std::string& name = names[static_cast<std::size_t>(k)];
+    if (group.has_noise_scale() && !group.noise_scale.row(k).hasNaN()) {
+      stddev[k] = 1;
+      continue;
+    }
     if (options.noise_stddev) {
       stddev[k] = *options.noise_stddev;
     } else if (!model.noise.stddev.empty()) {
@@ -186,13 +242,21 @@ Observations read_log(const Place& place, const Log& log, const FitProblemOption
   const System& system = place.system();
   LogReader reader(log.table, system, columns_of(place.model, options.columns));
   Observations group;
-  group.view = {View::Quantity::constrained_acceleration, acceleration_rows(system, options.observe, "--observe"), 0, -1,
-                place.setting};
+  std::vector<std::string> observe = options.observe;
+  if (observe.empty() && !options.baseline) {
+    observe = stated_accelerations(system, reader);
+    if (!observe.empty() && observe.size() < system.coordinates().size()) {
+      notes.push_back(fmt::format("{}: observes {}: the log gives the deviations of these alone; others with --observe",
+                                  log.table.name(), fmt::join(observe, ", ")));
+    }
+  }
+  group.view = {View::Quantity::constrained_acceleration, acceleration_rows(system, observe, "--observe"), 0, -1, place.setting};
   group.states = states_of(place.prior, group.view, reader);
   const std::vector<std::string> observed = group.view.names(system);
   const std::vector<std::string> every = system.acceleration_names();
   const bool complete = std::all_of(every.begin(), every.end(), [&](const std::string& name) { return reader.has(name); });
   group.values = reader.values(observed);
+  group.noise_scale = stated_noise(observed, options, reader, log.table, notes);
   const MatrixXd all_values = complete && system.nc() > 0 ? reader.values(every) : MatrixXd();
   note_reading(reader, log.table, notes);
   note_violation(system, group.states, place.parameters, log.table, notes);
@@ -212,13 +276,25 @@ Observations read_log(const Place& place, const Log& log, const FitProblemOption
   if (static_cast<int>(rows.size()) < n_rows) {
     group.states = MatrixXd(group.states(Eigen::all, rows));
     group.values = MatrixXd(group.values(Eigen::all, rows));
+    if (group.has_noise_scale()) group.noise_scale = MatrixXd(group.noise_scale(Eigen::all, rows));
     notes.push_back(fmt::format("{}: {} of {} rows taken, by seed {}", log.table.name(), rows.size(), n_rows, options.seed));
   }
   require_mechanics_at(place, group.states, rows, log.table);
 
-  const bool model_estimates = place.model.noise.estimate && !options.noise_stddev;
+  const bool model_estimates = place.model.noise.estimate && !options.noise_stddev && !group.has_noise_scale();
   group.estimate_noise = options.protocol.name != Protocol::Name::paper && (options.estimate_noise || model_estimates);
   group.noise_stddev = noise_of(place.model, options, group, group.estimate_noise);
+  if (!group.has_noise_scale()) return group;
+  const VectorXd spread = row_stddev(group.values);
+  for (Index k = 0; k < spread.size(); ++k) {
+    const std::string& name = observed[static_cast<std::size_t>(k)];
+    if (group.noise_scale.row(k).hasNaN()) {
+      group.noise_scale.row(k).setOnes();
+    } else {
+      NoiseRule{fmt::format("{}: column '{}'", log.table.name(), reader.stddev_column(name)), name, spread[k], group.n_data()}
+          .require_each(group.noise_scale.row(k), rows);
+    }
+  }
   return group;
 }
 
@@ -354,10 +430,11 @@ Discrepancy discrepancy_of(const FitProblem& problem) {
   int n_shares = 0;
   for (const Observations& group : problem.observations) {
     if (group.view.quantity != View::Quantity::constrained_acceleration) continue;
-    for (Index k = 0; k < group.noise_stddev.size(); ++k) {
+    const VectorXd usual = group.usual_noise(group.noise_stddev);
+    for (Index k = 0; k < usual.size(); ++k) {
       const int row = group.view.rows[static_cast<std::size_t>(k)];
-      noise[row] = std::max(noise[row], group.noise_stddev[k]);
-      share += group.noise_stddev[k] / scales.acceleration_stddev[row];
+      noise[row] = std::max(noise[row], usual[k]);
+      share += usual[k] / scales.acceleration_stddev[row];
       ++n_shares;
     }
   }
@@ -467,6 +544,10 @@ WholeLog read_whole_log(const ModelFile& model, LogReader& reader) {
       log.accelerations.row(row) = reader.values({name});
     } else {
       log.missing.push_back(name);
+    }
+    if (!reader.stddev_column(name).empty()) {
+      static_cast<void>(reader.stddevs({name}));
+      log.stated.push_back(static_cast<int>(row));
     }
     ++row;
   }

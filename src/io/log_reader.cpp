@@ -89,14 +89,18 @@ int LogReader::require(const std::string& name) {
   return column;
 }
 
-MatrixXd LogReader::states(const std::vector<bool>& reads) {
+MatrixXd LogReader::states(const std::vector<bool>& reads) { return read_states(reads, &CsvTable::number); }
+
+MatrixXd LogReader::states_with_gaps(const std::vector<bool>& reads) { return read_states(reads, &CsvTable::number_or_nan); }
+
+MatrixXd LogReader::read_states(const std::vector<bool>& reads, Number number) {
   const std::vector<std::string> names = system_.state_names();
   MatrixXd states =
       MatrixXd::Constant(static_cast<Index>(names.size()), table_.n_rows(), std::numeric_limits<double>::quiet_NaN());
   for (std::size_t k = 0; k < names.size(); ++k) {
     if (!reads[k]) continue;
     const int column = require(names[k]);
-    for (int row = 0; row < table_.n_rows(); ++row) states(static_cast<Index>(k), row) = table_.number(row, column);
+    for (int row = 0; row < table_.n_rows(); ++row) states(static_cast<Index>(k), row) = (table_.*number)(row, column);
   }
   return states;
 }
@@ -108,6 +112,33 @@ MatrixXd LogReader::values(const std::vector<std::string>& names) {
     for (int row = 0; row < table_.n_rows(); ++row) values(static_cast<Index>(k), row) = table_.number(row, column);
   }
   return values;
+}
+
+std::string LogReader::stddev_column(const std::string& name) const {
+  const int column = find(name);
+  if (column < 0) return "";
+  for (const std::string& candidate : {table_.header()[static_cast<std::size_t>(column)] + "_std", name + "_std"}) {
+    if (table_.find(candidate) >= 0) return candidate;
+  }
+  return "";
+}
+
+MatrixXd LogReader::stddevs(const std::vector<std::string>& names) {
+  MatrixXd stddevs(static_cast<Index>(names.size()), table_.n_rows());
+  for (std::size_t k = 0; k < names.size(); ++k) {
+    const int column = table_.find(stddev_column(names[k]));
+    used_.insert(column);
+    for (int row = 0; row < table_.n_rows(); ++row) {
+      const double stddev = table_.number(row, column);
+      if (!(stddev > 0)) {
+        throw InputError(
+            fmt::format("{}: the standard deviation of {} must be positive, got {}; leave out the row, or the column",
+                        table_.place(row, column), names[k], stddev));
+      }
+      stddevs(static_cast<Index>(k), row) = stddev;
+    }
+  }
+  return stddevs;
 }
 
 std::vector<std::string> LogReader::unused_columns() const {

@@ -13,6 +13,7 @@
 #include "io/latent_tapes.hpp"
 #include "io/model_reader.hpp"
 #include "io/toml_reader.hpp"
+#include "robots/robot_expressions.hpp"
 
 namespace gp2 {
 
@@ -41,7 +42,7 @@ std::string read_text(const std::filesystem::path& path) {
 }
 
 /// @param mechanics  null: they stand in the text
-ModelFile parse_model(std::string text, std::string name, const MechanicsSource* mechanics) {
+ModelFile parse_model(std::string text, std::string name, const MechanicsSource* mechanics, const RobotSource& robot) {
   ModelFile model;
   model.name = std::move(name);
   model.text = std::move(text);
@@ -50,7 +51,7 @@ ModelFile parse_model(std::string text, std::string name, const MechanicsSource*
   }
   try {
     const toml::table root = toml::parse(model.text, model.name);
-    read_model(root, mechanics, model);
+    read_model(root, mechanics, robot, model);
   } catch (const toml::parse_error& error) {
     throw InputError(fmt::format("{}:{}: not valid TOML: {}", model.name, error.source().begin.line, error.description()));
   } catch (const LocatedError&) {
@@ -69,24 +70,47 @@ ModelFile ModelFile::read(const std::filesystem::path& path, const MechanicsSour
   return parse(read_text(path), path.string(), mechanics);
 }
 
-ModelFile ModelFile::parse(std::string text, std::string name) { return parse_model(std::move(text), std::move(name), nullptr); }
+namespace {
+
+// a robot's file stands beside the model's
+RobotSource beside(const std::string& model_name) {
+  return
+      [folder = std::filesystem::path(model_name).parent_path()](const std::string& file) { return read_robot(folder / file); };
+}
+
+}  // namespace
+
+ModelFile ModelFile::parse(std::string text, std::string name) {
+  const RobotSource robot = beside(name);
+  return parse_model(std::move(text), std::move(name), nullptr, robot);
+}
+
+ModelFile ModelFile::parse(std::string text, std::string name, const RobotSource& robot) {
+  return parse_model(std::move(text), std::move(name), nullptr, robot);
+}
 
 ModelFile ModelFile::parse(std::string text, std::string name, const MechanicsSource& mechanics) {
-  return parse_model(std::move(text), std::move(name), &mechanics);
+  return parse_model(std::move(text), std::move(name), &mechanics, {});
 }
 
 void ModelFile::define(const std::string& symbol, Expression value) {
   if (symbols_.emplace(symbol, value).second) symbol_names_.push_back(symbol);
 }
 
-Expression ModelFile::expression(std::string_view written) const {
+Expression ModelFile::parse_symbols(std::string_view written) const {
   return parse_expression(
       written, *graph,
       [&](std::string_view symbol) -> std::optional<Expression> {
         const auto found = symbols_.find(symbol);
-        return found == symbols_.end() ? std::nullopt : std::optional(found->second);
+        if (found != symbols_.end()) return found->second;
+        return robot_expressions_ ? robot_expressions_->variable(std::string(symbol)) : std::nullopt;
       },
       symbol_names_);
+}
+
+Expression ModelFile::expression(std::string_view written) const {
+  const Expression value = parse_symbols(written);
+  return robot_expressions_ ? robot_expressions_->expand(value) : value;
 }
 
 SystemSymbols ModelFile::symbols() const { return {*graph, system->coordinates(), system->inputs(), system->parameters()}; }

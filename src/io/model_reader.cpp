@@ -12,6 +12,7 @@
 #include "io/name_order.hpp"
 #include "io/toml_reader.hpp"
 #include "prior/random.hpp"
+#include "robots/robot_expressions.hpp"
 
 namespace gp2 {
 
@@ -20,15 +21,16 @@ using Level = ConstraintRow::Level;
 /// Reads the tables of a model file one after the other; every complaint carries file, line and key.
 class ModelReader : private TomlReader {
  public:
-  ModelReader(const toml::table& root, const MechanicsSource* mechanics, ModelFile& model)
-      : TomlReader(model.name), root_(root), source_(mechanics), model_(model) {}
+  ModelReader(const toml::table& root, const MechanicsSource* mechanics, const RobotSource& robot, ModelFile& model)
+      : TomlReader(model.name), root_(root), source_(mechanics), robot_source_(robot), model_(model) {}
 
   void read() {
     only_keys(root_, "",
-              {"name", "coordinates", "inputs", "parameters", "let", "mechanics", "constraints", "latent", "noise", "truth",
-               "sampling", "columns"});
+              {"name", "robot", "coordinates", "inputs", "parameters", "let", "mechanics", "constraints", "latent", "noise",
+               "truth", "sampling", "motion", "columns"});
     definition_.graph = model_.graph = std::make_shared<ExpressionGraph>();
     definition_.name = root_.contains("name") ? text(*root_.get("name"), "name") : model_.name;
+    read_robot();
     read_coordinates();
     read_inputs();
     read_parameters();
@@ -40,12 +42,13 @@ class ModelReader : private TomlReader {
       read_mechanics();
       read_constraints();
       model_.system = std::make_shared<const SymbolicSystem>(definition_);
-      check_mass_symmetry();
+      if (mass_node_ != nullptr) check_mass_symmetry();
     }
     read_latents();
     read_noise();
     read_truth();
     read_sampling();
+    read_motion();
     read_columns();
     if (source_ == nullptr) read_potential();
   }
@@ -53,14 +56,23 @@ class ModelReader : private TomlReader {
  private:
   // an expression given as text or as a number
   Expression expression(const toml::node& node, const std::string& key) const {
+    const Expression value = unexpanded(node, key);
+    return robot() ? robot()->expand(value) : value;
+  }
+
+  // the same, the points of the robot left as they are
+  Expression unexpanded(const toml::node& node, const std::string& key) const {
     if (node.is_number()) return definition_.graph->constant(number(node, key));
     if (!node.is_string()) fail(node, key, fmt::format("expected an expression in quotes, or a number, got {}", written(node)));
     try {
-      return model_.expression(text(node, key));
+      return model_.parse_symbols(text(node, key));
     } catch (const InputError& error) {
       fail(node, key, fmt::format("\"{}\", {}", shortened(text(node, key)), error.what()));
     }
   }
+
+  // null without a robot
+  [[nodiscard]] const std::shared_ptr<RobotExpressions>& robot() const { return model_.robot_expressions_; }
 
   void declare(const std::string& name, const toml::node& node, const std::string& key) {
     static const std::set<std::string> reserved = {"pi",   "sin",  "cos", "tan", "asin", "acos", "atan", "atan2", "sinh",
@@ -72,10 +84,47 @@ class ModelReader : private TomlReader {
     if (!names_.insert(name).second) fail(node, key, fmt::format("the name '{}' is taken already; choose another", name));
   }
 
+  void read_robot() {
+    if (!root_.contains("robot")) return;
+    const toml::node& node = *root_.get("robot");
+    if (source_ != nullptr) fail(node, "robot", "the mechanics of this model are given as code: remove it");
+    try {
+      model_.robot = robot_source_(text(node, "robot"));
+    } catch (const InputError& error) {
+      fail(node, "robot", error.what());
+    }
+    if (model_.robot->joints().empty()) fail(node, "robot", "this robot has no joints: there is nothing that moves");
+  }
+
+  // the joints of the robot, unless the file has names of its own for them
+  void take_coordinates_of_robot() {
+    const toml::node& node = *root_.get("robot");
+    for (const RobotDescription::Joint* joint : model_.robot->joints()) {
+      if (!is_identifier(joint->name)) {
+        fail(node, "robot",
+             fmt::format("its joint '{}' has a name that cannot stand in an expression: give names of your own, one "
+                         "per joint in the order of the file, with coordinates = [\"q1\", …]",
+                         joint->name));
+      }
+      declare_coordinate({joint->name, false}, node, "robot");
+    }
+  }
+
+  void declare_coordinate(const Coordinate& coordinate, const toml::node& node, const std::string& key) {
+    declare(coordinate.name, node, key);
+    declare(coordinate.velocity(), node, key);
+    declare(coordinate.acceleration(), node, key);
+    definition_.coordinates.push_back(coordinate);
+  }
+
   void read_coordinates() {
-    if (!root_.contains("coordinates")) fail(1, "coordinates", R"(missing; write coordinates = ["q1", "q2"])");
-    const toml::node& node = *root_.get("coordinates");
     names_.insert("t");
+    if (!root_.contains("coordinates")) {
+      if (!model_.robot) fail(1, "coordinates", R"(missing; write coordinates = ["q1", "q2"])");
+      take_coordinates_of_robot();
+      return;
+    }
+    const toml::node& node = *root_.get("coordinates");
     for (const toml::node& entry : array(node, "coordinates")) {
       Coordinate coordinate;
       if (entry.is_table()) {
@@ -86,12 +135,16 @@ class ModelReader : private TomlReader {
       } else {
         coordinate.name = text(entry, "coordinates");
       }
-      declare(coordinate.name, entry, "coordinates");
-      declare(coordinate.velocity(), entry, "coordinates");
-      declare(coordinate.acceleration(), entry, "coordinates");
-      definition_.coordinates.push_back(coordinate);
+      declare_coordinate(coordinate, entry, "coordinates");
     }
     if (definition_.coordinates.empty()) fail(node, "coordinates", "a system needs at least one coordinate");
+    if (model_.robot && model_.robot->joints().size() != definition_.coordinates.size()) {
+      std::vector<std::string> joints;
+      for (const RobotDescription::Joint* joint : model_.robot->joints()) joints.push_back(joint->name);
+      fail(node, "coordinates",
+           fmt::format("{} names for the {} joints of the robot; they are, in this order: {}", definition_.coordinates.size(),
+                       joints.size(), fmt::join(joints, ", ")));
+    }
   }
 
   void read_inputs() {
@@ -110,10 +163,13 @@ class ModelReader : private TomlReader {
       Parameter parameter{name, 0, std::nullopt, false};
       if (node->is_table()) {
         const toml::table& entry = *node->as_table();
-        only_keys(entry, key, {"value", "bounds", "estimate"});
-        if (!entry.contains("value"))
+        only_keys(entry, key, {"value", "bounds", "estimate", "of"});
+        if (entry.contains("of")) parameter.value = read_robot_number(*entry.get("of"), key + ".of", name);
+        if (entry.contains("value")) {
+          parameter.value = number(*entry.get("value"), key + ".value");
+        } else if (!entry.contains("of")) {
           fail(*node, key, "missing value; write { value = 1.0, bounds = [0.5, 2.0], estimate = true }");
-        parameter.value = number(*entry.get("value"), key + ".value");
+        }
         if (entry.contains("bounds")) parameter.bounds = range(*entry.get("bounds"), key + ".bounds");
         if (entry.contains("estimate")) parameter.estimate = boolean(*entry.get("estimate"), key + ".estimate");
         if (parameter.bounds && (parameter.value < parameter.bounds->first || parameter.value > parameter.bounds->second)) {
@@ -128,8 +184,35 @@ class ModelReader : private TomlReader {
     }
   }
 
+  // mass("link7") or com('link7').x: a number of the robot that is this parameter from now on; gives the robot's own value
+  double read_robot_number(const toml::node& node, const std::string& key, const std::string& parameter) {
+    std::string of = text(node, key);
+    std::replace(of.begin(), of.end(), '\'', '"');
+    std::erase(of, ' ');
+    if (!model_.robot) fail(node, key, "only a model with a robot = \"FILE\" has such numbers; give a value instead");
+    const auto [other, is_new] = robot_parameters_.emplace(of, parameter);
+    if (!is_new) fail(node, key, fmt::format("{} is the parameter '{}' already", of, other->second));
+    for (const auto& [name, value] : robot_numbers(*model_.robot)) {
+      if (name == of) return value;
+    }
+    std::vector<std::string> bodies, joints;
+    for (const RobotDescription::Body& body : model_.robot->bodies) bodies.push_back(body.name);
+    for (const RobotDescription::Joint* joint : model_.robot->joints()) joints.push_back(joint->name);
+    fail(node, key,
+         fmt::format(
+             "the robot has no number '{}'; there are mass(\"BODY\"), com(\"BODY\").x, inertia(\"BODY\").xx with the bodies {}, "
+             "and damping(\"JOINT\"), stiffness, friction, armature with the joints {}",
+             shortened(of), fmt::join(bodies, ", "), fmt::join(joints, ", ")));
+  }
+
   void declare_symbols() {
     symbols_.emplace(*definition_.graph, definition_.coordinates, definition_.inputs, definition_.parameters);
+    if (model_.robot) {
+      std::map<std::string, Expression> numbers;
+      for (const auto& [of, parameter] : robot_parameters_) numbers.emplace(of, definition_.graph->variable(parameter));
+      model_.robot_expressions_ =
+          std::make_shared<RobotExpressions>(*model_.robot, *definition_.graph, *symbols_, std::move(numbers));
+    }
     for (Expression symbol : symbols_->state_and_parameters()) model_.define(symbol.variable_name(), symbol);
     for (Expression symbol : symbols_->ddq) model_.define(symbol.variable_name(), symbol);
   }
@@ -158,7 +241,7 @@ class ModelReader : private TomlReader {
     }
     for (const std::size_t k : order.positions) {
       const auto& [name, node] = entries[k];
-      model_.define(name, expression(*node, fmt::format("let.{}", name)));
+      model_.define(name, unexpanded(*node, fmt::format("let.{}", name)));
     }
   }
 
@@ -216,12 +299,24 @@ class ModelReader : private TomlReader {
   }
 
   void read_mechanics() {
-    const std::size_t nq = definition_.coordinates.size();
+    if (!root_.contains("mechanics") && model_.robot) {
+      take_mechanics_of_robot(nullptr);
+      return;
+    }
     if (!root_.contains("mechanics")) fail(1, "mechanics", "missing; a model needs [mechanics] with mass = [[…], …]");
     const toml::table& mechanics = table(*root_.get("mechanics"), "mechanics");
+    if (model_.robot) {
+      take_mechanics_of_robot(&mechanics);
+      return;
+    }
     only_keys(mechanics, "mechanics", {"mass", "force", "potential"});
-    if (!mechanics.contains("mass")) fail(mechanics, "mechanics", "missing mass = [[…], …]");
+    read_mass(mechanics);
+    definition_.force = read_forces(mechanics, "mechanics");
+  }
 
+  void read_mass(const toml::table& mechanics) {
+    const std::size_t nq = definition_.coordinates.size();
+    if (!mechanics.contains("mass")) fail(mechanics, "mechanics", "missing mass = [[…], …]");
     mass_node_ = mechanics.get("mass");
     const toml::array& rows = array(*mass_node_, "mechanics.mass");
     if (rows.size() != nq) {
@@ -242,30 +337,82 @@ class ModelReader : private TomlReader {
         definition_.mass.back().push_back(entry);
       }
     }
+  }
 
-    if (mechanics.contains("force")) {
-      const toml::node& node = *mechanics.get("force");
-      const toml::array& force = array(node, "mechanics.force");
+  // M and F are the robot's; inputs act on its joints one by one, unless [mechanics] says how they act
+  void take_mechanics_of_robot(const toml::table* mechanics) {
+    const std::size_t nq = definition_.coordinates.size();
+    definition_.mass = robot()->mass();
+    definition_.force = robot()->force();
+    std::vector<Expression> applied(nq, definition_.graph->constant(0));
+    if (mechanics != nullptr) {
+      if (mechanics->contains("mass")) {
+        fail(*mechanics->get("mass"), "mechanics.mass", "the mass matrix is the robot's: remove it, or remove robot = …");
+      }
+      only_keys(*mechanics, "mechanics", {"force", "force_on", "potential"});
+      applied = read_forces(*mechanics, "mechanics");
+    }
+    const bool inputs_are_written = mechanics != nullptr && mechanics->contains("force");
+    const std::vector<Expression>& u = symbols_->u;
+    if (!inputs_are_written && !u.empty()) {
+      if (u.size() != nq) {
+        fail(*root_.get("inputs"), "inputs",
+             fmt::format("{} inputs for {} joints: give one per joint, or say in [mechanics] force = [ … ] how they act",
+                         u.size(), nq));
+      }
+      for (std::size_t j = 0; j < nq; ++j) applied[j] = applied[j] + u[j];
+    }
+    for (std::size_t j = 0; j < nq; ++j) definition_.force[j] = applied[j] + definition_.force[j];
+  }
+
+  // force = [ … ], one per coordinate, and with a robot force_on = { 'site("tip").x' = … }: a force along a quantity r acts on
+  // the coordinates as (∂r/∂q)ᵀ force
+  std::vector<Expression> read_forces(const toml::table& entries, const std::string& section) const {
+    const std::size_t nq = definition_.coordinates.size();
+    std::vector<Expression> forces(nq, definition_.graph->constant(0));
+    if (entries.contains("force")) {
+      const toml::node& node = *entries.get("force");
+      const toml::array& force = array(node, section + ".force");
       if (force.size() != nq) {
-        fail(node, "mechanics.force", fmt::format("expected {} entries, one per coordinate, got {}", nq, force.size()));
+        fail(node, section + ".force", fmt::format("expected {} entries, one per coordinate, got {}", nq, force.size()));
       }
       for (std::size_t j = 0; j < nq; ++j) {
-        const std::string key = fmt::format("mechanics.force entry {}", j + 1);
-        const Expression entry = expression(*force.get(j), key);
-        allow_only(*force.get(j), key, entry, symbols_->ddq, "a force may not depend on accelerations");
-        definition_.force.push_back(entry);
+        const std::string key = fmt::format("{}.force entry {}", section, j + 1);
+        forces[j] = expression(*force.get(j), key);
+        allow_only(*force.get(j), key, forces[j], symbols_->ddq, "a force may not depend on accelerations");
       }
-    } else {
-      definition_.force.assign(nq, definition_.graph->constant(0));
     }
+    if (!entries.contains("force_on")) return forces;
+    const toml::node& node = *entries.get("force_on");
+    if (!robot()) fail(node, section + ".force_on", "only a model with a robot = \"FILE\" has points for a force to act on");
+    for (const auto& [name, entry] : entries_of(table(node, section + ".force_on"))) {
+      const std::string key = fmt::format("{}.force_on.{}", section, name);
+      const Expression force = expression(*entry, key);
+      allow_only(*entry, key, force, symbols_->ddq, "a force may not depend on accelerations");
+      for (std::size_t j = 0; j < nq; ++j) forces[j] = forces[j] + robot_quantity(*entry, key, name).jacobian[j] * force;
+    }
+    return forces;
+  }
+
+  const RobotQuantity& robot_quantity(const toml::node& node, const std::string& key, const std::string& name) const {
+    try {
+      const Expression variable = model_.parse_symbols(name);
+      if (variable.operation() == Operation::variable) return robot()->quantity(variable.variable_name());
+    } catch (const InputError& error) {
+      fail(node, key, error.what());
+    }
+    fail(node, key, "expected a point of the robot, such as 'site(\"tip\").x'");
   }
 
   // last, so that M, A, b and F are built the same way with it and without
   void read_potential() {
+    if (robot()) model_.potential = robot()->potential();
+    if (!root_.contains("mechanics")) return;
     const toml::table& mechanics = *root_.get("mechanics")->as_table();
     if (!mechanics.contains("potential")) return;
     const toml::node& node = *mechanics.get("potential");
-    model_.potential = expression(node, "mechanics.potential");
+    const Expression potential = expression(node, "mechanics.potential");
+    model_.potential = model_.potential ? *model_.potential + potential : potential;
     for (const auto* group : {&symbols_->dq, &symbols_->ddq, &symbols_->u}) {
       allow_only(node, "mechanics.potential", *model_.potential, *group,
                  "the potential may depend on coordinates, t and parameters only");
@@ -308,7 +455,16 @@ class ModelReader : private TomlReader {
     }
   }
 
+  ConstraintRow derive(Level level, Expression c, std::string text) const {
+    if (!robot()) return derive_constraint(level, c, std::move(text), *symbols_);
+    return robot()->derive_constraint(level, c, std::move(text), definition_.coordinates, definition_.inputs,
+                                      definition_.parameters);
+  }
+
   void read_constraints() {
+    if (robot()) {
+      for (auto& [c, name] : robot()->loops()) definition_.constraints.push_back(derive(Level::position, c, std::move(name)));
+    }
     if (!root_.contains("constraints")) return;
     const toml::table& constraints = table(*root_.get("constraints"), "constraints");
     only_keys(constraints, "constraints", {"position", "velocity", "acceleration"});
@@ -320,10 +476,9 @@ class ModelReader : private TomlReader {
       for (std::size_t k = 0; k < rows.size(); ++k) {
         const toml::node& node = *rows.get(k);
         const std::string key = fmt::format("constraints.{} entry {}", level_name, k + 1);
-        const Expression c = expression(node, key);
+        const Expression c = unexpanded(node, key);
         try {
-          definition_.constraints.push_back(
-              derive_constraint(level, c, node.is_string() ? text(node, key) : to_string(c), *symbols_));
+          definition_.constraints.push_back(derive(level, c, node.is_string() ? text(node, key) : to_string(c)));
         } catch (const InputError& error) {
           fail(node, key, error.what());
         }
@@ -484,16 +639,20 @@ class ModelReader : private TomlReader {
   void read_truth() {
     if (!root_.contains("truth")) return;
     const toml::table& truth = table(*root_.get("truth"), "truth");
-    only_keys(truth, "truth", {"acceleration"});
-    if (!truth.contains("acceleration")) fail(truth, "truth", "missing acceleration = [ … ]");
-    const toml::array& rows = array(*truth.get("acceleration"), "truth.acceleration");
+    only_keys(truth, "truth", {"acceleration", "force", "force_on"});
+    if (truth.empty()) fail(truth, "truth", "missing acceleration = [ … ] or force = [ … ]");
     const std::size_t nq = definition_.coordinates.size();
+    model_.truth.assign(nq, definition_.graph->constant(0));
+    model_.truth_force = read_forces(truth, "truth");
+    if (!truth.contains("acceleration")) return;
+    const toml::array& rows = array(*truth.get("acceleration"), "truth.acceleration");
     if (rows.size() != nq) {
       fail(rows, "truth.acceleration", fmt::format("expected {} entries, one per coordinate, got {}", nq, rows.size()));
     }
-    for (const toml::node& row : rows) {
-      model_.truth.push_back(expression(row, "truth.acceleration"));
-      allow_only(row, "truth.acceleration", model_.truth.back(), symbols_->ddq, "the true acceleration may not depend on itself");
+    for (std::size_t j = 0; j < nq; ++j) {
+      const toml::node& row = *rows.get(j);
+      model_.truth[j] = expression(row, "truth.acceleration");
+      allow_only(row, "truth.acceleration", model_.truth[j], symbols_->ddq, "the true acceleration may not depend on itself");
     }
   }
 
@@ -515,7 +674,7 @@ class ModelReader : private TomlReader {
     for (const auto& [name, node] : entries_of(sampling)) {
       const std::string key = fmt::format("sampling.{}", name);
       if (name == "start") {
-        read_newton_start(table(*node, key));
+        model_.newton_start = read_start(table(*node, key), key);
         continue;
       }
       ModelFile::SamplingRule rule{name, std::nullopt, {}, line_of(*node)};
@@ -532,13 +691,76 @@ class ModelReader : private TomlReader {
     sort_rules(std::move(rules));
   }
 
-  void read_newton_start(const toml::table& start) {
+  // where coordinates and velocities begin
+  std::map<std::string, double> read_start(const toml::table& start, const std::string& section) const {
+    std::map<std::string, double> values;
     for (const auto& [name, node] : entries_of(start)) {
-      const std::string key = fmt::format("sampling.start.{}", name);
+      const std::string key = fmt::format("{}.{}", section, name);
       const bool known = std::any_of(definition_.coordinates.begin(), definition_.coordinates.end(),
                                      [&name = name](const Coordinate& c) { return c.name == name || c.velocity() == name; });
       if (!known) fail(*node, key, fmt::format("'{}' is neither a coordinate nor a velocity of this model", name));
-      model_.newton_start[name] = number(*node, key);
+      values[name] = number(*node, key);
+    }
+    return values;
+  }
+
+  void read_motion() {
+    if (!root_.contains("motion")) return;
+    const toml::table& entries = table(*root_.get("motion"), "motion");
+    only_keys(entries, "motion",
+              {"rate", "segment", "profile", "natural_frequency", "damping_ratio", "targets", "hold", "start"});
+    if (root_.contains("sampling")) {
+      fail(entries, "motion", "states are drawn by [sampling] or met on the way by [motion]: remove one of the two");
+    }
+    if (source_ != nullptr) fail(entries, "motion", "only a model with its mechanics as text can be driven: remove it");
+    if (definition_.inputs.empty())
+      fail(entries, "motion", "a model without inputs cannot be driven; give inputs, or use [sampling]");
+    ModelFile::Motion motion;
+    const auto positive = [&](const char* name, double otherwise) {
+      const std::string key = fmt::format("motion.{}", name);
+      if (!entries.contains(name) && otherwise > 0) return otherwise;
+      if (!entries.contains(name)) fail(entries, "motion", fmt::format("missing {} = …", name));
+      const double value = number(*entries.get(name), key);
+      if (!(value > 0)) fail(*entries.get(name), key, fmt::format("must be positive, got {}", value));
+      return value;
+    };
+    motion.rate = positive("rate", 0);
+    motion.natural_frequency = positive("natural_frequency", 10);
+    motion.damping_ratio = positive("damping_ratio", 1);
+    if (!entries.contains("segment"))
+      fail(entries, "motion", "missing segment = [shortest, longest], how long a line takes in s");
+    motion.segment = range(*entries.get("segment"), "motion.segment");
+    if (!(motion.segment.first > 0)) fail(*entries.get("segment"), "motion.segment", "a line takes a positive time");
+    if (entries.contains("profile")) {
+      const std::string profile = text(*entries.get("profile"), "motion.profile");
+      if (profile != "smooth" && profile != "trapezoid") {
+        fail(*entries.get("profile"), "motion.profile",
+             fmt::format(R"(expected "smooth" or "trapezoid", got "{}")", shortened(profile)));
+      }
+      if (profile == "trapezoid") motion.profile = ModelFile::Motion::Profile::trapezoid;
+    }
+    if (!entries.contains("targets")) fail(entries, "motion", "missing targets = { q1 = [lower, upper], … }");
+    for (const auto& [name, node] : entries_of(table(*entries.get("targets"), "motion.targets"))) {
+      const std::string key = fmt::format("motion.targets.{}", name);
+      motion.targets.push_back(read_target(*node, key, name));
+      motion.targets.back().range = range(*node, key);
+    }
+    if (motion.targets.empty()) fail(*entries.get("targets"), "motion.targets", "a motion needs at least one target");
+    if (entries.contains("hold")) {
+      for (const toml::node& node : array(*entries.get("hold"), "motion.hold")) {
+        motion.targets.push_back(read_target(node, "motion.hold", text(node, "motion.hold")));
+      }
+    }
+    if (entries.contains("start")) motion.start = read_start(table(*entries.get("start"), "motion.start"), "motion.start");
+    model_.motion = std::move(motion);
+  }
+
+  // a function y(q) of the coordinates, twice differentiated along the motion as a constraint is
+  ModelFile::Motion::Target read_target(const toml::node& node, const std::string& key, const std::string& written_target) const {
+    try {
+      return {written_target, derive(Level::position, model_.parse_symbols(written_target), written_target), std::nullopt};
+    } catch (const InputError& error) {
+      fail(node, key, fmt::format("\"{}\" must be a function of the coordinates: {}", shortened(written_target), error.what()));
     }
   }
 
@@ -579,6 +801,8 @@ class ModelReader : private TomlReader {
 
   const toml::table& root_;
   const MechanicsSource* source_;  // null: the mechanics are text
+  const RobotSource& robot_source_;
+  std::map<std::string, std::string> robot_parameters_;  // number of the robot -> parameter
   ModelFile& model_;
   SymbolicSystem::Definition definition_;
   std::set<std::string> names_;
@@ -586,8 +810,8 @@ class ModelReader : private TomlReader {
   const toml::node* mass_node_ = nullptr;
 };
 
-void read_model(const toml::table& root, const MechanicsSource* mechanics, ModelFile& model) {
-  ModelReader(root, mechanics, model).read();
+void read_model(const toml::table& root, const MechanicsSource* mechanics, const RobotSource& robot, ModelFile& model) {
+  ModelReader(root, mechanics, robot, model).read();
 }
 
 }  // namespace gp2

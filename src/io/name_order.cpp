@@ -17,9 +17,13 @@ std::set<std::string> words_of(std::string_view text) {
   };
   std::set<std::string> words;
   for (std::size_t at = 0; at < text.size();) {
+    // site("tip").z speaks of no symbol 'tip' or 'z'
+    if (text[at] == '"' || text[at] == '\'') at = std::min(text.find(text[at], at + 1), text.size());
+    const bool is_component = text.substr(at, 2) == ").";
+    if (is_component) at += 2;
     std::size_t end = at;
     while (end < text.size() && in_word(text[end])) ++end;
-    if (const std::string_view word = text.substr(at, end - at); is_identifier(word)) words.emplace(word);
+    if (const std::string_view word = text.substr(at, end - at); is_identifier(word) && !is_component) words.emplace(word);
     at = std::max(end, at + 1);
   }
   return words;

@@ -193,15 +193,18 @@ void check_mechanics(const System& system, const MechanicsBatch& mechanics, std:
     findings.push_back(
         {Level::warning, "constraints: they leave no freedom (rank = number of coordinates): nothing is left to learn"});
   }
-  if (zero_rows > 0) {
-    findings.push_back(
-        {Level::warning, fmt::format("constraints: a row of A vanishes {} times; it is dropped there", zero_rows)});
-  }
 
   // a row that nearly vanishes somewhere decides the direction of its force from rounding
   for (int row = 0; row < system.nc(); ++row) {
     std::vector<double> sizes;
     for (int i = 0; i < mechanics.values.n_states(); ++i) sizes.push_back(mechanics.values.A(i).row(row).norm());
+    if (std::all_of(sizes.begin(), sizes.end(), [](double size) { return size == 0; })) {
+      // a loop in a plane, closed in space
+      zero_rows -= mechanics.values.n_states();
+      findings.push_back({Level::good, fmt::format("constraint '{}': nothing moves along it, its row of A is zero at every state",
+                                                   system.constraint_labels()[static_cast<std::size_t>(row)])});
+      continue;
+    }
     std::vector<double> sorted = sizes;
     std::nth_element(sorted.begin(), sorted.begin() + static_cast<std::ptrdiff_t>(sorted.size() / 2), sorted.end());
     const double usual = sorted[sorted.size() / 2];
@@ -213,6 +216,10 @@ void check_mechanics(const System& system, const MechanicsBatch& mechanics, std:
                                        system.constraint_labels()[static_cast<std::size_t>(row)], *smallest / usual,
                                        smallest - sizes.begin() + 1)});
     }
+  }
+  if (zero_rows > 0) {
+    findings.push_back(
+        {Level::warning, fmt::format("constraints: a row of A vanishes {} times; it is dropped there", zero_rows)});
   }
 }
 
@@ -330,7 +337,7 @@ std::vector<Finding> check_system(const System& system, const Ref<const MatrixXd
 }
 
 std::vector<Finding> check_data(const System& system, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters,
-                                const Ref<const MatrixXd>& accelerations) {
+                                const Ref<const MatrixXd>& accelerations, const std::vector<int>& stated) {
   std::vector<Finding> findings;
   if (const auto violation = largest_violation(system, states, parameters)) {
     findings.push_back({violation->relative > constraint_violation_tolerance ? Level::warning : Level::good,
@@ -348,9 +355,18 @@ std::vector<Finding> check_data(const System& system, const Ref<const MatrixXd>&
         {Level::good, fmt::format("measured ddq on A ddq = b: rms residual {:.3g} for '{}' (noise, if the model is right)",
                                   rms[k], system.constraint_labels()[static_cast<std::size_t>(k)])});
   }
-  if (const auto rows = dependent_columns(system, states, parameters, accelerations)) {
+  const std::vector<std::string> every = system.acceleration_names();
+  const auto rows = dependent_columns(system, states, parameters, accelerations);
+  if (rows && !stated.empty() && stated.size() <= rows->size()) {
     std::vector<std::string> names;
-    for (int row : *rows) names.push_back(system.coordinates()[static_cast<std::size_t>(row)].acceleration());
+    for (int row : stated) names.push_back(every[static_cast<std::size_t>(row)]);
+    findings.push_back(
+        {Level::good, fmt::format("dependent columns: the {} accelerations obey A ddq = b to rounding; a fit observes "
+                                  "{}, whose deviations the log gives",
+                                  system.nq(), fmt::join(names, ", "))});
+  } else if (rows) {
+    std::vector<std::string> names;
+    for (int row : *rows) names.push_back(every[static_cast<std::size_t>(row)]);
     findings.push_back(
         {Level::warning, fmt::format("dependent columns: the {} accelerations obey A ddq = b to rounding, so only {} of them are "
                                      "independent measurements: fit with --observe {}",

@@ -1,5 +1,6 @@
 #include <algorithm>
 #include <cmath>
+#include <vector>
 
 #include <fmt/format.h>
 #include <Eigen/QR>
@@ -198,13 +199,20 @@ MatrixXd UdwadiaKalaba::Lambda() const {
 MatrixXd UdwadiaKalaba::multipliers_of_force() const {
   // Lᵀ Aᵀλ = ΛA M⁻¹Aᵀ λ solves Aᵀλ = f
   MatrixXd solution = row_scale_.asDiagonal() * L_unit_.transpose();
-  const Eigen::Index nc = row_scale_.size();
-  if (rank_ == nc) return solution;
+  // rows that vanish have multipliers 0 and no part in what follows
+  std::vector<Eigen::Index> rows;
+  for (Eigen::Index row = 0; row < row_scale_.size(); ++row) {
+    if (row_scale_[row] > 0) rows.push_back(row);
+  }
+  const Eigen::Index n_redundant = static_cast<Eigen::Index>(rows.size()) - rank_;
+  if (n_redundant == 0) return solution;
   // redundant rows: take away what lies in the null space of Aᵀ. Of the unit rows its basis is clear; D brings it to the rows as
   // written
-  const Eigen::JacobiSVD<MatrixXd> svd(A_unit_.transpose(), Eigen::ComputeFullV);
-  const MatrixXd null_space = row_scale_.asDiagonal() * svd.matrixV().rightCols(nc - rank_);
-  return solution - null_space * null_space.completeOrthogonalDecomposition().solve(solution);
+  const Eigen::JacobiSVD<MatrixXd> svd(A_unit_(rows, Eigen::all).transpose(), Eigen::ComputeFullV);
+  const MatrixXd null_space = row_scale_(rows).asDiagonal() * svd.matrixV().rightCols(n_redundant);
+  const MatrixXd of_rows = solution(rows, Eigen::all);
+  solution(rows, Eigen::all) -= null_space * null_space.completeOrthogonalDecomposition().solve(of_rows);
+  return solution;
 }
 
 MatrixXd UdwadiaKalaba::differentiate_Lambda(const Ref<const MatrixXd>& dM, const Ref<const MatrixXd>& dA) const {

@@ -15,6 +15,7 @@
 #include "gp2/error.hpp"
 #include "gp2/mechanics.hpp"
 #include "prior/random.hpp"
+#include "simulation/controlled_motion.hpp"
 
 namespace gp2 {
 
@@ -284,7 +285,9 @@ class Sampler {
   // everything that the true motion and the constraints read must be known
   void check_known() const {
     const System& system = *model_.system;
-    const Tape truth(model_.truth, symbols_.state_and_parameters());
+    std::vector<Expression> added = model_.truth;
+    added.insert(added.end(), model_.truth_force.begin(), model_.truth_force.end());
+    const Tape truth(added, symbols_.state_and_parameters());
     const std::vector<bool> mechanics = system.reads(SystemPart::mechanics);
     const std::vector<bool> force = system.reads(SystemPart::force);
     const std::vector<bool> residuals = system.reads(SystemPart::residuals);
@@ -346,16 +349,18 @@ void require_truth(const ModelFile& model) {
 
 ModelMotion::ModelMotion(const ModelFile& model) : system_(model.system), parameters_(model.system->parameter_values()) {
   truth_ = Tape(model.truth, model.symbols().state_and_parameters());
+  truth_force_ = Tape(model.truth_force, model.symbols().state_and_parameters());
 }
 
 MatrixXd ModelMotion::acceleration(const Eigen::Ref<const MatrixXd>& states) const {
   const MechanicsBatch mechanics = require_mechanics(*system_, states, parameters_);
-  MatrixXd truth = MatrixXd::Zero(system_->nq(), states.cols());
+  MatrixXd truth = MatrixXd::Zero(system_->nq(), states.cols()), truth_force = truth;
   if (truth_.n_outputs() > 0) truth_.evaluate(states, parameters_, truth);
+  if (truth_force_.n_outputs() > 0) truth_force_.evaluate(states, parameters_, truth_force);
   MatrixXd accelerations(system_->nq(), states.cols());
   for (int i = 0; i < static_cast<int>(states.cols()); ++i) {
     const UdwadiaKalaba& projection = mechanics.projections[static_cast<std::size_t>(i)];
-    accelerations.col(i) = projection.constrain(projection.solve_mass(mechanics.values.F(i)) + truth.col(i));
+    accelerations.col(i) = projection.constrain(projection.solve_mass(mechanics.values.F(i) + truth_force.col(i)) + truth.col(i));
   }
   return accelerations;
 }
@@ -424,12 +429,32 @@ MatrixXd grid_states(const ModelFile& model, const Sampler& sampler, const std::
   return states;
 }
 
+GeneratedData draw_states(const ModelFile& model, const GenerateOptions& options, RandomStream& random) {
+  const Sampler sampler(model);
+  GeneratedData data;
+  data.known = sampler.known();
+  if (!options.grid.empty()) {
+    data.states = grid_states(model, sampler, options.grid);
+    return data;
+  }
+  data.states.resize(model.system->layout().size(), options.n);
+  const auto fraction = [&](std::size_t) { return random.uniform(); };
+  for (int i = 0; i < options.n; ++i) data.states.col(i) = sampler.draw(fraction, i);
+  return data;
+}
+
 }  // namespace
 
 GeneratedData generate(const ModelFile& model, const GenerateOptions& options) {
   const System& system = *model.system;
-  if (model.sampling.empty()) {
-    throw InputError(fmt::format("{}: missing [sampling]: where states are drawn from, say q1 = [-1, 1]", model.name));
+  if (model.sampling.empty() && !model.motion) {
+    throw InputError(
+        fmt::format("{}: missing [sampling]: where states are drawn from, say q1 = [-1, 1]; or [motion]: how the "
+                    "system is driven",
+                    model.name));
+  }
+  if (model.motion && !options.grid.empty()) {
+    throw InputError(fmt::format("{}: a grid is of the ranges of [sampling], but this model has [motion]", model.name));
   }
   require_truth(model);
   if (options.n < 1) throw InputError(fmt::format("generate: n must be at least 1, got {}", options.n));
@@ -438,17 +463,8 @@ GeneratedData generate(const ModelFile& model, const GenerateOptions& options) {
     throw InputError(fmt::format("generate: noise_stddev must hold {} finite numbers ≥ 0, one per coordinate", system.nq()));
   }
 
-  const Sampler sampler(model);
   RandomStream random(options.seed);
-  GeneratedData data;
-  data.known = sampler.known();
-  if (options.grid.empty()) {
-    data.states.resize(system.layout().size(), options.n);
-    const auto fraction = [&](std::size_t) { return random.uniform(); };
-    for (int i = 0; i < options.n; ++i) data.states.col(i) = sampler.draw(fraction, i);
-  } else {
-    data.states = grid_states(model, sampler, options.grid);
-  }
+  GeneratedData data = model.motion ? generate_motion(model, options.n, random) : draw_states(model, options, random);
   data.accelerations = true_acceleration(model, data.states);
   // noise comes last, so that states are the same for any noise
   for (Index i = 0; i < data.accelerations.cols(); ++i) {

@@ -374,4 +374,21 @@ bool ExpressionGraph::depends_on(Expression e, Expression x) const {
   return std::binary_search(ids.begin(), ids.end(), x.id_);
 }
 
+ExpressionSize ExpressionGraph::size_of(Expression e) const {
+  ExpressionSize size;
+  std::unordered_map<std::uint32_t, double> written;
+  for (const std::uint32_t id : implementation_->reachable(std::array{e.id_})) {
+    const Node& node = implementation_->nodes[id];
+    double sum = 1;
+    if (!is_leaf(node.operation)) {
+      ++size.operations;
+      sum += written.at(node.a);
+    }
+    if (is_binary(node.operation)) sum += written.at(node.b);
+    written.emplace(id, sum);
+  }
+  size.written = written.at(e.id_);
+  return size;
+}
+
 }  // namespace gp2

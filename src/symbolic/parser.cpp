@@ -73,7 +73,8 @@ std::string joined(const Names& names, std::string_view separator) {
 ///     product = factor { ("*" | "/") factor }
 ///     factor  = ("-" | "+") factor | power
 ///     power   = atom [ "^" factor ]
-///     atom    = number | symbol | function "(" sum { "," sum } ")" | "(" sum ")"
+///     atom    = number | symbol | function "(" sum { "," sum } ")" | quantity | "(" sum ")"
+///     quantity = symbol "(" name in quotes { "," number } ")" "." symbol
 class Parser {
  public:
   Parser(std::string_view text, ExpressionGraph& graph, const std::function<std::optional<Expression>(std::string_view)>& resolve,
@@ -195,7 +196,11 @@ class Parser {
     while (position_ < text_.size() && (is_letter(text_[position_]) || is_digit(text_[position_]))) ++position_;
     const std::string_view name = text_.substr(start, position_ - start);
     skip_space();
-    if (peek() == '(') return call(name, start);
+    if (peek() == '(') {
+      const std::size_t inside = text_.find_first_not_of(" \t\n\r", position_ + 1);
+      if (inside != std::string_view::npos && (text_[inside] == '"' || text_[inside] == '\'')) return quantity(name, start);
+      return call(name, start);
+    }
 
     if (name == "pi") return graph_.constant(std::numbers::pi);
     if (const auto resolved = resolve_(name)) return *resolved;
@@ -203,6 +208,41 @@ class Parser {
     std::string mend = suggestion(name, known_names_);
     if (mend.empty()) mend = "; known here: " + (known_names_.empty() ? "none" : joined(known_names_, ", "));
     fail(start, fmt::format("unknown symbol '{}'{}", shortened(name), mend));
+  }
+
+  /// A symbol that is no single word, such as site("tip").z or point("link7", 0, 0, 0.1).x, resolved by its text with double
+  /// quotes and one space after each comma.
+  Expression quantity(std::string_view kind, std::size_t start) {
+    const std::size_t open = position_;
+    take();
+    const char quote = text_[position_];
+    const std::size_t end = text_.find(quote, position_ + 1);
+    if (end == std::string_view::npos) fail(position_, "this name in quotes does not end");
+    std::string symbol = fmt::format("{}(\"{}\"", kind, text_.substr(position_ + 1, end - position_ - 1));
+    position_ = end + 1;
+    skip_space();
+    while (peek() == ',') {
+      take();
+      const std::size_t number_start = position_;
+      const Expression value = factor();
+      if (!value.is_constant()) fail(number_start, fmt::format("what follows the name in {}(...) must be numbers", kind));
+      symbol += fmt::format(", {}", value.constant_value());
+    }
+    close(open);
+    if (peek() != '.') fail(position_, fmt::format("found {} where a component must stand, as in {}).x", found(), symbol));
+    ++position_;
+    const std::size_t component = position_;
+    while (position_ < text_.size() && (is_letter(text_[position_]) || is_digit(text_[position_]))) ++position_;
+    symbol += fmt::format(").{}", text_.substr(component, position_ - component));
+    skip_space();
+    std::optional<Expression> resolved;
+    try {
+      resolved = resolve_(symbol);
+    } catch (const InputError& error) {
+      fail(start, error.what());
+    }
+    if (!resolved) fail(start, fmt::format("unknown symbol '{}'; only a model with a robot has points", shortened(symbol)));
+    return *resolved;
   }
 
   Expression call(std::string_view name, std::size_t start) {

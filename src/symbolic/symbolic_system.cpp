@@ -147,6 +147,7 @@ std::vector<std::string> labels_of(const SymbolicSystem::Definition& definition)
 
 // The derivatives are taken in a graph of their own: that of the definition may be growing elsewhere.
 struct SymbolicSystem::StateTape {
+  bool is_too_large = false;  // for a graph, with the derivatives
   std::unique_ptr<ExpressionGraph> graph = std::make_unique<ExpressionGraph>();
   std::vector<Expression> outputs, inputs;  // until the derivatives are taken
   std::vector<StateDerivatives::Entry> derivatives;
@@ -165,10 +166,7 @@ SymbolicSystem::SymbolicSystem(Definition definition)
   mechanics_ = Tape(std::span(outputs).first(outputs.size() - definition_.force.size()), tape_inputs);
   force_ = Tape(definition_.force, tape_inputs);
   for (Expression parameter : symbols.parameters) {
-    std::vector<Expression> derivatives;
-    derivatives.reserve(outputs.size());
-    for (Expression output : outputs) derivatives.push_back(graph.differentiate(output, parameter));
-    derivatives_.emplace_back(derivatives, tape_inputs);
+    derivatives_.emplace_back(graph.differentiate(outputs, parameter), tape_inputs);
   }
 
   std::vector<Expression> residuals;
@@ -233,12 +231,16 @@ class SymbolicSystem::Evaluator final : public StateEvaluator {
 const SymbolicSystem::StateTape& SymbolicSystem::state_tape() const {
   std::call_once(state_tape_is_filled_, [this] {
     StateTape& out = *state_tape_;
-    const internal::DerivativeExpressions derivatives =
-        internal::state_derivatives(out.outputs, std::span(out.inputs).first(static_cast<std::size_t>(layout().size())));
-    std::vector<Expression> all = out.outputs;
-    all.insert(all.end(), derivatives.expressions.begin(), derivatives.expressions.end());
-    out.tape = Tape(all, out.inputs);
-    out.derivatives = derivatives.entries;
+    try {
+      const internal::DerivativeExpressions derivatives =
+          internal::state_derivatives(out.outputs, std::span(out.inputs).first(static_cast<std::size_t>(layout().size())));
+      std::vector<Expression> all = out.outputs;
+      all.insert(all.end(), derivatives.expressions.begin(), derivatives.expressions.end());
+      out.tape = Tape(all, out.inputs);
+      out.derivatives = derivatives.entries;
+    } catch (const InputError&) {
+      out.is_too_large = true;
+    }
     out.outputs.clear();
     out.inputs.clear();
     out.graph.reset();
@@ -249,6 +251,7 @@ const SymbolicSystem::StateTape& SymbolicSystem::state_tape() const {
 std::unique_ptr<StateEvaluator> SymbolicSystem::make_evaluator(const Ref<const VectorXd>& parameters, bool derivatives) const {
   if (!derivatives) return std::make_unique<Evaluator>(*this, parameters, values_, std::span<const StateDerivatives::Entry>());
   const StateTape& all = state_tape();
+  if (all.is_too_large) return System::make_evaluator(parameters, true);
   return std::make_unique<Evaluator>(*this, parameters, all.tape, all.derivatives);
 }
 

@@ -119,6 +119,7 @@ Fit fit_output(int output, const Prior& prior, const std::vector<Observations>& 
     group.view.rows = {output};
     group.values = MatrixXd(group.values.row(output));
     group.noise_stddev = VectorXd(group.noise_stddev.segment(output, 1));
+    if (group.has_noise_scale()) group.noise_scale = MatrixXd(group.noise_scale.row(output));
   }
   std::vector<Hyperparameter> own;
   for (const Hyperparameter& h : hyperparameters) {

@@ -13,6 +13,7 @@
 #include "inference/parallel.hpp"
 #include "prior/random.hpp"
 #include "training/lbfgsb.hpp"
+#include "training/objective.hpp"
 
 namespace gp2 {
 
@@ -21,53 +22,6 @@ using Eigen::VectorXd;
 using Kind = Hyperparameter::Kind;
 
 namespace {
-
-// what the optimiser sees of a hyperparameter: its logarithm, θ measured in widths of its box, an entry of W in its unit
-double to_internal(const Hyperparameter& h, double value) {
-  if (h.kind == Kind::mixing) return value / h.scale[0];
-  return h.is_positive() ? std::log(value) : (value - h.lower) / (h.upper - h.lower);
-}
-
-double from_internal(const Hyperparameter& h, double x) {
-  if (h.kind == Kind::mixing) return std::clamp(x * h.scale[0], h.lower, h.upper);
-  const double value = h.is_positive() ? std::exp(x) : h.lower + x * (h.upper - h.lower);
-  return std::clamp(value, h.lower, h.upper);
-}
-
-// ½ Σ (log(value/median)/log_stddev)², and its derivative in log value added to `gradient`
-double hyperprior(const std::vector<Hyperparameter>& hyperparameters, VectorXd* gradient) {
-  double sum = 0;
-  for (std::size_t k = 0; k < hyperparameters.size(); ++k) {
-    const Hyperparameter& h = hyperparameters[k];
-    if (h.log_stddev == 0) continue;
-    const double distance = std::log(h.value / h.median) / h.log_stddev;
-    sum += 0.5 * distance * distance;
-    if (gradient != nullptr) (*gradient)[static_cast<Index>(k)] += distance / h.log_stddev;
-  }
-  return sum;
-}
-
-// ∂NLL/∂x of one hyperparameter, from the gradient in model values
-double gather(const Hyperparameter& h, const ModelValues& gradient) {
-  const auto owner = static_cast<std::size_t>(h.owner);
-  switch (h.kind) {
-    case Kind::kernel:
-      return gradient.kernel[owner][h.index];
-    case Kind::signal_stddev:
-      return gradient.signal_stddev[owner][h.index];
-    case Kind::shared_signal_stddev:
-      return gradient.signal_stddev[owner].sum();
-    case Kind::noise_stddev:
-      return gradient.noise_stddev[owner][h.index];
-    case Kind::parameter:
-      return gradient.parameters[h.index] * (h.upper - h.lower);
-    case Kind::mixing:
-      return gradient.mixing[owner].reshaped()[h.index] * h.scale[0];
-    case Kind::sqrt_kappa:
-      return gradient.mixing[owner].rightCols(gradient.mixing[owner].rows())(h.index, h.index) * h.value;
-  }
-  return 0;
-}
 
 // latents that have a W, but W = 0
 std::set<int> unmixed_latents(const std::vector<Hyperparameter>& hyperparameters) {
@@ -105,11 +59,9 @@ class Training {
  public:
   Training(const Prior& prior, const std::vector<Observations>& observations, const std::vector<Hyperparameter>& hyperparameters,
            const FitOptions& options)
-      : prior_(prior),
-        observations_(observations),
-        hyperparameters_(hyperparameters),
+      : hyperparameters_(hyperparameters),
         options_(options),
-        likelihood_(prior, observations, model_values(prior, observations, hyperparameters), likelihood_options(hyperparameters)),
+        objective_(prior, observations, hyperparameters),
         reports_(static_cast<std::size_t>(n_restarts())),
         results_(static_cast<std::size_t>(n_restarts())),
         fractions_(static_cast<std::size_t>(n_restarts()), 0.0) {
@@ -128,8 +80,7 @@ class Training {
     // restarts side by side; where there is one alone, its evaluations share the threads
     parallel_for(n_restarts(), n_threads_, [&](int restart, int) { run_restart(restart, n_restarts() == 1 ? n_threads_ : 1); });
     release();
-    constexpr int max_escapes = 5;
-    while (n_escapes_ < max_escapes && !stopped() && escape()) ++n_escapes_;
+    while (n_escapes_ < options_.max_escapes && !stopped() && escape()) ++n_escapes_;
   }
 
   // the lowest objective; of equal ones the first
@@ -143,36 +94,7 @@ class Training {
   [[nodiscard]] int n_escapes() const { return n_escapes_; }
 
  private:
-  static Likelihood::Options likelihood_options(const std::vector<Hyperparameter>& hyperparameters) {
-    Likelihood::Options options;
-    for (const Hyperparameter& h : hyperparameters) {
-      if (h.kind == Kind::parameter) options.gradient_parameters.push_back(h.index);
-      if (h.kind == Kind::noise_stddev) options.noise_gradient = true;
-    }
-    return options;
-  }
-
   [[nodiscard]] bool stopped() const { return options_.stop != nullptr && options_.stop->load(); }
-
-  std::vector<Hyperparameter> at(const VectorXd& x) const {
-    std::vector<Hyperparameter> hyperparameters = hyperparameters_;
-    for (std::size_t k = 0; k < hyperparameters.size(); ++k) {
-      hyperparameters[k].value = from_internal(hyperparameters[k], x[static_cast<Index>(k)]);
-    }
-    return hyperparameters;
-  }
-
-  double objective(const VectorXd& x, VectorXd* gradient, Likelihood::Workspace& workspace) const {
-    const std::vector<Hyperparameter> hyperparameters = at(x);
-    ModelValues model_gradient;
-    const double value = likelihood_.evaluate(model_values(prior_, observations_, hyperparameters),
-                                              gradient == nullptr ? nullptr : &model_gradient, workspace);
-    if (!std::isfinite(value)) return value;
-    for (std::size_t k = 0; gradient != nullptr && k < hyperparameters.size(); ++k) {
-      (*gradient)[static_cast<Index>(k)] = gather(hyperparameters[k], model_gradient);
-    }
-    return value + hyperprior(hyperparameters, gradient);
-  }
 
   LbfgsbResult optimise(int restart, const std::vector<Hyperparameter>& from, Likelihood::Workspace& workspace) {
     LbfgsbOptions options;
@@ -183,15 +105,13 @@ class Training {
     options.iteration = [&](int iteration, double value) { return report_iteration(restart, iteration, value); };
     options.stop = [&] { return stopped(); };
     const Index n = static_cast<Index>(from.size());
-    VectorXd start(n);
-    for (Index k = 0; k < n; ++k)
-      start[k] = to_internal(from[static_cast<std::size_t>(k)], from[static_cast<std::size_t>(k)].value);
-    return minimise([&](const VectorXd& x, VectorXd& gradient) { return objective(x, &gradient, workspace); }, start,
-                    Eigen::Map<const VectorXd>(box_.lower.data(), n), Eigen::Map<const VectorXd>(box_.upper.data(), n), options);
+    return minimise([&](const VectorXd& x, VectorXd& gradient) { return objective_(x, &gradient, workspace); },
+                    internal_values(from), Eigen::Map<const VectorXd>(box_.lower.data(), n),
+                    Eigen::Map<const VectorXd>(box_.upper.data(), n), options);
   }
 
   void store(std::size_t restart, const LbfgsbResult& result) {
-    results_[restart] = options_.max_iterations == 0 ? hyperparameters_ : at(result.x);
+    results_[restart] = options_.max_iterations == 0 ? hyperparameters_ : objective_.at(result.x);
     RestartReport& report = reports_[restart];
     report.objective = result.value;
     report.negative_log_likelihood = result.value - hyperprior(results_[restart], nullptr);
@@ -209,12 +129,7 @@ class Training {
     if (!std::isfinite(reports_[from].objective) || hyperparameters_.empty()) return false;
     if (reports_[from].iterations >= options_.max_iterations) return false;
     constexpr int n_points = 9;
-    const Index n = static_cast<Index>(hyperparameters_.size());
-    VectorXd x(n);
-    for (Index k = 0; k < n; ++k) {
-      const Hyperparameter& h = results_[from][static_cast<std::size_t>(k)];
-      x[k] = to_internal(h, h.value);
-    }
+    const VectorXd x = internal_values(results_[from]);
     // the box of a mixing matrix is no more than a limit, too wide to scan
     std::vector<std::size_t> scanned;
     for (std::size_t k = 0; k < hyperparameters_.size(); ++k) {
@@ -231,7 +146,7 @@ class Training {
     parallel_for(static_cast<int>(values.size()), n_threads_, [&](int trial, int) {
       if (stopped()) return;
       Likelihood::Workspace workspace;
-      values[static_cast<std::size_t>(trial)] = objective(moved(trial), nullptr, workspace);
+      values[static_cast<std::size_t>(trial)] = objective_(moved(trial), nullptr, workspace);
     });
     if (stopped()) return false;
     reports_[from].evaluations += static_cast<int>(values.size());
@@ -239,7 +154,8 @@ class Training {
     const double before = reports_[from].objective;
     if (!(*lowest < before)) return false;
     Likelihood::Workspace workspace(n_threads_);
-    const LbfgsbResult result = optimise(static_cast<int>(from), at(moved(static_cast<int>(lowest - values.begin()))), workspace);
+    const LbfgsbResult result =
+        optimise(static_cast<int>(from), objective_.at(moved(static_cast<int>(lowest - values.begin()))), workspace);
     if (!(result.value < before)) return false;
     store(from, result);
     // a gain below this is the tail of the same optimum
@@ -304,12 +220,10 @@ class Training {
     return !stopped();
   }
 
-  const Prior& prior_;
-  const std::vector<Observations>& observations_;
   const std::vector<Hyperparameter>& hyperparameters_;
   const FitOptions& options_;
   int n_threads_ = thread_count(options_.n_threads);
-  Likelihood likelihood_;
+  Objective objective_;
   std::vector<RestartReport> reports_;
   std::vector<std::vector<Hyperparameter>> results_;
   struct {

@@ -280,6 +280,15 @@ std::vector<Hyperparameter> default_hyperparameters(const Prior& prior, const st
       const double spread = scales.output_stddev[g][static_cast<Index>(k)];
       h.lower = Standard::noise_lower * spread;
       h.upper = Standard::noise_upper * spread;
+      if (observations[g].has_noise_scale()) {
+        // a factor of stated deviations: the smallest of them stays above the lower bound, the usual one below the upper
+        h.unit = fmt::format("stated deviation of {}", names[k]);
+        const auto scale = observations[g].noise_scale.row(static_cast<Index>(k));
+        h.lower /= scale.minCoeff();
+        h.upper =
+            std::max(h.upper / observations[g].usual_noise(VectorXd::Ones(observations[g].view.size()))[static_cast<Index>(k)],
+                     2 * h.lower);
+      }
       h.value = std::clamp(observations[g].noise_stddev[static_cast<Index>(k)], h.lower, h.upper);
       if (protocol.hyperprior && protocol.name == Protocol::Name::standard) {
         h.median = h.value;

@@ -127,7 +127,7 @@ TEST(Check, WarnsOfARowThatVanishes) {
 TEST(Check, WithoutSamplingOrDataSaysThatNothingWasEvaluated) {
   const Desk desk;
   desk.write("model.toml", particle(R"([["1", "0"], ["0", "1"]])", R"(["ddq2"])"));
-  EXPECT_THAT(desk.done("gp2 check model.toml").out, HasSubstr("no --data and no [sampling]"));
+  EXPECT_THAT(desk.done("gp2 check model.toml").out, HasSubstr("no --data, and neither [sampling] nor [motion]"));
 }
 
 }  // namespace

@@ -133,6 +133,17 @@ TEST_P(LikelihoodGradient, MatchesDifferencesInEveryHyperparameter) {
   EXPECT_GT(n_problems, 0);
 }
 
+TEST(LikelihoodGradientTest, MatchesDifferencesWhereEachValueHasItsOwnNoise) {
+  std::vector<std::string> seen;
+  for (const Problem& p : test::problems(9, seed)) {
+    const std::string model = p.name.substr(0, p.name.find(','));
+    if (std::find(seen.begin(), seen.end(), model) != seen.end()) continue;
+    seen.push_back(model);
+    expect_gradient(test::with_noise_scale(p, seed));
+  }
+  EXPECT_GT(seen.size(), 3U);
+}
+
 // the sums over pairs of samples go tile by tile: here are several, and samples whose ranks differ
 TEST(LikelihoodGradientTest, MatchesDifferencesOverSeveralTiles) {
   int n_problems = 0;

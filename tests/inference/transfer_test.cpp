@@ -96,7 +96,7 @@ TEST(TransferTest, ToTheSameSystemIsThePlainPredictionBitByBit) {
       PriorOptions options;
       options.mean = p.prior.mean;
       // read anew, as a command does
-      const auto same = make_setting(model, ModelFile::parse(model.text, "again"), options);
+      const auto same = make_setting(model, ModelFile::parse(model.text, model.name), options);
       for (const Quantity quantity :
            {Quantity::constrained_acceleration, Quantity::unconstrained_acceleration, Quantity::multipliers}) {
         const View view = View::all(quantity, *model.system);

@@ -47,6 +47,12 @@ FitFile fit_of(const ModelFile& model, const FitSettings& settings = {}) {
   return fit;
 }
 
+Json written_json(const FitFile& fit) {
+  const TemporaryFolder folder;
+  fit.write(folder / "fit.json");
+  return Json::parse(read_file(folder / "fit.json"));
+}
+
 FitFile written_and_read(const FitFile& fit) {
   const TemporaryFolder folder;
   fit.write(folder / "fit.json");
@@ -97,6 +103,20 @@ TEST(FitFile, EveryChoiceOfPriorAndProtocolSurvives) {
       }
     }
   }
+}
+
+TEST(FitFile, ANoiseOfEachValueSurvivesToTheBit) {
+  FitFile fit = fit_of(unicycle());
+  EXPECT_EQ(written_json(fit).at("version"), 1) << "what older gp2 can read is written for them";
+  EXPECT_FALSE(written_json(fit).at("observations").at(0).contains("noise_scale"));
+  Observations& group = fit.observations.front();
+  RandomStream random(3);
+  group.noise_scale.resize(group.values.rows(), group.values.cols());
+  for (double& scale : group.noise_scale.reshaped()) scale = 0.3 + random.uniform();
+  EXPECT_EQ(written_json(fit).at("version"), 4) << "others would read a wrong noise";
+  const FitFile read = written_and_read(fit);
+  EXPECT_EQ(read.observations.front().noise_scale, group.noise_scale);
+  expect_same_predictions(fit, read);
 }
 
 TEST(FitFile, TheReportSurvives) {
@@ -224,8 +244,8 @@ TEST_F(DamagedFit, OtherFilesAreRefused) {
 }
 
 TEST_F(DamagedFit, ANewerFormatIsRefusedWithBothVersions) {
-  EXPECT_EQ(error_after([](Json& json) { json["version"] = 4; }),
-            fmt::format("of format 4, but this gp2 ({}) reads up to 3: use a newer gp2", version()));
+  EXPECT_EQ(error_after([](Json& json) { json["version"] = 6; }),
+            fmt::format("of format 6, but this gp2 ({}) reads up to 5: use a newer gp2", version()));
   EXPECT_EQ(error_after([](Json& json) {
               // whatever else a newer format changes
               json = Json{{"format", "gp2 fit"}, {"version", 7}};
@@ -308,6 +328,16 @@ TEST_F(DamagedFit, ValuesOutOfPlaceAreNamed) {
   const std::string noise_rule = "noise_stddev must hold one positive number per row of the view";
   EXPECT_EQ(error_after([&](Json& json) { observation(json)["noise_stddev"] = {0.1, 0.1}; }), noise_rule);
   EXPECT_EQ(error_after([&](Json& json) { observation(json)["noise_stddev"] = {0.1, 0, 0.1}; }), noise_rule);
+  const auto with_scale = [&](double value) {
+    return error_after([&](Json& json) {
+      observation(json)["noise_scale"] = observation(json)["values"];
+      for (auto& [name, row] : observation(json)["noise_scale"].items()) row = std::vector<double>(6, value);
+    });
+  };
+  EXPECT_EQ(with_scale(2), "");
+  EXPECT_EQ(with_scale(0), "noise_scale must be positive and finite, got 0; leave out values that are worth nothing");
+  EXPECT_EQ(error_after([&](Json& json) { observation(json)["noise_scale"] = Json::object(); }),
+            "the values of 'ddq1' are missing");
   EXPECT_EQ(error_after([](Json& json) { json["prior"]["mean"] = "constant"; }), "'constant' is no prior mean");
   EXPECT_EQ(error_after([](Json& json) { json["prior"]["directions"] = "up"; }), "'up' is no choice of directions");
   EXPECT_THAT(error_after([](Json& json) { json["model"]["text"] = "coordinates = 3"; }),

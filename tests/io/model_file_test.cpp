@@ -72,7 +72,7 @@ TEST_P(ShippedModel, IsReadWhole) {
   EXPECT_FALSE(model.latents.empty());
   EXPECT_THAT(model.noise.stddev, SizeIs(static_cast<std::size_t>(model.system->nq())));
   EXPECT_THAT(model.truth, SizeIs(static_cast<std::size_t>(model.system->nq())));
-  EXPECT_FALSE(model.sampling.empty());
+  EXPECT_TRUE(!model.sampling.empty() || model.motion);
   for (const bool raw_angles : {false, true}) {
     EXPECT_THAT(make_prior(model, {Prior::Mean::force, std::nullopt, raw_angles}).latents, SizeIs(model.latents.size()));
   }
@@ -278,9 +278,8 @@ std::vector<Complaint> complaints() {
       // shape of the file
       {"Empty", "", "1: coordinates: missing; write coordinates = [\"q1\", \"q2\"]"},
       {"UnknownTable", base + "[friction]\nc = 1\n",
-       "7: friction: unknown key; known here: name, coordinates, inputs, parameters, let, mechanics, constraints, latent, noise, "
-       "truth, "
-       "sampling, columns"},
+       "7: friction: unknown key; known here: name, robot, coordinates, inputs, parameters, let, mechanics, constraints, latent, "
+       "noise, truth, sampling, motion, columns"},
       {"FirstOfSeveralUnknownKeys", base + "zeta = 1\nalpha = 2\n",
        "7: mechanics.zeta: unknown key; known here: mass, force, potential"},
       {"NameIsNoText", "name = 3\n" + base, "1: name: expected a text in quotes, got 3"},
@@ -319,7 +318,7 @@ std::vector<Complaint> complaints() {
       {"ThreeBounds", with_parameter("m = { value = 2, bounds = [1, 2, 3] }"),
        "4: parameters.m.bounds: expected [lower, upper], got [ 1, 2, 3 ]"},
       {"ParameterWithAnUnknownKey", with_parameter("m = { value = 2, bound = [1, 3] }"),
-       "4: parameters.m.bound: unknown key; known here: value, bounds, estimate"},
+       "4: parameters.m.bound: unknown key; known here: value, bounds, estimate, of"},
       {"ParameterNamedLikeACoordinate", with_parameter("m = 1\nq1 = 2"),
        "5: parameters.q1: the name 'q1' is taken already; choose another"},
       {"EstimateIsNoBoolean", with_parameter("m = { value = 2, estimate = \"yes\" }"),
@@ -436,7 +435,7 @@ std::vector<Complaint> complaints() {
        "8: noise.ddq: missing initial: where the estimate starts"},
       {"NoiseIsText", base + "[noise]\nddq = \"estimate\"\n", "8: noise.ddq: expected a finite number, got 'estimate'"},
       // truth and sampling
-      {"TruthWithoutAcceleration", base + "[truth]\n", "7: truth: missing acceleration = [ … ]"},
+      {"TruthWithoutAcceleration", base + "[truth]\n", "7: truth: missing acceleration = [ … ] or force = [ … ]"},
       {"TruthOfTheWrongLength", base + "[truth]\nacceleration = [\"0\"]\n",
        "8: truth.acceleration: expected 2 entries, one per coordinate, got 1"},
       {"TruthOfAnAcceleration", base + "[truth]\nacceleration = [\"0\", \"ddq1\"]\n",

@@ -42,6 +42,12 @@ VectorXd with_entry(const VectorXd& b, double entry) {
   return extended;
 }
 
+// a row that vanishes stays
+MatrixXd unit_rows(MatrixXd A) {
+  for (auto row : A.rowwise()) row.normalize();
+  return A;
+}
+
 class MechanicsLaws : public testing::TestWithParam<std::string> {
  protected:
   template <typename Law>
@@ -163,7 +169,7 @@ TEST_P(MechanicsLaws, NoAdmissibleAccelerationIsCloserToTheUnconstrainedOneThanG
       return (acceleration - a_bar).dot(c.M * (acceleration - a_bar));
     };
     // null space of A, from its own decomposition
-    const Eigen::JacobiSVD<MatrixXd> svd(c.A.rowwise().normalized(), Eigen::ComputeFullV);
+    const Eigen::JacobiSVD<MatrixXd> svd(unit_rows(c.A), Eigen::ComputeFullV);
     const MatrixXd free = svd.matrixV().rightCols(c.M.rows() - c.projection.rank());
     if (free.cols() == 0) return;
     for (int trial = 0; trial < 5; ++trial) {
@@ -173,6 +179,24 @@ TEST_P(MechanicsLaws, NoAdmissibleAccelerationIsCloserToTheUnconstrainedOneThanG
       EXPECT_LE(std::abs(w.dot(c.M * (ddq - a_bar))), c.rounding * largest(c.M) * w.norm() * (ddq.norm() + a_bar.norm()));
     }
   });
+}
+
+// With rows 0 and a combination of others among them: multipliers are the shortest, and a row that vanishes has none.
+TEST(UdwadiaKalabaTest, MultipliersOfRedundantAndVanishingRowsAreThoseOfThePseudoinverse) {
+  RandomStream random(seed);
+  for (int trial = 0; trial < 50; ++trial) {
+    MatrixXd A = MatrixXd::Zero(5, 4);
+    for (int row : {0, 2}) A.row(row) = test::random_vector(4, random);
+    if (trial % 2 == 0) A.row(4) = 0.3 * A.row(0) - 2 * A.row(2);
+    const VectorXd lambda = test::random_vector(5, random);
+    const MatrixXd root = test::random_vector(16, random).reshaped(4, 4);
+    const MatrixXd M = root * root.transpose() + MatrixXd::Identity(4, 4);
+    const UdwadiaKalaba projection(M, A, A * test::random_vector(4, random));
+    const VectorXd force = A.transpose() * lambda;
+    const VectorXd expected = A.transpose().completeOrthogonalDecomposition().solve(force);
+    EXPECT_LE((projection.multipliers_of_force() * force - expected).cwiseAbs().maxCoeff(),
+              1e-12 * condition(M) * (1 + expected.norm()));
+  }
 }
 
 TEST(UdwadiaKalabaTest, WithoutConstraintsTheMotionIsTheUnconstrainedOne) {

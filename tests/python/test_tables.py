@@ -150,3 +150,27 @@ def test_a_path_may_be_bytes_and_hold_any_character(arm_log, tmp_path):
         gp2.read_csv(tmp_path / "missing.csv")
     with pytest.raises(TypeError):
         gp2.read_csv(3)
+
+
+def test_deviations_in_a_table_are_the_noise_of_its_values(arm, frame, arm_log, arm_states):
+    names = arm.acceleration_names
+    stated = frame.assign(**{name + "_std": 0.2 for name in names})
+    expected = gp2.fit(arm, frame, max_iterations=0, noise_std=0.2, discrepancy=False)
+    got = gp2.fit(arm, stated, max_iterations=0, discrepancy=False)
+    np.testing.assert_allclose(got.predict(arm_states).mean, expected.predict(arm_states).mean, rtol=1e-9, atol=1e-9)
+    got.update(stated.head(1))
+    expected.update(frame.head(1))
+    np.testing.assert_allclose(got.predict(arm_states).mean, expected.predict(arm_states).mean, rtol=1e-9, atol=1e-9)
+    with pytest.raises(gp2.InputError, match=f"in the fit each value of {names[0]} has a noise of its own"):
+        got.update(frame.head(1))
+    got.update(frame.head(1), noise_std=0.2)
+
+
+def test_resampled_rows_are_rows_of_the_table(arm, frame):
+    some = gp2.resample(arm, frame, 4)
+    assert some.columns == list(frame.columns)
+    first = frame.columns[0]
+    assert set(some[first]) <= set(frame[first]) and len(some[first]) == 4
+    np.testing.assert_array_equal(gp2.resample(arm, frame, 3)[first], some[first][:3])
+    with pytest.raises(gp2.InputError, match="fewer than the n = 1000"):
+        gp2.resample(arm, frame, 1000, seed=1, features=[first])

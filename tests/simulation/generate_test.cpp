@@ -196,7 +196,7 @@ std::string error_of(const ModelFile& model) {
 TEST(GenerateSampling, WithoutSamplingOrTruthThereIsNoData) {
   const std::string text = "coordinates = [\"x\"]\n[mechanics]\nmass = [[1]]\n[constraints]\nposition = [\"x - t\"]\n";
   EXPECT_EQ(error_of(ModelFile::parse(text + "[truth]\nacceleration = [0]\n", "m.toml")),
-            "m.toml: missing [sampling]: where states are drawn from, say q1 = [-1, 1]");
+            "m.toml: missing [sampling]: where states are drawn from, say q1 = [-1, 1]; or [motion]: how the system is driven");
   const ModelFile without_truth = ModelFile::parse(text + "[sampling]\nt = [0, 1]\n", "m.toml");
   const std::string missing_truth =
       "m.toml: missing [truth] acceleration = [ … ]: what is added to M⁻¹ force, \"0\" where nothing is";

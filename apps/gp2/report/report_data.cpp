@@ -36,13 +36,14 @@ std::string date_of(const std::filesystem::path& path) {
   return fmt::format("{:%Y-%m-%d}", fmt::gmtime(std::chrono::system_clock::to_time_t(seconds)));
 }
 
-// the fitted noise of a row of ddq: that of the first training data that have it, as in evaluate_predictions
+// the fitted noise of a row of ddq: the usual one of the first training data that have it, as in evaluate_predictions
 double noise_of(const Posterior& posterior, int row) {
   for (std::size_t g = 0; g < posterior.observations().size(); ++g) {
-    const View& view = posterior.observations()[g].view;
+    const Observations& group = posterior.observations()[g];
+    const View& view = group.view;
     if (view.quantity != View::Quantity::constrained_acceleration || view.latent >= 0) continue;
     const auto found = std::find(view.rows.begin(), view.rows.end(), row);
-    if (found != view.rows.end()) return posterior.values().noise_stddev[g][found - view.rows.begin()];
+    if (found != view.rows.end()) return group.usual_noise(posterior.values().noise_stddev[g])[found - view.rows.begin()];
   }
   return not_a_number;
 }

@@ -48,6 +48,9 @@ std::string matrix_mathml(const char* name, const std::vector<std::vector<Expres
   std::string body;
   for (const auto& row : rows) {
     body += "<mtr>";
+    for (const Expression entry : row) {
+      if (entry.graph().size_of(entry).written > longest) return "";
+    }
     for (const Expression entry : row) body += "<mtd><mrow>" + to_string(entry, Notation::mathml) + "</mrow></mtd>";
     body += "</mtr>";
     if (body.size() > longest) return "";
@@ -119,7 +122,7 @@ Json observations_json(const FitFile& fit) {
     const Observations& group = fit.observations[g];
     const std::string latent = group.view.latent < 0 ? "" : home.latents[static_cast<std::size_t>(group.view.latent)].name;
     Json noise = Json::array();
-    for (const double one : values.noise_stddev[g]) noise.push_back(number(one));
+    for (const double one : group.usual_noise(values.noise_stddev[g])) noise.push_back(number(one));
     groups.push_back({{"names", group.view.names(*prior_of(home, group.view).system, latent)},
                       {"n", group.n_data()},
                       {"system", g < fit.systems.size() && fit.systems[g] ? fit.systems[g]->system->name() : ""},

@@ -65,6 +65,9 @@ struct Method {
   bool estimate = false;  // the system's parameters
   std::map<Protocol::Name, int> n_restarts;
   double reduction_tolerance = FitOptions().reduction_tolerance;  // where the optimiser stops
+  int max_iterations = FitOptions().max_iterations;
+  int max_escapes = FitOptions().max_escapes;
+  bool wide = false;  // of a baseline: bounds that do not matter instead of the published ones
 
   /// Whether its training differs between the protocols.
   [[nodiscard]] bool has_protocol() const { return !is_truth && !baseline; }
@@ -100,6 +103,7 @@ Line line_of(const Section& line, const ModelFile& model);
 int number_of_runs(const std::string& pattern, const std::optional<std::filesystem::path>& data, std::optional<int> asked,
                    int defined);
 
+Method method_of(const Section& section);  // restarts are not set
 Method method_of(const Section& section, const Section& restarts);
 std::vector<Method> methods_of(const Section& definition);
 
@@ -109,8 +113,9 @@ struct Trained {
   Fit fit;
 };
 /// @param estimate  parameters, where the method estimates any
+/// @param start     where the first restart begins, of hyperparameters by the same names; empty: at their own values
 Trained train(const ModelFile& model, const std::vector<std::string>& estimate, const Method& method, Protocol::Name protocol,
-              const CsvTable& log, int run, int n_threads);
+              const CsvTable& log, int run, int n_threads, const std::vector<Hyperparameter>& start = {});
 
 /// How well a method predicts on the grid.
 struct Score {
@@ -143,5 +148,6 @@ void reproduce_fig3a(const ReproduceOptions& options);
 void reproduce_fig3b(const ReproduceOptions& options);
 void reproduce_fig3c(const ReproduceOptions& options);
 void reproduce_figS7(const ReproduceOptions& options);
+void reproduce_arm_on_surface(const ReproduceOptions& options);
 
 }  // namespace gp2::command

@@ -1,3 +1,4 @@
+#include <algorithm>
 #include <chrono>
 #include <limits>
 
@@ -15,7 +16,7 @@ namespace gp2::command {
 using Eigen::Index;
 using Eigen::MatrixXd;
 
-Method method_of(const Section& section, const Section& restarts) {
+Method method_of(const Section& section) {
   Method method;
   method.name = section.text("name");
   method.is_truth = section.flag("truth");
@@ -27,7 +28,13 @@ Method method_of(const Section& section, const Section& restarts) {
     }
   }
   method.mean = section.mean();
+  method.wide = section.flag("wide");
   method.estimate = section.flag("estimate");
+  return method;
+}
+
+Method method_of(const Section& section, const Section& restarts) {
+  Method method = method_of(section);
   method.n_restarts = {{Protocol::Name::paper, restarts.integer(method.baseline ? "baseline" : "paper")},
                        {Protocol::Name::standard, restarts.integer(method.baseline ? "baseline" : "default")}};
   return method;
@@ -80,8 +87,30 @@ Score score_of(const ExperimentSystem& system, const Method& method, Protocol::N
   return score;
 }
 
+namespace {
+
+// the published bounds of lengthscales and signals, of which the upper ones keep a function from being almost linear
+void widen(std::vector<Hyperparameter>& hyperparameters) {
+  constexpr double lower = 0.1, upper = 1e3;
+  for (Hyperparameter& h : hyperparameters) {
+    if (h.kind != Hyperparameter::Kind::kernel && h.kind != Hyperparameter::Kind::signal_stddev) continue;
+    h.lower *= lower;
+    h.upper *= upper;
+  }
+}
+
+void start_from(const std::vector<Hyperparameter>& start, std::vector<Hyperparameter>& hyperparameters) {
+  for (Hyperparameter& h : hyperparameters) {
+    const auto same =
+        std::find_if(start.begin(), start.end(), [&](const Hyperparameter& s) { return s.name == h.name && s.owner == h.owner; });
+    if (same != start.end()) h.value = std::clamp(same->value, h.lower, h.upper);
+  }
+}
+
+}  // namespace
+
 Trained train(const ModelFile& model, const std::vector<std::string>& estimate, const Method& method, Protocol::Name protocol,
-              const CsvTable& log, int run, int n_threads) {
+              const CsvTable& log, int run, int n_threads, const std::vector<Hyperparameter>& start) {
   FitProblemOptions options;
   options.mean = method.mean == "force" ? Prior::Mean::force : Prior::Mean::zero;
   options.estimate = estimate;
@@ -89,10 +118,14 @@ Trained train(const ModelFile& model, const std::vector<std::string>& estimate, 
   options.baseline = method.baseline;
   options.seed = static_cast<std::uint64_t>(run);
   FitProblem problem = make_fit_problem(model, log, options);
+  if (method.wide) widen(problem.hyperparameters);
+  start_from(start, problem.hyperparameters);
   FitOptions fit_options = default_fit_options(problem);
   fit_options.n_restarts = method.n_restarts.at(protocol);
   fit_options.seed = options.seed;
   fit_options.n_threads = n_threads;
+  fit_options.max_iterations = method.max_iterations;
+  fit_options.max_escapes = method.max_escapes;
   if (!method.baseline) fit_options.reduction_tolerance = method.reduction_tolerance;
   Fit result = fit(problem, fit_options);
   return {std::move(problem), std::move(result)};

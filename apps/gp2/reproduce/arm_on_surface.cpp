@@ -1,0 +1,237 @@
+#include <algorithm>
+#include <chrono>
+#include <cmath>
+#include <numeric>
+
+#include <fmt/format.h>
+
+#include "command.hpp"
+#include "gp2/error.hpp"
+#include "gp2/generate.hpp"
+#include "gp2/resample.hpp"
+#include "reproduce/experiment.hpp"
+#include "reproduce/table.hpp"
+
+// The benchmark of Rath, Geist & Trimpe 2021: an arm that slides on a plane.
+namespace gp2::command {
+
+namespace {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+
+/// Samples of a motion, measured with noise.
+struct Motion {
+  GeneratedData measured;
+  MatrixXd truth;  // (nq × N)
+
+  [[nodiscard]] Motion only(const std::vector<int>& samples) const {
+    return {{measured.states(Eigen::all, samples), measured.accelerations(Eigen::all, samples), measured.known},
+            truth(Eigen::all, samples)};
+  }
+};
+
+Motion motion_of(const ModelFile& model, const Section& section) {
+  GenerateOptions options;
+  options.n = section.integer("samples");
+  options.seed = static_cast<std::uint64_t>(section.integer("seed"));
+  options.noise_stddev = Eigen::Map<const VectorXd>(model.noise.stddev.data(), model.system->nq());
+  Motion motion{generate(model, options), {}};
+  motion.truth = true_acceleration(model, motion.measured.states);
+  return motion;
+}
+
+/// Which samples are learned from, and which tested on.
+struct Split {
+  std::vector<int> training, blocks;
+};
+
+Split split_of(const Section& training, const Section& blocks) {
+  const int n = training.integer("samples"), leave = training.integer("leave");
+  const int length = blocks.integer("samples"), every = blocks.integer("every");
+  if (every < 1) throw InputError(fmt::format("blocks: every must be positive, got {}", every));
+  Split split;
+  std::vector<bool> kept(static_cast<std::size_t>(n), false);
+  for (const double first : blocks.numbers("starts")) {
+    const auto start = static_cast<int>(first);
+    if (start < 0 || length < 1 || start + length > n) {
+      throw InputError(
+          fmt::format("blocks: the samples {} … {} are not all of the {} of the training motion", start, start + length - 1, n));
+    }
+    std::fill_n(kept.begin() + start, length, true);
+    for (int i = 0; i < length; i += every) split.blocks.push_back(start + i);
+  }
+  for (int i = leave; i < n - leave; ++i) {
+    if (!kept[static_cast<std::size_t>(i)]) split.training.push_back(i);
+  }
+  return split;
+}
+
+/// n samples that cover a motion best, each n's among the next one's.
+std::vector<int> informative(const ModelFile& model, const Motion& motion, int n) {
+  ResampleOptions options;
+  options.n = n;
+  return resample(model, as_table(motion.measured, *model.system, model.name), options).rows;
+}
+
+struct Errors {
+  double noisy = 0, exact = 0;                                 // mean absolute, over coordinates and samples
+  double mean_constraint_error = 0, max_constraint_error = 0;  // of |A ddq − b|
+};
+
+Errors errors_of(const Posterior& posterior, const System& system, const Motion& motion) {
+  const MatrixXd& states = motion.measured.states;
+  const MatrixXd prediction = posterior.mean(View::all(View::Quantity::constrained_acceleration, system), states);
+  Errors errors;
+  errors.noisy = (prediction - motion.measured.accelerations).cwiseAbs().mean();
+  errors.exact = (prediction - motion.truth).cwiseAbs().mean();
+  const SystemValues values = system.evaluate(states, system.parameter_values());
+  for (Index i = 0; i < states.cols(); ++i) {
+    const VectorXd residual = (values.A(static_cast<int>(i)) * prediction.col(i) - values.b(static_cast<int>(i))).cwiseAbs();
+    errors.mean_constraint_error += residual.mean() / static_cast<double>(states.cols());
+    errors.max_constraint_error = std::max(errors.max_constraint_error, residual.maxCoeff());
+  }
+  return errors;
+}
+
+double seconds_since(std::chrono::steady_clock::time_point start) {
+  return std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
+}
+
+/// What a method learns: the model of its own, or the one that moved.
+std::vector<ModelFile> models_of(const Section& definition, const std::filesystem::path& experiments) {
+  std::vector<ModelFile> models;
+  for (const Section& section : definition.sections("method")) {
+    models.push_back(ModelFile::read(experiments / section.text("model", definition.text("model"))));
+  }
+  return models;
+}
+
+/// The methods as they are trained on the k-th number of points.
+std::vector<Method> methods_at(const Section& definition, std::size_t k) {
+  const Section restarts = definition.section("restarts"), stop = definition.section("stop");
+  std::vector<Method> methods;
+  for (const Section& section : definition.sections("method")) {
+    Method& method = methods.emplace_back(method_of(section));
+    const std::vector<double> n_restarts = restarts.numbers(method.baseline ? "baseline" : "default");
+    const std::vector<double> escapes = restarts.numbers("escapes");
+    const auto at = [&](const std::vector<double>& list) { return static_cast<int>(list[std::min(k, list.size() - 1)]); };
+    method.n_restarts[Protocol::Name::standard] = at(n_restarts);
+    method.max_escapes = at(escapes);
+    method.max_iterations = stop.integer("max_iterations");
+    method.reduction_tolerance = stop.number("reduction_tolerance");
+  }
+  return methods;
+}
+
+// what stands of a method for the k-th number of points in [published]
+std::optional<double> published(const Section& definition, const std::string& method, std::size_t k) {
+  if (!definition.has("published") || !definition.section("published").has(method)) return std::nullopt;
+  const std::vector<double> errors = definition.section("published").numbers(method);
+  return k < errors.size() ? std::optional(errors[k]) : std::nullopt;
+}
+
+// each error beside the smallest of the methods that know no mechanics, as the published one beside the published one of theirs
+void add_ratios(const Section& definition, std::size_t k, const std::vector<Method>& methods, Table& table,
+                std::size_t first_row) {
+  std::optional<double> published_plain;
+  for (std::size_t m = 0; m < methods.size(); ++m) {
+    if (methods[m].baseline && !published_plain) published_plain = published(definition, methods[m].name, k);
+  }
+  for (const std::string place : {"blocks", "independent"}) {
+    double plain = std::numeric_limits<double>::infinity();
+    for (std::size_t m = 0; m < methods.size(); ++m) {
+      if (methods[m].baseline) plain = std::min(plain, table.row(first_row + m)["mae_" + place].get<double>());
+    }
+    for (std::size_t m = 0; m < methods.size(); ++m) {
+      Table::Row& row = table.row(first_row + m);
+      row["ratio_" + place] = number_or_null(row["mae_" + place].get<double>() / plain);
+    }
+  }
+  for (std::size_t m = 0; m < methods.size(); ++m) {
+    const std::optional<double> theirs = published(definition, methods[m].name, k);
+    table.row(first_row + m)["published_mae"] = theirs ? Table::Row(*theirs) : Table::Row();
+    table.row(first_row + m)["published_ratio"] =
+        theirs && published_plain ? Table::Row(*theirs / *published_plain) : Table::Row();
+  }
+}
+
+std::string shown(const Table::Row& value) { return value.is_null() ? "-" : fmt::format("{:.3f}", value.get<double>()); }
+
+void print(const std::vector<Table::Row>& rows) {
+  fmt::print("{:>5} {:<16} {:>9} {:>9} {:>9} {:>7} {:>7} {:>9} {:>10} {:>10} {:>8}\n", "n", "method", "blocks", "indep.",
+             "published", "ratio", "indep.", "published", "|Addq−b|", "largest", "seconds");
+  for (const Table::Row& row : rows) {
+    fmt::print("{:>5} {:<16} {:>9} {:>9} {:>9} {:>7} {:>7} {:>9} {:>10.1e} {:>10.1e} {:>8.0f}\n", row["n"].get<int>(),
+               row["method"].get<std::string>(), shown(row["mae_blocks"]), shown(row["mae_independent"]),
+               shown(row["published_mae"]), shown(row["ratio_blocks"]), shown(row["ratio_independent"]),
+               shown(row["published_ratio"]), row["mean_constraint_error"].get<double>(),
+               row["max_constraint_error"].get<double>(), row["seconds"].get<double>());
+  }
+}
+
+}  // namespace
+
+void reproduce_arm_on_surface(const ReproduceOptions& options) {
+  const Section definition = Section::read(options.experiments / "arm_on_surface.toml");
+  const ModelFile model = ModelFile::read(options.experiments / definition.text("model"));
+  const System& system = *model.system;
+  const std::vector<ModelFile> models = models_of(definition, options.experiments);
+  const std::vector<double> sizes = definition.numbers("n");
+  const Section training = definition.section("training"), elsewhere = definition.section("independent");
+
+  const Motion whole = motion_of(model, training);
+  const Split split = split_of(training, definition.section("blocks"));
+  const Motion candidates = whole.only(split.training), blocks = whole.only(split.blocks);
+  const auto largest = static_cast<int>(*std::max_element(sizes.begin(), sizes.end()));
+  const Motion chosen = candidates.only(informative(model, candidates, largest));
+  const CsvTable log = as_table(chosen.measured, system, model.name);
+
+  const Motion other = motion_of(model, elsewhere);
+  std::vector<int> of_other;
+  const int leave = elsewhere.integer("leave"), every = std::max(1, elsewhere.integer("every"));
+  for (int i = leave; i < elsewhere.integer("samples") - leave; i += every) of_other.push_back(i);
+  const Motion independent = other.only(of_other);
+
+  Table table;
+  std::map<std::string, std::vector<Hyperparameter>> fitted;  // to fewer points, by method
+  for (std::size_t k = 0; k < sizes.size(); ++k) {
+    const auto n = static_cast<int>(sizes[k]);
+    const std::vector<Method> methods = methods_at(definition, k);
+    const std::size_t first_row = table.rows().size();
+    for (std::size_t m = 0; m < methods.size(); ++m) {
+      const Method& method = methods[m];
+      talk_over(fmt::format("arm-on-surface: n = {}: {}", n, method.name));
+      const auto start = std::chrono::steady_clock::now();
+      const Trained trained =
+          train(models[m], {}, method, Protocol::Name::standard, log.first_rows(n), 0, options.threads, fitted[method.name]);
+      const double seconds = seconds_since(start);
+      fitted[method.name] = trained.fit.report.hyperparameters;
+      const Errors on_blocks = errors_of(trained.fit.posterior, system, blocks);
+      const Errors on_independent = errors_of(trained.fit.posterior, system, independent);
+      table.add({{"n", n},
+                 {"method", method.name},
+                 {"mae_blocks", on_blocks.noisy},
+                 {"mae_independent", on_independent.noisy},
+                 {"published_mae", nullptr},
+                 {"ratio_blocks", nullptr},
+                 {"ratio_independent", nullptr},
+                 {"published_ratio", nullptr},
+                 {"truth_mae_blocks", on_blocks.exact},
+                 {"truth_mae_independent", on_independent.exact},
+                 {"mean_constraint_error", (on_blocks.mean_constraint_error + on_independent.mean_constraint_error) / 2},
+                 {"max_constraint_error", std::max(on_blocks.max_constraint_error, on_independent.max_constraint_error)},
+                 {"nll", trained.fit.report.negative_log_likelihood},
+                 {"iterations", trained.fit.report.iterations},
+                 {"seconds", seconds}});
+    }
+    add_ratios(definition, k, methods, table, first_row);
+    table.write(options.output / "arm_on_surface");  // an hour's work is kept
+  }
+  talk_over("");
+  print(table.rows());
+  plot(options, "arm_on_surface");
+}
+
+}  // namespace gp2::command

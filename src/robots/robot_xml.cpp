@@ -1,0 +1,204 @@
+#include "robots/robot_xml.hpp"
+
+#include <algorithm>
+#include <array>
+#include <cctype>
+#include <locale>
+#include <map>
+#include <optional>
+#include <set>
+#include <sstream>
+#include <string_view>
+
+#include <fmt/format.h>
+#include <fmt/ranges.h>
+#include <boost/property_tree/ptree.hpp>
+#include <boost/property_tree/xml_parser.hpp>
+
+#include "gp2/error.hpp"
+
+namespace gp2 {
+
+using Tree = boost::property_tree::ptree;
+
+namespace {
+
+// Elements within elements: the parser calls itself for each, and a real file has a dozen. Comments may hold tags that are never
+// closed, which this counts too.
+void check_depth(std::string_view text, const std::string& name) {
+  constexpr int deepest = 1000;
+  int depth = 0;
+  for (std::size_t k = 0; k + 1 < text.size(); ++k) {
+    if (text[k] == '<' && std::isalpha(static_cast<unsigned char>(text[k + 1])) != 0) ++depth;
+    if ((text[k] == '<' && text[k + 1] == '/') || (text[k] == '/' && text[k + 1] == '>')) --depth;
+    if (depth > deepest) throw InputError(fmt::format("{}: elements are nested more than {} deep", name, deepest));
+  }
+}
+
+Tree parse(const std::string& text, const std::string& name) {
+  check_depth(text, name);
+  Tree tree;
+  std::istringstream stream(text);
+  try {
+    read_xml(stream, tree, boost::property_tree::xml_parser::no_comments | boost::property_tree::xml_parser::trim_whitespace);
+  } catch (const boost::property_tree::xml_parser_error& error) {
+    throw InputError(fmt::format("{}:{}: not XML ({}); a robot is a MJCF or URDF file", name, error.line(), error.message()));
+  }
+  return tree;
+}
+
+std::optional<std::string> attribute(const Tree& element, const char* name) {
+  const auto value = element.get_optional<std::string>(Tree::path_type(fmt::format("<xmlattr>|{}", name), '|'));
+  return value ? std::optional(*value) : std::nullopt;
+}
+
+// Checks of a <robot> and its changes; `name` is the file's.
+class Urdf {
+ public:
+  Urdf(Tree& robot, std::string name) : robot_(robot), name_(std::move(name)) {}
+
+  RobotXml prepared() {
+    const auto compiler = robot_.get_child_optional("mujoco.compiler");
+    inertia_is_of_shapes_ = compiler && attribute(*compiler, "inertiafromgeom") == "true";
+    for (auto& [tag, element] : robot_) {
+      if (tag.rfind("xacro:", 0) == 0) fail(fmt::format("<{}> is of xacro: expand it first with: xacro FILE > robot.urdf", tag));
+      if (tag == "link") check_link(element);
+    }
+    if (links_.empty()) fail("it has no <link>");
+    RobotXml xml;
+    xml.is_urdf = true;
+    for (const auto& [tag, element] : robot_) {
+      if (tag == "joint") check_joint(element, xml.mimics);
+    }
+    for (const RobotXml::Mimic& mimic : xml.mimics) {
+      if (joints_.count(mimic.followed) == 0) {
+        fail(fmt::format("joint '{}': it mimics '{}', which is no joint of the file", mimic.joint, mimic.followed));
+      }
+    }
+    check_tree();
+    keep_fixed_links();
+    return xml;
+  }
+
+ private:
+  [[noreturn]] void fail(const std::string& what) const { throw InputError(fmt::format("{}: {}", name_, what)); }
+
+  [[nodiscard]] std::string name_of(const Tree& element, const char* tag) const {
+    const auto name = attribute(element, "name");
+    if (!name || name->empty()) fail(fmt::format("a <{}> has no name", tag));
+    return *name;
+  }
+
+  [[nodiscard]] double number(const std::optional<std::string>& text, const std::string& where, const char* what) const {
+    double value = 0;
+    std::istringstream stream(text.value_or(""));
+    stream.imbue(std::locale::classic());
+    if (!(stream >> value) || !(stream >> std::ws).eof()) {
+      fail(fmt::format("{}: {} must be a number, got '{}'", where, what, text.value_or("")));
+    }
+    return value;
+  }
+
+  void check_link(Tree& link) {
+    const std::string where = fmt::format("link '{}'", name_of(link, "link"));
+    if (!links_.insert(name_of(link, "link")).second) fail(fmt::format("{}: it stands twice", where));
+    const auto inertial = link.get_child_optional("inertial");
+    if (!inertial) return;
+    const auto mass = inertial->get_child_optional("mass");
+    if (!mass) fail(fmt::format("{}: its <inertial> has no <mass>", where));
+    const double value = number(attribute(*mass, "value"), where, "its mass");
+    if (!(value >= 0)) fail(fmt::format("{}: its mass must be ≥ 0 kg, got {}", where, value));
+
+    // shapes only matter where they stand in for an inertia
+    if (inertia_is_of_shapes_) return;
+    link.erase("visual");
+    link.erase("collision");
+  }
+
+  [[nodiscard]] std::string link_of(const Tree& joint, const char* end, const std::string& where) const {
+    const auto child = joint.get_child_optional(end);
+    const auto link = child ? attribute(*child, "link") : std::nullopt;
+    if (!link) fail(fmt::format("{}: it has no <{} link=\"…\"/>", where, end));
+    if (links_.count(*link) == 0) {
+      fail(fmt::format("{}: its {} link '{}' is not in the file; add <link name=\"{}\"> or correct the name", where, end, *link,
+                       *link));
+    }
+    return *link;
+  }
+
+  void check_joint(const Tree& joint, std::vector<RobotXml::Mimic>& mimics) {
+    static constexpr std::array<const char*, 6> types = {"revolute", "continuous", "prismatic", "fixed", "floating", "planar"};
+    const std::string name = name_of(joint, "joint");
+    const std::string where = fmt::format("joint '{}'", name);
+    if (!joints_.insert(name).second) fail(fmt::format("{}: it stands twice", where));
+    const std::string type = attribute(joint, "type").value_or("");
+    if (std::find(types.begin(), types.end(), type) == types.end()) {
+      fail(fmt::format("{}: its type is '{}'; there is: {}", where, type, fmt::join(types, ", ")));
+    }
+    if (type == "floating") {
+      fail(
+          fmt::format("{}: it is floating, that is, it has a quaternion, which cannot be a coordinate: make it fixed, or write "
+                      "three prismatic and three revolute joints in its place",
+                      where));
+    }
+    const std::string parent = link_of(joint, "parent", where);
+    const std::string child = link_of(joint, "child", where);
+    if (!parents_.emplace(child, parent).second) {
+      fail(fmt::format("link '{}': it is the child of two joints; a loop is closed in MJCF, with <equality><connect>", child));
+    }
+    if (const auto mimic = joint.get_child_optional("mimic")) {
+      const auto followed = attribute(*mimic, "joint");
+      if (!followed) fail(fmt::format("{}: its <mimic> names no joint", where));
+      const double multiplier = number(attribute(*mimic, "multiplier").value_or("1"), where, "the multiplier of its <mimic>");
+      const double offset = number(attribute(*mimic, "offset").value_or("0"), where, "the offset of its <mimic>");
+      mimics.push_back({name, *followed, multiplier, offset});
+    }
+  }
+
+  // every link hangs, by way of its parents, on one that has none
+  void check_tree() const {
+    std::set<std::string> hangs;
+    for (const std::string& link : links_) {
+      std::set<std::string> path;
+      for (auto step = parents_.find(link); step != parents_.end() && hangs.count(step->first) == 0;
+           step = parents_.find(step->second)) {
+        if (!path.insert(step->first).second) fail(fmt::format("link '{}': it is its own ancestor", step->first));
+      }
+      hangs.merge(path);
+    }
+  }
+
+  void keep_fixed_links() {
+    if (!robot_.get_child_optional("mujoco")) robot_.push_front({"mujoco", Tree()});
+    Tree& mujoco = robot_.get_child("mujoco");
+    if (!mujoco.get_child_optional("compiler")) mujoco.push_front({"compiler", Tree()});
+    Tree& compiler = mujoco.get_child("compiler");
+    if (!attribute(compiler, "fusestatic")) compiler.put("<xmlattr>.fusestatic", "false");
+  }
+
+  Tree& robot_;
+  std::string name_;
+  bool inertia_is_of_shapes_ = false;  // for a link that has its own, too
+  std::set<std::string> links_;
+  std::set<std::string> joints_;
+  std::map<std::string, std::string> parents_;  // of a link by its name
+};
+
+}  // namespace
+
+RobotXml read_robot_xml(const std::string& text, const std::filesystem::path& path) {
+  Tree tree = parse(text, path.string());
+  if (tree.get_child_optional("mujoco")) return {};
+  const auto robot = tree.get_child_optional("robot");
+  if (!robot) {
+    const std::string root = tree.empty() ? ", but it is empty" : fmt::format(", but it starts with <{}>", tree.front().first);
+    throw InputError(fmt::format("{}: a robot is a MJCF file (<mujoco>) or a URDF file (<robot>){}", path.string(), root));
+  }
+  RobotXml xml = Urdf(*robot, path.string()).prepared();
+  std::ostringstream stream;
+  write_xml(stream, tree);
+  xml.text = stream.str();
+  return xml;
+}
+
+}  // namespace gp2

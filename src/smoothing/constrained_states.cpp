@@ -1,0 +1,317 @@
+#include "smoothing/constrained_states.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <set>
+
+#include <fmt/format.h>
+#include <fmt/ranges.h>
+#include <Eigen/Cholesky>
+#include <Eigen/QR>
+#include <Eigen/SVD>
+
+#include "gp2/error.hpp"
+
+namespace gp2 {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+
+namespace {
+
+constexpr double rank_tolerance = 1e-10;
+
+Eigen::CompleteOrthogonalDecomposition<MatrixXd> decomposition_of(const MatrixXd& A) {
+  Eigen::CompleteOrthogonalDecomposition<MatrixXd> decomposition;
+  decomposition.setThreshold(rank_tolerance);
+  decomposition.compute(A);
+  return decomposition;
+}
+
+Index rank_of(const MatrixXd& A) { return A.size() == 0 ? 0 : decomposition_of(A).rank(); }
+
+// orthonormal columns that span {x: A x = 0}
+MatrixXd null_space(const MatrixXd& A) {
+  const Index n = A.cols();
+  if (A.rows() == 0 || n == 0) return MatrixXd::Identity(n, n);
+  const Eigen::ColPivHouseholderQR<MatrixXd> qr = [&] {
+    Eigen::ColPivHouseholderQR<MatrixXd> decomposition;
+    decomposition.setThreshold(rank_tolerance);
+    return decomposition.compute(A.transpose());
+  }();
+  return (qr.householderQ() * MatrixXd::Identity(n, n)).rightCols(n - qr.rank());
+}
+
+// entries of a state that stay as they are while the others are solved for
+std::vector<bool> held_entries(const System& system, const std::vector<int>& measured, const std::vector<int>& blind) {
+  const StateLayout layout = system.layout();
+  std::vector<bool> held(static_cast<std::size_t>(layout.size()), false);
+  for (const int j : measured) held[static_cast<std::size_t>(layout.q(j))] = held[static_cast<std::size_t>(layout.dq(j))] = true;
+  for (const int j : blind) held[static_cast<std::size_t>(layout.q(j))] = true;
+  for (int k = layout.t(); k < layout.size(); ++k) held[static_cast<std::size_t>(k)] = true;
+  return held;
+}
+
+std::vector<int> others(int n, const std::vector<int>& some) {
+  std::vector<int> out;
+  for (int j = 0; j < n; ++j) {
+    if (std::find(some.begin(), some.end(), j) == some.end()) out.push_back(j);
+  }
+  return out;
+}
+
+std::vector<int> joined(std::vector<int> some, const std::vector<int>& more) {
+  some.insert(some.end(), more.begin(), more.end());
+  return some;
+}
+
+std::vector<int> read_positions(const System& system, const std::vector<int>& among) {
+  std::vector<int> out;
+  for (const int j : among) {
+    const auto entry = static_cast<std::size_t>(system.layout().q(j));
+    if (system.reads(SystemPart::mechanics)[entry] || system.reads(SystemPart::force)[entry] ||
+        system.reads(SystemPart::residuals)[entry]) {
+      out.push_back(j);
+    }
+  }
+  return out;
+}
+
+}  // namespace
+
+ConstrainedStates::ConstrainedStates(const ModelFile& model, std::vector<int> measured)
+    : system_(*model.system),
+      parameters_(model.system->parameter_values()),
+      measured_(std::move(measured)),
+      free_(others(system_.nq(), measured_)),
+      seen_(read_positions(system_, free_)),
+      blind_(others(system_.nq(), joined(measured_, seen_))),
+      held_(held_entries(system_, measured_, blind_)),
+      projection_(system_, parameters_, held_) {
+  for (const System::Residual& label : system_.residual_labels()) {
+    (label.velocity ? velocity_rows_ : position_rows_).push_back(label.row);
+  }
+}
+
+// code need not bear a NaN where it reads nothing
+MatrixXd ConstrainedStates::without_blind(const MatrixXd& states) const { return states.array().isNaN().select(0, states); }
+
+void ConstrainedStates::solve_acceleration(const VectorXd& state, Eigen::Ref<VectorXd> acceleration) const {
+  const SystemValues values = system_.evaluate(state, parameters_);
+  const MatrixXd A = values.A(0);
+  const VectorXd rest = values.b(0) - A(Eigen::all, measured_) * acceleration(measured_);
+  const VectorXd solved = decomposition_of(A(Eigen::all, free_)).solve(rest);
+  acceleration(free_) = solved;
+}
+
+void ConstrainedStates::complete(VectorXd& state, Eigen::Ref<VectorXd> acceleration) const {
+  if (free_.empty()) return;
+  state = without_blind(state);
+  projection_.apply(state);
+  solve_acceleration(state, acceleration);
+  for (const int j : blind_) state[system_.layout().q(j)] = std::numeric_limits<double>::quiet_NaN();
+}
+
+void ConstrainedStates::approach(VectorXd& state, Eigen::Ref<VectorXd> acceleration) const {
+  if (free_.empty()) return;
+  state = without_blind(state);
+  const auto first_residual = [&](bool velocity) {
+    const MatrixXd all = system_.residuals(state, parameters_);
+    VectorXd some(static_cast<Index>((velocity ? velocity_rows_ : position_rows_).size()));
+    Index next = 0;
+    for (std::size_t k = 0; k < system_.residual_labels().size(); ++k) {
+      if (system_.residual_labels()[k].velocity == velocity) some[next++] = all(static_cast<Index>(k), 0);
+    }
+    return some;
+  };
+  constexpr int max_iterations = 50;
+  constexpr double close = 1e-12;
+  for (int iteration = 0; iteration < max_iterations && !seen_.empty() && !position_rows_.empty(); ++iteration) {
+    const MatrixXd A = system_.evaluate(state, parameters_).A(0);
+    const VectorXd step = decomposition_of(A(position_rows_, seen_)).solve(first_residual(false));
+    if (!step.allFinite()) break;
+    state(seen_) -= step;  // coordinates come first in a state
+    if (step.cwiseAbs().maxCoeff() <= close * (1 + state(seen_).cwiseAbs().maxCoeff())) break;
+  }
+  if (!velocity_rows_.empty()) {
+    const MatrixXd A = system_.evaluate(state, parameters_).A(0);
+    const VectorXd step = decomposition_of(A(velocity_rows_, free_)).solve(first_residual(true));
+    for (std::size_t k = 0; k < free_.size(); ++k) state[system_.layout().dq(free_[k])] -= step[static_cast<Index>(k)];
+  }
+  solve_acceleration(state, acceleration);
+  for (const int j : blind_) state[system_.layout().q(j)] = std::numeric_limits<double>::quiet_NaN();
+}
+
+int ConstrainedStates::redundancy(const VectorXd& state) const {
+  const MatrixXd A = system_.evaluate(without_blind(state), parameters_).A(0);
+  std::vector<std::string> open;
+  const auto find_open = [&](const std::vector<int>& rows, const std::vector<int>& unknown, const auto& name) {
+    const MatrixXd moves = null_space(A(rows, unknown));
+    for (std::size_t j = 0; j < unknown.size(); ++j) {
+      if (moves.row(static_cast<Index>(j)).norm() > 1e-8)
+        open.push_back(name(system_.coordinates()[static_cast<std::size_t>(unknown[j])]));
+    }
+  };
+  find_open(position_rows_, seen_, [](const Coordinate& coordinate) { return coordinate.name; });
+  if (open.empty()) {
+    find_open(velocity_rows_, free_, [](const Coordinate& coordinate) { return coordinate.velocity(); });
+  }
+  if (!open.empty()) {
+    throw InputError(
+        fmt::format("the log has no column for {0}, and the constraints of '{1}' do not decide {2} from what it has; log {0}, or "
+                    "name its column with --map LOGNAME={0}",
+                    fmt::join(open, ", "), system_.name(), open.size() > 1 ? "them" : "it"));
+  }
+  return static_cast<int>(rank_of(A) - rank_of(A(Eigen::all, free_)));
+}
+
+std::vector<int> ConstrainedStates::independent_accelerations(const MatrixXd& states, const VectorXd& stddev) const {
+  // all accelerations that A allows are Z times n − rank A numbers; rows of Z that stay far from singular say them all
+  constexpr int n_looked_at = 25;
+  std::vector<MatrixXd> bases;
+  std::set<std::vector<int>> candidates;
+  const Index stride = std::max<Index>(1, states.cols() / n_looked_at);
+  for (Index i = 0; i < states.cols(); i += stride) {
+    const MatrixXd A = system_.evaluate(without_blind(states.col(i)), parameters_).A(0);
+    const MatrixXd Z = stddev.cwiseInverse().asDiagonal() * null_space(A)(measured_, Eigen::all);
+    const Eigen::ColPivHouseholderQR<MatrixXd> qr(Z.transpose());
+    std::vector<int> chosen;
+    for (Index k = 0; k < Z.cols(); ++k) chosen.push_back(qr.colsPermutation().indices()[k]);
+    std::sort(chosen.begin(), chosen.end());
+    candidates.insert(chosen);
+    bases.push_back(Z);
+  }
+  std::vector<int> best;
+  double best_worst = -1;
+  for (const std::vector<int>& candidate : candidates) {
+    double worst = std::numeric_limits<double>::infinity();
+    for (const MatrixXd& Z : bases) {
+      if (candidate.size() != static_cast<std::size_t>(Z.cols()))
+        worst = 0;
+      else
+        worst = std::min(worst, Eigen::JacobiSVD<MatrixXd>(Z(candidate, Eigen::all)).singularValues().tail(1).sum());
+    }
+    if (worst > best_worst) {
+      best_worst = worst;
+      best = candidate;
+    }
+  }
+  for (int& k : best) k = measured_[static_cast<std::size_t>(k)];
+  return best;
+}
+
+ConstrainedStates::Linearisation ConstrainedStates::linearise(const VectorXd& state, const VectorXd& acceleration) const {
+  const Index nq = system_.nq(), nc = system_.nc();
+  const auto n_position = static_cast<Index>(position_rows_.size()), n_velocity = static_cast<Index>(velocity_rows_.size());
+  // central differences in q and dq, all in one batch
+  const VectorXd steps = 1e-6 * state.head(2 * nq).cwiseAbs().cwiseMax(1);
+  MatrixXd states = state.replicate(1, 1 + 4 * nq);
+  for (Index k = 0; k < 2 * nq; ++k) {
+    states(k, 1 + 2 * k) += steps[k];
+    states(k, 2 + 2 * k) -= steps[k];
+  }
+  const SystemValues values = system_.evaluate(states, parameters_);
+  MatrixXd residuals(n_position + n_velocity + nc, states.cols());
+  const MatrixXd off = system_.residuals(states, parameters_);
+  Index position = 0, velocity = n_position;
+  for (std::size_t k = 0; k < system_.residual_labels().size(); ++k) {
+    residuals.row(system_.residual_labels()[k].velocity ? velocity++ : position++) = off.row(static_cast<Index>(k));
+  }
+  for (Index i = 0; i < states.cols(); ++i) {
+    residuals.col(i).tail(nc) = values.A(static_cast<int>(i)) * acceleration - values.b(static_cast<int>(i));
+  }
+  Linearisation out{residuals.col(0), MatrixXd::Zero(residuals.rows(), 3 * nq)};
+  for (Index k = 0; k < 2 * nq; ++k) {
+    out.jacobian.col(k) = (residuals.col(1 + 2 * k) - residuals.col(2 + 2 * k)) / (2 * steps[k]);
+  }
+  const MatrixXd A = values.A(0);
+  out.jacobian.topLeftCorner(n_position, nq) = A(position_rows_, Eigen::all);
+  out.jacobian.block(n_position, nq, n_velocity, nq) = A(velocity_rows_, Eigen::all);
+  out.jacobian.bottomRightCorner(nc, nq) = A;
+  return out;
+}
+
+void ConstrainedStates::condition(VectorXd& state, Eigen::Ref<VectorXd> acceleration,
+                                  std::vector<Eigen::Matrix3d>& covariance) const {
+  const Index nq = system_.nq(), n_measured = static_cast<Index>(measured_.size());
+  // measured entries of z are ẑ + W w, w ~ N(0, I)
+  MatrixXd W = MatrixXd::Zero(3 * nq, 3 * n_measured);
+  for (Index k = 0; k < n_measured; ++k) {
+    const Eigen::Matrix3d root = covariance[static_cast<std::size_t>(k)].llt().matrixL();
+    for (Index a = 0; a < 3; ++a) {
+      for (Index b = 0; b <= a; ++b) W(a * nq + measured_[static_cast<std::size_t>(k)], 3 * k + b) = root(a, b);
+    }
+  }
+  std::vector<Index> unknown;
+  for (Index a = 0; a < 3; ++a) {
+    for (const int j : free_) {
+      if (a > 0 || std::find(seen_.begin(), seen_.end(), j) != seen_.end()) unknown.push_back(a * nq + j);
+    }
+  }
+  approach(state, acceleration);
+  VectorXd x = without_blind(state);
+  VectorXd z(3 * nq);
+  z << x.head(2 * nq), acceleration;
+  const VectorXd estimate = z;
+
+  constexpr int max_iterations = 50;
+  constexpr double converged = 1e-9, at_rounding = 1e-14;
+  double previous = std::numeric_limits<double>::infinity();
+  for (int iteration = 0; iteration < max_iterations; ++iteration) {
+    x.head(2 * nq) = z.head(2 * nq);
+    Linearisation at = linearise(x, z.tail(nq));
+    if (!at.residual.allFinite() || !at.jacobian.allFinite()) break;
+    MatrixXd J_measured = at.jacobian * W;
+    // rows in the units of what was measured, so that rank is a matter of directions
+    VectorXd scale = J_measured.rowwise().norm();
+    for (Index i = 0; i < scale.size(); ++i) {
+      if (!(scale[i] > 0)) scale[i] = at.jacobian.row(i).norm();
+      scale[i] = scale[i] > 0 ? 1 / scale[i] : 0;
+    }
+    J_measured = scale.asDiagonal() * J_measured;
+    const MatrixXd J_unknown = scale.asDiagonal() * at.jacobian(Eigen::all, unknown);
+    const MatrixXd U = null_space(J_unknown.transpose());  // combinations of constraints that no unknown enters
+    const MatrixXd B = U.transpose() * J_measured;
+    VectorXd known_off = VectorXd::Zero(3 * nq);
+    for (Index a = 0; a < 3; ++a) {
+      for (const int j : measured_) known_off[a * nq + j] = estimate[a * nq + j] - z[a * nq + j];
+    }
+    const VectorXd wanted = -scale.cwiseProduct(at.residual + at.jacobian * known_off);
+    const auto constraints = decomposition_of(B);
+    const VectorXd w = B.rows() > 0 ? VectorXd(constraints.solve(U.transpose() * wanted)) : VectorXd::Zero(3 * n_measured);
+    VectorXd step = known_off + W * w;
+    if (!unknown.empty()) {
+      const VectorXd left = wanted - J_measured * w;
+      const VectorXd solved = decomposition_of(J_unknown).solve(left);
+      step(unknown) = solved;
+    }
+    z += step;
+    const double size = (step.array() / z.array().abs().max(1)).abs().maxCoeff();
+    if (size <= at_rounding || (size <= converged && size >= previous / 2)) {
+      state.head(2 * nq) = z.head(2 * nq);
+      acceleration = z.tail(nq);
+      MatrixXd kept = MatrixXd::Identity(3 * n_measured, 3 * n_measured);
+      if (B.rows() > 0) kept -= constraints.pseudoInverse() * B;
+      const MatrixXd all = W * kept * W.transpose();
+      for (Index k = 0; k < n_measured; ++k) {
+        for (Index a = 0; a < 3; ++a) {
+          for (Index b = 0; b < 3; ++b) {
+            const int j = measured_[static_cast<std::size_t>(k)];
+            covariance[static_cast<std::size_t>(k)](a, b) = all(a * nq + j, b * nq + j);
+          }
+        }
+      }
+      for (const int j : blind_) state[system_.layout().q(j)] = std::numeric_limits<double>::quiet_NaN();
+      return;
+    }
+    previous = size;
+  }
+  throw NumericalError(
+      fmt::format("system '{}': the measured positions do not meet the constraints at t = {:.6g}; are their units and zeros "
+                  "those of the model?",
+                  system_.name(), state[system_.layout().t()]));
+}
+
+}  // namespace gp2

@@ -1,0 +1,65 @@
+#pragma once
+
+#include <vector>
+
+#include <Eigen/Core>
+
+#include "gp2/model_file.hpp"
+#include "simulation/projection.hpp"
+
+namespace gp2 {
+
+/// What was measured of a motion, together with the constraints, one row after another.
+class ConstrainedStates {
+ public:
+  /// @param measured  coordinates, sorted
+  ConstrainedStates(const ModelFile& model, std::vector<int> measured);
+
+  [[nodiscard]] const std::vector<int>& completed() const { return free_; }  // coordinates that were not measured
+
+  /// Solves a state and its acceleration for what was not measured, the measured coordinates held: positions and velocities by
+  /// Newton's method, the acceleration from A ddq = b. Positions that nothing reads stay NaN.
+  /// @param state         [q; dq; t; u], where the entries to be solved for say where Newton's method starts
+  /// @param acceleration  (nq)
+  /// @throws NumericalError when the constraints are not reached.
+  void complete(Eigen::VectorXd& state, Eigen::Ref<Eigen::VectorXd> acceleration) const;
+
+  /// The same in the sense of least squares, as far as Newton's method comes: where noise contradicts the constraints, close to
+  /// them.
+  void approach(Eigen::VectorXd& state, Eigen::Ref<Eigen::VectorXd> acceleration) const;
+
+  /// How many constraints hold among the measured coordinates alone.
+  /// @throws InputError naming what the constraints leave open at that state.
+  [[nodiscard]] int redundancy(const Eigen::VectorXd& state) const;
+
+  /// n − rank A accelerations of measured coordinates that are farthest from depending on each other at all of the states.
+  /// @param stddev  of the measured ones' accelerations
+  [[nodiscard]] std::vector<int> independent_accelerations(const Eigen::MatrixXd& states, const Eigen::VectorXd& stddev) const;
+
+  /// Conditions z = (q, dq, ddq) of the measured coordinates on c = 0, ċ = 0, A ddq = b, and solves for the others.
+  /// @param covariance  of (q, dq, ddq) of each measured coordinate; that of the result takes its place
+  /// @throws NumericalError when that does not converge.
+  void condition(Eigen::VectorXd& state, Eigen::Ref<Eigen::VectorXd> acceleration,
+                 std::vector<Eigen::Matrix3d>& covariance) const;
+
+ private:
+  void solve_acceleration(const Eigen::VectorXd& state, Eigen::Ref<Eigen::VectorXd> acceleration) const;
+  /// r(z) = (c, ċ, A ddq − b) and J = ∂r/∂z, z = (q, dq, ddq) of all coordinates.
+  struct Linearisation {
+    Eigen::VectorXd residual;
+    Eigen::MatrixXd jacobian;
+  };
+  [[nodiscard]] Linearisation linearise(const Eigen::VectorXd& state, const Eigen::VectorXd& acceleration) const;
+  [[nodiscard]] Eigen::MatrixXd without_blind(const Eigen::MatrixXd& states) const;
+
+  const System& system_;
+  Eigen::VectorXd parameters_;
+  std::vector<int> measured_, free_;
+  std::vector<int> seen_;                           // the other free positions
+  std::vector<int> blind_;                          // free positions that nothing reads
+  std::vector<int> position_rows_, velocity_rows_;  // of A, of the residuals in their order
+  std::vector<bool> held_;                          // entries of the state
+  ConstraintProjection projection_;
+};
+
+}  // namespace gp2

@@ -1,0 +1,316 @@
+#include "gp2/smoother.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <functional>
+#include <limits>
+#include <numbers>
+#include <numeric>
+
+#include <fmt/format.h>
+
+#include "gp2/error.hpp"
+#include "smoothing/matern_motion.hpp"
+
+namespace gp2 {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+
+namespace {
+
+constexpr int n_outputs = 3;  // q, dq, ddq
+
+/// Moments in time, each with its measurements; the steps between them, the equal ones told once.
+struct Timeline {
+  struct Moment {
+    double time = 0;
+    int interval = -1;        // the step that leads here, among `intervals`; −1 at the first
+    int first = 0, last = 0;  // its measurements are [first, last)
+  };
+  std::vector<Moment> moments;
+  std::vector<double> intervals;  // [s]
+};
+
+/// @param times  further moments, increasing
+Timeline timeline_of(const std::vector<Measurement>& measurements, const VectorXd& times = {}) {
+  // stamps of one clock differ in their last digits
+  constexpr double same_interval = 1e-9;
+  Timeline line;
+  int measurement = 0;
+  Index further = 0;
+  const int n_measurements = static_cast<int>(measurements.size());
+  while (measurement < n_measurements || further < times.size()) {
+    const double measured_at = measurement < n_measurements ? measurements[static_cast<std::size_t>(measurement)].time
+                                                            : std::numeric_limits<double>::infinity();
+    const double asked_at = further < times.size() ? times[further] : std::numeric_limits<double>::infinity();
+    Timeline::Moment moment{std::min(measured_at, asked_at), -1, measurement, measurement};
+    while (measurement < n_measurements && measurements[static_cast<std::size_t>(measurement)].time <= moment.time) ++measurement;
+    while (further < times.size() && times[further] <= moment.time) ++further;
+    moment.last = measurement;
+    line.moments.push_back(moment);
+  }
+
+  std::vector<std::pair<double, std::size_t>> steps;
+  for (std::size_t k = 1; k < line.moments.size(); ++k) steps.emplace_back(line.moments[k].time - line.moments[k - 1].time, k);
+  std::sort(steps.begin(), steps.end());
+  for (const auto& [interval, k] : steps) {
+    if (line.intervals.empty() || interval > line.intervals.back() * (1 + same_interval)) line.intervals.push_back(interval);
+    line.moments[k].interval = static_cast<int>(line.intervals.size()) - 1;
+  }
+  return line;
+}
+
+void check(const SmootherModel& model, const std::vector<Measurement>& measurements, const char* caller) {
+  const auto require_positive = [&](double value, const char* name) {
+    if (!(value > 0) || !std::isfinite(value))
+      throw InputError(fmt::format("{}: {} must be positive, got {}", caller, name, value));
+  };
+  require_positive(model.lengthscale, "lengthscale");
+  require_positive(model.signal_stddev, "signal_stddev");
+  require_positive(model.noise_stddev, "noise_stddev");
+  require_positive(model.velocity_noise_stddev, "velocity_noise_stddev");
+  if (!(model.time_stddev >= 0) || !std::isfinite(model.time_stddev)) {
+    throw InputError(fmt::format("{}: time_stddev must not be negative, got {}", caller, model.time_stddev));
+  }
+  if (measurements.empty()) throw InputError(fmt::format("{}: there are no measurements", caller));
+  for (std::size_t k = 0; k < measurements.size(); ++k) {
+    const Measurement& one = measurements[k];
+    if (!std::isfinite(one.time) || !std::isfinite(one.value) || !std::isfinite(one.rate)) {
+      throw InputError(fmt::format("{}: measurement {} must be finite, got {} at time {}", caller, k, one.value, one.time));
+    }
+    require_positive(one.noise_factor, "noise_factor");
+    if (k > 0 && one.time < measurements[k - 1].time) {
+      throw InputError(
+          fmt::format("{}: times must not run backwards, got {} after {}", caller, one.time, measurements[k - 1].time));
+    }
+  }
+}
+
+/// The Kalman filter of one model on one timeline. States are in units of q's size and of the lengthscale's time.
+template <int D>
+class Filter {
+ public:
+  using Motion = MaternMotion<D>;
+  using Vector = typename Motion::Vector;
+  using Matrix = typename Motion::Matrix;
+
+  Filter(const SmootherModel& model, const std::vector<Measurement>& measurements, const Timeline& line)
+      : model_(model), measurements_(measurements), line_(line), rate_(std::sqrt(2.0 * D - 1) / model.lengthscale) {
+    for (int d = 0; d < n_outputs; ++d) unit_[static_cast<std::size_t>(d)] = model.signal_stddev * std::pow(rate_, d);
+    steps_.reserve(line.intervals.size());
+    for (const double interval : line.intervals) steps_.push_back(motion_.step(rate_ * interval));
+    run();
+  }
+
+  [[nodiscard]] double log_likelihood() const { return log_likelihood_; }
+
+  /// With r = ∂ log p/∂x and N = −∂² log p/∂x² of the predicted mean x at a moment, found from the last to the first, the
+  /// derivative by its covariance is ½(r rᵀ − N) (de Jong 1989; Koopman & Shephard 1992), and the rest the chain rule.
+  [[nodiscard]] VectorXd gradient() const {
+    // by log rate, log size, log noise, log velocity noise, log τ
+    VectorXd gradient = VectorXd::Zero(SmootherModel::n_parameters);
+    VectorXd by_interval = VectorXd::Zero(static_cast<Index>(steps_.size()));
+    Vector r = Vector::Zero();
+    Matrix N = Matrix::Zero();
+    for (std::size_t k = line_.moments.size(); k-- > 0;) {
+      const Timeline::Moment& moment = line_.moments[k];
+      for (int m = moment.last; m-- > moment.first;) {
+        const Update& update = updates_[static_cast<std::size_t>(m)];
+        const double along = update.residual / update.variance - update.gain.dot(r);
+        const Vector N_gain = N * update.gain;
+        const double precision = 1 / update.variance + update.gain.dot(N_gain);
+        const double by_log_noise = update.noise_variance * (along * along - precision);
+        gradient[2 + update.derivative] += (1 - update.time_share) * by_log_noise;
+        gradient[4] += update.time_share * by_log_noise;
+        // in its unit a value shrinks as the unit grows, and so does its noise
+        const double by_log_unit = along * update.value - by_log_noise - 1;
+        gradient[0] += update.derivative * by_log_unit;
+        gradient[1] += by_log_unit;
+        // r ← H v/F + (I − K H)ᵀ r,   N ← HᵀH/F + (I − K H)ᵀ N (I − K H)
+        r[update.derivative] += along;
+        N.row(update.derivative) -= N_gain.transpose();
+        N.col(update.derivative) -= N_gain;
+        N(update.derivative, update.derivative) += precision;
+      }
+      if (moment.interval < 0) break;
+      const typename Motion::Step& step = steps_[static_cast<std::size_t>(moment.interval)];
+      const Belief& before = updated_[k - 1];
+      // of x ← Φ x, P ← Φ P Φᵀ + Q with dΦ = F Φ dτ and dQ = g gᵀ dτ
+      const Matrix by_covariance = 0.5 * (r * r.transpose() - N);
+      const Matrix moved = step.transition * before.root;
+      const Vector mean = step.transition * before.mean;
+      by_interval[moment.interval] += r.dot(motion_.F() * mean) +
+                                      2 * (by_covariance * moved).cwiseProduct(motion_.F() * moved).sum() +
+                                      step.impulse.dot(by_covariance * step.impulse);
+      r = (step.transition.transpose() * r).eval();
+      N = (step.transition.transpose() * N * step.transition).eval();
+    }
+    for (std::size_t k = 0; k < steps_.size(); ++k) {
+      gradient[0] += by_interval[static_cast<Index>(k)] * rate_ * line_.intervals[k];
+    }
+    gradient[0] = -gradient[0];  // the rate falls as the lengthscale grows
+    return gradient;
+  }
+
+  /// Rauch–Tung–Striebel: P_k|n = (I − J Φ) P_k (I − J Φ)ᵀ + J Q Jᵀ + J P_k+1|n Jᵀ, a sum of squares.
+  /// @param write  called with each moment's number, mean and covariance, from the last to the first
+  template <typename Write>
+  void smooth(const Write& write) const {
+    Belief smoothed = updated_.back();
+    for (std::size_t k = line_.moments.size(); k-- > 0;) {
+      if (k + 1 < line_.moments.size()) {
+        const typename Motion::Step& step = steps_[static_cast<std::size_t>(line_.moments[k + 1].interval)];
+        const Belief &here = updated_[k], &next = predicted_[k + 1];
+        // J = P Φᵀ (S Sᵀ)⁻¹ with S the root of the predicted covariance
+        const Matrix moved = step.transition * here.root;
+        const auto S = next.root.template triangularView<Eigen::Lower>();
+        Matrix J_transposed = moved * here.root.transpose();
+        S.solveInPlace(J_transposed);
+        S.transpose().solveInPlace(J_transposed);
+        const Matrix J = J_transposed.transpose();
+        Eigen::Matrix<double, D, 3 * D> columns;
+        columns << here.root - J * moved, J * step.noise_factor, J * smoothed.root;
+        smoothed.mean = (here.mean + J * (smoothed.mean - next.mean)).eval();
+        smoothed.root = triangular_root<D, 3 * D>(columns);
+      }
+      const Eigen::Matrix3Xd root = smoothed.root.template topRows<n_outputs>();
+      Eigen::Vector3d mean = smoothed.mean.template head<n_outputs>();
+      Eigen::Matrix3d covariance = root * root.transpose();
+      const Eigen::Map<const Eigen::Vector3d> unit(unit_.data());
+      mean = mean.cwiseProduct(unit).eval();
+      covariance = (unit.asDiagonal() * covariance * unit.asDiagonal()).eval();
+      write(k, mean, covariance);
+    }
+  }
+
+ private:
+  /// N(mean, root rootᵀ).
+  struct Belief {
+    Vector mean;
+    Matrix root;
+  };
+  /// What a measurement did.
+  struct Update {
+    int derivative = 0;  // 0: of q, 1: of dq
+    double value = 0, residual = 0, variance = 0, noise_variance = 0;
+    double time_share = 0;  // of noise_variance that is due to τ
+    Vector gain;
+  };
+
+  void run() {
+    predicted_.resize(line_.moments.size());
+    updated_.resize(line_.moments.size());
+    updates_.resize(measurements_.size());
+    Belief belief{Vector::Zero(), motion_.stationary_root()};
+    for (std::size_t k = 0; k < line_.moments.size(); ++k) {
+      const Timeline::Moment& moment = line_.moments[k];
+      if (moment.interval >= 0) {
+        const typename Motion::Step& step = steps_[static_cast<std::size_t>(moment.interval)];
+        Eigen::Matrix<double, D, 2 * D> columns;
+        columns << step.transition * belief.root, step.noise_factor;
+        belief.root = triangular_root<D, 2 * D>(columns);
+        belief.mean = (step.transition * belief.mean).eval();
+      }
+      predicted_[k] = belief;
+      for (int m = moment.first; m < moment.last; ++m) take_in(m, belief);
+      updated_[k] = belief;
+    }
+  }
+
+  // Potter's update: P − P Hᵀ H P / F = S (I − f fᵀ/F) Sᵀ with f = Sᵀ Hᵀ, and I − f fᵀ/F = (I − γ f fᵀ)², γ = 1/(F + √(F R))
+  void take_in(int m, Belief& belief) {
+    const Measurement& measurement = measurements_[static_cast<std::size_t>(m)];
+    Update& update = updates_[static_cast<std::size_t>(m)];
+    update.derivative = measurement.velocity ? 1 : 0;
+    const double unit = unit_[static_cast<std::size_t>(update.derivative)];
+    const double read = measurement.noise_factor * (measurement.velocity ? model_.velocity_noise_stddev : model_.noise_stddev);
+    const double late = measurement.velocity ? 0 : model_.time_stddev * measurement.rate;
+    const double noise = std::hypot(read, late) / unit;
+    update.value = measurement.value / unit;
+    update.noise_variance = noise * noise;
+    update.time_share = late * late / (read * read + late * late);
+    const Vector f = belief.root.row(update.derivative).transpose();
+    update.variance = f.squaredNorm() + update.noise_variance;
+    update.residual = update.value - belief.mean[update.derivative];
+    const Vector covariance = belief.root * f;
+    update.gain = covariance / update.variance;
+    belief.mean += update.gain * update.residual;
+    belief.root -= covariance / (update.variance + std::sqrt(update.variance) * noise) * f.transpose();
+    log_likelihood_ -=
+        0.5 * (update.residual * update.residual / update.variance + std::log(2 * std::numbers::pi * update.variance)) +
+        std::log(unit);
+  }
+
+  const SmootherModel& model_;
+  const std::vector<Measurement>& measurements_;
+  const Timeline& line_;
+  Motion motion_;
+  double rate_;                           // dτ/dt
+  std::array<double, n_outputs> unit_{};  // of q, dq, ddq
+  std::vector<typename Motion::Step> steps_;
+  std::vector<Belief> predicted_, updated_;  // at each moment, before and after its measurements
+  std::vector<Update> updates_;
+  double log_likelihood_ = 0;
+};
+
+/// work(Filter) of the right number of states.
+template <typename Work>
+auto with_filter(const SmootherModel& model, const std::vector<Measurement>& measurements, const Timeline& line,
+                 const Work& work) {
+  switch (model.smoothness) {
+    case Smoothness::matern52:
+      return work(Filter<3>(model, measurements, line));
+    case Smoothness::matern72:
+      return work(Filter<4>(model, measurements, line));
+    case Smoothness::matern92:
+      break;
+  }
+  return work(Filter<5>(model, measurements, line));
+}
+
+}  // namespace
+
+const std::vector<std::string>& smoothness_words() {
+  static const std::vector<std::string> words = {"5/2", "7/2", "9/2"};
+  return words;
+}
+
+std::optional<Smoothness> smoothness_of(const std::string& word) {
+  if (word == "5/2") return Smoothness::matern52;
+  if (word == "7/2") return Smoothness::matern72;
+  if (word == "9/2") return Smoothness::matern92;
+  return std::nullopt;
+}
+
+double log_likelihood(const SmootherModel& model, const std::vector<Measurement>& measurements, VectorXd* gradient) {
+  check(model, measurements, "log_likelihood");
+  return with_filter(model, measurements, timeline_of(measurements), [&](const auto& filter) {
+    if (gradient) *gradient = filter.gradient();
+    return filter.log_likelihood();
+  });
+}
+
+SmoothedMotion smooth(const SmootherModel& model, const std::vector<Measurement>& measurements, const VectorXd& times) {
+  check(model, measurements, "smooth");
+  for (Index k = 0; k < times.size(); ++k) {
+    if (!std::isfinite(times[k]) || (k > 0 && !(times[k] > times[k - 1]))) {
+      throw InputError(fmt::format("smooth: times must be finite and increase, got {} at {}", times[k], k));
+    }
+  }
+  const Timeline line = timeline_of(measurements, times);
+  SmoothedMotion out{Eigen::Matrix3Xd(3, times.size()), std::vector<Eigen::Matrix3d>(static_cast<std::size_t>(times.size()))};
+  with_filter(model, measurements, line, [&](const auto& filter) {
+    Index next = times.size() - 1;
+    filter.smooth([&](std::size_t k, const Eigen::Vector3d& mean, const Eigen::Matrix3d& covariance) {
+      if (next < 0 || line.moments[k].time != times[next]) return;
+      out.mean.col(next) = mean;
+      out.covariance[static_cast<std::size_t>(next--)] = covariance;
+    });
+    return 0;
+  });
+  return out;
+}
+
+}  // namespace gp2

@@ -1,0 +1,230 @@
+#include <gtest/gtest.h>
+
+#include "gp2/error.hpp"
+#include "gp2/evaluation.hpp"
+#include "inference/sampling.hpp"
+
+// Observations whose values have a noise each.
+namespace gp2 {
+namespace {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+using test::largest;
+using test::Problem;
+using test::Quantity;
+
+constexpr std::uint64_t seed = 40411;
+
+std::vector<Problem> problems() {
+  std::vector<Problem> all;
+  for (const Problem& p : test::problems(9, seed)) all.push_back(test::with_noise_scale(p, seed + all.size()));
+  return all;
+}
+
+struct Evaluated {
+  double value = 0;
+  ModelValues gradient;
+};
+
+// under every derivative there is
+Evaluated evaluate(const Problem& p) {
+  Likelihood::Options options;
+  options.noise_gradient = true;
+  for (int k = 0; k < static_cast<int>(p.values.parameters.size()); ++k) options.gradient_parameters.push_back(k);
+  Likelihood::Workspace workspace;
+  Evaluated out;
+  out.value = Likelihood(p.prior, p.observations, p.values, options).evaluate(p.values, &out.gradient, workspace);
+  return out;
+}
+
+View every_acceleration(const Problem& p) { return View::all(Quantity::unconstrained_acceleration, *p.prior.system); }
+
+Posterior posterior_of(const Problem& p) { return {p.prior, p.observations, p.values}; }
+
+// ε times the condition number of K̃ + I, after mechanics with κ(M) of some hundreds
+double rounding(const Problem& p) { return 1e4 * test::eps * test::condition(p); }
+
+TEST(ValueNoiseTest, TheLikelihoodIsTheDenseMultivariateNormalDensity) {
+  for (const Problem& p : problems()) {
+    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, seed));
+    const double dense = test::dense_negative_log_likelihood(p);
+    EXPECT_NEAR(evaluate(p).value, dense, rounding(p) * (1 + std::abs(dense)));
+    EXPECT_NEAR(posterior_of(p).negative_log_likelihood(), dense, rounding(p) * (1 + std::abs(dense)));
+    EXPECT_LT(rounding(p), 1e-6) << "too badly conditioned to test anything";
+  }
+}
+
+TEST(ValueNoiseTest, ThePosteriorIsTheTextbookGaussianProcess) {
+  for (const Problem& p : problems()) {
+    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, seed));
+    const auto [mean, covariance] = test::dense_posterior(p, every_acceleration(p), p.queries);
+    const Posterior::Joint joint = posterior_of(p).joint(every_acceleration(p), p.queries);
+    EXPECT_LE(largest(joint.mean - mean), rounding(p) * (1 + largest(mean)));
+    EXPECT_LE(largest(joint.covariance - covariance), rounding(p) * (1 + largest(covariance)));
+  }
+}
+
+TEST(ValueNoiseTest, AScaleOfOneChangesNoBit) {
+  for (const Problem& p : test::problems(9, seed)) {
+    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, seed));
+    Problem scaled = p;
+    for (Observations& group : scaled.observations) group.noise_scale.setOnes(group.values.rows(), group.values.cols());
+    const Evaluated expected = evaluate(p), got = evaluate(scaled);
+    EXPECT_EQ(got.value, expected.value);
+    EXPECT_EQ(got.gradient.kernel, expected.gradient.kernel);
+    EXPECT_EQ(got.gradient.noise_stddev, expected.gradient.noise_stddev);
+    EXPECT_EQ(got.gradient.parameters, expected.gradient.parameters);
+    const Posterior plain = posterior_of(p), of_scaled = posterior_of(scaled);
+    EXPECT_EQ(of_scaled.negative_log_likelihood(), plain.negative_log_likelihood());
+    EXPECT_EQ(of_scaled.mean(every_acceleration(p), p.queries), plain.mean(every_acceleration(p), p.queries));
+  }
+}
+
+TEST(ValueNoiseTest, OnlyTheProductOfFactorAndScaleCounts) {
+  for (const Problem& p : problems()) {
+    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, seed));
+    Problem other = p;
+    for (std::size_t g = 0; g < p.observations.size(); ++g) {
+      other.observations[g].noise_scale *= 3;
+      other.values.noise_stddev[g] /= 3;
+    }
+    const Evaluated expected = evaluate(p), got = evaluate(other);
+    EXPECT_NEAR(got.value, expected.value, rounding(p) * (1 + std::abs(expected.value)));
+    for (std::size_t g = 0; g < p.observations.size(); ++g) {
+      EXPECT_LE(largest(got.gradient.noise_stddev[g] - expected.gradient.noise_stddev[g]),
+                rounding(p) * (1 + largest(expected.gradient.noise_stddev[g])));
+      EXPECT_FALSE(expected.gradient.noise_stddev[g].isZero(1e-3));
+    }
+    const MatrixXd mean = posterior_of(p).mean(every_acceleration(p), p.queries);
+    EXPECT_LE(largest(posterior_of(other).mean(every_acceleration(p), p.queries) - mean), rounding(p) * (1 + largest(mean)));
+  }
+}
+
+TEST(ValueNoiseTest, AValueOfVastNoiseSaysNothing) {
+  for (Problem p : problems()) {
+    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, seed));
+    Problem without = p;
+    for (Problem* each : {&p, &without}) each->observations.resize(1), each->values.noise_stddev.resize(1);
+    // its pull on the mean falls with the square of the noise: 1e-14 is below rounding
+    p.observations[0].noise_scale.col(0).setConstant(1e7);
+    Observations& group = without.observations[0];
+    const auto rest = Eigen::seq(1, Eigen::last);
+    group.states = MatrixXd(group.states(Eigen::all, rest));
+    group.values = MatrixXd(group.values(Eigen::all, rest));
+    group.noise_scale = MatrixXd(group.noise_scale(Eigen::all, rest));
+    const MatrixXd expected = posterior_of(without).mean(every_acceleration(p), p.queries);
+    const MatrixXd got = posterior_of(p).mean(every_acceleration(p), p.queries);
+    EXPECT_LE(largest(got - expected), (1e-11 + rounding(without)) * (1 + largest(expected)));
+  }
+}
+
+TEST(ValueNoiseTest, APosteriorThatGrowsAndShrinksIsTheOneBuiltAnew) {
+  for (const Problem& p : problems()) {
+    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, seed));
+    const auto columns = [&](std::size_t g, const auto& some) {
+      const Observations& all = p.observations[g];
+      return Observations{MatrixXd(all.states(Eigen::all, some)),
+                          all.view,
+                          MatrixXd(all.values(Eigen::all, some)),
+                          p.values.noise_stddev[g],
+                          false,
+                          MatrixXd(all.noise_scale(Eigen::all, some))};
+    };
+    Posterior posterior = posterior_of(p).without_data();
+    for (std::size_t g = 0; g < p.observations.size(); ++g) {
+      posterior = update(std::move(posterior), columns(g, Eigen::seq(0, 1)));
+      posterior = update(std::move(posterior), columns(g, Eigen::seq(2, Eigen::last)));
+    }
+    ASSERT_EQ(posterior.observations().size(), p.observations.size()) << "one noise and view is one group";
+    const auto expect_equal = [&](const Problem& anew) {
+      const Posterior expected = posterior_of(anew);
+      EXPECT_NEAR(posterior.negative_log_likelihood(), expected.negative_log_likelihood(),
+                  rounding(p) * (1 + std::abs(expected.negative_log_likelihood())));
+      const MatrixXd mean = expected.mean(every_acceleration(p), p.queries);
+      EXPECT_LE(largest(posterior.mean(every_acceleration(p), p.queries) - mean), rounding(p) * (1 + largest(mean)));
+      EXPECT_EQ(posterior.observations()[0].noise_scale, anew.observations[0].noise_scale);
+    };
+    expect_equal(p);
+    posterior = remove_oldest(std::move(posterior), 2);
+    Problem rest = p;
+    rest.observations[0] = columns(0, Eigen::seq(2, Eigen::last));
+    expect_equal(rest);
+  }
+}
+
+TEST(ValueNoiseTest, ValuesOfOneNoiseAndOfTheirOwnAreGroupsApart) {
+  const Problem p = problems().front();
+  Observations plain = p.observations[0];
+  plain.noise_stddev = p.values.noise_stddev[0];
+  plain.noise_scale = {};
+  Posterior posterior = update(posterior_of(p), plain);
+  ASSERT_EQ(posterior.observations().size(), 2U);
+  EXPECT_FALSE(posterior.observations()[1].has_noise_scale());
+  posterior = remove_oldest(std::move(posterior), plain.n_data());
+  EXPECT_EQ(posterior.observations()[0].n_data(), 0);
+  EXPECT_TRUE(std::isfinite(posterior.negative_log_likelihood()));
+}
+
+TEST(ValueNoiseTest, TheUsualNoiseIsTheMedian) {
+  Observations group;
+  group.noise_scale = (MatrixXd(2, 3) << 1, 2, 9, 5, 3, 4).finished();
+  EXPECT_EQ(group.usual_noise(Eigen::Vector2d(10, 1)), Eigen::Vector2d(20, 4));
+  EXPECT_EQ(group.noise_at(Eigen::Vector2d(10, 1), 2), Eigen::Vector2d(90, 4));
+  group.noise_scale = {};
+  EXPECT_EQ(group.usual_noise(Eigen::Vector2d(10, 1)), Eigen::Vector2d(10, 1));
+  EXPECT_EQ(group.noise_at(Eigen::Vector2d(10, 1), 2), Eigen::Vector2d(10, 1));
+}
+
+TEST(ValueNoiseTest, AnEvaluationMeasuresByTheUsualNoise) {
+  for (const Problem& p : problems()) {
+    const View every = View::all(Quantity::constrained_acceleration, *p.prior.system);
+    if (!(p.observations[0].view == every)) continue;
+    const MatrixXd targets = MatrixXd::Zero(every.size(), p.queries.cols());
+    const Posterior posterior = posterior_of(p);
+    const Posterior::Marginal prediction = posterior.marginal(every, p.queries);
+    const VectorXd noise = p.observations[0].usual_noise(p.values.noise_stddev[0]);
+    const Eigen::ArrayXXd variance = prediction.stddev().array().square().colwise() + noise.array().square();
+    const double expected =
+        0.5 * (prediction.mean.array().square() / variance + variance.log() + std::log(2 * std::numbers::pi)).mean();
+    EXPECT_NEAR(evaluate_predictions(posterior, p.queries, every.rows, targets).nlpd, expected, 1e-12 * (1 + std::abs(expected)));
+    return;
+  }
+  FAIL() << "no problem observes every acceleration";
+}
+
+TEST(ValueNoiseTest, AScaleOfTheWrongShapeOrSignIsRefused) {
+  const Problem p = problems().front();
+  const auto refused = [&](const auto& change) {
+    Problem bad = p;
+    change(bad.observations[0].noise_scale);
+    std::vector<std::string> texts;
+    const auto note = [&](const auto& work) {
+      try {
+        work();
+        texts.emplace_back();
+      } catch (const InputError& error) {
+        texts.emplace_back(error.what());
+      }
+    };
+    note([&] { Likelihood(bad.prior, bad.observations, bad.values, {}); });
+    note([&] { posterior_of(bad); });
+    note([&] { static_cast<void>(update(posterior_of(p), bad.observations[0])); });
+    EXPECT_EQ(texts[0], texts[1]);
+    EXPECT_EQ("update: " + texts[0], texts[2]);
+    return texts[0];
+  };
+  const Index d = p.observations[0].values.rows(), n = p.observations[0].values.cols();
+  EXPECT_EQ(refused([&](MatrixXd& scale) { scale = MatrixXd::Ones(d, n - 1); }),
+            fmt::format("noise_scale must hold one number for each of the {} × {} values, got {} × {}; leave it empty where each "
+                        "row has one noise",
+                        d, n, d, n - 1));
+  const std::string rule = "noise_scale must be positive and finite, got {}; leave out values that are worth nothing";
+  EXPECT_EQ(refused([](MatrixXd& scale) { scale(0, 1) = 0; }), fmt::format(fmt::runtime(rule), 0));
+  EXPECT_EQ(refused([](MatrixXd& scale) { scale(0, 1) = -2; }), fmt::format(fmt::runtime(rule), -2));
+  EXPECT_EQ(refused([](MatrixXd& scale) { scale(0, 1) = std::nan(""); }), fmt::format(fmt::runtime(rule), "nan"));
+}
+
+}  // namespace
+}  // namespace gp2

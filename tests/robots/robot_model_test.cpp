@@ -1,0 +1,206 @@
+// Robot models from end to end: driven motion, fits that keep their robot, long simulations.
+
+#include <cmath>
+#include <filesystem>
+#include <string>
+
+#include <fmt/format.h>
+#include <gtest/gtest.h>
+
+#include "gp2/csv.hpp"
+#include "gp2/error.hpp"
+#include "gp2/fit_file.hpp"
+#include "gp2/fit_problem.hpp"
+#include "gp2/generate.hpp"
+#include "gp2/mechanics.hpp"
+#include "gp2/model_file.hpp"
+#include "gp2/predictor.hpp"
+#include "gp2/simulate.hpp"
+
+namespace gp2 {
+namespace {
+
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+
+ModelFile read(const char* file) { return ModelFile::read(std::filesystem::path(GP2_SOURCE_DIR) / file); }
+
+GeneratedData motion_of(const ModelFile& model, int n, double noise = 0, std::uint64_t seed = 1) {
+  return generate(model, {n, seed, VectorXd::Constant(model.system->nq(), noise)});
+}
+
+double value_of(const ModelFile& model, const std::string& text, const VectorXd& state) {
+  const Expression e = model.expression(text);
+  MatrixXd value;
+  Tape(std::span(&e, 1), model.symbols().state_and_parameters()).evaluate(state, model.system->parameter_values(), value);
+  return value(0, 0);
+}
+
+TEST(Motion, OfTheArmKeepsItsTipOnThePlaneAndPointingDown) {
+  const ModelFile model = read("experiments/arm_on_surface/arm.toml");
+  const GeneratedData data = motion_of(model, 240);
+  double moved = 0;
+  for (Eigen::Index i = 0; i < data.states.cols(); ++i) {
+    const VectorXd state = data.states.col(i);
+    EXPECT_NEAR(value_of(model, "site('tip').z", state), 0.055, 1e-14);
+    EXPECT_NEAR(value_of(model, "dsite('tip').z", state), 0, 1e-13);
+    // what the controller does not know, friction of 1 N s/m, is small beside its gain
+    EXPECT_NEAR(value_of(model, "site('tip').rot_zz", state), -1, 1e-3);
+    moved = std::max(moved, std::abs(value_of(model, "site('tip').x", state)));
+  }
+  EXPECT_GT(moved, 0.05);
+  const MechanicsBatch mechanics = require_mechanics(*model.system, data.states, model.system->parameter_values());
+  for (int i = 0; i < static_cast<int>(data.states.cols()); ++i) {
+    const VectorXd error = mechanics.values.A(i) * data.accelerations.col(i) - mechanics.values.b(i);
+    EXPECT_LE(error.cwiseAbs().maxCoeff(), 1e-12 * (1 + data.accelerations.col(i).cwiseAbs().maxCoeff()));
+  }
+}
+
+TEST(Motion, ReachesItsTargetsWhereTheControllerKnowsEverything) {
+  // a slider on a rail, no unknown force: the reference is followed to the order of the hold, ω⁻² of the jerk between samples
+  const ModelFile model = ModelFile::parse(R"(
+coordinates = ["q1"]
+inputs = ["u1"]
+[mechanics]
+mass = [["2"]]
+force = ["u1 - 3*q1"]
+[truth]
+acceleration = ["0"]
+[motion]
+rate = 200
+segment = [1, 1.000001]
+natural_frequency = 30
+targets = { q1 = [2, 2.000001] }
+)",
+                                           "slider");
+  const GeneratedData data = motion_of(model, 300);
+  EXPECT_EQ(data.states(0, 0), 0);
+  EXPECT_NEAR(data.states(0, 299), 2, 2e-3);
+  EXPECT_NEAR(data.states(0, 100), 1, 2e-2) << "half of the way in half of the time";
+}
+
+TEST(Motion, IsTheSameForAnyNoiseAndTheSameSeedOnly) {
+  const ModelFile model = read("models/four_bar.toml");
+  const GeneratedData quiet = motion_of(model, 40), noisy = motion_of(model, 40, 0.1), other = motion_of(model, 40, 0, 2);
+  EXPECT_EQ(quiet.states, noisy.states);
+  EXPECT_NE(quiet.accelerations, noisy.accelerations);
+  EXPECT_NE(quiet.states, other.states);
+}
+
+std::string error_of(const std::string& text) {
+  try {
+    const ModelFile model = ModelFile::parse(text, "m");
+    motion_of(model, 2);
+  } catch (const std::exception& error) {
+    return error.what();
+  }
+  return "no error";
+}
+
+TEST(Motion, SaysWhatIsWrongWithIt) {
+  const std::string head = "coordinates = ['q1']\ninputs = ['u1']\n[mechanics]\nmass = [['1']]\nforce = ['u1']\n";
+  const std::string truth = "[truth]\nacceleration = ['0']\n";
+  const std::string motion = "[motion]\nrate = 10\nsegment = [1, 2]\n";
+  const auto expect = [&](const std::string& text, const std::string& part) {
+    EXPECT_NE(error_of(text).find(part), std::string::npos) << error_of(text);
+  };
+  expect(head + truth + motion, "missing targets = { q1 = [lower, upper], … }");
+  expect(head + truth + motion + "targets = {}\n", "a motion needs at least one target");
+  expect(head + truth + motion + "targets = { dq1 = [0, 1] }\n", "must be a function of the coordinates");
+  expect(head + truth + motion + "targets = { q1 = [0, 1] }\nhold = ['q2']\n", "unknown symbol 'q2'");
+  expect(head + truth + motion + "targets = { q1 = [0, 1] }\nprofile = 'linear'\n", R"(expected "smooth" or "trapezoid")");
+  expect(head + truth + motion + "targets = { q1 = [0, 1] }\nnatural_frequency = 0\n", "must be positive, got 0");
+  expect(head + truth + motion + "targets = { q1 = [0, 1] }\nstart = { q3 = 0 }\n",
+         "'q3' is neither a coordinate nor a velocity");
+  expect(head + truth + motion + "targets = { q1 = [0, 1] }\n[sampling]\nq1 = [0, 1]\n", "remove one of the two");
+  expect(head + truth + "[motion]\nsegment = [1, 2]\n", "missing rate = …");
+  expect(head + truth + "[motion]\nrate = 10\n", "missing segment = [shortest, longest]");
+  expect(head + truth + "[motion]\nrate = 10\nsegment = [-1, 2]\n", "a line takes a positive time");
+  expect(head + motion + "targets = { q1 = [0, 1] }\n", "missing [truth]");
+  expect("coordinates = ['q1']\n[mechanics]\nmass = [['1']]\n" + truth + motion + "targets = { q1 = [0, 1] }\n",
+         "a model without inputs cannot be driven");
+  const ModelFile model = ModelFile::parse(head + truth + motion + "targets = { q1 = [0, 1] }\n", "m");
+  GenerateOptions grid{2, 1, VectorXd::Zero(1)};
+  grid.grid["q1"] = 3;
+  EXPECT_THROW(generate(model, grid), InputError);
+}
+
+Fit fit_of(const ModelFile& model, FitProblem& problem, int n) {
+  const CsvTable log = as_table(motion_of(model, n, 0.05), *model.system, "log");
+  FitProblemOptions options;
+  options.mean = Prior::Mean::force;
+  problem = make_fit_problem(model, log, options);
+  FitOptions fit_options = default_fit_options(problem);
+  fit_options.n_restarts = 1;
+  fit_options.max_iterations = 30;
+  return fit(problem, fit_options);
+}
+
+TEST(RobotFit, IsReadBackWithoutTheRobotsFileAndPredictsTheSameBits) {
+  const std::filesystem::path folder = std::filesystem::path(testing::TempDir()) / "robot_fit";
+  std::filesystem::create_directories(folder);
+  for (const char* file : {"four_bar.toml", "four_bar.xml"}) {
+    std::filesystem::copy_file(std::filesystem::path(GP2_SOURCE_DIR) / "models" / file, folder / file,
+                               std::filesystem::copy_options::overwrite_existing);
+  }
+  const ModelFile model = ModelFile::read(folder / "four_bar.toml");
+  FitProblem problem;
+  const Fit fitted = fit_of(model, problem, 40);
+  FitFile file;
+  file.model = model;
+  file.prior_options = problem.prior_options;
+  file.observations = problem.observations;
+  file.report = fitted.report;
+  file.write(folder / "fit.json");
+  std::filesystem::remove(folder / "four_bar.xml");
+  const FitFile again = FitFile::read(folder / "fit.json");
+  const MatrixXd states = motion_of(model, 20, 0, 3).states;
+  const View view = View::all(View::Quantity::constrained_acceleration, *model.system);
+  EXPECT_EQ(again.posterior().mean(view, states), file.posterior().mean(view, states));
+  EXPECT_THROW(ModelFile::read(folder / "four_bar.toml"), InputError) << "the model itself does need it";
+}
+
+TEST(RobotFit, OfTheFourBarStaysOnItsLoopForAMinute) {
+  const ModelFile model = read("models/four_bar.toml");
+  FitProblem problem;
+  const Fit fitted = fit_of(model, problem, 100);
+  VectorXd start = VectorXd::Zero(model.system->layout().size());
+  start[model.system->layout().dq(0)] = 3;
+  SimulateOptions options;
+  options.times = VectorXd::LinSpaced(121, 0, 60);
+  const View view = View::all(View::Quantity::constrained_acceleration, *model.system);
+  const Trajectory motion = simulate(
+      *model.system, model.system->parameter_values(),
+      [&](const Eigen::Ref<const VectorXd>& state) -> VectorXd { return fitted.posterior.mean(view, state); },
+      project_onto_constraints(*model.system, model.system->parameter_values(), start), options);
+  EXPECT_LE(motion.max_position_drift, 1e-10);
+  EXPECT_LE(motion.max_velocity_drift, 1e-10);
+}
+
+// two state Jacobians: exact derivatives of the robot's expressions, and differences of the mean
+TEST(RobotFit, PredictorHasTheJacobianOfItsMean) {
+  const ModelFile model = read("models/four_bar.toml");
+  FitProblem problem;
+  const Fit fitted = fit_of(model, problem, 40);
+  const View view = View::all(View::Quantity::constrained_acceleration, *model.system);
+  const Predictor predictor(fitted.posterior, view);
+  Predictor::Workspace workspace = predictor.make_workspace();
+  VectorXd state = motion_of(model, 30, 0, 4).states.col(29);
+  MatrixXd jacobian(3, state.size());
+  VectorXd mean(3), above(3), below(3);
+  ASSERT_EQ(predictor.mean_and_jacobian(state, mean, jacobian, workspace), Predictor::Status::ok);
+  for (int k : {0, 1, 2, 3, 4, 5, 7}) {
+    const double h = 1e-6;
+    VectorXd moved = state;
+    moved[k] += h;
+    ASSERT_EQ(predictor.mean(moved, above, workspace), Predictor::Status::ok);
+    moved[k] -= 2 * h;
+    ASSERT_EQ(predictor.mean(moved, below, workspace), Predictor::Status::ok);
+    const VectorXd difference = (above - below) / (2 * h);
+    EXPECT_LE((jacobian.col(k) - difference).cwiseAbs().maxCoeff(), 1e-5 * (1 + difference.cwiseAbs().maxCoeff())) << k;
+  }
+  EXPECT_GT(jacobian.cwiseAbs().maxCoeff(), 0.1);
+}
+
+}  // namespace
+}  // namespace gp2
