@@ -35,14 +35,6 @@ std::map<std::string, std::string> parse_map(const std::string& text) {
   return columns;
 }
 
-std::string csv_cell(const std::string& text) {
-  const bool plain = text.find_first_of(",\"") == std::string::npos && !text.starts_with(' ') && !text.ends_with(' ');
-  if (plain) return text;
-  std::string cell = "\"";
-  for (char c : text) cell.append(c == '"' ? 2 : 1, c);  // a quote is written twice
-  return cell += '"';
-}
-
 CLI::Validator not_negative() {
   const auto check = [](const std::string& text) {
     return text.starts_with('-') ? "must not be negative, got " + text : std::string();

@@ -31,10 +31,6 @@ void add_reproduce(CLI::App& app);
 /// "theta1=q3,theta2=q6" -> model's name -> log's name.
 /// @throws InputError when it is not of that form.
 std::map<std::string, std::string> parse_map(const std::string& text);
-
-/// A cell of a CSV file that reads back as `text`.
-std::string csv_cell(const std::string& text);
-
 /// "a,b" -> {"a", "b"}; empty for "" .
 std::vector<std::string> parse_list(const std::string& text);
 

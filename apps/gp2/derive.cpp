@@ -123,18 +123,7 @@ void run(const Arguments& arguments) {
   const DerivedData data = derive(model, log, options);
 
   const CsvTable table = as_table(data, *model.system, arguments.output);
-  std::string csv;
-  for (int column = 0; column < table.n_columns(); ++column) {
-    csv += csv_cell(table.header()[static_cast<std::size_t>(column)]);
-    csv += column + 1 < table.n_columns() ? ',' : '\n';
-  }
-  for (int row = 0; row < table.n_rows(); ++row) {
-    for (int column = 0; column < table.n_columns(); ++column) {
-      csv += csv_cell(table.cell(row, column));
-      csv += column + 1 < table.n_columns() ? ',' : '\n';
-    }
-  }
-  write_file(arguments.output, csv);
+  write_file(arguments.output, table.text());
   talk(data.notes);
   report(data, *model.system);
   std::vector<std::string> independent;

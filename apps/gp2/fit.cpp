@@ -45,10 +45,12 @@ FitProblemOptions problem_options(const Arguments& arguments) {
   }
   if (arguments.noise == "estimate") {
     options.estimate_noise = true;
+  } else if (arguments.noise == "stated") {
+    options.trust_stated_noise = true;
   } else if (!arguments.noise.empty()) {
     double value = 0;
     if (!CLI::detail::lexical_cast(arguments.noise, value) || !(value > 0) || !std::isfinite(value)) {
-      throw InputError(fmt::format("--noise-std: expected a positive number or 'estimate', got '{}'", arguments.noise));
+      throw InputError(fmt::format("--noise-std: expected a positive number, 'estimate' or 'stated', got '{}'", arguments.noise));
     }
     options.noise_stddev = value;
   }
@@ -211,7 +213,8 @@ void add_fit(CLI::App& app) {
   command->add_option("--estimate", a->estimate, "parameters to estimate, p1,p2, or none (default: those the model says)");
   command->add_option(
       "--noise-std", a->noise,
-      "noise standard deviation of every observed ddq, or 'estimate' (default: as the log's NAME_std or the model says)");
+      "noise standard deviation of every observed ddq, or 'estimate' (default: the log's NAME_std times a factor that is "
+      "estimated, 'stated' for those as they are, or as the model says)");
   command->add_option("--protocol", a->protocol, "default, or paper: the set-up of Geist & Trimpe 2020")
       ->check(CLI::IsMember({"default", "paper"}))
       ->capture_default_str();

@@ -55,14 +55,7 @@ void run(const Arguments& arguments) {
       model, {arguments.n.value_or(1), arguments.seed, noise_of(model, arguments.noise_stddev), grid_of(arguments.grid)});
 
   const CsvTable table = as_table(data, *model.system, arguments.output);
-  std::string csv = fmt::format("{}\n", fmt::join(table.header(), ","));
-  for (int row = 0; row < table.n_rows(); ++row) {
-    for (int column = 0; column < table.n_columns(); ++column) {
-      csv += table.cell(row, column);
-      csv += column + 1 < table.n_columns() ? ',' : '\n';
-    }
-  }
-  write_file(arguments.output, csv);
+  write_file(arguments.output, table.text());
   talk({fmt::format("{}: {} rows of '{}'", arguments.output, data.states.cols(), model.system->name())});
 }
 

@@ -38,20 +38,6 @@ std::vector<std::string> parse_expressions(const std::string& text) {
   return expressions;
 }
 
-// rows as they stand in the log, each column of it
-std::string csv_of(const CsvTable& log, const std::vector<int>& rows) {
-  std::string csv;
-  const auto add_line = [&](const auto& cell_at) {
-    for (int column = 0; column < log.n_columns(); ++column) {
-      csv += csv_cell(cell_at(column));
-      csv += column + 1 < log.n_columns() ? ',' : '\n';
-    }
-  };
-  add_line([&](int column) { return log.header()[static_cast<std::size_t>(column)]; });
-  for (const int row : rows) add_line([&](int column) { return log.cell(row, column); });
-  return csv;
-}
-
 void run(const Arguments& arguments) {
   require_folder(arguments.output);
   const ModelFile model = ModelFile::read(arguments.model);
@@ -62,7 +48,7 @@ void run(const Arguments& arguments) {
   options.seed = arguments.seed;
   options.columns = parse_map(arguments.map);
   const Resample chosen = resample(model, log, options);
-  write_file(arguments.output, csv_of(log, chosen.rows));
+  write_file(arguments.output, log.take(chosen.rows).text());
   if (chosen.n_skipped > 0)
     talk({fmt::format("{}: {} rows skipped: no number in some feature", arguments.log, chosen.n_skipped)});
   talk({fmt::format("measured by {}, each in its standard deviations", fmt::join(chosen.features, ", ")),

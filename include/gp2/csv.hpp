@@ -21,6 +21,10 @@ class CsvTable {
 
   /// The table without the rows after the first n.
   [[nodiscard]] CsvTable first_rows(int n) const;
+  /// These rows, in this order.
+  [[nodiscard]] CsvTable take(const std::vector<int>& rows) const;
+  /// As a file has it.
+  [[nodiscard]] std::string text() const;
 
   [[nodiscard]] const std::string& name() const { return name_; }
   [[nodiscard]] const std::vector<std::string>& header() const { return header_; }
@@ -43,6 +47,9 @@ class CsvTable {
   std::vector<std::string> cells_;  // row after row
   std::vector<int> lines_;          // line in the file of each row
 };
+
+/// A cell of a CSV file that reads back as `text`.
+std::string csv_cell(const std::string& text);
 
 /// The shortest text that reads back to the same double.
 std::string shortest(double value);

@@ -37,7 +37,11 @@ struct FitProblemOptions {
   std::optional<Baseline::Kind> baseline;            // learns ddq without mechanics, instead of the model's latents
   std::optional<std::vector<std::string>> estimate;  // parameters; not given: those the model wants estimated
   std::optional<double> noise_stddev;                // for every observed row; not given: the log's own, or the model's [noise]
-  bool estimate_noise = false;                       // of what the log states: a factor
+  bool estimate_noise = false;
+  /// Of deviations that a log states a common factor is estimated, since no smoother knows all errors of a sensor: on real logs
+  /// they are too small, and a fit that believes them learns noise. True: they are taken as they are. Under the protocol of the
+  /// paper and for baselines they are in any case.
+  bool trust_stated_noise = false;
   Protocol protocol;
   /// A discrepancy latent beside the model's one, where that acts in every direction, under the standard protocol with
   /// hyper-priors.

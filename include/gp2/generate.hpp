@@ -40,8 +40,8 @@ GeneratedData generate(const ModelFile& model, const GenerateOptions& options);
 /// @param name  stands for the table in messages
 CsvTable as_table(const GeneratedData& data, const System& system, std::string name);
 
-/// The motion of a model as it is written: ddq = L b + T (M⁻¹(F + truth.force) + truth.acceleration), both 0 without [truth]. Compiled once, for many
-/// calls.
+/// The motion of a model as it is written: ddq = L b + T (M⁻¹(F + truth.force) + truth.acceleration), both 0 without [truth].
+/// Compiled once, for many calls.
 class ModelMotion {
  public:
   explicit ModelMotion(const ModelFile& model);

@@ -370,7 +370,7 @@ def fit(
     mean: Literal["zero", "force"] = "zero",
     prior: Literal["acceleration", "force"] | None = None,
     baseline: Literal["se", "icm", "lmc"] | None = None,
-    noise_std: float | Literal["estimate"] | None = None,
+    noise_std: float | Literal["estimate", "stated"] | None = None,
     estimate: Sequence[str] | None = None,
     protocol: Literal["default", "paper"] = "default",
     hyperprior: bool = True,
@@ -388,6 +388,20 @@ def fit(
 ) -> Posterior: ...
 def load(path: _Path, system: System | None = None) -> Posterior: ...
 def read_csv(path: _Path) -> Table: ...
+def derive(
+    system: System,
+    data: _Table,
+    *,
+    episode: str = "",
+    episodes: Sequence[str] = [],
+    rate: float = 0.0,
+    every: int = 1,
+    hold_constraints: bool = False,
+    outlier_threshold: float = 5.0,
+    smoothness: str = "9/2",
+    keep: Sequence[str] = [],
+    columns: Mapping[str, str] | None = None,
+) -> tuple[Table, dict[str, Any]]: ...
 def resample(
     system: System,
     data: _Table,

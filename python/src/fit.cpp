@@ -118,16 +118,19 @@ FitProblemOptions problem_options(const Arguments& arguments) {
   }
   options.estimate = arguments.estimate;
   if (py::isinstance<py::str>(arguments.noise_std)) {
-    options.estimate_noise = choice<bool>(arguments.noise_std.cast<std::string>(), {{"estimate", true}}, "noise_std");
+    options.estimate_noise =
+        choice<bool>(arguments.noise_std.cast<std::string>(), {{"estimate", true}, {"stated", false}}, "noise_std");
+    options.trust_stated_noise = !options.estimate_noise;
   } else if (!arguments.noise_std.is_none()) {
     try {
       options.noise_stddev = arguments.noise_std.cast<double>();
     } catch (const py::cast_error&) {
-      throw py::type_error(
-          fmt::format("noise_std: expected a positive number or 'estimate', got {}", std::string(py::repr(arguments.noise_std))));
+      throw py::type_error(fmt::format("noise_std: expected a positive number, 'estimate' or 'stated', got {}",
+                                       std::string(py::repr(arguments.noise_std))));
     }
     if (!(*options.noise_stddev > 0) || !std::isfinite(*options.noise_stddev)) {
-      throw InputError(fmt::format("noise_std: expected a positive number or 'estimate', got {}", *options.noise_stddev));
+      throw InputError(
+          fmt::format("noise_std: expected a positive number, 'estimate' or 'stated', got {}", *options.noise_stddev));
     }
   }
   options.protocol.name = choice<Protocol::Name>(
@@ -273,7 +276,7 @@ mean        'zero', or 'force': the model's known force is relied on
 prior       'acceleration' or 'force': where the latent acts; default: as the model says
 baseline    'se', 'icm' or 'lmc': learn ddq without mechanics
 noise_std   standard deviation of every observed ddq, or 'estimate'; default: of each value, where data have columns
-            ddNAME_std, or the model's
+            ddNAME_std, times a factor that is estimated ('stated': as they are), or the model's
 estimate    names of parameters; default: those the model wants estimated
 columns     {model's name: log's name}
 restarts    runs of the optimiser; default: 5, of a baseline 30

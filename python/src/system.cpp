@@ -7,6 +7,7 @@
 #include "arrays.hpp"
 #include "bindings.hpp"
 #include "gp2/check.hpp"
+#include "gp2/derive.hpp"
 #include "gp2/error.hpp"
 #include "gp2/fit_problem.hpp"
 #include "gp2/generate.hpp"
@@ -75,11 +76,68 @@ CsvTable generate_table(const PySystem& self, int n, std::uint64_t seed, std::op
 CsvTable resample_table(const PySystem& self, const py::object& data, int n, const std::vector<std::string>& features,
                         const std::optional<std::uint64_t>& seed, const py::object& columns) {
   const CsvTable table = to_table(data, "data");
-  std::vector<std::string> cells;
-  for (const int row : resample(*self.model, table, {n, features, seed, columns_argument(columns)}).rows) {
-    for (int column = 0; column < table.n_columns(); ++column) cells.push_back(table.cell(row, column));
+  return table.take(resample(*self.model, table, {n, features, seed, columns_argument(columns)}).rows);
+}
+
+// what became of each column of a raw log
+py::dict report_of(const DerivedData& derived, const System& system) {
+  const auto named = [&](const std::vector<int>& coordinates) {
+    py::list names;
+    for (const int j : coordinates) names.append(system.coordinates()[static_cast<std::size_t>(j)].name);
+    return names;
+  };
+  py::list series;
+  for (const DerivedSeries& one : derived.series) {
+    py::dict entry;
+    entry["coordinate"] = system.coordinates()[static_cast<std::size_t>(one.coordinate)].name;
+    entry["episode"] = derived.episodes[static_cast<std::size_t>(one.episode)];
+    entry["lengthscale"] = one.model.lengthscale;
+    entry["signal_std"] = one.model.signal_stddev;
+    entry["noise_std"] = one.model.noise_stddev;
+    entry["bandwidth"] = one.bandwidth;
+    entry["resolution"] = one.resolution;
+    entry["used"] = one.used;
+    entry["missing"] = one.missing;
+    entry["repeated"] = one.repeated;
+    entry["outliers"] = one.outliers;
+    entry["wraps"] = one.wraps;
+    entry["gaps"] = one.gaps;
+    entry["longest_gap"] = one.longest_gap;
+    series.append(entry);
   }
-  return CsvTable::from_cells(table.name(), table.header(), std::move(cells));
+  py::dict report;
+  report["series"] = series;
+  report["measured"] = named(derived.measured);
+  report["completed"] = named(derived.completed);
+  report["independent"] = named(derived.independent);
+  report["notes"] = derived.notes;
+  return report;
+}
+
+py::tuple derive_table(const PySystem& self, const py::object& data, const std::string& episode,
+                       const std::vector<std::string>& episodes, double rate, int every, bool hold_constraints,
+                       double outlier_threshold, const std::string& smoothness, const std::vector<std::string>& keep,
+                       const py::object& columns) {
+  DeriveOptions options;
+  options.columns = columns_argument(columns);
+  options.episode_column = episode;
+  options.episodes = episodes;
+  options.keep = keep;
+  options.rate = rate;
+  options.every = every;
+  options.hold_constraints = hold_constraints;
+  options.outlier_threshold = outlier_threshold;
+  const std::optional<Smoothness> order = smoothness_of(smoothness);
+  if (!order)
+    throw InputError(fmt::format("smoothness: expected one of {}, got '{}'", fmt::join(smoothness_words(), ", "), smoothness));
+  options.smoothness = *order;
+  const CsvTable table = to_table(data, "data");
+  DerivedData derived;
+  {
+    const py::gil_scoped_release release;
+    derived = derive(*self.model, table, options);
+  }
+  return py::make_tuple(as_table(derived, self.system(), "derived data"), report_of(derived, self.system()));
 }
 
 py::list findings_list(const std::vector<Finding>& findings) {
@@ -278,6 +336,13 @@ Raises InputError with the key, the rule, the value got and the mend.)");
   module.def("check", &check, py::arg("system"), py::arg("data") = py::none(), py::arg("columns") = py::none(),
              "Is a system well-posed, and does a log fit it? A list of Finding: rank, definiteness, derivatives; data on the\n"
              "constraint, dependent columns. Without data at states drawn from the model's [sampling].");
+  module.def("derive", &derive_table, py::arg("system"), py::arg("data"), py::kw_only(), py::arg("episode") = "",
+             py::arg("episodes") = std::vector<std::string>(), py::arg("rate") = 0.0, py::arg("every") = 1,
+             py::arg("hold_constraints") = false, py::arg("outlier_threshold") = 5.0, py::arg("smoothness") = "9/2",
+             py::arg("keep") = std::vector<std::string>(), py::arg("columns") = py::none(),
+             "A raw log of t and positions as states and accelerations with a standard deviation for each value: a Table for\n"
+             "fit, and a report (dict): what was found of each coordinate in each episode, what was completed from the\n"
+             "constraints, which accelerations are independent, notes. The options are those of gp2 derive; docs/raw-logs.md.");
   module.def(
       "resample", &resample_table, py::arg("system"), py::arg("data"), py::arg("n"), py::kw_only(),
       py::arg("features") = std::vector<std::string>(), py::arg("seed") = py::none(), py::arg("columns") = py::none(),

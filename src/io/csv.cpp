@@ -150,6 +150,38 @@ CsvTable CsvTable::first_rows(int n) const {
   return table;
 }
 
+CsvTable CsvTable::take(const std::vector<int>& rows) const {
+  CsvTable taken = *this;
+  taken.cells_.clear();
+  taken.lines_.clear();
+  for (const int row : rows) {
+    for (int column = 0; column < n_columns(); ++column) taken.cells_.push_back(cell(row, column));
+    taken.lines_.push_back(lines_[static_cast<std::size_t>(row)]);
+  }
+  return taken;
+}
+
+std::string csv_cell(const std::string& text) {
+  const bool plain = text.find_first_of(",\"") == std::string::npos && !text.starts_with(' ') && !text.ends_with(' ');
+  if (plain) return text;
+  std::string cell = "\"";
+  for (char c : text) cell.append(c == '"' ? 2 : 1, c);  // a quote is written twice
+  return cell += '"';
+}
+
+std::string CsvTable::text() const {
+  std::string csv;
+  const auto add = [&](const std::string& cell, int column) {
+    csv += csv_cell(cell);
+    csv += column + 1 < n_columns() ? ',' : '\n';
+  };
+  for (int column = 0; column < n_columns(); ++column) add(header_[static_cast<std::size_t>(column)], column);
+  for (int row = 0; row < n_rows(); ++row) {
+    for (int column = 0; column < n_columns(); ++column) add(cell(row, column), column);
+  }
+  return csv;
+}
+
 int CsvTable::find(std::string_view column) const {
   for (std::size_t k = 0; k < header_.size(); ++k) {
     if (header_[k] == column) return static_cast<int>(k);

@@ -167,6 +167,12 @@ std::vector<std::string> stddev_columns(const std::vector<std::string>& names, c
   return columns;
 }
 
+// of the deviations that a log states
+bool estimates_factor(const FitProblemOptions& options) {
+  const bool can_estimate = options.protocol.name != Protocol::Name::paper && !options.baseline;
+  return can_estimate && (options.estimate_noise || !options.trust_stated_noise);
+}
+
 // σ of each value where the log states it, NaN elsewhere (d × N); empty when it states none, or --noise-std overrides them
 MatrixXd stated_noise(const std::vector<std::string>& observed, const FitProblemOptions& options, LogReader& reader,
                       const CsvTable& log, std::vector<std::string>& notes) {
@@ -187,7 +193,7 @@ MatrixXd stated_noise(const std::vector<std::string>& observed, const FitProblem
     if (!reader.stddev_column(observed[k]).empty()) stddev.row(static_cast<Index>(k)) = reader.stddevs({observed[k]});
   }
   notes.push_back(fmt::format("{}: the noise of each value is that in {}{}", log.name(), fmt::join(columns, ", "),
-                              options.estimate_noise ? ", times a factor that is estimated" : ""));
+                              estimates_factor(options) ? ", times a factor that is estimated" : ""));
   return stddev;
 }
 
@@ -283,6 +289,7 @@ Observations read_log(const Place& place, const Log& log, const FitProblemOption
 
   const bool model_estimates = place.model.noise.estimate && !options.noise_stddev && !group.has_noise_scale();
   group.estimate_noise = options.protocol.name != Protocol::Name::paper && (options.estimate_noise || model_estimates);
+  if (group.has_noise_scale()) group.estimate_noise = estimates_factor(options);
   group.noise_stddev = noise_of(place.model, options, group, group.estimate_noise);
   if (!group.has_noise_scale()) return group;
   const VectorXd spread = row_stddev(group.values);

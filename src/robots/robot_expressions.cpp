@@ -81,7 +81,7 @@ void RobotExpressions::add_links() {
       link.mass = zero;
       link.first_moment = constant(graph_, Vector3d(Vector3d::Zero()));
       link.inertia = constant(graph_, Matrix3d(Matrix3d::Zero()));
-      links_.push_back(std::move(link));
+      links_.push_back(link);
       frame = {static_cast<int>(links_.size()) - 1, Matrix3d::Identity(), -joint.anchor};
     }
     frames_.push_back(frame);

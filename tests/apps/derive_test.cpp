@@ -95,7 +95,7 @@ TEST(DeriveCommand, RealEncodersPredictFastSwingingFromSlow) {
   for (int seed = 0; seed < 3; ++seed) {
     desk.done(fmt::format("gp2 resample low.csv --model models/double_pendulum.toml -n 50 --seed {} -o train.csv", seed));
     desk.done(
-        "gp2 fit models/double_pendulum.toml --data train.csv --observe ddq3,ddq6 --prior force --noise-std estimate -o "
+        "gp2 fit models/double_pendulum.toml --data train.csv --observe ddq3,ddq6 --prior force -o "
         "fit.json");
     const double nrmse = desk.done("gp2 evaluate fit.json --data '" + real_file("double_pendulum/test.csv").string() +
                                    "' --outputs ddq3,ddq6 --json")

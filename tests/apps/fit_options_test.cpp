@@ -257,7 +257,7 @@ TEST_F(FitCommand, NumbersOutOfRangeAreRefused) {
   EXPECT_THAT(refusal("--threads -2"), HasSubstr("--threads: must be positive"));
   for (const char* noise : {"0", "-0.1", "nan", "inf", "0.1m", "little"}) {
     EXPECT_THAT(refusal(std::string("--noise-std ") + noise),
-                HasSubstr(std::string("--noise-std: expected a positive number or 'estimate', got '") + noise + "'"));
+                HasSubstr(std::string("--noise-std: expected a positive number, 'estimate' or 'stated', got '") + noise + "'"));
   }
 }
 

@@ -77,10 +77,16 @@ const Hyperparameter& noise_in(const FitProblem& problem) {
   throw std::runtime_error("no noise is estimated");
 }
 
+FitProblemOptions trusting() {
+  FitProblemOptions options;
+  options.trust_stated_noise = true;
+  return options;
+}
+
 VectorXd stated_deviations() { return 0.01 * VectorXd::LinSpaced(40, 1, 40); }
 
 TEST(StatedNoise, IsThatOfEachValueAndSaysWhatIsObserved) {
-  const FitProblem problem = make_fit_problem(slope_with(), log_of({"ddx_std"}), {});
+  const FitProblem problem = make_fit_problem(slope_with(), log_of({"ddx_std"}), trusting());
   EXPECT_THAT(observed(problem), ElementsAre("ddx"));
   const Observations& group = problem.observations.front();
   EXPECT_EQ(group.noise_stddev, VectorXd::Ones(1));
@@ -94,14 +100,14 @@ TEST(StatedNoise, IsThatOfEachValueAndSaysWhatIsObserved) {
 }
 
 TEST(StatedNoise, OfEveryAccelerationLeavesThemAllObserved) {
-  const FitProblem problem = make_fit_problem(slope_with(), log_of({"ddx_std", "ddy_std"}), {});
+  const FitProblem problem = make_fit_problem(slope_with(), log_of({"ddx_std", "ddy_std"}), trusting());
   EXPECT_THAT(observed(problem), ElementsAre("ddx", "ddy"));
   EXPECT_THAT(problem.notes, Contains("log.csv: the noise of each value is that in ddx_std, ddy_std"));
   EXPECT_THAT(problem.notes, Contains(HasSubstr("warning: log.csv: the accelerations obey A ddq = b")));
 }
 
 TEST(StatedNoise, TheModelsNoiseServesWhereNothingIsStated) {
-  FitProblemOptions options;
+  FitProblemOptions options = trusting();
   options.observe = {"ddy", "ddx"};
   const FitProblem problem = make_fit_problem(slope_with("[noise]\nddq = [0.3, 0.7]\n"), log_of({"ddx_std"}), options);
   const Observations& group = problem.observations.front();
@@ -124,10 +130,8 @@ TEST(StatedNoise, OneNoiseForAllReplacesIt) {
   EXPECT_THAT(problem.notes, Contains("log.csv: --noise-std 0.2 stands for the deviations in ddx_std"));
 }
 
-TEST(StatedNoise, IsMultipliedByAFactorWhereTheNoiseIsEstimated) {
-  FitProblemOptions options;
-  options.estimate_noise = true;
-  const FitProblem problem = make_fit_problem(slope_with(), log_of({"ddx_std"}), options);
+TEST(StatedNoise, IsMultipliedByAFactorThatIsEstimatedUnlessItIsTrusted) {
+  const FitProblem problem = make_fit_problem(slope_with(), log_of({"ddx_std"}), {});
   EXPECT_THAT(problem.notes, Contains("log.csv: the noise of each value is that in ddx_std, times a factor that is estimated"));
   const Hyperparameter& factor = noise_in(problem);
   EXPECT_EQ(factor.name, "noise_stddev(ddx)");
@@ -141,9 +145,9 @@ TEST(StatedNoise, IsMultipliedByAFactorWhereTheNoiseIsEstimated) {
   EXPECT_TRUE(problem.observations.front().estimate_noise);
 }
 
-TEST(StatedNoise, AModelThatWantsItsNoiseEstimatedIsNotAsked) {
+TEST(StatedNoise, AModelThatWantsItsNoiseEstimatedIsNotAskedWhereItIsTrusted) {
   const ModelFile model = slope_with("[noise]\nddq = { estimate = true, initial = 0.1 }\n");
-  EXPECT_FALSE(make_fit_problem(model, log_of({"ddx_std"}), {}).observations.front().estimate_noise);
+  EXPECT_FALSE(make_fit_problem(model, log_of({"ddx_std"}), trusting()).observations.front().estimate_noise);
   EXPECT_TRUE(make_fit_problem(model, log_of({}), {}).observations.front().estimate_noise);
 }
 
@@ -228,11 +232,10 @@ TEST(StatedNoise, WeighsTheValuesOfAFit) {
     const MatrixXd mean = fitted.posterior.mean(View::all(View::Quantity::constrained_acceleration, *spring.system), states);
     return (mean.row(0) + 3 * states.row(0) + 0.5 * states.row(1)).cwiseAbs().maxCoeff();
   };
-  FitProblemOptions blind, factor;
+  FitProblemOptions blind;
   blind.noise_stddev = 1.4;
-  factor.estimate_noise = true;
   EXPECT_LT(worst_error({}), 0.05);
-  EXPECT_LT(worst_error(factor), 0.05);
+  EXPECT_LT(worst_error(trusting()), 0.05);
   EXPECT_GT(worst_error(blind), 0.2);
 }
 

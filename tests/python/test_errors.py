@@ -142,15 +142,15 @@ def test_names_are_checked(posterior, arm, arm_log, arm_states):
         (lambda: gp2.fit(arm, arm_log, prior="velocity"), "prior: expected one of"),
         (lambda: gp2.fit(arm, arm_log, baseline="gp"), "baseline: expected one of 'se', 'icm', 'lmc', got 'gp'"),
         (lambda: gp2.fit(arm, arm_log, protocol="new"), "protocol: expected one of"),
-        (lambda: gp2.fit(arm, arm_log, noise_std="guess"), "noise_std: expected one of 'estimate', got 'guess'"),
-        (lambda: gp2.fit(arm, arm_log, noise_std=-1), "noise_std: expected a positive number or 'estimate', got -1"),
+        (lambda: gp2.fit(arm, arm_log, noise_std="guess"), "noise_std: expected one of 'estimate', 'stated', got 'guess'"),
+        (lambda: gp2.fit(arm, arm_log, noise_std=-1), "noise_std: expected a positive number, 'estimate' or 'stated', got -1"),
         (lambda: gp2.fit(arm, arm_log, restarts=0), "restarts: must be at least 1, got 0"),
         (lambda: gp2.fit(arm, arm_log, max_iterations=-1), "max_iterations: must be at least 0, got -1"),
         (lambda: gp2.fit(arm, arm_log, max_points=0), "max_points: must be at least 1, got 0"),
         (lambda: gp2.fit(arm, arm_log, threads=-1), "threads: must be at least 0, got -1"),
     ]:
         assert text in text_of(call)
-    with pytest.raises(TypeError, match="noise_std: expected a positive number or 'estimate', got \\[1\\]"):
+    with pytest.raises(TypeError, match="noise_std: expected a positive number, 'estimate' or 'stated', got \\[1\\]"):
         gp2.fit(arm, arm_log, noise_std=[1])
     with pytest.raises(TypeError, match="a model holds text, numbers, lists and mappings, not set"):
         gp2.System(coordinates=["x"], mass=[{1}])
