@@ -98,19 +98,20 @@ ConstrainedStates::ConstrainedStates(const ModelFile& model, std::vector<int> me
 // code need not bear a NaN where it reads nothing
 MatrixXd ConstrainedStates::without_blind(const MatrixXd& states) const { return states.array().isNaN().select(0, states); }
 
-void ConstrainedStates::solve_acceleration(const VectorXd& state, Eigen::Ref<VectorXd> acceleration) const {
+VectorXd ConstrainedStates::completed_acceleration(const VectorXd& state, VectorXd acceleration) const {
   const SystemValues values = system_.evaluate(state, parameters_);
   const MatrixXd A = values.A(0);
   const VectorXd rest = values.b(0) - A(Eigen::all, measured_) * acceleration(measured_);
   const VectorXd solved = decomposition_of(A(Eigen::all, free_)).solve(rest);
   acceleration(free_) = solved;
+  return acceleration;
 }
 
 void ConstrainedStates::complete(VectorXd& state, Eigen::Ref<VectorXd> acceleration) const {
   if (free_.empty()) return;
   state = without_blind(state);
   projection_.apply(state);
-  solve_acceleration(state, acceleration);
+  acceleration = completed_acceleration(state, acceleration);
   for (const int j : blind_) state[system_.layout().q(j)] = std::numeric_limits<double>::quiet_NaN();
 }
 
@@ -140,7 +141,7 @@ void ConstrainedStates::approach(VectorXd& state, Eigen::Ref<VectorXd> accelerat
     const VectorXd step = decomposition_of(A(velocity_rows_, free_)).solve(first_residual(true));
     for (std::size_t k = 0; k < free_.size(); ++k) state[system_.layout().dq(free_[k])] -= step[static_cast<Index>(k)];
   }
-  solve_acceleration(state, acceleration);
+  acceleration = completed_acceleration(state, acceleration);
   for (const int j : blind_) state[system_.layout().q(j)] = std::numeric_limits<double>::quiet_NaN();
 }
 

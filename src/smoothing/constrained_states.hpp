@@ -43,7 +43,8 @@ class ConstrainedStates {
                  std::vector<Eigen::Matrix3d>& covariance) const;
 
  private:
-  void solve_acceleration(const Eigen::VectorXd& state, Eigen::Ref<Eigen::VectorXd> acceleration) const;
+  // with what was not measured from A ddq = b
+  [[nodiscard]] Eigen::VectorXd completed_acceleration(const Eigen::VectorXd& state, Eigen::VectorXd acceleration) const;
   /// r(z) = (c, ċ, A ddq − b) and J = ∂r/∂z, z = (q, dq, ddq) of all coordinates.
   struct Linearisation {
     Eigen::VectorXd residual;
