@@ -24,7 +24,7 @@ struct LaplaceUncertainty {
   double distance_from_optimum = 0;
 };
 
-/// H by central differences of the exact gradient, two evaluations for each hyperparameter that is not held.
+/// H by central differences of the exact gradient, two or four evaluations for each hyperparameter that is not held.
 ///
 /// @param hyperparameters  fitted, as a FitReport has them
 /// @param n_threads        0: as many as the machine has; results do not depend on it

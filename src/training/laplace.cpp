@@ -1,5 +1,6 @@
 #include "gp2/laplace.hpp"
 
+#include <algorithm>
 #include <cmath>
 #include <limits>
 
@@ -20,8 +21,7 @@ using Kind = Hyperparameter::Kind;
 
 namespace {
 
-// of a difference, as the optimiser sees a hyperparameter. Gradients are known to some 1e-8 of the number of data, and change by
-// their own size over a unit of a logarithm, or a box.
+// of a difference, as the optimiser sees a hyperparameter: at most
 double step_of(const Hyperparameter& h) { return h.kind == Kind::parameter ? 1e-3 : 1e-2; }
 
 // the unit of x in LaplaceUncertainty, as the optimiser sees it
@@ -41,27 +41,50 @@ std::vector<int> free_ones(const std::vector<Hyperparameter>& hyperparameters) {
   return free;
 }
 
-MatrixXd hessian_of(const Objective& objective, const VectorXd& x, const std::vector<Hyperparameter>& hyperparameters,
-                    const std::vector<int>& free, int n_threads) {
-  const auto n = static_cast<Index>(free.size());
-  MatrixXd H(n, n);
-  parallel_for(static_cast<int>(n), n_threads, [&](int k, int) {
-    Likelihood::Workspace workspace;
-    const int moved = free[static_cast<std::size_t>(k)];
-    const double step = step_of(hyperparameters[static_cast<std::size_t>(moved)]);
-    const auto gradient_at = [&](double distance) -> VectorXd {
-      VectorXd there = x, gradient(x.size());
-      there[moved] += distance;
-      if (!std::isfinite(objective(there, &gradient, workspace))) {
-        throw NumericalError(fmt::format("the likelihood is not finite near the fitted value of '{}': no standard errors",
-                                         hyperparameters[static_cast<std::size_t>(moved)].name));
-      }
-      return gradient(free);
-    };
-    H.col(k) = (gradient_at(step) - gradient_at(-step)) / (2 * step);
-  });
-  return (H + H.transpose()) / 2;
-}
+class Differences {
+ public:
+  Differences(const Objective& objective, const VectorXd& x, const std::vector<Hyperparameter>& hyperparameters,
+              const std::vector<int>& free)
+      : objective_(objective), x_(x), hyperparameters_(hyperparameters), free_(free) {}
+
+  // H of the free ones. Data may know a parameter a thousand times better where the others are known than where they are not:
+  // then H is nearly singular, and the steps are short, three such deviations, so that what differences neglect does not matter.
+  [[nodiscard]] MatrixXd hessian(int n_threads) const {
+    const auto n = static_cast<Index>(free_.size());
+    MatrixXd H(n, n);
+    parallel_for(static_cast<int>(n), n_threads, [&](int k, int) {
+      Likelihood::Workspace workspace;
+      const Hyperparameter& h = hyperparameters_[static_cast<std::size_t>(free_[static_cast<std::size_t>(k)])];
+      const double step = step_of(h);
+      H.col(k) = column(k, step, workspace);
+      constexpr double shortest = 1e-8, deviations = 3;
+      const double short_step = std::max(deviations / std::sqrt(std::abs(H(k, k))), shortest);
+      if (h.kind == Kind::parameter && short_step < step) H.col(k) = column(k, short_step, workspace);
+    });
+    return (H + H.transpose()) / 2;
+  }
+
+ private:
+  [[nodiscard]] VectorXd column(int k, double step, Likelihood::Workspace& workspace) const {
+    return (gradient_at(k, step, workspace) - gradient_at(k, -step, workspace)) / (2 * step);
+  }
+
+  [[nodiscard]] VectorXd gradient_at(int k, double distance, Likelihood::Workspace& workspace) const {
+    const int moved = free_[static_cast<std::size_t>(k)];
+    VectorXd there = x_, gradient(x_.size());
+    there[moved] += distance;
+    if (!std::isfinite(objective_(there, &gradient, workspace))) {
+      throw NumericalError(fmt::format("the likelihood is not finite near the fitted value of '{}': no standard errors",
+                                       hyperparameters_[static_cast<std::size_t>(moved)].name));
+    }
+    return gradient(free_);
+  }
+
+  const Objective& objective_;
+  const VectorXd& x_;
+  const std::vector<Hyperparameter>& hyperparameters_;
+  const std::vector<int>& free_;
+};
 
 }  // namespace
 
@@ -73,12 +96,12 @@ LaplaceUncertainty laplace_uncertainty(const Prior& prior, const std::vector<Obs
   const VectorXd x = internal_values(hyperparameters);
   const std::vector<int> free = free_ones(hyperparameters);
   const auto n = static_cast<Index>(hyperparameters.size()), n_free = static_cast<Index>(free.size());
-  const MatrixXd H = hessian_of(objective, x, hyperparameters, free, thread_count(n_threads));
+  const MatrixXd H = Differences(objective, x, hyperparameters, free).hessian(thread_count(n_threads));
 
   // in units of what each would be uncertain by, were the others known: 1 on the diagonal
   VectorXd unit = H.diagonal().array().abs().max(1e-10).rsqrt();
   const Eigen::SelfAdjointEigenSolver<MatrixXd> eigen(unit.asDiagonal() * H * unit.asDiagonal());
-  constexpr double smallest = 1e-6;  // what differences of gradients leave of a zero
+  constexpr double smallest = 1e-8;  // what differences of gradients leave of a zero
   const Index n_flat = (eigen.eigenvalues().array() < smallest).count();
   const MatrixXd flat = eigen.eigenvectors().leftCols(n_flat), steep = eigen.eigenvectors().rightCols(n_free - n_flat);
   const VectorXd variance = eigen.eigenvalues().tail(n_free - n_flat).cwiseInverse();

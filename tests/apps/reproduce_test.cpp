@@ -8,6 +8,7 @@
 
 #include "apps/command_line.hpp"
 #include "gp2/fit_problem.hpp"
+#include "gp2/robot.hpp"
 #include "test_models.hpp"
 
 // gp2 reproduce on definitions that are cut down to seconds: what it writes, and what it says of what is wrong.
@@ -104,7 +105,8 @@ class Reproduce : public testing::Test {
         } else if (value.is_number()) {
           EXPECT_EQ(csv.number(row, column), value.get<double>()) << name << " " << key;
         } else {
-          EXPECT_EQ(csv.cell(row, column), value.is_null() ? "" : value.get<std::string>()) << name << " " << key;
+          const std::string text = value.is_string() ? value.get<std::string>() : value.is_null() ? "" : value.dump();
+          EXPECT_EQ(csv.cell(row, column), text) << name << " " << key;
         }
       }
     }
@@ -405,6 +407,56 @@ TEST_F(Reproduce, TheLearningCurveSaysThatItTakesNoPublishedData) {
          [](const std::string& text) { return with(with(only(text, "method", {"GP2_known_mean0"}), "runs", "1"), "n", "[8]"); });
   std::filesystem::create_directory(desk / "data");
   EXPECT_TRUE(reproduce("learning-curve --data data").said("learning-curve: the published observations are 100 per run"));
+}
+
+// ---- the arm of Rath, Geist & Trimpe
+
+/// The definition of an arm's experiment, cut down to a motion of seconds.
+std::string small_arm(const std::string& text) {
+  const auto replaced_all = [](const std::string& in, const char* what, const char* by) {
+    return std::regex_replace(in, std::regex(what), by);
+  };
+  std::string small = replaced_all(text, "samples = 54000|samples = 14400", "samples = 1500");
+  small = replaced_all(replaced_all(small, "leave   = 1000", "leave   = 100"), "max_iterations += [0-9]+", "max_iterations = 15");
+  small = replaced_all(replaced_all(small, "starts  = [^\n]*", "starts  = [600]"), "samples = 3000", "samples = 300");
+  return replaced_all(replaced_all(small, "= \\[10, 6, 4, 3, 2\\]", "= [1]"), "= \\[(3, 2, 1, 1, 1|5, 1, 0, 0, 0)\\]", "= [0]");
+}
+
+TEST_F(Reproduce, TheArmOnASurfaceObeysItsConstraintWhereAMethodKnowsIt) {
+  if (!can_read_robots()) GTEST_SKIP() << "this build reads no robots";
+  shrink("arm_on_surface.toml",
+         [](const std::string& text) { return small_arm(replaced(text, "[100, 200, 400, 600, 1000]", "[20, 40]")); });
+  reproduce("arm-on-surface");
+  const json rows = table("arm_on_surface");
+  ASSERT_EQ(rows.size(), 10U);
+  for (const json& row : rows) {
+    SCOPED_TRACE(row.dump());
+    const bool knows_mechanics = !row["method"].get<std::string>().starts_with("GP ") && row["method"] != "GP";
+    EXPECT_EQ(row["max_constraint_error"] < 1e-12, knows_mechanics);
+    EXPECT_GT(row["mae_blocks"], 0.07) << "targets have noise of 0.1, 0.08 of mean size";
+    EXPECT_NEAR(row["mae_blocks"].get<double>(), row["truth_mae_blocks"].get<double>(), 0.08);
+    EXPECT_EQ(row["published_mae"].is_null(), row["method"] == "GP wide");
+    EXPECT_GT(row["ratio_independent"], 0);
+  }
+  // the plain one is what the others are measured by
+  EXPECT_EQ(rows[0]["ratio_blocks"], 1);
+  EXPECT_EQ(rows[5]["ratio_independent"], 1);
+  expect_pictures({"arm_on_surface"});
+}
+
+TEST_F(Reproduce, TheMassOfTheArmsLastLinkHasAnEstimateAndAStandardError) {
+  if (!can_read_robots()) GTEST_SKIP() << "this build reads no robots";
+  shrink("arm_mass.toml", [](const std::string& text) { return small_arm(replaced(text, "n     = 600", "n     = 30")); });
+  reproduce("arm-mass");
+  const json rows = table("arm_mass");
+  ASSERT_EQ(rows.size(), 4U);
+  EXPECT_EQ(rows[3]["parameter"], "m7");
+  EXPECT_EQ(rows[3]["start"], 2.5);
+  for (const json& row : rows) {
+    EXPECT_NEAR(row["error"].get<double>(), row["estimate"].get<double>() - row["truth"].get<double>(), 1e-15);
+    EXPECT_TRUE(row["stddev"].is_null() || row["stddev"] >= 0) << row;
+  }
+  EXPECT_EQ(table("arm_mass_correlation")[1]["c7y"], 1);
 }
 
 // ---- without gnuplot

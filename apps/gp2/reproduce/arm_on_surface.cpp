@@ -8,6 +8,7 @@
 #include "command.hpp"
 #include "gp2/error.hpp"
 #include "gp2/generate.hpp"
+#include "gp2/laplace.hpp"
 #include "gp2/resample.hpp"
 #include "reproduce/experiment.hpp"
 #include "reproduce/table.hpp"
@@ -47,8 +48,17 @@ struct Split {
   std::vector<int> training, blocks;
 };
 
+// without the first and the last of a motion
+std::vector<int> samples_of(const Section& section) {
+  const int n = section.integer("samples"), leave = section.integer("leave");
+  const int every = section.has("every") ? std::max(1, section.integer("every")) : 1;
+  std::vector<int> samples;
+  for (int i = leave; i < n - leave; i += every) samples.push_back(i);
+  return samples;
+}
+
 Split split_of(const Section& training, const Section& blocks) {
-  const int n = training.integer("samples"), leave = training.integer("leave");
+  const int n = training.integer("samples");
   const int length = blocks.integer("samples"), every = blocks.integer("every");
   if (every < 1) throw InputError(fmt::format("blocks: every must be positive, got {}", every));
   Split split;
@@ -62,7 +72,7 @@ Split split_of(const Section& training, const Section& blocks) {
     std::fill_n(kept.begin() + start, length, true);
     for (int i = 0; i < length; i += every) split.blocks.push_back(start + i);
   }
-  for (int i = leave; i < n - leave; ++i) {
+  for (const int i : samples_of(training)) {
     if (!kept[static_cast<std::size_t>(i)]) split.training.push_back(i);
   }
   return split;
@@ -132,28 +142,24 @@ std::optional<double> published(const Section& definition, const std::string& me
   return k < errors.size() ? std::optional(errors[k]) : std::nullopt;
 }
 
-// each error beside the smallest of the methods that know no mechanics, as the published one beside the published one of theirs
+// each error beside that of the first method that knows no mechanics, and the same of the published ones
 void add_ratios(const Section& definition, std::size_t k, const std::vector<Method>& methods, Table& table,
                 std::size_t first_row) {
-  std::optional<double> published_plain;
+  const auto plain = static_cast<std::size_t>(
+      std::find_if(methods.begin(), methods.end(), [](const Method& method) { return method.baseline.has_value(); }) -
+      methods.begin());
+  if (plain == methods.size()) return;
+  const std::optional<double> published_plain = published(definition, methods[plain].name, k);
+  const Table::Row reference = table.row(first_row + plain);
   for (std::size_t m = 0; m < methods.size(); ++m) {
-    if (methods[m].baseline && !published_plain) published_plain = published(definition, methods[m].name, k);
-  }
-  for (const std::string place : {"blocks", "independent"}) {
-    double plain = std::numeric_limits<double>::infinity();
-    for (std::size_t m = 0; m < methods.size(); ++m) {
-      if (methods[m].baseline) plain = std::min(plain, table.row(first_row + m)["mae_" + place].get<double>());
+    Table::Row& row = table.row(first_row + m);
+    for (const std::string place : {"blocks", "independent"}) {
+      row["ratio_" + place] = number_or_null(row["mae_" + place].get<double>() / reference["mae_" + place].get<double>());
     }
-    for (std::size_t m = 0; m < methods.size(); ++m) {
-      Table::Row& row = table.row(first_row + m);
-      row["ratio_" + place] = number_or_null(row["mae_" + place].get<double>() / plain);
-    }
-  }
-  for (std::size_t m = 0; m < methods.size(); ++m) {
     const std::optional<double> theirs = published(definition, methods[m].name, k);
-    table.row(first_row + m)["published_mae"] = theirs ? Table::Row(*theirs) : Table::Row();
-    table.row(first_row + m)["published_ratio"] =
-        theirs && published_plain ? Table::Row(*theirs / *published_plain) : Table::Row();
+    if (!theirs) continue;
+    row["published_mae"] = *theirs;
+    if (published_plain) row["published_ratio"] = *theirs / *published_plain;
   }
 }
 
@@ -189,10 +195,7 @@ void reproduce_arm_on_surface(const ReproduceOptions& options) {
   const CsvTable log = as_table(chosen.measured, system, model.name);
 
   const Motion other = motion_of(model, elsewhere);
-  std::vector<int> of_other;
-  const int leave = elsewhere.integer("leave"), every = std::max(1, elsewhere.integer("every"));
-  for (int i = leave; i < elsewhere.integer("samples") - leave; i += every) of_other.push_back(i);
-  const Motion independent = other.only(of_other);
+  const Motion independent = other.only(samples_of(elsewhere));
 
   Table table;
   std::map<std::string, std::vector<Hyperparameter>> fitted;  // to fewer points, by method
@@ -232,6 +235,64 @@ void reproduce_arm_on_surface(const ReproduceOptions& options) {
   talk_over("");
   print(table.rows());
   plot(options, "arm_on_surface");
+}
+
+void reproduce_arm_mass(const ReproduceOptions& options) {
+  const Section definition = Section::read(options.experiments / "arm_mass.toml");
+  const ModelFile moving = ModelFile::read(options.experiments / definition.text("truth"));
+  const ModelFile model = ModelFile::read(options.experiments / definition.text("model"));
+  const Section truth = definition.section("true"), stop = definition.section("stop");
+  const Motion whole = motion_of(moving, definition.section("training"));
+  const Motion candidates = whole.only(samples_of(definition.section("training")));
+  const Motion chosen = candidates.only(informative(moving, candidates, definition.integer("n")));
+  const CsvTable log = as_table(chosen.measured, *moving.system, moving.name);
+
+  Table table, correlations;
+  for (const Section& section : definition.sections("method")) {
+    Method method = method_of(section);
+    method.n_restarts[Protocol::Name::standard] = definition.section("restarts").integer("default");
+    method.max_iterations = stop.integer("max_iterations");
+    method.reduction_tolerance = stop.number("reduction_tolerance");
+    method.max_escapes = 0;
+    talk_over(fmt::format("arm-mass: {}", method.name));
+    const auto start = std::chrono::steady_clock::now();
+    const Trained trained = train(model, truth.keys(), method, Protocol::Name::standard, log, 0, options.threads);
+    const double seconds_fit = seconds_since(start);
+    talk_over(fmt::format("arm-mass: {}: standard errors", method.name));
+    const std::vector<Hyperparameter>& fitted = trained.fit.report.hyperparameters;
+    const LaplaceUncertainty uncertainty =
+        laplace_uncertainty(trained.problem.prior, trained.problem.observations, fitted, options.threads);
+    const double seconds = seconds_since(start);
+    talk_over("");
+    for (std::size_t k = 0; k < fitted.size(); ++k) {
+      const Hyperparameter& h = fitted[k];
+      if (h.kind != Hyperparameter::Kind::parameter) continue;
+      const auto column = static_cast<Index>(k);
+      const double error = h.value - truth.number(h.name);
+      table.add({{"method", method.name},
+                 {"parameter", h.name},
+                 {"start", trained.problem.hyperparameters[k].value},
+                 {"truth", truth.number(h.name)},
+                 {"estimate", h.value},
+                 {"stddev", number_or_null(uncertainty.stddev[column])},
+                 {"error", error},
+                 {"error_in_stddevs", number_or_null(error / uncertainty.stddev[column])},
+                 {"converged", trained.fit.report.converged},
+                 {"distance_from_optimum", number_or_null(uncertainty.distance_from_optimum)},
+                 {"seconds_fit", seconds_fit},
+                 {"seconds", seconds}});
+      Table::Row row = {{"method", method.name}, {"parameter", h.name}};
+      for (std::size_t l = 0; l < fitted.size(); ++l) {
+        if (fitted[l].kind != Hyperparameter::Kind::parameter) continue;
+        row[fitted[l].name] = number_or_null(uncertainty.correlation(column, static_cast<Index>(l)));
+      }
+      correlations.add(std::move(row));
+      fmt::print("{:<18} {:<5} true {:>7.4f}   estimated {:>9.5f} ± {:.5f}\n", method.name, h.name, truth.number(h.name), h.value,
+                 uncertainty.stddev[column]);
+    }
+  }
+  table.write(options.output / "arm_mass");
+  correlations.write(options.output / "arm_mass_correlation");
 }
 
 }  // namespace gp2::command

@@ -149,5 +149,6 @@ void reproduce_fig3b(const ReproduceOptions& options);
 void reproduce_fig3c(const ReproduceOptions& options);
 void reproduce_figS7(const ReproduceOptions& options);
 void reproduce_arm_on_surface(const ReproduceOptions& options);
+void reproduce_arm_mass(const ReproduceOptions& options);
 
 }  // namespace gp2::command

@@ -26,13 +26,14 @@ struct Experiment {
   bool of_the_paper = true;  // and of "all"
 };
 
-constexpr std::array<Experiment, 7> experiments = {{{"table1", reproduce_table1},
+constexpr std::array<Experiment, 8> experiments = {{{"table1", reproduce_table1},
                                                     {"fig3a", reproduce_fig3a},
                                                     {"fig3b", reproduce_fig3b},
                                                     {"fig3c", reproduce_fig3c},
                                                     {"figS7", reproduce_figS7},
                                                     {"learning-curve", reproduce_learning_curve},
-                                                    {"arm-on-surface", reproduce_arm_on_surface, false}}};
+                                                    {"arm-on-surface", reproduce_arm_on_surface, false},
+                                                    {"arm-mass", reproduce_arm_mass, false}}};
 
 // the definitions: as told, beside an installed command, or in the source the command was built from
 std::filesystem::path definitions(const std::string& told) {
