@@ -48,7 +48,7 @@ async function open(name, { width = 1200, scheme = "light", pictures = true } = 
   page.on("dialog", (dialog) => { complaints.push(`dialog ${dialog.message()}`); dialog.dismiss(); });
   const own = pathToFileURL(join(folder, name)).href;
   page.on("request", (request) => { if (request.url().split("#")[0] !== own && !request.url().startsWith("data:")) requests.push(request.url()); });
-  await page.goto(own);
+  await page.goto(own, { timeout: 120_000 });  // a busy machine is slow to start
   if (pictures) await page.waitForFunction(() => document.querySelectorAll("canvas").length > 0);
   await settled(page);
   return {
