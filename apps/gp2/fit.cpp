@@ -1,6 +1,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdio>
+#include <limits>
 #include <memory>
 
 #include <unistd.h>
@@ -18,6 +19,7 @@ namespace gp2::command {
 
 namespace {
 
+using Eigen::Index;
 using Json = nlohmann::ordered_json;
 
 struct Arguments {
@@ -31,6 +33,7 @@ struct Arguments {
   std::optional<int> max_points;
   std::uint64_t seed = 0;
   bool json = false;
+  bool no_standard_errors = false;
 };
 
 FitProblemOptions problem_options(const Arguments& arguments) {
@@ -94,29 +97,55 @@ void print_progress(const Progress& p) {
   std::fflush(stderr);
 }
 
+Json number_or_null(double value) { return std::isfinite(value) ? Json(value) : Json(); }
+
+// of a parameter; NaN where it is not known, ∞ where the data do not determine it
+double stddev_of(const FitReport& report, std::size_t k) {
+  if (!report.uncertainty || report.hyperparameters[k].at_bound()) return std::numeric_limits<double>::quiet_NaN();
+  return report.uncertainty->stddev[static_cast<Index>(k)];
+}
+
 Json to_json(const FitReport& report) {
   Json hyperparameters = Json::array();
-  for (const Hyperparameter& h : report.hyperparameters) {
+  Json errors = Json::array();  // of parameters, with their correlations
+  for (std::size_t k = 0; k < report.hyperparameters.size(); ++k) {
+    const Hyperparameter& h = report.hyperparameters[k];
     hyperparameters.push_back({{"name", h.name},
                                {"value", h.value},
                                {"lower", h.lower},
                                {"upper", h.upper},
                                {"unit", h.unit},
                                {"at_bound", h.at_bound()}});
+    if (h.kind != Hyperparameter::Kind::parameter || !report.uncertainty) continue;
+    Json correlation = Json::object();
+    for (std::size_t l = 0; l < report.hyperparameters.size(); ++l) {
+      const Hyperparameter& other = report.hyperparameters[l];
+      if (other.kind != Hyperparameter::Kind::parameter) continue;
+      correlation[other.name] = number_or_null(report.uncertainty->correlation(static_cast<Index>(k), static_cast<Index>(l)));
+    }
+    errors.push_back({{"name", h.name}, {"stddev", number_or_null(stddev_of(report, k))}, {"correlation", correlation}});
   }
-  return {{"nll", report.negative_log_likelihood},
-          {"termination", report.termination},
-          {"iterations", report.iterations},
-          {"seconds", report.seconds},
-          {"hyperparameters", hyperparameters}};
+  Json json = {{"nll", report.negative_log_likelihood},
+               {"termination", report.termination},
+               {"iterations", report.iterations},
+               {"seconds", report.seconds},
+               {"hyperparameters", hyperparameters}};
+  if (report.uncertainty) {
+    json["standard_errors"] = {{"parameters", errors},
+                               {"distance_from_optimum", number_or_null(report.uncertainty->distance_from_optimum)}};
+  }
+  return json;
 }
 
 void print_text(const FitReport& report) {
   fmt::print("negative log likelihood {:.6f}\n", report.negative_log_likelihood);
   fmt::print("{} after {} iterations ({} restarts, best: {}), {:.2f} s\n", report.termination, report.iterations,
              report.restarts.size(), report.best_restart + 1, report.seconds);
-  for (const Hyperparameter& h : report.hyperparameters) {
-    fmt::print("  {:<34} {:>13.6g}   [{:.3g}, {:.3g}]{}\n", h.name, h.value, h.lower, h.upper,
+  for (std::size_t k = 0; k < report.hyperparameters.size(); ++k) {
+    const Hyperparameter& h = report.hyperparameters[k];
+    const double stddev = h.kind == Hyperparameter::Kind::parameter ? stddev_of(report, k) : std::nan("");
+    const std::string error = std::isfinite(stddev) ? fmt::format(" ± {:.2g}", stddev) : std::isinf(stddev) ? " ± ∞" : "";
+    fmt::print("  {:<34} {:>13.6g}{}   [{:.3g}, {:.3g}]{}\n", h.name, h.value, error, h.lower, h.upper,
                h.at_bound() ? "   at its bound" : "");
   }
 }
@@ -150,6 +179,7 @@ void run(const Arguments& arguments) {
   options.max_iterations = arguments.max_iterations;
   options.seed = arguments.seed;
   options.n_threads = arguments.threads;
+  options.standard_errors = !arguments.no_standard_errors;
   const bool terminal = isatty(STDERR_FILENO) != 0;
   if (terminal) options.progress = print_progress;
   Fit result = fit(problem, options);
@@ -234,6 +264,8 @@ void add_fit(CLI::App& app) {
   command->add_option("--seed", a->seed, "of restarts and --max-points")->check(not_negative())->capture_default_str();
   command->add_option("--threads", a->threads, "0: as many as the machine has; results do not depend on it")
       ->capture_default_str();
+  command->add_flag("--no-standard-errors", a->no_standard_errors,
+                    "leave out the standard errors of estimated parameters, which take a few dozen gradients");
   command->add_flag("--json", a->json, "report as JSON on stdout");
   command->add_option("-o,--output", a->output, "fitted model to write (JSON)")->required();
   command->footer("Example:\n  gp2 fit models/surface.toml --data train.csv --mean force -o fit.json");

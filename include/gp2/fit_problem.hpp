@@ -81,7 +81,7 @@ Fit fit(const FitProblem& problem, const FitOptions& options);
 /// start outside of them is taken; they are widened to hold it, and the notes say so.
 void read_start(const std::filesystem::path& path, int max_iterations, FitProblem& problem);
 
-/// What a person should know of a fit: noise that ended at its lower bound.
+/// What a person should know of a fit: parameters at a bound, uncertainty_notes, and noise at its lower bound.
 std::vector<std::string> notes_of(const FitReport& report);
 
 /// Which latent of a prior has a name. @throws InputError naming `option` and the latents there are.

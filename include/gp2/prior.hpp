@@ -30,6 +30,8 @@ struct Latent {
     double initial = 0;  // 0: the protocol's default
     double lower = 0;    // 0: the protocol's default
     double upper = 0;    // 0: the protocol's default
+    // log-normal hyper-prior; log_stddev 0: the protocol's default
+    double median = 0, log_stddev = 0;
   };
 
   std::string name;

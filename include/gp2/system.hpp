@@ -25,10 +25,17 @@ struct StateLayout {
 
 /// A number of the model that may be estimated from data.
 struct Parameter {
+  /// What is believed of it before the data: a normal density of the value, or of its logarithm.
+  struct Belief {
+    double median = 0, stddev = 0;
+    bool of_logarithm = false;
+  };
+
   std::string name;
   double value = 0;
   std::optional<std::pair<double, double>> bounds;  // hard limits when estimated
   bool estimate = false;                            // the model file's wish; a fit may override it
+  std::optional<Belief> prior = std::nullopt;       // weighed when estimated
 };
 
 /// A coordinate and the names its velocity and acceleration go by.

@@ -36,8 +36,10 @@ struct Hyperparameter {
   double lower = 0, upper = 0;
   Eigen::VectorXd scale;  // of a shared signal standard deviation: its unit per column; of W and √κ: their unit
 
-  /// Weak log-normal hyper-prior: ½ (log(value/median)/log_stddev)² is added to the objective; none where log_stddev = 0.
+  /// Log-normal hyper-prior: ½ (log(value/median)/log_stddev)² is added to the objective; none where log_stddev = 0.
   double median = 0, log_stddev = 0;
+  /// Normal hyper-prior of a parameter, instead: ½ ((value − median)/stddev)²; none where stddev = 0.
+  double stddev = 0;
 
   [[nodiscard]] bool is_positive() const { return kind != Kind::parameter && kind != Kind::mixing; }
   /// Within 1e-6 of a bound, on the scale it is optimised on.
@@ -106,9 +108,11 @@ struct FitOptions {
   int max_iterations = 1000;                      // per restart; 0: condition at the starting values
   std::uint64_t seed = 0;                         // of the other starting points
   int n_threads = 0;                              // 0: as many as the machine has; results do not depend on it
-  double gradient_tolerance = 1e-5;               // stop when the projected gradient's largest entry is below
+  double gradient_tolerance = 1e-5;               // stop when the projected gradient's largest entry is below; that in a
+                                                  // parameter is per deviation it would have were all else known
   double reduction_tolerance = 1e-12;             // stop when an iteration lowers the objective by less, relatively
   int max_escapes = 5;                            // scans for lower optima from the best one
+  bool standard_errors = true;                    // FitReport::uncertainty, where parameters are estimated
   std::function<void(const Progress&)> progress;  // called from worker threads, one at a time
   const std::atomic<bool>* stop = nullptr;        // set: return the best so far
 };
@@ -122,6 +126,22 @@ struct RestartReport {
   std::string termination;  // which inequality stopped it
 };
 
+/// How well data determine what was fitted to them: Laplace's approximation. About its minimum the objective of `fit` is
+/// J(x) ≈ J(x̂) + ½ (x − x̂)ᵀH(x − x̂), which makes x̂ the mean and H⁻¹ the covariance of x given the data. x is each hyperparameter
+/// as it is optimised: its logarithm, or where it may be negative (θ, entries of W) itself. The deviation of one allows for not
+/// knowing the others.
+struct LaplaceUncertainty {
+  Eigen::VectorXd stddev;  // of x_k: in the unit of θ and W, of the logarithm else; 0 where held, ∞ where not determined (n)
+  Eigen::MatrixXd correlation;  // of x_k and x_l; 0 where one is held, NaN where one is not determined (n × n)
+  std::vector<int> held;        // at a bound, and taken as known
+  /// Combinations of x that the data do not determine, a unit vector in the units of `stddev` per column: parameters that enter
+  /// by their ratio only, say (n × number of combinations).
+  Eigen::MatrixXd undetermined;
+  /// √(gᵀH⁻¹g) of what is determined: how many standard deviations the optimum is away. Where it is not small, the optimiser
+  /// stopped too early for these figures; ∞ where it stopped on a slope that bends downwards.
+  double distance_from_optimum = 0;
+};
+
 struct FitReport {
   std::vector<Hyperparameter> hyperparameters;  // fitted values
   double negative_log_likelihood = 0;           // physical units, all constants, without hyper-prior
@@ -132,6 +152,7 @@ struct FitReport {
   int best_restart = 0;
   int n_escapes = 0;  // times the scan from the best optimum found a lower one
   std::vector<RestartReport> restarts;
+  std::optional<LaplaceUncertainty> uncertainty;  // of the hyperparameters, in their order
   double seconds = 0;
 };
 

@@ -384,6 +384,7 @@ void save(const PyPosterior& self, const py::object& path) {
 
 template <typename Class>
 void define_report(Class& report) {
+  using namespace py::literals;
   report.def_readonly("hyperparameters", &FitReport::hyperparameters, "Fitted values, list of Hyperparameter.")
       .def_readonly("negative_log_likelihood", &FitReport::negative_log_likelihood,
                     "-log p(y), physical units, all constants, without hyper-prior.")
@@ -394,6 +395,31 @@ void define_report(Class& report) {
       .def_readonly("best_restart", &FitReport::best_restart)
       .def_readonly("restarts", &FitReport::restarts, "How each run ended, list of RestartReport.")
       .def_readonly("seconds", &FitReport::seconds)
+      .def_property_readonly(
+          "standard_errors",
+          [](const FitReport& self) {
+            py::dict errors;
+            for (std::size_t k = 0; self.uncertainty && k < self.hyperparameters.size(); ++k) {
+              const Hyperparameter& h = self.hyperparameters[k];
+              if (h.kind != Hyperparameter::Kind::parameter) continue;
+              errors[py::str(h.name)] = h.at_bound() ? std::nan("") : self.uncertainty->stddev[static_cast<Eigen::Index>(k)];
+            }
+            return errors;
+          },
+          "Of estimated parameters, by name: inf where the data do not determine one, nan where it is at a bound.")
+      .def(
+          "correlation",
+          [](const FitReport& self, const std::string& a, const std::string& b) {
+            const auto index = [&](const std::string& name) {
+              for (std::size_t k = 0; k < self.hyperparameters.size(); ++k) {
+                if (self.hyperparameters[k].name == name) return static_cast<Eigen::Index>(k);
+              }
+              throw py::key_error(name);
+            };
+            const Eigen::Index k = index(a), l = index(b);
+            return self.uncertainty ? self.uncertainty->correlation(k, l) : std::nan("");
+          },
+          "a"_a, "b"_a, "Of the errors of two hyperparameters; nan where one is not determined.")
       .def("__getitem__",
            [](const FitReport& self, const std::string& name) {
              for (const Hyperparameter& h : self.hyperparameters) {
@@ -405,8 +431,12 @@ void define_report(Class& report) {
         std::string text = fmt::format("negative log likelihood {:.6f}\n{} after {} iterations ({} restarts, best: {}), {:.2f} s",
                                        self.negative_log_likelihood, self.termination, self.iterations, self.restarts.size(),
                                        self.best_restart + 1, self.seconds);
-        for (const Hyperparameter& h : self.hyperparameters) {
-          text += fmt::format("\n  {:<34} {:>13.6g}   [{:.3g}, {:.3g}]{}", h.name, h.value, h.lower, h.upper,
+        for (std::size_t k = 0; k < self.hyperparameters.size(); ++k) {
+          const Hyperparameter& h = self.hyperparameters[k];
+          const bool has_error = self.uncertainty && h.kind == Hyperparameter::Kind::parameter && !h.at_bound();
+          const std::string error =
+              has_error ? fmt::format(" ± {:.2g}", self.uncertainty->stddev[static_cast<Eigen::Index>(k)]) : "";
+          text += fmt::format("\n  {:<34} {:>13.6g}{}   [{:.3g}, {:.3g}]{}", h.name, h.value, error, h.lower, h.upper,
                               h.at_bound() ? "   at its bound" : "");
         }
         return text;

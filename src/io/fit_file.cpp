@@ -136,6 +136,7 @@ Json hyperparameter_json(const Hyperparameter& h) {
                {"index", h.index}};
   if (h.scale.size() > 0) json["scale"] = vector_json(h.scale);
   if (h.log_stddev > 0) json["hyperprior"] = {{"median", h.median}, {"log_stddev", h.log_stddev}};
+  if (h.stddev > 0) json["hyperprior"] = {{"mean", h.median}, {"stddev", h.stddev}};
   return json;
 }
 
@@ -151,8 +152,10 @@ Hyperparameter hyperparameter_from(const Json& json) {
   h.index = integer(json.at("index"));
   if (json.contains("scale")) h.scale = vector_from(json.at("scale"));
   if (json.contains("hyperprior")) {
-    h.median = number(json.at("hyperprior").at("median"));
-    h.log_stddev = number(json.at("hyperprior").at("log_stddev"));
+    const Json& prior = json.at("hyperprior");
+    const bool normal = prior.contains("mean");
+    h.median = number(prior.at(normal ? "mean" : "median"));
+    (normal ? h.stddev : h.log_stddev) = number(prior.at(normal ? "stddev" : "log_stddev"));
   }
   const bool needs_scale = h.kind == Kind::mixing || h.kind == Kind::sqrt_kappa;
   if ((h.is_positive() && !(h.value > 0)) || !(h.scale.array() > 0).all() || (needs_scale && h.scale.size() != 1)) {
@@ -340,6 +343,57 @@ Json restart_json(const RestartReport& r) {
           {"termination", r.termination}};
 }
 
+// numbers that may be ∞ or NaN: null
+Json numbers_or_null(const Eigen::Ref<const VectorXd>& values) {
+  Json json = Json::array();
+  for (const double value : values) json.push_back(number_or_null(value));
+  return json;
+}
+
+Json columns_json(const MatrixXd& matrix) {
+  Json json = Json::array();
+  for (Index k = 0; k < matrix.cols(); ++k) json.push_back(numbers_or_null(matrix.col(k)));
+  return json;
+}
+
+Json uncertainty_json(const LaplaceUncertainty& uncertainty) {
+  return {{"stddev", numbers_or_null(uncertainty.stddev)},
+          {"held", uncertainty.held},
+          {"correlation", columns_json(uncertainty.correlation)},
+          {"undetermined", columns_json(uncertainty.undetermined)},
+          {"distance_from_optimum", number_or_null(uncertainty.distance_from_optimum)}};
+}
+
+/// @param n  hyperparameters
+LaplaceUncertainty uncertainty_from(const Json& json, std::size_t n) {
+  const auto column = [n](const Json& values, double null) {
+    if (array(values).size() != n) throw InputError(fmt::format("standard errors of {} of {} hyperparameters", values.size(), n));
+    VectorXd out(static_cast<Index>(n));
+    std::transform(values.begin(), values.end(), out.begin(),
+                   [null](const Json& value) { return value.is_null() ? null : number(value); });
+    return out;
+  };
+  const auto columns = [&](const Json& values) {
+    MatrixXd out(static_cast<Index>(n), static_cast<Index>(array(values).size()));
+    for (Index k = 0; k < out.cols(); ++k) {
+      out.col(k) = column(values[static_cast<std::size_t>(k)], std::numeric_limits<double>::quiet_NaN());
+    }
+    return out;
+  };
+  LaplaceUncertainty out;
+  out.stddev = column(json.at("stddev"), std::numeric_limits<double>::infinity());
+  for (const Json& k : array(json.at("held"))) {
+    const int index = integer(k);
+    if (index < 0 || index >= static_cast<int>(n)) throw InputError(fmt::format("{} is no hyperparameter", index));
+    out.held.push_back(index);
+  }
+  out.correlation = columns(json.at("correlation"));
+  if (out.correlation.cols() != out.correlation.rows()) throw InputError("correlations that are not square");
+  out.undetermined = columns(json.at("undetermined"));
+  out.distance_from_optimum = number_or_infinity(json.at("distance_from_optimum"));
+  return out;
+}
+
 RestartReport restart_from(const Json& json) {
   return {number_or_infinity(json.at("objective")), number_or_infinity(json.at("nll")),     integer(json.at("iterations")),
           integer(json.at("evaluations")),          integer(json.at("failed_evaluations")), json.at("converged").get<bool>(),
@@ -386,6 +440,7 @@ void FitFile::write(const std::filesystem::path& path) const {
                     {"best_restart", report.best_restart},
                     {"restarts", Json::array()}};
   for (const RestartReport& restart : report.restarts) json["report"]["restarts"].push_back(restart_json(restart));
+  if (report.uncertainty) json["report"]["uncertainty"] = uncertainty_json(*report.uncertainty);
   json["data_source"] = data_source;
   json["observations"] = Json::array();
   const Prior home = prior();
@@ -451,6 +506,9 @@ FitFile read_fit(const std::filesystem::path& path, const MechanicsSource* mecha
     fit.report.iterations = integer(report.at("iterations"));
     fit.report.best_restart = integer(report.at("best_restart"));
     for (const Json& restart : array(report.at("restarts"))) fit.report.restarts.push_back(restart_from(restart));
+    if (report.contains("uncertainty")) {
+      fit.report.uncertainty = uncertainty_from(report.at("uncertainty"), fit.report.hyperparameters.size());
+    }
   } catch (const Json::exception& error) {
     throw InputError(fmt::format("{}: not a whole fit file: {}", path.string(), error.what()));
   } catch (const InputError& error) {

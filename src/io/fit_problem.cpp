@@ -10,6 +10,7 @@
 
 #include "gp2/check.hpp"
 #include "gp2/error.hpp"
+#include "gp2/laplace.hpp"
 #include "gp2/mechanics.hpp"
 #include "io/baseline_prior.hpp"
 #include "prior/random.hpp"
@@ -508,9 +509,21 @@ std::vector<std::string> notes_of(const FitReport& report) {
     const bool at_lower = h.at_bound() && h.value < 2 * h.lower;
     if (h.kind == Hyperparameter::Kind::noise_stddev && at_lower) collapsed.push_back(h.name);
   }
-  if (collapsed.empty()) return {};
-  return {fmt::format("warning: {} ended at the lower bound: the columns may not be independent measurements; see gp2 check",
-                      fmt::join(collapsed, ", "))};
+  std::vector<std::string> notes;
+  for (const Hyperparameter& h : report.hyperparameters) {
+    if (h.kind != Hyperparameter::Kind::parameter || !h.at_bound() || report.iterations == 0) continue;
+    notes.push_back(
+        fmt::format("warning: {} ended at its bound, {:.6g}. It may lie beyond, or the model lacks something", h.name, h.value));
+  }
+  for (const UncertaintyNote& note : uncertainty_notes(report)) {
+    notes.push_back(fmt::format("{}{}. {}", note.is_warning ? "warning: " : "", note.text, note.mend));
+  }
+  if (!collapsed.empty()) {
+    notes.push_back(
+        fmt::format("warning: {} ended at the lower bound: the columns may not be independent measurements; see gp2 check",
+                    fmt::join(collapsed, ", ")));
+  }
+  return notes;
 }
 
 FitOptions default_fit_options(const FitProblem& problem) {

@@ -1,6 +1,7 @@
 #include "io/model_reader.hpp"
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <optional>
 #include <set>
@@ -163,7 +164,7 @@ class ModelReader : private TomlReader {
       Parameter parameter{name, 0, std::nullopt, false};
       if (node->is_table()) {
         const toml::table& entry = *node->as_table();
-        only_keys(entry, key, {"value", "bounds", "estimate", "of"});
+        only_keys(entry, key, {"value", "bounds", "estimate", "of", "prior"});
         if (entry.contains("of")) parameter.value = read_robot_number(*entry.get("of"), key + ".of", name);
         if (entry.contains("value")) {
           parameter.value = number(*entry.get("value"), key + ".value");
@@ -172,6 +173,7 @@ class ModelReader : private TomlReader {
         }
         if (entry.contains("bounds")) parameter.bounds = range(*entry.get("bounds"), key + ".bounds");
         if (entry.contains("estimate")) parameter.estimate = boolean(*entry.get("estimate"), key + ".estimate");
+        if (entry.contains("prior")) parameter.prior = belief(*entry.get("prior"), key + ".prior");
         if (parameter.bounds && (parameter.value < parameter.bounds->first || parameter.value > parameter.bounds->second)) {
           fail(*node, key,
                fmt::format("the value {} is outside its bounds [{}, {}]", parameter.value, parameter.bounds->first,
@@ -182,6 +184,26 @@ class ModelReader : private TomlReader {
       }
       definition_.parameters.push_back(parameter);
     }
+  }
+
+  // { mean = 2, stddev = 0.1 } of a parameter, or { median = 2, log_stddev = 0.1 } of one that is positive
+  Parameter::Belief belief(const toml::node& node, const std::string& key, bool normal_too = true) const {
+    const toml::table& entry = table(node, key);
+    Parameter::Belief out;
+    out.of_logarithm = !normal_too || !entry.contains("mean");
+    const std::array<const char*, 2> keys = {out.of_logarithm ? "median" : "mean", out.of_logarithm ? "log_stddev" : "stddev"};
+    only_keys(entry, key, {keys[0], keys[1]});
+    for (const char* name : keys) {
+      if (entry.contains(name)) continue;
+      fail(node, key,
+           fmt::format("missing {}; write {}{{ median = 2.0, log_stddev = 0.1 }}, the second of its logarithm", name,
+                       normal_too ? "{ mean = 2.0, stddev = 0.1 }, or, of a positive one, " : ""));
+    }
+    out.median = number(*entry.get(keys[0]), fmt::format("{}.{}", key, keys[0]));
+    out.stddev = number(*entry.get(keys[1]), fmt::format("{}.{}", key, keys[1]));
+    if (!(out.stddev > 0)) fail(node, key, fmt::format("{} must be positive, got {}", keys[1], out.stddev));
+    if (out.of_logarithm && !(out.median > 0)) fail(node, key, fmt::format("median must be positive, got {}", out.median));
+    return out;
   }
 
   // mass("link7") or com('link7').x: a number of the robot that is this parameter from now on; gives the robot's own value
@@ -495,7 +517,7 @@ class ModelReader : private TomlReader {
            fmt::format("expected a table such as {{ initial = 1, bounds = [0.1, 10] }}, got {}", written(*latent.get(name))));
     }
     const toml::table& entry = *latent.get(name)->as_table();
-    only_keys(entry, key, {"initial", "bounds"});
+    only_keys(entry, key, {"initial", "bounds", "prior"});
     const auto require_positive = [&](const char* what, double value) {
       if (!(value > 0)) {
         fail(*entry.get(what), fmt::format("{}.{}", key, what),
@@ -509,6 +531,11 @@ class ModelReader : private TomlReader {
     if (entry.contains("initial")) {
       out.initial = number(*entry.get("initial"), key + ".initial");
       require_positive("initial", out.initial);
+    }
+    if (entry.contains("prior")) {
+      const Parameter::Belief prior = belief(*entry.get("prior"), key + ".prior", false);
+      out.median = prior.median;
+      out.log_stddev = prior.stddev;
     }
     if (out.initial > 0 && out.upper > 0 && (out.initial < out.lower || out.initial > out.upper)) {
       fail(entry, key, fmt::format("initial = {} is outside bounds = [{}, {}]", out.initial, out.lower, out.upper));

@@ -12,6 +12,7 @@
 #include "inference/lapack.hpp"
 #include "inference/parallel.hpp"
 #include "prior/random.hpp"
+#include "training/curvature.hpp"
 #include "training/lbfgsb.hpp"
 #include "training/objective.hpp"
 
@@ -81,6 +82,7 @@ class Training {
     parallel_for(n_restarts(), n_threads_, [&](int restart, int) { run_restart(restart, n_restarts() == 1 ? n_threads_ : 1); });
     release();
     while (n_escapes_ < options_.max_escapes && !stopped() && escape()) ++n_escapes_;
+    if (options_.standard_errors && options_.max_iterations > 0 && !stopped() && estimates_parameters()) estimate_errors();
   }
 
   // the lowest objective; of equal ones the first
@@ -92,11 +94,23 @@ class Training {
   [[nodiscard]] const std::vector<RestartReport>& reports() const { return reports_; }
   [[nodiscard]] const std::vector<Hyperparameter>& result(std::size_t restart) const { return results_[restart]; }
   [[nodiscard]] int n_escapes() const { return n_escapes_; }
+  [[nodiscard]] const std::optional<LaplaceUncertainty>& uncertainty() const { return uncertainty_; }
 
  private:
   [[nodiscard]] bool stopped() const { return options_.stop != nullptr && options_.stop->load(); }
 
+  [[nodiscard]] bool estimates_parameters() const {
+    return std::any_of(hyperparameters_.begin(), hyperparameters_.end(), [](const auto& h) { return h.kind == Kind::parameter; });
+  }
+
+  // A parameter that data know to a millionth of its box bends the objective 10¹² times as much as a lengthscale, and
+  // quasi-Newton steps stall: the optimiser sees it in units of what is known of it.
   LbfgsbResult optimise(int restart, const std::vector<Hyperparameter>& from, Likelihood::Workspace& workspace) {
+    return optimise(restart, from, scales_of_parameters(objective_, internal_values(from), from, workspace), workspace);
+  }
+
+  LbfgsbResult optimise(int restart, const std::vector<Hyperparameter>& from, const VectorXd& scales,
+                        Likelihood::Workspace& workspace) {
     LbfgsbOptions options;
     options.max_iterations =
         options_.max_iterations - reports_[static_cast<std::size_t>(restart)].iterations;  // an escape goes on
@@ -105,9 +119,41 @@ class Training {
     options.iteration = [&](int iteration, double value) { return report_iteration(restart, iteration, value); };
     options.stop = [&] { return stopped(); };
     const Index n = static_cast<Index>(from.size());
-    return minimise([&](const VectorXd& x, VectorXd& gradient) { return objective_(x, &gradient, workspace); },
-                    internal_values(from), Eigen::Map<const VectorXd>(box_.lower.data(), n),
-                    Eigen::Map<const VectorXd>(box_.upper.data(), n), options);
+    LbfgsbResult result = minimise(
+        [&](const VectorXd& scaled, VectorXd& gradient) {
+          const double value = objective_(scaled.cwiseProduct(scales), &gradient, workspace);
+          gradient = gradient.cwiseProduct(scales);
+          return value;
+        },
+        internal_values(from).cwiseQuotient(scales), Eigen::Map<const VectorXd>(box_.lower.data(), n).cwiseQuotient(scales),
+        Eigen::Map<const VectorXd>(box_.upper.data(), n).cwiseQuotient(scales), options);
+    result.x = result.x.cwiseProduct(scales);
+    return result;
+  }
+
+  // Where the best run stopped short of its optimum it goes on, now that the curvatures are known, in units of them.
+  void estimate_errors() {
+    constexpr double near = 0.02;  // standard deviations
+    constexpr int n_attempts = 2;
+    const std::size_t from = best();
+    try {
+      Likelihood::Workspace workspace(n_threads_);
+      for (int attempt = 0;; ++attempt) {
+        const std::vector<Hyperparameter>& at = results_[from];
+        const Curvature curvature = curvature_at(objective_, internal_values(at), at, n_threads_);
+        const bool may_go_on = attempt < n_attempts && reports_[from].iterations < options_.max_iterations && !stopped();
+        if (curvature.distance_from_optimum() <= near || !may_go_on) {
+          uncertainty_ = laplace_uncertainty(curvature, at);
+          return;
+        }
+        VectorXd scales = VectorXd::Ones(static_cast<Index>(at.size()));
+        scales(curvature.free) = curvature.unit.cwiseMin(1);
+        const LbfgsbResult further = optimise(static_cast<int>(from), at, scales, workspace);
+        if (further.value < reports_[from].objective) store(from, further);
+      }
+    } catch (const NumericalError&) {
+      // no finite likelihood about the optimum: no standard errors, which the report says by having none
+    }
   }
 
   void store(std::size_t restart, const LbfgsbResult& result) {
@@ -230,6 +276,7 @@ class Training {
     std::vector<double> lower, upper;
   } box_;  // as the optimiser sees it
   int n_escapes_ = 0;
+  std::optional<LaplaceUncertainty> uncertainty_;
 
   std::mutex mutex_;  // guards what follows
   std::vector<double> fractions_;
@@ -258,6 +305,7 @@ Fit fit(const Prior& prior, const std::vector<Observations>& observations, const
   report.iterations = winner.iterations;
   report.best_restart = static_cast<int>(best);
   report.n_escapes = training.n_escapes();
+  report.uncertainty = training.uncertainty();
   report.restarts = training.reports();
   Posterior posterior(prior, observations, model_values(prior, observations, report.hyperparameters));
   report.seconds = std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();

@@ -182,8 +182,8 @@ void add_kernel_parameters(const Latent& latent, int owner, const std::string& p
         initial = choose(range.initial, paper ? 1 : Standard::lengthscale_initial);
         lower = choose(range.lower, paper ? 0.5 : Standard::lengthscale_lower);
         upper = choose(range.upper, paper ? 20 : Standard::lengthscale_upper);
-        median = Standard::lengthscale_median;
-        log_stddev = Standard::lengthscale_log_stddev;
+        median = choose(range.median, Standard::lengthscale_median);
+        log_stddev = choose(range.log_stddev, Standard::lengthscale_log_stddev);
         if (parameter.kind == Kernel::ParameterKind::lengthscale) {
           scale = scales.feature_stddev[static_cast<std::size_t>(owner)][parameter.feature];
           h.unit = unit_of(latent.feature_names[static_cast<std::size_t>(parameter.feature)]);
@@ -242,8 +242,8 @@ void add_signal_stddevs(const Latent& latent, int owner, const std::string& pref
     h.lower = choose(range.lower, Standard::signal_lower) * scale[l];
     h.upper = choose(range.upper, Standard::signal_upper) * scale[l];
     if (protocol.hyperprior) {
-      h.median = Standard::signal_median * scale[l];
-      h.log_stddev = Standard::signal_log_stddev;
+      h.median = choose(range.median, Standard::signal_median) * scale[l];
+      h.log_stddev = choose(range.log_stddev, Standard::signal_log_stddev);
     }
     out.push_back(std::move(h));
   }
@@ -338,6 +338,16 @@ std::vector<Hyperparameter> default_hyperparameters(const Prior& prior, const st
     } else {
       throw InputError(
           fmt::format("parameter '{}' is 0 and has no bounds: write {} = {{ value = 0, bounds = [lower, upper] }}", name, name));
+    }
+    if (parameter.prior && protocol.hyperprior && protocol.name == Protocol::Name::standard) {
+      if (parameter.prior->of_logarithm && !(h.lower > 0)) {
+        throw InputError(
+            fmt::format("parameter '{}': a prior of the logarithm needs bounds above 0, got [{}, {}]; write "
+                        "bounds = [lower, upper], or prior = {{ mean = …, stddev = … }}",
+                        name, h.lower, h.upper));
+      }
+      h.median = parameter.prior->median;
+      (parameter.prior->of_logarithm ? h.log_stddev : h.stddev) = parameter.prior->stddev;
     }
     out.push_back(std::move(h));
   }

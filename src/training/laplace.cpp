@@ -5,12 +5,11 @@
 #include <limits>
 
 #include <fmt/format.h>
-#include <Eigen/Eigenvalues>
+#include <fmt/ranges.h>
 
-#include "gp2/error.hpp"
 #include "inference/lapack.hpp"
 #include "inference/parallel.hpp"
-#include "training/objective.hpp"
+#include "training/curvature.hpp"
 
 namespace gp2 {
 
@@ -21,91 +20,21 @@ using Kind = Hyperparameter::Kind;
 
 namespace {
 
-// of a difference, as the optimiser sees a hyperparameter: at most
-double step_of(const Hyperparameter& h) { return h.kind == Kind::parameter ? 1e-3 : 1e-2; }
-
 // the unit of x in LaplaceUncertainty, as the optimiser sees it
 double unit_of(const Hyperparameter& h) {
   if (h.kind == Kind::mixing) return h.scale[0];
   return h.kind == Kind::parameter ? h.upper - h.lower : 1;
 }
 
-// hyperparameters that are not at a bound, nor nearer to it than a difference needs
-std::vector<int> free_ones(const std::vector<Hyperparameter>& hyperparameters) {
-  std::vector<int> free;
-  for (std::size_t k = 0; k < hyperparameters.size(); ++k) {
-    const Hyperparameter& h = hyperparameters[k];
-    const double x = to_internal(h, h.value), step = step_of(h);
-    if (x - to_internal(h, h.lower) > step && to_internal(h, h.upper) - x > step) free.push_back(static_cast<int>(k));
-  }
-  return free;
-}
-
-class Differences {
- public:
-  Differences(const Objective& objective, const VectorXd& x, const std::vector<Hyperparameter>& hyperparameters,
-              const std::vector<int>& free)
-      : objective_(objective), x_(x), hyperparameters_(hyperparameters), free_(free) {}
-
-  // H of the free ones. Data may know a parameter a thousand times better where the others are known than where they are not:
-  // then H is nearly singular, and the steps are short, three such deviations, so that what differences neglect does not matter.
-  [[nodiscard]] MatrixXd hessian(int n_threads) const {
-    const auto n = static_cast<Index>(free_.size());
-    MatrixXd H(n, n);
-    parallel_for(static_cast<int>(n), n_threads, [&](int k, int) {
-      Likelihood::Workspace workspace;
-      const Hyperparameter& h = hyperparameters_[static_cast<std::size_t>(free_[static_cast<std::size_t>(k)])];
-      const double step = step_of(h);
-      H.col(k) = column(k, step, workspace);
-      constexpr double shortest = 1e-8, deviations = 3;
-      const double short_step = std::max(deviations / std::sqrt(std::abs(H(k, k))), shortest);
-      if (h.kind == Kind::parameter && short_step < step) H.col(k) = column(k, short_step, workspace);
-    });
-    return (H + H.transpose()) / 2;
-  }
-
- private:
-  [[nodiscard]] VectorXd column(int k, double step, Likelihood::Workspace& workspace) const {
-    return (gradient_at(k, step, workspace) - gradient_at(k, -step, workspace)) / (2 * step);
-  }
-
-  [[nodiscard]] VectorXd gradient_at(int k, double distance, Likelihood::Workspace& workspace) const {
-    const int moved = free_[static_cast<std::size_t>(k)];
-    VectorXd there = x_, gradient(x_.size());
-    there[moved] += distance;
-    if (!std::isfinite(objective_(there, &gradient, workspace))) {
-      throw NumericalError(fmt::format("the likelihood is not finite near the fitted value of '{}': no standard errors",
-                                       hyperparameters_[static_cast<std::size_t>(moved)].name));
-    }
-    return gradient(free_);
-  }
-
-  const Objective& objective_;
-  const VectorXd& x_;
-  const std::vector<Hyperparameter>& hyperparameters_;
-  const std::vector<int>& free_;
-};
-
 }  // namespace
 
-LaplaceUncertainty laplace_uncertainty(const Prior& prior, const std::vector<Observations>& observations,
-                                       const std::vector<Hyperparameter>& hyperparameters, int n_threads) {
+LaplaceUncertainty laplace_uncertainty(const Curvature& curvature, const std::vector<Hyperparameter>& hyperparameters) {
   constexpr double infinity = std::numeric_limits<double>::infinity(), nan = std::numeric_limits<double>::quiet_NaN();
-  const lapack::SingleThread single_thread;
-  const Objective objective(prior, observations, hyperparameters);
-  const VectorXd x = internal_values(hyperparameters);
-  const std::vector<int> free = free_ones(hyperparameters);
+  const std::vector<int>& free = curvature.free;
   const auto n = static_cast<Index>(hyperparameters.size()), n_free = static_cast<Index>(free.size());
-  const MatrixXd H = Differences(objective, x, hyperparameters, free).hessian(thread_count(n_threads));
-
-  // in units of what each would be uncertain by, were the others known: 1 on the diagonal
-  VectorXd unit = H.diagonal().array().abs().max(1e-10).rsqrt();
-  const Eigen::SelfAdjointEigenSolver<MatrixXd> eigen(unit.asDiagonal() * H * unit.asDiagonal());
-  constexpr double smallest = 1e-8;  // what differences of gradients leave of a zero
-  const Index n_flat = (eigen.eigenvalues().array() < smallest).count();
-  const MatrixXd flat = eigen.eigenvectors().leftCols(n_flat), steep = eigen.eigenvectors().rightCols(n_free - n_flat);
-  const VectorXd variance = eigen.eigenvalues().tail(n_free - n_flat).cwiseInverse();
-  const MatrixXd covariance = steep * variance.asDiagonal() * steep.transpose();
+  const Index n_flat = (curvature.eigenvalues.array() <= curvature.zero).count();
+  const MatrixXd flat = curvature.eigenvectors.leftCols(n_flat), steep = curvature.eigenvectors.rightCols(n_free - n_flat);
+  const MatrixXd covariance = steep * curvature.eigenvalues.tail(n_free - n_flat).cwiseInverse().asDiagonal() * steep.transpose();
 
   LaplaceUncertainty out;
   out.stddev = VectorXd::Zero(n);
@@ -116,8 +45,8 @@ LaplaceUncertainty laplace_uncertainty(const Prior& prior, const std::vector<Obs
   }
   const auto is_flat = [&](Index k) { return flat.row(k).squaredNorm() > 1e-4; };
   for (Index k = 0; k < n_free; ++k) {
-    const double to_unit = unit[k] * unit_of(hyperparameters[static_cast<std::size_t>(free[static_cast<std::size_t>(k)])]);
     const Index at = free[static_cast<std::size_t>(k)];
+    const double to_unit = curvature.unit[k] * unit_of(hyperparameters[static_cast<std::size_t>(at)]);
     out.stddev[at] = is_flat(k) ? infinity : to_unit * std::sqrt(covariance(k, k));
     out.undetermined.row(at) = to_unit * flat.row(k);
     for (Index l = 0; l < k; ++l) {
@@ -127,13 +56,100 @@ LaplaceUncertainty laplace_uncertainty(const Prior& prior, const std::vector<Obs
     }
   }
   out.undetermined.colwise().normalize();
-
-  Likelihood::Workspace workspace;
-  VectorXd gradient = VectorXd::Zero(n);
-  objective(x, &gradient, workspace);
-  const VectorXd scaled = steep.transpose() * unit.cwiseProduct(gradient(free));
-  out.distance_from_optimum = std::sqrt((scaled.array().square() * variance.array()).sum());
+  out.distance_from_optimum = curvature.distance_from_optimum();
   return out;
+}
+
+LaplaceUncertainty laplace_uncertainty(const Prior& prior, const std::vector<Observations>& observations,
+                                       const std::vector<Hyperparameter>& hyperparameters, int n_threads) {
+  const lapack::SingleThread single_thread;
+  const Objective objective(prior, observations, hyperparameters);
+  return laplace_uncertainty(curvature_at(objective, internal_values(hyperparameters), hyperparameters, thread_count(n_threads)),
+                             hyperparameters);
+}
+
+namespace {
+
+// "R by +1 %, Ic by +0.98 %": θ along a direction, as far as the one that changes most changes by a hundredth
+std::string changes_along(const std::vector<Hyperparameter>& hyperparameters, const std::vector<int>& parameters,
+                          const VectorXd& direction) {
+  const auto relative = [&](int k) {
+    const double value = hyperparameters[static_cast<std::size_t>(k)].value;
+    return value == 0 ? direction[k] : direction[k] / std::abs(value);
+  };
+  double largest = 0;
+  for (const int k : parameters) largest = std::abs(relative(k)) > std::abs(largest) ? relative(k) : largest;
+  std::vector<std::string> changes;
+  for (const int k : parameters) {
+    const Hyperparameter& h = hyperparameters[static_cast<std::size_t>(k)];
+    const double change = relative(k) / largest;
+    constexpr double negligible = 1e-3;
+    if (std::abs(change) < negligible) continue;
+    changes.push_back(h.value == 0 ? fmt::format("{} by {:+.2g}", h.name, change / 100)
+                                   : fmt::format("{} by {:+.2g} %", h.name, change));
+  }
+  return fmt::format("{}", fmt::join(changes, ", "));
+}
+
+}  // namespace
+
+std::vector<UncertaintyNote> uncertainty_notes(const FitReport& report) {
+  if (!report.uncertainty) return {};
+  const std::vector<Hyperparameter>& fitted = report.hyperparameters;
+  const LaplaceUncertainty& uncertainty = *report.uncertainty;
+  const auto name_of = [&](int k) { return fitted[static_cast<std::size_t>(k)].name; };
+  std::vector<int> parameters, open;
+  std::vector<std::string> names;  // of those that are open
+  for (int k = 0; k < static_cast<int>(fitted.size()); ++k) {
+    if (fitted[static_cast<std::size_t>(k)].kind != Kind::parameter) continue;
+    parameters.push_back(k);
+    if (!std::isinf(uncertainty.stddev[k])) continue;
+    open.push_back(k);
+    names.push_back(name_of(k));
+  }
+  std::vector<UncertaintyNote> notes;
+  constexpr double far = 0.5;  // standard deviations
+  if (uncertainty.distance_from_optimum > far) {
+    notes.push_back(
+        {true,
+         fmt::format("the standard errors are rough: the optimiser stopped {}",
+                     std::isfinite(uncertainty.distance_from_optimum)
+                         ? fmt::format("{:.2g} standard deviations before the optimum", uncertainty.distance_from_optimum)
+                         : "where no optimum is near"),
+         "Fit with a larger --max-iterations, or --start from this fit"});
+  }
+  // without hyper-priors combinations of other hyperparameters may be open too: of no interest
+  std::vector<Index> combinations;
+  for (Index c = 0; c < uncertainty.undetermined.cols() && !open.empty(); ++c) {
+    if (uncertainty.undetermined.col(c)(open).cwiseAbs().maxCoeff() > 1e-6) combinations.push_back(c);
+  }
+  const auto n_open = static_cast<int>(open.size()), n_combinations = static_cast<int>(combinations.size());
+  if (n_open == 1) {
+    notes.push_back(
+        {true, fmt::format("the data do not determine {}", names[0]), "Hold it at a known value, or give it a prior"});
+  } else if (n_combinations == 1) {
+    notes.push_back({true,
+                     fmt::format("the data determine {} only together: changing {} at once fits as well", fmt::join(names, ", "),
+                                 changes_along(fitted, open, uncertainty.undetermined.col(combinations[0]))),
+                     "Hold one of them at a known value, or give it a prior"});
+  } else if (n_combinations > 1) {
+    notes.push_back({true,
+                     fmt::format("of the {} parameters {} the data leave {} combinations open", n_open, fmt::join(names, ", "),
+                                 n_combinations),
+                     fmt::format("Hold {} of them at known values, or give them priors", n_combinations)});
+  }
+  constexpr double alike = 0.98;
+  for (const int k : parameters) {
+    for (const int l : parameters) {
+      const double correlation = uncertainty.correlation(k, l);
+      if (l <= k || !(std::abs(correlation) > alike)) continue;
+      notes.push_back({false,
+                       fmt::format("{} and {} are known much better together than each by itself (correlation {:.4f})",
+                                   name_of(k), name_of(l), correlation),
+                       "Know one of them from elsewhere, and the other follows"});
+    }
+  }
+  return notes;
 }
 
 }  // namespace gp2

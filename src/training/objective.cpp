@@ -24,10 +24,16 @@ double hyperprior(const std::vector<Hyperparameter>& hyperparameters, VectorXd* 
   double sum = 0;
   for (std::size_t k = 0; k < hyperparameters.size(); ++k) {
     const Hyperparameter& h = hyperparameters[k];
-    if (h.log_stddev == 0) continue;
-    const double distance = std::log(h.value / h.median) / h.log_stddev;
+    const bool normal = h.stddev > 0;
+    if (!normal && h.log_stddev == 0) continue;
+    const double stddev = normal ? h.stddev : h.log_stddev;
+    const double distance = (normal ? h.value - h.median : std::log(h.value / h.median)) / stddev;
     sum += 0.5 * distance * distance;
-    if (gradient != nullptr) (*gradient)[static_cast<Index>(k)] += distance / h.log_stddev;
+    if (gradient == nullptr) continue;
+    // d value/dx of a θ, and d log value/dx, which is 1 of what is optimised as a logarithm
+    const double width = h.kind == Kind::parameter ? h.upper - h.lower : 1;
+    const double slope = normal ? width : h.kind == Kind::parameter ? width / h.value : 1;
+    (*gradient)[static_cast<Index>(k)] += distance / stddev * slope;
   }
   return sum;
 }

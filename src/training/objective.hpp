@@ -13,7 +13,7 @@ double to_internal(const Hyperparameter& h, double value);
 /// Within the bounds.
 double from_internal(const Hyperparameter& h, double x);
 
-/// ½ Σ (log(value/median)/log_stddev)², and its derivative in log value added to `gradient`.
+/// ½ Σ (log(value/median)/log_stddev)² + ½ Σ ((value − median)/stddev)², and its derivative in x added to `gradient`.
 double hyperprior(const std::vector<Hyperparameter>& hyperparameters, Eigen::VectorXd* gradient);
 
 /// What training minimises: the negative log likelihood plus hyper-priors. Thread-safe.

@@ -139,6 +139,37 @@ TEST_F(FitCommand, EstimateChoosesTheParameters) {
   EXPECT_EQ(names(desk.done(line + " --estimate none").json()), nothing);
 }
 
+TEST_F(FitCommand, ParametersHaveStandardErrorsUnlessNotWanted) {
+  const nlohmann::json report = fit("--restarts 1 --estimate p1,p2");
+  ASSERT_EQ(report["standard_errors"]["parameters"].size(), 2U);
+  const nlohmann::json& p1 = report["standard_errors"]["parameters"][0];
+  EXPECT_EQ(p1["name"], "p1");
+  EXPECT_GT(p1["stddev"].get<double>(), 0);
+  EXPECT_LT(p1["stddev"].get<double>(), 0.01);
+  EXPECT_EQ(p1["correlation"]["p1"], 1);
+  EXPECT_LT(report["standard_errors"]["distance_from_optimum"].get<double>(), 0.1);
+  EXPECT_FALSE(short_fit("--estimate p1 --no-standard-errors").contains("standard_errors"));
+  EXPECT_FALSE(short_fit("--estimate none").contains("standard_errors"));
+  const std::string text = desk.done("gp2 fit models/surface.toml --data train.csv --restarts 1 --estimate p1 -o fit.json").out;
+  EXPECT_THAT(text, testing::ContainsRegex("p1 +0\\.[0-9]+ ± 0\\.[0-9]+ "));
+}
+
+// Geist & Trimpe 2020, example 2: with prior mean zero R and Ic enter by R/Ic alone
+TEST_F(FitCommand, TellsWhichParametersAreKnownByTheirRatioOnly) {
+  desk.done("gp2 generate models/unicycle.toml --n 80 --seed 3 -o unicycle.csv");
+  const Outcome outcome =
+      desk.done("gp2 fit models/unicycle.toml --data unicycle.csv --restarts 1 --estimate R,Ic -o unicycle.json");
+  EXPECT_THAT(outcome.err,
+              HasSubstr("warning: the data determine R, Ic only together: changing R by +1 %, Ic by +1 % at once fits "
+                        "as well. Hold one of them at a known value, or give it a prior"));
+  EXPECT_THAT(outcome.out, testing::ContainsRegex("R +0\\.[0-9]+ ± ∞ "));
+  const Outcome one = desk.done("gp2 fit models/unicycle.toml --data unicycle.csv --restarts 1 --estimate R -o unicycle.json");
+  EXPECT_THAT(one.err, Not(HasSubstr("warning")));
+  const Outcome force =
+      desk.done("gp2 fit models/unicycle.toml --data unicycle.csv --mean force --restarts 1 --estimate R,Ic -o unicycle.json");
+  EXPECT_THAT(force.err, Not(HasSubstr("only together")));
+}
+
 TEST_F(FitCommand, NoiseIsTheModelsTheGivenOrEstimated) {
   const auto noise = [&] { return desk.json("fit.json")["observations"][0]["noise_stddev"]; };
   fit("--max-iterations 0");

@@ -146,9 +146,31 @@ TEST(FitFile, TheReportSurvives) {
   for (std::size_t k = 0; k < fit.report.hyperparameters.size(); ++k) {
     const Hyperparameter& a = fit.report.hyperparameters[k];
     const Hyperparameter& b = read.report.hyperparameters[k];
-    EXPECT_EQ(std::tie(a.kind, a.owner, a.index, a.name, a.unit, a.value, a.lower, a.upper, a.median, a.log_stddev),
-              std::tie(b.kind, b.owner, b.index, b.name, b.unit, b.value, b.lower, b.upper, b.median, b.log_stddev));
+    EXPECT_EQ(std::tie(a.kind, a.owner, a.index, a.name, a.unit, a.value, a.lower, a.upper, a.median, a.log_stddev, a.stddev),
+              std::tie(b.kind, b.owner, b.index, b.name, b.unit, b.value, b.lower, b.upper, b.median, b.log_stddev, b.stddev));
   }
+}
+
+TEST(FitFile, StandardErrorsSurvive) {
+  FitFile fit = fit_of(unicycle());
+  EXPECT_FALSE(written_json(fit).at("report").contains("uncertainty"));
+  EXPECT_FALSE(written_and_read(fit).report.uncertainty.has_value());
+  const auto n = static_cast<Eigen::Index>(fit.report.hyperparameters.size());
+  LaplaceUncertainty& written = fit.report.uncertainty.emplace();
+  written.stddev = Eigen::VectorXd::LinSpaced(n, 0.1, 0.7);
+  written.stddev[1] = std::numeric_limits<double>::infinity();
+  written.correlation = Eigen::MatrixXd::Identity(n, n);
+  written.correlation(0, 2) = written.correlation(2, 0) = -0.3;
+  written.held = {3};
+  written.undetermined = Eigen::MatrixXd::Zero(n, 1);
+  written.undetermined(1, 0) = 1;
+  written.distance_from_optimum = 0.01;
+  const LaplaceUncertainty read = written_and_read(fit).report.uncertainty.value();
+  EXPECT_EQ(read.stddev, written.stddev);
+  EXPECT_EQ(read.correlation, written.correlation);
+  EXPECT_EQ(read.held, written.held);
+  EXPECT_EQ(read.undetermined, written.undetermined);
+  EXPECT_EQ(read.distance_from_optimum, written.distance_from_optimum);
 }
 
 TEST(FitFile, TheSameFitGivesTheSameBytes) {

@@ -6,6 +6,7 @@
 #include "gp2/error.hpp"
 #include "gp2/training.hpp"
 #include "test_models.hpp"
+#include "training/objective.hpp"
 
 namespace gp2 {
 namespace {
@@ -113,6 +114,74 @@ TEST(HyperparametersTest, TheStandardProtocolHasItsOwnBoxAndHyperPriors) {
   EXPECT_EQ(find(all, "R").upper, 0.07);
   for (const Hyperparameter& h : default_hyperparameters(prior, observations, {}, {Protocol::Name::standard, false})) {
     EXPECT_EQ(h.log_stddev, 0) << h.name;
+  }
+}
+
+// the surface's model with priors of its own
+ModelFile with_priors(const std::string& p1) {
+  std::string text = test::model("models/surface.toml").text;
+  const std::size_t line = text.find("\np1"), end = text.find('\n', line + 1);
+  text.replace(line, end - line, "\np1 = " + p1);
+  text.insert(text.find("[[latent]]") + 10,
+              "\nlengthscale = { prior = { median = 2, log_stddev = 0.5 } }\nsignal_stddev = { prior = { median = 3, log_stddev "
+              "= 0.25 } }\n");
+  return ModelFile::parse(text, "with priors");
+}
+
+TEST(HyperparametersTest, PriorsOfTheModelReplaceTheWeakOnes) {
+  const ModelFile model = with_priors("{ value = 0.08, bounds = [0.01, 1], prior = { median = 0.09, log_stddev = 0.2 } }");
+  const Prior prior = make_prior(model);
+  const std::vector<Observations> observations = observe(model, 30, false);
+  const auto all = default_hyperparameters(prior, observations, {"p1"}, {});
+  const double spread = stddev(evaluate_features(prior.latents[0], observations[0].states).col(0));
+  expect_same(find(all, "lengthscale(q1)").median, 2 * spread);
+  EXPECT_EQ(find(all, "lengthscale(q1)").log_stddev, 0.5);
+  expect_same(find(all, "signal_stddev(ddq1)").median, 3 * stddev(observations[0].values.row(0)));
+  EXPECT_EQ(find(all, "signal_stddev(ddq1)").log_stddev, 0.25);
+  EXPECT_EQ(find(all, "p1").median, 0.09);
+  EXPECT_EQ(find(all, "p1").log_stddev, 0.2);
+  for (const Protocol& without : {Protocol{Protocol::Name::standard, false}, Protocol{Protocol::Name::paper, true}}) {
+    for (const Hyperparameter& h : default_hyperparameters(prior, observations, {"p1"}, without)) {
+      EXPECT_EQ(h.log_stddev, 0) << h.name;
+    }
+  }
+  const ModelFile normal = with_priors("{ value = 0.08, bounds = [-1, 1], prior = { mean = 0.09, stddev = 0.02 } }");
+  const auto of_normal = default_hyperparameters(make_prior(normal), observations, {"p1"}, {});
+  EXPECT_EQ(find(of_normal, "p1").median, 0.09);
+  EXPECT_EQ(find(of_normal, "p1").stddev, 0.02);
+  EXPECT_EQ(find(of_normal, "p1").log_stddev, 0);
+}
+
+TEST(HyperparametersTest, APriorOfALogarithmNeedsBoundsAboveZero) {
+  const ModelFile model = with_priors("{ value = 0.08, bounds = [-1, 1], prior = { median = 0.09, log_stddev = 0.2 } }");
+  try {
+    default_hyperparameters(make_prior(model), observe(model, 5, false), {"p1"}, {});
+    FAIL() << "no error";
+  } catch (const InputError& error) {
+    EXPECT_THAT(error.what(), HasSubstr("parameter 'p1': a prior of the logarithm needs bounds above 0, got [-1, 1]"));
+  }
+}
+
+TEST(HyperparametersTest, TheGradientOfPriorsIsThatOfTheirSum) {
+  for (const char* p1 : {"{ value = 0.08, bounds = [0.01, 1], prior = { median = 0.2, log_stddev = 0.3 } }",
+                         "{ value = 0.08, bounds = [-1, 1], prior = { mean = 0.09, stddev = 0.02 } }"}) {
+    const ModelFile model = with_priors(p1);
+    const auto all = default_hyperparameters(make_prior(model), observe(model, 20, false), {"p1"}, {});
+    const VectorXd x = internal_values(all);
+    const auto sum_at = [&](Eigen::Index k, double step) {
+      std::vector<Hyperparameter> moved = all;
+      Hyperparameter& h = moved[static_cast<std::size_t>(k)];
+      h.value = from_internal(h, x[k] + step);
+      return hyperprior(moved, nullptr);
+    };
+    VectorXd gradient = VectorXd::Zero(x.size());
+    hyperprior(all, &gradient);
+    for (Eigen::Index k = 0; k < x.size(); ++k) {
+      // differences of a function of the size of 100 with steps of 1e-5 are right to 1e-16 · 100 / 1e-5
+      EXPECT_NEAR(gradient[k], (sum_at(k, 1e-5) - sum_at(k, -1e-5)) / 2e-5, 1e-5 * (1 + std::abs(gradient[k])))
+          << all[static_cast<std::size_t>(k)].name;
+    }
+    EXPECT_GT(std::abs(gradient[x.size() - 1]), 1e-3);
   }
 }
 

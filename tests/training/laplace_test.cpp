@@ -1,6 +1,8 @@
 #include "gp2/laplace.hpp"
 
+#include <array>
 #include <cmath>
+#include <limits>
 
 #include <gtest/gtest.h>
 #include <Eigen/Dense>
@@ -177,6 +179,127 @@ TEST(LaplaceTest, StatedDeviationsCoverTheErrorsOfManyFits) {
   }
   // χ² of 150 over 150: 1 ± 0.115
   EXPECT_NEAR(sum_of_squares / n_sets, 1, 0.35);
+}
+
+FitOptions one_run(bool standard_errors = true) {
+  FitOptions options;
+  options.n_restarts = 1;
+  options.n_threads = 1;
+  options.standard_errors = standard_errors;
+  return options;
+}
+
+// A wheel of radius r on an inertia J, driven through one rolling contact: only r²/J moves the carriage.
+const ModelFile& rolling() {
+  static const ModelFile model = ModelFile::parse(R"toml(
+name        = "rolling"
+coordinates = ["x", "a"]
+[parameters]
+r = { value = 0.5, bounds = [0.1, 5] }
+J = { value = 0.3, bounds = [0.05, 5] }
+[mechanics]
+mass  = [["1", "0"], ["0", "J"]]
+force = ["sin(3*x)", "0"]
+[constraints]
+velocity = ["dx - r*sin(a)*da"]
+[[latent]]
+kernel   = "se"
+features = ["dx", "x"]
+directions = "force"
+[noise]
+ddq = 0.01
+[truth]
+force = ["-0.5*dx", "0"]
+[sampling]
+x  = [-1, 2]
+a  = [0.4, 2.6]
+da = [-1, 1]
+)toml",
+                                                  "rolling");
+  return model;
+}
+
+TEST(LaplaceTest, ParametersKnownToAMillionthOfTheirBoxAreFittedToTheirOptimum) {
+  // r of the model is 0.5 within [0, 1e4]: known to about 1e-7 of its box, a lengthscale to its order of magnitude
+  std::string text = rolling().text;
+  text.replace(text.find("bounds = [0.1, 5]"), 17, "bounds = [0.1, 1e4]");
+  const ModelFile model = ModelFile::parse(text, "wide");
+  const Problem p = problem(model, 60, {"r"}, seed, 0.01);
+  const FitReport report = fit(p.prior, p.observations, p.hyperparameters, one_run()).report;
+  ASSERT_TRUE(report.uncertainty.has_value());
+  EXPECT_LT(report.uncertainty->distance_from_optimum, 0.02);
+  const auto last = static_cast<Index>(report.hyperparameters.size()) - 1;
+  ASSERT_EQ(report.hyperparameters.back().name, "r");
+  EXPECT_LT(report.uncertainty->stddev[last], 0.01);
+  EXPECT_LT(std::abs(report.hyperparameters.back().value - 0.5), 4 * report.uncertainty->stddev[last]);
+}
+
+TEST(LaplaceTest, NoFitWithoutParametersPaysForStandardErrors) {
+  const Problem p = problem(line(), 20, {});
+  EXPECT_FALSE(fit(p.prior, p.observations, p.hyperparameters, one_run()).report.uncertainty.has_value());
+  const Problem with = problem(line(), 20, {"p"});
+  EXPECT_FALSE(fit(with.prior, with.observations, with.hyperparameters, one_run(false)).report.uncertainty.has_value());
+}
+
+TEST(LaplaceTest, NotesSayWhichParametersAreKnownOnlyTogether) {
+  std::string text = line().text;
+  text.replace(text.find("p*x + r"), 7, "p + 2*r");
+  const Problem p = problem(ModelFile::parse(text, "sum"), 20, {"p", "r"});
+  const FitReport report = fit(p.prior, p.observations, p.hyperparameters, one_run()).report;
+  const std::vector<UncertaintyNote> notes = uncertainty_notes(report);
+  ASSERT_EQ(notes.size(), 1U);
+  EXPECT_TRUE(notes[0].is_warning);
+  EXPECT_NE(notes[0].text.find("the data determine p, r only together: changing"), std::string::npos) << notes[0].text;
+}
+
+TEST(LaplaceTest, APriorDeterminesWhatDataDoNot) {
+  std::string text = line().text;
+  text.replace(text.find("p*x + r"), 7, "p + 2*r");
+  text.replace(text.find("r = { value = 0.2,"), 18, "r = { value = 0.2, prior = { mean = 0.1, stddev = 0.05 },");
+  const Problem p = problem(ModelFile::parse(text, "sum"), 20, {"p", "r"});
+  const FitReport report = fit(p.prior, p.observations, p.hyperparameters, one_run()).report;
+  ASSERT_TRUE(report.uncertainty.has_value());
+  const auto r = static_cast<Index>(report.hyperparameters.size()) - 1;
+  // nothing else speaks of r by itself: the posterior of it is its prior
+  EXPECT_NEAR(report.hyperparameters.back().value, 0.1, 1e-3);
+  EXPECT_NEAR(report.uncertainty->stddev[r], 0.05, 1e-3);
+  EXPECT_TRUE(uncertainty_notes(report).size() <= 1);
+  for (const UncertaintyNote& note : uncertainty_notes(report)) EXPECT_FALSE(note.is_warning) << note.text;
+}
+
+TEST(LaplaceTest, NotesNameASingleOpenParameterManyCombinationsAndFitsThatStoppedEarly) {
+  FitReport report;
+  report.hyperparameters.resize(3);
+  const std::array<const char*, 3> names = {"m", "R", "Ic"};
+  for (std::size_t k = 0; k < 3; ++k) {
+    report.hyperparameters[k].kind = Kind::parameter;
+    report.hyperparameters[k].name = names[k];
+    report.hyperparameters[k].value = 1;
+  }
+  constexpr double infinity = std::numeric_limits<double>::infinity();
+  LaplaceUncertainty& u = report.uncertainty.emplace();
+  u.correlation = MatrixXd::Identity(3, 3);
+  u.stddev = Eigen::Vector3d(infinity, 1, 1);
+  u.undetermined = Eigen::Vector3d(1, 0, 0);
+  EXPECT_EQ(uncertainty_notes(report).at(0).text, "the data do not determine m");
+  u.stddev.setConstant(infinity);
+  u.undetermined = MatrixXd::Identity(3, 2);
+  EXPECT_EQ(uncertainty_notes(report).at(0).text, "of the 3 parameters m, R, Ic the data leave 2 combinations open");
+  EXPECT_EQ(uncertainty_notes(report).at(0).mend, "Hold 2 of them at known values, or give them priors");
+  u.stddev.setOnes();
+  u.undetermined.resize(3, 0);
+  u.distance_from_optimum = 1.5;
+  EXPECT_EQ(uncertainty_notes(report).at(0).text,
+            "the standard errors are rough: the optimiser stopped 1.5 standard deviations before the optimum");
+  u.distance_from_optimum = infinity;
+  EXPECT_EQ(uncertainty_notes(report).at(0).text,
+            "the standard errors are rough: the optimiser stopped where no optimum is near");
+  u.distance_from_optimum = 0;
+  u.correlation(0, 2) = u.correlation(2, 0) = -0.991;
+  ASSERT_EQ(uncertainty_notes(report).size(), 1U);
+  EXPECT_FALSE(uncertainty_notes(report)[0].is_warning);
+  EXPECT_EQ(uncertainty_notes(report)[0].text,
+            "m and Ic are known much better together than each by itself (correlation -0.9910)");
 }
 
 }  // namespace

@@ -1,9 +1,11 @@
 #include <algorithm>
+#include <cctype>
 #include <cmath>
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
+#include "gp2/laplace.hpp"
 #include "report/report_data.hpp"
 
 namespace gp2::command {
@@ -83,6 +85,14 @@ void bound_advice(const Report& report, std::vector<Advice>& advice) {
     advice.push_back({Level::note, fmt::format("At a bound: {}.", fmt::join(others, ", ")),
                       "Widen the bounds of the latent in the model file if you have no reason for them; a very short lengthscale "
                       "means that the fit explains noise by wiggles."});
+  }
+}
+
+void uncertainty_advice(const FitReport& report, std::vector<Advice>& advice) {
+  for (const UncertaintyNote& note : uncertainty_notes(report)) {
+    std::string text = note.text + ".";
+    text[0] = static_cast<char>(std::toupper(text[0]));
+    advice.push_back({note.is_warning ? Level::warning : Level::note, text, note.mend + "."});
   }
 }
 
@@ -180,6 +190,7 @@ std::vector<Advice> learning_advice(const Report& report) {
   std::vector<Advice> advice;
   optimiser_advice(report.fit.report, advice);
   bound_advice(report, advice);
+  uncertainty_advice(report.fit.report, advice);
   constraint_advice(report, advice);
   independence_advice(report, advice);
   for (const ReportData& data : report.data) {

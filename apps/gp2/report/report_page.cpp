@@ -136,12 +136,17 @@ Json parameters_json(const FitFile& fit) {
   Json rows = Json::array();
   for (const Parameter& parameter : fit.model.system->parameters()) {
     Json row = {{"name", parameter.name}, {"model", parameter.value}};
-    for (const Hyperparameter& h : fit.report.hyperparameters) {
+    for (std::size_t k = 0; k < fit.report.hyperparameters.size(); ++k) {
+      const Hyperparameter& h = fit.report.hyperparameters[k];
       if (h.kind != Hyperparameter::Kind::parameter || h.name != parameter.name) continue;
       row["fitted"] = h.value;
       row["lower"] = h.lower;
       row["upper"] = h.upper;
       row["at_bound"] = h.at_bound();
+      if (fit.report.uncertainty && !h.at_bound()) {
+        const double stddev = fit.report.uncertainty->stddev[static_cast<Eigen::Index>(k)];
+        row["stddev"] = std::isinf(stddev) ? Json("not determined") : number(stddev);
+      }
     }
     rows.push_back(row);
   }

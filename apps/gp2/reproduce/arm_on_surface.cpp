@@ -8,7 +8,6 @@
 #include "command.hpp"
 #include "gp2/error.hpp"
 #include "gp2/generate.hpp"
-#include "gp2/laplace.hpp"
 #include "gp2/resample.hpp"
 #include "reproduce/experiment.hpp"
 #include "reproduce/table.hpp"
@@ -254,16 +253,14 @@ void reproduce_arm_mass(const ReproduceOptions& options) {
     method.max_iterations = stop.integer("max_iterations");
     method.reduction_tolerance = stop.number("reduction_tolerance");
     method.max_escapes = 0;
+    method.standard_errors = true;
     talk_over(fmt::format("arm-mass: {}", method.name));
     const auto start = std::chrono::steady_clock::now();
     const Trained trained = train(model, truth.keys(), method, Protocol::Name::standard, log, 0, options.threads);
-    const double seconds_fit = seconds_since(start);
-    talk_over(fmt::format("arm-mass: {}: standard errors", method.name));
-    const std::vector<Hyperparameter>& fitted = trained.fit.report.hyperparameters;
-    const LaplaceUncertainty uncertainty =
-        laplace_uncertainty(trained.problem.prior, trained.problem.observations, fitted, options.threads);
     const double seconds = seconds_since(start);
     talk_over("");
+    const std::vector<Hyperparameter>& fitted = trained.fit.report.hyperparameters;
+    const LaplaceUncertainty& uncertainty = trained.fit.report.uncertainty.value();
     for (std::size_t k = 0; k < fitted.size(); ++k) {
       const Hyperparameter& h = fitted[k];
       if (h.kind != Hyperparameter::Kind::parameter) continue;
@@ -279,7 +276,6 @@ void reproduce_arm_mass(const ReproduceOptions& options) {
                  {"error_in_stddevs", number_or_null(error / uncertainty.stddev[column])},
                  {"converged", trained.fit.report.converged},
                  {"distance_from_optimum", number_or_null(uncertainty.distance_from_optimum)},
-                 {"seconds_fit", seconds_fit},
                  {"seconds", seconds}});
       Table::Row row = {{"method", method.name}, {"parameter", h.name}};
       for (std::size_t l = 0; l < fitted.size(); ++l) {

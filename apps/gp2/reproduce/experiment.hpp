@@ -67,7 +67,8 @@ struct Method {
   double reduction_tolerance = FitOptions().reduction_tolerance;  // where the optimiser stops
   int max_iterations = FitOptions().max_iterations;
   int max_escapes = FitOptions().max_escapes;
-  bool wide = false;  // of a baseline: bounds that do not matter instead of the published ones
+  bool standard_errors = false;  // of the system's parameters
+  bool wide = false;             // of a baseline: bounds that do not matter instead of the published ones
 
   /// Whether its training differs between the protocols.
   [[nodiscard]] bool has_protocol() const { return !is_truth && !baseline; }

@@ -126,6 +126,7 @@ Trained train(const ModelFile& model, const std::vector<std::string>& estimate, 
   fit_options.n_threads = n_threads;
   fit_options.max_iterations = method.max_iterations;
   fit_options.max_escapes = method.max_escapes;
+  fit_options.standard_errors = method.standard_errors;
   if (!method.baseline) fit_options.reduction_tolerance = method.reduction_tolerance;
   Fit result = fit(problem, fit_options);
   return {std::move(problem), std::move(result)};

@@ -148,8 +148,8 @@
     } else if (!estimated) {
       parameters.append(table("Parameters of the system", [{ label: "parameter" }, { label: "held at", number: true }], report.parameters.map((row) => [row.name, row.model])));
     } else {
-      parameters.append(table("Parameters of the system", [{ label: "parameter" }, { label: "in the model file", number: true }, { label: "fitted", number: true }, { label: "lower bound", number: true }, { label: "upper bound", number: true }, { label: "" }],
-        report.parameters.map((row) => [row.name, row.model, row.fitted === undefined ? "held" : row.fitted, row.lower, row.upper, bound(row)]), (r) => report.parameters[r].at_bound));
+      parameters.append(table("Parameters of the system", [{ label: "parameter" }, { label: "in the model file", number: true }, { label: "fitted", number: true }, { label: "standard error", number: true }, { label: "lower bound", number: true }, { label: "upper bound", number: true }, { label: "" }],
+        report.parameters.map((row) => [row.name, row.model, row.fitted === undefined ? "held" : row.fitted, row.stddev, row.lower, row.upper, bound(row)]), (r) => report.parameters[r].at_bound));
     }
     byId("hyperparameters").append(table("Hyperparameters", [{ label: "name" }, { label: "value", number: true }, { label: "lower bound", number: true }, { label: "upper bound", number: true }, { label: "unit" }, { label: "" }],
       report.hyperparameters.map((row) => [row.name, row.value, row.lower, row.upper, row.unit, bound(row)]), (r) => report.hyperparameters[r].at_bound));

@@ -1,0 +1,152 @@
+#include "training/curvature.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+
+#include <fmt/format.h>
+#include <Eigen/Eigenvalues>
+
+#include "gp2/error.hpp"
+#include "inference/parallel.hpp"
+
+namespace gp2 {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+using Kind = Hyperparameter::Kind;
+
+namespace {
+
+std::vector<int> free_ones(const std::vector<Hyperparameter>& hyperparameters) {
+  std::vector<int> free;
+  for (std::size_t k = 0; k < hyperparameters.size(); ++k) {
+    if (!hyperparameters[k].at_bound()) free.push_back(static_cast<int>(k));
+  }
+  return free;
+}
+
+class Differences {
+ public:
+  Differences(const Objective& objective, const VectorXd& x, const std::vector<Hyperparameter>& hyperparameters)
+      : objective_(objective), x_(x), hyperparameters_(hyperparameters), free_(free_ones(hyperparameters)) {}
+
+  [[nodiscard]] const std::vector<int>& free() const { return free_; }
+
+  // Of an entry between a parameter and another hyperparameter the parameter's column is the better one.
+  [[nodiscard]] MatrixXd hessian(int n_threads) const {
+    const auto n = static_cast<Index>(free_.size());
+    MatrixXd H(n, n);
+    parallel_for(static_cast<int>(n), n_threads, [&](int k, int) {
+      Likelihood::Workspace workspace;
+      H.col(k) = is_parameter(k) ? parameter_column(k, workspace) : central(k, within_box(k, 3e-3, 1), workspace);
+    });
+    for (Index k = 0; k < n; ++k) {
+      for (Index l = 0; l < k; ++l) {
+        const bool known_better = is_parameter(k) != is_parameter(l);
+        const double both = known_better ? (is_parameter(k) ? H(l, k) : H(k, l)) : (H(k, l) + H(l, k)) / 2;
+        H(k, l) = H(l, k) = both;
+      }
+    }
+    return H;
+  }
+
+ private:
+  [[nodiscard]] const Hyperparameter& at(Index k) const {
+    return hyperparameters_[static_cast<std::size_t>(free_[static_cast<std::size_t>(k)])];
+  }
+  [[nodiscard]] bool is_parameter(Index k) const { return at(k).kind == Kind::parameter; }
+
+  // at most so long that `times` steps stay in the box
+  [[nodiscard]] double within_box(Index k, double step, double times) const {
+    const Hyperparameter& h = at(k);
+    const double x = to_internal(h, h.value);
+    return std::min({step, (x - to_internal(h, h.lower)) / times, (to_internal(h, h.upper) - x) / times});
+  }
+
+  // θ enters M, A and b in any way, within a box that may be much wider than what is known of it: the step is a thousandth of its
+  // value or three of the deviations that it would have were all else known, whichever is longer. Where two parameters are
+  // known a thousand times better together than each by itself, H is nearly singular: hence four points.
+  [[nodiscard]] VectorXd parameter_column(Index k, Likelihood::Workspace& workspace) const {
+    constexpr double relative = 1e-3, first = 1e-5, deviations = 3;
+    const Hyperparameter& h = at(k);
+    const double curvature = central(k, within_box(k, first, 1), workspace)[k];
+    const double deviation = deviations / std::sqrt(std::max(std::abs(curvature), 1e-300));
+    const double step =
+        within_box(k, std::min(relative, std::max(relative * std::abs(h.value) / (h.upper - h.lower), deviation)), 2);
+    return (4 * central(k, step, workspace) - central(k, 2 * step, workspace)) / 3;
+  }
+
+  [[nodiscard]] VectorXd central(Index k, double step, Likelihood::Workspace& workspace) const {
+    return (gradient_at(k, step, workspace) - gradient_at(k, -step, workspace)) / (2 * step);
+  }
+
+  [[nodiscard]] VectorXd gradient_at(Index k, double distance, Likelihood::Workspace& workspace) const {
+    VectorXd there = x_, gradient(x_.size());
+    there[free_[static_cast<std::size_t>(k)]] += distance;
+    if (!std::isfinite(objective_(there, &gradient, workspace))) {
+      throw NumericalError(
+          fmt::format("the likelihood is not finite near the fitted value of '{}': no standard errors", at(k).name));
+    }
+    return gradient(free_);
+  }
+
+  const Objective& objective_;
+  const VectorXd& x_;
+  const std::vector<Hyperparameter>& hyperparameters_;
+  std::vector<int> free_;
+};
+
+}  // namespace
+
+double Curvature::distance_from_optimum() const {
+  if (free.empty()) return 0;
+  if (eigenvalues[0] < -zero) return std::numeric_limits<double>::infinity();
+  const VectorXd slopes = eigenvectors.transpose() * unit.cwiseProduct(gradient);
+  return std::sqrt((eigenvalues.array() > zero).select(slopes.array().square() / eigenvalues.array().max(zero), 0).sum());
+}
+
+Curvature curvature_at(const Objective& objective, const VectorXd& x, const std::vector<Hyperparameter>& hyperparameters,
+                       int n_threads) {
+  const Differences differences(objective, x, hyperparameters);
+  Curvature out;
+  out.free = differences.free();
+  Likelihood::Workspace workspace(n_threads);
+  VectorXd gradient = VectorXd::Zero(x.size());
+  objective(x, &gradient, workspace);
+  out.gradient = gradient(out.free);
+  if (out.free.empty()) return out;
+  const MatrixXd H = differences.hessian(n_threads);
+  out.unit = H.diagonal().array().abs().max(1e-10).rsqrt();
+  const Eigen::SelfAdjointEigenSolver<MatrixXd> eigen(out.unit.asDiagonal() * H * out.unit.asDiagonal());
+  out.eigenvalues = eigen.eigenvalues();
+  out.eigenvectors = eigen.eigenvectors();
+  constexpr double of_differences = 1e-7;
+  constexpr double bend = 1e-2;  // of a valley over one deviation, for data that know a parameter to a hundredth
+  out.zero = std::max(of_differences, bend * out.unit.cwiseProduct(out.gradient).norm());
+  return out;
+}
+
+VectorXd scales_of_parameters(const Objective& objective, const VectorXd& x, const std::vector<Hyperparameter>& hyperparameters,
+                              Likelihood::Workspace& workspace) {
+  VectorXd scales = VectorXd::Ones(x.size());
+  VectorXd gradient = VectorXd::Zero(x.size()), gradient_there = gradient;
+  if (std::none_of(hyperparameters.begin(), hyperparameters.end(), [](const auto& h) { return h.kind == Kind::parameter; })) {
+    return scales;
+  }
+  if (!std::isfinite(objective(x, &gradient, workspace))) return scales;
+  for (Index k = 0; k < x.size(); ++k) {
+    const Hyperparameter& h = hyperparameters[static_cast<std::size_t>(k)];
+    if (h.kind != Kind::parameter) continue;
+    constexpr double step = 1e-5;  // of the box, away from the nearer bound
+    VectorXd there = x;
+    there[k] += x[k] < 0.5 ? step : -step;
+    if (!std::isfinite(objective(there, &gradient_there, workspace))) continue;
+    const double curvature = std::abs((gradient_there[k] - gradient[k]) / step);
+    if (curvature > 1) scales[k] = 1 / std::sqrt(curvature);
+  }
+  return scales;
+}
+
+}  // namespace gp2

@@ -1,0 +1,44 @@
+#pragma once
+
+#include <vector>
+
+#include <Eigen/Core>
+
+#include "training/objective.hpp"
+
+namespace gp2 {
+
+/// The objective about x to second order, in the hyperparameters that are free: those that are not at a bound.
+///
+/// Curvatures differ by many orders of magnitude (data may know a mass to 1e-6 of its box, and of a lengthscale only that it is
+/// long), so directions are told apart in units of what each x_k would be uncertain by, were the others known.
+struct Curvature {
+  std::vector<int> free;        // indices in x
+  Eigen::VectorXd gradient;     // of the free ones
+  Eigen::VectorXd unit;         // 1/√|H_kk|
+  Eigen::VectorXd eigenvalues;  // of D H D, D = diag(unit): ascending
+  Eigen::MatrixXd eigenvectors;
+
+  /// Below this an eigenvalue may be zero: what differences leave of one, and what a slope across a curved valley adds. Where
+  /// parameters enter by their ratio the bottom of the valley is a curve, and the objective is flat along it only at the minimum.
+  double zero = 0;
+
+  /// √(gᵀH⁻¹g), how many standard deviations the minimum is away, without directions of no curvature; ∞ where the objective
+  /// curves downwards along a direction, so that there is no minimum near.
+  [[nodiscard]] double distance_from_optimum() const;
+};
+
+/// H by differences of the exact gradient: two evaluations for each free hyperparameter, six for each θ. The results do not
+/// depend on n_threads.
+/// @throws NumericalError when the objective is not finite about x
+Curvature curvature_at(const Objective& objective, const Eigen::VectorXd& x, const std::vector<Hyperparameter>& hyperparameters,
+                       int n_threads);
+
+LaplaceUncertainty laplace_uncertainty(const Curvature& curvature, const std::vector<Hyperparameter>& hyperparameters);
+
+/// For the optimiser, whose steps stall where curvatures differ much: 1/√|∂²J/∂x_k²| of each θ, by a difference, and 1 for the
+/// others, which are logarithms.
+Eigen::VectorXd scales_of_parameters(const Objective& objective, const Eigen::VectorXd& x,
+                                     const std::vector<Hyperparameter>& hyperparameters, Likelihood::Workspace& workspace);
+
+}  // namespace gp2
