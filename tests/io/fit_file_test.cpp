@@ -1,5 +1,6 @@
 #include "gp2/fit_file.hpp"
 
+#include <array>
 #include <functional>
 #include <limits>
 
@@ -311,18 +312,18 @@ TEST_F(DamagedFit, WithAnyByteChangedIsRefusedOrMeansTheSame) {
   const Json meant = Json::parse(content);
   int n_refused = 0, n_same = 0;
   for (std::size_t k = 0; k < content.size(); ++k) {
-    for (const char flip : {'\x01', '\x20', '\x2a', '\x80'}) {
-      std::string changed = content;
-      changed[k] = static_cast<char>(changed[k] ^ flip);
-      if (error_of(changed).empty()) {
-        ASSERT_EQ(Json::parse(changed), meant) << k << " " << changed.substr(k, 20);
-        ++n_same;
-      } else {
-        ++n_refused;
-      }
+    std::string changed = content;
+    constexpr std::array<char, 5> flips = {'\x01', '\x20', '\x2a', '\x80', '\x04'};  // in turn
+    changed[k] = static_cast<char>(changed[k] ^ flips[k % flips.size()]);
+    if (error_of(changed).empty()) {
+      ASSERT_EQ(Json::parse(changed), meant) << k << " " << changed.substr(k, 20);
+      ++n_same;
+    } else {
+      ++n_refused;
     }
   }
-  EXPECT_GT(n_refused, 2 * n_same);  // the text is indented
+  EXPECT_GT(n_same, 0);
+  EXPECT_GT(n_refused, 5 * n_same);
 }
 
 TEST_F(DamagedFit, ChangedByHandIsToldHowToMakeItGood) {
