@@ -79,7 +79,8 @@ class Training {
   void run() {
     const lapack::SingleThread single_thread;
     // restarts side by side; where there is one alone, its evaluations share the threads
-    parallel_for(n_restarts(), n_threads_, [&](int restart, int) { run_restart(restart, n_restarts() == 1 ? n_threads_ : 1); });
+    parallel_for(n_restarts(), n_side_by_side_,
+                 [&](int restart, int) { run_restart(restart, n_restarts() == 1 ? n_threads_ : 1); });
     release();
     while (n_escapes_ < options_.max_escapes && !stopped() && escape()) ++n_escapes_;
     if (options_.standard_errors && options_.max_iterations > 0 && !stopped() && estimates_parameters()) estimate_errors();
@@ -96,9 +97,9 @@ class Training {
   [[nodiscard]] int n_escapes() const { return n_escapes_; }
   [[nodiscard]] const std::optional<LaplaceUncertainty>& uncertainty() const { return uncertainty_; }
 
- private:
   [[nodiscard]] bool stopped() const { return options_.stop != nullptr && options_.stop->load(); }
 
+ private:
   [[nodiscard]] bool estimates_parameters() const {
     return std::any_of(hyperparameters_.begin(), hyperparameters_.end(), [](const auto& h) { return h.kind == Kind::parameter; });
   }
@@ -140,7 +141,7 @@ class Training {
       Likelihood::Workspace workspace(n_threads_);
       for (int attempt = 0;; ++attempt) {
         const std::vector<Hyperparameter>& at = results_[from];
-        const Curvature curvature = curvature_at(objective_, internal_values(at), at, n_threads_);
+        const Curvature curvature = curvature_at(objective_, internal_values(at), at, n_side_by_side_);
         const bool may_go_on = attempt < n_attempts && reports_[from].iterations < options_.max_iterations && !stopped();
         if (curvature.distance_from_optimum() <= near || !may_go_on) {
           uncertainty_ = laplace_uncertainty(curvature, at);
@@ -189,7 +190,7 @@ class Training {
       return there;
     };
     std::vector<double> values(scanned.size() * n_points);
-    parallel_for(static_cast<int>(values.size()), n_threads_, [&](int trial, int) {
+    parallel_for(static_cast<int>(values.size()), n_side_by_side_, [&](int trial, int) {
       if (stopped()) return;
       Likelihood::Workspace workspace;
       values[static_cast<std::size_t>(trial)] = objective_(moved(trial), nullptr, workspace);
@@ -238,7 +239,7 @@ class Training {
     constexpr int n_draws = 4;
     constexpr double size = 0.1;
     std::vector<LbfgsbResult> drawn(n_draws);
-    parallel_for(n_draws, n_threads_, [&](int draw, int) {
+    parallel_for(n_draws, n_side_by_side_, [&](int draw, int) {
       RandomStream random(options_.seed, static_cast<std::uint64_t>(n_restarts() + draw));
       std::vector<Hyperparameter> start = results_[from];
       for (Hyperparameter& h : start) {
@@ -269,6 +270,7 @@ class Training {
   const std::vector<Hyperparameter>& hyperparameters_;
   const FitOptions& options_;
   int n_threads_ = thread_count(options_.n_threads);
+  int n_side_by_side_ = options_.max_side_by_side > 0 ? std::min(options_.max_side_by_side, n_threads_) : n_threads_;
   Objective objective_;
   std::vector<RestartReport> reports_;
   std::vector<std::vector<Hyperparameter>> results_;
@@ -300,8 +302,10 @@ Fit fit(const Prior& prior, const std::vector<Observations>& observations, const
   report.hyperparameters = training.result(best);
   report.negative_log_likelihood = winner.negative_log_likelihood;
   report.objective = winner.objective;
-  report.converged = winner.converged;
-  report.termination = winner.termination;
+  // the best so far may have converged, but not all that was asked for was tried
+  const bool interrupted = training.stopped();
+  report.converged = winner.converged && !interrupted;
+  report.termination = interrupted ? FitReport::interrupted : winner.termination;
   report.iterations = winner.iterations;
   report.best_restart = static_cast<int>(best);
   report.n_escapes = training.n_escapes();
