@@ -466,7 +466,8 @@ void Predictor::Implementation::write_mean(const Ref<const VectorXd>& state, con
   if (view.quantity == Quantity::constraint_force || options.jacobian) {
     // where M is singular ā has nothing but a_of_force, of M', and so drops out
     w.of_constraint = -w.force;
-    w.of_constraint.noalias() += at.M() * (w.gap + w.a_of_force);
+    w.of_constraint.noalias() += at.M() * w.gap;
+    w.of_constraint.noalias() += at.M() * w.a_of_force;
   }
   for (Index r = 0; r < mean.size(); ++r) {
     const Index row = view.rows[static_cast<std::size_t>(r)];
