@@ -11,6 +11,7 @@
 #include "gp2/error.hpp"
 #include "gp2/fit_problem.hpp"
 #include "gp2/generate.hpp"
+#include "gp2/prior.hpp"
 
 namespace gp2::command {
 
@@ -52,6 +53,18 @@ WholeLog read_log(const ModelFile& model, const Arguments& arguments) {
   return log;
 }
 
+// the system, and where that is sound what the prior asks of it
+int check_mechanics(const ModelFile& model, const Eigen::MatrixXd& states) {
+  const System& system = *model.system;
+  const int n_errors = print(check_system(system, states, system.parameter_values()));
+  if (n_errors > 0) return n_errors;
+  MechanicsBatch mechanics;
+  evaluate_mechanics(make_prior(model), View::all(View::Quantity::constrained_acceleration, system), states,
+                     system.parameter_values(), mechanics);
+  if (!mechanics.fault) return 0;
+  return print({{Finding::Level::error, fmt::format("{} at state {}", mechanics.fault->text, mechanics.fault->state + 1)}});
+}
+
 void run(const Arguments& arguments) {
   const ModelFile model = ModelFile::read(arguments.model);
   const System& system = *model.system;
@@ -62,12 +75,12 @@ void run(const Arguments& arguments) {
   int n_errors = 0;
   if (!arguments.data.empty()) {
     const WholeLog log = read_log(model, arguments);
-    n_errors += print(check_system(system, log.states, system.parameter_values()));
+    n_errors += check_mechanics(model, log.states);
     if (n_errors == 0)
       n_errors += print(check_data(system, log.states, system.parameter_values(), log.accelerations, log.stated));
   } else if ((!model.sampling.empty() || model.motion) && !model.truth.empty()) {
     const GeneratedData data = generate(model, {100, 1, Eigen::VectorXd::Zero(system.nq())});
-    n_errors += print(check_system(system, data.states, system.parameter_values()));
+    n_errors += check_mechanics(model, data.states);
   } else {
     fmt::print("warning  no --data, and neither [sampling] nor [motion] in the model: nothing to evaluate it at\n");
   }

@@ -41,9 +41,9 @@ std::optional<std::vector<int>> dependent_columns(const System& system, const Ei
                                                   const Eigen::Ref<const Eigen::VectorXd>& parameters,
                                                   const Eigen::Ref<const Eigen::MatrixXd>& accelerations);
 
-/// Is the system well-posed at these states? M symmetric positive definite, A of constant rank and not nearly zero, b in the
-/// range of A, derivatives in the parameters equal to finite differences, A and b equal to the second derivative of the
-/// constraints along a motion.
+/// Is the system well-posed at these states? M symmetric and positive definite or completed by A, A of constant rank and not
+/// nearly zero, b in the range of A, derivatives in the parameters equal to finite differences, A and b equal to the second
+/// derivative of the constraints along a motion.
 ///
 /// @param states  (layout size × N), as good as on the constraint
 std::vector<Finding> check_system(const System& system, const Eigen::Ref<const Eigen::MatrixXd>& states,

@@ -48,7 +48,7 @@ class ModelMotion {
 
   /// @param states  (layout size × N)
   /// @return (nq × N), not finite where the truth is not
-  /// @throws InputError when M is not positive definite or the constraints contradict each other at a state.
+  /// @throws InputError as require_mechanics, and where M is singular while truth.acceleration is not 0.
   [[nodiscard]] Eigen::MatrixXd acceleration(const Eigen::Ref<const Eigen::MatrixXd>& states) const;
 
  private:

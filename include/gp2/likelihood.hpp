@@ -40,8 +40,7 @@ class Likelihood {
   };
 
   /// @param initial  values at which everything that has no gradient stays: fixed noise and parameters are reduced once, here.
-  /// @throws InputError when M is not positive definite or the constraints contradict each other at an observed state, under
-  /// `initial`.
+  /// @throws InputError as require_mechanics of the prior, under `initial`.
   Likelihood(Prior prior, std::vector<Observations> observations, const ModelValues& initial, Options options);
   ~Likelihood();
   Likelihood(Likelihood&&) noexcept;
@@ -60,7 +59,7 @@ class Likelihood {
     std::unique_ptr<Implementation> implementation_;
   };
 
-  /// −log p(y | values): +∞ where M is not positive definite, the constraints contradict each other, or the factorisation fails.
+  /// −log p(y | values): +∞ where the mechanics have a fault (evaluate_mechanics of the prior) or the factorisation fails.
   ///
   /// @param gradient  when not null, receives ∂/∂log of kernel parameters, signal and noise standard deviations, ∂/∂C of learned
   ///                  directions, and ∂/∂θ of the parameters asked for (zero elsewhere). Left as it was when the value is +∞.

@@ -17,14 +17,28 @@ namespace gp2 {
 /// computed without forming A M⁻¹Aᵀ: with M = C Cᵀ and B = A C⁻ᵀ, rows of B scaled to unit norm, a rank-revealing QR of Bᵀ gives
 /// orthonormal bases of range(Bᵀ) and of its complement Z, and T = C⁻ᵀ Z Zᵀ Cᵀ. Any number of rows, redundant ones too.
 ///
+/// Where M is singular (a massless coordinate; more coordinates than the bodies need) there is no ā, but a force F̄ still has one
+/// motion if M is positive semidefinite and [M; A] has full column rank (Udwadia & Phohomsiri 2006). Then
+///
+///     M' = M + AᵀΣA,    Σ = diag(σ_1 … σ_nc) > 0,
+///
+/// is positive definite and stands for M in all that follows. The force AᵀΣb that it adds to M ddq = F̄ + Aᵀλ, as A ddq = b, is
+/// one that the constraint takes up: ddq = T M'⁻¹F̄ + L b whatever Σ, and only λ, smaller by Σb than that of M', shows it.
+/// T M'⁻¹ and L are the blocks of [(I − A⁺A) M; A]⁺. Each row is weighed by the masses that it holds together, so that neither
+/// its scale nor units matter.
+///
 /// For control loops, `compute` takes one object to the next state. Const member functions may be called from several threads.
 class UdwadiaKalaba {
  public:
   /// Directions of range(Bᵀ) whose pivot is below this fraction of the largest count as redundant.
   static constexpr double rank_tolerance = 1e-10;
+  /// M, or M', counts as singular where a squared pivot of its Cholesky factorisation is below this fraction of its diagonal
+  /// entry: half of the digits are lost there. An M that is positive definite beyond that, and that A does not complete, is used
+  /// as it is.
+  static constexpr double mass_tolerance = 1e-8;
 
   UdwadiaKalaba() = default;
-  /// @param M  mass matrix        (nq × nq), symmetric positive definite
+  /// @param M  mass matrix        (nq × nq), symmetric positive definite, or semidefinite as above
   /// @param A  constraint matrix  (nc × nq)
   /// @param b  constraint vector  (nc)
   UdwadiaKalaba(const Eigen::Ref<const Eigen::MatrixXd>& M, const Eigen::Ref<const Eigen::MatrixXd>& A,
@@ -42,12 +56,26 @@ class UdwadiaKalaba {
     friend class UdwadiaKalaba;
     Eigen::VectorXd rows_;                           // (nc)
     Eigen::MatrixXd square_, force_, wide_, tall_;   // (nq × nq), (nq × nq), (nc × nq), (nq × nc)
+    Eigen::MatrixXd mass_bar_;                       // (nq × nq)
     Eigen::MatrixXd Lambda_, Lambda_bar_, product_;  // (nc × nc)
   };
 
-  /// Whether M is positive definite to working precision; when it is not, nothing below is valid.
-  [[nodiscard]] bool mass_is_positive_definite() const { return mass_is_positive_definite_; }
-  [[nodiscard]] int rank() const { return rank_; }                       // of A
+  /// What M is to working precision.
+  enum class Mass {
+    positive_definite,
+    singular,      // semidefinite, and [M; A] has full column rank: M' stands for M
+    undetermined,  // semidefinite, but [M; A] leaves a direction in which nothing determines ddq
+    indefinite,    // or not finite
+  };
+  [[nodiscard]] Mass mass_kind() const { return mass_kind_; }
+  [[nodiscard]] bool mass_is_positive_definite() const { return mass_kind_ == Mass::positive_definite; }
+  [[nodiscard]] bool mass_is_singular() const { return mass_kind_ == Mass::singular; }
+  /// When it is not, nothing below is valid.
+  [[nodiscard]] bool motion_is_determined() const { return mass_is_positive_definite() || mass_is_singular(); }
+
+  [[nodiscard]] const Eigen::MatrixXd& mass() const { return mass_; }  // M' or, where M is positive definite, M  (nq × nq)
+  [[nodiscard]] const Eigen::VectorXd& row_masses() const { return row_mass_; }  // σ; zeros where M is positive definite  (nc)
+  [[nodiscard]] int rank() const { return rank_; }                               // of A
   [[nodiscard]] int n_zero_rows() const { return n_zero_rows_; }         // rows of A that vanish at this state; they are dropped
   [[nodiscard]] double inconsistency() const { return inconsistency_; }  // largest |A L b − b|, rows of B of unit norm
   [[nodiscard]] double size_of_b() const { return size_of_b_; }          // largest |b|, rows of B of unit norm
@@ -66,15 +94,19 @@ class UdwadiaKalaba {
   /// K with λ = K Aᵀλ (nc × nq). Of the multipliers of redundant rows it gives those of minimum norm.
   [[nodiscard]] Eigen::MatrixXd multipliers_of_force() const;
 
-  /// M⁻¹ v.
+  /// M⁻¹ v, or M'⁻¹ v.
   [[nodiscard]] Eigen::MatrixXd solve_mass(const Eigen::Ref<const Eigen::MatrixXd>& v) const;
-  /// v := M⁻¹ v, v (nq × any). Allocates nothing.
+  /// v := M⁻¹ v or M'⁻¹ v, v (nq × any). Allocates nothing.
   void solve_mass_in_place(Eigen::Ref<Eigen::MatrixXd> v) const;
 
   /// The constrained acceleration of an unconstrained one, L b + T ā, with one step of refinement onto A ddq = b.
   [[nodiscard]] Eigen::VectorXd constrain(const Eigen::Ref<const Eigen::VectorXd>& a_bar) const;
   /// The same, written to ddq (nq), which must not overlap a_bar.
   void constrain(const Eigen::Ref<const Eigen::VectorXd>& a_bar, Eigen::Ref<Eigen::VectorXd> ddq, Workspace& workspace) const;
+
+  /// dM' = dM + dAᵀΣA + AᵀΣdA, or dM where M is positive definite. Here and below Σ is held: no ddq and no force depends on it.
+  [[nodiscard]] Eigen::MatrixXd differentiate_mass(const Eigen::Ref<const Eigen::MatrixXd>& dM,
+                                                   const Eigen::Ref<const Eigen::MatrixXd>& dA) const;
 
   struct Derivative {
     Eigen::MatrixXd T;   // dT     (nq × nq)
@@ -99,7 +131,9 @@ class UdwadiaKalaba {
   };
   /// `differentiate` in reverse: from ds = T̄ : dT + L̄b · d(L b), with v = L̄b and X = M⁻¹Tᵀ(T̄ − v (L b)ᵀ),
   ///
-  ///     M̄ += X (L A)ᵀ,    Ā −= Λ A Xᵀ + Lᵀ(T̄ Tᵀ + v (L b)ᵀ),    b̄ += Lᵀv.
+  ///     M̄ += X (L A)ᵀ,    Ā −= Λ A Xᵀ + Lᵀ(T̄ Tᵀ + v (L b)ᵀ),    b̄ += Lᵀv,
+  ///
+  /// where M is singular also Ā += Σ A (Ȳ + Ȳᵀ), Ȳ what is added to M̄.
   ///
   /// @param T_bar   (nq × nq)
   /// @param Lb_bar  (nq)
@@ -111,12 +145,17 @@ class UdwadiaKalaba {
   void add_Lambda_adjoint(const Eigen::Ref<const Eigen::MatrixXd>& Lambda_bar, Adjoint adjoint, Workspace& workspace) const;
 
  private:
+  double factorise_mass(const Eigen::Ref<const Eigen::MatrixXd>& M, const Eigen::Ref<const Eigen::MatrixXd>& A);
+  void complete_mass(const Eigen::Ref<const Eigen::MatrixXd>& M, const Eigen::Ref<const Eigen::MatrixXd>& A);
   void decompose_rows();
-  bool mass_is_positive_definite_ = true;
+  void add_mass_adjoint(Adjoint adjoint, Workspace& workspace) const;
+  Mass mass_kind_ = Mass::positive_definite;
   int rank_ = 0;
   int n_zero_rows_ = 0;
   double inconsistency_ = 0;
   double size_of_b_ = 0;
+  Eigen::MatrixXd mass_;         // M or M'                  (nq × nq)
+  Eigen::VectorXd row_mass_;     // σ                        (nc)
   Eigen::MatrixXd mass_factor_;  // C in the lower triangle  (nq × nq)
   Eigen::VectorXd row_scale_;    // 1 / norm of each row of B, 0 for a zero row
   Eigen::MatrixXd A_unit_;       // rows of A so scaled      (nc × nq)
@@ -127,6 +166,8 @@ class UdwadiaKalaba {
   Eigen::VectorXd Lb_;
   // memory of the decompositions
   Eigen::VectorXd residual_;                  // (nc)
+  Eigen::VectorXd weight_;                    // (nq)
+  Eigen::MatrixXd A_T_;                       // (nc × nq)
   Eigen::MatrixXd rows_, R_transposed_;       // (nq × nc), (nc × min(nq, nc))
   Eigen::VectorXd reflection_, reflection2_;  // (min(nq, nc))
   Eigen::VectorXi order_, order2_;            // (nc), (min(nq, nc))
@@ -140,7 +181,11 @@ struct MechanicsBatch {
   SystemValues values;
   std::vector<UdwadiaKalaba> projections;
 
-  /// What makes the numbers unusable: the first state at which M is not positive definite or the constraints are inconsistent.
+  /// The first state at which M is singular, −1: none.
+  [[nodiscard]] int first_singular() const;
+
+  /// What makes the numbers unusable: the first state at which M is indefinite, nothing determines ddq in some direction, or the
+  /// constraints are inconsistent.
   struct Fault {
     int state = 0;
     std::string text;
@@ -159,7 +204,7 @@ void evaluate_mechanics(const System& system, const Eigen::Ref<const Eigen::Matr
                         const Eigen::Ref<const Eigen::VectorXd>& parameters, MechanicsBatch& batch);
 
 /// The same, where a fault is an error.
-/// @throws InputError naming the state and the rule.
+/// @throws InputError naming the state and the rule; where nothing determines ddq in some direction, this direction too.
 MechanicsBatch require_mechanics(const System& system, const Eigen::Ref<const Eigen::MatrixXd>& states,
                                  const Eigen::Ref<const Eigen::VectorXd>& parameters);
 

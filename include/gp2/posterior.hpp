@@ -27,14 +27,14 @@ struct ViewAt {
 /// Immutable, cheap to copy, thread-safe. One that is given away can grow and shrink with its data: update, remove_oldest.
 class Posterior {
  public:
-  /// @throws InputError when M is not positive definite or the constraints contradict each other at an observed state.
+  /// @throws InputError as require_mechanics of the prior, at an observed state.
   /// @throws NumericalError when the covariance cannot be factored in double precision (noise too small).
   Posterior(Prior prior, std::vector<Observations> observations, ModelValues values);
 
   /// E[view] at N states (d × N). A state's result is the same, to the bit, whatever other states are asked for and however many
   /// threads work.
   /// @param n_threads  that may work on it; 0: as many as the machine has
-  /// @throws InputError as require_mechanics.
+  /// @throws InputError as require_mechanics of the prior.
   [[nodiscard]] Eigen::MatrixXd mean(const View& view, const Eigen::Ref<const Eigen::MatrixXd>& states, int n_threads = 1) const;
 
   struct Marginal {

@@ -78,9 +78,11 @@ class Predictor {
   /// says why.
   enum class Status {
     ok,
-    mass_not_positive_definite,
-    contradicting_constraints,  // no acceleration satisfies A ddq = b
-    not_finite,                 // an entry of the state that is read, or what an expression or its derivative makes of it
+    mass_not_positive_definite,     // nor semidefinite
+    motion_undetermined,            // M is singular, and the constraints leave a direction in which nothing determines ddq
+    no_unconstrained_acceleration,  // M is singular, and the view or a latent is of ā
+    contradicting_constraints,      // no acceleration satisfies A ddq = b
+    not_finite,                     // an entry of the state that is read, or what an expression or its derivative makes of it
   };
 
   /// E[view] at a state.
@@ -101,8 +103,8 @@ class Predictor {
   ///
   ///     dddq = T (dā + M⁻¹(dM (ā − ddq) + dAᵀλ)) + L (db − dA ddq)
   ///
-  /// which is exact wherever the rank of A is the same around the state. As good as the system's derivatives: see
-  /// state_evaluator.hpp, also for |v| at v = 0.
+  /// (where M is singular dF̄ − dM ddq + dAᵀλ instead of M dā + dM (ā − ddq) + dAᵀλ), which is exact wherever the rank of A is the
+  /// same around the state. As good as the system's derivatives: see state_evaluator.hpp, also for |v| at v = 0.
   /// @param jacobian  (d × layout size), columns in the order of StateLayout: [q; dq; t; u]
   /// @throws InputError when options().jacobian is false.
   [[nodiscard]] Status mean_and_jacobian(const Eigen::Ref<const Eigen::VectorXd>& state, Eigen::Ref<Eigen::VectorXd> mean,

@@ -22,7 +22,7 @@ namespace gp2 {
 struct Latent {
   enum class Base {
     acceleration,  // E = B
-    force,         // E = M⁻¹B
+    force,         // E = M⁻¹B; where M is singular M'⁻¹B, M' as in UdwadiaKalaba
   };
 
   /// How a parameter of the kernel starts and is bounded, relative to its default scale (design of the scales: training.hpp).
@@ -108,6 +108,22 @@ struct PriorValues {
     return {directions[latent].col(i).data(), mean.rows(), directions[latent].rows() / mean.rows()};
   }
 };
+
+/// The mechanics at N states for a view of a prior: as evaluate_mechanics of the system, and a fault also where M is singular, so
+/// that there is no ā, while the view is of ā, the prior's mean constant, or a latent not on forces.
+///
+/// @param prior       prior_of(home, view)
+/// @param parameters  of its system
+void evaluate_mechanics(const Prior& prior, const View& view, const Eigen::Ref<const Eigen::MatrixXd>& states,
+                        const Eigen::Ref<const Eigen::VectorXd>& parameters, MechanicsBatch& batch);
+
+/// The same, where a fault is an error.
+/// @throws InputError naming the state and the rule.
+MechanicsBatch require_mechanics(const Prior& prior, const View& view, const Eigen::Ref<const Eigen::MatrixXd>& states,
+                                 const Eigen::Ref<const Eigen::VectorXd>& parameters);
+
+/// What of a view of a prior has no meaning where M is singular, as a text; nothing where all has.
+std::optional<std::string> what_needs_acceleration(const Prior& prior, const View& view);
 
 /// φ_a at N states (N × D_a), one row per state: the layout kernels read.
 Eigen::MatrixXd evaluate_features(const Latent& latent, const Eigen::Ref<const Eigen::MatrixXd>& states);

@@ -14,13 +14,14 @@ namespace gp2 {
 
 struct Setting;
 
-/// A quantity that is affine in the unconstrained acceleration ā at a state: G(x) ā(x) + d(x).
+/// A quantity that is affine in the unconstrained acceleration ā at a state: G(x) ā(x) + d(x). Where M is singular ā stands for
+/// M'⁻¹F̄, the M' of UdwadiaKalaba, and cannot be viewed itself; elsewhere M' = M.
 struct View {
   enum class Quantity {
     constrained_acceleration,    // ddq = T ā + L b    G = T             d = L b           [ddq]
     unconstrained_acceleration,  // ā                  G = I             d = 0             [ddq]
-    constraint_force,            // Aᵀλ = M (ddq − ā)  G = M (T − I)     d = M L b         [force]
-    multipliers,                 // λ                  G = −(Aᵀ)⁺M L A   d = (Aᵀ)⁺M L b    [force/row]; nc of them
+    constraint_force,            // Aᵀλ = M (ddq − ā)  G = M T − M'      d = M L b         [force]
+    multipliers,                 // λ                  G = (Aᵀ)⁺(MT − M')  d = (Aᵀ)⁺M L b  [force/row]; nc of them
     next_velocity,               // dq + Δt ddq        G = Δt T          d = dq + Δt L b   [dq]
   };
 

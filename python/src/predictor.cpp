@@ -77,6 +77,14 @@ class PyPredictor {
         return;
       case Predictor::Status::mass_not_positive_definite:
         throw InputError("state: the mass matrix is not positive definite there");
+      case Predictor::Status::motion_undetermined:
+        throw InputError(
+            "state: the mass matrix is singular there, and the constraints leave a direction in which nothing determines ddq");
+      case Predictor::Status::no_unconstrained_acceleration:
+        throw InputError(
+            "state: the mass matrix is singular there, so that there is no unconstrained acceleration, which the view or a "
+            "latent is "
+            "of");
       case Predictor::Status::contradicting_constraints:
         throw InputError("state: the constraints contradict each other there: no acceleration satisfies A ddq = b");
       case Predictor::Status::not_finite:

@@ -30,9 +30,9 @@ void Query::evaluate(const Posterior::Implementation& posterior, const View& vie
   const Prior& there = prior_of(posterior.prior, viewed);
   const VectorXd parameters = parameters_of(viewed, posterior.values.parameters);
   const auto block = states.middleCols(first, n);
-  evaluate_mechanics(*there.system, block, parameters, mechanics);
+  evaluate_mechanics(there, viewed, block, parameters, mechanics);
   // whether constraints contradict each other depends on the largest b of all states, not of a block: throws, or all is well
-  if (mechanics.fault) static_cast<void>(require_mechanics(*there.system, states, parameters));
+  if (mechanics.fault) static_cast<void>(require_mechanics(there, viewed, states, parameters));
   view = evaluate_view(viewed, mechanics, block);
   prior = evaluate_prior(there, block, parameters, mechanics);
   latent = viewed.latent;
@@ -218,7 +218,7 @@ void Posterior::Implementation::add_samples(const std::vector<Observations>& gro
   if (!model_observations(prior, groups, values.parameters, {}, models)) {
     for (const Observations& group : groups) {
       static_cast<void>(
-          require_mechanics(*prior_of(prior, group.view).system, group.states, parameters_of(group.view, values.parameters)));
+          require_mechanics(prior_of(prior, group.view), group.view, group.states, parameters_of(group.view, values.parameters)));
     }
   }
   Reduction reduction;

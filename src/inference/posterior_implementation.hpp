@@ -71,7 +71,7 @@ struct Query {
   [[nodiscard]] bool needs(std::size_t a) const { return latent < 0 || latent == static_cast<int>(a); }
 
   /// Of the states first … first + n − 1, in the memory of what was there.
-  /// @throws InputError as require_mechanics for all states.
+  /// @throws InputError as require_mechanics of the prior for all states.
   void evaluate(const Posterior::Implementation& posterior, const View& view, const Eigen::Ref<const Eigen::MatrixXd>& states,
                 Eigen::Index first, Eigen::Index n);
 

@@ -134,8 +134,9 @@ struct Predictor::Implementation {
   std::vector<Term> terms;
   std::vector<std::vector<Index>> row_of;  // [component][sample], as in Posterior::Implementation
   Index reduced_size = 0;
-  Index n_all_functions = 0;  // Σ F
-  bool has_force = false;     // μ or a direction that is multiplied by M⁻¹
+  Index n_all_functions = 0;        // Σ F
+  bool has_force = false;           // μ or a direction that is multiplied by M⁻¹
+  bool needs_acceleration = false;  // ā itself, which is none where M is singular
   Data<double> in_double;
   Data<float> in_single;
 
@@ -188,7 +189,7 @@ struct Predictor::Workspace::Implementation {
   VectorXd a_of_force;        // … and the product
   VectorXd a;                 // ddq, or T ā of one latent alone
   VectorXd gap;               // a − ā, then ā − a − a_of_force
-  VectorXd of_constraint;     // M (a − ā)
+  VectorXd of_constraint;     // Aᵀλ = M (a − ā)
   VectorXd lambda;            // λ (nc)
   MatrixXd L;                 // (nq × nc)
   MatrixXd d_a_bar;           // dā, and (nq × layout size)
@@ -256,6 +257,7 @@ Predictor::Implementation::Implementation(const Posterior::Implementation& poste
       reduced_size(posterior.factor.size()) {
   check_view(view, prior);
   has_force = has_mean_force();
+  needs_acceleration = what_needs_acceleration(prior, view).has_value();
   for (std::size_t a = 0; a < prior.latents.size(); ++a) {
     if (!is_whole() && static_cast<int>(a) != view.latent) continue;
     terms.push_back({a, posterior.latents[a].kernel, posterior.latents[a].C});
@@ -405,7 +407,17 @@ Status Predictor::Implementation::evaluate(const Ref<const VectorXd>& state, Sta
   at.evaluate(state);
   if (!is_finite(at.M()) || !is_finite(at.A()) || !is_finite(at.b())) return Status::not_finite;
   w.projection.compute(at.M(), at.A(), at.b());
-  if (!w.projection.mass_is_positive_definite()) return Status::mass_not_positive_definite;
+  switch (w.projection.mass_kind()) {
+    case UdwadiaKalaba::Mass::positive_definite:
+      break;
+    case UdwadiaKalaba::Mass::singular:
+      if (needs_acceleration) return Status::no_unconstrained_acceleration;
+      break;
+    case UdwadiaKalaba::Mass::undetermined:
+      return Status::motion_undetermined;
+    case UdwadiaKalaba::Mass::indefinite:
+      return Status::mass_not_positive_definite;
+  }
   if (w.projection.inconsistency() > MechanicsBatch::consistency_tolerance * w.projection.size_of_b()) {
     return Status::contradicting_constraints;
   }
@@ -451,7 +463,12 @@ void Predictor::Implementation::write_mean(const Ref<const VectorXd>& state, con
     w.a.noalias() = w.projection.T() * w.a_bar;
   }
   w.gap = w.a - w.a_bar;
-  if (view.quantity == Quantity::constraint_force || options.jacobian) w.of_constraint.noalias() = at.M() * w.gap;
+  if (view.quantity == Quantity::constraint_force || options.jacobian) {
+    // where M is singular ā has nothing but a_of_force, of M', and so drops out
+    w.of_constraint = -w.force;
+    w.of_constraint.noalias() += at.M() * w.gap;
+    w.of_constraint.noalias() += at.M() * w.a_of_force;
+  }
   for (Index r = 0; r < mean.size(); ++r) {
     const Index row = view.rows[static_cast<std::size_t>(r)];
     if (view.quantity == Quantity::constraint_force) {
@@ -476,7 +493,7 @@ void Predictor::Implementation::write_stddev(const StateEvaluator& at, Workspace
         break;
       case Quantity::constraint_force:
         for (Index j = 0; j < nq; ++j) {
-          double entry = -at.M()(row, j);
+          double entry = -w.projection.mass()(row, j);
           for (Index i = 0; i < nq; ++i) entry += at.M()(row, i) * T(i, j);
           w.Gt(j, r) = entry;
         }
@@ -581,6 +598,7 @@ void Predictor::Implementation::write_stddev(const StateEvaluator& at, Workspace
 //     dā = P + M⁻¹(R − dM a_of_force),    P, R: the changes of what stands without and with M⁻¹ in ā
 //     da = T (P + M⁻¹(R + dM (ā − a − a_of_force) + dAᵀλ)) + L (db − dA a)
 //
+// Where M is singular P = 0 and ā = a_of_force: the second line is then M ddq = F̄ + Aᵀλ, differentiated, with T M'⁻¹ and L of M'.
 // Derivatives are few: each entry of dM, dA, db, dF is added where it belongs.
 void Predictor::Implementation::write_jacobian(const Ref<const VectorXd>& state, const StateEvaluator& at,
                                                Workspace::Implementation& w, Ref<MatrixXd> jacobian) const {
@@ -650,15 +668,17 @@ void Predictor::Implementation::write_jacobian(const Ref<const VectorXd>& state,
     }
   }
 
-  // dā
-  if (view.quantity == Quantity::unconstrained_acceleration || view.quantity == Quantity::constraint_force) {
+  if (view.quantity == Quantity::unconstrained_acceleration) {
     w.d_a = R;
     w.projection.solve_mass_in_place(w.d_a);
     w.d_a += P;
-  }
-  if (view.quantity == Quantity::unconstrained_acceleration) {
     for (Index r = 0; r < jacobian.rows(); ++r) jacobian.row(r) = w.d_a.row(view.rows[static_cast<std::size_t>(r)]);
     return;
+  }
+  if (view.quantity == Quantity::constraint_force) {
+    // M dā
+    w.d_a = R;
+    w.d_a.noalias() += at.M().lazyProduct(P);
   }
   // da, in the place of P
   R += w.d_forced - w.d_gap;
@@ -669,8 +689,8 @@ void Predictor::Implementation::write_jacobian(const Ref<const VectorXd>& state,
   const MatrixXd& d_a = w.d_forced;
   if (view.quantity == Quantity::constraint_force) {
     // d(M (a − ā))
-    P = d_a - w.d_a;
-    w.d_gap.noalias() += at.M().lazyProduct(P);
+    w.d_gap.noalias() += at.M().lazyProduct(d_a);
+    w.d_gap -= w.d_a;
     for (Index r = 0; r < jacobian.rows(); ++r) jacobian.row(r) = w.d_gap.row(view.rows[static_cast<std::size_t>(r)]);
     return;
   }

@@ -43,7 +43,7 @@ bool model_observations(const Prior& prior, const std::vector<Observations>& obs
     ObservationModel& model = models[g];
     const Prior& there = prior_of(prior, group.view);
     const VectorXd theta = parameters_of(group.view, parameters);
-    evaluate_mechanics(*there.system, group.states, theta, model.mechanics);
+    evaluate_mechanics(there, group.view, group.states, theta, model.mechanics);
     if (model.mechanics.fault) return false;
     model.values = {evaluate_view(group.view, model.mechanics, group.states),
                     evaluate_prior(there, group.states, theta, model.mechanics)};

@@ -113,8 +113,10 @@ Place place_of(const ModelFile& home, const Prior& prior, const PriorOptions& op
 }
 
 // the likelihood would refuse these states too, but it does not know their rows in the log
-void require_mechanics_at(const Place& place, const MatrixXd& states, const std::vector<int>& rows, const CsvTable& log) {
-  const MechanicsBatch mechanics = evaluate_mechanics(place.system(), states, place.parameters);
+void require_mechanics_at(const Place& place, const View& view, const MatrixXd& states, const std::vector<int>& rows,
+                          const CsvTable& log) {
+  MechanicsBatch mechanics;
+  evaluate_mechanics(place.prior, view, states, place.parameters, mechanics);
   if (!mechanics.fault) return;
   throw InputError(fmt::format("{}: data row {}: {} ('{}' with the model's parameters; see gp2 check)", log.name(),
                                rows[static_cast<std::size_t>(mechanics.fault->state)] + 1, mechanics.fault->text,
@@ -232,7 +234,7 @@ VectorXd noise_of(const ModelFile& model, const FitProblemOptions& options, cons
 // Size of G ā in each row of a view: the spread of the values or, for those that hardly vary, as exact zeros, what the prior
 // expects: its standard deviation, root mean square over the states, with the signals at their default scales.
 VectorXd signal_size(const Place& place, const Observations& group, const std::vector<VectorXd>& signal_stddev) {
-  const MechanicsBatch mechanics = require_mechanics(place.system(), group.states, place.parameters);
+  const MechanicsBatch mechanics = require_mechanics(place.prior, group.view, group.states, place.parameters);
   const ViewValues view = evaluate_view(group.view, mechanics, group.states);
   PriorValues prior = evaluate_prior(place.prior, group.states, place.parameters, mechanics);
   if (group.view.latent >= 0) prior.keep_only(static_cast<std::size_t>(group.view.latent));
@@ -287,7 +289,7 @@ Observations read_log(const Place& place, const Log& log, const FitProblemOption
     if (group.has_noise_scale()) group.noise_scale = MatrixXd(group.noise_scale(Eigen::all, rows));
     notes.push_back(fmt::format("{}: {} of {} rows taken, by seed {}", log.table.name(), rows.size(), n_rows, options.seed));
   }
-  require_mechanics_at(place, group.states, rows, log.table);
+  require_mechanics_at(place, group.view, group.states, rows, log.table);
 
   const bool model_estimates = place.model.noise.estimate && !options.noise_stddev && !group.has_noise_scale();
   group.estimate_noise = options.protocol.name != Protocol::Name::paper && (options.estimate_noise || model_estimates);
@@ -343,7 +345,7 @@ Observations read_knowledge(const Place& place, const Prior& home, const Knowled
   group.states = states_of(place.prior, group.view, reader);
   note_reading(reader, table, notes);
   note_violation(system, group.states, place.parameters, table, notes);
-  require_mechanics_at(place, group.states, chosen_rows(table.n_rows(), table.n_rows(), 0), table);
+  require_mechanics_at(place, group.view, group.states, chosen_rows(table.n_rows(), table.n_rows(), 0), table);
   return group;
 }
 
@@ -424,10 +426,19 @@ void note_parameters(const ModelFile& home, const Place& place, const std::vecto
   }
 }
 
+// so that there is no ā for a discrepancy to act on
+bool has_singular_mass(const FitProblem& problem) {
+  const VectorXd parameters = problem.prior.system->parameter_values();
+  return std::any_of(problem.observations.begin(), problem.observations.end(), [&](const Observations& group) {
+    const Prior& there = prior_of(problem.prior, group.view);
+    return evaluate_mechanics(*there.system, group.states, parameters_of(group.view, parameters)).first_singular() >= 0;
+  });
+}
+
 bool has_discrepancy(const FitProblem& problem, const FitProblemOptions& options) {
   const bool standard = options.protocol.name == Protocol::Name::standard && options.protocol.hyperprior;
   return options.discrepancy && standard && problem.prior.latents.size() == 1 &&
-         problem.prior.latents.front().directions_are_identity;
+         problem.prior.latents.front().directions_are_identity && !has_singular_mass(problem);
 }
 
 // a share of the noise, as the fit starts with it, in each acceleration; where one is not measured, of its spread the same share

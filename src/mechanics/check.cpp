@@ -155,18 +155,46 @@ std::optional<std::vector<int>> dependent_columns(const System& system, const Re
 
 namespace {
 
-// M, A, b: definite, of constant rank, consistent
+VectorXd eigenvalues_of(const MatrixXd& M) {
+  return Eigen::SelfAdjointEigenSolver<MatrixXd>(M, Eigen::EigenvaluesOnly).eigenvalues();
+}
+
+// of a semidefinite M, each coordinate in units of its diagonal entry
+int rank_of_mass(const MatrixXd& M) {
+  VectorXd unit = M.diagonal();
+  for (double& entry : unit) entry = entry > 0 ? 1 / std::sqrt(entry) : 0;
+  const VectorXd eigenvalues = eigenvalues_of(unit.asDiagonal() * M * unit.asDiagonal());
+  return static_cast<int>((eigenvalues.array() > UdwadiaKalaba::mass_tolerance).count());
+}
+
+// M, A, b: definite or completed by A, of constant rank, consistent
 void check_mechanics(const System& system, const MechanicsBatch& mechanics, std::vector<Finding>& findings) {
+  const int n_states = mechanics.values.n_states();
   double worst_condition = 0, asymmetry = 0;
-  for (int i = 0; i < mechanics.values.n_states(); ++i) {
+  int n_singular = 0, mass_rank = system.nq();
+  for (int i = 0; i < n_states; ++i) {
     const MatrixXd M = mechanics.values.M(i);
-    asymmetry = std::max(asymmetry, (M - M.transpose()).cwiseAbs().maxCoeff() / M.cwiseAbs().maxCoeff());
-    const VectorXd eigenvalues = Eigen::SelfAdjointEigenSolver<MatrixXd>(M, Eigen::EigenvaluesOnly).eigenvalues();
-    worst_condition = std::max(worst_condition, eigenvalues.maxCoeff() / eigenvalues.minCoeff());
+    const double largest = M.cwiseAbs().maxCoeff();
+    if (largest > 0) asymmetry = std::max(asymmetry, (M - M.transpose()).cwiseAbs().maxCoeff() / largest);
+    if (mechanics.projections[static_cast<std::size_t>(i)].mass_is_singular()) {
+      ++n_singular;
+      mass_rank = std::min(mass_rank, rank_of_mass(M));
+    } else {
+      const VectorXd eigenvalues = eigenvalues_of(M);
+      worst_condition = std::max(worst_condition, eigenvalues.maxCoeff() / eigenvalues.minCoeff());
+    }
   }
-  findings.push_back({asymmetry > 1e-10 ? Level::error : Level::good,
-                      fmt::format("mass matrix: positive definite at all {} states, condition number up to {:.3g}",
-                                  mechanics.values.n_states(), worst_condition)});
+  findings.push_back(
+      {asymmetry > 1e-10 ? Level::error : Level::good,
+       fmt::format("mass matrix: positive definite at all {} states, condition number up to {:.3g}", n_states, worst_condition)});
+  if (n_singular > 0) {
+    findings.back().text = fmt::format(
+        "mass matrix: singular at {} of {} states, rank {} of {}{}; the constraints determine the motion all the same, and the "
+        "latents must act on forces: directions = \"force\"",
+        n_singular, n_states, mass_rank, system.nq(),
+        n_singular < n_states ? fmt::format("; elsewhere positive definite, condition number up to {:.3g}", worst_condition)
+                              : "");
+  }
   if (asymmetry > 1e-10) findings.back().text = fmt::format("mass matrix: not symmetric (relative difference {:.3g})", asymmetry);
   if (system.nc() == 0) {
     findings.push_back({Level::warning, "constraints: none; T = I, and ddq is the unconstrained acceleration"});

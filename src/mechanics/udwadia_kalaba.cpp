@@ -1,5 +1,7 @@
 #include <algorithm>
 #include <cmath>
+#include <string>
+#include <utility>
 #include <vector>
 
 #include <fmt/format.h>
@@ -8,6 +10,7 @@
 
 #include "gp2/error.hpp"
 #include "gp2/mechanics.hpp"
+#include "mechanics/describe_fault.hpp"
 #include "mechanics/dot.hpp"
 #include "mechanics/pivoted_qr.hpp"
 
@@ -20,26 +23,17 @@ using Eigen::VectorXd;
 
 namespace {
 
-// "at state 3 (q1 = 0.1, dq1 = 2): …", with the entries that are known
-std::string describe_fault(const System& system, const Ref<const MatrixXd>& states, const MechanicsBatch::Fault& fault) {
-  const std::vector<std::string> names = system.state_names();
-  std::string where;
-  for (Eigen::Index row = 0; row < states.rows(); ++row) {
-    const double value = states(row, fault.state);
-    if (std::isnan(value)) continue;
-    where += fmt::format("{}{} = {:.6g}", where.empty() ? "" : ", ", names[static_cast<std::size_t>(row)], value);
-  }
-  return fmt::format("system '{}': {} at state {} ({})", system.name(), fault.text, fault.state + 1, where);
-}
-
-// M = C Cᵀ, from the lower triangle of M to C in its place; false where a pivot is lost to rounding, or negative
-bool factorise(MatrixXd& M) {
+// M = C Cᵀ, from the lower triangle of M to C in its place. Returns the smallest squared pivot, as a fraction of its diagonal
+// entry; 0 where one is lost to rounding, or negative
+double factorise(MatrixXd& M) {
   const Index n = M.rows();
+  double smallest = 1;
   for (Index k = 0; k < n; ++k) {
     double* const pivot = M.col(k).data() + k;
     double square = *pivot;
     for (Index j = 0; j < k; ++j) square -= M(k, j) * M(k, j);
-    if (!(square > 1e-14 * std::abs(*pivot))) return false;
+    if (!(square > 1e-14 * std::abs(*pivot))) return 0;
+    smallest = std::min(smallest, square / *pivot);
     *pivot = std::sqrt(square);
     const double scale = 1 / *pivot;
     for (Index j = 0; j < k; ++j) {
@@ -48,7 +42,71 @@ bool factorise(MatrixXd& M) {
     }
     for (Index i = 1; i < n - k; ++i) pivot[i] *= scale;
   }
+  return smallest;
+}
+
+// Whether M ⪰ 0 to rounding. Each coordinate in units of its diagonal entry, the largest pivot is eliminated next; what is left
+// of a semidefinite matrix where none is above rounding is itself rounding.
+bool is_semidefinite(const Ref<const MatrixXd>& M, MatrixXd& rest) {
+  constexpr double rounding = 1e-13;
+  const Index n = M.rows();
+  rest = M;
+  for (Index step = 0; step < n; ++step) {
+    Index pivot = -1;
+    double largest = rounding;
+    for (Index j = 0; j < n; ++j) {
+      if (!(rest(j, j) > largest * M(j, j))) continue;
+      largest = rest(j, j) / M(j, j);
+      pivot = j;
+    }
+    if (pivot < 0) break;
+    for (Index j = 0; j < n; ++j) {
+      if (j == pivot) continue;
+      const double factor = rest(pivot, j) / rest(pivot, pivot);
+      for (Index i = 0; i < n; ++i) {
+        if (i != pivot) rest(i, j) -= rest(i, pivot) * factor;
+      }
+    }
+    rest.row(pivot).setZero();
+    rest.col(pivot).setZero();
+  }
+  // no root where a diagonal entry is negative
+  for (Index j = 0; j < n; ++j) {
+    for (Index i = 0; i < n; ++i) {
+      if (!(std::abs(rest(i, j)) <= rounding * std::sqrt(M(i, i)) * std::sqrt(M(j, j)))) return false;
+    }
+  }
   return true;
+}
+
+// σ_k = 1/(A_k diag(w)⁻¹A_kᵀ), w_j = M_jj. A massless coordinate has the w_j that rows weighed before it lend, Σ σ_k A_kj²; so
+// rows among such coordinates come after those that tie them to a mass.
+void weigh_rows(const Ref<const MatrixXd>& M, const Ref<const MatrixXd>& A, VectorXd& w, VectorXd& sigma) {
+  w = M.diagonal();
+  sigma.setZero();
+  const auto weigh = [&](Index k, bool by_mass) {
+    double sum = 0;
+    for (Index j = 0; j < w.size(); ++j) {
+      if (!by_mass || w[j] > 0) sum += A(k, j) * A(k, j) / (by_mass ? w[j] : 1);
+    }
+    if (sum > 0) sigma[k] = 1 / sum;
+    return sum > 0;
+  };
+  for (Index pass = 0; pass < A.rows(); ++pass) {
+    bool some = false;
+    for (Index k = 0; k < A.rows(); ++k) {
+      if (sigma[k] == 0) some = weigh(k, true) || some;
+    }
+    // rows that nothing ties to a mass: one of them sets their scale
+    for (Index k = 0; !some && k < A.rows(); ++k) {
+      if (sigma[k] == 0) some = weigh(k, false);
+    }
+    if (!some) return;
+    for (Index j = 0; j < w.size(); ++j) {
+      if (w[j] > 0) continue;
+      for (Index k = 0; k < A.rows(); ++k) w[j] += sigma[k] * A(k, j) * A(k, j);
+    }
+  }
 }
 
 // X := C⁻¹ X. Row by row: the columns do not wait for each other
@@ -83,14 +141,54 @@ void solve_upper(const MatrixXd& C, Matrix& X) {
 
 }  // namespace
 
+// M or, where it is singular, M' and its factor. Returns the smallest pivot
+double UdwadiaKalaba::factorise_mass(const Ref<const MatrixXd>& M, const Ref<const MatrixXd>& A) {
+  mass_ = M;
+  mass_factor_ = M;
+  row_mass_.setZero(A.rows());
+  mass_kind_ = Mass::indefinite;
+  if (!M.allFinite()) return 0;
+  const double pivot = factorise(mass_factor_);
+  mass_kind_ = Mass::positive_definite;
+  if (pivot > mass_tolerance) return pivot;
+
+  const bool semidefinite = A.allFinite() && is_semidefinite(M, T_);
+  if (semidefinite) {
+    complete_mass(M, A);
+    mass_factor_ = mass_;
+    const double completed = factorise(mass_factor_);
+    mass_kind_ = Mass::singular;
+    if (completed > mass_tolerance) return completed;
+  }
+  if (pivot > 0) {
+    // ill-conditioned, and A does not help
+    mass_ = M;
+    mass_factor_ = M;
+    row_mass_.setZero();
+    mass_kind_ = Mass::positive_definite;
+    return factorise(mass_factor_);
+  }
+  mass_kind_ = semidefinite || !A.allFinite() ? Mass::undetermined : Mass::indefinite;
+  return 0;
+}
+
+// M' = M + AᵀΣA
+void UdwadiaKalaba::complete_mass(const Ref<const MatrixXd>& M, const Ref<const MatrixXd>& A) {
+  weigh_rows(M, A, weight_, row_mass_);
+  for (Index k = 0; k < A.rows(); ++k) {
+    for (Index j = 0; j < M.cols(); ++j) {
+      for (Index i = 0; i < M.rows(); ++i) mass_(i, j) += row_mass_[k] * (A(k, i) * A(k, j));
+    }
+  }
+}
+
 void UdwadiaKalaba::compute(const Ref<const MatrixXd>& M, const Ref<const MatrixXd>& A, const Ref<const VectorXd>& b) {
   const Index nq = M.rows();
   const Index nc = A.rows();
   rank_ = n_zero_rows_ = 0;
   inconsistency_ = size_of_b_ = 0;
-  mass_factor_ = M;
-  mass_is_positive_definite_ = M.allFinite() && factorise(mass_factor_);
-  if (!mass_is_positive_definite_) return;
+  const double pivot = factorise_mass(M, A);
+  if (!motion_is_determined()) return;
 
   // Bᵀ = C⁻¹Aᵀ, its columns (the rows of B) scaled to unit norm; rows of A that vanish are dropped
   rows_ = A.transpose();
@@ -111,7 +209,13 @@ void UdwadiaKalaba::compute(const Ref<const MatrixXd>& M, const Ref<const Matrix
     }
   }
   decompose_rows();
-  ML_unit_.noalias() = M * L_unit_;
+  constexpr double well_conditioned = 1e-4;
+  if (pivot < well_conditioned) {
+    // T M⁻¹ rounds at ε κ^1.5 of T as it comes, κ = 1/pivot; with what A still sees of T taken away, at ε κ
+    A_T_.noalias() = A_unit_ * T_;
+    T_.noalias() -= L_unit_ * A_T_;
+  }
+  ML_unit_.noalias() = mass_ * L_unit_;
 
   // b must lie in range(A); a dropped row is 0 = b_k
   Lb_.noalias() = L_unit_ * b_unit_;
@@ -218,7 +322,18 @@ MatrixXd UdwadiaKalaba::multipliers_of_force() const {
 MatrixXd UdwadiaKalaba::differentiate_Lambda(const Ref<const MatrixXd>& dM, const Ref<const MatrixXd>& dA) const {
   const MatrixXd L = this->L();
   const MatrixXd Lambda_dA_L = Lambda() * (dA * L);
-  return L.transpose() * dM * L - Lambda_dA_L - Lambda_dA_L.transpose();
+  return L.transpose() * differentiate_mass(dM, dA) * L - Lambda_dA_L - Lambda_dA_L.transpose();
+}
+
+MatrixXd UdwadiaKalaba::differentiate_mass(const Ref<const MatrixXd>& dM, const Ref<const MatrixXd>& dA) const {
+  if (!mass_is_singular()) return dM;
+  MatrixXd d = dM;
+  for (Index k = 0; k < row_mass_.size(); ++k) {
+    if (row_mass_[k] == 0) continue;
+    const MatrixXd half = row_mass_[k] / row_scale_[k] * A_unit_.row(k).transpose() * dA.row(k);
+    d += half + half.transpose();
+  }
+  return d;
 }
 
 VectorXd UdwadiaKalaba::constrain(const Ref<const VectorXd>& a_bar) const {
@@ -243,7 +358,7 @@ UdwadiaKalaba::Derivative UdwadiaKalaba::differentiate(const Ref<const MatrixXd>
   // ΛA = (M L)ᵀ and Λb = (M L)ᵀ L b
   const MatrixXd dA_unit = row_scale_.asDiagonal() * dA;
   MatrixXd force = dA_unit.transpose() * ML_unit_.transpose();  // dAᵀΛA − dM L A, and L A L b = L b
-  if (!dM.isZero(0)) force -= dM * (L_unit_ * A_unit_);
+  if (mass_is_singular() || !dM.isZero(0)) force -= differentiate_mass(dM, dA) * (L_unit_ * A_unit_);
   solve_mass_in_place(force);
   const MatrixXd T_M_inverse_force = T_ * force;
   Derivative d;
@@ -264,7 +379,7 @@ void UdwadiaKalaba::add_adjoint(const Ref<const MatrixXd>& T_bar, const Ref<cons
   if (row_scale_.size() == 0) return;  // L A = 0
 
   workspace.tall_.noalias() = X * A_unit_.transpose();
-  adjoint.M.noalias() += workspace.tall_ * L_unit_.transpose();
+  add_mass_adjoint(adjoint, workspace);
 
   sum.noalias() = T_bar * T_.transpose();
   sum.noalias() += Lb_bar * Lb_.transpose();
@@ -283,12 +398,88 @@ void UdwadiaKalaba::add_Lambda_adjoint(const Ref<const MatrixXd>& Lambda_bar, Ad
   Lambda.noalias() = L_unit_.transpose() * ML_unit_;
   unit_bar = row_scale_.asDiagonal() * Lambda_bar * row_scale_.asDiagonal();
   workspace.tall_.noalias() = L_unit_ * unit_bar;
-  adjoint.M.noalias() += workspace.tall_ * L_unit_.transpose();
+  add_mass_adjoint(adjoint, workspace);
 
   workspace.product_ = unit_bar + unit_bar.transpose();
   unit_bar.noalias() = Lambda * workspace.product_;
   workspace.wide_.noalias() = unit_bar * L_unit_.transpose();
   adjoint.A -= row_scale_.asDiagonal() * workspace.wide_;
+}
+
+// of M', W Lᵀ with W in workspace.tall_, to M and, where M is singular, A: Ā += Σ A (M̄' + M̄'ᵀ)
+void UdwadiaKalaba::add_mass_adjoint(Adjoint adjoint, Workspace& workspace) const {
+  if (!mass_is_singular()) {
+    adjoint.M.noalias() += workspace.tall_ * L_unit_.transpose();
+    return;
+  }
+  workspace.mass_bar_.noalias() = workspace.tall_ * L_unit_.transpose();
+  adjoint.M += workspace.mass_bar_;
+  workspace.wide_.noalias() = A_unit_ * workspace.mass_bar_;
+  workspace.wide_.noalias() += A_unit_ * workspace.mass_bar_.transpose();
+  for (Index k = 0; k < row_mass_.size(); ++k) {
+    if (row_mass_[k] > 0) adjoint.A.row(k) += row_mass_[k] / row_scale_[k] * workspace.wide_.row(k);
+  }
+}
+
+namespace {
+
+// "0.71 q2 − 0.71 q3": a unit vector v with M v = 0 and A v = 0. Sought where M' has a diagonal of ones
+std::string free_direction(const System& system, const UdwadiaKalaba& projection, const MatrixXd& M, const MatrixXd& A) {
+  const Index nq = M.rows();
+  VectorXd scale = projection.mass().diagonal();
+  for (double& entry : scale) entry = entry > 0 ? 1 / std::sqrt(entry) : 1;
+  MatrixXd rows(nq + A.rows(), nq);
+  rows << scale.asDiagonal() * M, A;
+  rows = rows * scale.asDiagonal();
+  rows.bottomRows(A.rows()).rowwise().normalize();
+  const Eigen::JacobiSVD<MatrixXd> svd(rows, Eigen::ComputeFullV);
+  const VectorXd v = (scale.asDiagonal() * svd.matrixV().col(nq - 1)).normalized();
+
+  std::string text;
+  double sign = 0;  // that of the first entry shown
+  for (Index j = 0; j < nq; ++j) {
+    if (std::abs(v[j]) < 0.005) continue;
+    if (sign == 0) sign = v[j] < 0 ? -1 : 1;
+    const std::string size = fmt::format("{:.2g}", std::abs(v[j]));
+    text += text.empty() ? "" : (sign * v[j] < 0 ? " − " : " + ");
+    text += (size == "1" ? "" : size + " ") + system.coordinates()[static_cast<std::size_t>(j)].name;
+  }
+  return text;
+}
+
+std::optional<std::string> mass_fault(const System& system, const SystemValues& values, int i, const UdwadiaKalaba& projection) {
+  switch (projection.mass_kind()) {
+    case UdwadiaKalaba::Mass::positive_definite:
+    case UdwadiaKalaba::Mass::singular:
+      return std::nullopt;
+    case UdwadiaKalaba::Mass::undetermined:
+      return fmt::format(
+          "the mass matrix M is singular, and nothing determines ddq along {}: only a constraint that acts there, or a mass, "
+          "does",
+          free_direction(system, projection, values.M(i), values.A(i)));
+    case UdwadiaKalaba::Mass::indefinite:
+      return "the mass matrix M is not positive definite";
+  }
+  return std::nullopt;
+}
+
+}  // namespace
+
+std::string internal::describe_fault(const System& system, const Ref<const MatrixXd>& states,
+                                     const MechanicsBatch::Fault& fault) {
+  const std::vector<std::string> names = system.state_names();
+  std::string where;
+  for (Index row = 0; row < states.rows(); ++row) {
+    const double value = states(row, fault.state);
+    if (std::isnan(value)) continue;
+    where += fmt::format("{}{} = {:.6g}", where.empty() ? "" : ", ", names[static_cast<std::size_t>(row)], value);
+  }
+  return fmt::format("system '{}': {} at state {} ({})", system.name(), fault.text, fault.state + 1, where);
+}
+
+int MechanicsBatch::first_singular() const {
+  const auto first = std::find_if(projections.begin(), projections.end(), [](const auto& one) { return one.mass_is_singular(); });
+  return first == projections.end() ? -1 : static_cast<int>(first - projections.begin());
 }
 
 MechanicsBatch evaluate_mechanics(const System& system, const Ref<const MatrixXd>& states,
@@ -308,12 +499,13 @@ void evaluate_mechanics(const System& system, const Ref<const MatrixXd>& states,
   for (int i = 0; i < n_states; ++i) {
     UdwadiaKalaba& projection = batch.projections[static_cast<std::size_t>(i)];
     projection.compute(batch.values.M(i), batch.values.A(i), batch.values.b(i));
-    if (!projection.mass_is_positive_definite()) {
-      batch.fault = {i, "the mass matrix M is not positive definite"};
+    const bool is_indefinite = projection.mass_kind() == UdwadiaKalaba::Mass::indefinite;
+    if (!is_indefinite && (!batch.values.A(i).allFinite() || !batch.values.b(i).allFinite())) {
+      batch.fault = {i, "A or b is not a finite number"};
       return;
     }
-    if (!batch.values.A(i).allFinite() || !batch.values.b(i).allFinite()) {
-      batch.fault = {i, "A or b is not a finite number"};
+    if (std::optional<std::string> text = mass_fault(system, batch.values, i, projection)) {
+      batch.fault = {i, std::move(*text)};
       return;
     }
     size_of_b = std::max(size_of_b, projection.size_of_b());
@@ -328,7 +520,7 @@ void evaluate_mechanics(const System& system, const Ref<const MatrixXd>& states,
 
 MechanicsBatch require_mechanics(const System& system, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters) {
   MechanicsBatch batch = evaluate_mechanics(system, states, parameters);
-  if (batch.fault) throw InputError(describe_fault(system, states, *batch.fault));
+  if (batch.fault) throw InputError(internal::describe_fault(system, states, *batch.fault));
   return batch;
 }
 

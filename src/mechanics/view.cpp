@@ -27,17 +27,22 @@ Affine evaluate_at(const View& view, const MechanicsBatch& mechanics, const Ref<
   const MatrixXd& T = projection.T();
   const VectorXd& Lb = projection.Lb();
   const Eigen::Index nq = T.rows();
-  const auto M = mechanics.values.M(i);
+  // Aᵀλ = M ddq − M'ā
+  const auto constraint_force = [&]() -> Affine {
+    const auto M = mechanics.values.M(i);
+    return {M * T - projection.mass(), M * Lb};
+  };
   switch (view.quantity) {
     case Quantity::constrained_acceleration:
       return {T, Lb};
     case Quantity::unconstrained_acceleration:
       return {MatrixXd::Identity(nq, nq), VectorXd::Zero(nq)};
     case Quantity::constraint_force:
-      return {M * (T - MatrixXd::Identity(nq, nq)), M * Lb};
+      return constraint_force();
     case Quantity::multipliers: {
       const MatrixXd K = projection.multipliers_of_force();
-      return {K * (M * (T - MatrixXd::Identity(nq, nq))), K * (M * Lb)};
+      const Affine force = constraint_force();
+      return {K * force.G, K * force.d};
     }
     case Quantity::next_velocity:
       return {view.time_step * T, states.col(i).segment(nq, nq) + view.time_step * Lb};
@@ -52,7 +57,7 @@ Affine differentiate_at(const View& view, const MechanicsBatch& mechanics, const
   const auto dA = derivative.A(i);
   if (view.quantity == Quantity::unconstrained_acceleration) return {MatrixXd::Zero(nq, nq), VectorXd::Zero(nq)};
   if (view.quantity == Quantity::multipliers) {
-    // λ = Λ (b − A ā)
+    // λ = Λ (b − A ā) − Σ b
     if (projection.rank() < dA.rows()) {
       throw InputError(
           "multipliers of redundant constraints cannot be observed while parameters are estimated: leave out the rows "
@@ -60,12 +65,13 @@ Affine differentiate_at(const View& view, const MechanicsBatch& mechanics, const
     }
     const MatrixXd Lambda = projection.Lambda();
     const MatrixXd dLambda = projection.differentiate_Lambda(dM, dA);
-    return {-(dLambda * mechanics.values.A(i) + Lambda * dA), dLambda * mechanics.values.b(i) + Lambda * derivative.b(i)};
+    return {-(dLambda * mechanics.values.A(i) + Lambda * dA),
+            dLambda * mechanics.values.b(i) + Lambda * derivative.b(i) - projection.row_masses().cwiseProduct(derivative.b(i))};
   }
   const UdwadiaKalaba::Derivative d = projection.differentiate(dM, dA, derivative.b(i));
   if (view.quantity == Quantity::constraint_force) {
     const auto M = mechanics.values.M(i);
-    return {dM * (projection.T() - MatrixXd::Identity(nq, nq)) + M * d.T, dM * projection.Lb() + M * d.Lb};
+    return {dM * projection.T() + M * d.T - projection.differentiate_mass(dM, dA), dM * projection.Lb() + M * d.Lb};
   }
   const double factor = view.quantity == Quantity::next_velocity ? view.time_step : 1;
   return {factor * d.T, factor * d.Lb};

@@ -1,5 +1,12 @@
 #include "gp2/prior.hpp"
 
+#include <algorithm>
+
+#include <fmt/format.h>
+
+#include "gp2/error.hpp"
+#include "mechanics/describe_fault.hpp"
+
 namespace gp2 {
 
 using Eigen::Index;
@@ -63,6 +70,34 @@ void PriorValues::keep_only(std::size_t latent) {
   }
 }
 
+std::optional<std::string> what_needs_acceleration(const Prior& prior, const View& view) {
+  if (view.quantity == View::Quantity::unconstrained_acceleration) return "the view is of the unconstrained acceleration ā";
+  if (prior.mean == Prior::Mean::constant) return "the prior's mean is an acceleration";
+  const auto of_acceleration = std::find_if(prior.latents.begin(), prior.latents.end(),
+                                            [](const Latent& latent) { return latent.base == Latent::Base::acceleration; });
+  if (of_acceleration == prior.latents.end()) return std::nullopt;
+  return fmt::format(
+      "the latent '{}' acts on the unconstrained acceleration ā: let it act on forces, directions = \"force\" or {{ force = … }}",
+      of_acceleration->name);
+}
+
+void evaluate_mechanics(const Prior& prior, const View& view, const Ref<const MatrixXd>& states,
+                        const Ref<const VectorXd>& parameters, MechanicsBatch& batch) {
+  evaluate_mechanics(*prior.system, states, parameters, batch);
+  const int singular = batch.first_singular();
+  if (batch.fault || singular < 0) return;
+  const std::optional<std::string> text = what_needs_acceleration(prior, view);
+  if (text) batch.fault = {singular, fmt::format("the mass matrix M is singular, so that there is no M⁻¹, but {}", *text)};
+}
+
+MechanicsBatch require_mechanics(const Prior& prior, const View& view, const Ref<const MatrixXd>& states,
+                                 const Ref<const VectorXd>& parameters) {
+  MechanicsBatch batch;
+  evaluate_mechanics(prior, view, states, parameters, batch);
+  if (batch.fault) throw InputError(internal::describe_fault(*prior.system, states, *batch.fault));
+  return batch;
+}
+
 MatrixXd evaluate_features(const Latent& latent, const Ref<const MatrixXd>& states) {
   MatrixXd features;
   latent.features.evaluate(states, VectorXd(), features);
@@ -98,12 +133,13 @@ PriorValues differentiate_prior(const Prior& prior, const Ref<const MatrixXd>& s
   const Index nq = prior.system->nq();
   const int n_states = static_cast<int>(states.cols());
   PriorValues d{MatrixXd::Zero(nq, n_states), {}};
+  const auto solve = [&](int i, const Ref<const MatrixXd>& change, const Ref<const MatrixXd>& value) -> MatrixXd {
+    const UdwadiaKalaba& projection = mechanics.projections[static_cast<std::size_t>(i)];
+    return projection.solve_mass(change - projection.differentiate_mass(derivative.M(i), derivative.A(i)) * value);
+  };
   // dμ = M⁻¹(dF − dM μ)
   if (prior.mean == Prior::Mean::force) {
-    for (int i = 0; i < n_states; ++i) {
-      d.mean.col(i) =
-          mechanics.projections[static_cast<std::size_t>(i)].solve_mass(derivative.F(i) - derivative.M(i) * values.mean.col(i));
-    }
+    for (int i = 0; i < n_states; ++i) d.mean.col(i) = solve(i, derivative.F(i), values.mean.col(i));
   }
   for (std::size_t a = 0; a < prior.latents.size(); ++a) {
     const Latent& latent = prior.latents[a];
@@ -113,10 +149,7 @@ PriorValues differentiate_prior(const Prior& prior, const Ref<const MatrixXd>& s
     }
     // E = M⁻¹B: dE = M⁻¹(dB − dM E)
     if (latent.base == Latent::Base::force) {
-      for (int i = 0; i < n_states; ++i) {
-        block(dE, i, nq) =
-            mechanics.projections[static_cast<std::size_t>(i)].solve_mass(block(dE, i, nq) - derivative.M(i) * values.E(a, i));
-      }
+      for (int i = 0; i < n_states; ++i) block(dE, i, nq) = solve(i, block(dE, i, nq), values.E(a, i));
     }
     d.directions.push_back(std::move(dE));
   }

@@ -14,6 +14,7 @@
 
 #include "gp2/error.hpp"
 #include "gp2/mechanics.hpp"
+#include "mechanics/describe_fault.hpp"
 #include "prior/random.hpp"
 #include "simulation/controlled_motion.hpp"
 
@@ -360,6 +361,11 @@ MatrixXd ModelMotion::acceleration(const Eigen::Ref<const MatrixXd>& states) con
   MatrixXd accelerations(system_->nq(), states.cols());
   for (int i = 0; i < static_cast<int>(states.cols()); ++i) {
     const UdwadiaKalaba& projection = mechanics.projections[static_cast<std::size_t>(i)];
+    if (projection.mass_is_singular() && !truth.col(i).isZero(0)) {
+      throw InputError(internal::describe_fault(
+          *system_, states,
+          {i, "the mass matrix M is singular, so that [truth] acceleration cannot be added to M⁻¹F: write it as [truth] force"}));
+    }
     accelerations.col(i) = projection.constrain(projection.solve_mass(mechanics.values.F(i) + truth_force.col(i)) + truth.col(i));
   }
   return accelerations;

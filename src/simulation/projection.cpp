@@ -17,6 +17,21 @@ using Eigen::MatrixXd;
 using Eigen::Ref;
 using Eigen::VectorXd;
 
+namespace {
+
+// The metric M of the coordinates that may move. Where M is singular and the constraints of the level leave a massless direction,
+// the least change has none of it: the diagonal entries, one where there is none, weigh it.
+UdwadiaKalaba step_onto(MatrixXd M, const MatrixXd& A, const VectorXd& c) {
+  UdwadiaKalaba step(M, A, c);
+  if (step.mass_kind() != UdwadiaKalaba::Mass::undetermined) return step;
+  const VectorXd weights = M.diagonal();
+  for (Index j = 0; j < M.rows(); ++j) M(j, j) += weights[j] > 0 ? weights[j] : 1;
+  step.compute(M, A, c);
+  return step;
+}
+
+}  // namespace
+
 ConstraintProjection::ConstraintProjection(const System& system, VectorXd parameters, const std::vector<bool>& held)
     : system_(system), parameters_(std::move(parameters)), position_(level_of(false, held)), velocity_(level_of(true, held)) {}
 
@@ -51,8 +66,9 @@ bool ConstraintProjection::apply(const Level& level, VectorXd& state) const {
   // the constraint as well; that part is taken back: x ← x + T (x_before − x)
   const SystemValues values = system_.evaluate(state, parameters_);
   const auto n_rows = static_cast<Index>(level.rows.size());
-  const UdwadiaKalaba here(values.M(0)(level.free, level.free), values.A(0)(level.rows, level.free), VectorXd::Zero(n_rows));
-  if (!here.mass_is_positive_definite() || here.rank() == n_rows) return true;
+  const UdwadiaKalaba here =
+      step_onto(values.M(0)(level.free, level.free), values.A(0)(level.rows, level.free), VectorXd::Zero(n_rows));
+  if (!here.motion_is_determined() || here.rank() == n_rows) return true;
   std::vector<int> entries = level.free;
   for (int& entry : entries) entry += level.first;
   const VectorXd back = here.T() * (before(entries) - state(entries));
@@ -88,8 +104,8 @@ bool ConstraintProjection::newton(const Level& level, VectorXd& state) const {
     if (level.free.empty()) fail(level, state);
     previous = off;
 
-    const UdwadiaKalaba step(values.M(0)(level.free, level.free), A(Eigen::all, level.free), c);
-    if (!step.mass_is_positive_definite()) fail(level, state);
+    const UdwadiaKalaba step = step_onto(values.M(0)(level.free, level.free), A(Eigen::all, level.free), c);
+    if (!step.motion_is_determined()) fail(level, state);
     for (std::size_t j = 0; j < level.free.size(); ++j) {
       state[level.first + level.free[j]] -= step.Lb()[static_cast<Index>(j)];
     }

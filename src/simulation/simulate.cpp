@@ -266,7 +266,7 @@ bool has_redundant_rows(const System& system, const VectorXd& parameters, const 
   if (system.nc() < 2) return false;
   projection.apply(state);
   const MechanicsBatch mechanics = evaluate_mechanics(system, state, parameters);
-  return !mechanics.projections.empty() && mechanics.projections[0].mass_is_positive_definite() &&
+  return !mechanics.projections.empty() && mechanics.projections[0].motion_is_determined() &&
          mechanics.projections[0].rank() < system.nc();
 }
 

@@ -103,7 +103,7 @@ Scales default_scales(const Prior& prior, const std::vector<Observations>& obser
   for (const Observations& group : observations) {
     const Prior& there = prior_of(prior, group.view);
     const VectorXd parameters = parameters_of(group.view, system.parameter_values());
-    const MechanicsBatch mechanics = require_mechanics(*there.system, group.states, parameters);
+    const MechanicsBatch mechanics = require_mechanics(there, group.view, group.states, parameters);
     PriorValues values = evaluate_prior(there, group.states, parameters, mechanics);
     for (std::size_t a = 0; a < prior.latents.size(); ++a) {
       features[a].push_back(evaluate_features(there.latents[a], group.states).transpose());
@@ -111,7 +111,7 @@ Scales default_scales(const Prior& prior, const std::vector<Observations>& obser
     }
     for (std::size_t j = 0; j < mass.size(); ++j) {
       const auto row = static_cast<Index>(j);
-      for (int i = 0; i < group.n_data(); ++i) mass[j].push_back(mechanics.values.M(i)(row, row));
+      for (const UdwadiaKalaba& projection : mechanics.projections) mass[j].push_back(projection.mass()(row, row));
     }
   }
   VectorXd mass_diagonal(system.nq());

@@ -549,5 +549,44 @@ TEST(SimulatePosterior, StaysOnTheConstraintAndDriftsNoMoreThanTheAnalyticModelW
   EXPECT_LT(order, 7);
 }
 
+TEST(SimulateMasslessCoordinate, KeepsTheEnergyAndTheConstraints) {
+  std::string text = test::model("models/massless_rod.toml").text;
+  text.resize(text.find("[truth]"));
+  const ModelFile rod = ModelFile::parse(text, "rod");
+  const VectorXd start = solved_state(rod, {{"theta", 1.2}, {"dtheta", 2}, {"u1", 0}});
+  EXPECT_NEAR(start[0], 0.6 * std::sin(1.2), 1e-12);
+  EXPECT_NEAR(start[3], 0.6 * 2 * std::cos(1.2), 1e-12);
+  const Trajectory out = simulate_model(rod, start, with_tolerance(times(5, 51), 1e-9));
+  EXPECT_LT(out.max_position_drift, 1e-14);
+  const VectorXd energy = mechanical_energy(rod, rod.system->parameter_values(), out.states);
+  // some thousand steps, each within 1e-9 of its size
+  EXPECT_LT((energy.array() - energy[0]).abs().maxCoeff(), 1e-6 * std::abs(energy[0]));
+  EXPECT_GT((out.states.row(2).array() - 1.2).abs().maxCoeff(), 1);
+}
+
+// the position constraint says nothing of y, which only a constraint on accelerations holds
+TEST(SimulateMasslessCoordinate, IsNotMovedByAConstraintThatDoesNotSeeIt) {
+  const ModelFile model = ModelFile::parse(R"toml(
+coordinates = ["x", "y", "z"]
+[mechanics]
+mass  = [["1", "0", "0"], ["0", "0", "0"], ["0", "0", "3"]]
+force = ["1", "0", "0"]
+[constraints]
+position = ["x - z"]
+acceleration = ["ddy - 2*ddx"]
+)toml",
+                                           "follower");
+  VectorXd state = VectorXd::Zero(7);
+  state.head(3) << 4, 7, 0;
+  const VectorXd projected = project_onto_constraints(*model.system, VectorXd(), state, {});
+  // the least change in the metric of M
+  EXPECT_NEAR(projected[0], 1, 1e-14);
+  EXPECT_EQ(projected[1], 7);
+  EXPECT_NEAR(projected[2], 1, 1e-14);
+  const Trajectory out = simulate_model(model, projected, with_tolerance(times(2, 3), 1e-9));
+  EXPECT_NEAR(out.states(0, 2), 1 + 0.25 * 2, 1e-9);
+  EXPECT_NEAR(out.states(1, 2), 7 + 2 * 0.25 * 2, 1e-9);
+}
+
 }  // namespace
 }  // namespace gp2

@@ -69,9 +69,13 @@ ReportData data_at(const Posterior& posterior, const MatrixXd& states, const std
   data.predicted = prediction.mean;
   data.stddev = prediction.stddev();
   view.quantity = View::Quantity::unconstrained_acceleration;
-  prediction = posterior.marginal(view, states, /*n_threads=*/0);
-  data.unconstrained = prediction.mean;
-  data.unconstrained_stddev = prediction.stddev();
+  MechanicsBatch mechanics;
+  evaluate_mechanics(prior, view, states, parameters, mechanics);
+  if (!mechanics.fault) {
+    prediction = posterior.marginal(view, states, /*n_threads=*/0);
+    data.unconstrained = prediction.mean;
+    data.unconstrained_stddev = prediction.stddev();
+  }
 
   const SystemValues values = judge.evaluate(states, parameters);
   data.constraint_error.resize(judge.nc(), states.cols());

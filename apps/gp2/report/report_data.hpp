@@ -37,7 +37,7 @@ struct ReportData {
   Eigen::MatrixXd measured;              // (d × N)
   Eigen::VectorXd noise_stddev;          // fitted noise of each output (d); NaN where training did not observe it
   Eigen::MatrixXd predicted, stddev;     // ddq  (nq × N)
-  Eigen::MatrixXd unconstrained;         // ā    (nq × N)
+  Eigen::MatrixXd unconstrained;         // ā    (nq × N), empty where M is singular
   Eigen::MatrixXd unconstrained_stddev;  //      (nq × N)
   Eigen::MatrixXd constraint_error;      // |A ddq − b| of the predicted mean, fitted parameters (nc × N)
   Eigen::MatrixXd truth;                 // the true ddq (nq × N), NaN where unknown; empty without --truth

@@ -430,7 +430,13 @@
     chart(byId("constrained-chart"), {
       title: `Constrained acceleration dd${coordinate}`, summary: `Band of ±${format(width, 3)} on average${k < 0 ? "; not measured in these data" : ""}.`, x, y: { label: `dd${coordinate}` }, series, band: true,
     });
-    chart(byId("unconstrained-chart"), {
+    const unconstrained = byId("unconstrained-chart");
+    if (data.unconstrained.length === 0) {
+      clear(unconstrained);
+      unconstrained.append(make("p", { class: "muted", text: "The mass matrix is singular in these data: there is no unconstrained acceleration." }));
+      return;
+    }
+    chart(unconstrained, {
       title: `Unconstrained acceleration ā of ${coordinate}`, summary: `Band of ±${format(2 * rms(data.unconstrained_stddev[j]), 3)} on average. What the constraint hides of ā the data cannot show.`,
       x, y: { label: `ā ${coordinate}` }, series: [withBand("ā", data.unconstrained[j], data.unconstrained_stddev[j])], band: true,
     });

@@ -1,0 +1,277 @@
+#include <cmath>
+#include <string>
+#include <vector>
+
+#include <gmock/gmock.h>
+#include <gtest/gtest.h>
+
+#include "allocation_count.hpp"
+#include "gp2/error.hpp"
+#include "gp2/predictor.hpp"
+#include "gp2/training.hpp"
+#include "inference/problems.hpp"
+
+// A massless coordinate is learned from, and predicts, as a model that does without it.
+namespace gp2 {
+namespace {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+using test::eps;
+using test::Quantity;
+using testing::HasSubstr;
+using Status = Predictor::Status;
+
+constexpr std::uint64_t seed = 50606;
+
+double largest(const MatrixXd& matrix) { return matrix.size() == 0 ? 0 : matrix.cwiseAbs().maxCoeff(); }
+
+// models/massless_rod.toml with what is unknown at the hinge alone, and the pendulum that it is
+const ModelFile& rod() {
+  static const ModelFile model =
+      ModelFile::parse(test::changed(test::model("models/massless_rod.toml").text,
+                                     {{"directions = \"force\"", "directions = { force = [[\"0\"], [\"0\"], [\"1\"]] }"}}),
+                       "rod");
+  return model;
+}
+const ModelFile& pendulum() {
+  static const ModelFile model = ModelFile::parse(R"toml(
+name        = "pendulum"
+coordinates = [{ name = "theta", angle = true }]
+inputs      = ["u1"]
+[parameters]
+m = { value = 0.5, bounds = [0.3, 0.8] }
+l = { value = 0.6, bounds = [0.5, 0.7] }
+g = 9.81
+[mechanics]
+mass  = [["m*l^2"]]
+force = ["u1 - m*g*l*sin(theta)"]
+[[latent]]
+kernel     = "se"
+features   = ["theta", "dtheta", "u1"]
+directions = { force = [["1"]] }
+)toml",
+                                                  "pendulum");
+  return model;
+}
+
+const PriorOptions force_as_mean{Prior::Mean::force, std::nullopt};
+
+// θ, θ̇, t and u1 of the rod's states
+MatrixXd of_pendulum(const MatrixXd& states) {
+  const std::vector<int> rows = {2, 5, 6, 7};
+  return states(rows, Eigen::all);
+}
+
+// θ̈ measured
+Observations angle_observed(const View& view, const MatrixXd& states, const MatrixXd& values) {
+  return {states, view, values, VectorXd::Constant(1, 0.2), false};
+}
+
+ModelValues some_values(const Observations& group) {
+  ModelValues values;
+  values.kernel = {VectorXd::Constant(4, 1.5)};
+  values.signal_stddev = {VectorXd::Constant(1, 0.3)};
+  values.noise_stddev = {group.noise_stddev};
+  values.parameters = rod().system->parameter_values();
+  return values;
+}
+
+TEST(MasslessCoordinate, HasTheLikelihoodTheGradientTheFitAndThePredictionsOfTheModelWithoutIt) {
+  SCOPED_TRACE(fmt::format("seed {}", seed));
+  const GeneratedData data = generate(rod(), {30, seed, VectorXd::Constant(3, 0.2)});
+  const MatrixXd values = data.accelerations.row(2);
+  const Observations here = angle_observed({Quantity::constrained_acceleration, {2}}, data.states, values);
+  const Observations there = angle_observed({Quantity::constrained_acceleration, {0}}, of_pendulum(data.states), values);
+  const Prior prior = make_prior(rod(), force_as_mean), without = make_prior(pendulum(), force_as_mean);
+
+  const ModelValues start = some_values(here);
+  Likelihood::Options options;
+  options.noise_gradient = true;
+  options.gradient_parameters = {0, 1, 2};
+  ModelValues gradient, expected;
+  Likelihood::Workspace workspace, other_workspace;
+  const double nll = Likelihood(prior, {here}, start, options).evaluate(start, &gradient, workspace);
+  const double expected_nll = Likelihood(without, {there}, start, options).evaluate(start, &expected, other_workspace);
+  // both are the same numbers, rounded on other ways: ε times the condition of K̃ + I, below 30 (0.3/0.2)²
+  const double rounding = 1e5 * eps;
+  EXPECT_NEAR(nll, expected_nll, rounding * std::abs(nll));
+  EXPECT_LE(largest(gradient.kernel[0] - expected.kernel[0]), rounding * (1 + largest(expected.kernel[0])));
+  EXPECT_LE(largest(gradient.signal_stddev[0] - expected.signal_stddev[0]), rounding * (1 + largest(expected.signal_stddev[0])));
+  EXPECT_LE(largest(gradient.noise_stddev[0] - expected.noise_stddev[0]), rounding * (1 + largest(expected.noise_stddev[0])));
+  EXPECT_LE(largest(gradient.parameters - expected.parameters), rounding * (1 + largest(expected.parameters)));
+  EXPECT_GT(expected.parameters.cwiseAbs().minCoeff(), 0.01);
+
+  // fitted from the same start within the same bounds
+  std::vector<Hyperparameter> hyperparameters = default_hyperparameters(without, {there}, {"m"}, {});
+  FitOptions fit_options;
+  fit_options.n_restarts = 2;
+  fit_options.n_threads = 1;
+  const Fit fitted = fit(prior, {here}, hyperparameters, fit_options);
+  const Fit fitted_without = fit(without, {there}, hyperparameters, fit_options);
+  // the optimiser stops at a gradient of 1e-5 in logarithms: the objective is then within about its square, what it depends on
+  // within about itself
+  EXPECT_NEAR(fitted.report.negative_log_likelihood, fitted_without.report.negative_log_likelihood, 1e-7);
+  const MatrixXd states = test::draw(rod(), 20, seed + 1).states;
+  const Posterior::Marginal marginal = fitted.posterior.marginal(here.view, states);
+  const Posterior::Marginal other = fitted_without.posterior.marginal(there.view, of_pendulum(states));
+  EXPECT_LE(largest(marginal.mean - other.mean), 1e-4 * (1 + largest(other.mean)));
+  EXPECT_LE(largest(marginal.stddev() - other.stddev()), 1e-4);
+}
+
+// everything observed that can be, with the model's own prior on all three forces
+struct Problem {
+  Prior prior;
+  std::vector<Observations> observations;
+  ModelValues values;
+  MatrixXd queries;
+};
+
+Problem problem(Prior::Mean mean) {
+  const ModelFile& model = test::model("models/massless_rod.toml");
+  const MatrixXd states = test::draw(model, 24, seed).states;
+  Problem p{make_prior(model, {mean, std::nullopt}), {}, {}, states.rightCols(3)};
+  RandomStream random(seed, mean == Prior::Mean::force ? 1 : 2);
+  Index first = 0;
+  for (const Quantity quantity : {Quantity::constrained_acceleration, Quantity::constraint_force, Quantity::multipliers}) {
+    const View view = View::all(quantity, *model.system);
+    p.observations.push_back(test::observe(model, view, states.middleCols(first, 7), random));
+    first += 7;
+  }
+  p.values = test::random_values(p.prior, p.observations, random);
+  return p;
+}
+
+TEST(MasslessCoordinate, HasTheExactGradientOfTheLikelihoodInEveryParameter) {
+  for (const Prior::Mean mean : {Prior::Mean::zero, Prior::Mean::force}) {
+    const Problem p = problem(mean);
+    Likelihood::Options options;
+    options.noise_gradient = true;
+    options.gradient_parameters = {0, 1, 2};
+    const Likelihood likelihood(p.prior, p.observations, p.values, options);
+    Likelihood::Workspace workspace;
+    ModelValues gradient;
+    likelihood.evaluate(p.values, &gradient, workspace);
+    const auto expect = [&](double analytic, const auto& member, bool positive) {
+      const double value = member(p.values);
+      const auto at = [&](double x) -> VectorXd {
+        ModelValues moved = p.values;
+        member(moved) = positive ? std::exp(x) : x;
+        return VectorXd::Constant(1, likelihood.evaluate(moved, nullptr, workspace));
+      };
+      const test::Difference difference =
+          test::central_difference(at, positive ? std::log(value) : value, positive ? 0.5 : 0.05 * value, 1e3 * eps);
+      EXPECT_TRUE(test::matches(VectorXd::Constant(1, analytic), difference));
+      EXPECT_GT(std::abs(analytic), difference.error[0]);
+    };
+    const int n_parameters = mean == Prior::Mean::force ? 3 : 2;  // without F nothing depends on g
+    for (int k = 0; k < n_parameters; ++k) {
+      SCOPED_TRACE(p.prior.system->parameters()[static_cast<std::size_t>(k)].name);
+      expect(
+          gradient.parameters[k], [k](auto& values) -> auto& { return values.parameters[k]; }, false);
+    }
+    for (int k = 0; k < 3; ++k) {
+      expect(
+          gradient.signal_stddev[0][k], [k](auto& values) -> auto& { return values.signal_stddev[0][k]; }, true);
+      expect(
+          gradient.noise_stddev[1][k], [k](auto& values) -> auto& { return values.noise_stddev[1][k]; }, true);
+    }
+  }
+}
+
+TEST(MasslessCoordinate, IsPredictedByThePredictorAsByThePosteriorAndDifferentiatedExactly) {
+  for (const Prior::Mean mean : {Prior::Mean::zero, Prior::Mean::force}) {
+    const Problem p = problem(mean);
+    const Posterior posterior(p.prior, p.observations, p.values);
+    for (const Quantity quantity : {Quantity::constrained_acceleration, Quantity::constraint_force, Quantity::next_velocity}) {
+      for (const int latent : {-1, 0}) {
+        View view = View::all(quantity, *p.prior.system);
+        view.time_step = 0.1;
+        view.latent = latent;
+        SCOPED_TRACE(fmt::format("{}, latent {}", View::word(quantity), latent));
+        const Predictor predictor(posterior, view);
+        Predictor::Workspace workspace = predictor.make_workspace();
+        VectorXd got(3), again(3), stddev(3);
+        MatrixXd jacobian(3, 8);
+        for (const VectorXd state : p.queries.colwise()) {
+          const Posterior::Marginal expected = posterior.marginal(view, state);
+          ASSERT_EQ(predictor.mean_and_stddev(state, got, stddev, workspace), Status::ok);
+          EXPECT_LE(largest(got - expected.mean), 1e4 * eps * (1 + largest(expected.mean)));
+          const MatrixXd prior = posterior.without_data().marginal(view, state).stddev();
+          for (Index r = 0; r < 3; ++r) {
+            EXPECT_NEAR(stddev[r] * stddev[r], expected.covariance(4 * r, 0), 1e4 * eps * (prior(r) * prior(r) + eps));
+          }
+          EXPECT_EQ(test::allocations_of(
+                        [&] { EXPECT_EQ(predictor.mean_and_jacobian(state, again, jacobian, workspace), Status::ok); }),
+                    0U);
+          EXPECT_EQ(again, got);
+          for (Index k = 0; k < state.size(); ++k) {
+            const auto mean_at = [&](double x) {
+              VectorXd moved = state, there(3);
+              moved[k] = x;
+              EXPECT_EQ(predictor.mean(moved, there, workspace), Status::ok);
+              return there;
+            };
+            EXPECT_TRUE(test::matches(jacobian.col(k), test::central_difference(mean_at, state[k], 0.02, 1e3 * eps)))
+                << "entry " << k << " of the state";
+          }
+        }
+      }
+    }
+  }
+}
+
+// M is singular at x = 0, where the row of A, (1, c), completes it or does not
+TEST(MasslessCoordinate, ThePredictorTellsWhatIsWrongWithAStateAndGoesOn) {
+  const auto expect = [](const std::string& row, const std::string& directions, Status status) {
+    const ModelFile model = ModelFile::parse(fmt::format(R"toml(
+name        = "a point"
+coordinates = ["x", "y"]
+[mechanics]
+mass  = [["x", "0"], ["0", "1"]]
+[constraints]
+acceleration = ["{}"]
+[[latent]]
+features   = ["y"]
+directions = "{}"
+)toml",
+                                                         row, directions),
+                                             "a point");
+    ModelValues values{{VectorXd::Ones(1)}, {VectorXd::Ones(2)}, {}, {}, VectorXd()};
+    const Predictor predictor(Posterior(make_prior(model), {}, values));
+    Predictor::Workspace workspace = predictor.make_workspace();
+    VectorXd mean(2);
+    EXPECT_EQ(predictor.mean(VectorXd::Ones(5), mean, workspace), Status::ok);
+    EXPECT_EQ(test::allocations_of([&] { EXPECT_EQ(predictor.mean(VectorXd::Zero(5), mean, workspace), status); }), 0U);
+    EXPECT_EQ(mean.array().isNaN().all(), status != Status::ok);
+    EXPECT_EQ(predictor.mean(VectorXd::Ones(5), mean, workspace), Status::ok);
+  };
+  expect("ddx - ddy", "force", Status::ok);
+  expect("ddx - ddy", "acceleration", Status::no_unconstrained_acceleration);
+  expect("x*ddx - ddy", "force", Status::motion_undetermined);
+}
+
+TEST(MasslessCoordinate, WithAPriorOnTheAccelerationThereIsNoPosterior) {
+  const ModelFile& model = test::model("models/massless_rod.toml");
+  const Prior prior = make_prior(model, {Prior::Mean::zero, Latent::Base::acceleration});
+  RandomStream random(seed);
+  const Observations group = test::observe(model, View::all(Quantity::constrained_acceleration, *model.system),
+                                           test::draw(model, 5, seed).states, random);
+  const ModelValues values = test::random_values(prior, {group}, random);
+  try {
+    Posterior(prior, {group}, values);
+    FAIL() << "no error";
+  } catch (const InputError& error) {
+    EXPECT_THAT(error.what(), HasSubstr("M is singular, so that there is no M⁻¹, but the latent 'unknown force' acts on"));
+  }
+  try {
+    const Likelihood likelihood(prior, {group}, values, {});
+    FAIL() << "no error";
+  } catch (const InputError& error) {
+    EXPECT_THAT(error.what(), HasSubstr("at state 1 (x = "));
+  }
+}
+
+}  // namespace
+}  // namespace gp2
