@@ -30,7 +30,7 @@ struct Arguments {
   int max_iterations = 1000, threads = 0;
   std::optional<int> max_points;
   std::uint64_t seed = 0;
-  bool json = false;
+  bool project = false, robust = false, json = false;
 };
 
 FitProblemOptions problem_options(const Arguments& arguments) {
@@ -61,6 +61,8 @@ FitProblemOptions problem_options(const Arguments& arguments) {
   options.also_noise_stddev = arguments.also_noise;
   options.time_step = arguments.time_step;
   options.seed = arguments.seed;
+  options.project = arguments.project;
+  options.robust = arguments.robust;
   return options;
 }
 
@@ -94,7 +96,7 @@ void print_progress(const Progress& p) {
   std::fflush(stderr);
 }
 
-Json to_json(const FitReport& report) {
+Json to_json(const FitProblem& problem, const FitReport& report) {
   Json hyperparameters = Json::array();
   for (const Hyperparameter& h : report.hyperparameters) {
     hyperparameters.push_back({{"name", h.name},
@@ -104,11 +106,23 @@ Json to_json(const FitReport& report) {
                                {"unit", h.unit},
                                {"at_bound", h.at_bound()}});
   }
-  return {{"nll", report.negative_log_likelihood},
-          {"termination", report.termination},
-          {"iterations", report.iterations},
-          {"seconds", report.seconds},
-          {"hyperparameters", hyperparameters}};
+  Json json = {{"nll", report.negative_log_likelihood},
+               {"termination", report.termination},
+               {"iterations", report.iterations},
+               {"seconds", report.seconds},
+               {"hyperparameters", hyperparameters}};
+  if (!problem.robust) return json;
+  json["distrusted"] = Json::array();
+  for (const DistrustedValue& value : report.distrusted) {
+    const auto group = static_cast<std::size_t>(value.group);
+    const View& view = problem.observations[group].view;
+    json["distrusted"].push_back({{"log", value.group + 1},
+                                  {"line", problem.lines[group][static_cast<std::size_t>(value.state)]},
+                                  {"value", view.names(*prior_of(problem.prior, view).system)[static_cast<std::size_t>(value.row)]},
+                                  {"distance", value.distance},
+                                  {"noise_factor", value.noise_factor}});
+  }
+  return json;
 }
 
 void print_text(const FitReport& report) {
@@ -155,12 +169,13 @@ void run(const Arguments& arguments) {
   Fit result = fit(problem, options);
   if (terminal) fmt::print(stderr, "\r\033[K");
 
+  talk(distrust_notes(problem, result.report));
   talk(notes_of(result.report));
   file.prior_options = problem.prior_options;
   std::vector<std::string> sources = arguments.data;
   sources.insert(sources.end(), arguments.also.begin(), arguments.also.end());
   file.data_source = fmt::format("{}", fmt::join(sources, ", "));
-  file.observations = std::move(problem.observations);
+  file.observations = result.posterior.observations();
   file.systems = std::move(problem.systems);
   file.report = result.report;
   file.write(arguments.output);
@@ -168,7 +183,7 @@ void run(const Arguments& arguments) {
   for (const Observations& group : file.observations) n_rows += group.n_data();
   talk({fmt::format("{}: fit of '{}' to {} rows", arguments.output, file.model.system->name(), n_rows)});
   if (arguments.json) {
-    fmt::print("{}\n", to_json(result.report).dump(2));
+    fmt::print("{}\n", to_json(problem, result.report).dump(2));
   } else {
     print_text(result.report);
   }
@@ -225,6 +240,9 @@ void add_fit(CLI::App& app) {
       ->add_option("--discrepancy", a->discrepancy, "a small latent for what the kernel would rule out (docs/priors.md), or none")
       ->check(CLI::IsMember({"default", "none"}))
       ->capture_default_str();
+  command->add_flag("--project", a->project,
+                    "move states onto position and velocity constraints, with the model's parameters, before anything else");
+  command->add_flag("--robust", a->robust, "distrust values that disagree with all others, and say which (docs/bad-data.md)");
   command->add_option("--restarts", a->restarts,
                       "runs of the optimiser; the first starts at the model's values (default: 5; of a baseline 30)");
   command->add_option("--max-iterations", a->max_iterations, "per run; 0 conditions at the starting values")
