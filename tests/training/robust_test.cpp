@@ -89,7 +89,6 @@ TEST(RobustTest, OutliersAreFoundAndTheFitIsNearlyThatOfCleanData) {
     const int n_false = static_cast<int>(found.size() - dirty.wrong.size()) + n_missed;
     RecordProperty(test::stem(file), fmt::format("nrmse clean {:.4f}, plain {:.4f}, robust {:.4f}; {} wrong, {} missed, {} false",
                                                  error_clean, error_plain, error_robust, dirty.wrong.size(), n_missed, n_false));
-    std::cout << file << fmt::format(" nrmse clean {:.4f}, plain {:.4f}, robust {:.4f}; {} wrong, {} missed, {} false\n", error_clean, error_plain, error_robust, dirty.wrong.size(), n_missed, n_false);
     EXPECT_LE(error_robust, 1.3 * error_clean);
     EXPECT_GE(error_plain, 2 * error_robust) << "the outliers do no harm: nothing is tested";
     EXPECT_LE(n_missed, 1);
@@ -103,7 +102,6 @@ TEST(RobustTest, OfCleanDataNextToNothingIsDistrusted) {
     const Data clean = data_of(file, 100);
     const Fit plain = fit(clean.prior, clean.observations, clean.hyperparameters, quick());
     const Fit robust = fit_robust(clean.prior, clean.observations, clean.hyperparameters, quick());
-    std::cout << file << " " << robust.report.distrusted.size() << " " << error_of(clean, plain.posterior) << " " << error_of(clean, robust.posterior) << "\n";
     // 300 Gaussian values have one beyond 4 σ in one of fifty data sets
     EXPECT_LE(robust.report.distrusted.size(), 1U);
     EXPECT_LE(error_of(clean, robust.posterior), 1.05 * error_of(clean, plain.posterior));
