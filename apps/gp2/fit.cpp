@@ -242,7 +242,7 @@ void add_fit(CLI::App& app) {
       ->capture_default_str();
   command->add_flag("--project", a->project,
                     "move states onto position and velocity constraints, with the model's parameters, before anything else");
-  command->add_flag("--robust", a->robust, "distrust values that disagree with all others, and say which (docs/bad-data.md)");
+  command->add_flag("--robust", a->robust, "distrust values that disagree with all others, and say which (docs/command-line.md)");
   command->add_option("--restarts", a->restarts,
                       "runs of the optimiser; the first starts at the model's values (default: 5; of a baseline 30)");
   command->add_option("--max-iterations", a->max_iterations, "per run; 0 conditions at the starting values")

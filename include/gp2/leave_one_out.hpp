@@ -14,8 +14,8 @@ struct LeaveOneOut {
   Eigen::MatrixXd variance;  // (d × N)
 };
 
-/// Leave-one-out predictions of every value, per Observations, by one inversion (Sundararajan & Keerthi 2001, eq. 21 of the
-/// covariance Q K̃ Qᵀ + I of all whitened values e, whose inverse is Q P Qᵀ + I − QQᵀ with P = (K̃ + I)⁻¹):
+/// Leave-one-out predictions of every value, per Observations, by one inversion: Rasmussen & Williams 2006, eq. 5.12, of the
+/// covariance Q K̃ Qᵀ + I of all whitened values e, whose inverse is Q P Qᵀ + I − QQᵀ with P = (K̃ + I)⁻¹:
 ///
 ///     y_k − mean_k = σ_k α_k / p_k,    variance_k = σ_k² (1/p_k − 1),    α = Qα̃ + (I − QQᵀ) e,  p = diag(Q P Qᵀ + I − QQᵀ).
 ///

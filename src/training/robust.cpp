@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <optional>
 #include <set>
 #include <tuple>
 
@@ -74,9 +75,28 @@ Choice choose(const std::vector<Observations>& observations, const Posterior& po
   return choice;
 }
 
+// the observations without values that lie farther than `threshold` robust standard deviations from the median of their row
+std::vector<Observations> without_far_values(std::vector<Observations> observations, double threshold) {
+  for (Observations& group : observations) {
+    for (Index k = 0; k < group.values.rows(); ++k) {
+      std::vector<double> values = measured(group.values, k);
+      if (values.empty()) continue;
+      const double middle = median(values);
+      for (double& value : values) value = std::abs(value - middle);
+      const double spread = median(std::move(values)) / normal_median;
+      if (spread == 0) continue;  // most values are the same
+      for (double& value : group.values.row(k)) {
+        if (std::abs(value - middle) > threshold * spread) value = std::numeric_limits<double>::quiet_NaN();
+      }
+    }
+  }
+  return observations;
+}
+
 // what to distrust at sight, under a noise to start with
-Choice choose_at_sight(const std::vector<Observations>& observations, const std::vector<VectorXd>& noise_stddev) {
-  const std::vector<Observations> usual = without_gross_errors(observations);
+Choice choose_at_sight(const std::vector<Observations>& observations, const std::vector<VectorXd>& noise_stddev,
+                       double threshold) {
+  const std::vector<Observations> usual = without_far_values(observations, threshold);
   Choice choice{observations, {}};
   for (std::size_t g = 0; g < observations.size(); ++g) {
     const MatrixXd& values = observations[g].values;
@@ -96,53 +116,73 @@ Choice choose_at_sight(const std::vector<Observations>& observations, const std:
   return choice;
 }
 
+// Turns of fit and choice.
+class Search {
+ public:
+  Search(const Prior& prior, const std::vector<Observations>& observations, const FitOptions& options, const RobustOptions& robust)
+      : prior_(prior), observations_(observations), options_(options), robust_(robust) {}
+
+  /// Fits until the choice stays.
+  void run(Choice choice, std::vector<Hyperparameter> start, const FitOptions& options) {
+    for (int round = 0; round < robust_.max_rounds && (round == 0 || !stopped()); ++round) {
+      Fit fitted = fit(prior_, choice.observations, start, options);
+      start = fitted.report.hyperparameters;
+      Choice next = choose(observations_, fitted.posterior, robust_.threshold);
+      const bool is_settled = next.values() == choice.values();
+      fitted.report.distrusted = choice.distrusted;
+      const double cost = fitted.report.objective + price() * static_cast<double>(choice.distrusted.size());
+      if (cost < lowest_cost_) {
+        lowest_cost_ = cost;
+        best_ = std::move(fitted);
+      }
+      if (is_settled) return;
+      choice = std::move(next);
+    }
+  }
+
+  [[nodiscard]] const Fit& best() const { return *best_; }
+  void forget_cost() { lowest_cost_ = std::numeric_limits<double>::infinity(); }
+
+ private:
+  [[nodiscard]] bool stopped() const { return options_.stop != nullptr && options_.stop->load(); }
+  // what distrusting a value at the threshold lowers the objective by: ½ (z² − 1 − log z²)
+  [[nodiscard]] double price() const {
+    const double square = robust_.threshold * robust_.threshold;
+    return 0.5 * (square - 1 - std::log(square));
+  }
+
+  const Prior& prior_;
+  const std::vector<Observations>& observations_;
+  const FitOptions& options_;
+  const RobustOptions& robust_;
+  std::optional<Fit> best_;
+  double lowest_cost_ = std::numeric_limits<double>::infinity();
+};
+
+constexpr double gross = 10, suspicious = 3;  // robust standard deviations from the median
+
 }  // namespace
 
 std::vector<Observations> without_gross_errors(std::vector<Observations> observations) {
-  constexpr double gross = 10;
-  for (Observations& group : observations) {
-    for (Index k = 0; k < group.values.rows(); ++k) {
-      std::vector<double> values = measured(group.values, k);
-      if (values.empty()) continue;
-      const double middle = median(values);
-      for (double& value : values) value = std::abs(value - middle);
-      const double spread = median(std::move(values)) / normal_median;
-      if (spread == 0) continue;  // most values are the same
-      for (double& value : group.values.row(k)) {
-        if (std::abs(value - middle) > gross * spread) value = std::numeric_limits<double>::quiet_NaN();
-      }
-    }
-  }
-  return observations;
+  return without_far_values(std::move(observations), gross);
 }
 
 Fit fit_robust(const Prior& prior, const std::vector<Observations>& observations,
                const std::vector<Hyperparameter>& hyperparameters, const FitOptions& options, const RobustOptions& robust) {
-  const auto stopped = [&] { return options.stop != nullptr && options.stop->load(); };
-  // a choice to start with, by single runs of the optimiser
   FitOptions quick = options;
   quick.n_restarts = 1;
   quick.max_escapes = 0;
-  Choice choice = choose_at_sight(observations, model_values(prior, observations, hyperparameters).noise_stddev);
-  std::vector<Hyperparameter> start = hyperparameters;
-  const auto turn = [&](const FitOptions& how, const std::vector<Hyperparameter>& from, bool& is_settled) {
-    Fit fitted = fit(prior, choice.observations, from, how);
-    Choice next = choose(observations, fitted.posterior, robust.threshold);
-    is_settled = next.values() == choice.values();
-    fitted.report.distrusted = choice.distrusted;
-    if (!is_settled) choice = std::move(next);
-    return fitted;
-  };
-  bool is_settled = false;
-  for (int round = 0; round < robust.max_rounds && !is_settled && !stopped(); ++round) {
-    start = turn(quick, start, is_settled).report.hyperparameters;
+  // Outliers hide behind each other where a fit explains them all, by a signal that is large and short. From a choice that is
+  // too strict at first it is not drawn there; the objective, at a price for each value distrusted, decides between them.
+  const std::vector<VectorXd> noise = model_values(prior, observations, hyperparameters).noise_stddev;
+  Search search(prior, observations, options, robust);
+  for (const double threshold : {gross, suspicious}) {
+    search.run(choose_at_sight(observations, noise, threshold), hyperparameters, quick);
   }
-  // the fit, and another where its optimum is so different that the choice changes
-  Fit fitted = turn(options, hyperparameters, is_settled);
-  for (int round = 1; round < robust.max_rounds && !is_settled && !stopped(); ++round) {
-    fitted = turn(options, fitted.report.hyperparameters, is_settled);
-  }
-  return fitted;
+  Choice choice{search.best().posterior.observations(), search.best().report.distrusted};
+  search.forget_cost();
+  search.run(std::move(choice), hyperparameters, options);
+  return search.best();
 }
 
 }  // namespace gp2
