@@ -12,6 +12,7 @@
 #include "gp2/fit_problem.hpp"
 #include "gp2/generate.hpp"
 #include "gp2/prior.hpp"
+#include "gp2/projected_states.hpp"
 
 namespace gp2::command {
 
@@ -47,6 +48,13 @@ WholeLog read_log(const ModelFile& model, const Arguments& arguments) {
     for (const int row : log.stated) names.push_back(model.system->acceleration_names()[static_cast<std::size_t>(row)]);
     fmt::print("ok       noise of each value: {}, which a fit observes\n", fmt::join(names, ", "));
   }
+  for (int row = 0; row < model.system->nq(); ++row) {
+    const auto values = log.accelerations.row(row).array();
+    const auto n_missing = values.isNaN().count();
+    const std::string name = model.system->acceleration_names()[static_cast<std::size_t>(row)];
+    if (n_missing == 0 || n_missing == values.size()) continue;
+    fmt::print("ok       {} of {} values of {} are not measured: their cells are empty\n", n_missing, values.size(), name);
+  }
   for (const auto& [name, found] : reader.aliases_used()) fmt::print("ok       column '{}' taken as {}\n", found, name);
   const std::vector<std::string> unused = reader.unused_columns();
   if (!unused.empty()) fmt::print("ok       columns not needed: {}\n", fmt::join(unused, ", "));
@@ -76,8 +84,10 @@ void run(const Arguments& arguments) {
   if (!arguments.data.empty()) {
     const WholeLog log = read_log(model, arguments);
     n_errors += check_mechanics(model, log.states);
-    if (n_errors == 0)
+    if (n_errors == 0) {
       n_errors += print(check_data(system, log.states, system.parameter_values(), log.accelerations, log.stated));
+      n_errors += print(check_states(system, log.states, system.parameter_values()));
+    }
   } else if ((!model.sampling.empty() || model.motion) && !model.truth.empty()) {
     const GeneratedData data = generate(model, {100, 1, Eigen::VectorXd::Zero(system.nq())});
     n_errors += check_mechanics(model, data.states);

@@ -36,7 +36,8 @@ Json to_json(const Evaluation& e) {
           {"nlpd_latent", number(e.nlpd_latent)},
           {"coverage95_latent", number(e.coverage95_latent)},
           {"n_zero_variance", e.n_zero_variance},
-          {"n", e.n}};
+          {"n", e.n},
+          {"n_missing", e.n_missing}};
 }
 
 void print_text(const Evaluation& e) {
@@ -49,7 +50,8 @@ void print_text(const Evaluation& e) {
   fmt::print("nlpd, 95 % coverage         {:.4g}, {:.3g}   (with measurement noise)\n", e.nlpd, e.coverage95);
   fmt::print("the same, noise-free        {:.4g}, {:.3g}   ({} marginals without variance left out)\n", e.nlpd_latent,
              e.coverage95_latent, e.n_zero_variance);
-  fmt::print("points                      {}\n", e.n);
+  fmt::print("points                      {}{}\n", e.n,
+             e.n_missing > 0 ? fmt::format("   ({} values not measured)", e.n_missing) : "");
 }
 
 // the accelerations that training observed

@@ -35,8 +35,7 @@ struct Arguments {
   int max_iterations = 1000, threads = 0;
   std::optional<int> max_points;
   std::uint64_t seed = 0;
-  bool json = false;
-  bool no_standard_errors = false;
+  bool project = false, robust = false, json = false, no_standard_errors = false;
 };
 
 FitProblemOptions problem_options(const Arguments& arguments) {
@@ -67,6 +66,8 @@ FitProblemOptions problem_options(const Arguments& arguments) {
   options.also_noise_stddev = arguments.also_noise;
   options.time_step = arguments.time_step;
   options.seed = arguments.seed;
+  options.project = arguments.project;
+  options.robust = arguments.robust;
   return options;
 }
 
@@ -108,7 +109,7 @@ double stddev_of(const FitReport& report, std::size_t k) {
   return report.uncertainty->stddev[static_cast<Index>(k)];
 }
 
-Json to_json(const FitReport& report, const std::string& options) {
+Json to_json(const FitProblem& problem, const FitReport& report, const std::string& options) {
   Json hyperparameters = Json::array();
   Json errors = Json::array();  // of parameters, with their correlations
   for (std::size_t k = 0; k < report.hyperparameters.size(); ++k) {
@@ -134,6 +135,18 @@ Json to_json(const FitReport& report, const std::string& options) {
   if (report.uncertainty) {
     json["standard_errors"] = {{"parameters", errors},
                                {"distance_from_optimum", number_or_null(report.uncertainty->distance_from_optimum)}};
+  }
+  if (!problem.robust) return json;
+  json["distrusted"] = Json::array();
+  for (const DistrustedValue& value : report.distrusted) {
+    const auto group = static_cast<std::size_t>(value.group);
+    const View& view = problem.observations[group].view;
+    json["distrusted"].push_back(
+        {{"log", value.group + 1},
+         {"line", problem.lines[group][static_cast<std::size_t>(value.state)]},
+         {"value", view.names(*prior_of(problem.prior, view).system)[static_cast<std::size_t>(value.row)]},
+         {"distance", value.distance},
+         {"noise_factor", value.noise_factor}});
   }
   return json;
 }
@@ -225,10 +238,11 @@ void run(const Arguments& arguments) {
   }
 
   const FitReport& report = result->report;
+  talk(distrust_notes(problem, report));
   talk(notes_of(report));
   const auto print = [&] {
     if (arguments.json) {
-      fmt::print("{}\n", to_json(report, file.options).dump(2));
+      fmt::print("{}\n", to_json(problem, report, file.options).dump(2));
     } else {
       print_text(report);
     }
@@ -237,7 +251,7 @@ void run(const Arguments& arguments) {
   std::vector<std::string> sources = arguments.data;
   sources.insert(sources.end(), arguments.also.begin(), arguments.also.end());
   file.data_source = fmt::format("{}", fmt::join(sources, ", "));
-  file.observations = std::move(problem.observations);
+  file.observations = result->posterior.observations();
   file.systems = std::move(problem.systems);
   file.report = report;
   try {
@@ -308,6 +322,9 @@ void add_fit(CLI::App& app) {
       ->add_option("--discrepancy", a->discrepancy, "a small latent for what the kernel would rule out (docs/priors.md), or none")
       ->check(CLI::IsMember({"default", "none"}))
       ->capture_default_str();
+  command->add_flag("--project", a->project,
+                    "move states onto position and velocity constraints, with the model's parameters, before anything else");
+  command->add_flag("--robust", a->robust, "distrust values that disagree with all others, and say which (docs/command-line.md)");
   command->add_option("--restarts", a->restarts,
                       "runs of the optimiser; the first starts at the model's values (default: 5; of a baseline 30)");
   command->add_option("--max-iterations", a->max_iterations, "per run; 0 conditions at the starting values")

@@ -35,7 +35,7 @@ std::optional<ConstraintViolation> largest_violation(const System& system, const
 /// Whether measured accelerations obey A ddq = b to rounding: then they were computed from each other, and only nq − rank(A) of
 /// them are independent measurements. Treating all as independent makes an estimated noise collapse to zero.
 ///
-/// @param accelerations  (nq × N)
+/// @param accelerations  (nq × N); states with one that is not measured (NaN) are left out
 /// @returns the rows of ddq to observe instead (the best-conditioned independent set); nothing when the columns are independent.
 std::optional<std::vector<int>> dependent_columns(const System& system, const Eigen::Ref<const Eigen::MatrixXd>& states,
                                                   const Eigen::Ref<const Eigen::VectorXd>& parameters,
@@ -51,7 +51,7 @@ std::vector<Finding> check_system(const System& system, const Eigen::Ref<const E
 
 /// How a log fits the system: states on the constraint, accelerations on A ddq = b, independent columns.
 ///
-/// @param accelerations  (nq × N); NaN rows where not measured
+/// @param accelerations  (nq × N); NaN where not measured: A ddq = b is looked at where all are
 /// @param stated         rows of ddq whose standard deviations the log states: those that a fit observes; empty: all
 std::vector<Finding> check_data(const System& system, const Eigen::Ref<const Eigen::MatrixXd>& states,
                                 const Eigen::Ref<const Eigen::VectorXd>& parameters,

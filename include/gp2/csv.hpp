@@ -32,12 +32,15 @@ class CsvTable {
   [[nodiscard]] int n_columns() const { return static_cast<int>(header_.size()); }
   [[nodiscard]] int find(std::string_view column) const;  // −1 when there is none
   [[nodiscard]] const std::string& cell(int row, int column) const;
+  [[nodiscard]] int line(int row) const { return lines_[static_cast<std::size_t>(row)]; }  // in the file
 
   /// "log.csv:7: column 'q1'", for messages.
   [[nodiscard]] std::string place(int row, int column) const;
 
   /// @throws InputError naming file, line and column when the cell is not a finite number.
   [[nodiscard]] double number(int row, int column) const;
+  /// NaN where the cell is empty. @throws InputError as number, when it holds something else.
+  [[nodiscard]] double number_or_empty(int row, int column) const;
   /// NaN where the cell is empty or not finite. @throws InputError when it is something else.
   [[nodiscard]] double number_or_nan(int row, int column) const;
 

@@ -24,11 +24,12 @@ struct Evaluation {
   double nlpd_latent = 0, coverage95_latent = 0;  // of noise-free targets
   int n_zero_variance = 0;  // marginals without variance (the constraint decides them), left out of the latent figures
   int n = 0;                // points
+  int n_missing = 0;        // targets that are not measured (NaN), left out of all figures
 };
 
 /// @param states   (layout size × N)
 /// @param rows     of ddq that are compared
-/// @param targets  (rows × N)
+/// @param targets  (rows × N); NaN: not measured
 /// @param setting  the other system under which they were measured; null: the prior's own
 /// @param n_threads  as in Posterior::marginal
 Evaluation evaluate_predictions(const Posterior& posterior, const Eigen::Ref<const Eigen::MatrixXd>& states,

@@ -49,6 +49,8 @@ struct FitProblemOptions {
   std::optional<int> max_points;            // of each log: the first of a shuffle by `seed`
   std::optional<double> also_noise_stddev;  // of every row that is known; not given: [noise], where it is an acceleration
   std::optional<double> time_step;          // Δt of a known next velocity
+  bool project = false;                     // states onto the constraints, at the model's parameters, before anything else
+  bool robust = false;                      // values that disagree with all others are to be distrusted
   std::uint64_t seed = 0;
 };
 
@@ -59,11 +61,14 @@ struct FitProblem {
   std::vector<Observations> observations;                 // of each log, then of each knowledge
   std::vector<std::shared_ptr<const ModelFile>> systems;  // per Observations: its model where that is another; for FitFile
   std::vector<Hyperparameter> hyperparameters;
+  std::vector<std::vector<int>> lines;  // per Observations: the line in its log of each state
+  bool robust = false;
   std::vector<std::string> notes;  // what a person should know: columns taken by alias, states off the constraint, …
 };
 
 /// Reads logs of accelerations, and what else is known, into a fit of a model. A log with a column NAME_std beside an
-/// acceleration states the noise of each of its values.
+/// acceleration states the noise of each of its values. An empty cell of what is measured, or of its NAME_std, is a value that
+/// is not measured; rows without any are left out, and the notes say how many of each.
 /// @throws InputError for missing columns, bad cells, unknown names, a log's model that does not fit (make_setting), noise that
 /// is
 ///   missing, not positive, or too small for double precision.
@@ -80,7 +85,7 @@ FitOptions default_fit_options(const FitProblem& problem);
 std::string fit_options_json(const FitProblemOptions& asked, const FitOptions& options,
                              const std::vector<Hyperparameter>& start = {});
 
-/// fit() or, of a baseline, fit_baseline().
+/// fit() or, of a baseline, fit_baseline(), or fit_robust() where that is asked for.
 Fit fit(const FitProblem& problem, const FitOptions& options);
 
 /// Starting values from a file, as read_start_values. Bounds are the optimiser's: where it does not run, at max_iterations 0, a
@@ -89,6 +94,9 @@ void read_start(const std::filesystem::path& path, int max_iterations, FitProble
 
 /// What a person should know of a fit: parameters at a bound, uncertainty_notes, and noise at its lower bound.
 std::vector<std::string> notes_of(const FitReport& report);
+
+/// What a robust fit distrusts: how many values, and the worst of them with their lines in the log.
+std::vector<std::string> distrust_notes(const FitProblem& problem, const FitReport& report);
 
 /// Which latent of a prior has a name. @throws InputError naming `option` and the latents there are.
 int latent_index(const Prior& prior, const std::string& name, const std::string& option);
@@ -100,7 +108,7 @@ LogReader open_log(const ModelFile& model, const CsvTable& log, const std::map<s
 /// States of a log for a prior and a view, with the columns that only the constraint residuals read where the log has them.
 struct LogStates {
   Eigen::MatrixXd states;
-  Eigen::MatrixXd accelerations;  // those asked for (accelerations × N)
+  Eigen::MatrixXd accelerations;  // those asked for (accelerations × N); NaN: not measured
   std::vector<std::string> notes;
 };
 LogStates read_log_states(const Prior& prior, const View& view, const ModelFile& model, const CsvTable& log,
@@ -109,7 +117,7 @@ LogStates read_log_states(const Prior& prior, const View& view, const ModelFile&
 /// All that a log has of states and accelerations.
 struct WholeLog {
   Eigen::MatrixXd states;            // NaN where neither the model reads an entry nor the log has it (layout size × N)
-  Eigen::MatrixXd accelerations;     // NaN where not in the log (nq × N)
+  Eigen::MatrixXd accelerations;     // NaN where not measured, or not in the log (nq × N)
   std::vector<std::string> missing;  // accelerations that are not in the log
   std::vector<int> stated;           // rows of accelerations whose standard deviations the log states
 };

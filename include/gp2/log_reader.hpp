@@ -28,14 +28,19 @@ class LogReader {
   /// The same, but a cell that is empty or not finite is NaN.
   [[nodiscard]] Eigen::MatrixXd states_with_gaps(const std::vector<bool>& reads);
 
-  /// Named columns of the model, say ddq1 and ddq3 (names.size() × N).
+  /// Named columns of the model, say t and u1 (names.size() × N). @throws InputError as states.
   [[nodiscard]] Eigen::MatrixXd values(const std::vector<std::string>& names);
+
+  /// Named columns of measurements, say ddq1 and ddq3 (names.size() × N): an empty cell is NaN, not measured.
+  /// @throws InputError as states, for other cells that are not finite numbers, and for a column without any number.
+  [[nodiscard]] Eigen::MatrixXd measurements(const std::vector<std::string>& names);
 
   /// The column with the standard deviation of each value of a named column of the model: the log's name of that with _std
   /// behind; empty when there is none.
   [[nodiscard]] std::string stddev_column(const std::string& name) const;
-  /// (names.size() × N)
-  /// @throws InputError naming file, line and column of a standard deviation that is not positive and finite.
+  /// (names.size() × N); an empty cell is NaN.
+  /// @throws InputError naming file, line and column of a standard deviation that is not positive and finite, and as
+  /// measurements.
   [[nodiscard]] Eigen::MatrixXd stddevs(const std::vector<std::string>& names);
 
   [[nodiscard]] bool has(const std::string& name) const { return find(name) >= 0; }
@@ -47,6 +52,7 @@ class LogReader {
  private:
   [[nodiscard]] int find(const std::string& name) const;
   [[nodiscard]] int require(const std::string& name);
+  void require_a_number(const Eigen::RowVectorXd& values, int column) const;
   using Number = double (CsvTable::*)(int row, int column) const;
   [[nodiscard]] Eigen::MatrixXd read_states(const std::vector<bool>& reads, Number number);
 

@@ -118,6 +118,13 @@ struct FitOptions {
   const std::atomic<bool>* stop = nullptr;        // set: return the best so far, as not converged: interrupted
 };
 
+/// A value that a robust fit distrusts (robust.hpp): number `row` of the view of Observations `group`, at state `state`.
+struct DistrustedValue {
+  int group = 0, row = 0, state = 0;
+  double distance = 0;      // from what all others predict, in standard deviations of that and its noise
+  double noise_factor = 0;  // its noise was taken to be as many times larger
+};
+
 /// How one run of the optimiser ended.
 struct RestartReport {
   double objective = 0;  // negative log likelihood plus hyper-priors; +∞ where no finite start was found
@@ -156,6 +163,7 @@ struct FitReport {
   int n_escapes = 0;  // times the scan from the best optimum found a lower one
   std::vector<RestartReport> restarts;
   std::optional<LaplaceUncertainty> uncertainty;  // of the hyperparameters, in their order
+  std::vector<DistrustedValue> distrusted;        // of a robust fit, the farthest first
   double seconds = 0;
 };
 

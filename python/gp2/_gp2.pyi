@@ -158,6 +158,8 @@ class FitReport:
     @property
     def restarts(self) -> list[RestartReport]: ...
     @property
+    def distrusted(self) -> list[dict[str, Any]]: ...
+    @property
     def seconds(self) -> float: ...
     @property
     def standard_errors(self) -> dict[str, float]: ...
@@ -201,6 +203,8 @@ class Evaluation:
     def n_zero_variance(self) -> int: ...
     @property
     def n(self) -> int: ...
+    @property
+    def n_missing(self) -> int: ...
 
 class Motion:
     @property
@@ -380,6 +384,8 @@ def fit(
     protocol: Literal["default", "paper"] = "default",
     hyperprior: bool = True,
     discrepancy: bool = True,
+    project: bool = False,
+    robust: bool = False,
     columns: Mapping[str, str] | None = None,
     max_points: int | None = None,
     also_noise_std: float | None = None,

@@ -31,7 +31,7 @@ Log log_of(const py::object& data, const std::optional<PySystem>& system, const 
   return {to_table(data, what), system ? system->model : nullptr};
 }
 
-// a table of states and accelerations, columns by the model's names; entries that are not measured (NaN) are left out
+// a table of states and accelerations, columns by the model's names; NaN is an empty cell, and a column of it is left out
 CsvTable table_of(const py::tuple& arrays, const System& system) {
   if (arrays.size() != 2) throw InputError(fmt::format("data: expected (states, accelerations), got {} arrays", arrays.size()));
   const std::vector<std::string> accelerations = system.acceleration_names();
@@ -52,7 +52,7 @@ CsvTable table_of(const py::tuple& arrays, const System& system) {
   add(system.state_names(), states.matrix());
   add(accelerations, ddq.matrix());
   for (Eigen::Index i = 0; i < states.matrix().cols(); ++i) {
-    for (const Eigen::VectorXd& column : columns) cells.push_back(shortest(column[i]));
+    for (const Eigen::VectorXd& column : columns) cells.push_back(std::isnan(column[i]) ? "" : shortest(column[i]));
   }
   return CsvTable::from_cells("data", std::move(header), std::move(cells));
 }
@@ -96,7 +96,7 @@ struct Arguments {
   py::object noise_std, columns, progress, start;
   std::optional<std::vector<std::string>> estimate;
   std::string protocol = "default";
-  bool hyperprior = true, discrepancy = true;
+  bool hyperprior = true, discrepancy = true, project = false, robust = false;
   std::optional<int> max_points, restarts;
   std::optional<double> also_noise_std, dt;
   int max_iterations = 1000, threads = 0;
@@ -141,6 +141,8 @@ FitProblemOptions problem_options(const Arguments& arguments) {
   options.max_points = arguments.max_points;
   options.also_noise_stddev = arguments.also_noise_std;
   options.time_step = arguments.dt;
+  options.project = arguments.project;
+  options.robust = arguments.robust;
   options.seed = arguments.seed;
   return options;
 }
@@ -203,7 +205,8 @@ PyPosterior fit_model(const PySystem& system, const py::object& data, const Argu
   }
   std::optional<PyPosterior> posterior;
   if (result) {
-    const std::vector<std::string> notes = notes_of(result->report);
+    std::vector<std::string> notes = distrust_notes(problem, result->report);
+    for (std::string& note : notes_of(result->report)) notes.push_back(std::move(note));
     if (!raised) tell(notes);
     problem.notes.insert(problem.notes.end(), notes.begin(), notes.end());
     FitFile file;
@@ -259,22 +262,24 @@ void add_fit(py::module_& module) {
          const std::vector<std::string>& observe, const std::string& mean, const std::optional<std::string>& prior,
          const std::optional<std::string>& baseline, const py::object& noise_std,
          const std::optional<std::vector<std::string>>& estimate, const std::string& protocol, bool hyperprior, bool discrepancy,
-         const py::object& columns, const std::optional<int>& max_points, const std::optional<double>& also_noise_std,
-         const std::optional<double>& dt, const std::optional<int>& restarts, int max_iterations, const py::object& start,
-         std::uint64_t seed, int threads, const py::object& progress) {
-        return fit_model(system, data, {also,     observe,        mean,     prior,          baseline,   noise_std,   columns,
-                                        progress, start,          estimate, protocol,       hyperprior, discrepancy, max_points,
-                                        restarts, also_noise_std, dt,       max_iterations, threads,    seed});
+         bool project, bool robust, const py::object& columns, const std::optional<int>& max_points,
+         const std::optional<double>& also_noise_std, const std::optional<double>& dt, const std::optional<int>& restarts,
+         int max_iterations, const py::object& start, std::uint64_t seed, int threads, const py::object& progress) {
+        return fit_model(system, data,
+                         {also,     observe,        mean,     prior,          baseline,    noise_std, columns, progress,
+                          start,    estimate,       protocol, hyperprior,     discrepancy, project,   robust,  max_points,
+                          restarts, also_noise_std, dt,       max_iterations, threads,     seed});
       },
       "system"_a, "data"_a, py::kw_only(), "also"_a = std::vector<PyKnowledge>(), "observe"_a = std::vector<std::string>(),
       "mean"_a = "zero", "prior"_a = py::none(), "baseline"_a = py::none(), "noise_std"_a = py::none(), "estimate"_a = py::none(),
-      "protocol"_a = "default", "hyperprior"_a = true, "discrepancy"_a = true, "columns"_a = py::none(),
-      "max_points"_a = py::none(), "also_noise_std"_a = py::none(), "dt"_a = py::none(), "restarts"_a = py::none(),
-      "max_iterations"_a = 1000, "start"_a = py::none(), "seed"_a = 0, "threads"_a = 0, "progress"_a = py::none(),
+      "protocol"_a = "default", "hyperprior"_a = true, "discrepancy"_a = true, "project"_a = false, "robust"_a = false,
+      "columns"_a = py::none(), "max_points"_a = py::none(), "also_noise_std"_a = py::none(), "dt"_a = py::none(),
+      "restarts"_a = py::none(), "max_iterations"_a = 1000, "start"_a = py::none(), "seed"_a = 0, "threads"_a = 0,
+      "progress"_a = py::none(),
       R"(Fit a system to measured accelerations.
 
 data        a path, Table, pandas frame or mapping with columns named as the model's (or aliases); or (states, accelerations),
-            arrays (n, len(state_names)) and (n, nq), columns of NaN being "not measured"; or a list of these and of Log
+            arrays (n, len(state_names)) and (n, nq); or a list of these and of Log. NaN, or None, of an acceleration is "not measured"
 also        list of Knowledge: other quantities, measured or known
 observe     accelerations to learn from; default: those with a column ddNAME_std, or all
 mean        'zero', or 'force': the model's known force is relied on
@@ -283,6 +288,8 @@ baseline    'se', 'icm' or 'lmc': learn ddq without mechanics
 noise_std   standard deviation of every observed ddq, or 'estimate'; default: of each value, where data have columns
             ddNAME_std, times a factor that is estimated ('stated': as they are), or the model's
 estimate    names of parameters; default: those the model wants estimated
+project     move states onto position and velocity constraints, with the model's parameters, before anything else
+robust      distrust values that disagree with all others; report.distrusted lists them
 columns     {model's name: log's name}
 restarts    runs of the optimiser; default: 5, of a baseline 30
 max_iterations  per run; 0 conditions at the starting values

@@ -394,6 +394,22 @@ void define_report(Class& report) {
       .def_readonly("iterations", &FitReport::iterations, "Of the best restart.")
       .def_readonly("best_restart", &FitReport::best_restart)
       .def_readonly("restarts", &FitReport::restarts, "How each run ended, list of RestartReport.")
+      .def_property_readonly(
+          "distrusted",
+          [](const FitReport& self) {
+            py::list list;
+            for (const DistrustedValue& value : self.distrusted) {
+              py::dict entry;
+              entry["log"] = value.group;
+              entry["row"] = value.row;
+              entry["state"] = value.state;
+              entry["distance"] = value.distance;
+              entry["noise_factor"] = value.noise_factor;
+              list.append(entry);
+            }
+            return list;
+          },
+          "Values that a robust fit distrusts, the farthest first: `log` and `state` count from 0, `row` among the observed.")
       .def_readonly("seconds", &FitReport::seconds)
       .def_property_readonly(
           "standard_errors",
@@ -495,6 +511,7 @@ void add_posterior(py::module_& module) {
       .def_readonly("n_zero_variance", &Evaluation::n_zero_variance,
                     "Marginals without variance, left out of the latent figures.")
       .def_readonly("n", &Evaluation::n)
+      .def_readonly("n_missing", &Evaluation::n_missing, "Targets that are not measured, left out of all figures.")
       .def("__repr__", [](const Evaluation& e) {
         std::string rmse;
         for (std::size_t k = 0; k < e.outputs.size(); ++k) {

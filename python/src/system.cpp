@@ -11,6 +11,7 @@
 #include "gp2/error.hpp"
 #include "gp2/fit_problem.hpp"
 #include "gp2/generate.hpp"
+#include "gp2/projected_states.hpp"
 #include "gp2/resample.hpp"
 
 namespace gp2::python {
@@ -166,6 +167,8 @@ py::list check(const PySystem& self, const py::object& data, const py::object& c
   if (std::none_of(findings.begin(), findings.end(), is_error)) {
     const std::vector<Finding> more = check_data(system, log.states, parameters, log.accelerations, log.stated);
     findings.insert(findings.end(), more.begin(), more.end());
+    const std::vector<Finding> offsets = check_states(system, log.states, parameters);
+    findings.insert(findings.end(), offsets.begin(), offsets.end());
   }
   return findings_list(findings);
 }

@@ -1,3 +1,5 @@
+#include <cmath>
+
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 #include <pybind11/stl.h>
@@ -9,6 +11,14 @@
 namespace gp2::python {
 
 namespace {
+
+// NaN stands for an empty cell, as pandas reads one
+std::string cell_of(double number) { return std::isnan(number) ? "" : shortest(number); }
+
+bool is_missing(const py::handle& cell) {
+  if (cell.is_none() || (PyFloat_Check(cell.ptr()) != 0 && std::isnan(PyFloat_AS_DOUBLE(cell.ptr())))) return true;
+  return std::string(py::str(py::type::handle_of(cell).attr("__name__"))) == "NAType";  // pandas.NA
+}
 
 // a column as cells that read back to the same numbers
 std::vector<std::string> cells_of(const py::object& column, const std::string& what) {
@@ -22,9 +32,9 @@ std::vector<std::string> cells_of(const py::object& column, const std::string& w
   const char kind = array.dtype().kind();
   if (kind == 'f' || kind == 'i' || kind == 'u') {
     const auto numbers = py::array_t<double, py::array::forcecast>::ensure(array);
-    for (py::ssize_t i = 0; i < numbers.size(); ++i) cells.push_back(shortest(numbers.at(i)));
+    for (py::ssize_t i = 0; i < numbers.size(); ++i) cells.push_back(cell_of(numbers.at(i)));
   } else {  // text, or what must not be read
-    for (const py::handle cell : array) cells.emplace_back(py::str(cell));
+    for (const py::handle cell : array) cells.push_back(is_missing(cell) ? "" : std::string(py::str(cell)));
   }
   return cells;
 }
@@ -35,7 +45,7 @@ py::array column_of(const CsvTable& table, const std::string& name) {
     throw py::key_error(fmt::format("{} has no column '{}'; it has: {}", table.name(), name, fmt::join(table.header(), ", ")));
   }
   Eigen::VectorXd values(table.n_rows());
-  for (int i = 0; i < table.n_rows(); ++i) values[i] = table.number(i, column);
+  for (int i = 0; i < table.n_rows(); ++i) values[i] = table.number_or_empty(i, column);
   return to_vector(std::move(values));
 }
 
@@ -81,7 +91,9 @@ void add_table(py::module_& module) {
       .def("__len__", &CsvTable::n_rows)
       .def("__contains__", [](const CsvTable& table, const std::string& name) { return table.find(name) >= 0; })
       .def("__getitem__", &column_of, py::arg("name"),
-           "A column (n,).\n\nRaises KeyError when there is none, InputError when a cell is not a finite number.")
+           "A column (n,), NaN where the cell is empty.\n\nRaises KeyError when there is none, InputError when a cell is "
+           "something "
+           "else than a finite number.")
       .def("__repr__", [](const CsvTable& table) {
         return fmt::format("<gp2.Table '{}': {} rows of {}>", table.name(), table.n_rows(), fmt::join(table.header(), ", "));
       });

@@ -86,12 +86,16 @@ Evaluation evaluate_predictions(const Posterior& posterior, const Ref<const Matr
   for (std::size_t k = 0; k < rows.size(); ++k) {
     const Index row = rows[k];
     const VectorXd error = (targets.row(static_cast<Index>(k)) - prediction.mean.row(row)).transpose();
-    e.rmse[static_cast<Index>(k)] = std::sqrt(error.squaredNorm() / e.n);
+    const Eigen::Array<bool, Eigen::Dynamic, 1> is_measured = !targets.row(static_cast<Index>(k)).transpose().array().isNaN();
+    const Index n_measured = is_measured.count();
+    e.n_missing += e.n - static_cast<int>(n_measured);
+    e.rmse[static_cast<Index>(k)] = std::sqrt(is_measured.select(error, 0).squaredNorm() / static_cast<double>(n_measured));
     const Trained training = trained(posterior, rows[k]);
     normalised += e.rmse[static_cast<Index>(k)] / training.spread;
     // what rounding leaves of a variance that is zero
     const double zero = 1e-10 * test_spread[static_cast<Index>(k)];
     for (int i = 0; i < e.n; ++i) {
+      if (!is_measured[i]) continue;
       if (std::isfinite(training.noise)) measured.add(error[i], std::hypot(stddev(row, i), training.noise));
       if (stddev(row, i) > zero) {
         latent.add(error[i], stddev(row, i));

@@ -20,21 +20,68 @@ using Eigen::Index;
 using Eigen::MatrixXd;
 using Eigen::VectorXd;
 
+namespace {
+
+// the entries of row k that are measured
+VectorXd measured(const Eigen::Ref<const MatrixXd>& values, Index k) {
+  VectorXd some(values.cols());
+  Index n = 0;
+  for (const double value : values.row(k)) {
+    if (!std::isnan(value)) some[n++] = value;
+  }
+  return some.head(n);
+}
+
+// of(the measured entries) for each row, NaN where there are none
+template <typename Of>
+VectorXd over_measured(const Eigen::Ref<const MatrixXd>& values, const Of& of) {
+  VectorXd out(values.rows());
+  for (Index k = 0; k < out.size(); ++k) {
+    const VectorXd some = measured(values, k);
+    out[k] = some.size() == 0 ? std::numeric_limits<double>::quiet_NaN() : of(some);
+  }
+  return out;
+}
+
+}  // namespace
+
+VectorXd row_mean(const Eigen::Ref<const MatrixXd>& values) {
+  if (!values.hasNaN()) return values.rowwise().mean();
+  return over_measured(values, [](const VectorXd& some) { return some.mean(); });
+}
+
 VectorXd row_stddev(const Eigen::Ref<const MatrixXd>& values) {
+  if (values.hasNaN()) {
+    return over_measured(values, [](const VectorXd& some) { return row_stddev(some.transpose())[0]; });
+  }
   const VectorXd mean = values.rowwise().mean();
   return (values.colwise() - mean).rowwise().squaredNorm().array().sqrt() / std::sqrt(static_cast<double>(values.cols()));
 }
 
 VectorXd Observations::noise_at(const Eigen::Ref<const VectorXd>& stddev, Index i) const {
-  if (!has_noise_scale()) return stddev;
-  return stddev.cwiseProduct(noise_scale.col(i));
+  VectorXd noise = stddev;
+  if (has_noise_scale()) noise.array() *= noise_scale.col(i).array();
+  for (Index k = 0; k < noise.size(); ++k) {
+    if (std::isnan(values(k, i))) noise[k] = std::numeric_limits<double>::infinity();
+  }
+  return noise;
+}
+
+VectorXd Observations::measured_scales(Index k) const {
+  VectorXd scales(values.cols());
+  Index n = 0;
+  for (Index i = 0; i < values.cols(); ++i) {
+    if (!std::isnan(values(k, i))) scales[n++] = noise_scale(k, i);
+  }
+  return scales.head(n);
 }
 
 VectorXd Observations::usual_noise(const Eigen::Ref<const VectorXd>& stddev) const {
   if (!has_noise_scale()) return stddev;
   VectorXd usual = stddev;
   for (Index k = 0; k < usual.size(); ++k) {
-    VectorXd scale = noise_scale.row(k);
+    VectorXd scale = measured_scales(k);
+    if (scale.size() == 0) continue;
     const auto middle = scale.begin() + scale.size() / 2;
     std::nth_element(scale.begin(), middle, scale.end());
     usual[k] *= *middle;
@@ -50,10 +97,11 @@ void Observations::require_noise_scale() const {
                     "each row has one noise",
                     values.rows(), values.cols(), noise_scale.rows(), noise_scale.cols()));
   }
-  for (const double scale : noise_scale.reshaped()) {
-    if (scale > 0 && std::isfinite(scale)) continue;
-    throw InputError(
-        fmt::format("noise_scale must be positive and finite, got {}; leave out values that are worth nothing", scale));
+  for (Index entry = 0; entry < values.size(); ++entry) {
+    const double scale = noise_scale.reshaped()[entry];
+    if ((scale > 0 && std::isfinite(scale)) || std::isnan(values.reshaped()[entry])) continue;
+    throw InputError(fmt::format(
+        "noise_scale must be positive and finite, got {}; a value that is worth nothing is NaN, not measured", scale));
   }
 }
 
@@ -467,8 +515,9 @@ class SampleGradient {
 
     // S^{-1/2} scales the rows of W and e, and σ_k the whole row k of S^{1/2}
     if (options_.noise_gradient) {
-      gradient.noise_stddev[group].array() +=
-          1 - d_e_.array() * sample.e.array() - whitening_.array() * d_W_.cwiseProduct(G).rowwise().sum().array();
+      // a value of weight 0, which is not measured, has no log S
+      gradient.noise_stddev[group].array() += (whitening_.array() > 0).cast<double>() - d_e_.array() * sample.e.array() -
+                                              whitening_.array() * d_W_.cwiseProduct(G).rowwise().sum().array();
     }
     if (options_.gradient_parameters.empty()) return;
 

@@ -97,12 +97,6 @@ void Posterior::Implementation::finish() {
 
 namespace {
 
-// ½ ‖(I − QQᵀ)e‖² + ½ log|S| + ½ dim y log 2π of one sample, S = diag(noise²)
-double constant_of(const Reduction::Sample& sample, const VectorXd& noise) {
-  return 0.5 * sample.e_out.squaredNorm() + noise.array().log().sum() +
-         0.5 * static_cast<double>(sample.e.size()) * std::log(2 * std::numbers::pi);
-}
-
 // Sums over the samples at a block of states, and their memory, of one thread.
 class SampleSums {
  public:
@@ -287,8 +281,7 @@ void Posterior::Implementation::add_samples(const std::vector<Observations>& gro
   next_number = number.back();
   for (const Reduction::Sample& sample : reduction.samples) {
     const std::size_t group = static_cast<std::size_t>(sample.group);
-    const VectorXd noise = groups[group].noise_at(noise_stddev[group], sample.index);
-    samples.push_back({first_group + sample.group, number[group] + sample.index, constant_of(sample, noise)});
+    samples.push_back({first_group + sample.group, number[group] + sample.index, sample.constant});
   }
 }
 
@@ -605,8 +598,8 @@ void check_added(const Prior& prior, const Observations& added) {
                     "states, got {} × {}",
                     added.view.size(), added.states.cols(), added.values.rows(), added.values.cols()));
   }
-  if (!added.values.allFinite()) {
-    throw InputError("update: `values` must be finite, got one that is not; leave out states without a measurement");
+  if (added.values.array().isInf().any()) {
+    throw InputError("update: `values` must be finite, or NaN where nothing is measured; got one that is infinite");
   }
   try {
     added.require_noise_scale();

@@ -82,10 +82,14 @@ void reduce(const Prior& prior, const std::vector<Observations>& observations, c
     VectorXd whitening = noise_stddev[g].cwiseInverse();
     double log_det_S_half = noise_stddev[g].array().log().sum();
     const Index d = group.view.size();
+    Index n_measured = d;
+    const bool is_mixed = group.has_noise_scale() || group.values.hasNaN();
     for (int i = 0; i < group.n_data(); ++i) {
-      if (group.has_noise_scale()) {
+      if (is_mixed) {
         noise = group.noise_at(noise_stddev[g], i);
         whitening = noise.cwiseInverse();
+        n_measured = (whitening.array() > 0).count();
+        if (n_measured < d) noise = (whitening.array() > 0).select(noise, 1);
         log_det_S_half = noise.array().log().sum();
       }
       // W P = Q R', so R = Qᵀ W
@@ -104,11 +108,13 @@ void reduce(const Prior& prior, const std::vector<Observations>& observations, c
       sample.e = group.values.col(i) - models[g].values.view.offset.col(i);
       sample.e.noalias() -= G.lazyProduct(models[g].values.prior.mean.col(i));
       sample.e.array() *= whitening.array();
+      if (n_measured < d) sample.e = (whitening.array() > 0).select(sample.e, 0);
       sample.y.noalias() = sample.Q.transpose().lazyProduct(sample.e);
       sample.e_out = sample.e;
       sample.e_out.noalias() -= sample.Q.lazyProduct(sample.y);
-      reduction.constant +=
-          0.5 * sample.e_out.squaredNorm() + log_det_S_half + 0.5 * static_cast<double>(d) * std::log(2 * std::numbers::pi);
+      sample.constant = 0.5 * sample.e_out.squaredNorm() + log_det_S_half +
+                        0.5 * static_cast<double>(n_measured) * std::log(2 * std::numbers::pi);
+      reduction.constant += sample.constant;
     }
   }
 

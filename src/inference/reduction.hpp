@@ -26,7 +26,8 @@ struct ObservationModel {
 bool model_observations(const Prior& prior, const std::vector<Observations>& observations, const Eigen::VectorXd& parameters,
                         const std::vector<int>& gradient_parameters, std::vector<ObservationModel>& models);
 
-/// Observations whitened by their noise and split: W = S^{-1/2}G = Q R, e = S^{-1/2}(y − d − Gμ), ỹ = Qᵀe.
+/// Observations whitened by their noise and split: W = S^{-1/2}G = Q R, e = S^{-1/2}(y − d − Gμ), ỹ = Qᵀe. A value that is not
+/// measured has S = ∞: its rows of W and e are zero, and its log S is no part of the density.
 ///
 /// Samples are sorted by falling rank and numbers stored component by component: row (c, k) of every reduced vector belongs to
 /// component c of sorted sample k and stands at offset[c] + k, for k < count[c]. So each pair of components is one dense block.
@@ -37,13 +38,14 @@ struct Reduction {
     Eigen::VectorXd e;      // (d)
     Eigen::VectorXd y;      // Qᵀe (r)
     Eigen::VectorXd e_out;  // (I − QQᵀ) e
+    double constant = 0;    // ½ ‖(I − QQᵀ)e‖² + ½ log|S| + ½ dim y log 2π
   };
   std::vector<Sample> samples;              // sorted
   std::vector<Eigen::Index> count, offset;  // per component; offset has one more entry, the reduced size
   Eigen::VectorXd y;                        // ỹ
   std::vector<Eigen::MatrixXd> directions;  // per latent: rows R_i E_a(x_i), without C  (size × p_a)
   std::vector<bool> learned_alike;          // per latent: C is learned, and R_i E_a(x_i) is the same at every sample
-  double constant = 0;                      // ½ Σ‖(I − QQᵀ)e‖² + ½ Σ log|S| + ½ Σ dim y log 2π
+  double constant = 0;                      // Σ of the samples' own
 
   [[nodiscard]] Eigen::Index size() const { return offset.back(); }
   [[nodiscard]] int n_components() const { return static_cast<int>(count.size()); }

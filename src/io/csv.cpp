@@ -213,6 +213,10 @@ double CsvTable::number(int row, int column) const {
   return value;
 }
 
+double CsvTable::number_or_empty(int row, int column) const {
+  return trim(cell(row, column)).empty() ? std::numeric_limits<double>::quiet_NaN() : number(row, column);
+}
+
 double CsvTable::number_or_nan(int row, int column) const {
   std::string_view text = trim(cell(row, column));
   if (text.starts_with('+')) text.remove_prefix(1);

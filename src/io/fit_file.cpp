@@ -120,6 +120,7 @@ void take_checksum(ParsedJson& json) {
       written, is, is));
 }
 
+// NaN becomes null
 Json vector_json(const VectorXd& values) { return std::vector<double>(values.begin(), values.end()); }
 
 VectorXd vector_from(const ParsedJson& json) {
@@ -138,7 +139,19 @@ Json rows_json(const MatrixXd& matrix, const std::vector<std::string>& names) {
   return json;
 }
 
-MatrixXd rows_from(const ParsedJson& json, const std::vector<std::string>& names, const std::vector<bool>& needed, Index n) {
+// one named array per row, of a measured quantity: null where a value is not measured
+Json measured_json(const MatrixXd& matrix, const std::vector<std::string>& names) {
+  Json json = Json::object();
+  for (Index k = 0; k < matrix.rows(); ++k) json[names[static_cast<std::size_t>(k)]] = vector_json(matrix.row(k));
+  return json;
+}
+
+double number_or_missing(const ParsedJson& json) {
+  return json.is_null() ? std::numeric_limits<double>::quiet_NaN() : number(json);
+}
+
+MatrixXd rows_from(const ParsedJson& json, const std::vector<std::string>& names, const std::vector<bool>& needed, Index n,
+                   double (*entry)(const ParsedJson&) = number) {
   if (!json.is_object()) throw InputError("expected an object of named arrays");
   // sizes first: a damaged n must not ask for memory
   for (const auto& [name, values] : json.items()) {
@@ -153,7 +166,9 @@ MatrixXd rows_from(const ParsedJson& json, const std::vector<std::string>& names
   }
   MatrixXd matrix = MatrixXd::Constant(static_cast<Index>(names.size()), n, std::numeric_limits<double>::quiet_NaN());
   for (std::size_t k = 0; k < names.size(); ++k) {
-    if (json.contains(names[k])) matrix.row(static_cast<Index>(k)) = vector_from(json.at(names[k]));
+    if (!json.contains(names[k])) continue;
+    const Json& values = json.at(names[k]);
+    std::transform(values.begin(), values.end(), matrix.row(static_cast<Index>(k)).begin(), entry);
   }
   return matrix;
 }
@@ -308,8 +323,8 @@ Json observations_json(const Observations& group, const Prior& home, const Model
                {"noise_stddev", vector_json(group.noise_stddev)},
                {"estimate_noise", group.estimate_noise},
                {"states", rows_json(group.states, system.state_names())},
-               {"values", rows_json(group.values, group.view.names(system))}};
-  if (group.has_noise_scale()) json["noise_scale"] = rows_json(group.noise_scale, group.view.names(system));
+               {"values", measured_json(group.values, group.view.names(system))}};
+  if (group.has_noise_scale()) json["noise_scale"] = measured_json(group.noise_scale, group.view.names(system));
   if (other != nullptr) json["system"] = model_json(*other);
   return json;
 }
@@ -350,9 +365,9 @@ Observations observations_from(const ParsedJson& json, const Prior& home, std::s
   json.at("estimate_noise").get_to(group.estimate_noise);
   // values come first: they bound what a damaged n can claim
   const std::vector<bool> every(group.view.rows.size(), true);
-  group.values = rows_from(json.at("values"), group.view.names(system), every, n);
+  group.values = rows_from(json.at("values"), group.view.names(system), every, n, number_or_missing);
   if (json.contains("noise_scale")) {
-    group.noise_scale = rows_from(json.at("noise_scale"), group.view.names(system), every, n);
+    group.noise_scale = rows_from(json.at("noise_scale"), group.view.names(system), every, n, number_or_missing);
     group.require_noise_scale();
   }
   std::vector<bool> reads = prior.reads();

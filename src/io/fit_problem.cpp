@@ -13,6 +13,8 @@
 #include "gp2/error.hpp"
 #include "gp2/laplace.hpp"
 #include "gp2/mechanics.hpp"
+#include "gp2/projected_states.hpp"
+#include "gp2/robust.hpp"
 #include "io/baseline_prior.hpp"
 #include "prior/random.hpp"
 
@@ -70,7 +72,8 @@ void note_violation(const System& system, const MatrixXd& states, const VectorXd
 }
 
 // columns a prior and a view need, and those that only tell whether a state or a prediction is on the constraint
-MatrixXd states_of(const Prior& prior, const View& view, LogReader& reader) {
+/// @param needs_residuals  whether what the constraints' residuals read is needed too
+MatrixXd states_of(const Prior& prior, const View& view, LogReader& reader, bool needs_residuals = false) {
   std::vector<bool> reads = prior.reads();
   const std::vector<bool> of_view = view.reads(*prior.system);
   std::vector<bool> judged = prior.judge().reads(SystemPart::residuals);
@@ -79,18 +82,69 @@ MatrixXd states_of(const Prior& prior, const View& view, LogReader& reader) {
     for (std::size_t k = 0; k < judged.size(); ++k) judged[k] = judged[k] || constraints[k];
   }
   const std::vector<std::string> names = prior.system->state_names();
-  for (std::size_t k = 0; k < reads.size(); ++k) reads[k] = reads[k] || of_view[k] || (judged[k] && reader.has(names[k]));
+  for (std::size_t k = 0; k < reads.size(); ++k) {
+    reads[k] = reads[k] || of_view[k] || (judged[k] && (needs_residuals || reader.has(names[k])));
+  }
   return reader.states(reads);
 }
 
-// the first n of a shuffle of 0 … size − 1; all in order when n is no less
-std::vector<int> chosen_rows(int size, int n, std::uint64_t seed) {
-  std::vector<int> rows(static_cast<std::size_t>(size));
+std::vector<int> every_row(const CsvTable& log) {
+  std::vector<int> rows(static_cast<std::size_t>(log.n_rows()));
   std::iota(rows.begin(), rows.end(), 0);
-  if (n >= size) return rows;
-  rows = RandomStream(seed).permutation(size);
-  rows.resize(static_cast<std::size_t>(n));
   return rows;
+}
+
+// the first n of a shuffle of `rows`; all in order when n is no less
+std::vector<int> chosen_rows(const std::vector<int>& rows, int n, std::uint64_t seed) {
+  const int size = static_cast<int>(rows.size());
+  if (n >= size) return rows;
+  std::vector<int> chosen;
+  for (const int k : RandomStream(seed).permutation(size)) chosen.push_back(rows[static_cast<std::size_t>(k)]);
+  chosen.resize(static_cast<std::size_t>(n));
+  return chosen;
+}
+
+// these states of a group
+void keep_rows(Observations& group, const std::vector<int>& rows) {
+  group.states = MatrixXd(group.states(Eigen::all, rows));
+  group.values = MatrixXd(group.values(Eigen::all, rows));
+  if (group.has_noise_scale()) group.noise_scale = MatrixXd(group.noise_scale(Eigen::all, rows));
+}
+
+// The rows of a log with something measured. Values without a stated deviation where others of the column have one count as
+// not measured.
+std::vector<int> measured_rows(Observations& group, const std::vector<std::string>& names, const CsvTable& log,
+                               std::vector<std::string>& notes) {
+  std::vector<std::string> missing;
+  for (Index k = 0; k < group.values.rows(); ++k) {
+    Index n_without = 0;
+    if (group.has_noise_scale() && !group.noise_scale.row(k).array().isNaN().all()) {
+      for (Index i = 0; i < group.values.cols(); ++i) {
+        if (std::isnan(group.values(k, i)) || !std::isnan(group.noise_scale(k, i))) continue;
+        group.values(k, i) = std::numeric_limits<double>::quiet_NaN();
+        ++n_without;
+      }
+    }
+    const Index n = group.values.row(k).array().isNaN().count();
+    if (n == 0) continue;
+    missing.push_back(fmt::format("{} of {} of {}{}", n, log.n_rows(), names[static_cast<std::size_t>(k)],
+                                  n_without > 0 ? fmt::format(" ({} for want of a deviation)", n_without) : ""));
+  }
+  if (missing.empty()) return every_row(log);
+  notes.push_back(fmt::format("{}: values not measured, their cells being empty: {}", log.name(), fmt::join(missing, ", ")));
+  std::vector<int> rows;
+  for (int i = 0; i < log.n_rows(); ++i) {
+    if (!group.values.col(i).array().isNaN().all()) rows.push_back(i);
+  }
+  const std::size_t n_left_out = static_cast<std::size_t>(log.n_rows()) - rows.size();
+  if (n_left_out > 0) notes.push_back(fmt::format("{}: {} rows left out: they measure nothing", log.name(), n_left_out));
+  return rows;
+}
+
+std::vector<int> lines_of(const std::vector<int>& rows, const CsvTable& log) {
+  std::vector<int> lines;
+  for (const int row : rows) lines.push_back(log.line(row));
+  return lines;
 }
 
 // The system that a log was taken on, as its observations see it.
@@ -123,6 +177,45 @@ void require_mechanics_at(const Place& place, const View& view, const MatrixXd& 
                                place.system().name()));
 }
 
+// --project: the states of a log moved onto the constraints, at the model's parameters
+void project(const Place& place, const CsvTable& log, MatrixXd& states, std::vector<std::string>& notes) {
+  const System& system = place.system();
+  if (system.residual_labels().empty()) {
+    notes.push_back(
+        fmt::format("{}: nothing to project: '{}' has no position or velocity constraints", log.name(), system.name()));
+    return;
+  }
+  ProjectedStates projected = [&] {
+    try {
+      return project_states(system, place.parameters, states);
+    } catch (const InputError& error) {
+      throw InputError(fmt::format("--project: {}: {}", log.name(), error.what()));
+    }
+  }();
+  if (!projected.failures.empty()) {
+    std::vector<std::string> lines;
+    for (const ProjectedStates::Failure& failure : projected.failures) {
+      if (lines.size() < 12) lines.push_back(std::to_string(log.line(failure.state)));
+    }
+    if (lines.size() < projected.failures.size()) lines.emplace_back("…");
+    throw InputError(fmt::format(
+        "--project: {}: {} of {} states have no state on the constraints near them (line {}): {}; mend or leave out "
+        "these rows, or see gp2 check",
+        log.name(), projected.failures.size(), log.n_rows(), fmt::join(lines, ", "), projected.failures.front().text));
+  }
+  const std::vector<std::string> names = system.state_names();
+  std::vector<std::string> shifts;
+  for (Index k = 0; k < projected.shift.rows(); ++k) {
+    const SizeSummary size = summarise_sizes(projected.shift.row(k));
+    if (size.largest == 0) continue;
+    shifts.push_back(fmt::format("{} by {:.2g} on average, {:.2g} at most (line {})", names[static_cast<std::size_t>(k)],
+                                 size.mean, size.largest, log.line(size.at)));
+  }
+  notes.push_back(fmt::format("{}: states projected onto the constraints: {}", log.name(),
+                              shifts.empty() ? "none moved" : fmt::format("{}", fmt::join(shifts, ", "))));
+  states = std::move(projected.states);
+}
+
 // σ of a row of a group; refused where ε‖K̃‖ ≪ 1 could not hold at a signal of the given size
 struct NoiseRule {
   std::string source, name;  // where σ comes from; the row
@@ -134,9 +227,10 @@ struct NoiseRule {
 
   [[nodiscard]] double smallest() const { return signal * std::sqrt(static_cast<double>(n_data) / largest_norm); }
 
-  /// @param rows  of the log, of each value
+  /// @param stddev  ∞ where nothing is measured
+  /// @param rows    of the log, of each value
   void require_each(const Eigen::RowVectorXd& stddev, const std::vector<int>& rows) const {
-    if ((signal / stddev.array()).square().sum() <= largest_norm) return;
+    if (!((signal / stddev.array()).square().sum() > largest_norm)) return;
     Index worst = 0;
     const double least = stddev.minCoeff(&worst);
     throw InputError(
@@ -203,14 +297,14 @@ MatrixXd stated_noise(const std::vector<std::string>& observed, const FitProblem
 
 // σ of each row or, where the log states it, a factor of it
 VectorXd noise_of(const ModelFile& model, const FitProblemOptions& options, const Observations& group, bool estimate) {
-  const VectorXd spread = row_stddev(group.values);
+  const VectorXd spread = row_stddev(options.robust ? without_gross_errors({group}).front().values : group.values);
   const std::vector<std::string> names = group.view.names(*model.system);
   const std::string source = options.noise_stddev ? "--noise-std" : model.name + ": [noise] ddq";
   VectorXd stddev(group.view.size());
   for (Index k = 0; k < stddev.size(); ++k) {
     const auto row = static_cast<std::size_t>(group.view.rows[static_cast<std::size_t>(k)]);
     const std::string& name = names[static_cast<std::size_t>(k)];
-    if (group.has_noise_scale() && !group.noise_scale.row(k).hasNaN()) {
+    if (group.has_noise_scale() && !group.noise_scale.row(k).array().isNaN().all()) {
       stddev[k] = 1;
       continue;
     }
@@ -248,7 +342,9 @@ VectorXd signal_size(const Place& place, const Observations& group, const std::v
 }
 
 // accelerations measured
-Observations read_log(const Place& place, const Log& log, const FitProblemOptions& options, std::vector<std::string>& notes) {
+/// @param lines  receives the line of each state in the log
+Observations read_log(const Place& place, const Log& log, const FitProblemOptions& options, std::vector<int>& lines,
+                      std::vector<std::string>& notes) {
   const System& system = place.system();
   LogReader reader(log.table, system, columns_of(place.model, options.columns));
   Observations group;
@@ -261,14 +357,15 @@ Observations read_log(const Place& place, const Log& log, const FitProblemOption
     }
   }
   group.view = {View::Quantity::constrained_acceleration, acceleration_rows(system, observe, "--observe"), 0, -1, place.setting};
-  group.states = states_of(place.prior, group.view, reader);
+  group.states = states_of(place.prior, group.view, reader, options.project);
   const std::vector<std::string> observed = group.view.names(system);
   const std::vector<std::string> every = system.acceleration_names();
   const bool complete = std::all_of(every.begin(), every.end(), [&](const std::string& name) { return reader.has(name); });
-  group.values = reader.values(observed);
+  group.values = reader.measurements(observed);
   group.noise_scale = stated_noise(observed, options, reader, log.table, notes);
-  const MatrixXd all_values = complete && system.nc() > 0 ? reader.values(every) : MatrixXd();
+  const MatrixXd all_values = complete && system.nc() > 0 ? reader.measurements(every) : MatrixXd();
   note_reading(reader, log.table, notes);
+  if (options.project) project(place, log.table, group.states, notes);
   note_violation(system, group.states, place.parameters, log.table, notes);
   if (all_values.size() > 0) {
     const auto independent = dependent_columns(system, group.states, place.parameters, all_values);
@@ -282,13 +379,14 @@ Observations read_log(const Place& place, const Log& log, const FitProblemOption
     }
   }
   const int n_rows = log.table.n_rows();
-  const std::vector<int> rows = chosen_rows(n_rows, options.max_points.value_or(n_rows), options.seed);
-  if (static_cast<int>(rows.size()) < n_rows) {
-    group.states = MatrixXd(group.states(Eigen::all, rows));
-    group.values = MatrixXd(group.values(Eigen::all, rows));
-    if (group.has_noise_scale()) group.noise_scale = MatrixXd(group.noise_scale(Eigen::all, rows));
-    notes.push_back(fmt::format("{}: {} of {} rows taken, by seed {}", log.table.name(), rows.size(), n_rows, options.seed));
+  const std::vector<int> measured = measured_rows(group, observed, log.table, notes);
+  const std::vector<int> rows = chosen_rows(measured, options.max_points.value_or(n_rows), options.seed);
+  if (rows.size() < measured.size()) {
+    notes.push_back(
+        fmt::format("{}: {} of {} rows taken, by seed {}", log.table.name(), rows.size(), measured.size(), options.seed));
   }
+  if (static_cast<int>(rows.size()) < n_rows) keep_rows(group, rows);
+  lines = lines_of(rows, log.table);
   require_mechanics_at(place, group.view, group.states, rows, log.table);
 
   const bool model_estimates = place.model.noise.estimate && !options.noise_stddev && !group.has_noise_scale();
@@ -299,11 +397,13 @@ Observations read_log(const Place& place, const Log& log, const FitProblemOption
   const VectorXd spread = row_stddev(group.values);
   for (Index k = 0; k < spread.size(); ++k) {
     const std::string& name = observed[static_cast<std::size_t>(k)];
-    if (group.noise_scale.row(k).hasNaN()) {
-      group.noise_scale.row(k).setOnes();
+    auto scale = group.noise_scale.row(k);
+    if (scale.array().isNaN().all()) {
+      scale.setOnes();
     } else {
+      const auto is_measured = !group.values.row(k).array().isNaN();
       NoiseRule{fmt::format("{}: column '{}'", log.table.name(), reader.stddev_column(name)), name, spread[k], group.n_data()}
-          .require_each(group.noise_scale.row(k), rows);
+          .require_each(is_measured.select(scale, std::numeric_limits<double>::infinity()), rows);
     }
   }
   return group;
@@ -311,7 +411,7 @@ Observations read_log(const Place& place, const Log& log, const FitProblemOption
 
 // what else is measured or known, its noise not yet
 Observations read_knowledge(const Place& place, const Prior& home, const Knowledge& knowledge, const FitProblemOptions& options,
-                            std::vector<std::string>& notes) {
+                            std::vector<int>& lines, std::vector<std::string>& notes) {
   const System& system = place.system();
   const CsvTable& table = knowledge.log.table;
   const std::string option = "--also " + View::word(knowledge.quantity);
@@ -341,11 +441,15 @@ Observations read_knowledge(const Place& place, const Prior& home, const Knowled
                                  fmt::join(table.header(), ", ")));
   }
   group.view.rows = std::move(rows);
-  group.values = reader.values(names);
-  group.states = states_of(place.prior, group.view, reader);
+  group.values = reader.measurements(names);
+  group.states = states_of(place.prior, group.view, reader, options.project);
   note_reading(reader, table, notes);
+  if (options.project) project(place, table, group.states, notes);
   note_violation(system, group.states, place.parameters, table, notes);
-  require_mechanics_at(place, group.view, group.states, chosen_rows(table.n_rows(), table.n_rows(), 0), table);
+  const std::vector<int> measured = measured_rows(group, names, table, notes);
+  keep_rows(group, measured);
+  lines = lines_of(measured, table);
+  require_mechanics_at(place, group.view, group.states, measured, table);
   return group;
 }
 
@@ -382,6 +486,8 @@ void require_baseline_options(const FitProblemOptions& options, const std::vecto
   refuse(options.estimate && !options.estimate->empty(), "knows no parameters of the system", "--estimate");
   refuse(!options.observe.empty(), "learns every acceleration", "--observe");
   refuse(options.estimate_noise, "has fixed noise", "--noise-std estimate");
+  refuse(options.project, "knows no constraints", "--project");
+  refuse(options.robust, "is fitted as published", "--robust");
   refuse(!also.empty() || options.time_step || options.also_noise_stddev, "knows ddq only", "--also");
   const bool elsewhere = std::any_of(logs.begin(), logs.end(), [](const Log& log) { return log.model != nullptr; });
   refuse(elsewhere, "knows no system", "@OTHER.toml");
@@ -396,7 +502,7 @@ FitProblem make_baseline_problem(const ModelFile& model, const std::vector<Log>&
   problem.prior = make_prior(model, problem.prior_options);
   for (const Log& log : logs) {
     const Place place = place_of(model, problem.prior, problem.prior_options, log);
-    problem.observations.push_back(read_log(place, log, options, problem.notes));
+    problem.observations.push_back(read_log(place, log, options, problem.lines.emplace_back(), problem.notes));
     problem.systems.push_back(nullptr);
   }
   problem.prior_options.baseline = standardised_by(problem.observations, problem.prior.latents.front(), *options.baseline);
@@ -435,6 +541,11 @@ bool has_singular_mass(const FitProblem& problem) {
   });
 }
 
+// what scales, starts and bounds are taken from
+std::vector<Observations> trusted_observations(const FitProblem& problem) {
+  return problem.robust ? without_gross_errors(problem.observations) : problem.observations;
+}
+
 bool has_discrepancy(const FitProblem& problem, const FitProblemOptions& options) {
   const bool standard = options.protocol.name == Protocol::Name::standard && options.protocol.hyperprior;
   return options.discrepancy && standard && problem.prior.latents.size() == 1 &&
@@ -444,7 +555,7 @@ bool has_discrepancy(const FitProblem& problem, const FitProblemOptions& options
 // a share of the noise, as the fit starts with it, in each acceleration; where one is not measured, of its spread the same share
 // as in the others
 Discrepancy discrepancy_of(const FitProblem& problem) {
-  const Scales scales = default_scales(problem.prior, problem.observations);
+  const Scales scales = default_scales(problem.prior, trusted_observations(problem));
   VectorXd noise = VectorXd::Zero(scales.acceleration_stddev.size());
   double share = 0;
   int n_shares = 0;
@@ -564,13 +675,36 @@ std::string fit_options_json(const FitProblemOptions& asked, const FitOptions& o
   if (asked.trust_stated_noise) json["noise_std"] = "stated";
   if (asked.max_points) json["max_points"] = *asked.max_points;
   if (asked.also_noise_stddev) json["also_noise_std"] = *asked.also_noise_stddev;
+  if (asked.project) json["project"] = true;
+  if (asked.robust) json["robust"] = true;
   if (asked.time_step) json["dt"] = *asked.time_step;
   for (const auto& [name, column] : asked.columns) json["map"] += column + "=" + name;
   for (const Hyperparameter& h : start) json["start"][h.name] = h.value;
   return json.dump();
 }
 
+std::vector<std::string> distrust_notes(const FitProblem& problem, const FitReport& report) {
+  if (!problem.robust) return {};
+  std::ptrdiff_t n_values = 0;
+  for (const Observations& group : problem.observations) n_values += (!group.values.array().isNaN()).count();
+  constexpr std::size_t max_shown = 12;
+  std::vector<std::string> worst;
+  for (const DistrustedValue& value : report.distrusted) {
+    if (worst.size() == max_shown) break;
+    const auto group = static_cast<std::size_t>(value.group);
+    const View& view = problem.observations[group].view;
+    worst.push_back(fmt::format("{} in line {}{} ({:.3g} σ)",
+                                view.names(*prior_of(problem.prior, view).system)[static_cast<std::size_t>(value.row)],
+                                problem.lines[group][static_cast<std::size_t>(value.state)],
+                                problem.observations.size() > 1 ? fmt::format(" of log {}", group + 1) : "", value.distance));
+  }
+  if (worst.size() < report.distrusted.size()) worst.emplace_back("…");
+  return {fmt::format("robust: {} of {} values distrusted{}{}", report.distrusted.size(), n_values, worst.empty() ? "" : ": ",
+                      fmt::join(worst, ", "))};
+}
+
 Fit fit(const FitProblem& problem, const FitOptions& options) {
+  if (problem.robust) return fit_robust(problem.prior, problem.observations, problem.hyperparameters, options);
   const std::optional<Baseline>& baseline = problem.prior_options.baseline;
   return baseline ? fit_baseline(baseline->kind, problem.prior, problem.observations, problem.hyperparameters, options)
                   : fit(problem.prior, problem.observations, problem.hyperparameters, options);
@@ -584,7 +718,7 @@ LogReader open_log(const ModelFile& model, const CsvTable& log, const std::map<s
 LogStates read_log_states(const Prior& prior, const View& view, const ModelFile& model, const CsvTable& log,
                           const std::map<std::string, std::string>& columns, const std::vector<std::string>& accelerations) {
   LogReader reader = open_log(model, log, columns);
-  LogStates out{states_of(prior, view, reader), reader.values(accelerations), {}};
+  LogStates out{states_of(prior, view, reader), reader.measurements(accelerations), {}};
   note_reading(reader, log, out.notes);
   note_violation(*prior.system, out.states, prior.system->parameter_values(), log, out.notes);
   return out;
@@ -601,7 +735,7 @@ WholeLog read_whole_log(const ModelFile& model, LogReader& reader) {
   Index row = 0;
   for (const std::string& name : system.acceleration_names()) {
     if (reader.has(name)) {
-      log.accelerations.row(row) = reader.values({name});
+      log.accelerations.row(row) = reader.measurements({name});
     } else {
       log.missing.push_back(name);
     }
@@ -629,6 +763,7 @@ FitProblem make_fit_problem(const ModelFile& model, const std::vector<Log>& logs
     throw InputError("--protocol paper has its prior on the acceleration: leave out --prior force");
   }
   FitProblem problem;
+  problem.robust = options.robust;
   problem.prior_options.mean = options.mean;
   problem.prior_options.base = paper ? std::optional(Latent::Base::acceleration) : options.base;
   problem.prior_options.raw_angles = paper;
@@ -655,7 +790,9 @@ FitProblem make_fit_problem(const ModelFile& model, const std::vector<Log>& logs
     problem.systems.push_back(place.other);
     return place;
   };
-  for (const Log& log : logs) problem.observations.push_back(read_log(place_at(log), log, options, problem.notes));
+  for (const Log& log : logs) {
+    problem.observations.push_back(read_log(place_at(log), log, options, problem.lines.emplace_back(), problem.notes));
+  }
 
   // what else is known; its noise is judged by the size of the measured signals
   const bool needs_step = std::any_of(
@@ -663,10 +800,10 @@ FitProblem make_fit_problem(const ModelFile& model, const std::vector<Log>& logs
   if (options.time_step && !needs_step) throw InputError("--dt goes with --also next-velocity:FILE.csv");
   if (options.also_noise_stddev && also.empty()) throw InputError("--also-noise-std goes with --also VIEW:FILE.csv");
   if (!also.empty()) {
-    const std::vector<VectorXd> signal_stddev = default_scales(problem.prior, problem.observations).signal_stddev;
+    const std::vector<VectorXd> signal_stddev = default_scales(problem.prior, trusted_observations(problem)).signal_stddev;
     for (const Knowledge& knowledge : also) {
       const Place place = place_at(knowledge.log);
-      Observations group = read_knowledge(place, problem.prior, knowledge, options, problem.notes);
+      Observations group = read_knowledge(place, problem.prior, knowledge, options, problem.lines.emplace_back(), problem.notes);
       group.noise_stddev = noise_of_knowledge(place, knowledge, options, group, signal_stddev);
       problem.observations.push_back(std::move(group));
     }
@@ -679,7 +816,7 @@ FitProblem make_fit_problem(const ModelFile& model, const std::vector<Log>& logs
       if (other) problem.observations[g].view.setting = make_setting(model, *other, problem.prior_options);
     }
   }
-  problem.hyperparameters = default_hyperparameters(problem.prior, problem.observations, estimate, options.protocol);
+  problem.hyperparameters = default_hyperparameters(problem.prior, trusted_observations(problem), estimate, options.protocol);
   return problem;
 }
 

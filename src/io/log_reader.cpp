@@ -114,6 +114,23 @@ MatrixXd LogReader::values(const std::vector<std::string>& names) {
   return values;
 }
 
+void LogReader::require_a_number(const Eigen::RowVectorXd& values, int column) const {
+  if (!values.array().isNaN().all()) return;
+  throw InputError(fmt::format("{}: column '{}': every cell is empty, so nothing is measured there; leave the column out",
+                               table_.name(), table_.header()[static_cast<std::size_t>(column)]));
+}
+
+MatrixXd LogReader::measurements(const std::vector<std::string>& names) {
+  MatrixXd values(static_cast<Index>(names.size()), table_.n_rows());
+  for (std::size_t k = 0; k < names.size(); ++k) {
+    const int column = require(names[k]);
+    const auto row_of_values = static_cast<Index>(k);
+    for (int row = 0; row < table_.n_rows(); ++row) values(row_of_values, row) = table_.number_or_empty(row, column);
+    require_a_number(values.row(row_of_values), column);
+  }
+  return values;
+}
+
 std::string LogReader::stddev_column(const std::string& name) const {
   const int column = find(name);
   if (column < 0) return "";
@@ -129,14 +146,16 @@ MatrixXd LogReader::stddevs(const std::vector<std::string>& names) {
     const int column = table_.find(stddev_column(names[k]));
     used_.insert(column);
     for (int row = 0; row < table_.n_rows(); ++row) {
-      const double stddev = table_.number(row, column);
-      if (!(stddev > 0)) {
+      const double stddev = table_.number_or_empty(row, column);
+      if (stddev <= 0) {
         throw InputError(
-            fmt::format("{}: the standard deviation of {} must be positive, got {}; leave out the row, or the column",
+            fmt::format("{}: the standard deviation of {} must be positive, got {}; leave the cell empty where nothing is "
+                        "measured",
                         table_.place(row, column), names[k], stddev));
       }
       stddevs(static_cast<Index>(k), row) = stddev;
     }
+    require_a_number(stddevs.row(static_cast<Index>(k)), column);
   }
   return stddevs;
 }

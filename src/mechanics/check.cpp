@@ -98,6 +98,15 @@ std::vector<int> independent_rows(const std::vector<MatrixXd>& scaled_T, int siz
   return best;
 }
 
+// the states at which every acceleration is measured
+std::vector<int> complete_states(const Ref<const MatrixXd>& accelerations) {
+  std::vector<int> complete;
+  for (Index i = 0; i < accelerations.cols(); ++i) {
+    if (!accelerations.col(i).hasNaN()) complete.push_back(static_cast<int>(i));
+  }
+  return complete;
+}
+
 }  // namespace
 
 std::optional<ConstraintViolation> largest_violation(const System& system, const Ref<const MatrixXd>& states,
@@ -126,8 +135,13 @@ std::optional<ConstraintViolation> largest_violation(const System& system, const
 std::optional<std::vector<int>> dependent_columns(const System& system, const Ref<const MatrixXd>& states,
                                                   const Ref<const VectorXd>& parameters,
                                                   const Ref<const MatrixXd>& accelerations) {
+  if (accelerations.hasNaN()) {
+    const std::vector<int> complete = complete_states(accelerations);
+    if (complete.empty()) return std::nullopt;
+    return dependent_columns(system, states(Eigen::all, complete), parameters, accelerations(Eigen::all, complete));
+  }
   const MechanicsBatch mechanics = evaluate_mechanics(system, states, parameters);
-  if (mechanics.fault || system.nc() == 0 || accelerations.hasNaN()) return std::nullopt;
+  if (mechanics.fault || system.nc() == 0) return std::nullopt;
   // a log with 7 digits or more of a computed quantity; measured accelerations are never that good
   constexpr double tolerance = 1e-6;
   int rank = 0;
@@ -372,12 +386,13 @@ std::vector<Finding> check_data(const System& system, const Ref<const MatrixXd>&
                         fmt::format("data on the constraint: off by {:.2g} at most, {:.1e} of its scale ('{}', row {})",
                                     violation->value, violation->relative, violation->constraint, violation->state + 1)});
   }
-  if (accelerations.hasNaN() || system.nc() == 0) return findings;
+  const std::vector<int> complete = complete_states(accelerations);
+  if (complete.empty() || system.nc() == 0) return findings;
 
   const SystemValues values = system.evaluate(states, parameters);
   VectorXd rms = VectorXd::Zero(system.nc());
-  for (int i = 0; i < values.n_states(); ++i) rms += (values.A(i) * accelerations.col(i) - values.b(i)).cwiseAbs2();
-  rms = (rms / values.n_states()).cwiseSqrt();
+  for (const int i : complete) rms += (values.A(i) * accelerations.col(i) - values.b(i)).cwiseAbs2();
+  rms = (rms / static_cast<double>(complete.size())).cwiseSqrt();
   for (Index k = 0; k < rms.size(); ++k) {
     findings.push_back(
         {Level::good, fmt::format("measured ddq on A ddq = b: rms residual {:.3g} for '{}' (noise, if the model is right)",

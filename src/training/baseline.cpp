@@ -173,7 +173,7 @@ Fit fit_outputs(const Prior& prior, const std::vector<Observations>& observation
 
 Baseline standardised_by(const std::vector<Observations>& observations, const Latent& latent, Baseline::Kind kind) {
   const MatrixXd features = pooled_features(observations, latent);
-  return {kind, pooled_values(observations).rowwise().mean(), features.rowwise().mean(), usable_stddev(features)};
+  return {kind, row_mean(pooled_values(observations)), features.rowwise().mean(), usable_stddev(features)};
 }
 
 std::vector<Hyperparameter> baseline_hyperparameters(const Prior& prior, const std::vector<Observations>& observations) {

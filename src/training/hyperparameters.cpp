@@ -283,8 +283,8 @@ std::vector<Hyperparameter> default_hyperparameters(const Prior& prior, const st
       if (observations[g].has_noise_scale()) {
         // a factor of stated deviations: the smallest of them stays above the lower bound, the usual one below the upper
         h.unit = fmt::format("stated deviation of {}", names[k]);
-        const auto scale = observations[g].noise_scale.row(static_cast<Index>(k));
-        h.lower /= scale.minCoeff();
+        const VectorXd scale = observations[g].measured_scales(static_cast<Index>(k));
+        if (scale.size() > 0) h.lower /= scale.minCoeff();
         h.upper =
             std::max(h.upper / observations[g].usual_noise(VectorXd::Ones(observations[g].view.size()))[static_cast<Index>(k)],
                      2 * h.lower);

@@ -76,7 +76,7 @@ TEST(CommandLine, JsonStandsAloneOnStdoutWithTheContractedKeys) {
   const Outcome evaluation = desk.done("gp2 evaluate fit.json --data train.csv --json");
   EXPECT_THAT(keys(evaluation.json()),
               ElementsAre("coverage95", "coverage95_latent", "max_constraint_error", "max_constraint_error_fitted", "n",
-                          "n_zero_variance", "nlpd", "nlpd_latent", "nrmse", "rmse", "rmse_normalised"));
+                          "n_missing", "n_zero_variance", "nlpd", "nlpd_latent", "nrmse", "rmse", "rmse_normalised"));
   EXPECT_THAT(keys(evaluation.json()["rmse"]), ElementsAre("ddq1", "ddq2", "ddq3"));
 }
 

@@ -169,6 +169,7 @@ TEST(ValueNoiseTest, ValuesOfOneNoiseAndOfTheirOwnAreGroupsApart) {
 
 TEST(ValueNoiseTest, TheUsualNoiseIsTheMedian) {
   Observations group;
+  group.values.setZero(2, 3);
   group.noise_scale = (MatrixXd(2, 3) << 1, 2, 9, 5, 3, 4).finished();
   EXPECT_EQ(group.usual_noise(Eigen::Vector2d(10, 1)), Eigen::Vector2d(20, 4));
   EXPECT_EQ(group.noise_at(Eigen::Vector2d(10, 1), 2), Eigen::Vector2d(90, 4));
@@ -220,7 +221,7 @@ TEST(ValueNoiseTest, AScaleOfTheWrongShapeOrSignIsRefused) {
             fmt::format("noise_scale must hold one number for each of the {} × {} values, got {} × {}; leave it empty where each "
                         "row has one noise",
                         d, n, d, n - 1));
-  const std::string rule = "noise_scale must be positive and finite, got {}; leave out values that are worth nothing";
+  const std::string rule = "noise_scale must be positive and finite, got {}; a value that is worth nothing is NaN, not measured";
   EXPECT_EQ(refused([](MatrixXd& scale) { scale(0, 1) = 0; }), fmt::format(fmt::runtime(rule), 0));
   EXPECT_EQ(refused([](MatrixXd& scale) { scale(0, 1) = -2; }), fmt::format(fmt::runtime(rule), -2));
   EXPECT_EQ(refused([](MatrixXd& scale) { scale(0, 1) = std::nan(""); }), fmt::format(fmt::runtime(rule), "nan"));

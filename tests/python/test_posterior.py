@@ -121,7 +121,7 @@ def test_removed_data_are_as_if_they_had_not_been(arm, arm_log, arm_states, tmp_
 def test_a_refused_update_leaves_the_posterior_as_it_was(posterior, arm_log, arm_states):
     before = posterior.predict(arm_states).cov
     bad = {name: values[:2] for name, values in columns_of(arm_log).items()}
-    bad["ddelbow"] = np.array([0.1, np.nan])
+    bad["ddelbow"] = np.array([0.1, np.inf])
     with pytest.raises(gp2.InputError, match="ddelbow"):
         posterior.update(bad)
     with pytest.raises(gp2.InputError, match="noise_std: these accelerations were not observed in the fit"):

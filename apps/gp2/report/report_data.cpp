@@ -238,27 +238,30 @@ VectorXd ReportData::rmse_to_truth() const {
 MatrixXd coverage(const ReportData& data, const Ref<const VectorXd>& levels) {
   const Index d = std::ssize(data.rows), n = data.measured.cols();
   MatrixXd share = MatrixXd::Zero(levels.size(), d + 1);
-  int n_known = 0;
+  Index n_known = 0;
   for (Index k = 0; k < d; ++k) {
     const Index row = data.rows[static_cast<std::size_t>(k)];
     if (!std::isfinite(data.noise_stddev[k])) {
       share.col(k).setConstant(not_a_number);
       continue;
     }
-    ++n_known;
+    Index n_measured = 0;
     for (Index i = 0; i < n; ++i) {
+      if (std::isnan(data.measured(k, i))) continue;
+      ++n_measured;
       const double z = (data.measured(k, i) - data.predicted(row, i)) / std::hypot(data.stddev(row, i), data.noise_stddev[k]);
       // the central interval that just holds the measurement
       const double probability = std::erf(std::abs(z) / std::numbers::sqrt2);
       for (Index l = 0; l < levels.size(); ++l) share(l, k) += probability <= levels[l] ? 1 : 0;
     }
+    n_known += n_measured;
     share.col(d) += share.col(k);
-    share.col(k) /= static_cast<double>(n);
+    share.col(k) /= static_cast<double>(n_measured);
   }
   if (n_known == 0) {
     share.col(d).setConstant(not_a_number);
   } else {
-    share.col(d) /= static_cast<double>(n) * n_known;
+    share.col(d) /= static_cast<double>(n_known);
   }
   return share;
 }

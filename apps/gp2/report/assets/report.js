@@ -363,7 +363,7 @@
     while (host.children.length > data.outputs.length) { clear(host.lastChild); host.lastChild.remove(); }
     while (host.children.length < data.outputs.length) host.append(make("div"));
     data.outputs.forEach((output, k) => {
-      const values = data.measured[k].map((value, i) => value - predictedOutput(k)[i]);
+      const values = data.measured[k].map((value, i) => value === null ? null : value - predictedOutput(k)[i]);
       const noise = data.noise[k];
       chart(host.children[k], {
         title: output, summary: `rms ${format(rms(values), 3)}${noise === null ? "" : `, fitted noise ${format(noise, 3)}`}`,

@@ -1,0 +1,104 @@
+#include "gp2/projected_states.hpp"
+
+#include <algorithm>
+#include <cmath>
+
+#include <fmt/format.h>
+#include <fmt/ranges.h>
+
+#include "gp2/error.hpp"
+#include "simulation/projection.hpp"
+
+namespace gp2 {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::Ref;
+using Eigen::VectorXd;
+
+ProjectedStates project_states(const System& system, const Ref<const VectorXd>& parameters, const Ref<const MatrixXd>& states) {
+  const Index n_moving = 2 * static_cast<Index>(system.nq());
+  ProjectedStates out{states, MatrixXd::Zero(n_moving, states.cols()), {}};
+  const MatrixXd residuals = system.residuals(states, parameters);
+  for (Index k = 0; k < residuals.rows(); ++k) {
+    if (!residuals.row(k).hasNaN()) continue;
+    throw InputError(
+        fmt::format("system '{}': the states lack a coordinate or velocity that the constraint \"{}\" reads, and "
+                    "cannot be projected onto it",
+                    system.name(), system.residual_labels()[static_cast<std::size_t>(k)].text));
+  }
+  const ConstraintProjection projection(system, parameters);
+  VectorXd state;
+  for (Index i = 0; i < states.cols(); ++i) {
+    // what is not measured is read by nothing, but must not turn up in products with zero
+    state = states.col(i).array().isNaN().select(0, states.col(i));
+    try {
+      projection.apply(state);
+    } catch (const Error& error) {
+      out.failures.push_back({static_cast<int>(i), error.what()});
+      continue;
+    }
+    out.states.col(i) = states.col(i).array().isNaN().select(states.col(i), state);
+    out.shift.col(i) = (out.states.col(i) - states.col(i)).head(n_moving).cwiseAbs();
+  }
+  out.shift = out.shift.array().isNaN().select(0, out.shift);
+  return out;
+}
+
+SizeSummary summarise_sizes(const Ref<const VectorXd>& sizes) {
+  if (sizes.size() == 0) return {};
+  SizeSummary summary;
+  Index at = 0;
+  summary.largest = sizes.maxCoeff(&at);
+  summary.at = static_cast<int>(at);
+  summary.mean = sizes.mean();
+  VectorXd sorted = sizes;
+  const auto middle = sorted.begin() + sorted.size() / 2;
+  std::nth_element(sorted.begin(), middle, sorted.end());
+  summary.median = *middle;
+  return summary;
+}
+
+std::vector<Finding> check_states(const System& system, const Ref<const MatrixXd>& states,
+                                  const Ref<const VectorXd>& parameters) {
+  const auto violation = largest_violation(system, states, parameters);
+  const MatrixXd residuals = system.residuals(states, parameters);
+  if (!violation || violation->relative <= constraint_violation_tolerance || residuals.hasNaN()) return {};
+  using Level = Finding::Level;
+  std::vector<Finding> findings;
+  for (Index k = 0; k < residuals.rows(); ++k) {
+    const System::Residual& label = system.residual_labels()[static_cast<std::size_t>(k)];
+    const SizeSummary size = summarise_sizes(residuals.row(k).cwiseAbs());
+    findings.push_back(
+        {Level::good, fmt::format("off the {} constraint '{}' by {:.2g} in the median, {:.2g} at most (row {})",
+                                  label.velocity ? "velocity" : "position", label.text, size.median, size.largest, size.at + 1)});
+  }
+  const ProjectedStates projected = project_states(system, parameters, states);
+  const std::vector<std::string> names = system.state_names();
+  std::vector<std::string> shifts;
+  for (Index k = 0; k < projected.shift.rows(); ++k) {
+    const SizeSummary size = summarise_sizes(projected.shift.row(k));
+    if (size.largest == 0) continue;
+    shifts.push_back(fmt::format("{} by {:.2g} in the median, {:.2g} at most (row {})", names[static_cast<std::size_t>(k)],
+                                 size.median, size.largest, size.at + 1));
+  }
+  if (!shifts.empty()) {
+    findings.push_back(
+        {Level::good, fmt::format("the nearest states on the constraints, to which fit --project moves, differ in {}",
+                                  fmt::join(shifts, ", "))});
+  }
+  if (!projected.failures.empty()) {
+    std::vector<std::string> rows;
+    for (const ProjectedStates::Failure& failure : projected.failures) {
+      if (rows.size() < 12) rows.push_back(std::to_string(failure.state + 1));
+    }
+    if (rows.size() < projected.failures.size()) rows.emplace_back("…");
+    findings.push_back(
+        {Level::warning, fmt::format("{} states have no state on the constraints near them: rows {}; fit --project "
+                                     "refuses them",
+                                     projected.failures.size(), fmt::join(rows, ", "))});
+  }
+  return findings;
+}
+
+}  // namespace gp2

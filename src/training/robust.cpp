@@ -1,0 +1,189 @@
+#include "gp2/robust.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <optional>
+#include <set>
+#include <tuple>
+
+namespace gp2 {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+
+namespace {
+
+constexpr double normal_median = 0.6744897501960817;  // of |z|, z ~ N(0, 1)
+
+double median(std::vector<double> values) {
+  const auto middle = values.begin() + std::ssize(values) / 2;
+  std::nth_element(values.begin(), middle, values.end());
+  return *middle;
+}
+
+// the values of row k that are measured
+std::vector<double> measured(const MatrixXd& values, Index k) {
+  std::vector<double> some;
+  for (const double value : values.row(k)) {
+    if (!std::isnan(value)) some.push_back(value);
+  }
+  return some;
+}
+
+struct Choice {
+  std::vector<Observations> observations;  // the distrusted values with a noise of their own
+  std::vector<DistrustedValue> distrusted;
+
+  [[nodiscard]] std::set<std::tuple<int, int, int>> values() const {
+    std::set<std::tuple<int, int, int>> set;
+    for (const DistrustedValue& value : distrusted) set.emplace(value.group, value.row, value.state);
+    return set;
+  }
+};
+
+// what to distrust in the light of a posterior under whatever noise
+Choice choose(const std::vector<Observations>& observations, const Posterior& posterior, double threshold) {
+  const std::vector<LeaveOneOut> left_out = leave_one_out(posterior);
+  Choice choice{observations, {}};
+  for (std::size_t g = 0; g < observations.size(); ++g) {
+    const Observations& group = observations[g];
+    const VectorXd& sigma = posterior.values().noise_stddev[g];
+    MatrixXd noise(group.values.rows(), group.values.cols());
+    for (Index i = 0; i < noise.cols(); ++i) noise.col(i) = group.noise_at(sigma, i);
+    const MatrixXd residual = group.values - left_out[g].mean;
+    const MatrixXd stddev = (left_out[g].variance.array() + noise.array().square()).sqrt();
+    for (Index k = 0; k < noise.rows(); ++k) {
+      std::vector<double> distances = measured((residual.array() / stddev.array()).abs(), k);
+      if (distances.empty()) continue;
+      const double usual = std::max(1.0, median(std::move(distances)) / normal_median);
+      for (Index i = 0; i < noise.cols(); ++i) {
+        const double distance = std::abs(residual(k, i)) / (usual * stddev(k, i));
+        if (!(distance > threshold)) continue;
+        const double r = residual(k, i);
+        const double factor = std::sqrt(r * r - left_out[g].variance(k, i)) / noise(k, i);
+        MatrixXd& scale = choice.observations[g].noise_scale;
+        if (scale.size() == 0) scale.setOnes(noise.rows(), noise.cols());
+        scale(k, i) *= factor;
+        choice.distrusted.push_back({static_cast<int>(g), static_cast<int>(k), static_cast<int>(i), distance, factor});
+      }
+    }
+  }
+  std::stable_sort(choice.distrusted.begin(), choice.distrusted.end(),
+                   [](const DistrustedValue& a, const DistrustedValue& b) { return a.distance > b.distance; });
+  return choice;
+}
+
+// the observations without values that lie farther than `threshold` robust standard deviations from the median of their row
+std::vector<Observations> without_far_values(std::vector<Observations> observations, double threshold) {
+  for (Observations& group : observations) {
+    for (Index k = 0; k < group.values.rows(); ++k) {
+      std::vector<double> values = measured(group.values, k);
+      if (values.empty()) continue;
+      const double middle = median(values);
+      for (double& value : values) value = std::abs(value - middle);
+      const double spread = median(std::move(values)) / normal_median;
+      if (spread == 0) continue;  // most values are the same
+      for (double& value : group.values.row(k)) {
+        if (std::abs(value - middle) > threshold * spread) value = std::numeric_limits<double>::quiet_NaN();
+      }
+    }
+  }
+  return observations;
+}
+
+// what to distrust at sight, under a noise to start with
+Choice choose_at_sight(const std::vector<Observations>& observations, const std::vector<VectorXd>& noise_stddev,
+                       double threshold) {
+  const std::vector<Observations> usual = without_far_values(observations, threshold);
+  Choice choice{observations, {}};
+  for (std::size_t g = 0; g < observations.size(); ++g) {
+    const MatrixXd& values = observations[g].values;
+    const VectorXd mean = row_mean(usual[g].values);
+    MatrixXd& scale = choice.observations[g].noise_scale;
+    for (Index i = 0; i < values.cols(); ++i) {
+      for (Index k = 0; k < values.rows(); ++k) {
+        if (std::isnan(values(k, i)) || !std::isnan(usual[g].values(k, i))) continue;
+        const double noise = observations[g].noise_at(noise_stddev[g], i)[k];
+        const double factor = std::max(1.0, std::abs(values(k, i) - mean[k]) / noise);
+        if (scale.size() == 0) scale.setOnes(values.rows(), values.cols());
+        scale(k, i) *= factor;
+        choice.distrusted.push_back({static_cast<int>(g), static_cast<int>(k), static_cast<int>(i), factor, factor});
+      }
+    }
+  }
+  return choice;
+}
+
+// Turns of fit and choice.
+class Search {
+ public:
+  Search(const Prior& prior, const std::vector<Observations>& observations, const FitOptions& options,
+         const RobustOptions& robust)
+      : prior_(prior), observations_(observations), options_(options), robust_(robust) {}
+
+  /// Fits until the choice stays.
+  void run(Choice choice, std::vector<Hyperparameter> start, const FitOptions& options) {
+    for (int round = 0; round < robust_.max_rounds && (round == 0 || !stopped()); ++round) {
+      Fit fitted = fit(prior_, choice.observations, start, options);
+      start = fitted.report.hyperparameters;
+      Choice next = choose(observations_, fitted.posterior, robust_.threshold);
+      const bool is_settled = next.values() == choice.values();
+      fitted.report.distrusted = choice.distrusted;
+      const double cost = fitted.report.objective + price() * static_cast<double>(choice.distrusted.size());
+      if (cost < lowest_cost_) {
+        lowest_cost_ = cost;
+        best_ = std::move(fitted);
+      }
+      if (is_settled) return;
+      choice = std::move(next);
+    }
+  }
+
+  [[nodiscard]] const Fit& best() const { return *best_; }
+  void forget_cost() { lowest_cost_ = std::numeric_limits<double>::infinity(); }
+
+ private:
+  [[nodiscard]] bool stopped() const { return options_.stop != nullptr && options_.stop->load(); }
+  // what distrusting a value at the threshold lowers the objective by: ½ (z² − 1 − log z²)
+  [[nodiscard]] double price() const {
+    const double square = robust_.threshold * robust_.threshold;
+    return 0.5 * (square - 1 - std::log(square));
+  }
+
+  const Prior& prior_;
+  const std::vector<Observations>& observations_;
+  const FitOptions& options_;
+  const RobustOptions& robust_;
+  std::optional<Fit> best_;
+  double lowest_cost_ = std::numeric_limits<double>::infinity();
+};
+
+constexpr double gross = 10, suspicious = 3;  // robust standard deviations from the median
+
+}  // namespace
+
+std::vector<Observations> without_gross_errors(std::vector<Observations> observations) {
+  return without_far_values(std::move(observations), gross);
+}
+
+Fit fit_robust(const Prior& prior, const std::vector<Observations>& observations,
+               const std::vector<Hyperparameter>& hyperparameters, const FitOptions& options, const RobustOptions& robust) {
+  FitOptions quick = options;
+  quick.n_restarts = 1;
+  quick.max_escapes = 0;
+  // Outliers hide behind each other where a fit explains them all, by a signal that is large and short. From a choice that is
+  // too strict at first it is not drawn there; the objective, at a price for each value distrusted, decides between them.
+  const std::vector<VectorXd> noise = model_values(prior, observations, hyperparameters).noise_stddev;
+  Search search(prior, observations, options, robust);
+  for (const double threshold : {gross, suspicious}) {
+    search.run(choose_at_sight(observations, noise, threshold), hyperparameters, quick);
+  }
+  Choice choice{search.best().posterior.observations(), search.best().report.distrusted};
+  search.forget_cost();
+  search.run(std::move(choice), hyperparameters, options);
+  return search.best();
+}
+
+}  // namespace gp2

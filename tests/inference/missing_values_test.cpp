@@ -1,0 +1,301 @@
+#include <gtest/gtest.h>
+
+#include "gp2/error.hpp"
+#include "gp2/evaluation.hpp"
+#include "gp2/leave_one_out.hpp"
+#include "inference/sampling.hpp"
+
+// Observations some of whose values are not measured, and what is predicted of a value when it is left out.
+namespace gp2 {
+namespace {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+using test::Extended;
+using test::ExtendedVector;
+using test::largest;
+using test::Problem;
+using test::Quantity;
+
+constexpr std::uint64_t seed = 40711;
+constexpr double nan = std::numeric_limits<double>::quiet_NaN();
+
+// with a third of the values gone, at one state all of them
+Problem with_gaps(Problem p, std::uint64_t stream) {
+  RandomStream random(seed, stream);
+  for (Observations& group : p.observations) {
+    for (double& value : group.values.reshaped()) {
+      if (random.uniform() < 1.0 / 3) value = nan;
+    }
+    group.values.col(1).setConstant(nan);
+    // of no meaning where nothing is measured, so anything may stand there
+    if (group.has_noise_scale()) group.noise_scale = group.values.array().isNaN().select(-1, group.noise_scale);
+  }
+  return p;
+}
+
+// plain ones, and some with a noise of its own for each value
+std::vector<Problem> problems() {
+  std::vector<Problem> all;
+  for (const Problem& p : test::problems(9, seed)) {
+    const std::uint64_t stream = all.size();
+    all.push_back(with_gaps(stream % 2 == 0 ? p : test::with_noise_scale(p, seed + stream), stream));
+  }
+  return all;
+}
+
+double rounding(const Problem& p) {
+  Problem whole = p;
+  for (Observations& group : whole.observations) {
+    group.values.setZero();
+    if (group.has_noise_scale()) group.noise_scale = (group.noise_scale.array() > 0).select(group.noise_scale, 1);
+  }
+  return 1e4 * test::eps * test::condition(whole);
+}
+
+// −log N of the measured values alone
+double dense_density_of_measured(const Problem& p) {
+  const test::DenseObservations dense = test::dense_observations(p);
+  std::vector<Index> rows;
+  for (Index k = 0; k < dense.residual.size(); ++k) {
+    if (!std::isnan(static_cast<double>(dense.residual[k]))) rows.push_back(k);
+  }
+  const Eigen::LLT<Extended> factor(Extended(dense.covariance(rows, rows)));
+  const ExtendedVector white = factor.matrixL().solve(ExtendedVector(dense.residual(rows)));
+  const long double log_det_half = Extended(factor.matrixL()).diagonal().array().log().sum();
+  return static_cast<double>(white.squaredNorm() / 2 + log_det_half +
+                             static_cast<long double>(rows.size()) * std::log(2 * std::numbers::pi_v<long double>) / 2);
+}
+
+Likelihood::Options every_derivative(const Problem& p) {
+  Likelihood::Options options;
+  options.noise_gradient = true;
+  for (int k = 0; k < static_cast<int>(p.values.parameters.size()); ++k) options.gradient_parameters.push_back(k);
+  return options;
+}
+
+struct Evaluated {
+  double value = 0;
+  ModelValues gradient;
+};
+
+Evaluated evaluate(const Problem& p) {
+  Likelihood::Workspace workspace;
+  Evaluated out;
+  out.value = Likelihood(p.prior, p.observations, p.values, every_derivative(p)).evaluate(p.values, &out.gradient, workspace);
+  return out;
+}
+
+// the same data with a group for each state, whose view has the measured rows alone
+Problem taken_apart(const Problem& p) {
+  Problem apart = p;
+  apart.observations.clear();
+  apart.values.noise_stddev.clear();
+  for (std::size_t g = 0; g < p.observations.size(); ++g) {
+    const Observations& group = p.observations[g];
+    for (Index i = 0; i < group.values.cols(); ++i) {
+      std::vector<int> measured;
+      for (int k = 0; k < group.view.size(); ++k) {
+        if (!std::isnan(group.values(k, i))) measured.push_back(k);
+      }
+      if (measured.empty()) continue;
+      Observations& one = apart.observations.emplace_back();
+      one.states = group.states.col(i);
+      one.view = group.view;
+      one.view.rows.clear();
+      for (const int k : measured) one.view.rows.push_back(group.view.rows[static_cast<std::size_t>(k)]);
+      one.values = MatrixXd(group.values.col(i)(measured));
+      one.noise_stddev = group.noise_at(p.values.noise_stddev[g], i)(measured);
+      apart.values.noise_stddev.push_back(one.noise_stddev);
+    }
+  }
+  return apart;
+}
+
+View every_acceleration(const Problem& p) { return View::all(Quantity::unconstrained_acceleration, *p.prior.system); }
+
+Posterior posterior_of(const Problem& p) { return {p.prior, p.observations, p.values}; }
+
+TEST(MissingValuesTest, TheLikelihoodIsTheDenseDensityOfTheMeasuredValuesAlone) {
+  int n_well_conditioned = 0;
+  for (const Problem& p : problems()) {
+    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, seed));
+    const double dense = dense_density_of_measured(p);
+    ASSERT_TRUE(std::isfinite(dense));
+    EXPECT_NEAR(evaluate(p).value, dense, rounding(p) * (1 + std::abs(dense)));
+    EXPECT_NEAR(posterior_of(p).negative_log_likelihood(), dense, rounding(p) * (1 + std::abs(dense)));
+    if (rounding(p) > 1e-9) continue;
+    EXPECT_NEAR(evaluate(p).value, dense, 1e-12 * (1 + std::abs(dense)));
+    ++n_well_conditioned;
+  }
+  EXPECT_GT(n_well_conditioned, 10);
+}
+
+TEST(MissingValuesTest, GapsAreTheSameAsAViewOfItsOwnForEachState) {
+  for (const Problem& p : problems()) {
+    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, seed));
+    const Problem apart = taken_apart(p);
+    const Evaluated got = evaluate(p), expected = evaluate(apart);
+    EXPECT_NEAR(got.value, expected.value, rounding(p) * (1 + std::abs(expected.value)));
+    for (std::size_t a = 0; a < p.prior.latents.size(); ++a) {
+      EXPECT_LE(largest(got.gradient.kernel[a] - expected.gradient.kernel[a]),
+                rounding(p) * (1 + largest(expected.gradient.kernel[a])));
+      EXPECT_LE(largest(got.gradient.signal_stddev[a] - expected.gradient.signal_stddev[a]),
+                rounding(p) * (1 + largest(expected.gradient.signal_stddev[a])));
+    }
+    const MatrixXd mean = posterior_of(apart).mean(every_acceleration(p), p.queries);
+    EXPECT_LE(largest(posterior_of(p).mean(every_acceleration(p), p.queries) - mean), rounding(p) * (1 + largest(mean)));
+  }
+}
+
+TEST(MissingValuesTest, TheGradientIsThatOfTheLikelihood) {
+  int n_nonzero = 0;
+  for (const Problem& p : problems()) {
+    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, seed));
+    const Likelihood likelihood(p.prior, p.observations, p.values, every_derivative(p));
+    Likelihood::Workspace workspace;
+    ModelValues gradient;
+    const double value = likelihood.evaluate(p.values, &gradient, workspace);
+    const auto expect_match = [&](double analytic, double x, bool positive, const auto& member) {
+      const auto at = [&](double moved) -> VectorXd {
+        ModelValues values = p.values;
+        member(values) = positive ? std::exp(moved) : moved;
+        return VectorXd::Constant(1, likelihood.evaluate(values, nullptr, workspace));
+      };
+      const double scale = positive ? 0.5 : 0.05 * (x == 0 ? 1 : std::abs(x));
+      const test::Difference difference =
+          test::central_difference(at, positive ? std::log(x) : x, scale, std::max(64 * test::eps, rounding(p) / 100));
+      EXPECT_TRUE(test::matches(VectorXd::Constant(1, analytic), difference)) << "value " << value;
+      if (std::abs(analytic) > 10 * difference.error[0]) ++n_nonzero;
+    };
+    for (std::size_t g = 0; g < p.observations.size(); ++g) {
+      for (Index k = 0; k < p.values.noise_stddev[g].size(); ++k) {
+        SCOPED_TRACE(fmt::format("noise {} of group {}", k, g));
+        expect_match(gradient.noise_stddev[g][k], p.values.noise_stddev[g][k], true,
+                     [&](ModelValues& v) -> double& { return v.noise_stddev[g][k]; });
+      }
+    }
+    const std::vector<Parameter>& parameters = p.prior.system->parameters();
+    for (Index k = 0; k < gradient.parameters.size(); ++k) {
+      const std::string& name = parameters[static_cast<std::size_t>(k)].name;
+      if (std::find(p.not_estimable.begin(), p.not_estimable.end(), name) != p.not_estimable.end()) continue;
+      SCOPED_TRACE(name);
+      expect_match(gradient.parameters[k], p.values.parameters[k], false,
+                   [&](ModelValues& v) -> double& { return v.parameters[k]; });
+    }
+  }
+  EXPECT_GT(n_nonzero, 100) << "the test must not pass empty";
+}
+
+TEST(MissingValuesTest, WhatStandsBesideAGapChangesNoBit) {
+  for (const Problem& p : problems()) {
+    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, seed));
+    Problem other = p;
+    for (Observations& group : other.observations) {
+      if (group.has_noise_scale()) group.noise_scale = group.values.array().isNaN().select(nan, group.noise_scale);
+    }
+    const Evaluated expected = evaluate(p), got = evaluate(other);
+    EXPECT_EQ(got.value, expected.value);
+    for (std::size_t g = 0; g < p.observations.size(); ++g) {
+      EXPECT_EQ(got.gradient.noise_stddev[g], expected.gradient.noise_stddev[g]);
+    }
+  }
+}
+
+TEST(MissingValuesTest, APosteriorGrowsAndShrinksWithThem) {
+  const Problem p = problems().front();
+  const Observations& all = p.observations[0];
+  Posterior posterior = posterior_of(p).without_data();
+  const auto part = [&](const auto& columns) {
+    Observations some = all;
+    some.states = MatrixXd(all.states(Eigen::all, columns));
+    some.values = MatrixXd(all.values(Eigen::all, columns));
+    some.noise_stddev = p.values.noise_stddev[0];
+    return some;
+  };
+  posterior = update(std::move(posterior), part(Eigen::seq(0, 3)));
+  posterior = update(std::move(posterior), part(Eigen::seq(4, Eigen::last)));
+  const MatrixXd mean = posterior_of(p).mean(every_acceleration(p), p.queries);
+  EXPECT_LE(largest(posterior.mean(every_acceleration(p), p.queries) - mean), rounding(p) * (1 + largest(mean)));
+  EXPECT_NEAR(posterior.negative_log_likelihood(), posterior_of(p).negative_log_likelihood(),
+              rounding(p) * (1 + std::abs(posterior.negative_log_likelihood())));
+  posterior = remove_oldest(std::move(posterior), 2);
+  const Posterior expected(p.prior, {part(Eigen::seq(2, Eigen::last))}, p.values);
+  const MatrixXd rest = expected.mean(every_acceleration(p), p.queries);
+  EXPECT_LE(largest(posterior.mean(every_acceleration(p), p.queries) - rest), rounding(p) * (1 + largest(rest)));
+
+  Observations infinite = part(Eigen::seq(0, 0));
+  infinite.values(0, 0) = std::numeric_limits<double>::infinity();
+  try {
+    static_cast<void>(update(std::move(posterior), infinite));
+    ADD_FAILURE() << "an infinite value was taken";
+  } catch (const InputError& error) {
+    EXPECT_STREQ(error.what(), "update: `values` must be finite, or NaN where nothing is measured; got one that is infinite");
+  }
+}
+
+TEST(MissingValuesTest, FiguresOfARowAreThoseOfItsMeasuredValues) {
+  const MatrixXd values = (MatrixXd(3, 4) << 1, nan, 3, nan, nan, nan, nan, nan, 1, 2, 3, 4).finished();
+  EXPECT_EQ(row_mean(values)[0], 2);
+  EXPECT_EQ(row_stddev(values)[0], 1);
+  EXPECT_TRUE(std::isnan(row_mean(values)[1]) && std::isnan(row_stddev(values)[1]));
+  EXPECT_EQ(row_stddev(values)[2], row_stddev(values.bottomRows(1))[0]);
+  Observations group;
+  group.values = values;
+  group.noise_scale = (MatrixXd(3, 4) << 1, 90, 3, 90, 1, 1, 1, 1, 5, 6, 7, 8).finished();
+  EXPECT_EQ(group.measured_scales(0), Eigen::Vector2d(1, 3));
+  EXPECT_EQ(group.usual_noise(Eigen::Vector3d(1, 1, 2)), Eigen::Vector3d(3, 1, 14));
+  EXPECT_EQ(group.noise_at(Eigen::Vector3d(1, 1, 2), 1),
+            Eigen::Vector3d(std::numeric_limits<double>::infinity(), std::numeric_limits<double>::infinity(), 12));
+}
+
+TEST(MissingValuesTest, AnEvaluationLeavesThemOut) {
+  const Problem p = problems().front();
+  const View every = View::all(Quantity::constrained_acceleration, *p.prior.system);
+  const Posterior posterior = posterior_of(p);
+  const MatrixXd mean = posterior.mean(every, p.queries);
+  MatrixXd targets = mean;
+  for (Index i = 0; i < targets.cols(); ++i) targets(0, i) += 1 + static_cast<double>(i);
+  const Evaluation whole = evaluate_predictions(posterior, p.queries.leftCols(2), every.rows, targets.leftCols(2));
+  targets(0, 2) = nan;
+  const Evaluation e = evaluate_predictions(posterior, p.queries, every.rows, targets);
+  EXPECT_EQ(e.n, p.queries.cols());
+  EXPECT_EQ(e.n_missing, 1);
+  EXPECT_EQ(whole.n_missing, 0);
+  EXPECT_NEAR(e.rmse[0], whole.rmse[0], 1e-12 * whole.rmse[0]);
+  EXPECT_TRUE(std::isfinite(e.nlpd) && std::isfinite(e.nrmse));
+}
+
+TEST(LeaveOneOutTest, EachValueIsPredictedAsByAPosteriorThatHasNotSeenIt) {
+  for (const Problem& p : problems()) {
+    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, seed));
+    const std::vector<LeaveOneOut> left_out = leave_one_out(posterior_of(p));
+    ASSERT_EQ(left_out.size(), p.observations.size());
+    RandomStream random(seed, 99);
+    for (std::size_t g = 0; g < p.observations.size(); ++g) {
+      const Observations& group = p.observations[g];
+      int n_compared = 0;
+      for (Index i = 0; i < group.values.cols(); ++i) {
+        for (Index k = 0; k < group.values.rows(); ++k) {
+          if (std::isnan(group.values(k, i))) {
+            EXPECT_TRUE(std::isnan(left_out[g].mean(k, i)) && std::isnan(left_out[g].variance(k, i)));
+            continue;
+          }
+          if (++n_compared > 2) continue;
+          Problem without = p;
+          without.observations[g].values(k, i) = nan;
+          const Posterior::Marginal expected = posterior_of(without).marginal(group.view, group.states.col(i));
+          const double variance = expected.covariance.col(0)[k * group.view.size() + k];
+          const double size = largest(expected.mean) + std::sqrt(variance) + group.noise_stddev[k];
+          EXPECT_NEAR(left_out[g].mean(k, i), expected.mean(k, 0), rounding(p) * (1 + size));
+          EXPECT_NEAR(left_out[g].variance(k, i), variance, rounding(p) * (1 + size * size));
+        }
+      }
+      EXPECT_GT(n_compared, 0);
+    }
+  }
+}
+
+}  // namespace
+}  // namespace gp2

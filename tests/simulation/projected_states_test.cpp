@@ -1,0 +1,121 @@
+#include "gp2/projected_states.hpp"
+
+#include <gmock/gmock.h>
+
+#include "gp2/error.hpp"
+#include "gp2/simulate.hpp"
+#include "test_models.hpp"
+
+// Measured states moved onto the constraints.
+namespace gp2 {
+namespace {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+using testing::HasSubstr;
+
+constexpr std::uint64_t seed = 40721;
+
+// q and dq with an error of this size
+MatrixXd disturbed(const ModelFile& model, MatrixXd states, double size) {
+  RandomStream random(seed);
+  for (Index i = 0; i < states.cols(); ++i) {
+    for (int k = 0; k < 2 * model.system->nq(); ++k) states(k, i) += size * random.normal();
+  }
+  return states;
+}
+
+TEST(ProjectedStatesTest, StatesEndOnTheConstraintsWhereOneAloneDoes) {
+  for (const char* file : {"models/surface.toml", "models/double_pendulum.toml", "models/unicycle.toml"}) {
+    SCOPED_TRACE(fmt::format("{}, seed {}", file, seed));
+    const ModelFile& model = test::model(file);
+    const VectorXd parameters = model.system->parameter_values();
+    const MatrixXd states = disturbed(model, generate(model, {20, seed, VectorXd::Zero(model.system->nq())}).states, 1e-3);
+    const ProjectedStates projected = project_states(*model.system, parameters, states);
+    EXPECT_TRUE(projected.failures.empty());
+    EXPECT_FALSE(projected.states.hasNaN() && !states.hasNaN());
+    for (Index i = 0; i < states.cols(); ++i) {
+      const VectorXd measured = states.col(i).array().isNaN().select(0, states.col(i));
+      const VectorXd alone = project_onto_constraints(*model.system, parameters, measured);
+      for (Index k = 0; k < alone.size(); ++k) {
+        if (std::isnan(states(k, i))) {
+          EXPECT_TRUE(std::isnan(projected.states(k, i)));
+        } else {
+          EXPECT_EQ(projected.states(k, i), alone[k]);
+        }
+      }
+    }
+    // the project's projection ends at rounding of the terms, here of size 1
+    const MatrixXd residuals = model.system->residuals(projected.states, parameters);
+    EXPECT_LT(residuals.cwiseAbs().maxCoeff(), 1e-13);
+    // no farther than a few of the errors: the nearest state is not farther than the true one, in the metric of M
+    EXPECT_LT(projected.shift.maxCoeff(), 0.05);
+    EXPECT_GT(projected.shift.maxCoeff(), 1e-4);
+    // projected again they stay
+    EXPECT_LT(project_states(*model.system, parameters, projected.states).shift.maxCoeff(), 1e-14);
+  }
+}
+
+TEST(ProjectedStatesTest, AStateWithoutAnAdmissibleOneNearIsToldByItsNumber) {
+  const ModelFile circle = ModelFile::parse(R"toml(
+coordinates = ["x"]
+[mechanics]
+mass = [["1"]]
+[constraints]
+position = ["x^2 + 1"]
+)toml",
+                                            "circle.toml");
+  MatrixXd states = MatrixXd::Zero(3, 2);
+  states << 0.5, 0.7, 0, 0, 0, 0;
+  const ProjectedStates projected = project_states(*circle.system, {}, states);
+  ASSERT_EQ(projected.failures.size(), 2U);
+  EXPECT_EQ(projected.failures[1].state, 1);
+  EXPECT_THAT(projected.failures[1].text, HasSubstr("did not converge"));
+  EXPECT_EQ(projected.states, states);
+  const std::vector<Finding> findings = check_states(*circle.system, states, {});
+  ASSERT_FALSE(findings.empty());
+  EXPECT_EQ(findings.back().level, Finding::Level::warning);
+  EXPECT_EQ(findings.back().text, "2 states have no state on the constraints near them: rows 1, 2; fit --project refuses them");
+}
+
+TEST(ProjectedStatesTest, StatesThatLackWhatTheConstraintReadsAreRefused) {
+  const ModelFile& model = test::model("models/surface.toml");
+  MatrixXd states = generate(model, {3, seed, VectorXd::Zero(3)}).states;
+  states.row(1).setConstant(std::nan(""));
+  try {
+    static_cast<void>(project_states(*model.system, model.system->parameter_values(), states));
+    ADD_FAILURE() << "was not refused";
+  } catch (const InputError& error) {
+    EXPECT_THAT(error.what(), HasSubstr("the states lack a coordinate or velocity that the constraint \""));
+    EXPECT_THAT(error.what(), HasSubstr("reads, and cannot be projected onto it"));
+  }
+  EXPECT_TRUE(check_states(*model.system, states, model.system->parameter_values()).empty());
+}
+
+TEST(ProjectedStatesTest, ACheckSaysHowFarOffTheStatesAre) {
+  const ModelFile circle = ModelFile::parse(R"toml(
+coordinates = ["x", "y"]
+[mechanics]
+mass = [["1", "0"], ["0", "1"]]
+[constraints]
+position = ["sqrt(x^2 + y^2) - 1"]
+)toml",
+                                            "circle.toml");
+  MatrixXd states = MatrixXd::Zero(5, 4);
+  // off by 0, 0.1, 0.2 and −0.3 along x, with velocities along the circle
+  states.row(0) << 1, 1.1, 1.2, 0.7;
+  states.row(3) << 1, 2, 3, 4;
+  const std::vector<Finding> findings = check_states(*circle.system, states, {});
+  ASSERT_EQ(findings.size(), 3U);
+  EXPECT_EQ(findings[0].text, "off the position constraint 'sqrt(x^2 + y^2) - 1' by 0.2 in the median, 0.3 at most (row 4)");
+  EXPECT_THAT(findings[1].text, HasSubstr("off the velocity constraint "));
+  EXPECT_EQ(findings[2].text,
+            "the nearest states on the constraints, to which fit --project moves, differ in x by 0.2 in the median, 0.3 at most "
+            "(row 4)");
+  states.row(0).setOnes();
+  EXPECT_TRUE(check_states(*circle.system, states, {}).empty());
+}
+
+}  // namespace
+}  // namespace gp2
