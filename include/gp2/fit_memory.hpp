@@ -30,7 +30,7 @@ FitMemory fit_memory(const FitProblem& problem, const FitOptions& options);
 std::optional<double> free_memory(const std::filesystem::path& root = "/");
 
 /// The options under which a fit stays within `free` bytes: with fewer evaluations side by side where those asked for would not,
-/// and then a note says so. Results do not depend on it.
+/// and then a note says so. Results do not depend on it. A fit of less than 100 MB is never touched.
 /// @param free  as free_memory(); nothing: no limit
 /// @throws InputError when one evaluation alone takes more, with the rows that would fit; as fit_memory.
 FitOptions within_memory(const FitProblem& problem, const FitOptions& options, std::optional<double> free,

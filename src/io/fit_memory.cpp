@@ -190,8 +190,9 @@ std::optional<double> free_memory(const std::filesystem::path& root) {
 FitOptions within_memory(const FitProblem& problem, const FitOptions& options, std::optional<double> free,
                          std::vector<std::string>& notes) {
   if (!free) return options;
-  constexpr double share = 0.9;  // the estimate is good to a tenth or so
-  const double usable = share * *free;
+  // the estimate is good to a tenth or so; a small fit is never refused, for what is free is not known that well
+  constexpr double share = 0.9, small = 1e8;
+  const double usable = std::max(share * *free, small);
   const FitMemory memory = fit_memory(problem, options);
   if (memory.bytes() <= usable) return options;
 
@@ -218,8 +219,8 @@ FitOptions within_memory(const FitProblem& problem, const FitOptions& options, s
   }
   const double alone = memory.shared + std::max(memory.evaluation, memory.posterior);
   throw InputError(fmt::format(
-      "the fit of {:.0f} rows factors a matrix of size {} and takes {:.1f} GB of memory, of which {:.1f} GB are free: {} rows "
-      "of a log fit: take so many with --max-points {}, or choose them with gp2 resample",
+      "the fit of {:.0f} rows factors a matrix of size {} and takes {:.1f} GB of memory, of which {:.1f} GB are free; {} rows "
+      "of each log would fit: take so many with --max-points {}, or choose them with gp2 resample",
       n_states(problem), memory.reduced_size, gigabytes(alone), gigabytes(*free), most, most));
 }
 

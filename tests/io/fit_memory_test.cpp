@@ -78,6 +78,12 @@ TEST(WithinMemory, ThatIsEnoughOrUnknownNothingChanges) {
   EXPECT_TRUE(notes.empty());
 }
 
+TEST(WithinMemory, ASmallFitIsNeverRefused) {
+  std::vector<std::string> notes;
+  EXPECT_EQ(within_memory(problem_of(100), on_threads(4), 0, notes).max_side_by_side, 0);
+  EXPECT_NE(input_error_of([&] { within_memory(problem_of(10000), on_threads(4), 0, notes); }), "");
+}
+
 TEST(WithinMemory, ThatHoldsFewerFewerRunSideBySide) {
   const FitProblem problem = problem_of(10000);
   const FitMemory memory = fit_memory(problem, on_threads(4));
