@@ -307,6 +307,9 @@ TEST(SingularMass, ReuseGivesTheBitsOfANewObjectAndAllocatesNothing) {
     };
     use();
     EXPECT_EQ(test::allocations_of(use), 0U);
+    // the first singular state too
+    UdwadiaKalaba other_kind(regular, p.A, b);
+    EXPECT_EQ(test::allocations_of([&] { other_kind.compute(M, p.A, b); }), 0U);
     const UdwadiaKalaba fresh(M, p.A, b);
     EXPECT_TRUE(fresh.mass_is_singular());
     EXPECT_EQ(reused.T(), fresh.T());
