@@ -253,6 +253,22 @@ directions = "{}"
   expect("x*ddx - ddy", "force", Status::motion_undetermined);
 }
 
+// M_θθ = 0: the torque that the hinge can be expected to see is that of the ball on its rod
+TEST(MasslessCoordinate, HasAForceScaleOfTheMassThatItsConstraintsLendIt) {
+  const ModelFile& model = test::model("models/massless_rod.toml");
+  const GeneratedData data = test::draw(model, 30, seed);
+  for (const int row : {0, 2}) {
+    const Observations group{
+        data.states, {Quantity::constrained_acceleration, {row}}, data.accelerations.row(row), VectorXd::Constant(1, 0.1), false};
+    const Scales scales = default_scales(make_prior(model), {group});
+    EXPECT_TRUE(scales.acceleration_stddev.allFinite()) << scales.acceleration_stddev.transpose();
+    // within what one mass weighed by two rows can differ from m l²
+    const double torque = 0.5 * 0.6 * 0.6 * row_stddev(data.accelerations.row(2))[0];
+    EXPECT_GT(scales.signal_stddev[0][2], torque / 10) << "row " << row;
+    EXPECT_LT(scales.signal_stddev[0][2], torque * 10) << "row " << row;
+  }
+}
+
 TEST(MasslessCoordinate, WithAPriorOnTheAccelerationThereIsNoPosterior) {
   const ModelFile& model = test::model("models/massless_rod.toml");
   const Prior prior = make_prior(model, {Prior::Mean::zero, Latent::Base::acceleration});
