@@ -146,6 +146,9 @@ double UdwadiaKalaba::factorise_mass(const Ref<const MatrixXd>& M, const Ref<con
   mass_ = M;
   mass_factor_ = M;
   row_mass_.setZero(A.rows());
+  // here, so that the first singular state allocates no more than others
+  weight_.resize(M.rows());
+  A_T_.resize(A.rows(), M.cols());
   mass_kind_ = Mass::indefinite;
   if (!M.allFinite()) return 0;
   const double pivot = factorise(mass_factor_);
@@ -454,9 +457,9 @@ std::optional<std::string> mass_fault(const System& system, const SystemValues& 
       return std::nullopt;
     case UdwadiaKalaba::Mass::undetermined:
       return fmt::format(
-          "the mass matrix M is singular, and nothing determines ddq along {}: only a constraint that acts there, or a mass, "
+          "the mass matrix M is singular, and {}nothing determines ddq along {}: only a constraint that acts there, or a mass, "
           "does",
-          free_direction(system, projection, values.M(i), values.A(i)));
+          system.nc() == 0 ? "without constraints " : "", free_direction(system, projection, values.M(i), values.A(i)));
     case UdwadiaKalaba::Mass::indefinite:
       return "the mass matrix M is not positive definite";
   }

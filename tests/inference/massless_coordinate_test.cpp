@@ -242,14 +242,31 @@ directions = "{}"
     const Predictor predictor(Posterior(make_prior(model), {}, values));
     Predictor::Workspace workspace = predictor.make_workspace();
     VectorXd mean(2);
+    const VectorXd zero = VectorXd::Zero(5);
     EXPECT_EQ(predictor.mean(VectorXd::Ones(5), mean, workspace), Status::ok);
-    EXPECT_EQ(test::allocations_of([&] { EXPECT_EQ(predictor.mean(VectorXd::Zero(5), mean, workspace), status); }), 0U);
+    EXPECT_EQ(test::allocations_of([&] { EXPECT_EQ(predictor.mean(zero, mean, workspace), status); }), 0U);
     EXPECT_EQ(mean.array().isNaN().all(), status != Status::ok);
     EXPECT_EQ(predictor.mean(VectorXd::Ones(5), mean, workspace), Status::ok);
   };
   expect("ddx - ddy", "force", Status::ok);
   expect("ddx - ddy", "acceleration", Status::no_unconstrained_acceleration);
   expect("x*ddx - ddy", "force", Status::motion_undetermined);
+}
+
+// M_θθ = 0: the torque that the hinge can be expected to see is that of the ball on its rod
+TEST(MasslessCoordinate, HasAForceScaleOfTheMassThatItsConstraintsLendIt) {
+  const ModelFile& model = test::model("models/massless_rod.toml");
+  const GeneratedData data = test::draw(model, 30, seed);
+  for (const int row : {0, 2}) {
+    const Observations group{
+        data.states, {Quantity::constrained_acceleration, {row}}, data.accelerations.row(row), VectorXd::Constant(1, 0.1), false};
+    const Scales scales = default_scales(make_prior(model), {group});
+    EXPECT_TRUE(scales.acceleration_stddev.allFinite()) << scales.acceleration_stddev.transpose();
+    // within what one mass weighed by two rows can differ from m l²
+    const double torque = 0.5 * 0.6 * 0.6 * row_stddev(data.accelerations.row(2))[0];
+    EXPECT_GT(scales.signal_stddev[0][2], torque / 10) << "row " << row;
+    EXPECT_LT(scales.signal_stddev[0][2], torque * 10) << "row " << row;
+  }
 }
 
 TEST(MasslessCoordinate, WithAPriorOnTheAccelerationThereIsNoPosterior) {

@@ -380,7 +380,8 @@ TEST(PredictorTest, TellsWhatIsWrongWithAStateAndGoesOn) {
   const VectorXd zero = VectorXd::Zero(5);
   VectorXd unknown = VectorXd::Ones(5);
   unknown[0] = std::numeric_limits<double>::quiet_NaN();
-  expect(prior_of_one_point("x", "\"ddx - y\""), zero, Status::mass_not_positive_definite);
+  expect(prior_of_one_point("x", "\"ddx - y\""), -VectorXd::Ones(5), Status::mass_not_positive_definite);
+  expect(prior_of_one_point("x", "\"ddx - y\""), zero, Status::no_unconstrained_acceleration);
   expect(prior_of_one_point("1", "\"ddx - x\", \"ddx - 1\""), zero, Status::contradicting_constraints);
   expect(prior_of_one_point("x", "\"ddx - y\""), unknown, Status::not_finite);
   expect(prior_of_one_point("1", "\"ddx - 1/x\""), zero, Status::not_finite);
