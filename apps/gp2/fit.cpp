@@ -116,11 +116,12 @@ Json to_json(const FitProblem& problem, const FitReport& report) {
   for (const DistrustedValue& value : report.distrusted) {
     const auto group = static_cast<std::size_t>(value.group);
     const View& view = problem.observations[group].view;
-    json["distrusted"].push_back({{"log", value.group + 1},
-                                  {"line", problem.lines[group][static_cast<std::size_t>(value.state)]},
-                                  {"value", view.names(*prior_of(problem.prior, view).system)[static_cast<std::size_t>(value.row)]},
-                                  {"distance", value.distance},
-                                  {"noise_factor", value.noise_factor}});
+    json["distrusted"].push_back(
+        {{"log", value.group + 1},
+         {"line", problem.lines[group][static_cast<std::size_t>(value.state)]},
+         {"value", view.names(*prior_of(problem.prior, view).system)[static_cast<std::size_t>(value.row)]},
+         {"distance", value.distance},
+         {"noise_factor", value.noise_factor}});
   }
   return json;
 }

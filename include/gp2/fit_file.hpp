@@ -13,8 +13,8 @@ namespace gp2 {
 /// A fitted model as a file: the model's text, the options its prior was made with, the data and the hyperparameters. The
 /// posterior is computed anew from these, so a file loaded gives the same bits as before it was saved.
 struct FitFile {
-  /// 6: values that are not measured; 5: robots; 4: values with a noise of their own; 3: mechanics that are code; 2: observations of other systems; others are
-  /// written as 1.
+  /// 6: values that are not measured; 5: robots; 4: values with a noise of their own; 3: mechanics that are code; 2: observations
+  /// of other systems; others are written as 1.
   static constexpr int format_version = 6;
 
   ModelFile model;

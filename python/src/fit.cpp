@@ -257,19 +257,20 @@ void add_fit(py::module_& module) {
          const std::vector<std::string>& observe, const std::string& mean, const std::optional<std::string>& prior,
          const std::optional<std::string>& baseline, const py::object& noise_std,
          const std::optional<std::vector<std::string>>& estimate, const std::string& protocol, bool hyperprior, bool discrepancy,
-         bool project, bool robust, const py::object& columns, const std::optional<int>& max_points, const std::optional<double>& also_noise_std,
-         const std::optional<double>& dt, const std::optional<int>& restarts, int max_iterations, const py::object& start,
-         std::uint64_t seed, int threads, const py::object& progress) {
-        return fit_model(system, data, {also,     observe,        mean,     prior,          baseline,   noise_std,   columns,
-                                        progress, start,          estimate, protocol,       hyperprior, discrepancy, project, robust, max_points,
-                                        restarts, also_noise_std, dt,       max_iterations, threads,    seed});
+         bool project, bool robust, const py::object& columns, const std::optional<int>& max_points,
+         const std::optional<double>& also_noise_std, const std::optional<double>& dt, const std::optional<int>& restarts,
+         int max_iterations, const py::object& start, std::uint64_t seed, int threads, const py::object& progress) {
+        return fit_model(system, data,
+                         {also,     observe,        mean,     prior,          baseline,    noise_std, columns, progress,
+                          start,    estimate,       protocol, hyperprior,     discrepancy, project,   robust,  max_points,
+                          restarts, also_noise_std, dt,       max_iterations, threads,     seed});
       },
       "system"_a, "data"_a, py::kw_only(), "also"_a = std::vector<PyKnowledge>(), "observe"_a = std::vector<std::string>(),
       "mean"_a = "zero", "prior"_a = py::none(), "baseline"_a = py::none(), "noise_std"_a = py::none(), "estimate"_a = py::none(),
-      "protocol"_a = "default", "hyperprior"_a = true, "discrepancy"_a = true, "project"_a = false,
-      "robust"_a = false, "columns"_a = py::none(),
-      "max_points"_a = py::none(), "also_noise_std"_a = py::none(), "dt"_a = py::none(), "restarts"_a = py::none(),
-      "max_iterations"_a = 1000, "start"_a = py::none(), "seed"_a = 0, "threads"_a = 0, "progress"_a = py::none(),
+      "protocol"_a = "default", "hyperprior"_a = true, "discrepancy"_a = true, "project"_a = false, "robust"_a = false,
+      "columns"_a = py::none(), "max_points"_a = py::none(), "also_noise_std"_a = py::none(), "dt"_a = py::none(),
+      "restarts"_a = py::none(), "max_iterations"_a = 1000, "start"_a = py::none(), "seed"_a = 0, "threads"_a = 0,
+      "progress"_a = py::none(),
       R"(Fit a system to measured accelerations.
 
 data        a path, Table, pandas frame or mapping with columns named as the model's (or aliases); or (states, accelerations),

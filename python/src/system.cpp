@@ -6,12 +6,12 @@
 
 #include "arrays.hpp"
 #include "bindings.hpp"
-#include "gp2/projected_states.hpp"
 #include "gp2/check.hpp"
 #include "gp2/derive.hpp"
 #include "gp2/error.hpp"
 #include "gp2/fit_problem.hpp"
 #include "gp2/generate.hpp"
+#include "gp2/projected_states.hpp"
 #include "gp2/resample.hpp"
 
 namespace gp2::python {

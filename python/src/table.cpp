@@ -91,7 +91,8 @@ void add_table(py::module_& module) {
       .def("__len__", &CsvTable::n_rows)
       .def("__contains__", [](const CsvTable& table, const std::string& name) { return table.find(name) >= 0; })
       .def("__getitem__", &column_of, py::arg("name"),
-           "A column (n,), NaN where the cell is empty.\n\nRaises KeyError when there is none, InputError when a cell is something "
+           "A column (n,), NaN where the cell is empty.\n\nRaises KeyError when there is none, InputError when a cell is "
+           "something "
            "else than a finite number.")
       .def("__repr__", [](const CsvTable& table) {
         return fmt::format("<gp2.Table '{}': {} rows of {}>", table.name(), table.n_rows(), fmt::join(table.header(), ", "));

@@ -100,8 +100,8 @@ void Observations::require_noise_scale() const {
   for (Index entry = 0; entry < values.size(); ++entry) {
     const double scale = noise_scale.reshaped()[entry];
     if ((scale > 0 && std::isfinite(scale)) || std::isnan(values.reshaped()[entry])) continue;
-    throw InputError(
-        fmt::format("noise_scale must be positive and finite, got {}; a value that is worth nothing is NaN, not measured", scale));
+    throw InputError(fmt::format(
+        "noise_scale must be positive and finite, got {}; a value that is worth nothing is NaN, not measured", scale));
   }
 }
 

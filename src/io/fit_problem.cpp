@@ -194,10 +194,10 @@ void project(const Place& place, const CsvTable& log, MatrixXd& states, std::vec
       if (lines.size() < 12) lines.push_back(std::to_string(log.line(failure.state)));
     }
     if (lines.size() < projected.failures.size()) lines.emplace_back("…");
-    throw InputError(
-        fmt::format("--project: {}: {} of {} states have no state on the constraints near them (line {}): {}; mend or leave out "
-                    "these rows, or see gp2 check",
-                    log.name(), projected.failures.size(), log.n_rows(), fmt::join(lines, ", "), projected.failures.front().text));
+    throw InputError(fmt::format(
+        "--project: {}: {} of {} states have no state on the constraints near them (line {}): {}; mend or leave out "
+        "these rows, or see gp2 check",
+        log.name(), projected.failures.size(), log.n_rows(), fmt::join(lines, ", "), projected.failures.front().text));
   }
   const std::vector<std::string> names = system.state_names();
   std::vector<std::string> shifts;
@@ -378,8 +378,8 @@ Observations read_log(const Place& place, const Log& log, const FitProblemOption
   const std::vector<int> measured = measured_rows(group, observed, log.table, notes);
   const std::vector<int> rows = chosen_rows(measured, options.max_points.value_or(n_rows), options.seed);
   if (rows.size() < measured.size()) {
-    notes.push_back(fmt::format("{}: {} of {} rows taken, by seed {}", log.table.name(), rows.size(), measured.size(),
-                                options.seed));
+    notes.push_back(
+        fmt::format("{}: {} of {} rows taken, by seed {}", log.table.name(), rows.size(), measured.size(), options.seed));
   }
   if (static_cast<int>(rows.size()) < n_rows) keep_rows(group, rows);
   lines = lines_of(rows, log.table);
@@ -748,8 +748,7 @@ FitProblem make_fit_problem(const ModelFile& model, const std::vector<Log>& logs
     const std::vector<VectorXd> signal_stddev = default_scales(problem.prior, trusted_observations(problem)).signal_stddev;
     for (const Knowledge& knowledge : also) {
       const Place place = place_at(knowledge.log);
-      Observations group =
-          read_knowledge(place, problem.prior, knowledge, options, problem.lines.emplace_back(), problem.notes);
+      Observations group = read_knowledge(place, problem.prior, knowledge, options, problem.lines.emplace_back(), problem.notes);
       group.noise_stddev = noise_of_knowledge(place, knowledge, options, group, signal_stddev);
       problem.observations.push_back(std::move(group));
     }

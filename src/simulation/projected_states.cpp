@@ -22,9 +22,10 @@ ProjectedStates project_states(const System& system, const Ref<const VectorXd>& 
   const MatrixXd residuals = system.residuals(states, parameters);
   for (Index k = 0; k < residuals.rows(); ++k) {
     if (!residuals.row(k).hasNaN()) continue;
-    throw InputError(fmt::format("system '{}': the states lack a coordinate or velocity that the constraint \"{}\" reads, and "
-                                 "cannot be projected onto it",
-                                 system.name(), system.residual_labels()[static_cast<std::size_t>(k)].text));
+    throw InputError(
+        fmt::format("system '{}': the states lack a coordinate or velocity that the constraint \"{}\" reads, and "
+                    "cannot be projected onto it",
+                    system.name(), system.residual_labels()[static_cast<std::size_t>(k)].text));
   }
   const ConstraintProjection projection(system, parameters);
   VectorXd state;
@@ -58,7 +59,8 @@ SizeSummary summarise_sizes(const Ref<const VectorXd>& sizes) {
   return summary;
 }
 
-std::vector<Finding> check_states(const System& system, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters) {
+std::vector<Finding> check_states(const System& system, const Ref<const MatrixXd>& states,
+                                  const Ref<const VectorXd>& parameters) {
   const auto violation = largest_violation(system, states, parameters);
   const MatrixXd residuals = system.residuals(states, parameters);
   if (!violation || violation->relative <= constraint_violation_tolerance || residuals.hasNaN()) return {};
@@ -67,9 +69,9 @@ std::vector<Finding> check_states(const System& system, const Ref<const MatrixXd
   for (Index k = 0; k < residuals.rows(); ++k) {
     const System::Residual& label = system.residual_labels()[static_cast<std::size_t>(k)];
     const SizeSummary size = summarise_sizes(residuals.row(k).cwiseAbs());
-    findings.push_back({Level::good, fmt::format("off the {} constraint '{}' by {:.2g} in the median, {:.2g} at most (row {})",
-                                                 label.velocity ? "velocity" : "position", label.text, size.median, size.largest,
-                                                 size.at + 1)});
+    findings.push_back(
+        {Level::good, fmt::format("off the {} constraint '{}' by {:.2g} in the median, {:.2g} at most (row {})",
+                                  label.velocity ? "velocity" : "position", label.text, size.median, size.largest, size.at + 1)});
   }
   const ProjectedStates projected = project_states(system, parameters, states);
   const std::vector<std::string> names = system.state_names();
@@ -81,8 +83,9 @@ std::vector<Finding> check_states(const System& system, const Ref<const MatrixXd
                                  size.median, size.largest, size.at + 1));
   }
   if (!shifts.empty()) {
-    findings.push_back({Level::good, fmt::format("the nearest states on the constraints, to which fit --project moves, differ in {}",
-                                                 fmt::join(shifts, ", "))});
+    findings.push_back(
+        {Level::good, fmt::format("the nearest states on the constraints, to which fit --project moves, differ in {}",
+                                  fmt::join(shifts, ", "))});
   }
   if (!projected.failures.empty()) {
     std::vector<std::string> rows;
@@ -90,9 +93,10 @@ std::vector<Finding> check_states(const System& system, const Ref<const MatrixXd
       if (rows.size() < 12) rows.push_back(std::to_string(failure.state + 1));
     }
     if (rows.size() < projected.failures.size()) rows.emplace_back("…");
-    findings.push_back({Level::warning, fmt::format("{} states have no state on the constraints near them: rows {}; fit --project "
-                                                    "refuses them",
-                                                    projected.failures.size(), fmt::join(rows, ", "))});
+    findings.push_back(
+        {Level::warning, fmt::format("{} states have no state on the constraints near them: rows {}; fit --project "
+                                     "refuses them",
+                                     projected.failures.size(), fmt::join(rows, ", "))});
   }
   return findings;
 }

@@ -119,7 +119,8 @@ Choice choose_at_sight(const std::vector<Observations>& observations, const std:
 // Turns of fit and choice.
 class Search {
  public:
-  Search(const Prior& prior, const std::vector<Observations>& observations, const FitOptions& options, const RobustOptions& robust)
+  Search(const Prior& prior, const std::vector<Observations>& observations, const FitOptions& options,
+         const RobustOptions& robust)
       : prior_(prior), observations_(observations), options_(options), robust_(robust) {}
 
   /// Fits until the choice stays.

@@ -67,8 +67,7 @@ TEST(MissingValuesFileTest, AnEmptyCellOfAnAccelerationIsNotMeasured) {
   ASSERT_EQ(values.cols(), 12);
   EXPECT_TRUE(std::isnan(values(0, 0)) && std::isnan(values(0, 3)) && std::isnan(values(2, 3)));
   EXPECT_EQ(values.array().isNaN().count(), 3);
-  EXPECT_THAT(problem.notes,
-              Contains("log.csv: values not measured, their cells being empty: 2 of 12 of ddq1, 1 of 12 of ddq3"));
+  EXPECT_THAT(problem.notes, Contains("log.csv: values not measured, their cells being empty: 2 of 12 of ddq1, 1 of 12 of ddq3"));
   EXPECT_TRUE(std::isfinite(fit(problem, unoptimised()).report.negative_log_likelihood));
 }
 
@@ -87,13 +86,21 @@ TEST(MissingValuesFileTest, ARowThatMeasuresNothingIsLeftOutAsIfItWereNotThere) 
 }
 
 TEST(MissingValuesFileTest, WhatIsNoNumberStaysAnError) {
-  EXPECT_EQ(input_error_of([] { problem_of(log_of({{"ddq2", 4, "nan"}})); }),
+  EXPECT_EQ(input_error_of([] {
+              problem_of(log_of({{"ddq2", 4, "nan"}}));
+            }),
             "log.csv:6: column 'ddq2': 'nan' is not a finite number");
-  EXPECT_EQ(input_error_of([] { problem_of(log_of({{"ddq2", 4, "lost"}})); }),
+  EXPECT_EQ(input_error_of([] {
+              problem_of(log_of({{"ddq2", 4, "lost"}}));
+            }),
             "log.csv:6: column 'ddq2': 'lost' is not a finite number");
-  EXPECT_EQ(input_error_of([] { problem_of(log_of({{"ddq2", -1, ""}})); }),
+  EXPECT_EQ(input_error_of([] {
+              problem_of(log_of({{"ddq2", -1, ""}}));
+            }),
             "log.csv: column 'ddq2': every cell is empty, so nothing is measured there; leave the column out");
-  EXPECT_EQ(input_error_of([] { problem_of(log_of({{"dq2", 4, ""}})); }),
+  EXPECT_EQ(input_error_of([] {
+              problem_of(log_of({{"dq2", 4, ""}}));
+            }),
             "log.csv:6: column 'dq2': the cell is empty; a number is needed here");
 }
 
@@ -108,12 +115,16 @@ TEST(MissingValuesFileTest, StatedDeviationsGoWithTheirValues) {
                                       "1 of 12 of ddq3 (1 for want of a deviation)"));
   EXPECT_TRUE(std::isfinite(fit(problem, unoptimised()).report.negative_log_likelihood));
   for (const char* text : {"0", "-0.1"}) {
-    EXPECT_EQ(input_error_of([&] { problem_of(log_of({{"ddq1_std", 3, text}}, stated)); }),
+    EXPECT_EQ(input_error_of([&] {
+                problem_of(log_of({{"ddq1_std", 3, text}}, stated));
+              }),
               fmt::format("log.csv:5: column 'ddq1_std': the standard deviation of ddq1 must be positive, got {}; leave the cell "
                           "empty where nothing is measured",
                           text));
   }
-  EXPECT_EQ(input_error_of([&] { problem_of(log_of({{"ddq1_std", -1, ""}}, stated)); }),
+  EXPECT_EQ(input_error_of([&] {
+              problem_of(log_of({{"ddq1_std", -1, ""}}, stated));
+            }),
             "log.csv: column 'ddq1_std': every cell is empty, so nothing is measured there; leave the column out");
 }
 
@@ -176,8 +187,8 @@ TEST(MissingValuesFileTest, ACheckLooksAtTheRowsWhereAllIsMeasured) {
   const WholeLog whole = read_whole_log(surface(), reader);
   const VectorXd parameters = surface().system->parameter_values();
   const std::vector<Finding> findings = check_data(*surface().system, whole.states, parameters, whole.accelerations);
-  const std::vector<Finding> rest = check_data(*surface().system, whole.states.rightCols(11), parameters,
-                                               whole.accelerations.rightCols(11));
+  const std::vector<Finding> rest =
+      check_data(*surface().system, whole.states.rightCols(11), parameters, whole.accelerations.rightCols(11));
   ASSERT_EQ(findings.size(), rest.size());
   EXPECT_THAT(findings[1].text, HasSubstr("measured ddq on A ddq = b"));
   EXPECT_EQ(findings[1].text, rest[1].text);
@@ -221,18 +232,16 @@ ddq = 0.1
                                             "circle.toml");
   FitProblemOptions options;
   options.project = true;
-  EXPECT_THAT(input_error_of([&] {
-                make_fit_problem(circle, CsvTable::parse("x,dx,ddx\n0.5,0,1\n0.7,0,2\n", "log.csv"), options);
-              }),
-              HasSubstr("--project: log.csv: 2 of 2 states have no state on the constraints near them (line 2, 3): system"));
+  EXPECT_THAT(
+      input_error_of([&] { make_fit_problem(circle, CsvTable::parse("x,dx,ddx\n0.5,0,1\n0.7,0,2\n", "log.csv"), options); }),
+      HasSubstr("--project: log.csv: 2 of 2 states have no state on the constraints near them (line 2, 3): system"));
   const ModelFile free = ModelFile::parse(test::model("models/duffing.toml").text, "duffing.toml");
   if (free.system->residual_labels().empty()) {
     const CsvTable log = as_table(generate(free, {5, seed, VectorXd::Zero(free.system->nq())}), *free.system, "log.csv");
     EXPECT_THAT(make_fit_problem(free, log, options).notes, Contains(HasSubstr("log.csv: nothing to project: '")));
   }
   options.baseline = Baseline::Kind::se;
-  EXPECT_EQ(input_error_of([&] { problem_of(log_of({}), options); }),
-            "--baseline se knows no constraints: leave out --project");
+  EXPECT_EQ(input_error_of([&] { problem_of(log_of({}), options); }), "--baseline se knows no constraints: leave out --project");
   options.project = false;
   options.robust = true;
   EXPECT_EQ(input_error_of([&] { problem_of(log_of({}), options); }), "--baseline se is fitted as published: leave out --robust");

@@ -25,17 +25,14 @@ struct Data {
   std::vector<Hyperparameter> hyperparameters;
   std::set<std::pair<Index, Index>> wrong;  // (row, state)
 
-  void set_hyperparameters() {
-    hyperparameters = default_hyperparameters(prior, without_gross_errors(observations), {}, {});
-  }
+  void set_hyperparameters() { hyperparameters = default_hyperparameters(prior, without_gross_errors(observations), {}, {}); }
 };
 
 // accelerations of a system with the noise of its model file
 Data data_of(const std::string& file, int n) {
   const ModelFile& model = test::model(file);
   Data data{model, make_prior(model), {}, {}, {}};
-  const VectorXd noise =
-      Eigen::Map<const VectorXd>(model.noise.stddev.data(), static_cast<Index>(model.noise.stddev.size()));
+  const VectorXd noise = Eigen::Map<const VectorXd>(model.noise.stddev.data(), static_cast<Index>(model.noise.stddev.size()));
   const GeneratedData drawn = generate(model, {n, seed, noise});
   data.observations.push_back(
       {drawn.states, View::all(View::Quantity::constrained_acceleration, *model.system), drawn.accelerations, noise});
