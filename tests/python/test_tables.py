@@ -205,7 +205,7 @@ def test_a_robust_fit_lists_what_it_distrusts(arm, arm_log):
 def test_states_are_projected_before_the_fit_where_asked_for(arm, arm_log):
     log = columns_of(arm_log)
     log["elbow"] = log["elbow"] + 1e-3
-    assert any("off the constraint" in finding.text for finding in gp2.check(arm, log))
+    assert any("off the position constraint" in finding.text for finding in gp2.check(arm, log))
     projected = gp2.fit(arm, log, project=True, max_iterations=0)
     assert any("states projected onto the constraints" in note for note in projected.notes)
     assert projected.negative_log_likelihood != gp2.fit(arm, log, max_iterations=0).negative_log_likelihood
