@@ -52,7 +52,6 @@ class LogReader {
  private:
   [[nodiscard]] int find(const std::string& name) const;
   [[nodiscard]] int require(const std::string& name);
-  void require_a_number(const Eigen::RowVectorXd& values, int column) const;
   using Number = double (CsvTable::*)(int row, int column) const;
   [[nodiscard]] Eigen::MatrixXd read_states(const std::vector<bool>& reads, Number number);
 

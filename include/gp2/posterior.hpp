@@ -100,7 +100,7 @@ class Posterior {
 /// In place where no copy of `posterior` is held, by PathwiseSamples either; else a copy is changed and the others
 /// stay what they are. Memory is drawn for the factor only when what was set aside is full, and then for half as many rows again.
 ///
-/// @throws InputError when shapes do not fit, values are not finite or noise is not positive, and as the constructor; it and
+/// @throws InputError when shapes do not fit, values are infinite or noise is not positive, and as the constructor; it and
 /// NumericalError leave `posterior` as it was. Otherwise it is empty, as after any move.
 [[nodiscard]] Posterior update(Posterior&& posterior, Observations added);
 

@@ -56,6 +56,15 @@ std::map<std::string, std::string> columns_of(const ModelFile& model, std::map<s
   return columns;
 }
 
+// whether a log has a column for this, with something in it
+bool has_values(LogReader& reader, const CsvTable& log, const std::string& name) {
+  const int column = reader.column(name);
+  for (int row = 0; column >= 0 && row < log.n_rows(); ++row) {
+    if (log.cell(row, column).find_first_not_of(" \t") != std::string::npos) return true;
+  }
+  return false;
+}
+
 void note_reading(const LogReader& reader, const CsvTable& log, std::vector<std::string>& notes) {
   for (const auto& [name, found] : reader.aliases_used()) notes.push_back(fmt::format("column '{}' taken as {}", found, name));
   const std::vector<std::string> unused = reader.unused_columns();
@@ -295,9 +304,14 @@ MatrixXd stated_noise(const std::vector<std::string>& observed, const FitProblem
   return stddev;
 }
 
+// of the values that a robust fit does not distrust at sight
+VectorXd spread_of(const Observations& group, const FitProblemOptions& options) {
+  return row_stddev(options.robust ? without_gross_errors({group}).front().values : group.values);
+}
+
 // σ of each row or, where the log states it, a factor of it
 VectorXd noise_of(const ModelFile& model, const FitProblemOptions& options, const Observations& group, bool estimate) {
-  const VectorXd spread = row_stddev(options.robust ? without_gross_errors({group}).front().values : group.values);
+  const VectorXd spread = spread_of(group, options);
   const std::vector<std::string> names = group.view.names(*model.system);
   const std::string source = options.noise_stddev ? "--noise-std" : model.name + ": [noise] ddq";
   VectorXd stddev(group.view.size());
@@ -360,10 +374,12 @@ Observations read_log(const Place& place, const Log& log, const FitProblemOption
   group.states = states_of(place.prior, group.view, reader, options.project);
   const std::vector<std::string> observed = group.view.names(system);
   const std::vector<std::string> every = system.acceleration_names();
-  const bool complete = std::all_of(every.begin(), every.end(), [&](const std::string& name) { return reader.has(name); });
+  const auto all = [&](const auto& has) { return std::all_of(every.begin(), every.end(), has); };
+  const bool complete = system.nc() > 0 && all([&](const std::string& name) { return reader.has(name); }) &&
+                        all([&](const std::string& name) { return has_values(reader, log.table, name); });
   group.values = reader.measurements(observed);
   group.noise_scale = stated_noise(observed, options, reader, log.table, notes);
-  const MatrixXd all_values = complete && system.nc() > 0 ? reader.measurements(every) : MatrixXd();
+  const MatrixXd all_values = complete ? reader.measurements(every) : MatrixXd();
   note_reading(reader, log.table, notes);
   if (options.project) project(place, log.table, group.states, notes);
   note_violation(system, group.states, place.parameters, log.table, notes);
@@ -394,7 +410,7 @@ Observations read_log(const Place& place, const Log& log, const FitProblemOption
   if (group.has_noise_scale()) group.estimate_noise = estimates_factor(options);
   group.noise_stddev = noise_of(place.model, options, group, group.estimate_noise);
   if (!group.has_noise_scale()) return group;
-  const VectorXd spread = row_stddev(group.values);
+  const VectorXd spread = spread_of(group, options);
   for (Index k = 0; k < spread.size(); ++k) {
     const std::string& name = observed[static_cast<std::size_t>(k)];
     auto scale = group.noise_scale.row(k);

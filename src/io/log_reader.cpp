@@ -22,6 +22,12 @@ std::string number_after(const std::string& prefix, const std::string& name) {
   return rest.find_first_not_of("0123456789") == std::string::npos ? rest : "";
 }
 
+void require_a_number(const Eigen::RowVectorXd& values, const CsvTable& table, int column, const char* mend) {
+  if (!values.array().isNaN().all()) return;
+  throw InputError(fmt::format("{}: column '{}': every cell is empty, so nothing is measured there; {}", table.name(),
+                               table.header()[static_cast<std::size_t>(column)], mend));
+}
+
 }  // namespace
 
 LogReader::LogReader(const CsvTable& table, const System& system, const std::map<std::string, std::string>& columns)
@@ -114,19 +120,13 @@ MatrixXd LogReader::values(const std::vector<std::string>& names) {
   return values;
 }
 
-void LogReader::require_a_number(const Eigen::RowVectorXd& values, int column) const {
-  if (!values.array().isNaN().all()) return;
-  throw InputError(fmt::format("{}: column '{}': every cell is empty, so nothing is measured there; leave the column out",
-                               table_.name(), table_.header()[static_cast<std::size_t>(column)]));
-}
-
 MatrixXd LogReader::measurements(const std::vector<std::string>& names) {
   MatrixXd values(static_cast<Index>(names.size()), table_.n_rows());
   for (std::size_t k = 0; k < names.size(); ++k) {
     const int column = require(names[k]);
     const auto row_of_values = static_cast<Index>(k);
     for (int row = 0; row < table_.n_rows(); ++row) values(row_of_values, row) = table_.number_or_empty(row, column);
-    require_a_number(values.row(row_of_values), column);
+    require_a_number(values.row(row_of_values), table_, column, "observe others (--observe)");
   }
   return values;
 }
@@ -155,7 +155,7 @@ MatrixXd LogReader::stddevs(const std::vector<std::string>& names) {
       }
       stddevs(static_cast<Index>(k), row) = stddev;
     }
-    require_a_number(stddevs.row(static_cast<Index>(k)), column);
+    require_a_number(stddevs.row(static_cast<Index>(k)), table_, column, "leave the column out");
   }
   return stddevs;
 }

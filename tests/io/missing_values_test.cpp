@@ -97,7 +97,10 @@ TEST(MissingValuesFileTest, WhatIsNoNumberStaysAnError) {
   EXPECT_EQ(input_error_of([] {
               problem_of(log_of({{"ddq2", -1, ""}}));
             }),
-            "log.csv: column 'ddq2': every cell is empty, so nothing is measured there; leave the column out");
+            "log.csv: column 'ddq2': every cell is empty, so nothing is measured there; observe others (--observe)");
+  FitProblemOptions others;
+  others.observe = {"ddq1", "ddq3"};
+  EXPECT_EQ(problem_of(log_of({{"ddq2", -1, ""}}), others).observations.front().values.rows(), 2);
   EXPECT_EQ(input_error_of([] {
               problem_of(log_of({{"dq2", 4, ""}}));
             }),

@@ -242,6 +242,8 @@ def test_data_as_arrays_leave_out_what_is_not_measured(arm, arm_log):
     without = gp2.fit(arm, (states[rest], ddq[rest]), observe=["ddshoulder"], max_iterations=0)
     assert gap.n_data == without.n_data == 29
     np.testing.assert_array_equal(gap.predict(states).cov, without.predict(states).cov)
+    ddq[3, 0] = np.inf
+    refuses(lambda: gp2.fit(arm, (states, ddq), observe=["ddshoulder"], max_iterations=0), gp2.InputError, "ddshoulder", "inf")
     refuses(lambda: gp2.fit(arm, (states,)), gp2.InputError, "data: expected (states, accelerations), got 1 arrays")
     refuses(lambda: gp2.fit(arm, (states, ddq[1:])), gp2.InputError, "data: 30 states, but 29 accelerations")
     refuses(lambda: gp2.fit(arm, (states, ddq.T)), gp2.InputError, "accelerations: expected shape (n, 2)")

@@ -174,3 +174,38 @@ def test_resampled_rows_are_rows_of_the_table(arm, frame):
     np.testing.assert_array_equal(gp2.resample(arm, frame, 3)[first], some[first][:3])
     with pytest.raises(gp2.InputError, match="fewer than the n = 1000"):
         gp2.resample(arm, frame, 1000, seed=1, features=[first])
+
+
+@pytest.mark.parametrize("gap", [np.nan, None, pd.NA])
+def test_an_empty_cell_of_an_acceleration_is_not_measured(gap, arm, arm_log, tmp_path):
+    frame = pd.DataFrame(columns_of(arm_log))
+    whole = gp2.fit(arm, frame, max_iterations=0)
+    frame = frame.astype({"ddelbow": object})
+    frame.loc[4, "ddelbow"] = gap
+    fitted = gp2.fit(arm, frame, max_iterations=0)
+    assert fitted.n_data == len(frame)
+    assert fitted.negative_log_likelihood != whole.negative_log_likelihood
+    assert np.isnan(gp2.Table(frame)["ddelbow"][4])
+    assert fitted.evaluate(frame).n_missing == 1
+    fitted.save(tmp_path / "fit.json")
+    assert gp2.load(tmp_path / "fit.json").negative_log_likelihood == fitted.negative_log_likelihood
+
+
+def test_a_robust_fit_lists_what_it_distrusts(arm, arm_log):
+    log = columns_of(arm_log)
+    log["ddelbow"] = log["ddelbow"].copy()
+    log["ddelbow"][7] += 100 * np.std(log["ddelbow"])
+    fitted = gp2.fit(arm, log, robust=True, restarts=1)
+    worst = fitted.report.distrusted[0]
+    assert worst["state"] == 7
+    assert worst["distance"] > 4
+    assert not gp2.fit(arm, log, max_iterations=0).report.distrusted
+
+
+def test_states_are_projected_before_the_fit_where_asked_for(arm, arm_log):
+    log = columns_of(arm_log)
+    log["elbow"] = log["elbow"] + 1e-3
+    assert any("off the position constraint" in finding.text for finding in gp2.check(arm, log))
+    projected = gp2.fit(arm, log, project=True, max_iterations=0)
+    assert any("states projected onto the constraints" in note for note in projected.notes)
+    assert projected.negative_log_likelihood != gp2.fit(arm, log, max_iterations=0).negative_log_likelihood

@@ -68,12 +68,12 @@ position = ["x^2 + 1"]
                                             "circle.toml");
   MatrixXd states = MatrixXd::Zero(3, 2);
   states << 0.5, 0.7, 0, 0, 0, 0;
-  const ProjectedStates projected = project_states(*circle.system, {}, states);
+  const ProjectedStates projected = project_states(*circle.system, VectorXd(), states);
   ASSERT_EQ(projected.failures.size(), 2U);
   EXPECT_EQ(projected.failures[1].state, 1);
   EXPECT_THAT(projected.failures[1].text, HasSubstr("did not converge"));
   EXPECT_EQ(projected.states, states);
-  const std::vector<Finding> findings = check_states(*circle.system, states, {});
+  const std::vector<Finding> findings = check_states(*circle.system, states, VectorXd());
   ASSERT_FALSE(findings.empty());
   EXPECT_EQ(findings.back().level, Finding::Level::warning);
   EXPECT_EQ(findings.back().text, "2 states have no state on the constraints near them: rows 1, 2; fit --project refuses them");
@@ -106,7 +106,7 @@ position = ["sqrt(x^2 + y^2) - 1"]
   // off by 0, 0.1, 0.2 and −0.3 along x, with velocities along the circle
   states.row(0) << 1, 1.1, 1.2, 0.7;
   states.row(3) << 1, 2, 3, 4;
-  const std::vector<Finding> findings = check_states(*circle.system, states, {});
+  const std::vector<Finding> findings = check_states(*circle.system, states, VectorXd());
   ASSERT_EQ(findings.size(), 3U);
   EXPECT_EQ(findings[0].text, "off the position constraint 'sqrt(x^2 + y^2) - 1' by 0.2 in the median, 0.3 at most (row 4)");
   EXPECT_THAT(findings[1].text, HasSubstr("off the velocity constraint "));
@@ -114,7 +114,7 @@ position = ["sqrt(x^2 + y^2) - 1"]
             "the nearest states on the constraints, to which fit --project moves, differ in x by 0.2 in the median, 0.3 at most "
             "(row 4)");
   states.row(0).setOnes();
-  EXPECT_TRUE(check_states(*circle.system, states, {}).empty());
+  EXPECT_TRUE(check_states(*circle.system, states, VectorXd()).empty());
 }
 
 }  // namespace
