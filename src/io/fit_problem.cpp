@@ -110,13 +110,22 @@ Place place_of(const ModelFile& home, const Prior& prior, const PriorOptions& op
   return {*log.model, log.model, std::move(setting), there, std::move(parameters)};
 }
 
-// the likelihood would refuse these states too, but it does not know their rows in the log
-void require_mechanics_at(const Place& place, const MatrixXd& states, const std::vector<int>& rows, const CsvTable& log) {
+// the likelihood would refuse these states too, but it does not know their rows in the log. Where a constraint lets go at some of
+// them is counted
+void require_mechanics_at(const Place& place, const MatrixXd& states, const std::vector<int>& rows, const CsvTable& log,
+                          std::vector<std::string>& notes) {
   const MechanicsBatch mechanics = evaluate_mechanics(place.system(), states, place.parameters);
-  if (!mechanics.fault) return;
-  throw InputError(fmt::format("{}: data row {}: {} ('{}' with the model's parameters; see gp2 check)", log.name(),
-                               rows[static_cast<std::size_t>(mechanics.fault->state)] + 1, mechanics.fault->text,
-                               place.system().name()));
+  const auto data_row = [&](int state) { return rows[static_cast<std::size_t>(state)] + 1; };
+  if (mechanics.fault) {
+    throw InputError(fmt::format("{}: data row {}: {} ('{}' with the model's parameters; see gp2 check)", log.name(),
+                                 data_row(mechanics.fault->state), mechanics.fault->text, place.system().name()));
+  }
+  const LowerRank lower = states_of_lower_rank(mechanics);
+  if (lower.states.empty()) return;
+  notes.push_back(
+      fmt::format("warning: {}: the constraints have rank {} but at {} of {} rows, where it is as low as {}, first at "
+                  "data row {}; see gp2 check",
+                  log.name(), lower.usual, lower.states.size(), rows.size(), lower.lowest, data_row(lower.states.front())));
 }
 
 // σ of a row of a group; refused where ε‖K̃‖ ≪ 1 could not hold at a signal of the given size
@@ -285,7 +294,7 @@ Observations read_log(const Place& place, const Log& log, const FitProblemOption
     if (group.has_noise_scale()) group.noise_scale = MatrixXd(group.noise_scale(Eigen::all, rows));
     notes.push_back(fmt::format("{}: {} of {} rows taken, by seed {}", log.table.name(), rows.size(), n_rows, options.seed));
   }
-  require_mechanics_at(place, group.states, rows, log.table);
+  require_mechanics_at(place, group.states, rows, log.table, notes);
 
   const bool model_estimates = place.model.noise.estimate && !options.noise_stddev && !group.has_noise_scale();
   group.estimate_noise = options.protocol.name != Protocol::Name::paper && (options.estimate_noise || model_estimates);
@@ -341,7 +350,7 @@ Observations read_knowledge(const Place& place, const Prior& home, const Knowled
   group.states = states_of(place.prior, group.view, reader);
   note_reading(reader, table, notes);
   note_violation(system, group.states, place.parameters, table, notes);
-  require_mechanics_at(place, group.states, chosen_rows(table.n_rows(), table.n_rows(), 0), table);
+  require_mechanics_at(place, group.states, chosen_rows(table.n_rows(), table.n_rows(), 0), table, notes);
   return group;
 }
 
