@@ -1,4 +1,7 @@
+#include <cmath>
+#include <functional>
 #include <thread>
+#include <vector>
 
 #include <gtest/gtest.h>
 
