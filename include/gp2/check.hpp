@@ -6,7 +6,7 @@
 
 #include <Eigen/Core>
 
-#include "gp2/system.hpp"
+#include "gp2/mechanics.hpp"
 
 namespace gp2 {
 
@@ -32,6 +32,14 @@ inline constexpr double constraint_violation_tolerance = 1e-6;
 std::optional<ConstraintViolation> largest_violation(const System& system, const Eigen::Ref<const Eigen::MatrixXd>& states,
                                                      const Eigen::Ref<const Eigen::VectorXd>& parameters);
 
+/// States where A has a lower rank than at others: a constraint lets go there, or follows from the rest.
+struct LowerRank {
+  int usual = 0;            // the highest rank
+  int lowest = 0;           // of A over the states
+  std::vector<int> states;  // where it is below the highest, in order
+};
+LowerRank states_of_lower_rank(const MechanicsBatch& mechanics);
+
 /// Whether measured accelerations obey A ddq = b to rounding: then they were computed from each other, and only nq − rank(A) of
 /// them are independent measurements. Treating all as independent makes an estimated noise collapse to zero.
 ///
@@ -41,9 +49,9 @@ std::optional<std::vector<int>> dependent_columns(const System& system, const Ei
                                                   const Eigen::Ref<const Eigen::VectorXd>& parameters,
                                                   const Eigen::Ref<const Eigen::MatrixXd>& accelerations);
 
-/// Is the system well-posed at these states? M symmetric and positive definite or completed by A, A of constant rank and not
-/// nearly zero, b in the range of A, derivatives in the parameters equal to finite differences, A and b equal to the second
-/// derivative of the constraints along a motion.
+/// Is the system well-posed at these states? M symmetric and positive definite or completed by A, A of constant rank, its rows
+/// neither nearly zero nor nearly redundant, b in the range of A, derivatives in the parameters equal to finite differences, A
+/// and b equal to the second derivative of the constraints along a motion.
 ///
 /// @param states  (layout size × N), as good as on the constraint
 std::vector<Finding> check_system(const System& system, const Eigen::Ref<const Eigen::MatrixXd>& states,

@@ -80,7 +80,8 @@ struct Scales {
   Eigen::VectorXd acceleration_stddev;          // σ (nq)
 };
 
-/// σ_j = std of the observed ddq_j; for an unobserved j, σ_j = √(mean over observed i of M_ii σ_i²/M_jj), M at its median.
+/// σ_j = std of the observed ddq_j, or the size of its values where they do not vary; where there are none, or all are 0,
+/// σ_j = √(mean over observed i of M_ii σ_i²/M_jj), M at its median.
 Scales default_scales(const Prior& prior, const std::vector<Observations>& observations);
 
 /// Everything tunable: kernels and signals of every latent, noise where it is estimated, and the named parameters of the system.

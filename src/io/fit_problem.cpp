@@ -175,15 +175,23 @@ Place place_of(const ModelFile& home, const Prior& prior, const PriorOptions& op
   return {*log.model, log.model, std::move(setting), there, std::move(parameters)};
 }
 
-// the likelihood would refuse these states too, but it does not know their rows in the log
+// the likelihood would refuse these states too, but it does not know their rows in the log. Where a constraint lets go at some of
+// them is counted
 void require_mechanics_at(const Place& place, const View& view, const MatrixXd& states, const std::vector<int>& rows,
-                          const CsvTable& log) {
+                          const CsvTable& log, std::vector<std::string>& notes) {
   MechanicsBatch mechanics;
   evaluate_mechanics(place.prior, view, states, place.parameters, mechanics);
-  if (!mechanics.fault) return;
-  throw InputError(fmt::format("{}: data row {}: {} ('{}' with the model's parameters; see gp2 check)", log.name(),
-                               rows[static_cast<std::size_t>(mechanics.fault->state)] + 1, mechanics.fault->text,
-                               place.system().name()));
+  const auto data_row = [&](int state) { return rows[static_cast<std::size_t>(state)] + 1; };
+  if (mechanics.fault) {
+    throw InputError(fmt::format("{}: data row {}: {} ('{}' with the model's parameters; see gp2 check)", log.name(),
+                                 data_row(mechanics.fault->state), mechanics.fault->text, place.system().name()));
+  }
+  const LowerRank lower = states_of_lower_rank(mechanics);
+  if (lower.states.empty()) return;
+  notes.push_back(
+      fmt::format("warning: {}: the constraints have rank {} but at {} of {} rows, where it is as low as {}, first at "
+                  "data row {}; see gp2 check",
+                  log.name(), lower.usual, lower.states.size(), rows.size(), lower.lowest, data_row(lower.states.front())));
 }
 
 // --project: the states of a log moved onto the constraints, at the model's parameters
@@ -403,7 +411,7 @@ Observations read_log(const Place& place, const Log& log, const FitProblemOption
   }
   if (static_cast<int>(rows.size()) < n_rows) keep_rows(group, rows);
   lines = lines_of(rows, log.table);
-  require_mechanics_at(place, group.view, group.states, rows, log.table);
+  require_mechanics_at(place, group.view, group.states, rows, log.table, notes);
 
   const bool model_estimates = place.model.noise.estimate && !options.noise_stddev && !group.has_noise_scale();
   group.estimate_noise = options.protocol.name != Protocol::Name::paper && (options.estimate_noise || model_estimates);
@@ -465,7 +473,7 @@ Observations read_knowledge(const Place& place, const Prior& home, const Knowled
   const std::vector<int> measured = measured_rows(group, names, table, notes);
   keep_rows(group, measured);
   lines = lines_of(measured, table);
-  require_mechanics_at(place, group.view, group.states, measured, table);
+  require_mechanics_at(place, group.view, group.states, measured, table, notes);
   return group;
 }
 

@@ -6,6 +6,7 @@
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
+#include <Eigen/Cholesky>
 #include <Eigen/Eigenvalues>
 #include <Eigen/SVD>
 
@@ -132,6 +133,19 @@ std::optional<ConstraintViolation> largest_violation(const System& system, const
   return worst;
 }
 
+LowerRank states_of_lower_rank(const MechanicsBatch& mechanics) {
+  LowerRank lower;
+  if (mechanics.projections.empty()) return lower;
+  const auto by_rank = [](const UdwadiaKalaba& a, const UdwadiaKalaba& b) { return a.rank() < b.rank(); };
+  const auto [lowest, highest] = std::minmax_element(mechanics.projections.begin(), mechanics.projections.end(), by_rank);
+  lower.lowest = lowest->rank();
+  lower.usual = highest->rank();
+  for (std::size_t i = 0; i < mechanics.projections.size(); ++i) {
+    if (mechanics.projections[i].rank() < lower.usual) lower.states.push_back(static_cast<int>(i));
+  }
+  return lower;
+}
+
 std::optional<std::vector<int>> dependent_columns(const System& system, const Ref<const MatrixXd>& states,
                                                   const Ref<const VectorXd>& parameters,
                                                   const Ref<const MatrixXd>& accelerations) {
@@ -181,6 +195,33 @@ int rank_of_mass(const MatrixXd& M) {
   return static_cast<int>((eigenvalues.array() > UdwadiaKalaba::mass_tolerance).count());
 }
 
+// rows that nearly follow from each other: accelerations are a difference of large numbers
+void check_independence(const MechanicsBatch& mechanics, std::vector<Finding>& findings) {
+  // half of the digits are left; a row with noise that was meant to follow from the others is worse
+  constexpr double tolerance = 1e-7;
+  double worst = 1;
+  int state = 0, n_states = 0;
+  for (int i = 0; i < mechanics.values.n_states(); ++i) {
+    const UdwadiaKalaba& projection = mechanics.projections[static_cast<std::size_t>(i)];
+    if (projection.rank() == 0) continue;
+    // rows of A M^{-1/2}, of unit norm
+    MatrixXd B = projection.mass().llt().matrixL().solve(mechanics.values.A(i).transpose());
+    for (Index row = 0; row < B.cols(); ++row) B.col(row).stableNormalize();
+    const VectorXd values = Eigen::BDCSVD<MatrixXd>(B).singularValues();
+    const double smallest = values[projection.rank() - 1] / values[0];
+    n_states += smallest < tolerance ? 1 : 0;
+    if (smallest >= worst) continue;
+    worst = smallest;
+    state = i;
+  }
+  if (n_states == 0) return;
+  findings.push_back(
+      {Level::warning, fmt::format("constraints: rows nearly follow from each other at {} of {} states (singular values down to "
+                                   "{:.1e} of the largest, at state {}); leave out what is redundant, or write it so that it is "
+                                   "so to rounding",
+                                   n_states, mechanics.values.n_states(), worst, state + 1)});
+}
+
 // M, A, b: definite or completed by A, of constant rank, consistent
 void check_mechanics(const System& system, const MechanicsBatch& mechanics, std::vector<Finding>& findings) {
   const int n_states = mechanics.values.n_states();
@@ -215,22 +256,24 @@ void check_mechanics(const System& system, const MechanicsBatch& mechanics, std:
     return;
   }
 
-  int lowest = system.nc(), highest = 0, zero_rows = 0;
-  for (const UdwadiaKalaba& projection : mechanics.projections) {
-    lowest = std::min(lowest, projection.rank());
-    highest = std::max(highest, projection.rank());
-    zero_rows += projection.n_zero_rows();
-  }
-  if (lowest != highest) {
+  int zero_rows = 0;
+  for (const UdwadiaKalaba& projection : mechanics.projections) zero_rows += projection.n_zero_rows();
+  const LowerRank lower = states_of_lower_rank(mechanics);
+  const int highest = lower.usual;
+  if (!lower.states.empty()) {
     findings.push_back(
-        {Level::warning, fmt::format("constraints: the rank of A changes over the states, from {} to {} of {} rows", lowest,
-                                     highest, system.nc())});
+        {Level::warning,
+         fmt::format("constraints: the rank of A changes over the states, from {} to {} of {} rows; it is lower at {} of {} "
+                     "states, first at state {}",
+                     lower.lowest, highest, system.nc(), lower.states.size(), mechanics.values.n_states(),
+                     lower.states.front() + 1)});
   } else if (highest < system.nc()) {
     findings.push_back({Level::good, fmt::format("constraints: rank {} of {} rows: {} redundant, which is allowed", highest,
                                                  system.nc(), system.nc() - highest)});
   } else {
     findings.push_back({Level::good, fmt::format("constraints: {} rows, independent at every state", system.nc())});
   }
+  check_independence(mechanics, findings);
   if (highest >= system.nq()) {
     findings.push_back(
         {Level::warning, "constraints: they leave no freedom (rank = number of coordinates): nothing is left to learn"});

@@ -1,5 +1,6 @@
 #include <algorithm>
 #include <cmath>
+#include <limits>
 #include <string>
 #include <utility>
 #include <vector>
@@ -22,6 +23,8 @@ using Eigen::Ref;
 using Eigen::VectorXd;
 
 namespace {
+
+constexpr double smallest_row = std::numeric_limits<double>::min();  // of which there is an inverse
 
 // M = C Cᵀ, from the lower triangle of M to C in its place. Returns the smallest squared pivot, as a fraction of its diagonal
 // entry; 0 where one is lost to rounding, or negative
@@ -201,9 +204,11 @@ void UdwadiaKalaba::compute(const Ref<const MatrixXd>& M, const Ref<const Matrix
   solve_lower(mass_factor_, rows_);
   for (Index k = 0; k < nc; ++k) {
     double* const row = rows_.col(k).data();
-    const double square = internal::dot(row, row, nq);
-    if (square == 0) ++n_zero_rows_;
-    const double scale = square == 0 ? 0 : 1 / std::sqrt(square);
+    double norm = std::sqrt(internal::dot(row, row, nq));
+    // squares of tiny and huge entries are no doubles
+    if (!(norm > 1e-140 && norm < 1e140)) norm = rows_.col(k).stableNorm();
+    const double scale = norm < smallest_row ? 0 : 1 / norm;
+    if (scale == 0) ++n_zero_rows_;
     row_scale_[k] = scale;
     b_unit_[k] *= scale;
     for (Index i = 0; i < nq; ++i) {
@@ -239,6 +244,13 @@ void UdwadiaKalaba::decompose_rows() {
   const Index rank = internal::pivoted_qr(rows_, reflection_, order_, rank_tolerance);
   rank_ = static_cast<int>(rank);
 
+  // nothing constrains the motion: T = I to the bit, so that the force of constraints is 0 and not rounding that looks like news
+  if (rank == 0) {
+    T_.setIdentity(nq, nq);
+    L_unit_.setZero(nq, nc);
+    return;
+  }
+
   // Bᵀ P = [Y Z] [R; 0]: Y spans range(Bᵀ), Z its complement, and T = C⁻ᵀ Z Zᵀ Cᵀ
   T_ = mass_factor_.transpose();
   for (Index j = 0; j < nq; ++j) T_.col(j).tail(nq - 1 - j).setZero();
@@ -256,7 +268,7 @@ void UdwadiaKalaba::decompose_rows() {
         x[i] = ((i == j ? 1 : 0) - internal::dot(rows_.col(i).data() + j, x + j, i - j)) / rows_(i, i);
       }
     }
-  } else if (rank > 0) {
+  } else {
     // Rᵀ P₂ = Q₂ R₂ is (nc × rank), of full rank: (Rᵀ)⁺ = P₂ R₂⁻¹ Q₂ᵀ
     R_transposed_.resize(nc, std::min(nq, nc));
     reflection2_.resize(R_transposed_.cols());

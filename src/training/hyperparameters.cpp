@@ -46,11 +46,21 @@ double median(std::vector<double> values) {
 // a spread that bounds and starting points can be multiples of, even where the data do not vary
 double usable(double spread, double fallback) { return spread > 0 && std::isfinite(spread) ? spread : fallback; }
 
-// what a group says of the accelerations' spread, per row of its view; nothing where the view is of another kind
-std::optional<VectorXd> acceleration_stddev(const Observations& group, const VectorXd& mass_diagonal) {
+// standard deviation of each row; 0 where it does not vary but for rounding
+VectorXd spread_of_rows(const Eigen::Ref<const MatrixXd>& values) {
+  const VectorXd stddev = row_stddev(values);
+  return (stddev.array() > 1e-12 * values.cwiseAbs().rowwise().maxCoeff().array()).select(stddev, 0);
+}
+
+VectorXd size_of_rows(const Eigen::Ref<const MatrixXd>& values) { return values.cwiseAbs().rowwise().maxCoeff(); }
+
+// what a group says of the accelerations' spread, or of their size, per row of its view; nothing where the view is of another
+// kind
+template <typename OfRows>
+std::optional<VectorXd> acceleration_scale(const Observations& group, const VectorXd& mass_diagonal, const OfRows& of_rows) {
   using Quantity = View::Quantity;
   if (group.view.latent >= 0) return std::nullopt;
-  VectorXd stddev = row_stddev(group.values);
+  VectorXd stddev = of_rows(group.values);
   switch (group.view.quantity) {
     case Quantity::constrained_acceleration:
     case Quantity::unconstrained_acceleration:
@@ -62,22 +72,29 @@ std::optional<VectorXd> acceleration_stddev(const Observations& group, const Vec
     case Quantity::next_velocity: {
       const Index nq = mass_diagonal.size();
       const MatrixXd dq = group.states.middleRows(nq, nq)(group.view.rows, Eigen::all);
-      return VectorXd(row_stddev(group.values - dq) / group.view.time_step);
+      return VectorXd(of_rows(group.values - dq) / group.view.time_step);
     }
   }
   return std::nullopt;
 }
 
-// σ_j of every coordinate: measured where ddq_j is observed, otherwise by equal kinetic scale √(mean M_ii σ_i² / M_jj)
+// σ_j of every coordinate: where ddq_j is observed its spread, or its size where it does not vary; otherwise by equal kinetic
+// scale √(mean M_ii σ_i² / M_jj)
 VectorXd coordinate_scales(const System& system, const std::vector<Observations>& observations, const VectorXd& mass_diagonal) {
   VectorXd variance = VectorXd::Constant(system.nq(), -1);
-  for (const Observations& group : observations) {
-    const std::optional<VectorXd> stddev = acceleration_stddev(group, mass_diagonal);
-    for (Index k = 0; stddev && k < stddev->size(); ++k) {
-      double& entry = variance[group.view.rows[static_cast<std::size_t>(k)]];
-      entry = std::max(entry, (*stddev)[k] * (*stddev)[k]);
+  const auto add = [&](const auto& of_rows) {
+    for (const Observations& group : observations) {
+      const std::optional<VectorXd> scale = acceleration_scale(group, mass_diagonal, of_rows);
+      for (Index k = 0; scale && k < scale->size(); ++k) {
+        double& entry = variance[group.view.rows[static_cast<std::size_t>(k)]];
+        entry = std::max(entry, (*scale)[k] * (*scale)[k]);
+      }
     }
-  }
+  };
+  add(spread_of_rows);
+  const VectorXd of_spread = variance;
+  add(size_of_rows);
+  variance = (of_spread.array() > 0).select(of_spread, variance);
   double kinetic = 0;
   int n_observed = 0;
   for (Index j = 0; j < variance.size(); ++j) {
@@ -147,11 +164,12 @@ Scales default_scales(const Prior& prior, const std::vector<Observations>& obser
     scales.signal_stddev.push_back(std::move(signal));
   }
   for (const Observations& group : observations) {
-    VectorXd stddev = row_stddev(group.values);
+    VectorXd stddev = spread_of_rows(group.values);
+    const VectorXd size = size_of_rows(group.values);
     for (Index k = 0; k < stddev.size(); ++k) {
       const auto row = static_cast<std::size_t>(group.view.rows[static_cast<std::size_t>(k)]);
       const bool per_coordinate = group.view.quantity != View::Quantity::multipliers;
-      stddev[k] = usable(stddev[k], per_coordinate ? sigma[static_cast<Index>(row)] : 1);
+      stddev[k] = usable(stddev[k], usable(size[k], per_coordinate ? sigma[static_cast<Index>(row)] : 1));
     }
     scales.output_stddev.push_back(std::move(stddev));
   }

@@ -1,0 +1,134 @@
+#include <gmock/gmock.h>
+#include <gtest/gtest.h>
+
+#include "gp2/check.hpp"
+#include "gp2/error.hpp"
+#include "gp2/fit_problem.hpp"
+#include "gp2/generate.hpp"
+
+// Constraints that let go at some states, or nearly follow from each other: counted, reported, and named where they contradict.
+namespace gp2 {
+namespace {
+
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+using testing::AllOf;
+using testing::Contains;
+using testing::HasSubstr;
+
+ModelFile model_with(const std::string& constraints) {
+  return ModelFile::parse(R"toml(
+name        = "cart"
+coordinates = ["x", "y", "z"]
+[mechanics]
+mass  = [["2", "0", "0"], ["0", "1", "0"], ["0", "0", "1"]]
+force = ["0", "0", "0"]
+[constraints]
+acceleration = )toml" + constraints +
+                              R"toml(
+[[latent]]
+kernel     = "se"
+features   = ["x", "dx"]
+directions = "acceleration"
+[noise]
+ddq = 0.1
+)toml",
+                          "cart");
+}
+
+// eight states, x = 0 at the third and the seventh
+MatrixXd states() {
+  MatrixXd states = MatrixXd::Constant(7, 8, 0.5);
+  states.row(0).setLinSpaced(1, 8);
+  states(0, 2) = states(0, 6) = 0;
+  return states;
+}
+
+CsvTable log_of(const ModelFile& model) {
+  GeneratedData data{states(), MatrixXd::Random(3, 8), std::vector<bool>(7, true)};
+  return as_table(data, *model.system, "log.csv");
+}
+
+std::string text_of(const std::vector<Finding>& findings, Finding::Level level) {
+  std::string text;
+  for (const Finding& finding : findings) {
+    if (finding.level == level) text += finding.text + "\n";
+  }
+  return text;
+}
+
+TEST(ChangingRankTest, StatesOfLowerRankAreCounted) {
+  const ModelFile lets_go = model_with(R"-(["x*(ddx - ddy)", "ddz"])-");
+  const MechanicsBatch mechanics = require_mechanics(*lets_go.system, states(), VectorXd());
+  const LowerRank lower = states_of_lower_rank(mechanics);
+  EXPECT_EQ(lower.usual, 2);
+  EXPECT_EQ(lower.lowest, 1);
+  EXPECT_EQ(lower.states, (std::vector<int>{2, 6}));
+  EXPECT_THAT(text_of(check_system(*lets_go.system, states(), VectorXd()), Finding::Level::warning),
+              AllOf(HasSubstr("from 1 to 2 of 2 rows; it is lower at 2 of 8 states, first at state 3"),
+                    HasSubstr("a row of A vanishes 2 times; it is dropped there")));
+  const FitProblem problem = make_fit_problem(lets_go, log_of(lets_go), {});
+  EXPECT_THAT(problem.notes, Contains(AllOf(HasSubstr("the constraints have rank 2 but at 2 of 8 rows"),
+                                            HasSubstr("as low as 1, first at data row 3"))));
+}
+
+TEST(ChangingRankTest, ConstraintsOfOneRankAreNoteworthyToNobody) {
+  const ModelFile constant = model_with(R"-(["ddx - ddy", "2*ddx - 2*ddy", "ddz"])-");
+  EXPECT_TRUE(states_of_lower_rank(require_mechanics(*constant.system, states(), VectorXd())).states.empty());
+  EXPECT_EQ(text_of(check_system(*constant.system, states(), VectorXd()), Finding::Level::warning), "");
+  EXPECT_THAT(make_fit_problem(constant, log_of(constant), {}).notes, testing::Not(Contains(HasSubstr("rank"))));
+}
+
+TEST(ChangingRankTest, RowsThatNearlyFollowFromEachOtherAreReported) {
+  // the third row differs from the first by 1e-9 at one state, by much at others
+  const ModelFile nearly = model_with(R"-(["ddx - ddy", "ddx - ddy*(1 + 1e-9 + (x - 4)^2)"])-");
+  EXPECT_THAT(text_of(check_system(*nearly.system, states(), VectorXd()), Finding::Level::warning),
+              AllOf(HasSubstr("rows nearly follow from each other at 1 of 8 states"), HasSubstr("at state 4")));
+}
+
+TEST(ChangingRankTest, AContradictionIsRefusedByItsRowOfTheLog) {
+  const ModelFile contradictory = model_with(R"-(["ddx - ddy - 1", "x*(2*ddx - 2*ddy - 2) - 0.001*x*(x - 4)^2*(x - 8)"])-");
+  EXPECT_THAT(text_of(check_system(*contradictory.system, states(), VectorXd()), Finding::Level::error),
+              AllOf(HasSubstr("contradict"), HasSubstr("at state 1")));
+  try {
+    make_fit_problem(contradictory, log_of(contradictory), {});
+    FAIL() << "no error";
+  } catch (const InputError& error) {
+    EXPECT_THAT(error.what(), AllOf(HasSubstr("log.csv: data row 1"), HasSubstr("contradict")));
+  }
+}
+
+// squares of such entries are no doubles
+TEST(ChangingRankTest, RowsOfAnySizeCount) {
+  const MatrixXd M = MatrixXd::Identity(2, 2);
+  for (const double size : {1e-300, 1e-170, 1e-160, 1.0, 1e160, 1e300}) {
+    const MatrixXd A = size * (MatrixXd(1, 2) << 1, 2).finished();
+    const UdwadiaKalaba projection(M, A, VectorXd::Constant(1, 5 * size));
+    EXPECT_EQ(projection.rank(), 1);
+    EXPECT_EQ(projection.n_zero_rows(), 0);
+    EXPECT_LE((projection.Lb() - Eigen::Vector2d(1, 2)).norm(), 1e-15 * 8);
+    EXPECT_LE(projection.inconsistency(), 1e-14);
+  }
+  // what is no number with an inverse is none, and that is counted
+  EXPECT_EQ(UdwadiaKalaba(M, MatrixXd::Constant(1, 2, 1e-310), VectorXd::Zero(1)).n_zero_rows(), 1);
+}
+
+// Found by a property: M (T − I) was rounding there, which a small noise made into an observation of ā.
+TEST(ChangingRankTest, AForceOfConstraintsThatAreNotThereSaysNothing) {
+  const MatrixXd M = (MatrixXd(2, 2) << 1.7, 0.3, 0.3, 0.9).finished();
+  for (const int n_rows : {0, 1, 3}) {
+    const UdwadiaKalaba projection(M, MatrixXd::Zero(n_rows, 2), VectorXd::Zero(n_rows));
+    EXPECT_EQ(projection.T(), MatrixXd::Identity(2, 2));
+  }
+  const ModelFile free = model_with("[]");
+  const Prior prior = make_prior(free);
+  const View force = View::all(View::Quantity::constraint_force, *free.system);
+  const Observations contradicting{states(), force, MatrixXd::Ones(3, 8), VectorXd::Constant(3, 1e-6), false};
+  const ModelValues values = model_values(prior, {contradicting}, default_hyperparameters(prior, {contradicting}, {}, {}));
+  const Posterior posterior(prior, {contradicting}, values);
+  EXPECT_EQ(posterior.reduced_size(), 0);
+  EXPECT_TRUE(posterior.mean(View::all(View::Quantity::unconstrained_acceleration, *free.system), states()).isZero(0));
+}
+
+}  // namespace
+}  // namespace gp2
