@@ -14,6 +14,7 @@
 #include "gp2/csv.hpp"
 #include "gp2/error.hpp"
 #include "gp2/version.hpp"
+#include "symbolic/graph.hpp"
 
 namespace gp2 {
 
@@ -77,8 +78,9 @@ double number(const Json& json) {
   return json.get<double>();
 }
 
-Json parse_json(const std::filesystem::path& path) {
-  Json json = Json::parse(read_file(path), nullptr, false);
+/// @param path  stands for the file in messages
+Json parse_json(std::string_view text, const std::filesystem::path& path) {
+  Json json = Json::parse(text, nullptr, false);
   if (json.is_discarded()) {
     throw InputError(
         fmt::format("{}: not valid JSON: the file is cut short or damaged; write it again with gp2 fit", path.string()));
@@ -222,9 +224,12 @@ bool mechanics_are_code(const Json& model) {
 /// @param mechanics  null: not given
 ModelFile model_from(const Json& json, const MechanicsSource* mechanics) {
   if (!mechanics_are_code(json)) {
-    if (!json.contains("robot")) return ModelFile::parse(json.at("text"), json.at("name"));
-    return ModelFile::parse(json.at("text"), json.at("name"),
-                            RobotSource([&](const std::string&) { return robot_from_json(json.at("robot").dump()); }));
+    // a fit is whole in itself: its text must not make it read other files
+    const RobotSource robot = [&](const std::string& file) {
+      if (!json.contains("robot")) throw InputError(fmt::format("the fit does not hold the robot of '{}'", file));
+      return robot_from_json(json.at("robot").dump());
+    };
+    return ModelFile::parse(json.at("text"), json.at("name"), robot);
   }
   if (mechanics == nullptr) {
     throw InputError(
@@ -404,10 +409,12 @@ namespace {
 
 bool is_fit(const Json& json) { return json.is_object() && json.contains("format") && json.at("format") == format_name; }
 
+/// @param path       stands for the file in messages
 /// @param mechanics  null: not given
-FitFile read_fit(const std::filesystem::path& path, const MechanicsSource* mechanics) {
+FitFile read_fit(std::string_view text, const std::filesystem::path& path, const MechanicsSource* mechanics) {
   constexpr int format_version = FitFile::format_version;
-  const Json json = parse_json(path);
+  const internal::StepLimit limit;  // for all its models together
+  const Json json = parse_json(text, path);
   FitFile fit;
   try {
     if (!is_fit(json)) throw InputError("not a fit written by gp2");
@@ -461,9 +468,13 @@ FitFile read_fit(const std::filesystem::path& path, const MechanicsSource* mecha
 
 }  // namespace
 
-FitFile FitFile::read(const std::filesystem::path& path) { return read_fit(path, nullptr); }
+FitFile FitFile::read(const std::filesystem::path& path) { return read_fit(read_file(path), path, nullptr); }
 
-FitFile FitFile::read(const std::filesystem::path& path, const MechanicsSource& mechanics) { return read_fit(path, &mechanics); }
+FitFile FitFile::parse(std::string_view text, const std::string& name) { return read_fit(text, name, nullptr); }
+
+FitFile FitFile::read(const std::filesystem::path& path, const MechanicsSource& mechanics) {
+  return read_fit(read_file(path), path, &mechanics);
+}
 
 namespace {
 
@@ -485,7 +496,7 @@ std::vector<Hyperparameter> hyperparameters_of(const std::filesystem::path& path
 }  // namespace
 
 void read_start_values(const std::filesystem::path& path, std::vector<Hyperparameter>& hyperparameters) {
-  const Json json = parse_json(path);
+  const Json json = parse_json(read_file(path), path);
   std::vector<std::pair<std::string, double>> values;
   const bool of_fit = is_fit(json);
   if (of_fit) {

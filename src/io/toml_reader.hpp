@@ -1,6 +1,7 @@
 #pragma once
 
 #include <string>
+#include <string_view>
 #include <utility>
 #include <vector>
 
@@ -16,6 +17,10 @@ class LocatedError : public InputError {
   using InputError::InputError;
 };
 
+/// toml++ goes down into arrays, tables and dotted keys by recursion, and bounds that for brackets only.
+/// @throws LocatedError when brackets nest deeper than 32, or a key has more than 16 dots.
+void require_shallow(std::string_view text, const std::string& file_name);
+
 /// The entries of a table in the file's own order: TOML tables are sorted by name.
 std::vector<std::pair<std::string, const toml::node*>> entries_of(const toml::table& table);
 
@@ -24,8 +29,8 @@ int line_of(const toml::node& node);
 /// A value as the file has it, to show what was got; at most 60 bytes.
 std::string written(const toml::node& node);
 
-/// At most 60 bytes of a text, cut between characters.
-std::string shortened(const std::string& text);
+/// At most so many bytes of a text, cut between characters.
+std::string shortened(const std::string& text, std::size_t max_size = 60);
 
 /// Typed access to the nodes of a TOML file; what does not fit is an error "FILE:LINE: KEY: what was expected, what was got".
 class TomlReader {
