@@ -1,5 +1,6 @@
 #include <cstdio>
 #include <filesystem>
+#include <system_error>
 
 #include <fmt/format.h>
 
@@ -42,10 +43,18 @@ CLI::Validator not_negative() {
   return {check, ""};
 }
 
-void require_folder(const std::string& output) {
+void require_output(const std::string& output, const std::vector<std::string>& inputs) {
   const std::filesystem::path folder = std::filesystem::path(output).parent_path();
   if (!folder.empty() && !std::filesystem::is_directory(folder)) {
     throw InputError(fmt::format("-o {}: there is no folder '{}'; make it first", output, folder.string()));
+  }
+  require_writable(output);
+  std::error_code not_there;
+  if (!std::filesystem::is_regular_file(output, not_there)) return;
+  for (const std::string& input : inputs) {
+    if (std::filesystem::equivalent(output, input, not_there)) {
+      throw InputError(fmt::format("-o {}: that is the input {}, which would be lost; write to another file", output, input));
+    }
   }
 }
 

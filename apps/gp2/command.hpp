@@ -37,8 +37,10 @@ std::vector<std::string> parse_list(const std::string& text);
 /// For unsigned options: CLI11 would take -1 for the largest number there is.
 CLI::Validator not_negative();
 
-/// @throws InputError when the folder of a file to be written does not exist: better said before an hour of work than after.
-void require_folder(const std::string& output);
+/// Whether a file can be written at the end: better said before an hour of work than after.
+/// @param inputs  files that are read, which it must not replace; "" for none
+/// @throws InputError when its folder does not exist, it is an input, or as require_writable.
+void require_output(const std::string& output, const std::vector<std::string>& inputs);
 
 /// work(), with the log named in what it throws: a posterior knows the number of a state only.
 template <typename Work>

@@ -107,7 +107,7 @@ void report(const DerivedData& data, const System& system) {
 }
 
 void run(const Arguments& arguments) {
-  require_folder(arguments.output);
+  require_output(arguments.output, {arguments.log, arguments.model});
   const ModelFile model = ModelFile::read(arguments.model);
   const CsvTable log = CsvTable::read(arguments.log);
   DeriveOptions options;

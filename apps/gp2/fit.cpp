@@ -1,6 +1,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdio>
+#include <cstring>
 #include <memory>
 
 #include <unistd.h>
@@ -12,7 +13,9 @@
 #include "command.hpp"
 #include "gp2/csv.hpp"
 #include "gp2/error.hpp"
+#include "gp2/fit_memory.hpp"
 #include "gp2/fit_problem.hpp"
+#include "interruption.hpp"
 
 namespace gp2::command {
 
@@ -94,7 +97,7 @@ void print_progress(const Progress& p) {
   std::fflush(stderr);
 }
 
-Json to_json(const FitReport& report) {
+Json to_json(const FitReport& report, const std::string& options) {
   Json hyperparameters = Json::array();
   for (const Hyperparameter& h : report.hyperparameters) {
     hyperparameters.push_back({{"name", h.name},
@@ -104,11 +107,9 @@ Json to_json(const FitReport& report) {
                                {"unit", h.unit},
                                {"at_bound", h.at_bound()}});
   }
-  return {{"nll", report.negative_log_likelihood},
-          {"termination", report.termination},
-          {"iterations", report.iterations},
-          {"seconds", report.seconds},
-          {"hyperparameters", hyperparameters}};
+  return {{"nll", report.negative_log_likelihood}, {"termination", report.termination},
+          {"iterations", report.iterations},       {"seconds", report.seconds},
+          {"options", Json::parse(options)},       {"hyperparameters", hyperparameters}};
 }
 
 void print_text(const FitReport& report) {
@@ -119,6 +120,33 @@ void print_text(const FitReport& report) {
     fmt::print("  {:<34} {:>13.6g}   [{:.3g}, {:.3g}]{}\n", h.name, h.value, h.lower, h.upper,
                h.at_bound() ? "   at its bound" : "");
   }
+}
+
+// what a fit reads and must not replace; where it starts from may be where it ends
+std::vector<std::string> inputs_of(const Arguments& arguments) {
+  std::vector<std::string> inputs = {arguments.model};
+  const auto add = [&](const std::string& log) {
+    const auto [path, model] = split_at_system(log);
+    inputs.insert(inputs.end(), {path, model});
+  };
+  for (const std::string& log : arguments.data) add(log);
+  for (const std::string& log : arguments.also) add(log.substr(log.find(':') + 1));
+  return inputs;
+}
+
+// the fit or, where a signal asked for its end before there was anything to give, nothing
+std::optional<Fit> fit_until(const Interruption& interruption, const FitProblem& problem, FitOptions options) {
+  options.stop = interruption.stop();
+  try {
+    return fit(problem, options);
+  } catch (const NumericalError&) {
+    if (interruption.signal() == 0) throw;
+    return std::nullopt;
+  }
+}
+
+std::string told(const Interruption& interruption) {
+  return fmt::format("interrupted by signal {} ({})", interruption.signal(), strsignal(interruption.signal()));
 }
 
 void run(const Arguments& arguments) {
@@ -134,14 +162,15 @@ void run(const Arguments& arguments) {
   if (arguments.threads < 0) {
     throw InputError(fmt::format("--threads: must be positive, or 0 for as many as the machine has; got {}", arguments.threads));
   }
-  require_folder(arguments.output);
+  require_output(arguments.output, inputs_of(arguments));
   FitFile file;
   file.model = ModelFile::read(arguments.model);
   std::vector<Log> logs;
   for (const std::string& text : arguments.data) logs.push_back(read_log(text));
   std::vector<Knowledge> also;
   for (const std::string& text : arguments.also) also.push_back(read_knowledge(text));
-  FitProblem problem = make_fit_problem(file.model, logs, also, problem_options(arguments));
+  const FitProblemOptions asked = problem_options(arguments);
+  FitProblem problem = make_fit_problem(file.model, logs, also, asked);
   if (!arguments.start.empty()) read_start(arguments.start, arguments.max_iterations, problem);
   talk(problem.notes);
 
@@ -150,27 +179,51 @@ void run(const Arguments& arguments) {
   options.max_iterations = arguments.max_iterations;
   options.seed = arguments.seed;
   options.n_threads = arguments.threads;
+  file.options =
+      fit_options_json(asked, options, arguments.start.empty() ? std::vector<Hyperparameter>() : problem.hyperparameters);
+  std::vector<std::string> of_memory;
+  options = within_memory(problem, options, free_memory(), of_memory);
+  talk(of_memory);
   const bool terminal = isatty(STDERR_FILENO) != 0;
   if (terminal) options.progress = print_progress;
-  Fit result = fit(problem, options);
+  const Interruption interruption;
+  const std::optional<Fit> result = fit_until(interruption, problem, options);
   if (terminal) fmt::print(stderr, "\r\033[K");
+  if (!result) {
+    talk({fmt::format("{} before there was a fit: nothing is written", told(interruption))});
+    throw Interrupted{interruption.signal()};
+  }
 
-  talk(notes_of(result.report));
+  const FitReport& report = result->report;
+  talk(notes_of(report));
+  const auto print = [&] {
+    if (arguments.json) {
+      fmt::print("{}\n", to_json(report, file.options).dump(2));
+    } else {
+      print_text(report);
+    }
+  };
   file.prior_options = problem.prior_options;
   std::vector<std::string> sources = arguments.data;
   sources.insert(sources.end(), arguments.also.begin(), arguments.also.end());
   file.data_source = fmt::format("{}", fmt::join(sources, ", "));
   file.observations = std::move(problem.observations);
   file.systems = std::move(problem.systems);
-  file.report = result.report;
-  file.write(arguments.output);
+  file.report = report;
+  try {
+    file.write(arguments.output);
+  } catch (const InputError&) {
+    print();  // what an hour has found is not lost to a full disk
+    throw;
+  }
   int n_rows = 0;
   for (const Observations& group : file.observations) n_rows += group.n_data();
   talk({fmt::format("{}: fit of '{}' to {} rows", arguments.output, file.model.system->name(), n_rows)});
-  if (arguments.json) {
-    fmt::print("{}\n", to_json(result.report).dump(2));
-  } else {
-    print_text(result.report);
+  print();
+  if (report.termination == FitReport::interrupted) {
+    talk({fmt::format("{}: {} holds the best so far, not converged; --start {} goes on from there", told(interruption),
+                      arguments.output, arguments.output)});
+    throw Interrupted{interruption.signal()};
   }
 }
 

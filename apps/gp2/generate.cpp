@@ -50,6 +50,7 @@ std::map<std::string, int> grid_of(const std::string& text) {
 void run(const Arguments& arguments) {
   if (arguments.n.has_value() != arguments.grid.empty()) throw InputError("give either --n or --grid; see gp2 generate --help");
   if (arguments.n && *arguments.n < 1) throw InputError(fmt::format("--n: must be positive, got {}", *arguments.n));
+  require_output(arguments.output, {arguments.model});
   const ModelFile model = ModelFile::read(arguments.model);
   const GeneratedData data = generate(
       model, {arguments.n.value_or(1), arguments.seed, noise_of(model, arguments.noise_stddev), grid_of(arguments.grid)});

@@ -1,5 +1,8 @@
 #include <algorithm>
+#include <cerrno>
+#include <csignal>
 #include <cstdio>
+#include <cstring>
 #include <exception>
 #include <string>
 #include <utility>
@@ -13,6 +16,7 @@
 #include "gp2/blas.hpp"
 #include "gp2/error.hpp"
 #include "gp2/version.hpp"
+#include "interruption.hpp"
 
 namespace {
 
@@ -23,6 +27,12 @@ int failed(int exit_code, const std::string& text) {
   std::fflush(stdout);  // where both go to one terminal or file, the results came first
   fmt::print(stderr, "gp2: {}\n", text);
   return exit_code;
+}
+
+// results that could not be printed must not pass as printed
+int finished() {
+  if (std::fflush(stdout) == 0 && std::ferror(stdout) == 0) return 0;
+  return failed(exit_bad_input, fmt::format("error: standard output: cannot be written: {}", std::strerror(errno)));
 }
 
 // of --version --verbose
@@ -65,6 +75,7 @@ void require_known_command(const CLI::App& app, int argc, char** argv) {
 
 int main(int argc, char** argv) {
   gp2::command::choose_blas_kernel(argv);
+  std::signal(SIGXFSZ, SIG_IGN);  // a file beyond the limit (ulimit -f) is an error to tell, like a full disk
   CLI::App app{
       "Learn the dynamics of constrained mechanical systems from measured data, with predictions that obey the constraints "
       "exactly."};
@@ -80,7 +91,8 @@ int main(int argc, char** argv) {
       "  gp2 generate models/surface.toml --n 100 -o train.csv\n"
       "  gp2 fit models/surface.toml --data train.csv -o fit.json\n"
       "  gp2 predict fit.json --states train.csv --cov std -o prediction.csv\n\n"
-      "Exit codes: 0 done, 1 numerical failure, 2 bad input. Results go to stdout, talk to stderr.");
+      "Exit codes: 0 done, 1 numerical failure, 2 bad input, 128 + n ended by signal n (130 Ctrl-C, 143 SIGTERM; gp2 fit "
+      "saves the best so far). Results go to stdout, talk to stderr.");
   gp2::command::add_show(app);
   gp2::command::add_check(app);
   gp2::command::add_generate(app);
@@ -102,6 +114,8 @@ int main(int argc, char** argv) {
     return app.exit(version);
   } catch (const CLI::ParseError& error) {
     return failed(exit_bad_input, fmt::format("error: {}\nRun gp2 --help, or gp2 COMMAND --help.", error.what()));
+  } catch (const gp2::command::Interrupted& interrupted) {
+    return 128 + interrupted.signal;
   } catch (const gp2::InputError& error) {
     return failed(exit_bad_input, fmt::format("error: {}", error.what()));
   } catch (const gp2::NumericalError& error) {
@@ -109,7 +123,8 @@ int main(int argc, char** argv) {
   } catch (const std::bad_alloc&) {
     return failed(exit_numerical, "numerical failure: not enough memory; take fewer points (--max-points)");
   } catch (const std::exception& error) {
+    if (std::ferror(stdout) != 0) return finished();  // where fmt could not print
     return failed(exit_numerical, fmt::format("internal error: {}", error.what()));
   }
-  return 0;
+  return finished();
 }

@@ -128,6 +128,7 @@ void run(const Arguments& arguments) {
   if (arguments.n_samples && *arguments.n_samples < 1) {
     throw InputError(fmt::format("--samples: must be at least 1, got {}", *arguments.n_samples));
   }
+  require_output(arguments.output, {arguments.fit, arguments.states, arguments.system});
   const FitFile fit = FitFile::read(arguments.fit);
   const CsvTable table = CsvTable::read(arguments.states);
   const Posterior posterior = arguments.unconditioned ? fit.posterior().without_data() : fit.posterior();

@@ -14,7 +14,7 @@ struct Arguments {
 };
 
 void run(const Arguments& arguments) {
-  require_folder(arguments.output);
+  require_output(arguments.output, {arguments.fit, arguments.data, arguments.truth});
   if (!arguments.map.empty() && arguments.data.empty()) {
     throw InputError("--map names columns of --data, which is not given; the fit has its own data");
   }

@@ -39,7 +39,7 @@ std::vector<std::string> parse_expressions(const std::string& text) {
 }
 
 void run(const Arguments& arguments) {
-  require_folder(arguments.output);
+  require_output(arguments.output, {arguments.log, arguments.model});
   const ModelFile model = ModelFile::read(arguments.model);
   const CsvTable log = CsvTable::read(arguments.log);
   ResampleOptions options;

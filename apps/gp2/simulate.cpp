@@ -303,7 +303,7 @@ void run(const Arguments& arguments) {
     if (!(tolerance > 0) || !std::isfinite(tolerance))
       throw InputError(fmt::format("{}: must be positive, got {}", option, tolerance));
   }
-  require_folder(arguments.output);
+  require_output(arguments.output, {arguments.subject, arguments.start, arguments.inputs.value_or("")});
   const Subject subject = read_subject(arguments.subject);
   if (arguments.n_samples && !subject.posterior)
     throw InputError("--samples: a model has no posterior to draw from; give a FIT.json");

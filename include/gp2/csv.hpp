@@ -60,11 +60,16 @@ std::string csv_cell(const std::string& text);
 /// The shortest text that reads back to the same double.
 std::string shortest(double value);
 
-/// Writes `content` to a file whole or not at all: into a temporary file beside it, flushed, then renamed over `path`. A link
-/// stays and its target is replaced; an old file's permissions are kept; a device or pipe, say /dev/stdout, is written to as it
-/// is.
-/// @throws InputError naming the path when that fails; an old file at `path` is then intact.
+/// Writes `content` to a file whole or not at all: into a temporary file beside it, flushed, then renamed over `path`. The
+/// temporary file has no name until it is whole, where the file system can do that: then nothing is left of it however the
+/// process ends. A link stays and its target is replaced; an old file's permissions are kept, and one that is read-only is not
+/// replaced; a device or pipe, say /dev/stdout, is written to as it is.
+/// @throws InputError naming the path and the system's reason when that fails; an old file at `path` is then intact.
 void write_file(const std::filesystem::path& path, std::string_view content);
+
+/// @throws InputError as write_file would, for what can be told before there is content: no such folder, a folder of that name,
+/// no permission.
+void require_writable(const std::filesystem::path& path);
 
 /// The largest file that is read, 1 GiB.
 inline constexpr std::size_t max_file_size = std::size_t{1} << 30;

@@ -14,9 +14,9 @@ namespace gp2 {
 /// A fitted model as a file: the model's text, the options its prior was made with, the data and the hyperparameters. The
 /// posterior is computed anew from these, so a file loaded gives the same bits as before it was saved.
 struct FitFile {
-  /// 5: robots; 4: values with a noise of their own; 3: mechanics that are code; 2: observations of other systems; others are
-  /// written as 1.
-  static constexpr int format_version = 5;
+  /// 6: a checksum and options; 5: robots; 4: values with a noise of their own; 3: mechanics that are code; 2: observations of
+  /// other systems. All of them are read; 6 is written.
+  static constexpr int format_version = 6;
 
   ModelFile model;
   PriorOptions prior_options;
@@ -24,7 +24,8 @@ struct FitFile {
   std::vector<Observations> observations;
   /// Per Observations: the model file of its view's setting; null where it has none. May be shorter.
   std::vector<std::shared_ptr<const ModelFile>> systems;
-  FitReport report;  // with the fitted hyperparameters
+  FitReport report;     // with the fitted hyperparameters
+  std::string options;  // what was asked of the fit, a JSON object (fit_options_json); empty: not known
 
   [[nodiscard]] Prior prior() const { return make_prior(model, prior_options); }
   /// The prior conditioned on the data, under the fitted hyperparameters.
@@ -32,7 +33,8 @@ struct FitFile {
 
   /// Written whole or not at all. @throws InputError when that fails, or `systems` lacks the model file of a setting.
   void write(const std::filesystem::path& path) const;
-  /// @throws InputError naming the file and what is wrong: not a fit, of a newer format, cut short, or with values out of place.
+  /// @throws InputError naming the file and what is wrong: not a fit, of a newer format, cut short, changed after it was written
+  ///   (its checksum is of another content; the text says how a change that is meant is made good), or with values out of place.
   static FitFile read(const std::filesystem::path& path);
   /// @param text  what the file holds
   /// @param name  stands for the file in messages

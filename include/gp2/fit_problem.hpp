@@ -74,6 +74,12 @@ FitProblem make_fit_problem(const ModelFile& model, const CsvTable& log, const F
 /// How a problem is fitted unless told otherwise: a baseline has options of its own.
 FitOptions default_fit_options(const FitProblem& problem);
 
+/// What was asked of a fit, for FitFile: a flat JSON object under the names of gp2 fit's options. What was not given is left out;
+/// with the logs, or the observations of the FitFile, it is enough to fit again to the same bits.
+/// @param start  values that were given to start from, as "start"; empty: none
+std::string fit_options_json(const FitProblemOptions& asked, const FitOptions& options,
+                             const std::vector<Hyperparameter>& start = {});
+
 /// fit() or, of a baseline, fit_baseline().
 Fit fit(const FitProblem& problem, const FitOptions& options);
 

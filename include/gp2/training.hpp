@@ -106,11 +106,12 @@ struct FitOptions {
   int max_iterations = 1000;                      // per restart; 0: condition at the starting values
   std::uint64_t seed = 0;                         // of the other starting points
   int n_threads = 0;                              // 0: as many as the machine has; results do not depend on it
+  int max_side_by_side = 0;                       // evaluations at a time, each with a matrix of its own; 0: n_threads
   double gradient_tolerance = 1e-5;               // stop when the projected gradient's largest entry is below
   double reduction_tolerance = 1e-12;             // stop when an iteration lowers the objective by less, relatively
   int max_escapes = 5;                            // scans for lower optima from the best one
   std::function<void(const Progress&)> progress;  // called from worker threads, one at a time
-  const std::atomic<bool>* stop = nullptr;        // set: return the best so far
+  const std::atomic<bool>* stop = nullptr;        // set: return the best so far, as not converged: interrupted
 };
 
 /// How one run of the optimiser ended.
@@ -123,6 +124,8 @@ struct RestartReport {
 };
 
 struct FitReport {
+  static constexpr const char* interrupted = "interrupted";  // termination of a fit that was stopped on request
+
   std::vector<Hyperparameter> hyperparameters;  // fitted values
   double negative_log_likelihood = 0;           // physical units, all constants, without hyper-prior
   double objective = 0;

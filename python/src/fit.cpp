@@ -6,6 +6,7 @@
 #include "arrays.hpp"
 #include "bindings.hpp"
 #include "gp2/error.hpp"
+#include "gp2/fit_memory.hpp"
 #include "gp2/fit_problem.hpp"
 
 namespace gp2::python {
@@ -173,15 +174,18 @@ PyPosterior fit_model(const PySystem& system, const py::object& data, const Argu
     const std::string what = fmt::format("also[{}]", also.size());
     also.push_back({quantity_argument(knowledge.view), knowledge.latent, log_of(knowledge.data, knowledge.system, what)});
   }
-  FitProblem problem = make_fit_problem(model, logs, also, problem_options(arguments));
+  const FitProblemOptions asked = problem_options(arguments);
+  FitProblem problem = make_fit_problem(model, logs, also, asked);
   if (!arguments.start.is_none()) read_start(path_argument(arguments.start), arguments.max_iterations, problem);
-  tell(problem.notes);
-
   FitOptions options = default_fit_options(problem);
   options.n_restarts = arguments.restarts.value_or(options.n_restarts);
   options.max_iterations = arguments.max_iterations;
   options.seed = arguments.seed;
   options.n_threads = arguments.threads;
+  const std::string asked_json =
+      fit_options_json(asked, options, arguments.start.is_none() ? std::vector<Hyperparameter>() : problem.hyperparameters);
+  options = within_memory(problem, options, free_memory(), problem.notes);
+  tell(problem.notes);
   std::atomic<bool> stop = false;
   options.stop = &stop;
   LastProgress progress;
@@ -205,6 +209,7 @@ PyPosterior fit_model(const PySystem& system, const py::object& data, const Argu
     FitFile file;
     file.model = model;
     file.prior_options = problem.prior_options;
+    file.options = asked_json;
     for (const Log& log : logs) file.data_source += (file.data_source.empty() ? "" : ", ") + log.table.name();
     file.systems = std::move(problem.systems);
     file.report = std::move(result->report);
@@ -285,7 +290,8 @@ start       path of starting values, JSON or FIT.json
 progress    called with a Progress some times a second
 
 Returns a Posterior with its report. Same seed, same bits, for any number of threads. The interpreter's lock is released; Ctrl-C
-raises KeyboardInterrupt, whose attribute `posterior` is the best so far (None when there is none yet).
+raises KeyboardInterrupt, whose attribute `posterior` is the best so far (None when there is none yet). A fit that would take
+more memory than is free is refused, with the rows that would fit.
 Raises InputError for data or options that do not fit, with the text of the command; NumericalError when nothing could be fitted.)");
 }
 

@@ -518,6 +518,13 @@ void add_posterior(py::module_& module) {
                              })
       .def_property_readonly(
           "report", [](const PyPosterior& self) { return self.file.report; }, "How the fit went.")
+      .def_property_readonly(
+          "options",
+          [](const PyPosterior& self) -> py::object {
+            if (self.file.options.empty()) return py::none();
+            return py::module_::import("json").attr("loads")(self.file.options);
+          },
+          "What the fit was asked, a dict under the names of the options of gp2 fit; None where a file does not say.")
       .def_readonly("notes", &PyPosterior::notes, "What the reading of the data had to say.")
       .def_property_readonly("n_data",
                              [](const PyPosterior& self) {

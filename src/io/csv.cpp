@@ -245,14 +245,46 @@ std::string shortest(double value) {
 
 namespace {
 
-// Opens a new file beside `path`, with the permissions that the process gives to new files; −1 and errno when that fails.
-int open_beside(const std::string& path, std::string& temporary) {
-  static std::atomic<unsigned> counter = 0;  // threads of one process must not meet
+// a name beside `target` that no other thread or process takes
+std::string temporary_name(const std::string& target) {
+  static std::atomic<unsigned> counter = 0;
+  return fmt::format("{}.{}-{}.tmp", target, getpid(), counter++);
+}
+
+// The folder that a path is in.
+std::string folder_of(const std::string& path) {
+  const std::string folder = std::filesystem::path(path).parent_path().string();
+  return folder.empty() ? "." : folder;
+}
+
+// Opens a new file beside `target`, with the permissions that the process gives to new files; −1 and errno when that fails. It
+// has no name, which give_name() can give it, or where the system does not know such files `name`.
+int open_beside(const std::string& target, std::string& name) {
+#ifdef O_TMPFILE
+  if (access("/proc/self/fd", X_OK) == 0) {
+    const int file = open(folder_of(target).c_str(), O_WRONLY | O_TMPFILE | O_CLOEXEC, 0666);
+    if (file >= 0) return file;
+  }
+#endif
   while (true) {
-    temporary = fmt::format("{}.{}-{}.tmp", path, getpid(), counter++);
-    const int file = open(temporary.c_str(), O_WRONLY | O_CREAT | O_EXCL | O_CLOEXEC, 0666);
+    name = temporary_name(target);
+    const int file = open(name.c_str(), O_WRONLY | O_CREAT | O_EXCL | O_CLOEXEC, 0666);
     if (file >= 0 || errno != EEXIST) return file;
   }
+}
+
+// false and errno when that fails
+bool give_name(int file, const std::string& target, std::string& name) {
+  const std::string link = fmt::format("/proc/self/fd/{}", file);
+  while (name.empty()) {
+    const std::string wanted = temporary_name(target);
+    if (linkat(AT_FDCWD, link.c_str(), AT_FDCWD, wanted.c_str(), AT_SYMLINK_FOLLOW) == 0) {
+      name = wanted;
+    } else if (errno != EEXIST) {
+      return false;
+    }
+  }
+  return true;
 }
 
 // all of `content`; false and errno when that fails
@@ -266,45 +298,70 @@ bool write_all(int file, std::string_view content) {
   return true;
 }
 
-}  // namespace
+void require_written(const std::filesystem::path& path, bool good) {
+  if (!good) throw InputError(fmt::format("{}: cannot be written: {}", path.string(), std::strerror(errno)));
+}
 
-void write_file(const std::filesystem::path& path, std::string_view content) {
-  const auto require = [&](bool good) {
-    if (!good) throw InputError(fmt::format("{}: cannot be written: {}", path.string(), std::strerror(errno)));
-  };
-  // a link stays; what it points at is replaced
+// A file to be written: a link stays, what it points at is replaced.
+struct Target {
+  std::string path;
+  bool exists = false;
+  struct stat status = {};
+
+  [[nodiscard]] bool is_regular() const { return !exists || S_ISREG(status.st_mode); }
+};
+
+Target target_of(const std::filesystem::path& path) {
+  Target target;
   std::error_code no_such_file;
   const std::filesystem::path resolved = std::filesystem::canonical(path, no_such_file);
-  const std::string target = no_such_file ? path.string() : resolved.string();
-
-  struct stat old = {};
-  const bool exists = stat(target.c_str(), &old) == 0;
-  if (exists && S_ISDIR(old.st_mode)) {
+  target.path = no_such_file ? path.string() : resolved.string();
+  target.exists = stat(target.path.c_str(), &target.status) == 0;
+  if (target.exists && S_ISDIR(target.status.st_mode)) {
     errno = EISDIR;
-    require(false);
+    require_written(path, false);
   }
+  // a file that is read-only could be replaced all the same, but is so for a reason
+  if (target.exists) require_written(path, faccessat(AT_FDCWD, target.path.c_str(), W_OK, AT_EACCESS) == 0);
+  return target;
+}
+
+}  // namespace
+
+void require_writable(const std::filesystem::path& path) {
+  const Target target = target_of(path);
+  if (!target.is_regular()) return;
+  const std::string folder = folder_of(target.path);
+  const bool is_folder = std::filesystem::is_directory(folder);
+  if (!is_folder) errno = std::filesystem::exists(folder) ? ENOTDIR : ENOENT;
+  require_written(path, is_folder && faccessat(AT_FDCWD, folder.c_str(), W_OK | X_OK, AT_EACCESS) == 0);
+}
+
+void write_file(const std::filesystem::path& path, std::string_view content) {
+  const Target target = target_of(path);
   // /dev/stdout, a pipe: nothing to replace, and a rename would destroy the device
-  if (exists && !S_ISREG(old.st_mode)) {
-    const int device = open(target.c_str(), O_WRONLY | O_CLOEXEC);
-    require(device >= 0);
+  if (!target.is_regular()) {
+    const int device = open(target.path.c_str(), O_WRONLY | O_CLOEXEC);
+    require_written(path, device >= 0);
     const bool good = write_all(device, content);
-    require(close(device) == 0 && good);
+    const int reason = errno;
+    const bool closed = close(device) == 0;
+    if (!good) errno = reason;
+    require_written(path, good && closed);
     return;
   }
 
   std::string temporary;
-  const int file = open_beside(target, temporary);
-  require(file >= 0);
-  bool good = !exists || fchmod(file, old.st_mode & 07777) == 0;
-  good = good && write_all(file, content) && fsync(file) == 0;
-  good = close(file) == 0 && good;
-  good = good && std::rename(temporary.c_str(), target.c_str()) == 0;
-  if (!good) {
-    const int reason = errno;
-    unlink(temporary.c_str());
-    errno = reason;
-    require(false);
-  }
+  const int file = open_beside(target.path, temporary);
+  require_written(path, file >= 0);
+  bool good = !target.exists || fchmod(file, target.status.st_mode & 07777) == 0;
+  good = good && write_all(file, content) && fsync(file) == 0 && give_name(file, target.path, temporary);
+  good = good && std::rename(temporary.c_str(), target.path.c_str()) == 0;
+  const int reason = errno;
+  close(file);  // after fsync it has nothing left to fail at
+  if (!good && !temporary.empty()) unlink(temporary.c_str());
+  errno = reason;
+  require_written(path, good);
 }
 
 }  // namespace gp2

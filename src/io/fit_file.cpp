@@ -9,6 +9,7 @@
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
+#include <boost/crc.hpp>
 #include <nlohmann/json.hpp>
 
 #include "gp2/csv.hpp"
@@ -21,7 +22,8 @@ namespace gp2 {
 using Eigen::Index;
 using Eigen::MatrixXd;
 using Eigen::VectorXd;
-using Json = nlohmann::ordered_json;
+using Json = nlohmann::ordered_json;  // written: keys in the order that a person reads
+using ParsedJson = nlohmann::json;    // read: keys are found in no time, however many a file claims
 using Kind = Hyperparameter::Kind;
 
 namespace {
@@ -49,7 +51,7 @@ const char* name_of(const std::array<Named<Choice>, n>& choices, Choice choice) 
 }
 
 template <class Choice, std::size_t n>
-Choice choice_from(const Json& json, const std::array<Named<Choice>, n>& choices, const char* what) {
+Choice choice_from(const ParsedJson& json, const std::array<Named<Choice>, n>& choices, const char* what) {
   const auto name = json.get<std::string>();
   const auto known = std::find_if(choices.begin(), choices.end(), [&](const auto& other) { return name == other.second; });
   if (known == choices.end()) throw InputError(fmt::format("'{}' is no {}", name, what));
@@ -57,10 +59,10 @@ Choice choice_from(const Json& json, const std::array<Named<Choice>, n>& choices
 }
 
 // a value to show in a message
-std::string shown(const Json& json) { return json.is_structured() ? json.type_name() : json.dump(); }
+std::string shown(const ParsedJson& json) { return json.is_structured() ? json.type_name() : json.dump(); }
 
 // a whole number, where Json itself would round or wrap
-int integer(const Json& json) {
+int integer(const ParsedJson& json) {
   constexpr auto largest = std::numeric_limits<int>::max();
   if (!json.is_number_integer()) throw InputError(fmt::format("{} stands where a whole number must", shown(json)));
   if (std::abs(json.get<double>()) > largest) throw InputError(fmt::format("{} is too large", shown(json)));
@@ -68,19 +70,26 @@ int integer(const Json& json) {
 }
 
 // an array, where a loop would also take other values
-const Json& array(const Json& json) {
+const ParsedJson& array(const ParsedJson& json) {
   if (!json.is_array()) throw InputError(fmt::format("{} stands where an array must", shown(json)));
   return json;
 }
 
-double number(const Json& json) {
+double number(const ParsedJson& json) {
   if (!json.is_number()) throw InputError(fmt::format("{} stands where a number must", shown(json)));
   return json.get<double>();
 }
 
+// What reads JSON goes down a level by calling itself: a file must not make it go down without end.
+constexpr int max_depth = 64;
+
 /// @param path  stands for the file in messages
-Json parse_json(std::string_view text, const std::filesystem::path& path) {
-  Json json = Json::parse(text, nullptr, false);
+ParsedJson parse_json(std::string_view text, const std::filesystem::path& path) {
+  const auto check_depth = [&](int depth, ParsedJson::parse_event_t, const ParsedJson&) {
+    if (depth > max_depth) throw InputError(fmt::format("{}: nested deeper than {} levels", path.string(), max_depth));
+    return true;
+  };
+  ParsedJson json = ParsedJson::parse(text, check_depth, false);
   if (json.is_discarded()) {
     throw InputError(
         fmt::format("{}: not valid JSON: the file is cut short or damaged; write it again with gp2 fit", path.string()));
@@ -88,9 +97,34 @@ Json parse_json(std::string_view text, const std::filesystem::path& path) {
   return json;
 }
 
+// CRC-64 of xz over the compact text with sorted keys, in which only what is meant counts. It sees every change within eight
+// bytes in a row, and others but for one in 2⁶⁴. It guards against damage and slips of the pen, not against intent, so no
+// cryptographic digest, and no library for one, is needed: who means a change is told the checksum to write.
+std::string checksum_of(const ParsedJson& json) {
+  boost::crc_optimal<64, 0x42F0E1EBA9EA3693, 0xFFFFFFFFFFFFFFFF, 0xFFFFFFFFFFFFFFFF, true, true> crc;
+  const std::string text = json.dump(-1, ' ', false, ParsedJson::error_handler_t::replace);
+  crc.process_bytes(text.data(), text.size());
+  return fmt::format("{:016x}", crc.checksum());
+}
+
+// Out of a file, where it must be right. Formats before the sixth have none; one that is there counts all the same, so that a
+// change of the version is seen too.
+void take_checksum(ParsedJson& json) {
+  const bool has_one = json.contains("checksum");
+  if (!has_one && integer(json.at("version")) < 6) return;
+  const std::string written = has_one ? shown(json.at("checksum")) : "missing";
+  json.erase("checksum");
+  const std::string is = '"' + checksum_of(json) + '"';
+  if (written == is) return;
+  throw InputError(fmt::format(
+      "the file was changed after gp2 wrote it: its checksum is {}, its content has {}. If it is damaged, write it again "
+      "with gp2 fit; if the change is meant, set \"checksum\": {} in the file",
+      written, is, is));
+}
+
 Json vector_json(const VectorXd& values) { return std::vector<double>(values.begin(), values.end()); }
 
-VectorXd vector_from(const Json& json) {
+VectorXd vector_from(const ParsedJson& json) {
   VectorXd values(static_cast<Index>(array(json).size()));
   std::transform(json.begin(), json.end(), values.begin(), number);
   return values;
@@ -106,7 +140,7 @@ Json rows_json(const MatrixXd& matrix, const std::vector<std::string>& names) {
   return json;
 }
 
-MatrixXd rows_from(const Json& json, const std::vector<std::string>& names, const std::vector<bool>& needed, Index n) {
+MatrixXd rows_from(const ParsedJson& json, const std::vector<std::string>& names, const std::vector<bool>& needed, Index n) {
   if (!json.is_object()) throw InputError("expected an object of named arrays");
   // sizes first: a damaged n must not ask for memory
   for (const auto& [name, values] : json.items()) {
@@ -141,7 +175,7 @@ Json hyperparameter_json(const Hyperparameter& h) {
   return json;
 }
 
-Hyperparameter hyperparameter_from(const Json& json) {
+Hyperparameter hyperparameter_from(const ParsedJson& json) {
   Hyperparameter h;
   json.at("name").get_to(h.name);
   json.at("unit").get_to(h.unit);
@@ -215,14 +249,14 @@ Json model_json(const ModelFile& model) {
   return json;
 }
 
-bool mechanics_are_code(const Json& model) {
+bool mechanics_are_code(const ParsedJson& model) {
   if (!model.contains("mechanics")) return false;
   if (model.at("mechanics") != code) throw InputError(fmt::format("mechanics as {} are not known", shown(model.at("mechanics"))));
   return true;
 }
 
 /// @param mechanics  null: not given
-ModelFile model_from(const Json& json, const MechanicsSource* mechanics) {
+ModelFile model_from(const ParsedJson& json, const MechanicsSource* mechanics) {
   if (!mechanics_are_code(json)) {
     // a fit is whole in itself: its text must not make it read other files
     const RobotSource robot = [&](const std::string& file) {
@@ -247,7 +281,7 @@ Json baseline_json(const Baseline& baseline) {
           {"feature_stddev", vector_json(baseline.feature_stddev)}};
 }
 
-Discrepancy discrepancy_from(const Json& json) {
+Discrepancy discrepancy_from(const ParsedJson& json) {
   Discrepancy discrepancy{vector_from(json.at("lengthscale")), vector_from(json.at("stddev"))};
   if (!(discrepancy.lengthscale.array() > 0).all() || !(discrepancy.stddev.array() > 0).all()) {
     throw InputError("lengthscale and stddev of the discrepancy must be positive");
@@ -255,7 +289,7 @@ Discrepancy discrepancy_from(const Json& json) {
   return discrepancy;
 }
 
-Baseline baseline_from(const Json& json) {
+Baseline baseline_from(const ParsedJson& json) {
   const auto word = json.at("kind").get<std::string>();
   const std::optional<Baseline::Kind> kind = Baseline::kind_of(word);
   if (!kind) throw InputError(fmt::format("'{}' is no baseline; there is: {}", word, fmt::join(Baseline::words(), ", ")));
@@ -282,7 +316,7 @@ Json observations_json(const Observations& group, const Prior& home, const Model
   return json;
 }
 
-Observations observations_from(const Json& json, const Prior& home, std::shared_ptr<const Setting> setting) {
+Observations observations_from(const ParsedJson& json, const Prior& home, std::shared_ptr<const Setting> setting) {
   Observations group;
   group.view.setting = std::move(setting);
   const Prior& prior = prior_of(home, group.view);
@@ -300,7 +334,7 @@ Observations observations_from(const Json& json, const Prior& home, std::shared_
     throw InputError(fmt::format("latent {} of a view is outside -1 … {}", group.view.latent, prior.latents.size() - 1));
   }
   const int n_rows = View::all(*quantity, system).size();
-  for (const Json& row : array(json.at("rows"))) {
+  for (const ParsedJson& row : array(json.at("rows"))) {
     const int index = integer(row);
     if (index < 0 || index >= n_rows) throw InputError(fmt::format("row {} of a view is outside 0 … {}", index, n_rows - 1));
     if (std::find(group.view.rows.begin(), group.view.rows.end(), index) != group.view.rows.end()) {
@@ -333,7 +367,9 @@ Observations observations_from(const Json& json, const Prior& home, std::shared_
 // a restart without a finite start has the objective ∞, which JSON has not: null
 Json number_or_null(double value) { return std::isfinite(value) ? Json(value) : Json(); }
 
-double number_or_infinity(const Json& json) { return json.is_null() ? std::numeric_limits<double>::infinity() : number(json); }
+double number_or_infinity(const ParsedJson& json) {
+  return json.is_null() ? std::numeric_limits<double>::infinity() : number(json);
+}
 
 Json restart_json(const RestartReport& r) {
   return {{"objective", number_or_null(r.objective)},
@@ -345,7 +381,7 @@ Json restart_json(const RestartReport& r) {
           {"termination", r.termination}};
 }
 
-RestartReport restart_from(const Json& json) {
+RestartReport restart_from(const ParsedJson& json) {
   return {number_or_infinity(json.at("objective")), number_or_infinity(json.at("nll")),     integer(json.at("iterations")),
           integer(json.at("evaluations")),          integer(json.at("failed_evaluations")), json.at("converged").get<bool>(),
           json.at("termination").get<std::string>()};
@@ -361,16 +397,7 @@ Posterior FitFile::posterior() const {
 void FitFile::write(const std::filesystem::path& path) const {
   Json json;
   json["format"] = format_name;
-  const bool at_home =
-      std::all_of(observations.begin(), observations.end(), [](const auto& group) { return !group.view.setting; });
-  const bool with_code = model.mechanics_are_code || std::any_of(systems.begin(), systems.end(), [](const auto& other) {
-                           return other && other->mechanics_are_code;
-                         });
-  const bool with_noise_scale =
-      std::any_of(observations.begin(), observations.end(), [](const auto& group) { return group.has_noise_scale(); });
-  const bool with_robot =
-      model.robot || std::any_of(systems.begin(), systems.end(), [](const auto& other) { return other && other->robot; });
-  json["version"] = with_robot ? 5 : with_noise_scale ? 4 : with_code ? 3 : at_home ? 1 : 2;
+  json["version"] = format_version;
   json["library"] = version();
   json["model"] = model_json(model);
   json["prior"] = {{"mean", name_of(means, prior_options.mean)},
@@ -391,6 +418,7 @@ void FitFile::write(const std::filesystem::path& path) const {
                     {"best_restart", report.best_restart},
                     {"restarts", Json::array()}};
   for (const RestartReport& restart : report.restarts) json["report"]["restarts"].push_back(restart_json(restart));
+  if (!options.empty()) json["options"] = Json::parse(options);
   json["data_source"] = data_source;
   json["observations"] = Json::array();
   const Prior home = prior();
@@ -401,40 +429,52 @@ void FitFile::write(const std::filesystem::path& path) const {
     }
     json["observations"].push_back(observations_json(observations[g], home, other));
   }
+  json["checksum"] = checksum_of(ParsedJson(json));
   // a path in `data_source` may hold bytes that are no text
   write_file(path, json.dump(1, ' ', false, Json::error_handler_t::replace) + "\n");
 }
 
 namespace {
 
-bool is_fit(const Json& json) { return json.is_object() && json.contains("format") && json.at("format") == format_name; }
+bool is_fit(const ParsedJson& json) { return json.is_object() && json.contains("format") && json.at("format") == format_name; }
+
+// a fit of a format that is known, as it was written
+void require_fit(ParsedJson& json) {
+  constexpr int format_version = FitFile::format_version;
+  if (!is_fit(json)) throw InputError("not a fit written by gp2");
+  const int file_version = integer(json.at("version"));
+  if (file_version > format_version) {
+    throw InputError(
+        fmt::format("of format {}, but this gp2 ({}) reads up to {}: use a newer gp2", file_version, version(), format_version));
+  }
+  if (file_version < 1) throw InputError(fmt::format("format {} does not exist", file_version));
+  take_checksum(json);
+}
 
 /// @param path       stands for the file in messages
 /// @param mechanics  null: not given
 FitFile read_fit(std::string_view text, const std::filesystem::path& path, const MechanicsSource* mechanics) {
-  constexpr int format_version = FitFile::format_version;
   const internal::StepLimit limit;  // for all its models together
-  const Json json = parse_json(text, path);
+  ParsedJson json = parse_json(text, path);
   FitFile fit;
   try {
-    if (!is_fit(json)) throw InputError("not a fit written by gp2");
-    const int file_version = integer(json.at("version"));
-    if (file_version > format_version) {
-      throw InputError(fmt::format("of format {}, but this gp2 ({}) reads up to {}: use a newer gp2", file_version, version(),
-                                   format_version));
-    }
-    if (file_version < 1) throw InputError(fmt::format("format {} does not exist", file_version));
+    require_fit(json);
     fit.model = model_from(json.at("model"), mechanics);
     bool code_is_used = fit.model.mechanics_are_code;
-    const Json& prior_json = json.at("prior");
+    const ParsedJson& prior_json = json.at("prior");
     fit.prior_options.mean = choice_from(prior_json.at("mean"), means, "prior mean");
     fit.prior_options.base = choice_from(prior_json.at("directions"), directions, "choice of directions");
     prior_json.at("raw_angles").get_to(fit.prior_options.raw_angles);
     if (prior_json.contains("discrepancy")) fit.prior_options.discrepancy = discrepancy_from(prior_json.at("discrepancy"));
     if (prior_json.contains("baseline")) fit.prior_options.baseline = baseline_from(prior_json.at("baseline"));
     json.at("data_source").get_to(fit.data_source);
+    if (json.contains("options")) {
+      if (!json.at("options").is_object())
+        throw InputError(fmt::format("options must be an object, got {}", shown(json.at("options"))));
+      fit.options = json.at("options").dump();
+    }
     const Prior prior = fit.prior();
-    for (const Json& group : array(json.at("observations"))) {
+    for (const ParsedJson& group : array(json.at("observations"))) {
       std::shared_ptr<const Setting> setting;
       std::shared_ptr<const ModelFile>& system = fit.systems.emplace_back();
       if (group.contains("system")) {
@@ -448,16 +488,16 @@ FitFile read_fit(std::string_view text, const std::filesystem::path& path, const
     if (mechanics != nullptr && !code_is_used) {
       throw InputError("mechanics are given as code, but this fit has them as text: read it without");
     }
-    for (const Json& h : array(json.at("hyperparameters"))) fit.report.hyperparameters.push_back(hyperparameter_from(h));
+    for (const ParsedJson& h : array(json.at("hyperparameters"))) fit.report.hyperparameters.push_back(hyperparameter_from(h));
     check_hyperparameters(fit.report.hyperparameters, prior, fit.observations);
-    const Json& report = json.at("report");
+    const ParsedJson& report = json.at("report");
     fit.report.negative_log_likelihood = number(report.at("nll"));
     fit.report.objective = number(report.at("objective"));
     report.at("converged").get_to(fit.report.converged);
     report.at("termination").get_to(fit.report.termination);
     fit.report.iterations = integer(report.at("iterations"));
     fit.report.best_restart = integer(report.at("best_restart"));
-    for (const Json& restart : array(report.at("restarts"))) fit.report.restarts.push_back(restart_from(restart));
+    for (const ParsedJson& restart : array(report.at("restarts"))) fit.report.restarts.push_back(restart_from(restart));
   } catch (const Json::exception& error) {
     throw InputError(fmt::format("{}: not a whole fit file: {}", path.string(), error.what()));
   } catch (const InputError& error) {
@@ -479,12 +519,13 @@ FitFile FitFile::read(const std::filesystem::path& path, const MechanicsSource& 
 namespace {
 
 // Of a fit whose mechanics are code the hyperparameters alone are read: there is no model to hold them against.
-std::vector<Hyperparameter> hyperparameters_of(const std::filesystem::path& path, const Json& json) {
+std::vector<Hyperparameter> hyperparameters_of(const std::filesystem::path& path, ParsedJson& json) {
   const bool with_code = json.contains("model") && json.at("model").is_object() && json.at("model").contains("mechanics");
   if (!with_code) return FitFile::read(path).report.hyperparameters;
   std::vector<Hyperparameter> hyperparameters;
   try {
-    for (const Json& h : array(json.at("hyperparameters"))) hyperparameters.push_back(hyperparameter_from(h));
+    require_fit(json);
+    for (const ParsedJson& h : array(json.at("hyperparameters"))) hyperparameters.push_back(hyperparameter_from(h));
   } catch (const Json::exception& error) {
     throw InputError(fmt::format("{}: not a whole fit file: {}", path.string(), error.what()));
   } catch (const InputError& error) {
@@ -496,7 +537,7 @@ std::vector<Hyperparameter> hyperparameters_of(const std::filesystem::path& path
 }  // namespace
 
 void read_start_values(const std::filesystem::path& path, std::vector<Hyperparameter>& hyperparameters) {
-  const Json json = parse_json(read_file(path), path);
+  ParsedJson json = parse_json(read_file(path), path);
   std::vector<std::pair<std::string, double>> values;
   const bool of_fit = is_fit(json);
   if (of_fit) {

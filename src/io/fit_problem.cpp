@@ -7,6 +7,7 @@
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
+#include <nlohmann/json.hpp>
 
 #include "gp2/check.hpp"
 #include "gp2/error.hpp"
@@ -515,6 +516,33 @@ std::vector<std::string> notes_of(const FitReport& report) {
 
 FitOptions default_fit_options(const FitProblem& problem) {
   return problem.prior_options.baseline ? baseline_fit_options() : FitOptions{};
+}
+
+std::string fit_options_json(const FitProblemOptions& asked, const FitOptions& options,
+                             const std::vector<Hyperparameter>& start) {
+  nlohmann::json json = {{"mean", asked.mean == Prior::Mean::force ? "force" : "zero"},
+                         {"protocol", asked.protocol.name == Protocol::Name::paper ? "paper" : "default"},
+                         {"hyperprior", asked.protocol.hyperprior ? "default" : "none"},
+                         {"discrepancy", asked.discrepancy ? "default" : "none"},
+                         {"restarts", options.n_restarts},
+                         {"max_iterations", options.max_iterations},
+                         {"max_escapes", options.max_escapes},
+                         {"gradient_tolerance", options.gradient_tolerance},
+                         {"reduction_tolerance", options.reduction_tolerance},
+                         {"seed", options.seed}};
+  if (!asked.observe.empty()) json["observe"] = asked.observe;
+  if (asked.base) json["prior"] = *asked.base == Latent::Base::force ? "force" : "acceleration";
+  if (asked.baseline) json["baseline"] = Baseline::word(*asked.baseline);
+  if (asked.estimate) json["estimate"] = *asked.estimate;
+  if (asked.noise_stddev) json["noise_std"] = *asked.noise_stddev;
+  if (asked.estimate_noise) json["noise_std"] = "estimate";
+  if (asked.trust_stated_noise) json["noise_std"] = "stated";
+  if (asked.max_points) json["max_points"] = *asked.max_points;
+  if (asked.also_noise_stddev) json["also_noise_std"] = *asked.also_noise_stddev;
+  if (asked.time_step) json["dt"] = *asked.time_step;
+  for (const auto& [name, column] : asked.columns) json["map"] += column + "=" + name;
+  for (const Hyperparameter& h : start) json["start"][h.name] = h.value;
+  return json.dump();
 }
 
 Fit fit(const FitProblem& problem, const FitOptions& options) {

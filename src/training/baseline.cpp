@@ -162,8 +162,9 @@ Fit fit_outputs(const Prior& prior, const std::vector<Observations>& observation
   const RestartReport& best = all.restarts.front();
   all.negative_log_likelihood = best.negative_log_likelihood;
   all.objective = best.objective;
-  all.converged = best.converged;
-  all.termination = best.termination;
+  const bool interrupted = options.stop != nullptr && options.stop->load();
+  all.converged = best.converged && !interrupted;
+  all.termination = interrupted ? FitReport::interrupted : best.termination;
   all.iterations = best.iterations;
   return {Posterior(prior, observations, model_values(prior, observations, all.hyperparameters)), std::move(all)};
 }

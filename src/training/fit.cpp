@@ -78,7 +78,8 @@ class Training {
   void run() {
     const lapack::SingleThread single_thread;
     // restarts side by side; where there is one alone, its evaluations share the threads
-    parallel_for(n_restarts(), n_threads_, [&](int restart, int) { run_restart(restart, n_restarts() == 1 ? n_threads_ : 1); });
+    parallel_for(n_restarts(), n_side_by_side_,
+                 [&](int restart, int) { run_restart(restart, n_restarts() == 1 ? n_threads_ : 1); });
     release();
     while (n_escapes_ < options_.max_escapes && !stopped() && escape()) ++n_escapes_;
   }
@@ -92,10 +93,9 @@ class Training {
   [[nodiscard]] const std::vector<RestartReport>& reports() const { return reports_; }
   [[nodiscard]] const std::vector<Hyperparameter>& result(std::size_t restart) const { return results_[restart]; }
   [[nodiscard]] int n_escapes() const { return n_escapes_; }
-
- private:
   [[nodiscard]] bool stopped() const { return options_.stop != nullptr && options_.stop->load(); }
 
+ private:
   LbfgsbResult optimise(int restart, const std::vector<Hyperparameter>& from, Likelihood::Workspace& workspace) {
     LbfgsbOptions options;
     options.max_iterations =
@@ -143,7 +143,7 @@ class Training {
       return there;
     };
     std::vector<double> values(scanned.size() * n_points);
-    parallel_for(static_cast<int>(values.size()), n_threads_, [&](int trial, int) {
+    parallel_for(static_cast<int>(values.size()), n_side_by_side_, [&](int trial, int) {
       if (stopped()) return;
       Likelihood::Workspace workspace;
       values[static_cast<std::size_t>(trial)] = objective_(moved(trial), nullptr, workspace);
@@ -192,7 +192,7 @@ class Training {
     constexpr int n_draws = 4;
     constexpr double size = 0.1;
     std::vector<LbfgsbResult> drawn(n_draws);
-    parallel_for(n_draws, n_threads_, [&](int draw, int) {
+    parallel_for(n_draws, n_side_by_side_, [&](int draw, int) {
       RandomStream random(options_.seed, static_cast<std::uint64_t>(n_restarts() + draw));
       std::vector<Hyperparameter> start = results_[from];
       for (Hyperparameter& h : start) {
@@ -223,6 +223,7 @@ class Training {
   const std::vector<Hyperparameter>& hyperparameters_;
   const FitOptions& options_;
   int n_threads_ = thread_count(options_.n_threads);
+  int n_side_by_side_ = options_.max_side_by_side > 0 ? std::min(options_.max_side_by_side, n_threads_) : n_threads_;
   Objective objective_;
   std::vector<RestartReport> reports_;
   std::vector<std::vector<Hyperparameter>> results_;
@@ -253,8 +254,10 @@ Fit fit(const Prior& prior, const std::vector<Observations>& observations, const
   report.hyperparameters = training.result(best);
   report.negative_log_likelihood = winner.negative_log_likelihood;
   report.objective = winner.objective;
-  report.converged = winner.converged;
-  report.termination = winner.termination;
+  // the best so far may have converged, but not all that was asked for was tried
+  const bool interrupted = training.stopped();
+  report.converged = winner.converged && !interrupted;
+  report.termination = interrupted ? FitReport::interrupted : winner.termination;
   report.iterations = winner.iterations;
   report.best_restart = static_cast<int>(best);
   report.n_escapes = training.n_escapes();

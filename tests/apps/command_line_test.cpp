@@ -68,7 +68,7 @@ TEST(CommandLine, JsonStandsAloneOnStdoutWithTheContractedKeys) {
   const Outcome fit =
       desk.done("gp2 fit models/surface.toml --data train.csv --max-iterations 3 --restarts 1 --json -o fit.json");
   const auto report = fit.json();
-  EXPECT_THAT(keys(report), ElementsAre("hyperparameters", "iterations", "nll", "seconds", "termination"));
+  EXPECT_THAT(keys(report), ElementsAre("hyperparameters", "iterations", "nll", "options", "seconds", "termination"));
   ASSERT_EQ(report["hyperparameters"].size(), 12u);
   for (const auto& one : report["hyperparameters"]) {
     EXPECT_THAT(keys(one), ElementsAre("at_bound", "lower", "name", "unit", "upper", "value"));

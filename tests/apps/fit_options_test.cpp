@@ -64,6 +64,36 @@ TEST_F(FitCommand, IterationsStopAtTheirLimitAndItIsSaid) {
   EXPECT_THAT(report["termination"], HasSubstr("limit of iterations"));
 }
 
+TEST_F(FitCommand, IsNotLostWhenItCannotBeWritten) {
+  const Outcome full = desk.run("gp2 fit models/surface.toml --data train.csv --max-iterations 0 -o /dev/full");
+  EXPECT_EQ(full.status, 2);
+  EXPECT_TRUE(full.said("/dev/full: cannot be written: No space left on device"));
+  EXPECT_THAT(full.out, HasSubstr("lengthscale(q1)"));
+}
+
+TEST_F(FitCommand, TellsWhatItWasAskedAndTheFileDoesToo) {
+  const nlohmann::json report = short_fit("--mean force --observe ddq1,ddq3 --noise-std 0.2 --seed 7 --estimate none");
+  const nlohmann::json expected = {{"discrepancy", "default"},
+                                   {"estimate", nlohmann::json::array()},
+                                   {"gradient_tolerance", 1e-5},
+                                   {"hyperprior", "default"},
+                                   {"max_escapes", 5},
+                                   {"max_iterations", 6},
+                                   {"mean", "force"},
+                                   {"noise_std", 0.2},
+                                   {"observe", {"ddq1", "ddq3"}},
+                                   {"protocol", "default"},
+                                   {"reduction_tolerance", 1e-12},
+                                   {"restarts", 1},
+                                   {"seed", 7}};
+  EXPECT_EQ(report["options"], expected);
+  EXPECT_EQ(desk.json("fit.json")["options"], expected);
+  // where it was told to start, too: the values can be given again as they are
+  const nlohmann::json again = fit("--start fit.json --max-iterations 0", "again.json");
+  desk.write("start.json", again["options"]["start"].dump());
+  EXPECT_EQ(fit("--start start.json --max-iterations 0")["hyperparameters"], again["hyperparameters"]);
+}
+
 TEST_F(FitCommand, StartTakesValuesByName) {
   desk.write("values.json", R"json({"lengthscale(q2)": 2.5, "signal_stddev(ddq3)": 4})json");
   const nlohmann::json standard = fit("--max-iterations 0"), report = fit("--max-iterations 0 --start values.json");

@@ -64,7 +64,7 @@ TEST(BaselineFile, PredictsTheSameBitsAfterItWasWrittenAndRead) {
 TEST(BaselineFile, ThatIsDamagedIsRefused) {
   const TemporaryFolder folder;
   fit_of(Baseline::Kind::lmc).write(folder / "fit.json");
-  const Json whole = Json::parse(read_file(folder / "fit.json"));
+  const Json whole = test::without_checksum(Json::parse(read_file(folder / "fit.json")));
   const auto refusal = [&](const std::function<void(Json&)>& damage) {
     Json json = whole;
     damage(json);

@@ -2,11 +2,14 @@
 
 #include <bit>
 #include <cmath>
+#include <csignal>
 #include <limits>
 #include <random>
 #include <thread>
 
+#include <sys/resource.h>
 #include <sys/stat.h>
+#include <sys/wait.h>
 #include <unistd.h>
 
 #include <gmock/gmock.h>
@@ -209,6 +212,8 @@ TEST(Csv, AFileThatCannotBeReadIsNamedWithTheReason) {
   EXPECT_EQ(input_error_of([&] { CsvTable::read(folder / "none.csv"); }),
             (folder / "none.csv").string() + ": cannot be read: No such file or directory");
   EXPECT_EQ(input_error_of([&] { CsvTable::read(folder.path()); }), folder.path().string() + ": cannot be read: Is a directory");
+  // a read that fails half way
+  EXPECT_EQ(input_error_of([] { CsvTable::read("/proc/self/mem"); }), "/proc/self/mem: cannot be read: Input/output error");
   if (geteuid() != 0) {
     const auto secret = folder.write("secret.csv", "q1\n1\n");
     chmod(secret.c_str(), 0);
@@ -251,6 +256,59 @@ TEST(WriteFile, LeavesTheOldFileIntactWhenTheFolderIsReadOnly) {
   chmod(folder.path().c_str(), 0555);
   EXPECT_THAT(input_error_of([&] { write_file(path, "new"); }), EndsWith(": cannot be written: Permission denied"));
   chmod(folder.path().c_str(), 0755);
+  EXPECT_EQ(read_file(path), "old");
+  EXPECT_EQ(n_files(folder), 1U);
+}
+
+TEST(WriteFile, DoesNotReplaceAFileThatIsReadOnly) {
+  const TemporaryFolder folder;
+  const auto path = folder.write("fit.json", "old");
+  chmod(path.c_str(), 0444);
+  chmod(folder.path().c_str(), 0777);
+  // root may write anywhere, so not as root
+  const bool is_root = geteuid() == 0;
+  if (is_root) ASSERT_EQ(seteuid(65534), 0);
+  const std::string written = input_error_of([&] { write_file(path, "new"); });
+  const std::string asked = input_error_of([&] { require_writable(path); });
+  if (is_root) ASSERT_EQ(seteuid(0), 0);
+  EXPECT_EQ(written, path.string() + ": cannot be written: Permission denied");
+  EXPECT_EQ(asked, written);
+  EXPECT_EQ(read_file(path), "old");
+  EXPECT_EQ(n_files(folder), 1U);
+}
+
+TEST(WriteFile, CanBeAskedForBefore) {
+  const TemporaryFolder folder;
+  const auto old = folder.write("old", "old");
+  const auto error_of = [](const std::filesystem::path& path) { return input_error_of([&] { require_writable(path); }); };
+  EXPECT_EQ(error_of(folder / "new"), "");
+  EXPECT_EQ(error_of(old), "");
+  EXPECT_EQ(error_of("/dev/stdout"), "");
+  EXPECT_EQ(error_of("new-file-in-the-working-folder"), "");
+  EXPECT_EQ(error_of(folder.path()), folder.path().string() + ": cannot be written: Is a directory");
+  EXPECT_EQ(error_of(folder / "none/new"), (folder / "none/new").string() + ": cannot be written: No such file or directory");
+  EXPECT_EQ(error_of(old / "new"), (old / "new").string() + ": cannot be written: Not a directory");
+  EXPECT_EQ(read_file(old), "old");
+  EXPECT_EQ(n_files(folder), 1U);
+}
+
+TEST(WriteFile, LeavesTheOldFileIntactWhenTheDiskIsFull) {
+  EXPECT_EQ(input_error_of([] { write_file("/dev/full", "x"); }), "/dev/full: cannot be written: No space left on device");
+  // no disk can be filled here, but a limit on the size of files fails the same call of the system at the same place
+  const TemporaryFolder folder;
+  const auto path = folder.write("fit.json", "old");
+  const pid_t child = fork();
+  if (child == 0) {
+    signal(SIGXFSZ, SIG_IGN);
+    const rlimit limit = {5000, 5000};
+    setrlimit(RLIMIT_FSIZE, &limit);
+    const std::string error = input_error_of([&] { write_file(path, std::string(100000, 'x')); });
+    const bool good = error == path.string() + ": cannot be written: File too large" && n_files(folder) == 1;
+    _exit(good ? 0 : 1);
+  }
+  int status = 0;
+  ASSERT_EQ(waitpid(child, &status, 0), child);
+  EXPECT_EQ(status, 0);
   EXPECT_EQ(read_file(path), "old");
   EXPECT_EQ(n_files(folder), 1U);
 }

@@ -62,6 +62,7 @@ def test_ctrl_c_ends_a_fit_with_the_best_so_far():
         except KeyboardInterrupt as stop:
             posterior = stop.posterior
             assert not posterior.report.converged, posterior.report
+            assert posterior.report.termination == "interrupted"
             assert posterior.report.objective <= said[0].best
             assert posterior.predict(data).mean.shape == (300, 3)
             posterior.update(system.generate(2, seed=5))

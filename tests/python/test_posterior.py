@@ -149,6 +149,8 @@ def test_a_loaded_fit_gives_the_same_bits(arm, arm_log, arm_states, tmp_path):
         assert loaded.report["m2"] == posterior.report["m2"]
         assert loaded.negative_log_likelihood == posterior.negative_log_likelihood
         assert loaded.system.text == arm.text
+        assert loaded.options == posterior.options
+        assert (loaded.options["restarts"], loaded.options["estimate"]) == (1, ["m2"])
         loaded.save(tmp_path / "again.json")
         assert (tmp_path / "again.json").read_bytes() == (tmp_path / "fit.json").read_bytes()
 
