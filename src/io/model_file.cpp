@@ -5,13 +5,13 @@
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
-#include <toml++/toml.h>
 
 #include "gp2/csv.hpp"
 #include "gp2/error.hpp"
 #include "io/baseline_prior.hpp"
 #include "io/latent_tapes.hpp"
 #include "io/model_reader.hpp"
+#include "io/toml.hpp"
 #include "io/toml_reader.hpp"
 #include "robots/robot_expressions.hpp"
 #include "symbolic/graph.hpp"

@@ -5,9 +5,8 @@
 #include <utility>
 #include <vector>
 
-#include <toml++/toml.h>
-
 #include "gp2/error.hpp"
+#include "io/toml.hpp"
 
 namespace gp2 {
 

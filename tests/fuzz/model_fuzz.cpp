@@ -2,6 +2,7 @@
 
 #include "fuzz/fuzz.hpp"
 #include "gp2/model_file.hpp"
+#include "gp2/state_evaluator.hpp"
 
 namespace {
 

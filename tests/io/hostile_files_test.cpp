@@ -1,9 +1,11 @@
 // Files made to harm: each is read or refused, with words that name it, soon.
 
-#include <chrono>
+#include <cstdint>
+#include <ctime>
 #include <filesystem>
 #include <functional>
 #include <string>
+#include <vector>
 
 #include <sys/stat.h>
 
@@ -27,8 +29,8 @@ using testing::StartsWith;
 class HostileFiles : public testing::Test {
  protected:
   void TearDown() override {
-    // generous: a few seconds under a sanitizer on a busy machine
-    EXPECT_LT(std::chrono::steady_clock::now() - start_, std::chrono::seconds(20));
+    // of the processor, whatever else runs beside; generous, for sanitizers
+    EXPECT_LT(static_cast<double>(std::clock() - start_) / CLOCKS_PER_SEC, 15);
   }
 
   static std::string repeated(const std::string& text, std::size_t n) {
@@ -65,7 +67,7 @@ class HostileFiles : public testing::Test {
   }
 
  private:
-  std::chrono::steady_clock::time_point start_ = std::chrono::steady_clock::now();
+  std::clock_t start_ = std::clock();
 };
 
 // ---------------------------------------------------------------------------------------------------------- expressions in a
@@ -159,6 +161,10 @@ TEST_F(HostileFiles, DeepArraysTablesAndKeysAreRefused) {
   const std::string harmless = "name = \"" + repeated("[.", 50) + "\" # " + repeated("[.", 50) + "\n";
   EXPECT_EQ(error_of_model(harmless + model_with_force("q1")), "");
   EXPECT_THAT(error_of_model("noise.ddq = [" + repeated("1.5, ", 1000) + "]\n"), HasSubstr("coordinates: missing"));
+}
+
+TEST_F(HostileFiles, WhatTheTomlParserOnlyAssertsIsRefused) {
+  for (const char* text : {"[=]", "[\x0f]", "[[ ,]]", "[\n]"}) EXPECT_EQ(error_of_model(text), "m.toml: not valid TOML") << text;
 }
 
 TEST_F(HostileFiles, ALargeModelFileIsRefusedBeforeItIsRead) {
