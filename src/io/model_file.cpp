@@ -52,7 +52,7 @@ ModelFile parse_model(std::string text, std::string name, const MechanicsSource*
   }
   try {
     const internal::StepLimit limit;
-    require_shallow(model.text, model.name);
+    require_safe(model.text, model.name);
     const toml::table root = toml::parse(model.text, model.name);
     read_model(root, mechanics, robot, model);
   } catch (const toml::parse_error& error) {

@@ -19,12 +19,13 @@ std::string shortened(const std::string& text, std::size_t max_size) {
   return text.substr(0, end) + "...";
 }
 
-void require_shallow(std::string_view text, const std::string& file_name) {
+void require_safe(std::string_view text, const std::string& file_name) {
   constexpr int max_depth = 32, max_dots = 16;
   int line = 1, depth = 0, dots = 0;
   const auto fail = [&](const std::string& what) { throw LocatedError(fmt::format("{}:{}: {}", file_name, line, what)); };
-  char within = '\0';        // '#': a comment, '"' or '\'': a text in quotes
-  std::size_t n_quotes = 0;  // that end it: 1, or 3 of a text of several lines
+  char within = '\0';                                           // '#': a comment, '"' or '\'': a text in quotes
+  std::size_t n_quotes = 0;                                     // that end it: 1, or 3 of a text of several lines
+  if (text.starts_with("\xef\xbb\xbf")) text.remove_prefix(3);  // the byte order mark of some editors
   for (std::size_t at = 0; at < text.size(); ++at) {
     const char c = text[at];
     const std::string_view next = text.substr(at, 5);
@@ -54,6 +55,8 @@ void require_shallow(std::string_view text, const std::string& file_name) {
       --depth;
     } else if (c == ',' || c == '=') {
       dots = 0;
+    } else if (static_cast<unsigned char>(c) >= 0x80) {
+      fail("letters beyond ASCII stand in quotes and comments only");
     }
     if (at < text.size() && text[at] == '\n') {
       ++line;

@@ -16,9 +16,10 @@ class LocatedError : public InputError {
   using InputError::InputError;
 };
 
-/// toml++ goes down into arrays, tables and dotted keys by recursion, and bounds that for brackets only.
-/// @throws LocatedError when brackets nest deeper than 32, or a key has more than 16 dots.
-void require_shallow(std::string_view text, const std::string& file_name);
+/// Refuses what toml++ 3.3 does not survive: it goes down into dotted keys by recursion without a bound, and takes it for granted
+/// that nothing beyond ASCII stands outside of quotes and comments.
+/// @throws LocatedError for that, when brackets nest deeper than 32, and when a key has more than 16 dots.
+void require_safe(std::string_view text, const std::string& file_name);
 
 /// The entries of a table in the file's own order: TOML tables are sorted by name.
 std::vector<std::pair<std::string, const toml::node*>> entries_of(const toml::table& table);

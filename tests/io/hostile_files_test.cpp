@@ -165,6 +165,7 @@ TEST_F(HostileFiles, DeepArraysTablesAndKeysAreRefused) {
 
 TEST_F(HostileFiles, WhatTheTomlParserOnlyAssertsIsRefused) {
   for (const char* text : {"[=]", "[\x0f]", "[[ ,]]", "[\n]"}) EXPECT_EQ(error_of_model(text), "m.toml: not valid TOML") << text;
+  EXPECT_EQ(error_of_model("# é\n[é]"), "m.toml:2: letters beyond ASCII stand in quotes and comments only");
 }
 
 TEST_F(HostileFiles, ALargeModelFileIsRefusedBeforeItIsRead) {
