@@ -1,5 +1,6 @@
 #pragma once
 
+#include <cstddef>
 #include <filesystem>
 #include <string>
 #include <string_view>
@@ -8,10 +9,15 @@
 namespace gp2 {
 
 /// A table of comma-separated values with one header line. Cells may be quoted; blank lines are skipped. Cells stay text until
-/// they are asked for as numbers, so columns that are not needed may hold anything.
+/// they are asked for as numbers, so columns that are not needed may hold anything. A table has at most `max_columns`, their
+/// names at most `max_name_length` bytes: what has more is no table.
 class CsvTable {
  public:
-  /// @throws InputError naming file and line: unreadable or empty file, no data rows, ragged row, repeated or empty column name.
+  static constexpr std::size_t max_columns = 10'000;
+  static constexpr std::size_t max_name_length = 1000;
+
+  /// @throws InputError naming file and line: unreadable or empty file, no data rows, ragged row, too many columns, a column
+  ///   name that is empty, repeated or too long.
   static CsvTable read(const std::filesystem::path& path);
   /// @param name  stands for the file in messages
   static CsvTable parse(std::string_view text, std::string name);
@@ -68,7 +74,11 @@ void write_file(const std::filesystem::path& path, std::string_view content);
 /// no permission.
 void require_writable(const std::filesystem::path& path);
 
-/// The content of a file. @throws InputError when it cannot be read.
-std::string read_file(const std::filesystem::path& path);
+/// The largest file that is read, 1 GiB.
+inline constexpr std::size_t max_file_size = std::size_t{1} << 30;
+
+/// The content of a file, or of a pipe or device to its end.
+/// @throws InputError when it cannot be read, holds more than `max_size` bytes, or is a pipe that nothing writes to.
+std::string read_file(const std::filesystem::path& path, std::size_t max_size = max_file_size);
 
 }  // namespace gp2

@@ -3,6 +3,7 @@
 #include <filesystem>
 #include <memory>
 #include <string>
+#include <string_view>
 #include <vector>
 
 #include "gp2/model_file.hpp"
@@ -35,6 +36,9 @@ struct FitFile {
   /// @throws InputError naming the file and what is wrong: not a fit, of a newer format, cut short, changed after it was written
   ///   (its checksum is of another content; the text says how a change that is meant is made good), or with values out of place.
   static FitFile read(const std::filesystem::path& path);
+  /// @param text  what the file holds
+  /// @param name  stands for the file in messages
+  static FitFile parse(std::string_view text, const std::string& name);
   /// The same of a fit whose mechanics are code: it holds what its model declares, and is told the code again. The code must be
   /// that of the fit, for the posterior to be.
   /// @param mechanics  asked for every model of the file whose mechanics are code; the declaration's name tells which

@@ -1,7 +1,6 @@
 #include "gp2/csv.hpp"
 
 #include <algorithm>
-#include <array>
 #include <atomic>
 #include <cerrno>
 #include <charconv>
@@ -25,6 +24,8 @@
 namespace gp2 {
 
 namespace {
+
+constexpr std::string_view byte_order_mark = "\xef\xbb\xbf";  // with which some spreadsheets begin a file
 
 std::string_view trim(std::string_view text) {
   const auto is_space = [](char c) { return c == ' ' || c == '\t' || c == '\r'; };
@@ -71,8 +72,15 @@ std::optional<std::vector<std::string>> split(std::string_view line) {
   }
 }
 
-// names that are there, once each
+// a cell to show in a message
+std::string shown(const std::string& cell) { return cell.size() <= 60 ? cell : cell.substr(0, 57) + "..."; }
+
+// names that are there, once each, and not too many
 void check_header(const std::vector<std::string>& header, const std::string& where) {
+  if (header.size() > CsvTable::max_columns) {
+    throw InputError(fmt::format("{}: the header has {} columns; at most {} are read: split the table, or is it no table?", where,
+                                 header.size(), CsvTable::max_columns));
+  }
   if (header.size() == 1 && header[0].find_first_of(";\t") != std::string::npos) {
     throw InputError(
         fmt::format("{}: the header is not separated by commas but by '{}'; write commas, and '.' as the decimal point", where,
@@ -82,6 +90,11 @@ void check_header(const std::vector<std::string>& header, const std::string& whe
   for (std::size_t k = 0; k < header.size(); ++k) {
     if (header[k].empty()) {
       throw InputError(fmt::format("{}: column {} of the header has no name; name it, or remove a comma too many", where, k + 1));
+    }
+    if (header[k].size() > CsvTable::max_name_length) {
+      throw InputError(
+          fmt::format("{}: the name of column {} has {} bytes, at most {} are allowed: is this no table? It begins '{}'", where,
+                      k + 1, header[k].size(), CsvTable::max_name_length, shown(header[k])));
     }
     if (!seen.insert(header[k]).second) {
       throw InputError(fmt::format("{}: the column '{}' stands twice in the header; rename or remove one", where, header[k]));
@@ -96,7 +109,7 @@ CsvTable CsvTable::read(const std::filesystem::path& path) { return parse(read_f
 CsvTable CsvTable::parse(std::string_view text, std::string name) {
   CsvTable table;
   table.name_ = std::move(name);
-  if (text.starts_with("\xef\xbb\xbf")) text.remove_prefix(3);  // the byte order mark of some spreadsheets
+  if (text.starts_with(byte_order_mark)) text.remove_prefix(byte_order_mark.size());
   int line_number = 0;
   while (!text.empty()) {
     const std::size_t end = text.find('\n');
@@ -162,7 +175,7 @@ CsvTable CsvTable::take(const std::vector<int>& rows) const {
 }
 
 std::string csv_cell(const std::string& text) {
-  const bool plain = text.find_first_of(",\"") == std::string::npos && !text.starts_with(' ') && !text.ends_with(' ');
+  const bool plain = text.find_first_of(",\"") == std::string::npos && trim(text) == text && !text.starts_with(byte_order_mark);
   if (plain) return text;
   std::string cell = "\"";
   for (char c : text) cell.append(c == '"' ? 2 : 1, c);  // a quote is written twice
@@ -172,7 +185,8 @@ std::string csv_cell(const std::string& text) {
 std::string CsvTable::text() const {
   std::string csv;
   const auto add = [&](const std::string& cell, int column) {
-    csv += csv_cell(cell);
+    // the line of one empty cell would be blank
+    csv += cell.empty() && n_columns() == 1 ? "\"\"" : csv_cell(cell);
     csv += column + 1 < n_columns() ? ',' : '\n';
   };
   for (int column = 0; column < n_columns(); ++column) add(header_[static_cast<std::size_t>(column)], column);
@@ -208,8 +222,9 @@ double CsvTable::number(int row, int column) const {
   double value = 0;
   const auto [end, error] = std::from_chars(digits.data(), digits.data() + digits.size(), value);
   const bool whole = end == digits.data() + digits.size();
-  if (whole && error == std::errc::result_out_of_range) fail(fmt::format("'{}' does not fit a double (5e-324 to 1.8e308)", text));
-  if (!whole || error != std::errc() || !std::isfinite(value)) fail(fmt::format("'{}' is not a finite number", text));
+  if (whole && error == std::errc::result_out_of_range)
+    fail(fmt::format("'{}' does not fit a double (5e-324 to 1.8e308)", shown(text)));
+  if (!whole || error != std::errc() || !std::isfinite(value)) fail(fmt::format("'{}' is not a finite number", shown(text)));
   return value;
 }
 
@@ -351,26 +366,6 @@ void write_file(const std::filesystem::path& path, std::string_view content) {
   if (!good && !temporary.empty()) unlink(temporary.c_str());
   errno = reason;
   require_written(path, good);
-}
-
-std::string read_file(const std::filesystem::path& path) {
-  const auto require = [&](bool good) {
-    if (!good) throw InputError(fmt::format("{}: cannot be read: {}", path.string(), std::strerror(errno)));
-  };
-  const int file = open(path.c_str(), O_RDONLY | O_CLOEXEC);
-  require(file >= 0);
-  std::string content;
-  std::array<char, 1 << 16> block;
-  ssize_t n = 0;
-  do {
-    n = ::read(file, block.data(), block.size());
-    if (n > 0) content.append(block.data(), static_cast<std::size_t>(n));
-  } while (n > 0 || (n < 0 && errno == EINTR));
-  const int reason = errno;
-  close(file);
-  errno = reason;
-  require(n == 0);
-  return content;
 }
 
 }  // namespace gp2

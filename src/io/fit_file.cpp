@@ -15,6 +15,7 @@
 #include "gp2/csv.hpp"
 #include "gp2/error.hpp"
 #include "gp2/version.hpp"
+#include "symbolic/graph.hpp"
 
 namespace gp2 {
 
@@ -82,12 +83,13 @@ double number(const ParsedJson& json) {
 // What reads JSON goes down a level by calling itself: a file must not make it go down without end.
 constexpr int max_depth = 64;
 
-ParsedJson parse_json(const std::filesystem::path& path) {
+/// @param path  stands for the file in messages
+ParsedJson parse_json(std::string_view text, const std::filesystem::path& path) {
   const auto check_depth = [&](int depth, ParsedJson::parse_event_t, const ParsedJson&) {
     if (depth > max_depth) throw InputError(fmt::format("{}: nested deeper than {} levels", path.string(), max_depth));
     return true;
   };
-  ParsedJson json = ParsedJson::parse(read_file(path), check_depth, false);
+  ParsedJson json = ParsedJson::parse(text, check_depth, false);
   if (json.is_discarded()) {
     throw InputError(
         fmt::format("{}: not valid JSON: the file is cut short or damaged; write it again with gp2 fit", path.string()));
@@ -274,9 +276,12 @@ bool mechanics_are_code(const ParsedJson& model) {
 /// @param mechanics  null: not given
 ModelFile model_from(const ParsedJson& json, const MechanicsSource* mechanics) {
   if (!mechanics_are_code(json)) {
-    if (!json.contains("robot")) return ModelFile::parse(json.at("text"), json.at("name"));
-    return ModelFile::parse(json.at("text"), json.at("name"),
-                            RobotSource([&](const std::string&) { return robot_from_json(json.at("robot").dump()); }));
+    // a fit is whole in itself: its text must not make it read other files
+    const RobotSource robot = [&](const std::string& file) {
+      if (!json.contains("robot")) throw InputError(fmt::format("the fit does not hold the robot of '{}'", file));
+      return robot_from_json(json.at("robot").dump());
+    };
+    return ModelFile::parse(json.at("text"), json.at("name"), robot);
   }
   if (mechanics == nullptr) {
     throw InputError(
@@ -516,9 +521,11 @@ void require_fit(ParsedJson& json) {
   take_checksum(json);
 }
 
+/// @param path       stands for the file in messages
 /// @param mechanics  null: not given
-FitFile read_fit(const std::filesystem::path& path, const MechanicsSource* mechanics) {
-  ParsedJson json = parse_json(path);
+FitFile read_fit(std::string_view text, const std::filesystem::path& path, const MechanicsSource* mechanics) {
+  const internal::StepLimit limit;  // for all its models together
+  ParsedJson json = parse_json(text, path);
   FitFile fit;
   try {
     require_fit(json);
@@ -574,9 +581,13 @@ FitFile read_fit(const std::filesystem::path& path, const MechanicsSource* mecha
 
 }  // namespace
 
-FitFile FitFile::read(const std::filesystem::path& path) { return read_fit(path, nullptr); }
+FitFile FitFile::read(const std::filesystem::path& path) { return read_fit(read_file(path), path, nullptr); }
 
-FitFile FitFile::read(const std::filesystem::path& path, const MechanicsSource& mechanics) { return read_fit(path, &mechanics); }
+FitFile FitFile::parse(std::string_view text, const std::string& name) { return read_fit(text, name, nullptr); }
+
+FitFile FitFile::read(const std::filesystem::path& path, const MechanicsSource& mechanics) {
+  return read_fit(read_file(path), path, &mechanics);
+}
 
 namespace {
 
@@ -599,7 +610,7 @@ std::vector<Hyperparameter> hyperparameters_of(const std::filesystem::path& path
 }  // namespace
 
 void read_start_values(const std::filesystem::path& path, std::vector<Hyperparameter>& hyperparameters) {
-  ParsedJson json = parse_json(path);
+  ParsedJson json = parse_json(read_file(path), path);
   std::vector<std::pair<std::string, double>> values;
   const bool of_fit = is_fit(json);
   if (of_fit) {

@@ -5,21 +5,22 @@
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
-#include <toml++/toml.h>
 
 #include "gp2/csv.hpp"
 #include "gp2/error.hpp"
 #include "io/baseline_prior.hpp"
 #include "io/latent_tapes.hpp"
 #include "io/model_reader.hpp"
+#include "io/toml.hpp"
 #include "io/toml_reader.hpp"
 #include "robots/robot_expressions.hpp"
+#include "symbolic/graph.hpp"
 
 namespace gp2 {
 
 namespace {
 
-constexpr std::size_t max_file_size = 1 << 20;
+constexpr std::size_t max_model_size = 1 << 20;
 
 }  // namespace
 
@@ -33,12 +34,12 @@ std::vector<std::string> expand_angle(const std::string& feature, const std::vec
 namespace {
 
 std::string read_text(const std::filesystem::path& path) {
-  std::error_code unknown;  // of a pipe, say; then `parse` looks at the size
+  std::error_code unknown;  // of a pipe, say
   const auto size = std::filesystem::file_size(path, unknown);
-  if (!unknown && size > max_file_size) {
-    throw InputError(fmt::format("{}: {} bytes; a model file has at most {}", path.string(), size, max_file_size));
+  if (!unknown && size > max_model_size) {
+    throw InputError(fmt::format("{}: {} bytes; a model file has at most {}", path.string(), size, max_model_size));
   }
-  return read_file(path);
+  return read_file(path, max_model_size);
 }
 
 /// @param mechanics  null: they stand in the text
@@ -46,10 +47,12 @@ ModelFile parse_model(std::string text, std::string name, const MechanicsSource*
   ModelFile model;
   model.name = std::move(name);
   model.text = std::move(text);
-  if (model.text.size() > max_file_size) {
-    throw InputError(fmt::format("{}: {} bytes; a model file has at most {}", model.name, model.text.size(), max_file_size));
+  if (model.text.size() > max_model_size) {
+    throw InputError(fmt::format("{}: {} bytes; a model file has at most {}", model.name, model.text.size(), max_model_size));
   }
   try {
+    const internal::StepLimit limit;
+    require_safe(model.text, model.name);
     const toml::table root = toml::parse(model.text, model.name);
     read_model(root, mechanics, robot, model);
   } catch (const toml::parse_error& error) {
@@ -164,6 +167,7 @@ Latent make_discrepancy(const ModelFile& model, const SystemSymbols& symbols, co
 }  // namespace
 
 Prior make_prior(const ModelFile& model, const PriorOptions& options) {
+  const internal::StepLimit limit;
   if (options.baseline) return make_baseline_prior(model, *options.baseline);
   const System& system = *model.system;
   ExpressionGraph& graph = *model.graph;

@@ -3,9 +3,8 @@
 #include <string>
 #include <vector>
 
-#include <toml++/toml.h>
-
 #include "gp2/model_file.hpp"
+#include "io/toml.hpp"
 
 namespace gp2 {
 

@@ -12,11 +12,57 @@ namespace gp2 {
 
 int line_of(const toml::node& node) { return static_cast<int>(node.source().begin.line); }
 
-std::string shortened(const std::string& text) {
-  if (text.size() <= 60) return text;
-  std::size_t end = 57;
+std::string shortened(const std::string& text, std::size_t max_size) {
+  if (text.size() <= max_size) return text;
+  std::size_t end = max_size - 3;
   while (end > 0 && (static_cast<unsigned char>(text[end]) & 0xC0U) == 0x80U) --end;
   return text.substr(0, end) + "...";
+}
+
+void require_safe(std::string_view text, const std::string& file_name) {
+  constexpr int max_depth = 32, max_dots = 16;
+  int line = 1, depth = 0, dots = 0;
+  const auto fail = [&](const std::string& what) { throw LocatedError(fmt::format("{}:{}: {}", file_name, line, what)); };
+  char within = '\0';                                           // '#': a comment, '"' or '\'': a text in quotes
+  std::size_t n_quotes = 0;                                     // that end it: 1, or 3 of a text of several lines
+  if (text.starts_with("\xef\xbb\xbf")) text.remove_prefix(3);  // the byte order mark of some editors
+  for (std::size_t at = 0; at < text.size(); ++at) {
+    const char c = text[at];
+    const std::string_view next = text.substr(at, 5);
+    const std::size_t run = std::min(next.find_first_not_of(c), next.size());  // of this character, up to 5
+    if (within == '#') {
+      if (c == '\n') within = '\0';
+    } else if (within != '\0') {
+      if (c == '\\' && within == '"') ++at;
+      if (c == within && run >= n_quotes) {
+        // up to two quotes may stand right before the three that end a text
+        at += n_quotes == 1 ? 0 : run - 1;
+        within = '\0';
+      } else if (c == '\n' && n_quotes == 1) {
+        within = '\0';
+      }
+    } else if (c == '#' || c == '"' || c == '\'') {
+      within = c;
+      n_quotes = run >= 3 ? 3 : 1;
+      if (c != '#') at += n_quotes - 1;
+    } else if (c == '.') {
+      if (++dots > max_dots) fail(fmt::format("a key with more than {} dots", max_dots));
+    } else if (c == '[' || c == '{') {
+      dots = 0;
+      if (++depth > max_depth) fail(fmt::format("arrays and tables are nested deeper than {}", max_depth));
+    } else if (c == ']' || c == '}') {
+      dots = 0;
+      --depth;
+    } else if (c == ',' || c == '=') {
+      dots = 0;
+    } else if (static_cast<unsigned char>(c) >= 0x80) {
+      fail("letters beyond ASCII stand in quotes and comments only");
+    }
+    if (at < text.size() && text[at] == '\n') {
+      ++line;
+      dots = 0;
+    }
+  }
 }
 
 std::string written(const toml::node& node) {
@@ -42,7 +88,9 @@ void TomlReader::fail(const toml::node& node, const std::string& key, const std:
 }
 
 void TomlReader::fail(int line, const std::string& key, const std::string& message) const {
-  throw LocatedError(fmt::format("{}:{}: {}: {}", name_, line, key, message));
+  // names and texts of the file may be as long as the file
+  constexpr std::size_t enough = 200, enough_words = 4000;
+  throw LocatedError(fmt::format("{}:{}: {}: {}", name_, line, shortened(key, enough), shortened(message, enough_words)));
 }
 
 void TomlReader::only_keys(const toml::table& table, const std::string& where, const std::vector<std::string>& known) const {

@@ -1,12 +1,12 @@
 #pragma once
 
 #include <string>
+#include <string_view>
 #include <utility>
 #include <vector>
 
-#include <toml++/toml.h>
-
 #include "gp2/error.hpp"
+#include "io/toml.hpp"
 
 namespace gp2 {
 
@@ -16,6 +16,11 @@ class LocatedError : public InputError {
   using InputError::InputError;
 };
 
+/// Refuses what toml++ 3.3 does not survive: it goes down into dotted keys by recursion without a bound, and takes it for granted
+/// that nothing beyond ASCII stands outside of quotes and comments.
+/// @throws LocatedError for that, when brackets nest deeper than 32, and when a key has more than 16 dots.
+void require_safe(std::string_view text, const std::string& file_name);
+
 /// The entries of a table in the file's own order: TOML tables are sorted by name.
 std::vector<std::pair<std::string, const toml::node*>> entries_of(const toml::table& table);
 
@@ -24,8 +29,8 @@ int line_of(const toml::node& node);
 /// A value as the file has it, to show what was got; at most 60 bytes.
 std::string written(const toml::node& node);
 
-/// At most 60 bytes of a text, cut between characters.
-std::string shortened(const std::string& text);
+/// At most so many bytes of a text, cut between characters.
+std::string shortened(const std::string& text, std::size_t max_size = 60);
 
 /// Typed access to the nodes of a TOML file; what does not fit is an error "FILE:LINE: KEY: what was expected, what was got".
 class TomlReader {

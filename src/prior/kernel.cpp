@@ -20,6 +20,8 @@ using Primitive = Kernel::Primitive;
 
 namespace {
 
+constexpr std::size_t max_parameters = 10'000;
+
 constexpr std::array<std::pair<std::string_view, Primitive>, 7> primitive_names = {{{"se", Primitive::se},
                                                                                     {"matern32", Primitive::matern32},
                                                                                     {"matern52", Primitive::matern52},
@@ -101,6 +103,10 @@ Kernel Kernel::parse(std::string_view text, std::span<const std::string> feature
         }
       }
       if (primitive == Primitive::rq) kernel.parameters_.push_back({ParameterKind::shape, -1, prefix + "alpha"});
+      if (kernel.parameters_.size() > max_parameters) {
+        throw InputError(fmt::format("a kernel of {} factors on {} features has more than {} hyperparameters; use fewer",
+                                     n_factors, features.size(), max_parameters));
+      }
     }
     if (!kernel.terms_.empty()) {
       term.amplitude = static_cast<int>(kernel.parameters_.size());

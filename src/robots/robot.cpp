@@ -18,7 +18,8 @@ namespace gp2 {
 
 using Eigen::Matrix3d;
 using Eigen::Vector3d;
-using Json = nlohmann::ordered_json;
+using Json = nlohmann::ordered_json;  // written: keys in the order that a person reads
+using ParsedJson = nlohmann::json;    // read: a key is found at once, however many there are
 using Body = RobotDescription::Body;
 using Connect = RobotDescription::Connect;
 using Coupling = RobotDescription::Coupling;
@@ -302,7 +303,7 @@ namespace {
 // An entry of the JSON text, with the words that say where it stands. Each has a fixed set of keys: one more or less is an error.
 class Entry {
  public:
-  Entry(const Json& json, std::string where) : json_(json), where_(std::move(where)) {}
+  Entry(const ParsedJson& json, std::string where) : json_(json), where_(std::move(where)) {}
 
   // the entry is an object with these keys
   void has(std::initializer_list<const char*> keys) const {
@@ -323,7 +324,7 @@ class Entry {
   [[nodiscard]] std::vector<Entry> items() const {
     if (!json_.is_array()) fail("an array");
     std::vector<Entry> entries;
-    for (const Json& item : json_) entries.emplace_back(item, fmt::format("{}[{}]", where_, entries.size()));
+    for (const ParsedJson& item : json_) entries.emplace_back(item, fmt::format("{}[{}]", where_, entries.size()));
     return entries;
   }
   [[nodiscard]] std::vector<Entry> items(std::size_t n) const {
@@ -342,7 +343,7 @@ class Entry {
   }
   [[nodiscard]] int integer() const {
     if (!json_.is_number_integer()) fail("a whole number");
-    // Json itself would wrap
+    // ParsedJson itself would wrap
     if (std::abs(json_.get<double>()) > std::numeric_limits<int>::max()) fail("a smaller number");
     return json_.get<int>();
   }
@@ -367,12 +368,12 @@ class Entry {
 
   [[noreturn]] void fail(const std::string& expected) const {
     const std::string got =
-        json_.is_structured() ? json_.type_name() : json_.dump(-1, ' ', false, Json::error_handler_t::replace);
+        json_.is_structured() ? json_.type_name() : json_.dump(-1, ' ', false, ParsedJson::error_handler_t::replace);
     throw InputError(fmt::format("{}: {} stands where {} must", where_, got, expected));
   }
 
  private:
-  const Json& json_;
+  const ParsedJson& json_;
   std::string where_;
 };
 
@@ -466,7 +467,7 @@ Coupling coupling_from(const Entry& entry) {
 }  // namespace
 
 RobotDescription robot_from_json(const std::string& text) {
-  const Json json = Json::parse(text, nullptr, false);
+  const ParsedJson json = ParsedJson::parse(text, nullptr, false);
   if (json.is_discarded()) throw InputError("robot: not valid JSON: the text is cut short or damaged");
   const Entry entry(json, "robot");
   entry.has({"name", "gravity", "bodies", "sites", "connects", "welds", "couplings", "notes"});

@@ -18,7 +18,38 @@ using internal::is_binary;
 using internal::is_leaf;
 using internal::Node;
 
+namespace {
+
+struct StepsLeft {
+  bool is_limited = false;
+  std::uint64_t limit = 0, taken = 0;
+};
+thread_local StepsLeft steps_of_thread;
+
+}  // namespace
+
+internal::StepLimit::StepLimit(std::uint64_t steps) : is_outermost_(!steps_of_thread.is_limited) {
+  if (is_outermost_) steps_of_thread = {true, steps, 0};
+}
+
+internal::StepLimit::~StepLimit() {
+  if (is_outermost_) steps_of_thread = {};
+}
+
+void internal::StepLimit::count(std::size_t steps) {
+  StepsLeft& all = steps_of_thread;
+  if (!all.is_limited) return;
+  all.taken += steps;
+  if (all.taken > all.limit) {
+    throw InputError(
+        fmt::format("expressions: their derivatives and tapes take more than {} steps; use fewer or shorter "
+                    "expressions, or fewer parameters",
+                    all.limit));
+  }
+}
+
 std::uint32_t ExpressionGraph::Implementation::intern(const Node& node) {
+  internal::StepLimit::count(1);
   Key key{node.operation, node.a, node.b, std::bit_cast<std::uint64_t>(node.value)};
   if (internal::is_commutative(node.operation) && key.a > key.b) std::swap(key.a, key.b);
   if (const auto found = ids_.find(key); found != ids_.end()) return found->second;
@@ -44,6 +75,7 @@ std::vector<std::uint32_t> ExpressionGraph::Implementation::reachable(std::span<
     if (!is_leaf(node.operation)) visit(node.a);
     if (is_binary(node.operation)) visit(node.b);
   }
+  internal::StepLimit::count(found.size());
   std::sort(found.begin(), found.end());
   return found;
 }

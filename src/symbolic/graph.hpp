@@ -20,6 +20,26 @@ namespace gp2 {
 
 namespace internal {
 
+/// While one lives, what its thread does with expressions must end within so many steps: nodes made or visited, inputs of tapes.
+/// A file can ask for more than anyone can wait for within all limits of size (many derivatives of one large expression, say).
+/// One inside another changes nothing.
+class StepLimit {
+ public:
+  /// About ten seconds, and 1 GB where every step is one of a tape.
+  static constexpr std::uint64_t max_steps = 50'000'000;
+
+  explicit StepLimit(std::uint64_t steps = max_steps);
+  ~StepLimit();
+  StepLimit(const StepLimit&) = delete;
+  StepLimit& operator=(const StepLimit&) = delete;
+
+  /// @throws InputError past the limit of this thread; without one it does nothing.
+  static void count(std::size_t steps);
+
+ private:
+  bool is_outermost_;
+};
+
 struct Node {
   Operation operation = Operation::constant;
   std::uint32_t a = 0;  // id of the first operand; of a variable: index of its name

@@ -6,6 +6,7 @@
 
 #include "gp2/error.hpp"
 #include "gp2/state_evaluator.hpp"
+#include "symbolic/graph.hpp"
 #include "symbolic/state_derivatives.hpp"
 
 namespace gp2 {
@@ -231,6 +232,7 @@ class SymbolicSystem::Evaluator final : public StateEvaluator {
 const SymbolicSystem::StateTape& SymbolicSystem::state_tape() const {
   std::call_once(state_tape_is_filled_, [this] {
     StateTape& out = *state_tape_;
+    const internal::StepLimit limit;
     try {
       const internal::DerivativeExpressions derivatives =
           internal::state_derivatives(out.outputs, std::span(out.inputs).first(static_cast<std::size_t>(layout().size())));

@@ -23,6 +23,7 @@ constexpr Index block_size = 64;  // points evaluated together
 }  // namespace
 
 Tape::Tape(std::span<const Expression> outputs, std::span<const Expression> inputs) : uses_input_(inputs.size(), false) {
+  internal::StepLimit::count(inputs.size() + outputs.size());
   if (outputs.empty()) return;
   ExpressionGraph& graph = outputs.front().graph();
   const std::vector<internal::Node>& nodes = graph.implementation_->nodes;

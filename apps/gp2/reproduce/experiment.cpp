@@ -6,12 +6,12 @@
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
-#include <toml++/toml.h>
 #include <nlohmann/json.hpp>
 
 #include "command.hpp"
 #include "gp2/error.hpp"
 #include "gp2/generate.hpp"
+#include "io/toml.hpp"
 
 namespace gp2::command {
 
