@@ -273,7 +273,7 @@ TEST(UpdateTest, RefusesWhatDoesNotFitAndKeepsThePosterior) {
   refuses("update: a column of `states`", [](Observations& o) { o.states.conservativeResize(3, Eigen::NoChange); });
   refuses("update: `values` must have a row", [](Observations& o) { o.values = o.values.leftCols(1).eval(); });
   refuses("update: `values` must have a row", [](Observations& o) { o.values = o.values.topRows(1).eval(); });
-  refuses("update: `values` must be finite", [](Observations& o) { o.values(0, 1) = std::nan(""); });
+  refuses("update: `values` must be finite", [](Observations& o) { o.values(0, 1) = std::numeric_limits<double>::infinity(); });
   refuses("update: `noise_stddev` must have one number", [](Observations& o) { o.noise_stddev = VectorXd::Ones(1); });
   refuses("update: `noise_stddev` must be positive", [](Observations& o) { o.noise_stddev[0] = 0; });
   refuses("update: `noise_stddev` must be positive", [](Observations& o) { o.noise_stddev[0] = std::nan(""); });

@@ -405,13 +405,14 @@ TEST_F(DamagedFit, OtherFilesAreRefused) {
 }
 
 TEST_F(DamagedFit, ANewerFormatIsRefusedWithBothVersions) {
-  EXPECT_EQ(error_after([](Json& json) { json["version"] = 7; }),
-            fmt::format("of format 7, but this gp2 ({}) reads up to 6: use a newer gp2", version()));
+  EXPECT_EQ(error_after([](Json& json) { json["version"] = FitFile::format_version + 1; }),
+            fmt::format("of format {}, but this gp2 ({}) reads up to {}: use a newer gp2", FitFile::format_version + 1, version(),
+                        FitFile::format_version));
   EXPECT_EQ(error_after([](Json& json) {
               // whatever else a newer format changes
-              json = Json{{"format", "gp2 fit"}, {"version", 7}};
-            }).substr(0, 11),
-            "of format 7");
+              json = Json{{"format", "gp2 fit"}, {"version", 99}};
+            }).substr(0, 12),
+            "of format 99");
   EXPECT_EQ(error_after([](Json& json) { json["version"] = 0; }), "format 0 does not exist");
   EXPECT_EQ(error_after([](Json& json) { json["version"] = 4294967297; }), "4294967297 is too large");
   EXPECT_EQ(error_after([](Json& json) { json["version"] = 1.5; }), "1.5 stands where a whole number must");
