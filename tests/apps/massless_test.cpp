@@ -1,3 +1,5 @@
+#include <cmath>
+
 #include <gmock/gmock.h>
 #include <gtest/gtest.h>
 
@@ -27,20 +29,21 @@ TEST(MasslessRod, PassesThroughEveryCommand) {
   EXPECT_THAT(fit.err, Not(HasSubstr("warning")));
   // the noise-free accelerations spread over some 10 m/s²
   const nlohmann::json evaluation = desk.done("gp2 evaluate fit.json --data test.csv --json").json();
-  EXPECT_LT(evaluation.at("rmse").get<double>(), 0.5) << evaluation.dump();
+  EXPECT_LT(evaluation.at("rmse").at("ddtheta").get<double>(), 0.5) << evaluation.dump();
   EXPECT_LT(evaluation.at("max_constraint_error").get<double>(), 1e-9) << evaluation.dump();
 
   // the force of the rod on the ball and of the ball on the rod: Aᵀλ does no work along x = l sin θ, z = −l cos θ
   desk.done("gp2 predict fit.json --states test.csv --view constraint-force -o force.csv");
   const CsvTable force = desk.table("force.csv"), states = desk.table("test.csv");
+  const auto number = [](const CsvTable& table, int row, const std::string& name) { return table.number(row, table.find(name)); };
   for (int i = 0; i < states.n_rows(); ++i) {
-    const double theta = states.column("theta")[i];
-    const double along = 0.6 * (force.column("fc_x")[i] * std::cos(theta) + force.column("fc_z")[i] * std::sin(theta));
-    EXPECT_NEAR(along + force.column("fc_theta")[i], 0, 1e-9 * (1 + std::abs(along)));
+    const double theta = number(states, i, "theta");
+    const double along = 0.6 * (number(force, i, "fc_x") * std::cos(theta) + number(force, i, "fc_z") * std::sin(theta));
+    EXPECT_NEAR(along + number(force, i, "fc_theta"), 0, 1e-9 * (1 + std::abs(along)));
   }
   desk.done("gp2 predict fit.json --states test.csv --view multipliers -o multipliers.csv");
   desk.done("gp2 simulate " + rod + " --start theta=1 --t-end 1 -o motion.csv");
-  const Outcome motion = desk.done("gp2 simulate fit.json --start theta=1 --t-end 1 -o learned.csv");
+  desk.done("gp2 simulate fit.json --start theta=1 --t-end 1 -o learned.csv");
   desk.done("gp2 report fit.json -o report.html");
   EXPECT_THAT(desk.read("report.html"), HasSubstr("\"unconstrained\":[]"));
 }
@@ -65,14 +68,12 @@ TEST(MasslessRod, HasNoUnconstrainedAccelerationAndTheErrorsSaySo) {
       refused("fit " + rod + " --data log.csv --baseline se -o out.json"),
       HasSubstr(
           "log.csv: data row 1: the mass matrix M is singular, and without constraints nothing determines ddq along theta"));
-  desk.write("loose.toml", test::replaced(desk.read(rod), ", \"z + l*cos(theta)\"]", "]"));
+  desk.write("loose.toml", test::replaced(desk.read(rod), "\"x - l*sin(theta)\", \"z + l*cos(theta)\"", "\"x - 0.1*theta^2\""));
   desk.write("rigid.toml", test::replaced(desk.read(rod), "directions = \"force\"", "directions = \"acceleration\""));
   EXPECT_THAT(refused("check rigid.toml --data log.csv"),
               HasSubstr("ERROR    the mass matrix M is singular, so that there is no M⁻¹"));
-  // of sin θ alone the angle is decided but where the rod stands level
-  std::string level = "x,z,theta,dx,dz,dtheta,u1,ddx,ddz,ddtheta\n";
-  level += "0.1,0,0.1,0,0,0,0,0,0,0\n0.6,0,1.5707963267948966,0,0,0,0,0,0,0\n";
-  desk.write("level.csv", level);
+  // of a constraint that does not see the angle at one state
+  desk.write("level.csv", "x,z,theta,dx,dz,dtheta,u1,ddx,ddz,ddtheta\n0.1,0,1,0,0,0,0,0,0,0\n0,0,0,0,0,0,0,0,0,0\n");
   EXPECT_THAT(refused("fit loose.toml --data level.csv -o out.json"),
               HasSubstr("level.csv: data row 2: the mass matrix M is singular, and nothing determines ddq along theta: only a "
                         "constraint that acts there, or a mass, does"));
