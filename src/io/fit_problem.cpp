@@ -540,7 +540,7 @@ std::string fit_options_json(const FitProblemOptions& asked, const FitOptions& o
   if (asked.max_points) json["max_points"] = *asked.max_points;
   if (asked.also_noise_stddev) json["also_noise_std"] = *asked.also_noise_stddev;
   if (asked.time_step) json["dt"] = *asked.time_step;
-  for (const auto& [name, column] : asked.columns) json["map"] += column + "=" + name;
+  for (const auto& [name, column] : asked.columns) json["map"] += fmt::format("{}={}", column, name);
   for (const Hyperparameter& h : start) json["start"][h.name] = h.value;
   return json.dump();
 }
