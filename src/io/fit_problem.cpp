@@ -702,7 +702,7 @@ std::string fit_options_json(const FitProblemOptions& asked, const FitOptions& o
   if (asked.project) json["project"] = true;
   if (asked.robust) json["robust"] = true;
   if (asked.time_step) json["dt"] = *asked.time_step;
-  for (const auto& [name, column] : asked.columns) json["map"] += column + "=" + name;
+  for (const auto& [name, column] : asked.columns) json["map"] += fmt::format("{}={}", column, name);
   for (const Hyperparameter& h : start) json["start"][h.name] = h.value;
   return json.dump();
 }
