@@ -139,7 +139,7 @@ TEST_F(HostileFiles, HalfAMillionEntriesAreReadOrRefused) {
   expect(model_with_force("q1") + "[noise]\nddq = " + zeros,
          "m.toml:6: noise.ddq: expected one value or 1, one per coordinate, got 450000");
   expect(model_with_force("q1") + "[[latent]]\nfeatures = " + zeros, "m.toml:6: latent.features: '0' stands twice; remove one");
-  EXPECT_THAT(error_of_model("name = " + zeros), StartsWith("m.toml:1: name: expected a text in quotes, got [ 0, 0, "));
+  EXPECT_THAT(error_of_model("name = " + zeros), StartsWith("m.toml:1: name: expected a text in quotes, got ["));
 }
 
 TEST_F(HostileFiles, LongNamesAreShownShortened) {
@@ -233,7 +233,7 @@ TEST_F(HostileFiles, FoldersDevicesAndPipesInsteadOfFilesAreRefused) {
     EXPECT_EQ(error(folder.path().string()), folder.path().string() + ": cannot be read: Is a directory");
     EXPECT_EQ(error(pipe), pipe + ": cannot be read: a pipe that nothing writes to");
     EXPECT_THAT(error("/dev/zero"), AllOf(StartsWith("/dev/zero: more than "), HasSubstr(" bytes, which is all that is read")));
-    EXPECT_THAT(error("/dev/null"), StartsWith("/dev/null: "));
+    EXPECT_THAT(error("/dev/null"), StartsWith("/dev/null:"));
   }
 }
 
