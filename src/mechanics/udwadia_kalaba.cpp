@@ -526,7 +526,9 @@ void evaluate_mechanics(const System& system, const Ref<const MatrixXd>& states,
     size_of_b = std::max(size_of_b, projection.size_of_b());
   }
   for (int i = 0; i < n_states; ++i) {
-    if (batch.projections[static_cast<std::size_t>(i)].inconsistency() > MechanicsBatch::consistency_tolerance * size_of_b) {
+    // of a b that has died away to numbers without full precision nothing can be said
+    const double tolerance = std::max(MechanicsBatch::consistency_tolerance * size_of_b, std::numeric_limits<double>::min());
+    if (batch.projections[static_cast<std::size_t>(i)].inconsistency() > tolerance) {
       batch.fault = {i, "the constraints contradict each other: no acceleration satisfies A ddq = b"};
       return;
     }

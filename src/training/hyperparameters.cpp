@@ -46,13 +46,16 @@ double median(std::vector<double> values) {
 // a spread that bounds and starting points can be multiples of, even where the data do not vary
 double usable(double spread, double fallback) { return spread > 0 && std::isfinite(spread) ? spread : fallback; }
 
+// of what is measured
+VectorXd size_of_rows(const Eigen::Ref<const MatrixXd>& values) {
+  return values.array().isNaN().select(0, values).cwiseAbs().rowwise().maxCoeff();
+}
+
 // standard deviation of each row; 0 where it does not vary but for rounding
 VectorXd spread_of_rows(const Eigen::Ref<const MatrixXd>& values) {
   const VectorXd stddev = row_stddev(values);
-  return (stddev.array() > 1e-12 * values.cwiseAbs().rowwise().maxCoeff().array()).select(stddev, 0);
+  return (stddev.array() > 1e-12 * size_of_rows(values).array()).select(stddev, 0);
 }
-
-VectorXd size_of_rows(const Eigen::Ref<const MatrixXd>& values) { return values.cwiseAbs().rowwise().maxCoeff(); }
 
 // what a group says of the accelerations' spread, or of their size, per row of its view; nothing where the view is of another
 // kind

@@ -267,10 +267,14 @@ TEST(WriteFile, DoesNotReplaceAFileThatIsReadOnly) {
   chmod(folder.path().c_str(), 0777);
   // root may write anywhere, so not as root
   const bool is_root = geteuid() == 0;
-  if (is_root) ASSERT_EQ(seteuid(65534), 0);
+  if (is_root) {
+    ASSERT_EQ(seteuid(65534), 0);
+  }
   const std::string written = input_error_of([&] { write_file(path, "new"); });
   const std::string asked = input_error_of([&] { require_writable(path); });
-  if (is_root) ASSERT_EQ(seteuid(0), 0);
+  if (is_root) {
+    ASSERT_EQ(seteuid(0), 0);
+  }
   EXPECT_EQ(written, path.string() + ": cannot be written: Permission denied");
   EXPECT_EQ(asked, written);
   EXPECT_EQ(read_file(path), "old");

@@ -189,7 +189,7 @@ TEST(FitFile, TellsWhatWasAskedOfTheFit) {
   EXPECT_EQ(Json::parse(fit_options_json(asked, options)),
             Json::parse(R"({"discrepancy": "default", "gradient_tolerance": 1e-5, "hyperprior": "default", "max_escapes": 5,
                             "max_iterations": 1000, "mean": "zero", "protocol": "default", "reduction_tolerance": 1e-12,
-                            "restarts": 5, "seed": 0})"));
+                            "restarts": 5, "seed": 0, "standard_errors": true})"));
   asked.columns = {{"q3", "theta1"}};
   asked.observe = {"ddq1", "ddq3"};
   asked.mean = Prior::Mean::force;
@@ -213,7 +213,7 @@ TEST(FitFile, TellsWhatWasAskedOfTheFit) {
   EXPECT_EQ(Json::parse(text), Json::parse(R"({"also_noise_std": 0.2, "baseline": "icm", "discrepancy": "none", "dt": 0.01,
       "estimate": [], "gradient_tolerance": 1e-5, "hyperprior": "none", "map": ["theta1=q3"], "max_escapes": 5,
       "max_iterations": 1000, "max_points": 30, "mean": "force", "noise_std": 0.1, "observe": ["ddq1", "ddq3"],
-      "prior": "force", "protocol": "paper", "reduction_tolerance": 1e-12, "restarts": 3, "seed": 18446744073709551615,
+      "prior": "force", "protocol": "paper", "reduction_tolerance": 1e-12, "restarts": 3, "seed": 18446744073709551615, "standard_errors": true,
       "start": {"m2": 0.7}})"));
   asked.estimate_noise = true;
   EXPECT_EQ(Json::parse(fit_options_json(asked, options))["noise_std"], "estimate");

@@ -242,6 +242,9 @@ test("a fit to 1000 rows with 1000 rows of test makes at most 2 MB", async () =>
 test("a fit that learned from no acceleration has a page without pictures", async () => {
   // the same numbers, said to be of the unconstrained acceleration
   const fit = json("unicycle.json");
+  // of a format without a checksum
+  fit.version = 5;
+  delete fit.checksum;
   const [group] = fit.observations;
   group.view = "unconstrained";
   for (const name of ["q1", "q2", "q3"]) {
