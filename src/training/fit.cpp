@@ -7,6 +7,8 @@
 #include <random>
 #include <set>
 
+#include <fmt/format.h>
+
 #include "gp2/error.hpp"
 #include "gp2/training.hpp"
 #include "inference/lapack.hpp"
@@ -152,8 +154,9 @@ class Training {
         const LbfgsbResult further = optimise(static_cast<int>(from), at, scales, workspace);
         if (further.value < reports_[from].objective) store(from, further);
       }
-    } catch (const NumericalError&) {
-      // no finite likelihood about the optimum: no standard errors, which the report says by having none
+    } catch (const NumericalError& error) {
+      // the fit stands, and says why it has none
+      reports_[from].termination += fmt::format("; {}", error.what());
     }
   }
 

@@ -7,6 +7,7 @@
 #include <gtest/gtest.h>
 #include <Eigen/Dense>
 
+#include "gp2/error.hpp"
 #include "test_models.hpp"
 
 namespace gp2 {
@@ -232,6 +233,30 @@ TEST(LaplaceTest, ParametersKnownToAMillionthOfTheirBoxAreFittedToTheirOptimum) 
   ASSERT_EQ(report.hyperparameters.back().name, "r");
   EXPECT_LT(report.uncertainty->stddev[last], 0.01);
   EXPECT_LT(std::abs(report.hyperparameters.back().value - 0.5), 4 * report.uncertainty->stddev[last]);
+}
+
+// √r has no value left of r = 0: nothing to take differences of
+TEST(LaplaceTest, AFitAtTheEdgeOfItsModelSaysThatItHasNoStandardErrors) {
+  std::string text = line().text;
+  text.replace(text.find("p*x + r"), 7, "p*x + sqrt(r)");
+  text.replace(text.find("value = 0.2"), 11, "value = 1e-7");
+  Problem p = problem(ModelFile::parse(text, "edge"), 20, {"r"});
+  try {
+    laplace_uncertainty(p.prior, p.observations, p.hyperparameters, 1);
+    FAIL() << "no error";
+  } catch (const NumericalError& error) {
+    EXPECT_STREQ(error.what(), "the likelihood is not finite near the fitted value of 'r': no standard errors");
+  }
+  // r alone, between 1e-7 and what it can hardly leave
+  p = only(std::move(p), {Kind::parameter});
+  FitOptions options = one_run();
+  options.max_iterations = 1;
+  options.gradient_tolerance = 1e300;
+  const FitReport report = fit(p.prior, p.observations, p.hyperparameters, options).report;
+  EXPECT_FALSE(report.uncertainty.has_value());
+  EXPECT_NE(report.termination.find("; the likelihood is not finite near the fitted value of 'r': no standard errors"),
+            std::string::npos)
+      << report.termination;
 }
 
 TEST(LaplaceTest, NoFitWithoutParametersPaysForStandardErrors) {
