@@ -162,6 +162,12 @@ bool continues_product(Expression e) {
   return e.operation() != Operation::divide && !e.is_constant();
 }
 
+/// Whether e is a product or quotient that starts with 0, as 0/0 does: of -0/0 a reader takes -0, which is 0, first.
+bool starts_with_zero(Expression e) {
+  while (e.operation() == Operation::multiply || e.operation() == Operation::divide) e = e.left();
+  return e.is_constant(0);
+}
+
 /// Parentheses around what stands between, and the name of a function before them.
 /// Not stretchy: around indices and powers browsers make them taller than the eye needs.
 constexpr const char* mathml_open = "<mrow><mo stretchy=\"false\">(</mo>";
@@ -221,7 +227,7 @@ Written write(Expression e, Notation notation) {
     case Operation::subtract:
       return {{{e.left(), in_sum}, " - ", {e.right(), in_product}}, in_sum};
     case Operation::negate:
-      return {{"-", {e.left(), in_product}}, in_product};
+      return {{"-", {e.left(), starts_with_zero(e.left()) ? in_power : in_product}}, in_product};
     case Operation::multiply_or_zero:
       if (c) {
         return {{"(", {e.left(), in_sum}, " == 0.0 ? 0.0 : ", {e.left(), in_product}, "*", {e.right(), in_power}, ")"}, atomic};

@@ -122,6 +122,7 @@ class Whitening {
   }
   /// Rows of A C⁻ᵀ, of unit norm; their norms.
   [[nodiscard]] std::pair<Extended, ExtendedVector> rows(const Extended& A) const {
+    if (A.rows() == 0) return {A, ExtendedVector()};  // Eigen's solve reads the first of the right sides
     Extended B = C_.triangularView<Eigen::Lower>().solve(A.transpose().eval()).transpose();
     const ExtendedVector norms = B.rowwise().norm();
     for (Index row = 0; row < B.rows(); ++row) {

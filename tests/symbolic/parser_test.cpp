@@ -190,9 +190,9 @@ TEST_F(ParserTest, TextReadsBackToTheSameNode) {
     const std::string text = to_string(e);
     ASSERT_EQ(read_back(text), e) << text << "\nwas read as\n" << to_string(read_back(text));
   }
-  for (const char* text :
-       {"x - (y - z)", "x/(y*z)", "x/(y/z)", "(x^y)^z", "x^(-y)", "(-x)^y", "(-2)^x", "-2^x", "-(x + y)*z", "-3/x", "-x - y",
-        "x^(y + z)", "x - (y + z)", "pi*x", "x^(-pi)", "-pi - x", "1e-300*x", "2^x^y", "x*(y/z)"}) {
+  for (const char* text : {"x - (y - z)", "x/(y*z)",    "x/(y/z)",  "(x^y)^z", "x^(-y)",    "(-x)^y",      "(-2)^x",
+                           "-2^x",        "-(x + y)*z", "-3/x",     "-x - y",  "x^(y + z)", "x - (y + z)", "pi*x",
+                           "x^(-pi)",     "-pi - x",    "1e-300*x", "2^x^y",   "x*(y/z)",   "-(0/0)",      "y - (0/0*x)/2"}) {
     const Expression e = read_back(text);
     EXPECT_EQ(read_back(to_string(e)), e) << text << " printed as " << to_string(e);
   }
