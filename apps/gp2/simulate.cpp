@@ -232,6 +232,7 @@ double largest_change(const Eigen::VectorXd& energy) { return (energy.array() - 
 nlohmann::ordered_json report_of(const std::vector<Motion>& motions) {
   Trajectory total;
   double energy_drift = 0;
+  std::size_t n_lower_rank = 0;
   std::optional<double> leaves_data;
   for (const Motion& motion : motions) {
     const Trajectory& one = motion.trajectory;
@@ -241,6 +242,7 @@ nlohmann::ordered_json report_of(const std::vector<Motion>& motions) {
     total.rejected_steps += one.rejected_steps;
     total.evaluations += one.evaluations;
     total.seconds += one.seconds;
+    n_lower_rank += one.lower_rank.states.size();
     if (motion.energy) energy_drift = std::max(energy_drift, largest_change(*motion.energy));
     const std::optional<double> left = motion.uncertainty ? motion.uncertainty->leaves_data : std::nullopt;
     if (left && (!leaves_data || *left < *leaves_data)) leaves_data = left;
@@ -256,6 +258,7 @@ nlohmann::ordered_json report_of(const std::vector<Motion>& motions) {
   report["start_velocity_residual"] = motions[0].trajectory.start_velocity_residual;
   report["start_displacement"] = motions[0].trajectory.start_displacement;
   report["max_energy_drift"] = motions[0].energy ? nlohmann::ordered_json(energy_drift) : nullptr;
+  report["n_lower_rank"] = n_lower_rank;
   report["leaves_data_at"] = leaves_data ? nlohmann::ordered_json(*leaves_data) : nullptr;
   return report;
 }
@@ -281,6 +284,16 @@ std::vector<std::string> notes_of(const std::vector<Motion>& motions, const Argu
                     motions.size() > 1 ? fmt::format("sample {} ", k) : "the motion ", *motions[k].uncertainty->leaves_data,
                     motions[k].uncertainty->coordinate));
     break;  // the first sample stands for the others
+  }
+  for (const Motion& motion : motions) {
+    const LowerRank& lower = motion.trajectory.lower_rank;
+    if (lower.states.empty()) continue;
+    notes.push_back(
+        fmt::format("warning: the constraints have rank {} but at {} of {} rows of the motion, where it is as low as {}, first "
+                    "at t = {:.6g}; the motion may branch there",
+                    lower.usual, lower.states.size(), motion.trajectory.times.size(), lower.lowest,
+                    motion.trajectory.times[lower.states.front()]));
+    break;  // as above
   }
   const nlohmann::ordered_json report = report_of(motions);
   notes.push_back(fmt::format("{}: {} rows, {} steps; drift |c| ≤ {:.3g}, |dc/dt| ≤ {:.3g}", arguments.output,

@@ -32,7 +32,8 @@ inline constexpr double constraint_violation_tolerance = 1e-6;
 std::optional<ConstraintViolation> largest_violation(const System& system, const Eigen::Ref<const Eigen::MatrixXd>& states,
                                                      const Eigen::Ref<const Eigen::VectorXd>& parameters);
 
-/// States where A has a lower rank than at others: a constraint lets go there, or follows from the rest.
+/// States where A has a lower rank than at others: a constraint lets go there, or follows from the rest. Unknown, and none, after
+/// a fault.
 struct LowerRank {
   int usual = 0;            // the highest rank
   int lowest = 0;           // of A over the states

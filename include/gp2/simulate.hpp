@@ -5,6 +5,7 @@
 
 #include <Eigen/Core>
 
+#include "gp2/check.hpp"
 #include "gp2/model_file.hpp"
 #include "gp2/system.hpp"
 
@@ -54,7 +55,8 @@ struct Trajectory {
 
   double max_position_drift = 0;       // largest |c| of position constraints at the written times
   double max_velocity_drift = 0;       // largest |dc/dt|, or |c| of velocity constraints, there
-  double start_position_residual = 0;  // the same at the start as it was given
+  LowerRank lower_rank;                // written times at which constraints let go, or follow from each other
+  double start_position_residual = 0;  // the drift at the start as it was given
   double start_velocity_residual = 0;
   double start_displacement = 0;  // by how much the projection of the start changed an entry of q or dq, at most
 

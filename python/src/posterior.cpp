@@ -546,6 +546,9 @@ void add_posterior(py::module_& module) {
           "Of ddq along the mean's motion (n, nq); None of a model's own motion or a sample's.")
       .def_property_readonly("max_position_drift", [](const Motion& m) { return m.trajectory.max_position_drift; })
       .def_property_readonly("max_velocity_drift", [](const Motion& m) { return m.trajectory.max_velocity_drift; })
+      .def_property_readonly(
+          "n_lower_rank", [](const Motion& m) { return m.trajectory.lower_rank.states.size(); },
+          "Times at which the constraints have a lower rank than at others.")
       .def_property_readonly("steps", [](const Motion& m) { return m.trajectory.steps; })
       .def_property_readonly("rejected_steps", [](const Motion& m) { return m.trajectory.rejected_steps; })
       .def_property_readonly("evaluations", [](const Motion& m) { return m.trajectory.evaluations; });

@@ -135,7 +135,7 @@ std::optional<ConstraintViolation> largest_violation(const System& system, const
 
 LowerRank states_of_lower_rank(const MechanicsBatch& mechanics) {
   LowerRank lower;
-  if (mechanics.projections.empty()) return lower;
+  if (mechanics.projections.empty() || mechanics.fault) return lower;
   const auto by_rank = [](const UdwadiaKalaba& a, const UdwadiaKalaba& b) { return a.rank() < b.rank(); };
   const auto [lowest, highest] = std::minmax_element(mechanics.projections.begin(), mechanics.projections.end(), by_rank);
   lower.lowest = lowest->rank();

@@ -36,6 +36,7 @@ TEST(SimulateModelCommand, WritesAHundredRowsOnTheConstraint) {
   EXPECT_LE(report["max_velocity_drift"], 1e-12);
   EXPECT_GT(report["steps"], 10);
   EXPECT_GE(report["seconds"], 0);
+  EXPECT_EQ(report["n_lower_rank"], 0);
   EXPECT_EQ(report["leaves_data_at"], nullptr);
 
   const CsvTable motion = desk.table("motion.csv");

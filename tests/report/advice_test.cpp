@@ -71,6 +71,17 @@ TEST(Advice, OfAGoodFitIsToTestItOrToLook) {
   EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::good, "Nothing to mend", "pictures")));
 }
 
+TEST(Advice, TellsWhereAConstraintLetsGo) {
+  Report report = good_report();
+  report.data = {good_data("training"), good_data("test")};
+  report.data[1].states = Eigen::MatrixXd::Zero(7, 50);
+  report.data[1].lower_rank = {2, 1, {3, 8}};
+  EXPECT_THAT(learning_advice(report),
+              ElementsAre(advises(Level::warning,
+                                  "rank 2 but at 2 of 50 states of the test data, where it is as low as 1, first at row 4",
+                                  "dead centre")));
+}
+
 TEST(Advice, TellsThatTheOptimiserDidNotConverge) {
   Report report = good_report();
   report.fit.report.converged = false;

@@ -101,6 +101,24 @@ TEST(Simulate, FollowsAnOscillatorThatHasNoConstraint) {
   EXPECT_GE(out.evaluations, 6 * out.steps);
 }
 
+TEST(Simulate, CountsTheTimesAtWhichAConstraintLetsGo) {
+  const ModelFile model = ModelFile::parse(R"toml(
+coordinates = ["x", "y"]
+[mechanics]
+mass  = [[1, 0], [0, 1]]
+force = ["0", "1"]
+[constraints]
+acceleration = ["x*(ddx - ddy)"]
+)toml",
+                                           "lets go");
+  const Trajectory out = simulate_model(model, state_of(model, {{"dx", 1}}), with_tolerance(times(1, 11), 1e-8));
+  EXPECT_EQ(out.lower_rank.usual, 1);
+  EXPECT_EQ(out.lower_rank.lowest, 0);
+  EXPECT_EQ(out.lower_rank.states, std::vector<int>{0});
+  const Trajectory away = simulate_model(model, state_of(model, {{"x", 1}, {"dx", 1}}), with_tolerance(times(1, 11), 1e-8));
+  EXPECT_TRUE(away.lower_rank.states.empty());
+}
+
 TEST(Simulate, InterpolatesBetweenStepsAsWellAsItSteps) {
   const ModelFile model = oscillator();
   const auto error = [&](double tolerance) {

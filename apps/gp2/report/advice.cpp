@@ -146,6 +146,20 @@ void constraint_advice(const Report& report, std::vector<Advice>& advice) {
        "signs or offsets of a column, or wrong parameters of the constraint: estimate them with --estimate."});
 }
 
+void rank_advice(const Report& report, std::vector<Advice>& advice) {
+  for (const ReportData& data : report.data) {
+    const LowerRank& lower = data.lower_rank;
+    if (lower.states.empty()) continue;
+    advice.push_back(
+        {Level::warning,
+         fmt::format("The constraints have rank {} but at {} of {} states of the {} data, where it is as low as {}, "
+                     "first at row {}.",
+                     lower.usual, lower.states.size(), data.states.cols(), data.name, lower.lowest, lower.states.front() + 1),
+         "One constraint less holds there, as at a dead centre of a linkage. If the machine has none, look whether "
+         "a row vanishes only as it is written: gp2 check names it."});
+  }
+}
+
 void independence_advice(const Report& report, std::vector<Advice>& advice) {
   for (const ReportData& data : report.data) {
     if (data.independent.empty()) continue;
@@ -192,6 +206,7 @@ std::vector<Advice> learning_advice(const Report& report) {
   bound_advice(report, advice);
   uncertainty_advice(report.fit.report, advice);
   constraint_advice(report, advice);
+  rank_advice(report, advice);
   independence_advice(report, advice);
   for (const ReportData& data : report.data) {
     if (data.is_test) test_advice(data, report.data.front().is_test ? nullptr : &report.data.front(), advice);

@@ -43,6 +43,7 @@ struct ReportData {
   Eigen::MatrixXd truth;                 // the true ddq (nq × N), NaN where unknown; empty without --truth
   std::vector<std::pair<std::string, Eigen::VectorXd>> features;  // φ by name (N each)
   std::optional<ConstraintViolation> violation;
+  LowerRank lower_rank;                  // states at which constraints let go, or follow from each other
   std::vector<std::string> independent;  // accelerations to observe instead, where the outputs follow from each other
 
   /// Root mean square of truth − predicted per output (d); NaN where the truth is not known.
