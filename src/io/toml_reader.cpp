@@ -67,6 +67,12 @@ void require_safe(std::string_view text, const std::string& file_name) {
 
 std::string written(const toml::node& node) {
   if (node.is_table()) return "a table";
+  if (const toml::array* const array = node.as_array()) {
+    // toml++ 3.3 computes the width of numbers below 1 by an undefined cast when it writes arrays
+    std::vector<std::string> elements;
+    for (const toml::node& element : *array) elements.push_back(written(element));
+    return shortened(fmt::format("[{}]", fmt::join(elements, ", ")));
+  }
   std::ostringstream text;
   node.visit([&](const auto& value) { text << value; });
   return shortened(text.str());

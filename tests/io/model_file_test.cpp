@@ -325,7 +325,7 @@ std::vector<Complaint> complaints() {
       {"BoundsInTheWrongOrder", with_parameter("m = { value = 2, bounds = [3, 1] }"),
        "4: parameters.m.bounds: the lower end 3 must be below the upper end 1"},
       {"ThreeBounds", with_parameter("m = { value = 2, bounds = [1, 2, 3] }"),
-       "4: parameters.m.bounds: expected [lower, upper], got [ 1, 2, 3 ]"},
+       "4: parameters.m.bounds: expected [lower, upper], got [1, 2, 3]"},
       {"ParameterWithAnUnknownKey", with_parameter("m = { value = 2, bound = [1, 3] }"),
        "4: parameters.m.bound: unknown key; known here: value, bounds, estimate, of, prior"},
       {"ParameterNamedLikeACoordinate", with_parameter("m = 1\nq1 = 2"),
