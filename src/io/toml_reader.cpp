@@ -23,12 +23,8 @@ void require_safe(std::string_view text, const std::string& file_name) {
   constexpr int max_depth = 32, max_dots = 16;
   int line = 1, depth = 0, dots = 0;
   const auto fail = [&](const std::string& what) { throw LocatedError(fmt::format("{}:{}: {}", file_name, line, what)); };
-  const auto require_ascii = [&](char c) {
-    if (static_cast<unsigned char>(c) >= 0x80) fail("letters beyond ASCII stand in quotes and comments only");
-  };
   char within = '\0';                                           // '#': a comment, '"' or '\'': a text in quotes
   std::size_t n_quotes = 0;                                     // that end it: 1, or 3 of a text of several lines
-  bool is_key = false;                                          // of several parts, or else a word with a quote in it
   if (text.starts_with("\xef\xbb\xbf")) text.remove_prefix(3);  // the byte order mark of some editors
   for (std::size_t at = 0; at < text.size(); ++at) {
     const char c = text[at];
@@ -37,7 +33,6 @@ void require_safe(std::string_view text, const std::string& file_name) {
     if (within == '#') {
       if (c == '\n') within = '\0';
     } else if (within != '\0') {
-      if (is_key) require_ascii(c);
       if (c == '\\' && within == '"') ++at;
       if (c == within && run >= n_quotes) {
         // up to two quotes may stand right before the three that end a text
@@ -48,9 +43,6 @@ void require_safe(std::string_view text, const std::string& file_name) {
       }
     } else if (c == '#' || c == '"' || c == '\'') {
       within = c;
-      const char before = at == 0 ? '\n' : text[at - 1];
-      is_key = c != '#' && before == '.';
-      if (c != '#' && std::string_view(" \t\r\n=,[{.").find(before) == std::string_view::npos) fail("a quote within a word");
       n_quotes = run >= 3 ? 3 : 1;
       if (c != '#') at += n_quotes - 1;
     } else if (c == '.') {
@@ -63,8 +55,8 @@ void require_safe(std::string_view text, const std::string& file_name) {
       --depth;
     } else if (c == ',' || c == '=') {
       dots = 0;
-    } else {
-      require_ascii(c);
+    } else if (static_cast<unsigned char>(c) >= 0x80) {
+      fail("letters beyond ASCII stand in quotes and comments only");
     }
     if (at < text.size() && text[at] == '\n') {
       ++line;

@@ -17,8 +17,8 @@ class LocatedError : public InputError {
 };
 
 /// Refuses what toml++ 3.3 does not survive: it goes down into dotted keys by recursion without a bound, and takes it for granted
-/// that nothing beyond ASCII stands outside of quotes and comments; a quote in the middle of a word opens none.
-/// @throws LocatedError for these, when brackets nest deeper than 32, and when a key has more than 16 dots.
+/// that nothing beyond ASCII stands outside of quotes and comments.
+/// @throws LocatedError for that, when brackets nest deeper than 32, and when a key has more than 16 dots.
 void require_safe(std::string_view text, const std::string& file_name);
 
 /// The entries of a table in the file's own order: TOML tables are sorted by name.

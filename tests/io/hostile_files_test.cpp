@@ -166,14 +166,6 @@ TEST_F(HostileFiles, DeepArraysTablesAndKeysAreRefused) {
 TEST_F(HostileFiles, WhatTheTomlParserOnlyAssertsIsRefused) {
   for (const char* text : {"[=]", "[\x0f]", "[[ ,]]", "[\n]"}) EXPECT_EQ(error_of_model(text), "m.toml: not valid TOML") << text;
   EXPECT_EQ(error_of_model("# é\n[é]"), "m.toml:2: letters beyond ASCII stand in quotes and comments only");
-  // such quotes are none to the parser
-  EXPECT_EQ(error_of_model("a = 1\"é\""), "m.toml:1: a quote within a word");
-  EXPECT_EQ(error_of_model("\na = 1.'é'"), "m.toml:2: letters beyond ASCII stand in quotes and comments only");
-}
-
-TEST_F(HostileFiles, QuotesInKeysAndListsAreRead) {
-  EXPECT_THAT(error_of_model("let . \"a\".'b' = \"é\""), HasSubstr("m.toml:1: let.a: "));
-  EXPECT_THAT(error_of_model("coordinates=['q1',\"q2\",\n\"\"]"), HasSubstr("m.toml:1: coordinates"));
 }
 
 TEST_F(HostileFiles, ALargeModelFileIsRefusedBeforeItIsRead) {
