@@ -16,9 +16,9 @@ class LocatedError : public InputError {
   using InputError::InputError;
 };
 
-/// Refuses what toml++ 3.3 does not survive: it goes down into dotted keys by recursion without a bound, and takes it for granted
-/// that nothing beyond ASCII stands outside of quotes and comments.
-/// @throws LocatedError for that, when brackets nest deeper than 32, and when a key has more than 16 dots.
+/// Refuses what toml++ 3.3 does not survive, for it goes down into dotted keys by recursion without a bound; and letters beyond
+/// ASCII outside of quotes and comments, for it does not say what is wrong with them.
+/// @throws LocatedError for these: a key of more than 16 dots, brackets deeper than 32.
 void require_safe(std::string_view text, const std::string& file_name);
 
 /// The entries of a table in the file's own order: TOML tables are sorted by name.

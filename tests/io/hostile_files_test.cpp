@@ -166,6 +166,9 @@ TEST_F(HostileFiles, DeepArraysTablesAndKeysAreRefused) {
 TEST_F(HostileFiles, WhatTheTomlParserOnlyAssertsIsRefused) {
   for (const char* text : {"[=]", "[\x0f]", "[[ ,]]", "[\n]"}) EXPECT_EQ(error_of_model(text), "m.toml: not valid TOML") << text;
   EXPECT_EQ(error_of_model("# é\n[é]"), "m.toml:2: letters beyond ASCII stand in quotes and comments only");
+  // toml++ looks for white space behind a backslash at the end of a line, and for the end of a number
+  EXPECT_EQ(error_of_model("name = \"\"\"a\\\n é\"\"\"\n" + model_with_force("q1")), "");
+  EXPECT_THAT(error_of_model("name = 1\"é\""), HasSubstr("m.toml:1: "));
 }
 
 TEST_F(HostileFiles, ALargeModelFileIsRefusedBeforeItIsRead) {
