@@ -20,16 +20,24 @@ ProjectedStates project_states(const System& system, const Ref<const VectorXd>& 
   const Index n_moving = 2 * static_cast<Index>(system.nq());
   ProjectedStates out{states, MatrixXd::Zero(n_moving, states.cols()), {}};
   const MatrixXd residuals = system.residuals(states, parameters);
-  for (Index k = 0; k < residuals.rows(); ++k) {
-    if (!residuals.row(k).hasNaN()) continue;
+  const auto label = [&](Index k) { return system.residual_labels()[static_cast<std::size_t>(k)].text; };
+  const bool lacks_columns = states.topRows(n_moving).array().isNaN().rowwise().all().any();
+  for (Index k = 0; lacks_columns && k < residuals.rows(); ++k) {
+    if (!residuals.row(k).array().isNaN().all()) continue;
     throw InputError(
         fmt::format("system '{}': the states lack a coordinate or velocity that the constraint \"{}\" reads, and "
                     "cannot be projected onto it",
-                    system.name(), system.residual_labels()[static_cast<std::size_t>(k)].text));
+                    system.name(), label(k)));
   }
   const ConstraintProjection projection(system, parameters);
   VectorXd state;
   for (Index i = 0; i < states.cols(); ++i) {
+    if (residuals.col(i).hasNaN()) {
+      Index k = 0;
+      while (!std::isnan(residuals(k, i))) ++k;
+      out.failures.push_back({static_cast<int>(i), fmt::format("the constraint \"{}\" is not a number there", label(k))});
+      continue;
+    }
     // what is not measured is read by nothing, but must not turn up in products with zero
     state = states.col(i).array().isNaN().select(0, states.col(i));
     try {

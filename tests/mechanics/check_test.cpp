@@ -44,6 +44,21 @@ TEST(Check, AStateAtRestIsNoFaultOfAAndB) {
   EXPECT_EQ(motion_finding(*model.system, bead_states().leftCols(1)).level, Finding::Level::good);
 }
 
+TEST(Check, ConstraintsThatAreNotThereOrLeaveNoFreedomAreToldOf) {
+  const auto said = [](const std::string& constraints) {
+    const ModelFile model =
+        ModelFile::parse("coordinates = ['x', 'z']\n[mechanics]\nmass = [['1', '0'], ['0', '1']]\n" + constraints, "two");
+    std::string text;
+    for (const Finding& finding : check_system(*model.system, bead_states(), model.system->parameter_values())) {
+      if (finding.level == Finding::Level::warning) text += finding.text;
+    }
+    return text;
+  };
+  EXPECT_THAT(said(""), HasSubstr("constraints: none; T = I"));
+  EXPECT_THAT(said("[constraints]\nacceleration = ['ddx - 1', 'ddz - x*ddx']"), HasSubstr("they leave no freedom"));
+  EXPECT_EQ(said("[constraints]\nacceleration = ['ddz - x*ddx']"), "");
+}
+
 TEST(Check, AWrongBIsFound) {
   const ModelFile model = bead();
   CallableSystem::Definition wrong;

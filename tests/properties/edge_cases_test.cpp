@@ -1,9 +1,13 @@
 #include <gmock/gmock.h>
 #include <gtest/gtest.h>
+#include <Eigen/QR>
 
+#include "gp2/check.hpp"
 #include "gp2/fit_problem.hpp"
+#include "gp2/generate.hpp"
 #include "gp2/training.hpp"
 #include "inference/problems.hpp"
+#include "properties/chain_of_links.hpp"
 
 // Data at their edges: points that come twice, one point, nothing that varies.
 namespace gp2 {
@@ -146,6 +150,19 @@ TEST(EdgeCaseTest, FeaturesThatDoNotVarySayNothing) {
 }
 
 // n − 1 constraints leave one direction; n leave none, and there is nothing to learn
+// 15 coordinates of which 5 are free: too many choices to try them all
+TEST(EdgeCaseTest, OfManyCoordinatesThoseAreFoundThatDetermineTheOthers) {
+  const ModelFile chain = ModelFile::parse(test::chain_of_links(5), "chain");
+  const System& system = *chain.system;
+  const GeneratedData data = generate(chain, {8, seed, VectorXd::Zero(system.nq())});
+  const auto rows = dependent_columns(system, data.states, system.parameter_values(), data.accelerations);
+  ASSERT_TRUE(rows.has_value());
+  ASSERT_EQ(rows->size(), 5U);
+  for (const UdwadiaKalaba& projection : require_mechanics(system, data.states, system.parameter_values()).projections) {
+    EXPECT_EQ(Eigen::ColPivHouseholderQR<MatrixXd>(projection.T()(*rows, Eigen::all)).rank(), 5);
+  }
+}
+
 TEST(EdgeCaseTest, AsManyConstraintsAsCoordinatesLeaveNothingToLearn) {
   const auto model = [](const std::string& constraints) {
     return ModelFile::parse(R"toml(

@@ -44,6 +44,7 @@ constexpr const char* tree = R"(<mujoco>
           <body name="tip" pos="0 0.3 0">
             <inertial pos="0 0 0.1" mass="0.4" diaginertia="0.001 0.001 0.0005"/>
             <joint name="b2" type="slide" axis="0 1 0"/>
+            <site name="on_tip" pos="0.02 0.1 0.03"/>
           </body>
         </body>
       </body>
@@ -54,9 +55,16 @@ constexpr const char* tree = R"(<mujoco>
       </body>
     </body>
   </worldbody>
+  <tendon>
+    <spatial name="rope">
+      <site site="on_base"/><site site="on_fixed"/><site site="on_tip"/><pulley divisor="2"/><site site="on_tip"/><site site="on_base"/>
+    </spatial>
+    <fixed name="sum"><joint joint="b1" coef="0.3"/><joint joint="c2" coef="-0.7"/></fixed>
+  </tendon>
   <equality>
     <connect name="loop" body1="tip" body2="right" anchor="0.02 0.03 0.04"/>
     <joint name="gear" joint1="b2" joint2="c1" polycoef="0.1 0.4 0.2 0.05 0.01"/>
+    <tendon name="hoist" tendon1="rope" tendon2="sum" polycoef="0 0.8 0.3 0 0"/>
   </equality>
 </mujoco>)";
 
@@ -387,6 +395,7 @@ TEST(RobotModel, SaysWhatIsWrong) {
   expect("[parameters]\nm = { of = 'mass(\"link8\")' }", "the robot has no number 'mass(\"link8\")'");
   expect("[parameters]\nm = { of = 'mass(\"link7\")' }\nm2 = { of = 'mass(\"link7\")' }", "is the parameter 'm' already");
   expect("[truth]\nforce_on = { 'q1 + q2' = '1' }", "expected a point of the robot");
+  expect("[truth]\nforce_on = { 'site(\"tpi\").x' = '1' }", "has no site 'tpi'");
   expect("[truth]\nforce_on = { 'site(\"tip\").x' = 'ddq1' }", "a force may not depend on accelerations");
   EXPECT_THROW(
       ModelFile::parse("coordinates = ['x']\n[mechanics]\nmass = [['1']]\n[constraints]\nposition = ['site(\"a\").x']", "m"),

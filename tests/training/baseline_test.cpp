@@ -134,6 +134,24 @@ TEST(Baseline, OfIndependentOutputsIsTrainedOneByOneAsItWouldBeTogether) {
   EXPECT_LE(fit_of(p, longer).report.negative_log_likelihood, together.report.negative_log_likelihood + 0.01);
 }
 
+TEST(Baseline, OfIndependentOutputsTellsTheProgressOfTheWhole) {
+  const FitProblem se = problem(Baseline::Kind::se);
+  FitOptions options = quick();
+  double fraction = 0, seconds = 0;
+  int calls = 0;
+  options.progress = [&](const Progress& progress) {
+    ++calls;
+    EXPECT_GE(progress.fraction, fraction);
+    EXPECT_LE(progress.fraction, 1);
+    EXPECT_GE(progress.seconds, seconds);
+    fraction = progress.fraction;
+    seconds = progress.seconds;
+  };
+  fit_of(se, options);
+  EXPECT_GT(calls, 3);
+  EXPECT_GT(fraction, 0.9);
+}
+
 TEST(Baseline, OfMoreTermsHasNoLowerLikelihood) {
   FitOptions options = quick();
   options.max_iterations = 200;
