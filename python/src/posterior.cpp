@@ -197,6 +197,15 @@ std::optional<Posterior> kept_by_others(const PyPosterior& self) {
   return self.file.model.mechanics_are_code ? std::optional(self.posterior) : std::nullopt;
 }
 
+/// Whether the values of a group came with standard deviations of their own, and did not only get larger ones by a robust fit.
+bool has_stated_noise(const Observations& group, int index, const std::vector<DistrustedValue>& distrusted) {
+  MatrixXd scale = group.noise_scale;
+  for (const DistrustedValue& value : distrusted) {
+    if (value.group == index && value.state < scale.cols()) scale(value.row, value.state) /= value.noise_factor;
+  }
+  return ((scale.array() - 1).abs() > 1e-12).any();
+}
+
 void update_with(PyPosterior& self, const py::object& data, const std::vector<std::string>& observe,
                  const std::optional<double>& noise_stddev, const py::object& columns) {
   const System& system = self.system();
@@ -221,7 +230,7 @@ void update_with(PyPosterior& self, const py::object& data, const std::vector<st
       throw InputError("noise_std: these accelerations were not observed in the fit; give their noise standard deviation");
     }
     added.noise_stddev = self.posterior.values().noise_stddev[static_cast<std::size_t>(at_home - groups.begin())];
-    if (at_home->has_noise_scale()) {
+    if (has_stated_noise(*at_home, static_cast<int>(at_home - groups.begin()), self.file.report.distrusted)) {
       LogReader reader = open_log(self.file.model, table, columns_argument(columns));
       for (const std::string& name : names) {
         if (!reader.stddev_column(name).empty()) continue;

@@ -200,6 +200,10 @@ def test_a_robust_fit_lists_what_it_distrusts(arm, arm_log):
     assert worst["state"] == 7
     assert worst["distance"] > 4
     assert not gp2.fit(arm, log, max_iterations=0).report.distrusted
+    # the log states no noise, and more of it needs none
+    n = fitted.n_data
+    fitted.update({name: values[:3] for name, values in columns_of(arm_log).items()})
+    assert fitted.n_data == n + 3
 
 
 def test_states_are_projected_before_the_fit_where_asked_for(arm, arm_log):
