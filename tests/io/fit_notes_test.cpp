@@ -1,24 +1,18 @@
 #include <gmock/gmock.h>
 
 #include "gp2/fit_problem.hpp"
-#include "gp2/generate.hpp"
 #include "io/io_testing.hpp"
-#include "test_models.hpp"
 
 // What a fit says before it begins and after it has ended.
 namespace gp2 {
 namespace {
 
-using Eigen::MatrixXd;
-using Eigen::VectorXd;
 using test::input_error_of;
 using testing::AllOf;
 using testing::Contains;
 using testing::ElementsAre;
 using testing::HasSubstr;
 using testing::StartsWith;
-
-constexpr std::uint64_t seed = 40761;
 
 Hyperparameter hyperparameter(Hyperparameter::Kind kind, const std::string& name, double value, double lower, double upper) {
   Hyperparameter h;
