@@ -40,6 +40,9 @@ struct LowerRank {
   std::vector<int> states;  // where it is below the highest, in order
 };
 LowerRank states_of_lower_rank(const MechanicsBatch& mechanics);
+/// The same of any number of states, in the memory of a few.
+LowerRank states_of_lower_rank(const System& system, const Eigen::Ref<const Eigen::MatrixXd>& states,
+                               const Eigen::Ref<const Eigen::VectorXd>& parameters);
 
 /// Whether measured accelerations obey A ddq = b to rounding: then they were computed from each other, and only nq − rank(A) of
 /// them are independent measurements. Treating all as independent makes an estimated noise collapse to zero.

@@ -133,17 +133,43 @@ std::optional<ConstraintViolation> largest_violation(const System& system, const
   return worst;
 }
 
-LowerRank states_of_lower_rank(const MechanicsBatch& mechanics) {
+namespace {
+
+LowerRank lower_of(const std::vector<int>& ranks) {
   LowerRank lower;
-  if (mechanics.projections.empty() || mechanics.fault) return lower;
-  const auto by_rank = [](const UdwadiaKalaba& a, const UdwadiaKalaba& b) { return a.rank() < b.rank(); };
-  const auto [lowest, highest] = std::minmax_element(mechanics.projections.begin(), mechanics.projections.end(), by_rank);
-  lower.lowest = lowest->rank();
-  lower.usual = highest->rank();
-  for (std::size_t i = 0; i < mechanics.projections.size(); ++i) {
-    if (mechanics.projections[i].rank() < lower.usual) lower.states.push_back(static_cast<int>(i));
+  if (ranks.empty()) return lower;
+  const auto [lowest, highest] = std::minmax_element(ranks.begin(), ranks.end());
+  lower.lowest = *lowest;
+  lower.usual = *highest;
+  for (std::size_t i = 0; i < ranks.size(); ++i) {
+    if (ranks[i] < lower.usual) lower.states.push_back(static_cast<int>(i));
   }
   return lower;
+}
+
+void append_ranks(const MechanicsBatch& mechanics, std::vector<int>& ranks) {
+  for (const UdwadiaKalaba& projection : mechanics.projections) ranks.push_back(projection.rank());
+}
+
+}  // namespace
+
+LowerRank states_of_lower_rank(const MechanicsBatch& mechanics) {
+  std::vector<int> ranks;
+  if (!mechanics.fault) append_ranks(mechanics, ranks);
+  return lower_of(ranks);
+}
+
+LowerRank states_of_lower_rank(const System& system, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters) {
+  if (system.nc() == 0) return {};
+  constexpr Index block = 256;
+  std::vector<int> ranks;
+  for (Index first = 0; first < states.cols(); first += block) {
+    const Index n = std::min(block, states.cols() - first);
+    const MechanicsBatch mechanics = evaluate_mechanics(system, states.middleCols(first, n), parameters);
+    if (mechanics.fault) return {};
+    append_ranks(mechanics, ranks);
+  }
+  return lower_of(ranks);
 }
 
 std::optional<std::vector<int>> dependent_columns(const System& system, const Ref<const MatrixXd>& states,

@@ -64,6 +64,12 @@ TEST(ChangingRankTest, StatesOfLowerRankAreCounted) {
   EXPECT_EQ(lower.usual, 2);
   EXPECT_EQ(lower.lowest, 1);
   EXPECT_EQ(lower.states, (std::vector<int>{2, 6}));
+  // more than are evaluated at once
+  const LowerRank of_many = states_of_lower_rank(*lets_go.system, states().replicate(1, 40), VectorXd());
+  EXPECT_EQ(of_many.usual, 2);
+  EXPECT_EQ(of_many.lowest, 1);
+  ASSERT_EQ(of_many.states.size(), 80U);
+  for (int k = 0; k < 80; ++k) EXPECT_EQ(of_many.states[static_cast<std::size_t>(k)], 8 * (k / 2) + (k % 2 == 0 ? 2 : 6));
   EXPECT_THAT(text_of(check_system(*lets_go.system, states(), VectorXd()), Finding::Level::warning),
               AllOf(HasSubstr("from 1 to 2 of 2 rows; it is lower at 2 of 8 states, first at state 3"),
                     HasSubstr("a row of A vanishes 2 times; it is dropped there")));

@@ -82,7 +82,7 @@ ReportData data_at(const Posterior& posterior, const MatrixXd& states, const std
   for (int i = 0; i < values.n_states() && judge.nc() > 0; ++i) {
     data.constraint_error.col(i) = (values.A(i) * data.predicted.col(i) - values.b(i)).cwiseAbs();
   }
-  data.lower_rank = states_of_lower_rank(evaluate_mechanics(judge, states, parameters));
+  data.lower_rank = states_of_lower_rank(judge, states, parameters);
   if (judge.nc() > 0) data.violation = largest_violation(judge, states, parameters);
 
   for (const Latent& latent : prior.latents) {
