@@ -1,28 +1,20 @@
 #include <gmock/gmock.h>
 
 #include "gp2/fit_problem.hpp"
+#include "hyperparameter.hpp"
 #include "io/io_testing.hpp"
 
 // What a fit says before it begins and after it has ended.
 namespace gp2 {
 namespace {
 
+using test::hyperparameter;
 using test::input_error_of;
 using testing::AllOf;
 using testing::Contains;
 using testing::ElementsAre;
 using testing::HasSubstr;
 using testing::StartsWith;
-
-Hyperparameter hyperparameter(Hyperparameter::Kind kind, const std::string& name, double value, double lower, double upper) {
-  Hyperparameter h;
-  h.kind = kind;
-  h.name = name;
-  h.value = value;
-  h.lower = lower;
-  h.upper = upper;
-  return h;
-}
 
 TEST(FitNotes, NameWhatEndedAtABound) {
   FitReport report;

@@ -149,7 +149,6 @@ TEST(EdgeCaseTest, FeaturesThatDoNotVarySayNothing) {
   expect_usable(quick_fit(p.prior, p.observations), p);
 }
 
-// n − 1 constraints leave one direction; n leave none, and there is nothing to learn
 // 15 coordinates of which 5 are free: too many choices to try them all
 TEST(EdgeCaseTest, OfManyCoordinatesThoseAreFoundThatDetermineTheOthers) {
   const ModelFile chain = ModelFile::parse(test::chain_of_links(5), "chain");
@@ -163,6 +162,7 @@ TEST(EdgeCaseTest, OfManyCoordinatesThoseAreFoundThatDetermineTheOthers) {
   }
 }
 
+// n − 1 constraints leave one direction; n leave none, and there is nothing to learn
 TEST(EdgeCaseTest, AsManyConstraintsAsCoordinatesLeaveNothingToLearn) {
   const auto model = [](const std::string& constraints) {
     return ModelFile::parse(R"toml(

@@ -3,11 +3,13 @@
 #include <gmock/gmock.h>
 #include <gtest/gtest.h>
 
+#include "hyperparameter.hpp"
 #include "report/report_data.hpp"
 
 namespace gp2::command {
 namespace {
 
+using test::hyperparameter;
 using testing::AllOf;
 using testing::ElementsAre;
 using testing::Field;
@@ -20,16 +22,6 @@ using Level = Advice::Level;
 
 auto advises(Level level, const std::string& text, const std::string& mend) {
   return AllOf(Field(&Advice::level, level), Field(&Advice::text, HasSubstr(text)), Field(&Advice::mend, HasSubstr(mend)));
-}
-
-Hyperparameter hyperparameter(Hyperparameter::Kind kind, const std::string& name, double value, double lower, double upper) {
-  Hyperparameter h;
-  h.kind = kind;
-  h.name = name;
-  h.value = value;
-  h.lower = lower;
-  h.upper = upper;
-  return h;
 }
 
 // a fit with nothing to mend

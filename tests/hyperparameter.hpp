@@ -1,0 +1,20 @@
+#pragma once
+
+#include <string>
+
+#include "gp2/training.hpp"
+
+namespace gp2::test {
+
+inline Hyperparameter hyperparameter(Hyperparameter::Kind kind, const std::string& name, double value, double lower,
+                                     double upper) {
+  Hyperparameter h;
+  h.kind = kind;
+  h.name = name;
+  h.value = value;
+  h.lower = lower;
+  h.upper = upper;
+  return h;
+}
+
+}  // namespace gp2::test
