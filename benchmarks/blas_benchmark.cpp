@@ -6,9 +6,9 @@
 #include <benchmark/benchmark.h>
 #include <Eigen/Core>
 
+#include "base/lapack.hpp"
 #include "blas_choice.hpp"
-#include "gp2/blas.hpp"
-#include "inference/lapack.hpp"
+#include "gp2/base/blas.hpp"
 
 namespace {
 

@@ -7,9 +7,9 @@
 #include <benchmark/benchmark.h>
 #include <Eigen/Core>
 
-#include "gp2/generate.hpp"
-#include "gp2/training.hpp"
-#include "inference/lapack.hpp"
+#include "base/lapack.hpp"
+#include "gp2/fit.hpp"
+#include "gp2/simulation/generate.hpp"
 #include "inference/reduction.hpp"
 
 namespace {
@@ -28,7 +28,7 @@ void reset_peak() { std::ofstream("/proc/self/clear_refs") << 5; }
 
 // the surface model with N observations; nq − nc = 2 numbers remain of each
 struct Problem {
-  gp2::ModelFile model = gp2::ModelFile::read(GP2_SOURCE_DIR "/models/surface.toml");
+  gp2::Model model = gp2::Model::read(GP2_SOURCE_DIR "/models/surface.toml");
   gp2::Prior prior;
   std::vector<gp2::Observations> observations;
   std::vector<gp2::Hyperparameter> hyperparameters;

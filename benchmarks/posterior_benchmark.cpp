@@ -4,10 +4,10 @@
 #include <benchmark/benchmark.h>
 #include <Eigen/Core>
 
-#include "gp2/generate.hpp"
+#include "base/lapack.hpp"
+#include "gp2/fit.hpp"
 #include "gp2/posterior.hpp"
-#include "gp2/training.hpp"
-#include "inference/lapack.hpp"
+#include "gp2/simulation/generate.hpp"
 
 namespace {
 
@@ -16,7 +16,7 @@ constexpr int n_states = 6075;
 // The surface with N observations, at hyperparameters where all of them matter; two numbers remain of each. With or without the
 // latent for what the model leaves out that `gp2 fit` adds by default.
 struct Problem {
-  gp2::ModelFile model = gp2::ModelFile::read(GP2_SOURCE_DIR "/models/surface.toml");
+  gp2::Model model = gp2::Model::read(GP2_SOURCE_DIR "/models/surface.toml");
   gp2::Prior prior;
   std::vector<gp2::Observations> observations;
   gp2::ModelValues values;

@@ -10,9 +10,9 @@
 #include <benchmark/benchmark.h>
 #include <Eigen/Core>
 
-#include "gp2/generate.hpp"
+#include "gp2/fit.hpp"
 #include "gp2/predictor.hpp"
-#include "gp2/training.hpp"
+#include "gp2/simulation/generate.hpp"
 
 namespace {
 
@@ -21,7 +21,7 @@ using gp2::Predictor;
 enum class Call { mean, stddev, jacobian };
 
 struct Setup {
-  gp2::ModelFile model = gp2::ModelFile::read(GP2_SOURCE_DIR "/models/surface.toml");
+  gp2::Model model = gp2::Model::read(GP2_SOURCE_DIR "/models/surface.toml");
   Eigen::MatrixXd states = gp2::generate(model, {1000, 2, Eigen::VectorXd::Zero(3)}).states;
   Eigen::VectorXd mean = Eigen::VectorXd::Zero(3), stddev = mean;
   Eigen::MatrixXd jacobian = Eigen::MatrixXd::Zero(3, states.rows());

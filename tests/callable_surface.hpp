@@ -4,9 +4,9 @@
 #include <memory>
 #include <string>
 
-#include "gp2/callable_system.hpp"
-#include "gp2/csv.hpp"
-#include "gp2/model_file.hpp"
+#include "gp2/data/csv.hpp"
+#include "gp2/mechanics/callable_system.hpp"
+#include "gp2/model.hpp"
 
 // models/surface.toml with M, A, b and F written as code.
 namespace gp2::test {

@@ -2,7 +2,7 @@
 
 #include <string>
 
-#include "gp2/training.hpp"
+#include "gp2/fit.hpp"
 
 namespace gp2::test {
 

@@ -13,12 +13,12 @@
 #include <gtest/gtest.h>
 #include <Eigen/Core>
 
-#include "gp2/csv.hpp"
-#include "gp2/generate.hpp"
-#include "gp2/mechanics.hpp"
-#include "gp2/model_file.hpp"
-#include "gp2/robot.hpp"
-#include "prior/random.hpp"
+#include "base/random.hpp"
+#include "gp2/data/csv.hpp"
+#include "gp2/mechanics/udwadia_kalaba.hpp"
+#include "gp2/model.hpp"
+#include "gp2/robots/robot.hpp"
+#include "gp2/simulation/generate.hpp"
 
 // The models that laws are tested on, the states they are tested at, and the difference quotients they are tested against.
 namespace gp2::test {
@@ -52,11 +52,11 @@ inline std::string stem(const std::string& file) { return std::filesystem::path(
 inline std::string model_test_name(const testing::TestParamInfo<std::string>& info) { return stem(info.param); }
 
 /// A model file of the checkout, read once.
-inline const ModelFile& model(const std::string& file) {
-  static std::map<std::string, ModelFile> models;
+inline const Model& model(const std::string& file) {
+  static std::map<std::string, Model> models;
   const auto known = models.find(file);
   if (known != models.end()) return known->second;
-  return models.emplace(file, ModelFile::read(std::filesystem::path(GP2_SOURCE_DIR) / file)).first->second;
+  return models.emplace(file, Model::read(std::filesystem::path(GP2_SOURCE_DIR) / file)).first->second;
 }
 
 inline Eigen::VectorXd random_vector(Eigen::Index size, RandomStream& random) {
@@ -66,12 +66,12 @@ inline Eigen::VectorXd random_vector(Eigen::Index size, RandomStream& random) {
 }
 
 /// States and noise-free accelerations drawn from a model's [sampling].
-inline GeneratedData draw(const ModelFile& model, int n, std::uint64_t seed) {
+inline GeneratedData draw(const Model& model, int n, std::uint64_t seed) {
   return generate(model, {n, seed, Eigen::VectorXd::Zero(model.system->nq())});
 }
 
 /// Whether some rows of A follow from the others. They do so on the constraint only, so such a model has no meaning off it.
-inline bool has_redundant_rows(const ModelFile& model) {
+inline bool has_redundant_rows(const Model& model) {
   const MechanicsBatch batch = require_mechanics(*model.system, draw(model, 1, 1).states, model.system->parameter_values());
   return batch.projections[0].rank() < model.system->nc();
 }
@@ -83,7 +83,7 @@ struct StateFamily {
 
 // where A, or a part of it, is on the verge of vanishing or of losing rank
 inline Eigen::MatrixXd nearly_singular_states(const std::string& file) {
-  const ModelFile& model_file = model(file);
+  const Model& model_file = model(file);
   const StateLayout layout = model_file.system->layout();
   constexpr double half_pi = std::numbers::pi / 2;
   std::vector<Eigen::VectorXd> states;
@@ -129,7 +129,7 @@ inline Eigen::MatrixXd nearly_singular_states(const std::string& file) {
 
 /// The states laws must hold at: usual ones, at rest, hardly moving, far off the usual ones, nearly singular.
 inline std::vector<StateFamily> state_families(const std::string& file, std::uint64_t seed) {
-  const ModelFile& model_file = model(file);
+  const Model& model_file = model(file);
   const StateLayout layout = model_file.system->layout();
   const int n = 20;
   Eigen::MatrixXd drawn = draw(model_file, n, seed).states;

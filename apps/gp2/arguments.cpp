@@ -60,16 +60,16 @@ void require_output(const std::string& output, const std::vector<std::string>& i
 
 View PredictedSystem::view(View::Quantity quantity) const {
   View view = View::all(quantity, *prior.system);
-  view.setting = setting;
+  view.other_system = other_system;
   return view;
 }
 
 PredictedSystem predicted_system(const FitFile& fit, const std::string& path) {
   if (path.empty()) return {fit.model, nullptr, fit.prior()};
-  ModelFile other = ModelFile::read(path);
-  std::shared_ptr<const Setting> setting = make_setting(fit.model, other, fit.prior_options);
-  Prior prior = setting->prior;
-  return {std::move(other), std::move(setting), std::move(prior)};
+  Model other = Model::read(path);
+  std::shared_ptr<const OtherSystem> other_system = make_other_system(fit.model, other, fit.prior_options);
+  Prior prior = other_system->prior;
+  return {std::move(other), std::move(other_system), std::move(prior)};
 }
 
 std::pair<std::string, std::string> split_at_system(const std::string& text) {

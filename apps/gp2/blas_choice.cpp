@@ -3,7 +3,7 @@
 #include <cerrno>
 #include <cstdlib>
 
-#include "gp2/blas.hpp"
+#include "gp2/base/blas.hpp"
 
 #ifdef __linux__
 #include <sys/prctl.h>

@@ -4,7 +4,7 @@
 
 namespace gp2::command {
 
-/// Makes sure that OpenBLAS computes with the kernel that is fastest on this processor (gp2/blas.hpp). To be called first in
+/// Makes sure that OpenBLAS computes with the kernel that is fastest on this processor (gp2/base/blas.hpp). To be called first in
 /// main.
 ///
 /// OpenBLAS chooses when it is loaded, before main, and takes a kernel's name from OPENBLAS_CORETYPE alone. Where that is not set

@@ -1,4 +1,4 @@
-#include "gp2/check.hpp"
+#include "gp2/mechanics/check.hpp"
 
 #include <limits>
 #include <memory>
@@ -7,12 +7,12 @@
 #include <fmt/ranges.h>
 
 #include "command.hpp"
-#include "gp2/csv.hpp"
+#include "gp2/data/csv.hpp"
 #include "gp2/error.hpp"
-#include "gp2/fit_problem.hpp"
-#include "gp2/generate.hpp"
+#include "gp2/jobs/fit_problem.hpp"
 #include "gp2/prior.hpp"
-#include "gp2/projected_states.hpp"
+#include "gp2/simulation/generate.hpp"
+#include "gp2/simulation/projected_states.hpp"
 
 namespace gp2::command {
 
@@ -35,7 +35,7 @@ int print(const std::vector<Finding>& findings) {
 }
 
 // a column that is missing is an error only where the model cannot do without
-WholeLog read_log(const ModelFile& model, const Arguments& arguments) {
+WholeLog read_log(const Model& model, const Arguments& arguments) {
   const CsvTable table = CsvTable::read(arguments.data);
   LogReader reader = open_log(model, table, parse_map(arguments.map));
   WholeLog log = read_whole_log(model, reader);
@@ -62,7 +62,7 @@ WholeLog read_log(const ModelFile& model, const Arguments& arguments) {
 }
 
 // the system, and where that is sound what the prior asks of it
-int check_mechanics(const ModelFile& model, const Eigen::MatrixXd& states) {
+int check_mechanics(const Model& model, const Eigen::MatrixXd& states) {
   const System& system = *model.system;
   const int n_errors = print(check_system(system, states, system.parameter_values()));
   if (n_errors > 0) return n_errors;
@@ -74,7 +74,7 @@ int check_mechanics(const ModelFile& model, const Eigen::MatrixXd& states) {
 }
 
 void run(const Arguments& arguments) {
-  const ModelFile model = ModelFile::read(arguments.model);
+  const Model model = Model::read(arguments.model);
   const System& system = *model.system;
   fmt::print("ok       {}: '{}', {} coordinates, {} constraints\n", arguments.model, system.name(), system.nq(), system.nc());
   if (model.robot) {

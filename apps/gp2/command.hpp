@@ -8,10 +8,10 @@
 
 #include <CLI/CLI.hpp>
 
-#include "gp2/csv.hpp"
+#include "gp2/data/csv.hpp"
 #include "gp2/error.hpp"
-#include "gp2/fit_file.hpp"
-#include "gp2/generate.hpp"
+#include "gp2/files/fit_file.hpp"
+#include "gp2/simulation/generate.hpp"
 
 namespace gp2::command {
 
@@ -54,16 +54,16 @@ auto at_states_of(const CsvTable& log, const Work& work) {
 
 /// The system under which a fit predicts.
 struct PredictedSystem {
-  ModelFile model;
-  std::shared_ptr<const Setting> setting;  // null: the fit's own
-  Prior prior;                             // of that system
+  Model model;
+  std::shared_ptr<const OtherSystem> other_system;  // null: the fit's own
+  Prior prior;                                      // of that system
 
   /// Every row of a quantity there.
   [[nodiscard]] View view(View::Quantity quantity) const;
 };
 
 /// @param path  of --system: another model file; empty: the fit's own
-/// @throws InputError when that model does not fit (make_setting).
+/// @throws InputError when that model does not fit (make_other_system).
 PredictedSystem predicted_system(const FitFile& fit, const std::string& path);
 
 inline constexpr const char* system_help =

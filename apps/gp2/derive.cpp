@@ -1,4 +1,4 @@
-#include "gp2/derive.hpp"
+#include "gp2/jobs/derive.hpp"
 
 #include <algorithm>
 #include <memory>
@@ -108,7 +108,7 @@ void report(const DerivedData& data, const System& system) {
 
 void run(const Arguments& arguments) {
   require_output(arguments.output, {arguments.log, arguments.model});
-  const ModelFile model = ModelFile::read(arguments.model);
+  const Model model = Model::read(arguments.model);
   const CsvTable log = CsvTable::read(arguments.log);
   DeriveOptions options;
   options.columns = parse_map(arguments.map);

@@ -1,4 +1,4 @@
-#include "gp2/evaluation.hpp"
+#include "gp2/inference/evaluation.hpp"
 
 #include <cmath>
 #include <memory>
@@ -7,8 +7,8 @@
 #include <nlohmann/json.hpp>
 
 #include "command.hpp"
-#include "gp2/csv.hpp"
-#include "gp2/fit_problem.hpp"
+#include "gp2/data/csv.hpp"
+#include "gp2/jobs/fit_problem.hpp"
 
 namespace gp2::command {
 
@@ -74,7 +74,7 @@ void run(const Arguments& arguments) {
   talk(log.notes);
   const Posterior posterior = fit.posterior();
   const Evaluation evaluation = at_states_of(table, [&] {
-    return evaluate_predictions(posterior, log.states, rows, log.accelerations, system.setting, /*n_threads=*/0);
+    return evaluate_predictions(posterior, log.states, rows, log.accelerations, system.other_system, /*n_threads=*/0);
   });
   if (arguments.json) {
     fmt::print("{}\n", to_json(evaluation).dump(2));

@@ -12,10 +12,10 @@
 #include <nlohmann/json.hpp>
 
 #include "command.hpp"
-#include "gp2/csv.hpp"
+#include "gp2/data/csv.hpp"
 #include "gp2/error.hpp"
-#include "gp2/fit_memory.hpp"
-#include "gp2/fit_problem.hpp"
+#include "gp2/jobs/fit_memory.hpp"
+#include "gp2/jobs/fit_problem.hpp"
 #include "interruption.hpp"
 
 namespace gp2::command {
@@ -74,11 +74,11 @@ FitProblemOptions problem_options(const Arguments& arguments) {
 // LOG or LOG@OTHER.toml
 Log read_log(const std::string& text) {
   const auto [path, model] = split_at_system(text);
-  return {CsvTable::read(path), model.empty() ? nullptr : std::make_shared<const ModelFile>(ModelFile::read(model))};
+  return {CsvTable::read(path), model.empty() ? nullptr : std::make_shared<const Model>(Model::read(model))};
 }
 
 // VIEW:LOG or VIEW@LATENT:LOG
-Knowledge read_knowledge(const std::string& text) {
+SideInformation read_knowledge(const std::string& text) {
   const std::size_t colon = text.find(':');
   const std::string view = text.substr(0, std::min(colon, text.size()));
   const std::size_t at = view.find('@');
@@ -206,10 +206,10 @@ void run(const Arguments& arguments) {
   }
   require_output(arguments.output, inputs_of(arguments));
   FitFile file;
-  file.model = ModelFile::read(arguments.model);
+  file.model = Model::read(arguments.model);
   std::vector<Log> logs;
   for (const std::string& text : arguments.data) logs.push_back(read_log(text));
-  std::vector<Knowledge> also;
+  std::vector<SideInformation> also;
   for (const std::string& text : arguments.also) also.push_back(read_knowledge(text));
   const FitProblemOptions asked = problem_options(arguments);
   FitProblem problem = make_fit_problem(file.model, logs, also, asked);

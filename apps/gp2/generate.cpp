@@ -1,4 +1,4 @@
-#include "gp2/generate.hpp"
+#include "gp2/simulation/generate.hpp"
 
 #include <memory>
 
@@ -6,7 +6,7 @@
 #include <fmt/ranges.h>
 
 #include "command.hpp"
-#include "gp2/csv.hpp"
+#include "gp2/data/csv.hpp"
 #include "gp2/error.hpp"
 
 namespace gp2::command {
@@ -20,7 +20,7 @@ struct Arguments {
   std::optional<double> noise_stddev;
 };
 
-Eigen::VectorXd noise_of(const ModelFile& model, const std::optional<double>& given) {
+Eigen::VectorXd noise_of(const Model& model, const std::optional<double>& given) {
   const Eigen::Index nq = model.system->nq();
   if (given) {
     if (!(*given >= 0)) throw InputError(fmt::format("--noise-std: must not be negative, got {}", *given));
@@ -51,7 +51,7 @@ void run(const Arguments& arguments) {
   if (arguments.n.has_value() != arguments.grid.empty()) throw InputError("give either --n or --grid; see gp2 generate --help");
   if (arguments.n && *arguments.n < 1) throw InputError(fmt::format("--n: must be positive, got {}", *arguments.n));
   require_output(arguments.output, {arguments.model});
-  const ModelFile model = ModelFile::read(arguments.model);
+  const Model model = Model::read(arguments.model);
   const GeneratedData data = generate(
       model, {arguments.n.value_or(1), arguments.seed, noise_of(model, arguments.noise_stddev), grid_of(arguments.grid)});
 

@@ -13,9 +13,9 @@
 
 #include "blas_choice.hpp"
 #include "command.hpp"
-#include "gp2/blas.hpp"
+#include "gp2/base/blas.hpp"
+#include "gp2/base/version.hpp"
 #include "gp2/error.hpp"
-#include "gp2/version.hpp"
 #include "interruption.hpp"
 
 namespace {

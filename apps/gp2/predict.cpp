@@ -7,9 +7,9 @@
 #include <fmt/ranges.h>
 
 #include "command.hpp"
-#include "gp2/csv.hpp"
+#include "gp2/data/csv.hpp"
 #include "gp2/error.hpp"
-#include "gp2/fit_problem.hpp"
+#include "gp2/jobs/fit_problem.hpp"
 
 namespace gp2::command {
 

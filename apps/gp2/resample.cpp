@@ -1,4 +1,4 @@
-#include "gp2/resample.hpp"
+#include "gp2/jobs/resample.hpp"
 
 #include <memory>
 
@@ -40,7 +40,7 @@ std::vector<std::string> parse_expressions(const std::string& text) {
 
 void run(const Arguments& arguments) {
   require_output(arguments.output, {arguments.log, arguments.model});
-  const ModelFile model = ModelFile::read(arguments.model);
+  const Model model = Model::read(arguments.model);
   const CsvTable log = CsvTable::read(arguments.log);
   ResampleOptions options;
   options.n = arguments.n;

@@ -4,7 +4,7 @@
 #include <fmt/ranges.h>
 
 #include "command.hpp"
-#include "gp2/model_file.hpp"
+#include "gp2/model.hpp"
 
 namespace gp2::command {
 
@@ -65,7 +65,7 @@ void print_robot(const RobotDescription& robot) {
   for (const std::string& note : robot.notes) fmt::print("  {}\n", note);
 }
 
-void print_text(const ModelFile& model, const SymbolicSystem& system, const std::vector<std::vector<Expression>>& A,
+void print_text(const Model& model, const SymbolicSystem& system, const std::vector<std::vector<Expression>>& A,
                 const std::vector<std::vector<Expression>>& b, const std::vector<std::vector<Expression>>& F, bool full) {
   fmt::print("{}\n  {} coordinates, {} inputs, {} constraints\n", system.name(), system.nq(), system.inputs().size(),
              system.nc());
@@ -99,7 +99,7 @@ void print_text(const ModelFile& model, const SymbolicSystem& system, const std:
 }
 
 void run(const Arguments& arguments) {
-  const ModelFile model = ModelFile::read(arguments.model);
+  const Model model = Model::read(arguments.model);
   const SymbolicSystem& system = require_symbolic_system(model);
   const SymbolicSystem::Definition& definition = system.definition();
   std::vector<std::vector<Expression>> A, b, F;

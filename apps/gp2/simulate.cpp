@@ -10,11 +10,11 @@
 #include <nlohmann/json.hpp>
 
 #include "command.hpp"
-#include "gp2/csv.hpp"
+#include "gp2/data/csv.hpp"
+#include "gp2/data/log_reader.hpp"
 #include "gp2/error.hpp"
-#include "gp2/fit_file.hpp"
-#include "gp2/log_reader.hpp"
-#include "gp2/pathwise.hpp"
+#include "gp2/files/fit_file.hpp"
+#include "gp2/inference/pathwise.hpp"
 
 namespace gp2::command {
 
@@ -35,7 +35,7 @@ constexpr double most_rows = 1e7;
 
 /// What is simulated: a model by its own equations, or a fit by its posterior.
 struct Subject {
-  ModelFile model;
+  Model model;
   std::optional<Posterior> posterior;  // of a fit
   Eigen::VectorXd parameters;
 
@@ -47,7 +47,7 @@ Subject read_subject(const std::string& file) {
   const std::string text = read_file(file);
   const std::size_t first = text.find_first_not_of(" \t\r\n");
   if (first == std::string::npos || text[first] != '{') {
-    ModelFile model = ModelFile::read(file);
+    Model model = Model::read(file);
     const Eigen::VectorXd parameters = model.system->parameter_values();
     return {std::move(model), std::nullopt, parameters};
   }
@@ -57,7 +57,7 @@ Subject read_subject(const std::string& file) {
   return {std::move(fit.model), std::move(posterior), parameters};
 }
 
-std::map<std::string, std::string> columns_of(const ModelFile& model, const std::string& map) {
+std::map<std::string, std::string> columns_of(const Model& model, const std::string& map) {
   std::map<std::string, std::string> columns = parse_map(map);
   columns.insert(model.columns.begin(), model.columns.end());  // --map wins
   return columns;
@@ -91,7 +91,7 @@ StartingPoint parse_start(const std::string& text, const System& system) {
 }
 
 // the first row of a log: what it has of coordinates, velocities and t
-StartingPoint read_start(const std::string& file, const ModelFile& model, const std::string& map) {
+StartingPoint read_start(const std::string& file, const Model& model, const std::string& map) {
   const CsvTable table = CsvTable::read(file);
   LogReader reader(table, *model.system, columns_of(model, map));
   const std::vector<std::string> names = model.system->state_names();
@@ -114,7 +114,7 @@ StartingPoint read_start(const std::string& file, const ModelFile& model, const 
   return start;
 }
 
-InputSignal read_inputs(const Arguments& arguments, const ModelFile& model, double t_start, double t_end) {
+InputSignal read_inputs(const Arguments& arguments, const Model& model, double t_start, double t_end) {
   if (!arguments.inputs) return {};
   const System& system = *model.system;
   if (system.inputs().empty()) throw InputError(fmt::format("--inputs: '{}' has no inputs", system.name()));

@@ -11,10 +11,10 @@
 
 #include <Eigen/Core>
 
-#include "gp2/csv.hpp"
+#include "gp2/data/csv.hpp"
 #include "gp2/error.hpp"
-#include "gp2/fit_file.hpp"
-#include "gp2/log_reader.hpp"
+#include "gp2/files/fit_file.hpp"
+#include "gp2/data/log_reader.hpp"
 #include "gp2/predictor.hpp"
 
 int main(int argc, char** argv) try {

@@ -6,7 +6,7 @@
 
 #include <Eigen/Core>
 
-#include "gp2/likelihood.hpp"
+#include "gp2/inference/likelihood.hpp"
 #include "gp2/observations.hpp"
 #include "gp2/prior.hpp"
 

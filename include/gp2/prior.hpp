@@ -8,9 +8,9 @@
 
 #include <Eigen/Core>
 
-#include "gp2/expression.hpp"
-#include "gp2/kernel.hpp"
-#include "gp2/mechanics.hpp"
+#include "gp2/mechanics/udwadia_kalaba.hpp"
+#include "gp2/prior/kernel.hpp"
+#include "gp2/symbolic/expression.hpp"
 #include "gp2/view.hpp"
 
 namespace gp2 {
@@ -84,7 +84,7 @@ struct Prior {
 
 /// Another system in which the latents of a prior act: other constraints, masses or parameters, with the same coordinates and
 /// inputs (Geist & Trimpe 2020, eq. 10).
-struct Setting {
+struct OtherSystem {
   Prior prior;              // as many latents as the prior at home, with the same kernels, features and numbers of directions
   std::vector<int> shared;  // per parameter of its system: which parameter at home it is; −1: it has its own value
 
@@ -92,7 +92,7 @@ struct Setting {
   [[nodiscard]] Eigen::VectorXd parameters(const Eigen::Ref<const Eigen::VectorXd>& home) const;
 };
 
-/// What a view looks at: the prior of its setting, or the one at home; and the parameters there.
+/// What a view looks at: the prior of its other system, or the one at home; and the parameters there.
 const Prior& prior_of(const Prior& home, const View& view);
 Eigen::VectorXd parameters_of(const View& view, const Eigen::Ref<const Eigen::VectorXd>& home);
 

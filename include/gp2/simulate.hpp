@@ -5,8 +5,8 @@
 
 #include <Eigen/Core>
 
-#include "gp2/check.hpp"
-#include "gp2/model_file.hpp"
+#include "gp2/mechanics/check.hpp"
+#include "gp2/model.hpp"
 #include "gp2/system.hpp"
 
 namespace gp2 {
@@ -100,15 +100,15 @@ struct StartingPoint {
 /// held; Newton's method starts for them at the model's newton_start, or at what `start` has. Where what is given leaves no
 /// solution the start stays as it is, for simulate() to project or not.
 /// @param notes  what was solved for, or why not, is added
-Eigen::VectorXd complete_start(const ModelFile& model, const Eigen::VectorXd& parameters, StartingPoint start,
+Eigen::VectorXd complete_start(const Model& model, const Eigen::VectorXd& parameters, StartingPoint start,
                                std::vector<std::string>& notes);
 
 /// The acceleration of a model as it is written: L b + T (M⁻¹F + truth), truth = 0 without [truth].
-Acceleration model_acceleration(const ModelFile& model);
+Acceleration model_acceleration(const Model& model);
 
 /// Kinetic and potential energy ½ dqᵀM dq + V of a model with [mechanics] potential, at N states (N) [J].
 /// @throws InputError when the model has none.
-Eigen::VectorXd mechanical_energy(const ModelFile& model, const Eigen::VectorXd& parameters,
+Eigen::VectorXd mechanical_energy(const Model& model, const Eigen::VectorXd& parameters,
                                   const Eigen::Ref<const Eigen::MatrixXd>& states);
 
 }  // namespace gp2

@@ -8,11 +8,11 @@
 
 #include <Eigen/Core>
 
-#include "gp2/mechanics.hpp"
+#include "gp2/mechanics/udwadia_kalaba.hpp"
 
 namespace gp2 {
 
-struct Setting;
+struct OtherSystem;
 
 /// A quantity that is affine in the unconstrained acceleration ā at a state: G(x) ā(x) + d(x). Where M is singular ā stands for
 /// M'⁻¹F̄, the M' of UdwadiaKalaba, and cannot be viewed itself; elsewhere M' = M.
@@ -31,7 +31,7 @@ struct View {
   /// What one latent alone adds: G E_a f_a, without μ and d. −1: everything.
   int latent = -1;
   /// The quantity as it is under another system (Geist & Trimpe 2020, eq. 10): prior.hpp. Null: the prior's own system.
-  std::shared_ptr<const Setting> setting = nullptr;
+  std::shared_ptr<const OtherSystem> other_system = nullptr;
 
   /// Every row of a quantity.
   static View all(Quantity quantity, const System& system);
@@ -45,7 +45,7 @@ struct View {
   [[nodiscard]] std::vector<bool> reads(const System& system) const;
 
   [[nodiscard]] int size() const { return static_cast<int>(rows.size()); }
-  /// The same rows of the same quantity, under the same Setting object.
+  /// The same rows of the same quantity, under the same OtherSystem object.
   bool operator==(const View&) const = default;
   /// ddq1 … (constrained), abar_q1 … (unconstrained), fc_q1 … (constraint force), lambda1 … (multipliers), dq1_next … (next
   /// velocity), with @LATENT behind where one latent is viewed alone.

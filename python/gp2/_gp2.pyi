@@ -346,7 +346,7 @@ class Predictor:
 class Log:
     def __init__(self, data: _Table, system: System | None = None) -> None: ...
 
-class Knowledge:
+class SideInformation:
     def __init__(self, view: _View, data: _Table, latent: str = "", system: System | None = None) -> None: ...
 
 class Progress:
@@ -376,7 +376,7 @@ def fit(
     system: System,
     data: _Table | Log | _Arrays | list[Any],  # of these
     *,
-    also: Sequence[Knowledge] = [],
+    also: Sequence[SideInformation] = [],
     observe: Sequence[str] = [],
     mean: Literal["zero", "force"] = "zero",
     prior: Literal["acceleration", "force"] | None = None,

@@ -14,10 +14,10 @@
 #include <Eigen/Core>
 
 #include "arrays.hpp"
-#include "gp2/csv.hpp"
+#include "gp2/data/csv.hpp"
 #include "gp2/error.hpp"
-#include "gp2/fit_file.hpp"
-#include "gp2/model_file.hpp"
+#include "gp2/files/fit_file.hpp"
+#include "gp2/model.hpp"
 #include "gp2/posterior.hpp"
 
 namespace gp2::python {
@@ -31,7 +31,7 @@ void add_predictor(py::module_& module);
 
 /// gp2.System: a model file.
 struct PySystem {
-  std::shared_ptr<const ModelFile> model;
+  std::shared_ptr<const Model> model;
   MechanicsSource mechanics = {};  // where they are Python functions
 
   [[nodiscard]] const System& system() const { return *model->system; }
@@ -70,7 +70,7 @@ void tell(const std::vector<std::string>& notes);
 class States {
  public:
   /// @throws InputError when an entry that the prior or the view reads is not finite; as Rows and read_log_states.
-  States(const py::object& data, const Prior& prior, const View& view, const ModelFile& model, const py::object& columns);
+  States(const py::object& data, const Prior& prior, const View& view, const Model& model, const py::object& columns);
 
   [[nodiscard]] Eigen::Map<const Eigen::MatrixXd> matrix() const;  // (layout size × n)
 

@@ -1,6 +1,6 @@
 // Systems whose mechanics are Python functions.
 
-#include "gp2/callable_system.hpp"
+#include "gp2/mechanics/callable_system.hpp"
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
@@ -175,7 +175,7 @@ PySystem from_callables(const py::object& mechanics, const py::object& constrain
   }
   const py::object text = py::module_::import("gp2._model_text").attr("model_text")(**kwargs);
   MechanicsSource source = source_of(mechanics, constraints, derivatives, residuals, reads);
-  auto model = std::make_shared<const ModelFile>(ModelFile::parse(text.cast<std::string>(), "System.from_callables(…)", source));
+  auto model = std::make_shared<const Model>(Model::parse(text.cast<std::string>(), "System.from_callables(…)", source));
   return {std::move(model), std::move(source)};
 }
 

@@ -6,8 +6,8 @@
 #include "arrays.hpp"
 #include "bindings.hpp"
 #include "gp2/error.hpp"
-#include "gp2/fit_memory.hpp"
-#include "gp2/fit_problem.hpp"
+#include "gp2/jobs/fit_memory.hpp"
+#include "gp2/jobs/fit_problem.hpp"
 
 namespace gp2::python {
 
@@ -20,7 +20,7 @@ struct PyLog {
 };
 
 /// Another quantity that is measured or known.
-struct PyKnowledge {
+struct PySideInformation {
   std::string view;
   py::object data;
   std::string latent;
@@ -89,7 +89,7 @@ Choice choice(const std::string& given, const std::vector<std::pair<std::string,
 }
 
 struct Arguments {
-  std::vector<PyKnowledge> also;
+  std::vector<PySideInformation> also;
   std::vector<std::string> observe;
   std::string mean = "zero";
   std::optional<std::string> prior, baseline;
@@ -169,10 +169,10 @@ PyPosterior fit_model(const PySystem& system, const py::object& data, const Argu
   require_at_least(0, arguments.max_iterations, "max_iterations");
   require_at_least(1, arguments.max_points, "max_points");
   require_at_least(0, arguments.threads, "threads");
-  const ModelFile& model = *system.model;
+  const Model& model = *system.model;
   const std::vector<Log> logs = logs_of(data, *model.system);
-  std::vector<Knowledge> also;
-  for (const PyKnowledge& knowledge : arguments.also) {
+  std::vector<SideInformation> also;
+  for (const PySideInformation& knowledge : arguments.also) {
     const std::string what = fmt::format("also[{}]", also.size());
     also.push_back({quantity_argument(knowledge.view), knowledge.latent, log_of(knowledge.data, knowledge.system, what)});
   }
@@ -242,10 +242,10 @@ void add_fit(py::module_& module) {
              return PyLog{std::move(data), std::move(system)};
            }),
            "data"_a, "system"_a = py::none());
-  py::class_<PyKnowledge>(module, "Knowledge",
-                          "Another quantity that is measured or known: the columns of a view that a table has.")
+  py::class_<PySideInformation>(module, "SideInformation",
+                                "Another quantity that is measured or known: the columns of a view that a table has.")
       .def(py::init([](std::string view, py::object data, std::string latent, std::optional<PySystem> system) {
-             return PyKnowledge{std::move(view), std::move(data), std::move(latent), std::move(system)};
+             return PySideInformation{std::move(view), std::move(data), std::move(latent), std::move(system)};
            }),
            "view"_a, "data"_a, "latent"_a = "", "system"_a = py::none());
   py::class_<Progress>(module, "Progress", "What the optimiser tells while it runs.")
@@ -258,7 +258,7 @@ void add_fit(py::module_& module) {
 
   module.def(
       "fit",
-      [](const PySystem& system, const py::object& data, const std::vector<PyKnowledge>& also,
+      [](const PySystem& system, const py::object& data, const std::vector<PySideInformation>& also,
          const std::vector<std::string>& observe, const std::string& mean, const std::optional<std::string>& prior,
          const std::optional<std::string>& baseline, const py::object& noise_std,
          const std::optional<std::vector<std::string>>& estimate, const std::string& protocol, bool hyperprior, bool discrepancy,
@@ -270,7 +270,7 @@ void add_fit(py::module_& module) {
                           start,    estimate,       protocol, hyperprior,     discrepancy, project,   robust,  max_points,
                           restarts, also_noise_std, dt,       max_iterations, threads,     seed});
       },
-      "system"_a, "data"_a, py::kw_only(), "also"_a = std::vector<PyKnowledge>(), "observe"_a = std::vector<std::string>(),
+      "system"_a, "data"_a, py::kw_only(), "also"_a = std::vector<PySideInformation>(), "observe"_a = std::vector<std::string>(),
       "mean"_a = "zero", "prior"_a = py::none(), "baseline"_a = py::none(), "noise_std"_a = py::none(), "estimate"_a = py::none(),
       "protocol"_a = "default", "hyperprior"_a = true, "discrepancy"_a = true, "project"_a = false, "robust"_a = false,
       "columns"_a = py::none(), "max_points"_a = py::none(), "also_noise_std"_a = py::none(), "dt"_a = py::none(),
@@ -280,7 +280,7 @@ void add_fit(py::module_& module) {
 
 data        a path, Table, pandas frame or mapping with columns named as the model's (or aliases); or (states, accelerations),
             arrays (n, len(state_names)) and (n, nq); or a list of these and of Log. NaN, or None, of an acceleration is "not measured"
-also        list of Knowledge: other quantities, measured or known
+also        list of SideInformation: other quantities, measured or known
 observe     accelerations to learn from; default: those with a column ddNAME_std, or all
 mean        'zero', or 'force': the model's known force is relied on
 prior       'acceleration' or 'force': where the latent acts; default: as the model says

@@ -3,9 +3,9 @@
 #include <pybind11/pybind11.h>
 
 #include "bindings.hpp"
-#include "gp2/blas.hpp"
+#include "gp2/base/blas.hpp"
+#include "gp2/base/version.hpp"
 #include "gp2/error.hpp"
-#include "gp2/version.hpp"
 
 PYBIND11_MODULE(_gp2, module) {
   namespace py = pybind11;

@@ -10,9 +10,9 @@
 #include "arrays.hpp"
 #include "bindings.hpp"
 #include "gp2/error.hpp"
-#include "gp2/evaluation.hpp"
-#include "gp2/fit_problem.hpp"
-#include "gp2/pathwise.hpp"
+#include "gp2/inference/evaluation.hpp"
+#include "gp2/inference/pathwise.hpp"
+#include "gp2/jobs/fit_problem.hpp"
 #include "gp2/simulate.hpp"
 
 namespace gp2::python {
@@ -28,7 +28,7 @@ namespace {
 /// What is looked at: a view, and the model of the system under which.
 struct Look {
   View view;
-  const ModelFile* model = nullptr;
+  const Model* model = nullptr;
   Prior prior;  // of that system
   std::vector<std::string> names;
 };
@@ -42,7 +42,7 @@ struct ViewArguments {
 };
 
 // text that is the same is the same system; functions cannot be compared, but the system that they made can
-bool is_same(const ModelFile& a, const ModelFile& b) {
+bool is_same(const Model& a, const Model& b) {
   return a.system == b.system || (!a.mechanics_are_code && !b.mechanics_are_code && a.text == b.text);
 }
 
@@ -52,10 +52,11 @@ Look look(const PyPosterior& self, const ViewArguments& arguments) {
   const View::Quantity quantity = quantity_argument(arguments.quantity);
   if (arguments.system != nullptr && !is_same(*arguments.system->model, self.file.model)) {
     out.model = arguments.system->model.get();
-    const std::shared_ptr<const Setting> setting = make_setting(self.file.model, *out.model, self.file.prior_options);
-    out.prior = setting->prior;
+    const std::shared_ptr<const OtherSystem> other_system =
+        make_other_system(self.file.model, *out.model, self.file.prior_options);
+    out.prior = other_system->prior;
     out.view = View::all(quantity, *out.prior.system);
-    out.view.setting = setting;
+    out.view.other_system = other_system;
   } else {
     out.view = View::all(quantity, *home.system);
   }
@@ -183,7 +184,7 @@ Evaluation evaluate(const PyPosterior& self, const py::object& data, const PySys
   const Posterior posterior = self.posterior;
   try {
     const py::gil_scoped_release release;
-    return evaluate_predictions(posterior, log.states, rows, log.accelerations, at.view.setting, n_threads);
+    return evaluate_predictions(posterior, log.states, rows, log.accelerations, at.view.other_system, n_threads);
   } catch (const InputError& error) {
     throw InputError(table.name() + ": " + error.what());
   }
@@ -211,7 +212,7 @@ void update_with(PyPosterior& self, const py::object& data, const std::vector<st
   const System& system = self.system();
   const std::vector<Observations>& groups = self.posterior.observations();
   const auto at_home = std::find_if(groups.begin(), groups.end(), [](const Observations& group) {
-    return group.view.quantity == View::Quantity::constrained_acceleration && group.view.setting == nullptr;
+    return group.view.quantity == View::Quantity::constrained_acceleration && group.view.other_system == nullptr;
   });
   Observations added;
   added.view = View::all(View::Quantity::constrained_acceleration, system);
@@ -266,7 +267,7 @@ std::map<std::string, double> start_values(const py::object& start) {
 }
 
 /// A start by names, what is not named following from the constraints; or all of q and dq.
-VectorXd start_state(const ModelFile& model, const VectorXd& parameters, const py::object& start, double t_start) {
+VectorXd start_state(const Model& model, const VectorXd& parameters, const py::object& start, double t_start) {
   const System& system = *model.system;
   const StateLayout layout = system.layout();
   VectorXd state = VectorXd::Zero(layout.size());
@@ -311,8 +312,8 @@ InputSignal input_signal(const System& system, const py::object& inputs) {
 }
 
 /// Motions of accelerations, one after the other; Ctrl-C ends them.
-std::vector<Motion> simulate_all(const ModelFile& model, const VectorXd& parameters,
-                                 const std::vector<Acceleration>& accelerations, const SimulateArguments& arguments) {
+std::vector<Motion> simulate_all(const Model& model, const VectorXd& parameters, const std::vector<Acceleration>& accelerations,
+                                 const SimulateArguments& arguments) {
   const System& system = *model.system;
   SimulateOptions options;
   const auto times = vector_argument(arguments.times, "times");
@@ -573,7 +574,7 @@ void add_posterior(py::module_& module) {
       .def("save", &save, "path"_a, "Write a FIT.json, whole or not at all. Loaded again it gives the same bits.")
       .def_property_readonly("system",
                              [](const PyPosterior& self) {
-                               return PySystem{std::make_shared<const ModelFile>(self.file.model), self.mechanics};
+                               return PySystem{std::make_shared<const Model>(self.file.model), self.mechanics};
                              })
       .def_property_readonly(
           "report", [](const PyPosterior& self) { return self.file.report; }, "How the fit went.")

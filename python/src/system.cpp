@@ -6,13 +6,13 @@
 
 #include "arrays.hpp"
 #include "bindings.hpp"
-#include "gp2/check.hpp"
-#include "gp2/derive.hpp"
 #include "gp2/error.hpp"
-#include "gp2/fit_problem.hpp"
-#include "gp2/generate.hpp"
-#include "gp2/projected_states.hpp"
-#include "gp2/resample.hpp"
+#include "gp2/jobs/derive.hpp"
+#include "gp2/jobs/fit_problem.hpp"
+#include "gp2/jobs/resample.hpp"
+#include "gp2/mechanics/check.hpp"
+#include "gp2/simulation/generate.hpp"
+#include "gp2/simulation/projected_states.hpp"
 
 namespace gp2::python {
 
@@ -61,7 +61,7 @@ Mechanics evaluate(const PySystem& self, const py::object& states, const std::ma
 
 CsvTable generate_table(const PySystem& self, int n, std::uint64_t seed, std::optional<double> noise_stddev,
                         const std::map<std::string, int>& grid) {
-  const ModelFile& model = *self.model;
+  const Model& model = *self.model;
   const System& system = self.system();
   GenerateOptions options{n, seed, Eigen::VectorXd::Zero(system.nq()), grid};
   if (noise_stddev) {
@@ -149,7 +149,7 @@ py::list findings_list(const std::vector<Finding>& findings) {
 
 // the findings of gp2 check
 py::list check(const PySystem& self, const py::object& data, const py::object& columns) {
-  const ModelFile& model = *self.model;
+  const Model& model = *self.model;
   const System& system = self.system();
   const Eigen::VectorXd parameters = system.parameter_values();
   if (data.is_none()) {
@@ -207,7 +207,7 @@ void tell(const std::vector<std::string>& notes) {
   }
 }
 
-States::States(const py::object& data, const Prior& prior, const View& view, const ModelFile& model, const py::object& columns) {
+States::States(const py::object& data, const Prior& prior, const View& view, const Model& model, const py::object& columns) {
   const System& system = *prior.system;
   if (!is_array(data)) {
     const CsvTable table = to_table(data, "states");
@@ -273,20 +273,18 @@ Raises InputError with the key, the rule, the value got and the mend.)");
   system
       .def(py::init([](const py::kwargs& kwargs) {
         const py::object text = py::module_::import("gp2._model_text").attr("model_text")(**kwargs);
-        return PySystem{std::make_shared<const ModelFile>(ModelFile::parse(text.cast<std::string>(), "System(…)"))};
+        return PySystem{std::make_shared<const Model>(Model::parse(text.cast<std::string>(), "System(…)"))};
       }))
       .def_static(
           "load",
-          [](const py::object& path) {
-            return PySystem{std::make_shared<const ModelFile>(ModelFile::read(path_argument(path)))};
-          },
+          [](const py::object& path) { return PySystem{std::make_shared<const Model>(Model::read(path_argument(path)))}; },
           py::arg("path"), "Read a model file.\n\nRaises InputError with file, line, key, the rule, the value got and the mend.")
       .def_static(
           "parse",
           [](const std::string& text, const std::string& name, const std::optional<std::string>& robot) {
-            if (!robot) return PySystem{std::make_shared<const ModelFile>(ModelFile::parse(text, name))};
+            if (!robot) return PySystem{std::make_shared<const Model>(Model::parse(text, name))};
             const RobotSource source = [&](const std::string&) { return robot_from_json(*robot); };
-            return PySystem{std::make_shared<const ModelFile>(ModelFile::parse(text, name, source))};
+            return PySystem{std::make_shared<const Model>(Model::parse(text, name, source))};
           },
           py::arg("text"), py::arg("name") = "text", py::arg("robot") = py::none(),
           "The same from the text of a model file; `name` stands for it in messages, `robot` (see the property) for its file.")

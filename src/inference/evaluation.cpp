@@ -1,4 +1,4 @@
-#include "gp2/evaluation.hpp"
+#include "gp2/inference/evaluation.hpp"
 
 #include <cmath>
 #include <limits>
@@ -68,10 +68,10 @@ double max_constraint_error(const System& system, const Ref<const MatrixXd>& sta
 }
 
 Evaluation evaluate_predictions(const Posterior& posterior, const Ref<const MatrixXd>& states, const std::vector<int>& rows,
-                                const Ref<const MatrixXd>& targets, const std::shared_ptr<const Setting>& setting,
+                                const Ref<const MatrixXd>& targets, const std::shared_ptr<const OtherSystem>& other_system,
                                 int n_threads) {
   View all = View::all(View::Quantity::constrained_acceleration, *posterior.prior().system);
-  all.setting = setting;
+  all.other_system = other_system;
   const System& system = prior_of(posterior.prior(), all).judge();
   const Posterior::Marginal prediction = posterior.marginal(all, states, n_threads);
   const MatrixXd stddev = prediction.stddev();

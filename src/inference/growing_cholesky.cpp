@@ -3,7 +3,7 @@
 #include <algorithm>
 #include <cmath>
 
-#include "inference/lapack.hpp"
+#include "base/lapack.hpp"
 
 extern "C" void drot_(const int* n, double* x, const int* incx, double* y, const int* incy, const double* c, const double* s);
 

@@ -1,10 +1,10 @@
-#include "gp2/leave_one_out.hpp"
+#include "gp2/inference/leave_one_out.hpp"
 
 #include <cmath>
 #include <limits>
 
+#include "base/lapack.hpp"
 #include "gp2/error.hpp"
-#include "inference/lapack.hpp"
 #include "inference/reduction.hpp"
 
 namespace gp2 {

@@ -1,14 +1,14 @@
-#include "gp2/pathwise.hpp"
+#include "gp2/inference/pathwise.hpp"
 
 #include <algorithm>
 
 #include <fmt/format.h>
 
+#include "base/lapack.hpp"
+#include "base/simd.hpp"
 #include "gp2/error.hpp"
-#include "inference/lapack.hpp"
 #include "inference/posterior_implementation.hpp"
 #include "prior/random_features.hpp"
-#include "prior/simd.hpp"
 
 namespace gp2 {
 

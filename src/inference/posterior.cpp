@@ -8,13 +8,13 @@
 
 #include <fmt/format.h>
 
+#include "base/lapack.hpp"
+#include "base/parallel.hpp"
+#include "base/random.hpp"
+#include "base/simd.hpp"
 #include "gp2/error.hpp"
-#include "inference/lapack.hpp"
-#include "inference/parallel.hpp"
 #include "inference/posterior_implementation.hpp"
 #include "prior/padded_rows.hpp"
-#include "prior/random.hpp"
-#include "prior/simd.hpp"
 
 namespace gp2 {
 

@@ -9,11 +9,11 @@
 
 #include <fmt/format.h>
 
+#include "base/lapack.hpp"
+#include "base/simd.hpp"
 #include "gp2/error.hpp"
-#include "gp2/state_evaluator.hpp"
-#include "inference/lapack.hpp"
+#include "gp2/mechanics/state_evaluator.hpp"
 #include "inference/posterior_implementation.hpp"
-#include "prior/simd.hpp"
 
 namespace gp2 {
 

@@ -4,9 +4,9 @@
 #include <cmath>
 #include <numbers>
 
-#include "inference/parallel.hpp"
+#include "base/parallel.hpp"
+#include "base/simd.hpp"
 #include "mechanics/pivoted_qr.hpp"
-#include "prior/simd.hpp"
 
 namespace gp2 {
 
@@ -19,8 +19,8 @@ namespace {
 
 // which parameter of the viewed system the one at home is, −1: none
 int index_there(const View& view, int parameter) {
-  if (!view.setting) return parameter;
-  const std::vector<int>& shared = view.setting->shared;
+  if (!view.other_system) return parameter;
+  const std::vector<int>& shared = view.other_system->shared;
   const auto found = std::find(shared.begin(), shared.end(), parameter);
   return found == shared.end() ? -1 : static_cast<int>(found - shared.begin());
 }

@@ -3,9 +3,9 @@
 #include <optional>
 #include <vector>
 
-#include "gp2/likelihood.hpp"
+#include "base/simd.hpp"
+#include "gp2/inference/likelihood.hpp"
 #include "prior/kernel_columns.hpp"
-#include "prior/simd.hpp"
 
 namespace gp2 {
 

@@ -1,4 +1,4 @@
-#include "gp2/callable_system.hpp"
+#include "gp2/mechanics/callable_system.hpp"
 
 #include <algorithm>
 #include <cmath>

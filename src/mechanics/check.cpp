@@ -1,4 +1,4 @@
-#include "gp2/check.hpp"
+#include "gp2/mechanics/check.hpp"
 
 #include <algorithm>
 #include <cmath>
@@ -10,7 +10,7 @@
 #include <Eigen/Eigenvalues>
 #include <Eigen/SVD>
 
-#include "gp2/mechanics.hpp"
+#include "gp2/mechanics/udwadia_kalaba.hpp"
 
 namespace gp2 {
 

@@ -4,7 +4,7 @@
 
 #include <Eigen/Core>
 
-#include "gp2/mechanics.hpp"
+#include "gp2/mechanics/udwadia_kalaba.hpp"
 
 namespace gp2::internal {
 

@@ -1,4 +1,4 @@
-#include "gp2/state_evaluator.hpp"
+#include "gp2/mechanics/state_evaluator.hpp"
 
 #include <algorithm>
 #include <cmath>

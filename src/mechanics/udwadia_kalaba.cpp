@@ -10,7 +10,7 @@
 #include <Eigen/SVD>
 
 #include "gp2/error.hpp"
-#include "gp2/mechanics.hpp"
+#include "gp2/mechanics/udwadia_kalaba.hpp"
 #include "mechanics/describe_fault.hpp"
 #include "mechanics/dot.hpp"
 #include "mechanics/pivoted_qr.hpp"

@@ -1,4 +1,4 @@
-#include "gp2/kernel.hpp"
+#include "gp2/prior/kernel.hpp"
 
 #include <array>
 #include <cctype>

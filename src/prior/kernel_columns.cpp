@@ -5,8 +5,8 @@
 #include <numbers>
 #include <utility>
 
+#include "base/simd.hpp"
 #include "prior/padded_rows.hpp"
-#include "prior/simd.hpp"
 
 namespace gp2 {
 

@@ -4,7 +4,7 @@
 
 #include <Eigen/Core>
 
-#include "gp2/kernel.hpp"
+#include "gp2/prior/kernel.hpp"
 
 namespace gp2 {
 

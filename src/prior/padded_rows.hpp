@@ -5,7 +5,7 @@
 
 #include <Eigen/Core>
 
-#include "prior/simd.hpp"
+#include "base/simd.hpp"
 
 // Matrices with one row per point, and rows of zeros that pad them to whole vectors (simd.hpp).
 namespace gp2 {

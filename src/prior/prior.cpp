@@ -49,7 +49,7 @@ std::vector<bool> Prior::reads() const {
   return reads;
 }
 
-VectorXd Setting::parameters(const Ref<const VectorXd>& home) const {
+VectorXd OtherSystem::parameters(const Ref<const VectorXd>& home) const {
   VectorXd parameters = prior.system->parameter_values();
   for (std::size_t k = 0; k < shared.size(); ++k) {
     if (shared[k] >= 0) parameters[static_cast<Index>(k)] = home[shared[k]];
@@ -57,10 +57,10 @@ VectorXd Setting::parameters(const Ref<const VectorXd>& home) const {
   return parameters;
 }
 
-const Prior& prior_of(const Prior& home, const View& view) { return view.setting ? view.setting->prior : home; }
+const Prior& prior_of(const Prior& home, const View& view) { return view.other_system ? view.other_system->prior : home; }
 
 VectorXd parameters_of(const View& view, const Ref<const VectorXd>& home) {
-  return view.setting ? view.setting->parameters(home) : VectorXd(home);
+  return view.other_system ? view.other_system->parameters(home) : VectorXd(home);
 }
 
 void PriorValues::keep_only(std::size_t latent) {

@@ -4,8 +4,8 @@
 
 #include <Eigen/Core>
 
-#include "gp2/kernel.hpp"
-#include "prior/random.hpp"
+#include "base/random.hpp"
+#include "gp2/prior/kernel.hpp"
 
 namespace gp2 {
 

@@ -6,7 +6,7 @@
 
 #include <Eigen/Core>
 
-#include "gp2/expression.hpp"
+#include "gp2/symbolic/expression.hpp"
 
 namespace gp2 {
 

@@ -11,9 +11,9 @@
 #include <mujoco/mujoco.h>
 #include <Eigen/Dense>
 
-#include "gp2/csv.hpp"
+#include "gp2/data/csv.hpp"
 #include "gp2/error.hpp"
-#include "gp2/robot.hpp"
+#include "gp2/robots/robot.hpp"
 #include "robots/robot_checks.hpp"
 #include "robots/robot_xml.hpp"
 
@@ -75,7 +75,7 @@ class Handlers {
   Handler warning_;
 };
 
-using Model = std::unique_ptr<mjModel, void (*)(mjModel*)>;
+using ModelPointer = std::unique_ptr<mjModel, void (*)(mjModel*)>;
 
 // a file that is only in memory
 class VirtualFile {
@@ -124,7 +124,7 @@ std::string mend_of(const std::string& refusal) {
 }
 
 /// @param warnings  what MuJoCo says to a file that it accepts
-Model load(const std::filesystem::path& path, const RobotXml& xml, std::vector<std::string>& warnings) {
+ModelPointer load(const std::filesystem::path& path, const RobotXml& xml, std::vector<std::string>& warnings) {
   std::array<char, 1024> refusal = {};
   mjModel* model = nullptr;
   try {
@@ -468,7 +468,7 @@ bool can_read_robots() { return true; }
 RobotDescription read_robot(const std::filesystem::path& path) {
   const RobotXml xml = read_robot_xml(read_file(path), path);
   std::vector<std::string> warnings;
-  const Model model = load(path, xml, warnings);
+  const ModelPointer model = load(path, xml, warnings);
   RobotDescription robot = Description(*model, path.string()).make(xml, warnings);
   try {
     check_robot(robot);

@@ -1,4 +1,4 @@
-#include "gp2/robot.hpp"
+#include "gp2/robots/robot.hpp"
 
 #include <algorithm>
 #include <array>

@@ -1,6 +1,6 @@
 #pragma once
 
-#include "gp2/robot.hpp"
+#include "gp2/robots/robot.hpp"
 
 namespace gp2 {
 

@@ -6,9 +6,9 @@
 #include <utility>
 #include <vector>
 
-#include "gp2/expression.hpp"
-#include "gp2/robot.hpp"
-#include "gp2/symbolic_system.hpp"
+#include "gp2/mechanics/symbolic_system.hpp"
+#include "gp2/robots/robot.hpp"
+#include "gp2/symbolic/expression.hpp"
 #include "robots/expression_algebra.hpp"
 
 namespace gp2 {

@@ -1,7 +1,7 @@
 #include <fmt/format.h>
 
 #include "gp2/error.hpp"
-#include "gp2/robot.hpp"
+#include "gp2/robots/robot.hpp"
 
 namespace gp2 {
 

@@ -7,10 +7,10 @@
 #include <fmt/format.h>
 #include <Eigen/QR>
 
+#include "base/random.hpp"
 #include "gp2/error.hpp"
-#include "gp2/mechanics.hpp"
+#include "gp2/mechanics/udwadia_kalaba.hpp"
 #include "gp2/simulate.hpp"
-#include "prior/random.hpp"
 
 namespace gp2 {
 
@@ -25,8 +25,8 @@ struct Progress {
   double s = 0, ds = 0, dds = 0;
 };
 
-Progress progress(ModelFile::Motion::Profile profile, double x) {
-  if (profile == ModelFile::Motion::Profile::smooth) {
+Progress progress(Model::Motion::Profile profile, double x) {
+  if (profile == Model::Motion::Profile::smooth) {
     // the least jerk with rest at both ends: 10 x³ − 15 x⁴ + 6 x⁵
     return {x * x * x * (10 + x * (6 * x - 15)), 30 * x * x * (1 - x) * (1 - x), 60 * x * (1 - x) * (1 - 2 * x)};
   }
@@ -45,10 +45,10 @@ struct TaskState {
 
 class Controller {
  public:
-  Controller(const ModelFile& model, const VectorXd& start, RandomStream& random)
+  Controller(const Model& model, const VectorXd& start, RandomStream& random)
       : model_(model), motion_(*model.motion), parameters_(model.system->parameter_values()), start_(start), random_(random) {
     std::vector<Expression> outputs;
-    for (const ModelFile::Motion::Target& target : motion_.targets) {
+    for (const Model::Motion::Target& target : motion_.targets) {
       outputs.insert(outputs.end(), target.row.residuals.begin(), target.row.residuals.end());
       outputs.push_back(-target.row.b);
       outputs.insert(outputs.end(), target.row.A.begin(), target.row.A.end());
@@ -118,8 +118,8 @@ class Controller {
     }
   }
 
-  const ModelFile& model_;
-  const ModelFile::Motion& motion_;
+  const Model& model_;
+  const Model::Motion& motion_;
   VectorXd parameters_, start_;
   RandomStream& random_;
   Tape task_;
@@ -127,7 +127,7 @@ class Controller {
   double begin_ = 0, duration_ = 0;
 };
 
-VectorXd start_of(const ModelFile& model) {
+VectorXd start_of(const Model& model) {
   const System& system = *model.system;
   const std::vector<std::string> names = system.state_names();
   VectorXd state = VectorXd::Zero(system.layout().size());
@@ -140,7 +140,7 @@ VectorXd start_of(const ModelFile& model) {
 
 }  // namespace
 
-GeneratedData generate_motion(const ModelFile& model, int n, RandomStream& random) {
+GeneratedData generate_motion(const Model& model, int n, RandomStream& random) {
   const System& system = *model.system;
   const StateLayout layout = system.layout();
   const VectorXd parameters = system.parameter_values();

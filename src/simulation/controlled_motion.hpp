@@ -1,7 +1,7 @@
 #pragma once
 
-#include "gp2/generate.hpp"
-#include "prior/random.hpp"
+#include "base/random.hpp"
+#include "gp2/simulation/generate.hpp"
 
 namespace gp2 {
 
@@ -16,6 +16,6 @@ namespace gp2 {
 /// and its inputs are the smallest u, with the smallest λ, for which M ddq* = F(u) + Aᵀλ. They are held until the next sample.
 ///
 /// @throws NumericalError when the motion cannot go on.
-GeneratedData generate_motion(const ModelFile& model, int n, RandomStream& random);
+GeneratedData generate_motion(const Model& model, int n, RandomStream& random);
 
 }  // namespace gp2

@@ -1,4 +1,4 @@
-#include "gp2/generate.hpp"
+#include "gp2/simulation/generate.hpp"
 
 #include <algorithm>
 #include <cmath>
@@ -12,10 +12,10 @@
 #include <fmt/ranges.h>
 #include <Eigen/QR>
 
+#include "base/random.hpp"
 #include "gp2/error.hpp"
-#include "gp2/mechanics.hpp"
+#include "gp2/mechanics/udwadia_kalaba.hpp"
 #include "mechanics/describe_fault.hpp"
-#include "prior/random.hpp"
 #include "simulation/controlled_motion.hpp"
 
 namespace gp2 {
@@ -102,7 +102,7 @@ Equations equations_of(const System& system, bool velocity) {
 class Completion {
  public:
   /// @param given  which entries of the state [sampling] gives; what it does not, but an equation has, is solved for
-  Completion(const ModelFile& model, Equations equations, const std::vector<bool>& given)
+  Completion(const Model& model, Equations equations, const std::vector<bool>& given)
       : model_(model), equations_(std::move(equations)) {
     const std::vector<std::string> state_names = model.system->state_names();
     for (std::size_t k = 0; k < equations_.variables.size(); ++k) {
@@ -186,7 +186,7 @@ class Completion {
     return fmt::format("{}", fmt::join(parts, ", "));
   }
 
-  const ModelFile& model_;
+  const Model& model_;
   Equations equations_;
   std::vector<int> unknowns_;         // entries of the state to solve for
   std::vector<int> unknown_columns_;  // their positions among the variables of the equations
@@ -197,8 +197,7 @@ class Completion {
 /// Draws one state after the other by the rules of [sampling].
 class Sampler {
  public:
-  explicit Sampler(const ModelFile& model)
-      : model_(model), parameters_(model.system->parameter_values()), symbols_(model.symbols()) {
+  explicit Sampler(const Model& model) : model_(model), parameters_(model.system->parameter_values()), symbols_(model.symbols()) {
     place_rules();
     add_completions();
     schedule_rules();
@@ -228,7 +227,7 @@ class Sampler {
     const std::vector<std::string> names = model_.system->state_names();
     known_.assign(names.size(), false);
     tape_inputs_ = symbols_.state();
-    for (const ModelFile::SamplingRule& rule : model_.sampling) {
+    for (const Model::SamplingRule& rule : model_.sampling) {
       const auto of_state = std::find(names.begin(), names.end(), rule.name);
       if (of_state != names.end()) {
         target_.push_back(static_cast<int>(of_state - names.begin()));
@@ -270,7 +269,7 @@ class Sampler {
     std::map<std::string, Stage> available;
     for (int unknown : positions_->unknowns()) available[name_of(unknown)] = Stage::after_positions;
     for (int unknown : velocities_->unknowns()) available[name_of(unknown)] = Stage::after_velocities;
-    for (const ModelFile::SamplingRule& rule : model_.sampling) {
+    for (const Model::SamplingRule& rule : model_.sampling) {
       Stage stage = Stage::before_positions;
       if (!rule.range) {
         for (const std::string& name : graph().variables_of(rule.value)) {
@@ -308,7 +307,7 @@ class Sampler {
     MatrixXd value;
     for (std::size_t r = 0; r < model_.sampling.size(); ++r) {
       if (stage_[r] != stage) continue;
-      const ModelFile::SamplingRule& rule = model_.sampling[r];
+      const Model::SamplingRule& rule = model_.sampling[r];
       if (rule.range) {
         state(target_[r], 0) = rule.range->first + fraction(r) * (rule.range->second - rule.range->first);
         continue;
@@ -327,7 +326,7 @@ class Sampler {
     return tape_inputs_[static_cast<std::size_t>(entry)].variable_name();
   }
 
-  const ModelFile& model_;
+  const Model& model_;
   VectorXd parameters_;
   SystemSymbols symbols_;
   std::vector<bool> known_;              // entries of the state that are drawn or solved for
@@ -339,7 +338,7 @@ class Sampler {
   std::optional<Completion> positions_, velocities_;
 };
 
-void require_truth(const ModelFile& model) {
+void require_truth(const Model& model) {
   if (model.truth.empty()) {
     throw InputError(
         fmt::format("{}: missing [truth] acceleration = [ … ]: what is added to M⁻¹ force, \"0\" where nothing is", model.name));
@@ -348,7 +347,7 @@ void require_truth(const ModelFile& model) {
 
 }  // namespace
 
-ModelMotion::ModelMotion(const ModelFile& model) : system_(model.system), parameters_(model.system->parameter_values()) {
+ModelMotion::ModelMotion(const Model& model) : system_(model.system), parameters_(model.system->parameter_values()) {
   truth_ = Tape(model.truth, model.symbols().state_and_parameters());
   truth_force_ = Tape(model.truth_force, model.symbols().state_and_parameters());
 }
@@ -371,7 +370,7 @@ MatrixXd ModelMotion::acceleration(const Eigen::Ref<const MatrixXd>& states) con
   return accelerations;
 }
 
-MatrixXd true_acceleration(const ModelFile& model, const Eigen::Ref<const MatrixXd>& states) {
+MatrixXd true_acceleration(const Model& model, const Eigen::Ref<const MatrixXd>& states) {
   require_truth(model);
   MatrixXd accelerations = ModelMotion(model).acceleration(states);
   for (int i = 0; i < static_cast<int>(states.cols()); ++i) {
@@ -385,11 +384,11 @@ MatrixXd true_acceleration(const ModelFile& model, const Eigen::Ref<const Matrix
 namespace {
 
 // points of every range of [sampling], in its order; 0 where a rule is an expression
-std::vector<int> grid_points(const ModelFile& model, const std::map<std::string, int>& grid) {
+std::vector<int> grid_points(const Model& model, const std::map<std::string, int>& grid) {
   std::vector<int> points;
   std::vector<std::string> ranges;
   double total = 1;
-  for (const ModelFile::SamplingRule& rule : model.sampling) {
+  for (const Model::SamplingRule& rule : model.sampling) {
     points.push_back(0);
     if (!rule.range) continue;
     ranges.push_back(rule.name);
@@ -415,7 +414,7 @@ std::vector<int> grid_points(const ModelFile& model, const std::map<std::string,
 }
 
 // even points over every range, ends included, the last range fastest; the middle where there is one point
-MatrixXd grid_states(const ModelFile& model, const Sampler& sampler, const std::map<std::string, int>& grid) {
+MatrixXd grid_states(const Model& model, const Sampler& sampler, const std::map<std::string, int>& grid) {
   const std::vector<int> points = grid_points(model, grid);
   int n = 1;
   for (const int of_rule : points) n *= std::max(of_rule, 1);
@@ -435,7 +434,7 @@ MatrixXd grid_states(const ModelFile& model, const Sampler& sampler, const std::
   return states;
 }
 
-GeneratedData draw_states(const ModelFile& model, const GenerateOptions& options, RandomStream& random) {
+GeneratedData draw_states(const Model& model, const GenerateOptions& options, RandomStream& random) {
   const Sampler sampler(model);
   GeneratedData data;
   data.known = sampler.known();
@@ -451,7 +450,7 @@ GeneratedData draw_states(const ModelFile& model, const GenerateOptions& options
 
 }  // namespace
 
-GeneratedData generate(const ModelFile& model, const GenerateOptions& options) {
+GeneratedData generate(const Model& model, const GenerateOptions& options) {
   const System& system = *model.system;
   if (model.sampling.empty() && !model.motion) {
     throw InputError(

@@ -1,4 +1,4 @@
-#include "gp2/projected_states.hpp"
+#include "gp2/simulation/projected_states.hpp"
 
 #include <algorithm>
 #include <cmath>

@@ -7,7 +7,7 @@
 #include <fmt/format.h>
 
 #include "gp2/error.hpp"
-#include "gp2/mechanics.hpp"
+#include "gp2/mechanics/udwadia_kalaba.hpp"
 #include "gp2/simulate.hpp"
 
 namespace gp2 {

@@ -12,8 +12,8 @@
 #include <boost/numeric/odeint/stepper/runge_kutta_dopri5.hpp>
 
 #include "gp2/error.hpp"
-#include "gp2/generate.hpp"
-#include "gp2/mechanics.hpp"
+#include "gp2/mechanics/udwadia_kalaba.hpp"
+#include "gp2/simulation/generate.hpp"
 #include "simulation/projection.hpp"
 
 namespace gp2 {
@@ -306,12 +306,12 @@ Trajectory simulate(const System& system, const VectorXd& parameters, const Acce
   return out;
 }
 
-Acceleration model_acceleration(const ModelFile& model) {
+Acceleration model_acceleration(const Model& model) {
   return
       [motion = ModelMotion(model)](const Ref<const VectorXd>& state) -> VectorXd { return motion.acceleration(state).col(0); };
 }
 
-VectorXd mechanical_energy(const ModelFile& model, const VectorXd& parameters, const Ref<const MatrixXd>& states) {
+VectorXd mechanical_energy(const Model& model, const VectorXd& parameters, const Ref<const MatrixXd>& states) {
   const System& system = *model.system;
   if (!model.potential) throw InputError(fmt::format("{}: no energy without [mechanics] potential = \"…\"", model.name));
   MatrixXd potential;

@@ -20,7 +20,7 @@ std::string listed(const std::vector<std::string>& names, const Eigen::VectorXd&
 
 }  // namespace
 
-Eigen::VectorXd complete_start(const ModelFile& model, const Eigen::VectorXd& parameters, StartingPoint start,
+Eigen::VectorXd complete_start(const Model& model, const Eigen::VectorXd& parameters, StartingPoint start,
                                std::vector<std::string>& notes) {
   const System& system = *model.system;
   const std::vector<std::string> names = system.state_names();

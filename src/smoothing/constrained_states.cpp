@@ -81,7 +81,7 @@ std::vector<int> read_positions(const System& system, const std::vector<int>& am
 
 }  // namespace
 
-ConstrainedStates::ConstrainedStates(const ModelFile& model, std::vector<int> measured)
+ConstrainedStates::ConstrainedStates(const Model& model, std::vector<int> measured)
     : system_(*model.system),
       parameters_(model.system->parameter_values()),
       measured_(std::move(measured)),

@@ -4,7 +4,7 @@
 
 #include <Eigen/Core>
 
-#include "gp2/model_file.hpp"
+#include "gp2/model.hpp"
 #include "simulation/projection.hpp"
 
 namespace gp2 {
@@ -13,7 +13,7 @@ namespace gp2 {
 class ConstrainedStates {
  public:
   /// @param measured  coordinates, sorted
-  ConstrainedStates(const ModelFile& model, std::vector<int> measured);
+  ConstrainedStates(const Model& model, std::vector<int> measured);
 
   [[nodiscard]] const std::vector<int>& completed() const { return free_; }  // coordinates that were not measured
 

@@ -6,7 +6,7 @@
 #include <fmt/format.h>
 
 #include "gp2/error.hpp"
-#include "gp2/smoother.hpp"
+#include "gp2/smoothing/smoother.hpp"
 #include "training/lbfgsb.hpp"
 
 namespace gp2 {

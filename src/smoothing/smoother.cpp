@@ -1,4 +1,4 @@
-#include "gp2/smoother.hpp"
+#include "gp2/smoothing/smoother.hpp"
 
 #include <algorithm>
 #include <cmath>

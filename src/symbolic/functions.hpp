@@ -4,7 +4,7 @@
 #include <array>
 #include <string_view>
 
-#include "gp2/expression.hpp"
+#include "gp2/symbolic/expression.hpp"
 
 namespace gp2::internal {
 

@@ -14,7 +14,7 @@
 #include <utility>
 #include <vector>
 
-#include "gp2/expression.hpp"
+#include "gp2/symbolic/expression.hpp"
 
 namespace gp2 {
 

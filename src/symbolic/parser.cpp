@@ -7,7 +7,7 @@
 #include <fmt/format.h>
 
 #include "gp2/error.hpp"
-#include "gp2/expression.hpp"
+#include "gp2/symbolic/expression.hpp"
 #include "symbolic/functions.hpp"
 
 namespace gp2 {

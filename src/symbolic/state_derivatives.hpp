@@ -3,7 +3,7 @@
 #include <span>
 #include <vector>
 
-#include "gp2/expression.hpp"
+#include "gp2/symbolic/expression.hpp"
 
 namespace gp2::internal {
 

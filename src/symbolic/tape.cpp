@@ -5,7 +5,7 @@
 #include <fmt/format.h>
 
 #include "gp2/error.hpp"
-#include "gp2/expression.hpp"
+#include "gp2/symbolic/expression.hpp"
 #include "symbolic/graph.hpp"
 #include "symbolic/state_derivatives.hpp"
 

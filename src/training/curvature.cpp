@@ -7,8 +7,8 @@
 #include <fmt/format.h>
 #include <Eigen/Eigenvalues>
 
+#include "base/parallel.hpp"
 #include "gp2/error.hpp"
-#include "inference/parallel.hpp"
 
 namespace gp2 {
 

@@ -9,11 +9,11 @@
 
 #include <fmt/format.h>
 
+#include "base/lapack.hpp"
+#include "base/parallel.hpp"
+#include "base/random.hpp"
 #include "gp2/error.hpp"
-#include "gp2/training.hpp"
-#include "inference/lapack.hpp"
-#include "inference/parallel.hpp"
-#include "prior/random.hpp"
+#include "gp2/fit.hpp"
 #include "training/curvature.hpp"
 #include "training/lbfgsb.hpp"
 #include "training/objective.hpp"

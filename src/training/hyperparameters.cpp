@@ -5,7 +5,7 @@
 #include <fmt/format.h>
 
 #include "gp2/error.hpp"
-#include "gp2/training.hpp"
+#include "gp2/fit.hpp"
 
 namespace gp2 {
 

@@ -1,4 +1,4 @@
-#include "gp2/laplace.hpp"
+#include "gp2/training/laplace.hpp"
 
 #include <algorithm>
 #include <cmath>
@@ -7,8 +7,8 @@
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
-#include "inference/lapack.hpp"
-#include "inference/parallel.hpp"
+#include "base/lapack.hpp"
+#include "base/parallel.hpp"
 #include "training/curvature.hpp"
 
 namespace gp2 {

@@ -4,7 +4,7 @@
 
 #include <Eigen/Core>
 
-#include "gp2/training.hpp"
+#include "gp2/fit.hpp"
 
 namespace gp2 {
 

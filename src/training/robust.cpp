@@ -1,4 +1,4 @@
-#include "gp2/robust.hpp"
+#include "gp2/training/robust.hpp"
 
 #include <algorithm>
 #include <cmath>

@@ -8,8 +8,8 @@
 #include <gtest/gtest.h>
 
 #include "apps/command_line.hpp"
-#include "gp2/blas.hpp"
-#include "gp2/version.hpp"
+#include "gp2/base/blas.hpp"
+#include "gp2/base/version.hpp"
 
 namespace gp2::test {
 namespace {

@@ -9,8 +9,8 @@
 
 #include <nlohmann/json.hpp>
 
-#include "gp2/csv.hpp"
-#include "io/io_testing.hpp"
+#include "gp2/data/csv.hpp"
+#include "io_testing.hpp"
 
 // The built command, run as a person runs it: by a shell, in a folder, with files beside it.
 namespace gp2::test {

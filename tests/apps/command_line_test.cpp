@@ -3,7 +3,7 @@
 #include <gmock/gmock.h>
 #include <gtest/gtest.h>
 
-#include "gp2/version.hpp"
+#include "gp2/base/version.hpp"
 
 namespace gp2::test {
 namespace {

@@ -5,8 +5,8 @@
 #include <gtest/gtest.h>
 
 #include "apps/command_line.hpp"
-#include "gp2/fit_file.hpp"
-#include "prior/random.hpp"
+#include "base/random.hpp"
+#include "gp2/files/fit_file.hpp"
 
 namespace gp2::test {
 namespace {

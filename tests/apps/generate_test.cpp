@@ -2,8 +2,8 @@
 #include <gtest/gtest.h>
 
 #include "apps/command_line.hpp"
-#include "gp2/generate.hpp"
-#include "gp2/log_reader.hpp"
+#include "gp2/data/log_reader.hpp"
+#include "gp2/simulation/generate.hpp"
 #include "test_models.hpp"
 
 namespace gp2::test {
@@ -14,7 +14,7 @@ class Generate : public testing::TestWithParam<std::string> {};
 TEST_P(Generate, WithoutNoiseGivesTheTruth) {
   const Desk desk;
   desk.done("gp2 generate " + GetParam() + " --n 15 --noise-std 0 -o truth.csv");
-  const ModelFile& model_file = model(GetParam());
+  const Model& model_file = model(GetParam());
   const CsvTable table = desk.table("truth.csv");
   ASSERT_EQ(table.n_rows(), 15);
   LogReader reader(table, *model_file.system);

@@ -14,7 +14,7 @@
 #include <gtest/gtest.h>
 
 #include "apps/command_line.hpp"
-#include "gp2/fit_file.hpp"
+#include "gp2/files/fit_file.hpp"
 
 // Signals sent to the command, as by a person at a terminal or by a batch system.
 namespace gp2::test {

@@ -5,7 +5,7 @@
 #include <gtest/gtest.h>
 
 #include "apps/command_line.hpp"
-#include "gp2/fit_problem.hpp"
+#include "gp2/jobs/fit_problem.hpp"
 
 // generate, fit, predict, evaluate: what the command writes is what the library computes.
 namespace gp2::test {

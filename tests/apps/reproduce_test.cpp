@@ -7,8 +7,8 @@
 #include <gtest/gtest.h>
 
 #include "apps/command_line.hpp"
-#include "gp2/fit_problem.hpp"
-#include "gp2/robot.hpp"
+#include "gp2/jobs/fit_problem.hpp"
+#include "gp2/robots/robot.hpp"
 #include "test_models.hpp"
 
 // gp2 reproduce on definitions that are cut down to seconds: what it writes, and what it says of what is wrong.

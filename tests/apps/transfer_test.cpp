@@ -4,7 +4,7 @@
 #include <gtest/gtest.h>
 
 #include "apps/command_line.hpp"
-#include "gp2/fit_problem.hpp"
+#include "gp2/jobs/fit_problem.hpp"
 
 // Other systems, several logs and other views, from the command line: what it writes is what the library computes.
 namespace gp2::test {
@@ -57,8 +57,8 @@ class Transfer : public testing::Test {
 TEST_F(Transfer, PredictsUnderAnotherSystem) {
   static_cast<void>(fit("--data train.csv"));
   const FitFile file = FitFile::read(desk / "fit.json");
-  const ModelFile other = ModelFile::read(desk / "other.toml");
-  const auto setting = make_setting(file.model, other, file.prior_options);
+  const Model other = Model::read(desk / "other.toml");
+  const auto other_system = make_other_system(file.model, other, file.prior_options);
   struct Case {
     std::string word;
     View::Quantity quantity;
@@ -71,8 +71,8 @@ TEST_F(Transfer, PredictsUnderAnotherSystem) {
     SCOPED_TRACE(word);
     desk.done("gp2 predict fit.json --system other.toml --states test.csv --cov std -o there.csv --view " + word);
     View view = View::all(quantity, *other.system);
-    view.setting = setting;
-    const MatrixXd states = read_log_states(setting->prior, view, other, desk.table("test.csv"), {}).states;
+    view.other_system = other_system;
+    const MatrixXd states = read_log_states(other_system->prior, view, other, desk.table("test.csv"), {}).states;
     const Posterior::Marginal expected = file.posterior().marginal(view, states);
     EXPECT_EQ(columns(desk.table("there.csv"), names), expected.mean);
     std::vector<std::string> stddevs;
@@ -102,9 +102,9 @@ TEST_F(Transfer, PoolsLogsOfSeveralSystems) {
   static_cast<void>(fit("--data train.csv --data other.csv@other.toml --data train.csv --max-points 12"));
   const FitFile file = FitFile::read(desk / "fit.json");
   ASSERT_EQ(file.observations.size(), 3U);
-  EXPECT_EQ(file.observations[0].view.setting, nullptr);
-  ASSERT_NE(file.observations[1].view.setting, nullptr);
-  EXPECT_EQ(file.observations[1].view.setting->prior.system->parameter_values()[0], 4.0);
+  EXPECT_EQ(file.observations[0].view.other_system, nullptr);
+  ASSERT_NE(file.observations[1].view.other_system, nullptr);
+  EXPECT_EQ(file.observations[1].view.other_system->prior.system->parameter_values()[0], 4.0);
   EXPECT_EQ(file.observations[1].n_data(), 12);
   EXPECT_EQ(file.data_source, "train.csv, other.csv@other.toml, train.csv");
   // the fit needs no file but itself
@@ -143,7 +143,7 @@ TEST_F(Transfer, JoinsKnowledgeToTheObservations) {
   const FitFile more = FitFile::read(desk / "fit.json");
   ASSERT_EQ(more.observations.size(), 4U);
   EXPECT_EQ(more.observations[1].view.time_step, 0.1);
-  EXPECT_NE(more.observations[2].view.setting, nullptr);
+  EXPECT_NE(more.observations[2].view.other_system, nullptr);
   EXPECT_EQ(more.observations[3].view.latent, 0);
 }
 

@@ -1,7 +1,7 @@
 #include <cmath>
 
 #include "fuzz/fuzz.hpp"
-#include "gp2/csv.hpp"
+#include "gp2/data/csv.hpp"
 
 using gp2::CsvTable;
 using gp2::test::accepts;

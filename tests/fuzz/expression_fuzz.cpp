@@ -11,7 +11,7 @@
 #include <fmt/format.h>
 
 #include "fuzz/fuzz.hpp"
-#include "gp2/expression.hpp"
+#include "gp2/symbolic/expression.hpp"
 #include "symbolic/graph.hpp"
 
 using gp2::Expression;

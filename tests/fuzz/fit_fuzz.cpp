@@ -1,5 +1,5 @@
 #include "fuzz/fuzz.hpp"
-#include "gp2/fit_file.hpp"
+#include "gp2/files/fit_file.hpp"
 
 extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size) {
   gp2::test::accepts([&] {

@@ -1,8 +1,8 @@
 #include <string>
 
 #include "fuzz/fuzz.hpp"
-#include "gp2/model_file.hpp"
-#include "gp2/state_evaluator.hpp"
+#include "gp2/mechanics/state_evaluator.hpp"
+#include "gp2/model.hpp"
 
 namespace {
 
@@ -26,8 +26,8 @@ gp2::RobotDescription pendulum(const std::string&) {
 
 extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size) {
   gp2::test::accepts([&] {
-    const gp2::ModelFile model =
-        gp2::ModelFile::parse(std::string(gp2::test::text_of(data, size)), "model.toml", gp2::RobotSource(pendulum));
+    const gp2::Model model =
+        gp2::Model::parse(std::string(gp2::test::text_of(data, size)), "model.toml", gp2::RobotSource(pendulum));
     static_cast<void>(make_prior(model));
     // the mechanics where everything is zero, and their derivatives
     const auto evaluator = model.system->make_evaluator(model.system->parameter_values(), true);

@@ -14,8 +14,8 @@ constexpr std::uint64_t seed = 60611;
 constexpr int n_data = 8;
 
 // "acceleration", or a matrix of expressions, in place of the directions
-ModelFile sledge(const std::string& constraint, const std::string& directions) {
-  return ModelFile::parse(R"toml(
+Model sledge(const std::string& constraint, const std::string& directions) {
+  return Model::parse(R"toml(
 name        = "sledge"
 coordinates = ["x", "y"]
 [parameters]
@@ -30,13 +30,13 @@ name       = "first"
 kernel     = "se"
 features   = ["x", "y"]
 directions = )toml" + directions +
-                              R"toml(
+                          R"toml(
 [[latent]]
 name       = "second"
 kernel     = "linear"
 features   = ["x", "dx"]
 directions = )toml" + directions,
-                          "sledge");
+                      "sledge");
 }
 
 struct Case {
@@ -60,7 +60,7 @@ struct Learned {
 
 Learned learned(const Case& c) {
   RandomStream random(seed);
-  const ModelFile model = sledge(c.constraint, "\"acceleration\"");
+  const Model model = sledge(c.constraint, "\"acceleration\"");
   Learned p{make_prior(model), {}, {}};
   for (Latent& latent : p.prior.latents) latent.learned_rank = 1;
   for (const View& view : c.views) {

@@ -1,4 +1,4 @@
-#include "gp2/likelihood.hpp"
+#include "gp2/inference/likelihood.hpp"
 
 #include <gtest/gtest.h>
 
@@ -83,7 +83,7 @@ TEST(LikelihoodTest, ARowThatSaysNothingNewChangesNothing) {
   std::string doubled_text = text;
   doubled_text.replace(doubled_text.find(row), row.size(),
                        row + ",\n  \"10*(p1*q1^2 + p2*q2^2 + p3*q1*q2 + p4*cos(p5*q1) - q3)\"");
-  const ModelFile doubled = ModelFile::parse(doubled_text, "surface with a row twice");
+  const Model doubled = Model::parse(doubled_text, "surface with a row twice");
   ASSERT_EQ(doubled.system->nc(), 2);
   Likelihood::Options options;
   options.gradient_parameters = {2, 3};
@@ -104,7 +104,7 @@ TEST(LikelihoodTest, ARowThatSaysNothingNewChangesNothing) {
 }
 
 TEST(LikelihoodTest, IsInfiniteWhereAParameterMakesTheMassMatrixIndefinite) {
-  const ModelFile& model = test::model("models/unicycle.toml");
+  const Model& model = test::model("models/unicycle.toml");
   for (Problem p : test::problems(9, seed)) {
     if (!p.name.starts_with("unicycle")) continue;
     const int Ic = model.system->parameter_index("Ic");

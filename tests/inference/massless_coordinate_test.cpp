@@ -7,8 +7,8 @@
 
 #include "allocation_count.hpp"
 #include "gp2/error.hpp"
+#include "gp2/fit.hpp"
 #include "gp2/predictor.hpp"
-#include "gp2/training.hpp"
 #include "inference/problems.hpp"
 
 // A massless coordinate is learned from, and predicts, as a model that does without it.
@@ -28,15 +28,15 @@ constexpr std::uint64_t seed = 50606;
 double largest(const MatrixXd& matrix) { return matrix.size() == 0 ? 0 : matrix.cwiseAbs().maxCoeff(); }
 
 // models/massless_rod.toml with what is unknown at the hinge alone, and the pendulum that it is
-const ModelFile& rod() {
-  static const ModelFile model =
-      ModelFile::parse(test::changed(test::model("models/massless_rod.toml").text,
-                                     {{"directions = \"force\"", "directions = { force = [[\"0\"], [\"0\"], [\"1\"]] }"}}),
-                       "rod");
+const Model& rod() {
+  static const Model model =
+      Model::parse(test::changed(test::model("models/massless_rod.toml").text,
+                                 {{"directions = \"force\"", "directions = { force = [[\"0\"], [\"0\"], [\"1\"]] }"}}),
+                   "rod");
   return model;
 }
-const ModelFile& pendulum() {
-  static const ModelFile model = ModelFile::parse(R"toml(
+const Model& pendulum() {
+  static const Model model = Model::parse(R"toml(
 name        = "pendulum"
 coordinates = [{ name = "theta", angle = true }]
 inputs      = ["u1"]
@@ -52,7 +52,7 @@ kernel     = "se"
 features   = ["theta", "dtheta", "u1"]
 directions = { force = [["1"]] }
 )toml",
-                                                  "pendulum");
+                                          "pendulum");
   return model;
 }
 
@@ -129,7 +129,7 @@ struct Problem {
 };
 
 Problem problem(Prior::Mean mean) {
-  const ModelFile& model = test::model("models/massless_rod.toml");
+  const Model& model = test::model("models/massless_rod.toml");
   const MatrixXd states = test::draw(model, 24, seed).states;
   Problem p{make_prior(model, {mean, std::nullopt}), {}, {}, states.rightCols(3)};
   RandomStream random(seed, mean == Prior::Mean::force ? 1 : 2);
@@ -225,7 +225,7 @@ TEST(MasslessCoordinate, IsPredictedByThePredictorAsByThePosteriorAndDifferentia
 // M is singular at x = 0, where the row of A, (1, c), completes it or does not
 TEST(MasslessCoordinate, ThePredictorTellsWhatIsWrongWithAStateAndGoesOn) {
   const auto expect = [](const std::string& row, const std::string& directions, Status status) {
-    const ModelFile model = ModelFile::parse(fmt::format(R"toml(
+    const Model model = Model::parse(fmt::format(R"toml(
 name        = "a point"
 coordinates = ["x", "y"]
 [mechanics]
@@ -236,8 +236,8 @@ acceleration = ["{}"]
 features   = ["y"]
 directions = "{}"
 )toml",
-                                                         row, directions),
-                                             "a point");
+                                                 row, directions),
+                                     "a point");
     ModelValues values{{VectorXd::Ones(1)}, {VectorXd::Ones(2)}, {}, {}, VectorXd()};
     const Predictor predictor(Posterior(make_prior(model), {}, values));
     Predictor::Workspace workspace = predictor.make_workspace();
@@ -255,7 +255,7 @@ directions = "{}"
 
 // M_θθ = 0: the torque that the hinge can be expected to see is that of the ball on its rod
 TEST(MasslessCoordinate, HasAForceScaleOfTheMassThatItsConstraintsLendIt) {
-  const ModelFile& model = test::model("models/massless_rod.toml");
+  const Model& model = test::model("models/massless_rod.toml");
   const GeneratedData data = test::draw(model, 30, seed);
   for (const int row : {0, 2}) {
     const Observations group{
@@ -270,7 +270,7 @@ TEST(MasslessCoordinate, HasAForceScaleOfTheMassThatItsConstraintsLendIt) {
 }
 
 TEST(MasslessCoordinate, WithAPriorOnTheAccelerationThereIsNoPosterior) {
-  const ModelFile& model = test::model("models/massless_rod.toml");
+  const Model& model = test::model("models/massless_rod.toml");
   const Prior prior = make_prior(model, {Prior::Mean::zero, Latent::Base::acceleration});
   RandomStream random(seed);
   const Observations group = test::observe(model, View::all(Quantity::constrained_acceleration, *model.system),

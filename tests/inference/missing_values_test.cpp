@@ -1,8 +1,8 @@
 #include <gtest/gtest.h>
 
 #include "gp2/error.hpp"
-#include "gp2/evaluation.hpp"
-#include "gp2/leave_one_out.hpp"
+#include "gp2/inference/evaluation.hpp"
+#include "gp2/inference/leave_one_out.hpp"
 #include "inference/sampling.hpp"
 
 // Observations some of whose values are not measured, and what is predicted of a value when it is left out.

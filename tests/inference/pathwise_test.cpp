@@ -1,10 +1,10 @@
-#include "gp2/pathwise.hpp"
+#include "gp2/inference/pathwise.hpp"
 
 #include <gmock/gmock.h>
 #include <gtest/gtest.h>
 
 #include "gp2/error.hpp"
-#include "gp2/evaluation.hpp"
+#include "gp2/inference/evaluation.hpp"
 #include "inference/sampling.hpp"
 
 namespace gp2 {
@@ -116,15 +116,15 @@ TEST(PathwiseTest, LatentsAddUpAndLeaveTheMean) {
 }
 
 TEST(PathwiseTest, ActsUnderAnotherSystem) {
-  const ModelFile& home = test::model("models/surface.toml");
+  const Model& home = test::model("models/surface.toml");
   std::string text = home.text;
   const std::string surface_here = "p1*q1^2 + p2*q2^2 + p3*q1*q2 + p4*cos(p5*q1)";
   text.replace(text.find(surface_here), surface_here.size(), "0.1*q1 - 0.15*q2 - 0.1*cos(3*q1)");
-  const ModelFile other = ModelFile::parse(text, "another surface");
+  const Model other = Model::parse(text, "another surface");
   const Posterior posterior = test::surface_posterior(seed);
-  const auto setting = make_setting(home, other);
+  const auto other_system = make_other_system(home, other);
   View there = View::all(Quantity::constrained_acceleration, *other.system);
-  there.setting = setting;
+  there.other_system = other_system;
   const View here = View::all(Quantity::constrained_acceleration, *home.system);
   const MatrixXd states = test::draw(other, 4, seed).states;
 
@@ -135,7 +135,7 @@ TEST(PathwiseTest, ActsUnderAnotherSystem) {
   const Posterior::Joint joint = posterior.joint(quantities);
   test::expect_moments(samples, joint);
   test::expect_moments(posterior.sample(quantities, 1000, seed), joint);
-  const VectorXd parameters = setting->parameters(posterior.values().parameters);
+  const VectorXd parameters = other_system->parameters(posterior.values().parameters);
   for (const auto& sample : samples.topRows(there.size() * states.cols()).colwise()) {
     EXPECT_LE(max_constraint_error(*other.system, states, parameters, sample.reshaped(3, 4)), 1e-12);
   }
@@ -144,7 +144,7 @@ TEST(PathwiseTest, ActsUnderAnotherSystem) {
   // the unconstrained acceleration is the same in both
   View a_bar = View::all(Quantity::unconstrained_acceleration, *home.system);
   const MatrixXd a_bar_here = paths.evaluate(0, a_bar, states);
-  a_bar.setting = setting;
+  a_bar.other_system = other_system;
   EXPECT_EQ(paths.evaluate(0, a_bar, states), a_bar_here);
 }
 

@@ -5,20 +5,20 @@
 #include <utility>
 #include <vector>
 
-#include "gp2/evaluation.hpp"
-#include "gp2/training.hpp"
+#include "gp2/fit.hpp"
+#include "gp2/inference/evaluation.hpp"
 #include "inference/problems.hpp"
 
 // What data of one surface, or pooled from two, say about the motion on a third.
 namespace gp2::test {
 
 /// The published particle on a surface of other parameters p1 … p7.
-inline ModelFile surface_of(const std::vector<double>& p, const std::string& name) {
+inline Model surface_of(const std::vector<double>& p, const std::string& name) {
   std::string text = model("experiments/surface_published.toml").text;
   const std::size_t first = text.find("[parameters]"), end = text.find("[let]");
   std::string parameters = "[parameters]\n";
   for (std::size_t k = 0; k < p.size(); ++k) parameters += fmt::format("p{} = {}\n", k + 1, shortest(p[k]));
-  return ModelFile::parse(text.replace(first, end - first, parameters + "\n"), name);
+  return Model::parse(text.replace(first, end - first, parameters + "\n"), name);
 }
 
 /// Root mean square error of predicted accelerations on a third surface [m/s²], by what was trained on.
@@ -39,18 +39,18 @@ struct PooledScore {
 
 /// The third surface is drawn: none is chosen to suit.
 inline PooledScore score_pooling(int n, std::uint64_t seed) {
-  const ModelFile first = surface_of({0.08, 0.05, 0.05, 0, 0, 0.1, 3}, "first surface");
-  const ModelFile second = surface_of({0, 0, 0, 0.1, -0.15, -0.1, 3}, "second surface");
+  const Model first = surface_of({0.08, 0.05, 0.05, 0, 0, 0.1, 3}, "first surface");
+  const Model second = surface_of({0, 0, 0, 0.1, -0.15, -0.1, 3}, "second surface");
   RandomStream random(seed, 77);
   std::vector<double> p;
   for (const double size : {0.1, 0.1, 0.1, 0.15, 0.15, 0.1}) p.push_back(size * (2 * random.uniform() - 1));
   p.push_back(2 + 2 * random.uniform());
-  const ModelFile third = surface_of(p, "third surface");
+  const Model third = surface_of(p, "third surface");
   const Prior prior = make_prior(first);
   const View ddq = View::all(Quantity::constrained_acceleration, *first.system);
-  const auto measured = [&](const ModelFile& surface, std::uint64_t of) {
+  const auto measured = [&](const Model& surface, std::uint64_t of) {
     const GeneratedData data = generate(surface, {n, 100 * seed + of, VectorXd::Constant(3, 0.1)});
-    const View view = &surface == &first ? ddq : under(ddq, make_setting(first, surface));
+    const View view = &surface == &first ? ddq : under(ddq, make_other_system(first, surface));
     return Observations{data.states, view, data.accelerations, VectorXd::Constant(3, 0.1), false};
   };
   const Observations a = measured(first, 1), b = measured(second, 2);
@@ -58,7 +58,7 @@ inline PooledScore score_pooling(int n, std::uint64_t seed) {
     return Observations{group.states.leftCols(n / 2), group.view, group.values.leftCols(n / 2), group.noise_stddev, false};
   };
   const GeneratedData truth = draw(third, 400, 100 * seed + 3);
-  const auto there = make_setting(first, third);
+  const auto there = make_other_system(first, third);
   const auto rmse = [&](const std::vector<Observations>& observations) {
     FitOptions options;
     options.n_restarts = 2;

@@ -76,7 +76,7 @@ TEST(PosteriorBatchTest, NoStatesGiveNoNumbers) {
 
 TEST(PosteriorBatchTest, JudgesContradictingConstraintsByAllStatesAskedFor) {
   // 1e-9 apart: beyond 1e-6 of b where y is small, within it beside a state where it is not
-  const ModelFile model = ModelFile::parse(R"toml(
+  const Model model = Model::parse(R"toml(
 name        = "two rods"
 coordinates = ["x", "y"]
 [mechanics]
@@ -89,7 +89,7 @@ kernel     = "se"
 features   = ["x"]
 directions = "acceleration"
 )toml",
-                                           "two rods");
+                                   "two rods");
   const View view = View::all(Quantity::constrained_acceleration, *model.system);
   const Posterior posterior(make_prior(model), {}, {{VectorXd::Ones(1)}, {VectorXd::Ones(2)}, {}, {}, VectorXd()});
   MatrixXd states = MatrixXd::Zero(5, 700);

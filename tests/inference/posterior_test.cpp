@@ -160,7 +160,7 @@ TEST(PosteriorTest, FarFromTheDataIsThePrior) {
 
 TEST(PosteriorTest, MeetsItsDataAsTheNoiseVanishes) {
   for (const char* file : {"models/surface.toml", "models/unicycle.toml"}) {
-    const ModelFile& model = test::model(file);
+    const Model& model = test::model(file);
     const GeneratedData data = test::draw(model, 15, seed);
     const View view = View::all(Quantity::constrained_acceleration, *model.system);
     const Prior prior = make_prior(model);
@@ -184,7 +184,7 @@ TEST(PosteriorTest, MeetsItsDataAsTheNoiseVanishes) {
 
 TEST(PosteriorTest, LearnsAnAccelerationThatWasNeverMeasured) {
   // ddq1 and ddq2 of the surface fix ddq3: with A and b known, the constraint says the rest
-  const ModelFile& model = test::model("models/surface.toml");
+  const Model& model = test::model("models/surface.toml");
   const GeneratedData data = test::draw(model, 15, seed);
   const Prior prior = make_prior(model);
   const View two{Quantity::constrained_acceleration, {0, 1}};
@@ -200,7 +200,7 @@ TEST(PosteriorTest, LearnsAnAccelerationThatWasNeverMeasured) {
 
 TEST(PosteriorTest, AVarianceThatRoundingMadeNegativeIsZeroAndCounted) {
   // at the data, what is left of the variance is 1e-18 of the signal's: less than the rounding of what is taken away
-  const ModelFile& model = test::model("models/surface.toml");
+  const Model& model = test::model("models/surface.toml");
   const GeneratedData data = test::draw(model, 15, seed);
   const Prior prior = make_prior(model);
   const View view = View::all(Quantity::unconstrained_acceleration, *model.system);
@@ -216,7 +216,7 @@ TEST(PosteriorTest, AVarianceThatRoundingMadeNegativeIsZeroAndCounted) {
 }
 
 TEST(PosteriorTest, OfASystemWithoutConstraintsIsAPlainGaussianProcess) {
-  const ModelFile model = ModelFile::parse(R"toml(
+  const Model model = Model::parse(R"toml(
 name        = "free mass"
 coordinates = ["x", "y"]
 [parameters]
@@ -229,7 +229,7 @@ kernel     = "se"
 features   = ["x", "dy"]
 directions = "force"
 )toml",
-                                           "free mass");
+                                   "free mass");
   RandomStream random(seed);
   MatrixXd states(5, 12);
   for (double& entry : states.reshaped()) entry = random.normal();
@@ -255,7 +255,7 @@ TEST(PosteriorTest, KnowsWhatItWasMadeOf) {
 }
 
 TEST(PosteriorTest, RefusesToPredictWhereTheMassMatrixIsIndefinite) {
-  const ModelFile model = ModelFile::parse(R"toml(
+  const Model model = Model::parse(R"toml(
 name        = "cart"
 coordinates = ["x", "y"]
 [mechanics]
@@ -268,7 +268,7 @@ kernel     = "se"
 features   = ["x"]
 directions = "acceleration"
 )toml",
-                                           "cart");
+                                   "cart");
   const Prior prior = make_prior(model);
   const View view = View::all(Quantity::constrained_acceleration, *model.system);
   MatrixXd states = MatrixXd::Zero(5, 2);

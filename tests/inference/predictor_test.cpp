@@ -10,7 +10,7 @@
 
 #include "allocation_count.hpp"
 #include "gp2/error.hpp"
-#include "gp2/state_evaluator.hpp"
+#include "gp2/mechanics/state_evaluator.hpp"
 #include "inference/sampling.hpp"
 
 // One state at a time must give what a posterior gives for many.
@@ -51,14 +51,14 @@ std::vector<View> views_of(const Problem& p) {
     views.push_back(view);
   }
   for (const Observations& group : p.observations) {
-    if (group.view.setting && group.view.quantity != Quantity::multipliers) views.push_back(group.view);
+    if (group.view.other_system && group.view.quantity != Quantity::multipliers) views.push_back(group.view);
   }
   return views;
 }
 
 std::string describe(const Problem& p, const View& view) {
   return fmt::format("{}, {} ({} rows, latent {}{}), seed {}", p.name, View::word(view.quantity), view.size(), view.latent,
-                     view.setting ? ", elsewhere" : "", seed);
+                     view.other_system ? ", elsewhere" : "", seed);
 }
 
 MatrixXd known(const MatrixXd& states) { return states.array().isNaN().select(0, states); }
@@ -179,7 +179,7 @@ TEST(PredictorTest, ObeysTheConstraintAndItsDerivativeInBothPrecisions) {
 // one row that says the same as another everywhere
 TEST(PredictorTest, DifferentiatesUnderRedundantRows) {
   const auto predict = [](const std::string& constraints) {
-    const ModelFile model = ModelFile::parse(fmt::format(R"toml(
+    const Model model = Model::parse(fmt::format(R"toml(
 name        = "two in a groove"
 coordinates = ["x", "y"]
 [mechanics]
@@ -192,8 +192,8 @@ kernel     = "se"
 features   = ["x", "dy"]
 directions = "force"
 )toml",
-                                                         constraints),
-                                             "two in a groove");
+                                                 constraints),
+                                     "two in a groove");
     RandomStream random(seed);
     const MatrixXd states = test::random_vector(5 * 12, random).reshaped(5, 12);
     const MatrixXd values = test::random_vector(2 * 12, random).reshaped(2, 12);
@@ -336,7 +336,7 @@ TEST(PredictorTest, InSinglePrecisionIsThePosteriorUnderEveryKernel) {
 }
 
 Posterior prior_of_one_point(const std::string& mass, const std::string& constraints) {
-  const ModelFile model = ModelFile::parse(fmt::format(R"toml(
+  const Model model = Model::parse(fmt::format(R"toml(
 name        = "a point"
 coordinates = ["x", "y"]
 [mechanics]
@@ -349,8 +349,8 @@ kernel     = "se"
 features   = ["x"]
 directions = "acceleration"
 )toml",
-                                                       mass, constraints),
-                                           "a point");
+                                               mass, constraints),
+                                   "a point");
   return {make_prior(model), {}, {{VectorXd::Ones(1)}, {VectorXd::Ones(2)}, {}, {}, VectorXd()}};
 }
 

@@ -8,8 +8,8 @@
 
 #include <Eigen/Dense>
 
-#include "gp2/likelihood.hpp"
-#include "gp2/model_file.hpp"
+#include "gp2/inference/likelihood.hpp"
+#include "gp2/model.hpp"
 #include "gp2/posterior.hpp"
 #include "test_models.hpp"
 
@@ -33,8 +33,8 @@ struct Problem {
 };
 
 /// A row of the constraint that vanishes where x = 0, where the motion is free: the rank of T differs from state to state.
-inline const ModelFile& model_with_a_vanishing_row() {
-  static const ModelFile model = ModelFile::parse(R"toml(
+inline const Model& model_with_a_vanishing_row() {
+  static const Model model = Model::parse(R"toml(
 name        = "contact that lets go"
 coordinates = ["x", "y", "z"]
 [parameters]
@@ -51,13 +51,13 @@ kernel     = "se"
 features   = ["x", "y", "dx"]
 directions = "acceleration"
 )toml",
-                                                  "contact that lets go");
+                                          "contact that lets go");
   return model;
 }
 
 /// Quadratic friction whose speed has no derivative at rest, with two latents, and a parameter everywhere.
-inline const ModelFile& model_with_friction() {
-  static const ModelFile model = ModelFile::parse(R"toml(
+inline const Model& model_with_friction() {
+  static const Model model = Model::parse(R"toml(
 name        = "sledge"
 coordinates = ["x", { name = "heading", angle = true }]
 inputs      = ["u"]
@@ -85,7 +85,7 @@ kernel     = "rq + matern32 + constant"
 features   = ["dx"]
 directions = [["c^2*dx + k"], ["m"]]
 )toml",
-                                                  "sledge");
+                                          "sledge");
   return model;
 }
 
@@ -100,33 +100,33 @@ inline std::string changed(std::string text, const std::vector<std::pair<std::st
 }
 
 /// Another, heavier particle on another surface; m, p1 and p5 are those of models/surface.toml.
-inline const ModelFile& another_surface() {
-  static const ModelFile other = ModelFile::parse(
-      changed(model("models/surface.toml").text,
-              {{"m  = 3.0", "m  = { value = 3.0, estimate = true }"},
-               {"[[\"m\", \"0\", \"0\"]", "[[\"1.5*m\", \"0.2\", \"0\"]"},
-               {"[\"0\", \"m\", \"0\"]", "[\"0.2\", \"m\", \"0\"]"},
-               {"bounds = [0.04, 0.16] }", "bounds = [0.04, 0.16], estimate = true }"},
-               {"bounds = [2.5, 3.5] }", "bounds = [2.5, 3.5], estimate = true }"},
-               {"p4 = { value = 0.1", "p4 = { value = 0.15"},
-               {"p1*q1^2 + p2*q2^2 + p3*q1*q2 + p4*cos(p5*q1) - q3", "p1*q1*q2 - 3*p2*q2 + p4*sin(p5*q2) - q3"}}),
-      "another surface");
+inline const Model& another_surface() {
+  static const Model other =
+      Model::parse(changed(model("models/surface.toml").text,
+                           {{"m  = 3.0", "m  = { value = 3.0, estimate = true }"},
+                            {"[[\"m\", \"0\", \"0\"]", "[[\"1.5*m\", \"0.2\", \"0\"]"},
+                            {"[\"0\", \"m\", \"0\"]", "[\"0.2\", \"m\", \"0\"]"},
+                            {"bounds = [0.04, 0.16] }", "bounds = [0.04, 0.16], estimate = true }"},
+                            {"bounds = [2.5, 3.5] }", "bounds = [2.5, 3.5], estimate = true }"},
+                            {"p4 = { value = 0.1", "p4 = { value = 0.15"},
+                            {"p1*q1^2 + p2*q2^2 + p3*q1*q2 + p4*cos(p5*q1) - q3", "p1*q1*q2 - 3*p2*q2 + p4*sin(p5*q2) - q3"}}),
+                   "another surface");
   return other;
 }
 
 /// The sledge with another mass on a runner that is turned; c and k are those of model_with_friction().
-inline const ModelFile& another_sledge() {
-  static const ModelFile other = ModelFile::parse(
-      changed(model_with_friction().text, {{"m = 2.0", "m = 2.6"},
-                                           {"c = 0.7", "c = { value = 0.7, estimate = true }"},
-                                           {"k = 1.5", "k = { value = 1.5, estimate = true }"},
-                                           {"dx*cos(heading) - e*dheading", "dx*sin(heading) + k*dx - e*dheading"}}),
-      "another sledge");
+inline const Model& another_sledge() {
+  static const Model other =
+      Model::parse(changed(model_with_friction().text, {{"m = 2.0", "m = 2.6"},
+                                                        {"c = 0.7", "c = { value = 0.7, estimate = true }"},
+                                                        {"k = 1.5", "k = { value = 1.5, estimate = true }"},
+                                                        {"dx*cos(heading) - e*dheading", "dx*sin(heading) + k*dx - e*dheading"}}),
+                   "another sledge");
   return other;
 }
 
-inline View under(View view, std::shared_ptr<const Setting> setting) {
-  view.setting = std::move(setting);
+inline View under(View view, std::shared_ptr<const OtherSystem> other_system) {
+  view.other_system = std::move(other_system);
   return view;
 }
 
@@ -156,7 +156,7 @@ inline ModelValues random_values(const Prior& prior, const std::vector<Observati
   return values;
 }
 
-inline Observations observe(const ModelFile& model, View view, const MatrixXd& states, RandomStream& random) {
+inline Observations observe(const Model& model, View view, const MatrixXd& states, RandomStream& random) {
   Observations group{states, std::move(view), {}, {}, true};
   group.values = MatrixXd(group.view.size(), states.cols());
   if (model.truth.empty() || group.view.quantity != Quantity::constrained_acceleration) {
@@ -182,7 +182,7 @@ inline Observations observe(const ModelFile& model, View view, const MatrixXd& s
 inline std::vector<Problem> problems(int n, std::uint64_t seed) {
   std::vector<Problem> all;
   std::uint64_t stream = 0;
-  const auto add = [&](const std::string& name, const ModelFile& model, const PriorOptions& options, const MatrixXd& states,
+  const auto add = [&](const std::string& name, const Model& model, const PriorOptions& options, const MatrixXd& states,
                        const std::vector<View>& views) {
     RandomStream random(seed, ++stream);
     Problem problem{name, make_prior(model, options), {}, {}, states.rightCols(3), {}};
@@ -207,7 +207,7 @@ inline std::vector<Problem> problems(int n, std::uint64_t seed) {
     all.push_back(std::move(problem));
   };
   for (const std::string& file : library_models()) {
-    const ModelFile& m = model(file);
+    const Model& m = model(file);
     const MatrixXd states = draw(m, n + 3, seed).states;
     const View ddq = View::all(Quantity::constrained_acceleration, *m.system);
     const View a_bar = View::all(Quantity::unconstrained_acceleration, *m.system);
@@ -228,7 +228,7 @@ inline std::vector<Problem> problems(int n, std::uint64_t seed) {
     }
   }
   RandomStream random(seed, 1000);
-  const auto random_states = [&](const ModelFile& m) {
+  const auto random_states = [&](const Model& m) {
     MatrixXd states(m.system->layout().size(), n + 3);
     for (double& entry : states.reshaped()) entry = random.normal();
     return states;
@@ -236,7 +236,7 @@ inline std::vector<Problem> problems(int n, std::uint64_t seed) {
   MatrixXd vanishing = random_states(model_with_a_vanishing_row());
   for (Index i = 0; i < vanishing.cols(); i += 2) vanishing(0, i) = 0;
   for (Prior::Mean mean : {Prior::Mean::zero, Prior::Mean::force}) {
-    const ModelFile& m = model_with_a_vanishing_row();
+    const Model& m = model_with_a_vanishing_row();
     add("a row that vanishes at some states", m, {mean, std::nullopt, false}, vanishing,
         {View::all(Quantity::constrained_acceleration, *m.system)});
     add("a row that vanishes at some states, two rows and all", m, {mean, std::nullopt, false}, vanishing,
@@ -244,30 +244,30 @@ inline std::vector<Problem> problems(int n, std::uint64_t seed) {
   }
   // x scaled: the row is dropped at x = 0 whatever c, so the rank stays as c varies
   for (Prior::Mean mean : {Prior::Mean::zero, Prior::Mean::force}) {
-    const ModelFile& m = model_with_friction();
+    const Model& m = model_with_friction();
     MatrixXd states = random_states(m);
     states.col(0).segment(m.system->nq(), m.system->nq()).setZero();
     const PriorOptions options{mean, std::nullopt, false};
     const View ddq = View::all(Quantity::constrained_acceleration, *m.system);
     add("friction, two latents, one state at rest", m, options, states, {ddq, View{Quantity::unconstrained_acceleration, {1}}});
-    const auto elsewhere = make_setting(m, another_sledge(), options);
+    const auto elsewhere = make_other_system(m, another_sledge(), options);
     View alone = under(View{Quantity::constraint_force, {1, 0}}, elsewhere);
     alone.latent = 1;
     add("friction, pooled with another sledge", m, options, states, {ddq, under(ddq, elsewhere), alone});
   }
   for (Prior::Mean mean : {Prior::Mean::zero, Prior::Mean::force}) {
-    const ModelFile& m = model("models/surface.toml");
+    const Model& m = model("models/surface.toml");
     const MatrixXd states = draw(m, n + 3, seed).states;
     for (const auto base : {Latent::Base::acceleration, Latent::Base::force}) {
       const PriorOptions options{mean, base, false};
-      const auto elsewhere = make_setting(m, another_surface(), options);
+      const auto elsewhere = make_other_system(m, another_surface(), options);
       const View ddq = View::all(Quantity::constrained_acceleration, *m.system);
       add("surface, pooled with another surface", m, options, states,
           {ddq, under(ddq, elsewhere), under(View{Quantity::unconstrained_acceleration, {2, 0}}, elsewhere)});
     }
   }
   for (const std::string& file : library_models()) {
-    const ModelFile& m = model(file);
+    const Model& m = model(file);
     const MatrixXd states = draw(m, n + 3, seed).states;
     const std::string name = stem(file);
     View next = View::all(Quantity::next_velocity, *m.system);

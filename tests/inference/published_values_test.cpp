@@ -3,8 +3,8 @@
 #include <gtest/gtest.h>
 #include <nlohmann/json.hpp>
 
-#include "gp2/likelihood.hpp"
-#include "gp2/log_reader.hpp"
+#include "gp2/data/log_reader.hpp"
+#include "gp2/inference/likelihood.hpp"
 #include "gp2/posterior.hpp"
 #include "reference_data.hpp"
 #include "test_models.hpp"
@@ -63,7 +63,7 @@ struct PublishedCase {
 
 PublishedCase load(const json& golden) {
   const PublishedSystem& published = published_system(golden["system"]);
-  const ModelFile& model = test::model(published.file);
+  const Model& model = test::model(published.file);
   const bool with_mean = golden["prior_mean_a"];
   PublishedCase c{make_prior(model, {with_mean ? Prior::Mean::force : Prior::Mean::zero, std::nullopt, true}), {}, {}, {}, {}};
   c.y_mean = vector(golden["normalisation"]["y_mean"]);

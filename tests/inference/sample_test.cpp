@@ -1,7 +1,7 @@
 #include <gtest/gtest.h>
 #include <Eigen/Eigenvalues>
 
-#include "gp2/evaluation.hpp"
+#include "gp2/inference/evaluation.hpp"
 #include "gp2/posterior.hpp"
 #include "inference/sampling.hpp"
 
@@ -38,7 +38,7 @@ TEST(PosteriorSampleTest, ObeysGaussPrincipleSampleBySample) {
 }
 
 TEST(PosteriorSampleTest, ObeysTheConstraintAsTheMeanDoes) {
-  const ModelFile& surface = test::model("models/surface.toml");
+  const Model& surface = test::model("models/surface.toml");
   const System& system = *surface.system;
   const View ddq = View::all(Quantity::constrained_acceleration, system);
   const Posterior posterior = test::surface_posterior(seed);
@@ -71,7 +71,7 @@ TEST(PosteriorSampleTest, EqualStatesInTwoQuantitiesAreOneDraw) {
 
 TEST(PosteriorSampleTest, SameSeedSameBitsAnotherSeedOthers) {
   const Posterior posterior = test::surface_posterior(seed);
-  const ModelFile& surface = test::model("models/surface.toml");
+  const Model& surface = test::model("models/surface.toml");
   const ViewAt ddq{View::all(Quantity::constrained_acceleration, *surface.system), test::draw(surface, 4, seed).states};
   const MatrixXd samples = posterior.sample({ddq}, 3, 7);
   EXPECT_EQ(samples, posterior.sample({ddq}, 3, 7));
@@ -127,7 +127,7 @@ TEST(PosteriorJointTest, CovarianceOfTheAccelerationIsThatOfTheUnconstrainedOneP
 
 TEST(PosteriorJointTest, IsSymmetricAndHoldsTheJointsOfItsParts) {
   const Posterior posterior = test::surface_posterior(seed);
-  const ModelFile& surface = test::model("models/surface.toml");
+  const Model& surface = test::model("models/surface.toml");
   const MatrixXd states = test::draw(surface, 5, seed).states;
   const ViewAt force{View{Quantity::constraint_force, {2, 0}}, states.leftCols(3)};
   const ViewAt lambda{View::all(Quantity::multipliers, *surface.system), states.rightCols(2)};
@@ -144,7 +144,7 @@ TEST(PosteriorJointTest, IsSymmetricAndHoldsTheJointsOfItsParts) {
 TEST(PosteriorJointTest, KnowingThatNothingAcceleratesAtRestNeverRaisesAVariance) {
   for (const char* file : {"models/surface.toml", "models/unicycle.toml", "models/double_pendulum.toml"}) {
     SCOPED_TRACE(file);
-    const ModelFile& model = test::model(file);
+    const Model& model = test::model(file);
     const System& system = *model.system;
     const StateLayout layout = system.layout();
     const GeneratedData data = generate(model, {40, seed, VectorXd::Constant(system.nq(), 0.1)});

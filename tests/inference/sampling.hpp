@@ -52,7 +52,7 @@ inline void expect_gauss_principle(const MatrixXd& samples, const MechanicsBatch
 
 /// The particle on a surface, learned from 30 noisy states.
 inline Posterior surface_posterior(std::uint64_t seed, double noise = 0.1) {
-  const ModelFile& surface = model("models/surface.toml");
+  const Model& surface = model("models/surface.toml");
   const GeneratedData data = generate(surface, {30, seed, VectorXd::Constant(3, noise)});
   const View ddq = View::all(Quantity::constrained_acceleration, *surface.system);
   const Prior prior = make_prior(surface);

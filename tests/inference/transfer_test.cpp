@@ -1,8 +1,8 @@
 #include <gmock/gmock.h>
 
 #include "gp2/error.hpp"
-#include "gp2/evaluation.hpp"
-#include "gp2/training.hpp"
+#include "gp2/fit.hpp"
+#include "gp2/inference/evaluation.hpp"
 #include "inference/pooled_surfaces.hpp"
 #include "inference/problems.hpp"
 
@@ -22,15 +22,15 @@ constexpr std::uint64_t seed = 40403;
 /// Problems with an observation of another system, and that system.
 struct Elsewhere {
   Problem problem;
-  std::shared_ptr<const Setting> setting;
+  std::shared_ptr<const OtherSystem> other_system;
 };
 
 std::vector<Elsewhere> problems_elsewhere() {
   std::vector<Elsewhere> all;
   for (Problem& p : test::problems(12, seed)) {
     for (const Observations& group : p.observations) {
-      if (!group.view.setting) continue;
-      all.push_back({p, group.view.setting});
+      if (!group.view.other_system) continue;
+      all.push_back({p, group.view.other_system});
       break;
     }
   }
@@ -41,15 +41,15 @@ double size_of(const MatrixXd& matrix) { return 1 + matrix.cwiseAbs().maxCoeff()
 
 TEST(TransferTest, PredictsTheAccelerationOfTheOtherConstraint) {
   int n = 0;
-  for (const auto& [p, setting] : problems_elsewhere()) {
+  for (const auto& [p, other_system] : problems_elsewhere()) {
     SCOPED_TRACE(fmt::format("{}, mean {}, seed {}", p.name, static_cast<int>(p.prior.mean), seed));
     ++n;
     const Posterior posterior(p.prior, p.observations, p.values);
-    const System& there = *setting->prior.system;
-    const View ddq = under(View::all(Quantity::constrained_acceleration, there), setting);
-    const View a_bar = under(View::all(Quantity::unconstrained_acceleration, there), setting);
+    const System& there = *other_system->prior.system;
+    const View ddq = under(View::all(Quantity::constrained_acceleration, there), other_system);
+    const View a_bar = under(View::all(Quantity::unconstrained_acceleration, there), other_system);
     const Posterior::Joint joint = posterior.joint({{ddq, p.queries}, {a_bar, p.queries}});
-    const MechanicsBatch mechanics = require_mechanics(there, p.queries, setting->parameters(p.values.parameters));
+    const MechanicsBatch mechanics = require_mechanics(there, p.queries, other_system->parameters(p.values.parameters));
     const Index nq = there.nq(), N = p.queries.cols();
     // [ddq; ā] of each state: ddq = L'b' + T'ā
     MatrixXd T = MatrixXd::Zero(nq * N, nq * N);
@@ -64,19 +64,20 @@ TEST(TransferTest, PredictsTheAccelerationOfTheOtherConstraint) {
     EXPECT_LE((joint.mean.head(nq * N) - (Lb + T * joint.mean.tail(nq * N))).cwiseAbs().maxCoeff(),
               1e3 * test::eps * size_of(joint.mean) * size_of(T));
     EXPECT_LE((joint.covariance.topLeftCorner(nq * N, nq * N) - T * of_a_bar * T.transpose()).cwiseAbs().maxCoeff(), rounding);
-    EXPECT_LE(max_constraint_error(there, p.queries, setting->parameters(p.values.parameters), posterior.mean(ddq, p.queries)),
-              1e4 * test::eps * size_of(joint.mean) * size_of(mechanics.values.constraint_matrix));
+    EXPECT_LE(
+        max_constraint_error(there, p.queries, other_system->parameters(p.values.parameters), posterior.mean(ddq, p.queries)),
+        1e4 * test::eps * size_of(joint.mean) * size_of(mechanics.values.constraint_matrix));
   }
   EXPECT_GE(n, 6);
 }
 
 TEST(TransferTest, AgreesWithTheTextbookProcess) {
-  for (const auto& [p, setting] : problems_elsewhere()) {
+  for (const auto& [p, other_system] : problems_elsewhere()) {
     SCOPED_TRACE(fmt::format("{}, mean {}, seed {}", p.name, static_cast<int>(p.prior.mean), seed));
     const Posterior posterior(p.prior, p.observations, p.values);
     for (const Quantity quantity : {Quantity::constrained_acceleration, Quantity::unconstrained_acceleration,
                                     Quantity::constraint_force, Quantity::multipliers}) {
-      const View view = under(View::all(quantity, *setting->prior.system), setting);
+      const View view = under(View::all(quantity, *other_system->prior.system), other_system);
       const auto [mean, covariance] = test::dense_posterior(p, view, p.queries);
       const Posterior::Joint joint = posterior.joint(view, p.queries);
       const double tolerance = 1e3 * test::eps * test::condition(p);
@@ -89,14 +90,14 @@ TEST(TransferTest, AgreesWithTheTextbookProcess) {
 TEST(TransferTest, ToTheSameSystemIsThePlainPredictionBitByBit) {
   for (const std::string& file : test::library_models()) {
     SCOPED_TRACE(file);
-    const ModelFile& model = test::model(file);
+    const Model& model = test::model(file);
     for (const Problem& p : test::problems(9, seed)) {
       if (p.name != test::stem(file) + ", force as mean") continue;
       const Posterior posterior(p.prior, p.observations, p.values);
       PriorOptions options;
       options.mean = p.prior.mean;
       // read anew, as a command does
-      const auto same = make_setting(model, ModelFile::parse(model.text, model.name), options);
+      const auto same = make_other_system(model, Model::parse(model.text, model.name), options);
       for (const Quantity quantity :
            {Quantity::constrained_acceleration, Quantity::unconstrained_acceleration, Quantity::multipliers}) {
         const View view = View::all(quantity, *model.system);
@@ -108,8 +109,8 @@ TEST(TransferTest, ToTheSameSystemIsThePlainPredictionBitByBit) {
 }
 
 TEST(TransferTest, AFittedParameterGoesAlongWhereItIsShared) {
-  const ModelFile& home = test::model("models/surface.toml");
-  const auto setting = make_setting(home, test::another_surface());
+  const Model& home = test::model("models/surface.toml");
+  const auto other_system = make_other_system(home, test::another_surface());
   Problem p = [] {
     for (Problem& problem : test::problems(9, seed)) {
       if (problem.name == "surface, every row") return problem;
@@ -119,21 +120,21 @@ TEST(TransferTest, AFittedParameterGoesAlongWhereItIsShared) {
   p.values.parameters[home.system->parameter_index("p5")] = 2.7;   // shared
   p.values.parameters[home.system->parameter_index("p4")] = 0.19;  // not
   const Posterior posterior(p.prior, p.observations, p.values);
-  const View ddq = under(View::all(Quantity::constrained_acceleration, *home.system), setting);
+  const View ddq = under(View::all(Quantity::constrained_acceleration, *home.system), other_system);
   VectorXd expected = test::another_surface().system->parameter_values();
   expected[test::another_surface().system->parameter_index("p5")] = 2.7;
-  EXPECT_LE(max_constraint_error(*setting->prior.system, p.queries, expected, posterior.mean(ddq, p.queries)), 1e-11);
+  EXPECT_LE(max_constraint_error(*other_system->prior.system, p.queries, expected, posterior.mean(ddq, p.queries)), 1e-11);
   EXPECT_EQ(expected[test::another_surface().system->parameter_index("p4")], 0.15);
 }
 
 TEST(EvaluationTest, MeasuresTheConstraintOfTheOtherSystem) {
-  const ModelFile& home = test::model("models/surface.toml");
-  const auto setting = make_setting(home, test::another_surface());
+  const Model& home = test::model("models/surface.toml");
+  const auto other_system = make_other_system(home, test::another_surface());
   for (const Problem& p : test::problems(9, seed)) {
     if (p.name != "surface, every row") continue;
     const Posterior posterior(p.prior, p.observations, p.values);
     const MatrixXd targets = MatrixXd::Random(3, p.queries.cols());
-    const Evaluation there = evaluate_predictions(posterior, p.queries, {0, 1, 2}, targets, setting);
+    const Evaluation there = evaluate_predictions(posterior, p.queries, {0, 1, 2}, targets, other_system);
     EXPECT_LE(there.max_constraint_error, 1e-11);
     EXPECT_LE(there.max_constraint_error_fitted, 1e-11);
     EXPECT_GT((there.rmse - evaluate_predictions(posterior, p.queries, {0, 1, 2}, targets).rmse).norm(), 1e-3);
@@ -154,8 +155,8 @@ TEST(EvaluationTest, NormalisesByTheSpreadOfAllLogs) {
 // ---- several latents at once
 
 /// A sledge on a wavy track: drag that grows with the speed, and a motor of unknown curve.
-const ModelFile& sledge_with_motor() {
-  static const ModelFile model = ModelFile::parse(R"toml(
+const Model& sledge_with_motor() {
+  static const Model model = Model::parse(R"toml(
 coordinates = ["x", "y"]
 inputs      = ["u"]
 [let]
@@ -184,12 +185,12 @@ x  = [-2, 2]
 dx = [-2, 2]
 u  = [-3, 3]
 )toml",
-                                                  "sledge with motor");
+                                          "sledge with motor");
   return model;
 }
 
 TEST(SeveralLatents, AreToldApartWhereTheirDirectionsAndFeaturesDiffer) {
-  const ModelFile& model = sledge_with_motor();
+  const Model& model = sledge_with_motor();
   PriorOptions options;
   options.mean = Prior::Mean::force;
   const Prior prior = make_prior(model, options);

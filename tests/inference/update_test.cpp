@@ -3,7 +3,7 @@
 #include <algorithm>
 
 #include "gp2/error.hpp"
-#include "gp2/pathwise.hpp"
+#include "gp2/inference/pathwise.hpp"
 #include "inference/sampling.hpp"
 #include "prior/kernel_columns.hpp"
 
@@ -225,7 +225,7 @@ TEST(UpdateTest, HappensInPlaceUnlessAnotherHoldsThePosterior) {
 }
 
 TEST(UpdateTest, SamplesOfAGrownPosteriorHaveItsMoments) {
-  const ModelFile& surface = test::model("models/surface.toml");
+  const Model& surface = test::model("models/surface.toml");
   const GeneratedData data = generate(surface, {40, seed, VectorXd::Constant(3, 0.1)});
   const View ddq = View::all(Quantity::constrained_acceleration, *surface.system);
   Posterior posterior = test::surface_posterior(seed);
@@ -286,7 +286,7 @@ TEST(UpdateTest, RefusesWhatDoesNotFitAndKeepsThePosterior) {
 }
 
 TEST(UpdateTest, RefusesStatesWithoutMechanicsAndKeepsThePosterior) {
-  const ModelFile model = ModelFile::parse(R"toml(
+  const Model model = Model::parse(R"toml(
 name        = "cart"
 coordinates = ["x", "y"]
 [mechanics]
@@ -299,7 +299,7 @@ kernel     = "se"
 features   = ["x"]
 directions = "acceleration"
 )toml",
-                                           "cart");
+                                   "cart");
   const View view = View::all(Quantity::constrained_acceleration, *model.system);
   Posterior posterior(make_prior(model), {}, {{VectorXd::Ones(1)}, {VectorXd::Ones(2)}, {}, {}, VectorXd()});
   Observations added{MatrixXd::Zero(5, 1), view, MatrixXd::Zero(2, 1), VectorXd::Ones(2), false};

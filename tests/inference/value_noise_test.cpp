@@ -1,7 +1,7 @@
 #include <gtest/gtest.h>
 
 #include "gp2/error.hpp"
-#include "gp2/evaluation.hpp"
+#include "gp2/inference/evaluation.hpp"
 #include "inference/sampling.hpp"
 
 // Observations whose values have a noise each.

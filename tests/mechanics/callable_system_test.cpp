@@ -1,4 +1,4 @@
-#include "gp2/callable_system.hpp"
+#include "gp2/mechanics/callable_system.hpp"
 
 #include <limits>
 
@@ -6,10 +6,10 @@
 #include <gmock/gmock.h>
 
 #include "callable_surface.hpp"
-#include "gp2/check.hpp"
 #include "gp2/error.hpp"
+#include "gp2/mechanics/check.hpp"
+#include "gp2/mechanics/state_evaluator.hpp"
 #include "gp2/simulate.hpp"
-#include "gp2/state_evaluator.hpp"
 #include "test_models.hpp"
 
 // Mechanics given as functions against the same given as text.

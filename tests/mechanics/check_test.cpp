@@ -1,9 +1,9 @@
-#include "gp2/check.hpp"
+#include "gp2/mechanics/check.hpp"
 
 #include <gmock/gmock.h>
 
-#include "gp2/callable_system.hpp"
-#include "gp2/model_file.hpp"
+#include "gp2/mechanics/callable_system.hpp"
+#include "gp2/model.hpp"
 
 namespace gp2 {
 namespace {
@@ -20,15 +20,15 @@ MatrixXd bead_states() {
   return states;
 }
 
-ModelFile bead() {
-  return ModelFile::parse(R"(
+Model bead() {
+  return Model::parse(R"(
 coordinates = ["x", "z"]
 [mechanics]
 mass = [["1", "0"], ["0", "1"]]
 [constraints]
 position = ["z - 0.5*x^2"]
 )",
-                          "a bead on a wire");
+                      "a bead on a wire");
 }
 
 Finding motion_finding(const System& system, const MatrixXd& states) {
@@ -39,15 +39,15 @@ Finding motion_finding(const System& system, const MatrixXd& states) {
 }
 
 TEST(Check, AStateAtRestIsNoFaultOfAAndB) {
-  const ModelFile model = bead();
+  const Model model = bead();
   EXPECT_EQ(motion_finding(*model.system, bead_states()).level, Finding::Level::good);
   EXPECT_EQ(motion_finding(*model.system, bead_states().leftCols(1)).level, Finding::Level::good);
 }
 
 TEST(Check, ConstraintsThatAreNotThereOrLeaveNoFreedomAreToldOf) {
   const auto said = [](const std::string& constraints) {
-    const ModelFile model =
-        ModelFile::parse("coordinates = ['x', 'z']\n[mechanics]\nmass = [['1', '0'], ['0', '1']]\n" + constraints, "two");
+    const Model model =
+        Model::parse("coordinates = ['x', 'z']\n[mechanics]\nmass = [['1', '0'], ['0', '1']]\n" + constraints, "two");
     std::string text;
     for (const Finding& finding : check_system(*model.system, bead_states(), model.system->parameter_values())) {
       if (finding.level == Finding::Level::warning) text += finding.text;
@@ -60,7 +60,7 @@ TEST(Check, ConstraintsThatAreNotThereOrLeaveNoFreedomAreToldOf) {
 }
 
 TEST(Check, AWrongBIsFound) {
-  const ModelFile model = bead();
+  const Model model = bead();
   CallableSystem::Definition wrong;
   wrong.declaration = {"wrong", model.system->coordinates(), {}, {}};
   wrong.constraints = {{"wire", ConstraintLevel::position}};

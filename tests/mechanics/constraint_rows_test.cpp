@@ -1,6 +1,6 @@
 #include <gtest/gtest.h>
 
-#include "gp2/symbolic_system.hpp"
+#include "gp2/mechanics/symbolic_system.hpp"
 #include "test_models.hpp"
 
 // A and b against the motion they come from.
@@ -63,7 +63,7 @@ TEST_P(ConstraintRows, TheirResidualChangesAlongTheMotionAsAAndBSay) {
 }
 
 TEST(ConstraintRowsTest, AnAccelerationLevelConstraintIsTakenAsWritten) {
-  const ModelFile model = ModelFile::parse(R"toml(
+  const Model model = Model::parse(R"toml(
 name        = "two carts"
 coordinates = ["x", "y"]
 inputs      = ["u"]
@@ -79,7 +79,7 @@ kernel     = "se"
 features   = ["x"]
 directions = "acceleration"
 )toml",
-                                           "two carts");
+                                   "two carts");
   const VectorXd state = (VectorXd(6) << 0.3, -1, 0.5, 2, 0.25, 1.5).finished();  // x y dx dy t u
   const SystemValues values = model.system->evaluate(state, model.system->parameter_values());
   EXPECT_EQ(values.A(0)(0, 0), 2.0);

@@ -3,8 +3,8 @@
 #include <gtest/gtest.h>
 
 #include "gp2/error.hpp"
-#include "gp2/mechanics.hpp"
-#include "gp2/model_file.hpp"
+#include "gp2/mechanics/udwadia_kalaba.hpp"
+#include "gp2/model.hpp"
 #include "test_models.hpp"
 
 // What the mechanics refuse, and that they say where.
@@ -16,8 +16,8 @@ using Eigen::VectorXd;
 using testing::AllOf;
 using testing::HasSubstr;
 
-ModelFile model(const std::string& mass, const std::string& constraints) {
-  return ModelFile::parse(fmt::format(R"toml(
+Model model(const std::string& mass, const std::string& constraints) {
+  return Model::parse(fmt::format(R"toml(
 name        = "cart"
 coordinates = ["x", "y"]
 [mechanics]
@@ -30,8 +30,8 @@ kernel     = "se"
 features   = ["x"]
 directions = "acceleration"
 )toml",
-                                      mass, constraints),
-                          "cart");
+                                  mass, constraints),
+                      "cart");
 }
 
 // x = 1, x = 2, … at rest
@@ -41,7 +41,7 @@ MatrixXd states(const std::vector<double>& x) {
   return states;
 }
 
-std::string message(const ModelFile& model, const MatrixXd& states) {
+std::string message(const Model& model, const MatrixXd& states) {
   try {
     require_mechanics(*model.system, states, model.system->parameter_values());
   } catch (const InputError& error) {
@@ -52,7 +52,7 @@ std::string message(const ModelFile& model, const MatrixXd& states) {
 
 TEST(MechanicsFaults, ContradictoryConstraintsAreAnErrorThatNamesTheState) {
   // ẍ = 0 and ẍ = x: they agree at x = 0 only
-  const ModelFile contradictory = model(R"([["1", "0"], ["0", "1"]])", R"(acceleration = ["ddx", "ddx - x"])");
+  const Model contradictory = model(R"([["1", "0"], ["0", "1"]])", R"(acceleration = ["ddx", "ddx - x"])");
   EXPECT_THAT(message(contradictory, states({0, 3})),
               AllOf(HasSubstr("cart"), HasSubstr("contradict"), HasSubstr("state 2"), HasSubstr("x = 3")));
   EXPECT_EQ(message(contradictory, states({0})), "no error");
@@ -60,7 +60,7 @@ TEST(MechanicsFaults, ContradictoryConstraintsAreAnErrorThatNamesTheState) {
 
 // b = −0.09 exp(−0.3 t) … is below 1e-308 there, where numbers have a few digits only
 TEST(MechanicsFaults, AConstraintWhoseMotionHasDiedAwayIsNoContradiction) {
-  const ModelFile& duffing = test::model("models/duffing.toml");
+  const Model& duffing = test::model("models/duffing.toml");
   MatrixXd states = MatrixXd::Zero(duffing.system->layout().size(), 1);
   for (double t = 2300; t < 2500; t += 2) {
     states(duffing.system->layout().t(), 0) = t;
@@ -69,13 +69,13 @@ TEST(MechanicsFaults, AConstraintWhoseMotionHasDiedAwayIsNoContradiction) {
 }
 
 TEST(MechanicsFaults, ARowThatVanishesWhileItsRightHandSideDoesNotIsAContradiction) {
-  const ModelFile vanishing = model(R"([["1", "0"], ["0", "1"]])", R"(acceleration = ["x*ddx - 1"])");
+  const Model vanishing = model(R"([["1", "0"], ["0", "1"]])", R"(acceleration = ["x*ddx - 1"])");
   EXPECT_THAT(message(vanishing, states({2, 1, 0})), AllOf(HasSubstr("contradict"), HasSubstr("state 3")));
   EXPECT_THAT(message(vanishing, states({0})), HasSubstr("contradict"));
 }
 
 TEST(MechanicsFaults, AMassMatrixThatIsNotPositiveDefiniteIsAnErrorThatNamesTheState) {
-  const ModelFile indefinite = model(R"([["1", "x"], ["x", "1"]])", R"(position = ["y"])");
+  const Model indefinite = model(R"([["1", "x"], ["x", "1"]])", R"(position = ["y"])");
   EXPECT_EQ(message(indefinite, states({0.5, -0.9})), "no error");
   EXPECT_THAT(message(indefinite, states({0.5, 2, 3})),
               AllOf(HasSubstr("mass matrix"), HasSubstr("not positive definite"), HasSubstr("state 2"), HasSubstr("x = 2")));
@@ -88,12 +88,12 @@ TEST(MechanicsFaults, AMassMatrixThatIsNotPositiveDefiniteIsAnErrorThatNamesTheS
 }
 
 TEST(MechanicsFaults, AConstraintThatIsNotANumberIsAnErrorThatNamesTheState) {
-  const ModelFile broken = model(R"([["1", "0"], ["0", "1"]])", R"(acceleration = ["ddy + sqrt(x)*ddx"])");
+  const Model broken = model(R"([["1", "0"], ["0", "1"]])", R"(acceleration = ["ddy + sqrt(x)*ddx"])");
   EXPECT_THAT(message(broken, states({1, -1})), AllOf(HasSubstr("finite"), HasSubstr("state 2"), HasSubstr("x = -1")));
 }
 
 TEST(MechanicsFaults, TheCheckedEvaluationReportsTheSameFaultAsAValue) {
-  const ModelFile indefinite = model(R"([["1", "x"], ["x", "1"]])", R"(position = ["y"])");
+  const Model indefinite = model(R"([["1", "x"], ["x", "1"]])", R"(position = ["y"])");
   const MechanicsBatch batch = evaluate_mechanics(*indefinite.system, states({0, 2}), VectorXd());
   ASSERT_TRUE(batch.fault);
   EXPECT_EQ(batch.fault->state, 1);

@@ -1,7 +1,7 @@
 #include <gtest/gtest.h>
 #include <Eigen/Dense>
 
-#include "gp2/mechanics.hpp"
+#include "gp2/mechanics/udwadia_kalaba.hpp"
 #include "test_models.hpp"
 
 // Laws of ddq = L b + T ā, for every model at every kind of state.

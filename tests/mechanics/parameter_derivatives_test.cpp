@@ -3,7 +3,7 @@
 
 #include <gtest/gtest.h>
 
-#include "gp2/mechanics.hpp"
+#include "gp2/mechanics/udwadia_kalaba.hpp"
 #include "test_models.hpp"
 
 // dT and d(L b) in every parameter of every model, against differences.

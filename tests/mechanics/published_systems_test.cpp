@@ -4,7 +4,7 @@
 #include <Eigen/Dense>
 #include <nlohmann/json.hpp>
 
-#include "gp2/mechanics.hpp"
+#include "gp2/mechanics/udwadia_kalaba.hpp"
 #include "reference_data.hpp"
 #include "test_models.hpp"
 
@@ -46,7 +46,7 @@ INSTANTIATE_TEST_SUITE_P(
 TEST_P(PublishedSystems, HaveThePublishedMatricesAndAccelerations) {
   if (const auto absent = test::why_reference_is_absent()) GTEST_SKIP() << *absent;
   const json expected = json::parse(std::ifstream(test::reference_file("systems.json"))).at(GetParam().key);
-  const ModelFile& model = test::model(GetParam().file);
+  const Model& model = test::model(GetParam().file);
   const System& system = *model.system;
   VectorXd parameters = system.parameter_values();
   for (std::size_t k = 0; k < GetParam().parameters.size(); ++k) {

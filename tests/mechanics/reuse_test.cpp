@@ -2,7 +2,7 @@
 #include <Eigen/Dense>
 
 #include "allocation_count.hpp"
-#include "gp2/mechanics.hpp"
+#include "gp2/mechanics/udwadia_kalaba.hpp"
 #include "test_models.hpp"
 
 // One object, one batch, from state to state: the same numbers as new ones, and no allocation.
@@ -150,7 +150,7 @@ TEST_P(BatchReuse, GivesTheBitsOfANewBatchAndAllocatesNothing) {
 }
 
 TEST(BatchReuseTest, AFaultIsForgottenAtTheNextStates) {
-  const ModelFile model = ModelFile::parse(R"(
+  const Model model = Model::parse(R"(
 name = "indefinite"
 coordinates = ["x"]
 [mechanics]
@@ -163,7 +163,7 @@ kernel = "se"
 features = ["x"]
 directions = "acceleration"
 )",
-                                           "indefinite.toml");
+                                   "indefinite.toml");
   MechanicsBatch batch;
   evaluate_mechanics(*model.system, Eigen::Vector3d(-1, 0, 0), VectorXd(), batch);
   ASSERT_TRUE(batch.fault);

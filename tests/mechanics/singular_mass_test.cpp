@@ -4,9 +4,9 @@
 #include <Eigen/Dense>
 
 #include "allocation_count.hpp"
-#include "gp2/check.hpp"
 #include "gp2/error.hpp"
-#include "gp2/mechanics.hpp"
+#include "gp2/mechanics/check.hpp"
+#include "gp2/mechanics/udwadia_kalaba.hpp"
 #include "gp2/prior.hpp"
 #include "gp2/view.hpp"
 #include "test_models.hpp"
@@ -322,7 +322,7 @@ TEST(SingularMass, ReuseGivesTheBitsOfANewObjectAndAllocatesNothing) {
 
 // ---- systems -----------------------------------------------------------------------------------------------------------------
 
-const ModelFile& rod() { return test::model("models/massless_rod.toml"); }
+const Model& rod() { return test::model("models/massless_rod.toml"); }
 
 template <typename Call>
 std::string error_of(const Call& call) {
@@ -334,8 +334,8 @@ std::string error_of(const Call& call) {
   return "no error";
 }
 
-ModelFile points(const std::string& mass, const std::string& constraints) {
-  return ModelFile::parse(fmt::format(R"toml(
+Model points(const std::string& mass, const std::string& constraints) {
+  return Model::parse(fmt::format(R"toml(
 name        = "points"
 coordinates = ["x", "y", "z"]
 [mechanics]
@@ -347,11 +347,11 @@ acceleration = [{}]
 features   = ["x"]
 directions = "force"
 )toml",
-                                      mass, constraints),
-                          "points");
+                                  mass, constraints),
+                      "points");
 }
 
-std::string fault_of(const ModelFile& model) {
+std::string fault_of(const Model& model) {
   return error_of([&] { require_mechanics(*model.system, VectorXd::Ones(7), VectorXd()); });
 }
 
@@ -403,7 +403,7 @@ TEST(SingularMassFaults, ATrueAccelerationIsRefusedUnlessItIsZero) {
     std::string text = rod().text;
     const std::string force = "force = [\"0\", \"0\", \"-0.3*tanh(10*dtheta) - 0.05*dtheta\"]";
     text.replace(text.find(force), force.size(), truth);
-    return ModelFile::parse(text, "rod");
+    return Model::parse(text, "rod");
   };
   EXPECT_EQ(error_of([&] { test::draw(with(R"(acceleration = ["0", "0", "0"])"), 2, 1); }), "no error");
   EXPECT_THAT(error_of([&] { test::draw(with(R"(acceleration = ["0", "0", "1"])"), 2, 1); }),
@@ -508,7 +508,7 @@ TEST(SingularMassModel, CheckSaysThatMIsSingularAndWhatFollows) {
               HasSubstr("mass matrix: singular at 20 of 20 states, rank 2 of 3; the constraints determine the motion all the "
                         "same, and the latents must act on forces: directions = \"force\"\n"));
   // regular at x ≠ 0
-  const ModelFile sometimes = points(R"([["1", "0", "0"], ["0", "x", "0"], ["0", "0", "1"]])", R"("ddx - ddy", "ddz")");
+  const Model sometimes = points(R"([["1", "0", "0"], ["0", "x", "0"], ["0", "0", "1"]])", R"("ddx - ddy", "ddz")");
   MatrixXd states = MatrixXd::Ones(7, 3);
   states(0, 1) = 0;
   EXPECT_THAT(check_system(*sometimes.system, states, VectorXd()).front().text,

@@ -1,4 +1,4 @@
-#include "gp2/state_evaluator.hpp"
+#include "gp2/mechanics/state_evaluator.hpp"
 
 #include <thread>
 
@@ -144,7 +144,7 @@ TEST_P(StateEvaluators, DoNotSpreadWhatIsNotRead) {
 
 TEST_P(StateEvaluators, OfTwoThreadsDoNotDisturbEachOther) {
   // a system of its own, so that both ask for the derivatives first
-  const ModelFile model = ModelFile::read(std::filesystem::path(GP2_SOURCE_DIR) / GetParam());
+  const Model model = Model::read(std::filesystem::path(GP2_SOURCE_DIR) / GetParam());
   const MatrixXd states = test::draw(model, 50, seed).states;
   std::vector<VectorXd> sums(2);
   const auto work = [&](std::size_t thread) {
@@ -207,7 +207,7 @@ TEST_P(StateEvaluators, OfAnySystemTakeDifferencesOfTheStatedError) {
 }
 
 TEST_P(StateEvaluators, HaveTheirLikeInTheFeaturesAndDirectionsOfALatent) {
-  const ModelFile& model = test::model(GetParam());
+  const Model& model = test::model(GetParam());
   const Prior prior = make_prior(model);
   const MatrixXd states = test::draw(model, 3, seed).states;
   const auto check = [&](const Tape& tape, const StateDerivatives& derivatives, const VectorXd& shared, const char* what) {
@@ -245,7 +245,7 @@ TEST_P(StateEvaluators, HaveTheirLikeInTheFeaturesAndDirectionsOfALatent) {
 }
 
 TEST(StateEvaluatorTest, WhereASpeedHasNoDerivativeItIsZero) {
-  const ModelFile model = ModelFile::parse(R"toml(
+  const Model model = Model::parse(R"toml(
 name = "two coordinates"
 coordinates = ["x", "y"]
 [let]
@@ -260,7 +260,7 @@ kernel = "se"
 features = ["x"]
 directions = [["-v*dx"], ["-v"]]
 )toml",
-                                           "two.toml");
+                                   "two.toml");
   const auto evaluator = model.system->make_evaluator(VectorXd(), true);
   VectorXd state = VectorXd::Zero(5);
   state[0] = 3;

@@ -4,13 +4,13 @@
 
 #include <Eigen/Core>
 
-#include "gp2/evaluation.hpp"
-#include "gp2/generate.hpp"
-#include "gp2/training.hpp"
-#include "gp2/version.hpp"
+#include "gp2/base/version.hpp"
+#include "gp2/fit.hpp"
+#include "gp2/inference/evaluation.hpp"
+#include "gp2/simulation/generate.hpp"
 
 int main() {
-  const gp2::ModelFile model = gp2::ModelFile::parse(R"(
+  const gp2::Model model = gp2::Model::parse(R"(
 coordinates = ["x", "y"]
 [parameters]
 m = 2.0
@@ -28,7 +28,7 @@ acceleration = ["-0.3*dx", "-0.3*dy"]
 x  = [-1, 1]
 dx = [-2, 2]
 )",
-                                                     "a bead on a wire");
+                                             "a bead on a wire");
   const gp2::GeneratedData data = gp2::generate(model, {50, 1, Eigen::Vector2d(0.01, 0.01)});
   const gp2::Prior prior = gp2::make_prior(model, {gp2::Prior::Mean::force, std::nullopt, false});
   const gp2::View view = gp2::View::all(gp2::View::Quantity::constrained_acceleration, *model.system);

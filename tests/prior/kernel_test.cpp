@@ -1,12 +1,12 @@
-#include "gp2/kernel.hpp"
+#include "gp2/prior/kernel.hpp"
 
 #include <gmock/gmock.h>
 #include <gtest/gtest.h>
 #include <Eigen/Eigenvalues>
 
+#include "base/simd.hpp"
 #include "gp2/error.hpp"
 #include "prior/kernel_columns.hpp"
-#include "prior/simd.hpp"
 #include "test_models.hpp"
 
 namespace gp2 {

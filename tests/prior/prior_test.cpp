@@ -16,8 +16,8 @@ using Eigen::VectorXd;
 constexpr std::uint64_t seed = 30302;
 
 // directions and a force with parameters in them, on a mass matrix with parameters; the speed has no derivative at rest
-const ModelFile& friction_model() {
-  static const ModelFile model = ModelFile::parse(R"toml(
+const Model& friction_model() {
+  static const Model model = Model::parse(R"toml(
 name        = "sledge"
 coordinates = ["x", { name = "heading", angle = true }]
 inputs      = ["u"]
@@ -50,19 +50,19 @@ kernel     = "se"
 features   = ["dx"]
 directions = "force"
 )toml",
-                                                  "sledge");
+                                          "sledge");
   return model;
 }
 
 struct PriorCase {
   std::string name;
-  const ModelFile* model;
+  const Model* model;
   PriorOptions options;
 };
 
 std::vector<PriorCase> prior_cases() {
   std::vector<PriorCase> all;
-  const auto add = [&](std::string name, const ModelFile& model) {
+  const auto add = [&](std::string name, const Model& model) {
     for (Prior::Mean mean : {Prior::Mean::zero, Prior::Mean::force}) {
       PriorOptions options;
       options.mean = mean;
@@ -77,7 +77,7 @@ std::vector<PriorCase> prior_cases() {
   return all;
 }
 
-MatrixXd states_of(const ModelFile& model) {
+MatrixXd states_of(const Model& model) {
   if (!model.sampling.empty()) return test::draw(model, 5, seed).states;
   RandomStream random(seed);
   MatrixXd states(model.system->layout().size(), 6);
@@ -173,7 +173,7 @@ TEST(PriorTest, AtRestADirectionWithASpeedInItHasFiniteDerivatives) {
 }
 
 TEST(PriorTest, AnAngleIsReadThroughItsSineAndCosineUnlessAskedForRaw) {
-  const ModelFile& model = test::model("models/unicycle.toml");
+  const Model& model = test::model("models/unicycle.toml");
   EXPECT_EQ(make_prior(model).latents[0].feature_names,
             (std::vector<std::string>{"dq1", "dq2", "sin(q3)", "cos(q3)", "dq3", "u1", "u2"}));
   const Prior raw = make_prior(model, {Prior::Mean::zero, std::nullopt, true});
@@ -191,7 +191,7 @@ TEST(PriorTest, AnAngleIsReadThroughItsSineAndCosineUnlessAskedForRaw) {
 }
 
 TEST(PriorTest, ReadsWhatItsPartsReadAndNoMore) {
-  const ModelFile& model = test::model("models/unicycle.toml");
+  const Model& model = test::model("models/unicycle.toml");
   const StateLayout layout = model.system->layout();
   const std::vector<bool> zero_mean = make_prior(model).reads();
   EXPECT_FALSE(zero_mean[static_cast<std::size_t>(layout.q(0))]);
@@ -199,7 +199,7 @@ TEST(PriorTest, ReadsWhatItsPartsReadAndNoMore) {
   EXPECT_TRUE(zero_mean[static_cast<std::size_t>(layout.q(2))]);
   EXPECT_TRUE(zero_mean[static_cast<std::size_t>(layout.u(0))]) << "a feature";
   // the double pendulum's linear velocities enter neither mechanics nor features
-  const ModelFile& pendulum = test::model("models/double_pendulum.toml");
+  const Model& pendulum = test::model("models/double_pendulum.toml");
   EXPECT_FALSE(make_prior(pendulum).reads()[static_cast<std::size_t>(pendulum.system->layout().dq(0))]);
 }
 

@@ -3,11 +3,11 @@
 
 #include <gtest/gtest.h>
 
-#include "gp2/check.hpp"
-#include "gp2/fit_problem.hpp"
-#include "gp2/generate.hpp"
+#include "gp2/jobs/fit_problem.hpp"
+#include "gp2/mechanics/check.hpp"
+#include "gp2/mechanics/symbolic_system.hpp"
 #include "gp2/simulate.hpp"
-#include "gp2/symbolic_system.hpp"
+#include "gp2/simulation/generate.hpp"
 #include "properties/chain_of_links.hpp"
 #include "test_models.hpp"
 
@@ -37,11 +37,11 @@ INSTANTIATE_TEST_SUITE_P(Links, Chain, testing::Values(5, 10, 20),
 
 TEST_P(Chain, IsCheckedGeneratedFittedPredictedAndSimulated) {
   const int n_links = GetParam();
-  ModelFile model;
+  Model model;
   const auto step = [&](const char* name, const std::function<void()>& work) {
     RecordProperty(name, fmt::format("{:.3g} s", seconds_of(work)));
   };
-  step("read", [&] { model = ModelFile::parse(test::chain_of_links(n_links), "a chain"); });
+  step("read", [&] { model = Model::parse(test::chain_of_links(n_links), "a chain"); });
   const System& system = *model.system;
   const Index n = system.nq();
   ASSERT_EQ(n, 3 * n_links);
@@ -128,7 +128,7 @@ TEST_P(Chain, IsCheckedGeneratedFittedPredictedAndSimulated) {
 TEST(ChainTest, TheWorkPerStateGrowsAsTheCubeOfTheLinks) {
   std::vector<double> seconds;
   for (const int n_links : {5, 10, 20}) {
-    const ModelFile model = ModelFile::parse(test::chain_of_links(n_links), "a chain");
+    const Model model = Model::parse(test::chain_of_links(n_links), "a chain");
     const MatrixXd states = test::draw(model, 20, seed).states;
     MechanicsBatch batch;
     // a clock that ticks in microseconds

@@ -1,10 +1,10 @@
 #include <gmock/gmock.h>
 #include <gtest/gtest.h>
 
-#include "gp2/check.hpp"
 #include "gp2/error.hpp"
-#include "gp2/fit_problem.hpp"
-#include "gp2/generate.hpp"
+#include "gp2/jobs/fit_problem.hpp"
+#include "gp2/mechanics/check.hpp"
+#include "gp2/simulation/generate.hpp"
 
 // Constraints that let go at some states, or nearly follow from each other: counted, reported, and named where they contradict.
 namespace gp2 {
@@ -16,8 +16,8 @@ using testing::AllOf;
 using testing::Contains;
 using testing::HasSubstr;
 
-ModelFile model_with(const std::string& constraints) {
-  return ModelFile::parse(R"toml(
+Model model_with(const std::string& constraints) {
+  return Model::parse(R"toml(
 name        = "cart"
 coordinates = ["x", "y", "z"]
 [mechanics]
@@ -25,7 +25,7 @@ mass  = [["2", "0", "0"], ["0", "1", "0"], ["0", "0", "1"]]
 force = ["0", "0", "0"]
 [constraints]
 acceleration = )toml" + constraints +
-                              R"toml(
+                          R"toml(
 [[latent]]
 kernel     = "se"
 features   = ["x", "dx"]
@@ -33,7 +33,7 @@ directions = "acceleration"
 [noise]
 ddq = 0.1
 )toml",
-                          "cart");
+                      "cart");
 }
 
 // eight states, x = 0 at the third and the seventh
@@ -44,7 +44,7 @@ MatrixXd states() {
   return states;
 }
 
-CsvTable log_of(const ModelFile& model) {
+CsvTable log_of(const Model& model) {
   GeneratedData data{states(), MatrixXd::Random(3, 8), std::vector<bool>(7, true)};
   return as_table(data, *model.system, "log.csv");
 }
@@ -58,7 +58,7 @@ std::string text_of(const std::vector<Finding>& findings, Finding::Level level) 
 }
 
 TEST(ChangingRankTest, StatesOfLowerRankAreCounted) {
-  const ModelFile lets_go = model_with(R"-(["x*(ddx - ddy)", "ddz"])-");
+  const Model lets_go = model_with(R"-(["x*(ddx - ddy)", "ddz"])-");
   const MechanicsBatch mechanics = require_mechanics(*lets_go.system, states(), VectorXd());
   const LowerRank lower = states_of_lower_rank(mechanics);
   EXPECT_EQ(lower.usual, 2);
@@ -79,7 +79,7 @@ TEST(ChangingRankTest, StatesOfLowerRankAreCounted) {
 }
 
 TEST(ChangingRankTest, ConstraintsOfOneRankAreNoteworthyToNobody) {
-  const ModelFile constant = model_with(R"-(["ddx - ddy", "2*ddx - 2*ddy", "ddz"])-");
+  const Model constant = model_with(R"-(["ddx - ddy", "2*ddx - 2*ddy", "ddz"])-");
   EXPECT_TRUE(states_of_lower_rank(require_mechanics(*constant.system, states(), VectorXd())).states.empty());
   EXPECT_EQ(text_of(check_system(*constant.system, states(), VectorXd()), Finding::Level::warning), "");
   EXPECT_THAT(make_fit_problem(constant, log_of(constant), {}).notes, testing::Not(Contains(HasSubstr("rank"))));
@@ -87,13 +87,13 @@ TEST(ChangingRankTest, ConstraintsOfOneRankAreNoteworthyToNobody) {
 
 TEST(ChangingRankTest, RowsThatNearlyFollowFromEachOtherAreReported) {
   // the third row differs from the first by 1e-9 at one state, by much at others
-  const ModelFile nearly = model_with(R"-(["ddx - ddy", "ddx - ddy*(1 + 1e-9 + (x - 4)^2)"])-");
+  const Model nearly = model_with(R"-(["ddx - ddy", "ddx - ddy*(1 + 1e-9 + (x - 4)^2)"])-");
   EXPECT_THAT(text_of(check_system(*nearly.system, states(), VectorXd()), Finding::Level::warning),
               AllOf(HasSubstr("rows nearly follow from each other at 1 of 8 states"), HasSubstr("at state 4")));
 }
 
 TEST(ChangingRankTest, AContradictionIsRefusedByItsRowOfTheLog) {
-  const ModelFile contradictory = model_with(R"-(["ddx - ddy - 1", "x*(2*ddx - 2*ddy - 2) - 0.001*x*(x - 4)^2*(x - 8)"])-");
+  const Model contradictory = model_with(R"-(["ddx - ddy - 1", "x*(2*ddx - 2*ddy - 2) - 0.001*x*(x - 4)^2*(x - 8)"])-");
   EXPECT_THAT(text_of(check_system(*contradictory.system, states(), VectorXd()), Finding::Level::error),
               AllOf(HasSubstr("contradict"), HasSubstr("at state 1")));
   try {
@@ -126,7 +126,7 @@ TEST(ChangingRankTest, AForceOfConstraintsThatAreNotThereSaysNothing) {
     const UdwadiaKalaba projection(M, MatrixXd::Zero(n_rows, 2), VectorXd::Zero(n_rows));
     EXPECT_EQ(projection.T(), MatrixXd::Identity(2, 2));
   }
-  const ModelFile free = model_with("[]");
+  const Model free = model_with("[]");
   const Prior prior = make_prior(free);
   const View force = View::all(View::Quantity::constraint_force, *free.system);
   const Observations contradicting{states(), force, MatrixXd::Ones(3, 8), VectorXd::Constant(3, 1e-6), false};

@@ -2,10 +2,10 @@
 #include <gtest/gtest.h>
 #include <Eigen/QR>
 
-#include "gp2/check.hpp"
-#include "gp2/fit_problem.hpp"
-#include "gp2/generate.hpp"
-#include "gp2/training.hpp"
+#include "gp2/fit.hpp"
+#include "gp2/jobs/fit_problem.hpp"
+#include "gp2/mechanics/check.hpp"
+#include "gp2/simulation/generate.hpp"
 #include "inference/problems.hpp"
 #include "properties/chain_of_links.hpp"
 
@@ -25,7 +25,7 @@ constexpr std::uint64_t seed = 20271;
 double largest(const MatrixXd& matrix) { return matrix.cwiseAbs().maxCoeff(); }
 
 Problem surface_problem(int n) {
-  const ModelFile& model = test::model("models/surface.toml");
+  const Model& model = test::model("models/surface.toml");
   RandomStream random(seed);
   Problem p{"surface", make_prior(model), {}, {}, test::draw(model, 5, seed + 1).states, {}};
   p.observations = {test::observe(model, View::all(Quantity::constrained_acceleration, *model.system),
@@ -151,7 +151,7 @@ TEST(EdgeCaseTest, FeaturesThatDoNotVarySayNothing) {
 
 // 15 coordinates of which 5 are free: too many choices to try them all
 TEST(EdgeCaseTest, OfManyCoordinatesThoseAreFoundThatDetermineTheOthers) {
-  const ModelFile chain = ModelFile::parse(test::chain_of_links(5), "chain");
+  const Model chain = Model::parse(test::chain_of_links(5), "chain");
   const System& system = *chain.system;
   const GeneratedData data = generate(chain, {8, seed, VectorXd::Zero(system.nq())});
   const auto rows = dependent_columns(system, data.states, system.parameter_values(), data.accelerations);
@@ -165,7 +165,7 @@ TEST(EdgeCaseTest, OfManyCoordinatesThoseAreFoundThatDetermineTheOthers) {
 // n − 1 constraints leave one direction; n leave none, and there is nothing to learn
 TEST(EdgeCaseTest, AsManyConstraintsAsCoordinatesLeaveNothingToLearn) {
   const auto model = [](const std::string& constraints) {
-    return ModelFile::parse(R"toml(
+    return Model::parse(R"toml(
 name = "linkage"
 coordinates = ["x", "y", "z"]
 [mechanics]
@@ -173,13 +173,13 @@ mass  = [["2", "0", "0"], ["0", "1", "0.5"], ["0", "0.5", "1"]]
 force = ["0", "0", "-9.81"]
 [constraints]
 position = [)toml" + constraints +
-                                R"toml(]
+                            R"toml(]
 [[latent]]
 kernel     = "se"
 features   = ["x", "dx"]
 directions = "acceleration"
 )toml",
-                            "linkage");
+                        "linkage");
   };
   RandomStream random(seed);
   MatrixXd states(7, 15);
@@ -187,7 +187,7 @@ directions = "acceleration"
   for (const auto& [constraints, freedom] : std::vector<std::pair<std::string, int>>{
            {R"-("x - sin(y)", "z - x*y")-", 1}, {R"-("x - sin(y)", "z - x*y", "x + 2*y + 3*z - 1")-", 0}}) {
     SCOPED_TRACE(constraints);
-    const ModelFile linkage = model(constraints);
+    const Model linkage = model(constraints);
     Problem p{"linkage", make_prior(linkage), {}, {}, states.leftCols(4), {}};
     p.observations = {test::observe(linkage, View::all(Quantity::constrained_acceleration, *linkage.system), states, random)};
     const Fitted fitted = quick_fit(p.prior, p.observations);

@@ -111,7 +111,7 @@ RandomProblem random_problem() {
   const int n = *rc::gen::inRange(1, 5).as("coordinates");
   const int n_rows = *rc::gen::inRange(0, 4).as("rows");
   const int rank = n_rows == 0 ? 0 : *rc::gen::inRange(1, std::min(n, n_rows) + 1).as("rank");
-  const ModelFile model = ModelFile::parse(random_model(n, rank, n_rows, random), "a random model");
+  const Model model = Model::parse(random_model(n, rank, n_rows, random), "a random model");
   const System& system = *model.system;
   RandomProblem p;
   p.name = model.text;

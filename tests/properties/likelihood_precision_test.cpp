@@ -85,7 +85,7 @@ class Reference {
 
 // @param stretch  of the lengthscales: long ones bring the smallest eigenvalues of K̃ down to nothing, and those of K̃ + I to 1
 Problem surface_problem(double stretch, double signal) {
-  const ModelFile& model = test::model("models/surface.toml");
+  const Model& model = test::model("models/surface.toml");
   RandomStream random(seed);
   Problem p{"surface", make_prior(model), {}, {}, {}, {}};
   const MatrixXd states = test::draw(model, 14, seed).states;

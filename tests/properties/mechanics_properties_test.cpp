@@ -3,7 +3,7 @@
 #include <gtest/gtest.h>
 #include <rapidcheck/gtest.h>
 
-#include "gp2/callable_system.hpp"
+#include "gp2/mechanics/callable_system.hpp"
 #include "properties/random_mechanics.hpp"
 
 // Laws of ddq = L b + T ā where M, A and b are anything.

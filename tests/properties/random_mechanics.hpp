@@ -6,8 +6,8 @@
 #include <rapidcheck.h>
 #include <Eigen/Dense>
 
-#include "gp2/mechanics.hpp"
-#include "prior/random.hpp"
+#include "base/random.hpp"
+#include "gp2/mechanics/udwadia_kalaba.hpp"
 #include "test_models.hpp"
 
 // M, A, b of random size, rank, conditioning and units, and the equations of motion with multipliers that they must agree with.

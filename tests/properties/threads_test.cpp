@@ -5,10 +5,10 @@
 
 #include <gtest/gtest.h>
 
-#include "gp2/pathwise.hpp"
+#include "gp2/fit.hpp"
+#include "gp2/inference/pathwise.hpp"
+#include "gp2/mechanics/state_evaluator.hpp"
 #include "gp2/predictor.hpp"
-#include "gp2/state_evaluator.hpp"
-#include "gp2/training.hpp"
 #include "test_models.hpp"
 
 // Everything that is const, from many threads at once: the same bits as from one, and no race (run under the thread sanitizer).
@@ -38,7 +38,7 @@ struct Shared {
 };
 
 Shared shared(const std::string& file) {
-  const ModelFile& model = test::model(file);
+  const Model& model = test::model(file);
   const GeneratedData data = generate(model, {24, seed, VectorXd::Constant(model.system->nq(), 0.1)});
   Shared out{make_prior(model), {}, {}, test::draw(model, 10, seed + 1).states};
   out.observations = {{data.states, View::all(Quantity::constrained_acceleration, *model.system), data.accelerations,

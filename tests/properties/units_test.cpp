@@ -3,7 +3,7 @@
 
 #include <gtest/gtest.h>
 
-#include "gp2/training.hpp"
+#include "gp2/fit.hpp"
 #include "inference/problems.hpp"
 
 // The same particle on the same surface, its log in other units: everything that is learned is the same, in those units.
@@ -37,7 +37,7 @@ struct Units {
 };
 
 // models/surface.toml with another mass for each direction, its expressions in the old units by way of [let]
-ModelFile surface_in(const Units& units, const std::string& kernel, const std::string& directions) {
+Model surface_in(const Units& units, const std::string& kernel, const std::string& directions) {
   std::string text =
       "name = \"surface\"\ncoordinates = [\"Q1\", \"Q2\", \"Q3\"]\ninputs = [\"U1\", \"U2\", \"U3\"]\n"
       "[parameters]\nm = { value = 3, estimate = true, bounds = [1, 9] }\n"
@@ -64,7 +64,7 @@ ModelFile surface_in(const Units& units, const std::string& kernel, const std::s
       "[[latent]]\nkernel = \"{}\"\nfeatures = [\"Q1\", \"Q2\", \"Q3\", \"dQ1\", \"dQ2\", \"U1\"]\n"
       "directions = {}\n",
       kernel, directions);
-  return ModelFile::parse(text, "surface in " + units.name);
+  return Model::parse(text, "surface in " + units.name);
 }
 
 struct Case {
@@ -79,7 +79,7 @@ struct Learned {
 };
 
 Learned learn(const Units& units, const Case& c, const MatrixXd& states, const MatrixXd& accelerations) {
-  const ModelFile model = surface_in(units, c.kernel, c.directions);
+  const Model model = surface_in(units, c.kernel, c.directions);
   Learned out{make_prior(model, {c.mean, std::nullopt, false}), {}, {}};
   const VectorXd noise = VectorXd::Constant(3, 0.1).cwiseProduct(units.acceleration());
   out.observations = {{units.state().asDiagonal() * states, View::all(Quantity::constrained_acceleration, *model.system),
@@ -113,7 +113,7 @@ double largest(const MatrixXd& matrix) { return matrix.cwiseAbs().maxCoeff(); }
 void expect_same(const Units& units, const Case& c) {
   SCOPED_TRACE(fmt::format("{}, kernel {}, directions {}, seed {}", units.name, c.kernel, c.directions, seed));
   // on the surface, in metres, seconds and joules
-  const ModelFile& surface = test::model("models/surface.toml");
+  const Model& surface = test::model("models/surface.toml");
   const MatrixXd states = test::draw(surface, 46, seed).states;
   RandomStream random(seed);
   MatrixXd accelerations = true_acceleration(surface, states);

@@ -9,8 +9,8 @@
 
 #include <nlohmann/json.hpp>
 
-#include "gp2/evaluation.hpp"
-#include "gp2/fit_problem.hpp"
+#include "gp2/inference/evaluation.hpp"
+#include "gp2/jobs/fit_problem.hpp"
 #include "reference_data.hpp"
 #include "test_models.hpp"
 
@@ -46,7 +46,7 @@ struct Score {
   }
 };
 
-inline Score score(const ModelFile& model, const std::filesystem::path& train, const std::filesystem::path& test,
+inline Score score(const Model& model, const std::filesystem::path& train, const std::filesystem::path& test,
                    const FitProblemOptions& problem_options, int n_restarts) {
   const FitProblem problem = make_fit_problem(model, CsvTable::read(train), problem_options);
   FitOptions options;

@@ -12,11 +12,11 @@ namespace {
 using Eigen::Index;
 using Eigen::MatrixXd;
 
-const ModelFile& pendulum() { return model("models/double_pendulum.toml"); }
+const Model& pendulum() { return model("models/double_pendulum.toml"); }
 
 /// λ at states, from the true motion: Aᵀλ = M (ddq − ā).
 MatrixXd true_multipliers(const MatrixXd& states) {
-  ModelFile free = pendulum();
+  Model free = pendulum();
   free.system = pendulum().system->without_constraints();
   const MatrixXd a_bar = true_acceleration(free, states), ddq = true_acceleration(pendulum(), states);
   const System& system = *pendulum().system;

@@ -8,16 +8,16 @@
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
-#include "gp2/csv.hpp"
-#include "gp2/fit_file.hpp"
-#include "gp2/fit_problem.hpp"
+#include "gp2/data/csv.hpp"
+#include "gp2/files/fit_file.hpp"
+#include "gp2/jobs/fit_problem.hpp"
 
 namespace {
 
-void print(const std::string& name, const gp2::Posterior& posterior, gp2::View view, const gp2::ModelFile& model,
+void print(const std::string& name, const gp2::Posterior& posterior, gp2::View view, const gp2::Model& model,
            const gp2::CsvTable& table) {
   view.time_step = 0.01;
-  const gp2::Prior& prior = view.setting ? view.setting->prior : posterior.prior();
+  const gp2::Prior& prior = view.other_system ? view.other_system->prior : posterior.prior();
   const gp2::LogStates log = gp2::read_log_states(prior, view, model, table, {});
   const gp2::Posterior::Marginal prediction = posterior.marginal(view, log.states);
   fmt::print("{}", name);
@@ -32,7 +32,7 @@ int main(int argc, char** argv) {
   if (argc != 4) return 2;
   const gp2::FitFile fit = gp2::FitFile::read(argv[1]);
   const gp2::CsvTable table = gp2::CsvTable::read(argv[2]);
-  const gp2::ModelFile other = gp2::ModelFile::read(argv[3]);
+  const gp2::Model other = gp2::Model::read(argv[3]);
   const gp2::Posterior posterior = fit.posterior();
   const gp2::System& system = *fit.model.system;
   for (const std::string& word : gp2::View::quantity_words()) {
@@ -44,7 +44,7 @@ int main(int argc, char** argv) {
       print(fmt::format("{}@{}", word, latent), posterior, part, fit.model, table);
     }
     gp2::View there = gp2::View::all(*gp2::View::quantity_of(word), *other.system);
-    there.setting = gp2::make_setting(fit.model, other, fit.prior_options);
+    there.other_system = gp2::make_other_system(fit.model, other, fit.prior_options);
     print(word + "@other", posterior, there, other, table);
   }
   return 0;

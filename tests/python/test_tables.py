@@ -71,14 +71,14 @@ def test_several_logs_are_learnt_from_together(arm, frame, arm_states):
 def test_other_quantities_are_learnt_from_too(arm, frame, arm_states):
     rest = {name: np.array([value]) for name, value in frame.iloc[0].items()}
     rest |= {"abar_shoulder": np.array([0.5]), "abar_elbow": np.array([-0.5])}
-    also = [gp2.Knowledge("unconstrained", rest)]
+    also = [gp2.SideInformation("unconstrained", rest)]
     posterior = gp2.fit(arm, frame, also=also, also_noise_std=1e-3, max_iterations=0)
     assert posterior.n_data == len(frame) + 1
     without = gp2.fit(arm, frame, max_iterations=0)
     error, error_without = (p.predict(frame[:1], "unconstrained").mean - [0.5, -0.5] for p in (posterior, without))
     assert np.abs(error).max() < 0.02 < np.abs(error_without).max()
     with pytest.raises(gp2.InputError, match="view: expected one of"):
-        gp2.fit(arm, frame, also=[gp2.Knowledge("position", rest)])
+        gp2.fit(arm, frame, also=[gp2.SideInformation("position", rest)])
 
 
 def test_a_table_is_a_mapping_of_names_to_arrays(arm_log):

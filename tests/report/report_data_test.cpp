@@ -47,8 +47,8 @@ TEST(RmseToTruth, LeavesOutStatesWhereTheTruthIsNotKnown) {
   EXPECT_DOUBLE_EQ(data.rmse_to_truth()[0], 2);
 }
 
-ModelFile particle(const std::string& constraints) {
-  return ModelFile::parse(
+Model particle(const std::string& constraints) {
+  return Model::parse(
       "coordinates = ['x', 'y', 'z']\n[parameters]\nr = 2\n[mechanics]\nmass = [['1','0','0'],['0','1','0'],"
       "['0','0','1']]\n[constraints]\n" +
           constraints + "\n[[latent]]\nkernel = 'se'\nfeatures = ['x']\n",
@@ -62,7 +62,7 @@ MatrixXd states_at(const MatrixXd& q) {
 }
 
 TEST(ConstraintSurfaceOf, ASphereIsTwoSheetsOnWhichTheConstraintHolds) {
-  const ModelFile model = particle("position = ['x^2 + y^2 + z^2 - r^2']");
+  const Model model = particle("position = ['x^2 + y^2 + z^2 - r^2']");
   MatrixXd q(3, 4);
   q << 0.3, -0.5, 0.2, -0.4,  //
       0.4, -0.2, -0.6, 0.3,   //
@@ -86,10 +86,10 @@ TEST(ConstraintSurfaceOf, OtherThanOneFixedConstraintInThreeCoordinatesIsNotDraw
   const MatrixXd q = MatrixXd::Random(3, 5);
   for (const char* constraints :
        {"position = []", "position = ['x - y', 'z']", "position = ['z - t']", "velocity = ['dx - y*dz']"}) {
-    const ModelFile model = particle(constraints);
+    const Model model = particle(constraints);
     EXPECT_FALSE(constraint_surface(*model.symbolic_system(), model.system->parameter_values(), states_at(q))) << constraints;
   }
-  const ModelFile model = particle("position = ['z - x']");
+  const Model model = particle("position = ['z - x']");
   EXPECT_TRUE(constraint_surface(*model.symbolic_system(), model.system->parameter_values(), states_at(q)));
   MatrixXd unknown = states_at(q);
   unknown.row(1).setConstant(std::numeric_limits<double>::quiet_NaN());

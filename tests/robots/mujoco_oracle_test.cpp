@@ -5,7 +5,7 @@
 
 #include <gtest/gtest.h>
 
-#include "io/io_testing.hpp"
+#include "io_testing.hpp"
 #include "reference_data.hpp"
 
 // What the oracle promises, checked by other roads than MuJoCo's, so that our expressions are tested against the right thing.

@@ -6,8 +6,8 @@
 #include <gmock/gmock.h>
 #include <Eigen/Geometry>
 
-#include "gp2/robot.hpp"
-#include "io/io_testing.hpp"
+#include "gp2/robots/robot.hpp"
+#include "io_testing.hpp"
 #include "reference_data.hpp"
 #include "robots/mujoco_oracle.hpp"
 

@@ -10,10 +10,10 @@
 #include <gtest/gtest.h>
 #include <Eigen/QR>
 
+#include "base/random.hpp"
 #include "gp2/error.hpp"
-#include "gp2/model_file.hpp"
-#include "gp2/state_evaluator.hpp"
-#include "prior/random.hpp"
+#include "gp2/mechanics/state_evaluator.hpp"
+#include "gp2/model.hpp"
 #include "robots/mujoco_oracle.hpp"
 
 namespace gp2 {
@@ -76,8 +76,8 @@ std::filesystem::path written(const std::string& text, const char* name) {
 
 std::filesystem::path source(const char* path) { return std::filesystem::path(GP2_SOURCE_DIR) / path; }
 
-ModelFile model_of(const std::filesystem::path& robot, const std::string& more = "") {
-  return ModelFile::parse(fmt::format("robot = '{}'\n{}", robot.string(), more), "robot model");
+Model model_of(const std::filesystem::path& robot, const std::string& more = "") {
+  return Model::parse(fmt::format("robot = '{}'\n{}", robot.string(), more), "robot model");
 }
 
 VectorXd random_vector(RandomStream& random, Eigen::Index n) {
@@ -97,7 +97,7 @@ class RobotOfFile : public testing::TestWithParam<const char*> {
 
 // Both sides sum some hundred products of numbers of the size of the largest: 1e-12 of it leaves a factor of 20 above rounding.
 TEST_P(RobotOfFile, HasTheMassMatrixAndTheForcesOfMujoco) {
-  const ModelFile model = model_of(path());
+  const Model model = model_of(path());
   const System& system = *model.system;
   MujocoOracle oracle(path());
   RandomStream random(1);
@@ -115,7 +115,7 @@ TEST_P(RobotOfFile, HasTheMassMatrixAndTheForcesOfMujoco) {
 }
 
 TEST_P(RobotOfFile, HasTheConstraintRowsOfMujoco) {
-  const ModelFile model = model_of(path());
+  const Model model = model_of(path());
   const System& system = *model.system;
   if (system.nc() == 0) GTEST_SKIP() << "no loops";
   MujocoOracle oracle(path());
@@ -132,7 +132,7 @@ TEST_P(RobotOfFile, HasTheConstraintRowsOfMujoco) {
 }
 
 TEST_P(RobotOfFile, HasConstraintVectorsThatAreTheSecondDerivativeAlongAMotion) {
-  const ModelFile model = model_of(path());
+  const Model model = model_of(path());
   const System& system = *model.system;
   if (system.nc() == 0) GTEST_SKIP() << "no loops";
   RandomStream random(3);
@@ -169,9 +169,9 @@ TEST(RobotExpressions, PointsAndAxesAreThoseOfMujoco) {
   std::string rows;
   for (const std::string& quantity : quantities) rows += fmt::format("'{} - 0*a1', ", quantity);
   // each as a constraint: residual and its rate, A = J, b = −J̇ dq
-  const ModelFile model = model_of(path, fmt::format("[constraints]\nacceleration = [{}]\n",
-                                                     R"('ddsite("on_fixed").x', 'ddsite("on_base").rot_yz', 'ddbody("tip").z',)"
-                                                     R"('ddbody("tip").rot_xx', 'ddpoint("right", 0.1, -0.2, 0.3).y')"));
+  const Model model = model_of(path, fmt::format("[constraints]\nacceleration = [{}]\n",
+                                                 R"('ddsite("on_fixed").x', 'ddsite("on_base").rot_yz', 'ddbody("tip").z',)"
+                                                 R"('ddbody("tip").rot_xx', 'ddpoint("right", 0.1, -0.2, 0.3).y')"));
   const System& system = *model.system;
   RandomStream random(4);
   const VectorXd q = random_vector(random, system.nq()), dq = random_vector(random, system.nq());
@@ -237,7 +237,7 @@ TEST(RobotExpressions, WeldHoldsWhatMujocosWeldHolds) {
   <equality><weld name="glue" body1="b" body2="c"/></equality>
 </mujoco>)",
                                              "weld.xml");
-  const ModelFile model = model_of(path);
+  const Model model = model_of(path);
   const System& system = *model.system;
   ASSERT_EQ(system.nc(), 6);
   MujocoOracle oracle(path);
@@ -258,7 +258,7 @@ TEST(RobotExpressions, WeldHoldsWhatMujocosWeldHolds) {
 }
 
 TEST(RobotExpressions, ForceIsLessThePotentialsSlopeAtRest) {
-  const ModelFile model = model_of(written(tree, "tree.xml"));
+  const Model model = model_of(written(tree, "tree.xml"));
   const System& system = *model.system;
   const SystemSymbols symbols = model.symbols();
   std::vector<Expression> slopes;
@@ -273,7 +273,7 @@ TEST(RobotExpressions, ForceIsLessThePotentialsSlopeAtRest) {
 }
 
 TEST(RobotExpressions, NumbersOfTheRobotAreParametersWithExactDerivatives) {
-  const ModelFile model = model_of(source("experiments/arm_on_surface/iiwa7.xml"), R"toml(
+  const Model model = model_of(source("experiments/arm_on_surface/iiwa7.xml"), R"toml(
 [parameters]
 m = { of = "mass('link7')", value = 1.7, estimate = true }
 cx = { of = 'com("link7").x', value = 0.03 }
@@ -306,10 +306,10 @@ f = { of = 'friction("q5")', value = 0.4 }
 // the description with another mass is the same robot as the parameter with that value
 TEST(RobotExpressions, MassAsAParameterIsTheMassOfTheBody) {
   RobotDescription robot = read_robot(source("experiments/arm_on_surface/iiwa7.xml"));
-  const ModelFile named = ModelFile::parse("robot = 'x'\n[parameters]\nm = { of = \"mass('link7')\", value = 2.2 }", "named",
-                                           RobotSource([&](const std::string&) { return robot; }));
+  const Model named = Model::parse("robot = 'x'\n[parameters]\nm = { of = \"mass('link7')\", value = 2.2 }", "named",
+                                   RobotSource([&](const std::string&) { return robot; }));
   robot.bodies.back().mass = 2.2;
-  const ModelFile changed = ModelFile::parse("robot = 'x'", "changed", RobotSource([&](const std::string&) { return robot; }));
+  const Model changed = Model::parse("robot = 'x'", "changed", RobotSource([&](const std::string&) { return robot; }));
   RandomStream random(7);
   VectorXd state = VectorXd::Zero(named.system->layout().size());
   state.head(14) = random_vector(random, 14);
@@ -320,9 +320,9 @@ TEST(RobotExpressions, MassAsAParameterIsTheMassOfTheBody) {
 }
 
 TEST(RobotExpressions, StateDerivativesAreThoseOfDifferences) {
-  const ModelFile model = model_of(source("experiments/arm_on_surface/iiwa7.xml"),
-                                   "inputs = ['u1','u2','u3','u4','u5','u6','u7']\n[constraints]\nposition = ['site(\"tip\").z - "
-                                   "0.1*sin(site(\"tip\").x)']\n");
+  const Model model = model_of(source("experiments/arm_on_surface/iiwa7.xml"),
+                               "inputs = ['u1','u2','u3','u4','u5','u6','u7']\n[constraints]\nposition = ['site(\"tip\").z - "
+                               "0.1*sin(site(\"tip\").x)']\n");
   const System& system = *model.system;
   const auto exact = system.make_evaluator(system.parameter_values(), true);
   const auto differences = system.System::make_evaluator(system.parameter_values(), true);
@@ -355,7 +355,7 @@ TEST(RobotExpressions, OfALongChainTakeDifferencesInTheState) {
   }
   for (int i = 0; i < n; ++i) chain += "</body>";
   const std::filesystem::path path = written(chain + "</worldbody></mujoco>", "chain.xml");
-  const ModelFile model = model_of(path);
+  const Model model = model_of(path);
   const System& system = *model.system;
   MujocoOracle oracle(path);
   RandomStream random(9);
@@ -372,7 +372,7 @@ TEST(RobotModel, SaysWhatIsWrong) {
   const std::string arm = fmt::format("robot = '{}'\n", source("experiments/arm_on_surface/iiwa7.xml").string());
   const auto message = [&](const std::string& more) -> std::string {
     try {
-      ModelFile::parse(arm + more, "arm.toml");
+      Model::parse(arm + more, "arm.toml");
     } catch (const std::exception& error) {
       return error.what();
     }
@@ -397,9 +397,8 @@ TEST(RobotModel, SaysWhatIsWrong) {
   expect("[truth]\nforce_on = { 'q1 + q2' = '1' }", "expected a point of the robot");
   expect("[truth]\nforce_on = { 'site(\"tpi\").x' = '1' }", "has no site 'tpi'");
   expect("[truth]\nforce_on = { 'site(\"tip\").x' = 'ddq1' }", "a force may not depend on accelerations");
-  EXPECT_THROW(
-      ModelFile::parse("coordinates = ['x']\n[mechanics]\nmass = [['1']]\n[constraints]\nposition = ['site(\"a\").x']", "m"),
-      InputError);
+  EXPECT_THROW(Model::parse("coordinates = ['x']\n[mechanics]\nmass = [['1']]\n[constraints]\nposition = ['site(\"a\").x']", "m"),
+               InputError);
 }
 
 }  // namespace

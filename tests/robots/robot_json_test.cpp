@@ -5,8 +5,8 @@
 #include <Eigen/Geometry>
 #include <nlohmann/json.hpp>
 
-#include "gp2/robot.hpp"
-#include "io/io_testing.hpp"
+#include "gp2/robots/robot.hpp"
+#include "io_testing.hpp"
 
 namespace gp2 {
 namespace {

@@ -7,15 +7,15 @@
 #include <fmt/format.h>
 #include <gtest/gtest.h>
 
-#include "gp2/csv.hpp"
+#include "gp2/data/csv.hpp"
 #include "gp2/error.hpp"
-#include "gp2/fit_file.hpp"
-#include "gp2/fit_problem.hpp"
-#include "gp2/generate.hpp"
-#include "gp2/mechanics.hpp"
-#include "gp2/model_file.hpp"
+#include "gp2/files/fit_file.hpp"
+#include "gp2/jobs/fit_problem.hpp"
+#include "gp2/mechanics/udwadia_kalaba.hpp"
+#include "gp2/model.hpp"
 #include "gp2/predictor.hpp"
 #include "gp2/simulate.hpp"
+#include "gp2/simulation/generate.hpp"
 
 namespace gp2 {
 namespace {
@@ -23,13 +23,13 @@ namespace {
 using Eigen::MatrixXd;
 using Eigen::VectorXd;
 
-ModelFile read(const char* file) { return ModelFile::read(std::filesystem::path(GP2_SOURCE_DIR) / file); }
+Model read(const char* file) { return Model::read(std::filesystem::path(GP2_SOURCE_DIR) / file); }
 
-GeneratedData motion_of(const ModelFile& model, int n, double noise = 0, std::uint64_t seed = 1) {
+GeneratedData motion_of(const Model& model, int n, double noise = 0, std::uint64_t seed = 1) {
   return generate(model, {n, seed, VectorXd::Constant(model.system->nq(), noise)});
 }
 
-double value_of(const ModelFile& model, const std::string& text, const VectorXd& state) {
+double value_of(const Model& model, const std::string& text, const VectorXd& state) {
   const Expression e = model.expression(text);
   MatrixXd value;
   Tape(std::span(&e, 1), model.symbols().state_and_parameters()).evaluate(state, model.system->parameter_values(), value);
@@ -37,7 +37,7 @@ double value_of(const ModelFile& model, const std::string& text, const VectorXd&
 }
 
 TEST(Motion, OfTheArmKeepsItsTipOnThePlaneAndPointingDown) {
-  const ModelFile model = read("experiments/arm_on_surface/arm.toml");
+  const Model model = read("experiments/arm_on_surface/arm.toml");
   const GeneratedData data = motion_of(model, 240);
   double moved = 0;
   for (Eigen::Index i = 0; i < data.states.cols(); ++i) {
@@ -58,7 +58,7 @@ TEST(Motion, OfTheArmKeepsItsTipOnThePlaneAndPointingDown) {
 
 TEST(Motion, ReachesItsTargetsWhereTheControllerKnowsEverything) {
   // a slider on a rail, no unknown force: the reference is followed to the order of the hold, ω⁻² of the jerk between samples
-  const ModelFile model = ModelFile::parse(R"(
+  const Model model = Model::parse(R"(
 coordinates = ["q1"]
 inputs = ["u1"]
 [mechanics]
@@ -72,7 +72,7 @@ segment = [1, 1.000001]
 natural_frequency = 30
 targets = { q1 = [2, 2.000001] }
 )",
-                                           "slider");
+                                   "slider");
   const GeneratedData data = motion_of(model, 300);
   EXPECT_EQ(data.states(0, 0), 0);
   EXPECT_NEAR(data.states(0, 299), 2, 2e-3);
@@ -80,7 +80,7 @@ targets = { q1 = [2, 2.000001] }
 }
 
 TEST(Motion, IsTheSameForAnyNoiseAndTheSameSeedOnly) {
-  const ModelFile model = read("models/four_bar.toml");
+  const Model model = read("models/four_bar.toml");
   const GeneratedData quiet = motion_of(model, 40), noisy = motion_of(model, 40, 0.1), other = motion_of(model, 40, 0, 2);
   EXPECT_EQ(quiet.states, noisy.states);
   EXPECT_NE(quiet.accelerations, noisy.accelerations);
@@ -89,7 +89,7 @@ TEST(Motion, IsTheSameForAnyNoiseAndTheSameSeedOnly) {
 
 std::string error_of(const std::string& text) {
   try {
-    const ModelFile model = ModelFile::parse(text, "m");
+    const Model model = Model::parse(text, "m");
     motion_of(model, 2);
   } catch (const std::exception& error) {
     return error.what();
@@ -119,13 +119,13 @@ TEST(Motion, SaysWhatIsWrongWithIt) {
   expect(head + motion + "targets = { q1 = [0, 1] }\n", "missing [truth]");
   expect("coordinates = ['q1']\n[mechanics]\nmass = [['1']]\n" + truth + motion + "targets = { q1 = [0, 1] }\n",
          "a model without inputs cannot be driven");
-  const ModelFile model = ModelFile::parse(head + truth + motion + "targets = { q1 = [0, 1] }\n", "m");
+  const Model model = Model::parse(head + truth + motion + "targets = { q1 = [0, 1] }\n", "m");
   GenerateOptions grid{2, 1, VectorXd::Zero(1)};
   grid.grid["q1"] = 3;
   EXPECT_THROW(generate(model, grid), InputError);
 }
 
-Fit fit_of(const ModelFile& model, FitProblem& problem, int n) {
+Fit fit_of(const Model& model, FitProblem& problem, int n) {
   const CsvTable log = as_table(motion_of(model, n, 0.05), *model.system, "log");
   FitProblemOptions options;
   options.mean = Prior::Mean::force;
@@ -143,7 +143,7 @@ TEST(RobotFit, IsReadBackWithoutTheRobotsFileAndPredictsTheSameBits) {
     std::filesystem::copy_file(std::filesystem::path(GP2_SOURCE_DIR) / "models" / file, folder / file,
                                std::filesystem::copy_options::overwrite_existing);
   }
-  const ModelFile model = ModelFile::read(folder / "four_bar.toml");
+  const Model model = Model::read(folder / "four_bar.toml");
   FitProblem problem;
   const Fit fitted = fit_of(model, problem, 40);
   FitFile file;
@@ -157,11 +157,11 @@ TEST(RobotFit, IsReadBackWithoutTheRobotsFileAndPredictsTheSameBits) {
   const MatrixXd states = motion_of(model, 20, 0, 3).states;
   const View view = View::all(View::Quantity::constrained_acceleration, *model.system);
   EXPECT_EQ(again.posterior().mean(view, states), file.posterior().mean(view, states));
-  EXPECT_THROW(ModelFile::read(folder / "four_bar.toml"), InputError) << "the model itself does need it";
+  EXPECT_THROW(Model::read(folder / "four_bar.toml"), InputError) << "the model itself does need it";
 }
 
 TEST(RobotFit, OfTheFourBarStaysOnItsLoopForAMinute) {
-  const ModelFile model = read("models/four_bar.toml");
+  const Model model = read("models/four_bar.toml");
   FitProblem problem;
   const Fit fitted = fit_of(model, problem, 100);
   VectorXd start = VectorXd::Zero(model.system->layout().size());
@@ -179,7 +179,7 @@ TEST(RobotFit, OfTheFourBarStaysOnItsLoopForAMinute) {
 
 // two state Jacobians: exact derivatives of the robot's expressions, and differences of the mean
 TEST(RobotFit, PredictorHasTheJacobianOfItsMean) {
-  const ModelFile model = read("models/four_bar.toml");
+  const Model model = read("models/four_bar.toml");
   FitProblem problem;
   const Fit fitted = fit_of(model, problem, 40);
   const View view = View::all(View::Quantity::constrained_acceleration, *model.system);

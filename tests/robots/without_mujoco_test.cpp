@@ -1,7 +1,7 @@
 #include <gmock/gmock.h>
 
-#include "gp2/robot.hpp"
-#include "io/io_testing.hpp"
+#include "gp2/robots/robot.hpp"
+#include "io_testing.hpp"
 
 namespace gp2 {
 namespace {

@@ -1,10 +1,10 @@
-#include "gp2/generate.hpp"
+#include "gp2/simulation/generate.hpp"
 
 #include <fmt/format.h>
 #include <gmock/gmock.h>
 
 #include "gp2/error.hpp"
-#include "io/io_testing.hpp"
+#include "io_testing.hpp"
 #include "reference_data.hpp"
 #include "test_models.hpp"
 
@@ -26,7 +26,7 @@ bool identical(const MatrixXd& a, const MatrixXd& b) {
          ((a.array() == b.array()) || (a.array().isNaN() && b.array().isNaN())).all();
 }
 
-GeneratedData noise_free(const ModelFile& model, int n = 200, std::uint64_t seed = 1) {
+GeneratedData noise_free(const Model& model, int n = 200, std::uint64_t seed = 1) {
   return generate(model, {n, seed, VectorXd::Zero(model.system->nq())});
 }
 
@@ -36,7 +36,7 @@ class Generate : public testing::TestWithParam<std::string> {};
 INSTANTIATE_TEST_SUITE_P(EveryModel, Generate, testing::ValuesIn(test::every_model()), test::model_test_name);
 
 TEST_P(Generate, TheSameSeedGivesTheSameBitsAndAnotherSeedOthers) {
-  const ModelFile& model = test::model(GetParam());
+  const Model& model = test::model(GetParam());
   const VectorXd noise = VectorXd::Constant(model.system->nq(), 0.1);
   const GeneratedData a = generate(model, {20, 5, noise}), b = generate(model, {20, 5, noise}),
                       c = generate(model, {20, 6, noise});
@@ -49,7 +49,7 @@ TEST_P(Generate, TheSameSeedGivesTheSameBitsAndAnotherSeedOthers) {
 }
 
 TEST_P(Generate, StatesSatisfyTheConstraintsToRounding) {
-  const ModelFile& model = test::model(GetParam());
+  const Model& model = test::model(GetParam());
   const MatrixXd states = noise_free(model).states;
   const System& system = *model.system;
   const VectorXd parameters = system.parameter_values();
@@ -67,7 +67,7 @@ TEST_P(Generate, StatesSatisfyTheConstraintsToRounding) {
 }
 
 TEST_P(Generate, NoiseFreeAccelerationsSatisfyTheConstraintsAndAreTheTruth) {
-  const ModelFile& model = test::model(GetParam());
+  const Model& model = test::model(GetParam());
   const GeneratedData data = noise_free(model);
   EXPECT_TRUE(identical(data.accelerations, true_acceleration(model, data.states)));
   const SystemValues values = model.system->evaluate(data.states, model.system->parameter_values());
@@ -81,7 +81,7 @@ TEST_P(Generate, NoiseFreeAccelerationsSatisfyTheConstraintsAndAreTheTruth) {
 }
 
 TEST_P(Generate, WhatIsKnownIsFiniteAndTheRestIsNaN) {
-  const ModelFile& model = test::model(GetParam());
+  const Model& model = test::model(GetParam());
   const GeneratedData data = noise_free(model, 10);
   ASSERT_EQ(data.known.size(), static_cast<std::size_t>(model.system->layout().size()));
   for (std::size_t k = 0; k < data.known.size(); ++k) {
@@ -92,11 +92,11 @@ TEST_P(Generate, WhatIsKnownIsFiniteAndTheRestIsNaN) {
 }
 
 TEST_P(Generate, RangesAreFilledEvenly) {
-  const ModelFile& model = test::model(GetParam());
+  const Model& model = test::model(GetParam());
   const std::vector<std::string> names = model.system->state_names();
   constexpr int n = 4000;
   const MatrixXd states = noise_free(model, n).states;
-  for (const ModelFile::SamplingRule& rule : model.sampling) {
+  for (const Model::SamplingRule& rule : model.sampling) {
     const auto name = std::find(names.begin(), names.end(), rule.name);
     if (!rule.range || name == names.end()) continue;
     const auto [lower, upper] = *rule.range;
@@ -114,7 +114,7 @@ TEST_P(Generate, RangesAreFilledEvenly) {
 // ---- noise
 
 TEST(GenerateNoise, HasTheStatedStandardDeviationInEachOutput) {
-  const ModelFile& model = test::model("models/surface.toml");
+  const Model& model = test::model("models/surface.toml");
   constexpr int n = 20000;
   const Eigen::Vector3d stddev(0.1, 0, 3);
   const MatrixXd noise = generate(model, {n, 1, stddev}).accelerations - noise_free(model, n).accelerations;
@@ -128,7 +128,7 @@ TEST(GenerateNoise, HasTheStatedStandardDeviationInEachOutput) {
 }
 
 TEST(GenerateNoise, OfTheWrongSizeOrSignIsRefused) {
-  const ModelFile& model = test::model("models/surface.toml");
+  const Model& model = test::model("models/surface.toml");
   const std::string rule = "generate: noise_stddev must hold 3 finite numbers ≥ 0, one per coordinate";
   EXPECT_EQ(input_error_of([&] { generate(model, {5, 1, VectorXd::Zero(2)}); }), rule);
   EXPECT_EQ(input_error_of([&] { generate(model, {5, 1, Eigen::Vector3d(0, -1, 0)}); }), rule);
@@ -140,8 +140,8 @@ TEST(GenerateNoise, OfTheWrongSizeOrSignIsRefused) {
 // ---- rules of [sampling]
 
 // a bead on a circle of radius 2, and a free coordinate that only the truth may read
-ModelFile circle(const std::string& sampling, const std::string& truth = "[\"0\", \"0\", \"0\"]") {
-  return ModelFile::parse(
+Model circle(const std::string& sampling, const std::string& truth = "[\"0\", \"0\", \"0\"]") {
+  return Model::parse(
       "coordinates = [\"x\", \"y\", \"z\"]\ninputs = [\"u\"]\n[mechanics]\n"
       "mass = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]\n[constraints]\nposition = [\"x^2 + y^2 - 4\"]\n[truth]\n"
       "acceleration = " +
@@ -152,7 +152,7 @@ enum Entry { x, y, z, dx, dy, dz, t, u };
 
 TEST(GenerateSampling, CoordinatesThatAreSolvedForTakeTheBranchOfTheStart) {
   for (const double sign : {1.0, -1.0}) {
-    const ModelFile model = circle(fmt::format("x = [-1, 1]\ndx = [-1, 1]\nstart = {{ y = {} }}\n", sign));
+    const Model model = circle(fmt::format("x = [-1, 1]\ndx = [-1, 1]\nstart = {{ y = {} }}\n", sign));
     const GeneratedData data = noise_free(model, 50);
     EXPECT_GT((sign * data.states.row(y)).minCoeff(), 1.7);
     EXPECT_LT((data.states.row(x).array().square() + data.states.row(y).array().square() - 4).abs().maxCoeff(), 1e-14);
@@ -166,7 +166,7 @@ TEST(GenerateSampling, CoordinatesThatAreSolvedForTakeTheBranchOfTheStart) {
 }
 
 TEST(GenerateSampling, RulesMayUseAuxiliaryDrawsAndWhatIsSolvedFor) {
-  const ModelFile model =
+  const Model model =
       circle("x = \"r*0.5\"\nr = [-1, 1]\ndx = \"s\"\ns = \"2*y\"\nstart = { y = 1 }\nz = \"dy + 1\"\nt = 3\nu = \"t + s\"\n");
   const MatrixXd states = noise_free(model, 20).states;
   EXPECT_LE(states.row(x).cwiseAbs().maxCoeff(), 0.5);
@@ -189,15 +189,15 @@ TEST(GenerateSampling, TheUnicycleNeedsNoPosition) {
   EXPECT_TRUE(data.known[2]);
 }
 
-std::string error_of(const ModelFile& model) {
+std::string error_of(const Model& model) {
   return input_error_of([&] { noise_free(model, 5); });
 }
 
 TEST(GenerateSampling, WithoutSamplingOrTruthThereIsNoData) {
   const std::string text = "coordinates = [\"x\"]\n[mechanics]\nmass = [[1]]\n[constraints]\nposition = [\"x - t\"]\n";
-  EXPECT_EQ(error_of(ModelFile::parse(text + "[truth]\nacceleration = [0]\n", "m.toml")),
+  EXPECT_EQ(error_of(Model::parse(text + "[truth]\nacceleration = [0]\n", "m.toml")),
             "m.toml: missing [sampling]: where states are drawn from, say q1 = [-1, 1]; or [motion]: how the system is driven");
-  const ModelFile without_truth = ModelFile::parse(text + "[sampling]\nt = [0, 1]\n", "m.toml");
+  const Model without_truth = Model::parse(text + "[sampling]\nt = [0, 1]\n", "m.toml");
   const std::string missing_truth =
       "m.toml: missing [truth] acceleration = [ … ]: what is added to M⁻¹ force, \"0\" where nothing is";
   EXPECT_EQ(error_of(without_truth), missing_truth);
@@ -212,11 +212,11 @@ TEST(GenerateSampling, WhatNeitherRulesNorConstraintsDecideIsNamed) {
       error_of(circle("dx = [-1, 1]\nstart = { x = 1, y = 1 }\n")),
       StartsWith("circle.toml: [sampling]: at x = 1, y = 1 the constraints decide only 1 of the 2 unknowns x, y: draw some"));
   // a constraint that reads t although A and b do not
-  EXPECT_THAT(error_of(ModelFile::parse(
-                  "coordinates = [\"x\"]\n[mechanics]\nmass = [[1]]\n[constraints]\nposition = [\"x - t\"]\n[truth]\n"
-                  "acceleration = [0]\n[sampling]\na = [0, 1]\n",
-                  "m.toml")),
-              HasSubstr("says nothing of 't'"));
+  EXPECT_THAT(
+      error_of(Model::parse("coordinates = [\"x\"]\n[mechanics]\nmass = [[1]]\n[constraints]\nposition = [\"x - t\"]\n[truth]\n"
+                            "acceleration = [0]\n[sampling]\na = [0, 1]\n",
+                            "m.toml")),
+      HasSubstr("says nothing of 't'"));
 }
 
 TEST(GenerateSampling, ASingularStartIsNamedWithTheMend) {
@@ -236,11 +236,11 @@ TEST(GenerateSampling, StatesDrawnOffTheConstraintAreRefused) {
 
 TEST(GenerateSampling, ContradictingConstraintsAreRefused) {
   // least squares has a solution, the constraints have none
-  EXPECT_THAT(error_of(ModelFile::parse(
-                  "coordinates = [\"x\"]\n[mechanics]\nmass = [[1]]\n[constraints]\nposition = [\"x - 1\", \"x - 2\"]\n"
-                  "[truth]\nacceleration = [0]\n[sampling]\nt = [0, 1]\n",
-                  "m.toml")),
-              HasSubstr("is off the constraint"));
+  EXPECT_THAT(
+      error_of(Model::parse("coordinates = [\"x\"]\n[mechanics]\nmass = [[1]]\n[constraints]\nposition = [\"x - 1\", \"x - 2\"]\n"
+                            "[truth]\nacceleration = [0]\n[sampling]\nt = [0, 1]\n",
+                            "m.toml")),
+      HasSubstr("is off the constraint"));
 }
 
 TEST(GenerateSampling, AConstraintOutOfReachIsANumericalError) {
@@ -266,7 +266,7 @@ TEST(GenerateSampling, ATruthThatIsNoNumberIsNamed) {
 
 // ---- grids
 
-GeneratedData grid_of(const ModelFile& model, const std::map<std::string, int>& points, std::uint64_t seed = 1) {
+GeneratedData grid_of(const Model& model, const std::map<std::string, int>& points, std::uint64_t seed = 1) {
   return generate(model, {1, seed, VectorXd::Zero(model.system->nq()), points});
 }
 
@@ -285,7 +285,7 @@ INSTANTIATE_TEST_SUITE_P(
 
 TEST_P(GenerateGrid, IsThePublishedOneRowByRow) {
   if (const auto absent = test::why_reference_is_absent()) GTEST_SKIP() << *absent;
-  const ModelFile& model = test::model("experiments/" + GetParam().system + "_published.toml");
+  const Model& model = test::model("experiments/" + GetParam().system + "_published.toml");
   const GeneratedData grid = grid_of(model, GetParam().points);
   const CsvTable published = CsvTable::read(test::reference_file("grid/" + GetParam().system + "_grid.csv"));
   ASSERT_EQ(grid.states.cols(), published.n_rows());
@@ -308,7 +308,7 @@ TEST_P(GenerateGrid, IsThePublishedOneRowByRow) {
 }
 
 TEST(GenerateGrid, RunsTheLastRangeFastestFromEndToEnd) {
-  const ModelFile model = circle("x = [-1, 1]\nw = [0, 3]\ndx = \"2*w\"\nz = [5, 7]\nstart = { y = 1 }\n");
+  const Model model = circle("x = [-1, 1]\nw = [0, 3]\ndx = \"2*w\"\nz = [5, 7]\nstart = { y = 1 }\n");
   const MatrixXd states = grid_of(model, {{"z", 1}, {"w", 3}, {"x", 2}}).states;
   const auto row = [&](Entry entry) { return std::vector<double>(states.row(entry).begin(), states.row(entry).end()); };
   EXPECT_THAT(row(x), ElementsAre(-1, -1, -1, 1, 1, 1));
@@ -318,7 +318,7 @@ TEST(GenerateGrid, RunsTheLastRangeFastestFromEndToEnd) {
 }
 
 TEST(GenerateGrid, TakesNothingFromTheSeedButTheNoise) {
-  const ModelFile& model = test::model("models/surface.toml");
+  const Model& model = test::model("models/surface.toml");
   const std::map<std::string, int> points = {{"q1", 2}, {"q2", 2}, {"dq1", 1}, {"dq2", 1}, {"u1", 1}, {"u2", 1}, {"u3", 2}};
   const GeneratedData a = grid_of(model, points, 1), b = grid_of(model, points, 2);
   EXPECT_TRUE(identical(a.states, b.states));
@@ -332,7 +332,7 @@ TEST(GenerateGrid, TakesNothingFromTheSeedButTheNoise) {
 }
 
 TEST(GenerateGrid, ThatIsNoneIsRefused) {
-  const ModelFile model = circle("x = [-1, 1]\ndx = [-1, 1]\nz = \"x\"\nstart = { y = 1 }\n");
+  const Model model = circle("x = [-1, 1]\ndx = [-1, 1]\nz = \"x\"\nstart = { y = 1 }\n");
   const auto refused = [&](const std::map<std::string, int>& points) { return input_error_of([&] { grid_of(model, points); }); };
   EXPECT_EQ(refused({{"x", 2}, {"dx", 2}}), "");
   EXPECT_EQ(refused({{"x", 2}}), "grid: no number of points for 'dx': every range of [sampling] needs one");

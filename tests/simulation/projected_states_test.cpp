@@ -1,4 +1,4 @@
-#include "gp2/projected_states.hpp"
+#include "gp2/simulation/projected_states.hpp"
 
 #include <gmock/gmock.h>
 
@@ -18,7 +18,7 @@ using testing::HasSubstr;
 constexpr std::uint64_t seed = 40721;
 
 // q and dq with an error of this size
-MatrixXd disturbed(const ModelFile& model, MatrixXd states, double size) {
+MatrixXd disturbed(const Model& model, MatrixXd states, double size) {
   RandomStream random(seed);
   for (Index i = 0; i < states.cols(); ++i) {
     for (int k = 0; k < 2 * model.system->nq(); ++k) states(k, i) += size * random.normal();
@@ -29,7 +29,7 @@ MatrixXd disturbed(const ModelFile& model, MatrixXd states, double size) {
 TEST(ProjectedStatesTest, StatesEndOnTheConstraintsWhereOneAloneDoes) {
   for (const char* file : {"models/surface.toml", "models/double_pendulum.toml", "models/unicycle.toml"}) {
     SCOPED_TRACE(fmt::format("{}, seed {}", file, seed));
-    const ModelFile& model = test::model(file);
+    const Model& model = test::model(file);
     const VectorXd parameters = model.system->parameter_values();
     const MatrixXd states = disturbed(model, generate(model, {20, seed, VectorXd::Zero(model.system->nq())}).states, 1e-3);
     const ProjectedStates projected = project_states(*model.system, parameters, states);
@@ -58,14 +58,14 @@ TEST(ProjectedStatesTest, StatesEndOnTheConstraintsWhereOneAloneDoes) {
 }
 
 TEST(ProjectedStatesTest, AStateWithoutAnAdmissibleOneNearIsToldByItsNumber) {
-  const ModelFile circle = ModelFile::parse(R"toml(
+  const Model circle = Model::parse(R"toml(
 coordinates = ["x"]
 [mechanics]
 mass = [["1"]]
 [constraints]
 position = ["x^2 + 1"]
 )toml",
-                                            "circle.toml");
+                                    "circle.toml");
   MatrixXd states = MatrixXd::Zero(3, 2);
   states << 0.5, 0.7, 0, 0, 0, 0;
   const ProjectedStates projected = project_states(*circle.system, VectorXd(), states);
@@ -80,7 +80,7 @@ position = ["x^2 + 1"]
 }
 
 TEST(ProjectedStatesTest, StatesThatLackWhatTheConstraintReadsAreRefused) {
-  const ModelFile& model = test::model("models/surface.toml");
+  const Model& model = test::model("models/surface.toml");
   MatrixXd states = generate(model, {3, seed, VectorXd::Zero(3)}).states;
   states.row(1).setConstant(std::nan(""));
   try {
@@ -94,14 +94,14 @@ TEST(ProjectedStatesTest, StatesThatLackWhatTheConstraintReadsAreRefused) {
 }
 
 TEST(ProjectedStatesTest, ACheckSaysHowFarOffTheStatesAre) {
-  const ModelFile circle = ModelFile::parse(R"toml(
+  const Model circle = Model::parse(R"toml(
 coordinates = ["x", "y"]
 [mechanics]
 mass = [["1", "0"], ["0", "1"]]
 [constraints]
 position = ["sqrt(x^2 + y^2) - 1"]
 )toml",
-                                            "circle.toml");
+                                    "circle.toml");
   MatrixXd states = MatrixXd::Zero(5, 4);
   // off by 0, 0.1, 0.2 and −0.3 along x, with velocities along the circle
   states.row(0) << 1, 1.1, 1.2, 0.7;

@@ -8,9 +8,9 @@
 #include <nlohmann/json.hpp>
 
 #include "gp2/error.hpp"
+#include "gp2/fit.hpp"
 #include "gp2/posterior.hpp"
-#include "gp2/training.hpp"
-#include "io/io_testing.hpp"
+#include "io_testing.hpp"
 #include "reference_data.hpp"
 #include "test_models.hpp"
 
@@ -38,7 +38,7 @@ std::string numerical_error_of(F f) {
 VectorXd times(double t_end, int n, double t_start = 0) { return VectorXd::LinSpaced(n, t_start, t_end); }
 
 /// A state of a model from a few of its entries; the rest is 0.
-VectorXd state_of(const ModelFile& model, const std::vector<std::pair<std::string, double>>& entries) {
+VectorXd state_of(const Model& model, const std::vector<std::pair<std::string, double>>& entries) {
   const std::vector<std::string> names = model.system->state_names();
   VectorXd state = VectorXd::Zero(model.system->layout().size());
   for (const auto& [name, value] : entries) {
@@ -50,7 +50,7 @@ VectorXd state_of(const ModelFile& model, const std::vector<std::pair<std::strin
 }
 
 /// The same, where entries not given are solved from the constraints.
-VectorXd solved_state(const ModelFile& model, const std::vector<std::pair<std::string, double>>& entries) {
+VectorXd solved_state(const Model& model, const std::vector<std::pair<std::string, double>>& entries) {
   std::vector<bool> held;
   for (const std::string& name : model.system->state_names()) {
     held.push_back(std::any_of(entries.begin(), entries.end(), [&](const auto& entry) { return entry.first == name; }));
@@ -58,7 +58,7 @@ VectorXd solved_state(const ModelFile& model, const std::vector<std::pair<std::s
   return project_onto_constraints(*model.system, model.system->parameter_values(), state_of(model, entries), held);
 }
 
-Trajectory simulate_model(const ModelFile& model, const VectorXd& start, const SimulateOptions& options) {
+Trajectory simulate_model(const Model& model, const VectorXd& start, const SimulateOptions& options) {
   return simulate(*model.system, model.system->parameter_values(), model_acceleration(model), start, options);
 }
 
@@ -70,23 +70,23 @@ SimulateOptions with_tolerance(const VectorXd& times, double tolerance, bool pro
   return options;
 }
 
-const ModelFile& surface() { return test::model("models/surface.toml"); }
-const ModelFile& published_surface() { return test::model("experiments/surface_published.toml"); }
+const Model& surface() { return test::model("models/surface.toml"); }
+const Model& published_surface() { return test::model("experiments/surface_published.toml"); }
 
 /// The start of the paper's figure 3 c.
 VectorXd figure_start() { return solved_state(surface(), {{"q1", 0.4}, {"q2", 0.8}, {"dq1", 0.8}, {"dq2", 1}}); }
 
 // ---- a body without constraints
 
-ModelFile oscillator(double damping = 0) {
-  return ModelFile::parse(fmt::format("coordinates = [\"x\"]\ninputs = [\"f\"]\n[mechanics]\nmass = [[1]]\n"
-                                      "force = [\"f - x - {}*dx\"]\npotential = \"x^2/2\"\n",
-                                      damping),
-                          "oscillator.toml");
+Model oscillator(double damping = 0) {
+  return Model::parse(fmt::format("coordinates = [\"x\"]\ninputs = [\"f\"]\n[mechanics]\nmass = [[1]]\n"
+                                  "force = [\"f - x - {}*dx\"]\npotential = \"x^2/2\"\n",
+                                  damping),
+                      "oscillator.toml");
 }
 
 TEST(Simulate, FollowsAnOscillatorThatHasNoConstraint) {
-  const ModelFile model = oscillator();
+  const Model model = oscillator();
   const Trajectory out = simulate_model(model, state_of(model, {{"x", 1}}), with_tolerance(times(10, 101), 1e-10));
   for (int i = 0; i < out.states.cols(); ++i) {
     const double t = out.times[i];
@@ -102,7 +102,7 @@ TEST(Simulate, FollowsAnOscillatorThatHasNoConstraint) {
 }
 
 TEST(Simulate, CountsTheTimesAtWhichAConstraintLetsGo) {
-  const ModelFile model = ModelFile::parse(R"toml(
+  const Model model = Model::parse(R"toml(
 coordinates = ["x", "y"]
 [mechanics]
 mass  = [[1, 0], [0, 1]]
@@ -110,7 +110,7 @@ force = ["0", "1"]
 [constraints]
 acceleration = ["x*(ddx - ddy)"]
 )toml",
-                                           "lets go");
+                                   "lets go");
   const Trajectory out = simulate_model(model, state_of(model, {{"dx", 1}}), with_tolerance(times(1, 11), 1e-8));
   EXPECT_EQ(out.lower_rank.usual, 1);
   EXPECT_EQ(out.lower_rank.lowest, 0);
@@ -120,7 +120,7 @@ acceleration = ["x*(ddx - ddy)"]
 }
 
 TEST(Simulate, InterpolatesBetweenStepsAsWellAsItSteps) {
-  const ModelFile model = oscillator();
+  const Model model = oscillator();
   const auto error = [&](double tolerance) {
     const Trajectory out = simulate_model(model, state_of(model, {{"x", 1}}), with_tolerance(times(10, 1001), tolerance));
     EXPECT_LT(out.steps, 500);  // most times lie within a step
@@ -130,7 +130,7 @@ TEST(Simulate, InterpolatesBetweenStepsAsWellAsItSteps) {
 }
 
 TEST(Simulate, ReachesTheSameStateWhateverIsWritten) {
-  const ModelFile& model = surface();
+  const Model& model = surface();
   const Trajectory few = simulate_model(model, figure_start(), with_tolerance(times(6, 2), 1e-6));
   const Trajectory many = simulate_model(model, figure_start(), with_tolerance(times(6, 301), 1e-6));
   EXPECT_EQ(few.states.col(1), many.states.col(300));
@@ -169,8 +169,8 @@ TEST(SimulateInputs, HaveNoKinkWhereTheTableGoesOnStraight) {
 
 TEST(SimulateInputs, AShortPulseIsNotSteppedOver) {
   // at rest for 50 s; then a triangle of 10 ms and area 1 N s sets the unit mass off at 1 m/s
-  const ModelFile model =
-      ModelFile::parse("coordinates = [\"x\"]\ninputs = [\"f\"]\n[mechanics]\nmass = [[1]]\nforce = [\"f\"]\n", "mass.toml");
+  const Model model =
+      Model::parse("coordinates = [\"x\"]\ninputs = [\"f\"]\n[mechanics]\nmass = [[1]]\nforce = [\"f\"]\n", "mass.toml");
   SimulateOptions options = with_tolerance(Eigen::Vector2d(0, 100), 1e-9);
   options.inputs = InputSignal(Eigen::Vector3d(50, 50.005, 50.01), Eigen::RowVector3d(0, 200, 0));
   const Trajectory out = simulate_model(model, VectorXd::Zero(4), options);
@@ -250,7 +250,7 @@ class SimulateModel : public testing::TestWithParam<std::string> {};
 INSTANTIATE_TEST_SUITE_P(EveryModel, SimulateModel, testing::ValuesIn(test::every_model()), test::model_test_name);
 
 TEST_P(SimulateModel, StaysOnItsConstraintsAndProjectionChangesNothingElse) {
-  const ModelFile& model = test::model(GetParam());
+  const Model& model = test::model(GetParam());
   VectorXd start = test::draw(model, 1, 3).states.col(0);
   start = start.array().isNaN().select(0, start);
   const double t0 = start[model.system->layout().t()];
@@ -271,7 +271,7 @@ TEST_P(SimulateModel, StaysOnItsConstraintsAndProjectionChangesNothingElse) {
 }
 
 TEST_P(SimulateModel, IsTheSameToTheBitEachTime) {
-  const ModelFile& model = test::model(GetParam());
+  const Model& model = test::model(GetParam());
   VectorXd start = test::draw(model, 1, 4).states.col(0);
   start = start.array().isNaN().select(0, start);
   const auto run = [&] { return simulate_model(model, start, with_tolerance(times(0.3, 7), 1e-7)); };
@@ -281,11 +281,11 @@ TEST_P(SimulateModel, IsTheSameToTheBitEachTime) {
 }
 
 TEST(SimulateRedundant, ASliderCrankTurnsAsItDoesWithoutTheRedundantRow) {
-  const ModelFile& redundant = test::model("models/slider_crank.toml");
+  const Model& redundant = test::model("models/slider_crank.toml");
   std::string text = redundant.text;
   const std::string row = ",\n            \"(q3 - r*cos(q1))^2 + (r*sin(q1))^2 - l^2\"";
   text.erase(text.find(row), row.size());
-  const ModelFile plain = ModelFile::parse(text, "plain.toml");
+  const Model plain = Model::parse(text, "plain.toml");
   const VectorXd start = solved_state(plain, {{"q1", 0.3}, {"dq1", 5}});
   ASSERT_GT(start[2], 0.3);  // the slider is on its side of the axle
   for (const bool project : {true, false}) {
@@ -303,7 +303,7 @@ TEST(SimulateRedundant, ASliderCrankTurnsAsItDoesWithoutTheRedundantRow) {
 }
 
 TEST(SimulateUnicycle, RollsWithoutSlipAndNeedsNoPosition) {
-  const ModelFile& model = test::model("models/unicycle.toml");
+  const Model& model = test::model("models/unicycle.toml");
   SimulateOptions options = with_tolerance(times(20, 201), 1e-7);
   options.inputs = InputSignal(Eigen::Vector3d(0, 5, 10), (MatrixXd(2, 3) << 0.3, 0.3, 0.3, 0, 0.02, -0.02).finished());
   const Trajectory out = simulate_model(model, VectorXd::Zero(9), options);
@@ -323,7 +323,7 @@ TEST(SimulateUnicycle, RollsWithoutSlipAndNeedsNoPosition) {
 }
 
 TEST(SimulateDuffing, FollowsAConstraintThatMovesWithTime) {
-  const ModelFile& model = test::model("models/duffing.toml");
+  const Model& model = test::model("models/duffing.toml");
   const VectorXd start = solved_state(model, {{"q2", 0.5}, {"dq2", 0}});
   EXPECT_NEAR(start[2], 2 * M_PI, 1e-12);  // d/dt of A0 exp(−αt) sin(ωt) at 0
   const Trajectory out = simulate_model(model, start, with_tolerance(times(5, 101), 1e-8));
@@ -335,15 +335,15 @@ TEST(SimulateDuffing, FollowsAConstraintThatMovesWithTime) {
 
 // ---- energy
 
-ModelFile pendulum() {
-  return ModelFile::parse(
+Model pendulum() {
+  return Model::parse(
       "coordinates = [\"x\", \"y\"]\n[parameters]\nm = 2\nl = 1\n[mechanics]\nmass = [[\"m\", 0], [0, \"m\"]]\n"
       "force = [0, \"-m*9.81\"]\npotential = \"m*9.81*y\"\n[constraints]\nposition = [\"x^2 + y^2 - l^2\"]\n",
       "pendulum.toml");
 }
 
 TEST(SimulateEnergy, OfAnUndampedPendulumIsKeptToTheTolerance) {
-  const ModelFile model = pendulum();
+  const Model model = pendulum();
   const VectorXd start = solved_state(model, {{"x", 0.8}, {"y", -0.6}});
   double before = 1;
   for (const double tolerance : {1e-5, 1e-7, 1e-9}) {
@@ -360,7 +360,7 @@ TEST(SimulateEnergy, OfAnUndampedPendulumIsKeptToTheTolerance) {
 
 TEST_P(SimulateModel, PotentialIsTheOneOfTheForcesThatWrite) {
   // without inputs, speeds and [truth], a force field is −∂V/∂q
-  const ModelFile& model = test::model(GetParam());
+  const Model& model = test::model(GetParam());
   if (!model.potential || test::stem(GetParam()) == "duffing") GTEST_SKIP() << "no potential of F alone";
   VectorXd state = test::draw(model, 1, 3).states.col(0);
   state = state.array().isNaN().select(0, state);
@@ -378,7 +378,7 @@ TEST_P(SimulateModel, PotentialIsTheOneOfTheForcesThatWrite) {
 }
 
 TEST(SimulateEnergy, NeedsAPotential) {
-  const ModelFile& model = test::model("models/unicycle.toml");
+  const Model& model = test::model("models/unicycle.toml");
   EXPECT_THAT(input_error_of([&] { mechanical_energy(model, model.system->parameter_values(), VectorXd::Zero(9)); }),
               HasSubstr("unicycle.toml: no energy without [mechanics] potential"));
 }
@@ -409,7 +409,7 @@ TEST(SimulateStart, OffTheConstraintIsTakenAsItIsWithoutProjection) {
 
 TEST(SimulateStart, IsMovedAsLittleAsCanBeInTheMetricOfM) {
   // a bead on a line x + y = 0 whose second coordinate is 9 times as heavy: it moves a ninth as far
-  const ModelFile model = ModelFile::parse(
+  const Model model = Model::parse(
       "coordinates = [\"x\", \"y\"]\n[mechanics]\nmass = [[1, 0], [0, 9]]\n[constraints]\nposition = [\"x + y\"]\n", "line.toml");
   const VectorXd moved = project_onto_constraints(*model.system, VectorXd(), state_of(model, {{"x", 1}, {"dy", 10}}));
   EXPECT_NEAR(moved[0], 0.1, 1e-15);
@@ -419,7 +419,7 @@ TEST(SimulateStart, IsMovedAsLittleAsCanBeInTheMetricOfM) {
 }
 
 TEST(SimulateStart, KeepsWhatIsHeld) {
-  const ModelFile& model = test::model("models/double_pendulum.toml");
+  const Model& model = test::model("models/double_pendulum.toml");
   const VectorXd state = solved_state(model, {{"q3", 2.5}, {"q6", 4}, {"dq3", 1}, {"dq6", -3}});
   EXPECT_EQ(state[2], 2.5);
   EXPECT_EQ(state[5], 4);
@@ -429,7 +429,7 @@ TEST(SimulateStart, KeepsWhatIsHeld) {
 }
 
 TEST(SimulateStart, ThatCannotBePutOnTheConstraintSaysWhere) {
-  const ModelFile model = pendulum();
+  const Model model = pendulum();
   // x = 2 is out of reach of a rod of 1 m
   EXPECT_THAT(numerical_error_of([&] {
                 solved_state(model, {{"x", 2}});
@@ -445,7 +445,7 @@ TEST(SimulateStart, ThatCannotBePutOnTheConstraintSaysWhere) {
 // ---- faults
 
 TEST(SimulateFaults, WrongOptionsAreRefused) {
-  const ModelFile model = oscillator();
+  const Model model = oscillator();
   const VectorXd start = VectorXd::Zero(4);
   const auto refusal = [&](const std::function<void(SimulateOptions&)>& change) {
     SimulateOptions options = with_tolerance(times(1, 2), 1e-6);
@@ -476,7 +476,7 @@ TEST(SimulateFaults, WrongOptionsAreRefused) {
 
 // accelerations of a free body, of a function of [x; dx; t; u]
 std::string fault_of(const std::function<double(const VectorXd&)>& acceleration, const SimulateOptions& options) {
-  const ModelFile model = oscillator();
+  const Model model = oscillator();
   return numerical_error_of([&] {
     simulate(
         *model.system, VectorXd(), [&](const auto& x) { return VectorXd::Constant(1, acceleration(x)); },
@@ -518,7 +518,7 @@ TEST(SimulateFaults, TooManyStepsNameTheTimeReached) {
 
 TEST(SimulateFaults, ASmallerStepIsTriedBeforeGivingUp) {
   // stages of the first, far too large step lie where there is no acceleration
-  const ModelFile model = oscillator();
+  const Model model = oscillator();
   SimulateOptions options = with_tolerance(times(1, 2), 1e-8);
   options.initial_step = 1;
   const Trajectory out = simulate(
@@ -532,7 +532,7 @@ TEST(SimulateFaults, ASmallerStepIsTriedBeforeGivingUp) {
 
 TEST(SimulatePosterior, StaysOnTheConstraintAndDriftsNoMoreThanTheAnalyticModelWithoutProjection) {
   // GP² with plausible hyperparameters, not fitted: the drift has nothing to do with how good it is
-  const ModelFile& model = surface();
+  const Model& model = surface();
   const Prior prior = make_prior(model);
   const GeneratedData data = generate(model, {100, 1, VectorXd::Constant(3, 0.1)});
   const Observations observations{data.states, View::all(View::Quantity::constrained_acceleration, *model.system),
@@ -570,7 +570,7 @@ TEST(SimulatePosterior, StaysOnTheConstraintAndDriftsNoMoreThanTheAnalyticModelW
 TEST(SimulateMasslessCoordinate, KeepsTheEnergyAndTheConstraints) {
   std::string text = test::model("models/massless_rod.toml").text;
   text.resize(text.find("[truth]"));
-  const ModelFile rod = ModelFile::parse(text, "rod");
+  const Model rod = Model::parse(text, "rod");
   const VectorXd start = solved_state(rod, {{"theta", 1.2}, {"dtheta", 2}, {"u1", 0}});
   EXPECT_NEAR(start[0], 0.6 * std::sin(1.2), 1e-12);
   EXPECT_NEAR(start[3], 0.6 * 2 * std::cos(1.2), 1e-12);
@@ -584,7 +584,7 @@ TEST(SimulateMasslessCoordinate, KeepsTheEnergyAndTheConstraints) {
 
 // the position constraint says nothing of y, which only a constraint on accelerations holds
 TEST(SimulateMasslessCoordinate, IsNotMovedByAConstraintThatDoesNotSeeIt) {
-  const ModelFile model = ModelFile::parse(R"toml(
+  const Model model = Model::parse(R"toml(
 coordinates = ["x", "y", "z"]
 [mechanics]
 mass  = [["1", "0", "0"], ["0", "0", "0"], ["0", "0", "3"]]
@@ -593,7 +593,7 @@ force = ["1", "0", "0"]
 position = ["x - z"]
 acceleration = ["ddy - 2*ddx"]
 )toml",
-                                           "follower");
+                                   "follower");
   VectorXd state = VectorXd::Zero(7);
   state.head(3) << 4, 7, 0;
   const VectorXd projected = project_onto_constraints(*model.system, VectorXd(), state, {});

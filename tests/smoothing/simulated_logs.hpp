@@ -9,9 +9,9 @@
 #include <Eigen/Core>
 #include <Eigen/LU>
 
-#include "gp2/derive.hpp"
+#include "base/random.hpp"
+#include "gp2/jobs/derive.hpp"
 #include "gp2/simulate.hpp"
-#include "prior/random.hpp"
 #include "test_models.hpp"
 
 // Logs of a double pendulum whose motion is known, with the faults of real ones.
@@ -31,7 +31,7 @@ struct SimulatedLog {
   CsvTable table;  // episode, t, q3, q6
 };
 
-inline SimulatedLog simulated_log(const ModelFile& model, const std::vector<std::array<double, 4>>& starts, double duration,
+inline SimulatedLog simulated_log(const Model& model, const std::vector<std::array<double, 4>>& starts, double duration,
                                   const LogFaults& faults, std::uint64_t seed) {
   constexpr double sampling_rate = 500;
   RandomStream random(seed);

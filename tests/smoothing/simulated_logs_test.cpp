@@ -27,7 +27,7 @@ const std::vector<Case> cases = {
 
 // The table of docs/raw-logs.md. GP2_PRINT_TABLES=1 prints it.
 TEST(SimulatedLogs, DerivativesAreNoWorseThanSavitzkyGolaysAndTheirDeviationsHoldTheTruth) {
-  const ModelFile& model = test::model("models/double_pendulum.toml");
+  const Model& model = test::model("models/double_pendulum.toml");
   std::string table;
   for (const auto& [motion, starts] : {std::pair("slow", slow), std::pair("fast", fast)}) {
     for (const Case& one : cases) {

@@ -1,4 +1,4 @@
-#include "gp2/smoother.hpp"
+#include "gp2/smoothing/smoother.hpp"
 
 #include <cmath>
 #include <limits>
@@ -8,8 +8,8 @@
 #include <gtest/gtest.h>
 #include <Eigen/Cholesky>
 
+#include "base/random.hpp"
 #include "gp2/error.hpp"
-#include "prior/random.hpp"
 
 namespace gp2::test {
 namespace {

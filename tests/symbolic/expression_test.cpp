@@ -1,4 +1,4 @@
-#include "gp2/expression.hpp"
+#include "gp2/symbolic/expression.hpp"
 
 #include <limits>
 

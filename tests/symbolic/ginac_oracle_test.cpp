@@ -7,7 +7,7 @@
 #include <ginac/ginac.h>
 #include <gtest/gtest.h>
 
-#include "gp2/expression.hpp"
+#include "gp2/symbolic/expression.hpp"
 #include "random_expression.hpp"
 
 // CLN, below GiNaC, keeps a string of its own until the end

@@ -2,7 +2,7 @@
 #include <gtest/gtest.h>
 
 #include "gp2/error.hpp"
-#include "gp2/expression.hpp"
+#include "gp2/symbolic/expression.hpp"
 
 namespace gp2 {
 namespace {

@@ -5,7 +5,7 @@
 #include <gtest/gtest.h>
 
 #include "gp2/error.hpp"
-#include "gp2/expression.hpp"
+#include "gp2/symbolic/expression.hpp"
 #include "random_expression.hpp"
 
 namespace gp2 {

@@ -8,7 +8,7 @@
 #include <string>
 #include <vector>
 
-#include "gp2/expression.hpp"
+#include "gp2/symbolic/expression.hpp"
 
 namespace gp2::test {
 

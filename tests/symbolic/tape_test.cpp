@@ -8,7 +8,7 @@
 
 #include "allocation_count.hpp"
 #include "gp2/error.hpp"
-#include "gp2/expression.hpp"
+#include "gp2/symbolic/expression.hpp"
 #include "random_expression.hpp"
 
 namespace gp2 {

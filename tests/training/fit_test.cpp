@@ -4,7 +4,7 @@
 #include <gtest/gtest.h>
 
 #include "gp2/error.hpp"
-#include "gp2/training.hpp"
+#include "gp2/fit.hpp"
 #include "test_models.hpp"
 
 namespace gp2 {
@@ -25,7 +25,7 @@ struct Problem {
 
 Problem problem(const std::string& file, int n, const std::vector<std::string>& estimated = {}, const Protocol& protocol = {},
                 bool estimate_noise = false, double noise_stddev = 0.05) {
-  const ModelFile& model = test::model(file);
+  const Model& model = test::model(file);
   GenerateOptions options{n, seed, {}};
   options.noise_stddev = VectorXd::Constant(model.system->nq(), noise_stddev);
   const GeneratedData data = generate(model, options);
@@ -187,7 +187,7 @@ TEST(FitTest, ConvergesToAPointWhoseProjectedGradientIsBelowTheTolerance) {
 }
 
 TEST(FitTest, FindsTheParametersOfTheConstraintThatMadeTheData) {
-  const ModelFile& model = test::model("models/duffing.toml");
+  const Model& model = test::model("models/duffing.toml");
   Problem p = problem("models/duffing.toml", 40, {"A0", "omega"});
   const int A0 = model.system->parameter_index("A0"), omega = model.system->parameter_index("omega");
   for (Hyperparameter& h : p.hyperparameters) {

@@ -4,7 +4,7 @@
 #include <gtest/gtest.h>
 
 #include "gp2/error.hpp"
-#include "gp2/training.hpp"
+#include "gp2/fit.hpp"
 #include "test_models.hpp"
 #include "training/objective.hpp"
 
@@ -20,7 +20,7 @@ using Kind = Hyperparameter::Kind;
 
 constexpr std::uint64_t seed = 50501;
 
-std::vector<Observations> observe(const ModelFile& model, int n, bool estimate_noise, std::vector<int> rows = {}) {
+std::vector<Observations> observe(const Model& model, int n, bool estimate_noise, std::vector<int> rows = {}) {
   const GeneratedData data = test::draw(model, n, seed);
   View view = View::all(View::Quantity::constrained_acceleration, *model.system);
   if (!rows.empty()) view.rows = rows;
@@ -43,7 +43,7 @@ double stddev(const VectorXd& values) { return std::sqrt((values.array() - value
 void expect_same(double got, double want) { EXPECT_NEAR(got, want, 64 * test::eps * std::abs(want)); }
 
 TEST(HyperparametersTest, ThePaperProtocolHasThePapersBox) {
-  const ModelFile& model = test::model("experiments/surface_published.toml");
+  const Model& model = test::model("experiments/surface_published.toml");
   const Prior prior = make_prior(model, {Prior::Mean::zero, std::nullopt, true});
   const std::vector<Observations> observations = observe(model, 60, false);
   const auto all = default_hyperparameters(prior, observations, {"p1", "p4", "p7"}, {Protocol::Name::paper, true});
@@ -76,7 +76,7 @@ TEST(HyperparametersTest, ThePaperProtocolHasThePapersBox) {
 }
 
 TEST(HyperparametersTest, ThePaperProtocolKeepsToTheFilesBounds) {
-  const ModelFile& model = test::model("models/unicycle.toml");
+  const Model& model = test::model("models/unicycle.toml");
   const Prior prior = make_prior(model);
   const auto all = default_hyperparameters(prior, observe(model, 30, false), {"R", "Ic"}, {Protocol::Name::paper, true});
   EXPECT_EQ(find(all, "R").lower, 0.05 - 0.02);
@@ -86,7 +86,7 @@ TEST(HyperparametersTest, ThePaperProtocolKeepsToTheFilesBounds) {
 }
 
 TEST(HyperparametersTest, TheStandardProtocolHasItsOwnBoxAndHyperPriors) {
-  const ModelFile& model = test::model("models/unicycle.toml");
+  const Model& model = test::model("models/unicycle.toml");
   const Prior prior = make_prior(model);
   const std::vector<Observations> observations = observe(model, 40, true);
   const auto all = default_hyperparameters(prior, observations, {"R"}, {});
@@ -118,18 +118,18 @@ TEST(HyperparametersTest, TheStandardProtocolHasItsOwnBoxAndHyperPriors) {
 }
 
 // the surface's model with priors of its own
-ModelFile with_priors(const std::string& p1) {
+Model with_priors(const std::string& p1) {
   std::string text = test::model("models/surface.toml").text;
   const std::size_t line = text.find("\np1"), end = text.find('\n', line + 1);
   text.replace(line, end - line, "\np1 = " + p1);
   text.insert(text.find("[[latent]]") + 10,
               "\nlengthscale = { prior = { median = 2, log_stddev = 0.5 } }\nsignal_stddev = { prior = { median = 3, log_stddev "
               "= 0.25 } }\n");
-  return ModelFile::parse(text, "with priors");
+  return Model::parse(text, "with priors");
 }
 
 TEST(HyperparametersTest, PriorsOfTheModelReplaceTheWeakOnes) {
-  const ModelFile model = with_priors("{ value = 0.08, bounds = [0.01, 1], prior = { median = 0.09, log_stddev = 0.2 } }");
+  const Model model = with_priors("{ value = 0.08, bounds = [0.01, 1], prior = { median = 0.09, log_stddev = 0.2 } }");
   const Prior prior = make_prior(model);
   const std::vector<Observations> observations = observe(model, 30, false);
   const auto all = default_hyperparameters(prior, observations, {"p1"}, {});
@@ -145,7 +145,7 @@ TEST(HyperparametersTest, PriorsOfTheModelReplaceTheWeakOnes) {
       EXPECT_EQ(h.log_stddev, 0) << h.name;
     }
   }
-  const ModelFile normal = with_priors("{ value = 0.08, bounds = [-1, 1], prior = { mean = 0.09, stddev = 0.02 } }");
+  const Model normal = with_priors("{ value = 0.08, bounds = [-1, 1], prior = { mean = 0.09, stddev = 0.02 } }");
   const auto of_normal = default_hyperparameters(make_prior(normal), observations, {"p1"}, {});
   EXPECT_EQ(find(of_normal, "p1").median, 0.09);
   EXPECT_EQ(find(of_normal, "p1").stddev, 0.02);
@@ -153,7 +153,7 @@ TEST(HyperparametersTest, PriorsOfTheModelReplaceTheWeakOnes) {
 }
 
 TEST(HyperparametersTest, APriorOfALogarithmNeedsBoundsAboveZero) {
-  const ModelFile model = with_priors("{ value = 0.08, bounds = [-1, 1], prior = { median = 0.09, log_stddev = 0.2 } }");
+  const Model model = with_priors("{ value = 0.08, bounds = [-1, 1], prior = { median = 0.09, log_stddev = 0.2 } }");
   try {
     default_hyperparameters(make_prior(model), observe(model, 5, false), {"p1"}, {});
     FAIL() << "no error";
@@ -165,7 +165,7 @@ TEST(HyperparametersTest, APriorOfALogarithmNeedsBoundsAboveZero) {
 TEST(HyperparametersTest, TheGradientOfPriorsIsThatOfTheirSum) {
   for (const char* p1 : {"{ value = 0.08, bounds = [0.01, 1], prior = { median = 0.2, log_stddev = 0.3 } }",
                          "{ value = 0.08, bounds = [-1, 1], prior = { mean = 0.09, stddev = 0.02 } }"}) {
-    const ModelFile model = with_priors(p1);
+    const Model model = with_priors(p1);
     const auto all = default_hyperparameters(make_prior(model), observe(model, 20, false), {"p1"}, {});
     const VectorXd x = internal_values(all);
     const auto sum_at = [&](Eigen::Index k, double step) {
@@ -186,7 +186,7 @@ TEST(HyperparametersTest, TheGradientOfPriorsIsThatOfTheirSum) {
 }
 
 TEST(HyperparametersTest, AFixedNoiseIsNoHyperparameter) {
-  const ModelFile& model = test::model("models/duffing.toml");
+  const Model& model = test::model("models/duffing.toml");
   for (const Hyperparameter& h : default_hyperparameters(make_prior(model), observe(model, 20, false), {}, {})) {
     EXPECT_NE(h.kind, Kind::noise_stddev);
     EXPECT_NE(h.kind, Kind::parameter);
@@ -195,7 +195,7 @@ TEST(HyperparametersTest, AFixedNoiseIsNoHyperparameter) {
 
 TEST(HyperparametersTest, NamesAreUnique) {
   for (const std::string& file : test::every_model()) {
-    const ModelFile& model = test::model(file);
+    const Model& model = test::model(file);
     const Prior prior = make_prior(model);
     std::set<int> in_features;
     for (const Latent& latent : prior.latents)
@@ -216,7 +216,7 @@ TEST(HyperparametersTest, NamesAreUnique) {
 }
 
 TEST(HyperparametersTest, AParameterThatIsNotThereOrHasNoRangeIsAnError) {
-  const ModelFile model = ModelFile::parse(R"toml(
+  const Model model = Model::parse(R"toml(
 name        = "cart"
 coordinates = ["x", "y"]
 [parameters]
@@ -232,7 +232,7 @@ kernel     = "se"
 features   = ["x"]
 directions = "acceleration"
 )toml",
-                                           "cart");
+                                   "cart");
   RandomStream random(seed);
   MatrixXd states(5, 10), values(2, 10);
   for (double& entry : states.reshaped()) entry = random.normal();
@@ -256,7 +256,7 @@ directions = "acceleration"
 }
 
 TEST(HyperparametersTest, AParameterThatStandsInAFeatureCannotBeEstimated) {
-  const ModelFile& model = test::model("models/arm_on_moving_plane.toml");
+  const Model& model = test::model("models/arm_on_moving_plane.toml");
   const Prior prior = make_prior(model);
   const std::vector<Observations> observations = observe(model, 10, false);
   EXPECT_NO_THROW(default_hyperparameters(prior, observations, {"m2"}, {}));
@@ -269,7 +269,7 @@ TEST(HyperparametersTest, AParameterThatStandsInAFeatureCannotBeEstimated) {
 }
 
 TEST(HyperparametersTest, TheScaleOfAnUnobservedAccelerationComesFromEqualKineticScale) {
-  const ModelFile& model = test::model("models/double_pendulum.toml");
+  const Model& model = test::model("models/double_pendulum.toml");
   const std::vector<Observations> observations = observe(model, 50, false, {2, 5});
   const Scales scales = default_scales(make_prior(model), observations);
   const VectorXd p = model.system->parameter_values();
@@ -285,7 +285,7 @@ TEST(HyperparametersTest, TheScaleOfAnUnobservedAccelerationComesFromEqualKineti
 }
 
 TEST(HyperparametersTest, AFeatureThatDoesNotVaryStillHasAScale) {
-  const ModelFile& model = test::model("models/surface.toml");
+  const Model& model = test::model("models/surface.toml");
   std::vector<Observations> observations = observe(model, 20, false);
   const StateLayout layout = model.system->layout();
   observations[0].states.row(layout.u(0)).setZero();
@@ -296,7 +296,7 @@ TEST(HyperparametersTest, AFeatureThatDoesNotVaryStillHasAScale) {
 }
 
 TEST(HyperparametersTest, ModelValuesPutEachNumberInItsPlace) {
-  const ModelFile& model = test::model("models/arm_on_moving_plane.toml");
+  const Model& model = test::model("models/arm_on_moving_plane.toml");
   const Prior prior = make_prior(model);
   const std::vector<Observations> observations = observe(model, 20, true);
   auto all = default_hyperparameters(prior, observations, {"m2"}, {});

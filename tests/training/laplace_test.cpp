@@ -1,4 +1,4 @@
-#include "gp2/laplace.hpp"
+#include "gp2/training/laplace.hpp"
 
 #include <array>
 #include <cmath>
@@ -21,8 +21,8 @@ using Kind = Hyperparameter::Kind;
 constexpr std::uint64_t seed = 60611;
 
 /// ddx = p x + r + friction, two parameters in which the likelihood is quadratic: their covariance is (Zᵀ C⁻¹ Z)⁻¹.
-const ModelFile& line() {
-  static const ModelFile model = ModelFile::parse(R"toml(
+const Model& line() {
+  static const Model model = Model::parse(R"toml(
 name        = "line"
 coordinates = ["x"]
 [parameters]
@@ -42,7 +42,7 @@ acceleration = ["0"]
 x  = [-1, 2]
 dx = [-1, 1]
 )toml",
-                                                  "line");
+                                          "line");
   return model;
 }
 
@@ -52,7 +52,7 @@ struct Problem {
   std::vector<Hyperparameter> hyperparameters;
 };
 
-Problem problem(const ModelFile& model, int n, const std::vector<std::string>& estimated, std::uint64_t of_seed = seed,
+Problem problem(const Model& model, int n, const std::vector<std::string>& estimated, std::uint64_t of_seed = seed,
                 double noise_stddev = 0.3) {
   GenerateOptions options{n, of_seed, VectorXd::Constant(model.system->nq(), noise_stddev)};
   const GeneratedData data = generate(model, options);
@@ -142,7 +142,7 @@ TEST(LaplaceTest, WhatIsAtABoundIsHeld) {
 TEST(LaplaceTest, ParametersThatEnterByTheirSumOnlyAreNamedUndetermined) {
   std::string text = line().text;
   text.replace(text.find("p*x + r"), 7, "p + 2*r");
-  const ModelFile model = ModelFile::parse(text, "sum");
+  const Model model = Model::parse(text, "sum");
   const Problem p = only(problem(model, 20, {"p", "r"}), {Kind::parameter});
   const LaplaceUncertainty uncertainty = laplace_uncertainty(p.prior, p.observations, p.hyperparameters, 1);
   EXPECT_TRUE(std::isinf(uncertainty.stddev[0]));
@@ -191,8 +191,8 @@ FitOptions one_run(bool standard_errors = true) {
 }
 
 // A wheel of radius r on an inertia J, driven through one rolling contact: only r²/J moves the carriage.
-const ModelFile& rolling() {
-  static const ModelFile model = ModelFile::parse(R"toml(
+const Model& rolling() {
+  static const Model model = Model::parse(R"toml(
 name        = "rolling"
 coordinates = ["x", "a"]
 [parameters]
@@ -216,7 +216,7 @@ x  = [-1, 2]
 a  = [0.4, 2.6]
 da = [-1, 1]
 )toml",
-                                                  "rolling");
+                                          "rolling");
   return model;
 }
 
@@ -224,7 +224,7 @@ TEST(LaplaceTest, ParametersKnownToAMillionthOfTheirBoxAreFittedToTheirOptimum) 
   // r of the model is 0.5 within [0, 1e4]: known to about 1e-7 of its box, a lengthscale to its order of magnitude
   std::string text = rolling().text;
   text.replace(text.find("bounds = [0.1, 5]"), 17, "bounds = [0.1, 1e4]");
-  const ModelFile model = ModelFile::parse(text, "wide");
+  const Model model = Model::parse(text, "wide");
   const Problem p = problem(model, 60, {"r"}, seed, 0.01);
   const FitReport report = fit(p.prior, p.observations, p.hyperparameters, one_run()).report;
   ASSERT_TRUE(report.uncertainty.has_value());
@@ -240,7 +240,7 @@ TEST(LaplaceTest, AFitAtTheEdgeOfItsModelSaysThatItHasNoStandardErrors) {
   std::string text = line().text;
   text.replace(text.find("p*x + r"), 7, "p*x + sqrt(r)");
   text.replace(text.find("value = 0.2"), 11, "value = 1e-7");
-  Problem p = problem(ModelFile::parse(text, "edge"), 20, {"r"});
+  Problem p = problem(Model::parse(text, "edge"), 20, {"r"});
   try {
     laplace_uncertainty(p.prior, p.observations, p.hyperparameters, 1);
     FAIL() << "no error";
@@ -269,7 +269,7 @@ TEST(LaplaceTest, NoFitWithoutParametersPaysForStandardErrors) {
 TEST(LaplaceTest, NotesSayWhichParametersAreKnownOnlyTogether) {
   std::string text = line().text;
   text.replace(text.find("p*x + r"), 7, "p + 2*r");
-  const Problem p = problem(ModelFile::parse(text, "sum"), 20, {"p", "r"});
+  const Problem p = problem(Model::parse(text, "sum"), 20, {"p", "r"});
   const FitReport report = fit(p.prior, p.observations, p.hyperparameters, one_run()).report;
   const std::vector<UncertaintyNote> notes = uncertainty_notes(report);
   ASSERT_EQ(notes.size(), 1U);
@@ -281,7 +281,7 @@ TEST(LaplaceTest, APriorDeterminesWhatDataDoNot) {
   std::string text = line().text;
   text.replace(text.find("p*x + r"), 7, "p + 2*r");
   text.replace(text.find("r = { value = 0.2,"), 18, "r = { value = 0.2, prior = { mean = 0.1, stddev = 0.05 },");
-  const Problem p = problem(ModelFile::parse(text, "sum"), 20, {"p", "r"});
+  const Problem p = problem(Model::parse(text, "sum"), 20, {"p", "r"});
   const FitReport report = fit(p.prior, p.observations, p.hyperparameters, one_run()).report;
   ASSERT_TRUE(report.uncertainty.has_value());
   const auto r = static_cast<Index>(report.hyperparameters.size()) - 1;

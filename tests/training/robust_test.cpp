@@ -1,11 +1,11 @@
-#include "gp2/robust.hpp"
+#include "gp2/training/robust.hpp"
 
 #include <set>
 
 #include <gmock/gmock.h>
 
-#include "gp2/evaluation.hpp"
-#include "gp2/generate.hpp"
+#include "gp2/inference/evaluation.hpp"
+#include "gp2/simulation/generate.hpp"
 #include "test_models.hpp"
 
 // Fits of data some of which are wrong.
@@ -19,7 +19,7 @@ using Eigen::VectorXd;
 constexpr std::uint64_t seed = 40731;
 
 struct Data {
-  const ModelFile& model;
+  const Model& model;
   Prior prior;
   std::vector<Observations> observations;
   std::vector<Hyperparameter> hyperparameters;
@@ -30,7 +30,7 @@ struct Data {
 
 // accelerations of a system with the noise of its model file
 Data data_of(const std::string& file, int n) {
-  const ModelFile& model = test::model(file);
+  const Model& model = test::model(file);
   Data data{model, make_prior(model), {}, {}, {}};
   const VectorXd noise = Eigen::Map<const VectorXd>(model.noise.stddev.data(), static_cast<Index>(model.noise.stddev.size()));
   const GeneratedData drawn = generate(model, {n, seed, noise});

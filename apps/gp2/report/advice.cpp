@@ -5,7 +5,7 @@
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
-#include "gp2/laplace.hpp"
+#include "gp2/training/laplace.hpp"
 #include "report/report_data.hpp"
 
 namespace gp2::command {

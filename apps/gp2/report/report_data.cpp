@@ -15,8 +15,8 @@
 
 #include "command.hpp"
 #include "gp2/error.hpp"
-#include "gp2/fit_problem.hpp"
-#include "gp2/generate.hpp"
+#include "gp2/jobs/fit_problem.hpp"
+#include "gp2/simulation/generate.hpp"
 
 namespace gp2::command {
 
@@ -50,13 +50,13 @@ double noise_of(const Posterior& posterior, int row) {
 
 // predictions and figures at states with measured accelerations
 ReportData data_at(const Posterior& posterior, const MatrixXd& states, const std::vector<int>& rows, const MatrixXd& measured,
-                   const std::shared_ptr<const Setting>& setting) {
+                   const std::shared_ptr<const OtherSystem>& other_system) {
   ReportData data;
   data.rows = rows;
   data.states = states;
   data.measured = measured;
   View view = View::all(View::Quantity::constrained_acceleration, *posterior.prior().system);
-  view.setting = setting;
+  view.other_system = other_system;
   const Prior& prior = prior_of(posterior.prior(), view);
   const System& judge = prior.judge();
   const VectorXd parameters = parameters_of(view, posterior.values().parameters);
@@ -64,7 +64,7 @@ ReportData data_at(const Posterior& posterior, const MatrixXd& states, const std
   data.noise_stddev.resize(std::ssize(rows));
   for (std::size_t k = 0; k < rows.size(); ++k) data.noise_stddev[static_cast<Index>(k)] = noise_of(posterior, rows[k]);
 
-  data.evaluation = evaluate_predictions(posterior, states, rows, measured, setting, /*n_threads=*/0);
+  data.evaluation = evaluate_predictions(posterior, states, rows, measured, other_system, /*n_threads=*/0);
   Posterior::Marginal prediction = posterior.marginal(view, states, /*n_threads=*/0);
   data.predicted = prediction.mean;
   data.stddev = prediction.stddev();
@@ -115,7 +115,7 @@ std::vector<ReportData> training_data(const FitFile& fit, const Posterior& poste
   for (std::size_t g = 0; g < fit.observations.size(); ++g) {
     const Observations& group = fit.observations[g];
     if (group.view.quantity != View::Quantity::constrained_acceleration || group.view.latent >= 0) continue;
-    ReportData data = data_at(posterior, group.states, group.view.rows, group.values, group.view.setting);
+    ReportData data = data_at(posterior, group.states, group.view.rows, group.values, group.view.other_system);
     data.name = all.empty() ? "training" : fmt::format("training {}", all.size() + 1);
     const bool elsewhere = g < fit.systems.size() && fit.systems[g];
     data.source = elsewhere ? fmt::format("measured on '{}'", fit.systems[g]->system->name()) : fit.data_source;
@@ -160,7 +160,7 @@ ReportData test_data(const ReportOptions& options, const FitFile& fit, const Pos
 }
 
 void add_truth(const ReportOptions& options, Report& report) {
-  const ModelFile truth = ModelFile::read(options.truth);
+  const Model truth = Model::read(options.truth);
   const System& home = *report.fit.model.system;
   if (truth.truth.empty()) {
     throw InputError(

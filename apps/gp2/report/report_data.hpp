@@ -7,9 +7,9 @@
 
 #include <Eigen/Core>
 
-#include "gp2/check.hpp"
-#include "gp2/evaluation.hpp"
-#include "gp2/fit_file.hpp"
+#include "gp2/files/fit_file.hpp"
+#include "gp2/inference/evaluation.hpp"
+#include "gp2/mechanics/check.hpp"
 
 namespace gp2::command {
 

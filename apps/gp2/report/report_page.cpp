@@ -6,9 +6,9 @@
 #include <fmt/ranges.h>
 #include <nlohmann/json.hpp>
 
-#include "gp2/csv.hpp"
+#include "gp2/base/version.hpp"
+#include "gp2/data/csv.hpp"
 #include "gp2/error.hpp"
-#include "gp2/version.hpp"
 #include "report/assets.hpp"
 #include "report/report_data.hpp"
 

@@ -7,8 +7,8 @@
 
 #include "command.hpp"
 #include "gp2/error.hpp"
-#include "gp2/generate.hpp"
-#include "gp2/resample.hpp"
+#include "gp2/jobs/resample.hpp"
+#include "gp2/simulation/generate.hpp"
 #include "reproduce/experiment.hpp"
 #include "reproduce/table.hpp"
 
@@ -32,7 +32,7 @@ struct Motion {
   }
 };
 
-Motion motion_of(const ModelFile& model, const Section& section) {
+Motion motion_of(const Model& model, const Section& section) {
   GenerateOptions options;
   options.n = section.integer("samples");
   options.seed = static_cast<std::uint64_t>(section.integer("seed"));
@@ -78,7 +78,7 @@ Split split_of(const Section& training, const Section& blocks) {
 }
 
 /// n samples that cover a motion best, each n's among the next one's.
-std::vector<int> informative(const ModelFile& model, const Motion& motion, int n) {
+std::vector<int> informative(const Model& model, const Motion& motion, int n) {
   ResampleOptions options;
   options.n = n;
   return resample(model, as_table(motion.measured, *model.system, model.name), options).rows;
@@ -109,10 +109,10 @@ double seconds_since(std::chrono::steady_clock::time_point start) {
 }
 
 /// What a method learns: the model of its own, or the one that moved.
-std::vector<ModelFile> models_of(const Section& definition, const std::filesystem::path& experiments) {
-  std::vector<ModelFile> models;
+std::vector<Model> models_of(const Section& definition, const std::filesystem::path& experiments) {
+  std::vector<Model> models;
   for (const Section& section : definition.sections("method")) {
-    models.push_back(ModelFile::read(experiments / section.text("model", definition.text("model"))));
+    models.push_back(Model::read(experiments / section.text("model", definition.text("model"))));
   }
   return models;
 }
@@ -180,9 +180,9 @@ void print(const std::vector<Table::Row>& rows) {
 
 void reproduce_arm_on_surface(const ReproduceOptions& options) {
   const Section definition = Section::read(options.experiments / "arm_on_surface.toml");
-  const ModelFile model = ModelFile::read(options.experiments / definition.text("model"));
+  const Model model = Model::read(options.experiments / definition.text("model"));
   const System& system = *model.system;
-  const std::vector<ModelFile> models = models_of(definition, options.experiments);
+  const std::vector<Model> models = models_of(definition, options.experiments);
   const std::vector<double> sizes = definition.numbers("n");
   const Section training = definition.section("training"), elsewhere = definition.section("independent");
 
@@ -238,8 +238,8 @@ void reproduce_arm_on_surface(const ReproduceOptions& options) {
 
 void reproduce_arm_mass(const ReproduceOptions& options) {
   const Section definition = Section::read(options.experiments / "arm_mass.toml");
-  const ModelFile moving = ModelFile::read(options.experiments / definition.text("truth"));
-  const ModelFile model = ModelFile::read(options.experiments / definition.text("model"));
+  const Model moving = Model::read(options.experiments / definition.text("truth"));
+  const Model model = Model::read(options.experiments / definition.text("model"));
   const Section truth = definition.section("true"), stop = definition.section("stop");
   const Motion whole = motion_of(moving, definition.section("training"));
   const Motion candidates = whole.only(samples_of(definition.section("training")));

@@ -10,8 +10,8 @@
 
 #include "command.hpp"
 #include "gp2/error.hpp"
-#include "gp2/generate.hpp"
-#include "io/toml.hpp"
+#include "gp2/simulation/generate.hpp"
+#include "model/toml.hpp"
 
 namespace gp2::command {
 
@@ -141,7 +141,7 @@ std::map<std::string, int> grid_of(const Section& section) {
 
 ExperimentSystem::ExperimentSystem(const Section& section, const std::filesystem::path& experiments,
                                    const std::vector<Method>& methods)
-    : name(section.text("name")), model(ModelFile::read(experiments / section.text("model"))) {
+    : name(section.text("name")), model(Model::read(experiments / section.text("model"))) {
   for (const Method& method : methods) {
     if (method.estimate) parameters[method.mean] = section.section("parameters").texts(method.mean);
   }
@@ -163,7 +163,7 @@ std::filesystem::path published(const std::filesystem::path& data, const std::st
 
 }  // namespace
 
-CsvTable observations_of(const ModelFile& model, const std::string& pattern, const std::optional<std::filesystem::path>& data,
+CsvTable observations_of(const Model& model, const std::string& pattern, const std::optional<std::filesystem::path>& data,
                          int run, int n) {
   if (data) return CsvTable::read(published(*data, pattern, run));
   GenerateOptions options;
@@ -173,15 +173,15 @@ CsvTable observations_of(const ModelFile& model, const std::string& pattern, con
   return as_table(generate(model, options), *model.system, fmt::format("{}, generated run {}", model.system->name(), run));
 }
 
-Line line_of(const Section& line, const ModelFile& model) {
+Line line_of(const Section& line, const Model& model) {
   // what the model draws is given instead, ranges first: expressions may use them
-  std::vector<ModelFile::SamplingRule> ranges, values;
+  std::vector<Model::SamplingRule> ranges, values;
   GenerateOptions options;
   Line out;
-  for (const ModelFile::SamplingRule& drawn : model.sampling) {
+  for (const Model::SamplingRule& drawn : model.sampling) {
     const std::vector<std::string> states = model.system->state_names();
     if (std::find(states.begin(), states.end(), drawn.name) == states.end()) continue;
-    ModelFile::SamplingRule rule{drawn.name, std::nullopt, model.expression("0"), 0};
+    Model::SamplingRule rule{drawn.name, std::nullopt, model.expression("0"), 0};
     if (line.is_list(drawn.name)) {
       const std::vector<double> ends = line.numbers(drawn.name, 2);
       rule.range = std::pair(ends[0], ends[1]);
@@ -193,7 +193,7 @@ Line line_of(const Section& line, const ModelFile& model) {
     if (line.has(drawn.name)) rule.value = model.expression(line.text(drawn.name));
     values.push_back(std::move(rule));
   }
-  ModelFile along = model;
+  Model along = model;
   along.sampling = std::move(ranges);
   along.sampling.insert(along.sampling.end(), values.begin(), values.end());
   options.noise_stddev = VectorXd::Zero(model.system->nq());

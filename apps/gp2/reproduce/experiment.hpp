@@ -10,11 +10,11 @@
 
 #include <Eigen/Core>
 
-#include "gp2/csv.hpp"
+#include "gp2/data/csv.hpp"
 #include "gp2/error.hpp"
-#include "gp2/fit_problem.hpp"
-#include "gp2/model_file.hpp"
-#include "gp2/training.hpp"
+#include "gp2/fit.hpp"
+#include "gp2/jobs/fit_problem.hpp"
+#include "gp2/model.hpp"
 
 namespace gp2::command {
 
@@ -77,7 +77,7 @@ struct Method {
 /// One system of an experiment: its model, and the grid that predictions are tested on.
 struct ExperimentSystem {
   std::string name;
-  ModelFile model;
+  Model model;
   std::map<std::string, std::vector<std::string>> parameters;  // to estimate, per mean: "zero", "force"
   Eigen::MatrixXd grid_states, grid_truth;                     // (layout size × points), (nq × points), noise-free
 
@@ -88,7 +88,7 @@ struct ExperimentSystem {
 
 /// Noisy observations of a run as a log: the published file, or drawn from the same distributions by the number of the run.
 /// @param pattern  of the published files, "{}" standing for the run
-CsvTable observations_of(const ModelFile& model, const std::string& pattern, const std::optional<std::filesystem::path>& data,
+CsvTable observations_of(const Model& model, const std::string& pattern, const std::optional<std::filesystem::path>& data,
                          int run, int n);
 
 /// States along a line, and the true accelerations there. `line` has one range from left to right, or several, numbers and
@@ -97,7 +97,7 @@ struct Line {
   std::string name;  // of the entry that runs
   Eigen::MatrixXd states, truth;
 };
-Line line_of(const Section& line, const ModelFile& model);
+Line line_of(const Section& line, const Model& model);
 
 /// How many runs to do: those asked for, at most those that are published.
 /// @throws InputError when more are asked for than there are.
@@ -115,7 +115,7 @@ struct Trained {
 };
 /// @param estimate  parameters, where the method estimates any
 /// @param start     where the first restart begins, of hyperparameters by the same names; empty: at their own values
-Trained train(const ModelFile& model, const std::vector<std::string>& estimate, const Method& method, Protocol::Name protocol,
+Trained train(const Model& model, const std::vector<std::string>& estimate, const Method& method, Protocol::Name protocol,
               const CsvTable& log, int run, int n_threads, const std::vector<Hyperparameter>& start = {});
 
 /// How well a method predicts on the grid.

@@ -4,8 +4,8 @@
 #include <fmt/format.h>
 
 #include "command.hpp"
-#include "gp2/evaluation.hpp"
-#include "gp2/generate.hpp"
+#include "gp2/inference/evaluation.hpp"
+#include "gp2/simulation/generate.hpp"
 #include "reproduce/experiment.hpp"
 #include "reproduce/table.hpp"
 
@@ -23,11 +23,11 @@ Protocol::Name protocol_of(const ReproduceOptions& options) { return options.pro
 
 /// GP² trained on the observations that a section names.
 struct TrainedFigure {
-  ModelFile model;
+  Model model;
   Trained trained;
 
   TrainedFigure(const Section& section, const Section& restarts, const ReproduceOptions& options)
-      : model(ModelFile::read(options.experiments / section.text("model"))),
+      : model(Model::read(options.experiments / section.text("model"))),
         trained(train(model, {}, method(section, restarts), protocol_of(options),
                       observations_of(model, section.text("data"), options.data, 0, section.integer("n")), 0, options.threads)) {}
 
@@ -65,8 +65,8 @@ Table along(const Line& line, const System& system, const Posterior& posterior, 
 }
 
 // M⁻¹F + truth
-MatrixXd true_unconstrained(const ModelFile& model, const MatrixXd& states) {
-  ModelFile free = model;
+MatrixXd true_unconstrained(const Model& model, const MatrixXd& states) {
+  Model free = model;
   free.system = model.system->without_constraints();
   return true_acceleration(free, states);
 }
@@ -81,9 +81,9 @@ void reproduce_fig3a(const ReproduceOptions& options) {
   along(line, *figure.model.system, figure.posterior(), here, line.truth).write(options.output / "fig3a_same_surface");
 
   // the same latents under the other surface (eq. 10)
-  const ModelFile other = ModelFile::read(options.experiments / definition.text("other"));
+  const Model other = Model::read(options.experiments / definition.text("other"));
   View there = here;
-  there.setting = make_setting(figure.model, other, figure.trained.problem.prior_options);
+  there.other_system = make_other_system(figure.model, other, figure.trained.problem.prior_options);
   const Line line_there = line_of(definition.section("line"), other);
   along(line_there, *other.system, figure.posterior(), there, line_there.truth).write(options.output / "fig3a_other_surface");
   plot(options, "fig3a");

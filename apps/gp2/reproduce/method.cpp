@@ -5,10 +5,10 @@
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
-#include "gp2/baseline.hpp"
+#include "gp2/baselines/baseline.hpp"
 #include "gp2/error.hpp"
-#include "gp2/evaluation.hpp"
-#include "gp2/generate.hpp"
+#include "gp2/inference/evaluation.hpp"
+#include "gp2/simulation/generate.hpp"
 #include "reproduce/experiment.hpp"
 
 namespace gp2::command {
@@ -109,7 +109,7 @@ void start_from(const std::vector<Hyperparameter>& start, std::vector<Hyperparam
 
 }  // namespace
 
-Trained train(const ModelFile& model, const std::vector<std::string>& estimate, const Method& method, Protocol::Name protocol,
+Trained train(const Model& model, const std::vector<std::string>& estimate, const Method& method, Protocol::Name protocol,
               const CsvTable& log, int run, int n_threads, const std::vector<Hyperparameter>& start) {
   FitProblemOptions options;
   options.mean = method.mean == "force" ? Prior::Mean::force : Prior::Mean::zero;

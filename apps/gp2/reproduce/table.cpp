@@ -6,7 +6,7 @@
 #include <fmt/ranges.h>
 
 #include "command.hpp"
-#include "gp2/csv.hpp"
+#include "gp2/data/csv.hpp"
 
 namespace gp2::command {
 

@@ -9,7 +9,7 @@
 
 #include "command.hpp"
 #include "gp2/error.hpp"
-#include "gp2/evaluation.hpp"
+#include "gp2/inference/evaluation.hpp"
 #include "reproduce/experiment.hpp"
 #include "reproduce/table.hpp"
 

@@ -47,7 +47,7 @@ std::vector<double> published_error(const Section& definition, const ReproduceOp
 }
 
 std::vector<Rollout> roll_out(const Section& definition, const ReproduceOptions& options) {
-  const ModelFile model = ModelFile::read(options.experiments / definition.text("model"));
+  const Model model = Model::read(options.experiments / definition.text("model"));
   const System& system = *model.system;
   const CsvTable log = observations_of(model, definition.text("data"), options.data, 0, definition.integer("n"));
   const Protocol::Name protocol = options.protocols.back();
@@ -98,7 +98,7 @@ std::vector<Rollout> roll_out(const Section& definition, const ReproduceOptions&
 // errors to the true surface and, where a method has fitted its own, to that
 void reproduce_trajectories(const ReproduceOptions& options, const std::string& name) {
   const Section definition = Section::read(options.experiments / (name + ".toml"));
-  const ModelFile model = ModelFile::read(options.experiments / definition.text("model"));
+  const Model model = Model::read(options.experiments / definition.text("model"));
   const System& system = *model.system;
   const std::vector<Rollout> rollouts = roll_out(definition, options);
   Table table, summary;

@@ -1,0 +1,31 @@
+#pragma once
+
+#include <cstddef>
+#include <filesystem>
+#include <string>
+#include <string_view>
+
+namespace gp2 {
+
+/// Writes `content` to a file whole or not at all: into a temporary file beside it, flushed, then renamed over `path`. The
+/// temporary file has no name until it is whole, where the file system can do that: then nothing is left of it however the
+/// process ends. A link stays and its target is replaced; an old file's permissions are kept, and one that is read-only is not
+/// replaced; a device or pipe, say /dev/stdout, is written to as it is.
+/// @throws InputError naming the path and the system's reason when that fails; an old file at `path` is then intact.
+void write_file(const std::filesystem::path& path, std::string_view content);
+
+/// @throws InputError as write_file would, for what can be told before there is content: no such folder, a folder of that name,
+/// no permission.
+void require_writable(const std::filesystem::path& path);
+
+/// The largest file that is read, 1 GiB.
+inline constexpr std::size_t max_file_size = std::size_t{1} << 30;
+
+/// The content of a file, or of a pipe or device to its end.
+/// @throws InputError when it cannot be read, holds more than `max_size` bytes, or is a pipe that nothing writes to.
+std::string read_file(const std::filesystem::path& path, std::size_t max_size = max_file_size);
+
+/// The shortest text that reads back to the same double.
+std::string shortest(double value);
+
+}  // namespace gp2

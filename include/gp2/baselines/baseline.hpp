@@ -1,0 +1,54 @@
+#pragma once
+
+#include <optional>
+#include <string>
+#include <string_view>
+#include <vector>
+
+#include <Eigen/Core>
+
+#include "gp2/fit.hpp"
+
+namespace gp2 {
+
+/// A model of ddq that knows no mechanics (Geist & Trimpe 2020, sec. 5): multi-output Gaussian processes with inputs and outputs
+/// standardised by the training data (mean 0, standard deviation 1),
+///
+///     se   ddq_j ~ GP(0, s_j² k_SE), each output with lengthscales of its own,
+///     icm  K = B₁ k_SE,
+///     lmc  K = B₁ k_SE + B₂ k_bias + B₃ k_linear,    B_i = W_iW_iᵀ + diag κ_i,  W_i (nq × nq).
+///
+/// It is a Prior like any other: its system has no constraints, so that ddq = ā, and its loadings are learned. Observations,
+/// views and predictions need to know nothing of it.
+struct Baseline {
+  enum class Kind { se, icm, lmc };
+
+  Kind kind = Kind::se;
+  Eigen::VectorXd output_mean;                   // of the training ddq (nq): the prior mean
+  Eigen::VectorXd feature_mean, feature_stddev;  // of the features in training (D), in which k_linear is x·x'
+
+  static const std::vector<std::string>& words();  // "se", "icm", "lmc": the words of commands and files
+  static std::string word(Kind kind);
+  static std::optional<Kind> kind_of(std::string_view word);
+};
+
+/// A baseline with the means and standard deviations of what it is to learn from.
+///
+/// @param latent  whose features it has
+Baseline standardised_by(const std::vector<Observations>& observations, const Latent& latent, Baseline::Kind kind);
+
+/// What is tuned of a baseline prior, with the published starts and bounds, in units of the data's standard deviations:
+/// lengthscales in [0.5, 20]; the signal of `se` in [0.1, 1]; W and κ without bounds that matter. No hyper-priors.
+///
+/// @param observations  of all accelerations, in order
+std::vector<Hyperparameter> baseline_hyperparameters(const Prior& prior, const std::vector<Observations>& observations);
+
+/// 30 restarts, and a coarser tolerance: baselines have many optima, so that starts count for more than digits.
+FitOptions baseline_fit_options();
+
+/// fit() of a baseline. The outputs of `se` are independent and are trained one by one: nq problems of N instead of one of nq N;
+/// restart k of the report adds up the k-th best of each output.
+Fit fit_baseline(Baseline::Kind kind, const Prior& prior, const std::vector<Observations>& observations,
+                 const std::vector<Hyperparameter>& hyperparameters, const FitOptions& options = baseline_fit_options());
+
+}  // namespace gp2

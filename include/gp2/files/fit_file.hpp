@@ -1,0 +1,53 @@
+#pragma once
+
+#include <filesystem>
+#include <memory>
+#include <string>
+#include <string_view>
+#include <vector>
+
+#include "gp2/fit.hpp"
+#include "gp2/model.hpp"
+
+namespace gp2 {
+
+/// A fitted model as a file: the model's text, the options its prior was made with, the data and the hyperparameters. The
+/// posterior is computed anew from these, so a file loaded gives the same bits as before it was saved.
+struct FitFile {
+  /// 6: a checksum and options, values that are not measured; 5: robots; 4: values with a noise of their own; 3: mechanics that
+  /// are code; 2: observations of other systems. All of them are read; 6 is written.
+  static constexpr int format_version = 6;
+
+  Model model;
+  PriorOptions prior_options;
+  std::string data_source;  // where the data came from, for people
+  std::vector<Observations> observations;
+  /// Per Observations: the model file of its view's other system; null where it has none. May be shorter.
+  std::vector<std::shared_ptr<const Model>> systems;
+  FitReport report;     // with the fitted hyperparameters
+  std::string options;  // what was asked of the fit, a JSON object (fit_options_json); empty: not known
+
+  [[nodiscard]] Prior prior() const { return make_prior(model, prior_options); }
+  /// The prior conditioned on the data, under the fitted hyperparameters.
+  [[nodiscard]] Posterior posterior() const;
+
+  /// Written whole or not at all. @throws InputError when that fails, or `systems` lacks the model of another system.
+  void write(const std::filesystem::path& path) const;
+  /// @throws InputError naming the file and what is wrong: not a fit, of a newer format, cut short, changed after it was written
+  ///   (its checksum is of another content; the text says how a change that is meant is made good), or with values out of place.
+  static FitFile read(const std::filesystem::path& path);
+  /// @param text  what the file holds
+  /// @param name  stands for the file in messages
+  static FitFile parse(std::string_view text, const std::string& name);
+  /// The same of a fit whose mechanics are code: it holds what its model declares, and is told the code again. The code must be
+  /// that of the fit, for the posterior to be.
+  /// @param mechanics  asked for every model of the file whose mechanics are code; the declaration's name tells which
+  /// @throws InputError also when there is no such model.
+  static FitFile read(const std::filesystem::path& path, const MechanicsSource& mechanics);
+};
+
+/// Starting values for hyperparameters by name, from {"name": value, …} or a FitFile.
+/// @throws InputError naming the file, an unknown name (with those there are), or a value outside its bounds.
+void read_start_values(const std::filesystem::path& path, std::vector<Hyperparameter>& hyperparameters);
+
+}  // namespace gp2

@@ -1,0 +1,83 @@
+#pragma once
+
+#include <map>
+#include <optional>
+#include <string>
+#include <vector>
+
+#include <Eigen/Core>
+
+#include "gp2/data/csv.hpp"
+#include "gp2/model.hpp"
+#include "gp2/smoothing/smoother.hpp"
+
+namespace gp2 {
+
+struct DeriveOptions {
+  std::map<std::string, std::string> columns = {};  // model's name -> log's name, before the model's own [columns]
+  std::string episode_column = {};                  // empty: "episode" where the log has it
+  std::vector<std::string> episodes = {};           // to take, by what the column says; empty: all of them
+  std::vector<std::string> keep = {};               // further columns of the log to pass on
+  double rate = 0;                // rows per second, evenly from the first sample of an episode; 0: where there are samples
+  int every = 1;                  // of these rows, the first and then each so many
+  bool hold_constraints = false;  // condition each row on the constraints
+  Smoothness smoothness = Smoothness::matern92;
+  double outlier_threshold = 5;  // as SmootherFitOptions
+  int n_threads = 0;             // 0: all cores; the numbers do not depend on it
+};
+
+/// What became of one column of the log in one episode.
+struct DerivedSeries {
+  int coordinate = 0;           // of the system
+  int episode = 0;              // among DerivedData::episodes
+  SmootherModel model;          // of the positions about their mean
+  bool noise_at_least = false;  // the noise ended at that of rounding to the resolution
+  bool shared_model = false;    // too short for a model of its own: the median of the others
+  double resolution = 0;        // step of the encoder; 0: none found
+  double bandwidth = 0;         // up to which the motion stands out of the noise [Hz]
+  int used = 0;                 // measurements
+  int missing = 0;              // empty cells and NaN
+  int repeated = 0;             // the same value at the same time
+  int outliers = 0;             // distrusted
+  int wraps = 0;                // jumps of 2π taken out
+  int gaps = 0;                 // spaces of more than three usual ones
+  double longest_gap = 0;       // [s]
+};
+
+/// Motions with their derivatives, as a fit wants them.
+struct DerivedData {
+  std::vector<std::string> episodes;  // what the column says; one empty text without such a column
+  std::vector<int> episode;           // of each row (N)
+  Eigen::MatrixXd states;             // [q; dq; t; u] (layout size × N), NaN where unknown
+  Eigen::MatrixXd accelerations;      // ddq (nq × N), NaN where unknown
+  Eigen::MatrixXd stddev;             // of q, dq, ddq (3 nq × N), NaN where not measured
+  std::vector<int> measured;          // coordinates the log has
+  std::vector<int> completed;         // coordinates that follow from them
+  std::vector<int> independent;       // accelerations that are independent measurements
+  std::vector<DerivedSeries> series;  // coordinate by coordinate, episode by episode
+  std::vector<std::string> kept_names;
+  std::vector<std::vector<std::string>> kept;  // cells of each kept column (N)
+  std::string episode_column;                  // its name; empty without one
+  std::vector<std::string> notes;              // what a person should know
+};
+
+/// Positions, and velocities where logged, to velocities and accelerations with a standard deviation for each value.
+///
+/// Each coordinate of each episode is smoothed by itself (smoother.hpp), with a model of its own. Inputs go through the filter
+/// that the positions went through. Coordinates that are not in the log are solved for from the constraints, the others held:
+/// positions and velocities by Newton's method, accelerations from A ddq = b.
+///
+/// With `hold_constraints` each row's estimate z = (q, dq, ddq) ~ N(ẑ, Σ) is conditioned on c = 0, ċ = 0 and A ddq = b,
+/// linearised where it ends: z ← ẑ + Σ Jᵀ (J Σ Jᵀ)⁺ (−r(z) − J (ẑ − z)), J = ∂r/∂z.
+///
+/// @throws InputError naming the log, episode, column and row: no time, no coordinate, time that runs backwards, too few
+///   samples, a column that never moves, an unknown episode or column, coordinates that the log leaves open.
+/// @throws NumericalError when Newton's method does not reach the constraints.
+DerivedData derive(const Model& model, const CsvTable& log, const DeriveOptions& options = {});
+
+/// Columns: the episode where there is one, t, q, dq, u, ddq as far as known, NAME_std of what was measured (of accelerations:
+/// of independent ones), what is kept.
+/// @param name  stands for the table in messages
+CsvTable as_table(const DerivedData& data, const System& system, std::string name);
+
+}  // namespace gp2

@@ -1,0 +1,131 @@
+#pragma once
+
+#include <filesystem>
+#include <map>
+#include <memory>
+#include <optional>
+#include <string>
+#include <vector>
+
+#include "gp2/data/csv.hpp"
+#include "gp2/data/log_reader.hpp"
+#include "gp2/files/fit_file.hpp"
+#include "gp2/fit.hpp"
+#include "gp2/model.hpp"
+
+namespace gp2 {
+
+/// Measurements as a table, and the system they were taken on.
+struct Log {
+  CsvTable table;
+  std::shared_ptr<const Model> model = nullptr;  // of that system; null: the model that is fitted
+};
+
+/// Another quantity that is measured or known at some states: the columns of its rows that the table holds, at least one.
+struct SideInformation {
+  View::Quantity quantity = View::Quantity::unconstrained_acceleration;
+  std::string latent;  // only what this latent adds, by its name; empty: everything
+  Log log;
+};
+
+/// What a person asks of a fit beyond the model and its logs.
+struct FitProblemOptions {
+  std::map<std::string, std::string> columns;  // model's name -> log's name, before the model's own [columns]
+  std::vector<std::string> observe;            // accelerations to observe; empty: those whose deviations the log states, or all
+  Prior::Mean mean = Prior::Mean::zero;
+  std::optional<Latent::Base> base;                  // replaces the directions of the model's latent
+  std::optional<Baseline::Kind> baseline;            // learns ddq without mechanics, instead of the model's latents
+  std::optional<std::vector<std::string>> estimate;  // parameters; not given: those the model wants estimated
+  std::optional<double> noise_stddev;                // for every observed row; not given: the log's own, or the model's [noise]
+  bool estimate_noise = false;
+  /// Of deviations that a log states a common factor is estimated, since no smoother knows all errors of a sensor: on real logs
+  /// they are too small, and a fit that believes them learns noise. True: they are taken as they are. Under the protocol of the
+  /// paper and for baselines they are in any case.
+  bool trust_stated_noise = false;
+  Protocol protocol;
+  /// A discrepancy latent beside the model's one, where that acts in every direction, under the standard protocol with
+  /// hyper-priors.
+  bool discrepancy = true;
+  std::optional<int> max_points;            // of each log: the first of a shuffle by `seed`
+  std::optional<double> also_noise_stddev;  // of every row that is known; not given: [noise], where it is an acceleration
+  std::optional<double> time_step;          // Δt of a known next velocity
+  bool project = false;                     // states onto the constraints, at the model's parameters, before anything else
+  bool robust = false;                      // values that disagree with all others are to be distrusted
+  std::uint64_t seed = 0;
+};
+
+/// A fit ready to run.
+struct FitProblem {
+  PriorOptions prior_options;
+  Prior prior;
+  std::vector<Observations> observations;             // of each log, then of each knowledge
+  std::vector<std::shared_ptr<const Model>> systems;  // per Observations: its model where that is another; for FitFile
+  std::vector<Hyperparameter> hyperparameters;
+  std::vector<std::vector<int>> lines;  // per Observations: the line in its log of each state
+  bool robust = false;
+  std::vector<std::string> notes;  // what a person should know: columns taken by alias, states off the constraint, …
+};
+
+/// Reads logs of accelerations, and what else is known, into a fit of a model. A log with a column NAME_std beside an
+/// acceleration states the noise of each of its values. An empty cell of what is measured, or of its NAME_std, is a value that
+/// is not measured; rows without any are left out, and the notes say how many of each.
+/// @throws InputError for missing columns, bad cells, unknown names, a log's model that does not fit (make_other_system), noise
+/// that is
+///   missing, not positive, or too small for double precision.
+FitProblem make_fit_problem(const Model& model, const std::vector<Log>& logs, const std::vector<SideInformation>& also,
+                            const FitProblemOptions& options);
+FitProblem make_fit_problem(const Model& model, const CsvTable& log, const FitProblemOptions& options);
+
+/// How a problem is fitted unless told otherwise: a baseline has options of its own.
+FitOptions default_fit_options(const FitProblem& problem);
+
+/// What was asked of a fit, for FitFile: a flat JSON object under the names of gp2 fit's options. What was not given is left out;
+/// with the logs, or the observations of the FitFile, it is enough to fit again to the same bits.
+/// @param start  values that were given to start from, as "start"; empty: none
+std::string fit_options_json(const FitProblemOptions& asked, const FitOptions& options,
+                             const std::vector<Hyperparameter>& start = {});
+
+/// fit() or, of a baseline, fit_baseline(), or fit_robust() where that is asked for.
+Fit fit(const FitProblem& problem, const FitOptions& options);
+
+/// Starting values from a file, as read_start_values. Bounds are the optimiser's: where it does not run, at max_iterations 0, a
+/// start outside of them is taken; they are widened to hold it, and the notes say so.
+void read_start(const std::filesystem::path& path, int max_iterations, FitProblem& problem);
+
+/// What a person should know of a fit: parameters at a bound, uncertainty_notes, and noise at its lower bound.
+std::vector<std::string> notes_of(const FitReport& report);
+
+/// What a robust fit distrusts: how many values, and the worst of them with their lines in the log.
+std::vector<std::string> distrust_notes(const FitProblem& problem, const FitReport& report);
+
+/// Which latent of a prior has a name. @throws InputError naming `option` and the latents there are.
+int latent_index(const Prior& prior, const std::string& name, const std::string& option);
+
+/// A reader of a log that knows the columns by `columns` (model's name -> log's name), then by the model's own [columns].
+/// @throws InputError when `columns` names what the model or the log does not have.
+LogReader open_log(const Model& model, const CsvTable& log, const std::map<std::string, std::string>& columns);
+
+/// States of a log for a prior and a view, with the columns that only the constraint residuals read where the log has them.
+struct LogStates {
+  Eigen::MatrixXd states;
+  Eigen::MatrixXd accelerations;  // those asked for (accelerations × N); NaN: not measured
+  std::vector<std::string> notes;
+};
+LogStates read_log_states(const Prior& prior, const View& view, const Model& model, const CsvTable& log,
+                          const std::map<std::string, std::string>& columns, const std::vector<std::string>& accelerations = {});
+
+/// All that a log has of states and accelerations.
+struct WholeLog {
+  Eigen::MatrixXd states;            // NaN where neither the model reads an entry nor the log has it (layout size × N)
+  Eigen::MatrixXd accelerations;     // NaN where not measured, or not in the log (nq × N)
+  std::vector<std::string> missing;  // accelerations that are not in the log
+  std::vector<int> stated;           // rows of accelerations whose standard deviations the log states
+};
+/// @throws InputError for a missing column that the model's prior reads, and as LogReader::stddevs.
+WholeLog read_whole_log(const Model& model, LogReader& reader);
+
+/// Indices of named accelerations; all of them when `names` is empty.
+/// @throws InputError listing the accelerations there are.
+std::vector<int> acceleration_rows(const System& system, const std::vector<std::string>& names, const std::string& option);
+
+}  // namespace gp2

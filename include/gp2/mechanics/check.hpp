@@ -1,0 +1,72 @@
+#pragma once
+
+#include <optional>
+#include <string>
+#include <vector>
+
+#include <Eigen/Core>
+
+#include "gp2/mechanics/udwadia_kalaba.hpp"
+
+namespace gp2 {
+
+/// One thing a check looked at.
+struct Finding {
+  enum class Level { good, warning, error };
+  Level level = Level::good;
+  std::string text;
+};
+
+/// The largest violation of a position- or velocity-level constraint over a batch of states.
+struct ConstraintViolation {
+  double relative = 0;  // |c| / Σ_j |A_j| spread(q_j), spread over the batch; velocities for velocity-level rows
+  double value = 0;     // c itself
+  int state = 0;
+  std::string constraint;
+};
+
+/// States that are off the constraint by more than this fraction of its scale deserve a warning.
+inline constexpr double constraint_violation_tolerance = 1e-6;
+
+/// @returns nothing when the system has no such constraint, or the states lack what it reads.
+std::optional<ConstraintViolation> largest_violation(const System& system, const Eigen::Ref<const Eigen::MatrixXd>& states,
+                                                     const Eigen::Ref<const Eigen::VectorXd>& parameters);
+
+/// States where A has a lower rank than at others: a constraint lets go there, or follows from the rest. Unknown, and none, after
+/// a fault.
+struct LowerRank {
+  int usual = 0;            // the highest rank
+  int lowest = 0;           // of A over the states
+  std::vector<int> states;  // where it is below the highest, in order
+};
+LowerRank states_of_lower_rank(const MechanicsBatch& mechanics);
+/// The same of any number of states, in the memory of a few.
+LowerRank states_of_lower_rank(const System& system, const Eigen::Ref<const Eigen::MatrixXd>& states,
+                               const Eigen::Ref<const Eigen::VectorXd>& parameters);
+
+/// Whether measured accelerations obey A ddq = b to rounding: then they were computed from each other, and only nq − rank(A) of
+/// them are independent measurements. Treating all as independent makes an estimated noise collapse to zero.
+///
+/// @param accelerations  (nq × N); states with one that is not measured (NaN) are left out
+/// @returns the rows of ddq to observe instead (the best-conditioned independent set); nothing when the columns are independent.
+std::optional<std::vector<int>> dependent_columns(const System& system, const Eigen::Ref<const Eigen::MatrixXd>& states,
+                                                  const Eigen::Ref<const Eigen::VectorXd>& parameters,
+                                                  const Eigen::Ref<const Eigen::MatrixXd>& accelerations);
+
+/// Is the system well-posed at these states? M symmetric and positive definite or completed by A, A of constant rank, its rows
+/// neither nearly zero nor nearly redundant, b in the range of A, derivatives in the parameters equal to finite differences, A
+/// and b equal to the second derivative of the constraints along a motion.
+///
+/// @param states  (layout size × N), as good as on the constraint
+std::vector<Finding> check_system(const System& system, const Eigen::Ref<const Eigen::MatrixXd>& states,
+                                  const Eigen::Ref<const Eigen::VectorXd>& parameters);
+
+/// How a log fits the system: states on the constraint, accelerations on A ddq = b, independent columns.
+///
+/// @param accelerations  (nq × N); NaN where not measured: A ddq = b is looked at where all are
+/// @param stated         rows of ddq whose standard deviations the log states: those that a fit observes; empty: all
+std::vector<Finding> check_data(const System& system, const Eigen::Ref<const Eigen::MatrixXd>& states,
+                                const Eigen::Ref<const Eigen::VectorXd>& parameters,
+                                const Eigen::Ref<const Eigen::MatrixXd>& accelerations, const std::vector<int>& stated = {});
+
+}  // namespace gp2

@@ -1,0 +1,154 @@
+#pragma once
+
+#include <filesystem>
+#include <functional>
+#include <map>
+#include <memory>
+#include <optional>
+#include <string>
+#include <string_view>
+#include <utility>
+#include <vector>
+
+#include <Eigen/Core>
+
+#include "gp2/baselines/baseline.hpp"
+#include "gp2/mechanics/symbolic_system.hpp"
+#include "gp2/prior.hpp"
+#include "gp2/robots/robot.hpp"
+
+namespace gp2 {
+
+class RobotExpressions;
+
+/// What stands in for the file that a model file names as its robot.
+using RobotSource = std::function<RobotDescription(const std::string& file)>;
+
+/// Code that gives the equations of a system, which a model file only declares: a CallableSystem, say, or a System of one's own.
+/// What it returns must go by the coordinates, inputs and parameters declared.
+using MechanicsSource = std::function<std::shared_ptr<const System>(const SystemDeclaration& declaration)>;
+
+/// A mechanical system and its prior as text (TOML; docs/model-files.md has every key). The equations of the system may come from
+/// code instead; everything else is the same then.
+class Model {
+ public:
+  /// @throws InputError with file, line, key, the rule, the value got and the mend.
+  static Model read(const std::filesystem::path& path);
+  /// @param name  stands for the file in messages; its folder is where a relative robot = "FILE" is looked for
+  static Model parse(std::string text, std::string name);
+  static Model parse(std::string text, std::string name, const RobotSource& robot);
+
+  /// The same of a file without [mechanics] and [constraints]: M, A, b and F come from code.
+  /// @throws InputError also when the file has one of the two, or `mechanics` is empty, returns nothing, or a system that goes by
+  ///   other coordinates, inputs or parameters.
+  static Model read(const std::filesystem::path& path, const MechanicsSource& mechanics);
+  static Model parse(std::string text, std::string name, const MechanicsSource& mechanics);
+
+  /// A [[latent]] as written.
+  struct LatentText {
+    std::string name;
+    std::string kernel;
+    std::vector<std::string> features;
+    Latent::Base base = Latent::Base::acceleration;
+    std::vector<std::vector<Expression>> directions;  // B (nq rows × p), empty: the identity
+    Latent::Range lengthscale, signal_stddev;
+    int line = 0;
+  };
+
+  struct Noise {
+    std::vector<double> stddev;  // per coordinate; empty when the file has no [noise]
+    bool estimate = false;
+  };
+
+  /// One entry of [sampling]: a uniform range, or an expression of other entries.
+  struct SamplingRule {
+    std::string name;
+    std::optional<std::pair<double, double>> range;
+    Expression value;  // where there is no range
+    int line = 0;
+  };
+
+  /// [motion]: how the system is driven while it is sampled. A task y(q) follows straight lines between random targets.
+  struct Motion {
+    enum class Profile { smooth /* of least jerk */, trapezoid /* of the speed */ };
+    struct Target {
+      std::string text;
+      ConstraintRow row;                               // of y: A = J, b = −J̇ dq, residuals y and ẏ
+      std::optional<std::pair<double, double>> range;  // of the targets; none: y stays where it starts
+    };
+    double rate = 0;                    // samples per second [Hz]
+    std::pair<double, double> segment;  // how long a line takes [s]
+    Profile profile = Profile::smooth;
+    double natural_frequency = 0;  // ω of the controller [rad/s]
+    double damping_ratio = 1;      // ζ
+    std::vector<Target> targets;
+    std::map<std::string, double> start;  // where it begins, before it is moved onto the constraints
+  };
+
+  std::string name;                        // for messages
+  std::string text;                        // the file's content
+  bool mechanics_are_code = false;         // M, A, b and F come from a MechanicsSource, not from the text
+  std::optional<RobotDescription> robot;   // that the model file names
+  std::shared_ptr<ExpressionGraph> graph;  // of every expression here
+  std::shared_ptr<const System> system;
+  std::vector<LatentText> latents;
+  Noise noise;
+  std::optional<Expression> potential;         // V(q, t) [J], for the energy that `simulate` reports
+  std::vector<Expression> truth;               // added to M⁻¹F; nq entries, or none without [truth]
+  std::vector<Expression> truth_force;         // added to F; likewise
+  std::vector<SamplingRule> sampling;          // in an order in which each can be computed; empty without [sampling]
+  std::map<std::string, double> newton_start;  // [sampling] start
+  std::optional<Motion> motion;                // instead of sampling
+  std::map<std::string, std::string> columns;  // the model's name -> the name in logs
+
+  /// An expression of the model's symbols and [let] names. Points of its robot, site("tip").z say, become what they are in
+  /// coordinates and velocities.
+  [[nodiscard]] Expression expression(std::string_view text) const;
+
+  /// The variables of the system in `graph`.
+  [[nodiscard]] SystemSymbols symbols() const;
+
+  /// The system as expressions of `graph`; null where its mechanics are code.
+  [[nodiscard]] const SymbolicSystem* symbolic_system() const;
+
+ private:
+  void define(const std::string& symbol, Expression value);
+  [[nodiscard]] Expression parse_symbols(std::string_view text) const;  // points of the robot stay as they are
+
+  std::shared_ptr<RobotExpressions> robot_expressions_;  // null without a robot
+  std::map<std::string, Expression, std::less<>> symbols_;
+  std::vector<std::string> symbol_names_;  // to suggest from when a symbol is unknown
+  friend class ModelReader;
+};
+
+/// The system of a model as expressions. @throws InputError where its mechanics are code.
+const SymbolicSystem& require_symbolic_system(const Model& model);
+
+/// What the model's kernel would rule out without reason: a second latent of fixed, short lengthscales and a size below the
+/// noise. It hardly moves the mean, but keeps a standard deviation where the fit would call an effect absent that the data cannot
+/// see.
+struct Discrepancy {
+  Eigen::VectorXd lengthscale;  // of each feature of the model's latent (D)
+  Eigen::VectorXd stddev;       // of each acceleration (nq)
+};
+
+struct PriorOptions {
+  Prior::Mean mean = Prior::Mean::zero;
+  std::optional<Latent::Base> base;       // replaces the directions of the model's latent by the identity or M⁻¹
+  bool raw_angles = false;                // a feature that is an angle stays as it is instead of its sine and cosine
+  std::optional<Baseline> baseline = {};  // replaces latents, mean, constraints; of the model it keeps the features, angles raw
+  std::optional<Discrepancy> discrepancy = {};  // beside the model's one latent
+};
+
+/// The prior of a model file. Not to be called from several threads for one model: its expression graph grows.
+/// @throws InputError when a kernel or feature is wrong, or `base` is asked for and the model has several latents.
+Prior make_prior(const Model& model, const PriorOptions& options = {});
+
+/// The system of `other` for the latents of `home` to act in. A parameter that `other` marks `estimate = true` and `home` has
+/// by the same name is one and the same; every other keeps the value of its own file. As make_prior, not to be called from
+/// several threads for one model.
+/// @throws InputError naming what differs: coordinates, inputs, the number of latents, or a latent's kernel, features or
+///   directions; and when a parameter that is one and the same stands in a feature of `other`.
+std::shared_ptr<const OtherSystem> make_other_system(const Model& home, const Model& other, const PriorOptions& options = {});
+
+}  // namespace gp2

@@ -1,0 +1,29 @@
+#pragma once
+
+#include <string>
+#include <vector>
+
+#include "gp2/fit.hpp"
+
+namespace gp2 {
+
+/// How well data determine hyperparameters; H by differences of the exact gradient, two evaluations for each that is not held and
+/// six for each θ.
+///
+/// @param hyperparameters  fitted, as a FitReport has them
+/// @param n_threads        0: as many as the machine has; results do not depend on it
+/// @throws InputError, NumericalError  as Likelihood; NumericalError when the likelihood is not finite about the fit
+LaplaceUncertainty laplace_uncertainty(const Prior& prior, const std::vector<Observations>& observations,
+                                       const std::vector<Hyperparameter>& hyperparameters, int n_threads = 0);
+
+/// What a person should know of an uncertainty, and what to do about it.
+struct UncertaintyNote {
+  bool is_warning = true;
+  std::string text, mend;
+};
+
+/// Of the parameters of a fit: those that the data do not determine, pairs that they hardly tell apart, and standard errors that
+/// are not to be trusted.
+std::vector<UncertaintyNote> uncertainty_notes(const FitReport& report);
+
+}  // namespace gp2

@@ -1,0 +1,219 @@
+#include "gp2/base/file.hpp"
+
+#include <algorithm>
+#include <array>
+#include <atomic>
+#include <cerrno>
+#include <charconv>
+#include <cstdio>
+#include <cstring>
+#include <system_error>
+
+#include <fcntl.h>
+#include <poll.h>
+#include <sys/stat.h>
+#include <unistd.h>
+
+#include <fmt/format.h>
+
+#include "gp2/error.hpp"
+
+namespace gp2 {
+
+namespace {
+
+constexpr int patience = 3000;                                 // how long a pipe may lack a writer [ms]
+constexpr std::size_t max_device_size = std::size_t{1} << 24;  // /dev/zero has no end; a person at a terminal types less
+
+struct OpenFile {
+  explicit OpenFile(const std::filesystem::path& path) : descriptor(open(path.c_str(), O_RDONLY | O_CLOEXEC | O_NONBLOCK)) {}
+  ~OpenFile() {
+    if (descriptor >= 0) close(descriptor);
+  }
+  OpenFile(const OpenFile&) = delete;
+  OpenFile& operator=(const OpenFile&) = delete;
+
+  /// Waits until there is something to read, or the end; false when that takes longer than `milliseconds`.
+  [[nodiscard]] bool wait(int milliseconds) const {
+    pollfd one = {descriptor, POLLIN, 0};
+    return poll(&one, 1, milliseconds) != 0;
+  }
+
+  const int descriptor;
+};
+
+}  // namespace
+
+std::string read_file(const std::filesystem::path& path, std::size_t max_size) {
+  const auto fail = [&](const std::string& why) { throw InputError(fmt::format("{}: {}", path.string(), why)); };
+  const auto require = [&](bool good) {
+    if (!good) fail(fmt::format("cannot be read: {}", std::strerror(errno)));
+  };
+  // opened without waiting, for a pipe may never get a writer
+  const OpenFile file(path);
+  require(file.descriptor >= 0);
+  struct stat status = {};
+  require(fstat(file.descriptor, &status) == 0);
+  const bool is_pipe = S_ISFIFO(status.st_mode);
+  if (!S_ISREG(status.st_mode) && !is_pipe) max_size = std::min(max_size, max_device_size);
+
+  std::string content;
+  if (S_ISREG(status.st_mode)) {
+    const auto size = static_cast<std::size_t>(status.st_size);
+    if (size > max_size) fail(fmt::format("{} bytes; at most {} are read", size, max_size));
+    content.reserve(size);
+  }
+  std::array<char, 1 << 16> block;
+  bool has_writer = !is_pipe, was_patient = false;
+  while (true) {
+    const ssize_t n = read(file.descriptor, block.data(), block.size());
+    if (n > 0) {
+      content.append(block.data(), static_cast<std::size_t>(n));
+      if (content.size() > max_size) fail(fmt::format("more than {} bytes, which is all that is read", max_size));
+      has_writer = true;
+    } else if (n == 0) {
+      if (has_writer) return content;
+      // no one has opened the pipe for writing yet
+      if (was_patient) fail("cannot be read: a pipe that nothing writes to");
+      if (file.wait(patience)) {
+        has_writer = true;
+      } else {
+        was_patient = true;
+      }
+    } else if (errno == EAGAIN) {
+      has_writer = true;
+      static_cast<void>(file.wait(-1));
+    } else {
+      require(errno == EINTR);
+    }
+  }
+}
+
+std::string shortest(double value) {
+  char buffer[32];
+  const auto result = std::to_chars(buffer, buffer + sizeof buffer, value);
+  return std::string(buffer, result.ptr);
+}
+
+namespace {
+
+// a name beside `target` that no other thread or process takes
+std::string temporary_name(const std::string& target) {
+  static std::atomic<unsigned> counter = 0;
+  return fmt::format("{}.{}-{}.tmp", target, getpid(), counter++);
+}
+
+// The folder that a path is in.
+std::string folder_of(const std::string& path) {
+  const std::string folder = std::filesystem::path(path).parent_path().string();
+  return folder.empty() ? "." : folder;
+}
+
+// Opens a new file beside `target`, with the permissions that the process gives to new files; −1 and errno when that fails. It
+// has no name, which give_name() can give it, or where the system does not know such files `name`.
+int open_beside(const std::string& target, std::string& name) {
+#ifdef O_TMPFILE
+  if (access("/proc/self/fd", X_OK) == 0) {
+    const int file = open(folder_of(target).c_str(), O_WRONLY | O_TMPFILE | O_CLOEXEC, 0666);
+    if (file >= 0) return file;
+  }
+#endif
+  while (true) {
+    name = temporary_name(target);
+    const int file = open(name.c_str(), O_WRONLY | O_CREAT | O_EXCL | O_CLOEXEC, 0666);
+    if (file >= 0 || errno != EEXIST) return file;
+  }
+}
+
+// false and errno when that fails
+bool give_name(int file, const std::string& target, std::string& name) {
+  const std::string link = fmt::format("/proc/self/fd/{}", file);
+  while (name.empty()) {
+    const std::string wanted = temporary_name(target);
+    if (linkat(AT_FDCWD, link.c_str(), AT_FDCWD, wanted.c_str(), AT_SYMLINK_FOLLOW) == 0) {
+      name = wanted;
+    } else if (errno != EEXIST) {
+      return false;
+    }
+  }
+  return true;
+}
+
+// all of `content`; false and errno when that fails
+bool write_all(int file, std::string_view content) {
+  while (!content.empty()) {
+    const ssize_t n = ::write(file, content.data(), content.size());
+    if (n < 0 && errno == EINTR) continue;
+    if (n < 0) return false;
+    content.remove_prefix(static_cast<std::size_t>(n));
+  }
+  return true;
+}
+
+void require_written(const std::filesystem::path& path, bool good) {
+  if (!good) throw InputError(fmt::format("{}: cannot be written: {}", path.string(), std::strerror(errno)));
+}
+
+// A file to be written: a link stays, what it points at is replaced.
+struct Target {
+  std::string path;
+  bool exists = false;
+  struct stat status = {};
+
+  [[nodiscard]] bool is_regular() const { return !exists || S_ISREG(status.st_mode); }
+};
+
+Target target_of(const std::filesystem::path& path) {
+  Target target;
+  std::error_code no_such_file;
+  const std::filesystem::path resolved = std::filesystem::canonical(path, no_such_file);
+  target.path = no_such_file ? path.string() : resolved.string();
+  target.exists = stat(target.path.c_str(), &target.status) == 0;
+  if (target.exists && S_ISDIR(target.status.st_mode)) {
+    errno = EISDIR;
+    require_written(path, false);
+  }
+  // a file that is read-only could be replaced all the same, but is so for a reason
+  if (target.exists) require_written(path, faccessat(AT_FDCWD, target.path.c_str(), W_OK, AT_EACCESS) == 0);
+  return target;
+}
+
+}  // namespace
+
+void require_writable(const std::filesystem::path& path) {
+  const Target target = target_of(path);
+  if (!target.is_regular()) return;
+  const std::string folder = folder_of(target.path);
+  const bool is_folder = std::filesystem::is_directory(folder);
+  if (!is_folder) errno = std::filesystem::exists(folder) ? ENOTDIR : ENOENT;
+  require_written(path, is_folder && faccessat(AT_FDCWD, folder.c_str(), W_OK | X_OK, AT_EACCESS) == 0);
+}
+
+void write_file(const std::filesystem::path& path, std::string_view content) {
+  const Target target = target_of(path);
+  // /dev/stdout, a pipe: nothing to replace, and a rename would destroy the device
+  if (!target.is_regular()) {
+    const int device = open(target.path.c_str(), O_WRONLY | O_CLOEXEC);
+    require_written(path, device >= 0);
+    const bool good = write_all(device, content);
+    const int reason = errno;
+    const bool closed = close(device) == 0;
+    if (!good) errno = reason;
+    require_written(path, good && closed);
+    return;
+  }
+
+  std::string temporary;
+  const int file = open_beside(target.path, temporary);
+  require_written(path, file >= 0);
+  bool good = !target.exists || fchmod(file, target.status.st_mode & 07777) == 0;
+  good = good && write_all(file, content) && fsync(file) == 0 && give_name(file, target.path, temporary);
+  good = good && std::rename(temporary.c_str(), target.path.c_str()) == 0;
+  const int reason = errno;
+  close(file);  // after fsync it has nothing left to fail at
+  if (!good && !temporary.empty()) unlink(temporary.c_str());
+  errno = reason;
+  require_written(path, good);
+}
+
+}  // namespace gp2

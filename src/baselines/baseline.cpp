@@ -1,0 +1,217 @@
+#include "gp2/baselines/baseline.hpp"
+
+#include <algorithm>
+#include <array>
+
+#include <fmt/format.h>
+
+namespace gp2 {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+using Kind = Hyperparameter::Kind;
+
+const std::vector<std::string>& Baseline::words() {
+  static const std::vector<std::string> words = {"se", "icm", "lmc"};
+  return words;
+}
+
+std::string Baseline::word(Kind kind) { return words()[static_cast<std::size_t>(kind)]; }
+
+std::optional<Baseline::Kind> Baseline::kind_of(std::string_view word) {
+  const auto found = std::find(words().begin(), words().end(), word);
+  if (found == words().end()) return std::nullopt;
+  return static_cast<Kind>(found - words().begin());
+}
+
+namespace {
+
+// a measured quantity over all observations, one column per sample
+template <typename Part>
+MatrixXd pooled(const std::vector<Observations>& observations, const Part& part) {
+  MatrixXd all;
+  for (const Observations& group : observations) {
+    const MatrixXd more = part(group);
+    all.conservativeResize(more.rows(), all.cols() + more.cols());
+    all.rightCols(more.cols()) = more;
+  }
+  return all;
+}
+
+MatrixXd pooled_values(const std::vector<Observations>& observations) {
+  return pooled(observations, [](const Observations& group) { return group.values; });
+}
+
+MatrixXd pooled_features(const std::vector<Observations>& observations, const Latent& latent) {
+  return pooled(observations,
+                [&](const Observations& group) -> MatrixXd { return evaluate_features(latent, group.states).transpose(); });
+}
+
+// of each row; 1 where it is constant
+VectorXd usable_stddev(const MatrixXd& values) {
+  const VectorXd stddev = row_stddev(values);
+  return (stddev.array() > 0).select(stddev, VectorXd::Ones(stddev.size()));
+}
+
+struct Range {
+  double initial, lower, upper;
+};
+
+// in standard deviations of feature and output: the published code's
+constexpr Range lengthscale_range = {1, 0.5, 20}, signal_range = {0.5, 0.1, 1};
+// no more than limits of what double precision can hold
+constexpr Range mixing_range = {0.5, -1e4, 1e4}, sqrt_kappa_range = {0.5, 1e-8, 1e4};
+
+Hyperparameter hyperparameter(Kind kind, std::size_t owner, Index index, std::string name, const std::string& unit, Range range,
+                              double scale) {
+  Hyperparameter h;
+  h.kind = kind;
+  h.owner = static_cast<int>(owner);
+  h.index = static_cast<int>(index);
+  h.name = std::move(name);
+  h.unit = "unit of " + unit;
+  h.value = range.initial * scale;
+  h.lower = range.lower * scale;
+  h.upper = range.upper * scale;
+  if (kind == Kind::mixing || kind == Kind::sqrt_kappa) h.scale = VectorXd::Constant(1, scale);
+  return h;
+}
+
+// W of the first latent starts as a multiple of the identity, outputs that know nothing of each other but columns that differ;
+// the others at zero, as in the published code, which holds them there
+void add_loading(const Latent& latent, std::size_t owner, const std::string& prefix, const VectorXd& scale,
+                 std::vector<Hyperparameter>& out) {
+  for (Index column = 0; column < *latent.learned_rank; ++column) {
+    for (Index row = 0; row < latent.size(); ++row) {
+      const std::string& name = latent.column_names[static_cast<std::size_t>(row)];
+      Range range = mixing_range;
+      if (row != column || owner > 0) range.initial = 0;
+      out.push_back(hyperparameter(Kind::mixing, owner, row + latent.size() * column,
+                                   fmt::format("{}W({},{})", prefix, name, column + 1), name, range, scale[row]));
+    }
+  }
+  for (Index row = 0; row < latent.size(); ++row) {
+    const std::string& name = latent.column_names[static_cast<std::size_t>(row)];
+    out.push_back(hyperparameter(Kind::sqrt_kappa, owner, row, fmt::format("{}sqrt_kappa({})", prefix, name), name,
+                                 sqrt_kappa_range, scale[row]));
+  }
+}
+
+// the k-th best of one output, added to that of the others
+void add(const RestartReport& restart, RestartReport& sum) {
+  sum.objective += restart.objective;
+  sum.negative_log_likelihood += restart.negative_log_likelihood;
+  sum.iterations += restart.iterations;
+  sum.evaluations += restart.evaluations;
+  sum.failed_evaluations += restart.failed_evaluations;
+  sum.converged = sum.converged && restart.converged;
+  if (!restart.converged || sum.termination.empty()) sum.termination = restart.termination;
+}
+
+// one output of a prior whose latent j acts on output j alone
+Fit fit_output(int output, const Prior& prior, const std::vector<Observations>& observations,
+               const std::vector<Hyperparameter>& hyperparameters, const FitOptions& options) {
+  Prior alone = prior;
+  alone.latents = {prior.latents[static_cast<std::size_t>(output)]};
+  std::vector<Observations> observed = observations;
+  for (Observations& group : observed) {
+    group.view.rows = {output};
+    group.values = MatrixXd(group.values.row(output));
+    group.noise_stddev = VectorXd(group.noise_stddev.segment(output, 1));
+    if (group.has_noise_scale()) group.noise_scale = MatrixXd(group.noise_scale.row(output));
+  }
+  std::vector<Hyperparameter> own;
+  for (const Hyperparameter& h : hyperparameters) {
+    if (h.owner == output) own.push_back(h);
+  }
+  for (Hyperparameter& h : own) h.owner = 0;
+  Fit fitted = fit(alone, observed, own, options);
+  for (Hyperparameter& h : fitted.report.hyperparameters) h.owner = output;
+  return fitted;
+}
+
+Fit fit_outputs(const Prior& prior, const std::vector<Observations>& observations,
+                const std::vector<Hyperparameter>& hyperparameters, const FitOptions& options) {
+  const int n_outputs = prior.system->nq();
+  FitReport all;
+  all.converged = true;
+  double best_so_far = 0;
+  for (int output = 0; output < n_outputs; ++output) {
+    FitOptions own = options;
+    if (options.progress) {
+      own.progress = [&, output](Progress p) {
+        p.best += best_so_far;
+        p.seconds += all.seconds;
+        p.fraction = (output + p.fraction) / n_outputs;
+        options.progress(p);
+      };
+    }
+    FitReport report = fit_output(output, prior, observations, hyperparameters, own).report;
+    std::stable_sort(report.restarts.begin(), report.restarts.end(),
+                     [](const auto& a, const auto& b) { return a.objective < b.objective; });
+    RestartReport none;
+    none.converged = true;
+    all.restarts.resize(report.restarts.size(), none);
+    for (std::size_t k = 0; k < report.restarts.size(); ++k) add(report.restarts[k], all.restarts[k]);
+    all.hyperparameters.insert(all.hyperparameters.end(), report.hyperparameters.begin(), report.hyperparameters.end());
+    all.n_escapes += report.n_escapes;
+    all.seconds += report.seconds;
+    best_so_far += report.objective;
+  }
+  const RestartReport& best = all.restarts.front();
+  all.negative_log_likelihood = best.negative_log_likelihood;
+  all.objective = best.objective;
+  const bool interrupted = options.stop != nullptr && options.stop->load();
+  all.converged = best.converged && !interrupted;
+  all.termination = interrupted ? FitReport::interrupted : best.termination;
+  all.iterations = best.iterations;
+  return {Posterior(prior, observations, model_values(prior, observations, all.hyperparameters)), std::move(all)};
+}
+
+}  // namespace
+
+Baseline standardised_by(const std::vector<Observations>& observations, const Latent& latent, Baseline::Kind kind) {
+  const MatrixXd features = pooled_features(observations, latent);
+  return {kind, row_mean(pooled_values(observations)), features.rowwise().mean(), usable_stddev(features)};
+}
+
+std::vector<Hyperparameter> baseline_hyperparameters(const Prior& prior, const std::vector<Observations>& observations) {
+  const VectorXd output_stddev = usable_stddev(pooled_values(observations));
+  std::vector<Hyperparameter> out;
+  for (std::size_t a = 0; a < prior.latents.size(); ++a) {
+    const Latent& latent = prior.latents[a];
+    const std::string prefix = prior.latents.size() == 1 ? "" : latent.name + ".";
+    if (!latent.kernel_is_fixed && !latent.kernel.parameters().empty()) {
+      const VectorXd feature_stddev = usable_stddev(pooled_features(observations, latent));
+      for (std::size_t p = 0; p < latent.kernel.parameters().size(); ++p) {
+        const Kernel::Parameter& parameter = latent.kernel.parameters()[p];
+        out.push_back(hyperparameter(Kind::kernel, a, static_cast<Index>(p), prefix + parameter.name,
+                                     latent.feature_names[static_cast<std::size_t>(parameter.feature)], lengthscale_range,
+                                     feature_stddev[parameter.feature]));
+      }
+    }
+    if (latent.learned_rank) {
+      add_loading(latent, a, prefix, output_stddev, out);
+    } else {
+      out.push_back(hyperparameter(Kind::signal_stddev, a, 0, prefix + "signal_stddev", latent.column_names.front(), signal_range,
+                                   output_stddev[static_cast<Index>(a)]));
+    }
+  }
+  return out;
+}
+
+FitOptions baseline_fit_options() {
+  FitOptions options;
+  options.n_restarts = 30;
+  options.reduction_tolerance = 1e-9;
+  return options;
+}
+
+Fit fit_baseline(Baseline::Kind kind, const Prior& prior, const std::vector<Observations>& observations,
+                 const std::vector<Hyperparameter>& hyperparameters, const FitOptions& options) {
+  return kind == Baseline::Kind::se ? fit_outputs(prior, observations, hyperparameters, options)
+                                    : fit(prior, observations, hyperparameters, options);
+}
+
+}  // namespace gp2

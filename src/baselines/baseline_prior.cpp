@@ -1,0 +1,106 @@
+#include "baselines/baseline_prior.hpp"
+
+#include <algorithm>
+
+#include <fmt/format.h>
+
+#include "gp2/error.hpp"
+#include "model/latent_tapes.hpp"
+
+namespace gp2 {
+
+using Eigen::Index;
+
+namespace {
+
+void require_size(const Eigen::VectorXd& values, std::size_t size, const char* what, const char* of) {
+  if (values.size() == static_cast<Index>(size)) return;
+  throw InputError(
+      fmt::format("{} of a baseline must hold one number for each of the {} {}, got {}", what, size, of, values.size()));
+}
+
+// what a baseline's latents are made of: the features of the model's latents, each once
+struct Parts {
+  SystemSymbols symbols;
+  std::vector<std::string> names;
+  std::vector<Expression> raw;
+
+  explicit Parts(const Model& model) : symbols(model.symbols()) {
+    ExpressionGraph& graph = *model.graph;
+    std::map<std::string, Expression> parameter_values;
+    for (const Parameter& parameter : model.system->parameters()) {
+      parameter_values.emplace(parameter.name, graph.constant(parameter.value));
+    }
+    for (const Model::LatentText& latent : model.latents) {
+      for (const std::string& feature : latent.features) {
+        if (std::find(names.begin(), names.end(), feature) != names.end()) continue;
+        names.push_back(feature);
+        raw.push_back(graph.substitute(model.expression(feature), parameter_values));
+      }
+    }
+  }
+
+  [[nodiscard]] Latent latent(std::string name, const char* kernel, const std::vector<Expression>& features) const {
+    Latent latent;
+    latent.name = std::move(name);
+    latent.feature_names = names;
+    set_features(latent, features, symbols);
+    latent.kernel = Kernel::parse(kernel, latent.feature_names);
+    return latent;
+  }
+};
+
+}  // namespace
+
+Baseline unstandardised(const Model& model, Baseline::Kind kind) {
+  const auto n_features = static_cast<Index>(Parts(model).names.size());
+  using Eigen::VectorXd;
+  return {kind, VectorXd::Zero(model.system->nq()), VectorXd::Zero(n_features), VectorXd::Ones(n_features)};
+}
+
+Prior make_baseline_prior(const Model& model, const Baseline& baseline) {
+  const System& system = *model.system;
+  ExpressionGraph& graph = *model.graph;
+  const Parts parts(model);
+  const auto n_outputs = static_cast<std::size_t>(system.nq());
+  require_size(baseline.output_mean, n_outputs, "output_mean", "outputs");
+  require_size(baseline.feature_mean, parts.names.size(), "feature_mean", "features");
+  require_size(baseline.feature_stddev, parts.names.size(), "feature_stddev", "features");
+
+  Prior prior{system.without_constraints(), {}, Prior::Mean::constant, baseline.output_mean, model.system};
+  if (baseline.kind == Baseline::Kind::se) {
+    // latent j acts on output j
+    for (std::size_t j = 0; j < n_outputs; ++j) {
+      const std::string output = system.coordinates()[j].acceleration();
+      Latent latent = parts.latent(output, "se", parts.raw);
+      latent.column_names = {output};
+      std::vector<Expression> unit(n_outputs, graph.constant(0));
+      const Tape zero(unit, parts.symbols.state_and_parameters());
+      latent.direction_derivatives.assign(system.parameters().size(), zero);
+      unit[j] = graph.constant(1);
+      set_directions(latent, unit, parts.symbols);
+      prior.latents.push_back(std::move(latent));
+    }
+    return prior;
+  }
+
+  prior.latents = {parts.latent("se", "se", parts.raw)};
+  if (baseline.kind == Baseline::Kind::lmc) {
+    std::vector<Expression> standardised;
+    for (std::size_t d = 0; d < parts.raw.size(); ++d) {
+      const auto row = static_cast<Index>(d);
+      standardised.push_back((parts.raw[d] - graph.constant(baseline.feature_mean[row])) /
+                             graph.constant(baseline.feature_stddev[row]));
+    }
+    prior.latents.push_back(parts.latent("bias", "constant", parts.raw));
+    prior.latents.push_back(parts.latent("linear", "linear", standardised));
+    prior.latents.back().kernel_is_fixed = true;
+  }
+  for (Latent& latent : prior.latents) {
+    for (const Coordinate& coordinate : system.coordinates()) latent.column_names.push_back(coordinate.acceleration());
+    latent.learned_rank = static_cast<int>(n_outputs);
+  }
+  return prior;
+}
+
+}  // namespace gp2

@@ -1,0 +1,171 @@
+#include "gp2/data/log_reader.hpp"
+
+#include <algorithm>
+#include <limits>
+
+#include <fmt/format.h>
+#include <fmt/ranges.h>
+
+#include "gp2/error.hpp"
+
+namespace gp2 {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+
+namespace {
+
+// "1" of "q1" for prefix "q"; empty when the name is not prefix + digits
+std::string number_after(const std::string& prefix, const std::string& name) {
+  if (!name.starts_with(prefix) || name.size() == prefix.size()) return "";
+  const std::string rest = name.substr(prefix.size());
+  return rest.find_first_not_of("0123456789") == std::string::npos ? rest : "";
+}
+
+void require_a_number(const Eigen::RowVectorXd& values, const CsvTable& table, int column, const char* mend) {
+  if (!values.array().isNaN().all()) return;
+  throw InputError(fmt::format("{}: column '{}': every cell is empty, so nothing is measured there; {}", table.name(),
+                               table.header()[static_cast<std::size_t>(column)], mend));
+}
+
+}  // namespace
+
+LogReader::LogReader(const CsvTable& table, const System& system, const std::map<std::string, std::string>& columns)
+    : table_(table), system_(system), columns_(columns) {
+  std::vector<std::string> own_names = system.state_names();
+  for (const Coordinate& coordinate : system.coordinates()) own_names.push_back(coordinate.acceleration());
+
+  for (const Coordinate& coordinate : system.coordinates()) {
+    // a renamed coordinate brings its derivatives along
+    if (const auto renamed = columns.find(coordinate.name); renamed != columns.end()) {
+      columns_.emplace(coordinate.velocity(), "d" + renamed->second);
+      columns_.emplace(coordinate.acceleration(), "dd" + renamed->second);
+      aliases_[coordinate.velocity()] = {renamed->second + "_dot"};
+      aliases_[coordinate.acceleration()] = {renamed->second + "_ddot"};
+    }
+    const std::string number = number_after("q", coordinate.name);
+    if (!number.empty()) {
+      for (const char* velocity : {"qd", "v", "qvel"}) aliases_[coordinate.velocity()].push_back(velocity + number);
+      for (const char* acceleration : {"qdd", "a", "qacc"}) aliases_[coordinate.acceleration()].push_back(acceleration + number);
+    }
+    aliases_[coordinate.velocity()].push_back(coordinate.name + "_dot");
+    aliases_[coordinate.acceleration()].push_back(coordinate.name + "_ddot");
+  }
+  for (const std::string& input : system.inputs()) {
+    const std::string number = number_after("u", input);
+    if (!number.empty()) aliases_[input] = {"tau" + number};
+    if (input == "u") aliases_[input] = {"tau"};
+  }
+  aliases_["t"] = {"time", "timestamp"};
+  // in a model with a coordinate v1, the column v1 is that coordinate, not the velocity of q1
+  for (auto& [name, aliases] : aliases_) {
+    std::erase_if(aliases, [&](const std::string& alias) {
+      return std::find(own_names.begin(), own_names.end(), alias) != own_names.end();
+    });
+  }
+}
+
+int LogReader::find(const std::string& name) const {
+  if (const auto renamed = columns_.find(name); renamed != columns_.end()) {
+    if (const int column = table_.find(renamed->second); column >= 0) return column;
+  }
+  if (const int column = table_.find(name); column >= 0) return column;
+  if (const auto aliases = aliases_.find(name); aliases != aliases_.end()) {
+    for (const std::string& alias : aliases->second) {
+      if (const int column = table_.find(alias); column >= 0) return column;
+    }
+  }
+  return -1;
+}
+
+int LogReader::require(const std::string& name) {
+  const int column = find(name);
+  if (column < 0) {
+    std::vector<std::string> tried = {name};
+    if (const auto renamed = columns_.find(name); renamed != columns_.end()) tried.insert(tried.begin(), renamed->second);
+    if (const auto aliases = aliases_.find(name); aliases != aliases_.end()) {
+      tried.insert(tried.end(), aliases->second.begin(), aliases->second.end());
+    }
+    throw InputError(fmt::format("{}: missing column '{}' (looked for {}); the file has: {}. Rename it, or give --map LOGNAME={}",
+                                 table_.name(), name, fmt::join(tried, ", "), fmt::join(table_.header(), ", "), name));
+  }
+  used_.insert(column);
+  const std::string& found = table_.header()[static_cast<std::size_t>(column)];
+  if (found != name) aliases_used_[name] = found;
+  return column;
+}
+
+MatrixXd LogReader::states(const std::vector<bool>& reads) { return read_states(reads, &CsvTable::number); }
+
+MatrixXd LogReader::states_with_gaps(const std::vector<bool>& reads) { return read_states(reads, &CsvTable::number_or_nan); }
+
+MatrixXd LogReader::read_states(const std::vector<bool>& reads, Number number) {
+  const std::vector<std::string> names = system_.state_names();
+  MatrixXd states =
+      MatrixXd::Constant(static_cast<Index>(names.size()), table_.n_rows(), std::numeric_limits<double>::quiet_NaN());
+  for (std::size_t k = 0; k < names.size(); ++k) {
+    if (!reads[k]) continue;
+    const int column = require(names[k]);
+    for (int row = 0; row < table_.n_rows(); ++row) states(static_cast<Index>(k), row) = (table_.*number)(row, column);
+  }
+  return states;
+}
+
+MatrixXd LogReader::values(const std::vector<std::string>& names) {
+  MatrixXd values(static_cast<Index>(names.size()), table_.n_rows());
+  for (std::size_t k = 0; k < names.size(); ++k) {
+    const int column = require(names[k]);
+    for (int row = 0; row < table_.n_rows(); ++row) values(static_cast<Index>(k), row) = table_.number(row, column);
+  }
+  return values;
+}
+
+MatrixXd LogReader::measurements(const std::vector<std::string>& names) {
+  MatrixXd values(static_cast<Index>(names.size()), table_.n_rows());
+  for (std::size_t k = 0; k < names.size(); ++k) {
+    const int column = require(names[k]);
+    const auto row_of_values = static_cast<Index>(k);
+    for (int row = 0; row < table_.n_rows(); ++row) values(row_of_values, row) = table_.number_or_empty(row, column);
+    require_a_number(values.row(row_of_values), table_, column, "observe others (--observe)");
+  }
+  return values;
+}
+
+std::string LogReader::stddev_column(const std::string& name) const {
+  const int column = find(name);
+  if (column < 0) return "";
+  for (const std::string& candidate : {table_.header()[static_cast<std::size_t>(column)] + "_std", name + "_std"}) {
+    if (table_.find(candidate) >= 0) return candidate;
+  }
+  return "";
+}
+
+MatrixXd LogReader::stddevs(const std::vector<std::string>& names) {
+  MatrixXd stddevs(static_cast<Index>(names.size()), table_.n_rows());
+  for (std::size_t k = 0; k < names.size(); ++k) {
+    const int column = table_.find(stddev_column(names[k]));
+    used_.insert(column);
+    for (int row = 0; row < table_.n_rows(); ++row) {
+      const double stddev = table_.number_or_empty(row, column);
+      if (stddev <= 0) {
+        throw InputError(
+            fmt::format("{}: the standard deviation of {} must be positive, got {}; leave the cell empty where nothing is "
+                        "measured",
+                        table_.place(row, column), names[k], stddev));
+      }
+      stddevs(static_cast<Index>(k), row) = stddev;
+    }
+    require_a_number(stddevs.row(static_cast<Index>(k)), table_, column, "leave the column out");
+  }
+  return stddevs;
+}
+
+std::vector<std::string> LogReader::unused_columns() const {
+  std::vector<std::string> unused;
+  for (int column = 0; column < table_.n_columns(); ++column) {
+    if (!used_.contains(column)) unused.push_back(table_.header()[static_cast<std::size_t>(column)]);
+  }
+  return unused;
+}
+
+}  // namespace gp2

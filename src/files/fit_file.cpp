@@ -1,0 +1,649 @@
+#include "gp2/files/fit_file.hpp"
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <limits>
+#include <set>
+#include <tuple>
+
+#include <fmt/format.h>
+#include <fmt/ranges.h>
+#include <boost/crc.hpp>
+#include <nlohmann/json.hpp>
+
+#include "gp2/base/version.hpp"
+#include "gp2/data/csv.hpp"
+#include "gp2/error.hpp"
+#include "symbolic/graph.hpp"
+
+namespace gp2 {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+using Json = nlohmann::ordered_json;  // written: keys in the order that a person reads
+using ParsedJson = nlohmann::json;    // read: keys are found in no time, however many a file claims
+using Kind = Hyperparameter::Kind;
+
+namespace {
+
+constexpr const char* format_name = "gp2 fit";
+
+// a choice and its name in the file
+template <class Choice>
+using Named = std::pair<Choice, const char*>;
+
+constexpr std::array<Named<Kind>, 7> kinds = {{{Kind::kernel, "kernel"},
+                                               {Kind::signal_stddev, "signal_stddev"},
+                                               {Kind::shared_signal_stddev, "shared_signal_stddev"},
+                                               {Kind::noise_stddev, "noise_stddev"},
+                                               {Kind::parameter, "parameter"},
+                                               {Kind::mixing, "mixing"},
+                                               {Kind::sqrt_kappa, "sqrt_kappa"}}};
+constexpr std::array<Named<Prior::Mean>, 2> means = {{{Prior::Mean::zero, "zero"}, {Prior::Mean::force, "force"}}};
+constexpr std::array<Named<std::optional<Latent::Base>>, 3> directions = {
+    {{std::nullopt, "model"}, {Latent::Base::acceleration, "acceleration"}, {Latent::Base::force, "force"}}};
+
+template <class Choice, std::size_t n>
+const char* name_of(const std::array<Named<Choice>, n>& choices, Choice choice) {
+  return std::find_if(choices.begin(), choices.end(), [&](const auto& known) { return known.first == choice; })->second;
+}
+
+template <class Choice, std::size_t n>
+Choice choice_from(const ParsedJson& json, const std::array<Named<Choice>, n>& choices, const char* what) {
+  const auto name = json.get<std::string>();
+  const auto known = std::find_if(choices.begin(), choices.end(), [&](const auto& other) { return name == other.second; });
+  if (known == choices.end()) throw InputError(fmt::format("'{}' is no {}", name, what));
+  return known->first;
+}
+
+// a value to show in a message
+std::string shown(const ParsedJson& json) { return json.is_structured() ? json.type_name() : json.dump(); }
+
+// a whole number, where Json itself would round or wrap
+int integer(const ParsedJson& json) {
+  constexpr auto largest = std::numeric_limits<int>::max();
+  if (!json.is_number_integer()) throw InputError(fmt::format("{} stands where a whole number must", shown(json)));
+  if (std::abs(json.get<double>()) > largest) throw InputError(fmt::format("{} is too large", shown(json)));
+  return json.get<int>();
+}
+
+// an array, where a loop would also take other values
+const ParsedJson& array(const ParsedJson& json) {
+  if (!json.is_array()) throw InputError(fmt::format("{} stands where an array must", shown(json)));
+  return json;
+}
+
+double number(const ParsedJson& json) {
+  if (!json.is_number()) throw InputError(fmt::format("{} stands where a number must", shown(json)));
+  return json.get<double>();
+}
+
+// What reads JSON goes down a level by calling itself: a file must not make it go down without end.
+constexpr int max_depth = 64;
+
+/// @param path  stands for the file in messages
+ParsedJson parse_json(std::string_view text, const std::filesystem::path& path) {
+  const auto check_depth = [&](int depth, ParsedJson::parse_event_t, const ParsedJson&) {
+    if (depth > max_depth) throw InputError(fmt::format("{}: nested deeper than {} levels", path.string(), max_depth));
+    return true;
+  };
+  ParsedJson json = ParsedJson::parse(text, check_depth, false);
+  if (json.is_discarded()) {
+    throw InputError(
+        fmt::format("{}: not valid JSON: the file is cut short or damaged; write it again with gp2 fit", path.string()));
+  }
+  return json;
+}
+
+// CRC-64 of xz over the compact text with sorted keys, in which only what is meant counts. It sees every change within eight
+// bytes in a row, and others but for one in 2⁶⁴. It guards against damage and slips of the pen, not against intent, so no
+// cryptographic digest, and no library for one, is needed: who means a change is told the checksum to write.
+std::string checksum_of(const ParsedJson& json) {
+  boost::crc_optimal<64, 0x42F0E1EBA9EA3693, 0xFFFFFFFFFFFFFFFF, 0xFFFFFFFFFFFFFFFF, true, true> crc;
+  const std::string text = json.dump(-1, ' ', false, ParsedJson::error_handler_t::replace);
+  crc.process_bytes(text.data(), text.size());
+  return fmt::format("{:016x}", crc.checksum());
+}
+
+// Out of a file, where it must be right. Formats before the sixth have none; one that is there counts all the same, so that a
+// change of the version is seen too.
+void take_checksum(ParsedJson& json) {
+  const bool has_one = json.contains("checksum");
+  if (!has_one && integer(json.at("version")) < 6) return;
+  const std::string written = has_one ? shown(json.at("checksum")) : "missing";
+  json.erase("checksum");
+  const std::string is = '"' + checksum_of(json) + '"';
+  if (written == is) return;
+  throw InputError(fmt::format(
+      "the file was changed after gp2 wrote it: its checksum is {}, its content has {}. If it is damaged, write it again "
+      "with gp2 fit; if the change is meant, set \"checksum\": {} in the file",
+      written, is, is));
+}
+
+// NaN becomes null
+Json vector_json(const VectorXd& values) { return std::vector<double>(values.begin(), values.end()); }
+
+VectorXd vector_from(const ParsedJson& json) {
+  VectorXd values(static_cast<Index>(array(json).size()));
+  std::transform(json.begin(), json.end(), values.begin(), number);
+  return values;
+}
+
+// one named array per row; rows that are not measured (NaN) are left out
+Json rows_json(const MatrixXd& matrix, const std::vector<std::string>& names) {
+  Json json = Json::object();
+  for (Index k = 0; k < matrix.rows(); ++k) {
+    if (matrix.row(k).hasNaN()) continue;
+    json[names[static_cast<std::size_t>(k)]] = vector_json(matrix.row(k));
+  }
+  return json;
+}
+
+// one named array per row, of a measured quantity: null where a value is not measured
+Json measured_json(const MatrixXd& matrix, const std::vector<std::string>& names) {
+  Json json = Json::object();
+  for (Index k = 0; k < matrix.rows(); ++k) json[names[static_cast<std::size_t>(k)]] = vector_json(matrix.row(k));
+  return json;
+}
+
+double number_or_missing(const ParsedJson& json) {
+  return json.is_null() ? std::numeric_limits<double>::quiet_NaN() : number(json);
+}
+
+MatrixXd rows_from(const ParsedJson& json, const std::vector<std::string>& names, const std::vector<bool>& needed, Index n,
+                   double (*entry)(const ParsedJson&) = number) {
+  if (!json.is_object()) throw InputError("expected an object of named arrays");
+  // sizes first: a damaged n must not ask for memory
+  for (const auto& [name, values] : json.items()) {
+    if (std::find(names.begin(), names.end(), name) == names.end())
+      throw InputError(fmt::format("'{}' is not of this model", name));
+    if (!values.is_array() || values.size() != static_cast<std::size_t>(n)) {
+      throw InputError(fmt::format("'{}' has {} values, expected {}", name, values.size(), n));
+    }
+  }
+  for (std::size_t k = 0; k < names.size(); ++k) {
+    if (needed[k] && !json.contains(names[k])) throw InputError(fmt::format("the values of '{}' are missing", names[k]));
+  }
+  MatrixXd matrix = MatrixXd::Constant(static_cast<Index>(names.size()), n, std::numeric_limits<double>::quiet_NaN());
+  for (std::size_t k = 0; k < names.size(); ++k) {
+    if (!json.contains(names[k])) continue;
+    const Json& values = json.at(names[k]);
+    std::transform(values.begin(), values.end(), matrix.row(static_cast<Index>(k)).begin(), entry);
+  }
+  return matrix;
+}
+
+Json hyperparameter_json(const Hyperparameter& h) {
+  Json json = {{"name", h.name},
+               {"value", h.value},
+               {"lower", h.lower},
+               {"upper", h.upper},
+               {"unit", h.unit},
+               {"at_bound", h.at_bound()},
+               {"kind", name_of(kinds, h.kind)},
+               {"owner", h.owner},
+               {"index", h.index}};
+  if (h.scale.size() > 0) json["scale"] = vector_json(h.scale);
+  if (h.log_stddev > 0) json["hyperprior"] = {{"median", h.median}, {"log_stddev", h.log_stddev}};
+  if (h.stddev > 0) json["hyperprior"] = {{"mean", h.median}, {"stddev", h.stddev}};
+  return json;
+}
+
+Hyperparameter hyperparameter_from(const ParsedJson& json) {
+  Hyperparameter h;
+  json.at("name").get_to(h.name);
+  json.at("unit").get_to(h.unit);
+  h.value = number(json.at("value"));
+  h.lower = number(json.at("lower"));
+  h.upper = number(json.at("upper"));
+  h.kind = choice_from(json.at("kind"), kinds, "kind of hyperparameter");
+  h.owner = integer(json.at("owner"));
+  h.index = integer(json.at("index"));
+  if (json.contains("scale")) h.scale = vector_from(json.at("scale"));
+  if (json.contains("hyperprior")) {
+    const ParsedJson& prior = json.at("hyperprior");
+    const bool normal = prior.contains("mean");
+    h.median = number(prior.at(normal ? "mean" : "median"));
+    (normal ? h.stddev : h.log_stddev) = number(prior.at(normal ? "stddev" : "log_stddev"));
+  }
+  const bool needs_scale = h.kind == Kind::mixing || h.kind == Kind::sqrt_kappa;
+  if ((h.is_positive() && !(h.value > 0)) || !(h.scale.array() > 0).all() || (needs_scale && h.scale.size() != 1)) {
+    throw InputError(fmt::format("hyperparameter '{}' has the impossible value {}", h.name, h.value));
+  }
+  return h;
+}
+
+// every hyperparameter belongs to something the model has, once, and every kernel and signal has its values
+void check_hyperparameters(const std::vector<Hyperparameter>& hyperparameters, const Prior& prior,
+                           const std::vector<Observations>& observations) {
+  std::set<std::tuple<Kind, int, int>> open;  // kind, owner, index
+  std::set<std::tuple<Kind, int, int>> optional;
+  const auto add = [](auto& set, Kind kind, std::size_t owner, std::size_t size) {
+    for (std::size_t k = 0; k < size; ++k) set.emplace(kind, static_cast<int>(owner), static_cast<int>(k));
+  };
+  for (std::size_t a = 0; a < prior.latents.size(); ++a) {
+    const Latent& latent = prior.latents[a];
+    if (!latent.kernel_is_fixed) add(open, Kind::kernel, a, latent.kernel.parameters().size());
+    if (latent.learned_rank) {
+      add(open, Kind::mixing, a, latent.column_names.size() * static_cast<std::size_t>(*latent.learned_rank));
+      add(open, Kind::sqrt_kappa, a, latent.column_names.size());
+    } else if (!latent.signal_is_fixed) {
+      add(open, Kind::signal_stddev, a, latent.column_names.size());
+    }
+  }
+  for (std::size_t group = 0; group < observations.size(); ++group) {
+    add(optional, Kind::noise_stddev, group, observations[group].view.rows.size());
+  }
+  add(optional, Kind::parameter, 0, prior.system->parameters().size());
+
+  for (const Hyperparameter& h : hyperparameters) {
+    bool good = false;
+    if (h.kind == Kind::shared_signal_stddev) {
+      good = h.owner >= 0 && h.owner < static_cast<int>(prior.latents.size()) &&
+             h.scale.size() == prior.latents[static_cast<std::size_t>(h.owner)].size();
+      for (Index k = 0; good && k < h.scale.size(); ++k) {
+        good = open.erase({Kind::signal_stddev, h.owner, static_cast<int>(k)}) == 1;
+      }
+    } else {
+      good = open.erase({h.kind, h.owner, h.index}) + optional.erase({h.kind, h.owner, h.index}) == 1;
+    }
+    if (!good) throw InputError(fmt::format("hyperparameter '{}' belongs to nothing in this model, or stands twice", h.name));
+  }
+  if (!open.empty()) {
+    const auto [kind, owner, index] = *open.begin();
+    throw InputError(fmt::format("{} {} of latent '{}' has no value", name_of(kinds, kind), index + 1,
+                                 prior.latents[static_cast<std::size_t>(owner)].name));
+  }
+}
+
+constexpr const char* code = "code";
+
+Json model_json(const Model& model) {
+  Json json = {{"name", model.name}, {"text", model.text}};
+  if (model.mechanics_are_code) json["mechanics"] = code;
+  if (model.robot) json["robot"] = Json::parse(to_json(*model.robot));
+  return json;
+}
+
+bool mechanics_are_code(const ParsedJson& model) {
+  if (!model.contains("mechanics")) return false;
+  if (model.at("mechanics") != code) throw InputError(fmt::format("mechanics as {} are not known", shown(model.at("mechanics"))));
+  return true;
+}
+
+/// @param mechanics  null: not given
+Model model_from(const ParsedJson& json, const MechanicsSource* mechanics) {
+  if (!mechanics_are_code(json)) {
+    // a fit is whole in itself: its text must not make it read other files
+    const RobotSource robot = [&](const std::string& file) {
+      if (!json.contains("robot")) throw InputError(fmt::format("the fit does not hold the robot of '{}'", file));
+      return robot_from_json(json.at("robot").dump());
+    };
+    return Model::parse(json.at("text"), json.at("name"), robot);
+  }
+  if (mechanics == nullptr) {
+    throw InputError(
+        fmt::format("the mechanics of its model '{}' are code, which a file cannot hold: read it where that code is, with "
+                    "FitFile::read(path, mechanics)",
+                    json.at("name").get<std::string>()));
+  }
+  return Model::parse(json.at("text"), json.at("name"), *mechanics);
+}
+
+Json baseline_json(const Baseline& baseline) {
+  return {{"kind", Baseline::word(baseline.kind)},
+          {"output_mean", vector_json(baseline.output_mean)},
+          {"feature_mean", vector_json(baseline.feature_mean)},
+          {"feature_stddev", vector_json(baseline.feature_stddev)}};
+}
+
+Discrepancy discrepancy_from(const ParsedJson& json) {
+  Discrepancy discrepancy{vector_from(json.at("lengthscale")), vector_from(json.at("stddev"))};
+  if (!(discrepancy.lengthscale.array() > 0).all() || !(discrepancy.stddev.array() > 0).all()) {
+    throw InputError("lengthscale and stddev of the discrepancy must be positive");
+  }
+  return discrepancy;
+}
+
+Baseline baseline_from(const ParsedJson& json) {
+  const auto word = json.at("kind").get<std::string>();
+  const std::optional<Baseline::Kind> kind = Baseline::kind_of(word);
+  if (!kind) throw InputError(fmt::format("'{}' is no baseline; there is: {}", word, fmt::join(Baseline::words(), ", ")));
+  Baseline baseline{*kind, vector_from(json.at("output_mean")), vector_from(json.at("feature_mean")),
+                    vector_from(json.at("feature_stddev"))};
+  if (!(baseline.feature_stddev.array() > 0).all()) throw InputError("feature_stddev of a baseline must be positive");
+  return baseline;
+}
+
+/// @param other  the model of its view's other system; null: none
+Json observations_json(const Observations& group, const Prior& home, const Model* other) {
+  const System& system = *prior_of(home, group.view).system;
+  Json json = {{"view", View::word(group.view.quantity)},
+               {"rows", group.view.rows},
+               {"time_step", group.view.time_step},
+               {"latent", group.view.latent},
+               {"n", group.n_data()},
+               {"noise_stddev", vector_json(group.noise_stddev)},
+               {"estimate_noise", group.estimate_noise},
+               {"states", rows_json(group.states, system.state_names())},
+               {"values", measured_json(group.values, group.view.names(system))}};
+  if (group.has_noise_scale()) json["noise_scale"] = measured_json(group.noise_scale, group.view.names(system));
+  if (other != nullptr) json["system"] = model_json(*other);
+  return json;
+}
+
+Observations observations_from(const ParsedJson& json, const Prior& home, std::shared_ptr<const OtherSystem> other_system) {
+  Observations group;
+  group.view.other_system = std::move(other_system);
+  const Prior& prior = prior_of(home, group.view);
+  const System& system = *prior.system;
+  const auto word = json.at("view").get<std::string>();
+  const std::optional<View::Quantity> quantity = View::quantity_of(word);
+  if (!quantity) throw InputError(fmt::format("'{}' is no view", word));
+  group.view.quantity = *quantity;
+  group.view.time_step = number(json.at("time_step"));
+  if (*quantity == View::Quantity::next_velocity && !(group.view.time_step > 0)) {
+    throw InputError("the time_step of next-velocity must be positive");
+  }
+  group.view.latent = integer(json.at("latent"));
+  if (group.view.latent < -1 || group.view.latent >= static_cast<int>(prior.latents.size())) {
+    throw InputError(fmt::format("latent {} of a view is outside -1 … {}", group.view.latent, prior.latents.size() - 1));
+  }
+  const int n_rows = View::all(*quantity, system).size();
+  for (const ParsedJson& row : array(json.at("rows"))) {
+    const int index = integer(row);
+    if (index < 0 || index >= n_rows) throw InputError(fmt::format("row {} of a view is outside 0 … {}", index, n_rows - 1));
+    if (std::find(group.view.rows.begin(), group.view.rows.end(), index) != group.view.rows.end()) {
+      throw InputError(fmt::format("row {} of a view stands twice", index));
+    }
+    group.view.rows.push_back(index);
+  }
+  if (group.view.rows.empty()) throw InputError("a view without rows");
+  const int n = integer(json.at("n"));
+  if (n < 1) throw InputError(fmt::format("{} observations are not possible", n));
+  group.noise_stddev = vector_from(json.at("noise_stddev"));
+  if (group.noise_stddev.size() != group.view.size() || !(group.noise_stddev.array() > 0).all()) {
+    throw InputError("noise_stddev must hold one positive number per row of the view");
+  }
+  json.at("estimate_noise").get_to(group.estimate_noise);
+  // values come first: they bound what a damaged n can claim
+  const std::vector<bool> every(group.view.rows.size(), true);
+  group.values = rows_from(json.at("values"), group.view.names(system), every, n, number_or_missing);
+  if (json.contains("noise_scale")) {
+    group.noise_scale = rows_from(json.at("noise_scale"), group.view.names(system), every, n, number_or_missing);
+    group.require_noise_scale();
+  }
+  std::vector<bool> reads = prior.reads();
+  const std::vector<bool> of_view = group.view.reads(system);
+  for (std::size_t k = 0; k < reads.size(); ++k) reads[k] = reads[k] || of_view[k];
+  group.states = rows_from(json.at("states"), system.state_names(), reads, n);
+  return group;
+}
+
+// a restart without a finite start has the objective ∞, which JSON has not: null
+Json number_or_null(double value) { return std::isfinite(value) ? Json(value) : Json(); }
+
+double number_or_infinity(const ParsedJson& json) {
+  return json.is_null() ? std::numeric_limits<double>::infinity() : number(json);
+}
+
+Json restart_json(const RestartReport& r) {
+  return {{"objective", number_or_null(r.objective)},
+          {"nll", number_or_null(r.negative_log_likelihood)},
+          {"iterations", r.iterations},
+          {"evaluations", r.evaluations},
+          {"failed_evaluations", r.failed_evaluations},
+          {"converged", r.converged},
+          {"termination", r.termination}};
+}
+
+// numbers that may be ∞ or NaN: null
+Json numbers_or_null(const Eigen::Ref<const VectorXd>& values) {
+  Json json = Json::array();
+  for (const double value : values) json.push_back(number_or_null(value));
+  return json;
+}
+
+Json columns_json(const MatrixXd& matrix) {
+  Json json = Json::array();
+  for (Index k = 0; k < matrix.cols(); ++k) json.push_back(numbers_or_null(matrix.col(k)));
+  return json;
+}
+
+Json uncertainty_json(const LaplaceUncertainty& uncertainty) {
+  return {{"stddev", numbers_or_null(uncertainty.stddev)},
+          {"held", uncertainty.held},
+          {"correlation", columns_json(uncertainty.correlation)},
+          {"undetermined", columns_json(uncertainty.undetermined)},
+          {"distance_from_optimum", number_or_null(uncertainty.distance_from_optimum)}};
+}
+
+/// @param n  hyperparameters
+LaplaceUncertainty uncertainty_from(const ParsedJson& json, std::size_t n) {
+  const auto column = [n](const ParsedJson& values, double null) {
+    if (array(values).size() != n) throw InputError(fmt::format("standard errors of {} of {} hyperparameters", values.size(), n));
+    VectorXd out(static_cast<Index>(n));
+    std::transform(values.begin(), values.end(), out.begin(),
+                   [null](const ParsedJson& value) { return value.is_null() ? null : number(value); });
+    return out;
+  };
+  const auto columns = [&](const ParsedJson& values) {
+    MatrixXd out(static_cast<Index>(n), static_cast<Index>(array(values).size()));
+    for (Index k = 0; k < out.cols(); ++k) {
+      out.col(k) = column(values[static_cast<std::size_t>(k)], std::numeric_limits<double>::quiet_NaN());
+    }
+    return out;
+  };
+  LaplaceUncertainty out;
+  out.stddev = column(json.at("stddev"), std::numeric_limits<double>::infinity());
+  for (const ParsedJson& k : array(json.at("held"))) {
+    const int index = integer(k);
+    if (index < 0 || index >= static_cast<int>(n)) throw InputError(fmt::format("{} is no hyperparameter", index));
+    out.held.push_back(index);
+  }
+  out.correlation = columns(json.at("correlation"));
+  if (out.correlation.cols() != out.correlation.rows()) throw InputError("correlations that are not square");
+  out.undetermined = columns(json.at("undetermined"));
+  out.distance_from_optimum = number_or_infinity(json.at("distance_from_optimum"));
+  return out;
+}
+
+RestartReport restart_from(const ParsedJson& json) {
+  return {number_or_infinity(json.at("objective")), number_or_infinity(json.at("nll")),     integer(json.at("iterations")),
+          integer(json.at("evaluations")),          integer(json.at("failed_evaluations")), json.at("converged").get<bool>(),
+          json.at("termination").get<std::string>()};
+}
+
+}  // namespace
+
+Posterior FitFile::posterior() const {
+  const Prior prior_of_model = prior();
+  return {prior_of_model, observations, model_values(prior_of_model, observations, report.hyperparameters)};
+}
+
+void FitFile::write(const std::filesystem::path& path) const {
+  Json json;
+  json["format"] = format_name;
+  json["version"] = format_version;
+  json["library"] = version();
+  json["model"] = model_json(model);
+  json["prior"] = {{"mean", name_of(means, prior_options.mean)},
+                   {"directions", name_of(directions, prior_options.base)},
+                   {"raw_angles", prior_options.raw_angles}};
+  if (prior_options.baseline) json["prior"]["baseline"] = baseline_json(*prior_options.baseline);
+  if (prior_options.discrepancy) {
+    json["prior"]["discrepancy"] = {{"lengthscale", vector_json(prior_options.discrepancy->lengthscale)},
+                                    {"stddev", vector_json(prior_options.discrepancy->stddev)}};
+  }
+  json["hyperparameters"] = Json::array();
+  for (const Hyperparameter& h : report.hyperparameters) json["hyperparameters"].push_back(hyperparameter_json(h));
+  json["report"] = {{"nll", report.negative_log_likelihood},
+                    {"objective", report.objective},
+                    {"converged", report.converged},
+                    {"termination", report.termination},
+                    {"iterations", report.iterations},
+                    {"best_restart", report.best_restart},
+                    {"restarts", Json::array()}};
+  for (const RestartReport& restart : report.restarts) json["report"]["restarts"].push_back(restart_json(restart));
+  if (report.uncertainty) json["report"]["uncertainty"] = uncertainty_json(*report.uncertainty);
+  if (!options.empty()) json["options"] = Json::parse(options);
+  json["data_source"] = data_source;
+  json["observations"] = Json::array();
+  const Prior home = prior();
+  for (std::size_t g = 0; g < observations.size(); ++g) {
+    const Model* other = observations[g].view.other_system && g < systems.size() ? systems[g].get() : nullptr;
+    if (observations[g].view.other_system && other == nullptr) {
+      throw InputError(fmt::format("{}: the model file of the system of observations {} is not given", path.string(), g + 1));
+    }
+    json["observations"].push_back(observations_json(observations[g], home, other));
+  }
+  json["checksum"] = checksum_of(ParsedJson(json));
+  // a path in `data_source` may hold bytes that are no text
+  write_file(path, json.dump(1, ' ', false, Json::error_handler_t::replace) + "\n");
+}
+
+namespace {
+
+bool is_fit(const ParsedJson& json) { return json.is_object() && json.contains("format") && json.at("format") == format_name; }
+
+// a fit of a format that is known, as it was written
+void require_fit(ParsedJson& json) {
+  constexpr int format_version = FitFile::format_version;
+  if (!is_fit(json)) throw InputError("not a fit written by gp2");
+  const int file_version = integer(json.at("version"));
+  if (file_version > format_version) {
+    throw InputError(
+        fmt::format("of format {}, but this gp2 ({}) reads up to {}: use a newer gp2", file_version, version(), format_version));
+  }
+  if (file_version < 1) throw InputError(fmt::format("format {} does not exist", file_version));
+  take_checksum(json);
+}
+
+/// @param path       stands for the file in messages
+/// @param mechanics  null: not given
+FitFile read_fit(std::string_view text, const std::filesystem::path& path, const MechanicsSource* mechanics) {
+  const internal::StepLimit limit;  // for all its models together
+  ParsedJson json = parse_json(text, path);
+  FitFile fit;
+  try {
+    require_fit(json);
+    fit.model = model_from(json.at("model"), mechanics);
+    bool code_is_used = fit.model.mechanics_are_code;
+    const ParsedJson& prior_json = json.at("prior");
+    fit.prior_options.mean = choice_from(prior_json.at("mean"), means, "prior mean");
+    fit.prior_options.base = choice_from(prior_json.at("directions"), directions, "choice of directions");
+    prior_json.at("raw_angles").get_to(fit.prior_options.raw_angles);
+    if (prior_json.contains("discrepancy")) fit.prior_options.discrepancy = discrepancy_from(prior_json.at("discrepancy"));
+    if (prior_json.contains("baseline")) fit.prior_options.baseline = baseline_from(prior_json.at("baseline"));
+    json.at("data_source").get_to(fit.data_source);
+    if (json.contains("options")) {
+      if (!json.at("options").is_object())
+        throw InputError(fmt::format("options must be an object, got {}", shown(json.at("options"))));
+      fit.options = json.at("options").dump();
+    }
+    const Prior prior = fit.prior();
+    for (const ParsedJson& group : array(json.at("observations"))) {
+      std::shared_ptr<const OtherSystem> other_system;
+      std::shared_ptr<const Model>& system = fit.systems.emplace_back();
+      if (group.contains("system")) {
+        system = std::make_shared<const Model>(model_from(group.at("system"), mechanics));
+        code_is_used = code_is_used || system->mechanics_are_code;
+        other_system = make_other_system(fit.model, *system, fit.prior_options);
+      }
+      fit.observations.push_back(observations_from(group, prior, std::move(other_system)));
+    }
+    if (fit.observations.empty()) throw InputError("no observations");
+    if (mechanics != nullptr && !code_is_used) {
+      throw InputError("mechanics are given as code, but this fit has them as text: read it without");
+    }
+    for (const ParsedJson& h : array(json.at("hyperparameters"))) fit.report.hyperparameters.push_back(hyperparameter_from(h));
+    check_hyperparameters(fit.report.hyperparameters, prior, fit.observations);
+    const ParsedJson& report = json.at("report");
+    fit.report.negative_log_likelihood = number(report.at("nll"));
+    fit.report.objective = number(report.at("objective"));
+    report.at("converged").get_to(fit.report.converged);
+    report.at("termination").get_to(fit.report.termination);
+    fit.report.iterations = integer(report.at("iterations"));
+    fit.report.best_restart = integer(report.at("best_restart"));
+    for (const ParsedJson& restart : array(report.at("restarts"))) fit.report.restarts.push_back(restart_from(restart));
+    if (report.contains("uncertainty")) {
+      fit.report.uncertainty = uncertainty_from(report.at("uncertainty"), fit.report.hyperparameters.size());
+    }
+  } catch (const Json::exception& error) {
+    throw InputError(fmt::format("{}: not a whole fit file: {}", path.string(), error.what()));
+  } catch (const InputError& error) {
+    throw InputError(fmt::format("{}: {}", path.string(), error.what()));
+  }
+  return fit;
+}
+
+}  // namespace
+
+FitFile FitFile::read(const std::filesystem::path& path) { return read_fit(read_file(path), path, nullptr); }
+
+FitFile FitFile::parse(std::string_view text, const std::string& name) { return read_fit(text, name, nullptr); }
+
+FitFile FitFile::read(const std::filesystem::path& path, const MechanicsSource& mechanics) {
+  return read_fit(read_file(path), path, &mechanics);
+}
+
+namespace {
+
+// Of a fit whose mechanics are code the hyperparameters alone are read: there is no model to hold them against.
+std::vector<Hyperparameter> hyperparameters_of(const std::filesystem::path& path, ParsedJson& json) {
+  const bool with_code = json.contains("model") && json.at("model").is_object() && json.at("model").contains("mechanics");
+  if (!with_code) return FitFile::read(path).report.hyperparameters;
+  std::vector<Hyperparameter> hyperparameters;
+  try {
+    require_fit(json);
+    for (const ParsedJson& h : array(json.at("hyperparameters"))) hyperparameters.push_back(hyperparameter_from(h));
+  } catch (const Json::exception& error) {
+    throw InputError(fmt::format("{}: not a whole fit file: {}", path.string(), error.what()));
+  } catch (const InputError& error) {
+    throw InputError(fmt::format("{}: {}", path.string(), error.what()));
+  }
+  return hyperparameters;
+}
+
+}  // namespace
+
+void read_start_values(const std::filesystem::path& path, std::vector<Hyperparameter>& hyperparameters) {
+  ParsedJson json = parse_json(read_file(path), path);
+  std::vector<std::pair<std::string, double>> values;
+  const bool of_fit = is_fit(json);
+  if (of_fit) {
+    for (const Hyperparameter& h : hyperparameters_of(path, json)) values.emplace_back(h.name, h.value);
+  } else if (json.is_object()) {
+    for (const auto& [name, value] : json.items()) {
+      if (!value.is_number())
+        throw InputError(fmt::format("{}: '{}' is not a number but {}", path.string(), name, value.type_name()));
+      values.emplace_back(name, value.get<double>());
+    }
+  } else {
+    throw InputError(fmt::format("{}: expected {{\"name\": value, …}} or a file written by gp2 fit", path.string()));
+  }
+
+  std::vector<Hyperparameter> started = hyperparameters;
+  for (const auto& [name, value] : values) {
+    const auto h = std::find_if(started.begin(), started.end(), [&name = name](const auto& known) { return known.name == name; });
+    if (h == started.end()) {
+      // a fit may have had more to tune than this one; a hand-written value must mean something
+      if (of_fit) continue;
+      std::vector<std::string> known;
+      for (const Hyperparameter& other : started) known.push_back(other.name);
+      throw InputError(
+          fmt::format("{}: unknown hyperparameter '{}'; this fit has: {}", path.string(), name, fmt::join(known, ", ")));
+    }
+    // a value printed with a few digits less may lie a rounding outside
+    const double tolerance = 1e-9 * (h->is_positive() ? std::abs(value) : h->upper - h->lower);
+    if (!(value >= h->lower - tolerance && value <= h->upper + tolerance)) {
+      throw InputError(fmt::format("{}: {} = {} is outside its bounds [{}, {}]", path.string(), name, value, h->lower, h->upper));
+    }
+    h->value = std::clamp(value, h->lower, h->upper);
+  }
+  hyperparameters = std::move(started);
+}
+
+}  // namespace gp2

@@ -1,0 +1,114 @@
+#include "gp2/jobs/resample.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+
+#include <fmt/format.h>
+
+#include "base/random.hpp"
+#include "gp2/error.hpp"
+#include "gp2/jobs/fit_problem.hpp"
+#include "gp2/observations.hpp"
+#include "model/model_reader.hpp"
+
+namespace gp2 {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::Ref;
+using Eigen::VectorXd;
+
+FarthestPoints farthest_points(const Ref<const MatrixXd>& points, int n, int first) {
+  FarthestPoints out;
+  out.distance = VectorXd::Zero(n);
+  // squares of distances from the nearest chosen point; −1 at the chosen ones, so that none is chosen twice
+  VectorXd nearest = VectorXd::Constant(points.cols(), std::numeric_limits<double>::infinity());
+  Index next = first;
+  for (int k = 0; k < n; ++k) {
+    if (k > 0) out.distance[k] = std::sqrt(nearest.maxCoeff(&next));
+    out.chosen.push_back(static_cast<int>(next));
+    nearest = nearest.cwiseMin((points.colwise() - points.col(next)).colwise().squaredNorm().transpose());
+    nearest[next] = -1;
+  }
+  out.radius = std::sqrt(std::max(nearest.maxCoeff(), 0.0));
+  return out;
+}
+
+namespace {
+
+struct Features {
+  std::vector<std::string> names;
+  Tape tape;  // state -> features
+};
+
+// with angles and parameters as the prior has them
+Features features_of(const Model& model, const std::vector<std::string>& asked) {
+  ExpressionGraph& graph = *model.graph;
+  std::map<std::string, Expression> parameter_values;
+  for (const Parameter& parameter : model.system->parameters()) {
+    parameter_values.emplace(parameter.name, graph.constant(parameter.value));
+  }
+  Features features;
+  std::vector<Expression> values;
+  for (const std::string& written : asked.empty() ? model.latents.front().features : asked) {
+    for (const std::string& name : expand_angle(written, model.system->coordinates())) {
+      try {
+        values.push_back(graph.substitute(model.expression(name), parameter_values));
+      } catch (const InputError& error) {
+        throw InputError(fmt::format("--features: '{}': {}", written, error.what()));
+      }
+      features.names.push_back(name);
+    }
+  }
+  features.tape = Tape(values, model.symbols().state());
+  return features;
+}
+
+// divided by their standard deviation; 0 where they do not vary
+MatrixXd standardised(const MatrixXd& values) {
+  const VectorXd mean = values.rowwise().mean(), stddev = row_stddev(values);
+  MatrixXd out = values.colwise() - mean;
+  for (Index d = 0; d < values.rows(); ++d) {
+    // what is left of a constant is rounding
+    const bool varies = stddev[d] > 1e-12 * values.row(d).cwiseAbs().maxCoeff();
+    out.row(d) *= varies ? 1 / stddev[d] : 0;
+  }
+  return out;
+}
+
+}  // namespace
+
+Resample resample(const Model& model, const CsvTable& log, const ResampleOptions& options) {
+  if (options.n < 1) throw InputError(fmt::format("resample: n must be positive, got {}", options.n));
+  Features features = features_of(model, options.features);
+  std::vector<bool> reads;
+  for (int k = 0; k < model.system->layout().size(); ++k) reads.push_back(features.tape.uses_input(k));
+  MatrixXd values;
+  features.tape.evaluate(open_log(model, log, options.columns).states_with_gaps(reads), VectorXd(), values);
+
+  std::vector<int> usable;
+  for (int i = 0; i < log.n_rows(); ++i) {
+    if (values.col(i).allFinite()) usable.push_back(i);
+  }
+  const int n_usable = static_cast<int>(usable.size());
+  if (options.n > n_usable) {
+    throw InputError(fmt::format(
+        "{}: has {} rows{}, fewer than the n = {} asked for", log.name(), n_usable,
+        n_usable < log.n_rows() ? fmt::format(" with a number in every feature, of {}", log.n_rows()) : "", options.n));
+  }
+  const MatrixXd points = standardised(values(Eigen::all, usable));
+  Index first = 0;
+  if (options.seed) {
+    first = static_cast<Index>(RandomStream(*options.seed).uniform() * n_usable);
+  } else {
+    points.colwise().squaredNorm().minCoeff(&first);
+  }
+  FarthestPoints farthest = farthest_points(points, options.n, static_cast<int>(first));
+
+  Resample out{{}, std::move(farthest.distance), farthest.radius, std::move(features.names), log.n_rows() - n_usable};
+  for (const int chosen : farthest.chosen) out.rows.push_back(usable[static_cast<std::size_t>(chosen)]);
+  return out;
+}
+
+}  // namespace gp2

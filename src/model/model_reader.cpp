@@ -1,0 +1,844 @@
+#include "model/model_reader.hpp"
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <optional>
+#include <set>
+
+#include <fmt/format.h>
+#include <fmt/ranges.h>
+
+#include "base/random.hpp"
+#include "gp2/error.hpp"
+#include "model/name_order.hpp"
+#include "model/toml_reader.hpp"
+#include "robots/robot_expressions.hpp"
+
+namespace gp2 {
+
+using Level = ConstraintRow::Level;
+
+/// Reads the tables of a model file one after the other; every complaint carries file, line and key.
+class ModelReader : private TomlReader {
+ public:
+  ModelReader(const toml::table& root, const MechanicsSource* mechanics, const RobotSource& robot, Model& model)
+      : TomlReader(model.name), root_(root), source_(mechanics), robot_source_(robot), model_(model) {}
+
+  void read() {
+    only_keys(root_, "",
+              {"name", "robot", "coordinates", "inputs", "parameters", "let", "mechanics", "constraints", "latent", "noise",
+               "truth", "sampling", "motion", "columns"});
+    definition_.graph = model_.graph = std::make_shared<ExpressionGraph>();
+    definition_.name = root_.contains("name") ? text(*root_.get("name"), "name") : model_.name;
+    read_robot();
+    read_coordinates();
+    read_inputs();
+    read_parameters();
+    declare_symbols();
+    read_let();
+    if (source_ != nullptr) {
+      ask_for_mechanics();
+    } else {
+      read_mechanics();
+      read_constraints();
+      model_.system = std::make_shared<const SymbolicSystem>(definition_);
+      if (mass_node_ != nullptr) check_mass_symmetry();
+    }
+    read_latents();
+    read_noise();
+    read_truth();
+    read_sampling();
+    read_motion();
+    read_columns();
+    if (source_ == nullptr) read_potential();
+  }
+
+ private:
+  // an expression given as text or as a number
+  Expression expression(const toml::node& node, const std::string& key) const {
+    const Expression value = unexpanded(node, key);
+    return robot() ? robot()->expand(value) : value;
+  }
+
+  // the same, the points of the robot left as they are
+  Expression unexpanded(const toml::node& node, const std::string& key) const {
+    if (node.is_number()) return definition_.graph->constant(number(node, key));
+    if (!node.is_string()) fail(node, key, fmt::format("expected an expression in quotes, or a number, got {}", written(node)));
+    try {
+      return model_.parse_symbols(text(node, key));
+    } catch (const InputError& error) {
+      fail(node, key, fmt::format("\"{}\", {}", shortened(text(node, key)), error.what()));
+    }
+  }
+
+  // null without a robot
+  [[nodiscard]] const std::shared_ptr<RobotExpressions>& robot() const { return model_.robot_expressions_; }
+
+  void declare(const std::string& name, const toml::node& node, const std::string& key) {
+    static const std::set<std::string> reserved = {"pi",   "sin",  "cos", "tan", "asin", "acos", "atan", "atan2", "sinh",
+                                                   "cosh", "tanh", "exp", "log", "sqrt", "abs",  "sign", "min",   "max"};
+    if (!is_identifier(name)) {
+      fail(node, key, fmt::format("'{}' is not a name: use letters, digits and _, beginning with a letter", name));
+    }
+    if (reserved.contains(name)) fail(node, key, fmt::format("'{}' is the name of a function or constant; choose another", name));
+    if (!names_.insert(name).second) fail(node, key, fmt::format("the name '{}' is taken already; choose another", name));
+  }
+
+  void read_robot() {
+    if (!root_.contains("robot")) return;
+    const toml::node& node = *root_.get("robot");
+    if (source_ != nullptr) fail(node, "robot", "the mechanics of this model are given as code: remove it");
+    try {
+      model_.robot = robot_source_(text(node, "robot"));
+    } catch (const InputError& error) {
+      fail(node, "robot", error.what());
+    }
+    if (model_.robot->joints().empty()) fail(node, "robot", "this robot has no joints: there is nothing that moves");
+  }
+
+  // the joints of the robot, unless the file has names of its own for them
+  void take_coordinates_of_robot() {
+    const toml::node& node = *root_.get("robot");
+    for (const RobotDescription::Joint* joint : model_.robot->joints()) {
+      if (!is_identifier(joint->name)) {
+        fail(node, "robot",
+             fmt::format("its joint '{}' has a name that cannot stand in an expression: give names of your own, one "
+                         "per joint in the order of the file, with coordinates = [\"q1\", …]",
+                         joint->name));
+      }
+      declare_coordinate({joint->name, false}, node, "robot");
+    }
+  }
+
+  void declare_coordinate(const Coordinate& coordinate, const toml::node& node, const std::string& key) {
+    declare(coordinate.name, node, key);
+    declare(coordinate.velocity(), node, key);
+    declare(coordinate.acceleration(), node, key);
+    definition_.coordinates.push_back(coordinate);
+  }
+
+  void read_coordinates() {
+    names_.insert("t");
+    if (!root_.contains("coordinates")) {
+      if (!model_.robot) fail(1, "coordinates", R"(missing; write coordinates = ["q1", "q2"])");
+      take_coordinates_of_robot();
+      return;
+    }
+    const toml::node& node = *root_.get("coordinates");
+    for (const toml::node& entry : array(node, "coordinates")) {
+      Coordinate coordinate;
+      if (entry.is_table()) {
+        only_keys(*entry.as_table(), "coordinates", {"name", "angle"});
+        if (!entry.as_table()->contains("name")) fail(entry, "coordinates", R"(expected { name = "q1", angle = true })");
+        coordinate.name = text(*entry.as_table()->get("name"), "coordinates.name");
+        if (entry.as_table()->contains("angle")) coordinate.angle = boolean(*entry.as_table()->get("angle"), "coordinates.angle");
+      } else {
+        coordinate.name = text(entry, "coordinates");
+      }
+      declare_coordinate(coordinate, entry, "coordinates");
+    }
+    if (definition_.coordinates.empty()) fail(node, "coordinates", "a system needs at least one coordinate");
+    if (model_.robot && model_.robot->joints().size() != definition_.coordinates.size()) {
+      std::vector<std::string> joints;
+      for (const RobotDescription::Joint* joint : model_.robot->joints()) joints.push_back(joint->name);
+      fail(node, "coordinates",
+           fmt::format("{} names for the {} joints of the robot; they are, in this order: {}", definition_.coordinates.size(),
+                       joints.size(), fmt::join(joints, ", ")));
+    }
+  }
+
+  void read_inputs() {
+    if (!root_.contains("inputs")) return;
+    for (const toml::node& entry : array(*root_.get("inputs"), "inputs")) {
+      definition_.inputs.push_back(text(entry, "inputs"));
+      declare(definition_.inputs.back(), entry, "inputs");
+    }
+  }
+
+  void read_parameters() {
+    if (!root_.contains("parameters")) return;
+    for (const auto& [name, node] : entries_of(table(*root_.get("parameters"), "parameters"))) {
+      const std::string key = fmt::format("parameters.{}", name);
+      declare(name, *node, key);
+      Parameter parameter{name, 0, std::nullopt, false};
+      if (node->is_table()) {
+        const toml::table& entry = *node->as_table();
+        only_keys(entry, key, {"value", "bounds", "estimate", "of", "prior"});
+        if (entry.contains("of")) parameter.value = read_robot_number(*entry.get("of"), key + ".of", name);
+        if (entry.contains("value")) {
+          parameter.value = number(*entry.get("value"), key + ".value");
+        } else if (!entry.contains("of")) {
+          fail(*node, key, "missing value; write { value = 1.0, bounds = [0.5, 2.0], estimate = true }");
+        }
+        if (entry.contains("bounds")) parameter.bounds = range(*entry.get("bounds"), key + ".bounds");
+        if (entry.contains("estimate")) parameter.estimate = boolean(*entry.get("estimate"), key + ".estimate");
+        if (entry.contains("prior")) parameter.prior = belief(*entry.get("prior"), key + ".prior");
+        if (parameter.bounds && (parameter.value < parameter.bounds->first || parameter.value > parameter.bounds->second)) {
+          fail(*node, key,
+               fmt::format("the value {} is outside its bounds [{}, {}]", parameter.value, parameter.bounds->first,
+                           parameter.bounds->second));
+        }
+      } else {
+        parameter.value = number(*node, key);
+      }
+      definition_.parameters.push_back(parameter);
+    }
+  }
+
+  // { mean = 2, stddev = 0.1 } of a parameter, or { median = 2, log_stddev = 0.1 } of one that is positive
+  Parameter::Belief belief(const toml::node& node, const std::string& key, bool normal_too = true) const {
+    const toml::table& entry = table(node, key);
+    Parameter::Belief out;
+    out.of_logarithm = !normal_too || !entry.contains("mean");
+    const std::array<const char*, 2> keys = {out.of_logarithm ? "median" : "mean", out.of_logarithm ? "log_stddev" : "stddev"};
+    only_keys(entry, key, {keys[0], keys[1]});
+    for (const char* name : keys) {
+      if (entry.contains(name)) continue;
+      fail(node, key,
+           fmt::format("missing {}; write {}{{ median = 2.0, log_stddev = 0.1 }}, the second of its logarithm", name,
+                       normal_too ? "{ mean = 2.0, stddev = 0.1 }, or, of a positive one, " : ""));
+    }
+    out.median = number(*entry.get(keys[0]), fmt::format("{}.{}", key, keys[0]));
+    out.stddev = number(*entry.get(keys[1]), fmt::format("{}.{}", key, keys[1]));
+    if (!(out.stddev > 0)) fail(node, key, fmt::format("{} must be positive, got {}", keys[1], out.stddev));
+    if (out.of_logarithm && !(out.median > 0)) fail(node, key, fmt::format("median must be positive, got {}", out.median));
+    return out;
+  }
+
+  // mass("link7") or com('link7').x: a number of the robot that is this parameter from now on; gives the robot's own value
+  double read_robot_number(const toml::node& node, const std::string& key, const std::string& parameter) {
+    std::string of = text(node, key);
+    std::replace(of.begin(), of.end(), '\'', '"');
+    std::erase(of, ' ');
+    if (!model_.robot) fail(node, key, "only a model with a robot = \"FILE\" has such numbers; give a value instead");
+    const auto [other, is_new] = robot_parameters_.emplace(of, parameter);
+    if (!is_new) fail(node, key, fmt::format("{} is the parameter '{}' already", of, other->second));
+    for (const auto& [name, value] : robot_numbers(*model_.robot)) {
+      if (name == of) return value;
+    }
+    std::vector<std::string> bodies, joints;
+    for (const RobotDescription::Body& body : model_.robot->bodies) bodies.push_back(body.name);
+    for (const RobotDescription::Joint* joint : model_.robot->joints()) joints.push_back(joint->name);
+    fail(node, key,
+         fmt::format(
+             "the robot has no number '{}'; there are mass(\"BODY\"), com(\"BODY\").x, inertia(\"BODY\").xx with the bodies {}, "
+             "and damping(\"JOINT\"), stiffness, friction, armature with the joints {}",
+             shortened(of), fmt::join(bodies, ", "), fmt::join(joints, ", ")));
+  }
+
+  void declare_symbols() {
+    symbols_.emplace(*definition_.graph, definition_.coordinates, definition_.inputs, definition_.parameters);
+    if (model_.robot) {
+      std::map<std::string, Expression> numbers;
+      for (const auto& [of, parameter] : robot_parameters_) numbers.emplace(of, definition_.graph->variable(parameter));
+      model_.robot_expressions_ =
+          std::make_shared<RobotExpressions>(*model_.robot, *definition_.graph, *symbols_, std::move(numbers));
+    }
+    for (Expression symbol : symbols_->state_and_parameters()) model_.define(symbol.variable_name(), symbol);
+    for (Expression symbol : symbols_->ddq) model_.define(symbol.variable_name(), symbol);
+  }
+
+  // names may stand in any order and use each other, but not in a circle
+  void read_let() {
+    if (!root_.contains("let")) return;
+    const auto entries = entries_of(table(*root_.get("let"), "let"));
+    std::map<std::string, std::size_t> position;
+    for (const auto& [name, node] : entries) {
+      declare(name, *node, fmt::format("let.{}", name));
+      position.emplace(name, position.size());
+    }
+    std::vector<std::vector<std::size_t>> uses;
+    for (const auto& [name, node] : entries) {
+      uses.emplace_back();
+      if (!node->is_string()) continue;
+      for (const std::string& word : words_of(node->as_string()->get())) {
+        if (const auto other = position.find(word); other != position.end()) uses.back().push_back(other->second);
+      }
+    }
+    const Order order = order_by_use(uses);
+    if (!order.circle.empty()) {
+      const auto& [name, node] = entries[order.circle.front()];
+      fail(*node, fmt::format("let.{}", name), "defined in terms of itself" + circle_text(order.circle, entries));
+    }
+    for (const std::size_t k : order.positions) {
+      const auto& [name, node] = entries[k];
+      model_.define(name, unexpanded(*node, fmt::format("let.{}", name)));
+    }
+  }
+
+  // ": a uses b uses a"
+  template <class Entries>
+  static std::string circle_text(const std::vector<std::size_t>& circle, const Entries& entries) {
+    constexpr std::size_t enough = 8;
+    std::string text = ": ";
+    for (std::size_t k = 0; k < std::min(circle.size(), enough); ++k) text += fmt::format("{} uses ", entries[circle[k]].first);
+    if (circle.size() > enough) text += "… uses ";
+    return text + entries[circle.front()].first;
+  }
+
+  void ask_for_mechanics() {
+    for (const char* key : {"mechanics", "constraints"}) {
+      if (root_.contains(key)) {
+        fail(*root_.get(key), key,
+             fmt::format("the mechanics of this model are given as code: remove [{}], or read the file without that code", key));
+      }
+    }
+    if (!*source_) throw InputError("the code that is to give the mechanics is an empty function");
+    model_.mechanics_are_code = true;
+    model_.system = (*source_)({definition_.name, definition_.coordinates, definition_.inputs, definition_.parameters});
+    if (!model_.system) throw InputError("the code that is to give the mechanics returned no system");
+    require_as_declared(*model_.system);
+  }
+
+  // the rest of the file speaks of what it declares itself
+  void require_as_declared(const System& system) const {
+    const auto require_same = [](const char* what, const std::string& declared, const std::string& got) {
+      if (declared == got) return;
+      throw InputError(
+          fmt::format("the system that code returned has the {} {}, but this file declares {}; give it those of "
+                      "the declaration",
+                      what, got.empty() ? "(none)" : got, declared.empty() ? "(none)" : declared));
+    };
+    const auto coordinates = [](const std::vector<Coordinate>& all) {
+      std::vector<std::string> names;
+      for (const Coordinate& c : all) names.push_back(c.angle ? c.name + " (an angle)" : c.name);
+      return fmt::format("{}", fmt::join(names, ", "));
+    };
+    const auto parameters = [](const std::vector<Parameter>& all) {
+      std::vector<std::string> names;
+      for (const Parameter& p : all) {
+        names.push_back(fmt::format("{} = {}", p.name, p.value));
+        if (p.bounds) names.back() += fmt::format(" in [{}, {}]", p.bounds->first, p.bounds->second);
+        if (p.estimate) names.back() += " (estimated)";
+      }
+      return fmt::format("{}", fmt::join(names, ", "));
+    };
+    require_same("coordinates", coordinates(definition_.coordinates), coordinates(system.coordinates()));
+    require_same("inputs", fmt::format("{}", fmt::join(definition_.inputs, ", ")),
+                 fmt::format("{}", fmt::join(system.inputs(), ", ")));
+    require_same("parameters", parameters(definition_.parameters), parameters(system.parameters()));
+  }
+
+  void read_mechanics() {
+    if (!root_.contains("mechanics") && model_.robot) {
+      take_mechanics_of_robot(nullptr);
+      return;
+    }
+    if (!root_.contains("mechanics")) fail(1, "mechanics", "missing; a model needs [mechanics] with mass = [[…], …]");
+    const toml::table& mechanics = table(*root_.get("mechanics"), "mechanics");
+    if (model_.robot) {
+      take_mechanics_of_robot(&mechanics);
+      return;
+    }
+    only_keys(mechanics, "mechanics", {"mass", "force", "potential"});
+    read_mass(mechanics);
+    definition_.force = read_forces(mechanics, "mechanics");
+  }
+
+  void read_mass(const toml::table& mechanics) {
+    const std::size_t nq = definition_.coordinates.size();
+    if (!mechanics.contains("mass")) fail(mechanics, "mechanics", "missing mass = [[…], …]");
+    mass_node_ = mechanics.get("mass");
+    const toml::array& rows = array(*mass_node_, "mechanics.mass");
+    if (rows.size() != nq) {
+      fail(*mass_node_, "mechanics.mass", fmt::format("expected {} rows, one per coordinate, got {}", nq, rows.size()));
+    }
+    for (std::size_t i = 0; i < nq; ++i) {
+      const std::string key = fmt::format("mechanics.mass row {}", i + 1);
+      const toml::array& entries = array(*rows.get(i), key);
+      if (entries.size() != nq) fail(entries, key, fmt::format("expected {} entries, got {}", nq, entries.size()));
+      definition_.mass.emplace_back();
+      for (std::size_t j = 0; j < nq; ++j) {
+        const std::string entry_key = fmt::format("mechanics.mass row {} column {}", i + 1, j + 1);
+        const Expression entry = expression(*entries.get(j), entry_key);
+        for (const auto* group : {&symbols_->dq, &symbols_->ddq, &symbols_->u}) {
+          allow_only(*entries.get(j), entry_key, entry, *group,
+                     "the mass matrix may depend on coordinates, t and parameters only");
+        }
+        definition_.mass.back().push_back(entry);
+      }
+    }
+  }
+
+  // M and F are the robot's; inputs act on its joints one by one, unless [mechanics] says how they act
+  void take_mechanics_of_robot(const toml::table* mechanics) {
+    const std::size_t nq = definition_.coordinates.size();
+    definition_.mass = robot()->mass();
+    definition_.force = robot()->force();
+    std::vector<Expression> applied(nq, definition_.graph->constant(0));
+    if (mechanics != nullptr) {
+      if (mechanics->contains("mass")) {
+        fail(*mechanics->get("mass"), "mechanics.mass", "the mass matrix is the robot's: remove it, or remove robot = …");
+      }
+      only_keys(*mechanics, "mechanics", {"force", "force_on", "potential"});
+      applied = read_forces(*mechanics, "mechanics");
+    }
+    const bool inputs_are_written = mechanics != nullptr && mechanics->contains("force");
+    const std::vector<Expression>& u = symbols_->u;
+    if (!inputs_are_written && !u.empty()) {
+      if (u.size() != nq) {
+        fail(*root_.get("inputs"), "inputs",
+             fmt::format("{} inputs for {} joints: give one per joint, or say in [mechanics] force = [ … ] how they act",
+                         u.size(), nq));
+      }
+      for (std::size_t j = 0; j < nq; ++j) applied[j] = applied[j] + u[j];
+    }
+    for (std::size_t j = 0; j < nq; ++j) definition_.force[j] = applied[j] + definition_.force[j];
+  }
+
+  // force = [ … ], one per coordinate, and with a robot force_on = { 'site("tip").x' = … }: a force along a quantity r acts on
+  // the coordinates as (∂r/∂q)ᵀ force
+  std::vector<Expression> read_forces(const toml::table& entries, const std::string& section) const {
+    const std::size_t nq = definition_.coordinates.size();
+    std::vector<Expression> forces(nq, definition_.graph->constant(0));
+    if (entries.contains("force")) {
+      const toml::node& node = *entries.get("force");
+      const toml::array& force = array(node, section + ".force");
+      if (force.size() != nq) {
+        fail(node, section + ".force", fmt::format("expected {} entries, one per coordinate, got {}", nq, force.size()));
+      }
+      for (std::size_t j = 0; j < nq; ++j) {
+        const std::string key = fmt::format("{}.force entry {}", section, j + 1);
+        forces[j] = expression(*force.get(j), key);
+        allow_only(*force.get(j), key, forces[j], symbols_->ddq, "a force may not depend on accelerations");
+      }
+    }
+    if (!entries.contains("force_on")) return forces;
+    const toml::node& node = *entries.get("force_on");
+    if (!robot()) fail(node, section + ".force_on", "only a model with a robot = \"FILE\" has points for a force to act on");
+    for (const auto& [name, entry] : entries_of(table(node, section + ".force_on"))) {
+      const std::string key = fmt::format("{}.force_on.{}", section, name);
+      const Expression force = expression(*entry, key);
+      allow_only(*entry, key, force, symbols_->ddq, "a force may not depend on accelerations");
+      for (std::size_t j = 0; j < nq; ++j) forces[j] = forces[j] + robot_quantity(*entry, key, name).jacobian[j] * force;
+    }
+    return forces;
+  }
+
+  const RobotQuantity& robot_quantity(const toml::node& node, const std::string& key, const std::string& name) const {
+    try {
+      const Expression variable = model_.parse_symbols(name);
+      if (variable.operation() == Operation::variable) return robot()->quantity(variable.variable_name());
+    } catch (const InputError& error) {
+      fail(node, key, error.what());
+    }
+    fail(node, key, "expected a point of the robot, such as 'site(\"tip\").x'");
+  }
+
+  // last, so that M, A, b and F are built the same way with it and without
+  void read_potential() {
+    if (robot()) model_.potential = robot()->potential();
+    if (!root_.contains("mechanics")) return;
+    const toml::table& mechanics = *root_.get("mechanics")->as_table();
+    if (!mechanics.contains("potential")) return;
+    const toml::node& node = *mechanics.get("potential");
+    const Expression potential = expression(node, "mechanics.potential");
+    model_.potential = model_.potential ? *model_.potential + potential : potential;
+    for (const auto* group : {&symbols_->dq, &symbols_->ddq, &symbols_->u}) {
+      allow_only(node, "mechanics.potential", *model_.potential, *group,
+                 "the potential may depend on coordinates, t and parameters only");
+    }
+  }
+
+  void allow_only(const toml::node& node, const std::string& key, Expression e, const std::vector<Expression>& forbidden,
+                  const char* rule) const {
+    const std::vector<std::string> used = definition_.graph->variables_of(e);
+    for (Expression symbol : forbidden) {
+      if (std::binary_search(used.begin(), used.end(), symbol.variable_name())) {
+        fail(node, key, fmt::format("{}, but this entry depends on '{}'", rule, symbol.variable_name()));
+      }
+    }
+  }
+
+  // M = Mᵀ at random points, to rounding: entries may be written differently on the two sides
+  void check_mass_symmetry() const {
+    constexpr int n_points = 10;
+    RandomStream random(1);
+    Eigen::MatrixXd points(model_.system->layout().size(), n_points);
+    for (double& value : points.reshaped()) value = 2 * random.uniform() - 1;
+    const SystemValues values = model_.system->evaluate(points, model_.system->parameter_values());
+    const auto entry = [&](Eigen::Index row, Eigen::Index column) {
+      return written(
+          *mass_node_->as_array()->get(static_cast<std::size_t>(row))->as_array()->get(static_cast<std::size_t>(column)));
+    };
+    for (int i = 0; i < n_points; ++i) {
+      const auto M = values.M(i);
+      for (Eigen::Index row = 0; row < M.rows(); ++row) {
+        for (Eigen::Index column = 0; column < row; ++column) {
+          // a positive definite M has M_rc² < M_rr M_cc
+          const double size = std::max(std::abs(M(row, column)), std::sqrt(std::abs(M(row, row) * M(column, column))));
+          if (std::abs(M(row, column) - M(column, row)) <= 1e-10 * size || !std::isfinite(size)) continue;
+          fail(*mass_node_, "mechanics.mass",
+               fmt::format("not symmetric: row {} column {} is {}, but row {} column {} is {}; write the same on both sides",
+                           column + 1, row + 1, entry(column, row), row + 1, column + 1, entry(row, column)));
+        }
+      }
+    }
+  }
+
+  ConstraintRow derive(Level level, Expression c, std::string text) const {
+    if (!robot()) return derive_constraint(level, c, std::move(text), *symbols_);
+    return robot()->derive_constraint(level, c, std::move(text), definition_.coordinates, definition_.inputs,
+                                      definition_.parameters);
+  }
+
+  void read_constraints() {
+    if (robot()) {
+      for (auto& [c, name] : robot()->loops()) definition_.constraints.push_back(derive(Level::position, c, std::move(name)));
+    }
+    if (!root_.contains("constraints")) return;
+    const toml::table& constraints = table(*root_.get("constraints"), "constraints");
+    only_keys(constraints, "constraints", {"position", "velocity", "acceleration"});
+    const std::pair<const char*, Level> levels[] = {
+        {"position", Level::position}, {"velocity", Level::velocity}, {"acceleration", Level::acceleration}};
+    for (const auto& [level_name, level] : levels) {
+      if (!constraints.contains(level_name)) continue;
+      const toml::array& rows = array(*constraints.get(level_name), fmt::format("constraints.{}", level_name));
+      for (std::size_t k = 0; k < rows.size(); ++k) {
+        const toml::node& node = *rows.get(k);
+        const std::string key = fmt::format("constraints.{} entry {}", level_name, k + 1);
+        const Expression c = unexpanded(node, key);
+        try {
+          definition_.constraints.push_back(derive(level, c, node.is_string() ? text(node, key) : to_string(c)));
+        } catch (const InputError& error) {
+          fail(node, key, error.what());
+        }
+      }
+    }
+  }
+
+  Latent::Range latent_range(const toml::table& latent, const std::string& name) const {
+    Latent::Range out;
+    if (!latent.contains(name)) return out;
+    const std::string key = "latent." + name;
+    if (!latent.get(name)->is_table()) {
+      fail(*latent.get(name), key,
+           fmt::format("expected a table such as {{ initial = 1, bounds = [0.1, 10] }}, got {}", written(*latent.get(name))));
+    }
+    const toml::table& entry = *latent.get(name)->as_table();
+    only_keys(entry, key, {"initial", "bounds", "prior"});
+    const auto require_positive = [&](const char* what, double value) {
+      if (!(value > 0)) {
+        fail(*entry.get(what), fmt::format("{}.{}", key, what),
+             fmt::format("values are factors of the default scale and must be positive, got {}", value));
+      }
+    };
+    if (entry.contains("bounds")) {
+      std::tie(out.lower, out.upper) = range(*entry.get("bounds"), key + ".bounds");
+      require_positive("bounds", out.lower);
+    }
+    if (entry.contains("initial")) {
+      out.initial = number(*entry.get("initial"), key + ".initial");
+      require_positive("initial", out.initial);
+    }
+    if (entry.contains("prior")) {
+      const Parameter::Belief prior = belief(*entry.get("prior"), key + ".prior", false);
+      out.median = prior.median;
+      out.log_stddev = prior.stddev;
+    }
+    if (out.initial > 0 && out.upper > 0 && (out.initial < out.lower || out.initial > out.upper)) {
+      fail(entry, key, fmt::format("initial = {} is outside bounds = [{}, {}]", out.initial, out.lower, out.upper));
+    }
+    return out;
+  }
+
+  void read_latents() {
+    if (!root_.contains("latent")) {
+      add_default_latent();
+      return;
+    }
+    if (root_.get("latent")->is_table())
+      fail(*root_.get("latent"), "latent", "write [[latent]], with two brackets: there may be several");
+    std::set<std::string> names;
+    for (const toml::node& node : array(*root_.get("latent"), "latent")) {
+      const toml::table& entry = table(node, "latent");
+      only_keys(entry, "latent", {"name", "kernel", "features", "directions", "lengthscale", "signal_stddev"});
+      Model::LatentText latent;
+      latent.line = line_of(node);
+      latent.name =
+          entry.contains("name") ? text(*entry.get("name"), "latent.name") : fmt::format("latent {}", model_.latents.size() + 1);
+      if (!names.insert(latent.name).second) fail(node, "latent.name", fmt::format("'{}' is taken already", latent.name));
+      if (latent.name == "discrepancy")
+        fail(node, "latent.name", "'discrepancy' is the name of the latent that gp2 adds; take another");
+      latent.kernel = entry.contains("kernel") ? text(*entry.get("kernel"), "latent.kernel") : "se";
+      if (!entry.contains("features")) fail(node, "latent", R"(missing features = ["q1", …])");
+      std::set<std::string> expanded;
+      for (const toml::node& feature : array(*entry.get("features"), "latent.features")) {
+        const Expression value = expression(feature, "latent.features");
+        allow_only(feature, "latent.features", value, symbols_->ddq, "a feature may not depend on accelerations");
+        latent.features.push_back(feature.is_string() ? text(feature, "latent.features") : to_string(value));
+        // lengthscales go by the names of features
+        for (const std::string& name : expand_angle(latent.features.back(), definition_.coordinates)) {
+          if (!expanded.insert(name).second) fail(feature, "latent.features", fmt::format("'{}' stands twice; remove one", name));
+        }
+      }
+      if (latent.features.empty()) fail(node, "latent.features", "a latent needs at least one feature");
+      if (entry.contains("directions")) read_directions(*entry.get("directions"), latent);
+      latent.lengthscale = latent_range(entry, "lengthscale");
+      latent.signal_stddev = latent_range(entry, "signal_stddev");
+      try {
+        static_cast<void>(Kernel::parse(latent.kernel, latent.features));
+      } catch (const InputError& error) {
+        fail(entry.contains("kernel") ? *entry.get("kernel") : node, "latent.kernel", error.what());
+      }
+      model_.latents.push_back(std::move(latent));
+    }
+    if (model_.latents.empty()) add_default_latent();
+  }
+
+  // one squared-exponential latent on the acceleration, over everything a state has but the time
+  void add_default_latent() {
+    Model::LatentText latent;
+    latent.name = "unconstrained acceleration";
+    latent.kernel = "se";
+    latent.line = 1;
+    for (Expression symbol : symbols_->state()) {
+      if (!(symbol == symbols_->t)) latent.features.push_back(symbol.variable_name());
+    }
+    model_.latents.push_back(std::move(latent));
+  }
+
+  // "acceleration", "force", [[…], …] (nq rows), or { force = [[…], …] }
+  void read_directions(const toml::node& node, Model::LatentText& latent) const {
+    const std::string key = "latent.directions";
+    const toml::node* matrix = &node;
+    if (node.is_string()) {
+      const std::string value = text(node, key);
+      if (value != "acceleration" && value != "force") {
+        fail(node, key,
+             fmt::format(R"(expected "acceleration", "force" or a matrix of expressions [[…], …], got "{}")", shortened(value)));
+      }
+      latent.base = value == "force" ? Latent::Base::force : Latent::Base::acceleration;
+      return;
+    }
+    if (node.is_table()) {
+      only_keys(*node.as_table(), key, {"force", "acceleration"});
+      if (node.as_table()->size() != 1) fail(node, key, "expected { force = [[…], …] } or { acceleration = [[…], …] }");
+      latent.base = node.as_table()->contains("force") ? Latent::Base::force : Latent::Base::acceleration;
+      matrix = &node.as_table()->begin()->second;
+    }
+    const toml::array& rows = array(*matrix, key);
+    const std::size_t nq = definition_.coordinates.size();
+    if (rows.size() != nq) fail(*matrix, key, fmt::format("expected {} rows, one per coordinate, got {}", nq, rows.size()));
+    for (const toml::node& row_node : rows) {
+      const toml::array& row = array(row_node, key);
+      if (row.empty() || row.size() != array(*rows.get(0), key).size()) {
+        fail(row_node, key, "every row needs the same number of entries, at least one");
+      }
+      latent.directions.emplace_back();
+      for (const toml::node& entry : row) {
+        const Expression value = expression(entry, key);
+        allow_only(entry, key, value, symbols_->ddq, "a direction may not depend on accelerations");
+        latent.directions.back().push_back(value);
+      }
+    }
+  }
+
+  void read_noise() {
+    if (!root_.contains("noise")) return;
+    const toml::table& noise = table(*root_.get("noise"), "noise");
+    only_keys(noise, "noise", {"ddq"});
+    if (!noise.contains("ddq")) return;
+    const toml::node* node = noise.get("ddq");
+    if (node->is_table()) {
+      const toml::table& entry = *node->as_table();
+      only_keys(entry, "noise.ddq", {"estimate", "initial"});
+      if (entry.contains("estimate")) model_.noise.estimate = boolean(*entry.get("estimate"), "noise.ddq.estimate");
+      if (!entry.contains("initial")) fail(entry, "noise.ddq", "missing initial: where the estimate starts");
+      node = entry.get("initial");
+    }
+    const std::size_t nq = definition_.coordinates.size();
+    if (node->is_array()) {
+      for (const toml::node& entry : *node->as_array()) model_.noise.stddev.push_back(number(entry, "noise.ddq"));
+      if (model_.noise.stddev.size() != nq) {
+        fail(*node, "noise.ddq",
+             fmt::format("expected one value or {}, one per coordinate, got {}", nq, model_.noise.stddev.size()));
+      }
+    } else {
+      model_.noise.stddev.assign(nq, number(*node, "noise.ddq"));
+    }
+    for (double stddev : model_.noise.stddev) {
+      if (!(stddev > 0)) fail(*node, "noise.ddq", fmt::format("a noise standard deviation must be positive, got {}", stddev));
+    }
+  }
+
+  void read_truth() {
+    if (!root_.contains("truth")) return;
+    const toml::table& truth = table(*root_.get("truth"), "truth");
+    only_keys(truth, "truth", {"acceleration", "force", "force_on"});
+    if (truth.empty()) fail(truth, "truth", "missing acceleration = [ … ] or force = [ … ]");
+    const std::size_t nq = definition_.coordinates.size();
+    model_.truth.assign(nq, definition_.graph->constant(0));
+    model_.truth_force = read_forces(truth, "truth");
+    if (!truth.contains("acceleration")) return;
+    const toml::array& rows = array(*truth.get("acceleration"), "truth.acceleration");
+    if (rows.size() != nq) {
+      fail(rows, "truth.acceleration", fmt::format("expected {} entries, one per coordinate, got {}", nq, rows.size()));
+    }
+    for (std::size_t j = 0; j < nq; ++j) {
+      const toml::node& row = *rows.get(j);
+      model_.truth[j] = expression(row, "truth.acceleration");
+      allow_only(row, "truth.acceleration", model_.truth[j], symbols_->ddq, "the true acceleration may not depend on itself");
+    }
+  }
+
+  void read_sampling() {
+    if (!root_.contains("sampling")) return;
+    const toml::table& sampling = table(*root_.get("sampling"), "sampling");
+    // names that are not of the state are auxiliary draws, visible to expressions here only
+    std::set<std::string> drawable;
+    for (Expression symbol : symbols_->state()) drawable.insert(symbol.variable_name());
+    const auto visible = model_.symbols_;
+    const auto visible_names = model_.symbol_names_;
+    for (const auto& [name, node] : entries_of(sampling)) {
+      if (name == "start" || drawable.contains(name)) continue;
+      declare(name, *node, fmt::format("sampling.{}", name));
+      model_.define(name, definition_.graph->variable(name));
+    }
+
+    std::vector<Model::SamplingRule> rules;
+    for (const auto& [name, node] : entries_of(sampling)) {
+      const std::string key = fmt::format("sampling.{}", name);
+      if (name == "start") {
+        model_.newton_start = read_start(table(*node, key), key);
+        continue;
+      }
+      Model::SamplingRule rule{name, std::nullopt, {}, line_of(*node)};
+      if (node->is_array()) {
+        rule.range = range(*node, key);
+      } else {
+        rule.value = expression(*node, key);
+        allow_only(*node, key, rule.value, symbols_->ddq, "a sample may not depend on accelerations");
+      }
+      rules.push_back(std::move(rule));
+    }
+    model_.symbols_ = visible;
+    model_.symbol_names_ = visible_names;
+    sort_rules(std::move(rules));
+  }
+
+  // where coordinates and velocities begin
+  std::map<std::string, double> read_start(const toml::table& start, const std::string& section) const {
+    std::map<std::string, double> values;
+    for (const auto& [name, node] : entries_of(start)) {
+      const std::string key = fmt::format("{}.{}", section, name);
+      const bool known = std::any_of(definition_.coordinates.begin(), definition_.coordinates.end(),
+                                     [&name = name](const Coordinate& c) { return c.name == name || c.velocity() == name; });
+      if (!known) fail(*node, key, fmt::format("'{}' is neither a coordinate nor a velocity of this model", name));
+      values[name] = number(*node, key);
+    }
+    return values;
+  }
+
+  void read_motion() {
+    if (!root_.contains("motion")) return;
+    const toml::table& entries = table(*root_.get("motion"), "motion");
+    only_keys(entries, "motion",
+              {"rate", "segment", "profile", "natural_frequency", "damping_ratio", "targets", "hold", "start"});
+    if (root_.contains("sampling")) {
+      fail(entries, "motion", "states are drawn by [sampling] or met on the way by [motion]: remove one of the two");
+    }
+    if (source_ != nullptr) fail(entries, "motion", "only a model with its mechanics as text can be driven: remove it");
+    if (definition_.inputs.empty())
+      fail(entries, "motion", "a model without inputs cannot be driven; give inputs, or use [sampling]");
+    Model::Motion motion;
+    const auto positive = [&](const char* name, double otherwise) {
+      const std::string key = fmt::format("motion.{}", name);
+      if (!entries.contains(name) && otherwise > 0) return otherwise;
+      if (!entries.contains(name)) fail(entries, "motion", fmt::format("missing {} = …", name));
+      const double value = number(*entries.get(name), key);
+      if (!(value > 0)) fail(*entries.get(name), key, fmt::format("must be positive, got {}", value));
+      return value;
+    };
+    motion.rate = positive("rate", 0);
+    motion.natural_frequency = positive("natural_frequency", 10);
+    motion.damping_ratio = positive("damping_ratio", 1);
+    if (!entries.contains("segment"))
+      fail(entries, "motion", "missing segment = [shortest, longest], how long a line takes in s");
+    motion.segment = range(*entries.get("segment"), "motion.segment");
+    if (!(motion.segment.first > 0)) fail(*entries.get("segment"), "motion.segment", "a line takes a positive time");
+    if (entries.contains("profile")) {
+      const std::string profile = text(*entries.get("profile"), "motion.profile");
+      if (profile != "smooth" && profile != "trapezoid") {
+        fail(*entries.get("profile"), "motion.profile",
+             fmt::format(R"(expected "smooth" or "trapezoid", got "{}")", shortened(profile)));
+      }
+      if (profile == "trapezoid") motion.profile = Model::Motion::Profile::trapezoid;
+    }
+    if (!entries.contains("targets")) fail(entries, "motion", "missing targets = { q1 = [lower, upper], … }");
+    for (const auto& [name, node] : entries_of(table(*entries.get("targets"), "motion.targets"))) {
+      const std::string key = fmt::format("motion.targets.{}", name);
+      motion.targets.push_back(read_target(*node, key, name));
+      motion.targets.back().range = range(*node, key);
+    }
+    if (motion.targets.empty()) fail(*entries.get("targets"), "motion.targets", "a motion needs at least one target");
+    if (entries.contains("hold")) {
+      for (const toml::node& node : array(*entries.get("hold"), "motion.hold")) {
+        motion.targets.push_back(read_target(node, "motion.hold", text(node, "motion.hold")));
+      }
+    }
+    if (entries.contains("start")) motion.start = read_start(table(*entries.get("start"), "motion.start"), "motion.start");
+    model_.motion = std::move(motion);
+  }
+
+  // a function y(q) of the coordinates, twice differentiated along the motion as a constraint is
+  Model::Motion::Target read_target(const toml::node& node, const std::string& key, const std::string& written_target) const {
+    try {
+      return {written_target, derive(Level::position, model_.parse_symbols(written_target), written_target), std::nullopt};
+    } catch (const InputError& error) {
+      fail(node, key, fmt::format("\"{}\" must be a function of the coordinates: {}", shortened(written_target), error.what()));
+    }
+  }
+
+  // each rule after those it uses
+  void sort_rules(std::vector<Model::SamplingRule> rules) {
+    std::map<std::string, std::size_t> position;
+    for (const Model::SamplingRule& rule : rules) position.emplace(rule.name, position.size());
+    std::vector<std::vector<std::size_t>> uses(rules.size());
+    std::vector<std::pair<std::string, int>> entries;
+    for (std::size_t k = 0; k < rules.size(); ++k) {
+      entries.emplace_back(rules[k].name, rules[k].line);
+      if (rules[k].range) continue;
+      for (const std::string& name : definition_.graph->variables_of(rules[k].value)) {
+        if (const auto other = position.find(name); other != position.end()) uses[k].push_back(other->second);
+      }
+    }
+    const Order order = order_by_use(uses);
+    if (!order.circle.empty()) {
+      const auto& [name, line] = entries[order.circle.front()];
+      fail(line, fmt::format("sampling.{}", name), "drawn in terms of itself" + circle_text(order.circle, entries));
+    }
+    for (const std::size_t k : order.positions) model_.sampling.push_back(std::move(rules[k]));
+  }
+
+  void read_columns() {
+    if (!root_.contains("columns")) return;
+    std::set<std::string> known, taken;
+    for (Expression symbol : symbols_->state()) known.insert(symbol.variable_name());
+    for (Expression symbol : symbols_->ddq) known.insert(symbol.variable_name());
+    for (const auto& [name, node] : entries_of(table(*root_.get("columns"), "columns"))) {
+      const std::string key = fmt::format("columns.{}", name);
+      if (!known.contains(name)) fail(*node, key, "not a coordinate, velocity, acceleration, input or t of this model");
+      const std::string column = text(*node, key);
+      if (!taken.insert(column).second) fail(*node, key, fmt::format("the column '{}' is another name's already", column));
+      model_.columns[name] = column;
+    }
+  }
+
+  const toml::table& root_;
+  const MechanicsSource* source_;  // null: the mechanics are text
+  const RobotSource& robot_source_;
+  std::map<std::string, std::string> robot_parameters_;  // number of the robot -> parameter
+  Model& model_;
+  SymbolicSystem::Definition definition_;
+  std::set<std::string> names_;
+  std::optional<SystemSymbols> symbols_;
+  const toml::node* mass_node_ = nullptr;
+};
+
+void read_model(const toml::table& root, const MechanicsSource* mechanics, const RobotSource& robot, Model& model) {
+  ModelReader(root, mechanics, robot, model).read();
+}
+
+}  // namespace gp2

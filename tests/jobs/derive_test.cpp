@@ -1,0 +1,336 @@
+#include "gp2/jobs/derive.hpp"
+
+#include <cmath>
+#include <functional>
+#include <numbers>
+
+#include <fmt/format.h>
+#include <gmock/gmock.h>
+#include <gtest/gtest.h>
+
+#include "gp2/error.hpp"
+#include "smoothing/simulated_logs.hpp"
+
+namespace gp2::test {
+namespace {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+using testing::Contains;
+using testing::Each;
+using testing::ElementsAre;
+using testing::HasSubstr;
+
+const std::vector<std::array<double, 4>> two_starts = {{3.5, 3.6, 0, 0}, {3.0, 2.5, 1, -1}};
+
+const Model& pendulum() { return model("models/double_pendulum.toml"); }
+
+SimulatedLog short_log(const std::vector<std::array<double, 4>>& starts = two_starts) {
+  return simulated_log(pendulum(), starts, 0.5, {2e-5, 1e-5, 0, 0}, 1);
+}
+
+/// A cart on a rail, driven: nothing constrains it.
+const Model& cart() {
+  static const Model file = Model::parse(R"(
+name = "cart"
+coordinates = ["q1"]
+inputs = ["u1"]
+[mechanics]
+mass = [["1"]]
+force = ["u1"]
+[[latent]]
+name = "rest"
+kernel = "se"
+features = ["q1", "dq1", "u1"]
+directions = "force"
+)",
+                                         "cart.toml");
+  return file;
+}
+
+/// Header "t,q1" and rows of sin(3t) at 100 Hz, changed by `edit`.
+using Row = std::vector<std::string>;
+CsvTable cart_log(
+    const std::function<void(std::vector<Row>&)>& edit = [](auto&) {}, std::vector<std::string> header = {"t", "q1"},
+    int n = 200) {
+  std::vector<Row> rows;
+  RandomStream random(1);
+  for (int k = 0; k < n; ++k) rows.push_back({shortest(k / 100.0), shortest(std::sin(3 * k / 100.0) + 1e-4 * random.normal())});
+  edit(rows);
+  std::vector<std::string> cells;
+  for (const Row& row : rows) cells.insert(cells.end(), row.begin(), row.end());
+  return CsvTable::from_cells("log.csv", std::move(header), std::move(cells));
+}
+
+double largest(const MatrixXd& values) { return values.cwiseAbs().maxCoeff(); }
+
+TEST(Derive, CompletesDependentCoordinatesFromTheConstraints) {
+  const SimulatedLog log = short_log();
+  const DerivedData data = derive(pendulum(), log.table);
+  const System& system = *pendulum().system;
+  EXPECT_THAT(data.measured, ElementsAre(2, 5));
+  EXPECT_THAT(data.completed, ElementsAre(0, 1, 3, 4));
+  EXPECT_THAT(data.independent, ElementsAre(2, 5));
+  EXPECT_THAT(data.notes, Contains(HasSubstr("from the constraints: q1, q2, q4, q5")));
+  EXPECT_EQ(data.states.cols(), 500);
+  const VectorXd parameters = system.parameter_values();
+  EXPECT_LE(largest(system.residuals(data.states, parameters)), 1e-12);
+  const SystemValues values = system.evaluate(data.states, parameters);
+  for (int i = 0; i < data.states.cols(); ++i) {
+    EXPECT_LE(largest(values.A(i) * data.accelerations.col(i) - values.b(i)), 1e-11);
+  }
+  // and they are those of the motion
+  const Trajectory& truth = log.episodes[1];
+  for (Index i = 20; i < 230; ++i) {
+    EXPECT_LE(largest(data.states.col(250 + i).head(12) - truth.states.col(i).head(12)), 0.01);
+    EXPECT_LE(largest(data.accelerations.col(250 + i) - truth.accelerations.col(i)), 1.5);
+  }
+}
+
+TEST(Derive, TableHasADeviationForWhatWasMeasured) {
+  const SimulatedLog log = short_log();
+  const DerivedData data = derive(pendulum(), log.table);
+  const CsvTable table = as_table(data, *pendulum().system, "data.csv");
+  EXPECT_THAT(table.header(), ElementsAre("episode", "t", "q1", "q2", "q3", "q4", "q5", "q6", "dq1", "dq2", "dq3", "dq4", "dq5",
+                                          "dq6", "ddq1", "ddq2", "ddq3", "ddq4", "ddq5", "ddq6", "q3_std", "q6_std", "dq3_std",
+                                          "dq6_std", "ddq3_std", "ddq6_std"));
+  EXPECT_EQ(table.cell(250, 0), "1");
+  EXPECT_EQ(table.number(3, 1), 0.006);
+  EXPECT_EQ(table.number(7, table.find("ddq6")), data.accelerations(5, 7));
+  EXPECT_EQ(table.number(7, table.find("dq3_std")), data.stddev(6 + 2, 7));
+}
+
+TEST(Derive, SameBitsForAnyNumberOfThreads) {
+  const SimulatedLog log = short_log();
+  const DerivedData one = derive(pendulum(), log.table, {.n_threads = 1}),
+                    three = derive(pendulum(), log.table, {.n_threads = 3});
+  EXPECT_EQ(as_table(one, *pendulum().system, "").n_rows(), 500);
+  EXPECT_EQ(one.accelerations, three.accelerations);
+  EXPECT_EQ(one.states.topRows(13), three.states.topRows(13));
+}
+
+TEST(Derive, ConstraintsAmongMeasuredCoordinatesAreHeldAndMakeThemMoreExact) {
+  // all six coordinates measured, the positions with 1e-4 m of noise
+  const SimulatedLog simulated = short_log();
+  const System& system = *pendulum().system;
+  RandomStream random(2);
+  std::vector<std::string> cells;
+  const Trajectory& truth = simulated.episodes[0];
+  for (Index i = 0; i < truth.times.size(); ++i) {
+    cells.push_back(shortest(truth.times[i]));
+    for (int j = 0; j < 6; ++j) cells.push_back(shortest(truth.states(j, i) + 1e-4 * random.normal()));
+  }
+  const CsvTable log = CsvTable::from_cells("log", {"t", "q1", "q2", "q3", "q4", "q5", "q6"}, cells);
+  const DerivedData free = derive(pendulum(), log), held = derive(pendulum(), log, {.hold_constraints = true});
+  EXPECT_THAT(free.independent, ElementsAre(0, 1, 2, 3, 4, 5));
+  EXPECT_THAT(free.notes,
+              Contains(HasSubstr(
+                  "4 of the constraints hold among the measured coordinates alone: --hold-constraints makes use of that")));
+  EXPECT_EQ(held.independent.size(), 2U);
+
+  const VectorXd parameters = system.parameter_values();
+  EXPECT_GT(largest(system.residuals(free.states, parameters)), 1e-6);
+  EXPECT_LE(largest(system.residuals(held.states, parameters)), 1e-11);
+  const SystemValues values = system.evaluate(held.states, parameters);
+  for (int i = 0; i < held.states.cols(); ++i) EXPECT_LE(largest(values.A(i) * held.accelerations.col(i) - values.b(i)), 1e-8);
+
+  const auto inner = [](const MatrixXd& all) { return all.middleCols(15, all.cols() - 30); };
+  EXPECT_LT(inner(held.accelerations - truth.accelerations).norm(), 0.8 * inner(free.accelerations - truth.accelerations).norm());
+  // the deviations fell, and still hold the truth
+  const MatrixXd stddev = inner(held.stddev.bottomRows(6)), error = inner(held.accelerations - truth.accelerations);
+  EXPECT_LT(stddev.sum(), inner(free.stddev.bottomRows(6)).sum());
+  EXPECT_GE((error.array().abs() <= 1.96 * stddev.array()).cast<double>().mean(), 0.85);
+}
+
+TEST(Derive, OfRedundantAndMissingCoordinatesTheConstraintsAreHeld) {
+  const SimulatedLog simulated = short_log();
+  std::vector<std::string> cells;
+  const Trajectory& truth = simulated.episodes[0];
+  RandomStream random(3);
+  for (Index i = 0; i < truth.times.size(); ++i) {
+    cells.push_back(shortest(truth.times[i]));
+    for (const int j : {0, 2, 5}) cells.push_back(shortest(truth.states(j, i) + 1e-5 * random.normal()));
+  }
+  const CsvTable log = CsvTable::from_cells("log", {"t", "q1", "q3", "q6"}, cells);
+  const DerivedData held = derive(pendulum(), log, {.hold_constraints = true});
+  EXPECT_LE(largest(pendulum().system->residuals(held.states, pendulum().system->parameter_values())), 1e-11);
+  EXPECT_LE(largest(held.states.col(100).head(12) - truth.states.col(100).head(12)), 0.01);
+  EXPECT_THAT([&] { derive(pendulum(), log); },
+              testing::ThrowsMessage<InputError>(
+                  HasSubstr("1 of the constraints holds among the measured coordinates alone, which noise contradicts, "
+                            "so that q2, q4, q5 cannot be solved for; hold the constraints (--hold-constraints)")));
+}
+
+TEST(Derive, GapsMissingCellsAndRepeatedRowsAreCountedAndBridged) {
+  const CsvTable log = cart_log([](std::vector<Row>& rows) {
+    rows.erase(rows.begin() + 100, rows.begin() + 110);
+    rows[20][1] = "";
+    rows[21][1] = "NaN";
+    rows.insert(rows.begin() + 50, rows[50]);  // all the same
+    rows.insert(rows.begin() + 60, {rows[60][0], "0.9737"});
+  });
+  const DerivedData data = derive(cart(), log);
+  ASSERT_EQ(data.series.size(), 1U);
+  const DerivedSeries& series = data.series[0];
+  EXPECT_EQ(series.missing, 2);
+  EXPECT_EQ(series.repeated, 1);
+  EXPECT_EQ(series.gaps, 1);
+  EXPECT_NEAR(series.longest_gap, 0.11, 1e-9);
+  EXPECT_EQ(data.states.cols(), 190);
+  EXPECT_NEAR(data.states(0, 20), std::sin(0.6), 2e-4);
+  EXPECT_NEAR(data.states(1, 21), 3 * std::cos(0.63), 0.02);
+  // beside the gap less is known
+  EXPECT_GT(data.stddev(0, 100), 1.2 * data.stddev(0, 70));
+}
+
+TEST(Derive, RowsAtAnEvenRateGoThroughGaps) {
+  const CsvTable log = cart_log([](std::vector<Row>& rows) { rows.erase(rows.begin() + 100, rows.begin() + 110); });
+  const DerivedData data = derive(cart(), log, {.rate = 50});
+  ASSERT_EQ(data.states.cols(), 100);
+  EXPECT_EQ(data.states(2, 53), 1.06);
+  EXPECT_NEAR(data.states(0, 53), std::sin(3 * 1.06), 1e-3);
+  EXPECT_GT(data.stddev(0, 52), data.stddev(0, 40));
+  EXPECT_EQ(derive(cart(), log, {.every = 4}).states.cols(), 48);
+}
+
+TEST(Derive, WrappedAnglesAreUnwrapped) {
+  const Model wheel = Model::parse(R"(
+name = "wheel"
+coordinates = [{ name = "q1", angle = true }]
+[mechanics]
+mass = [["1"]]
+force = ["0"]
+[[latent]]
+name = "rest"
+kernel = "se"
+features = ["dq1"]
+directions = "force"
+)",
+                                   "wheel.toml");
+  const CsvTable log = cart_log([](std::vector<Row>& rows) {
+    for (std::size_t k = 0; k < rows.size(); ++k) {
+      const double angle = 8 * 0.01 * static_cast<double>(k);
+      rows[k][1] = shortest(std::remainder(angle, 2 * std::numbers::pi));
+    }
+  });
+  const DerivedData data = derive(wheel, log);
+  EXPECT_EQ(data.series[0].wraps, 3);
+  EXPECT_EQ(data.series[0].outliers, 0);
+  for (Index i = 0; i < data.states.cols(); ++i) EXPECT_NEAR(data.states(1, i), 8, 0.01);
+}
+
+TEST(Derive, VelocitiesOfTheLogAreUsed) {
+  RandomStream random(4);
+  const auto with_velocity = [&](std::vector<Row>& rows) {
+    for (std::size_t k = 0; k < rows.size(); ++k)
+      rows[k].push_back(shortest(3 * std::cos(0.03 * static_cast<double>(k)) + 1e-4 * random.normal()));
+  };
+  const DerivedData without = derive(cart(), cart_log());
+  const DerivedData with = derive(cart(), cart_log(with_velocity, {"t", "q1", "qd1"}));
+  EXPECT_LT(with.stddev.row(2).mean(), 0.5 * without.stddev.row(2).mean());
+  EXPECT_NEAR(with.accelerations(0, 50), -9 * std::sin(1.5), 0.05);
+  EXPECT_THAT(with.notes, Contains("dq1 is the column 'qd1'"));
+}
+
+TEST(Derive, InputsGoThroughTheFilterOfThePositions) {
+  // where the input is the position itself, so is what the filter makes of it
+  const CsvTable log = cart_log(
+      [](std::vector<Row>& rows) {
+        for (Row& row : rows) row.push_back(row[1]);
+      },
+      {"t", "q1", "tau1"});
+  const DerivedData data = derive(cart(), log);
+  for (Index i = 0; i < data.states.cols(); ++i) EXPECT_NEAR(data.states(3, i), data.states(0, i), 1e-9);
+  EXPECT_THAT(as_table(data, *cart().system, "").header(),
+              ElementsAre("t", "q1", "dq1", "u1", "ddq1", "q1_std", "dq1_std", "ddq1_std"));
+  EXPECT_THAT(derive(cart(), cart_log()).notes, Contains("the log has no input u1"));
+}
+
+TEST(Derive, EpisodesAreChosenByWhatTheirColumnSays) {
+  const SimulatedLog log = short_log({two_starts[0], two_starts[1], two_starts[0]});
+  const DerivedData data = derive(pendulum(), log.table, {.episodes = {"2", "0"}, .keep = {"q6"}, .n_threads = 1});
+  EXPECT_THAT(data.episodes, ElementsAre("0", "2"));
+  EXPECT_EQ(data.states.cols(), 500);
+  EXPECT_EQ(data.kept[0][250], log.table.cell(500, 3));
+  EXPECT_EQ(data.states(12, 250), 0);
+}
+
+TEST(Derive, AShortEpisodeTakesTheModelOfTheOthers) {
+  const CsvTable log = cart_log(
+      [](std::vector<Row>& rows) {
+        for (std::size_t k = 0; k < rows.size(); ++k) rows[k].push_back(k < 180 ? "long" : "short");
+      },
+      {"t", "q1", "run"});
+  const DerivedData data = derive(cart(), log, {.episode_column = "run"});
+  ASSERT_EQ(data.series.size(), 2U);
+  EXPECT_FALSE(data.series[0].shared_model);
+  EXPECT_TRUE(data.series[1].shared_model);
+  EXPECT_EQ(data.series[1].model.lengthscale, data.series[0].model.lengthscale);
+}
+
+TEST(Derive, SaysWhatIsWrongWithALog) {
+  const auto fault = [](const CsvTable& log, const DeriveOptions& options = {}, const Model& model = cart()) -> std::string {
+    try {
+      derive(model, log, options);
+    } catch (const InputError& error) {
+      return error.what();
+    }
+    return "nothing";
+  };
+  const auto edit = [](auto change) { return cart_log([=](std::vector<Row>& rows) { change(rows); }); };
+
+  EXPECT_THAT(fault(edit([](auto& rows) { std::swap(rows[10][0], rows[11][0]); })),
+              HasSubstr("log.csv: column 't': time runs backwards at data row 12: 0.1 after 0.11. Sort the rows, or give the "
+                        "column that numbers the episodes"));
+  EXPECT_THAT(fault(edit([](auto& rows) { rows.resize(1); })),
+              HasSubstr("column 'q1': 1 samples are too few to find a motion in; 5 are needed"));
+  EXPECT_THAT(fault(edit([](auto& rows) {
+                for (Row& row : rows) row[1] = "2.5";
+              })),
+              HasSubstr("column 'q1': all 200 values are 2.5: nothing moves, which tells neither velocity nor noise"));
+  EXPECT_THAT(fault(edit([](auto& rows) {
+                for (Row& row : rows) row[1] = "nan";
+              })),
+              HasSubstr("0 samples are too few"));
+  EXPECT_THAT(fault(edit([](auto& rows) { rows[7][1] = "1,5"; })),
+              HasSubstr("log.csv:9: column 'q1': '1,5' is not a finite number"));
+  EXPECT_THAT(fault(edit([](auto& rows) { rows[7][0] = ""; })), HasSubstr("log.csv:9: column 't': the cell is empty"));
+  EXPECT_THAT(fault(cart_log([](auto&) {}, {"clock", "q1"})),
+              HasSubstr("log.csv: missing column 't' (looked for t, time, timestamp)"));
+  EXPECT_THAT(
+      fault(cart_log([](auto&) {}, {"t", "angle"})),
+      HasSubstr(
+          "log.csv: no column is a coordinate of 'cart' (q1); the file has: t, angle. Rename them, or give --map LOGNAME=q1"));
+  EXPECT_THAT(fault(cart_log(), {.episode_column = "run"}),
+              HasSubstr("episode column: log.csv has no column 'run'; it has: t, q1"));
+  EXPECT_THAT(fault(cart_log(), {.episodes = {"3"}}), HasSubstr("episodes: log.csv has no column 'episode' to choose from"));
+  EXPECT_THAT(fault(short_log().table, {.episodes = {"7"}}, pendulum()),
+              HasSubstr("episodes: simulated log has no episode '7'; it has: 0, 1"));
+  EXPECT_THAT(fault(cart_log(), {.keep = {"heat"}}), HasSubstr("keep: log.csv has no column 'heat'; it has: t, q1"));
+  EXPECT_THAT(fault(cart_log(), {.keep = {"q1"}, .rate = 10}), HasSubstr("keep: rows of an even rate are not those of the log"));
+  EXPECT_THAT(fault(cart_log(), {.rate = -1}), HasSubstr("rate: must be positive, got -1"));
+  EXPECT_THAT(fault(cart_log(), {.rate = 1e9}), HasSubstr("rows; at most 1e+07 are written"));
+  EXPECT_THAT(fault(cart_log(), {.every = 0}), HasSubstr("every: must be at least 1, got 0"));
+  EXPECT_THAT(fault(cart_log(), {.outlier_threshold = -1}), HasSubstr("outlier threshold: must not be negative, got -1"));
+  EXPECT_THAT(fault(cart_log(
+                  [](auto& rows) {
+                    for (Row& row : rows) row.push_back("");
+                  },
+                  {"t", "q1", "u1"})),
+              HasSubstr("column 'u1': there is no value"));
+
+  // of the pendulum's angles one is not there, and nothing decides it
+  std::vector<std::string> cells;
+  const SimulatedLog simulated = short_log();
+  for (int row = 0; row < 250; ++row) {
+    cells.push_back(simulated.table.cell(row, 1));
+    cells.push_back(simulated.table.cell(row, 2));
+  }
+  EXPECT_THAT(
+      fault(CsvTable::from_cells("one angle.csv", {"t", "q3"}, cells), {}, pendulum()),
+      HasSubstr("has no column for q4, q5, q6, and the constraints of 'double pendulum' do not decide them from what it has"));
+}
+
+}  // namespace
+}  // namespace gp2::test

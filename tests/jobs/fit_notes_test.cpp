@@ -1,0 +1,78 @@
+#include <gmock/gmock.h>
+
+#include "gp2/jobs/fit_problem.hpp"
+#include "hyperparameter.hpp"
+#include "io_testing.hpp"
+
+// What a fit says before it begins and after it has ended.
+namespace gp2 {
+namespace {
+
+using test::hyperparameter;
+using test::input_error_of;
+using testing::AllOf;
+using testing::Contains;
+using testing::ElementsAre;
+using testing::HasSubstr;
+using testing::StartsWith;
+
+TEST(FitNotes, NameWhatEndedAtABound) {
+  FitReport report;
+  report.iterations = 10;
+  report.hyperparameters = {hyperparameter(Hyperparameter::Kind::parameter, "m", 2, 0.5, 2),
+                            hyperparameter(Hyperparameter::Kind::parameter, "k", 1, 0.5, 2),
+                            hyperparameter(Hyperparameter::Kind::noise_stddev, "noise of ddx", 1e-4, 1e-4, 1),
+                            hyperparameter(Hyperparameter::Kind::noise_stddev, "noise of ddy", 1e-4, 1e-4, 1)};
+  EXPECT_THAT(notes_of(report),
+              ElementsAre(HasSubstr("warning: m ended at its bound, 2."),
+                          HasSubstr("warning: noise of ddx, noise of ddy ended at the lower bound: the columns may not be")));
+  // where nothing was optimised nothing ended anywhere
+  report.iterations = 0;
+  report.hyperparameters.resize(2);
+  EXPECT_THAT(notes_of(report), testing::IsEmpty());
+}
+
+Model cart(const std::string& constraints) {
+  return Model::parse("coordinates = ['x', 'y']\n[mechanics]\nmass = [['2', '0'], ['0', '1']]\n" + constraints +
+                          "[[latent]]\nkernel = 'se'\nfeatures = ['dx']\ndirections = 'acceleration'\n",
+                      "cart");
+}
+
+FitProblem problem_of(const Model& model, const CsvTable& log) {
+  FitProblemOptions options;
+  options.project = true;
+  options.estimate_noise = true;
+  return make_fit_problem(model, log, options);
+}
+
+TEST(FitNotes, TellThatThereIsNothingToProjectOnto) {
+  const CsvTable log = CsvTable::parse("x,y,dx,dy,ddx,ddy\n1,2,3,4,5,0\n2,3,4,5,6,0\n", "log.csv");
+  for (const char* constraints : {"", "[constraints]\nacceleration = ['ddx - ddy']\n"}) {
+    EXPECT_THAT(problem_of(cart(constraints), log).notes,
+                Contains(HasSubstr("log.csv: nothing to project: 'cart' has no position or velocity constraints")));
+  }
+}
+
+TEST(FitNotes, TellWhichStatesTheConstraintsDoNotKnow) {
+  const Model model = cart("[constraints]\nposition = ['y - sqrt(x)']\n");
+  const CsvTable log = CsvTable::parse("x,y,dx,dy,ddx,ddy\n1,1,2,1,0,0\n-2,4,6,0,1,1\n", "log.csv");
+  EXPECT_THAT(input_error_of([&] { problem_of(model, log); }),
+              AllOf(StartsWith("--project: log.csv: 1 of 2 states have no state on the constraints near them (line 3): "),
+                    HasSubstr("the constraint \"y - sqrt(x)\" is not a number there")));
+}
+
+// a column that does not vary gives no scale for its noise
+TEST(FitNotes, NoiseThatIsEstimatedStartsAtAScaleOfTheColumn) {
+  const CsvTable log = CsvTable::parse("x,y,dx,dy,ddx,ddy\n1,2,3,4,5,0\n2,3,4,5,7,0\n", "log.csv");
+  const FitProblem problem = problem_of(cart(""), log);
+  std::vector<double> noise;
+  for (const Hyperparameter& h : problem.hyperparameters) {
+    if (h.kind == Hyperparameter::Kind::noise_stddev) noise.push_back(h.value);
+  }
+  ASSERT_EQ(noise.size(), 2U);
+  EXPECT_GT(noise[0], 0.01);
+  EXPECT_EQ(noise[1], 0.05);
+}
+
+}  // namespace
+}  // namespace gp2

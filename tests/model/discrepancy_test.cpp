@@ -1,0 +1,402 @@
+#include <functional>
+
+#include <fmt/format.h>
+#include <gmock/gmock.h>
+#include <nlohmann/json.hpp>
+
+#include "gp2/jobs/fit_problem.hpp"
+#include "gp2/simulation/generate.hpp"
+#include "io_testing.hpp"
+#include "test_models.hpp"
+
+// The small latent beside the model's one: when a fit has it, how large it is, and that a fit file keeps it.
+namespace gp2 {
+namespace {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+using Json = nlohmann::ordered_json;
+using test::eps;
+using test::input_error_of;
+using test::TemporaryFolder;
+using testing::ElementsAre;
+using testing::HasSubstr;
+using Quantity = View::Quantity;
+
+/// A bead on a wire; what follows [noise] may be said otherwise, and a [[latent]] too.
+Model bead(const std::string& latent = "directions = \"acceleration\"\n", const std::string& noise = "ddq = [0.1, 0.3]",
+           const std::string& wire = "y - 0.7*x^2", const std::string& name = "bead.toml") {
+  return Model::parse(fmt::format(R"toml(
+coordinates = ["x", "y"]
+inputs      = ["u"]
+[mechanics]
+mass  = [["2", "0"], ["0", "2"]]
+force = ["u", "-2*9.81"]
+[constraints]
+position = ["{}"]
+[truth]
+acceleration = ["-0.3*dx", "-0.3*dy"]
+[sampling]
+x  = [-1, 1]
+dx = [-1, 1]
+u  = [-2, 2]
+[noise]
+{}
+[[latent]]
+name       = "drag"
+kernel     = "se"
+features   = ["x", "dx", "u"]
+{}
+)toml",
+                                  wire, noise, latent),
+                      name);
+}
+
+/// A noisy log of a model's own motion.
+CsvTable log_of(const Model& model, int n = 12, std::uint64_t seed = 3) {
+  const System& system = *model.system;
+  const GeneratedData data = generate(model, {n, seed, VectorXd::Constant(system.nq(), 0.1)});
+  const std::vector<std::string> states = system.state_names();
+  std::vector<std::string> names;
+  MatrixXd values(0, n);
+  const auto add = [&](const std::string& name, const auto& row) {
+    names.push_back(name);
+    values.conservativeResize(values.rows() + 1, Eigen::NoChange);
+    values.bottomRows(1) = row;
+  };
+  for (std::size_t k = 0; k < states.size(); ++k) {
+    if (data.known[k]) add(states[k], data.states.row(static_cast<Index>(k)));
+  }
+  for (int j = 0; j < system.nq(); ++j) {
+    add(system.coordinates()[static_cast<std::size_t>(j)].acceleration(), data.accelerations.row(j));
+  }
+  std::string text;
+  for (std::size_t k = 0; k < names.size(); ++k) text += fmt::format("{}{}", k == 0 ? "" : ",", names[k]);
+  for (int i = 0; i < n; ++i) {
+    for (Index k = 0; k < values.rows(); ++k) text += fmt::format("{}{}", k == 0 ? "\n" : ",", shortest(values(k, i)));
+  }
+  return CsvTable::parse(text, "log.csv");
+}
+
+FitProblem problem_of(const Model& model, const FitProblemOptions& options = {}) {
+  return make_fit_problem(model, log_of(model), options);
+}
+
+/// The model's hyperparameters as they start, and the data.
+Posterior start_of(const FitProblem& problem) {
+  return {problem.prior, problem.observations, model_values(problem.prior, problem.observations, problem.hyperparameters)};
+}
+
+/// As `gp2 fit --max-iterations 0` writes it.
+FitFile file_of(const Model& model, const FitProblem& problem) {
+  FitFile file;
+  file.model = model;
+  file.prior_options = problem.prior_options;
+  file.observations = problem.observations;
+  file.systems = problem.systems;
+  FitOptions options;
+  options.max_iterations = 0;
+  file.report = fit(problem.prior, problem.observations, problem.hyperparameters, options).report;
+  return file;
+}
+
+View view_of(const Prior& prior, Quantity quantity, int latent = -1) {
+  View view = View::all(quantity, *prior.system);
+  view.latent = latent;
+  return view;
+}
+
+MatrixXd some_states(const Model& model) { return test::draw(model, 6, 8).states; }
+
+// ---- which fits have one
+
+bool has_discrepancy(const Model& model, const FitProblemOptions& options = {}) {
+  const FitProblem problem = problem_of(model, options);
+  const bool has = problem.prior_options.discrepancy.has_value();
+  EXPECT_EQ(problem.prior.latents.back().name == "discrepancy", has);
+  return has;
+}
+
+TEST(Discrepancy, StandsBesideOneLatentThatActsInEveryDirection) {
+  EXPECT_TRUE(has_discrepancy(bead()));
+  EXPECT_TRUE(has_discrepancy(bead("directions = \"force\"\n")));
+  FitProblemOptions options;
+  options.mean = Prior::Mean::force;
+  options.base = Latent::Base::force;
+  options.estimate_noise = true;
+  EXPECT_TRUE(has_discrepancy(bead(), options));
+  // --prior replaces the directions that a file gives
+  EXPECT_TRUE(has_discrepancy(bead("directions = [[\"-dx\"], [\"-dy\"]]\n"), options));
+
+  const Prior prior = problem_of(bead()).prior;
+  ASSERT_EQ(prior.latents.size(), 2U);
+  EXPECT_EQ(prior.latents[0].name, "drag");
+  EXPECT_TRUE(prior.latents[0].directions_are_identity);
+  EXPECT_EQ(prior.latents[1].feature_names, prior.latents[0].feature_names);
+  EXPECT_EQ(view_of(prior, Quantity::unconstrained_acceleration, 1).names(*prior.system, prior.latents[1].name),
+            (std::vector<std::string>{"abar_x@discrepancy", "abar_y@discrepancy"}));
+}
+
+TEST(Discrepancy, IsLeftOutOfThePapersProtocolOfMaximumLikelihoodAndWhereAskedTo) {
+  FitProblemOptions paper, maximum_likelihood, none, baseline;
+  paper.protocol.name = Protocol::Name::paper;
+  maximum_likelihood.protocol.hyperprior = false;
+  none.discrepancy = false;
+  baseline.baseline = Baseline::Kind::se;
+  for (const FitProblemOptions& options : {paper, maximum_likelihood, none, baseline})
+    EXPECT_FALSE(has_discrepancy(bead(), options));
+}
+
+TEST(Discrepancy, IsLeftOutWhereTheModelSaysHowItsLatentsAct) {
+  EXPECT_FALSE(has_discrepancy(bead("directions = [[\"-dx\"], [\"-dy\"]]\n")));
+  EXPECT_FALSE(has_discrepancy(bead("directions = [[\"1\", \"0\"], [\"0\", \"1\"]]\n"))) << "written out is structured too";
+  EXPECT_FALSE(has_discrepancy(
+      bead("directions = \"acceleration\"\n[[latent]]\nname = \"drive\"\nkernel = \"se\"\nfeatures = [\"u\"]\n")));
+}
+
+// ---- how large it is
+
+TEST(Discrepancy, HasAShareOfTheNoiseAndOfTheSpreadOfEachFeature) {
+  const Model model = bead();
+  const FitProblem problem = problem_of(model);
+  const Discrepancy& discrepancy = *problem.prior_options.discrepancy;
+  EXPECT_EQ(discrepancy.stddev, 0.4 * Eigen::Vector2d(0.1, 0.3));
+  // the features are entries of the state
+  const MatrixXd& states = problem.observations.front().states;
+  const StateLayout layout = model.system->layout();
+  ASSERT_EQ(discrepancy.lengthscale.size(), 3);
+  for (const auto& [feature, entry] : {std::pair(0, layout.q(0)), std::pair(1, layout.dq(0)), std::pair(2, layout.u(0))}) {
+    const VectorXd x = states.row(entry);
+    const double spread = std::sqrt((x.array() - x.mean()).square().mean());
+    EXPECT_NEAR(discrepancy.lengthscale[feature], 1.25 * spread, 20 * eps * spread);
+  }
+}
+
+TEST(Discrepancy, IsASquaredExponentialOfTheseSizes) {
+  const Model model = bead("directions = \"force\"\n");  // the discrepancy acts on the acceleration all the same
+  const FitProblem problem = problem_of(model);
+  const Discrepancy& discrepancy = *problem.prior_options.discrepancy;
+  const MatrixXd states = some_states(model);
+  const View alone = view_of(problem.prior, Quantity::unconstrained_acceleration, 1);
+  const MatrixXd covariance = start_of(problem).without_data().joint(alone, states).covariance;
+  const StateLayout layout = model.system->layout();
+  const std::vector<int> features = {layout.q(0), layout.dq(0), layout.u(0)};
+  for (Index i = 0; i < states.cols(); ++i) {
+    for (Index k = 0; k < states.cols(); ++k) {
+      const VectorXd distance = (states.col(i) - states.col(k))(features).cwiseQuotient(discrepancy.lengthscale);
+      const VectorXd variance = discrepancy.stddev.array().square() * std::exp(-0.5 * distance.squaredNorm());
+      EXPECT_LE((covariance.block(2 * i, 2 * k, 2, 2) - MatrixXd(variance.asDiagonal())).cwiseAbs().maxCoeff(), 20 * eps);
+    }
+  }
+}
+
+TEST(Discrepancy, TakesTheNoiseThatTheFitStartsWith) {
+  FitProblemOptions stated;
+  stated.noise_stddev = 0.5;
+  EXPECT_EQ(problem_of(bead(), stated).prior_options.discrepancy->stddev, VectorXd::Constant(2, 0.4 * 0.5));
+  FitProblemOptions estimated;
+  estimated.estimate_noise = true;
+  const FitProblem problem = problem_of(bead("", "ddq = { estimate = true, initial = [0.2, 0.4] }"), estimated);
+  EXPECT_EQ(problem.prior_options.discrepancy->stddev, 0.4 * problem.observations.front().noise_stddev);
+  EXPECT_EQ(problem.observations.front().noise_stddev, Eigen::Vector2d(0.2, 0.4));
+}
+
+TEST(Discrepancy, TakesTheLargestNoiseOfSeveralLogs) {
+  const auto quiet = std::make_shared<const Model>(bead("", "ddq = [0.05, 0.6]", "y - 0.7*x^2", "quiet.toml"));
+  const Model model = bead();
+  const FitProblem problem = make_fit_problem(model, {{log_of(model)}, {log_of(*quiet), quiet}}, {}, {});
+  EXPECT_EQ(problem.prior_options.discrepancy->stddev, 0.4 * Eigen::Vector2d(0.1, 0.6));
+}
+
+TEST(Discrepancy, GivesAnAccelerationThatIsNotMeasuredTheSameShareOfItsSpread) {
+  const Model model = bead();
+  for (const auto& [observed, measured] : {std::pair("ddx", 0), std::pair("ddy", 1)}) {
+    FitProblemOptions options;
+    options.observe = {observed};
+    const FitProblem problem = problem_of(model, options);
+    const VectorXd spread = default_scales(problem.prior, problem.observations).acceleration_stddev;
+    const VectorXd& stddev = problem.prior_options.discrepancy->stddev;
+    const double noise = problem.observations.front().noise_stddev[0];
+    EXPECT_EQ(stddev[measured], 0.4 * noise) << observed;
+    EXPECT_NEAR(stddev[1 - measured], 0.4 * noise / spread[measured] * spread[1 - measured], 8 * eps) << observed;
+  }
+}
+
+TEST(Discrepancy, OfUnmeasuredAccelerationsTakesTheMeanShareOfTheMeasuredOnes) {
+  const Model& model = test::model("experiments/surface_published.toml");
+  FitProblemOptions options;
+  options.observe = {"ddq1", "ddq3"};
+  const FitProblem problem = problem_of(model, options);
+  const VectorXd spread = default_scales(problem.prior, problem.observations).acceleration_stddev;
+  const VectorXd& stddev = problem.prior_options.discrepancy->stddev;
+  const double share = (0.1 / spread[0] + 0.1 / spread[2]) / 2;
+  EXPECT_NEAR(stddev[1], 0.4 * share * spread[1], 8 * eps * stddev[1]);
+  EXPECT_EQ(stddev[0], 0.4 * 0.1);
+}
+
+TEST(Discrepancy, ThatDoesNotFitThePriorIsRefused) {
+  const auto refused = [](Index n_lengthscales, Index n_stddevs) {
+    PriorOptions options;
+    options.discrepancy = Discrepancy{VectorXd::Ones(n_lengthscales), VectorXd::Ones(n_stddevs)};
+    return input_error_of([&] { make_prior(bead(), options); });
+  };
+  EXPECT_EQ(refused(3, 2), "");
+  EXPECT_EQ(refused(2, 2), "a discrepancy must hold 3 lengthscales and 2 standard deviations, got 2 and 2");
+  EXPECT_EQ(refused(3, 1), "a discrepancy must hold 3 lengthscales and 2 standard deviations, got 3 and 1");
+}
+
+// ---- what it does
+
+TEST(Discrepancy, LeavesNothingToTuneAndTheNamesAsTheyAre) {
+  FitProblemOptions without;
+  without.discrepancy = false;
+  const FitProblem a = problem_of(bead()), b = problem_of(bead(), without);
+  std::vector<std::string> names;
+  ASSERT_EQ(a.hyperparameters.size(), b.hyperparameters.size());
+  for (std::size_t k = 0; k < a.hyperparameters.size(); ++k) {
+    const Hyperparameter &with = a.hyperparameters[k], &alone = b.hyperparameters[k];
+    names.push_back(with.name);
+    EXPECT_EQ(std::tie(with.name, with.unit, with.value, with.lower, with.upper, with.median, with.log_stddev),
+              std::tie(alone.name, alone.unit, alone.value, alone.lower, alone.upper, alone.median, alone.log_stddev));
+  }
+  EXPECT_THAT(names,
+              ElementsAre("lengthscale(x)", "lengthscale(dx)", "lengthscale(u)", "signal_stddev(ddx)", "signal_stddev(ddy)"));
+}
+
+TEST(Discrepancy, AndTheModelsLatentTogetherAreThePosterior) {
+  const Model model = bead();
+  const FitProblem problem = problem_of(model);
+  const Posterior posterior = start_of(problem);
+  const MatrixXd states = some_states(model);
+  for (const Quantity quantity : {Quantity::constrained_acceleration, Quantity::unconstrained_acceleration}) {
+    const View all = view_of(problem.prior, quantity), first = view_of(problem.prior, quantity, 0),
+               second = view_of(problem.prior, quantity, 1);
+    const Posterior::Joint whole = posterior.joint(all, states);
+    const Posterior::Joint parts = posterior.joint({{first, states}, {second, states}});
+    const Index n = whole.mean.size();
+    const auto block = [&](Index i, Index k) { return parts.covariance.block(i * n, k * n, n, n); };
+    const double scale = block(0, 0).cwiseAbs().maxCoeff();
+    EXPECT_LE((block(0, 0) + block(0, 1) + block(1, 0) + block(1, 1) - whole.covariance).cwiseAbs().maxCoeff(), 1e-12 * scale);
+    // the data cannot tell them apart wholly
+    EXPECT_GT(block(0, 1).cwiseAbs().maxCoeff(), 1e-6 * scale);
+    // zero mean: what is left of the whole is L b
+    const Posterior::Joint prior = posterior.without_data().joint(all, states);
+    const VectorXd latents = parts.mean.head(n) + parts.mean.tail(n);
+    EXPECT_LE((whole.mean - prior.mean - latents).cwiseAbs().maxCoeff(), 1e-12 * whole.mean.cwiseAbs().maxCoeff());
+    // before data they are independent
+    const Posterior::Joint before = posterior.without_data().joint({{first, states}, {second, states}});
+    EXPECT_EQ(before.covariance.topRightCorner(n, n).cwiseAbs().maxCoeff(), 0);
+  }
+}
+
+TEST(Discrepancy, NeverLowersAVarianceUnderTheSameHyperparameters) {
+  const Model model = bead();
+  FitProblemOptions options;
+  options.discrepancy = false;
+  const Posterior without = start_of(problem_of(model, options)), with = start_of(problem_of(model));
+  const MatrixXd states = some_states(model);
+  double largest = 0;
+  for (const Quantity quantity : {Quantity::constrained_acceleration, Quantity::unconstrained_acceleration}) {
+    const View view = view_of(with.prior(), quantity);
+    const MatrixXd a = without.marginal(view, states).covariance, b = with.marginal(view, states).covariance;
+    for (const Index entry : {0, 3}) {  // the variances
+      EXPECT_GE((b - a).row(entry).minCoeff(), -1e-12 * a.row(entry).maxCoeff());
+      largest = std::max(largest, (b - a).row(entry).maxCoeff());
+    }
+  }
+  EXPECT_GT(largest, 1e-6);
+}
+
+TEST(Discrepancy, ActsUnderTheSystemsOfAllLogs) {
+  const Model model = bead();
+  const auto other = std::make_shared<const Model>(bead("", "ddq = [0.1, 0.3]", "y - sin(x)", "other.toml"));
+  const FitProblem problem = make_fit_problem(model, {{log_of(model)}, {log_of(*other), other}}, {}, {});
+  const std::shared_ptr<const OtherSystem>& other_system = problem.observations[1].view.other_system;
+  ASSERT_NE(other_system, nullptr);
+  ASSERT_EQ(other_system->prior.latents.size(), 2U);
+  EXPECT_EQ(other_system->prior.latents[1].name, "discrepancy");
+  // ā before data is the same function in both systems
+  const Posterior posterior = start_of(problem);
+  View here = view_of(problem.prior, Quantity::unconstrained_acceleration, 1), there = here;
+  there.other_system = other_system;
+  const MatrixXd states = some_states(model);
+  const Posterior::Joint joint = posterior.without_data().joint({{here, states}, {there, states}});
+  const Index n = joint.mean.size() / 2;
+  const double scale = joint.covariance.maxCoeff();
+  EXPECT_LE((joint.covariance.topLeftCorner(n, n) - joint.covariance.topRightCorner(n, n)).cwiseAbs().maxCoeff(),
+            8 * eps * scale);
+
+  const TemporaryFolder folder;
+  file_of(model, problem).write(folder / "fit.json");
+  const FitFile read = FitFile::read(folder / "fit.json");
+  ASSERT_NE(read.observations[1].view.other_system, nullptr);
+  EXPECT_EQ(read.observations[1].view.other_system->prior.latents.size(), 2U);
+  const View ddq = view_of(problem.prior, Quantity::constrained_acceleration);
+  EXPECT_EQ(read.posterior().marginal(ddq, states).covariance, posterior.marginal(ddq, states).covariance);
+}
+
+// ---- in a fit file
+
+TEST(Discrepancy, ComesBackFromAFitFileBitForBit) {
+  int n_tried = 0;
+  for (const std::string& file : test::library_models()) {
+    SCOPED_TRACE(file);
+    const Model& model = test::model(file);
+    const FitProblem problem = problem_of(model);
+    const FitFile written = file_of(model, problem);
+    const TemporaryFolder folder;
+    written.write(folder / "fit.json");
+    const FitFile read = FitFile::read(folder / "fit.json");
+    ASSERT_EQ(read.prior_options.discrepancy.has_value(), problem.prior_options.discrepancy.has_value());
+    if (!read.prior_options.discrepancy) continue;
+    ++n_tried;
+    EXPECT_EQ(read.prior_options.discrepancy->lengthscale, problem.prior_options.discrepancy->lengthscale);
+    EXPECT_EQ(read.prior_options.discrepancy->stddev, problem.prior_options.discrepancy->stddev);
+    const Posterior before = written.posterior(), after = read.posterior();
+    EXPECT_EQ(before.negative_log_likelihood(), after.negative_log_likelihood());
+    const MatrixXd states = some_states(model);
+    for (const int latent : {-1, 0, 1}) {
+      const View view = view_of(before.prior(), Quantity::unconstrained_acceleration, latent);
+      EXPECT_EQ(before.mean(view, states), after.mean(view, states));
+      EXPECT_EQ(before.marginal(view, states).covariance, after.marginal(view, states).covariance);
+    }
+    read.write(folder / "again.json");
+    EXPECT_EQ(read_file(folder / "again.json"), read_file(folder / "fit.json"));
+  }
+  EXPECT_GE(n_tried, 3);
+}
+
+TEST(Discrepancy, ThatIsNoneInAFitFileIsRefused) {
+  const TemporaryFolder folder;
+  file_of(bead(), problem_of(bead())).write(folder / "fit.json");
+  const Json whole = test::without_checksum(Json::parse(read_file(folder / "fit.json")));
+  const auto error_after = [&](const std::function<void(Json&)>& damage) {
+    Json json = whole;
+    damage(json["prior"]["discrepancy"]);
+    const auto path = folder.write("damaged.json", json.dump());
+    const std::string error = input_error_of([&] { FitFile::read(path); });
+    const std::string prefix = path.string() + ": ";
+    EXPECT_TRUE(error.empty() || error.starts_with(prefix)) << error;
+    return error.substr(std::min(prefix.size(), error.size()));
+  };
+  EXPECT_EQ(error_after([](Json&) {}), "");
+  EXPECT_EQ(error_after([](Json& of) { of["lengthscale"].erase(0); }),
+            "a discrepancy must hold 3 lengthscales and 2 standard deviations, got 2 and 2");
+  EXPECT_EQ(error_after([](Json& of) { of["stddev"].push_back(1); }),
+            "a discrepancy must hold 3 lengthscales and 2 standard deviations, got 3 and 3");
+  EXPECT_EQ(error_after([](Json& of) { of["stddev"] = Json::array(); }),
+            "a discrepancy must hold 3 lengthscales and 2 standard deviations, got 3 and 0");
+  for (const char* key : {"lengthscale", "stddev"}) {
+    for (const double value : {0.0, -0.1}) {
+      EXPECT_EQ(error_after([&](Json& of) { of[key][1] = value; }), "lengthscale and stddev of the discrepancy must be positive");
+    }
+    EXPECT_EQ(error_after([&](Json& of) { of[key][1] = nullptr; }), "null stands where a number must");
+    EXPECT_EQ(error_after([&](Json& of) { of[key] = 1; }), "1 stands where an array must");
+    EXPECT_THAT(error_after([&](Json& of) { of.erase(key); }), HasSubstr(key));
+  }
+  EXPECT_THAT(error_after([](Json& of) { of = "some"; }), HasSubstr("not a whole fit file"));
+}
+
+}  // namespace
+}  // namespace gp2
