@@ -26,9 +26,10 @@ struct LbfgsbResult {
   std::string termination;
 };
 
-/// Minimises f over the box [lower, upper] with the original L-BFGS-B 3.0 (Zhu, Byrd, Lu, Nocedal 1997; Morales, Nocedal 2011).
-/// Every run owns its memory: re-entrant. f(x, gradient) may be +∞ or not a number away from the start: such a step is shortened
-/// tenfold. Prints nothing.
+/// Minimises f over the box [lower, upper] with L-BFGS-B 3.0 (Zhu, Byrd, Lu, Nocedal 1997; Morales, Nocedal 2011). The path
+/// depends on nothing but the values of f, to the bit. Every run owns its memory: re-entrant. f(x, gradient) may be +∞ or not a
+/// number away from the start: such a step is shortened tenfold, and a run that ends at the edge of such a region has not
+/// converged.
 LbfgsbResult minimise(const std::function<double(const Eigen::VectorXd&, Eigen::VectorXd&)>& f, const Eigen::VectorXd& start,
                       const Eigen::VectorXd& lower, const Eigen::VectorXd& upper, const LbfgsbOptions& options);
 

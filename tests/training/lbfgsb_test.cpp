@@ -1,13 +1,18 @@
 #include "training/lbfgsb.hpp"
 
+#include <array>
+#include <bit>
 #include <cmath>
+#include <cstdint>
 #include <cstdio>
 #include <cstdlib>
 #include <limits>
 #include <thread>
+#include <vector>
 
 #include <unistd.h>
 
+#include <fmt/format.h>
 #include <gmock/gmock.h>
 #include <gtest/gtest.h>
 
@@ -34,10 +39,10 @@ double rosenbrock(const VectorXd& x, VectorXd& gradient) {
 
 VectorXd constant(int n, double value) { return VectorXd::Constant(n, value); }
 
-// L-BFGS-B as its authors wrote it reports an ascent direction with a print statement: here for every fifth seed
+// The Fortran of the authors reports an ascent direction with a print statement: here for every fifth seed
 TEST(LbfgsbDeathTest, NeverWritesToStandardOutput) {
   const auto run = [] {
-    // in a process of its own, because the Fortran runtime writes when the process ends
+    // in a process of its own, because what is written may come out when the process ends
     std::fflush(stdout);
     if (dup2(STDERR_FILENO, STDOUT_FILENO) < 0) std::exit(1);
     LbfgsbOptions options;
@@ -124,21 +129,106 @@ TEST(LbfgsbTest, ShortensAStepIntoTheInfiniteTenfold) {
 }
 
 TEST(LbfgsbTest, EndsAtTheEdgeOfAnInfiniteRegionWithTheBestPointItSaw) {
-  // the minimum lies beyond the edge; there is no stationary point to converge to
-  double best = infinity;
-  const auto cut = [&](const VectorXd& x, VectorXd& gradient) {
-    if (x[0] > 0.5) return infinity;
-    const double value = rosenbrock(x, gradient);
-    best = std::min(best, value);
-    return value;
+  // the minimum lies beyond the edge; there is no stationary point to converge to, from wherever the edge is reached
+  for (int k = 0; k < 200; ++k) {
+    double best = infinity;
+    const auto cut = [&](const VectorXd& x, VectorXd& gradient) {
+      if (x[0] > 0.5) return infinity;
+      const double value = rosenbrock(x, gradient);
+      best = std::min(best, value);
+      return value;
+    };
+    const Eigen::Vector2d start(-0.5 + 0.004 * k, -0.5);
+    const LbfgsbResult result = minimise(cut, start, constant(2, -3), constant(2, 3), {});
+    EXPECT_FALSE(result.converged) << "start " << k << ": " << result.termination;
+    EXPECT_EQ(result.termination, "the objective is infinite just beyond the best point, which is no optimum");
+    EXPECT_LE(result.x[0], 0.5);
+    VectorXd gradient(2);
+    EXPECT_EQ(result.value, rosenbrock(result.x, gradient)) << "value and point belong together";
+    EXPECT_LT(result.value, 0.5) << "close to the edge, where it is a quarter";
+    EXPECT_GE(result.value, best);
+  }
+}
+
+TEST(LbfgsbTest, AnInfiniteRegionThatWasLeftBehindIsNoHindranceToConvergence) {
+  LbfgsbOptions options;
+  options.gradient_tolerance = 0;
+  for (int k = 0; k < 50; ++k) {
+    const auto half = [](const VectorXd& x, VectorXd& gradient) {
+      return x[0] > 1.2 || x[1] > 1.3 ? infinity : rosenbrock(x, gradient);
+    };
+    const LbfgsbResult result = minimise(half, Eigen::Vector2d(-1.2 + 0.01 * k, -2.9), constant(2, -3), constant(2, 30), options);
+    EXPECT_GT(result.failed_evaluations, 0) << "nothing was tested";
+    EXPECT_TRUE(result.converged) << "start " << k << ": " << result.termination;
+    EXPECT_LE((result.x - constant(2, 1)).cwiseAbs().maxCoeff(), 1e-4);
+  }
+}
+
+// Rosenbrock's function of six variables, two of which end at a bound; four pairs are kept of 28
+struct Bounded {
+  VectorXd start = constant(6, -1), lower = constant(6, -3), upper = constant(6, 3);
+  LbfgsbOptions options;
+
+  Bounded() {
+    upper[1] = 0.5;
+    lower[4] = 0.25;
+    options.memory = 4;
+  }
+};
+
+// its path must differ from the authors' by rounding errors only: values after each iteration of their Fortran 3.0
+TEST(LbfgsbTest, TakesTheStepsOfTheFortran) {
+  Bounded problem;
+  std::vector<double> values;
+  problem.options.iteration = [&](int, double value) {
+    values.push_back(value);
+    return true;
   };
-  const LbfgsbResult result = minimise(cut, constant(2, -0.5), constant(2, -3), constant(2, 3), {});
-  EXPECT_FALSE(result.converged) << result.termination;
-  EXPECT_LE(result.x[0], 0.5);
-  VectorXd gradient(2);
-  EXPECT_EQ(result.value, rosenbrock(result.x, gradient)) << "value and point belong together";
-  EXPECT_LT(result.value, 0.5) << "close to the edge, where it is a quarter";
-  EXPECT_GE(result.value, best);
+  const LbfgsbResult result = minimise(rosenbrock, problem.start, problem.lower, problem.upper, problem.options);
+  constexpr std::array expected = {
+      272.71179330157588, 61.452967497838898, 42.073978767687713, 16.96579196776457,  12.327274105065092, 11.090694149994201,
+      10.831232181174588, 10.806112325730027, 10.741664894167029, 10.635307468491122, 10.497583754857704, 10.297134663436202,
+      9.8331549702017167, 9.7474473964538326, 9.5427437653355334, 9.3431731955382542, 8.9901917218887029, 8.6031103640492912,
+      8.3452895189085332, 7.8641838540288722, 7.8449411402655791, 7.8441034678096697, 7.8440559077689134, 7.8440544359957443,
+      7.8440540908457352, 7.844054066335044,  7.8440540659132543, 7.8440540659123661};
+  ASSERT_EQ(values.size(), expected.size());
+  for (std::size_t k = 0; k < expected.size(); ++k) EXPECT_NEAR(values[k], expected[k], 1e-11 * expected[k]) << "iteration " << k;
+  EXPECT_EQ(result.evaluations, 34);
+  EXPECT_EQ(result.termination, "the projected gradient fell below its tolerance");
+}
+
+// no library may have a say in the path: the bits of all points that are visited, and of the last one
+TEST(LbfgsbTest, TakesTheSameStepsToTheBitOnEveryMachine) {
+  struct Expected {
+    double edge;  // infinite where x₁ + x₆ is above it
+    int evaluations;
+    std::uint64_t path;
+    std::array<double, 6> x;
+  };
+  const std::array<Expected, 2> all = {
+      {{infinity,
+        34,
+        0xfcb1cb619c839996,
+        {0x1.6ac84f6bd557dp-1, 0x1p-1, 0x1.3f491bbf15bbbp-2, 0x1.7b79400278fe7p-3, 0x1p-2, 0x1.fffffb3aa8bd6p-5}},
+       {0.3,
+        160,
+        0xa23244b5b5c07a99,
+        {0x1.f03235a25bffdp-3, 0x1.86f6a3122161dp-5, 0x1.f0e6a1d9042c8p-8, 0x1.80b5bfccf1626p-5, 0x1p-2, 0x1.d8d0c31026fe7p-5}}}};
+  for (const Expected& expected : all) {
+    SCOPED_TRACE(expected.edge);
+    std::uint64_t path = 14695981039346656037U;  // FNV-1a, of doubles instead of bytes
+    const auto cut = [&](const VectorXd& x, VectorXd& gradient) {
+      for (const double entry : x) path = (path ^ std::bit_cast<std::uint64_t>(entry)) * 1099511628211U;
+      return x[0] + x[5] > expected.edge ? infinity : rosenbrock(x, gradient);
+    };
+    const Bounded problem;
+    const LbfgsbResult result = minimise(cut, problem.start, problem.lower, problem.upper, problem.options);
+    EXPECT_EQ(result.evaluations, expected.evaluations);
+    EXPECT_EQ(path, expected.path) << std::hex << path;
+    for (int i = 0; i < 6; ++i) {
+      EXPECT_EQ(result.x[i], expected.x[static_cast<std::size_t>(i)]) << fmt::format("x[{}] = {:a}", i, result.x[i]);
+    }
+  }
 }
 
 TEST(LbfgsbTest, CallsTheRoundingErrorsOfTheObjectiveConvergence) {
