@@ -1,4 +1,5 @@
-# Installs the library, its headers, the command, the models, the experiments, and the package that find_package(gp2) reads.
+# Installs the library, its headers, the command, the models, the experiments, the documentation with its examples, and the package
+# that find_package(gp2) reads.
 option(GP2_INSTALL "Install gp2 along with the project" ${PROJECT_IS_TOP_LEVEL})
 if(NOT GP2_INSTALL)
   return()
@@ -14,7 +15,11 @@ install(DIRECTORY ${PROJECT_SOURCE_DIR}/models/ DESTINATION ${CMAKE_INSTALL_DATA
         PATTERN "*.xml")
 install(DIRECTORY ${PROJECT_SOURCE_DIR}/experiments/ DESTINATION ${CMAKE_INSTALL_DATADIR}/gp2/experiments
         FILES_MATCHING PATTERN "*.toml" PATTERN "*.xml" PATTERN "*.gp")
-install(FILES ${PROJECT_SOURCE_DIR}/LICENSE ${PROJECT_SOURCE_DIR}/THIRD_PARTY.md DESTINATION ${CMAKE_INSTALL_DOCDIR})
+install(FILES ${PROJECT_SOURCE_DIR}/LICENSE ${PROJECT_SOURCE_DIR}/THIRD_PARTY.md ${PROJECT_SOURCE_DIR}/README.md
+              ${PROJECT_SOURCE_DIR}/CHANGELOG.md
+        DESTINATION ${CMAKE_INSTALL_DOCDIR})
+install(DIRECTORY ${PROJECT_SOURCE_DIR}/docs DESTINATION ${CMAKE_INSTALL_DOCDIR} FILES_MATCHING PATTERN "*.md")
+install(DIRECTORY ${PROJECT_SOURCE_DIR}/examples DESTINATION ${CMAKE_INSTALL_DOCDIR})
 if(TARGET gp2_command)
   set_target_properties(gp2_command PROPERTIES INSTALL_RPATH "$ORIGIN/../${CMAKE_INSTALL_LIBDIR}")
   install(TARGETS gp2_command)
