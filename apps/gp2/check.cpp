@@ -36,7 +36,7 @@ int print(const std::vector<Finding>& findings) {
 
 // a column that is missing is an error only where the model cannot do without
 WholeLog read_log(const Model& model, const Arguments& arguments) {
-  const CsvTable table = CsvTable::read(arguments.data);
+  const CsvTable table = CsvTable::read(arguments.data, CsvTable::Keep::numbers);
   LogReader reader = open_log(model, table, parse_map(arguments.map));
   WholeLog log = read_whole_log(model, reader);
   fmt::print("ok       {}: {} rows, every column found that the model reads\n", arguments.data, table.n_rows());

@@ -64,7 +64,7 @@ std::vector<std::string> observed_outputs(const FitFile& fit) {
 
 void run(const Arguments& arguments) {
   const FitFile fit = FitFile::read(arguments.fit);
-  const CsvTable table = CsvTable::read(arguments.data);
+  const CsvTable table = CsvTable::read(arguments.data, CsvTable::Keep::numbers);
   std::vector<std::string> outputs = parse_list(arguments.outputs);
   if (outputs.empty()) outputs = observed_outputs(fit);
   const std::vector<int> rows = acceleration_rows(*fit.model.system, outputs, "--outputs");

@@ -74,7 +74,8 @@ FitProblemOptions problem_options(const Arguments& arguments) {
 // LOG or LOG@OTHER.toml
 Log read_log(const std::string& text) {
   const auto [path, model] = split_at_system(text);
-  return {CsvTable::read(path), model.empty() ? nullptr : std::make_shared<const Model>(Model::read(model))};
+  return {CsvTable::read(path, CsvTable::Keep::numbers),
+          model.empty() ? nullptr : std::make_shared<const Model>(Model::read(model))};
 }
 
 // VIEW:LOG or VIEW@LATENT:LOG

@@ -92,7 +92,7 @@ StartingPoint parse_start(const std::string& text, const System& system) {
 
 // the first row of a log: what it has of coordinates, velocities and t
 StartingPoint read_start(const std::string& file, const Model& model, const std::string& map) {
-  const CsvTable table = CsvTable::read(file);
+  const CsvTable table = CsvTable::read(file, CsvTable::Keep::numbers);
   LogReader reader(table, *model.system, columns_of(model, map));
   const std::vector<std::string> names = model.system->state_names();
   StartingPoint start{Eigen::VectorXd::Zero(model.system->layout().size()), std::vector<bool>(names.size(), false)};
@@ -118,7 +118,7 @@ InputSignal read_inputs(const Arguments& arguments, const Model& model, double t
   if (!arguments.inputs) return {};
   const System& system = *model.system;
   if (system.inputs().empty()) throw InputError(fmt::format("--inputs: '{}' has no inputs", system.name()));
-  const CsvTable table = CsvTable::read(*arguments.inputs);
+  const CsvTable table = CsvTable::read(*arguments.inputs, CsvTable::Keep::numbers);
   LogReader reader(table, system, columns_of(model, arguments.map));
   const Eigen::VectorXd times = reader.values({"t"}).row(0).transpose();
   const Eigen::MatrixXd values = reader.values(system.inputs());

@@ -55,7 +55,8 @@ std::string path_argument(const py::object& path);
 
 /// A table from a gp2.Table, a path, a pandas frame, or a mapping of column names to arrays.
 /// @param what  stands for the argument in messages
-CsvTable to_table(const py::object& data, const std::string& what);
+/// @param keep  of a file; a gp2.Table is as it was read
+CsvTable to_table(const py::object& data, const std::string& what, CsvTable::Keep keep = CsvTable::Keep::numbers);
 
 /// The model's name -> the log's name. @throws py::type_error
 std::map<std::string, std::string> columns_argument(const py::object& columns);

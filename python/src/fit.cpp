@@ -39,22 +39,16 @@ CsvTable table_of(const py::tuple& arrays, const System& system) {
   if (states.matrix().cols() != ddq.matrix().cols()) {
     throw InputError(fmt::format("data: {} states, but {} accelerations", states.matrix().cols(), ddq.matrix().cols()));
   }
-  std::vector<std::string> header, cells;
-  std::vector<Eigen::VectorXd> columns;
+  std::vector<CsvTable::Column> columns;
   const auto add = [&](const std::vector<std::string>& names, const Eigen::Map<const Eigen::MatrixXd>& rows) {
     for (std::size_t k = 0; k < names.size(); ++k) {
-      const Eigen::VectorXd column = rows.row(static_cast<Eigen::Index>(k));
-      if (column.array().isNaN().all()) continue;
-      header.push_back(names[k]);
-      columns.push_back(column);
+      const auto values = rows.row(static_cast<Eigen::Index>(k));
+      if (!values.array().isNaN().all()) columns.push_back({names[k], {values.begin(), values.end()}});
     }
   };
   add(system.state_names(), states.matrix());
   add(accelerations, ddq.matrix());
-  for (Eigen::Index i = 0; i < states.matrix().cols(); ++i) {
-    for (const Eigen::VectorXd& column : columns) cells.push_back(std::isnan(column[i]) ? "" : shortest(column[i]));
-  }
-  return CsvTable::from_cells("data", std::move(header), std::move(cells));
+  return CsvTable::from_columns("data", std::move(columns));
 }
 
 std::vector<Log> logs_of(const py::object& data, const System& system) {

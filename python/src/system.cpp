@@ -76,7 +76,7 @@ CsvTable generate_table(const PySystem& self, int n, std::uint64_t seed, std::op
 
 CsvTable resample_table(const PySystem& self, const py::object& data, int n, const std::vector<std::string>& features,
                         const std::optional<std::uint64_t>& seed, const py::object& columns) {
-  const CsvTable table = to_table(data, "data");
+  const CsvTable table = to_table(data, "data", CsvTable::Keep::text);
   return table.take(resample(*self.model, table, {n, features, seed, columns_argument(columns)}).rows);
 }
 
@@ -132,7 +132,7 @@ py::tuple derive_table(const PySystem& self, const py::object& data, const std::
   if (!order)
     throw InputError(fmt::format("smoothness: expected one of {}, got '{}'", fmt::join(smoothness_words(), ", "), smoothness));
   options.smoothness = *order;
-  const CsvTable table = to_table(data, "data");
+  const CsvTable table = to_table(data, "data", CsvTable::Keep::text);
   DerivedData derived;
   {
     const py::gil_scoped_release release;

@@ -1,4 +1,5 @@
 #include <cmath>
+#include <new>
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
@@ -12,31 +13,28 @@ namespace gp2::python {
 
 namespace {
 
-// NaN stands for an empty cell, as pandas reads one
-std::string cell_of(double number) { return std::isnan(number) ? "" : shortest(number); }
-
 bool is_missing(const py::handle& cell) {
   if (cell.is_none() || (PyFloat_Check(cell.ptr()) != 0 && std::isnan(PyFloat_AS_DOUBLE(cell.ptr())))) return true;
   return std::string(py::str(py::type::handle_of(cell).attr("__name__"))) == "NAType";  // pandas.NA
 }
 
-// a column as cells that read back to the same numbers
-std::vector<std::string> cells_of(const py::object& column, const std::string& what) {
-  const py::array array = py::array::ensure(column);
+// a column of a table; NaN stands for an empty cell, as pandas reads one
+CsvTable::Column to_column(std::string name, const py::object& values, const std::string& what) {
+  const py::array array = py::array::ensure(values);
   if (!array || array.ndim() != 1) {
     PyErr_Clear();
     throw InputError(fmt::format("{}: expected one-dimensional", what));
   }
-  std::vector<std::string> cells;
-  cells.reserve(static_cast<std::size_t>(array.size()));
+  CsvTable::Column column{std::move(name), {}};
   const char kind = array.dtype().kind();
   if (kind == 'f' || kind == 'i' || kind == 'u') {
-    const auto numbers = py::array_t<double, py::array::forcecast>::ensure(array);
-    for (py::ssize_t i = 0; i < numbers.size(); ++i) cells.push_back(cell_of(numbers.at(i)));
+    const auto numbers = py::array_t<double, py::array::c_style | py::array::forcecast>::ensure(array);
+    if (!numbers) throw std::bad_alloc();
+    column.numbers.assign(numbers.data(), numbers.data() + numbers.size());
   } else {  // text, or what must not be read
-    for (const py::handle cell : array) cells.push_back(is_missing(cell) ? "" : std::string(py::str(cell)));
+    for (const py::handle cell : array) column.cells.push_back(is_missing(cell) ? "" : std::string(py::str(cell)));
   }
-  return cells;
+  return column;
 }
 
 py::array column_of(const CsvTable& table, const std::string& name) {
@@ -53,36 +51,29 @@ py::array column_of(const CsvTable& table, const std::string& name) {
 
 std::string path_argument(const py::object& path) { return py::bytes(py::module_::import("os").attr("fsencode")(path)); }
 
-CsvTable to_table(const py::object& data, const std::string& what) {
+CsvTable to_table(const py::object& data, const std::string& what, CsvTable::Keep keep) {
   if (py::isinstance<CsvTable>(data)) return data.cast<CsvTable>();
   const bool is_path = py::isinstance<py::str>(data) || py::hasattr(data, "__fspath__");
-  if (is_path) return CsvTable::read(path_argument(data));
+  if (is_path) return CsvTable::read(path_argument(data), keep);
   if (!py::hasattr(data, "keys")) {
     throw py::type_error(
         fmt::format("{}: expected a gp2.Table, the path of a CSV file, a pandas frame, or a mapping of column "
                     "names to arrays; got {}",
                     what, std::string(py::str(py::type::of(data)))));
   }
-  std::vector<std::string> header;
-  std::vector<std::vector<std::string>> columns;
+  std::vector<CsvTable::Column> columns;
   for (const py::handle key : data.attr("keys")()) {
-    header.emplace_back(py::str(key));
-    columns.push_back(cells_of(data[key], fmt::format("{}['{}']", what, header.back())));
-    if (columns.back().size() != columns.front().size()) {
-      throw InputError(fmt::format("{}: the columns differ in length: '{}' has {}, '{}' has {}", what, header.front(),
-                                   columns.front().size(), header.back(), columns.back().size()));
-    }
+    std::string name = py::str(key);
+    const std::string column = fmt::format("{}['{}']", what, name);
+    columns.push_back(to_column(std::move(name), data[key], column));
   }
-  std::vector<std::string> cells;
-  for (std::size_t i = 0; !columns.empty() && i < columns.front().size(); ++i) {
-    for (auto& column : columns) cells.push_back(std::move(column[i]));
-  }
-  return CsvTable::from_cells(what, std::move(header), std::move(cells));
+  return CsvTable::from_columns(what, std::move(columns));
 }
 
 void add_table(py::module_& module) {
   py::class_<CsvTable>(module, "Table", "Columns by name, as read from a CSV file. A mapping of names to arrays (n,).")
-      .def(py::init([](const py::object& columns, const std::string& name) { return to_table(columns, name); }),
+      .def(py::init(
+               [](const py::object& columns, const std::string& name) { return to_table(columns, name, CsvTable::Keep::text); }),
            py::arg("columns"), py::arg("name") = "data",
            "From a pandas frame, a mapping of column names to arrays of one length, or the path of a CSV file.")
       .def_property_readonly("name", &CsvTable::name, "Stands for the table in messages.")

@@ -7,6 +7,7 @@
 #include <charconv>
 #include <cstdio>
 #include <cstring>
+#include <functional>
 #include <system_error>
 
 #include <fcntl.h>
@@ -44,35 +45,21 @@ struct OpenFile {
 
 }  // namespace
 
-std::string read_file(const std::filesystem::path& path, std::size_t max_size) {
-  const auto fail = [&](const std::string& why) { throw InputError(fmt::format("{}: {}", path.string(), why)); };
-  const auto require = [&](bool good) {
-    if (!good) fail(fmt::format("cannot be read: {}", std::strerror(errno)));
-  };
-  // opened without waiting, for a pipe may never get a writer
-  const OpenFile file(path);
-  require(file.descriptor >= 0);
-  struct stat status = {};
-  require(fstat(file.descriptor, &status) == 0);
-  const bool is_pipe = S_ISFIFO(status.st_mode);
-  if (!S_ISREG(status.st_mode) && !is_pipe) max_size = std::min(max_size, max_device_size);
+namespace {
 
-  std::string content;
-  if (S_ISREG(status.st_mode)) {
-    const auto size = static_cast<std::size_t>(status.st_size);
-    if (size > max_size) fail(fmt::format("{} bytes; at most {} are read", size, max_size));
-    content.reserve(size);
-  }
+// Reads what a descriptor that does not wait has, block after block, to its end.
+template <typename Require, typename Fail>
+void read_to_end(const OpenFile& file, bool is_pipe, const std::function<void(std::string_view)>& take, const Require& require,
+                 const Fail& fail) {
   std::array<char, 1 << 16> block;
   bool has_writer = !is_pipe, was_patient = false;
   while (true) {
     const ssize_t n = read(file.descriptor, block.data(), block.size());
     if (n > 0) {
-      content.append(block.data(), static_cast<std::size_t>(n));
-      if (content.size() > max_size) fail(fmt::format("more than {} bytes, which is all that is read", max_size));
+      take({block.data(), static_cast<std::size_t>(n)});
       has_writer = true;
     } else if (n == 0) {
-      if (has_writer) return content;
+      if (has_writer) return;
       // no one has opened the pipe for writing yet
       if (was_patient) fail("cannot be read: a pipe that nothing writes to");
       if (file.wait(patience)) {
@@ -87,6 +74,42 @@ std::string read_file(const std::filesystem::path& path, std::size_t max_size) {
       require(errno == EINTR);
     }
   }
+}
+
+}  // namespace
+
+void read_blocks(const std::filesystem::path& path, const std::function<void(std::string_view)>& take, std::size_t max_size) {
+  const auto fail = [&](const std::string& why) { throw InputError(fmt::format("{}: {}", path.string(), why)); };
+  const auto require = [&](bool good) {
+    if (!good) fail(fmt::format("cannot be read: {}", std::strerror(errno)));
+  };
+  // opened without waiting, for a pipe may never get a writer
+  const OpenFile file(path);
+  require(file.descriptor >= 0);
+  struct stat status = {};
+  require(fstat(file.descriptor, &status) == 0);
+  const bool is_pipe = S_ISFIFO(status.st_mode);
+  if (!S_ISREG(status.st_mode) && !is_pipe) max_size = std::min(max_size, max_device_size);
+  if (S_ISREG(status.st_mode) && static_cast<std::size_t>(status.st_size) > max_size) {
+    fail(fmt::format("{} bytes; at most {} are read", status.st_size, max_size));
+  }
+  std::size_t size = 0;
+  const auto take_counted = [&](std::string_view block) {
+    size += block.size();
+    if (size > max_size) fail(fmt::format("more than {} bytes, which is all that is read", max_size));
+    take(block);
+  };
+  read_to_end(file, is_pipe, take_counted, require, fail);
+}
+
+std::string read_file(const std::filesystem::path& path, std::size_t max_size) {
+  std::string content;
+  std::error_code unknown;
+  const std::uintmax_t size = std::filesystem::file_size(path, unknown);
+  if (!unknown && size <= max_size) content.reserve(static_cast<std::size_t>(size));
+  read_blocks(
+      path, [&](std::string_view block) { content += block; }, max_size);
+  return content;
 }
 
 std::string shortest(double value) {

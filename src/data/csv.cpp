@@ -3,12 +3,12 @@
 #include <algorithm>
 #include <charconv>
 #include <cmath>
-#include <iterator>
 #include <limits>
 #include <numeric>
 #include <optional>
 #include <set>
 #include <system_error>
+#include <utility>
 
 #include <fmt/format.h>
 
@@ -53,20 +53,46 @@ std::optional<std::string> take_cell(std::string_view& line) {
   return cell;
 }
 
-// the cells of a line; nothing when a quote is not closed properly
-std::optional<std::vector<std::string>> split(std::string_view line) {
-  std::vector<std::string> cells;
-  while (true) {
-    std::optional<std::string> cell = take_cell(line);
-    if (!cell) return std::nullopt;
-    cells.push_back(std::move(*cell));
-    if (line.empty()) return cells;
-    line.remove_prefix(1);  // the comma
-  }
-}
-
 // a cell to show in a message
 std::string shown(const std::string& cell) { return cell.size() <= 60 ? cell : cell.substr(0, 57) + "..."; }
+
+constexpr double nan = std::numeric_limits<double>::quiet_NaN();
+
+// What from_chars makes of a whole cell.
+struct Parsed {
+  double value = 0;
+  bool is_whole = false;  // nothing is left over
+  std::errc error = {};
+
+  [[nodiscard]] bool is_number() const { return is_whole && error == std::errc() && std::isfinite(value); }
+};
+
+Parsed parse_number(std::string_view cell) {
+  std::string_view digits = trim(cell);
+  // from_chars knows no plus sign
+  if (digits.starts_with('+') && !digits.starts_with("+-")) digits.remove_prefix(1);
+  Parsed parsed;
+  const auto [end, error] = std::from_chars(digits.data(), digits.data() + digits.size(), parsed.value);
+  parsed.is_whole = end == digits.data() + digits.size();
+  parsed.error = error;
+  return parsed;
+}
+
+// the number in a cell; NaN when it holds none
+double number_in(std::string_view cell) {
+  const Parsed parsed = parse_number(cell);
+  return parsed.is_number() ? parsed.value : nan;
+}
+
+// throws the reason why a cell is no number
+void refuse_cell(const std::string& cell, const std::string& place) {
+  const auto fail = [&](const std::string& what) { throw InputError(fmt::format("{}: {}", place, what)); };
+  const Parsed parsed = parse_number(cell);
+  if (trim(cell).empty()) fail("the cell is empty; a number is needed here");
+  if (parsed.is_whole && parsed.error == std::errc::result_out_of_range)
+    fail(fmt::format("'{}' does not fit a double (5e-324 to 1.8e308)", shown(cell)));
+  fail(fmt::format("'{}' is not a finite number", shown(cell)));
+}
 
 // names that are there, once each, and not too many
 void check_header(const std::vector<std::string>& header, const std::string& where) {
@@ -95,76 +121,249 @@ void check_header(const std::vector<std::string>& header, const std::string& whe
   }
 }
 
+/// Texts of some cells, or of all, in the order of the cells.
+class CellTexts {
+ public:
+  void reserve(std::size_t n_bytes) { bytes_.reserve(n_bytes); }
+
+  /// @param cell  beyond all that were added before
+  void add(std::size_t cell, std::string_view text) {
+    // as long as no cell is left out, the k-th text is that of cell k
+    if (cell != ends_.size() || !cells_.empty()) cells_.push_back(cell);
+    bytes_ += text;
+    ends_.push_back(bytes_.size());
+  }
+
+  /// Nothing where no text is kept.
+  [[nodiscard]] std::optional<std::string_view> find(std::size_t cell) const {
+    std::size_t k = cell;
+    const std::size_t n_consecutive = ends_.size() - cells_.size();
+    if (cell >= n_consecutive) {
+      const auto found = std::lower_bound(cells_.begin(), cells_.end(), cell);
+      if (found == cells_.end() || *found != cell) return std::nullopt;
+      k = n_consecutive + static_cast<std::size_t>(found - cells_.begin());
+    }
+    const std::size_t start = k == 0 ? 0 : ends_[k - 1];
+    return std::string_view(bytes_).substr(start, ends_[k] - start);
+  }
+
+ private:
+  std::string bytes_;               // text after text
+  std::vector<std::size_t> ends_;   // of each text in `bytes_`
+  std::vector<std::size_t> cells_;  // of each text behind those of the first cells, ascending
+};
+
 }  // namespace
 
-CsvTable CsvTable::read(const std::filesystem::path& path) { return parse(read_file(path), path.string()); }
+struct CsvTable::Content {
+  std::string name;
+  std::vector<std::string> header;
+  std::vector<std::vector<double>> columns;  // NaN where a cell is empty or no finite number
+  std::vector<int> lines;                    // line in the file of each row
+  CellTexts texts;                           // by row · n_columns + column
 
-CsvTable CsvTable::parse(std::string_view text, std::string name) {
-  CsvTable table;
-  table.name_ = std::move(name);
-  if (text.starts_with(byte_order_mark)) text.remove_prefix(byte_order_mark.size());
-  int line_number = 0;
-  while (!text.empty()) {
-    const std::size_t end = text.find('\n');
-    const std::string_view line = text.substr(0, end);
-    text.remove_prefix(end == std::string_view::npos ? text.size() : end + 1);
-    ++line_number;
-    if (trim(line).empty()) continue;
-    const std::string where = fmt::format("{}:{}", table.name_, line_number);
-    std::optional<std::vector<std::string>> cells = split(trim(line));
-    if (!cells) throw InputError(fmt::format("{}: a quote \" is not closed before the comma or the end of the line", where));
-    if (table.header_.empty()) {
-      check_header(*cells, where);
-      table.header_ = std::move(*cells);
-      continue;
+  [[nodiscard]] std::optional<std::string_view> text(int row, int column) const {
+    return texts.find(static_cast<std::size_t>(row) * header.size() + static_cast<std::size_t>(column));
+  }
+  [[nodiscard]] double number(int row, int column) const {
+    return columns[static_cast<std::size_t>(column)][static_cast<std::size_t>(row)];
+  }
+};
+
+/// Takes a table in line by line.
+class CsvTable::Builder {
+ public:
+  Builder(std::string name, Keep keep) : keep_(keep) { content_.name = std::move(name); }
+
+  /// A line of the text, in its order, without its end.
+  void add_line(std::string_view line) {
+    ++line_number_;
+    if (line_number_ == 1 && line.starts_with(byte_order_mark)) line.remove_prefix(byte_order_mark.size());
+    line = trim(line);
+    if (line.empty()) return;
+    if (content_.header.empty()) {
+      read_header(line);
+    } else {
+      read_row(line);
+      content_.lines.push_back(line_number_);
     }
-    if (cells->size() != table.header_.size()) {
+  }
+
+  CsvTable finish() {
+    if (content_.header.empty()) {
+      throw InputError(fmt::format("{}: the file is empty; expected a header line and data rows", content_.name));
+    }
+    if (content_.lines.empty()) throw InputError(fmt::format("{}: no data rows after the header", content_.name));
+    return CsvTable(std::make_shared<const Content>(std::move(content_)));
+  }
+
+ private:
+  [[nodiscard]] std::string where() const { return fmt::format("{}:{}", content_.name, line_number_); }
+
+  [[nodiscard]] std::string take_cell_or_throw(std::string_view& line) const {
+    std::optional<std::string> cell = take_cell(line);
+    if (!cell) throw InputError(fmt::format("{}: a quote \" is not closed before the comma or the end of the line", where()));
+    return std::move(*cell);
+  }
+
+  void read_header(std::string_view line) {
+    std::vector<std::string> names = {take_cell_or_throw(line)};
+    while (!line.empty()) {
+      line.remove_prefix(1);  // the comma
+      names.push_back(take_cell_or_throw(line));
+    }
+    check_header(names, where());
+    content_.columns.resize(names.size());
+    content_.header = std::move(names);
+  }
+
+  void read_row(std::string_view line) {
+    std::size_t n_cells = 0;
+    read_cell(line, n_cells++);
+    while (!line.empty()) {
+      line.remove_prefix(1);  // the comma
+      read_cell(line, n_cells++);
+    }
+    if (n_cells != content_.header.size()) {
       throw InputError(
-          fmt::format("{}: ragged row: {} cells, but the header has {} columns", where, cells->size(), table.header_.size()));
+          fmt::format("{}: ragged row: {} cells, but the header has {} columns", where(), n_cells, content_.header.size()));
     }
-    table.cells_.insert(table.cells_.end(), std::make_move_iterator(cells->begin()), std::make_move_iterator(cells->end()));
-    table.lines_.push_back(line_number);
   }
-  if (table.header_.empty()) {
-    throw InputError(fmt::format("{}: the file is empty; expected a header line and data rows", table.name_));
+
+  // the cell at the front of `line`, which is left with what follows it
+  void read_cell(std::string_view& line, std::size_t column) {
+    double value = nan;
+    const char* const line_end = line.data() + line.size();
+    const auto [end, error] = std::from_chars(line.data(), line_end, value);
+    const bool is_plain = error == std::errc() && std::isfinite(value) && (end == line_end || *end == ',');
+    if (is_plain) {
+      const std::string_view cell = line.substr(0, static_cast<std::size_t>(end - line.data()));
+      line.remove_prefix(cell.size());
+      add_cell(column, value, cell);
+    } else {
+      const std::string cell = take_cell_or_throw(line);
+      add_cell(column, number_in(cell), cell);
+    }
   }
-  if (table.lines_.empty()) throw InputError(fmt::format("{}: no data rows after the header", table.name_));
-  return table;
+
+  void add_cell(std::size_t column, double value, std::string_view text) {
+    if (column >= content_.columns.size()) return;  // of a ragged row
+    content_.columns[column].push_back(value);
+    if (keep_ == Keep::text || (std::isnan(value) && !text.empty())) {
+      content_.texts.add(content_.lines.size() * content_.columns.size() + column, text);
+    }
+  }
+
+  const Keep keep_;
+  Content content_;
+  int line_number_ = 0;
+};
+
+CsvTable::CsvTable() : content_(std::make_shared<const Content>()) {}
+
+CsvTable::CsvTable(std::shared_ptr<const Content> content) : content_(std::move(content)) {}
+
+CsvTable CsvTable::read(const std::filesystem::path& path, Keep keep) {
+  Builder builder(path.string(), keep);
+  std::string rest;  // of a line that goes on in the next block
+  read_blocks(path, [&](std::string_view block) {
+    for (std::size_t end = block.find('\n'); end != std::string_view::npos; end = block.find('\n')) {
+      const std::string_view line = block.substr(0, end);
+      builder.add_line(rest.empty() ? line : std::string_view(rest += line));
+      rest.clear();
+      block.remove_prefix(end + 1);
+    }
+    rest += block;
+  });
+  if (!rest.empty()) builder.add_line(rest);
+  return builder.finish();
 }
 
-CsvTable CsvTable::from_cells(std::string name, std::vector<std::string> header, std::vector<std::string> cells) {
-  if (header.empty()) throw InputError(fmt::format("{}: there are no columns", name));
-  check_header(header, name);
-  if (cells.empty()) throw InputError(fmt::format("{}: there are no rows", name));
-  if (cells.size() % header.size() != 0) {
-    throw InputError(fmt::format("{}: {} cells do not make rows of {} columns", name, cells.size(), header.size()));
+CsvTable CsvTable::parse(std::string_view text, std::string name, Keep keep) {
+  Builder builder(std::move(name), keep);
+  while (!text.empty()) {
+    const std::size_t end = text.find('\n');
+    builder.add_line(text.substr(0, end));
+    text.remove_prefix(end == std::string_view::npos ? text.size() : end + 1);
   }
-  CsvTable table;
-  table.name_ = std::move(name);
-  table.header_ = std::move(header);
-  table.cells_ = std::move(cells);
-  table.lines_.resize(table.cells_.size() / table.header_.size());
-  std::iota(table.lines_.begin(), table.lines_.end(), 2);  // the header is line 1
-  return table;
+  return builder.finish();
+}
+
+CsvTable CsvTable::from_cells(std::string name, std::vector<std::string> header, const std::vector<std::string>& cells) {
+  std::vector<Column> columns;
+  for (std::string& one : header) columns.push_back({std::move(one), {}, {}});
+  const std::size_t n_columns = columns.size();
+  if (n_columns > 0 && cells.size() % n_columns != 0) {
+    throw InputError(fmt::format("{}: {} cells do not make rows of {} columns", name, cells.size(), n_columns));
+  }
+  for (std::size_t k = 0; k < cells.size() && n_columns > 0; ++k) columns[k % n_columns].cells.push_back(cells[k]);
+  return from_columns(std::move(name), std::move(columns));
+}
+
+namespace {
+
+std::size_t n_rows_of(const CsvTable::Column& column) { return std::max(column.numbers.size(), column.cells.size()); }
+
+// columns of one length, and names that are there, once each
+void check_columns(const std::vector<CsvTable::Column>& columns, const std::vector<std::string>& header,
+                   const std::string& name) {
+  for (const CsvTable::Column& column : columns) {
+    if (n_rows_of(column) == n_rows_of(columns.front())) continue;
+    throw InputError(fmt::format("{}: the columns differ in length: '{}' has {}, '{}' has {}", name, header.front(),
+                                 n_rows_of(columns.front()), column.name, n_rows_of(column)));
+  }
+  if (columns.empty()) throw InputError(fmt::format("{}: there are no columns", name));
+  check_header(header, name);
+  if (n_rows_of(columns.front()) == 0) throw InputError(fmt::format("{}: there are no rows", name));
+}
+
+}  // namespace
+
+CsvTable CsvTable::from_columns(std::string name, std::vector<Column> columns) {
+  Content content;
+  for (const Column& column : columns) content.header.push_back(column.name);
+  check_columns(columns, content.header, name);
+  content.name = std::move(name);
+  content.lines.resize(n_rows_of(columns.front()));
+  std::iota(content.lines.begin(), content.lines.end(), 2);  // the header is line 1
+
+  for (std::size_t row = 0; row < content.lines.size(); ++row) {
+    for (std::size_t k = 0; k < columns.size(); ++k) {
+      const std::size_t cell = row * columns.size() + k;
+      if (columns[k].numbers.empty()) {
+        content.texts.add(cell, columns[k].cells[row]);
+      } else if (double& number = columns[k].numbers[row]; std::isinf(number)) {
+        content.texts.add(cell, shortest(std::exchange(number, nan)));
+      }
+    }
+  }
+  for (Column& column : columns) {
+    for (const std::string& cell : column.cells) column.numbers.push_back(number_in(cell));
+    content.columns.push_back(std::move(column.numbers));
+  }
+  return CsvTable(std::make_shared<const Content>(std::move(content)));
 }
 
 CsvTable CsvTable::first_rows(int n) const {
-  CsvTable table = *this;
-  const auto rows = static_cast<std::size_t>(std::clamp(n, 0, n_rows()));
-  table.cells_.resize(rows * header_.size());
-  table.lines_.resize(rows);
-  return table;
+  std::vector<int> rows(static_cast<std::size_t>(std::clamp(n, 0, n_rows())));
+  std::iota(rows.begin(), rows.end(), 0);
+  return take(rows);
 }
 
 CsvTable CsvTable::take(const std::vector<int>& rows) const {
-  CsvTable taken = *this;
-  taken.cells_.clear();
-  taken.lines_.clear();
+  Content taken;
+  taken.name = name();
+  taken.header = header();
+  taken.columns.resize(header().size());
   for (const int row : rows) {
-    for (int column = 0; column < n_columns(); ++column) taken.cells_.push_back(cell(row, column));
-    taken.lines_.push_back(lines_[static_cast<std::size_t>(row)]);
+    for (int column = 0; column < n_columns(); ++column) {
+      const auto k = static_cast<std::size_t>(column);
+      if (const auto text = content_->text(row, column)) taken.texts.add(taken.lines.size() * header().size() + k, *text);
+      taken.columns[k].push_back(content_->number(row, column));
+    }
+    taken.lines.push_back(line(row));
   }
-  return taken;
+  return CsvTable(std::make_shared<const Content>(std::move(taken)));
 }
 
 std::string csv_cell(const std::string& text) {
@@ -182,56 +381,56 @@ std::string CsvTable::text() const {
     csv += cell.empty() && n_columns() == 1 ? "\"\"" : csv_cell(cell);
     csv += column + 1 < n_columns() ? ',' : '\n';
   };
-  for (int column = 0; column < n_columns(); ++column) add(header_[static_cast<std::size_t>(column)], column);
+  for (int column = 0; column < n_columns(); ++column) add(header()[static_cast<std::size_t>(column)], column);
   for (int row = 0; row < n_rows(); ++row) {
     for (int column = 0; column < n_columns(); ++column) add(cell(row, column), column);
   }
   return csv;
 }
 
+const std::string& CsvTable::name() const { return content_->name; }
+
+const std::vector<std::string>& CsvTable::header() const { return content_->header; }
+
+int CsvTable::n_rows() const { return static_cast<int>(content_->lines.size()); }
+
+int CsvTable::line(int row) const { return content_->lines[static_cast<std::size_t>(row)]; }
+
 int CsvTable::find(std::string_view column) const {
-  for (std::size_t k = 0; k < header_.size(); ++k) {
-    if (header_[k] == column) return static_cast<int>(k);
+  for (int k = 0; k < n_columns(); ++k) {
+    if (header()[static_cast<std::size_t>(k)] == column) return k;
   }
   return -1;
 }
 
-const std::string& CsvTable::cell(int row, int column) const {
-  return cells_[static_cast<std::size_t>(row) * header_.size() + static_cast<std::size_t>(column)];
+std::string CsvTable::cell(int row, int column) const {
+  if (const auto text = content_->text(row, column)) return std::string(*text);
+  const double value = content_->number(row, column);
+  return std::isnan(value) ? "" : shortest(value);
+}
+
+bool CsvTable::is_empty(int row, int column) const {
+  return std::isnan(content_->number(row, column)) && trim(content_->text(row, column).value_or("")).empty();
 }
 
 std::string CsvTable::place(int row, int column) const {
-  return fmt::format("{}:{}: column '{}'", name_, lines_[static_cast<std::size_t>(row)],
-                     header_[static_cast<std::size_t>(column)]);
+  return fmt::format("{}:{}: column '{}'", name(), line(row), header()[static_cast<std::size_t>(column)]);
 }
 
 double CsvTable::number(int row, int column) const {
-  const auto fail = [&](const std::string& what) { throw InputError(fmt::format("{}: {}", place(row, column), what)); };
-  const std::string& text = cell(row, column);
-  std::string_view digits = trim(text);
-  if (digits.empty()) fail("the cell is empty; a number is needed here");
-  // from_chars knows no plus sign
-  if (digits.starts_with('+') && !digits.starts_with("+-")) digits.remove_prefix(1);
-  double value = 0;
-  const auto [end, error] = std::from_chars(digits.data(), digits.data() + digits.size(), value);
-  const bool whole = end == digits.data() + digits.size();
-  if (whole && error == std::errc::result_out_of_range)
-    fail(fmt::format("'{}' does not fit a double (5e-324 to 1.8e308)", shown(text)));
-  if (!whole || error != std::errc() || !std::isfinite(value)) fail(fmt::format("'{}' is not a finite number", shown(text)));
+  const double value = content_->number(row, column);
+  if (std::isnan(value)) refuse_cell(cell(row, column), place(row, column));
   return value;
 }
 
-double CsvTable::number_or_empty(int row, int column) const {
-  return trim(cell(row, column)).empty() ? std::numeric_limits<double>::quiet_NaN() : number(row, column);
-}
+double CsvTable::number_or_empty(int row, int column) const { return is_empty(row, column) ? nan : number(row, column); }
 
 double CsvTable::number_or_nan(int row, int column) const {
-  std::string_view text = trim(cell(row, column));
-  if (text.starts_with('+')) text.remove_prefix(1);
-  double value = 0;
-  const auto [end, error] = std::from_chars(text.data(), text.data() + text.size(), value);
-  const bool is_gap = text.empty() || (end == text.data() + text.size() && error == std::errc() && !std::isfinite(value));
-  return is_gap ? std::numeric_limits<double>::quiet_NaN() : number(row, column);
+  const double value = content_->number(row, column);
+  if (!std::isnan(value) || is_empty(row, column)) return value;
+  const Parsed parsed = parse_number(cell(row, column));
+  const bool is_gap = parsed.is_whole && parsed.error == std::errc() && !std::isfinite(parsed.value);
+  return is_gap ? nan : number(row, column);
 }
 
 }  // namespace gp2

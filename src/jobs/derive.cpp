@@ -544,19 +544,17 @@ DerivedData derive(const Model& model, const CsvTable& log, const DeriveOptions&
 CsvTable as_table(const DerivedData& data, const System& system, std::string name) {
   const StateLayout layout = system.layout();
   const std::vector<std::string> state_names = system.state_names(), acceleration_names = system.acceleration_names();
-  std::vector<std::string> header;
-  std::vector<const double*> firsts;  // of each numeric column
-  std::vector<Index> strides;
+  std::vector<CsvTable::Column> columns;
   const auto add = [&](const std::string& column, const MatrixXd& values, Index row) {
-    header.push_back(column);
-    firsts.push_back(values.data() + row);
-    strides.push_back(values.rows());
+    columns.push_back({column, {values.row(row).begin(), values.row(row).end()}});
   };
   const auto add_known = [&](const std::string& column, const MatrixXd& values, Index row) {
     if (!values.row(row).array().isNaN().any()) add(column, values, row);
   };
-  const bool with_episode = !data.episode_column.empty();
-  if (with_episode) header.push_back(data.episode_column);
+  if (!data.episode_column.empty()) {
+    std::vector<std::string>& labels = columns.emplace_back(CsvTable::Column{data.episode_column, {}}).cells;
+    for (const int episode : data.episode) labels.push_back(data.episodes[static_cast<std::size_t>(episode)]);
+  }
   add("t", data.states, layout.t());
   for (int k = 0; k < layout.t(); ++k) add_known(state_names[static_cast<std::size_t>(k)], data.states, k);
   for (int k = layout.u(0); k < layout.size(); ++k) add_known(state_names[static_cast<std::size_t>(k)], data.states, k);
@@ -569,16 +567,8 @@ CsvTable as_table(const DerivedData& data, const System& system, std::string nam
   }
   for (const int j : data.independent)
     add(acceleration_names[static_cast<std::size_t>(j)] + "_std", data.stddev, 2 * layout.nq + j);
-  header.insert(header.end(), data.kept_names.begin(), data.kept_names.end());
-
-  std::vector<std::string> cells;
-  cells.reserve(header.size() * data.episode.size());
-  for (std::size_t i = 0; i < data.episode.size(); ++i) {
-    if (with_episode) cells.push_back(data.episodes[static_cast<std::size_t>(data.episode[i])]);
-    for (std::size_t k = 0; k < firsts.size(); ++k) cells.push_back(shortest(firsts[k][strides[k] * static_cast<Index>(i)]));
-    for (const auto& column : data.kept) cells.push_back(column[i]);
-  }
-  return CsvTable::from_cells(std::move(name), std::move(header), std::move(cells));
+  for (std::size_t k = 0; k < data.kept.size(); ++k) columns.push_back({data.kept_names[k], {}, data.kept[k]});
+  return CsvTable::from_columns(std::move(name), std::move(columns));
 }
 
 }  // namespace gp2

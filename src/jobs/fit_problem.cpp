@@ -60,7 +60,7 @@ std::map<std::string, std::string> columns_of(const Model& model, std::map<std::
 bool has_values(LogReader& reader, const CsvTable& log, const std::string& name) {
   const int column = reader.column(name);
   for (int row = 0; column >= 0 && row < log.n_rows(); ++row) {
-    if (log.cell(row, column).find_first_not_of(" \t") != std::string::npos) return true;
+    if (!log.is_empty(row, column)) return true;
   }
   return false;
 }

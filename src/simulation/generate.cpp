@@ -482,18 +482,15 @@ GeneratedData generate(const Model& model, const GenerateOptions& options) {
 
 CsvTable as_table(const GeneratedData& data, const System& system, std::string name) {
   const std::vector<std::string> names = system.state_names(), accelerations = system.acceleration_names();
-  std::vector<std::string> header, cells;
+  std::vector<CsvTable::Column> columns;
+  const auto add = [&](const std::string& column, const auto& values) {
+    columns.push_back({column, {values.begin(), values.end()}});
+  };
   for (std::size_t k = 0; k < names.size(); ++k) {
-    if (data.known[k]) header.push_back(names[k]);
+    if (data.known[k]) add(names[k], data.states.row(static_cast<Index>(k)));
   }
-  header.insert(header.end(), accelerations.begin(), accelerations.end());
-  for (Index i = 0; i < data.states.cols(); ++i) {
-    for (std::size_t k = 0; k < names.size(); ++k) {
-      if (data.known[k]) cells.push_back(shortest(data.states(static_cast<Index>(k), i)));
-    }
-    for (const double value : data.accelerations.col(i)) cells.push_back(shortest(value));
-  }
-  return CsvTable::from_cells(std::move(name), std::move(header), std::move(cells));
+  for (std::size_t k = 0; k < accelerations.size(); ++k) add(accelerations[k], data.accelerations.row(static_cast<Index>(k)));
+  return CsvTable::from_columns(std::move(name), std::move(columns));
 }
 
 }  // namespace gp2

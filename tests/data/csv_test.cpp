@@ -146,6 +146,48 @@ TEST(Csv, RefusesCellsThatAreNoTable) {
               HasSubstr("the column 'q1' stands twice"));
 }
 
+TEST(Csv, IsMadeOfColumnsOfNumbersWithoutPrintingThem) {
+  const double nan = std::numeric_limits<double>::quiet_NaN(), infinity = std::numeric_limits<double>::infinity();
+  const CsvTable table = CsvTable::from_columns("frame", {{"x", {0.1, nan, -infinity}}, {"label", {}, {"007", "", "late"}}});
+  EXPECT_EQ(table.n_rows(), 3);
+  EXPECT_EQ(table.number(0, 0), 0.1);
+  EXPECT_TRUE(std::isnan(table.number_or_empty(1, 0)));
+  EXPECT_TRUE(std::isnan(table.number_or_nan(2, 0)));
+  EXPECT_EQ(input_error_of([&] { static_cast<void>(table.number(2, 0)); }), "frame:4: column 'x': '-inf' is not a finite number");
+  EXPECT_EQ(table.number(0, 1), 7);
+  EXPECT_EQ(table.cell(0, 1), "007");
+  EXPECT_EQ(table.text(), "x,label\n0.1,007\n,\n-inf,late\n");
+  EXPECT_EQ(table.take({2, 0}).text(), "x,label\n-inf,late\n0.1,007\n");
+}
+
+TEST(Csv, RefusesColumnsThatAreNoTable) {
+  EXPECT_EQ(input_error_of([] { CsvTable::from_columns("frame", {}); }), "frame: there are no columns");
+  EXPECT_EQ(input_error_of([] { CsvTable::from_columns("frame", {{"x", {}}}); }), "frame: there are no rows");
+  EXPECT_EQ(input_error_of([] {
+              CsvTable::from_columns("frame", {{"x", {1, 2}}, {"y", {}, {"a"}}});
+            }),
+            "frame: the columns differ in length: 'x' has 2, 'y' has 1");
+}
+
+TEST(Csv, KeepsEveryCellAsItIsWrittenOrNumbersAlone) {
+  const std::string text = "x,\"a, b\"\n1.50, 007\nnan,\n+2,\"1e400\"\n\" \",far\n";
+  const CsvTable whole = parse(text), lean = CsvTable::parse(text, "log.csv", CsvTable::Keep::numbers);
+  EXPECT_EQ(whole.text(), "x,\"a, b\"\n1.50,007\nnan,\n+2,1e400\n\" \",far\n");
+  EXPECT_EQ(lean.text(), "x,\"a, b\"\n1.5,7\nnan,\n2,1e400\n\" \",far\n");
+  EXPECT_EQ(lean.take({3, 1, 0}).text(), "x,\"a, b\"\n\" \",far\nnan,\n1.5,7\n");
+  for (int row = 0; row < whole.n_rows(); ++row) {
+    for (int column = 0; column < whole.n_columns(); ++column) {
+      EXPECT_EQ(whole.is_empty(row, column), lean.is_empty(row, column));
+      const auto outcome = [&](const CsvTable& table) {
+        double value = 0;
+        const std::string error = input_error_of([&] { value = table.number(row, column); });
+        return std::pair(value, error);
+      };
+      EXPECT_EQ(outcome(whole), outcome(lean));
+    }
+  }
+}
+
 // ---- numbers
 
 TEST(Csv, NumbersMayHaveASignAnExponentAndSpacesInQuotes) {
@@ -230,6 +272,25 @@ TEST(Csv, AFileReadsBackAsItWasWritten) {
   EXPECT_EQ(read_file(folder / "log.csv"), content);
   write_file(folder / "log.csv", "");
   EXPECT_EQ(read_file(folder / "log.csv"), "");
+}
+
+TEST(Csv, LinesThatLieAcrossBlocksOfAFileAreReadWhole) {
+  const TemporaryFolder folder;
+  std::string content = "\xef\xbb\xbfx,\"remark, long\"\r\n";
+  // lines of every length, many blocks
+  for (int k = 0; k < 3000; ++k) {
+    content += std::to_string(k) + ".5,\"" + std::string(static_cast<std::size_t>(k % 97), ',') + "\"\"\"" +
+               (k % 7 == 0 ? "\r\n\n" : "\n");
+  }
+  content += "1,last";
+  write_file(folder / "log.csv", content);
+  for (const CsvTable::Keep keep : {CsvTable::Keep::text, CsvTable::Keep::numbers}) {
+    const CsvTable table = CsvTable::read(folder / "log.csv", keep);
+    const CsvTable parsed = CsvTable::parse(content, "log.csv", keep);
+    EXPECT_EQ(table.n_rows(), 3001);
+    EXPECT_EQ(table.text(), parsed.text());
+    for (int row = 0; row < table.n_rows(); ++row) ASSERT_EQ(table.line(row), parsed.line(row));
+  }
 }
 
 std::size_t n_files(const TemporaryFolder& folder) {

@@ -132,7 +132,7 @@ std::vector<std::string> observed_outputs(const std::vector<ReportData>& trainin
 
 ReportData test_data(const ReportOptions& options, const FitFile& fit, const Posterior& posterior,
                      const std::vector<std::string>& observed, std::vector<std::string>& notes) {
-  const CsvTable table = CsvTable::read(options.data);
+  const CsvTable table = CsvTable::read(options.data, CsvTable::Keep::numbers);
   const std::vector<int> rows = acceleration_rows(*fit.model.system, observed, "--data");
   View view{View::Quantity::constrained_acceleration, rows};
   const Prior& prior = posterior.prior();

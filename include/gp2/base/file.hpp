@@ -2,6 +2,7 @@
 
 #include <cstddef>
 #include <filesystem>
+#include <functional>
 #include <string>
 #include <string_view>
 
@@ -24,6 +25,11 @@ inline constexpr std::size_t max_file_size = std::size_t{1} << 30;
 /// The content of a file, or of a pipe or device to its end.
 /// @throws InputError when it cannot be read, holds more than `max_size` bytes, or is a pipe that nothing writes to.
 std::string read_file(const std::filesystem::path& path, std::size_t max_size = max_file_size);
+
+/// The same, handed on block after block as it is read.
+/// @throws InputError as read_file, and what `take` throws.
+void read_blocks(const std::filesystem::path& path, const std::function<void(std::string_view)>& take,
+                 std::size_t max_size = max_file_size);
 
 /// The shortest text that reads back to the same double.
 std::string shortest(double value);

@@ -1,6 +1,7 @@
 #pragma once
 
 #include <filesystem>
+#include <memory>
 #include <string>
 #include <string_view>
 #include <vector>
@@ -9,22 +10,41 @@
 
 namespace gp2 {
 
-/// A table of comma-separated values with one header line. Cells may be quoted; blank lines are skipped. Cells stay text until
-/// they are asked for as numbers, so columns that are not needed may hold anything. A table has at most `max_columns`, their
-/// names at most `max_name_length` bytes: what has more is no table.
+/// A table of comma-separated values with one header line. Cells may be quoted; blank lines are skipped. Columns are kept as
+/// doubles, parsed once; a cell that is no number is kept as text, and is an error only when it is asked for as a number, so
+/// columns that are not needed may hold anything. A table has at most `max_columns`, their names at most `max_name_length`
+/// bytes: what has more is no table. Copies share their content, which never changes.
 class CsvTable {
  public:
   static constexpr std::size_t max_columns = 10'000;
   static constexpr std::size_t max_name_length = 1000;
 
+  /// What is kept of the cells of a file beside their numbers.
+  enum class Keep {
+    text,     // every cell as it is written
+    numbers,  // the text of those alone that are no numbers; a number is written in its shortest form then
+  };
+
+  /// A column that comes from elsewhere than a file: of numbers, NaN where a cell is empty, or of cells.
+  struct Column {
+    std::string name;
+    std::vector<double> numbers;
+    std::vector<std::string> cells = {};  // where there are no numbers
+  };
+
+  CsvTable();
+
   /// @throws InputError naming file and line: unreadable or empty file, no data rows, ragged row, too many columns, a column
   ///   name that is empty, repeated or too long.
-  static CsvTable read(const std::filesystem::path& path);
+  static CsvTable read(const std::filesystem::path& path, Keep keep = Keep::text);
   /// @param name  stands for the file in messages
-  static CsvTable parse(std::string_view text, std::string name);
+  static CsvTable parse(std::string_view text, std::string name, Keep keep = Keep::text);
   /// From cells, row after row; a row's place in messages is the line it would have in a file.
   /// @throws InputError as parse, and when the cells do not fill the last row.
-  static CsvTable from_cells(std::string name, std::vector<std::string> header, std::vector<std::string> cells);
+  static CsvTable from_cells(std::string name, std::vector<std::string> header, const std::vector<std::string>& cells);
+  /// From columns; nothing is printed or parsed of those that hold numbers.
+  /// @throws InputError as parse, and when the columns differ in length.
+  static CsvTable from_columns(std::string name, std::vector<Column> columns);
 
   /// The table without the rows after the first n.
   [[nodiscard]] CsvTable first_rows(int n) const;
@@ -33,13 +53,16 @@ class CsvTable {
   /// As a file has it.
   [[nodiscard]] std::string text() const;
 
-  [[nodiscard]] const std::string& name() const { return name_; }
-  [[nodiscard]] const std::vector<std::string>& header() const { return header_; }
-  [[nodiscard]] int n_rows() const { return static_cast<int>(cells_.size() / header_.size()); }
-  [[nodiscard]] int n_columns() const { return static_cast<int>(header_.size()); }
+  [[nodiscard]] const std::string& name() const;
+  [[nodiscard]] const std::vector<std::string>& header() const;
+  [[nodiscard]] int n_rows() const;
+  [[nodiscard]] int n_columns() const { return static_cast<int>(header().size()); }
   [[nodiscard]] int find(std::string_view column) const;  // −1 when there is none
-  [[nodiscard]] const std::string& cell(int row, int column) const;
-  [[nodiscard]] int line(int row) const { return lines_[static_cast<std::size_t>(row)]; }  // in the file
+  /// A cell as it is written, without the quotes around it; where its text is not kept, a number in its shortest form.
+  [[nodiscard]] std::string cell(int row, int column) const;
+  /// Whether there is nothing in a cell but space.
+  [[nodiscard]] bool is_empty(int row, int column) const;
+  [[nodiscard]] int line(int row) const;  // in the file
 
   /// "log.csv:7: column 'q1'", for messages.
   [[nodiscard]] std::string place(int row, int column) const;
@@ -52,10 +75,11 @@ class CsvTable {
   [[nodiscard]] double number_or_nan(int row, int column) const;
 
  private:
-  std::string name_;
-  std::vector<std::string> header_;
-  std::vector<std::string> cells_;  // row after row
-  std::vector<int> lines_;          // line in the file of each row
+  struct Content;
+  class Builder;
+  explicit CsvTable(std::shared_ptr<const Content> content);
+
+  std::shared_ptr<const Content> content_;
 };
 
 /// A cell of a CSV file that reads back as `text`.
