@@ -40,7 +40,7 @@ struct Problem {
   [[nodiscard]] gp2::Posterior posterior() const { return {prior, observations, values}; }
   [[nodiscard]] gp2::Observations one(int column) const {
     const gp2::Observations& all = observations[0];
-    return {all.states.col(column), ddq, all.values.col(column), values.noise_stddev[0], false};
+    return {all.states().col(column), ddq, all.values().col(column), values.noise_stddev[0], false};
   }
 };
 

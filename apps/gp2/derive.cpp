@@ -7,6 +7,7 @@
 #include <fmt/ranges.h>
 
 #include "command.hpp"
+#include "gp2/base/statistics.hpp"
 
 namespace gp2::command {
 
@@ -38,12 +39,6 @@ std::vector<std::string> parse_episodes(const std::string& text) {
     for (int k = first; k <= last; ++k) episodes.push_back(std::to_string(k));
   }
   return episodes;
-}
-
-double median(std::vector<double> values) {
-  const auto middle = values.begin() + static_cast<std::ptrdiff_t>(values.size() / 2);
-  std::nth_element(values.begin(), middle, values.end());
-  return *middle;
 }
 
 // "2 gaps, the longest 0.3 s"

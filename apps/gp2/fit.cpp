@@ -141,7 +141,7 @@ Json to_json(const FitProblem& problem, const FitReport& report, const std::stri
   json["distrusted"] = Json::array();
   for (const DistrustedValue& value : report.distrusted) {
     const auto group = static_cast<std::size_t>(value.group);
-    const View& view = problem.observations[group].view;
+    const View& view = problem.observations[group].view();
     json["distrusted"].push_back(
         {{"log", value.group + 1},
          {"line", problem.lines[group][static_cast<std::size_t>(value.state)]},

@@ -1,38 +1,89 @@
 #pragma once
 
+#include <vector>
+
 #include <Eigen/Core>
 
+#include "gp2/base/statistics.hpp"
 #include "gp2/view.hpp"
 
 namespace gp2 {
 
-/// N noisy measurements of one view: y_i = G(x_i) ā(x_i) + d(x_i) + ε_i,  ε_i ~ N(0, diag(σ_i²)),  σ_ki = σ_k s_ki.
-struct Observations {
-  Eigen::MatrixXd states;        // x_i  (layout size × N)
-  View view;                     // what was measured, d rows
-  Eigen::MatrixXd values;        // y_i  (d × N); NaN: not measured
-  Eigen::VectorXd noise_stddev;  // σ    (d), > 0; the starting value where it is estimated
-  bool estimate_noise = false;
-  /// s  (d × N), > 0, where each value has a noise of its own; empty: s = 1. Of no meaning where a value is not measured.
-  Eigen::MatrixXd noise_scale = {};
+/// Noise of N measurements of d values each: ε_i ~ N(0, diag(σ_i²)),  σ_ki = σ_k s_ki. Each row of values has one σ_k, and s = 1,
+/// or each value has a scale s_ki of its own. What belongs to one state alone is a column of a matrix, so that rows of data are
+/// taken, appended and removed alike for every kind of noise.
+class Noise {
+ public:
+  /// @param stddev        σ  (d), > 0; the starting value where it is estimated
+  /// @param is_estimated  whether a fit estimates σ
+  /// @param scale         s  (d × N), > 0; of no meaning where a value is not measured. Empty: s = 1
+  explicit Noise(Eigen::VectorXd stddev, bool is_estimated = false, Eigen::MatrixXd scale = {});
 
-  [[nodiscard]] int n_data() const { return static_cast<int>(states.cols()); }
-  [[nodiscard]] bool has_noise_scale() const { return noise_scale.size() > 0; }
+  [[nodiscard]] const Eigen::VectorXd& stddev() const { return stddev_; }
+  [[nodiscard]] bool is_estimated() const { return is_estimated_; }
+  [[nodiscard]] const Eigen::MatrixXd& scale() const { return scale_; }
+  [[nodiscard]] bool has_scale() const { return scale_.size() > 0; }
 
-  /// σ_i (d) at state i under a noise σ that may differ from noise_stddev, as an estimate does; ∞ where nothing is measured.
-  [[nodiscard]] Eigen::VectorXd noise_at(const Eigen::Ref<const Eigen::VectorXd>& stddev, Eigen::Index i) const;
-  /// s of the values of row k that are measured.
-  [[nodiscard]] Eigen::VectorXd measured_scales(Eigen::Index k) const;
-  /// The noise of a usual value (d): σ times the median of s over the measured values of its row.
-  [[nodiscard]] Eigen::VectorXd usual_noise(const Eigen::Ref<const Eigen::VectorXd>& stddev) const;
-  /// @throws InputError when noise_scale is not empty and not as large as `values`, or not positive and finite where they are
-  /// measured.
-  void require_noise_scale() const;
+  /// σ_i (d) of state i under a σ that may differ from stddev(), as an estimate does.
+  [[nodiscard]] Eigen::VectorXd at(const Eigen::Ref<const Eigen::VectorXd>& stddev, Eigen::Index i) const;
+
+  /// The noise of these states, in this order.
+  [[nodiscard]] Noise take(const std::vector<int>& states) const;
+  void append(const Noise& more);
+  void remove_first(int n);
+
+  /// @throws InputError when stddev() is not of one positive finite number for each row of `values`; when there is a scale and
+  /// it is not as large as `values`, or not positive and finite where they are measured.
+  void require_noise_of(const Eigen::MatrixXd& values) const;
+
+ private:
+  Eigen::VectorXd stddev_;
+  bool is_estimated_;
+  Eigen::MatrixXd scale_;
 };
 
-/// Mean of each row, over the entries that are measured; NaN where none is.
-Eigen::VectorXd row_mean(const Eigen::Ref<const Eigen::MatrixXd>& values);
-/// Standard deviation (divided by their number) of each row, likewise.
-Eigen::VectorXd row_stddev(const Eigen::Ref<const Eigen::MatrixXd>& values);
+/// N noisy measurements of one view: y_i = G(x_i) ā(x_i) + d(x_i) + ε_i.
+class Observations {
+ public:
+  /// @param states  x_i  (layout size × N)
+  /// @param view    what was measured, d rows
+  /// @param values  y_i  (d × N); NaN: not measured
+  /// @param noise   of ε_i
+  /// @throws InputError when the sizes do not fit each other, a value is infinite, or as Noise::require_noise_of.
+  Observations(Eigen::MatrixXd states, View view, Eigen::MatrixXd values, Noise noise);
+  Observations(Eigen::MatrixXd states, View view, Eigen::MatrixXd values, Eigen::VectorXd noise_stddev,
+               bool estimate_noise = false, Eigen::MatrixXd noise_scale = {});
+
+  [[nodiscard]] const Eigen::MatrixXd& states() const { return states_; }
+  [[nodiscard]] const View& view() const { return view_; }
+  [[nodiscard]] const Eigen::MatrixXd& values() const { return values_; }
+  [[nodiscard]] const Noise& noise() const { return noise_; }
+  [[nodiscard]] int n_data() const { return static_cast<int>(states_.cols()); }
+
+  /// The same states with another view, other values, another noise. @throws InputError as the constructor.
+  [[nodiscard]] Observations with_view(View view) const { return {states_, std::move(view), values_, noise_}; }
+  [[nodiscard]] Observations with_values(Eigen::MatrixXd values) const { return {states_, view_, std::move(values), noise_}; }
+  [[nodiscard]] Observations with_noise(Noise noise) const { return {states_, view_, values_, std::move(noise)}; }
+
+  /// These states, in this order.
+  [[nodiscard]] Observations take(const std::vector<int>& states) const;
+  /// Adds the states of `more` behind one's own; its view and σ are taken to be the same.
+  /// @throws InputError when one has a noise of each value and the other has not.
+  void append(const Observations& more);
+  void remove_first(int n);
+
+  /// σ_i (d) at state i under a noise σ that may differ from noise().stddev(); ∞ where nothing is measured.
+  [[nodiscard]] Eigen::VectorXd noise_at(const Eigen::Ref<const Eigen::VectorXd>& stddev, Eigen::Index i) const;
+  /// s of the values of row k that are measured.
+  [[nodiscard]] std::vector<double> measured_scales(Eigen::Index k) const;
+  /// The noise of a usual value (d): σ times the median of s over the measured values of its row.
+  [[nodiscard]] Eigen::VectorXd usual_noise(const Eigen::Ref<const Eigen::VectorXd>& stddev) const;
+
+ private:
+  Eigen::MatrixXd states_;
+  View view_;
+  Eigen::MatrixXd values_;
+  Noise noise_;
+};
 
 }  // namespace gp2

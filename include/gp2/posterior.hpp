@@ -90,7 +90,7 @@ class Posterior {
 /// and a posterior built anew takes O(n³). The same as that one to rounding. Hyperparameters and parameters of the system are
 /// held, and with them all scales.
 ///
-///     posterior = update(std::move(posterior), {.states = x, .view = ddq, .values = y, .noise_stddev = sigma});
+///     posterior = update(std::move(posterior), {x, ddq, y, sigma});
 ///
 /// The noise of the new observations is their own, as it stands; that of earlier ones is by values().noise_stddev.
 /// Where both view and noise_stddev are those of an earlier group of observations() the new ones join it behind its last, if both

@@ -175,7 +175,7 @@ Evaluation evaluate(const PyPosterior& self, const py::object& data, const PySys
   std::vector<std::string> names = outputs;
   for (const Observations& group : self.posterior.observations()) {
     if (!names.empty()) break;
-    if (group.view.quantity == View::Quantity::constrained_acceleration) names = group.view.names(self.system());
+    if (group.view().quantity == View::Quantity::constrained_acceleration) names = group.view().names(self.system());
   }
   const std::vector<int> rows = acceleration_rows(self.system(), names, "outputs");
   const CsvTable table = to_table(data, "data");
@@ -200,7 +200,7 @@ std::optional<Posterior> kept_by_others(const PyPosterior& self) {
 
 /// Whether the values of a group came with standard deviations of their own, and did not only get larger ones by a robust fit.
 bool has_stated_noise(const Observations& group, int index, const std::vector<DistrustedValue>& distrusted) {
-  MatrixXd scale = group.noise_scale;
+  MatrixXd scale = group.noise().scale();
   for (const DistrustedValue& value : distrusted) {
     if (value.group == index && value.state < scale.cols()) scale(value.row, value.state) /= value.noise_factor;
   }
@@ -212,25 +212,25 @@ void update_with(PyPosterior& self, const py::object& data, const std::vector<st
   const System& system = self.system();
   const std::vector<Observations>& groups = self.posterior.observations();
   const auto at_home = std::find_if(groups.begin(), groups.end(), [](const Observations& group) {
-    return group.view.quantity == View::Quantity::constrained_acceleration && group.view.other_system == nullptr;
+    return group.view().quantity == View::Quantity::constrained_acceleration && group.view().other_system == nullptr;
   });
-  Observations added;
-  added.view = View::all(View::Quantity::constrained_acceleration, system);
+  View view = View::all(View::Quantity::constrained_acceleration, system);
   std::vector<std::string> names = observe;
-  if (names.empty() && at_home != groups.end()) names = at_home->view.names(system);
-  added.view.rows = acceleration_rows(system, names, "observe");
-  if (names.empty()) names = added.view.names(system);
+  if (names.empty() && at_home != groups.end()) names = at_home->view().names(system);
+  view.rows = acceleration_rows(system, names, "observe");
+  if (names.empty()) names = view.names(system);
 
   const CsvTable table = to_table(data, "data");
-  LogStates log = read_log_states(self.posterior.prior(), added.view, self.file.model, table, columns_argument(columns), names);
+  LogStates log = read_log_states(self.posterior.prior(), view, self.file.model, table, columns_argument(columns), names);
 
   // the noise that the fit has for these rows, unless told otherwise; where it is a factor of stated ones, the log states them
-  added.noise_stddev = VectorXd::Constant(added.view.size(), noise_stddev.value_or(std::numeric_limits<double>::quiet_NaN()));
+  VectorXd stddev = VectorXd::Constant(view.size(), noise_stddev.value_or(std::numeric_limits<double>::quiet_NaN()));
+  MatrixXd scale;
   if (!noise_stddev) {
-    if (at_home == groups.end() || at_home->view.rows != added.view.rows) {
+    if (at_home == groups.end() || at_home->view().rows != view.rows) {
       throw InputError("noise_std: these accelerations were not observed in the fit; give their noise standard deviation");
     }
-    added.noise_stddev = self.posterior.values().noise_stddev[static_cast<std::size_t>(at_home - groups.begin())];
+    stddev = self.posterior.values().noise_stddev[static_cast<std::size_t>(at_home - groups.begin())];
     if (has_stated_noise(*at_home, static_cast<int>(at_home - groups.begin()), self.file.report.distrusted)) {
       LogReader reader = open_log(self.file.model, table, columns_argument(columns));
       for (const std::string& name : names) {
@@ -240,12 +240,12 @@ void update_with(PyPosterior& self, const py::object& data, const std::vector<st
                         "{}_std, or one for all",
                         name, name));
       }
-      added.noise_scale = reader.stddevs(names);
+      scale = reader.stddevs(names);
     }
   }
   tell(log.notes);
-  added.states = std::move(log.states);
-  added.values = std::move(log.accelerations);
+  Observations added(std::move(log.states), std::move(view), std::move(log.accelerations), std::move(stddev), false,
+                     std::move(scale));
   const std::optional<Posterior> kept = kept_by_others(self);
   self.posterior = update(std::move(self.posterior), std::move(added));
 }

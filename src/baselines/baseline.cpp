@@ -40,12 +40,12 @@ MatrixXd pooled(const std::vector<Observations>& observations, const Part& part)
 }
 
 MatrixXd pooled_values(const std::vector<Observations>& observations) {
-  return pooled(observations, [](const Observations& group) { return group.values; });
+  return pooled(observations, [](const Observations& group) { return group.values(); });
 }
 
 MatrixXd pooled_features(const std::vector<Observations>& observations, const Latent& latent) {
   return pooled(observations,
-                [&](const Observations& group) -> MatrixXd { return evaluate_features(latent, group.states).transpose(); });
+                [&](const Observations& group) -> MatrixXd { return evaluate_features(latent, group.states()).transpose(); });
 }
 
 // of each row; 1 where it is constant
@@ -116,10 +116,12 @@ Fit fit_output(int output, const Prior& prior, const std::vector<Observations>& 
   alone.latents = {prior.latents[static_cast<std::size_t>(output)]};
   std::vector<Observations> observed = observations;
   for (Observations& group : observed) {
-    group.view.rows = {output};
-    group.values = MatrixXd(group.values.row(output));
-    group.noise_stddev = VectorXd(group.noise_stddev.segment(output, 1));
-    if (group.has_noise_scale()) group.noise_scale = MatrixXd(group.noise_scale.row(output));
+    View view = group.view();
+    view.rows = {output};
+    const Noise& noise = group.noise();
+    group = {group.states(), std::move(view), group.values().row(output),
+             Noise(noise.stddev().segment(output, 1), noise.is_estimated(),
+                   noise.has_scale() ? MatrixXd(noise.scale().row(output)) : MatrixXd())};
   }
   std::vector<Hyperparameter> own;
   for (const Hyperparameter& h : hyperparameters) {

@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <utility>
 
 #include <fmt/format.h>
 
@@ -16,87 +17,124 @@ using Eigen::VectorXd;
 
 namespace {
 
-// the entries of row k that are measured
-VectorXd measured(const Eigen::Ref<const MatrixXd>& values, Index k) {
-  VectorXd some(values.cols());
-  Index n = 0;
-  for (const double value : values.row(k)) {
-    if (!std::isnan(value)) some[n++] = value;
-  }
-  return some.head(n);
+void append_columns(MatrixXd& matrix, const MatrixXd& more) {
+  matrix.conservativeResize(Eigen::NoChange, matrix.cols() + more.cols());
+  matrix.rightCols(more.cols()) = more;
 }
 
-// of(the measured entries) for each row, NaN where there are none
-template <typename Of>
-VectorXd over_measured(const Eigen::Ref<const MatrixXd>& values, const Of& of) {
-  VectorXd out(values.rows());
-  for (Index k = 0; k < out.size(); ++k) {
-    const VectorXd some = measured(values, k);
-    out[k] = some.size() == 0 ? std::numeric_limits<double>::quiet_NaN() : of(some);
-  }
-  return out;
+void erase_first_columns(MatrixXd& matrix, Index n) {
+  std::copy(matrix.data() + n * matrix.rows(), matrix.data() + matrix.size(), matrix.data());
+  matrix.conservativeResize(Eigen::NoChange, matrix.cols() - n);
 }
 
 }  // namespace
 
-VectorXd row_mean(const Eigen::Ref<const MatrixXd>& values) {
-  if (!values.hasNaN()) return values.rowwise().mean();
-  return over_measured(values, [](const VectorXd& some) { return some.mean(); });
-}
+Noise::Noise(VectorXd stddev, bool is_estimated, MatrixXd scale)
+    : stddev_(std::move(stddev)), is_estimated_(is_estimated), scale_(std::move(scale)) {}
 
-VectorXd row_stddev(const Eigen::Ref<const MatrixXd>& values) {
-  if (values.hasNaN()) {
-    return over_measured(values, [](const VectorXd& some) { return row_stddev(some.transpose())[0]; });
-  }
-  const VectorXd mean = values.rowwise().mean();
-  return (values.colwise() - mean).rowwise().squaredNorm().array().sqrt() / std::sqrt(static_cast<double>(values.cols()));
-}
-
-VectorXd Observations::noise_at(const Eigen::Ref<const VectorXd>& stddev, Index i) const {
+VectorXd Noise::at(const Eigen::Ref<const VectorXd>& stddev, Index i) const {
   VectorXd noise = stddev;
-  if (has_noise_scale()) noise.array() *= noise_scale.col(i).array();
-  for (Index k = 0; k < noise.size(); ++k) {
-    if (std::isnan(values(k, i))) noise[k] = std::numeric_limits<double>::infinity();
-  }
+  if (has_scale()) noise.array() *= scale_.col(i).array();
   return noise;
 }
 
-VectorXd Observations::measured_scales(Index k) const {
-  VectorXd scales(values.cols());
-  Index n = 0;
-  for (Index i = 0; i < values.cols(); ++i) {
-    if (!std::isnan(values(k, i))) scales[n++] = noise_scale(k, i);
-  }
-  return scales.head(n);
+Noise Noise::take(const std::vector<int>& states) const {
+  return Noise(stddev_, is_estimated_, has_scale() ? MatrixXd(scale_(Eigen::all, states)) : MatrixXd());
 }
 
-VectorXd Observations::usual_noise(const Eigen::Ref<const VectorXd>& stddev) const {
-  if (!has_noise_scale()) return stddev;
-  VectorXd usual = stddev;
-  for (Index k = 0; k < usual.size(); ++k) {
-    VectorXd scale = measured_scales(k);
-    if (scale.size() == 0) continue;
-    const auto middle = scale.begin() + scale.size() / 2;
-    std::nth_element(scale.begin(), middle, scale.end());
-    usual[k] *= *middle;
+void Noise::append(const Noise& more) {
+  if (has_scale() != more.has_scale()) {
+    throw InputError("observations: some have a noise of each value and some have not; give all of them a noise_scale, or none");
   }
-  return usual;
+  if (has_scale()) append_columns(scale_, more.scale_);
 }
 
-void Observations::require_noise_scale() const {
-  if (!has_noise_scale()) return;
-  if (noise_scale.rows() != values.rows() || noise_scale.cols() != values.cols()) {
+void Noise::remove_first(int n) {
+  if (has_scale()) erase_first_columns(scale_, n);
+}
+
+void Noise::require_noise_of(const MatrixXd& values) const {
+  if (stddev_.size() != values.rows()) {
+    throw InputError(fmt::format("observations: `noise_stddev` must have one number for each of the view's {} rows, got {}",
+                                 values.rows(), stddev_.size()));
+  }
+  for (const double sigma : stddev_) {
+    if (sigma > 0 && std::isfinite(sigma)) continue;
+    throw InputError(fmt::format("observations: `noise_stddev` must be positive and finite, got {}", sigma));
+  }
+  if (!has_scale()) return;
+  if (scale_.rows() != values.rows() || scale_.cols() != values.cols()) {
     throw InputError(
         fmt::format("noise_scale must hold one number for each of the {} × {} values, got {} × {}; leave it empty where "
                     "each row has one noise",
-                    values.rows(), values.cols(), noise_scale.rows(), noise_scale.cols()));
+                    values.rows(), values.cols(), scale_.rows(), scale_.cols()));
   }
   for (Index entry = 0; entry < values.size(); ++entry) {
-    const double scale = noise_scale.reshaped()[entry];
+    const double scale = scale_.reshaped()[entry];
     if ((scale > 0 && std::isfinite(scale)) || std::isnan(values.reshaped()[entry])) continue;
     throw InputError(fmt::format(
         "noise_scale must be positive and finite, got {}; a value that is worth nothing is NaN, not measured", scale));
   }
+}
+
+Observations::Observations(MatrixXd states, View view, MatrixXd values, Noise noise)
+    : states_(std::move(states)), view_(std::move(view)), values_(std::move(values)), noise_(std::move(noise)) {
+  if (values_.rows() != view_.size() || values_.cols() != states_.cols()) {
+    throw InputError(
+        fmt::format("observations: `values` must have a row for each of the view's {} and a column for each of the {} "
+                    "states, got {} × {}",
+                    view_.size(), states_.cols(), values_.rows(), values_.cols()));
+  }
+  if (values_.array().isInf().any()) {
+    throw InputError("observations: `values` must be finite, or NaN where nothing is measured; got one that is infinite");
+  }
+  noise_.require_noise_of(values_);
+}
+
+Observations::Observations(MatrixXd states, View view, MatrixXd values, VectorXd noise_stddev, bool estimate_noise,
+                           MatrixXd noise_scale)
+    : Observations(std::move(states), std::move(view), std::move(values),
+                   Noise(std::move(noise_stddev), estimate_noise, std::move(noise_scale))) {}
+
+Observations Observations::take(const std::vector<int>& states) const {
+  return {MatrixXd(states_(Eigen::all, states)), view_, MatrixXd(values_(Eigen::all, states)), noise_.take(states)};
+}
+
+void Observations::append(const Observations& more) {
+  noise_.append(more.noise_);
+  append_columns(states_, more.states_);
+  append_columns(values_, more.values_);
+}
+
+void Observations::remove_first(int n) {
+  erase_first_columns(states_, n);
+  erase_first_columns(values_, n);
+  noise_.remove_first(n);
+}
+
+VectorXd Observations::noise_at(const Eigen::Ref<const VectorXd>& stddev, Index i) const {
+  VectorXd noise = noise_.at(stddev, i);
+  for (Index k = 0; k < noise.size(); ++k) {
+    if (std::isnan(values_(k, i))) noise[k] = std::numeric_limits<double>::infinity();
+  }
+  return noise;
+}
+
+std::vector<double> Observations::measured_scales(Index k) const {
+  std::vector<double> scales;
+  for (Index i = 0; i < values_.cols(); ++i) {
+    if (!std::isnan(values_(k, i))) scales.push_back(noise_.scale()(k, i));
+  }
+  return scales;
+}
+
+VectorXd Observations::usual_noise(const Eigen::Ref<const VectorXd>& stddev) const {
+  VectorXd usual = stddev;
+  for (Index k = 0; k < usual.size() && noise_.has_scale(); ++k) {
+    std::vector<double> scales = measured_scales(k);
+    if (!scales.empty()) usual[k] *= median(std::move(scales));
+  }
+  return usual;
 }
 
 }  // namespace gp2

@@ -234,7 +234,7 @@ void check_hyperparameters(const std::vector<Hyperparameter>& hyperparameters, c
     }
   }
   for (std::size_t group = 0; group < observations.size(); ++group) {
-    add(optional, Kind::noise_stddev, group, observations[group].view.rows.size());
+    add(optional, Kind::noise_stddev, group, observations[group].view().rows.size());
   }
   add(optional, Kind::parameter, 0, prior.system->parameters().size());
 
@@ -319,67 +319,73 @@ Baseline baseline_from(const ParsedJson& json) {
 
 /// @param other  the model of its view's other system; null: none
 Json observations_json(const Observations& group, const Prior& home, const Model* other) {
-  const System& system = *prior_of(home, group.view).system;
-  Json json = {{"view", View::word(group.view.quantity)},
-               {"rows", group.view.rows},
-               {"time_step", group.view.time_step},
-               {"latent", group.view.latent},
+  const System& system = *prior_of(home, group.view()).system;
+  Json json = {{"view", View::word(group.view().quantity)},
+               {"rows", group.view().rows},
+               {"time_step", group.view().time_step},
+               {"latent", group.view().latent},
                {"n", group.n_data()},
-               {"noise_stddev", vector_json(group.noise_stddev)},
-               {"estimate_noise", group.estimate_noise},
-               {"states", rows_json(group.states, system.state_names())},
-               {"values", measured_json(group.values, group.view.names(system))}};
-  if (group.has_noise_scale()) json["noise_scale"] = measured_json(group.noise_scale, group.view.names(system));
+               {"noise_stddev", vector_json(group.noise().stddev())},
+               {"estimate_noise", group.noise().is_estimated()},
+               {"states", rows_json(group.states(), system.state_names())},
+               {"values", measured_json(group.values(), group.view().names(system))}};
+  if (group.noise().has_scale()) json["noise_scale"] = measured_json(group.noise().scale(), group.view().names(system));
   if (other != nullptr) json["system"] = model_json(*other);
   return json;
 }
 
-Observations observations_from(const ParsedJson& json, const Prior& home, std::shared_ptr<const OtherSystem> other_system) {
-  Observations group;
-  group.view.other_system = std::move(other_system);
-  const Prior& prior = prior_of(home, group.view);
-  const System& system = *prior.system;
+View view_from(const ParsedJson& json, const Prior& home, std::shared_ptr<const OtherSystem> other_system) {
+  View view;
+  view.other_system = std::move(other_system);
+  const Prior& prior = prior_of(home, view);
   const auto word = json.at("view").get<std::string>();
   const std::optional<View::Quantity> quantity = View::quantity_of(word);
   if (!quantity) throw InputError(fmt::format("'{}' is no view", word));
-  group.view.quantity = *quantity;
-  group.view.time_step = number(json.at("time_step"));
-  if (*quantity == View::Quantity::next_velocity && !(group.view.time_step > 0)) {
+  view.quantity = *quantity;
+  view.time_step = number(json.at("time_step"));
+  if (*quantity == View::Quantity::next_velocity && !(view.time_step > 0)) {
     throw InputError("the time_step of next-velocity must be positive");
   }
-  group.view.latent = integer(json.at("latent"));
-  if (group.view.latent < -1 || group.view.latent >= static_cast<int>(prior.latents.size())) {
-    throw InputError(fmt::format("latent {} of a view is outside -1 … {}", group.view.latent, prior.latents.size() - 1));
+  view.latent = integer(json.at("latent"));
+  if (view.latent < -1 || view.latent >= static_cast<int>(prior.latents.size())) {
+    throw InputError(fmt::format("latent {} of a view is outside -1 … {}", view.latent, prior.latents.size() - 1));
   }
-  const int n_rows = View::all(*quantity, system).size();
+  const int n_rows = View::all(*quantity, *prior.system).size();
   for (const ParsedJson& row : array(json.at("rows"))) {
     const int index = integer(row);
     if (index < 0 || index >= n_rows) throw InputError(fmt::format("row {} of a view is outside 0 … {}", index, n_rows - 1));
-    if (std::find(group.view.rows.begin(), group.view.rows.end(), index) != group.view.rows.end()) {
+    if (std::find(view.rows.begin(), view.rows.end(), index) != view.rows.end()) {
       throw InputError(fmt::format("row {} of a view stands twice", index));
     }
-    group.view.rows.push_back(index);
+    view.rows.push_back(index);
   }
-  if (group.view.rows.empty()) throw InputError("a view without rows");
+  if (view.rows.empty()) throw InputError("a view without rows");
+  return view;
+}
+
+Observations observations_from(const ParsedJson& json, const Prior& home, std::shared_ptr<const OtherSystem> other_system) {
+  View view = view_from(json, home, std::move(other_system));
+  const Prior& prior = prior_of(home, view);
+  const System& system = *prior.system;
   const int n = integer(json.at("n"));
   if (n < 1) throw InputError(fmt::format("{} observations are not possible", n));
-  group.noise_stddev = vector_from(json.at("noise_stddev"));
-  if (group.noise_stddev.size() != group.view.size() || !(group.noise_stddev.array() > 0).all()) {
+  VectorXd noise_stddev = vector_from(json.at("noise_stddev"));
+  if (noise_stddev.size() != view.size() || !(noise_stddev.array() > 0).all()) {
     throw InputError("noise_stddev must hold one positive number per row of the view");
   }
-  json.at("estimate_noise").get_to(group.estimate_noise);
+  const auto estimate_noise = json.at("estimate_noise").get<bool>();
   // values come first: they bound what a damaged n can claim
-  const std::vector<bool> every(group.view.rows.size(), true);
-  group.values = rows_from(json.at("values"), group.view.names(system), every, n, number_or_missing);
+  const std::vector<bool> every(view.rows.size(), true);
+  MatrixXd values = rows_from(json.at("values"), view.names(system), every, n, number_or_missing);
+  MatrixXd noise_scale;
   if (json.contains("noise_scale")) {
-    group.noise_scale = rows_from(json.at("noise_scale"), group.view.names(system), every, n, number_or_missing);
-    group.require_noise_scale();
+    noise_scale = rows_from(json.at("noise_scale"), view.names(system), every, n, number_or_missing);
   }
   std::vector<bool> reads = prior.reads();
-  const std::vector<bool> of_view = group.view.reads(system);
+  const std::vector<bool> of_view = view.reads(system);
   for (std::size_t k = 0; k < reads.size(); ++k) reads[k] = reads[k] || of_view[k];
-  group.states = rows_from(json.at("states"), system.state_names(), reads, n);
-  return group;
+  MatrixXd states = rows_from(json.at("states"), system.state_names(), reads, n);
+  return {std::move(states), std::move(view), std::move(values), std::move(noise_stddev), estimate_noise, std::move(noise_scale)};
 }
 
 // a restart without a finite start has the objective ∞, which JSON has not: null
@@ -493,8 +499,8 @@ void FitFile::write(const std::filesystem::path& path) const {
   json["observations"] = Json::array();
   const Prior home = prior();
   for (std::size_t g = 0; g < observations.size(); ++g) {
-    const Model* other = observations[g].view.other_system && g < systems.size() ? systems[g].get() : nullptr;
-    if (observations[g].view.other_system && other == nullptr) {
+    const Model* other = observations[g].view().other_system && g < systems.size() ? systems[g].get() : nullptr;
+    if (observations[g].view().other_system && other == nullptr) {
       throw InputError(fmt::format("{}: the model file of the system of observations {} is not given", path.string(), g + 1));
     }
     json["observations"].push_back(observations_json(observations[g], home, other));

@@ -42,11 +42,11 @@ Trained trained(const Posterior& posterior, int row) {
   std::vector<double> values;
   for (std::size_t g = 0; g < posterior.observations().size(); ++g) {
     const Observations& group = posterior.observations()[g];
-    if (group.view.quantity != View::Quantity::constrained_acceleration || group.view.latent >= 0) continue;
-    for (int k = 0; k < group.view.size(); ++k) {
-      if (group.view.rows[static_cast<std::size_t>(k)] != row) continue;
+    if (group.view().quantity != View::Quantity::constrained_acceleration || group.view().latent >= 0) continue;
+    for (int k = 0; k < group.view().size(); ++k) {
+      if (group.view().rows[static_cast<std::size_t>(k)] != row) continue;
       if (values.empty()) trained.noise = group.usual_noise(posterior.values().noise_stddev[g])[k];
-      values.insert(values.end(), group.values.row(k).begin(), group.values.row(k).end());
+      values.insert(values.end(), group.values().row(k).begin(), group.values().row(k).end());
     }
   }
   if (!values.empty()) trained.spread = row_stddev(Eigen::Map<Eigen::RowVectorXd>(values.data(), std::ssize(values)))[0];

@@ -42,8 +42,8 @@ std::vector<LeaveOneOut> leave_one_out(const Posterior& posterior) {
   constexpr double not_a_number = std::numeric_limits<double>::quiet_NaN();
   std::vector<LeaveOneOut> out;
   for (const Observations& group : observations) {
-    out.push_back({MatrixXd::Constant(group.values.rows(), group.values.cols(), not_a_number),
-                   MatrixXd::Constant(group.values.rows(), group.values.cols(), not_a_number)});
+    out.push_back({MatrixXd::Constant(group.values().rows(), group.values().cols(), not_a_number),
+                   MatrixXd::Constant(group.values().rows(), group.values().cols(), not_a_number)});
   }
   for (std::size_t s = 0; s < reduction.samples.size(); ++s) {
     const Reduction::Sample& sample = reduction.samples[s];
@@ -68,7 +68,7 @@ std::vector<LeaveOneOut> leave_one_out(const Posterior& posterior) {
     for (Index k = 0; k < noise.size(); ++k) {
       if (!std::isfinite(noise[k])) continue;  // not measured
       const double p = P_e(k, k);
-      out[g].mean(k, sample.index) = observations[g].values(k, sample.index) - noise[k] * alpha_e[k] / p;
+      out[g].mean(k, sample.index) = observations[g].values()(k, sample.index) - noise[k] * alpha_e[k] / p;
       out[g].variance(k, sample.index) = noise[k] * noise[k] * std::max(0.0, 1 / p - 1);
     }
   }

@@ -97,8 +97,8 @@ Likelihood::Likelihood(Prior prior, std::vector<Observations> observations, cons
   self.observations = std::move(observations);
   self.options = std::move(options);
   for (const Observations& group : self.observations) {
-    group.require_noise_scale();
-    require_mechanics(prior_of(self.prior, group.view), group.view, group.states, parameters_of(group.view, initial.parameters));
+    require_mechanics(prior_of(self.prior, group.view()), group.view(), group.states(),
+                      parameters_of(group.view(), initial.parameters));
   }
   self.features = features_by_group(self.prior, self.observations);
   std::vector<ObservationModel> models;

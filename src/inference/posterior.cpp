@@ -206,12 +206,11 @@ void add_prior_covariance(double k, const double* left, const double* right, Ind
 
 void Posterior::Implementation::add_samples(const std::vector<Observations>& groups, const std::vector<VectorXd>& noise_stddev,
                                             int first_group) {
-  for (const Observations& group : groups) group.require_noise_scale();
   std::vector<ObservationModel> models;
   if (!model_observations(prior, groups, values.parameters, {}, models)) {
     for (const Observations& group : groups) {
-      static_cast<void>(
-          require_mechanics(prior_of(prior, group.view), group.view, group.states, parameters_of(group.view, values.parameters)));
+      static_cast<void>(require_mechanics(prior_of(prior, group.view()), group.view(), group.states(),
+                                          parameters_of(group.view(), values.parameters)));
     }
   }
   Reduction reduction;
@@ -587,48 +586,11 @@ std::shared_ptr<Posterior::Implementation> Posterior::own_implementation() const
 namespace {
 
 void check_added(const Prior& prior, const Observations& added) {
-  const Index n_state = prior_of(prior, added.view).system->layout().size();
-  if (added.states.rows() != n_state) {
+  const Index n_state = prior_of(prior, added.view()).system->layout().size();
+  if (added.states().rows() != n_state) {
     throw InputError(fmt::format("update: a column of `states` is a state of '{}' and must have {} rows (StateLayout), got {}",
-                                 prior.system->name(), n_state, added.states.rows()));
+                                 prior.system->name(), n_state, added.states().rows()));
   }
-  if (added.values.rows() != added.view.size() || added.values.cols() != added.states.cols()) {
-    throw InputError(
-        fmt::format("update: `values` must have a row for each of the view's {} and a column for each of the {} "
-                    "states, got {} × {}",
-                    added.view.size(), added.states.cols(), added.values.rows(), added.values.cols()));
-  }
-  if (added.values.array().isInf().any()) {
-    throw InputError("update: `values` must be finite, or NaN where nothing is measured; got one that is infinite");
-  }
-  try {
-    added.require_noise_scale();
-  } catch (const InputError& error) {
-    throw InputError(std::string("update: ") + error.what());
-  }
-  if (added.noise_stddev.size() != added.view.size()) {
-    throw InputError(
-        fmt::format("update: `noise_stddev` must have one number for each of the view's {} rows, got {}; that of "
-                    "earlier observations is values().noise_stddev",
-                    added.view.size(), added.noise_stddev.size()));
-  }
-  for (const double sigma : added.noise_stddev) {
-    if (sigma > 0 && std::isfinite(sigma)) continue;
-    throw InputError(
-        fmt::format("update: `noise_stddev` must be positive and finite, got {}; that of earlier observations is "
-                    "values().noise_stddev",
-                    sigma));
-  }
-}
-
-void append_columns(MatrixXd& matrix, const MatrixXd& more) {
-  matrix.conservativeResize(Eigen::NoChange, matrix.cols() + more.cols());
-  matrix.rightCols(more.cols()) = more;
-}
-
-void erase_first_columns(MatrixXd& matrix, Index n) {
-  std::copy(matrix.data() + n * matrix.rows(), matrix.data() + matrix.size(), matrix.data());
-  matrix.conservativeResize(Eigen::NoChange, matrix.cols() - n);
 }
 
 }  // namespace
@@ -642,17 +604,15 @@ Posterior update(Posterior&& posterior, Observations added) {
   std::size_t group = 0;
   const auto belongs = [&] {
     const Observations& there = self->observations[group];
-    return there.view == added.view && self->values.noise_stddev[group] == added.noise_stddev &&
-           there.has_noise_scale() == added.has_noise_scale();
+    return there.view() == added.view() && self->values.noise_stddev[group] == added.noise().stddev() &&
+           there.noise().has_scale() == added.noise().has_scale();
   };
   while (group < self->observations.size() && !belongs()) ++group;
-  self->add_samples({added}, {added.noise_stddev}, static_cast<int>(group));
+  self->add_samples({added}, {added.noise().stddev()}, static_cast<int>(group));
   if (group < self->observations.size()) {
-    append_columns(self->observations[group].states, added.states);
-    append_columns(self->observations[group].values, added.values);
-    if (added.has_noise_scale()) append_columns(self->observations[group].noise_scale, added.noise_scale);
+    self->observations[group].append(added);
   } else {
-    self->values.noise_stddev.push_back(added.noise_stddev);
+    self->values.noise_stddev.push_back(added.noise().stddev());
     self->observations.push_back(std::move(added));
   }
   self->finish();
@@ -678,14 +638,10 @@ Posterior remove_oldest(Posterior&& posterior, int n) {
   std::sort(gone.begin(), gone.end());
 
   // in each group the oldest stand first
-  std::vector<Index> n_gone(self->observations.size());
+  std::vector<int> n_gone(self->observations.size());
   for (const Index sample : gone) ++n_gone[static_cast<std::size_t>(self->samples[static_cast<std::size_t>(sample)].group)];
   self->erase_samples(gone);
-  for (std::size_t group = 0; group < n_gone.size(); ++group) {
-    erase_first_columns(self->observations[group].states, n_gone[group]);
-    erase_first_columns(self->observations[group].values, n_gone[group]);
-    if (self->observations[group].has_noise_scale()) erase_first_columns(self->observations[group].noise_scale, n_gone[group]);
-  }
+  for (std::size_t group = 0; group < n_gone.size(); ++group) self->observations[group].remove_first(n_gone[group]);
   self->finish();
   posterior.implementation_.reset();
   return Posterior(self);

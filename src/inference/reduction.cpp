@@ -41,27 +41,27 @@ bool model_observations(const Prior& prior, const std::vector<Observations>& obs
   for (std::size_t g = 0; g < observations.size(); ++g) {
     const Observations& group = observations[g];
     ObservationModel& model = models[g];
-    const Prior& there = prior_of(prior, group.view);
-    const VectorXd theta = parameters_of(group.view, parameters);
-    evaluate_mechanics(there, group.view, group.states, theta, model.mechanics);
+    const Prior& there = prior_of(prior, group.view());
+    const VectorXd theta = parameters_of(group.view(), parameters);
+    evaluate_mechanics(there, group.view(), group.states(), theta, model.mechanics);
     if (model.mechanics.fault) return false;
-    model.values = {evaluate_view(group.view, model.mechanics, group.states),
-                    evaluate_prior(there, group.states, theta, model.mechanics)};
+    model.values = {evaluate_view(group.view(), model.mechanics, group.states()),
+                    evaluate_prior(there, group.states(), theta, model.mechanics)};
     model.derivatives.clear();
     for (int parameter : gradient_parameters) {
-      const int index = index_there(group.view, parameter);
+      const int index = index_there(group.view(), parameter);
       if (index < 0) {
         model.derivatives.push_back(zero_like(model.values));
         continue;
       }
-      const SystemValues d = there.system->differentiate(group.states, theta, index);
+      const SystemValues d = there.system->differentiate(group.states(), theta, index);
       model.derivatives.push_back(
-          {differentiate_view(group.view, model.mechanics, d),
-           differentiate_prior(there, group.states, theta, model.mechanics, model.values.prior, d, index)});
+          {differentiate_view(group.view(), model.mechanics, d),
+           differentiate_prior(there, group.states(), theta, model.mechanics, model.values.prior, d, index)});
     }
-    if (group.view.latent >= 0) {
-      model.values.prior.keep_only(static_cast<std::size_t>(group.view.latent));
-      for (ObservationModel::Values& d : model.derivatives) d.prior.keep_only(static_cast<std::size_t>(group.view.latent));
+    if (group.view().latent >= 0) {
+      model.values.prior.keep_only(static_cast<std::size_t>(group.view().latent));
+      for (ObservationModel::Values& d : model.derivatives) d.prior.keep_only(static_cast<std::size_t>(group.view().latent));
     }
   }
   return true;
@@ -81,9 +81,9 @@ void reduce(const Prior& prior, const std::vector<Observations>& observations, c
     const Observations& group = observations[g];
     VectorXd whitening = noise_stddev[g].cwiseInverse();
     double log_det_S_half = noise_stddev[g].array().log().sum();
-    const Index d = group.view.size();
+    const Index d = group.view().size();
     Index n_measured = d;
-    const bool is_mixed = group.has_noise_scale() || group.values.hasNaN();
+    const bool is_mixed = group.noise().has_scale() || group.values().hasNaN();
     for (int i = 0; i < group.n_data(); ++i) {
       if (is_mixed) {
         noise = group.noise_at(noise_stddev[g], i);
@@ -105,7 +105,7 @@ void reduce(const Prior& prior, const std::vector<Observations>& observations, c
       sample.Q.setIdentity(d, rank);
       internal::apply_Q(factors, reflection, rank, sample.Q);
       sample.R.noalias() = sample.Q.transpose().lazyProduct(W);
-      sample.e = group.values.col(i) - models[g].values.view.offset.col(i);
+      sample.e = group.values().col(i) - models[g].values.view.offset.col(i);
       sample.e.noalias() -= G.lazyProduct(models[g].values.prior.mean.col(i));
       sample.e.array() *= whitening.array();
       if (n_measured < d) sample.e = (whitening.array() > 0).select(sample.e, 0);
@@ -166,8 +166,8 @@ std::vector<std::vector<MatrixXd>> features_by_group(const Prior& prior, const s
   std::vector<std::vector<MatrixXd>> features;
   for (const Observations& group : observations) {
     std::vector<MatrixXd>& of_group = features.emplace_back();
-    for (const Latent& latent : prior_of(prior, group.view).latents) {
-      of_group.push_back(evaluate_features(latent, group.states));
+    for (const Latent& latent : prior_of(prior, group.view()).latents) {
+      of_group.push_back(evaluate_features(latent, group.states()));
     }
   }
   return features;

@@ -13,6 +13,7 @@
 #include <fmt/ranges.h>
 
 #include "base/parallel.hpp"
+#include "gp2/base/statistics.hpp"
 #include "gp2/data/log_reader.hpp"
 #include "gp2/error.hpp"
 #include "gp2/jobs/fit_problem.hpp"
@@ -29,12 +30,6 @@ namespace {
 constexpr double nan = std::numeric_limits<double>::quiet_NaN();
 constexpr int least_for_own_model = 40;  // samples
 constexpr double most_rows = 1e7;
-
-double median(std::vector<double> values) {
-  const auto middle = values.begin() + static_cast<std::ptrdiff_t>(values.size() / 2);
-  std::nth_element(values.begin(), middle, values.end());
-  return *middle;
-}
 
 /// An empty cell, or one of the words that loggers write instead.
 bool is_missing(const std::string& cell) {

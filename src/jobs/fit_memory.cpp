@@ -34,15 +34,12 @@ double triangle(double r) {
 // Σ rank of what the states of one Observations measure, from some of them
 double reduced_size(const FitProblem& problem, std::size_t g, ModelValues values) {
   constexpr Index enough = 256;
-  Observations group = problem.observations[g];
+  const Observations& group = problem.observations[g];
   const Index n = group.n_data(), n_some = std::min(n, enough);
-  std::vector<Index> some(static_cast<std::size_t>(n_some));
-  for (Index k = 0; k < n_some; ++k) some[static_cast<std::size_t>(k)] = k * n / n_some;
-  group.states = Eigen::MatrixXd(group.states(Eigen::all, some));
-  group.values = Eigen::MatrixXd(group.values(Eigen::all, some));
-  if (group.has_noise_scale()) group.noise_scale = Eigen::MatrixXd(group.noise_scale(Eigen::all, some));
+  std::vector<int> some;
+  for (Index k = 0; k < n_some; ++k) some.push_back(static_cast<int>(k * n / n_some));
   values.noise_stddev = {values.noise_stddev[g]};
-  return static_cast<double>(Likelihood(problem.prior, {group}, values, {}).reduced_size()) * static_cast<double>(n) /
+  return static_cast<double>(Likelihood(problem.prior, {group.take(some)}, values, {}).reduced_size()) * static_cast<double>(n) /
          static_cast<double>(n_some);
 }
 
@@ -56,7 +53,7 @@ PerState per_state(const FitProblem& problem, double rank) {
   const System& system = *problem.prior.system;
   const double n = system.nq(), m = system.nc();
   double d = 0;
-  for (const Observations& group : problem.observations) d = std::max(d, static_cast<double>(group.view.size()));
+  for (const Observations& group : problem.observations) d = std::max(d, static_cast<double>(group.view().size()));
   const auto n_parameters = std::count_if(problem.hyperparameters.begin(), problem.hyperparameters.end(),
                                           [](const auto& h) { return h.kind == Hyperparameter::Kind::parameter; });
   // states and values as they stand in the problem, the likelihood and the posterior

@@ -7,6 +7,7 @@
 #include <fmt/format.h>
 
 #include "base/random.hpp"
+#include "gp2/base/statistics.hpp"
 #include "gp2/error.hpp"
 #include "gp2/jobs/fit_problem.hpp"
 #include "gp2/observations.hpp"

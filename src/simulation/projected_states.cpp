@@ -6,6 +6,7 @@
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
+#include "gp2/base/statistics.hpp"
 #include "gp2/error.hpp"
 #include "simulation/projection.hpp"
 
@@ -60,10 +61,7 @@ SizeSummary summarise_sizes(const Ref<const VectorXd>& sizes) {
   summary.largest = sizes.maxCoeff(&at);
   summary.at = static_cast<int>(at);
   summary.mean = sizes.mean();
-  VectorXd sorted = sizes;
-  const auto middle = sorted.begin() + sorted.size() / 2;
-  std::nth_element(sorted.begin(), middle, sorted.end());
-  summary.median = *middle;
+  summary.median = median({sizes.begin(), sizes.end()});
   return summary;
 }
 

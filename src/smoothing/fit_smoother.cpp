@@ -5,6 +5,7 @@
 
 #include <fmt/format.h>
 
+#include "gp2/base/statistics.hpp"
 #include "gp2/error.hpp"
 #include "gp2/smoothing/smoother.hpp"
 #include "training/lbfgsb.hpp"
@@ -18,12 +19,6 @@ namespace {
 
 constexpr int least_positions = 5;
 constexpr double median_of_normal = 0.6745;  // of |x|, x standard normal
-
-double median(std::vector<double> values) {
-  const auto middle = values.begin() + static_cast<std::ptrdiff_t>(values.size() / 2);
-  std::nth_element(values.begin(), middle, values.end());
-  return *middle;
-}
 
 double square(double x) { return x * x; }
 

@@ -4,6 +4,7 @@
 
 #include <fmt/format.h>
 
+#include "gp2/base/statistics.hpp"
 #include "gp2/error.hpp"
 #include "gp2/fit.hpp"
 
@@ -37,12 +38,6 @@ MatrixXd side_by_side(const std::vector<MatrixXd>& parts) {
   return all;
 }
 
-double median(std::vector<double> values) {
-  const auto middle = values.begin() + static_cast<std::ptrdiff_t>(values.size() / 2);
-  std::nth_element(values.begin(), middle, values.end());
-  return *middle;
-}
-
 // a spread that bounds and starting points can be multiples of, even where the data do not vary
 double usable(double spread, double fallback) { return spread > 0 && std::isfinite(spread) ? spread : fallback; }
 
@@ -62,20 +57,20 @@ VectorXd spread_of_rows(const Eigen::Ref<const MatrixXd>& values) {
 template <typename OfRows>
 std::optional<VectorXd> acceleration_scale(const Observations& group, const VectorXd& mass_diagonal, const OfRows& of_rows) {
   using Quantity = View::Quantity;
-  if (group.view.latent >= 0) return std::nullopt;
-  VectorXd stddev = of_rows(group.values);
-  switch (group.view.quantity) {
+  if (group.view().latent >= 0) return std::nullopt;
+  VectorXd stddev = of_rows(group.values());
+  switch (group.view().quantity) {
     case Quantity::constrained_acceleration:
     case Quantity::unconstrained_acceleration:
       return stddev;
     case Quantity::constraint_force:
-      return VectorXd(stddev.cwiseQuotient(mass_diagonal(group.view.rows)));
+      return VectorXd(stddev.cwiseQuotient(mass_diagonal(group.view().rows)));
     case Quantity::multipliers:
       return std::nullopt;
     case Quantity::next_velocity: {
       const Index nq = mass_diagonal.size();
-      const MatrixXd dq = group.states.middleRows(nq, nq)(group.view.rows, Eigen::all);
-      return VectorXd(of_rows(group.values - dq) / group.view.time_step);
+      const MatrixXd dq = group.states().middleRows(nq, nq)(group.view().rows, Eigen::all);
+      return VectorXd(of_rows(group.values() - dq) / group.view().time_step);
     }
   }
   return std::nullopt;
@@ -89,7 +84,7 @@ VectorXd coordinate_scales(const System& system, const std::vector<Observations>
     for (const Observations& group : observations) {
       const std::optional<VectorXd> scale = acceleration_scale(group, mass_diagonal, of_rows);
       for (Index k = 0; scale && k < scale->size(); ++k) {
-        double& entry = variance[group.view.rows[static_cast<std::size_t>(k)]];
+        double& entry = variance[group.view().rows[static_cast<std::size_t>(k)]];
         entry = std::max(entry, (*scale)[k] * (*scale)[k]);
       }
     }
@@ -121,12 +116,12 @@ Scales default_scales(const Prior& prior, const std::vector<Observations>& obser
   std::vector<std::vector<MatrixXd>> features(prior.latents.size()), directions(prior.latents.size());
   std::vector<std::vector<double>> mass(static_cast<std::size_t>(system.nq()));
   for (const Observations& group : observations) {
-    const Prior& there = prior_of(prior, group.view);
-    const VectorXd parameters = parameters_of(group.view, system.parameter_values());
-    const MechanicsBatch mechanics = require_mechanics(there, group.view, group.states, parameters);
-    PriorValues values = evaluate_prior(there, group.states, parameters, mechanics);
+    const Prior& there = prior_of(prior, group.view());
+    const VectorXd parameters = parameters_of(group.view(), system.parameter_values());
+    const MechanicsBatch mechanics = require_mechanics(there, group.view(), group.states(), parameters);
+    PriorValues values = evaluate_prior(there, group.states(), parameters, mechanics);
     for (std::size_t a = 0; a < prior.latents.size(); ++a) {
-      features[a].push_back(evaluate_features(there.latents[a], group.states).transpose());
+      features[a].push_back(evaluate_features(there.latents[a], group.states()).transpose());
       directions[a].push_back(std::move(values.directions[a]));
     }
     for (std::size_t j = 0; j < mass.size(); ++j) {
@@ -167,11 +162,11 @@ Scales default_scales(const Prior& prior, const std::vector<Observations>& obser
     scales.signal_stddev.push_back(std::move(signal));
   }
   for (const Observations& group : observations) {
-    VectorXd stddev = spread_of_rows(group.values);
-    const VectorXd size = size_of_rows(group.values);
+    VectorXd stddev = spread_of_rows(group.values());
+    const VectorXd size = size_of_rows(group.values());
     for (Index k = 0; k < stddev.size(); ++k) {
-      const auto row = static_cast<std::size_t>(group.view.rows[static_cast<std::size_t>(k)]);
-      const bool per_coordinate = group.view.quantity != View::Quantity::multipliers;
+      const auto row = static_cast<std::size_t>(group.view().rows[static_cast<std::size_t>(k)]);
+      const bool per_coordinate = group.view().quantity != View::Quantity::multipliers;
       stddev[k] = usable(stddev[k], usable(size[k], per_coordinate ? sigma[static_cast<Index>(row)] : 1));
     }
     scales.output_stddev.push_back(std::move(stddev));
@@ -288,8 +283,8 @@ std::vector<Hyperparameter> default_hyperparameters(const Prior& prior, const st
   }
 
   for (std::size_t g = 0; g < observations.size(); ++g) {
-    if (!observations[g].estimate_noise) continue;
-    const std::vector<std::string> names = observations[g].view.names(system);
+    if (!observations[g].noise().is_estimated()) continue;
+    const std::vector<std::string> names = observations[g].view().names(system);
     for (std::size_t k = 0; k < names.size(); ++k) {
       Hyperparameter h;
       h.kind = Kind::noise_stddev;
@@ -301,16 +296,16 @@ std::vector<Hyperparameter> default_hyperparameters(const Prior& prior, const st
       const double spread = scales.output_stddev[g][static_cast<Index>(k)];
       h.lower = Standard::noise_lower * spread;
       h.upper = Standard::noise_upper * spread;
-      if (observations[g].has_noise_scale()) {
+      if (observations[g].noise().has_scale()) {
         // a factor of stated deviations: the smallest of them stays above the lower bound, the usual one below the upper
         h.unit = fmt::format("stated deviation of {}", names[k]);
-        const VectorXd scale = observations[g].measured_scales(static_cast<Index>(k));
-        if (scale.size() > 0) h.lower /= scale.minCoeff();
+        const std::vector<double> scale = observations[g].measured_scales(static_cast<Index>(k));
+        if (!scale.empty()) h.lower /= *std::min_element(scale.begin(), scale.end());
         h.upper =
-            std::max(h.upper / observations[g].usual_noise(VectorXd::Ones(observations[g].view.size()))[static_cast<Index>(k)],
+            std::max(h.upper / observations[g].usual_noise(VectorXd::Ones(observations[g].view().size()))[static_cast<Index>(k)],
                      2 * h.lower);
       }
-      h.value = std::clamp(observations[g].noise_stddev[static_cast<Index>(k)], h.lower, h.upper);
+      h.value = std::clamp(observations[g].noise().stddev()[static_cast<Index>(k)], h.lower, h.upper);
       if (protocol.hyperprior && protocol.name == Protocol::Name::standard) {
         h.median = h.value;
         h.log_stddev = Standard::noise_log_stddev;
@@ -384,7 +379,7 @@ ModelValues model_values(const Prior& prior, const std::vector<Observations>& ob
     values.mixing.emplace_back();
     if (latent.learned_rank) values.mixing.back().setZero(latent.size(), latent.n_functions());
   }
-  for (const Observations& group : observations) values.noise_stddev.push_back(group.noise_stddev);
+  for (const Observations& group : observations) values.noise_stddev.push_back(group.noise().stddev());
   values.parameters = prior.system->parameter_values();
   for (const Hyperparameter& h : hyperparameters) {
     const auto owner = static_cast<std::size_t>(h.owner);

@@ -1,4 +1,5 @@
 #include "gp2/training/robust.hpp"
+#include "gp2/base/statistics.hpp"
 
 #include <algorithm>
 #include <cmath>
@@ -17,19 +18,13 @@ namespace {
 
 constexpr double normal_median = 0.6744897501960817;  // of |z|, z ~ N(0, 1)
 
-double median(std::vector<double> values) {
-  const auto middle = values.begin() + std::ssize(values) / 2;
-  std::nth_element(values.begin(), middle, values.end());
-  return *middle;
+// s of each value, 1 where it has no noise of its own
+MatrixXd scale_of(const Observations& group) {
+  return group.noise().has_scale() ? group.noise().scale() : MatrixXd::Ones(group.values().rows(), group.values().cols());
 }
 
-// the values of row k that are measured
-std::vector<double> measured(const MatrixXd& values, Index k) {
-  std::vector<double> some;
-  for (const double value : values.row(k)) {
-    if (!std::isnan(value)) some.push_back(value);
-  }
-  return some;
+Observations with_scale(const Observations& group, MatrixXd scale) {
+  return group.with_noise(Noise(group.noise().stddev(), group.noise().is_estimated(), std::move(scale)));
 }
 
 struct Choice {
@@ -50,12 +45,14 @@ Choice choose(const std::vector<Observations>& observations, const Posterior& po
   for (std::size_t g = 0; g < observations.size(); ++g) {
     const Observations& group = observations[g];
     const VectorXd& sigma = posterior.values().noise_stddev[g];
-    MatrixXd noise(group.values.rows(), group.values.cols());
+    MatrixXd noise(group.values().rows(), group.values().cols());
     for (Index i = 0; i < noise.cols(); ++i) noise.col(i) = group.noise_at(sigma, i);
-    const MatrixXd residual = group.values - left_out[g].mean;
+    MatrixXd scale = scale_of(group);
+    const std::size_t n_before = choice.distrusted.size();
+    const MatrixXd residual = group.values() - left_out[g].mean;
     const MatrixXd stddev = (left_out[g].variance.array() + noise.array().square()).sqrt();
     for (Index k = 0; k < noise.rows(); ++k) {
-      std::vector<double> distances = measured((residual.array() / stddev.array()).abs(), k);
+      std::vector<double> distances = measured_entries((residual.array() / stddev.array()).abs(), k);
       if (distances.empty()) continue;
       const double usual = std::max(1.0, median(std::move(distances)) / normal_median);
       for (Index i = 0; i < noise.cols(); ++i) {
@@ -63,55 +60,53 @@ Choice choose(const std::vector<Observations>& observations, const Posterior& po
         if (!(distance > threshold)) continue;
         const double r = residual(k, i);
         const double factor = std::sqrt(r * r - left_out[g].variance(k, i)) / noise(k, i);
-        MatrixXd& scale = choice.observations[g].noise_scale;
-        if (scale.size() == 0) scale.setOnes(noise.rows(), noise.cols());
         scale(k, i) *= factor;
         choice.distrusted.push_back({static_cast<int>(g), static_cast<int>(k), static_cast<int>(i), distance, factor});
       }
     }
+    if (choice.distrusted.size() > n_before) choice.observations[g] = with_scale(group, std::move(scale));
   }
   std::stable_sort(choice.distrusted.begin(), choice.distrusted.end(),
                    [](const DistrustedValue& a, const DistrustedValue& b) { return a.distance > b.distance; });
   return choice;
 }
 
-// the observations without values that lie farther than `threshold` robust standard deviations from the median of their row
-std::vector<Observations> without_far_values(std::vector<Observations> observations, double threshold) {
-  for (Observations& group : observations) {
-    for (Index k = 0; k < group.values.rows(); ++k) {
-      std::vector<double> values = measured(group.values, k);
-      if (values.empty()) continue;
-      const double middle = median(values);
-      for (double& value : values) value = std::abs(value - middle);
-      const double spread = median(std::move(values)) / normal_median;
-      if (spread == 0) continue;  // most values are the same
-      for (double& value : group.values.row(k)) {
-        if (std::abs(value - middle) > threshold * spread) value = std::numeric_limits<double>::quiet_NaN();
-      }
+// the values without those that lie farther than `threshold` robust standard deviations from the median of their row
+MatrixXd without_far_values(MatrixXd near, double threshold) {
+  for (Index k = 0; k < near.rows(); ++k) {
+    std::vector<double> values = measured_entries(near, k);
+    if (values.empty()) continue;
+    const double middle = median(values);
+    for (double& value : values) value = std::abs(value - middle);
+    const double spread = median(std::move(values)) / normal_median;
+    if (spread == 0) continue;  // most values are the same
+    for (double& value : near.row(k)) {
+      if (std::abs(value - middle) > threshold * spread) value = std::numeric_limits<double>::quiet_NaN();
     }
   }
-  return observations;
+  return near;
 }
 
 // what to distrust at sight, under a noise to start with
 Choice choose_at_sight(const std::vector<Observations>& observations, const std::vector<VectorXd>& noise_stddev,
                        double threshold) {
-  const std::vector<Observations> usual = without_far_values(observations, threshold);
   Choice choice{observations, {}};
   for (std::size_t g = 0; g < observations.size(); ++g) {
-    const MatrixXd& values = observations[g].values;
-    const VectorXd mean = row_mean(usual[g].values);
-    MatrixXd& scale = choice.observations[g].noise_scale;
+    const MatrixXd& values = observations[g].values();
+    MatrixXd scale = scale_of(observations[g]);
+    const std::size_t n_before = choice.distrusted.size();
+    const MatrixXd usual = without_far_values(values, threshold);
+    const VectorXd mean = row_mean(usual);
     for (Index i = 0; i < values.cols(); ++i) {
       for (Index k = 0; k < values.rows(); ++k) {
-        if (std::isnan(values(k, i)) || !std::isnan(usual[g].values(k, i))) continue;
+        if (std::isnan(values(k, i)) || !std::isnan(usual(k, i))) continue;
         const double noise = observations[g].noise_at(noise_stddev[g], i)[k];
         const double factor = std::max(1.0, std::abs(values(k, i) - mean[k]) / noise);
-        if (scale.size() == 0) scale.setOnes(values.rows(), values.cols());
         scale(k, i) *= factor;
         choice.distrusted.push_back({static_cast<int>(g), static_cast<int>(k), static_cast<int>(i), factor, factor});
       }
     }
+    if (choice.distrusted.size() > n_before) choice.observations[g] = with_scale(observations[g], std::move(scale));
   }
   return choice;
 }
@@ -165,8 +160,11 @@ constexpr double gross = 10, suspicious = 3;  // robust standard deviations from
 }  // namespace
 
 std::vector<Observations> without_gross_errors(std::vector<Observations> observations) {
-  return without_far_values(std::move(observations), gross);
+  for (Observations& group : observations) group = group.with_values(without_gross_errors(group.values()));
+  return observations;
 }
+
+MatrixXd without_gross_errors(const MatrixXd& values) { return without_far_values(values, gross); }
 
 Fit fit_robust(const Prior& prior, const std::vector<Observations>& observations,
                const std::vector<Hyperparameter>& hyperparameters, const FitOptions& options, const RobustOptions& robust) {

@@ -149,7 +149,7 @@ TEST_F(FitCommand, MaxPointsTakesTheFirstRowsOfAShuffleBySeed) {
   const Observations group = FitFile::read(desk / "fit.json").observations.at(0);
   ASSERT_EQ(group.n_data(), 8);
   const CsvTable table = desk.table("train.csv");
-  for (int i = 0; i < 8; ++i) EXPECT_EQ(group.states(0, i), table.number(order[static_cast<std::size_t>(i)], table.find("q1")));
+  for (int i = 0; i < 8; ++i) EXPECT_EQ(group.states()(0, i), table.number(order[static_cast<std::size_t>(i)], table.find("q1")));
 
   fit("--max-points 8 --seed 7 --max-iterations 0", "same.json");
   EXPECT_EQ(desk.read("same.json"), desk.read("fit.json"));

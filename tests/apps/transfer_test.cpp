@@ -102,9 +102,9 @@ TEST_F(Transfer, PoolsLogsOfSeveralSystems) {
   static_cast<void>(fit("--data train.csv --data other.csv@other.toml --data train.csv --max-points 12"));
   const FitFile file = FitFile::read(desk / "fit.json");
   ASSERT_EQ(file.observations.size(), 3U);
-  EXPECT_EQ(file.observations[0].view.other_system, nullptr);
-  ASSERT_NE(file.observations[1].view.other_system, nullptr);
-  EXPECT_EQ(file.observations[1].view.other_system->prior.system->parameter_values()[0], 4.0);
+  EXPECT_EQ(file.observations[0].view().other_system, nullptr);
+  ASSERT_NE(file.observations[1].view().other_system, nullptr);
+  EXPECT_EQ(file.observations[1].view().other_system->prior.system->parameter_values()[0], 4.0);
   EXPECT_EQ(file.observations[1].n_data(), 12);
   EXPECT_EQ(file.data_source, "train.csv, other.csv@other.toml, train.csv");
   // the fit needs no file but itself
@@ -128,7 +128,7 @@ TEST_F(Transfer, JoinsKnowledgeToTheObservations) {
   static_cast<void>(fit("--data train.csv --also unconstrained:rest.csv --also-noise-std 0.001"));
   const FitFile file = FitFile::read(desk / "fit.json");
   ASSERT_EQ(file.observations.size(), 2U);
-  EXPECT_THAT(file.observations[1].view.rows, ElementsAre(2));
+  EXPECT_THAT(file.observations[1].view().rows, ElementsAre(2));
   desk.done("gp2 predict fit.json --states rest.csv --view unconstrained --cov std -o known.csv");
   const MatrixXd known = columns(desk.table("known.csv"), {"abar_q3", "abar_q3_std"});
   EXPECT_NEAR(known(0, 0), -9.81, 0.005);
@@ -142,9 +142,9 @@ TEST_F(Transfer, JoinsKnowledgeToTheObservations) {
           "--also 'unconstrained@unconstrained acceleration:more.csv' --also-noise-std 0.1"));
   const FitFile more = FitFile::read(desk / "fit.json");
   ASSERT_EQ(more.observations.size(), 4U);
-  EXPECT_EQ(more.observations[1].view.time_step, 0.1);
-  EXPECT_NE(more.observations[2].view.other_system, nullptr);
-  EXPECT_EQ(more.observations[3].view.latent, 0);
+  EXPECT_EQ(more.observations[1].view().time_step, 0.1);
+  EXPECT_NE(more.observations[2].view().other_system, nullptr);
+  EXPECT_EQ(more.observations[3].view().latent, 0);
 }
 
 TEST_F(Transfer, RefusesWhatDoesNotFit) {

@@ -77,13 +77,13 @@ TEST(Baseline, LearnsTheAccelerationOfASystemWithoutConstraintsButIsJudgedByThem
     EXPECT_EQ(p.prior.system->nc(), 0);
     EXPECT_EQ(p.prior.judge().nc(), 1);
     const Observations& observed = p.observations.front();
-    const VectorXd mean = observed.values.rowwise().mean();
+    const VectorXd mean = observed.values().rowwise().mean();
     EXPECT_EQ(p.prior.constant_mean, mean);
     const Posterior posterior = fit_of(p).posterior;
     const View ddq = View::all(View::Quantity::constrained_acceleration, *p.prior.system);
     const View a_bar = View::all(View::Quantity::unconstrained_acceleration, *p.prior.system);
-    EXPECT_EQ(posterior.mean(ddq, observed.states), posterior.mean(a_bar, observed.states));
-    const Evaluation e = evaluate_predictions(posterior, observed.states, ddq.rows, observed.values);
+    EXPECT_EQ(posterior.mean(ddq, observed.states()), posterior.mean(a_bar, observed.states()));
+    const Evaluation e = evaluate_predictions(posterior, observed.states(), ddq.rows, observed.values());
     EXPECT_LT(e.rmse_normalised, 0.5);
     EXPECT_GT(e.max_constraint_error, 1e-6) << "it knows no constraint";
     EXPECT_LT(e.max_constraint_error, 10);
@@ -93,7 +93,7 @@ TEST(Baseline, LearnsTheAccelerationOfASystemWithoutConstraintsButIsJudgedByThem
 TEST(Baseline, FarFromDataItReturnsToTheTrainingMean) {
   for (const Baseline::Kind kind : {Baseline::Kind::se, Baseline::Kind::icm}) {
     const FitProblem p = problem(kind);
-    const MatrixXd far = MatrixXd::Constant(p.observations[0].states.rows(), 1, 1e6);
+    const MatrixXd far = MatrixXd::Constant(p.observations[0].states().rows(), 1, 1e6);
     const VectorXd mean = fit_of(p).posterior.mean(View::all(View::Quantity::constrained_acceleration, *p.prior.system), far);
     EXPECT_EQ(mean, p.prior.constant_mean);
   }
@@ -212,12 +212,12 @@ TEST(Baseline, ReachesThePublishedLikelihoodsAndErrors) {
       few.n_restarts = 3;
       const Fit result = fit_of(p, few);
       const Observations& observed = p.observations.front();
-      const LogStates at = read_log_states(p.prior, observed.view, model, grid, {}, observed.view.names(*model.system));
-      const Evaluation e = evaluate_predictions(result.posterior, at.states, observed.view.rows, at.accelerations);
+      const LogStates at = read_log_states(p.prior, observed.view(), model, grid, {}, observed.view().names(*model.system));
+      const Evaluation e = evaluate_predictions(result.posterior, at.states, observed.view().rows, at.accelerations);
       const auto& reference =
           published[system][kind == Baseline::Kind::se ? "SE" : "ICM"]["recomputed_at_published_hyperparameters"];
       const double in_published_units =
-          result.report.negative_log_likelihood - observed.n_data() * row_stddev(observed.values).array().log().sum();
+          result.report.negative_log_likelihood - observed.n_data() * row_stddev(observed.values()).array().log().sum();
       EXPECT_NEAR(in_published_units, reference["nll_per_run"][0].get<double>(), 0.01);
       const double rmse = reference["rmse_per_run"][0];
       EXPECT_NEAR(e.rmse_normalised, rmse, 0.001 * rmse);

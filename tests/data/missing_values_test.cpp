@@ -63,7 +63,7 @@ FitOptions unoptimised() {
 
 TEST(MissingValuesFileTest, AnEmptyCellOfAnAccelerationIsNotMeasured) {
   const FitProblem problem = problem_of(log_of({{"ddq1", 0, ""}, {"ddq1", 3, "  "}, {"ddq3", 3, ""}}));
-  const MatrixXd& values = problem.observations.front().values;
+  const MatrixXd& values = problem.observations.front().values();
   ASSERT_EQ(values.cols(), 12);
   EXPECT_TRUE(std::isnan(values(0, 0)) && std::isnan(values(0, 3)) && std::isnan(values(2, 3)));
   EXPECT_EQ(values.array().isNaN().count(), 3);
@@ -100,7 +100,7 @@ TEST(MissingValuesFileTest, WhatIsNoNumberStaysAnError) {
             "log.csv: column 'ddq2': every cell is empty, so nothing is measured there; observe others (--observe)");
   FitProblemOptions others;
   others.observe = {"ddq1", "ddq3"};
-  EXPECT_EQ(problem_of(log_of({{"ddq2", -1, ""}}), others).observations.front().values.rows(), 2);
+  EXPECT_EQ(problem_of(log_of({{"ddq2", -1, ""}}), others).observations.front().values().rows(), 2);
   EXPECT_EQ(input_error_of([] {
               problem_of(log_of({{"dq2", 4, ""}}));
             }),
@@ -112,8 +112,8 @@ TEST(MissingValuesFileTest, StatedDeviationsGoWithTheirValues) {
   const CsvTable log = log_of({{"ddq1", 0, ""}, {"ddq1_std", 0, ""}, {"ddq2", 1, ""}, {"ddq3_std", 2, ""}}, stated);
   const FitProblem problem = problem_of(log);
   const Observations& group = problem.observations.front();
-  EXPECT_TRUE(std::isnan(group.values(0, 0)) && std::isnan(group.values(1, 1)) && std::isnan(group.values(2, 2)));
-  EXPECT_EQ(group.noise_scale(2, 3), 0.08);
+  EXPECT_TRUE(std::isnan(group.values()(0, 0)) && std::isnan(group.values()(1, 1)) && std::isnan(group.values()(2, 2)));
+  EXPECT_EQ(group.noise().scale()(2, 3), 0.08);
   EXPECT_THAT(problem.notes, Contains("log.csv: values not measured, their cells being empty: 1 of 12 of ddq1, 1 of 12 of ddq2, "
                                       "1 of 12 of ddq3 (1 for want of a deviation)"));
   EXPECT_TRUE(std::isfinite(fit(problem, unoptimised()).report.negative_log_likelihood));
@@ -135,7 +135,7 @@ TEST(MissingValuesFileTest, ScalesAreThoseOfTheMeasuredValues) {
   const FitProblem problem = problem_of(log_of({{"ddq1", 0, ""}, {"ddq1", 5, ""}}));
   const Observations& group = problem.observations.front();
   std::vector<double> measured;
-  for (const double value : group.values.row(0)) {
+  for (const double value : group.values().row(0)) {
     if (!std::isnan(value)) measured.push_back(value);
   }
   const Scales scales = default_scales(problem.prior, problem.observations);
@@ -156,12 +156,12 @@ TEST(MissingValuesFileTest, AFileKeepsThemToTheBit) {
     file.report = fitted.report;
     file.write(folder / "fit.json");
     const FitFile read = FitFile::read(folder / "fit.json");
-    const MatrixXd &expected = file.observations.front().values, &got = read.observations.front().values;
+    const MatrixXd &expected = file.observations.front().values(), &got = read.observations.front().values();
     EXPECT_TRUE(((got.array() == expected.array()) || (got.array().isNaN() && expected.array().isNaN())).all());
     EXPECT_EQ(read.posterior().negative_log_likelihood(), fitted.posterior.negative_log_likelihood());
     const View view = View::all(View::Quantity::constrained_acceleration, *surface().system);
-    EXPECT_EQ(read.posterior().mean(view, problem.observations.front().states),
-              fitted.posterior.mean(view, problem.observations.front().states));
+    EXPECT_EQ(read.posterior().mean(view, problem.observations.front().states()),
+              fitted.posterior.mean(view, problem.observations.front().states()));
   }
 }
 
@@ -180,7 +180,7 @@ TEST(MissingValuesFileTest, AKnowledgeMayHaveThemToo) {
   const FitProblem problem = make_fit_problem(surface(), {Log{log_of({})}}, {knowledge}, options);
   EXPECT_EQ(problem.observations[1].n_data(), 2);
   EXPECT_THAT(problem.lines[1], ElementsAre(2, 4));
-  EXPECT_TRUE(std::isnan(problem.observations[1].values(1, 1)));
+  EXPECT_TRUE(std::isnan(problem.observations[1].values()(1, 1)));
   EXPECT_THAT(problem.notes, Contains("rest.csv: 1 rows left out: they measure nothing"));
 }
 
@@ -211,9 +211,9 @@ TEST(ProjectOptionTest, StatesAreMovedOntoTheConstraintsBeforeTheFitAndTheNotesS
   EXPECT_THAT(problem.notes, Contains(HasSubstr("at most (line 6)")));
   EXPECT_THAT(problem.notes, testing::Not(Contains(HasSubstr("off the constraint"))));
   const System& system = *surface().system;
-  const MatrixXd& states = problem.observations.front().states;
+  const MatrixXd& states = problem.observations.front().states();
   EXPECT_LT(system.residuals(states, system.parameter_values()).cwiseAbs().maxCoeff(), 1e-13);
-  EXPECT_LT((states - problem_of(off).observations.front().states).cwiseAbs().maxCoeff(), 0.0101)
+  EXPECT_LT((states - problem_of(off).observations.front().states()).cwiseAbs().maxCoeff(), 0.0101)
       << "with equal masses no coordinate moves farther than the error";
 }
 
@@ -269,7 +269,7 @@ TEST(RobustOptionTest, ScalesDoNotComeFromAGrossErrorAndItsLineIsNamed) {
   EXPECT_EQ(robust.report.distrusted.front().state, 7);
   EXPECT_THAT(distrust_notes(problem, robust.report),
               ElementsAre(HasSubstr("robust: 1 of 120 values distrusted: ddq2 in line 9 (")));
-  EXPECT_GT(robust.posterior.observations().front().noise_scale(1, 7), 1e4);
+  EXPECT_GT(robust.posterior.observations().front().noise().scale()(1, 7), 1e4);
   EXPECT_THAT(distrust_notes(problem_of(log_of({})), robust.report), testing::IsEmpty());
 }
 

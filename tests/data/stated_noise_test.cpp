@@ -67,7 +67,7 @@ CsvTable log_with(const std::string& stddev, int row) {
 }
 
 std::vector<std::string> observed(const FitProblem& problem) {
-  return problem.observations.front().view.names(*problem.prior.system);
+  return problem.observations.front().view().names(*problem.prior.system);
 }
 
 const Hyperparameter& noise_in(const FitProblem& problem) {
@@ -89,10 +89,10 @@ TEST(StatedNoise, IsThatOfEachValueAndSaysWhatIsObserved) {
   const FitProblem problem = make_fit_problem(slope_with(), log_of({"ddx_std"}), trusting());
   EXPECT_THAT(observed(problem), ElementsAre("ddx"));
   const Observations& group = problem.observations.front();
-  EXPECT_EQ(group.noise_stddev, VectorXd::Ones(1));
-  EXPECT_FALSE(group.estimate_noise);
-  ASSERT_EQ(group.noise_scale.cols(), 40);
-  EXPECT_LE((group.noise_scale.row(0).transpose() - stated_deviations()).cwiseAbs().maxCoeff(), 1e-15);
+  EXPECT_EQ(group.noise().stddev(), VectorXd::Ones(1));
+  EXPECT_FALSE(group.noise().is_estimated());
+  ASSERT_EQ(group.noise().scale().cols(), 40);
+  EXPECT_LE((group.noise().scale().row(0).transpose() - stated_deviations()).cwiseAbs().maxCoeff(), 1e-15);
   EXPECT_THAT(problem.notes,
               ElementsAre("log.csv: observes ddx: the log gives the deviations of these alone; others with --observe",
                           "log.csv: the noise of each value is that in ddx_std"))
@@ -112,9 +112,9 @@ TEST(StatedNoise, TheModelsNoiseServesWhereNothingIsStated) {
   const FitProblem problem = make_fit_problem(slope_with("[noise]\nddq = [0.3, 0.7]\n"), log_of({"ddx_std"}), options);
   const Observations& group = problem.observations.front();
   EXPECT_THAT(observed(problem), ElementsAre("ddy", "ddx"));
-  EXPECT_EQ(group.noise_stddev, Eigen::Vector2d(0.7, 1));
-  EXPECT_EQ(group.noise_scale.row(0), Eigen::RowVectorXd::Ones(40));
-  EXPECT_LE((group.noise_scale.row(1).transpose() - stated_deviations()).cwiseAbs().maxCoeff(), 1e-15);
+  EXPECT_EQ(group.noise().stddev(), Eigen::Vector2d(0.7, 1));
+  EXPECT_EQ(group.noise().scale().row(0), Eigen::RowVectorXd::Ones(40));
+  EXPECT_LE((group.noise().scale().row(1).transpose() - stated_deviations()).cwiseAbs().maxCoeff(), 1e-15);
 
   EXPECT_THAT(input_error_of([&] { make_fit_problem(slope_with(), log_of({"ddx_std"}), options); }),
               HasSubstr("slope.toml: the noise of ddy is not known"));
@@ -125,8 +125,8 @@ TEST(StatedNoise, OneNoiseForAllReplacesIt) {
   options.noise_stddev = 0.2;
   const FitProblem problem = make_fit_problem(slope_with(), log_of({"ddx_std"}), options);
   EXPECT_THAT(observed(problem), ElementsAre("ddx"));
-  EXPECT_FALSE(problem.observations.front().has_noise_scale());
-  EXPECT_EQ(problem.observations.front().noise_stddev, VectorXd::Constant(1, 0.2));
+  EXPECT_FALSE(problem.observations.front().noise().has_scale());
+  EXPECT_EQ(problem.observations.front().noise().stddev(), VectorXd::Constant(1, 0.2));
   EXPECT_THAT(problem.notes, Contains("log.csv: --noise-std 0.2 stands for the deviations in ddx_std"));
 }
 
@@ -139,16 +139,16 @@ TEST(StatedNoise, IsMultipliedByAFactorThatIsEstimatedUnlessItIsTrusted) {
   EXPECT_EQ(factor.value, 1);
   EXPECT_EQ(factor.median, 1);
   // the smallest deviation stays above 1e-6 of the spread, the usual one below twice the spread
-  const double spread = row_stddev(problem.observations.front().values)[0];
+  const double spread = row_stddev(problem.observations.front().values())[0];
   EXPECT_DOUBLE_EQ(factor.lower, 1e-6 * spread / 0.01);
   EXPECT_DOUBLE_EQ(factor.upper, 2 * spread / 0.21);
-  EXPECT_TRUE(problem.observations.front().estimate_noise);
+  EXPECT_TRUE(problem.observations.front().noise().is_estimated());
 }
 
 TEST(StatedNoise, AModelThatWantsItsNoiseEstimatedIsNotAskedWhereItIsTrusted) {
   const Model model = slope_with("[noise]\nddq = { estimate = true, initial = 0.1 }\n");
-  EXPECT_FALSE(make_fit_problem(model, log_of({"ddx_std"}), trusting()).observations.front().estimate_noise);
-  EXPECT_TRUE(make_fit_problem(model, log_of({}), {}).observations.front().estimate_noise);
+  EXPECT_FALSE(make_fit_problem(model, log_of({"ddx_std"}), trusting()).observations.front().noise().is_estimated());
+  EXPECT_TRUE(make_fit_problem(model, log_of({}), {}).observations.front().noise().is_estimated());
 }
 
 TEST(StatedNoise, GoesByTheNameThatTheLogGivesTheAcceleration) {
@@ -168,8 +168,8 @@ TEST(StatedNoise, FollowsTheRowsThatAreTaken) {
   ASSERT_EQ(part.n_data(), 7);
   for (Index i = 0; i < 7; ++i) {
     Index same = -1;
-    (whole.states.row(0).array() - part.states(0, i)).abs().minCoeff(&same);
-    EXPECT_EQ(part.noise_scale(0, i), whole.noise_scale(0, same));
+    (whole.states().row(0).array() - part.states()(0, i)).abs().minCoeff(&same);
+    EXPECT_EQ(part.noise().scale()(0, i), whole.noise().scale()(0, same));
   }
 }
 
@@ -195,7 +195,7 @@ TEST(StatedNoise, ThatIsNotAPositiveNumberIsNamedByFileLineAndColumn) {
 
 TEST(StatedNoise, TooSmallForDoublePrecisionAtOneValueIsRefused) {
   // ‖K̃‖ ≤ Σ (signal/noise)² must leave a hundredth of the digits: one small value among 40 may be √40 below the rule for all
-  const double spread = row_stddev(make_fit_problem(slope_with(), log_of({"ddx_std"}), {}).observations.front().values)[0];
+  const double spread = row_stddev(make_fit_problem(slope_with(), log_of({"ddx_std"}), {}).observations.front().values())[0];
   const double limit = spread * std::sqrt(std::numeric_limits<double>::epsilon() / 0.01);
   EXPECT_NO_THROW(make_fit_problem(slope_with(), log_with(shortest(1.01 * limit), 3), {}));
   for (const bool estimate : {false, true}) {
@@ -243,7 +243,7 @@ TEST(StatedNoise, WeighsTheValuesOfABaseline) {
   FitProblemOptions options;
   options.baseline = Baseline::Kind::se;
   const FitProblem problem = make_fit_problem(slope_with(), log_of({"ddx_std", "ddy_std"}), options);
-  EXPECT_TRUE(problem.observations.front().has_noise_scale());
+  EXPECT_TRUE(problem.observations.front().noise().has_scale());
   FitOptions at_start;
   at_start.max_iterations = 0;
   const Fit fitted = fit(problem, at_start);
@@ -265,7 +265,7 @@ TEST(StatedNoise, TellsACheckWhichAccelerationsAreMeasured) {
     EXPECT_THAT(reader.unused_columns(), testing::IsEmpty());
     std::vector<std::string> out;
     for (const Finding& finding :
-         check_data(*model.system, whole.states, model.system->parameter_values(), whole.accelerations, whole.stated)) {
+         check_data(*model.system, whole.states(), model.system->parameter_values(), whole.accelerations, whole.stated)) {
       out.push_back((finding.level == Finding::Level::good ? "good: " : "not good: ") + finding.text);
     }
     return out;

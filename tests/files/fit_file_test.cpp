@@ -12,6 +12,7 @@
 #include "gp2/jobs/fit_problem.hpp"
 #include "gp2/simulation/generate.hpp"
 #include "io_testing.hpp"
+#include "observations_testing.hpp"
 #include "test_models.hpp"
 
 namespace gp2 {
@@ -113,10 +114,11 @@ TEST(FitFile, ANoiseOfEachValueSurvivesToTheBit) {
   EXPECT_FALSE(written_json(fit).at("observations").at(0).contains("noise_scale"));
   Observations& group = fit.observations.front();
   RandomStream random(3);
-  group.noise_scale.resize(group.values.rows(), group.values.cols());
-  for (double& scale : group.noise_scale.reshaped()) scale = 0.3 + random.uniform();
+  Eigen::MatrixXd scale(group.values().rows(), group.values().cols());
+  for (double& one : scale.reshaped()) one = 0.3 + random.uniform();
+  group = test::with_scale(group, scale);
   const FitFile read = written_and_read(fit);
-  EXPECT_EQ(read.observations.front().noise_scale, group.noise_scale);
+  EXPECT_EQ(read.observations.front().noise().scale(), group.noise().scale());
   expect_same_predictions(fit, read);
 }
 
@@ -243,14 +245,14 @@ TEST_P(OldFit, IsReadAndWrittenAsTheNewest) {
   EXPECT_EQ(json.at("version"), FitFile::format_version);
   const FitFile again = written_and_read(old);
   const View view = View::all(View::Quantity::constrained_acceleration, *old.model.system);
-  const Eigen::MatrixXd& states = old.observations.front().states;
+  const Eigen::MatrixXd& states = old.observations.front().states();
   EXPECT_EQ(old.posterior().mean(view, states), again.posterior().mean(view, states));
   EXPECT_EQ(old.posterior().marginal(view, states).covariance, again.posterior().marginal(view, states).covariance);
 }
 
 TEST(FitFile, StatesThatWereNotMeasuredStayUnknown) {
   const FitFile read = written_and_read(fit_of(unicycle()));
-  EXPECT_TRUE(read.observations[0].states.topRows(2).array().isNaN().all());  // q1, q2
+  EXPECT_TRUE(read.observations[0].states().topRows(2).array().isNaN().all());  // q1, q2
 }
 
 TEST(FitFile, ADataSourceThatIsNoTextIsNoObstacle) {

@@ -64,7 +64,7 @@ TEST(ASaveThatIsKilled, LeavesTheOldFileOrTheNewOneWhole) {
 
     FitFile read;
     ASSERT_NO_THROW(read = FitFile::read(path)) << "kill " << kill_number << " after " << seconds << " s";
-    ASSERT_EQ(read.observations.front().values, fit.observations.front().values);
+    ASSERT_EQ(read.observations.front().values(), fit.observations.front().values());
     (read.data_source == before ? n_old : n_new) += 1;
   }
   EXPECT_GT(n_old, 0);

@@ -100,7 +100,7 @@ TEST(LearnedDirections, AreThoseOfAPriorThatHasThemWritten) {
     const double value = Likelihood(p.prior, p.observations, values, {}).evaluate(values, nullptr, workspace);
     EXPECT_NEAR(value, expected, 1e-12 * (1 + std::abs(expected)));
 
-    const MatrixXd states = p.observations[0].states.leftCols(3);
+    const MatrixXd states = p.observations[0].states().leftCols(3);
     const Posterior one(p.prior, p.observations, values), other(written, p.observations, as_written);
     const View view = c.views[0];
     EXPECT_TRUE(one.mean(view, states).isApprox(other.mean(view, states), 1e-10));

@@ -25,7 +25,7 @@ double evaluate(const Problem& p, const Likelihood::Options& options = {}) {
 // The quadratic form and the log determinant lose ε times the condition number; mechanics with κ(M) of some hundreds come before.
 double tolerance(const Problem& p, double value) {
   Index n = 0;
-  for (const Observations& group : p.observations) n += group.values.size();
+  for (const Observations& group : p.observations) n += group.values().size();
   return 1e3 * test::eps * test::condition(p) * (static_cast<double>(n) + std::abs(value));
 }
 
@@ -138,8 +138,10 @@ TEST(PosteriorTest, RefusesANoiseTooSmallForDoublePrecision) {
   Problem p = test::problems(12, seed).front();
   // every state twice: the covariance of the signal alone is singular
   Observations& group = p.observations[0];
-  const Index n = group.states.cols();
-  group.states.rightCols(n / 2) = group.states.leftCols(n / 2);
+  MatrixXd states = group.states();
+  const Index n = states.cols();
+  states.rightCols(n / 2) = states.leftCols(n / 2);
+  group = test::with_states(group, states);
   for (VectorXd& s : p.values.signal_stddev) s *= 1e12;
   EXPECT_THROW(Posterior(p.prior, p.observations, p.values), NumericalError);
 }

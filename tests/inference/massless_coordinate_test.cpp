@@ -73,7 +73,7 @@ ModelValues some_values(const Observations& group) {
   ModelValues values;
   values.kernel = {VectorXd::Constant(4, 1.5)};
   values.signal_stddev = {VectorXd::Constant(1, 0.3)};
-  values.noise_stddev = {group.noise_stddev};
+  values.noise_stddev = {group.noise().stddev()};
   values.parameters = rod().system->parameter_values();
   return values;
 }
@@ -114,8 +114,8 @@ TEST(MasslessCoordinate, HasTheLikelihoodTheGradientTheFitAndThePredictionsOfThe
   // within about itself
   EXPECT_NEAR(fitted.report.negative_log_likelihood, fitted_without.report.negative_log_likelihood, 1e-7);
   const MatrixXd states = test::draw(rod(), 20, seed + 1).states;
-  const Posterior::Marginal marginal = fitted.posterior.marginal(here.view, states);
-  const Posterior::Marginal other = fitted_without.posterior.marginal(there.view, of_pendulum(states));
+  const Posterior::Marginal marginal = fitted.posterior.marginal(here.view(), states);
+  const Posterior::Marginal other = fitted_without.posterior.marginal(there.view(), of_pendulum(states));
   EXPECT_LE(largest(marginal.mean - other.mean), 1e-4 * (1 + largest(other.mean)));
   EXPECT_LE(largest(marginal.stddev() - other.stddev()), 1e-4);
 }

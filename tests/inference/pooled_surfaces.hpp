@@ -55,7 +55,8 @@ inline PooledScore score_pooling(int n, std::uint64_t seed) {
   };
   const Observations a = measured(first, 1), b = measured(second, 2);
   const auto half = [&](const Observations& group) {
-    return Observations{group.states.leftCols(n / 2), group.view, group.values.leftCols(n / 2), group.noise_stddev, false};
+    return Observations{group.states().leftCols(n / 2), group.view(), group.values().leftCols(n / 2), group.noise().stddev(),
+                        false};
   };
   const GeneratedData truth = draw(third, 400, 100 * seed + 3);
   const auto there = make_other_system(first, third);

@@ -41,7 +41,7 @@ TEST(PosteriorBatchTest, AStateHasTheSameBitsInEveryBatchAndOnAnyNumberOfThreads
     const Problem p = many_samples(name);
     const Posterior posterior(p.prior, p.observations, p.values);
     View view = View::all(Quantity::constrained_acceleration, *p.prior.system);
-    const MatrixXd& some = p.observations[0].states;
+    const MatrixXd& some = p.observations[0].states();
     const MatrixXd states = some.replicate(1, 600 / some.cols() + 1);
     for (int latent : {-1, 0}) {
       view.latent = latent;

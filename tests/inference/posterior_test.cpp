@@ -248,7 +248,7 @@ directions = "force"
 TEST(PosteriorTest, KnowsWhatItWasMadeOf) {
   const Problem p = test::problems(9, seed).front();
   const Posterior posterior(p.prior, p.observations, p.values);
-  EXPECT_EQ(posterior.observations()[0].values, p.observations[0].values);
+  EXPECT_EQ(posterior.observations()[0].values(), p.observations[0].values());
   EXPECT_EQ(posterior.values().kernel, p.values.kernel);
   EXPECT_EQ(posterior.prior().system, p.prior.system);
   EXPECT_EQ(posterior.reduced_size(), Likelihood(p.prior, p.observations, p.values, {}).reduced_size());

@@ -51,7 +51,7 @@ std::vector<View> views_of(const Problem& p) {
     views.push_back(view);
   }
   for (const Observations& group : p.observations) {
-    if (group.view.other_system && group.view.quantity != Quantity::multipliers) views.push_back(group.view);
+    if (group.view().other_system && group.view().quantity != Quantity::multipliers) views.push_back(group.view());
   }
   return views;
 }
@@ -246,13 +246,13 @@ TEST(PredictorTest, GivesTheSameBitsOnSeveralThreadsAndOutlivesItsPosterior) {
   const View view = View::all(Quantity::constrained_acceleration, *p.prior.system);
   std::optional<Posterior> posterior(Posterior(p.prior, p.observations, p.values));
   const Predictor predictor(*posterior, view);
-  const MatrixXd expected = posterior->mean(view, p.observations[0].states);
+  const MatrixXd expected = posterior->mean(view, p.observations[0].states());
   posterior.reset();
   constexpr int n_threads = 4;
   std::vector<MatrixXd> results(n_threads);
   std::vector<std::thread> threads;
   for (MatrixXd& result : results) {
-    threads.emplace_back([&predictor, &result, &states = p.observations[0].states] {
+    threads.emplace_back([&predictor, &result, &states = p.observations[0].states()] {
       Predictor::Workspace workspace = Predictor(predictor).make_workspace();
       for (int repeat = 0; repeat < 20; ++repeat) {
         result.resize(0, 0);

@@ -11,6 +11,7 @@
 #include "gp2/inference/likelihood.hpp"
 #include "gp2/model.hpp"
 #include "gp2/posterior.hpp"
+#include "observations_testing.hpp"
 #include "test_models.hpp"
 
 // Small regression problems of every kind, and the textbook Gaussian process they must agree with.
@@ -136,7 +137,7 @@ inline ModelValues random_values(const Prior& prior, const std::vector<Observati
     VectorXd& kernel = values.kernel.emplace_back(static_cast<Index>(latent.kernel.parameters().size()));
     MatrixXd features(0, latent.n_features());
     for (const Observations& group : observations) {
-      const MatrixXd more = evaluate_features(latent, group.states);
+      const MatrixXd more = evaluate_features(latent, group.states());
       features.conservativeResize(features.rows() + more.rows(), Eigen::NoChange);
       features.bottomRows(more.rows()) = more;
     }
@@ -151,30 +152,27 @@ inline ModelValues random_values(const Prior& prior, const std::vector<Observati
     VectorXd& signal = values.signal_stddev.emplace_back(latent.size());
     for (double& s : signal) s = 0.5 + random.uniform();
   }
-  for (const Observations& group : observations) values.noise_stddev.push_back(group.noise_stddev);
+  for (const Observations& group : observations) values.noise_stddev.push_back(group.noise().stddev());
   values.parameters = prior.system->parameter_values();
   return values;
 }
 
 inline Observations observe(const Model& model, View view, const MatrixXd& states, RandomStream& random) {
-  Observations group{states, std::move(view), {}, {}, true};
-  group.values = MatrixXd(group.view.size(), states.cols());
-  if (model.truth.empty() || group.view.quantity != Quantity::constrained_acceleration) {
-    for (double& y : group.values.reshaped()) y = random.normal();
+  MatrixXd values(view.size(), states.cols());
+  if (model.truth.empty() || view.quantity != Quantity::constrained_acceleration) {
+    for (double& y : values.reshaped()) y = random.normal();
   } else {
     const MatrixXd truth = true_acceleration(model, states);
-    for (int row = 0; row < group.view.size(); ++row) {
-      group.values.row(row) = truth.row(group.view.rows[static_cast<std::size_t>(row)]);
-    }
+    for (int row = 0; row < view.size(); ++row) values.row(row) = truth.row(view.rows[static_cast<std::size_t>(row)]);
   }
   // unequal noise of about the size of the signal: the covariance is then well conditioned, and so are the numbers compared
-  const VectorXd spread = row_stddev(group.values);
-  group.noise_stddev = VectorXd(group.view.size());
+  const VectorXd spread = row_stddev(values);
+  VectorXd stddev(view.size());
   for (Index k = 0; k < spread.size(); ++k) {
-    group.noise_stddev[k] = (spread[k] > 0 ? spread[k] : 1) * (0.2 + 0.4 * random.uniform());
-    for (double& y : group.values.row(k)) y += group.noise_stddev[k] * random.normal();
+    stddev[k] = (spread[k] > 0 ? spread[k] : 1) * (0.2 + 0.4 * random.uniform());
+    for (double& y : values.row(k)) y += stddev[k] * random.normal();
   }
-  return group;
+  return {states, std::move(view), std::move(values), std::move(stddev), true};
 }
 
 /// Problems over the models of models/ and two of our own: all rows and some, constrained, unconstrained and both, mean zero and
@@ -197,7 +195,7 @@ inline std::vector<Problem> problems(int n, std::uint64_t seed) {
     if (model.system->name().find("redundant") != std::string::npos) problem.not_estimable = {"r", "l"};
     // the signal to the size of the data, so that it is neither lost in the noise nor beyond it
     double spread = 0;
-    for (const Observations& group : problem.observations) spread = std::max(spread, row_stddev(group.values).maxCoeff());
+    for (const Observations& group : problem.observations) spread = std::max(spread, row_stddev(group.values()).maxCoeff());
     const PriorValues prior_values = evaluate_prior(problem.prior, states, problem.values.parameters,
                                                     require_mechanics(*problem.prior.system, states, problem.values.parameters));
     for (std::size_t a = 0; a < problem.prior.latents.size(); ++a) {
@@ -395,8 +393,8 @@ inline Extended dense_covariance(const Prior& prior, const ModelValues& values, 
 /// Everything observed, state after state, group after group: y ~ N(mean, K + S).
 /// σ of each value of a group (d × N).
 inline MatrixXd noise_of_values(const Problem& p, std::size_t g) {
-  const MatrixXd& scale = p.observations[g].noise_scale;
-  const MatrixXd ones = MatrixXd::Ones(p.observations[g].values.rows(), p.observations[g].values.cols());
+  const MatrixXd& scale = p.observations[g].noise().scale();
+  const MatrixXd ones = MatrixXd::Ones(p.observations[g].values().rows(), p.observations[g].values().cols());
   return p.values.noise_stddev[g].asDiagonal() * (scale.size() > 0 ? scale : ones);
 }
 
@@ -404,8 +402,9 @@ inline MatrixXd noise_of_values(const Problem& p, std::size_t g) {
 inline Problem with_noise_scale(Problem p, std::uint64_t seed) {
   RandomStream random(seed);
   for (Observations& group : p.observations) {
-    group.noise_scale.resize(group.values.rows(), group.values.cols());
-    for (double& scale : group.noise_scale.reshaped()) scale = std::pow(3, 2 * random.uniform() - 1);
+    MatrixXd scale(group.values().rows(), group.values().cols());
+    for (double& one : scale.reshaped()) one = std::pow(3, 2 * random.uniform() - 1);
+    group = with_scale(group, std::move(scale));
   }
   return p;
 }
@@ -420,14 +419,14 @@ inline DenseObservations dense_observations(const Problem& p) {
   DenseObservations dense;
   std::vector<Index> first{0};
   for (const Observations& group : p.observations) {
-    dense.views.push_back(dense_view(p.prior, p.values, group.view, group.states));
-    first.push_back(first.back() + group.values.size());
+    dense.views.push_back(dense_view(p.prior, p.values, group.view(), group.states()));
+    first.push_back(first.back() + group.values().size());
   }
   dense.residual.resize(first.back());
   dense.covariance.resize(first.back(), first.back());
   for (std::size_t g = 0; g < p.observations.size(); ++g) {
     const Observations& group = p.observations[g];
-    dense.residual.segment(first[g], group.values.size()) = group.values.reshaped().cast<long double>() - dense.views[g].mean;
+    dense.residual.segment(first[g], group.values().size()) = group.values().reshaped().cast<long double>() - dense.views[g].mean;
     for (std::size_t h = 0; h < p.observations.size(); ++h) {
       dense.covariance.block(first[g], first[h], first[g + 1] - first[g], first[h + 1] - first[h]) =
           dense_covariance(p.prior, p.values, dense.views[g], dense.views[h]);
@@ -475,8 +474,8 @@ inline double condition(const Problem& p) {
   VectorXd whitening(dense.residual.size());
   Index first = 0;
   for (std::size_t g = 0; g < p.observations.size(); ++g) {
-    whitening.segment(first, p.observations[g].values.size()) = noise_of_values(p, g).reshaped().cwiseInverse();
-    first += p.observations[g].values.size();
+    whitening.segment(first, p.observations[g].values().size()) = noise_of_values(p, g).reshaped().cwiseInverse();
+    first += p.observations[g].values().size();
   }
   const MatrixXd white = whitening.asDiagonal() * dense.covariance.cast<double>() * whitening.asDiagonal();
   return white.norm();

@@ -78,7 +78,7 @@ PublishedCase load(const json& golden) {
 
   c.values.kernel = {vector(theta["lengthscales"]).cwiseProduct(vector(golden["normalisation"]["x_std"]))};
   c.values.signal_stddev = {theta["signal_std"].get<double>() * c.y_std};
-  c.values.noise_stddev = {c.observations[0].noise_stddev};
+  c.values.noise_stddev = {c.observations[0].noise().stddev()};
   c.values.parameters = model.system->parameter_values();
   const std::vector<std::string>& names = with_mean ? published.parameters_with_mean : published.parameters_without_mean;
   if (names.size() != theta["params"].size()) throw std::runtime_error("unexpected number of parameters");
@@ -181,7 +181,7 @@ TEST_F(PublishedValues, TheReductionHasThePublishedSizeAndValue) {
       const PublishedCase c = load(one);
       const Posterior posterior(c.prior, c.observations, c.values);
       EXPECT_EQ(posterior.reduced_size(), check["reduced_size"].get<int>());
-      EXPECT_EQ(c.observations[0].values.size(), check["full_size"].get<Index>());
+      EXPECT_EQ(c.observations[0].values().size(), check["full_size"].get<Index>());
       const double expected = check["nll_reduced_physical"];
       EXPECT_NEAR(posterior.negative_log_likelihood(), expected,
                   published_system(one["system"]).likelihood_tolerance * std::abs(expected));

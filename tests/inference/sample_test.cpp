@@ -161,7 +161,7 @@ TEST(PosteriorJointTest, KnowingThatNothingAcceleratesAtRestNeverRaisesAVariance
     ModelValues values = test::random_values(prior, observations, random);
     const Posterior before(prior, observations, values);
     observations.push_back({rest, a_bar, MatrixXd::Zero(system.nq(), rest.cols()), VectorXd::Constant(system.nq(), 1e-3), false});
-    values.noise_stddev.push_back(observations.back().noise_stddev);
+    values.noise_stddev.push_back(observations.back().noise().stddev());
     const Posterior after(prior, observations, values);
 
     // at rest, the variance is at most that of what was said there

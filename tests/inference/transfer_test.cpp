@@ -29,8 +29,8 @@ std::vector<Elsewhere> problems_elsewhere() {
   std::vector<Elsewhere> all;
   for (Problem& p : test::problems(12, seed)) {
     for (const Observations& group : p.observations) {
-      if (!group.view.other_system) continue;
-      all.push_back({p, group.view.other_system});
+      if (!group.view().other_system) continue;
+      all.push_back({p, group.view().other_system});
       break;
     }
   }
@@ -146,7 +146,7 @@ TEST(EvaluationTest, NormalisesByTheSpreadOfAllLogs) {
     if (p.name != "surface, pooled with another surface") continue;
     const Posterior posterior(p.prior, p.observations, p.values);
     MatrixXd all(3, p.observations[0].n_data() + p.observations[1].n_data());
-    all << p.observations[0].values, p.observations[1].values;
+    all << p.observations[0].values(), p.observations[1].values();
     const Evaluation e = evaluate_predictions(posterior, p.queries, {0, 1, 2}, MatrixXd::Random(3, p.queries.cols()));
     EXPECT_NEAR(e.rmse_normalised, e.rmse.cwiseQuotient(row_stddev(all)).mean(), 1e-12 * e.rmse_normalised);
   }

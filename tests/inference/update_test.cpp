@@ -5,6 +5,7 @@
 #include "gp2/error.hpp"
 #include "gp2/inference/pathwise.hpp"
 #include "inference/sampling.hpp"
+#include "observations_testing.hpp"
 #include "prior/kernel_columns.hpp"
 
 // Posteriors that grow and shrink with their data are those built anew.
@@ -23,7 +24,7 @@ constexpr std::uint64_t seed = 40405;
 // columns of one of a problem's Observations, with the noise that its values give
 Observations part_of(const Problem& p, std::size_t group, const std::vector<Index>& columns) {
   const Observations& all = p.observations[group];
-  return {all.states(Eigen::all, columns), all.view, all.values(Eigen::all, columns), p.values.noise_stddev[group], false};
+  return {all.states()(Eigen::all, columns), all.view(), all.values()(Eigen::all, columns), p.values.noise_stddev[group], false};
 }
 
 Posterior without_data(const Problem& p) { return Posterior(p.prior, p.observations, p.values).without_data(); }
@@ -131,30 +132,29 @@ TEST(UpdateTest, AGrownPosteriorIsDescribedByItsObservationsAndValues) {
   // the same view and noise: the same group
   posterior = update(std::move(posterior), part_of(p, 0, {2, 3}));
   ASSERT_EQ(posterior.observations().size(), 1U);
-  EXPECT_EQ(posterior.observations()[0].states.rightCols(2), p.observations[0].states.middleCols(2, 2));
-  EXPECT_EQ(posterior.observations()[0].values.rightCols(2), p.observations[0].values.middleCols(2, 2));
+  EXPECT_EQ(posterior.observations()[0].states().rightCols(2), p.observations[0].states().middleCols(2, 2));
+  EXPECT_EQ(posterior.observations()[0].values().rightCols(2), p.observations[0].values().middleCols(2, 2));
   // another noise, and another view
-  Observations noisy = part_of(p, 0, {0});
-  noisy.noise_stddev *= 2;
+  const Observations noisy = test::with_stddev(part_of(p, 0, {0}), 2 * p.values.noise_stddev[0]);
   posterior = update(std::move(posterior), noisy);
-  Observations one_row = part_of(p, 0, {1});
-  one_row.view.rows = {0};
-  one_row.values = one_row.values.topRows(1).eval();
-  one_row.noise_stddev = one_row.noise_stddev.head(1).eval();
+  const Observations both_rows = part_of(p, 0, {1});
+  View first_row = both_rows.view();
+  first_row.rows = {0};
+  const Observations one_row(both_rows.states(), first_row, both_rows.values().topRows(1), both_rows.noise().stddev().head(1));
   posterior = update(std::move(posterior), one_row);
   ASSERT_EQ(posterior.observations().size(), 3U);
-  EXPECT_EQ(posterior.values().noise_stddev[1], noisy.noise_stddev);
-  EXPECT_EQ(posterior.values().noise_stddev[2], one_row.noise_stddev);
+  EXPECT_EQ(posterior.values().noise_stddev[1], noisy.noise().stddev());
+  EXPECT_EQ(posterior.values().noise_stddev[2], one_row.noise().stddev());
   expect_equal(posterior, Posterior(p.prior, posterior.observations(), posterior.values()), p);
   // of the first group nothing is left but its noise
   posterior = remove_oldest(std::move(posterior), static_cast<int>(n) + 2);
   ASSERT_EQ(posterior.observations().size(), 3U);
   EXPECT_EQ(posterior.observations()[0].n_data(), 0);
-  EXPECT_EQ(posterior.observations()[0].states.rows(), p.observations[0].states.rows());
+  EXPECT_EQ(posterior.observations()[0].states().rows(), p.observations[0].states().rows());
   EXPECT_EQ(posterior.values().noise_stddev[0], p.values.noise_stddev[0]);
   expect_equal(posterior, Posterior(p.prior, posterior.observations(), posterior.values()), p);
   posterior = update(std::move(posterior), part_of(p, 0, {4}));
-  EXPECT_EQ(posterior.observations()[0].states, p.observations[0].states.col(4));
+  EXPECT_EQ(posterior.observations()[0].states(), p.observations[0].states().col(4));
   expect_equal(posterior, Posterior(p.prior, posterior.observations(), posterior.values()), p);
 }
 
@@ -173,7 +173,7 @@ TEST(UpdateTest, WithoutItsDataIsThePriorAndLearnsAgain) {
                  Posterior(p.prior, {p.observations.back()},
                            [&] {
                              ModelValues values = p.values;
-                             values.noise_stddev = {p.observations.back().noise_stddev};
+                             values.noise_stddev = {p.observations.back().noise().stddev()};
                              return values;
                            }()),
                  p);
@@ -184,8 +184,8 @@ TEST(UpdateTest, ManyAtOnceAreAsGoodAsOneAfterAnother) {
   const Problem p = test::problems(60, seed).front();
   Posterior at_once = update(without_data(p), p.observations[0]);
   Posterior halves = update(Posterior(p.prior, {part_of(p, 0, {0, 1, 2})}, p.values),
-                            {p.observations[0].states.rightCols(57), p.observations[0].view,
-                             p.observations[0].values.rightCols(57), p.values.noise_stddev[0], false});
+                            {p.observations[0].states().rightCols(57), p.observations[0].view(),
+                             p.observations[0].values().rightCols(57), p.values.noise_stddev[0], false});
   const Posterior anew(p.prior, p.observations, p.values);
   expect_equal(at_once, anew, p);
   expect_equal(halves, anew, p);
@@ -198,7 +198,7 @@ TEST(UpdateTest, NothingAddedOrRemovedChangesNothing) {
   posterior = update(std::move(posterior), part_of(p, 0, {}));
   posterior = remove_oldest(std::move(posterior), 0);
   EXPECT_EQ(posterior.negative_log_likelihood(), before.negative_log_likelihood());
-  EXPECT_EQ(posterior.observations()[0].states, before.observations()[0].states);
+  EXPECT_EQ(posterior.observations()[0].states(), before.observations()[0].states());
 }
 
 TEST(UpdateTest, HappensInPlaceUnlessAnotherHoldsThePosterior) {
@@ -265,18 +265,10 @@ void expect_refusal(Posterior& posterior, const std::string& text, const Call& c
 TEST(UpdateTest, RefusesWhatDoesNotFitAndKeepsThePosterior) {
   const Problem p = test::problems(9, seed).front();
   Posterior posterior(p.prior, p.observations, p.values);
-  const auto refuses = [&](const std::string& text, const auto& spoil) {
-    Observations added = part_of(p, 0, {0, 1});
-    spoil(added);
-    expect_refusal<InputError>(posterior, text, [&](Posterior& it) { it = update(std::move(it), added); });
-  };
-  refuses("update: a column of `states`", [](Observations& o) { o.states.conservativeResize(3, Eigen::NoChange); });
-  refuses("update: `values` must have a row", [](Observations& o) { o.values = o.values.leftCols(1).eval(); });
-  refuses("update: `values` must have a row", [](Observations& o) { o.values = o.values.topRows(1).eval(); });
-  refuses("update: `values` must be finite", [](Observations& o) { o.values(0, 1) = std::numeric_limits<double>::infinity(); });
-  refuses("update: `noise_stddev` must have one number", [](Observations& o) { o.noise_stddev = VectorXd::Ones(1); });
-  refuses("update: `noise_stddev` must be positive", [](Observations& o) { o.noise_stddev[0] = 0; });
-  refuses("update: `noise_stddev` must be positive", [](Observations& o) { o.noise_stddev[0] = std::nan(""); });
+  const Observations added = part_of(p, 0, {0, 1});
+  expect_refusal<InputError>(posterior, "update: a column of `states`", [&](Posterior& it) {
+    it = update(std::move(it), test::with_states(added, added.states().topRows(3)));
+  });
   for (int n : {-1, 10}) {
     expect_refusal<InputError>(posterior,
                                fmt::format("remove_oldest: there are 9 observed states, so n must be 0 … 9, got {}", n),
@@ -304,7 +296,9 @@ directions = "acceleration"
   Posterior posterior(make_prior(model), {}, {{VectorXd::Ones(1)}, {VectorXd::Ones(2)}, {}, {}, VectorXd()});
   Observations added{MatrixXd::Zero(5, 1), view, MatrixXd::Zero(2, 1), VectorXd::Ones(2), false};
   posterior = update(std::move(posterior), added);
-  added.states(0, 0) = 2;
+  MatrixXd singular = added.states();
+  singular(0, 0) = 2;
+  added = test::with_states(added, singular);
   expect_refusal<InputError>(posterior, "mass matrix", [&](Posterior& it) { it = update(std::move(it), added); });
 }
 
@@ -312,8 +306,7 @@ TEST(UpdateTest, RefusesNoiseTooSmallForDoublePrecisionAndKeepsThePosterior) {
   const Problem p = test::problems(9, seed).front();
   Posterior posterior(p.prior, p.observations, p.values);
   // the same state over and over, known to 1e-12 of its size
-  Observations added = part_of(p, 0, {0, 0, 0, 0, 0, 0, 0, 0});
-  added.noise_stddev *= 1e-12;
+  const Observations added = test::with_stddev(part_of(p, 0, {0, 0, 0, 0, 0, 0, 0, 0}), 1e-12 * p.values.noise_stddev[0]);
   expect_refusal<NumericalError>(posterior, "cannot be factored in double precision",
                                  [&](Posterior& it) { it = update(std::move(it), added); });
   posterior = update(std::move(posterior), part_of(p, 0, {0}));

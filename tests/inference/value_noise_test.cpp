@@ -3,6 +3,7 @@
 #include "gp2/error.hpp"
 #include "gp2/inference/evaluation.hpp"
 #include "inference/sampling.hpp"
+#include "observations_testing.hpp"
 
 // Observations whose values have a noise each.
 namespace gp2 {
@@ -70,7 +71,9 @@ TEST(ValueNoiseTest, AScaleOfOneChangesNoBit) {
   for (const Problem& p : test::problems(9, seed)) {
     SCOPED_TRACE(fmt::format("{}, seed {}", p.name, seed));
     Problem scaled = p;
-    for (Observations& group : scaled.observations) group.noise_scale.setOnes(group.values.rows(), group.values.cols());
+    for (Observations& group : scaled.observations) {
+      group = test::with_scale(group, MatrixXd::Ones(group.values().rows(), group.values().cols()));
+    }
     const Evaluated expected = evaluate(p), got = evaluate(scaled);
     EXPECT_EQ(got.value, expected.value);
     EXPECT_EQ(got.gradient.kernel, expected.gradient.kernel);
@@ -87,7 +90,7 @@ TEST(ValueNoiseTest, OnlyTheProductOfFactorAndScaleCounts) {
     SCOPED_TRACE(fmt::format("{}, seed {}", p.name, seed));
     Problem other = p;
     for (std::size_t g = 0; g < p.observations.size(); ++g) {
-      other.observations[g].noise_scale *= 3;
+      other.observations[g] = test::with_scale(p.observations[g], 3 * p.observations[g].noise().scale());
       other.values.noise_stddev[g] /= 3;
     }
     const Evaluated expected = evaluate(p), got = evaluate(other);
@@ -108,12 +111,10 @@ TEST(ValueNoiseTest, AValueOfVastNoiseSaysNothing) {
     Problem without = p;
     for (Problem* each : {&p, &without}) each->observations.resize(1), each->values.noise_stddev.resize(1);
     // its pull on the mean falls with the square of the noise: 1e-14 is below rounding
-    p.observations[0].noise_scale.col(0).setConstant(1e7);
-    Observations& group = without.observations[0];
-    const auto rest = Eigen::seq(1, Eigen::last);
-    group.states = MatrixXd(group.states(Eigen::all, rest));
-    group.values = MatrixXd(group.values(Eigen::all, rest));
-    group.noise_scale = MatrixXd(group.noise_scale(Eigen::all, rest));
+    MatrixXd vast = p.observations[0].noise().scale();
+    vast.col(0).setConstant(1e7);
+    p.observations[0] = test::with_scale(p.observations[0], vast);
+    without.observations[0].remove_first(1);
     const MatrixXd expected = posterior_of(without).mean(every_acceleration(p), p.queries);
     const MatrixXd got = posterior_of(p).mean(every_acceleration(p), p.queries);
     EXPECT_LE(largest(got - expected), (1e-11 + rounding(without)) * (1 + largest(expected)));
@@ -125,12 +126,12 @@ TEST(ValueNoiseTest, APosteriorThatGrowsAndShrinksIsTheOneBuiltAnew) {
     SCOPED_TRACE(fmt::format("{}, seed {}", p.name, seed));
     const auto columns = [&](std::size_t g, const auto& some) {
       const Observations& all = p.observations[g];
-      return Observations{MatrixXd(all.states(Eigen::all, some)),
-                          all.view,
-                          MatrixXd(all.values(Eigen::all, some)),
+      return Observations{MatrixXd(all.states()(Eigen::all, some)),
+                          all.view(),
+                          MatrixXd(all.values()(Eigen::all, some)),
                           p.values.noise_stddev[g],
                           false,
-                          MatrixXd(all.noise_scale(Eigen::all, some))};
+                          MatrixXd(all.noise().scale()(Eigen::all, some))};
     };
     Posterior posterior = posterior_of(p).without_data();
     for (std::size_t g = 0; g < p.observations.size(); ++g) {
@@ -144,7 +145,7 @@ TEST(ValueNoiseTest, APosteriorThatGrowsAndShrinksIsTheOneBuiltAnew) {
                   rounding(p) * (1 + std::abs(expected.negative_log_likelihood())));
       const MatrixXd mean = expected.mean(every_acceleration(p), p.queries);
       EXPECT_LE(largest(posterior.mean(every_acceleration(p), p.queries) - mean), rounding(p) * (1 + largest(mean)));
-      EXPECT_EQ(posterior.observations()[0].noise_scale, anew.observations[0].noise_scale);
+      EXPECT_EQ(posterior.observations()[0].noise().scale(), anew.observations[0].noise().scale());
     };
     expect_equal(p);
     posterior = remove_oldest(std::move(posterior), 2);
@@ -156,24 +157,21 @@ TEST(ValueNoiseTest, APosteriorThatGrowsAndShrinksIsTheOneBuiltAnew) {
 
 TEST(ValueNoiseTest, ValuesOfOneNoiseAndOfTheirOwnAreGroupsApart) {
   const Problem p = problems().front();
-  Observations plain = p.observations[0];
-  plain.noise_stddev = p.values.noise_stddev[0];
-  plain.noise_scale = {};
+  const Observations plain = p.observations[0].with_noise(Noise(p.values.noise_stddev[0]));
   Posterior posterior = update(posterior_of(p), plain);
   ASSERT_EQ(posterior.observations().size(), 2U);
-  EXPECT_FALSE(posterior.observations()[1].has_noise_scale());
+  EXPECT_FALSE(posterior.observations()[1].noise().has_scale());
   posterior = remove_oldest(std::move(posterior), plain.n_data());
   EXPECT_EQ(posterior.observations()[0].n_data(), 0);
   EXPECT_TRUE(std::isfinite(posterior.negative_log_likelihood()));
 }
 
 TEST(ValueNoiseTest, TheUsualNoiseIsTheMedian) {
-  Observations group;
-  group.values.setZero(2, 3);
-  group.noise_scale = (MatrixXd(2, 3) << 1, 2, 9, 5, 3, 4).finished();
+  Observations group(MatrixXd::Zero(1, 3), {Quantity::constrained_acceleration, {0, 1}}, MatrixXd::Zero(2, 3), VectorXd::Ones(2),
+                     false, (MatrixXd(2, 3) << 1, 2, 9, 5, 3, 4).finished());
   EXPECT_EQ(group.usual_noise(Eigen::Vector2d(10, 1)), Eigen::Vector2d(20, 4));
   EXPECT_EQ(group.noise_at(Eigen::Vector2d(10, 1), 2), Eigen::Vector2d(90, 4));
-  group.noise_scale = {};
+  group = test::with_scale(group, {});
   EXPECT_EQ(group.usual_noise(Eigen::Vector2d(10, 1)), Eigen::Vector2d(10, 1));
   EXPECT_EQ(group.noise_at(Eigen::Vector2d(10, 1), 2), Eigen::Vector2d(10, 1));
 }
@@ -181,7 +179,7 @@ TEST(ValueNoiseTest, TheUsualNoiseIsTheMedian) {
 TEST(ValueNoiseTest, AnEvaluationMeasuresByTheUsualNoise) {
   for (const Problem& p : problems()) {
     const View every = View::all(Quantity::constrained_acceleration, *p.prior.system);
-    if (!(p.observations[0].view == every)) continue;
+    if (!(p.observations[0].view() == every)) continue;
     const MatrixXd targets = MatrixXd::Zero(every.size(), p.queries.cols());
     const Posterior posterior = posterior_of(p);
     const Posterior::Marginal prediction = posterior.marginal(every, p.queries);
@@ -197,26 +195,17 @@ TEST(ValueNoiseTest, AnEvaluationMeasuresByTheUsualNoise) {
 
 TEST(ValueNoiseTest, AScaleOfTheWrongShapeOrSignIsRefused) {
   const Problem p = problems().front();
-  const auto refused = [&](const auto& change) {
-    Problem bad = p;
-    change(bad.observations[0].noise_scale);
-    std::vector<std::string> texts;
-    const auto note = [&](const auto& work) {
-      try {
-        work();
-        texts.emplace_back();
-      } catch (const InputError& error) {
-        texts.emplace_back(error.what());
-      }
-    };
-    note([&] { Likelihood(bad.prior, bad.observations, bad.values, {}); });
-    note([&] { posterior_of(bad); });
-    note([&] { static_cast<void>(update(posterior_of(p), bad.observations[0])); });
-    EXPECT_EQ(texts[0], texts[1]);
-    EXPECT_EQ("update: " + texts[0], texts[2]);
-    return texts[0];
+  const auto refused = [&](const auto& change) -> std::string {
+    MatrixXd scale = p.observations[0].noise().scale();
+    change(scale);
+    try {
+      static_cast<void>(test::with_scale(p.observations[0], scale));
+    } catch (const InputError& error) {
+      return error.what();
+    }
+    return "";
   };
-  const Index d = p.observations[0].values.rows(), n = p.observations[0].values.cols();
+  const Index d = p.observations[0].values().rows(), n = p.observations[0].values().cols();
   EXPECT_EQ(refused([&](MatrixXd& scale) { scale = MatrixXd::Ones(d, n - 1); }),
             fmt::format("noise_scale must hold one number for each of the {} × {} values, got {} × {}; leave it empty where each "
                         "row has one noise",

@@ -25,14 +25,11 @@ FitProblem problem_of(int n_states) {
   const GeneratedData data = generate(model, {50, 3, noise_stddev});
   FitProblem problem;
   problem.prior = make_prior(model);
-  Observations group{Eigen::MatrixXd(data.states.rows(), n_states),
-                     View::all(View::Quantity::constrained_acceleration, *model.system), Eigen::MatrixXd(3, n_states),
-                     noise_stddev};
-  for (int i = 0; i < n_states; ++i) {
-    group.states.col(i) = data.states.col(i % 50);
-    group.values.col(i) = data.accelerations.col(i % 50);
-  }
-  problem.observations = {group};
+  std::vector<int> again;
+  for (int i = 0; i < n_states; ++i) again.push_back(i % 50);
+  const Observations group(data.states, View::all(View::Quantity::constrained_acceleration, *model.system), data.accelerations,
+                           noise_stddev);
+  problem.observations = {group.take(again)};
   problem.hyperparameters = default_hyperparameters(problem.prior, problem.observations, {}, {});
   return problem;
 }

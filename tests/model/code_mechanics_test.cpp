@@ -363,7 +363,9 @@ TEST(CodeMechanics, AreAskedForEveryModelOfAFitThatNeedsThem) {
   text.replace(text.find("particle on a surface"), 21, "the other");
   const auto other = std::make_shared<const Model>(Model::parse(text, "other.toml", test::callable_surface));
   fit.observations.push_back(fit.observations.front());
-  fit.observations.back().view.other_system = make_other_system(fit.model, *other, fit.prior_options);
+  View there = fit.observations.back().view();
+  there.other_system = make_other_system(fit.model, *other, fit.prior_options);
+  fit.observations.back() = fit.observations.back().with_view(there);
   fit.systems = {nullptr, other};
   const auto hyperparameters = default_hyperparameters(fit.prior(), fit.observations, {}, Protocol());
   FitOptions options;

@@ -163,7 +163,7 @@ TEST(Discrepancy, HasAShareOfTheNoiseAndOfTheSpreadOfEachFeature) {
   const Discrepancy& discrepancy = *problem.prior_options.discrepancy;
   EXPECT_EQ(discrepancy.stddev, 0.4 * Eigen::Vector2d(0.1, 0.3));
   // the features are entries of the state
-  const MatrixXd& states = problem.observations.front().states;
+  const MatrixXd& states = problem.observations.front().states();
   const StateLayout layout = model.system->layout();
   ASSERT_EQ(discrepancy.lengthscale.size(), 3);
   for (const auto& [feature, entry] : {std::pair(0, layout.q(0)), std::pair(1, layout.dq(0)), std::pair(2, layout.u(0))}) {
@@ -198,8 +198,8 @@ TEST(Discrepancy, TakesTheNoiseThatTheFitStartsWith) {
   FitProblemOptions estimated;
   estimated.estimate_noise = true;
   const FitProblem problem = problem_of(bead("", "ddq = { estimate = true, initial = [0.2, 0.4] }"), estimated);
-  EXPECT_EQ(problem.prior_options.discrepancy->stddev, 0.4 * problem.observations.front().noise_stddev);
-  EXPECT_EQ(problem.observations.front().noise_stddev, Eigen::Vector2d(0.2, 0.4));
+  EXPECT_EQ(problem.prior_options.discrepancy->stddev, 0.4 * problem.observations.front().noise().stddev());
+  EXPECT_EQ(problem.observations.front().noise().stddev(), Eigen::Vector2d(0.2, 0.4));
 }
 
 TEST(Discrepancy, TakesTheLargestNoiseOfSeveralLogs) {
@@ -217,7 +217,7 @@ TEST(Discrepancy, GivesAnAccelerationThatIsNotMeasuredTheSameShareOfItsSpread) {
     const FitProblem problem = problem_of(model, options);
     const VectorXd spread = default_scales(problem.prior, problem.observations).acceleration_stddev;
     const VectorXd& stddev = problem.prior_options.discrepancy->stddev;
-    const double noise = problem.observations.front().noise_stddev[0];
+    const double noise = problem.observations.front().noise().stddev()[0];
     EXPECT_EQ(stddev[measured], 0.4 * noise) << observed;
     EXPECT_NEAR(stddev[1 - measured], 0.4 * noise / spread[measured] * spread[1 - measured], 8 * eps) << observed;
   }
@@ -312,7 +312,7 @@ TEST(Discrepancy, ActsUnderTheSystemsOfAllLogs) {
   const Model model = bead();
   const auto other = std::make_shared<const Model>(bead("", "ddq = [0.1, 0.3]", "y - sin(x)", "other.toml"));
   const FitProblem problem = make_fit_problem(model, {{log_of(model)}, {log_of(*other), other}}, {}, {});
-  const std::shared_ptr<const OtherSystem>& other_system = problem.observations[1].view.other_system;
+  const std::shared_ptr<const OtherSystem>& other_system = problem.observations[1].view().other_system;
   ASSERT_NE(other_system, nullptr);
   ASSERT_EQ(other_system->prior.latents.size(), 2U);
   EXPECT_EQ(other_system->prior.latents[1].name, "discrepancy");
@@ -330,8 +330,8 @@ TEST(Discrepancy, ActsUnderTheSystemsOfAllLogs) {
   const TemporaryFolder folder;
   file_of(model, problem).write(folder / "fit.json");
   const FitFile read = FitFile::read(folder / "fit.json");
-  ASSERT_NE(read.observations[1].view.other_system, nullptr);
-  EXPECT_EQ(read.observations[1].view.other_system->prior.latents.size(), 2U);
+  ASSERT_NE(read.observations[1].view().other_system, nullptr);
+  EXPECT_EQ(read.observations[1].view().other_system->prior.latents.size(), 2U);
   const View ddq = view_of(problem.prior, Quantity::constrained_acceleration);
   EXPECT_EQ(read.posterior().marginal(ddq, states).covariance, posterior.marginal(ddq, states).covariance);
 }

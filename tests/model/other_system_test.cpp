@@ -157,7 +157,7 @@ TEST(PooledProblem, HasAGroupPerLogEachUnderItsOwnSystem) {
   const FitProblem problem =
       make_fit_problem(model, {Log{table(model, 8, 1, "a.csv")}, Log{table(*other, 4, 2, "b.csv"), other}}, {}, options);
   ASSERT_EQ(problem.observations.size(), 2U);
-  EXPECT_EQ(problem.observations[0].view.other_system, nullptr);
+  EXPECT_EQ(problem.observations[0].view().other_system, nullptr);
   EXPECT_EQ(problem.observations[0].n_data(), 5) << "--max-points is of each log";
   const Observations& b = problem.observations[1];
   ASSERT_NE(b.view.other_system, nullptr);
@@ -176,12 +176,12 @@ TEST(PooledProblem, TakesTheNoiseOfEachModelOrOneForAll) {
   const auto other = std::make_shared<const Model>(Model::parse(noisier, "other.toml"));
   const std::vector<Log> logs = {Log{table(model, 8, 1, "a.csv")}, Log{table(model, 8, 2, "b.csv"), other}};
   const FitProblem own = make_fit_problem(model, logs, {}, {});
-  EXPECT_EQ(own.observations[0].noise_stddev, Eigen::Vector2d(0.1, 0.2));
-  EXPECT_EQ(own.observations[1].noise_stddev, Eigen::Vector2d(0.4, 0.4));
+  EXPECT_EQ(own.observations[0].noise().stddev(), Eigen::Vector2d(0.1, 0.2));
+  EXPECT_EQ(own.observations[1].noise().stddev(), Eigen::Vector2d(0.4, 0.4));
   FitProblemOptions options;
   options.noise_stddev = 0.3;
   for (const Observations& group : make_fit_problem(model, logs, {}, options).observations) {
-    EXPECT_EQ(group.noise_stddev, Eigen::Vector2d(0.3, 0.3));
+    EXPECT_EQ(group.noise().stddev(), Eigen::Vector2d(0.3, 0.3));
   }
   options.noise_stddev.reset();
   options.estimate_noise = true;
@@ -214,7 +214,7 @@ TEST(PooledProblem, ARenamingMustBeOfSomeLog) {
   const CsvTable renamed = CsvTable::parse(text, "b.csv");
   FitProblemOptions options;
   options.columns = {{"x", "X"}};
-  EXPECT_EQ(make_fit_problem(model, {Log{table(model, 8, 1, "a.csv")}, Log{renamed}}, {}, options).observations[1].values(0, 1),
+  EXPECT_EQ(make_fit_problem(model, {Log{table(model, 8, 1, "a.csv")}, Log{renamed}}, {}, options).observations[1].values()(0, 1),
             2);
   options.columns = {{"x", "Z"}};
   EXPECT_EQ(
@@ -249,14 +249,15 @@ TEST(KnownViews, ObserveTheColumnsThatAreThere) {
   EXPECT_EQ(of(Quantity::constrained_acceleration, "ddx", "3").view.rows, std::vector{0});
   EXPECT_EQ(of(Quantity::next_velocity, "dx_next,dy_next,dy", "3,0,0").view.time_step, 0.02);
   const Observations drag = of(Quantity::unconstrained_acceleration, "abar_x@drag", "0", "drag");
-  EXPECT_EQ(drag.view.latent, 0);
-  EXPECT_EQ(drag.view.rows, std::vector{0});
+  EXPECT_EQ(drag.view().latent, 0);
+  EXPECT_EQ(drag.view().rows, std::vector{0});
 }
 
 TEST(KnownViews, TakeTheModelsNoiseForAccelerationsOnly) {
   const Model model = home();
   const std::vector<Log> logs = {Log{table(model, 8, 1, "a.csv")}};
-  EXPECT_EQ(make_fit_problem(model, logs, {at_rest("abar_y", "0")}, {}).observations[1].noise_stddev, VectorXd::Constant(1, 0.2));
+  EXPECT_EQ(make_fit_problem(model, logs, {at_rest("abar_y", "0")}, {}).observations[1].noise().stddev(),
+            VectorXd::Constant(1, 0.2));
   SideInformation force = at_rest("fc_x", "0");
   force.quantity = Quantity::constraint_force;
   EXPECT_EQ(input_error_of([&] { make_fit_problem(model, logs, {force}, {}); }),
@@ -344,10 +345,10 @@ TEST(FitFileOfSeveralSystems, PredictsTheSameBitsAfterItWasWrittenAndRead) {
   const FitFile read = FitFile::read(folder / "fit.json");
   ASSERT_EQ(read.observations.size(), 5U);
   for (std::size_t g = 0; g < 5; ++g) {
-    const View &a = fit.observations[g].view, &b = read.observations[g].view;
+    const View &a = fit.observations[g].view(), &b = read.observations[g].view();
     EXPECT_EQ(std::tie(a.quantity, a.rows, a.time_step, a.latent), std::tie(b.quantity, b.rows, b.time_step, b.latent));
     EXPECT_EQ(a.other_system == nullptr, b.other_system == nullptr);
-    EXPECT_EQ(fit.observations[g].values, read.observations[g].values);
+    EXPECT_EQ(fit.observations[g].values(), read.observations[g].values());
     if (a.other_system) {
       EXPECT_EQ(a.other_system->shared, b.other_system->shared);
     }

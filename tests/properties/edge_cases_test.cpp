@@ -34,28 +34,20 @@ Problem surface_problem(int n) {
   return p;
 }
 
-Observations side_by_side(Observations one, const Observations& other) {
-  const Index n = one.n_data();
-  one.states.conservativeResize(Eigen::NoChange, n + other.n_data());
-  one.values.conservativeResize(Eigen::NoChange, n + other.n_data());
-  one.states.rightCols(other.n_data()) = other.states;
-  one.values.rightCols(other.n_data()) = other.values;
-  return one;
-}
-
 // y₁ and y₂ of one state say what their mean says at half the variance
 TEST(EdgeCaseTest, APointMeasuredTwiceIsOneOfHalfTheVariance) {
   const Problem p = surface_problem(30);
-  Observations again = p.observations[0];
+  const Observations& first = p.observations[0];
+  MatrixXd again = first.values();
   RandomStream random(seed, 2);
-  for (double& y : again.values.reshaped()) y += 0.1 * random.normal();
+  for (double& y : again.reshaped()) y += 0.1 * random.normal();
   for (const double apart : {0.0, 1e-15, 1e-12}) {
     SCOPED_TRACE(fmt::format("apart {:g}, seed {}", apart, seed));
-    Observations moved = again;
-    for (double& entry : moved.states.reshaped()) entry *= 1 + apart * random.normal();
-    const Observations twice = side_by_side(p.observations[0], moved);
-    Observations once = p.observations[0];
-    once.values = 0.5 * (once.values + again.values);
+    MatrixXd moved = first.states();
+    for (double& entry : moved.reshaped()) entry *= 1 + apart * random.normal();
+    Observations twice = first;
+    twice.append(test::with_states(first.with_values(again), moved));
+    const Observations once = first.with_values(0.5 * (first.values() + again));
     ModelValues half = p.values;
     half.noise_stddev[0] /= std::sqrt(2.0);
     const Posterior of_twice(p.prior, {twice}, p.values), of_once(p.prior, {once}, half);
@@ -97,21 +89,23 @@ void expect_usable(const Fitted& fitted, const Problem& p) {
 
 TEST(EdgeCaseTest, OnePointIsDataEnough) {
   Problem p = surface_problem(1);
-  p.observations[0].estimate_noise = false;
+  p.observations[0] = test::with_estimated_noise(p.observations[0], false);
   const Fitted fitted = quick_fit(p.prior, p.observations);
   expect_usable(fitted, p);
   // nothing varies, so that scales are those of the values' own size
   const Scales scales = default_scales(p.prior, p.observations);
-  EXPECT_EQ(scales.acceleration_stddev, p.observations[0].values.col(0).cwiseAbs());
-  p.observations[0].estimate_noise = true;
+  EXPECT_EQ(scales.acceleration_stddev, p.observations[0].values().col(0).cwiseAbs());
+  p.observations[0] = test::with_estimated_noise(p.observations[0], true);
   expect_usable(quick_fit(p.prior, p.observations), p);
 }
 
 TEST(EdgeCaseTest, OutputsThatDoNotVaryHaveTheScaleOfTheirSize) {
   Problem p = surface_problem(12);
   // 0.1 is no binary number: the mean of many rounds, and the spread is 1e-17, not 0
-  p.observations[0].values.row(0).setConstant(0.1);
-  p.observations[0].values.row(1).setConstant(-30);
+  MatrixXd values = p.observations[0].values();
+  values.row(0).setConstant(0.1);
+  values.row(1).setConstant(-30);
+  p.observations[0] = p.observations[0].with_values(values);
   const Scales scales = default_scales(p.prior, p.observations);
   EXPECT_EQ(scales.acceleration_stddev[0], 0.1);
   EXPECT_EQ(scales.acceleration_stddev[1], 30);
@@ -121,21 +115,24 @@ TEST(EdgeCaseTest, OutputsThatDoNotVaryHaveTheScaleOfTheirSize) {
 
 TEST(EdgeCaseTest, OutputsThatAreZeroHaveTheScaleOfTheOthersKineticEnergy) {
   Problem p = surface_problem(12);
-  const VectorXd spread = row_stddev(p.observations[0].values);
-  p.observations[0].values.row(0).setZero();
+  const VectorXd spread = row_stddev(p.observations[0].values());
+  MatrixXd values = p.observations[0].values();
+  values.row(0).setZero();
+  p.observations[0] = p.observations[0].with_values(values);
   const Scales scales = default_scales(p.prior, p.observations);
   // the three masses are equal
   const double kinetic = (spread[1] * spread[1] + spread[2] * spread[2]) / 3;
   EXPECT_NEAR(scales.acceleration_stddev[0], std::sqrt(kinetic), 8 * eps * std::sqrt(kinetic));
   expect_usable(quick_fit(p.prior, p.observations), p);
-  p.observations[0].values.setZero();
+  p.observations[0] = p.observations[0].with_values(MatrixXd::Zero(3, 12));
   expect_usable(quick_fit(p.prior, p.observations), p);
 }
 
 TEST(EdgeCaseTest, FeaturesThatDoNotVarySayNothing) {
   Problem p = surface_problem(12);
-  MatrixXd& states = p.observations[0].states;
+  MatrixXd states = p.observations[0].states();
   states.row(6 + 1).setConstant(0.1);  // u1
+  p.observations[0] = test::with_states(p.observations[0], states);
   expect_usable(quick_fit(p.prior, p.observations), p);
   // a constant feature under any lengthscale: the same likelihood
   Likelihood::Workspace workspace;
@@ -145,7 +142,7 @@ TEST(EdgeCaseTest, FeaturesThatDoNotVarySayNothing) {
   other.kernel[0][6] *= 1e-3;
   EXPECT_EQ(likelihood.evaluate(other, nullptr, workspace), value);
   // all of them: every sample at one and the same state
-  states = states.col(0).replicate(1, states.cols()).eval();
+  p.observations[0] = test::with_states(p.observations[0], states.col(0).replicate(1, states.cols()));
   expect_usable(quick_fit(p.prior, p.observations), p);
 }
 
@@ -194,14 +191,14 @@ directions = "acceleration"
     expect_usable(fitted, p);
     EXPECT_EQ(fitted.fit.posterior.reduced_size(), 15 * freedom);
     const MechanicsBatch mechanics = require_mechanics(*linkage.system, p.queries, VectorXd());
-    const Posterior::Marginal marginal = fitted.fit.posterior.marginal(p.observations[0].view, p.queries);
+    const Posterior::Marginal marginal = fitted.fit.posterior.marginal(p.observations[0].view(), p.queries);
     for (int i = 0; i < 4; ++i) {
       const MatrixXd A = mechanics.values.A(i);
       const VectorXd ddq = marginal.mean.col(i);
       EXPECT_LE(largest(A * ddq - mechanics.values.b(i)), 1e3 * eps * (1 + largest(A) * largest(ddq)));
     }
     if (freedom > 0) continue;
-    EXPECT_LE(largest(marginal.covariance), 1e-20 * (1 + largest(p.observations[0].values)));
+    EXPECT_LE(largest(marginal.covariance), 1e-20 * (1 + largest(p.observations[0].values())));
   }
 }
 

@@ -148,15 +148,15 @@ RandomProblem random_problem() {
       p.mechanics_condition = std::max(p.mechanics_condition, of_mass * of_rows);
     }
   };
-  for (const Observations& group : p.observations) add_conditions(group.states);
+  for (const Observations& group : p.observations) add_conditions(group.states());
   add_conditions(p.queries);
   RC_PRE(p.mechanics_condition < 1e3);
   RC_LOG() << model.text;
   for (const Observations& group : p.observations) {
-    RC_LOG() << View::word(group.view.quantity) << ", latent " << group.view.latent << ", noise "
-             << group.noise_stddev.transpose() << ", at\n"
-             << group.states << "\n:\n"
-             << group.values << '\n';
+    RC_LOG() << View::word(group.view().quantity) << ", latent " << group.view().latent << ", noise "
+             << group.noise().stddev().transpose() << ", at\n"
+             << group.states() << "\n:\n"
+             << group.values() << '\n';
   }
   RC_LOG() << "queries\n" << p.queries << "\nkernel " << p.values.kernel[0].transpose() << '\n';
   return p;
@@ -167,7 +167,7 @@ double rounding(const RandomProblem& p) { return 1e3 * eps * p.mechanics_conditi
 
 Index n_values(const Problem& p) {
   Index n = 0;
-  for (const Observations& group : p.observations) n += group.values.size();
+  for (const Observations& group : p.observations) n += group.values().size();
   return n;
 }
 
@@ -270,9 +270,7 @@ RC_GTEST_PROP(GpProperty, MoreDataAddedIsTheSameAsConditioningAnew, ()) {
   const Posterior all(p.prior, p.observations, p.values);
   Posterior grown = all.without_data();
   for (std::size_t g = 0; g < p.observations.size(); ++g) {
-    Observations group = p.observations[g];
-    group.noise_stddev = p.values.noise_stddev[g];
-    grown = update(std::move(grown), group);
+    grown = update(std::move(grown), test::with_stddev(p.observations[g], p.values.noise_stddev[g]));
   }
   const View view = View::all(Quantity::unconstrained_acceleration, *p.prior.system);
   const auto compare = [&](const Posterior& one, const Posterior& other) {

@@ -40,15 +40,15 @@ class Reference {
   explicit Reference(const Problem& p) {
     const Observations& group = p.observations[0];
     const Index nq = p.prior.system->nq();
-    features_ = evaluate_features(p.prior.latents[0], group.states).cast<Real>();
-    const SystemValues values = p.prior.system->evaluate(group.states, p.values.parameters);
-    residual_.resize(group.values.size());
+    features_ = evaluate_features(p.prior.latents[0], group.states()).cast<Real>();
+    const SystemValues values = p.prior.system->evaluate(group.states(), p.values.parameters);
+    residual_.resize(group.values().size());
     for (int i = 0; i < values.n_states(); ++i) {
       const RealMatrix A = values.A(i).cast<Real>();
       const RealMatrix M_inverse_At = values.M(i).cast<Real>().partialPivLu().solve(A.transpose().eval());
       const RealMatrix L = (A * M_inverse_At).partialPivLu().solve(M_inverse_At.transpose().eval()).transpose();
       T_.push_back(RealMatrix::Identity(nq, nq) - L * A);
-      residual_.segment(i * nq, nq) = group.values.col(i).cast<Real>() - L * values.b(i).cast<Real>();
+      residual_.segment(i * nq, nq) = group.values().col(i).cast<Real>() - L * values.b(i).cast<Real>();
     }
   }
 

@@ -56,9 +56,9 @@ inline Score score(const Model& model, const std::filesystem::path& train, const
   const Fit result = fit(problem.prior, problem.observations, problem.hyperparameters, options);
   const Observations& observed = problem.observations.front();
   const LogStates grid =
-      read_log_states(problem.prior, observed.view, model, CsvTable::read(test), {}, observed.view.names(*model.system));
-  return {result.report, evaluate_predictions(result.posterior, grid.states, observed.view.rows, grid.accelerations),
-          row_stddev(observed.values)};
+      read_log_states(problem.prior, observed.view(), model, CsvTable::read(test), {}, observed.view().names(*model.system));
+  return {result.report, evaluate_predictions(result.posterior, grid.states, observed.view().rows, grid.accelerations),
+          row_stddev(observed.values())};
 }
 
 inline double mean(const std::vector<double>& values) {

@@ -71,7 +71,7 @@ TEST(FitTest, GivesTheSameBitsForAnyNumberOfThreads) {
     options.n_threads = n_threads;
     const Fit result = fit(p.prior, p.observations, p.hyperparameters, options);
     values.push_back(values_of(result.report.hyperparameters));
-    means.push_back(result.posterior.mean(p.observations[0].view, p.observations[0].states));
+    means.push_back(result.posterior.mean(p.observations[0].view(), p.observations[0].states()));
     objectives.emplace_back();
     for (const RestartReport& restart : result.report.restarts) objectives.back().push_back(restart.objective);
   }
@@ -111,8 +111,8 @@ TEST(FitTest, NoIterationsConditionsAtTheStart) {
   EXPECT_NEAR(result.report.negative_log_likelihood, result.posterior.negative_log_likelihood(),
               1e-9 * std::abs(result.report.negative_log_likelihood));
   const Posterior there(p.prior, p.observations, model_values(p.prior, p.observations, p.hyperparameters));
-  EXPECT_EQ(result.posterior.mean(p.observations[0].view, p.observations[0].states),
-            there.mean(p.observations[0].view, p.observations[0].states));
+  EXPECT_EQ(result.posterior.mean(p.observations[0].view(), p.observations[0].states()),
+            there.mean(p.observations[0].view(), p.observations[0].states()));
 }
 
 TEST(FitTest, ReportsTheObjectiveAtTheValuesItReturns) {

@@ -5,6 +5,7 @@
 
 #include "gp2/error.hpp"
 #include "gp2/fit.hpp"
+#include "observations_testing.hpp"
 #include "test_models.hpp"
 #include "training/objective.hpp"
 
@@ -48,7 +49,7 @@ TEST(HyperparametersTest, ThePaperProtocolHasThePapersBox) {
   const std::vector<Observations> observations = observe(model, 60, false);
   const auto all = default_hyperparameters(prior, observations, {"p1", "p4", "p7"}, {Protocol::Name::paper, true});
   ASSERT_EQ(all.size(), 9u + 1u + 3u);
-  const MatrixXd features = evaluate_features(prior.latents[0], observations[0].states);
+  const MatrixXd features = evaluate_features(prior.latents[0], observations[0].states());
   for (int d = 0; d < 9; ++d) {
     const Hyperparameter& h = all[static_cast<std::size_t>(d)];
     SCOPED_TRACE(h.name);
@@ -66,7 +67,7 @@ TEST(HyperparametersTest, ThePaperProtocolHasThePapersBox) {
   EXPECT_EQ(signal.lower, 0.5);
   EXPECT_EQ(signal.upper, 10);
   ASSERT_EQ(signal.scale.size(), 3);
-  for (int j = 0; j < 3; ++j) expect_same(signal.scale[j], stddev(observations[0].values.row(j)));
+  for (int j = 0; j < 3; ++j) expect_same(signal.scale[j], stddev(observations[0].values().row(j)));
   EXPECT_EQ(find(all, "p1").lower, 0.08 - 0.02);
   EXPECT_EQ(find(all, "p1").upper, 0.08 + 0.02);
   EXPECT_EQ(find(all, "p4").lower, -0.02) << "a value of zero, too";
@@ -92,14 +93,14 @@ TEST(HyperparametersTest, TheStandardProtocolHasItsOwnBoxAndHyperPriors) {
   const auto all = default_hyperparameters(prior, observations, {"R"}, {});
   using Standard = Protocol::Standard;
   ASSERT_EQ(all.size(), 7u + 3u + 3u + 1u);
-  const double spread = stddev(evaluate_features(prior.latents[0], observations[0].states).col(2));
+  const double spread = stddev(evaluate_features(prior.latents[0], observations[0].states()).col(2));
   const Hyperparameter& lengthscale = find(all, "lengthscale(sin(q3))");
   expect_same(lengthscale.value, Standard::lengthscale_initial * spread);
   expect_same(lengthscale.lower, Standard::lengthscale_lower * spread);
   expect_same(lengthscale.upper, Standard::lengthscale_upper * spread);
   expect_same(lengthscale.median, Standard::lengthscale_median * spread);
   EXPECT_EQ(lengthscale.log_stddev, Standard::lengthscale_log_stddev);
-  const double output = stddev(observations[0].values.row(2));
+  const double output = stddev(observations[0].values().row(2));
   const Hyperparameter& signal = find(all, "signal_stddev(ddq3)");
   EXPECT_EQ(signal.kind, Kind::signal_stddev);
   expect_same(signal.value, output);
@@ -133,10 +134,10 @@ TEST(HyperparametersTest, PriorsOfTheModelReplaceTheWeakOnes) {
   const Prior prior = make_prior(model);
   const std::vector<Observations> observations = observe(model, 30, false);
   const auto all = default_hyperparameters(prior, observations, {"p1"}, {});
-  const double spread = stddev(evaluate_features(prior.latents[0], observations[0].states).col(0));
+  const double spread = stddev(evaluate_features(prior.latents[0], observations[0].states()).col(0));
   expect_same(find(all, "lengthscale(q1)").median, 2 * spread);
   EXPECT_EQ(find(all, "lengthscale(q1)").log_stddev, 0.5);
-  expect_same(find(all, "signal_stddev(ddq1)").median, 3 * stddev(observations[0].values.row(0)));
+  expect_same(find(all, "signal_stddev(ddq1)").median, 3 * stddev(observations[0].values().row(0)));
   EXPECT_EQ(find(all, "signal_stddev(ddq1)").log_stddev, 0.25);
   EXPECT_EQ(find(all, "p1").median, 0.09);
   EXPECT_EQ(find(all, "p1").log_stddev, 0.2);
@@ -274,7 +275,7 @@ TEST(HyperparametersTest, TheScaleOfAnUnobservedAccelerationComesFromEqualKineti
   const Scales scales = default_scales(make_prior(model), observations);
   const VectorXd p = model.system->parameter_values();
   const auto parameter = [&](const char* name) { return p[model.system->parameter_index(name)]; };
-  const double s3 = stddev(observations[0].values.row(0)), s6 = stddev(observations[0].values.row(1));
+  const double s3 = stddev(observations[0].values().row(0)), s6 = stddev(observations[0].values().row(1));
   const double kinetic = (parameter("I1") * s3 * s3 + parameter("I2") * s6 * s6) / 2;
   // force scale of coordinate j: M_jj σ_j
   const VectorXd& force = scales.signal_stddev[0];
@@ -288,8 +289,10 @@ TEST(HyperparametersTest, AFeatureThatDoesNotVaryStillHasAScale) {
   const Model& model = test::model("models/surface.toml");
   std::vector<Observations> observations = observe(model, 20, false);
   const StateLayout layout = model.system->layout();
-  observations[0].states.row(layout.u(0)).setZero();
-  observations[0].states.row(layout.u(1)).setConstant(3);
+  MatrixXd states = observations[0].states();
+  states.row(layout.u(0)).setZero();
+  states.row(layout.u(1)).setConstant(3);
+  observations[0] = test::with_states(observations[0], states);
   const Scales scales = default_scales(make_prior(model), observations);
   EXPECT_EQ(scales.feature_stddev[0][6], 1);
   EXPECT_EQ(scales.feature_stddev[0][7], 3);
@@ -318,7 +321,7 @@ TEST(HyperparametersTest, ModelValuesPutEachNumberInItsPlace) {
   shared.value = 3;
   shared.scale = Eigen::Vector2d(1, 0.5);
   EXPECT_EQ(model_values(prior, observations, {shared}).signal_stddev[1], Eigen::Vector2d(3, 1.5));
-  EXPECT_EQ(model_values(prior, observations, {shared}).noise_stddev[0], observations[0].noise_stddev);
+  EXPECT_EQ(model_values(prior, observations, {shared}).noise_stddev[0], observations[0].noise().stddev());
 }
 
 TEST(HyperparametersTest, ABoundIsReportedWhenItIsHit) {

@@ -8,6 +8,7 @@
 #include <Eigen/Dense>
 
 #include "gp2/error.hpp"
+#include "observations_testing.hpp"
 #include "test_models.hpp"
 
 namespace gp2 {
@@ -77,15 +78,15 @@ TEST(LaplaceTest, IsExactWhereTheLikelihoodIsQuadratic) {
 
   const Observations& observed = p.observations.front();
   const ModelValues values = model_values(p.prior, p.observations, p.hyperparameters);
-  const Index n = observed.states.cols();
+  const Index n = observed.states().cols();
   const double s = values.signal_stddev[0][0], lengthscale = values.kernel[0][0];
   MatrixXd C(n, n), Z(n, 2);
   for (Index i = 0; i < n; ++i) {
     for (Index j = 0; j < n; ++j) {
-      const double r = (observed.states(1, i) - observed.states(1, j)) / lengthscale;
+      const double r = (observed.states()(1, i) - observed.states()(1, j)) / lengthscale;
       C(i, j) = s * s * std::exp(-0.5 * r * r) + (i == j ? 0.09 : 0);
     }
-    Z.row(i) << observed.states(0, i), 1;
+    Z.row(i) << observed.states()(0, i), 1;
   }
   const MatrixXd covariance = (Z.transpose() * C.llt().solve(Z)).inverse();
   // gradients are linear here: what differences leave is rounding over the step
@@ -111,7 +112,7 @@ TEST(LaplaceTest, DistanceFromTheOptimumIsMeasuredInStandardDeviations) {
 TEST(LaplaceTest, TheDeviationOfALogarithmOfNoiseIsThatOfCounting) {
   // noise alone: log σ of n numbers is known to 1/√(2n)
   Problem p = problem(line(), 200, {});
-  p.observations[0].estimate_noise = true;
+  p.observations[0] = test::with_estimated_noise(p.observations[0], true);
   p.hyperparameters = default_hyperparameters(p.prior, p.observations, {}, Protocol{.hyperprior = false});
   for (Hyperparameter& h : p.hyperparameters) {
     if (h.kind == Kind::signal_stddev) h.value = h.lower = 1e-6;

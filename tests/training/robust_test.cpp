@@ -42,7 +42,7 @@ Data data_of(const std::string& file, int n) {
 
 // a share of the values, or of the states with all values, moved by 5 to 15 spreads of their row, either way
 Data with_outliers(Data data, double share, bool whole_states) {
-  MatrixXd& values = data.observations.front().values;
+  MatrixXd values = data.observations.front().values();
   const VectorXd spread = row_stddev(values);
   RandomStream random(seed);
   for (Index i = 0; i < values.cols(); ++i) {
@@ -53,6 +53,7 @@ Data with_outliers(Data data, double share, bool whole_states) {
       data.wrong.emplace(k, i);
     }
   }
+  data.observations.front() = data.observations.front().with_values(values);
   data.set_hyperparameters();
   return data;
 }
@@ -66,7 +67,7 @@ FitOptions quick() {
 
 double error_of(const Data& data, const Posterior& posterior) {
   const GeneratedData truth = generate(data.model, {200, seed + 1, VectorXd::Zero(data.model.system->nq())});
-  std::vector<int> rows = data.observations.front().view.rows;
+  std::vector<int> rows = data.observations.front().view().rows;
   return evaluate_predictions(posterior, truth.states, rows, truth.accelerations).nrmse;
 }
 

@@ -40,7 +40,7 @@ std::string date_of(const std::filesystem::path& path) {
 double noise_of(const Posterior& posterior, int row) {
   for (std::size_t g = 0; g < posterior.observations().size(); ++g) {
     const Observations& group = posterior.observations()[g];
-    const View& view = group.view;
+    const View& view = group.view();
     if (view.quantity != View::Quantity::constrained_acceleration || view.latent >= 0) continue;
     const auto found = std::find(view.rows.begin(), view.rows.end(), row);
     if (found != view.rows.end()) return group.usual_noise(posterior.values().noise_stddev[g])[found - view.rows.begin()];
@@ -114,13 +114,13 @@ std::vector<ReportData> training_data(const FitFile& fit, const Posterior& poste
   std::vector<ReportData> all;
   for (std::size_t g = 0; g < fit.observations.size(); ++g) {
     const Observations& group = fit.observations[g];
-    if (group.view.quantity != View::Quantity::constrained_acceleration || group.view.latent >= 0) continue;
-    ReportData data = data_at(posterior, group.states, group.view.rows, group.values, group.view.other_system);
+    if (group.view().quantity != View::Quantity::constrained_acceleration || group.view().latent >= 0) continue;
+    ReportData data = data_at(posterior, group.states(), group.view().rows, group.values(), group.view().other_system);
     data.name = all.empty() ? "training" : fmt::format("training {}", all.size() + 1);
     const bool elsewhere = g < fit.systems.size() && fit.systems[g];
     data.source = elsewhere ? fmt::format("measured on '{}'", fit.systems[g]->system->name()) : fit.data_source;
-    data.independent = independent_outputs(prior_of(posterior.prior(), group.view).judge(),
-                                           parameters_of(group.view, posterior.values().parameters), data);
+    data.independent = independent_outputs(prior_of(posterior.prior(), group.view()).judge(),
+                                           parameters_of(group.view(), posterior.values().parameters), data);
     all.push_back(std::move(data));
   }
   return all;

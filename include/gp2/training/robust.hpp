@@ -10,6 +10,8 @@ namespace gp2 {
 /// The observations without values that lie farther than 10 robust standard deviations (1.48 times the median distance) from the
 /// median of their row: scales and starting points are not to be set by a sensor that lost contact.
 std::vector<Observations> without_gross_errors(std::vector<Observations> observations);
+/// Of values (d × N) alone: NaN takes the place of those.
+Eigen::MatrixXd without_gross_errors(const Eigen::MatrixXd& values);
 
 struct RobustOptions {
   double threshold = 4;  // distance from which on a value is distrusted; of Gaussian values 6 in 100 000 are so far

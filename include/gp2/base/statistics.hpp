@@ -1,0 +1,18 @@
+#pragma once
+
+#include <vector>
+
+#include <Eigen/Core>
+
+namespace gp2 {
+
+/// Mean of each row, over the entries that are measured; NaN where none is.
+Eigen::VectorXd row_mean(const Eigen::Ref<const Eigen::MatrixXd>& values);
+/// Standard deviation (divided by their number) of each row, likewise.
+Eigen::VectorXd row_stddev(const Eigen::Ref<const Eigen::MatrixXd>& values);
+/// The entries of row k that are measured, in their order: those that are not NaN.
+std::vector<double> measured_entries(const Eigen::Ref<const Eigen::MatrixXd>& values, Eigen::Index k);
+/// The median of at least one value; of an even number the larger one of the two in the middle.
+double median(std::vector<double> values);
+
+}  // namespace gp2

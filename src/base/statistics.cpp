@@ -1,0 +1,57 @@
+#include "gp2/base/statistics.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+
+namespace gp2 {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+
+namespace {
+
+// of(the measured entries) for each row, NaN where there are none
+template <typename Of>
+VectorXd over_measured(const Eigen::Ref<const MatrixXd>& values, const Of& of) {
+  VectorXd out(values.rows());
+  for (Index k = 0; k < out.size(); ++k) {
+    const std::vector<double> some = measured_entries(values, k);
+    out[k] = some.empty() ? std::numeric_limits<double>::quiet_NaN()
+                          : of(VectorXd(Eigen::Map<const VectorXd>(some.data(), std::ssize(some))));
+  }
+  return out;
+}
+
+}  // namespace
+
+std::vector<double> measured_entries(const Eigen::Ref<const MatrixXd>& values, Index k) {
+  std::vector<double> some;
+  some.reserve(static_cast<std::size_t>(values.cols()));
+  for (const double value : values.row(k)) {
+    if (!std::isnan(value)) some.push_back(value);
+  }
+  return some;
+}
+
+VectorXd row_mean(const Eigen::Ref<const MatrixXd>& values) {
+  if (!values.hasNaN()) return values.rowwise().mean();
+  return over_measured(values, [](const VectorXd& some) { return some.mean(); });
+}
+
+VectorXd row_stddev(const Eigen::Ref<const MatrixXd>& values) {
+  if (values.hasNaN()) {
+    return over_measured(values, [](const VectorXd& some) { return row_stddev(some.transpose())[0]; });
+  }
+  const VectorXd mean = values.rowwise().mean();
+  return (values.colwise() - mean).rowwise().squaredNorm().array().sqrt() / std::sqrt(static_cast<double>(values.cols()));
+}
+
+double median(std::vector<double> values) {
+  const auto middle = values.begin() + std::ssize(values) / 2;
+  std::nth_element(values.begin(), middle, values.end());
+  return *middle;
+}
+
+}  // namespace gp2

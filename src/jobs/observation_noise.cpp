@@ -1,0 +1,192 @@
+#include "jobs/observation_noise.hpp"
+
+#include <cmath>
+#include <limits>
+
+#include <fmt/format.h>
+#include <fmt/ranges.h>
+
+#include "gp2/error.hpp"
+#include "gp2/training/robust.hpp"
+
+namespace gp2 {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+
+namespace {
+
+// σ of a row of a group; refused where ε‖K̃‖ ≪ 1 could not hold at a signal of the given size
+struct NoiseRule {
+  std::string source, name;  // where σ comes from; the row
+  double signal = 0;         // its size
+  int n_data = 0;
+
+  // ‖K̃‖ ≤ Σ_i (signal/noise_i)²; a hundredth of the digits must be left
+  static constexpr double largest_norm = 0.01 / std::numeric_limits<double>::epsilon();
+
+  [[nodiscard]] double smallest() const { return signal * std::sqrt(static_cast<double>(n_data) / largest_norm); }
+
+  /// @param stddev  ∞ where nothing is measured
+  /// @param rows    of the log, of each value
+  void require_each(const Eigen::RowVectorXd& stddev, const std::vector<int>& rows) const {
+    if (!((signal / stddev.array()).square().sum() > largest_norm)) return;
+    Index worst = 0;
+    const double least = stddev.minCoeff(&worst);
+    throw InputError(
+        fmt::format("{}: data row {}: the noise standard deviation {} of {} is too small for double precision beside a spread of "
+                    "{:.3g}; the smallest usable value is {:.2g}",
+                    source, rows[static_cast<std::size_t>(worst)] + 1, least, name, signal, smallest()));
+  }
+
+  void require(double stddev, bool estimated) const {
+    if (!(stddev > 0) || !std::isfinite(stddev)) {
+      throw InputError(fmt::format("{}: the noise standard deviation of {} must be positive, got {}", source, name, stddev));
+    }
+    if (!estimated && stddev < smallest()) {
+      throw InputError(
+          fmt::format("{}: the noise standard deviation {} of {} is too small for double precision beside a spread "
+                      "of {:.3g}; the smallest usable value is {:.2g}",
+                      source, stddev, name, signal, smallest()));
+    }
+  }
+};
+
+std::vector<std::string> stddev_columns(const std::vector<std::string>& names, const LogReader& reader) {
+  std::vector<std::string> columns;
+  for (const std::string& name : names) columns.push_back(reader.stddev_column(name));
+  return columns;
+}
+
+// Standard deviation of each row, over the values that a robust fit does not distrust at sight.
+VectorXd spread_of(const Readings& readings, const FitProblemOptions& options) {
+  return row_stddev(options.robust ? without_gross_errors(readings.values) : readings.values);
+}
+
+// Size of G ā in each row of a view: the spread of the values or, for those that hardly vary, as exact zeros, what the prior
+// expects: its standard deviation, root mean square over the states, with the signals at their default scales.
+VectorXd signal_size(const LoggedSystem& logged, const Readings& readings, const std::vector<VectorXd>& signal_stddev) {
+  const Index n_data = readings.states.cols();
+  const MechanicsBatch mechanics = require_mechanics(logged.prior, readings.view, readings.states, logged.parameters);
+  const ViewValues view = evaluate_view(readings.view, mechanics, readings.states);
+  PriorValues prior = evaluate_prior(logged.prior, readings.states, logged.parameters, mechanics);
+  if (readings.view.latent >= 0) prior.keep_only(static_cast<std::size_t>(readings.view.latent));
+  VectorXd variance = VectorXd::Zero(readings.view.size());
+  for (int i = 0; i < n_data; ++i) {
+    for (std::size_t a = 0; a < signal_stddev.size(); ++a) {
+      variance += (view.G(i) * prior.E(a, i) * signal_stddev[a].asDiagonal()).rowwise().squaredNorm();
+    }
+  }
+  return (variance / n_data).cwiseSqrt().cwiseMax(row_stddev(readings.values - view.offset));
+}
+
+}  // namespace
+
+std::vector<std::string> stated_accelerations(const System& system, const LogReader& reader) {
+  std::vector<std::string> stated = system.acceleration_names();
+  std::erase_if(stated, [&](const std::string& name) { return reader.stddev_column(name).empty(); });
+  return stated;
+}
+
+bool estimates_factor(const FitProblemOptions& options) {
+  const bool can_estimate = options.protocol.name != Protocol::Name::paper && !options.baseline;
+  return can_estimate && (options.estimate_noise || !options.trust_stated_noise);
+}
+
+MatrixXd stated_noise(const std::vector<std::string>& observed, const FitProblemOptions& options, LogReader& reader,
+                      const CsvTable& log, std::vector<std::string>& notes) {
+  std::vector<std::string> stated;
+  for (const std::string& name : observed) {
+    if (!reader.stddev_column(name).empty()) stated.push_back(name);
+  }
+  if (stated.empty()) return {};
+  const std::vector<std::string> columns = stddev_columns(stated, reader);
+  if (options.noise_stddev) {
+    notes.push_back(fmt::format("{}: --noise-std {} stands for the deviations in {}", log.name(), *options.noise_stddev,
+                                fmt::join(columns, ", ")));
+    return {};
+  }
+  MatrixXd stddev =
+      MatrixXd::Constant(static_cast<Index>(observed.size()), log.n_rows(), std::numeric_limits<double>::quiet_NaN());
+  for (std::size_t k = 0; k < observed.size(); ++k) {
+    if (!reader.stddev_column(observed[k]).empty()) stddev.row(static_cast<Index>(k)) = reader.stddevs({observed[k]});
+  }
+  notes.push_back(fmt::format("{}: the noise of each value is that in {}{}", log.name(), fmt::join(columns, ", "),
+                              estimates_factor(options) ? ", times a factor that is estimated" : ""));
+  return stddev;
+}
+
+VectorXd noise_of(const Model& model, const FitProblemOptions& options, const Readings& readings, bool estimate) {
+  const VectorXd spread = spread_of(readings, options);
+  const std::vector<std::string> names = readings.view.names(*model.system);
+  const std::string source = options.noise_stddev ? "--noise-std" : model.name + ": [noise] ddq";
+  VectorXd stddev(readings.view.size());
+  for (Index k = 0; k < stddev.size(); ++k) {
+    const auto row = static_cast<std::size_t>(readings.view.rows[static_cast<std::size_t>(k)]);
+    const std::string& name = names[static_cast<std::size_t>(k)];
+    if (readings.states_noise(k)) {
+      stddev[k] = 1;
+      continue;
+    }
+    if (options.noise_stddev) {
+      stddev[k] = *options.noise_stddev;
+    } else if (!model.noise.stddev.empty()) {
+      stddev[k] = model.noise.stddev[row];
+    } else if (estimate) {
+      stddev[k] = 0.05 * (spread[k] > 0 ? spread[k] : 1);
+    } else {
+      throw InputError(
+          fmt::format("{}: the noise of {} is not known: write [noise] ddq = … in the model, or give --noise-std S or "
+                      "--noise-std estimate",
+                      model.name, name));
+    }
+    NoiseRule{source, name, spread[k], static_cast<int>(readings.states.cols())}.require(stddev[k], estimate);
+  }
+  return stddev;
+}
+
+MatrixXd noise_scale_of(const Readings& readings, const std::vector<std::string>& names, const FitProblemOptions& options,
+                        const LogReader& reader, const CsvTable& log, const std::vector<int>& rows) {
+  if (!readings.states_noise()) return {};
+  MatrixXd scale = readings.stated_stddev;
+  const VectorXd spread = spread_of(readings, options);
+  for (Index k = 0; k < scale.rows(); ++k) {
+    if (!readings.states_noise(k)) {
+      scale.row(k).setOnes();
+      continue;
+    }
+    const std::string& name = names[static_cast<std::size_t>(k)];
+    const auto is_measured = !readings.values.row(k).array().isNaN();
+    NoiseRule{fmt::format("{}: column '{}'", log.name(), reader.stddev_column(name)), name, spread[k],
+              static_cast<int>(scale.cols())}
+        .require_each(is_measured.select(scale.row(k), std::numeric_limits<double>::infinity()), rows);
+  }
+  return scale;
+}
+
+VectorXd noise_of_side_information(const LoggedSystem& logged, const SideInformation& side_information,
+                                   const FitProblemOptions& options, const Readings& readings,
+                                   const std::vector<VectorXd>& signal_stddev) {
+  using Quantity = View::Quantity;
+  const bool is_acceleration = side_information.quantity == Quantity::constrained_acceleration ||
+                               side_information.quantity == Quantity::unconstrained_acceleration;
+  const std::vector<double>& of_model = logged.model.noise.stddev;
+  if (!options.also_noise_stddev && (!is_acceleration || of_model.empty())) {
+    throw InputError(fmt::format("--also {}: {}: its noise is not known: give --also-noise-std S",
+                                 View::word(side_information.quantity), side_information.log.table.name()));
+  }
+  const std::string source = options.also_noise_stddev ? "--also-noise-std" : logged.model.name + ": [noise] ddq";
+  const std::vector<std::string> names = readings.view.names(logged.system(), side_information.latent);
+  const VectorXd signal = signal_size(logged, readings, signal_stddev);
+  VectorXd stddev(readings.view.size());
+  for (Index k = 0; k < stddev.size(); ++k) {
+    const auto row = static_cast<std::size_t>(k);
+    stddev[k] =
+        options.also_noise_stddev ? *options.also_noise_stddev : of_model[static_cast<std::size_t>(readings.view.rows[row])];
+    NoiseRule{source, names[row], signal[k], static_cast<int>(readings.states.cols())}.require(stddev[k], false);
+  }
+  return stddev;
+}
+
+}  // namespace gp2

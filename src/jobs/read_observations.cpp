@@ -1,0 +1,409 @@
+#include "jobs/read_observations.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <numeric>
+
+#include <fmt/format.h>
+#include <fmt/ranges.h>
+
+#include "base/random.hpp"
+#include "gp2/error.hpp"
+#include "gp2/mechanics/check.hpp"
+#include "gp2/mechanics/udwadia_kalaba.hpp"
+#include "gp2/simulation/projected_states.hpp"
+#include "jobs/observation_noise.hpp"
+
+namespace gp2 {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+
+namespace {
+
+std::map<std::string, std::string> columns_of(const Model& model, std::map<std::string, std::string> columns) {
+  columns.insert(model.columns.begin(), model.columns.end());
+  return columns;
+}
+
+// Whether a log has a column for this, with something in it.
+bool has_values(LogReader& reader, const CsvTable& log, const std::string& name) {
+  const int column = reader.column(name);
+  for (int row = 0; column >= 0 && row < log.n_rows(); ++row) {
+    if (!log.is_empty(row, column)) return true;
+  }
+  return false;
+}
+
+void note_reading(const LogReader& reader, const CsvTable& log, std::vector<std::string>& notes) {
+  for (const auto& [name, found] : reader.aliases_used()) notes.push_back(fmt::format("column '{}' taken as {}", found, name));
+  const std::vector<std::string> unused = reader.unused_columns();
+  if (!unused.empty()) notes.push_back(fmt::format("{}: columns not needed: {}", log.name(), fmt::join(unused, ", ")));
+}
+
+void note_violation(const System& system, const MatrixXd& states, const VectorXd& parameters, const CsvTable& log,
+                    std::vector<std::string>& notes) {
+  const auto violation = largest_violation(system, states, parameters);
+  if (!violation || violation->relative <= constraint_violation_tolerance) return;
+  notes.push_back(
+      fmt::format("warning: {}: states are off the constraint: '{}' is {:.3g} at data row {}, {:.1e} of its scale; see gp2 check",
+                  log.name(), violation->constraint, violation->value, violation->state + 1, violation->relative));
+}
+
+// The states, of the columns that a prior and a view need, and of those that only tell whether a state or a prediction is on the
+// constraint where the log has them.
+/// @param needs_residuals  whether what the constraints' residuals read is needed too
+MatrixXd states_of(const Prior& prior, const View& view, LogReader& reader, bool needs_residuals = false) {
+  std::vector<bool> reads = prior.reads();
+  const std::vector<bool> of_view = view.reads(*prior.system);
+  std::vector<bool> judged = prior.judge().reads(SystemPart::residuals);
+  if (prior.constrained_system) {
+    const std::vector<bool> constraints = prior.constrained_system->reads(SystemPart::mechanics);
+    for (std::size_t k = 0; k < judged.size(); ++k) judged[k] = judged[k] || constraints[k];
+  }
+  const std::vector<std::string> names = prior.system->state_names();
+  for (std::size_t k = 0; k < reads.size(); ++k) {
+    reads[k] = reads[k] || of_view[k] || (judged[k] && (needs_residuals || reader.has(names[k])));
+  }
+  return reader.states(reads);
+}
+
+std::vector<int> every_row(const CsvTable& log) {
+  std::vector<int> rows(static_cast<std::size_t>(log.n_rows()));
+  std::iota(rows.begin(), rows.end(), 0);
+  return rows;
+}
+
+// the first n of a shuffle of `rows`; all in order when n is no less
+std::vector<int> chosen_rows(const std::vector<int>& rows, int n, std::uint64_t seed) {
+  const int size = static_cast<int>(rows.size());
+  if (n >= size) return rows;
+  std::vector<int> chosen;
+  for (const int k : RandomStream(seed).permutation(size)) chosen.push_back(rows[static_cast<std::size_t>(k)]);
+  chosen.resize(static_cast<std::size_t>(n));
+  return chosen;
+}
+
+// The rows of a log with something measured. Values without a stated deviation where others of the column have one count as
+// not measured.
+std::vector<int> measured_rows(Readings& readings, const std::vector<std::string>& names, const CsvTable& log,
+                               std::vector<std::string>& notes) {
+  MatrixXd& values = readings.values;
+  std::vector<std::string> missing;
+  for (Index k = 0; k < values.rows(); ++k) {
+    Index n_without = 0;
+    if (readings.states_noise(k)) {
+      for (Index i = 0; i < values.cols(); ++i) {
+        if (std::isnan(values(k, i)) || !std::isnan(readings.stated_stddev(k, i))) continue;
+        values(k, i) = std::numeric_limits<double>::quiet_NaN();
+        ++n_without;
+      }
+    }
+    const Index n = values.row(k).array().isNaN().count();
+    if (n == 0) continue;
+    missing.push_back(fmt::format("{} of {} of {}{}", n, log.n_rows(), names[static_cast<std::size_t>(k)],
+                                  n_without > 0 ? fmt::format(" ({} for want of a deviation)", n_without) : ""));
+  }
+  if (missing.empty()) return every_row(log);
+  notes.push_back(fmt::format("{}: values not measured, their cells being empty: {}", log.name(), fmt::join(missing, ", ")));
+  std::vector<int> rows;
+  for (int i = 0; i < log.n_rows(); ++i) {
+    if (!values.col(i).array().isNaN().all()) rows.push_back(i);
+  }
+  const std::size_t n_left_out = static_cast<std::size_t>(log.n_rows()) - rows.size();
+  if (n_left_out > 0) notes.push_back(fmt::format("{}: {} rows left out: they measure nothing", log.name(), n_left_out));
+  return rows;
+}
+
+std::vector<int> lines_of(const std::vector<int>& rows, const CsvTable& log) {
+  std::vector<int> lines;
+  for (const int row : rows) lines.push_back(log.line(row));
+  return lines;
+}
+
+// the likelihood would refuse these states too, but it does not know their rows in the log. Where a constraint lets go at some of
+// them is counted
+void require_mechanics_at(const LoggedSystem& logged, const View& view, const MatrixXd& states, const std::vector<int>& rows,
+                          const CsvTable& log, std::vector<std::string>& notes) {
+  MechanicsBatch mechanics;
+  evaluate_mechanics(logged.prior, view, states, logged.parameters, mechanics);
+  const auto data_row = [&](int state) { return rows[static_cast<std::size_t>(state)] + 1; };
+  if (mechanics.fault) {
+    throw InputError(fmt::format("{}: data row {}: {} ('{}' with the model's parameters; see gp2 check)", log.name(),
+                                 data_row(mechanics.fault->state), mechanics.fault->text, logged.system().name()));
+  }
+  const LowerRank lower = states_of_lower_rank(mechanics);
+  if (lower.states.empty()) return;
+  notes.push_back(
+      fmt::format("warning: {}: the constraints have rank {} but at {} of {} rows, where it is as low as {}, first at "
+                  "data row {}; see gp2 check",
+                  log.name(), lower.usual, lower.states.size(), rows.size(), lower.lowest, data_row(lower.states.front())));
+}
+
+// --project: the states of a log moved onto the constraints, at the model's parameters
+void project(const LoggedSystem& logged, const CsvTable& log, MatrixXd& states, std::vector<std::string>& notes) {
+  const System& system = logged.system();
+  if (system.residual_labels().empty()) {
+    notes.push_back(
+        fmt::format("{}: nothing to project: '{}' has no position or velocity constraints", log.name(), system.name()));
+    return;
+  }
+  ProjectedStates projected = [&] {
+    try {
+      return project_states(system, logged.parameters, states);
+    } catch (const InputError& error) {
+      throw InputError(fmt::format("--project: {}: {}", log.name(), error.what()));
+    }
+  }();
+  if (!projected.failures.empty()) {
+    std::vector<std::string> lines;
+    for (const ProjectedStates::Failure& failure : projected.failures) {
+      if (lines.size() < 12) lines.push_back(std::to_string(log.line(failure.state)));
+    }
+    if (lines.size() < projected.failures.size()) lines.emplace_back("…");
+    throw InputError(fmt::format(
+        "--project: {}: {} of {} states have no state on the constraints near them (line {}): {}; mend or leave out "
+        "these rows, or see gp2 check",
+        log.name(), projected.failures.size(), log.n_rows(), fmt::join(lines, ", "), projected.failures.front().text));
+  }
+  const std::vector<std::string> names = system.state_names();
+  std::vector<std::string> shifts;
+  for (Index k = 0; k < projected.shift.rows(); ++k) {
+    const SizeSummary size = summarise_sizes(projected.shift.row(k));
+    if (size.largest == 0) continue;
+    shifts.push_back(fmt::format("{} by {:.2g} on average, {:.2g} at most (line {})", names[static_cast<std::size_t>(k)],
+                                 size.mean, size.largest, log.line(size.at)));
+  }
+  notes.push_back(fmt::format("{}: states projected onto the constraints: {}", log.name(),
+                              shifts.empty() ? "none moved" : fmt::format("{}", fmt::join(shifts, ", "))));
+  states = std::move(projected.states);
+}
+
+// which accelerations a fit observes
+std::vector<std::string> observed_accelerations(const System& system, const FitProblemOptions& options, const LogReader& reader,
+                                                const CsvTable& log, std::vector<std::string>& notes) {
+  if (!options.observe.empty() || options.baseline) return options.observe;
+  std::vector<std::string> stated = stated_accelerations(system, reader);
+  if (!stated.empty() && stated.size() < system.coordinates().size()) {
+    notes.push_back(fmt::format("{}: observes {}: the log gives the deviations of these alone; others with --observe", log.name(),
+                                fmt::join(stated, ", ")));
+  }
+  return stated;
+}
+
+// all accelerations, where the log has them and something constrains them; else empty
+MatrixXd all_accelerations(const System& system, LogReader& reader, const CsvTable& log) {
+  const std::vector<std::string> every = system.acceleration_names();
+  const auto all = [&](const auto& has) { return std::all_of(every.begin(), every.end(), has); };
+  const bool complete = system.nc() > 0 && all([&](const std::string& name) { return reader.has(name); }) &&
+                        all([&](const std::string& name) { return has_values(reader, log, name); });
+  return complete ? reader.measurements(every) : MatrixXd();
+}
+
+// accelerations that follow from others are no measurements
+void note_dependence(const LoggedSystem& logged, const MatrixXd& states, const MatrixXd& accelerations, std::size_t n_observed,
+                     const CsvTable& log, std::vector<std::string>& notes) {
+  if (accelerations.size() == 0) return;
+  const std::vector<std::string> every = logged.system().acceleration_names();
+  const auto independent = dependent_columns(logged.system(), states, logged.parameters, accelerations);
+  if (!independent || n_observed <= independent->size()) return;
+  std::vector<std::string> names;
+  for (int row : *independent) names.push_back(every[static_cast<std::size_t>(row)]);
+  notes.push_back(
+      fmt::format("warning: {}: the accelerations obey A ddq = b to rounding: they are not {} independent "
+                  "measurements but {}; observe independent rows only, say --observe {}",
+                  log.name(), every.size(), independent->size(), fmt::join(names, ",")));
+}
+
+// the rows of a view whose columns are there
+std::vector<int> side_information_rows(const View& view, const std::vector<std::string>& every, const LogReader& reader,
+                                       const std::string& option, const CsvTable& table, const System& system) {
+  std::vector<int> rows;
+  for (std::size_t k = 0; k < every.size(); ++k) {
+    if (reader.has(every[k])) rows.push_back(view.rows[k]);
+  }
+  if (every.empty()) throw InputError(fmt::format("{}: '{}' has no constraints", option, system.name()));
+  if (rows.empty()) {
+    throw InputError(fmt::format("{}: {} has none of the columns {}; it has: {}", option, table.name(), fmt::join(every, ", "),
+                                 fmt::join(table.header(), ", ")));
+  }
+  return rows;
+}
+
+}  // namespace
+
+void check_columns(const System& system, const std::vector<const CsvTable*>& logs,
+                   const std::map<std::string, std::string>& columns) {
+  std::vector<std::string> known = system.state_names();
+  for (const std::string& name : system.acceleration_names()) known.push_back(name);
+  for (const auto& [name, column] : columns) {
+    if (std::find(known.begin(), known.end(), name) == known.end()) {
+      throw InputError(fmt::format("--map {}={}: '{}' is neither a state nor an acceleration of '{}'; it has: {}", column, name,
+                                   name, system.name(), fmt::join(known, ", ")));
+    }
+    // a log may lack a coordinate that nothing reads, but then it has the coordinate's derivatives
+    std::vector<std::string> meant = {column};
+    const auto& coordinates = system.coordinates();
+    if (std::any_of(coordinates.begin(), coordinates.end(), [&name = name](const auto& one) { return one.name == name; })) {
+      meant = {column, "d" + column, "dd" + column, column + "_dot", column + "_ddot"};
+    }
+    std::vector<std::string> lacking;
+    for (const CsvTable* log : logs) {
+      if (std::any_of(meant.begin(), meant.end(), [&](const std::string& one) { return log->find(one) >= 0; })) break;
+      lacking.push_back(fmt::format("{} has no column '{}'; it has: {}", log->name(), column, fmt::join(log->header(), ", ")));
+    }
+    if (lacking.size() == logs.size()) throw InputError(fmt::format("--map {}={}: {}", column, name, fmt::join(lacking, "; ")));
+  }
+}
+
+LoggedSystem logged_system(const Model& fitted, const Prior& prior, const PriorOptions& options, const Log& log) {
+  if (!log.model) return {fitted, nullptr, nullptr, prior, fitted.system->parameter_values()};
+  std::shared_ptr<const OtherSystem> other_system = make_other_system(fitted, *log.model, options);
+  const Prior& there = other_system->prior;
+  VectorXd parameters = other_system->parameters(fitted.system->parameter_values());
+  return {*log.model, log.model, std::move(other_system), there, std::move(parameters)};
+}
+
+Observations read_log(const LoggedSystem& logged, const Log& log, const FitProblemOptions& options, std::vector<int>& lines,
+                      std::vector<std::string>& notes) {
+  const System& system = logged.system();
+  LogReader reader(log.table, system, columns_of(logged.model, options.columns));
+  Readings readings;
+  const std::vector<std::string> observe = observed_accelerations(system, options, reader, log.table, notes);
+  readings.view = {View::Quantity::constrained_acceleration, acceleration_rows(system, observe, "--observe"), 0, -1,
+                   logged.other_system};
+  readings.states = states_of(logged.prior, readings.view, reader, options.project);
+  const std::vector<std::string> observed = readings.view.names(system);
+  readings.values = reader.measurements(observed);
+  readings.stated_stddev = stated_noise(observed, options, reader, log.table, notes);
+  const MatrixXd all_values = all_accelerations(system, reader, log.table);
+  note_reading(reader, log.table, notes);
+  if (options.project) project(logged, log.table, readings.states, notes);
+  note_violation(system, readings.states, logged.parameters, log.table, notes);
+  note_dependence(logged, readings.states, all_values, observed.size(), log.table, notes);
+
+  const int n_rows = log.table.n_rows();
+  const std::vector<int> measured = measured_rows(readings, observed, log.table, notes);
+  const std::vector<int> rows = chosen_rows(measured, options.max_points.value_or(n_rows), options.seed);
+  if (rows.size() < measured.size()) {
+    notes.push_back(
+        fmt::format("{}: {} of {} rows taken, by seed {}", log.table.name(), rows.size(), measured.size(), options.seed));
+  }
+  if (static_cast<int>(rows.size()) < n_rows) readings.keep(rows);
+  lines = lines_of(rows, log.table);
+  require_mechanics_at(logged, readings.view, readings.states, rows, log.table, notes);
+
+  const bool model_estimates = logged.model.noise.estimate && !options.noise_stddev;
+  const bool estimate = readings.states_noise()
+                            ? estimates_factor(options)
+                            : options.protocol.name != Protocol::Name::paper && (options.estimate_noise || model_estimates);
+  VectorXd stddev = noise_of(logged.model, options, readings, estimate);
+  MatrixXd scale = noise_scale_of(readings, observed, options, reader, log.table, rows);
+  return {std::move(readings.states),
+          std::move(readings.view),
+          std::move(readings.values),
+          std::move(stddev),
+          estimate,
+          std::move(scale)};
+}
+
+Observations read_side_information(const LoggedSystem& logged, const Prior& fitted, const SideInformation& side_information,
+                                   const FitProblemOptions& options, const std::vector<VectorXd>& signal_stddev,
+                                   std::vector<int>& lines, std::vector<std::string>& notes) {
+  const System& system = logged.system();
+  const CsvTable& table = side_information.log.table;
+  const std::string option = "--also " + View::word(side_information.quantity);
+  Readings readings;
+  View& view = readings.view;
+  view = View::all(side_information.quantity, system);
+  view.other_system = logged.other_system;
+  if (!side_information.latent.empty()) view.latent = latent_index(fitted, side_information.latent, option);
+  if (side_information.quantity == View::Quantity::next_velocity) {
+    if (!options.time_step) throw InputError(option + " needs the time step: --dt SECONDS");
+    if (!(*options.time_step > 0)) throw InputError(fmt::format("--dt: must be positive, got {}", *options.time_step));
+    view.time_step = *options.time_step;
+  }
+  LogReader reader(table, system, columns_of(logged.model, options.columns));
+  view.rows = side_information_rows(view, view.names(system, side_information.latent), reader, option, table, system);
+  const std::vector<std::string> names = view.names(system, side_information.latent);
+  readings.values = reader.measurements(names);
+  readings.states = states_of(logged.prior, view, reader, options.project);
+  note_reading(reader, table, notes);
+  if (options.project) project(logged, table, readings.states, notes);
+  note_violation(system, readings.states, logged.parameters, table, notes);
+  const std::vector<int> measured = measured_rows(readings, names, table, notes);
+  readings.keep(measured);
+  lines = lines_of(measured, table);
+  require_mechanics_at(logged, view, readings.states, measured, table, notes);
+  VectorXd stddev = noise_of_side_information(logged, side_information, options, readings, signal_stddev);
+  return {std::move(readings.states), std::move(readings.view), std::move(readings.values), std::move(stddev)};
+}
+
+std::vector<int> acceleration_rows(const System& system, const std::vector<std::string>& names, const std::string& option) {
+  const std::vector<std::string> known = system.acceleration_names();
+  std::vector<int> rows;
+  for (const std::string& name : names.empty() ? known : names) {
+    const auto found = std::find(known.begin(), known.end(), name);
+    if (found == known.end()) {
+      throw InputError(fmt::format("{}: '{}' is not an acceleration of '{}'; it has: {}", option, name, system.name(),
+                                   fmt::join(known, ", ")));
+    }
+    const int row = static_cast<int>(found - known.begin());
+    if (std::find(rows.begin(), rows.end(), row) != rows.end())
+      throw InputError(fmt::format("{}: '{}' stands twice", option, name));
+    rows.push_back(row);
+  }
+  return rows;
+}
+
+int latent_index(const Prior& prior, const std::string& name, const std::string& option) {
+  std::vector<std::string> names;
+  for (const Latent& latent : prior.latents) names.push_back(latent.name);
+  const auto found = std::find(names.begin(), names.end(), name);
+  if (found == names.end()) {
+    throw InputError(fmt::format("{}: no latent is called '{}'; there is: {}", option, name, fmt::join(names, ", ")));
+  }
+  return static_cast<int>(found - names.begin());
+}
+
+LogReader open_log(const Model& model, const CsvTable& log, const std::map<std::string, std::string>& columns) {
+  check_columns(*model.system, {&log}, columns);
+  return {log, *model.system, columns_of(model, columns)};
+}
+
+LogStates read_log_states(const Prior& prior, const View& view, const Model& model, const CsvTable& log,
+                          const std::map<std::string, std::string>& columns, const std::vector<std::string>& accelerations) {
+  LogReader reader = open_log(model, log, columns);
+  LogStates out{states_of(prior, view, reader), reader.measurements(accelerations), {}};
+  note_reading(reader, log, out.notes);
+  note_violation(*prior.system, out.states, prior.system->parameter_values(), log, out.notes);
+  return out;
+}
+
+WholeLog read_whole_log(const Model& model, LogReader& reader) {
+  const System& system = *model.system;
+  std::vector<bool> reads = make_prior(model).reads();
+  const std::vector<std::string> names = system.state_names();
+  for (std::size_t k = 0; k < reads.size(); ++k) reads[k] = reads[k] || reader.has(names[k]);
+  WholeLog log;
+  log.states = reader.states(reads);
+  log.accelerations = MatrixXd::Constant(system.nq(), log.states.cols(), std::numeric_limits<double>::quiet_NaN());
+  Index row = 0;
+  for (const std::string& name : system.acceleration_names()) {
+    if (reader.has(name)) {
+      log.accelerations.row(row) = reader.measurements({name});
+    } else {
+      log.missing.push_back(name);
+    }
+    if (!reader.stddev_column(name).empty()) {
+      static_cast<void>(reader.stddevs({name}));
+      log.stated.push_back(static_cast<int>(row));
+    }
+    ++row;
+  }
+  return log;
+}
+
+}  // namespace gp2
