@@ -94,13 +94,13 @@ class Posterior {
 ///
 /// The noise of the new observations is their own, as it stands; that of earlier ones is by values().noise_stddev.
 /// Where both view and noise_stddev are those of an earlier group of observations() the new ones join it behind its last, if both
-/// have a noise_scale or neither has; else they are a new group, with its noise in values(). So Posterior(prior(),
+/// have a noise of each value or neither has; else they are a new group, with its noise in values(). So Posterior(prior(),
 /// observations(), values()) is always the posterior built anew.
 ///
 /// In place where no copy of `posterior` is held, by PathwiseSamples either; else a copy is changed and the others
 /// stay what they are. Memory is drawn for the factor only when what was set aside is full, and then for half as many rows again.
 ///
-/// @throws InputError when shapes do not fit, values are infinite or noise is not positive, and as the constructor; it and
+/// @throws InputError when the states are not as large as those of the system, and as the constructor; it and
 /// NumericalError leave `posterior` as it was. Otherwise it is empty, as after any move.
 [[nodiscard]] Posterior update(Posterior&& posterior, Observations added);
 

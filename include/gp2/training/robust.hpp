@@ -27,7 +27,7 @@ struct RobustOptions {
 /// distrusted is readmitted. Where more than half of a row's values are farther off than noise should be, distances are relative
 /// to theirs: a noise that is stated too small makes no outliers.
 ///
-/// @returns the fit; its posterior's observations hold the noise in noise_scale, and report.distrusted lists the values.
+/// @returns the fit; its posterior's observations hold it as scale of their Noise, and report.distrusted lists the values.
 /// @throws  as fit().
 Fit fit_robust(const Prior& prior, const std::vector<Observations>& observations,
                const std::vector<Hyperparameter>& hyperparameters, const FitOptions& options = {},
