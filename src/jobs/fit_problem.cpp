@@ -10,7 +10,6 @@
 #include <nlohmann/json.hpp>
 
 #include "base/random.hpp"
-#include "baselines/baseline_prior.hpp"
 #include "gp2/error.hpp"
 #include "gp2/mechanics/check.hpp"
 #include "gp2/mechanics/udwadia_kalaba.hpp"
@@ -85,9 +84,9 @@ void note_violation(const System& system, const MatrixXd& states, const VectorXd
 MatrixXd states_of(const Prior& prior, const View& view, LogReader& reader, bool needs_residuals = false) {
   std::vector<bool> reads = prior.reads();
   const std::vector<bool> of_view = view.reads(*prior.system);
-  std::vector<bool> judged = prior.judge().reads(SystemPart::residuals);
-  if (prior.constrained_system) {
-    const std::vector<bool> constraints = prior.constrained_system->reads(SystemPart::mechanics);
+  std::vector<bool> judged = prior.reference_system().reads(SystemPart::residuals);
+  if (prior.reference) {
+    const std::vector<bool> constraints = prior.reference->reads(SystemPart::mechanics);
     for (std::size_t k = 0; k < judged.size(); ++k) judged[k] = judged[k] || constraints[k];
   }
   const std::vector<std::string> names = prior.system->state_names();
@@ -167,7 +166,7 @@ struct Place {
   [[nodiscard]] const System& system() const { return *prior.system; }
 };
 
-Place place_of(const Model& home, const Prior& prior, const PriorOptions& options, const Log& log) {
+Place place_of(const Model& home, const Prior& prior, const FitPriorOptions& options, const Log& log) {
   if (!log.model) return {home, nullptr, nullptr, prior, home.system->parameter_values()};
   std::shared_ptr<const OtherSystem> other_system = make_other_system(home, *log.model, options);
   const Prior& there = other_system->prior;
@@ -637,7 +636,7 @@ void read_start(const std::filesystem::path& path, int max_iterations, FitProble
   }
   const std::vector<Hyperparameter> bounded = problem.hyperparameters;
   for (Hyperparameter& h : problem.hyperparameters) {
-    h.lower = h.is_positive() ? std::numeric_limits<double>::min() : std::numeric_limits<double>::lowest();
+    h.lower = h.positive ? std::numeric_limits<double>::min() : std::numeric_limits<double>::lowest();
     h.upper = std::numeric_limits<double>::max();
   }
   read_start_values(path, problem.hyperparameters);
