@@ -52,7 +52,7 @@ void likelihood_and_gradient(benchmark::State& state, const std::vector<std::str
   const gp2::ModelValues values = gp2::model_values(problem.prior, problem.observations, problem.hyperparameters);
   const gp2::Likelihood likelihood(problem.prior, problem.observations, values, options);
   gp2::Likelihood::Workspace workspace(n_threads);
-  gp2::ModelValues gradient;
+  gp2::ModelGradient gradient;
   for (auto _ : state) benchmark::DoNotOptimize(likelihood.evaluate(values, &gradient, workspace));
 }
 

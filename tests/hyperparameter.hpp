@@ -8,8 +8,7 @@ namespace gp2::test {
 
 inline Hyperparameter hyperparameter(Hyperparameter::Kind kind, const std::string& name, double value, double lower,
                                      double upper) {
-  Hyperparameter h;
-  h.kind = kind;
+  Hyperparameter h = Hyperparameter::of(kind, 0, 0);
   h.name = name;
   h.value = value;
   h.lower = lower;

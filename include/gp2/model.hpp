@@ -12,7 +12,6 @@
 
 #include <Eigen/Core>
 
-#include "gp2/baselines/baseline.hpp"
 #include "gp2/mechanics/symbolic_system.hpp"
 #include "gp2/prior.hpp"
 #include "gp2/robots/robot.hpp"
@@ -134,9 +133,8 @@ struct Discrepancy {
 
 struct PriorOptions {
   Prior::Mean mean = Prior::Mean::zero;
-  std::optional<Latent::Base> base;       // replaces the directions of the model's latent by the identity or M⁻¹
-  bool raw_angles = false;                // a feature that is an angle stays as it is instead of its sine and cosine
-  std::optional<Baseline> baseline = {};  // replaces latents, mean, constraints; of the model it keeps the features, angles raw
+  std::optional<Latent::Base> base;             // replaces the directions of the model's latent by the identity or M⁻¹
+  bool raw_angles = false;                      // a feature that is an angle stays as it is instead of its sine and cosine
   std::optional<Discrepancy> discrepancy = {};  // beside the model's one latent
 };
 

@@ -17,8 +17,7 @@ namespace gp2 {
 
 /// A group of independent zero-mean scalar Gaussian processes f(φ(x)) that share one kernel and act on ā through the p directions
 /// E(x) (nq × p) and a loading C: they add E(x) C f(φ(x)) to ā. C is diag(s), the signal standard deviations s_1 … s_p of p
-/// processes, or, where the directions are learned, C = [W, diag(√κ)] (p × (rank + p)): E C CᵀEᵀ = E (WWᵀ + diag κ) Eᵀ is the
-/// coregionalisation matrix of multi-output models.
+/// processes, or a free matrix (p × functions): E C CᵀEᵀ is then the coregionalisation matrix of multi-output models.
 struct Latent {
   enum class Base {
     acceleration,  // E = B
@@ -46,14 +45,14 @@ struct Latent {
   StateDerivatives feature_state_derivatives;    // state -> ∂φ/∂x
   StateDerivatives direction_state_derivatives;  // state, parameters -> ∂B/∂x; none where B = I
   bool directions_are_identity = true;           // B = I, p = nq
-  std::optional<int> learned_rank;               // columns of W; not given: C = diag(s)
+  std::optional<int> free_loading;               // columns of a free loading C; not given: C = diag(s)
   bool kernel_is_fixed = false;                  // the kernel's parameters are 1, in the units that its features have
   bool signal_is_fixed = false;                  // s = 1, in the units that its directions have
   Range lengthscale, signal_stddev;
 
   [[nodiscard]] int size() const { return static_cast<int>(column_names.size()); }  // p
   [[nodiscard]] int n_features() const { return static_cast<int>(feature_names.size()); }
-  [[nodiscard]] int n_functions() const { return size() + learned_rank.value_or(0); }  // columns of C
+  [[nodiscard]] int n_functions() const { return free_loading.value_or(size()); }  // columns of C
 };
 
 /// A Gaussian process prior on the unconstrained acceleration (Geist & Trimpe 2020, sec. 4):
@@ -72,11 +71,11 @@ struct Prior {
   std::vector<Latent> latents;
   Mean mean = Mean::zero;
   Eigen::VectorXd constant_mean;  // (nq), of Mean::constant
-  /// Where the prior ignores constraints, which `system` then lacks (baseline.hpp): the system with them. Null: `system` has all.
-  std::shared_ptr<const System> constrained_system = nullptr;
+  /// The system whose constraints predictions are held against, where the prior ignores them and `system` lacks them; null:
+  /// `system` itself.
+  std::shared_ptr<const System> reference = nullptr;
 
-  /// The system whose constraints predictions are held against.
-  [[nodiscard]] const System& judge() const { return constrained_system ? *constrained_system : *system; }
+  [[nodiscard]] const System& reference_system() const { return reference ? *reference : *system; }
 
   /// Which entries of a state the prior and the mechanics read (size layout().size()): the columns a data set must have.
   [[nodiscard]] std::vector<bool> reads() const;

@@ -63,38 +63,29 @@ constexpr Range lengthscale_range = {1, 0.5, 20}, signal_range = {0.5, 0.1, 1};
 // no more than limits of what double precision can hold
 constexpr Range mixing_range = {0.5, -1e4, 1e4}, sqrt_kappa_range = {0.5, 1e-8, 1e4};
 
-Hyperparameter hyperparameter(Kind kind, std::size_t owner, Index index, std::string name, const std::string& unit, Range range,
-                              double scale) {
-  Hyperparameter h;
-  h.kind = kind;
-  h.owner = static_cast<int>(owner);
-  h.index = static_cast<int>(index);
-  h.name = std::move(name);
-  h.unit = "unit of " + unit;
+void set_range(Hyperparameter& h, const Range& range, double scale) {
   h.value = range.initial * scale;
   h.lower = range.lower * scale;
   h.upper = range.upper * scale;
-  if (kind == Kind::mixing || kind == Kind::sqrt_kappa) h.scale = VectorXd::Constant(1, scale);
-  return h;
 }
 
 // W of the first latent starts as a multiple of the identity, outputs that know nothing of each other but columns that differ;
 // the others at zero, as in the published code, which holds them there
 void add_loading(const Latent& latent, std::size_t owner, const std::string& prefix, const VectorXd& scale,
                  std::vector<Hyperparameter>& out) {
-  for (Index column = 0; column < *latent.learned_rank; ++column) {
-    for (Index row = 0; row < latent.size(); ++row) {
-      const std::string& name = latent.column_names[static_cast<std::size_t>(row)];
-      Range range = mixing_range;
-      if (row != column || owner > 0) range.initial = 0;
-      out.push_back(hyperparameter(Kind::mixing, owner, row + latent.size() * column,
-                                   fmt::format("{}W({},{})", prefix, name, column + 1), name, range, scale[row]));
-    }
-  }
-  for (Index row = 0; row < latent.size(); ++row) {
-    const std::string& name = latent.column_names[static_cast<std::size_t>(row)];
-    out.push_back(hyperparameter(Kind::sqrt_kappa, owner, row, fmt::format("{}sqrt_kappa({})", prefix, name), name,
-                                 sqrt_kappa_range, scale[row]));
+  for (const LoadingEntry& entry : loading_entries(latent)) {
+    const bool is_kappa = entry.kind == LoadingEntry::Kind::sqrt_kappa;
+    const std::string& output = latent.column_names[static_cast<std::size_t>(entry.row)];
+    Hyperparameter h = Hyperparameter::of(Kind::loading, owner, static_cast<std::size_t>(entry.index_in_loading));
+    h.name =
+        is_kappa ? fmt::format("{}sqrt_kappa({})", prefix, output) : fmt::format("{}W({},{})", prefix, output, entry.column + 1);
+    h.unit = "unit of " + output;
+    h.positive = is_kappa;
+    h.size = scale[entry.row];
+    Range range = is_kappa ? sqrt_kappa_range : mixing_range;
+    if (!is_kappa && (entry.row != entry.column || owner > 0)) range.initial = 0;
+    set_range(h, range, h.size);
+    out.push_back(std::move(h));
   }
 }
 
@@ -178,6 +169,17 @@ Baseline standardised_by(const std::vector<Observations>& observations, const La
   return {kind, row_mean(pooled_values(observations)), features.rowwise().mean(), usable_stddev(features)};
 }
 
+const char* LoadingEntry::word(Kind kind) { return kind == Kind::mixing ? "mixing" : "sqrt_kappa"; }
+
+std::vector<LoadingEntry> loading_entries(const Latent& latent) {
+  if (!latent.free_loading) return {};
+  const int p = latent.size(), rank = *latent.free_loading - p;
+  std::vector<LoadingEntry> entries;
+  for (int k = 0; k < p * rank; ++k) entries.push_back({LoadingEntry::Kind::mixing, k % p, k / p, k, k});
+  for (int j = 0; j < p; ++j) entries.push_back({LoadingEntry::Kind::sqrt_kappa, j, j, j, (rank + j) * p + j});
+  return entries;
+}
+
 std::vector<Hyperparameter> baseline_hyperparameters(const Prior& prior, const std::vector<Observations>& observations) {
   const VectorXd output_stddev = usable_stddev(pooled_values(observations));
   std::vector<Hyperparameter> out;
@@ -188,16 +190,19 @@ std::vector<Hyperparameter> baseline_hyperparameters(const Prior& prior, const s
       const VectorXd feature_stddev = usable_stddev(pooled_features(observations, latent));
       for (std::size_t p = 0; p < latent.kernel.parameters().size(); ++p) {
         const Kernel::Parameter& parameter = latent.kernel.parameters()[p];
-        out.push_back(hyperparameter(Kind::kernel, a, static_cast<Index>(p), prefix + parameter.name,
-                                     latent.feature_names[static_cast<std::size_t>(parameter.feature)], lengthscale_range,
-                                     feature_stddev[parameter.feature]));
+        Hyperparameter& h = out.emplace_back(Hyperparameter::of(Kind::kernel, a, p));
+        h.name = prefix + parameter.name;
+        h.unit = "unit of " + latent.feature_names[static_cast<std::size_t>(parameter.feature)];
+        set_range(h, lengthscale_range, feature_stddev[parameter.feature]);
       }
     }
-    if (latent.learned_rank) {
+    if (latent.free_loading) {
       add_loading(latent, a, prefix, output_stddev, out);
     } else {
-      out.push_back(hyperparameter(Kind::signal_stddev, a, 0, prefix + "signal_stddev", latent.column_names.front(), signal_range,
-                                   output_stddev[static_cast<Index>(a)]));
+      Hyperparameter& h = out.emplace_back(Hyperparameter::of(Kind::signal_stddev, a, 0));
+      h.name = prefix + "signal_stddev";
+      h.unit = "unit of " + latent.column_names.front();
+      set_range(h, signal_range, output_stddev[static_cast<Index>(a)]);
     }
   }
   return out;

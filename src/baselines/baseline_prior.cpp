@@ -1,11 +1,12 @@
-#include "baselines/baseline_prior.hpp"
-
 #include <algorithm>
 
 #include <fmt/format.h>
 
+#include "gp2/baselines/baseline.hpp"
 #include "gp2/error.hpp"
 #include "model/latent_tapes.hpp"
+#include "model/other_system.hpp"
+#include "symbolic/graph.hpp"
 
 namespace gp2 {
 
@@ -59,6 +60,7 @@ Baseline unstandardised(const Model& model, Baseline::Kind kind) {
 }
 
 Prior make_baseline_prior(const Model& model, const Baseline& baseline) {
+  const internal::StepLimit limit;
   const System& system = *model.system;
   ExpressionGraph& graph = *model.graph;
   const Parts parts(model);
@@ -98,9 +100,22 @@ Prior make_baseline_prior(const Model& model, const Baseline& baseline) {
   }
   for (Latent& latent : prior.latents) {
     for (const Coordinate& coordinate : system.coordinates()) latent.column_names.push_back(coordinate.acceleration());
-    latent.learned_rank = static_cast<int>(n_outputs);
+    latent.free_loading = static_cast<int>(2 * n_outputs);  // [W, diag √κ]
   }
   return prior;
+}
+
+Prior make_prior(const Model& model, const FitPriorOptions& options) {
+  if (options.baseline) return make_baseline_prior(model, *options.baseline);
+  return make_prior(model, static_cast<const PriorOptions&>(options));
+}
+
+std::shared_ptr<const OtherSystem> make_other_system(const Model& home, const Model& other, const FitPriorOptions& options) {
+  if (!options.baseline) return make_other_system(home, other, static_cast<const PriorOptions&>(options));
+  const Prior at_home = make_baseline_prior(home, *options.baseline);
+  Prior there = make_baseline_prior(other, *options.baseline);
+  require_same_latents(home, at_home, other, there);
+  return share_parameters(home, at_home, other, std::move(there));
 }
 
 }  // namespace gp2

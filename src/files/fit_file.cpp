@@ -5,7 +5,6 @@
 #include <cmath>
 #include <limits>
 #include <set>
-#include <tuple>
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
@@ -34,13 +33,11 @@ constexpr const char* format_name = "gp2 fit";
 template <class Choice>
 using Named = std::pair<Choice, const char*>;
 
-constexpr std::array<Named<Kind>, 7> kinds = {{{Kind::kernel, "kernel"},
+constexpr std::array<Named<Kind>, 5> kinds = {{{Kind::kernel, "kernel"},
                                                {Kind::signal_stddev, "signal_stddev"},
                                                {Kind::shared_signal_stddev, "shared_signal_stddev"},
                                                {Kind::noise_stddev, "noise_stddev"},
-                                               {Kind::parameter, "parameter"},
-                                               {Kind::mixing, "mixing"},
-                                               {Kind::sqrt_kappa, "sqrt_kappa"}}};
+                                               {Kind::parameter, "parameter"}}};
 constexpr std::array<Named<Prior::Mean>, 2> means = {{{Prior::Mean::zero, "zero"}, {Prior::Mean::force, "force"}}};
 constexpr std::array<Named<std::optional<Latent::Base>>, 3> directions = {
     {{std::nullopt, "model"}, {Latent::Base::acceleration, "acceleration"}, {Latent::Base::force, "force"}}};
@@ -175,87 +172,137 @@ MatrixXd rows_from(const ParsedJson& json, const std::vector<std::string>& names
   return matrix;
 }
 
-Json hyperparameter_json(const Hyperparameter& h) {
-  Json json = {{"name", h.name},
-               {"value", h.value},
-               {"lower", h.lower},
-               {"upper", h.upper},
-               {"unit", h.unit},
-               {"at_bound", h.at_bound()},
-               {"kind", name_of(kinds, h.kind)},
-               {"owner", h.owner},
-               {"index", h.index}};
-  if (h.scale.size() > 0) json["scale"] = vector_json(h.scale);
-  if (h.log_stddev > 0) json["hyperprior"] = {{"median", h.median}, {"log_stddev", h.log_stddev}};
-  if (h.stddev > 0) json["hyperprior"] = {{"mean", h.median}, {"stddev", h.stddev}};
+// What a hyperparameter is called in the file. Entries of a free loading go by the names of baselines, which alone have one.
+struct Label {
+  std::string kind;
+  int owner, index;
+
+  auto operator<=>(const Label&) const = default;
+};
+
+std::string kind_word(const Hyperparameter& h) {
+  if (h.kind != Kind::loading) return name_of(kinds, h.kind);
+  return LoadingEntry::word(h.positive ? LoadingEntry::Kind::sqrt_kappa : LoadingEntry::Kind::mixing);
+}
+
+Label label_of(const Hyperparameter& h, const Prior& prior) {
+  Label label{kind_word(h), h.owner, h.index};
+  if (h.kind != Kind::loading) return label;
+  const std::vector<LoadingEntry> entries = loading_entries(prior.latents[static_cast<std::size_t>(h.owner)]);
+  const auto is_it = [&](const LoadingEntry& entry) { return entry.index_in_loading == h.index; };
+  label.index = std::find_if(entries.begin(), entries.end(), is_it)->index;
+  return label;
+}
+
+Json hyperprior_json(const HyperPrior& prior) {
+  const bool normal = prior.form == HyperPrior::Form::normal;
+  return {{normal ? "mean" : "median", prior.median}, {normal ? "stddev" : "log_stddev", prior.stddev}};
+}
+
+Json hyperparameter_json(const Hyperparameter& h, const Prior& prior) {
+  const Label label = label_of(h, prior);
+  Json json = {{"name", h.name},           {"value", h.value},   {"lower", h.lower},     {"upper", h.upper},    {"unit", h.unit},
+               {"at_bound", h.at_bound()}, {"kind", label.kind}, {"owner", label.owner}, {"index", label.index}};
+  if (h.column_scale.size() > 0) json["scale"] = vector_json(h.column_scale);
+  if (h.size > 0) json["scale"] = Json::array({h.size});
+  if (h.hyperprior.form != HyperPrior::Form::none) json["hyperprior"] = hyperprior_json(h.hyperprior);
   return json;
 }
 
+HyperPrior hyperprior_from(const ParsedJson& json) {
+  const bool normal = json.contains("mean");
+  HyperPrior prior{normal ? HyperPrior::Form::normal : HyperPrior::Form::log_normal, number(json.at(normal ? "mean" : "median")),
+                   number(json.at(normal ? "stddev" : "log_stddev"))};
+  return prior.stddev > 0 ? prior : HyperPrior{};
+}
+
+// The kind of a hyperparameter, and whether it is positive.
+Hyperparameter of_kind(const ParsedJson& json) {
+  for (const LoadingEntry::Kind kind : {LoadingEntry::Kind::mixing, LoadingEntry::Kind::sqrt_kappa}) {
+    if (json != LoadingEntry::word(kind)) continue;
+    Hyperparameter h = Hyperparameter::of(Kind::loading, 0, 0);
+    h.positive = kind == LoadingEntry::Kind::sqrt_kappa;
+    return h;
+  }
+  return Hyperparameter::of(choice_from(json, kinds, "kind of hyperparameter"), 0, 0);
+}
+
+// As it is labelled: locate_in_model finds the entry of a loading.
 Hyperparameter hyperparameter_from(const ParsedJson& json) {
-  Hyperparameter h;
+  Hyperparameter h = of_kind(json.at("kind"));
   json.at("name").get_to(h.name);
   json.at("unit").get_to(h.unit);
   h.value = number(json.at("value"));
   h.lower = number(json.at("lower"));
   h.upper = number(json.at("upper"));
-  h.kind = choice_from(json.at("kind"), kinds, "kind of hyperparameter");
   h.owner = integer(json.at("owner"));
   h.index = integer(json.at("index"));
-  if (json.contains("scale")) h.scale = vector_from(json.at("scale"));
-  if (json.contains("hyperprior")) {
-    const ParsedJson& prior = json.at("hyperprior");
-    const bool normal = prior.contains("mean");
-    h.median = number(prior.at(normal ? "mean" : "median"));
-    (normal ? h.stddev : h.log_stddev) = number(prior.at(normal ? "stddev" : "log_stddev"));
-  }
-  const bool needs_scale = h.kind == Kind::mixing || h.kind == Kind::sqrt_kappa;
-  if ((h.is_positive() && !(h.value > 0)) || !(h.scale.array() > 0).all() || (needs_scale && h.scale.size() != 1)) {
+  const VectorXd scale = json.contains("scale") ? vector_from(json.at("scale")) : VectorXd();
+  const bool has_size = h.kind == Kind::loading;
+  if ((h.positive && !(h.value > 0)) || !(scale.array() > 0).all() || (has_size && scale.size() != 1)) {
     throw InputError(fmt::format("hyperparameter '{}' has the impossible value {}", h.name, h.value));
   }
+  if (has_size) h.size = scale[0];
+  if (h.kind == Kind::shared_signal_stddev) h.column_scale = scale;
+  if (json.contains("hyperprior")) h.hyperprior = hyperprior_from(json.at("hyperprior"));
   return h;
 }
 
-// every hyperparameter belongs to something the model has, once, and every kernel and signal has its values
-void check_hyperparameters(const std::vector<Hyperparameter>& hyperparameters, const Prior& prior,
-                           const std::vector<Observations>& observations) {
-  std::set<std::tuple<Kind, int, int>> open;  // kind, owner, index
-  std::set<std::tuple<Kind, int, int>> optional;
-  const auto add = [](auto& set, Kind kind, std::size_t owner, std::size_t size) {
-    for (std::size_t k = 0; k < size; ++k) set.emplace(kind, static_cast<int>(owner), static_cast<int>(k));
-  };
-  for (std::size_t a = 0; a < prior.latents.size(); ++a) {
-    const Latent& latent = prior.latents[a];
-    if (!latent.kernel_is_fixed) add(open, Kind::kernel, a, latent.kernel.parameters().size());
-    if (latent.learned_rank) {
-      add(open, Kind::mixing, a, latent.column_names.size() * static_cast<std::size_t>(*latent.learned_rank));
-      add(open, Kind::sqrt_kappa, a, latent.column_names.size());
-    } else if (!latent.signal_is_fixed) {
-      add(open, Kind::signal_stddev, a, latent.column_names.size());
-    }
-  }
-  for (std::size_t group = 0; group < observations.size(); ++group) {
-    add(optional, Kind::noise_stddev, group, observations[group].view().rows.size());
-  }
-  add(optional, Kind::parameter, 0, prior.system->parameters().size());
+// Hyperparameters that a prior and its observations may have.
+struct Labels {
+  std::set<Label> needed, optional;
 
-  for (const Hyperparameter& h : hyperparameters) {
-    bool good = false;
-    if (h.kind == Kind::shared_signal_stddev) {
-      good = h.owner >= 0 && h.owner < static_cast<int>(prior.latents.size()) &&
-             h.scale.size() == prior.latents[static_cast<std::size_t>(h.owner)].size();
-      for (Index k = 0; good && k < h.scale.size(); ++k) {
-        good = open.erase({Kind::signal_stddev, h.owner, static_cast<int>(k)}) == 1;
+  Labels(const Prior& prior, const std::vector<Observations>& observations) {
+    const auto add = [](std::set<Label>& set, Kind kind, std::size_t owner, std::size_t size) {
+      for (std::size_t k = 0; k < size; ++k) set.insert({name_of(kinds, kind), static_cast<int>(owner), static_cast<int>(k)});
+    };
+    for (std::size_t a = 0; a < prior.latents.size(); ++a) {
+      const Latent& latent = prior.latents[a];
+      if (!latent.kernel_is_fixed) add(needed, Kind::kernel, a, latent.kernel.parameters().size());
+      for (const LoadingEntry& entry : loading_entries(latent)) {
+        needed.insert({LoadingEntry::word(entry.kind), static_cast<int>(a), entry.index});
       }
-    } else {
-      good = open.erase({h.kind, h.owner, h.index}) + optional.erase({h.kind, h.owner, h.index}) == 1;
+      if (!latent.free_loading && !latent.signal_is_fixed) add(needed, Kind::signal_stddev, a, latent.column_names.size());
     }
+    for (std::size_t group = 0; group < observations.size(); ++group) {
+      add(optional, Kind::noise_stddev, group, observations[group].view().rows.size());
+    }
+    add(optional, Kind::parameter, 0, prior.system->parameters().size());
+  }
+
+  // whether a label was there, and not taken before
+  bool take(const Label& label) { return needed.erase(label) + optional.erase(label) == 1; }
+
+  bool take_columns(const Hyperparameter& shared, const Prior& prior) {
+    bool good = shared.owner >= 0 && shared.owner < static_cast<int>(prior.latents.size()) &&
+                shared.column_scale.size() == prior.latents[static_cast<std::size_t>(shared.owner)].size();
+    for (int k = 0; good && k < shared.column_scale.size(); ++k) {
+      good = take({name_of(kinds, Kind::signal_stddev), shared.owner, k});
+    }
+    return good;
+  }
+};
+
+int index_in_loading(const Label& label, const Latent& latent) {
+  const std::vector<LoadingEntry> entries = loading_entries(latent);
+  const auto is_it = [&](const LoadingEntry& e) { return label.kind == LoadingEntry::word(e.kind) && label.index == e.index; };
+  return std::find_if(entries.begin(), entries.end(), is_it)->index_in_loading;
+}
+
+// every hyperparameter belongs to something the model has, once, and every kernel and signal has its values
+void locate_in_model(std::vector<Hyperparameter>& hyperparameters, const Prior& prior,
+                           const std::vector<Observations>& observations) {
+  Labels labels(prior, observations);
+  for (Hyperparameter& h : hyperparameters) {
+    const Label label{kind_word(h), h.owner, h.index};
+    const bool good = h.kind == Kind::shared_signal_stddev ? labels.take_columns(h, prior) : labels.take(label);
     if (!good) throw InputError(fmt::format("hyperparameter '{}' belongs to nothing in this model, or stands twice", h.name));
+    if (h.kind == Kind::loading) h.index = index_in_loading(label, prior.latents[static_cast<std::size_t>(h.owner)]);
   }
-  if (!open.empty()) {
-    const auto [kind, owner, index] = *open.begin();
-    throw InputError(fmt::format("{} {} of latent '{}' has no value", name_of(kinds, kind), index + 1,
-                                 prior.latents[static_cast<std::size_t>(owner)].name));
-  }
+  if (labels.needed.empty()) return;
+  const auto& [kind, owner, index] = *labels.needed.begin();
+  throw InputError(
+      fmt::format("{} {} of latent '{}' has no value", kind, index + 1, prior.latents[static_cast<std::size_t>(owner)].name));
 }
 
 constexpr const char* code = "code";
@@ -484,7 +531,8 @@ void FitFile::write(const std::filesystem::path& path) const {
                                     {"stddev", vector_json(prior_options.discrepancy->stddev)}};
   }
   json["hyperparameters"] = Json::array();
-  for (const Hyperparameter& h : report.hyperparameters) json["hyperparameters"].push_back(hyperparameter_json(h));
+  const Prior home = prior();
+  for (const Hyperparameter& h : report.hyperparameters) json["hyperparameters"].push_back(hyperparameter_json(h, home));
   json["report"] = {{"nll", report.negative_log_likelihood},
                     {"objective", report.objective},
                     {"converged", report.converged},
@@ -497,7 +545,6 @@ void FitFile::write(const std::filesystem::path& path) const {
   if (!options.empty()) json["options"] = Json::parse(options);
   json["data_source"] = data_source;
   json["observations"] = Json::array();
-  const Prior home = prior();
   for (std::size_t g = 0; g < observations.size(); ++g) {
     const Model* other = observations[g].view().other_system && g < systems.size() ? systems[g].get() : nullptr;
     if (observations[g].view().other_system && other == nullptr) {
@@ -565,7 +612,7 @@ FitFile read_fit(std::string_view text, const std::filesystem::path& path, const
       throw InputError("mechanics are given as code, but this fit has them as text: read it without");
     }
     for (const ParsedJson& h : array(json.at("hyperparameters"))) fit.report.hyperparameters.push_back(hyperparameter_from(h));
-    check_hyperparameters(fit.report.hyperparameters, prior, fit.observations);
+    locate_in_model(fit.report.hyperparameters, prior, fit.observations);
     const ParsedJson& report = json.at("report");
     fit.report.negative_log_likelihood = number(report.at("nll"));
     fit.report.objective = number(report.at("objective"));
@@ -643,7 +690,7 @@ void read_start_values(const std::filesystem::path& path, std::vector<Hyperparam
           fmt::format("{}: unknown hyperparameter '{}'; this fit has: {}", path.string(), name, fmt::join(known, ", ")));
     }
     // a value printed with a few digits less may lie a rounding outside
-    const double tolerance = 1e-9 * (h->is_positive() ? std::abs(value) : h->upper - h->lower);
+    const double tolerance = 1e-9 * (h->positive ? std::abs(value) : h->upper - h->lower);
     if (!(value >= h->lower - tolerance && value <= h->upper + tolerance)) {
       throw InputError(fmt::format("{}: {} = {} is outside its bounds [{}, {}]", path.string(), name, value, h->lower, h->upper));
     }

@@ -72,7 +72,7 @@ Evaluation evaluate_predictions(const Posterior& posterior, const Ref<const Matr
                                 int n_threads) {
   View all = View::all(View::Quantity::constrained_acceleration, *posterior.prior().system);
   all.other_system = other_system;
-  const System& system = prior_of(posterior.prior(), all).judge();
+  const System& system = prior_of(posterior.prior(), all).reference_system();
   const Posterior::Marginal prediction = posterior.marginal(all, states, n_threads);
   const MatrixXd stddev = prediction.stddev();
 

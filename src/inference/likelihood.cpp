@@ -20,11 +20,6 @@ using Eigen::Index;
 using Eigen::MatrixXd;
 using Eigen::VectorXd;
 
-MatrixXd ModelValues::loading(std::size_t a) const {
-  if (is_learned(a)) return mixing[a];
-  return signal_stddev[a].asDiagonal();
-}
-
 namespace {
 constexpr Index large_size = 2000;         // of a matrix that OpenBLAS works on faster with several threads
 constexpr std::size_t many_samples = 512;  // from here on threads pay in the sums over pairs of samples
@@ -120,23 +115,13 @@ int Likelihood::reduced_size() const { return implementation_->initial_size; }
 
 namespace {
 
-ModelValues zero_gradient(const ModelValues& values) {
-  ModelValues gradient = values;
-  for (VectorXd& v : gradient.kernel) v.setZero();
-  for (VectorXd& v : gradient.signal_stddev) v.setZero();
-  for (MatrixXd& C : gradient.mixing) C.setZero();
-  for (VectorXd& v : gradient.noise_stddev) v.setZero();
-  gradient.parameters.setZero();
-  return gradient;
-}
-
 // Sums over pairs of samples, i ≥ j, that the gradient is made of; S_ij = P_ij − α̃_iα̃_jᵀ, P = (K̃ + I)⁻¹. One for each part of the
 // work, added up in a fixed order.
 struct PairSums {
   struct OfLatent {
     MatrixXd kernel;  // ½ Σ_ij ⟨S_ij, Z_i Z_jᵀ⟩ ∂k_ij/∂log v             (lanes × parameters)
-    MatrixXd columns;  // ½ Σ_ij k_ij ⟨S_ij, ∂(Z_i Z_jᵀ)/∂log⟩ in a factor of each column of Z, where these are learned alike:
-                       // Σ_ij S_ij k_ij for each pair of components            (lanes × columns)
+    MatrixXd columns;  // ½ Σ_ij k_ij ⟨S_ij, ∂(Z_i Z_jᵀ)/∂log⟩ in a factor of each column of Z, where C is free and all samples
+                       // alike: Σ_ij S_ij k_ij for each pair of components            (lanes × columns)
     MatrixXd V;     // V_i = Σ_j S_ij Z_j k_ij, by component             (N × components·functions)
     MatrixXd mean;  // Σ_j k_ij Z_jᵀα̃_j                                  (N × functions)
   };
@@ -219,7 +204,7 @@ class PairSweep {
     const PairSweep& sweep;
     MatrixXd S;                  // of one pair of components; pairs off the diagonal count twice
     MatrixXd Sk;                 // S ∘ k
-    MatrixXd together;           // H where the directions are learned alike, before its factor
+    MatrixXd together;           // H where C is free and all samples alike, before its factor
     std::vector<MatrixXd> k, H;  // per latent; H_ij = ⟨S_ij, Z_i Z_jᵀ⟩
     VectorXd ones, z, projected, point;
     KernelColumns::Workspace workspace;
@@ -400,7 +385,7 @@ class SampleGradient {
     for (std::size_t a = 0; a < V_.size(); ++a) loading_.push_back(values.loading(a));
   }
 
-  void add(Index i, ModelValues& gradient) {
+  void add(Index i, ModelGradient& gradient) {
     const Reduction::Sample& sample = reduction_.samples[static_cast<std::size_t>(i)];
     const std::size_t group = static_cast<std::size_t>(sample.group);
     const ObservationModel& model = models_[group];
@@ -431,8 +416,8 @@ class SampleGradient {
     // S^{-1/2} scales the rows of W and e, and σ_k the whole row k of S^{1/2}
     if (options_.noise_gradient) {
       // a value of weight 0, which is not measured, has no log S
-      gradient.noise_stddev[group].array() += (whitening_.array() > 0).cast<double>() - d_e_.array() * sample.e.array() -
-                                              whitening_.array() * d_W_.cwiseProduct(G).rowwise().sum().array();
+      gradient.log_noise_stddev[group].array() += (whitening_.array() > 0).cast<double>() - d_e_.array() * sample.e.array() -
+                                                  whitening_.array() * d_W_.cwiseProduct(G).rowwise().sum().array();
     }
     if (options_.gradient_parameters.empty()) return;
 
@@ -472,7 +457,7 @@ class SampleGradient {
 
 }  // namespace
 
-double Likelihood::evaluate(const ModelValues& values, ModelValues* gradient, Workspace& workspace) const {
+double Likelihood::evaluate(const ModelValues& values, ModelGradient* gradient, Workspace& workspace) const {
   constexpr double infinity = std::numeric_limits<double>::infinity();
   const Implementation& self = *implementation_;
   Workspace::Implementation& work = *workspace.implementation_;
@@ -511,32 +496,33 @@ double Likelihood::evaluate(const ModelValues& values, ModelValues* gradient, Wo
   for (std::size_t a = 0; a < n_latents; ++a) {
     const Latent& latent = self.prior.latents[a];
     wanted[a].kernel = !latent.kernel_is_fixed && values.kernel[a].size() > 0;
-    wanted[a].alike = reduction.learned_alike[a] && !needs_V;
-    wanted[a].V = needs_V || (values.is_learned(a) && !wanted[a].alike);
+    wanted[a].alike = reduction.same_directions[a] && !needs_V;
+    wanted[a].V = needs_V || (values.has_free_loading(a) && !wanted[a].alike);
     wanted[a].columns = wanted[a].kernel || wanted[a].V || !latent.signal_is_fixed;
     wanted[a].mean = needs_V;
     n_functions.push_back(values.loading(a).cols());
   }
   const PairSums sums = PairSweep(reduction, work.K, alpha, work.kernels, work.Z, n_functions, wanted).run(n_threads);
 
-  *gradient = zero_gradient(values);
+  *gradient = ModelGradient::zero(values);
   const Index n_components = reduction.n_components();
   for (std::size_t a = 0; a < n_latents; ++a) {
-    if (wanted[a].kernel) gradient->kernel[a] = 0.5 * sums.latents[a].kernel.colwise().sum().transpose();
+    if (wanted[a].kernel) gradient->log_kernel[a] = 0.5 * sums.latents[a].kernel.colwise().sum().transpose();
     if (!wanted[a].columns) continue;
     const VectorXd columns = sums.latents[a].columns.colwise().sum();
     const Index p = self.prior.latents[a].size();
-    if (!values.is_learned(a)) {
-      gradient->signal_stddev[a] = columns;
+    if (!values.has_free_loading(a)) {
+      gradient->log_signal_stddev[a] = columns;
     } else if (wanted[a].alike) {
       // ∂NLL/∂C = ½ Dᵀ(G + Gᵀ)D C, G the sums of each pair of components, D the first sample's directions
       const MatrixXd D = work.D[a].row(0).reshaped(p, n_components).transpose();
       const MatrixXd G = columns.reshaped(n_components, n_components);
-      gradient->mixing[a] = 0.5 * D.transpose() * (G + G.transpose()) * D * values.loading(a);
+      gradient->free_loading[a] = 0.5 * D.transpose() * (G + G.transpose()) * D * values.loading(a);
     } else {
       const Index m = sums.latents[a].V.cols() / n_components;
       for (Index c = 0; c < n_components; ++c) {
-        gradient->mixing[a].noalias() += work.D[a].middleCols(c * p, p).transpose() * sums.latents[a].V.middleCols(c * m, m);
+        gradient->free_loading[a].noalias() +=
+            work.D[a].middleCols(c * p, p).transpose() * sums.latents[a].V.middleCols(c * m, m);
       }
     }
   }

@@ -151,14 +151,14 @@ void reduce(const Prior& prior, const std::vector<Observations>& observations, c
       }
     }
   }
-  reduction.learned_alike.clear();
+  reduction.same_directions.clear();
   for (std::size_t a = 0; a < prior.latents.size(); ++a) {
-    bool alike = prior.latents[a].learned_rank.has_value();
+    bool alike = prior.latents[a].free_loading.has_value();
     for (std::size_t c = 0; alike && c < reduction.count.size(); ++c) {
       const auto block = reduction.directions[a].middleRows(reduction.offset[c], reduction.count[c]);
       alike = reduction.count[c] == reduction.count.front() && (block.rowwise() - block.row(0)).isZero(0);
     }
-    reduction.learned_alike.push_back(alike);
+    reduction.same_directions.push_back(alike);
   }
 }
 

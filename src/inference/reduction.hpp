@@ -44,7 +44,7 @@ struct Reduction {
   std::vector<Eigen::Index> count, offset;  // per component; offset has one more entry, the reduced size
   Eigen::VectorXd y;                        // ỹ
   std::vector<Eigen::MatrixXd> directions;  // per latent: rows R_i E_a(x_i), without C  (size × p_a)
-  std::vector<bool> learned_alike;          // per latent: C is learned, and R_i E_a(x_i) is the same at every sample
+  std::vector<bool> same_directions;        // per latent: C is free, and R_i E_a(x_i) is the same at every sample
   double constant = 0;                      // Σ of the samples' own
 
   [[nodiscard]] Eigen::Index size() const { return offset.back(); }

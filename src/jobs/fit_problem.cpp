@@ -7,7 +7,6 @@
 #include <fmt/ranges.h>
 #include <nlohmann/json.hpp>
 
-#include "baselines/baseline_prior.hpp"
 #include "gp2/error.hpp"
 #include "gp2/training/laplace.hpp"
 #include "gp2/training/robust.hpp"
@@ -131,7 +130,7 @@ void read_start(const std::filesystem::path& path, int max_iterations, FitProble
   }
   const std::vector<Hyperparameter> bounded = problem.hyperparameters;
   for (Hyperparameter& h : problem.hyperparameters) {
-    h.lower = h.is_positive() ? std::numeric_limits<double>::min() : std::numeric_limits<double>::lowest();
+    h.lower = h.positive ? std::numeric_limits<double>::min() : std::numeric_limits<double>::lowest();
     h.upper = std::numeric_limits<double>::max();
   }
   read_start_values(path, problem.hyperparameters);

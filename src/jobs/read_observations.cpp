@@ -58,9 +58,9 @@ void note_violation(const System& system, const MatrixXd& states, const VectorXd
 MatrixXd states_of(const Prior& prior, const View& view, LogReader& reader, bool needs_residuals = false) {
   std::vector<bool> reads = prior.reads();
   const std::vector<bool> of_view = view.reads(*prior.system);
-  std::vector<bool> judged = prior.judge().reads(SystemPart::residuals);
-  if (prior.constrained_system) {
-    const std::vector<bool> constraints = prior.constrained_system->reads(SystemPart::mechanics);
+  std::vector<bool> judged = prior.reference_system().reads(SystemPart::residuals);
+  if (prior.reference) {
+    const std::vector<bool> constraints = prior.reference->reads(SystemPart::mechanics);
     for (std::size_t k = 0; k < judged.size(); ++k) judged[k] = judged[k] || constraints[k];
   }
   const std::vector<std::string> names = prior.system->state_names();
@@ -258,7 +258,7 @@ void check_columns(const System& system, const std::vector<const CsvTable*>& log
   }
 }
 
-LoggedSystem logged_system(const Model& fitted, const Prior& prior, const PriorOptions& options, const Log& log) {
+LoggedSystem logged_system(const Model& fitted, const Prior& prior, const FitPriorOptions& options, const Log& log) {
   if (!log.model) return {fitted, nullptr, nullptr, prior, fitted.system->parameter_values()};
   std::shared_ptr<const OtherSystem> other_system = make_other_system(fitted, *log.model, options);
   const Prior& there = other_system->prior;

@@ -15,7 +15,7 @@ void check_columns(const System& system, const std::vector<const CsvTable*>& log
                    const std::map<std::string, std::string>& columns);
 
 /// @param fitted  the model that is fitted, with its prior
-LoggedSystem logged_system(const Model& fitted, const Prior& prior, const PriorOptions& options, const Log& log);
+LoggedSystem logged_system(const Model& fitted, const Prior& prior, const FitPriorOptions& options, const Log& log);
 
 /// The accelerations that a log measures.
 /// @param lines  receives the line of each state in the log

@@ -15,7 +15,6 @@ namespace gp2 {
 using Eigen::Index;
 using Eigen::MatrixXd;
 using Eigen::VectorXd;
-using Kind = Hyperparameter::Kind;
 
 namespace {
 
@@ -56,13 +55,13 @@ class Differences {
   [[nodiscard]] const Hyperparameter& at(Index k) const {
     return hyperparameters_[static_cast<std::size_t>(free_[static_cast<std::size_t>(k)])];
   }
-  [[nodiscard]] bool is_parameter(Index k) const { return at(k).kind == Kind::parameter; }
+  [[nodiscard]] bool is_parameter(Index k) const { return at(k).is_system_parameter(); }
 
   // at most so long that `times` steps stay in the box
   [[nodiscard]] double within_box(Index k, double step, double times) const {
     const Hyperparameter& h = at(k);
-    const double x = to_internal(h, h.value);
-    return std::min({step, (x - to_internal(h, h.lower)) / times, (to_internal(h, h.upper) - x) / times});
+    const double x = h.coordinate();
+    return std::min({step, (x - h.lower_coordinate()) / times, (h.upper_coordinate() - x) / times});
   }
 
   // θ enters M, A and b in any way, within a box that may be much wider than what is known of it: the step is a thousandth of its
@@ -73,8 +72,7 @@ class Differences {
     const Hyperparameter& h = at(k);
     const double curvature = central(k, within_box(k, first, 1), workspace)[k];
     const double deviation = deviations / std::sqrt(std::max(std::abs(curvature), 1e-300));
-    const double step =
-        within_box(k, std::min(relative, std::max(relative * std::abs(h.value) / (h.upper - h.lower), deviation)), 2);
+    const double step = within_box(k, std::min(relative, std::max(relative * std::abs(h.value) / h.map().unit, deviation)), 2);
     return (4 * central(k, step, workspace) - central(k, 2 * step, workspace)) / 3;
   }
 
@@ -132,13 +130,13 @@ VectorXd scales_of_parameters(const Objective& objective, const VectorXd& x, con
                               Likelihood::Workspace& workspace) {
   VectorXd scales = VectorXd::Ones(x.size());
   VectorXd gradient = VectorXd::Zero(x.size()), gradient_there = gradient;
-  if (std::none_of(hyperparameters.begin(), hyperparameters.end(), [](const auto& h) { return h.kind == Kind::parameter; })) {
+  if (std::none_of(hyperparameters.begin(), hyperparameters.end(), [](const auto& h) { return h.is_system_parameter(); })) {
     return scales;
   }
   if (!std::isfinite(objective(x, &gradient, workspace))) return scales;
   for (Index k = 0; k < x.size(); ++k) {
     const Hyperparameter& h = hyperparameters[static_cast<std::size_t>(k)];
-    if (h.kind != Kind::parameter) continue;
+    if (!h.is_system_parameter()) continue;
     constexpr double step = 1e-5;  // of the box, away from the nearer bound
     VectorXd there = x;
     there[k] += x[k] < 0.5 ? step : -step;

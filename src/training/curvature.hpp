@@ -4,6 +4,7 @@
 
 #include <Eigen/Core>
 
+#include "gp2/fit.hpp"
 #include "training/objective.hpp"
 
 namespace gp2 {

@@ -22,38 +22,40 @@ namespace gp2 {
 
 using Eigen::Index;
 using Eigen::VectorXd;
-using Kind = Hyperparameter::Kind;
 
 namespace {
 
-// latents that have a W, but W = 0
-std::set<int> unmixed_latents(const std::vector<Hyperparameter>& hyperparameters) {
-  std::set<int> unmixed;
+// latents whose loading stands at the stationary point 0
+std::set<int> latents_at_zero(const std::vector<Hyperparameter>& hyperparameters) {
+  std::set<int> at_zero;
   for (const Hyperparameter& h : hyperparameters) {
-    if (h.kind == Kind::mixing) unmixed.insert(h.owner);
+    if (h.is_stationary_at_zero()) at_zero.insert(h.owner);
   }
   for (const Hyperparameter& h : hyperparameters) {
-    if (h.kind == Kind::mixing && h.value != 0) unmixed.erase(h.owner);
+    if (h.is_stationary_at_zero() && h.value != 0) at_zero.erase(h.owner);
   }
-  return unmixed;
+  return at_zero;
 }
 
-// a random start: log-normal about the first start where there is a hyper-prior, else even in the box (in logarithms for positive
-// values). The box of a mixing matrix is no more than a limit: its entries are drawn about their unit. Matrices
-// that are zero at the first start stay zero (see Training::release).
+// A random start: about the size where the box is no more than a limit, log-normal about the first start where the hyper-prior is
+// log-normal, else even in the box of the coordinate.
+double draw(const Hyperparameter& h, RandomStream& random) {
+  if (h.size > 0) {
+    const double relative = random.normal();
+    return std::clamp(h.size * (h.positive ? std::exp(relative) : relative), h.lower, h.upper);
+  }
+  if (h.hyperprior.form == HyperPrior::Form::log_normal) {
+    return std::clamp(h.value * std::exp(Protocol::Standard::start_log_stddev * random.normal()), h.lower, h.upper);
+  }
+  const double lower = h.lower_coordinate();
+  return h.value_at(lower + random.uniform() * (h.upper_coordinate() - lower));
+}
+
+// Loadings that are zero at the first start stay zero (see Training::release).
 std::vector<Hyperparameter> draw_start(std::vector<Hyperparameter> hyperparameters, RandomStream& random) {
-  const std::set<int> unmixed = unmixed_latents(hyperparameters);
+  const std::set<int> at_zero = latents_at_zero(hyperparameters);
   for (Hyperparameter& h : hyperparameters) {
-    if (h.kind == Kind::mixing) {
-      if (!unmixed.contains(h.owner)) h.value = std::clamp(h.scale[0] * random.normal(), h.lower, h.upper);
-    } else if (h.kind == Kind::sqrt_kappa) {
-      h.value = std::clamp(h.scale[0] * std::exp(random.normal()), h.lower, h.upper);
-    } else if (h.log_stddev > 0) {
-      h.value = std::clamp(h.value * std::exp(Protocol::Standard::start_log_stddev * random.normal()), h.lower, h.upper);
-    } else {
-      const double lower = to_internal(h, h.lower);
-      h.value = from_internal(h, lower + random.uniform() * (to_internal(h, h.upper) - lower));
-    }
+    if (!h.is_stationary_at_zero() || !at_zero.contains(h.owner)) h.value = draw(h, random);
   }
   return hyperparameters;
 }
@@ -69,8 +71,8 @@ class Training {
         results_(static_cast<std::size_t>(n_restarts())),
         fractions_(static_cast<std::size_t>(n_restarts()), 0.0) {
     for (const Hyperparameter& h : hyperparameters) {
-      box_.lower.push_back(to_internal(h, h.lower));
-      box_.upper.push_back(to_internal(h, h.upper));
+      box_.lower.push_back(h.lower_coordinate());
+      box_.upper.push_back(h.upper_coordinate());
     }
   }
 
@@ -103,13 +105,13 @@ class Training {
 
  private:
   [[nodiscard]] bool estimates_parameters() const {
-    return std::any_of(hyperparameters_.begin(), hyperparameters_.end(), [](const auto& h) { return h.kind == Kind::parameter; });
+    return std::any_of(hyperparameters_.begin(), hyperparameters_.end(), [](const auto& h) { return h.is_system_parameter(); });
   }
 
   // A parameter that data know to a millionth of its box bends the objective 10¹² times as much as a lengthscale, and
   // quasi-Newton steps stall: the optimiser sees it in units of what is known of it.
   LbfgsbResult optimise(int restart, const std::vector<Hyperparameter>& from, Likelihood::Workspace& workspace) {
-    return optimise(restart, from, scales_of_parameters(objective_, internal_values(from), from, workspace), workspace);
+    return optimise(restart, from, scales_of_parameters(objective_, coordinates(from), from, workspace), workspace);
   }
 
   LbfgsbResult optimise(int restart, const std::vector<Hyperparameter>& from, const VectorXd& scales,
@@ -128,7 +130,7 @@ class Training {
           gradient = gradient.cwiseProduct(scales);
           return value;
         },
-        internal_values(from).cwiseQuotient(scales), Eigen::Map<const VectorXd>(box_.lower.data(), n).cwiseQuotient(scales),
+        coordinates(from).cwiseQuotient(scales), Eigen::Map<const VectorXd>(box_.lower.data(), n).cwiseQuotient(scales),
         Eigen::Map<const VectorXd>(box_.upper.data(), n).cwiseQuotient(scales), options);
     result.x = result.x.cwiseProduct(scales);
     return result;
@@ -143,7 +145,7 @@ class Training {
       Likelihood::Workspace workspace(n_threads_);
       for (int attempt = 0;; ++attempt) {
         const std::vector<Hyperparameter>& at = results_[from];
-        const Curvature curvature = curvature_at(objective_, internal_values(at), at, n_side_by_side_);
+        const Curvature curvature = curvature_at(objective_, coordinates(at), at, n_side_by_side_);
         const bool may_go_on = attempt < n_attempts && reports_[from].iterations < options_.max_iterations && !stopped();
         if (curvature.distance_from_optimum() <= near || !may_go_on) {
           uncertainty_ = laplace_uncertainty(curvature, at);
@@ -164,7 +166,7 @@ class Training {
     results_[restart] = options_.max_iterations == 0 ? hyperparameters_ : objective_.at(result.x);
     RestartReport& report = reports_[restart];
     report.objective = result.value;
-    report.negative_log_likelihood = result.value - hyperprior(results_[restart], nullptr);
+    report.negative_log_likelihood = result.value - negative_log_hyperpriors(results_[restart], nullptr);
     report.iterations += result.iterations;
     report.evaluations += result.evaluations;
     report.failed_evaluations += result.failed_evaluations;
@@ -179,11 +181,11 @@ class Training {
     if (!std::isfinite(reports_[from].objective) || hyperparameters_.empty()) return false;
     if (reports_[from].iterations >= options_.max_iterations) return false;
     constexpr int n_points = 9;
-    const VectorXd x = internal_values(results_[from]);
-    // the box of a mixing matrix is no more than a limit, too wide to scan
+    const VectorXd x = coordinates(results_[from]);
+    // a box that is no more than a limit is too wide to scan
     std::vector<std::size_t> scanned;
     for (std::size_t k = 0; k < hyperparameters_.size(); ++k) {
-      if (hyperparameters_[k].kind != Kind::mixing && hyperparameters_[k].kind != Kind::sqrt_kappa) scanned.push_back(k);
+      if (hyperparameters_[k].size == 0) scanned.push_back(k);
     }
     if (scanned.empty()) return false;
     const auto moved = [&](int trial) {
@@ -233,20 +235,20 @@ class Training {
     fractions_[static_cast<std::size_t>(restart)] = 1;
   }
 
-  // Where W of a latent is zero so is its gradient: every run stays in that smaller model, which has fewer optima. From the best
-  // of them W is let go.
+  // Where the loading of a latent is zero so is its gradient: every run stays in that smaller model, which has fewer optima. From
+  // the best of them the loading is let go.
   void release() {
     const std::size_t from = best();
-    const std::set<int> unmixed = unmixed_latents(results_[from]);
-    if (unmixed.empty() || stopped() || reports_[from].iterations >= options_.max_iterations) return;
+    const std::set<int> at_zero = latents_at_zero(results_[from]);
+    if (at_zero.empty() || stopped() || reports_[from].iterations >= options_.max_iterations) return;
     constexpr int n_draws = 4;
-    constexpr double size = 0.1;
+    constexpr double share = 0.1;  // of its size
     std::vector<LbfgsbResult> drawn(n_draws);
     parallel_for(n_draws, n_side_by_side_, [&](int draw, int) {
       RandomStream random(options_.seed, static_cast<std::uint64_t>(n_restarts() + draw));
       std::vector<Hyperparameter> start = results_[from];
       for (Hyperparameter& h : start) {
-        if (h.kind == Kind::mixing && unmixed.contains(h.owner)) h.value = size * h.scale[0] * random.normal();
+        if (h.is_stationary_at_zero() && at_zero.contains(h.owner)) h.value = share * h.size * random.normal();
       }
       Likelihood::Workspace workspace;
       drawn[static_cast<std::size_t>(draw)] = optimise(static_cast<int>(from), start, workspace);

@@ -16,15 +16,10 @@ namespace gp2 {
 using Eigen::Index;
 using Eigen::MatrixXd;
 using Eigen::VectorXd;
-using Kind = Hyperparameter::Kind;
-
 namespace {
 
-// the unit of x in LaplaceUncertainty, as the optimiser sees it
-double unit_of(const Hyperparameter& h) {
-  if (h.kind == Kind::mixing) return h.scale[0];
-  return h.kind == Kind::parameter ? h.upper - h.lower : 1;
-}
+// of x in LaplaceUncertainty: its coordinate's unit, and 1 of logarithms
+double unit_of(const Hyperparameter& h) { return h.map().is_logarithm ? 1 : h.map().unit; }
 
 }  // namespace
 
@@ -64,7 +59,7 @@ LaplaceUncertainty laplace_uncertainty(const Prior& prior, const std::vector<Obs
                                        const std::vector<Hyperparameter>& hyperparameters, int n_threads) {
   const lapack::SingleThread single_thread;
   const Objective objective(prior, observations, hyperparameters);
-  return laplace_uncertainty(curvature_at(objective, internal_values(hyperparameters), hyperparameters, thread_count(n_threads)),
+  return laplace_uncertainty(curvature_at(objective, coordinates(hyperparameters), hyperparameters, thread_count(n_threads)),
                              hyperparameters);
 }
 
@@ -91,34 +86,27 @@ std::string changes_along(const std::vector<Hyperparameter>& hyperparameters, co
   return fmt::format("{}", fmt::join(changes, ", "));
 }
 
-}  // namespace
+void note_distance(double distance, std::vector<UncertaintyNote>& notes) {
+  constexpr double far = 0.5;  // standard deviations
+  if (!(distance > far)) return;
+  notes.push_back({true,
+                   fmt::format("the standard errors are rough: the optimiser stopped {}",
+                               std::isfinite(distance) ? fmt::format("{:.2g} standard deviations before the optimum", distance)
+                                                       : "where no optimum is near"),
+                   "Fit with a larger --max-iterations, or --start from this fit"});
+}
 
-std::vector<UncertaintyNote> uncertainty_notes(const FitReport& report) {
-  if (!report.uncertainty) return {};
-  const std::vector<Hyperparameter>& fitted = report.hyperparameters;
-  const LaplaceUncertainty& uncertainty = *report.uncertainty;
-  const auto name_of = [&](int k) { return fitted[static_cast<std::size_t>(k)].name; };
-  std::vector<int> parameters, open;
-  std::vector<std::string> names;  // of those that are open
-  for (int k = 0; k < static_cast<int>(fitted.size()); ++k) {
-    if (fitted[static_cast<std::size_t>(k)].kind != Kind::parameter) continue;
-    parameters.push_back(k);
+// Parameters that the data do not determine. Without hyper-priors combinations of other hyperparameters may be open too: of no
+// interest.
+void note_open_parameters(const std::vector<Hyperparameter>& fitted, const LaplaceUncertainty& uncertainty,
+                          const std::vector<int>& parameters, std::vector<UncertaintyNote>& notes) {
+  std::vector<int> open;
+  std::vector<std::string> names;
+  for (const int k : parameters) {
     if (!std::isinf(uncertainty.stddev[k])) continue;
     open.push_back(k);
-    names.push_back(name_of(k));
+    names.push_back(fitted[static_cast<std::size_t>(k)].name);
   }
-  std::vector<UncertaintyNote> notes;
-  constexpr double far = 0.5;  // standard deviations
-  if (uncertainty.distance_from_optimum > far) {
-    notes.push_back(
-        {true,
-         fmt::format("the standard errors are rough: the optimiser stopped {}",
-                     std::isfinite(uncertainty.distance_from_optimum)
-                         ? fmt::format("{:.2g} standard deviations before the optimum", uncertainty.distance_from_optimum)
-                         : "where no optimum is near"),
-         "Fit with a larger --max-iterations, or --start from this fit"});
-  }
-  // without hyper-priors combinations of other hyperparameters may be open too: of no interest
   std::vector<Index> combinations;
   for (Index c = 0; c < uncertainty.undetermined.cols() && !open.empty(); ++c) {
     if (uncertainty.undetermined.col(c)(open).cwiseAbs().maxCoeff() > 1e-6) combinations.push_back(c);
@@ -138,17 +126,38 @@ std::vector<UncertaintyNote> uncertainty_notes(const FitReport& report) {
                                  n_combinations),
                      fmt::format("Hold {} of them at known values, or give them priors", n_combinations)});
   }
+}
+
+// Pairs that the data hardly tell apart.
+void note_pairs(const std::vector<Hyperparameter>& fitted, const LaplaceUncertainty& uncertainty,
+                const std::vector<int>& parameters, std::vector<UncertaintyNote>& notes) {
   constexpr double alike = 0.98;
   for (const int k : parameters) {
     for (const int l : parameters) {
       const double correlation = uncertainty.correlation(k, l);
       if (l <= k || !(std::abs(correlation) > alike)) continue;
-      notes.push_back({false,
-                       fmt::format("{} and {} are known much better together than each by itself (correlation {:.4f})",
-                                   name_of(k), name_of(l), correlation),
-                       "Know one of them from elsewhere, and the other follows"});
+      notes.push_back(
+          {false,
+           fmt::format("{} and {} are known much better together than each by itself (correlation {:.4f})",
+                       fitted[static_cast<std::size_t>(k)].name, fitted[static_cast<std::size_t>(l)].name, correlation),
+           "Know one of them from elsewhere, and the other follows"});
     }
   }
+}
+
+}  // namespace
+
+std::vector<UncertaintyNote> uncertainty_notes(const FitReport& report) {
+  if (!report.uncertainty) return {};
+  const std::vector<Hyperparameter>& fitted = report.hyperparameters;
+  std::vector<int> parameters;
+  for (int k = 0; k < static_cast<int>(fitted.size()); ++k) {
+    if (fitted[static_cast<std::size_t>(k)].is_system_parameter()) parameters.push_back(k);
+  }
+  std::vector<UncertaintyNote> notes;
+  note_distance(report.uncertainty->distance_from_optimum, notes);
+  note_open_parameters(fitted, *report.uncertainty, parameters, notes);
+  note_pairs(fitted, *report.uncertainty, parameters, notes);
   return notes;
 }
 

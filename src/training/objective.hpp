@@ -4,17 +4,12 @@
 
 #include <Eigen/Core>
 
-#include "gp2/fit.hpp"
+#include "gp2/training/hyperparameter.hpp"
 
 namespace gp2 {
 
-/// What the optimiser sees of a hyperparameter: its logarithm, θ measured in widths of its box, an entry of W in its unit.
-double to_internal(const Hyperparameter& h, double value);
-/// Within the bounds.
-double from_internal(const Hyperparameter& h, double x);
-
-/// ½ Σ (log(value/median)/log_stddev)² + ½ Σ ((value − median)/stddev)², and its derivative in x added to `gradient`.
-double hyperprior(const std::vector<Hyperparameter>& hyperparameters, Eigen::VectorXd* gradient);
+/// −log of the hyper-priors at the hyperparameters' own values, and its derivative in their coordinates added to `gradient`.
+double negative_log_hyperpriors(const std::vector<Hyperparameter>& hyperparameters, Eigen::VectorXd* gradient);
 
 /// What training minimises: the negative log likelihood plus hyper-priors. Thread-safe.
 class Objective {
@@ -23,7 +18,7 @@ class Objective {
   Objective(const Prior& prior, const std::vector<Observations>& observations,
             const std::vector<Hyperparameter>& hyperparameters);
 
-  /// @param x         as the optimiser sees hyperparameters
+  /// @param x         the hyperparameters' coordinates
   /// @param gradient  in x, of the size of x; not computed when null; left as it was when the value is +∞
   double operator()(const Eigen::VectorXd& x, Eigen::VectorXd* gradient, Likelihood::Workspace& workspace) const;
 
@@ -37,7 +32,7 @@ class Objective {
   Likelihood likelihood_;
 };
 
-/// Their own values as the optimiser sees them.
-Eigen::VectorXd internal_values(const std::vector<Hyperparameter>& hyperparameters);
+/// x: where hyperparameters stand, in their coordinates.
+Eigen::VectorXd coordinates(const std::vector<Hyperparameter>& hyperparameters);
 
 }  // namespace gp2

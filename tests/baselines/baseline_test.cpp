@@ -1,5 +1,6 @@
 #include "gp2/baselines/baseline.hpp"
 
+#include <algorithm>
 #include <cmath>
 
 #include <gmock/gmock.h>
@@ -10,6 +11,7 @@
 #include "gp2/jobs/fit_problem.hpp"
 #include "reference_data.hpp"
 #include "test_models.hpp"
+#include "training/objective.hpp"
 
 namespace gp2 {
 namespace {
@@ -75,7 +77,7 @@ TEST(Baseline, LearnsTheAccelerationOfASystemWithoutConstraintsButIsJudgedByThem
   for (const Baseline::Kind kind : {Baseline::Kind::se, Baseline::Kind::icm, Baseline::Kind::lmc}) {
     const FitProblem p = problem(kind);
     EXPECT_EQ(p.prior.system->nc(), 0);
-    EXPECT_EQ(p.prior.judge().nc(), 1);
+    EXPECT_EQ(p.prior.reference_system().nc(), 1);
     const Observations& observed = p.observations.front();
     const VectorXd mean = observed.values().rowwise().mean();
     EXPECT_EQ(p.prior.constant_mean, mean);
@@ -113,6 +115,43 @@ TEST(Baseline, TunesWhatItsCovarianceIsMadeOf) {
   EXPECT_EQ(lmc.size(), 5 + 3 * 6U);
   EXPECT_THAT(lmc, AllOf(Contains("se.lengthscale(t)"), Contains("bias.W(ddq2,1)"), Contains("linear.sqrt_kappa(ddq1)")));
   EXPECT_THAT(lmc, Not(Contains(HasSubstr("linear.lengthscale"))));
+}
+
+TEST(Baseline, TheEntriesOfAFreeLoadingAreWAndTheDiagonalOfRootKappa) {
+  Latent latent;
+  latent.column_names = {"ddx", "ddy"};
+  EXPECT_TRUE(loading_entries(latent).empty());
+  latent.free_loading = 5;  // W of three columns
+  const std::vector<LoadingEntry> entries = loading_entries(latent);
+  ASSERT_EQ(entries.size(), 3 * 2 + 2U);
+  // where each stands in C (2 × 5)
+  MatrixXd C = MatrixXd::Zero(2, 5);
+  for (const LoadingEntry& entry : entries) C.reshaped()[entry.index_in_loading] = 1 + entry.index;
+  MatrixXd expected(2, 5);
+  expected << 1, 3, 5, 1, 0,  //
+      2, 4, 6, 0, 2;
+  EXPECT_EQ(C, expected);
+}
+
+TEST(Baseline, TheObjectiveHasTheGradientOfDifferences) {
+  const FitProblem p = problem(Baseline::Kind::lmc, "models/duffing.toml");
+  std::vector<Hyperparameter> start = p.hyperparameters;
+  RandomStream random(seed);
+  for (Hyperparameter& h : start) h.value = std::clamp(h.value + 0.2 * h.size * random.normal(), h.lower, h.upper);
+  const Objective objective(p.prior, p.observations, start);
+  const VectorXd x = coordinates(start);
+  VectorXd gradient(x.size());
+  Likelihood::Workspace workspace;
+  objective(x, &gradient, workspace);
+  for (Index k = 0; k < x.size(); ++k) {
+    SCOPED_TRACE(start[static_cast<std::size_t>(k)].name);
+    const auto at = [&](double there) -> VectorXd {
+      VectorXd moved = x;
+      moved[k] = there;
+      return VectorXd::Constant(1, objective(moved, nullptr, workspace));
+    };
+    EXPECT_TRUE(test::matches(gradient.segment(k, 1), test::central_difference(at, x[k], 0.1, 1e-12)));
+  }
 }
 
 TEST(Baseline, OfIndependentOutputsIsTrainedOneByOneAsItWouldBeTogether) {

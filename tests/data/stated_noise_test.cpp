@@ -137,7 +137,7 @@ TEST(StatedNoise, IsMultipliedByAFactorThatIsEstimatedUnlessItIsTrusted) {
   EXPECT_EQ(factor.name, "noise_stddev(ddx)");
   EXPECT_EQ(factor.unit, "stated deviation of ddx");
   EXPECT_EQ(factor.value, 1);
-  EXPECT_EQ(factor.median, 1);
+  EXPECT_EQ(factor.hyperprior.median, 1);
   // the smallest deviation stays above 1e-6 of the spread, the usual one below twice the spread
   const double spread = row_stddev(problem.observations.front().values())[0];
   EXPECT_DOUBLE_EQ(factor.lower, 1e-6 * spread / 0.01);

@@ -149,8 +149,10 @@ TEST(FitFile, TheReportSurvives) {
   for (std::size_t k = 0; k < fit.report.hyperparameters.size(); ++k) {
     const Hyperparameter& a = fit.report.hyperparameters[k];
     const Hyperparameter& b = read.report.hyperparameters[k];
-    EXPECT_EQ(std::tie(a.kind, a.owner, a.index, a.name, a.unit, a.value, a.lower, a.upper, a.median, a.log_stddev, a.stddev),
-              std::tie(b.kind, b.owner, b.index, b.name, b.unit, b.value, b.lower, b.upper, b.median, b.log_stddev, b.stddev));
+    EXPECT_EQ(std::tie(a.kind, a.owner, a.index, a.name, a.unit, a.value, a.lower, a.upper, a.positive, a.size),
+              std::tie(b.kind, b.owner, b.index, b.name, b.unit, b.value, b.lower, b.upper, b.positive, b.size));
+    EXPECT_EQ(std::tie(a.hyperprior.form, a.hyperprior.median, a.hyperprior.stddev),
+              std::tie(b.hyperprior.form, b.hyperprior.median, b.hyperprior.stddev));
   }
 }
 

@@ -62,7 +62,7 @@ Learned learned(const Case& c) {
   RandomStream random(seed);
   const Model model = sledge(c.constraint, "\"acceleration\"");
   Learned p{make_prior(model), {}, {}};
-  for (Latent& latent : p.prior.latents) latent.learned_rank = 1;
+  for (Latent& latent : p.prior.latents) latent.free_loading = 1 + latent.size();  // [W, diag √κ] of one column W
   for (const View& view : c.views) {
     MatrixXd states(model.system->layout().size(), n_data);
     for (double& entry : states.reshaped()) entry = random.normal();
@@ -70,7 +70,7 @@ Learned learned(const Case& c) {
   }
   p.values = test::random_values(p.prior, p.observations, random);
   for (const Latent& latent : p.prior.latents) {
-    MatrixXd& C = p.values.mixing.emplace_back(MatrixXd::Zero(latent.size(), latent.n_functions()));
+    MatrixXd& C = p.values.free_loading.emplace_back(MatrixXd::Zero(latent.size(), latent.n_functions()));
     C.col(0) = test::random_vector(latent.size(), random);
     for (Index j = 0; j < latent.size(); ++j) C(j, 1 + j) = 0.5 + random.uniform();
   }
@@ -82,11 +82,11 @@ TEST(LearnedDirections, AreThoseOfAPriorThatHasThemWritten) {
     SCOPED_TRACE(c.name);
     const Learned p = learned(c);
     Likelihood::Workspace workspace;
-    for (std::size_t a = 0; a < p.values.mixing.size(); ++a) ASSERT_EQ(p.values.mixing[a].cols(), 3);
+    for (std::size_t a = 0; a < p.values.free_loading.size(); ++a) ASSERT_EQ(p.values.free_loading[a].cols(), 3);
     // both latents need the same text: they are compared with the loading of the first in both
     ModelValues values = p.values;
-    values.mixing[1] = values.mixing[0];
-    const MatrixXd& C = values.mixing[0];
+    values.free_loading[1] = values.free_loading[0];
+    const MatrixXd& C = values.free_loading[0];
     std::string text = "[";
     for (Index row = 0; row < C.rows(); ++row) {
       text += fmt::format("{}[\"{}\", \"{}\", \"{}\"]", row > 0 ? ", " : "", shortest(C(row, 0)), shortest(C(row, 1)),
@@ -94,7 +94,7 @@ TEST(LearnedDirections, AreThoseOfAPriorThatHasThemWritten) {
     }
     const Prior written = make_prior(sledge(c.constraint, text + "]"));
     ModelValues as_written = values;
-    as_written.mixing.clear();
+    as_written.free_loading.clear();
     for (VectorXd& s : as_written.signal_stddev) s = VectorXd::Ones(3);
     const double expected = Likelihood(written, p.observations, as_written, {}).evaluate(as_written, nullptr, workspace);
     const double value = Likelihood(p.prior, p.observations, values, {}).evaluate(values, nullptr, workspace);
@@ -117,7 +117,7 @@ TEST(LearnedDirections, HaveTheGradientOfDifferences) {
       options.noise_gradient = noise_gradient;
       const Likelihood likelihood(p.prior, p.observations, p.values, options);
       Likelihood::Workspace workspace;
-      ModelValues gradient;
+      ModelGradient gradient;
       likelihood.evaluate(p.values, &gradient, workspace);
       const auto expect_match = [&](double analytic, const auto& member, bool positive) {
         const double value = member(p.values);
@@ -130,16 +130,16 @@ TEST(LearnedDirections, HaveTheGradientOfDifferences) {
         EXPECT_TRUE(test::matches(VectorXd::Constant(1, analytic), difference));
         EXPECT_GT(std::abs(analytic), 10 * difference.error[0]) << "a gradient that is zero tests nothing";
       };
-      for (std::size_t a = 0; a < p.values.mixing.size(); ++a) {
-        for (Index k = 0; k < p.values.mixing[a].size(); ++k) {
+      for (std::size_t a = 0; a < p.values.free_loading.size(); ++a) {
+        for (Index k = 0; k < p.values.free_loading[a].size(); ++k) {
           SCOPED_TRACE(fmt::format("entry {} of the loading of latent {}", k, a));
           expect_match(
-              gradient.mixing[a].reshaped()[k], [&](auto& v) -> auto& { return v.mixing[a].data()[k]; }, false);
+              gradient.free_loading[a].reshaped()[k], [&](auto& v) -> auto& { return v.free_loading[a].data()[k]; }, false);
         }
         for (Index k = 0; k < p.values.kernel[a].size(); ++k) {
           SCOPED_TRACE(fmt::format("parameter {} of the kernel of latent {}", k, a));
           expect_match(
-              gradient.kernel[a][k], [&](auto& v) -> auto& { return v.kernel[a][k]; }, true);
+              gradient.log_kernel[a][k], [&](auto& v) -> auto& { return v.kernel[a][k]; }, true);
         }
       }
     }
@@ -149,14 +149,14 @@ TEST(LearnedDirections, HaveTheGradientOfDifferences) {
 TEST(LearnedDirections, AFixedKernelHasNoGradientButTheSameLoadings) {
   Learned p = learned(cases()[0]);
   Likelihood::Workspace workspace;
-  ModelValues free, fixed;
+  ModelGradient free, fixed;
   const double value = Likelihood(p.prior, p.observations, p.values, {}).evaluate(p.values, &free, workspace);
   p.prior.latents[1].kernel_is_fixed = true;
   EXPECT_EQ(Likelihood(p.prior, p.observations, p.values, {}).evaluate(p.values, &fixed, workspace), value);
-  EXPECT_TRUE(fixed.kernel[1].isZero(0));
-  EXPECT_FALSE(free.kernel[1].isZero(0));
-  EXPECT_EQ(fixed.kernel[0], free.kernel[0]);
-  EXPECT_EQ(fixed.mixing[1], free.mixing[1]);
+  EXPECT_TRUE(fixed.log_kernel[1].isZero(0));
+  EXPECT_FALSE(free.log_kernel[1].isZero(0));
+  EXPECT_EQ(fixed.log_kernel[0], free.log_kernel[0]);
+  EXPECT_EQ(fixed.free_loading[1], free.free_loading[1]);
 }
 
 }  // namespace

@@ -20,7 +20,7 @@ class Gradient {
     value_ = likelihood_.evaluate(problem.values, &gradient_, workspace_);
   }
 
-  [[nodiscard]] const ModelValues& analytic() const { return gradient_; }
+  [[nodiscard]] const ModelGradient& analytic() const { return gradient_; }
 
   // `member` picks the number out of ModelValues; positive ones are differentiated in their logarithm
   template <typename Member>
@@ -57,7 +57,7 @@ class Gradient {
   const Problem& problem_;
   Likelihood likelihood_;
   Likelihood::Workspace workspace_;
-  ModelValues gradient_;
+  ModelGradient gradient_;
   double value_ = 0;
   double condition_ = test::condition(problem_);
   int n_nonzero_ = 0;
@@ -90,12 +90,12 @@ void expect_gradient(const Problem& p) {
     for (Index k = 0; k < p.values.kernel[a].size(); ++k) {
       gradient.expect_match(
           p.prior.latents[a].name + ": " + p.prior.latents[a].kernel.parameters()[static_cast<std::size_t>(k)].name,
-          gradient.analytic().kernel[a][k], [&](auto& v) -> auto& { return v.kernel[a][k]; }, true);
+          gradient.analytic().log_kernel[a][k], [&](auto& v) -> auto& { return v.kernel[a][k]; }, true);
     }
     for (Index l = 0; l < p.values.signal_stddev[a].size(); ++l) {
       gradient.expect_match(
           fmt::format("{}: signal of {}", p.prior.latents[a].name, p.prior.latents[a].column_names[static_cast<std::size_t>(l)]),
-          gradient.analytic().signal_stddev[a][l], [&](auto& v) -> auto& { return v.signal_stddev[a][l]; }, true);
+          gradient.analytic().log_signal_stddev[a][l], [&](auto& v) -> auto& { return v.signal_stddev[a][l]; }, true);
     }
     n_expected_nonzero += static_cast<int>(p.values.kernel[a].size());
   }
@@ -103,7 +103,7 @@ void expect_gradient(const Problem& p) {
     for (Index k = 0; k < p.values.noise_stddev[g].size(); ++k) {
       gradient.expect_match(
           fmt::format("noise {} of group {}", k, g),
-          gradient.analytic().noise_stddev[g][k], [&](auto& v) -> auto& { return v.noise_stddev[g][k]; }, true);
+          gradient.analytic().log_noise_stddev[g][k], [&](auto& v) -> auto& { return v.noise_stddev[g][k]; }, true);
       ++n_expected_nonzero;
     }
   }
@@ -164,14 +164,15 @@ TEST(LikelihoodGradientTest, IsTheSameToTheBitOnAnyNumberOfThreads) {
     options.gradient_parameters = {0};
     const Likelihood likelihood(p.prior, p.observations, p.values, options);
     ASSERT_LT(likelihood.reduced_size(), 2000) << "larger matrices are factored on several threads";
-    ModelValues gradient, other;
+    ModelGradient gradient, other;
     Likelihood::Workspace one(1), three(3);
     EXPECT_EQ(likelihood.evaluate(p.values, &gradient, one), likelihood.evaluate(p.values, &other, three));
-    for (std::size_t a = 0; a < gradient.kernel.size(); ++a) {
-      EXPECT_EQ(gradient.kernel[a], other.kernel[a]);
-      EXPECT_EQ(gradient.signal_stddev[a], other.signal_stddev[a]);
+    for (std::size_t a = 0; a < gradient.log_kernel.size(); ++a) {
+      EXPECT_EQ(gradient.log_kernel[a], other.log_kernel[a]);
+      EXPECT_EQ(gradient.log_signal_stddev[a], other.log_signal_stddev[a]);
     }
-    for (std::size_t g = 0; g < gradient.noise_stddev.size(); ++g) EXPECT_EQ(gradient.noise_stddev[g], other.noise_stddev[g]);
+    for (std::size_t g = 0; g < gradient.log_noise_stddev.size(); ++g)
+      EXPECT_EQ(gradient.log_noise_stddev[g], other.log_noise_stddev[g]);
     EXPECT_EQ(gradient.parameters, other.parameters);
     break;
   }
@@ -180,21 +181,21 @@ TEST(LikelihoodGradientTest, IsTheSameToTheBitOnAnyNumberOfThreads) {
 TEST(LikelihoodGradientTest, IsAllThatWasAskedForAndZeroElsewhere) {
   const Problem p = test::problems(9, seed).front();
   Likelihood::Workspace workspace;
-  ModelValues gradient;
+  ModelGradient gradient;
   Likelihood(p.prior, p.observations, p.values, {}).evaluate(p.values, &gradient, workspace);
   EXPECT_TRUE(gradient.parameters.isZero(0));
-  EXPECT_TRUE(gradient.noise_stddev[0].isZero(0));
-  EXPECT_FALSE(gradient.kernel[0].isZero(0));
+  EXPECT_TRUE(gradient.log_noise_stddev[0].isZero(0));
+  EXPECT_FALSE(gradient.log_kernel[0].isZero(0));
   EXPECT_EQ(gradient.parameters.size(), p.values.parameters.size());
 
   // the same numbers whether or not the rest is asked for
   Likelihood::Options options;
   options.noise_gradient = true;
   options.gradient_parameters = {1};
-  ModelValues more;
+  ModelGradient more;
   Likelihood(p.prior, p.observations, p.values, options).evaluate(p.values, &more, workspace);
-  EXPECT_EQ(more.kernel, gradient.kernel);
-  EXPECT_EQ(more.signal_stddev, gradient.signal_stddev);
+  EXPECT_EQ(more.log_kernel, gradient.log_kernel);
+  EXPECT_EQ(more.log_signal_stddev, gradient.log_signal_stddev);
   EXPECT_EQ(more.parameters[0], 0);
 }
 
@@ -211,11 +212,11 @@ TEST(LikelihoodGradientTest, IsFiniteWhenEverySampleIsAtRest) {
     options.noise_gradient = true;
     for (int k = 0; k < static_cast<int>(p.values.parameters.size()); ++k) options.gradient_parameters.push_back(k);
     Likelihood::Workspace workspace;
-    ModelValues gradient;
+    ModelGradient gradient;
     EXPECT_TRUE(std::isfinite(Likelihood(p.prior, p.observations, p.values, options).evaluate(p.values, &gradient, workspace)));
-    for (const VectorXd& g : gradient.kernel) EXPECT_TRUE(g.allFinite());
-    for (const VectorXd& g : gradient.signal_stddev) EXPECT_TRUE(g.allFinite());
-    for (const VectorXd& g : gradient.noise_stddev) EXPECT_TRUE(g.allFinite());
+    for (const VectorXd& g : gradient.log_kernel) EXPECT_TRUE(g.allFinite());
+    for (const VectorXd& g : gradient.log_signal_stddev) EXPECT_TRUE(g.allFinite());
+    for (const VectorXd& g : gradient.log_noise_stddev) EXPECT_TRUE(g.allFinite());
     EXPECT_TRUE(gradient.parameters.allFinite());
   }
 }

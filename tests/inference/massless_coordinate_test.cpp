@@ -90,16 +90,18 @@ TEST(MasslessCoordinate, HasTheLikelihoodTheGradientTheFitAndThePredictionsOfThe
   Likelihood::Options options;
   options.noise_gradient = true;
   options.gradient_parameters = {0, 1, 2};
-  ModelValues gradient, expected;
+  ModelGradient gradient, expected;
   Likelihood::Workspace workspace, other_workspace;
   const double nll = Likelihood(prior, {here}, start, options).evaluate(start, &gradient, workspace);
   const double expected_nll = Likelihood(without, {there}, start, options).evaluate(start, &expected, other_workspace);
   // both are the same numbers, rounded on other ways: ε times the condition of K̃ + I, below 30 (0.3/0.2)²
   const double rounding = 1e5 * eps;
   EXPECT_NEAR(nll, expected_nll, rounding * std::abs(nll));
-  EXPECT_LE(largest(gradient.kernel[0] - expected.kernel[0]), rounding * (1 + largest(expected.kernel[0])));
-  EXPECT_LE(largest(gradient.signal_stddev[0] - expected.signal_stddev[0]), rounding * (1 + largest(expected.signal_stddev[0])));
-  EXPECT_LE(largest(gradient.noise_stddev[0] - expected.noise_stddev[0]), rounding * (1 + largest(expected.noise_stddev[0])));
+  EXPECT_LE(largest(gradient.log_kernel[0] - expected.log_kernel[0]), rounding * (1 + largest(expected.log_kernel[0])));
+  EXPECT_LE(largest(gradient.log_signal_stddev[0] - expected.log_signal_stddev[0]),
+            rounding * (1 + largest(expected.log_signal_stddev[0])));
+  EXPECT_LE(largest(gradient.log_noise_stddev[0] - expected.log_noise_stddev[0]),
+            rounding * (1 + largest(expected.log_noise_stddev[0])));
   EXPECT_LE(largest(gradient.parameters - expected.parameters), rounding * (1 + largest(expected.parameters)));
   EXPECT_GT(expected.parameters.cwiseAbs().minCoeff(), 0.01);
 
@@ -151,7 +153,7 @@ TEST(MasslessCoordinate, HasTheExactGradientOfTheLikelihoodInEveryParameter) {
     options.gradient_parameters = {0, 1, 2};
     const Likelihood likelihood(p.prior, p.observations, p.values, options);
     Likelihood::Workspace workspace;
-    ModelValues gradient;
+    ModelGradient gradient;
     likelihood.evaluate(p.values, &gradient, workspace);
     const auto expect = [&](double analytic, const auto& member, bool positive) {
       const double value = member(p.values);
@@ -173,9 +175,9 @@ TEST(MasslessCoordinate, HasTheExactGradientOfTheLikelihoodInEveryParameter) {
     }
     for (int k = 0; k < 3; ++k) {
       expect(
-          gradient.signal_stddev[0][k], [k](auto& values) -> auto& { return values.signal_stddev[0][k]; }, true);
+          gradient.log_signal_stddev[0][k], [k](auto& values) -> auto& { return values.signal_stddev[0][k]; }, true);
       expect(
-          gradient.noise_stddev[1][k], [k](auto& values) -> auto& { return values.noise_stddev[1][k]; }, true);
+          gradient.log_noise_stddev[1][k], [k](auto& values) -> auto& { return values.noise_stddev[1][k]; }, true);
     }
   }
 }

@@ -81,7 +81,7 @@ Likelihood::Options every_derivative(const Problem& p) {
 
 struct Evaluated {
   double value = 0;
-  ModelValues gradient;
+  ModelGradient gradient;
 };
 
 Evaluated evaluate(const Problem& p) {
@@ -141,10 +141,10 @@ TEST(MissingValuesTest, GapsAreTheSameAsAViewOfItsOwnForEachState) {
     const Evaluated got = evaluate(p), expected = evaluate(apart);
     EXPECT_NEAR(got.value, expected.value, rounding(p) * (1 + std::abs(expected.value)));
     for (std::size_t a = 0; a < p.prior.latents.size(); ++a) {
-      EXPECT_LE(largest(got.gradient.kernel[a] - expected.gradient.kernel[a]),
-                rounding(p) * (1 + largest(expected.gradient.kernel[a])));
-      EXPECT_LE(largest(got.gradient.signal_stddev[a] - expected.gradient.signal_stddev[a]),
-                rounding(p) * (1 + largest(expected.gradient.signal_stddev[a])));
+      EXPECT_LE(largest(got.gradient.log_kernel[a] - expected.gradient.log_kernel[a]),
+                rounding(p) * (1 + largest(expected.gradient.log_kernel[a])));
+      EXPECT_LE(largest(got.gradient.log_signal_stddev[a] - expected.gradient.log_signal_stddev[a]),
+                rounding(p) * (1 + largest(expected.gradient.log_signal_stddev[a])));
     }
     const MatrixXd mean = posterior_of(apart).mean(every_acceleration(p), p.queries);
     EXPECT_LE(largest(posterior_of(p).mean(every_acceleration(p), p.queries) - mean), rounding(p) * (1 + largest(mean)));
@@ -157,7 +157,7 @@ TEST(MissingValuesTest, TheGradientIsThatOfTheLikelihood) {
     SCOPED_TRACE(fmt::format("{}, seed {}", p.name, seed));
     const Likelihood likelihood(p.prior, p.observations, p.values, every_derivative(p));
     Likelihood::Workspace workspace;
-    ModelValues gradient;
+    ModelGradient gradient;
     const double value = likelihood.evaluate(p.values, &gradient, workspace);
     const auto expect_match = [&](double analytic, double x, bool positive, const auto& member) {
       const auto at = [&](double moved) -> VectorXd {
@@ -174,7 +174,7 @@ TEST(MissingValuesTest, TheGradientIsThatOfTheLikelihood) {
     for (std::size_t g = 0; g < p.observations.size(); ++g) {
       for (Index k = 0; k < p.values.noise_stddev[g].size(); ++k) {
         SCOPED_TRACE(fmt::format("noise {} of group {}", k, g));
-        expect_match(gradient.noise_stddev[g][k], p.values.noise_stddev[g][k], true,
+        expect_match(gradient.log_noise_stddev[g][k], p.values.noise_stddev[g][k], true,
                      [&](ModelValues& v) -> double& { return v.noise_stddev[g][k]; });
       }
     }
@@ -201,7 +201,7 @@ TEST(MissingValuesTest, WhatStandsBesideAGapChangesNoBit) {
     const Evaluated expected = evaluate(p), got = evaluate(other);
     EXPECT_EQ(got.value, expected.value);
     for (std::size_t g = 0; g < p.observations.size(); ++g) {
-      EXPECT_EQ(got.gradient.noise_stddev[g], expected.gradient.noise_stddev[g]);
+      EXPECT_EQ(got.gradient.log_noise_stddev[g], expected.gradient.log_noise_stddev[g]);
     }
   }
 }

@@ -26,7 +26,7 @@ std::vector<Problem> problems() {
 
 struct Evaluated {
   double value = 0;
-  ModelValues gradient;
+  ModelGradient gradient;
 };
 
 // under every derivative there is
@@ -76,8 +76,8 @@ TEST(ValueNoiseTest, AScaleOfOneChangesNoBit) {
     }
     const Evaluated expected = evaluate(p), got = evaluate(scaled);
     EXPECT_EQ(got.value, expected.value);
-    EXPECT_EQ(got.gradient.kernel, expected.gradient.kernel);
-    EXPECT_EQ(got.gradient.noise_stddev, expected.gradient.noise_stddev);
+    EXPECT_EQ(got.gradient.log_kernel, expected.gradient.log_kernel);
+    EXPECT_EQ(got.gradient.log_noise_stddev, expected.gradient.log_noise_stddev);
     EXPECT_EQ(got.gradient.parameters, expected.gradient.parameters);
     const Posterior plain = posterior_of(p), of_scaled = posterior_of(scaled);
     EXPECT_EQ(of_scaled.negative_log_likelihood(), plain.negative_log_likelihood());
@@ -96,9 +96,9 @@ TEST(ValueNoiseTest, OnlyTheProductOfFactorAndScaleCounts) {
     const Evaluated expected = evaluate(p), got = evaluate(other);
     EXPECT_NEAR(got.value, expected.value, rounding(p) * (1 + std::abs(expected.value)));
     for (std::size_t g = 0; g < p.observations.size(); ++g) {
-      EXPECT_LE(largest(got.gradient.noise_stddev[g] - expected.gradient.noise_stddev[g]),
-                rounding(p) * (1 + largest(expected.gradient.noise_stddev[g])));
-      EXPECT_FALSE(expected.gradient.noise_stddev[g].isZero(1e-3));
+      EXPECT_LE(largest(got.gradient.log_noise_stddev[g] - expected.gradient.log_noise_stddev[g]),
+                rounding(p) * (1 + largest(expected.gradient.log_noise_stddev[g])));
+      EXPECT_FALSE(expected.gradient.log_noise_stddev[g].isZero(1e-3));
     }
     const MatrixXd mean = posterior_of(p).mean(every_acceleration(p), p.queries);
     EXPECT_LE(largest(posterior_of(other).mean(every_acceleration(p), p.queries) - mean), rounding(p) * (1 + largest(mean)));

@@ -5,7 +5,6 @@
 #include <gmock/gmock.h>
 #include <nlohmann/json.hpp>
 
-#include "baselines/baseline_prior.hpp"
 #include "callable_surface.hpp"
 #include "gp2/files/fit_file.hpp"
 #include "gp2/inference/likelihood.hpp"
@@ -200,7 +199,7 @@ std::vector<Observations> observations_of(int n) {
 
 struct Evaluated {
   double value = 0;
-  ModelValues gradient;
+  ModelGradient gradient;
 };
 
 Evaluated evaluated(const Model& model, const PriorOptions& options = {}) {
@@ -232,8 +231,8 @@ TEST(CodeMechanics, HaveTheLikelihoodAndItsGradient) {
       // ε^(2/3) ≈ 4e-11 of sums that cancel to a part in a hundred
       EXPECT_NEAR(differenced.gradient.parameters[p], expected, 1e-8 * text.gradient.parameters.cwiseAbs().maxCoeff());
     }
-    expect_close(code.gradient.kernel[0], text.gradient.kernel[0], 1e-11);
-    expect_close(code.gradient.noise_stddev[0], text.gradient.noise_stddev[0], 1e-11);
+    expect_close(code.gradient.log_kernel[0], text.gradient.log_kernel[0], 1e-11);
+    expect_close(code.gradient.log_noise_stddev[0], text.gradient.log_noise_stddev[0], 1e-11);
   }
 }
 
@@ -291,10 +290,10 @@ TEST(CodeMechanics, AFitSurvivesParametersWithoutAFiniteNumber) {
 }
 
 TEST(CodeMechanics, ServeAsABaselineAndWithADiscrepancy) {
-  PriorOptions baseline, discrepancy;
+  FitPriorOptions baseline, discrepancy;
   baseline.baseline = unstandardised(text_model(), Baseline::Kind::se);
   discrepancy.discrepancy = {VectorXd::Constant(9, 0.5), VectorXd::Constant(3, 0.01)};
-  for (const PriorOptions& options : {baseline, discrepancy}) {
+  for (const FitPriorOptions& options : {baseline, discrepancy}) {
     const double expected = evaluated(text_model(), options).value;
     EXPECT_NEAR(evaluated(code_model(), options).value, expected, 1e-12 * std::abs(expected));
   }

@@ -257,8 +257,9 @@ TEST(Discrepancy, LeavesNothingToTuneAndTheNamesAsTheyAre) {
   for (std::size_t k = 0; k < a.hyperparameters.size(); ++k) {
     const Hyperparameter &with = a.hyperparameters[k], &alone = b.hyperparameters[k];
     names.push_back(with.name);
-    EXPECT_EQ(std::tie(with.name, with.unit, with.value, with.lower, with.upper, with.median, with.log_stddev),
-              std::tie(alone.name, alone.unit, alone.value, alone.lower, alone.upper, alone.median, alone.log_stddev));
+    EXPECT_EQ(std::tie(with.name, with.unit, with.value, with.lower, with.upper, with.hyperprior.median, with.hyperprior.stddev),
+              std::tie(alone.name, alone.unit, alone.value, alone.lower, alone.upper, alone.hyperprior.median,
+                       alone.hyperprior.stddev));
   }
   EXPECT_THAT(names,
               ElementsAre("lengthscale(x)", "lengthscale(dx)", "lengthscale(u)", "signal_stddev(ddx)", "signal_stddev(ddy)"));

@@ -228,7 +228,7 @@ RC_GTEST_PROP(GpProperty, TheGradientIsThatOfDifferenceQuotients, ()) {
   options.gradient_parameters = {0};
   const Likelihood likelihood(p.prior, p.observations, p.values, options);
   Likelihood::Workspace workspace;
-  ModelValues gradient;
+  ModelGradient gradient;
   const double value = likelihood.evaluate(p.values, &gradient, workspace);
   RC_ASSERT(std::isfinite(value));
   const double precision = 64 * eps * p.mechanics_condition * (1 + test::condition(p) / 100);
@@ -248,17 +248,17 @@ RC_GTEST_PROP(GpProperty, TheGradientIsThatOfDifferenceQuotients, ()) {
   for (std::size_t a = 0; a < p.prior.latents.size(); ++a) {
     for (Index k = 0; k < p.values.kernel[a].size(); ++k) {
       compare(
-          "kernel", gradient.kernel[a][k], [&](auto& v) -> auto& { return v.kernel[a][k]; }, true);
+          "kernel", gradient.log_kernel[a][k], [&](auto& v) -> auto& { return v.kernel[a][k]; }, true);
     }
     for (Index l = 0; l < p.values.signal_stddev[a].size(); ++l) {
       compare(
-          "signal", gradient.signal_stddev[a][l], [&](auto& v) -> auto& { return v.signal_stddev[a][l]; }, true);
+          "signal", gradient.log_signal_stddev[a][l], [&](auto& v) -> auto& { return v.signal_stddev[a][l]; }, true);
     }
   }
   for (std::size_t g = 0; g < p.observations.size(); ++g) {
     for (Index k = 0; k < p.values.noise_stddev[g].size(); ++k) {
       compare(
-          "noise", gradient.noise_stddev[g][k], [&](auto& v) -> auto& { return v.noise_stddev[g][k]; }, true);
+          "noise", gradient.log_noise_stddev[g][k], [&](auto& v) -> auto& { return v.noise_stddev[g][k]; }, true);
     }
   }
   compare(

@@ -132,7 +132,7 @@ TEST(LikelihoodPrecisionTest, IsWhatFiftyDigitsSayToRoundingTimesTheConditionNum
     options.noise_gradient = true;
     const Likelihood likelihood(p.prior, p.observations, p.values, options);
     Likelihood::Workspace workspace;
-    ModelValues gradient;
+    ModelGradient gradient;
     const double value = likelihood.evaluate(p.values, &gradient, workspace);
 
     const Reference reference(p);
@@ -153,9 +153,9 @@ TEST(LikelihoodPrecisionTest, IsWhatFiftyDigitsSayToRoundingTimesTheConditionNum
       worst = std::max(worst, std::abs(static_cast<double>(Real(analytic) - slope)));
       largest_slope = std::max(largest_slope, std::abs(static_cast<double>(slope)));
     };
-    for (Index k = 0; k < tuned.lengthscale.size(); ++k) compare(gradient.kernel[0][k], &Tuned::lengthscale, k);
-    for (Index k = 0; k < tuned.signal.size(); ++k) compare(gradient.signal_stddev[0][k], &Tuned::signal, k);
-    for (Index k = 0; k < tuned.noise.size(); ++k) compare(gradient.noise_stddev[0][k], &Tuned::noise, k);
+    for (Index k = 0; k < tuned.lengthscale.size(); ++k) compare(gradient.log_kernel[0][k], &Tuned::lengthscale, k);
+    for (Index k = 0; k < tuned.signal.size(); ++k) compare(gradient.log_signal_stddev[0][k], &Tuned::signal, k);
+    for (Index k = 0; k < tuned.noise.size(); ++k) compare(gradient.log_noise_stddev[0][k], &Tuned::noise, k);
     EXPECT_LE(worst, 4 * tolerance);
     EXPECT_GT(largest_slope, 1) << "nothing was tested";
     RecordProperty(fmt::format("stretch_{}_condition_{:.0e}", stretch, target),

@@ -121,8 +121,9 @@ TEST_P(Threads, SystemsLikelihoodsAndSampledFunctionsAreSharedByMany) {
   const MatrixXd queries = data.queries.array().isNaN().select(0, data.queries);
   const auto numbers = [&] {
     Likelihood::Workspace workspace(2);
-    ModelValues gradient;
-    double sum = likelihood.evaluate(values, &gradient, workspace) + gradient.kernel[0].sum() + gradient.noise_stddev[0].sum();
+    ModelGradient gradient;
+    double sum =
+        likelihood.evaluate(values, &gradient, workspace) + gradient.log_kernel[0].sum() + gradient.log_noise_stddev[0].sum();
     sum += require_mechanics(system, queries, values.parameters).projections[0].T().sum();
     for (int p = 0; p < static_cast<int>(system.parameters().size()); ++p) {
       sum += system.differentiate(queries, values.parameters, p).mass.sum();

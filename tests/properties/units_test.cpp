@@ -129,7 +129,7 @@ void expect_same(const Units& units, const Case& c) {
     const Hyperparameter &a = old.hyperparameters[k], &b = other.hyperparameters[k];
     const double scale = factor(a, old.prior, units, own);
     for (const auto& [one, another] :
-         {std::pair{a.value, b.value}, {a.lower, b.lower}, {a.upper, b.upper}, {a.median, b.median}}) {
+         {std::pair{a.value, b.value}, {a.lower, b.lower}, {a.upper, b.upper}, {a.hyperprior.median, b.hyperprior.median}}) {
       EXPECT_NEAR(another, scale * one, 64 * eps * std::abs(scale * one)) << a.name;
     }
   }
@@ -141,7 +141,7 @@ void expect_same(const Units& units, const Case& c) {
   options.noise_gradient = true;
   options.gradient_parameters = {0, 1};
   Likelihood::Workspace workspace;
-  ModelValues slope_old, slope_other;
+  ModelGradient slope_old, slope_other;
   const double value_old = Likelihood(old.prior, old.observations, in_old, options).evaluate(in_old, &slope_old, workspace);
   const double value_other =
       Likelihood(other.prior, other.observations, in_other, options).evaluate(in_other, &slope_other, workspace);
@@ -151,9 +151,9 @@ void expect_same(const Units& units, const Case& c) {
   const auto expect_equal = [](const VectorXd& a, const VectorXd& b, const char* what) {
     EXPECT_LE(largest(a - b), 1e-8 * (1 + largest(a))) << what;
   };
-  expect_equal(slope_old.kernel[0], slope_other.kernel[0], "kernel");
-  expect_equal(slope_old.signal_stddev[0], slope_other.signal_stddev[0], "signal");
-  expect_equal(slope_old.noise_stddev[0], slope_other.noise_stddev[0], "noise");
+  expect_equal(slope_old.log_kernel[0], slope_other.log_kernel[0], "kernel");
+  expect_equal(slope_old.log_signal_stddev[0], slope_other.log_signal_stddev[0], "signal");
+  expect_equal(slope_old.log_noise_stddev[0], slope_other.log_noise_stddev[0], "noise");
   expect_equal(slope_old.parameters, slope_other.parameters, "θ");
 
   // predictions and their standard deviations

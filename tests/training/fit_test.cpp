@@ -56,7 +56,8 @@ double objective(const Problem& p, const std::vector<Hyperparameter>& hyperparam
   const ModelValues values = model_values(p.prior, p.observations, hyperparameters);
   double sum = Posterior(p.prior, p.observations, values).negative_log_likelihood();
   for (const Hyperparameter& h : hyperparameters) {
-    if (h.log_stddev > 0) sum += 0.5 * std::pow(std::log(h.value / h.median) / h.log_stddev, 2);
+    if (h.hyperprior.form == HyperPrior::Form::none) continue;
+    sum += 0.5 * std::pow(std::log(h.value / h.hyperprior.median) / h.hyperprior.stddev, 2);
   }
   return sum;
 }
@@ -166,12 +167,12 @@ TEST(FitTest, ConvergesToAPointWhoseProjectedGradientIsBelowTheTolerance) {
       // on the scale the optimiser works on: the logarithm, or the width of the box
       const auto at = [&](double x) -> VectorXd {
         std::vector<Hyperparameter> moved = report.hyperparameters;
-        moved[k].value = h.is_positive() ? std::exp(x) : h.lower + x * (h.upper - h.lower);
+        moved[k].value = h.positive ? std::exp(x) : h.lower + x * (h.upper - h.lower);
         return VectorXd::Constant(1, objective(p, moved));
       };
-      const double x = h.is_positive() ? std::log(h.value) : (h.value - h.lower) / (h.upper - h.lower);
+      const double x = h.positive ? std::log(h.value) : (h.value - h.lower) / (h.upper - h.lower);
       // the likelihood at this noise is rounded at some 1e-12 of itself
-      const test::Difference slope = test::central_difference(at, x, h.is_positive() ? 0.5 : 0.01, 1e-12);
+      const test::Difference slope = test::central_difference(at, x, h.positive ? 0.5 : 0.01, 1e-12);
       // of a parameter, over what it is known by were the rest known; at the start that was within a factor of two of here
       double unit = 1;
       if (h.kind == Kind::parameter) {

@@ -60,20 +60,20 @@ TEST(HyperparametersTest, ThePaperProtocolHasThePapersBox) {
     expect_same(h.lower, 0.5 * spread);
     expect_same(h.upper, 20 * spread);
     expect_same(h.value, spread);
-    EXPECT_EQ(h.log_stddev, 0) << "no hyper-prior";
+    EXPECT_EQ(h.hyperprior.form, HyperPrior::Form::none);
   }
   const Hyperparameter& signal = find(all, "signal_stddev");
   EXPECT_EQ(signal.kind, Kind::shared_signal_stddev);
   EXPECT_EQ(signal.lower, 0.5);
   EXPECT_EQ(signal.upper, 10);
-  ASSERT_EQ(signal.scale.size(), 3);
-  for (int j = 0; j < 3; ++j) expect_same(signal.scale[j], stddev(observations[0].values().row(j)));
+  ASSERT_EQ(signal.column_scale.size(), 3);
+  for (int j = 0; j < 3; ++j) expect_same(signal.column_scale[j], stddev(observations[0].values().row(j)));
   EXPECT_EQ(find(all, "p1").lower, 0.08 - 0.02);
   EXPECT_EQ(find(all, "p1").upper, 0.08 + 0.02);
   EXPECT_EQ(find(all, "p4").lower, -0.02) << "a value of zero, too";
   EXPECT_EQ(find(all, "p4").upper, 0.02);
   EXPECT_EQ(find(all, "p7").upper, 3.0 + 0.02);
-  EXPECT_EQ(find(all, "p1").log_stddev, 0);
+  EXPECT_EQ(find(all, "p1").hyperprior.form, HyperPrior::Form::none);
 }
 
 TEST(HyperparametersTest, ThePaperProtocolKeepsToTheFilesBounds) {
@@ -98,8 +98,8 @@ TEST(HyperparametersTest, TheStandardProtocolHasItsOwnBoxAndHyperPriors) {
   expect_same(lengthscale.value, Standard::lengthscale_initial * spread);
   expect_same(lengthscale.lower, Standard::lengthscale_lower * spread);
   expect_same(lengthscale.upper, Standard::lengthscale_upper * spread);
-  expect_same(lengthscale.median, Standard::lengthscale_median * spread);
-  EXPECT_EQ(lengthscale.log_stddev, Standard::lengthscale_log_stddev);
+  expect_same(lengthscale.hyperprior.median, Standard::lengthscale_median * spread);
+  EXPECT_EQ(lengthscale.hyperprior.stddev, Standard::lengthscale_log_stddev);
   const double output = stddev(observations[0].values().row(2));
   const Hyperparameter& signal = find(all, "signal_stddev(ddq3)");
   EXPECT_EQ(signal.kind, Kind::signal_stddev);
@@ -110,11 +110,11 @@ TEST(HyperparametersTest, TheStandardProtocolHasItsOwnBoxAndHyperPriors) {
   expect_same(noise.value, 0.1 * output);
   expect_same(noise.lower, 1e-6 * output);
   expect_same(noise.upper, 2 * output);
-  expect_same(noise.median, 0.1 * output);
+  expect_same(noise.hyperprior.median, 0.1 * output);
   EXPECT_EQ(find(all, "R").lower, 0.01);
   EXPECT_EQ(find(all, "R").upper, 0.07);
   for (const Hyperparameter& h : default_hyperparameters(prior, observations, {}, {Protocol::Name::standard, false})) {
-    EXPECT_EQ(h.log_stddev, 0) << h.name;
+    EXPECT_EQ(h.hyperprior.form, HyperPrior::Form::none) << h.name;
   }
 }
 
@@ -135,22 +135,23 @@ TEST(HyperparametersTest, PriorsOfTheModelReplaceTheWeakOnes) {
   const std::vector<Observations> observations = observe(model, 30, false);
   const auto all = default_hyperparameters(prior, observations, {"p1"}, {});
   const double spread = stddev(evaluate_features(prior.latents[0], observations[0].states()).col(0));
-  expect_same(find(all, "lengthscale(q1)").median, 2 * spread);
-  EXPECT_EQ(find(all, "lengthscale(q1)").log_stddev, 0.5);
-  expect_same(find(all, "signal_stddev(ddq1)").median, 3 * stddev(observations[0].values().row(0)));
-  EXPECT_EQ(find(all, "signal_stddev(ddq1)").log_stddev, 0.25);
-  EXPECT_EQ(find(all, "p1").median, 0.09);
-  EXPECT_EQ(find(all, "p1").log_stddev, 0.2);
+  expect_same(find(all, "lengthscale(q1)").hyperprior.median, 2 * spread);
+  EXPECT_EQ(find(all, "lengthscale(q1)").hyperprior.stddev, 0.5);
+  expect_same(find(all, "signal_stddev(ddq1)").hyperprior.median, 3 * stddev(observations[0].values().row(0)));
+  EXPECT_EQ(find(all, "signal_stddev(ddq1)").hyperprior.stddev, 0.25);
+  EXPECT_EQ(find(all, "p1").hyperprior.median, 0.09);
+  EXPECT_EQ(find(all, "p1").hyperprior.stddev, 0.2);
+  EXPECT_EQ(find(all, "p1").hyperprior.form, HyperPrior::Form::log_normal);
   for (const Protocol& without : {Protocol{Protocol::Name::standard, false}, Protocol{Protocol::Name::paper, true}}) {
     for (const Hyperparameter& h : default_hyperparameters(prior, observations, {"p1"}, without)) {
-      EXPECT_EQ(h.log_stddev, 0) << h.name;
+      EXPECT_EQ(h.hyperprior.form, HyperPrior::Form::none) << h.name;
     }
   }
   const Model normal = with_priors("{ value = 0.08, bounds = [-1, 1], prior = { mean = 0.09, stddev = 0.02 } }");
   const auto of_normal = default_hyperparameters(make_prior(normal), observations, {"p1"}, {});
-  EXPECT_EQ(find(of_normal, "p1").median, 0.09);
-  EXPECT_EQ(find(of_normal, "p1").stddev, 0.02);
-  EXPECT_EQ(find(of_normal, "p1").log_stddev, 0);
+  EXPECT_EQ(find(of_normal, "p1").hyperprior.median, 0.09);
+  EXPECT_EQ(find(of_normal, "p1").hyperprior.stddev, 0.02);
+  EXPECT_EQ(find(of_normal, "p1").hyperprior.form, HyperPrior::Form::normal);
 }
 
 TEST(HyperparametersTest, APriorOfALogarithmNeedsBoundsAboveZero) {
@@ -168,15 +169,15 @@ TEST(HyperparametersTest, TheGradientOfPriorsIsThatOfTheirSum) {
                          "{ value = 0.08, bounds = [-1, 1], prior = { mean = 0.09, stddev = 0.02 } }"}) {
     const Model model = with_priors(p1);
     const auto all = default_hyperparameters(make_prior(model), observe(model, 20, false), {"p1"}, {});
-    const VectorXd x = internal_values(all);
+    const VectorXd x = coordinates(all);
     const auto sum_at = [&](Eigen::Index k, double step) {
       std::vector<Hyperparameter> moved = all;
       Hyperparameter& h = moved[static_cast<std::size_t>(k)];
-      h.value = from_internal(h, x[k] + step);
-      return hyperprior(moved, nullptr);
+      h.value = h.value_at(x[k] + step);
+      return negative_log_hyperpriors(moved, nullptr);
     };
     VectorXd gradient = VectorXd::Zero(x.size());
-    hyperprior(all, &gradient);
+    negative_log_hyperpriors(all, &gradient);
     for (Eigen::Index k = 0; k < x.size(); ++k) {
       // differences of a function of the size of 100 with steps of 1e-5 are right to 1e-16 · 100 / 1e-5
       EXPECT_NEAR(gradient[k], (sum_at(k, 1e-5) - sum_at(k, -1e-5)) / 2e-5, 1e-5 * (1 + std::abs(gradient[k])))
@@ -211,7 +212,7 @@ TEST(HyperparametersTest, NamesAreUnique) {
       EXPECT_TRUE(h.lower <= h.value && h.value <= h.upper) << file << ": " << h.name;
       EXPECT_TRUE(std::isfinite(h.lower) && std::isfinite(h.upper) && h.lower < h.upper) << file << ": " << h.name;
       EXPECT_FALSE(h.unit.empty()) << file << ": " << h.name;
-      EXPECT_TRUE(h.lower > 0 || !h.is_positive()) << file << ": " << h.name;
+      EXPECT_TRUE(h.lower > 0 || !h.positive) << file << ": " << h.name;
     }
   }
 }
@@ -315,17 +316,15 @@ TEST(HyperparametersTest, ModelValuesPutEachNumberInItsPlace) {
   }
   EXPECT_EQ(values.parameters[model.system->parameter_index("m1")], 2.0) << "what is not estimated keeps its value";
 
-  Hyperparameter shared;
-  shared.kind = Kind::shared_signal_stddev;
-  shared.owner = 1;
+  Hyperparameter shared = Hyperparameter::of(Kind::shared_signal_stddev, 1, 0);
   shared.value = 3;
-  shared.scale = Eigen::Vector2d(1, 0.5);
+  shared.column_scale = Eigen::Vector2d(1, 0.5);
   EXPECT_EQ(model_values(prior, observations, {shared}).signal_stddev[1], Eigen::Vector2d(3, 1.5));
   EXPECT_EQ(model_values(prior, observations, {shared}).noise_stddev[0], observations[0].noise().stddev());
 }
 
 TEST(HyperparametersTest, ABoundIsReportedWhenItIsHit) {
-  Hyperparameter positive;
+  Hyperparameter positive = Hyperparameter::of(Kind::noise_stddev, 0, 0);
   positive.lower = 1e-3;
   positive.upper = 1e3;
   for (double value : {1e-3, 1e-3 * (1 + 1e-7), 1e3, 1e3 * (1 - 1e-7)}) {
@@ -336,8 +335,7 @@ TEST(HyperparametersTest, ABoundIsReportedWhenItIsHit) {
     positive.value = value;
     EXPECT_FALSE(positive.at_bound()) << value;
   }
-  Hyperparameter parameter;
-  parameter.kind = Kind::parameter;
+  Hyperparameter parameter = Hyperparameter::of(Kind::parameter, 0, 0);
   parameter.lower = -1;
   parameter.upper = 1;
   for (double value : {-1.0, -1 + 1e-6, 1.0}) {

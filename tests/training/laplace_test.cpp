@@ -298,7 +298,7 @@ TEST(LaplaceTest, NotesNameASingleOpenParameterManyCombinationsAndFitsThatStoppe
   report.hyperparameters.resize(3);
   const std::array<const char*, 3> names = {"m", "R", "Ic"};
   for (std::size_t k = 0; k < 3; ++k) {
-    report.hyperparameters[k].kind = Kind::parameter;
+    report.hyperparameters[k] = Hyperparameter::of(Kind::parameter, 0, k);
     report.hyperparameters[k].name = names[k];
     report.hyperparameters[k].value = 1;
   }

@@ -58,9 +58,9 @@ ReportData data_at(const Posterior& posterior, const MatrixXd& states, const std
   View view = View::all(View::Quantity::constrained_acceleration, *posterior.prior().system);
   view.other_system = other_system;
   const Prior& prior = prior_of(posterior.prior(), view);
-  const System& judge = prior.judge();
+  const System& reference = prior.reference_system();
   const VectorXd parameters = parameters_of(view, posterior.values().parameters);
-  data.outputs = View{View::Quantity::constrained_acceleration, rows}.names(judge);
+  data.outputs = View{View::Quantity::constrained_acceleration, rows}.names(reference);
   data.noise_stddev.resize(std::ssize(rows));
   for (std::size_t k = 0; k < rows.size(); ++k) data.noise_stddev[static_cast<Index>(k)] = noise_of(posterior, rows[k]);
 
@@ -77,13 +77,13 @@ ReportData data_at(const Posterior& posterior, const MatrixXd& states, const std
     data.unconstrained_stddev = prediction.stddev();
   }
 
-  const SystemValues values = judge.evaluate(states, parameters);
-  data.constraint_error.resize(judge.nc(), states.cols());
-  for (int i = 0; i < values.n_states() && judge.nc() > 0; ++i) {
+  const SystemValues values = reference.evaluate(states, parameters);
+  data.constraint_error.resize(reference.nc(), states.cols());
+  for (int i = 0; i < values.n_states() && reference.nc() > 0; ++i) {
     data.constraint_error.col(i) = (values.A(i) * data.predicted.col(i) - values.b(i)).cwiseAbs();
   }
-  data.lower_rank = states_of_lower_rank(judge, states, parameters);
-  if (judge.nc() > 0) data.violation = largest_violation(judge, states, parameters);
+  data.lower_rank = states_of_lower_rank(reference, states, parameters);
+  if (reference.nc() > 0) data.violation = largest_violation(reference, states, parameters);
 
   for (const Latent& latent : prior.latents) {
     if (latent.kernel_is_fixed) continue;
@@ -119,7 +119,7 @@ std::vector<ReportData> training_data(const FitFile& fit, const Posterior& poste
     data.name = all.empty() ? "training" : fmt::format("training {}", all.size() + 1);
     const bool elsewhere = g < fit.systems.size() && fit.systems[g];
     data.source = elsewhere ? fmt::format("measured on '{}'", fit.systems[g]->system->name()) : fit.data_source;
-    data.independent = independent_outputs(prior_of(posterior.prior(), group.view()).judge(),
+    data.independent = independent_outputs(prior_of(posterior.prior(), group.view()).reference_system(),
                                            parameters_of(group.view(), posterior.values().parameters), data);
     all.push_back(std::move(data));
   }
@@ -211,7 +211,7 @@ std::vector<Relevance> relevance_of(const Posterior& posterior) {
       one.lengthscale = values.kernel[a][static_cast<Index>(p)];
       one.spread = scales.feature_stddev[a][parameter.feature];
       one.relevance = (periodic ? 1 : one.spread) / one.lengthscale;
-      if (!values.is_learned(a)) one.effect = largest_signal * one.relevance;
+      if (!values.has_free_loading(a)) one.effect = largest_signal * one.relevance;
       all.push_back(std::move(one));
     }
   }

@@ -1,25 +1,28 @@
 #pragma once
 
+#include <memory>
 #include <optional>
 #include <string>
 #include <string_view>
+#include <utility>
 #include <vector>
 
 #include <Eigen/Core>
 
 #include "gp2/fit.hpp"
+#include "gp2/model.hpp"
 
 namespace gp2 {
 
-/// A model of ddq that knows no mechanics (Geist & Trimpe 2020, sec. 5): multi-output Gaussian processes with inputs and outputs
+/// A prior on ddq that knows no mechanics (Geist & Trimpe 2020, sec. 5): multi-output Gaussian processes with inputs and outputs
 /// standardised by the training data (mean 0, standard deviation 1),
 ///
 ///     se   ddq_j ~ GP(0, s_j² k_SE), each output with lengthscales of its own,
 ///     icm  K = B₁ k_SE,
 ///     lmc  K = B₁ k_SE + B₂ k_bias + B₃ k_linear,    B_i = W_iW_iᵀ + diag κ_i,  W_i (nq × nq).
 ///
-/// It is a Prior like any other: its system has no constraints, so that ddq = ā, and its loadings are learned. Observations,
-/// views and predictions need to know nothing of it.
+/// It is a Prior like any other: its system has no constraints, so that ddq = ā, and the loadings of icm and lmc are free,
+/// C = [W, diag √κ] (loading_entries). Observations, views and predictions need to know nothing of it.
 struct Baseline {
   enum class Kind { se, icm, lmc };
 
@@ -32,10 +35,44 @@ struct Baseline {
   static std::optional<Kind> kind_of(std::string_view word);
 };
 
+/// A baseline of means 0 and standard deviations 1.
+Baseline unstandardised(const Model& model, Baseline::Kind kind);
+
 /// A baseline with the means and standard deviations of what it is to learn from.
 ///
 /// @param latent  whose features it has
 Baseline standardised_by(const std::vector<Observations>& observations, const Latent& latent, Baseline::Kind kind);
+
+/// The prior of a baseline over the features of all latents of a model, angles raw.
+/// @throws InputError when a mean or standard deviation has another size than outputs or features.
+Prior make_baseline_prior(const Model& model, const Baseline& baseline);
+
+/// What the prior of a fit is made of: the latents of its model, or a baseline instead.
+struct FitPriorOptions : PriorOptions {
+  FitPriorOptions() = default;
+  FitPriorOptions(PriorOptions options) : PriorOptions(std::move(options)) {}
+
+  std::optional<Baseline> baseline;  // replaces latents, mean, constraints; of the model it keeps the features, angles raw
+};
+
+/// make_prior or make_baseline_prior, make_other_system or another system that the baseline sees.
+Prior make_prior(const Model& model, const FitPriorOptions& options);
+std::shared_ptr<const OtherSystem> make_other_system(const Model& home, const Model& other, const FitPriorOptions& options);
+
+/// An entry of a loading C = [W, diag √κ] that is tuned. Files call it by its kind and its index there.
+struct LoadingEntry {
+  enum class Kind { mixing /* W_jl, index j + p l */, sqrt_kappa /* √κ_j, index j */ };
+  Kind kind;
+  int row;     // j
+  int column;  // l of W; of √κ: j
+  int index;
+  int index_in_loading;  // in C, column by column
+
+  static const char* word(Kind kind);  // "mixing", "sqrt_kappa"
+};
+
+/// The entries of a latent's free loading, W first; none where it is not free.
+std::vector<LoadingEntry> loading_entries(const Latent& latent);
 
 /// What is tuned of a baseline prior, with the published starts and bounds, in units of the data's standard deviations:
 /// lengthscales in [0.5, 20]; the signal of `se` in [0.1, 1]; W and κ without bounds that matter. No hyper-priors.

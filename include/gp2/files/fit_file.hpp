@@ -6,6 +6,7 @@
 #include <string_view>
 #include <vector>
 
+#include "gp2/baselines/baseline.hpp"
 #include "gp2/fit.hpp"
 #include "gp2/model.hpp"
 
@@ -19,7 +20,7 @@ struct FitFile {
   static constexpr int format_version = 6;
 
   Model model;
-  PriorOptions prior_options;
+  FitPriorOptions prior_options;
   std::string data_source;  // where the data came from, for people
   std::vector<Observations> observations;
   /// Per Observations: the model file of its view's other system; null where it has none. May be shorter.

@@ -6,23 +6,11 @@
 
 #include <Eigen/Core>
 
+#include "gp2/inference/model_values.hpp"
 #include "gp2/observations.hpp"
 #include "gp2/prior.hpp"
 
 namespace gp2 {
-
-/// Everything about a prior and its observations that can be tuned, in physical units; also the shape of its gradient.
-struct ModelValues {
-  std::vector<Eigen::VectorXd> kernel;         // per latent: the kernel's parameters
-  std::vector<Eigen::VectorXd> signal_stddev;  // per latent: s (p_a); ones where the directions are learned
-  std::vector<Eigen::MatrixXd> mixing;         // per latent: C = [W, diag(√κ)] of learned directions; may be left empty
-  std::vector<Eigen::VectorXd> noise_stddev;   // per Observations: σ (d), of values with a noise of their own the common factor
-  Eigen::VectorXd parameters;                  // of the system: θ
-
-  [[nodiscard]] bool is_learned(std::size_t a) const { return a < mixing.size() && mixing[a].size() > 0; }
-  /// C_a of latent a (p_a × functions).
-  [[nodiscard]] Eigen::MatrixXd loading(std::size_t a) const;
-};
 
 /// The negative log marginal likelihood of observations under a prior, in its reduced, jitter-free form, and its exact gradient.
 ///
@@ -61,9 +49,10 @@ class Likelihood {
 
   /// −log p(y | values): +∞ where the mechanics have a fault (evaluate_mechanics of the prior) or the factorisation fails.
   ///
-  /// @param gradient  when not null, receives ∂/∂log of kernel parameters, signal and noise standard deviations, ∂/∂C of learned
-  ///                  directions, and ∂/∂θ of the parameters asked for (zero elsewhere). Left as it was when the value is +∞.
-  double evaluate(const ModelValues& values, ModelValues* gradient, Workspace& workspace) const;
+  /// @param gradient  when not null, receives the gradient: zero in a fixed kernel, and where the options do not ask for the
+  /// noise
+  ///                  or a parameter. Left as it was when the value is +∞.
+  double evaluate(const ModelValues& values, ModelGradient* gradient, Workspace& workspace) const;
 
   [[nodiscard]] const Prior& prior() const;
   [[nodiscard]] const std::vector<Observations>& observations() const;

@@ -56,7 +56,7 @@ struct FitProblemOptions {
 
 /// A fit ready to run.
 struct FitProblem {
-  PriorOptions prior_options;
+  FitPriorOptions prior_options;
   Prior prior;
   std::vector<Observations> observations;             // of each log, then of each knowledge
   std::vector<std::shared_ptr<const Model>> systems;  // per Observations: its model where that is another; for FitFile

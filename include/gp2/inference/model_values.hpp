@@ -1,0 +1,34 @@
+#pragma once
+
+#include <vector>
+
+#include <Eigen/Core>
+
+namespace gp2 {
+
+/// Everything about a prior and its observations that can be tuned, in physical units.
+struct ModelValues {
+  std::vector<Eigen::VectorXd> kernel;         // per latent: the kernel's parameters
+  std::vector<Eigen::VectorXd> signal_stddev;  // per latent: s of C = diag(s) (p); ones where C is free
+  std::vector<Eigen::MatrixXd> free_loading;   // per latent: C where it is free (p × functions), else empty; may be left empty
+  std::vector<Eigen::VectorXd> noise_stddev;   // per Observations: σ (d), of values with a noise of their own the common factor
+  Eigen::VectorXd parameters;                  // of the system: θ
+
+  [[nodiscard]] bool has_free_loading(std::size_t a) const { return a < free_loading.size() && free_loading[a].size() > 0; }
+  /// C_a of latent a (p × functions).
+  [[nodiscard]] Eigen::MatrixXd loading(std::size_t a) const;
+};
+
+/// The gradient of the negative log likelihood: in the logarithm of each number that is positive by nature, a parameter of a
+/// kernel or a standard deviation, and in C and θ themselves. Shapes are those of ModelValues.
+struct ModelGradient {
+  std::vector<Eigen::VectorXd> log_kernel;
+  std::vector<Eigen::VectorXd> log_signal_stddev;  // zero where C is free
+  std::vector<Eigen::MatrixXd> free_loading;
+  std::vector<Eigen::VectorXd> log_noise_stddev;
+  Eigen::VectorXd parameters;
+
+  static ModelGradient zero(const ModelValues& values);
+};
+
+}  // namespace gp2

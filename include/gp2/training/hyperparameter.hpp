@@ -1,0 +1,101 @@
+#pragma once
+
+#include <optional>
+#include <string>
+#include <string_view>
+#include <vector>
+
+#include <Eigen/Core>
+
+#include "gp2/inference/likelihood.hpp"
+
+namespace gp2 {
+
+/// The optimiser's coordinate x of a value v: v = origin + unit·x, or v = exp x.
+struct CoordinateMap {
+  bool is_logarithm = true;
+  double origin = 0, unit = 1;  // of v = origin + unit·x
+
+  [[nodiscard]] double coordinate(double value) const;
+  [[nodiscard]] double value(double x) const;
+  [[nodiscard]] double value_slope(double value) const;      // dv/dx
+  [[nodiscard]] double logarithm_slope(double value) const;  // d log v/dx
+};
+
+/// A hyper-prior of a value v: −log of its density, without constants, is added to the objective.
+struct HyperPrior {
+  enum class Form {
+    none,
+    normal,      // ½ ((v − median)/stddev)²
+    log_normal,  // ½ (log(v/median)/stddev)²
+  };
+  Form form = Form::none;
+  double median = 0;
+  double stddev = 0;  // of v, or of log v
+
+  [[nodiscard]] double negative_log(double value) const;
+  /// Derivative of negative_log in the map's coordinate.
+  [[nodiscard]] double slope(double value, const CoordinateMap& map) const;
+};
+
+/// One number that training adjusts, in physical units: a place in ModelValues, a map to the optimiser's coordinate, bounds, and
+/// a hyper-prior. What depends on its kind is asked of it.
+struct Hyperparameter {
+  enum class Kind {
+    kernel,                // parameter `index` of the kernel of latent `owner`
+    signal_stddev,         // s_index of latent `owner`
+    shared_signal_stddev,  // one factor for all s of latent `owner`, times `column_scale`
+    loading,               // entry `index` of the free loading C of latent `owner`, column by column
+    noise_stddev,          // σ_index of Observations `owner`
+    parameter,             // θ_index of the system
+  };
+
+  Kind kind = Kind::kernel;
+  int owner = 0;
+  int index = 0;
+  Eigen::VectorXd column_scale;  // of a shared signal standard deviation: the unit of each s
+  std::string name;
+  std::string unit;
+  double value = 0;  // where the first restart starts; the fitted value in a FitReport
+  double lower = 0, upper = 0;
+  /// Positive by nature: optimised as its logarithm. Else it is optimised in widths of its box, from `lower` on, or in units of
+  /// its `size`.
+  bool positive = true;
+  /// Typical size, where the bounds are no more than limits: random starts are drawn about it, and no scan crosses the box. 0:
+  /// the box tells.
+  double size = 0;
+  HyperPrior hyperprior;
+
+  /// A hyperparameter of no name and value: positive unless of the system's parameters or a loading.
+  static Hyperparameter of(Kind kind, std::size_t owner, std::size_t index);
+
+  /// Within 1e-6 of a bound, on the scale it is optimised on.
+  [[nodiscard]] bool at_bound() const;
+  [[nodiscard]] bool is_system_parameter() const { return kind == Kind::parameter; }
+  /// Entries of a loading enter by C Cᵀ: where all of one latent's that may be negative are 0, so is their gradient.
+  [[nodiscard]] bool is_stationary_at_zero() const { return kind == Kind::loading && !positive; }
+
+  // Its place in the model.
+  void write(ModelValues& values) const;
+  void ask_for_gradient(Likelihood::Options& options) const;
+
+  // The optimiser's coordinate.
+  [[nodiscard]] CoordinateMap map() const;
+  [[nodiscard]] double coordinate() const { return map().coordinate(value); }
+  [[nodiscard]] double lower_coordinate() const { return map().coordinate(lower); }
+  [[nodiscard]] double upper_coordinate() const { return map().coordinate(upper); }
+  /// The value at a coordinate, within the bounds.
+  [[nodiscard]] double value_at(double x) const;
+
+  // The objective in that coordinate.
+  /// ∂NLL/∂x, given the gradient of the negative log likelihood at its value.
+  [[nodiscard]] double likelihood_slope(const ModelGradient& gradient) const;
+  [[nodiscard]] double negative_log_hyperprior() const { return hyperprior.negative_log(value); }
+  [[nodiscard]] double hyperprior_slope() const { return hyperprior.slope(value, map()); }
+};
+
+/// The values that `hyperparameters` stand for; what they leave out keeps the model's value.
+ModelValues model_values(const Prior& prior, const std::vector<Observations>& observations,
+                         const std::vector<Hyperparameter>& hyperparameters);
+
+}  // namespace gp2

@@ -1,0 +1,223 @@
+#include "gp2/training/default_hyperparameters.hpp"
+
+#include <algorithm>
+#include <tuple>
+#include <utility>
+
+#include <fmt/format.h>
+
+#include "gp2/error.hpp"
+
+namespace gp2 {
+
+using Eigen::Index;
+using Eigen::VectorXd;
+using Kind = Hyperparameter::Kind;
+using Standard = Protocol::Standard;
+
+namespace {
+
+std::string unit_of(const std::string& quantity) { return fmt::format("unit of {}", quantity); }
+
+bool has_hyperpriors(const Protocol& protocol) { return protocol.name == Protocol::Name::standard && protocol.hyperprior; }
+
+// the model's own range, and where it says nothing the protocol's
+Latent::Range filled(const Latent::Range& own, const Latent::Range& defaults) {
+  const auto choose = [](double mine, double fallback) { return mine > 0 ? mine : fallback; };
+  return {choose(own.initial, defaults.initial), choose(own.lower, defaults.lower), choose(own.upper, defaults.upper),
+          choose(own.median, defaults.median), choose(own.log_stddev, defaults.log_stddev)};
+}
+
+// start, bounds and hyper-prior, from factors of a scale
+void set_range(Hyperparameter& h, const Latent::Range& range, double scale, const Protocol& protocol) {
+  h.value = range.initial * scale;
+  h.lower = range.lower * scale;
+  h.upper = range.upper * scale;
+  if (has_hyperpriors(protocol)) h.hyperprior = {HyperPrior::Form::log_normal, range.median * scale, range.log_stddev};
+}
+
+Latent::Range lengthscale_range(const Latent& latent, const Protocol& protocol) {
+  const Latent::Range paper = {1, 0.5, 20, Standard::lengthscale_median, Standard::lengthscale_log_stddev};
+  const Latent::Range standard = {Standard::lengthscale_initial, Standard::lengthscale_lower, Standard::lengthscale_upper,
+                                  Standard::lengthscale_median, Standard::lengthscale_log_stddev};
+  return filled(latent.lengthscale, protocol.name == Protocol::Name::paper ? paper : standard);
+}
+
+Hyperparameter kernel_hyperparameter(const Latent& latent, std::size_t owner, std::size_t index, const Scales& scales,
+                                     const Protocol& protocol) {
+  const Kernel::Parameter& parameter = latent.kernel.parameters()[index];
+  Hyperparameter h = Hyperparameter::of(Kind::kernel, owner, index);
+  h.unit = std::string("1");
+  Latent::Range range = {1, 1e-3, 1e3, 1, Standard::shape_log_stddev};
+  double scale = 1;
+  switch (parameter.kind) {
+    case Kernel::ParameterKind::lengthscale:
+      scale = scales.feature_stddev[owner][parameter.feature];
+      range = lengthscale_range(latent, protocol);
+      break;
+    case Kernel::ParameterKind::periodic_lengthscale:
+      range = lengthscale_range(latent, protocol);
+      break;
+    case Kernel::ParameterKind::period:
+      scale = scales.feature_range[owner][parameter.feature];
+      range = {0.5, 0.02, 20, 0.5, Standard::shape_log_stddev};
+      break;
+    case Kernel::ParameterKind::shape:
+    case Kernel::ParameterKind::amplitude:
+      break;
+  }
+  const bool has_unit = parameter.kind == Kernel::ParameterKind::lengthscale || parameter.kind == Kernel::ParameterKind::period;
+  if (has_unit) h.unit = unit_of(latent.feature_names[static_cast<std::size_t>(parameter.feature)]);
+  range.initial = std::clamp(range.initial, range.lower, range.upper);
+  set_range(h, range, scale, protocol);
+  return h;
+}
+
+// one factor of the default scales, for all columns
+Hyperparameter shared_signal(const Latent& latent, std::size_t owner, const Scales& scales, const Protocol& protocol) {
+  Hyperparameter h = Hyperparameter::of(Kind::shared_signal_stddev, owner, 0);
+  h.unit = "default scale of each column";
+  h.column_scale = scales.signal_stddev[owner];
+  Latent::Range range = filled(latent.signal_stddev, {1, 0.5, 10, 0, 0});
+  range.initial = std::clamp(range.initial, range.lower, range.upper);
+  set_range(h, range, 1, protocol);
+  return h;
+}
+
+Hyperparameter column_signal(const Latent& latent, std::size_t owner, std::size_t column, const Scales& scales,
+                             const Protocol& protocol) {
+  Hyperparameter h = Hyperparameter::of(Kind::signal_stddev, owner, column);
+  h.unit = unit_of(latent.column_names[column]);
+  const Latent::Range standard = {Standard::signal_initial, Standard::signal_lower, Standard::signal_upper,
+                                  Standard::signal_median, Standard::signal_log_stddev};
+  set_range(h, filled(latent.signal_stddev, standard), scales.signal_stddev[owner][static_cast<Index>(column)], protocol);
+  return h;
+}
+
+void add_latent(const Latent& latent, std::size_t owner, const std::string& prefix, const Scales& scales,
+                const Protocol& protocol, std::vector<Hyperparameter>& out) {
+  for (std::size_t p = 0; p < latent.kernel.parameters().size(); ++p) {
+    out.push_back(kernel_hyperparameter(latent, owner, p, scales, protocol));
+    out.back().name = prefix + latent.kernel.parameters()[p].name;
+  }
+  if (protocol.name == Protocol::Name::paper) {
+    out.push_back(shared_signal(latent, owner, scales, protocol));
+    out.back().name = prefix + "signal_stddev";
+    return;
+  }
+  for (std::size_t l = 0; l < latent.column_names.size(); ++l) {
+    out.push_back(column_signal(latent, owner, l, scales, protocol));
+    out.back().name = fmt::format("{}signal_stddev({})", prefix, latent.column_names[l]);
+  }
+}
+
+void add_latents(const Prior& prior, const Scales& scales, const Protocol& protocol, std::vector<Hyperparameter>& out) {
+  const auto is_tuned = [](const Latent& latent) { return !latent.kernel_is_fixed || !latent.signal_is_fixed; };
+  const bool one_is_tuned = std::count_if(prior.latents.begin(), prior.latents.end(), is_tuned) == 1;
+  for (std::size_t a = 0; a < prior.latents.size(); ++a) {
+    const Latent& latent = prior.latents[a];
+    if (is_tuned(latent)) add_latent(latent, a, one_is_tuned ? "" : latent.name + ".", scales, protocol, out);
+  }
+}
+
+// σ of one row, or the factor of the deviations that a log states for it
+Hyperparameter noise_hyperparameter(const Observations& observations, std::size_t group, std::size_t row, const std::string& name,
+                                    double spread, const Protocol& protocol) {
+  const auto k = static_cast<Index>(row);
+  Hyperparameter h = Hyperparameter::of(Kind::noise_stddev, group, row);
+  h.name = fmt::format("noise_stddev({})", name);
+  if (group > 0) h.name += fmt::format("#{}", group + 1);  // of the second log, the third, …
+  h.unit = unit_of(name);
+  h.lower = Standard::noise_lower * spread;
+  h.upper = Standard::noise_upper * spread;
+  if (observations.noise().has_scale()) {
+    // the smallest of the stated deviations stays above the lower bound, the usual one below the upper
+    h.unit = fmt::format("stated deviation of {}", name);
+    const std::vector<double> scale = observations.measured_scales(k);
+    if (!scale.empty()) h.lower /= *std::min_element(scale.begin(), scale.end());
+    h.upper = std::max(h.upper / observations.usual_noise(VectorXd::Ones(observations.view().size()))[k], 2 * h.lower);
+  }
+  h.value = std::clamp(observations.noise().stddev()[k], h.lower, h.upper);
+  if (has_hyperpriors(protocol)) h.hyperprior = {HyperPrior::Form::log_normal, h.value, Standard::noise_log_stddev};
+  return h;
+}
+
+void add_noise(const System& system, const std::vector<Observations>& observations, const Scales& scales,
+               const Protocol& protocol, std::vector<Hyperparameter>& out) {
+  for (std::size_t g = 0; g < observations.size(); ++g) {
+    if (!observations[g].noise().is_estimated()) continue;
+    const std::vector<std::string> names = observations[g].view().names(system);
+    for (std::size_t k = 0; k < names.size(); ++k) {
+      const double spread = scales.output_stddev[g][static_cast<Index>(k)];
+      out.push_back(noise_hyperparameter(observations[g], g, k, names[k], spread, protocol));
+    }
+  }
+}
+
+int estimable_parameter(const Prior& prior, const std::string& name) {
+  const System& system = *prior.system;
+  const int index = system.parameter_index(name);
+  if (index < 0) {
+    std::string known;
+    for (const Parameter& parameter : system.parameters()) known += (known.empty() ? "" : ", ") + parameter.name;
+    throw InputError(fmt::format("--estimate: the model '{}' has no parameter '{}'; it has: {}", system.name(), name,
+                                 known.empty() ? "none" : known));
+  }
+  for (const Latent& latent : prior.latents) {
+    const std::vector<int>& used = latent.feature_parameters;
+    if (std::find(used.begin(), used.end(), index) == used.end()) continue;
+    throw InputError(
+        fmt::format("--estimate: parameter '{}' stands in a feature of the latent '{}', and features hold no estimated "
+                    "parameters; write the feature without it, or leave it out",
+                    name, latent.name));
+  }
+  return index;
+}
+
+// its own, or half to twice its value; under the paper's protocol ± 0.02, within its own
+std::pair<double, double> bounds_of(const Parameter& parameter, const Protocol& protocol) {
+  const double value = parameter.value;
+  if (protocol.name == Protocol::Name::paper) {
+    constexpr double distance = 0.02;
+    if (!parameter.bounds) return {value - distance, value + distance};
+    return {std::max(value - distance, parameter.bounds->first), std::min(value + distance, parameter.bounds->second)};
+  }
+  if (parameter.bounds) return *parameter.bounds;
+  if (value != 0) return {std::min(0.5 * value, 2 * value), std::max(0.5 * value, 2 * value)};
+  throw InputError(fmt::format("parameter '{}' is 0 and has no bounds: write {} = {{ value = 0, bounds = [lower, upper] }}",
+                               parameter.name, parameter.name));
+}
+
+Hyperparameter parameter_hyperparameter(const Prior& prior, const std::string& name, const Protocol& protocol) {
+  const auto index = static_cast<std::size_t>(estimable_parameter(prior, name));
+  const Parameter& parameter = prior.system->parameters()[index];
+  Hyperparameter h = Hyperparameter::of(Kind::parameter, 0, index);
+  h.name = name;
+  h.unit = unit_of(name);
+  h.value = parameter.value;
+  std::tie(h.lower, h.upper) = bounds_of(parameter, protocol);
+  if (!parameter.prior || !has_hyperpriors(protocol)) return h;
+  if (parameter.prior->of_logarithm && !(h.lower > 0)) {
+    throw InputError(
+        fmt::format("parameter '{}': a prior of the logarithm needs bounds above 0, got [{}, {}]; write "
+                    "bounds = [lower, upper], or prior = {{ mean = …, stddev = … }}",
+                    name, h.lower, h.upper));
+  }
+  h.hyperprior = {parameter.prior->of_logarithm ? HyperPrior::Form::log_normal : HyperPrior::Form::normal,
+                  parameter.prior->median, parameter.prior->stddev};
+  return h;
+}
+
+}  // namespace
+
+std::vector<Hyperparameter> default_hyperparameters(const Prior& prior, const std::vector<Observations>& observations,
+                                                    const std::vector<std::string>& estimated, const Protocol& protocol) {
+  const Scales scales = default_scales(prior, observations);
+  std::vector<Hyperparameter> out;
+  add_latents(prior, scales, protocol, out);
+  add_noise(*prior.system, observations, scales, protocol, out);
+  for (const std::string& name : estimated) out.push_back(parameter_hyperparameter(prior, name, protocol));
+  return out;
+}
+
+}  // namespace gp2

@@ -1,0 +1,188 @@
+#include <algorithm>
+#include <cmath>
+#include <optional>
+
+#include "gp2/base/statistics.hpp"
+#include "gp2/training/default_hyperparameters.hpp"
+
+namespace gp2 {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+
+namespace {
+
+MatrixXd side_by_side(const std::vector<MatrixXd>& parts) {
+  Index n = 0;
+  for (const MatrixXd& part : parts) n += part.cols();
+  MatrixXd all(parts.front().rows(), n);
+  Index first = 0;
+  for (const MatrixXd& part : parts) {
+    all.middleCols(first, part.cols()) = part;
+    first += part.cols();
+  }
+  return all;
+}
+
+// a spread that bounds and starting points can be multiples of, even where the data do not vary
+double usable(double spread, double fallback) { return spread > 0 && std::isfinite(spread) ? spread : fallback; }
+
+// of what is measured
+VectorXd size_of_rows(const Eigen::Ref<const MatrixXd>& values) {
+  return values.array().isNaN().select(0, values).cwiseAbs().rowwise().maxCoeff();
+}
+
+// standard deviation of each row; 0 where it does not vary but for rounding
+VectorXd spread_of_rows(const Eigen::Ref<const MatrixXd>& values) {
+  const VectorXd stddev = row_stddev(values);
+  return (stddev.array() > 1e-12 * size_of_rows(values).array()).select(stddev, 0);
+}
+
+// what a group says of the accelerations' spread, or of their size, per row of its view; nothing where the view is of another
+// kind
+template <typename OfRows>
+std::optional<VectorXd> acceleration_scale(const Observations& group, const VectorXd& mass_diagonal, const OfRows& of_rows) {
+  using Quantity = View::Quantity;
+  if (group.view().latent >= 0) return std::nullopt;
+  VectorXd stddev = of_rows(group.values());
+  switch (group.view().quantity) {
+    case Quantity::constrained_acceleration:
+    case Quantity::unconstrained_acceleration:
+      return stddev;
+    case Quantity::constraint_force:
+      return VectorXd(stddev.cwiseQuotient(mass_diagonal(group.view().rows)));
+    case Quantity::multipliers:
+      return std::nullopt;
+    case Quantity::next_velocity: {
+      const Index nq = mass_diagonal.size();
+      const MatrixXd dq = group.states().middleRows(nq, nq)(group.view().rows, Eigen::all);
+      return VectorXd(of_rows(group.values() - dq) / group.view().time_step);
+    }
+  }
+  return std::nullopt;
+}
+
+// σ_j of every coordinate: where ddq_j is observed its spread, or its size where it does not vary; otherwise by equal kinetic
+// scale √(mean M_ii σ_i² / M_jj)
+VectorXd coordinate_scales(const System& system, const std::vector<Observations>& observations, const VectorXd& mass_diagonal) {
+  VectorXd variance = VectorXd::Constant(system.nq(), -1);
+  const auto add = [&](const auto& of_rows) {
+    for (const Observations& group : observations) {
+      const std::optional<VectorXd> scale = acceleration_scale(group, mass_diagonal, of_rows);
+      for (Index k = 0; scale && k < scale->size(); ++k) {
+        double& entry = variance[group.view().rows[static_cast<std::size_t>(k)]];
+        entry = std::max(entry, (*scale)[k] * (*scale)[k]);
+      }
+    }
+  };
+  add(spread_of_rows);
+  const VectorXd of_spread = variance;
+  add(size_of_rows);
+  variance = (of_spread.array() > 0).select(of_spread, variance);
+  double kinetic = 0;
+  int n_observed = 0;
+  for (Index j = 0; j < variance.size(); ++j) {
+    if (variance[j] < 0) continue;
+    kinetic += mass_diagonal[j] * variance[j];
+    ++n_observed;
+  }
+  kinetic = usable(kinetic / std::max(n_observed, 1), 1);
+  VectorXd sigma(system.nq());
+  for (Index j = 0; j < sigma.size(); ++j) {
+    const double equal_kinetic = std::sqrt(kinetic / mass_diagonal[j]);
+    sigma[j] = variance[j] < 0 ? equal_kinetic : usable(std::sqrt(variance[j]), equal_kinetic);
+  }
+  return sigma;
+}
+
+// the prior at the states of all observations
+struct PooledStates {
+  std::vector<MatrixXd> features;    // per latent (D × N)
+  std::vector<MatrixXd> directions;  // per latent (nq·p × N)
+  VectorXd mass_diagonal;            // M_jj at its median (nq)
+};
+
+PooledStates pooled_states(const Prior& prior, const std::vector<Observations>& observations) {
+  const System& system = *prior.system;
+  std::vector<std::vector<MatrixXd>> features(prior.latents.size()), directions(prior.latents.size());
+  std::vector<std::vector<double>> mass(static_cast<std::size_t>(system.nq()));
+  for (const Observations& group : observations) {
+    const Prior& there = prior_of(prior, group.view());
+    const VectorXd parameters = parameters_of(group.view(), system.parameter_values());
+    const MechanicsBatch mechanics = require_mechanics(there, group.view(), group.states(), parameters);
+    PriorValues values = evaluate_prior(there, group.states(), parameters, mechanics);
+    for (std::size_t a = 0; a < prior.latents.size(); ++a) {
+      features[a].push_back(evaluate_features(there.latents[a], group.states()).transpose());
+      directions[a].push_back(std::move(values.directions[a]));
+    }
+    for (std::size_t j = 0; j < mass.size(); ++j) {
+      const auto row = static_cast<Index>(j);
+      for (const UdwadiaKalaba& projection : mechanics.projections) mass[j].push_back(projection.mass()(row, row));
+    }
+  }
+  PooledStates pooled;
+  for (std::size_t a = 0; a < prior.latents.size(); ++a) {
+    pooled.features.push_back(side_by_side(features[a]));
+    pooled.directions.push_back(side_by_side(directions[a]));
+  }
+  pooled.mass_diagonal.resize(system.nq());
+  for (std::size_t j = 0; j < mass.size(); ++j) pooled.mass_diagonal[static_cast<Index>(j)] = median(std::move(mass[j]));
+  return pooled;
+}
+
+// a feature that is constant to rounding has no spread of its own, but a magnitude
+VectorXd usable_spreads(VectorXd spreads, const MatrixXd& features) {
+  for (Index d = 0; d < spreads.size(); ++d) {
+    const double magnitude = usable(features.row(d).cwiseAbs().maxCoeff(), 1);
+    if (!(spreads[d] > 1e-12 * magnitude)) spreads[d] = magnitude;
+  }
+  return spreads;
+}
+
+// σ_j, M_jj σ_j, or of directions of its own σ̄ / rms(E column)
+VectorXd signal_scales(const Latent& latent, const MatrixXd& directions, const VectorXd& mass_diagonal, const VectorXd& sigma) {
+  if (latent.directions_are_identity) {
+    return latent.base == Latent::Base::force ? VectorXd(mass_diagonal.cwiseProduct(sigma)) : sigma;
+  }
+  VectorXd signal(latent.size());
+  for (Index l = 0; l < signal.size(); ++l) {
+    const auto column = directions.middleRows(l * sigma.size(), sigma.size());
+    const double rms = std::sqrt(column.squaredNorm() / static_cast<double>(column.size()));
+    signal[l] = sigma.mean() / usable(rms, 1);
+  }
+  return signal;
+}
+
+// the spread of each row that is observed, or its size, or that of its acceleration
+VectorXd output_scales(const Observations& group, const VectorXd& sigma) {
+  VectorXd stddev = spread_of_rows(group.values());
+  const VectorXd size = size_of_rows(group.values());
+  const bool per_coordinate = group.view().quantity != View::Quantity::multipliers;
+  for (Index k = 0; k < stddev.size(); ++k) {
+    const int row = group.view().rows[static_cast<std::size_t>(k)];
+    stddev[k] = usable(stddev[k], usable(size[k], per_coordinate ? sigma[row] : 1));
+  }
+  return stddev;
+}
+
+}  // namespace
+
+Scales default_scales(const Prior& prior, const std::vector<Observations>& observations) {
+  const PooledStates pooled = pooled_states(prior, observations);
+  Scales scales;
+  scales.acceleration_stddev = coordinate_scales(*prior.system, observations, pooled.mass_diagonal);
+  for (std::size_t a = 0; a < prior.latents.size(); ++a) {
+    const MatrixXd& features = pooled.features[a];
+    scales.feature_stddev.push_back(usable_spreads(row_stddev(features), features));
+    scales.feature_range.push_back(usable_spreads(features.rowwise().maxCoeff() - features.rowwise().minCoeff(), features));
+    scales.signal_stddev.push_back(
+        signal_scales(prior.latents[a], pooled.directions[a], pooled.mass_diagonal, scales.acceleration_stddev));
+  }
+  for (const Observations& group : observations) {
+    scales.output_stddev.push_back(output_scales(group, scales.acceleration_stddev));
+  }
+  return scales;
+}
+
+}  // namespace gp2
