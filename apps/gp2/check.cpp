@@ -67,8 +67,7 @@ int check_mechanics(const Model& model, const Eigen::MatrixXd& states) {
   const int n_errors = print(check_system(system, states, system.parameter_values()));
   if (n_errors > 0) return n_errors;
   MechanicsBatch mechanics;
-  evaluate_mechanics(make_prior(model), View::all(View::Quantity::constrained_acceleration, system), states,
-                     system.parameter_values(), mechanics);
+  evaluate_mechanics(make_prior(model), View::constrained_acceleration(system), states, system.parameter_values(), mechanics);
   if (!mechanics.fault) return 0;
   return print({{Finding::Level::error, fmt::format("{} at state {}", mechanics.fault->text, mechanics.fault->state + 1)}});
 }

@@ -57,7 +57,7 @@ void print_text(const Evaluation& e) {
 // the accelerations that training observed
 std::vector<std::string> observed_outputs(const FitFile& fit) {
   for (const Observations& group : fit.observations) {
-    if (group.view().quantity == View::Quantity::constrained_acceleration) return group.view().names(*fit.model.system);
+    if (group.view().is_of_ddq()) return group.view().names(*fit.model.system);
   }
   return {};
 }

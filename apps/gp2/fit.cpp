@@ -83,10 +83,10 @@ SideInformation read_knowledge(const std::string& text) {
   const std::size_t colon = text.find(':');
   const std::string view = text.substr(0, std::min(colon, text.size()));
   const std::size_t at = view.find('@');
-  const std::optional<View::Quantity> quantity = View::quantity_of(view.substr(0, at));
+  const std::optional<View::Quantity> quantity = View::Quantity::of_word(view.substr(0, at));
   if (colon == std::string::npos || !quantity) {
     throw InputError(fmt::format("--also: '{}' is not VIEW:FILE.csv or VIEW@LATENT:FILE.csv with VIEW one of {}", text,
-                                 fmt::join(View::quantity_words(), ", ")));
+                                 fmt::join(View::Quantity::words(), ", ")));
   }
   return {*quantity, at == std::string::npos ? "" : view.substr(at + 1), read_log(text.substr(colon + 1))};
 }

@@ -27,16 +27,16 @@ struct Arguments {
 // what the arguments ask to see
 View view_of(const Arguments& arguments, const PredictedSystem& system, const Prior& home) {
   const Prior& prior = system.prior;
-  View view = system.view(*View::quantity_of(arguments.view));
+  View view = system.view(*View::Quantity::of_word(arguments.view));
   if (view.size() == 0) throw InputError(fmt::format("--view {}: '{}' has no constraints", arguments.view, prior.system->name()));
-  const bool needs_step = view.quantity == View::Quantity::next_velocity;
+  const bool needs_step = view.quantity->needs_time_step();
   if (needs_step != arguments.time_step.has_value()) {
     throw InputError(needs_step ? "--view next-velocity needs the time step: --dt SECONDS"
                                 : "--dt goes with --view next-velocity");
   }
   if (needs_step) {
-    view.time_step = *arguments.time_step;
-    if (!(view.time_step > 0)) throw InputError(fmt::format("--dt: must be positive, got {}", view.time_step));
+    view.time_step = arguments.time_step;
+    if (!(*view.time_step > 0)) throw InputError(fmt::format("--dt: must be positive, got {}", *view.time_step));
   }
   if (arguments.latent) view.latent = latent_index(home, *arguments.latent, "--latent");
   return view;
@@ -50,7 +50,7 @@ struct NewColumns {
 
 NewColumns predict(const Posterior& posterior, const View& view, const Eigen::MatrixXd& states, const std::string& covariance) {
   const Prior& prior = posterior.prior();
-  const std::string latent = view.latent < 0 ? "" : prior.latents[static_cast<std::size_t>(view.latent)].name;
+  const std::string latent = !view.latent ? "" : prior.latents[static_cast<std::size_t>(*view.latent)].name;
   const std::vector<std::string> names = view.names(*prior_of(prior, view).system, latent);
   const Eigen::Index d = view.size();
   NewColumns out{names, {}};
@@ -153,7 +153,7 @@ void add_predict(CLI::App& app) {
       ->add_option("--view", arguments->view,
                    "constrained: ddq1 …; unconstrained: abar_q1 …; constraint-force: fc_q1 …; multipliers: lambda1 …; "
                    "next-velocity: dq1_next …, with --dt")
-      ->check(CLI::IsMember(View::quantity_words()))
+      ->check(CLI::IsMember(View::Quantity::words()))
       ->capture_default_str();
   command->add_option("--dt", arguments->time_step, "time step of next-velocity [s]");
   command->add_option("--latent", arguments->latent, "only what this latent adds to the view, by its name: NAME@LATENT");

@@ -40,7 +40,7 @@ struct Subject {
   Eigen::VectorXd parameters;
 
   [[nodiscard]] const System& system() const { return *model.system; }
-  [[nodiscard]] View view() const { return View::all(View::Quantity::constrained_acceleration, system()); }
+  [[nodiscard]] View view() const { return View::constrained_acceleration(system()); }
 };
 
 Subject read_subject(const std::string& file) {

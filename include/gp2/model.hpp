@@ -15,6 +15,7 @@
 #include "gp2/mechanics/symbolic_system.hpp"
 #include "gp2/prior.hpp"
 #include "gp2/robots/robot.hpp"
+#include "gp2/view.hpp"
 
 namespace gp2 {
 

@@ -51,8 +51,7 @@ class Predictor {
 
   /// Predicts every row of the constrained acceleration ddq.
   explicit Predictor(const Posterior& posterior);
-  /// @throws InputError when the view looks at multipliers, which are not predicted here, or has rows or a latent that there are
-  /// not.
+  /// @throws InputError when the view has rows or a latent that there are not, or lacks a time step.
   Predictor(const Posterior& posterior, View view);
   Predictor(const Posterior& posterior, View view, Options options);
 
@@ -104,7 +103,8 @@ class Predictor {
   ///     dddq = T (dā + M⁻¹(dM (ā − ddq) + dAᵀλ)) + L (db − dA ddq)
   ///
   /// (where M is singular dF̄ − dM ddq + dAᵀλ instead of M dā + dM (ā − ddq) + dAᵀλ), which is exact wherever the rank of A is the
-  /// same around the state. As good as the system's derivatives: see state_evaluator.hpp, also for |v| at v = 0.
+  /// same around the state; so are the multipliers of least norm of redundant rows, and their derivative. As good as the system's
+  /// derivatives: see state_evaluator.hpp, also for |v| at v = 0.
   /// @param jacobian  (d × layout size), columns in the order of StateLayout: [q; dq; t; u]
   /// @throws InputError when options().jacobian is false.
   [[nodiscard]] Status mean_and_jacobian(const Eigen::Ref<const Eigen::VectorXd>& state, Eigen::Ref<Eigen::VectorXd> mean,

@@ -11,7 +11,6 @@
 #include "gp2/mechanics/udwadia_kalaba.hpp"
 #include "gp2/prior/kernel.hpp"
 #include "gp2/symbolic/expression.hpp"
-#include "gp2/view.hpp"
 
 namespace gp2 {
 
@@ -81,20 +80,6 @@ struct Prior {
   [[nodiscard]] std::vector<bool> reads() const;
 };
 
-/// Another system in which the latents of a prior act: other constraints, masses or parameters, with the same coordinates and
-/// inputs (Geist & Trimpe 2020, eq. 10).
-struct OtherSystem {
-  Prior prior;              // as many latents as the prior at home, with the same kernels, features and numbers of directions
-  std::vector<int> shared;  // per parameter of its system: which parameter at home it is; −1: it has its own value
-
-  /// The parameters there, given those at home.
-  [[nodiscard]] Eigen::VectorXd parameters(const Eigen::Ref<const Eigen::VectorXd>& home) const;
-};
-
-/// What a view looks at: the prior of its other system, or the one at home; and the parameters there.
-const Prior& prior_of(const Prior& home, const View& view);
-Eigen::VectorXd parameters_of(const View& view, const Eigen::Ref<const Eigen::VectorXd>& home);
-
 /// μ and E at N states, or their derivatives in one parameter.
 struct PriorValues {
   Eigen::MatrixXd mean;                     // μ    (nq × N)
@@ -107,22 +92,6 @@ struct PriorValues {
     return {directions[latent].col(i).data(), mean.rows(), directions[latent].rows() / mean.rows()};
   }
 };
-
-/// The mechanics at N states for a view of a prior: as evaluate_mechanics of the system, and a fault also where M is singular, so
-/// that there is no ā, while the view is of ā, the prior's mean constant, or a latent not on forces.
-///
-/// @param prior       prior_of(home, view)
-/// @param parameters  of its system
-void evaluate_mechanics(const Prior& prior, const View& view, const Eigen::Ref<const Eigen::MatrixXd>& states,
-                        const Eigen::Ref<const Eigen::VectorXd>& parameters, MechanicsBatch& batch);
-
-/// The same, where a fault is an error.
-/// @throws InputError naming the state and the rule.
-MechanicsBatch require_mechanics(const Prior& prior, const View& view, const Eigen::Ref<const Eigen::MatrixXd>& states,
-                                 const Eigen::Ref<const Eigen::VectorXd>& parameters);
-
-/// What of a view of a prior has no meaning where M is singular, as a text; nothing where all has.
-std::optional<std::string> what_needs_acceleration(const Prior& prior, const View& view);
 
 /// φ_a at N states (N × D_a), one row per state: the layout kernels read.
 Eigen::MatrixXd evaluate_features(const Latent& latent, const Eigen::Ref<const Eigen::MatrixXd>& states);

@@ -3,48 +3,60 @@
 #include <memory>
 #include <optional>
 #include <string>
-#include <string_view>
 #include <vector>
 
 #include <Eigen/Core>
 
-#include "gp2/mechanics/udwadia_kalaba.hpp"
+#include "gp2/mechanics/quantity.hpp"
+#include "gp2/prior.hpp"
 
 namespace gp2 {
 
-struct OtherSystem;
+/// Another system in which the latents of a prior act: other constraints, masses or parameters, with the same coordinates and
+/// inputs (Geist & Trimpe 2020, eq. 10).
+struct OtherSystem {
+  Prior prior;              // as many latents as the prior at home, with the same kernels, features and numbers of directions
+  std::vector<int> shared;  // per parameter of its system: which parameter at home it is; −1: it has its own value
 
-/// A quantity that is affine in the unconstrained acceleration ā at a state: G(x) ā(x) + d(x). Where M is singular ā stands for
-/// M'⁻¹F̄, the M' of UdwadiaKalaba, and cannot be viewed itself; elsewhere M' = M.
+  /// The parameters there, given those at home.
+  [[nodiscard]] Eigen::VectorXd parameters(const Eigen::Ref<const Eigen::VectorXd>& home) const;
+};
+
+/// Rows of a quantity that is affine in the unconstrained acceleration ā of a prior: v(x) = G(x) ā(x) + d(x). Where M is singular
+/// ā stands for M'⁻¹F̄, the M' of UdwadiaKalaba, and cannot be viewed itself; elsewhere M' = M.
 struct View {
-  enum class Quantity {
-    constrained_acceleration,    // ddq = T ā + L b    G = T             d = L b           [ddq]
-    unconstrained_acceleration,  // ā                  G = I             d = 0             [ddq]
-    constraint_force,            // Aᵀλ = M (ddq − ā)  G = M T − M'      d = M L b         [force]
-    multipliers,                 // λ                  G = (Aᵀ)⁺(MT − M')  d = (Aᵀ)⁺M L b  [force/row]; nc of them
-    next_velocity,               // dq + Δt ddq        G = Δt T          d = dq + Δt L b   [dq]
-  };
+  using Quantity = gp2::Quantity;
 
   Quantity quantity = Quantity::constrained_acceleration;
-  std::vector<int> rows;  // of the quantity, in this order
-  double time_step = 0;   // Δt of next_velocity [s]
-  /// What one latent alone adds: G E_a f_a, without μ and d. −1: everything.
-  int latent = -1;
-  /// The quantity as it is under another system (Geist & Trimpe 2020, eq. 10): prior.hpp. Null: the prior's own system.
+  std::vector<int> rows;                 // of the quantity, in this order
+  std::optional<double> time_step = {};  // Δt, of a quantity that needs one: next_velocity [s]
+  /// What one latent alone adds: G E_a f_a, without μ and d. Not given: everything.
+  std::optional<int> latent = {};
+  /// The quantity as it is under another system. Null: the prior's own system.
   std::shared_ptr<const OtherSystem> other_system = nullptr;
 
   /// Every row of a quantity.
   static View all(Quantity quantity, const System& system);
-
-  /// "constrained", "unconstrained", "constraint-force", "multipliers", "next-velocity": the words of commands and files.
-  static const std::vector<std::string>& quantity_words();
-  static std::string word(Quantity quantity);
-  static std::optional<Quantity> quantity_of(std::string_view word);
-
-  /// Which entries of a state the view reads beyond those of the mechanics (layout size): dq for next_velocity.
-  [[nodiscard]] std::vector<bool> reads(const System& system) const;
+  static View constrained_acceleration(const System& system) { return all(Quantity::constrained_acceleration, system); }
+  static View unconstrained_acceleration(const System& system) { return all(Quantity::unconstrained_acceleration, system); }
+  static View constraint_force(const System& system) { return all(Quantity::constraint_force, system); }
+  static View multipliers(const System& system) { return all(Quantity::multipliers, system); }
+  static View next_velocity(const System& system, double time_step);
 
   [[nodiscard]] int size() const { return static_cast<int>(rows.size()); }
+  /// Whether it is of measured accelerations: ddq, to which every latent adds.
+  [[nodiscard]] bool is_of_ddq() const { return quantity == Quantity::constrained_acceleration && !latent; }
+  /// Δt where the quantity depends on it, else 0.
+  /// @throws InputError where it is needed and not given.
+  [[nodiscard]] double required_time_step() const;
+  /// Whether μ, or latent a, is part of it.
+  [[nodiscard]] bool has_mean() const { return !latent; }
+  [[nodiscard]] bool has_latent(std::size_t a) const { return !latent || *latent == static_cast<int>(a); }
+  /// The entry of the state that is added to row k of the view, where there is one.
+  [[nodiscard]] std::optional<int> added_entry(const StateLayout& layout, int k) const;
+  /// Which entries of a state the view reads beyond those of the mechanics (layout size).
+  [[nodiscard]] std::vector<bool> reads(const System& system) const;
+
   /// The same rows of the same quantity, under the same OtherSystem object.
   bool operator==(const View&) const = default;
   /// ddq1 … (constrained), abar_q1 … (unconstrained), fc_q1 … (constraint force), lambda1 … (multipliers), dq1_next … (next
@@ -52,6 +64,26 @@ struct View {
   /// @param latent_name  of that latent
   [[nodiscard]] std::vector<std::string> names(const System& system, const std::string& latent_name = "") const;
 };
+
+/// What a view looks at: the prior of its other system, or the one at home; and the parameters there.
+const Prior& prior_of(const Prior& home, const View& view);
+Eigen::VectorXd parameters_of(const View& view, const Eigen::Ref<const Eigen::VectorXd>& home);
+
+/// The mechanics at N states for a view of a prior: as evaluate_mechanics of the system, and a fault also where M is singular, so
+/// that there is no ā, while the view is of ā, the prior's mean constant, or a latent not on forces.
+///
+/// @param prior       prior_of(home, view)
+/// @param parameters  of its system
+void evaluate_mechanics(const Prior& prior, const View& view, const Eigen::Ref<const Eigen::MatrixXd>& states,
+                        const Eigen::Ref<const Eigen::VectorXd>& parameters, MechanicsBatch& batch);
+
+/// The same, where a fault is an error.
+/// @throws InputError naming the state and the rule.
+MechanicsBatch require_mechanics(const Prior& prior, const View& view, const Eigen::Ref<const Eigen::MatrixXd>& states,
+                                 const Eigen::Ref<const Eigen::VectorXd>& parameters);
+
+/// What of a view of a prior has no meaning where M is singular, as a text; nothing where all has.
+std::optional<std::string> what_needs_acceleration(const Prior& prior, const View& view);
 
 /// G and d of a view, or their derivatives in one parameter, at N states.
 struct ViewValues {
@@ -67,7 +99,7 @@ struct ViewValues {
 ViewValues evaluate_view(const View& view, const MechanicsBatch& mechanics, const Eigen::Ref<const Eigen::MatrixXd>& states);
 
 /// ∂G/∂p and ∂d/∂p, given ∂M/∂p, ∂A/∂p, ∂b/∂p.
-/// @throws InputError for multipliers of redundant rows, which are not differentiable.
+/// @throws InputError for multipliers of redundant rows, whose number may change with the parameters.
 ViewValues differentiate_view(const View& view, const MechanicsBatch& mechanics, const SystemValues& derivative);
 
 }  // namespace gp2

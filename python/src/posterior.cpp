@@ -62,13 +62,13 @@ Look look(const PyPosterior& self, const ViewArguments& arguments) {
   }
   if (out.view.size() == 0)
     throw InputError(fmt::format("view '{}': '{}' has no constraints", arguments.quantity, out.prior.system->name()));
-  const bool needs_step = quantity == View::Quantity::next_velocity;
+  const bool needs_step = quantity->needs_time_step();
   if (needs_step != arguments.time_step.has_value()) {
     throw InputError(needs_step ? "view 'next-velocity' needs the time step dt [s]" : "dt goes with view 'next-velocity'");
   }
   if (needs_step) {
-    out.view.time_step = *arguments.time_step;
-    if (!(out.view.time_step > 0)) throw InputError(fmt::format("dt: must be positive, got {}", out.view.time_step));
+    out.view.time_step = arguments.time_step;
+    if (!(*out.view.time_step > 0)) throw InputError(fmt::format("dt: must be positive, got {}", *out.view.time_step));
   }
   if (arguments.latent) out.view.latent = latent_index(home, *arguments.latent, "latent");
   out.names = out.view.names(*out.prior.system, arguments.latent.value_or(""));
@@ -175,7 +175,7 @@ Evaluation evaluate(const PyPosterior& self, const py::object& data, const PySys
   std::vector<std::string> names = outputs;
   for (const Observations& group : self.posterior.observations()) {
     if (!names.empty()) break;
-    if (group.view().quantity == View::Quantity::constrained_acceleration) names = group.view().names(self.system());
+    if (group.view().is_of_ddq()) names = group.view().names(self.system());
   }
   const std::vector<int> rows = acceleration_rows(self.system(), names, "outputs");
   const CsvTable table = to_table(data, "data");
@@ -212,9 +212,9 @@ void update_with(PyPosterior& self, const py::object& data, const std::vector<st
   const System& system = self.system();
   const std::vector<Observations>& groups = self.posterior.observations();
   const auto at_home = std::find_if(groups.begin(), groups.end(), [](const Observations& group) {
-    return group.view().quantity == View::Quantity::constrained_acceleration && group.view().other_system == nullptr;
+    return group.view().is_of_ddq() && group.view().other_system == nullptr;
   });
-  View view = View::all(View::Quantity::constrained_acceleration, system);
+  View view = View::constrained_acceleration(system);
   std::vector<std::string> names = observe;
   if (names.empty() && at_home != groups.end()) names = at_home->view().names(system);
   view.rows = acceleration_rows(system, names, "observe");
@@ -351,7 +351,7 @@ std::vector<Motion> simulate_all(const Model& model, const VectorXd& parameters,
 
 py::object simulate_posterior(const PyPosterior& self, const SimulateArguments& arguments, const std::optional<int>& n_samples,
                               std::uint64_t seed) {
-  const View view = View::all(View::Quantity::constrained_acceleration, self.system());
+  const View view = View::constrained_acceleration(self.system());
   const Posterior posterior = self.posterior;
   const VectorXd parameters = posterior.values().parameters;
   std::vector<Acceleration> accelerations;

@@ -101,10 +101,11 @@ class PyPredictor {
 PyPredictor make(const PyPosterior& posterior, const std::string& quantity, const std::optional<double>& dt, bool std,
                  bool jacobian, const std::string& storage) {
   View view = View::all(quantity_argument(quantity), posterior.system());
-  if ((view.quantity == View::Quantity::next_velocity) != dt.has_value()) {
+  if (view.size() == 0) throw InputError(fmt::format("view '{}': '{}' has no constraints", quantity, posterior.system().name()));
+  if (view.quantity->needs_time_step() != dt.has_value()) {
     throw InputError(dt ? "dt goes with view 'next-velocity'" : "view 'next-velocity' needs the time step dt [s]");
   }
-  view.time_step = dt.value_or(0);
+  view.time_step = dt;
   if (storage != "double" && storage != "single") {
     throw InputError(fmt::format("storage: expected 'double' or 'single', got '{}'", storage));
   }

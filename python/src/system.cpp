@@ -190,9 +190,9 @@ std::map<std::string, std::string> columns_argument(const py::object& columns) {
 }
 
 View::Quantity quantity_argument(const std::string& given) {
-  const std::optional<View::Quantity> quantity = View::quantity_of(given);
+  const std::optional<View::Quantity> quantity = View::Quantity::of_word(given);
   if (!quantity)
-    throw InputError(fmt::format("view: expected one of {}, got '{}'", fmt::join(View::quantity_words(), ", "), given));
+    throw InputError(fmt::format("view: expected one of {}, got '{}'", fmt::join(View::Quantity::words(), ", "), given));
   return *quantity;
 }
 

@@ -291,7 +291,7 @@ int index_in_loading(const Label& label, const Latent& latent) {
 
 // every hyperparameter belongs to something the model has, once, and every kernel and signal has its values
 void locate_in_model(std::vector<Hyperparameter>& hyperparameters, const Prior& prior,
-                           const std::vector<Observations>& observations) {
+                     const std::vector<Observations>& observations) {
   Labels labels(prior, observations);
   for (Hyperparameter& h : hyperparameters) {
     const Label label{kind_word(h), h.owner, h.index};
@@ -367,10 +367,10 @@ Baseline baseline_from(const ParsedJson& json) {
 /// @param other  the model of its view's other system; null: none
 Json observations_json(const Observations& group, const Prior& home, const Model* other) {
   const System& system = *prior_of(home, group.view()).system;
-  Json json = {{"view", View::word(group.view().quantity)},
+  Json json = {{"view", group.view().quantity->word()},
                {"rows", group.view().rows},
-               {"time_step", group.view().time_step},
-               {"latent", group.view().latent},
+               {"time_step", group.view().time_step.value_or(0)},
+               {"latent", group.view().latent.value_or(-1)},
                {"n", group.n_data()},
                {"noise_stddev", vector_json(group.noise().stddev())},
                {"estimate_noise", group.noise().is_estimated()},
@@ -386,17 +386,19 @@ View view_from(const ParsedJson& json, const Prior& home, std::shared_ptr<const 
   view.other_system = std::move(other_system);
   const Prior& prior = prior_of(home, view);
   const auto word = json.at("view").get<std::string>();
-  const std::optional<View::Quantity> quantity = View::quantity_of(word);
+  const std::optional<View::Quantity> quantity = View::Quantity::of_word(word);
   if (!quantity) throw InputError(fmt::format("'{}' is no view", word));
   view.quantity = *quantity;
-  view.time_step = number(json.at("time_step"));
-  if (*quantity == View::Quantity::next_velocity && !(view.time_step > 0)) {
-    throw InputError("the time_step of next-velocity must be positive");
+  const double time_step = number(json.at("time_step"));
+  if ((*quantity)->needs_time_step()) {
+    if (!(time_step > 0)) throw InputError(fmt::format("the time_step of {} must be positive", word));
+    view.time_step = time_step;
   }
-  view.latent = integer(json.at("latent"));
-  if (view.latent < -1 || view.latent >= static_cast<int>(prior.latents.size())) {
-    throw InputError(fmt::format("latent {} of a view is outside -1 … {}", view.latent, prior.latents.size() - 1));
+  const int latent = integer(json.at("latent"));
+  if (latent < -1 || latent >= static_cast<int>(prior.latents.size())) {
+    throw InputError(fmt::format("latent {} of a view is outside -1 … {}", latent, prior.latents.size() - 1));
   }
+  if (latent >= 0) view.latent = latent;
   const int n_rows = View::all(*quantity, *prior.system).size();
   for (const ParsedJson& row : array(json.at("rows"))) {
     const int index = integer(row);

@@ -42,7 +42,7 @@ Trained trained(const Posterior& posterior, int row) {
   std::vector<double> values;
   for (std::size_t g = 0; g < posterior.observations().size(); ++g) {
     const Observations& group = posterior.observations()[g];
-    if (group.view().quantity != View::Quantity::constrained_acceleration || group.view().latent >= 0) continue;
+    if (!group.view().is_of_ddq()) continue;
     for (int k = 0; k < group.view().size(); ++k) {
       if (group.view().rows[static_cast<std::size_t>(k)] != row) continue;
       if (values.empty()) trained.noise = group.usual_noise(posterior.values().noise_stddev[g])[k];
@@ -70,7 +70,7 @@ double max_constraint_error(const System& system, const Ref<const MatrixXd>& sta
 Evaluation evaluate_predictions(const Posterior& posterior, const Ref<const MatrixXd>& states, const std::vector<int>& rows,
                                 const Ref<const MatrixXd>& targets, const std::shared_ptr<const OtherSystem>& other_system,
                                 int n_threads) {
-  View all = View::all(View::Quantity::constrained_acceleration, *posterior.prior().system);
+  View all = View::constrained_acceleration(*posterior.prior().system);
   all.other_system = other_system;
   const System& system = prior_of(posterior.prior(), all).reference_system();
   const Posterior::Marginal prediction = posterior.marginal(all, states, n_threads);

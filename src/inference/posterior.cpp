@@ -35,7 +35,7 @@ void Query::evaluate(const Posterior::Implementation& posterior, const View& vie
   view = evaluate_view(viewed, mechanics, block);
   prior = evaluate_prior(there, block, parameters, mechanics);
   latent = viewed.latent;
-  if (latent >= 0) prior.keep_only(static_cast<std::size_t>(latent));
+  if (latent) prior.keep_only(static_cast<std::size_t>(*latent));
   features.resize(there.latents.size());
   for (std::size_t a = 0; a < features.size(); ++a) features[a] = evaluate_features(there.latents[a], block);
 }
@@ -105,9 +105,9 @@ class SampleSums {
   [[nodiscard]] const std::vector<MatrixXd>& mean() const { return mean_; }
 
   /// @param features  per latent (n × D)
-  /// @param latent    the one that is needed, −1: all
+  /// @param latent    the one that is needed; not given: all
   /// @param loadings  ℓ_aᵀ as in Query; where not null, `cross` receives cov(ỹ, Σ_a ℓ_aᵀ f_a), d columns per state
-  void evaluate(const std::vector<MatrixXd>& features, int latent, const std::vector<MatrixXd>* loadings = nullptr,
+  void evaluate(const std::vector<MatrixXd>& features, std::optional<int> latent, const std::vector<MatrixXd>* loadings = nullptr,
                 MatrixXd* cross = nullptr) {
     const std::size_t n_latents = posterior_.latents.size();
     const Index n_states = features.front().rows();
@@ -134,7 +134,7 @@ class SampleSums {
  private:
   static constexpr Index chunk = 256;  // samples whose features stay in the L1 cache
 
-  [[nodiscard]] bool needs(std::size_t a) const { return latent_ < 0 || latent_ == static_cast<int>(a); }
+  [[nodiscard]] bool needs(std::size_t a) const { return !latent_ || *latent_ == static_cast<int>(a); }
   VectorXd& point(std::size_t a, Index i) { return points_[a][static_cast<std::size_t>(i)]; }
 
   // the kernel between samples of a chunk and state i, and its part of the mean
@@ -178,7 +178,7 @@ class SampleSums {
   VectorXd products_, sums_;
   std::vector<MatrixXd> mean_;
   KernelColumns::Workspace kernel_;
-  int latent_ = -1;
+  std::optional<int> latent_;
 };
 
 // calls work(first state, how many, block, thread) for every block of states

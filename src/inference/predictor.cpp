@@ -1,19 +1,17 @@
 #include "gp2/predictor.hpp"
 
-#include <algorithm>
 #include <cmath>
 #include <limits>
+#include <optional>
 #include <string_view>
 #include <utility>
 #include <vector>
 
 #include <fmt/format.h>
 
-#include "base/lapack.hpp"
-#include "base/simd.hpp"
 #include "gp2/error.hpp"
 #include "gp2/mechanics/state_evaluator.hpp"
-#include "inference/posterior_implementation.hpp"
+#include "inference/predictor_data.hpp"
 
 namespace gp2 {
 
@@ -22,123 +20,22 @@ using Eigen::Map;
 using Eigen::MatrixXd;
 using Eigen::Ref;
 using Eigen::VectorXd;
-using Quantity = View::Quantity;
 using Status = Predictor::Status;
-
-namespace {
-
-template <typename T>
-using MatrixOf = Eigen::Matrix<T, Eigen::Dynamic, Eigen::Dynamic>;
-template <typename T>
-using VectorOf = Eigen::Matrix<T, Eigen::Dynamic, 1>;
-
-template <typename T>
-const simd::Loops<T>& loops() {
-  if constexpr (std::is_same_v<T, double>) {
-    return simd::target().loops;
-  } else {
-    return simd::target().loops_single;
-  }
-}
-
-// `rows` in another precision, padded with zeros to n_rows
-template <typename T>
-MatrixOf<T> stored(const Ref<const MatrixXd>& rows, Index n_rows) {
-  MatrixOf<T> out = MatrixOf<T>::Zero(n_rows, rows.cols());
-  const Index n = std::min(n_rows, rows.rows());
-  out.topRows(n) = rows.topRows(n).template cast<T>();
-  return out;
-}
-
-// A latent that the view needs.
-struct Term {
-  std::size_t latent = 0;
-  KernelColumns kernel;  // k between the samples and a state
-  MatrixXd C;            // loading (p × F)
-
-  [[nodiscard]] Index size() const { return C.rows(); }         // p
-  [[nodiscard]] Index n_functions() const { return C.cols(); }  // F
-};
-
-// What is known of the latents at the N samples, in the precision it is stored in. Rows are padded to whole vectors.
-template <typename T>
-struct Data {
-  struct Latent {
-    MatrixOf<T> points;      // of se: scaled features, less their centre (n_rows × D)
-    VectorXd centre;         // (D)
-    MatrixOf<T> weights;     // β Cᵀ (n_rows × p)
-    MatrixXd exact_weights;  // of another kernel: the same in double precision, where T is single
-    MatrixOf<T> Z;           // as in Posterior::Implementation (n_rows × components·F)
-  };
-  std::vector<Latent> latents;  // per term
-  std::vector<T> inverse;       // X = L⁻¹ row by row, each padded with zeros to whole vectors
-
-  void store(const Posterior::Implementation& posterior, const std::vector<Term>& terms, bool stddev) {
-    for (const Term& term : terms) {
-      const Posterior::Implementation::LatentAtSamples& from = posterior.latents[term.latent];
-      const Index n = static_cast<Index>(posterior.samples.size()), n_rows = simd::padded<T>(n);
-      Latent& latent = latents.emplace_back();
-      if (term.kernel.is_squared_exponential()) {
-        MatrixXd points = term.kernel.scaled().topRows(n);
-        latent.centre = VectorXd::Zero(points.cols());
-        if (std::is_same_v<T, float> && n > 0) latent.centre = points.colwise().mean();
-        points.rowwise() -= latent.centre.transpose();
-        latent.points = stored<T>(points, n_rows);
-      } else if (std::is_same_v<T, float>) {
-        latent.exact_weights = from.beta * from.C.transpose();
-      }
-      latent.weights = stored<T>((from.beta * from.C.transpose()).topRows(n), n_rows);
-      if (stddev) latent.Z = stored<T>(from.Z.topRows(n), n_rows);
-    }
-    if (stddev) store_inverse(posterior.factor);
-  }
-
-  void store_inverse(const GrowingCholesky& factor) {
-    const Index n = factor.size();
-    std::vector<Index> first{0};  // of each row
-    for (Index i = 0; i < n; ++i) first.push_back(first.back() + simd::padded<T>(i + 1));
-    inverse.resize(static_cast<std::size_t>(first.back()));
-    // L X = I for blocks of columns, which begin with zeros
-    constexpr Index block = 64;
-    MatrixXd columns;
-    for (Index j = 0; j < n; j += block) {
-      const Index m = std::min(block, n - j), below = n - j;
-      columns = MatrixXd::Identity(below, m);
-      lapack::solve_lower(factor.L().bottomRightCorner(below, below), false, columns);
-      for (Index i = 0; i < below; ++i) {
-        T* const row = inverse.data() + first[static_cast<std::size_t>(j + i)] + j;
-        for (Index l = 0; l < std::min(m, i + 1); ++l) row[l] = static_cast<T>(columns(i, l));
-      }
-    }
-  }
-};
-
-// Memory of the sums over the samples.
-template <typename T>
-struct Memory {
-  MatrixOf<T> k;         // k_a (n_rows × terms)
-  VectorOf<T> point;     // of se: as Data::Latent::points (D)
-  VectorOf<T> sums;      // of any few columns
-  VectorOf<T> products;  // (n_rows)
-  VectorOf<T> loading;   // (F)
-  MatrixOf<T> cross;     // cov(ỹ, ·), by row of the factor (reduced size, padded × columns)
-};
-
-}  // namespace
 
 struct Predictor::Implementation {
   Prior prior;          // where the view looks
   VectorXd parameters;  // there
   View view;
   Options options;
-  std::vector<Term> terms;
-  std::vector<std::vector<Index>> row_of;  // [component][sample], as in Posterior::Implementation
-  Index reduced_size = 0;
-  Index n_all_functions = 0;        // Σ F
-  bool has_force = false;           // μ or a direction that is multiplied by M⁻¹
-  bool needs_acceleration = false;  // ā itself, which is none where M is singular
-  Data<double> in_double;
-  Data<float> in_single;
+  std::vector<PredictorTerm> terms;
+  double time_step = 0;                           // Δt of the view's quantity
+  MotionParts parts;                              // that it reads
+  std::vector<std::optional<int>> added_entries;  // of the state, to each row of the view
+  bool is_constrained = false;                    // ddq or Aᵀλ is one of them
+  bool has_force = false;                         // μ or a direction that is multiplied by M⁻¹
+  bool needs_acceleration = false;                // ā itself, which is none where M is singular
+  PredictorData<double> in_double;
+  PredictorData<float> in_single;
 
   Implementation(const Posterior::Implementation& posterior, View viewed, Options given);
 
@@ -146,22 +43,29 @@ struct Predictor::Implementation {
   template <typename Work>
   void with_data(Workspace::Implementation& w, const Work& work) const;
 
-  Status evaluate(const Ref<const VectorXd>& state, StateEvaluator& at, Workspace::Implementation& w) const;
-  void write_mean(const Ref<const VectorXd>& state, const StateEvaluator& at, Workspace::Implementation& w,
-                  Ref<VectorXd> mean) const;
-  // both; NaN in the mean where the state cannot be evaluated
-  Status evaluate_mean(const Ref<const VectorXd>& state, StateEvaluator& at, Workspace::Implementation& w,
-                       Ref<VectorXd>& mean) const;
+  // the mean; NaN where the state cannot be evaluated
+  Status write_mean(const Ref<const VectorXd>& state, StateEvaluator& at, Workspace::Implementation& w,
+                    Ref<VectorXd>& mean) const;
+  // these follow the mean at the same state
   void write_stddev(const StateEvaluator& at, Workspace::Implementation& w, Ref<VectorXd> stddev) const;
   void write_jacobian(const Ref<const VectorXd>& state, const StateEvaluator& at, Workspace::Implementation& w,
                       Ref<MatrixXd> jacobian) const;
 
-  [[nodiscard]] const Latent& latent(const Term& term) const { return prior.latents[term.latent]; }
-  // whether the view is G ā + d, not G E_a f_a
-  [[nodiscard]] bool is_whole() const { return view.latent < 0; }
-  [[nodiscard]] bool has_mean_force() const { return is_whole() && prior.mean == Prior::Mean::force; }
-  [[nodiscard]] bool is_of_functions() const { return n_all_functions < view.size(); }
-  [[nodiscard]] double factor() const { return view.quantity == Quantity::next_velocity ? view.time_step : 1; }
+  [[nodiscard]] const Latent& latent(const PredictorTerm& term) const { return prior.latents[term.latent]; }
+  [[nodiscard]] bool has_mean_force() const { return view.has_mean() && prior.mean == Prior::Mean::force; }
+  [[nodiscard]] int n_quantity_rows() const { return view.quantity->n_rows(prior.system->nq(), prior.system->nc()); }
+
+ private:
+  // the projection at a state
+  Status evaluate_mechanics(StateEvaluator& at, Workspace::Implementation& w) const;
+  // ā there
+  Status evaluate_prior(const Ref<const VectorXd>& state, const StateEvaluator& at, Workspace::Implementation& w) const;
+  // ddq, and Aᵀλ if the view or the Jacobian needs it
+  void evaluate_motion(const StateEvaluator& at, Workspace::Implementation& w) const;
+  void write_loadings(Workspace::Implementation& w) const;
+  void differentiate_prior(const Ref<const VectorXd>& state, Workspace::Implementation& w) const;
+  void differentiate_mechanics(const StateEvaluator& at, Workspace::Implementation& w) const;
+  void differentiate_motion(const StateEvaluator& at, Workspace::Implementation& w) const;
 };
 
 struct Predictor::Workspace::Implementation {
@@ -169,8 +73,8 @@ struct Predictor::Workspace::Implementation {
   std::unique_ptr<StateEvaluator> values, values_and_derivatives;
   UdwadiaKalaba projection;
   UdwadiaKalaba::Workspace refinement;
-  KernelColumns::Workspace kernel;
-  VectorXd k, gradient;  // of a kernel that is no se: its values (rows), and (D·p)
+  QuantityKind::Workspace quantity;
+  AffineMotion affine_motion;
 
   struct AtState {
     VectorXd features_tape, directions_tape, dfeatures_tape, ddirections_tape;
@@ -181,29 +85,40 @@ struct Predictor::Workspace::Implementation {
     VectorXd signal;                  // C g (p)
     MatrixXd dsignal;                 // d(C g)/dφ (D × p)
     MatrixXd E_dsignal;               // B d(C g)/dφ (nq × D)
-    MatrixXd loading;                 // ℓ (F × d)
   };
   std::vector<AtState> terms;
-  VectorXd a_bar;             // ā
-  VectorXd force;             // what is multiplied by M⁻¹ in it …
-  VectorXd a_of_force;        // … and the product
-  VectorXd a;                 // ddq, or T ā of one latent alone
-  VectorXd gap;               // a − ā, then ā − a − a_of_force
-  VectorXd of_constraint;     // Aᵀλ = M (a − ā)
-  VectorXd lambda;            // λ (nc)
-  MatrixXd L;                 // (nq × nc)
-  MatrixXd d_a_bar;           // dā, and (nq × layout size)
-  MatrixXd d_force;           // what is multiplied by M⁻¹ in it and in da
-  MatrixXd d_forced;          // … in da alone
-  MatrixXd d_rows;            // db − dA a (nc × layout size)
-  MatrixXd d_a;               // da
-  MatrixXd d_gap;             // dM (a − ā)
-  MatrixXd Gt, M_inverse_Gt;  // Gᵀ (nq × d)
-  VectorXd variance;          // (d)
-  Memory<double> in_double;
-  Memory<float> in_single;
+  VectorXd a_bar;                  // ā
+  VectorXd force;                  // what is multiplied by M⁻¹ in it …
+  VectorXd a_of_force;             // … and the product
+  VectorXd a;                      // ddq, or T ā of one latent alone
+  VectorXd gap;                    // a − ā
+  VectorXd of_constraint;          // Aᵀλ = M (a − ā)
+  VectorXd lambda;                 // λ (nc)
+  MatrixXd L;                      // (nq × nc)
+  MatrixXd d_of_rest;              // of dā, what is not multiplied by M⁻¹ (nq × layout size)
+  MatrixXd d_force;                // what is
+  MatrixXd d_forced;               // … in da alone
+  MatrixXd d_rows;                 // db − dA a (nc × layout size)
+  MatrixXd d_a_bar, d_a;           // dā, da
+  MatrixXd d_mass_a_bar;           // M dā
+  MatrixXd d_of_constraint;        // dM (a − ā), then d(Aᵀλ)
+  MatrixXd value, d_value;         // every row of the quantity (× 1), (× layout size)
+  MatrixXd G;                      // every row (× nq)
+  MatrixXd Gt, M_inverse_Gt;       // Gᵀ of the view (nq × d)
+  std::vector<MatrixXd> loadings;  // ℓ, per term (F × d)
+  VectorXd variance;               // (d)
+  PredictorData<double>::Memory in_double;
+  PredictorData<float>::Memory in_single;
 
   explicit Implementation(std::shared_ptr<const Predictor::Implementation> owner);
+
+  [[nodiscard]] MotionColumns motion() const { return {columns_of(a), columns_of(a_bar), columns_of(of_constraint)}; }
+  [[nodiscard]] MotionColumns dmotion() const { return {columns_of(d_a), columns_of(d_a_bar), columns_of(d_of_constraint)}; }
+  [[nodiscard]] StateMechanics mechanics(const Map<const MatrixXd>& A) const { return {projection, A, predictor->time_step}; }
+
+ private:
+  void reserve_mechanics();
+  void reserve_term(const PredictorTerm& term);
 };
 
 template <typename Work>
@@ -218,17 +133,15 @@ void Predictor::Implementation::with_data(Workspace::Implementation& w, const Wo
 namespace {
 
 void check_view(const View& view, const Prior& prior) {
-  if (view.quantity == Quantity::multipliers) {
-    throw InputError("Predictor: multipliers are not predicted; view the constraint force, or use Posterior::mean");
-  }
+  const int n_rows = view.quantity->n_rows(prior.system->nq(), prior.system->nc());
   for (const int row : view.rows) {
-    if (row < 0 || row >= prior.system->nq()) {
-      throw InputError(fmt::format("Predictor: rows of the view are 0 … {}, got {}", prior.system->nq() - 1, row));
+    if (row < 0 || row >= n_rows) {
+      throw InputError(fmt::format("Predictor: rows of the view are 0 … {}, got {}", n_rows - 1, row));
     }
   }
-  if (view.latent >= static_cast<int>(prior.latents.size())) {
+  if (view.latent && (*view.latent < 0 || *view.latent >= static_cast<int>(prior.latents.size()))) {
     throw InputError(fmt::format("Predictor: the prior has {} latents, numbered from 0, got a view of latent {}",
-                                 prior.latents.size(), view.latent));
+                                 prior.latents.size(), *view.latent));
   }
 }
 
@@ -246,6 +159,29 @@ void check_size(std::string_view what, Index got, Index wanted) {
   if (got != wanted) throw InputError(fmt::format("Predictor: {} is of size {}, got {}", what, wanted, got));
 }
 
+// dA in each entry of the state
+class StateChange final : public ConstraintChange {
+ public:
+  explicit StateChange(const StateEvaluator& at) : at_(at) {}
+  void add_product(const Ref<const MatrixXd>& x, Ref<MatrixXd> out) const override {
+    for_each([&](int i, int j, int k, double value) { out(i, k) += value * x(j, x.cols() == 1 ? 0 : k); });
+  }
+  void subtract_transposed_product(const Ref<const MatrixXd>& y, Ref<MatrixXd> out) const override {
+    for_each([&](int i, int j, int k, double value) { out(j, k) -= value * y(i, y.cols() == 1 ? 0 : k); });
+  }
+
+ private:
+  template <typename Work>
+  void for_each(const Work& work) const {
+    const auto values = at_.derivative_values();
+    for (std::size_t e = 0; e < at_.derivatives().size(); ++e) {
+      const auto [quantity, i, j, k] = at_.derivatives()[e];
+      if (quantity == StateEvaluator::Quantity::constraint_matrix) work(i, j, k, values[static_cast<Index>(e)]);
+    }
+  }
+  const StateEvaluator& at_;
+};
+
 }  // namespace
 
 Predictor::Implementation::Implementation(const Posterior::Implementation& posterior, View viewed, Options given)
@@ -253,15 +189,16 @@ Predictor::Implementation::Implementation(const Posterior::Implementation& poste
       parameters(parameters_of(viewed, posterior.values.parameters)),
       view(std::move(viewed)),
       options(given),
-      row_of(posterior.row_of),
-      reduced_size(posterior.factor.size()) {
+      time_step(view.required_time_step()),
+      parts(view.quantity->parts()),
+      is_constrained(parts.constrained_acceleration || parts.constraint_force) {
   check_view(view, prior);
   has_force = has_mean_force();
+  for (int r = 0; r < view.size(); ++r) added_entries.push_back(view.added_entry(prior.system->layout(), r));
   needs_acceleration = what_needs_acceleration(prior, view).has_value();
   for (std::size_t a = 0; a < prior.latents.size(); ++a) {
-    if (!is_whole() && static_cast<int>(a) != view.latent) continue;
+    if (!view.has_latent(a)) continue;
     terms.push_back({a, posterior.latents[a].kernel, posterior.latents[a].C});
-    n_all_functions += terms.back().n_functions();
     has_force = has_force || prior.latents[a].base == Latent::Base::force;
   }
   if (options.storage == Storage::single_precision) {
@@ -274,137 +211,69 @@ Predictor::Implementation::Implementation(const Posterior::Implementation& poste
 Predictor::Workspace::Implementation::Implementation(std::shared_ptr<const Predictor::Implementation> owner)
     : predictor(std::move(owner)) {
   const Predictor::Implementation& self = *predictor;
-  const System& system = *self.prior.system;
-  const Index nq = system.nq(), nc = system.nc(), n_state = system.layout().size(), d = self.view.size();
-  values = system.make_evaluator(self.parameters, false);
-  if (self.options.jacobian) values_and_derivatives = system.make_evaluator(self.parameters, true);
+  values = self.prior.system->make_evaluator(self.parameters, false);
+  if (self.options.jacobian) values_and_derivatives = self.prior.system->make_evaluator(self.parameters, true);
+  reserve_mechanics();
+  for (const PredictorTerm& term : self.terms) reserve_term(term);
+  self.with_data(*this, [&](const auto& data, auto& memory) {
+    memory = data.make_memory(self.terms, self.view.size(), self.options.stddev);
+  });
+}
 
+void Predictor::Workspace::Implementation::reserve_mechanics() {
+  const System& system = *predictor->prior.system;
+  const Index nq = system.nq(), nc = system.nc(), n_state = system.layout().size(), d = predictor->view.size();
+  const Index n_rows = predictor->n_quantity_rows();
   a_bar.setZero(nq);
   force = a_of_force = a = gap = of_constraint = a_bar;
   lambda.setZero(nc);
   L.setZero(nq, nc);
   d_a_bar.setZero(nq, n_state);
-  d_force = d_forced = d_a = d_gap = d_a_bar;
+  d_of_rest = d_force = d_forced = d_a = d_mass_a_bar = d_of_constraint = d_a_bar;
   d_rows.setZero(nc, n_state);
+  value.setZero(n_rows, 1);
+  d_value.setZero(n_rows, n_state);
+  G.setZero(n_rows, nq);
   Gt.setZero(nq, d);
   M_inverse_Gt = Gt;
   variance.setZero(d);
   // rows that are all the same, so that the memory for redundant ones is there too
-  projection.compute(MatrixXd::Identity(nq, nq), MatrixXd::Ones(nc, nq), VectorXd::Zero(nc));
+  const MatrixXd rows = MatrixXd::Ones(nc, nq);
+  projection.compute(MatrixXd::Identity(nq, nq), rows, VectorXd::Zero(nc));
   projection.constrain(a_bar, a, refinement);
-
-  const Index n_samples = self.row_of.empty() ? 0 : static_cast<Index>(self.row_of.front().size());
-  self.with_data(*this, [&]<typename T>(const Data<T>&, Memory<T>& memory) {
-    const Index n_rows = simd::padded<T>(n_samples);
-    Index widest = 1;  // of columns summed at once
-    for (const Term& term : self.terms) {
-      const Latent& latent = self.latent(term);
-      const Index D = latent.n_features(), p = term.size();
-      AtState& at = terms.emplace_back();
-      at.features_tape = latent.features.make_workspace(VectorXd());
-      at.features.setZero(D);
-      at.point.setZero(term.kernel.n_scaled());
-      at.signal.setZero(p);
-      at.dsignal.setZero(D, p);
-      at.E_dsignal.setZero(nq, D);
-      at.loading.setZero(term.n_functions(), d);
-      if (!latent.directions_are_identity) {
-        at.directions_tape = latent.directions.make_workspace(self.parameters);
-        at.directions.setZero(nq * p);
-      }
-      if (self.options.jacobian) {
-        at.dfeatures_tape = latent.feature_state_derivatives.tape.make_workspace(VectorXd());
-        at.dfeatures.setZero(static_cast<Index>(latent.feature_state_derivatives.entries.size()));
-        if (!latent.directions_are_identity) {
-          at.ddirections_tape = latent.direction_state_derivatives.tape.make_workspace(self.parameters);
-          at.ddirections.setZero(static_cast<Index>(latent.direction_state_derivatives.entries.size()));
-        }
-      }
-      if (!term.kernel.is_squared_exponential()) {
-        // once, so that its own memory is there
-        k.setZero(term.kernel.n_rows());
-        const MatrixXd weights = MatrixXd::Zero(k.size(), p);
-        gradient.setZero(std::max(gradient.size(), D * p));
-        term.kernel.evaluate(0, k.size(), at.point, k.data(), kernel);
-        term.kernel.differentiate(0, k.size(), at.point, k.data(), weights.data(), weights.rows(), p, gradient.data(), kernel);
-      }
-      if (memory.point.size() < D) memory.point.setZero(D);
-      widest = std::max({widest, D * p, term.n_functions()});
-    }
-    const Index n_columns = std::min(d, self.n_all_functions);
-    memory.k.setZero(n_rows, static_cast<Index>(self.terms.size()));
-    memory.sums.setZero(std::max(widest, n_columns));
-    memory.loading.setZero(widest);
-    if (self.options.stddev) {
-      memory.products.setZero(n_rows);
-      memory.cross.setZero(simd::padded<T>(self.reduced_size), n_columns);
-    }
-  });
+  affine_motion.evaluate(projection, MatrixXd::Identity(nq, nq), predictor->parts);
+  const StateMechanics at = mechanics({rows.data(), nc, nq});
+  predictor->view.quantity->evaluate(at, motion(), value, quantity);
+  predictor->view.quantity->differentiate(at, motion(), dmotion(), StateChange(*values), d_value, quantity);
 }
 
-namespace {
-
-// k between the samples and a state
-template <typename T>
-void evaluate_kernel(const Term& term, const typename Data<T>::Latent& data, Predictor::Workspace::Implementation& w,
-                     const VectorXd& point, Memory<T>& memory, T* k) {
-  if (term.kernel.is_squared_exponential()) {
-    const Index D = point.size();
-    for (Index d = 0; d < D; ++d) memory.point[d] = static_cast<T>(point[d] - data.centre[d]);
-    loops<T>().squared_exponential(data.points.rows(), D, data.points.data(), data.points.rows(), memory.point.data(), k);
-    return;
+void Predictor::Workspace::Implementation::reserve_term(const PredictorTerm& term) {
+  const Latent& latent = predictor->latent(term);
+  const Index D = latent.n_features(), p = term.size(), nq = a_bar.size();
+  AtState& at = terms.emplace_back();
+  at.features_tape = latent.features.make_workspace(VectorXd());
+  at.features.setZero(D);
+  at.point.setZero(term.kernel.n_scaled());
+  at.signal.setZero(p);
+  at.dsignal.setZero(D, p);
+  at.E_dsignal.setZero(nq, D);
+  loadings.emplace_back(MatrixXd::Zero(term.n_functions(), predictor->view.size()));
+  if (!latent.directions_are_identity) {
+    at.directions_tape = latent.directions.make_workspace(predictor->parameters);
+    at.directions.setZero(nq * p);
   }
-  const Index n = term.kernel.n_rows();
-  if constexpr (std::is_same_v<T, double>) {
-    term.kernel.evaluate(0, n, point, k, w.kernel);
-  } else {
-    term.kernel.evaluate(0, n, point, w.k.data(), w.kernel);
-    for (Index j = 0; j < n; ++j) k[j] = static_cast<T>(w.k[j]);
+  if (!predictor->options.jacobian) return;
+  at.dfeatures_tape = latent.feature_state_derivatives.tape.make_workspace(VectorXd());
+  at.dfeatures.setZero(static_cast<Index>(latent.feature_state_derivatives.entries.size()));
+  if (!latent.directions_are_identity) {
+    at.ddirections_tape = latent.direction_state_derivatives.tape.make_workspace(predictor->parameters);
+    at.ddirections.setZero(static_cast<Index>(latent.direction_state_derivatives.entries.size()));
   }
 }
 
-// d(C g)/dφ (D × p)
-template <typename T>
-void differentiate_signal(const Term& term, const typename Data<T>::Latent& data, Predictor::Workspace::Implementation& w,
-                          const VectorXd& point, Memory<T>& memory, const T* k, MatrixXd& dsignal) {
-  const Index D = dsignal.rows(), p = dsignal.cols(), n = data.weights.rows();
-  if (term.kernel.is_squared_exponential()) {
-    for (Index d = 0; d < D; ++d) memory.point[d] = static_cast<T>(point[d] - data.centre[d]);
-    loops<T>().difference_products(n, D, p, k, data.weights.data(), n, data.points.data(), n, memory.point.data(),
-                                   memory.sums.data());
-    // dk/dφ_d = k Δ_d/ℓ_d of scaled differences
-    for (Index l = 0; l < p; ++l) {
-      for (Index d = 0; d < D; ++d) dsignal(d, l) = static_cast<double>(memory.sums[l * D + d]) / term.kernel.values()[d];
-    }
-    return;
-  }
-  const Index n_rows = term.kernel.n_rows();
-  if constexpr (std::is_same_v<T, double>) {
-    term.kernel.differentiate(0, n_rows, point, k, data.weights.data(), n, p, dsignal.data(), w.kernel);
-  } else {
-    term.kernel.evaluate(0, n_rows, point, w.k.data(), w.kernel);
-    term.kernel.differentiate(0, n_rows, point, w.k.data(), data.exact_weights.data(), n_rows, p, dsignal.data(), w.kernel);
-  }
-}
+// ---------------------------------------------------------------- mean
 
-// B v added to sum, B (nq × p) or the identity
-void add_product(const VectorXd& B, const VectorXd& v, VectorXd& sum) {
-  const Index nq = sum.size();
-  if (B.size() == 0) {
-    for (Index i = 0; i < nq; ++i) sum[i] += v[i];
-    return;
-  }
-  for (Index l = 0; l < v.size(); ++l) {
-    for (Index i = 0; i < nq; ++i) sum[i] += B[l * nq + i] * v[l];
-  }
-}
-
-}  // namespace
-
-// M, A, b, F, the projection and ā at a state
-Status Predictor::Implementation::evaluate(const Ref<const VectorXd>& state, StateEvaluator& at,
-                                           Workspace::Implementation& w) const {
-  at.evaluate(state);
+Status Predictor::Implementation::evaluate_mechanics(StateEvaluator& at, Workspace::Implementation& w) const {
   if (!is_finite(at.M()) || !is_finite(at.A()) || !is_finite(at.b())) return Status::not_finite;
   w.projection.compute(at.M(), at.A(), at.b());
   switch (w.projection.mass_kind()) {
@@ -421,25 +290,41 @@ Status Predictor::Implementation::evaluate(const Ref<const VectorXd>& state, Sta
   if (w.projection.inconsistency() > MechanicsBatch::consistency_tolerance * w.projection.size_of_b()) {
     return Status::contradicting_constraints;
   }
+  return Status::ok;
+}
 
+namespace {
+
+// B v added to sum, B (nq × p) or the identity
+void add_product(const VectorXd& B, const VectorXd& v, VectorXd& sum) {
+  const Index nq = sum.size();
+  if (B.size() == 0) {
+    for (Index i = 0; i < nq; ++i) sum[i] += v[i];
+    return;
+  }
+  for (Index l = 0; l < v.size(); ++l) {
+    for (Index i = 0; i < nq; ++i) sum[i] += B[l * nq + i] * v[l];
+  }
+}
+
+}  // namespace
+
+Status Predictor::Implementation::evaluate_prior(const Ref<const VectorXd>& state, const StateEvaluator& at,
+                                                 Workspace::Implementation& w) const {
   w.a_bar.setZero();
-  if (is_whole() && prior.mean == Prior::Mean::constant) w.a_bar = prior.constant_mean;
+  if (view.has_mean() && prior.mean == Prior::Mean::constant) w.a_bar = prior.constant_mean;
   w.force.setZero();
   if (has_mean_force()) w.force = at.F();
   bool all_features = true;  // are finite; without observations ā does not show it
-  with_data(w, [&]<typename T>(const Data<T>& data, Memory<T>& memory) {
+  with_data(w, [&](const auto& data, auto& memory) {
     for (std::size_t a = 0; a < terms.size(); ++a) {
-      const Term& term = terms[a];
+      const PredictorTerm& term = terms[a];
       const Latent& of = latent(term);
       Workspace::Implementation::AtState& here = w.terms[a];
       of.features.evaluate_at(state, here.features_tape, here.features);
       all_features = all_features && is_finite(here.features);
       term.kernel.scale(here.features, here.point);
-      T* const k = memory.k.col(static_cast<Index>(a)).data();
-      evaluate_kernel<T>(term, data.latents[a], w, here.point, memory, k);
-      const MatrixOf<T>& weights = data.latents[a].weights;
-      loops<T>().weighted_sums(weights.rows(), term.size(), k, weights.data(), weights.rows(), memory.sums.data());
-      for (Index l = 0; l < term.size(); ++l) here.signal[l] = static_cast<double>(memory.sums[l]);
+      data.evaluate_signal(term, a, here.point, memory, here.signal);
       if (!of.directions_are_identity) of.directions.evaluate_at(state, here.directions_tape, here.directions);
       add_product(here.directions, here.signal, of.base == Latent::Base::force ? w.force : w.a_bar);
     }
@@ -452,146 +337,84 @@ Status Predictor::Implementation::evaluate(const Ref<const VectorXd>& state, Sta
   return is_finite(w.a_bar) && all_features ? Status::ok : Status::not_finite;
 }
 
-void Predictor::Implementation::write_mean(const Ref<const VectorXd>& state, const StateEvaluator& at,
-                                           Workspace::Implementation& w, Ref<VectorXd> mean) const {
-  const Index nq = w.a_bar.size();
-  if (view.quantity == Quantity::unconstrained_acceleration) {
-    w.a = w.a_bar;
-  } else if (is_whole()) {
+void Predictor::Implementation::evaluate_motion(const StateEvaluator& at, Workspace::Implementation& w) const {
+  if (!is_constrained) return;
+  if (view.has_mean()) {
     w.projection.constrain(w.a_bar, w.a, w.refinement);
   } else {
     w.a.noalias() = w.projection.T() * w.a_bar;
   }
+  if (!parts.constraint_force && !options.jacobian) return;
+  // where M is singular ā has nothing but a_of_force, of M', and so drops out
   w.gap = w.a - w.a_bar;
-  if (view.quantity == Quantity::constraint_force || options.jacobian) {
-    // where M is singular ā has nothing but a_of_force, of M', and so drops out
-    w.of_constraint = -w.force;
-    w.of_constraint.noalias() += at.M() * w.gap;
-    w.of_constraint.noalias() += at.M() * w.a_of_force;
+  w.of_constraint = -w.force;
+  w.of_constraint.noalias() += at.M() * w.gap;
+  w.of_constraint.noalias() += at.M() * w.a_of_force;
+}
+
+Status Predictor::Implementation::write_mean(const Ref<const VectorXd>& state, StateEvaluator& at, Workspace::Implementation& w,
+                                             Ref<VectorXd>& mean) const {
+  at.evaluate(state);
+  Status status = evaluate_mechanics(at, w);
+  if (status == Status::ok) status = evaluate_prior(state, at, w);
+  if (status == Status::ok) {
+    evaluate_motion(at, w);
+    view.quantity->evaluate(w.mechanics(at.A()), w.motion(), w.value, w.quantity);
+    for (std::size_t r = 0; r < view.rows.size(); ++r) {
+      double& entry = mean[static_cast<Index>(r)];
+      entry = w.value(view.rows[r], 0);
+      if (added_entries[r]) entry += state[*added_entries[r]];
+    }
+    if (!is_finite(mean)) status = Status::not_finite;
   }
-  for (Index r = 0; r < mean.size(); ++r) {
-    const Index row = view.rows[static_cast<std::size_t>(r)];
-    if (view.quantity == Quantity::constraint_force) {
-      mean[r] = w.of_constraint[row];
-    } else {
-      mean[r] = factor() * w.a[row];
-      if (view.quantity == Quantity::next_velocity && is_whole()) mean[r] += state[nq + row];
+  if (status != Status::ok) mean.setConstant(not_a_number);
+  return status;
+}
+
+// ---------------------------------------------------------------- standard deviation
+
+// ℓ = Cᵀ Bᵀ Gᵀ, or with M⁻¹, and the prior's variance
+void Predictor::Implementation::write_loadings(Workspace::Implementation& w) const {
+  const Index nq = w.Gt.rows();
+  w.variance.setZero();
+  for (std::size_t a = 0; a < terms.size(); ++a) {
+    const PredictorTerm& term = terms[a];
+    const VectorXd& B = w.terms[a].directions;
+    const MatrixXd& Gt = latent(term).base == Latent::Base::force ? w.M_inverse_Gt : w.Gt;
+    const double k = term.kernel.variance(w.terms[a].point);
+    // (Bᵀ Gᵀ)_lr
+    const auto along = [&](Index l, Index r) {
+      if (B.size() == 0) return Gt(l, r);
+      double sum = 0;
+      for (Index i = 0; i < nq; ++i) sum += B[l * nq + i] * Gt(i, r);
+      return sum;
+    };
+    MatrixXd& loading = w.loadings[a];
+    loading.setZero();
+    for (Index r = 0; r < loading.cols(); ++r) {
+      for (Index l = 0; l < term.size(); ++l) {
+        const double value = along(l, r);
+        for (Index f = 0; f < term.n_functions(); ++f) loading(f, r) += term.C(l, f) * value;
+      }
+      w.variance[r] += k * loading.col(r).squaredNorm();
     }
   }
 }
 
 void Predictor::Implementation::write_stddev(const StateEvaluator& at, Workspace::Implementation& w, Ref<VectorXd> stddev) const {
-  const Index nq = w.a_bar.size(), d = view.size();
-  // Gᵀ
-  const MatrixXd& T = w.projection.T();
-  for (Index r = 0; r < d; ++r) {
-    const Index row = view.rows[static_cast<std::size_t>(r)];
-    switch (view.quantity) {
-      case Quantity::unconstrained_acceleration:
-        w.Gt.col(r).setZero();
-        w.Gt(row, r) = 1;
-        break;
-      case Quantity::constraint_force:
-        for (Index j = 0; j < nq; ++j) {
-          double entry = -w.projection.mass()(row, j);
-          for (Index i = 0; i < nq; ++i) entry += at.M()(row, i) * T(i, j);
-          w.Gt(j, r) = entry;
-        }
-        break;
-      default:
-        for (Index j = 0; j < nq; ++j) w.Gt(j, r) = factor() * T(row, j);
-    }
-  }
+  w.affine_motion.evaluate(w.projection, at.M(), parts);
+  view.quantity->evaluate(w.mechanics(at.A()), w.affine_motion.linear(), w.G, w.quantity);
+  for (int r = 0; r < view.size(); ++r) w.Gt.col(r) = w.G.row(view.rows[static_cast<std::size_t>(r)]);
   if (has_force) {
     w.M_inverse_Gt = w.Gt;
     w.projection.solve_mass_in_place(w.M_inverse_Gt);
   }
-
-  // ℓ = Cᵀ Bᵀ Gᵀ, or with M⁻¹, and the prior's variance
-  w.variance.setZero();
-  for (std::size_t a = 0; a < terms.size(); ++a) {
-    const Term& term = terms[a];
-    Workspace::Implementation::AtState& here = w.terms[a];
-    const MatrixXd& Gt = latent(term).base == Latent::Base::force ? w.M_inverse_Gt : w.Gt;
-    const double k = term.kernel.variance(here.point);
-    for (Index r = 0; r < d; ++r) {
-      here.loading.col(r).setZero();
-      for (Index l = 0; l < term.size(); ++l) {
-        double along = 0;
-        if (here.directions.size() == 0) {
-          along = Gt(l, r);
-        } else {
-          for (Index i = 0; i < nq; ++i) along += here.directions[l * nq + i] * Gt(i, r);
-        }
-        for (Index f = 0; f < term.n_functions(); ++f) here.loading(f, r) += term.C(l, f) * along;
-      }
-      w.variance[r] += k * here.loading.col(r).squaredNorm();
-    }
-  }
-
-  with_data(w, [&]<typename Real>(const Data<Real>& data, Memory<Real>& memory) {
-    const simd::Loops<Real>& loop = loops<Real>();
-    // the covariance of ỹ with each row of the view, or with each latent function where those are fewer
-    const Index n_columns = memory.cross.cols();
-    const auto add_products = [&](std::size_t a, std::size_t c, const Real* loading, Index first, Index n) {
-      const MatrixOf<Real>& Z = data.latents[a].Z;
-      loop.add_scaled_products(Z.rows(), n, memory.k.col(static_cast<Index>(a)).data(),
-                               Z.col(static_cast<Index>(c) * terms[a].n_functions() + first).data(), Z.rows(), loading,
-                               memory.products.data());
-    };
-    for (std::size_t c = 0; c < row_of.size(); ++c) {
-      const auto scatter = [&](Index column) {
-        const std::vector<Index>& rows = row_of[c];
-        Real* const to = memory.cross.col(column).data();
-        for (std::size_t j = 0; j < rows.size(); ++j) {
-          if (rows[j] >= 0) to[rows[j]] = memory.products[static_cast<Index>(j)];
-        }
-      };
-      if (is_of_functions()) {
-        const Real one = 1;
-        Index column = 0;
-        for (std::size_t a = 0; a < terms.size(); ++a) {
-          for (Index f = 0; f < terms[a].n_functions(); ++f) {
-            memory.products.setZero();
-            add_products(a, c, &one, f, 1);
-            scatter(column++);
-          }
-        }
-        continue;
-      }
-      for (Index r = 0; r < d; ++r) {
-        memory.products.setZero();
-        for (std::size_t a = 0; a < terms.size(); ++a) {
-          const Index n_functions = terms[a].n_functions();
-          for (Index f = 0; f < n_functions; ++f) memory.loading[f] = static_cast<Real>(w.terms[a].loading(f, r));
-          add_products(a, c, memory.loading.data(), 0, n_functions);
-        }
-        scatter(r);
-      }
-    }
-
-    // |X c|², row by row of X
-    const Real* row = data.inverse.data();
-    for (Index i = 0; i < reduced_size; ++i) {
-      const Index n = simd::padded<Real>(i + 1);
-      loop.weighted_sums(n, n_columns, row, memory.cross.data(), memory.cross.rows(), memory.sums.data());
-      row += n;
-      if (!is_of_functions()) {
-        for (Index r = 0; r < d; ++r) w.variance[r] -= static_cast<double>(memory.sums[r]) * static_cast<double>(memory.sums[r]);
-        continue;
-      }
-      for (Index r = 0; r < d; ++r) {
-        double sum = 0;
-        Index column = 0;
-        for (const Workspace::Implementation::AtState& here : w.terms) {
-          for (Index f = 0; f < here.loading.rows(); ++f) sum += here.loading(f, r) * static_cast<double>(memory.sums[column++]);
-        }
-        w.variance[r] -= sum * sum;
-      }
-    }
-  });
-  for (Index r = 0; r < d; ++r) stddev[r] = w.variance[r] < 0 ? 0 : std::sqrt(w.variance[r]);
+  write_loadings(w);
+  with_data(w, [&](const auto& data, auto& memory) { data.subtract_explained(terms, w.loadings, memory, w.variance); });
+  for (Index r = 0; r < stddev.size(); ++r) stddev[r] = w.variance[r] < 0 ? 0 : std::sqrt(w.variance[r]);
 }
+
+// ---------------------------------------------------------------- Jacobian
 
 // With a = T ā + L b, b = 0 for one latent alone:
 //
@@ -600,109 +423,112 @@ void Predictor::Implementation::write_stddev(const StateEvaluator& at, Workspace
 //
 // Where M is singular P = 0 and ā = a_of_force: the second line is then M ddq = F̄ + Aᵀλ, differentiated, with T M'⁻¹ and L of M'.
 // Derivatives are few: each entry of dM, dA, db, dF is added where it belongs.
-void Predictor::Implementation::write_jacobian(const Ref<const VectorXd>& state, const StateEvaluator& at,
-                                               Workspace::Implementation& w, Ref<MatrixXd> jacobian) const {
-  const Index nq = w.a_bar.size();
-  MatrixXd& P = w.d_a_bar;
-  MatrixXd& R = w.d_force;
-  P.setZero();
-  R.setZero();
-  with_data(w, [&]<typename T>(const Data<T>& data, Memory<T>& memory) {
-    for (std::size_t a = 0; a < terms.size(); ++a) {
-      const Term& term = terms[a];
-      const Latent& of = latent(term);
-      Workspace::Implementation::AtState& here = w.terms[a];
-      differentiate_signal<T>(term, data.latents[a], w, here.point, memory, memory.k.col(static_cast<Index>(a)).data(),
-                              here.dsignal);
-      MatrixXd& sum = of.base == Latent::Base::force ? R : P;
-      // B d(C g)/dφ, then along the features
-      if (here.directions.size() == 0) {
-        here.E_dsignal = here.dsignal.transpose();
-      } else {
-        here.E_dsignal.noalias() =
-            Map<const MatrixXd>(here.directions.data(), nq, term.size()).lazyProduct(here.dsignal.transpose());
-      }
-      of.feature_state_derivatives.tape.evaluate_at(state, here.dfeatures_tape, here.dfeatures);
-      for (std::size_t e = 0; e < of.feature_state_derivatives.entries.size(); ++e) {
-        const StateDerivatives::Entry& entry = of.feature_state_derivatives.entries[e];
-        const double value = here.dfeatures[static_cast<Index>(e)];
-        for (Index i = 0; i < nq; ++i) sum(i, entry.state_index) += here.E_dsignal(i, entry.output) * value;
-      }
-      // dB C g
-      if (of.directions_are_identity) continue;
-      of.direction_state_derivatives.tape.evaluate_at(state, here.ddirections_tape, here.ddirections);
-      for (std::size_t e = 0; e < of.direction_state_derivatives.entries.size(); ++e) {
-        const StateDerivatives::Entry& entry = of.direction_state_derivatives.entries[e];
-        sum(entry.output % nq, entry.state_index) += here.ddirections[static_cast<Index>(e)] * here.signal[entry.output / nq];
-      }
-    }
-  });
 
-  const bool is_constrained = view.quantity != Quantity::unconstrained_acceleration;
+// what the latents add to P and R
+void Predictor::Implementation::differentiate_prior(const Ref<const VectorXd>& state, Workspace::Implementation& w) const {
+  const Index nq = w.a_bar.size();
+  w.d_of_rest.setZero();
+  w.d_force.setZero();
+  for (std::size_t a = 0; a < terms.size(); ++a) {
+    const PredictorTerm& term = terms[a];
+    const Latent& of = latent(term);
+    Workspace::Implementation::AtState& here = w.terms[a];
+    with_data(w, [&](const auto& data, auto& memory) { data.differentiate_signal(term, a, here.point, memory, here.dsignal); });
+    MatrixXd& sum = of.base == Latent::Base::force ? w.d_force : w.d_of_rest;
+    // B d(C g)/dφ, then along the features
+    if (here.directions.size() == 0) {
+      here.E_dsignal = here.dsignal.transpose();
+    } else {
+      here.E_dsignal.noalias() =
+          Map<const MatrixXd>(here.directions.data(), nq, term.size()).lazyProduct(here.dsignal.transpose());
+    }
+    of.feature_state_derivatives.tape.evaluate_at(state, here.dfeatures_tape, here.dfeatures);
+    for (std::size_t e = 0; e < of.feature_state_derivatives.entries.size(); ++e) {
+      const StateDerivatives::Entry& entry = of.feature_state_derivatives.entries[e];
+      const double value = here.dfeatures[static_cast<Index>(e)];
+      for (Index i = 0; i < nq; ++i) sum(i, entry.state_index) += here.E_dsignal(i, entry.output) * value;
+    }
+    // dB C g
+    if (of.directions_are_identity) continue;
+    of.direction_state_derivatives.tape.evaluate_at(state, here.ddirections_tape, here.ddirections);
+    for (std::size_t e = 0; e < of.direction_state_derivatives.entries.size(); ++e) {
+      const StateDerivatives::Entry& entry = of.direction_state_derivatives.entries[e];
+      sum(entry.output % nq, entry.state_index) += here.ddirections[static_cast<Index>(e)] * here.signal[entry.output / nq];
+    }
+  }
+}
+
+// R − dM a_of_force, dAᵀλ, dM (a − ā), db − dA a
+void Predictor::Implementation::differentiate_mechanics(const StateEvaluator& at, Workspace::Implementation& w) const {
   if (is_constrained) {
     w.projection.write_L(w.L);
     w.lambda.noalias() = w.L.transpose() * w.of_constraint;
   }
   w.d_forced.setZero();
   w.d_rows.setZero();
-  w.d_gap.setZero();
+  w.d_of_constraint.setZero();
   const auto values = at.derivative_values();
   for (std::size_t e = 0; e < at.derivatives().size(); ++e) {
     const auto [quantity, i, j, k] = at.derivatives()[e];
     const double value = values[static_cast<Index>(e)];
     switch (quantity) {
       case StateEvaluator::Quantity::mass:
-        R(i, k) -= value * w.a_of_force[j];
-        w.d_gap(i, k) += value * w.gap[j];
+        w.d_force(i, k) -= value * w.a_of_force[j];
+        w.d_of_constraint(i, k) += value * w.gap[j];
         break;
       case StateEvaluator::Quantity::constraint_matrix:
         w.d_forced(j, k) += value * w.lambda[i];
         w.d_rows(i, k) -= value * w.a[j];
         break;
       case StateEvaluator::Quantity::constraint_vector:
-        if (is_whole()) w.d_rows(i, k) += value;
+        if (view.has_mean()) w.d_rows(i, k) += value;
         break;
       case StateEvaluator::Quantity::force:
-        if (has_mean_force()) R(i, k) += value;
+        if (has_mean_force()) w.d_force(i, k) += value;
         break;
     }
   }
+}
 
-  if (view.quantity == Quantity::unconstrained_acceleration) {
-    w.d_a = R;
-    w.projection.solve_mass_in_place(w.d_a);
-    w.d_a += P;
-    for (Index r = 0; r < jacobian.rows(); ++r) jacobian.row(r) = w.d_a.row(view.rows[static_cast<std::size_t>(r)]);
-    return;
+// dā, da and d(Aᵀλ) = dM (a − ā) + M da − M dā, those that the view needs
+void Predictor::Implementation::differentiate_motion(const StateEvaluator& at, Workspace::Implementation& w) const {
+  if (parts.unconstrained_acceleration) {
+    w.d_a_bar = w.d_force;
+    w.projection.solve_mass_in_place(w.d_a_bar);
+    w.d_a_bar += w.d_of_rest;
   }
-  if (view.quantity == Quantity::constraint_force) {
-    // M dā
-    w.d_a = R;
-    w.d_a.noalias() += at.M().lazyProduct(P);
+  if (!is_constrained) return;
+  if (parts.constraint_force) {
+    w.d_mass_a_bar = w.d_force;
+    w.d_mass_a_bar.noalias() += at.M().lazyProduct(w.d_of_rest);
   }
-  // da, in the place of P
-  R += w.d_forced - w.d_gap;
-  w.projection.solve_mass_in_place(R);
-  P += R;
-  w.d_forced.noalias() = w.projection.T().lazyProduct(P);
-  w.d_forced.noalias() += w.L.lazyProduct(w.d_rows);
-  const MatrixXd& d_a = w.d_forced;
-  if (view.quantity == Quantity::constraint_force) {
-    // d(M (a − ā))
-    w.d_gap.noalias() += at.M().lazyProduct(d_a);
-    w.d_gap -= w.d_a;
-    for (Index r = 0; r < jacobian.rows(); ++r) jacobian.row(r) = w.d_gap.row(view.rows[static_cast<std::size_t>(r)]);
-    return;
-  }
-  for (Index r = 0; r < jacobian.rows(); ++r) {
-    const Index row = view.rows[static_cast<std::size_t>(r)];
-    jacobian.row(r) = factor() * d_a.row(row);
-    if (view.quantity == Quantity::next_velocity && is_whole()) jacobian(r, nq + row) += 1;
+  w.d_force += w.d_forced - w.d_of_constraint;
+  w.projection.solve_mass_in_place(w.d_force);
+  w.d_of_rest += w.d_force;
+  w.d_a.noalias() = w.projection.T().lazyProduct(w.d_of_rest);
+  w.d_a.noalias() += w.L.lazyProduct(w.d_rows);
+  if (parts.constraint_force) {
+    w.d_of_constraint.noalias() += at.M().lazyProduct(w.d_a);
+    w.d_of_constraint -= w.d_mass_a_bar;
   }
 }
 
+void Predictor::Implementation::write_jacobian(const Ref<const VectorXd>& state, const StateEvaluator& at,
+                                               Workspace::Implementation& w, Ref<MatrixXd> jacobian) const {
+  differentiate_prior(state, w);
+  differentiate_mechanics(at, w);
+  differentiate_motion(at, w);
+  view.quantity->differentiate(w.mechanics(at.A()), w.motion(), w.dmotion(), StateChange(at), w.d_value, w.quantity);
+  for (std::size_t r = 0; r < view.rows.size(); ++r) {
+    jacobian.row(static_cast<Index>(r)) = w.d_value.row(view.rows[r]);
+    if (added_entries[r]) jacobian(static_cast<Index>(r), *added_entries[r]) += 1;
+  }
+}
+
+// ---------------------------------------------------------------- the public class
+
 Predictor::Predictor(const Posterior& posterior)
-    : Predictor(posterior, View::all(Quantity::constrained_acceleration, *posterior.prior().system)) {}
+    : Predictor(posterior, View::constrained_acceleration(*posterior.prior().system)) {}
 Predictor::Predictor(const Posterior& posterior, View view) : Predictor(posterior, std::move(view), Options()) {}
 Predictor::Predictor(const Posterior& posterior, View view, Options options)
     : implementation_(std::make_shared<const Implementation>(*posterior.implementation_, std::move(view), options)) {}
@@ -712,17 +538,6 @@ Predictor::Workspace::Workspace(const Predictor& predictor)
 Predictor::Workspace::~Workspace() = default;
 Predictor::Workspace::Workspace(Workspace&&) noexcept = default;
 Predictor::Workspace& Predictor::Workspace::operator=(Workspace&&) noexcept = default;
-
-Status Predictor::Implementation::evaluate_mean(const Ref<const VectorXd>& state, StateEvaluator& at,
-                                                Workspace::Implementation& w, Ref<VectorXd>& mean) const {
-  Status status = evaluate(state, at, w);
-  if (status == Status::ok) {
-    write_mean(state, at, w, mean);
-    if (!is_finite(mean)) status = Status::not_finite;
-  }
-  if (status != Status::ok) mean.setConstant(not_a_number);
-  return status;
-}
 
 const View& Predictor::view() const { return implementation_->view; }
 const Predictor::Options& Predictor::options() const { return implementation_->options; }
@@ -743,7 +558,7 @@ void check_arguments(const Predictor::Implementation* predictor, const Ref<const
 Status Predictor::mean(const Ref<const VectorXd>& state, Ref<VectorXd> mean, Workspace& workspace) const {
   check_arguments(implementation_.get(), state, mean, workspace.implementation_.get());
   Workspace::Implementation& w = *workspace.implementation_;
-  return implementation_->evaluate_mean(state, *w.values, w, mean);
+  return implementation_->write_mean(state, *w.values, w, mean);
 }
 
 Status Predictor::mean_and_stddev(const Ref<const VectorXd>& state, Ref<VectorXd> mean, Ref<VectorXd> stddev,
@@ -752,7 +567,7 @@ Status Predictor::mean_and_stddev(const Ref<const VectorXd>& state, Ref<VectorXd
   check_size("the standard deviation", stddev.size(), view().size());
   check_arguments(implementation_.get(), state, mean, workspace.implementation_.get());
   Workspace::Implementation& w = *workspace.implementation_;
-  const Status status = implementation_->evaluate_mean(state, *w.values, w, mean);
+  const Status status = implementation_->write_mean(state, *w.values, w, mean);
   if (status == Status::ok) {
     implementation_->write_stddev(*w.values, w, stddev);
   } else {
@@ -769,7 +584,7 @@ Status Predictor::mean_and_jacobian(const Ref<const VectorXd>& state, Ref<Vector
   check_size("a row of the Jacobian", jacobian.cols(), state.size());
   Workspace::Implementation& w = *workspace.implementation_;
   StateEvaluator& at = *w.values_and_derivatives;
-  Status status = implementation_->evaluate_mean(state, at, w, mean);
+  Status status = implementation_->write_mean(state, at, w, mean);
   if (status == Status::ok) {
     implementation_->write_jacobian(state, at, w, jacobian);
     if (!is_finite(jacobian)) {

@@ -276,7 +276,7 @@ FitProblem make_fit_problem(const Model& model, const std::vector<Log>& logs, co
 
   // what else is known; its noise is judged by the size of the measured signals
   const bool needs_step = std::any_of(also.begin(), also.end(), [](const SideInformation& side_information) {
-    return side_information.quantity == View::Quantity::next_velocity;
+    return side_information.quantity->needs_time_step();
   });
   if (options.time_step && !needs_step) throw InputError("--dt goes with --also next-velocity:FILE.csv");
   if (options.also_noise_stddev && also.empty()) throw InputError("--also-noise-std goes with --also VIEW:FILE.csv");

@@ -71,7 +71,7 @@ VectorXd signal_size(const LoggedSystem& logged, const Readings& readings, const
   const MechanicsBatch mechanics = require_mechanics(logged.prior, readings.view, readings.states, logged.parameters);
   const ViewValues view = evaluate_view(readings.view, mechanics, readings.states);
   PriorValues prior = evaluate_prior(logged.prior, readings.states, logged.parameters, mechanics);
-  if (readings.view.latent >= 0) prior.keep_only(static_cast<std::size_t>(readings.view.latent));
+  if (readings.view.latent) prior.keep_only(static_cast<std::size_t>(*readings.view.latent));
   VectorXd variance = VectorXd::Zero(readings.view.size());
   for (int i = 0; i < n_data; ++i) {
     for (std::size_t a = 0; a < signal_stddev.size(); ++a) {
@@ -168,13 +168,10 @@ MatrixXd noise_scale_of(const Readings& readings, const std::vector<std::string>
 VectorXd noise_of_side_information(const LoggedSystem& logged, const SideInformation& side_information,
                                    const FitProblemOptions& options, const Readings& readings,
                                    const std::vector<VectorXd>& signal_stddev) {
-  using Quantity = View::Quantity;
-  const bool is_acceleration = side_information.quantity == Quantity::constrained_acceleration ||
-                               side_information.quantity == Quantity::unconstrained_acceleration;
   const std::vector<double>& of_model = logged.model.noise.stddev;
-  if (!options.also_noise_stddev && (!is_acceleration || of_model.empty())) {
+  if (!options.also_noise_stddev && (!side_information.quantity->is_acceleration() || of_model.empty())) {
     throw InputError(fmt::format("--also {}: {}: its noise is not known: give --also-noise-std S",
-                                 View::word(side_information.quantity), side_information.log.table.name()));
+                                 side_information.quantity->word(), side_information.log.table.name()));
   }
   const std::string source = options.also_noise_stddev ? "--also-noise-std" : logged.model.name + ": [noise] ddq";
   const std::vector<std::string> names = readings.view.names(logged.system(), side_information.latent);

@@ -272,8 +272,8 @@ Observations read_log(const LoggedSystem& logged, const Log& log, const FitProbl
   LogReader reader(log.table, system, columns_of(logged.model, options.columns));
   Readings readings;
   const std::vector<std::string> observe = observed_accelerations(system, options, reader, log.table, notes);
-  readings.view = {View::Quantity::constrained_acceleration, acceleration_rows(system, observe, "--observe"), 0, -1,
-                   logged.other_system};
+  readings.view = {
+      View::Quantity::constrained_acceleration, acceleration_rows(system, observe, "--observe"), {}, {}, logged.other_system};
   readings.states = states_of(logged.prior, readings.view, reader, options.project);
   const std::vector<std::string> observed = readings.view.names(system);
   readings.values = reader.measurements(observed);
@@ -314,16 +314,16 @@ Observations read_side_information(const LoggedSystem& logged, const Prior& fitt
                                    std::vector<int>& lines, std::vector<std::string>& notes) {
   const System& system = logged.system();
   const CsvTable& table = side_information.log.table;
-  const std::string option = "--also " + View::word(side_information.quantity);
+  const std::string option = "--also " + side_information.quantity->word();
   Readings readings;
   View& view = readings.view;
   view = View::all(side_information.quantity, system);
   view.other_system = logged.other_system;
   if (!side_information.latent.empty()) view.latent = latent_index(fitted, side_information.latent, option);
-  if (side_information.quantity == View::Quantity::next_velocity) {
+  if (side_information.quantity->needs_time_step()) {
     if (!options.time_step) throw InputError(option + " needs the time step: --dt SECONDS");
     if (!(*options.time_step > 0)) throw InputError(fmt::format("--dt: must be positive, got {}", *options.time_step));
-    view.time_step = *options.time_step;
+    view.time_step = options.time_step;
   }
   LogReader reader(table, system, columns_of(logged.model, options.columns));
   view.rows = side_information_rows(view, view.names(system, side_information.latent), reader, option, table, system);

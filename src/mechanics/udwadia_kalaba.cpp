@@ -6,7 +6,6 @@
 #include <vector>
 
 #include <fmt/format.h>
-#include <Eigen/QR>
 #include <Eigen/SVD>
 
 #include "gp2/error.hpp"
@@ -311,33 +310,36 @@ void UdwadiaKalaba::solve_mass_in_place(Ref<MatrixXd> v) const {
 
 MatrixXd UdwadiaKalaba::L() const { return L_unit_ * row_scale_.asDiagonal(); }
 
-MatrixXd UdwadiaKalaba::Lambda() const {
-  return row_scale_.asDiagonal() * (L_unit_.transpose() * ML_unit_) * row_scale_.asDiagonal();
-}
-
 MatrixXd UdwadiaKalaba::multipliers_of_force() const {
-  // Lᵀ Aᵀλ = ΛA M⁻¹Aᵀ λ solves Aᵀλ = f
-  MatrixXd solution = row_scale_.asDiagonal() * L_unit_.transpose();
-  // rows that vanish have multipliers 0 and no part in what follows
-  std::vector<Eigen::Index> rows;
-  for (Eigen::Index row = 0; row < row_scale_.size(); ++row) {
-    if (row_scale_[row] > 0) rows.push_back(row);
-  }
-  const Eigen::Index n_redundant = static_cast<Eigen::Index>(rows.size()) - rank_;
-  if (n_redundant == 0) return solution;
-  // redundant rows: take away what lies in the null space of Aᵀ. Of the unit rows its basis is clear; D brings it to the rows as
-  // written
-  const Eigen::JacobiSVD<MatrixXd> svd(A_unit_(rows, Eigen::all).transpose(), Eigen::ComputeFullV);
-  const MatrixXd null_space = row_scale_(rows).asDiagonal() * svd.matrixV().rightCols(n_redundant);
-  const MatrixXd of_rows = solution(rows, Eigen::all);
-  solution(rows, Eigen::all) -= null_space * null_space.completeOrthogonalDecomposition().solve(of_rows);
-  return solution;
+  MatrixXd K;
+  Workspace workspace;
+  write_multipliers_of_force(K, workspace);
+  return K;
 }
 
-MatrixXd UdwadiaKalaba::differentiate_Lambda(const Ref<const MatrixXd>& dM, const Ref<const MatrixXd>& dA) const {
-  const MatrixXd L = this->L();
-  const MatrixXd Lambda_dA_L = Lambda() * (dA * L);
-  return L.transpose() * differentiate_mass(dM, dA) * L - Lambda_dA_L - Lambda_dA_L.transpose();
+void UdwadiaKalaba::write_multipliers_of_force(MatrixXd& K, Workspace& workspace) const {
+  // Lᵀ Aᵀλ = ΛA M⁻¹Aᵀ λ solves Aᵀλ = f
+  K.noalias() = row_scale_.asDiagonal() * L_unit_.transpose();
+  const Index nc = row_scale_.size();
+  // rows that vanish have multipliers 0 and no part in what follows
+  const Index n_redundant = nc - n_zero_rows_ - rank_;
+  if (n_redundant == 0 || rank_ == 0) return;
+
+  // redundant rows: take away what lies in the null space of Aᵀ. Of the unit rows it is that of Bᵀ P = Y R, spanned by the last
+  // columns of Q₂ in Rᵀ P₂ = Q₂ R₂ (decompose_rows); D brings it to the rows as written
+  workspace.null_space_.setZero(nc, nc);
+  workspace.null_rows_.resize(nc, nc);
+  workspace.reflection_.resize(nc);
+  workspace.order_.resize(nc);
+  auto basis = workspace.null_space_.leftCols(nc - rank_);
+  auto of_rows = workspace.null_rows_.leftCols(nc - rank_);
+  basis.bottomRows(nc - rank_).setIdentity();
+  internal::apply_Q(R_transposed_.leftCols(rank_), reflection2_, rank_, basis);
+  for (Index i = 0; i < nc; ++i) of_rows.row(order_[i]) = row_scale_[order_[i]] * basis.row(i);
+  internal::pivoted_qr(of_rows, workspace.reflection_.head(nc - rank_), workspace.order_.head(nc - rank_), 0);
+  internal::apply_Q_transposed(of_rows, workspace.reflection_, n_redundant, K);
+  K.topRows(n_redundant).setZero();
+  internal::apply_Q(of_rows, workspace.reflection_, n_redundant, K);
 }
 
 MatrixXd UdwadiaKalaba::differentiate_mass(const Ref<const MatrixXd>& dM, const Ref<const MatrixXd>& dA) const {
@@ -380,60 +382,6 @@ UdwadiaKalaba::Derivative UdwadiaKalaba::differentiate(const Ref<const MatrixXd>
   d.Lb = T_M_inverse_force * Lb_ + L_unit_ * (row_scale_.cwiseProduct(db) - dA_unit * Lb_);
   d.T = -T_M_inverse_force - L_unit_ * (dA_unit * T_);
   return d;
-}
-
-void UdwadiaKalaba::add_adjoint(const Ref<const MatrixXd>& T_bar, const Ref<const VectorXd>& Lb_bar, Adjoint adjoint,
-                                Workspace& workspace) const {
-  // in the unit rows, as in `differentiate`: Ā of the rows as written is D times theirs
-  MatrixXd& sum = workspace.square_;  // T̄ − v (L b)ᵀ, then T̄ Tᵀ + v (L b)ᵀ
-  MatrixXd& X = workspace.force_;
-  sum = T_bar;
-  sum.noalias() -= Lb_bar * Lb_.transpose();
-  X.noalias() = T_.transpose() * sum;
-  solve_mass_in_place(X);
-  if (row_scale_.size() == 0) return;  // L A = 0
-
-  workspace.tall_.noalias() = X * A_unit_.transpose();
-  add_mass_adjoint(adjoint, workspace);
-
-  sum.noalias() = T_bar * T_.transpose();
-  sum.noalias() += Lb_bar * Lb_.transpose();
-  workspace.wide_.noalias() = ML_unit_.transpose() * X.transpose();
-  workspace.wide_.noalias() += L_unit_.transpose() * sum;
-  adjoint.A -= row_scale_.asDiagonal() * workspace.wide_;
-
-  workspace.rows_.noalias() = L_unit_.transpose() * Lb_bar;
-  adjoint.b += row_scale_.cwiseProduct(workspace.rows_);
-}
-
-void UdwadiaKalaba::add_Lambda_adjoint(const Ref<const MatrixXd>& Lambda_bar, Adjoint adjoint, Workspace& workspace) const {
-  // in the unit rows: Λ̄ → D Λ̄ D
-  MatrixXd& Lambda = workspace.Lambda_;
-  MatrixXd& unit_bar = workspace.Lambda_bar_;
-  Lambda.noalias() = L_unit_.transpose() * ML_unit_;
-  unit_bar = row_scale_.asDiagonal() * Lambda_bar * row_scale_.asDiagonal();
-  workspace.tall_.noalias() = L_unit_ * unit_bar;
-  add_mass_adjoint(adjoint, workspace);
-
-  workspace.product_ = unit_bar + unit_bar.transpose();
-  unit_bar.noalias() = Lambda * workspace.product_;
-  workspace.wide_.noalias() = unit_bar * L_unit_.transpose();
-  adjoint.A -= row_scale_.asDiagonal() * workspace.wide_;
-}
-
-// of M', W Lᵀ with W in workspace.tall_, to M and, where M is singular, A: Ā += Σ A (M̄' + M̄'ᵀ)
-void UdwadiaKalaba::add_mass_adjoint(Adjoint adjoint, Workspace& workspace) const {
-  if (!mass_is_singular()) {
-    adjoint.M.noalias() += workspace.tall_ * L_unit_.transpose();
-    return;
-  }
-  workspace.mass_bar_.noalias() = workspace.tall_ * L_unit_.transpose();
-  adjoint.M += workspace.mass_bar_;
-  workspace.wide_.noalias() = A_unit_ * workspace.mass_bar_;
-  workspace.wide_.noalias() += A_unit_ * workspace.mass_bar_.transpose();
-  for (Index k = 0; k < row_mass_.size(); ++k) {
-    if (row_mass_[k] > 0) adjoint.A.row(k) += row_mass_[k] / row_scale_[k] * workspace.wide_.row(k);
-  }
 }
 
 namespace {

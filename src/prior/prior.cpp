@@ -1,11 +1,6 @@
 #include "gp2/prior.hpp"
 
-#include <algorithm>
-
-#include <fmt/format.h>
-
-#include "gp2/error.hpp"
-#include "mechanics/describe_fault.hpp"
+#include <utility>
 
 namespace gp2 {
 
@@ -49,53 +44,11 @@ std::vector<bool> Prior::reads() const {
   return reads;
 }
 
-VectorXd OtherSystem::parameters(const Ref<const VectorXd>& home) const {
-  VectorXd parameters = prior.system->parameter_values();
-  for (std::size_t k = 0; k < shared.size(); ++k) {
-    if (shared[k] >= 0) parameters[static_cast<Index>(k)] = home[shared[k]];
-  }
-  return parameters;
-}
-
-const Prior& prior_of(const Prior& home, const View& view) { return view.other_system ? view.other_system->prior : home; }
-
-VectorXd parameters_of(const View& view, const Ref<const VectorXd>& home) {
-  return view.other_system ? view.other_system->parameters(home) : VectorXd(home);
-}
-
 void PriorValues::keep_only(std::size_t latent) {
   mean.setZero();
   for (std::size_t a = 0; a < directions.size(); ++a) {
     if (a != latent) directions[a].setZero();
   }
-}
-
-std::optional<std::string> what_needs_acceleration(const Prior& prior, const View& view) {
-  if (view.quantity == View::Quantity::unconstrained_acceleration) return "the view is of the unconstrained acceleration ā";
-  if (prior.mean == Prior::Mean::constant) return "the prior's mean is an acceleration";
-  const auto of_acceleration = std::find_if(prior.latents.begin(), prior.latents.end(),
-                                            [](const Latent& latent) { return latent.base == Latent::Base::acceleration; });
-  if (of_acceleration == prior.latents.end()) return std::nullopt;
-  return fmt::format(
-      "the latent '{}' acts on the unconstrained acceleration ā: let it act on forces, directions = \"force\" or {{ force = … }}",
-      of_acceleration->name);
-}
-
-void evaluate_mechanics(const Prior& prior, const View& view, const Ref<const MatrixXd>& states,
-                        const Ref<const VectorXd>& parameters, MechanicsBatch& batch) {
-  evaluate_mechanics(*prior.system, states, parameters, batch);
-  const int singular = batch.first_singular();
-  if (batch.fault || singular < 0) return;
-  const std::optional<std::string> text = what_needs_acceleration(prior, view);
-  if (text) batch.fault = {singular, fmt::format("the mass matrix M is singular, so that there is no M⁻¹, but {}", *text)};
-}
-
-MechanicsBatch require_mechanics(const Prior& prior, const View& view, const Ref<const MatrixXd>& states,
-                                 const Ref<const VectorXd>& parameters) {
-  MechanicsBatch batch;
-  evaluate_mechanics(prior, view, states, parameters, batch);
-  if (batch.fault) throw InputError(internal::describe_fault(*prior.system, states, *batch.fault));
-  return batch;
 }
 
 MatrixXd evaluate_features(const Latent& latent, const Ref<const MatrixXd>& states) {

@@ -43,24 +43,17 @@ VectorXd spread_of_rows(const Eigen::Ref<const MatrixXd>& values) {
 // kind
 template <typename OfRows>
 std::optional<VectorXd> acceleration_scale(const Observations& group, const VectorXd& mass_diagonal, const OfRows& of_rows) {
-  using Quantity = View::Quantity;
-  if (group.view().latent >= 0) return std::nullopt;
-  VectorXd stddev = of_rows(group.values());
-  switch (group.view().quantity) {
-    case Quantity::constrained_acceleration:
-    case Quantity::unconstrained_acceleration:
-      return stddev;
-    case Quantity::constraint_force:
-      return VectorXd(stddev.cwiseQuotient(mass_diagonal(group.view().rows)));
-    case Quantity::multipliers:
-      return std::nullopt;
-    case Quantity::next_velocity: {
-      const Index nq = mass_diagonal.size();
-      const MatrixXd dq = group.states().middleRows(nq, nq)(group.view().rows, Eigen::all);
-      return VectorXd(of_rows(group.values() - dq) / group.view().time_step);
-    }
+  const View& view = group.view();
+  if (view.latent || !view.quantity->is_per_coordinate()) return std::nullopt;
+  const StateLayout layout{static_cast<int>(mass_diagonal.size()), 0};
+  MatrixXd values = group.values();
+  VectorXd per_acceleration(view.size());
+  for (int k = 0; k < view.size(); ++k) {
+    const double mass = mass_diagonal[view.rows[static_cast<std::size_t>(k)]];
+    per_acceleration[k] = view.quantity->per_acceleration(mass, view.time_step.value_or(0));
+    if (const std::optional<int> entry = view.added_entry(layout, k)) values.row(k) -= group.states().row(*entry);
   }
-  return std::nullopt;
+  return VectorXd(of_rows(values).cwiseQuotient(per_acceleration));
 }
 
 // σ_j of every coordinate: where ddq_j is observed its spread, or its size where it does not vary; otherwise by equal kinetic
@@ -158,7 +151,7 @@ VectorXd signal_scales(const Latent& latent, const MatrixXd& directions, const V
 VectorXd output_scales(const Observations& group, const VectorXd& sigma) {
   VectorXd stddev = spread_of_rows(group.values());
   const VectorXd size = size_of_rows(group.values());
-  const bool per_coordinate = group.view().quantity != View::Quantity::multipliers;
+  const bool per_coordinate = group.view().quantity->is_per_coordinate();
   for (Index k = 0; k < stddev.size(); ++k) {
     const int row = group.view().rows[static_cast<std::size_t>(k)];
     stddev[k] = usable(stddev[k], usable(size[k], per_coordinate ? sigma[row] : 1));

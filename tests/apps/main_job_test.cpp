@@ -88,18 +88,18 @@ TEST_F(MainJob, PredictsEveryViewUnderItsName) {
   struct Case {
     std::string options;
     View::Quantity quantity;
-    double time_step;
-    int latent;
+    std::optional<double> time_step;
+    std::optional<int> latent;
     std::vector<std::string> names;
   };
   const std::string latent = "'unconstrained acceleration'";
   const std::vector<Case> cases = {
-      {"--view constraint-force", View::Quantity::constraint_force, 0, -1, {"fc_q1", "fc_q2", "fc_q3"}},
-      {"--view multipliers", View::Quantity::multipliers, 0, -1, {"lambda1"}},
-      {"--view next-velocity --dt 0.01", View::Quantity::next_velocity, 0.01, -1, {"dq1_next", "dq2_next", "dq3_next"}},
+      {"--view constraint-force", View::Quantity::constraint_force, {}, {}, {"fc_q1", "fc_q2", "fc_q3"}},
+      {"--view multipliers", View::Quantity::multipliers, {}, {}, {"lambda1"}},
+      {"--view next-velocity --dt 0.01", View::Quantity::next_velocity, 0.01, {}, {"dq1_next", "dq2_next", "dq3_next"}},
       {"--view unconstrained --latent " + latent,
        View::Quantity::unconstrained_acceleration,
-       0,
+       {},
        0,
        {"abar_q1@unconstrained acceleration", "abar_q2@unconstrained acceleration", "abar_q3@unconstrained acceleration"}}};
   for (const Case& one : cases) {

@@ -187,11 +187,11 @@ TEST(MasslessCoordinate, IsPredictedByThePredictorAsByThePosteriorAndDifferentia
     const Problem p = problem(mean);
     const Posterior posterior(p.prior, p.observations, p.values);
     for (const Quantity quantity : {Quantity::constrained_acceleration, Quantity::constraint_force, Quantity::next_velocity}) {
-      for (const int latent : {-1, 0}) {
+      for (const std::optional<int>& latent : {std::optional<int>(), std::optional(0)}) {
         View view = View::all(quantity, *p.prior.system);
         view.time_step = 0.1;
         view.latent = latent;
-        SCOPED_TRACE(fmt::format("{}, latent {}", View::word(quantity), latent));
+        SCOPED_TRACE(fmt::format("{}, latent {}", quantity->word(), latent.value_or(-1)));
         const Predictor predictor(posterior, view);
         Predictor::Workspace workspace = predictor.make_workspace();
         VectorXd got(3), again(3), stddev(3);

@@ -43,7 +43,7 @@ TEST(PosteriorBatchTest, AStateHasTheSameBitsInEveryBatchAndOnAnyNumberOfThreads
     View view = View::all(Quantity::constrained_acceleration, *p.prior.system);
     const MatrixXd& some = p.observations[0].states();
     const MatrixXd states = some.replicate(1, 600 / some.cols() + 1);
-    for (int latent : {-1, 0}) {
+    for (const std::optional<int>& latent : {std::optional<int>(), std::optional(0)}) {
       view.latent = latent;
       const MatrixXd mean = posterior.mean(view, states);
       const Posterior::Marginal marginal = posterior.marginal(view, states);

@@ -35,30 +35,30 @@ const std::vector<Problem>& problems() {
   return all;
 }
 
-// every view of a predictor, with some rows and with one latent alone too, and those under other systems
+// every view, with some rows and with one latent alone too, and those under other systems
 std::vector<View> views_of(const Problem& p) {
   std::vector<View> views;
   const System& system = *p.prior.system;
-  for (const Quantity quantity : {Quantity::constrained_acceleration, Quantity::unconstrained_acceleration,
-                                  Quantity::constraint_force, Quantity::next_velocity}) {
+  for (const Quantity quantity : Quantity::all()) {
     View view = View::all(quantity, system);
-    if (quantity == Quantity::next_velocity) view.time_step = 0.1;
+    if (view.size() == 0) continue;
+    if (quantity->needs_time_step()) view.time_step = 0.1;
     views.push_back(view);
     View alone = view;
     alone.latent = static_cast<int>(p.prior.latents.size()) - 1;
     views.push_back(alone);
-    view.rows = {system.nq() - 1, 0};
+    view.rows = {view.rows.back(), 0};
     views.push_back(view);
   }
   for (const Observations& group : p.observations) {
-    if (group.view().other_system && group.view().quantity != Quantity::multipliers) views.push_back(group.view());
+    if (group.view().other_system) views.push_back(group.view());
   }
   return views;
 }
 
 std::string describe(const Problem& p, const View& view) {
-  return fmt::format("{}, {} ({} rows, latent {}{}), seed {}", p.name, View::word(view.quantity), view.size(), view.latent,
-                     view.other_system ? ", elsewhere" : "", seed);
+  return fmt::format("{}, {} ({} rows, latent {}{}), seed {}", p.name, view.quantity->word(), view.size(),
+                     view.latent.value_or(-1), view.other_system ? ", elsewhere" : "", seed);
 }
 
 MatrixXd known(const MatrixXd& states) { return states.array().isNaN().select(0, states); }
@@ -178,7 +178,7 @@ TEST(PredictorTest, ObeysTheConstraintAndItsDerivativeInBothPrecisions) {
 
 // one row that says the same as another everywhere
 TEST(PredictorTest, DifferentiatesUnderRedundantRows) {
-  const auto predict = [](const std::string& constraints) {
+  const auto predict = [](const std::string& constraints, Quantity quantity) {
     const Model model = Model::parse(fmt::format(R"toml(
 name        = "two in a groove"
 coordinates = ["x", "y"]
@@ -202,17 +202,65 @@ directions = "force"
     const Posterior posterior(make_prior(model, {Prior::Mean::force, std::nullopt, false}),
                               {{states, a_bar, values, noise, false}},
                               {{VectorXd::Ones(2)}, {VectorXd::Ones(2)}, {}, {noise}, VectorXd()});
-    const Predictor predictor(posterior);
+    const Predictor predictor(posterior, View::all(quantity, *model.system));
     Predictor::Workspace workspace = predictor.make_workspace();
     return Prediction(predictor, test::random_vector(5, random), workspace);
   };
-  const Prediction once = predict("\"ddx*cos(y) + x*ddy - dx*dy\"");
-  const Prediction twice = predict("\"ddx*cos(y) + x*ddy - dx*dy\", \"3*(ddx*cos(y) + x*ddy - dx*dy)\"");
-  ASSERT_EQ(once.status, Status::ok);
-  ASSERT_EQ(twice.status, Status::ok);
-  EXPECT_LE(largest(twice.mean - once.mean), 1e3 * eps * (1 + largest(once.mean)));
-  EXPECT_LE(largest(twice.stddev - once.stddev), 1e3 * eps * (1 + largest(once.stddev)));
-  EXPECT_LE(largest(twice.jacobian - once.jacobian), 1e3 * eps * (1 + largest(once.jacobian)));
+  const std::string row = "\"ddx*cos(y) + x*ddy - dx*dy\"";
+  const std::string rows = row + ", \"3*(ddx*cos(y) + x*ddy - dx*dy)\"";
+  for (const Quantity quantity : {Quantity::constrained_acceleration, Quantity::constraint_force, Quantity::multipliers}) {
+    SCOPED_TRACE(quantity->word());
+    const Prediction once = predict(row, quantity), twice = predict(rows, quantity);
+    ASSERT_EQ(once.status, Status::ok);
+    ASSERT_EQ(twice.status, Status::ok);
+    // Aᵀλ = a λ₁ = a (λ₁ + 3 λ₂) with λ₁² + λ₂² least
+    MatrixXd of_once = MatrixXd::Identity(2, 2);
+    if (quantity == Quantity::multipliers) of_once = Eigen::Vector2d(0.1, 0.3);
+    EXPECT_LE(largest(twice.mean - of_once * once.mean), 1e3 * eps * (1 + largest(once.mean)));
+    EXPECT_LE(largest(twice.stddev - of_once * once.stddev), 1e3 * eps * (1 + largest(once.stddev)));
+    EXPECT_LE(largest(twice.jacobian - of_once * once.jacobian), 1e3 * eps * (1 + largest(once.jacobian)));
+  }
+}
+
+// Rows whose proportion changes with the state: multipliers of minimum norm have a derivative there too
+TEST(PredictorTest, DifferentiatesMultipliersOfRedundantRows) {
+  const Model model = Model::parse(R"toml(
+name        = "two in a groove, said differently"
+coordinates = ["x", "y"]
+[mechanics]
+mass  = [["2 + sin(y)", "0.3*x"], ["0.3*x", "1"]]
+force = ["-x*dx", "y"]
+[constraints]
+acceleration = ["ddx*cos(y) + x*ddy - dx*dy", "(2 + sin(x))*(ddx*cos(y) + x*ddy - dx*dy)", "ddx*cos(y) + x*ddy - dx*dy"]
+[[latent]]
+kernel     = "se"
+features   = ["x", "dy"]
+directions = "force"
+)toml",
+                                   "two in a groove");
+  RandomStream random(seed);
+  const MatrixXd states = test::random_vector(5 * 12, random).reshaped(5, 12);
+  const MatrixXd values = test::random_vector(2 * 12, random).reshaped(2, 12);
+  const VectorXd noise = VectorXd::Constant(2, 0.3);
+  const Posterior posterior(make_prior(model, {Prior::Mean::force, std::nullopt, false}),
+                            {{states, View::unconstrained_acceleration(*model.system), values, noise, false}},
+                            {{VectorXd::Ones(2)}, {VectorXd::Ones(2)}, {}, {noise}, VectorXd()});
+  const Predictor predictor(posterior, View::multipliers(*model.system));
+  Predictor::Workspace workspace = predictor.make_workspace();
+  const VectorXd state = test::random_vector(5, random);
+  const Prediction prediction(predictor, state, workspace);
+  ASSERT_EQ(prediction.status, Status::ok);
+  for (Index k = 0; k < state.size(); ++k) {
+    const auto mean_at = [&](double x) {
+      VectorXd moved = state, mean(3);
+      moved[k] = x;
+      EXPECT_EQ(predictor.mean(moved, mean, workspace), Status::ok);
+      return mean;
+    };
+    EXPECT_TRUE(matches(prediction.jacobian.col(k), test::central_difference(mean_at, state[k], 0.02, 1e3 * eps)))
+        << "entry " << k << " of the state";
+  }
+  EXPECT_GT(largest(prediction.jacobian), 0.1);
 }
 
 TEST(PredictorTest, AllocatesNothing) {
@@ -410,8 +458,8 @@ std::string error_of(const Call& call) {
 TEST(PredictorTest, NamesWhatIsWrongWithAnArgument) {
   const Posterior posterior = test::surface_posterior(seed);
   const System& system = *posterior.prior().system;
-  EXPECT_THAT(error_of([&] { Predictor(posterior, View::all(Quantity::multipliers, system)); }),
-              HasSubstr("multipliers are not predicted; view the constraint force"));
+  EXPECT_EQ(error_of([&] { Predictor(posterior, View::all(Quantity::next_velocity, system)); }),
+            "view 'next-velocity' needs a time step");
   EXPECT_THAT(error_of([&] { Predictor(posterior, {.rows = {3}}); }), HasSubstr("rows of the view are 0 … 2, got 3"));
   EXPECT_THAT(error_of([&] { Predictor(posterior, {.rows = {0}, .latent = 1}); }), HasSubstr("1 latents, numbered from 0"));
   const Predictor bare(posterior, View::all(Quantity::constrained_acceleration, system), {.stddev = false, .jacobian = false});

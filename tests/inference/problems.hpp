@@ -328,33 +328,25 @@ inline DenseView dense_view(const Prior& home, const ModelValues& values, const 
     const Extended M = mechanics.M(i).cast<long double>();
     Extended all_G = identity;
     ExtendedVector all_d = ExtendedVector::Zero(nq);
-    switch (view.quantity) {
-      case Quantity::constrained_acceleration:
-        all_G = T;
-        all_d = Lb;
-        break;
-      case Quantity::unconstrained_acceleration:
-        break;
-      case Quantity::constraint_force:
-        all_G = M * (T - identity);
-        all_d = M * Lb;
-        break;
-      case Quantity::multipliers: {
-        const Extended K = pseudo_inverse(mechanics.A(i).transpose().cast<long double>());
-        all_G = K * M * (T - identity);
-        all_d = K * M * Lb;
-        break;
-      }
-      case Quantity::next_velocity:
-        all_G = view.time_step * T;
-        all_d = states.col(i).segment(nq, nq).cast<long double>() + view.time_step * Lb;
-        break;
+    if (view.quantity == Quantity::constrained_acceleration) {
+      all_G = T;
+      all_d = Lb;
+    } else if (view.quantity == Quantity::constraint_force) {
+      all_G = M * (T - identity);
+      all_d = M * Lb;
+    } else if (view.quantity == Quantity::multipliers) {
+      const Extended K = pseudo_inverse(mechanics.A(i).transpose().cast<long double>());
+      all_G = K * M * (T - identity);
+      all_d = K * M * Lb;
+    } else if (view.quantity == Quantity::next_velocity) {
+      all_G = *view.time_step * T;
+      all_d = states.col(i).segment(nq, nq).cast<long double>() + *view.time_step * Lb;
     }
     const Extended G = all_G(view.rows, Eigen::all);
     const ExtendedVector offset =
-        view.latent >= 0 ? ExtendedVector(ExtendedVector::Zero(view.size())) : ExtendedVector(all_d(view.rows));
+        view.latent ? ExtendedVector(ExtendedVector::Zero(view.size())) : ExtendedVector(all_d(view.rows));
     ExtendedVector mean = ExtendedVector::Zero(nq);
-    if (prior.mean == Prior::Mean::force && view.latent < 0) mean = M_inverse * mechanics.F(i).cast<long double>();
+    if (prior.mean == Prior::Mean::force && !view.latent) mean = M_inverse * mechanics.F(i).cast<long double>();
     dense.mean.segment(i * view.size(), view.size()) = G * mean + offset;
     std::vector<Extended>& loadings = dense.loading.emplace_back();
     for (std::size_t a = 0; a < prior.latents.size(); ++a) {

@@ -225,7 +225,7 @@ TEST(SingularMass, AMassThatIsIllConditionedAndThatAConstraintDoesNotCompleteIsU
   EXPECT_EQ(UdwadiaKalaba(M, Eigen::RowVector2d(1, 0), VectorXd::Zero(1)).mass_kind(), Mass::singular);
 }
 
-// M, A, b that change smoothly while the ranks stay; forwards against differences, then in reverse
+// M, A, b that change smoothly while the ranks stay; against differences
 TEST(SingularMassDerivatives, AreThoseOfTheMotion) {
   RandomStream random(seed, 3);
   double size = 0;
@@ -269,21 +269,6 @@ TEST(SingularMassDerivatives, AreThoseOfTheMotion) {
         },
         0, 0.003, 1e5 * eps);
     EXPECT_TRUE(test::matches(dG.reshaped(), G_difference));
-
-    const MatrixXd T_bar = random_matrix(nq, nq, random), Lambda_bar = random_matrix(nc, nc, random);
-    const VectorXd Lb_bar = test::random_vector(nq, random);
-    MatrixXd M_bar = MatrixXd::Zero(nq, nq), A_bar = MatrixXd::Zero(nc, nq);
-    VectorXd b_bar = VectorXd::Zero(nc);
-    UdwadiaKalaba::Workspace workspace;
-    projection.add_adjoint(T_bar, Lb_bar, {M_bar, A_bar, b_bar}, workspace);
-    double forwards = T_bar.cwiseProduct(d.T).sum() + Lb_bar.dot(d.Lb);
-    if (projection.rank() == nc) {
-      projection.add_Lambda_adjoint(Lambda_bar, {M_bar, A_bar, b_bar}, workspace);
-      forwards += Lambda_bar.cwiseProduct(projection.differentiate_Lambda(dM, dA)).sum();
-    }
-    const double terms = M_bar.cwiseAbs().cwiseProduct(dM.cwiseAbs()).sum() + A_bar.cwiseAbs().cwiseProduct(dA.cwiseAbs()).sum() +
-                         b_bar.cwiseAbs().dot(db.cwiseAbs());
-    EXPECT_NEAR(M_bar.cwiseProduct(dM).sum() + A_bar.cwiseProduct(dA).sum() + b_bar.dot(db), forwards, 1e-9 * (1 + terms));
   });
   EXPECT_GT(size, 0.1);
 }
@@ -296,13 +281,13 @@ TEST(SingularMass, ReuseGivesTheBitsOfANewObjectAndAllocatesNothing) {
     const VectorXd b = p.b(), b2 = other.b();
     UdwadiaKalaba reused;
     UdwadiaKalaba::Workspace workspace;
-    MatrixXd M_bar = 0 * M, A_bar = 0 * p.A;
-    VectorXd b_bar = 0 * b, ddq = p.ddq;
+    MatrixXd K;
+    VectorXd ddq = p.ddq;
     const auto use = [&] {
       reused.compute(regular, p.A, b);
       reused.compute(indefinite, p.A, b);
       reused.compute(M2, other.A, b2);
-      reused.add_adjoint(M, p.force, {M_bar, A_bar, b_bar}, workspace);
+      reused.write_multipliers_of_force(K, workspace);
       reused.compute(M, p.A, b);
       reused.constrain(p.force, ddq, workspace);
       reused.solve_mass_in_place(ddq);
@@ -478,7 +463,7 @@ TEST(SingularMassModel, ViewsOfThePriorHaveExactDerivativesInTheParameters) {
     const ViewValues v = evaluate_view(view, mechanics, states);
     const PriorValues p = evaluate_prior(prior, states, parameters, mechanics);
     for (int k = 0; k < 2; ++k) {
-      SCOPED_TRACE(fmt::format("{}, {}", View::word(quantity), system.parameters()[static_cast<std::size_t>(k)].name));
+      SCOPED_TRACE(fmt::format("{}, {}", quantity->word(), system.parameters()[static_cast<std::size_t>(k)].name));
       const SystemValues ds = system.differentiate(states, parameters, k);
       const ViewValues dv = differentiate_view(view, mechanics, ds);
       const PriorValues dp = differentiate_prior(prior, states, parameters, mechanics, p, ds, k);

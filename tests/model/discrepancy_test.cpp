@@ -101,7 +101,7 @@ FitFile file_of(const Model& model, const FitProblem& problem) {
   return file;
 }
 
-View view_of(const Prior& prior, Quantity quantity, int latent = -1) {
+View view_of(const Prior& prior, Quantity quantity, std::optional<int> latent = {}) {
   View view = View::all(quantity, *prior.system);
   view.latent = latent;
   return view;
@@ -357,7 +357,7 @@ TEST(Discrepancy, ComesBackFromAFitFileBitForBit) {
     const Posterior before = written.posterior(), after = read.posterior();
     EXPECT_EQ(before.negative_log_likelihood(), after.negative_log_likelihood());
     const MatrixXd states = some_states(model);
-    for (const int latent : {-1, 0, 1}) {
+    for (const std::optional<int>& latent : {std::optional<int>(), std::optional(0), std::optional(1)}) {
       const View view = view_of(before.prior(), Quantity::unconstrained_acceleration, latent);
       EXPECT_EQ(before.mean(view, states), after.mean(view, states));
       EXPECT_EQ(before.marginal(view, states).covariance, after.marginal(view, states).covariance);

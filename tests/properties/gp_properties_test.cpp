@@ -153,7 +153,7 @@ RandomProblem random_problem() {
   RC_PRE(p.mechanics_condition < 1e3);
   RC_LOG() << model.text;
   for (const Observations& group : p.observations) {
-    RC_LOG() << View::word(group.view().quantity) << ", latent " << group.view().latent << ", noise "
+    RC_LOG() << group.view().quantity->word() << ", latent " << group.view().latent.value_or(-1) << ", noise "
              << group.noise().stddev().transpose() << ", at\n"
              << group.states() << "\n:\n"
              << group.values() << '\n';
@@ -187,9 +187,9 @@ RC_GTEST_PROP(GpProperty, ThePosteriorIsTheTextbookOne, ()) {
     const View view = View::all(quantity, *p.prior.system);
     const auto [mean, covariance] = test::dense_posterior(p, view, p.queries);
     const Posterior::Joint joint = posterior.joint(view, p.queries);
-    expect_at_most(largest(joint.mean - mean), rounding(p) * (1 + largest(mean)), View::word(quantity) + ", mean");
+    expect_at_most(largest(joint.mean - mean), rounding(p) * (1 + largest(mean)), quantity->word() + ", mean");
     expect_at_most(largest(joint.covariance - covariance), rounding(p) * (1 + largest(covariance)),
-                   View::word(quantity) + ", covariance");
+                   quantity->word() + ", covariance");
   }
 }
 

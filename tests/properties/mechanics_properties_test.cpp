@@ -200,30 +200,6 @@ RC_GTEST_PROP(MechanicsProperty, DerivativesAreThoseOfDifferenceQuotients, ()) {
   RC_ASSERT(static_cast<bool>(result));
 }
 
-RC_GTEST_PROP(MechanicsProperty, TheAdjointIsTheDerivativeInReverse, ()) {
-  RandomStream random = stream();
-  const Path path = random_path(random);
-  const RandomMechanics& start = path.start;
-  const Index n = start.n(), m = start.A.rows();
-  const UdwadiaKalaba projection(path.M(0), path.A(0), path.b(0));
-  const UdwadiaKalaba::Derivative d = projection.differentiate(path.dM, path.dA(), path.db());
-  const VectorXd unit = start.M.diagonal().cwiseSqrt();
-  const MatrixXd T_bar = unit.asDiagonal() * test::random_matrix(n, n, random) * unit.cwiseInverse().asDiagonal();
-  const VectorXd Lb_bar = unit.cwiseProduct(test::random_vector(n, random));
-  MatrixXd M_bar = MatrixXd::Zero(n, n), A_bar = MatrixXd::Zero(m, n);
-  VectorXd b_bar = VectorXd::Zero(m);
-  UdwadiaKalaba::Workspace workspace;
-  projection.add_adjoint(T_bar, Lb_bar, {M_bar, A_bar, b_bar}, workspace);
-  const double forward = T_bar.cwiseProduct(d.T).sum() + Lb_bar.dot(d.Lb);
-  const double reverse = M_bar.cwiseProduct(path.dM).sum() + A_bar.cwiseProduct(path.dA()).sum() + b_bar.dot(path.db());
-  const double terms = T_bar.cwiseProduct(d.T).cwiseAbs().sum() + Lb_bar.cwiseProduct(d.Lb).cwiseAbs().sum() +
-                       M_bar.cwiseProduct(path.dM).cwiseAbs().sum() + A_bar.cwiseProduct(path.dA()).cwiseAbs().sum() +
-                       b_bar.cwiseProduct(path.db()).cwiseAbs().sum();
-  RC_ASSERT(terms > 0 || start.n() == 1);
-  expect_at_most(std::abs(forward - reverse), start.rounding() * start.condition_of_mass * start.condition_of_rows * terms,
-                 "T̄ : dT + L̄b · dLb = M̄ : dM + Ā : dA + b̄ · db");
-}
-
 // A row and the same row with noise: above the rank tolerance what follows from the conditioning holds, below the rank is lower
 // and says so. There is nothing in between.
 RC_GTEST_PROP(MechanicsProperty, ANearlyRedundantRowIsNeverAWrongNumber, ()) {

@@ -163,9 +163,9 @@ void expect_same(const Units& units, const Case& c) {
     const Posterior::Marginal b =
         of_other.marginal(View::all(quantity, *other.prior.system), units.state().asDiagonal() * queries);
     const MatrixXd mean = unit.cwiseInverse().asDiagonal() * b.mean, stddev = unit.cwiseInverse().asDiagonal() * b.stddev();
-    EXPECT_LE(largest(mean - a.mean), 1e-8 * largest(a.mean)) << View::word(quantity);
+    EXPECT_LE(largest(mean - a.mean), 1e-8 * largest(a.mean)) << quantity->word();
     // friction along the surface leaves the force across it certain: a rounded zero, beside the mean
-    EXPECT_LE(largest(stddev - a.stddev()), 1e-8 * largest(a.stddev()) + 1e-12 * largest(a.mean)) << View::word(quantity);
+    EXPECT_LE(largest(stddev - a.stddev()), 1e-8 * largest(a.stddev()) + 1e-12 * largest(a.mean)) << quantity->word();
   };
   compare(Quantity::constrained_acceleration, units.acceleration());
   compare(Quantity::unconstrained_acceleration, units.acceleration());

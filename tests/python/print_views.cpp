@@ -35,15 +35,15 @@ int main(int argc, char** argv) {
   const gp2::Model other = gp2::Model::read(argv[3]);
   const gp2::Posterior posterior = fit.posterior();
   const gp2::System& system = *fit.model.system;
-  for (const std::string& word : gp2::View::quantity_words()) {
-    const gp2::View view = gp2::View::all(*gp2::View::quantity_of(word), system);
+  for (const std::string& word : gp2::View::Quantity::words()) {
+    const gp2::View view = gp2::View::all(*gp2::View::Quantity::of_word(word), system);
     print(word, posterior, view, fit.model, table);
     for (int latent = 0; latent < static_cast<int>(posterior.prior().latents.size()); ++latent) {
       gp2::View part = view;
       part.latent = latent;
       print(fmt::format("{}@{}", word, latent), posterior, part, fit.model, table);
     }
-    gp2::View there = gp2::View::all(*gp2::View::quantity_of(word), *other.system);
+    gp2::View there = gp2::View::all(*gp2::View::Quantity::of_word(word), *other.system);
     there.other_system = gp2::make_other_system(fit.model, other, fit.prior_options);
     print(word + "@other", posterior, there, other, table);
   }

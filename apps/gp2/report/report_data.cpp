@@ -41,7 +41,7 @@ double noise_of(const Posterior& posterior, int row) {
   for (std::size_t g = 0; g < posterior.observations().size(); ++g) {
     const Observations& group = posterior.observations()[g];
     const View& view = group.view();
-    if (view.quantity != View::Quantity::constrained_acceleration || view.latent >= 0) continue;
+    if (!view.is_of_ddq()) continue;
     const auto found = std::find(view.rows.begin(), view.rows.end(), row);
     if (found != view.rows.end()) return group.usual_noise(posterior.values().noise_stddev[g])[found - view.rows.begin()];
   }
@@ -55,7 +55,7 @@ ReportData data_at(const Posterior& posterior, const MatrixXd& states, const std
   data.rows = rows;
   data.states = states;
   data.measured = measured;
-  View view = View::all(View::Quantity::constrained_acceleration, *posterior.prior().system);
+  View view = View::constrained_acceleration(*posterior.prior().system);
   view.other_system = other_system;
   const Prior& prior = prior_of(posterior.prior(), view);
   const System& reference = prior.reference_system();
@@ -114,7 +114,7 @@ std::vector<ReportData> training_data(const FitFile& fit, const Posterior& poste
   std::vector<ReportData> all;
   for (std::size_t g = 0; g < fit.observations.size(); ++g) {
     const Observations& group = fit.observations[g];
-    if (group.view().quantity != View::Quantity::constrained_acceleration || group.view().latent >= 0) continue;
+    if (!group.view().is_of_ddq()) continue;
     ReportData data = data_at(posterior, group.states(), group.view().rows, group.values(), group.view().other_system);
     data.name = all.empty() ? "training" : fmt::format("training {}", all.size() + 1);
     const bool elsewhere = g < fit.systems.size() && fit.systems[g];
@@ -136,7 +136,7 @@ ReportData test_data(const ReportOptions& options, const FitFile& fit, const Pos
   const std::vector<int> rows = acceleration_rows(*fit.model.system, observed, "--data");
   View view{View::Quantity::constrained_acceleration, rows};
   const Prior& prior = posterior.prior();
-  const View all = View::all(View::Quantity::constrained_acceleration, *prior.system);
+  const View all = View::constrained_acceleration(*prior.system);
   const LogStates log = read_log_states(prior, all, fit.model, table, options.columns, view.names(*fit.model.system));
   notes.insert(notes.end(), log.notes.begin(), log.notes.end());
   ReportData data = at_states_of(table, [&] { return data_at(posterior, log.states, rows, log.accelerations, nullptr); });

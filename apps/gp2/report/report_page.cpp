@@ -120,7 +120,7 @@ Json observations_json(const FitFile& fit) {
   Json groups = Json::array();
   for (std::size_t g = 0; g < fit.observations.size(); ++g) {
     const Observations& group = fit.observations[g];
-    const std::string latent = group.view().latent < 0 ? "" : home.latents[static_cast<std::size_t>(group.view().latent)].name;
+    const std::string latent = !group.view().latent ? "" : home.latents[static_cast<std::size_t>(*group.view().latent)].name;
     Json noise = Json::array();
     for (const double one : group.usual_noise(values.noise_stddev[g])) noise.push_back(number(one));
     groups.push_back({{"names", group.view().names(*prior_of(home, group.view()).system, latent)},

@@ -91,7 +91,7 @@ struct Errors {
 
 Errors errors_of(const Posterior& posterior, const System& system, const Motion& motion) {
   const MatrixXd& states = motion.measured.states;
-  const MatrixXd prediction = posterior.mean(View::all(View::Quantity::constrained_acceleration, system), states);
+  const MatrixXd prediction = posterior.mean(View::constrained_acceleration(system), states);
   Errors errors;
   errors.noisy = (prediction - motion.measured.accelerations).cwiseAbs().mean();
   errors.exact = (prediction - motion.truth).cwiseAbs().mean();

@@ -76,7 +76,7 @@ MatrixXd true_unconstrained(const Model& model, const MatrixXd& states) {
 void reproduce_fig3a(const ReproduceOptions& options) {
   const Section definition = Section::read(options.experiments / "fig3a.toml");
   const TrainedFigure figure(definition, definition.section("restarts"), options);
-  const View here = View::all(Quantity::constrained_acceleration, *figure.model.system);
+  const View here = View::constrained_acceleration(*figure.model.system);
   const Line line = line_of(definition.section("line"), figure.model);
   along(line, *figure.model.system, figure.posterior(), here, line.truth).write(options.output / "fig3a_same_surface");
 
@@ -99,7 +99,7 @@ void reproduce_fig3b(const ReproduceOptions& options) {
   const TrainedFigure figure(samples_of, restarts, options);
   const System& system = *figure.model.system;
   const Line line = line_of(samples_of.section("line"), figure.model);
-  const View all = View::all(Quantity::constrained_acceleration, system);
+  const View all = View::constrained_acceleration(system);
   const MatrixXd before = figure.posterior().without_data().sample({{all, line.states}}, n_samples, 1);
   const MatrixXd after = figure.posterior().sample({{all, line.states}}, n_samples, 1);
   const Posterior::Marginal prediction = figure.posterior().marginal(all, line.states);
@@ -129,7 +129,7 @@ void reproduce_fig3b(const ReproduceOptions& options) {
   for (const Section& section : definition.sections("unconstrained")) {
     const TrainedFigure inferred(section, restarts, options);
     const Line of = line_of(section.section("line"), inferred.model);
-    const View a_bar = View::all(Quantity::unconstrained_acceleration, *inferred.model.system);
+    const View a_bar = View::unconstrained_acceleration(*inferred.model.system);
     along(of, *inferred.model.system, inferred.posterior(), a_bar, true_unconstrained(inferred.model, of.states))
         .write(options.output / fmt::format("fig3b_abar_{}", section.text("name")));
   }

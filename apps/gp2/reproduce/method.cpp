@@ -78,7 +78,7 @@ Score score_of(const ExperimentSystem& system, const Method& method, Protocol::N
       const Prior& prior = trained.problem.prior;
       posterior = Posterior(prior, observations, model_values(prior, observations, trained.fit.report.hyperparameters));
     }
-    prediction = posterior.mean(View::all(View::Quantity::constrained_acceleration, mechanics), system.grid_states);
+    prediction = posterior.mean(View::constrained_acceleration(mechanics), system.grid_states);
     score.rmse_normalised = normalised_error(prediction, system.grid_truth, row_stddev(observations.front().values()));
     score.negative_log_likelihood = trained.fit.report.negative_log_likelihood;
   }

@@ -81,7 +81,7 @@ std::vector<Rollout> roll_out(const Section& definition, const ReproduceOptions&
           method.estimate ? definition.section("parameters").texts(method.mean) : std::vector<std::string>();
       trained = train(model, estimate, method, protocol, log, 0, options.threads);
       if (method.estimate) parameters = trained->fit.posterior.values().parameters;
-      const View view = View::all(View::Quantity::constrained_acceleration, system);
+      const View view = View::constrained_acceleration(system);
       acceleration = [posterior = trained->fit.posterior, view](const Eigen::Ref<const VectorXd>& state) -> VectorXd {
         return posterior.mean(view, state);
       };

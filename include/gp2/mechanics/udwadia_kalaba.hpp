@@ -54,10 +54,10 @@ class UdwadiaKalaba {
   /// workspace serves any number of objects, of one thread.
   class Workspace {
     friend class UdwadiaKalaba;
-    Eigen::VectorXd rows_;                           // (nc)
-    Eigen::MatrixXd square_, force_, wide_, tall_;   // (nq × nq), (nq × nq), (nc × nq), (nq × nc)
-    Eigen::MatrixXd mass_bar_;                       // (nq × nq)
-    Eigen::MatrixXd Lambda_, Lambda_bar_, product_;  // (nc × nc)
+    Eigen::VectorXd rows_;                    // (nc)
+    Eigen::MatrixXd null_space_, null_rows_;  // (nc × nc)
+    Eigen::VectorXd reflection_;              // (nc)
+    Eigen::VectorXi order_;                   // (nc)
   };
 
   /// What M is to working precision.
@@ -88,11 +88,11 @@ class UdwadiaKalaba {
   /// The same, written to L (nq × nc). Allocates nothing.
   void write_L(Eigen::Ref<Eigen::MatrixXd> L) const { L = L_unit_ * row_scale_.asDiagonal(); }
 
-  /// (A M⁻¹Aᵀ)⁺ of the rows as written, where they are independent (nc × nc).
-  [[nodiscard]] Eigen::MatrixXd Lambda() const;
-
-  /// K with λ = K Aᵀλ (nc × nq). Of the multipliers of redundant rows it gives those of minimum norm.
+  /// K = (Aᵀ)⁺ on the forces of constraints: λ = K Aᵀλ (nc × nq). Of the multipliers of redundant rows it gives those of minimum
+  /// norm.
   [[nodiscard]] Eigen::MatrixXd multipliers_of_force() const;
+  /// The same, written to K. Allocates nothing where the sizes are those of the call before.
+  void write_multipliers_of_force(Eigen::MatrixXd& K, Workspace& workspace) const;
 
   /// M⁻¹ v, or M'⁻¹ v.
   [[nodiscard]] Eigen::MatrixXd solve_mass(const Eigen::Ref<const Eigen::MatrixXd>& v) const;
@@ -119,36 +119,10 @@ class UdwadiaKalaba {
   [[nodiscard]] Derivative differentiate(const Eigen::Ref<const Eigen::MatrixXd>& dM, const Eigen::Ref<const Eigen::MatrixXd>& dA,
                                          const Eigen::Ref<const Eigen::VectorXd>& db) const;
 
-  /// dΛ = −(Λ dA L + (Λ dA L)ᵀ − Lᵀ dM L), where the rows of A are independent.
-  [[nodiscard]] Eigen::MatrixXd differentiate_Lambda(const Eigen::Ref<const Eigen::MatrixXd>& dM,
-                                                     const Eigen::Ref<const Eigen::MatrixXd>& dA) const;
-
-  /// Sensitivities of a scalar s, ds = M̄ : dM + Ā : dA + b̄ · db, to which the adjoints below add.
-  struct Adjoint {
-    Eigen::Ref<Eigen::MatrixXd> M;  // M̄  (nq × nq), not symmetrised
-    Eigen::Ref<Eigen::MatrixXd> A;  // Ā  (nc × nq)
-    Eigen::Ref<Eigen::VectorXd> b;  // b̄  (nc)
-  };
-  /// `differentiate` in reverse: from ds = T̄ : dT + L̄b · d(L b), with v = L̄b and X = M⁻¹Tᵀ(T̄ − v (L b)ᵀ),
-  ///
-  ///     M̄ += X (L A)ᵀ,    Ā −= Λ A Xᵀ + Lᵀ(T̄ Tᵀ + v (L b)ᵀ),    b̄ += Lᵀv,
-  ///
-  /// where M is singular also Ā += Σ A (Ȳ + Ȳᵀ), Ȳ what is added to M̄.
-  ///
-  /// @param T_bar   (nq × nq)
-  /// @param Lb_bar  (nq)
-  void add_adjoint(const Eigen::Ref<const Eigen::MatrixXd>& T_bar, const Eigen::Ref<const Eigen::VectorXd>& Lb_bar,
-                   Adjoint adjoint, Workspace& workspace) const;
-
-  /// `differentiate_Lambda` in reverse: from ds = Λ̄ : dΛ,  M̄ += L Λ̄ Lᵀ,  Ā −= Λ (Λ̄ + Λ̄ᵀ) Lᵀ.
-  /// @param Lambda_bar  (nc × nc)
-  void add_Lambda_adjoint(const Eigen::Ref<const Eigen::MatrixXd>& Lambda_bar, Adjoint adjoint, Workspace& workspace) const;
-
  private:
   double factorise_mass(const Eigen::Ref<const Eigen::MatrixXd>& M, const Eigen::Ref<const Eigen::MatrixXd>& A);
   void complete_mass(const Eigen::Ref<const Eigen::MatrixXd>& M, const Eigen::Ref<const Eigen::MatrixXd>& A);
   void decompose_rows();
-  void add_mass_adjoint(Adjoint adjoint, Workspace& workspace) const;
   Mass mass_kind_ = Mass::positive_definite;
   int rank_ = 0;
   int n_zero_rows_ = 0;

@@ -62,10 +62,10 @@ TEST_F(Views, OfOtherQuantitiesCarryTheirNames) {
   EXPECT_EQ(first(Quantity::constraint_force), "fc_q1");
   EXPECT_EQ(first(Quantity::multipliers), "lambda1");
   EXPECT_EQ(first(Quantity::next_velocity), "dq1_next");
-  EXPECT_EQ((View{Quantity::unconstrained_acceleration, {1}, 0, 0}.names(system, "drag")),
+  EXPECT_EQ((View{Quantity::unconstrained_acceleration, {1}, std::nullopt, 0}.names(system, "drag")),
             std::vector<std::string>{"abar_q2@drag"});
-  for (const std::string& word : View::quantity_words()) EXPECT_EQ(View::word(*View::quantity_of(word)), word);
-  EXPECT_FALSE(View::quantity_of("sideways"));
+  for (const std::string& word : View::Quantity::words()) EXPECT_EQ((*View::Quantity::of_word(word))->word(), word);
+  EXPECT_FALSE(View::Quantity::of_word("sideways"));
 }
 
 // what each quantity is, by its definition, for every model and some ā
@@ -145,7 +145,7 @@ TEST_P(ViewsOfEveryModel, DerivativesInTheParametersEqualDifferences) {
       const MatrixXd dG = (up.matrix - down.matrix) / (2 * step);
       // central differences: rounding ε/step of the values, truncation step² of the third derivative
       const double tolerance_G = 1e-6 * (up.matrix.cwiseAbs().maxCoeff() / step * 1e-3 + dG.cwiseAbs().maxCoeff());
-      EXPECT_LT((d.matrix - dG).cwiseAbs().maxCoeff(), tolerance_G) << system.parameters()[p].name << " " << View::word(quantity);
+      EXPECT_LT((d.matrix - dG).cwiseAbs().maxCoeff(), tolerance_G) << system.parameters()[p].name << " " << quantity->word();
       for (Eigen::Index k = 0; k < d.offset.size(); ++k) {
         const double difference = (up.offset.reshaped()[k] - down.offset.reshaped()[k]) / (2 * step);
         if (std::isnan(difference)) continue;

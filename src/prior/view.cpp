@@ -1,0 +1,184 @@
+#include "gp2/view.hpp"
+
+#include <algorithm>
+#include <numeric>
+
+#include <fmt/format.h>
+
+#include "gp2/error.hpp"
+#include "mechanics/describe_fault.hpp"
+
+namespace gp2 {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::Ref;
+using Eigen::VectorXd;
+
+VectorXd OtherSystem::parameters(const Ref<const VectorXd>& home) const {
+  VectorXd parameters = prior.system->parameter_values();
+  for (std::size_t k = 0; k < shared.size(); ++k) {
+    if (shared[k] >= 0) parameters[static_cast<Index>(k)] = home[shared[k]];
+  }
+  return parameters;
+}
+
+View View::all(Quantity quantity, const System& system) {
+  View view{quantity, std::vector<int>(static_cast<std::size_t>(quantity->n_rows(system.nq(), system.nc())))};
+  std::iota(view.rows.begin(), view.rows.end(), 0);
+  return view;
+}
+
+View View::next_velocity(const System& system, double time_step) {
+  View view = all(Quantity::next_velocity, system);
+  view.time_step = time_step;
+  return view;
+}
+
+double View::required_time_step() const {
+  if (!quantity->needs_time_step()) return 0;
+  if (!time_step) throw InputError(fmt::format("view '{}' needs a time step", quantity->word()));
+  return *time_step;
+}
+
+std::optional<int> View::added_entry(const StateLayout& layout, int k) const {
+  // what a latent adds has no part of the offset
+  return latent ? std::nullopt : quantity->added_entry(layout, rows[static_cast<std::size_t>(k)]);
+}
+
+std::vector<bool> View::reads(const System& system) const {
+  std::vector<bool> reads(static_cast<std::size_t>(system.layout().size()), false);
+  for (int k = 0; k < size(); ++k) {
+    if (const std::optional<int> entry = added_entry(system.layout(), k)) reads[static_cast<std::size_t>(*entry)] = true;
+  }
+  return reads;
+}
+
+std::vector<std::string> View::names(const System& system, const std::string& latent_name) const {
+  std::vector<std::string> names;
+  for (const int row : rows) {
+    names.push_back(quantity->name(system, row));
+    if (latent) names.back() += "@" + latent_name;
+  }
+  return names;
+}
+
+const Prior& prior_of(const Prior& home, const View& view) { return view.other_system ? view.other_system->prior : home; }
+
+VectorXd parameters_of(const View& view, const Ref<const VectorXd>& home) {
+  return view.other_system ? view.other_system->parameters(home) : VectorXd(home);
+}
+
+std::optional<std::string> what_needs_acceleration(const Prior& prior, const View& view) {
+  if (view.quantity->parts().unconstrained_acceleration) return "the view is of the unconstrained acceleration ā";
+  if (prior.mean == Prior::Mean::constant) return "the prior's mean is an acceleration";
+  const auto of_acceleration = std::find_if(prior.latents.begin(), prior.latents.end(),
+                                            [](const Latent& latent) { return latent.base == Latent::Base::acceleration; });
+  if (of_acceleration == prior.latents.end()) return std::nullopt;
+  return fmt::format(
+      "the latent '{}' acts on the unconstrained acceleration ā: let it act on forces, directions = \"force\" or {{ force = … }}",
+      of_acceleration->name);
+}
+
+void evaluate_mechanics(const Prior& prior, const View& view, const Ref<const MatrixXd>& states,
+                        const Ref<const VectorXd>& parameters, MechanicsBatch& batch) {
+  evaluate_mechanics(*prior.system, states, parameters, batch);
+  const int singular = batch.first_singular();
+  if (batch.fault || singular < 0) return;
+  const std::optional<std::string> text = what_needs_acceleration(prior, view);
+  if (text) batch.fault = {singular, fmt::format("the mass matrix M is singular, so that there is no M⁻¹, but {}", *text)};
+}
+
+MechanicsBatch require_mechanics(const Prior& prior, const View& view, const Ref<const MatrixXd>& states,
+                                 const Ref<const VectorXd>& parameters) {
+  MechanicsBatch batch;
+  evaluate_mechanics(prior, view, states, parameters, batch);
+  if (batch.fault) throw InputError(internal::describe_fault(*prior.system, states, *batch.fault));
+  return batch;
+}
+
+namespace {
+
+StateMechanics mechanics_at(const View& view, const MechanicsBatch& mechanics, int i) {
+  return {mechanics.projections[static_cast<std::size_t>(i)], mechanics.values.A(i), view.required_time_step()};
+}
+
+// ∂A/∂p, for any number of motions
+class ParameterChange final : public ConstraintChange {
+ public:
+  explicit ParameterChange(const SystemValues::ConstBlock& dA) : dA_(dA) {}
+  void add_product(const Ref<const MatrixXd>& x, Ref<MatrixXd> out) const override { out.noalias() += dA_ * x; }
+  void subtract_transposed_product(const Ref<const MatrixXd>& y, Ref<MatrixXd> out) const override {
+    out.noalias() -= dA_.transpose() * y;
+  }
+
+ private:
+  SystemValues::ConstBlock dA_;
+};
+
+// Every row of G and d of a quantity at one state, or their derivatives.
+struct Affine {
+  MatrixXd G;
+  MatrixXd d;  // (size × 1)
+};
+
+// the rows of the view at every state, at(i, all rows)
+template <typename At>
+ViewValues collect(const View& view, const MechanicsBatch& mechanics, const At& at) {
+  const Index nq = mechanics.values.force.rows();
+  const int n_states = mechanics.values.n_states();
+  ViewValues out{MatrixXd(view.size() * nq, n_states), MatrixXd(view.size(), n_states)};
+  for (int i = 0; i < n_states; ++i) {
+    const Affine& affine = at(i);
+    Eigen::Map<MatrixXd>(out.matrix.col(i).data(), view.size(), nq) = affine.G(view.rows, Eigen::all);
+    out.offset.col(i) = affine.d(view.rows, 0);
+  }
+  // what a latent adds has no part of the offset
+  if (view.latent) out.offset.setZero();
+  return out;
+}
+
+Affine affine_of(const View& view, const SystemValues& values) {
+  const auto nq = static_cast<int>(values.force.rows()), nc = static_cast<int>(values.constraint_vector.rows());
+  const int n_rows = view.quantity->n_rows(nq, nc);
+  return {MatrixXd(n_rows, nq), MatrixXd(n_rows, 1)};
+}
+
+}  // namespace
+
+ViewValues evaluate_view(const View& view, const MechanicsBatch& mechanics, const Ref<const MatrixXd>& states) {
+  QuantityKind::Workspace workspace;
+  AffineMotion motion;
+  Affine all = affine_of(view, mechanics.values);
+  ViewValues out = collect(view, mechanics, [&](int i) -> const Affine& {
+    const StateMechanics at = mechanics_at(view, mechanics, i);
+    motion.evaluate(at.projection, mechanics.values.M(i), view.quantity->parts());
+    view.quantity->evaluate(at, motion.linear(), all.G, workspace);
+    view.quantity->evaluate(at, motion.constant(), all.d, workspace);
+    return all;
+  });
+  const StateLayout layout{static_cast<int>(mechanics.values.force.rows()), 0};
+  for (int k = 0; k < view.size(); ++k) {
+    if (const std::optional<int> entry = view.added_entry(layout, k)) out.offset.row(k) += states.row(*entry);
+  }
+  return out;
+}
+
+ViewValues differentiate_view(const View& view, const MechanicsBatch& mechanics, const SystemValues& derivative) {
+  QuantityKind::Workspace workspace;
+  AffineMotion motion, dmotion;
+  Affine all = affine_of(view, mechanics.values);
+  return collect(view, mechanics, [&](int i) -> const Affine& {
+    const StateMechanics at = mechanics_at(view, mechanics, i);
+    const auto M = mechanics.values.M(i);
+    const ParameterChange dA(derivative.A(i));
+    view.quantity->require_parameter_derivatives(at);
+    motion.evaluate(at.projection, M, view.quantity->parts());
+    dmotion.differentiate(at.projection, M, derivative.M(i), derivative.A(i), derivative.b(i), view.quantity->parts());
+    view.quantity->differentiate(at, motion.linear(), dmotion.linear(), dA, all.G, workspace);
+    view.quantity->differentiate(at, motion.constant(), dmotion.constant(), dA, all.d, workspace);
+    return all;
+  });
+}
+
+}  // namespace gp2
