@@ -265,7 +265,7 @@ TEST(StatedNoise, TellsACheckWhichAccelerationsAreMeasured) {
     EXPECT_THAT(reader.unused_columns(), testing::IsEmpty());
     std::vector<std::string> out;
     for (const Finding& finding :
-         check_data(*model.system, whole.states(), model.system->parameter_values(), whole.accelerations, whole.stated)) {
+         check_data(*model.system, whole.states, model.system->parameter_values(), whole.accelerations, whole.stated)) {
       out.push_back((finding.level == Finding::Level::good ? "good: " : "not good: ") + finding.text);
     }
     return out;

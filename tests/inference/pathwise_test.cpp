@@ -92,10 +92,10 @@ TEST(PathwiseTest, MeetsDataThatAreNearlyFreeOfNoise) {
   const PathwiseSamples paths = sample_paths(posterior, 20, {500, seed});
   for (int s = 0; s < paths.n_samples(); ++s) {
     // a sample is off the data by no more than the noise in them and what is left of the variance
-    EXPECT_LE(largest(paths.evaluate(s, data.view, data.states) - data.values), 8 * noise);
+    EXPECT_LE(largest(paths.evaluate(s, data.view(), data.states()) - data.values()), 8 * noise);
   }
   const MatrixXd away = surface_states(5);
-  EXPECT_GT(largest(paths.evaluate(0, data.view, away) - paths.evaluate(1, data.view, away)), 100 * noise);
+  EXPECT_GT(largest(paths.evaluate(0, data.view(), away) - paths.evaluate(1, data.view(), away)), 100 * noise);
 }
 
 TEST(PathwiseTest, LatentsAddUpAndLeaveTheMean) {
