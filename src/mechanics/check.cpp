@@ -7,9 +7,8 @@
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 #include <Eigen/Cholesky>
-#include <Eigen/Eigenvalues>
-#include <Eigen/SVD>
 
+#include "base/decompositions.hpp"
 #include "gp2/mechanics/udwadia_kalaba.hpp"
 
 namespace gp2 {
@@ -233,7 +232,7 @@ void check_independence(const MechanicsBatch& mechanics, std::vector<Finding>& f
     // rows of A M^{-1/2}, of unit norm
     MatrixXd B = projection.mass().llt().matrixL().solve(mechanics.values.A(i).transpose());
     for (Index row = 0; row < B.cols(); ++row) B.col(row).stableNormalize();
-    const VectorXd values = Eigen::BDCSVD<MatrixXd>(B).singularValues();
+    const VectorXd values = Eigen::JacobiSVD<MatrixXd>(B).singularValues();
     const double smallest = values[projection.rank() - 1] / values[0];
     n_states += smallest < tolerance ? 1 : 0;
     if (smallest >= worst) continue;

@@ -8,6 +8,7 @@
 #include <fmt/format.h>
 #include <Eigen/SVD>
 
+#include "base/decompositions.hpp"
 #include "gp2/error.hpp"
 #include "gp2/mechanics/udwadia_kalaba.hpp"
 #include "mechanics/describe_fault.hpp"

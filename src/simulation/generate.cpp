@@ -12,6 +12,7 @@
 #include <fmt/ranges.h>
 #include <Eigen/QR>
 
+#include "base/decompositions.hpp"
 #include "base/random.hpp"
 #include "gp2/error.hpp"
 #include "gp2/mechanics/udwadia_kalaba.hpp"

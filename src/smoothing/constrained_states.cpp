@@ -11,6 +11,7 @@
 #include <Eigen/QR>
 #include <Eigen/SVD>
 
+#include "base/decompositions.hpp"
 #include "gp2/error.hpp"
 
 namespace gp2 {

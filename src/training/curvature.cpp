@@ -7,6 +7,7 @@
 #include <fmt/format.h>
 #include <Eigen/Eigenvalues>
 
+#include "base/decompositions.hpp"
 #include "base/parallel.hpp"
 #include "gp2/error.hpp"
 
@@ -117,7 +118,7 @@ Curvature curvature_at(const Objective& objective, const VectorXd& x, const std:
   if (out.free.empty()) return out;
   const MatrixXd H = differences.hessian(n_threads);
   out.unit = H.diagonal().array().abs().max(1e-10).rsqrt();
-  const Eigen::SelfAdjointEigenSolver<MatrixXd> eigen(out.unit.asDiagonal() * H * out.unit.asDiagonal());
+  const Eigen::SelfAdjointEigenSolver<MatrixXd> eigen(MatrixXd(out.unit.asDiagonal() * H * out.unit.asDiagonal()));
   out.eigenvalues = eigen.eigenvalues();
   out.eigenvectors = eigen.eigenvectors();
   constexpr double of_differences = 1e-7;

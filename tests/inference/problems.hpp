@@ -8,6 +8,7 @@
 
 #include <Eigen/Dense>
 
+#include "decompositions.hpp"
 #include "gp2/inference/likelihood.hpp"
 #include "gp2/model.hpp"
 #include "gp2/posterior.hpp"

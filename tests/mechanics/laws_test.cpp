@@ -1,6 +1,7 @@
 #include <gtest/gtest.h>
 #include <Eigen/Dense>
 
+#include "decompositions.hpp"
 #include "gp2/mechanics/udwadia_kalaba.hpp"
 #include "test_models.hpp"
 

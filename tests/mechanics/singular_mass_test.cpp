@@ -4,6 +4,7 @@
 #include <Eigen/Dense>
 
 #include "allocation_count.hpp"
+#include "decompositions.hpp"
 #include "gp2/error.hpp"
 #include "gp2/mechanics/check.hpp"
 #include "gp2/mechanics/udwadia_kalaba.hpp"

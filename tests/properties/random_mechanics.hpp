@@ -7,6 +7,7 @@
 #include <Eigen/Dense>
 
 #include "base/random.hpp"
+#include "decompositions.hpp"
 #include "gp2/mechanics/udwadia_kalaba.hpp"
 #include "test_models.hpp"
 
