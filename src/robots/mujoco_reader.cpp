@@ -11,7 +11,7 @@
 #include <mujoco/mujoco.h>
 #include <Eigen/Dense>
 
-#include "gp2/data/csv.hpp"
+#include "gp2/base/file.hpp"
 #include "gp2/error.hpp"
 #include "gp2/robots/robot.hpp"
 #include "robots/robot_checks.hpp"

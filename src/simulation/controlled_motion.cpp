@@ -140,7 +140,7 @@ VectorXd start_of(const Model& model) {
 
 }  // namespace
 
-GeneratedData generate_motion(const Model& model, int n, RandomStream& random) {
+MatrixXd generate_motion(const Model& model, int n, RandomStream& random) {
   const System& system = *model.system;
   const StateLayout layout = system.layout();
   const VectorXd parameters = system.parameter_values();
@@ -148,15 +148,13 @@ GeneratedData generate_motion(const Model& model, int n, RandomStream& random) {
 
   VectorXd state = start_of(model);
   Controller controller(model, state, random);
-  GeneratedData data;
-  data.known.assign(static_cast<std::size_t>(layout.size()), true);
-  data.states.resize(layout.size(), n);
+  MatrixXd states(layout.size(), n);
   for (int i = 0; i < n; ++i) {
     state[layout.t()] = i / model.motion->rate;
     state.tail(layout.nu) = controller.inputs(state);
     if (!state.allFinite())
       throw NumericalError(fmt::format("{}: [motion]: the inputs are not finite at sample {}", model.name, i + 1));
-    data.states.col(i) = state;
+    states.col(i) = state;
     if (i + 1 == n) break;
     SimulateOptions step;
     step.times.resize(2);
@@ -165,7 +163,7 @@ GeneratedData generate_motion(const Model& model, int n, RandomStream& random) {
     step.initial_step = 1 / model.motion->rate;
     state = simulate(system, parameters, acceleration, state, step).states.col(1);
   }
-  return data;
+  return states;
 }
 
 }  // namespace gp2

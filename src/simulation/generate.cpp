@@ -16,7 +16,6 @@
 #include "base/random.hpp"
 #include "gp2/error.hpp"
 #include "gp2/mechanics/udwadia_kalaba.hpp"
-#include "mechanics/describe_fault.hpp"
 #include "simulation/controlled_motion.hpp"
 
 namespace gp2 {
@@ -339,51 +338,6 @@ class Sampler {
   std::optional<Completion> positions_, velocities_;
 };
 
-void require_truth(const Model& model) {
-  if (model.truth.empty()) {
-    throw InputError(
-        fmt::format("{}: missing [truth] acceleration = [ … ]: what is added to M⁻¹ force, \"0\" where nothing is", model.name));
-  }
-}
-
-}  // namespace
-
-ModelMotion::ModelMotion(const Model& model) : system_(model.system), parameters_(model.system->parameter_values()) {
-  truth_ = Tape(model.truth, model.symbols().state_and_parameters());
-  truth_force_ = Tape(model.truth_force, model.symbols().state_and_parameters());
-}
-
-MatrixXd ModelMotion::acceleration(const Eigen::Ref<const MatrixXd>& states) const {
-  const MechanicsBatch mechanics = require_mechanics(*system_, states, parameters_);
-  MatrixXd truth = MatrixXd::Zero(system_->nq(), states.cols()), truth_force = truth;
-  if (truth_.n_outputs() > 0) truth_.evaluate(states, parameters_, truth);
-  if (truth_force_.n_outputs() > 0) truth_force_.evaluate(states, parameters_, truth_force);
-  MatrixXd accelerations(system_->nq(), states.cols());
-  for (int i = 0; i < static_cast<int>(states.cols()); ++i) {
-    const UdwadiaKalaba& projection = mechanics.projections[static_cast<std::size_t>(i)];
-    if (projection.mass_is_singular() && !truth.col(i).isZero(0)) {
-      throw InputError(internal::describe_fault(
-          *system_, states,
-          {i, "the mass matrix M is singular, so that [truth] acceleration cannot be added to M⁻¹F: write it as [truth] force"}));
-    }
-    accelerations.col(i) = projection.constrain(projection.solve_mass(mechanics.values.F(i) + truth_force.col(i)) + truth.col(i));
-  }
-  return accelerations;
-}
-
-MatrixXd true_acceleration(const Model& model, const Eigen::Ref<const MatrixXd>& states) {
-  require_truth(model);
-  MatrixXd accelerations = ModelMotion(model).acceleration(states);
-  for (int i = 0; i < static_cast<int>(states.cols()); ++i) {
-    if (!accelerations.col(i).allFinite()) {
-      throw InputError(fmt::format("{}: the true acceleration is not a finite number at sample {}", model.name, i + 1));
-    }
-  }
-  return accelerations;
-}
-
-namespace {
-
 // points of every range of [sampling], in its order; 0 where a rule is an expression
 std::vector<int> grid_points(const Model& model, const std::map<std::string, int>& grid) {
   std::vector<int> points;
@@ -435,6 +389,11 @@ MatrixXd grid_states(const Model& model, const Sampler& sampler, const std::map<
   return states;
 }
 
+// a motion knows its whole state
+std::vector<bool> every_entry(const System& system) {
+  return std::vector<bool>(static_cast<std::size_t>(system.layout().size()), true);
+}
+
 GeneratedData draw_states(const Model& model, const GenerateOptions& options, RandomStream& random) {
   const Sampler sampler(model);
   GeneratedData data;
@@ -470,7 +429,8 @@ GeneratedData generate(const Model& model, const GenerateOptions& options) {
   }
 
   RandomStream random(options.seed);
-  GeneratedData data = model.motion ? generate_motion(model, options.n, random) : draw_states(model, options, random);
+  GeneratedData data = model.motion ? GeneratedData{generate_motion(model, options.n, random), {}, every_entry(system)}
+                                    : draw_states(model, options, random);
   data.accelerations = true_acceleration(model, data.states);
   // noise comes last, so that states are the same for any noise
   for (Index i = 0; i < data.accelerations.cols(); ++i) {

@@ -13,7 +13,7 @@
 
 #include "gp2/error.hpp"
 #include "gp2/mechanics/udwadia_kalaba.hpp"
-#include "gp2/simulation/generate.hpp"
+#include "gp2/simulation/model_motion.hpp"
 #include "simulation/projection.hpp"
 
 namespace gp2 {

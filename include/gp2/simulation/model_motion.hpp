@@ -1,0 +1,35 @@
+#pragma once
+
+#include <memory>
+
+#include <Eigen/Core>
+
+#include "gp2/model.hpp"
+
+namespace gp2 {
+
+/// @throws InputError when a model has no [truth].
+void require_truth(const Model& model);
+
+/// The motion of a model as it is written: ddq = L b + T (M⁻¹(F + truth.force) + truth.acceleration), both 0 without [truth].
+/// Compiled once, for many calls.
+class ModelMotion {
+ public:
+  explicit ModelMotion(const Model& model);
+
+  /// @param states  (layout size × N)
+  /// @return (nq × N), not finite where the truth is not
+  /// @throws InputError as require_mechanics, and where M is singular while truth.acceleration is not 0.
+  [[nodiscard]] Eigen::MatrixXd acceleration(const Eigen::Ref<const Eigen::MatrixXd>& states) const;
+
+ private:
+  std::shared_ptr<const System> system_;
+  Eigen::VectorXd parameters_;
+  Tape truth_, truth_force_;
+};
+
+/// The true acceleration L b + T (M⁻¹F + truth) at given states (nq × N).
+/// @throws InputError when there is no [truth], or it is not finite at a state.
+Eigen::MatrixXd true_acceleration(const Model& model, const Eigen::Ref<const Eigen::MatrixXd>& states);
+
+}  // namespace gp2
