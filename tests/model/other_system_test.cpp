@@ -377,7 +377,7 @@ TEST(FitFileOfSeveralSystems, NeedsTheModelFileOfEach) {
   EXPECT_THAT(input_error_of([&] { fit.write(folder / "lost.json"); }),
               HasSubstr("lost.json: the model file of the system of observations 2 is not given"));
   EXPECT_FALSE(std::filesystem::exists(folder / "lost.json"));
-  fit.observations.resize(1);
+  fit.observations.erase(fit.observations.begin() + 1, fit.observations.end());
   std::erase_if(fit.report.hyperparameters,
                 [](const Hyperparameter& h) { return h.kind == Hyperparameter::Kind::noise_stddev && h.owner > 0; });
   fit.report.uncertainty.reset();
