@@ -2,8 +2,8 @@
 
 #include <cstddef>
 
-// Counts the calls of malloc and its kin, which operator new and Eigen end in: a test that uses it has allocation_count.cpp among
-// its sources.
+// Counts the calls of malloc and its kin, which operator new and Eigen end in:
+// a test that uses it has allocation_count.cpp among its sources.
 namespace gp2::test {
 
 /// How often this thread has allocated so far.

@@ -15,8 +15,8 @@ inline int thread_count(int wanted) {
 }
 
 /// Calls work(task, thread) once for every task 0 … n_tasks − 1, in an order that differs from run to run, on the calling thread
-/// and up to n_threads − 1 others; thread 0 … n_threads − 1 is the one that works. The first exception is thrown again when all
-/// are done.
+/// and up to n_threads − 1 others; thread 0 … n_threads − 1 is the one that works.
+/// The first exception is thrown again when all are done.
 template <typename Work>
 void parallel_for(int n_tasks, int n_threads, const Work& work) {
   n_threads = std::clamp(n_threads, 1, std::max(n_tasks, 1));

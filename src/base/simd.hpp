@@ -32,8 +32,8 @@ struct Loops {
   void (*weighted_differences)(Size n, Size D, const T* w, const T* x, Size ldx, const T* p, T* out);
   /// out_dl = Σ_i k_i B_il (x_id − p_d) (D × m)
   void (*difference_products)(Size n, Size D, Size m, const T* k, const T* B, Size ldb, const T* x, Size ldx, const T* p, T* out);
-  /// sums_d,lane += Σ w_i (x_id − p_d)² over the i of each lane, so that many calls need one sum over lanes at the end (lanes ×
-  /// D)
+  /// sums_d,lane += Σ w_i (x_id − p_d)² over the i of each lane,
+  /// so that many calls need one sum over lanes at the end (lanes × D)
   void (*add_weighted_squares)(Size n, Size D, const T* w, const T* x, Size ldx, const T* p, T* sums);
   /// out_i += k_i Σ_l B_il b_l
   void (*add_scaled_products)(Size n, Size m, const T* k, const T* B, Size ldb, const T* b, T* out);

@@ -77,8 +77,8 @@ struct Vector {
   }
 };
 
-// calls body(i, v) for the vectors v of r² = Σ_d (x_id − p_d)² from row i on, several at a time so that they hide each other's
-// latency
+// calls body(i, v) for the vectors v of r² = Σ_d (x_id − p_d)² from row i on,
+// several at a time so that they hide each other's latency
 template <typename T, typename Body>
 inline void for_each_squared_distance(Size n, Size D, const T* x, Size ldx, const T* p, const Body& body) {
   using V = Vector<T>;

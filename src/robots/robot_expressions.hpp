@@ -14,8 +14,8 @@
 namespace gp2 {
 
 /// The numbers of a robot that a model may name as parameters, with their values: mass("link7"), com("link7").x,
-/// inertia("link7").xx (about the centre of mass, in the body's axes), damping("q1"), stiffness("q1"), friction("q1") (dry),
-/// armature("q1").
+/// inertia("link7").xx (about the centre of mass, in the body's axes), damping("q1"), stiffness("q1"),
+/// friction("q1") (dry), armature("q1").
 std::vector<std::pair<std::string, double>> robot_numbers(const RobotDescription& robot);
 
 /// A point of a robot, or an axis of a frame on it, along one axis of the world, as a function of the coordinates q.

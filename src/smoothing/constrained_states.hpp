@@ -24,8 +24,8 @@ class ConstrainedStates {
   /// @throws NumericalError when the constraints are not reached.
   void complete(Eigen::VectorXd& state, Eigen::Ref<Eigen::VectorXd> acceleration) const;
 
-  /// The same in the sense of least squares, as far as Newton's method comes: where noise contradicts the constraints, close to
-  /// them.
+  /// The same in the sense of least squares, as far as Newton's method comes:
+  /// where noise contradicts the constraints, close to them.
   void approach(Eigen::VectorXd& state, Eigen::Ref<Eigen::VectorXd> acceleration) const;
 
   /// How many constraints hold among the measured coordinates alone.

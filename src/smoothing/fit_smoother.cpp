@@ -22,8 +22,8 @@ constexpr double median_of_normal = 0.6745;  // of |x|, x standard normal
 
 double square(double x) { return x * x; }
 
-/// How far each inner position is off the cubic through two neighbours on either side, in units that noise of deviation 1 gives
-/// it.
+/// How far each inner position is off the cubic through two neighbours on either side,
+/// in units that noise of deviation 1 gives it.
 struct Roughness {
   std::vector<int> measurement;
   std::vector<double> residual;

@@ -117,8 +117,8 @@ namespace {
 /// Whether e is written with a leading minus: −u, or a negative constant. Then -e is simpler than e.
 bool has_minus(Expression e) { return e.operation() == Operation::negate || (e.is_constant() && e.constant_value() < 0); }
 
-/// What `operation` makes of two constants, unless that is infinite or NaN: such a node stays, so that evaluating it shows the
-/// error.
+/// What `operation` makes of two constants, unless that is infinite or NaN: such a node stays,
+/// so that evaluating it shows the error.
 std::optional<double> fold(Operation operation, double a, double b) {
   double value = 0;
   if (const auto n = internal::small_integer(b); operation == Operation::power && n) {

@@ -94,8 +94,8 @@ inline void integer_power(int n, std::ptrdiff_t lanes, const double* a, double* 
   }
 }
 
-/// Calls `use` with the arithmetic of `operation` as a function (double a, double b) -> double; unary ones ignore b. NaN stays
-/// NaN.
+/// Calls `use` with the arithmetic of `operation` as a function (double a, double b) -> double;
+/// unary ones ignore b. NaN stays NaN.
 template <class Use>
 void with_arithmetic(Operation operation, Use&& use) {
   switch (operation) {

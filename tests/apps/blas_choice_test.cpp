@@ -1,5 +1,5 @@
-// The command chooses OpenBLAS' kernel: it starts over, once, where OpenBLAS took one that is too narrow
-// (apps/gp2/blas_choice.hpp).
+// The command chooses OpenBLAS' kernel: it starts over, once,
+// where OpenBLAS took one that is too narrow (apps/gp2/blas_choice.hpp).
 
 #include <map>
 #include <sstream>

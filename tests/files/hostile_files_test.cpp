@@ -70,8 +70,7 @@ class HostileFiles : public testing::Test {
   std::clock_t start_ = std::clock();
 };
 
-// ---------------------------------------------------------------------------------------------------------- expressions in a
-// model
+// ------------------------------------------------------------------------------------------------------- expressions in a model
 
 TEST_F(HostileFiles, AMillionParenthesesAreRefusedByLineAndKey) {
   EXPECT_EQ(error_of_model(model_with_force(std::string(1'000'000, '('))),
@@ -127,8 +126,7 @@ TEST_F(HostileFiles, AKernelOfManyFactorsIsRefused) {
             "m.toml:7: latent.kernel: a kernel of 50001 factors on 1 features has more than 10000 hyperparameters; use fewer");
 }
 
-// ------------------------------------------------------------------------------------------------------------------ the model
-// file
+// --------------------------------------------------------------------------------------------------------------- the model file
 
 TEST_F(HostileFiles, HalfAMillionEntriesAreReadOrRefused) {
   const std::string zeros = "[" + repeated("0,", 450'000) + "]";
@@ -179,8 +177,7 @@ TEST_F(HostileFiles, ALargeModelFileIsRefusedBeforeItIsRead) {
             path.string() + ": 100000000 bytes; a model file has at most 1048576");
 }
 
-// -------------------------------------------------------------------------------------------------------------------------- a
-// fit
+// ------------------------------------------------------------------------------------------------------------------------ a fit
 
 TEST_F(HostileFiles, DeepBracketsInAFitAreRefused) {
   for (const std::string& deep : {std::string(100'000, '['), std::string(100'000, '[') + std::string(100'000, ']')}) {
@@ -202,8 +199,7 @@ TEST_F(HostileFiles, AFitDoesNotReadTheRobotThatItsTextNames) {
   EXPECT_EQ(error_of_fit(text), "fit.json: m.toml:1: robot: the fit does not hold the robot of '/dev/zero'");
 }
 
-// --------------------------------------------------------------------------------------------------------------------------- a
-// log
+// ------------------------------------------------------------------------------------------------------------------------ a log
 
 TEST_F(HostileFiles, ALineOfAHundredMegabytesIsRefused) {
   const std::string line(100'000'000, 'x');

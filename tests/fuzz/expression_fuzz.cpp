@@ -24,8 +24,8 @@ namespace {
 
 const std::vector<std::string> variable_names = {"q1", "q2", "dq1", "t", "m"};
 
-/// The value of an expression as its definition says, operand by operand. Integer powers take the library's own product: std::pow
-/// rounds otherwise.
+/// The value of an expression as its definition says, operand by operand.
+/// Integer powers take the library's own product: std::pow rounds otherwise.
 class DirectEvaluation {
  public:
   explicit DirectEvaluation(const std::map<std::string, double>& values) : values_(values) {}

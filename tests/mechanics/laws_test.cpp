@@ -95,8 +95,8 @@ TEST_P(MechanicsLaws, LIsAGeneralisedInverseOfAWhichTurnsBIntoAnAcceleration) {
     for (Eigen::Index row = 0; row < c.A.rows(); ++row) {
       const double size = largest(c.A.row(row));
       EXPECT_LE(largest(c.A.row(row) * LA - c.A.row(row)), c.rounding * size * (1 + largest(LA)));
-      // a redundant row agrees with the others as far as the state satisfies the constraints: 16 ε times sizes of order one or
-      // less
+      // a redundant row agrees with the others as far as the state satisfies the constraints:
+      // 16 ε times sizes of order one or less
       EXPECT_NEAR(c.A.row(row) * c.projection.Lb(), c.b[row],
                   c.rounding * (size * largest(c.projection.Lb()) + std::abs(c.b[row]) + largest(c.b)));
     }

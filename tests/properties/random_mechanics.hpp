@@ -70,8 +70,8 @@ inline double condition_number(const MatrixXd& matrix) {
   return values[0] / values[values.size() - 1];
 }
 
-/// Call within a property: n ≤ 12, up to 8 rows of any rank, κ(M) ≤ 1e6, κ of the rows ≤ 1e4, units of coordinates and rows over
-/// many decades.
+/// Call within a property: n ≤ 12, up to 8 rows of any rank, κ(M) ≤ 1e6, κ of the rows ≤ 1e4,
+/// units of coordinates and rows over many decades.
 inline RandomMechanics random_mechanics(RandomStream& random, int at_least_one_row = 0) {
   const int n = *rc::gen::inRange(1, 13).as("coordinates");
   const int m = *rc::gen::inRange(at_least_one_row, 9).as("rows");

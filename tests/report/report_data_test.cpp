@@ -119,8 +119,8 @@ TEST_F(ReportOf, HasTheVeryFiguresOfEvaluate) {
   for (const auto& [k, file] : {std::pair(0, "train.csv"), std::pair(1, "test.csv")}) {
     const auto told = desk.done(std::string("gp2 evaluate fit.json --json --data ") + file).json();
     const auto& figures = json["data"][static_cast<std::size_t>(k)]["figures"];
-    // the fit keeps its data to the bit, and a state's prediction does not depend on the others; a covariance may, in its last
-    // digits
+    // the fit keeps its data to the bit, and a state's prediction does not depend on the others; a covariance may,
+    // in its last digits
     for (const char* key : {"rmse_normalised", "nrmse", "max_constraint_error", "max_constraint_error_fitted", "n"}) {
       EXPECT_EQ(figures[key], told[key]) << key;
     }
