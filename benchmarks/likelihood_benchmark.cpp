@@ -10,7 +10,7 @@
 #include "base/lapack.hpp"
 #include "gp2/fit.hpp"
 #include "gp2/simulation/generate.hpp"
-#include "inference/reduction.hpp"
+#include "inference/assemble.hpp"
 
 namespace {
 
@@ -65,17 +65,13 @@ void estimated_parameters(benchmark::State& state) { likelihood_and_gradient(sta
 void assembly(benchmark::State& state) {
   const Problem problem(static_cast<int>(state.range(0)), {}, false);
   const gp2::ModelValues values = gp2::model_values(problem.prior, problem.observations, problem.hyperparameters);
-  std::vector<gp2::ObservationModel> models;
-  gp2::model_observations(problem.prior, problem.observations, values.parameters, {}, models);
   gp2::Reduction reduction;
-  gp2::reduce(problem.prior, problem.observations, models, values.noise_stddev, reduction);
-  const auto features =
-      gp2::sorted_features(problem.prior, gp2::features_by_group(problem.prior, problem.observations), reduction);
-  const std::vector<gp2::KernelColumns> kernels = {{problem.prior.latents[0].kernel, features[0], values.kernel[0]}};
-  const std::vector<Eigen::MatrixXd> Z = {gp2::by_component(reduction, reduction.directions[0] * values.loading(0))};
+  gp2::reduce(problem.prior, problem.observations,
+              gp2::require_models(problem.prior, problem.observations, values.parameters, {}), values.noise_stddev, reduction);
+  const gp2::LatentRows rows = gp2::latent_rows(problem.prior, problem.observations, reduction, values);
   Eigen::MatrixXd K(reduction.size(), reduction.size());
   for (auto _ : state) {
-    gp2::assemble(reduction, kernels, Z, static_cast<int>(state.range(1)), K);
+    gp2::assemble(rows, static_cast<int>(state.range(1)), K);
     benchmark::DoNotOptimize(K.data());
   }
 }

@@ -41,6 +41,16 @@ void GrowingCholesky::reserve(Index n) {
   memory_.swap(memory);
 }
 
+void GrowingCholesky::resize(Index n) {
+  if (capacity() != n) memory_.resize(n, n);
+  size_ = n;
+}
+
+Eigen::Block<const MatrixXd> GrowingCholesky::invert() {
+  lapack::invert_factored(lower());
+  return L();
+}
+
 VectorXd GrowingCholesky::solve() const {
   VectorXd solution = z_;
   lapack::solve_lower(L(), true, solution);

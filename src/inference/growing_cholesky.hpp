@@ -26,8 +26,17 @@ class GrowingCholesky {
   [[nodiscard]] const Eigen::VectorXd& z() const { return z_; }  // (n)
   [[nodiscard]] Eigen::VectorXd solve() const;                   // K⁻¹y = L⁻ᵀz
 
+  [[nodiscard]] double log_det_half() const { return L().diagonal().array().log().sum(); }  // ½ log|K|
+
+  /// For a K of n rows, to be written to lower(), without room for more. What stood here is lost; memory of that size is used
+  /// again.
+  void resize(Eigen::Index n);
+
   /// From K in the lower triangle of lower() to L and z = L⁻¹y; false where K is not positive definite.
   [[nodiscard]] bool factorise(const Eigen::Ref<const Eigen::VectorXd>& y);
+
+  /// The lower triangle of K⁻¹, in the place of L, which is lost.
+  [[nodiscard]] Eigen::Block<const Eigen::MatrixXd> invert();
 
   /// L and z of [K k; kᵀ κ] and [y; υ], in O(n² m) operations. False, and nothing has changed, where that is not positive
   /// definite.

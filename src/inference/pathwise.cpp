@@ -7,7 +7,7 @@
 #include "base/lapack.hpp"
 #include "base/simd.hpp"
 #include "gp2/error.hpp"
-#include "inference/posterior_implementation.hpp"
+#include "inference/query.hpp"
 #include "prior/random_features.hpp"
 
 namespace gp2 {
@@ -23,7 +23,7 @@ namespace {
 struct LatentPath {
   RandomFeatures features;
   MatrixXd weights;  // W (features × functions)
-  MatrixXd beta;     // β (N, padded × functions)
+  MatrixXd beta;     // β (rows of the basis × functions)
 };
 
 LatentPath draw_prior_path(const Posterior::Implementation& posterior, std::size_t a, int n_features, RandomStream& random) {
@@ -34,26 +34,15 @@ LatentPath draw_prior_path(const Posterior::Implementation& posterior, std::size
   return path;
 }
 
-// ỹ − Σ_a Z_a f̃_a − ε, what is left of the data to explain
-VectorXd misfit(const Posterior::Implementation& posterior, const std::vector<LatentPath>& paths, RandomStream& random) {
-  VectorXd misfit = posterior.y;
-  for (std::size_t a = 0; a < paths.size(); ++a) {
-    const LatentPath& path = paths[a];
-    const Posterior::Implementation::LatentAtSamples& latent = posterior.latents[a];
-    VectorXd psi(path.features.size());
-    for (std::size_t j = 0; j < posterior.samples.size(); ++j) {
-      const Index sample = static_cast<Index>(j);
-      path.features.evaluate(latent.kernel.features().row(sample).transpose(), psi);
-      const VectorXd f = path.weights.transpose() * psi;
-      for (std::size_t c = 0; c < posterior.row_of.size(); ++c) {
-        if (posterior.row_of[c][j] < 0) continue;
-        const auto Z = latent.Z.row(sample).segment(static_cast<Index>(c) * f.size(), f.size());
-        misfit[posterior.row_of[c][j]] -= Z * f;
-      }
-    }
+// a function of the prior at the points of a basis (functions × points)
+MatrixXd evaluate_prior_path(const LatentPath& path, const KernelColumns& kernel) {
+  MatrixXd f(path.weights.cols(), kernel.n_points());
+  VectorXd psi(path.features.size());
+  for (Index j = 0; j < kernel.n_points(); ++j) {
+    path.features.evaluate(kernel.features().row(j).transpose(), psi);
+    f.col(j) = path.weights.transpose() * psi;
   }
-  for (double& entry : misfit) entry -= random.normal();
-  return misfit;
+  return f;
 }
 
 }  // namespace
@@ -81,7 +70,7 @@ MatrixXd PathwiseSamples::evaluate(int sample, const View& view, const Ref<const
   for (std::size_t a = 0; a < paths.size(); ++a) {
     if (!query.needs(a)) continue;
     const LatentPath& path = paths[a];
-    const KernelColumns& kernel = posterior.latents[a].kernel;
+    const KernelColumns& kernel = posterior.latents->latents()[a].kernel;
     psi.resize(path.features.size());
     k.resize(kernel.n_rows());
     sums.resize(path.weights.cols());
@@ -111,23 +100,24 @@ PathwiseSamples sample_paths(const Posterior& posterior, int n_samples, const Pa
 
   // solved in blocks that are always as wide, so that the bits of a sample do not depend on how many there are
   constexpr int block_size = 8;
-  MatrixXd alpha = MatrixXd::Zero(conditioned.factor.size(), block_size);
+  const LatentPosterior& latents = *conditioned.latents;
+  MatrixXd misfits = MatrixXd::Zero(latents.size(), block_size);
   for (int first = 0; first < n_samples; first += block_size) {
     const int end = std::min(first + block_size, n_samples);
     for (int s = first; s < end; ++s) {
       RandomStream random(options.seed, static_cast<std::uint64_t>(s));
       std::vector<LatentPath>& paths = self->samples.emplace_back();
+      std::vector<MatrixXd> f;
       for (std::size_t a = 0; a < conditioned.prior.latents.size(); ++a) {
         paths.push_back(draw_prior_path(conditioned, a, options.n_features, random));
+        f.push_back(evaluate_prior_path(paths.back(), latents.latents()[a].kernel));
       }
-      alpha.col(s - first) = misfit(conditioned, paths, random);
+      misfits.col(s - first) = latents.misfit(f, random);
     }
-    lapack::solve_lower(conditioned.factor.L(), false, alpha);
-    lapack::solve_lower(conditioned.factor.L(), true, alpha);
+    std::vector<std::vector<MatrixXd>> weights = latents.weights(misfits);
     for (int s = first; s < end; ++s) {
-      for (std::size_t a = 0; a < conditioned.prior.latents.size(); ++a) {
-        self->samples[static_cast<std::size_t>(s)][a].beta = conditioned.latent_weights(a, alpha.col(s - first));
-      }
+      std::vector<LatentPath>& paths = self->samples[static_cast<std::size_t>(s)];
+      for (std::size_t a = 0; a < paths.size(); ++a) paths[a].beta = std::move(weights[static_cast<std::size_t>(s - first)][a]);
     }
   }
   return PathwiseSamples(std::move(self));

@@ -11,6 +11,7 @@
 
 #include "gp2/error.hpp"
 #include "gp2/mechanics/state_evaluator.hpp"
+#include "inference/posterior_implementation.hpp"
 #include "inference/predictor_data.hpp"
 
 namespace gp2 {
@@ -198,13 +199,13 @@ Predictor::Implementation::Implementation(const Posterior::Implementation& poste
   needs_acceleration = what_needs_acceleration(prior, view).has_value();
   for (std::size_t a = 0; a < prior.latents.size(); ++a) {
     if (!view.has_latent(a)) continue;
-    terms.push_back({a, posterior.latents[a].kernel, posterior.latents[a].C});
+    terms.push_back({a, posterior.latents->latents()[a].kernel, posterior.C[a]});
     has_force = has_force || prior.latents[a].base == Latent::Base::force;
   }
   if (options.storage == Storage::single_precision) {
-    in_single.store(posterior, terms, options.stddev);
+    in_single.store(*posterior.latents, terms, options.stddev);
   } else {
-    in_double.store(posterior, terms, options.stddev);
+    in_double.store(*posterior.latents, terms, options.stddev);
   }
 }
 

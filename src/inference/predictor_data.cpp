@@ -3,7 +3,6 @@
 #include <algorithm>
 #include <type_traits>
 
-#include "base/lapack.hpp"
 #include "base/simd.hpp"
 
 namespace gp2 {
@@ -42,13 +41,13 @@ Index n_functions(const std::vector<PredictorTerm>& terms) {
 }  // namespace
 
 template <typename T>
-void PredictorData<T>::store(const Posterior::Implementation& posterior, const std::vector<PredictorTerm>& terms, bool stddev) {
-  row_of_ = posterior.row_of;
+void PredictorData<T>::store(const LatentPosterior& posterior, const std::vector<PredictorTerm>& terms, bool stddev) {
+  row_of_ = posterior.row_of();
   n_samples_ = row_of_.empty() ? 0 : static_cast<Index>(row_of_.front().size());
-  reduced_size_ = posterior.factor.size();
+  reduced_size_ = posterior.size();
   for (const PredictorTerm& term : terms) {
-    const Posterior::Implementation::LatentAtSamples& from = posterior.latents[term.latent];
-    const Index n = static_cast<Index>(posterior.samples.size()), n_rows = simd::padded<T>(n);
+    const LatentPosterior::Basis& from = posterior.latents()[term.latent];
+    const Index n = from.kernel.n_points(), n_rows = simd::padded<T>(n);
     LatentData& latent = latents_.emplace_back();
     if (term.kernel.is_squared_exponential()) {
       MatrixXd points = term.kernel.scaled().topRows(n);
@@ -57,27 +56,25 @@ void PredictorData<T>::store(const Posterior::Implementation& posterior, const s
       points.rowwise() -= latent.centre.transpose();
       latent.points = stored<T>(points, n_rows);
     } else if (std::is_same_v<T, float>) {
-      latent.exact_weights = from.beta * from.C.transpose();
+      latent.exact_weights = from.beta * term.C.transpose();
     }
-    latent.weights = stored<T>((from.beta * from.C.transpose()).topRows(n), n_rows);
+    latent.weights = stored<T>((from.beta * term.C.transpose()).topRows(n), n_rows);
     if (stddev) latent.Z = stored<T>(from.Z.topRows(n), n_rows);
   }
-  if (stddev) store_inverse(posterior.factor);
+  if (stddev) store_inverse(posterior);
 }
 
 template <typename T>
-void PredictorData<T>::store_inverse(const GrowingCholesky& factor) {
-  const Index n = factor.size();
+void PredictorData<T>::store_inverse(const LatentPosterior& posterior) {
+  const Index n = posterior.size();
   std::vector<Index> first{0};  // of each row
   for (Index i = 0; i < n; ++i) first.push_back(first.back() + simd::padded<T>(i + 1));
   inverse_.resize(static_cast<std::size_t>(first.back()));
-  // L X = I for blocks of columns, which begin with zeros
+  // by blocks of columns, which begin with zeros
   constexpr Index block = 64;
-  MatrixXd columns;
   for (Index j = 0; j < n; j += block) {
     const Index m = std::min(block, n - j), below = n - j;
-    columns = MatrixXd::Identity(below, m);
-    lapack::solve_lower(factor.L().bottomRightCorner(below, below), false, columns);
+    const MatrixXd columns = posterior.whitening_columns(j, m);
     for (Index i = 0; i < below; ++i) {
       T* const row = inverse_.data() + first[static_cast<std::size_t>(j + i)] + j;
       for (Index l = 0; l < std::min(m, i + 1); ++l) row[l] = static_cast<T>(columns(i, l));

@@ -4,7 +4,7 @@
 
 #include <Eigen/Core>
 
-#include "inference/posterior_implementation.hpp"
+#include "inference/gram.hpp"
 #include "prior/kernel_columns.hpp"
 
 namespace gp2 {
@@ -41,7 +41,7 @@ class PredictorData {
   };
 
   /// @param stddev  whether subtract_explained is wanted
-  void store(const Posterior::Implementation& posterior, const std::vector<PredictorTerm>& terms, bool stddev);
+  void store(const LatentPosterior& posterior, const std::vector<PredictorTerm>& terms, bool stddev);
   /// @param n_rows  of the view
   [[nodiscard]] Memory make_memory(const std::vector<PredictorTerm>& terms, Eigen::Index n_rows, bool stddev) const;
 
@@ -64,10 +64,10 @@ class PredictorData {
     Eigen::VectorXd centre;         // (D)
     Matrix weights;                 // β Cᵀ (n_rows × p)
     Eigen::MatrixXd exact_weights;  // of another kernel: the same in double precision, where T is single
-    Matrix Z;                       // as in Posterior::Implementation (n_rows × components·F)
+    Matrix Z;                       // as in LatentPosterior (n_rows × components·F)
   };
 
-  void store_inverse(const GrowingCholesky& factor);
+  void store_inverse(const LatentPosterior& posterior);
   void evaluate_kernel(const PredictorTerm& term, std::size_t a, const Eigen::VectorXd& point, Memory& memory, T* k) const;
   void move_point(const LatentData& data, const Eigen::VectorXd& point, Memory& memory) const;
   [[nodiscard]] bool is_by_function(const std::vector<PredictorTerm>& terms, Eigen::Index n_rows) const;
@@ -79,9 +79,9 @@ class PredictorData {
   void write_cross_of_functions(const std::vector<PredictorTerm>& terms, Memory& memory) const;
 
   std::vector<LatentData> latents_;                // per term
-  std::vector<std::vector<Eigen::Index>> row_of_;  // [component][sample], as in Posterior::Implementation
+  std::vector<std::vector<Eigen::Index>> row_of_;  // [component][sample], as in LatentPosterior
   Eigen::Index n_samples_ = 0, reduced_size_ = 0;
-  std::vector<T> inverse_;  // X = L⁻¹ row by row, each padded with zeros to whole vectors
+  std::vector<T> inverse_;  // X row by row, each padded with zeros to whole vectors
 };
 
 extern template class PredictorData<double>;

@@ -1,7 +1,7 @@
 #include <gtest/gtest.h>
 
+#include "inference/assemble.hpp"
 #include "inference/problems.hpp"
-#include "inference/reduction.hpp"
 
 // The analytic gradient against differences, for every hyperparameter of every problem.
 namespace gp2 {

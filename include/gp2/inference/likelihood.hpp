@@ -49,8 +49,7 @@ class Likelihood {
 
   /// −log p(y | values): +∞ where the mechanics have a fault (evaluate_mechanics of the prior) or the factorisation fails.
   ///
-  /// @param gradient  when not null, receives the gradient: zero in a fixed kernel, and where the options do not ask for the
-  /// noise
+  /// @param gradient  when not null, receives the gradient: zero in a fixed kernel, and where the options do not ask for the noise
   ///                  or a parameter. Left as it was when the value is +∞.
   double evaluate(const ModelValues& values, ModelGradient* gradient, Workspace& workspace) const;
 

@@ -1,0 +1,57 @@
+#pragma once
+
+#include "inference/gram.hpp"
+#include "inference/growing_cholesky.hpp"
+
+namespace gp2 {
+
+/// K̃ + I = L Lᵀ, exactly: O(n³) operations and O(n²) memory for n reduced rows.
+class DenseGram final : public Gram {
+ public:
+  /// @param n_threads  that it may use where there are samples enough for it to pay
+  explicit DenseGram(int n_threads = 1) : n_threads_(n_threads) {}
+
+  [[nodiscard]] std::optional<GramValue> factorise(const LatentRows& rows) override;
+  [[nodiscard]] GramGradient differentiate(const LatentRows& rows, const std::vector<GramGradientParts>& parts) override;
+  [[nodiscard]] Inverse invert(const LatentRows& rows) override;
+  [[nodiscard]] std::unique_ptr<LatentPosterior> condition(const LatentRows& rows) const override;
+
+ private:
+  [[nodiscard]] int n_threads(const LatentRows& rows) const;
+  [[nodiscard]] int n_blas_threads(const LatentRows& rows) const;
+
+  int n_threads_;
+  GrowingCholesky factor_;
+};
+
+/// The latents given the observations by L: the samples are the basis, ỹ the basis variables and X = L⁻¹.
+class DensePosterior final : public LatentPosterior {
+ public:
+  /// Without observations; latents and kernels as those of `like`.
+  explicit DensePosterior(const LatentRows& like);
+  [[nodiscard]] std::unique_ptr<LatentPosterior> clone() const override;
+
+  [[nodiscard]] Eigen::Index size() const override { return factor_.size(); }
+  [[nodiscard]] GramValue value() const override;
+  void whiten(Eigen::Ref<Eigen::MatrixXd> c) const override;
+  [[nodiscard]] Eigen::MatrixXd whitening_columns(Eigen::Index first, Eigen::Index n) const override;
+  [[nodiscard]] Eigen::VectorXd misfit(const std::vector<Eigen::MatrixXd>& f, RandomStream& random) const override;
+  [[nodiscard]] std::vector<std::vector<Eigen::MatrixXd>> weights(Eigen::MatrixXd misfits) const override;
+  [[nodiscard]] bool append(const LatentRows& more) override;
+  void erase(const std::vector<Eigen::Index>& samples) override;
+
+ private:
+  // the factor of K̃ + I, of all rows or extended by more; false where it is not positive definite
+  [[nodiscard]] bool factorise(const LatentRows& rows);
+  [[nodiscard]] bool extend(const LatentRows& more);
+  void append_basis(const LatentRows& more);
+  // β_j = Z_jᵀ α̃_j (n_rows × F)
+  [[nodiscard]] Eigen::MatrixXd latent_weights(std::size_t a, const Eigen::VectorXd& alpha) const;
+  void refresh_weights();
+
+  Eigen::Index n_samples_ = 0;
+  Eigen::VectorXd y_;       // ỹ
+  GrowingCholesky factor_;  // with L⁻¹ỹ
+};
+
+}  // namespace gp2

@@ -1,0 +1,180 @@
+#include <algorithm>
+#include <numeric>
+#include <utility>
+
+#include "base/lapack.hpp"
+#include "inference/assemble.hpp"
+#include "inference/dense_gram.hpp"
+#include "inference/latent_sums.hpp"
+#include "prior/padded_rows.hpp"
+
+namespace gp2 {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::Ref;
+using Eigen::VectorXd;
+
+DensePosterior::DensePosterior(const LatentRows& like) {
+  for (const LatentRows::OfLatent& latent : like.latents) {
+    const KernelColumns& kernel = latent.kernel;
+    latents_.push_back(
+        {KernelColumns(kernel.kernel(), MatrixXd(0, kernel.features().cols()), kernel.values()), {}, {}, latent.n_functions});
+  }
+}
+
+std::unique_ptr<LatentPosterior> DensePosterior::clone() const { return std::make_unique<DensePosterior>(*this); }
+
+GramValue DensePosterior::value() const { return {0.5 * factor_.z().squaredNorm(), factor_.log_det_half()}; }
+
+void DensePosterior::whiten(Ref<MatrixXd> c) const { lapack::solve_lower(factor_.L(), false, c); }
+
+MatrixXd DensePosterior::whitening_columns(Index first, Index n) const {
+  const Index below = size() - first;
+  MatrixXd columns = MatrixXd::Identity(below, n);
+  lapack::solve_lower(factor_.L().bottomRightCorner(below, below), false, columns);
+  return columns;
+}
+
+// ỹ − Σ_a Z_a f̃_a − ε
+VectorXd DensePosterior::misfit(const std::vector<MatrixXd>& f, RandomStream& random) const {
+  VectorXd misfit = y_;
+  for (std::size_t a = 0; a < latents_.size(); ++a) {
+    const Index n_functions = latents_[a].n_functions;
+    for (Index j = 0; j < n_samples_; ++j) {
+      for (std::size_t c = 0; c < row_of_.size(); ++c) {
+        const Index row = row_of_[c][static_cast<std::size_t>(j)];
+        if (row < 0) continue;
+        misfit[row] -= latents_[a].Z.row(j).segment(static_cast<Index>(c) * n_functions, n_functions) * f[a].col(j);
+      }
+    }
+  }
+  for (double& entry : misfit) entry -= random.normal();
+  return misfit;
+}
+
+std::vector<std::vector<MatrixXd>> DensePosterior::weights(MatrixXd misfits) const {
+  MatrixXd& alpha = misfits;
+  lapack::solve_lower(factor_.L(), false, alpha);
+  lapack::solve_lower(factor_.L(), true, alpha);
+  std::vector<std::vector<MatrixXd>> weights;
+  for (Index column = 0; column < alpha.cols(); ++column) {
+    std::vector<MatrixXd>& of_column = weights.emplace_back();
+    for (std::size_t a = 0; a < latents_.size(); ++a) of_column.push_back(latent_weights(a, alpha.col(column)));
+  }
+  return weights;
+}
+
+MatrixXd DensePosterior::latent_weights(std::size_t a, const VectorXd& alpha) const {
+  const Basis& latent = latents_[a];
+  const Index n_functions = latent.n_functions;
+  MatrixXd weights = MatrixXd::Zero(latent.kernel.n_rows(), n_functions);
+  for (std::size_t c = 0; c < row_of_.size(); ++c) {
+    const auto Z = latent.Z.middleCols(static_cast<Index>(c) * n_functions, n_functions);
+    for (std::size_t j = 0; j < row_of_[c].size(); ++j) {
+      if (row_of_[c][j] < 0) continue;
+      const Index row = static_cast<Index>(j);
+      for (Index l = 0; l < n_functions; ++l) weights(row, l) += Z(row, l) * alpha[row_of_[c][j]];
+    }
+  }
+  return weights;
+}
+
+void DensePosterior::refresh_weights() {
+  const VectorXd alpha = factor_.solve();
+  for (std::size_t a = 0; a < latents_.size(); ++a) latents_[a].beta = latent_weights(a, alpha);
+}
+
+bool DensePosterior::append(const LatentRows& more) {
+  if (!(size() == 0 ? factorise(more) : extend(more))) return false;
+  append_basis(more);
+  refresh_weights();
+  return true;
+}
+
+bool DensePosterior::factorise(const LatentRows& rows) {
+  GrowingCholesky factor(rows.size());
+  assemble(rows, 1, factor.lower());
+  if (!factor.factorise(rows.reduction->y)) return false;
+  factor_ = std::move(factor);
+  return true;
+}
+
+bool DensePosterior::extend(const LatentRows& more) {
+  const Reduction& reduction = *more.reduction;
+  const Index n_new = more.n_samples(), n_components = reduction.n_components();
+  MatrixXd kappa(more.size(), more.size());
+  assemble(more, 1, kappa);
+  // row c of Z at a sample is the loading of its component c
+  std::vector<MatrixXd> features, loadings;
+  for (const LatentRows::OfLatent& latent : more.latents) {
+    features.emplace_back(latent.kernel.features().topRows(n_new));
+    loadings.emplace_back(latent.Z.topRows(n_new).transpose());
+  }
+  MatrixXd cross(size(), n_new * n_components), k(size(), more.size());
+  LatentSums(*this).evaluate(features, std::nullopt, &loadings, &cross);
+  for (Index c = 0; c < n_components; ++c) {
+    for (Index j = 0; j < reduction.count[static_cast<std::size_t>(c)]; ++j) {
+      k.col(reduction.offset[static_cast<std::size_t>(c)] + j) = cross.col(j * n_components + c);
+    }
+  }
+  return factor_.append(std::move(k), std::move(kappa), reduction.y);
+}
+
+void DensePosterior::append_basis(const LatentRows& more) {
+  const Reduction& reduction = *more.reduction;
+  const Index n_old = n_samples_, n_new = more.n_samples(), first_row = y_.size();
+  y_.conservativeResize(first_row + more.size());
+  y_.tail(more.size()) = reduction.y;
+  if (row_of_.size() < reduction.count.size()) {
+    row_of_.resize(reduction.count.size(), std::vector<Index>(static_cast<std::size_t>(n_old), -1));
+  }
+  for (std::size_t c = 0; c < row_of_.size(); ++c) {
+    row_of_[c].resize(static_cast<std::size_t>(n_old + n_new), -1);
+    if (c >= reduction.count.size()) continue;
+    for (Index j = 0; j < reduction.count[c]; ++j) {
+      row_of_[c][static_cast<std::size_t>(n_old + j)] = first_row + reduction.offset[c] + j;
+    }
+  }
+  for (std::size_t a = 0; a < latents_.size(); ++a) {
+    const LatentRows::OfLatent& rows = more.latents[a];
+    latents_[a].kernel.append(rows.kernel.features().topRows(n_new));
+    MatrixXd& Z = latents_[a].Z;
+    resize_points(Z, n_old + n_new);
+    const Index n_columns = latents_[a].n_functions * static_cast<Index>(row_of_.size());
+    if (Z.cols() < n_columns) Z.conservativeResizeLike(MatrixXd::Zero(Z.rows(), n_columns));
+    Z.block(n_old, 0, n_new, rows.Z.cols()) = rows.Z.topRows(n_new);
+  }
+  n_samples_ = n_old + n_new;
+}
+
+void DensePosterior::erase(const std::vector<Index>& samples) {
+  const Index n = n_samples_;
+  // the rows that go, and where those that stay come to stand
+  std::vector<Index> rows;
+  for (const std::vector<Index>& of_component : row_of_) {
+    for (const Index sample : samples) {
+      if (of_component[static_cast<std::size_t>(sample)] >= 0) rows.push_back(of_component[static_cast<std::size_t>(sample)]);
+    }
+  }
+  std::sort(rows.begin(), rows.end());
+  factor_.erase(rows);
+  std::vector<Index> kept(static_cast<std::size_t>(y_.size())), moved(kept.size());
+  std::iota(kept.begin(), kept.end(), Index{0});
+  kept.resize(static_cast<std::size_t>(close_gaps(kept.data(), y_.size(), rows)));
+  for (std::size_t row = 0; row < kept.size(); ++row) moved[static_cast<std::size_t>(kept[row])] = static_cast<Index>(row);
+  y_.conservativeResize(close_gaps(y_.data(), y_.size(), rows));
+
+  for (std::vector<Index>& of_component : row_of_) {
+    of_component.resize(static_cast<std::size_t>(close_gaps(of_component.data(), n, samples)));
+    for (Index& row : of_component) row = row < 0 ? row : moved[static_cast<std::size_t>(row)];
+  }
+  for (Basis& latent : latents_) {
+    erase_points(latent.Z, n, samples);
+    latent.kernel.erase(samples);
+  }
+  n_samples_ = n - static_cast<Index>(samples.size());
+  refresh_weights();
+}
+
+}  // namespace gp2

@@ -1,0 +1,122 @@
+#pragma once
+
+#include <memory>
+#include <optional>
+#include <vector>
+
+#include <Eigen/Core>
+
+#include "base/random.hpp"
+#include "inference/latent_rows.hpp"
+
+// The seam between reduced observations and all that is inferred from them. How K̃ + I is solved stands behind it and nowhere
+// else:
+//
+//     Reduction ─> LatentRows ─> Gram ─┬─> GramValue, GramGradient ─> Likelihood
+//                                      └─> LatentPosterior ─> Posterior, PathwiseSamples, Predictor
+namespace gp2 {
+
+/// −log N(ỹ; 0, K̃ + I) = data_fit + complexity + ½ size log 2π.
+struct GramValue {
+  double data_fit = 0;    // ½ ỹᵀ(K̃ + I)⁻¹ỹ
+  double complexity = 0;  // ½ log|K̃ + I|
+};
+
+/// Which derivatives of one latent are needed.
+struct GramGradientParts {
+  bool kernel = false, columns = false, V = false, mean = false;
+  bool alike = false;  // Z_i is the same at every sample and V not needed: `columns` are sums of pairs of components
+
+  [[nodiscard]] bool any() const { return kernel || columns || V || mean; }
+};
+
+/// Derivatives of −log N(ỹ; 0, K̃ + I). Those in every hyperparameter and parameter follow from them by the chain rule at single
+/// samples (theory.md, T13 and T14), whatever the solver. P = (K̃ + I)⁻¹, S_ij = P_ij − α̃_iα̃_jᵀ.
+struct GramGradient {
+  struct OfLatent {
+    Eigen::VectorXd kernel;   // ∂/∂log v: ½ Σ_ij ⟨S_ij, Z_i Z_jᵀ⟩ ∂k_ij/∂log v              (parameters)
+    Eigen::VectorXd columns;  // ∂/∂log of a factor of each column of Z                      (functions)
+                              // where Z_i is alike: Σ_ij S_ij k_ij                          (components²)
+    Eigen::MatrixXd V;        // ∂/∂Z_i = V_i = Σ_j S_ij Z_j k_ij, by component              (N × components·functions)
+    Eigen::MatrixXd mean;     // Σ_j k_ij Z_jᵀα̃_j, the posterior mean of f_a at the samples  (N × functions)
+  };
+  Eigen::VectorXd alpha;  // ∂/∂ỹ = α̃ = Pỹ  (size)
+  std::vector<OfLatent> latents;
+};
+
+/// The latents given the observations. They are known through numbers that are linear in the latents at the points of a basis,
+/// here called basis variables: ỹ at the samples (dense), or inducing values. With c = cov(basis variables, ·),
+///
+///     E[f_a(φ)] = Σ_j k_a(φ, φ_j) β_a,j,    cov = cov of the prior − (X c)ᵀ X c'.
+class LatentPosterior {
+ public:
+  /// One latent at the points of the basis. Rows of points are padded to whole vectors (simd.hpp).
+  struct Basis {
+    KernelColumns kernel;          // k_a between the points and another
+    Eigen::MatrixXd Z;             // column c·F + l: weight of f_l(φ_j) in component c of point j, 0 where there is none
+    Eigen::MatrixXd beta;          // β  (n_rows × F)
+    Eigen::Index n_functions = 0;  // F
+  };
+
+  virtual ~LatentPosterior() = default;
+  [[nodiscard]] virtual std::unique_ptr<LatentPosterior> clone() const = 0;
+
+  [[nodiscard]] const std::vector<Basis>& latents() const { return latents_; }
+  /// Which basis variable is component c of point j: [c][j]; −1: the point has fewer components.
+  [[nodiscard]] const std::vector<std::vector<Eigen::Index>>& row_of() const { return row_of_; }
+
+  [[nodiscard]] virtual Eigen::Index size() const = 0;  // basis variables
+  [[nodiscard]] virtual GramValue value() const = 0;
+
+  /// c ← X c.
+  virtual void whiten(Eigen::Ref<Eigen::MatrixXd> c) const = 0;
+  /// Columns first … first + n − 1 of X, a lower triangle, from row `first` on (size() − first × n).
+  [[nodiscard]] virtual Eigen::MatrixXd whitening_columns(Eigen::Index first, Eigen::Index n) const = 0;
+
+  /// Σ − (X c)ᵀ X c in the lower triangle, Σ the prior's covariance and c of the same quantities.
+  void subtract_explained(Eigen::MatrixXd c, Eigen::MatrixXd& covariance) const;
+
+  /// What a function drawn from the prior, with noise drawn for it, leaves of the data to explain.
+  /// @param f  per latent: the function at the points of its basis (F × points)
+  [[nodiscard]] virtual Eigen::VectorXd misfit(const std::vector<Eigen::MatrixXd>& f, RandomStream& random) const = 0;
+  /// The weights in place of β that explain such misfits: [column of misfits][latent].
+  [[nodiscard]] virtual std::vector<std::vector<Eigen::MatrixXd>> weights(Eigen::MatrixXd misfits) const = 0;
+
+  /// Conditions on more observations. False, and nothing has changed, where the covariance is not positive definite.
+  [[nodiscard]] virtual bool append(const LatentRows& more) = 0;
+  /// Takes observed samples away, by rising numbers in the order of adding.
+  virtual void erase(const std::vector<Eigen::Index>& samples) = 0;
+
+ protected:
+  LatentPosterior() = default;
+  LatentPosterior(const LatentPosterior&) = default;
+  LatentPosterior& operator=(const LatentPosterior&) = delete;
+
+  std::vector<Basis> latents_;
+  std::vector<std::vector<Eigen::Index>> row_of_;
+};
+
+/// A solver of K̃ + I. It has memory that is used again: one per thread.
+class Gram {
+ public:
+  virtual ~Gram() = default;
+
+  /// Sums up the observations; nothing where K̃ + I is not positive definite in double precision.
+  [[nodiscard]] virtual std::optional<GramValue> factorise(const LatentRows& rows) = 0;
+
+  /// Once after factorise of the same rows.
+  /// @param parts  per latent
+  [[nodiscard]] virtual GramGradient differentiate(const LatentRows& rows, const std::vector<GramGradientParts>& parts) = 0;
+
+  struct Inverse {
+    Eigen::VectorXd alpha;                // α̃
+    std::vector<Eigen::MatrixXd> blocks;  // P_ii of each sample (r × r)
+  };
+  /// Once after factorise of the same rows.
+  [[nodiscard]] virtual Inverse invert(const LatentRows& rows) = 0;
+
+  /// The latents given the observations; null where K̃ + I is not positive definite in double precision.
+  [[nodiscard]] virtual std::unique_ptr<LatentPosterior> condition(const LatentRows& rows) const = 0;
+};
+
+}  // namespace gp2

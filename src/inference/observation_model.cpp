@@ -1,0 +1,75 @@
+#include "inference/observation_model.hpp"
+
+#include <algorithm>
+#include <utility>
+
+namespace gp2 {
+
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+
+namespace {
+
+// which parameter of the viewed system the one at home is, −1: none
+int index_there(const View& view, int parameter) {
+  if (!view.other_system) return parameter;
+  const std::vector<int>& shared = view.other_system->shared;
+  const auto found = std::find(shared.begin(), shared.end(), parameter);
+  return found == shared.end() ? -1 : static_cast<int>(found - shared.begin());
+}
+
+ObservationModel::Values zero_like(ObservationModel::Values values) {
+  values.view.matrix.setZero();
+  values.view.offset.setZero();
+  values.prior.mean.setZero();
+  for (MatrixXd& E : values.prior.directions) E.setZero();
+  return values;
+}
+
+}  // namespace
+
+bool model_observations(const Prior& prior, const std::vector<Observations>& observations, const VectorXd& parameters,
+                        const std::vector<int>& gradient_parameters, std::vector<ObservationModel>& models) {
+  models.resize(observations.size());
+  for (std::size_t g = 0; g < observations.size(); ++g) {
+    const Observations& group = observations[g];
+    ObservationModel& model = models[g];
+    const Prior& there = prior_of(prior, group.view());
+    const VectorXd theta = parameters_of(group.view(), parameters);
+    evaluate_mechanics(there, group.view(), group.states(), theta, model.mechanics);
+    if (model.mechanics.fault) return false;
+    model.values = {evaluate_view(group.view(), model.mechanics, group.states()),
+                    evaluate_prior(there, group.states(), theta, model.mechanics)};
+    model.derivatives.clear();
+    for (int parameter : gradient_parameters) {
+      const int index = index_there(group.view(), parameter);
+      if (index < 0) {
+        model.derivatives.push_back(zero_like(model.values));
+        continue;
+      }
+      const SystemValues d = there.system->differentiate(group.states(), theta, index);
+      model.derivatives.push_back(
+          {differentiate_view(group.view(), model.mechanics, d),
+           differentiate_prior(there, group.states(), theta, model.mechanics, model.values.prior, d, index)});
+    }
+    if (group.view().latent) {
+      model.values.prior.keep_only(static_cast<std::size_t>(*group.view().latent));
+      for (ObservationModel::Values& d : model.derivatives) d.prior.keep_only(static_cast<std::size_t>(*group.view().latent));
+    }
+  }
+  return true;
+}
+
+std::vector<ObservationModel> require_models(const Prior& prior, const std::vector<Observations>& observations,
+                                             const VectorXd& parameters, const std::vector<int>& gradient_parameters) {
+  std::vector<ObservationModel> models;
+  if (model_observations(prior, observations, parameters, gradient_parameters, models)) return models;
+  // the error names the state
+  for (const Observations& group : observations) {
+    static_cast<void>(
+        require_mechanics(prior_of(prior, group.view()), group.view(), group.states(), parameters_of(group.view(), parameters)));
+  }
+  return models;
+}
+
+}  // namespace gp2

@@ -1,0 +1,34 @@
+#pragma once
+
+#include <vector>
+
+#include <Eigen/Core>
+
+#include "gp2/observations.hpp"
+#include "gp2/prior.hpp"
+
+namespace gp2 {
+
+/// What the parameters θ decide about one Observations: G, d of its view and μ, E of the prior, with their derivatives in the
+/// parameters asked for.
+struct ObservationModel {
+  struct Values {
+    ViewValues view;
+    PriorValues prior;
+  };
+  Values values;
+  std::vector<Values> derivatives;  // one per gradient parameter
+  MechanicsBatch mechanics;         // that they come from
+};
+
+/// @param models  receives one per Observations; what it held is memory to be used again
+/// @returns whether the mechanics hold at every state (no fault of evaluate_mechanics).
+bool model_observations(const Prior& prior, const std::vector<Observations>& observations, const Eigen::VectorXd& parameters,
+                        const std::vector<int>& gradient_parameters, std::vector<ObservationModel>& models);
+
+/// The same, where a fault is an error.
+/// @throws InputError as require_mechanics of the prior.
+std::vector<ObservationModel> require_models(const Prior& prior, const std::vector<Observations>& observations,
+                                             const Eigen::VectorXd& parameters, const std::vector<int>& gradient_parameters);
+
+}  // namespace gp2

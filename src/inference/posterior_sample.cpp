@@ -1,0 +1,123 @@
+#include <map>
+#include <utility>
+
+#include "base/lapack.hpp"
+#include "base/random.hpp"
+#include "gp2/posterior.hpp"
+#include "inference/latent_sums.hpp"
+#include "inference/query.hpp"
+
+// Samples of a posterior at given states.
+namespace gp2 {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::Ref;
+using Eigen::VectorXd;
+
+namespace {
+
+// Every latent function at a set of points, stacked: function l of latent a at point j stands at first[a] + l·points + j.
+struct LatentPoints {
+  std::vector<MatrixXd> features;          // per latent (points × D), each point once
+  std::vector<std::vector<int>> of_state;  // per query: the point of each state
+  std::vector<Index> first;                // per latent
+  Index size = 0;
+
+  // States of equal features share a point: drawn apart, they would agree to the square root of rounding only.
+  LatentPoints(const Posterior::Implementation& posterior, const std::vector<Query>& queries) {
+    std::map<std::vector<double>, int> known;
+    std::vector<std::pair<std::size_t, Index>> source;  // query and state of each point
+    for (std::size_t q = 0; q < queries.size(); ++q) {
+      std::vector<int>& points = of_state.emplace_back();
+      for (Index i = 0; i < queries[q].size(); ++i) {
+        std::vector<double> key;
+        for (const MatrixXd& features_of : queries[q].features) {
+          for (const double value : features_of.row(i)) key.push_back(value);
+        }
+        const auto [place, is_new] = known.emplace(std::move(key), static_cast<int>(source.size()));
+        if (is_new) source.emplace_back(q, i);
+        points.push_back(place->second);
+      }
+    }
+    for (std::size_t a = 0; a < posterior.C.size(); ++a) {
+      MatrixXd& of_latent = features.emplace_back(static_cast<Index>(source.size()), posterior.prior.latents[a].n_features());
+      for (std::size_t j = 0; j < source.size(); ++j) {
+        of_latent.row(static_cast<Index>(j)) = queries[source[j].first].features[a].row(source[j].second);
+      }
+      first.push_back(size);
+      size += posterior.C[a].cols() * of_latent.rows();
+    }
+  }
+};
+
+struct LatentGaussian {
+  VectorXd mean;
+  MatrixXd covariance;
+};
+
+// the posterior of every latent function at the points
+LatentGaussian latent_posterior(const Posterior::Implementation& self, const LatentPoints& points) {
+  LatentGaussian out{VectorXd::Zero(points.size), MatrixXd::Zero(points.size, points.size)};
+  MatrixXd cross = MatrixXd::Zero(self.latents->size(), points.size);
+  LatentSums sums(*self.latents);
+  for (std::size_t a = 0; a < self.C.size(); ++a) {
+    const Index n_points = points.features[a].rows(), n_functions = self.C[a].cols();
+    // each function is its own view of the latents
+    std::vector<MatrixXd> loadings(self.C.size());
+    loadings[a] = MatrixXd::Identity(n_functions, n_functions).reshaped().replicate(1, n_points);
+    MatrixXd cross_of_latent(cross.rows(), n_functions * n_points);
+    sums.evaluate(points.features, static_cast<int>(a), &loadings, &cross_of_latent);
+    const MatrixXd k = self.prior.latents[a].kernel.evaluate(points.features[a], points.features[a], self.values.kernel[a]);
+    for (Index l = 0; l < n_functions; ++l) {
+      const Index first = points.first[a] + l * n_points;
+      out.covariance.block(first, first, n_points, n_points) = k;
+      out.mean.segment(first, n_points) = sums.mean()[a].row(l).transpose();
+      for (Index j = 0; j < n_points; ++j) cross.col(first + j) = cross_of_latent.col(j * n_functions + l);
+    }
+  }
+  self.latents->subtract_explained(std::move(cross), out.covariance);
+  return out;
+}
+
+}  // namespace
+
+MatrixXd Posterior::sample(const std::vector<ViewAt>& quantities, int n_samples, std::uint64_t seed) const {
+  const Implementation& self = *implementation_;
+  const lapack::SingleThread single_thread;
+  std::vector<Query> queries;
+  Index n_rows = 0;
+  for (const ViewAt& quantity : quantities) {
+    const Query& query = queries.emplace_back(make_query(self, quantity.view, quantity.states));
+    n_rows += query.n_rows() * query.size();
+  }
+  const LatentPoints points(self, queries);
+  const LatentGaussian latents = latent_posterior(self, points);
+
+  // f = mean + P L ξ, of a covariance Pᵀ Σ P = L Lᵀ that may be singular
+  const lapack::PivotedFactor factor = lapack::factorise_semidefinite(latents.covariance);
+  RandomStream random(seed);
+  MatrixXd xi(points.size, n_samples);
+  for (double& entry : xi.reshaped()) entry = random.normal();
+  MatrixXd f(points.size, n_samples);
+  f(factor.rows, Eigen::all) = factor.L * xi.topRows(factor.L.cols());
+  f.colwise() += latents.mean;
+
+  MatrixXd samples(n_rows, n_samples);
+  Index row = 0;
+  for (std::size_t q = 0; q < queries.size(); ++q) {
+    const Query& query = queries[q];
+    for (int i = 0; i < static_cast<int>(query.size()); ++i, row += query.n_rows()) {
+      MatrixXd a_bar = query.prior.mean.col(i).replicate(1, n_samples);
+      for (std::size_t a = 0; a < self.C.size(); ++a) {
+        const auto rows = Eigen::seqN(points.first[a] + points.of_state[q][static_cast<std::size_t>(i)], self.C[a].cols(),
+                                      points.features[a].rows());
+        a_bar += query.prior.E(a, i) * (self.C[a] * MatrixXd(f(rows, Eigen::all)));
+      }
+      samples.middleRows(row, query.n_rows()) = (query.view.G(i) * a_bar).colwise() + query.view.offset.col(i);
+    }
+  }
+  return samples;
+}
+
+}  // namespace gp2

@@ -1,0 +1,59 @@
+#include "inference/query.hpp"
+
+namespace gp2 {
+
+using Eigen::Index;
+using Eigen::Map;
+using Eigen::MatrixXd;
+using Eigen::Ref;
+using Eigen::VectorXd;
+
+void Query::evaluate(const Posterior::Implementation& posterior, const View& viewed, const Ref<const MatrixXd>& states,
+                     Index first, Index n) {
+  const Prior& there = prior_of(posterior.prior, viewed);
+  const VectorXd parameters = parameters_of(viewed, posterior.values.parameters);
+  const auto block = states.middleCols(first, n);
+  evaluate_mechanics(there, viewed, block, parameters, mechanics);
+  // whether constraints contradict each other depends on the largest b of all states, not of a block: throws, or all is well
+  if (mechanics.fault) static_cast<void>(require_mechanics(there, viewed, states, parameters));
+  view = evaluate_view(viewed, mechanics, block);
+  prior = evaluate_prior(there, block, parameters, mechanics);
+  latent = viewed.latent;
+  if (latent) prior.keep_only(static_cast<std::size_t>(*latent));
+  features.resize(there.latents.size());
+  for (std::size_t a = 0; a < features.size(); ++a) features[a] = evaluate_features(there.latents[a], block);
+}
+
+void Query::view_of(const Posterior::Implementation& posterior, const std::vector<MatrixXd>& f, Ref<MatrixXd> values) const {
+  VectorXd a_bar, signal;
+  for (int i = 0; i < static_cast<int>(size()); ++i) {
+    a_bar = prior.mean.col(i);
+    for (std::size_t a = 0; a < f.size(); ++a) {
+      if (!needs(a)) continue;
+      signal.noalias() = posterior.C[a].lazyProduct(f[a].col(i));
+      a_bar.noalias() += prior.E(a, i).lazyProduct(signal);
+    }
+    values.col(i).noalias() = view.G(i).lazyProduct(a_bar);
+    values.col(i) += view.offset.col(i);
+  }
+}
+
+std::vector<MatrixXd> Query::loadings(const Posterior::Implementation& posterior) const {
+  std::vector<MatrixXd> loadings;
+  for (std::size_t a = 0; a < posterior.C.size(); ++a) {
+    const MatrixXd& C = posterior.C[a];
+    MatrixXd& of_latent = loadings.emplace_back(MatrixXd::Zero(C.cols() * n_rows(), size()));
+    for (int i = 0; needs(a) && i < static_cast<int>(size()); ++i) {
+      Map<MatrixXd>(of_latent.col(i).data(), C.cols(), n_rows()) = C.transpose() * (view.G(i) * prior.E(a, i)).transpose();
+    }
+  }
+  return loadings;
+}
+
+Query make_query(const Posterior::Implementation& posterior, const View& view, const Ref<const MatrixXd>& states) {
+  Query query;
+  query.evaluate(posterior, view, states, 0, states.cols());
+  return query;
+}
+
+}  // namespace gp2

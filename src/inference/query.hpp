@@ -1,0 +1,39 @@
+#pragma once
+
+#include <optional>
+#include <vector>
+
+#include <Eigen/Core>
+
+#include "inference/posterior_implementation.hpp"
+
+namespace gp2 {
+
+/// Everything a view needs at n states: v(x_i) = G_i (μ_i + Σ_a E_a,i C_a f_a(φ_a,i)) + d_i.
+struct Query {
+  MechanicsBatch mechanics;
+  ViewValues view;
+  PriorValues prior;
+  std::vector<Eigen::MatrixXd> features;  // per latent (n × D)
+  std::optional<int> latent;              // the one that is viewed alone
+
+  [[nodiscard]] Eigen::Index size() const { return view.offset.cols(); }    // n
+  [[nodiscard]] Eigen::Index n_rows() const { return view.offset.rows(); }  // d
+  [[nodiscard]] bool needs(std::size_t a) const { return !latent || *latent == static_cast<int>(a); }
+
+  /// Of the states first … first + n − 1, in the memory of what was there.
+  /// @throws InputError as require_mechanics of the prior for all states.
+  void evaluate(const Posterior::Implementation& posterior, const View& view, const Eigen::Ref<const Eigen::MatrixXd>& states,
+                Eigen::Index first, Eigen::Index n);
+
+  /// v at every state, given f_a there, per latent (F × n).
+  void view_of(const Posterior::Implementation& posterior, const std::vector<Eigen::MatrixXd>& f,
+               Eigen::Ref<Eigen::MatrixXd> values) const;
+
+  /// (G E_a C_a)ᵀ per latent: of v = … + Σ_a ℓ_aᵀ f_a at each state (F·d × n). Zero where the latent is not viewed.
+  [[nodiscard]] std::vector<Eigen::MatrixXd> loadings(const Posterior::Implementation& posterior) const;
+};
+
+Query make_query(const Posterior::Implementation& posterior, const View& view, const Eigen::Ref<const Eigen::MatrixXd>& states);
+
+}  // namespace gp2
