@@ -3,7 +3,9 @@
 #include <stdexcept>
 #include <string>
 
-namespace gp2 {
+#include "gp2/export.hpp"
+
+namespace gp2 GP2_API {
 
 /// Base of everything gp2 throws.
 class Error : public std::runtime_error {

@@ -9,11 +9,12 @@
 
 #include <Eigen/Core>
 
+#include "gp2/export.hpp"
 #include "gp2/posterior.hpp"
 #include "gp2/training/default_hyperparameters.hpp"
 #include "gp2/training/hyperparameter.hpp"
 
-namespace gp2 {
+namespace gp2 GP2_API {
 
 /// What the optimiser tells while it runs.
 struct Progress {

@@ -12,12 +12,13 @@
 
 #include <Eigen/Core>
 
+#include "gp2/export.hpp"
 #include "gp2/mechanics/symbolic_system.hpp"
 #include "gp2/prior.hpp"
 #include "gp2/robots/robot.hpp"
 #include "gp2/view.hpp"
 
-namespace gp2 {
+namespace gp2 GP2_API {
 
 class RobotExpressions;
 

@@ -5,9 +5,10 @@
 #include <Eigen/Core>
 
 #include "gp2/base/statistics.hpp"
+#include "gp2/export.hpp"
 #include "gp2/view.hpp"
 
-namespace gp2 {
+namespace gp2 GP2_API {
 
 /// Noise of N measurements of d values each: ε_i ~ N(0, diag(σ_i²)),  σ_ki = σ_k s_ki. Each row of values has one σ_k, and s = 1,
 /// or each value has a scale s_ki of its own. What belongs to one state alone is a column of a matrix, so that rows of data are

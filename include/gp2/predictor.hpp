@@ -4,10 +4,11 @@
 
 #include <Eigen/Core>
 
+#include "gp2/export.hpp"
 #include "gp2/posterior.hpp"
 #include "gp2/view.hpp"
 
-namespace gp2 {
+namespace gp2 GP2_API {
 
 /// Predictions of one view at one state after another, for control loops: mean, standard deviation, and the mean's Jacobian in
 /// the state. They allocate nothing, take no locks and call no BLAS, as long as the system is a SymbolicSystem (which every

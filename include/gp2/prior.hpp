@@ -8,11 +8,12 @@
 
 #include <Eigen/Core>
 
+#include "gp2/export.hpp"
 #include "gp2/mechanics/udwadia_kalaba.hpp"
 #include "gp2/prior/kernel.hpp"
 #include "gp2/symbolic/expression.hpp"
 
-namespace gp2 {
+namespace gp2 GP2_API {
 
 /// A group of independent zero-mean scalar Gaussian processes f(φ(x)) that share one kernel and act on ā through the p directions
 /// E(x) (nq × p) and a loading C: they add E(x) C f(φ(x)) to ā. C is diag(s), the signal standard deviations s_1 … s_p of p

@@ -5,11 +5,12 @@
 
 #include <Eigen/Core>
 
+#include "gp2/export.hpp"
 #include "gp2/mechanics/check.hpp"
 #include "gp2/model.hpp"
 #include "gp2/system.hpp"
 
-namespace gp2 {
+namespace gp2 GP2_API {
 
 /// ddq at one state [q; dq; t; u]: a model's own, a posterior mean, or one sample of a posterior.
 using Acceleration = std::function<Eigen::VectorXd(const Eigen::Ref<const Eigen::VectorXd>& state)>;

@@ -8,7 +8,9 @@
 
 #include <Eigen/Core>
 
-namespace gp2 {
+#include "gp2/export.hpp"
+
+namespace gp2 GP2_API {
 
 /// Where each quantity of a state stands in its column of numbers x = [q; dq; t; u]. A batch of N states is a matrix (size() ×
 /// N). An entry that no expression of the model reads may be NaN ("not measured").

@@ -7,10 +7,11 @@
 
 #include <Eigen/Core>
 
+#include "gp2/export.hpp"
 #include "gp2/mechanics/quantity.hpp"
 #include "gp2/prior.hpp"
 
-namespace gp2 {
+namespace gp2 GP2_API {
 
 /// Another system in which the latents of a prior act: other constraints, masses or parameters, with the same coordinates and
 /// inputs (Geist & Trimpe 2020, eq. 10).

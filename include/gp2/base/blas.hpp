@@ -3,7 +3,9 @@
 #include <string>
 #include <string_view>
 
-namespace gp2 {
+#include "gp2/export.hpp"
+
+namespace gp2 GP2_API {
 
 /// Vector instructions that the processor has and the operating system saves between threads. All false off x86.
 struct ProcessorFeatures {

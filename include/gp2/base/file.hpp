@@ -6,7 +6,9 @@
 #include <string>
 #include <string_view>
 
-namespace gp2 {
+#include "gp2/export.hpp"
+
+namespace gp2 GP2_API {
 
 /// Writes `content` to a file whole or not at all: into a temporary file beside it, flushed, then renamed over `path`. The
 /// temporary file has no name until it is whole, where the file system can do that: then nothing is left of it however the

@@ -4,7 +4,9 @@
 
 #include <Eigen/Core>
 
-namespace gp2 {
+#include "gp2/export.hpp"
+
+namespace gp2 GP2_API {
 
 /// Mean of each row, over the entries that are measured; NaN where none is.
 Eigen::VectorXd row_mean(const Eigen::Ref<const Eigen::MatrixXd>& values);

@@ -1,6 +1,8 @@
 #pragma once
 
-namespace gp2 {
+#include "gp2/export.hpp"
+
+namespace gp2 GP2_API {
 
 /// The version of the library, say "0.1.0".
 const char* version();

@@ -9,10 +9,11 @@
 
 #include <Eigen/Core>
 
+#include "gp2/export.hpp"
 #include "gp2/fit.hpp"
 #include "gp2/model.hpp"
 
-namespace gp2 {
+namespace gp2 GP2_API {
 
 /// A prior on ddq that knows no mechanics (Geist & Trimpe 2020, sec. 5): multi-output Gaussian processes with inputs and outputs
 /// standardised by the training data (mean 0, standard deviation 1),

@@ -7,8 +7,9 @@
 #include <vector>
 
 #include "gp2/base/file.hpp"
+#include "gp2/export.hpp"
 
-namespace gp2 {
+namespace gp2 GP2_API {
 
 /// A table of comma-separated values with one header line. Cells may be quoted; blank lines are skipped. Columns are kept as
 /// doubles, parsed once; a cell that is no number is kept as text, and is an error only when it is asked for as a number, so

@@ -8,9 +8,10 @@
 #include <Eigen/Core>
 
 #include "gp2/data/csv.hpp"
+#include "gp2/export.hpp"
 #include "gp2/system.hpp"
 
-namespace gp2 {
+namespace gp2 GP2_API {
 
 /// Finds a system's states and accelerations in a log by the names of its columns, in any order. A name is looked up as given by
 /// `columns`, then as itself, then under its aliases: for coordinate q1: velocity qd1, v1, qvel1, acceleration qdd1, a1, qacc1;

@@ -8,10 +8,11 @@
 #include <vector>
 
 #include "gp2/baselines/baseline.hpp"
+#include "gp2/export.hpp"
 #include "gp2/fit.hpp"
 #include "gp2/model.hpp"
 
-namespace gp2 {
+namespace gp2 GP2_API {
 
 /// A fitted model as a file: the model's text, the options its prior was made with, the data and the hyperparameters. The
 /// posterior is computed anew from these, so a file loaded gives the same bits as before it was saved.

@@ -6,9 +6,10 @@
 
 #include <Eigen/Core>
 
+#include "gp2/export.hpp"
 #include "gp2/posterior.hpp"
 
-namespace gp2 {
+namespace gp2 GP2_API {
 
 /// How well a posterior predicts measured constrained accelerations.
 struct Evaluation {

@@ -4,9 +4,10 @@
 
 #include <Eigen/Core>
 
+#include "gp2/export.hpp"
 #include "gp2/posterior.hpp"
 
-namespace gp2 {
+namespace gp2 GP2_API {
 
 /// What all other measured values say of each measured value of one Observations, without its noise.
 struct LeaveOneOut {

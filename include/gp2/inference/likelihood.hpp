@@ -6,11 +6,12 @@
 
 #include <Eigen/Core>
 
+#include "gp2/export.hpp"
 #include "gp2/inference/model_values.hpp"
 #include "gp2/observations.hpp"
 #include "gp2/prior.hpp"
 
-namespace gp2 {
+namespace gp2 GP2_API {
 
 /// The negative log marginal likelihood of observations under a prior, in its reduced, jitter-free form, and its exact gradient.
 ///

@@ -4,7 +4,9 @@
 
 #include <Eigen/Core>
 
-namespace gp2 {
+#include "gp2/export.hpp"
+
+namespace gp2 GP2_API {
 
 /// Everything about a prior and its observations that can be tuned, in physical units.
 struct ModelValues {

@@ -5,9 +5,10 @@
 
 #include <Eigen/Core>
 
+#include "gp2/export.hpp"
 #include "gp2/posterior.hpp"
 
-namespace gp2 {
+namespace gp2 GP2_API {
 
 struct PathwiseOptions {
   int n_features = 2000;  // random features of each latent function and term of its kernel; the error falls as 1/√n_features

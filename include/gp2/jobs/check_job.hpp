@@ -5,11 +5,12 @@
 #include <vector>
 
 #include "gp2/data/csv.hpp"
+#include "gp2/export.hpp"
 #include "gp2/jobs/option.hpp"
 #include "gp2/mechanics/check.hpp"
 #include "gp2/model.hpp"
 
-namespace gp2 {
+namespace gp2 GP2_API {
 
 struct CheckOptions {
   std::map<std::string, std::string> columns;  // model's name -> log's name, before the model's own [columns]

@@ -8,11 +8,12 @@
 #include <Eigen/Core>
 
 #include "gp2/data/csv.hpp"
+#include "gp2/export.hpp"
 #include "gp2/jobs/option.hpp"
 #include "gp2/model.hpp"
 #include "gp2/smoothing/smoother.hpp"
 
-namespace gp2 {
+namespace gp2 GP2_API {
 
 struct DeriveOptions {
   std::map<std::string, std::string> columns = {};  // model's name -> log's name, before the model's own [columns]

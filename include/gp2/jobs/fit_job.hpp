@@ -6,13 +6,14 @@
 #include <string>
 #include <vector>
 
+#include "gp2/export.hpp"
 #include "gp2/files/fit_file.hpp"
 #include "gp2/fit.hpp"
 #include "gp2/jobs/fit_problem.hpp"
 #include "gp2/jobs/option.hpp"
 #include "gp2/model.hpp"
 
-namespace gp2 {
+namespace gp2 GP2_API {
 
 /// What a fit is asked for: a model, its data, and options.
 struct FitRequest {

@@ -5,9 +5,10 @@
 #include <string>
 #include <vector>
 
+#include "gp2/export.hpp"
 #include "gp2/jobs/fit_problem.hpp"
 
-namespace gp2 {
+namespace gp2 GP2_API {
 
 /// The memory of a fit at its peak, estimated before it is taken. What grows with the square of the data are triangles of the
 /// reduced size r = Σ rank of what each state measures: one for each evaluation of the likelihood, one for the posterior.

@@ -9,12 +9,13 @@
 #include "gp2/data/csv.hpp"
 #include "gp2/data/log_reader.hpp"
 #include "gp2/error.hpp"
+#include "gp2/export.hpp"
 #include "gp2/files/fit_file.hpp"
 #include "gp2/fit.hpp"
 #include "gp2/jobs/option.hpp"
 #include "gp2/model.hpp"
 
-namespace gp2 {
+namespace gp2 GP2_API {
 
 /// Measurements as a table, and the system they were taken on.
 struct Log {

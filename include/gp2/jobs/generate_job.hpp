@@ -6,10 +6,11 @@
 #include <string>
 #include <vector>
 
+#include "gp2/export.hpp"
 #include "gp2/jobs/option.hpp"
 #include "gp2/simulation/generate.hpp"
 
-namespace gp2 {
+namespace gp2 GP2_API {
 
 struct GenerateRequest {
   std::optional<int> n;             // rows, drawn at random

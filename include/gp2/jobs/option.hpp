@@ -10,7 +10,9 @@
 #include <variant>
 #include <vector>
 
-namespace gp2 {
+#include "gp2/export.hpp"
+
+namespace gp2 GP2_API {
 
 /// One word of several, for an enumeration.
 struct Choice {

@@ -10,13 +10,14 @@
 #include <Eigen/Core>
 
 #include "gp2/data/csv.hpp"
+#include "gp2/export.hpp"
 #include "gp2/files/fit_file.hpp"
 #include "gp2/inference/evaluation.hpp"
 #include "gp2/jobs/option.hpp"
 #include "gp2/posterior.hpp"
 #include "gp2/view.hpp"
 
-namespace gp2 {
+namespace gp2 GP2_API {
 
 /// What a fit is asked for: a quantity, of the fitted system or another one.
 struct ViewRequest {

@@ -7,12 +7,13 @@
 
 #include <Eigen/Core>
 
+#include "gp2/export.hpp"
 #include "gp2/files/fit_file.hpp"
 #include "gp2/inference/evaluation.hpp"
 #include "gp2/jobs/option.hpp"
 #include "gp2/mechanics/check.hpp"
 
-namespace gp2 {
+namespace gp2 GP2_API {
 
 /// How much one feature of a latent matters.
 struct Relevance {

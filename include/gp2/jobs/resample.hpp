@@ -9,10 +9,11 @@
 #include <Eigen/Core>
 
 #include "gp2/data/csv.hpp"
+#include "gp2/export.hpp"
 #include "gp2/jobs/option.hpp"
 #include "gp2/model.hpp"
 
-namespace gp2 {
+namespace gp2 GP2_API {
 
 /// Greedy k-centre (Gonzalez 1985): point after point, the next the one farthest from all chosen before it; of equal ones the
 /// first. The n chosen leave no point farther from them than twice what the best n could. O(n N D).

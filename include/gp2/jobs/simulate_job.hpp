@@ -12,12 +12,13 @@
 #include <Eigen/Core>
 
 #include "gp2/data/csv.hpp"
+#include "gp2/export.hpp"
 #include "gp2/jobs/option.hpp"
 #include "gp2/model.hpp"
 #include "gp2/posterior.hpp"
 #include "gp2/simulate.hpp"
 
-namespace gp2 {
+namespace gp2 GP2_API {
 
 /// Where a motion starts: coordinates and velocities by name, or those of the first row of a log, what is not given following from
 /// the constraints; or all of q and dq.

@@ -8,9 +8,10 @@
 
 #include <Eigen/Core>
 
+#include "gp2/export.hpp"
 #include "gp2/system.hpp"
 
-namespace gp2 {
+namespace gp2 GP2_API {
 
 /// A System whose M, A, b and F come from functions over batches of states: another library's mechanics, a simulator, Python.
 ///

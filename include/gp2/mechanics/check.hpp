@@ -6,9 +6,10 @@
 
 #include <Eigen/Core>
 
+#include "gp2/export.hpp"
 #include "gp2/mechanics/udwadia_kalaba.hpp"
 
-namespace gp2 {
+namespace gp2 GP2_API {
 
 /// One thing a check looked at.
 struct Finding {

@@ -7,10 +7,11 @@
 
 #include <Eigen/Core>
 
+#include "gp2/export.hpp"
 #include "gp2/mechanics/udwadia_kalaba.hpp"
 #include "gp2/system.hpp"
 
-namespace gp2 {
+namespace gp2 GP2_API {
 
 /// What quantities are made of, at one state: one motion, or m of them in columns, or a change of it in each of m directions.
 struct MotionColumns {

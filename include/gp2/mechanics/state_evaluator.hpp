@@ -5,10 +5,11 @@
 
 #include <Eigen/Core>
 
+#include "gp2/export.hpp"
 #include "gp2/symbolic/expression.hpp"
 #include "gp2/system.hpp"
 
-namespace gp2 {
+namespace gp2 GP2_API {
 
 /// M, A, b, F at one state after another, with fixed parameters, and their derivatives in the state x = [q; dq; t; u]
 /// (StateLayout): what a control loop needs. Made by System::make_evaluator; it must not outlive its system, and each thread has

@@ -5,10 +5,11 @@
 #include <string>
 #include <vector>
 
+#include "gp2/export.hpp"
 #include "gp2/symbolic/expression.hpp"
 #include "gp2/system.hpp"
 
-namespace gp2 {
+namespace gp2 GP2_API {
 
 /// The variables of a constrained mechanical system in an expression graph.
 struct SystemSymbols {

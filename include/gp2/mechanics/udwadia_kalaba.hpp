@@ -6,9 +6,10 @@
 
 #include <Eigen/Core>
 
+#include "gp2/export.hpp"
 #include "gp2/system.hpp"
 
-namespace gp2 {
+namespace gp2 GP2_API {
 
 /// The Udwadia–Kalaba equation at one state (Geist & Trimpe 2020, eq. 4):
 ///

@@ -7,7 +7,9 @@
 
 #include <Eigen/Core>
 
-namespace gp2 {
+#include "gp2/export.hpp"
+
+namespace gp2 GP2_API {
 
 /// A scalar covariance function of D features, a sum of products of these, with Δ_d = φ_d − φ'_d and r² = Σ_d (Δ_d/ℓ_d)²:
 ///

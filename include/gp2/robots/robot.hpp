@@ -8,7 +8,9 @@
 
 #include <Eigen/Core>
 
-namespace gp2 {
+#include "gp2/export.hpp"
+
+namespace gp2 GP2_API {
 
 /// A robot as numbers: a tree of rigid bodies, the joints that move them, named points on them, and what closes loops. It is what
 /// a MJCF or URDF file says; the expressions of M, F, A and b follow from it (robot_expressions.hpp).

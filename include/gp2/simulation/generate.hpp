@@ -8,10 +8,11 @@
 #include <Eigen/Core>
 
 #include "gp2/data/csv.hpp"
+#include "gp2/export.hpp"
 #include "gp2/model.hpp"
 #include "gp2/simulation/model_motion.hpp"
 
-namespace gp2 {
+namespace gp2 GP2_API {
 
 /// States drawn from a model's [sampling] and what its [truth] says of them.
 struct GeneratedData {

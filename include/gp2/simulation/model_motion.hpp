@@ -4,9 +4,10 @@
 
 #include <Eigen/Core>
 
+#include "gp2/export.hpp"
 #include "gp2/model.hpp"
 
-namespace gp2 {
+namespace gp2 GP2_API {
 
 /// @throws InputError when a model has no [truth].
 void require_truth(const Model& model);

@@ -5,10 +5,11 @@
 
 #include <Eigen/Core>
 
+#include "gp2/export.hpp"
 #include "gp2/mechanics/check.hpp"
 #include "gp2/system.hpp"
 
-namespace gp2 {
+namespace gp2 GP2_API {
 
 /// Measured states and the nearest ones that obey the constraints.
 struct ProjectedStates {

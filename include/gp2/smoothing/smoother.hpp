@@ -6,7 +6,9 @@
 
 #include <Eigen/Core>
 
-namespace gp2 {
+#include "gp2/export.hpp"
+
+namespace gp2 GP2_API {
 
 /// The kernel of a motion q(t): Matérn of order ν, in time, so that q has ν − ½ derivatives.
 enum class Smoothness { matern52 = 2, matern72 = 3, matern92 = 4 };

@@ -5,9 +5,10 @@
 
 #include <Eigen/Core>
 
+#include "gp2/export.hpp"
 #include "gp2/training/hyperparameter.hpp"
 
-namespace gp2 {
+namespace gp2 GP2_API {
 
 /// How hyperparameters start, are bounded and weighed.
 struct Protocol {

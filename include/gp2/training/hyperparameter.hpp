@@ -7,9 +7,10 @@
 
 #include <Eigen/Core>
 
+#include "gp2/export.hpp"
 #include "gp2/inference/likelihood.hpp"
 
-namespace gp2 {
+namespace gp2 GP2_API {
 
 /// The optimiser's coordinate x of a value v: v = origin + unit·x, or v = exp x.
 struct CoordinateMap {

@@ -3,9 +3,10 @@
 #include <string>
 #include <vector>
 
+#include "gp2/export.hpp"
 #include "gp2/fit.hpp"
 
-namespace gp2 {
+namespace gp2 GP2_API {
 
 /// How well data determine hyperparameters; H by differences of the exact gradient, two evaluations for each that is not held and
 /// six for each θ.

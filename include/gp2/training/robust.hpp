@@ -2,10 +2,11 @@
 
 #include <vector>
 
+#include "gp2/export.hpp"
 #include "gp2/fit.hpp"
 #include "gp2/inference/leave_one_out.hpp"
 
-namespace gp2 {
+namespace gp2 GP2_API {
 
 /// The observations without values that lie farther than 10 robust standard deviations (1.48 times the median distance) from the
 /// median of their row: scales and starting points are not to be set by a sensor that lost contact.
