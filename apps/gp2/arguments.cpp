@@ -1,28 +1,57 @@
+#include <cctype>
+#include <charconv>
 #include <cstdio>
 #include <filesystem>
+#include <optional>
 #include <system_error>
+#include <variant>
 
 #include <fmt/format.h>
 
 #include "command.hpp"
+#include "gp2/base/file.hpp"
 #include "gp2/error.hpp"
 
 namespace gp2::command {
 
-std::vector<std::string> parse_list(const std::string& text) {
+std::vector<std::string> parse_list(const std::string& text, const std::string& option) {
   std::vector<std::string> items;
-  std::size_t first = 0;
-  while (first < text.size()) {
-    const std::size_t end = std::min(text.find(',', first), text.size());
-    if (end > first) items.push_back(text.substr(first, end - first));
-    first = end + 1;
+  int depth = 0;
+  std::string item;
+  for (const char c : text + ",") {
+    if (c == '(') ++depth;
+    if (c == ')') --depth;
+    if (c != ',' || depth > 0) {
+      item += c;
+      continue;
+    }
+    const std::size_t first = item.find_first_not_of(' ');
+    if (first != std::string::npos) items.push_back(item.substr(first, item.find_last_not_of(' ') + 1 - first));
+    item.clear();
   }
+  if (!item.empty()) throw InputError(fmt::format("{}: a parenthesis is not closed in '{}'", option, text));
   return items;
+}
+
+std::map<std::string, int> parse_counts(const std::string& text, const std::string& option) {
+  std::map<std::string, int> counts;
+  for (const std::string& item : parse_list(text, option)) {
+    const std::size_t equals = item.find('=');
+    int n = 0;
+    const char* end = item.data() + item.size();
+    const bool is_count = equals != std::string::npos && equals > 0 &&
+                          std::from_chars(item.data() + equals + 1, end, n).ptr == end && equals + 1 < item.size();
+    if (!is_count) throw InputError(fmt::format("{}: '{}' is not RANGE=POINTS, say q1=5", option, item));
+    if (!counts.emplace(item.substr(0, equals), n).second) {
+      throw InputError(fmt::format("{}: '{}' stands twice", option, item.substr(0, equals)));
+    }
+  }
+  return counts;
 }
 
 std::map<std::string, std::string> parse_map(const std::string& text) {
   std::map<std::string, std::string> columns;
-  for (const std::string& item : parse_list(text)) {
+  for (const std::string& item : parse_list(text, "--map")) {
     const std::size_t equals = item.find('=');
     if (equals == std::string::npos || equals == 0 || equals + 1 == item.size()) {
       throw InputError(fmt::format("--map: '{}' is not LOGNAME=MODELNAME, say theta1=q3", item));
@@ -34,13 +63,6 @@ std::map<std::string, std::string> parse_map(const std::string& text) {
           fmt::format("--map: '{}' is given two columns, '{}' and '{}'", name, twice->second, item.substr(0, equals)));
   }
   return columns;
-}
-
-CLI::Validator not_negative() {
-  const auto check = [](const std::string& text) {
-    return text.starts_with('-') ? "must not be negative, got " + text : std::string();
-  };
-  return {check, ""};
 }
 
 void require_output(const std::string& output, const std::vector<std::string>& inputs) {
@@ -58,18 +80,8 @@ void require_output(const std::string& output, const std::vector<std::string>& i
   }
 }
 
-View PredictedSystem::view(View::Quantity quantity) const {
-  View view = View::all(quantity, *prior.system);
-  view.other_system = other_system;
-  return view;
-}
-
-PredictedSystem predicted_system(const FitFile& fit, const std::string& path) {
-  if (path.empty()) return {fit.model, nullptr, fit.prior()};
-  Model other = Model::read(path);
-  std::shared_ptr<const OtherSystem> other_system = make_other_system(fit.model, other, fit.prior_options);
-  Prior prior = other_system->prior;
-  return {std::move(other), std::move(other_system), std::move(prior)};
+std::shared_ptr<const Model> read_other_system(const std::string& path) {
+  return path.empty() ? nullptr : std::make_shared<const Model>(Model::read(path));
 }
 
 std::pair<std::string, std::string> split_at_system(const std::string& text) {
@@ -78,8 +90,40 @@ std::pair<std::string, std::string> split_at_system(const std::string& text) {
   return {text.substr(0, at), text.substr(at + 1)};
 }
 
-void talk(const std::vector<std::string>& notes) {
-  for (const std::string& note : notes) fmt::print(stderr, "gp2: {}\n", note);
+Option argument(const std::string& flag, std::string& value, const std::string& text) {
+  Option option{"", &value, "", text};
+  for (const char c : flag) option.name += static_cast<char>(std::tolower(static_cast<unsigned char>(c)));
+  option.flag = flag;
+  return required(std::move(option));
+}
+
+Option output(std::string& value, const std::string& sample, const std::string& text) {
+  Option option{"output", &value, sample, text};
+  option.flag = "-o,--output";
+  return required(std::move(option));
+}
+
+Option required(Option option) {
+  option.is_required = true;
+  return option;
+}
+
+std::string flag_of(const Option& option) {
+  if (!option.flag.empty()) return option.flag;
+  std::string flag = std::holds_alternative<YesByDefault>(option.value) ? "--no-" : "--";
+  for (const char c : option.name) flag += c == '_' ? '-' : c;
+  return flag;
+}
+
+std::string with_flags(const std::string& message) {
+  return respelled(message, [](const std::string& name, const std::optional<std::string>& value) {
+    const std::string flag = flag_of(Option{name, static_cast<bool*>(nullptr), "", ""});
+    return value ? flag + " " + *value : flag;
+  });
+}
+
+void print_notes(const std::vector<std::string>& notes) {
+  for (const std::string& note : notes) fmt::print(stderr, "gp2: {}\n", with_flags(note));
 }
 
 }  // namespace gp2::command

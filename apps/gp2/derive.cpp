@@ -1,12 +1,17 @@
 #include "gp2/jobs/derive.hpp"
 
 #include <algorithm>
+#include <charconv>
 #include <memory>
+#include <optional>
+#include <string_view>
+#include <system_error>
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
 #include "command.hpp"
+#include "gp2/base/file.hpp"
 #include "gp2/base/statistics.hpp"
 
 namespace gp2::command {
@@ -14,29 +19,32 @@ namespace gp2::command {
 namespace {
 
 struct Arguments {
-  std::string log, model, output, map, episode, episodes, keep, smoothness = "9/2";
-  double rate = 0;
-  int every = 1;
-  bool hold_constraints = false;
-  double outlier_threshold = 5;
+  std::string log, model, output;
+  DeriveOptions options;
 };
 
-// "0-12,15" -> 0 … 12, 15; what is no range of whole numbers is a name
-std::vector<std::string> parse_episodes(const std::string& text) {
+// A whole number, all of the text.
+std::optional<int> whole_number(std::string_view text) {
+  int number = 0;
+  const auto [end, error] = std::from_chars(text.data(), text.data() + text.size(), number);
+  return error == std::errc() && end == text.data() + text.size() ? std::optional(number) : std::nullopt;
+}
+
+// {"0-12", "15"} -> 0 … 12, 15; what is no range of whole numbers is a name.
+std::vector<std::string> without_ranges(const std::vector<std::string>& items) {
   std::vector<std::string> episodes;
-  for (const std::string& item : parse_list(text)) {
+  for (const std::string& item : items) {
     const std::size_t dash = item.find('-', 1);
-    int first = 0, last = 0;
-    const bool range = dash != std::string::npos && CLI::detail::lexical_cast(item.substr(0, dash), first) &&
-                       CLI::detail::lexical_cast(item.substr(dash + 1), last);
-    if (!range) {
+    const auto first = whole_number(std::string_view(item).substr(0, dash));
+    const auto last = dash == std::string::npos ? std::nullopt : whole_number(std::string_view(item).substr(dash + 1));
+    if (!first || !last) {
       episodes.push_back(item);
       continue;
     }
     constexpr int most = 1'000'000;
-    if (last < first || last - first > most)
+    if (*last < *first || *last - *first > most)
       throw InputError(fmt::format("--episodes: '{}' is not a range FIRST-LAST, say 0-12", item));
-    for (int k = first; k <= last; ++k) episodes.push_back(std::to_string(k));
+    for (int k = *first; k <= *last; ++k) episodes.push_back(std::to_string(k));
   }
   return episodes;
 }
@@ -97,64 +105,39 @@ void report(const DerivedData& data, const System& system) {
     for (const DerivedSeries& one : data.series) {
       if (one.coordinate == j) series.push_back(&one);
     }
-    talk({fmt::format("{}: {}", system.coordinates()[static_cast<std::size_t>(j)].name, text_of(series))});
+    print_notes({fmt::format("{}: {}", system.coordinates()[static_cast<std::size_t>(j)].name, text_of(series))});
   }
 }
 
-void run(const Arguments& arguments) {
+void run(Arguments& arguments) {
   require_output(arguments.output, {arguments.log, arguments.model});
+  arguments.options.episodes = without_ranges(arguments.options.episodes);
   const Model model = Model::read(arguments.model);
   const CsvTable log = CsvTable::read(arguments.log);
-  DeriveOptions options;
-  options.columns = parse_map(arguments.map);
-  options.episode_column = arguments.episode;
-  options.episodes = parse_episodes(arguments.episodes);
-  options.keep = parse_list(arguments.keep);
-  options.rate = arguments.rate;
-  options.every = arguments.every;
-  options.hold_constraints = arguments.hold_constraints;
-  options.outlier_threshold = arguments.outlier_threshold;
-  options.smoothness = *smoothness_of(arguments.smoothness);
-  const DerivedData data = derive(model, log, options);
+  const DerivedData data = derive(model, log, arguments.options);
 
   const CsvTable table = as_table(data, *model.system, arguments.output);
   write_file(arguments.output, table.text());
-  talk(data.notes);
+  print_notes(data.notes);
   report(data, *model.system);
   std::vector<std::string> independent;
   for (const int j : data.independent) independent.push_back(model.system->acceleration_names()[static_cast<std::size_t>(j)]);
-  talk({fmt::format("{}: {} rows, {}; independent accelerations: {}", arguments.output, table.n_rows(),
+  print_notes({fmt::format("{}: {} rows, {}; independent accelerations: {}", arguments.output, table.n_rows(),
                     count_of(static_cast<int>(data.episodes.size()), "episode", "episodes"), fmt::join(independent, ", "))});
 }
 
 }  // namespace
 
-void add_derive(CLI::App& app) {
-  CLI::App* command = app.add_subcommand("derive", "Smooth a raw log of positions into velocities and accelerations for a fit");
-  auto arguments = std::make_shared<Arguments>();
-  command->add_option("LOG", arguments->log, "CSV of t and positions, and of velocities and inputs where there are")->required();
-  command->add_option("--model", arguments->model, "model file")->required();
-  command->add_option("--episode", arguments->episode,
-                      "column that tells episodes apart (default: episode, where the log has it)");
-  command->add_option("--episodes", arguments->episodes, "only these, say 0-12,15");
-  command->add_option("--rate", arguments->rate, "rows per second, evenly within an episode (default: where there are samples)");
-  command->add_option("--every", arguments->every, "only each so many rows")->capture_default_str();
-  command->add_flag("--hold-constraints", arguments->hold_constraints,
-                    "condition each row on the constraints, where more is measured than they leave free");
-  command
-      ->add_option(
-          "--outlier-threshold", arguments->outlier_threshold,
-          "a sample is distrusted that is farther than this many standard deviations from what the others say; 0: none is")
-      ->capture_default_str();
-  command->add_option("--smoothness", arguments->smoothness, "order of the Matérn kernel of the motion")
-      ->check(CLI::IsMember(smoothness_words()))
-      ->capture_default_str();
-  command->add_option("--keep", arguments->keep, "further columns of the log to pass on, NAME,…");
-  command->add_option("--map", arguments->map, "columns by other names, LOGNAME=MODELNAME,…");
-  command->add_option("-o,--output", arguments->output, "CSV file to write")->required();
-  command->footer(
-      "Example:\n  gp2 derive encoders.csv --model models/double_pendulum.toml --map theta1=q3,theta2=q6 -o data.csv");
-  command->callback([arguments] { run(*arguments); });
+Command derive_command() {
+  const auto a = std::make_shared<Arguments>();
+  Command command{"derive", "Smooth a raw log of positions into velocities and accelerations for a fit",
+                  "gp2 derive encoders.csv --model models/double_pendulum.toml --map theta1=q3,theta2=q6 -o data.csv", {}, {}};
+  command.options = {argument("LOG", a->log, "CSV of t and positions, and of velocities and inputs where there are"),
+                     required({"model", &a->model, "MODEL", "model file"})};
+  for (Option& option : options(a->options)) command.options.push_back(std::move(option));
+  command.options.push_back(output(a->output, "CSV", "CSV file to write"));
+  command.run = [a](const std::set<std::string>&) { run(*a); };
+  return command;
 }
 
 }  // namespace gp2::command

@@ -8,7 +8,7 @@
 
 #include "command.hpp"
 #include "gp2/data/csv.hpp"
-#include "gp2/jobs/fit_problem.hpp"
+#include "gp2/jobs/predict_job.hpp"
 
 namespace gp2::command {
 
@@ -17,7 +17,8 @@ namespace {
 using Json = nlohmann::ordered_json;
 
 struct Arguments {
-  std::string fit, data, outputs, map, system;
+  std::string fit, data, system;
+  EvaluateRequest request;
   bool json = false;
 };
 
@@ -54,28 +55,12 @@ void print_text(const Evaluation& e) {
              e.n_missing > 0 ? fmt::format("   ({} values not measured)", e.n_missing) : "");
 }
 
-// the accelerations that training observed
-std::vector<std::string> observed_outputs(const FitFile& fit) {
-  for (const Observations& group : fit.observations) {
-    if (group.view().is_of_ddq()) return group.view().names(*fit.model.system);
-  }
-  return {};
-}
-
-void run(const Arguments& arguments) {
+void run(Arguments& arguments) {
   const FitFile fit = FitFile::read(arguments.fit);
   const CsvTable table = CsvTable::read(arguments.data, CsvTable::Keep::numbers);
-  std::vector<std::string> outputs = parse_list(arguments.outputs);
-  if (outputs.empty()) outputs = observed_outputs(fit);
-  const std::vector<int> rows = acceleration_rows(*fit.model.system, outputs, "--outputs");
-  const PredictedSystem system = predicted_system(fit, arguments.system);
-  const View view = system.view(View::Quantity::constrained_acceleration);
-  const LogStates log = read_log_states(system.prior, view, system.model, table, parse_map(arguments.map), outputs);
-  talk(log.notes);
-  const Posterior posterior = fit.posterior();
-  const Evaluation evaluation = at_states_of(table, [&] {
-    return evaluate_predictions(posterior, log.states, rows, log.accelerations, system.other_system, /*n_threads=*/0);
-  });
+  arguments.request.system = read_other_system(arguments.system);
+  const auto [evaluation, notes] = evaluate(fit, fit.posterior(), table, arguments.request);
+  print_notes(notes);
   if (arguments.json) {
     fmt::print("{}\n", to_json(evaluation).dump(2));
   } else {
@@ -85,19 +70,17 @@ void run(const Arguments& arguments) {
 
 }  // namespace
 
-void add_evaluate(CLI::App& app) {
-  CLI::App* command =
-      app.add_subcommand("evaluate", "Compare predictions of the constrained acceleration with measured or true values");
-  auto arguments = std::make_shared<Arguments>();
-  command->add_option("FIT.json", arguments->fit, "file written by gp2 fit")->required();
-  command->add_option("--data", arguments->data, "CSV with states and accelerations")->required();
-  command->add_option("--outputs", arguments->outputs,
-                      "accelerations to compare, ddq3,ddq6 (default: those observed in training)");
-  command->add_option("--system", arguments->system, system_help);
-  command->add_option("--map", arguments->map, "columns by other names, LOGNAME=MODELNAME,…");
-  command->add_flag("--json", arguments->json, "figures as JSON on stdout");
-  command->footer("Example:\n  gp2 evaluate fit.json --data test.csv --json");
-  command->callback([arguments] { run(*arguments); });
+Command evaluate_command() {
+  const auto a = std::make_shared<Arguments>();
+  Command command{"evaluate", "Compare predictions of the constrained acceleration with measured or true values",
+                  "gp2 evaluate fit.json --data test.csv --json", {}, {}};
+  command.options = {argument("FIT.json", a->fit, "file written by gp2 fit"),
+                     required({"data", &a->data, "CSV", "CSV with states and accelerations"}),
+                     {"system", &a->system, "OTHER.toml", system_help}};
+  for (Option& option : options(a->request)) command.options.push_back(std::move(option));
+  command.options.push_back({"json", &a->json, "", "figures as JSON on stdout"});
+  command.run = [a](const std::set<std::string>&) { run(*a); };
+  return command;
 }
 
 }  // namespace gp2::command

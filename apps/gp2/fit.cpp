@@ -14,8 +14,7 @@
 #include "command.hpp"
 #include "gp2/data/csv.hpp"
 #include "gp2/error.hpp"
-#include "gp2/jobs/fit_memory.hpp"
-#include "gp2/jobs/fit_problem.hpp"
+#include "gp2/jobs/fit_job.hpp"
 #include "interruption.hpp"
 
 namespace gp2::command {
@@ -26,50 +25,11 @@ using Eigen::Index;
 using Json = nlohmann::ordered_json;
 
 struct Arguments {
-  std::string model, map, observe, mean = "zero", prior, baseline, noise, protocol = "default", hyperprior = "default",
-                                   discrepancy = "default", start, output;
+  std::string model, again, output;
   std::vector<std::string> data, also;
-  std::optional<double> also_noise, time_step;
-  std::optional<std::string> estimate;
-  std::optional<int> restarts;
-  int max_iterations = 1000, threads = 0;
-  std::optional<int> max_points;
-  std::uint64_t seed = 0;
-  bool project = false, robust = false, json = false, no_standard_errors = false;
+  bool json = false;
+  FitRequest request;
 };
-
-FitProblemOptions problem_options(const Arguments& arguments) {
-  FitProblemOptions options;
-  options.columns = parse_map(arguments.map);
-  options.observe = parse_list(arguments.observe);
-  options.mean = arguments.mean == "force" ? Prior::Mean::force : Prior::Mean::zero;
-  if (!arguments.prior.empty()) options.base = arguments.prior == "force" ? Latent::Base::force : Latent::Base::acceleration;
-  if (!arguments.baseline.empty()) options.baseline = Baseline::kind_of(arguments.baseline);
-  if (arguments.estimate) {
-    options.estimate = *arguments.estimate == "none" ? std::vector<std::string>{} : parse_list(*arguments.estimate);
-  }
-  if (arguments.noise == "estimate") {
-    options.estimate_noise = true;
-  } else if (arguments.noise == "stated") {
-    options.trust_stated_noise = true;
-  } else if (!arguments.noise.empty()) {
-    double value = 0;
-    if (!CLI::detail::lexical_cast(arguments.noise, value) || !(value > 0) || !std::isfinite(value)) {
-      throw InputError(fmt::format("--noise-std: expected a positive number, 'estimate' or 'stated', got '{}'", arguments.noise));
-    }
-    options.noise_stddev = value;
-  }
-  options.protocol.name = arguments.protocol == "paper" ? Protocol::Name::paper : Protocol::Name::standard;
-  options.protocol.hyperprior = arguments.hyperprior == "default";
-  options.discrepancy = arguments.discrepancy == "default";
-  options.max_points = arguments.max_points;
-  options.also_noise_stddev = arguments.also_noise;
-  options.time_step = arguments.time_step;
-  options.seed = arguments.seed;
-  options.project = arguments.project;
-  options.robust = arguments.robust;
-  return options;
-}
 
 // LOG or LOG@OTHER.toml
 Log read_log(const std::string& text) {
@@ -79,13 +39,13 @@ Log read_log(const std::string& text) {
 }
 
 // VIEW:LOG or VIEW@LATENT:LOG
-SideInformation read_knowledge(const std::string& text) {
+SideInformation read_side_information(const std::string& text) {
   const std::size_t colon = text.find(':');
   const std::string view = text.substr(0, std::min(colon, text.size()));
   const std::size_t at = view.find('@');
   const std::optional<View::Quantity> quantity = View::Quantity::of_word(view.substr(0, at));
   if (colon == std::string::npos || !quantity) {
-    throw InputError(fmt::format("--also: '{}' is not VIEW:FILE.csv or VIEW@LATENT:FILE.csv with VIEW one of {}", text,
+    throw InputError(fmt::format("`also`: '{}' is not VIEW:FILE.csv or VIEW@LATENT:FILE.csv with VIEW one of {}", text,
                                  fmt::join(View::Quantity::words(), ", ")));
   }
   return {*quantity, at == std::string::npos ? "" : view.substr(at + 1), read_log(text.substr(colon + 1))};
@@ -167,7 +127,7 @@ void print_text(const FitReport& report) {
 
 // what a fit reads and must not replace; where it starts from may be where it ends
 std::vector<std::string> inputs_of(const Arguments& arguments) {
-  std::vector<std::string> inputs = {arguments.model};
+  std::vector<std::string> inputs = {arguments.model, arguments.again};
   const auto add = [&](const std::string& log) {
     const auto [path, model] = split_at_system(log);
     inputs.insert(inputs.end(), {path, model});
@@ -177,84 +137,87 @@ std::vector<std::string> inputs_of(const Arguments& arguments) {
   return inputs;
 }
 
-// the fit or, where a signal asked for its end before there was anything to give, nothing
-std::optional<Fit> fit_until(const Interruption& interruption, const FitProblem& problem, FitOptions options) {
-  options.stop = interruption.stop();
+// The fit; nothing where a signal asked for its end before there was anything to give.
+std::optional<FitOutcome> fit_until(const Interruption& interruption, const FitJob& job, bool on_terminal) {
   try {
-    return fit(problem, options);
+    return run_fit(job, on_terminal ? print_progress : std::function<void(const Progress&)>(), interruption.stop());
   } catch (const NumericalError&) {
     if (interruption.signal() == 0) throw;
     return std::nullopt;
   }
 }
 
-std::string told(const Interruption& interruption) {
+std::string interrupted_by(const Interruption& interruption) {
   return fmt::format("interrupted by signal {} ({})", interruption.signal(), strsignal(interruption.signal()));
 }
 
-void run(const Arguments& arguments) {
-  if (arguments.restarts && *arguments.restarts < 1) {
-    throw InputError(fmt::format("--restarts: must be positive, got {}", *arguments.restarts));
-  }
-  if (arguments.max_iterations < 0) {
-    throw InputError(fmt::format("--max-iterations: must not be negative, got {}", arguments.max_iterations));
-  }
-  if (arguments.max_points && *arguments.max_points < 1) {
-    throw InputError(fmt::format("--max-points: must be positive, got {}", *arguments.max_points));
-  }
-  if (arguments.threads < 0) {
-    throw InputError(fmt::format("--threads: must be positive, or 0 for as many as the machine has; got {}", arguments.threads));
-  }
-  require_output(arguments.output, inputs_of(arguments));
-  FitFile file;
-  file.model = Model::read(arguments.model);
-  std::vector<Log> logs;
-  for (const std::string& text : arguments.data) logs.push_back(read_log(text));
-  std::vector<SideInformation> also;
-  for (const std::string& text : arguments.also) also.push_back(read_knowledge(text));
-  const FitProblemOptions asked = problem_options(arguments);
-  FitProblem problem = make_fit_problem(file.model, logs, also, asked);
-  if (!arguments.start.empty()) read_start(arguments.start, arguments.max_iterations, problem);
-  talk(problem.notes);
+std::string data_source_of(const Arguments& arguments) {
+  std::vector<std::string> sources = arguments.data;
+  sources.insert(sources.end(), arguments.also.begin(), arguments.also.end());
+  return fmt::format("{}", fmt::join(sources, ", "));
+}
 
-  FitOptions options = default_fit_options(problem);
-  options.n_restarts = arguments.restarts.value_or(options.n_restarts);
-  options.max_iterations = arguments.max_iterations;
-  options.seed = arguments.seed;
-  options.n_threads = arguments.threads;
-  options.standard_errors = !arguments.no_standard_errors;
-  file.options =
-      fit_options_json(asked, options, arguments.start.empty() ? std::vector<Hyperparameter>() : problem.hyperparameters);
-  std::vector<std::string> of_memory;
-  options = within_memory(problem, options, free_memory(), of_memory);
-  talk(of_memory);
-  const bool terminal = isatty(STDERR_FILENO) != 0;
-  if (terminal) options.progress = print_progress;
+void read_data(Arguments& arguments) {
+  FitRequest& request = arguments.request;
+  request.data_source = data_source_of(arguments);
+  for (const std::string& text : arguments.data) request.logs.push_back(read_log(text));
+  for (const std::string& text : arguments.also) request.also.push_back(read_side_information(text));
+}
+
+FitJob prepare(Arguments& arguments) {
+  if (arguments.again.empty()) {
+    arguments.request.model = Model::read(arguments.model);
+    read_data(arguments);
+    return prepare_fit(std::move(arguments.request));
+  }
+  const FitFile fit = FitFile::read(arguments.again);
+  const int threads = arguments.request.threads;
+  if (arguments.data.empty()) return prepare_fit_again(fit, threads);
+  arguments.request = request_of(fit);
+  arguments.request.threads = threads;
+  read_data(arguments);
+  return prepare_fit(std::move(arguments.request));
+}
+
+// A fit needs a model and data, or another fit whose options it takes.
+void require_inputs(const Arguments& arguments, const std::set<std::string>& given) {
+  if (arguments.again.empty()) {
+    if (arguments.model.empty()) throw UsageError{"MODEL is required"};
+    if (arguments.data.empty()) throw UsageError{"--data is required"};
+    return;
+  }
+  const std::set<std::string> allowed = {"again", "data", "also", "threads", "json", "output"};
+  for (const std::string& name : given) {
+    if (!allowed.contains(name)) {
+      throw InputError(fmt::format("`again`: {} has its model and options: leave out `{}`", arguments.again, name));
+    }
+  }
+  if (arguments.data.empty() && !arguments.also.empty()) throw InputError("`again`: `also` goes with `data`");
+}
+
+void run(Arguments& arguments, const std::set<std::string>& given) {
+  require_inputs(arguments, given);
+  require_output(arguments.output, inputs_of(arguments));
+  const FitJob job = prepare(arguments);
+  print_notes(job.notes);
+  const bool on_terminal = isatty(STDERR_FILENO) != 0;
   const Interruption interruption;
-  const std::optional<Fit> result = fit_until(interruption, problem, options);
-  if (terminal) fmt::print(stderr, "\r\033[K");
-  if (!result) {
-    talk({fmt::format("{} before there was a fit: nothing is written", told(interruption))});
+  const std::optional<FitOutcome> outcome = fit_until(interruption, job, on_terminal);
+  if (on_terminal) fmt::print(stderr, "\r\033[K");
+  if (!outcome) {
+    print_notes({fmt::format("{} before there was a fit: nothing is written", interrupted_by(interruption))});
     throw Interrupted{interruption.signal()};
   }
 
-  const FitReport& report = result->report;
-  talk(distrust_notes(problem, report));
-  talk(notes_of(report));
+  print_notes(outcome->notes);
+  const FitFile& file = outcome->file;
   const auto print = [&] {
     if (arguments.json) {
-      fmt::print("{}\n", to_json(problem, report, file.options).dump(2));
+      fmt::print("{}\n", to_json(job.problem, file.report, file.options).dump(2));
     } else {
-      print_text(report);
+      print_text(file.report);
     }
   };
-  file.prior_options = problem.prior_options;
-  std::vector<std::string> sources = arguments.data;
-  sources.insert(sources.end(), arguments.also.begin(), arguments.also.end());
-  file.data_source = fmt::format("{}", fmt::join(sources, ", "));
-  file.observations = result->posterior.observations();
-  file.systems = std::move(problem.systems);
-  file.report = report;
   try {
     file.write(arguments.output);
   } catch (const InputError&) {
@@ -263,84 +226,40 @@ void run(const Arguments& arguments) {
   }
   int n_rows = 0;
   for (const Observations& group : file.observations) n_rows += group.n_data();
-  talk({fmt::format("{}: fit of '{}' to {} rows", arguments.output, file.model.system->name(), n_rows)});
+  print_notes({fmt::format("{}: fit of '{}' to {} rows", arguments.output, file.model.system->name(), n_rows)});
   print();
-  if (report.termination == FitReport::interrupted) {
-    talk({fmt::format("{}: {} holds the best so far, not converged; --start {} goes on from there", told(interruption),
-                      arguments.output, arguments.output)});
+  if (file.report.termination == FitReport::interrupted) {
+    print_notes({fmt::format("{}: {} holds the best so far, not converged; --start {} goes on from there",
+                             interrupted_by(interruption), arguments.output, arguments.output)});
     throw Interrupted{interruption.signal()};
   }
 }
 
 }  // namespace
 
-void add_fit(CLI::App& app) {
-  CLI::App* command = app.add_subcommand("fit", "Fit a model to a log of states and accelerations");
-  auto a = std::make_shared<Arguments>();
-  command->add_option("MODEL", a->model, "model file")->required();
-  command
-      ->add_option("--data", a->data,
-                   "CSV log; columns are found by name, in any order. Several: --data A.csv --data B.csv@OTHER.toml, where B was "
-                   "measured on the system of another model file")
-      ->required()
-      ->allow_extra_args(false)
-      ->type_name("LOG[@OTHER.toml]");
-  command
-      ->add_option(
-          "--also", a->also,
-          "another quantity, measured or known, say unconstrained:rest.csv with abar_q1 …: the columns that are there are "
-          "observed. May be given several times")
-      ->allow_extra_args(false)
-      ->type_name("VIEW[@LATENT]:CSV[@OTHER.toml]");
-  command->add_option("--also-noise-std", a->also_noise,
-                      "noise standard deviation of what --also gives (default, for accelerations: the model's [noise])");
-  command->add_option("--dt", a->time_step, "time step of --also next-velocity [s]");
-  command->add_option("--map", a->map, "columns by other names, LOGNAME=MODELNAME,…: theta1=q3 also brings dtheta1, ddtheta1");
-  command->add_option("--observe", a->observe,
-                      "accelerations to learn from, ddq3,ddq6 (default: those with a column NAME_std in the log, or all)");
-  command->add_option("--mean", a->mean, "prior mean of the unconstrained acceleration: zero, or force = M⁻¹F of the model")
-      ->check(CLI::IsMember({"zero", "force"}))
-      ->capture_default_str();
-  command
-      ->add_option("--prior", a->prior, "put the model's latent on the acceleration or on the force (default: as the model says)")
-      ->check(CLI::IsMember({"acceleration", "force"}));
-  command
-      ->add_option("--baseline", a->baseline,
-                   "learn ddq without mechanics: se (independent outputs), icm or lmc (multi-output), from the model's features")
-      ->check(CLI::IsMember(Baseline::words()));
-  command->add_option("--estimate", a->estimate, "parameters to estimate, p1,p2, or none (default: those the model says)");
-  command->add_option(
-      "--noise-std", a->noise,
-      "noise standard deviation of every observed ddq, or 'estimate' (default: the log's NAME_std times a factor that is "
-      "estimated, 'stated' for those as they are, or as the model says)");
-  command->add_option("--protocol", a->protocol, "default, or paper: the set-up of Geist & Trimpe 2020")
-      ->check(CLI::IsMember({"default", "paper"}))
-      ->capture_default_str();
-  command->add_option("--hyperprior", a->hyperprior, "weak log-normal hyper-priors, or none: maximum likelihood")
-      ->check(CLI::IsMember({"default", "none"}))
-      ->capture_default_str();
-  command
-      ->add_option("--discrepancy", a->discrepancy, "a small latent for what the kernel would rule out (docs/priors.md), or none")
-      ->check(CLI::IsMember({"default", "none"}))
-      ->capture_default_str();
-  command->add_flag("--project", a->project,
-                    "move states onto position and velocity constraints, with the model's parameters, before anything else");
-  command->add_flag("--robust", a->robust, "distrust values that disagree with all others, and say which (docs/command-line.md)");
-  command->add_option("--restarts", a->restarts,
-                      "runs of the optimiser; the first starts at the model's values (default: 5; of a baseline 30)");
-  command->add_option("--max-iterations", a->max_iterations, "per run; 0 conditions at the starting values")
-      ->capture_default_str();
-  command->add_option("--start", a->start, "starting values: {\"name\": value, …} as JSON, or a FIT.json");
-  command->add_option("--max-points", a->max_points, "take this many rows of each log, the first of a shuffle by --seed");
-  command->add_option("--seed", a->seed, "of restarts and --max-points")->check(not_negative())->capture_default_str();
-  command->add_option("--threads", a->threads, "0: as many as the machine has; results do not depend on it")
-      ->capture_default_str();
-  command->add_flag("--no-standard-errors", a->no_standard_errors,
-                    "leave out the standard errors of estimated parameters, which take a few dozen gradients");
-  command->add_flag("--json", a->json, "report as JSON on stdout");
-  command->add_option("-o,--output", a->output, "fitted model to write (JSON)")->required();
-  command->footer("Example:\n  gp2 fit models/surface.toml --data train.csv --mean force -o fit.json");
-  command->callback([a] { run(*a); });
+Command fit_command() {
+  const auto a = std::make_shared<Arguments>();
+  Command command{"fit", "Fit a model to a log of states and accelerations",
+                  "gp2 fit models/surface.toml --data train.csv --mean force -o fit.json", {}, {}};
+  command.options = {
+      argument("MODEL", a->model, "model file"),
+      {"data", Repeated{&a->data}, "LOG[@OTHER.toml]",
+       "CSV log; columns are found by name, in any order. Several: --data A.csv --data B.csv@OTHER.toml, where B was measured on "
+       "the system of another model file"},
+      {"also", Repeated{&a->also}, "VIEW[@LATENT]:CSV[@OTHER.toml]",
+       "another quantity, measured or known, say unconstrained:rest.csv with abar_q1 …: the columns that are there are observed. "
+       "May be given several times"},
+  };
+  for (Option& option : options(a->request)) command.options.push_back(std::move(option));
+  command.options.insert(
+      command.options.end(),
+      {{"again", &a->again, "FIT.json",
+        "instead of MODEL and options: those of an earlier fit, and its data unless others are given. Same bits"},
+       {"json", &a->json, "", "report as JSON on stdout"},
+       output(a->output, "FIT.json", "fitted model to write (JSON)")});
+  command.options.front().is_required = false;  // --again stands for it
+  command.run = [a](const std::set<std::string>& given) { run(*a, given); };
+  return command;
 }
 
 }  // namespace gp2::command

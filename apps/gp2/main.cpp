@@ -8,11 +8,12 @@
 #include <utility>
 #include <vector>
 
+#include <CLI/CLI.hpp>
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
 #include "blas_choice.hpp"
-#include "command.hpp"
+#include "command_line.hpp"
 #include "gp2/base/blas.hpp"
 #include "gp2/base/version.hpp"
 #include "gp2/error.hpp"
@@ -93,17 +94,13 @@ int main(int argc, char** argv) {
       "  gp2 predict fit.json --states train.csv --cov std -o prediction.csv\n\n"
       "Exit codes: 0 done, 1 numerical failure, 2 bad input, 128 + n ended by signal n (130 Ctrl-C, 143 SIGTERM; gp2 fit "
       "saves the best so far). Results go to stdout, talk to stderr.");
-  gp2::command::add_show(app);
-  gp2::command::add_check(app);
-  gp2::command::add_generate(app);
-  gp2::command::add_derive(app);
-  gp2::command::add_resample(app);
-  gp2::command::add_fit(app);
-  gp2::command::add_predict(app);
-  gp2::command::add_simulate(app);
-  gp2::command::add_evaluate(app);
-  gp2::command::add_report(app);
-  gp2::command::add_reproduce(app);
+  for (const auto command :
+       {gp2::command::show_command, gp2::command::check_command, gp2::command::generate_command, gp2::command::derive_command,
+        gp2::command::resample_command, gp2::command::fit_command, gp2::command::predict_command,
+        gp2::command::simulate_command, gp2::command::evaluate_command, gp2::command::report_command,
+        gp2::command::reproduce_command}) {
+    gp2::command::add_command(app, command());
+  }
 
   try {
     require_known_command(app, argc, argv);
@@ -114,12 +111,14 @@ int main(int argc, char** argv) {
     return app.exit(version);
   } catch (const CLI::ParseError& error) {
     return failed(exit_bad_input, fmt::format("error: {}\nRun gp2 --help, or gp2 COMMAND --help.", error.what()));
+  } catch (const gp2::command::UsageError& error) {
+    return failed(exit_bad_input, fmt::format("error: {}\nRun gp2 --help, or gp2 COMMAND --help.", error.text));
   } catch (const gp2::command::Interrupted& interrupted) {
     return 128 + interrupted.signal;
   } catch (const gp2::InputError& error) {
-    return failed(exit_bad_input, fmt::format("error: {}", error.what()));
+    return failed(exit_bad_input, fmt::format("error: {}", gp2::command::with_flags(error.what())));
   } catch (const gp2::NumericalError& error) {
-    return failed(exit_numerical, fmt::format("numerical failure: {}", error.what()));
+    return failed(exit_numerical, fmt::format("numerical failure: {}", gp2::command::with_flags(error.what())));
   } catch (const std::bad_alloc&) {
     return failed(exit_numerical, "numerical failure: not enough memory; take fewer points (--max-points)");
   } catch (const std::exception& error) {

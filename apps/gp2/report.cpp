@@ -3,45 +3,47 @@
 #include <fmt/format.h>
 
 #include "command.hpp"
-#include "report/report_data.hpp"
+#include "gp2/base/file.hpp"
+#include "gp2/error.hpp"
+#include "report/report_page.hpp"
 
 namespace gp2::command {
 
 namespace {
 
 struct Arguments {
-  std::string fit, data, truth, map, output;
+  std::string output;
+  ReportOptions options;
 };
 
 void run(const Arguments& arguments) {
-  require_output(arguments.output, {arguments.fit, arguments.data, arguments.truth});
-  if (!arguments.map.empty() && arguments.data.empty()) {
+  const ReportOptions& options = arguments.options;
+  require_output(arguments.output, {options.fit, options.data, options.truth});
+  if (!options.columns.empty() && options.data.empty()) {
     throw InputError("--map names columns of --data, which is not given; the fit has its own data");
   }
   std::vector<std::string> notes;
-  const Report report = collect_report({arguments.fit, arguments.data, arguments.truth, parse_map(arguments.map)}, notes);
-  talk(notes);
+  const Report report = collect_report(options, notes);
+  print_notes(notes);
   const std::string page = report_page(report);
   write_file(arguments.output, page);
-  talk({fmt::format("{}: report of '{}', {:.0f} kB; open it in a browser", arguments.output, report.fit.model.system->name(),
+  print_notes({fmt::format("{}: report of '{}', {:.0f} kB; open it in a browser", arguments.output, report.fit.model.system->name(),
                     static_cast<double>(page.size()) / 1e3)});
 }
 
 }  // namespace
 
-void add_report(CLI::App& app) {
-  CLI::App* command = app.add_subcommand("report",
-                                         "Write a fit as one HTML page: what was fitted, how well, pictures of residuals, "
-                                         "calibration and motion, and what to do next");
-  auto arguments = std::make_shared<Arguments>();
-  command->add_option("FIT.json", arguments->fit, "file written by gp2 fit")->required();
-  command->add_option("--data", arguments->data, "CSV with states and accelerations that the fit has not seen: a test");
-  command->add_option("--truth", arguments->truth,
-                      "model file whose [truth] is the true acceleration, shown beside the prediction");
-  command->add_option("--map", arguments->map, "columns of --data by other names, LOGNAME=MODELNAME,…");
-  command->add_option("-o,--output", arguments->output, "HTML file to write; it needs no network")->required();
-  command->footer("Example:\n  gp2 report fit.json --data test.csv -o report.html");
-  command->callback([arguments] { run(*arguments); });
+Command report_command() {
+  const auto a = std::make_shared<Arguments>();
+  Command command{"report",
+                  "Write a fit as one HTML page: what was fitted, how well, pictures of residuals, calibration and motion, and what "
+                  "to do next",
+                  "gp2 report fit.json --data test.csv -o report.html", {}, {}};
+  command.options = {argument("FIT.json", a->options.fit, "file written by gp2 fit")};
+  for (Option& option : options(a->options)) command.options.push_back(std::move(option));
+  command.options.push_back(output(a->output, "HTML", "HTML file to write; it needs no network"));
+  command.run = [a](const std::set<std::string>&) { run(*a); };
+  return command;
 }
 
 }  // namespace gp2::command

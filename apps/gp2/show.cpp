@@ -117,14 +117,15 @@ void run(const Arguments& arguments) {
 
 }  // namespace
 
-void add_show(CLI::App& app) {
-  CLI::App* command = app.add_subcommand("show", "Print the derived A, b, M, F, the parameters and the features of a model");
-  auto arguments = std::make_shared<Arguments>();
-  command->add_option("MODEL", arguments->model, "model file")->required();
-  command->add_flag("--latex", arguments->latex, "as LaTeX");
-  command->add_flag("--full", arguments->full, "long expressions too, which otherwise are counted");
-  command->footer("Example:\n  gp2 show models/surface.toml");
-  command->callback([arguments] { run(*arguments); });
+Command show_command() {
+  const auto a = std::make_shared<Arguments>();
+  Command command{"show", "Print the derived A, b, M, F, the parameters and the features of a model",
+                  "gp2 show models/surface.toml", {}, {}};
+  command.options = {argument("MODEL", a->model, "model file"),
+                     {"latex", &a->latex, "", "as LaTeX"},
+                     {"full", &a->full, "", "long expressions too, which otherwise are counted"}};
+  command.run = [a](const std::set<std::string>&) { run(*a); };
+  return command;
 }
 
 }  // namespace gp2::command

@@ -234,7 +234,16 @@ class Motion:
 
 class Posterior:
     @staticmethod
-    def load(path: _Path, system: System | None = None) -> Posterior: ...
+    def fit_again(
+    path: _Path,
+    data: _Table | Log | _Arrays | list[Any] | None = None,
+    *,
+    also: Sequence[SideInformation] = [],
+    system: System | None = None,
+    threads: int = 0,
+    progress: Callable[[Progress], object] | None = None,
+) -> Posterior: ...
+def load(path: _Path, system: System | None = None) -> Posterior: ...
     def save(self, path: _Path) -> None: ...
     @property
     def system(self) -> System: ...
@@ -308,11 +317,12 @@ class Posterior:
         times: npt.ArrayLike,
         inputs: _Table | None = None,
         *,
-        n_samples: None = None,
-        seed: int = 0,
         rtol: float = 1e-06,
         atol: float = 1e-09,
         project: bool = True,
+        n_samples: None = None,
+        seed: int = 0,
+        columns: Mapping[str, str] | None = None,
     ) -> Motion: ...
     @overload
     def simulate(
@@ -321,11 +331,12 @@ class Posterior:
         times: npt.ArrayLike,
         inputs: _Table | None = None,
         *,
-        n_samples: int,
-        seed: int = 0,
         rtol: float = 1e-06,
         atol: float = 1e-09,
         project: bool = True,
+        n_samples: int,
+        seed: int = 0,
+        columns: Mapping[str, str] | None = None,
     ) -> list[Motion]: ...
 
 class Predictor:
@@ -377,26 +388,8 @@ def fit(
     data: _Table | Log | _Arrays | list[Any],  # of these
     *,
     also: Sequence[SideInformation] = [],
-    observe: Sequence[str] = [],
-    mean: Literal["zero", "force"] = "zero",
-    prior: Literal["acceleration", "force"] | None = None,
-    baseline: Literal["se", "icm", "lmc"] | None = None,
-    noise_std: float | Literal["estimate", "stated"] | None = None,
-    estimate: Sequence[str] | None = None,
-    protocol: Literal["default", "paper"] = "default",
-    hyperprior: bool = True,
-    discrepancy: bool = True,
-    project: bool = False,
-    robust: bool = False,
-    columns: Mapping[str, str] | None = None,
-    max_points: int | None = None,
-    also_noise_std: float | None = None,
-    dt: float | None = None,
-    restarts: int | None = None,
-    max_iterations: int = 1000,
-    start: _Path | None = None,
-    seed: int = 0,
-    threads: int = 0,
+    # options of fit: written by scripts/options
+    # end of options
     progress: Callable[[Progress], object] | None = None,
 ) -> Posterior: ...
 def load(path: _Path, system: System | None = None) -> Posterior: ...
@@ -405,24 +398,16 @@ def derive(
     system: System,
     data: _Table,
     *,
-    episode: str = "",
-    episodes: Sequence[str] = [],
-    rate: float = 0.0,
-    every: int = 1,
-    hold_constraints: bool = False,
-    outlier_threshold: float = 5.0,
-    smoothness: str = "9/2",
-    keep: Sequence[str] = [],
-    columns: Mapping[str, str] | None = None,
+    # options of derive: written by scripts/options
+    # end of options
 ) -> tuple[Table, dict[str, Any]]: ...
 def resample(
     system: System,
     data: _Table,
     n: int,
     *,
-    features: Sequence[str] = [],
-    seed: int | None = None,
-    columns: Mapping[str, str] | None = None,
+    # options of resample: written by scripts/options
+    # end of options
 ) -> Table: ...
 def simulate(
     system: System,
@@ -430,7 +415,6 @@ def simulate(
     times: npt.ArrayLike,
     inputs: _Table | None = None,
     *,
-    rtol: float = 1e-06,
-    atol: float = 1e-09,
-    project: bool = True,
+    # options of simulate: written by scripts/options
+    # end of options
 ) -> Motion: ...

@@ -6,8 +6,11 @@
 #include "arrays.hpp"
 #include "bindings.hpp"
 #include "gp2/error.hpp"
-#include "gp2/jobs/fit_memory.hpp"
-#include "gp2/jobs/fit_problem.hpp"
+#include "gp2/jobs/derive.hpp"
+#include "gp2/jobs/fit_job.hpp"
+#include "gp2/jobs/resample.hpp"
+#include "gp2/jobs/simulate_job.hpp"
+#include "options.hpp"
 
 namespace gp2::python {
 
@@ -72,75 +75,6 @@ std::vector<Log> logs_of(const py::object& data, const System& system) {
   return logs;
 }
 
-template <typename Choice>
-Choice choice(const std::string& given, const std::vector<std::pair<std::string, Choice>>& choices, const std::string& what) {
-  std::string words;
-  for (const auto& [word, value] : choices) {
-    if (word == given) return value;
-    words += (words.empty() ? "'" : ", '") + word + "'";
-  }
-  throw InputError(fmt::format("{}: expected one of {}, got '{}'", what, words, given));
-}
-
-struct Arguments {
-  std::vector<PySideInformation> also;
-  std::vector<std::string> observe;
-  std::string mean = "zero";
-  std::optional<std::string> prior, baseline;
-  py::object noise_std, columns, progress, start;
-  std::optional<std::vector<std::string>> estimate;
-  std::string protocol = "default";
-  bool hyperprior = true, discrepancy = true, project = false, robust = false;
-  std::optional<int> max_points, restarts;
-  std::optional<double> also_noise_std, dt;
-  int max_iterations = 1000, threads = 0;
-  std::uint64_t seed = 0;
-};
-
-FitProblemOptions problem_options(const Arguments& arguments) {
-  FitProblemOptions options;
-  options.columns = columns_argument(arguments.columns);
-  options.observe = arguments.observe;
-  options.mean = choice<Prior::Mean>(arguments.mean, {{"zero", Prior::Mean::zero}, {"force", Prior::Mean::force}}, "mean");
-  if (arguments.prior) {
-    options.base = choice<Latent::Base>(*arguments.prior,
-                                        {{"acceleration", Latent::Base::acceleration}, {"force", Latent::Base::force}}, "prior");
-  }
-  if (arguments.baseline) {
-    std::vector<std::pair<std::string, Baseline::Kind>> kinds;
-    for (const std::string& word : Baseline::words()) kinds.emplace_back(word, *Baseline::kind_of(word));
-    options.baseline = choice(*arguments.baseline, kinds, "baseline");
-  }
-  options.estimate = arguments.estimate;
-  if (py::isinstance<py::str>(arguments.noise_std)) {
-    options.estimate_noise =
-        choice<bool>(arguments.noise_std.cast<std::string>(), {{"estimate", true}, {"stated", false}}, "noise_std");
-    options.trust_stated_noise = !options.estimate_noise;
-  } else if (!arguments.noise_std.is_none()) {
-    try {
-      options.noise_stddev = arguments.noise_std.cast<double>();
-    } catch (const py::cast_error&) {
-      throw py::type_error(fmt::format("noise_std: expected a positive number, 'estimate' or 'stated', got {}",
-                                       std::string(py::repr(arguments.noise_std))));
-    }
-    if (!(*options.noise_stddev > 0) || !std::isfinite(*options.noise_stddev)) {
-      throw InputError(
-          fmt::format("noise_std: expected a positive number, 'estimate' or 'stated', got {}", *options.noise_stddev));
-    }
-  }
-  options.protocol.name = choice<Protocol::Name>(
-      arguments.protocol, {{"default", Protocol::Name::standard}, {"paper", Protocol::Name::paper}}, "protocol");
-  options.protocol.hyperprior = arguments.hyperprior;
-  options.discrepancy = arguments.discrepancy;
-  options.max_points = arguments.max_points;
-  options.also_noise_stddev = arguments.also_noise_std;
-  options.time_step = arguments.dt;
-  options.project = arguments.project;
-  options.robust = arguments.robust;
-  options.seed = arguments.seed;
-  return options;
-}
-
 /// What the optimiser said last; it speaks from other threads.
 class LastProgress {
  public:
@@ -158,59 +92,40 @@ class LastProgress {
   std::optional<Progress> last_;
 };
 
-PyPosterior fit_model(const PySystem& system, const py::object& data, const Arguments& arguments) {
-  require_at_least(1, arguments.restarts, "restarts");
-  require_at_least(0, arguments.max_iterations, "max_iterations");
-  require_at_least(1, arguments.max_points, "max_points");
-  require_at_least(0, arguments.threads, "threads");
-  const Model& model = *system.model;
-  const std::vector<Log> logs = logs_of(data, *model.system);
-  std::vector<SideInformation> also;
-  for (const PySideInformation& knowledge : arguments.also) {
-    const std::string what = fmt::format("also[{}]", also.size());
-    also.push_back({quantity_argument(knowledge.view), knowledge.latent, log_of(knowledge.data, knowledge.system, what)});
+std::vector<SideInformation> side_information_of(const std::vector<PySideInformation>& also) {
+  std::vector<SideInformation> out;
+  for (const PySideInformation& one : also) {
+    const std::string what = fmt::format("also[{}]", out.size());
+    out.push_back({quantity_argument(one.view), one.latent, log_of(one.data, one.system, what)});
   }
-  const FitProblemOptions asked = problem_options(arguments);
-  FitProblem problem = make_fit_problem(model, logs, also, asked);
-  if (!arguments.start.is_none()) read_start(path_argument(arguments.start), arguments.max_iterations, problem);
-  FitOptions options = default_fit_options(problem);
-  options.n_restarts = arguments.restarts.value_or(options.n_restarts);
-  options.max_iterations = arguments.max_iterations;
-  options.seed = arguments.seed;
-  options.n_threads = arguments.threads;
-  const std::string asked_json =
-      fit_options_json(asked, options, arguments.start.is_none() ? std::vector<Hyperparameter>() : problem.hyperparameters);
-  options = within_memory(problem, options, free_memory(), problem.notes);
-  tell(problem.notes);
+  return out;
+}
+
+/// Runs a fit without the interpreter's lock; Ctrl-C ends it with the best so far.
+PyPosterior run(const FitJob& job, const py::object& progress_callback, const MechanicsSource& mechanics) {
+  tell(job.notes);
   std::atomic<bool> stop = false;
-  options.stop = &stop;
   LastProgress progress;
-  if (!arguments.progress.is_none()) options.progress = [&](const Progress& p) { progress.set(p); };
+  std::function<void(const Progress&)> note_progress;
+  if (!progress_callback.is_none()) note_progress = [&](const Progress& p) { progress.set(p); };
   const auto tell_progress = [&] {
-    if (const std::optional<Progress> last = progress.take()) arguments.progress(*last);
+    if (const std::optional<Progress> last = progress.take()) progress_callback(*last);
   };
 
   std::exception_ptr raised;
-  std::optional<Fit> result;
+  std::optional<FitOutcome> outcome;
   try {
-    result = run_interruptibly([&] { return fit(problem, options); }, stop, raised, tell_progress);
+    outcome = run_interruptibly([&] { return run_fit(job, note_progress, &stop); }, stop, raised, tell_progress);
   } catch (const Error&) {
     if (!raised) throw;  // stopped before there was anything to give
   }
   std::optional<PyPosterior> posterior;
-  if (result) {
-    std::vector<std::string> notes = distrust_notes(problem, result->report);
-    for (std::string& note : notes_of(result->report)) notes.push_back(std::move(note));
-    if (!raised) tell(notes);
-    problem.notes.insert(problem.notes.end(), notes.begin(), notes.end());
-    FitFile file;
-    file.model = model;
-    file.prior_options = problem.prior_options;
-    file.options = asked_json;
-    for (const Log& log : logs) file.data_source += (file.data_source.empty() ? "" : ", ") + log.table.name();
-    file.systems = std::move(problem.systems);
-    file.report = std::move(result->report);
-    posterior = PyPosterior{std::move(file), std::move(result->posterior), std::move(problem.notes), system.mechanics};
+  if (outcome) {
+    if (!raised) tell(outcome->notes);
+    std::vector<std::string> notes = job.notes;
+    notes.insert(notes.end(), outcome->notes.begin(), outcome->notes.end());
+    outcome->file.observations.clear();
+    posterior = PyPosterior{std::move(outcome->file), std::move(outcome->posterior), with_keywords(std::move(notes)), mechanics};
   }
   if (raised) {
     try {
@@ -221,6 +136,55 @@ PyPosterior fit_model(const PySystem& system, const py::object& data, const Argu
     }
   }
   return std::move(*posterior);
+}
+
+PyPosterior fit_model(const PySystem& system, const py::object& data, const py::kwargs& kwargs) {
+  py::dict keywords = kwargs;
+  FitRequest request;
+  const auto progress = take<py::object>(keywords, "progress", py::none());
+  const auto also = take<std::vector<PySideInformation>>(keywords, "also", {});
+  read_keywords("fit", keywords, options(request));
+  request.model = *system.model;
+  request.logs = logs_of(data, system.system());
+  request.also = side_information_of(also);
+  return run(prepare_fit(std::move(request)), progress, system.mechanics);
+}
+
+PyPosterior fit_again(const py::object& path, const py::object& data, const std::vector<PySideInformation>& also,
+                      const PySystem* system, int threads, const py::object& progress) {
+  const MechanicsSource mechanics = system == nullptr ? MechanicsSource() : system->mechanics;
+  const FitFile file = mechanics ? FitFile::read(path_argument(path), mechanics) : FitFile::read(path_argument(path));
+  if (data.is_none()) {
+    if (!also.empty()) throw InputError("`again`: `also` goes with `data`");
+    return run(prepare_fit_again(file, threads), progress, mechanics);
+  }
+  FitRequest request = request_of(file);
+  request.threads = threads;
+  request.data_source.clear();
+  request.logs = logs_of(data, *request.model.system);
+  request.also = side_information_of(also);
+  return run(prepare_fit(std::move(request)), progress, mechanics);
+}
+
+std::string fit_documentation() {
+  FitRequest request;
+  const std::vector<Option> table = options(request);
+  return signature("fit", "system: System, data: object, *, also: Sequence[SideInformation] = [],", table,
+                   ", progress: Callable[[Progress], object] | None = None", "Posterior") +
+         R"(
+Fit a system to measured accelerations.
+
+data        a path, Table, pandas frame or mapping with columns named as the model's (or aliases); or (states, accelerations),
+            arrays (n, len(state_names)) and (n, nq); or a list of these and of Log. NaN, or None, of an acceleration is "not measured"
+also        list of SideInformation: other quantities, measured or known
+progress    called with a Progress some times a second
+
+)" + documentation(table) +
+         R"(
+Returns a Posterior with its report. Same seed, same bits, for any number of threads. The interpreter's lock is released; Ctrl-C
+raises KeyboardInterrupt, whose attribute `posterior` is the best so far (None when there is none yet). A fit that would take
+more memory than is free is refused, with the rows that would fit.
+Raises InputError for data or options that do not fit; NumericalError when nothing could be fitted.)";
 }
 
 }  // namespace
@@ -250,50 +214,29 @@ void add_fit(py::module_& module) {
       .def_readonly("seconds", &Progress::seconds)
       .def_readonly("fraction", &Progress::fraction, "Of the work, estimated.");
 
+  {
+    py::options own_signature;
+    own_signature.disable_function_signatures();
+    module.def("fit", &fit_model, "system"_a, "data"_a, fit_documentation().c_str());
+  }
+  module.def("fit_again", &fit_again, "path"_a, "data"_a = py::none(), py::kw_only(),
+             "also"_a = std::vector<PySideInformation>(), "system"_a = nullptr, "threads"_a = 0, "progress"_a = py::none(),
+             "Repeat the fit in a FIT.json with the options it was made with, from its data or from those given: the same bits.\n\n"
+             "system: of System.from_callables, as in gp2.load. A robust fit needs its data.");
   module.def(
-      "fit",
-      [](const PySystem& system, const py::object& data, const std::vector<PySideInformation>& also,
-         const std::vector<std::string>& observe, const std::string& mean, const std::optional<std::string>& prior,
-         const std::optional<std::string>& baseline, const py::object& noise_std,
-         const std::optional<std::vector<std::string>>& estimate, const std::string& protocol, bool hyperprior, bool discrepancy,
-         bool project, bool robust, const py::object& columns, const std::optional<int>& max_points,
-         const std::optional<double>& also_noise_std, const std::optional<double>& dt, const std::optional<int>& restarts,
-         int max_iterations, const py::object& start, std::uint64_t seed, int threads, const py::object& progress) {
-        return fit_model(system, data,
-                         {also,     observe,        mean,     prior,          baseline,    noise_std, columns, progress,
-                          start,    estimate,       protocol, hyperprior,     discrepancy, project,   robust,  max_points,
-                          restarts, also_noise_std, dt,       max_iterations, threads,     seed});
+      "_stub_of_options",
+      [](const std::string& job) {
+        FitRequest fit;
+        SimulateRequest simulate;
+        DeriveOptions derive;
+        ResampleOptions resample;
+        const std::map<std::string, std::vector<Option>> tables = {{"fit", options(fit)},
+                                                                   {"simulate", options(simulate)},
+                                                                   {"derive", options(derive)},
+                                                                   {"resample", options(resample)}};
+        return stub_lines(tables.at(job));
       },
-      "system"_a, "data"_a, py::kw_only(), "also"_a = std::vector<PySideInformation>(), "observe"_a = std::vector<std::string>(),
-      "mean"_a = "zero", "prior"_a = py::none(), "baseline"_a = py::none(), "noise_std"_a = py::none(), "estimate"_a = py::none(),
-      "protocol"_a = "default", "hyperprior"_a = true, "discrepancy"_a = true, "project"_a = false, "robust"_a = false,
-      "columns"_a = py::none(), "max_points"_a = py::none(), "also_noise_std"_a = py::none(), "dt"_a = py::none(),
-      "restarts"_a = py::none(), "max_iterations"_a = 1000, "start"_a = py::none(), "seed"_a = 0, "threads"_a = 0,
-      "progress"_a = py::none(),
-      R"(Fit a system to measured accelerations.
-
-data        a path, Table, pandas frame or mapping with columns named as the model's (or aliases); or (states, accelerations),
-            arrays (n, len(state_names)) and (n, nq); or a list of these and of Log. NaN, or None, of an acceleration is "not measured"
-also        list of SideInformation: other quantities, measured or known
-observe     accelerations to learn from; default: those with a column ddNAME_std, or all
-mean        'zero', or 'force': the model's known force is relied on
-prior       'acceleration' or 'force': where the latent acts; default: as the model says
-baseline    'se', 'icm' or 'lmc': learn ddq without mechanics
-noise_std   standard deviation of every observed ddq, or 'estimate'; default: of each value, where data have columns
-            ddNAME_std, times a factor that is estimated ('stated': as they are), or the model's
-estimate    names of parameters; default: those the model wants estimated
-project     move states onto position and velocity constraints, with the model's parameters, before anything else
-robust      distrust values that disagree with all others; report.distrusted lists them
-columns     {model's name: log's name}
-restarts    runs of the optimiser; default: 5, of a baseline 30
-max_iterations  per run; 0 conditions at the starting values
-start       path of starting values, JSON or FIT.json
-progress    called with a Progress some times a second
-
-Returns a Posterior with its report. Same seed, same bits, for any number of threads. The interpreter's lock is released; Ctrl-C
-raises KeyboardInterrupt, whose attribute `posterior` is the best so far (None when there is none yet). A fit that would take
-more memory than is free is refused, with the rows that would fit.
-Raises InputError for data or options that do not fit, with the text of the command; NumericalError when nothing could be fitted.)");
+      "job"_a);
 }
 
 }  // namespace gp2::python

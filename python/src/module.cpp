@@ -6,13 +6,23 @@
 #include "gp2/base/blas.hpp"
 #include "gp2/base/version.hpp"
 #include "gp2/error.hpp"
+#include "options.hpp"
 
 PYBIND11_MODULE(_gp2, module) {
   namespace py = pybind11;
-  py::register_exception<gp2::InputError>(module, "InputError", PyExc_ValueError).doc() =
-      "The user's input breaks a rule. The text says where, which rule, the value got, and the mend.";
-  py::register_exception<gp2::NumericalError>(module, "NumericalError", PyExc_ArithmeticError).doc() =
-      "The input is well-formed but the numbers cannot be computed.";
+  static py::exception<gp2::InputError> input_error(module, "InputError", PyExc_ValueError);
+  input_error.doc() = "The user's input breaks a rule. The text says where, which rule, the value got, and the mend.";
+  static py::exception<gp2::NumericalError> numerical_error(module, "NumericalError", PyExc_ArithmeticError);
+  numerical_error.doc() = "The input is well-formed but the numbers cannot be computed.";
+  py::register_exception_translator([](std::exception_ptr thrown) {
+    try {
+      if (thrown) std::rethrow_exception(thrown);
+    } catch (const gp2::InputError& error) {
+      input_error(gp2::python::with_keywords(error.what()).c_str());
+    } catch (const gp2::NumericalError& error) {
+      numerical_error(gp2::python::with_keywords(error.what()).c_str());
+    }
+  });
   gp2::python::add_table(module);
   gp2::python::add_system(module);
   gp2::python::add_posterior(module);

@@ -10,10 +10,10 @@
 #include "arrays.hpp"
 #include "bindings.hpp"
 #include "gp2/error.hpp"
-#include "gp2/inference/evaluation.hpp"
-#include "gp2/inference/pathwise.hpp"
 #include "gp2/jobs/fit_problem.hpp"
-#include "gp2/simulate.hpp"
+#include "gp2/jobs/predict_job.hpp"
+#include "gp2/jobs/simulate_job.hpp"
+#include "options.hpp"
 
 namespace gp2::python {
 
@@ -25,14 +25,6 @@ namespace {
 
 // ---------------------------------------------------------------- views
 
-/// What is looked at: a view, and the model of the system under which.
-struct Look {
-  View view;
-  const Model* model = nullptr;
-  Prior prior;  // of that system
-  std::vector<std::string> names;
-};
-
 /// The keywords that name a view.
 struct ViewArguments {
   std::string quantity = "constrained";
@@ -41,38 +33,10 @@ struct ViewArguments {
   std::optional<double> time_step;
 };
 
-// text that is the same is the same system; functions cannot be compared, but the system that they made can
-bool is_same(const Model& a, const Model& b) {
-  return a.system == b.system || (!a.mechanics_are_code && !b.mechanics_are_code && a.text == b.text);
-}
-
-Look look(const PyPosterior& self, const ViewArguments& arguments) {
-  const Prior& home = self.posterior.prior();
-  Look out{View{}, &self.file.model, home, {}};
-  const View::Quantity quantity = quantity_argument(arguments.quantity);
-  if (arguments.system != nullptr && !is_same(*arguments.system->model, self.file.model)) {
-    out.model = arguments.system->model.get();
-    const std::shared_ptr<const OtherSystem> other_system =
-        make_other_system(self.file.model, *out.model, self.file.prior_options);
-    out.prior = other_system->prior;
-    out.view = View::all(quantity, *out.prior.system);
-    out.view.other_system = other_system;
-  } else {
-    out.view = View::all(quantity, *home.system);
-  }
-  if (out.view.size() == 0)
-    throw InputError(fmt::format("view '{}': '{}' has no constraints", arguments.quantity, out.prior.system->name()));
-  const bool needs_step = quantity->needs_time_step();
-  if (needs_step != arguments.time_step.has_value()) {
-    throw InputError(needs_step ? "view 'next-velocity' needs the time step dt [s]" : "dt goes with view 'next-velocity'");
-  }
-  if (needs_step) {
-    out.view.time_step = arguments.time_step;
-    if (!(*out.view.time_step > 0)) throw InputError(fmt::format("dt: must be positive, got {}", *out.view.time_step));
-  }
-  if (arguments.latent) out.view.latent = latent_index(home, *arguments.latent, "latent");
-  out.names = out.view.names(*out.prior.system, arguments.latent.value_or(""));
-  return out;
+/// The model of another system keeps alive what a view looks at.
+ViewRequest view_request(const ViewArguments& arguments) {
+  return {quantity_argument(arguments.quantity), arguments.time_step, arguments.latent,
+          arguments.system == nullptr ? nullptr : arguments.system->model};
 }
 
 // ---------------------------------------------------------------- predictions
@@ -96,7 +60,8 @@ Index states_between_signals(const Posterior& posterior, bool mean_only, Index d
 Prediction predict(const PyPosterior& self, const py::object& data, const ViewArguments& arguments, bool mean_only,
                    const py::object& columns, int n_threads) {
   require_at_least(0, n_threads, "threads");
-  const Look at = look(self, arguments);
+  const ViewRequest request = view_request(arguments);
+  const PredictedView at = predicted_view(self.file, self.posterior.prior(), request);
   const States states(data, at.prior, at.view, *at.model, columns);
   const auto x = states.matrix();
   const Index d = at.view.size(), n = x.cols();
@@ -141,7 +106,8 @@ py::array asked_for(const std::optional<py::array>& values) {
 }
 
 py::tuple joint(const PyPosterior& self, const py::object& data, const ViewArguments& arguments, const py::object& columns) {
-  const Look at = look(self, arguments);
+  const ViewRequest request = view_request(arguments);
+  const PredictedView at = predicted_view(self.file, self.posterior.prior(), request);
   const States states(data, at.prior, at.view, *at.model, columns);
   const Posterior posterior = self.posterior;
   Posterior::Joint result = states.named([&] {
@@ -155,7 +121,8 @@ py::tuple joint(const PyPosterior& self, const py::object& data, const ViewArgum
 py::array sample(const PyPosterior& self, const py::object& data, int n_samples, std::uint64_t seed,
                  const ViewArguments& arguments, const py::object& columns) {
   require_at_least(1, n_samples, "n_samples");
-  const Look at = look(self, arguments);
+  const ViewRequest request = view_request(arguments);
+  const PredictedView at = predicted_view(self.file, self.posterior.prior(), request);
   const States states(data, at.prior, at.view, *at.model, columns);
   const Posterior posterior = self.posterior;
   MatrixXd samples = states.named([&] {
@@ -168,26 +135,18 @@ py::array sample(const PyPosterior& self, const py::object& data, int n_samples,
 
 // ---------------------------------------------------------------- figures
 
-Evaluation evaluate(const PyPosterior& self, const py::object& data, const PySystem* system,
-                    const std::vector<std::string>& outputs, const py::object& columns, int n_threads) {
-  require_at_least(0, n_threads, "threads");
-  const Look at = look(self, {"constrained", system, std::nullopt, std::nullopt});
-  std::vector<std::string> names = outputs;
-  for (const Observations& group : self.posterior.observations()) {
-    if (!names.empty()) break;
-    if (group.view().is_of_ddq()) names = group.view().names(self.system());
-  }
-  const std::vector<int> rows = acceleration_rows(self.system(), names, "outputs");
+Evaluation evaluate_posterior(const PyPosterior& self, const py::object& data, const PySystem* system,
+                              const std::vector<std::string>& outputs, const py::object& columns, int n_threads) {
+  const EvaluateRequest request{outputs, system == nullptr ? nullptr : system->model, columns_argument(columns), n_threads};
   const CsvTable table = to_table(data, "data");
-  const LogStates log = read_log_states(at.prior, at.view, *at.model, table, columns_argument(columns), names);
-  tell(log.notes);
   const Posterior posterior = self.posterior;
-  try {
+  EvaluateOutcome outcome;
+  {
     const py::gil_scoped_release release;
-    return evaluate_predictions(posterior, log.states, rows, log.accelerations, at.view.other_system, n_threads);
-  } catch (const InputError& error) {
-    throw InputError(table.name() + ": " + error.what());
+    outcome = evaluate(self.file, posterior, table, request);
   }
+  tell(outcome.notes);
+  return std::move(outcome.evaluation);
 }
 
 // ---------------------------------------------------------------- data that grow
@@ -257,7 +216,11 @@ struct Motion {
   std::optional<MatrixXd> stddev;
 };
 
-std::map<std::string, double> start_values(const py::object& start) {
+MotionStart start_argument(const py::object& start, const System& system) {
+  if (is_array(start)) {
+    const auto values = vector_argument(start, 2 * system.nq(), "start");
+    return VectorXd(Eigen::Map<const VectorXd>(values.data(), 2 * system.nq()));
+  }
   try {
     return start.cast<std::map<std::string, double>>();
   } catch (const py::cast_error&) {
@@ -266,113 +229,61 @@ std::map<std::string, double> start_values(const py::object& start) {
   }
 }
 
-/// A start by names, what is not named following from the constraints; or all of q and dq.
-VectorXd start_state(const Model& model, const VectorXd& parameters, const py::object& start, double t_start) {
-  const System& system = *model.system;
-  const StateLayout layout = system.layout();
-  VectorXd state = VectorXd::Zero(layout.size());
-  state[layout.t()] = t_start;
-  if (is_array(start)) {
-    const auto values = vector_argument(start, 2 * layout.nq, "start");
-    state.head(2 * layout.nq) = Eigen::Map<const VectorXd>(values.data(), 2 * layout.nq);
-    if (!state.allFinite()) throw InputError("start: not all numbers are finite");
-    return state;
-  }
-  StartingPoint point{state, std::vector<bool>(static_cast<std::size_t>(layout.size()), false)};
-  const std::vector<std::string> names = system.state_names();
-  for (const auto& [name, value] : start_values(start)) {
-    const auto found = std::find(names.begin(), names.begin() + layout.t(), name);
-    if (found == names.begin() + layout.t()) {
-      throw InputError(fmt::format("start: '{}' is no coordinate or velocity of '{}'; there are: {}", name, system.name(),
-                                   fmt::join(names.begin(), names.begin() + layout.t(), ", ")));
-    }
-    if (!std::isfinite(value)) throw InputError(fmt::format("start: {} = {} is not a finite number", name, value));
-    const auto k = found - names.begin();
-    point.state[k] = value;
-    point.given[static_cast<std::size_t>(k)] = true;
-  }
-  std::vector<std::string> notes;
-  state = complete_start(model, parameters, std::move(point), notes);
-  tell(notes);
-  return state;
+SimulateRequest simulate_request(const System& system, const py::object& start, const py::object& times, const py::object& inputs,
+                                 const py::dict& keywords) {
+  SimulateRequest request;
+  read_keywords("simulate", keywords, options(request));
+  request.start = start_argument(start, system);
+  const auto points = vector_argument(times, "times");
+  request.times = Eigen::Map<const VectorXd>(points.data(), points.size());
+  if (!inputs.is_none()) request.inputs = to_table(inputs, "inputs");
+  return request;
 }
 
-struct SimulateArguments {
-  py::object start, times, inputs;
-  double relative_tolerance = 1e-6, absolute_tolerance = 1e-9;
-  bool project = true;
-};
-
-InputSignal input_signal(const System& system, const py::object& inputs) {
-  if (inputs.is_none()) return {};
-  if (system.inputs().empty()) throw InputError(fmt::format("inputs: '{}' has no inputs", system.name()));
-  const CsvTable table = to_table(inputs, "inputs");
-  LogReader reader(table, system);
-  return {reader.values({"t"}).row(0).transpose(), reader.values(system.inputs())};
-}
-
-/// Motions of accelerations, one after the other; Ctrl-C ends them.
-std::vector<Motion> simulate_all(const Model& model, const VectorXd& parameters, const std::vector<Acceleration>& accelerations,
-                                 const SimulateArguments& arguments) {
-  const System& system = *model.system;
-  SimulateOptions options;
-  const auto times = vector_argument(arguments.times, "times");
-  if (times.size() == 0) throw InputError("times: expected the times [s] at which states are wanted; the first is the start");
-  options.times = Eigen::Map<const VectorXd>(times.data(), times.size());
-  options.relative_tolerance = arguments.relative_tolerance;
-  options.absolute_tolerance = arguments.absolute_tolerance;
-  options.project = arguments.project;
-  options.inputs = input_signal(system, arguments.inputs);
-  const VectorXd start = start_state(model, parameters, arguments.start, options.times[0]);
-
+/// Motions one after the other; Ctrl-C ends them.
+std::vector<Motion> run_motions(const SimulateJob& job) {
+  tell(job.notes);
   std::atomic<bool> stop = false;
   std::exception_ptr raised;
-  struct Stopped {};
   std::vector<Motion> motions;
   try {
-    motions = run_interruptibly(
-        [&] {
-          std::vector<Motion> out;
-          for (const Acceleration& acceleration : accelerations) {
-            const Acceleration stoppable = [&](const Eigen::Ref<const VectorXd>& x) {
-              if (stop) throw Stopped();
-              return acceleration(x);
-            };
-            out.push_back({simulate(system, parameters, stoppable, start, options), std::nullopt});
-          }
-          return out;
-        },
-        stop, raised, [] {});
-  } catch (const Stopped&) {
+    for (Trajectory& trajectory : run_interruptibly([&] { return run_simulation(job, &stop); }, stop, raised, [] {})) {
+      motions.push_back({std::move(trajectory), std::nullopt});
+    }
+  } catch (const SimulationStopped&) {
   }
   if (raised) std::rethrow_exception(raised);
   return motions;
 }
 
-py::object simulate_posterior(const PyPosterior& self, const SimulateArguments& arguments, const std::optional<int>& n_samples,
-                              std::uint64_t seed) {
-  const View view = View::constrained_acceleration(self.system());
+Motion simulate_model(const PySystem& system, const py::object& start, const py::object& times, const py::object& inputs,
+                      const py::kwargs& keywords) {
+  const SimulateRequest request = simulate_request(system.system(), start, times, inputs, keywords);
+  return run_motions(prepare_simulation(*system.model, request)).front();
+}
+
+py::object simulate_posterior(const PyPosterior& self, const py::object& start, const py::object& times, const py::object& inputs,
+                              const py::kwargs& keywords) {
+  const SimulateRequest request = simulate_request(self.system(), start, times, inputs, keywords);
   const Posterior posterior = self.posterior;
-  const VectorXd parameters = posterior.values().parameters;
-  std::vector<Acceleration> accelerations;
-  std::optional<PathwiseSamples> samples;
-  if (n_samples) {
-    require_at_least(1, *n_samples, "n_samples");
+  const SimulateJob job = [&] {
     const py::gil_scoped_release release;
-    samples = sample_paths(posterior, *n_samples, {.seed = seed});
-  }
-  for (int k = 0; k < n_samples.value_or(1); ++k) {
-    accelerations.emplace_back([&, k](const Eigen::Ref<const VectorXd>& x) -> VectorXd {
-      return samples ? samples->evaluate(k, view, x).col(0) : posterior.mean(view, x).col(0);
-    });
-  }
-  std::vector<Motion> motions = simulate_all(self.file.model, parameters, accelerations, arguments);
-  if (n_samples) return py::cast(std::move(motions));
+    return prepare_simulation(self.file.model, posterior, request);
+  }();
+  std::vector<Motion> motions = run_motions(job);
+  if (request.n_samples) return py::cast(std::move(motions));
   {
+    const View view = View::constrained_acceleration(self.system());
     const py::gil_scoped_release release;
     motions[0].stddev = posterior.marginal(view, motions[0].trajectory.states, /*n_threads=*/0).stddev();
   }
   return py::cast(std::move(motions[0]));
+}
+
+std::string simulate_documentation(const std::string& first) {
+  SimulateRequest request;
+  return signature("simulate", first + "start: Mapping[str, float] | ArrayLike, times: ArrayLike, inputs: object = None, *,",
+                   options(request), "", first == "self: Posterior, " ? "Motion | list[Motion]" : "Motion");
 }
 
 // ---------------------------------------------------------------- files
@@ -568,7 +479,8 @@ void add_posterior(py::module_& module) {
                                  const std::optional<double>& dt) {
     return ViewArguments{view, system, latent, dt};
   };
-  py::class_<PyPosterior>(module, "Posterior", "A prior conditioned on data. Made by gp2.fit or gp2.load.")
+  py::class_<PyPosterior> posterior(module, "Posterior", "A prior conditioned on data. Made by gp2.fit or gp2.load.");
+  posterior
       .def_static("load", &load, "path"_a, "system"_a = nullptr,
                   "As gp2.load.\n\nRaises InputError naming the file and what is wrong.")
       .def("save", &save, "path"_a, "Write a FIT.json, whole or not at all. Loaded again it gives the same bits.")
@@ -641,7 +553,7 @@ Raises InputError for states that are not finite where they are read, or contrad
           "states"_a, "n_samples"_a = 1, "seed"_a = 0, "view"_a = "constrained", py::kw_only(), "system"_a = nullptr,
           "latent"_a = py::none(), "dt"_a = py::none(), "columns"_a = py::none(),
           "Draws of a view at all states together (n_samples, n, d). Each obeys A ddq = b. Same seed, same samples.")
-      .def("evaluate", &evaluate, "data"_a, "system"_a = nullptr, "outputs"_a = std::vector<std::string>(),
+      .def("evaluate", &evaluate_posterior, "data"_a, "system"_a = nullptr, "outputs"_a = std::vector<std::string>(),
            "columns"_a = py::none(), "threads"_a = 0, "Compare with measured or true accelerations: the figures of gp2 evaluate.")
       .def("update", &update_with, "data"_a, "observe"_a = std::vector<std::string>(), "noise_std"_a = py::none(),
            "columns"_a = py::none(),
@@ -659,37 +571,30 @@ Raises InputError for states that are not finite where they are read, or contrad
             return PyPosterior{self.file, self.posterior.without_data(), {}, self.mechanics};
           },
           "The prior under the same hyperparameters.")
-      .def(
-          "simulate",
-          [](const PyPosterior& self, const py::object& start, const py::object& times, const py::object& inputs,
-             const std::optional<int>& n_samples, std::uint64_t seed, double rtol, double atol, bool project) {
-            return simulate_posterior(self, {start, times, inputs, rtol, atol, project}, n_samples, seed);
-          },
-          "start"_a, "times"_a, "inputs"_a = py::none(), py::kw_only(), "n_samples"_a = py::none(), "seed"_a = 0, "rtol"_a = 1e-6,
-          "atol"_a = 1e-9, "project"_a = true,
-          R"(Integrate the mean's motion, or n_samples motions, each of one function drawn from the posterior.
-
-start   {"q1": 0.4, "dq1": 1.0}: what is not named follows from the constraints; or all of q and dq
-times   at which states are wanted (n) [s]; the first is the start
-inputs  a table with t and every input, linear in between; default: zero
-
-Returns a Motion, or with n_samples a list of them. Raises NumericalError, with the time, when it cannot go on.)")
       .def("__repr__", [](const PyPosterior& self) { return fmt::format("<gp2.Posterior of '{}'>", self.system().name()); });
 
   module.def("load", &load, "path"_a, "system"_a = nullptr,
              "Read a FIT.json: a Posterior.\n\nsystem: of System.from_callables, where the fit was of that one; its functions "
              "are not in the "
              "file.\n\nRaises InputError naming the file and what is wrong.");
-  module.def(
-      "simulate",
-      [](const PySystem& system, const py::object& start, const py::object& times, const py::object& inputs, double rtol,
-         double atol, bool project) {
-        return simulate_all(*system.model, system.system().parameter_values(), {model_acceleration(*system.model)},
-                            {start, times, inputs, rtol, atol, project})
-            .front();
-      },
-      "system"_a, "start"_a, "times"_a, "inputs"_a = py::none(), py::kw_only(), "rtol"_a = 1e-6, "atol"_a = 1e-9,
-      "project"_a = true, "Integrate a system by its own force and [truth]. As Posterior.simulate.");
+  SimulateRequest motion;
+  const std::string motion_options = documentation(options(motion));
+  py::options own_signature;
+  own_signature.disable_function_signatures();
+  posterior.def("simulate", &simulate_posterior, "start"_a, "times"_a, "inputs"_a = py::none(),
+                (simulate_documentation("self: Posterior, ") + R"(
+Integrate the mean's motion, or n_samples motions, each of one function drawn from the posterior.
+
+start   {"q1": 0.4, "dq1": 1.0}: what is not named follows from the constraints; or all of q and dq
+times   at which states are wanted (n) [s]; the first is the start
+inputs  a table with t and every input, linear in between, that covers the motion; default: zero
+
+)" + motion_options + R"(
+Returns a Motion, or with n_samples a list of them. Raises NumericalError, with the time, when it cannot go on.)")
+                    .c_str());
+  module.def("simulate", &simulate_model, "system"_a, "start"_a, "times"_a, "inputs"_a = py::none(),
+             (simulate_documentation("system: System, ") + "\nIntegrate a system by its own force and [truth]. As Posterior.simulate.")
+                 .c_str());
 }
 
 }  // namespace gp2::python

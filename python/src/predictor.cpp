@@ -6,6 +6,7 @@
 #include "arrays.hpp"
 #include "bindings.hpp"
 #include "gp2/error.hpp"
+#include "gp2/jobs/predict_job.hpp"
 
 namespace gp2::python {
 
@@ -100,12 +101,8 @@ class PyPredictor {
 
 PyPredictor make(const PyPosterior& posterior, const std::string& quantity, const std::optional<double>& dt, bool std,
                  bool jacobian, const std::string& storage) {
-  View view = View::all(quantity_argument(quantity), posterior.system());
-  if (view.size() == 0) throw InputError(fmt::format("view '{}': '{}' has no constraints", quantity, posterior.system().name()));
-  if (view.quantity->needs_time_step() != dt.has_value()) {
-    throw InputError(dt ? "dt goes with view 'next-velocity'" : "view 'next-velocity' needs the time step dt [s]");
-  }
-  view.time_step = dt;
+  const ViewRequest request{quantity_argument(quantity), dt, std::nullopt, nullptr};
+  const View view = predicted_view(posterior.file, posterior.posterior.prior(), request).view;
   if (storage != "double" && storage != "single") {
     throw InputError(fmt::format("storage: expected 'double' or 'single', got '{}'", storage));
   }

@@ -7,12 +7,12 @@
 #include "arrays.hpp"
 #include "bindings.hpp"
 #include "gp2/error.hpp"
+#include "gp2/jobs/check_job.hpp"
 #include "gp2/jobs/derive.hpp"
 #include "gp2/jobs/fit_problem.hpp"
+#include "gp2/jobs/generate_job.hpp"
 #include "gp2/jobs/resample.hpp"
-#include "gp2/mechanics/check.hpp"
-#include "gp2/simulation/generate.hpp"
-#include "gp2/simulation/projected_states.hpp"
+#include "options.hpp"
 
 namespace gp2::python {
 
@@ -61,23 +61,16 @@ Mechanics evaluate(const PySystem& self, const py::object& states, const std::ma
 
 CsvTable generate_table(const PySystem& self, int n, std::uint64_t seed, std::optional<double> noise_stddev,
                         const std::map<std::string, int>& grid) {
-  const Model& model = *self.model;
-  const System& system = self.system();
-  GenerateOptions options{n, seed, Eigen::VectorXd::Zero(system.nq()), grid};
-  if (noise_stddev) {
-    options.noise_stddev.setConstant(*noise_stddev);
-  } else if (!model.noise.stddev.empty()) {
-    options.noise_stddev = Eigen::Map<const Eigen::VectorXd>(model.noise.stddev.data(), system.nq());
-  } else {
-    throw InputError(fmt::format("{}: no [noise] ddq to draw from; give noise_std (0 for the truth)", model.name));
-  }
-  return as_table(generate(model, options), system, fmt::format("data of '{}'", system.name()));
+  const GeneratedData data = generate(*self.model, GenerateRequest{n, grid, seed, noise_stddev});
+  return as_table(data, self.system(), fmt::format("data of '{}'", self.system().name()));
 }
 
-CsvTable resample_table(const PySystem& self, const py::object& data, int n, const std::vector<std::string>& features,
-                        const std::optional<std::uint64_t>& seed, const py::object& columns) {
+CsvTable resample_table(const PySystem& self, const py::object& data, int n, const py::kwargs& keywords) {
+  ResampleOptions asked;
+  read_keywords("resample", keywords, options(asked));
+  asked.n = n;
   const CsvTable table = to_table(data, "data", CsvTable::Keep::text);
-  return table.take(resample(*self.model, table, {n, features, seed, columns_argument(columns)}).rows);
+  return table.take(resample(*self.model, table, asked).rows);
 }
 
 // what became of each column of a raw log
@@ -115,62 +108,27 @@ py::dict report_of(const DerivedData& derived, const System& system) {
   return report;
 }
 
-py::tuple derive_table(const PySystem& self, const py::object& data, const std::string& episode,
-                       const std::vector<std::string>& episodes, double rate, int every, bool hold_constraints,
-                       double outlier_threshold, const std::string& smoothness, const std::vector<std::string>& keep,
-                       const py::object& columns) {
-  DeriveOptions options;
-  options.columns = columns_argument(columns);
-  options.episode_column = episode;
-  options.episodes = episodes;
-  options.keep = keep;
-  options.rate = rate;
-  options.every = every;
-  options.hold_constraints = hold_constraints;
-  options.outlier_threshold = outlier_threshold;
-  const std::optional<Smoothness> order = smoothness_of(smoothness);
-  if (!order)
-    throw InputError(fmt::format("smoothness: expected one of {}, got '{}'", fmt::join(smoothness_words(), ", "), smoothness));
-  options.smoothness = *order;
+py::tuple derive_table(const PySystem& self, const py::object& data, const py::kwargs& keywords) {
+  DeriveOptions asked;
+  read_keywords("derive", keywords, options(asked));
   const CsvTable table = to_table(data, "data", CsvTable::Keep::text);
   DerivedData derived;
   {
     const py::gil_scoped_release release;
-    derived = derive(*self.model, table, options);
+    derived = derive(*self.model, table, asked);
   }
   return py::make_tuple(as_table(derived, self.system(), "derived data"), report_of(derived, self.system()));
 }
 
-py::list findings_list(const std::vector<Finding>& findings) {
+py::list check_system_and_log(const PySystem& self, const py::object& data, const py::object& columns) {
+  std::optional<CsvTable> table;
+  if (!data.is_none()) table = to_table(data, "data");
   py::list list;
-  for (const Finding& finding : findings) list.append(finding);
+  for (Finding& finding : check(*self.model, table ? &*table : nullptr, {columns_argument(columns)})) {
+    finding.text = with_keywords(finding.text);
+    list.append(std::move(finding));
+  }
   return list;
-}
-
-// the findings of gp2 check
-py::list check(const PySystem& self, const py::object& data, const py::object& columns) {
-  const Model& model = *self.model;
-  const System& system = self.system();
-  const Eigen::VectorXd parameters = system.parameter_values();
-  if (data.is_none()) {
-    if ((model.sampling.empty() && !model.motion) || model.truth.empty()) {
-      throw InputError("check: no data, and no sampling and truth in the model: nothing to evaluate it at");
-    }
-    const GeneratedData drawn = generate(model, {100, 1, Eigen::VectorXd::Zero(system.nq())});
-    return findings_list(check_system(system, drawn.states, parameters));
-  }
-  const CsvTable table = to_table(data, "data");
-  LogReader reader = open_log(model, table, columns_argument(columns));
-  const WholeLog log = read_whole_log(model, reader);
-  std::vector<Finding> findings = check_system(system, log.states, parameters);
-  const auto is_error = [](const Finding& finding) { return finding.level == Finding::Level::error; };
-  if (std::none_of(findings.begin(), findings.end(), is_error)) {
-    const std::vector<Finding> more = check_data(system, log.states, parameters, log.accelerations, log.stated);
-    findings.insert(findings.end(), more.begin(), more.end());
-    const std::vector<Finding> offsets = check_states(system, log.states, parameters);
-    findings.insert(findings.end(), offsets.begin(), offsets.end());
-  }
-  return findings_list(findings);
 }
 
 const char* word(Finding::Level level) {
@@ -198,7 +156,7 @@ View::Quantity quantity_argument(const std::string& given) {
 
 void tell(const std::vector<std::string>& notes) {
   const std::string mark = "warning: ";
-  for (const std::string& note : notes) {
+  for (const std::string& note : with_keywords(notes)) {
     if (note.starts_with(mark)) {
       if (PyErr_WarnEx(PyExc_UserWarning, note.substr(mark.size()).c_str(), 1) != 0) throw py::error_already_set();
     } else {
@@ -334,22 +292,29 @@ Raises InputError with the key, the rule, the value got and the mend.)");
                            fmt::join(coordinate_names(self.system()), ", "), self.system().nc());
       });
 
-  module.def("check", &check, py::arg("system"), py::arg("data") = py::none(), py::arg("columns") = py::none(),
+  module.def("check", &check_system_and_log, py::arg("system"), py::arg("data") = py::none(), py::arg("columns") = py::none(),
              "Is a system well-posed, and does a log fit it? A list of Finding: rank, definiteness, derivatives; data on the\n"
              "constraint, dependent columns. Without data at states drawn from the model's [sampling].");
-  module.def("derive", &derive_table, py::arg("system"), py::arg("data"), py::kw_only(), py::arg("episode") = "",
-             py::arg("episodes") = std::vector<std::string>(), py::arg("rate") = 0.0, py::arg("every") = 1,
-             py::arg("hold_constraints") = false, py::arg("outlier_threshold") = 5.0, py::arg("smoothness") = "9/2",
-             py::arg("keep") = std::vector<std::string>(), py::arg("columns") = py::none(),
-             "A raw log of t and positions as states and accelerations with a standard deviation for each value: a Table for\n"
-             "fit, and a report (dict): what was found of each coordinate in each episode, what was completed from the\n"
-             "constraints, which accelerations are independent, notes. The options are those of gp2 derive; docs/raw-logs.md.");
-  module.def(
-      "resample", &resample_table, py::arg("system"), py::arg("data"), py::arg("n"), py::kw_only(),
-      py::arg("features") = std::vector<std::string>(), py::arg("seed") = py::none(), py::arg("columns") = py::none(),
-      "The n rows of a table that cover its states best, whole, in the order of choice: farthest points in the features of\n"
-      "the system's first latent, or in expressions given, each divided by its standard deviation. The first is the row\n"
-      "nearest to the mean or, with a seed, a random one. Rows without a number in some feature are left out.");
+  DeriveOptions of_derive;
+  ResampleOptions of_resample;
+  py::options own_signature;
+  own_signature.disable_function_signatures();
+  module.def("derive", &derive_table, py::arg("system"), py::arg("data"),
+             (signature("derive", "system: System, data: object, *,", options(of_derive), "", "tuple[Table, dict[str, Any]]") + R"(
+A raw log of t and positions as states and accelerations with a standard deviation for each value: a Table for fit, and a report
+(dict): what was found of each coordinate in each episode, what was completed from the constraints, which accelerations are
+independent, notes. docs/raw-logs.md.
+
+)" + documentation(options(of_derive)))
+                 .c_str());
+  module.def("resample", &resample_table, py::arg("system"), py::arg("data"), py::arg("n"),
+             (signature("resample", "system: System, data: object, n: int, *,", options(of_resample), "", "Table") + R"(
+The n rows of a table that cover its states best, whole, in the order of choice: farthest points in the features of the system's
+first latent, or in expressions given, each divided by its standard deviation. The first is the row nearest to the mean or, with a
+seed, a random one. Rows without a number in some feature are left out.
+
+)" + documentation(options(of_resample)))
+                 .c_str());
 }
 
 }  // namespace gp2::python

@@ -86,7 +86,7 @@ int LogReader::require(const std::string& name) {
     if (const auto aliases = aliases_.find(name); aliases != aliases_.end()) {
       tried.insert(tried.end(), aliases->second.begin(), aliases->second.end());
     }
-    throw InputError(fmt::format("{}: missing column '{}' (looked for {}); the file has: {}. Rename it, or give --map LOGNAME={}",
+    throw InputError(fmt::format("{}: missing column '{}' (looked for {}); the file has: {}. Rename it, or give `map=LOGNAME={}`",
                                  table_.name(), name, fmt::join(tried, ", "), fmt::join(table_.header(), ", "), name));
   }
   used_.insert(column);
@@ -126,7 +126,7 @@ MatrixXd LogReader::measurements(const std::vector<std::string>& names) {
     const int column = require(names[k]);
     const auto row_of_values = static_cast<Index>(k);
     for (int row = 0; row < table_.n_rows(); ++row) values(row_of_values, row) = table_.number_or_empty(row, column);
-    require_a_number(values.row(row_of_values), table_, column, "observe others (--observe)");
+    require_a_number(values.row(row_of_values), table_, column, "observe others (`observe`)");
   }
   return values;
 }

@@ -662,39 +662,46 @@ std::vector<Hyperparameter> hyperparameters_of(const std::filesystem::path& path
   return hyperparameters;
 }
 
+std::vector<Hyperparameter>::iterator find_named(std::vector<Hyperparameter>& hyperparameters, const std::string& name) {
+  return std::find_if(hyperparameters.begin(), hyperparameters.end(), [&](const auto& known) { return known.name == name; });
+}
+
 }  // namespace
 
 void read_start_values(const std::filesystem::path& path, std::vector<Hyperparameter>& hyperparameters) {
   ParsedJson json = parse_json(read_file(path), path);
-  std::vector<std::pair<std::string, double>> values;
-  const bool of_fit = is_fit(json);
-  if (of_fit) {
-    for (const Hyperparameter& h : hyperparameters_of(path, json)) values.emplace_back(h.name, h.value);
+  std::map<std::string, double> values;
+  if (is_fit(json)) {
+    // a fit may have had more to tune than this one; a hand-written value must mean something
+    for (const Hyperparameter& h : hyperparameters_of(path, json)) {
+      if (find_named(hyperparameters, h.name) != hyperparameters.end()) values[h.name] = h.value;
+    }
   } else if (json.is_object()) {
     for (const auto& [name, value] : json.items()) {
       if (!value.is_number())
         throw InputError(fmt::format("{}: '{}' is not a number but {}", path.string(), name, value.type_name()));
-      values.emplace_back(name, value.get<double>());
+      values[name] = value.get<double>();
     }
   } else {
     throw InputError(fmt::format("{}: expected {{\"name\": value, …}} or a file written by gp2 fit", path.string()));
   }
+  set_start_values(values, path.string(), hyperparameters);
+}
 
+void set_start_values(const std::map<std::string, double>& values, const std::string& source,
+                      std::vector<Hyperparameter>& hyperparameters) {
   std::vector<Hyperparameter> started = hyperparameters;
   for (const auto& [name, value] : values) {
-    const auto h = std::find_if(started.begin(), started.end(), [&name = name](const auto& known) { return known.name == name; });
+    const auto h = find_named(started, name);
     if (h == started.end()) {
-      // a fit may have had more to tune than this one; a hand-written value must mean something
-      if (of_fit) continue;
       std::vector<std::string> known;
       for (const Hyperparameter& other : started) known.push_back(other.name);
-      throw InputError(
-          fmt::format("{}: unknown hyperparameter '{}'; this fit has: {}", path.string(), name, fmt::join(known, ", ")));
+      throw InputError(fmt::format("{}: unknown hyperparameter '{}'; this fit has: {}", source, name, fmt::join(known, ", ")));
     }
     // a value printed with a few digits less may lie a rounding outside
     const double tolerance = 1e-9 * (h->positive ? std::abs(value) : h->upper - h->lower);
     if (!(value >= h->lower - tolerance && value <= h->upper + tolerance)) {
-      throw InputError(fmt::format("{}: {} = {} is outside its bounds [{}, {}]", path.string(), name, value, h->lower, h->upper));
+      throw InputError(fmt::format("{}: {} = {} is outside its bounds [{}, {}]", source, name, value, h->lower, h->upper));
     }
     h->value = std::clamp(value, h->lower, h->upper);
   }

@@ -117,7 +117,7 @@ class Deriver {
       std::vector<std::string> names;
       for (const Coordinate& coordinate : system_.coordinates()) names.push_back(coordinate.name);
       throw InputError(
-          fmt::format("{}: no column is a coordinate of '{}' ({}); the file has: {}. Rename them, or give --map LOGNAME={}",
+          fmt::format("{}: no column is a coordinate of '{}' ({}); the file has: {}. Rename them, or give `map=LOGNAME={}`",
                       log_.name(), system_.name(), fmt::join(names, ", "), fmt::join(log_.header(), ", "), names.front()));
     }
     for (int k = 0; k < static_cast<int>(system_.inputs().size()); ++k) {
@@ -443,10 +443,10 @@ class Deriver {
                                            redundancy == 1 ? "s" : "");
       if (!completed.empty()) {
         throw InputError(fmt::format(
-            "{}: {}, which noise contradicts, so that {} cannot be solved for; hold the constraints (--hold-constraints)",
+            "{}: {}, which noise contradicts, so that {} cannot be solved for; hold the constraints (`hold_constraints`)",
             log_.name(), fact, fmt::join(completed, ", ")));
       }
-      data_.notes.push_back(fact + ": --hold-constraints makes use of that");
+      data_.notes.push_back(fact + ": `hold_constraints` makes use of that");
     }
     const bool conditioned = options_.hold_constraints && redundancy > 0;
     if (options_.hold_constraints && redundancy == 0)
@@ -531,6 +531,24 @@ class Deriver {
 };
 
 }  // namespace
+
+std::vector<Option> options(DeriveOptions& options) {
+  std::vector<std::pair<std::string, Smoothness>> orders;
+  for (const std::string& word : smoothness_words()) orders.emplace_back(word, *smoothness_of(word));
+  return {
+      {"episode", &options.episode_column, "COLUMN", "column that tells episodes apart", "episode, where the log has it"},
+      {"episodes", &options.episodes, "0-12,15", "only these", "all"},
+      {"rate", &options.rate, "HZ", "rows per second, evenly within an episode, through gaps too", "where there are samples"},
+      {"every", &options.every, "K", "only each so many rows of an episode"},
+      {"hold_constraints", &options.hold_constraints, "",
+       "condition each row on the constraints, where more is measured than they leave free"},
+      {"outlier_threshold", &options.outlier_threshold, "S",
+       "a sample is distrusted that is farther than this many standard deviations from what the others say; 0: none is"},
+      {"smoothness", choice(options.smoothness, orders), "", "order of the Matérn kernel of the motion"},
+      {"keep", &options.keep, "NAME,…", "further columns of the log to pass on"},
+      {"map", &options.columns, "LOGNAME=NAME,…", "columns by other names", "", "columns"},
+  };
+}
 
 DerivedData derive(const Model& model, const CsvTable& log, const DeriveOptions& options) {
   return Deriver(model, log, options).run();

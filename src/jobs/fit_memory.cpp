@@ -217,7 +217,7 @@ FitOptions within_memory(const FitProblem& problem, const FitOptions& options, s
   const double alone = memory.shared + std::max(memory.evaluation, memory.posterior);
   throw InputError(fmt::format(
       "the fit of {:.0f} rows factors a matrix of size {} and takes {:.1f} GB of memory, of which {:.1f} GB are free; {} rows "
-      "of each log would fit: take so many with --max-points {}, or choose them with gp2 resample",
+      "of each log would fit: take so many with `max_points={}`, or choose them with gp2 resample",
       n_states(problem), memory.reduced_size, gigabytes(alone), gigabytes(*free), most, most));
 }
 

@@ -5,7 +5,6 @@
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
-#include <nlohmann/json.hpp>
 
 #include "gp2/error.hpp"
 #include "gp2/training/laplace.hpp"
@@ -24,16 +23,16 @@ namespace {
 void require_baseline_options(const FitProblemOptions& options, const std::vector<Log>& logs,
                               const std::vector<SideInformation>& also) {
   const auto refuse = [&](bool asked, const char* rule, const char* option) {
-    if (asked) throw InputError(fmt::format("--baseline {} {}: leave out {}", Baseline::word(*options.baseline), rule, option));
+    if (asked) throw InputError(fmt::format("`baseline={}` {}: leave out {}", Baseline::word(*options.baseline), rule, option));
   };
-  refuse(options.mean != Prior::Mean::zero, "has the mean of the training data as prior mean", "--mean");
-  refuse(options.base.has_value(), "has its prior on ddq", "--prior");
-  refuse(options.estimate && !options.estimate->empty(), "knows no parameters of the system", "--estimate");
-  refuse(!options.observe.empty(), "learns every acceleration", "--observe");
-  refuse(options.estimate_noise, "has fixed noise", "--noise-std estimate");
-  refuse(options.project, "knows no constraints", "--project");
-  refuse(options.robust, "is fitted as published", "--robust");
-  refuse(!also.empty() || options.time_step || options.also_noise_stddev, "knows ddq only", "--also");
+  refuse(options.mean != Prior::Mean::zero, "has the mean of the training data as prior mean", "`mean`");
+  refuse(options.base.has_value(), "has its prior on ddq", "`prior`");
+  refuse(options.estimate && !options.estimate->empty(), "knows no parameters of the system", "`estimate`");
+  refuse(!options.observe.empty(), "learns every acceleration", "`observe`");
+  refuse(options.estimate_noise, "has fixed noise", "`noise_std=estimate`");
+  refuse(options.project, "knows no constraints", "`project`");
+  refuse(options.robust, "is fitted as published", "`robust`");
+  refuse(!also.empty() || options.time_step || options.also_noise_stddev, "knows ddq only", "`also`");
   const bool elsewhere = std::any_of(logs.begin(), logs.end(), [](const Log& log) { return log.model != nullptr; });
   refuse(elsewhere, "knows no system", "@OTHER.toml");
 }
@@ -52,7 +51,7 @@ FitProblem make_baseline_problem(const Model& model, const std::vector<Log>& log
   }
   problem.prior_options.baseline = standardised_by(problem.observations, problem.prior.latents.front(), *options.baseline);
   problem.prior = make_prior(model, problem.prior_options);
-  problem.hyperparameters = baseline_hyperparameters(problem.prior, problem.observations);
+  problem.hyperparameters = starting_hyperparameters(problem, options);
   return problem;
 }
 
@@ -75,6 +74,16 @@ void note_parameters(const Model& home, const LoggedSystem& logged, const std::v
                       logged.model.name, name, parameters[k].value, home.name));
     }
   }
+}
+
+// The parameters to estimate: those asked for, else those that the model says.
+std::vector<std::string> estimated_parameters(const System& system, const FitProblemOptions& options) {
+  if (options.estimate) return *options.estimate;
+  std::vector<std::string> names;
+  for (const Parameter& parameter : system.parameters()) {
+    if (parameter.estimate) names.push_back(parameter.name);
+  }
+  return names;
 }
 
 // so that there is no ā for a discrepancy to act on
@@ -123,9 +132,17 @@ Discrepancy discrepancy_of(const FitProblem& problem) {
 
 }  // namespace
 
-void read_start(const std::filesystem::path& path, int max_iterations, FitProblem& problem) {
+void read_start(const NamedNumbers& start, int max_iterations, FitProblem& problem) {
+  const std::string source = start.file.empty() ? "`start`" : start.file;
+  const auto read = [&] {
+    if (start.file.empty()) {
+      set_start_values(start.values, source, problem.hyperparameters);
+    } else {
+      read_start_values(start.file, problem.hyperparameters);
+    }
+  };
   if (max_iterations > 0) {
-    read_start_values(path, problem.hyperparameters);
+    read();
     return;
   }
   const std::vector<Hyperparameter> bounded = problem.hyperparameters;
@@ -133,14 +150,14 @@ void read_start(const std::filesystem::path& path, int max_iterations, FitProble
     h.lower = h.positive ? std::numeric_limits<double>::min() : std::numeric_limits<double>::lowest();
     h.upper = std::numeric_limits<double>::max();
   }
-  read_start_values(path, problem.hyperparameters);
+  read();
   for (std::size_t k = 0; k < bounded.size(); ++k) {
     Hyperparameter& h = problem.hyperparameters[k];
     h.lower = std::min(bounded[k].lower, h.value);
     h.upper = std::max(bounded[k].upper, h.value);
     if (h.lower == bounded[k].lower && h.upper == bounded[k].upper) continue;
     problem.notes.push_back(fmt::format("{}: {} = {} is outside its bounds [{:.6g}, {:.6g}]; taken, as nothing is optimised",
-                                        path.string(), h.name, h.value, bounded[k].lower, bounded[k].upper));
+                                        source, h.name, h.value, bounded[k].lower, bounded[k].upper));
   }
 }
 
@@ -167,38 +184,14 @@ std::vector<std::string> notes_of(const FitReport& report) {
   return notes;
 }
 
-FitOptions default_fit_options(const FitProblem& problem) {
-  return problem.prior_options.baseline ? baseline_fit_options() : FitOptions{};
+std::vector<Hyperparameter> starting_hyperparameters(const FitProblem& problem, const FitProblemOptions& options) {
+  if (options.baseline) return baseline_hyperparameters(problem.prior, problem.observations);
+  return default_hyperparameters(problem.prior, trusted_observations(problem), estimated_parameters(*problem.prior.system, options),
+                                 options.protocol);
 }
 
-std::string fit_options_json(const FitProblemOptions& asked, const FitOptions& options,
-                             const std::vector<Hyperparameter>& start) {
-  nlohmann::json json = {{"mean", asked.mean == Prior::Mean::force ? "force" : "zero"},
-                         {"protocol", asked.protocol.name == Protocol::Name::paper ? "paper" : "default"},
-                         {"hyperprior", asked.protocol.hyperprior ? "default" : "none"},
-                         {"discrepancy", asked.discrepancy ? "default" : "none"},
-                         {"restarts", options.n_restarts},
-                         {"max_iterations", options.max_iterations},
-                         {"max_escapes", options.max_escapes},
-                         {"gradient_tolerance", options.gradient_tolerance},
-                         {"reduction_tolerance", options.reduction_tolerance},
-                         {"standard_errors", options.standard_errors},
-                         {"seed", options.seed}};
-  if (!asked.observe.empty()) json["observe"] = asked.observe;
-  if (asked.base) json["prior"] = *asked.base == Latent::Base::force ? "force" : "acceleration";
-  if (asked.baseline) json["baseline"] = Baseline::word(*asked.baseline);
-  if (asked.estimate) json["estimate"] = *asked.estimate;
-  if (asked.noise_stddev) json["noise_std"] = *asked.noise_stddev;
-  if (asked.estimate_noise) json["noise_std"] = "estimate";
-  if (asked.trust_stated_noise) json["noise_std"] = "stated";
-  if (asked.max_points) json["max_points"] = *asked.max_points;
-  if (asked.also_noise_stddev) json["also_noise_std"] = *asked.also_noise_stddev;
-  if (asked.project) json["project"] = true;
-  if (asked.robust) json["robust"] = true;
-  if (asked.time_step) json["dt"] = *asked.time_step;
-  for (const auto& [name, column] : asked.columns) json["map"] += fmt::format("{}={}", column, name);
-  for (const Hyperparameter& h : start) json["start"][h.name] = h.value;
-  return json.dump();
+FitOptions default_fit_options(const FitProblem& problem) {
+  return problem.prior_options.baseline ? baseline_fit_options() : FitOptions{};
 }
 
 std::vector<std::string> distrust_notes(const FitProblem& problem, const FitReport& report) {
@@ -238,9 +231,9 @@ FitProblem make_fit_problem(const Model& model, const std::vector<Log>& logs, co
     return make_baseline_problem(model, logs, options);
   }
   const bool paper = options.protocol.name == Protocol::Name::paper;
-  if (paper && options.estimate_noise) throw InputError("--protocol paper has fixed noise: leave out --noise-std estimate");
+  if (paper && options.estimate_noise) throw InputError("`protocol=paper` has fixed noise: leave out `noise_std=estimate`");
   if (paper && options.base == Latent::Base::force) {
-    throw InputError("--protocol paper has its prior on the acceleration: leave out --prior force");
+    throw InputError("`protocol=paper` has its prior on the acceleration: leave out `prior=force`");
   }
   FitProblem problem;
   problem.robust = options.robust;
@@ -253,15 +246,7 @@ FitProblem make_fit_problem(const Model& model, const std::vector<Log>& logs, co
   for (const SideInformation& side_information : also) tables.push_back(&side_information.log.table);
   check_columns(*model.system, tables, options.columns);
 
-  // what is tuned
-  std::vector<std::string> estimate;
-  if (options.estimate) {
-    estimate = *options.estimate;
-  } else {
-    for (const Parameter& parameter : model.system->parameters()) {
-      if (parameter.estimate) estimate.push_back(parameter.name);
-    }
-  }
+  const std::vector<std::string> estimate = estimated_parameters(*model.system, options);
 
   // what is measured
   const auto logged_at = [&](const Log& log) {
@@ -278,8 +263,8 @@ FitProblem make_fit_problem(const Model& model, const std::vector<Log>& logs, co
   const bool needs_step = std::any_of(also.begin(), also.end(), [](const SideInformation& side_information) {
     return side_information.quantity->needs_time_step();
   });
-  if (options.time_step && !needs_step) throw InputError("--dt goes with --also next-velocity:FILE.csv");
-  if (options.also_noise_stddev && also.empty()) throw InputError("--also-noise-std goes with --also VIEW:FILE.csv");
+  if (options.time_step && !needs_step) throw InputError("`dt` goes with `also=next-velocity:FILE.csv`");
+  if (options.also_noise_stddev && also.empty()) throw InputError("`also_noise_std` goes with `also=VIEW:FILE.csv`");
   if (!also.empty()) {
     const std::vector<VectorXd> signal_stddev = default_scales(problem.prior, trusted_observations(problem)).signal_stddev;
     for (const SideInformation& side_information : also) {
@@ -299,7 +284,7 @@ FitProblem make_fit_problem(const Model& model, const std::vector<Log>& logs, co
       problem.observations[g] = problem.observations[g].with_view(std::move(view));
     }
   }
-  problem.hyperparameters = default_hyperparameters(problem.prior, trusted_observations(problem), estimate, options.protocol);
+  problem.hyperparameters = starting_hyperparameters(problem, options);
   return problem;
 }
 

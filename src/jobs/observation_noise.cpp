@@ -103,7 +103,7 @@ MatrixXd stated_noise(const std::vector<std::string>& observed, const FitProblem
   if (stated.empty()) return {};
   const std::vector<std::string> columns = stddev_columns(stated, reader);
   if (options.noise_stddev) {
-    notes.push_back(fmt::format("{}: --noise-std {} stands for the deviations in {}", log.name(), *options.noise_stddev,
+    notes.push_back(fmt::format("{}: `noise_std={}` stands for the deviations in {}", log.name(), *options.noise_stddev,
                                 fmt::join(columns, ", ")));
     return {};
   }
@@ -120,7 +120,7 @@ MatrixXd stated_noise(const std::vector<std::string>& observed, const FitProblem
 VectorXd noise_of(const Model& model, const FitProblemOptions& options, const Readings& readings, bool estimate) {
   const VectorXd spread = spread_of(readings, options);
   const std::vector<std::string> names = readings.view.names(*model.system);
-  const std::string source = options.noise_stddev ? "--noise-std" : model.name + ": [noise] ddq";
+  const std::string source = options.noise_stddev ? "`noise_std`" : model.name + ": [noise] ddq";
   VectorXd stddev(readings.view.size());
   for (Index k = 0; k < stddev.size(); ++k) {
     const auto row = static_cast<std::size_t>(readings.view.rows[static_cast<std::size_t>(k)]);
@@ -137,8 +137,8 @@ VectorXd noise_of(const Model& model, const FitProblemOptions& options, const Re
       stddev[k] = 0.05 * (spread[k] > 0 ? spread[k] : 1);
     } else {
       throw InputError(
-          fmt::format("{}: the noise of {} is not known: write [noise] ddq = … in the model, or give --noise-std S or "
-                      "--noise-std estimate",
+          fmt::format("{}: the noise of {} is not known: write [noise] ddq = … in the model, or give `noise_std=S` or "
+                      "`noise_std=estimate`",
                       model.name, name));
     }
     NoiseRule{source, name, spread[k], static_cast<int>(readings.states.cols())}.require(stddev[k], estimate);
@@ -170,10 +170,10 @@ VectorXd noise_of_side_information(const LoggedSystem& logged, const SideInforma
                                    const std::vector<VectorXd>& signal_stddev) {
   const std::vector<double>& of_model = logged.model.noise.stddev;
   if (!options.also_noise_stddev && (!side_information.quantity->is_acceleration() || of_model.empty())) {
-    throw InputError(fmt::format("--also {}: {}: its noise is not known: give --also-noise-std S",
+    throw InputError(fmt::format("`also={}`: {}: its noise is not known: give `also_noise_std=S`",
                                  side_information.quantity->word(), side_information.log.table.name()));
   }
-  const std::string source = options.also_noise_stddev ? "--also-noise-std" : logged.model.name + ": [noise] ddq";
+  const std::string source = options.also_noise_stddev ? "`also_noise_std`" : logged.model.name + ": [noise] ddq";
   const std::vector<std::string> names = readings.view.names(logged.system(), side_information.latent);
   const VectorXd signal = signal_size(logged, readings, signal_stddev);
   VectorXd stddev(readings.view.size());

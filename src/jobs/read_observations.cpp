@@ -154,7 +154,7 @@ void project(const LoggedSystem& logged, const CsvTable& log, MatrixXd& states, 
     try {
       return project_states(system, logged.parameters, states);
     } catch (const InputError& error) {
-      throw InputError(fmt::format("--project: {}: {}", log.name(), error.what()));
+      throw InputError(fmt::format("`project`: {}: {}", log.name(), error.what()));
     }
   }();
   if (!projected.failures.empty()) {
@@ -164,7 +164,7 @@ void project(const LoggedSystem& logged, const CsvTable& log, MatrixXd& states, 
     }
     if (lines.size() < projected.failures.size()) lines.emplace_back("…");
     throw InputError(fmt::format(
-        "--project: {}: {} of {} states have no state on the constraints near them (line {}): {}; mend or leave out "
+        "`project`: {}: {} of {} states have no state on the constraints near them (line {}): {}; mend or leave out "
         "these rows, or see gp2 check",
         log.name(), projected.failures.size(), log.n_rows(), fmt::join(lines, ", "), projected.failures.front().text));
   }
@@ -187,7 +187,7 @@ std::vector<std::string> observed_accelerations(const System& system, const FitP
   if (!options.observe.empty() || options.baseline) return options.observe;
   std::vector<std::string> stated = stated_accelerations(system, reader);
   if (!stated.empty() && stated.size() < system.coordinates().size()) {
-    notes.push_back(fmt::format("{}: observes {}: the log gives the deviations of these alone; others with --observe", log.name(),
+    notes.push_back(fmt::format("{}: observes {}: the log gives the deviations of these alone; others with `observe`", log.name(),
                                 fmt::join(stated, ", ")));
   }
   return stated;
@@ -213,7 +213,7 @@ void note_dependence(const LoggedSystem& logged, const MatrixXd& states, const M
   for (int row : *independent) names.push_back(every[static_cast<std::size_t>(row)]);
   notes.push_back(
       fmt::format("warning: {}: the accelerations obey A ddq = b to rounding: they are not {} independent "
-                  "measurements but {}; observe independent rows only, say --observe {}",
+                  "measurements but {}; observe independent rows only, say `observe={}`",
                   log.name(), every.size(), independent->size(), fmt::join(names, ",")));
 }
 
@@ -240,7 +240,7 @@ void check_columns(const System& system, const std::vector<const CsvTable*>& log
   for (const std::string& name : system.acceleration_names()) known.push_back(name);
   for (const auto& [name, column] : columns) {
     if (std::find(known.begin(), known.end(), name) == known.end()) {
-      throw InputError(fmt::format("--map {}={}: '{}' is neither a state nor an acceleration of '{}'; it has: {}", column, name,
+      throw InputError(fmt::format("`map={}={}`: '{}' is neither a state nor an acceleration of '{}'; it has: {}", column, name,
                                    name, system.name(), fmt::join(known, ", ")));
     }
     // a log may lack a coordinate that nothing reads, but then it has the coordinate's derivatives
@@ -254,7 +254,7 @@ void check_columns(const System& system, const std::vector<const CsvTable*>& log
       if (std::any_of(meant.begin(), meant.end(), [&](const std::string& one) { return log->find(one) >= 0; })) break;
       lacking.push_back(fmt::format("{} has no column '{}'; it has: {}", log->name(), column, fmt::join(log->header(), ", ")));
     }
-    if (lacking.size() == logs.size()) throw InputError(fmt::format("--map {}={}: {}", column, name, fmt::join(lacking, "; ")));
+    if (!logs.empty() && lacking.size() == logs.size()) throw InputError(fmt::format("`map={}={}`: {}", column, name, fmt::join(lacking, "; ")));
   }
 }
 
@@ -273,7 +273,7 @@ Observations read_log(const LoggedSystem& logged, const Log& log, const FitProbl
   Readings readings;
   const std::vector<std::string> observe = observed_accelerations(system, options, reader, log.table, notes);
   readings.view = {
-      View::Quantity::constrained_acceleration, acceleration_rows(system, observe, "--observe"), {}, {}, logged.other_system};
+      View::Quantity::constrained_acceleration, acceleration_rows(system, observe, "`observe`"), {}, {}, logged.other_system};
   readings.states = states_of(logged.prior, readings.view, reader, options.project);
   const std::vector<std::string> observed = readings.view.names(system);
   readings.values = reader.measurements(observed);
@@ -314,15 +314,15 @@ Observations read_side_information(const LoggedSystem& logged, const Prior& fitt
                                    std::vector<int>& lines, std::vector<std::string>& notes) {
   const System& system = logged.system();
   const CsvTable& table = side_information.log.table;
-  const std::string option = "--also " + side_information.quantity->word();
+  const std::string option = "`also=" + side_information.quantity->word() + "`";
   Readings readings;
   View& view = readings.view;
   view = View::all(side_information.quantity, system);
   view.other_system = logged.other_system;
   if (!side_information.latent.empty()) view.latent = latent_index(fitted, side_information.latent, option);
   if (side_information.quantity->needs_time_step()) {
-    if (!options.time_step) throw InputError(option + " needs the time step: --dt SECONDS");
-    if (!(*options.time_step > 0)) throw InputError(fmt::format("--dt: must be positive, got {}", *options.time_step));
+    if (!options.time_step) throw InputError(option + " needs the time step: `dt=SECONDS`");
+    if (!(*options.time_step > 0)) throw InputError(fmt::format("`dt`: must be positive, got {}", *options.time_step));
     view.time_step = options.time_step;
   }
   LogReader reader(table, system, columns_of(logged.model, options.columns));
@@ -368,9 +368,14 @@ int latent_index(const Prior& prior, const std::string& name, const std::string&
   return static_cast<int>(found - names.begin());
 }
 
+std::map<std::string, std::string> checked_columns(const Model& model, const std::vector<const CsvTable*>& logs,
+                                                   const std::map<std::string, std::string>& columns) {
+  check_columns(*model.system, logs, columns);
+  return columns_of(model, columns);
+}
+
 LogReader open_log(const Model& model, const CsvTable& log, const std::map<std::string, std::string>& columns) {
-  check_columns(*model.system, {&log}, columns);
-  return {log, *model.system, columns_of(model, columns)};
+  return {log, *model.system, checked_columns(model, {&log}, columns)};
 }
 
 LogStates read_log_states(const Prior& prior, const View& view, const Model& model, const CsvTable& log,

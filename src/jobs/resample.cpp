@@ -57,7 +57,7 @@ Features features_of(const Model& model, const std::vector<std::string>& asked) 
       try {
         values.push_back(graph.substitute(model.expression(name), parameter_values));
       } catch (const InputError& error) {
-        throw InputError(fmt::format("--features: '{}': {}", written, error.what()));
+        throw InputError(fmt::format("`features`: '{}': {}", written, error.what()));
       }
       features.names.push_back(name);
     }
@@ -79,6 +79,15 @@ MatrixXd standardised(const MatrixXd& values) {
 }
 
 }  // namespace
+
+std::vector<Option> options(ResampleOptions& options) {
+  return {
+      {"features", &options.features, "q1,dq1,…", "expressions of the model's symbols to measure by",
+       "the features of the model's first latent"},
+      {"seed", &options.seed, "S", "start at a random row", "at the row nearest to the mean"},
+      {"map", &options.columns, "LOGNAME=NAME,…", "columns by other names", "", "columns"},
+  };
+}
 
 Resample resample(const Model& model, const CsvTable& log, const ResampleOptions& options) {
   if (options.n < 1) throw InputError(fmt::format("resample: n must be positive, got {}", options.n));

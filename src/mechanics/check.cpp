@@ -480,7 +480,7 @@ std::vector<Finding> check_data(const System& system, const Ref<const MatrixXd>&
     for (int row : *rows) names.push_back(every[static_cast<std::size_t>(row)]);
     findings.push_back(
         {Level::warning, fmt::format("dependent columns: the {} accelerations obey A ddq = b to rounding, so only {} of them are "
-                                     "independent measurements: fit with --observe {}",
+                                     "independent measurements: fit with `observe={}`",
                                      system.nq(), rows->size(), fmt::join(names, ","))});
   }
   return findings;

@@ -172,7 +172,7 @@ Prior make_prior(const Model& model, const PriorOptions& options) {
   const SystemSymbols symbols = model.symbols();
   if (options.base && model.latents.size() > 1) {
     throw InputError(
-        fmt::format("{}: --prior replaces the directions of the one [[latent]], but this model has {}: edit the model "
+        fmt::format("{}: `prior` replaces the directions of the one [[latent]], but this model has {}: edit the model "
                     "file instead",
                     model.name, model.latents.size()));
   }

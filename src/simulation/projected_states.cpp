@@ -90,7 +90,7 @@ std::vector<Finding> check_states(const System& system, const Ref<const MatrixXd
   }
   if (!shifts.empty()) {
     findings.push_back(
-        {Level::good, fmt::format("the nearest states on the constraints, to which fit --project moves, differ in {}",
+        {Level::good, fmt::format("the nearest states on the constraints, to which fit `project` moves, differ in {}",
                                   fmt::join(shifts, ", "))});
   }
   if (!projected.failures.empty()) {
@@ -100,7 +100,7 @@ std::vector<Finding> check_states(const System& system, const Ref<const MatrixXd
     }
     if (rows.size() < projected.failures.size()) rows.emplace_back("…");
     findings.push_back(
-        {Level::warning, fmt::format("{} states have no state on the constraints near them: rows {}; fit --project "
+        {Level::warning, fmt::format("{} states have no state on the constraints near them: rows {}; fit `project` "
                                      "refuses them",
                                      projected.failures.size(), fmt::join(rows, ", "))});
   }

@@ -36,7 +36,7 @@ Eigen::VectorXd complete_start(const Model& model, const Eigen::VectorXd& parame
   try {
     state = project_onto_constraints(system, parameters, start.state, start.given);
   } catch (const NumericalError& error) {
-    notes.push_back(fmt::format("--start: what is given leaves no solution of the constraints ({})", error.what()));
+    notes.push_back(fmt::format("`start`: what is given leaves no solution of the constraints ({})", error.what()));
     return start.state;
   }
   std::vector<int> solved;

@@ -163,7 +163,7 @@ int ConstrainedStates::redundancy(const VectorXd& state) const {
   if (!open.empty()) {
     throw InputError(
         fmt::format("the log has no column for {0}, and the constraints of '{1}' do not decide {2} from what it has; log {0}, or "
-                    "name its column with --map LOGNAME={0}",
+                    "name its column with `map=LOGNAME={0}`",
                     fmt::join(open, ", "), system_.name(), open.size() > 1 ? "them" : "it"));
   }
   return static_cast<int>(rank_of(A) - rank_of(A(Eigen::all, free_)));

@@ -160,14 +160,14 @@ int estimable_parameter(const Prior& prior, const std::string& name) {
   if (index < 0) {
     std::string known;
     for (const Parameter& parameter : system.parameters()) known += (known.empty() ? "" : ", ") + parameter.name;
-    throw InputError(fmt::format("--estimate: the model '{}' has no parameter '{}'; it has: {}", system.name(), name,
+    throw InputError(fmt::format("`estimate`: the model '{}' has no parameter '{}'; it has: {}", system.name(), name,
                                  known.empty() ? "none" : known));
   }
   for (const Latent& latent : prior.latents) {
     const std::vector<int>& used = latent.feature_parameters;
     if (std::find(used.begin(), used.end(), index) == used.end()) continue;
     throw InputError(
-        fmt::format("--estimate: parameter '{}' stands in a feature of the latent '{}', and features hold no estimated "
+        fmt::format("`estimate`: parameter '{}' stands in a feature of the latent '{}', and features hold no estimated "
                     "parameters; write the feature without it, or leave it out",
                     name, latent.name));
   }

@@ -93,7 +93,7 @@ void note_distance(double distance, std::vector<UncertaintyNote>& notes) {
                    fmt::format("the standard errors are rough: the optimiser stopped {}",
                                std::isfinite(distance) ? fmt::format("{:.2g} standard deviations before the optimum", distance)
                                                        : "where no optimum is near"),
-                   "Fit with a larger --max-iterations, or --start from this fit"});
+                   "Fit with a larger `max_iterations`, or `start` from this fit"});
 }
 
 // Parameters that the data do not determine. Without hyper-priors combinations of other hyperparameters may be open too: of no

@@ -241,5 +241,19 @@ TEST(SimulateRefusals, AMotionThatCannotBeContinuedExitsWith1AndNamesTheTime) {
   EXPECT_FALSE(desk.has("motion.csv"));
 }
 
+TEST_F(SimulateFit, MapRefusesNamesThatNobodyHas) {
+  const auto refusal = [&](const std::string& options) {
+    const Outcome outcome = desk.run("gp2 simulate fit.json --t-end 0.1 -o motion.csv " + options);
+    EXPECT_EQ(outcome.status, 2) << options;
+    return outcome.err;
+  };
+  EXPECT_THAT(refusal("--start train.csv --map nosuch=q99"), HasSubstr("--map nosuch=q99: 'q99' is neither a state nor"));
+  EXPECT_THAT(refusal("--start train.csv --map nosuch=q1"), HasSubstr("--map nosuch=q1: train.csv has no column 'nosuch'"));
+  EXPECT_THAT(refusal(figure_start + " --map nosuch=q99"), HasSubstr("'q99' is neither"));
+  // of two logs one may lack the column
+  desk.write("inputs.csv", "t,push,u2,u3\n0,1,0,0\n1,1,0,0\n");
+  desk.done("gp2 simulate fit.json --start train.csv --inputs inputs.csv --map push=u1 --t-end 0.1 -o motion.csv");
+}
+
 }  // namespace
 }  // namespace gp2::test

@@ -119,8 +119,7 @@ TEST_F(LogReaderTest, TwoCoordinatesMayTradeNames) {
 TEST_F(LogReaderTest, AMissingColumnIsRefusedWithWhatWasTriedAndWhatThereIs) {
   EXPECT_EQ(input_error_of([&] { state("q1,remark\n1,x\n", "dq2"); }),
             "log.csv: missing column 'dq2' (looked for dq2, qd2, v2, qvel2, q2_dot); the file has: q1, remark. Rename it, or "
-            "give --map "
-            "LOGNAME=dq2");
+            "give `map=LOGNAME=dq2`");
   EXPECT_THAT(input_error_of([&] {
                 state("q1\n1\n", "q2", {{"q2", "theta"}});
               }),

@@ -97,7 +97,7 @@ TEST(MissingValuesFileTest, WhatIsNoNumberStaysAnError) {
   EXPECT_EQ(input_error_of([] {
               problem_of(log_of({{"ddq2", -1, ""}}));
             }),
-            "log.csv: column 'ddq2': every cell is empty, so nothing is measured there; observe others (--observe)");
+            "log.csv: column 'ddq2': every cell is empty, so nothing is measured there; observe others (`observe`)");
   FitProblemOptions others;
   others.observe = {"ddq1", "ddq3"};
   EXPECT_EQ(problem_of(log_of({{"ddq2", -1, ""}}), others).observations.front().values().rows(), 2);
@@ -237,17 +237,17 @@ ddq = 0.1
   options.project = true;
   EXPECT_THAT(
       input_error_of([&] { make_fit_problem(circle, CsvTable::parse("x,dx,ddx\n0.5,0,1\n0.7,0,2\n", "log.csv"), options); }),
-      HasSubstr("--project: log.csv: 2 of 2 states have no state on the constraints near them (line 2, 3): system"));
+      HasSubstr("`project`: log.csv: 2 of 2 states have no state on the constraints near them (line 2, 3): system"));
   const Model free = Model::parse(test::model("models/duffing.toml").text, "duffing.toml");
   if (free.system->residual_labels().empty()) {
     const CsvTable log = as_table(generate(free, {5, seed, VectorXd::Zero(free.system->nq())}), *free.system, "log.csv");
     EXPECT_THAT(make_fit_problem(free, log, options).notes, Contains(HasSubstr("log.csv: nothing to project: '")));
   }
   options.baseline = Baseline::Kind::se;
-  EXPECT_EQ(input_error_of([&] { problem_of(log_of({}), options); }), "--baseline se knows no constraints: leave out --project");
+  EXPECT_EQ(input_error_of([&] { problem_of(log_of({}), options); }), "`baseline=se` knows no constraints: leave out `project`");
   options.project = false;
   options.robust = true;
-  EXPECT_EQ(input_error_of([&] { problem_of(log_of({}), options); }), "--baseline se is fitted as published: leave out --robust");
+  EXPECT_EQ(input_error_of([&] { problem_of(log_of({}), options); }), "`baseline=se` is fitted as published: leave out `robust`");
 }
 
 // ---------------------------------------------------------------- --robust

@@ -9,7 +9,7 @@
 #include <nlohmann/json.hpp>
 
 #include "gp2/base/version.hpp"
-#include "gp2/jobs/fit_problem.hpp"
+#include "gp2/jobs/fit_job.hpp"
 #include "gp2/simulation/generate.hpp"
 #include "io_testing.hpp"
 #include "observations_testing.hpp"
@@ -188,43 +188,8 @@ TEST(FitFile, TheSameFitGivesTheSameBytes) {
 }
 
 TEST(FitFile, TellsWhatWasAskedOfTheFit) {
-  FitProblemOptions asked;
-  FitOptions options;
-  EXPECT_EQ(Json::parse(fit_options_json(asked, options)),
-            Json::parse(R"({"discrepancy": "default", "gradient_tolerance": 1e-5, "hyperprior": "default", "max_escapes": 5,
-                            "max_iterations": 1000, "mean": "zero", "protocol": "default", "reduction_tolerance": 1e-12,
-                            "restarts": 5, "seed": 0, "standard_errors": true})"));
-  asked.columns = {{"q3", "theta1"}};
-  asked.observe = {"ddq1", "ddq3"};
-  asked.mean = Prior::Mean::force;
-  asked.base = Latent::Base::force;
-  asked.baseline = Baseline::Kind::icm;
-  asked.estimate = std::vector<std::string>();
-  asked.noise_stddev = 0.1;
-  asked.protocol = {Protocol::Name::paper, false};
-  asked.discrepancy = false;
-  asked.max_points = 30;
-  asked.also_noise_stddev = 0.2;
-  asked.time_step = 0.01;
-  options.seed = 18446744073709551615U;
-  options.n_restarts = 3;
-  const std::string text = fit_options_json(asked, options, {[] {
-                                              Hyperparameter h;
-                                              h.name = "m2";
-                                              h.value = 0.7;
-                                              return h;
-                                            }()});
-  EXPECT_EQ(Json::parse(text), Json::parse(R"({"also_noise_std": 0.2, "baseline": "icm", "discrepancy": "none", "dt": 0.01,
-      "estimate": [], "gradient_tolerance": 1e-5, "hyperprior": "none", "map": ["theta1=q3"], "max_escapes": 5,
-      "max_iterations": 1000, "max_points": 30, "mean": "force", "noise_std": 0.1, "observe": ["ddq1", "ddq3"],
-      "prior": "force", "protocol": "paper", "reduction_tolerance": 1e-12, "restarts": 3, "seed": 18446744073709551615, "standard_errors": true,
-      "start": {"m2": 0.7}})"));
-  asked.estimate_noise = true;
-  EXPECT_EQ(Json::parse(fit_options_json(asked, options))["noise_std"], "estimate");
-  asked.estimate_noise = false;
-  asked.trust_stated_noise = true;
-  EXPECT_EQ(Json::parse(fit_options_json(asked, options))["noise_std"], "stated");
-
+  FitRequest request;
+  const std::string text = options_json(options(request));
   FitFile fit = fit_of(unicycle());
   EXPECT_EQ(written_and_read(fit).options, "");
   fit.options = text;
@@ -319,7 +284,8 @@ ddq = 0.1
 )",
                                    "m.toml");
   FitFile fit = fit_of(model, {{}, {}, false, 2});
-  fit.options = fit_options_json({}, {});
+  FitRequest request;
+  fit.options = options_json(options(request));
   const TemporaryFolder folder;
   fit.write(folder / "small.json");
   return read_file(folder / "small.json");

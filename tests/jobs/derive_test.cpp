@@ -126,7 +126,7 @@ TEST(Derive, ConstraintsAmongMeasuredCoordinatesAreHeldAndMakeThemMoreExact) {
   EXPECT_THAT(free.independent, ElementsAre(0, 1, 2, 3, 4, 5));
   EXPECT_THAT(free.notes,
               Contains(HasSubstr(
-                  "4 of the constraints hold among the measured coordinates alone: --hold-constraints makes use of that")));
+                  "4 of the constraints hold among the measured coordinates alone: `hold_constraints` makes use of that")));
   EXPECT_EQ(held.independent.size(), 2U);
 
   const VectorXd parameters = system.parameter_values();
@@ -159,7 +159,7 @@ TEST(Derive, OfRedundantAndMissingCoordinatesTheConstraintsAreHeld) {
   EXPECT_THAT([&] { derive(pendulum(), log); },
               testing::ThrowsMessage<InputError>(
                   HasSubstr("1 of the constraints holds among the measured coordinates alone, which noise contradicts, "
-                            "so that q2, q4, q5 cannot be solved for; hold the constraints (--hold-constraints)")));
+                            "so that q2, q4, q5 cannot be solved for; hold the constraints (`hold_constraints`)")));
 }
 
 TEST(Derive, GapsMissingCellsAndRepeatedRowsAreCountedAndBridged) {
@@ -301,7 +301,7 @@ TEST(Derive, SaysWhatIsWrongWithALog) {
   EXPECT_THAT(
       fault(cart_log([](auto&) {}, {"t", "angle"})),
       HasSubstr(
-          "log.csv: no column is a coordinate of 'cart' (q1); the file has: t, angle. Rename them, or give --map LOGNAME=q1"));
+          "log.csv: no column is a coordinate of 'cart' (q1); the file has: t, angle. Rename them, or give `map=LOGNAME=q1`"));
   EXPECT_THAT(fault(cart_log(), {.episode_column = "run"}),
               HasSubstr("episode column: log.csv has no column 'run'; it has: t, q1"));
   EXPECT_THAT(fault(cart_log(), {.episodes = {"3"}}), HasSubstr("episodes: log.csv has no column 'episode' to choose from"));

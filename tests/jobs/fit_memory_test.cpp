@@ -98,10 +98,10 @@ TEST(WithinMemory, ThatHoldsNoneIsToldTheRowsThatFit) {
   std::vector<std::string> notes;
   const std::string error = input_error_of([&] { within_memory(problem_of(10000), on_threads(4), 0.5 * gigabyte, notes); });
   EXPECT_THAT(error, AllOf(HasSubstr("the fit of 10000 rows factors a matrix of size 20000 and takes "),
-                           HasSubstr("GB of memory, of which 0.5 GB are free"), HasSubstr("take so many with --max-points "),
+                           HasSubstr("GB of memory, of which 0.5 GB are free"), HasSubstr("take so many with `max_points="),
                            HasSubstr("or choose them with gp2 resample")));
   // so many fit, and not many more
-  const int most = std::stoi(error.substr(error.find("--max-points ") + 13));
+  const int most = std::stoi(error.substr(error.find("`max_points=") + 12));
   EXPECT_GT(most, 1000);
   EXPECT_EQ(within_memory(problem_of(most), on_threads(1), 0.5 * gigabyte, notes).max_side_by_side, 0);
   EXPECT_NE(input_error_of([&] { within_memory(problem_of(most + most / 10), on_threads(1), 0.5 * gigabyte, notes); }), "");

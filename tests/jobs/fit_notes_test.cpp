@@ -57,7 +57,7 @@ TEST(FitNotes, TellWhichStatesTheConstraintsDoNotKnow) {
   const Model model = cart("[constraints]\nposition = ['y - sqrt(x)']\n");
   const CsvTable log = CsvTable::parse("x,y,dx,dy,ddx,ddy\n1,1,2,1,0,0\n-2,4,6,0,1,1\n", "log.csv");
   EXPECT_THAT(input_error_of([&] { problem_of(model, log); }),
-              AllOf(StartsWith("--project: log.csv: 1 of 2 states have no state on the constraints near them (line 3): "),
+              AllOf(StartsWith("`project`: log.csv: 1 of 2 states have no state on the constraints near them (line 3): "),
                     HasSubstr("the constraint \"y - sqrt(x)\" is not a number there")));
 }
 

@@ -199,7 +199,7 @@ TEST(Resample, SaysWhatItCannotDo) {
   EXPECT_EQ(refused(choose(0)), "resample: n must be positive, got 0");
   EXPECT_EQ(refused(choose(3)), "log.csv: has 2 rows with a number in every feature, of 3, fewer than the n = 3 asked for");
   EXPECT_EQ(refused(choose(4, {"a"})), "log.csv: has 3 rows, fewer than the n = 4 asked for");
-  EXPECT_THAT(refused(choose(1, {"x", "q7"})), HasSubstr("--features: 'q7': "));
+  EXPECT_THAT(refused(choose(1, {"x", "q7"})), HasSubstr("`features`: 'q7': "));
   EXPECT_THAT(refused(choose(1, {"dx"})), HasSubstr("log.csv: missing column 'dx'"));
   const CsvTable words = CsvTable::parse("x,a\n0,0\nfar,1\n", "log.csv");
   EXPECT_EQ(input_error_of([&] { resample(model(), words, choose(1)); }), "log.csv:3: column 'x': 'far' is not a finite number");

@@ -146,7 +146,7 @@ TEST(Model, DirectionsMayBeReplacedWhereThereIsOneLatent) {
   EXPECT_EQ(input_error_of([&] {
               make_prior(parse(base + latent + latent), {Prior::Mean::zero, Latent::Base::force});
             }),
-            "m.toml: --prior replaces the directions of the one [[latent]], but this model has 2: edit the model file instead");
+            "m.toml: `prior` replaces the directions of the one [[latent]], but this model has 2: edit the model file instead");
 }
 
 TEST(Model, LatentsKeepWhatIsWritten) {

@@ -158,7 +158,7 @@ TEST(PooledProblem, HasAGroupPerLogEachUnderItsOwnSystem) {
       make_fit_problem(model, {Log{table(model, 8, 1, "a.csv")}, Log{table(*other, 4, 2, "b.csv"), other}}, {}, options);
   ASSERT_EQ(problem.observations.size(), 2U);
   EXPECT_EQ(problem.observations[0].view().other_system, nullptr);
-  EXPECT_EQ(problem.observations[0].n_data(), 5) << "--max-points is of each log";
+  EXPECT_EQ(problem.observations[0].n_data(), 5) << "max_points is of each log";
   const Observations& b = problem.observations[1];
   ASSERT_NE(b.view().other_system, nullptr);
   EXPECT_EQ(b.view().other_system->prior.system, other->system);
@@ -221,7 +221,7 @@ TEST(PooledProblem, ARenamingMustBeOfSomeLog) {
       input_error_of([&] {
         make_fit_problem(model, {Log{table(model, 8, 1, "a.csv")}, Log{renamed}}, {}, options);
       }),
-      "--map Z=x: a.csv has no column 'Z'; it has: x, y, dx, dy, u, ddx, ddy; b.csv has no column 'Z'; it has: X, dX, u, ddX, "
+      "`map=Z=x`: a.csv has no column 'Z'; it has: x, y, dx, dy, u, ddx, ddy; b.csv has no column 'Z'; it has: X, dX, u, ddX, "
       "ddy");
 }
 
@@ -261,7 +261,7 @@ TEST(KnownViews, TakeTheModelsNoiseForAccelerationsOnly) {
   SideInformation force = at_rest("fc_x", "0");
   force.quantity = Quantity::constraint_force;
   EXPECT_EQ(input_error_of([&] { make_fit_problem(model, logs, {force}, {}); }),
-            "--also constraint-force: rest.csv: its noise is not known: give --also-noise-std S");
+            "`also=constraint-force`: rest.csv: its noise is not known: give `also_noise_std=S`");
 }
 
 TEST(KnownViews, ConstantsAreKnownNoBetterThanDoublesCanHold) {
@@ -273,9 +273,9 @@ TEST(KnownViews, ConstantsAreKnownNoBetterThanDoublesCanHold) {
     return input_error_of([&] { make_fit_problem(model, logs, {at_rest()}, options); });
   };
   EXPECT_EQ(refusal(1e-5), "");
-  EXPECT_THAT(refusal(1e-9), AllOf(HasSubstr("--also-noise-std: the noise standard deviation 1e-09 of abar_x is too small"),
+  EXPECT_THAT(refusal(1e-9), AllOf(HasSubstr("`also_noise_std`: the noise standard deviation 1e-09 of abar_x is too small"),
                                    HasSubstr("the smallest usable value is")));
-  EXPECT_EQ(refusal(0), "--also-noise-std: the noise standard deviation of abar_x must be positive, got 0");
+  EXPECT_EQ(refusal(0), "`also_noise_std`: the noise standard deviation of abar_x must be positive, got 0");
 }
 
 TEST(KnownViews, RefuseWhatCannotBeMeant) {
@@ -288,22 +288,22 @@ TEST(KnownViews, RefuseWhatCannotBeMeant) {
     return input_error_of([&] { make_fit_problem(model, logs, {knowledge}, options); });
   };
   EXPECT_EQ(refusal(at_rest("abar_z", "0")),
-            "--also unconstrained: rest.csv has none of the columns abar_x, abar_y; it has: x, dx, u, abar_z");
+            "`also=unconstrained`: rest.csv has none of the columns abar_x, abar_y; it has: x, dx, u, abar_z");
   SideInformation unknown = at_rest();
   unknown.latent = "lift";
-  EXPECT_EQ(refusal(unknown), "--also unconstrained: no latent is called 'lift'; there is: drag");
-  EXPECT_EQ(refusal(at_rest("dx_next", "0"), Quantity::next_velocity), "--also next-velocity needs the time step: --dt SECONDS");
+  EXPECT_EQ(refusal(unknown), "`also=unconstrained`: no latent is called 'lift'; there is: drag");
+  EXPECT_EQ(refusal(at_rest("dx_next", "0"), Quantity::next_velocity), "`also=next-velocity` needs the time step: `dt=SECONDS`");
   options.time_step = -1;
-  EXPECT_EQ(refusal(at_rest("dx_next", "0"), Quantity::next_velocity), "--dt: must be positive, got -1");
-  EXPECT_EQ(refusal(at_rest()), "--dt goes with --also next-velocity:FILE.csv");
+  EXPECT_EQ(refusal(at_rest("dx_next", "0"), Quantity::next_velocity), "`dt`: must be positive, got -1");
+  EXPECT_EQ(refusal(at_rest()), "`dt` goes with `also=next-velocity:FILE.csv`");
   options.time_step.reset();
   EXPECT_EQ(input_error_of([&] { make_fit_problem(model, logs, {}, options); }),
-            "--also-noise-std goes with --also VIEW:FILE.csv");
+            "`also_noise_std` goes with `also=VIEW:FILE.csv`");
   const Model free = Model::parse("coordinates = [\"x\"]\n[mechanics]\nmass = [[2]]\n[noise]\nddq = 0.1\n", "free.toml");
   SideInformation lambda{Quantity::multipliers, "", Log{CsvTable::parse("x,dx,lambda1\n0,0,1\n", "l.csv")}};
   EXPECT_EQ(input_error_of(
                 [&] { make_fit_problem(free, {Log{CsvTable::parse("x,dx,ddx\n0,0,1\n1,2,3\n", "a.csv")}}, {lambda}, options); }),
-            "--also multipliers: 'free.toml' has no constraints");
+            "`also=multipliers`: 'free.toml' has no constraints");
 }
 
 // ---- there and back

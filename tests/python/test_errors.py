@@ -1,6 +1,7 @@
-"""Exceptions carry the text of the command; warnings are Python's."""
+"""Exceptions carry the text of the command, with keywords for its options; warnings are Python's."""
 
 import logging
+import re
 import warnings
 
 import numpy as np
@@ -29,6 +30,14 @@ def said(command):
         return outcome.stderr.split(mark, 1)[1].rstrip("\n")
 
     return said
+
+
+def with_keywords(text):
+    """What the command says, with its options as Python has them."""
+    text = re.sub(r"--map (\w+)=(\w+)", r"columns={'\2': '\1'}", text)
+    text = re.sub(r"--(protocol|noise-std|prior|view) ([a-z-]+)", lambda m: f"{m[1]}='{m[2]}'".replace("noise-", "noise_"), text)
+    text = re.sub(r"--([a-z-]+) (S|SECONDS)\b", lambda m: f"{m[1].replace('-', '_')}={m[2]}", text)
+    return re.sub(r"--([a-z-]+)", lambda m: m[1].replace("-", "_"), text)
 
 
 def text_of(call):
@@ -87,7 +96,7 @@ def test_a_mistake_in_a_fit_reads_as_the_command_says_it(spoil, options, said, a
         arguments += [f"--{name}", ",".join(value) if isinstance(value, list) else value]
     expected = said("fit", MODELS / "arm_on_moving_plane.toml", "--data", path, *arguments, "-o", "fit.json")
     keywords = {name.replace("-", "_"): value for name, value in options.items()}
-    assert text_of(lambda: gp2.fit(arm, path, **keywords)) == expected
+    assert text_of(lambda: gp2.fit(arm, path, **keywords)) == with_keywords(expected)
 
 
 def test_a_mistake_in_a_file_reads_as_the_command_says_it(said, arm_fit_file, log_file, tmp_path):
@@ -104,8 +113,9 @@ def test_a_mistake_in_a_file_reads_as_the_command_says_it(said, arm_fit_file, lo
 def test_a_mistake_in_a_prediction_reads_as_the_command_says_it(said, posterior, arm_fit_file, arm_log, tmp_path):
     states = {name: values for name, values in columns_of(arm_log).items() if name != "delbow"}
     path = write_csv(tmp_path / "states.csv", states)
-    assert text_of(lambda: posterior.predict(path)) == said("predict", arm_fit_file, "--states", path, "-o", "out.csv")
-    assert text_of(lambda: posterior.evaluate(path)) == said("evaluate", arm_fit_file, "--data", path)
+    expected = said("predict", arm_fit_file, "--states", path, "-o", "out.csv")
+    assert text_of(lambda: posterior.predict(path)) == with_keywords(expected)
+    assert text_of(lambda: posterior.evaluate(path)) == with_keywords(said("evaluate", arm_fit_file, "--data", path))
     other = said("predict", arm_fit_file, "--states", path, "--system", SURFACE, "-o", "out.csv")
     assert text_of(lambda: posterior.predict(path, system=gp2.System.load(SURFACE))) == other
 
@@ -130,8 +140,8 @@ def test_names_are_checked(posterior, arm, arm_log, arm_states):
     for call, text in [
         (lambda: posterior.predict(arm_states, "position"), "view: expected one of constrained, "),
         (lambda: posterior.predict(arm_states, latent="friction"), "latent: "),
-        (lambda: posterior.predict(arm_states, "next-velocity"), "view 'next-velocity' needs the time step dt [s]"),
-        (lambda: posterior.predict(arm_states, dt=0.1), "dt goes with view 'next-velocity'"),
+        (lambda: posterior.predict(arm_states, "next-velocity"), "view='next-velocity' needs the time step: dt=SECONDS"),
+        (lambda: posterior.predict(arm_states, dt=0.1), "dt goes with view='next-velocity'"),
         (lambda: posterior.predict(arm_states, "next-velocity", dt=-1), "dt: must be positive, got -1"),
         (lambda: posterior.sample(arm_states, 0), "n_samples: must be at least 1, got 0"),
         (lambda: posterior.simulate({}, [0, 1], n_samples=-1), "n_samples: must be at least 1, got -1"),
@@ -143,11 +153,11 @@ def test_names_are_checked(posterior, arm, arm_log, arm_states):
         (lambda: gp2.fit(arm, arm_log, baseline="gp"), "baseline: expected one of 'se', 'icm', 'lmc', got 'gp'"),
         (lambda: gp2.fit(arm, arm_log, protocol="new"), "protocol: expected one of"),
         (lambda: gp2.fit(arm, arm_log, noise_std="guess"), "noise_std: expected one of 'estimate', 'stated', got 'guess'"),
-        (lambda: gp2.fit(arm, arm_log, noise_std=-1), "noise_std: expected a positive number, 'estimate' or 'stated', got -1"),
-        (lambda: gp2.fit(arm, arm_log, restarts=0), "restarts: must be at least 1, got 0"),
-        (lambda: gp2.fit(arm, arm_log, max_iterations=-1), "max_iterations: must be at least 0, got -1"),
-        (lambda: gp2.fit(arm, arm_log, max_points=0), "max_points: must be at least 1, got 0"),
-        (lambda: gp2.fit(arm, arm_log, threads=-1), "threads: must be at least 0, got -1"),
+        (lambda: gp2.fit(arm, arm_log, noise_std=-1), "noise_std: expected a positive number, 'estimate' or 'stated', got '-1'"),
+        (lambda: gp2.fit(arm, arm_log, restarts=0), "restarts: must be positive, got 0"),
+        (lambda: gp2.fit(arm, arm_log, max_iterations=-1), "max_iterations: must not be negative, got -1"),
+        (lambda: gp2.fit(arm, arm_log, max_points=0), "max_points: must be positive, got 0"),
+        (lambda: gp2.fit(arm, arm_log, threads=-1), "threads: must be positive, or 0 for as many as the machine has; got -1"),
     ]:
         assert text in text_of(call)
     with pytest.raises(TypeError, match="noise_std: expected a positive number, 'estimate' or 'stated', got \\[1\\]"):
@@ -185,6 +195,17 @@ def test_warnings_are_pythons_and_notes_go_to_the_logger(posterior, arm, arm_log
 
 def test_noise_that_is_not_given_is_not_taken_for_none():
     keys = {"coordinates": ["x"], "mass": [["1"]], "truth": ["0"], "sampling": {"x": [-1, 1], "dx": [-1, 1]}}
-    with pytest.raises(gp2.InputError, match=r"no \[noise\] ddq to draw from; give noise_std \(0 for the truth\)"):
+    with pytest.raises(gp2.InputError, match=r"no \[noise\] ddq to draw from; give noise_std=S \(0 for the truth\)"):
         gp2.System(**keys).generate(3)
     assert len(gp2.System(**keys).generate(3, noise_std=0)) == 3
+
+
+def test_texts_name_options_as_keywords(arm, arm_log):
+    log = columns_of(arm_log)
+    del log["elbow"]
+    assert "or give columns={'elbow': 'LOGNAME'}" in text_of(lambda: gp2.fit(arm, log))
+    text = text_of(lambda: gp2.fit(arm, arm_log, protocol="paper", noise_std="estimate"))
+    assert text == "protocol='paper' has fixed noise: leave out noise_std='estimate'"
+    text = text_of(lambda: gp2.fit(arm, arm_log, columns={"elbow": "nosuch"}))
+    assert text.startswith("columns={'elbow': 'nosuch'}: data has no column 'nosuch'")
+    assert "--" not in text

@@ -3,10 +3,10 @@
 #include <gmock/gmock.h>
 #include <gtest/gtest.h>
 
+#include "gp2/jobs/report_job.hpp"
 #include "hyperparameter.hpp"
-#include "report/report_data.hpp"
 
-namespace gp2::command {
+namespace gp2 {
 namespace {
 
 using test::hyperparameter;
@@ -58,7 +58,7 @@ ReportData good_data(const std::string& name) {
 
 TEST(Advice, OfAGoodFitIsToTestItOrToLook) {
   Report report = good_report();
-  EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::good, "Nothing to mend", "--data")));
+  EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::good, "Nothing to mend", "`data`")));
   report.data = {good_data("training"), good_data("test")};
   EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::good, "Nothing to mend", "pictures")));
 }
@@ -79,7 +79,7 @@ TEST(Advice, TellsThatTheOptimiserDidNotConverge) {
   report.fit.report.converged = false;
   report.fit.report.termination = "the limit of iterations was reached";
   EXPECT_THAT(learning_advice(report),
-              ElementsAre(advises(Level::warning, "did not converge: the limit of iterations", "--max-iterations")));
+              ElementsAre(advises(Level::warning, "did not converge: the limit of iterations", "`max_iterations`")));
 }
 
 TEST(Advice, TellsThatNothingWasOptimisedAndThenSaysNothingOfRelevance) {
@@ -87,16 +87,16 @@ TEST(Advice, TellsThatNothingWasOptimisedAndThenSaysNothingOfRelevance) {
   report.fit.report.converged = false;
   report.fit.report.iterations = 0;
   report.relevance = {{"friction", "dq1", 1e6, 1, 1e-6, 1e-6}};
-  EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::note, "Nothing was optimised", "--max-iterations 0")));
+  EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::note, "Nothing was optimised", "`max_iterations=0`")));
 }
 
 TEST(Advice, TellsOfRestartsThatFailedOrDisagree) {
   Report report = good_report();
   report.fit.report.restarts[1].objective = 15;
   report.fit.report.restarts[2].objective = 12;
-  EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::note, "Only one of 3 restarts", "--restarts")));
+  EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::note, "Only one of 3 restarts", "`restarts`")));
   report.fit.report.objective = 5;
-  EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::note, "No restart reached", "--restarts")));
+  EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::note, "No restart reached", "`restarts`")));
   report.fit.report.objective = 10;
   report.fit.report.restarts[1].objective = std::numeric_limits<double>::infinity();
   EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::note, "1 of 3 restarts found no finite start", "bounds")));
@@ -114,7 +114,7 @@ TEST(Advice, TellsANoiseThatCollapsedFromOneAtItsUpperBound) {
   Report report = good_report();
   report.fit.report.hyperparameters = {hyperparameter(Hyperparameter::Kind::noise_stddev, "noise_stddev(ddq1)", 1e-6, 1e-6, 2)};
   EXPECT_THAT(learning_advice(report),
-              ElementsAre(advises(Level::warning, "The noise collapsed: noise_stddev(ddq1)", "--observe")));
+              ElementsAre(advises(Level::warning, "The noise collapsed: noise_stddev(ddq1)", "`observe`")));
   report.fit.report.hyperparameters.front().value = 2;
   EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::note, "noise_stddev(ddq1) (upper bound, 2)", "Widen")));
 }
@@ -151,14 +151,14 @@ TEST(Advice, TellsOfDataOffTheConstraintByHowFarTheyAre) {
   report.data[1].violation = ConstraintViolation{1e-3, 1e-3, 5, "q1 - q2"};
   EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::warning, "of the training and test data", "")));
   EXPECT_THAT(learning_advice(report),
-              ElementsAre(advises(Level::warning, "row 4 of training: q1 - q2 = 1e-09, 0.3", "--estimate")));
+              ElementsAre(advises(Level::warning, "row 4 of training: q1 - q2 = 1e-09, 0.3", "`estimate`")));
 }
 
 TEST(Advice, TellsOfColumnsThatFollowFromEachOther) {
   Report report = good_report();
   report.data = {good_data("training")};
   report.data[0].independent = {"ddq1", "ddq3"};
-  EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::warning, "follow from each other", "--observe ddq1,ddq3")));
+  EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::warning, "follow from each other", "`observe=ddq1,ddq3`")));
 }
 
 TEST(Advice, JudgesTheCoverageOfTheTestByItsSize) {
@@ -172,7 +172,7 @@ TEST(Advice, JudgesTheCoverageOfTheTestByItsSize) {
   EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::good, "", "")));
   test.n = 1000;
   test.coverage95 = 0.999;
-  EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::note, "Too cautious: 99.9 %", "--noise-std estimate")));
+  EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::note, "Too cautious: 99.9 %", "`noise_std=estimate`")));
   test.coverage95_latent = 0.95;
   EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::note, "Too cautious: 99.9 %", "free of noise")));
 }
@@ -197,4 +197,4 @@ TEST(Advice, PutsWarningsFirst) {
 }
 
 }  // namespace
-}  // namespace gp2::command
+}  // namespace gp2

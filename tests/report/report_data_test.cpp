@@ -1,4 +1,4 @@
-#include "report/report_data.hpp"
+#include "report/report_page.hpp"
 
 #include <cmath>
 #include <limits>

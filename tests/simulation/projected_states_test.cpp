@@ -76,7 +76,7 @@ position = ["x^2 + 1"]
   const std::vector<Finding> findings = check_states(*circle.system, states, VectorXd());
   ASSERT_FALSE(findings.empty());
   EXPECT_EQ(findings.back().level, Finding::Level::warning);
-  EXPECT_EQ(findings.back().text, "2 states have no state on the constraints near them: rows 1, 2; fit --project refuses them");
+  EXPECT_EQ(findings.back().text, "2 states have no state on the constraints near them: rows 1, 2; fit `project` refuses them");
 }
 
 TEST(ProjectedStatesTest, StatesThatLackWhatTheConstraintReadsAreRefused) {
@@ -111,7 +111,7 @@ position = ["sqrt(x^2 + y^2) - 1"]
   EXPECT_EQ(findings[0].text, "off the position constraint 'sqrt(x^2 + y^2) - 1' by 0.2 in the median, 0.3 at most (row 4)");
   EXPECT_THAT(findings[1].text, HasSubstr("off the velocity constraint "));
   EXPECT_EQ(findings[2].text,
-            "the nearest states on the constraints, to which fit --project moves, differ in x by 0.2 in the median, 0.3 at most "
+            "the nearest states on the constraints, to which fit `project` moves, differ in x by 0.2 in the median, 0.3 at most "
             "(row 4)");
   states.row(0).setOnes();
   EXPECT_TRUE(check_states(*circle.system, states, VectorXd()).empty());

@@ -6,11 +6,12 @@
 #include <fmt/ranges.h>
 #include <nlohmann/json.hpp>
 
+#include "command.hpp"
 #include "gp2/base/version.hpp"
 #include "gp2/data/csv.hpp"
 #include "gp2/error.hpp"
 #include "report/assets.hpp"
-#include "report/report_data.hpp"
+#include "report/report_page.hpp"
 
 namespace gp2::command {
 
@@ -284,7 +285,7 @@ Json advice_json(const std::vector<Advice>& all) {
   Json rows = Json::array();
   for (const Advice& one : all) {
     const char* level = one.level == Advice::Level::warning ? "warning" : one.level == Advice::Level::note ? "note" : "good";
-    rows.push_back({{"level", level}, {"text", one.text}, {"mend", one.mend}});
+    rows.push_back({{"level", level}, {"text", with_flags(one.text)}, {"mend", with_flags(one.mend)}});
   }
   return rows;
 }

@@ -124,7 +124,7 @@ void reproduce_fig3b(const ReproduceOptions& options) {
                                                    of.col(s).reshaped(all.size(), line.states.cols())));
     }
   }
-  talk({fmt::format("fig3b: largest |A ddq − b| of {} samples: {:.2g}", 2 * n_samples, worst)});
+  print_notes({fmt::format("fig3b: largest |A ddq − b| of {} samples: {:.2g}", 2 * n_samples, worst)});
 
   for (const Section& section : definition.sections("unconstrained")) {
     const TrainedFigure inferred(section, restarts, options);

@@ -30,7 +30,7 @@ void reproduce_learning_curve(const ReproduceOptions& options) {
   const int n_runs = number_of_runs("", std::nullopt, options.runs, definition.integer("runs"));
   const Protocol::Name protocol = options.protocols.back();
   if (options.data)
-    talk({"learning-curve: the published observations are 100 per run; these are drawn from the same distributions"});
+    print_notes({"learning-curve: the published observations are 100 per run; these are drawn from the same distributions"});
 
   Table runs, summary;
   for (const Section& section : definition.sections("system")) {

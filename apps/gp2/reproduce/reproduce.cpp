@@ -51,6 +51,7 @@ std::filesystem::path definitions(const std::string& told) {
 }
 
 void run(const Arguments& arguments) {
+  if (arguments.threads < 0) throw InputError(fmt::format("`threads`: must be positive, or 0 for as many as the machine has; got {}", arguments.threads));
   ReproduceOptions options;
   options.experiments = definitions(arguments.experiments);
   if (!arguments.data.empty()) {
@@ -73,7 +74,7 @@ void run(const Arguments& arguments) {
     if (arguments.what == "all" ? !experiment.of_the_paper : arguments.what != experiment.name) continue;
     try {
       experiment.run(options);
-      talk({fmt::format("{}: {} is done", options.output.string(), experiment.name)});
+      print_notes({fmt::format("{}: {} is done", options.output.string(), experiment.name)});
     } catch (const PictureError& picture) {
       if (not_drawn.empty() || not_drawn.back() != picture.what()) not_drawn.emplace_back(picture.what());
     }
@@ -83,25 +84,27 @@ void run(const Arguments& arguments) {
 
 }  // namespace
 
-void add_reproduce(CLI::App& app) {
-  CLI::App* command = app.add_subcommand("reproduce", "Rebuild the tables and figures of Geist & Trimpe 2020, and more");
-  auto arguments = std::make_shared<Arguments>();
-  std::vector<std::string> names = {"all"};
-  for (const Experiment& experiment : experiments) names.emplace_back(experiment.name);
-  command->add_option("WHAT", arguments->what, "which")->required()->check(CLI::IsMember(names));
-  command
-      ->add_option("--protocol", arguments->protocol,
-                   "how GP² is trained: paper, default, or both; the other methods are the same under each")
-      ->check(CLI::IsMember({"paper", "default", "both"}))
-      ->capture_default_str();
-  command->add_option("--data", arguments->data,
-                      "folder of the published observations; without it they are drawn from the same distributions");
-  command->add_option("--runs", arguments->runs, "data sets (default: 10, or those that --data holds)");
-  command->add_option("--threads", arguments->threads, "0: as many as the machine has")->check(not_negative());
-  command->add_option("--experiments", arguments->experiments, "folder of the definitions (default: those of gp2)");
-  command->add_option("-o,--output", arguments->output, "folder for numbers (CSV, JSON) and pictures (SVG, PNG)")->required();
-  command->footer("Example:\n  gp2 reproduce table1 --runs 2 -o results");
-  command->callback([arguments] { run(*arguments); });
+Command reproduce_command() {
+  const auto a = std::make_shared<Arguments>();
+  std::vector<std::pair<std::string, std::string>> names = {{"all", "all"}};
+  for (const Experiment& experiment : experiments) names.emplace_back(experiment.name, experiment.name);
+  Command command{"reproduce", "Rebuild the tables and figures of Geist & Trimpe 2020, and more",
+                  "gp2 reproduce table1 --runs 2 -o results", {}, {}};
+  Option what{"what", choice(a->what, names), "", "which"};
+  what.flag = "WHAT";
+  command.options = {
+      required(std::move(what)),
+      {"protocol", choice(a->protocol, {{"paper", "paper"}, {"default", "default"}, {"both", "both"}}), "",
+       "how GP² is trained: paper, default, or both; the other methods are the same under each"},
+      {"data", &a->data, "DIR",
+       "folder of the published observations; without it they are drawn from the same distributions"},
+      {"runs", &a->runs, "R", "data sets", "10, or those that --data holds"},
+      {"threads", &a->threads, "K", "0: as many as the machine has"},
+      {"experiments", &a->experiments, "DIR", "folder of the definitions", "those of gp2"},
+      output(a->output, "DIR", "folder for numbers (CSV, JSON) and pictures (SVG, PNG)"),
+  };
+  command.run = [a](const std::set<std::string>&) { run(*a); };
+  return command;
 }
 
 }  // namespace gp2::command

@@ -1,6 +1,7 @@
 #pragma once
 
 #include <filesystem>
+#include <map>
 #include <memory>
 #include <string>
 #include <string_view>
@@ -26,7 +27,7 @@ struct FitFile {
   /// Per Observations: the model file of its view's other system; null where it has none. May be shorter.
   std::vector<std::shared_ptr<const Model>> systems;
   FitReport report;     // with the fitted hyperparameters
-  std::string options;  // what was asked of the fit, a JSON object (fit_options_json); empty: not known
+  std::string options;  // what was asked of the fit, a JSON object (options_json); empty: not known
 
   [[nodiscard]] Prior prior() const { return make_prior(model, prior_options); }
   /// The prior conditioned on the data, under the fitted hyperparameters.
@@ -50,5 +51,9 @@ struct FitFile {
 /// Starting values for hyperparameters by name, from {"name": value, …} or a FitFile.
 /// @throws InputError naming the file, an unknown name (with those there are), or a value outside its bounds.
 void read_start_values(const std::filesystem::path& path, std::vector<Hyperparameter>& hyperparameters);
+/// The same from values at hand.
+/// @param source  stands for them in messages
+void set_start_values(const std::map<std::string, double>& values, const std::string& source,
+                      std::vector<Hyperparameter>& hyperparameters);
 
 }  // namespace gp2

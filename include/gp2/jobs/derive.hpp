@@ -8,6 +8,7 @@
 #include <Eigen/Core>
 
 #include "gp2/data/csv.hpp"
+#include "gp2/jobs/option.hpp"
 #include "gp2/model.hpp"
 #include "gp2/smoothing/smoother.hpp"
 
@@ -25,6 +26,8 @@ struct DeriveOptions {
   double outlier_threshold = 5;  // as SmootherFitOptions
   int n_threads = 0;             // 0: all cores; the numbers do not depend on it
 };
+
+std::vector<Option> options(DeriveOptions& options);
 
 /// What became of one column of the log in one episode.
 struct DerivedSeries {

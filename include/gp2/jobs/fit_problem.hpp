@@ -1,6 +1,5 @@
 #pragma once
 
-#include <filesystem>
 #include <map>
 #include <memory>
 #include <optional>
@@ -9,8 +8,10 @@
 
 #include "gp2/data/csv.hpp"
 #include "gp2/data/log_reader.hpp"
+#include "gp2/error.hpp"
 #include "gp2/files/fit_file.hpp"
 #include "gp2/fit.hpp"
+#include "gp2/jobs/option.hpp"
 #include "gp2/model.hpp"
 
 namespace gp2 {
@@ -79,18 +80,15 @@ FitProblem make_fit_problem(const Model& model, const CsvTable& log, const FitPr
 /// How a problem is fitted unless told otherwise: a baseline has options of its own.
 FitOptions default_fit_options(const FitProblem& problem);
 
-/// What was asked of a fit, for FitFile: a flat JSON object under the names of gp2 fit's options. What was not given is left out;
-/// with the logs, or the observations of the FitFile, it is enough to fit again to the same bits.
-/// @param start  values that were given to start from, as "start"; empty: none
-std::string fit_options_json(const FitProblemOptions& asked, const FitOptions& options,
-                             const std::vector<Hyperparameter>& start = {});
+/// Where the hyperparameters of a problem start, and their bounds.
+std::vector<Hyperparameter> starting_hyperparameters(const FitProblem& problem, const FitProblemOptions& options);
 
 /// fit() or, of a baseline, fit_baseline(), or fit_robust() where that is asked for.
 Fit fit(const FitProblem& problem, const FitOptions& options);
 
-/// Starting values from a file, as read_start_values. Bounds are the optimiser's: where it does not run, at max_iterations 0, a
-/// start outside of them is taken; they are widened to hold it, and the notes say so.
-void read_start(const std::filesystem::path& path, int max_iterations, FitProblem& problem);
+/// Starting values, as read_start_values. Bounds are the optimiser's: where it does not run, at max_iterations 0, a start outside
+/// of them is taken; they are widened to hold it, and the notes say so.
+void read_start(const NamedNumbers& start, int max_iterations, FitProblem& problem);
 
 /// What a person should know of a fit: parameters at a bound, uncertainty_notes, and noise at its lower bound.
 std::vector<std::string> notes_of(const FitReport& report);
@@ -100,6 +98,11 @@ std::vector<std::string> distrust_notes(const FitProblem& problem, const FitRepo
 
 /// Which latent of a prior has a name. @throws InputError naming `option` and the latents there are.
 int latent_index(const Prior& prior, const std::string& name, const std::string& option);
+
+/// Names of columns for logs that are read together: those given, then the model's own [columns].
+/// @throws InputError when `columns` names what the model does not have, or none of the logs has.
+std::map<std::string, std::string> checked_columns(const Model& model, const std::vector<const CsvTable*>& logs,
+                                                   const std::map<std::string, std::string>& columns);
 
 /// A reader of a log that knows the columns by `columns` (model's name -> log's name), then by the model's own [columns].
 /// @throws InputError when `columns` names what the model or the log does not have.
@@ -113,6 +116,16 @@ struct LogStates {
 };
 LogStates read_log_states(const Prior& prior, const View& view, const Model& model, const CsvTable& log,
                           const std::map<std::string, std::string>& columns, const std::vector<std::string>& accelerations = {});
+
+/// work(), with the log named in what it throws: a posterior knows the number of a state only.
+template <typename Work>
+auto at_states_of(const CsvTable& log, const Work& work) {
+  try {
+    return work();
+  } catch (const InputError& error) {
+    throw InputError(log.name() + ": " + error.what());
+  }
+}
 
 /// All that a log has of states and accelerations.
 struct WholeLog {

@@ -9,6 +9,7 @@
 #include <Eigen/Core>
 
 #include "gp2/data/csv.hpp"
+#include "gp2/jobs/option.hpp"
 #include "gp2/model.hpp"
 
 namespace gp2 {
@@ -32,6 +33,8 @@ struct ResampleOptions {
   std::optional<std::uint64_t> seed = {};           // of a random first row; not given: the row nearest to the mean
   std::map<std::string, std::string> columns = {};  // model's name -> log's name, before the model's own [columns]
 };
+
+std::vector<Option> options(ResampleOptions& options);
 
 /// Which rows of a log to learn from.
 struct Resample {

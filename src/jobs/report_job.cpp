@@ -1,4 +1,4 @@
-#include "report/report_data.hpp"
+#include "gp2/jobs/report_job.hpp"
 
 #include <algorithm>
 #include <array>
@@ -13,12 +13,11 @@
 #include <fmt/ranges.h>
 #include <nlohmann/json.hpp>
 
-#include "command.hpp"
 #include "gp2/error.hpp"
 #include "gp2/jobs/fit_problem.hpp"
 #include "gp2/simulation/generate.hpp"
 
-namespace gp2::command {
+namespace gp2 {
 
 using Eigen::Index;
 using Eigen::MatrixXd;
@@ -133,7 +132,7 @@ std::vector<std::string> observed_outputs(const std::vector<ReportData>& trainin
 ReportData test_data(const ReportOptions& options, const FitFile& fit, const Posterior& posterior,
                      const std::vector<std::string>& observed, std::vector<std::string>& notes) {
   const CsvTable table = CsvTable::read(options.data, CsvTable::Keep::numbers);
-  const std::vector<int> rows = acceleration_rows(*fit.model.system, observed, "--data");
+  const std::vector<int> rows = acceleration_rows(*fit.model.system, observed, "`data`");
   View view{View::Quantity::constrained_acceleration, rows};
   const Prior& prior = posterior.prior();
   const View all = View::constrained_acceleration(*prior.system);
@@ -164,10 +163,10 @@ void add_truth(const ReportOptions& options, Report& report) {
   const System& home = *report.fit.model.system;
   if (truth.truth.empty()) {
     throw InputError(
-        fmt::format("--truth {}: has no [truth]; give a model file that says what the true acceleration is", options.truth));
+        fmt::format("`truth={}`: has no [truth]; give a model file that says what the true acceleration is", options.truth));
   }
   if (truth.system->state_names() != home.state_names()) {
-    throw InputError(fmt::format("--truth {}: its state is {}, that of the fit is {}; coordinates and inputs must be the same",
+    throw InputError(fmt::format("`truth={}`: its state is {}, that of the fit is {}; coordinates and inputs must be the same",
                                  options.truth, fmt::join(truth.system->state_names(), " "), fmt::join(home.state_names(), " ")));
   }
   const ModelMotion motion(truth);
@@ -184,8 +183,8 @@ void add_truth(const ReportOptions& options, Report& report) {
   }
   if (!any) {
     throw InputError(
-        fmt::format("--truth {}: not finite at any state of the data; the fit keeps only the columns its model reads, "
-                    "so give a --data with all that the truth reads",
+        fmt::format("`truth={}`: not finite at any state of the data; the fit keeps only the columns its model reads, "
+                    "so give a `data` with all that the truth reads",
                     options.truth));
   }
   report.truth_source = truth.system->name();
@@ -336,6 +335,14 @@ std::optional<ConstraintSurface> constraint_surface(const SymbolicSystem& system
   return surface;
 }
 
+std::vector<Option> options(ReportOptions& options) {
+  return {
+      {"data", &options.data, "CSV", "CSV with states and accelerations that the fit has not seen: a test"},
+      {"truth", &options.truth, "MODEL", "model file whose [truth] is the true acceleration, shown beside the prediction"},
+      {"map", &options.columns, "LOGNAME=NAME,…", "columns of `data` by other names", "", "columns"},
+  };
+}
+
 Report collect_report(const ReportOptions& options, std::vector<std::string>& notes) {
   Report report;
   report.fit = FitFile::read(options.fit);
@@ -360,4 +367,4 @@ Report collect_report(const ReportOptions& options, std::vector<std::string>& no
   return report;
 }
 
-}  // namespace gp2::command
+}  // namespace gp2

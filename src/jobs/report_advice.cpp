@@ -5,10 +5,10 @@
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
+#include "gp2/jobs/report_job.hpp"
 #include "gp2/training/laplace.hpp"
-#include "report/report_data.hpp"
 
-namespace gp2::command {
+namespace gp2 {
 
 namespace {
 
@@ -27,10 +27,10 @@ void optimiser_advice(const FitReport& report, std::vector<Advice>& advice) {
   const bool never_ran = report.iterations == 0 && !report.converged;
   if (never_ran) {
     advice.push_back({Level::note, fmt::format("Nothing was optimised: {}.", report.termination),
-                      "All figures below are of the starting values. Leave out --max-iterations 0 to fit."});
+                      "All figures below are of the starting values. Leave out `max_iterations=0` to fit."});
   } else if (!report.converged) {
     advice.push_back({Level::warning, fmt::format("The optimiser did not converge: {}.", report.termination),
-                      "Fit again with a larger --max-iterations, or with --start of this file to go on from here."});
+                      "Fit again with a larger `max_iterations`, or with `start` of this file to go on from here."});
   }
   if (never_ran) return;
   int n_finite = 0, n_best = 0;
@@ -49,7 +49,7 @@ void optimiser_advice(const FitReport& report, std::vector<Advice>& advice) {
     advice.push_back({Level::note,
                       n_best == 1 ? fmt::format("Only one of {} restarts reached the optimum taken.", report.restarts.size())
                                   : "No restart reached the optimum taken: a scan from the best of them found it.",
-                      "There may be a better one that none has reached: fit with more --restarts and compare the objective."});
+                      "There may be a better one that none has reached: fit with more `restarts` and compare the objective."});
   }
 }
 
@@ -65,7 +65,7 @@ void bound_advice(const Report& report, std::vector<Advice>& advice) {
           {Level::warning,
            fmt::format("The parameter {} ended at its {} bound, {:.6g}.", h.name, lower ? "lower" : "upper", h.value),
            fmt::format("If the true value may lie beyond, widen its bounds in the model file; if not, the data do "
-                       "not determine it or a part of the model is missing: fix it (--estimate without {}) and "
+                       "not determine it or a part of the model is missing: fix it (`estimate` without {}) and "
                        "look at the residuals.",
                        h.name)});
     } else if (h.kind == Hyperparameter::Kind::kernel && !lower && h.name.find("lengthscale") != std::string::npos) {
@@ -78,8 +78,8 @@ void bound_advice(const Report& report, std::vector<Advice>& advice) {
     advice.push_back({Level::warning,
                       fmt::format("The noise collapsed: {} ended at the lower bound.", fmt::join(collapsed, ", ")),
                       "The fit takes the data as exact, and its bands are not to be trusted. The columns may follow from each "
-                      "other (gp2 check tells; fit with --observe), or be smoothed or computed instead of measured; or give the "
-                      "noise you know with --noise-std."});
+                      "other (gp2 check tells; fit with `observe`), or be smoothed or computed instead of measured; or give the "
+                      "noise you know with `noise_std`."});
   }
   if (!others.empty()) {
     advice.push_back({Level::note, fmt::format("At a bound: {}.", fmt::join(others, ", ")),
@@ -143,7 +143,7 @@ void constraint_advice(const Report& report, std::vector<Advice>& advice) {
                    fmt::join(names, " and "), violation.state + 1, worst->name, violation.constraint, violation.value,
                    violation.relative),
        "A little is measurement noise, or parameters that were estimated, and does no harm. Much means wrong units, "
-       "signs or offsets of a column, or wrong parameters of the constraint: estimate them with --estimate."});
+       "signs or offsets of a column, or wrong parameters of the constraint: estimate them with `estimate`."});
 }
 
 void rank_advice(const Report& report, std::vector<Advice>& advice) {
@@ -166,7 +166,7 @@ void independence_advice(const Report& report, std::vector<Advice>& advice) {
     advice.push_back(
         {Level::warning,
          fmt::format("The accelerations of the {} data follow from each other: they obey the constraint to rounding.", data.name),
-         fmt::format("They are not independent measurements. Fit with --observe {}.", fmt::join(data.independent, ","))});
+         fmt::format("They are not independent measurements. Fit with `observe={}`.", fmt::join(data.independent, ","))});
   }
 }
 
@@ -178,14 +178,14 @@ void test_advice(const ReportData& data, const ReportData* training, std::vector
   if (std::isfinite(e.coverage95) && e.coverage95 < nominal - tolerance) {
     advice.push_back({Level::warning,
                       fmt::format("Over-confident: {:.1f} % of the test data lie within the 95 % bands.", 100 * e.coverage95),
-                      "The test goes where training has not been, the noise is set too small (--noise-std estimate), or a "
+                      "The test goes where training has not been, the noise is set too small (`noise_std=estimate`), or a "
                       "feature is missing. Residuals against each feature show which; take training data there."});
   } else if (std::isfinite(e.coverage95) && e.coverage95 > nominal + tolerance) {
     const bool noise_free = std::isfinite(e.coverage95_latent) && std::abs(e.coverage95_latent - nominal) <= tolerance;
     advice.push_back(
         {Level::note, fmt::format("Too cautious: {:.1f} % of the test data lie within the 95 % bands.", 100 * e.coverage95),
          noise_free ? "The test data seem to be free of noise: judge by the noise-free coverage, which is as it should be."
-                    : "If the test data hold measurement noise, that of the model is too large: --noise-std estimate."});
+                    : "If the test data hold measurement noise, that of the model is too large: `noise_std=estimate`."});
   }
   if (training == nullptr || training->outputs != data.outputs) return;
   const double ratio = e.rmse.norm() / training->evaluation.rmse.norm();
@@ -216,10 +216,10 @@ std::vector<Advice> learning_advice(const Report& report) {
   if (advice.empty()) {
     advice.push_back({Level::good, "Nothing to mend was found.",
                       report.data.empty() || !report.data.back().is_test
-                          ? "The training data cannot show everything: give --data of a run that the fit has not seen."
+                          ? "The training data cannot show everything: give `data` of a run that the fit has not seen."
                           : "Look at the pictures all the same: no rule sees what an eye sees."});
   }
   return advice;
 }
 
-}  // namespace gp2::command
+}  // namespace gp2

@@ -9,9 +9,10 @@
 
 #include "gp2/files/fit_file.hpp"
 #include "gp2/inference/evaluation.hpp"
+#include "gp2/jobs/option.hpp"
 #include "gp2/mechanics/check.hpp"
 
-namespace gp2::command {
+namespace gp2 {
 
 /// How much one feature of a latent matters.
 struct Relevance {
@@ -40,7 +41,7 @@ struct ReportData {
   Eigen::MatrixXd unconstrained;         // ā    (nq × N), empty where M is singular
   Eigen::MatrixXd unconstrained_stddev;  //      (nq × N)
   Eigen::MatrixXd constraint_error;      // |A ddq − b| of the predicted mean, fitted parameters (nc × N)
-  Eigen::MatrixXd truth;                 // the true ddq (nq × N), NaN where unknown; empty without --truth
+  Eigen::MatrixXd truth;                 // the true ddq (nq × N), NaN where unknown; empty where it is not asked for
   std::vector<std::pair<std::string, Eigen::VectorXd>> features;  // φ by name (N each)
   std::optional<ConstraintViolation> violation;
   LowerRank lower_rank;                  // states at which constraints let go, or follow from each other
@@ -84,15 +85,18 @@ struct Report {
   std::vector<ReportData> data;
   std::vector<Relevance> relevance;
   std::optional<ConstraintSurface> surface;
-  std::string truth_source;  // the model of --truth
+  std::string truth_source;  // the model that tells the truth
 };
 
 struct ReportOptions {
   std::string fit;                             // FIT.json
   std::string data;                            // CSV of a test; empty: none
   std::string truth;                           // model file that tells the true acceleration; empty: none
-  std::map<std::string, std::string> columns;  // of --map
+  std::map<std::string, std::string> columns;  // model's name -> log's name, of `data`
 };
+
+/// data, truth, map.
+std::vector<Option> options(ReportOptions& options);
 
 /// Predicts, evaluates and collects.
 /// @param notes  receives what a person should know
@@ -102,10 +106,4 @@ Report collect_report(const ReportOptions& options, std::vector<std::string>& no
 /// What the figures say about how to go on, most pressing first.
 std::vector<Advice> learning_advice(const Report& report);
 
-/// The report for the page's script: JSON in which no text can end a script element.
-std::string report_json(const Report& report);
-
-/// The page: one HTML file that needs nothing else.
-std::string report_page(const Report& report);
-
-}  // namespace gp2::command
+}  // namespace gp2

@@ -1,0 +1,207 @@
+#include "command_line.hpp"
+
+#include <map>
+#include <memory>
+#include <optional>
+#include <regex>
+#include <utility>
+#include <variant>
+
+#include <CLI/CLI.hpp>
+#include <fmt/format.h>
+#include <fmt/ranges.h>
+
+#include "gp2/error.hpp"
+
+namespace gp2::command {
+
+namespace {
+
+template <typename... Cases>
+struct Overloaded : Cases... {
+  using Cases::operator()...;
+};
+template <typename... Cases>
+Overloaded(Cases...) -> Overloaded<Cases...>;
+
+// "docs/priors.md" stays in help; `seed` becomes --seed
+std::string help_of(const Option& option) {
+  std::string text = with_flags(option.text);
+  if (std::holds_alternative<YesByDefault>(option.value)) text = "leave out " + text;
+  if (!option.otherwise.empty()) text += fmt::format(" (default: {})", option.otherwise);
+  return text;
+}
+
+void set_number_or_word(const NumberOrWord& one, const Option& option, const std::string& text) {
+  for (const auto& [word, flag] : one.words) {
+    *flag = text == word;
+    if (*flag) return;
+  }
+  double number = 0;
+  if (!CLI::detail::lexical_cast(text, number)) {
+    std::vector<std::string> words;
+    for (const auto& [word, flag] : one.words) words.push_back("'" + word + "'");
+    throw InputError(
+        fmt::format("{}: expected a positive number, {}, got '{}'", flag_of(option), fmt::join(words, " or "), text));
+  }
+  *one.number = number;
+}
+
+// Values that CLI11 leaves as text.
+void set_from_text(const Option& option, const std::string& text) {
+  std::visit(Overloaded{[&](std::vector<std::string>* list) { *list = parse_list(text, flag_of(option)); },
+                        [&](std::optional<std::vector<std::string>>* list) {
+                          *list = text == "none" ? std::vector<std::string>{} : parse_list(text, flag_of(option));
+                        },
+                        [&](std::map<std::string, std::string>* columns) { *columns = parse_map(text); },
+                        [&](std::map<std::string, int>* counts) { *counts = parse_counts(text, flag_of(option)); },
+                        [&](NamedNumbers* numbers) { *numbers = {text, {}}; },
+                        [&](const Choice& one) { one.set(text); }, [&](const Switch& one) { *one.value = text == one.on; },
+                        [&](const NumberOrWord& one) { set_number_or_word(one, option, text); }, [](const auto&) {}},
+             option.value);
+}
+
+// ---------------------------------------------------------------- the tables of docs/command-line.md
+
+// `--mean zero` \| `force`
+std::string usage_of(const Option& option) {
+  const std::string flag = flag_of(option);
+  const auto words = [&](const std::vector<std::string>& all) {
+    return fmt::format("`{} {}`", flag, fmt::join(all, "` \\| `"));
+  };
+  return std::visit(Overloaded{[&](const Choice& one) { return words(one.words); },
+                               [&](const Switch& one) { return words({one.on, one.off}); },
+                               [&](const NumberOrWord& one) {
+                                 std::vector<std::string> all = {option.sample};
+                                 for (const auto& [word, flag_value] : one.words) all.push_back(word);
+                                 return words(all);
+                               },
+                               [&](const auto&) {
+                                 const std::size_t comma = flag.find(',');  // of -o,--output
+                                 const std::string sample = option.sample.empty() ? "" : " " + option.sample;
+                                 return fmt::format("`{}{}`", flag.substr(0, comma), sample);
+                               }},
+                    option.value);
+}
+
+// What a new request holds, where that says it.
+std::string default_of(const Option& option) {
+  const auto word = [](const std::string& text) { return text.empty() ? text : "`" + text + "`"; };
+  return std::visit(Overloaded{[&](const Choice& one) { return word(one.get()); },
+                               [&](const Switch& one) { return word(*one.value ? one.on : one.off); },
+                               [](const int* number) { return std::to_string(*number); },
+                               [](const std::uint64_t* number) { return std::to_string(*number); },
+                               [](const double* number) { return fmt::format("{}", *number); },
+                               [](const auto&) { return std::string(); }},
+                    option.value);
+}
+
+// docs/priors.md -> [priors.md](priors.md)
+std::string with_links(const std::string& text) {
+  static const std::regex page("docs/([a-z-]+\\.md)");
+  return std::regex_replace(text, page, "[$1]($1)");
+}
+
+// CLI11 would take -1 for the largest number there is.
+CLI::Validator not_negative() {
+  const auto check = [](const std::string& text) {
+    return text.starts_with('-') ? "must not be negative, got " + text : std::string();
+  };
+  return {check, ""};
+}
+
+/// A subcommand while its options are added and read.
+class Parsing {
+ public:
+  Parsing(CLI::App& app, Command command) : app_(app), command_(std::move(command)) {
+    for (const Option& option : command_.options) {
+      CLI::Option* added = add(option);
+      if (option.is_required) added->required();
+      if (!option.needs.empty()) added->needs(added_.at(option.needs));
+      added_[option.name] = added;
+    }
+  }
+
+  [[nodiscard]] const Command& command() const { return command_; }
+
+  void run() const {
+    std::set<std::string> given;
+    for (const Option& option : command_.options) {
+      if (added_.at(option.name)->count() == 0) continue;
+      given.insert(option.name);
+      const auto text = texts_.find(option.name);
+      if (text != texts_.end()) set_from_text(option, text->second);
+    }
+    command_.run(given);
+  }
+
+ private:
+  CLI::Option* add(const Option& option) {
+    const std::string flag = flag_of(option), help = help_of(option);
+    CLI::Option* added = std::visit(
+        Overloaded{
+            [&](bool* value) { return app_.add_flag(flag, *value, help); },
+            [&](const YesByDefault& one) { return app_.add_flag(flag, [one](std::int64_t n) { *one.value = n == 0; }, help); },
+            [&](int* value) { return app_.add_option(flag, *value, help)->capture_default_str(); },
+            [&](double* value) { return app_.add_option(flag, *value, help)->capture_default_str(); },
+            [&](std::string* value) { return app_.add_option(flag, *value, help); },
+            [&](std::uint64_t* value) {
+              return app_.add_option(flag, *value, help)->check(not_negative())->capture_default_str();
+            },
+            [&](std::optional<std::uint64_t>* value) { return app_.add_option(flag, *value, help)->check(not_negative()); },
+            [&](const Repeated& one) { return app_.add_option(flag, *one.values, help)->allow_extra_args(false); },
+            [&](const Choice& one) { return add_words(option, one.words, one.get()); },
+            [&](const Switch& one) { return add_words(option, {one.on, one.off}, *one.value ? one.on : one.off); },
+            [&]<typename T>(std::optional<T>* value) { return add_optional(option, value); },
+            [&](const auto&) { return app_.add_option(flag, texts_[option.name], help); },
+        },
+        option.value);
+    if (!option.sample.empty()) added->type_name(option.sample);
+    return added;
+  }
+
+  CLI::Option* add_words(const Option& option, const std::vector<std::string>& words, const std::string& chosen) {
+    std::string& text = texts_[option.name] = chosen;
+    CLI::Option* added = app_.add_option(flag_of(option), text, help_of(option))->check(CLI::IsMember(words));
+    return chosen.empty() ? added : added->capture_default_str();
+  }
+
+  template <typename T>
+  CLI::Option* add_optional(const Option& option, std::optional<T>* value) {
+    if constexpr (std::is_same_v<T, std::vector<std::string>>) {
+      return app_.add_option(flag_of(option), texts_[option.name], help_of(option));
+    } else {
+      return app_.add_option(flag_of(option), *value, help_of(option));
+    }
+  }
+
+  CLI::App& app_;
+  const Command command_;
+  std::map<std::string, CLI::Option*> added_;
+  std::map<std::string, std::string> texts_;  // what was given for options that CLI11 leaves as text
+};
+
+}  // namespace
+
+void add_command(CLI::App& app, Command command) {
+  CLI::App* subcommand = app.add_subcommand(command.name, command.text);
+  subcommand->footer("Example:\n  " + command.example);
+  const auto parsing = std::make_shared<Parsing>(*subcommand, std::move(command));
+  subcommand->callback([parsing] { parsing->run(); });
+  // for scripts/options; like --version it asks for nothing else
+  subcommand->set_version_flag("--options-as-markdown", [parsing] { return markdown_table(parsing->command()); })->group("");
+}
+
+std::string markdown_table(const Command& command) {
+  std::string table = "| option | default | |\n|---|---|---|\n";
+  for (const Option& option : command.options) {
+    const std::string usage = usage_of(option);
+    const std::string otherwise = option.is_required ? "required" : option.otherwise.empty() ? default_of(option) : option.otherwise;
+    std::string text = with_flags(option.text);
+    if (std::holds_alternative<YesByDefault>(option.value)) text = "leaves out " + text;
+    table += fmt::format("| {} | {} | {} |\n", usage, otherwise, with_links(text));
+  }
+  return table;
+}
+
+}  // namespace gp2::command

@@ -1,0 +1,69 @@
+#pragma once
+
+#include <atomic>
+#include <functional>
+#include <optional>
+#include <string>
+#include <vector>
+
+#include "gp2/files/fit_file.hpp"
+#include "gp2/fit.hpp"
+#include "gp2/jobs/fit_problem.hpp"
+#include "gp2/jobs/option.hpp"
+#include "gp2/model.hpp"
+
+namespace gp2 {
+
+/// What a fit is asked for: a model, its data, and options.
+struct FitRequest {
+  Model model;
+  std::vector<Log> logs;
+  std::vector<SideInformation> also;
+  std::string data_source;  // where the data came from, for people; empty: the names of the tables
+
+  FitProblemOptions problem;  // what is learned from the data; `seed` is also that of the restarts
+  NamedNumbers start;         // starting values of hyperparameters
+  std::optional<int> restarts, max_escapes;
+  std::optional<double> gradient_tolerance, reduction_tolerance;
+  int max_iterations = 1000;
+  int threads = 0;
+  bool standard_errors = true;
+};
+
+/// The table of its options.
+std::vector<Option> options(FitRequest& request);
+
+/// A fit that is ready to run: its data are read, its options checked.
+struct FitJob {
+  FitProblem problem;
+  FitOptions options;
+  FitFile file;  // all but the observations and the report
+  std::vector<std::string> notes;
+};
+
+/// @throws InputError for options out of range; as make_fit_problem, read_start and within_memory.
+FitJob prepare_fit(FitRequest request);
+
+/// The model and the options of a fit as it was asked for, without its data.
+/// @throws InputError when the file does not say what was asked: those before format 6 do not.
+FitRequest request_of(const FitFile& fit);
+
+/// A fit again, from the data that are in its file: the same bits, on the same machine.
+/// @param threads  as FitRequest
+/// @throws InputError as request_of, and for robust fits, whose data are marked by the first one.
+FitJob prepare_fit_again(const FitFile& fit, int threads = 0);
+
+/// What a fit gives.
+struct FitOutcome {
+  FitFile file;                    // ready to be written
+  Posterior posterior;             // as file.posterior()
+  std::vector<std::string> notes;  // what a person should know
+};
+
+/// @param progress  called from other threads, one at a time
+/// @param stop      set: ends with the best so far, whose termination is FitReport::interrupted
+/// @throws NumericalError  as fit(), also when stopped before there was anything to give.
+FitOutcome run_fit(const FitJob& job, const std::function<void(const Progress&)>& progress = {},
+                   const std::atomic<bool>* stop = nullptr);
+
+}  // namespace gp2

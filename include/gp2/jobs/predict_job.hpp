@@ -1,0 +1,81 @@
+#pragma once
+
+#include <cstdint>
+#include <map>
+#include <memory>
+#include <optional>
+#include <string>
+#include <vector>
+
+#include <Eigen/Core>
+
+#include "gp2/data/csv.hpp"
+#include "gp2/files/fit_file.hpp"
+#include "gp2/inference/evaluation.hpp"
+#include "gp2/jobs/option.hpp"
+#include "gp2/posterior.hpp"
+#include "gp2/view.hpp"
+
+namespace gp2 {
+
+/// What a fit is asked for: a quantity, of the fitted system or another one.
+struct ViewRequest {
+  View::Quantity quantity = View::Quantity::constrained_acceleration;
+  std::optional<double> time_step;            // Δt of the next velocity
+  std::optional<std::string> latent;          // only what this latent adds
+  std::shared_ptr<const Model> system = nullptr;  // with the same coordinates, inputs and latents; null: the fitted one
+};
+/// view, dt, latent.
+std::vector<Option> options(ViewRequest& request);
+
+/// A view, and the system under which it is.
+struct PredictedView {
+  View view;
+  const Model* model = nullptr;  // of that system: the fit's or the request's, which outlive this
+  Prior prior;                   // there
+  std::vector<std::string> names;
+};
+
+/// @param prior  of the posterior
+/// @throws InputError when the view needs a time step or constraints, there is no such latent, or the other system does not fit
+///   (make_other_system).
+PredictedView predicted_view(const FitFile& fit, const Prior& prior, const ViewRequest& request);
+
+struct PredictRequest {
+  enum class Covariance { none, stddev, full };
+
+  ViewRequest view;
+  std::map<std::string, std::string> columns;  // model's name -> log's name, before the model's own [columns]
+  Covariance covariance = Covariance::none;
+  std::optional<int> n_samples;  // draws of all rows together
+  std::uint64_t seed = 0;
+  bool unconditioned = false;  // from the prior, as if there had been no data
+};
+std::vector<Option> options(PredictRequest& request);
+
+struct PredictOutcome {
+  std::vector<std::string> names;  // NAME of the view, NAME_std, cov_NAME1_NAME2, NAME_sample1, …
+  Eigen::MatrixXd values;          // (names × N)
+  std::vector<std::string> notes;
+};
+
+/// @throws InputError for states that are missing, not finite or contradict the constraints, with the table's name.
+PredictOutcome predict(const FitFile& fit, const CsvTable& states, const PredictRequest& request);
+
+struct EvaluateRequest {
+  std::vector<std::string> outputs;               // accelerations; empty: those observed in the fit
+  std::shared_ptr<const Model> system = nullptr;  // as ViewRequest
+  std::map<std::string, std::string> columns;
+  int threads = 0;
+};
+std::vector<Option> options(EvaluateRequest& request);
+
+struct EvaluateOutcome {
+  Evaluation evaluation;
+  std::vector<std::string> notes;
+};
+
+/// Compares predictions with measured or true accelerations.
+EvaluateOutcome evaluate(const FitFile& fit, const Posterior& posterior, const CsvTable& log, const EvaluateRequest& request);
+
+}  // namespace gp2

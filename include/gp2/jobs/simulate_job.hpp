@@ -1,0 +1,77 @@
+#pragma once
+
+#include <atomic>
+#include <cstdint>
+#include <map>
+#include <memory>
+#include <optional>
+#include <string>
+#include <variant>
+#include <vector>
+
+#include <Eigen/Core>
+
+#include "gp2/data/csv.hpp"
+#include "gp2/jobs/option.hpp"
+#include "gp2/model.hpp"
+#include "gp2/posterior.hpp"
+#include "gp2/simulate.hpp"
+
+namespace gp2 {
+
+/// Where a motion starts: coordinates and velocities by name, or those of the first row of a log, what is not given following from
+/// the constraints; or all of q and dq.
+using MotionStart = std::variant<std::map<std::string, double>, CsvTable, Eigen::VectorXd>;
+
+struct SimulateRequest {
+  MotionStart start;
+  Eigen::VectorXd times;           // at which states are wanted [s]; the first is the start
+  std::optional<CsvTable> inputs;  // t and every input, linear in between; not given: zero
+
+  std::map<std::string, std::string> columns;  // model's name -> log's name, before the model's own [columns]
+  double relative_tolerance = 1e-6, absolute_tolerance = 1e-9;
+  bool project = true;
+  std::optional<int> n_samples;  // functions drawn from the posterior, instead of its mean
+  std::uint64_t seed = 0;
+};
+std::vector<Option> options(SimulateRequest& request);
+
+/// The time of a log's first row; nothing where it has none.
+std::optional<double> start_time(const Model& model, const MotionStart& start,
+                                 const std::map<std::string, std::string>& columns);
+
+/// Times from a start to an end, both among them.
+/// @param time_step  between two; not given: 100 times
+/// @throws InputError for an end that is not after the start, or more than 1e7 times.
+Eigen::VectorXd motion_times(double t_start, double t_end, const std::optional<double>& time_step);
+
+/// A motion that is to be integrated.
+struct SimulateJob {
+  std::shared_ptr<const System> system;
+  Eigen::VectorXd parameters;
+  Eigen::VectorXd start;                     // the whole state
+  std::vector<Acceleration> accelerations;   // one for each motion
+  SimulateOptions options;
+  std::vector<std::string> notes;            // how the start was completed
+};
+
+/// The motion of a model by its own equations: its force and [truth].
+SimulateJob prepare_simulation(const Model& model, const SimulateRequest& request);
+/// The motion of the mean of a posterior, or of samples.
+SimulateJob prepare_simulation(const Model& model, const Posterior& posterior, const SimulateRequest& request);
+
+/// Thrown by run_simulation when it is asked to end.
+struct SimulationStopped {};
+
+/// @param stop  set: throws SimulationStopped
+std::vector<Trajectory> run_simulation(const SimulateJob& job, const std::atomic<bool>* stop = nullptr);
+
+/// The uncertainty of ddq along a motion, and where it leaves the region of the data.
+struct MotionUncertainty {
+  Eigen::MatrixXd stddev;             // (nq × N)
+  std::optional<double> leaves_data;  // first time at which a standard deviation exceeds half the prior's
+  std::string acceleration;           // which one
+};
+MotionUncertainty motion_uncertainty(const Posterior& posterior, const Trajectory& trajectory);
+
+}  // namespace gp2

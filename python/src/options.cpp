@@ -1,0 +1,270 @@
+#include "options.hpp"
+
+#include <algorithm>
+
+#include <fmt/format.h>
+#include <fmt/ranges.h>
+#include <pybind11/stl.h>
+
+#include "bindings.hpp"
+#include "gp2/error.hpp"
+#include "gp2/jobs/derive.hpp"
+#include "gp2/jobs/fit_job.hpp"
+#include "gp2/jobs/generate_job.hpp"
+#include "gp2/jobs/predict_job.hpp"
+#include "gp2/jobs/resample.hpp"
+#include "gp2/jobs/simulate_job.hpp"
+
+namespace gp2::python {
+
+namespace {
+
+template <typename... Cases>
+struct Overloaded : Cases... {
+  using Cases::operator()...;
+};
+template <typename... Cases>
+Overloaded(Cases...) -> Overloaded<Cases...>;
+
+template <typename T>
+T cast(py::handle given, const std::string& name, const std::string& expected) {
+  try {
+    return given.cast<T>();
+  } catch (const py::cast_error&) {
+    throw py::type_error(fmt::format("{}: expected {}, got {}", name, expected, std::string(py::repr(given))));
+  }
+}
+
+std::vector<std::string> quoted(std::vector<std::string> words) {
+  for (std::string& word : words) word = "'" + word + "'";
+  return words;
+}
+
+std::vector<std::string> words_of(const NumberOrWord& one) {
+  std::vector<std::string> words;
+  for (const auto& [word, flag] : one.words) words.push_back(word);
+  return words;
+}
+
+std::string one_of(py::handle given, const std::vector<std::string>& words, const std::string& name) {
+  const auto word = cast<std::string>(given, name, "a str");
+  if (std::find(words.begin(), words.end(), word) == words.end()) {
+    throw InputError(fmt::format("{}: expected one of {}, got '{}'", name, fmt::join(quoted(words), ", "), word));
+  }
+  return word;
+}
+
+void read_number_or_word(py::handle given, const NumberOrWord& one, const std::string& name) {
+  if (!py::isinstance<py::str>(given)) {
+    *one.number = cast<double>(given, name, fmt::format("a positive number, {}", fmt::join(quoted(words_of(one)), " or ")));
+    return;
+  }
+  const std::string word = one_of(given, words_of(one), name);
+  for (const auto& [known, flag] : one.words) *flag = known == word;
+}
+
+void read_named_numbers(py::handle given, NamedNumbers& numbers, const std::string& name) {
+  if (py::isinstance<py::dict>(given)) {
+    numbers.values = cast<std::map<std::string, double>>(given, name, "numbers by name");
+  } else {
+    numbers.file = path_argument(py::reinterpret_borrow<py::object>(given));
+  }
+}
+
+// None stands for "not given" wherever that is possible.
+bool has_none(const OptionValue& value) {
+  return std::visit(Overloaded{[]<typename T>(const std::optional<T>*) { return true; },
+                               [](const std::map<std::string, std::string>*) { return true; },
+                               [](const std::map<std::string, int>*) { return true; }, [](const NamedNumbers*) { return true; },
+                               [](const Choice& one) { return one.get().empty(); }, [](const NumberOrWord&) { return true; },
+                               [](const auto&) { return false; }},
+                    value);
+}
+
+void read_keyword(py::handle given, const Option& option) {
+  const std::string& name = keyword_of(option);
+  if (given.is_none() && has_none(option.value)) return;
+  std::visit(
+      Overloaded{
+          [&](bool* flag) { *flag = cast<bool>(given, name, "True or False"); },
+          [&](const YesByDefault& one) { *one.value = cast<bool>(given, name, "True or False"); },
+          [&](const Switch& one) {
+            const bool is_word = py::isinstance<py::str>(given);
+            *one.value = is_word ? one_of(given, {one.on, one.off}, name) == one.on : cast<bool>(given, name, "True or False");
+          },
+          [&](int* value) { *value = cast<int>(given, name, "a whole number"); },
+          [&](std::uint64_t* value) { *value = cast<std::uint64_t>(given, name, "a whole number that is not negative"); },
+          [&](double* value) { *value = cast<double>(given, name, "a number"); },
+          [&](std::string* value) { *value = cast<std::string>(given, name, "a str"); },
+          [&](std::optional<int>* value) { *value = cast<int>(given, name, "a whole number"); },
+          [&](std::optional<std::uint64_t>* value) {
+            *value = cast<std::uint64_t>(given, name, "a whole number that is not negative");
+          },
+          [&](std::optional<double>* value) { *value = cast<double>(given, name, "a number"); },
+          [&](std::optional<std::string>* value) { *value = cast<std::string>(given, name, "a str"); },
+          [&](std::vector<std::string>* list) { *list = cast<std::vector<std::string>>(given, name, "a list of names"); },
+          [&](std::optional<std::vector<std::string>>* list) {
+            *list = cast<std::vector<std::string>>(given, name, "a list of names");
+          },
+          [&](std::map<std::string, std::string>* columns) {
+            *columns = columns_argument(py::reinterpret_borrow<py::object>(given));
+          },
+          [&](std::map<std::string, int>* counts) {
+            *counts = cast<std::map<std::string, int>>(given, name, "a dict of names to whole numbers");
+          },
+          [&](NamedNumbers* numbers) { read_named_numbers(given, *numbers, name); },
+          [&](const Choice& one) { one.set(one_of(given, one.words, name)); },
+          [&](const NumberOrWord& one) { read_number_or_word(given, one, name); },
+          [&](const Repeated& one) { *one.values = cast<std::vector<std::string>>(given, name, "a list of names"); },
+      },
+      option.value);
+}
+
+std::string literal(const std::vector<std::string>& words) {
+  std::string text;
+  for (const std::string& word : words) text += (text.empty() ? "\"" : ", \"") + word + '"';
+  return "Literal[" + text + "]";
+}
+
+// The type and the default of a keyword, as a stub has them.
+struct Declaration {
+  std::string type, otherwise;
+};
+Declaration declaration_of(const OptionValue& value) {
+  const auto truth = [](bool is_true) { return is_true ? "True" : "False"; };
+  return std::visit(
+      Overloaded{
+          [&](const bool* flag) -> Declaration { return {"bool", truth(*flag)}; },
+          [&](const Switch& one) -> Declaration { return {"bool", truth(*one.value)}; },
+          [&](const YesByDefault& one) -> Declaration { return {"bool", truth(*one.value)}; },
+          [](const int* number) -> Declaration { return {"int", std::to_string(*number)}; },
+          [](const std::uint64_t* number) -> Declaration { return {"int", std::to_string(*number)}; },
+          [](const double* number) -> Declaration { return {"float", std::string(py::repr(py::float_(*number)))}; },
+          [](const std::string* text) -> Declaration { return {"str", '"' + *text + '"'}; },
+          [](const std::optional<int>*) -> Declaration { return {"int | None", "None"}; },
+          [](const std::optional<std::uint64_t>*) -> Declaration { return {"int | None", "None"}; },
+          [](const std::optional<double>*) -> Declaration { return {"float | None", "None"}; },
+          [](const std::optional<std::string>*) -> Declaration { return {"str | None", "None"}; },
+          [](const std::vector<std::string>*) -> Declaration { return {"Sequence[str]", "[]"}; },
+          [](const std::optional<std::vector<std::string>>*) -> Declaration { return {"Sequence[str] | None", "None"}; },
+          [](const std::map<std::string, std::string>*) -> Declaration { return {"Mapping[str, str] | None", "None"}; },
+          [](const std::map<std::string, int>*) -> Declaration { return {"Mapping[str, int] | None", "None"}; },
+          [](const NamedNumbers*) -> Declaration { return {"_Path | Mapping[str, float] | None", "None"}; },
+          [](const Choice& one) -> Declaration {
+            if (one.get().empty()) return {literal(one.words) + " | None", "None"};
+            return {literal(one.words), '"' + one.get() + '"'};
+          },
+          [](const NumberOrWord& one) -> Declaration { return {"float | " + literal(words_of(one)) + " | None", "None"}; },
+          [](const Repeated&) -> Declaration { return {"Sequence[str]", "[]"}; },
+      },
+      value);
+}
+
+std::string declaration(const Option& option) {
+  const auto [type, otherwise] = declaration_of(option.value);
+  return fmt::format("{}: {} = {}", keyword_of(option), type, otherwise);
+}
+
+// Every option that a message may name, with its kind.
+const std::vector<Option>& every_option() {
+  static FitRequest fit;
+  static PredictRequest predict;
+  static EvaluateRequest evaluate;
+  static SimulateRequest simulate;
+  static GenerateRequest generate;
+  static DeriveOptions derive;
+  static ResampleOptions resample;
+  static const std::vector<Option> all = [] {
+    std::vector<Option> list;
+    for (std::vector<Option> table : {options(fit), options(predict), options(evaluate), options(simulate), options(generate),
+                                      options(derive), options(resample)}) {
+      list.insert(list.end(), table.begin(), table.end());
+    }
+    return list;
+  }();
+  return all;
+}
+
+std::string value_text(const Option& option, const std::string& value) {
+  const auto is_word = [&](const std::vector<std::string>& words) {
+    return std::find(words.begin(), words.end(), value) != words.end();
+  };
+  const auto list = [&] {
+    std::vector<std::string> items;
+    for (std::size_t first = 0; first <= value.size();) {
+      const std::size_t end = std::min(value.find(',', first), value.size());
+      items.push_back(value.substr(first, end - first));
+      first = end + 1;
+    }
+    return fmt::format("[{}]", fmt::join(quoted(items), ", "));
+  };
+  return std::visit(Overloaded{[&](const Choice& one) { return is_word(one.words) ? "'" + value + "'" : value; },
+                               [&](const NumberOrWord& one) { return is_word(words_of(one)) ? "'" + value + "'" : value; },
+                               [&](const std::vector<std::string>*) { return list(); },
+                               [&](const std::optional<std::vector<std::string>>*) { return list(); },
+                               [&](const std::map<std::string, std::string>*) {
+                                 const std::size_t equals = value.rfind('=');
+                                 return fmt::format("{{'{}': '{}'}}", value.substr(equals + 1), value.substr(0, equals));
+                               },
+                               [&](const auto&) { return value; }},
+                    option.value);
+}
+
+}  // namespace
+
+const std::string& keyword_of(const Option& option) { return option.keyword.empty() ? option.name : option.keyword; }
+
+void read_keywords(const std::string& function, const py::dict& keywords, const std::vector<Option>& options) {
+  for (const auto& [key, value] : keywords) {
+    const auto name = key.cast<std::string>();
+    const auto option =
+        std::find_if(options.begin(), options.end(), [&](const Option& one) { return keyword_of(one) == name; });
+    if (option != options.end()) {
+      read_keyword(value, *option);
+      continue;
+    }
+    py::list known;
+    for (const Option& one : options) known.append(keyword_of(one));
+    const py::list near = py::module_::import("difflib").attr("get_close_matches")(name, known, 1);
+    throw py::type_error(fmt::format("{}() got an unexpected keyword argument '{}'{}", function, name,
+                                     near.empty() ? "" : fmt::format("; did you mean '{}'?", near[0].cast<std::string>())));
+  }
+}
+
+std::string signature(const std::string& function, const std::string& first, const std::vector<Option>& options,
+                      const std::string& last, const std::string& returned) {
+  std::vector<std::string> declarations;
+  for (const Option& option : options) declarations.push_back(declaration(option));
+  return fmt::format("{}({} {}{}) -> {}\n", function, first, fmt::join(declarations, ", "), last, returned);
+}
+
+std::string documentation(const std::vector<Option>& options) {
+  std::string text;
+  for (const Option& option : options) {
+    text += fmt::format("{:<19} {}{}\n", keyword_of(option), with_keywords(option.text),
+                        option.otherwise.empty() ? "" : fmt::format("; default: {}", option.otherwise));
+  }
+  return text;
+}
+
+std::string stub_lines(const std::vector<Option>& options) {
+  std::string lines;
+  for (const Option& option : options) lines += fmt::format("{},\n", declaration(option));
+  return lines;
+}
+
+std::string with_keywords(const std::string& message) {
+  return respelled(message, [](const std::string& name, const std::optional<std::string>& value) {
+    const Option* option = find_option(every_option(), name);
+    const std::string keyword = option == nullptr ? name : keyword_of(*option);
+    if (!value) return keyword;
+    return fmt::format("{}={}", keyword, option == nullptr ? *value : value_text(*option, *value));
+  });
+}
+
+std::vector<std::string> with_keywords(std::vector<std::string> messages) {
+  for (std::string& message : messages) message = with_keywords(message);
+  return messages;
+}
+
+}  // namespace gp2::python

@@ -1,0 +1,45 @@
+#pragma once
+
+#include <string>
+#include <vector>
+
+#include <pybind11/pybind11.h>
+
+#include "gp2/jobs/option.hpp"
+
+namespace gp2::python {
+
+namespace py = pybind11;
+
+/// Takes a keyword that is no option of a job out of `keywords`.
+template <typename T>
+T take(py::dict& keywords, const char* name, T otherwise) {
+  if (!keywords.contains(name)) return otherwise;
+  return keywords.attr("pop")(name).cast<T>();
+}
+
+/// Reads what is left of the keywords of a call into the options of a job.
+/// @param function  for messages: fit
+/// @throws py::type_error for an unknown keyword, with the nearest there is, or a value of the wrong type; InputError for a
+///   word that an option does not have.
+void read_keywords(const std::string& function, const py::dict& keywords, const std::vector<Option>& options);
+
+/// The first line of a docstring: fit(system: System, *, mean: Literal["zero", "force"] = "zero", …) -> Posterior
+/// @param first, last  parameters before and after the options, ending and beginning with a comma
+std::string signature(const std::string& function, const std::string& first, const std::vector<Option>& options,
+                      const std::string& last, const std::string& returned);
+
+/// A line of a docstring for each option: its name and sentence.
+std::string documentation(const std::vector<Option>& options);
+
+/// The keywords of an option list as lines of the stub.
+std::string stub_lines(const std::vector<Option>& options);
+
+/// A message of the library with its options as Python has them: `noise_std=estimate` -> noise_std='estimate'.
+std::string with_keywords(const std::string& message);
+std::vector<std::string> with_keywords(std::vector<std::string> messages);
+
+/// The name of an option in Python.
+const std::string& keyword_of(const Option& option);
+
+}  // namespace gp2::python

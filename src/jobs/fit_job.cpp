@@ -1,0 +1,182 @@
+#include "gp2/jobs/fit_job.hpp"
+
+#include <cmath>
+#include <utility>
+
+#include <fmt/format.h>
+#include <fmt/ranges.h>
+
+#include "gp2/error.hpp"
+#include "gp2/jobs/fit_memory.hpp"
+
+namespace gp2 {
+
+namespace {
+
+void require_in_range(const FitRequest& request) {
+  const auto require_positive = [](const char* name, const auto& value) {
+    if (value && !(*value > 0)) throw InputError(fmt::format("`{}`: must be positive, got {}", name, *value));
+  };
+  const auto require_not_negative = [](const char* name, const std::optional<int>& value) {
+    if (value && *value < 0) throw InputError(fmt::format("`{}`: must not be negative, got {}", name, *value));
+  };
+  require_positive("restarts", request.restarts);
+  require_not_negative("max_iterations", request.max_iterations);
+  require_positive("max_points", request.problem.max_points);
+  if (request.threads < 0) {
+    throw InputError(
+        fmt::format("`threads`: must be positive, or 0 for as many as the machine has; got {}", request.threads));
+  }
+  const std::optional<double>& noise = request.problem.noise_stddev;
+  if (noise && (!(*noise > 0) || !std::isfinite(*noise))) {
+    throw InputError(fmt::format("`noise_std`: expected a positive number, 'estimate' or 'stated', got '{}'", *noise));
+  }
+  require_not_negative("max_escapes", request.max_escapes);
+  require_positive("gradient_tolerance", request.gradient_tolerance);
+  require_positive("reduction_tolerance", request.reduction_tolerance);
+}
+
+// The options of the optimiser: those asked for or, where nothing was, those of the problem, which the request then says too.
+FitOptions optimiser_options(FitRequest& request, const FitProblem& problem) {
+  FitOptions options = default_fit_options(problem);
+  const auto settle = [](auto& asked, auto& value) { value = asked.value_or(value), asked = value; };
+  settle(request.restarts, options.n_restarts);
+  settle(request.max_escapes, options.max_escapes);
+  settle(request.gradient_tolerance, options.gradient_tolerance);
+  settle(request.reduction_tolerance, options.reduction_tolerance);
+  options.max_iterations = request.max_iterations;
+  options.seed = request.problem.seed;
+  options.n_threads = request.threads;
+  options.standard_errors = request.standard_errors;
+  return options;
+}
+
+std::string source_of(const FitRequest& request) {
+  if (!request.data_source.empty()) return request.data_source;
+  std::vector<std::string> names;
+  for (const Log& log : request.logs) names.push_back(log.table.name());
+  for (const SideInformation& one : request.also) names.push_back(one.log.table.name());
+  return fmt::format("{}", fmt::join(names, ", "));
+}
+
+// What both kinds of preparation end with.
+FitJob job_of(FitRequest request, FitProblem problem) {
+  // a file of starting values may change: the record has the values
+  if (!request.start.empty()) {
+    read_start(request.start, request.max_iterations, problem);
+    request.start.file.clear();
+    for (const Hyperparameter& h : problem.hyperparameters) request.start.values[h.name] = h.value;
+  }
+  FitJob job;
+  const FitOptions asked = optimiser_options(request, problem);
+  job.notes = problem.notes;
+  job.options = within_memory(problem, asked, free_memory(), job.notes);
+  job.file.options = options_json(options(request));
+  job.file.prior_options = problem.prior_options;
+  job.file.systems = problem.systems;
+  job.file.data_source = source_of(request);
+  job.file.model = std::move(request.model);
+  job.problem = std::move(problem);
+  return job;
+}
+
+}  // namespace
+
+std::vector<Option> options(FitRequest& request) {
+  FitProblemOptions& problem = request.problem;
+  return {
+      {"also_noise_std", &problem.also_noise_stddev, "S", "noise standard deviation of what `also` gives",
+       "for accelerations: the model's [noise]"},
+      {"dt", &problem.time_step, "SECONDS", "time step of next velocities in `also` [s]"},
+      {"map", &problem.columns, "LOGNAME=NAME,…",
+       "columns by other names, in all logs together: theta1 for q3 also brings dtheta1, ddtheta1", "", "columns"},
+      {"observe", &problem.observe, "ddq3,ddq6", "accelerations to learn from; others need not be in the log",
+       "those with a column NAME_std in the log, or all"},
+      {"mean", choice(problem.mean, {{"zero", Prior::Mean::zero}, {"force", Prior::Mean::force}}), "",
+       "prior mean of the unconstrained acceleration: zero, or force = M⁻¹F of the model, where that is relied on"},
+      {"prior", choice(problem.base, {{"acceleration", Latent::Base::acceleration}, {"force", Latent::Base::force}}), "",
+       "put the model's latent on the acceleration or on the force", "as the model says"},
+      {"baseline",
+       choice(problem.baseline, {{"se", Baseline::Kind::se}, {"icm", Baseline::Kind::icm}, {"lmc", Baseline::Kind::lmc}}), "",
+       "learn ddq without mechanics (docs/priors.md): se (independent outputs), icm or lmc (multi-output), from the model's "
+       "features"},
+      {"estimate", &problem.estimate, "p1,p2", "parameters to estimate, or none", "those the model says"},
+      {"noise_std",
+       NumberOrWord{&problem.noise_stddev, {{"estimate", &problem.estimate_noise}, {"stated", &problem.trust_stated_noise}}}, "S",
+       "noise standard deviation of every observed ddq, 'estimate', or 'stated' for the log's NAME_std as they are",
+       "the log's NAME_std times a factor that is estimated, or as the model says"},
+      {"protocol", choice(problem.protocol.name, {{"default", Protocol::Name::standard}, {"paper", Protocol::Name::paper}}), "",
+       "how hyperparameters start and are bounded (docs/priors.md): default, or paper: the set-up of Geist & Trimpe 2020"},
+      {"hyperprior", Switch{&problem.protocol.hyperprior, "default", "none"}, "",
+       "weak log-normal hyper-priors, or none: maximum likelihood within the same bounds"},
+      {"discrepancy", Switch{&problem.discrepancy, "default", "none"}, "",
+       "a small latent for what the kernel would rule out (docs/priors.md), or none"},
+      {"project", &problem.project, "",
+       "move states onto position and velocity constraints, with the model's parameters, before anything else"},
+      {"robust", &problem.robust, "", "distrust values that disagree with all others, and say which (docs/command-line.md)"},
+      {"restarts", &request.restarts, "R", "runs of the optimiser; the first starts at the model's values",
+       "5; of a baseline 30"},
+      {"max_iterations", &request.max_iterations, "K",
+       "per run, what follows an escape included; 0 conditions at the starting values"},
+      {"start", &request.start, "FILE", "starting values: {\"name\": value, …} as JSON, or a FIT.json"},
+      {"max_points", &problem.max_points, "N", "take this many rows of each log, the first of a shuffle by `seed`", "all"},
+      {"seed", &problem.seed, "S", "of restarts and `max_points`"},
+      not_recorded({"threads", &request.threads, "K", "0: as many as the machine has; results do not depend on it"}),
+      {"standard_errors", YesByDefault{&request.standard_errors}, "",
+       "the standard errors of estimated parameters, which take a few dozen gradients"},
+      {"max_escapes", &request.max_escapes, "K", "scans for lower optima from the best one", "5"},
+      {"gradient_tolerance", &request.gradient_tolerance, "G", "stop when the largest entry of the projected gradient is below",
+       "1e-5"},
+      {"reduction_tolerance", &request.reduction_tolerance, "R",
+       "stop when an iteration lowers the objective by less, relatively", "1e-12; of a baseline 1e-9"},
+  };
+}
+
+FitJob prepare_fit(FitRequest request) {
+  require_in_range(request);
+  FitProblem problem = make_fit_problem(request.model, request.logs, request.also, request.problem);
+  return job_of(std::move(request), std::move(problem));
+}
+
+FitRequest request_of(const FitFile& fit) {
+  if (fit.options.empty()) {
+    throw InputError("the fit does not say what it was asked: its file is of a gp2 before format 6; fit anew");
+  }
+  FitRequest request;
+  request.model = fit.model;
+  request.data_source = fit.data_source;
+  read_options(fit.options, options(request), "options of the fit");
+  return request;
+}
+
+FitJob prepare_fit_again(const FitFile& fit, int threads) {
+  FitRequest request = request_of(fit);
+  request.threads = threads;
+  require_in_range(request);
+  if (request.problem.robust) {
+    throw InputError("`again`: the data of a robust fit are marked by what it distrusts; give its logs by `data`");
+  }
+  FitProblem problem;
+  problem.prior_options = fit.prior_options;
+  problem.prior = fit.prior();
+  problem.observations = fit.observations;
+  problem.systems = fit.systems;
+  problem.systems.resize(problem.observations.size());
+  problem.lines.resize(problem.observations.size());
+  problem.hyperparameters = starting_hyperparameters(problem, request.problem);
+  return job_of(std::move(request), std::move(problem));
+}
+
+FitOutcome run_fit(const FitJob& job, const std::function<void(const Progress&)>& progress, const std::atomic<bool>* stop) {
+  FitOptions options = job.options;
+  options.progress = progress;
+  options.stop = stop;
+  Fit result = fit(job.problem, options);
+  FitOutcome outcome{job.file, std::move(result.posterior), distrust_notes(job.problem, result.report)};
+  for (std::string& note : notes_of(result.report)) outcome.notes.push_back(std::move(note));
+  outcome.file.observations = outcome.posterior.observations();
+  outcome.file.report = std::move(result.report);
+  return outcome;
+}
+
+}  // namespace gp2

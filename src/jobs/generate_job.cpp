@@ -1,0 +1,42 @@
+#include "gp2/jobs/generate_job.hpp"
+
+#include <fmt/format.h>
+
+#include "gp2/error.hpp"
+
+namespace gp2 {
+
+namespace {
+
+Eigen::VectorXd noise_of(const Model& model, const std::optional<double>& given) {
+  const Eigen::Index nq = model.system->nq();
+  if (given) {
+    if (!(*given >= 0)) throw InputError(fmt::format("`noise_std`: must not be negative, got {}", *given));
+    return Eigen::VectorXd::Constant(nq, *given);
+  }
+  if (model.noise.stddev.empty()) {
+    throw InputError(fmt::format("{}: no [noise] ddq to draw from; give `noise_std=S` (0 for the truth)", model.name));
+  }
+  return Eigen::Map<const Eigen::VectorXd>(model.noise.stddev.data(), nq);
+}
+
+}  // namespace
+
+std::vector<Option> options(GenerateRequest& request) {
+  return {
+      {"n", &request.n, "N", "number of rows, drawn at random"},
+      {"grid", &request.grid, "q1=5,dq1=3,…",
+       "instead of `n`: every combination of so many points of each range in [sampling], evenly from end to end; with "
+       "`noise_std=0` for test data"},
+      {"seed", &request.seed, "S", "of the random numbers; same seed, same states, whatever the noise"},
+      {"noise_std", &request.noise_stddev, "S", "standard deviation of the noise on every ddq; 0 gives the truth",
+       "the model's [noise]"},
+  };
+}
+
+GeneratedData generate(const Model& model, const GenerateRequest& request) {
+  if (request.n && *request.n < 1) throw InputError(fmt::format("`n`: must be positive, got {}", *request.n));
+  return generate(model, GenerateOptions{request.n.value_or(1), request.seed, noise_of(model, request.noise_stddev), request.grid});
+}
+
+}  // namespace gp2

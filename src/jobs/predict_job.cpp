@@ -1,0 +1,174 @@
+#include "gp2/jobs/predict_job.hpp"
+
+#include <utility>
+
+#include <fmt/format.h>
+
+#include "gp2/error.hpp"
+#include "gp2/jobs/fit_problem.hpp"
+
+namespace gp2 {
+
+namespace {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+
+// Text that is the same is the same system; functions cannot be compared, but the system that they made can.
+bool is_same(const Model& a, const Model& b) {
+  return a.system == b.system || (!a.mechanics_are_code && !b.mechanics_are_code && a.text == b.text);
+}
+
+void set_time_step(View& view, const std::optional<double>& time_step) {
+  const bool needs_step = view.quantity->needs_time_step();
+  if (needs_step != time_step.has_value()) {
+    throw InputError(needs_step ? "`view=next-velocity` needs the time step: `dt=SECONDS`"
+                                : "`dt` goes with `view=next-velocity`");
+  }
+  if (!needs_step) return;
+  if (!(*time_step > 0)) throw InputError(fmt::format("`dt`: must be positive, got {}", *time_step));
+  view.time_step = *time_step;
+}
+
+void predict_marginals(const Posterior& posterior, const View& view, const MatrixXd& states,
+                       PredictRequest::Covariance covariance, PredictOutcome& out) {
+  const Index d = view.size();
+  if (covariance == PredictRequest::Covariance::none) {
+    out.values = posterior.mean(view, states, /*n_threads=*/0);
+    return;
+  }
+  const Posterior::Marginal prediction = posterior.marginal(view, states, /*n_threads=*/0);
+  if (prediction.n_clipped > 0) {
+    out.notes.push_back(fmt::format("{} variances were negative by rounding and set to 0", prediction.n_clipped));
+  }
+  const std::vector<std::string> names = out.names;
+  for (const std::string& name : names) out.names.push_back(name + "_std");
+  const bool full = covariance == PredictRequest::Covariance::full;
+  out.values.resize(2 * d + (full ? d * (d + 1) / 2 : 0), states.cols());
+  out.values.topRows(d) = prediction.mean;
+  out.values.middleRows(d, d) = prediction.stddev();
+  Index row = 2 * d;
+  for (Index j = 0; full && j < d; ++j) {
+    for (Index k = j; k < d; ++k) {
+      out.names.push_back(fmt::format("cov_{}_{}", names[static_cast<std::size_t>(j)], names[static_cast<std::size_t>(k)]));
+      out.values.row(row++) = prediction.covariance.row(k * d + j);
+    }
+  }
+}
+
+// NAME_sample1 … of every name, then NAME_sample2 …: draws of the view at all states together.
+void add_samples(const Posterior& posterior, const View& view, const MatrixXd& states, int n_samples, std::uint64_t seed,
+                 PredictOutcome& out) {
+  const MatrixXd samples = posterior.sample({{view, states}}, n_samples, seed);
+  const Index d = view.size(), first = out.values.rows();
+  const std::vector<std::string> names(out.names.begin(), out.names.begin() + d);
+  out.values.conservativeResize(first + d * n_samples, Eigen::NoChange);
+  for (int s = 0; s < n_samples; ++s) {
+    for (const std::string& name : names) out.names.push_back(fmt::format("{}_sample{}", name, s + 1));
+    out.values.middleRows(first + d * s, d) = samples.col(s).reshaped(d, states.cols());
+  }
+}
+
+// The accelerations that the fit observed.
+std::vector<std::string> observed_outputs(const Posterior& posterior, const System& system) {
+  for (const Observations& group : posterior.observations()) {
+    if (group.view().is_of_ddq()) return group.view().names(system);
+  }
+  return {};
+}
+
+Option columns_option(std::map<std::string, std::string>& columns) {
+  return {"map", &columns, "LOGNAME=NAME,…", "columns by other names", "", "columns"};
+}
+
+}  // namespace
+
+std::vector<Option> options(ViewRequest& request) {
+  std::vector<std::pair<std::string, View::Quantity>> words;
+  for (const std::string& word : View::Quantity::words()) words.emplace_back(word, *View::Quantity::of_word(word));
+  return {
+      {"view", choice(request.quantity, words), "",
+       "constrained: ddq1 …; unconstrained: abar_q1 …; constraint-force: fc_q1 …; multipliers: lambda1 …; next-velocity: "
+       "dq1_next …, with `dt`"},
+      {"dt", &request.time_step, "SECONDS", "time step of next-velocity [s]"},
+      {"latent", &request.latent, "NAME",
+       "only what this latent adds to the view, by its name: NAME@LATENT; the small one that a fit adds is called discrepancy"},
+  };
+}
+
+PredictedView predicted_view(const FitFile& fit, const Prior& prior, const ViewRequest& request) {
+  PredictedView out{View{}, &fit.model, prior, {}};
+  std::shared_ptr<const OtherSystem> other_system;
+  if (request.system && !is_same(*request.system, fit.model)) {
+    out.model = request.system.get();
+    other_system = make_other_system(fit.model, *out.model, fit.prior_options);
+    out.prior = other_system->prior;
+  }
+  out.view = View::all(request.quantity, *out.prior.system);
+  out.view.other_system = other_system;
+  if (out.view.size() == 0) {
+    throw InputError(
+        fmt::format("`view={}`: '{}' has no constraints", request.quantity->word(), out.prior.system->name()));
+  }
+  set_time_step(out.view, request.time_step);
+  if (request.latent) out.view.latent = latent_index(prior, *request.latent, "`latent`");
+  out.names = out.view.names(*out.prior.system, request.latent.value_or(""));
+  return out;
+}
+
+std::vector<Option> options(PredictRequest& request) {
+  using Covariance = PredictRequest::Covariance;
+  std::vector<Option> table = options(request.view);
+  table.push_back({"cov",
+                   choice(request.covariance,
+                          {{"none", Covariance::none}, {"std", Covariance::stddev}, {"full", Covariance::full}}),
+                   "", "none; std: NAME_std; full: also cov_NAME1_NAME2, the upper triangle. Without measurement noise"});
+  table.push_back({"samples", &request.n_samples, "S",
+                   "draws of all rows together: NAME_sample1 … NAME_sampleS; time grows with the cube of the rows", "",
+                   "n_samples"});
+  table.push_back({"seed", &request.seed, "K", "of the samples; same seed, same samples", "", "", "", "samples"});
+  table.push_back({"unconditioned", &request.unconditioned, "",
+                   "predict from the prior under the fitted hyperparameters, as if there had been no data"});
+  table.push_back(columns_option(request.columns));
+  return table;
+}
+
+PredictOutcome predict(const FitFile& fit, const CsvTable& states, const PredictRequest& request) {
+  if (request.n_samples && *request.n_samples < 1) {
+    throw InputError(fmt::format("`samples`: must be at least 1, got {}", *request.n_samples));
+  }
+  const Posterior posterior = request.unconditioned ? fit.posterior().without_data() : fit.posterior();
+  const PredictedView at = predicted_view(fit, posterior.prior(), request.view);
+  LogStates log = read_log_states(at.prior, at.view, *at.model, states, request.columns);
+  PredictOutcome out{at.names, {}, std::move(log.notes)};
+  at_states_of(states, [&] { predict_marginals(posterior, at.view, log.states, request.covariance, out); });
+  if (request.n_samples) add_samples(posterior, at.view, log.states, *request.n_samples, request.seed, out);
+  return out;
+}
+
+std::vector<Option> options(EvaluateRequest& request) {
+  return {{"outputs", &request.outputs, "ddq3,ddq6", "accelerations to compare", "those observed in training"},
+          columns_option(request.columns),
+          not_recorded({"threads", &request.threads, "K", "0: as many as the machine has; results do not depend on it"})};
+}
+
+EvaluateOutcome evaluate(const FitFile& fit, const Posterior& posterior, const CsvTable& log, const EvaluateRequest& request) {
+  if (request.threads < 0) {
+    throw InputError(
+        fmt::format("`threads`: must be positive, or 0 for as many as the machine has; got {}", request.threads));
+  }
+  const System& system = *fit.model.system;
+  const std::vector<std::string> outputs = request.outputs.empty() ? observed_outputs(posterior, system) : request.outputs;
+  const std::vector<int> rows = acceleration_rows(system, outputs, "`outputs`");
+  ViewRequest constrained;
+  constrained.system = request.system;
+  const PredictedView at = predicted_view(fit, posterior.prior(), constrained);
+  LogStates states = read_log_states(at.prior, at.view, *at.model, log, request.columns, outputs);
+  EvaluateOutcome out{{}, std::move(states.notes)};
+  out.evaluation = at_states_of(log, [&] {
+    return evaluate_predictions(posterior, states.states, rows, states.accelerations, at.view.other_system, request.threads);
+  });
+  return out;
+}
+
+}  // namespace gp2

@@ -1,0 +1,250 @@
+#include "gp2/jobs/simulate_job.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <memory>
+#include <utility>
+
+#include <fmt/format.h>
+#include <fmt/ranges.h>
+
+#include "gp2/error.hpp"
+#include "gp2/inference/pathwise.hpp"
+#include "gp2/jobs/fit_problem.hpp"
+
+namespace gp2 {
+
+namespace {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+
+void require_in_range(const SimulateRequest& request) {
+  if (request.n_samples && *request.n_samples < 1) {
+    throw InputError(fmt::format("`samples`: must be at least 1, got {}", *request.n_samples));
+  }
+  for (const auto& [name, tolerance] : {std::pair("rtol", request.relative_tolerance), std::pair("atol", request.absolute_tolerance)}) {
+    if (!(tolerance > 0) || !std::isfinite(tolerance))
+      throw InputError(fmt::format("`{}`: must be positive, got {}", name, tolerance));
+  }
+  if (request.times.size() == 0) {
+    throw InputError("`times`: expected the times [s] at which states are wanted; the first is the start");
+  }
+}
+
+StartingPoint empty_start(const System& system) {
+  const int size = system.layout().size();
+  return {VectorXd::Zero(size), std::vector<bool>(static_cast<std::size_t>(size), false)};
+}
+
+StartingPoint start_by_names(const System& system, const std::map<std::string, double>& given) {
+  const std::vector<std::string> names = system.state_names();
+  const auto end = names.begin() + system.layout().t();  // coordinates and velocities come first
+  StartingPoint start = empty_start(system);
+  for (const auto& [name, value] : given) {
+    const auto found = std::find(names.begin(), end, name);
+    if (found == end) {
+      throw InputError(fmt::format("`start`: '{}' is no coordinate or velocity of '{}'; there are: {}", name, system.name(),
+                                   fmt::join(names.begin(), end, ", ")));
+    }
+    if (!std::isfinite(value)) throw InputError(fmt::format("`start`: {} = '{}' is not a finite number", name, value));
+    const auto entry = found - names.begin();
+    start.state[entry] = value;
+    start.given[static_cast<std::size_t>(entry)] = true;
+  }
+  return start;
+}
+
+// What the first row of a log has of coordinates, velocities and t.
+StartingPoint start_of_log(const Model& model, const CsvTable& table, const std::map<std::string, std::string>& columns) {
+  const System& system = *model.system;
+  LogReader reader(table, system, columns);
+  const std::vector<std::string> names = system.state_names();
+  StartingPoint start = empty_start(system);
+  std::vector<std::string> found;
+  for (int k = 0; k <= system.layout().t(); ++k) {
+    const auto entry = static_cast<std::size_t>(k);
+    if (!reader.has(names[entry])) continue;
+    start.given[entry] = true;
+    found.push_back(names[entry]);
+  }
+  if (found.empty()) {
+    throw InputError(fmt::format("`start`: {} has none of the columns {}", table.name(),
+                                 fmt::join(names.begin(), names.begin() + system.layout().t(), ", ")));
+  }
+  const VectorXd row = reader.values(found).col(0);
+  Index next = 0;
+  for (std::size_t k = 0; k < names.size(); ++k) {
+    if (start.given[k]) start.state[static_cast<Index>(k)] = row[next++];
+  }
+  return start;
+}
+
+VectorXd start_state(const Model& model, const VectorXd& parameters, const SimulateRequest& request,
+                     const std::map<std::string, std::string>& columns, std::vector<std::string>& notes) {
+  const System& system = *model.system;
+  const StateLayout layout = system.layout();
+  const double t_start = request.times[0];
+  if (const auto* whole = std::get_if<VectorXd>(&request.start)) {
+    if (whole->size() != 2 * layout.nq) {
+      throw InputError(fmt::format("`start`: expected {} numbers, got {}", 2 * layout.nq, whole->size()));
+    }
+    if (!whole->allFinite()) throw InputError("`start`: not all numbers are finite");
+    VectorXd state = VectorXd::Zero(layout.size());
+    state.head(2 * layout.nq) = *whole;
+    state[layout.t()] = t_start;
+    return state;
+  }
+  const auto* table = std::get_if<CsvTable>(&request.start);
+  StartingPoint start = table != nullptr
+                            ? start_of_log(model, *table, columns)
+                            : start_by_names(system, std::get<std::map<std::string, double>>(request.start));
+  start.state[layout.t()] = t_start;
+  return complete_start(model, parameters, std::move(start), notes);
+}
+
+// Inputs must cover the motion: they are not extrapolated.
+InputSignal input_signal(const System& system, const SimulateRequest& request,
+                         const std::map<std::string, std::string>& columns) {
+  if (!request.inputs) return {};
+  const CsvTable& table = *request.inputs;
+  if (system.inputs().empty()) throw InputError(fmt::format("`inputs`: '{}' has no inputs", system.name()));
+  LogReader reader(table, system, columns);
+  const VectorXd times = reader.values({"t"}).row(0).transpose();
+  const MatrixXd values = reader.values(system.inputs());
+  const double t_start = request.times[0], t_end = request.times[request.times.size() - 1];
+  try {
+    InputSignal signal(times, values);
+    const double slack = 1e-9 * (t_end - t_start);
+    if (times[0] > t_start + slack || times[times.size() - 1] < t_end - slack) {
+      throw InputError(
+          fmt::format("times {} to {} do not cover the motion from {} to {}", times[0], times[times.size() - 1], t_start, t_end));
+    }
+    return signal;
+  } catch (const InputError& error) {
+    throw InputError(fmt::format("{}: {}", table.name(), error.what()));
+  }
+}
+
+// All but the accelerations.
+SimulateJob prepare(const Model& model, VectorXd parameters, const SimulateRequest& request) {
+  require_in_range(request);
+  std::vector<const CsvTable*> tables;
+  if (const auto* table = std::get_if<CsvTable>(&request.start)) tables.push_back(table);
+  if (request.inputs) tables.push_back(&*request.inputs);
+  const std::map<std::string, std::string> columns = checked_columns(model, tables, request.columns);
+  SimulateJob job;
+  job.system = model.system;
+  job.options.times = request.times;
+  job.options.relative_tolerance = request.relative_tolerance;
+  job.options.absolute_tolerance = request.absolute_tolerance;
+  job.options.project = request.project;
+  job.options.inputs = input_signal(*model.system, request, columns);
+  job.start = start_state(model, parameters, request, columns, job.notes);
+  job.parameters = std::move(parameters);
+  return job;
+}
+
+}  // namespace
+
+std::vector<Option> options(SimulateRequest& request) {
+  return {
+      {"rtol", &request.relative_tolerance, "R", "relative error per step, in each of q and dq"},
+      {"atol", &request.absolute_tolerance, "A", "absolute error per step"},
+      {"project", Switch{&request.project, "on", "off"}, "",
+       "onto the constraints, after each step and where states are written; off shows how far an integrator drifts"},
+      {"samples", &request.n_samples, "S", "that many functions drawn from the posterior, instead of its mean", "", "n_samples"},
+      {"seed", &request.seed, "K", "of `samples`; same seed, same samples"},
+      {"map", &request.columns, "LOGNAME=NAME,…", "columns by other names, in all logs together", "", "columns"},
+  };
+}
+
+std::optional<double> start_time(const Model& model, const MotionStart& start,
+                                 const std::map<std::string, std::string>& columns) {
+  const auto* table = std::get_if<CsvTable>(&start);
+  if (table == nullptr) return std::nullopt;
+  const StartingPoint point = start_of_log(model, *table, checked_columns(model, {}, columns));
+  const int t = model.system->layout().t();
+  return point.given[static_cast<std::size_t>(t)] ? std::optional(point.state[t]) : std::nullopt;
+}
+
+VectorXd motion_times(double t_start, double t_end, const std::optional<double>& time_step) {
+  constexpr int default_rows = 100;
+  constexpr double most_rows = 1e7;
+  if (!std::isfinite(t_start)) throw InputError(fmt::format("`t_start`: must be a finite number, got {}", t_start));
+  if (!(t_end > t_start) || !std::isfinite(t_end)) {
+    throw InputError(fmt::format("`t_end`: must be after the start {}, got {}", t_start, t_end));
+  }
+  if (!time_step) return VectorXd::LinSpaced(default_rows, t_start, t_end);
+  if (!(*time_step > 0)) throw InputError(fmt::format("`dt`: must be positive, got {}", *time_step));
+  const double span = t_end - t_start;
+  if (span / *time_step > most_rows) {
+    throw InputError(
+        fmt::format("`dt`: {} would write {:.3g} rows; at most {:.0e} are written", *time_step, span / *time_step, most_rows));
+  }
+  const auto n_full = static_cast<int>(std::floor(span / *time_step * (1 + 1e-12) + 1e-9));
+  std::vector<double> times;
+  for (int k = 0; k <= n_full; ++k) times.push_back(t_start + k * *time_step);
+  if (times.size() > 1 && t_end - times.back() < 1e-6 * *time_step) {
+    times.back() = t_end;
+  } else {
+    times.push_back(t_end);
+  }
+  return Eigen::Map<const VectorXd>(times.data(), static_cast<Index>(times.size()));
+}
+
+SimulateJob prepare_simulation(const Model& model, const SimulateRequest& request) {
+  if (request.n_samples) throw InputError("`samples`: a model has no posterior to draw from; give a FIT.json");
+  SimulateJob job = prepare(model, model.system->parameter_values(), request);
+  job.accelerations = {model_acceleration(model)};
+  return job;
+}
+
+SimulateJob prepare_simulation(const Model& model, const Posterior& posterior, const SimulateRequest& request) {
+  SimulateJob job = prepare(model, posterior.values().parameters, request);
+  const View view = View::constrained_acceleration(*model.system);
+  if (!request.n_samples) {
+    job.accelerations.emplace_back([posterior, view](const Eigen::Ref<const VectorXd>& x) -> VectorXd {
+      return posterior.mean(view, x).col(0);
+    });
+    return job;
+  }
+  const auto samples = std::make_shared<const PathwiseSamples>(sample_paths(posterior, *request.n_samples, {.seed = request.seed}));
+  for (int k = 0; k < samples->n_samples(); ++k) {
+    job.accelerations.emplace_back([samples, view, k](const Eigen::Ref<const VectorXd>& x) -> VectorXd {
+      return samples->evaluate(k, view, x).col(0);
+    });
+  }
+  return job;
+}
+
+std::vector<Trajectory> run_simulation(const SimulateJob& job, const std::atomic<bool>* stop) {
+  std::vector<Trajectory> motions;
+  for (const Acceleration& acceleration : job.accelerations) {
+    const Acceleration stoppable = [&](const Eigen::Ref<const VectorXd>& x) {
+      if (stop != nullptr && *stop) throw SimulationStopped();
+      return acceleration(x);
+    };
+    motions.push_back(simulate(*job.system, job.parameters, stoppable, job.start, job.options));
+  }
+  return motions;
+}
+
+MotionUncertainty motion_uncertainty(const Posterior& posterior, const Trajectory& trajectory) {
+  const System& system = *posterior.prior().system;
+  const View view = View::constrained_acceleration(system);
+  MotionUncertainty out;
+  out.stddev = posterior.marginal(view, trajectory.states).stddev();
+  const MatrixXd prior = posterior.without_data().marginal(view, trajectory.states).stddev();
+  for (Index i = 0; i < prior.cols() && !out.leaves_data; ++i) {
+    for (Index j = 0; j < prior.rows() && !out.leaves_data; ++j) {
+      if (!(out.stddev(j, i) > prior(j, i) / 2)) continue;
+      out.leaves_data = trajectory.times[i];
+      out.acceleration = system.coordinates()[static_cast<std::size_t>(j)].acceleration();
+    }
+  }
+  return out;
+}
+
+}  // namespace gp2

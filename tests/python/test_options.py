@@ -1,0 +1,77 @@
+"""Keywords, stub and pages come from the tables of options of the library."""
+
+import subprocess
+import sys
+
+import pytest
+
+import gp2
+from conftest import ROOT, program
+
+
+def test_pages_and_stub_are_those_of_the_tables():
+    program("GP2_COMMAND")
+    outcome = subprocess.run([sys.executable, ROOT / "scripts" / "options", "--check"], capture_output=True, text=True)
+    assert outcome.returncode == 0, outcome.stdout + outcome.stderr
+
+
+def test_an_unknown_keyword_is_refused_with_the_nearest(arm, arm_log):
+    with pytest.raises(TypeError, match=r"fit\(\) got an unexpected keyword argument 'noise_sd'; did you mean 'noise_std'\?"):
+        gp2.fit(arm, arm_log, noise_sd=0.1)
+    with pytest.raises(TypeError, match=r"unexpected keyword argument 'qqq'$"):
+        gp2.fit(arm, arm_log, qqq=1)
+
+
+@pytest.mark.parametrize(
+    ("keyword", "value"),
+    [
+        ("restarts", 2.5), ("seed", -1), ("observe", "ddshoulder"), ("noise_std", [1]), ("max_iterations", None),
+        ("columns", 3), ("mean", 1), ("start", 3.5),
+    ],
+)  # fmt: skip
+def test_a_keyword_of_another_type_is_a_type_error(arm, arm_log, keyword, value):
+    with pytest.raises(TypeError, match=keyword if keyword != "start" else None):
+        gp2.fit(arm, arm_log, **{keyword: value})
+
+
+def test_words_and_numbers_out_of_range_are_input_errors(arm, arm_log):
+    for keyword, value, said in [
+        ("mean", "one", "mean: expected one of 'zero', 'force', got 'one'"),
+        ("noise_std", "little", "noise_std: expected one of 'estimate', 'stated', got 'little'"),
+        ("noise_std", -1.0, "noise_std: expected a positive number, 'estimate' or 'stated', got '-1'"),
+        ("restarts", 0, "restarts: must be positive, got 0"),
+    ]:
+        with pytest.raises(gp2.InputError) as caught:
+            gp2.fit(arm, arm_log, **{keyword: value})
+        assert str(caught.value) == said
+
+
+def test_options_of_a_fit_are_under_the_names_of_the_command(arm, arm_log):
+    posterior = gp2.fit(arm, arm_log, mean="force", restarts=1, max_iterations=0, hyperprior=False, standard_errors=False)
+    assert posterior.options["hyperprior"] == "none"
+    assert posterior.options["restarts"] == 1
+    assert posterior.options["standard_errors"] is False
+
+
+def test_start_may_be_a_dict(arm, arm_log):
+    first = gp2.fit(arm, arm_log, restarts=1, max_iterations=3)
+    values = {h.name: h.value for h in first.report.hyperparameters}
+    again = gp2.fit(arm, arm_log, max_iterations=0, start=values)
+    assert {h.name: h.value for h in again.report.hyperparameters} == values
+
+
+def test_a_fit_is_repeated_to_the_bits(arm, arm_log, tmp_path):
+    posterior = gp2.fit(arm, arm_log, mean="force", estimate=["m2"], restarts=2, max_iterations=20, seed=4)
+    posterior.save(tmp_path / "fit.json")
+    gp2.fit_again(tmp_path / "fit.json").save(tmp_path / "again.json")
+    gp2.fit_again(tmp_path / "fit.json", arm_log).save(tmp_path / "from_log.json")
+    text = (tmp_path / "fit.json").read_text(encoding="utf-8")
+    assert (tmp_path / "again.json").read_text(encoding="utf-8") == text
+    assert (tmp_path / "from_log.json").read_text(encoding="utf-8") == text
+
+
+def test_messages_speak_of_keywords(arm, arm_log, tmp_path):
+    with pytest.raises(gp2.InputError, match="^again: also goes with data$"):
+        posterior = gp2.fit(arm, arm_log, restarts=1, max_iterations=0)
+        posterior.save(tmp_path / "fit.json")
+        gp2.fit_again(tmp_path / "fit.json", also=[gp2.SideInformation("unconstrained", arm_log)])
