@@ -273,7 +273,7 @@ py::object simulate_posterior(const PyPosterior& self, const py::object& start, 
   std::vector<Motion> motions = run_motions(job);
   if (request.n_samples) return py::cast(std::move(motions));
   {
-    const View view = View::all(View::Quantity::constrained_acceleration, self.system());
+    const View view = View::constrained_acceleration(self.system());
     const py::gil_scoped_release release;
     motions[0].stddev = posterior.marginal(view, motions[0].trajectory.states, /*n_threads=*/0).stddev();
   }

@@ -66,7 +66,7 @@ void check_mechanics(const Model& model, const Eigen::MatrixXd& states, std::vec
   append(findings, check_system(system, states, system.parameter_values()));
   if (has_error(findings)) return;
   MechanicsBatch mechanics;
-  evaluate_mechanics(make_prior(model), View::all(View::Quantity::constrained_acceleration, system), states,
+  evaluate_mechanics(make_prior(model), View::constrained_acceleration(system), states,
                      system.parameter_values(), mechanics);
   if (!mechanics.fault) return;
   findings.push_back({Level::error, fmt::format("{} at state {}", mechanics.fault->text, mechanics.fault->state + 1)});

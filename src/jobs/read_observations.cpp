@@ -272,8 +272,8 @@ Observations read_log(const LoggedSystem& logged, const Log& log, const FitProbl
   LogReader reader(log.table, system, columns_of(logged.model, options.columns));
   Readings readings;
   const std::vector<std::string> observe = observed_accelerations(system, options, reader, log.table, notes);
-  readings.view = {View::Quantity::constrained_acceleration, acceleration_rows(system, observe, "`observe`"), {}, {},
-                   logged.other_system};
+  readings.view = {
+      View::Quantity::constrained_acceleration, acceleration_rows(system, observe, "`observe`"), {}, {}, logged.other_system};
   readings.states = states_of(logged.prior, readings.view, reader, options.project);
   const std::vector<std::string> observed = readings.view.names(system);
   readings.values = reader.measurements(observed);

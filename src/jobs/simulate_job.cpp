@@ -203,7 +203,7 @@ SimulateJob prepare_simulation(const Model& model, const SimulateRequest& reques
 
 SimulateJob prepare_simulation(const Model& model, const Posterior& posterior, const SimulateRequest& request) {
   SimulateJob job = prepare(model, posterior.values().parameters, request);
-  const View view = View::all(View::Quantity::constrained_acceleration, *model.system);
+  const View view = View::constrained_acceleration(*model.system);
   if (!request.n_samples) {
     job.accelerations.emplace_back([posterior, view](const Eigen::Ref<const VectorXd>& x) -> VectorXd {
       return posterior.mean(view, x).col(0);
@@ -233,7 +233,7 @@ std::vector<Trajectory> run_simulation(const SimulateJob& job, const std::atomic
 
 MotionUncertainty motion_uncertainty(const Posterior& posterior, const Trajectory& trajectory) {
   const System& system = *posterior.prior().system;
-  const View view = View::all(View::Quantity::constrained_acceleration, system);
+  const View view = View::constrained_acceleration(system);
   MotionUncertainty out;
   out.stddev = posterior.marginal(view, trajectory.states).stddev();
   const MatrixXd prior = posterior.without_data().marginal(view, trajectory.states).stddev();

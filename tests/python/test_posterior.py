@@ -232,7 +232,7 @@ def test_the_predictors_options_are_checked(posterior):
     for options, text in [
         ({"view": "position"}, "view: expected one of constrained"),
         ({"dt": 0.1}, "dt goes with view='next-velocity'"),
-        ({"view": "next-velocity"}, "needs the time step dt [s]"),
+        ({"view": "next-velocity"}, "needs the time step: dt=SECONDS"),
         ({"storage": "half"}, "storage: expected 'double' or 'single', got 'half'"),
     ]:
         with pytest.raises(gp2.InputError) as caught:

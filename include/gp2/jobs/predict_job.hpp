@@ -22,8 +22,8 @@ namespace gp2 GP2_API {
 /// What a fit is asked for: a quantity, of the fitted system or another one.
 struct ViewRequest {
   View::Quantity quantity = View::Quantity::constrained_acceleration;
-  std::optional<double> time_step;            // Δt of the next velocity
-  std::optional<std::string> latent;          // only what this latent adds
+  std::optional<double> time_step;                // Δt of the next velocity
+  std::optional<std::string> latent;              // only what this latent adds
   std::shared_ptr<const Model> system = nullptr;  // with the same coordinates, inputs and latents; null: the fitted one
 };
 /// view, dt, latent.
@@ -79,4 +79,4 @@ struct EvaluateOutcome {
 /// Compares predictions with measured or true accelerations.
 EvaluateOutcome evaluate(const FitFile& fit, const Posterior& posterior, const CsvTable& log, const EvaluateRequest& request);
 
-}  // namespace gp2
+}  // namespace GP2_API
