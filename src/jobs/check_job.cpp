@@ -40,8 +40,8 @@ void check_columns_of(const CsvTable& table, const LogReader& reader, const Whol
   const auto good = [&](std::string text) { findings.push_back({Level::good, std::move(text)}); };
   good(fmt::format("{}: {} rows, every column found that the model reads", table.name(), table.n_rows()));
   if (!log.missing.empty()) {
-    findings.push_back({Level::warning, fmt::format("not in the log: {}; fit with `observe` for the others",
-                                                    fmt::join(log.missing, ", "))});
+    findings.push_back(
+        {Level::warning, fmt::format("not in the log: {}; fit with `observe` for the others", fmt::join(log.missing, ", "))});
   }
   if (!log.stated.empty()) {
     std::vector<std::string> names;
@@ -66,8 +66,7 @@ void check_mechanics(const Model& model, const Eigen::MatrixXd& states, std::vec
   append(findings, check_system(system, states, system.parameter_values()));
   if (has_error(findings)) return;
   MechanicsBatch mechanics;
-  evaluate_mechanics(make_prior(model), View::constrained_acceleration(system), states,
-                     system.parameter_values(), mechanics);
+  evaluate_mechanics(make_prior(model), View::constrained_acceleration(system), states, system.parameter_values(), mechanics);
   if (!mechanics.fault) return;
   findings.push_back({Level::error, fmt::format("{} at state {}", mechanics.fault->text, mechanics.fault->state + 1)});
 }
