@@ -234,16 +234,7 @@ class Motion:
 
 class Posterior:
     @staticmethod
-    def fit_again(
-    path: _Path,
-    data: _Table | Log | _Arrays | list[Any] | None = None,
-    *,
-    also: Sequence[SideInformation] = [],
-    system: System | None = None,
-    threads: int = 0,
-    progress: Callable[[Progress], object] | None = None,
-) -> Posterior: ...
-def load(path: _Path, system: System | None = None) -> Posterior: ...
+    def load(path: _Path, system: System | None = None) -> Posterior: ...
     def save(self, path: _Path) -> None: ...
     @property
     def system(self) -> System: ...
@@ -389,7 +380,40 @@ def fit(
     *,
     also: Sequence[SideInformation] = [],
     # options of fit: written by scripts/options
+    also_noise_std: float | None = None,
+    dt: float | None = None,
+    columns: Mapping[str, str] | None = None,
+    observe: Sequence[str] = [],
+    mean: Literal["zero", "force"] = "zero",
+    prior: Literal["acceleration", "force"] | None = None,
+    baseline: Literal["se", "icm", "lmc"] | None = None,
+    estimate: Sequence[str] | None = None,
+    noise_std: float | Literal["estimate", "stated"] | None = None,
+    protocol: Literal["default", "paper"] = "default",
+    hyperprior: bool = True,
+    discrepancy: bool = True,
+    project: bool = False,
+    robust: bool = False,
+    restarts: int | None = None,
+    max_iterations: int = 1000,
+    start: _Path | Mapping[str, float] | None = None,
+    max_points: int | None = None,
+    seed: int = 0,
+    threads: int = 0,
+    standard_errors: bool = True,
+    max_escapes: int | None = None,
+    gradient_tolerance: float | None = None,
+    reduction_tolerance: float | None = None,
     # end of options
+    progress: Callable[[Progress], object] | None = None,
+) -> Posterior: ...
+def fit_again(
+    path: _Path,
+    data: _Table | Log | _Arrays | list[Any] | None = None,
+    *,
+    also: Sequence[SideInformation] = [],
+    system: System | None = None,
+    threads: int = 0,
     progress: Callable[[Progress], object] | None = None,
 ) -> Posterior: ...
 def load(path: _Path, system: System | None = None) -> Posterior: ...
@@ -399,6 +423,15 @@ def derive(
     data: _Table,
     *,
     # options of derive: written by scripts/options
+    episode: str = "",
+    episodes: Sequence[str] = [],
+    rate: float = 0.0,
+    every: int = 1,
+    hold_constraints: bool = False,
+    outlier_threshold: float = 5.0,
+    smoothness: Literal["5/2", "7/2", "9/2"] = "9/2",
+    keep: Sequence[str] = [],
+    columns: Mapping[str, str] | None = None,
     # end of options
 ) -> tuple[Table, dict[str, Any]]: ...
 def resample(
@@ -407,6 +440,9 @@ def resample(
     n: int,
     *,
     # options of resample: written by scripts/options
+    features: Sequence[str] = [],
+    seed: int | None = None,
+    columns: Mapping[str, str] | None = None,
     # end of options
 ) -> Table: ...
 def simulate(
@@ -416,5 +452,11 @@ def simulate(
     inputs: _Table | None = None,
     *,
     # options of simulate: written by scripts/options
+    rtol: float = 1e-06,
+    atol: float = 1e-09,
+    project: bool = True,
+    n_samples: int | None = None,
+    seed: int = 0,
+    columns: Mapping[str, str] | None = None,
     # end of options
 ) -> Motion: ...
