@@ -589,12 +589,14 @@ start   {"q1": 0.4, "dq1": 1.0}: what is not named follows from the constraints;
 times   at which states are wanted (n) [s]; the first is the start
 inputs  a table with t and every input, linear in between, that covers the motion; default: zero
 
-)" + motion_options + R"(
+)" + motion_options +
+                 R"(
 Returns a Motion, or with n_samples a list of them. Raises NumericalError, with the time, when it cannot go on.)")
                     .c_str());
-  module.def("simulate", &simulate_model, "system"_a, "start"_a, "times"_a, "inputs"_a = py::none(),
-             (simulate_documentation("system: System, ") + "\nIntegrate a system by its own force and [truth]. As Posterior.simulate.")
-                 .c_str());
+  module.def(
+      "simulate", &simulate_model, "system"_a, "start"_a, "times"_a, "inputs"_a = py::none(),
+      (simulate_documentation("system: System, ") + "\nIntegrate a system by its own force and [truth]. As Posterior.simulate.")
+          .c_str());
 }
 
 }  // namespace gp2::python

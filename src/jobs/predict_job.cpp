@@ -107,8 +107,7 @@ PredictedView predicted_view(const FitFile& fit, const Prior& prior, const ViewR
   out.view = View::all(request.quantity, *out.prior.system);
   out.view.other_system = other_system;
   if (out.view.size() == 0) {
-    throw InputError(
-        fmt::format("`view={}`: '{}' has no constraints", request.quantity->word(), out.prior.system->name()));
+    throw InputError(fmt::format("`view={}`: '{}' has no constraints", request.quantity->word(), out.prior.system->name()));
   }
   set_time_step(out.view, request.time_step);
   if (request.latent) out.view.latent = latent_index(prior, *request.latent, "`latent`");
@@ -119,10 +118,9 @@ PredictedView predicted_view(const FitFile& fit, const Prior& prior, const ViewR
 std::vector<Option> options(PredictRequest& request) {
   using Covariance = PredictRequest::Covariance;
   std::vector<Option> table = options(request.view);
-  table.push_back({"cov",
-                   choice(request.covariance,
-                          {{"none", Covariance::none}, {"std", Covariance::stddev}, {"full", Covariance::full}}),
-                   "", "none; std: NAME_std; full: also cov_NAME1_NAME2, the upper triangle. Without measurement noise"});
+  table.push_back(
+      {"cov", choice(request.covariance, {{"none", Covariance::none}, {"std", Covariance::stddev}, {"full", Covariance::full}}),
+       "", "none; std: NAME_std; full: also cov_NAME1_NAME2, the upper triangle. Without measurement noise"});
   table.push_back({"samples", &request.n_samples, "S",
                    "draws of all rows together: NAME_sample1 … NAME_sampleS; time grows with the cube of the rows", "",
                    "n_samples"});
@@ -154,8 +152,7 @@ std::vector<Option> options(EvaluateRequest& request) {
 
 EvaluateOutcome evaluate(const FitFile& fit, const Posterior& posterior, const CsvTable& log, const EvaluateRequest& request) {
   if (request.threads < 0) {
-    throw InputError(
-        fmt::format("`threads`: must be positive, or 0 for as many as the machine has; got {}", request.threads));
+    throw InputError(fmt::format("`threads`: must be positive, or 0 for as many as the machine has; got {}", request.threads));
   }
   const System& system = *fit.model.system;
   const std::vector<std::string> outputs = request.outputs.empty() ? observed_outputs(posterior, system) : request.outputs;

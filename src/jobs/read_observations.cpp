@@ -254,7 +254,8 @@ void check_columns(const System& system, const std::vector<const CsvTable*>& log
       if (std::any_of(meant.begin(), meant.end(), [&](const std::string& one) { return log->find(one) >= 0; })) break;
       lacking.push_back(fmt::format("{} has no column '{}'; it has: {}", log->name(), column, fmt::join(log->header(), ", ")));
     }
-    if (!logs.empty() && lacking.size() == logs.size()) throw InputError(fmt::format("`map={}={}`: {}", column, name, fmt::join(lacking, "; ")));
+    if (!logs.empty() && lacking.size() == logs.size())
+      throw InputError(fmt::format("`map={}={}`: {}", column, name, fmt::join(lacking, "; ")));
   }
 }
 

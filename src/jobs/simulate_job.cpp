@@ -24,7 +24,8 @@ void require_in_range(const SimulateRequest& request) {
   if (request.n_samples && *request.n_samples < 1) {
     throw InputError(fmt::format("`samples`: must be at least 1, got {}", *request.n_samples));
   }
-  for (const auto& [name, tolerance] : {std::pair("rtol", request.relative_tolerance), std::pair("atol", request.absolute_tolerance)}) {
+  for (const auto& [name, tolerance] :
+       {std::pair("rtol", request.relative_tolerance), std::pair("atol", request.absolute_tolerance)}) {
     if (!(tolerance > 0) || !std::isfinite(tolerance))
       throw InputError(fmt::format("`{}`: must be positive, got {}", name, tolerance));
   }
@@ -97,9 +98,8 @@ VectorXd start_state(const Model& model, const VectorXd& parameters, const Simul
     return state;
   }
   const auto* table = std::get_if<CsvTable>(&request.start);
-  StartingPoint start = table != nullptr
-                            ? start_of_log(model, *table, columns)
-                            : start_by_names(system, std::get<std::map<std::string, double>>(request.start));
+  StartingPoint start = table != nullptr ? start_of_log(model, *table, columns)
+                                         : start_by_names(system, std::get<std::map<std::string, double>>(request.start));
   start.state[layout.t()] = t_start;
   return complete_start(model, parameters, std::move(start), notes);
 }
@@ -205,16 +205,15 @@ SimulateJob prepare_simulation(const Model& model, const Posterior& posterior, c
   SimulateJob job = prepare(model, posterior.values().parameters, request);
   const View view = View::constrained_acceleration(*model.system);
   if (!request.n_samples) {
-    job.accelerations.emplace_back([posterior, view](const Eigen::Ref<const VectorXd>& x) -> VectorXd {
-      return posterior.mean(view, x).col(0);
-    });
+    job.accelerations.emplace_back(
+        [posterior, view](const Eigen::Ref<const VectorXd>& x) -> VectorXd { return posterior.mean(view, x).col(0); });
     return job;
   }
-  const auto samples = std::make_shared<const PathwiseSamples>(sample_paths(posterior, *request.n_samples, {.seed = request.seed}));
+  const auto samples =
+      std::make_shared<const PathwiseSamples>(sample_paths(posterior, *request.n_samples, {.seed = request.seed}));
   for (int k = 0; k < samples->n_samples(); ++k) {
-    job.accelerations.emplace_back([samples, view, k](const Eigen::Ref<const VectorXd>& x) -> VectorXd {
-      return samples->evaluate(k, view, x).col(0);
-    });
+    job.accelerations.emplace_back(
+        [samples, view, k](const Eigen::Ref<const VectorXd>& x) -> VectorXd { return samples->evaluate(k, view, x).col(0); });
   }
   return job;
 }

@@ -70,11 +70,12 @@ struct Repeated {
 };
 
 /// Where the value of an option stands, and of what kind it is.
-using OptionValue = std::variant<bool*, int*, std::uint64_t*, double*, std::string*,                                      //
-                                 std::optional<int>*, std::optional<std::uint64_t>*, std::optional<double>*,              //
-                                 std::optional<std::string>*, std::vector<std::string>*,                                  //
-                                 std::optional<std::vector<std::string>>*, std::map<std::string, std::string>*,           //
-                                 std::map<std::string, int>*, NamedNumbers*, Choice, Switch, YesByDefault, NumberOrWord, Repeated>;
+using OptionValue =
+    std::variant<bool*, int*, std::uint64_t*, double*, std::string*,                             //
+                 std::optional<int>*, std::optional<std::uint64_t>*, std::optional<double>*,     //
+                 std::optional<std::string>*, std::vector<std::string>*,                         //
+                 std::optional<std::vector<std::string>>*, std::map<std::string, std::string>*,  //
+                 std::map<std::string, int>*, NamedNumbers*, Choice, Switch, YesByDefault, NumberOrWord, Repeated>;
 
 /// One entry of a job's table of options: `std::vector<Option> options(Request&)`. From this table come the options of the
 /// command, the keywords of Python with their docstrings and stubs, `options` in FIT.json, and the tables of the documentation.

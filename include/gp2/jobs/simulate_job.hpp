@@ -38,8 +38,7 @@ struct SimulateRequest {
 std::vector<Option> options(SimulateRequest& request);
 
 /// The time of a log's first row; nothing where it has none.
-std::optional<double> start_time(const Model& model, const MotionStart& start,
-                                 const std::map<std::string, std::string>& columns);
+std::optional<double> start_time(const Model& model, const MotionStart& start, const std::map<std::string, std::string>& columns);
 
 /// Times from a start to an end, both among them.
 /// @param time_step  between two; not given: 100 times
@@ -50,10 +49,10 @@ Eigen::VectorXd motion_times(double t_start, double t_end, const std::optional<d
 struct SimulateJob {
   std::shared_ptr<const System> system;
   Eigen::VectorXd parameters;
-  Eigen::VectorXd start;                     // the whole state
-  std::vector<Acceleration> accelerations;   // one for each motion
+  Eigen::VectorXd start;                    // the whole state
+  std::vector<Acceleration> accelerations;  // one for each motion
   SimulateOptions options;
-  std::vector<std::string> notes;            // how the start was completed
+  std::vector<std::string> notes;  // how the start was completed
 };
 
 /// The motion of a model by its own equations: its force and [truth].
