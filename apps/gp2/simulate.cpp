@@ -234,7 +234,7 @@ Command simulate_command() {
                   "gp2 simulate fit.json --start q1=0.4,q2=0.8,dq1=0.8,dq2=1 --t-end 6 -o motion.csv", {}, {}};
   command.options = {
       argument("FILE", a->file, "file written by gp2 fit, or a model file: its force and [truth]"),
-      required({"start", &a->start, "NAME=VALUE,…|CSV",
+      required({"start", &a->start, "NAME=VALUE,… or CSV",
                 "coordinates and velocities, or a CSV whose first row is taken. What is not given follows from the constraints, or "
                 "is 0"}),
       required({"t_end", &a->t_end, "SECONDS", "end of the motion [s]"}),
