@@ -7,9 +7,9 @@
 #include <utility>
 #include <variant>
 
-#include <CLI/CLI.hpp>
 #include <fmt/format.h>
 #include <fmt/ranges.h>
+#include <CLI/CLI.hpp>
 
 #include "gp2/error.hpp"
 
@@ -55,7 +55,9 @@ void set_from_text(const Option& option, const std::string& text) {
                         },
                         [&](std::map<std::string, std::string>* columns) { *columns = parse_map(text); },
                         [&](std::map<std::string, int>* counts) { *counts = parse_counts(text, flag_of(option)); },
-                        [&](NamedNumbers* numbers) { *numbers = {text, {}}; },
+                        [&](NamedNumbers* numbers) {
+                          *numbers = {text, {}};
+                        },
                         [&](const Choice& one) { one.set(text); }, [&](const Switch& one) { *one.value = text == one.on; },
                         [&](const NumberOrWord& one) { set_number_or_word(one, option, text); }, [](const auto&) {}},
              option.value);
@@ -66,11 +68,11 @@ void set_from_text(const Option& option, const std::string& text) {
 // `--mean zero` \| `force`
 std::string usage_of(const Option& option) {
   const std::string flag = flag_of(option);
-  const auto words = [&](const std::vector<std::string>& all) {
-    return fmt::format("`{} {}`", flag, fmt::join(all, "` \\| `"));
-  };
+  const auto words = [&](const std::vector<std::string>& all) { return fmt::format("`{} {}`", flag, fmt::join(all, "` \\| `")); };
   return std::visit(Overloaded{[&](const Choice& one) { return words(one.words); },
-                               [&](const Switch& one) { return words({one.on, one.off}); },
+                               [&](const Switch& one) {
+                                 return words({one.on, one.off});
+                               },
                                [&](const NumberOrWord& one) {
                                  std::vector<std::string> all = {option.sample};
                                  for (const auto& [word, flag_value] : one.words) all.push_back(word);
@@ -87,13 +89,13 @@ std::string usage_of(const Option& option) {
 // What a new request holds, where that says it.
 std::string default_of(const Option& option) {
   const auto word = [](const std::string& text) { return text.empty() ? text : "`" + text + "`"; };
-  return std::visit(Overloaded{[&](const Choice& one) { return word(one.get()); },
-                               [&](const Switch& one) { return word(*one.value ? one.on : one.off); },
-                               [](const int* number) { return std::to_string(*number); },
-                               [](const std::uint64_t* number) { return std::to_string(*number); },
-                               [](const double* number) { return fmt::format("{}", *number); },
-                               [](const auto&) { return std::string(); }},
-                    option.value);
+  return std::visit(
+      Overloaded{[&](const Choice& one) { return word(one.get()); },
+                 [&](const Switch& one) { return word(*one.value ? one.on : one.off); },
+                 [](int* number) { return std::to_string(*number); },
+                 [](std::uint64_t* number) { return std::to_string(*number); },
+                 [](double* number) { return fmt::format("{}", *number); }, [](const auto&) { return std::string(); }},
+      option.value);
 }
 
 // docs/priors.md -> [priors.md](priors.md)
@@ -141,7 +143,10 @@ class Parsing {
     CLI::Option* added = std::visit(
         Overloaded{
             [&](bool* value) { return app_.add_flag(flag, *value, help); },
-            [&](const YesByDefault& one) { return app_.add_flag(flag, [one](std::int64_t n) { *one.value = n == 0; }, help); },
+            [&](const YesByDefault& one) {
+              return app_.add_flag(
+                  flag, [one](std::int64_t n) { *one.value = n == 0; }, help);
+            },
             [&](int* value) { return app_.add_option(flag, *value, help)->capture_default_str(); },
             [&](double* value) { return app_.add_option(flag, *value, help)->capture_default_str(); },
             [&](std::string* value) { return app_.add_option(flag, *value, help); },
@@ -151,7 +156,9 @@ class Parsing {
             [&](std::optional<std::uint64_t>* value) { return app_.add_option(flag, *value, help)->check(not_negative()); },
             [&](const Repeated& one) { return app_.add_option(flag, *one.values, help)->allow_extra_args(false); },
             [&](const Choice& one) { return add_words(option, one.words, one.get()); },
-            [&](const Switch& one) { return add_words(option, {one.on, one.off}, *one.value ? one.on : one.off); },
+            [&](const Switch& one) {
+              return add_words(option, {one.on, one.off}, *one.value ? one.on : one.off);
+            },
             [&]<typename T>(std::optional<T>* value) { return add_optional(option, value); },
             [&](const auto&) { return app_.add_option(flag, texts_[option.name], help); },
         },
@@ -196,7 +203,9 @@ std::string markdown_table(const Command& command) {
   std::string table = "| option | default | |\n|---|---|---|\n";
   for (const Option& option : command.options) {
     const std::string usage = usage_of(option);
-    const std::string otherwise = option.is_required ? "required" : option.otherwise.empty() ? default_of(option) : option.otherwise;
+    const std::string otherwise = option.is_required         ? "required"
+                                  : option.otherwise.empty() ? default_of(option)
+                                                             : option.otherwise;
     std::string text = with_flags(option.text);
     if (std::holds_alternative<YesByDefault>(option.value)) text = "leaves out " + text;
     table += fmt::format("| {} | {} | {} |\n", usage, otherwise, with_links(text));

@@ -195,8 +195,7 @@ SimulateRequest read_request(const Arguments& arguments, const Model& model) {
   } else {
     request.start = CsvTable::read(arguments.start, CsvTable::Keep::numbers);
   }
-  const double t_start =
-      arguments.t_start ? *arguments.t_start : start_time(model, request.start, request.columns).value_or(0);
+  const double t_start = arguments.t_start ? *arguments.t_start : start_time(model, request.start, request.columns).value_or(0);
   request.times = motion_times(t_start, *arguments.t_end, arguments.time_step);
   if (!arguments.inputs.empty()) request.inputs = CsvTable::read(arguments.inputs, CsvTable::Keep::numbers);
   return request;
@@ -230,13 +229,17 @@ void run(const Arguments& arguments) {
 
 Command simulate_command() {
   const auto a = std::make_shared<Arguments>();
-  Command command{"simulate", "Integrate the motion of a fit or of a model, on its constraints",
-                  "gp2 simulate fit.json --start q1=0.4,q2=0.8,dq1=0.8,dq2=1 --t-end 6 -o motion.csv", {}, {}};
+  Command command{"simulate",
+                  "Integrate the motion of a fit or of a model, on its constraints",
+                  "gp2 simulate fit.json --start q1=0.4,q2=0.8,dq1=0.8,dq2=1 --t-end 6 -o motion.csv",
+                  {},
+                  {}};
   command.options = {
       argument("FILE", a->file, "file written by gp2 fit, or a model file: its force and [truth]"),
-      required({"start", &a->start, "NAME=VALUE,… or CSV",
-                "coordinates and velocities, or a CSV whose first row is taken. What is not given follows from the constraints, or "
-                "is 0"}),
+      required(
+          {"start", &a->start, "NAME=VALUE,… or CSV",
+           "coordinates and velocities, or a CSV whose first row is taken. What is not given follows from the constraints, or "
+           "is 0"}),
       required({"t_end", &a->t_end, "SECONDS", "end of the motion [s]"}),
       {"t_start", &a->t_start, "SECONDS", "its start [s]", "t of the CSV of --start, or 0"},
       {"dt", &a->time_step, "SECONDS", "time between written rows; the end is always written [s]", "100 rows"},

@@ -73,12 +73,12 @@ void read_named_numbers(py::handle given, NamedNumbers& numbers, const std::stri
 
 // None stands for "not given" wherever that is possible.
 bool has_none(const OptionValue& value) {
-  return std::visit(Overloaded{[]<typename T>(const std::optional<T>*) { return true; },
-                               [](const std::map<std::string, std::string>*) { return true; },
-                               [](const std::map<std::string, int>*) { return true; }, [](const NamedNumbers*) { return true; },
-                               [](const Choice& one) { return one.get().empty(); }, [](const NumberOrWord&) { return true; },
-                               [](const auto&) { return false; }},
-                    value);
+  return std::visit(
+      Overloaded{[]<typename T>(std::optional<T>*) { return true; }, [](std::map<std::string, std::string>*) { return true; },
+                 [](std::map<std::string, int>*) { return true; }, [](NamedNumbers*) { return true; },
+                 [](const Choice& one) { return one.get().empty(); }, [](const NumberOrWord&) { return true; },
+                 [](const auto&) { return false; }},
+      value);
 }
 
 void read_keyword(py::handle given, const Option& option) {
@@ -132,32 +132,67 @@ struct Declaration {
 };
 Declaration declaration_of(const OptionValue& value) {
   const auto truth = [](bool is_true) { return is_true ? "True" : "False"; };
-  return std::visit(
-      Overloaded{
-          [&](const bool* flag) -> Declaration { return {"bool", truth(*flag)}; },
-          [&](const Switch& one) -> Declaration { return {"bool", truth(*one.value)}; },
-          [&](const YesByDefault& one) -> Declaration { return {"bool", truth(*one.value)}; },
-          [](const int* number) -> Declaration { return {"int", std::to_string(*number)}; },
-          [](const std::uint64_t* number) -> Declaration { return {"int", std::to_string(*number)}; },
-          [](const double* number) -> Declaration { return {"float", std::string(py::repr(py::float_(*number)))}; },
-          [](const std::string* text) -> Declaration { return {"str", '"' + *text + '"'}; },
-          [](const std::optional<int>*) -> Declaration { return {"int | None", "None"}; },
-          [](const std::optional<std::uint64_t>*) -> Declaration { return {"int | None", "None"}; },
-          [](const std::optional<double>*) -> Declaration { return {"float | None", "None"}; },
-          [](const std::optional<std::string>*) -> Declaration { return {"str | None", "None"}; },
-          [](const std::vector<std::string>*) -> Declaration { return {"Sequence[str]", "[]"}; },
-          [](const std::optional<std::vector<std::string>>*) -> Declaration { return {"Sequence[str] | None", "None"}; },
-          [](const std::map<std::string, std::string>*) -> Declaration { return {"Mapping[str, str] | None", "None"}; },
-          [](const std::map<std::string, int>*) -> Declaration { return {"Mapping[str, int] | None", "None"}; },
-          [](const NamedNumbers*) -> Declaration { return {"_Path | Mapping[str, float] | None", "None"}; },
-          [](const Choice& one) -> Declaration {
-            if (one.get().empty()) return {literal(one.words) + " | None", "None"};
-            return {literal(one.words), '"' + one.get() + '"'};
-          },
-          [](const NumberOrWord& one) -> Declaration { return {"float | " + literal(words_of(one)) + " | None", "None"}; },
-          [](const Repeated&) -> Declaration { return {"Sequence[str]", "[]"}; },
-      },
-      value);
+  return std::visit(Overloaded{
+                        [&](const bool* flag) -> Declaration {
+                          return {"bool", truth(*flag)};
+                        },
+                        [&](const Switch& one) -> Declaration {
+                          return {"bool", truth(*one.value)};
+                        },
+                        [&](const YesByDefault& one) -> Declaration {
+                          return {"bool", truth(*one.value)};
+                        },
+                        [](const int* number) -> Declaration {
+                          return {"int", std::to_string(*number)};
+                        },
+                        [](const std::uint64_t* number) -> Declaration {
+                          return {"int", std::to_string(*number)};
+                        },
+                        [](const double* number) -> Declaration {
+                          return {"float", std::string(py::repr(py::float_(*number)))};
+                        },
+                        [](const std::string* text) -> Declaration {
+                          return {"str", '"' + *text + '"'};
+                        },
+                        [](const std::optional<int>*) -> Declaration {
+                          return {"int | None", "None"};
+                        },
+                        [](const std::optional<std::uint64_t>*) -> Declaration {
+                          return {"int | None", "None"};
+                        },
+                        [](const std::optional<double>*) -> Declaration {
+                          return {"float | None", "None"};
+                        },
+                        [](const std::optional<std::string>*) -> Declaration {
+                          return {"str | None", "None"};
+                        },
+                        [](const std::vector<std::string>*) -> Declaration {
+                          return {"Sequence[str]", "[]"};
+                        },
+                        [](const std::optional<std::vector<std::string>>*) -> Declaration {
+                          return {"Sequence[str] | None", "None"};
+                        },
+                        [](const std::map<std::string, std::string>*) -> Declaration {
+                          return {"Mapping[str, str] | None", "None"};
+                        },
+                        [](const std::map<std::string, int>*) -> Declaration {
+                          return {"Mapping[str, int] | None", "None"};
+                        },
+                        [](const NamedNumbers*) -> Declaration {
+                          return {"_Path | Mapping[str, float] | None", "None"};
+                        },
+                        [](const Choice& one) -> Declaration {
+                          if (one.get().empty()) return {literal(one.words) + " | None", "None"};
+                          return {literal(one.words), '"' + one.get() + '"'};
+                        },
+                        [](const NumberOrWord& one) -> Declaration {
+                          return {"float | " + literal(words_of(one)) + " | None", "None"};
+                        },
+                        [](const Repeated&) -> Declaration {
+                          return {"Sequence[str]", "[]"};
+                        },
+                    },
+                    value);
 }
 
 std::string declaration(const Option& option) {
@@ -200,9 +235,9 @@ std::string value_text(const Option& option, const std::string& value) {
   };
   return std::visit(Overloaded{[&](const Choice& one) { return is_word(one.words) ? "'" + value + "'" : value; },
                                [&](const NumberOrWord& one) { return is_word(words_of(one)) ? "'" + value + "'" : value; },
-                               [&](const std::vector<std::string>*) { return list(); },
-                               [&](const std::optional<std::vector<std::string>>*) { return list(); },
-                               [&](const std::map<std::string, std::string>*) {
+                               [&](std::vector<std::string>*) { return list(); },
+                               [&](std::optional<std::vector<std::string>>*) { return list(); },
+                               [&](std::map<std::string, std::string>*) {
                                  const std::size_t equals = value.rfind('=');
                                  return fmt::format("{{'{}': '{}'}}", value.substr(equals + 1), value.substr(0, equals));
                                },
@@ -217,8 +252,7 @@ const std::string& keyword_of(const Option& option) { return option.keyword.empt
 void read_keywords(const std::string& function, const py::dict& keywords, const std::vector<Option>& options) {
   for (const auto& [key, value] : keywords) {
     const auto name = key.cast<std::string>();
-    const auto option =
-        std::find_if(options.begin(), options.end(), [&](const Option& one) { return keyword_of(one) == name; });
+    const auto option = std::find_if(options.begin(), options.end(), [&](const Option& one) { return keyword_of(one) == name; });
     if (option != options.end()) {
       read_keyword(value, *option);
       continue;

@@ -23,31 +23,30 @@ Overloaded(Cases...) -> Overloaded<Cases...>;
 
 // The value of an option in JSON; null where it has none.
 Json json_of(const OptionValue& value) {
-  return std::visit(
-      Overloaded{
-          [](const bool* flag) { return *flag ? Json(true) : Json(); },
-          [](const Switch& one) { return Json(*one.value ? one.on : one.off); },
-          [](const YesByDefault& one) { return Json(*one.value); },
-          [](const Choice& one) { return one.get().empty() ? Json() : Json(one.get()); },
-          [](const NumberOrWord& one) {
-            for (const auto& [word, flag] : one.words) {
-              if (*flag) return Json(word);
-            }
-            return *one.number ? Json(**one.number) : Json();
-          },
-          [](const std::map<std::string, std::string>* columns) {
-            Json list;
-            for (const auto& [name, column] : *columns) list.push_back(fmt::format("{}={}", column, name));
-            return list;
-          },
-          [](const NamedNumbers* one) { return one->values.empty() ? Json() : Json(one->values); },
-          [](const std::string* text) { return text->empty() ? Json() : Json(*text); },
-          [](const std::vector<std::string>* list) { return list->empty() ? Json() : Json(*list); },
-          [](const Repeated& one) { return one.values->empty() ? Json() : Json(*one.values); },
-          []<typename T>(const std::optional<T>* one) { return *one ? Json(**one) : Json(); },
-          [](const auto* one) { return Json(*one); },
-      },
-      value);
+  return std::visit(Overloaded{
+                        [](const bool* flag) { return *flag ? Json(true) : Json(); },
+                        [](const Switch& one) { return Json(*one.value ? one.on : one.off); },
+                        [](const YesByDefault& one) { return Json(*one.value); },
+                        [](const Choice& one) { return one.get().empty() ? Json() : Json(one.get()); },
+                        [](const NumberOrWord& one) {
+                          for (const auto& [word, flag] : one.words) {
+                            if (*flag) return Json(word);
+                          }
+                          return *one.number ? Json(**one.number) : Json();
+                        },
+                        [](const std::map<std::string, std::string>* columns) {
+                          Json list;
+                          for (const auto& [name, column] : *columns) list.push_back(fmt::format("{}={}", column, name));
+                          return list;
+                        },
+                        [](const NamedNumbers* one) { return one->values.empty() ? Json() : Json(one->values); },
+                        [](const std::string* text) { return text->empty() ? Json() : Json(*text); },
+                        [](const std::vector<std::string>* list) { return list->empty() ? Json() : Json(*list); },
+                        [](const Repeated& one) { return one.values->empty() ? Json() : Json(*one.values); },
+                        []<typename T>(const std::optional<T>* one) { return *one ? Json(**one) : Json(); },
+                        [](const auto* one) { return Json(*one); },
+                    },
+                    value);
 }
 
 bool is_one_of(const std::vector<std::string>& words, const std::string& word) {
@@ -56,55 +55,54 @@ bool is_one_of(const std::vector<std::string>& words, const std::string& word) {
 
 // The reverse of json_of; false where the JSON is of another kind.
 bool read_value(const Json& json, const OptionValue& value) {
-  return std::visit(
-      Overloaded{
-          [&](bool* flag) { return json.is_boolean() && (json.get_to(*flag), true); },
-          [&](const Switch& one) {
-            *one.value = json == one.on;
-            return json == one.on || json == one.off;
-          },
-          [&](const YesByDefault& one) { return json.is_boolean() && (json.get_to(*one.value), true); },
-          [&](const Choice& one) {
-            const bool known = json.is_string() && is_one_of(one.words, json.get<std::string>());
-            if (known) one.set(json.get<std::string>());
-            return known;
-          },
-          [&](const NumberOrWord& one) {
-            bool known = json.is_number();
-            if (known) *one.number = json.get<double>();
-            for (const auto& [word, flag] : one.words) known = (*flag = json == word) || known;
-            return known;
-          },
-          [&](std::map<std::string, std::string>* columns) {
-            for (const Json& entry : json) {
-              const std::string text = entry.is_string() ? entry.get<std::string>() : "";
-              const std::size_t equals = text.rfind('=');
-              if (equals == std::string::npos) return false;
-              (*columns)[text.substr(equals + 1)] = text.substr(0, equals);
-            }
-            return json.is_array();
-          },
-          [&](NamedNumbers* one) {
-            for (const auto& [name, number] : json.items()) {
-              if (!number.is_number()) return false;
-              one->values[name] = number.get<double>();
-            }
-            return json.is_object();
-          },
-          [&](const Repeated& one) {
-            json.get_to(*one.values);
-            return true;
-          },
-          [&]<typename T>(std::optional<T>* one) {
-            one->emplace(json.get<T>());
-            return true;
-          },
-          [&](auto* one) {
-            json.get_to(*one);
-            return true;
-          },
-      },
-      value);
+  return std::visit(Overloaded{
+                        [&](bool* flag) { return json.is_boolean() && (json.get_to(*flag), true); },
+                        [&](const Switch& one) {
+                          *one.value = json == one.on;
+                          return json == one.on || json == one.off;
+                        },
+                        [&](const YesByDefault& one) { return json.is_boolean() && (json.get_to(*one.value), true); },
+                        [&](const Choice& one) {
+                          const bool known = json.is_string() && is_one_of(one.words, json.get<std::string>());
+                          if (known) one.set(json.get<std::string>());
+                          return known;
+                        },
+                        [&](const NumberOrWord& one) {
+                          bool known = json.is_number();
+                          if (known) *one.number = json.get<double>();
+                          for (const auto& [word, flag] : one.words) known = (*flag = json == word) || known;
+                          return known;
+                        },
+                        [&](std::map<std::string, std::string>* columns) {
+                          for (const Json& entry : json) {
+                            const std::string text = entry.is_string() ? entry.get<std::string>() : "";
+                            const std::size_t equals = text.rfind('=');
+                            if (equals == std::string::npos) return false;
+                            (*columns)[text.substr(equals + 1)] = text.substr(0, equals);
+                          }
+                          return json.is_array();
+                        },
+                        [&](NamedNumbers* one) {
+                          for (const auto& [name, number] : json.items()) {
+                            if (!number.is_number()) return false;
+                            one->values[name] = number.get<double>();
+                          }
+                          return json.is_object();
+                        },
+                        [&](const Repeated& one) {
+                          json.get_to(*one.values);
+                          return true;
+                        },
+                        [&]<typename T>(std::optional<T>* one) {
+                          one->emplace(json.get<T>());
+                          return true;
+                        },
+                        [&](auto* one) {
+                          json.get_to(*one);
+                          return true;
+                        },
+                    },
+                    value);
 }
 
 }  // namespace
@@ -125,7 +123,8 @@ std::string options_json(const std::vector<Option>& options) {
 }
 
 void read_options(const std::string& json, const std::vector<Option>& options, const std::string& source) {
-  for (const auto& [name, value] : Json::parse(json).items()) {
+  const Json values = Json::parse(json);
+  for (const auto& [name, value] : values.items()) {
     const Option* option = find_option(options, name);
     if (option == nullptr) throw InputError(fmt::format("{}: unknown option '{}'", source, name));
     bool is_read = false;
