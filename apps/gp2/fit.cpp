@@ -189,7 +189,8 @@ void require_inputs(const Arguments& arguments, const std::set<std::string>& giv
   const std::set<std::string> allowed = {"again", "data", "also", "threads", "json", "output"};
   for (const std::string& name : given) {
     if (!allowed.contains(name)) {
-      throw InputError(fmt::format("`again`: {} has its model and options: leave out `{}`", arguments.again, name));
+      throw InputError(fmt::format("`again`: {} has its model and options: leave out {}", arguments.again,
+                                   name == "model" ? "MODEL" : "`" + name + "`"));
     }
   }
   if (arguments.data.empty() && !arguments.also.empty()) throw InputError("`again`: `also` goes with `data`");
@@ -239,8 +240,11 @@ void run(Arguments& arguments, const std::set<std::string>& given) {
 
 Command fit_command() {
   const auto a = std::make_shared<Arguments>();
-  Command command{"fit", "Fit a model to a log of states and accelerations",
-                  "gp2 fit models/surface.toml --data train.csv --mean force -o fit.json", {}, {}};
+  Command command{"fit",
+                  "Fit a model to a log of states and accelerations",
+                  "gp2 fit models/surface.toml --data train.csv --mean force -o fit.json",
+                  {},
+                  {}};
   command.options = {
       argument("MODEL", a->model, "model file"),
       {"data", Repeated{&a->data}, "LOG[@OTHER.toml]",

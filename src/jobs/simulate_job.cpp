@@ -49,7 +49,7 @@ StartingPoint start_by_names(const System& system, const std::map<std::string, d
       throw InputError(fmt::format("`start`: '{}' is no coordinate or velocity of '{}'; there are: {}", name, system.name(),
                                    fmt::join(names.begin(), end, ", ")));
     }
-    if (!std::isfinite(value)) throw InputError(fmt::format("`start`: {} = '{}' is not a finite number", name, value));
+    if (!std::isfinite(value)) throw InputError(fmt::format("`start`: {} = {} is not a finite number", name, value));
     const auto entry = found - names.begin();
     start.state[entry] = value;
     start.given[static_cast<std::size_t>(entry)] = true;

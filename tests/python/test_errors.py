@@ -35,7 +35,7 @@ def said(command):
 def with_keywords(text):
     """What the command says, with its options as Python has them."""
     text = re.sub(r"--map (\w+)=(\w+)", r"columns={'\2': '\1'}", text)
-    text = re.sub(r"--(protocol|noise-std|prior|view) ([a-z-]+)", lambda m: f"{m[1]}='{m[2]}'".replace("noise-", "noise_"), text)
+    text = re.sub(r"--(protocol|noise-std|prior|view) (paper|estimate|force|next-velocity)", lambda m: f"{m[1]}='{m[2]}'".replace("noise-", "noise_"), text)
     text = re.sub(r"--([a-z-]+) (S|SECONDS)\b", lambda m: f"{m[1].replace('-', '_')}={m[2]}", text)
     return re.sub(r"--([a-z-]+)", lambda m: m[1].replace("-", "_"), text)
 
