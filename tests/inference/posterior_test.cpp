@@ -41,7 +41,7 @@ TEST(PosteriorTest, IsTheTextbookGaussianProcess) {
   for (const Problem& p : test::problems(9, seed)) {
     const Posterior posterior(p.prior, p.observations, p.values);
     for (const View& view : views_of(p)) {
-      SCOPED_TRACE(fmt::format("{}, view {}×{}, seed {}", p.name, static_cast<int>(view.quantity), view.size(), seed));
+      SCOPED_TRACE(fmt::format("{}, view {}×{}, seed {}", p.name, view.quantity->word(), view.size(), seed));
       const auto [mean, covariance] = test::dense_posterior(p, view, p.queries);
       const Posterior::Joint joint = posterior.joint(view, p.queries);
       EXPECT_LE(largest(joint.mean - mean), rounding(p) * (1 + largest(mean)));
