@@ -207,5 +207,5 @@ def test_texts_name_options_as_keywords(arm, arm_log):
     text = text_of(lambda: gp2.fit(arm, arm_log, protocol="paper", noise_std="estimate"))
     assert text == "protocol='paper' has fixed noise: leave out noise_std='estimate'"
     text = text_of(lambda: gp2.fit(arm, arm_log, columns={"elbow": "nosuch"}))
-    assert text.startswith("columns={'elbow': 'nosuch'}: data has no column 'nosuch'")
+    assert text.startswith("columns={'elbow': 'nosuch'}: data of 'two-link arm on a moving plane' has no column 'nosuch'")
     assert "--" not in text
