@@ -45,7 +45,9 @@ Command check_command() {
   Command command{
       "check",
       "Is a model well-posed, and does a log fit it? Rank, definiteness, derivatives, data on the constraint, dependent columns",
-      "gp2 check models/double_pendulum.toml --data train.csv", {}, {}};
+      "gp2 check models/double_pendulum.toml --data train.csv",
+      {},
+      {}};
   command.options = {argument("MODEL", a->model, "model file"),
                      {"data", &a->data, "CSV", "CSV log", "states of the model's [sampling] or [motion]"}};
   for (Option& option : options(a->options)) command.options.push_back(std::move(option));

@@ -122,16 +122,20 @@ void run(Arguments& arguments) {
   report(data, *model.system);
   std::vector<std::string> independent;
   for (const int j : data.independent) independent.push_back(model.system->acceleration_names()[static_cast<std::size_t>(j)]);
-  print_notes({fmt::format("{}: {} rows, {}; independent accelerations: {}", arguments.output, table.n_rows(),
-                    count_of(static_cast<int>(data.episodes.size()), "episode", "episodes"), fmt::join(independent, ", "))});
+  print_notes(
+      {fmt::format("{}: {} rows, {}; independent accelerations: {}", arguments.output, table.n_rows(),
+                   count_of(static_cast<int>(data.episodes.size()), "episode", "episodes"), fmt::join(independent, ", "))});
 }
 
 }  // namespace
 
 Command derive_command() {
   const auto a = std::make_shared<Arguments>();
-  Command command{"derive", "Smooth a raw log of positions into velocities and accelerations for a fit",
-                  "gp2 derive encoders.csv --model models/double_pendulum.toml --map theta1=q3,theta2=q6 -o data.csv", {}, {}};
+  Command command{"derive",
+                  "Smooth a raw log of positions into velocities and accelerations for a fit",
+                  "gp2 derive encoders.csv --model models/double_pendulum.toml --map theta1=q3,theta2=q6 -o data.csv",
+                  {},
+                  {}};
   command.options = {argument("LOG", a->log, "CSV of t and positions, and of velocities and inputs where there are"),
                      required({"model", &a->model, "MODEL", "model file"})};
   for (Option& option : options(a->options)) command.options.push_back(std::move(option));

@@ -72,8 +72,11 @@ void run(Arguments& arguments) {
 
 Command evaluate_command() {
   const auto a = std::make_shared<Arguments>();
-  Command command{"evaluate", "Compare predictions of the constrained acceleration with measured or true values",
-                  "gp2 evaluate fit.json --data test.csv --json", {}, {}};
+  Command command{"evaluate",
+                  "Compare predictions of the constrained acceleration with measured or true values",
+                  "gp2 evaluate fit.json --data test.csv --json",
+                  {},
+                  {}};
   command.options = {argument("FIT.json", a->fit, "file written by gp2 fit"),
                      required({"data", &a->data, "CSV", "CSV with states and accelerations"}),
                      {"system", &a->system, "OTHER.toml", system_help}};

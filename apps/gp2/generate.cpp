@@ -32,8 +32,11 @@ void run(const Arguments& arguments) {
 
 Command generate_command() {
   const auto a = std::make_shared<Arguments>();
-  Command command{"generate", "Draw states from a model's [sampling] and measure its [truth]",
-                  "gp2 generate models/surface.toml --n 100 --seed 1 -o train.csv", {}, {}};
+  Command command{"generate",
+                  "Draw states from a model's [sampling] and measure its [truth]",
+                  "gp2 generate models/surface.toml --n 100 --seed 1 -o train.csv",
+                  {},
+                  {}};
   command.options = {argument("MODEL", a->model, "model file")};
   for (Option& option : options(a->request)) command.options.push_back(std::move(option));
   command.options.push_back(output(a->output, "CSV", "CSV file to write"));

@@ -8,9 +8,9 @@
 #include <utility>
 #include <vector>
 
-#include <CLI/CLI.hpp>
 #include <fmt/format.h>
 #include <fmt/ranges.h>
+#include <CLI/CLI.hpp>
 
 #include "blas_choice.hpp"
 #include "command_line.hpp"
@@ -96,9 +96,8 @@ int main(int argc, char** argv) {
       "saves the best so far). Results go to stdout, talk to stderr.");
   for (const auto command :
        {gp2::command::show_command, gp2::command::check_command, gp2::command::generate_command, gp2::command::derive_command,
-        gp2::command::resample_command, gp2::command::fit_command, gp2::command::predict_command,
-        gp2::command::simulate_command, gp2::command::evaluate_command, gp2::command::report_command,
-        gp2::command::reproduce_command}) {
+        gp2::command::resample_command, gp2::command::fit_command, gp2::command::predict_command, gp2::command::simulate_command,
+        gp2::command::evaluate_command, gp2::command::report_command, gp2::command::reproduce_command}) {
     gp2::command::add_command(app, command());
   }
 

@@ -7,8 +7,8 @@
 #include <fmt/ranges.h>
 
 #include "command.hpp"
-#include "gp2/data/csv.hpp"
 #include "gp2/base/file.hpp"
+#include "gp2/data/csv.hpp"
 #include "gp2/jobs/predict_job.hpp"
 
 namespace gp2::command {
@@ -70,8 +70,11 @@ void run(Arguments& arguments) {
 
 Command predict_command() {
   const auto a = std::make_shared<Arguments>();
-  Command command{"predict", "Predict accelerations at given states, with their uncertainty",
-                  "gp2 predict fit.json --states states.csv --cov std -o prediction.csv", {}, {}};
+  Command command{"predict",
+                  "Predict accelerations at given states, with their uncertainty",
+                  "gp2 predict fit.json --states states.csv --cov std -o prediction.csv",
+                  {},
+                  {}};
   command.options = {argument("FIT.json", a->fit, "file written by gp2 fit"),
                      required({"states", &a->states, "CSV", "CSV with the states; one output row per input row"}),
                      {"system", &a->system, "OTHER.toml", system_help}};

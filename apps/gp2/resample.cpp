@@ -26,16 +26,19 @@ void run(const Arguments& arguments) {
   if (chosen.n_skipped > 0)
     print_notes({fmt::format("{}: {} rows skipped: no number in some feature", arguments.log, chosen.n_skipped)});
   print_notes({fmt::format("measured by {}, each in its standard deviations", fmt::join(chosen.features, ", ")),
-        fmt::format("{}: {} of {} rows; every other row is within {:.3g} of one of them", arguments.output, chosen.rows.size(),
-                    log.n_rows(), chosen.radius)});
+               fmt::format("{}: {} of {} rows; every other row is within {:.3g} of one of them", arguments.output,
+                           chosen.rows.size(), log.n_rows(), chosen.radius)});
 }
 
 }  // namespace
 
 Command resample_command() {
   const auto a = std::make_shared<Arguments>();
-  Command command{"resample", "Choose the rows of a log that cover its states best: farthest points in the model's features",
-                  "gp2 resample log.csv --model models/surface.toml -n 50 -o subset.csv", {}, {}};
+  Command command{"resample",
+                  "Choose the rows of a log that cover its states best: farthest points in the model's features",
+                  "gp2 resample log.csv --model models/surface.toml -n 50 -o subset.csv",
+                  {},
+                  {}};
   Option n = required({"n", &a->options.n, "N", "number of rows"});
   n.flag = "-n,--n";
   command.options = {argument("LOG", a->log, "CSV log"), required({"model", &a->model, "MODEL", "model file"}), std::move(n)};

@@ -119,8 +119,8 @@ void run(const Arguments& arguments) {
 
 Command show_command() {
   const auto a = std::make_shared<Arguments>();
-  Command command{"show", "Print the derived A, b, M, F, the parameters and the features of a model",
-                  "gp2 show models/surface.toml", {}, {}};
+  Command command{
+      "show", "Print the derived A, b, M, F, the parameters and the features of a model", "gp2 show models/surface.toml", {}, {}};
   command.options = {argument("MODEL", a->model, "model file"),
                      {"latex", &a->latex, "", "as LaTeX"},
                      {"full", &a->full, "", "long expressions too, which otherwise are counted"}};

@@ -26,4 +26,4 @@ class NumericalError : public Error {
   using Error::Error;
 };
 
-}  // namespace gp2
+}  // namespace GP2_API

@@ -87,4 +87,4 @@ class Observations {
   Noise noise_;
 };
 
-}  // namespace gp2
+}  // namespace GP2_API

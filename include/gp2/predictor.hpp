@@ -118,4 +118,4 @@ class Predictor {
   std::shared_ptr<const Implementation> implementation_;
 };
 
-}  // namespace gp2
+}  // namespace GP2_API

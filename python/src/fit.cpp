@@ -219,10 +219,11 @@ void add_fit(py::module_& module) {
     own_signature.disable_function_signatures();
     module.def("fit", &fit_model, "system"_a, "data"_a, fit_documentation().c_str());
   }
-  module.def("fit_again", &fit_again, "path"_a, "data"_a = py::none(), py::kw_only(),
-             "also"_a = std::vector<PySideInformation>(), "system"_a = nullptr, "threads"_a = 0, "progress"_a = py::none(),
-             "Repeat the fit in a FIT.json with the options it was made with, from its data or from those given: the same bits.\n\n"
-             "system: of System.from_callables, as in gp2.load. A robust fit needs its data.");
+  module.def(
+      "fit_again", &fit_again, "path"_a, "data"_a = py::none(), py::kw_only(), "also"_a = std::vector<PySideInformation>(),
+      "system"_a = nullptr, "threads"_a = 0, "progress"_a = py::none(),
+      "Repeat the fit in a FIT.json with the options it was made with, from its data or from those given: the same bits.\n\n"
+      "system: of System.from_callables, as in gp2.load. A robust fit needs its data.");
   module.def(
       "_stub_of_options",
       [](const std::string& job) {
@@ -230,10 +231,8 @@ void add_fit(py::module_& module) {
         SimulateRequest simulate;
         DeriveOptions derive;
         ResampleOptions resample;
-        const std::map<std::string, std::vector<Option>> tables = {{"fit", options(fit)},
-                                                                   {"simulate", options(simulate)},
-                                                                   {"derive", options(derive)},
-                                                                   {"resample", options(resample)}};
+        const std::map<std::string, std::vector<Option>> tables = {
+            {"fit", options(fit)}, {"simulate", options(simulate)}, {"derive", options(derive)}, {"resample", options(resample)}};
         return stub_lines(tables.at(job));
       },
       "job"_a);

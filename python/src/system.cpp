@@ -299,14 +299,15 @@ Raises InputError with the key, the rule, the value got and the mend.)");
   ResampleOptions of_resample;
   py::options own_signature;
   own_signature.disable_function_signatures();
-  module.def("derive", &derive_table, py::arg("system"), py::arg("data"),
-             (signature("derive", "system: System, data: object, *,", options(of_derive), "", "tuple[Table, dict[str, Any]]") + R"(
+  module.def(
+      "derive", &derive_table, py::arg("system"), py::arg("data"),
+      (signature("derive", "system: System, data: object, *,", options(of_derive), "", "tuple[Table, dict[str, Any]]") + R"(
 A raw log of t and positions as states and accelerations with a standard deviation for each value: a Table for fit, and a report
 (dict): what was found of each coordinate in each episode, what was completed from the constraints, which accelerations are
 independent, notes. docs/raw-logs.md.
 
 )" + documentation(options(of_derive)))
-                 .c_str());
+          .c_str());
   module.def("resample", &resample_table, py::arg("system"), py::arg("data"), py::arg("n"),
              (signature("resample", "system: System, data: object, n: int, *,", options(of_resample), "", "Table") + R"(
 The n rows of a table that cover its states best, whole, in the order of choice: farthest points in the features of the system's

@@ -24,8 +24,7 @@ void require_in_range(const FitRequest& request) {
   require_not_negative("max_iterations", request.max_iterations);
   require_positive("max_points", request.problem.max_points);
   if (request.threads < 0) {
-    throw InputError(
-        fmt::format("`threads`: must be positive, or 0 for as many as the machine has; got {}", request.threads));
+    throw InputError(fmt::format("`threads`: must be positive, or 0 for as many as the machine has; got {}", request.threads));
   }
   const std::optional<double>& noise = request.problem.noise_stddev;
   if (noise && (!(*noise > 0) || !std::isfinite(*noise))) {

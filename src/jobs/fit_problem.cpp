@@ -186,8 +186,8 @@ std::vector<std::string> notes_of(const FitReport& report) {
 
 std::vector<Hyperparameter> starting_hyperparameters(const FitProblem& problem, const FitProblemOptions& options) {
   if (options.baseline) return baseline_hyperparameters(problem.prior, problem.observations);
-  return default_hyperparameters(problem.prior, trusted_observations(problem), estimated_parameters(*problem.prior.system, options),
-                                 options.protocol);
+  return default_hyperparameters(problem.prior, trusted_observations(problem),
+                                 estimated_parameters(*problem.prior.system, options), options.protocol);
 }
 
 FitOptions default_fit_options(const FitProblem& problem) {

@@ -36,7 +36,8 @@ std::vector<Option> options(GenerateRequest& request) {
 
 GeneratedData generate(const Model& model, const GenerateRequest& request) {
   if (request.n && *request.n < 1) throw InputError(fmt::format("`n`: must be positive, got {}", *request.n));
-  return generate(model, GenerateOptions{request.n.value_or(1), request.seed, noise_of(model, request.noise_stddev), request.grid});
+  return generate(model,
+                  GenerateOptions{request.n.value_or(1), request.seed, noise_of(model, request.noise_stddev), request.grid});
 }
 
 }  // namespace gp2

@@ -55,7 +55,8 @@ TEST_F(FitAgain, RobustFitsNeedTheirLog) {
   desk.done("gp2 fit models/surface.toml --data train.csv --robust --restarts 1 --max-iterations 5 -o fit.json");
   const Outcome refused = desk.run("gp2 fit --again fit.json -o again.json");
   EXPECT_EQ(refused.status, 2);
-  EXPECT_THAT(refused.err, HasSubstr("--again: the data of a robust fit are marked by what it distrusts; give its logs by --data"));
+  EXPECT_THAT(refused.err,
+              HasSubstr("--again: the data of a robust fit are marked by what it distrusts; give its logs by --data"));
   desk.done("gp2 fit --again fit.json --data train.csv -o again.json");
   EXPECT_EQ(desk.read("again.json"), desk.read("fit.json"));
 }
@@ -67,7 +68,8 @@ TEST_F(FitAgain, RefusesWhatItDoesNotTake) {
     EXPECT_EQ(outcome.status, 2) << arguments;
     return outcome.err;
   };
-  EXPECT_THAT(refusal("models/surface.toml --again fit.json"), HasSubstr("--again: fit.json has its model and options: leave out"));
+  EXPECT_THAT(refusal("models/surface.toml --again fit.json"),
+              HasSubstr("--again: fit.json has its model and options: leave out"));
   EXPECT_THAT(refusal("--again fit.json --noise-std 0.1"), HasSubstr("leave out --noise-std"));
   EXPECT_THAT(refusal("--again fit.json --also unconstrained:train.csv"), HasSubstr("--again: --also goes with --data"));
   EXPECT_THAT(refusal("--again absent.json"), HasSubstr("absent.json: cannot be read"));

@@ -112,7 +112,8 @@ TEST(Options, InMessagesAreRespelledByAFace) {
       return "<" + name + (value ? ":" + *value : "") + ">";
     });
   };
-  EXPECT_EQ(spelled("`noise_std`: give `noise_std=estimate` or `map=a=b`"), "<noise_std>: give <noise_std:estimate> or <map:a=b>");
+  EXPECT_EQ(spelled("`noise_std`: give `noise_std=estimate` or `map=a=b`"),
+            "<noise_std>: give <noise_std:estimate> or <map:a=b>");
   EXPECT_EQ(spelled("log `A`: no `Option`, one `of` ` these"), "log `A`: no `Option`, one <of> ` these");
   EXPECT_EQ(spelled("nothing to spell"), "nothing to spell");
 }

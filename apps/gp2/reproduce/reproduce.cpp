@@ -51,7 +51,8 @@ std::filesystem::path definitions(const std::string& told) {
 }
 
 void run(const Arguments& arguments) {
-  if (arguments.threads < 0) throw InputError(fmt::format("`threads`: must be positive, or 0 for as many as the machine has; got {}", arguments.threads));
+  if (arguments.threads < 0)
+    throw InputError(fmt::format("`threads`: must be positive, or 0 for as many as the machine has; got {}", arguments.threads));
   ReproduceOptions options;
   options.experiments = definitions(arguments.experiments);
   if (!arguments.data.empty()) {
@@ -88,16 +89,18 @@ Command reproduce_command() {
   const auto a = std::make_shared<Arguments>();
   std::vector<std::pair<std::string, std::string>> names = {{"all", "all"}};
   for (const Experiment& experiment : experiments) names.emplace_back(experiment.name, experiment.name);
-  Command command{"reproduce", "Rebuild the tables and figures of Geist & Trimpe 2020, and more",
-                  "gp2 reproduce table1 --runs 2 -o results", {}, {}};
+  Command command{"reproduce",
+                  "Rebuild the tables and figures of Geist & Trimpe 2020, and more",
+                  "gp2 reproduce table1 --runs 2 -o results",
+                  {},
+                  {}};
   Option what{"what", choice(a->what, names), "", "which"};
   what.flag = "WHAT";
   command.options = {
       required(std::move(what)),
       {"protocol", choice(a->protocol, {{"paper", "paper"}, {"default", "default"}, {"both", "both"}}), "",
        "how GP² is trained: paper, default, or both; the other methods are the same under each"},
-      {"data", &a->data, "DIR",
-       "folder of the published observations; without it they are drawn from the same distributions"},
+      {"data", &a->data, "DIR", "folder of the published observations; without it they are drawn from the same distributions"},
       {"runs", &a->runs, "R", "data sets", "10, or those that --data holds"},
       {"threads", &a->threads, "K", "0: as many as the machine has"},
       {"experiments", &a->experiments, "DIR", "folder of the definitions", "those of gp2"},

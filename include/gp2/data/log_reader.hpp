@@ -64,4 +64,4 @@ class LogReader {
   std::set<int> used_;
 };
 
-}  // namespace gp2
+}  // namespace GP2_API

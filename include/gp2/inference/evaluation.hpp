@@ -43,4 +43,4 @@ double max_constraint_error(const System& system, const Eigen::Ref<const Eigen::
                             const Eigen::Ref<const Eigen::VectorXd>& parameters,
                             const Eigen::Ref<const Eigen::MatrixXd>& accelerations);
 
-}  // namespace gp2
+}  // namespace GP2_API

@@ -63,4 +63,4 @@ class Likelihood {
   std::unique_ptr<Implementation> implementation_;
 };
 
-}  // namespace gp2
+}  // namespace GP2_API

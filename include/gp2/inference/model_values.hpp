@@ -33,4 +33,4 @@ struct ModelGradient {
   static ModelGradient zero(const ModelValues& values);
 };
 
-}  // namespace gp2
+}  // namespace GP2_API

@@ -74,4 +74,4 @@ struct MotionUncertainty {
 };
 MotionUncertainty motion_uncertainty(const Posterior& posterior, const Trajectory& trajectory);
 
-}  // namespace gp2
+}  // namespace GP2_API

@@ -75,4 +75,4 @@ class StateEvaluator {
   Eigen::VectorXd values_;
 };
 
-}  // namespace gp2
+}  // namespace GP2_API

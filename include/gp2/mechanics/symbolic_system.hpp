@@ -89,4 +89,4 @@ class SymbolicSystem final : public System {
   mutable std::once_flag state_tape_is_filled_;
 };
 
-}  // namespace gp2
+}  // namespace GP2_API

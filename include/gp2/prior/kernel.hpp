@@ -82,4 +82,4 @@ class Kernel {
   std::vector<Parameter> parameters_;
 };
 
-}  // namespace gp2
+}  // namespace GP2_API

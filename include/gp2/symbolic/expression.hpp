@@ -223,4 +223,4 @@ struct StateDerivatives {
   StateDerivatives(std::span<const Expression> expressions, std::span<const Expression> inputs, int n_states);
 };
 
-}  // namespace gp2
+}  // namespace GP2_API

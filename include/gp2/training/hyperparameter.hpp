@@ -99,4 +99,4 @@ struct Hyperparameter {
 ModelValues model_values(const Prior& prior, const std::vector<Observations>& observations,
                          const std::vector<Hyperparameter>& hyperparameters);
 
-}  // namespace gp2
+}  // namespace GP2_API
