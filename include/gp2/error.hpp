@@ -26,4 +26,4 @@ class NumericalError : public Error {
   using Error::Error;
 };
 
-}  // namespace GP2_API
+}  // namespace gp2

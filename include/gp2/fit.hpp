@@ -104,4 +104,4 @@ struct Fit {
 Fit fit(const Prior& prior, const std::vector<Observations>& observations, const std::vector<Hyperparameter>& hyperparameters,
         const FitOptions& options = {});
 
-}  // namespace GP2_API
+}  // namespace gp2

@@ -151,4 +151,4 @@ Prior make_prior(const Model& model, const PriorOptions& options = {});
 ///   directions; and when a parameter that is one and the same stands in a feature of `other`.
 std::shared_ptr<const OtherSystem> make_other_system(const Model& home, const Model& other, const PriorOptions& options = {});
 
-}  // namespace GP2_API
+}  // namespace gp2

@@ -87,4 +87,4 @@ class Observations {
   Noise noise_;
 };
 
-}  // namespace GP2_API
+}  // namespace gp2

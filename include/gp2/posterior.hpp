@@ -111,4 +111,4 @@ class Posterior {
 /// @throws InputError when there are fewer; `posterior` is left as it was.
 [[nodiscard]] Posterior remove_oldest(Posterior&& posterior, int n);
 
-}  // namespace GP2_API
+}  // namespace gp2

@@ -118,4 +118,4 @@ class Predictor {
   std::shared_ptr<const Implementation> implementation_;
 };
 
-}  // namespace GP2_API
+}  // namespace gp2

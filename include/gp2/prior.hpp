@@ -105,4 +105,4 @@ PriorValues differentiate_prior(const Prior& prior, const Eigen::Ref<const Eigen
                                 const Eigen::Ref<const Eigen::VectorXd>& parameters, const MechanicsBatch& mechanics,
                                 const PriorValues& values, const SystemValues& derivative, int index);
 
-}  // namespace GP2_API
+}  // namespace gp2

@@ -112,4 +112,4 @@ Acceleration model_acceleration(const Model& model);
 Eigen::VectorXd mechanical_energy(const Model& model, const Eigen::VectorXd& parameters,
                                   const Eigen::Ref<const Eigen::MatrixXd>& states);
 
-}  // namespace GP2_API
+}  // namespace gp2

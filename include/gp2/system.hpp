@@ -154,4 +154,4 @@ class System {
   std::vector<std::string> constraint_labels_;
 };
 
-}  // namespace GP2_API
+}  // namespace gp2

@@ -103,4 +103,4 @@ ViewValues evaluate_view(const View& view, const MechanicsBatch& mechanics, cons
 /// @throws InputError for multipliers of redundant rows, whose number may change with the parameters.
 ViewValues differentiate_view(const View& view, const MechanicsBatch& mechanics, const SystemValues& derivative);
 
-}  // namespace GP2_API
+}  // namespace gp2

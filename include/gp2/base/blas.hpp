@@ -41,4 +41,4 @@ struct BlasReport {
 /// OpenBLAS reads OPENBLAS_CORETYPE when it is loaded, so only who starts the process can choose.
 BlasReport blas_report();
 
-}  // namespace GP2_API
+}  // namespace gp2

@@ -36,4 +36,4 @@ void read_blocks(const std::filesystem::path& path, const std::function<void(std
 /// The shortest text that reads back to the same double.
 std::string shortest(double value);
 
-}  // namespace GP2_API
+}  // namespace gp2

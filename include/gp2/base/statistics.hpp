@@ -17,4 +17,4 @@ std::vector<double> measured_entries(const Eigen::Ref<const Eigen::MatrixXd>& va
 /// The median of at least one value; of an even number the larger one of the two in the middle.
 double median(std::vector<double> values);
 
-}  // namespace GP2_API
+}  // namespace gp2

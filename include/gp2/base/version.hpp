@@ -10,4 +10,4 @@ const char* version();
 /// The instruction set that the library's own loops use on this processor: "AVX-512", "AVX2" or "baseline".
 const char* instruction_set();
 
-}  // namespace GP2_API
+}  // namespace gp2

@@ -89,4 +89,4 @@ FitOptions baseline_fit_options();
 Fit fit_baseline(Baseline::Kind kind, const Prior& prior, const std::vector<Observations>& observations,
                  const std::vector<Hyperparameter>& hyperparameters, const FitOptions& options = baseline_fit_options());
 
-}  // namespace GP2_API
+}  // namespace gp2

@@ -86,4 +86,4 @@ class CsvTable {
 /// A cell of a CSV file that reads back as `text`.
 std::string csv_cell(const std::string& text);
 
-}  // namespace GP2_API
+}  // namespace gp2

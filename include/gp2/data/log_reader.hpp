@@ -64,4 +64,4 @@ class LogReader {
   std::set<int> used_;
 };
 
-}  // namespace GP2_API
+}  // namespace gp2

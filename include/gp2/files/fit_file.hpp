@@ -57,4 +57,4 @@ void read_start_values(const std::filesystem::path& path, std::vector<Hyperparam
 void set_start_values(const std::map<std::string, double>& values, const std::string& source,
                       std::vector<Hyperparameter>& hyperparameters);
 
-}  // namespace GP2_API
+}  // namespace gp2

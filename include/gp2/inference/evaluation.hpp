@@ -43,4 +43,4 @@ double max_constraint_error(const System& system, const Eigen::Ref<const Eigen::
                             const Eigen::Ref<const Eigen::VectorXd>& parameters,
                             const Eigen::Ref<const Eigen::MatrixXd>& accelerations);
 
-}  // namespace GP2_API
+}  // namespace gp2

@@ -24,4 +24,4 @@ struct LeaveOneOut {
 /// @throws InputError, NumericalError  as Posterior.
 std::vector<LeaveOneOut> leave_one_out(const Posterior& posterior);
 
-}  // namespace GP2_API
+}  // namespace gp2

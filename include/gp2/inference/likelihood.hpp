@@ -63,4 +63,4 @@ class Likelihood {
   std::unique_ptr<Implementation> implementation_;
 };
 
-}  // namespace GP2_API
+}  // namespace gp2

@@ -33,4 +33,4 @@ struct ModelGradient {
   static ModelGradient zero(const ModelValues& values);
 };
 
-}  // namespace GP2_API
+}  // namespace gp2

@@ -47,4 +47,4 @@ class PathwiseSamples {
 /// @throws InputError when n_samples or n_features is below 1.
 PathwiseSamples sample_paths(const Posterior& posterior, int n_samples, const PathwiseOptions& options = {});
 
-}  // namespace GP2_API
+}  // namespace gp2

@@ -23,4 +23,4 @@ std::vector<Option> options(CheckOptions& options);
 /// @throws InputError for columns that are missing, as LogReader.
 std::vector<Finding> check(const Model& model, const CsvTable* log, const CheckOptions& options = {});
 
-}  // namespace GP2_API
+}  // namespace gp2

@@ -84,4 +84,4 @@ DerivedData derive(const Model& model, const CsvTable& log, const DeriveOptions&
 /// @param name  stands for the table in messages
 CsvTable as_table(const DerivedData& data, const System& system, std::string name);
 
-}  // namespace GP2_API
+}  // namespace gp2

@@ -67,4 +67,4 @@ struct FitOutcome {
 FitOutcome run_fit(const FitJob& job, const std::function<void(const Progress&)>& progress = {},
                    const std::atomic<bool>* stop = nullptr);
 
-}  // namespace GP2_API
+}  // namespace gp2

@@ -37,4 +37,4 @@ std::optional<double> free_memory(const std::filesystem::path& root = "/");
 FitOptions within_memory(const FitProblem& problem, const FitOptions& options, std::optional<double> free,
                          std::vector<std::string>& notes);
 
-}  // namespace GP2_API
+}  // namespace gp2

@@ -142,4 +142,4 @@ WholeLog read_whole_log(const Model& model, LogReader& reader);
 /// @throws InputError listing the accelerations there are.
 std::vector<int> acceleration_rows(const System& system, const std::vector<std::string>& names, const std::string& option);
 
-}  // namespace GP2_API
+}  // namespace gp2

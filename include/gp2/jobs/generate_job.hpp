@@ -24,4 +24,4 @@ std::vector<Option> options(GenerateRequest& request);
 /// @throws InputError when the noise is not known or negative, n is not positive; as generate().
 GeneratedData generate(const Model& model, const GenerateRequest& request);
 
-}  // namespace GP2_API
+}  // namespace gp2

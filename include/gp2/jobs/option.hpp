@@ -116,4 +116,4 @@ void read_options(const std::string& json, const std::vector<Option>& options, c
 std::string respelled(const std::string& message,
                       const std::function<std::string(const std::string&, const std::optional<std::string>&)>& spell);
 
-}  // namespace GP2_API
+}  // namespace gp2

@@ -79,4 +79,4 @@ struct EvaluateOutcome {
 /// Compares predictions with measured or true accelerations.
 EvaluateOutcome evaluate(const FitFile& fit, const Posterior& posterior, const CsvTable& log, const EvaluateRequest& request);
 
-}  // namespace GP2_API
+}  // namespace gp2

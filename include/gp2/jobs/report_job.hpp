@@ -107,4 +107,4 @@ Report collect_report(const ReportOptions& options, std::vector<std::string>& no
 /// What the figures say about how to go on, most pressing first.
 std::vector<Advice> learning_advice(const Report& report);
 
-}  // namespace GP2_API
+}  // namespace gp2

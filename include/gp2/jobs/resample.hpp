@@ -54,4 +54,4 @@ struct Resample {
 ///   or cells that are neither numbers nor empty.
 Resample resample(const Model& model, const CsvTable& log, const ResampleOptions& options);
 
-}  // namespace GP2_API
+}  // namespace gp2

@@ -74,4 +74,4 @@ struct MotionUncertainty {
 };
 MotionUncertainty motion_uncertainty(const Posterior& posterior, const Trajectory& trajectory);
 
-}  // namespace GP2_API
+}  // namespace gp2

@@ -80,4 +80,4 @@ class CallableSystem final : public System {
   std::vector<bool> mechanics_reads_, force_reads_, residuals_read_;
 };
 
-}  // namespace GP2_API
+}  // namespace gp2

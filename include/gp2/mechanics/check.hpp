@@ -70,4 +70,4 @@ std::vector<Finding> check_data(const System& system, const Eigen::Ref<const Eig
                                 const Eigen::Ref<const Eigen::VectorXd>& parameters,
                                 const Eigen::Ref<const Eigen::MatrixXd>& accelerations, const std::vector<int>& stated = {});
 
-}  // namespace GP2_API
+}  // namespace gp2

@@ -153,4 +153,4 @@ class AffineMotion {
   Eigen::VectorXd Lb_, zero_, force_at_zero_;
 };
 
-}  // namespace GP2_API
+}  // namespace gp2

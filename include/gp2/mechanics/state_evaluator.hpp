@@ -75,4 +75,4 @@ class StateEvaluator {
   Eigen::VectorXd values_;
 };
 
-}  // namespace GP2_API
+}  // namespace gp2

@@ -89,4 +89,4 @@ class SymbolicSystem final : public System {
   mutable std::once_flag state_tape_is_filled_;
 };
 
-}  // namespace GP2_API
+}  // namespace gp2

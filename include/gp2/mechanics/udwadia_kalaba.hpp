@@ -183,4 +183,4 @@ void evaluate_mechanics(const System& system, const Eigen::Ref<const Eigen::Matr
 MechanicsBatch require_mechanics(const System& system, const Eigen::Ref<const Eigen::MatrixXd>& states,
                                  const Eigen::Ref<const Eigen::VectorXd>& parameters);
 
-}  // namespace GP2_API
+}  // namespace gp2

@@ -82,4 +82,4 @@ class Kernel {
   std::vector<Parameter> parameters_;
 };
 
-}  // namespace GP2_API
+}  // namespace gp2

@@ -115,4 +115,4 @@ std::string to_json(const RobotDescription& robot);
 /// @throws InputError naming the entry that is missing or wrong.
 RobotDescription robot_from_json(const std::string& json);
 
-}  // namespace GP2_API
+}  // namespace gp2

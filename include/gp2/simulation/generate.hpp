@@ -41,4 +41,4 @@ GeneratedData generate(const Model& model, const GenerateOptions& options);
 /// @param name  stands for the table in messages
 CsvTable as_table(const GeneratedData& data, const System& system, std::string name);
 
-}  // namespace GP2_API
+}  // namespace gp2

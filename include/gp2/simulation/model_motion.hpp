@@ -33,4 +33,4 @@ class ModelMotion {
 /// @throws InputError when there is no [truth], or it is not finite at a state.
 Eigen::MatrixXd true_acceleration(const Model& model, const Eigen::Ref<const Eigen::MatrixXd>& states);
 
-}  // namespace GP2_API
+}  // namespace gp2

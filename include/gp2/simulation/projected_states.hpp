@@ -42,4 +42,4 @@ SizeSummary summarise_sizes(const Eigen::Ref<const Eigen::VectorXd>& sizes);
 std::vector<Finding> check_states(const System& system, const Eigen::Ref<const Eigen::MatrixXd>& states,
                                   const Eigen::Ref<const Eigen::VectorXd>& parameters);
 
-}  // namespace GP2_API
+}  // namespace gp2

@@ -93,4 +93,4 @@ SmootherFit fit_smoother(const std::vector<Measurement>& measurements, const Smo
 /// no such step.
 double resolution_of(const std::vector<double>& values);
 
-}  // namespace GP2_API
+}  // namespace gp2

@@ -223,4 +223,4 @@ struct StateDerivatives {
   StateDerivatives(std::span<const Expression> expressions, std::span<const Expression> inputs, int n_states);
 };
 
-}  // namespace GP2_API
+}  // namespace gp2

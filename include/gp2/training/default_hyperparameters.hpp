@@ -55,4 +55,4 @@ Scales default_scales(const Prior& prior, const std::vector<Observations>& obser
 std::vector<Hyperparameter> default_hyperparameters(const Prior& prior, const std::vector<Observations>& observations,
                                                     const std::vector<std::string>& estimated, const Protocol& protocol);
 
-}  // namespace GP2_API
+}  // namespace gp2

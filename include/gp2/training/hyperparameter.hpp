@@ -99,4 +99,4 @@ struct Hyperparameter {
 ModelValues model_values(const Prior& prior, const std::vector<Observations>& observations,
                          const std::vector<Hyperparameter>& hyperparameters);
 
-}  // namespace GP2_API
+}  // namespace gp2

@@ -27,4 +27,4 @@ struct UncertaintyNote {
 /// are not to be trusted.
 std::vector<UncertaintyNote> uncertainty_notes(const FitReport& report);
 
-}  // namespace GP2_API
+}  // namespace gp2

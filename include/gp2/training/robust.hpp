@@ -34,4 +34,4 @@ Fit fit_robust(const Prior& prior, const std::vector<Observations>& observations
                const std::vector<Hyperparameter>& hyperparameters, const FitOptions& options = {},
                const RobustOptions& robust = {});
 
-}  // namespace GP2_API
+}  // namespace gp2
