@@ -195,6 +195,7 @@ VectorXd motion_times(double t_start, double t_end, const std::optional<double>&
 }
 
 SimulateJob prepare_simulation(const Model& model, const SimulateRequest& request) {
+  require_in_range(request);
   if (request.n_samples) throw InputError("`samples`: a model has no posterior to draw from; give a FIT.json");
   SimulateJob job = prepare(model, model.system->parameter_values(), request);
   job.accelerations = {model_acceleration(model)};
