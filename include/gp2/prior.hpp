@@ -24,7 +24,7 @@ struct Latent {
     force,         // E = M⁻¹B; where M is singular M'⁻¹B, M' as in UdwadiaKalaba
   };
 
-  /// How a parameter of the kernel starts and is bounded, relative to its default scale (design of the scales: training.hpp).
+  /// How a parameter of the kernel starts and is bounded, relative to its default scale (scales: training/default_hyperparameters.hpp).
   struct Range {
     double initial = 0;  // 0: the protocol's default
     double lower = 0;    // 0: the protocol's default
