@@ -17,13 +17,6 @@ namespace gp2::command {
 
 namespace {
 
-template <typename... Cases>
-struct Overloaded : Cases... {
-  using Cases::operator()...;
-};
-template <typename... Cases>
-Overloaded(Cases...) -> Overloaded<Cases...>;
-
 // "docs/priors.md" stays in help; `seed` becomes --seed
 std::string help_of(const Option& option) {
   std::string text = with_flags(option.text);

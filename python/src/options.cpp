@@ -19,13 +19,6 @@ namespace gp2::python {
 
 namespace {
 
-template <typename... Cases>
-struct Overloaded : Cases... {
-  using Cases::operator()...;
-};
-template <typename... Cases>
-Overloaded(Cases...) -> Overloaded<Cases...>;
-
 template <typename T>
 T cast(py::handle given, const std::string& name, const std::string& expected) {
   try {

@@ -14,13 +14,6 @@ namespace {
 
 using Json = nlohmann::json;
 
-template <typename... Cases>
-struct Overloaded : Cases... {
-  using Cases::operator()...;
-};
-template <typename... Cases>
-Overloaded(Cases...) -> Overloaded<Cases...>;
-
 // The value of an option in JSON; null where it has none.
 Json json_of(const OptionValue& value) {
   return std::visit(Overloaded{

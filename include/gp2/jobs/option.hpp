@@ -77,6 +77,14 @@ using OptionValue =
                  std::optional<std::vector<std::string>>*, std::map<std::string, std::string>*,  //
                  std::map<std::string, int>*, NamedNumbers*, Choice, Switch, YesByDefault, NumberOrWord, Repeated>;
 
+/// A visitor of OptionValue: one function for each kind.
+template <typename... Cases>
+struct Overloaded : Cases... {
+  using Cases::operator()...;
+};
+template <typename... Cases>
+Overloaded(Cases...) -> Overloaded<Cases...>;
+
 /// One entry of a job's table of options: `std::vector<Option> options(Request&)`. From this table come the options of the
 /// command, the keywords of Python with their docstrings and stubs, `options` in FIT.json, and the tables of the documentation.
 /// The default is the value of a new request.
