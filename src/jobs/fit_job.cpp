@@ -23,9 +23,7 @@ void require_in_range(const FitRequest& request) {
   require_positive("restarts", request.restarts);
   require_not_negative("max_iterations", request.max_iterations);
   require_positive("max_points", request.problem.max_points);
-  if (request.threads < 0) {
-    throw InputError(fmt::format("`threads`: must be positive, or 0 for as many as the machine has; got {}", request.threads));
-  }
+  require_threads(request.threads);
   const std::optional<double>& noise = request.problem.noise_stddev;
   if (noise && (!(*noise > 0) || !std::isfinite(*noise))) {
     throw InputError(fmt::format("`noise_std`: expected a positive number, 'estimate' or 'stated', got '{}'", *noise));
@@ -120,7 +118,7 @@ std::vector<Option> options(FitRequest& request) {
       {"start", &request.start, "FILE", "starting values: {\"name\": value, …} as JSON, or a FIT.json"},
       {"max_points", &problem.max_points, "N", "take this many rows of each log, the first of a shuffle by `seed`", "all"},
       {"seed", &problem.seed, "S", "of restarts and `max_points`"},
-      not_recorded({"threads", &request.threads, "K", "0: as many as the machine has; results do not depend on it"}),
+      threads_option(request.threads),
       {"standard_errors", YesByDefault{&request.standard_errors}, "",
        "the standard errors of estimated parameters, which take a few dozen gradients"},
       {"max_escapes", &request.max_escapes, "K", "scans for lower optima from the best one", "5"},

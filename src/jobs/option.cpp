@@ -100,6 +100,16 @@ bool read_value(const Json& json, const OptionValue& value) {
 
 }  // namespace
 
+Option threads_option(int& threads) {
+  return not_recorded({"threads", &threads, "K", "0: as many as the machine has; results do not depend on it"});
+}
+
+void require_threads(int threads) {
+  if (threads < 0) {
+    throw InputError(fmt::format("`threads`: must be positive, or 0 for as many as the machine has; got {}", threads));
+  }
+}
+
 const Option* find_option(const std::vector<Option>& options, const std::string& name) {
   const auto found = std::find_if(options.begin(), options.end(), [&](const Option& option) { return option.name == name; });
   return found == options.end() ? nullptr : &*found;

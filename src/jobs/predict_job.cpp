@@ -147,13 +147,11 @@ PredictOutcome predict(const FitFile& fit, const CsvTable& states, const Predict
 std::vector<Option> options(EvaluateRequest& request) {
   return {{"outputs", &request.outputs, "ddq3,ddq6", "accelerations to compare", "those observed in training"},
           columns_option(request.columns),
-          not_recorded({"threads", &request.threads, "K", "0: as many as the machine has; results do not depend on it"})};
+          threads_option(request.threads)};
 }
 
 EvaluateOutcome evaluate(const FitFile& fit, const Posterior& posterior, const CsvTable& log, const EvaluateRequest& request) {
-  if (request.threads < 0) {
-    throw InputError(fmt::format("`threads`: must be positive, or 0 for as many as the machine has; got {}", request.threads));
-  }
+  require_threads(request.threads);
   const System& system = *fit.model.system;
   const std::vector<std::string> outputs = request.outputs.empty() ? observed_outputs(posterior, system) : request.outputs;
   const std::vector<int> rows = acceleration_rows(system, outputs, "`outputs`");

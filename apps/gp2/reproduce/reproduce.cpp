@@ -51,8 +51,7 @@ std::filesystem::path definitions(const std::string& told) {
 }
 
 void run(const Arguments& arguments) {
-  if (arguments.threads < 0)
-    throw InputError(fmt::format("`threads`: must be positive, or 0 for as many as the machine has; got {}", arguments.threads));
+  require_threads(arguments.threads);
   ReproduceOptions options;
   options.experiments = definitions(arguments.experiments);
   if (!arguments.data.empty()) {
@@ -102,7 +101,7 @@ Command reproduce_command() {
        "how GP² is trained: paper, default, or both; the other methods are the same under each"},
       {"data", &a->data, "DIR", "folder of the published observations; without it they are drawn from the same distributions"},
       {"runs", &a->runs, "R", "data sets", "10, or those that --data holds"},
-      {"threads", &a->threads, "K", "0: as many as the machine has"},
+      threads_option(a->threads),
       {"experiments", &a->experiments, "DIR", "folder of the definitions", "those of gp2"},
       output(a->output, "DIR", "folder for numbers (CSV, JSON) and pictures (SVG, PNG)"),
   };

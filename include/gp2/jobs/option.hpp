@@ -107,6 +107,11 @@ inline Option not_recorded(Option option) {
   return option;
 }
 
+/// "threads", alike in every job.
+Option threads_option(int& threads);
+/// @throws InputError when it is negative.
+void require_threads(int threads);
+
 /// The entry of a name; null where there is none.
 const Option* find_option(const std::vector<Option>& options, const std::string& name);
 
