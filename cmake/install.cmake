@@ -9,7 +9,7 @@ include(CMakePackageConfigHelpers)
 include(GNUInstallDirs)
 set(gp2_cmake_dir ${CMAKE_INSTALL_LIBDIR}/cmake/gp2)
 
-install(TARGETS gp2 EXPORT gp2Targets)
+install(TARGETS gp2 gp2_predict EXPORT gp2Targets)
 install(DIRECTORY ${PROJECT_SOURCE_DIR}/include/gp2 DESTINATION ${CMAKE_INSTALL_INCLUDEDIR} FILES_MATCHING PATTERN "*.hpp")
 install(DIRECTORY ${PROJECT_SOURCE_DIR}/models/ DESTINATION ${CMAKE_INSTALL_DATADIR}/gp2/models FILES_MATCHING PATTERN "*.toml"
         PATTERN "*.xml")

@@ -7,20 +7,9 @@
 
 #include <stdlib.h>
 
-#include "gp2/error.hpp"
+#include "input_error.hpp"
 
 namespace gp2::test {
-
-/// What f throws as InputError, or "" when it does not throw.
-template <class F>
-std::string input_error_of(F f) {
-  try {
-    f();
-  } catch (const InputError& error) {
-    return error.what();
-  }
-  return "";
-}
 
 /// A fit file as the format had it that knew no checksums: what is changed in it is then met for itself.
 template <class Json>

@@ -7,23 +7,15 @@
 namespace gp2::test {
 
 /// Observations with other states.
-inline Observations with_states(const Observations& group, Eigen::MatrixXd states) {
-  return {std::move(states), group.view(), group.values(), group.noise()};
-}
+Observations with_states(const Observations& group, Eigen::MatrixXd states);
 
 /// Observations with another σ.
-inline Observations with_stddev(const Observations& group, Eigen::VectorXd stddev) {
-  return group.with_noise(Noise(std::move(stddev), group.noise().is_estimated(), group.noise().scale()));
-}
+Observations with_stddev(const Observations& group, Eigen::VectorXd stddev);
 
 /// Observations with another scale s of each value; empty: s = 1.
-inline Observations with_scale(const Observations& group, Eigen::MatrixXd scale) {
-  return group.with_noise(Noise(group.noise().stddev(), group.noise().is_estimated(), std::move(scale)));
-}
+Observations with_scale(const Observations& group, Eigen::MatrixXd scale);
 
 /// Observations whose σ is estimated or not.
-inline Observations with_estimated_noise(const Observations& group, bool is_estimated) {
-  return group.with_noise(Noise(group.noise().stddev(), is_estimated, group.noise().scale()));
-}
+Observations with_estimated_noise(const Observations& group, bool is_estimated);
 
 }  // namespace gp2::test

@@ -14,7 +14,7 @@
 
 #include "gp2/export.hpp"
 #include "gp2/mechanics/symbolic_system.hpp"
-#include "gp2/prior.hpp"
+#include "gp2/prior/latent_spec.hpp"
 #include "gp2/robots/robot.hpp"
 #include "gp2/view.hpp"
 
@@ -29,6 +29,18 @@ using RobotSource = std::function<RobotDescription(const std::string& file)>;
 /// What it returns must go by the coordinates, inputs and parameters declared.
 using MechanicsSource = std::function<std::shared_ptr<const System>(const SystemDeclaration& declaration)>;
 
+/// Code for what a model file only declares.
+struct ModelCode {
+  MechanicsSource mechanics = {};  // empty: M, A, b and F stand in the file
+
+  struct OfLatent {
+    StateCode features = {}, directions = {};  // empty: they stand in the file
+  };
+  std::map<std::string, OfLatent> latents = {};  // by the name of the latent
+
+  explicit operator bool() const { return mechanics || !latents.empty(); }
+};
+
 /// A mechanical system and its prior as text (TOML; docs/model-files.md has every key). The equations of the system may come from
 /// code instead; everything else is the same then.
 class Model {
@@ -37,24 +49,18 @@ class Model {
   static Model read(const std::filesystem::path& path);
   /// @param name  stands for the file in messages; its folder is where a relative robot = "FILE" is looked for
   static Model parse(std::string text, std::string name);
-  static Model parse(std::string text, std::string name, const RobotSource& robot);
+  static Model parse(std::string text, std::string name, const RobotSource& robot, const ModelCode& code = {});
 
-  /// The same of a file without [mechanics] and [constraints]: M, A, b and F come from code.
-  /// @throws InputError also when the file has one of the two, or `mechanics` is empty, returns nothing, or a system that goes by
-  ///   other coordinates, inputs or parameters.
-  static Model read(const std::filesystem::path& path, const MechanicsSource& mechanics);
-  static Model parse(std::string text, std::string name, const MechanicsSource& mechanics);
+  /// The same of a file that leaves something to code: M, A, b and F, when it is without [mechanics] and [constraints]; features
+  /// and directions of latents, when it has { code = [names] } in their place.
+  /// @throws InputError also when code and file both give something, or neither; and when the mechanics return nothing, or a
+  ///   system that goes by other coordinates, inputs or parameters.
+  static Model read(const std::filesystem::path& path, const ModelCode& code);
+  static Model parse(std::string text, std::string name, const ModelCode& code);
 
-  /// A [[latent]] as written.
-  struct LatentText {
-    std::string name;
-    std::string kernel;
-    std::vector<std::string> features;
-    Latent::Base base = Latent::Base::acceleration;
-    std::vector<std::vector<Expression>> directions;  // B (nq rows × p), empty: the identity
-    Latent::Range lengthscale, signal_stddev;
-    int line = 0;
-  };
+  /// A model without a file: its text declares what a fit on disk must hold, the rest is code, as for `parse`.
+  /// @throws InputError as make_prior.
+  static Model from_code(std::shared_ptr<const System> system, const std::vector<LatentSpec>& latents);
 
   struct Noise {
     std::vector<double> stddev;  // per coordinate; empty when the file has no [noise]
@@ -88,11 +94,11 @@ class Model {
 
   std::string name;                        // for messages
   std::string text;                        // the file's content
-  bool mechanics_are_code = false;         // M, A, b and F come from a MechanicsSource, not from the text
+  ModelCode code;                          // what the text leaves to it
   std::optional<RobotDescription> robot;   // that the model file names
   std::shared_ptr<ExpressionGraph> graph;  // of every expression here
   std::shared_ptr<const System> system;
-  std::vector<LatentText> latents;
+  std::vector<LatentSpec> latents;
   Noise noise;
   std::optional<Expression> potential;         // V(q, t) [J], for the energy that `simulate` reports
   std::vector<Expression> truth;               // added to M⁻¹F; nq entries, or none without [truth]
@@ -124,21 +130,6 @@ class Model {
 
 /// The system of a model as expressions. @throws InputError where its mechanics are code.
 const SymbolicSystem& require_symbolic_system(const Model& model);
-
-/// What the model's kernel would rule out without reason: a second latent of fixed, short lengthscales and a size below the
-/// noise. It hardly moves the mean, but keeps a standard deviation where the fit would call an effect absent that the data cannot
-/// see.
-struct Discrepancy {
-  Eigen::VectorXd lengthscale;  // of each feature of the model's latent (D)
-  Eigen::VectorXd stddev;       // of each acceleration (nq)
-};
-
-struct PriorOptions {
-  Prior::Mean mean = Prior::Mean::zero;
-  std::optional<Latent::Base> base;             // replaces the directions of the model's latent by the identity or M⁻¹
-  bool raw_angles = false;                      // a feature that is an angle stays as it is instead of its sine and cosine
-  std::optional<Discrepancy> discrepancy = {};  // beside the model's one latent
-};
 
 /// The prior of a model file. Not to be called from several threads for one model: its expression graph grows.
 /// @throws InputError when a kernel or feature is wrong, or `base` is asked for and the model has several latents.

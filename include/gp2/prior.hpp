@@ -11,7 +11,7 @@
 #include "gp2/export.hpp"
 #include "gp2/mechanics/udwadia_kalaba.hpp"
 #include "gp2/prior/kernel.hpp"
-#include "gp2/symbolic/expression.hpp"
+#include "gp2/prior/state_function.hpp"
 
 namespace gp2 GP2_API {
 
@@ -35,19 +35,15 @@ struct Latent {
 
   std::string name;
   Kernel kernel;
-  std::vector<std::string> feature_names;  // φ(x), D of them
-  Tape features;                           // state -> φ; parameters in it keep the model's values
-  std::vector<int> feature_parameters;     // the system's parameters that φ uses: they cannot be estimated
+  std::vector<std::string> feature_names;         // of φ(x), D of them
+  std::shared_ptr<const StateFunction> features;  // φ; parameters in it keep the model's values
+  std::vector<int> feature_parameters;            // the system's parameters that φ uses: they cannot be estimated
   Base base = Base::acceleration;
-  std::vector<std::string> column_names;         // p of them, for the names of the signal standard deviations
-  Tape directions;                               // state, parameters -> B (nq × p), column-major; unused where B = I
-  std::vector<Tape> direction_derivatives;       // one per parameter of the system -> ∂B/∂p
-  StateDerivatives feature_state_derivatives;    // state -> ∂φ/∂x
-  StateDerivatives direction_state_derivatives;  // state, parameters -> ∂B/∂x; none where B = I
-  bool directions_are_identity = true;           // B = I, p = nq
-  std::optional<int> free_loading;               // columns of a free loading C; not given: C = diag(s)
-  bool kernel_is_fixed = false;                  // the kernel's parameters are 1, in the units that its features have
-  bool signal_is_fixed = false;                  // s = 1, in the units that its directions have
+  std::vector<std::string> column_names;            // p of them, for the names of the signal standard deviations
+  std::shared_ptr<const StateFunction> directions;  // B (nq × p), column-major; null: B = I, p = nq
+  std::optional<int> free_loading;                  // columns of a free loading C; not given: C = diag(s)
+  bool kernel_is_fixed = false;                     // the kernel's parameters are 1, in the units that its features have
+  bool signal_is_fixed = false;                     // s = 1, in the units that its directions have
   Range lengthscale, signal_stddev;
 
   [[nodiscard]] int size() const { return static_cast<int>(column_names.size()); }  // p

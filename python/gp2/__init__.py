@@ -36,6 +36,7 @@ from gp2._gp2 import (
     load,
     read_csv,
     resample,
+    show,
     simulate,
 )
 
@@ -66,5 +67,6 @@ __all__ = [
     "load",
     "read_csv",
     "resample",
+    "show",
     "simulate",
 ]

@@ -445,6 +445,14 @@ def resample(
     columns: Mapping[str, str] | None = None,
     # end of options
 ) -> Table: ...
+def show(
+    system: System,
+    *,
+    # options of show: written by scripts/options
+    latex: bool = False,
+    full: bool = False,
+    # end of options
+) -> str: ...
 def simulate(
     system: System,
     start: Mapping[str, float] | npt.ArrayLike,

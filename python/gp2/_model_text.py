@@ -79,6 +79,8 @@ def _value(value: Any) -> str:
         return repr(int(value))
     if isinstance(value, Real):
         return repr(float(value))
+    if isinstance(value, Mapping) and "function" in value:
+        return "{ " + f"code = {_value(list(value.get('names', ())))}" + " }"
     if isinstance(value, Mapping):
         return "{ " + ", ".join(_entries(value)) + " }"
     if hasattr(value, "tolist"):  # of NumPy

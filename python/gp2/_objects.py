@@ -18,8 +18,8 @@ def _read_system(text: str, name: str, robot: str | None = None) -> _gp2.System:
 def _reduce_system(system: _gp2.System) -> tuple[Any, ...]:
     try:
         _read_system(system.text, system.name, system.robot)
-    except _gp2.InputError as error:  # of System.from_callables
-        raise TypeError(f"'{system.name}' cannot be pickled: its mechanics are functions") from error
+    except _gp2.InputError as error:  # it has functions
+        raise TypeError(f"'{system.name}' cannot be pickled: it has functions, which are code") from error
     return _read_system, (system.text, system.name, system.robot)
 
 

@@ -32,20 +32,21 @@ void add_predictor(py::module_& module);
 /// gp2.System: a model file.
 struct PySystem {
   std::shared_ptr<const Model> model;
-  MechanicsSource mechanics = {};  // where they are Python functions
 
   [[nodiscard]] const System& system() const { return *model->system; }
 };
 
-/// System.from_callables.
+/// System(…) and System.from_callables: the text of a model from keywords, and what in it is Python functions.
 void add_callables(py::class_<PySystem>& system);
+
+/// Code of a system; none without one.
+inline ModelCode code_of(const PySystem* system) { return system == nullptr ? ModelCode() : system->model->code; }
 
 /// gp2.Posterior: what a fit file holds, conditioned.
 struct PyPosterior {
   FitFile file;  // without observations: those of `posterior`, which may grow
   Posterior posterior;
   std::vector<std::string> notes;
-  MechanicsSource mechanics = {};  // of the system, as in PySystem
 
   [[nodiscard]] const System& system() const { return *file.model.system; }
 };

@@ -1,6 +1,8 @@
-// Systems whose mechanics are Python functions.
+// Systems from keywords, whose mechanics or latents may be Python functions.
 
 #include "gp2/mechanics/callable_system.hpp"
+
+#include <algorithm>
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
@@ -38,12 +40,15 @@ class Function {
 
 using Shape = std::vector<py::ssize_t>;
 
-/// What a function returned for one quantity, as doubles. @throws InputError naming function, quantity and shapes.
+/// What a function returned for one quantity, as doubles; an extent of −1 may be any. @throws InputError naming function, quantity
+/// and shapes.
 py::array_t<double, py::array::c_style> returned(const py::object& object, const char* function, const char* quantity,
                                                  const char* wanted, const Shape& shape) {
   const py::array array = py::array::ensure(object);
   if (!array) PyErr_Clear();
-  const bool fits = array && Shape(array.shape(), array.shape() + array.ndim()) == shape;
+  const bool fits =
+      array && std::equal(shape.begin(), shape.end(), array.shape(), array.shape() + array.ndim(),
+                          [](py::ssize_t wanted_extent, py::ssize_t got) { return wanted_extent < 0 || wanted_extent == got; });
   const char kind = fits ? array.dtype().kind() : 'O';
   if (!fits || (kind != 'f' && kind != 'i' && kind != 'u')) {
     std::string got = std::string(py::str(py::type::of(object)));
@@ -51,8 +56,10 @@ py::array_t<double, py::array::c_style> returned(const py::object& object, const
       got = fmt::format("({}) of {}", fmt::join(array.shape(), array.shape() + array.ndim(), ", "),
                         std::string(py::str(array.dtype())));
     }
+    std::vector<std::string> extents;
+    for (const py::ssize_t extent : shape) extents.push_back(extent < 0 ? "any" : std::to_string(extent));
     throw InputError(fmt::format("{}: {} must be numbers of shape {} = ({}), got {}", function, quantity, wanted,
-                                 fmt::join(shape, ", "), got));
+                                 fmt::join(extents, ", "), got));
   }
   return py::array_t<double, py::array::c_style | py::array::forcecast>::ensure(array);
 }
@@ -63,6 +70,17 @@ py::dict by_name(const std::vector<Parameter>& parameters, const CallableSystem:
   return out;
 }
 
+// A row-major matrix per state, as functions return them, in column-major columns.
+MatrixXd column_major(const py::array_t<double, py::array::c_style>& array) {
+  const Index n = array.shape(0), rows = array.shape(1), columns = array.shape(2);
+  const Eigen::Map<const MatrixXd> row_major(array.data(), rows * columns, n);
+  MatrixXd blocks(rows * columns, n);
+  for (Index i = 0; i < n; ++i) {
+    blocks.col(i).reshaped(rows, columns) = row_major.col(i).reshaped(columns, rows).transpose();
+  }
+  return blocks;
+}
+
 /// (M, A, b, F) of a function. M and A hold a row-major matrix per state, SystemValues column-major ones.
 SystemValues values_of(const py::object& result, const char* function, Index n, Index nq, Index nc) {
   if (!py::isinstance<py::sequence>(result) || py::len(result) != 4) {
@@ -71,12 +89,8 @@ SystemValues values_of(const py::object& result, const char* function, Index n, 
   const py::sequence parts = result;
   SystemValues values;
   const auto matrices = [&](const py::object& part, const char* quantity, const char* wanted, Index rows) {
-    MatrixXd blocks(rows * nq, n);
-    if (rows == 0) return blocks;  // of A where nothing constrains: may be None
-    const auto array = returned(part, function, quantity, wanted, {n, rows, nq});
-    const Eigen::Map<const MatrixXd> row_major(array.data(), rows * nq, n);
-    for (Index i = 0; i < n; ++i) blocks.col(i).reshaped(rows, nq) = row_major.col(i).reshaped(nq, rows).transpose();
-    return blocks;
+    if (rows == 0) return MatrixXd(0, n);  // of A where nothing constrains: may be None
+    return column_major(returned(part, function, quantity, wanted, {n, rows, nq}));
   };
   const auto vectors = [&](const py::object& part, const char* quantity, const char* wanted, Index rows) {
     if (rows == 0) return MatrixXd(0, n);
@@ -160,29 +174,137 @@ MechanicsSource source_of(const py::object& mechanics, const py::object& constra
   };
 }
 
+void require_function(const py::object& given, const std::string& name) {
+  if (PyCallable_Check(given.ptr()) == 1) return;
+  throw py::type_error(fmt::format("{}: expected a function, got {}", name, std::string(py::str(py::type::of(given)))));
+}
+
+/// {"names": …, "function": …, "derivatives": …, "reads": …} of a latent.
+struct LatentFunction {
+  Index n_names = 0;
+  Function function;
+  std::optional<Function> derivatives;
+  std::optional<std::vector<std::string>> reads;
+
+  LatentFunction(const py::dict& given, const std::string& what) : function(given["function"]) {
+    for (const auto& [key, value] : given) {
+      const auto word = key.cast<std::string>();
+      if (word != "names" && word != "function" && word != "derivatives" && word != "reads") {
+        throw InputError(fmt::format("{}: expected 'names', 'function', 'derivatives' or 'reads', got '{}'", what, word));
+      }
+    }
+    require_function(given["function"], what);
+    if (!given.contains("names")) throw InputError(what + ": missing 'names', one for each number that the function gives");
+    n_names = static_cast<Index>(py::len(given["names"]));
+    if (given.contains("derivatives") && !given["derivatives"].is_none()) {
+      require_function(given["derivatives"], what + ": derivatives");
+      derivatives.emplace(given["derivatives"]);
+    }
+    if (given.contains("reads")) reads = given["reads"].cast<std::optional<std::vector<std::string>>>();
+  }
+};
+
+StateCode features_code(const LatentFunction& of, const std::string& what) {
+  StateCode code;
+  code.reads = of.reads;
+  code.evaluate = [=](const StateCode::States& states, const StateCode::Parameters&) -> MatrixXd {
+    const py::gil_scoped_acquire acquire;
+    const auto array =
+        returned(of.function(to_rows(states)), what.c_str(), "features", "(n, names)", {states.cols(), of.n_names});
+    return Eigen::Map<const MatrixXd>(array.data(), of.n_names, states.cols());
+  };
+  return code;
+}
+
+StateCode directions_code(const LatentFunction& of, const std::string& what, const std::vector<std::string>& names) {
+  // of parameters only names and values are known before there is a system
+  const auto named = [names](const StateCode::Parameters& values) {
+    py::dict out;
+    for (std::size_t k = 0; k < names.size(); ++k) out[py::str(names[k])] = values[static_cast<Index>(k)];
+    return out;
+  };
+  const auto matrices = [=](const py::object& result, Index n) {
+    return column_major(returned(result, what.c_str(), "directions", "(n, nq, names)", {n, -1, of.n_names}));
+  };
+  StateCode code;
+  code.reads = of.reads;
+  code.evaluate = [=](const StateCode::States& states, const StateCode::Parameters& parameters) {
+    const py::gil_scoped_acquire acquire;
+    return matrices(of.function(to_rows(states), named(parameters)), states.cols());
+  };
+  if (of.derivatives) {
+    code.differentiate = [=](const StateCode::States& states, const StateCode::Parameters& parameters, int index) {
+      const py::gil_scoped_acquire acquire;
+      const std::string& name = names[static_cast<std::size_t>(index)];
+      return matrices((*of.derivatives)(to_rows(states), named(parameters), name), states.cols());
+    };
+  }
+  return code;
+}
+
+std::optional<LatentFunction> function_in(const py::handle& given, const std::string& what) {
+  if (!py::isinstance<py::dict>(given) || !given.contains("function")) return std::nullopt;
+  return LatentFunction(given.cast<py::dict>(), what);
+}
+
+// what is functions among keywords of System
+std::map<std::string, ModelCode::OfLatent> latents_code(const py::kwargs& kwargs) {
+  std::map<std::string, ModelCode::OfLatent> out;
+  if (!kwargs.contains("latents")) return out;
+  std::vector<std::string> parameters;
+  if (kwargs.contains("parameters") && !kwargs["parameters"].is_none()) {
+    for (const auto& [name, value] : kwargs["parameters"].cast<py::dict>()) parameters.push_back(name.cast<std::string>());
+  }
+  int number = 0;
+  for (const py::handle latent : kwargs["latents"]) {
+    ++number;
+    if (!py::isinstance<py::dict>(latent)) continue;
+    const auto given = latent.cast<py::dict>();
+    const std::string name = given.contains("name") ? std::string(py::str(given["name"])) : fmt::format("latent {}", number);
+    const std::string what = fmt::format("latent '{}'", name);
+    ModelCode::OfLatent code;
+    if (given.contains("features")) {
+      if (const auto function = function_in(given["features"], what + ": features")) {
+        code.features = features_code(*function, what);
+      }
+    }
+    if (given.contains("directions")) {
+      py::object directions = given["directions"];
+      for (const char* base : {"force", "acceleration"}) {
+        if (py::isinstance<py::dict>(directions) && directions.contains(base)) directions = directions[base];
+      }
+      if (const auto function = function_in(directions, what + ": directions")) {
+        code.directions = directions_code(*function, what, parameters);
+      }
+    }
+    if (code.features || code.directions) out[name] = std::move(code);
+  }
+  return out;
+}
+
+PySystem from_keywords(const py::kwargs& kwargs, const char* name, ModelCode code) {
+  const py::object text = py::module_::import("gp2._model_text").attr("model_text")(**kwargs);
+  code.latents = latents_code(kwargs);
+  return {std::make_shared<const Model>(Model::parse(text.cast<std::string>(), name, code))};
+}
+
 PySystem from_callables(const py::object& mechanics, const py::object& constraints, const py::object& derivatives,
                         const py::object& residuals, const std::optional<std::vector<std::string>>& reads,
                         const py::kwargs& kwargs) {
-  const auto require_function = [](const py::object& given, const char* name) {
-    if (PyCallable_Check(given.ptr()) == 1) return;
-    throw py::type_error(fmt::format("{}: expected a function, got {}", name, std::string(py::str(py::type::of(given)))));
-  };
   require_function(mechanics, "mechanics");
   if (!derivatives.is_none()) require_function(derivatives, "derivatives");
   if (!residuals.is_none()) require_function(residuals, "residuals");
   for (const char* key : {"mass", "force"}) {
     if (kwargs.contains(key)) throw InputError(fmt::format("{}: the mechanics are code here; leave it out", key));
   }
-  const py::object text = py::module_::import("gp2._model_text").attr("model_text")(**kwargs);
-  MechanicsSource source = source_of(mechanics, constraints, derivatives, residuals, reads);
-  auto model = std::make_shared<const Model>(Model::parse(text.cast<std::string>(), "System.from_callables(…)", source));
-  return {std::move(model), std::move(source)};
+  return from_keywords(kwargs, "System.from_callables(…)", {source_of(mechanics, constraints, derivatives, residuals, reads)});
 }
 
 }  // namespace
 
 void add_callables(py::class_<PySystem>& system) {
   using namespace py::literals;
+  system.def(py::init([](const py::kwargs& kwargs) { return from_keywords(kwargs, "System(…)", {}); }));
   system.def_static("from_callables", &from_callables, "mechanics"_a, "constraints"_a = py::tuple(), "derivatives"_a = py::none(),
                     "residuals"_a = py::none(), "reads"_a = py::none(),
                     R"(A system whose equations are functions, say of Pinocchio, MuJoCo or Drake.

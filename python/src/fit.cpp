@@ -9,6 +9,7 @@
 #include "gp2/jobs/derive.hpp"
 #include "gp2/jobs/fit_job.hpp"
 #include "gp2/jobs/resample.hpp"
+#include "gp2/jobs/show_job.hpp"
 #include "gp2/jobs/simulate_job.hpp"
 #include "options.hpp"
 
@@ -102,7 +103,7 @@ std::vector<SideInformation> side_information_of(const std::vector<PySideInforma
 }
 
 /// Runs a fit without the interpreter's lock; Ctrl-C ends it with the best so far.
-PyPosterior run(const FitJob& job, const py::object& progress_callback, const MechanicsSource& mechanics) {
+PyPosterior run(const FitJob& job, const py::object& progress_callback) {
   tell(job.notes);
   std::atomic<bool> stop = false;
   LastProgress progress;
@@ -125,7 +126,7 @@ PyPosterior run(const FitJob& job, const py::object& progress_callback, const Me
     std::vector<std::string> notes = job.notes;
     notes.insert(notes.end(), outcome->notes.begin(), outcome->notes.end());
     outcome->file.observations.clear();
-    posterior = PyPosterior{std::move(outcome->file), std::move(outcome->posterior), with_keywords(std::move(notes)), mechanics};
+    posterior = PyPosterior{std::move(outcome->file), std::move(outcome->posterior), with_keywords(std::move(notes))};
   }
   if (raised) {
     try {
@@ -147,23 +148,22 @@ PyPosterior fit_model(const PySystem& system, const py::object& data, const py::
   request.model = *system.model;
   request.logs = logs_of(data, system.system());
   request.also = side_information_of(also);
-  return run(prepare_fit(std::move(request)), progress, system.mechanics);
+  return run(prepare_fit(std::move(request)), progress);
 }
 
 PyPosterior fit_again(const py::object& path, const py::object& data, const std::vector<PySideInformation>& also,
                       const PySystem* system, int threads, const py::object& progress) {
-  const MechanicsSource mechanics = system == nullptr ? MechanicsSource() : system->mechanics;
-  const FitFile file = mechanics ? FitFile::read(path_argument(path), mechanics) : FitFile::read(path_argument(path));
+  const FitFile file = FitFile::read(path_argument(path), code_of(system));
   if (data.is_none()) {
     if (!also.empty()) throw InputError("`again`: `also` goes with `data`");
-    return run(prepare_fit_again(file, threads), progress, mechanics);
+    return run(prepare_fit_again(file, threads), progress);
   }
   FitRequest request = request_of(file);
   request.threads = threads;
   request.data_source.clear();
   request.logs = logs_of(data, *request.model.system);
   request.also = side_information_of(also);
-  return run(prepare_fit(std::move(request)), progress, mechanics);
+  return run(prepare_fit(std::move(request)), progress);
 }
 
 std::string fit_documentation() {
@@ -223,7 +223,7 @@ void add_fit(py::module_& module) {
       "fit_again", &fit_again, "path"_a, "data"_a = py::none(), py::kw_only(), "also"_a = std::vector<PySideInformation>(),
       "system"_a = nullptr, "threads"_a = 0, "progress"_a = py::none(),
       "Repeat the fit in a FIT.json with the options it was made with, from its data or from those given: the same bits.\n\n"
-      "system: of System.from_callables, as in gp2.load. A robust fit needs its data.");
+      "system: as in gp2.load. A robust fit needs its data.");
   module.def(
       "_stub_of_options",
       [](const std::string& job) {
@@ -231,8 +231,12 @@ void add_fit(py::module_& module) {
         SimulateRequest simulate;
         DeriveOptions derive;
         ResampleOptions resample;
-        const std::map<std::string, std::vector<Option>> tables = {
-            {"fit", options(fit)}, {"simulate", options(simulate)}, {"derive", options(derive)}, {"resample", options(resample)}};
+        ShowRequest show;
+        const std::map<std::string, std::vector<Option>> tables = {{"fit", options(fit)},
+                                                                   {"simulate", options(simulate)},
+                                                                   {"derive", options(derive)},
+                                                                   {"resample", options(resample)},
+                                                                   {"show", options(show)}};
         return stub_lines(tables.at(job));
       },
       "job"_a);

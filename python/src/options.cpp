@@ -119,78 +119,57 @@ std::string literal(const std::vector<std::string>& words) {
   return "Literal[" + text + "]";
 }
 
-// The type and the default of a keyword, as a stub has them.
-struct Declaration {
-  std::string type, otherwise;
-};
-Declaration declaration_of(const OptionValue& value) {
+// The type of a keyword as a stub has it, but for the None that has_none() tells of.
+std::string type_of(const OptionValue& value) {
+  const auto kinds = Overloaded{
+      [](const bool*) { return "bool"; },
+      [](const Switch&) { return "bool"; },
+      [](const YesByDefault&) { return "bool"; },
+      [](const int*) { return "int"; },
+      [](const std::uint64_t*) { return "int"; },
+      [](const double*) { return "float"; },
+      [](const std::string*) { return "str"; },
+      [](const std::optional<int>*) { return "int"; },
+      [](const std::optional<std::uint64_t>*) { return "int"; },
+      [](const std::optional<double>*) { return "float"; },
+      [](const std::optional<std::string>*) { return "str"; },
+      [](const std::vector<std::string>*) { return "Sequence[str]"; },
+      [](const std::optional<std::vector<std::string>>*) { return "Sequence[str]"; },
+      [](const std::map<std::string, std::string>*) { return "Mapping[str, str]"; },
+      [](const std::map<std::string, int>*) { return "Mapping[str, int]"; },
+      [](const NamedNumbers*) { return "_Path | Mapping[str, float]"; },
+      [](const Choice& one) { return literal(one.words); },
+      [](const NumberOrWord& one) { return "float | " + literal(words_of(one)); },
+      [](const Repeated&) { return "Sequence[str]"; },
+  };
+  return std::visit<std::string>(kinds, value);
+}
+
+// The default of a keyword as a stub has it.
+std::string default_of(const OptionValue& value) {
   const auto truth = [](bool is_true) { return is_true ? "True" : "False"; };
-  return std::visit(Overloaded{
-                        [&](const bool* flag) -> Declaration {
-                          return {"bool", truth(*flag)};
-                        },
-                        [&](const Switch& one) -> Declaration {
-                          return {"bool", truth(*one.value)};
-                        },
-                        [&](const YesByDefault& one) -> Declaration {
-                          return {"bool", truth(*one.value)};
-                        },
-                        [](const int* number) -> Declaration {
-                          return {"int", std::to_string(*number)};
-                        },
-                        [](const std::uint64_t* number) -> Declaration {
-                          return {"int", std::to_string(*number)};
-                        },
-                        [](const double* number) -> Declaration {
-                          return {"float", std::string(py::repr(py::float_(*number)))};
-                        },
-                        [](const std::string* text) -> Declaration {
-                          return {"str", '"' + *text + '"'};
-                        },
-                        [](const std::optional<int>*) -> Declaration {
-                          return {"int | None", "None"};
-                        },
-                        [](const std::optional<std::uint64_t>*) -> Declaration {
-                          return {"int | None", "None"};
-                        },
-                        [](const std::optional<double>*) -> Declaration {
-                          return {"float | None", "None"};
-                        },
-                        [](const std::optional<std::string>*) -> Declaration {
-                          return {"str | None", "None"};
-                        },
-                        [](const std::vector<std::string>*) -> Declaration {
-                          return {"Sequence[str]", "[]"};
-                        },
-                        [](const std::optional<std::vector<std::string>>*) -> Declaration {
-                          return {"Sequence[str] | None", "None"};
-                        },
-                        [](const std::map<std::string, std::string>*) -> Declaration {
-                          return {"Mapping[str, str] | None", "None"};
-                        },
-                        [](const std::map<std::string, int>*) -> Declaration {
-                          return {"Mapping[str, int] | None", "None"};
-                        },
-                        [](const NamedNumbers*) -> Declaration {
-                          return {"_Path | Mapping[str, float] | None", "None"};
-                        },
-                        [](const Choice& one) -> Declaration {
-                          if (one.get().empty()) return {literal(one.words) + " | None", "None"};
-                          return {literal(one.words), '"' + one.get() + '"'};
-                        },
-                        [](const NumberOrWord& one) -> Declaration {
-                          return {"float | " + literal(words_of(one)) + " | None", "None"};
-                        },
-                        [](const Repeated&) -> Declaration {
-                          return {"Sequence[str]", "[]"};
-                        },
-                    },
-                    value);
+  const auto kinds = Overloaded{
+      [&](const bool* flag) { return truth(*flag); },
+      [&](const Switch& one) { return truth(*one.value); },
+      [&](const YesByDefault& one) { return truth(*one.value); },
+      [](const int* number) { return std::to_string(*number); },
+      [](const std::uint64_t* number) { return std::to_string(*number); },
+      [](const double* number) { return std::string(py::repr(py::float_(*number))); },
+      [](const std::string* text) { return '"' + *text + '"'; },
+      [](const std::vector<std::string>*) { return "[]"; },
+      [](const Repeated&) { return "[]"; },
+      [](const Choice& one) { return one.get().empty() ? "None" : '"' + one.get() + '"'; },
+      []<typename T>(const std::optional<T>*) { return "None"; },
+      []<typename T>(const std::map<std::string, T>*) { return "None"; },
+      [](const NamedNumbers*) { return "None"; },
+      [](const NumberOrWord&) { return "None"; },
+  };
+  return std::visit<std::string>(kinds, value);
 }
 
 std::string declaration(const Option& option) {
-  const auto [type, otherwise] = declaration_of(option.value);
-  return fmt::format("{}: {} = {}", keyword_of(option), type, otherwise);
+  return fmt::format("{}: {}{} = {}", keyword_of(option), type_of(option.value), has_none(option.value) ? " | None" : "",
+                     default_of(option.value));
 }
 
 // Every option that a message may name, with its kind.

@@ -151,10 +151,10 @@ Evaluation evaluate_posterior(const PyPosterior& self, const py::object& data, c
 
 // ---------------------------------------------------------------- data that grow
 
-// Changes are in place and under the interpreter's lock: other Python threads see them before or after. But mechanics that are
-// Python functions let go of the lock while they are called, so that a copy must be changed.
+// Changes are in place and under the interpreter's lock: other Python threads see them before or after. But Python
+// functions of a model let go of the lock while they are called, so that a copy must be changed.
 std::optional<Posterior> kept_by_others(const PyPosterior& self) {
-  return self.file.model.mechanics_are_code ? std::optional(self.posterior) : std::nullopt;
+  return self.file.model.code ? std::optional(self.posterior) : std::nullopt;
 }
 
 /// Whether the values of a group came with standard deviations of their own, and did not only get larger ones by a robust fit.
@@ -288,13 +288,12 @@ std::string simulate_documentation(const std::string& first) {
 
 // ---------------------------------------------------------------- files
 
-// the mechanics of a fit whose mechanics are Python functions are those of `system`
+// what is Python functions in a fit is that of `system`
 PyPosterior load(const py::object& path, const PySystem* system) {
-  const bool functions = system != nullptr && system->mechanics;
-  FitFile file = functions ? FitFile::read(path_argument(path), system->mechanics) : FitFile::read(path_argument(path));
+  FitFile file = FitFile::read(path_argument(path), code_of(system));
   Posterior posterior = file.posterior();
   file.observations.clear();
-  return {std::move(file), std::move(posterior), {}, functions ? system->mechanics : MechanicsSource()};
+  return {std::move(file), std::move(posterior), {}};
 }
 
 void save(const PyPosterior& self, const py::object& path) {
@@ -303,8 +302,65 @@ void save(const PyPosterior& self, const py::object& path) {
   file.write(path_argument(path));
 }
 
-template <typename Class>
-void define_report(Class& report) {
+// ---------------------------------------------------------------- report
+
+py::list distrusted_values(const FitReport& self) {
+  py::list list;
+  for (const DistrustedValue& value : self.distrusted) {
+    py::dict entry;
+    entry["log"] = value.group;
+    entry["row"] = value.row;
+    entry["state"] = value.state;
+    entry["distance"] = value.distance;
+    entry["noise_factor"] = value.noise_factor;
+    list.append(entry);
+  }
+  return list;
+}
+
+py::dict standard_errors(const FitReport& self) {
+  py::dict errors;
+  for (std::size_t k = 0; self.uncertainty && k < self.hyperparameters.size(); ++k) {
+    const Hyperparameter& h = self.hyperparameters[k];
+    if (h.kind != Hyperparameter::Kind::parameter) continue;
+    errors[py::str(h.name)] = h.at_bound() ? std::nan("") : self.uncertainty->stddev[static_cast<Eigen::Index>(k)];
+  }
+  return errors;
+}
+
+double correlation(const FitReport& self, const std::string& a, const std::string& b) {
+  const auto index = [&](const std::string& name) {
+    for (std::size_t k = 0; k < self.hyperparameters.size(); ++k) {
+      if (self.hyperparameters[k].name == name) return static_cast<Eigen::Index>(k);
+    }
+    throw py::key_error(name);
+  };
+  const Eigen::Index k = index(a), l = index(b);
+  return self.uncertainty ? self.uncertainty->correlation(k, l) : std::nan("");
+}
+
+double value_of(const FitReport& self, const std::string& name) {
+  for (const Hyperparameter& h : self.hyperparameters) {
+    if (h.name == name) return h.value;
+  }
+  throw py::key_error(name);
+}
+
+std::string text_of(const FitReport& self) {
+  std::string text = fmt::format("negative log likelihood {:.6f}\n{} after {} iterations ({} restarts, best: {}), {:.2f} s",
+                                 self.negative_log_likelihood, self.termination, self.iterations, self.restarts.size(),
+                                 self.best_restart + 1, self.seconds);
+  for (std::size_t k = 0; k < self.hyperparameters.size(); ++k) {
+    const Hyperparameter& h = self.hyperparameters[k];
+    const bool has_error = self.uncertainty && h.kind == Hyperparameter::Kind::parameter && !h.at_bound();
+    const std::string error = has_error ? fmt::format(" ± {:.2g}", self.uncertainty->stddev[static_cast<Eigen::Index>(k)]) : "";
+    text += fmt::format("\n  {:<34} {:>13.6g}{}   [{:.3g}, {:.3g}]{}", h.name, h.value, error, h.lower, h.upper,
+                        h.at_bound() ? "   at its bound" : "");
+  }
+  return text;
+}
+
+void define_report(py::class_<FitReport>& report) {
   using namespace py::literals;
   report.def_readonly("hyperparameters", &FitReport::hyperparameters, "Fitted values, list of Hyperparameter.")
       .def_readonly("negative_log_likelihood", &FitReport::negative_log_likelihood,
@@ -316,73 +372,18 @@ void define_report(Class& report) {
       .def_readonly("best_restart", &FitReport::best_restart)
       .def_readonly("restarts", &FitReport::restarts, "How each run ended, list of RestartReport.")
       .def_property_readonly(
-          "distrusted",
-          [](const FitReport& self) {
-            py::list list;
-            for (const DistrustedValue& value : self.distrusted) {
-              py::dict entry;
-              entry["log"] = value.group;
-              entry["row"] = value.row;
-              entry["state"] = value.state;
-              entry["distance"] = value.distance;
-              entry["noise_factor"] = value.noise_factor;
-              list.append(entry);
-            }
-            return list;
-          },
+          "distrusted", &distrusted_values,
           "Values that a robust fit distrusts, the farthest first: `log` and `state` count from 0, `row` among the observed.")
       .def_readonly("seconds", &FitReport::seconds)
       .def_property_readonly(
-          "standard_errors",
-          [](const FitReport& self) {
-            py::dict errors;
-            for (std::size_t k = 0; self.uncertainty && k < self.hyperparameters.size(); ++k) {
-              const Hyperparameter& h = self.hyperparameters[k];
-              if (h.kind != Hyperparameter::Kind::parameter) continue;
-              errors[py::str(h.name)] = h.at_bound() ? std::nan("") : self.uncertainty->stddev[static_cast<Eigen::Index>(k)];
-            }
-            return errors;
-          },
+          "standard_errors", &standard_errors,
           "Of estimated parameters, by name: inf where the data do not determine one, nan where it is at a bound.")
-      .def(
-          "correlation",
-          [](const FitReport& self, const std::string& a, const std::string& b) {
-            const auto index = [&](const std::string& name) {
-              for (std::size_t k = 0; k < self.hyperparameters.size(); ++k) {
-                if (self.hyperparameters[k].name == name) return static_cast<Eigen::Index>(k);
-              }
-              throw py::key_error(name);
-            };
-            const Eigen::Index k = index(a), l = index(b);
-            return self.uncertainty ? self.uncertainty->correlation(k, l) : std::nan("");
-          },
-          "a"_a, "b"_a, "Of the errors of two hyperparameters; nan where one is not determined.")
-      .def("__getitem__",
-           [](const FitReport& self, const std::string& name) {
-             for (const Hyperparameter& h : self.hyperparameters) {
-               if (h.name == name) return h.value;
-             }
-             throw py::key_error(name);
-           })
-      .def("__repr__", [](const FitReport& self) {
-        std::string text = fmt::format("negative log likelihood {:.6f}\n{} after {} iterations ({} restarts, best: {}), {:.2f} s",
-                                       self.negative_log_likelihood, self.termination, self.iterations, self.restarts.size(),
-                                       self.best_restart + 1, self.seconds);
-        for (std::size_t k = 0; k < self.hyperparameters.size(); ++k) {
-          const Hyperparameter& h = self.hyperparameters[k];
-          const bool has_error = self.uncertainty && h.kind == Hyperparameter::Kind::parameter && !h.at_bound();
-          const std::string error =
-              has_error ? fmt::format(" ± {:.2g}", self.uncertainty->stddev[static_cast<Eigen::Index>(k)]) : "";
-          text += fmt::format("\n  {:<34} {:>13.6g}{}   [{:.3g}, {:.3g}]{}", h.name, h.value, error, h.lower, h.upper,
-                              h.at_bound() ? "   at its bound" : "");
-        }
-        return text;
-      });
+      .def("correlation", &correlation, "a"_a, "b"_a, "Of the errors of two hyperparameters; nan where one is not determined.")
+      .def("__getitem__", &value_of)
+      .def("__repr__", &text_of);
 }
 
-}  // namespace
-
-void add_posterior(py::module_& module) {
+void add_reports(py::module_& module) {
   py::class_<Hyperparameter>(module, "Hyperparameter", "One number that training adjusts, in physical units.")
       .def_readonly("name", &Hyperparameter::name)
       .def_readonly("unit", &Hyperparameter::unit)
@@ -404,7 +405,11 @@ void add_posterior(py::module_& module) {
       .def_readonly("termination", &RestartReport::termination);
   py::class_<FitReport> report(module, "FitReport", "How a fit went; report['name'] is a fitted hyperparameter.");
   define_report(report);
+}
 
+// ---------------------------------------------------------------- classes of results
+
+void add_prediction(py::module_& module) {
   py::class_<Prediction>(module, "Prediction", "A view at n states, of d rows: the latent quantity, without measurement noise.")
       .def_readonly("mean", &Prediction::mean, "(n, d)")
       .def_property_readonly(
@@ -416,7 +421,9 @@ void add_posterior(py::module_& module) {
       .def("__repr__", [](const Prediction& p) {
         return fmt::format("<gp2.Prediction of {} at {} states>", fmt::join(p.names, ", "), p.mean.shape(0));
       });
+}
 
+void add_evaluation(py::module_& module) {
   py::class_<Evaluation>(module, "Evaluation", "How well a posterior predicts measured accelerations.")
       .def_readonly("outputs", &Evaluation::outputs)
       .def_property_readonly(
@@ -441,7 +448,9 @@ void add_posterior(py::module_& module) {
         return fmt::format("<gp2.Evaluation at {} points: {}; nrmse {:.4g}; max |A ddq - b| {:.2g}>", e.n, rmse, e.nrmse,
                            e.max_constraint_error_fitted);
       });
+}
 
+void add_motion(py::module_& module) {
   py::class_<Motion>(module, "Motion", "A motion at the times asked for.")
       .def_property_readonly(
           "t", [](const Motion& m) { return to_vector(m.trajectory.times); }, "(n) [s]")
@@ -473,21 +482,18 @@ void add_posterior(py::module_& module) {
       .def_property_readonly("steps", [](const Motion& m) { return m.trajectory.steps; })
       .def_property_readonly("rejected_steps", [](const Motion& m) { return m.trajectory.rejected_steps; })
       .def_property_readonly("evaluations", [](const Motion& m) { return m.trajectory.evaluations; });
+}
 
+// ---------------------------------------------------------------- methods of a posterior
+
+void define_files_and_facts(py::class_<PyPosterior>& posterior) {
   using namespace py::literals;
-  const auto view_arguments = [](const std::string& view, const PySystem* system, const std::optional<std::string>& latent,
-                                 const std::optional<double>& dt) {
-    return ViewArguments{view, system, latent, dt};
-  };
-  py::class_<PyPosterior> posterior(module, "Posterior", "A prior conditioned on data. Made by gp2.fit or gp2.load.");
   posterior
       .def_static("load", &load, "path"_a, "system"_a = nullptr,
                   "As gp2.load.\n\nRaises InputError naming the file and what is wrong.")
       .def("save", &save, "path"_a, "Write a FIT.json, whole or not at all. Loaded again it gives the same bits.")
       .def_property_readonly("system",
-                             [](const PyPosterior& self) {
-                               return PySystem{std::make_shared<const Model>(self.file.model), self.mechanics};
-                             })
+                             [](const PyPosterior& self) { return PySystem{std::make_shared<const Model>(self.file.model)}; })
       .def_property_readonly(
           "report", [](const PyPosterior& self) { return self.file.report; }, "How the fit went.")
       .def_property_readonly(
@@ -516,17 +522,21 @@ void add_posterior(py::module_& module) {
             }
             return values;
           },
-          "The system's parameters, with the fitted values of those that were estimated.")
-      .def(
-          "predict",
-          [=](const PyPosterior& self, const py::object& states, const std::string& view, const PySystem* system,
-              const std::optional<std::string>& latent, const std::optional<double>& dt, bool mean_only,
-              const py::object& columns, int threads) {
-            return predict(self, states, view_arguments(view, system, latent, dt), mean_only, columns, threads);
-          },
-          "states"_a, "view"_a = "constrained", py::kw_only(), "system"_a = nullptr, "latent"_a = py::none(), "dt"_a = py::none(),
-          "mean_only"_a = false, "columns"_a = py::none(), "threads"_a = 0,
-          R"(Predict a view at states (n, len(state_names)), or at those of a table by column names.
+          "The system's parameters, with the fitted values of those that were estimated.");
+}
+
+void define_predict(py::class_<PyPosterior>& posterior) {
+  using namespace py::literals;
+  posterior.def(
+      "predict",
+      [](const PyPosterior& self, const py::object& states, const std::string& view, const PySystem* system,
+         const std::optional<std::string>& latent, const std::optional<double>& dt, bool mean_only, const py::object& columns,
+         int threads) {
+        return predict(self, states, ViewArguments{view, system, latent, dt}, mean_only, columns, threads);
+      },
+      "states"_a, "view"_a = "constrained", py::kw_only(), "system"_a = nullptr, "latent"_a = py::none(), "dt"_a = py::none(),
+      "mean_only"_a = false, "columns"_a = py::none(), "threads"_a = 0,
+      R"(Predict a view at states (n, len(state_names)), or at those of a table by column names.
 
 view       'constrained': ddq (d = nq); 'unconstrained': the acceleration without constraints; 'constraint-force': A'λ;
            'multipliers': λ (d = nc); 'next-velocity': dq + dt ddq
@@ -535,24 +545,36 @@ latent     only what this latent adds, by its name
 mean_only  leaves out std and cov, which cost more by two orders
 
 Returns a Prediction with mean (n, d), std (n, d), cov (n, d, d).
-Raises InputError for states that are not finite where they are read, or contradict the constraints.)")
+Raises InputError for states that are not finite where they are read, or contradict the constraints.)");
+}
+
+void define_joint_and_sample(py::class_<PyPosterior>& posterior) {
+  using namespace py::literals;
+  posterior
       .def(
           "joint",
-          [=](const PyPosterior& self, const py::object& states, const std::string& view, const PySystem* system,
-              const std::optional<std::string>& latent, const std::optional<double>& dt,
-              const py::object& columns) { return joint(self, states, view_arguments(view, system, latent, dt), columns); },
+          [](const PyPosterior& self, const py::object& states, const std::string& view, const PySystem* system,
+             const std::optional<std::string>& latent, const std::optional<double>& dt, const py::object& columns) {
+            return joint(self, states, ViewArguments{view, system, latent, dt}, columns);
+          },
           "states"_a, "view"_a = "constrained", py::kw_only(), "system"_a = nullptr, "latent"_a = py::none(), "dt"_a = py::none(),
           "columns"_a = py::none(), "Mean (n d) and covariance (n d, n d) of all states together, state after state.")
       .def(
           "sample",
-          [=](const PyPosterior& self, const py::object& states, int n_samples, std::uint64_t seed, const std::string& view,
-              const PySystem* system, const std::optional<std::string>& latent, const std::optional<double>& dt,
-              const py::object& columns) {
-            return sample(self, states, n_samples, seed, view_arguments(view, system, latent, dt), columns);
+          [](const PyPosterior& self, const py::object& states, int n_samples, std::uint64_t seed, const std::string& view,
+             const PySystem* system, const std::optional<std::string>& latent, const std::optional<double>& dt,
+             const py::object& columns) {
+            return sample(self, states, n_samples, seed, ViewArguments{view, system, latent, dt}, columns);
           },
           "states"_a, "n_samples"_a = 1, "seed"_a = 0, "view"_a = "constrained", py::kw_only(), "system"_a = nullptr,
           "latent"_a = py::none(), "dt"_a = py::none(), "columns"_a = py::none(),
-          "Draws of a view at all states together (n_samples, n, d). Each obeys A ddq = b. Same seed, same samples.")
+          "Draws of a view at all states together (n_samples, n, d). Each obeys A ddq = b. Same seed, same samples.");
+}
+
+/// What takes measured data, or gives them up.
+void define_evaluate_and_update(py::class_<PyPosterior>& posterior) {
+  using namespace py::literals;
+  posterior
       .def("evaluate", &evaluate_posterior, "data"_a, "system"_a = nullptr, "outputs"_a = std::vector<std::string>(),
            "columns"_a = py::none(), "threads"_a = 0, "Compare with measured or true accelerations: the figures of gp2 evaluate.")
       .def("update", &update_with, "data"_a, "observe"_a = std::vector<std::string>(), "noise_std"_a = py::none(),
@@ -568,15 +590,14 @@ Raises InputError for states that are not finite where they are read, or contrad
       .def(
           "without_data",
           [](const PyPosterior& self) {
-            return PyPosterior{self.file, self.posterior.without_data(), {}, self.mechanics};
+            return PyPosterior{self.file, self.posterior.without_data(), {}};
           },
-          "The prior under the same hyperparameters.")
-      .def("__repr__", [](const PyPosterior& self) { return fmt::format("<gp2.Posterior of '{}'>", self.system().name()); });
+          "The prior under the same hyperparameters.");
+}
 
-  module.def("load", &load, "path"_a, "system"_a = nullptr,
-             "Read a FIT.json: a Posterior.\n\nsystem: of System.from_callables, where the fit was of that one; its functions "
-             "are not in the "
-             "file.\n\nRaises InputError naming the file and what is wrong.");
+/// These have their keywords in signatures of our own; the setting for that ends with this function.
+void define_simulate(py::class_<PyPosterior>& posterior, py::module_& module) {
+  using namespace py::literals;
   SimulateRequest motion;
   const std::string motion_options = documentation(options(motion));
   py::options own_signature;
@@ -597,6 +618,30 @@ Returns a Motion, or with n_samples a list of them. Raises NumericalError, with 
       "simulate", &simulate_model, "system"_a, "start"_a, "times"_a, "inputs"_a = py::none(),
       (simulate_documentation("system: System, ") + "\nIntegrate a system by its own force and [truth]. As Posterior.simulate.")
           .c_str());
+}
+
+}  // namespace
+
+void add_posterior(py::module_& module) {
+  // a class comes before the functions that return it, for their signatures to name it
+  add_reports(module);
+  add_prediction(module);
+  add_evaluation(module);
+  add_motion(module);
+
+  using namespace py::literals;
+  py::class_<PyPosterior> posterior(module, "Posterior", "A prior conditioned on data. Made by gp2.fit or gp2.load.");
+  define_files_and_facts(posterior);
+  define_predict(posterior);
+  define_joint_and_sample(posterior);
+  define_evaluate_and_update(posterior);
+  posterior.def("__repr__", [](const PyPosterior& self) { return fmt::format("<gp2.Posterior of '{}'>", self.system().name()); });
+
+  module.def(
+      "load", &load, "path"_a, "system"_a = nullptr,
+      "Read a FIT.json: a Posterior.\n\nsystem: where the fit was of one with Python functions, that one; they are not in the "
+      "file.\n\nRaises InputError naming the file and what is wrong.");
+  define_simulate(posterior, module);
 }
 
 }  // namespace gp2::python

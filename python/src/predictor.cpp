@@ -12,14 +12,14 @@ namespace gp2::python {
 
 namespace {
 
-/// A predictor and the memory of its caller. Python threads take turns, unless mechanics that are Python functions let go of the
+/// A predictor and the memory of its caller. Python threads take turns, unless Python functions of the model let go of the
 /// interpreter's lock: then each call has its own memory.
 class PyPredictor {
  public:
   PyPredictor(const PyPosterior& posterior, const View& view, const Predictor::Options& options)
       : predictor_(posterior.posterior, view, options),
         workspace_(predictor_.make_workspace()),
-        mechanics_are_code_(posterior.file.model.mechanics_are_code),
+        model_has_code_(posterior.file.model.code),
         size_(posterior.system().layout().size()) {}
 
   py::array_t<double> mean(const py::object& state) {
@@ -67,7 +67,7 @@ class PyPredictor {
 
   template <typename Call>
   void require(const Call& call) {
-    if (!mechanics_are_code_) return require_ok(call(workspace_));
+    if (!model_has_code_) return require_ok(call(workspace_));
     Predictor::Workspace own = predictor_.make_workspace();
     require_ok(call(own));
   }
@@ -95,7 +95,7 @@ class PyPredictor {
 
   Predictor predictor_;
   Predictor::Workspace workspace_;
-  bool mechanics_are_code_ = false;
+  bool model_has_code_ = false;
   Eigen::Index size_ = 0;
 };
 

@@ -12,6 +12,7 @@
 #include "gp2/jobs/fit_problem.hpp"
 #include "gp2/jobs/generate_job.hpp"
 #include "gp2/jobs/resample.hpp"
+#include "gp2/jobs/show_job.hpp"
 #include "options.hpp"
 
 namespace gp2::python {
@@ -63,6 +64,12 @@ CsvTable generate_table(const PySystem& self, int n, std::uint64_t seed, std::op
                         const std::map<std::string, int>& grid) {
   const GeneratedData data = generate(*self.model, GenerateRequest{n, grid, seed, noise_stddev});
   return as_table(data, self.system(), fmt::format("data of '{}'", self.system().name()));
+}
+
+std::string show_system(const PySystem& self, const py::kwargs& keywords) {
+  ShowRequest asked;
+  read_keywords("show", keywords, options(asked));
+  return show(*self.model, asked);
 }
 
 CsvTable resample_table(const PySystem& self, const py::object& data, int n, const py::kwargs& keywords) {
@@ -195,7 +202,9 @@ Eigen::Map<const Eigen::MatrixXd> States::matrix() const {
   return {read_.data(), read_.rows(), read_.cols()};
 }
 
-void add_system(py::module_& module) {
+namespace {
+
+void add_mechanics_and_finding(py::module_& module) {
   py::class_<Mechanics>(module, "Mechanics", "M(q,t) ddq = F + constraint forces, subject to A ddq = b, at n states.")
       .def_readonly("M", &Mechanics::M, "Mass matrix (n, nq, nq).")
       .def_readonly("A", &Mechanics::A, "Constraint matrix (n, nc, nq).")
@@ -207,32 +216,10 @@ void add_system(py::module_& module) {
           "level", [](const Finding& finding) { return word(finding.level); }, "'ok', 'warning' or 'error'.")
       .def_readonly("text", &Finding::text)
       .def("__repr__", [](const Finding& finding) { return fmt::format("{}: {}", word(finding.level), finding.text); });
+}
 
-  py::class_<PySystem> system(module, "System", R"(A constrained mechanical system and its prior.
-
-System.load("surface.toml") reads a model file; System(coordinates=…, mass=…, …) takes the same from strings and numbers:
-
-    gp2.System(
-        coordinates=["x", "z"],                  # or {"name": "q1", "angle": True}
-        inputs=["push"],
-        parameters={"m": 0.2, "h": {"value": 0.5, "bounds": [0.3, 0.7], "estimate": True}},
-        mass=[["m", "0"], ["0", "m"]],
-        force=["push", "-9.81*m"],               # the known part of the applied force
-        constraints=["z - h*x^2"],               # = 0; or {"position": […], "velocity": […], "acceleration": […]}
-        latents=[{"features": ["x", "dx"]}],     # the unknown; default: one on the acceleration, of the whole state
-        noise=0.05,                              # standard deviation of a measured ddq
-    )
-
-Further keywords: name, let, potential, truth, sampling, motion, columns. Each is the table of that name in a model file.
-With robot="arm.xml" (MJCF or URDF) coordinates are its joints unless given, and mass is its own; docs/robots.md.
-
-Raises InputError with the key, the rule, the value got and the mend.)");
-  add_callables(system);
+void define_model_files(py::class_<PySystem>& system) {
   system
-      .def(py::init([](const py::kwargs& kwargs) {
-        const py::object text = py::module_::import("gp2._model_text").attr("model_text")(**kwargs);
-        return PySystem{std::make_shared<const Model>(Model::parse(text.cast<std::string>(), "System(…)"))};
-      }))
       .def_static(
           "load",
           [](const py::object& path) { return PySystem{std::make_shared<const Model>(Model::read(path_argument(path)))}; },
@@ -249,8 +236,11 @@ Raises InputError with the key, the rule, the value got and the mend.)");
       .def_property_readonly(
           "robot",
           [](const PySystem& self) { return self.model->robot ? std::optional(to_json(*self.model->robot)) : std::nullopt; },
-          "The robot of the model as JSON text; None without one.")
-      .def_property_readonly("name", [](const PySystem& self) { return self.system().name(); })
+          "The robot of the model as JSON text; None without one.");
+}
+
+void define_names_and_parameters(py::class_<PySystem>& system) {
+  system.def_property_readonly("name", [](const PySystem& self) { return self.system().name(); })
       .def_property_readonly(
           "text", [](const PySystem& self) { return self.model->text; }, "The model file's text.")
       .def_property_readonly("coordinates", [](const PySystem& self) { return coordinate_names(self.system()); })
@@ -264,7 +254,12 @@ Raises InputError with the key, the rule, the value got and the mend.)");
           "Columns of an array of states: q, dq, t, u.")
       .def_property_readonly(
           "acceleration_names", [](const PySystem& self) { return self.system().acceleration_names(); },
-          "Columns of an array of accelerations: ddq.")
+          "Columns of an array of accelerations: ddq.");
+}
+
+/// Values at states, and tables of them.
+void define_evaluate_and_generate(py::class_<PySystem>& system) {
+  system
       .def("evaluate", &evaluate, py::arg("states"), py::arg("parameters") = py::dict(),
            "M, A, b, F at states (n, len(state_names)), with parameters by name where they are not the model's own.")
       .def(
@@ -286,19 +281,22 @@ Raises InputError with the key, the rule, the value got and the mend.)");
             return to_rows(read_whole_log(*self.model, reader).states);
           },
           py::arg("data"), py::arg("columns") = py::none(),
-          "States (n, len(state_names)) of a table by its column names. What the model does not read may be missing: NaN.")
-      .def("__repr__", [](const PySystem& self) {
-        return fmt::format("<gp2.System '{}': coordinates {}; {} constraints>", self.system().name(),
-                           fmt::join(coordinate_names(self.system()), ", "), self.system().nc());
-      });
+          "States (n, len(state_names)) of a table by its column names. What the model does not read may be missing: NaN.");
+}
 
-  module.def("check", &check_system_and_log, py::arg("system"), py::arg("data") = py::none(), py::arg("columns") = py::none(),
-             "Is a system well-posed, and does a log fit it? A list of Finding: rank, definiteness, derivatives; data on the\n"
-             "constraint, dependent columns. Without data at states drawn from the model's [sampling].");
+/// These have their keywords in signatures of our own; the setting for that ends with this function.
+void define_show_derive_and_resample(py::module_& module) {
+  ShowRequest of_show;
   DeriveOptions of_derive;
   ResampleOptions of_resample;
   py::options own_signature;
   own_signature.disable_function_signatures();
+  module.def("show", &show_system, py::arg("system"),
+             (signature("show", "system: System, *,", options(of_show), "", "str") + R"(
+M, F, the constraints with the A and b derived from them, the parameters and the latents, as text to print.
+
+)" + documentation(options(of_show)))
+                 .c_str());
   module.def(
       "derive", &derive_table, py::arg("system"), py::arg("data"),
       (signature("derive", "system: System, data: object, *,", options(of_derive), "", "tuple[Table, dict[str, Any]]") + R"(
@@ -316,6 +314,56 @@ seed, a random one. Rows without a number in some feature are left out.
 
 )" + documentation(options(of_resample)))
                  .c_str());
+}
+
+}  // namespace
+
+void add_system(py::module_& module) {
+  // a class comes before the functions that return it, for their signatures to name it
+  add_mechanics_and_finding(module);
+
+  py::class_<PySystem> system(module, "System", R"(A constrained mechanical system and its prior.
+
+System.load("surface.toml") reads a model file; System(coordinates=…, mass=…, …) takes the same from strings and numbers:
+
+    gp2.System(
+        coordinates=["x", "z"],                  # or {"name": "q1", "angle": True}
+        inputs=["push"],
+        parameters={"m": 0.2, "h": {"value": 0.5, "bounds": [0.3, 0.7], "estimate": True}},
+        mass=[["m", "0"], ["0", "m"]],
+        force=["push", "-9.81*m"],               # the known part of the applied force
+        constraints=["z - h*x^2"],               # = 0; or {"position": […], "velocity": […], "acceleration": […]}
+        latents=[{"features": ["x", "dx"]}],     # the unknown; default: one on the acceleration, of the whole state
+        noise=0.05,                              # standard deviation of a measured ddq
+    )
+
+Further keywords: name, let, potential, truth, sampling, motion, columns. Each is the table of that name in a model file.
+Features and directions of a latent may be functions, of a contact Jacobian say:
+
+    {"name": "contact",
+     "features": {"names": ["slip"], "function": slip},      # slip(states) -> (n, 1)
+     "directions": {"force": {"names": ["tangent"], "function": tangent}}}
+
+tangent(states, parameters) -> (n, nq, 1), parameters {name: value}. A function may have "reads", the names of the entries of a
+state that it reads (default: all), and one of directions "derivatives": f(states, parameters, name), in one parameter, exact
+(default: central differences). A fit is saved without them: gp2.load(path, system=this).
+
+With robot="arm.xml" (MJCF or URDF) coordinates are its joints unless given, and mass is its own; docs/robots.md.
+
+Raises InputError with the key, the rule, the value got and the mend.)");
+  add_callables(system);
+  define_model_files(system);
+  define_names_and_parameters(system);
+  define_evaluate_and_generate(system);
+  system.def("__repr__", [](const PySystem& self) {
+    return fmt::format("<gp2.System '{}': coordinates {}; {} constraints>", self.system().name(),
+                       fmt::join(coordinate_names(self.system()), ", "), self.system().nc());
+  });
+
+  module.def("check", &check_system_and_log, py::arg("system"), py::arg("data") = py::none(), py::arg("columns") = py::none(),
+             "Is a system well-posed, and does a log fit it? A list of Finding: rank, definiteness, derivatives; data on the\n"
+             "constraint, dependent columns. Without data at states drawn from the model's [sampling].");
+  define_show_derive_and_resample(module);
 }
 
 }  // namespace gp2::python

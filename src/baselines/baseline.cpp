@@ -12,19 +12,6 @@ using Eigen::MatrixXd;
 using Eigen::VectorXd;
 using Kind = Hyperparameter::Kind;
 
-const std::vector<std::string>& Baseline::words() {
-  static const std::vector<std::string> words = {"se", "icm", "lmc"};
-  return words;
-}
-
-std::string Baseline::word(Kind kind) { return words()[static_cast<std::size_t>(kind)]; }
-
-std::optional<Baseline::Kind> Baseline::kind_of(std::string_view word) {
-  const auto found = std::find(words().begin(), words().end(), word);
-  if (found == words().end()) return std::nullopt;
-  return static_cast<Kind>(found - words().begin());
-}
-
 namespace {
 
 // a measured quantity over all observations, one column per sample

@@ -4,13 +4,27 @@
 
 #include "gp2/baselines/baseline.hpp"
 #include "gp2/error.hpp"
-#include "model/latent_tapes.hpp"
 #include "model/other_system.hpp"
+#include "model/prior_words.hpp"
+#include "prior/expression_function.hpp"
 #include "symbolic/graph.hpp"
 
 namespace gp2 {
 
 using Eigen::Index;
+
+const std::vector<std::string>& Baseline::words() {
+  static const std::vector<std::string> words = {"se", "icm", "lmc"};
+  return words;
+}
+
+std::string Baseline::word(Kind kind) { return words()[static_cast<std::size_t>(kind)]; }
+
+std::optional<Baseline::Kind> Baseline::kind_of(std::string_view word) {
+  const auto found = std::find(words().begin(), words().end(), word);
+  if (found == words().end()) return std::nullopt;
+  return static_cast<Kind>(found - words().begin());
+}
 
 namespace {
 
@@ -22,21 +36,20 @@ void require_size(const Eigen::VectorXd& values, std::size_t size, const char* w
 
 // what a baseline's latents are made of: the features of the model's latents, each once
 struct Parts {
-  SystemSymbols symbols;
+  PriorWords words;
   std::vector<std::string> names;
   std::vector<Expression> raw;
 
-  explicit Parts(const Model& model) : symbols(model.symbols()) {
-    ExpressionGraph& graph = *model.graph;
-    std::map<std::string, Expression> parameter_values;
-    for (const Parameter& parameter : model.system->parameters()) {
-      parameter_values.emplace(parameter.name, graph.constant(parameter.value));
-    }
-    for (const Model::LatentText& latent : model.latents) {
+  explicit Parts(const Model& model) : words(prior_words(model)) {
+    for (const LatentSpec& latent : model.latents) {
+      if (latent.feature_code) {
+        throw InputError(fmt::format("{}: a baseline needs features as expressions, but those of the latent '{}' are code",
+                                     model.name, latent.name));
+      }
       for (const std::string& feature : latent.features) {
         if (std::find(names.begin(), names.end(), feature) != names.end()) continue;
         names.push_back(feature);
-        raw.push_back(graph.substitute(model.expression(feature), parameter_values));
+        raw.push_back(words.with_values(words.parse(feature), *model.system));
       }
     }
   }
@@ -45,7 +58,7 @@ struct Parts {
     Latent latent;
     latent.name = std::move(name);
     latent.feature_names = names;
-    set_features(latent, features, symbols);
+    latent.features = ExpressionFunction::of_state(features, words.symbols);
     latent.kernel = Kernel::parse(kernel, latent.feature_names);
     return latent;
   }
@@ -77,10 +90,8 @@ Prior make_baseline_prior(const Model& model, const Baseline& baseline) {
       Latent latent = parts.latent(output, "se", parts.raw);
       latent.column_names = {output};
       std::vector<Expression> unit(n_outputs, graph.constant(0));
-      const Tape zero(unit, parts.symbols.state_and_parameters());
-      latent.direction_derivatives.assign(system.parameters().size(), zero);
       unit[j] = graph.constant(1);
-      set_directions(latent, unit, parts.symbols);
+      latent.directions = ExpressionFunction::of_state_and_parameters(unit, parts.words.symbols, graph);
       prior.latents.push_back(std::move(latent));
     }
     return prior;

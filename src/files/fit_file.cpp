@@ -305,38 +305,38 @@ void locate_in_model(std::vector<Hyperparameter>& hyperparameters, const Prior& 
       fmt::format("{} {} of latent '{}' has no value", kind, index + 1, prior.latents[static_cast<std::size_t>(owner)].name));
 }
 
-constexpr const char* code = "code";
+constexpr const char* left_to_code = "code";
 
 Json model_json(const Model& model) {
   Json json = {{"name", model.name}, {"text", model.text}};
-  if (model.mechanics_are_code) json["mechanics"] = code;
+  if (model.code.mechanics) json["mechanics"] = left_to_code;
+  if (!model.code.latents.empty()) json["latents"] = left_to_code;
   if (model.robot) json["robot"] = Json::parse(to_json(*model.robot));
   return json;
 }
 
-bool mechanics_are_code(const ParsedJson& model) {
-  if (!model.contains("mechanics")) return false;
-  if (model.at("mechanics") != code) throw InputError(fmt::format("mechanics as {} are not known", shown(model.at("mechanics"))));
+bool is_code(const ParsedJson& model, const char* part) {
+  if (!model.contains(part)) return false;
+  if (model.at(part) != left_to_code) throw InputError(fmt::format("{} as {} are not known", part, shown(model.at(part))));
   return true;
 }
 
-/// @param mechanics  null: not given
-Model model_from(const ParsedJson& json, const MechanicsSource* mechanics) {
-  if (!mechanics_are_code(json)) {
-    // a fit is whole in itself: its text must not make it read other files
-    const RobotSource robot = [&](const std::string& file) {
-      if (!json.contains("robot")) throw InputError(fmt::format("the fit does not hold the robot of '{}'", file));
-      return robot_from_json(json.at("robot").dump());
-    };
-    return Model::parse(json.at("text"), json.at("name"), robot);
-  }
-  if (mechanics == nullptr) {
+Model model_from(const ParsedJson& json, const ModelCode& given) {
+  const bool mechanics = is_code(json, "mechanics"), latents = is_code(json, "latents");
+  if ((mechanics && !given.mechanics) || (latents && given.latents.empty())) {
     throw InputError(
-        fmt::format("the mechanics of its model '{}' are code, which a file cannot hold: read it where that code is, with "
-                    "FitFile::read(path, mechanics)",
-                    json.at("name").get<std::string>()));
+        fmt::format("the {} of its model '{}' are code, which a file cannot hold: read it where that code is, with "
+                    "FitFile::read(path, code)",
+                    mechanics && !given.mechanics ? "mechanics" : "latents", json.at("name").get<std::string>()));
   }
-  return Model::parse(json.at("text"), json.at("name"), *mechanics);
+  if (mechanics)
+    return Model::parse(json.at("text"), json.at("name"), {given.mechanics, latents ? given.latents : decltype(given.latents)()});
+  // a fit is whole in itself: its text must not make it read other files
+  const RobotSource robot = [&](const std::string& file) {
+    if (!json.contains("robot")) throw InputError(fmt::format("the fit does not hold the robot of '{}'", file));
+    return robot_from_json(json.at("robot").dump());
+  };
+  return Model::parse(json.at("text"), json.at("name"), robot, {{}, latents ? given.latents : decltype(given.latents)()});
 }
 
 Json baseline_json(const Baseline& baseline) {
@@ -576,16 +576,15 @@ void require_fit(ParsedJson& json) {
   take_checksum(json);
 }
 
-/// @param path       stands for the file in messages
-/// @param mechanics  null: not given
-FitFile read_fit(std::string_view text, const std::filesystem::path& path, const MechanicsSource* mechanics) {
+/// @param path  stands for the file in messages
+FitFile read_fit(std::string_view text, const std::filesystem::path& path, const ModelCode& code) {
   const internal::StepLimit limit;  // for all its models together
   ParsedJson json = parse_json(text, path);
   FitFile fit;
   try {
     require_fit(json);
-    fit.model = model_from(json.at("model"), mechanics);
-    bool code_is_used = fit.model.mechanics_are_code;
+    fit.model = model_from(json.at("model"), code);
+    bool code_is_used = static_cast<bool>(fit.model.code);
     const ParsedJson& prior_json = json.at("prior");
     fit.prior_options.mean = choice_from(prior_json.at("mean"), means, "prior mean");
     fit.prior_options.base = choice_from(prior_json.at("directions"), directions, "choice of directions");
@@ -603,16 +602,14 @@ FitFile read_fit(std::string_view text, const std::filesystem::path& path, const
       std::shared_ptr<const OtherSystem> other_system;
       std::shared_ptr<const Model>& system = fit.systems.emplace_back();
       if (group.contains("system")) {
-        system = std::make_shared<const Model>(model_from(group.at("system"), mechanics));
-        code_is_used = code_is_used || system->mechanics_are_code;
+        system = std::make_shared<const Model>(model_from(group.at("system"), code));
+        code_is_used = code_is_used || system->code;
         other_system = make_other_system(fit.model, *system, fit.prior_options);
       }
       fit.observations.push_back(observations_from(group, prior, std::move(other_system)));
     }
     if (fit.observations.empty()) throw InputError("no observations");
-    if (mechanics != nullptr && !code_is_used) {
-      throw InputError("mechanics are given as code, but this fit has them as text: read it without");
-    }
+    if (code && !code_is_used) throw InputError("code is given, but this fit is all text: read it without");
     for (const ParsedJson& h : array(json.at("hyperparameters"))) fit.report.hyperparameters.push_back(hyperparameter_from(h));
     locate_in_model(fit.report.hyperparameters, prior, fit.observations);
     const ParsedJson& report = json.at("report");
@@ -636,19 +633,17 @@ FitFile read_fit(std::string_view text, const std::filesystem::path& path, const
 
 }  // namespace
 
-FitFile FitFile::read(const std::filesystem::path& path) { return read_fit(read_file(path), path, nullptr); }
+FitFile FitFile::parse(std::string_view text, const std::string& name) { return read_fit(text, name, {}); }
 
-FitFile FitFile::parse(std::string_view text, const std::string& name) { return read_fit(text, name, nullptr); }
-
-FitFile FitFile::read(const std::filesystem::path& path, const MechanicsSource& mechanics) {
-  return read_fit(read_file(path), path, &mechanics);
-}
+FitFile FitFile::read(const std::filesystem::path& path, const ModelCode& code) { return read_fit(read_file(path), path, code); }
 
 namespace {
 
-// Of a fit whose mechanics are code the hyperparameters alone are read: there is no model to hold them against.
+// Of a fit that needs code the hyperparameters alone are read: there is no model to hold them against.
 std::vector<Hyperparameter> hyperparameters_of(const std::filesystem::path& path, ParsedJson& json) {
-  const bool with_code = json.contains("model") && json.at("model").is_object() && json.at("model").contains("mechanics");
+  const auto model = json.find("model");
+  const bool with_code =
+      model != json.end() && model->is_object() && (model->contains("mechanics") || model->contains("latents"));
   if (!with_code) return FitFile::read(path).report.hyperparameters;
   std::vector<Hyperparameter> hyperparameters;
   try {

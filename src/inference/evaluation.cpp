@@ -1,8 +1,9 @@
 #include "gp2/inference/evaluation.hpp"
 
 #include <cmath>
-#include <limits>
 #include <numbers>
+
+#include "base/not_a_number.hpp"
 
 namespace gp2 {
 
@@ -12,8 +13,6 @@ using Eigen::Ref;
 using Eigen::VectorXd;
 
 namespace {
-
-constexpr double not_a_number = std::numeric_limits<double>::quiet_NaN();
 
 // mean negative log density and share inside ±1.96 σ of Gaussian marginals
 struct Calibration {

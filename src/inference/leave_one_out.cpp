@@ -1,9 +1,9 @@
 #include "gp2/inference/leave_one_out.hpp"
 
 #include <cmath>
-#include <limits>
 
 #include "base/lapack.hpp"
+#include "base/not_a_number.hpp"
 #include "gp2/error.hpp"
 #include "inference/dense_gram.hpp"
 
@@ -25,7 +25,6 @@ std::vector<LeaveOneOut> leave_one_out(const Posterior& posterior) {
   if (!gram.factorise(rows)) throw NumericalError("leave_one_out: the covariance of the observations cannot be factored");
   const Gram::Inverse inverse = gram.invert(rows);
 
-  constexpr double not_a_number = std::numeric_limits<double>::quiet_NaN();
   std::vector<LeaveOneOut> out;
   for (const Observations& group : observations) {
     out.push_back({MatrixXd::Constant(group.values().rows(), group.values().cols(), not_a_number),

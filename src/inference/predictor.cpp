@@ -1,7 +1,6 @@
 #include "gp2/predictor.hpp"
 
 #include <cmath>
-#include <limits>
 #include <optional>
 #include <string_view>
 #include <utility>
@@ -9,6 +8,7 @@
 
 #include <fmt/format.h>
 
+#include "base/not_a_number.hpp"
 #include "gp2/error.hpp"
 #include "gp2/mechanics/state_evaluator.hpp"
 #include "inference/posterior_implementation.hpp"
@@ -78,7 +78,7 @@ struct Predictor::Workspace::Implementation {
   AffineMotion affine_motion;
 
   struct AtState {
-    VectorXd features_tape, directions_tape, dfeatures_tape, ddirections_tape;
+    std::unique_ptr<StateFunction::Evaluator> of_features, of_directions;
     VectorXd features;                // φ (D)
     VectorXd point;                   // scaled
     VectorXd directions;              // B (nq·p), none where B = I
@@ -153,8 +153,6 @@ bool is_finite(const Numbers& numbers) {
   for (const double number : numbers.reshaped()) sum += 0 * number;
   return sum == 0;
 }
-
-constexpr double not_a_number = std::numeric_limits<double>::quiet_NaN();
 
 void check_size(std::string_view what, Index got, Index wanted) {
   if (got != wanted) throw InputError(fmt::format("Predictor: {} is of size {}, got {}", what, wanted, got));
@@ -252,24 +250,18 @@ void Predictor::Workspace::Implementation::reserve_term(const PredictorTerm& ter
   const Latent& latent = predictor->latent(term);
   const Index D = latent.n_features(), p = term.size(), nq = a_bar.size();
   AtState& at = terms.emplace_back();
-  at.features_tape = latent.features.make_workspace(VectorXd());
+  at.of_features = latent.features->make_evaluator(VectorXd());
   at.features.setZero(D);
   at.point.setZero(term.kernel.n_scaled());
   at.signal.setZero(p);
   at.dsignal.setZero(D, p);
   at.E_dsignal.setZero(nq, D);
   loadings.emplace_back(MatrixXd::Zero(term.n_functions(), predictor->view.size()));
-  if (!latent.directions_are_identity) {
-    at.directions_tape = latent.directions.make_workspace(predictor->parameters);
-    at.directions.setZero(nq * p);
-  }
-  if (!predictor->options.jacobian) return;
-  at.dfeatures_tape = latent.feature_state_derivatives.tape.make_workspace(VectorXd());
-  at.dfeatures.setZero(static_cast<Index>(latent.feature_state_derivatives.entries.size()));
-  if (!latent.directions_are_identity) {
-    at.ddirections_tape = latent.direction_state_derivatives.tape.make_workspace(predictor->parameters);
-    at.ddirections.setZero(static_cast<Index>(latent.direction_state_derivatives.entries.size()));
-  }
+  at.dfeatures.setZero(static_cast<Index>(at.of_features->entries().size()));
+  if (!latent.directions) return;
+  at.of_directions = latent.directions->make_evaluator(predictor->parameters);
+  at.directions.setZero(nq * p);
+  at.ddirections.setZero(static_cast<Index>(at.of_directions->entries().size()));
 }
 
 // ---------------------------------------------------------------- mean
@@ -322,11 +314,11 @@ Status Predictor::Implementation::evaluate_prior(const Ref<const VectorXd>& stat
       const PredictorTerm& term = terms[a];
       const Latent& of = latent(term);
       Workspace::Implementation::AtState& here = w.terms[a];
-      of.features.evaluate_at(state, here.features_tape, here.features);
+      here.of_features->evaluate(state, here.features);
       all_features = all_features && is_finite(here.features);
       term.kernel.scale(here.features, here.point);
       data.evaluate_signal(term, a, here.point, memory, here.signal);
-      if (!of.directions_are_identity) of.directions.evaluate_at(state, here.directions_tape, here.directions);
+      if (here.of_directions) here.of_directions->evaluate(state, here.directions);
       add_product(here.directions, here.signal, of.base == Latent::Base::force ? w.force : w.a_bar);
     }
   });
@@ -443,17 +435,17 @@ void Predictor::Implementation::differentiate_prior(const Ref<const VectorXd>& s
       here.E_dsignal.noalias() =
           Map<const MatrixXd>(here.directions.data(), nq, term.size()).lazyProduct(here.dsignal.transpose());
     }
-    of.feature_state_derivatives.tape.evaluate_at(state, here.dfeatures_tape, here.dfeatures);
-    for (std::size_t e = 0; e < of.feature_state_derivatives.entries.size(); ++e) {
-      const StateDerivatives::Entry& entry = of.feature_state_derivatives.entries[e];
+    here.of_features->differentiate(state, here.dfeatures);
+    for (std::size_t e = 0; e < here.of_features->entries().size(); ++e) {
+      const StateDerivatives::Entry& entry = here.of_features->entries()[e];
       const double value = here.dfeatures[static_cast<Index>(e)];
       for (Index i = 0; i < nq; ++i) sum(i, entry.state_index) += here.E_dsignal(i, entry.output) * value;
     }
     // dB C g
-    if (of.directions_are_identity) continue;
-    of.direction_state_derivatives.tape.evaluate_at(state, here.ddirections_tape, here.ddirections);
-    for (std::size_t e = 0; e < of.direction_state_derivatives.entries.size(); ++e) {
-      const StateDerivatives::Entry& entry = of.direction_state_derivatives.entries[e];
+    if (!here.of_directions) continue;
+    here.of_directions->differentiate(state, here.ddirections);
+    for (std::size_t e = 0; e < here.of_directions->entries().size(); ++e) {
+      const StateDerivatives::Entry& entry = here.of_directions->entries()[e];
       sum(entry.output % nq, entry.state_index) += here.ddirections[static_cast<Index>(e)] * here.signal[entry.output / nq];
     }
   }

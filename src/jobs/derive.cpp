@@ -413,31 +413,47 @@ class Deriver {
 
   // what was not measured, and what the constraints say of what was
   void put_together() {
-    const StateLayout layout = system_.layout();
     const ConstrainedStates states(model_, data_.measured);
     data_.completed = states.completed();
     data_.independent = data_.measured;
-    const Index n = data_.states.cols();
-    if (n == 0) return;
+    if (data_.states.cols() == 0) return;
 
-    VectorXd start = VectorXd::Zero(2 * Index{layout.nq});
+    const VectorXd start = start_of_newton();
+    const int redundancy = redundancy_of(states, started(0, start));
+    std::vector<std::string> completed;
+    for (const int j : data_.completed) completed.push_back(system_.coordinates()[static_cast<std::size_t>(j)].name);
+    note_redundancy(redundancy, completed);
+    const bool conditioned = options_.hold_constraints && redundancy > 0;
+    parallel_for(static_cast<int>(episodes_.size()), thread_count(options_.n_threads),
+                 [&](int e, int) { put_episode_together(states, e, conditioned, start); });
+    if (!completed.empty()) data_.notes.push_back(fmt::format("from the constraints: {}", fmt::join(completed, ", ")));
+    if (conditioned) data_.independent = independent_accelerations(states);
+  }
+
+  /// Where the model file wants the coordinates that are not measured to be sought: q, dq.
+  [[nodiscard]] VectorXd start_of_newton() const {
+    VectorXd start = VectorXd::Zero(2 * Index{system_.nq()});
     const std::vector<std::string> names = system_.state_names();
     for (Index k = 0; k < start.size(); ++k) {
       const auto given = model_.newton_start.find(names[static_cast<std::size_t>(k)]);
       if (given != model_.newton_start.end()) start[k] = given->second;
     }
-    const auto started = [&](Index i, const VectorXd& from) -> VectorXd {
-      VectorXd state = data_.states.col(i);
-      for (const int j : data_.completed) {
-        state[layout.q(j)] = from[j];
-        state[layout.dq(j)] = from[layout.nq + j];
-      }
-      return state;
-    };
+    return start;
+  }
 
-    const int redundancy = redundancy_of(states, started(0, start));
-    std::vector<std::string> completed;
-    for (const int j : data_.completed) completed.push_back(system_.coordinates()[static_cast<std::size_t>(j)].name);
+  /// A row with what is not measured taken from elsewhere.
+  [[nodiscard]] VectorXd started(Index i, const VectorXd& from) const {
+    const StateLayout layout = system_.layout();
+    VectorXd state = data_.states.col(i);
+    for (const int j : data_.completed) {
+      state[layout.q(j)] = from[j];
+      state[layout.dq(j)] = from[layout.nq + j];
+    }
+    return state;
+  }
+
+  /// Says what the constraints mean for measured coordinates alone, and throws where noise would contradict them.
+  void note_redundancy(int redundancy, const std::vector<std::string>& completed) {
     if (redundancy > 0 && !options_.hold_constraints) {
       const std::string fact = fmt::format("{} of the constraints hold{} among the measured coordinates alone", redundancy,
                                            redundancy == 1 ? "s" : "");
@@ -448,46 +464,47 @@ class Deriver {
       }
       data_.notes.push_back(fact + ": `hold_constraints` makes use of that");
     }
-    const bool conditioned = options_.hold_constraints && redundancy > 0;
     if (options_.hold_constraints && redundancy == 0)
       data_.notes.emplace_back("no constraint holds among the measured coordinates alone: there is nothing to hold");
+  }
 
-    // rows of an episode follow one another: each starts at its predecessor
-    parallel_for(static_cast<int>(episodes_.size()), thread_count(options_.n_threads), [&](int e, int) {
-      const Index first = first_row_[static_cast<std::size_t>(e)];
-      const Index last = e + 1 < static_cast<int>(episodes_.size()) ? first_row_[static_cast<std::size_t>(e) + 1] : n;
-      std::vector<const Task*> tasks;
-      for (const Task& task : tasks_) {
-        if (task.episode == e) tasks.push_back(&task);
-      }
-      VectorXd from = start;
-      for (Index i = first; i < last; ++i) {
-        VectorXd state = started(i, from);
-        std::vector<Eigen::Matrix3d> covariance;
-        for (const Task* task : tasks) covariance.push_back(task->motion.covariance[static_cast<std::size_t>(i - first)]);
-        if (conditioned) {
-          states.condition(state, data_.accelerations.col(i), covariance);
-        } else {
-          states.complete(state, data_.accelerations.col(i));
-        }
-        data_.states.col(i) = state;
-        from = state.head(2 * layout.nq);
-        for (std::size_t k = 0; k < tasks.size(); ++k) {
-          for (int d = 0; d < 3; ++d) {
-            data_.stddev(d * layout.nq + tasks[k]->coordinate, i) = std::sqrt(std::max(covariance[k](d, d), 0.0));
-          }
-        }
-      }
-    });
-    if (!completed.empty()) data_.notes.push_back(fmt::format("from the constraints: {}", fmt::join(completed, ", ")));
-    if (conditioned) {
-      VectorXd stddev(static_cast<Index>(data_.measured.size()));
-      for (Index k = 0; k < stddev.size(); ++k) {
-        const auto row = data_.stddev.row(2 * layout.nq + data_.measured[static_cast<std::size_t>(k)]);
-        stddev[k] = std::max(median({row.begin(), row.end()}), std::numeric_limits<double>::min());
-      }
-      data_.independent = states.independent_accelerations(data_.states, stddev);
+  // rows of an episode follow one another: each starts at its predecessor
+  void put_episode_together(const ConstrainedStates& states, int e, bool conditioned, VectorXd from) {
+    const StateLayout layout = system_.layout();
+    const Index first = first_row_[static_cast<std::size_t>(e)];
+    const Index last =
+        e + 1 < static_cast<int>(episodes_.size()) ? first_row_[static_cast<std::size_t>(e) + 1] : data_.states.cols();
+    std::vector<const Task*> tasks;
+    for (const Task& task : tasks_) {
+      if (task.episode == e) tasks.push_back(&task);
     }
+    for (Index i = first; i < last; ++i) {
+      VectorXd state = started(i, from);
+      std::vector<Eigen::Matrix3d> covariance;
+      for (const Task* task : tasks) covariance.push_back(task->motion.covariance[static_cast<std::size_t>(i - first)]);
+      if (conditioned) {
+        states.condition(state, data_.accelerations.col(i), covariance);
+      } else {
+        states.complete(state, data_.accelerations.col(i));
+      }
+      data_.states.col(i) = state;
+      from = state.head(2 * layout.nq);
+      for (std::size_t k = 0; k < tasks.size(); ++k) {
+        for (int d = 0; d < 3; ++d) {
+          data_.stddev(d * layout.nq + tasks[k]->coordinate, i) = std::sqrt(std::max(covariance[k](d, d), 0.0));
+        }
+      }
+    }
+  }
+
+  /// Accelerations that say all others once the constraints hold, by their usual deviations.
+  [[nodiscard]] std::vector<int> independent_accelerations(const ConstrainedStates& states) const {
+    VectorXd stddev(static_cast<Index>(data_.measured.size()));
+    for (Index k = 0; k < stddev.size(); ++k) {
+      const auto row = data_.stddev.row(2 * system_.nq() + data_.measured[static_cast<std::size_t>(k)]);
+      stddev[k] = std::max(median({row.begin(), row.end()}), std::numeric_limits<double>::min());
+    }
+    return states.independent_accelerations(data_.states, stddev);
   }
 
   // a first row that is solved as well as it can be, to look at

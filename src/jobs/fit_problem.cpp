@@ -102,8 +102,8 @@ std::vector<Observations> trusted_observations(const FitProblem& problem) {
 
 bool has_discrepancy(const FitProblem& problem, const FitProblemOptions& options) {
   const bool standard = options.protocol.name == Protocol::Name::standard && options.protocol.hyperprior;
-  return options.discrepancy && standard && problem.prior.latents.size() == 1 &&
-         problem.prior.latents.front().directions_are_identity && !has_singular_mass(problem);
+  return options.discrepancy && standard && problem.prior.latents.size() == 1 && !problem.prior.latents.front().directions &&
+         !has_singular_mass(problem);
 }
 
 // a share of the noise, as the fit starts with it, in each acceleration; where one is not measured, of its spread the same share
@@ -221,15 +221,18 @@ Fit fit(const FitProblem& problem, const FitOptions& options) {
                   : fit(problem.prior, problem.observations, problem.hyperparameters, options);
 }
 
-FitProblem make_fit_problem(const Model& model, const std::vector<Log>& logs, const std::vector<SideInformation>& also,
-                            const FitProblemOptions& options) {
-  if (options.baseline) {
-    require_baseline_options(options, logs, also);
-    std::vector<const CsvTable*> tables;
-    for (const Log& log : logs) tables.push_back(&log.table);
-    check_columns(*model.system, tables, options.columns);
-    return make_baseline_problem(model, logs, options);
-  }
+namespace {
+
+void require_columns(const Model& model, const std::vector<Log>& logs, const std::vector<SideInformation>& also,
+                     const FitProblemOptions& options) {
+  std::vector<const CsvTable*> tables;
+  for (const Log& log : logs) tables.push_back(&log.table);
+  for (const SideInformation& side_information : also) tables.push_back(&side_information.log.table);
+  check_columns(*model.system, tables, options.columns);
+}
+
+// a problem without observations, and its prior
+FitProblem start_problem(const Model& model, const FitProblemOptions& options) {
   const bool paper = options.protocol.name == Protocol::Name::paper;
   if (paper && options.estimate_noise) throw InputError("`protocol=paper` has fixed noise: leave out `noise_std=estimate`");
   if (paper && options.base == Latent::Base::force) {
@@ -241,49 +244,65 @@ FitProblem make_fit_problem(const Model& model, const std::vector<Log>& logs, co
   problem.prior_options.base = paper ? std::optional(Latent::Base::acceleration) : options.base;
   problem.prior_options.raw_angles = paper;
   problem.prior = make_prior(model, problem.prior_options);
-  std::vector<const CsvTable*> tables;
-  for (const Log& log : logs) tables.push_back(&log.table);
-  for (const SideInformation& side_information : also) tables.push_back(&side_information.log.table);
-  check_columns(*model.system, tables, options.columns);
+  return problem;
+}
 
-  const std::vector<std::string> estimate = estimated_parameters(*model.system, options);
+// the system of a log that is read next
+LoggedSystem add_system(const Model& model, const Log& log, const std::vector<std::string>& estimated, FitProblem& problem) {
+  LoggedSystem logged = logged_system(model, problem.prior, problem.prior_options, log);
+  note_parameters(model, logged, estimated, problem.notes);
+  problem.systems.push_back(logged.other);
+  return logged;
+}
 
-  // what is measured
-  const auto logged_at = [&](const Log& log) {
-    LoggedSystem logged = logged_system(model, problem.prior, problem.prior_options, log);
-    note_parameters(model, logged, estimate, problem.notes);
-    problem.systems.push_back(logged.other);
-    return logged;
-  };
-  for (const Log& log : logs) {
-    problem.observations.push_back(read_log(logged_at(log), log, options, problem.lines.emplace_back(), problem.notes));
-  }
-
-  // what else is known; its noise is judged by the size of the measured signals
+// what else is known; its noise is judged by the size of the measured signals
+void add_side_information(const Model& model, const std::vector<SideInformation>& also, const FitProblemOptions& options,
+                          const std::vector<std::string>& estimated, FitProblem& problem) {
   const bool needs_step = std::any_of(also.begin(), also.end(), [](const SideInformation& side_information) {
     return side_information.quantity->needs_time_step();
   });
   if (options.time_step && !needs_step) throw InputError("`dt` goes with `also=next-velocity:FILE.csv`");
   if (options.also_noise_stddev && also.empty()) throw InputError("`also_noise_std` goes with `also=VIEW:FILE.csv`");
-  if (!also.empty()) {
-    const std::vector<VectorXd> signal_stddev = default_scales(problem.prior, trusted_observations(problem)).signal_stddev;
-    for (const SideInformation& side_information : also) {
-      const LoggedSystem logged = logged_at(side_information.log);
-      problem.observations.push_back(read_side_information(logged, problem.prior, side_information, options, signal_stddev,
-                                                           problem.lines.emplace_back(), problem.notes));
-    }
+  if (also.empty()) return;
+  const std::vector<VectorXd> signal_stddev = default_scales(problem.prior, trusted_observations(problem)).signal_stddev;
+  for (const SideInformation& side_information : also) {
+    const LoggedSystem logged = add_system(model, side_information.log, estimated, problem);
+    problem.observations.push_back(read_side_information(logged, problem.prior, side_information, options, signal_stddev,
+                                                         problem.lines.emplace_back(), problem.notes));
   }
-  if (has_discrepancy(problem, options)) {
-    problem.prior_options.discrepancy = discrepancy_of(problem);
-    problem.prior = make_prior(model, problem.prior_options);
-    for (std::size_t g = 0; g < problem.observations.size(); ++g) {
-      const std::shared_ptr<const Model>& other = problem.systems[g];
-      if (!other) continue;
-      View view = problem.observations[g].view();
-      view.other_system = make_other_system(model, *other, problem.prior_options);
-      problem.observations[g] = problem.observations[g].with_view(std::move(view));
-    }
+}
+
+// a discrepancy is part of the prior, and of that on every other system
+void add_discrepancy(const Model& model, FitProblem& problem) {
+  problem.prior_options.discrepancy = discrepancy_of(problem);
+  problem.prior = make_prior(model, problem.prior_options);
+  for (std::size_t g = 0; g < problem.observations.size(); ++g) {
+    const std::shared_ptr<const Model>& other = problem.systems[g];
+    if (!other) continue;
+    View view = problem.observations[g].view();
+    view.other_system = make_other_system(model, *other, problem.prior_options);
+    problem.observations[g] = problem.observations[g].with_view(std::move(view));
   }
+}
+
+}  // namespace
+
+FitProblem make_fit_problem(const Model& model, const std::vector<Log>& logs, const std::vector<SideInformation>& also,
+                            const FitProblemOptions& options) {
+  if (options.baseline) {
+    require_baseline_options(options, logs, also);
+    require_columns(model, logs, {}, options);
+    return make_baseline_problem(model, logs, options);
+  }
+  FitProblem problem = start_problem(model, options);
+  require_columns(model, logs, also, options);
+  const std::vector<std::string> estimated = estimated_parameters(*model.system, options);
+  for (const Log& log : logs) {
+    problem.observations.push_back(
+        read_log(add_system(model, log, estimated, problem), log, options, problem.lines.emplace_back(), problem.notes));
+  }
+  add_side_information(model, also, options, estimated, problem);
+  if (has_discrepancy(problem, options)) add_discrepancy(model, problem);
   problem.hyperparameters = starting_hyperparameters(problem, options);
   return problem;
 }

@@ -76,9 +76,9 @@ bool read_value(const Json& json, const OptionValue& value) {
                           return json.is_array();
                         },
                         [&](NamedNumbers* one) {
-                          for (const auto& [name, number] : json.items()) {
-                            if (!number.is_number()) return false;
-                            one->values[name] = number.get<double>();
+                          for (const auto& [name, entry] : json.items()) {
+                            if (!entry.is_number()) return false;
+                            one->values[name] = entry.get<double>();
                           }
                           return json.is_object();
                         },

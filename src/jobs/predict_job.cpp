@@ -15,9 +15,7 @@ using Eigen::Index;
 using Eigen::MatrixXd;
 
 // Text that is the same is the same system; functions cannot be compared, but the system that they made can.
-bool is_same(const Model& a, const Model& b) {
-  return a.system == b.system || (!a.mechanics_are_code && !b.mechanics_are_code && a.text == b.text);
-}
+bool is_same(const Model& a, const Model& b) { return a.system == b.system || (!a.code && !b.code && a.text == b.text); }
 
 void set_time_step(View& view, const std::optional<double>& time_step) {
   const bool needs_step = view.quantity->needs_time_step();

@@ -13,6 +13,7 @@
 #include <fmt/ranges.h>
 #include <nlohmann/json.hpp>
 
+#include "base/not_a_number.hpp"
 #include "gp2/error.hpp"
 #include "gp2/jobs/fit_problem.hpp"
 #include "gp2/simulation/generate.hpp"
@@ -25,8 +26,6 @@ using Eigen::Ref;
 using Eigen::VectorXd;
 
 namespace {
-
-constexpr double not_a_number = std::numeric_limits<double>::quiet_NaN();
 
 // the day a file was written, in UTC
 std::string date_of(const std::filesystem::path& path) {
@@ -266,9 +265,10 @@ MatrixXd coverage(const ReportData& data, const Ref<const VectorXd>& levels) {
   return share;
 }
 
-std::optional<ConstraintSurface> constraint_surface(const SymbolicSystem& system, const Ref<const VectorXd>& parameters,
-                                                    const Ref<const MatrixXd>& states) {
-  if (system.nq() != 3 || states.cols() < 2 || states.topRows(3).hasNaN()) return std::nullopt;
+namespace {
+
+// of the only position constraint, where it does not move with time; none: the constraints are no surface
+std::optional<int> surface_row(const SymbolicSystem& system) {
   int row = -1;
   const std::vector<ConstraintRow>& constraints = system.definition().constraints;
   for (std::size_t k = 0; k < constraints.size(); ++k) {
@@ -280,31 +280,31 @@ std::optional<ConstraintSurface> constraint_surface(const SymbolicSystem& system
   const Expression c = constraints[static_cast<std::size_t>(row)].residuals.front();
   const std::vector<std::string> read = c.graph().variables_of(c);
   if (std::find(read.begin(), read.end(), "t") != read.end()) return std::nullopt;
-  const std::vector<System::Residual>& labels = system.residual_labels();
-  const auto label = std::find_if(labels.begin(), labels.end(), [&](const auto& one) { return one.row == row && !one.velocity; });
+  return row;
+}
 
-  // solve for the coordinate in which c is never flat over the data: A's row is ∂c/∂q
-  const SystemValues values = system.evaluate(states, parameters);
+// the coordinate in which c is never flat over the data: A's row is ∂c/∂q
+int steepest_coordinate(const SystemValues& values, int row) {
   Eigen::Vector3d steepness = Eigen::Vector3d::Constant(std::numeric_limits<double>::infinity());
   for (int i = 0; i < values.n_states(); ++i) {
     const Eigen::Vector3d slope = values.A(i).row(row).cwiseAbs().transpose();
     steepness = steepness.cwiseMin(slope / std::max(slope.maxCoeff(), std::numeric_limits<double>::min()));
   }
-  ConstraintSurface surface;
-  steepness.maxCoeff(&surface.solved);
-  surface.first = surface.solved == 0 ? 1 : 0;
-  surface.second = surface.solved == 2 ? 1 : 2;
+  int steepest = 0;
+  steepness.maxCoeff(&steepest);
+  return steepest;
+}
 
-  constexpr Index n_grid = 25, n_scan = 41;
-  const auto range = [&](int coordinate, double margin, Index n) -> VectorXd {
-    const double low = states.row(coordinate).minCoeff(), high = states.row(coordinate).maxCoeff();
-    const double pad = margin * std::max(high - low, 1e-9 * std::abs(high) + 1e-300);
-    return VectorXd::LinSpaced(n, low - pad, high + pad);
-  };
-  surface.first_grid = range(surface.first, 0.08, n_grid);
-  surface.second_grid = range(surface.second, 0.08, n_grid);
-  const VectorXd scan = range(surface.solved, 0.6, n_scan);
-  MatrixXd probes = MatrixXd::Zero(system.layout().size(), n_grid * n_grid * n_scan);
+// n values from below the data to above
+VectorXd range_of(const Ref<const MatrixXd>& states, int coordinate, double margin, Index n) {
+  const double low = states.row(coordinate).minCoeff(), high = states.row(coordinate).maxCoeff();
+  const double pad = margin * std::max(high - low, 1e-9 * std::abs(high) + 1e-300);
+  return VectorXd::LinSpaced(n, low - pad, high + pad);
+}
+
+// states at each point of the grid, one after another along `scan`
+MatrixXd probe_states(const ConstraintSurface& surface, const VectorXd& scan, Index n_entries) {
+  MatrixXd probes = MatrixXd::Zero(n_entries, surface.first_grid.size() * surface.second_grid.size() * scan.size());
   Index column = 0;
   for (const double first : surface.first_grid) {
     for (const double second : surface.second_grid) {
@@ -315,22 +315,50 @@ std::optional<ConstraintSurface> constraint_surface(const SymbolicSystem& system
       }
     }
   }
-  const Eigen::RowVectorXd residual = system.residuals(probes, parameters).row(label - labels.begin());
+  return probes;
+}
 
-  // every change of sign is a point of the surface; the straight line between its ends is exact where c is linear in the
-  // coordinate
-  for (Index i = 0; i < n_grid; ++i) {
-    for (Index j = 0; j < n_grid; ++j) {
+// every change of sign is a point of the surface; the straight line between its ends is exact where c is linear in the
+// coordinate
+void add_sheets(const Eigen::RowVectorXd& residual, const VectorXd& scan, ConstraintSurface& surface) {
+  const Index n_first = surface.first_grid.size(), n_second = surface.second_grid.size(), n_scan = scan.size();
+  for (Index i = 0; i < n_first; ++i) {
+    for (Index j = 0; j < n_second; ++j) {
       std::size_t sheet = 0;
-      const Index first = (i * n_grid + j) * n_scan;
+      const Index first = (i * n_second + j) * n_scan;
       for (Index s = 0; s + 1 < n_scan; ++s) {
         const double here = residual[first + s], next = residual[first + s + 1];
         if (!(here * next < 0 || here == 0)) continue;
-        if (sheet == surface.sheets.size()) surface.sheets.emplace_back(MatrixXd::Constant(n_grid, n_grid, not_a_number));
+        if (sheet == surface.sheets.size()) surface.sheets.emplace_back(MatrixXd::Constant(n_first, n_second, not_a_number));
         surface.sheets[sheet++](i, j) = here == 0 ? scan[s] : scan[s] + (scan[s + 1] - scan[s]) * here / (here - next);
       }
     }
   }
+}
+
+}  // namespace
+
+std::optional<ConstraintSurface> constraint_surface(const SymbolicSystem& system, const Ref<const VectorXd>& parameters,
+                                                    const Ref<const MatrixXd>& states) {
+  if (system.nq() != 3 || states.cols() < 2 || states.topRows(3).hasNaN()) return std::nullopt;
+  const std::optional<int> row = surface_row(system);
+  if (!row) return std::nullopt;
+  const std::vector<System::Residual>& labels = system.residual_labels();
+  const auto label =
+      std::find_if(labels.begin(), labels.end(), [&](const auto& one) { return one.row == *row && !one.velocity; });
+
+  ConstraintSurface surface;
+  surface.solved = steepest_coordinate(system.evaluate(states, parameters), *row);
+  surface.first = surface.solved == 0 ? 1 : 0;
+  surface.second = surface.solved == 2 ? 1 : 2;
+
+  constexpr Index n_grid = 25, n_scan = 41;
+  surface.first_grid = range_of(states, surface.first, 0.08, n_grid);
+  surface.second_grid = range_of(states, surface.second, 0.08, n_grid);
+  const VectorXd scan = range_of(states, surface.solved, 0.6, n_scan);
+  const MatrixXd probes = probe_states(surface, scan, system.layout().size());
+  const Eigen::RowVectorXd residual = system.residuals(probes, parameters).row(label - labels.begin());
+  add_sheets(residual, scan, surface);
   if (surface.sheets.empty()) return std::nullopt;
   return surface;
 }

@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <utility>
 
 #include <fmt/format.h>
 
@@ -11,7 +12,8 @@
 #include "gp2/error.hpp"
 #include "gp2/jobs/fit_problem.hpp"
 #include "gp2/observations.hpp"
-#include "model/model_reader.hpp"
+#include "model/prior_words.hpp"
+#include "prior/expression_function.hpp"
 
 namespace gp2 {
 
@@ -40,30 +42,29 @@ namespace {
 
 struct Features {
   std::vector<std::string> names;
-  Tape tape;  // state -> features
+  std::shared_ptr<const StateFunction> function;
 };
 
-// with angles and parameters as the prior has them
+// those asked for, with angles and parameters as the prior has them, or the prior's
 Features features_of(const Model& model, const std::vector<std::string>& asked) {
-  ExpressionGraph& graph = *model.graph;
-  std::map<std::string, Expression> parameter_values;
-  for (const Parameter& parameter : model.system->parameters()) {
-    parameter_values.emplace(parameter.name, graph.constant(parameter.value));
+  if (asked.empty()) {
+    const Latent first = make_prior(model).latents.front();
+    return {first.feature_names, first.features};
   }
-  Features features;
+  const PriorWords words = prior_words(model);
+  std::vector<std::string> names;
   std::vector<Expression> values;
-  for (const std::string& written : asked.empty() ? model.latents.front().features : asked) {
+  for (const std::string& written : asked) {
     for (const std::string& name : expand_angle(written, model.system->coordinates())) {
       try {
-        values.push_back(graph.substitute(model.expression(name), parameter_values));
+        values.push_back(words.with_values(words.parse(name), *model.system));
       } catch (const InputError& error) {
         throw InputError(fmt::format("`features`: '{}': {}", written, error.what()));
       }
-      features.names.push_back(name);
+      names.push_back(name);
     }
   }
-  features.tape = Tape(values, model.symbols().state());
-  return features;
+  return {std::move(names), ExpressionFunction::of_state(values, words.symbols)};
 }
 
 // divided by their standard deviation; 0 where they do not vary
@@ -93,9 +94,8 @@ Resample resample(const Model& model, const CsvTable& log, const ResampleOptions
   if (options.n < 1) throw InputError(fmt::format("resample: n must be positive, got {}", options.n));
   Features features = features_of(model, options.features);
   std::vector<bool> reads;
-  for (int k = 0; k < model.system->layout().size(); ++k) reads.push_back(features.tape.uses_input(k));
-  MatrixXd values;
-  features.tape.evaluate(open_log(model, log, options.columns).states_with_gaps(reads), VectorXd(), values);
+  for (int k = 0; k < model.system->layout().size(); ++k) reads.push_back(features.function->reads(k));
+  const MatrixXd values = features.function->evaluate(open_log(model, log, options.columns).states_with_gaps(reads), VectorXd());
 
   std::vector<int> usable;
   for (int i = 0; i < log.n_rows(); ++i) {

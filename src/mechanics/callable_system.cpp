@@ -2,12 +2,12 @@
 
 #include <algorithm>
 #include <cmath>
-#include <limits>
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
 #include "gp2/error.hpp"
+#include "mechanics/differences.hpp"
 
 namespace gp2 {
 
@@ -21,29 +21,6 @@ std::vector<std::string> labels_of(const std::vector<CallableSystem::Constraint>
   std::vector<std::string> labels;
   for (const CallableSystem::Constraint& constraint : constraints) labels.push_back(constraint.text);
   return labels;
-}
-
-std::vector<bool> marks_of(const std::optional<std::vector<std::string>>& read, const char* what, const System& system) {
-  const std::vector<std::string> names = system.state_names();
-  if (!read) return std::vector<bool>(names.size(), true);
-  std::vector<bool> marks(names.size(), false);
-  for (const std::string& name : *read) {
-    const auto found = std::find(names.begin(), names.end(), name);
-    if (found == names.end()) {
-      throw InputError(fmt::format("system '{}': {}: '{}' is no entry of the state, which has {}", system.name(), what, name,
-                                   fmt::join(names, ", ")));
-    }
-    marks[static_cast<std::size_t>(found - names.begin())] = true;
-  }
-  return marks;
-}
-
-// whether every entry that is read is a finite number
-bool is_known(const Eigen::Ref<const VectorXd>& state, const std::vector<bool>& reads) {
-  for (Index k = 0; k < state.size(); ++k) {
-    if (reads[static_cast<std::size_t>(k)] && !std::isfinite(state[k])) return false;
-  }
-  return true;
 }
 
 }  // namespace
@@ -143,44 +120,23 @@ SystemValues CallableSystem::differentiate(const States& states, const Parameter
   return values;
 }
 
-namespace {
-
-// over which a parameter of the value p changes what depends on it
-double scale_of(const Parameter& parameter, double p) {
-  const std::optional<std::pair<double, double>>& bounds = parameter.bounds;
-  if (bounds && (bounds->first > 0 || bounds->second < 0) && p != 0) return std::abs(p);
-  const double scale = std::max(std::abs(p), std::abs(parameter.value));
-  if (scale > 0) return scale;
-  const double widest = bounds ? std::max(std::abs(bounds->first), std::abs(bounds->second)) : 0;
-  return widest > 0 ? widest : 1;
-}
-
-// a x + b y
-SystemValues combined(double a, const SystemValues& x, double b, const SystemValues& y) {
-  return {a * x.mass + b * y.mass, a * x.constraint_matrix + b * y.constraint_matrix,
-          a * x.constraint_vector + b * y.constraint_vector, a * x.force + b * y.force};
-}
-
-}  // namespace
-
 SystemValues CallableSystem::difference(const States& states, const Parameters& parameters, int index) const {
-  const Parameter& parameter = this->parameters()[static_cast<std::size_t>(index)];
-  const double p = parameters[index];
-  double h = std::cbrt(std::numeric_limits<double>::epsilon()) * scale_of(parameter, p);
-  h = (p + h) - p;  // as rounded
-  const auto at = [&](double value) {
+  SystemValues sum;
+  const ParameterStep step(this->parameters()[static_cast<std::size_t>(index)], parameters[index]);
+  for (const auto& [value, weight] : step.terms()) {
     VectorXd moved = parameters;
     moved[index] = value;
-    return evaluate(states, moved);
-  };
-  const auto allowed = [&](double value) {
-    return !parameter.bounds || (parameter.bounds->first <= value && value <= parameter.bounds->second);
-  };
-  const bool above = allowed(p + h), below = allowed(p - h);
-  if (above == below) return combined(1 / (2 * h), at(p + h), -1 / (2 * h), at(p - h));
-  // (−3 f(p) + 4 f(p + h) − f(p + 2h)) / 2h
-  if (below) h = -h;
-  return combined(1, combined(-3 / (2 * h), at(p), 2 / h, at(p + h)), -1 / (2 * h), at(p + 2 * h));
+    const SystemValues there = evaluate(states, moved);
+    const auto add = [weight = weight](MatrixXd& to, const MatrixXd& values) {
+      if (to.size() == 0) to.setZero(values.rows(), values.cols());
+      to += weight * values;
+    };
+    add(sum.mass, there.mass);
+    add(sum.constraint_matrix, there.constraint_matrix);
+    add(sum.constraint_vector, there.constraint_vector);
+    add(sum.force, there.force);
+  }
+  return sum;
 }
 
 MatrixXd CallableSystem::residuals(const States& states, const Parameters& parameters) const {

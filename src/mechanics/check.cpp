@@ -247,8 +247,8 @@ void check_independence(const MechanicsBatch& mechanics, std::vector<Finding>& f
                                    n_states, mechanics.values.n_states(), worst, state + 1)});
 }
 
-// M, A, b: definite or completed by A, of constant rank, consistent
-void check_mechanics(const System& system, const MechanicsBatch& mechanics, std::vector<Finding>& findings) {
+// M is symmetric, and definite or completed by A
+void check_mass(const System& system, const MechanicsBatch& mechanics, std::vector<Finding>& findings) {
   const int n_states = mechanics.values.n_states();
   double worst_condition = 0, asymmetry = 0;
   int n_singular = 0, mass_rank = system.nq();
@@ -276,13 +276,10 @@ void check_mechanics(const System& system, const MechanicsBatch& mechanics, std:
                               : "");
   }
   if (asymmetry > 1e-10) findings.back().text = fmt::format("mass matrix: not symmetric (relative difference {:.3g})", asymmetry);
-  if (system.nc() == 0) {
-    findings.push_back({Level::warning, "constraints: none; T = I, and ddq is the unconstrained acceleration"});
-    return;
-  }
+}
 
-  int zero_rows = 0;
-  for (const UdwadiaKalaba& projection : mechanics.projections) zero_rows += projection.n_zero_rows();
+// the rank of A is the same at all states, and leaves some freedom
+void check_rank(const System& system, const MechanicsBatch& mechanics, std::vector<Finding>& findings) {
   const LowerRank lower = states_of_lower_rank(mechanics);
   const int highest = lower.usual;
   if (!lower.states.empty()) {
@@ -303,8 +300,12 @@ void check_mechanics(const System& system, const MechanicsBatch& mechanics, std:
     findings.push_back(
         {Level::warning, "constraints: they leave no freedom (rank = number of coordinates): nothing is left to learn"});
   }
+}
 
-  // a row that nearly vanishes somewhere decides the direction of its force from rounding
+// a row of A that nearly vanishes somewhere decides the direction of its force from rounding
+void check_row_sizes(const System& system, const MechanicsBatch& mechanics, std::vector<Finding>& findings) {
+  int zero_rows = 0;
+  for (const UdwadiaKalaba& projection : mechanics.projections) zero_rows += projection.n_zero_rows();
   for (int row = 0; row < system.nc(); ++row) {
     std::vector<double> sizes;
     for (int i = 0; i < mechanics.values.n_states(); ++i) sizes.push_back(mechanics.values.A(i).row(row).norm());
@@ -331,6 +332,17 @@ void check_mechanics(const System& system, const MechanicsBatch& mechanics, std:
     findings.push_back(
         {Level::warning, fmt::format("constraints: a row of A vanishes {} times; it is dropped there", zero_rows)});
   }
+}
+
+// M, A, b: definite or completed by A, of constant rank, consistent
+void check_mechanics(const System& system, const MechanicsBatch& mechanics, std::vector<Finding>& findings) {
+  check_mass(system, mechanics, findings);
+  if (system.nc() == 0) {
+    findings.push_back({Level::warning, "constraints: none; T = I, and ddq is the unconstrained acceleration"});
+    return;
+  }
+  check_rank(system, mechanics, findings);
+  check_row_sizes(system, mechanics, findings);
 }
 
 // exact derivatives in the parameters against central differences

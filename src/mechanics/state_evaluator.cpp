@@ -1,12 +1,9 @@
 #include "gp2/mechanics/state_evaluator.hpp"
 
-#include <algorithm>
-#include <cmath>
-#include <limits>
-
 #include <fmt/format.h>
 
 #include "gp2/error.hpp"
+#include "mechanics/differences.hpp"
 
 namespace gp2 {
 
@@ -15,18 +12,18 @@ using Eigen::MatrixXd;
 using Eigen::Ref;
 using Eigen::VectorXd;
 using Derivative = StateEvaluator::Derivative;
-using Quantity = StateEvaluator::Quantity;
+using Part = StateEvaluator::Quantity;
 
 namespace {
 
 // of the numbers of M, A, b, F, each column-major, the one at `index`
 Derivative derivative_of(int index, int nq, int nc, int state_index) {
-  if (index < nq * nq) return {Quantity::mass, index % nq, index / nq, state_index};
+  if (index < nq * nq) return {Part::mass, index % nq, index / nq, state_index};
   index -= nq * nq;
-  if (index < nc * nq) return {Quantity::constraint_matrix, index % nc, index / nc, state_index};
+  if (index < nc * nq) return {Part::constraint_matrix, index % nc, index / nc, state_index};
   index -= nc * nq;
-  if (index < nc) return {Quantity::constraint_vector, index, 0, state_index};
-  return {Quantity::force, index - nc, 0, state_index};
+  if (index < nc) return {Part::constraint_vector, index, 0, state_index};
+  return {Part::force, index - nc, 0, state_index};
 }
 
 }  // namespace
@@ -76,43 +73,21 @@ class DifferenceEvaluator final : public StateEvaluator {
  private:
   DifferenceEvaluator(const System& system, const Ref<const VectorXd>& parameters,
                       const std::vector<StateDerivatives::Entry>& entries)
-      : StateEvaluator(system, parameters, entries), system_(system), parameters_(parameters), entries_(entries) {
-    for (const StateDerivatives::Entry& entry : entries_) {
-      if (moved_.empty() || moved_.back() != entry.state_index) moved_.push_back(entry.state_index);
-    }
-  }
+      : StateEvaluator(system, parameters, entries), system_(system), parameters_(parameters), differences_(entries) {}
 
   void evaluate_all(const Ref<const VectorXd>& state) override {
-    // x, then x ± h_k for each k
-    states_ = state.replicate(1, 1 + 2 * static_cast<Index>(moved_.size()));
-    for (std::size_t m = 0; m < moved_.size(); ++m) {
-      const double h = std::cbrt(std::numeric_limits<double>::epsilon()) * std::max(1.0, std::abs(state[moved_[m]]));
-      states_(moved_[m], column_above(m)) += h;
-      states_(moved_[m], column_above(m) + 1) -= h;
-    }
-    system_.evaluate_into(states_, parameters_, batch_);
-    values_.resize(n_values(), states_.cols());
+    const MatrixXd& states = differences_.states_around(state);
+    system_.evaluate_into(states, parameters_, batch_);
+    values_.resize(n_values(), states.cols());
     values_ << batch_.mass, batch_.constraint_matrix, batch_.constraint_vector, batch_.force;
-
     all_values().head(n_values()) = values_.col(0);
-    std::size_t m = 0;
-    Index out = n_values();
-    for (const StateDerivatives::Entry& entry : entries_) {
-      while (moved_[m] != entry.state_index) ++m;
-      const Index above = column_above(m);
-      // the step as rounded
-      const double step = states_(moved_[m], above) - states_(moved_[m], above + 1);
-      all_values()[out++] = (values_(entry.output, above) - values_(entry.output, above + 1)) / step;
-    }
+    differences_.differentiate(values_, all_values().tail(all_values().size() - n_values()));
   }
-
-  static Index column_above(std::size_t m) { return 1 + 2 * static_cast<Index>(m); }
 
   const System& system_;
   VectorXd parameters_;
-  std::vector<StateDerivatives::Entry> entries_;
-  std::vector<int> moved_;  // entries of the state that anything depends on
-  MatrixXd states_, values_;
+  StateDifferences differences_;
+  MatrixXd values_;
   SystemValues batch_;
 };
 

@@ -15,7 +15,6 @@ using Eigen::Index;
 using Eigen::MatrixXd;
 using Eigen::Ref;
 using Eigen::VectorXd;
-using Level = ConstraintRow::Level;
 
 SystemSymbols::SystemSymbols(ExpressionGraph& graph, const std::vector<Coordinate>& coordinates,
                              const std::vector<std::string>& inputs, const std::vector<Parameter>& system_parameters)
@@ -64,13 +63,13 @@ Expression rate(Expression e, const std::vector<Expression>& x, const std::vecto
 
 }  // namespace
 
-ConstraintRow derive_constraint(Level level, Expression c, std::string text, const SystemSymbols& symbols) {
+ConstraintRow derive_constraint(ConstraintLevel level, Expression c, std::string text, const SystemSymbols& symbols) {
   ExpressionGraph& graph = c.graph();
   ConstraintRow row{level, std::move(text), {}, c, {}};
   Expression bias = c;  // the part of the differentiated constraint that has no ddq
   const std::vector<Expression>* acted_on = &symbols.ddq;
   switch (level) {
-    case Level::position: {
+    case ConstraintLevel::position: {
       forbid(c, symbols.dq, "position", "coordinates, t and parameters");
       forbid(c, symbols.ddq, "position", "coordinates, t and parameters");
       forbid(c, symbols.u, "position", "coordinates, t and parameters");
@@ -81,7 +80,7 @@ ConstraintRow derive_constraint(Level level, Expression c, std::string text, con
       acted_on = &symbols.q;
       break;
     }
-    case Level::velocity:
+    case ConstraintLevel::velocity:
       forbid(c, symbols.ddq, "velocity", "coordinates, velocities, t and parameters");
       forbid(c, symbols.u, "velocity", "coordinates, velocities, t and parameters");
       // ċ = c_dq ddq + c_q dq + c_t
@@ -89,7 +88,7 @@ ConstraintRow derive_constraint(Level level, Expression c, std::string text, con
       row.residuals = {c};
       acted_on = &symbols.dq;
       break;
-    case Level::acceleration: {
+    case ConstraintLevel::acceleration: {
       std::map<std::string, Expression> at_rest;
       for (Expression acceleration : symbols.ddq) at_rest.emplace(acceleration.variable_name(), graph.constant(0));
       bias = graph.substitute(c, at_rest);
@@ -113,9 +112,9 @@ ConstraintRow derive_constraint(Level level, Expression c, std::string text, con
   }
   if (!acts) {
     throw InputError(fmt::format("the constraint does not depend on any {}: it cannot act on the motion",
-                                 level == Level::position   ? "coordinate"
-                                 : level == Level::velocity ? "velocity"
-                                                            : "acceleration"));
+                                 level == ConstraintLevel::position   ? "coordinate"
+                                 : level == ConstraintLevel::velocity ? "velocity"
+                                                                      : "acceleration"));
   }
   row.b = -bias;
   return row;
@@ -174,7 +173,7 @@ SymbolicSystem::SymbolicSystem(Definition definition)
   for (std::size_t k = 0; k < definition_.constraints.size(); ++k) {
     const ConstraintRow& row = definition_.constraints[k];
     for (std::size_t r = 0; r < row.residuals.size(); ++r) {
-      const bool velocity = row.level == Level::velocity || r == 1;
+      const bool velocity = row.level == ConstraintLevel::velocity || r == 1;
       residuals.push_back(row.residuals[r]);
       residual_labels_.push_back({static_cast<int>(k), velocity, (r == 1 ? "d/dt of " : "") + row.text});
     }

@@ -260,6 +260,18 @@ void UdwadiaKalaba::decompose_rows() {
 
   // B⁺ = Y (Rᵀ)⁺ Pᵀ, in the place of L = C⁻ᵀ B⁺
   L_unit_.setZero(nq, nc);
+  invert_R_transposed();
+  internal::apply_Q(rows_, reflection_, rank, L_unit_);
+
+  solve_upper(mass_factor_, T_);
+  solve_upper(mass_factor_, L_unit_);
+}
+
+// (Rᵀ)⁺ Pᵀ to the first rows of L_unit_, which are zero
+void UdwadiaKalaba::invert_R_transposed() {
+  const Index nq = rows_.rows();
+  const Index nc = rows_.cols();
+  const Index rank = rank_;
   if (rank == nc) {
     // (Rᵀ)⁻¹, lower triangular, by columns
     for (Index j = 0; j < nc; ++j) {
@@ -292,10 +304,6 @@ void UdwadiaKalaba::decompose_rows() {
       }
     }
   }
-  internal::apply_Q(rows_, reflection_, rank, L_unit_);
-
-  solve_upper(mass_factor_, T_);
-  solve_upper(mass_factor_, L_unit_);
 }
 
 MatrixXd UdwadiaKalaba::solve_mass(const Ref<const MatrixXd>& v) const {
@@ -327,7 +335,7 @@ void UdwadiaKalaba::write_multipliers_of_force(MatrixXd& K, Workspace& workspace
   if (n_redundant == 0 || rank_ == 0) return;
 
   // redundant rows: take away what lies in the null space of Aᵀ. Of the unit rows it is that of Bᵀ P = Y R, spanned by the last
-  // columns of Q₂ in Rᵀ P₂ = Q₂ R₂ (decompose_rows); D brings it to the rows as written
+  // columns of Q₂ in Rᵀ P₂ = Q₂ R₂ (invert_R_transposed); D brings it to the rows as written
   workspace.null_space_.setZero(nc, nc);
   workspace.null_rows_.resize(nc, nc);
   workspace.reflection_.resize(nc);

@@ -13,6 +13,7 @@
 #include "gp2/error.hpp"
 #include "model/name_order.hpp"
 #include "model/toml_reader.hpp"
+#include "prior/make_prior.hpp"
 #include "robots/robot_expressions.hpp"
 
 namespace gp2 {
@@ -22,8 +23,8 @@ using Level = ConstraintRow::Level;
 /// Reads the tables of a model file one after the other; every complaint carries file, line and key.
 class ModelReader : private TomlReader {
  public:
-  ModelReader(const toml::table& root, const MechanicsSource* mechanics, const RobotSource& robot, Model& model)
-      : TomlReader(model.name), root_(root), source_(mechanics), robot_source_(robot), model_(model) {}
+  ModelReader(const toml::table& root, const RobotSource& robot, Model& model)
+      : TomlReader(model.name), root_(root), robot_source_(robot), model_(model) {}
 
   void read() {
     only_keys(root_, "",
@@ -37,7 +38,7 @@ class ModelReader : private TomlReader {
     read_parameters();
     declare_symbols();
     read_let();
-    if (source_ != nullptr) {
+    if (model_.code.mechanics) {
       ask_for_mechanics();
     } else {
       read_mechanics();
@@ -46,12 +47,13 @@ class ModelReader : private TomlReader {
       if (mass_node_ != nullptr) check_mass_symmetry();
     }
     read_latents();
+    require_all_code_is_used();
     read_noise();
     read_truth();
     read_sampling();
     read_motion();
     read_columns();
-    if (source_ == nullptr) read_potential();
+    if (!model_.code.mechanics) read_potential();
   }
 
  private:
@@ -88,7 +90,7 @@ class ModelReader : private TomlReader {
   void read_robot() {
     if (!root_.contains("robot")) return;
     const toml::node& node = *root_.get("robot");
-    if (source_ != nullptr) fail(node, "robot", "the mechanics of this model are given as code: remove it");
+    if (model_.code.mechanics) fail(node, "robot", "the mechanics of this model are given as code: remove it");
     try {
       model_.robot = robot_source_(text(node, "robot"));
     } catch (const InputError& error) {
@@ -284,9 +286,8 @@ class ModelReader : private TomlReader {
              fmt::format("the mechanics of this model are given as code: remove [{}], or read the file without that code", key));
       }
     }
-    if (!*source_) throw InputError("the code that is to give the mechanics is an empty function");
-    model_.mechanics_are_code = true;
-    model_.system = (*source_)({definition_.name, definition_.coordinates, definition_.inputs, definition_.parameters});
+    model_.system =
+        model_.code.mechanics({definition_.name, definition_.coordinates, definition_.inputs, definition_.parameters});
     if (!model_.system) throw InputError("the code that is to give the mechanics returned no system");
     require_as_declared(*model_.system);
   }
@@ -554,8 +555,7 @@ class ModelReader : private TomlReader {
     for (const toml::node& node : array(*root_.get("latent"), "latent")) {
       const toml::table& entry = table(node, "latent");
       only_keys(entry, "latent", {"name", "kernel", "features", "directions", "lengthscale", "signal_stddev"});
-      Model::LatentText latent;
-      latent.line = line_of(node);
+      LatentSpec latent;
       latent.name =
           entry.contains("name") ? text(*entry.get("name"), "latent.name") : fmt::format("latent {}", model_.latents.size() + 1);
       if (!names.insert(latent.name).second) fail(node, "latent.name", fmt::format("'{}' is taken already", latent.name));
@@ -563,17 +563,7 @@ class ModelReader : private TomlReader {
         fail(node, "latent.name", "'discrepancy' is the name of the latent that gp2 adds; take another");
       latent.kernel = entry.contains("kernel") ? text(*entry.get("kernel"), "latent.kernel") : "se";
       if (!entry.contains("features")) fail(node, "latent", R"(missing features = ["q1", …])");
-      std::set<std::string> expanded;
-      for (const toml::node& feature : array(*entry.get("features"), "latent.features")) {
-        const Expression value = expression(feature, "latent.features");
-        allow_only(feature, "latent.features", value, symbols_->ddq, "a feature may not depend on accelerations");
-        latent.features.push_back(feature.is_string() ? text(feature, "latent.features") : to_string(value));
-        // lengthscales go by the names of features
-        for (const std::string& name : expand_angle(latent.features.back(), definition_.coordinates)) {
-          if (!expanded.insert(name).second) fail(feature, "latent.features", fmt::format("'{}' stands twice; remove one", name));
-        }
-      }
-      if (latent.features.empty()) fail(node, "latent.features", "a latent needs at least one feature");
+      read_features(*entry.get("features"), latent);
       if (entry.contains("directions")) read_directions(*entry.get("directions"), latent);
       latent.lengthscale = latent_range(entry, "lengthscale");
       latent.signal_stddev = latent_range(entry, "signal_stddev");
@@ -587,12 +577,72 @@ class ModelReader : private TomlReader {
     if (model_.latents.empty()) add_default_latent();
   }
 
+  // [expressions], or { code = [names] }
+  void read_features(const toml::node& node, LatentSpec& latent) const {
+    const std::string key = "latent.features";
+    std::set<std::string> expanded;
+    const auto add = [&](const toml::node& entry, const std::string& feature, const std::vector<std::string>& names) {
+      latent.features.push_back(feature);
+      // lengthscales go by the names of features
+      for (const std::string& name : names) {
+        if (!expanded.insert(name).second) fail(entry, key, fmt::format("'{}' stands twice; remove one", name));
+      }
+    };
+    if (node.is_table()) {
+      latent.feature_code = code_of(node, key, latent.name, &ModelCode::OfLatent::features);
+      for (const std::string& name : names_of_code(node, key)) add(node, name, {name});
+    } else {
+      for (const toml::node& entry : array(node, key)) {
+        const Expression value = expression(entry, key);
+        allow_only(entry, key, value, symbols_->ddq, "a feature may not depend on accelerations");
+        const std::string feature = written_expression(entry, key, value);
+        add(entry, feature, expand_angle(feature, definition_.coordinates));
+      }
+    }
+    if (latent.features.empty()) fail(node, key, "a latent needs at least one feature");
+  }
+
+  std::string written_expression(const toml::node& node, const std::string& key, Expression value) const {
+    return node.is_string() ? text(node, key) : to_string(value);
+  }
+
+  // { code = [names] }: one name for each number or column that code gives
+  std::vector<std::string> names_of_code(const toml::node& node, const std::string& key) const {
+    const toml::table& entry = table(node, key);
+    only_keys(entry, key, {"code"});
+    if (!entry.contains("code")) fail(node, key, R"(expected { code = ["name", …] })");
+    std::vector<std::string> names;
+    for (const toml::node& name : array(*entry.get("code"), key + ".code")) names.push_back(text(name, key + ".code"));
+    return names;
+  }
+
+  StateCode code_of(const toml::node& node, const std::string& key, const std::string& latent,
+                    StateCode ModelCode::OfLatent::*part) const {
+    const auto found = model_.code.latents.find(latent);
+    if (found != model_.code.latents.end() && found->second.*part) return found->second.*part;
+    fail(node, key, fmt::format("those of '{}' are code, and none is given: read the file where that code is", latent));
+  }
+
+  // what code gives, the file must leave to it
+  void require_all_code_is_used() const {
+    for (const auto& [name, code] : model_.code.latents) {
+      const auto found =
+          std::find_if(model_.latents.begin(), model_.latents.end(), [&](const LatentSpec& one) { return one.name == name; });
+      if (found == model_.latents.end())
+        throw InputError(fmt::format("code is given for the latent '{}', but there is none", name));
+      if (code.features && !found->feature_code) {
+        throw InputError(fmt::format("code is given for the features of the latent '{}', but the file has them", name));
+      }
+      if (code.directions && !found->direction_code) {
+        throw InputError(fmt::format("code is given for the directions of the latent '{}', but the file has them", name));
+      }
+    }
+  }
+
   // one squared-exponential latent on the acceleration, over everything a state has but the time
   void add_default_latent() {
-    Model::LatentText latent;
+    LatentSpec latent;
     latent.name = "unconstrained acceleration";
-    latent.kernel = "se";
-    latent.line = 1;
     for (Expression symbol : symbols_->state()) {
       if (!(symbol == symbols_->t)) latent.features.push_back(symbol.variable_name());
     }
@@ -600,7 +650,7 @@ class ModelReader : private TomlReader {
   }
 
   // "acceleration", "force", [[…], …] (nq rows), or { force = [[…], …] }
-  void read_directions(const toml::node& node, Model::LatentText& latent) const {
+  void read_directions(const toml::node& node, LatentSpec& latent) const {
     const std::string key = "latent.directions";
     const toml::node* matrix = &node;
     if (node.is_string()) {
@@ -612,11 +662,17 @@ class ModelReader : private TomlReader {
       latent.base = value == "force" ? Latent::Base::force : Latent::Base::acceleration;
       return;
     }
-    if (node.is_table()) {
+    if (node.is_table() && !node.as_table()->contains("code")) {
       only_keys(*node.as_table(), key, {"force", "acceleration"});
       if (node.as_table()->size() != 1) fail(node, key, "expected { force = [[…], …] } or { acceleration = [[…], …] }");
       latent.base = node.as_table()->contains("force") ? Latent::Base::force : Latent::Base::acceleration;
       matrix = &node.as_table()->begin()->second;
+    }
+    if (matrix->is_table()) {
+      latent.direction_code = code_of(*matrix, key, latent.name, &ModelCode::OfLatent::directions);
+      latent.direction_names = names_of_code(*matrix, key);
+      if (latent.direction_names.empty()) fail(*matrix, key, "directions that are code need a name for each column");
+      return;
     }
     const toml::array& rows = array(*matrix, key);
     const std::size_t nq = definition_.coordinates.size();
@@ -630,7 +686,7 @@ class ModelReader : private TomlReader {
       for (const toml::node& entry : row) {
         const Expression value = expression(entry, key);
         allow_only(entry, key, value, symbols_->ddq, "a direction may not depend on accelerations");
-        latent.directions.back().push_back(value);
+        latent.directions.back().push_back(written_expression(entry, key, value));
       }
     }
   }
@@ -739,7 +795,7 @@ class ModelReader : private TomlReader {
     if (root_.contains("sampling")) {
       fail(entries, "motion", "states are drawn by [sampling] or met on the way by [motion]: remove one of the two");
     }
-    if (source_ != nullptr) fail(entries, "motion", "only a model with its mechanics as text can be driven: remove it");
+    if (model_.code.mechanics) fail(entries, "motion", "only a model with its mechanics as text can be driven: remove it");
     if (definition_.inputs.empty())
       fail(entries, "motion", "a model without inputs cannot be driven; give inputs, or use [sampling]");
     Model::Motion motion;
@@ -827,7 +883,6 @@ class ModelReader : private TomlReader {
   }
 
   const toml::table& root_;
-  const MechanicsSource* source_;  // null: the mechanics are text
   const RobotSource& robot_source_;
   std::map<std::string, std::string> robot_parameters_;  // number of the robot -> parameter
   Model& model_;
@@ -837,8 +892,6 @@ class ModelReader : private TomlReader {
   const toml::node* mass_node_ = nullptr;
 };
 
-void read_model(const toml::table& root, const MechanicsSource* mechanics, const RobotSource& robot, Model& model) {
-  ModelReader(root, mechanics, robot, model).read();
-}
+void read_model(const toml::table& root, const RobotSource& robot, Model& model) { ModelReader(root, robot, model).read(); }
 
 }  // namespace gp2

@@ -37,7 +37,7 @@ std::string difference(const Prior& home, const Prior& other) {
       return written;
     };
     const auto directions = [](const Latent& latent) {
-      if (!latent.directions_are_identity) return fmt::format("{} of expressions", latent.size());
+      if (latent.directions) return fmt::format("{} of its own", latent.size());
       return std::string(latent.base == Latent::Base::force ? "\"force\"" : "\"acceleration\"");
     };
     const auto features = [](const Latent& latent) { return fmt::format("{}", fmt::join(latent.feature_names, ", ")); };

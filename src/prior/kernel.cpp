@@ -1,14 +1,15 @@
 #include "gp2/prior/kernel.hpp"
 
-#include <array>
 #include <cctype>
 #include <map>
 #include <utility>
 
 #include <fmt/format.h>
+#include <fmt/ranges.h>
 
 #include "gp2/error.hpp"
 #include "prior/kernel_columns.hpp"
+#include "prior/primitive.hpp"
 
 namespace gp2 {
 
@@ -21,14 +22,6 @@ using Primitive = Kernel::Primitive;
 namespace {
 
 constexpr std::size_t max_parameters = 10'000;
-
-constexpr std::array<std::pair<std::string_view, Primitive>, 7> primitive_names = {{{"se", Primitive::se},
-                                                                                    {"matern32", Primitive::matern32},
-                                                                                    {"matern52", Primitive::matern52},
-                                                                                    {"rq", Primitive::rq},
-                                                                                    {"periodic", Primitive::periodic},
-                                                                                    {"linear", Primitive::linear},
-                                                                                    {"constant", Primitive::constant}}};
 
 std::string_view trim(std::string_view text) {
   while (!text.empty() && std::isspace(static_cast<unsigned char>(text.front()))) text.remove_prefix(1);
@@ -47,12 +40,20 @@ std::vector<std::string_view> split(std::string_view text, char separator) {
 }
 
 Primitive primitive_of(std::string_view name, std::string_view text) {
-  for (const auto& [known, primitive] : primitive_names) {
-    if (known == name) return primitive;
+  const std::span<const std::string_view> known = primitive_names();
+  for (std::size_t k = 0; k < known.size(); ++k) {
+    if (known[k] == name) return static_cast<Primitive>(k);
   }
-  std::string known_names;
-  for (const auto& [known, primitive] : primitive_names) known_names += fmt::format(" {}", known);
-  throw InputError(fmt::format("kernel \"{}\": unknown kernel '{}'; use sums and products of{}", text, name, known_names));
+  throw InputError(
+      fmt::format("kernel \"{}\": unknown kernel '{}'; use sums and products of {}", text, name, fmt::join(known, " ")));
+}
+
+// "lengthscale" of the feature d, or "alpha" of none
+bool is_of_feature(Kernel::ParameterKind kind) { return kind != Kernel::ParameterKind::shape; }
+
+const char* word(Kernel::ParameterKind kind) {
+  if (kind == Kernel::ParameterKind::shape) return "alpha";
+  return kind == Kernel::ParameterKind::period ? "period" : "lengthscale";
 }
 
 }  // namespace
@@ -79,7 +80,7 @@ Kernel Kernel::parse(std::string_view text, std::span<const std::string> feature
   const auto prefix_of = [&](Primitive primitive) -> std::string {
     const int number = ++n_seen[primitive];
     if (n_factors == 1) return "";
-    const std::string name(primitive_names[static_cast<std::size_t>(primitive)].first);
+    const std::string name(primitive_names()[static_cast<std::size_t>(primitive)]);
     return n_uses[primitive] == 1 ? name + "." : fmt::format("{}{}.", name, number);
   };
   for (const std::vector<Primitive>& product : sum) {
@@ -89,20 +90,14 @@ Kernel Kernel::parse(std::string_view text, std::span<const std::string> feature
       const std::string prefix = prefix_of(primitive);
       if (term_prefix.empty()) term_prefix = prefix;
       term.factors.push_back({primitive, static_cast<int>(kernel.parameters_.size()), kernel.n_scaled_columns_});
-      if (primitive == Primitive::constant) continue;
+      if (parameter_kinds(primitive).empty()) continue;
       kernel.n_scaled_columns_ += kernel.n_features_;
-      for (std::size_t d = 0; d < features.size(); ++d) {
-        kernel.parameters_.push_back(
-            {primitive == Primitive::periodic ? ParameterKind::periodic_lengthscale : ParameterKind::lengthscale,
-             static_cast<int>(d), fmt::format("{}lengthscale({})", prefix, features[d])});
-      }
-      if (primitive == Primitive::periodic) {
-        for (std::size_t d = 0; d < features.size(); ++d) {
-          kernel.parameters_.push_back(
-              {ParameterKind::period, static_cast<int>(d), fmt::format("{}period({})", prefix, features[d])});
+      for (const ParameterKind kind : parameter_kinds(primitive)) {
+        if (!is_of_feature(kind)) kernel.parameters_.push_back({kind, -1, prefix + word(kind)});
+        for (std::size_t d = 0; is_of_feature(kind) && d < features.size(); ++d) {
+          kernel.parameters_.push_back({kind, static_cast<int>(d), fmt::format("{}{}({})", prefix, word(kind), features[d])});
         }
       }
-      if (primitive == Primitive::rq) kernel.parameters_.push_back({ParameterKind::shape, -1, prefix + "alpha"});
       if (kernel.parameters_.size() > max_parameters) {
         throw InputError(fmt::format("a kernel of {} factors on {} features has more than {} hyperparameters; use fewer",
                                      n_factors, features.size(), max_parameters));

@@ -1,12 +1,11 @@
 #include "prior/kernel_columns.hpp"
 
 #include <algorithm>
-#include <cmath>
-#include <numbers>
 #include <utility>
 
 #include "base/simd.hpp"
 #include "prior/padded_rows.hpp"
+#include "prior/primitive.hpp"
 
 namespace gp2 {
 
@@ -17,153 +16,6 @@ using Eigen::MatrixXd;
 using Eigen::Ref;
 using Eigen::VectorXd;
 using Primitive = Kernel::Primitive;
-
-// One factor of a kernel between n points and one more, in scaled features: Δ_d = x_d − p_d.
-struct KernelColumns::FactorColumn {
-  Primitive primitive;
-  Index n, n_features, stride;
-  const double* x;       // (n × D)
-  const double* p;       // (D)
-  const double* values;  // of the factor's parameters
-
-  [[nodiscard]] double shape() const { return values[n_features]; }  // α of rq
-  [[nodiscard]] auto delta(Index d) const { return Map<const ArrayXd>(x + d * stride, n) - p[d]; }
-  [[nodiscard]] bool is_stationary() const;
-  void squared_distance(double* r2) const { simd::loops().squared_distance(n, n_features, x, stride, p, r2); }
-
-  void evaluate(double* out, double* distance) const;
-  void weighted_slope(const double* k, const double* w, double* slope) const;
-  void add_gradient(const double* k, const double* w, double* sums, double* scratch) const;
-  void add_point_gradient(const double* k, const double* w, const double* scales, double* out, double* scratch,
-                          double* sums) const;
-};
-
-bool KernelColumns::FactorColumn::is_stationary() const {
-  return primitive == Primitive::se || primitive == Primitive::matern32 || primitive == Primitive::matern52 ||
-         primitive == Primitive::rq;
-}
-
-// the factor's value, with √3 r or √5 r of a Matérn kernel left in `distance`
-void KernelColumns::FactorColumn::evaluate(double* out, double* distance) const {
-  const simd::Loops<double>& loops = simd::loops();
-  Map<ArrayXd> value(out, n);
-  Map<ArrayXd> r(distance, n);
-  switch (primitive) {
-    case Primitive::se:
-      loops.squared_exponential(n, n_features, x, stride, p, out);
-      break;
-    case Primitive::matern32:
-      squared_distance(distance);
-      r = std::sqrt(3.0) * r.sqrt();
-      value = -r;
-      loops.exponential(n, out);
-      value *= 1 + r;
-      break;
-    case Primitive::matern52:
-      squared_distance(distance);
-      r = std::sqrt(5.0) * r.sqrt();
-      value = -r;
-      loops.exponential(n, out);
-      value *= 1 + r + r.square() / 3;
-      break;
-    case Primitive::rq:
-      squared_distance(out);
-      value = (-shape() * (1 + value / (2 * shape())).log()).exp();
-      break;
-    case Primitive::periodic:
-      value.setZero();
-      for (Index d = 0; d < n_features; ++d) value += (delta(d).sin() / values[d]).square();
-      value *= -2;
-      loops.exponential(n, out);
-      break;
-    case Primitive::linear:
-      value.setZero();
-      for (Index d = 0; d < n_features; ++d) value += Map<const ArrayXd>(x + d * stride, n) * p[d];
-      break;
-    case Primitive::constant:
-      value.setOnes();
-      break;
-  }
-}
-
-// −2 dk/d(r²) of a stationary factor of value k, times w
-void KernelColumns::FactorColumn::weighted_slope(const double* k, const double* w, double* slope) const {
-  const simd::Loops<double>& loops = simd::loops();
-  const Map<const ArrayXd> value(k, n), weight(w, n);
-  Map<ArrayXd> out(slope, n);
-  switch (primitive) {
-    case Primitive::se:
-      out = weight * value;
-      break;
-    case Primitive::matern32:
-      squared_distance(slope);
-      out = -std::sqrt(3.0) * out.sqrt();
-      loops.exponential(n, slope);
-      out *= 3 * weight;
-      break;
-    case Primitive::matern52:  // 5/3 (1 + √5 r) exp(−√5 r) = 5/3 k (1 + √5 r)/(1 + √5 r + 5/3 r²)
-      squared_distance(slope);
-      out = std::sqrt(5.0) * out.sqrt();
-      out = weight * value * (5.0 / 3.0) * (1 + out) / (1 + out + out.square() / 3);
-      break;
-    case Primitive::rq:
-      squared_distance(slope);
-      out = weight * value / (1 + out / (2 * shape()));
-      break;
-    default:
-      break;
-  }
-}
-
-// Adds Σ_i w_i ∂k_i/∂log v for the factor's parameters; column v of `sums` begins at sums + v · lanes.
-void KernelColumns::FactorColumn::add_gradient(const double* k, const double* w, double* sums, double* scratch) const {
-  constexpr Index lanes = simd::lanes<double>;
-  const Map<const ArrayXd> value(k, n), weight(w, n);
-  Map<ArrayXd> slope(scratch, n);
-  if (is_stationary()) {
-    // ∂k/∂log ℓ_d = −2 dk/d(r²) Δ_d²
-    weighted_slope(k, w, scratch);
-    simd::loops().add_weighted_squares(n, n_features, scratch, x, stride, p, sums);
-    if (primitive == Primitive::rq) {
-      squared_distance(scratch);
-      slope = 1 + slope / (2 * shape());
-      sums[n_features * lanes] += (weight * value * shape() * (1 - slope.inverse() - slope.log())).sum();
-    }
-    return;
-  }
-  if (primitive == Primitive::periodic) {
-    for (Index d = 0; d < n_features; ++d) {
-      const double inverse_square = 1 / (values[d] * values[d]);
-      sums[d * lanes] += 4 * (weight * value * delta(d).sin().square()).sum() * inverse_square;
-      sums[(n_features + d) * lanes] += 2 * (weight * value * (2 * delta(d)).sin() * delta(d)).sum() * inverse_square;
-    }
-    return;
-  }
-  if (primitive == Primitive::linear) {
-    for (Index d = 0; d < n_features; ++d) {
-      sums[d * lanes] -= 2 * (weight * Map<const ArrayXd>(x + d * stride, n)).sum() * p[d];
-    }
-  }
-}
-
-// out_d += scale_d Σ_i w_i ∂k_i/∂p_d, p the scaled features of the point
-void KernelColumns::FactorColumn::add_point_gradient(const double* k, const double* w, const double* scales, double* out,
-                                                     double* scratch, double* sums) const {
-  const Map<const ArrayXd> value(k, n), weight(w, n);
-  if (is_stationary()) {
-    weighted_slope(k, w, scratch);
-    simd::loops().weighted_differences(n, n_features, scratch, x, stride, p, sums);
-    for (Index d = 0; d < n_features; ++d) out[d] += scales[d] * sums[d];
-    return;
-  }
-  for (Index d = 0; d < n_features; ++d) {
-    if (primitive == Primitive::periodic) {
-      out[d] += scales[d] * 2 * (weight * value * (2 * delta(d)).sin()).sum() / (values[d] * values[d]);
-    } else if (primitive == Primitive::linear) {
-      out[d] += scales[d] * (weight * Map<const ArrayXd>(x + d * stride, n)).sum();
-    }
-  }
-}
 
 KernelColumns::KernelColumns(Kernel kernel, const Ref<const MatrixXd>& features)
     : kernel_(std::move(kernel)), n_points_(features.rows()) {
@@ -190,9 +42,7 @@ void KernelColumns::set_parameters(const Ref<const VectorXd>& values) {
       if (factor.primitive == Primitive::constant) continue;
       for (Index d = 0; d < n_features; ++d) {
         const Index column = factor.first_column + d;
-        scales_[column] = factor.primitive == Primitive::periodic
-                              ? std::numbers::pi / values_[factor.first_parameter + n_features + d]
-                              : 1 / values_[factor.first_parameter + d];
+        scales_[column] = feature_scale(factor.primitive, values_.data() + factor.first_parameter, n_features, d);
         scaled_.col(column) = scales_[column] * features_.col(d);
       }
     }
@@ -229,8 +79,7 @@ double KernelColumns::amplitude(const Kernel::Term& term) const {
   return term.amplitude < 0 ? 1 : values_[term.amplitude] * values_[term.amplitude];
 }
 
-KernelColumns::FactorColumn KernelColumns::column_of(const Kernel::Factor& factor, Index first, Index n,
-                                                     const VectorXd& point) const {
+FactorColumn KernelColumns::column_of(const Kernel::Factor& factor, Index first, Index n, const VectorXd& point) const {
   return {factor.primitive,
           n,
           kernel_.n_features(),

@@ -8,6 +8,8 @@
 
 namespace gp2 {
 
+struct FactorColumn;
+
 /// A kernel between n points and one more at a time: a column of its matrix. The features of the points stand scaled by the
 /// kernel's lengthscales and periods, and padded with zeros to whole vectors (simd.hpp).
 class KernelColumns {
@@ -65,7 +67,6 @@ class KernelColumns {
                      Eigen::Index ldw, Eigen::Index m, double* out, Workspace& workspace) const;
 
  private:
-  struct FactorColumn;
   [[nodiscard]] FactorColumn column_of(const Kernel::Factor& factor, Eigen::Index first, Eigen::Index n,
                                        const Eigen::VectorXd& point) const;
   [[nodiscard]] double amplitude(const Kernel::Term& term) const;

@@ -14,16 +14,11 @@ namespace {
 
 Map<MatrixXd> block(MatrixXd& matrix, int i, Index rows) { return {matrix.col(i).data(), rows, matrix.rows() / rows}; }
 
-// B(x) at N states, from its tape or the identity
-MatrixXd evaluate_base(const Latent& latent, const Tape& tape, const Ref<const MatrixXd>& states,
-                       const Ref<const VectorXd>& parameters, Index nq) {
-  if (latent.directions_are_identity) {
-    const MatrixXd identity = MatrixXd::Identity(nq, nq);
-    return identity.reshaped().replicate(1, states.cols());
-  }
-  MatrixXd values;
-  tape.evaluate(states, parameters, values);
-  return values;
+// B(x) at N states
+MatrixXd evaluate_base(const Latent& latent, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters, Index nq) {
+  if (latent.directions) return latent.directions->evaluate(states, parameters);
+  const MatrixXd identity = MatrixXd::Identity(nq, nq);
+  return identity.reshaped().replicate(1, states.cols());
 }
 
 }  // namespace
@@ -37,8 +32,7 @@ std::vector<bool> Prior::reads() const {
   for (const Latent& latent : latents) {
     for (std::size_t k = 0; k < reads.size(); ++k) {
       const int index = static_cast<int>(k);
-      reads[k] = reads[k] || latent.features.uses_input(index) ||
-                 (!latent.directions_are_identity && latent.directions.uses_input(index));
+      reads[k] = reads[k] || latent.features->reads(index) || (latent.directions && latent.directions->reads(index));
     }
   }
   return reads;
@@ -52,9 +46,7 @@ void PriorValues::keep_only(std::size_t latent) {
 }
 
 MatrixXd evaluate_features(const Latent& latent, const Ref<const MatrixXd>& states) {
-  MatrixXd features;
-  latent.features.evaluate(states, VectorXd(), features);
-  return features.transpose();
+  return latent.features->evaluate(states, VectorXd()).transpose();
 }
 
 PriorValues evaluate_prior(const Prior& prior, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters,
@@ -69,7 +61,7 @@ PriorValues evaluate_prior(const Prior& prior, const Ref<const MatrixXd>& states
     }
   }
   for (const Latent& latent : prior.latents) {
-    MatrixXd E = evaluate_base(latent, latent.directions, states, parameters, nq);
+    MatrixXd E = evaluate_base(latent, states, parameters, nq);
     if (latent.base == Latent::Base::force) {
       for (int i = 0; i < n_states; ++i) {
         block(E, i, nq) = mechanics.projections[static_cast<std::size_t>(i)].solve_mass(block(E, i, nq));
@@ -96,10 +88,8 @@ PriorValues differentiate_prior(const Prior& prior, const Ref<const MatrixXd>& s
   }
   for (std::size_t a = 0; a < prior.latents.size(); ++a) {
     const Latent& latent = prior.latents[a];
-    MatrixXd dE = MatrixXd::Zero(values.directions[a].rows(), n_states);
-    if (!latent.directions_are_identity) {
-      latent.direction_derivatives[static_cast<std::size_t>(index)].evaluate(states, parameters, dE);
-    }
+    MatrixXd dE = latent.directions ? latent.directions->differentiate(states, parameters, index)
+                                    : MatrixXd::Zero(values.directions[a].rows(), n_states);
     // E = M⁻¹B: dE = M⁻¹(dB − dM E)
     if (latent.base == Latent::Base::force) {
       for (int i = 0; i < n_states; ++i) block(dE, i, nq) = solve(i, block(dE, i, nq), values.E(a, i));

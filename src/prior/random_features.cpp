@@ -3,6 +3,8 @@
 #include <cmath>
 #include <numbers>
 
+#include "prior/primitive.hpp"
+
 namespace gp2 {
 
 using Eigen::Index;
@@ -15,25 +17,6 @@ namespace {
 
 bool is_linear(const Kernel::Factor& factor) { return factor.primitive == Primitive::linear; }
 bool has_spectrum(const Kernel::Factor& factor) { return !is_linear(factor) && factor.primitive != Primitive::constant; }
-
-// adds a draw from the spectral density of a factor
-// v: its own parameters
-void add_frequency(Primitive primitive, const double* v, RandomStream& random, VectorXd& frequency) {
-  const Index n = frequency.size();
-  if (primitive == Primitive::periodic) {
-    for (Index d = 0; d < n; ++d) {
-      const double mean = 0.5 / (v[d] * v[d]);
-      const double up = random.poisson(mean), down = random.poisson(mean);
-      frequency[d] += 2 * std::numbers::pi * (up - down) / v[n + d];
-    }
-    return;
-  }
-  double spread = 1;
-  if (primitive == Primitive::matern32) spread = std::sqrt(1.5 / random.gamma(1.5));
-  if (primitive == Primitive::matern52) spread = std::sqrt(2.5 / random.gamma(2.5));
-  if (primitive == Primitive::rq) spread = std::sqrt(random.gamma(v[n]) / v[n]);
-  for (Index d = 0; d < n; ++d) frequency[d] += spread * random.normal() / v[d];
-}
 
 // every product of one entry of each φ∘(1/ℓ)
 VectorXd monomials_at(const Ref<const VectorXd>& point, const std::vector<VectorXd>& inverse_lengthscale) {

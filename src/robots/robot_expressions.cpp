@@ -458,75 +458,102 @@ ConstraintRow RobotExpressions::derive_constraint(ConstraintLevel level, Express
   return row;
 }
 
-std::vector<std::pair<Expression, std::string>> RobotExpressions::loops() {
-  std::vector<std::pair<Expression, std::string>> rows;
-  const auto body_name = [&](int body) { return body < 0 ? "world" : robot_.bodies[static_cast<std::size_t>(body)].name; };
-  const auto component_of = [&](const std::string& of, const std::string& component) {
-    return graph_.variable(fmt::format("{}.{}", of, component));
-  };
-  const auto add_connect = [&](const RobotDescription::Connect& connect) {
-    const auto anchor = [&](std::size_t k) {
-      const Vector3d& at = connect.anchors[k];
-      return fmt::format("point(\"{}\", {}, {}, {})", body_name(connect.bodies[k]), at.x(), at.y(), at.z());
-    };
-    for (int i = 0; i < 3; ++i) {
-      rows.emplace_back(component_of(anchor(0), {axes[i]}) - component_of(anchor(1), {axes[i]}),
-                        fmt::format("{}.{}", connect.name, axes[i]));
-    }
-  };
-  for (const RobotDescription::Connect& connect : robot_.connects) add_connect(connect);
-  for (const RobotDescription::Weld& weld : robot_.welds) {
-    add_connect(weld.connect);
-    // E = R_12ᵀ R₁ᵀ R₂ is the identity where its skew part vanishes
-    const auto rotation = [&](std::size_t k) {
-      ExpressionMatrix R;
-      for (int i = 0; i < 3; ++i) {
-        for (int j = 0; j < 3; ++j) {
-          R(i, j) = component_of(fmt::format("body(\"{}\")", body_name(weld.connect.bodies[k])),
-                                 fmt::format("rot_{}{}", axes[i], axes[j]));
-        }
-      }
-      return R;
-    };
-    const ExpressionMatrix E = transposed(constant(graph_, weld.rotation)) * (transposed(rotation(0)) * rotation(1));
-    for (int i = 0; i < 3; ++i) {
-      const int j = (i + 1) % 3, k = (i + 2) % 3;
-      rows.emplace_back(E(k, j) - E(j, k), fmt::format("{}.rot_{}", weld.connect.name, axes[i]));
-    }
-  }
+namespace {
 
-  const std::vector<const Joint*> joints = robot_.joints();
-  const auto length_of = [&](const RobotDescription::Coupling::Length& length) {
-    Expression sum = graph_.constant(-length.reference);
-    for (const auto& [name, coefficient] : length.joints) {
-      const auto joint =
-          std::find_if(joints.begin(), joints.end(), [&name = name](const Joint* other) { return other->name == name; });
-      sum = sum + graph_.constant(coefficient) * q_[static_cast<std::size_t>(joint - joints.begin())];
-    }
-    for (const RobotDescription::Coupling::Segment& segment : length.segments) {
-      Expression square = graph_.constant(0);
-      for (int i = 0; i < 3; ++i) {
-        const auto at = [&](int site) {
-          return component_of(fmt::format("site(\"{}\")", robot_.sites[static_cast<std::size_t>(site)].name), {axes[i]});
-        };
-        const Expression d = at(segment.second) - at(segment.first);
-        square = square + d * d;
-      }
-      sum = sum + graph_.constant(segment.factor) * graph_.apply(Operation::sqrt, square);
-    }
-    return sum;
+using NamedExpressions = std::vector<std::pair<Expression, std::string>>;
+
+std::string body_name(const RobotDescription& robot, int body) {
+  return body < 0 ? "world" : robot.bodies[static_cast<std::size_t>(body)].name;
+}
+
+Expression component_of(ExpressionGraph& graph, const std::string& of, const std::string& component) {
+  return graph.variable(fmt::format("{}.{}", of, component));
+}
+
+// both anchors are one point
+void add_connect(const RobotDescription& robot, ExpressionGraph& graph, const RobotDescription::Connect& connect,
+                 NamedExpressions& rows) {
+  const auto anchor = [&](std::size_t k) {
+    const Vector3d& at = connect.anchors[k];
+    return fmt::format("point(\"{}\", {}, {}, {})", body_name(robot, connect.bodies[k]), at.x(), at.y(), at.z());
   };
-  for (const RobotDescription::Coupling& coupling : robot_.couplings) {
-    Expression polynomial = graph_.constant(coupling.polynomial[0]);
-    if (!coupling.x.empty()) {
-      const Expression x = length_of(coupling.x.front());
-      for (std::size_t k = 1; k < coupling.polynomial.size(); ++k) {
-        const Expression power = graph_.apply(Operation::power, x, graph_.constant(static_cast<double>(k)));
-        polynomial = polynomial + graph_.constant(coupling.polynomial[k]) * power;
-      }
-    }
-    rows.emplace_back(length_of(coupling.y) - polynomial, coupling.name);
+  for (int i = 0; i < 3; ++i) {
+    rows.emplace_back(component_of(graph, anchor(0), {axes[i]}) - component_of(graph, anchor(1), {axes[i]}),
+                      fmt::format("{}.{}", connect.name, axes[i]));
   }
+}
+
+ExpressionMatrix rotation_of(ExpressionGraph& graph, const std::string& body) {
+  ExpressionMatrix R;
+  for (int i = 0; i < 3; ++i) {
+    for (int j = 0; j < 3; ++j) {
+      R(i, j) = component_of(graph, fmt::format("body(\"{}\")", body), fmt::format("rot_{}{}", axes[i], axes[j]));
+    }
+  }
+  return R;
+}
+
+void add_weld(const RobotDescription& robot, ExpressionGraph& graph, const RobotDescription::Weld& weld, NamedExpressions& rows) {
+  add_connect(robot, graph, weld.connect, rows);
+  // E = R_12ᵀ R₁ᵀ R₂ is the identity where its skew part vanishes
+  const auto rotation = [&](std::size_t k) { return rotation_of(graph, body_name(robot, weld.connect.bodies[k])); };
+  const ExpressionMatrix E = transposed(constant(graph, weld.rotation)) * (transposed(rotation(0)) * rotation(1));
+  for (int i = 0; i < 3; ++i) {
+    const int j = (i + 1) % 3, k = (i + 2) % 3;
+    rows.emplace_back(E(k, j) - E(j, k), fmt::format("{}.rot_{}", weld.connect.name, axes[i]));
+  }
+}
+
+// between the two sites of a segment
+Expression squared_distance(const RobotDescription& robot, ExpressionGraph& graph,
+                            const RobotDescription::Coupling::Segment& segment) {
+  Expression square = graph.constant(0);
+  for (int i = 0; i < 3; ++i) {
+    const auto at = [&](int site) {
+      return component_of(graph, fmt::format("site(\"{}\")", robot.sites[static_cast<std::size_t>(site)].name), {axes[i]});
+    };
+    const Expression d = at(segment.second) - at(segment.first);
+    square = square + d * d;
+  }
+  return square;
+}
+
+Expression length_of(const RobotDescription& robot, ExpressionGraph& graph, const std::vector<Expression>& q,
+                     const RobotDescription::Coupling::Length& length) {
+  const std::vector<const Joint*> joints = robot.joints();
+  Expression sum = graph.constant(-length.reference);
+  for (const auto& [name, coefficient] : length.joints) {
+    const auto joint =
+        std::find_if(joints.begin(), joints.end(), [&name = name](const Joint* other) { return other->name == name; });
+    sum = sum + graph.constant(coefficient) * q[static_cast<std::size_t>(joint - joints.begin())];
+  }
+  for (const RobotDescription::Coupling::Segment& segment : length.segments) {
+    const Expression square = squared_distance(robot, graph, segment);
+    sum = sum + graph.constant(segment.factor) * graph.apply(Operation::sqrt, square);
+  }
+  return sum;
+}
+
+void add_coupling(const RobotDescription& robot, ExpressionGraph& graph, const std::vector<Expression>& q,
+                  const RobotDescription::Coupling& coupling, NamedExpressions& rows) {
+  Expression polynomial = graph.constant(coupling.polynomial[0]);
+  if (!coupling.x.empty()) {
+    const Expression x = length_of(robot, graph, q, coupling.x.front());
+    for (std::size_t k = 1; k < coupling.polynomial.size(); ++k) {
+      const Expression power = graph.apply(Operation::power, x, graph.constant(static_cast<double>(k)));
+      polynomial = polynomial + graph.constant(coupling.polynomial[k]) * power;
+    }
+  }
+  rows.emplace_back(length_of(robot, graph, q, coupling.y) - polynomial, coupling.name);
+}
+
+}  // namespace
+
+std::vector<std::pair<Expression, std::string>> RobotExpressions::loops() {
+  NamedExpressions rows;
+  for (const RobotDescription::Connect& connect : robot_.connects) add_connect(robot_, graph_, connect, rows);
+  for (const RobotDescription::Weld& weld : robot_.welds) add_weld(robot_, graph_, weld, rows);
+  for (const RobotDescription::Coupling& coupling : robot_.couplings) add_coupling(robot_, graph_, q_, coupling, rows);
   return rows;
 }
 

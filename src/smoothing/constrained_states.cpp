@@ -235,23 +235,101 @@ ConstrainedStates::Linearisation ConstrainedStates::linearise(const VectorXd& st
   return out;
 }
 
-void ConstrainedStates::condition(VectorXd& state, Eigen::Ref<VectorXd> acceleration,
-                                  std::vector<Eigen::Matrix3d>& covariance) const {
-  const Index nq = system_.nq(), n_measured = static_cast<Index>(measured_.size());
-  // measured entries of z are ẑ + W w, w ~ N(0, I)
+namespace {
+
+// W, so that measured entries of z are ẑ + W w, w ~ N(0, I)
+MatrixXd root_of(const std::vector<Eigen::Matrix3d>& covariance, const std::vector<int>& measured, Index nq) {
+  const Index n_measured = static_cast<Index>(measured.size());
   MatrixXd W = MatrixXd::Zero(3 * nq, 3 * n_measured);
   for (Index k = 0; k < n_measured; ++k) {
     const Eigen::Matrix3d root = covariance[static_cast<std::size_t>(k)].llt().matrixL();
     for (Index a = 0; a < 3; ++a) {
-      for (Index b = 0; b <= a; ++b) W(a * nq + measured_[static_cast<std::size_t>(k)], 3 * k + b) = root(a, b);
+      for (Index b = 0; b <= a; ++b) W(a * nq + measured[static_cast<std::size_t>(k)], 3 * k + b) = root(a, b);
     }
   }
+  return W;
+}
+
+// entries of z that are solved for: free coordinates, of whose positions only those that are read
+std::vector<Index> unknown_entries(const std::vector<int>& free, const std::vector<int>& seen, Index nq) {
   std::vector<Index> unknown;
   for (Index a = 0; a < 3; ++a) {
-    for (const int j : free_) {
-      if (a > 0 || std::find(seen_.begin(), seen_.end(), j) != seen_.end()) unknown.push_back(a * nq + j);
+    for (const int j : free) {
+      if (a > 0 || std::find(seen.begin(), seen.end(), j) != seen.end()) unknown.push_back(a * nq + j);
     }
   }
+  return unknown;
+}
+
+// how far measured entries of z are from their estimate; 0 elsewhere
+VectorXd offset_of_measured(const std::vector<int>& measured, const VectorXd& estimate, const VectorXd& z) {
+  const Index nq = z.size() / 3;
+  VectorXd known_off = VectorXd::Zero(3 * nq);
+  for (Index a = 0; a < 3; ++a) {
+    for (const int j : measured) known_off[a * nq + j] = estimate[a * nq + j] - z[a * nq + j];
+  }
+  return known_off;
+}
+
+// factors that bring rows to the units of what was measured, so that rank is a matter of directions
+VectorXd row_scale_of(const MatrixXd& J_measured, const MatrixXd& jacobian) {
+  VectorXd scale = J_measured.rowwise().norm();
+  for (Index i = 0; i < scale.size(); ++i) {
+    if (!(scale[i] > 0)) scale[i] = jacobian.row(i).norm();
+    scale[i] = scale[i] > 0 ? 1 / scale[i] : 0;
+  }
+  return scale;
+}
+
+// A step to the most likely z that meets the linearised constraints, and what they say of w: B w is given.
+struct ConditionedStep {
+  VectorXd step;
+  MatrixXd B;
+  Eigen::CompleteOrthogonalDecomposition<MatrixXd> constraints;  // of B
+};
+
+ConditionedStep conditioned_step(const VectorXd& residual, const MatrixXd& jacobian, const MatrixXd& W,
+                                 const std::vector<Index>& unknown, const VectorXd& known_off) {
+  MatrixXd J_measured = jacobian * W;
+  const VectorXd scale = row_scale_of(J_measured, jacobian);
+  J_measured = scale.asDiagonal() * J_measured;
+  const MatrixXd J_unknown = scale.asDiagonal() * jacobian(Eigen::all, unknown);
+  const MatrixXd U = null_space(J_unknown.transpose());  // combinations of constraints that no unknown enters
+  ConditionedStep out;
+  out.B = U.transpose() * J_measured;
+  const VectorXd wanted = -scale.cwiseProduct(residual + jacobian * known_off);
+  out.constraints = decomposition_of(out.B);
+  const VectorXd w = out.B.rows() > 0 ? VectorXd(out.constraints.solve(U.transpose() * wanted)) : VectorXd::Zero(W.cols());
+  out.step = known_off + W * w;
+  if (!unknown.empty()) {
+    const VectorXd left = wanted - J_measured * w;
+    const VectorXd solved = decomposition_of(J_unknown).solve(left);
+    out.step(unknown) = solved;
+  }
+  return out;
+}
+
+// what the constraints leave of the covariance of each measured coordinate
+void condition_covariance(const ConditionedStep& at, const MatrixXd& W, const std::vector<int>& measured,
+                          std::vector<Eigen::Matrix3d>& covariance) {
+  const Index nq = W.rows() / 3;
+  MatrixXd kept = MatrixXd::Identity(W.cols(), W.cols());
+  if (at.B.rows() > 0) kept -= at.constraints.pseudoInverse() * at.B;
+  const MatrixXd all = W * kept * W.transpose();
+  for (std::size_t k = 0; k < measured.size(); ++k) {
+    for (Index a = 0; a < 3; ++a) {
+      for (Index b = 0; b < 3; ++b) covariance[k](a, b) = all(a * nq + measured[k], b * nq + measured[k]);
+    }
+  }
+}
+
+}  // namespace
+
+void ConstrainedStates::condition(VectorXd& state, Eigen::Ref<VectorXd> acceleration,
+                                  std::vector<Eigen::Matrix3d>& covariance) const {
+  const Index nq = system_.nq();
+  const MatrixXd W = root_of(covariance, measured_, nq);
+  const std::vector<Index> unknown = unknown_entries(free_, seen_, nq);
   approach(state, acceleration);
   VectorXd x = without_blind(state);
   VectorXd z(3 * nq);
@@ -263,48 +341,16 @@ void ConstrainedStates::condition(VectorXd& state, Eigen::Ref<VectorXd> accelera
   double previous = std::numeric_limits<double>::infinity();
   for (int iteration = 0; iteration < max_iterations; ++iteration) {
     x.head(2 * nq) = z.head(2 * nq);
-    Linearisation at = linearise(x, z.tail(nq));
+    const Linearisation at = linearise(x, z.tail(nq));
     if (!at.residual.allFinite() || !at.jacobian.allFinite()) break;
-    MatrixXd J_measured = at.jacobian * W;
-    // rows in the units of what was measured, so that rank is a matter of directions
-    VectorXd scale = J_measured.rowwise().norm();
-    for (Index i = 0; i < scale.size(); ++i) {
-      if (!(scale[i] > 0)) scale[i] = at.jacobian.row(i).norm();
-      scale[i] = scale[i] > 0 ? 1 / scale[i] : 0;
-    }
-    J_measured = scale.asDiagonal() * J_measured;
-    const MatrixXd J_unknown = scale.asDiagonal() * at.jacobian(Eigen::all, unknown);
-    const MatrixXd U = null_space(J_unknown.transpose());  // combinations of constraints that no unknown enters
-    const MatrixXd B = U.transpose() * J_measured;
-    VectorXd known_off = VectorXd::Zero(3 * nq);
-    for (Index a = 0; a < 3; ++a) {
-      for (const int j : measured_) known_off[a * nq + j] = estimate[a * nq + j] - z[a * nq + j];
-    }
-    const VectorXd wanted = -scale.cwiseProduct(at.residual + at.jacobian * known_off);
-    const auto constraints = decomposition_of(B);
-    const VectorXd w = B.rows() > 0 ? VectorXd(constraints.solve(U.transpose() * wanted)) : VectorXd::Zero(3 * n_measured);
-    VectorXd step = known_off + W * w;
-    if (!unknown.empty()) {
-      const VectorXd left = wanted - J_measured * w;
-      const VectorXd solved = decomposition_of(J_unknown).solve(left);
-      step(unknown) = solved;
-    }
-    z += step;
-    const double size = (step.array() / z.array().abs().max(1)).abs().maxCoeff();
+    const VectorXd known_off = offset_of_measured(measured_, estimate, z);
+    const ConditionedStep next = conditioned_step(at.residual, at.jacobian, W, unknown, known_off);
+    z += next.step;
+    const double size = (next.step.array() / z.array().abs().max(1)).abs().maxCoeff();
     if (size <= at_rounding || (size <= converged && size >= previous / 2)) {
       state.head(2 * nq) = z.head(2 * nq);
       acceleration = z.tail(nq);
-      MatrixXd kept = MatrixXd::Identity(3 * n_measured, 3 * n_measured);
-      if (B.rows() > 0) kept -= constraints.pseudoInverse() * B;
-      const MatrixXd all = W * kept * W.transpose();
-      for (Index k = 0; k < n_measured; ++k) {
-        for (Index a = 0; a < 3; ++a) {
-          for (Index b = 0; b < 3; ++b) {
-            const int j = measured_[static_cast<std::size_t>(k)];
-            covariance[static_cast<std::size_t>(k)](a, b) = all(a * nq + j, b * nq + j);
-          }
-        }
-      }
+      condition_covariance(next, W, measured_, covariance);
       for (const int j : blind_) state[system_.layout().q(j)] = std::numeric_limits<double>::quiet_NaN();
       return;
     }

@@ -18,6 +18,7 @@ using Eigen::VectorXd;
 namespace {
 
 constexpr int least_positions = 5;
+constexpr int reach = 3;                     // measurements on either side whose residuals an outlier spoils
 constexpr double median_of_normal = 0.6745;  // of |x|, x standard normal
 
 double square(double x) { return x * x; }
@@ -53,8 +54,8 @@ Roughness roughness_of(const std::vector<Measurement>& all, const std::vector<in
   return out;
 }
 
-/// Measurements above a threshold that stand out most among those within `reach` of them.
-std::vector<int> peaks(const std::vector<double>& sizes, double threshold, int reach) {
+/// Measurements above a threshold that stand out most among those within reach of them.
+std::vector<int> peaks(const std::vector<double>& sizes, double threshold) {
   std::vector<int> out;
   const int n = static_cast<int>(sizes.size());
   for (int k = 0; k < n; ++k) {
@@ -193,10 +194,9 @@ Hindsight hindsight_of(const std::vector<Measurement>& measurements, const std::
   return out;
 }
 
-}  // namespace
-
-SmootherFit fit_smoother(const std::vector<Measurement>& measurements, const SmootherFitOptions& options) {
-  log_likelihood({}, measurements);  // checks them
+/// The measurements that are positions.
+/// @throws InputError when they are too few, or nothing moves.
+std::vector<int> positions_among(const std::vector<Measurement>& measurements) {
   std::vector<int> positions;
   for (std::size_t k = 0; k < measurements.size(); ++k) {
     if (!measurements[k].velocity) positions.push_back(static_cast<int>(k));
@@ -211,20 +211,44 @@ SmootherFit fit_smoother(const std::vector<Measurement>& measurements, const Smo
     throw InputError(fmt::format("fit_smoother: all {} positions are {}: nothing moves, so that there is no smoothness to find",
                                  positions.size(), first));
   }
+  return positions;
+}
 
-  // outliers far above everything else would hide the smaller ones
+/// Leaves out outliers far above everything else, which would hide the smaller ones.
+void drop_gross_errors(const Roughness& roughness, double noise_stddev, double threshold, std::vector<bool>& used) {
   constexpr double gross = 20;
-  constexpr int reach = 3;
+  std::vector<double> sizes(used.size(), 0);
+  for (std::size_t k = 0; k < roughness.measurement.size(); ++k) {
+    sizes[static_cast<std::size_t>(roughness.measurement[k])] = std::abs(roughness.residual[k]) / noise_stddev;
+  }
+  for (const int k : peaks(sizes, std::max(gross, threshold))) used[static_cast<std::size_t>(k)] = false;
+}
+
+/// Leaves out what hindsight distrusts, and takes back, once, what it trusts after all. Returns whether anything changed.
+bool choose_again(std::vector<double> sizes, double threshold, std::vector<bool>& used, std::vector<bool>& taken_back) {
+  bool changed = false;
+  for (std::size_t k = 0; k < sizes.size(); ++k) {
+    if (used[k]) continue;
+    if (sizes[k] <= threshold && !taken_back[k]) used[k] = taken_back[k] = changed = true;
+    sizes[k] = 0;
+  }
+  for (const int k : peaks(sizes, threshold)) {
+    used[static_cast<std::size_t>(k)] = false;
+    changed = true;
+  }
+  return changed;
+}
+
+}  // namespace
+
+SmootherFit fit_smoother(const std::vector<Measurement>& measurements, const SmootherFitOptions& options) {
+  log_likelihood({}, measurements);  // checks them
+  const std::vector<int> positions = positions_among(measurements);
   const Roughness roughness = roughness_of(measurements, positions);
   const SmootherModel rough = rough_model(measurements, positions, roughness, options);
+  const double threshold = options.outlier_threshold;
   std::vector<bool> used(measurements.size(), true);
-  if (options.outlier_threshold > 0) {
-    std::vector<double> sizes(measurements.size(), 0);
-    for (std::size_t k = 0; k < roughness.measurement.size(); ++k) {
-      sizes[static_cast<std::size_t>(roughness.measurement[k])] = std::abs(roughness.residual[k]) / rough.noise_stddev;
-    }
-    for (const int k : peaks(sizes, std::max(gross, options.outlier_threshold), reach)) used[static_cast<std::size_t>(k)] = false;
-  }
+  if (threshold > 0) drop_gross_errors(roughness, rough.noise_stddev, threshold, used);
 
   SmootherFit fit;
   fit.model = rough;
@@ -234,19 +258,7 @@ SmootherFit fit_smoother(const std::vector<Measurement>& measurements, const Smo
   for (int round = 0; round < max_rounds; ++round) {
     maximise(those_used(all, used), rough, options, fit);
     const Hindsight hindsight = hindsight_of(all, used, fit.model);
-    bool changed = false;
-    if (options.outlier_threshold > 0) {
-      std::vector<double> sizes = hindsight.sizes;
-      for (std::size_t k = 0; k < all.size(); ++k) {
-        if (used[k]) continue;
-        if (sizes[k] <= options.outlier_threshold && !taken_back[k]) used[k] = taken_back[k] = changed = true;
-        sizes[k] = 0;
-      }
-      for (const int k : peaks(sizes, options.outlier_threshold, reach)) {
-        used[static_cast<std::size_t>(k)] = false;
-        changed = true;
-      }
-    }
+    bool changed = threshold > 0 && choose_again(hindsight.sizes, threshold, used, taken_back);
     if (options.estimate_time_stddev) {
       for (std::size_t k = 0; k < all.size(); ++k) all[k].rate = hindsight.rates[k];
       changed = changed || round == 0;

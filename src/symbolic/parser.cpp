@@ -18,7 +18,7 @@ using internal::functions;
 
 namespace {
 
-constexpr std::size_t max_length = 65536;
+constexpr std::size_t max_text_length = 65536;
 constexpr int max_depth = 200;
 
 // not <cctype>: these do not depend on the locale
@@ -82,9 +82,9 @@ class Parser {
       : text_(text), graph_(graph), resolve_(resolve), known_names_(known_names) {}
 
   Expression parse() {
-    if (text_.size() > max_length) {
+    if (text_.size() > max_text_length) {
       throw InputError(fmt::format("the expression has {} characters, at most {} are allowed; give its parts names of their own",
-                                   text_.size(), max_length));
+                                   text_.size(), max_text_length));
     }
     skip_space();
     if (at_end()) fail(0, "the expression is empty; write a number, a symbol or a formula such as 2*q1");

@@ -16,7 +16,7 @@ namespace gp2 {
 
 namespace {
 
-constexpr std::size_t max_length = std::size_t{1} << 24;  // characters
+constexpr std::size_t max_written_length = std::size_t{1} << 24;  // characters
 
 /// How tightly a written expression holds together; one that must stand where more is needed gets parentheses.
 enum Binding { in_sum, in_product, in_power, atomic };
@@ -297,9 +297,9 @@ std::string to_string(Expression e, Notation notation) {
     rest.pop_back();
     if (!piece.expression) {
       text += piece.text;
-      if (text.size() > max_length) {
+      if (text.size() > max_written_length) {
         throw InputError(
-            fmt::format("expressions: written out, this one has more than {} characters; print its parts", max_length));
+            fmt::format("expressions: written out, this one has more than {} characters; print its parts", max_written_length));
       }
       continue;
     }

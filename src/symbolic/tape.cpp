@@ -20,48 +20,70 @@ namespace {
 
 constexpr Index block_size = 64;  // points evaluated together
 
-}  // namespace
+using Node = internal::Node;
 
-Tape::Tape(std::span<const Expression> outputs, std::span<const Expression> inputs) : uses_input_(inputs.size(), false) {
-  internal::StepLimit::count(inputs.size() + outputs.size());
-  if (outputs.empty()) return;
-  ExpressionGraph& graph = outputs.front().graph();
-  const std::vector<internal::Node>& nodes = graph.implementation_->nodes;
-
-  std::unordered_map<std::uint32_t, std::uint32_t> input_index;  // by id of the variable
+// by id of the variable
+std::unordered_map<std::uint32_t, std::uint32_t> index_inputs(std::span<const Expression> inputs, const ExpressionGraph& graph) {
+  std::unordered_map<std::uint32_t, std::uint32_t> input_index;
   for (std::size_t i = 0; i < inputs.size(); ++i) {
     if (&inputs[i].graph() != &graph || inputs[i].operation() != Operation::variable) {
       throw InputError(fmt::format("tape: input {} must be a variable of the graph of the outputs", i + 1));
     }
     input_index.emplace(inputs[i].id(), static_cast<std::uint32_t>(i));
   }
+  return input_index;
+}
+
+std::vector<std::uint32_t> roots_of(std::span<const Expression> outputs, const ExpressionGraph& graph) {
   std::vector<std::uint32_t> roots;
   for (const Expression& output : outputs) {
     if (&output.graph() != &graph) throw InputError("tape: all outputs must belong to one graph");
     roots.push_back(output.id());
   }
-  const std::vector<std::uint32_t> order = graph.implementation_->reachable(roots);
+  return roots;
+}
 
-  // the position in `order` at which each value is read last; outputs are kept to the end
-  const auto exponent_of = [&](const internal::Node& node) {
-    const bool constant_exponent = node.operation == Operation::power && nodes[node.b].operation == Operation::constant;
-    return constant_exponent ? internal::small_integer(nodes[node.b].value).value_or(0) : 0;
-  };
-  const auto reads_b = [&](const internal::Node& node) { return internal::is_binary(node.operation) && exponent_of(node) == 0; };
+// of a power with a small constant integer as exponent; else 0
+int exponent_of(const std::vector<Node>& nodes, const Node& node) {
+  const bool constant_exponent = node.operation == Operation::power && nodes[node.b].operation == Operation::constant;
+  return constant_exponent ? internal::small_integer(nodes[node.b].value).value_or(0) : 0;
+}
+
+bool reads_b(const std::vector<Node>& nodes, const Node& node) {
+  return internal::is_binary(node.operation) && exponent_of(nodes, node) == 0;
+}
+
+// the position in `order` at which each value is read last; outputs are kept to the end
+std::unordered_map<std::uint32_t, std::size_t> last_reads(const std::vector<Node>& nodes, const std::vector<std::uint32_t>& order,
+                                                          const std::vector<std::uint32_t>& roots) {
   std::unordered_map<std::uint32_t, std::size_t> last_read;
   for (std::size_t k = 0; k < order.size(); ++k) {
-    const internal::Node& node = nodes[order[k]];
+    const Node& node = nodes[order[k]];
     if (!internal::is_leaf(node.operation)) last_read[node.a] = k;
-    if (reads_b(node)) last_read[node.b] = k;
+    if (reads_b(nodes, node)) last_read[node.b] = k;
   }
   for (const std::uint32_t id : roots) last_read[id] = std::numeric_limits<std::size_t>::max();
+  return last_read;
+}
+
+}  // namespace
+
+Tape::Tape(std::span<const Expression> outputs, std::span<const Expression> inputs) : uses_input_(inputs.size(), false) {
+  internal::StepLimit::count(inputs.size() + outputs.size());
+  if (outputs.empty()) return;
+  ExpressionGraph& graph = outputs.front().graph();
+  const std::vector<Node>& nodes = graph.implementation_->nodes;
+  const std::unordered_map<std::uint32_t, std::uint32_t> input_index = index_inputs(inputs, graph);
+  const std::vector<std::uint32_t> roots = roots_of(outputs, graph);
+  const std::vector<std::uint32_t> order = graph.implementation_->reachable(roots);
+  const std::unordered_map<std::uint32_t, std::size_t> last_read = last_reads(nodes, order, roots);
 
   // one slot per constant and input; those of intermediate values are used again after their last read
   std::unordered_map<std::uint32_t, std::uint32_t> slots;
   std::vector<std::uint32_t> free_slots;
   for (std::size_t k = 0; k < order.size(); ++k) {
     const std::uint32_t id = order[k];
-    const internal::Node& node = nodes[id];
+    const Node& node = nodes[id];
     if (!last_read.contains(id)) continue;  // the exponent of an integer power
     if (node.operation == Operation::variable) {
       const auto index = input_index.find(id);
@@ -81,8 +103,8 @@ Tape::Tape(std::span<const Expression> outputs, std::span<const Expression> inpu
       const std::uint32_t result = free_slots.back();
       free_slots.pop_back();
       slots[id] = result;
-      const std::uint32_t operand_b = reads_b(node) ? node.b : node.a;
-      instructions_.push_back({node.operation, exponent_of(node), result, slots.at(node.a), slots.at(operand_b)});
+      const std::uint32_t operand_b = reads_b(nodes, node) ? node.b : node.a;
+      instructions_.push_back({node.operation, exponent_of(nodes, node), result, slots.at(node.a), slots.at(operand_b)});
       const auto release = [&](std::uint32_t operand) {
         if (last_read.at(operand) == k && !internal::is_leaf(nodes[operand].operation)) free_slots.push_back(slots.at(operand));
       };

@@ -135,7 +135,7 @@ VectorXd usable_spreads(VectorXd spreads, const MatrixXd& features) {
 
 // σ_j, M_jj σ_j, or of directions of its own σ̄ / rms(E column)
 VectorXd signal_scales(const Latent& latent, const MatrixXd& directions, const VectorXd& mass_diagonal, const VectorXd& sigma) {
-  if (latent.directions_are_identity) {
+  if (!latent.directions) {
     return latent.base == Latent::Base::force ? VectorXd(mass_diagonal.cwiseProduct(sigma)) : sigma;
   }
   VectorXd signal(latent.size());

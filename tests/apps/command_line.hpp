@@ -4,9 +4,11 @@
 #include <filesystem>
 #include <stdexcept>
 #include <string>
+#include <vector>
 
 #include <sys/wait.h>
 
+#include <Eigen/Core>
 #include <nlohmann/json.hpp>
 
 #include "gp2/data/csv.hpp"
@@ -69,6 +71,17 @@ inline std::string replaced(std::string text, const std::string& from, const std
     throw std::runtime_error("'" + from + "' must stand once in the text");
   }
   return text.replace(place, from.size(), to);
+}
+
+/// Columns of a table by their names (names × rows).
+inline Eigen::MatrixXd columns(const CsvTable& table, const std::vector<std::string>& names) {
+  Eigen::MatrixXd values(static_cast<Eigen::Index>(names.size()), table.n_rows());
+  for (std::size_t k = 0; k < names.size(); ++k) {
+    const int column = table.find(names[k]);
+    if (column < 0) throw std::runtime_error("no column " + names[k]);
+    for (int i = 0; i < table.n_rows(); ++i) values(static_cast<Eigen::Index>(k), i) = table.number(i, column);
+  }
+  return values;
 }
 
 }  // namespace gp2::test

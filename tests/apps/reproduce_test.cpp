@@ -510,7 +510,8 @@ TEST_F(Reproduce, WhatIsAskedForMustExist) {
   EXPECT_THAT(refusal("table1 --data nowhere -o out"), HasSubstr("--data: there is no folder 'nowhere'"));
   EXPECT_THAT(refusal("table1 --experiments nowhere -o out"), HasSubstr("--experiments: there is no folder 'nowhere'"));
   EXPECT_THAT(refusal("table1 --experiments small --runs 0 -o out"), HasSubstr("--runs: must be positive, got 0"));
-  EXPECT_THAT(refusal("table1 --threads -1 -o out"), HasSubstr("--threads: must be positive, or 0 for as many as the machine has; got -1"));
+  EXPECT_THAT(refusal("table1 --threads -1 -o out"),
+              HasSubstr("--threads: must be positive, or 0 for as many as the machine has; got -1"));
   EXPECT_THAT(refusal("table1"), HasSubstr("--output"));
   desk.write("file", "");
   EXPECT_THAT(refusal("table1 --experiments small -o file"), HasSubstr("-o file: the folder cannot be made: "));

@@ -10,21 +10,10 @@
 namespace gp2::test {
 namespace {
 
-using Eigen::Index;
 using Eigen::MatrixXd;
 using testing::AllOf;
 using testing::ElementsAre;
 using testing::HasSubstr;
-
-MatrixXd columns(const CsvTable& table, const std::vector<std::string>& names) {
-  MatrixXd values(static_cast<Index>(names.size()), table.n_rows());
-  for (std::size_t k = 0; k < names.size(); ++k) {
-    const int column = table.find(names[k]);
-    if (column < 0) throw std::runtime_error("no column " + names[k]);
-    for (int i = 0; i < table.n_rows(); ++i) values(static_cast<Index>(k), i) = table.number(i, column);
-  }
-  return values;
-}
 
 class Transfer : public testing::Test {
  protected:

@@ -10,6 +10,7 @@
 #include "gp2/fit.hpp"
 #include "gp2/predictor.hpp"
 #include "inference/problems.hpp"
+#include "input_error.hpp"
 
 // A massless coordinate is learned from, and predicts, as a model that does without it.
 namespace gp2 {
@@ -24,8 +25,6 @@ using testing::HasSubstr;
 using Status = Predictor::Status;
 
 constexpr std::uint64_t seed = 50606;
-
-double largest(const MatrixXd& matrix) { return matrix.size() == 0 ? 0 : matrix.cwiseAbs().maxCoeff(); }
 
 // models/massless_rod.toml with what is unknown at the hinge alone, and the pendulum that it is
 const Model& rod() {
@@ -97,12 +96,13 @@ TEST(MasslessCoordinate, HasTheLikelihoodTheGradientTheFitAndThePredictionsOfThe
   // both are the same numbers, rounded on other ways: ε times the condition of K̃ + I, below 30 (0.3/0.2)²
   const double rounding = 1e5 * eps;
   EXPECT_NEAR(nll, expected_nll, rounding * std::abs(nll));
-  EXPECT_LE(largest(gradient.log_kernel[0] - expected.log_kernel[0]), rounding * (1 + largest(expected.log_kernel[0])));
-  EXPECT_LE(largest(gradient.log_signal_stddev[0] - expected.log_signal_stddev[0]),
-            rounding * (1 + largest(expected.log_signal_stddev[0])));
-  EXPECT_LE(largest(gradient.log_noise_stddev[0] - expected.log_noise_stddev[0]),
-            rounding * (1 + largest(expected.log_noise_stddev[0])));
-  EXPECT_LE(largest(gradient.parameters - expected.parameters), rounding * (1 + largest(expected.parameters)));
+  EXPECT_LE(test::largest(gradient.log_kernel[0] - expected.log_kernel[0]),
+            rounding * (1 + test::largest(expected.log_kernel[0])));
+  EXPECT_LE(test::largest(gradient.log_signal_stddev[0] - expected.log_signal_stddev[0]),
+            rounding * (1 + test::largest(expected.log_signal_stddev[0])));
+  EXPECT_LE(test::largest(gradient.log_noise_stddev[0] - expected.log_noise_stddev[0]),
+            rounding * (1 + test::largest(expected.log_noise_stddev[0])));
+  EXPECT_LE(test::largest(gradient.parameters - expected.parameters), rounding * (1 + test::largest(expected.parameters)));
   EXPECT_GT(expected.parameters.cwiseAbs().minCoeff(), 0.01);
 
   // fitted from the same start within the same bounds
@@ -118,8 +118,8 @@ TEST(MasslessCoordinate, HasTheLikelihoodTheGradientTheFitAndThePredictionsOfThe
   const MatrixXd states = test::draw(rod(), 20, seed + 1).states;
   const Posterior::Marginal marginal = fitted.posterior.marginal(here.view(), states);
   const Posterior::Marginal other = fitted_without.posterior.marginal(there.view(), of_pendulum(states));
-  EXPECT_LE(largest(marginal.mean - other.mean), 1e-4 * (1 + largest(other.mean)));
-  EXPECT_LE(largest(marginal.stddev() - other.stddev()), 1e-4);
+  EXPECT_LE(test::largest(marginal.mean - other.mean), 1e-4 * (1 + test::largest(other.mean)));
+  EXPECT_LE(test::largest(marginal.stddev() - other.stddev()), 1e-4);
 }
 
 // everything observed that can be, with the model's own prior on all three forces
@@ -199,7 +199,7 @@ TEST(MasslessCoordinate, IsPredictedByThePredictorAsByThePosteriorAndDifferentia
         for (const VectorXd state : p.queries.colwise()) {
           const Posterior::Marginal expected = posterior.marginal(view, state);
           ASSERT_EQ(predictor.mean_and_stddev(state, got, stddev, workspace), Status::ok);
-          EXPECT_LE(largest(got - expected.mean), 1e4 * eps * (1 + largest(expected.mean)));
+          EXPECT_LE(test::largest(got - expected.mean), 1e4 * eps * (1 + test::largest(expected.mean)));
           const MatrixXd prior = posterior.without_data().marginal(view, state).stddev();
           for (Index r = 0; r < 3; ++r) {
             EXPECT_NEAR(stddev[r] * stddev[r], expected.covariance(4 * r, 0), 1e4 * eps * (prior(r) * prior(r) + eps));
@@ -278,18 +278,10 @@ TEST(MasslessCoordinate, WithAPriorOnTheAccelerationThereIsNoPosterior) {
   const Observations group = test::observe(model, View::all(Quantity::constrained_acceleration, *model.system),
                                            test::draw(model, 5, seed).states, random);
   const ModelValues values = test::random_values(prior, {group}, random);
-  try {
-    Posterior(prior, {group}, values);
-    FAIL() << "no error";
-  } catch (const InputError& error) {
-    EXPECT_THAT(error.what(), HasSubstr("M is singular, so that there is no M⁻¹, but the latent 'unknown force' acts on"));
-  }
-  try {
-    const Likelihood likelihood(prior, {group}, values, {});
-    FAIL() << "no error";
-  } catch (const InputError& error) {
-    EXPECT_THAT(error.what(), HasSubstr("at state 1 (x = "));
-  }
+  EXPECT_THAT(test::input_error_of([&] { Posterior(prior, {group}, values); }),
+              HasSubstr("M is singular, so that there is no M⁻¹, but the latent 'unknown force' acts on"));
+  EXPECT_THAT(test::input_error_of([&] { const Likelihood likelihood(prior, {group}, values, {}); }),
+              HasSubstr("at state 1 (x = "));
 }
 
 }  // namespace

@@ -29,7 +29,7 @@ struct Counted {
       };
       return std::make_shared<const CallableSystem>(definition);
     };
-    const Model model = Model::parse(test::surface_without_mechanics(), "surface.toml", counting_surface);
+    const Model model = Model::parse(test::surface_without_mechanics(), "surface.toml", {counting_surface});
     prior = make_prior(model);
     const GeneratedData data = generate(model, {20, 1, VectorXd::Constant(3, 0.1)});
     observations.push_back(

@@ -6,6 +6,7 @@
 #include "gp2/error.hpp"
 #include "gp2/inference/evaluation.hpp"
 #include "inference/sampling.hpp"
+#include "input_error.hpp"
 
 namespace gp2 {
 namespace {
@@ -190,28 +191,18 @@ TEST(PathwiseTest, ManyFeaturesMakeASampleGaussian) {
   EXPECT_NEAR(fourth / (squares * squares), 3, 5 * std::sqrt(96.0 / paths.n_samples()));
 }
 
-template <typename Call>
-std::string message_of(const Call& call) {
-  try {
-    call();
-  } catch (const InputError& error) {
-    return error.what();
-  }
-  return "";
-}
-
 TEST(PathwiseTest, RefusesWhatMakesNoSense) {
   const Posterior posterior = test::surface_posterior(seed);
   const View ddq = View::all(Quantity::constrained_acceleration, surface());
-  EXPECT_THAT(message_of([&] { static_cast<void>(sample_paths(posterior, 0)); }),
+  EXPECT_THAT(test::input_error_of([&] { static_cast<void>(sample_paths(posterior, 0)); }),
               AllOf(HasSubstr("n_samples must be 1 or more"), HasSubstr("got 0")));
-  EXPECT_THAT(message_of([&] {
+  EXPECT_THAT(test::input_error_of([&] {
                 static_cast<void>(sample_paths(posterior, 1, {0, 1}));
               }),
               AllOf(HasSubstr("n_features must be 1 or more"), HasSubstr("got 0")));
   const PathwiseSamples paths = sample_paths(posterior, 2, {10, 1});
   for (const int sample : {-1, 2}) {
-    EXPECT_THAT(message_of([&] { static_cast<void>(paths.evaluate(sample, ddq, surface_states(1))); }),
+    EXPECT_THAT(test::input_error_of([&] { static_cast<void>(paths.evaluate(sample, ddq, surface_states(1))); }),
                 AllOf(HasSubstr(fmt::format("sample {}", sample)), HasSubstr("there are 2 samples")));
   }
 }

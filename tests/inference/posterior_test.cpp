@@ -32,8 +32,6 @@ std::vector<View> views_of(const Problem& p) {
   return views;
 }
 
-double largest(const MatrixXd& matrix) { return matrix.size() == 0 ? 0 : matrix.cwiseAbs().maxCoeff(); }
-
 // ε times the condition number of K̃ + I, after mechanics with κ(M) of some hundreds
 double rounding(const Problem& p) { return 1e4 * test::eps * test::condition(p); }
 
@@ -44,8 +42,8 @@ TEST(PosteriorTest, IsTheTextbookGaussianProcess) {
       SCOPED_TRACE(fmt::format("{}, view {}×{}, seed {}", p.name, view.quantity->word(), view.size(), seed));
       const auto [mean, covariance] = test::dense_posterior(p, view, p.queries);
       const Posterior::Joint joint = posterior.joint(view, p.queries);
-      EXPECT_LE(largest(joint.mean - mean), rounding(p) * (1 + largest(mean)));
-      EXPECT_LE(largest(joint.covariance - covariance), rounding(p) * (1 + largest(covariance)));
+      EXPECT_LE(test::largest(joint.mean - mean), rounding(p) * (1 + test::largest(mean)));
+      EXPECT_LE(test::largest(joint.covariance - covariance), rounding(p) * (1 + test::largest(covariance)));
       EXPECT_LT(rounding(p), 1e-6) << "too badly conditioned to test anything";
     }
   }
@@ -64,7 +62,7 @@ TEST(PosteriorTest, TheLatentsAddUpToTheWhole) {
       view.latent = static_cast<int>(a);
       sum += posterior.mean(view, p.queries);
     }
-    EXPECT_LE(largest(sum - whole), 1e-13 * (1 + largest(whole) + largest(sum)));
+    EXPECT_LE(test::largest(sum - whole), 1e-13 * (1 + test::largest(whole) + test::largest(sum)));
   }
 }
 
@@ -77,10 +75,12 @@ TEST(PosteriorTest, MarginalsAreTheDiagonalBlocksOfTheJoint) {
       const Posterior::Marginal marginal = posterior.marginal(view, p.queries);
       const Index d = view.size();
       EXPECT_EQ(posterior.mean(view, p.queries), marginal.mean);
-      const double tolerance = rounding(p) * (1 + largest(joint.covariance));
+      const double tolerance = rounding(p) * (1 + test::largest(joint.covariance));
       for (Index i = 0; i < p.queries.cols(); ++i) {
-        EXPECT_LE(largest(joint.mean.segment(i * d, d) - marginal.mean.col(i)), rounding(p) * (1 + largest(marginal.mean)));
-        EXPECT_LE(largest(joint.covariance.block(i * d, i * d, d, d) - marginal.covariance.col(i).reshaped(d, d)), tolerance);
+        EXPECT_LE(test::largest(joint.mean.segment(i * d, d) - marginal.mean.col(i)),
+                  rounding(p) * (1 + test::largest(marginal.mean)));
+        EXPECT_LE(test::largest(joint.covariance.block(i * d, i * d, d, d) - marginal.covariance.col(i).reshaped(d, d)),
+                  tolerance);
         for (Index k = 0; k < d; ++k) {
           EXPECT_NEAR(marginal.stddev()(k, i) * marginal.stddev()(k, i), std::max(0.0, joint.covariance(i * d + k, i * d + k)),
                       tolerance);
@@ -101,8 +101,8 @@ TEST(PosteriorTest, MarginalsDoNotDependOnHowManyStatesAreAskedForAtOnce) {
   const Posterior::Marginal at_once = posterior.marginal(view, many);
   for (Index i : {Index{0}, Index{63}, Index{64}, Index{149}}) {
     const Posterior::Marginal alone = posterior.marginal(view, many.col(i));
-    EXPECT_LE(largest(at_once.mean.col(i) - alone.mean), rounding(p) * (1 + largest(alone.mean)));
-    EXPECT_LE(largest(at_once.covariance.col(i) - alone.covariance), rounding(p) * (1 + largest(alone.covariance)));
+    EXPECT_LE(test::largest(at_once.mean.col(i) - alone.mean), rounding(p) * (1 + test::largest(alone.mean)));
+    EXPECT_LE(test::largest(at_once.covariance.col(i) - alone.covariance), rounding(p) * (1 + test::largest(alone.covariance)));
   }
 }
 
@@ -128,14 +128,15 @@ TEST(PosteriorTest, ObeysTheConstraintInMeanAndCovariance) {
       // rows count by their own size
       const VectorXd size = A.rowwise().norm().cwiseMax(1e-300);
       const VectorXd error = (A * marginal.mean.col(i) - b).cwiseQuotient(size);
-      EXPECT_LE(largest(error),
-                tolerance * (1 + largest(marginal.mean.col(i)) + largest(a_bar.col(i)) + largest(b.cwiseQuotient(size))));
+      EXPECT_LE(test::largest(error), tolerance * (1 + test::largest(marginal.mean.col(i)) + test::largest(a_bar.col(i)) +
+                                                   test::largest(b.cwiseQuotient(size))));
       const MatrixXd A_unit = size.cwiseInverse().asDiagonal() * A;
-      EXPECT_LE(largest(A_unit * marginal.covariance.col(i).reshaped(nq, nq) * A_unit.transpose()),
-                tolerance * (1 + largest(marginal.covariance.col(i)) + largest(a_bar_variance.col(i))));
+      EXPECT_LE(test::largest(A_unit * marginal.covariance.col(i).reshaped(nq, nq) * A_unit.transpose()),
+                tolerance * (1 + test::largest(marginal.covariance.col(i)) + test::largest(a_bar_variance.col(i))));
       A_all.block(i * system.nc(), i * nq, system.nc(), nq) = A_unit;
     }
-    EXPECT_LE(largest(A_all * joint.covariance), tolerance * (1 + largest(joint.covariance) + largest(a_bar_variance)));
+    EXPECT_LE(test::largest(A_all * joint.covariance),
+              tolerance * (1 + test::largest(joint.covariance) + test::largest(a_bar_variance)));
   }
 }
 
@@ -152,8 +153,8 @@ TEST(PosteriorTest, FarFromTheDataIsThePrior) {
       const VectorXd mean = prior.mean.cast<double>();
       const MatrixXd covariance = test::dense_covariance(p.prior, p.values, prior, prior).cast<double>();
       const Posterior::Joint joint = Posterior(p.prior, p.observations, p.values).joint(view, far);
-      EXPECT_LE(largest(joint.mean - mean), 1e5 * test::eps * (1 + largest(mean)));
-      EXPECT_LE(largest(joint.covariance - covariance), 1e5 * test::eps * (1 + largest(covariance)));
+      EXPECT_LE(test::largest(joint.mean - mean), 1e5 * test::eps * (1 + test::largest(mean)));
+      EXPECT_LE(test::largest(joint.covariance - covariance), 1e5 * test::eps * (1 + test::largest(covariance)));
     }
   }
 }
@@ -171,7 +172,7 @@ TEST(PosteriorTest, MeetsItsDataAsTheNoiseVanishes) {
       RandomStream same(seed);
       ModelValues values = test::random_values(prior, observations, same);
       const Posterior posterior(prior, observations, values);
-      const double error = largest(posterior.mean(view, data.states) - data.accelerations);
+      const double error = test::largest(posterior.mean(view, data.states) - data.accelerations);
       // the smoother leaves S (K + S)⁻¹ (y − m); the observations' own covariance stands on some 1e-3 at least
       EXPECT_LT(error, 1e5 * noise * noise + 1e-9) << file << ", noise " << noise;
       EXPECT_LT(error, previous);
@@ -193,8 +194,8 @@ TEST(PosteriorTest, LearnsAnAccelerationThatWasNeverMeasured) {
   const Posterior posterior(prior, observations, test::random_values(prior, observations, random));
   const MatrixXd mean = posterior.mean(View::all(Quantity::constrained_acceleration, *model.system), data.states);
   // ddq3 = −(A₁ ddq1 + A₂ ddq2 − b)/A₃ carries their errors, times slopes of the surface below one
-  const double measured_error = largest((mean - data.accelerations).topRows(2));
-  EXPECT_LE(largest((mean - data.accelerations).row(2)), 2 * measured_error + 1e-12);
+  const double measured_error = test::largest((mean - data.accelerations).topRows(2));
+  EXPECT_LE(test::largest((mean - data.accelerations).row(2)), 2 * measured_error + 1e-12);
   EXPECT_LE(measured_error, 1e-4);
 }
 

@@ -12,6 +12,7 @@
 #include "gp2/error.hpp"
 #include "gp2/mechanics/state_evaluator.hpp"
 #include "inference/sampling.hpp"
+#include "input_error.hpp"
 
 // One state at a time must give what a posterior gives for many.
 namespace gp2 {
@@ -445,41 +446,35 @@ TEST(PredictorTest, TellsWhatIsWrongWithAStateAndGoesOn) {
   EXPECT_TRUE(mean.array().isNaN().all() && jacobian.array().isNaN().all());
 }
 
-template <typename Call>
-std::string error_of(const Call& call) {
-  try {
-    call();
-  } catch (const InputError& error) {
-    return error.what();
-  }
-  return "";
-}
-
 TEST(PredictorTest, NamesWhatIsWrongWithAnArgument) {
   const Posterior posterior = test::surface_posterior(seed);
   const System& system = *posterior.prior().system;
-  EXPECT_EQ(error_of([&] { Predictor(posterior, View::all(Quantity::next_velocity, system)); }),
+  EXPECT_EQ(test::input_error_of([&] { Predictor(posterior, View::all(Quantity::next_velocity, system)); }),
             "view 'next-velocity' needs a time step");
-  EXPECT_THAT(error_of([&] { Predictor(posterior, {.rows = {3}}); }), HasSubstr("rows of the view are 0 … 2, got 3"));
-  EXPECT_THAT(error_of([&] { Predictor(posterior, {.rows = {0}, .latent = 1}); }), HasSubstr("1 latents, numbered from 0"));
+  EXPECT_THAT(test::input_error_of([&] { Predictor(posterior, {.rows = {3}}); }), HasSubstr("rows of the view are 0 … 2, got 3"));
+  EXPECT_THAT(test::input_error_of([&] { Predictor(posterior, {.rows = {0}, .latent = 1}); }),
+              HasSubstr("1 latents, numbered from 0"));
   const Predictor bare(posterior, View::all(Quantity::constrained_acceleration, system), {.stddev = false, .jacobian = false});
   const Predictor other(posterior);
   Predictor::Workspace workspace = bare.make_workspace();
   VectorXd state = VectorXd::Zero(system.layout().size()), mean(3), stddev(3), two(2), short_state(2);
   MatrixXd jacobian(3, state.size()), narrow(3, 2), low(2, state.size());
   const auto ignore = [](Status) {};
-  EXPECT_THAT(error_of([&] { ignore(bare.mean_and_stddev(state, mean, stddev, workspace)); }), HasSubstr("Options::stddev"));
-  EXPECT_THAT(error_of([&] { ignore(bare.mean_and_jacobian(state, mean, jacobian, workspace)); }),
+  EXPECT_THAT(test::input_error_of([&] { ignore(bare.mean_and_stddev(state, mean, stddev, workspace)); }),
+              HasSubstr("Options::stddev"));
+  EXPECT_THAT(test::input_error_of([&] { ignore(bare.mean_and_jacobian(state, mean, jacobian, workspace)); }),
               HasSubstr("Options::jacobian"));
-  EXPECT_THAT(error_of([&] { ignore(other.mean(state, mean, workspace)); }), HasSubstr("the workspace is of another predictor"));
-  EXPECT_THAT(error_of([&] { ignore(bare.mean(short_state, mean, workspace)); }), HasSubstr("a state is of size 10, got 2"));
-  EXPECT_THAT(error_of([&] { ignore(bare.mean(state, two, workspace)); }), HasSubstr("the mean is of size 3, got 2"));
+  EXPECT_THAT(test::input_error_of([&] { ignore(other.mean(state, mean, workspace)); }),
+              HasSubstr("the workspace is of another predictor"));
+  EXPECT_THAT(test::input_error_of([&] { ignore(bare.mean(short_state, mean, workspace)); }),
+              HasSubstr("a state is of size 10, got 2"));
+  EXPECT_THAT(test::input_error_of([&] { ignore(bare.mean(state, two, workspace)); }), HasSubstr("the mean is of size 3, got 2"));
   Predictor::Workspace full = other.make_workspace();
-  EXPECT_THAT(error_of([&] { ignore(other.mean_and_stddev(state, mean, two, full)); }),
+  EXPECT_THAT(test::input_error_of([&] { ignore(other.mean_and_stddev(state, mean, two, full)); }),
               HasSubstr("the standard deviation is of size 3, got 2"));
-  EXPECT_THAT(error_of([&] { ignore(other.mean_and_jacobian(state, mean, low, full)); }),
+  EXPECT_THAT(test::input_error_of([&] { ignore(other.mean_and_jacobian(state, mean, low, full)); }),
               HasSubstr("a column of the Jacobian is of size 3, got 2"));
-  EXPECT_THAT(error_of([&] { ignore(other.mean_and_jacobian(state, mean, narrow, full)); }),
+  EXPECT_THAT(test::input_error_of([&] { ignore(other.mean_and_jacobian(state, mean, narrow, full)); }),
               HasSubstr("a row of the Jacobian is of size 10, got 2"));
   workspace = std::move(full);
   EXPECT_EQ(other.mean(state, mean, workspace), Status::ok);

@@ -3,6 +3,7 @@
 #include "gp2/error.hpp"
 #include "gp2/inference/evaluation.hpp"
 #include "inference/sampling.hpp"
+#include "input_error.hpp"
 #include "observations_testing.hpp"
 
 // Observations whose values have a noise each.
@@ -198,15 +199,10 @@ TEST(ValueNoiseTest, AnEvaluationMeasuresByTheUsualNoise) {
 
 TEST(ValueNoiseTest, AScaleOfTheWrongShapeOrSignIsRefused) {
   const Problem p = problems().front();
-  const auto refused = [&](const auto& change) -> std::string {
+  const auto refused = [&](const auto& change) {
     MatrixXd scale = p.observations[0].noise().scale();
     change(scale);
-    try {
-      static_cast<void>(test::with_scale(p.observations[0], scale));
-    } catch (const InputError& error) {
-      return error.what();
-    }
-    return "";
+    return test::input_error_of([&] { test::with_scale(p.observations[0], scale); });
   };
   const Index d = p.observations[0].values().rows(), n = p.observations[0].values().cols();
   EXPECT_EQ(refused([&](MatrixXd& scale) { scale = MatrixXd::Ones(d, n - 1); }),

@@ -9,7 +9,9 @@
 #include <gtest/gtest.h>
 
 #include "gp2/error.hpp"
+#include "input_error.hpp"
 #include "smoothing/simulated_logs.hpp"
+#include "test_models.hpp"
 
 namespace gp2::test {
 namespace {
@@ -63,8 +65,6 @@ CsvTable cart_log(
   return CsvTable::from_cells("log.csv", std::move(header), std::move(cells));
 }
 
-double largest(const MatrixXd& values) { return values.cwiseAbs().maxCoeff(); }
-
 TEST(Derive, CompletesDependentCoordinatesFromTheConstraints) {
   const SimulatedLog log = short_log();
   const DerivedData data = derive(pendulum(), log.table);
@@ -75,16 +75,16 @@ TEST(Derive, CompletesDependentCoordinatesFromTheConstraints) {
   EXPECT_THAT(data.notes, Contains(HasSubstr("from the constraints: q1, q2, q4, q5")));
   EXPECT_EQ(data.states.cols(), 500);
   const VectorXd parameters = system.parameter_values();
-  EXPECT_LE(largest(system.residuals(data.states, parameters)), 1e-12);
+  EXPECT_LE(test::largest(system.residuals(data.states, parameters)), 1e-12);
   const SystemValues values = system.evaluate(data.states, parameters);
   for (int i = 0; i < data.states.cols(); ++i) {
-    EXPECT_LE(largest(values.A(i) * data.accelerations.col(i) - values.b(i)), 1e-11);
+    EXPECT_LE(test::largest(values.A(i) * data.accelerations.col(i) - values.b(i)), 1e-11);
   }
   // and they are those of the motion
   const Trajectory& truth = log.episodes[1];
   for (Index i = 20; i < 230; ++i) {
-    EXPECT_LE(largest(data.states.col(250 + i).head(12) - truth.states.col(i).head(12)), 0.01);
-    EXPECT_LE(largest(data.accelerations.col(250 + i) - truth.accelerations.col(i)), 1.5);
+    EXPECT_LE(test::largest(data.states.col(250 + i).head(12) - truth.states.col(i).head(12)), 0.01);
+    EXPECT_LE(test::largest(data.accelerations.col(250 + i) - truth.accelerations.col(i)), 1.5);
   }
 }
 
@@ -130,10 +130,11 @@ TEST(Derive, ConstraintsAmongMeasuredCoordinatesAreHeldAndMakeThemMoreExact) {
   EXPECT_EQ(held.independent.size(), 2U);
 
   const VectorXd parameters = system.parameter_values();
-  EXPECT_GT(largest(system.residuals(free.states, parameters)), 1e-6);
-  EXPECT_LE(largest(system.residuals(held.states, parameters)), 1e-11);
+  EXPECT_GT(test::largest(system.residuals(free.states, parameters)), 1e-6);
+  EXPECT_LE(test::largest(system.residuals(held.states, parameters)), 1e-11);
   const SystemValues values = system.evaluate(held.states, parameters);
-  for (int i = 0; i < held.states.cols(); ++i) EXPECT_LE(largest(values.A(i) * held.accelerations.col(i) - values.b(i)), 1e-8);
+  for (int i = 0; i < held.states.cols(); ++i)
+    EXPECT_LE(test::largest(values.A(i) * held.accelerations.col(i) - values.b(i)), 1e-8);
 
   const auto inner = [](const MatrixXd& all) { return all.middleCols(15, all.cols() - 30); };
   EXPECT_LT(inner(held.accelerations - truth.accelerations).norm(), 0.8 * inner(free.accelerations - truth.accelerations).norm());
@@ -154,8 +155,8 @@ TEST(Derive, OfRedundantAndMissingCoordinatesTheConstraintsAreHeld) {
   }
   const CsvTable log = CsvTable::from_cells("log", {"t", "q1", "q3", "q6"}, cells);
   const DerivedData held = derive(pendulum(), log, {.hold_constraints = true});
-  EXPECT_LE(largest(pendulum().system->residuals(held.states, pendulum().system->parameter_values())), 1e-11);
-  EXPECT_LE(largest(held.states.col(100).head(12) - truth.states.col(100).head(12)), 0.01);
+  EXPECT_LE(test::largest(pendulum().system->residuals(held.states, pendulum().system->parameter_values())), 1e-11);
+  EXPECT_LE(test::largest(held.states.col(100).head(12) - truth.states.col(100).head(12)), 0.01);
   EXPECT_THAT([&] { derive(pendulum(), log); },
               testing::ThrowsMessage<InputError>(
                   HasSubstr("1 of the constraints holds among the measured coordinates alone, which noise contradicts, "
@@ -270,13 +271,8 @@ TEST(Derive, AShortEpisodeTakesTheModelOfTheOthers) {
 }
 
 TEST(Derive, SaysWhatIsWrongWithALog) {
-  const auto fault = [](const CsvTable& log, const DeriveOptions& options = {}, const Model& model = cart()) -> std::string {
-    try {
-      derive(model, log, options);
-    } catch (const InputError& error) {
-      return error.what();
-    }
-    return "nothing";
+  const auto fault = [](const CsvTable& log, const DeriveOptions& options = {}, const Model& model = cart()) {
+    return test::input_error_of([&] { derive(model, log, options); });
   };
   const auto edit = [](auto change) { return cart_log([=](std::vector<Row>& rows) { change(rows); }); };
 

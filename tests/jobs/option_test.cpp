@@ -6,6 +6,7 @@
 
 #include "gp2/error.hpp"
 #include "gp2/jobs/fit_job.hpp"
+#include "input_error.hpp"
 
 namespace gp2 {
 namespace {
@@ -80,12 +81,7 @@ TEST(Options, ReadBackAreThoseThatWereWritten) {
 
 std::string refusal(const std::string& text) {
   FitRequest request;
-  try {
-    read_options(text, options(request), "fit.json");
-  } catch (const InputError& error) {
-    return error.what();
-  }
-  return "";
+  return test::input_error_of([&] { read_options(text, options(request), "fit.json"); });
 }
 
 TEST(Options, OfAnotherKindAreRefusedByName) {

@@ -10,6 +10,7 @@
 #include "gp2/mechanics/check.hpp"
 #include "gp2/mechanics/state_evaluator.hpp"
 #include "gp2/simulate.hpp"
+#include "input_error.hpp"
 #include "test_models.hpp"
 
 // Mechanics given as functions against the same given as text.
@@ -60,16 +61,6 @@ void expect_close(const MatrixXd& got, const MatrixXd& expected, double toleranc
   ASSERT_EQ(got.cols(), expected.cols());
   ASSERT_TRUE(got.allFinite());
   EXPECT_LE((got - expected).cwiseAbs().maxCoeff(), tolerance * (1 + expected.cwiseAbs().maxCoeff()));
-}
-
-template <class F>
-std::string error_of(F f) {
-  try {
-    f();
-  } catch (const InputError& error) {
-    return error.what();
-  }
-  return "";
 }
 
 TEST(CallableSystemTest, HasTheNumbersOfTheSameSystemAsText) {
@@ -274,7 +265,7 @@ TEST(CallableSystemTest, DefinitionsThatMeanNothingAreRefused) {
   const auto refused = [](const std::function<void(CallableSystem::Definition&)>& spoil) {
     CallableSystem::Definition spoilt = definition();
     spoil(spoilt);
-    return error_of([&] { CallableSystem{spoilt}; });
+    return test::input_error_of([&] { CallableSystem{spoilt}; });
   };
   EXPECT_EQ(refused([](auto& d) { d.evaluate = nullptr; }), "system 'particle on a surface': evaluate is an empty function");
   EXPECT_EQ(refused([](auto& d) {
@@ -305,7 +296,7 @@ std::string evaluated(const Spoil& spoil) {
     return values;
   };
   const CallableSystem system(spoilt);
-  return error_of([&] { static_cast<void>(system.evaluate(states_of(4), system.parameter_values())); });
+  return test::input_error_of([&] { static_cast<void>(system.evaluate(states_of(4), system.parameter_values())); });
 }
 
 std::string differentiated(const Spoil& spoil) {
@@ -316,7 +307,7 @@ std::string differentiated(const Spoil& spoil) {
     return values;
   };
   const CallableSystem system(spoilt);
-  return error_of([&] { static_cast<void>(system.differentiate(states_of(4), system.parameter_values(), 0)); });
+  return test::input_error_of([&] { static_cast<void>(system.differentiate(states_of(4), system.parameter_values(), 0)); });
 }
 
 TEST(CallableSystemTest, ShapesAreHeldAgainstTheSystem) {
@@ -341,7 +332,8 @@ TEST(CallableSystemTest, ShapesAreHeldAgainstTheSystem) {
   spoilt.residuals = [](const CallableSystem::States& states, const CallableSystem::Parameters& p) -> MatrixXd {
     return test::surface_residuals(states, p).topRows(1);
   };
-  EXPECT_EQ(error_of([&] { static_cast<void>(CallableSystem(spoilt).residuals(states_of(4), surface().parameter_values())); }),
+  EXPECT_EQ(test::input_error_of(
+                [&] { static_cast<void>(CallableSystem(spoilt).residuals(states_of(4), surface().parameter_values())); }),
             "system 'particle on a surface': residuals returned the shape 1 × 4, expected 2 × 4: a row for each of the surface, "
             "d/dt of the surface; a column for each of the N = 4 states");
 }
@@ -362,7 +354,8 @@ TEST(CallableSystemTest, NumbersMustBeFinite) {
   spoilt.residuals = [](const CallableSystem::States& states, const CallableSystem::Parameters& p) -> MatrixXd {
     return test::surface_residuals(states, p) / 0;
   };
-  EXPECT_EQ(error_of([&] { static_cast<void>(CallableSystem(spoilt).residuals(states_of(4), surface().parameter_values())); }),
+  EXPECT_EQ(test::input_error_of(
+                [&] { static_cast<void>(CallableSystem(spoilt).residuals(states_of(4), surface().parameter_values())); }),
             "system 'particle on a surface': residuals returned a number that is not finite at state 1, where all that is read "
             "is finite");
 }
@@ -371,7 +364,7 @@ TEST(CallableSystemTest, AtParametersAFitStraysToNumbersNeedNotBeFiniteButTheirD
   const CallableSystem system(force_of({"p", 1, {}, true}, [](double p) { return std::sqrt(p); }));
   const MatrixXd state = MatrixXd::Zero(3, 1);
   EXPECT_TRUE(system.evaluate(state, VectorXd::Constant(1, -1)).F(0).hasNaN());
-  EXPECT_EQ(error_of([&] { static_cast<void>(system.differentiate(state, VectorXd::Zero(1), 0)); }),
+  EXPECT_EQ(test::input_error_of([&] { static_cast<void>(system.differentiate(state, VectorXd::Zero(1), 0)); }),
             "system 'one': the difference of evaluate in 'p' returned force F with a number that is not finite at state 1, where "
             "all that is read is finite");
 }

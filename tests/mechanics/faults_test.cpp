@@ -5,6 +5,7 @@
 #include "gp2/error.hpp"
 #include "gp2/mechanics/udwadia_kalaba.hpp"
 #include "gp2/model.hpp"
+#include "input_error.hpp"
 #include "test_models.hpp"
 
 // What the mechanics refuse, and that they say where.
@@ -42,12 +43,7 @@ MatrixXd states(const std::vector<double>& x) {
 }
 
 std::string message(const Model& model, const MatrixXd& states) {
-  try {
-    require_mechanics(*model.system, states, model.system->parameter_values());
-  } catch (const InputError& error) {
-    return error.what();
-  }
-  return "no error";
+  return test::input_error_of([&] { require_mechanics(*model.system, states, model.system->parameter_values()); });
 }
 
 TEST(MechanicsFaults, ContradictoryConstraintsAreAnErrorThatNamesTheState) {
@@ -55,7 +51,7 @@ TEST(MechanicsFaults, ContradictoryConstraintsAreAnErrorThatNamesTheState) {
   const Model contradictory = model(R"([["1", "0"], ["0", "1"]])", R"(acceleration = ["ddx", "ddx - x"])");
   EXPECT_THAT(message(contradictory, states({0, 3})),
               AllOf(HasSubstr("cart"), HasSubstr("contradict"), HasSubstr("state 2"), HasSubstr("x = 3")));
-  EXPECT_EQ(message(contradictory, states({0})), "no error");
+  EXPECT_EQ(message(contradictory, states({0})), "");
 }
 
 // b = −0.09 exp(−0.3 t) … is below 1e-308 there, where numbers have a few digits only
@@ -64,7 +60,7 @@ TEST(MechanicsFaults, AConstraintWhoseMotionHasDiedAwayIsNoContradiction) {
   MatrixXd states = MatrixXd::Zero(duffing.system->layout().size(), 1);
   for (double t = 2300; t < 2500; t += 2) {
     states(duffing.system->layout().t(), 0) = t;
-    EXPECT_EQ(message(duffing, states), "no error") << t;
+    EXPECT_EQ(message(duffing, states), "") << t;
   }
 }
 
@@ -76,11 +72,11 @@ TEST(MechanicsFaults, ARowThatVanishesWhileItsRightHandSideDoesNotIsAContradicti
 
 TEST(MechanicsFaults, AMassMatrixThatIsNotPositiveDefiniteIsAnErrorThatNamesTheState) {
   const Model indefinite = model(R"([["1", "x"], ["x", "1"]])", R"(position = ["y"])");
-  EXPECT_EQ(message(indefinite, states({0.5, -0.9})), "no error");
+  EXPECT_EQ(message(indefinite, states({0.5, -0.9})), "");
   EXPECT_THAT(message(indefinite, states({0.5, 2, 3})),
               AllOf(HasSubstr("mass matrix"), HasSubstr("not positive definite"), HasSubstr("state 2"), HasSubstr("x = 2")));
   // singular is another thing, negative and not a number are no better
-  EXPECT_EQ(message(indefinite, states({1})), "no error");
+  EXPECT_EQ(message(indefinite, states({1})), "");
   EXPECT_THAT(message(model(R"([["-1", "0"], ["0", "1"]])", R"(position = ["y"])"), states({1})),
               HasSubstr("not positive definite"));
   EXPECT_THAT(message(model(R"-([["log(x)", "0"], ["0", "1"]])-", R"(position = ["y"])"), states({-1})),

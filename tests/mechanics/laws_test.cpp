@@ -29,8 +29,6 @@ double condition(const MatrixXd& M) {
   return values[values.size() - 1] / values[0];
 }
 
-double largest(const MatrixXd& matrix) { return matrix.size() == 0 ? 0 : matrix.cwiseAbs().maxCoeff(); }
-
 MatrixXd with_row(const MatrixXd& A, const Eigen::RowVectorXd& row) {
   MatrixXd extended(A.rows() + 1, A.cols());
   extended << A, row;
@@ -72,16 +70,16 @@ INSTANTIATE_TEST_SUITE_P(EveryModel, MechanicsLaws, testing::ValuesIn(test::ever
 TEST_P(MechanicsLaws, TheProjectionTakesAwayWhatTheConstraintSees) {
   for_every_state([](const Case& c) {
     const MatrixXd& T = c.projection.T();
-    EXPECT_LE(largest(c.A * T), c.rounding * largest(c.A) * (1 + largest(T)));
+    EXPECT_LE(test::largest(c.A * T), c.rounding * test::largest(c.A) * (1 + test::largest(T)));
   });
 }
 
 TEST_P(MechanicsLaws, TheProjectionIsAProjectionThatIsSymmetricInTheMetricOfM) {
   for_every_state([](const Case& c) {
     const MatrixXd& T = c.projection.T();
-    const double scale = 1 + largest(T);
-    EXPECT_LE(largest(T * T - T), c.rounding * scale * scale);
-    EXPECT_LE(largest(c.M * T - T.transpose() * c.M), c.rounding * largest(c.M) * scale);
+    const double scale = 1 + test::largest(T);
+    EXPECT_LE(test::largest(T * T - T), c.rounding * scale * scale);
+    EXPECT_LE(test::largest(c.M * T - T.transpose() * c.M), c.rounding * test::largest(c.M) * scale);
     // its trace is the number of free directions
     EXPECT_NEAR(T.trace(), static_cast<double>(T.rows() - c.projection.rank()),
                 c.rounding * scale * static_cast<double>(T.rows()));
@@ -93,14 +91,15 @@ TEST_P(MechanicsLaws, LIsAGeneralisedInverseOfAWhichTurnsBIntoAnAcceleration) {
     const MatrixXd L = c.projection.L();
     const MatrixXd LA = L * c.A;
     for (Eigen::Index row = 0; row < c.A.rows(); ++row) {
-      const double size = largest(c.A.row(row));
-      EXPECT_LE(largest(c.A.row(row) * LA - c.A.row(row)), c.rounding * size * (1 + largest(LA)));
+      const double size = test::largest(c.A.row(row));
+      EXPECT_LE(test::largest(c.A.row(row) * LA - c.A.row(row)), c.rounding * size * (1 + test::largest(LA)));
       // a redundant row agrees with the others as far as the state satisfies the constraints:
       // 16 ε times sizes of order one or less
       EXPECT_NEAR(c.A.row(row) * c.projection.Lb(), c.b[row],
-                  c.rounding * (size * largest(c.projection.Lb()) + std::abs(c.b[row]) + largest(c.b)));
+                  c.rounding * (size * test::largest(c.projection.Lb()) + std::abs(c.b[row]) + test::largest(c.b)));
     }
-    EXPECT_LE(largest(c.projection.T() - (MatrixXd::Identity(c.M.rows(), c.M.rows()) - LA)), c.rounding * (1 + largest(LA)));
+    EXPECT_LE(test::largest(c.projection.T() - (MatrixXd::Identity(c.M.rows(), c.M.rows()) - LA)),
+              c.rounding * (1 + test::largest(LA)));
   });
 }
 
@@ -111,8 +110,9 @@ TEST_P(MechanicsLaws, ScalingTheRowsOfTheConstraintChangesNothing) {
     for (double& entry : scale) entry = std::pow(10.0, 12 * random.uniform() - 6);
     const UdwadiaKalaba scaled(c.M, scale.asDiagonal() * c.A, scale.cwiseProduct(c.b));
     EXPECT_EQ(scaled.rank(), c.projection.rank());
-    EXPECT_LE(largest(scaled.T() - c.projection.T()), c.rounding * (1 + largest(c.projection.T())));
-    EXPECT_LE(largest(scaled.Lb() - c.projection.Lb()), c.rounding * (largest(c.projection.Lb()) + largest(c.b)));
+    EXPECT_LE(test::largest(scaled.T() - c.projection.T()), c.rounding * (1 + test::largest(c.projection.T())));
+    EXPECT_LE(test::largest(scaled.Lb() - c.projection.Lb()),
+              c.rounding * (test::largest(c.projection.Lb()) + test::largest(c.b)));
   });
 }
 
@@ -123,8 +123,9 @@ TEST_P(MechanicsLaws, ARowThatFollowsFromTheOthersChangesNothing) {
     for (const VectorXd& w : {VectorXd(VectorXd::Unit(c.A.rows(), 0)), weights}) {
       const UdwadiaKalaba extended(c.M, with_row(c.A, w.transpose() * c.A), with_entry(c.b, w.dot(c.b)));
       EXPECT_EQ(extended.rank(), c.projection.rank());
-      EXPECT_LE(largest(extended.T() - c.projection.T()), c.rounding * (1 + largest(c.projection.T())));
-      EXPECT_LE(largest(extended.Lb() - c.projection.Lb()), c.rounding * (largest(c.projection.Lb()) + largest(c.b)));
+      EXPECT_LE(test::largest(extended.T() - c.projection.T()), c.rounding * (1 + test::largest(c.projection.T())));
+      EXPECT_LE(test::largest(extended.Lb() - c.projection.Lb()),
+                c.rounding * (test::largest(c.projection.Lb()) + test::largest(c.b)));
     }
   });
 }
@@ -134,8 +135,8 @@ TEST_P(MechanicsLaws, AZeroRowIsDroppedAndCounted) {
     const UdwadiaKalaba extended(c.M, with_row(c.A, Eigen::RowVectorXd::Zero(c.A.cols())), with_entry(c.b, 0));
     EXPECT_EQ(extended.n_zero_rows(), c.projection.n_zero_rows() + 1);
     EXPECT_EQ(extended.rank(), c.projection.rank());
-    EXPECT_LE(largest(extended.T() - c.projection.T()), c.rounding * (1 + largest(c.projection.T())));
-    EXPECT_LE(largest(extended.Lb() - c.projection.Lb()), c.rounding * largest(c.projection.Lb()));
+    EXPECT_LE(test::largest(extended.T() - c.projection.T()), c.rounding * (1 + test::largest(c.projection.T())));
+    EXPECT_LE(test::largest(extended.Lb() - c.projection.Lb()), c.rounding * test::largest(c.projection.Lb()));
   });
 }
 
@@ -146,7 +147,7 @@ TEST_P(MechanicsLaws, TheConstrainedAccelerationSolvesTheEquationsOfMotionWithMu
     const Eigen::Index n = c.M.rows(), m = c.A.rows();
     const VectorXd a_bar = test::random_vector(n, random);
     // rows to the size of M, so that the matrix is conditioned as the mechanics are
-    const VectorXd scale = largest(c.M) * c.A.rowwise().norm().cwiseInverse();
+    const VectorXd scale = test::largest(c.M) * c.A.rowwise().norm().cwiseInverse();
     MatrixXd kkt = MatrixXd::Zero(n + m, n + m);
     kkt << c.M, (scale.asDiagonal() * c.A).transpose(), scale.asDiagonal() * c.A, MatrixXd::Zero(m, m);
     VectorXd right(n + m);
@@ -155,9 +156,9 @@ TEST_P(MechanicsLaws, TheConstrainedAccelerationSolvesTheEquationsOfMotionWithMu
     const double kkt_condition = svd.singularValues()[0] / svd.singularValues()[n + m - 1];
     const VectorXd ddq = kkt.fullPivLu().solve(right).head(n);
     const double tolerance =
-        (c.rounding + 8 * eps * static_cast<double>(n + m) * kkt_condition) * (largest(ddq) + largest(a_bar));
-    EXPECT_LE(largest(c.projection.constrain(a_bar) - ddq), tolerance);
-    EXPECT_LE(largest(c.projection.Lb() + c.projection.T() * a_bar - ddq), tolerance);
+        (c.rounding + 8 * eps * static_cast<double>(n + m) * kkt_condition) * (test::largest(ddq) + test::largest(a_bar));
+    EXPECT_LE(test::largest(c.projection.constrain(a_bar) - ddq), tolerance);
+    EXPECT_LE(test::largest(c.projection.Lb() + c.projection.T() * a_bar - ddq), tolerance);
   });
 }
 
@@ -175,9 +176,9 @@ TEST_P(MechanicsLaws, NoAdmissibleAccelerationIsCloserToTheUnconstrainedOneThanG
     if (free.cols() == 0) return;
     for (int trial = 0; trial < 5; ++trial) {
       // of the size of the acceleration, so that the growth wᵀM w stands out of the rounding of the cost
-      const VectorXd w = (1 + largest(ddq)) * free * test::random_vector(free.cols(), random).normalized();
+      const VectorXd w = (1 + test::largest(ddq)) * free * test::random_vector(free.cols(), random).normalized();
       EXPECT_GT(cost(ddq + w), cost(ddq));
-      EXPECT_LE(std::abs(w.dot(c.M * (ddq - a_bar))), c.rounding * largest(c.M) * w.norm() * (ddq.norm() + a_bar.norm()));
+      EXPECT_LE(std::abs(w.dot(c.M * (ddq - a_bar))), c.rounding * test::largest(c.M) * w.norm() * (ddq.norm() + a_bar.norm()));
     }
   });
 }
@@ -204,8 +205,8 @@ TEST(UdwadiaKalabaTest, WithoutConstraintsTheMotionIsTheUnconstrainedOne) {
   const MatrixXd M = Eigen::Vector2d(2, 3).asDiagonal();
   const UdwadiaKalaba projection(M, MatrixXd(0, 2), VectorXd(0));
   EXPECT_EQ(projection.rank(), 0);
-  EXPECT_LE(largest(projection.T() - MatrixXd::Identity(2, 2)), 4 * eps);
-  EXPECT_EQ(largest(projection.Lb()), 0);
+  EXPECT_LE(test::largest(projection.T() - MatrixXd::Identity(2, 2)), 4 * eps);
+  EXPECT_EQ(test::largest(projection.Lb()), 0);
   EXPECT_EQ(projection.L().cols(), 0);
 }
 
@@ -224,7 +225,7 @@ TEST(UdwadiaKalabaTest, TheConstrainedAccelerationMeetsTheConstraintToRoundingWh
     const UdwadiaKalaba projection(0.5 * (M + M.transpose()), A, b);
     const VectorXd ddq = projection.constrain(1e3 * test::random_vector(4, random));
     // the sums A ddq themselves round at ε of their terms
-    EXPECT_LE(largest(A * ddq - b), 32 * eps * ((A.cwiseAbs() * ddq.cwiseAbs()).maxCoeff() + largest(b)));
+    EXPECT_LE(test::largest(A * ddq - b), 32 * eps * ((A.cwiseAbs() * ddq.cwiseAbs()).maxCoeff() + test::largest(b)));
   }
 }
 
@@ -240,8 +241,8 @@ TEST(UdwadiaKalabaTest, AFullyConstrainedSystemHasNoFreedomLeft) {
   const MatrixXd A = (MatrixXd(2, 2) << 1, 2, 0, 1).finished();
   const UdwadiaKalaba projection(MatrixXd::Identity(2, 2), A, Eigen::Vector2d(4, 1));
   EXPECT_EQ(projection.rank(), 2);
-  EXPECT_LE(largest(projection.T()), 4 * eps);
-  EXPECT_LE(largest(projection.Lb() - Eigen::Vector2d(2, 1)), 16 * eps);
+  EXPECT_LE(test::largest(projection.T()), 4 * eps);
+  EXPECT_LE(test::largest(projection.Lb() - Eigen::Vector2d(2, 1)), 16 * eps);
 }
 
 }  // namespace

@@ -7,6 +7,7 @@
 
 #include "allocation_count.hpp"
 #include "gp2/error.hpp"
+#include "input_error.hpp"
 #include "test_models.hpp"
 
 // M, A, b, F and their derivatives in the state, at one state after another.
@@ -210,13 +211,16 @@ TEST_P(StateEvaluators, HaveTheirLikeInTheFeaturesAndDirectionsOfALatent) {
   const Model& model = test::model(GetParam());
   const Prior prior = make_prior(model);
   const MatrixXd states = test::draw(model, 3, seed).states;
-  const auto check = [&](const Tape& tape, const StateDerivatives& derivatives, const VectorXd& shared, const char* what) {
+  const auto check = [&](const StateFunction& function, const VectorXd& parameters, const char* what) {
+    const auto evaluator = function.make_evaluator(parameters);
+    const std::vector<StateDerivatives::Entry>& entries = evaluator->entries();
     for (Index i = 0; i < states.cols(); ++i) {
       const VectorXd state = states.col(i).array().isNaN().select(0, states.col(i));
-      MatrixXd jacobian = MatrixXd::Zero(tape.n_outputs(), state.size()), values;
-      derivatives.tape.evaluate(state, shared, values);
-      for (std::size_t k = 0; k < derivatives.entries.size(); ++k) {
-        jacobian(derivatives.entries[k].output, derivatives.entries[k].state_index) = values(static_cast<Index>(k));
+      MatrixXd jacobian = MatrixXd::Zero(function.size(), state.size());
+      VectorXd values(static_cast<Index>(entries.size()));
+      evaluator->differentiate(state, values);
+      for (std::size_t k = 0; k < entries.size(); ++k) {
+        jacobian(entries[k].output, entries[k].state_index) = values[static_cast<Index>(k)];
       }
       for (Index k = 0; k < state.size(); ++k) {
         SCOPED_TRACE(fmt::format("{}, x_{}, state {}, seed {}", what, k, i, seed));
@@ -224,9 +228,7 @@ TEST_P(StateEvaluators, HaveTheirLikeInTheFeaturesAndDirectionsOfALatent) {
             [&](double value) -> VectorXd {
               VectorXd moved = state;
               moved[k] = value;
-              MatrixXd out;
-              tape.evaluate(moved, shared, out);
-              return out.col(0);
+              return function.evaluate(moved, parameters);
             },
             state[k], 0.05, 64 * test::eps);
         EXPECT_TRUE(test::matches(jacobian.col(k), difference));
@@ -234,13 +236,9 @@ TEST_P(StateEvaluators, HaveTheirLikeInTheFeaturesAndDirectionsOfALatent) {
     }
   };
   for (const Latent& latent : prior.latents) {
-    EXPECT_GE(latent.feature_state_derivatives.entries.size(), static_cast<std::size_t>(latent.n_features()));
-    check(latent.features, latent.feature_state_derivatives, VectorXd(), "features");
-    if (latent.directions_are_identity) {
-      EXPECT_TRUE(latent.direction_state_derivatives.entries.empty());
-    } else {
-      check(latent.directions, latent.direction_state_derivatives, system().parameter_values(), "directions");
-    }
+    EXPECT_GE(latent.features->make_evaluator(VectorXd())->entries().size(), static_cast<std::size_t>(latent.n_features()));
+    check(*latent.features, VectorXd(), "features");
+    if (latent.directions) check(*latent.directions, system().parameter_values(), "directions");
   }
 }
 
@@ -271,27 +269,20 @@ directions = [["-v*dx"], ["-v"]]
     const bool of_mass = evaluator->derivatives()[k].quantity == Quantity::mass;
     EXPECT_EQ(evaluator->derivative_values()[static_cast<Index>(k)], of_mass ? 6 : 0);
   }
-  MatrixXd derivatives;
   const Latent latent = make_prior(model).latents.front();
-  ASSERT_FALSE(latent.direction_state_derivatives.entries.empty());
-  latent.direction_state_derivatives.tape.evaluate(state, VectorXd(), derivatives);
+  const auto directions = latent.directions->make_evaluator(VectorXd());
+  ASSERT_FALSE(directions->entries().empty());
+  VectorXd derivatives(static_cast<Index>(directions->entries().size()));
+  directions->differentiate(state, derivatives);
   EXPECT_TRUE(derivatives.isZero(0));
 }
 
 TEST(StateEvaluatorTest, RefusesWrongSizes) {
   const System& system = *test::model("models/surface.toml").system;
-  const auto text_of = [](const auto& f) {
-    try {
-      f();
-    } catch (const InputError& error) {
-      return std::string(error.what());
-    }
-    return std::string("no error");
-  };
-  EXPECT_THAT(text_of([&] { return system.make_evaluator(VectorXd::Zero(1), true); }),
+  EXPECT_THAT(test::input_error_of([&] { return system.make_evaluator(VectorXd::Zero(1), true); }),
               testing::AllOf(HasSubstr("make_evaluator"), HasSubstr("parameters, got 1")));
   const auto evaluator = system.make_evaluator(system.parameter_values(), false);
-  EXPECT_THAT(text_of([&] { evaluator->evaluate(VectorXd::Zero(4)); }), HasSubstr("a state has 10 entries, got 4"));
+  EXPECT_THAT(test::input_error_of([&] { evaluator->evaluate(VectorXd::Zero(4)); }), HasSubstr("a state has 10 entries, got 4"));
 }
 
 }  // namespace

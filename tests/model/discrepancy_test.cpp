@@ -132,7 +132,7 @@ TEST(Discrepancy, StandsBesideOneLatentThatActsInEveryDirection) {
   const Prior prior = problem_of(bead()).prior;
   ASSERT_EQ(prior.latents.size(), 2U);
   EXPECT_EQ(prior.latents[0].name, "drag");
-  EXPECT_TRUE(prior.latents[0].directions_are_identity);
+  EXPECT_EQ(prior.latents[0].directions, nullptr);
   EXPECT_EQ(prior.latents[1].feature_names, prior.latents[0].feature_names);
   EXPECT_EQ(view_of(prior, Quantity::unconstrained_acceleration, 1).names(*prior.system, prior.latents[1].name),
             (std::vector<std::string>{"abar_x@discrepancy", "abar_y@discrepancy"}));

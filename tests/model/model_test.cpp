@@ -131,9 +131,8 @@ TEST(Model, DirectionsHaveFiveForms) {
     const Model model = parse(base + "[[latent]]\nfeatures = [\"q1\"]\ndirections = " + form.text + "\n");
     const Latent latent = make_prior(model).latents[0];
     EXPECT_EQ(latent.base, form.base) << form.text;
-    EXPECT_EQ(latent.directions_are_identity, form.n_columns == 0) << form.text;
+    EXPECT_EQ(latent.directions == nullptr, form.n_columns == 0) << form.text;
     EXPECT_EQ(latent.size(), form.n_columns == 0 ? 2 : form.n_columns) << form.text;
-    EXPECT_EQ(latent.direction_derivatives.size(), form.n_columns == 0 ? 0U : 1U) << form.text;
   }
 }
 
@@ -141,7 +140,7 @@ TEST(Model, DirectionsMayBeReplacedWhereThereIsOneLatent) {
   const std::string latent = "[[latent]]\nfeatures = [\"q1\"]\ndirections = [[\"1\"], [\"0\"]]\n";
   const Latent replaced_latent = make_prior(parse(base + latent), {Prior::Mean::zero, Latent::Base::force}).latents[0];
   EXPECT_EQ(replaced_latent.base, Latent::Base::force);
-  EXPECT_TRUE(replaced_latent.directions_are_identity);
+  EXPECT_EQ(replaced_latent.directions, nullptr);
   EXPECT_THAT(replaced_latent.column_names, ElementsAre("force_q1", "force_q2"));
   EXPECT_EQ(input_error_of([&] {
               make_prior(parse(base + latent + latent), {Prior::Mean::zero, Latent::Base::force});
@@ -165,10 +164,8 @@ signal_stddev = { initial = 0.5 }
   EXPECT_EQ(model.latents[0].lengthscale.initial, 2);
   EXPECT_EQ(model.latents[0].lengthscale.lower, 0.1);
   EXPECT_EQ(model.latents[0].lengthscale.upper, 10);
-  EXPECT_EQ(model.latents[0].line, 7);
   EXPECT_EQ(model.latents[1].name, "latent 2");
   EXPECT_EQ(model.latents[1].signal_stddev.initial, 0.5);
-  EXPECT_EQ(model.latents[1].line, 12);
 }
 
 TEST(Model, ParametersKeepTheOrderOfTheFile) {
@@ -397,7 +394,7 @@ std::vector<Complaint> complaints() {
       {"LatentWithAnUnknownKey", latent + "lengthscales = 1\n" + features,
        "8: latent.lengthscales: unknown key; known here: name, kernel, features, directions, lengthscale, signal_stddev"},
       {"LatentWithoutFeatures", latent + "kernel = \"se\"\n", "7: latent: missing features = [\"q1\", …]"},
-      {"LatentOfNoFeature", latent + "features = []\n", "7: latent.features: a latent needs at least one feature"},
+      {"LatentOfNoFeature", latent + "features = []\n", "8: latent.features: a latent needs at least one feature"},
       {"LatentNameTwice", latent + "name = \"a\"\n" + features + "[[latent]]\nname = \"a\"\n" + features,
        "10: latent.name: 'a' is taken already"},
       {"LatentNamedDiscrepancy", latent + "name = \"discrepancy\"\n" + features,

@@ -96,7 +96,7 @@ TEST(MakeSetting, NamesWhatDiffers) {
   EXPECT_EQ(refused(with(&BeadText::directions, R"("force")")),
             rule + "the directions of its latent 1, 'drag', are \"force\" there, but \"acceleration\" here");
   EXPECT_EQ(refused(with(&BeadText::directions, R"([["dx"], ["dy"]])")),
-            rule + "the directions of its latent 1, 'drag', are 1 of expressions there, but \"acceleration\" here");
+            rule + "the directions of its latent 1, 'drag', are 1 of its own there, but \"acceleration\" here");
   // --prior replaces the directions of both
   EXPECT_EQ(refused(with(&BeadText::directions, R"("force")"), {Prior::Mean::zero, Latent::Base::force, false, {}}), "");
 }

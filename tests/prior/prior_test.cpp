@@ -110,9 +110,8 @@ TEST(PriorTest, MeanAndDirectionsAreThoseOfItsEquations) {
       for (std::size_t a = 0; a < prior.latents.size(); ++a) {
         const Latent& latent = prior.latents[a];
         MatrixXd B = MatrixXd::Identity(prior.system->nq(), prior.system->nq());
-        if (!latent.directions_are_identity) {
-          MatrixXd entries;
-          latent.directions.evaluate(states.col(i), parameters, entries);
+        if (latent.directions) {
+          const MatrixXd entries = latent.directions->evaluate(states.col(i), parameters);
           B = entries.reshaped(prior.system->nq(), latent.size());
         }
         if (latent.base == Latent::Base::force) B = M_inverse * B;

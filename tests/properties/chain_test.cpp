@@ -22,8 +22,6 @@ using test::eps;
 
 constexpr std::uint64_t seed = 20273;
 
-double largest(const MatrixXd& matrix) { return matrix.cwiseAbs().maxCoeff(); }
-
 // of the processor: other programs run beside the tests
 double seconds_of(const std::function<void()>& work) {
   const std::clock_t start = std::clock();
@@ -70,8 +68,8 @@ TEST_P(Chain, IsCheckedGeneratedFittedPredictedAndSimulated) {
     const MatrixXd A = mechanics.values.A(i), M = mechanics.values.M(i);
     const MatrixXd& T = projection.T();
     EXPECT_EQ(projection.rank(), 2 * n_links);
-    of_laws = std::max({of_laws, largest(A * T) / (1 + largest(T)), largest(T * T - T) / (1 + largest(T)),
-                        largest(M * T - T.transpose() * M) / (largest(M) * (1 + largest(T)))});
+    of_laws = std::max({of_laws, test::largest(A * T) / (1 + test::largest(T)), test::largest(T * T - T) / (1 + test::largest(T)),
+                        test::largest(M * T - T.transpose() * M) / (test::largest(M) * (1 + test::largest(T)))});
   }
   // masses and moments of inertia differ by (n/links)²·12; entries of T are as large as their ratio's root
   EXPECT_LE(of_laws, 64 * eps * static_cast<double>(n) * 12 * n_links * n_links);
@@ -98,7 +96,7 @@ TEST_P(Chain, IsCheckedGeneratedFittedPredictedAndSimulated) {
   double worst = 0;
   for (int i = 0; i < 20; ++i) {
     const VectorXd residual = at_queries.A(i) * marginal.mean.col(i) - at_queries.b(i);
-    worst = std::max(worst, largest(residual) / (1 + largest(marginal.mean.col(i)) * largest(at_queries.A(i))));
+    worst = std::max(worst, test::largest(residual) / (1 + test::largest(marginal.mean.col(i)) * test::largest(at_queries.A(i))));
   }
   EXPECT_LE(worst, 64 * eps * static_cast<double>(n));
   // better than knowing nothing but the constraints and gravity

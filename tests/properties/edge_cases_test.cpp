@@ -22,8 +22,6 @@ using test::Quantity;
 
 constexpr std::uint64_t seed = 20271;
 
-double largest(const MatrixXd& matrix) { return matrix.cwiseAbs().maxCoeff(); }
-
 Problem surface_problem(int n) {
   const Model& model = test::model("models/surface.toml");
   RandomStream random(seed);
@@ -55,8 +53,8 @@ TEST(EdgeCaseTest, APointMeasuredTwiceIsOneOfHalfTheVariance) {
     const Posterior::Joint joint = of_twice.joint(view, p.queries), expected = of_once.joint(view, p.queries);
     // the two differ by the rounding of K̃ + I, and by the distance times the slopes
     const double tolerance = (1e3 * eps * test::condition(p) + 1e2 * apart * test::condition(p));
-    EXPECT_LE(largest(joint.mean - expected.mean), tolerance * (1 + largest(expected.mean)));
-    EXPECT_LE(largest(joint.covariance - expected.covariance), tolerance * (1 + largest(expected.covariance)));
+    EXPECT_LE(test::largest(joint.mean - expected.mean), tolerance * (1 + test::largest(expected.mean)));
+    EXPECT_LE(test::largest(joint.covariance - expected.covariance), tolerance * (1 + test::largest(expected.covariance)));
     EXPECT_EQ(of_twice.reduced_size(), 2 * of_once.reduced_size());
   }
 }
@@ -195,10 +193,10 @@ directions = "acceleration"
     for (int i = 0; i < 4; ++i) {
       const MatrixXd A = mechanics.values.A(i);
       const VectorXd ddq = marginal.mean.col(i);
-      EXPECT_LE(largest(A * ddq - mechanics.values.b(i)), 1e3 * eps * (1 + largest(A) * largest(ddq)));
+      EXPECT_LE(test::largest(A * ddq - mechanics.values.b(i)), 1e3 * eps * (1 + test::largest(A) * test::largest(ddq)));
     }
     if (freedom > 0) continue;
-    EXPECT_LE(largest(marginal.covariance), 1e-20 * (1 + largest(p.observations[0].values())));
+    EXPECT_LE(test::largest(marginal.covariance), 1e-20 * (1 + test::largest(p.observations[0].values())));
   }
 }
 

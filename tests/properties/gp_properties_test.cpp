@@ -25,8 +25,6 @@ void expect_at_most(double value, double bound, const std::string& law) {
   RC_ASSERT(value <= bound);
 }
 
-double largest(const MatrixXd& matrix) { return matrix.size() == 0 ? 0 : matrix.cwiseAbs().maxCoeff(); }
-
 bool flip(const char* what) { return *rc::gen::arbitrary<bool>().as(what); }
 
 std::string number(RandomStream& random) { return fmt::format("({:.6f})", random.normal()); }
@@ -187,8 +185,8 @@ RC_GTEST_PROP(GpProperty, ThePosteriorIsTheTextbookOne, ()) {
     const View view = View::all(quantity, *p.prior.system);
     const auto [mean, covariance] = test::dense_posterior(p, view, p.queries);
     const Posterior::Joint joint = posterior.joint(view, p.queries);
-    expect_at_most(largest(joint.mean - mean), rounding(p) * (1 + largest(mean)), quantity->word() + ", mean");
-    expect_at_most(largest(joint.covariance - covariance), rounding(p) * (1 + largest(covariance)),
+    expect_at_most(test::largest(joint.mean - mean), rounding(p) * (1 + test::largest(mean)), quantity->word() + ", mean");
+    expect_at_most(test::largest(joint.covariance - covariance), rounding(p) * (1 + test::largest(covariance)),
                    quantity->word() + ", covariance");
   }
 }
@@ -207,17 +205,18 @@ RC_GTEST_PROP(GpProperty, MeansSamplesAndCovariancesObeyTheConstraints, ()) {
     const MatrixXd A = mechanics.values.A(i);
     const VectorXd b = mechanics.values.b(i);
     // T and L b are applied last: rounding is that of the mechanics alone, whatever the condition of K̃ + I
-    const double tolerance = 1e2 * eps * p.mechanics_condition * (1 + largest(A));
+    const double tolerance = 1e2 * eps * p.mechanics_condition * (1 + test::largest(A));
     const auto obeys = [&](const VectorXd& acceleration, const std::string& what) {
-      if (A.rows() > 0) expect_at_most(largest(A * acceleration - b), tolerance * (1 + largest(acceleration)), what);
+      if (A.rows() > 0) expect_at_most(test::largest(A * acceleration - b), tolerance * (1 + test::largest(acceleration)), what);
     };
     obeys(joint.mean.segment(i * n, n), "A μ = b");
     obeys(marginal.mean.col(i), "A μ = b, marginal");
     for (Index s = 0; s < samples.cols(); ++s) obeys(samples.col(s).segment(i * n, n), "A sample = b");
     const MatrixXd covariance = joint.covariance.middleRows(i * n, n);
-    expect_at_most(largest(A * covariance), tolerance * (1 + largest(joint.covariance)), "A Σ = 0");
+    expect_at_most(test::largest(A * covariance), tolerance * (1 + test::largest(joint.covariance)), "A Σ = 0");
     const MatrixXd of_state = marginal.covariance.col(i).reshaped(n, n);
-    expect_at_most(largest(A * of_state * A.transpose()), tolerance * (1 + largest(A)) * (1 + largest(of_state)), "A Σ Aᵀ = 0");
+    expect_at_most(test::largest(A * of_state * A.transpose()),
+                   tolerance * (1 + test::largest(A)) * (1 + test::largest(of_state)), "A Σ Aᵀ = 0");
   }
 }
 
@@ -276,8 +275,8 @@ RC_GTEST_PROP(GpProperty, MoreDataAddedIsTheSameAsConditioningAnew, ()) {
   const auto compare = [&](const Posterior& one, const Posterior& other) {
     const Posterior::Joint joint = one.joint(view, p.queries), expected = other.joint(view, p.queries);
     RC_ASSERT(one.reduced_size() == other.reduced_size());
-    expect_at_most(largest(joint.mean - expected.mean), rounding(p) * (1 + largest(expected.mean)), "mean");
-    expect_at_most(largest(joint.covariance - expected.covariance), rounding(p) * (1 + largest(expected.covariance)),
+    expect_at_most(test::largest(joint.mean - expected.mean), rounding(p) * (1 + test::largest(expected.mean)), "mean");
+    expect_at_most(test::largest(joint.covariance - expected.covariance), rounding(p) * (1 + test::largest(expected.covariance)),
                    "covariance");
     expect_at_most(std::abs(one.negative_log_likelihood() - other.negative_log_likelihood()),
                    rounding(p) * (static_cast<double>(n_values(p)) + std::abs(other.negative_log_likelihood())), "−log p(y)");

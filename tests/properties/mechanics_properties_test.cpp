@@ -16,7 +16,7 @@ using Eigen::VectorXd;
 using test::eps;
 using test::Extended;
 using test::ExtendedVector;
-using test::largest;
+using test::largest_extended;
 using test::RandomMechanics;
 
 RandomStream stream() { return RandomStream(test::random_seed()); }
@@ -40,9 +40,9 @@ RC_GTEST_PROP(MechanicsProperty, TheProjectionIsTheOneOfItsLaws, ()) {
   const auto [B, norms] = white.rows(mechanics.A.cast<long double>());
   // A T = 0, T² = T, M T = Tᵀ M, and trace T = n − rank: whitened, T is an orthogonal projection
   const double backward = mechanics.rounding() / mechanics.condition_of_rows;
-  expect_at_most(largest(B * T), backward, "A T = 0");
-  expect_at_most(largest(T * T - T), backward, "T² = T");
-  expect_at_most(largest(T - T.transpose()), backward, "M T = Tᵀ M");
+  expect_at_most(largest_extended(B * T), backward, "A T = 0");
+  expect_at_most(largest_extended(T * T - T), backward, "T² = T");
+  expect_at_most(largest_extended(T - T.transpose()), backward, "M T = Tᵀ M");
   expect_at_most(std::abs(static_cast<double>(T.trace()) - static_cast<double>(mechanics.n() - mechanics.rank())),
                  backward * static_cast<double>(mechanics.n()), "trace T = n − rank A");
 }
@@ -56,12 +56,12 @@ RC_GTEST_PROP(MechanicsProperty, LIsAGeneralisedInverse, ()) {
   // whitened and of the unit rows, L is B⁺: as large as the rows' conditioning
   const Extended LA = Extended::Identity(mechanics.n(), mechanics.n()) - white.map(projection.T().cast<long double>());
   const Extended L_A = white.map((projection.L() * mechanics.A).cast<long double>());
-  expect_at_most(largest(L_A - LA), mechanics.rounding(), "T = I − L A");
-  expect_at_most(largest(B * L_A - B), mechanics.rounding(), "A L A = A");
+  expect_at_most(largest_extended(L_A - LA), mechanics.rounding(), "T = I − L A");
+  expect_at_most(largest_extended(B * L_A - B), mechanics.rounding(), "A L A = A");
   const ExtendedVector Lb = white.acceleration(projection.Lb().cast<long double>());
   const ExtendedVector b = mechanics.b.cast<long double>().cwiseQuotient(norms);
   const double size = static_cast<double>(white.acceleration(mechanics.x.cast<long double>()).norm());
-  expect_at_most(largest(B * Lb - b), mechanics.rounding() * size, "A L b = b");
+  expect_at_most(largest_extended(B * Lb - b), mechanics.rounding() * size, "A L b = b");
   RC_ASSERT(projection.inconsistency() <= mechanics.rounding() * size);
 }
 
@@ -73,8 +73,9 @@ RC_GTEST_PROP(MechanicsProperty, TheEquationsOfMotionWithMultipliersGiveTheSame,
   const test::ExactProjection exact = test::solve_equations_of_motion(mechanics.M, mechanics.A(mechanics.independent, Eigen::all),
                                                                       mechanics.b(mechanics.independent));
   const double size = 1 + static_cast<double>(white.acceleration(mechanics.x.cast<long double>()).norm());
-  expect_at_most(largest(white.map(projection.T().cast<long double>() - exact.T)), mechanics.rounding(), "T");
-  expect_at_most(largest(white.acceleration(projection.Lb().cast<long double>() - exact.Lb)), mechanics.rounding() * size, "L b");
+  expect_at_most(largest_extended(white.map(projection.T().cast<long double>() - exact.T)), mechanics.rounding(), "T");
+  expect_at_most(largest_extended(white.acceleration(projection.Lb().cast<long double>() - exact.Lb)),
+                 mechanics.rounding() * size, "L b");
 }
 
 RC_GTEST_PROP(MechanicsProperty, GaussPrincipleHolds, ()) {
@@ -89,11 +90,11 @@ RC_GTEST_PROP(MechanicsProperty, GaussPrincipleHolds, ()) {
   const double size = static_cast<double>(ddq.norm() + white.acceleration(a_bar.cast<long double>()).norm());
   // admissible, …
   const ExtendedVector b = mechanics.b(mechanics.independent).cast<long double>().cwiseQuotient(norms);
-  expect_at_most(largest(B * ddq - b), mechanics.rounding() * size, "A ddq = b");
+  expect_at_most(largest_extended(B * ddq - b), mechanics.rounding() * size, "A ddq = b");
   // … and the step from ā, in the metric of M, is a combination of the rows: at right angles to what they leave free
   ExtendedVector free = moved;
   if (mechanics.rank() > 0) free -= B.transpose() * B.transpose().colPivHouseholderQr().solve(moved);
-  expect_at_most(largest(free), mechanics.rounding() * size, "right angles");
+  expect_at_most(largest_extended(free), mechanics.rounding() * size, "right angles");
 }
 
 RC_GTEST_PROP(MechanicsProperty, ScalingRowsChangesTheMultipliersOnly, ()) {
@@ -106,9 +107,9 @@ RC_GTEST_PROP(MechanicsProperty, ScalingRowsChangesTheMultipliersOnly, ()) {
   RC_ASSERT(scaled.rank() == projection.rank());
   const test::Whitening white(mechanics.M);
   const double size = 1 + static_cast<double>(white.acceleration(mechanics.x.cast<long double>()).norm());
-  expect_at_most(largest(white.map((scaled.T() - projection.T()).cast<long double>())), mechanics.rounding(), "T");
-  expect_at_most(largest(white.acceleration((scaled.Lb() - projection.Lb()).cast<long double>())), mechanics.rounding() * size,
-                 "L b");
+  expect_at_most(largest_extended(white.map((scaled.T() - projection.T()).cast<long double>())), mechanics.rounding(), "T");
+  expect_at_most(largest_extended(white.acceleration((scaled.Lb() - projection.Lb()).cast<long double>())),
+                 mechanics.rounding() * size, "L b");
   // λ of independent rows is that of the rows as written: Aᵀλ is the same force
   if (mechanics.rank() < mechanics.A.rows()) return;
   const VectorXd force = mechanics.M * (projection.Lb() - mechanics.x);
@@ -116,7 +117,7 @@ RC_GTEST_PROP(MechanicsProperty, ScalingRowsChangesTheMultipliersOnly, ()) {
   const VectorXd of_scaled = scale.cwiseProduct(scaled.multipliers_of_force() * force);
   const auto [B, norms] = white.rows(mechanics.A.cast<long double>());
   // … from a force whose parts along rows at small angles to each other cancel
-  expect_at_most(largest(norms.cwiseProduct((of_scaled - lambda).cast<long double>())),
+  expect_at_most(largest_extended(norms.cwiseProduct((of_scaled - lambda).cast<long double>())),
                  mechanics.rounding() * mechanics.condition_of_rows * size, "λ");
 }
 
@@ -139,8 +140,9 @@ RC_GTEST_PROP(MechanicsProperty, ARowThatFollowsFromTheOthersChangesTheMultiplie
   const ExtendedVector norms = white.rows(A.cast<long double>()).second;
   const double lost = static_cast<double>(weights.cwiseAbs().cast<long double>().dot(norms.head(m)) / norms[m]);
   const double size = 1 + static_cast<double>(white.acceleration(mechanics.x.cast<long double>()).norm());
-  expect_at_most(largest(white.map((extended.T() - projection.T()).cast<long double>())), lost * mechanics.rounding(), "T");
-  expect_at_most(largest(white.acceleration((extended.Lb() - projection.Lb()).cast<long double>())),
+  expect_at_most(largest_extended(white.map((extended.T() - projection.T()).cast<long double>())), lost * mechanics.rounding(),
+                 "T");
+  expect_at_most(largest_extended(white.acceleration((extended.Lb() - projection.Lb()).cast<long double>())),
                  lost * mechanics.rounding() * size, "L b");
 }
 
@@ -228,20 +230,21 @@ RC_GTEST_PROP(MechanicsProperty, ANearlyRedundantRowIsNeverAWrongNumber, ()) {
   const double backward = mechanics.rounding() / mechanics.condition_of_rows + refined;
   // a projection it is, and a motion that satisfies the constraints, to what was dropped
   const double dropped = projection.rank() == mechanics.rank() ? 100 * UdwadiaKalaba::rank_tolerance : 0;
-  expect_at_most(largest(T * T - T), backward, "T² = T");
-  expect_at_most(largest(T - T.transpose()), backward, "M T = Tᵀ M");
-  expect_at_most(largest(B * T), backward + dropped, "A T = 0");
+  expect_at_most(largest_extended(T * T - T), backward, "T² = T");
+  expect_at_most(largest_extended(T - T.transpose()), backward, "M T = Tᵀ M");
+  expect_at_most(largest_extended(B * T), backward + dropped, "A T = 0");
   RC_ASSERT(projection.rank() == mechanics.rank() || projection.rank() == mechanics.rank() + 1);
   // what the rank leaves unsatisfied is what is reported
   const ExtendedVector Lb = white.acceleration(projection.Lb().cast<long double>());
   const ExtendedVector residual = B * Lb - b.cast<long double>().cwiseQuotient(norms);
   const double scale = size + static_cast<double>(Lb.norm());
-  expect_at_most(std::abs(largest(residual) - projection.inconsistency()), mechanics.rounding() * scale, "the residual reported");
+  expect_at_most(std::abs(largest_extended(residual) - projection.inconsistency()), mechanics.rounding() * scale,
+                 "the residual reported");
   if (projection.rank() == mechanics.rank()) {
     // what was dropped is no more than the tolerance allows: the row's distance from the span of the others
     const test::ExactProjection others =
         test::project_by_qr(mechanics.M, mechanics.A(mechanics.independent, Eigen::all), mechanics.b(mechanics.independent));
-    expect_at_most(largest(B.row(m) * white.map(others.T)),
+    expect_at_most(largest_extended(B.row(m) * white.map(others.T)),
                    10 * UdwadiaKalaba::rank_tolerance * mechanics.condition_of_rows + backward, "the row dropped");
     return;
   }
@@ -251,8 +254,8 @@ RC_GTEST_PROP(MechanicsProperty, ANearlyRedundantRowIsNeverAWrongNumber, ()) {
   const test::ExactProjection exact = test::project_by_qr(mechanics.M, A(independent, Eigen::all), b(independent));
   const double angle = test::condition_number(B(independent, Eigen::all).cast<double>());
   const double tolerance = backward * angle;
-  expect_at_most(largest(T - white.map(exact.T)), tolerance, "T");
-  expect_at_most(largest(white.acceleration(projection.Lb().cast<long double>() - exact.Lb)), tolerance * scale, "L b");
+  expect_at_most(largest_extended(T - white.map(exact.T)), tolerance, "T");
+  expect_at_most(largest_extended(white.acceleration(projection.Lb().cast<long double>() - exact.Lb)), tolerance * scale, "L b");
 }
 
 // One state of many where the constraints contradict each other.

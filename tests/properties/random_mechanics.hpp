@@ -184,7 +184,7 @@ inline ExactProjection project_by_qr(const MatrixXd& M, const MatrixXd& A, const
   return {C.transpose().triangularView<Eigen::Upper>().solve(whitened), C.transpose().triangularView<Eigen::Upper>().solve(y)};
 }
 
-inline double largest(const Extended& matrix) {
+inline double largest_extended(const Extended& matrix) {
   return matrix.size() == 0 ? 0 : static_cast<double>(matrix.cwiseAbs().maxCoeff());
 }
 

@@ -108,8 +108,6 @@ double factor(const Hyperparameter& h, const Prior& prior, const Units& units, b
   }
 }
 
-double largest(const MatrixXd& matrix) { return matrix.cwiseAbs().maxCoeff(); }
-
 void expect_same(const Units& units, const Case& c) {
   SCOPED_TRACE(fmt::format("{}, kernel {}, directions {}, seed {}", units.name, c.kernel, c.directions, seed));
   // on the surface, in metres, seconds and joules
@@ -149,7 +147,7 @@ void expect_same(const Units& units, const Case& c) {
   EXPECT_NEAR(value_other - shift, value_old, 1e-8 * (std::abs(value_old) + std::abs(shift)));
   // slopes in logarithms and in θ, which has the same unit, do not differ
   const auto expect_equal = [](const VectorXd& a, const VectorXd& b, const char* what) {
-    EXPECT_LE(largest(a - b), 1e-8 * (1 + largest(a))) << what;
+    EXPECT_LE(test::largest(a - b), 1e-8 * (1 + test::largest(a))) << what;
   };
   expect_equal(slope_old.log_kernel[0], slope_other.log_kernel[0], "kernel");
   expect_equal(slope_old.log_signal_stddev[0], slope_other.log_signal_stddev[0], "signal");
@@ -163,9 +161,10 @@ void expect_same(const Units& units, const Case& c) {
     const Posterior::Marginal b =
         of_other.marginal(View::all(quantity, *other.prior.system), units.state().asDiagonal() * queries);
     const MatrixXd mean = unit.cwiseInverse().asDiagonal() * b.mean, stddev = unit.cwiseInverse().asDiagonal() * b.stddev();
-    EXPECT_LE(largest(mean - a.mean), 1e-8 * largest(a.mean)) << quantity->word();
+    EXPECT_LE(test::largest(mean - a.mean), 1e-8 * test::largest(a.mean)) << quantity->word();
     // friction along the surface leaves the force across it certain: a rounded zero, beside the mean
-    EXPECT_LE(largest(stddev - a.stddev()), 1e-8 * largest(a.stddev()) + 1e-12 * largest(a.mean)) << quantity->word();
+    EXPECT_LE(test::largest(stddev - a.stddev()), 1e-8 * test::largest(a.stddev()) + 1e-12 * test::largest(a.mean))
+        << quantity->word();
   };
   compare(Quantity::constrained_acceleration, units.acceleration());
   compare(Quantity::unconstrained_acceleration, units.acceleration());

@@ -167,3 +167,88 @@ def test_what_is_no_system_is_refused(surface):
         as_functions(surface, mass=[["1"]])
     with pytest.raises(gp2.InputError, match="expected 'position', 'velocity' or 'acceleration', got 'loop'"):
         as_functions(surface, constraints={"loop": ["x"]})
+
+
+# ---- latents
+
+
+def bead(**latent):
+    return gp2.System(
+        coordinates=["x", "z"],
+        parameters={"h": {"value": 0.5, "bounds": [0.1, 2], "estimate": True}},
+        mass=[["2", "0"], ["0", "2"]],
+        force=["0", "-9.81*2"],
+        constraints=["z - h*x^2"],
+        noise=0.05,
+        truth=["-0.8*dx", "0"],
+        sampling={"x": [-1, 1], "dx": [-2, 2]},
+        latents=[{"name": "contact", **latent}],
+    )
+
+
+def features(states):
+    return np.stack([states[:, 0], np.sin(states[:, 2])], axis=1)
+
+
+def directions(states, values):
+    x, dx, h = states[:, 0], states[:, 2], values["h"]
+    return np.stack([h * x, 1 + h * dx**2], axis=1)[:, :, None]
+
+
+def directions_derivatives(states, values, name):
+    assert name == "h"
+    return np.stack([states[:, 0], states[:, 2] ** 2], axis=1)[:, :, None]
+
+
+TEXT = {"features": ["x", "sin(dx)"], "directions": {"force": [["h*x"], ["1 + h*dx^2"]]}}
+CODE = {
+    "features": {"names": ["x", "sin(dx)"], "function": features, "reads": ["x", "dx"]},
+    "directions": {
+        "force": {
+            "names": ["normal"],
+            "function": directions,
+            "derivatives": directions_derivatives,
+            "reads": ["x", "dx"],
+        }
+    },
+}
+
+
+def test_functions_of_a_latent_give_the_same_fit_as_text(tmp_path):
+    text, code = bead(**TEXT), bead(**CODE)
+    log = text.generate(40, seed=1)
+    options = {"mean": "force", "restarts": 1, "max_iterations": 5}
+    by_text, by_code = gp2.fit(text, log, **options), gp2.fit(code, log, **options)
+    assert by_code.report.objective == pytest.approx(by_text.report.objective, rel=1e-9)
+    states = text.states(text.generate(20, seed=2, noise_std=0))
+    np.testing.assert_allclose(by_code.predict(states).mean, by_text.predict(states).mean, rtol=1e-6, atol=1e-6)
+    by_code.save(tmp_path / "fit.json")
+    again = gp2.load(tmp_path / "fit.json", system=code)
+    np.testing.assert_array_equal(again.predict(states).mean, by_code.predict(states).mean)
+    np.testing.assert_array_equal(
+        gp2.Predictor(again).mean(np.ascontiguousarray(states[0])), gp2.Predictor(by_code).mean(states[0])
+    )
+    with pytest.raises(gp2.InputError, match="latents of its model .* are code"):
+        gp2.load(tmp_path / "fit.json")
+
+
+@pytest.mark.parametrize(
+    ("part", "given", "text"),
+    [
+        ("features", {"function": features}, "latent 'contact': features: missing 'names'"),
+        ("features", {"names": ["a"], "function": features}, r"features must be numbers of shape \(n, names\) = \(40, 1\)"),
+        ("features", {"names": ["a"], "function": features, "read": ["x"]}, "'names', 'function', 'derivatives' or 'reads', got 'read'"),
+        ("features", {"names": ["a"], "function": features, "reads": ["y"]}, "'y' is no entry of the state"),
+        ("directions", {"force": {"names": ["a", "b"], "function": directions}}, r"\(n, nq, names\) = \(40, any, 2\)"),
+        ("directions", {"names": ["a"], "function": lambda states, _: np.ones((len(states), 3, 1))}, "3 × 40, expected 2 × 40"),
+    ],
+)
+def test_functions_of_a_latent_are_refused_where_they_do_not_fit(part, given, text):
+    log = bead(**TEXT).generate(40, seed=1)
+    with pytest.raises(gp2.InputError, match=text):
+        gp2.fit(bead(**{**TEXT, part: given}), log, restarts=1, max_iterations=1)
+
+
+def test_what_is_no_function_is_a_type_error():
+    with pytest.raises(TypeError, match="latent 'contact': features: expected a function, got"):
+        bead(**{**CODE, "features": {"names": ["a"], "function": 3}})

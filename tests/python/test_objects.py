@@ -34,7 +34,7 @@ def test_what_holds_functions_cannot_be_pickled():
     system = gp2.System.from_callables(free_mass, name="a mass", coordinates=["x"], noise=0.1, reads=["x", "dx"])
     posterior = gp2.fit(system, {"x": [0.0, 1.0], "dx": [1.0, 0.5], "ddx": [0.1, 0.2]}, max_iterations=0)
     for thing in [system, posterior]:
-        with pytest.raises(TypeError, match="'a mass' cannot be pickled: its mechanics are functions"):
+        with pytest.raises(TypeError, match="'a mass' cannot be pickled: it has functions, which are code"):
             pickle.dumps(thing)
 
 

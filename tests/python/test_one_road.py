@@ -32,6 +32,13 @@ def test_check_has_the_findings_of_the_command(tmp_path, command, arm, arm_log):
     assert "not in the log: ddelbow; fit with observe for the others" in [text for _, text in findings(gp2.check(arm, path))]
 
 
+@pytest.mark.parametrize("options", [{}, {"full": True}, {"latex": True}])
+def test_show_is_what_the_command_prints(command, options):
+    model = MODELS / "unicycle.toml"
+    flags = [f"--{name}" for name in options]
+    assert gp2.show(gp2.System.load(model), **options) == command("show", model, *flags).stdout
+
+
 def test_check_without_data_or_sampling_says_so():
     system = gp2.System(coordinates=["x"], mass=[["1"]], noise=1)
     assert findings(gp2.check(system))[1:] == [

@@ -205,7 +205,7 @@ def test_systems_of_functions_can_be_cloned_but_not_pickled():
     X = np.random.default_rng(5).normal(size=(20, 3))
     model = clone(GP2Regressor(system)).fit(X, -X[:, 1])
     np.testing.assert_allclose(model.predict(X), -X[:, 1], atol=0.1)
-    with pytest.raises(TypeError, match="'a mass' cannot be pickled: its mechanics are functions"):
+    with pytest.raises(TypeError, match="'a mass' cannot be pickled: it has functions, which are code"):
         pickle.dumps(model)
 
 

@@ -14,6 +14,7 @@
 #include "gp2/error.hpp"
 #include "gp2/mechanics/state_evaluator.hpp"
 #include "gp2/model.hpp"
+#include "input_error.hpp"
 #include "robots/mujoco_oracle.hpp"
 
 namespace gp2 {
@@ -370,13 +371,8 @@ TEST(RobotExpressions, OfALongChainTakeDifferencesInTheState) {
 
 TEST(RobotModel, SaysWhatIsWrong) {
   const std::string arm = fmt::format("robot = '{}'\n", source("experiments/arm_on_surface/iiwa7.xml").string());
-  const auto message = [&](const std::string& more) -> std::string {
-    try {
-      Model::parse(arm + more, "arm.toml");
-    } catch (const std::exception& error) {
-      return error.what();
-    }
-    return "no error";
+  const auto message = [&](const std::string& more) {
+    return test::input_error_of([&] { Model::parse(arm + more, "arm.toml"); });
   };
   const auto expect = [&](const std::string& more, const std::string& part) {
     EXPECT_NE(message(more).find(part), std::string::npos) << message(more);

@@ -16,6 +16,7 @@
 #include "gp2/predictor.hpp"
 #include "gp2/simulate.hpp"
 #include "gp2/simulation/generate.hpp"
+#include "input_error.hpp"
 
 namespace gp2 {
 namespace {
@@ -88,13 +89,7 @@ TEST(Motion, IsTheSameForAnyNoiseAndTheSameSeedOnly) {
 }
 
 std::string error_of(const std::string& text) {
-  try {
-    const Model model = Model::parse(text, "m");
-    motion_of(model, 2);
-  } catch (const std::exception& error) {
-    return error.what();
-  }
-  return "no error";
+  return test::input_error_of([&] { motion_of(Model::parse(text, "m"), 2); });
 }
 
 TEST(Motion, SaysWhatIsWrongWithIt) {

@@ -4,6 +4,7 @@
 
 #include "gp2/error.hpp"
 #include "gp2/simulate.hpp"
+#include "input_error.hpp"
 #include "test_models.hpp"
 
 // Measured states moved onto the constraints.
@@ -83,13 +84,10 @@ TEST(ProjectedStatesTest, StatesThatLackWhatTheConstraintReadsAreRefused) {
   const Model& model = test::model("models/surface.toml");
   MatrixXd states = generate(model, {3, seed, VectorXd::Zero(3)}).states;
   states.row(1).setConstant(std::nan(""));
-  try {
-    static_cast<void>(project_states(*model.system, model.system->parameter_values(), states));
-    ADD_FAILURE() << "was not refused";
-  } catch (const InputError& error) {
-    EXPECT_THAT(error.what(), HasSubstr("the states lack a coordinate or velocity that the constraint \""));
-    EXPECT_THAT(error.what(), HasSubstr("reads, and cannot be projected onto it"));
-  }
+  EXPECT_THAT(
+      test::input_error_of([&] { static_cast<void>(project_states(*model.system, model.system->parameter_values(), states)); }),
+      testing::AllOf(HasSubstr("the states lack a coordinate or velocity that the constraint \""),
+                     HasSubstr("reads, and cannot be projected onto it")));
   EXPECT_TRUE(check_states(*model.system, states, model.system->parameter_values()).empty());
 }
 

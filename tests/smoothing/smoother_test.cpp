@@ -10,6 +10,7 @@
 
 #include "base/random.hpp"
 #include "gp2/error.hpp"
+#include "input_error.hpp"
 
 namespace gp2::test {
 namespace {
@@ -291,20 +292,10 @@ TEST(Smoother, NoiseIsNotBelowTheLeast) {
   EXPECT_TRUE(fit.noise_at_least);
 }
 
-template <typename Call>
-std::string thrown(const Call& call) {
-  try {
-    call();
-  } catch (const InputError& error) {
-    return error.what();
-  }
-  return "nothing";
-}
-
 TEST(Smoother, SaysWhatIsWrong) {
   const std::vector<Measurement> good = irregular(20, 9);
   const auto likelihood = [&](const SmootherModel& model, const std::vector<Measurement>& measurements) {
-    return thrown([&] { log_likelihood(model, measurements); });
+    return test::input_error_of([&] { log_likelihood(model, measurements); });
   };
   EXPECT_THAT(likelihood({.lengthscale = 0}, good), HasSubstr("lengthscale must be positive, got 0"));
   EXPECT_THAT(likelihood({.signal_stddev = -1}, good), HasSubstr("signal_stddev must be positive, got -1"));
@@ -315,9 +306,10 @@ TEST(Smoother, SaysWhatIsWrong) {
   EXPECT_THAT(likelihood({}, {{0, 1}, {1, std::nan("")}}), HasSubstr("measurement 1 must be finite, got nan at time 1"));
   EXPECT_THAT(likelihood({}, {{0, 1}, {-1, 1}}), HasSubstr("times must not run backwards, got -1 after 0"));
   EXPECT_THAT(likelihood({}, {{0, 1, false, 0}}), HasSubstr("noise_factor must be positive, got 0"));
-  EXPECT_THAT(thrown([&] { smooth({}, good, VectorXd::Zero(2)); }), HasSubstr("times must be finite and increase, got 0 at 1"));
-  EXPECT_THAT(thrown([&] { fit_smoother({{0, 1}, {1, 2}}); }), HasSubstr("2 positions are too few"));
-  EXPECT_THAT(thrown([&] {
+  EXPECT_THAT(test::input_error_of([&] { smooth({}, good, VectorXd::Zero(2)); }),
+              HasSubstr("times must be finite and increase, got 0 at 1"));
+  EXPECT_THAT(test::input_error_of([&] { fit_smoother({{0, 1}, {1, 2}}); }), HasSubstr("2 positions are too few"));
+  EXPECT_THAT(test::input_error_of([&] {
                 fit_smoother(std::vector<Measurement>{{0, 1}, {1, 1}, {2, 1}, {3, 1}, {4, 1}});
               }),
               HasSubstr("all 5 positions are 1: nothing moves"));

@@ -5,6 +5,7 @@
 #include <gtest/gtest.h>
 
 #include "gp2/error.hpp"
+#include "input_error.hpp"
 #include "random_expression.hpp"
 
 namespace gp2 {
@@ -22,17 +23,6 @@ class ExpressionTest : public testing::Test {
   ExpressionGraph graph;
   const Expression x = graph.variable("x"), y = graph.variable("y"), z = graph.variable("z");
 };
-
-/// What f throws, or "" when it does not.
-template <class F>
-std::string error_of(F f) {
-  try {
-    f();
-  } catch (const InputError& error) {
-    return error.what();
-  }
-  return "";
-}
 
 TEST_F(ExpressionTest, LocalRulesSimplify) {
   const std::vector<std::pair<std::string, std::string>> table{{"x + 0", "x"},
@@ -280,7 +270,7 @@ TEST_F(ExpressionTest, DeepExpressionsCostNoStack) {
 // --------------------------------------------------------------------------------------------------------------------- errors
 
 TEST_F(ExpressionTest, GraphsRefuseToGrowPastTheirBound) {
-  const std::string text = error_of([&] {
+  const std::string text = test::input_error_of([&] {
     for (std::size_t k = 0; k <= ExpressionGraph::max_nodes; ++k) graph.constant(static_cast<double>(k));
   });
   EXPECT_EQ(text, "expressions: more than 1000000 operations; use fewer or shorter expressions");
@@ -288,15 +278,15 @@ TEST_F(ExpressionTest, GraphsRefuseToGrowPastTheirBound) {
 }
 
 TEST_F(ExpressionTest, ConstantsMustBeFinite) {
-  EXPECT_EQ(error_of([&] { number(std::numeric_limits<double>::infinity()); }),
+  EXPECT_EQ(test::input_error_of([&] { number(std::numeric_limits<double>::infinity()); }),
             "expressions: a constant must be finite, got inf");
 }
 
 TEST_F(ExpressionTest, GraphsDoNotMix) {
   ExpressionGraph other;
-  EXPECT_EQ(error_of([&] { x + other.variable("x"); }),
+  EXPECT_EQ(test::input_error_of([&] { x + other.variable("x"); }),
             "expressions: the operands belong to different graphs; build all operands in one graph");
-  EXPECT_EQ(error_of([&] { apply(Operation::sin, other.variable("x")); }),
+  EXPECT_EQ(test::input_error_of([&] { apply(Operation::sin, other.variable("x")); }),
             "expressions: the operand belongs to another graph; build all operands in one graph");
 }
 
@@ -313,7 +303,7 @@ TEST_F(ExpressionTest, ACopyReadsAsTheOriginal) {
   // in its own graph an expression is its own copy
   EXPECT_EQ(graph.copy(originals), originals);
   EXPECT_TRUE(other.copy({}).empty());
-  EXPECT_EQ(error_of([&] {
+  EXPECT_EQ(test::input_error_of([&] {
               graph.copy(std::vector{x, other.variable("x")});
             }),
             "expressions: what is copied belongs to different graphs; copy each on its own");
@@ -327,14 +317,14 @@ TEST_F(ExpressionTest, SeveralExpressionsAreDifferentiatedAsEachAlone) {
 }
 
 TEST_F(ExpressionTest, DerivativesAreTakenWithRespectToVariables) {
-  EXPECT_EQ(error_of([&] { graph.differentiate(x * y, x + y); }),
+  EXPECT_EQ(test::input_error_of([&] { graph.differentiate(x * y, x + y); }),
             "expressions: a derivative is taken with respect to a variable");
 }
 
 TEST_F(ExpressionTest, TextsThatGrowWithoutBoundAreRefused) {
   Expression e = x;
   for (int level = 0; level < 40; ++level) e = e * e + x;
-  EXPECT_EQ(error_of([&] { to_string(e); }),
+  EXPECT_EQ(test::input_error_of([&] { to_string(e); }),
             "expressions: written out, this one has more than 16777216 characters; print its parts");
 }
 

@@ -9,6 +9,7 @@
 #include "allocation_count.hpp"
 #include "gp2/error.hpp"
 #include "gp2/symbolic/expression.hpp"
+#include "input_error.hpp"
 #include "random_expression.hpp"
 
 namespace gp2 {
@@ -232,30 +233,22 @@ TEST(Tape, NanIsNeverSwallowed) {
 TEST(Tape, ErrorsNameTheFault) {
   ExpressionGraph graph, other;
   const Expression x = graph.variable("x"), y = graph.variable("y");
-  const auto error_of = [](auto f) -> std::string {
-    try {
-      f();
-    } catch (const InputError& error) {
-      return error.what();
-    }
-    return "";
-  };
-  EXPECT_EQ(error_of([&] { Tape(std::vector{x * y}, std::vector{x}); }),
+  EXPECT_EQ(test::input_error_of([&] { Tape(std::vector{x * y}, std::vector{x}); }),
             "tape: an output depends on 'y', which is not among the inputs; add it to them");
-  EXPECT_EQ(error_of([&] {
+  EXPECT_EQ(test::input_error_of([&] {
               Tape(std::vector{x}, std::vector{x, x * y});
             }),
             "tape: input 2 must be a variable of the graph of the outputs");
-  EXPECT_EQ(error_of([&] {
+  EXPECT_EQ(test::input_error_of([&] {
               Tape(std::vector{x, other.variable("x")}, std::vector{x});
             }),
             "tape: all outputs must belong to one graph");
   Eigen::MatrixXd results;
-  EXPECT_EQ(error_of([&] {
+  EXPECT_EQ(test::input_error_of([&] {
               Tape(std::vector{x * y}, std::vector{x, y}).evaluate(Eigen::MatrixXd(1, 3), Eigen::VectorXd(2), results);
             }),
             "tape: evaluate needs 2 inputs, got 1 per point and 2 shared");
-  EXPECT_EQ(error_of([&] {
+  EXPECT_EQ(test::input_error_of([&] {
               std::ignore = Tape(std::vector{x * y}, std::vector{x, y}).make_workspace(Eigen::VectorXd::Zero(3));
             }),
             "tape: make_workspace takes at most the 2 inputs, got 3 shared");

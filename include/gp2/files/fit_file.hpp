@@ -36,17 +36,15 @@ struct FitFile {
 
   /// Written whole or not at all. @throws InputError when that fails, or `systems` lacks the model of another system.
   void write(const std::filesystem::path& path) const;
+  /// @param code  what the models of the fit left to code (Model::code), which a file cannot hold; it must be that of the fit, for
+  ///   the posterior to be. The declaration's name tells mechanics of which model they are asked for.
   /// @throws InputError naming the file and what is wrong: not a fit, of a newer format, cut short, changed after it was written
-  ///   (its checksum is of another content; the text says how a change that is meant is made good), or with values out of place.
-  static FitFile read(const std::filesystem::path& path);
+  ///   (its checksum is of another content; the text says how a change that is meant is made good), with values out of place, or
+  ///   with code where there is none to give or none given where there is.
+  static FitFile read(const std::filesystem::path& path, const ModelCode& code = {});
   /// @param text  what the file holds
   /// @param name  stands for the file in messages
   static FitFile parse(std::string_view text, const std::string& name);
-  /// The same of a fit whose mechanics are code: it holds what its model declares, and is told the code again. The code must be
-  /// that of the fit, for the posterior to be.
-  /// @param mechanics  asked for every model of the file whose mechanics are code; the declaration's name tells which
-  /// @throws InputError also when there is no such model.
-  static FitFile read(const std::filesystem::path& path, const MechanicsSource& mechanics);
 };
 
 /// Starting values for hyperparameters by name, from {"name": value, …} or a FitFile.

@@ -124,6 +124,7 @@ class UdwadiaKalaba {
   double factorise_mass(const Eigen::Ref<const Eigen::MatrixXd>& M, const Eigen::Ref<const Eigen::MatrixXd>& A);
   void complete_mass(const Eigen::Ref<const Eigen::MatrixXd>& M, const Eigen::Ref<const Eigen::MatrixXd>& A);
   void decompose_rows();
+  void invert_R_transposed();
   Mass mass_kind_ = Mass::positive_definite;
   int rank_ = 0;
   int n_zero_rows_ = 0;

@@ -1,0 +1,70 @@
+#pragma once
+
+#include <functional>
+#include <memory>
+#include <optional>
+#include <string>
+#include <vector>
+
+#include <Eigen/Core>
+
+#include "gp2/export.hpp"
+#include "gp2/prior.hpp"
+
+namespace gp2 GP2_API {
+
+/// Code for the features or the directions of a latent: a contact Jacobian of another library, say. It must give the same for the
+/// same arguments and may be called from several threads at once. What it throws goes to the caller as it is; the shape of what it
+/// returns is checked at every call, and that numbers are finite where everything that is read is.
+struct StateCode {
+  using States = StateFunction::States;
+  using Parameters = StateFunction::Parameters;
+
+  /// One row per number, one column per state (rows × N). Features are given no parameters (size 0): they depend on none that may
+  /// be estimated.
+  std::function<Eigen::MatrixXd(const States& states, const Parameters& parameters)> evaluate = nullptr;
+
+  /// Derivatives of directions in parameters()[index], exact (rows × N). Optional: without it they are differences, as in
+  /// CallableSystem::Definition::differentiate.
+  std::function<Eigen::MatrixXd(const States& states, const Parameters& parameters, int index)> differentiate = nullptr;
+
+  /// Names of the state's entries (q1, dq1, t, u1, …) that it reads: a log needs these columns. Not given: all.
+  std::optional<std::vector<std::string>> reads = std::nullopt;
+
+  explicit operator bool() const { return static_cast<bool>(evaluate); }
+};
+
+/// What a latent is made from: words, as in the [[latent]] of a model file (docs/model-files.md), or code.
+struct LatentSpec {
+  std::string name;
+  std::string kernel = "se";
+  std::vector<std::string> features;  // φ(x): expressions of the state; of code, what its numbers are called
+  StateCode feature_code = {};        // empty: features are expressions
+  Latent::Base base = Latent::Base::acceleration;
+  std::vector<std::vector<std::string>> directions = {};  // B(x): nq rows of p expressions of state and parameters
+  std::vector<std::string> direction_names = {};          // of code, its columns (p)
+  StateCode direction_code = {};                          // B(x) column-major (nq·p × N); neither: B = I
+  Latent::Range lengthscale = {}, signal_stddev = {};
+};
+
+/// What the model's kernel would rule out without reason: a second latent of fixed, short lengthscales and a size below the
+/// noise. It hardly moves the mean, but keeps a standard deviation where the fit would call an effect absent that the data cannot
+/// see.
+struct Discrepancy {
+  Eigen::VectorXd lengthscale;  // of each feature of the model's latent (D)
+  Eigen::VectorXd stddev;       // of each acceleration (nq)
+};
+
+struct PriorOptions {
+  Prior::Mean mean = Prior::Mean::zero;
+  std::optional<Latent::Base> base;             // replaces the directions of the one latent by the identity or M⁻¹
+  bool raw_angles = false;                      // a feature that is an angle stays as it is instead of its sine and cosine
+  std::optional<Discrepancy> discrepancy = {};  // beside the first latent
+};
+
+/// A prior without a model file. Expressions are of the system's coordinates, velocities, t, inputs and parameters.
+/// @throws InputError naming the latent, when a kernel, an expression or a list of code is wrong, or `base` is asked for and there
+///   are several latents.
+Prior make_prior(std::shared_ptr<const System> system, const std::vector<LatentSpec>& latents, const PriorOptions& options = {});
+
+}  // namespace gp2

@@ -1,0 +1,136 @@
+#include "gp2/jobs/show_job.hpp"
+
+#include <algorithm>
+
+#include <fmt/format.h>
+#include <fmt/ranges.h>
+
+namespace gp2 {
+
+namespace {
+
+// the expressions of a robot fill books
+std::string entry_text(Expression e, bool full) {
+  constexpr double readable = 100;
+  const ExpressionSize size = e.graph().size_of(e);
+  return full || size.written <= readable ? to_string(e) : fmt::format("({} operations)", size.operations);
+}
+
+std::string matrix_text(const std::vector<std::vector<Expression>>& rows, bool full) {
+  // columns aligned
+  std::vector<std::size_t> widths;
+  for (const auto& row : rows) {
+    widths.resize(std::max(widths.size(), row.size()));
+    for (std::size_t j = 0; j < row.size(); ++j) widths[j] = std::max(widths[j], entry_text(row[j], full).size());
+  }
+  std::string out;
+  for (const auto& row : rows) {
+    out += "  [";
+    for (std::size_t j = 0; j < row.size(); ++j)
+      out += fmt::format("{}{:<{}}", j == 0 ? " " : "   ", entry_text(row[j], full), widths[j]);
+    out += " ]\n";
+  }
+  return out.empty() ? "  (no rows)\n" : out;
+}
+
+std::string matrix_latex(const char* name, const std::vector<std::vector<Expression>>& rows) {
+  std::string out = fmt::format("{} = \\begin{{bmatrix}}\n", name);
+  for (std::size_t i = 0; i < rows.size(); ++i) {
+    std::vector<std::string> entries;
+    for (Expression entry : rows[i]) entries.push_back(to_string(entry, Notation::latex));
+    out += fmt::format("  {}{}\n", fmt::join(entries, " & "), i + 1 < rows.size() ? " \\\\" : "");
+  }
+  return out + "\\end{bmatrix}\n";
+}
+
+std::string latex_text(const SymbolicSystem::Definition& definition, const std::vector<std::vector<Expression>>& A,
+                       const std::vector<std::vector<Expression>>& b, const std::vector<std::vector<Expression>>& F) {
+  return fmt::format("\\begin{{align*}}\n{}\\\\\n{}\\\\\n{}\\\\\n{}\\end{{align*}}\n", matrix_latex("M", definition.mass),
+                     matrix_latex("F", F), matrix_latex("A", A), matrix_latex("b", b));
+}
+
+std::string robot_text(const RobotDescription& robot) {
+  const auto names = [](const auto& things) {
+    std::vector<std::string> out;
+    for (const auto& thing : things) out.push_back(thing.name);
+    return out.empty() ? "none" : fmt::format("{}", fmt::join(out, ", "));
+  };
+  std::string text =
+      fmt::format("\nrobot {}\n  bodies      {}\n  sites       {}\n", robot.name, names(robot.bodies), names(robot.sites));
+  for (const std::string& note : robot.notes) text += fmt::format("  {}\n", note);
+  return text;
+}
+
+// "  0.1   in [0, 1]   estimated"
+std::string parameters_text(const System& system) {
+  std::string text = "\nparameters\n";
+  for (const Parameter& parameter : system.parameters()) {
+    text += fmt::format("  {:<12} {}", parameter.name, parameter.value);
+    if (parameter.bounds) text += fmt::format("   in [{}, {}]", parameter.bounds->first, parameter.bounds->second);
+    text += parameter.estimate ? "   estimated\n" : "\n";
+  }
+  return text;
+}
+
+std::string directions_text(const Model& model, const LatentSpec& latent, bool full) {
+  if (latent.direction_code) return "  code\n";
+  std::vector<std::vector<Expression>> directions;
+  for (const std::vector<std::string>& row : latent.directions) {
+    directions.emplace_back();
+    for (const std::string& entry : row) directions.back().push_back(model.expression(entry));
+  }
+  return matrix_text(directions, full);
+}
+
+std::string latents_text(const Model& model, bool full) {
+  std::string text;
+  const Prior prior = make_prior(model);
+  for (std::size_t a = 0; a < prior.latents.size(); ++a) {
+    const Latent& latent = prior.latents[a];
+    text += fmt::format("\nlatent '{}'\n  kernel      {}\n  features    {}\n  acts on     {}\n", latent.name,
+                        latent.kernel.text(), fmt::join(latent.feature_names, ", "), fmt::join(latent.column_names, ", "));
+    if (!latent.directions) continue;
+    text += fmt::format("  directions{}\n{}", latent.base == Latent::Base::force ? " (forces)" : "",
+                        directions_text(model, model.latents[a], full));
+  }
+  return text;
+}
+
+std::string whole_text(const Model& model, const SymbolicSystem& system, const std::vector<std::vector<Expression>>& A,
+                       const std::vector<std::vector<Expression>>& b, const std::vector<std::vector<Expression>>& F, bool full) {
+  std::string text = fmt::format("{}\n  {} coordinates, {} inputs, {} constraints\n", system.name(), system.nq(),
+                                 system.inputs().size(), system.nc());
+  if (model.robot) text += robot_text(*model.robot);
+  text += fmt::format("\nmass matrix M\n{}", matrix_text(system.definition().mass, full));
+  text += fmt::format("\nknown force F\n{}", matrix_text(F, full));
+  text += "\nconstraints A ddq = b\n";
+  for (const ConstraintRow& row : system.definition().constraints) {
+    const char* level = row.level == ConstraintRow::Level::position   ? "position"
+                        : row.level == ConstraintRow::Level::velocity ? "velocity"
+                                                                      : "acceleration";
+    text += fmt::format("  {} = 0   ({} level)\n", row.text, level);
+  }
+  text += fmt::format("A\n{}b\n{}", matrix_text(A, full), matrix_text(b, full));
+  return text + parameters_text(system) + latents_text(model, full);
+}
+
+}  // namespace
+
+std::vector<Option> options(ShowRequest& request) {
+  return {{"latex", &request.latex, "", "as LaTeX"},
+          {"full", &request.full, "", "long expressions too, which otherwise are counted"}};
+}
+
+std::string show(const Model& model, const ShowRequest& request) {
+  const SymbolicSystem& system = require_symbolic_system(model);
+  const SymbolicSystem::Definition& definition = system.definition();
+  std::vector<std::vector<Expression>> A, b, F;
+  for (const ConstraintRow& row : definition.constraints) {
+    A.push_back(row.A);
+    b.push_back({row.b});
+  }
+  for (Expression entry : definition.force) F.push_back({entry});
+  return request.latex ? latex_text(definition, A, b, F) : whole_text(model, system, A, b, F, request.full);
+}
+
+}  // namespace gp2

@@ -1,0 +1,70 @@
+#include "prior/expression_function.hpp"
+
+namespace gp2 {
+
+using Eigen::MatrixXd;
+using Eigen::Ref;
+using Eigen::VectorXd;
+
+ExpressionFunction::ExpressionFunction(std::span<const Expression> expressions, std::span<const Expression> inputs,
+                                       std::size_t n_states)
+    : values_(expressions, inputs), state_derivatives_(expressions, inputs, static_cast<int>(n_states)) {}
+
+std::shared_ptr<const StateFunction> ExpressionFunction::of_state(std::span<const Expression> expressions,
+                                                                  const SystemSymbols& symbols) {
+  const std::vector<Expression> state = symbols.state();
+  return std::shared_ptr<const StateFunction>(new ExpressionFunction(expressions, state, state.size()));
+}
+
+std::shared_ptr<const StateFunction> ExpressionFunction::of_state_and_parameters(std::span<const Expression> expressions,
+                                                                                 const SystemSymbols& symbols,
+                                                                                 ExpressionGraph& graph) {
+  const std::vector<Expression> inputs = symbols.state_and_parameters();
+  const std::shared_ptr<ExpressionFunction> function(new ExpressionFunction(expressions, inputs, symbols.state().size()));
+  for (const Expression parameter : symbols.parameters) {
+    std::vector<Expression> derivatives;
+    for (const Expression expression : expressions) derivatives.push_back(graph.differentiate(expression, parameter));
+    function->parameter_derivatives_.emplace_back(derivatives, inputs);
+  }
+  return function;
+}
+
+MatrixXd ExpressionFunction::evaluate(const States& states, const Parameters& parameters) const {
+  MatrixXd values;
+  values_.evaluate(states, parameters, values);
+  return values;
+}
+
+MatrixXd ExpressionFunction::differentiate(const States& states, const Parameters& parameters, int index) const {
+  MatrixXd derivatives;
+  parameter_derivatives_[static_cast<std::size_t>(index)].evaluate(states, parameters, derivatives);
+  return derivatives;
+}
+
+class ExpressionFunction::TapeEvaluator final : public Evaluator {
+ public:
+  TapeEvaluator(const ExpressionFunction& function, const Parameters& parameters)
+      : values_(function.values_),
+        derivatives_(function.state_derivatives_),
+        workspace_(values_.make_workspace(parameters)),
+        workspace_of_derivatives_(derivatives_.tape.make_workspace(parameters)) {}
+
+  void evaluate(const Ref<const VectorXd>& state, Ref<VectorXd> values) override {
+    values_.evaluate_at(state, workspace_, values);
+  }
+  [[nodiscard]] const std::vector<StateDerivatives::Entry>& entries() const override { return derivatives_.entries; }
+  void differentiate(const Ref<const VectorXd>& state, Ref<VectorXd> derivatives) override {
+    derivatives_.tape.evaluate_at(state, workspace_of_derivatives_, derivatives);
+  }
+
+ private:
+  const Tape& values_;
+  const StateDerivatives& derivatives_;
+  VectorXd workspace_, workspace_of_derivatives_;
+};
+
+std::unique_ptr<StateFunction::Evaluator> ExpressionFunction::make_evaluator(const Parameters& parameters) const {
+  return std::make_unique<TapeEvaluator>(*this, parameters);
+}
+
+}  // namespace gp2

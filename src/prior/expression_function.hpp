@@ -1,0 +1,35 @@
+#pragma once
+
+#include <span>
+#include <vector>
+
+#include "gp2/mechanics/symbolic_system.hpp"
+#include "gp2/prior/state_function.hpp"
+
+namespace gp2 {
+
+/// A StateFunction given by expressions.
+class ExpressionFunction final : public StateFunction {
+ public:
+  /// Features: expressions of the state alone.
+  static std::shared_ptr<const StateFunction> of_state(std::span<const Expression> expressions, const SystemSymbols& symbols);
+  /// Directions: expressions of the state and the parameters, with their derivatives in each parameter.
+  static std::shared_ptr<const StateFunction> of_state_and_parameters(std::span<const Expression> expressions,
+                                                                      const SystemSymbols& symbols, ExpressionGraph& graph);
+
+  [[nodiscard]] int size() const override { return values_.n_outputs(); }
+  [[nodiscard]] Eigen::MatrixXd evaluate(const States& states, const Parameters& parameters) const override;
+  [[nodiscard]] Eigen::MatrixXd differentiate(const States& states, const Parameters& parameters, int index) const override;
+  [[nodiscard]] bool reads(int state_index) const override { return values_.uses_input(state_index); }
+  [[nodiscard]] std::unique_ptr<Evaluator> make_evaluator(const Parameters& parameters) const override;
+
+ private:
+  ExpressionFunction(std::span<const Expression> expressions, std::span<const Expression> inputs, std::size_t n_states);
+  class TapeEvaluator;
+
+  Tape values_;
+  StateDerivatives state_derivatives_;
+  std::vector<Tape> parameter_derivatives_;  // one per parameter of the system
+};
+
+}  // namespace gp2

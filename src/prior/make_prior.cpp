@@ -1,0 +1,208 @@
+#include "prior/make_prior.hpp"
+
+#include <algorithm>
+#include <map>
+#include <utility>
+
+#include <fmt/format.h>
+
+#include "gp2/error.hpp"
+#include "prior/code_function.hpp"
+#include "prior/expression_function.hpp"
+#include "symbolic/graph.hpp"
+
+namespace gp2 {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+
+namespace {
+
+// an error says of which latent it is
+template <typename Work>
+auto named(const LatentSpec& spec, const Work& work) {
+  try {
+    return work();
+  } catch (const InputError& error) {
+    throw InputError(fmt::format("latent '{}': {}", spec.name, error.what()));
+  }
+}
+
+/// Makes the latents of one prior.
+class LatentMaker {
+ public:
+  LatentMaker(std::shared_ptr<const System> system, const PriorOptions& options, const PriorWords& words)
+      : system_(std::move(system)), options_(options), words_(words) {}
+
+  [[nodiscard]] Latent make(const LatentSpec& spec) {
+    Latent latent;
+    latent.name = spec.name;
+    latent.base = options_.base.value_or(spec.base);
+    latent.lengthscale = spec.lengthscale;
+    latent.signal_stddev = spec.signal_stddev;
+    set_features(spec, latent);
+    latent.kernel = named(spec, [&] { return Kernel::parse(spec.kernel, latent.feature_names); });
+    set_directions(spec, latent);
+    return latent;
+  }
+
+  /// Features in units of the lengthscales, directions of the standard deviations: nothing is left to tune.
+  [[nodiscard]] Latent make_discrepancy(const LatentSpec& spec, const Discrepancy& discrepancy) {
+    Latent latent;
+    set_features(spec, latent, &discrepancy.lengthscale);
+    latent.name = "discrepancy";
+    latent.kernel = Kernel::parse("se", latent.feature_names);
+    latent.kernel_is_fixed = latent.signal_is_fixed = true;
+    const auto nq = static_cast<std::size_t>(system_->nq());
+    if (discrepancy.lengthscale.size() != latent.n_features() || discrepancy.stddev.size() != system_->nq()) {
+      throw InputError(fmt::format("a discrepancy must hold {} lengthscales and {} standard deviations, got {} and {}",
+                                   latent.n_features(), nq, discrepancy.lengthscale.size(), discrepancy.stddev.size()));
+    }
+    std::vector<Expression> directions(nq * nq, words_.graph.constant(0));
+    for (std::size_t j = 0; j < nq; ++j) {
+      latent.column_names.push_back(system_->coordinates()[j].acceleration());
+      directions[j * nq + j] = words_.graph.constant(discrepancy.stddev[static_cast<Index>(j)]);
+    }
+    latent.directions = ExpressionFunction::of_state_and_parameters(directions, words_.symbols, words_.graph);
+    return latent;
+  }
+
+ private:
+  /// @param unit  of each feature; null: 1
+  void set_features(const LatentSpec& spec, Latent& latent, const Eigen::VectorXd* unit = nullptr) {
+    if (spec.feature_code) {
+      latent.feature_names = spec.features;
+      StateCode code = spec.feature_code;
+      if (unit != nullptr) {
+        code.evaluate = [of = code.evaluate, unit = *unit](const auto& states, const auto& parameters) -> MatrixXd {
+          return of(states, parameters).array().colwise() / unit.array();
+        };
+      }
+      latent.features = std::make_shared<CodeFunction>(std::move(code), fmt::format("latent '{}': features", spec.name),
+                                                       latent.n_features(), system_);
+      return;
+    }
+    std::vector<Expression> values;
+    for (const std::string& feature : spec.features) {
+      for (const std::string& name :
+           options_.raw_angles ? std::vector<std::string>{feature} : expand_angle(feature, system_->coordinates())) {
+        latent.feature_names.push_back(name);
+        const Expression value = named(spec, [&] { return words_.parse(name); });
+        for (std::size_t k = 0; k < words_.symbols.parameters.size(); ++k) {
+          if (words_.graph.depends_on(value, words_.symbols.parameters[k])) {
+            latent.feature_parameters.push_back(static_cast<int>(k));
+          }
+        }
+        values.push_back(words_.with_values(value, *system_));
+      }
+    }
+    for (std::size_t d = 0; unit != nullptr && d < std::min(values.size(), static_cast<std::size_t>(unit->size())); ++d) {
+      values[d] = values[d] / words_.graph.constant((*unit)[static_cast<Index>(d)]);
+    }
+    latent.features = ExpressionFunction::of_state(values, words_.symbols);
+  }
+
+  void set_directions(const LatentSpec& spec, Latent& latent) {
+    if (options_.base || (spec.directions.empty() && !spec.direction_code)) {
+      const bool force = latent.base == Latent::Base::force;
+      for (const Coordinate& coordinate : system_->coordinates()) {
+        latent.column_names.push_back(force ? "force_" + coordinate.name : coordinate.acceleration());
+      }
+      return;
+    }
+    if (spec.direction_code) {
+      latent.column_names = spec.direction_names;
+      latent.directions = std::make_shared<CodeFunction>(spec.direction_code, fmt::format("latent '{}': directions", spec.name),
+                                                         system_->nq() * latent.size(), system_);
+      return;
+    }
+    std::vector<Expression> entries;
+    for (std::size_t column = 0; column < spec.directions.front().size(); ++column) {
+      latent.column_names.push_back(fmt::format("direction {}", column + 1));
+      for (const std::vector<std::string>& row : spec.directions) {
+        entries.push_back(named(spec, [&] { return words_.parse(row[column]); }));
+      }
+    }
+    latent.directions = ExpressionFunction::of_state_and_parameters(entries, words_.symbols, words_.graph);
+  }
+
+  std::shared_ptr<const System> system_;
+  const PriorOptions& options_;
+  const PriorWords& words_;
+};
+
+// what a model file's reader asks of a [[latent]], where there is no file
+void require_well_formed(const LatentSpec& spec, const System& system) {
+  const auto fail = [&](const std::string& text) { throw InputError(fmt::format("latent '{}': {}", spec.name, text)); };
+  if (spec.features.empty()) fail("it needs at least one feature; code needs a name for each of its numbers");
+  if (spec.direction_code) {
+    if (!spec.directions.empty()) fail("its directions are given twice, as expressions and as code; leave out one");
+    if (spec.direction_names.empty()) fail("directions that are code need a name for each column");
+    return;
+  }
+  if (spec.directions.empty()) return;
+  if (std::ssize(spec.directions) != system.nq()) {
+    fail(fmt::format("directions: expected {} rows, one per coordinate, got {}", system.nq(), spec.directions.size()));
+  }
+  for (const std::vector<std::string>& row : spec.directions) {
+    if (row.empty() || row.size() != spec.directions.front().size()) {
+      fail("directions: every row needs the same number of entries, at least one");
+    }
+  }
+}
+
+}  // namespace
+
+std::vector<std::string> expand_angle(const std::string& feature, const std::vector<Coordinate>& coordinates) {
+  const bool angle =
+      std::any_of(coordinates.begin(), coordinates.end(), [&](const Coordinate& c) { return c.angle && c.name == feature; });
+  if (!angle) return {feature};
+  return {fmt::format("sin({})", feature), fmt::format("cos({})", feature)};
+}
+
+Expression PriorWords::with_values(Expression e, const System& system) const {
+  std::map<std::string, Expression> values;
+  for (const Parameter& parameter : system.parameters()) values.emplace(parameter.name, graph.constant(parameter.value));
+  return graph.substitute(e, values);
+}
+
+Prior make_prior(std::shared_ptr<const System> system, const std::vector<LatentSpec>& latents, const PriorOptions& options,
+                 const PriorWords& words) {
+  const internal::StepLimit limit;
+  if (options.base && latents.size() > 1) {
+    throw InputError(
+        fmt::format("{}: `prior` replaces the directions of the one [[latent]], but this model has {}: edit the model "
+                    "file instead",
+                    words.source, latents.size()));
+  }
+  LatentMaker maker(system, options, words);
+  Prior prior{std::move(system), {}, options.mean, {}};
+  for (const LatentSpec& spec : latents) prior.latents.push_back(maker.make(spec));
+  if (options.discrepancy && !latents.empty()) {
+    prior.latents.push_back(maker.make_discrepancy(latents.front(), *options.discrepancy));
+  }
+  return prior;
+}
+
+Prior make_prior(std::shared_ptr<const System> system, const std::vector<LatentSpec>& latents, const PriorOptions& options) {
+  ExpressionGraph graph;
+  const PriorWords names{"", graph, {graph, system->coordinates(), system->inputs(), system->parameters()}, {}};
+  std::map<std::string, Expression, std::less<>> known;
+  std::vector<std::string> to_suggest;
+  for (const Expression symbol : names.symbols.state_and_parameters()) {
+    known.emplace(symbol.variable_name(), symbol);
+    to_suggest.push_back(symbol.variable_name());
+  }
+  const auto parse = [&](const std::string& text) {
+    const auto resolve = [&](std::string_view name) -> std::optional<Expression> {
+      const auto found = known.find(name);
+      return found == known.end() ? std::nullopt : std::optional(found->second);
+    };
+    return parse_expression(text, graph, resolve, to_suggest);
+  };
+  for (const LatentSpec& spec : latents) require_well_formed(spec, *system);
+  const std::string source = system->name();
+  return make_prior(std::move(system), latents, options, {source, graph, names.symbols, parse});
+}
+
+}  // namespace gp2

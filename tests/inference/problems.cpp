@@ -1,0 +1,422 @@
+#include "inference/problems.hpp"
+
+#include <numbers>
+
+#include "decompositions.hpp"
+
+namespace gp2::test {
+
+const Model& model_with_a_vanishing_row() {
+  static const Model model = Model::parse(R"toml(
+name        = "contact that lets go"
+coordinates = ["x", "y", "z"]
+[parameters]
+m = 2.0
+c = 1.3
+[mechanics]
+mass  = [["m", "0.2", "0"], ["0.2", "1", "0"], ["0", "0", "1.5"]]
+force = ["-c*x", "c*dy", "1"]
+[constraints]
+acceleration = ["x*(c*ddx - 2*ddy + dx)", "x*ddz"]
+[[latent]]
+name       = "a"
+kernel     = "se"
+features   = ["x", "y", "dx"]
+directions = "acceleration"
+)toml",
+                                          "contact that lets go");
+  return model;
+}
+
+const Model& model_with_friction() {
+  static const Model model = Model::parse(R"toml(
+name        = "sledge"
+coordinates = ["x", { name = "heading", angle = true }]
+inputs      = ["u"]
+[parameters]
+m = 2.0
+J = 0.5
+e = 0.3
+c = 0.7
+k = 1.5
+[let]
+speed = "sqrt(dx^2 + k*dheading^2)"
+[mechanics]
+mass  = [["m", "m*e*cos(heading)"], ["m*e*cos(heading)", "J"]]
+force = ["u - c*speed*dx", "-c*dheading"]
+[constraints]
+velocity = ["dx*cos(heading) - e*dheading"]
+[[latent]]
+name       = "slip"
+kernel     = "matern52 + linear*periodic"
+features   = ["heading", "u"]
+directions = { force = [["-c*speed*dx", "k"], ["0", "e*heading"]] }
+[[latent]]
+name       = "rest"
+kernel     = "rq + matern32 + constant"
+features   = ["dx"]
+directions = [["c^2*dx + k"], ["m"]]
+)toml",
+                                          "sledge");
+  return model;
+}
+
+std::string changed(std::string text, const std::vector<std::pair<std::string, std::string>>& changes) {
+  for (const auto& [from, to] : changes) {
+    const std::size_t place = text.find(from);
+    if (place == std::string::npos) throw std::runtime_error("not in the text: " + from);
+    text.replace(place, from.size(), to);
+  }
+  return text;
+}
+
+const Model& another_surface() {
+  static const Model other =
+      Model::parse(changed(model("models/surface.toml").text,
+                           {{"m  = 3.0", "m  = { value = 3.0, estimate = true }"},
+                            {"[[\"m\", \"0\", \"0\"]", "[[\"1.5*m\", \"0.2\", \"0\"]"},
+                            {"[\"0\", \"m\", \"0\"]", "[\"0.2\", \"m\", \"0\"]"},
+                            {"bounds = [0.04, 0.16] }", "bounds = [0.04, 0.16], estimate = true }"},
+                            {"bounds = [2.5, 3.5] }", "bounds = [2.5, 3.5], estimate = true }"},
+                            {"p4 = { value = 0.1", "p4 = { value = 0.15"},
+                            {"p1*q1^2 + p2*q2^2 + p3*q1*q2 + p4*cos(p5*q1) - q3", "p1*q1*q2 - 3*p2*q2 + p4*sin(p5*q2) - q3"}}),
+                   "another surface");
+  return other;
+}
+
+const Model& another_sledge() {
+  static const Model other =
+      Model::parse(changed(model_with_friction().text, {{"m = 2.0", "m = 2.6"},
+                                                        {"c = 0.7", "c = { value = 0.7, estimate = true }"},
+                                                        {"k = 1.5", "k = { value = 1.5, estimate = true }"},
+                                                        {"dx*cos(heading) - e*dheading", "dx*sin(heading) + k*dx - e*dheading"}}),
+                   "another sledge");
+  return other;
+}
+
+View under(View view, std::shared_ptr<const OtherSystem> other_system) {
+  view.other_system = std::move(other_system);
+  return view;
+}
+
+ModelValues random_values(const Prior& prior, const std::vector<Observations>& observations, RandomStream& random) {
+  ModelValues values;
+  for (const Latent& latent : prior.latents) {
+    VectorXd& kernel = values.kernel.emplace_back(static_cast<Index>(latent.kernel.parameters().size()));
+    MatrixXd features(0, latent.n_features());
+    for (const Observations& group : observations) {
+      const MatrixXd more = evaluate_features(latent, group.states());
+      features.conservativeResize(features.rows() + more.rows(), Eigen::NoChange);
+      features.bottomRows(more.rows()) = more;
+    }
+    const VectorXd spread = row_stddev(features.transpose());
+    for (Index p = 0; p < kernel.size(); ++p) {
+      const Kernel::Parameter& parameter = latent.kernel.parameters()[static_cast<std::size_t>(p)];
+      const bool in_feature_units =
+          parameter.kind == Kernel::ParameterKind::lengthscale || parameter.kind == Kernel::ParameterKind::period;
+      kernel[p] =
+          (in_feature_units && spread[parameter.feature] > 0 ? 2 * spread[parameter.feature] : 1.0) * (0.7 + random.uniform());
+    }
+    VectorXd& signal = values.signal_stddev.emplace_back(latent.size());
+    for (double& s : signal) s = 0.5 + random.uniform();
+  }
+  for (const Observations& group : observations) values.noise_stddev.push_back(group.noise().stddev());
+  values.parameters = prior.system->parameter_values();
+  return values;
+}
+
+Observations observe(const Model& model, View view, const MatrixXd& states, RandomStream& random) {
+  MatrixXd values(view.size(), states.cols());
+  if (model.truth.empty() || view.quantity != Quantity::constrained_acceleration) {
+    for (double& y : values.reshaped()) y = random.normal();
+  } else {
+    const MatrixXd truth = true_acceleration(model, states);
+    for (int row = 0; row < view.size(); ++row) values.row(row) = truth.row(view.rows[static_cast<std::size_t>(row)]);
+  }
+  // unequal noise of about the size of the signal: the covariance is then well conditioned, and so are the numbers compared
+  const VectorXd spread = row_stddev(values);
+  VectorXd stddev(view.size());
+  for (Index k = 0; k < spread.size(); ++k) {
+    stddev[k] = (spread[k] > 0 ? spread[k] : 1) * (0.2 + 0.4 * random.uniform());
+    for (double& y : values.row(k)) y += stddev[k] * random.normal();
+  }
+  return {states, std::move(view), std::move(values), std::move(stddev), true};
+}
+
+std::vector<Problem> problems(int n, std::uint64_t seed) {
+  std::vector<Problem> all;
+  std::uint64_t stream = 0;
+  const auto add = [&](const std::string& name, const Model& model, const PriorOptions& options, const MatrixXd& states,
+                       const std::vector<View>& views) {
+    RandomStream random(seed, ++stream);
+    Problem problem{name, make_prior(model, options), {}, {}, states.rightCols(3), {}};
+    // a different part of the states for each view
+    const Index per_view = (states.cols() - 3) / static_cast<Index>(views.size());
+    for (std::size_t v = 0; v < views.size(); ++v) {
+      problem.observations.push_back(
+          observe(model, views[v], states.middleCols(static_cast<Index>(v) * per_view, per_view), random));
+    }
+    problem.values = random_values(problem.prior, problem.observations, random);
+    // off the constraint, where another r or l puts the logged states, the redundant row of this model contradicts the others
+    if (model.system->name().find("redundant") != std::string::npos) problem.not_estimable = {"r", "l"};
+    // the signal to the size of the data, so that it is neither lost in the noise nor beyond it
+    double spread = 0;
+    for (const Observations& group : problem.observations) spread = std::max(spread, row_stddev(group.values()).maxCoeff());
+    const PriorValues prior_values = evaluate_prior(problem.prior, states, problem.values.parameters,
+                                                    require_mechanics(*problem.prior.system, states, problem.values.parameters));
+    for (std::size_t a = 0; a < problem.prior.latents.size(); ++a) {
+      const double size = std::sqrt(prior_values.directions[a].squaredNorm() / static_cast<double>(states.cols()));
+      problem.values.signal_stddev[a] *= spread / (size > 0 ? size : 1);
+    }
+    all.push_back(std::move(problem));
+  };
+  for (const std::string& file : library_models()) {
+    const Model& m = model(file);
+    const MatrixXd states = draw(m, n + 3, seed).states;
+    const View ddq = View::all(Quantity::constrained_acceleration, *m.system);
+    const View a_bar = View::all(Quantity::unconstrained_acceleration, *m.system);
+    const int last = m.system->nq() - 1;
+    const std::string name = stem(file);
+    add(name + ", every row", m, {}, states, {ddq});
+    add(name + ", force as mean", m, {Prior::Mean::force, std::nullopt, false}, states, {ddq});
+    add(name + ", one row", m, {Prior::Mean::force, std::nullopt, false}, states,
+        {View{Quantity::constrained_acceleration, {last}}});
+    add(name + ", two rows in another order and the unconstrained acceleration", m, {}, states,
+        {View{Quantity::constrained_acceleration, {last, 0}}, a_bar});
+    add(name + ", unconstrained acceleration", m, {}, states, {a_bar});
+    if (m.latents.size() == 1) {
+      add(name + ", prior on the other base", m,
+          {Prior::Mean::force, m.latents[0].base == Latent::Base::force ? Latent::Base::acceleration : Latent::Base::force,
+           false},
+          states, {ddq});
+    }
+  }
+  RandomStream random(seed, 1000);
+  const auto random_states = [&](const Model& m) {
+    MatrixXd states(m.system->layout().size(), n + 3);
+    for (double& entry : states.reshaped()) entry = random.normal();
+    return states;
+  };
+  MatrixXd vanishing = random_states(model_with_a_vanishing_row());
+  for (Index i = 0; i < vanishing.cols(); i += 2) vanishing(0, i) = 0;
+  for (Prior::Mean mean : {Prior::Mean::zero, Prior::Mean::force}) {
+    const Model& m = model_with_a_vanishing_row();
+    add("a row that vanishes at some states", m, {mean, std::nullopt, false}, vanishing,
+        {View::all(Quantity::constrained_acceleration, *m.system)});
+    add("a row that vanishes at some states, two rows and all", m, {mean, std::nullopt, false}, vanishing,
+        {View{Quantity::constrained_acceleration, {1, 0}}, View::all(Quantity::constrained_acceleration, *m.system)});
+  }
+  // x scaled: the row is dropped at x = 0 whatever c, so the rank stays as c varies
+  for (Prior::Mean mean : {Prior::Mean::zero, Prior::Mean::force}) {
+    const Model& m = model_with_friction();
+    MatrixXd states = random_states(m);
+    states.col(0).segment(m.system->nq(), m.system->nq()).setZero();
+    const PriorOptions options{mean, std::nullopt, false};
+    const View ddq = View::all(Quantity::constrained_acceleration, *m.system);
+    add("friction, two latents, one state at rest", m, options, states, {ddq, View{Quantity::unconstrained_acceleration, {1}}});
+    const auto elsewhere = make_other_system(m, another_sledge(), options);
+    View alone = under(View{Quantity::constraint_force, {1, 0}}, elsewhere);
+    alone.latent = 1;
+    add("friction, pooled with another sledge", m, options, states, {ddq, under(ddq, elsewhere), alone});
+  }
+  for (Prior::Mean mean : {Prior::Mean::zero, Prior::Mean::force}) {
+    const Model& m = model("models/surface.toml");
+    const MatrixXd states = draw(m, n + 3, seed).states;
+    for (const auto base : {Latent::Base::acceleration, Latent::Base::force}) {
+      const PriorOptions options{mean, base, false};
+      const auto elsewhere = make_other_system(m, another_surface(), options);
+      const View ddq = View::all(Quantity::constrained_acceleration, *m.system);
+      add("surface, pooled with another surface", m, options, states,
+          {ddq, under(ddq, elsewhere), under(View{Quantity::unconstrained_acceleration, {2, 0}}, elsewhere)});
+    }
+  }
+  for (const std::string& file : library_models()) {
+    const Model& m = model(file);
+    const MatrixXd states = draw(m, n + 3, seed).states;
+    const std::string name = stem(file);
+    View next = View::all(Quantity::next_velocity, *m.system);
+    next.time_step = 0.1;
+    View alone = View::all(Quantity::unconstrained_acceleration, *m.system);
+    alone.latent = static_cast<int>(m.latents.size()) - 1;
+    add(name + ", constraint force and one latent alone", m, {Prior::Mean::force, std::nullopt, false}, states,
+        {View::all(Quantity::constraint_force, *m.system), alone});
+    if (!states.middleRows(m.system->nq(), m.system->nq()).hasNaN()) add(name + ", next velocity", m, {}, states, {next});
+    // multipliers of redundant rows are not differentiable
+    const SystemValues values = m.system->evaluate(states.leftCols(1), m.system->parameter_values());
+    if (m.system->nc() > 0 && Eigen::ColPivHouseholderQR<MatrixXd>(values.A(0)).rank() == m.system->nc()) {
+      add(name + ", multipliers", m, {}, states, {View::all(Quantity::multipliers, *m.system)});
+    }
+  }
+  return all;
+}
+
+Extended pseudo_inverse(const Extended& matrix) {
+  const Eigen::JacobiSVD<Extended> svd(matrix, Eigen::ComputeThinU | Eigen::ComputeThinV);
+  const auto& sigma = svd.singularValues();
+  // twice the rank tolerance of B, squared in B Bᵀ, is far below what long double resolves
+  ExtendedVector inverse = sigma;
+  for (auto& s : inverse) s = s > 1e-12L * sigma[0] ? 1 / s : 0;
+  return svd.matrixV() * inverse.asDiagonal() * svd.matrixU().transpose();
+}
+
+DenseView dense_view(const Prior& home, const ModelValues& values, const View& view, const MatrixXd& states) {
+  const Prior& prior = prior_of(home, view);
+  const VectorXd parameters = parameters_of(view, values.parameters);
+  const System& system = *prior.system;
+  const Index nq = system.nq();
+  const SystemValues mechanics = system.evaluate(states, parameters);
+  DenseView dense{ExtendedVector(view.size() * states.cols()), {}, {}};
+  for (const Latent& latent : prior.latents) dense.features.push_back(evaluate_features(latent, states));
+  for (int i = 0; i < static_cast<int>(states.cols()); ++i) {
+    const Extended M_inverse = Extended(mechanics.M(i).cast<long double>()).fullPivLu().inverse();
+    // rows to unit norm, so that their size does not decide the rank
+    Extended A = mechanics.A(i).cast<long double>();
+    ExtendedVector b = mechanics.b(i).cast<long double>();
+    for (Index row = 0; row < A.rows(); ++row) {
+      const long double norm = A.row(row).norm();
+      if (norm == 0) continue;
+      A.row(row) /= norm;
+      b[row] /= norm;
+    }
+    Extended L(nq, 0);
+    if (A.rows() > 0) L = M_inverse * A.transpose() * pseudo_inverse(A * M_inverse * A.transpose());
+    Extended T = Extended::Identity(nq, nq);
+    if (A.rows() > 0) T -= L * A;
+    const ExtendedVector Lb = A.rows() > 0 ? ExtendedVector(L * b) : ExtendedVector(ExtendedVector::Zero(nq));
+    const Extended identity = Extended::Identity(nq, nq);
+    const Extended M = mechanics.M(i).cast<long double>();
+    Extended all_G = identity;
+    ExtendedVector all_d = ExtendedVector::Zero(nq);
+    if (view.quantity == Quantity::constrained_acceleration) {
+      all_G = T;
+      all_d = Lb;
+    } else if (view.quantity == Quantity::constraint_force) {
+      all_G = M * (T - identity);
+      all_d = M * Lb;
+    } else if (view.quantity == Quantity::multipliers) {
+      const Extended K = pseudo_inverse(mechanics.A(i).transpose().cast<long double>());
+      all_G = K * M * (T - identity);
+      all_d = K * M * Lb;
+    } else if (view.quantity == Quantity::next_velocity) {
+      all_G = *view.time_step * T;
+      all_d = states.col(i).segment(nq, nq).cast<long double>() + *view.time_step * Lb;
+    }
+    const Extended G = all_G(view.rows, Eigen::all);
+    const ExtendedVector offset =
+        view.latent ? ExtendedVector(ExtendedVector::Zero(view.size())) : ExtendedVector(all_d(view.rows));
+    ExtendedVector mean = ExtendedVector::Zero(nq);
+    if (prior.mean == Prior::Mean::force && !view.latent) mean = M_inverse * mechanics.F(i).cast<long double>();
+    dense.mean.segment(i * view.size(), view.size()) = G * mean + offset;
+    std::vector<Extended>& loadings = dense.loading.emplace_back();
+    for (std::size_t a = 0; a < prior.latents.size(); ++a) {
+      const Latent& latent = prior.latents[a];
+      Extended E = Extended::Identity(nq, nq);
+      if (latent.directions) {
+        const MatrixXd entries = latent.directions->evaluate(states.col(i), parameters);
+        E = Extended(entries.reshaped(nq, latent.size()).cast<long double>());
+      }
+      if (latent.base == Latent::Base::force) E = M_inverse * E;
+      if (view.latent >= 0 && view.latent != static_cast<int>(a)) E.setZero();
+      loadings.push_back(G * E * values.signal_stddev[a].cast<long double>().asDiagonal());
+    }
+  }
+  return dense;
+}
+
+Extended dense_covariance(const Prior& prior, const ModelValues& values, const DenseView& x, const DenseView& y) {
+  const Index n = static_cast<Index>(x.loading.size()), m = static_cast<Index>(y.loading.size());
+  const Index dx = x.mean.size() / n, dy = y.mean.size() / m;
+  Extended covariance = Extended::Zero(x.mean.size(), y.mean.size());
+  for (std::size_t a = 0; a < prior.latents.size(); ++a) {
+    const MatrixXd k = prior.latents[a].kernel.evaluate(x.features[a], y.features[a], values.kernel[a]);
+    for (Index j = 0; j < m; ++j) {
+      for (Index i = 0; i < n; ++i) {
+        covariance.block(i * dx, j * dy, dx, dy) += static_cast<long double>(k(i, j)) *
+                                                    x.loading[static_cast<std::size_t>(i)][a] *
+                                                    y.loading[static_cast<std::size_t>(j)][a].transpose();
+      }
+    }
+  }
+  return covariance;
+}
+
+MatrixXd noise_of_values(const Problem& p, std::size_t g) {
+  const MatrixXd& scale = p.observations[g].noise().scale();
+  const MatrixXd ones = MatrixXd::Ones(p.observations[g].values().rows(), p.observations[g].values().cols());
+  return p.values.noise_stddev[g].asDiagonal() * (scale.size() > 0 ? scale : ones);
+}
+
+Problem with_noise_scale(Problem p, std::uint64_t seed) {
+  RandomStream random(seed);
+  for (Observations& group : p.observations) {
+    MatrixXd scale(group.values().rows(), group.values().cols());
+    for (double& one : scale.reshaped()) one = std::pow(3, 2 * random.uniform() - 1);
+    group = with_scale(group, std::move(scale));
+  }
+  return p;
+}
+
+DenseObservations dense_observations(const Problem& p) {
+  DenseObservations dense;
+  std::vector<Index> first{0};
+  for (const Observations& group : p.observations) {
+    dense.views.push_back(dense_view(p.prior, p.values, group.view(), group.states()));
+    first.push_back(first.back() + group.values().size());
+  }
+  dense.residual.resize(first.back());
+  dense.covariance.resize(first.back(), first.back());
+  for (std::size_t g = 0; g < p.observations.size(); ++g) {
+    const Observations& group = p.observations[g];
+    dense.residual.segment(first[g], group.values().size()) = group.values().reshaped().cast<long double>() - dense.views[g].mean;
+    for (std::size_t h = 0; h < p.observations.size(); ++h) {
+      dense.covariance.block(first[g], first[h], first[g + 1] - first[g], first[h + 1] - first[h]) =
+          dense_covariance(p.prior, p.values, dense.views[g], dense.views[h]);
+    }
+  }
+  for (std::size_t g = 0; g < p.observations.size(); ++g) {
+    const MatrixXd sigma = noise_of_values(p, g);
+    for (Index k = first[g]; k < first[g + 1]; ++k) {
+      const long double s = sigma.reshaped()[k - first[g]];
+      dense.covariance(k, k) += s * s;
+    }
+  }
+  return dense;
+}
+
+double dense_negative_log_likelihood(const Problem& p) {
+  const DenseObservations dense = dense_observations(p);
+  const Eigen::LLT<Extended> factor(dense.covariance);
+  const ExtendedVector white = factor.matrixL().solve(dense.residual);
+  const long double log_det_half = Extended(factor.matrixL()).diagonal().array().log().sum();
+  return static_cast<double>(white.squaredNorm() / 2 + log_det_half +
+                             static_cast<long double>(dense.residual.size()) * std::log(2 * std::numbers::pi_v<long double>) / 2);
+}
+
+std::pair<VectorXd, MatrixXd> dense_posterior(const Problem& p, const View& view, const MatrixXd& states) {
+  const DenseObservations dense = dense_observations(p);
+  const DenseView at = dense_view(p.prior, p.values, view, states);
+  Extended cross(dense.residual.size(), at.mean.size());
+  Index first = 0;
+  for (const DenseView& observed : dense.views) {
+    cross.middleRows(first, observed.mean.size()) = dense_covariance(p.prior, p.values, observed, at);
+    first += observed.mean.size();
+  }
+  const Eigen::LLT<Extended> factor(dense.covariance);
+  const ExtendedVector mean = at.mean + cross.transpose() * factor.solve(dense.residual);
+  const Extended covariance = dense_covariance(p.prior, p.values, at, at) - cross.transpose() * factor.solve(cross);
+  return {mean.cast<double>(), covariance.cast<double>()};
+}
+
+double condition(const Problem& p) {
+  const DenseObservations dense = dense_observations(p);
+  VectorXd whitening(dense.residual.size());
+  Index first = 0;
+  for (std::size_t g = 0; g < p.observations.size(); ++g) {
+    whitening.segment(first, p.observations[g].values().size()) = noise_of_values(p, g).reshaped().cwiseInverse();
+    first += p.observations[g].values().size();
+  }
+  const MatrixXd white = whitening.asDiagonal() * dense.covariance.cast<double>() * whitening.asDiagonal();
+  return white.norm();
+}
+
+}  // namespace gp2::test
