@@ -236,11 +236,19 @@ def test_functions_of_a_latent_give_the_same_fit_as_text(tmp_path):
     ("part", "given", "text"),
     [
         ("features", {"function": features}, "latent 'contact': features: missing 'names'"),
-        ("features", {"names": ["a"], "function": features}, r"features must be numbers of shape \(n, names\) = \(40, 1\)"),
-        ("features", {"names": ["a"], "function": features, "read": ["x"]}, "'names', 'function', 'derivatives' or 'reads', got 'read'"),
+        ("features", {"names": ["a"], "function": features, "reads": []}, r"features must be numbers of shape \(n, names\) = \(40, 1\)"),
+        (
+            "features",
+            {"names": ["a"], "function": features, "read": ["x"]},
+            "'names', 'function', 'derivatives' or 'reads', got 'read'",
+        ),
         ("features", {"names": ["a"], "function": features, "reads": ["y"]}, "'y' is no entry of the state"),
-        ("directions", {"force": {"names": ["a", "b"], "function": directions}}, r"\(n, nq, names\) = \(40, any, 2\)"),
-        ("directions", {"names": ["a"], "function": lambda states, _: np.ones((len(states), 3, 1))}, "3 × 40, expected 2 × 40"),
+        ("directions", {"force": {"names": ["a", "b"], "function": directions, "reads": []}}, r"\(n, nq, names\) = \(40, any, 2\)"),
+        (
+            "directions",
+            {"names": ["a"], "function": lambda states, _: np.ones((len(states), 3, 1)), "reads": []},
+            "3 × 40, expected 2 × 40",
+        ),
     ],
 )
 def test_functions_of_a_latent_are_refused_where_they_do_not_fit(part, given, text):
