@@ -193,6 +193,27 @@ MatrixXd Posterior::Marginal::stddev() const {
   return stddev;
 }
 
+namespace {
+
+// between two queries, to their block; of one with itself the lower triangle of states
+void add_prior_covariance(const Posterior::Implementation& self, const Query& left, const std::vector<MatrixXd>& left_loadings,
+                          const Query& right, const std::vector<MatrixXd>& right_loadings, Ref<MatrixXd> covariance) {
+  const Index d = left.n_rows(), e = right.n_rows();
+  for (std::size_t a = 0; a < self.C.size(); ++a) {
+    if (!left.needs(a) || !right.needs(a)) continue;
+    const MatrixXd k = self.prior.latents[a].kernel.evaluate(left.features[a], right.features[a], self.values.kernel[a]);
+    for (Index i = 0; i < left.size(); ++i) {
+      const Index end = &left == &right ? i + 1 : right.size();
+      for (Index j = 0; j < end; ++j) {
+        add_prior_covariance(k(i, j), left_loadings[a].col(i).data(), right_loadings[a].col(j).data(), self.C[a].cols(),
+                             covariance.block(d * i, e * j, d, e));
+      }
+    }
+  }
+}
+
+}  // namespace
+
 Posterior::Joint Posterior::joint(const std::vector<ViewAt>& quantities) const {
   const Implementation& self = *implementation_;
   const lapack::SingleThread single_thread;
@@ -218,19 +239,9 @@ Posterior::Joint Posterior::joint(const std::vector<ViewAt>& quantities) const {
     cross.middleCols(first[q], d * n) = cross_of_query;
     query.view_of(self, sums.mean(), Map<MatrixXd>(joint.mean.data() + first[q], d, n));
     for (std::size_t r = 0; r <= q; ++r) {
-      const Index e = queries[r].n_rows();
-      for (std::size_t a = 0; a < self.C.size(); ++a) {
-        if (!query.needs(a) || !queries[r].needs(a)) continue;
-        const MatrixXd k =
-            self.prior.latents[a].kernel.evaluate(query.features[a], queries[r].features[a], self.values.kernel[a]);
-        for (Index i = 0; i < n; ++i) {
-          const Index end = r == q ? i + 1 : queries[r].size();
-          for (Index j = 0; j < end; ++j) {
-            add_prior_covariance(k(i, j), loadings[q][a].col(i).data(), loadings[r][a].col(j).data(), self.C[a].cols(),
-                                 joint.covariance.block(first[q] + d * i, first[r] + e * j, d, e));
-          }
-        }
-      }
+      const Index rows = d * n, columns = queries[r].n_rows() * queries[r].size();
+      add_prior_covariance(self, query, loadings[q], queries[r], loadings[r],
+                           joint.covariance.block(first[q], first[r], rows, columns));
     }
   }
   self.latents->subtract_explained(std::move(cross), joint.covariance);

@@ -20,6 +20,26 @@ double quantile(const std::vector<double>& sorted, double q) {
   return sorted[below] + (place - static_cast<double>(below)) * (sorted[above] - sorted[below]);
 }
 
+// median, quartiles and extremes over the runs
+// @param errors  [method][size][run]
+void add_summary(const std::string& system, const std::vector<Method>& methods, const std::vector<double>& sizes,
+                 std::vector<std::vector<std::vector<double>>> errors, Table& summary) {
+  for (std::size_t m = 0; m < methods.size(); ++m) {
+    for (std::size_t k = 0; k < sizes.size(); ++k) {
+      std::vector<double>& of = errors[m][k];
+      std::sort(of.begin(), of.end());
+      summary.add({{"system", system},
+                   {"method", methods[m].name},
+                   {"n", static_cast<int>(sizes[k])},
+                   {"rmse_median", quantile(of, 0.5)},
+                   {"rmse_quartile1", quantile(of, 0.25)},
+                   {"rmse_quartile3", quantile(of, 0.75)},
+                   {"rmse_min", of.front()},
+                   {"rmse_max", of.back()}});
+    }
+  }
+}
+
 }  // namespace
 
 void reproduce_learning_curve(const ReproduceOptions& options) {
@@ -56,20 +76,7 @@ void reproduce_learning_curve(const ReproduceOptions& options) {
         }
       }
     }
-    for (std::size_t m = 0; m < methods.size(); ++m) {
-      for (std::size_t k = 0; k < sizes.size(); ++k) {
-        std::vector<double>& of = errors[m][k];
-        std::sort(of.begin(), of.end());
-        summary.add({{"system", system.name},
-                     {"method", methods[m].name},
-                     {"n", static_cast<int>(sizes[k])},
-                     {"rmse_median", quantile(of, 0.5)},
-                     {"rmse_quartile1", quantile(of, 0.25)},
-                     {"rmse_quartile3", quantile(of, 0.75)},
-                     {"rmse_min", of.front()},
-                     {"rmse_max", of.back()}});
-      }
-    }
+    add_summary(system.name, methods, sizes, std::move(errors), summary);
   }
   talk_over("");
   runs.write(options.output / "learning_curve_runs");
