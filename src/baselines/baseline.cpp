@@ -156,17 +156,6 @@ Baseline standardised_by(const std::vector<Observations>& observations, const La
   return {kind, row_mean(pooled_values(observations)), features.rowwise().mean(), usable_stddev(features)};
 }
 
-const char* LoadingEntry::word(Kind kind) { return kind == Kind::mixing ? "mixing" : "sqrt_kappa"; }
-
-std::vector<LoadingEntry> loading_entries(const Latent& latent) {
-  if (!latent.free_loading) return {};
-  const int p = latent.size(), rank = *latent.free_loading - p;
-  std::vector<LoadingEntry> entries;
-  for (int k = 0; k < p * rank; ++k) entries.push_back({LoadingEntry::Kind::mixing, k % p, k / p, k, k});
-  for (int j = 0; j < p; ++j) entries.push_back({LoadingEntry::Kind::sqrt_kappa, j, j, j, (rank + j) * p + j});
-  return entries;
-}
-
 std::vector<Hyperparameter> baseline_hyperparameters(const Prior& prior, const std::vector<Observations>& observations) {
   const VectorXd output_stddev = usable_stddev(pooled_values(observations));
   std::vector<Hyperparameter> out;

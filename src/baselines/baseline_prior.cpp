@@ -66,6 +66,17 @@ struct Parts {
 
 }  // namespace
 
+const char* LoadingEntry::word(Kind kind) { return kind == Kind::mixing ? "mixing" : "sqrt_kappa"; }
+
+std::vector<LoadingEntry> loading_entries(const Latent& latent) {
+  if (!latent.free_loading) return {};
+  const int p = latent.size(), rank = *latent.free_loading - p;
+  std::vector<LoadingEntry> entries;
+  for (int k = 0; k < p * rank; ++k) entries.push_back({LoadingEntry::Kind::mixing, k % p, k / p, k, k});
+  for (int j = 0; j < p; ++j) entries.push_back({LoadingEntry::Kind::sqrt_kappa, j, j, j, (rank + j) * p + j});
+  return entries;
+}
+
 Baseline unstandardised(const Model& model, Baseline::Kind kind) {
   const auto n_features = static_cast<Index>(Parts(model).names.size());
   using Eigen::VectorXd;
