@@ -625,15 +625,16 @@ class ModelReader : private TomlReader {
 
   // what code gives, the file must leave to it
   void require_all_code_is_used() const {
-    for (const auto& [name, code] : model_.code.latents) {
+    for (const auto& entry : model_.code.latents) {
+      const std::string& name = entry.first;
       const auto found =
           std::find_if(model_.latents.begin(), model_.latents.end(), [&](const LatentSpec& one) { return one.name == name; });
       if (found == model_.latents.end())
         throw InputError(fmt::format("code is given for the latent '{}', but there is none", name));
-      if (code.features && !found->feature_code) {
+      if (entry.second.features && !found->feature_code) {
         throw InputError(fmt::format("code is given for the features of the latent '{}', but the file has them", name));
       }
-      if (code.directions && !found->direction_code) {
+      if (entry.second.directions && !found->direction_code) {
         throw InputError(fmt::format("code is given for the directions of the latent '{}', but the file has them", name));
       }
     }
