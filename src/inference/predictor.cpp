@@ -33,7 +33,8 @@ struct Predictor::Implementation {
   MotionParts parts;                              // that it reads
   std::vector<std::optional<int>> added_entries;  // of the state, to each row of the view
   bool is_constrained = false;                    // ddq or Aᵀλ is one of them
-  bool has_force = false;                         // μ or a direction that is multiplied by M⁻¹
+  bool has_force = false;                         // μ or a direction that is multiplied by M⁻¹ …
+  bool has_forced_latent = false;                 // … of which the deviation needs the directions
   bool needs_acceleration = false;                // ā itself, which is none where M is singular
   PredictorData<double> in_double;
   PredictorData<float> in_single;
@@ -192,14 +193,14 @@ Predictor::Implementation::Implementation(const Posterior::Implementation& poste
       parts(view.quantity->parts()),
       is_constrained(parts.constrained_acceleration || parts.constraint_force) {
   check_view(view, prior);
-  has_force = has_mean_force();
   for (int r = 0; r < view.size(); ++r) added_entries.push_back(view.added_entry(prior.system->layout(), r));
   needs_acceleration = what_needs_acceleration(prior, view).has_value();
   for (std::size_t a = 0; a < prior.latents.size(); ++a) {
     if (!view.has_latent(a)) continue;
     terms.push_back({a, posterior.latents->latents()[a].kernel, posterior.C[a]});
-    has_force = has_force || prior.latents[a].base == Latent::Base::force;
+    has_forced_latent = has_forced_latent || prior.latents[a].base == Latent::Base::force;
   }
+  has_force = has_mean_force() || has_forced_latent;
   if (options.storage == Storage::single_precision) {
     in_single.store(*posterior.latents, terms, options.stddev);
   } else {
@@ -398,7 +399,7 @@ void Predictor::Implementation::write_stddev(const StateEvaluator& at, Workspace
   w.affine_motion.evaluate(w.projection, at.M(), parts);
   view.quantity->evaluate(w.mechanics(at.A()), w.affine_motion.linear(), w.G, w.quantity);
   for (int r = 0; r < view.size(); ++r) w.Gt.col(r) = w.G.row(view.rows[static_cast<std::size_t>(r)]);
-  if (has_force) {
+  if (has_forced_latent) {
     w.M_inverse_Gt = w.Gt;
     w.projection.solve_mass_in_place(w.M_inverse_Gt);
   }
