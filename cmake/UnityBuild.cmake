@@ -1,5 +1,5 @@
-# Compiles all files of a room as one: what they share of Eigen's templates is compiled once, in half the time from scratch. After an edit
-# a room is more to compile than a file, so the presets for daily work go without.
+# Compiles all files of a room as one: what they share of Eigen's templates is compiled once, which is quicker from scratch. After an edit a
+# room is more to compile than a file, so the presets for daily work go without.
 option(GP2_UNITY_BUILD "Compile each room of the library as one file" OFF)
 
 #   gp2_compile_by_room(TARGET)
