@@ -265,6 +265,7 @@ std::map<std::string, ModelCode::OfLatent> latents_code(const py::kwargs& kwargs
     ModelCode::OfLatent code;
     if (given.contains("features")) {
       if (const auto function = function_in(given["features"], what + ": features")) {
+        if (function->derivatives) throw InputError(what + ": features hold no estimated parameters: leave out 'derivatives'");
         code.features = features_code(*function, what);
       }
     }

@@ -236,6 +236,7 @@ def test_functions_of_a_latent_give_the_same_fit_as_text(tmp_path):
     ("part", "given", "text"),
     [
         ("features", {"function": features}, "latent 'contact': features: missing 'names'"),
+        ("features", {"names": ["a"], "function": features, "derivatives": features}, "leave out 'derivatives'"),
         ("features", {"names": ["a"], "function": features, "reads": []}, r"features must be numbers of shape \(n, names\) = \(40, 1\)"),
         (
             "features",
