@@ -10,8 +10,8 @@
 #include "gp2/symbolic/expression.hpp"
 #include "random_expression.hpp"
 
-// CLN, below GiNaC, keeps a string of its own until the end
-extern "C" const char* __lsan_default_suppressions();
+// CLN, below GiNaC, keeps a string of its own until the end. The sanitizer's library finds this function only if it is visible.
+extern "C" [[gnu::visibility("default")]] const char* __lsan_default_suppressions();
 extern "C" const char* __lsan_default_suppressions() { return "leak:libcln\n"; }
 
 namespace gp2 {
