@@ -11,6 +11,7 @@
 #include "command.hpp"
 #include "gp2/base/file.hpp"
 #include "gp2/error.hpp"
+#include "streams.hpp"
 
 namespace gp2::command {
 
@@ -85,9 +86,15 @@ std::shared_ptr<const Model> read_other_system(const std::string& path) {
 }
 
 std::pair<std::string, std::string> split_at_system(const std::string& text) {
-  const std::size_t at = text.rfind('@');
-  if (at == std::string::npos || !text.ends_with(".toml")) return {text, ""};
-  return {text.substr(0, at), text.substr(at + 1)};
+  const std::size_t last = text.rfind('@');
+  if (last == std::string::npos || !text.ends_with(".toml")) return {text, ""};
+  // an @ may be part of a name: where both files are there is the right one
+  for (std::size_t at = last; at != std::string::npos && at > 0; at = text.rfind('@', at - 1)) {
+    std::error_code unknown;
+    const std::string log = text.substr(0, at), system = text.substr(at + 1);
+    if (std::filesystem::exists(log, unknown) && std::filesystem::exists(system, unknown)) return {log, system};
+  }
+  return {text.substr(0, last), text.substr(last + 1)};
 }
 
 Option argument(const std::string& flag, std::string& value, const std::string& text) {
@@ -123,7 +130,7 @@ std::string with_flags(const std::string& message) {
 }
 
 void print_notes(const std::vector<std::string>& notes) {
-  for (const std::string& note : notes) fmt::print(stderr, "gp2: {}\n", with_flags(note));
+  for (const std::string& note : notes) print_message("gp2: {}\n", with_flags(note));
 }
 
 }  // namespace gp2::command

@@ -8,6 +8,7 @@
 #include "command.hpp"
 #include "gp2/data/csv.hpp"
 #include "gp2/error.hpp"
+#include "streams.hpp"
 
 namespace gp2::command {
 
@@ -24,7 +25,7 @@ int print(const std::vector<Finding>& findings) {
     const char* mark = finding.level == Finding::Level::good      ? "ok     "
                        : finding.level == Finding::Level::warning ? "warning"
                                                                   : "ERROR  ";
-    fmt::print("{}  {}\n", mark, with_flags(finding.text));
+    print_result("{}  {}\n", mark, with_flags(finding.text));
     if (finding.level == Finding::Level::error) ++n_errors;
   }
   return n_errors;

@@ -74,7 +74,8 @@ inline constexpr const char* system_help =
     "model file of another system with the same coordinates, inputs and latents: predict under its constraints, masses and "
     "parameters";
 
-/// "LOG@OTHER.toml" -> {"LOG", "OTHER.toml"}, split at the last @; {text, ""} where what follows it does not end in .toml.
+/// "LOG@OTHER.toml" -> {"LOG", "OTHER.toml"}, split at the last @ at which both are files, else at the last; {text, ""} where the
+/// text does not end in .toml.
 std::pair<std::string, std::string> split_at_system(const std::string& text);
 
 /// Prints notes to stderr, a line each.

@@ -1,9 +1,12 @@
 #include "command_line.hpp"
 
+#include <charconv>
+#include <cstdint>
 #include <map>
 #include <memory>
 #include <optional>
 #include <regex>
+#include <system_error>
 #include <utility>
 #include <variant>
 
@@ -97,10 +100,13 @@ std::string with_links(const std::string& text) {
   return std::regex_replace(text, page, "[$1]($1)");
 }
 
-// CLI11 would take -1 for the largest number there is.
+// CLI11 would take -1, and what is larger than the largest number there is, for that number.
 CLI::Validator not_negative() {
   const auto check = [](const std::string& text) {
-    return text.starts_with('-') ? "must not be negative, got " + text : std::string();
+    if (text.starts_with('-')) return "must not be negative, got " + text;
+    std::uint64_t number = 0;
+    const auto [end, error] = std::from_chars(text.data(), text.data() + text.size(), number);
+    return error == std::errc::result_out_of_range ? "must be below 2^64, got " + text : std::string();
   };
   return {check, ""};
 }

@@ -9,6 +9,7 @@
 #include "command.hpp"
 #include "gp2/data/csv.hpp"
 #include "gp2/jobs/predict_job.hpp"
+#include "streams.hpp"
 
 namespace gp2::command {
 
@@ -43,16 +44,16 @@ Json to_json(const Evaluation& e) {
 
 void print_text(const Evaluation& e) {
   for (std::size_t k = 0; k < e.outputs.size(); ++k)
-    fmt::print("rmse {:<22} {:.6g}\n", e.outputs[k], e.rmse[static_cast<Eigen::Index>(k)]);
-  fmt::print("rmse / training std         {:.6g}   (mean over outputs)\n", e.rmse_normalised);
-  fmt::print("nrmse                       {:.6g}   (rms error / rms of the test spreads)\n", e.nrmse);
-  fmt::print("max |A ddq - b|             {:.3g}   (model's parameters; fitted ones: {:.3g})\n", e.max_constraint_error,
-             e.max_constraint_error_fitted);
-  fmt::print("nlpd, 95 % coverage         {:.4g}, {:.3g}   (with measurement noise)\n", e.nlpd, e.coverage95);
-  fmt::print("the same, noise-free        {:.4g}, {:.3g}   ({} marginals without variance left out)\n", e.nlpd_latent,
-             e.coverage95_latent, e.n_zero_variance);
-  fmt::print("points                      {}{}\n", e.n,
-             e.n_missing > 0 ? fmt::format("   ({} values not measured)", e.n_missing) : "");
+    print_result("rmse {:<22} {:.6g}\n", e.outputs[k], e.rmse[static_cast<Eigen::Index>(k)]);
+  print_result("rmse / training std         {:.6g}   (mean over outputs)\n", e.rmse_normalised);
+  print_result("nrmse                       {:.6g}   (rms error / rms of the test spreads)\n", e.nrmse);
+  print_result("max |A ddq - b|             {:.3g}   (fitted parameters; those of the model file: {:.3g})\n",
+               e.max_constraint_error_fitted, e.max_constraint_error);
+  print_result("nlpd, 95 % coverage         {:.4g}, {:.3g}   (with measurement noise)\n", e.nlpd, e.coverage95);
+  print_result("the same, noise-free        {:.4g}, {:.3g}   ({} marginals without variance left out)\n", e.nlpd_latent,
+               e.coverage95_latent, e.n_zero_variance);
+  print_result("points                      {}{}\n", e.n,
+               e.n_missing > 0 ? fmt::format("   ({} values not measured)", e.n_missing) : "");
 }
 
 void run(Arguments& arguments) {
@@ -62,7 +63,7 @@ void run(Arguments& arguments) {
   const auto [evaluation, notes] = evaluate(fit, fit.posterior(), table, arguments.request);
   print_notes(notes);
   if (arguments.json) {
-    fmt::print("{}\n", to_json(evaluation).dump(2));
+    print_result("{}\n", to_json(evaluation).dump(2));
   } else {
     print_text(evaluation);
   }

@@ -16,6 +16,7 @@
 #include "gp2/error.hpp"
 #include "gp2/jobs/fit_job.hpp"
 #include "interruption.hpp"
+#include "streams.hpp"
 
 namespace gp2::command {
 
@@ -57,9 +58,8 @@ void print_progress(const Progress& p) {
   if (last >= 0 && p.seconds - last < 0.1) return;
   last = p.seconds;
   const double left = p.fraction > 0 ? p.seconds * (1 - p.fraction) / p.fraction : 0;
-  fmt::print(stderr, "\rgp2: restart {}/{}  iteration {}  best {:.4f}  about {:.0f} s left   ", p.restart + 1, p.n_restarts,
-             p.iteration, p.best, left);
-  std::fflush(stderr);
+  print_message("\rgp2: restart {}/{}  iteration {}  best {:.4f}  about {:.0f} s left   ", p.restart + 1, p.n_restarts,
+                p.iteration, p.best, left);
 }
 
 Json number_or_null(double value) { return std::isfinite(value) ? Json(value) : Json(); }
@@ -113,15 +113,15 @@ Json to_json(const FitProblem& problem, const FitReport& report, const std::stri
 }
 
 void print_text(const FitReport& report) {
-  fmt::print("negative log likelihood {:.6f}\n", report.negative_log_likelihood);
-  fmt::print("{} after {} iterations ({} restarts, best: {}), {:.2f} s\n", report.termination, report.iterations,
-             report.restarts.size(), report.best_restart + 1, report.seconds);
+  print_result("negative log likelihood {:.6f}\n", report.negative_log_likelihood);
+  print_result("{} after {} iterations ({} restarts, best: {}), {:.2f} s\n", report.termination, report.iterations,
+               report.restarts.size(), report.best_restart + 1, report.seconds);
   for (std::size_t k = 0; k < report.hyperparameters.size(); ++k) {
     const Hyperparameter& h = report.hyperparameters[k];
     const double stddev = h.kind == Hyperparameter::Kind::parameter ? stddev_of(report, k) : std::nan("");
     const std::string error = std::isfinite(stddev) ? fmt::format(" ± {:.2g}", stddev) : std::isinf(stddev) ? " ± ∞" : "";
-    fmt::print("  {:<34} {:>13.6g}{}   [{:.3g}, {:.3g}]{}\n", h.name, h.value, error, h.lower, h.upper,
-               h.at_bound() ? "   at its bound" : "");
+    print_result("  {:<34} {:>13.6g}{}   [{:.3g}, {:.3g}]{}\n", h.name, h.value, error, h.lower, h.upper,
+                 h.at_bound() ? "   at its bound" : "");
   }
 }
 
@@ -183,7 +183,7 @@ FitJob prepare(Arguments& arguments) {
 void require_inputs(const Arguments& arguments, const std::set<std::string>& given) {
   if (arguments.again.empty()) {
     if (arguments.model.empty()) throw UsageError{"MODEL is required"};
-    if (arguments.data.empty()) throw UsageError{"--data is required"};
+    if (arguments.data.empty() && arguments.also.empty()) throw UsageError{"--data is required, or --also alone"};
     return;
   }
   const std::set<std::string> allowed = {"again", "data", "also", "threads", "json", "output"};
@@ -204,7 +204,7 @@ void run(Arguments& arguments, const std::set<std::string>& given) {
   const bool on_terminal = isatty(STDERR_FILENO) != 0;
   const Interruption interruption;
   const std::optional<FitOutcome> outcome = fit_until(interruption, job, on_terminal);
-  if (on_terminal) fmt::print(stderr, "\r\033[K");
+  if (on_terminal) print_message("\r\033[K");
   if (!outcome) {
     print_notes({fmt::format("{} before there was a fit: nothing is written", interrupted_by(interruption))});
     throw Interrupted{interruption.signal()};
@@ -214,7 +214,7 @@ void run(Arguments& arguments, const std::set<std::string>& given) {
   const FitFile& file = outcome->file;
   const auto print = [&] {
     if (arguments.json) {
-      fmt::print("{}\n", to_json(job.problem, file.report, file.options).dump(2));
+      print_result("{}\n", to_json(job.problem, file.report, file.options).dump(2));
     } else {
       print_text(file.report);
     }
@@ -232,6 +232,7 @@ void run(Arguments& arguments, const std::set<std::string>& given) {
   if (file.report.termination == FitReport::interrupted) {
     print_notes({fmt::format("{}: {} holds the best so far, not converged; --start {} goes on from there",
                              interrupted_by(interruption), arguments.output, arguments.output)});
+    if (file.report.iterations == 0) print_notes({"the best so far are starting values: no run has got lower yet"});
     throw Interrupted{interruption.signal()};
   }
 }
@@ -252,7 +253,7 @@ Command fit_command() {
        "the system of another model file"},
       {"also", Repeated{&a->also}, "VIEW[@LATENT]:CSV[@OTHER.toml]",
        "another quantity, measured or known, say unconstrained:rest.csv with abar_q1 …: the columns that are there are observed. "
-       "May be given several times"},
+       "May be given several times, and without --data"},
   };
   for (Option& option : options(a->request)) command.options.push_back(std::move(option));
   command.options.insert(

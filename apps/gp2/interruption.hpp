@@ -2,7 +2,11 @@
 
 #include <array>
 #include <atomic>
+#include <cerrno>
 #include <csignal>
+#include <string_view>
+
+#include <unistd.h>
 
 namespace gp2::command {
 
@@ -38,11 +42,16 @@ class Interruption {
  private:
   static constexpr std::array<int, 3> signals = {SIGINT, SIGTERM, SIGHUP};
 
-  // a handler may call sigaction and touch atomics without a lock, and little else
+  // a handler may call sigaction and write, and touch atomics without a lock, and little else
   static void ask(int signal) {
+    constexpr std::string_view text =
+        "\ngp2: stopping after the evaluation at hand, which takes long with many rows; once more ends at once, without a fit\n";
+    const int error = errno;
     signal_ = signal;
     stop_ = true;
     restore();
+    static_cast<void>(::write(STDERR_FILENO, text.data(), text.size()) == 0);
+    errno = error;
   }
   static void restore() {
     for (std::size_t k = 0; k < signals.size(); ++k) sigaction(signals[k], &before_[k], nullptr);

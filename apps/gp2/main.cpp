@@ -1,9 +1,9 @@
 #include <algorithm>
-#include <cerrno>
 #include <csignal>
 #include <cstdio>
 #include <cstring>
 #include <exception>
+#include <sstream>
 #include <string>
 #include <utility>
 #include <vector>
@@ -18,6 +18,7 @@
 #include "gp2/base/version.hpp"
 #include "gp2/error.hpp"
 #include "interruption.hpp"
+#include "streams.hpp"
 
 namespace {
 
@@ -25,15 +26,16 @@ constexpr int exit_numerical = 1;
 constexpr int exit_bad_input = 2;
 
 int failed(int exit_code, const std::string& text) {
-  std::fflush(stdout);  // where both go to one terminal or file, the results came first
-  fmt::print(stderr, "gp2: {}\n", text);
+  static_cast<void>(std::fflush(stdout));  // where both go to one terminal or file, the results came first
+  gp2::command::print_message("gp2: {}\n", text);
   return exit_code;
 }
 
 // results that could not be printed must not pass as printed
 int finished() {
-  if (std::fflush(stdout) == 0 && std::ferror(stdout) == 0) return 0;
-  return failed(exit_bad_input, fmt::format("error: standard output: cannot be written: {}", std::strerror(errno)));
+  const int error = gp2::command::finish_stdout();
+  if (error == 0) return 0;
+  return failed(exit_bad_input, fmt::format("error: standard output: cannot be written: {}", std::strerror(error)));
 }
 
 // of --version --verbose
@@ -76,6 +78,7 @@ void require_known_command(const CLI::App& app, int argc, char** argv) {
 
 int main(int argc, char** argv) {
   gp2::command::choose_blas_kernel(argv);
+  gp2::command::prepare_streams();
   std::signal(SIGXFSZ, SIG_IGN);  // a file beyond the limit (ulimit -f) is an error to tell, like a full disk
   CLI::App app{
       "Learn the dynamics of constrained mechanical systems from measured data, with predictions that obey the constraints "
@@ -104,10 +107,10 @@ int main(int argc, char** argv) {
   try {
     require_known_command(app, argc, argv);
     app.parse(argc, argv);
-  } catch (const CLI::CallForHelp& help) {
-    return app.exit(help);
-  } catch (const CLI::CallForVersion& version) {
-    return app.exit(version);
+  } catch (const CLI::Success& help_or_version) {
+    std::ostringstream text;
+    app.exit(help_or_version, text, text);
+    gp2::command::write_stdout(text.str());
   } catch (const CLI::ParseError& error) {
     return failed(exit_bad_input, fmt::format("error: {}\nRun gp2 --help, or gp2 COMMAND --help.", error.what()));
   } catch (const gp2::command::UsageError& error) {
@@ -121,7 +124,6 @@ int main(int argc, char** argv) {
   } catch (const std::bad_alloc&) {
     return failed(exit_numerical, "numerical failure: not enough memory; take fewer points (--max-points)");
   } catch (const std::exception& error) {
-    if (std::ferror(stdout) != 0) return finished();  // where fmt could not print
     return failed(exit_numerical, fmt::format("internal error: {}", error.what()));
   }
   return finished();

@@ -4,6 +4,7 @@
 
 #include "command.hpp"
 #include "gp2/jobs/show_job.hpp"
+#include "streams.hpp"
 
 namespace gp2::command {
 
@@ -22,7 +23,7 @@ Command show_command() {
       "show", "Print the derived A, b, M, F, the parameters and the features of a model", "gp2 show models/surface.toml", {}, {}};
   command.options = options(a->request);
   command.options.insert(command.options.begin(), argument("MODEL", a->model, "model file"));
-  command.run = [a](const std::set<std::string>&) { fmt::print("{}", show(Model::read(a->model), a->request)); };
+  command.run = [a](const std::set<std::string>&) { print_result("{}", show(Model::read(a->model), a->request)); };
   return command;
 }
 

@@ -14,6 +14,8 @@
 #include "gp2/data/csv.hpp"
 #include "gp2/error.hpp"
 #include "gp2/files/fit_file.hpp"
+#include "gp2/view.hpp"
+#include "streams.hpp"
 
 namespace gp2::command {
 
@@ -83,6 +85,10 @@ std::string csv_of(const std::vector<Motion>& motions, const Subject& subject, b
   line.insert(line.end(), names.begin(), names.begin() + layout.t());
   line.insert(line.end(), accelerations.begin(), accelerations.end());
   line.insert(line.end(), system.inputs().begin(), system.inputs().end());
+  if (system.nc() > 0) {
+    const std::vector<std::string> multipliers = View::multipliers(system).names(system);
+    line.insert(line.end(), multipliers.begin(), multipliers.end());
+  }
   for (std::size_t j = 0; with_stddev && j < accelerations.size(); ++j) line.push_back(accelerations[j] + "_std");
   if (subject.model.potential) line.emplace_back("energy");
   end_line();
@@ -98,6 +104,7 @@ std::string csv_of(const std::vector<Motion>& motions, const Subject& subject, b
       add(trajectory.states.col(i).head(2 * layout.nq));
       add(trajectory.accelerations.col(i));
       add(trajectory.states.col(i).tail(layout.nu));
+      if (system.nc() > 0) add(trajectory.records.col(i));
       if (with_stddev) add(motions[k].uncertainty->stddev.col(i));
       if (motions[k].energy) line.push_back(shortest((*motions[k].energy)[i]));
       end_line();
@@ -109,7 +116,7 @@ std::string csv_of(const std::vector<Motion>& motions, const Subject& subject, b
 double largest_change(const Eigen::VectorXd& energy) { return (energy.array() - energy[0]).abs().maxCoeff(); }
 
 // the worst of several motions, their sums where that says more
-nlohmann::ordered_json report_of(const std::vector<Motion>& motions) {
+nlohmann::ordered_json report_of(const std::vector<Motion>& motions, const System& system) {
   Trajectory total;
   double energy_drift = 0;
   std::size_t n_lower_rank = 0;
@@ -139,11 +146,16 @@ nlohmann::ordered_json report_of(const std::vector<Motion>& motions) {
   report["start_displacement"] = motions[0].trajectory.start_displacement;
   report["max_energy_drift"] = motions[0].energy ? nlohmann::ordered_json(energy_drift) : nullptr;
   report["n_lower_rank"] = n_lower_rank;
+  report["multiplier_sign_changes"] = nlohmann::ordered_json::object();
+  const std::vector<std::vector<double>> changes = multiplier_sign_changes(motions[0].trajectory);
+  for (std::size_t k = 0; k < changes.size(); ++k) {
+    report["multiplier_sign_changes"][View::multipliers(system).names(system)[k]] = changes[k];
+  }
   report["leaves_data_at"] = leaves_data ? nlohmann::ordered_json(*leaves_data) : nullptr;
   return report;
 }
 
-std::vector<std::string> notes_of(const std::vector<Motion>& motions, const Arguments& arguments) {
+std::vector<std::string> notes_of(const std::vector<Motion>& motions, const System& system, const Arguments& arguments) {
   std::vector<std::string> notes;
   const Trajectory& first = motions[0].trajectory;
   constexpr double worth_saying = 1e-9;
@@ -175,10 +187,12 @@ std::vector<std::string> notes_of(const std::vector<Motion>& motions, const Argu
                     motion.trajectory.times[lower.states.front()]));
     break;  // as above
   }
-  const nlohmann::ordered_json report = report_of(motions);
-  notes.push_back(fmt::format("{}: {} rows, {} steps; drift |c| ≤ {:.3g}, |dc/dt| ≤ {:.3g}", arguments.output,
-                              motions.size() * static_cast<std::size_t>(first.times.size()), report["steps"].get<int>(),
-                              report["max_position_drift"].get<double>(), report["max_velocity_drift"].get<double>()));
+  const nlohmann::ordered_json report = report_of(motions, system);
+  Eigen::Index n_rows = 0;
+  for (const Motion& motion : motions) n_rows += motion.trajectory.times.size();
+  notes.push_back(fmt::format("{}: {} rows, {} steps; drift |c| ≤ {:.3g}, |dc/dt| ≤ {:.3g}", arguments.output, n_rows,
+                              report["steps"].get<int>(), report["max_position_drift"].get<double>(),
+                              report["max_velocity_drift"].get<double>()));
   if (motions[0].energy) {
     const Eigen::VectorXd& energy = *motions[0].energy;
     notes.push_back(fmt::format("energy: {:.6g} J at the start, {:.6g} J at the end, largest change {:.3g} J", energy[0],
@@ -201,9 +215,10 @@ SimulateRequest read_request(const Arguments& arguments, const Model& model) {
   return request;
 }
 
-std::vector<Motion> motions_of(const Subject& subject, const SimulateJob& job) {
+std::vector<Motion> with_uncertainty(std::vector<Trajectory> trajectories, const Subject& subject, const SimulateJob& job) {
   std::vector<Motion> motions;
-  for (Trajectory& trajectory : run_simulation(job)) {
+  for (Trajectory& trajectory : trajectories) {
+    if (trajectory.times.size() == 0) continue;
     Motion& motion = motions.emplace_back(Motion{std::move(trajectory), {}, {}});
     if (subject.posterior) motion.uncertainty = motion_uncertainty(*subject.posterior, motion.trajectory);
     if (subject.model.potential) motion.energy = mechanical_energy(subject.model, job.parameters, motion.trajectory.states);
@@ -218,11 +233,21 @@ void run(const Arguments& arguments) {
   const SimulateJob job = subject.posterior ? prepare_simulation(subject.model, *subject.posterior, request)
                                             : prepare_simulation(subject.model, request);
   print_notes(job.notes);
-  const std::vector<Motion> motions = motions_of(subject, job);
+  std::vector<Trajectory> trajectories;
+  std::string unfinished;
+  try {
+    trajectories = run_simulation(job);
+  } catch (const UnfinishedMotion& motion) {
+    trajectories = motion.motions;
+    unfinished = motion.what();
+  }
+  const std::vector<Motion> motions = with_uncertainty(std::move(trajectories), subject, job);
+  if (motions.empty()) throw NumericalError(unfinished);
   write_file(arguments.output,
              csv_of(motions, subject, request.n_samples.has_value(), subject.posterior.has_value() && !request.n_samples));
-  print_notes(notes_of(motions, arguments));
-  if (arguments.json) fmt::print("{}\n", report_of(motions).dump(2));
+  print_notes(notes_of(motions, subject.system(), arguments));
+  if (arguments.json) print_result("{}\n", report_of(motions, subject.system()).dump(2));
+  if (!unfinished.empty()) throw NumericalError(fmt::format("{}; {} holds what was reached", unfinished, arguments.output));
 }
 
 }  // namespace

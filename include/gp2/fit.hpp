@@ -37,7 +37,9 @@ struct FitOptions {
   int max_escapes = 5;                            // scans for lower optima from the best one
   bool standard_errors = true;                    // FitReport::uncertainty, where parameters are estimated
   std::function<void(const Progress&)> progress;  // called from worker threads, one at a time
-  const std::atomic<bool>* stop = nullptr;        // set: return the best so far, as not converged: interrupted
+  /// Set: return the best so far, as not converged: interrupted. That takes as long as the evaluations of the likelihood and its
+  /// gradient that are under way, and the one that conditions the prior: of n measured numbers some n³ and n³/3 multiplications.
+  const std::atomic<bool>* stop = nullptr;
 };
 
 /// A value that a robust fit distrusts (robust.hpp): number `row` of the view of Observations `group`, at state `state`.
@@ -100,7 +102,8 @@ struct Fit {
 /// conditioned there. Loadings that start at zero, a stationary point, stay there in every run and are let go from the best.
 /// Same seed, same bits, for any number of threads.
 ///
-/// @throws InputError, NumericalError  as Likelihood and Posterior; NumericalError when no restart reached a finite likelihood.
+/// @throws InputError, NumericalError  as Likelihood, Posterior and require_hyperparameters; InputError when nothing is measured,
+/// a start lies outside its bounds, or an option has no meaning; NumericalError when no restart reached a finite likelihood.
 Fit fit(const Prior& prior, const std::vector<Observations>& observations, const std::vector<Hyperparameter>& hyperparameters,
         const FitOptions& options = {});
 

@@ -75,6 +75,9 @@ class Observations {
 
   /// σ_i (d) at state i under a noise σ that may differ from noise().stddev(); ∞ where nothing is measured.
   [[nodiscard]] Eigen::VectorXd noise_at(const Eigen::Ref<const Eigen::VectorXd>& stddev, Eigen::Index i) const;
+  /// Whether the values of row k came with standard deviations of their own, of which σ_k is a factor. A robust fit enlarges some
+  /// scales and leaves the others at 1 where they did not.
+  [[nodiscard]] bool states_noise(Eigen::Index k) const;
   /// s of the values of row k that are measured.
   [[nodiscard]] std::vector<double> measured_scales(Eigen::Index k) const;
   /// The noise of a usual value (d): σ times the median of s over the measured values of its row.

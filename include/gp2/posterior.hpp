@@ -25,17 +25,19 @@ struct ViewAt {
 /// A prior conditioned on observations (Geist & Trimpe 2020, eq. 6 and 7 under the prior of eq. 8, through the reduced form of
 /// likelihood.hpp). Every quantity is noise-free: the latent one, not the next measurement. Projections are applied last, so
 /// constrained means and samples obey A ddq = b, and covariances A Σ Aᵀ = 0, to rounding. Without observations it is the prior.
-/// Immutable, cheap to copy, thread-safe. One that is given away can grow and shrink with its data: update, remove_oldest.
+/// Immutable, cheap to copy, thread-safe. One that is given away can grow and shrink with its data: update, remove_oldest. Every
+/// member function throws InputError when the posterior was moved away.
 class Posterior {
  public:
-  /// @throws InputError as require_mechanics of the prior, at an observed state.
+  /// @throws InputError when prior, observations and values do not fit each other; and as require_mechanics and
+  /// require_prior_values, at an observed state.
   /// @throws NumericalError when the covariance cannot be factored in double precision (noise too small).
   Posterior(Prior prior, std::vector<Observations> observations, ModelValues values);
 
   /// E[view] at N states (d × N). A state's result is the same, to the bit, whatever other states are asked for and however many
   /// threads work.
   /// @param n_threads  that may work on it; 0: as many as the machine has
-  /// @throws InputError as require_mechanics of the prior.
+  /// @throws InputError as require_view, System::require_states, require_mechanics and require_prior_values; so do those below.
   [[nodiscard]] Eigen::MatrixXd mean(const View& view, const Eigen::Ref<const Eigen::MatrixXd>& states, int n_threads = 1) const;
 
   struct Marginal {
@@ -81,6 +83,7 @@ class Posterior {
   friend Posterior remove_oldest(Posterior&& posterior, int n);
 
   explicit Posterior(std::shared_ptr<const Implementation> implementation);
+  [[nodiscard]] const Implementation& implementation() const;  // throws when it was moved away
   // this one's where nobody else holds it, else a copy
   [[nodiscard]] std::shared_ptr<Implementation> own_implementation() const;
 
@@ -106,8 +109,9 @@ class Posterior {
 [[nodiscard]] Posterior update(Posterior&& posterior, Observations added);
 
 /// The posterior without the n observed states that were added first; those given to the constructor count in their order, group
-/// after group. Rows leave the factor by plane rotations, O(n²) operations each, as stable as a posterior built anew. A group of
-/// which nothing is left stays, without states, and keeps its noise. In place and otherwise as update.
+/// after group. Rows leave the factor by plane rotations, O(n²) operations each, as stable as a posterior built anew. A group that
+/// update() added goes with its last state; one that was given to the constructor stays, without states, and keeps its noise,
+/// since hyperparameters call it by its number. In place and otherwise as update.
 /// @throws InputError when there are fewer; `posterior` is left as it was.
 [[nodiscard]] Posterior remove_oldest(Posterior&& posterior, int n);
 

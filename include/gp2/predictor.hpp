@@ -26,7 +26,8 @@ namespace gp2 GP2_API {
 /// 14), κ the condition number of L, and ‖X‖ ≤ 1 since no eigenvalue of K̃ + I is below 1. A variance that rounding makes negative
 /// is 0.
 ///
-/// Immutable, cheap to copy, thread-safe; it holds its own copy of what it needs of the posterior.
+/// Immutable, cheap to copy, thread-safe; it holds its own copy of what it needs of the posterior. Every member function throws
+/// InputError when the predictor was moved away.
 class Predictor {
  public:
   enum class Storage {
@@ -52,7 +53,7 @@ class Predictor {
 
   /// Predicts every row of the constrained acceleration ddq.
   explicit Predictor(const Posterior& posterior);
-  /// @throws InputError when the view has rows or a latent that there are not, or lacks a time step.
+  /// @throws InputError as require_view.
   Predictor(const Posterior& posterior, View view);
   Predictor(const Posterior& posterior, View view, Options options);
 
@@ -115,6 +116,8 @@ class Predictor {
   [[nodiscard]] const Options& options() const;
 
  private:
+  [[nodiscard]] const Implementation& implementation() const;  // throws when it was moved away
+
   std::shared_ptr<const Implementation> implementation_;
 };
 

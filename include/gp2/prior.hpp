@@ -77,10 +77,16 @@ struct Prior {
   [[nodiscard]] std::vector<bool> reads() const;
 };
 
+/// @throws InputError when a prior is not whole: without a system, as one that was moved away, or with a latent whose kernel,
+/// features, directions and columns do not fit each other.
+void require_prior(const Prior& prior);
+
 /// μ and E at N states, or their derivatives in one parameter.
 struct PriorValues {
   Eigen::MatrixXd mean;                     // μ    (nq × N)
   std::vector<Eigen::MatrixXd> directions;  // E_a  (nq·p_a × N), column-major blocks, without the loadings C_a
+  /// The first state at which the known force or a direction is not a finite number.
+  std::optional<MechanicsBatch::Fault> fault = {};
 
   /// Leaves what one latent adds to ā: no μ, no other latent.
   void keep_only(std::size_t latent);
@@ -91,10 +97,16 @@ struct PriorValues {
 };
 
 /// φ_a at N states (N × D_a), one row per state: the layout kernels read.
-Eigen::MatrixXd evaluate_features(const Latent& latent, const Eigen::Ref<const Eigen::MatrixXd>& states);
+/// @throws InputError that names the state where a feature is not a finite number, and the feature.
+Eigen::MatrixXd evaluate_features(const Prior& prior, std::size_t latent, const Eigen::Ref<const Eigen::MatrixXd>& states);
 
+/// A number that is not finite is told by the `fault` of what is returned …
 PriorValues evaluate_prior(const Prior& prior, const Eigen::Ref<const Eigen::MatrixXd>& states,
                            const Eigen::Ref<const Eigen::VectorXd>& parameters, const MechanicsBatch& mechanics);
+
+/// … or here by an InputError that names the state.
+PriorValues require_prior_values(const Prior& prior, const Eigen::Ref<const Eigen::MatrixXd>& states,
+                                 const Eigen::Ref<const Eigen::VectorXd>& parameters, const MechanicsBatch& mechanics);
 
 /// ∂μ/∂p and ∂E_a/∂p for parameter p = system parameters()[index], given the values and the system's derivative there.
 PriorValues differentiate_prior(const Prior& prior, const Eigen::Ref<const Eigen::MatrixXd>& states,

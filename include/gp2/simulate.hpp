@@ -1,10 +1,14 @@
 #pragma once
 
 #include <functional>
+#include <span>
+#include <string>
+#include <utility>
 #include <vector>
 
 #include <Eigen/Core>
 
+#include "gp2/error.hpp"
 #include "gp2/export.hpp"
 #include "gp2/mechanics/check.hpp"
 #include "gp2/model.hpp"
@@ -38,6 +42,30 @@ class InputSignal {
   std::vector<double> kinks_;
 };
 
+/// Functions g(x) of the state at whose zeros an acceleration jumps, as dry friction −μ sign(v) does at v = 0.
+class SwitchingFunctions {
+ public:
+  SwitchingFunctions() = default;  // none
+  /// @param functions  g; each reads a velocity and no input
+  SwitchingFunctions(std::span<const Expression> functions, const SystemSymbols& symbols);
+
+  [[nodiscard]] int size() const { return size_; }
+  /// @param values     g (size)
+  /// @param gradients  ∂g/∂[q; dq; t] (size × 2 nq + 1)
+  void evaluate(const Eigen::Ref<const Eigen::VectorXd>& state, const Eigen::Ref<const Eigen::VectorXd>& parameters,
+                Eigen::VectorXd& values, Eigen::MatrixXd& gradients) const;
+
+ private:
+  Tape tape_;
+  int size_ = 0;
+};
+
+/// The arguments of sign() that read velocities, in a model's force, and in its [truth] or in features and directions of its
+/// latents. Not to be called from several threads for one model: its expression graph grows.
+SwitchingFunctions switching_functions(const Model& model, bool of_latents);
+
+inline constexpr double least_relative_tolerance = 1e-14;
+
 struct SimulateOptions {
   Eigen::VectorXd times;             // at which states are written, strictly increasing; the first is the start [s]
   double relative_tolerance = 1e-6;  // of a step's error estimate, in each of q and dq
@@ -45,6 +73,8 @@ struct SimulateOptions {
   bool project = true;               // onto position and velocity constraints, after each step and where states are written
   InputSignal inputs;                // u(t)
   int max_steps = 1'000'000;         // accepted and rejected
+  SwitchingFunctions switching;      // where the acceleration jumps
+  Acceleration record;               // another function of the state, of any size, that is wanted at the times; none
   double initial_step = 0;           // [s]; 0: found from the first two accelerations
 };
 
@@ -53,6 +83,7 @@ struct Trajectory {
   Eigen::VectorXd times;          // (N) [s]
   Eigen::MatrixXd states;         // [q; dq; t; u] (layout size × N)
   Eigen::MatrixXd accelerations;  // ddq there (nq × N)
+  Eigen::MatrixXd records;        // options.record there
 
   double max_position_drift = 0;       // largest |c| of position constraints at the written times
   double max_velocity_drift = 0;       // largest |dc/dt|, or |c| of velocity constraints, there
@@ -67,6 +98,15 @@ struct Trajectory {
   double seconds = 0;      // wall time
 };
 
+/// A motion that could not be continued to its end.
+class UnfinishedMotion : public NumericalError {
+ public:
+  UnfinishedMotion(const std::string& text, std::vector<Trajectory> reached)
+      : NumericalError(text), motions(std::move(reached)) {}
+
+  std::vector<Trajectory> motions;  // the last of them up to the state at which it stopped
+};
+
 /// Integrates ddq = acceleration(q, dq, t, u(t)) with the adaptive Dormand–Prince pair 5(4) and its dense output.
 ///
 /// An accepted step, its error estimated before, is projected onto the constraints: with c the residuals of position level and
@@ -75,11 +115,15 @@ struct Trajectory {
 /// steps, are projected too. Steps end at the kinks of the inputs, so that no pulse is stepped over. Redundant constraints mean
 /// nothing off the constraint: the stages of such systems are evaluated at their projections, with `project` or without.
 ///
+/// A zero of a switching function ends a step. There the motion crosses to the other side; or, where both sides drive it back, it
+/// stays on the zero with the mixture of both accelerations that keeps it there (Filippov), until that mixture leaves what lies
+/// between them: a body under dry friction rests, and breaks loose.
+///
 /// @param parameters  of the system's constraints and mass matrix (system.parameters().size())
 /// @param start       [q; dq; …] (layout size), t and u are set from the options. Off the constraint it is projected, or taken as
 ///                    it is without `project`; the trajectory reports both.
 /// @throws InputError when sizes, times or tolerances are wrong.
-/// @throws NumericalError, with the time, when a projection does not converge, the acceleration is not finite or cannot be
+/// @throws UnfinishedMotion, with the time, when a projection does not converge, the acceleration is not finite or cannot be
 ///   computed, the step size underflows, or max_steps is reached.
 Trajectory simulate(const System& system, const Eigen::VectorXd& parameters, const Acceleration& acceleration,
                     const Eigen::Ref<const Eigen::VectorXd>& start, const SimulateOptions& options);

@@ -109,9 +109,17 @@ class System {
   [[nodiscard]] Eigen::VectorXd parameter_values() const;             // the model's own values
   [[nodiscard]] int parameter_index(const std::string& name) const;   // −1 when there is none
 
+  /// @throws InputError when columns are not as large as a state.
+  void require_states(const Eigen::Ref<const Eigen::MatrixXd>& states) const;
+  /// @throws InputError when there is not a number for each of parameters().
+  void require_parameters(const Eigen::Ref<const Eigen::VectorXd>& parameters) const;
+  /// @throws InputError when there is no parameters()[index].
+  void require_parameter(int index) const;
+
   /// M, A, b, F at N states.
   /// @param states      (layout().size() × N)
   /// @param parameters  (parameters().size())
+  /// @throws InputError when a size is wrong; so do those below.
   [[nodiscard]] virtual SystemValues evaluate(const Eigen::Ref<const Eigen::MatrixXd>& states,
                                               const Eigen::Ref<const Eigen::VectorXd>& parameters) const = 0;
 
@@ -142,9 +150,6 @@ class System {
 
   /// Which entries of a state the named part reads (size layout().size()).
   [[nodiscard]] virtual std::vector<bool> reads(SystemPart part) const = 0;
-
-  /// The same coordinates, inputs, parameters, M and F, where nothing constrains the motion: ddq = ā.
-  [[nodiscard]] virtual std::shared_ptr<const System> without_constraints() const = 0;
 
  private:
   std::string name_;

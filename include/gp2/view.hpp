@@ -70,6 +70,10 @@ struct View {
 const Prior& prior_of(const Prior& home, const View& view);
 Eigen::VectorXd parameters_of(const View& view, const Eigen::Ref<const Eigen::VectorXd>& home);
 
+/// @throws InputError when a prior cannot be viewed so: there are no such rows or no such latent, none are named, the time step is
+/// missing or not positive, or the other system has other latents, coordinates or parameters.
+void require_view(const Prior& home, const View& view);
+
 /// The mechanics at N states for a view of a prior: as evaluate_mechanics of the system, and a fault also where M is singular, so
 /// that there is no ā, while the view is of ā, the prior's mean constant, or a latent not on forces.
 ///

@@ -310,6 +310,7 @@ class Posterior:
         *,
         rtol: float = 1e-06,
         atol: float = 1e-09,
+        max_steps: int = 1000000,
         project: bool = True,
         n_samples: None = None,
         seed: int = 0,
@@ -324,6 +325,7 @@ class Posterior:
         *,
         rtol: float = 1e-06,
         atol: float = 1e-09,
+        max_steps: int = 1000000,
         project: bool = True,
         n_samples: int,
         seed: int = 0,
@@ -462,6 +464,7 @@ def simulate(
     # options of simulate: written by scripts/options
     rtol: float = 1e-06,
     atol: float = 1e-09,
+    max_steps: int = 1000000,
     project: bool = True,
     n_samples: int | None = None,
     seed: int = 0,

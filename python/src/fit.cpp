@@ -175,7 +175,7 @@ std::string fit_documentation() {
 Fit a system to measured accelerations.
 
 data        a path, Table, pandas frame or mapping with columns named as the model's (or aliases); or (states, accelerations),
-            arrays (n, len(state_names)) and (n, nq); or a list of these and of Log. NaN, or None, of an acceleration is "not measured"
+            arrays (n, len(state_names)) and (n, nq); or a list of these and of Log, empty where `also` is all there is. NaN, or None, of an acceleration is "not measured"
 also        list of SideInformation: other quantities, measured or known
 progress    called with a Progress some times a second
 

@@ -157,15 +157,6 @@ std::optional<Posterior> kept_by_others(const PyPosterior& self) {
   return self.file.model.code ? std::optional(self.posterior) : std::nullopt;
 }
 
-/// Whether the values of a group came with standard deviations of their own, and did not only get larger ones by a robust fit.
-bool has_stated_noise(const Observations& group, int index, const std::vector<DistrustedValue>& distrusted) {
-  MatrixXd scale = group.noise().scale();
-  for (const DistrustedValue& value : distrusted) {
-    if (value.group == index && value.state < scale.cols()) scale(value.row, value.state) /= value.noise_factor;
-  }
-  return ((scale.array() - 1).abs() > 1e-12).any();
-}
-
 void update_with(PyPosterior& self, const py::object& data, const std::vector<std::string>& observe,
                  const std::optional<double>& noise_stddev, const py::object& columns) {
   const System& system = self.system();
@@ -190,7 +181,9 @@ void update_with(PyPosterior& self, const py::object& data, const std::vector<st
       throw InputError("noise_std: these accelerations were not observed in the fit; give their noise standard deviation");
     }
     stddev = self.posterior.values().noise_stddev[static_cast<std::size_t>(at_home - groups.begin())];
-    if (has_stated_noise(*at_home, static_cast<int>(at_home - groups.begin()), self.file.report.distrusted)) {
+    bool states_noise = false;
+    for (int k = 0; k < view.size(); ++k) states_noise = states_noise || at_home->states_noise(k);
+    if (states_noise) {
       LogReader reader = open_log(self.file.model, table, columns_argument(columns));
       for (const std::string& name : names) {
         if (!reader.stddev_column(name).empty()) continue;

@@ -8,7 +8,9 @@
 #include <cstdio>
 #include <cstring>
 #include <functional>
+#include <optional>
 #include <system_error>
+#include <utility>
 
 #include <fcntl.h>
 #include <poll.h>
@@ -78,6 +80,21 @@ void read_to_end(const OpenFile& file, bool is_pipe, const std::function<void(st
 
 }  // namespace
 
+namespace {
+
+// What a file is that begins so, and the mend, where it is one of those that are taken for text by mistake.
+std::optional<std::string> other_than_text(std::string_view begin) {
+  using namespace std::string_view_literals;
+  if (begin.starts_with("\xff\xfe"sv) || begin.starts_with("\xfe\xff"sv)) {
+    return "the text is UTF-16; save it as UTF-8 (iconv -f UTF-16 -t UTF-8)";
+  }
+  if (begin.starts_with("\x1f\x8b"sv)) return "the file is compressed by gzip; unpack it first (gunzip)";
+  if (begin.starts_with("PK\x03\x04"sv)) return "the file is a ZIP archive, as spreadsheets are; export it as CSV, or unpack it";
+  return std::nullopt;
+}
+
+}  // namespace
+
 void read_blocks(const std::filesystem::path& path, const std::function<void(std::string_view)>& take, std::size_t max_size) {
   const auto fail = [&](const std::string& why) { throw InputError(fmt::format("{}: {}", path.string(), why)); };
   const auto require = [&](bool good) {
@@ -99,7 +116,14 @@ void read_blocks(const std::filesystem::path& path, const std::function<void(std
     if (size > max_size) fail(fmt::format("more than {} bytes, which is all that is read", max_size));
     take(block);
   };
-  read_to_end(file, is_pipe, take_counted, require, fail);
+  bool is_begin = true;
+  const auto take_text = [&](std::string_view block) {
+    if (std::exchange(is_begin, false)) {
+      if (const std::optional<std::string> kind = other_than_text(block)) fail(*kind);
+    }
+    take_counted(block);
+  };
+  read_to_end(file, is_pipe, take_text, require, fail);
 }
 
 std::string read_file(const std::filesystem::path& path, std::size_t max_size) {
@@ -177,7 +201,18 @@ void require_written(const std::filesystem::path& path, bool good) {
   if (!good) throw InputError(fmt::format("{}: cannot be written: {}", path.string(), std::strerror(errno)));
 }
 
-// A file to be written: a link stays, what it points at is replaced.
+// What a path leads to, also where links end at a file that is not there yet.
+std::filesystem::path followed(std::filesystem::path path) {
+  constexpr int most_links = 40;  // as the system follows
+  std::error_code failed;
+  for (int k = 0; k < most_links && std::filesystem::is_symlink(std::filesystem::symlink_status(path, failed)); ++k) {
+    const std::filesystem::path target = std::filesystem::read_symlink(path, failed);
+    path = target.is_absolute() ? target : path.parent_path() / target;
+  }
+  return path;
+}
+
+// A file to be written: a link stays, what it points at is replaced or made.
 struct Target {
   std::string path;
   bool exists = false;
@@ -190,7 +225,7 @@ Target target_of(const std::filesystem::path& path) {
   Target target;
   std::error_code no_such_file;
   const std::filesystem::path resolved = std::filesystem::canonical(path, no_such_file);
-  target.path = no_such_file ? path.string() : resolved.string();
+  target.path = no_such_file ? followed(path).string() : resolved.string();
   target.exists = stat(target.path.c_str(), &target.status) == 0;
   if (target.exists && S_ISDIR(target.status.st_mode)) {
     errno = EISDIR;

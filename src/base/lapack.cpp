@@ -13,7 +13,18 @@ namespace gp2::lapack {
 namespace {
 std::mutex thread_mutex;
 int n_holders = 0;
-int threads_before = 1;
+int threads_before = 1;  // of OpenBLAS, when the first of our objects came
+int threads_set = 1;     // by us, last
+
+void set_threads(int n) {
+  openblas_set_num_threads(n);
+  threads_set = n;
+}
+
+// as long as nobody else has chosen another number meanwhile
+void set_threads_again(int n) {
+  if (openblas_get_num_threads() == threads_set) set_threads(n);
+}
 }  // namespace
 
 bool factorise(Eigen::Ref<Eigen::MatrixXd> A) {
@@ -103,27 +114,26 @@ void solve_lower(const Eigen::Ref<const Eigen::MatrixXd>& L, bool transposed, Ei
 
 SingleThread::SingleThread() {
   const std::scoped_lock lock(thread_mutex);
-  if (n_holders++ == 0 && openblas_set_num_threads != nullptr) {
-    threads_before = openblas_get_num_threads();
-    openblas_set_num_threads(1);
-  }
+  if (n_holders++ > 0 || openblas_set_num_threads == nullptr) return;
+  threads_before = openblas_get_num_threads();
+  set_threads(1);
 }
 
 SingleThread::~SingleThread() {
   const std::scoped_lock lock(thread_mutex);
-  if (--n_holders == 0 && openblas_set_num_threads != nullptr) openblas_set_num_threads(threads_before);
+  if (--n_holders == 0 && openblas_set_num_threads != nullptr) set_threads_again(threads_before);
 }
 
 ManyThreads::ManyThreads(int n_threads) {
   const std::scoped_lock lock(thread_mutex);
   if (n_threads <= 1 || openblas_set_num_threads == nullptr) return;
-  openblas_set_num_threads(n_threads);
+  set_threads(n_threads);
   changed_ = true;
 }
 
 ManyThreads::~ManyThreads() {
   const std::scoped_lock lock(thread_mutex);
-  if (changed_) openblas_set_num_threads(n_holders > 0 ? 1 : threads_before);
+  if (changed_) set_threads_again(n_holders > 0 ? 1 : threads_before);
 }
 
 }  // namespace gp2::lapack

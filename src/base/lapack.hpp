@@ -40,7 +40,7 @@ void invert_factored(Eigen::Ref<Eigen::MatrixXd> L);
 void solve_lower(const Eigen::Ref<const Eigen::MatrixXd>& L, bool transposed, Eigen::Ref<Eigen::MatrixXd> B);
 
 /// While any of these lives, OpenBLAS computes on the calling thread only: our threads and its own do not fight, and sums keep
-/// their order. The previous setting returns with the last one.
+/// their order. The previous setting returns with the last one, unless somebody has chosen another meanwhile.
 class SingleThread {
  public:
   SingleThread();

@@ -24,7 +24,7 @@ struct Loops {
   void (*squared_distance)(Size n, Size D, const T* x, Size ldx, const T* p, T* out);
   /// out_i = exp(−½ Σ_d (x_id − p_d)²)
   void (*squared_exponential)(Size n, Size D, const T* x, Size ldx, const T* p, T* out);
-  /// x_i ← exp(x_i), to 1 ulp for x_i in [−708, 709] ([−87, 88] in single precision); below, 0.
+  /// x_i ← exp(x_i), to 1 ulp for x_i in [−708, 709] ([−87, 88] in single precision); below, 0. NaN stays NaN.
   void (*exponential)(Size n, T* x);
   /// out_l = Σ_i w_i B_il
   void (*weighted_sums)(Size n, Size m, const T* w, const T* B, Size ldb, T* out);

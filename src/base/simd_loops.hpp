@@ -72,8 +72,9 @@ struct Vector {
     for (int k = degree - 1; k >= 0; --k) p = p * r + all(E::coefficients[k]);
     p = (r * r) * p + r + all(T(1));
     const Bits power = reinterpret_cast<Bits>(shifted) << E::mantissa_bits;
-    const Bits in_range = reinterpret_cast<Bits>(x >= all(E::lowest));
-    return reinterpret_cast<Type>((reinterpret_cast<Bits>(p) + power) & in_range);
+    // of NaN neither order holds, and it stays
+    const Bits is_zero = reinterpret_cast<Bits>(x < all(E::lowest));
+    return reinterpret_cast<Type>((reinterpret_cast<Bits>(p) + power) & ~is_zero);
   }
 };
 

@@ -5,6 +5,9 @@
 
 #include <fmt/format.h>
 
+#include "gp2/error.hpp"
+#include "inference/requirements.hpp"
+
 namespace gp2 {
 
 using Eigen::Index;
@@ -30,9 +33,10 @@ MatrixXd pooled_values(const std::vector<Observations>& observations) {
   return pooled(observations, [](const Observations& group) { return group.values(); });
 }
 
-MatrixXd pooled_features(const std::vector<Observations>& observations, const Latent& latent) {
-  return pooled(observations,
-                [&](const Observations& group) -> MatrixXd { return evaluate_features(latent, group.states()).transpose(); });
+MatrixXd pooled_features(const std::vector<Observations>& observations, const Prior& prior, std::size_t latent) {
+  return pooled(observations, [&](const Observations& group) -> MatrixXd {
+    return evaluate_features(prior, latent, group.states()).transpose();
+  });
 }
 
 // of each row; 1 where it is constant
@@ -149,21 +153,34 @@ Fit fit_outputs(const Prior& prior, const std::vector<Observations>& observation
   return {Posterior(prior, observations, model_values(prior, observations, all.hyperparameters)), std::move(all)};
 }
 
+// a baseline learns every acceleration
+void require_accelerations(const Prior& prior, const std::vector<Observations>& observations, const char* function) {
+  require_observations(prior, observations);
+  require_measured(observations, function);
+  for (const Observations& group : observations) {
+    if (group.view().is_of_ddq() && group.view().size() == prior.system->nq()) continue;
+    throw InputError(fmt::format("{}: a baseline learns from all {} accelerations, got observations of {} rows of '{}'", function,
+                                 prior.system->nq(), group.view().size(), group.view().quantity->word()));
+  }
+}
+
 }  // namespace
 
-Baseline standardised_by(const std::vector<Observations>& observations, const Latent& latent, Baseline::Kind kind) {
-  const MatrixXd features = pooled_features(observations, latent);
+Baseline standardised_by(const std::vector<Observations>& observations, const Prior& prior, Baseline::Kind kind) {
+  require_measured(observations, "standardised_by");
+  const MatrixXd features = pooled_features(observations, prior, 0);
   return {kind, row_mean(pooled_values(observations)), features.rowwise().mean(), usable_stddev(features)};
 }
 
 std::vector<Hyperparameter> baseline_hyperparameters(const Prior& prior, const std::vector<Observations>& observations) {
+  require_accelerations(prior, observations, "baseline_hyperparameters");
   const VectorXd output_stddev = usable_stddev(pooled_values(observations));
   std::vector<Hyperparameter> out;
   for (std::size_t a = 0; a < prior.latents.size(); ++a) {
     const Latent& latent = prior.latents[a];
     const std::string prefix = prior.latents.size() == 1 ? "" : latent.name + ".";
     if (!latent.kernel_is_fixed && !latent.kernel.parameters().empty()) {
-      const VectorXd feature_stddev = usable_stddev(pooled_features(observations, latent));
+      const VectorXd feature_stddev = usable_stddev(pooled_features(observations, prior, a));
       for (std::size_t p = 0; p < latent.kernel.parameters().size(); ++p) {
         const Kernel::Parameter& parameter = latent.kernel.parameters()[p];
         Hyperparameter& h = out.emplace_back(Hyperparameter::of(Kind::kernel, a, p));
@@ -193,6 +210,7 @@ FitOptions baseline_fit_options() {
 
 Fit fit_baseline(Baseline::Kind kind, const Prior& prior, const std::vector<Observations>& observations,
                  const std::vector<Hyperparameter>& hyperparameters, const FitOptions& options) {
+  require_accelerations(prior, observations, "fit_baseline");
   return kind == Baseline::Kind::se ? fit_outputs(prior, observations, hyperparameters, options)
                                     : fit(prior, observations, hyperparameters, options);
 }

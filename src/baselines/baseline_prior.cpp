@@ -4,9 +4,11 @@
 
 #include "gp2/baselines/baseline.hpp"
 #include "gp2/error.hpp"
+#include "gp2/mechanics/symbolic_system.hpp"
 #include "model/other_system.hpp"
 #include "model/prior_words.hpp"
 #include "prior/expression_function.hpp"
+#include "prior/make_prior.hpp"
 #include "symbolic/graph.hpp"
 
 namespace gp2 {
@@ -34,11 +36,13 @@ void require_size(const Eigen::VectorXd& values, std::size_t size, const char* w
       fmt::format("{} of a baseline must hold one number for each of the {} {}, got {}", what, size, of, values.size()));
 }
 
-// what a baseline's latents are made of: the features of the model's latents, each once
+// What a baseline's latents are made of: the features of the model's latents, each once, and every entry of the state that the
+// mechanics read and no latent does. What a latent need not learn a baseline must.
 struct Parts {
   PriorWords words;
   std::vector<std::string> names;
   std::vector<Expression> raw;
+  std::size_t n_of_latents = 0;
 
   explicit Parts(const Model& model) : words(prior_words(model)) {
     for (const LatentSpec& latent : model.latents) {
@@ -52,6 +56,28 @@ struct Parts {
         raw.push_back(words.with_values(words.parse(feature), *model.system));
       }
     }
+    n_of_latents = names.size();
+    add_states_of(*model.system);
+  }
+
+  void add_states_of(const System& system) {
+    const std::vector<std::string> state_names = system.state_names();
+    const std::vector<Expression> state = words.symbols.state();
+    const std::vector<bool> mechanics = system.reads(SystemPart::mechanics), force = system.reads(SystemPart::force);
+    const std::size_t n = raw.size();
+    for (std::size_t k = 0; k < state.size(); ++k) {
+      const auto reads = [&](Expression feature) { return words.graph.depends_on(feature, state[k]); };
+      const auto end = raw.begin() + static_cast<std::ptrdiff_t>(n);
+      if (!(mechanics[k] || force[k]) || std::any_of(raw.begin(), end, reads)) continue;
+      names.push_back(state_names[k]);
+      raw.push_back(state[k]);
+    }
+  }
+
+  /// The first n: files of earlier versions have the features of the latents alone.
+  void keep(std::size_t n) {
+    names.resize(n);
+    raw.erase(raw.begin() + static_cast<std::ptrdiff_t>(n), raw.end());
   }
 
   [[nodiscard]] Latent latent(std::string name, const char* kernel, const std::vector<Expression>& features) const {
@@ -63,6 +89,23 @@ struct Parts {
     return latent;
   }
 };
+
+// Of unit masses that nothing constrains or moves: ddq = ā, also where M is singular.
+std::shared_ptr<const System> without_mechanics(const Model& model) {
+  const System& system = *model.system;
+  const auto nq = static_cast<std::size_t>(system.nq());
+  const Expression zero = model.graph->constant(0), one = model.graph->constant(1);
+  std::vector<std::vector<Expression>> identity(nq, std::vector<Expression>(nq, zero));
+  for (std::size_t j = 0; j < nq; ++j) identity[j][j] = one;
+  return std::make_shared<const SymbolicSystem>(SymbolicSystem::Definition{system.name(),
+                                                                           system.coordinates(),
+                                                                           system.inputs(),
+                                                                           system.parameters(),
+                                                                           model.graph,
+                                                                           std::move(identity),
+                                                                           std::vector<Expression>(nq, zero),
+                                                                           {}});
+}
 
 }  // namespace
 
@@ -84,16 +127,18 @@ Baseline unstandardised(const Model& model, Baseline::Kind kind) {
 }
 
 Prior make_baseline_prior(const Model& model, const Baseline& baseline) {
+  require_system(model.system);
   const internal::StepLimit limit;
   const System& system = *model.system;
   ExpressionGraph& graph = *model.graph;
-  const Parts parts(model);
+  Parts parts(model);
+  if (baseline.feature_mean.size() == static_cast<Index>(parts.n_of_latents)) parts.keep(parts.n_of_latents);
   const auto n_outputs = static_cast<std::size_t>(system.nq());
   require_size(baseline.output_mean, n_outputs, "output_mean", "outputs");
   require_size(baseline.feature_mean, parts.names.size(), "feature_mean", "features");
   require_size(baseline.feature_stddev, parts.names.size(), "feature_stddev", "features");
 
-  Prior prior{system.without_constraints(), {}, Prior::Mean::constant, baseline.output_mean, model.system};
+  Prior prior{without_mechanics(model), {}, Prior::Mean::constant, baseline.output_mean, model.system};
   if (baseline.kind == Baseline::Kind::se) {
     // latent j acts on output j
     for (std::size_t j = 0; j < n_outputs; ++j) {

@@ -207,6 +207,10 @@ class CsvTable::Builder {
   }
 
   void read_header(std::string_view line) {
+    if (line.find('\r') != std::string_view::npos) {
+      throw InputError(
+          fmt::format("{}: lines end in a carriage return alone, as of old Macs; convert them (tr '\\r' '\\n')", where()));
+    }
     std::vector<std::string> names = {take_cell_or_throw(line)};
     while (!line.empty()) {
       line.remove_prefix(1);  // the comma

@@ -89,8 +89,12 @@ int LogReader::require(const std::string& name) {
     throw InputError(fmt::format("{}: missing column '{}' (looked for {}); the file has: {}. Rename it, or give `map=LOGNAME={}`",
                                  table_.name(), name, fmt::join(tried, ", "), fmt::join(table_.header(), ", "), name));
   }
-  used_.insert(column);
   const std::string& found = table_.header()[static_cast<std::size_t>(column)];
+  const auto [used, is_new] = used_.emplace(column, name);
+  if (!is_new && used->second != name) {
+    throw InputError(fmt::format("{}: column '{}' is read as {} and as {}; each needs a column of its own (`map=LOGNAME={}`)",
+                                 table_.name(), found, used->second, name, name));
+  }
   if (found != name) aliases_used_[name] = found;
   return column;
 }
@@ -144,7 +148,7 @@ MatrixXd LogReader::stddevs(const std::vector<std::string>& names) {
   MatrixXd stddevs(static_cast<Index>(names.size()), table_.n_rows());
   for (std::size_t k = 0; k < names.size(); ++k) {
     const int column = table_.find(stddev_column(names[k]));
-    used_.insert(column);
+    used_.emplace(column, names[k] + "_std");
     for (int row = 0; row < table_.n_rows(); ++row) {
       const double stddev = table_.number_or_empty(row, column);
       if (stddev <= 0) {

@@ -120,6 +120,12 @@ VectorXd Observations::noise_at(const Eigen::Ref<const VectorXd>& stddev, Index 
   return noise;
 }
 
+bool Observations::states_noise(Index k) const {
+  if (!noise_.has_scale()) return false;
+  const std::vector<double> scales = measured_scales(k);
+  return !scales.empty() && *std::min_element(scales.begin(), scales.end()) != 1;
+}
+
 std::vector<double> Observations::measured_scales(Index k) const {
   std::vector<double> scales;
   for (Index i = 0; i < values_.cols(); ++i) {

@@ -14,6 +14,7 @@
 #include "gp2/base/version.hpp"
 #include "gp2/data/csv.hpp"
 #include "gp2/error.hpp"
+#include "inference/requirements.hpp"
 #include "symbolic/graph.hpp"
 
 namespace gp2 {
@@ -71,6 +72,9 @@ const ParsedJson& array(const ParsedJson& json) {
   if (!json.is_array()) throw InputError(fmt::format("{} stands where an array must", shown(json)));
   return json;
 }
+
+// No quantity, and the square of none, is beyond these: sums over data stay finite.
+constexpr double largest_number = 1e100, smallest_scale = 1e-100;
 
 double number(const ParsedJson& json) {
   if (!json.is_number()) throw InputError(fmt::format("{} stands where a number must", shown(json)));
@@ -168,6 +172,12 @@ MatrixXd rows_from(const ParsedJson& json, const std::vector<std::string>& names
     if (!json.contains(names[k])) continue;
     const Json& values = json.at(names[k]);
     std::transform(values.begin(), values.end(), matrix.row(static_cast<Index>(k)).begin(), entry);
+    const double largest =
+        matrix.row(static_cast<Index>(k)).array().isNaN().select(0, matrix.row(static_cast<Index>(k)).cwiseAbs()).maxCoeff();
+    if (largest > largest_number) {
+      throw InputError(fmt::format("'{}' holds a number of the size {:.3g}; at most {:.0e} can be computed with", names[k],
+                                   largest, largest_number));
+    }
   }
   return matrix;
 }
@@ -239,7 +249,8 @@ Hyperparameter hyperparameter_from(const ParsedJson& json) {
   h.index = integer(json.at("index"));
   const VectorXd scale = json.contains("scale") ? vector_from(json.at("scale")) : VectorXd();
   const bool has_size = h.kind == Kind::loading;
-  if ((h.positive && !(h.value > 0)) || !(scale.array() > 0).all() || (has_size && scale.size() != 1)) {
+  if ((h.positive && !(h.value >= smallest_scale)) || std::abs(h.value) > largest_number || !(scale.array() > 0).all() ||
+      (has_size && scale.size() != 1)) {
     throw InputError(fmt::format("hyperparameter '{}' has the impossible value {}", h.name, h.value));
   }
   if (has_size) h.size = scale[0];
@@ -419,7 +430,8 @@ Observations observations_from(const ParsedJson& json, const Prior& home, std::s
   const int n = integer(json.at("n"));
   if (n < 1) throw InputError(fmt::format("{} observations are not possible", n));
   VectorXd noise_stddev = vector_from(json.at("noise_stddev"));
-  if (noise_stddev.size() != view.size() || !(noise_stddev.array() > 0).all()) {
+  if (noise_stddev.size() != view.size() || !(noise_stddev.array() >= smallest_scale).all() ||
+      !(noise_stddev.array() <= largest_number).all()) {
     throw InputError("noise_stddev must hold one positive number per row of the view");
   }
   const auto estimate_noise = json.at("estimate_noise").get<bool>();
@@ -513,6 +525,117 @@ RestartReport restart_from(const ParsedJson& json) {
 
 }  // namespace
 
+namespace {
+
+bool are_same(const MatrixXd& a, const MatrixXd& b) {
+  return a.rows() == b.rows() && a.cols() == b.cols() &&
+         (a.array() == b.array() || (a.array().isNaN() && b.array().isNaN())).all();
+}
+
+bool are_same(const std::vector<VectorXd>& a, const std::vector<VectorXd>& b) {
+  return std::equal(a.begin(), a.end(), b.begin(), b.end(), [](const auto& x, const auto& y) { return are_same(x, y); });
+}
+
+bool are_same(const ModelValues& a, const ModelValues& b) {
+  const bool all_but_loadings = are_same(a.kernel, b.kernel) && are_same(a.signal_stddev, b.signal_stddev) &&
+                                are_same(a.noise_stddev, b.noise_stddev) && are_same(a.parameters, b.parameters);
+  for (std::size_t k = 0; all_but_loadings && k < a.kernel.size(); ++k) {
+    if (!are_same(a.loading(k), b.loading(k))) return false;
+  }
+  return all_but_loadings;
+}
+
+// A prior, and the parameters of its system.
+struct PriorAt {
+  const Prior& prior;
+  VectorXd parameters;
+};
+
+// what differs between the latents of two priors, or nothing
+std::string difference_of_latents(const Prior& made, const Prior& fitted) {
+  if (made.latents.size() != fitted.latents.size()) {
+    return fmt::format("it has {} latents, the fit {}", made.latents.size(), fitted.latents.size());
+  }
+  for (std::size_t a = 0; a < made.latents.size(); ++a) {
+    const Latent &mine = made.latents[a], &its = fitted.latents[a];
+    const auto differ = [&](const char* what) { return fmt::format("{} of the latent '{}'", what, its.name); };
+    if (mine.kernel.text() != its.kernel.text()) return differ("the kernel");
+    if (mine.feature_names != its.feature_names) return differ("the features");
+    if (mine.base != its.base || mine.column_names != its.column_names || mine.free_loading != its.free_loading) {
+      return differ("the directions");
+    }
+    if (mine.kernel_is_fixed != its.kernel_is_fixed || mine.signal_is_fixed != its.signal_is_fixed) {
+      return differ("what is fixed");
+    }
+  }
+  return "";
+}
+
+// and in what they are at the states of observations
+std::string difference_at(const Observations& group, const PriorAt& made, const PriorAt& fitted) {
+  const System &mine = *made.prior.system, &its = *fitted.prior.system;
+  if (mine.state_names() != its.state_names()) return "the coordinates and inputs";
+  if (mine.parameters().size() != its.parameters().size() || !are_same(made.parameters, fitted.parameters)) {
+    return "the parameters of the system";
+  }
+  const std::string latents = difference_of_latents(made.prior, fitted.prior);
+  if (!latents.empty()) return latents;
+  const auto evaluate = [&](const PriorAt& at) {
+    MechanicsBatch mechanics;
+    evaluate_mechanics(*at.prior.system, group.states(), at.parameters, mechanics);
+    return mechanics;
+  };
+  const MechanicsBatch here = evaluate(made), there = evaluate(fitted);
+  const SystemValues &a = here.values, &b = there.values;
+  if (!are_same(a.mass, b.mass) || !are_same(a.constraint_matrix, b.constraint_matrix) ||
+      !are_same(a.constraint_vector, b.constraint_vector)) {
+    return "M, A or b";
+  }
+  const PriorValues x = evaluate_prior(made.prior, group.states(), made.parameters, here);
+  const PriorValues y = evaluate_prior(fitted.prior, group.states(), fitted.parameters, there);
+  if (!are_same(x.mean, y.mean)) return "the prior mean";
+  for (std::size_t k = 0; k < x.directions.size(); ++k) {
+    const std::string& name = fitted.prior.latents[k].name;
+    if (!are_same(x.directions[k], y.directions[k])) return fmt::format("the directions of the latent '{}'", name);
+    if (!are_same(evaluate_features(made.prior, k, group.states()), evaluate_features(fitted.prior, k, group.states()))) {
+      return fmt::format("the features of the latent '{}'", name);
+    }
+  }
+  return "";
+}
+
+}  // namespace
+
+FitFile::FitFile(Model fitted_model, FitPriorOptions options_of_prior, const Fit& fit,
+                 std::vector<std::shared_ptr<const Model>> other_models)
+    : model(std::move(fitted_model)),
+      prior_options(std::move(options_of_prior)),
+      observations(fit.posterior.observations()),
+      systems(std::move(other_models)),
+      report(fit.report) {
+  const Prior made = prior();
+  const VectorXd& parameters = fit.posterior.values().parameters;
+  systems.resize(observations.size());
+  for (std::size_t g = 0; g < observations.size(); ++g) {
+    const View& view = observations[g].view();
+    std::shared_ptr<const OtherSystem> other;
+    if (view.other_system && !systems[g]) {
+      throw InputError(fmt::format("FitFile: the model file of the system of observations {} is not given", g + 1));
+    }
+    if (view.other_system) other = make_other_system(model, *systems[g], prior_options);
+    const PriorAt here = {other ? other->prior : made, other ? other->parameters(parameters) : parameters};
+    const PriorAt there = {prior_of(fit.posterior.prior(), view), parameters_of(view, parameters)};
+    const std::string differs = difference_at(observations[g], here, there);
+    if (differs.empty()) continue;
+    throw InputError(
+        fmt::format("FitFile: model, prior_options and systems make another prior than that of the fit; what differs "
+                    "at observations {}: {}",
+                    g + 1, differs));
+  }
+  if (are_same(model_values(made, observations, report.hyperparameters), fit.posterior.values())) return;
+  throw InputError("FitFile: the hyperparameters of the report are not those of the posterior");
+}
+
 Posterior FitFile::posterior() const {
   const Prior prior_of_model = prior();
   return {prior_of_model, observations, model_values(prior_of_model, observations, report.hyperparameters)};
@@ -534,6 +657,8 @@ void FitFile::write(const std::filesystem::path& path) const {
   }
   json["hyperparameters"] = Json::array();
   const Prior home = prior();
+  require_observations(home, observations);
+  require_hyperparameters(home, observations, report.hyperparameters);
   for (const Hyperparameter& h : report.hyperparameters) json["hyperparameters"].push_back(hyperparameter_json(h, home));
   json["report"] = {{"nll", report.negative_log_likelihood},
                     {"objective", report.objective},

@@ -23,9 +23,8 @@ std::vector<std::vector<MatrixXd>> features_by_group(const Prior& prior, const s
   std::vector<std::vector<MatrixXd>> features;
   for (const Observations& group : observations) {
     std::vector<MatrixXd>& of_group = features.emplace_back();
-    for (const Latent& latent : prior_of(prior, group.view()).latents) {
-      of_group.push_back(evaluate_features(latent, group.states()));
-    }
+    const Prior& there = prior_of(prior, group.view());
+    for (std::size_t a = 0; a < there.latents.size(); ++a) of_group.push_back(evaluate_features(there, a, group.states()));
   }
   return features;
 }

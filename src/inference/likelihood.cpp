@@ -5,6 +5,7 @@
 #include <utility>
 
 #include "inference/dense_gram.hpp"
+#include "inference/requirements.hpp"
 #include "inference/sample_gradient.hpp"
 
 namespace gp2 {
@@ -118,6 +119,9 @@ Likelihood::Workspace::~Workspace() = default;
 
 Likelihood::Likelihood(Prior prior, std::vector<Observations> observations, const ModelValues& initial, Options options)
     : implementation_(std::make_unique<Implementation>()) {
+  require_observations(prior, observations);
+  require_values(prior, observations, initial);
+  for (const int parameter : options.gradient_parameters) prior.system->require_parameter(parameter);
   Implementation& self = *implementation_;
   self.prior = std::move(prior);
   self.observations = std::move(observations);
@@ -135,9 +139,10 @@ Likelihood::Likelihood(Prior prior, std::vector<Observations> observations, cons
 Likelihood::~Likelihood() = default;
 Likelihood::Likelihood(Likelihood&&) noexcept = default;
 
-const Prior& Likelihood::prior() const { return implementation_->prior; }
-const std::vector<Observations>& Likelihood::observations() const { return implementation_->observations; }
-int Likelihood::reduced_size() const { return implementation_->initial_size; }
+const Likelihood::Implementation& Likelihood::implementation() const { return require_held(implementation_, "Likelihood"); }
+const Prior& Likelihood::prior() const { return implementation().prior; }
+const std::vector<Observations>& Likelihood::observations() const { return implementation().observations; }
+int Likelihood::reduced_size() const { return implementation().initial_size; }
 
 std::vector<GramGradientParts> Likelihood::Implementation::parts(const Reduction& reduction, const ModelValues& values) const {
   std::vector<GramGradientParts> parts;
@@ -177,8 +182,9 @@ MatrixXd loading_gradient(const GramGradient::OfLatent& of_gram, bool alike, con
 
 double Likelihood::evaluate(const ModelValues& values, ModelGradient* gradient, Workspace& workspace) const {
   constexpr double infinity = std::numeric_limits<double>::infinity();
-  const Implementation& self = *implementation_;
-  Workspace::Implementation& work = *workspace.implementation_;
+  const Implementation& self = implementation();
+  Workspace::Implementation& work = require_held(workspace.implementation_, "Likelihood::Workspace");
+  require_values(self.prior, self.observations, values);
 
   // T10, T11: the observations under these values
   work.start(self);

@@ -40,6 +40,7 @@ bool model_observations(const Prior& prior, const std::vector<Observations>& obs
     if (model.mechanics.fault) return false;
     model.values = {evaluate_view(group.view(), model.mechanics, group.states()),
                     evaluate_prior(there, group.states(), theta, model.mechanics)};
+    if (model.values.prior.fault) return false;
     model.derivatives.clear();
     for (int parameter : gradient_parameters) {
       const int index = index_there(group.view(), parameter);
@@ -66,8 +67,10 @@ std::vector<ObservationModel> require_models(const Prior& prior, const std::vect
   if (model_observations(prior, observations, parameters, gradient_parameters, models)) return models;
   // the error names the state
   for (const Observations& group : observations) {
-    static_cast<void>(
-        require_mechanics(prior_of(prior, group.view()), group.view(), group.states(), parameters_of(group.view(), parameters)));
+    const Prior& there = prior_of(prior, group.view());
+    const VectorXd theta = parameters_of(group.view(), parameters);
+    const MechanicsBatch mechanics = require_mechanics(there, group.view(), group.states(), theta);
+    static_cast<void>(require_prior_values(there, group.states(), theta, mechanics));
   }
   return models;
 }

@@ -22,7 +22,7 @@ struct ObservationModel {
 };
 
 /// @param models  receives one per Observations; what it held is memory to be used again
-/// @returns whether the mechanics hold at every state (no fault of evaluate_mechanics).
+/// @returns whether neither the mechanics nor the prior have a fault at any state.
 bool model_observations(const Prior& prior, const std::vector<Observations>& observations, const Eigen::VectorXd& parameters,
                         const std::vector<int>& gradient_parameters, std::vector<ObservationModel>& models);
 

@@ -8,6 +8,7 @@
 #include "base/simd.hpp"
 #include "gp2/error.hpp"
 #include "inference/query.hpp"
+#include "inference/requirements.hpp"
 #include "prior/random_features.hpp"
 
 namespace gp2 {
@@ -55,14 +56,18 @@ struct PathwiseSamples::Implementation {
 PathwiseSamples::PathwiseSamples(std::shared_ptr<const Implementation> implementation)
     : implementation_(std::move(implementation)) {}
 
-int PathwiseSamples::n_samples() const { return static_cast<int>(implementation_->samples.size()); }
+const PathwiseSamples::Implementation& PathwiseSamples::implementation() const {
+  return require_held(implementation_, "PathwiseSamples");
+}
+
+int PathwiseSamples::n_samples() const { return static_cast<int>(implementation().samples.size()); }
 
 MatrixXd PathwiseSamples::evaluate(int sample, const View& view, const Ref<const MatrixXd>& states) const {
   if (sample < 0 || sample >= n_samples()) {
     throw InputError(fmt::format("sample {}: there are {} samples, 0 is the first", sample, n_samples()));
   }
-  const Posterior::Implementation& posterior = *implementation_->posterior;
-  const std::vector<LatentPath>& paths = implementation_->samples[static_cast<std::size_t>(sample)];
+  const Posterior::Implementation& posterior = *implementation().posterior;
+  const std::vector<LatentPath>& paths = implementation().samples[static_cast<std::size_t>(sample)];
   const Query query = make_query(posterior, view, states);
   std::vector<MatrixXd> f(paths.size());
   KernelColumns::Workspace workspace;
@@ -93,6 +98,7 @@ PathwiseSamples sample_paths(const Posterior& posterior, int n_samples, const Pa
   if (n_samples < 1) throw InputError(fmt::format("sample_paths: n_samples must be 1 or more, got {}", n_samples));
   if (options.n_features < 1)
     throw InputError(fmt::format("sample_paths: n_features must be 1 or more, got {}", options.n_features));
+  static_cast<void>(posterior.implementation());  // it was not moved away
   auto self = std::make_shared<PathwiseSamples::Implementation>();
   self->posterior = posterior.implementation_;
   const Posterior::Implementation& conditioned = *self->posterior;

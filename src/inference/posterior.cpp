@@ -12,6 +12,7 @@
 #include "inference/dense_gram.hpp"
 #include "inference/latent_sums.hpp"
 #include "inference/query.hpp"
+#include "inference/requirements.hpp"
 #include "prior/padded_rows.hpp"
 
 namespace gp2 {
@@ -55,10 +56,13 @@ void Posterior::Implementation::erase_samples(const std::vector<Index>& gone) {
 }
 
 Posterior::Posterior(Prior prior, std::vector<Observations> observations, ModelValues values) {
+  require_observations(prior, observations);
+  require_values(prior, observations, values);
   auto self = std::make_shared<Implementation>();
   self->prior = std::move(prior);
   self->observations = std::move(observations);
   self->values = std::move(values);
+  self->n_given_groups = self->observations.size();
   for (std::size_t a = 0; a < self->prior.latents.size(); ++a) self->C.push_back(self->values.loading(a));
   const lapack::SingleThread single_thread;
   self->add_samples(self->observations, self->values.noise_stddev, 0);
@@ -86,7 +90,8 @@ void add_prior_covariance(double k, const double* left, const double* right, Ind
 }  // namespace
 
 MatrixXd Posterior::mean(const View& view, const Ref<const MatrixXd>& states, int n_threads) const {
-  const Implementation& self = *implementation_;
+  const Implementation& self = implementation();
+  require_query(self, view, states);
   constexpr Index block_size = 256;
   n_threads = thread_count(n_threads);
   std::vector<Query> queries(static_cast<std::size_t>(n_threads));
@@ -171,11 +176,13 @@ class MarginalBlock {
 }  // namespace
 
 Posterior::Marginal Posterior::marginal(const View& view, const Ref<const MatrixXd>& states, int n_threads) const {
+  const Implementation& self = implementation();
+  require_query(self, view, states);
   const lapack::SingleThread single_thread;
   constexpr Index block_size = 64;
   n_threads = thread_count(n_threads);
   const Index d = view.size();
-  std::vector<MarginalBlock> blocks(static_cast<std::size_t>(n_threads), MarginalBlock(*implementation_));
+  std::vector<MarginalBlock> blocks(static_cast<std::size_t>(n_threads), MarginalBlock(self));
   std::vector<int> n_clipped(static_cast<std::size_t>(n_threads));
   Marginal marginal{MatrixXd(d, states.cols()), MatrixXd(d * d, states.cols()), 0};
   for_each_block(states.cols(), block_size, n_threads, [&](Index first, Index n, int thread) {
@@ -215,7 +222,7 @@ void add_prior_covariance(const Posterior::Implementation& self, const Query& le
 }  // namespace
 
 Posterior::Joint Posterior::joint(const std::vector<ViewAt>& quantities) const {
-  const Implementation& self = *implementation_;
+  const Implementation& self = implementation();
   const lapack::SingleThread single_thread;
   std::vector<Query> queries;
   std::vector<std::vector<MatrixXd>> loadings;
@@ -254,7 +261,7 @@ Posterior::Joint Posterior::joint(const View& view, const Ref<const MatrixXd>& s
 }
 
 Posterior Posterior::without_data() const {
-  const Implementation& self = *implementation_;
+  const Implementation& self = implementation();
   ModelValues values = self.values;
   values.noise_stddev.clear();
   return {self.prior, {}, std::move(values)};
@@ -262,15 +269,16 @@ Posterior Posterior::without_data() const {
 
 Posterior::Posterior(std::shared_ptr<const Implementation> implementation) : implementation_(std::move(implementation)) {}
 
-const Prior& Posterior::prior() const { return implementation_->prior; }
-const std::vector<Observations>& Posterior::observations() const { return implementation_->observations; }
-const ModelValues& Posterior::values() const { return implementation_->values; }
-int Posterior::reduced_size() const { return static_cast<int>(implementation_->latents->size()); }
+const Posterior::Implementation& Posterior::implementation() const { return require_held(implementation_, "Posterior"); }
+const Prior& Posterior::prior() const { return implementation().prior; }
+const std::vector<Observations>& Posterior::observations() const { return implementation().observations; }
+const ModelValues& Posterior::values() const { return implementation().values; }
+int Posterior::reduced_size() const { return static_cast<int>(implementation().latents->size()); }
 
 double Posterior::negative_log_likelihood() const {
-  const GramValue value = implementation_->latents->value();
+  const GramValue value = implementation().latents->value();
   double sum = value.data_fit + value.complexity;
-  for (const Implementation::Sample& sample : implementation_->samples) sum += sample.constant;
+  for (const Implementation::Sample& sample : implementation().samples) sum += sample.constant;
   return sum;
 }
 

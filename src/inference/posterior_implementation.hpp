@@ -25,6 +25,7 @@ struct Posterior::Implementation {
   std::vector<Sample> samples;               // in the order of adding to `latents`
   std::shared_ptr<LatentPosterior> latents;  // not shared: see own_implementation
   std::int64_t next_number = 0;
+  std::size_t n_given_groups = 0;  // of `observations`, that the constructor was given: the first ones
 
   /// Samples of more observations; `observations` stay as they are. On an error nothing has changed.
   /// @param noise_stddev  per group
@@ -33,6 +34,8 @@ struct Posterior::Implementation {
   void add_samples(const std::vector<Observations>& groups, const std::vector<Eigen::VectorXd>& noise_stddev, int first_group);
   /// Takes samples away, at rising indices; `observations` stay as they are.
   void erase_samples(const std::vector<Eigen::Index>& gone);
+  /// Groups without states go, but for those that the constructor was given.
+  void erase_empty_groups();
 };
 
 }  // namespace gp2

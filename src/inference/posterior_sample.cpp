@@ -83,7 +83,7 @@ LatentGaussian latent_posterior(const Posterior::Implementation& self, const Lat
 }  // namespace
 
 MatrixXd Posterior::sample(const std::vector<ViewAt>& quantities, int n_samples, std::uint64_t seed) const {
-  const Implementation& self = *implementation_;
+  const Implementation& self = implementation();
   const lapack::SingleThread single_thread;
   std::vector<Query> queries;
   Index n_rows = 0;

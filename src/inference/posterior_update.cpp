@@ -7,6 +7,7 @@
 #include "gp2/error.hpp"
 #include "gp2/posterior.hpp"
 #include "inference/posterior_implementation.hpp"
+#include "inference/requirements.hpp"
 
 // Posteriors that grow and shrink with their data.
 namespace gp2 {
@@ -25,20 +26,8 @@ std::shared_ptr<Posterior::Implementation> Posterior::own_implementation() const
   return std::const_pointer_cast<Implementation>(implementation_);
 }
 
-namespace {
-
-void check_added(const Prior& prior, const Observations& added) {
-  const Index n_state = prior_of(prior, added.view()).system->layout().size();
-  if (added.states().rows() != n_state) {
-    throw InputError(fmt::format("update: a column of `states` is a state of '{}' and must have {} rows (StateLayout), got {}",
-                                 prior.system->name(), n_state, added.states().rows()));
-  }
-}
-
-}  // namespace
-
 Posterior update(Posterior&& posterior, Observations added) {
-  check_added(posterior.prior(), added);
+  require_observations(posterior.prior(), added);
   const lapack::SingleThread single_thread;
   const auto self = posterior.own_implementation();
 
@@ -62,7 +51,7 @@ Posterior update(Posterior&& posterior, Observations added) {
 }
 
 Posterior remove_oldest(Posterior&& posterior, int n) {
-  const std::size_t n_samples = posterior.implementation_->samples.size();
+  const std::size_t n_samples = posterior.implementation().samples.size();
   if (n < 0 || static_cast<std::size_t>(n) > n_samples) {
     throw InputError(
         fmt::format("remove_oldest: there are {} observed states, so n must be 0 … {}, got {}", n_samples, n_samples, n));
@@ -83,8 +72,27 @@ Posterior remove_oldest(Posterior&& posterior, int n) {
   for (const Index sample : gone) ++n_gone[static_cast<std::size_t>(self->samples[static_cast<std::size_t>(sample)].group)];
   self->erase_samples(gone);
   for (std::size_t group = 0; group < n_gone.size(); ++group) self->observations[group].remove_first(n_gone[group]);
+  self->erase_empty_groups();
   posterior.implementation_.reset();
   return Posterior(self);
+}
+
+void Posterior::Implementation::erase_empty_groups() {
+  std::vector<int> renumbered;
+  std::size_t kept = 0;
+  for (std::size_t group = 0; group < observations.size(); ++group) {
+    renumbered.push_back(static_cast<int>(kept));
+    if (group >= n_given_groups && observations[group].n_data() == 0) continue;
+    if (kept < group) {
+      observations[kept] = std::move(observations[group]);
+      values.noise_stddev[kept] = std::move(values.noise_stddev[group]);
+    }
+    ++kept;
+  }
+  if (kept == observations.size()) return;
+  observations.erase(observations.begin() + static_cast<std::ptrdiff_t>(kept), observations.end());
+  values.noise_stddev.resize(kept);
+  for (Sample& sample : samples) sample.group = renumbered[static_cast<std::size_t>(sample.group)];
 }
 
 }  // namespace gp2

@@ -13,6 +13,7 @@
 #include "gp2/mechanics/state_evaluator.hpp"
 #include "inference/posterior_implementation.hpp"
 #include "inference/predictor_data.hpp"
+#include "inference/requirements.hpp"
 
 namespace gp2 {
 
@@ -134,19 +135,6 @@ void Predictor::Implementation::with_data(Workspace::Implementation& w, const Wo
 
 namespace {
 
-void check_view(const View& view, const Prior& prior) {
-  const int n_rows = view.quantity->n_rows(prior.system->nq(), prior.system->nc());
-  for (const int row : view.rows) {
-    if (row < 0 || row >= n_rows) {
-      throw InputError(fmt::format("Predictor: rows of the view are 0 … {}, got {}", n_rows - 1, row));
-    }
-  }
-  if (view.latent && (*view.latent < 0 || *view.latent >= static_cast<int>(prior.latents.size()))) {
-    throw InputError(fmt::format("Predictor: the prior has {} latents, numbered from 0, got a view of latent {}",
-                                 prior.latents.size(), *view.latent));
-  }
-}
-
 template <typename Numbers>
 bool is_finite(const Numbers& numbers) {
   // 0·x is 0 of a finite number only
@@ -192,7 +180,6 @@ Predictor::Implementation::Implementation(const Posterior::Implementation& poste
       time_step(view.required_time_step()),
       parts(view.quantity->parts()),
       is_constrained(parts.constrained_acceleration || parts.constraint_force) {
-  check_view(view, prior);
   for (int r = 0; r < view.size(); ++r) added_entries.push_back(view.added_entry(prior.system->layout(), r));
   needs_acceleration = what_needs_acceleration(prior, view).has_value();
   for (std::size_t a = 0; a < prior.latents.size(); ++a) {
@@ -281,10 +268,7 @@ Status Predictor::Implementation::evaluate_mechanics(StateEvaluator& at, Workspa
     case UdwadiaKalaba::Mass::indefinite:
       return Status::mass_not_positive_definite;
   }
-  if (w.projection.inconsistency() > MechanicsBatch::consistency_tolerance * w.projection.size_of_b()) {
-    return Status::contradicting_constraints;
-  }
-  return Status::ok;
+  return w.projection.is_contradictory(at.F()) ? Status::contradicting_constraints : Status::ok;
 }
 
 namespace {
@@ -524,33 +508,38 @@ void Predictor::Implementation::write_jacobian(const Ref<const VectorXd>& state,
 Predictor::Predictor(const Posterior& posterior)
     : Predictor(posterior, View::constrained_acceleration(*posterior.prior().system)) {}
 Predictor::Predictor(const Posterior& posterior, View view) : Predictor(posterior, std::move(view), Options()) {}
-Predictor::Predictor(const Posterior& posterior, View view, Options options)
-    : implementation_(std::make_shared<const Implementation>(*posterior.implementation_, std::move(view), options)) {}
+Predictor::Predictor(const Posterior& posterior, View view, Options options) {
+  require_view(posterior.prior(), view);
+  implementation_ = std::make_shared<const Implementation>(posterior.implementation(), std::move(view), options);
+}
 
-Predictor::Workspace::Workspace(const Predictor& predictor)
-    : implementation_(std::make_unique<Implementation>(predictor.implementation_)) {}
+Predictor::Workspace::Workspace(const Predictor& predictor) {
+  static_cast<void>(predictor.implementation());  // it was not moved away
+  implementation_ = std::make_unique<Implementation>(predictor.implementation_);
+}
 Predictor::Workspace::~Workspace() = default;
 Predictor::Workspace::Workspace(Workspace&&) noexcept = default;
 Predictor::Workspace& Predictor::Workspace::operator=(Workspace&&) noexcept = default;
 
-const View& Predictor::view() const { return implementation_->view; }
-const Predictor::Options& Predictor::options() const { return implementation_->options; }
+const Predictor::Implementation& Predictor::implementation() const { return require_held(implementation_, "Predictor"); }
+const View& Predictor::view() const { return implementation().view; }
+const Predictor::Options& Predictor::options() const { return implementation().options; }
 
 namespace {
 
-void check_arguments(const Predictor::Implementation* predictor, const Ref<const VectorXd>& state, const Ref<VectorXd>& mean,
+void check_arguments(const Predictor::Implementation& predictor, const Ref<const VectorXd>& state, const Ref<VectorXd>& mean,
                      const Predictor::Workspace::Implementation* workspace) {
-  if (workspace == nullptr || workspace->predictor.get() != predictor) {
+  if (workspace == nullptr || workspace->predictor.get() != &predictor) {
     throw InputError("Predictor: the workspace is of another predictor; use make_workspace() of this one");
   }
-  check_size("a state", state.size(), predictor->prior.system->layout().size());
-  check_size("the mean", mean.size(), predictor->view.size());
+  check_size("a state", state.size(), predictor.prior.system->layout().size());
+  check_size("the mean", mean.size(), predictor.view.size());
 }
 
 }  // namespace
 
 Status Predictor::mean(const Ref<const VectorXd>& state, Ref<VectorXd> mean, Workspace& workspace) const {
-  check_arguments(implementation_.get(), state, mean, workspace.implementation_.get());
+  check_arguments(implementation(), state, mean, workspace.implementation_.get());
   Workspace::Implementation& w = *workspace.implementation_;
   return implementation_->write_mean(state, *w.values, w, mean);
 }
@@ -559,7 +548,7 @@ Status Predictor::mean_and_stddev(const Ref<const VectorXd>& state, Ref<VectorXd
                                   Workspace& workspace) const {
   if (!options().stddev) throw InputError("Predictor: it was made without Options::stddev");
   check_size("the standard deviation", stddev.size(), view().size());
-  check_arguments(implementation_.get(), state, mean, workspace.implementation_.get());
+  check_arguments(implementation(), state, mean, workspace.implementation_.get());
   Workspace::Implementation& w = *workspace.implementation_;
   const Status status = implementation_->write_mean(state, *w.values, w, mean);
   if (status == Status::ok) {
@@ -573,7 +562,7 @@ Status Predictor::mean_and_stddev(const Ref<const VectorXd>& state, Ref<VectorXd
 Status Predictor::mean_and_jacobian(const Ref<const VectorXd>& state, Ref<VectorXd> mean, Ref<MatrixXd> jacobian,
                                     Workspace& workspace) const {
   if (!options().jacobian) throw InputError("Predictor: it was made without Options::jacobian");
-  check_arguments(implementation_.get(), state, mean, workspace.implementation_.get());
+  check_arguments(implementation(), state, mean, workspace.implementation_.get());
   check_size("a column of the Jacobian", jacobian.rows(), view().size());
   check_size("a row of the Jacobian", jacobian.cols(), state.size());
   Workspace::Implementation& w = *workspace.implementation_;

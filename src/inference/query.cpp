@@ -14,14 +14,14 @@ void Query::evaluate(const Posterior::Implementation& posterior, const View& vie
   const VectorXd parameters = parameters_of(viewed, posterior.values.parameters);
   const auto block = states.middleCols(first, n);
   evaluate_mechanics(there, viewed, block, parameters, mechanics);
-  // whether constraints contradict each other depends on the largest b of all states, not of a block: throws, or all is well
+  // the error counts the state among all, and what is rounding is judged over all
   if (mechanics.fault) static_cast<void>(require_mechanics(there, viewed, states, parameters));
   view = evaluate_view(viewed, mechanics, block);
-  prior = evaluate_prior(there, block, parameters, mechanics);
+  prior = require_prior_values(there, block, parameters, mechanics);
   latent = viewed.latent;
   if (latent) prior.keep_only(static_cast<std::size_t>(*latent));
   features.resize(there.latents.size());
-  for (std::size_t a = 0; a < features.size(); ++a) features[a] = evaluate_features(there.latents[a], block);
+  for (std::size_t a = 0; a < features.size(); ++a) features[a] = evaluate_features(there, a, block);
 }
 
 void Query::view_of(const Posterior::Implementation& posterior, const std::vector<MatrixXd>& f, Ref<MatrixXd> values) const {
@@ -50,7 +50,13 @@ std::vector<MatrixXd> Query::loadings(const Posterior::Implementation& posterior
   return loadings;
 }
 
+void require_query(const Posterior::Implementation& posterior, const View& view, const Ref<const MatrixXd>& states) {
+  require_view(posterior.prior, view);
+  prior_of(posterior.prior, view).system->require_states(states);
+}
+
 Query make_query(const Posterior::Implementation& posterior, const View& view, const Ref<const MatrixXd>& states) {
+  require_query(posterior, view, states);
   Query query;
   query.evaluate(posterior, view, states, 0, states.cols());
   return query;

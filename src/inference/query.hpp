@@ -34,6 +34,10 @@ struct Query {
   [[nodiscard]] std::vector<Eigen::MatrixXd> loadings(const Posterior::Implementation& posterior) const;
 };
 
+/// @throws InputError as require_view and System::require_states.
+void require_query(const Posterior::Implementation& posterior, const View& view, const Eigen::Ref<const Eigen::MatrixXd>& states);
+
+/// @throws InputError as require_query and Query::evaluate.
 Query make_query(const Posterior::Implementation& posterior, const View& view, const Eigen::Ref<const Eigen::MatrixXd>& states);
 
 }  // namespace gp2

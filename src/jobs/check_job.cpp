@@ -1,15 +1,20 @@
 #include "gp2/jobs/check_job.hpp"
 
 #include <algorithm>
+#include <cmath>
+#include <iterator>
+#include <numbers>
 #include <utility>
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
+#include "gp2/base/statistics.hpp"
 #include "gp2/jobs/fit_problem.hpp"
 #include "gp2/prior.hpp"
 #include "gp2/simulation/generate.hpp"
 #include "gp2/simulation/projected_states.hpp"
+#include "jobs/read_observations.hpp"
 
 namespace gp2 {
 
@@ -27,8 +32,9 @@ bool has_error(const std::vector<Finding>& findings) {
 
 void check_model(const Model& model, std::vector<Finding>& findings) {
   const System& system = *model.system;
-  findings.push_back({Level::good, fmt::format("{}: '{}', {} coordinates, {} constraints", model.name, system.name(), system.nq(),
-                                               system.nc())});
+  const auto counted = [](int n, const char* what) { return fmt::format("{} {}{}", n, what, n == 1 ? "" : "s"); };
+  findings.push_back({Level::good, fmt::format("{}: '{}', {}, {}", model.name, system.name(), counted(system.nq(), "coordinate"),
+                                               counted(system.nc(), "constraint"))});
   if (!model.robot) return;
   for (const std::string& note : model.robot->notes) findings.push_back({Level::good, note});
 }
@@ -71,14 +77,133 @@ void check_mechanics(const Model& model, const Eigen::MatrixXd& states, std::vec
   findings.push_back({Level::error, fmt::format("{} at state {}", mechanics.fault->text, mechanics.fault->state + 1)});
 }
 
+// Columns that do not vary, and rows that repeat others.
+void check_channels(const WholeLog& log, const System& system, std::vector<Finding>& findings) {
+  const std::vector<std::string> accelerations = system.acceleration_names();
+  const StateLayout layout = system.layout();
+  const auto is_stuck = [](const Eigen::RowVectorXd& row) {
+    std::vector<double> measured;
+    std::copy_if(row.begin(), row.end(), std::back_inserter(measured), [](double one) { return !std::isnan(one); });
+    return measured.size() > 4 &&
+           std::all_of(measured.begin(), measured.end(), [&](double one) { return one == measured.front(); });
+  };
+  for (int j = 0; j < system.nq(); ++j) {
+    const std::string velocity = system.coordinates()[static_cast<std::size_t>(j)].velocity();
+    const auto q = log.states.row(layout.q(j));
+    const bool moves = !q.hasNaN() && !is_stuck(q);
+    const auto add = [&](const std::string& name) {
+      findings.push_back(
+          {Level::warning, fmt::format("{} is the same in every row, while the system moves: a channel that is stuck?", name)});
+    };
+    if (moves && is_stuck(log.states.row(layout.dq(j)))) add(velocity);
+    if (!is_stuck(log.states.row(layout.dq(j))) && is_stuck(log.accelerations.row(j)))
+      add(accelerations[static_cast<std::size_t>(j)]);
+    if (is_stuck(q) && !log.states.row(layout.dq(j)).hasNaN() && !is_stuck(log.states.row(layout.dq(j))))
+      add(system.coordinates()[static_cast<std::size_t>(j)].name);
+  }
+  const int n_repeated = n_repeated_rows(log.states, log.accelerations);
+  if (n_repeated * 20 > log.states.cols()) {
+    findings.push_back(
+        {Level::warning,
+         fmt::format("{} of {} rows repeat another one to the last digit: they are no measurements of their own, and "
+                     "deviations come out too small; keep each once",
+                     n_repeated, log.states.cols())});
+  }
+}
+
+// Two columns of a log, value and rate, over the steps from row to row: y = Δvalue, x = mean rate · Δt.
+struct Steps {
+  double xx = 0, yy = 0, xy = 0;
+  int n = 0;
+
+  [[nodiscard]] double correlation() const { return xx > 0 && yy > 0 ? xy / std::sqrt(xx * yy) : 0; }
+  [[nodiscard]] double slope() const { return xx > 0 ? xy / xx : 0; }
+};
+
+/// @param lag  rows by which the rate is late
+Steps steps_of(const Eigen::RowVectorXd& t, const Eigen::RowVectorXd& value, const Eigen::RowVectorXd& rate, bool is_angle,
+               int lag) {
+  std::vector<double> lengths;
+  for (Eigen::Index i = 0; i + 1 < t.size(); ++i) lengths.push_back(t[i + 1] - t[i]);
+  const double usual = median(lengths);
+  Steps steps;
+  for (Eigen::Index i = 0; i + 1 < t.size(); ++i) {
+    const double dt = lengths[static_cast<std::size_t>(i)];
+    if (i + lag < 0 || i + 1 + lag >= t.size() || !(dt > 0) || dt > 1.5 * usual) continue;
+    const double x = 0.5 * (rate[i + lag] + rate[i + 1 + lag]) * dt;
+    double y = value[i + 1] - value[i];
+    if (is_angle) y = std::remainder(y, 2 * std::numbers::pi);
+    if (!std::isfinite(x) || !std::isfinite(y)) continue;
+    steps.xx += x * x;
+    steps.yy += y * y;
+    steps.xy += x * y;
+    ++steps.n;
+  }
+  return steps;
+}
+
+// What else the rate would have to be for the values to follow from it; empty where it is right, or nothing explains them better.
+std::string better_rate(const Eigen::RowVectorXd& t, const Eigen::RowVectorXd& value,
+                        const std::vector<Eigen::RowVectorXd>& rates, const std::vector<std::string>& names, std::size_t own,
+                        bool is_angle) {
+  constexpr double sure = 0.95;
+  const Steps now = steps_of(t, value, rates[own], is_angle, 0);
+  if (now.n < 20) return "";
+  if (std::abs(now.correlation()) > sure) {
+    const double slope = now.slope();
+    return std::abs(slope - 1) < 0.3 ? "" : fmt::format("it is {:.3g} × what is measured: a unit or a sign, or the clock", slope);
+  }
+  for (const int lag : {1, -1, 2, -2, 3, -3}) {
+    const double correlation = steps_of(t, value, rates[own], is_angle, lag).correlation();
+    if (correlation > sure && 1 - correlation < 0.3 * (1 - now.correlation())) {
+      return fmt::format("the column {} by {} row{}", lag > 0 ? "lags" : "leads", std::abs(lag), std::abs(lag) == 1 ? "" : "s");
+    }
+  }
+  for (std::size_t other = 0; other < rates.size(); ++other) {
+    if (other == own || rates[other].hasNaN()) continue;
+    const Steps steps = steps_of(t, value, rates[other], is_angle, 0);
+    if (std::abs(steps.correlation()) > sure && std::abs(now.correlation()) < 0.5) {
+      return fmt::format("it is measured by the column of {}: swapped?", names[other]);
+    }
+  }
+  return "";
+}
+
+// Of a log in the order of time: velocities are the rates of coordinates, accelerations those of velocities.
+void check_rates(const WholeLog& log, const System& system, std::vector<Finding>& findings) {
+  const StateLayout layout = system.layout();
+  const Eigen::RowVectorXd t = log.states.row(layout.t());
+  constexpr Eigen::Index fewest = 30;
+  if (t.hasNaN() || t.size() < fewest || !((t.tail(t.size() - 1) - t.head(t.size() - 1)).array() > 0).all()) return;
+  std::vector<Eigen::RowVectorXd> q, dq, ddq;
+  std::vector<std::string> velocities;
+  for (int j = 0; j < system.nq(); ++j) {
+    q.emplace_back(log.states.row(layout.q(j)));
+    dq.emplace_back(log.states.row(layout.dq(j)));
+    ddq.emplace_back(log.accelerations.row(j));
+    velocities.push_back(system.coordinates()[static_cast<std::size_t>(j)].velocity());
+  }
+  const std::vector<std::string> accelerations = system.acceleration_names();
+  for (std::size_t j = 0; j < q.size(); ++j) {
+    const Coordinate& coordinate = system.coordinates()[j];
+    const auto add = [&](const std::string& of, const std::string& rate, const std::string& text) {
+      if (!text.empty()) findings.push_back({Level::warning, fmt::format("{} is not the rate of {} over t: {}", rate, of, text)});
+    };
+    if (!q[j].hasNaN()) add(coordinate.name, velocities[j], better_rate(t, q[j], dq, velocities, j, coordinate.angle));
+    if (!dq[j].hasNaN()) add(velocities[j], accelerations[j], better_rate(t, dq[j], ddq, accelerations, j, false));
+  }
+}
+
 void check_log(const Model& model, const CsvTable& table, const CheckOptions& options, std::vector<Finding>& findings) {
   const System& system = *model.system;
   LogReader reader = open_log(model, table, options.columns);
   const WholeLog log = read_whole_log(model, reader);
   check_columns_of(table, reader, log, system, findings);
+  check_channels(log, system, findings);
+  check_rates(log, system, findings);
   check_mechanics(model, log.states, findings);
   if (has_error(findings)) return;
-  append(findings, check_data(system, log.states, system.parameter_values(), log.accelerations, log.stated));
+  append(findings, check_data(system, log.states, system.parameter_values(), log.accelerations, log.stddev, log.stated));
   append(findings, check_states(system, log.states, system.parameter_values()));
 }
 

@@ -7,9 +7,12 @@
 #include <fmt/ranges.h>
 
 #include "gp2/error.hpp"
+#include "gp2/inference/evaluation.hpp"
 #include "gp2/jobs/fit_memory.hpp"
 
 namespace gp2 {
+
+using Eigen::MatrixXd;
 
 namespace {
 
@@ -77,6 +80,74 @@ FitJob job_of(FitRequest request, FitProblem problem) {
   return job;
 }
 
+// What the residuals say against the data, the constraints or the noise.
+void add_residual_notes(const Posterior& posterior, std::vector<std::string>& notes) {
+  for (std::size_t g = 0; g < posterior.observations().size(); ++g) {
+    if (!posterior.observations()[g].view().is_of_ddq()) continue;
+    for (const ConstraintResidual& one : constraint_residuals(posterior, g)) {
+      if (one.is_too_large()) notes.push_back("warning: " + one.text());
+    }
+  }
+  std::vector<std::string> large, correlated;
+  for (const TrainingResidual& one : training_residuals(posterior)) {
+    if (one.is_too_large()) {
+      large.push_back(fmt::format("{} (z rms {:.2g}, {:.0f} % within 95 %)", one.output, one.rms, 100 * one.coverage95));
+    } else if (one.is_correlated()) {
+      correlated.push_back(fmt::format("{} ({:.2g})", one.output, one.serial_correlation));
+    }
+  }
+  if (!large.empty()) {
+    notes.push_back(
+        fmt::format("warning: values lie farther than noise from what all others predict: {}: the noise is stated too small, a "
+                    "column is wrong or lags, or the constraints or features miss something; see gp2 check and gp2 report",
+                    fmt::join(large, ", ")));
+  }
+  if (!correlated.empty()) {
+    notes.push_back(fmt::format(
+        "warning: residuals go on from row to row, correlation {}: something that lasts longer than a sample is missing, "
+        "and the rows are fewer measurements than they seem: deviations are too small",
+        fmt::join(correlated, ", ")));
+  }
+}
+
+// What this fit leaves out of the force that its model knows: that the latents cannot stand for it, or that the same data are far
+// more likely with it under the same hyperparameters.
+void add_force_note(const Posterior& posterior, std::vector<std::string>& notes) {
+  Prior prior = posterior.prior();
+  const std::vector<Observations>& observations = posterior.observations();
+  const bool is_elsewhere =
+      std::any_of(observations.begin(), observations.end(), [](const auto& group) { return group.view().other_system; });
+  if (prior.mean != Prior::Mean::zero || prior.reference || is_elsewhere) return;
+  const std::vector<bool> known = prior.reads(), force = prior.system->reads(SystemPart::force);
+  const std::vector<std::string> names = prior.system->state_names();
+  std::vector<std::string> unknown;
+  for (std::size_t k = 0; k < names.size(); ++k) {
+    if (force[k] && !known[k]) unknown.push_back(names[k]);
+  }
+  if (!unknown.empty()) {
+    notes.push_back(
+        fmt::format("warning: the known force of [mechanics] is not used, and no feature reads {}, on which it depends: fit "
+                    "with `mean=force`",
+                    fmt::join(unknown, ", ")));
+    return;
+  }
+  bool is_zero = true;
+  for (const Observations& group : observations) {
+    const MatrixXd F = prior.system->evaluate(group.states(), posterior.values().parameters).force;
+    if (!F.allFinite()) return;
+    is_zero = is_zero && F.isZero(0);
+  }
+  if (is_zero) return;
+  prior.mean = Prior::Mean::force;
+  const Posterior with_force(prior, observations, posterior.values());
+  const double gain = posterior.negative_log_likelihood() - with_force.negative_log_likelihood();
+  if (gain <= 10) return;
+  notes.push_back(fmt::format(
+      "the known force of [mechanics] is not used: with `mean=force` the log likelihood of these data is {:.3g} higher, "
+      "under the same hyperparameters",
+      gain));
+}
+
 }  // namespace
 
 std::vector<Option> options(FitRequest& request) {
@@ -96,7 +167,7 @@ std::vector<Option> options(FitRequest& request) {
       {"baseline",
        choice(problem.baseline, {{"se", Baseline::Kind::se}, {"icm", Baseline::Kind::icm}, {"lmc", Baseline::Kind::lmc}}), "",
        "learn ddq without mechanics (docs/priors.md): se (independent outputs), icm or lmc (multi-output), from the model's "
-       "features"},
+       "features and what else of the state it reads"},
       {"estimate", &problem.estimate, "p1,p2", "parameters to estimate, or none", "those the model says"},
       {"noise_std",
        NumberOrWord{&problem.noise_stddev, {{"estimate", &problem.estimate_noise}, {"stated", &problem.trust_stated_noise}}}, "S",
@@ -115,7 +186,7 @@ std::vector<Option> options(FitRequest& request) {
        "5; of a baseline 30"},
       {"max_iterations", &request.max_iterations, "K",
        "per run, what follows an escape included; 0 conditions at the starting values"},
-      {"start", &request.start, "FILE", "starting values: {\"name\": value, …} as JSON, or a FIT.json"},
+      {"start", &request.start, "FILE", "starting values: a file of JSON, {\"name\": value, …}, or a FIT.json"},
       {"max_points", &problem.max_points, "N", "take this many rows of each log, the first of a shuffle by `seed`", "all"},
       {"seed", &problem.seed, "S", "of restarts and `max_points`"},
       threads_option(request.threads),
@@ -171,6 +242,10 @@ FitOutcome run_fit(const FitJob& job, const std::function<void(const Progress&)>
   Fit result = fit(job.problem, options);
   FitOutcome outcome{job.file, std::move(result.posterior), distrust_notes(job.problem, result.report)};
   for (std::string& note : notes_of(result.report)) outcome.notes.push_back(std::move(note));
+  if (result.report.termination != FitReport::interrupted) {
+    add_force_note(outcome.posterior, outcome.notes);
+    add_residual_notes(outcome.posterior, outcome.notes);
+  }
   outcome.file.observations = outcome.posterior.observations();
   outcome.file.report = std::move(result.report);
   return outcome;

@@ -6,6 +6,8 @@
 #include <fstream>
 #include <sstream>
 
+#include <sys/mman.h>
+
 #include <fmt/format.h>
 
 #include "base/parallel.hpp"
@@ -77,6 +79,9 @@ PerState per_state(const FitProblem& problem, double rank) {
   return count;
 }
 
+// OpenBLAS maps a buffer for each thread that calls it, and where it gets none tries again for ever.
+constexpr double blas_buffer = 128 * 1024. * 1024;
+
 // A fit of so many states and reduced rows, one evaluation at a time.
 FitMemory memory_of(double n_states, double r, const PerState& count) {
   constexpr double blas = 1e7;  // OpenBLAS packs blocks of a matrix into memory of its own, one for each thread that calls it
@@ -85,6 +90,8 @@ FitMemory memory_of(double n_states, double r, const PerState& count) {
   memory.shared = number * n_states * count.shared;
   memory.evaluation = triangle(r / count.n_parts) + number * n_states * count.evaluation + blas;
   memory.posterior = triangle(r) + number * n_states * count.evaluation + blas;
+  memory.asked_by_evaluation = number * (r / count.n_parts) * (r / count.n_parts) + blas_buffer;
+  memory.asked_by_posterior = number * r * r + blas_buffer;
   return memory;
 }
 
@@ -184,8 +191,71 @@ std::optional<double> free_memory(const std::filesystem::path& root) {
   return free;
 }
 
-FitOptions within_memory(const FitProblem& problem, const FitOptions& options, std::optional<double> free,
-                         std::vector<std::string>& notes) {
+bool is_given(double bytes, int n_pieces) {
+  const auto size = static_cast<std::size_t>(bytes);
+  std::vector<void*> pieces;
+  bool all = true;
+  for (int k = 0; k < n_pieces && all; ++k) {
+    void* const piece = mmap(nullptr, size, PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS, -1, 0);
+    all = piece != MAP_FAILED;
+    if (all) pieces.push_back(piece);
+  }
+  for (void* const piece : pieces) munmap(piece, size);
+  return all;
+}
+
+namespace {
+
+// The most rows of each log with which `fits`, by halving.
+int most_affordable_rows(const FitProblem& problem, const std::function<bool(const FitMemory&)>& fits) {
+  const Sizes sizes = sizes_of(problem);
+  int most = 0, too_many = 0;
+  for (const Observations& group : problem.observations) too_many = std::max(too_many, group.n_data());
+  while (too_many - most > 1) {
+    const int middle = most + (too_many - most) / 2;
+    const double n = n_states(problem, middle);
+    (fits(memory_of(n, sizes.rank * n, sizes.count)) ? most : too_many) = middle;
+  }
+  return most;
+}
+
+// The options with as many evaluations side by side as the system gives memory for.
+FitOptions within_given(const FitProblem& problem, const FitOptions& options, std::vector<std::string>& notes,
+                        const std::function<bool(double, int)>& given) {
+  const FitMemory memory = fit_memory(problem, options);
+  const auto is_possible = [&](const FitMemory& one, int n) {
+    return given(one.asked_by_evaluation, n) && given(one.asked_by_posterior, 1);
+  };
+  int n = memory.side_by_side;
+  while (n > 0 && !is_possible(memory, n)) --n;
+  if (n == memory.side_by_side) return options;
+  if (n > 0) {
+    FitOptions fewer = options;
+    fewer.max_side_by_side = n;
+    notes.push_back(
+        fmt::format("the system does not give the memory that {} runs side by side ask for (ulimit -v?): {} at a time",
+                    memory.side_by_side, n));
+    return fewer;
+  }
+  const int most = most_affordable_rows(problem, [&](const FitMemory& fewer) { return is_possible(fewer, 1); });
+  const double asked = std::max(memory.asked_by_evaluation, memory.asked_by_posterior);
+  if (most == 0) {
+    throw InputError(
+        fmt::format("the fit asks for {:.1f} GB of memory, which the system does not give however few rows there are: "
+                    "raise the limit (ulimit -v)",
+                    gigabytes(asked)));
+  }
+  throw InputError(fmt::format(
+      "the fit of {:.0f} rows asks for {:.1f} GB of memory in one piece, which the system does not give; {} rows of each "
+      "log would fit: take so many with `max_points={}`, choose them with gp2 resample, or raise the limit (ulimit -v)",
+      n_states(problem), gigabytes(asked), most, most));
+}
+
+}  // namespace
+
+FitOptions within_memory(const FitProblem& problem, const FitOptions& all_options, std::optional<double> free,
+                         std::vector<std::string>& notes, const std::function<bool(double, int)>& given) {
+  const FitOptions options = within_given(problem, all_options, notes, given);
   if (!free) return options;
   // the estimate is good to a tenth or so; a small fit is never refused, for what is free is not known that well
   constexpr double share = 0.9, small = 1e8;
@@ -202,18 +272,7 @@ FitOptions within_memory(const FitProblem& problem, const FitOptions& options, s
     return fewer;
   }
 
-  // the most rows of each log that fit, by halving
-  const Sizes sizes = sizes_of(problem);
-  const auto fits = [&](int rows) {
-    const double n = n_states(problem, rows);
-    return memory_of(n, sizes.rank * n, sizes.count).bytes() <= usable;
-  };
-  int most = 0, too_many = 0;
-  for (const Observations& group : problem.observations) too_many = std::max(too_many, group.n_data());
-  while (too_many - most > 1) {
-    const int middle = most + (too_many - most) / 2;
-    (fits(middle) ? most : too_many) = middle;
-  }
+  const int most = most_affordable_rows(problem, [&](const FitMemory& fewer_rows) { return fewer_rows.bytes() <= usable; });
   const double alone = memory.shared + std::max(memory.evaluation, memory.posterior);
   throw InputError(fmt::format(
       "the fit of {:.0f} rows factors a matrix of size {} and takes {:.1f} GB of memory, of which {:.1f} GB are free; {} rows "

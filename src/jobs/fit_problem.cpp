@@ -49,7 +49,7 @@ FitProblem make_baseline_problem(const Model& model, const std::vector<Log>& log
     problem.observations.push_back(read_log(logged, log, options, problem.lines.emplace_back(), problem.notes));
     problem.systems.push_back(nullptr);
   }
-  problem.prior_options.baseline = standardised_by(problem.observations, problem.prior.latents.front(), *options.baseline);
+  problem.prior_options.baseline = standardised_by(problem.observations, problem.prior, *options.baseline);
   problem.prior = make_prior(model, problem.prior_options);
   problem.hyperparameters = starting_hyperparameters(problem, options);
   return problem;
@@ -100,10 +100,16 @@ std::vector<Observations> trusted_observations(const FitProblem& problem) {
   return problem.robust ? without_gross_errors(problem.observations) : problem.observations;
 }
 
+// what a discrepancy is a share of
+bool observes_accelerations(const FitProblem& problem) {
+  return std::any_of(problem.observations.begin(), problem.observations.end(),
+                     [](const Observations& group) { return group.view().quantity == View::Quantity::constrained_acceleration; });
+}
+
 bool has_discrepancy(const FitProblem& problem, const FitProblemOptions& options) {
   const bool standard = options.protocol.name == Protocol::Name::standard && options.protocol.hyperprior;
   return options.discrepancy && standard && problem.prior.latents.size() == 1 && !problem.prior.latents.front().directions &&
-         !has_singular_mass(problem);
+         observes_accelerations(problem) && !has_singular_mass(problem);
 }
 
 // a share of the noise, as the fit starts with it, in each acceleration; where one is not measured, of its spread the same share
@@ -264,7 +270,11 @@ void add_side_information(const Model& model, const std::vector<SideInformation>
   if (options.time_step && !needs_step) throw InputError("`dt` goes with `also=next-velocity:FILE.csv`");
   if (options.also_noise_stddev && also.empty()) throw InputError("`also_noise_std` goes with `also=VIEW:FILE.csv`");
   if (also.empty()) return;
-  const std::vector<VectorXd> signal_stddev = default_scales(problem.prior, trusted_observations(problem)).signal_stddev;
+  // without a log the size of the signals is that of what is known
+  std::vector<VectorXd> signal_stddev;
+  if (!problem.observations.empty()) {
+    signal_stddev = default_scales(problem.prior, trusted_observations(problem)).signal_stddev;
+  }
   for (const SideInformation& side_information : also) {
     const LoggedSystem logged = add_system(model, side_information.log, estimated, problem);
     problem.observations.push_back(read_side_information(logged, problem.prior, side_information, options, signal_stddev,
@@ -289,6 +299,7 @@ void add_discrepancy(const Model& model, FitProblem& problem) {
 
 FitProblem make_fit_problem(const Model& model, const std::vector<Log>& logs, const std::vector<SideInformation>& also,
                             const FitProblemOptions& options) {
+  if (logs.empty() && also.empty()) throw InputError("there is nothing to fit: give logs by `data`, or what is known by `also`");
   if (options.baseline) {
     require_baseline_options(options, logs, also);
     require_columns(model, logs, {}, options);

@@ -1,5 +1,7 @@
 #include "gp2/jobs/generate_job.hpp"
 
+#include <cmath>
+
 #include <fmt/format.h>
 
 #include "gp2/error.hpp"
@@ -12,6 +14,7 @@ Eigen::VectorXd noise_of(const Model& model, const std::optional<double>& given)
   const Eigen::Index nq = model.system->nq();
   if (given) {
     if (!(*given >= 0)) throw InputError(fmt::format("`noise_std`: must not be negative, got {}", *given));
+    if (std::isinf(*given)) throw InputError("`noise_std`: must be finite, got inf");
     return Eigen::VectorXd::Constant(nq, *given);
   }
   if (model.noise.stddev.empty()) {

@@ -17,6 +17,15 @@ using Eigen::VectorXd;
 
 namespace {
 
+// at two digits that are not below the value
+std::string rounded_up(double value) {
+  if (!(value > 0) || !std::isfinite(value)) return fmt::format("{}", value);
+  const double unit = std::pow(10, std::floor(std::log10(value)) - 1);
+  std::string text = fmt::format("{:.2g}", value);
+  if (std::stod(text) < value) text = fmt::format("{:.2g}", std::stod(text) + unit);
+  return text;
+}
+
 // σ of a row of a group; refused where ε‖K̃‖ ≪ 1 could not hold at a signal of the given size
 struct NoiseRule {
   std::string source, name;  // where σ comes from; the row
@@ -36,8 +45,8 @@ struct NoiseRule {
     const double least = stddev.minCoeff(&worst);
     throw InputError(
         fmt::format("{}: data row {}: the noise standard deviation {} of {} is too small for double precision beside a spread of "
-                    "{:.3g}; the smallest usable value is {:.2g}",
-                    source, rows[static_cast<std::size_t>(worst)] + 1, least, name, signal, smallest()));
+                    "{:.3g}; the smallest usable value is {}",
+                    source, rows[static_cast<std::size_t>(worst)] + 1, least, name, signal, rounded_up(smallest())));
   }
 
   void require(double stddev, bool estimated) const {
@@ -47,8 +56,8 @@ struct NoiseRule {
     if (!estimated && stddev < smallest()) {
       throw InputError(
           fmt::format("{}: the noise standard deviation {} of {} is too small for double precision beside a spread "
-                      "of {:.3g}; the smallest usable value is {:.2g}",
-                      source, stddev, name, signal, smallest()));
+                      "of {:.3g}; the smallest usable value is {}",
+                      source, stddev, name, signal, rounded_up(smallest())));
     }
   }
 };
@@ -70,7 +79,7 @@ VectorXd signal_size(const LoggedSystem& logged, const Readings& readings, const
   const Index n_data = readings.states.cols();
   const MechanicsBatch mechanics = require_mechanics(logged.prior, readings.view, readings.states, logged.parameters);
   const ViewValues view = evaluate_view(readings.view, mechanics, readings.states);
-  PriorValues prior = evaluate_prior(logged.prior, readings.states, logged.parameters, mechanics);
+  PriorValues prior = require_prior_values(logged.prior, readings.states, logged.parameters, mechanics);
   if (readings.view.latent) prior.keep_only(static_cast<std::size_t>(*readings.view.latent));
   VectorXd variance = VectorXd::Zero(readings.view.size());
   for (int i = 0; i < n_data; ++i) {
@@ -83,10 +92,17 @@ VectorXd signal_size(const LoggedSystem& logged, const Readings& readings, const
 
 }  // namespace
 
-std::vector<std::string> stated_accelerations(const System& system, const LogReader& reader) {
-  std::vector<std::string> stated = system.acceleration_names();
-  std::erase_if(stated, [&](const std::string& name) { return reader.stddev_column(name).empty(); });
-  return stated;
+std::vector<std::string> stated_accelerations(std::vector<std::string> names, const LogReader& reader) {
+  std::erase_if(names, [&](const std::string& name) { return reader.stddev_column(name).empty(); });
+  return names;
+}
+
+MatrixXd stated_stddevs(const std::vector<std::string>& names, LogReader& reader, Index n_rows) {
+  MatrixXd stddev = MatrixXd::Constant(std::ssize(names), n_rows, std::numeric_limits<double>::quiet_NaN());
+  for (std::size_t k = 0; k < names.size(); ++k) {
+    if (!reader.stddev_column(names[k]).empty()) stddev.row(static_cast<Index>(k)) = reader.stddevs({names[k]});
+  }
+  return stddev;
 }
 
 bool estimates_factor(const FitProblemOptions& options) {
@@ -96,10 +112,7 @@ bool estimates_factor(const FitProblemOptions& options) {
 
 MatrixXd stated_noise(const std::vector<std::string>& observed, const FitProblemOptions& options, LogReader& reader,
                       const CsvTable& log, std::vector<std::string>& notes) {
-  std::vector<std::string> stated;
-  for (const std::string& name : observed) {
-    if (!reader.stddev_column(name).empty()) stated.push_back(name);
-  }
+  const std::vector<std::string> stated = stated_accelerations(observed, reader);
   if (stated.empty()) return {};
   const std::vector<std::string> columns = stddev_columns(stated, reader);
   if (options.noise_stddev) {
@@ -107,14 +120,9 @@ MatrixXd stated_noise(const std::vector<std::string>& observed, const FitProblem
                                 fmt::join(columns, ", ")));
     return {};
   }
-  MatrixXd stddev =
-      MatrixXd::Constant(static_cast<Index>(observed.size()), log.n_rows(), std::numeric_limits<double>::quiet_NaN());
-  for (std::size_t k = 0; k < observed.size(); ++k) {
-    if (!reader.stddev_column(observed[k]).empty()) stddev.row(static_cast<Index>(k)) = reader.stddevs({observed[k]});
-  }
   notes.push_back(fmt::format("{}: the noise of each value is that in {}{}", log.name(), fmt::join(columns, ", "),
                               estimates_factor(options) ? ", times a factor that is estimated" : ""));
-  return stddev;
+  return stated_stddevs(observed, reader, log.n_rows());
 }
 
 VectorXd noise_of(const Model& model, const FitProblemOptions& options, const Readings& readings, bool estimate) {

@@ -8,8 +8,11 @@
 
 namespace gp2 {
 
-/// The accelerations whose standard deviations the log states, for each value.
-std::vector<std::string> stated_accelerations(const System& system, const LogReader& reader);
+/// Those of the accelerations whose standard deviations the log states, for each value.
+std::vector<std::string> stated_accelerations(std::vector<std::string> names, const LogReader& reader);
+
+/// These deviations, NaN where none is stated (accelerations × N).
+Eigen::MatrixXd stated_stddevs(const std::vector<std::string>& names, LogReader& reader, Eigen::Index n_rows);
 
 /// Whether a common factor of the stated standard deviations is estimated.
 bool estimates_factor(const FitProblemOptions& options);

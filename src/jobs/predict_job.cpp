@@ -6,6 +6,7 @@
 
 #include "gp2/error.hpp"
 #include "gp2/jobs/fit_problem.hpp"
+#include "jobs/read_observations.hpp"
 
 namespace gp2 {
 
@@ -65,14 +66,6 @@ void add_samples(const Posterior& posterior, const View& view, const MatrixXd& s
     for (const std::string& name : names) out.names.push_back(fmt::format("{}_sample{}", name, s + 1));
     out.values.middleRows(first + d * s, d) = samples.col(s).reshaped(d, states.cols());
   }
-}
-
-// The accelerations that the fit observed.
-std::vector<std::string> observed_outputs(const Posterior& posterior, const System& system) {
-  for (const Observations& group : posterior.observations()) {
-    if (group.view().is_of_ddq()) return group.view().names(system);
-  }
-  return {};
 }
 
 Option columns_option(std::map<std::string, std::string>& columns) {
@@ -143,24 +136,26 @@ PredictOutcome predict(const FitFile& fit, const CsvTable& states, const Predict
 }
 
 std::vector<Option> options(EvaluateRequest& request) {
-  return {{"outputs", &request.outputs, "ddq3,ddq6", "accelerations to compare", "those observed in training"},
+  return {{"outputs", &request.outputs, "ddq3,ddq6", "accelerations to compare", "those observed in training that the log has"},
           columns_option(request.columns),
           threads_option(request.threads)};
 }
 
 EvaluateOutcome evaluate(const FitFile& fit, const Posterior& posterior, const CsvTable& log, const EvaluateRequest& request) {
   require_threads(request.threads);
-  const System& system = *fit.model.system;
-  const std::vector<std::string> outputs = request.outputs.empty() ? observed_outputs(posterior, system) : request.outputs;
-  const std::vector<int> rows = acceleration_rows(system, outputs, "`outputs`");
+  EvaluateOutcome out;
   ViewRequest constrained;
   constrained.system = request.system;
   const PredictedView at = predicted_view(fit, posterior.prior(), constrained);
-  LogStates states = read_log_states(at.prior, at.view, *at.model, log, request.columns, outputs);
-  EvaluateOutcome out{{}, std::move(states.notes)};
-  out.evaluation = at_states_of(log, [&] {
-    return evaluate_predictions(posterior, states.states, rows, states.accelerations, at.view.other_system, request.threads);
-  });
+  const std::vector<std::string> outputs =
+      request.outputs.empty() ? outputs_to_compare(posterior, *at.model, log, request.columns, out.notes) : request.outputs;
+  const std::vector<int> rows = acceleration_rows(*fit.model.system, outputs, "`outputs`");
+  const LogStates states = read_log_states(at.prior, at.view, *at.model, log, request.columns, outputs);
+  out.notes.insert(out.notes.end(), states.notes.begin(), states.notes.end());
+  EvaluationOptions options{at.view.other_system, {}, request.threads};
+  options.noise_stddev = measurement_noise(posterior, rows, states.states.cols(), states.stated_stddev);
+  out.evaluation =
+      at_states_of(log, [&] { return evaluate_predictions(posterior, states.states, rows, states.accelerations, options); });
   return out;
 }
 

@@ -10,6 +10,7 @@
 
 #include "base/random.hpp"
 #include "gp2/error.hpp"
+#include "gp2/inference/evaluation.hpp"
 #include "gp2/mechanics/check.hpp"
 #include "gp2/mechanics/udwadia_kalaba.hpp"
 #include "gp2/simulation/projected_states.hpp"
@@ -70,10 +71,10 @@ MatrixXd states_of(const Prior& prior, const View& view, LogReader& reader, bool
   return reader.states(reads);
 }
 
-std::vector<int> every_row(const CsvTable& log) {
-  std::vector<int> rows(static_cast<std::size_t>(log.n_rows()));
-  std::iota(rows.begin(), rows.end(), 0);
-  return rows;
+std::vector<int> counted(Index n) {
+  std::vector<int> numbers(static_cast<std::size_t>(n));
+  std::iota(numbers.begin(), numbers.end(), 0);
+  return numbers;
 }
 
 // the first n of a shuffle of `rows`; all in order when n is no less
@@ -106,7 +107,7 @@ std::vector<int> measured_rows(Readings& readings, const std::vector<std::string
     missing.push_back(fmt::format("{} of {} of {}{}", n, log.n_rows(), names[static_cast<std::size_t>(k)],
                                   n_without > 0 ? fmt::format(" ({} for want of a deviation)", n_without) : ""));
   }
-  if (missing.empty()) return every_row(log);
+  if (missing.empty()) return counted(log.n_rows());
   notes.push_back(fmt::format("{}: values not measured, their cells being empty: {}", log.name(), fmt::join(missing, ", ")));
   std::vector<int> rows;
   for (int i = 0; i < log.n_rows(); ++i) {
@@ -142,8 +143,23 @@ void require_mechanics_at(const LoggedSystem& logged, const View& view, const Ma
                   log.name(), lower.usual, lower.states.size(), rows.size(), lower.lowest, data_row(lower.states.front())));
 }
 
+// Deviations of coordinates and velocities, of columns NAME_std; NaN where there are none. Empty where there is no such column.
+MatrixXd stated_state_deviations(const System& system, LogReader& reader, const CsvTable& log) {
+  const std::vector<std::string> names = system.state_names();
+  MatrixXd stddevs = MatrixXd::Constant(2 * system.nq(), log.n_rows(), std::numeric_limits<double>::quiet_NaN());
+  bool is_stated = false;
+  for (Index k = 0; k < stddevs.rows(); ++k) {
+    const std::string& name = names[static_cast<std::size_t>(k)];
+    if (reader.stddev_column(name).empty()) continue;
+    stddevs.row(k) = reader.stddevs({name});
+    is_stated = true;
+  }
+  return is_stated ? stddevs : MatrixXd();
+}
+
 // --project: the states of a log moved onto the constraints, at the model's parameters
-void project(const LoggedSystem& logged, const CsvTable& log, MatrixXd& states, std::vector<std::string>& notes) {
+void project(const LoggedSystem& logged, const CsvTable& log, const MatrixXd& stddevs, MatrixXd& states,
+             std::vector<std::string>& notes) {
   const System& system = logged.system();
   if (system.residual_labels().empty()) {
     notes.push_back(
@@ -152,7 +168,7 @@ void project(const LoggedSystem& logged, const CsvTable& log, MatrixXd& states, 
   }
   ProjectedStates projected = [&] {
     try {
-      return project_states(system, logged.parameters, states);
+      return project_states(system, logged.parameters, states, stddevs);
     } catch (const InputError& error) {
       throw InputError(fmt::format("`project`: {}: {}", log.name(), error.what()));
     }
@@ -185,7 +201,7 @@ void project(const LoggedSystem& logged, const CsvTable& log, MatrixXd& states, 
 std::vector<std::string> observed_accelerations(const System& system, const FitProblemOptions& options, const LogReader& reader,
                                                 const CsvTable& log, std::vector<std::string>& notes) {
   if (!options.observe.empty() || options.baseline) return options.observe;
-  std::vector<std::string> stated = stated_accelerations(system, reader);
+  std::vector<std::string> stated = stated_accelerations(system.acceleration_names(), reader);
   if (!stated.empty() && stated.size() < system.coordinates().size()) {
     notes.push_back(fmt::format("{}: observes {}: the log gives the deviations of these alone; others with `observe`", log.name(),
                                 fmt::join(stated, ", ")));
@@ -215,6 +231,15 @@ void note_dependence(const LoggedSystem& logged, const MatrixXd& states, const M
       fmt::format("warning: {}: the accelerations obey A ddq = b to rounding: they are not {} independent "
                   "measurements but {}; observe independent rows only, say `observe={}`",
                   log.name(), every.size(), independent->size(), fmt::join(names, ",")));
+}
+
+// rows that are copies are no measurements
+void note_repeats(const Readings& readings, const CsvTable& log, std::vector<std::string>& notes) {
+  const int n_repeated = n_repeated_rows(readings.states, readings.values);
+  if (n_repeated * 20 <= log.n_rows()) return;
+  notes.push_back(fmt::format(
+      "warning: {}: {} of {} rows repeat another one to the last digit: deviations come out too small; keep each once",
+      log.name(), n_repeated, log.n_rows()));
 }
 
 // the rows of a view whose columns are there
@@ -259,6 +284,24 @@ void check_columns(const System& system, const std::vector<const CsvTable*>& log
   }
 }
 
+int n_repeated_rows(const MatrixXd& states, const MatrixXd& values) {
+  // NaN is not equal to itself
+  const auto cleared = [](const MatrixXd& matrix) {
+    return MatrixXd(matrix.unaryExpr([](double one) { return std::isnan(one) ? 0.0 : one; }));
+  };
+  const MatrixXd x = cleared(states), y = cleared(values);
+  std::vector<int> order = counted(x.cols());
+  const auto less = [](const MatrixXd& matrix, int a, int b) {
+    return std::lexicographical_compare(matrix.col(a).begin(), matrix.col(a).end(), matrix.col(b).begin(), matrix.col(b).end());
+  };
+  std::sort(order.begin(), order.end(), [&](int a, int b) { return x.col(a) == x.col(b) ? less(y, a, b) : less(x, a, b); });
+  int n = 0;
+  for (std::size_t k = 1; k < order.size(); ++k) {
+    if (x.col(order[k]) == x.col(order[k - 1]) && y.col(order[k]) == y.col(order[k - 1])) ++n;
+  }
+  return n;
+}
+
 LoggedSystem logged_system(const Model& fitted, const Prior& prior, const FitPriorOptions& options, const Log& log) {
   if (!log.model) return {fitted, nullptr, nullptr, prior, fitted.system->parameter_values()};
   std::shared_ptr<const OtherSystem> other_system = make_other_system(fitted, *log.model, options);
@@ -280,10 +323,12 @@ Observations read_log(const LoggedSystem& logged, const Log& log, const FitProbl
   readings.values = reader.measurements(observed);
   readings.stated_stddev = stated_noise(observed, options, reader, log.table, notes);
   const MatrixXd all_values = all_accelerations(system, reader, log.table);
+  const MatrixXd state_stddevs = options.project ? stated_state_deviations(system, reader, log.table) : MatrixXd();
   note_reading(reader, log.table, notes);
-  if (options.project) project(logged, log.table, readings.states, notes);
+  if (options.project) project(logged, log.table, state_stddevs, readings.states, notes);
   note_violation(system, readings.states, logged.parameters, log.table, notes);
   note_dependence(logged, readings.states, all_values, observed.size(), log.table, notes);
+  note_repeats(readings, log.table, notes);
 
   const int n_rows = log.table.n_rows();
   const std::vector<int> measured = measured_rows(readings, observed, log.table, notes);
@@ -331,8 +376,9 @@ Observations read_side_information(const LoggedSystem& logged, const Prior& fitt
   const std::vector<std::string> names = view.names(system, side_information.latent);
   readings.values = reader.measurements(names);
   readings.states = states_of(logged.prior, view, reader, options.project);
+  const MatrixXd state_stddevs = options.project ? stated_state_deviations(system, reader, table) : MatrixXd();
   note_reading(reader, table, notes);
-  if (options.project) project(logged, table, readings.states, notes);
+  if (options.project) project(logged, table, state_stddevs, readings.states, notes);
   note_violation(system, readings.states, logged.parameters, table, notes);
   const std::vector<int> measured = measured_rows(readings, names, table, notes);
   readings.keep(measured);
@@ -382,10 +428,35 @@ LogReader open_log(const Model& model, const CsvTable& log, const std::map<std::
 LogStates read_log_states(const Prior& prior, const View& view, const Model& model, const CsvTable& log,
                           const std::map<std::string, std::string>& columns, const std::vector<std::string>& accelerations) {
   LogReader reader = open_log(model, log, columns);
-  LogStates out{states_of(prior, view, reader), reader.measurements(accelerations), {}};
+  LogStates out{states_of(prior, view, reader), reader.measurements(accelerations), {}, {}};
+  const std::vector<std::string> stated = stated_accelerations(accelerations, reader);
+  if (!stated.empty()) out.stated_stddev = stated_stddevs(accelerations, reader, log.n_rows());
   note_reading(reader, log, out.notes);
   note_violation(*prior.system, out.states, prior.system->parameter_values(), log, out.notes);
   return out;
+}
+
+std::vector<std::string> outputs_to_compare(const Posterior& posterior, const Model& model, const CsvTable& log,
+                                            const std::map<std::string, std::string>& columns, std::vector<std::string>& notes) {
+  const System& system = *model.system;
+  const LogReader reader = open_log(model, log, columns);
+  const std::vector<int> observed = observed_rows(posterior);
+  const std::vector<std::string> every = system.acceleration_names();
+  std::vector<std::string> outputs, not_in_log, not_observed;
+  for (int row = 0; row < system.nq(); ++row) {
+    const std::string& name = every[static_cast<std::size_t>(row)];
+    const bool is_observed = std::find(observed.begin(), observed.end(), row) != observed.end();
+    if (is_observed) (reader.has(name) ? outputs : not_in_log).push_back(name);
+    if (!is_observed && reader.has(name)) not_observed.push_back(name);
+  }
+  if (outputs.empty()) return observed.empty() ? every : not_in_log;  // what reads them names what is missing
+  if (!not_in_log.empty())
+    notes.push_back(fmt::format("{}: not compared: {}, which it lacks", log.name(), fmt::join(not_in_log, ", ")));
+  if (!not_observed.empty()) {
+    notes.push_back(fmt::format("{}: not compared: {}, which the fit did not observe; compare what you like with `outputs`",
+                                log.name(), fmt::join(not_observed, ", ")));
+  }
+  return outputs;
 }
 
 WholeLog read_whole_log(const Model& model, LogReader& reader) {
@@ -396,6 +467,7 @@ WholeLog read_whole_log(const Model& model, LogReader& reader) {
   WholeLog log;
   log.states = reader.states(reads);
   log.accelerations = MatrixXd::Constant(system.nq(), log.states.cols(), std::numeric_limits<double>::quiet_NaN());
+  log.stddev = log.accelerations;
   Index row = 0;
   for (const std::string& name : system.acceleration_names()) {
     if (reader.has(name)) {
@@ -403,8 +475,9 @@ WholeLog read_whole_log(const Model& model, LogReader& reader) {
     } else {
       log.missing.push_back(name);
     }
+    if (!model.noise.stddev.empty()) log.stddev.row(row).setConstant(model.noise.stddev[static_cast<std::size_t>(row)]);
     if (!reader.stddev_column(name).empty()) {
-      static_cast<void>(reader.stddevs({name}));
+      log.stddev.row(row) = reader.stddevs({name});
       log.stated.push_back(static_cast<int>(row));
     }
     ++row;

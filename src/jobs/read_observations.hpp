@@ -30,4 +30,13 @@ Observations read_side_information(const LoggedSystem& logged, const Prior& fitt
                                    const FitProblemOptions& options, const std::vector<Eigen::VectorXd>& signal_stddev,
                                    std::vector<int>& lines, std::vector<std::string>& notes);
 
+/// How many states, with the values measured there, are those of an earlier one to the last bit.
+int n_repeated_rows(const Eigen::MatrixXd& states, const Eigen::MatrixXd& values);
+
+/// The accelerations to compare predictions with where none are asked for: those that any observation of the fit has, as far as the
+/// log has them.
+/// @param notes  receives what is left out
+std::vector<std::string> outputs_to_compare(const Posterior& posterior, const Model& model, const CsvTable& log,
+                                            const std::map<std::string, std::string>& columns, std::vector<std::string>& notes);
+
 }  // namespace gp2

@@ -170,26 +170,153 @@ void independence_advice(const Report& report, std::vector<Advice>& advice) {
   }
 }
 
-void test_advice(const ReportData& data, const ReportData* training, std::vector<Advice>& advice) {
+// Residuals that the noise does not explain: of A ddq = b, and of each value from all others.
+void residual_advice(const Report& report, std::vector<Advice>& advice) {
+  for (const ReportData& data : report.data) {
+    for (const ConstraintResidual& one : data.constraint_residuals) {
+      if (!one.is_too_large()) continue;
+      advice.push_back(
+          {Level::warning, fmt::format("The {} data deny a constraint: {}.", data.name, one.text()),
+           "Until that is found nothing else on this page means much: look at the rows named, at units, signs and frames "
+           "of the columns, and at the constants of the constraint."});
+    }
+  }
+  for (const TrainingResidual& one : report.residuals) {
+    if (one.is_too_large()) {
+      advice.push_back(
+          {Level::warning,
+           fmt::format("Values of {} lie farther than noise from what all others predict: z rms {:.2g}, {:.0f} % within "
+                       "95 %.",
+                       one.output, one.rms, 100 * one.coverage95),
+           "The noise is stated too small, the column is wrong or lags the others, or a feature is missing. Residuals "
+           "against time and each feature show which."});
+    } else if (one.is_correlated()) {
+      advice.push_back(
+          {Level::note,
+           fmt::format("Residuals of {} go on from row to row: correlation {:.2g}.", one.output, one.serial_correlation),
+           "Something that lasts longer than a sample is missing, and the rows are fewer measurements than they seem: "
+           "deviations are too small. Take rows that are farther apart, or model what is missing."});
+    }
+  }
+}
+
+void robust_advice(const Report& report, std::vector<Advice>& advice) {
+  const std::vector<DistrustedValue>& distrusted = report.fit.report.distrusted;
+  if (distrusted.empty()) return;
+  const DistrustedValue& worst = distrusted.front();
+  advice.push_back(
+      {Level::note,
+       fmt::format("The robust fit distrusts {} {}; the farthest, at row {} of its data, by {:.3g} deviations.",
+                   distrusted.size(), distrusted.size() == 1 ? "value" : "values", worst.state + 1, worst.distance),
+       "They are among the points of the pictures. Where they have a cause, mend the log; the fit hardly heeds them."});
+}
+
+// A noise that came with each value is changed in the log, any other by an option.
+std::string noise_mend(const Report& report, const char* too) {
+  const bool is_stated =
+      std::any_of(report.fit.observations.begin(), report.fit.observations.end(), [](const Observations& group) {
+        bool any = false;
+        for (int k = 0; k < group.view().size(); ++k) any = any || group.states_noise(k);
+        return any;
+      });
+  if (!is_stated) return fmt::format("the noise is too {}: `noise_std=estimate`", too);
+  return fmt::format("the deviations in the log's columns NAME_std are too {}, and one factor for all does not mend them", too);
+}
+
+// (measured − predicted) / √(stddev² + noise²) of each output (d × N); NaN where one is not known
+Eigen::MatrixXd standardised_errors(const ReportData& data) {
+  Eigen::MatrixXd z(data.measured.rows(), data.measured.cols());
+  for (Eigen::Index k = 0; k < z.rows(); ++k) {
+    const int row = data.rows[static_cast<std::size_t>(k)];
+    z.row(k) = (data.measured.row(k) - data.predicted.row(row)).array() /
+               (data.stddev.row(row).array().square() + data.noise_stddev.row(k).array().square()).sqrt();
+  }
+  return z;
+}
+
+// Single errors far beyond the bands, and errors that follow a feature.
+void error_shape_advice(const ReportData& data, std::vector<Advice>& advice) {
+  const Eigen::MatrixXd z = standardised_errors(data);
+  for (Eigen::Index k = 0; k < z.rows(); ++k) {
+    const std::string& output = data.outputs[static_cast<std::size_t>(k)];
+    std::vector<int> known;
+    for (int i = 0; i < static_cast<int>(z.cols()); ++i) {
+      if (!std::isnan(z(k, i))) known.push_back(i);
+    }
+    const auto farthest =
+        std::max_element(known.begin(), known.end(), [&](int a, int b) { return std::abs(z(k, a)) < std::abs(z(k, b)); });
+    constexpr double far = 6;  // of a million Gaussian values none
+    if (farthest != known.end() && std::abs(z(k, *farthest)) > far) {
+      advice.push_back({Level::warning,
+                        fmt::format("At row {} of the {} data {} is off by {:.2g} deviations.", *farthest + 1, data.name, output,
+                                    std::abs(z(k, *farthest))),
+                        "An outlier of the log, or a state of which training knows nothing while the fit is sure of itself."});
+    }
+    const double n = static_cast<double>(known.size());
+    for (const auto& feature : data.features) {
+      const Eigen::VectorXd& values = feature.second;
+      std::sort(known.begin(), known.end(), [&](int a, int b) { return values[a] < values[b]; });
+      double products = 0, squares = 0;
+      for (std::size_t i = 0; i < known.size(); ++i) {
+        squares += z(k, known[i]) * z(k, known[i]);
+        if (i > 0) products += z(k, known[i - 1]) * z(k, known[i]);
+      }
+      // errors that are no larger than the bands follow what they like
+      if (known.size() < 30 || squares < 1.5 * n || products < std::max(0.4, 4 / std::sqrt(n)) * squares) continue;
+      advice.push_back(
+          {Level::warning, fmt::format("Errors of {} in the {} data follow {}.", output, data.name, feature.first),
+           "Neighbours in that feature err alike: the kernel or the features miss its shape, or training has too few "
+           "points there."});
+      break;
+    }
+  }
+}
+
+void coverage_advice(const Report& report, const ReportData& data, std::vector<Advice>& advice) {
   const Evaluation& e = data.evaluation;
   constexpr double nominal = 0.95;
   // three standard deviations of the share of n independent points, and no less than what anyone would act on
   const double tolerance = std::max(0.03, 3 * std::sqrt(nominal * (1 - nominal) / std::max(e.n, 1)));
   if (std::isfinite(e.coverage95) && e.coverage95 < nominal - tolerance) {
-    advice.push_back({Level::warning,
-                      fmt::format("Over-confident: {:.1f} % of the test data lie within the 95 % bands.", 100 * e.coverage95),
-                      "The test goes where training has not been, the noise is set too small (`noise_std=estimate`), or a "
-                      "feature is missing. Residuals against each feature show which; take training data there."});
-  } else if (std::isfinite(e.coverage95) && e.coverage95 > nominal + tolerance) {
-    const bool noise_free = std::isfinite(e.coverage95_latent) && std::abs(e.coverage95_latent - nominal) <= tolerance;
     advice.push_back(
-        {Level::note, fmt::format("Too cautious: {:.1f} % of the test data lie within the 95 % bands.", 100 * e.coverage95),
-         noise_free ? "The test data seem to be free of noise: judge by the noise-free coverage, which is as it should be."
-                    : "If the test data hold measurement noise, that of the model is too large: `noise_std=estimate`."});
+        {Level::warning, fmt::format("Over-confident: {:.1f} % of the test data lie within the 95 % bands.", 100 * e.coverage95),
+         fmt::format("The test goes where training has not been, {}, or a feature is missing. Residuals against each "
+                     "feature show which; take training data there.",
+                     noise_mend(report, "small"))});
+    return;
   }
-  if (training == nullptr || training->outputs != data.outputs) return;
-  const double ratio = e.rmse.norm() / training->evaluation.rmse.norm();
-  const bool beyond_noise = (e.rmse.array() > 2 * data.noise_stddev.array()).any();
+  if (!(std::isfinite(e.coverage95) && e.coverage95 > nominal + tolerance)) return;
+  // errors below the noise, where the noise of training is what its residuals are
+  const bool is_below_noise = (e.rmse.array() < 0.7 * data.noise_stddev.rowwise().mean().array()).all();
+  const bool noise_is_right =
+      std::none_of(report.residuals.begin(), report.residuals.end(), [](const auto& one) { return one.rms < 0.7; });
+  const bool is_covered = std::isfinite(e.coverage95_latent) && std::abs(e.coverage95_latent - nominal) <= tolerance;
+  const bool is_noise_free = is_covered || (is_below_noise && noise_is_right && !report.residuals.empty());
+  if (is_noise_free && std::isfinite(e.coverage95_latent) && e.coverage95_latent < nominal - tolerance) {
+    advice.push_back(
+        {Level::warning,
+         fmt::format("Over-confident: {:.1f} % of the test data, which seem to be free of noise, lie within the 95 % bands "
+                     "without noise.",
+                     100 * e.coverage95_latent),
+         "The test goes where training has not been, or a feature is missing. Residuals against each feature show which; "
+         "take training data there."});
+    return;
+  }
+  if (is_noise_free && !is_covered) return;
+  advice.push_back(
+      {Level::note, fmt::format("Too cautious: {:.1f} % of the test data lie within the 95 % bands.", 100 * e.coverage95),
+       is_noise_free ? "The test data seem to be free of noise: judge by the noise-free coverage, which is as it should be."
+                     : fmt::format("If the test data hold measurement noise, {}.", noise_mend(report, "large"))});
+}
+
+void test_advice(const Report& report, const ReportData& data, std::vector<Advice>& advice) {
+  coverage_advice(report, data, advice);
+  error_shape_advice(data, advice);
+  const ReportData& training = report.data.front();
+  if (training.is_test || training.outputs != data.outputs) return;
+  const Evaluation& e = data.evaluation;
+  const double ratio = e.rmse.norm() / training.evaluation.rmse.norm();
+  const bool beyond_noise = (e.rmse.array() > 2 * data.noise_stddev.rowwise().mean().array()).any();
   if (ratio > 3 && beyond_noise) {
     advice.push_back(
         {Level::warning, fmt::format("Test errors are {:.1f} times those of training.", ratio),
@@ -208,8 +335,10 @@ std::vector<Advice> learning_advice(const Report& report) {
   constraint_advice(report, advice);
   rank_advice(report, advice);
   independence_advice(report, advice);
+  residual_advice(report, advice);
+  robust_advice(report, advice);
   for (const ReportData& data : report.data) {
-    if (data.is_test) test_advice(data, report.data.front().is_test ? nullptr : &report.data.front(), advice);
+    if (data.is_test) test_advice(report, data, advice);
   }
   relevance_advice(report, advice);
   std::stable_sort(advice.begin(), advice.end(), [](const Advice& a, const Advice& b) { return a.level > b.level; });

@@ -17,6 +17,7 @@
 #include "gp2/error.hpp"
 #include "gp2/jobs/fit_problem.hpp"
 #include "gp2/simulation/generate.hpp"
+#include "jobs/read_observations.hpp"
 
 namespace gp2 {
 
@@ -34,21 +35,9 @@ std::string date_of(const std::filesystem::path& path) {
   return fmt::format("{:%Y-%m-%d}", fmt::gmtime(std::chrono::system_clock::to_time_t(seconds)));
 }
 
-// the fitted noise of a row of ddq: the usual one of the first training data that have it, as in evaluate_predictions
-double noise_of(const Posterior& posterior, int row) {
-  for (std::size_t g = 0; g < posterior.observations().size(); ++g) {
-    const Observations& group = posterior.observations()[g];
-    const View& view = group.view();
-    if (!view.is_of_ddq()) continue;
-    const auto found = std::find(view.rows.begin(), view.rows.end(), row);
-    if (found != view.rows.end()) return group.usual_noise(posterior.values().noise_stddev[g])[found - view.rows.begin()];
-  }
-  return not_a_number;
-}
-
-// predictions and figures at states with measured accelerations
+// predictions and figures at states with measured accelerations, their noise as in EvaluationOptions
 ReportData data_at(const Posterior& posterior, const MatrixXd& states, const std::vector<int>& rows, const MatrixXd& measured,
-                   const std::shared_ptr<const OtherSystem>& other_system) {
+                   MatrixXd noise_stddev, const std::shared_ptr<const OtherSystem>& other_system) {
   ReportData data;
   data.rows = rows;
   data.states = states;
@@ -59,10 +48,9 @@ ReportData data_at(const Posterior& posterior, const MatrixXd& states, const std
   const System& reference = prior.reference_system();
   const VectorXd parameters = parameters_of(view, posterior.values().parameters);
   data.outputs = View{View::Quantity::constrained_acceleration, rows}.names(reference);
-  data.noise_stddev.resize(std::ssize(rows));
-  for (std::size_t k = 0; k < rows.size(); ++k) data.noise_stddev[static_cast<Index>(k)] = noise_of(posterior, rows[k]);
+  data.noise_stddev = std::move(noise_stddev);
 
-  data.evaluation = evaluate_predictions(posterior, states, rows, measured, other_system, /*n_threads=*/0);
+  data.evaluation = evaluate_predictions(posterior, states, rows, measured, {other_system, data.noise_stddev, /*n_threads=*/0});
   Posterior::Marginal prediction = posterior.marginal(view, states, /*n_threads=*/0);
   data.predicted = prediction.mean;
   data.stddev = prediction.stddev();
@@ -80,12 +68,17 @@ ReportData data_at(const Posterior& posterior, const MatrixXd& states, const std
   for (int i = 0; i < values.n_states() && reference.nc() > 0; ++i) {
     data.constraint_error.col(i) = (values.A(i) * data.predicted.col(i) - values.b(i)).cwiseAbs();
   }
+  MatrixXd accelerations = MatrixXd::Constant(reference.nq(), states.cols(), not_a_number), noise = accelerations;
+  accelerations(rows, Eigen::all) = measured;
+  noise(rows, Eigen::all) = data.noise_stddev;
+  data.constraint_residuals = constraint_residuals(reference, states, parameters, accelerations, noise);
   data.lower_rank = states_of_lower_rank(reference, states, parameters);
   if (reference.nc() > 0) data.violation = largest_violation(reference, states, parameters);
 
-  for (const Latent& latent : prior.latents) {
+  for (std::size_t a = 0; a < prior.latents.size(); ++a) {
+    const Latent& latent = prior.latents[a];
     if (latent.kernel_is_fixed) continue;
-    const MatrixXd features = evaluate_features(latent, states);
+    const MatrixXd features = evaluate_features(prior, a, states);
     for (int d = 0; d < latent.n_features(); ++d) {
       const std::string& name = latent.feature_names[static_cast<std::size_t>(d)];
       const bool known =
@@ -113,7 +106,10 @@ std::vector<ReportData> training_data(const FitFile& fit, const Posterior& poste
   for (std::size_t g = 0; g < fit.observations.size(); ++g) {
     const Observations& group = fit.observations[g];
     if (!group.view().is_of_ddq()) continue;
-    ReportData data = data_at(posterior, group.states(), group.view().rows, group.values(), group.view().other_system);
+    MatrixXd noise(group.view().size(), group.n_data());
+    for (int i = 0; i < group.n_data(); ++i) noise.col(i) = group.noise().at(posterior.values().noise_stddev[g], i);
+    ReportData data =
+        data_at(posterior, group.states(), group.view().rows, group.values(), std::move(noise), group.view().other_system);
     data.name = all.empty() ? "training" : fmt::format("training {}", all.size() + 1);
     const bool elsewhere = g < fit.systems.size() && fit.systems[g];
     data.source = elsewhere ? fmt::format("measured on '{}'", fit.systems[g]->system->name()) : fit.data_source;
@@ -124,20 +120,20 @@ std::vector<ReportData> training_data(const FitFile& fit, const Posterior& poste
   return all;
 }
 
-std::vector<std::string> observed_outputs(const std::vector<ReportData>& training) {
-  return training.empty() ? std::vector<std::string>{} : training.front().outputs;
-}
-
 ReportData test_data(const ReportOptions& options, const FitFile& fit, const Posterior& posterior,
-                     const std::vector<std::string>& observed, std::vector<std::string>& notes) {
+                     std::vector<std::string>& notes) {
   const CsvTable table = CsvTable::read(options.data, CsvTable::Keep::numbers);
-  const std::vector<int> rows = acceleration_rows(*fit.model.system, observed, "`data`");
+  const std::vector<int> rows =
+      acceleration_rows(*fit.model.system, outputs_to_compare(posterior, fit.model, table, options.columns, notes), "`data`");
   View view{View::Quantity::constrained_acceleration, rows};
   const Prior& prior = posterior.prior();
   const View all = View::constrained_acceleration(*prior.system);
   const LogStates log = read_log_states(prior, all, fit.model, table, options.columns, view.names(*fit.model.system));
   notes.insert(notes.end(), log.notes.begin(), log.notes.end());
-  ReportData data = at_states_of(table, [&] { return data_at(posterior, log.states, rows, log.accelerations, nullptr); });
+  ReportData data = at_states_of(table, [&] {
+    MatrixXd noise = measurement_noise(posterior, rows, log.states.cols(), log.stated_stddev);
+    return data_at(posterior, log.states, rows, log.accelerations, std::move(noise), nullptr);
+  });
   data.name = "test";
   data.source = options.data;
   data.is_test = true;
@@ -240,22 +236,18 @@ MatrixXd coverage(const ReportData& data, const Ref<const VectorXd>& levels) {
   Index n_known = 0;
   for (Index k = 0; k < d; ++k) {
     const Index row = data.rows[static_cast<std::size_t>(k)];
-    if (!std::isfinite(data.noise_stddev[k])) {
-      share.col(k).setConstant(not_a_number);
-      continue;
-    }
     Index n_measured = 0;
     for (Index i = 0; i < n; ++i) {
-      if (std::isnan(data.measured(k, i))) continue;
+      const double z = (data.measured(k, i) - data.predicted(row, i)) / std::hypot(data.stddev(row, i), data.noise_stddev(k, i));
+      if (std::isnan(z)) continue;
       ++n_measured;
-      const double z = (data.measured(k, i) - data.predicted(row, i)) / std::hypot(data.stddev(row, i), data.noise_stddev[k]);
       // the central interval that just holds the measurement
       const double probability = std::erf(std::abs(z) / std::numbers::sqrt2);
       for (Index l = 0; l < levels.size(); ++l) share(l, k) += probability <= levels[l] ? 1 : 0;
     }
     n_known += n_measured;
     share.col(d) += share.col(k);
-    share.col(k) /= static_cast<double>(n_measured);
+    share.col(k) /= static_cast<double>(n_measured);  // NaN where the noise is not known
   }
   if (n_known == 0) {
     share.col(d).setConstant(not_a_number);
@@ -378,9 +370,10 @@ Report collect_report(const ReportOptions& options, std::vector<std::string>& no
   report.file_date = date_of(options.fit);
   const Posterior posterior = report.fit.posterior();
   report.data = training_data(report.fit, posterior);
+  report.residuals = training_residuals(posterior);
   report.relevance = relevance_of(posterior);
   if (!options.data.empty()) {
-    report.data.push_back(test_data(options, report.fit, posterior, observed_outputs(report.data), notes));
+    report.data.push_back(test_data(options, report.fit, posterior, notes));
   }
   if (!options.truth.empty()) add_truth(options, report);
   if (const SymbolicSystem* system = report.fit.model.symbolic_system(); system != nullptr && !report.data.empty()) {

@@ -11,6 +11,7 @@
 #include "gp2/error.hpp"
 #include "gp2/inference/pathwise.hpp"
 #include "gp2/jobs/fit_problem.hpp"
+#include "gp2/simulation/model_motion.hpp"
 
 namespace gp2 {
 
@@ -29,6 +30,11 @@ void require_in_range(const SimulateRequest& request) {
     if (!(tolerance > 0) || !std::isfinite(tolerance))
       throw InputError(fmt::format("`{}`: must be positive, got {}", name, tolerance));
   }
+  if (request.relative_tolerance < least_relative_tolerance) {
+    throw InputError(fmt::format("`rtol`: must be at least {}, near the rounding of doubles, got {}", least_relative_tolerance,
+                                 request.relative_tolerance));
+  }
+  if (request.max_steps < 1) throw InputError(fmt::format("`max_steps`: must be at least 1, got {}", request.max_steps));
   if (request.times.size() == 0) {
     throw InputError("`times`: expected the times [s] at which states are wanted; the first is the start");
   }
@@ -82,6 +88,29 @@ StartingPoint start_of_log(const Model& model, const CsvTable& table, const std:
   return start;
 }
 
+// What a log computed from its measurements by other parameters is off the constraints now, and is to be solved for again; projecting
+// would move the measurements too. Measured are the entries that [sampling] draws or, where it draws none, the angles.
+void free_what_depends(const Model& model, const VectorXd& parameters, StartingPoint& start) {
+  const System& system = *model.system;
+  const auto violation = largest_violation(system, start.state, parameters);
+  const auto n = static_cast<std::size_t>(2 * system.nq());
+  const bool is_whole =
+      std::all_of(start.given.begin(), start.given.begin() + static_cast<std::ptrdiff_t>(n), [](bool one) { return one; });
+  if (!is_whole || !violation || violation->relative <= constraint_violation_tolerance) return;
+  const std::vector<std::string> names = system.state_names();
+  std::vector<bool> is_measured(n, false);
+  for (std::size_t k = 0; k < n; ++k) {
+    is_measured[k] = std::any_of(model.sampling.begin(), model.sampling.end(),
+                                 [&](const auto& rule) { return rule.range && rule.name == names[k]; });
+  }
+  const auto none = [&] { return std::none_of(is_measured.begin(), is_measured.end(), [](bool one) { return one; }); };
+  for (std::size_t k = 0; k < n && model.sampling.empty(); ++k) {
+    is_measured[k] = system.coordinates()[k % static_cast<std::size_t>(system.nq())].angle;
+  }
+  if (none()) return;
+  std::copy(is_measured.begin(), is_measured.end(), start.given.begin());
+}
+
 VectorXd start_state(const Model& model, const VectorXd& parameters, const SimulateRequest& request,
                      const std::map<std::string, std::string>& columns, std::vector<std::string>& notes) {
   const System& system = *model.system;
@@ -101,6 +130,7 @@ VectorXd start_state(const Model& model, const VectorXd& parameters, const Simul
   StartingPoint start = table != nullptr ? start_of_log(model, *table, columns)
                                          : start_by_names(system, std::get<std::map<std::string, double>>(request.start));
   start.state[layout.t()] = t_start;
+  if (table != nullptr) free_what_depends(model, parameters, start);
   return complete_start(model, parameters, std::move(start), notes);
 }
 
@@ -139,6 +169,7 @@ SimulateJob prepare(const Model& model, VectorXd parameters, const SimulateReque
   job.options.times = request.times;
   job.options.relative_tolerance = request.relative_tolerance;
   job.options.absolute_tolerance = request.absolute_tolerance;
+  job.options.max_steps = request.max_steps;
   job.options.project = request.project;
   job.options.inputs = input_signal(*model.system, request, columns);
   job.start = start_state(model, parameters, request, columns, job.notes);
@@ -152,6 +183,7 @@ std::vector<Option> options(SimulateRequest& request) {
   return {
       {"rtol", &request.relative_tolerance, "R", "relative error per step, in each of q and dq"},
       {"atol", &request.absolute_tolerance, "A", "absolute error per step"},
+      {"max_steps", &request.max_steps, "N", "steps at most, accepted and rejected; what they reach is written"},
       {"project", Switch{&request.project, "on", "off"}, "",
        "onto the constraints, after each step and where states are written; off shows how far an integrator drifts"},
       {"samples", &request.n_samples, "S", "that many functions drawn from the posterior, instead of its mean", "", "n_samples"},
@@ -199,36 +231,67 @@ SimulateJob prepare_simulation(const Model& model, const SimulateRequest& reques
   if (request.n_samples) throw InputError("`samples`: a model has no posterior to draw from; give a FIT.json");
   SimulateJob job = prepare(model, model.system->parameter_values(), request);
   job.accelerations = {model_acceleration(model)};
+  job.options.switching = switching_functions(model, /*of_latents=*/false);
+  if (model.system->nc() > 0) {
+    job.records = {
+        [motion = ModelMotion(model)](const Eigen::Ref<const VectorXd>& x) -> VectorXd { return motion.multipliers(x).col(0); }};
+  }
   return job;
 }
 
 SimulateJob prepare_simulation(const Model& model, const Posterior& posterior, const SimulateRequest& request) {
   SimulateJob job = prepare(model, posterior.values().parameters, request);
-  const View view = View::constrained_acceleration(*model.system);
+  job.options.switching = switching_functions(model, /*of_latents=*/true);
+  const auto add = [&](const auto& function) {
+    const auto of_view = [&](const View& view) -> Acceleration {
+      return [function, view](const Eigen::Ref<const VectorXd>& x) -> VectorXd { return function(view, x).col(0); };
+    };
+    job.accelerations.push_back(of_view(View::constrained_acceleration(*model.system)));
+    if (model.system->nc() > 0) job.records.push_back(of_view(View::multipliers(*model.system)));
+  };
   if (!request.n_samples) {
-    job.accelerations.emplace_back(
-        [posterior, view](const Eigen::Ref<const VectorXd>& x) -> VectorXd { return posterior.mean(view, x).col(0); });
+    add([posterior](const View& view, const Eigen::Ref<const VectorXd>& x) { return posterior.mean(view, x); });
     return job;
   }
   const auto samples =
       std::make_shared<const PathwiseSamples>(sample_paths(posterior, *request.n_samples, {.seed = request.seed}));
   for (int k = 0; k < samples->n_samples(); ++k) {
-    job.accelerations.emplace_back(
-        [samples, view, k](const Eigen::Ref<const VectorXd>& x) -> VectorXd { return samples->evaluate(k, view, x).col(0); });
+    add([samples, k](const View& view, const Eigen::Ref<const VectorXd>& x) { return samples->evaluate(k, view, x); });
   }
   return job;
 }
 
 std::vector<Trajectory> run_simulation(const SimulateJob& job, const std::atomic<bool>* stop) {
   std::vector<Trajectory> motions;
-  for (const Acceleration& acceleration : job.accelerations) {
+  SimulateOptions options = job.options;
+  for (std::size_t k = 0; k < job.accelerations.size(); ++k) {
     const Acceleration stoppable = [&](const Eigen::Ref<const VectorXd>& x) {
       if (stop != nullptr && *stop) throw SimulationStopped();
-      return acceleration(x);
+      return job.accelerations[k](x);
     };
-    motions.push_back(simulate(*job.system, job.parameters, stoppable, job.start, job.options));
+    if (!job.records.empty()) options.record = job.records[k];
+    try {
+      motions.push_back(simulate(*job.system, job.parameters, stoppable, job.start, options));
+    } catch (UnfinishedMotion& unfinished) {
+      motions.push_back(std::move(unfinished.motions.front()));
+      throw UnfinishedMotion(unfinished.what(), std::move(motions));
+    }
   }
   return motions;
+}
+
+std::vector<std::vector<double>> multiplier_sign_changes(const Trajectory& trajectory) {
+  std::vector<std::vector<double>> changes;
+  for (const auto& lambda : trajectory.records.rowwise()) {
+    std::vector<double>& times = changes.emplace_back();
+    for (Index i = 1; i < lambda.size(); ++i) {
+      const double before = lambda[i - 1], after = lambda[i];
+      if ((before < 0) == (after < 0)) continue;
+      const double dt = trajectory.times[i] - trajectory.times[i - 1];
+      times.push_back(trajectory.times[i - 1] + dt * before / (before - after));
+    }
+  }
+  return changes;
 }
 
 MotionUncertainty motion_uncertainty(const Posterior& posterior, const Trajectory& trajectory) {

@@ -97,6 +97,8 @@ void CallableSystem::require_symmetry(const char* function, const SystemValues& 
 }
 
 SystemValues CallableSystem::evaluate(const States& states, const Parameters& parameters) const {
+  require_states(states);
+  require_parameters(parameters);
   SystemValues values = definition_.evaluate(states, parameters);
   require_shapes("evaluate", values, states.cols());
   // at other parameters a fit may be on the way through: the likelihood is +∞ there
@@ -106,6 +108,9 @@ SystemValues CallableSystem::evaluate(const States& states, const Parameters& pa
 }
 
 SystemValues CallableSystem::differentiate(const States& states, const Parameters& parameters, int index) const {
+  require_states(states);
+  require_parameters(parameters);
+  require_parameter(index);
   if (!definition_.differentiate) {
     SystemValues values = difference(states, parameters, index);
     require_finite(
@@ -140,6 +145,8 @@ SystemValues CallableSystem::difference(const States& states, const Parameters& 
 }
 
 MatrixXd CallableSystem::residuals(const States& states, const Parameters& parameters) const {
+  require_states(states);
+  require_parameters(parameters);
   const auto n_rows = static_cast<Index>(residual_labels_.size());
   if (n_rows == 0) return MatrixXd(0, states.cols());
   MatrixXd values = definition_.residuals(states, parameters);
@@ -171,28 +178,6 @@ std::vector<bool> CallableSystem::reads(SystemPart part) const {
   }
   // without residuals nothing is read
   return residual_labels_.empty() ? std::vector<bool>(residuals_read_.size(), false) : residuals_read_;
-}
-
-std::shared_ptr<const System> CallableSystem::without_constraints() const {
-  const auto freed = [](SystemValues values) {
-    values.constraint_matrix.resize(0, values.n_states());
-    values.constraint_vector.resize(0, values.n_states());
-    return values;
-  };
-  const auto whole = std::make_shared<const CallableSystem>(definition_);
-  Definition free = definition_;
-  free.constraints.clear();
-  free.residuals = nullptr;
-  free.evaluate = [whole, freed](const States& states, const Parameters& parameters) {
-    return freed(whole->evaluate(states, parameters));
-  };
-  // without derivatives of its own, the free system takes differences of its own
-  if (definition_.differentiate) {
-    free.differentiate = [whole, freed](const States& states, const Parameters& parameters, int index) {
-      return freed(whole->differentiate(states, parameters, index));
-    };
-  }
-  return std::make_shared<const CallableSystem>(std::move(free));
 }
 
 }  // namespace gp2

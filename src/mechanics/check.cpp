@@ -2,7 +2,9 @@
 
 #include <algorithm>
 #include <cmath>
+#include <functional>
 #include <numeric>
+#include <utility>
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
@@ -126,8 +128,10 @@ std::optional<ConstraintViolation> largest_violation(const System& system, const
     }
     Index state = 0;
     const double value = residuals.row(k).cwiseAbs().maxCoeff(&state);
-    const double relative = value / (scale > 0 ? scale : 1);
-    if (!worst || relative > worst->relative) worst = {relative, value, static_cast<int>(state), label.text};
+    if (scale == 0) scale = 1;
+    const double relative = value / scale;
+    const double rms = residuals.row(k).norm() / std::sqrt(static_cast<double>(residuals.cols())) / scale;
+    if (!worst || relative > worst->relative) worst = {relative, rms, value, static_cast<int>(state), label.text};
   }
   return worst;
 }
@@ -206,6 +210,83 @@ std::optional<std::vector<int>> dependent_columns(const System& system, const Re
   return independent_rows(scaled_T, system.nq() - rank);
 }
 
+bool ConstraintResidual::is_too_large() const {
+  if (n < 4) return false;
+  if (std::isfinite(expected)) {
+    // χ²/n of n normal values is 1 ± √(2/n)
+    const double ratio = rms / expected;
+    return ratio > 2 && ratio * ratio > 1 + 6 * std::sqrt(2.0 / n);
+  }
+  const double scatter = std::sqrt(std::max(0.0, rms * rms - mean * mean));
+  const bool is_offset = std::abs(mean) > scatter && std::abs(mean) * std::sqrt(n) > 6 * scatter && std::abs(mean) > 0.05 * size;
+  return is_offset || rms > 0.5 * size;
+}
+
+std::string ConstraintResidual::text() const {
+  const bool is_known = std::isfinite(expected);
+  if (!is_too_large()) {
+    if (!is_known) {
+      return fmt::format("measured ddq on A ddq = b: rms residual {:.3g} for '{}' (noise, if the model is right)", rms,
+                         constraint);
+    }
+    return fmt::format("measured ddq on A ddq = b: rms residual {:.3g} for '{}', expected {:.3g} from the noise", rms, constraint,
+                       expected);
+  }
+  std::vector<int> rows;
+  for (const int state : worst) rows.push_back(state + 1);
+  if (!is_known) {
+    return fmt::format(
+        "measured ddq on A ddq = b: rms residual {:.3g} for '{}', mean {:.3g}, is more than noise: a constraint, a "
+        "unit, a sign or gravity in a sensor is wrong (farthest off: row {})",
+        rms, constraint, mean, fmt::join(rows, ", "));
+  }
+  return fmt::format(
+      "measured ddq on A ddq = b: rms residual {:.3g} for '{}', mean {:.3g}, expected {:.2g} from the noise: {:.2g} ×; "
+      "a constraint, a unit, a sign or gravity in a sensor is wrong, or the noise is stated too small (farthest off: "
+      "row {})",
+      rms, constraint, mean, expected, rms / expected, fmt::join(rows, ", "));
+}
+
+std::vector<ConstraintResidual> constraint_residuals(const System& system, const Ref<const MatrixXd>& states,
+                                                     const Ref<const VectorXd>& parameters,
+                                                     const Ref<const MatrixXd>& accelerations,
+                                                     const Ref<const MatrixXd>& stddev) {
+  const SystemValues values = system.evaluate(states, parameters);
+  std::vector<ConstraintResidual> all;
+  for (int row = 0; row < system.nc(); ++row) {
+    ConstraintResidual one;
+    one.constraint = system.constraint_labels()[static_cast<std::size_t>(row)];
+    std::vector<std::pair<double, int>> distances;
+    for (int i = 0; i < values.n_states(); ++i) {
+      double r = -values.b(i)[row], size = std::abs(r), variance = 0;
+      for (int j = 0; j < system.nq(); ++j) {
+        const double a = values.A(i)(row, j);
+        if (a == 0) continue;
+        r += a * accelerations(j, i);
+        size += std::abs(a * accelerations(j, i));
+        variance += a * a * stddev(j, i) * stddev(j, i);
+      }
+      // a row that vanishes says nothing of ddq
+      if (!std::isfinite(r) || variance == 0) continue;
+      ++one.n;
+      one.rms += r * r;
+      one.mean += r;
+      one.size += size * size;
+      one.expected += variance;
+      distances.emplace_back(std::isfinite(variance) ? std::abs(r) / std::sqrt(variance) : std::abs(r), i);
+    }
+    if (one.n == 0) continue;
+    one.mean /= one.n;
+    for (double* const square : {&one.rms, &one.size, &one.expected}) *square = std::sqrt(*square / one.n);
+    const std::size_t n_worst = std::min<std::size_t>(3, distances.size());
+    std::partial_sort(distances.begin(), distances.begin() + static_cast<std::ptrdiff_t>(n_worst), distances.end(),
+                      std::greater<>());
+    for (std::size_t k = 0; k < n_worst; ++k) one.worst.push_back(distances[k].second);
+    all.push_back(std::move(one));
+  }
+  return all;
+}
+
 namespace {
 
 VectorXd eigenvalues_of(const MatrixXd& M) {
@@ -245,6 +326,21 @@ void check_independence(const MechanicsBatch& mechanics, std::vector<Finding>& f
                                    "{:.1e} of the largest, at state {}); leave out what is redundant, or write it so that it is "
                                    "so to rounding",
                                    n_states, mechanics.values.n_states(), worst, state + 1)});
+}
+
+// an M that changes with the motion comes with forces that are quadratic in the velocities
+void check_coriolis(const System& system, const MechanicsBatch& mechanics, std::vector<Finding>& findings) {
+  const MatrixXd& M = mechanics.values.mass;
+  const std::vector<bool> force = system.reads(SystemPart::force);
+  const StateLayout layout = system.layout();
+  const bool reads_velocities =
+      std::any_of(force.begin() + layout.dq(0), force.begin() + layout.dq(0) + layout.nq, [](bool one) { return one; });
+  const double change = (M.colwise() - M.col(0)).cwiseAbs().maxCoeff();
+  if (reads_velocities || !(change > 1e-9 * M.cwiseAbs().maxCoeff())) return;
+  findings.push_back(
+      {Level::warning,
+       "mass matrix: it changes with the motion, but the force depends on no velocity: the Coriolis and centrifugal "
+       "forces are missing; write coriolis = true in [mechanics]"});
 }
 
 // M is symmetric, and definite or completed by A
@@ -337,6 +433,7 @@ void check_row_sizes(const System& system, const MechanicsBatch& mechanics, std:
 // M, A, b: definite or completed by A, of constant rank, consistent
 void check_mechanics(const System& system, const MechanicsBatch& mechanics, std::vector<Finding>& findings) {
   check_mass(system, mechanics, findings);
+  check_coriolis(system, mechanics, findings);
   if (system.nc() == 0) {
     findings.push_back({Level::warning, "constraints: none; T = I, and ddq is the unconstrained acceleration"});
     return;
@@ -360,11 +457,13 @@ void check_parameter_derivatives(const System& system, const Ref<const MatrixXd>
     const SystemValues high = system.evaluate(states, above);
     const SystemValues low = system.evaluate(states, below);
     const auto compare = [&](const MatrixXd& exact, const MatrixXd& up, const MatrixXd& down, const MatrixXd& value) {
+      // an entry that is rounding beside the others is as good as zero
+      const double rounding = 1e-6 * exact.lpNorm<Eigen::Infinity>();
       for (Index k = 0; k < exact.size(); ++k) {
         const double difference = (up.reshaped()[k] - down.reshaped()[k]) / (above[p] - below[p]);
         if (!std::isfinite(difference) || !std::isfinite(exact.reshaped()[k])) continue;
-        const double size =
-            std::abs(exact.reshaped()[k]) + 1e-4 * std::abs(value.reshaped()[k]) / std::max(std::abs(parameters[p]), 1e-3);
+        const double size = std::abs(exact.reshaped()[k]) + rounding +
+                            1e-4 * std::abs(value.reshaped()[k]) / std::max(std::abs(parameters[p]), 1e-3);
         const double error = std::abs(difference - exact.reshaped()[k]) / std::max(size, 1e-12);
         if (error > worst) {
           worst = error;
@@ -459,24 +558,24 @@ std::vector<Finding> check_system(const System& system, const Ref<const MatrixXd
 }
 
 std::vector<Finding> check_data(const System& system, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters,
-                                const Ref<const MatrixXd>& accelerations, const std::vector<int>& stated) {
+                                const Ref<const MatrixXd>& accelerations, const Ref<const MatrixXd>& stddev,
+                                const std::vector<int>& stated) {
+  const bool estimates =
+      std::any_of(system.parameters().begin(), system.parameters().end(), [](const auto& one) { return one.estimate; });
   std::vector<Finding> findings;
   if (const auto violation = largest_violation(system, states, parameters)) {
-    findings.push_back({violation->relative > constraint_violation_tolerance ? Level::warning : Level::good,
+    const Level level = violation->rms > 0.3                                   ? Level::error
+                        : violation->relative > constraint_violation_tolerance ? Level::warning
+                                                                               : Level::good;
+    findings.push_back({estimates ? std::min(level, Level::warning) : level,
                         fmt::format("data on the constraint: off by {:.2g} at most, {:.1e} of its scale ('{}', row {})",
                                     violation->value, violation->relative, violation->constraint, violation->state + 1)});
   }
-  const std::vector<int> complete = complete_states(accelerations);
-  if (complete.empty() || system.nc() == 0) return findings;
-
-  const SystemValues values = system.evaluate(states, parameters);
-  VectorXd rms = VectorXd::Zero(system.nc());
-  for (const int i : complete) rms += (values.A(i) * accelerations.col(i) - values.b(i)).cwiseAbs2();
-  rms = (rms / static_cast<double>(complete.size())).cwiseSqrt();
-  for (Index k = 0; k < rms.size(); ++k) {
-    findings.push_back(
-        {Level::good, fmt::format("measured ddq on A ddq = b: rms residual {:.3g} for '{}' (noise, if the model is right)",
-                                  rms[k], system.constraint_labels()[static_cast<std::size_t>(k)])});
+  for (const ConstraintResidual& one : constraint_residuals(system, states, parameters, accelerations, stddev)) {
+    // as large as what should cancel: nothing that is learned from such data is of this system
+    const bool is_all = one.is_too_large() && one.rms > 0.3 * one.size && !estimates;
+    const std::string of_file = one.is_too_large() && estimates ? "; here with the parameters as in the model file" : "";
+    findings.push_back({is_all ? Level::error : one.is_too_large() ? Level::warning : Level::good, one.text() + of_file});
   }
   const std::vector<std::string> every = system.acceleration_names();
   const auto rows = dependent_columns(system, states, parameters, accelerations);

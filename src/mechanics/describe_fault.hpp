@@ -1,6 +1,7 @@
 #pragma once
 
 #include <string>
+#include <vector>
 
 #include <Eigen/Core>
 
@@ -11,5 +12,9 @@ namespace gp2::internal {
 /// "system 'NAME': TEXT at state 3 (q1 = 0.1, dq1 = 2)", with the entries of the state that are known.
 std::string describe_fault(const System& system, const Eigen::Ref<const Eigen::MatrixXd>& states,
                            const MechanicsBatch::Fault& fault);
+
+/// ", and of what the equations read dq1 is nan": the entries of state i that are read and not finite; empty where there are none.
+std::string unknown_entries(const System& system, const Eigen::Ref<const Eigen::MatrixXd>& states, int i,
+                            const std::vector<bool>& reads);
 
 }  // namespace gp2::internal

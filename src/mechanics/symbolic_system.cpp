@@ -189,6 +189,8 @@ SymbolicSystem::~SymbolicSystem() = default;
 
 void SymbolicSystem::run(const Tape& tape, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters,
                          SystemValues& values) const {
+  require_states(states);
+  require_parameters(parameters);
   values.mass.resize(Index{nq()} * nq(), states.cols());
   values.constraint_matrix.resize(Index{nc()} * nq(), states.cols());
   values.constraint_vector.resize(nc(), states.cols());
@@ -210,6 +212,7 @@ void SymbolicSystem::evaluate_into(const Ref<const MatrixXd>& states, const Ref<
 
 SystemValues SymbolicSystem::differentiate(const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters,
                                            int index) const {
+  require_parameter(index);
   SystemValues values;
   run(derivatives_[static_cast<std::size_t>(index)], states, parameters, values);
   return values;
@@ -257,15 +260,11 @@ std::unique_ptr<StateEvaluator> SymbolicSystem::make_evaluator(const Ref<const V
 }
 
 MatrixXd SymbolicSystem::residuals(const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters) const {
+  require_states(states);
+  require_parameters(parameters);
   MatrixXd values;
   residuals_.evaluate(states, parameters, values);
   return values;
-}
-
-std::shared_ptr<const System> SymbolicSystem::without_constraints() const {
-  Definition free = definition_;
-  free.constraints.clear();
-  return std::make_shared<const SymbolicSystem>(std::move(free));
 }
 
 std::vector<bool> SymbolicSystem::reads(SystemPart part) const {

@@ -1,5 +1,10 @@
 #include "gp2/system.hpp"
 
+#include <fmt/format.h>
+#include <fmt/ranges.h>
+
+#include "gp2/error.hpp"
+
 namespace gp2 {
 
 System::System(std::string name, std::vector<Coordinate> coordinates, std::vector<std::string> inputs,
@@ -29,6 +34,24 @@ Eigen::VectorXd System::parameter_values() const {
   Eigen::VectorXd values(static_cast<Eigen::Index>(parameters_.size()));
   for (Eigen::Index k = 0; k < values.size(); ++k) values[k] = parameters_[static_cast<std::size_t>(k)].value;
   return values;
+}
+
+void System::require_states(const Eigen::Ref<const Eigen::MatrixXd>& states) const {
+  if (states.rows() == layout().size()) return;
+  throw InputError(fmt::format("states: a column is a state of '{}' and must have {} rows, {} (StateLayout), got {}", name_,
+                               layout().size(), fmt::join(state_names(), ", "), states.rows()));
+}
+
+void System::require_parameters(const Eigen::Ref<const Eigen::VectorXd>& parameters) const {
+  if (parameters.size() == static_cast<Eigen::Index>(parameters_.size())) return;
+  throw InputError(fmt::format("parameters: there must be a number for each of the {} of '{}', got {}", parameters_.size(), name_,
+                               parameters.size()));
+}
+
+void System::require_parameter(int index) const {
+  const int n = static_cast<int>(parameters_.size());
+  if (index >= 0 && index < n) return;
+  throw InputError(fmt::format("'{}' has {} parameters, numbered from 0, got the number {}", name_, n, index));
 }
 
 int System::parameter_index(const std::string& name) const {

@@ -306,6 +306,16 @@ void UdwadiaKalaba::invert_R_transposed() {
   }
 }
 
+bool UdwadiaKalaba::is_contradictory(const Ref<const VectorXd>& F, double rounding) const {
+  if (!(inconsistency_ > std::max(consistency_tolerance * size_of_b_, rounding))) return false;
+  // as large as |C⁻¹F| where M is diagonal, and never much larger
+  double size_of_force = 0;
+  for (Index j = 0; j < F.size(); ++j) {
+    if (std::isfinite(F[j])) size_of_force = std::max(size_of_force, std::abs(F[j]) / std::sqrt(mass_(j, j)));
+  }
+  return inconsistency_ > consistency_tolerance * size_of_force;
+}
+
 MatrixXd UdwadiaKalaba::solve_mass(const Ref<const MatrixXd>& v) const {
   MatrixXd solution = v;
   solve_mass_in_place(solution);
@@ -435,7 +445,32 @@ std::optional<std::string> mass_fault(const System& system, const SystemValues& 
   return std::nullopt;
 }
 
+// of one state by itself
+std::optional<std::string> fault_at(const System& system, const SystemValues& values, const Ref<const MatrixXd>& states, int i,
+                                    const UdwadiaKalaba& projection) {
+  if (!values.M(i).allFinite())
+    return "the mass matrix M is not positive definite: it is not finite" +
+           internal::unknown_entries(system, states, i, system.reads(SystemPart::mechanics));
+  const bool is_indefinite = projection.mass_kind() == UdwadiaKalaba::Mass::indefinite;
+  if (!is_indefinite && (!values.A(i).allFinite() || !values.b(i).allFinite())) {
+    return "A or b is not a finite number" + internal::unknown_entries(system, states, i, system.reads(SystemPart::mechanics));
+  }
+  return mass_fault(system, values, i, projection);
+}
+
 }  // namespace
+
+std::string internal::unknown_entries(const System& system, const Ref<const MatrixXd>& states, int i,
+                                      const std::vector<bool>& reads) {
+  const std::vector<std::string> names = system.state_names();
+  std::string unknown;
+  for (Index row = 0; row < states.rows(); ++row) {
+    const auto k = static_cast<std::size_t>(row);
+    if (!reads[k] || std::isfinite(states(row, i))) continue;
+    unknown += fmt::format("{}{} is {}", unknown.empty() ? "" : ", ", names[k], states(row, i));
+  }
+  return unknown.empty() ? "" : ", and of what the equations read " + unknown;
+}
 
 std::string internal::describe_fault(const System& system, const Ref<const MatrixXd>& states,
                                      const MechanicsBatch::Fault& fault) {
@@ -471,21 +506,16 @@ void evaluate_mechanics(const System& system, const Ref<const MatrixXd>& states,
   for (int i = 0; i < n_states; ++i) {
     UdwadiaKalaba& projection = batch.projections[static_cast<std::size_t>(i)];
     projection.compute(batch.values.M(i), batch.values.A(i), batch.values.b(i));
-    const bool is_indefinite = projection.mass_kind() == UdwadiaKalaba::Mass::indefinite;
-    if (!is_indefinite && (!batch.values.A(i).allFinite() || !batch.values.b(i).allFinite())) {
-      batch.fault = {i, "A or b is not a finite number"};
-      return;
-    }
-    if (std::optional<std::string> text = mass_fault(system, batch.values, i, projection)) {
+    if (std::optional<std::string> text = fault_at(system, batch.values, states, i, projection)) {
       batch.fault = {i, std::move(*text)};
       return;
     }
     size_of_b = std::max(size_of_b, projection.size_of_b());
   }
+  // b is quadratic in the velocities, and where others move those at rest may be 1e-6 of theirs by rounding
+  const double rounding = std::max(1e-12 * size_of_b, std::numeric_limits<double>::min());
   for (int i = 0; i < n_states; ++i) {
-    // of a b that has died away to numbers without full precision nothing can be said
-    const double tolerance = std::max(MechanicsBatch::consistency_tolerance * size_of_b, std::numeric_limits<double>::min());
-    if (batch.projections[static_cast<std::size_t>(i)].inconsistency() > tolerance) {
+    if (batch.projections[static_cast<std::size_t>(i)].is_contradictory(batch.values.F(i), rounding)) {
       batch.fault = {i, "the constraints contradict each other: no acceleration satisfies A ddq = b"};
       return;
     }

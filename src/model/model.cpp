@@ -13,6 +13,7 @@
 #include "model/prior_words.hpp"
 #include "model/toml.hpp"
 #include "model/toml_reader.hpp"
+#include "prior/make_prior.hpp"
 #include "robots/robot_expressions.hpp"
 #include "symbolic/graph.hpp"
 
@@ -132,6 +133,7 @@ const SymbolicSystem& require_symbolic_system(const Model& model) {
 }
 
 Prior make_prior(const Model& model, const PriorOptions& options) {
+  require_system(model.system);
   return make_prior(model.system, model.latents, options, prior_words(model));
 }
 

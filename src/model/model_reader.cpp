@@ -35,6 +35,7 @@ class ModelReader : private TomlReader {
     read_robot();
     read_coordinates();
     read_inputs();
+    refuse_names_of_other_columns();
     read_parameters();
     declare_symbols();
     read_let();
@@ -155,6 +156,26 @@ class ModelReader : private TomlReader {
     for (const toml::node& entry : array(*root_.get("inputs"), "inputs")) {
       definition_.inputs.push_back(text(entry, "inputs"));
       declare(definition_.inputs.back(), entry, "inputs");
+    }
+  }
+
+  // A log or a prediction of the coordinate x has columns x_std, ddx_std, abar_x, … beside those of x itself.
+  void refuse_names_of_other_columns() {
+    const auto refuse = [&](const std::string& column, const std::string& of) {
+      if (!names_.contains(column)) return;
+      const char* key = root_.contains("coordinates") ? "coordinates" : "inputs";
+      fail(
+          1, key,
+          fmt::format("the column {} would be a name of this model and what logs and predictions call a quantity of '{}'; choose "
+                      "another name",
+                      column, of));
+    };
+    for (const Coordinate& coordinate : definition_.coordinates) {
+      for (const std::string& name : {coordinate.name, coordinate.velocity(), coordinate.acceleration()}) {
+        refuse(name + "_std", coordinate.name);
+      }
+      refuse(coordinate.velocity() + "_next", coordinate.name);
+      for (const char* prefix : {"abar_", "fc_"}) refuse(prefix + coordinate.name, coordinate.name);
     }
   }
 
@@ -332,9 +353,28 @@ class ModelReader : private TomlReader {
       take_mechanics_of_robot(&mechanics);
       return;
     }
-    only_keys(mechanics, "mechanics", {"mass", "force", "potential"});
+    only_keys(mechanics, "mechanics", {"mass", "force", "coriolis", "potential"});
     read_mass(mechanics);
     definition_.force = read_forces(mechanics, "mechanics");
+    if (mechanics.contains("coriolis") && boolean(*mechanics.get("coriolis"), "mechanics.coriolis")) add_coriolis_force();
+  }
+
+  // Lagrange's equations: F_i −= Σ_j dM_ij/dt dq_j − ½ Σ_jk ∂M_jk/∂q_i dq_j dq_k
+  void add_coriolis_force() {
+    ExpressionGraph& graph = *model_.graph;
+    const std::vector<Expression>&q = symbols_->q, &dq = symbols_->dq;
+    const auto& M = definition_.mass;
+    for (std::size_t i = 0; i < q.size(); ++i) {
+      for (std::size_t j = 0; j < q.size(); ++j) {
+        Expression rate = graph.differentiate(M[i][j], symbols_->t);
+        Expression half = graph.constant(0);
+        for (std::size_t k = 0; k < q.size(); ++k) {
+          rate = rate + graph.differentiate(M[i][j], q[k]) * dq[k];
+          half = half + graph.differentiate(M[j][k], q[i]) * dq[k];
+        }
+        definition_.force[i] = definition_.force[i] - (rate - graph.constant(0.5) * half) * dq[j];
+      }
+    }
   }
 
   void read_mass(const toml::table& mechanics) {

@@ -1,5 +1,9 @@
 #include "prior/expression_function.hpp"
 
+#include <fmt/format.h>
+
+#include "gp2/error.hpp"
+
 namespace gp2 {
 
 using Eigen::MatrixXd;
@@ -8,7 +12,9 @@ using Eigen::VectorXd;
 
 ExpressionFunction::ExpressionFunction(std::span<const Expression> expressions, std::span<const Expression> inputs,
                                        std::size_t n_states)
-    : values_(expressions, inputs), state_derivatives_(expressions, inputs, static_cast<int>(n_states)) {}
+    : n_states_(static_cast<Eigen::Index>(n_states)),
+      values_(expressions, inputs),
+      state_derivatives_(expressions, inputs, static_cast<int>(n_states)) {}
 
 std::shared_ptr<const StateFunction> ExpressionFunction::of_state(std::span<const Expression> expressions,
                                                                   const SystemSymbols& symbols) {
@@ -30,6 +36,10 @@ std::shared_ptr<const StateFunction> ExpressionFunction::of_state_and_parameters
 }
 
 MatrixXd ExpressionFunction::evaluate(const States& states, const Parameters& parameters) const {
+  if (states.rows() != n_states_) {
+    throw InputError(
+        fmt::format("features and directions are functions of a state of {} entries, got {}", n_states_, states.rows()));
+  }
   MatrixXd values;
   values_.evaluate(states, parameters, values);
   return values;

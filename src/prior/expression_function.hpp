@@ -27,6 +27,7 @@ class ExpressionFunction final : public StateFunction {
   ExpressionFunction(std::span<const Expression> expressions, std::span<const Expression> inputs, std::size_t n_states);
   class TapeEvaluator;
 
+  Eigen::Index n_states_;  // entries of a state
   Tape values_;
   StateDerivatives state_derivatives_;
   std::vector<Tape> parameter_derivatives_;  // one per parameter of the system

@@ -44,8 +44,13 @@ Primitive primitive_of(std::string_view name, std::string_view text) {
   for (std::size_t k = 0; k < known.size(); ++k) {
     if (known[k] == name) return static_cast<Primitive>(k);
   }
-  throw InputError(
-      fmt::format("kernel \"{}\": unknown kernel '{}'; use sums and products of {}", text, name, fmt::join(known, " ")));
+  // the names that other libraries have for them
+  constexpr std::pair<std::string_view, std::string_view> others[] = {
+      {"rbf", "se"}, {"gaussian", "se"}, {"squaredexponential", "se"}, {"matern", "matern52"}, {"rationalquadratic", "rq"}};
+  const auto other = std::find_if(std::begin(others), std::end(others), [&](const auto& one) { return one.first == name; });
+  throw InputError(fmt::format("kernel \"{}\": unknown kernel '{}'{}; use sums and products of {}", text, name,
+                               other == std::end(others) ? "" : fmt::format(", here called {}", other->second),
+                               fmt::join(known, " ")));
 }
 
 // "lengthscale" of the feature d, or "alpha" of none

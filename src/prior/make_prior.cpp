@@ -166,8 +166,13 @@ Expression PriorWords::with_values(Expression e, const System& system) const {
   return graph.substitute(e, values);
 }
 
+void require_system(const std::shared_ptr<const System>& system) {
+  if (!system) throw InputError("make_prior: there is no system; a model that was never read, or was moved away, has none");
+}
+
 Prior make_prior(std::shared_ptr<const System> system, const std::vector<LatentSpec>& latents, const PriorOptions& options,
                  const PriorWords& words) {
+  require_system(system);
   const internal::StepLimit limit;
   if (options.base && latents.size() > 1) {
     throw InputError(
@@ -185,6 +190,7 @@ Prior make_prior(std::shared_ptr<const System> system, const std::vector<LatentS
 }
 
 Prior make_prior(std::shared_ptr<const System> system, const std::vector<LatentSpec>& latents, const PriorOptions& options) {
+  require_system(system);
   ExpressionGraph graph;
   const PriorWords names{"", graph, {graph, system->coordinates(), system->inputs(), system->parameters()}, {}};
   std::map<std::string, Expression, std::less<>> known;

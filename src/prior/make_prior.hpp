@@ -24,6 +24,9 @@ struct PriorWords {
 Prior make_prior(std::shared_ptr<const System> system, const std::vector<LatentSpec>& latents, const PriorOptions& options,
                  const PriorWords& words);
 
+/// @throws InputError when there is none.
+void require_system(const std::shared_ptr<const System>& system);
+
 /// A feature that is an angle becomes its sine and cosine; another stays.
 std::vector<std::string> expand_angle(const std::string& feature, const std::vector<Coordinate>& coordinates);
 

@@ -1,6 +1,12 @@
 #include "gp2/prior.hpp"
 
+#include <cmath>
 #include <utility>
+
+#include <fmt/format.h>
+
+#include "gp2/error.hpp"
+#include "mechanics/describe_fault.hpp"
 
 namespace gp2 {
 
@@ -21,9 +27,54 @@ MatrixXd evaluate_base(const Latent& latent, const Ref<const MatrixXd>& states, 
   return identity.reshaped().replicate(1, states.cols());
 }
 
+struct Entry {
+  int row, state;
+};
+
+// the first, state by state, that is not a finite number
+std::optional<Entry> first_not_finite(const Ref<const MatrixXd>& values) {
+  if (values.allFinite()) return std::nullopt;
+  for (Index i = 0; i < values.cols(); ++i) {
+    for (Index row = 0; row < values.rows(); ++row) {
+      if (!std::isfinite(values(row, i))) return Entry{static_cast<int>(row), static_cast<int>(i)};
+    }
+  }
+  return std::nullopt;
+}
+
+const std::string& coordinate_name(const System& system, int j) { return system.coordinates()[static_cast<std::size_t>(j)].name; }
+
+void require_latent(const Latent& latent, Index nq) {
+  const auto fail = [&](const std::string& text) {
+    throw InputError(fmt::format("prior: the latent '{}' {}; make_prior makes whole ones", latent.name, text));
+  };
+  if (!latent.features) fail("has no features");
+  if (latent.kernel.terms().empty()) fail("has no kernel");
+  const int n_features = latent.n_features();
+  if (latent.features->size() != n_features || latent.kernel.n_features() != n_features) {
+    fail(fmt::format("has {} features of {} names, and a kernel of {}", latent.features->size(), n_features,
+                     latent.kernel.n_features()));
+  }
+  const Index n_directions = latent.directions ? latent.directions->size() : nq * nq;
+  if (latent.size() == 0 || n_directions != nq * latent.size()) {
+    fail(fmt::format("has {} columns, but directions of {} numbers for {} coordinates", latent.size(), n_directions, nq));
+  }
+  if (latent.n_functions() < 1) fail(fmt::format("has {} functions", latent.n_functions()));
+}
+
 }  // namespace
 
+void require_prior(const Prior& prior) {
+  if (!prior.system) throw InputError("prior: it has no system; make it by make_prior, and use none that was moved away");
+  const Index nq = prior.system->nq();
+  if (prior.mean == Prior::Mean::constant && prior.constant_mean.size() != nq) {
+    throw InputError(fmt::format("prior: its constant mean has {} numbers for {} coordinates", prior.constant_mean.size(), nq));
+  }
+  for (const Latent& latent : prior.latents) require_latent(latent, nq);
+}
+
 std::vector<bool> Prior::reads() const {
+  require_prior(*this);
   std::vector<bool> reads = system->reads(SystemPart::mechanics);
   if (mean == Mean::force) {
     const std::vector<bool> force = system->reads(SystemPart::force);
@@ -45,8 +96,20 @@ void PriorValues::keep_only(std::size_t latent) {
   }
 }
 
-MatrixXd evaluate_features(const Latent& latent, const Ref<const MatrixXd>& states) {
-  return latent.features->evaluate(states, VectorXd()).transpose();
+MatrixXd evaluate_features(const Prior& prior, std::size_t latent, const Ref<const MatrixXd>& states) {
+  const Latent& of = prior.latents.at(latent);
+  if (!of.features) throw InputError(fmt::format("prior: the latent '{}' has no features", of.name));
+  const MatrixXd features = of.features->evaluate(states, VectorXd());
+  if (const std::optional<Entry> entry = first_not_finite(features)) {
+    const std::string& feature = of.feature_names[static_cast<std::size_t>(entry->row)];
+    std::vector<bool> reads;
+    for (int k = 0; k < static_cast<int>(states.rows()); ++k) reads.push_back(of.features->reads(k));
+    throw InputError(internal::describe_fault(
+        *prior.system, states,
+        {entry->state, fmt::format("latent '{}': the feature '{}' is not a finite number{}", of.name, feature,
+                                   internal::unknown_entries(*prior.system, states, entry->state, reads))}));
+  }
+  return features.transpose();
 }
 
 PriorValues evaluate_prior(const Prior& prior, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters,
@@ -59,9 +122,19 @@ PriorValues evaluate_prior(const Prior& prior, const Ref<const MatrixXd>& states
     for (int i = 0; i < n_states; ++i) {
       values.mean.col(i) = mechanics.projections[static_cast<std::size_t>(i)].solve_mass(mechanics.values.F(i));
     }
+    if (const std::optional<Entry> entry = first_not_finite(mechanics.values.force)) {
+      values.fault = {entry->state, fmt::format("the applied force on '{}' is not a finite number",
+                                                coordinate_name(*prior.system, entry->row))};
+    }
   }
   for (const Latent& latent : prior.latents) {
     MatrixXd E = evaluate_base(latent, states, parameters, nq);
+    const std::optional<Entry> entry = values.fault ? std::nullopt : first_not_finite(E);
+    if (entry) {
+      values.fault = {entry->state, fmt::format("latent '{}': '{}' along '{}' is not a finite number", latent.name,
+                                                latent.column_names[static_cast<std::size_t>(entry->row / nq)],
+                                                coordinate_name(*prior.system, static_cast<int>(entry->row % nq)))};
+    }
     if (latent.base == Latent::Base::force) {
       for (int i = 0; i < n_states; ++i) {
         block(E, i, nq) = mechanics.projections[static_cast<std::size_t>(i)].solve_mass(block(E, i, nq));
@@ -69,6 +142,13 @@ PriorValues evaluate_prior(const Prior& prior, const Ref<const MatrixXd>& states
     }
     values.directions.push_back(std::move(E));
   }
+  return values;
+}
+
+PriorValues require_prior_values(const Prior& prior, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters,
+                                 const MechanicsBatch& mechanics) {
+  PriorValues values = evaluate_prior(prior, states, parameters, mechanics);
+  if (values.fault) throw InputError(internal::describe_fault(*prior.system, states, *values.fault));
   return values;
 }
 

@@ -1,6 +1,7 @@
 #include "gp2/view.hpp"
 
 #include <algorithm>
+#include <cmath>
 #include <numeric>
 
 #include <fmt/format.h>
@@ -14,6 +15,69 @@ using Eigen::Index;
 using Eigen::MatrixXd;
 using Eigen::Ref;
 using Eigen::VectorXd;
+
+namespace {
+
+void require_rows(const View& view, int nq, int nc) {
+  const int n_rows = view.quantity->n_rows(nq, nc);
+  for (const int row : view.rows) {
+    if (row >= 0 && row < n_rows) continue;
+    throw InputError(fmt::format("view '{}': there are the rows 0 … {}, got {}", view.quantity->word(), n_rows - 1, row));
+  }
+}
+
+// that the latents at home can act there
+void require_other_system(const Prior& home, const OtherSystem& other) {
+  const auto differ = [](const char* what, auto there, auto here) {
+    throw InputError(fmt::format("view: its other system has {} {}, that at home {}; make_other_system makes one that fits",
+                                 there, what, here));
+  };
+  require_prior(other.prior);
+  const System &there = *other.prior.system, &here = *home.system;
+  if (there.nq() != here.nq()) differ("coordinates", there.nq(), here.nq());
+  if (there.layout().nu != here.layout().nu) differ("inputs", there.layout().nu, here.layout().nu);
+  if (other.prior.latents.size() != home.latents.size()) differ("latents", other.prior.latents.size(), home.latents.size());
+  for (std::size_t a = 0; a < home.latents.size(); ++a) {
+    const Latent &mine = home.latents[a], &its = other.prior.latents[a];
+    const auto kernel = [](const Latent& latent) {
+      std::string text = latent.kernel.text();
+      std::erase(text, ' ');
+      return text;
+    };
+    if (kernel(its) != kernel(mine) || its.n_features() != mine.n_features() || its.size() != mine.size() ||
+        its.n_functions() != mine.n_functions()) {
+      throw InputError(
+          fmt::format("view: the latent '{}' of its other system is of another kind than '{}' at home; "
+                      "make_other_system makes one that fits",
+                      its.name, mine.name));
+    }
+  }
+  if (other.shared.size() != there.parameters().size()) {
+    throw InputError(fmt::format("view: its other system has {} parameters, but shared has {} numbers", there.parameters().size(),
+                                 other.shared.size()));
+  }
+  for (const int index : other.shared) {
+    if (index != -1) here.require_parameter(index);
+  }
+}
+
+}  // namespace
+
+void require_view(const Prior& home, const View& view) {
+  require_prior(home);
+  if (view.other_system) require_other_system(home, *view.other_system);
+  const System& system = *prior_of(home, view).system;
+  require_rows(view, system.nq(), system.nc());
+  if (view.rows.empty() && view.quantity->n_rows(system.nq(), system.nc()) > 0) {
+    throw InputError(fmt::format("view '{}' is of no rows; View::all has every one", view.quantity->word()));
+  }
+  const int n_latents = static_cast<int>(home.latents.size());
+  if (view.latent && (*view.latent < 0 || *view.latent >= n_latents)) {
+    throw InputError(fmt::format("view '{}': the prior has {} latents, numbered from 0, got the latent {}", view.quantity->word(),
+                                 n_latents, *view.latent));
+  }
+  static_cast<void>(view.required_time_step());
+}
 
 VectorXd OtherSystem::parameters(const Ref<const VectorXd>& home) const {
   VectorXd parameters = prior.system->parameter_values();
@@ -38,6 +102,9 @@ View View::next_velocity(const System& system, double time_step) {
 double View::required_time_step() const {
   if (!quantity->needs_time_step()) return 0;
   if (!time_step) throw InputError(fmt::format("view '{}' needs a time step", quantity->word()));
+  if (!(*time_step > 0) || !std::isfinite(*time_step)) {
+    throw InputError(fmt::format("view '{}': the time step must be positive, got {}", quantity->word(), *time_step));
+  }
   return *time_step;
 }
 
@@ -55,6 +122,7 @@ std::vector<bool> View::reads(const System& system) const {
 }
 
 std::vector<std::string> View::names(const System& system, const std::string& latent_name) const {
+  require_rows(*this, system.nq(), system.nc());
   std::vector<std::string> names;
   for (const int row : rows) {
     names.push_back(quantity->name(system, row));
@@ -82,6 +150,7 @@ std::optional<std::string> what_needs_acceleration(const Prior& prior, const Vie
 
 void evaluate_mechanics(const Prior& prior, const View& view, const Ref<const MatrixXd>& states,
                         const Ref<const VectorXd>& parameters, MechanicsBatch& batch) {
+  require_prior(prior);
   evaluate_mechanics(*prior.system, states, parameters, batch);
   const int singular = batch.first_singular();
   if (batch.fault || singular < 0) return;
@@ -140,6 +209,7 @@ ViewValues collect(const View& view, const MechanicsBatch& mechanics, const At& 
 
 Affine affine_of(const View& view, const SystemValues& values) {
   const auto nq = static_cast<int>(values.force.rows()), nc = static_cast<int>(values.constraint_vector.rows());
+  require_rows(view, nq, nc);
   const int n_rows = view.quantity->n_rows(nq, nc);
   return {MatrixXd(n_rows, nq), MatrixXd(n_rows, 1)};
 }

@@ -3,6 +3,7 @@
 #include <fmt/format.h>
 
 #include "gp2/error.hpp"
+#include "gp2/mechanics/quantity.hpp"
 #include "gp2/mechanics/udwadia_kalaba.hpp"
 #include "mechanics/describe_fault.hpp"
 
@@ -22,8 +23,7 @@ ModelMotion::ModelMotion(const Model& model) : system_(model.system), parameters
   truth_force_ = Tape(model.truth_force, model.symbols().state_and_parameters());
 }
 
-MatrixXd ModelMotion::acceleration(const Eigen::Ref<const MatrixXd>& states) const {
-  const MechanicsBatch mechanics = require_mechanics(*system_, states, parameters_);
+MatrixXd ModelMotion::unconstrained(const Eigen::Ref<const MatrixXd>& states, const MechanicsBatch& mechanics) const {
   MatrixXd truth = MatrixXd::Zero(system_->nq(), states.cols()), truth_force = truth;
   if (truth_.n_outputs() > 0) truth_.evaluate(states, parameters_, truth);
   if (truth_force_.n_outputs() > 0) truth_force_.evaluate(states, parameters_, truth_force);
@@ -35,9 +35,37 @@ MatrixXd ModelMotion::acceleration(const Eigen::Ref<const MatrixXd>& states) con
           *system_, states,
           {i, "the mass matrix M is singular, so that [truth] acceleration cannot be added to M⁻¹F: write it as [truth] force"}));
     }
-    accelerations.col(i) = projection.constrain(projection.solve_mass(mechanics.values.F(i) + truth_force.col(i)) + truth.col(i));
+    accelerations.col(i) = projection.solve_mass(mechanics.values.F(i) + truth_force.col(i)) + truth.col(i);
   }
   return accelerations;
+}
+
+MatrixXd ModelMotion::unconstrained_acceleration(const Eigen::Ref<const MatrixXd>& states) const {
+  return unconstrained(states, require_mechanics(*system_, states, parameters_));
+}
+
+MatrixXd ModelMotion::acceleration(const Eigen::Ref<const MatrixXd>& states) const {
+  const MechanicsBatch mechanics = require_mechanics(*system_, states, parameters_);
+  MatrixXd accelerations = unconstrained(states, mechanics);
+  for (Eigen::Index i = 0; i < states.cols(); ++i) {
+    accelerations.col(i) = mechanics.projections[static_cast<std::size_t>(i)].constrain(accelerations.col(i));
+  }
+  return accelerations;
+}
+
+MatrixXd ModelMotion::multipliers(const Eigen::Ref<const MatrixXd>& states) const {
+  const MechanicsBatch mechanics = require_mechanics(*system_, states, parameters_);
+  const MatrixXd a_bar = unconstrained(states, mechanics);
+  MatrixXd multipliers(system_->nc(), states.cols());
+  QuantityKind::Workspace workspace;
+  for (int i = 0; i < static_cast<int>(states.cols()); ++i) {
+    const UdwadiaKalaba& projection = mechanics.projections[static_cast<std::size_t>(i)];
+    const Eigen::VectorXd ddq = projection.constrain(a_bar.col(i)), free = a_bar.col(i),
+                          force = mechanics.values.M(i) * ddq - projection.mass() * free;
+    Quantity::multipliers->evaluate({projection, mechanics.values.A(i)}, {columns_of(ddq), columns_of(free), columns_of(force)},
+                                    multipliers.col(i), workspace);
+  }
+  return multipliers;
 }
 
 MatrixXd true_acceleration(const Model& model, const Eigen::Ref<const MatrixXd>& states) {

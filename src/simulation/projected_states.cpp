@@ -2,6 +2,8 @@
 
 #include <algorithm>
 #include <cmath>
+#include <limits>
+#include <vector>
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
@@ -17,7 +19,34 @@ using Eigen::MatrixXd;
 using Eigen::Ref;
 using Eigen::VectorXd;
 
-ProjectedStates project_states(const System& system, const Ref<const VectorXd>& parameters, const Ref<const MatrixXd>& states) {
+namespace {
+
+// What stands for deviations that are not stated (2 nq): the spread of each entry, in proportion to those that are. An entry that
+// never changes is taken as the steadiest of its level that does.
+VectorXd usual_deviations(const Ref<const MatrixXd>& states, const MatrixXd& stddevs) {
+  const Index nq = states.rows() / 2;
+  VectorXd spreads = row_stddev(states);
+  spreads = spreads.array().isFinite().select(spreads, 0);
+  for (const Index first : {Index{0}, nq}) {
+    const auto level = spreads.segment(first, nq);
+    const double least = (level.array() > 0).select(level, std::numeric_limits<double>::infinity()).minCoeff();
+    for (Index k = first; k < first + nq; ++k) {
+      if (spreads[k] == 0) spreads[k] = std::isfinite(least) ? least : 1;
+    }
+  }
+  std::vector<double> ratios;
+  for (Index k = 0; k < stddevs.rows(); ++k) {
+    for (const double stddev : stddevs.row(k)) {
+      if (!std::isnan(stddev)) ratios.push_back(stddev / spreads[k]);
+    }
+  }
+  return ratios.empty() ? spreads : VectorXd(median(ratios) * spreads);
+}
+
+}  // namespace
+
+ProjectedStates project_states(const System& system, const Ref<const VectorXd>& parameters, const Ref<const MatrixXd>& states,
+                               const MatrixXd& stddevs) {
   const Index n_moving = 2 * static_cast<Index>(system.nq());
   ProjectedStates out{states, MatrixXd::Zero(n_moving, states.cols()), {}};
   const MatrixXd residuals = system.residuals(states, parameters);
@@ -30,7 +59,8 @@ ProjectedStates project_states(const System& system, const Ref<const VectorXd>& 
                     "cannot be projected onto it",
                     system.name(), label(k)));
   }
-  const ConstraintProjection projection(system, parameters);
+  ConstraintProjection projection(system, parameters);
+  const VectorXd usual = usual_deviations(states.topRows(n_moving), stddevs);
   VectorXd state;
   for (Index i = 0; i < states.cols(); ++i) {
     if (residuals.col(i).hasNaN()) {
@@ -41,6 +71,7 @@ ProjectedStates project_states(const System& system, const Ref<const VectorXd>& 
     }
     // what is not measured is read by nothing, but must not turn up in products with zero
     state = states.col(i).array().isNaN().select(0, states.col(i));
+    projection.weigh_by(stddevs.size() == 0 ? usual : VectorXd(stddevs.col(i).array().isNaN().select(usual, stddevs.col(i))));
     try {
       projection.apply(state);
     } catch (const Error& error) {
@@ -75,9 +106,9 @@ std::vector<Finding> check_states(const System& system, const Ref<const MatrixXd
   for (Index k = 0; k < residuals.rows(); ++k) {
     const System::Residual& label = system.residual_labels()[static_cast<std::size_t>(k)];
     const SizeSummary size = summarise_sizes(residuals.row(k).cwiseAbs());
-    findings.push_back(
-        {Level::good, fmt::format("off the {} constraint '{}' by {:.2g} in the median, {:.2g} at most (row {})",
-                                  label.velocity ? "velocity" : "position", label.text, size.median, size.largest, size.at + 1)});
+    findings.push_back({Level::warning, fmt::format("off the {} constraint '{}' by {:.2g} in the median, {:.2g} at most (row {})",
+                                                    label.velocity ? "velocity" : "position", label.text, size.median,
+                                                    size.largest, size.at + 1)});
   }
   const ProjectedStates projected = project_states(system, parameters, states);
   const std::vector<std::string> names = system.state_names();

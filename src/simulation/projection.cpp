@@ -56,24 +56,37 @@ bool ConstraintProjection::apply(VectorXd& state) const {
   return apply(velocity_, state) || moved;
 }
 
+MatrixXd ConstraintProjection::metric(const Level& level, const MatrixXd& M) const {
+  if (weights_.size() == 0) return M(level.free, level.free);
+  std::vector<int> entries = level.free;
+  for (int& entry : entries) entry += level.first;
+  return VectorXd(weights_(entries)).asDiagonal();
+}
+
 bool ConstraintProjection::apply(const Level& level, VectorXd& state) const {
   if (level.residuals.empty()) return false;
   const VectorXd before = state;
   if (!newton(level, state)) return false;
-  if (level.rows.size() < 2) return true;
+  const bool to_nearest = weights_.size() > 0;
+  if (level.rows.size() < 2 && !to_nearest) return true;
 
   // Of redundant rows the rank is right on the constraint only. Off it a row that should say nothing new moves the state along
-  // the constraint as well; that part is taken back: x ← x + T (x_before − x)
-  const SystemValues values = system_.evaluate(state, parameters_);
+  // the constraint as well; that part is taken back: x ← x + T (x_before − x). Repeated this leads to the nearest state, where
+  // the way back is across the constraint.
   const auto n_rows = static_cast<Index>(level.rows.size());
-  const UdwadiaKalaba here =
-      step_onto(values.M(0)(level.free, level.free), values.A(0)(level.rows, level.free), VectorXd::Zero(n_rows));
-  if (!here.motion_is_determined() || here.rank() == n_rows) return true;
   std::vector<int> entries = level.free;
   for (int& entry : entries) entry += level.first;
-  const VectorXd back = here.T() * (before(entries) - state(entries));
-  state(entries) += back;
-  newton(level, state);
+  constexpr int most_repetitions = 50;
+  constexpr double nearest = 1e-10;  // of the way to the constraint
+  for (int k = 0; k < (to_nearest ? most_repetitions : 1); ++k) {
+    const SystemValues values = system_.evaluate(state, parameters_);
+    const UdwadiaKalaba here = step_onto(metric(level, values.M(0)), values.A(0)(level.rows, level.free), VectorXd::Zero(n_rows));
+    if (!here.motion_is_determined() || (here.rank() == n_rows && !to_nearest)) return true;
+    const VectorXd way = before(entries) - state(entries), back = here.T() * way;
+    state(entries) += back;
+    newton(level, state);
+    if (back.norm() <= nearest * way.norm()) break;
+  }
   return true;
 }
 
@@ -104,7 +117,7 @@ bool ConstraintProjection::newton(const Level& level, VectorXd& state) const {
     if (level.free.empty()) fail(level, state);
     previous = off;
 
-    const UdwadiaKalaba step = step_onto(values.M(0)(level.free, level.free), A(Eigen::all, level.free), c);
+    const UdwadiaKalaba step = step_onto(metric(level, values.M(0)), A(Eigen::all, level.free), c);
     if (!step.motion_is_determined()) fail(level, state);
     for (std::size_t j = 0; j < level.free.size(); ++j) {
       state[level.first + level.free[j]] -= step.Lb()[static_cast<Index>(j)];

@@ -8,11 +8,16 @@
 
 namespace gp2 {
 
-/// Puts states onto the position constraints, then onto the velocity constraints, by Newton's method in the metric of M.
+/// Puts states onto the position constraints, then onto the velocity constraints, by Newton's method in the metric of M, or of
+/// measured states' deviations.
 class ConstraintProjection {
  public:
   /// @param held  entries of the state that stay as they are (layout size); none when empty
   ConstraintProjection(const System& system, Eigen::VectorXd parameters, const std::vector<bool>& held = {});
+
+  /// From now on states move to the nearest one on the constraints, each change of q or dq in units of its deviation.
+  /// @param stddevs  positive (2 nq)
+  void weigh_by(const Eigen::VectorXd& stddevs) { weights_ = stddevs.array().square().inverse(); }
 
   /// @return whether the state changed.
   /// @throws NumericalError, naming the time and the residual, when a residual is not brought to rounding.
@@ -31,11 +36,14 @@ class ConstraintProjection {
   };
   [[nodiscard]] Level level_of(bool velocity, const std::vector<bool>& held) const;
   bool apply(const Level& level, Eigen::VectorXd& state) const;
+  /// M, or the weights of measured states, between the entries of a level that may change.
+  [[nodiscard]] Eigen::MatrixXd metric(const Level& level, const Eigen::MatrixXd& M) const;
   bool newton(const Level& level, Eigen::VectorXd& state) const;
   [[noreturn]] void fail(const Level& level, const Eigen::VectorXd& state) const;
 
   const System& system_;
   Eigen::VectorXd parameters_;
+  Eigen::VectorXd weights_;  // of q and dq, in the place of M (2 nq); empty: M
   Level position_, velocity_;
 };
 

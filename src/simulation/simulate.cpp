@@ -4,6 +4,7 @@
 #include <chrono>
 #include <cmath>
 #include <limits>
+#include <numeric>
 #include <optional>
 #include <string>
 
@@ -15,6 +16,7 @@
 #include "gp2/mechanics/udwadia_kalaba.hpp"
 #include "gp2/simulation/model_motion.hpp"
 #include "simulation/projection.hpp"
+#include "simulation/switching.hpp"
 
 namespace gp2 {
 
@@ -38,6 +40,11 @@ struct StageFault {
   std::string text;
 };
 
+// an acceleration that is not of the system
+struct WrongSize {
+  Index size;
+};
+
 bool is_finite(const Phase& phase) {
   return std::all_of(phase.begin(), phase.end(), [](double x) { return std::isfinite(x); });
 }
@@ -49,11 +56,13 @@ class Integration {
         acceleration_(acceleration),
         options_(options),
         projection_(system, parameters),
+        switching_(options.switching, parameters, layout_, options.absolute_tolerance),
         stepper_(ErrorChecker(options.absolute_tolerance, options.relative_tolerance, 1, 0)),
         state_(VectorXd::Zero(layout_.size())) {}
 
   Trajectory run(const Ref<const VectorXd>& start, bool redundant) {
     project_stages_ = redundant;
+    if (redundant) switching_.put_onto([this](VectorXd& state) { projection_.apply(state); });
     const Index n = options_.times.size();
     out_.times = options_.times;
     out_.states.resize(layout_.size(), n);
@@ -61,17 +70,29 @@ class Integration {
     t_ = options_.times[0];
     x_.assign(start.begin(), start.begin() + layout_.t());  // t follows q and dq
     dxdt_.resize(x_.size());
-    derivative_or_throw();
-    write(0, x_, dxdt_);
+    Index next = 0;
+    try {
+      switch_or_throw([&] { switching_.start(state_, counted()); });
+      derivative_or_throw();
+      write(next++, t_, x_, dxdt_);
+      integrate(next);
+    } catch (const WrongSize& wrong) {
+      throw InputError(
+          fmt::format("simulate: the acceleration has {} entries, the system {} coordinates", wrong.size, layout_.nq));
+    } catch (const NumericalError& error) {
+      keep(next);
+      throw UnfinishedMotion(error.what(), {std::move(out_)});
+    }
+    return std::move(out_);
+  }
 
+ private:
+  // To the end; `next` is the time that is to be written next.
+  void integrate(Index& next) {
+    const Index n = options_.times.size();
     double step = options_.initial_step > 0 ? options_.initial_step : first_step();
-    Index next = 1;
     while (next < n) {
-      if (out_.steps + out_.rejected_steps >= options_.max_steps) {
-        throw NumericalError(fmt::format(
-            "simulate: {} steps reach no further than t = {:.6g} of {:.6g}: loosen the tolerances, or allow more steps",
-            options_.max_steps, t_, t_end()));
-      }
+      require_progress();
       // a step ends where an input has a kink, and at the end
       const double limit = std::min(options_.inputs.next_kink(t_), t_end());
       const bool to_limit = step >= limit - t_;
@@ -83,15 +104,62 @@ class Integration {
       }
       step = to_limit ? std::max(step, tried) : tried;
       if (to_limit) t_new = limit;
-      next = write_within(next, t_new);
-      advance(t_new);
-      if (next < n && options_.times[next] == t_new) write(next++, x_, dxdt_);
+      const std::optional<double> crossing = find_crossing(t_new);
+      write_within(next, crossing.value_or(t_new), t_new);
+      if (crossing) {
+        x_new_ = x_crossing_;
+        t_new = *crossing;
+      }
+      advance(t_new, crossing.has_value());
+      if (next < n && options_.times[next] == t_new) write(next++, t_, x_, dxdt_);
     }
-    return std::move(out_);
   }
 
- private:
+  // Leaves what was written, and the state that was reached.
+  void keep(Index next) {
+    if (next > 0 && t_ > options_.times[next - 1]) {
+      write(next, t_, x_, dxdt_);
+      out_.times[next++] = t_;
+    }
+    out_.times.conservativeResize(next);
+    out_.states.conservativeResize(Eigen::NoChange, next);
+    out_.accelerations.conservativeResize(Eigen::NoChange, next);
+    if (options_.record) out_.records.conservativeResize(Eigen::NoChange, next);
+  }
+
+  void require_progress() const {
+    if (out_.steps + out_.rejected_steps >= options_.max_steps) {
+      throw NumericalError(
+          fmt::format("simulate: {} steps reach no further than t = {:.6g} of {:.6g}: loosen the tolerances, or "
+                      "allow more steps (`max_steps`)",
+                      options_.max_steps, t_, t_end()));
+    }
+    constexpr int enough = 1000;
+    if (out_.steps == enough) require_resolved();
+  }
+  // an end at which doubles are farther apart than the steps so far
+  void require_resolved() const {
+    const double step = (t_ - options_.times[0]) / std::max(out_.steps, 1);
+    if (step > smallest_step() || step == 0) return;
+    throw NumericalError(
+        fmt::format("simulate: at t = {:.6g} the motion needs steps of {:.2g} s; the end, {:.6g}, is so far that times there are "
+                    "not told apart so well: let the motion end sooner",
+                    t_, step, t_end()));
+  }
+  static double resolution(double t) { return 16 * std::numeric_limits<double>::epsilon() * std::abs(t); }
+  [[nodiscard]] double smallest_step() const { return std::max(resolution(t_), resolution(t_end())); }
+
   [[nodiscard]] double t_end() const { return options_.times[options_.times.size() - 1]; }
+
+  // the acceleration, each call of which counts
+  [[nodiscard]] Acceleration counted() {
+    return [this](const Ref<const VectorXd>& state) -> VectorXd {
+      VectorXd ddq = acceleration_(state);
+      ++out_.evaluations;
+      if (ddq.size() != layout_.nq) throw WrongSize{ddq.size()};
+      return ddq;
+    };
+  }
 
   // [q; dq; t; u(t)] in state_
   void expand(const Phase& x, double t) {
@@ -114,14 +182,9 @@ class Integration {
     VectorXd ddq;
     try {
       if (project_stages_) projection_.apply(state_);
-      ddq = acceleration_(state_);
+      ddq = switching_.is_empty() ? counted()(state_) : switching_.acceleration(state_, counted());
     } catch (const Error& error) {
       throw StageFault{error.what()};
-    }
-    ++out_.evaluations;
-    if (ddq.size() != layout_.nq) {
-      throw InputError(
-          fmt::format("simulate: the acceleration has {} entries, the system {} coordinates", ddq.size(), layout_.nq));
     }
     if (!ddq.allFinite()) throw StageFault{"the acceleration is not a finite number"};
     std::copy_n(x.begin() + layout_.nq, layout_.nq, dxdt.begin());
@@ -159,8 +222,8 @@ class Integration {
   }
 
   void require_step(double step) const {
-    const double smallest = 16 * std::numeric_limits<double>::epsilon() * std::max(std::abs(t_), std::abs(t_end()));
-    if (step > smallest) return;
+    if (step > smallest_step()) return;
+    require_resolved();
     throw NumericalError(fmt::format("simulate: the step size fell to {:.2g} s at t = {:.6g}: {}", step, t_,
                                      fault_ ? fault_->text : "the tolerances cannot be met there"));
   }
@@ -192,10 +255,46 @@ class Integration {
     return std::min({100 * h0, h1, span});
   }
 
-  // the times before the end of the step, from its dense output
-  Index write_within(Index next, double t_new) {
+  // The first time in the step to t_new at which the motion has crossed a surface where the acceleration jumps, or is let go by
+  // one; x_crossing_ is the state then.
+  std::optional<double> find_crossing(double t_new) {
+    if (switching_.is_empty()) return std::nullopt;
+    x_crossing_.resize(x_.size());
+    const auto has_left = [&](double t, bool is_end) {
+      stepper_.stepper().calc_state(t, x_crossing_, x_, dxdt_, t_, x_new_, dxdt_new_, t_new);
+      expand(x_crossing_, t);
+      return switching_.has_crossed(state_) || (is_end && is_let_go());
+    };
+    constexpr int parts = 8;
+    double before = t_, after = t_;
+    for (int k = 1; k <= parts; ++k) {
+      before = k == parts ? t_ : after;  // whether the motion is let go is asked at the end alone
+      after = k == parts ? t_new : t_ + (t_new - t_) * k / parts;
+      if (has_left(after, k == parts)) break;
+      if (k == parts) return std::nullopt;
+    }
+    for (double middle = std::midpoint(before, after); before < middle && middle < after; middle = std::midpoint(before, after)) {
+      (has_left(middle, true) ? after : before) = middle;
+    }
+    has_left(after, true);
+    return after;
+  }
+
+  // whether a surface that the motion slides on does not hold it at state_
+  bool is_let_go() {
+    if (!switching_.is_sliding()) return false;
+    try {
+      if (project_stages_) projection_.apply(state_);
+      return switching_.is_let_go(state_, counted());
+    } catch (const Error&) {
+      return false;
+    }
+  }
+
+  // the times before `end`, from the dense output of the step to t_new
+  void write_within(Index& next, double end, double t_new) {
     Phase x(x_.size()), dxdt(x_.size());
-    for (; next < options_.times.size() && options_.times[next] < t_new; ++next) {
+    for (; next < options_.times.size() && options_.times[next] < end; ++next) {
       const double t = options_.times[next];
       stepper_.stepper().calc_state(t, x, x_, dxdt_, t_, x_new_, dxdt_new_, t_new);
       if (options_.project) project(x, t);
@@ -204,33 +303,60 @@ class Integration {
       } catch (const StageFault& fault) {
         throw NumericalError(fmt::format("simulate: no acceleration at t = {:.6g}: {}", t, fault.text));
       }
-      write(next, x, dxdt);
+      write(next, t, x, dxdt);
     }
-    return next;
   }
 
-  void advance(double t_new) {
+  void advance(double t_new, bool has_crossed) {
     std::swap(x_, x_new_);
     std::swap(dxdt_, dxdt_new_);
     t_ = t_new;
-    if (options_.project && project(x_, t_)) derivative_or_throw();
+    const bool switches = has_crossed || switching_.is_sliding();
+    if (switches) {
+      expand(x_, t_);
+      switching_.cross(state_);
+      switching_.hold(state_);
+      std::copy_n(state_.begin(), x_.size(), x_.begin());
+    }
+    const bool moved = options_.project && project(x_, t_);
+    if (switches) switch_or_throw([&] { switching_.settle(state_, counted()); });
+    if (moved || switches) derivative_or_throw();
   }
 
-  void write(Index row, const Phase& x, const Phase& dxdt) {
-    expand(x, options_.times[row]);
+  // at (x_, t_), whose state is in state_
+  template <typename Work>
+  void switch_or_throw(const Work& work) {
+    if (switching_.is_empty()) return;
+    expand(x_, t_);
+    try {
+      if (project_stages_) projection_.apply(state_);
+      work();
+    } catch (const Error& error) {
+      throw NumericalError(fmt::format("simulate: no acceleration at t = {:.6g}: {}", t_, error.what()));
+    }
+  }
+
+  // after the acceleration at the same state
+  void write(Index row, double t, const Phase& x, const Phase& dxdt) {
+    expand(x, t);
     out_.states.col(row) = state_;
     std::copy(dxdt.begin() + layout_.nq, dxdt.end(), out_.accelerations.col(row).begin());
+    if (!options_.record) return;
+    const VectorXd recorded = switching_.mixed(state_, options_.record);
+    if (out_.records.size() == 0) out_.records.resize(recorded.size(), options_.times.size());
+    out_.records.col(row) = recorded;
   }
 
   const StateLayout layout_;
   const Acceleration& acceleration_;
   const SimulateOptions& options_;
   const ConstraintProjection projection_;
+  Switching switching_;
   ControlledStepper stepper_;
   bool project_stages_ = false;
   VectorXd state_;  // scratch
   double t_ = 0;
-  Phase x_, dxdt_, x_new_, dxdt_new_;
+  Phase x_, dxdt_, x_new_, dxdt_new_, x_crossing_;
   std::optional<StageFault> fault_;  // of the last try
   Trajectory out_;
 };
@@ -249,6 +375,10 @@ void require_options(const SimulateOptions& options, const System& system) {
       throw InputError(fmt::format("simulate: {} must be positive, got {}", what, value));
   };
   require_positive("the relative tolerance", options.relative_tolerance);
+  if (options.relative_tolerance < least_relative_tolerance) {
+    throw InputError(fmt::format("simulate: the relative tolerance must be at least {}, near the rounding of doubles, got {}",
+                                 least_relative_tolerance, options.relative_tolerance));
+  }
   require_positive("the absolute tolerance", options.absolute_tolerance);
   if (!(options.initial_step >= 0) || !std::isfinite(options.initial_step)) {
     throw InputError(fmt::format("simulate: the initial step must not be negative, got {}", options.initial_step));
@@ -295,15 +425,24 @@ Trajectory simulate(const System& system, const VectorXd& parameters, const Acce
   if (options.project) projection.apply(state);
   const bool redundant = has_redundant_rows(system, parameters, projection, state);
 
-  Trajectory out = Integration(system, parameters, acceleration, options).run(state, redundant);
-  out.start_position_residual = position_residual;
-  out.start_velocity_residual = velocity_residual;
-  out.start_displacement = (state - start).head(2 * layout.nq).lpNorm<Eigen::Infinity>();
-  out.max_position_drift = projection.largest_residual(out.states, false);
-  out.max_velocity_drift = projection.largest_residual(out.states, true);
-  out.lower_rank = states_of_lower_rank(system, out.states, parameters);
-  out.seconds = std::chrono::duration<double>(std::chrono::steady_clock::now() - clock_start).count();
-  return out;
+  const auto report = [&](Trajectory& out) {
+    out.start_position_residual = position_residual;
+    out.start_velocity_residual = velocity_residual;
+    out.start_displacement = (state - start).head(2 * layout.nq).lpNorm<Eigen::Infinity>();
+    out.seconds = std::chrono::duration<double>(std::chrono::steady_clock::now() - clock_start).count();
+    if (out.times.size() == 0) return;
+    out.max_position_drift = projection.largest_residual(out.states, false);
+    out.max_velocity_drift = projection.largest_residual(out.states, true);
+    out.lower_rank = states_of_lower_rank(system, out.states, parameters);
+  };
+  try {
+    Trajectory out = Integration(system, parameters, acceleration, options).run(state, redundant);
+    report(out);
+    return out;
+  } catch (UnfinishedMotion& unfinished) {
+    report(unfinished.motions.front());
+    throw;
+  }
 }
 
 Acceleration model_acceleration(const Model& model) {

@@ -29,7 +29,8 @@ Eigen::VectorXd complete_start(const Model& model, const Eigen::VectorXd& parame
     if (start.given[static_cast<std::size_t>(k)]) continue;
     open.push_back(k);
     const auto newton_start = model.newton_start.find(names[static_cast<std::size_t>(k)]);
-    if (newton_start != model.newton_start.end()) start.state[k] = newton_start->second;
+    // an entry that is known from elsewhere is the better start
+    if (newton_start != model.newton_start.end() && start.state[k] == 0) start.state[k] = newton_start->second;
   }
   if (open.empty()) return start.state;
   Eigen::VectorXd state;

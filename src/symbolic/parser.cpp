@@ -44,8 +44,9 @@ std::size_t edit_distance(std::string_view a, std::string_view b) {
 /// Empty if none is near.
 template <class Names>
 std::string suggestion(std::string_view name, const Names& candidates) {
-  if (name.size() > 64) return "";
-  std::size_t nearest = (name.size() + 2) / 3, longest_start = 0;
+  if (name.empty() || name.size() > 64) return "";
+  // a name that shares nothing with it is none that was meant
+  std::size_t nearest = std::min((name.size() + 2) / 3, name.size() - 1), longest_start = 0;
   std::string_view best;
   for (const std::string_view candidate : candidates) {
     if (candidate.size() > 64) continue;
@@ -323,15 +324,25 @@ class Parser {
     constexpr std::string_view known = "+-*/^().,";
     if (known.find(peek()) != std::string_view::npos) return fmt::format("'{}'", peek());
     if (peek() == '=') fail(position_, "found '='; write an equation left = right as the expression left - (right)");
+    if (peek() == '<' || peek() == '>') {
+      fail(position_,
+           fmt::format("found '{}'; constraints that come and go are not supported: write the equation that holds as long "
+                       "as there is contact",
+                       peek()));
+    }
     if (peek() == '[' || peek() == '{') fail(position_, fmt::format("found '{}'; group with ( )", peek()));
     constexpr std::string_view allowed = "allowed are letters a-z A-Z, digits, _ and + - * / ^ ( ) , .";
     if (byte >= 0x80) {
       // one UTF-8 character: its first byte and those that continue it
       std::size_t stop = position_ + 1;
       while (stop < text_.size() && (static_cast<unsigned char>(text_[stop]) & 0xC0U) == 0x80U && stop < position_ + 4) ++stop;
-      fail(position_, byte >= 0xC2 && stop > position_ + 1 ? fmt::format("character '{}' has no meaning here; {}",
-                                                                         text_.substr(position_, stop - position_), allowed)
-                                                           : fmt::format("byte 0x{:02X} is not UTF-8 text; {}", byte, allowed));
+      const std::string_view character = text_.substr(position_, stop - position_);
+      if (character == "²" || character == "³") {
+        fail(position_, fmt::format("found '{}'; a power is written ^{}", character, character == "²" ? 2 : 3));
+      }
+      fail(position_, byte >= 0xC2 && stop > position_ + 1
+                          ? fmt::format("character '{}' has no meaning here; {}", character, allowed)
+                          : fmt::format("byte 0x{:02X} is not UTF-8 text; {}", byte, allowed));
     }
     if (byte < 0x20 || byte == 0x7F)
       fail(position_, fmt::format("control character 0x{:02X} has no meaning here; {}", byte, allowed));

@@ -19,6 +19,8 @@ using Eigen::VectorXd;
 
 namespace {
 
+bool is_stopped(const std::atomic<bool>* stop) { return stop != nullptr && stop->load(); }
+
 std::vector<int> free_ones(const std::vector<Hyperparameter>& hyperparameters) {
   std::vector<int> free;
   for (std::size_t k = 0; k < hyperparameters.size(); ++k) {
@@ -29,8 +31,9 @@ std::vector<int> free_ones(const std::vector<Hyperparameter>& hyperparameters) {
 
 class Differences {
  public:
-  Differences(const Objective& objective, const VectorXd& x, const std::vector<Hyperparameter>& hyperparameters)
-      : objective_(objective), x_(x), hyperparameters_(hyperparameters), free_(free_ones(hyperparameters)) {}
+  Differences(const Objective& objective, const VectorXd& x, const std::vector<Hyperparameter>& hyperparameters,
+              const std::atomic<bool>* stop)
+      : objective_(objective), x_(x), hyperparameters_(hyperparameters), stop_(stop), free_(free_ones(hyperparameters)) {}
 
   [[nodiscard]] const std::vector<int>& free() const { return free_; }
 
@@ -82,6 +85,7 @@ class Differences {
   }
 
   [[nodiscard]] VectorXd gradient_at(Index k, double distance, Likelihood::Workspace& workspace) const {
+    if (is_stopped(stop_)) throw NumericalError("stopped on request: no standard errors");
     VectorXd there = x_, gradient(x_.size());
     there[free_[static_cast<std::size_t>(k)]] += distance;
     if (!std::isfinite(objective_(there, &gradient, workspace))) {
@@ -94,6 +98,7 @@ class Differences {
   const Objective& objective_;
   const VectorXd& x_;
   const std::vector<Hyperparameter>& hyperparameters_;
+  const std::atomic<bool>* stop_;
   std::vector<int> free_;
 };
 
@@ -107,8 +112,8 @@ double Curvature::distance_from_optimum() const {
 }
 
 Curvature curvature_at(const Objective& objective, const VectorXd& x, const std::vector<Hyperparameter>& hyperparameters,
-                       int n_threads) {
-  const Differences differences(objective, x, hyperparameters);
+                       int n_threads, const std::atomic<bool>* stop) {
+  const Differences differences(objective, x, hyperparameters, stop);
   Curvature out;
   out.free = differences.free();
   Likelihood::Workspace workspace(n_threads);
@@ -128,14 +133,14 @@ Curvature curvature_at(const Objective& objective, const VectorXd& x, const std:
 }
 
 VectorXd scales_of_parameters(const Objective& objective, const VectorXd& x, const std::vector<Hyperparameter>& hyperparameters,
-                              Likelihood::Workspace& workspace) {
+                              const std::atomic<bool>* stop, Likelihood::Workspace& workspace) {
   VectorXd scales = VectorXd::Ones(x.size());
   VectorXd gradient = VectorXd::Zero(x.size()), gradient_there = gradient;
   if (std::none_of(hyperparameters.begin(), hyperparameters.end(), [](const auto& h) { return h.is_system_parameter(); })) {
     return scales;
   }
-  if (!std::isfinite(objective(x, &gradient, workspace))) return scales;
-  for (Index k = 0; k < x.size(); ++k) {
+  if (is_stopped(stop) || !std::isfinite(objective(x, &gradient, workspace))) return scales;
+  for (Index k = 0; k < x.size() && !is_stopped(stop); ++k) {
     const Hyperparameter& h = hyperparameters[static_cast<std::size_t>(k)];
     if (!h.is_system_parameter()) continue;
     constexpr double step = 1e-5;  // of the box, away from the nearer bound

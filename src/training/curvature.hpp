@@ -1,5 +1,6 @@
 #pragma once
 
+#include <atomic>
 #include <vector>
 
 #include <Eigen/Core>
@@ -31,15 +32,17 @@ struct Curvature {
 
 /// H by differences of the exact gradient: two evaluations for each free hyperparameter, six for each θ. The results do not
 /// depend on n_threads.
-/// @throws NumericalError when the objective is not finite about x
+/// @param stop  where it is given, and set: no further evaluation is begun
+/// @throws NumericalError when the objective is not finite about x, or on a stop
 Curvature curvature_at(const Objective& objective, const Eigen::VectorXd& x, const std::vector<Hyperparameter>& hyperparameters,
-                       int n_threads);
+                       int n_threads, const std::atomic<bool>* stop = nullptr);
 
 LaplaceUncertainty laplace_uncertainty(const Curvature& curvature, const std::vector<Hyperparameter>& hyperparameters);
 
 /// For the optimiser, whose steps stall where curvatures differ much: 1/√|∂²J/∂x_k²| of each θ, by a difference, and 1 for the
-/// others, which are logarithms.
+/// others, which are logarithms. Also 1 from when it is stopped on.
 Eigen::VectorXd scales_of_parameters(const Objective& objective, const Eigen::VectorXd& x,
-                                     const std::vector<Hyperparameter>& hyperparameters, Likelihood::Workspace& workspace);
+                                     const std::vector<Hyperparameter>& hyperparameters, const std::atomic<bool>* stop,
+                                     Likelihood::Workspace& workspace);
 
 }  // namespace gp2

@@ -7,6 +7,7 @@
 #include <fmt/format.h>
 
 #include "gp2/error.hpp"
+#include "training/constraint_parameters.hpp"
 
 namespace gp2 {
 
@@ -142,11 +143,11 @@ Hyperparameter noise_hyperparameter(const Observations& observations, std::size_
   return h;
 }
 
-void add_noise(const System& system, const std::vector<Observations>& observations, const Scales& scales,
-               const Protocol& protocol, std::vector<Hyperparameter>& out) {
+void add_noise(const Prior& prior, const std::vector<Observations>& observations, const Scales& scales, const Protocol& protocol,
+               std::vector<Hyperparameter>& out) {
   for (std::size_t g = 0; g < observations.size(); ++g) {
     if (!observations[g].noise().is_estimated()) continue;
-    const std::vector<std::string> names = observations[g].view().names(system);
+    const std::vector<std::string> names = observations[g].view().names(*prior_of(prior, observations[g].view()).system);
     for (std::size_t k = 0; k < names.size(); ++k) {
       const double spread = scales.output_stddev[g][static_cast<Index>(k)];
       out.push_back(noise_hyperparameter(observations[g], g, k, names[k], spread, protocol));
@@ -215,8 +216,9 @@ std::vector<Hyperparameter> default_hyperparameters(const Prior& prior, const st
   const Scales scales = default_scales(prior, observations);
   std::vector<Hyperparameter> out;
   add_latents(prior, scales, protocol, out);
-  add_noise(*prior.system, observations, scales, protocol, out);
+  add_noise(prior, observations, scales, protocol, out);
   for (const std::string& name : estimated) out.push_back(parameter_hyperparameter(prior, name, protocol));
+  if (protocol.name != Protocol::Name::paper) weigh_by_residuals(prior, observations, out);
   return out;
 }
 

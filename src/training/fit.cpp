@@ -14,6 +14,7 @@
 #include "base/random.hpp"
 #include "gp2/error.hpp"
 #include "gp2/fit.hpp"
+#include "inference/requirements.hpp"
 #include "training/curvature.hpp"
 #include "training/lbfgsb.hpp"
 #include "training/objective.hpp"
@@ -111,7 +112,8 @@ class Training {
   // A parameter that data know to a millionth of its box bends the objective 10¹² times as much as a lengthscale, and
   // quasi-Newton steps stall: the optimiser sees it in units of what is known of it.
   LbfgsbResult optimise(int restart, const std::vector<Hyperparameter>& from, Likelihood::Workspace& workspace) {
-    return optimise(restart, from, scales_of_parameters(objective_, coordinates(from), from, workspace), workspace);
+    return optimise(restart, from, scales_of_parameters(objective_, coordinates(from), from, options_.stop, workspace),
+                    workspace);
   }
 
   LbfgsbResult optimise(int restart, const std::vector<Hyperparameter>& from, const VectorXd& scales,
@@ -145,10 +147,11 @@ class Training {
       Likelihood::Workspace workspace(n_threads_);
       for (int attempt = 0;; ++attempt) {
         const std::vector<Hyperparameter>& at = results_[from];
-        const Curvature curvature = curvature_at(objective_, coordinates(at), at, n_side_by_side_);
+        const Curvature curvature = curvature_at(objective_, coordinates(at), at, n_side_by_side_, options_.stop);
         const bool may_go_on = attempt < n_attempts && reports_[from].iterations < options_.max_iterations && !stopped();
         if (curvature.distance_from_optimum() <= near || !may_go_on) {
           uncertainty_ = laplace_uncertainty(curvature, at);
+          restore_undetermined(from, workspace);
           return;
         }
         VectorXd scales = VectorXd::Ones(static_cast<Index>(at.size()));
@@ -159,6 +162,21 @@ class Training {
     } catch (const NumericalError& error) {
       // the fit stands, and says why it has none
       reports_[from].termination += fmt::format("; {}", error.what());
+    }
+  }
+
+  // Parameters that the data do not determine keep their starting values, not those where chance left them, unless these fit worse:
+  // of those that are known together only one alone is not free.
+  void restore_undetermined(std::size_t from, Likelihood::Workspace& workspace) {
+    std::vector<Hyperparameter> restored = results_[from];
+    for (std::size_t k = 0; k < restored.size(); ++k) {
+      if (restored[k].is_system_parameter() && std::isinf(uncertainty_->stddev[static_cast<Index>(k)])) {
+        restored[k].value = hyperparameters_[k].value;
+      }
+    }
+    const double objective = reports_[from].objective;
+    if (objective_(coordinates(restored), nullptr, workspace) <= objective + 1e-9 * (1 + std::abs(objective))) {
+      results_[from] = std::move(restored);
     }
   }
 
@@ -243,8 +261,11 @@ class Training {
     if (at_zero.empty() || stopped() || reports_[from].iterations >= options_.max_iterations) return;
     constexpr int n_draws = 4;
     constexpr double share = 0.1;  // of its size
-    std::vector<LbfgsbResult> drawn(n_draws);
+    LbfgsbResult not_begun;
+    not_begun.value = std::numeric_limits<double>::infinity();
+    std::vector<LbfgsbResult> drawn(n_draws, not_begun);
     parallel_for(n_draws, n_side_by_side_, [&](int draw, int) {
+      if (stopped()) return;
       RandomStream random(options_.seed, static_cast<std::uint64_t>(n_restarts() + draw));
       std::vector<Hyperparameter> start = results_[from];
       for (Hyperparameter& h : start) {
@@ -291,11 +312,39 @@ class Training {
   std::chrono::steady_clock::time_point start_ = std::chrono::steady_clock::now();
 };
 
+void require_options(const FitOptions& options) {
+  const auto require = [](const char* name, auto got, auto least) {
+    if (!(got >= least)) throw InputError(fmt::format("fit: {} must be at least {}, got {}", name, least, got));
+  };
+  require("n_restarts", options.n_restarts, 1);
+  require("max_iterations", options.max_iterations, 0);
+  require("n_threads", options.n_threads, 0);
+  require("max_side_by_side", options.max_side_by_side, 0);
+  require("gradient_tolerance", options.gradient_tolerance, 0.0);
+  require("reduction_tolerance", options.reduction_tolerance, 0.0);
+  require("max_escapes", options.max_escapes, 0);
+}
+
+void require_starts(const std::vector<Hyperparameter>& hyperparameters) {
+  constexpr double rounding = 1e-9;
+  for (const Hyperparameter& h : hyperparameters) {
+    const double tolerance = rounding * (h.positive ? h.value : h.upper - h.lower);
+    if (h.value >= h.lower - tolerance && h.value <= h.upper + tolerance) continue;
+    throw InputError(
+        fmt::format("hyperparameter '{}' starts at {}, outside its bounds [{}, {}]", h.name, h.value, h.lower, h.upper));
+  }
+}
+
 }  // namespace
 
 Fit fit(const Prior& prior, const std::vector<Observations>& observations, const std::vector<Hyperparameter>& hyperparameters,
         const FitOptions& options) {
   const auto start = std::chrono::steady_clock::now();
+  require_options(options);
+  require_observations(prior, observations);
+  require_measured(observations, "fit");
+  require_hyperparameters(prior, observations, hyperparameters);
+  require_starts(hyperparameters);
   Training training(prior, observations, hyperparameters, options);
   training.run();
   const std::size_t best = training.best();

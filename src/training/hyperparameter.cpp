@@ -3,10 +3,15 @@
 #include <algorithm>
 #include <cmath>
 
+#include <fmt/format.h>
+
+#include "gp2/error.hpp"
+
 namespace gp2 {
 
 using Eigen::Index;
 using Eigen::VectorXd;
+using Kind = Hyperparameter::Kind;
 
 double CoordinateMap::coordinate(double value) const { return is_logarithm ? std::log(value) : (value - origin) / unit; }
 
@@ -109,8 +114,79 @@ CoordinateMap Hyperparameter::map() const {
 
 double Hyperparameter::value_at(double x) const { return std::clamp(map().value(x), lower, upper); }
 
+namespace {
+
+// how many indices its kind has at its owner; −1 where there is no such owner
+Index n_places(const Hyperparameter& h, const Prior& prior, const std::vector<Observations>& observations) {
+  const auto of = static_cast<std::size_t>(h.owner);
+  const bool is_noise = h.kind == Kind::noise_stddev;
+  if (h.kind == Kind::parameter) return std::ssize(prior.system->parameters());
+  if (h.owner < 0 || of >= (is_noise ? observations.size() : prior.latents.size())) return -1;
+  if (is_noise) return observations[of].view().size();
+  const Latent& latent = prior.latents[of];
+  switch (h.kind) {
+    case Kind::kernel:
+      return std::ssize(latent.kernel.parameters());
+    case Kind::signal_stddev:
+      return latent.size();
+    case Kind::shared_signal_stddev:
+      return h.column_scale.size() == latent.size() ? 1 : -1;
+    case Kind::loading:
+      return latent.free_loading ? Index{latent.size()} * *latent.free_loading : 0;
+    default:
+      return -1;
+  }
+}
+
+bool is_possible(const Hyperparameter& h, double value) { return std::isfinite(value) && (!h.positive || value > 0); }
+
+// each has a place in the model, and a value for it
+void require_places(const Prior& prior, const std::vector<Observations>& observations,
+                    const std::vector<Hyperparameter>& hyperparameters) {
+  require_prior(prior);
+  for (const Hyperparameter& h : hyperparameters) {
+    const Index n = n_places(h, prior, observations);
+    if (h.index < 0 || h.index >= n) {
+      throw InputError(fmt::format(
+          "hyperparameter '{}' belongs to nothing of this prior and these observations: was it made for others?", h.name));
+    }
+    if (is_possible(h, h.value)) continue;
+    throw InputError(fmt::format("hyperparameter '{}': its value must be finite{}, got {}", h.name,
+                                 h.positive ? " and positive" : "", h.value));
+  }
+}
+
+void require_bounds(const Hyperparameter& h) {
+  // in a box without width only a logarithm has a coordinate
+  const bool in_order = h.positive || h.size > 0 ? h.lower <= h.upper : h.lower < h.upper;
+  if (in_order && is_possible(h, h.lower) && is_possible(h, h.upper)) return;
+  throw InputError(fmt::format("hyperparameter '{}': its bounds must be finite{}, the lower one below the upper, got [{}, {}]",
+                               h.name, h.positive ? " and positive" : "", h.lower, h.upper));
+}
+
+void require_hyperprior(const Hyperparameter& h) {
+  const HyperPrior& prior = h.hyperprior;
+  if (prior.form == HyperPrior::Form::none) return;
+  const bool has_median = std::isfinite(prior.median) && (prior.form == HyperPrior::Form::normal || prior.median > 0);
+  if (prior.stddev > 0 && has_median) return;
+  throw InputError(fmt::format("hyperparameter '{}': its hyper-prior has the median {} and the deviation {}", h.name,
+                               prior.median, prior.stddev));
+}
+
+}  // namespace
+
+void require_hyperparameters(const Prior& prior, const std::vector<Observations>& observations,
+                             const std::vector<Hyperparameter>& hyperparameters) {
+  require_places(prior, observations, hyperparameters);
+  for (const Hyperparameter& h : hyperparameters) {
+    require_bounds(h);
+    require_hyperprior(h);
+  }
+}
+
 ModelValues model_values(const Prior& prior, const std::vector<Observations>& observations,
                          const std::vector<Hyperparameter>& hyperparameters) {
+  require_places(prior, observations, hyperparameters);
   ModelValues values;
   for (const Latent& latent : prior.latents) {
     values.kernel.emplace_back(VectorXd::Ones(static_cast<Index>(latent.kernel.parameters().size())));

@@ -7,8 +7,10 @@
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
+#include "base/decompositions.hpp"
 #include "base/lapack.hpp"
 #include "base/parallel.hpp"
+#include "inference/requirements.hpp"
 #include "training/curvature.hpp"
 
 namespace gp2 {
@@ -57,6 +59,8 @@ LaplaceUncertainty laplace_uncertainty(const Curvature& curvature, const std::ve
 
 LaplaceUncertainty laplace_uncertainty(const Prior& prior, const std::vector<Observations>& observations,
                                        const std::vector<Hyperparameter>& hyperparameters, int n_threads) {
+  require_observations(prior, observations);
+  require_hyperparameters(prior, observations, hyperparameters);
   const lapack::SingleThread single_thread;
   const Objective objective(prior, observations, hyperparameters);
   return laplace_uncertainty(curvature_at(objective, coordinates(hyperparameters), hyperparameters, thread_count(n_threads)),
@@ -107,18 +111,23 @@ void note_open_parameters(const std::vector<Hyperparameter>& fitted, const Lapla
     open.push_back(k);
     names.push_back(fitted[static_cast<std::size_t>(k)].name);
   }
-  std::vector<Index> combinations;
-  for (Index c = 0; c < uncertainty.undetermined.cols() && !open.empty(); ++c) {
-    if (uncertainty.undetermined.col(c)(open).cwiseAbs().maxCoeff() > 1e-6) combinations.push_back(c);
-  }
-  const auto n_open = static_cast<int>(open.size()), n_combinations = static_cast<int>(combinations.size());
+  if (open.empty()) return;
+  // what the combinations change of these parameters; they may differ in other hyperparameters only
+  MatrixXd changes = MatrixXd::Zero(uncertainty.undetermined.rows(), uncertainty.undetermined.cols());
+  changes(open, Eigen::all) = uncertainty.undetermined(open, Eigen::all);
+  const Eigen::JacobiSVD<MatrixXd> svd(changes, Eigen::ComputeThinU);
+  const auto n_open = static_cast<int>(open.size()),
+             n_combinations = static_cast<int>((svd.singularValues().array() > 1e-6).count());
   if (n_open == 1) {
     notes.push_back(
         {true, fmt::format("the data do not determine {}", names[0]), "Hold it at a known value, or give it a prior"});
+  } else if (n_combinations == n_open) {
+    notes.push_back({true, fmt::format("the data determine none of {}", fmt::join(names, ", ")),
+                     "Hold them at known values, or give them priors"});
   } else if (n_combinations == 1) {
     notes.push_back({true,
                      fmt::format("the data determine {} only together: changing {} at once fits as well", fmt::join(names, ", "),
-                                 changes_along(fitted, open, uncertainty.undetermined.col(combinations[0]))),
+                                 changes_along(fitted, open, svd.matrixU().col(0))),
                      "Hold one of them at a known value, or give it a prior"});
   } else if (n_combinations > 1) {
     notes.push_back({true,
@@ -126,6 +135,22 @@ void note_open_parameters(const std::vector<Hyperparameter>& fitted, const Lapla
                                  n_combinations),
                      fmt::format("Hold {} of them at known values, or give them priors", n_combinations)});
   }
+}
+
+// Parameters of which the data say no more than their hyper-priors do.
+void note_silent_parameters(const std::vector<Hyperparameter>& fitted, const LaplaceUncertainty& uncertainty,
+                            const std::vector<int>& parameters, std::vector<UncertaintyNote>& notes) {
+  std::vector<std::string> names;
+  for (const int k : parameters) {
+    const Hyperparameter& h = fitted[static_cast<std::size_t>(k)];
+    if (h.hyperprior.form != HyperPrior::Form::normal || uncertainty.stddev[k] < 0.999 * h.hyperprior.stddev) continue;
+    names.push_back(h.name);
+  }
+  if (names.empty()) return;
+  notes.push_back(
+      {false, fmt::format("the accelerations say nothing of {}", fmt::join(names, ", ")),
+       "The value is that of its prior, or what the constraints say of the logged states; where these are silent too, "
+       "the one it started from"});
 }
 
 // Pairs that the data hardly tell apart.
@@ -157,6 +182,7 @@ std::vector<UncertaintyNote> uncertainty_notes(const FitReport& report) {
   std::vector<UncertaintyNote> notes;
   note_distance(report.uncertainty->distance_from_optimum, notes);
   note_open_parameters(fitted, *report.uncertainty, parameters, notes);
+  note_silent_parameters(fitted, *report.uncertainty, parameters, notes);
   note_pairs(fitted, *report.uncertainty, parameters, notes);
   return notes;
 }

@@ -8,6 +8,11 @@
 #include <set>
 #include <tuple>
 
+#include <fmt/format.h>
+
+#include "gp2/error.hpp"
+#include "inference/requirements.hpp"
+
 namespace gp2 {
 
 using Eigen::Index;
@@ -118,22 +123,25 @@ class Search {
          const RobustOptions& robust)
       : prior_(prior), observations_(observations), options_(options), robust_(robust) {}
 
-  /// Fits until the choice stays.
+  /// Fits until the choice stays. Stopped on request, the best is that so far.
   void run(Choice choice, std::vector<Hyperparameter> start, const FitOptions& options) {
-    for (int round = 0; round < robust_.max_rounds && (round == 0 || !stopped()); ++round) {
+    for (int round = 0; round < robust_.max_rounds && (!best_ || !stopped()); ++round) {
       Fit fitted = fit(prior_, choice.observations, start, options);
       start = fitted.report.hyperparameters;
-      Choice next = choose(observations_, fitted.posterior, robust_.threshold);
-      const bool is_settled = next.values() == choice.values();
+      std::optional<Choice> next;
+      if (!stopped()) next = choose(observations_, fitted.posterior, robust_.threshold);
       fitted.report.distrusted = choice.distrusted;
       const double cost = fitted.report.objective + price() * static_cast<double>(choice.distrusted.size());
       if (cost < lowest_cost_) {
         lowest_cost_ = cost;
         best_ = std::move(fitted);
       }
-      if (is_settled) return;
-      choice = std::move(next);
+      if (!next || next->values() == choice.values()) break;
+      choice = std::move(*next);
     }
+    if (!stopped()) return;
+    best_->report.converged = false;
+    best_->report.termination = FitReport::interrupted;
   }
 
   [[nodiscard]] const Fit& best() const { return *best_; }
@@ -168,6 +176,13 @@ MatrixXd without_gross_errors(const MatrixXd& values) { return without_far_value
 
 Fit fit_robust(const Prior& prior, const std::vector<Observations>& observations,
                const std::vector<Hyperparameter>& hyperparameters, const FitOptions& options, const RobustOptions& robust) {
+  require_observations(prior, observations);
+  require_hyperparameters(prior, observations, hyperparameters);
+  if (!(robust.threshold > 0)) {
+    throw InputError(fmt::format("fit_robust: threshold must be positive, got {}", robust.threshold));
+  }
+  if (robust.max_rounds < 1)
+    throw InputError(fmt::format("fit_robust: max_rounds must be at least 1, got {}", robust.max_rounds));
   FitOptions quick = options;
   quick.n_restarts = 1;
   quick.max_escapes = 0;

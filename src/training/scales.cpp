@@ -4,6 +4,7 @@
 
 #include "gp2/base/statistics.hpp"
 #include "gp2/training/default_hyperparameters.hpp"
+#include "inference/requirements.hpp"
 
 namespace gp2 {
 
@@ -30,6 +31,7 @@ double usable(double spread, double fallback) { return spread > 0 && std::isfini
 
 // of what is measured
 VectorXd size_of_rows(const Eigen::Ref<const MatrixXd>& values) {
+  if (values.cols() == 0) return VectorXd::Zero(values.rows());
   return values.array().isNaN().select(0, values).cwiseAbs().rowwise().maxCoeff();
 }
 
@@ -104,9 +106,9 @@ PooledStates pooled_states(const Prior& prior, const std::vector<Observations>& 
     const Prior& there = prior_of(prior, group.view());
     const VectorXd parameters = parameters_of(group.view(), system.parameter_values());
     const MechanicsBatch mechanics = require_mechanics(there, group.view(), group.states(), parameters);
-    PriorValues values = evaluate_prior(there, group.states(), parameters, mechanics);
+    PriorValues values = require_prior_values(there, group.states(), parameters, mechanics);
     for (std::size_t a = 0; a < prior.latents.size(); ++a) {
-      features[a].push_back(evaluate_features(there.latents[a], group.states()).transpose());
+      features[a].push_back(evaluate_features(there, a, group.states()).transpose());
       directions[a].push_back(std::move(values.directions[a]));
     }
     for (std::size_t j = 0; j < mass.size(); ++j) {
@@ -162,6 +164,8 @@ VectorXd output_scales(const Observations& group, const VectorXd& sigma) {
 }  // namespace
 
 Scales default_scales(const Prior& prior, const std::vector<Observations>& observations) {
+  require_observations(prior, observations);
+  require_measured(observations, "default_scales");
   const PooledStates pooled = pooled_states(prior, observations);
   Scales scales;
   scales.acceleration_stddev = coordinate_scales(*prior.system, observations, pooled.mass_diagonal);

@@ -111,6 +111,53 @@ const std::vector<BadInput> bad_inputs = {
      }),
      fit_line,
      {"train.csv:1", "not separated by commas but by ';'"}},
+    {"LogInUtf16",
+     log_with([](const std::string& log) {
+       std::string wide = "\xff\xfe";
+       for (const char c : log) wide += {c, '\0'};
+       return wide;
+     }),
+     fit_line,
+     {"train.csv: the text is UTF-16; save it as UTF-8"}},
+    {"LogCompressed",
+     log_with([](const std::string& log) { return "\x1f\x8b\x08" + log; }),
+     fit_line,
+     {"train.csv: the file is compressed by gzip; unpack it first"}},
+    {"LogASpreadsheet",
+     log_with([](const std::string& log) { return "PK\x03\x04" + log; }),
+     fit_line,
+     {"train.csv: the file is a ZIP archive, as spreadsheets are; export it as CSV"}},
+    {"LogOfAnOldMac",
+     log_with([](std::string log) {
+       std::replace(log.begin(), log.end(), '\n', '\r');
+       return log;
+     }),
+     fit_line,
+     {"train.csv:1: lines end in a carriage return alone", "tr '\\r' '\\n'"}},
+    {"ModelInUtf16",
+     [](const Desk& desk) { desk.write("model.toml", "\xff\xfe" + desk.read("model.toml")); },
+     fit_line,
+     {"model.toml: the text is UTF-16"}},
+    {"ACoordinateThatIsAColumnOfAnother",
+     [](const Desk& desk) {
+       desk.write("model.toml",
+                  "coordinates = [\"x\", \"x_std\"]\n[mechanics]\nmass = [[1, 0], [0, 1]]\nforce = [\"0\", \"0\"]\n");
+     },
+     "gp2 check model.toml",
+     {"model.toml:1: coordinates: the column x_std would be a name of this model and what logs and predictions call a quantity "
+      "of 'x'"}},
+    {"SeedTooLarge",
+     nothing,
+     fit_line + " --seed 18446744073709551616",
+     {"--seed", "must be below 2^64, got 18446744073709551616"}},
+    {"GenerateInfiniteNoise",
+     nothing,
+     "gp2 generate model.toml --n 5 --noise-std inf -o old.csv",
+     {"--noise-std: must be finite, got inf"}},
+    {"OutputThroughALinkToNowhere",
+     [](const Desk& desk) { std::filesystem::create_symlink("absent/target.csv", desk / "link.csv"); },
+     "gp2 predict fit.json --states train.csv -o link.csv",
+     {"link.csv: cannot be written: No such file or directory"}},
     {"LogAbsent", nothing, "gp2 fit model.toml --data absent.csv -o old.json", {"absent.csv: cannot be read"}},
     // options
     {"NoiseTooSmall", nothing, fit_line + " --noise-std 1e-12", {"--noise-std", "1e-12", "too small", "smallest usable value"}},
@@ -218,6 +265,48 @@ TEST_P(BadInputTo, IsRefusedWithItsPlaceAndItsMend) {
 }
 
 INSTANTIATE_TEST_SUITE_P(TheCommand, BadInputTo, testing::ValuesIn(bad_inputs), [](const auto& one) { return one.param.name; });
+
+TEST(Edges, ALinkLeadsToTheFileThatIsMade) {
+  const Desk desk;
+  std::filesystem::create_directory(desk / "there");
+  std::filesystem::create_symlink("there/log.csv", desk / "link.csv");
+  std::filesystem::create_symlink("link.csv", desk / "chain.csv");
+  desk.done("gp2 generate models/surface.toml --n 5 -o chain.csv");
+  EXPECT_TRUE(std::filesystem::is_symlink(desk / "link.csv"));
+  EXPECT_TRUE(std::filesystem::is_symlink(desk / "chain.csv"));
+  EXPECT_EQ(desk.table("there/log.csv").n_rows(), 5);
+}
+
+TEST(Edges, AnAtSignMayBePartOfAPath) {
+  const Desk desk;
+  std::filesystem::create_directory(desk / "me@home");
+  desk.write("me@home/model.toml", desk.read("models/surface.toml"));
+  desk.done("gp2 generate models/surface.toml --n 10 -o me@home/log.csv");
+  for (const char* data : {"me@home/log.csv", "me@home/log.csv@models/surface.toml", "me@home/log.csv@me@home/model.toml"}) {
+    desk.done(std::string("gp2 fit models/surface.toml --max-iterations 0 -o fit.json --data ") + data);
+  }
+  const Outcome absent =
+      desk.run("gp2 fit models/surface.toml --max-iterations 0 -o fit.json --data me@home/log.csv@absent.toml");
+  EXPECT_THAT(absent.err, HasSubstr("absent.toml: cannot be read"));
+}
+
+TEST(Edges, AReportShowsNumbersBelowTheNormalOnes) {
+  const Desk desk;
+  std::string log = "q1,q2,q3,dq1,dq2,dq3,u1,u2,u3,ddq1,ddq2,ddq3\n";
+  desk.done("gp2 generate models/surface.toml --n 10 -o train.csv");
+  const CsvTable table = desk.table("train.csv");
+  for (int row = 0; row < table.n_rows(); ++row) {
+    for (int column = 0; column < table.n_columns(); ++column) {
+      // one velocity is as small as a number can be
+      const bool is_tiny = row == 0 && table.header()[static_cast<std::size_t>(column)] == "dq1";
+      const std::string cell = is_tiny ? "4e-320" : table.cell(row, column);
+      log += cell + (column + 1 < table.n_columns() ? "," : "\n");
+    }
+  }
+  desk.write("tiny.csv", log);
+  desk.done("gp2 fit models/surface.toml --data tiny.csv --max-iterations 0 -o fit.json");
+  desk.done("gp2 report fit.json -o report.html");
+}
 
 /// A mass that is negative where q1 is.
 constexpr const char* variable_mass = R"(

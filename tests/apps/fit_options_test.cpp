@@ -78,6 +78,19 @@ TEST_F(FitCommand, IsNotLostWhenItCannotBeWritten) {
   EXPECT_THAT(full.out, HasSubstr("lengthscale(q1)"));
 }
 
+TEST_F(FitCommand, IsRefusedUnderALimitOfMemoryInsteadOfWaitingForEver) {
+#if defined(__SANITIZE_ADDRESS__) || defined(__SANITIZE_THREAD__)
+  GTEST_SKIP() << "a sanitizer maps more than any limit";
+#endif
+  // what OpenBLAS maps grows with its threads
+  const std::string limited = "ulimit -v 300000; export OPENBLAS_NUM_THREADS=2; ";
+  if (desk.run(limited + "gp2 --version").status != 0) GTEST_SKIP() << "the command does not load within this limit here";
+  const Outcome outcome = desk.run(limited + "timeout -s KILL 60 gp2 fit models/surface.toml --data train.csv -o fit.json");
+  EXPECT_EQ(outcome.status, 2) << outcome.err;
+  EXPECT_TRUE(outcome.said("which the system does not give however few rows there are: raise the limit (ulimit -v)"))
+      << outcome.err;
+}
+
 TEST_F(FitCommand, TellsWhatItWasAskedAndTheFileDoesToo) {
   const nlohmann::json report = short_fit("--mean force --observe ddq1,ddq3 --noise-std 0.2 --seed 7 --estimate none");
   const nlohmann::json expected = {{"discrepancy", "default"},

@@ -64,10 +64,8 @@ TEST(MasslessRod, HasNoUnconstrainedAccelerationAndTheErrorsSaySo) {
   EXPECT_THAT(refused("fit " + rod + " --data log.csv --prior acceleration -o out.json"),
               AllOf(HasSubstr("log.csv: data row 1: the mass matrix M is singular"),
                     HasSubstr("the latent 'unknown force' acts on the unconstrained acceleration ā: let it act on forces")));
-  EXPECT_THAT(
-      refused("fit " + rod + " --data log.csv --baseline se -o out.json"),
-      HasSubstr(
-          "log.csv: data row 1: the mass matrix M is singular, and without constraints nothing determines ddq along theta"));
+  // a baseline has no mechanics
+  desk.done("gp2 fit " + rod + " --data log.csv --baseline se -o baseline.json");
   desk.write("loose.toml", test::replaced(desk.read(rod), "\"x - l*sin(theta)\", \"z + l*cos(theta)\"", "\"x - 0.1*theta^2\""));
   desk.write("rigid.toml", test::replaced(desk.read(rod), "directions = \"force\"", "directions = \"acceleration\""));
   EXPECT_THAT(refused("check rigid.toml --data log.csv"),

@@ -419,7 +419,7 @@ std::string small_arm(const std::string& text) {
   std::string small = replaced_all(text, "samples = 54000|samples = 14400", "samples = 1500");
   small = replaced_all(replaced_all(small, "leave   = 1000", "leave   = 100"), "max_iterations += [0-9]+", "max_iterations = 15");
   small = replaced_all(replaced_all(small, "starts  = [^\n]*", "starts  = [600]"), "samples = 3000", "samples = 300");
-  return replaced_all(replaced_all(small, "= \\[10, 6, 4, 3, 2\\]", "= [1]"), "= \\[(3, 2, 1, 1, 1|5, 1, 0, 0, 0)\\]", "= [0]");
+  return replaced_all(replaced_all(small, "= \\[(10, 6, 4, 3, 2|3, 2, 1, 1, 1)\\]", "= [1]"), "= \\[5, 1, 0, 0, 0\\]", "= [0]");
 }
 
 TEST_F(Reproduce, TheArmOnASurfaceObeysItsConstraintWhereAMethodKnowsIt) {

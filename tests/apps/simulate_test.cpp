@@ -40,8 +40,8 @@ TEST(SimulateModelCommand, WritesAHundredRowsOnTheConstraint) {
   EXPECT_EQ(report["leaves_data_at"], nullptr);
 
   const CsvTable motion = desk.table("motion.csv");
-  EXPECT_THAT(motion.header(),
-              ElementsAre("t", "q1", "q2", "q3", "dq1", "dq2", "dq3", "ddq1", "ddq2", "ddq3", "u1", "u2", "u3", "energy"));
+  EXPECT_THAT(motion.header(), ElementsAre("t", "q1", "q2", "q3", "dq1", "dq2", "dq3", "ddq1", "ddq2", "ddq3", "u1", "u2", "u3",
+                                           "lambda1", "energy"));
   ASSERT_EQ(motion.n_rows(), 100);
   EXPECT_EQ(number(motion, 0, "t"), 0);
   EXPECT_EQ(number(motion, 99, "t"), 6);
@@ -142,7 +142,7 @@ TEST_F(SimulateFit, StaysOnTheConstraintAndWritesItsUncertainty) {
   EXPECT_LE(report["max_velocity_drift"], 1e-12);
   const CsvTable motion = desk.table("motion.csv");
   EXPECT_THAT(motion.header(), ElementsAre("t", "q1", "q2", "q3", "dq1", "dq2", "dq3", "ddq1", "ddq2", "ddq3", "u1", "u2", "u3",
-                                           "ddq1_std", "ddq2_std", "ddq3_std", "energy"));
+                                           "lambda1", "ddq1_std", "ddq2_std", "ddq3_std", "energy"));
   EXPECT_GT(number(motion, 50, "ddq1_std"), 0);
   // the same numbers as predict's
   desk.done("gp2 predict fit.json --states motion.csv --cov std -o prediction.csv");
@@ -211,6 +211,8 @@ TEST(SimulateRefusals, NameTheOptionTheRuleAndTheValue) {
       {"--start q1=0 --t-end 1 --dt 1e-9", "--dt: 1e-09 would write 1e+09 rows; at most 1e+07 are written"},
       {"--start q1=0 --t-end 1 --rtol 0", "--rtol: must be positive, got 0"},
       {"--start q1=0 --t-end 1 --atol -1", "--atol: must be positive, got -1"},
+      {"--start q1=0 --t-end 1 --rtol 1e-30", "--rtol: must be at least 1e-14, near the rounding of doubles, got 1e-30"},
+      {"--start q1=0 --t-end 1 --max-steps 0", "--max-steps: must be at least 1, got 0"},
       {"--start q1=0 --t-end 1 --samples 0", "--samples: must be at least 1, got 0"},
       {"--start q1=0 --t-end 1 --samples 3", "--samples: a model has no posterior to draw from; give a FIT.json"},
       {"--start q1=0 --t-end 2 --inputs short.csv", "short.csv: times 0 to 1 do not cover the motion from 0 to 2"},
@@ -238,7 +240,56 @@ TEST(SimulateRefusals, AMotionThatCannotBeContinuedExitsWith1AndNamesTheTime) {
   EXPECT_EQ(outcome.status, 1);
   EXPECT_THAT(outcome.err, HasSubstr("numerical failure: simulate: the step size fell to"));
   EXPECT_THAT(outcome.err, HasSubstr("at t = 1:"));
-  EXPECT_FALSE(desk.has("motion.csv"));
+  EXPECT_THAT(outcome.err, HasSubstr("; motion.csv holds what was reached"));
+  const CsvTable motion = desk.table("motion.csv");
+  ASSERT_GT(motion.n_rows(), 30);
+  // x = 1/(1 − t)
+  EXPECT_NEAR(number(motion, 30, "x"), 1 / (1 - number(motion, 30, "t")), 1e-2);
+  EXPECT_GT(number(motion, motion.n_rows() - 1, "x"), 1e6);
+}
+
+TEST(SimulateModelCommand, DryFrictionStopsABodyInsteadOfTheCommand) {
+  const Desk desk;
+  desk.write("block.toml", "coordinates = [\"x\"]\n[mechanics]\nmass = [[1]]\nforce = [\"-2*sign(dx)\"]\n");
+  const auto report = desk.done("gp2 simulate block.toml --start dx=1 --t-end 10 --json -o motion.csv").json();
+  EXPECT_LT(report["steps"], 100);
+  const CsvTable motion = desk.table("motion.csv");
+  EXPECT_NEAR(number(motion, 99, "x"), 0.25, 1e-8);
+  EXPECT_NEAR(number(motion, 99, "dx"), 0, 1e-12);
+
+  // a fit whose latent jumps likewise
+  desk.write(
+      "learn.toml",
+      "coordinates = [\"x\"]\n[mechanics]\nmass = [[1]]\nforce = [\"0\"]\n[truth]\nacceleration = [\"-2*sign(dx)\"]\n"
+      "[sampling]\nx = [-1, 1]\ndx = [-1, 1]\n[[latent]]\nkernel = \"se\"\nfeatures = [\"sign(dx)\"]\n[noise]\nddq = 0.01\n");
+  desk.done("gp2 generate learn.toml --n 30 -o log.csv");
+  desk.done("gp2 fit learn.toml --data log.csv --restarts 1 -o fit.json");
+  const auto learnt = desk.done("gp2 simulate fit.json --start dx=1 --t-end 10 --json -o learnt.csv").json();
+  EXPECT_LT(learnt["steps"], 200);
+  EXPECT_NEAR(number(desk.table("learnt.csv"), 99, "x"), 0.25, 1e-3);
+}
+
+TEST(SimulateModelCommand, EndsAtItsStepsAndWritesWhatTheyReach) {
+  const Desk desk;
+  const Outcome outcome =
+      desk.run("gp2 simulate models/surface.toml " + figure_start + " --t-end 600 --max-steps 50 --json -o motion.csv");
+  EXPECT_EQ(outcome.status, 1);
+  EXPECT_THAT(outcome.err, HasSubstr("numerical failure: simulate: 50 steps reach no further than t = "));
+  EXPECT_THAT(outcome.err, HasSubstr("allow more steps (--max-steps); motion.csv holds what was reached"));
+  EXPECT_EQ(outcome.json()["steps"].get<int>() + outcome.json()["rejected_steps"].get<int>(), 50);
+  EXPECT_GE(desk.table("motion.csv").n_rows(), 2);
+}
+
+TEST(SimulateModelCommand, TellsWhenAMultiplierChangesItsSign) {
+  const Desk desk;
+  // a load on a floor that turns with time, and would lift the body
+  desk.write("floor.toml",
+             "coordinates = [\"x\", \"y\"]\n[mechanics]\nmass = [[1, 0], [0, 1]]\nforce = [\"0\", \"-9.81*cos(t)\"]\n"
+             "[constraints]\nposition = [\"y\"]\n");
+  const auto report = desk.done("gp2 simulate floor.toml --start dx=1 --t-end 3 --dt 0.01 --json -o motion.csv").json();
+  ASSERT_EQ(report["multiplier_sign_changes"]["lambda1"].size(), 1);
+  EXPECT_NEAR(report["multiplier_sign_changes"]["lambda1"][0].get<double>(), M_PI / 2, 1e-4);
+  EXPECT_NEAR(number(desk.table("motion.csv"), 0, "lambda1"), 9.81, 1e-12);
 }
 
 TEST_F(SimulateFit, MapRefusesNamesThatNobodyHas) {

@@ -123,6 +123,13 @@ TEST_F(Transfer, JoinsKnowledgeToTheObservations) {
   EXPECT_NEAR(known(0, 0), -9.81, 0.005);
   EXPECT_LE(known.row(1).maxCoeff(), 0.001) << "conditioning never raises a variance above the noise of what is known";
 
+  // and alone
+  static_cast<void>(fit("--also unconstrained:rest.csv --also-noise-std 0.001"));
+  EXPECT_EQ(FitFile::read(desk / "fit.json").observations.size(), 1U);
+  desk.done("gp2 predict fit.json --states rest.csv --view unconstrained -o known.csv");
+  EXPECT_NEAR(columns(desk.table("known.csv"), {"abar_q3"})(0, 0), -9.81, 0.005);
+  desk.done("gp2 evaluate fit.json --data test.csv");
+
   // other quantities, of one latent, under another system
   desk.write("more.csv",
              "q1,q2,q3,dq1,dq2,dq3,u1,u2,u3,dq1_next,fc_q1,abar_q1@unconstrained acceleration\n0,0,0.1,0,0,0,0,0,0,0.1,0,0\n");

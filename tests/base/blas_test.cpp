@@ -6,10 +6,13 @@
 #include <gmock/gmock.h>
 #include <gtest/gtest.h>
 
+#include "base/lapack.hpp"
+
 extern "C" {
 __attribute__((weak)) char* openblas_get_config();
 __attribute__((weak)) char* openblas_get_corename();
 __attribute__((weak)) int openblas_get_num_threads();
+__attribute__((weak)) void openblas_set_num_threads(int);
 }
 
 namespace gp2 {
@@ -53,6 +56,30 @@ TEST(Blas, RecommendedKernelIsFinal) {
         EXPECT_EQ(recommended_kernel(better, features), "") << kernel;
       }
     }
+  }
+}
+
+TEST(Blas, TheNumberOfThreadsReturnsUnlessSomebodyHasChosenAnother) {
+  if (openblas_set_num_threads == nullptr) GTEST_SKIP() << "another BLAS";
+  openblas_set_num_threads(3);
+  {
+    const lapack::SingleThread outer;
+    const lapack::SingleThread inner;
+    EXPECT_EQ(openblas_get_num_threads(), 1);
+    {
+      const lapack::ManyThreads many(2);
+      EXPECT_EQ(openblas_get_num_threads(), 2);
+    }
+    EXPECT_EQ(openblas_get_num_threads(), 1);
+  }
+  EXPECT_EQ(openblas_get_num_threads(), 3);
+  for (const bool many : {false, true}) {
+    {
+      const lapack::SingleThread single;
+      const lapack::ManyThreads several(many ? 4 : 1);
+      openblas_set_num_threads(2);
+    }
+    EXPECT_EQ(openblas_get_num_threads(), 2);
   }
 }
 

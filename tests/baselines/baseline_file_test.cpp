@@ -33,7 +33,7 @@ FitFile fit_of(Baseline::Kind kind) {
   fit.prior_options.raw_angles = true;
   fit.prior_options.baseline = {kind, VectorXd::Zero(fit.model.system->nq()), VectorXd::Zero(n_features),
                                 VectorXd::Ones(n_features)};
-  fit.prior_options.baseline = standardised_by(fit.observations, fit.prior().latents.front(), kind);
+  fit.prior_options.baseline = standardised_by(fit.observations, fit.prior(), kind);
   FitOptions options = baseline_fit_options();
   options.n_restarts = 2;
   options.max_iterations = 5;

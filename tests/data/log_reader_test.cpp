@@ -52,6 +52,16 @@ class LogReaderTest : public testing::Test {
   const Model model = model_of("[\"q1\", \"q2\"]");
 };
 
+TEST_F(LogReaderTest, ReadsNoColumnAsTwoNames) {
+  const CsvTable table = CsvTable::parse("q1,dq1,ddq1\n1,2,3\n", "log.csv");
+  LogReader reader(table, *model.system, {{"q2", "q1"}});
+  const std::string error = input_error_of([&] { static_cast<void>(reader.values({"q1", "q2"})); });
+  EXPECT_EQ(error, "log.csv: column 'q1' is read as q1 and as q2; each needs a column of its own (`map=LOGNAME=q2`)");
+  // where q1 itself is not read there is no doubt
+  LogReader other(table, *model.system, {{"q2", "q1"}});
+  EXPECT_EQ(other.values({"q2", "dq2"}).col(0), Eigen::Vector2d(1, 2));
+}
+
 TEST_F(LogReaderTest, FindsColumnsInAnyOrderAndReportsThoseItLeaves) {
   const CsvTable table = CsvTable::parse("remark,dq2,q1,ddq1,q2,t\nfirst,4,1,7,2,0\nsecond,5,2,8,3,1\n", "log.csv");
   LogReader reader(table, *model.system);

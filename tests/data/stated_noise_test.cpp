@@ -193,6 +193,11 @@ TEST(StatedNoise, ThatIsNotAPositiveNumberIsNamedByFileLineAndColumn) {
   EXPECT_EQ(refused(""), "") << "an empty cell is a value that is not measured";
 }
 
+double smallest_usable(const std::string& text) {
+  const std::string before = "the smallest usable value is ";
+  return std::stod(text.substr(text.find(before) + before.size()));
+}
+
 TEST(StatedNoise, TooSmallForDoublePrecisionAtOneValueIsRefused) {
   // ‖K̃‖ ≤ Σ (signal/noise)² must leave a hundredth of the digits: one small value among 40 may be √40 below the rule for all
   const double spread = row_stddev(make_fit_problem(slope_with(), log_of({"ddx_std"}), {}).observations.front().values())[0];
@@ -205,8 +210,20 @@ TEST(StatedNoise, TooSmallForDoublePrecisionAtOneValueIsRefused) {
         input_error_of([&] { make_fit_problem(slope_with(), log_with(shortest(0.99 * limit), 3), options); });
     EXPECT_THAT(text,
                 HasSubstr(fmt::format("log.csv: column 'ddx_std': data row 3: the noise standard deviation {} of ddx is too "
-                                      "small for double precision beside a spread of {:.3g}; the smallest usable value is {:.2g}",
-                                      0.99 * limit, spread, limit * std::sqrt(40))));
+                                      "small for double precision beside a spread of {:.3g}; the smallest usable value is ",
+                                      0.99 * limit, spread)));
+    EXPECT_GE(smallest_usable(text), limit * std::sqrt(40));
+    EXPECT_LE(smallest_usable(text), 1.1 * limit * std::sqrt(40));
+  }
+}
+
+TEST(StatedNoise, TheSmallestUsableValueIsUsable) {
+  FitProblemOptions options;
+  for (const int n_rows : {3, 7, 12, 19, 26, 33, 40}) {
+    const CsvTable log = log_of({}).first_rows(n_rows);
+    options.noise_stddev = 1e-12;
+    options.noise_stddev = smallest_usable(input_error_of([&] { make_fit_problem(slope_with(), log, options); }));
+    EXPECT_NO_THROW(make_fit_problem(slope_with(), log, options)) << n_rows;
   }
 }
 
@@ -264,8 +281,8 @@ TEST(StatedNoise, TellsACheckWhichAccelerationsAreMeasured) {
     EXPECT_EQ(whole.stated.size(), stated.size());
     EXPECT_THAT(reader.unused_columns(), testing::IsEmpty());
     std::vector<std::string> out;
-    for (const Finding& finding :
-         check_data(*model.system, whole.states, model.system->parameter_values(), whole.accelerations, whole.stated)) {
+    for (const Finding& finding : check_data(*model.system, whole.states, model.system->parameter_values(), whole.accelerations,
+                                             whole.stddev, whole.stated)) {
       out.push_back((finding.level == Finding::Level::good ? "good: " : "not good: ") + finding.text);
     }
     return out;

@@ -78,6 +78,56 @@ void expect_same_predictions(const FitFile& a, const FitFile& b) {
 
 // ---- there and back
 
+// ---- from a fit
+
+TEST(FitFileOfAFit, IsHeldAgainstIt) {
+  const Model& model = test::model("models/surface.toml");
+  const Model& other = test::model("models/duffing.toml");
+  FitSettings settings;
+  settings.prior.mean = Prior::Mean::force;
+  const FitFile by_hand = fit_of(model, settings);
+  const Fit fit = {by_hand.posterior(), by_hand.report};
+  const FitFile file(model, by_hand.prior_options, fit);
+  expect_same_predictions(by_hand, written_and_read(file));
+
+  const auto refusal = [&](const Model& of, const FitPriorOptions& options, const Fit& given) {
+    return input_error_of([&] { FitFile(of, options, given); });
+  };
+  const std::string differ =
+      "FitFile: model, prior_options and systems make another prior than that of the fit; what differs at observations 1: ";
+  EXPECT_EQ(refusal(model, {}, fit), differ + "the prior mean");
+  FitPriorOptions options = by_hand.prior_options;
+  options.base = Latent::Base::force;
+  EXPECT_THAT(refusal(model, options, fit), StartsWith(differ + "the directions of the latent '"));
+  options = by_hand.prior_options;
+  options.discrepancy = Discrepancy{Eigen::VectorXd::Ones(std::ssize(model.latents[0].features)), Eigen::VectorXd::Ones(3)};
+  EXPECT_EQ(refusal(model, options, fit), differ + "it has 2 latents, the fit 1");
+  EXPECT_EQ(refusal(other, by_hand.prior_options, fit), differ + "the coordinates and inputs");
+  Fit changed = fit;
+  changed.report.hyperparameters[0].value *= 1.5;
+  EXPECT_EQ(refusal(model, by_hand.prior_options, changed),
+            "FitFile: the hyperparameters of the report are not those of the posterior");
+}
+
+TEST(FitFileOfAFit, HasTheModelsOfItsOtherSystems) {
+  const auto model = std::make_shared<const Model>(test::model("models/surface.toml"));
+  FitFile by_hand = fit_of(*model);
+  View view = by_hand.observations[0].view();
+  view.other_system = make_other_system(*model, *model);
+  by_hand.observations[0] = by_hand.observations[0].with_view(view);
+  const Fit fit = {by_hand.posterior(), by_hand.report};
+  EXPECT_EQ(input_error_of([&] { FitFile(*model, {}, fit); }),
+            "FitFile: the model file of the system of observations 1 is not given");
+  const FitFile file(*model, {}, fit, {model});
+  EXPECT_EQ(written_and_read(file).posterior().negative_log_likelihood(), fit.posterior.negative_log_likelihood());
+}
+
+TEST(FitFileOfAFit, RefusesToWriteHyperparametersOfAnother) {
+  FitFile file = fit_of(test::model("models/surface.toml"));
+  file.report.hyperparameters[0].owner = 7;
+  EXPECT_THAT(input_error_of([&] { written_json(file); }), HasSubstr("belongs to nothing of this prior and these observations"));
+}
+
 class FitFileOf : public testing::TestWithParam<std::string> {};
 INSTANTIATE_TEST_SUITE_P(EveryModel, FitFileOf, testing::ValuesIn(test::every_model()), test::model_test_name);
 
@@ -469,6 +519,10 @@ TEST_F(DamagedFit, ValuesOutOfPlaceAreNamed) {
   };
   EXPECT_EQ(with_scale(2), "");
   EXPECT_EQ(with_scale(0), "noise_scale must be positive and finite, got 0; a value that is worth nothing is NaN, not measured");
+  for (const char* numbers : {"states", "values"}) {
+    EXPECT_THAT(error_after([&](Json& json) { observation(json)[numbers].front()[0] = 1e300; }),
+                HasSubstr("holds a number of the size 1e+300; at most 1e+100 can be computed with"));
+  }
   EXPECT_EQ(error_after([&](Json& json) { observation(json)["noise_scale"] = Json::object(); }),
             "the values of 'ddq1' are missing");
   EXPECT_EQ(error_after([](Json& json) { json["prior"]["mean"] = "constant"; }), "'constant' is no prior mean");
@@ -491,6 +545,8 @@ TEST_F(DamagedFit, HyperparametersThatBelongToNothingAreNamed) {
     }
     EXPECT_THAT(refused(kind, "value", 0), HasSubstr("has the impossible value 0")) << kind;
     EXPECT_THAT(refused(kind, "value", -1), HasSubstr("has the impossible value -1")) << kind;
+    EXPECT_THAT(refused(kind, "value", 1e300), HasSubstr("has the impossible value 1e+300")) << kind;
+    EXPECT_THAT(refused(kind, "value", 1e-300), HasSubstr("has the impossible value 1e-300")) << kind;
     EXPECT_EQ(refused(kind, "value", nullptr), "null stands where a number must") << kind;
     EXPECT_EQ(refused(kind, "kind", "other"), "'other' is no kind of hyperparameter") << kind;
   }

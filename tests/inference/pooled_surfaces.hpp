@@ -66,7 +66,7 @@ inline PooledScore score_pooling(int n, std::uint64_t seed) {
     options.n_threads = 2;
     options.seed = seed;
     const Posterior posterior = fit(prior, observations, default_hyperparameters(prior, observations, {}, {}), options).posterior;
-    const Evaluation e = evaluate_predictions(posterior, truth.states, {0, 1, 2}, truth.accelerations, there);
+    const Evaluation e = evaluate_predictions(posterior, truth.states, {0, 1, 2}, truth.accelerations, {there});
     return e.rmse.norm() / std::sqrt(3.0);
   };
   return {rmse({a}), rmse({b}), rmse({half(a)}), rmse({half(b)}), rmse({half(a), half(b)})};

@@ -74,8 +74,8 @@ TEST(PosteriorBatchTest, NoStatesGiveNoNumbers) {
   EXPECT_EQ(posterior.sample({{view, none}}, 3, seed).rows(), 0);
 }
 
-TEST(PosteriorBatchTest, JudgesContradictingConstraintsByAllStatesAskedFor) {
-  // 1e-9 apart: beyond 1e-6 of b where y is small, within it beside a state where it is not
+TEST(PosteriorBatchTest, JudgesContradictingConstraintsAtEachStateWhateverElseIsAskedFor) {
+  // 1e-9 apart: beyond 1e-6 of b where y is small, within it where it is not
   const Model model = Model::parse(R"toml(
 name        = "two rods"
 coordinates = ["x", "y"]
@@ -99,6 +99,10 @@ directions = "acceleration"
     EXPECT_THROW(static_cast<void>(posterior.marginal(view, states, n_threads)), InputError);
   }
   states(1, 699) = 1;
+  for (int n_threads : {1, 2}) {
+    EXPECT_THROW(static_cast<void>(posterior.mean(view, states, n_threads)), InputError);
+  }
+  states.row(1).setOnes();
   for (int n_threads : {1, 2}) {
     EXPECT_EQ(posterior.mean(view, states, n_threads), posterior.marginal(view, states, n_threads).mean);
   }

@@ -343,7 +343,7 @@ TEST(PredictorTest, InSinglePrecisionIsOffByNoMoreThanItSays) {
   const double e = std::numeric_limits<float>::epsilon() / 2;
   const Posterior prior = posterior.without_data();
   for (const VectorXd state : p.queries.colwise()) {
-    const Eigen::RowVectorXd point = evaluate_features(p.prior.latents[0], state) * lengthscale.cwiseInverse().asDiagonal();
+    const Eigen::RowVectorXd point = evaluate_features(p.prior, 0, state) * lengthscale.cwiseInverse().asDiagonal();
     double R = (point - centre).norm();
     for (Index j = 0; j < points.rows(); ++j) R = std::max(R, (points.row(j) - centre).norm());
     VectorXd bound = VectorXd::Zero(3);
@@ -451,7 +451,7 @@ TEST(PredictorTest, NamesWhatIsWrongWithAnArgument) {
   const System& system = *posterior.prior().system;
   EXPECT_EQ(test::input_error_of([&] { Predictor(posterior, View::all(Quantity::next_velocity, system)); }),
             "view 'next-velocity' needs a time step");
-  EXPECT_THAT(test::input_error_of([&] { Predictor(posterior, {.rows = {3}}); }), HasSubstr("rows of the view are 0 … 2, got 3"));
+  EXPECT_THAT(test::input_error_of([&] { Predictor(posterior, {.rows = {3}}); }), HasSubstr("there are the rows 0 … 2, got 3"));
   EXPECT_THAT(test::input_error_of([&] { Predictor(posterior, {.rows = {0}, .latent = 1}); }),
               HasSubstr("1 latents, numbered from 0"));
   const Predictor bare(posterior, View::all(Quantity::constrained_acceleration, system), {.stddev = false, .jacobian = false});

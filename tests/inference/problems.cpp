@@ -101,11 +101,12 @@ View under(View view, std::shared_ptr<const OtherSystem> other_system) {
 
 ModelValues random_values(const Prior& prior, const std::vector<Observations>& observations, RandomStream& random) {
   ModelValues values;
-  for (const Latent& latent : prior.latents) {
+  for (std::size_t a = 0; a < prior.latents.size(); ++a) {
+    const Latent& latent = prior.latents[a];
     VectorXd& kernel = values.kernel.emplace_back(static_cast<Index>(latent.kernel.parameters().size()));
     MatrixXd features(0, latent.n_features());
     for (const Observations& group : observations) {
-      const MatrixXd more = evaluate_features(latent, group.states());
+      const MatrixXd more = evaluate_features(prior, a, group.states());
       features.conservativeResize(features.rows() + more.rows(), Eigen::NoChange);
       features.bottomRows(more.rows()) = more;
     }
@@ -266,7 +267,7 @@ DenseView dense_view(const Prior& home, const ModelValues& values, const View& v
   const Index nq = system.nq();
   const SystemValues mechanics = system.evaluate(states, parameters);
   DenseView dense{ExtendedVector(view.size() * states.cols()), {}, {}};
-  for (const Latent& latent : prior.latents) dense.features.push_back(evaluate_features(latent, states));
+  for (std::size_t a = 0; a < prior.latents.size(); ++a) dense.features.push_back(evaluate_features(prior, a, states));
   for (int i = 0; i < static_cast<int>(states.cols()); ++i) {
     const Extended M_inverse = Extended(mechanics.M(i).cast<long double>()).fullPivLu().inverse();
     // rows to unit norm, so that their size does not decide the rank

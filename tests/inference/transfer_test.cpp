@@ -134,7 +134,7 @@ TEST(EvaluationTest, MeasuresTheConstraintOfTheOtherSystem) {
     if (p.name != "surface, every row") continue;
     const Posterior posterior(p.prior, p.observations, p.values);
     const MatrixXd targets = MatrixXd::Random(3, p.queries.cols());
-    const Evaluation there = evaluate_predictions(posterior, p.queries, {0, 1, 2}, targets, other_system);
+    const Evaluation there = evaluate_predictions(posterior, p.queries, {0, 1, 2}, targets, {other_system});
     EXPECT_LE(there.max_constraint_error, 1e-11);
     EXPECT_LE(there.max_constraint_error_fitted, 1e-11);
     EXPECT_GT((there.rmse - evaluate_predictions(posterior, p.queries, {0, 1, 2}, targets).rmse).norm(), 1e-3);

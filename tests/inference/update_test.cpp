@@ -125,6 +125,31 @@ TEST(UpdateTest, AWindowThatMovesForLongDoesNotDrift) {
   expect_equal(posterior, built_anew(p, ages), p);
 }
 
+TEST(UpdateTest, AWindowWhoseNoiseVariesHoldsNoGroupsWithoutStates) {
+  const Problem p = test::problems(30, seed).front();
+  Posterior posterior(p.prior, p.observations, p.values);
+  const int n_given = p.observations[0].n_data();
+  std::vector<Observations> added;
+  for (int step = 0; step < 60; ++step) {
+    const Index column = step % n_given;
+    added.push_back(test::with_stddev(part_of(p, 0, {column}), (1.5 + 0.01 * step) * p.values.noise_stddev[0]));
+    posterior = update(std::move(posterior), added.back());
+    posterior = remove_oldest(std::move(posterior), 1);
+    const auto n_added = std::min<std::size_t>(added.size(), 30);
+    ASSERT_EQ(posterior.observations().size(), 1 + n_added) << step;
+    ASSERT_EQ(posterior.values().noise_stddev.size(), 1 + n_added);
+  }
+  // hyperparameters call the group of the constructor by its number: it stays
+  EXPECT_EQ(posterior.observations()[0].n_data(), 0);
+  for (std::size_t k = 0; k < 30; ++k) {
+    EXPECT_EQ(posterior.observations()[k + 1].states(), added[added.size() - 30 + k].states());
+    EXPECT_EQ(posterior.values().noise_stddev[k + 1], added[added.size() - 30 + k].noise().stddev());
+  }
+  expect_equal(posterior, Posterior(p.prior, posterior.observations(), posterior.values()), p);
+  posterior = remove_oldest(std::move(posterior), 30);
+  EXPECT_EQ(posterior.observations().size(), 1U);
+}
+
 TEST(UpdateTest, AGrownPosteriorIsDescribedByItsObservationsAndValues) {
   const Problem p = test::problems(9, seed).front();
   Posterior posterior(p.prior, p.observations, p.values);
@@ -266,7 +291,7 @@ TEST(UpdateTest, RefusesWhatDoesNotFitAndKeepsThePosterior) {
   const Problem p = test::problems(9, seed).front();
   Posterior posterior(p.prior, p.observations, p.values);
   const Observations added = part_of(p, 0, {0, 1});
-  expect_refusal<InputError>(posterior, "update: a column of `states`", [&](Posterior& it) {
+  expect_refusal<InputError>(posterior, "states: a column is a state of", [&](Posterior& it) {
     it = update(std::move(it), test::with_states(added, added.states().topRows(3)));
   });
   for (int n : {-1, 10}) {

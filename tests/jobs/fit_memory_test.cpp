@@ -121,6 +121,26 @@ TEST(WithinMemory, TheResultIsTheSame) {
     EXPECT_EQ(one.hyperparameters[k].value, all.hyperparameters[k].value);
 }
 
+TEST(WithinMemory, WhatTheSystemDoesNotGiveIsNotBegun) {
+  const FitProblem problem = problem_of(1000);  // the square of 2000 and a buffer of BLAS: 32 MB and 134 MB
+  const auto with_limit = [&](double limit, std::vector<std::string>& notes) {
+    return within_memory(problem, on_threads(4), std::nullopt, notes, [&](double bytes, int n) { return n * bytes <= limit; });
+  };
+  std::vector<std::string> notes;
+  EXPECT_EQ(with_limit(gigabyte, notes).max_side_by_side, 0);
+  EXPECT_TRUE(notes.empty());
+  EXPECT_EQ(with_limit(0.4 * gigabyte, notes).max_side_by_side, 2);
+  ASSERT_EQ(notes.size(), 1U);
+  EXPECT_EQ(notes[0], "the system does not give the memory that 4 runs side by side ask for (ulimit -v?): 2 at a time");
+  const std::string few_rows = input_error_of([&] { with_limit(0.15 * gigabyte, notes); });
+  EXPECT_THAT(few_rows, AllOf(HasSubstr("the fit of 1000 rows asks for 0.2 GB of memory in one piece"),
+                              HasSubstr("rows of each log would fit: take so many with `max_points=")));
+  EXPECT_THAT(input_error_of([&] { with_limit(0.1 * gigabyte, notes); }), HasSubstr("however few rows there are"));
+  // of a million GB none is given, of little enough
+  EXPECT_FALSE(is_given(1e15, 1));
+  EXPECT_TRUE(is_given(1e6, 4));
+}
+
 // ---- what the system says
 
 class Machine : public testing::Test {

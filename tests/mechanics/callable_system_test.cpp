@@ -162,23 +162,6 @@ TEST(CallableSystemTest, TheStepOfADifferenceSuitsTheParameter) {
   EXPECT_NEAR(slope({"p", 0, {{0, 0}}, true}, 0, sine), 1, tolerance);
 }
 
-TEST(CallableSystemTest, WithoutConstraintsKeepsMassAndForce) {
-  const MatrixXd states = states_of(4);
-  const VectorXd parameters = surface().parameter_values();
-  CallableSystem::Definition differenced = definition();
-  differenced.differentiate = nullptr;
-  const CallableSystem by_differences(differenced);
-  for (const System* system : {&surface(), static_cast<const System*>(&by_differences)}) {
-    const auto free = system->without_constraints();
-    const auto expected = text_surface().without_constraints();
-    EXPECT_EQ(free->nc(), 0);
-    EXPECT_THAT(free->residual_labels(), IsEmpty());
-    EXPECT_EQ(free->residuals(states, parameters).rows(), 0);
-    expect_close(stack(free->evaluate(states, parameters)), stack(expected->evaluate(states, parameters)));
-    expect_close(stack(free->differentiate(states, parameters, 0)), stack(expected->differentiate(states, parameters, 0)), 1e-9);
-  }
-}
-
 TEST(CallableSystemTest, ChecksLikeOneOfText) {
   const auto findings = [](const System& system) { return check_system(system, states_of(10), system.parameter_values()); };
   const std::vector<Finding> of_text = findings(text_surface()), of_code = findings(surface());

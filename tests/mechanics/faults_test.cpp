@@ -54,6 +54,25 @@ TEST(MechanicsFaults, ContradictoryConstraintsAreAnErrorThatNamesTheState) {
   EXPECT_EQ(message(contradictory, states({0})), "");
 }
 
+// ẍ = y and ẍ = y + x contradict each other where x is not 0, however large y is elsewhere
+TEST(MechanicsFaults, AContradictionDoesNotHideBehindAnotherState) {
+  const Model contradictory = model(R"([["1", "0"], ["0", "1"]])", R"(acceleration = ["ddx - y", "ddx - y - x"])");
+  MatrixXd some = states({0, 0.5});
+  some(1, 0) = 1e6;
+  EXPECT_THAT(message(contradictory, some), AllOf(HasSubstr("contradict"), HasSubstr("state 2")));
+  some(0, 1) = 0;
+  EXPECT_EQ(message(contradictory, some), "");
+}
+
+// rounding near rest makes b of two rows differ altogether, which is nothing beside other states or an applied force
+TEST(MechanicsFaults, RoundingAtRestIsNoContradiction) {
+  const Model moving = model(R"([["1", "0"], ["0", "1"]])", R"(acceleration = ["ddx - dx^2", "ddx - dx*dy"])");
+  MatrixXd some = states({1, 1});
+  some.col(0).segment(2, 2) << 1, 1;
+  some.col(1).segment(2, 2) << 1e-17, -3e-17;
+  EXPECT_EQ(message(moving, some), "");
+}
+
 // b = −0.09 exp(−0.3 t) … is below 1e-308 there, where numbers have a few digits only
 TEST(MechanicsFaults, AConstraintWhoseMotionHasDiedAwayIsNoContradiction) {
   const Model& duffing = test::model("models/duffing.toml");

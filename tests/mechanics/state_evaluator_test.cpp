@@ -185,7 +185,6 @@ class OpaqueSystem final : public System {
   }
   const std::vector<Residual>& residual_labels() const override { return inside_.residual_labels(); }
   std::vector<bool> reads(SystemPart part) const override { return inside_.reads(part); }
-  std::shared_ptr<const System> without_constraints() const override { return inside_.without_constraints(); }
 
  private:
   const System& inside_;

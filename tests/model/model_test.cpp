@@ -115,7 +115,7 @@ TEST(Model, AnAngleAsAFeatureIsItsSineAndCosineUnlessRawOrInAnExpression) {
               ElementsAre("q2", "2*q2", "dq2"));
   //                              q1  q2    dq1  dq2 t  u1
   const Eigen::MatrixXd state = (Eigen::VectorXd(6) << 9, 0.5, 9, 7, 9, 9).finished();
-  EXPECT_EQ(evaluate_features(make_prior(model).latents[0], state), Eigen::RowVector4d(std::sin(0.5), std::cos(0.5), 1, 7));
+  EXPECT_EQ(evaluate_features(make_prior(model), 0, state), Eigen::RowVector4d(std::sin(0.5), std::cos(0.5), 1, 7));
 }
 
 TEST(Model, DirectionsHaveFiveForms) {
@@ -206,6 +206,22 @@ TEST(Model, AMassMatrixMayBeWrittenDifferentlyOnItsTwoSides) {
   EXPECT_EQ(error_of(with_mass(R"([["m", "0"], ["m*sin(q1)^2 + m*cos(q1)^2 - m", 1]])")), "");  // 0 to rounding
 }
 
+// of two links, by the textbook: h = m2 l1 l2 sin(q2 − q1)
+TEST(Model, CoriolisForcesFollowFromTheMassMatrix) {
+  const auto model = [](const std::string& force) {
+    return Model::parse(
+        "coordinates = ['a', 'b']\n[parameters]\nk = 0.7\n[mechanics]\nmass = [['3 + 0.1*t', 'k*cos(b - a)'], ['k*cos(b - "
+        "a)', '1']]\n" +
+            force,
+        "arm");
+  };
+  const Model derived = model("force = ['-a', '0']\ncoriolis = true\n");
+  const Model written = model("force = ['-a + k*sin(b - a)*db^2 - 0.1*da', '-k*sin(b - a)*da^2']\ncoriolis = false\n");
+  const Eigen::MatrixXd states = Eigen::MatrixXd::Random(5, 20);
+  const auto force = [&](const Model& of) { return of.system->evaluate(states, of.system->parameter_values()).force; };
+  EXPECT_LE(test::largest(force(derived) - force(written)), 1e-14);
+}
+
 TEST(Model, NoiseIsOneValueOrOnePerCoordinateAndMayBeEstimated) {
   EXPECT_THAT(parse(base + "[noise]\nddq = 0.1\n").noise.stddev, ElementsAre(0.1, 0.1));
   EXPECT_THAT(parse(base + "[noise]\nddq = [0.1, 2]\n").noise.stddev, ElementsAre(0.1, 2));
@@ -278,7 +294,7 @@ std::vector<Complaint> complaints() {
        "7: friction: unknown key; known here: name, robot, coordinates, inputs, parameters, let, mechanics, constraints, latent, "
        "noise, truth, sampling, motion, columns"},
       {"FirstOfSeveralUnknownKeys", base + "zeta = 1\nalpha = 2\n",
-       "7: mechanics.zeta: unknown key; known here: mass, force, potential"},
+       "7: mechanics.zeta: unknown key; known here: mass, force, coriolis, potential"},
       {"NameIsNoText", "name = 3\n" + base, "1: name: expected a text in quotes, got 3"},
       {"ParametersAreNoTable", "parameters = 3\ncoordinates = [\"q1\"]\n", "1: parameters: expected a table, got 3"},
       // coordinates
@@ -405,7 +421,8 @@ std::vector<Complaint> complaints() {
       {"FeatureTwiceOnceAsAnAngle", latent + "features = [\"q2\", \"sin(q2)\"]\n",
        "8: latent.features: 'sin(q2)' stands twice; remove one"},
       {"UnknownKernel", latent + "kernel = \"rbf\"\n" + features,
-       "8: latent.kernel: kernel \"rbf\": unknown kernel 'rbf'; use sums and products of se matern32 matern52 rq periodic linear "
+       "8: latent.kernel: kernel \"rbf\": unknown kernel 'rbf', here called se; use sums and products of se matern32 matern52 rq "
+       "periodic linear "
        "constant"},
       {"UnknownDirections", latent + features + "directions = \"forces\"\n",
        "9: latent.directions: expected \"acceleration\", \"force\" or a matrix of expressions [[…], …], got \"forces\""},

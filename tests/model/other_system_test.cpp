@@ -306,6 +306,29 @@ TEST(KnownViews, RefuseWhatCannotBeMeant) {
             "`also=multipliers`: 'free.toml' has no constraints");
 }
 
+TEST(Knowledge, AloneIsLearntFrom) {
+  const Model model = home();
+  SideInformation next = at_rest("dx_next,dy_next,dy", "0.1,0,0"), multiplier = at_rest("lambda1", "2");
+  next.quantity = Quantity::next_velocity;
+  multiplier.quantity = Quantity::multipliers;
+  FitProblemOptions options;
+  options.also_noise_stddev = 0.05;
+  FitOptions fit_options;
+  fit_options.n_restarts = 1;
+  for (const SideInformation& one : {at_rest(), next, multiplier}) {
+    SCOPED_TRACE(one.quantity->word());
+    options.time_step = one.quantity->needs_time_step() ? std::optional(0.1) : std::nullopt;
+    const FitProblem problem = make_fit_problem(model, {}, {one}, options);
+    ASSERT_EQ(problem.observations.size(), 1U);
+    EXPECT_FALSE(problem.prior_options.discrepancy) << "of what is measured there is none";
+    const Posterior posterior = fit(problem, fit_options).posterior;
+    const Observations& known = problem.observations[0];
+    EXPECT_LE(test::largest(posterior.mean(known.view(), known.states()) - known.values()), 0.1);
+  }
+  EXPECT_EQ(input_error_of([&] { make_fit_problem(model, {}, {}, options); }),
+            "there is nothing to fit: give logs by `data`, or what is known by `also`");
+}
+
 // ---- there and back
 
 FitFile fit_of_everything() {

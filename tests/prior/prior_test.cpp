@@ -181,12 +181,12 @@ TEST(PriorTest, AnAngleIsReadThroughItsSineAndCosineUnlessAskedForRaw) {
   // features of a state in the order of their names
   const MatrixXd states = test::draw(model, 3, seed).states;
   const StateLayout layout = model.system->layout();
-  const MatrixXd features = evaluate_features(raw.latents[0], states);
+  const MatrixXd features = evaluate_features(raw, 0, states);
   ASSERT_EQ(features.rows(), 3);
   ASSERT_EQ(features.cols(), 6);
   EXPECT_EQ(features(2, 2), states(layout.q(2), 2));
   EXPECT_EQ(features(1, 5), states(layout.u(1), 1));
-  EXPECT_EQ(evaluate_features(make_prior(model).latents[0], states)(0, 3), std::cos(states(layout.q(2), 0)));
+  EXPECT_EQ(evaluate_features(make_prior(model), 0, states)(0, 3), std::cos(states(layout.q(2), 0)));
 }
 
 TEST(PriorTest, ReadsWhatItsPartsReadAndNoMore) {

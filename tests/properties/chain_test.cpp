@@ -51,7 +51,8 @@ TEST_P(Chain, IsCheckedGeneratedFittedPredictedAndSimulated) {
   step("check", [&] {
     findings = check_system(system, data.states, system.parameter_values());
     const std::vector<Finding> of_data =
-        check_data(system, data.states, system.parameter_values(), true_acceleration(model, data.states));
+        check_data(system, data.states, system.parameter_values(), true_acceleration(model, data.states),
+                   MatrixXd::Constant(n, data.states.cols(), 0.05));
     findings.insert(findings.end(), of_data.begin(), of_data.end());
   });
   for (const Finding& finding : findings) {

@@ -40,7 +40,7 @@ class Reference {
   explicit Reference(const Problem& p) {
     const Observations& group = p.observations[0];
     const Index nq = p.prior.system->nq();
-    features_ = evaluate_features(p.prior.latents[0], group.states()).cast<Real>();
+    features_ = evaluate_features(p.prior, 0, group.states()).cast<Real>();
     const SystemValues values = p.prior.system->evaluate(group.states(), p.values.parameters);
     residual_.resize(group.values().size());
     for (int i = 0; i < values.n_states(); ++i) {

@@ -1,6 +1,7 @@
 #include <gtest/gtest.h>
 
 #include "apps/command_line.hpp"
+#include "gp2/simulation/model_motion.hpp"
 #include "published/acceptance.hpp"
 
 // Pin forces of a double pendulum with dry friction, learned from noisy accelerations: λ needs A ā, the part of the unconstrained
@@ -16,9 +17,7 @@ const Model& pendulum() { return model("models/double_pendulum.toml"); }
 
 /// λ at states, from the true motion: Aᵀλ = M (ddq − ā).
 MatrixXd true_multipliers(const MatrixXd& states) {
-  Model free = pendulum();
-  free.system = pendulum().system->without_constraints();
-  const MatrixXd a_bar = true_acceleration(free, states), ddq = true_acceleration(pendulum(), states);
+  const MatrixXd a_bar = ModelMotion(pendulum()).unconstrained_acceleration(states), ddq = true_acceleration(pendulum(), states);
   const System& system = *pendulum().system;
   const MechanicsBatch mechanics = require_mechanics(system, states, system.parameter_values());
   MatrixXd multipliers(system.nc(), states.cols());

@@ -81,6 +81,17 @@ def test_other_quantities_are_learnt_from_too(arm, frame, arm_states):
         gp2.fit(arm, frame, also=[gp2.SideInformation("position", rest)])
 
 
+def test_what_is_known_can_be_learnt_from_alone(arm, frame, arm_states):
+    rest = {name: np.array([value]) for name, value in frame.iloc[0].items()}
+    rest |= {"abar_shoulder": np.array([0.5]), "abar_elbow": np.array([-0.5])}
+    also = [gp2.SideInformation("unconstrained", rest)]
+    posterior = gp2.fit(arm, [], also=also, also_noise_std=1e-3, max_iterations=0)
+    assert posterior.n_data == 1
+    assert np.abs(posterior.predict(frame[:1], "unconstrained").mean - [0.5, -0.5]).max() < 0.02
+    with pytest.raises(gp2.InputError, match="there is nothing to fit: give logs by data, or what is known by also"):
+        gp2.fit(arm, [])
+
+
 def test_a_table_is_a_mapping_of_names_to_arrays(arm_log):
     assert len(arm_log) == 30
     assert arm_log.keys() == arm_log.columns

@@ -48,7 +48,7 @@ ReportData good_data(const std::string& name) {
   data.is_test = name == "test";
   data.outputs = {"ddq1"};
   data.rows = {0};
-  data.noise_stddev = Eigen::VectorXd::Constant(1, 0.1);
+  data.noise_stddev = Eigen::MatrixXd::Constant(1, 1, 0.1);
   data.evaluation.n = 1000;
   data.evaluation.rmse = Eigen::VectorXd::Constant(1, 0.1);
   data.evaluation.coverage95 = 0.95;
@@ -142,13 +142,13 @@ TEST(Advice, ALengthscaleAtItsUpperBoundIsOnlyAnIrrelevantFeature) {
 TEST(Advice, TellsOfDataOffTheConstraintByHowFarTheyAre) {
   Report report = good_report();
   report.data = {good_data("training")};
-  report.data[0].violation = ConstraintViolation{1e-9, 1e-9, 3, "q1 - q2"};
+  report.data[0].violation = ConstraintViolation{1e-9, 1e-9, 1e-9, 3, "q1 - q2"};
   EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::good, "", "")));
   report.data[0].violation->relative = 1e-4;
   EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::note, "of the training data are off the constraint", "units")));
   report.data[0].violation->relative = 0.3;
   report.data.push_back(good_data("test"));
-  report.data[1].violation = ConstraintViolation{1e-3, 1e-3, 5, "q1 - q2"};
+  report.data[1].violation = ConstraintViolation{1e-3, 1e-3, 1e-3, 5, "q1 - q2"};
   EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::warning, "of the training and test data", "")));
   EXPECT_THAT(learning_advice(report),
               ElementsAre(advises(Level::warning, "row 4 of training: q1 - q2 = 1e-09, 0.3", "`estimate`")));
@@ -186,6 +186,66 @@ TEST(Advice, TellsThatTheTestGoesBeyondTraining) {
   report.data[0].evaluation.rmse[0] = 0.01;
   report.data[1].evaluation.rmse[0] = 0.15;
   EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::good, "", "")));
+}
+
+TEST(Advice, TellsOfResidualsThatNoiseDoesNotExplain) {
+  Report report = good_report();
+  report.data = {good_data("training")};
+  report.data[0].constraint_residuals = {{"z - h*x^2", 50, 9.7, 9.69, 0.2, 10, {3, 4, 5}}};
+  EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::warning,
+                                                           "The training data deny a constraint: measured ddq on A "
+                                                           "ddq = b: rms residual 9.7 for 'z - h*x^2', mean 9.69, "
+                                                           "expected 0.2 from the noise: 48 ×",
+                                                           "units, signs")));
+  report.data[0].constraint_residuals[0].rms = report.data[0].constraint_residuals[0].mean = 0.21;
+  EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::good, "", "")));
+  report.residuals = {{0, "ddq1", 100, 4, 0.4, 0}};
+  EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::warning, "Values of ddq1 lie farther than noise", "lags")));
+  report.residuals = {{0, "ddq1", 100, 1, 0.95, 0.8}};
+  EXPECT_THAT(learning_advice(report),
+              ElementsAre(advises(Level::note, "Residuals of ddq1 go on from row to row", "farther apart")));
+}
+
+TEST(Advice, TellsOfDistrustedValues) {
+  Report report = good_report();
+  report.fit.report.distrusted = {{0, 0, 41, 13, 13}, {0, 0, 7, 5, 5}};
+  EXPECT_THAT(learning_advice(report),
+              ElementsAre(advises(Level::note, "distrusts 2 values; the farthest, at row 42", "mend the log")));
+}
+
+TEST(Advice, TellsOfOneErrorFarOutAndOfErrorsThatFollowAFeature) {
+  Report report = good_report();
+  report.data = {good_data("training"), good_data("test")};
+  ReportData& test = report.data[1];
+  constexpr int n = 60;
+  test.measured = Eigen::MatrixXd::Zero(1, n);
+  test.predicted = Eigen::MatrixXd::Zero(1, n);
+  test.stddev = Eigen::MatrixXd::Zero(1, n);
+  test.noise_stddev = Eigen::MatrixXd::Constant(1, n, 0.1);
+  test.measured(0, 16) = 1.3;
+  EXPECT_THAT(learning_advice(report),
+              ElementsAre(advises(Level::warning, "At row 17 of the test data ddq1 is off by 13 deviations", "")));
+  // a bow over the feature
+  const Eigen::VectorXd feature = Eigen::VectorXd::LinSpaced(n, -1, 1);
+  test.measured = (0.6 * feature.array().square() - 0.2).transpose();
+  test.features = {{"x", feature}};
+  EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::warning, "Errors of ddq1 in the test data follow x", "shape")));
+}
+
+TEST(Advice, DoesNotBlameTheNoiseWhereTheTestHasNone) {
+  Report report = good_report();
+  report.data = {good_data("training"), good_data("test")};
+  Evaluation& test = report.data[1].evaluation;
+  report.residuals = {{0, "ddq1", 100, 1, 0.95, 0}};
+  test.coverage95 = 1;
+  test.rmse[0] = 0.02;
+  test.coverage95_latent = 0.99;
+  EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::good, "", "")));
+  test.coverage95_latent = 0.7;
+  EXPECT_THAT(learning_advice(report),
+              ElementsAre(advises(Level::warning, "Over-confident: 70.0 % of the test data, which seem", "")));
+  report.residuals[0].rms = 0.3;
+  EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::note, "Too cautious: 100.0 %", "`noise_std=estimate`")));
 }
 
 TEST(Advice, PutsWarningsFirst) {

@@ -45,7 +45,8 @@ TEST_F(ReportCommand, FindsColumnsOfTheTestByOtherNames) {
   std::string header = log.substr(0, line);
   header = replaced(header, "ddq3", "alpha");
   desk.write("other.csv", header + log.substr(line));
-  EXPECT_EQ(desk.run("gp2 report fit.json --data other.csv -o report.html").status, 2);
+  EXPECT_THAT(desk.done("gp2 report fit.json --data other.csv -o report.html").err,
+              HasSubstr("other.csv: not compared: ddq3, which it lacks"));
   desk.done("gp2 report fit.json --data other.csv --map alpha=ddq3 -o report.html");
 }
 

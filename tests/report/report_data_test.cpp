@@ -25,8 +25,8 @@ TEST(Coverage, IsTheShareOfMeasurementsWithinTheirIntervals) {
   data.measured.row(0) << 0.5 * 5, 1.0 * 5, -2.5 * 5;
   data.predicted = MatrixXd::Zero(2, 3);
   data.stddev = MatrixXd::Constant(2, 3, 3);
-  data.noise_stddev = VectorXd::Constant(2, 4);  // hypot(3, 4) = 5
-  data.noise_stddev[1] = std::numeric_limits<double>::quiet_NaN();
+  data.noise_stddev = MatrixXd::Constant(2, 3, 4);  // hypot(3, 4) = 5
+  data.noise_stddev.row(1).setConstant(std::numeric_limits<double>::quiet_NaN());
   VectorXd levels(4);
   levels << 0.3, 0.5, 0.95, 0.99;
   const MatrixXd share = coverage(data, levels);

@@ -9,6 +9,7 @@
 
 #include "gp2/error.hpp"
 #include "gp2/fit.hpp"
+#include "gp2/jobs/simulate_job.hpp"
 #include "gp2/posterior.hpp"
 #include "io_testing.hpp"
 #include "reference_data.hpp"
@@ -135,6 +136,150 @@ TEST(Simulate, ReachesTheSameStateWhateverIsWritten) {
   const Trajectory many = simulate_model(model, figure_start(), with_tolerance(times(6, 301), 1e-6));
   EXPECT_EQ(few.states.col(1), many.states.col(300));
   EXPECT_EQ(few.steps, many.steps);
+}
+
+// ---- dry friction
+
+/// A model of one body or several without constraints, force[j] on coordinate j of mass 1.
+Model bodies(const std::vector<std::string>& coordinates, const std::vector<std::string>& force, const std::string& more = "") {
+  nlohmann::json mass = nlohmann::json::array();
+  for (std::size_t j = 0; j < force.size(); ++j) {
+    mass.push_back(std::vector<int>(force.size(), 0));
+    mass[j][j] = 1;
+  }
+  return Model::parse(fmt::format("coordinates = {}\n[mechanics]\nmass = {}\nforce = {}\n{}", nlohmann::json(coordinates).dump(),
+                                  mass.dump(), nlohmann::json(force).dump(), more),
+                      "bodies.toml");
+}
+
+Trajectory simulate_switching(const Model& model, const VectorXd& start, SimulateOptions options) {
+  options.switching = switching_functions(model, false);
+  return simulate_model(model, start, options);
+}
+
+TEST(SimulateDryFriction, BringsABodyToRestAndHoldsItThere) {
+  const Model model = bodies({"x"}, {"-2*sign(3*dx)"});
+  const Trajectory out = simulate_switching(model, state_of(model, {{"dx", 1}}), with_tolerance(times(10, 101), 1e-9));
+  EXPECT_LT(out.steps + out.rejected_steps, 100);
+  for (int i = 0; i < out.states.cols(); ++i) {
+    const double t = std::min(out.times[i], 0.5);
+    EXPECT_NEAR(out.states(0, i), t - t * t, 1e-9);
+    EXPECT_NEAR(out.states(1, i), 1 - 2 * t, 1e-9);
+    EXPECT_NEAR(out.accelerations(0, i), out.times[i] < 0.5 ? -2 : 0, out.times[i] == 0.5 ? 2 : 1e-9);
+  }
+}
+
+TEST(SimulateDryFriction, ASpringPullsABodyToWhereItSticks) {
+  // half swings about ±μ/k, each shorter by 2 μ/k: 1, −0.4, −0.2, which is within ±0.3
+  const Model model = bodies({"x"}, {"-x - 0.3*sign(dx)"});
+  const Trajectory out = simulate_switching(model, state_of(model, {{"x", 1}}), with_tolerance(times(20, 201), 1e-9));
+  EXPECT_LT(out.steps + out.rejected_steps, 500);
+  EXPECT_NEAR(out.states.row(0).minCoeff(), -0.4, 1e-3);
+  EXPECT_NEAR(out.states(0, 200), -0.2, 1e-8);
+  EXPECT_NEAR(out.states(1, 200), 0, 1e-12);
+}
+
+TEST(SimulateDryFriction, LetsABodyGoWhenTheForceIsLargeEnough) {
+  const Model model = bodies({"x"}, {"t - 2*sign(dx)"});
+  const Trajectory out = simulate_switching(model, state_of(model, {}), with_tolerance(times(4, 41), 1e-9));
+  for (int i = 0; i < out.states.cols(); ++i) {
+    const double t = std::max(out.times[i] - 2, 0.0);
+    EXPECT_NEAR(out.states(1, i), t * t / 2, 1e-7) << out.times[i];
+    EXPECT_NEAR(out.states(0, i), t * t * t / 6, 1e-7) << out.times[i];
+  }
+}
+
+TEST(SimulateDryFriction, TwoBodiesMoveAsOneUntilOneIsTornOff) {
+  // friction between both; the first is slowed by the ground as well, until it rests while the second slides on
+  const Model model = bodies({"x", "y"}, {"-sign(dx - dy) - 0.5*sign(dx)", "sign(dx - dy)"});
+  const Trajectory out = simulate_switching(model, state_of(model, {{"dx", 2}}), with_tolerance(times(10, 1001), 1e-9));
+  // 2 − 1.5 t = t at 0.8; from there as one with −0.25 until both rest at 0.8 + 3.2
+  for (int i = 0; i < out.states.cols(); ++i) {
+    const double t = out.times[i], together = std::max(0.8 - 0.25 * (t - 0.8), 0.0);
+    EXPECT_NEAR(out.states(2, i), t < 0.8 ? 2 - 1.5 * t : together, 1e-8) << t;
+    EXPECT_NEAR(out.states(3, i), t < 0.8 ? t : together, 1e-8) << t;
+  }
+  EXPECT_LT(out.steps + out.rejected_steps, 200);
+}
+
+TEST(SimulateDryFriction, HoldsABodyOnASlopeWithTheMultiplierOfRest) {
+  const std::string slope = "[constraints]\nposition = [\"y + x/4\"]\n";
+  const Model steep = bodies({"x", "y"}, {"-0.5*sign(dx)", "-1"}, slope), rough = bodies({"x", "y"}, {"-sign(dx)", "-1"}, slope);
+  SimulateOptions options = with_tolerance(times(5, 11), 1e-9);
+  // down the slope: −1/4 against friction
+  const Trajectory held = simulate_switching(rough, state_of(rough, {}), options);
+  EXPECT_EQ(held.states.topRows(4).cwiseAbs().maxCoeff(), 0);
+  EXPECT_LT(held.accelerations.cwiseAbs().maxCoeff(), 1e-12);
+  const Model slippery = bodies({"x", "y"}, {"-0.1*sign(dx)", "-1"}, slope);
+  const Trajectory slid = simulate_switching(slippery, state_of(slippery, {}), options);
+  // ddx (1 + 1/16) = 1/4 − 0.1
+  EXPECT_NEAR(slid.accelerations(0, 10), 0.15 / 1.0625, 1e-9);
+  EXPECT_NEAR(slid.states(0, 10), 0.5 * 25 * 0.15 / 1.0625, 1e-7);
+
+  // at rest the constraint bears all but friction: Aᵀλ = ddq − F with F = (−1/4 of friction, −1)
+  SimulateRequest request;
+  request.start = std::map<std::string, double>{{"x", 0}};
+  request.times = options.times;
+  const Trajectory motion = run_simulation(prepare_simulation(steep, request)).front();
+  ASSERT_EQ(motion.records.rows(), 1);
+  EXPECT_NEAR(motion.records(0, 5), 1, 1e-9);
+}
+
+TEST(SimulateDryFriction, BringsAMechanismOfRedundantConstraintsToRest) {
+  const auto slider_crank = [](const std::string& friction) {
+    std::string text = test::model("models/slider_crank.toml").text;
+    const std::string smooth = "tanh(20*dq3)";
+    return Model::parse(text.replace(text.find(smooth), smooth.size(), friction), "slider_crank.toml");
+  };
+  const Model dry = slider_crank("sign(dq3)"), steep = slider_crank("tanh(3000*dq3)");
+  const VectorXd start = solved_state(dry, {{"q1", 0.3}, {"dq1", 20}});
+  const Trajectory out = simulate_switching(dry, start, with_tolerance(times(3, 101), 1e-9));
+  const Trajectory nearly = simulate_model(steep, start, with_tolerance(times(3, 101), 1e-9));
+  EXPECT_LT((out.states - nearly.states).cwiseAbs().maxCoeff(), 0.1);
+  EXPECT_LT((out.states - nearly.states).topRows(3).cwiseAbs().maxCoeff(), 1e-3);
+  EXPECT_LT(out.states.col(100).segment(3, 3).cwiseAbs().maxCoeff(), 1e-9);
+  EXPECT_LT(out.accelerations.col(100).cwiseAbs().maxCoeff(), 1e-6);
+  EXPECT_LT(out.steps, nearly.steps);
+}
+
+TEST(SimulateDryFriction, IsFoundInForcesTruthAndLatents) {
+  const Model model = bodies({"x", "y"}, {"-sign(dx) - 2*sign(-3*dx/2)", "sign(x)"},
+                             "[truth]\nforce = [\"-sign(dx + dy)\", \"0\"]\n"
+                             "[[latent]]\nkernel = \"se\"\nfeatures = [\"x\", \"sign(dy)\"]\n");
+  EXPECT_EQ(switching_functions(model, false).size(), 2);  // dx, dx + dy
+  EXPECT_EQ(switching_functions(model, true).size(), 2);   // dx, dy
+  EXPECT_EQ(switching_functions(oscillator(0.1), false).size(), 0);
+}
+
+TEST(SimulateUnfinished, SaysWhatWasReached) {
+  const Model model = oscillator();
+  SimulateOptions options = with_tolerance(times(100, 101), 1e-9);
+  options.max_steps = 200;
+  try {
+    simulate_model(model, state_of(model, {{"x", 1}}), options);
+    FAIL();
+  } catch (const UnfinishedMotion& unfinished) {
+    EXPECT_THAT(unfinished.what(), StartsWith("simulate: 200 steps reach no further than t = "));
+    ASSERT_EQ(unfinished.motions.size(), 1);
+    const Trajectory& out = unfinished.motions[0];
+    EXPECT_EQ(out.steps + out.rejected_steps, 200);
+    ASSERT_GT(out.times.size(), 10);
+    EXPECT_EQ(out.states.cols(), out.times.size());
+    EXPECT_EQ(out.accelerations.cols(), out.times.size());
+    for (int i = 0; i < out.times.size(); ++i) EXPECT_NEAR(out.states(0, i), std::cos(out.times[i]), 1e-7);
+  }
+}
+
+TEST(SimulateUnfinished, AnEndThatDoublesCannotReachIsToldAtOnce) {
+  const Model model = oscillator();
+  EXPECT_THAT(numerical_error_of([&] {
+                simulate_model(model, state_of(model, {{"x", 1}}), with_tolerance(times(1e300, 3), 1e-6));
+              }),
+              AllOf(StartsWith("simulate: at t = "), HasSubstr("the end, 1e+300, is so far")));
+  // what rests may do so for ever
+  EXPECT_NO_THROW(simulate_model(model, state_of(model, {}), with_tolerance(times(1e300, 3), 1e-6)));
+  EXPECT_THAT(input_error_of([&] { simulate_model(model, state_of(model, {}), with_tolerance(times(1, 3), 1e-30)); }),
+              StartsWith("simulate: the relative tolerance must be at least 1e-14"));
 }
 
 // ---- inputs

@@ -122,6 +122,11 @@ TEST_F(ParserTest, ErrorsSayWhereWhatTheRuleAndTheMend) {
       {"sin()", "column 1: sin takes 1 argument, got 0"},
       {"min(q1)", "column 1: min takes 2 or more arguments, got 1"},
       {"max()", "column 1: max takes 2 or more arguments, got 0"},
+      {"q1^2 > 0",
+       "column 6: found '>'; constraints that come and go are not supported: write the equation that holds as long as there is "
+       "contact"},
+      {"q1² - 1", "column 3: found '²'; a power is written ^2"},
+      {"g", "column 1: unknown symbol 'g'; known here: q1, q2, dq1, dq2, dq3, mass"},
       {"q1 = q2", "column 4: found '='; write an equation left = right as the expression left - (right)"},
       {"[q1]", "column 1: found '['; group with ( )"},
       {"q1 + é·q2", "column 6: character 'é' has no meaning here; " + allowed},

@@ -5,6 +5,8 @@
 
 #include "gp2/error.hpp"
 #include "gp2/fit.hpp"
+#include "gp2/mechanics/callable_system.hpp"
+#include "gp2/training/robust.hpp"
 #include "test_models.hpp"
 
 namespace gp2 {
@@ -278,6 +280,48 @@ TEST(FitTest, BeginsNoFurtherRestartOnceItIsAskedToStop) {
     EXPECT_EQ(report.restarts[k].evaluations, 0);
     EXPECT_EQ(report.restarts[k].objective, std::numeric_limits<double>::infinity());
     EXPECT_EQ(report.restarts[k].termination, "not begun: stopped on request");
+  }
+}
+
+// The surface model as code that counts its evaluations and asks for the end of the fit at one of them.
+std::shared_ptr<const System> counting_surface(std::atomic<int>& n_calls, int stop_at, std::atomic<bool>& stop) {
+  const std::shared_ptr<const System> system = test::model("models/surface.toml").system;
+  CallableSystem::Definition definition;
+  definition.declaration = {system->name(), system->coordinates(), system->inputs(), system->parameters()};
+  for (const std::string& label : system->constraint_labels()) {
+    definition.constraints.push_back({label, ConstraintLevel::acceleration});
+  }
+  definition.evaluate = [system, &n_calls, stop_at, &stop](const auto& states, const auto& parameters) {
+    if (++n_calls == stop_at) stop = true;
+    return system->evaluate(states, parameters);
+  };
+  definition.differentiate = [system](const auto& states, const auto& parameters, int index) {
+    return system->differentiate(states, parameters, index);
+  };
+  return std::make_shared<const CallableSystem>(std::move(definition));
+}
+
+TEST(FitTest, EndsWithTheEvaluationUnderWayWhereverItIsAskedToStop) {
+  const Problem p = problem("models/surface.toml", 6, {"p1", "p5"});
+  const auto n_evaluations = [&](int stop_at, bool robust) {
+    std::atomic<int> n_calls = 0;
+    std::atomic<bool> stop = false;
+    Prior prior = p.prior;
+    prior.system = counting_surface(n_calls, stop_at, stop);
+    FitOptions options = quick();
+    options.stop = &stop;
+    const FitReport report = (robust ? fit_robust(prior, p.observations, p.hyperparameters, options)
+                                     : fit(prior, p.observations, p.hyperparameters, options))
+                                 .report;
+    EXPECT_TRUE(report.termination == FitReport::interrupted || stop_at < 0) << stop_at;
+    return n_calls.load();
+  };
+  for (const bool robust : {false, true}) {
+    const int all = n_evaluations(-1, robust);
+    for (int stop_at = 1; stop_at < all - 10; stop_at += 1 + all / 40) {
+      // at most the start of the first restart, one more, and what conditions the posterior
+      EXPECT_LE(n_evaluations(stop_at, robust), stop_at + 3) << stop_at << " of " << all;
+    }
   }
 }
 

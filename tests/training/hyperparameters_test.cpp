@@ -50,7 +50,7 @@ TEST(HyperparametersTest, ThePaperProtocolHasThePapersBox) {
   const std::vector<Observations> observations = observe(model, 60, false);
   const auto all = default_hyperparameters(prior, observations, {"p1", "p4", "p7"}, {Protocol::Name::paper, true});
   ASSERT_EQ(all.size(), 9u + 1u + 3u);
-  const MatrixXd features = evaluate_features(prior.latents[0], observations[0].states());
+  const MatrixXd features = evaluate_features(prior, 0, observations[0].states());
   for (int d = 0; d < 9; ++d) {
     const Hyperparameter& h = all[static_cast<std::size_t>(d)];
     SCOPED_TRACE(h.name);
@@ -94,7 +94,7 @@ TEST(HyperparametersTest, TheStandardProtocolHasItsOwnBoxAndHyperPriors) {
   const auto all = default_hyperparameters(prior, observations, {"R"}, {});
   using Standard = Protocol::Standard;
   ASSERT_EQ(all.size(), 7u + 3u + 3u + 1u);
-  const double spread = stddev(evaluate_features(prior.latents[0], observations[0].states()).col(2));
+  const double spread = stddev(evaluate_features(prior, 0, observations[0].states()).col(2));
   const Hyperparameter& lengthscale = find(all, "lengthscale(sin(q3))");
   expect_same(lengthscale.value, Standard::lengthscale_initial * spread);
   expect_same(lengthscale.lower, Standard::lengthscale_lower * spread);
@@ -135,7 +135,7 @@ TEST(HyperparametersTest, PriorsOfTheModelReplaceTheWeakOnes) {
   const Prior prior = make_prior(model);
   const std::vector<Observations> observations = observe(model, 30, false);
   const auto all = default_hyperparameters(prior, observations, {"p1"}, {});
-  const double spread = stddev(evaluate_features(prior.latents[0], observations[0].states()).col(0));
+  const double spread = stddev(evaluate_features(prior, 0, observations[0].states()).col(0));
   expect_same(find(all, "lengthscale(q1)").hyperprior.median, 2 * spread);
   EXPECT_EQ(find(all, "lengthscale(q1)").hyperprior.stddev, 0.5);
   expect_same(find(all, "signal_stddev(ddq1)").hyperprior.median, 3 * stddev(observations[0].values().row(0)));

@@ -1,5 +1,6 @@
 #include <algorithm>
 #include <cmath>
+#include <cstdlib>
 #include <limits>
 
 #include <fmt/format.h>
@@ -7,6 +8,7 @@
 #include <nlohmann/json.hpp>
 
 #include "command.hpp"
+#include "gp2/base/statistics.hpp"
 #include "gp2/base/version.hpp"
 #include "gp2/data/csv.hpp"
 #include "gp2/error.hpp"
@@ -29,7 +31,9 @@ constexpr Index max_drawn = 2000;
 Json number(double value) { return std::isfinite(value) ? Json(value) : Json(); }
 
 // for pictures: six digits
-Json rounded(double value) { return std::isfinite(value) ? Json(std::stod(fmt::format("{:.6g}", value))) : Json(); }
+Json rounded(double value) {
+  return std::isfinite(value) ? Json(std::strtod(fmt::format("{:.6g}", value).c_str(), nullptr)) : Json();
+}
 
 template <typename Row>
 Json row_json(const Row& row, Index stride = 1) {
@@ -233,7 +237,8 @@ Json data_json(const Report& report, const ReportData& data) {
   }
   const VectorXd levels = nominal_levels();
   Json noise = Json::array();
-  for (const double one : data.noise_stddev) noise.push_back(number(one));
+  // the page draws one band for all measurements of an output
+  for (const auto& row : data.noise_stddev.rowwise()) noise.push_back(number(median({row.begin(), row.end()})));
   Json json = {{"name", data.name},
                {"source", data.source},
                {"test", data.is_test},

@@ -11,6 +11,7 @@
 #include "gp2/simulation/generate.hpp"
 #include "reproduce/experiment.hpp"
 #include "reproduce/table.hpp"
+#include "streams.hpp"
 
 // The benchmark of Rath, Geist & Trimpe 2021: an arm that slides on a plane.
 namespace gp2::command {
@@ -165,14 +166,14 @@ void add_ratios(const Section& definition, std::size_t k, const std::vector<Meth
 std::string shown(const Table::Row& value) { return value.is_null() ? "-" : fmt::format("{:.3f}", value.get<double>()); }
 
 void print(const std::vector<Table::Row>& rows) {
-  fmt::print("{:>5} {:<16} {:>9} {:>9} {:>9} {:>7} {:>7} {:>9} {:>10} {:>10} {:>8}\n", "n", "method", "blocks", "indep.",
-             "published", "ratio", "indep.", "published", "|Addq−b|", "largest", "seconds");
+  print_result("{:>5} {:<16} {:>9} {:>9} {:>9} {:>7} {:>7} {:>9} {:>10} {:>10} {:>8}\n", "n", "method", "blocks", "indep.",
+               "published", "ratio", "indep.", "published", "|Addq−b|", "largest", "seconds");
   for (const Table::Row& row : rows) {
-    fmt::print("{:>5} {:<16} {:>9} {:>9} {:>9} {:>7} {:>7} {:>9} {:>10.1e} {:>10.1e} {:>8.0f}\n", row["n"].get<int>(),
-               row["method"].get<std::string>(), shown(row["mae_blocks"]), shown(row["mae_independent"]),
-               shown(row["published_mae"]), shown(row["ratio_blocks"]), shown(row["ratio_independent"]),
-               shown(row["published_ratio"]), row["mean_constraint_error"].get<double>(),
-               row["max_constraint_error"].get<double>(), row["seconds"].get<double>());
+    print_result("{:>5} {:<16} {:>9} {:>9} {:>9} {:>7} {:>7} {:>9} {:>10.1e} {:>10.1e} {:>8.0f}\n", row["n"].get<int>(),
+                 row["method"].get<std::string>(), shown(row["mae_blocks"]), shown(row["mae_independent"]),
+                 shown(row["published_mae"]), shown(row["ratio_blocks"]), shown(row["ratio_independent"]),
+                 shown(row["published_ratio"]), row["mean_constraint_error"].get<double>(),
+                 row["max_constraint_error"].get<double>(), row["seconds"].get<double>());
   }
 }
 
@@ -283,8 +284,8 @@ void reproduce_arm_mass(const ReproduceOptions& options) {
         row[fitted[l].name] = number_or_null(uncertainty.correlation(column, static_cast<Index>(l)));
       }
       correlations.add(std::move(row));
-      fmt::print("{:<18} {:<5} true {:>7.4f}   estimated {:>9.5f} ± {:.5f}\n", method.name, h.name, truth.number(h.name), h.value,
-                 uncertainty.stddev[column]);
+      print_result("{:<18} {:<5} true {:>7.4f}   estimated {:>9.5f} ± {:.5f}\n", method.name, h.name, truth.number(h.name),
+                   h.value, uncertainty.stddev[column]);
     }
   }
   table.write(options.output / "arm_mass");

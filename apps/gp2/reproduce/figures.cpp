@@ -6,6 +6,7 @@
 #include "command.hpp"
 #include "gp2/inference/evaluation.hpp"
 #include "gp2/simulation/generate.hpp"
+#include "gp2/simulation/model_motion.hpp"
 #include "reproduce/experiment.hpp"
 #include "reproduce/table.hpp"
 
@@ -62,13 +63,6 @@ Table along(const Line& line, const System& system, const Posterior& posterior, 
     table.add(std::move(row));
   }
   return table;
-}
-
-// M⁻¹F + truth
-MatrixXd true_unconstrained(const Model& model, const MatrixXd& states) {
-  Model free = model;
-  free.system = model.system->without_constraints();
-  return true_acceleration(free, states);
 }
 
 }  // namespace
@@ -130,7 +124,8 @@ void reproduce_fig3b(const ReproduceOptions& options) {
     const TrainedFigure inferred(section, restarts, options);
     const Line of = line_of(section.section("line"), inferred.model);
     const View a_bar = View::unconstrained_acceleration(*inferred.model.system);
-    along(of, *inferred.model.system, inferred.posterior(), a_bar, true_unconstrained(inferred.model, of.states))
+    along(of, *inferred.model.system, inferred.posterior(), a_bar,
+          ModelMotion(inferred.model).unconstrained_acceleration(of.states))
         .write(options.output / fmt::format("fig3b_abar_{}", section.text("name")));
   }
   plot(options, "fig3b");

@@ -9,6 +9,7 @@
 #include <fmt/format.h>
 
 #include "reproduce/experiment.hpp"
+#include "streams.hpp"
 
 extern char** environ;  // NOLINT(readability-redundant-declaration): POSIX leaves it to the program
 
@@ -62,8 +63,7 @@ void plot(const ReproduceOptions& options, const std::string& name) {
 
 void talk_over(const std::string& text) {
   if (isatty(STDERR_FILENO) == 0) return;
-  fmt::print(stderr, "\r\033[K{}", text);
-  std::fflush(stderr);
+  print_message("\r\033[K{}", text);
 }
 
 }  // namespace gp2::command

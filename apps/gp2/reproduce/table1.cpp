@@ -12,6 +12,7 @@
 #include "gp2/inference/evaluation.hpp"
 #include "reproduce/experiment.hpp"
 #include "reproduce/table.hpp"
+#include "streams.hpp"
 
 // Table 1 of Geist & Trimpe 2020.
 namespace gp2::command {
@@ -122,18 +123,18 @@ void print(const std::vector<Table::Row>& cells) {
   const auto shown = [](const Json& value, const char* format) {
     return value.is_null() ? std::string("-") : fmt::format(fmt::runtime(format), value.get<double>());
   };
-  fmt::print("{:<9} {:<8} {:<16} {:>28} {:>10} {:>28} {:>12}\n", "system", "protocol", "method", "rmse mean [min, max]",
-             "published", "printed mean [min, max]", "|A ddq − b|");
+  print_result("{:<9} {:<8} {:<16} {:>28} {:>10} {:>28} {:>12}\n", "system", "protocol", "method", "rmse mean [min, max]",
+               "published", "printed mean [min, max]", "|A ddq − b|");
   for (const Table::Row& row : cells) {
     const auto range = [&](const std::string& prefix) {
       if (row[prefix + "rmse_mean"].is_null()) return std::string("-");
       return fmt::format("{:.4g} [{:.4g}, {:.4g}]", row[prefix + "rmse_mean"].get<double>(),
                          row[prefix + "rmse_min"].get<double>(), row[prefix + "rmse_max"].get<double>());
     };
-    fmt::print("{:<9} {:<8} {:<16} {:>28} {:>10} {:>28} {:>12}\n", row["system"].get<std::string>(),
-               row["protocol"].get<std::string>(), row["method"].get<std::string>(), range(""),
-               shown(row["published_rmse_mean_same_runs"], "{:.4g}"), range("printed_"),
-               shown(row["max_constraint_error"], "{:.2g}"));
+    print_result("{:<9} {:<8} {:<16} {:>28} {:>10} {:>28} {:>12}\n", row["system"].get<std::string>(),
+                 row["protocol"].get<std::string>(), row["method"].get<std::string>(), range(""),
+                 shown(row["published_rmse_mean_same_runs"], "{:.4g}"), range("printed_"),
+                 shown(row["max_constraint_error"], "{:.2g}"));
   }
 }
 

@@ -8,6 +8,7 @@
 #include "gp2/simulate.hpp"
 #include "reproduce/experiment.hpp"
 #include "reproduce/table.hpp"
+#include "streams.hpp"
 
 // Figures 3c and S7 of Geist & Trimpe 2020: how far trajectories leave the surface.
 namespace gp2::command {
@@ -137,8 +138,8 @@ void reproduce_trajectories(const ReproduceOptions& options, const std::string& 
   table.write(options.output / name);
   summary.write(options.output / (name + "_summary"));
   for (const Table::Row& row : summary.rows()) {
-    fmt::print("{:<20} largest error to the surface {:>9.2e}   to the fitted one {:>9.2e}\n", row["method"].get<std::string>(),
-               row["max_surface_error"].get<double>(), row["max_fitted_surface_error"].get<double>());
+    print_result("{:<20} largest error to the surface {:>9.2e}   to the fitted one {:>9.2e}\n", row["method"].get<std::string>(),
+                 row["max_surface_error"].get<double>(), row["max_fitted_surface_error"].get<double>());
   }
   plot(options, name);
 }

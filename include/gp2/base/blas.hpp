@@ -37,8 +37,13 @@ struct BlasReport {
   std::string advice;          // what to set and why, one line; "" when there is nothing to mend
 };
 
-/// What the library says about itself. Neither this nor anything else in gp2's library changes a setting for the whole process:
-/// OpenBLAS reads OPENBLAS_CORETYPE when it is loaded, so only who starts the process can choose.
+/// What the library says about itself.
+///
+/// gp2's library changes one setting of the process, and for a time only: while a fit, a posterior or samples are computed,
+/// OpenBLAS uses one thread, or those of the fit for a single large matrix, since the bits of a result must not depend on its
+/// threads. Afterwards it has as many as before, unless the program has chosen another number meanwhile, which then stays. Who
+/// chooses one while gp2 computes may change last digits. OpenBLAS reads OPENBLAS_CORETYPE when it is loaded, so only who starts
+/// the process can choose the kernel.
 BlasReport blas_report();
 
 }  // namespace gp2

@@ -22,7 +22,7 @@ namespace gp2 GP2_API {
 ///     icm  K = B₁ k_SE,
 ///     lmc  K = B₁ k_SE + B₂ k_bias + B₃ k_linear,    B_i = W_iW_iᵀ + diag κ_i,  W_i (nq × nq).
 ///
-/// It is a Prior like any other: its system has no constraints, so that ddq = ā, and the loadings of icm and lmc are free,
+/// It is a Prior like any other: its system has unit masses and no constraints, so that ddq = ā, and the loadings of icm and lmc are free,
 /// C = [W, diag √κ] (loading_entries). Observations, views and predictions need to know nothing of it.
 struct Baseline {
   enum class Kind { se, icm, lmc };
@@ -40,11 +40,10 @@ struct Baseline {
 Baseline unstandardised(const Model& model, Baseline::Kind kind);
 
 /// A baseline with the means and standard deviations of what it is to learn from.
-///
-/// @param latent  whose features it has
-Baseline standardised_by(const std::vector<Observations>& observations, const Latent& latent, Baseline::Kind kind);
+Baseline standardised_by(const std::vector<Observations>& observations, const Prior& prior, Baseline::Kind kind);
 
-/// The prior of a baseline over the features of all latents of a model, angles raw.
+/// The prior of a baseline over the features of all latents of a model, angles raw, and the entries of the state that its mechanics
+/// read and no feature does.
 /// @throws InputError when a mean or standard deviation has another size than outputs or features.
 Prior make_baseline_prior(const Model& model, const Baseline& baseline);
 

@@ -1,7 +1,6 @@
 #pragma once
 
 #include <map>
-#include <set>
 #include <string>
 #include <vector>
 
@@ -61,7 +60,7 @@ class LogReader {
   std::map<std::string, std::string> columns_;
   std::map<std::string, std::vector<std::string>> aliases_;
   std::map<std::string, std::string> aliases_used_;
-  std::set<int> used_;
+  std::map<int, std::string> used_;  // column -> what it was read as
 };
 
 }  // namespace gp2

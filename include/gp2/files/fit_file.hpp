@@ -17,6 +17,17 @@ namespace gp2 GP2_API {
 /// A fitted model as a file: the model's text, the options its prior was made with, the data and the hyperparameters. The
 /// posterior is computed anew from these, so a file loaded gives the same bits as before it was saved.
 struct FitFile {
+  /// An empty one, for who fills in its members.
+  FitFile() = default;
+  /// The file of a fit, of which file.posterior() is the posterior. As make_prior, not to be called from several threads for one
+  /// model.
+  ///
+  /// @param prior_options  that the prior of the fit was made with
+  /// @param systems        as the member
+  /// @throws InputError naming what differs: a model, prior_options or systems that make another prior than the fit has, or
+  ///   hyperparameters of another posterior.
+  FitFile(Model model, FitPriorOptions prior_options, const Fit& fit, std::vector<std::shared_ptr<const Model>> systems = {});
+
   /// 6: a checksum and options, values that are not measured; 5: robots; 4: values with a noise of their own; 3: mechanics that
   /// are code; 2: observations of other systems. All of them are read; 6 is written.
   static constexpr int format_version = 6;
@@ -32,6 +43,7 @@ struct FitFile {
 
   [[nodiscard]] Prior prior() const { return make_prior(model, prior_options); }
   /// The prior conditioned on the data, under the fitted hyperparameters.
+  /// @throws InputError as model_values.
   [[nodiscard]] Posterior posterior() const;
 
   /// Written whole or not at all. @throws InputError when that fails, or `systems` lacks the model of another system.

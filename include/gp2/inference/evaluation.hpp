@@ -7,6 +7,7 @@
 #include <Eigen/Core>
 
 #include "gp2/export.hpp"
+#include "gp2/mechanics/check.hpp"
 #include "gp2/posterior.hpp"
 
 namespace gp2 GP2_API {
@@ -23,19 +24,54 @@ struct Evaluation {
   // per-output Gaussian marginals; NaN when there is nothing to average
   double nlpd = 0, coverage95 = 0;                // of measurements: noise included
   double nlpd_latent = 0, coverage95_latent = 0;  // of noise-free targets
-  int n_zero_variance = 0;  // marginals without variance (the constraint decides them), left out of the latent figures
+  int n_zero_variance = 0;  // outputs that the constraint decides at their state, left out of the latent figures
   int n = 0;                // points
   int n_missing = 0;        // targets that are not measured (NaN), left out of all figures
+};
+
+/// Rows of ddq that any observation of a posterior has, in order.
+std::vector<int> observed_rows(const Posterior& posterior);
+
+/// Noise of measured accelerations as training knows it (rows × N): the stated deviations, times the factor that training found for
+/// those stated there; where none is stated the usual noise of the row in the first observations that have it, NaN where none have.
+///
+/// @param stated  (rows × N); NaN: not stated; empty: none is
+Eigen::MatrixXd measurement_noise(const Posterior& posterior, const std::vector<int>& rows, Eigen::Index n_states,
+                                  const Eigen::MatrixXd& stated = {});
+
+struct EvaluationOptions {
+  std::shared_ptr<const OtherSystem> other_system = nullptr;  // under which the targets were measured; null: the prior's own
+  Eigen::MatrixXd noise_stddev = {};  // of the targets (rows × N); NaN: not known; empty: measurement_noise
+  int n_threads = 1;                  // as in Posterior::marginal
 };
 
 /// @param states   (layout size × N)
 /// @param rows     of ddq that are compared
 /// @param targets  (rows × N); NaN: not measured
-/// @param other_system  the other system under which they were measured; null: the prior's own
-/// @param n_threads  as in Posterior::marginal
 Evaluation evaluate_predictions(const Posterior& posterior, const Eigen::Ref<const Eigen::MatrixXd>& states,
                                 const std::vector<int>& rows, const Eigen::Ref<const Eigen::MatrixXd>& targets,
-                                const std::shared_ptr<const OtherSystem>& other_system = nullptr, int n_threads = 1);
+                                const EvaluationOptions& options = {});
+
+/// How the measured values of a row of ddq lie about what all others say of them: z = (y − mean)/√(variance + σ²) of leave_one_out,
+/// which in a sound fit is standard normal.
+struct TrainingResidual {
+  std::size_t group = 0;  // of the observations
+  std::string output;
+  int n = 0;                      // measured values
+  double rms = 0;                 // of z
+  double coverage95 = 0;          // share of |z| below 1.96
+  double serial_correlation = 0;  // of z from one state to the next, in the order of the observations
+
+  /// Whether z is larger than chance and fitted hyperparameters make it.
+  [[nodiscard]] bool is_too_large() const;
+  /// Whether z goes on from state to state: the states follow each other in time, and something is missing that lasts longer.
+  [[nodiscard]] bool is_correlated() const;
+};
+/// One for each row of each observation of ddq. Costs a factorisation and an inverse.
+std::vector<TrainingResidual> training_residuals(const Posterior& posterior);
+
+/// The observations of a group, of ddq, against A ddq = b under the fitted parameters and noise.
+std::vector<ConstraintResidual> constraint_residuals(const Posterior& posterior, std::size_t group);
 
 /// max |A ddq − b| over states and rows of A.
 /// @param accelerations  (nq × N)

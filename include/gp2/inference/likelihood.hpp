@@ -20,7 +20,8 @@ namespace gp2 GP2_API {
 ///     −log p(y) = −log N(ỹ; 0, K̃ + I) + ½ Σ‖(I − QQᵀ)e‖² + ½ Σ log|S| + ½ Σ (dim y − r) log 2π,
 ///     K̃_ij      = Σ_a R_i E_a(x_i) C_a k_a,ij C_aᵀE_a(x_j)ᵀ R_jᵀ.
 ///
-/// The factored matrix has Σ r rows and eigenvalues ≥ 1: nothing is ever added to its diagonal. Thread-safe.
+/// The factored matrix has Σ r rows and eigenvalues ≥ 1: nothing is ever added to its diagonal. Thread-safe. Every member function
+/// throws InputError when the likelihood, or the workspace, was moved away.
 class Likelihood {
  public:
   struct Options {
@@ -29,7 +30,8 @@ class Likelihood {
   };
 
   /// @param initial  values at which everything that has no gradient stays: fixed noise and parameters are reduced once, here.
-  /// @throws InputError as require_mechanics of the prior, under `initial`.
+  /// @throws InputError when prior, observations, values and options do not fit each other; and as require_mechanics and
+  /// require_prior_values, under `initial`.
   Likelihood(Prior prior, std::vector<Observations> observations, const ModelValues& initial, Options options);
   ~Likelihood();
   Likelihood(Likelihood&&) noexcept;
@@ -48,10 +50,11 @@ class Likelihood {
     std::unique_ptr<Implementation> implementation_;
   };
 
-  /// −log p(y | values): +∞ where the mechanics have a fault (evaluate_mechanics of the prior) or the factorisation fails.
+  /// −log p(y | values): +∞ where the mechanics or the prior have a fault (evaluate_mechanics, evaluate_prior) or the factorisation fails.
   ///
   /// @param gradient  when not null, receives the gradient: zero in a fixed kernel, and where the options do not ask for the noise
   ///                  or a parameter. Left as it was when the value is +∞.
+  /// @throws InputError when the values do not fit the prior and the observations.
   double evaluate(const ModelValues& values, ModelGradient* gradient, Workspace& workspace) const;
 
   [[nodiscard]] const Prior& prior() const;
@@ -60,6 +63,7 @@ class Likelihood {
 
  private:
   struct Implementation;
+  [[nodiscard]] const Implementation& implementation() const;  // throws when it was moved away
   std::unique_ptr<Implementation> implementation_;
 };
 

@@ -16,7 +16,8 @@ struct PathwiseOptions {
 };
 
 /// Whole functions drawn from a posterior: each is a vector field that can be evaluated at any state, in any view, and simulated.
-/// A ddq = b holds to rounding, as it does for the mean, since views are applied last. Immutable, cheap to copy, thread-safe.
+/// A ddq = b holds to rounding, as it does for the mean, since views are applied last. Immutable, cheap to copy, thread-safe. Every
+/// member function throws InputError when the samples were moved away.
 class PathwiseSamples {
  public:
   [[nodiscard]] int n_samples() const;
@@ -30,6 +31,7 @@ class PathwiseSamples {
  private:
   struct Implementation;
   explicit PathwiseSamples(std::shared_ptr<const Implementation> implementation);
+  [[nodiscard]] const Implementation& implementation() const;  // throws when it was moved away
   friend PathwiseSamples sample_paths(const Posterior& posterior, int n_samples, const PathwiseOptions& options);
 
   std::shared_ptr<const Implementation> implementation_;

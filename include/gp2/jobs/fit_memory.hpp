@@ -1,6 +1,7 @@
 #pragma once
 
 #include <filesystem>
+#include <functional>
 #include <optional>
 #include <string>
 #include <vector>
@@ -19,6 +20,9 @@ struct FitMemory {
   double evaluation = 0;  // of the likelihood and its gradient         [bytes]
   double posterior = 0;   // when the evaluations are done              [bytes]
 
+  /// What is asked of the system in one piece: the whole square of which a triangle is touched, and the buffer of BLAS.
+  double asked_by_evaluation = 0, asked_by_posterior = 0;  // [bytes]
+
   [[nodiscard]] double bytes() const;  // shared + max(side_by_side · evaluation, posterior)
 };
 
@@ -30,11 +34,16 @@ FitMemory fit_memory(const FitProblem& problem, const FitOptions& options);
 /// @param root  where /proc and /sys are; for tests
 std::optional<double> free_memory(const std::filesystem::path& root = "/");
 
+/// Whether the system gives so many bytes in each of several pieces, all at a time. It refuses what goes beyond a limit on the
+/// address space (ulimit -v), and a piece beyond what the machine has. Nothing is kept.
+bool is_given(double bytes, int n_pieces);
+
 /// The options under which a fit stays within `free` bytes: with fewer evaluations side by side where those asked for would not,
 /// and then a note says so. Results do not depend on it. A fit of less than 100 MB is never touched.
-/// @param free  as free_memory(); nothing: no limit
+/// @param free   as free_memory(); nothing: no limit
+/// @param given  as is_given: what the system does not give is not begun, also for a small fit
 /// @throws InputError when one evaluation alone takes more, with the rows that would fit; as fit_memory.
 FitOptions within_memory(const FitProblem& problem, const FitOptions& options, std::optional<double> free,
-                         std::vector<std::string>& notes);
+                         std::vector<std::string>& notes, const std::function<bool(double, int)>& given = is_given);
 
 }  // namespace gp2

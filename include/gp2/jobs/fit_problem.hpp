@@ -113,6 +113,7 @@ LogReader open_log(const Model& model, const CsvTable& log, const std::map<std::
 struct LogStates {
   Eigen::MatrixXd states;
   Eigen::MatrixXd accelerations;  // those asked for (accelerations × N); NaN: not measured
+  Eigen::MatrixXd stated_stddev;  // of these, from columns NAME_std (accelerations × N); NaN: not stated; empty: none is
   std::vector<std::string> notes;
 };
 LogStates read_log_states(const Prior& prior, const View& view, const Model& model, const CsvTable& log,
@@ -133,6 +134,7 @@ struct WholeLog {
   Eigen::MatrixXd states;            // NaN where neither the model reads an entry nor the log has it (layout size × N)
   Eigen::MatrixXd accelerations;     // NaN where not measured, or not in the log (nq × N)
   std::vector<std::string> missing;  // accelerations that are not in the log
+  Eigen::MatrixXd stddev;            // of their noise, as the log or else [noise] states it; NaN where neither does (nq × N)
   std::vector<int> stated;           // rows of accelerations whose standard deviations the log states
 };
 /// @throws InputError for a missing column that the model's prior reads, and as LogReader::stddevs.

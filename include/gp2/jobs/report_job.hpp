@@ -37,7 +37,7 @@ struct ReportData {
   std::vector<int> rows;                 // of ddq, d
   Eigen::MatrixXd states;                // (layout size × N), NaN where not kept
   Eigen::MatrixXd measured;              // (d × N)
-  Eigen::VectorXd noise_stddev;          // fitted noise of each output (d); NaN where training did not observe it
+  Eigen::MatrixXd noise_stddev;          // of each measurement (d × N); NaN where neither the log nor training knows it
   Eigen::MatrixXd predicted, stddev;     // ddq  (nq × N)
   Eigen::MatrixXd unconstrained;         // ā    (nq × N), empty where M is singular
   Eigen::MatrixXd unconstrained_stddev;  //      (nq × N)
@@ -45,7 +45,8 @@ struct ReportData {
   Eigen::MatrixXd truth;                 // the true ddq (nq × N), NaN where unknown; empty where it is not asked for
   std::vector<std::pair<std::string, Eigen::VectorXd>> features;  // φ by name (N each)
   std::optional<ConstraintViolation> violation;
-  LowerRank lower_rank;                  // states at which constraints let go, or follow from each other
+  std::vector<ConstraintResidual> constraint_residuals;  // of the measured accelerations
+  LowerRank lower_rank;                                  // states at which constraints let go, or follow from each other
   std::vector<std::string> independent;  // accelerations to observe instead, where the outputs follow from each other
 
   /// Root mean square of truth − predicted per output (d); NaN where the truth is not known.
@@ -84,6 +85,7 @@ struct Report {
   std::string library;    // the version that fitted
   std::string file_date;  // of the fit file, YYYY-MM-DD
   std::vector<ReportData> data;
+  std::vector<TrainingResidual> residuals;  // of the training data, leave one out
   std::vector<Relevance> relevance;
   std::optional<ConstraintSurface> surface;
   std::string truth_source;  // the model that tells the truth

@@ -31,6 +31,7 @@ struct SimulateRequest {
 
   std::map<std::string, std::string> columns;  // model's name -> log's name, before the model's own [columns]
   double relative_tolerance = 1e-6, absolute_tolerance = 1e-9;
+  int max_steps = SimulateOptions().max_steps;
   bool project = true;
   std::optional<int> n_samples;  // functions drawn from the posterior, instead of its mean
   std::uint64_t seed = 0;
@@ -51,6 +52,7 @@ struct SimulateJob {
   Eigen::VectorXd parameters;
   Eigen::VectorXd start;                    // the whole state
   std::vector<Acceleration> accelerations;  // one for each motion
+  std::vector<Acceleration> records;        // the multipliers λ of each motion; none without constraints
   SimulateOptions options;
   std::vector<std::string> notes;  // how the start was completed
 };
@@ -63,8 +65,14 @@ SimulateJob prepare_simulation(const Model& model, const Posterior& posterior, c
 /// Thrown by run_simulation when it is asked to end.
 struct SimulationStopped {};
 
+/// One motion after the other, λ recorded where there are constraints.
 /// @param stop  set: throws SimulationStopped
+/// @throws UnfinishedMotion with what was reached of all motions.
 std::vector<Trajectory> run_simulation(const SimulateJob& job, const std::atomic<bool>* stop = nullptr);
+
+/// When a multiplier changes its sign: a support that cannot pull would let go there. Linear in between the times written.
+/// @return for each multiplier (nc) its times [s]
+std::vector<std::vector<double>> multiplier_sign_changes(const Trajectory& trajectory);
 
 /// The uncertainty of ddq along a motion, and where it leaves the region of the data.
 struct MotionUncertainty {

@@ -67,7 +67,6 @@ class CallableSystem final : public System {
 
   [[nodiscard]] const std::vector<Residual>& residual_labels() const override { return residual_labels_; }
   [[nodiscard]] std::vector<bool> reads(SystemPart part) const override;
-  [[nodiscard]] std::shared_ptr<const System> without_constraints() const override;
 
  private:
   void require_shapes(const char* function, const SystemValues& values, Eigen::Index n_states) const;

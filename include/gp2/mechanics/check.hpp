@@ -21,6 +21,7 @@ struct Finding {
 /// The largest violation of a position- or velocity-level constraint over a batch of states.
 struct ConstraintViolation {
   double relative = 0;  // |c| / Σ_j |A_j| spread(q_j), spread over the batch; velocities for velocity-level rows
+  double rms = 0;       // the same, root mean square over the batch
   double value = 0;     // c itself
   int state = 0;
   std::string constraint;
@@ -54,6 +55,31 @@ std::optional<std::vector<int>> dependent_columns(const System& system, const Ei
                                                   const Eigen::Ref<const Eigen::VectorXd>& parameters,
                                                   const Eigen::Ref<const Eigen::MatrixXd>& accelerations);
 
+/// Measured accelerations against one row of A ddq = b: r = A ddq − b is what noise makes of it, if the model and the data are right.
+struct ConstraintResidual {
+  std::string constraint;
+  int n = 0;               // states at which every acceleration that the row reads is measured
+  double rms = 0;          // of r
+  double mean = 0;         // of r
+  double expected = 0;     // of √(A S Aᵀ), root mean square; NaN where the noise S is not known
+  double size = 0;         // of |A| |ddq| + |b|, root mean square
+  std::vector<int> worst;  // states with the largest r, in units of the expected one where that is known; at most three
+
+  /// Whether r is more than noise: more than twice what is expected, beyond what chance does to n values; where the noise is not
+  /// known, an offset that stands out of the scatter, or half as large as the terms that should cancel.
+  [[nodiscard]] bool is_too_large() const;
+  /// "the residual of 'z - h*x^2' is 9.69, expected 0.2 from the noise: 48 ×, …": what it means, for people.
+  [[nodiscard]] std::string text() const;
+};
+
+/// One for each row of A, of which a state at least is measured.
+/// @param accelerations  (nq × N); NaN: not measured
+/// @param stddev         of their noise (nq × N); NaN: not known
+std::vector<ConstraintResidual> constraint_residuals(const System& system, const Eigen::Ref<const Eigen::MatrixXd>& states,
+                                                     const Eigen::Ref<const Eigen::VectorXd>& parameters,
+                                                     const Eigen::Ref<const Eigen::MatrixXd>& accelerations,
+                                                     const Eigen::Ref<const Eigen::MatrixXd>& stddev);
+
 /// Is the system well-posed at these states? M symmetric and positive definite or completed by A, A of constant rank, its rows
 /// neither nearly zero nor nearly redundant, b in the range of A, derivatives in the parameters equal to finite differences, A
 /// and b equal to the second derivative of the constraints along a motion.
@@ -64,10 +90,12 @@ std::vector<Finding> check_system(const System& system, const Eigen::Ref<const E
 
 /// How a log fits the system: states on the constraint, accelerations on A ddq = b, independent columns.
 ///
-/// @param accelerations  (nq × N); NaN where not measured: A ddq = b is looked at where all are
+/// @param accelerations  (nq × N); NaN where not measured
+/// @param stddev         of their noise (nq × N); NaN: not known
 /// @param stated         rows of ddq whose standard deviations the log states: those that a fit observes; empty: all
 std::vector<Finding> check_data(const System& system, const Eigen::Ref<const Eigen::MatrixXd>& states,
                                 const Eigen::Ref<const Eigen::VectorXd>& parameters,
-                                const Eigen::Ref<const Eigen::MatrixXd>& accelerations, const std::vector<int>& stated = {});
+                                const Eigen::Ref<const Eigen::MatrixXd>& accelerations,
+                                const Eigen::Ref<const Eigen::MatrixXd>& stddev, const std::vector<int>& stated = {});
 
 }  // namespace gp2

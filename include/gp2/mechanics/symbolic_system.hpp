@@ -69,7 +69,6 @@ class SymbolicSystem final : public System {
                                           const Eigen::Ref<const Eigen::VectorXd>& parameters) const override;
   [[nodiscard]] const std::vector<Residual>& residual_labels() const override { return residual_labels_; }
   [[nodiscard]] std::vector<bool> reads(SystemPart part) const override;
-  [[nodiscard]] std::shared_ptr<const System> without_constraints() const override;
 
   [[nodiscard]] const Definition& definition() const { return definition_; }
 

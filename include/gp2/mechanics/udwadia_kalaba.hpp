@@ -1,5 +1,6 @@
 #pragma once
 
+#include <limits>
 #include <optional>
 #include <string>
 #include <vector>
@@ -81,6 +82,12 @@ class UdwadiaKalaba {
   [[nodiscard]] double inconsistency() const { return inconsistency_; }  // largest |A L b − b|, rows of B of unit norm
   [[nodiscard]] double size_of_b() const { return size_of_b_; }          // largest |b|, rows of B of unit norm
 
+  /// Whether no acceleration satisfies A ddq = b: |A L b − b| is above `consistency_tolerance` of what accelerates the system at
+  /// this state, |b| and the applied force F (nq), and above `rounding`.
+  [[nodiscard]] bool is_contradictory(const Eigen::Ref<const Eigen::VectorXd>& F,
+                                      double rounding = std::numeric_limits<double>::min()) const;
+  static constexpr double consistency_tolerance = 1e-6;
+
   [[nodiscard]] const Eigen::MatrixXd& T() const { return T_; }    // (nq × nq)
   [[nodiscard]] const Eigen::VectorXd& Lb() const { return Lb_; }  // (nq) [ddq]
 
@@ -151,9 +158,6 @@ class UdwadiaKalaba {
 
 /// The Udwadia–Kalaba equation at N states.
 struct MechanicsBatch {
-  /// At a state, |A L b − b| above this fraction of the largest b of the batch means that the constraints contradict each other.
-  static constexpr double consistency_tolerance = 1e-6;
-
   SystemValues values;
   std::vector<UdwadiaKalaba> projections;
 

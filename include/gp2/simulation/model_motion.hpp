@@ -5,6 +5,7 @@
 #include <Eigen/Core>
 
 #include "gp2/export.hpp"
+#include "gp2/mechanics/udwadia_kalaba.hpp"
 #include "gp2/model.hpp"
 
 namespace gp2 GP2_API {
@@ -22,8 +23,15 @@ class ModelMotion {
   /// @return (nq × N), not finite where the truth is not
   /// @throws InputError as require_mechanics, and where M is singular while truth.acceleration is not 0.
   [[nodiscard]] Eigen::MatrixXd acceleration(const Eigen::Ref<const Eigen::MatrixXd>& states) const;
+  /// ā = M⁻¹(F + truth.force) + truth.acceleration, which nothing constrains (nq × N). @throws as acceleration.
+  [[nodiscard]] Eigen::MatrixXd unconstrained_acceleration(const Eigen::Ref<const Eigen::MatrixXd>& states) const;
+  /// The multipliers λ of that motion (nc × N).
+  [[nodiscard]] Eigen::MatrixXd multipliers(const Eigen::Ref<const Eigen::MatrixXd>& states) const;
 
  private:
+  [[nodiscard]] Eigen::MatrixXd unconstrained(const Eigen::Ref<const Eigen::MatrixXd>& states,
+                                              const MechanicsBatch& mechanics) const;
+
   std::shared_ptr<const System> system_;
   Eigen::VectorXd parameters_;
   Tape truth_, truth_force_;

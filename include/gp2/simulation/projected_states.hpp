@@ -22,12 +22,13 @@ struct ProjectedStates {
   std::vector<Failure> failures;  // states from which Newton's method does not reach the constraints
 };
 
-/// Moves every state onto the position constraints, then onto the velocity constraints, by the least distance in the metric of M
-/// (project_onto_constraints).
-/// @param states  (layout size × N); NaN: not measured, which stays
+/// Moves every state to the nearest one on the position constraints, then on the velocity constraints, each change in units of the
+/// deviation of what was measured. Where that is not stated it is taken as proportional to the spread of the entry over the states.
+/// @param states   (layout size × N); NaN: not measured, which stays
+/// @param stddevs  of q and dq as measured (2 nq × N); NaN: not stated; empty: none is
 /// @throws InputError naming the constraint, when the states lack what it reads.
 ProjectedStates project_states(const System& system, const Eigen::Ref<const Eigen::VectorXd>& parameters,
-                               const Eigen::Ref<const Eigen::MatrixXd>& states);
+                               const Eigen::Ref<const Eigen::MatrixXd>& states, const Eigen::MatrixXd& stddevs = {});
 
 /// Median, mean and largest of numbers ≥ 0, and where.
 struct SizeSummary {

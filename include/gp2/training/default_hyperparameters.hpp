@@ -46,12 +46,13 @@ struct Scales {
 
 /// σ_j = std of the observed ddq_j, or the size of its values where they do not vary; where there are none, or all are 0,
 /// σ_j = √(mean over observed i of M_ii σ_i²/M_jj), M at its median.
+/// @throws InputError when the observations are not of the prior, or nothing is measured.
 Scales default_scales(const Prior& prior, const std::vector<Observations>& observations);
 
 /// Everything tunable: kernels and signals of every latent, noise where it is estimated, and the named parameters of the system.
 ///
 /// @param estimated  names of system parameters to estimate
-/// @throws InputError for an unknown name, or a parameter of value 0 without bounds.
+/// @throws InputError for an unknown name, or a parameter of value 0 without bounds; and as default_scales.
 std::vector<Hyperparameter> default_hyperparameters(const Prior& prior, const std::vector<Observations>& observations,
                                                     const std::vector<std::string>& estimated, const Protocol& protocol);
 

@@ -95,7 +95,13 @@ struct Hyperparameter {
   [[nodiscard]] double hyperprior_slope() const { return hyperprior.slope(value, map()); }
 };
 
+/// @throws InputError when hyperparameters are not of this prior and these observations, a value is not finite or, where it is
+/// positive by nature, not positive, or bounds are not in order.
+void require_hyperparameters(const Prior& prior, const std::vector<Observations>& observations,
+                             const std::vector<Hyperparameter>& hyperparameters);
+
 /// The values that `hyperparameters` stand for; what they leave out keeps the model's value.
+/// @throws InputError as require_hyperparameters, but for bounds and hyper-priors, which it does not read.
 ModelValues model_values(const Prior& prior, const std::vector<Observations>& observations,
                          const std::vector<Hyperparameter>& hyperparameters);
 

@@ -1,0 +1,49 @@
+#include "streams.hpp"
+
+#include <cerrno>
+#include <csignal>
+#include <cstdio>
+
+#include <fcntl.h>
+#include <unistd.h>
+
+namespace gp2::command {
+
+namespace {
+
+int stdout_error = 0;               // errno of the first write that failed
+bool pipes_were_signalled = false;  // SIGPIPE was not ignored by who started the process
+
+}  // namespace
+
+void prepare_streams() {
+  for (const int stream : {STDIN_FILENO, STDOUT_FILENO, STDERR_FILENO}) {
+    if (fcntl(stream, F_GETFD) != -1 || errno != EBADF) continue;
+    // the lowest free descriptor is this one; opened the wrong way round, each use of it fails
+    static_cast<void>(open("/dev/null", stream == STDIN_FILENO ? O_WRONLY : O_RDONLY));
+  }
+  pipes_were_signalled = std::signal(SIGPIPE, SIG_IGN) != SIG_IGN;
+}
+
+void write_stdout(std::string_view text) {
+  errno = 0;
+  if (std::fwrite(text.data(), 1, text.size(), stdout) != text.size() && stdout_error == 0) stdout_error = errno;
+}
+
+void write_stderr(std::string_view text) {
+  static_cast<void>(std::fwrite(text.data(), 1, text.size(), stderr));
+  static_cast<void>(std::fflush(stderr));
+}
+
+int finish_stdout() {
+  errno = 0;
+  const bool is_good = std::fflush(stdout) == 0 && std::ferror(stdout) == 0;
+  if (!is_good && stdout_error == 0) stdout_error = errno != 0 ? errno : EIO;
+  if (stdout_error == EPIPE && pipes_were_signalled) {
+    std::signal(SIGPIPE, SIG_DFL);
+    static_cast<void>(std::raise(SIGPIPE));
+  }
+  return stdout_error;
+}
+
+}  // namespace gp2::command

@@ -1,0 +1,101 @@
+#include "inference/requirements.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <string>
+
+#include <fmt/format.h>
+
+#include "gp2/error.hpp"
+
+namespace gp2 {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+
+void require_observations(const Prior& prior, const Observations& observations) {
+  require_view(prior, observations.view());
+  prior_of(prior, observations.view()).system->require_states(observations.states());
+}
+
+void require_observations(const Prior& prior, const std::vector<Observations>& observations) {
+  require_prior(prior);
+  for (std::size_t g = 0; g < observations.size(); ++g) {
+    try {
+      require_observations(prior, observations[g]);
+    } catch (const InputError& error) {
+      throw InputError(fmt::format("observations {}: {}", g + 1, error.what()));
+    }
+  }
+}
+
+void require_measured(const std::vector<Observations>& observations, const char* function) {
+  const auto is_measured = [](const Observations& group) { return !group.values().array().isNaN().all(); };
+  if (std::any_of(observations.begin(), observations.end(), is_measured)) return;
+  throw InputError(fmt::format("{}: there is nothing to learn from: {}", function,
+                               observations.empty() ? "no observations are given" : "every value is NaN, not measured"));
+}
+
+namespace {
+
+enum class Sign { any, not_negative, positive };
+
+bool has_sign(double value, Sign sign) {
+  return std::isfinite(value) && (sign == Sign::any || value > 0 || (sign == Sign::not_negative && value == 0));
+}
+
+// @param of  gives "kernel of latent 'f'"
+template <typename Of>
+void require_numbers(const VectorXd& values, Index size, Sign sign, const Of& of) {
+  if (values.size() != size) throw InputError(fmt::format("values: {} must have {} numbers, got {}", of(), size, values.size()));
+  for (const double value : values) {
+    if (has_sign(value, sign)) continue;
+    throw InputError(fmt::format("values: {} must be finite{}, got {}", of(),
+                                 sign == Sign::any        ? ""
+                                 : sign == Sign::positive ? " and positive"
+                                                          : " and not negative",
+                                 value));
+  }
+}
+
+void require_count(const char* member, std::size_t got, std::size_t wanted, const char* owners) {
+  if (got != wanted) throw InputError(fmt::format("values: {} is of {} {}, there are {}", member, got, owners, wanted));
+}
+
+}  // namespace
+
+void require_values(const Prior& prior, const std::vector<Observations>& observations, const ModelValues& values) {
+  const std::size_t n_latents = prior.latents.size();
+  require_count("kernel", values.kernel.size(), n_latents, "latents");
+  require_count("signal_stddev", values.signal_stddev.size(), n_latents, "latents");
+  for (std::size_t a = 0; a < n_latents; ++a) {
+    const Latent& latent = prior.latents[a];
+    const auto of = [&](const char* what) {
+      return [&latent, what] { return fmt::format("{} of latent '{}'", what, latent.name); };
+    };
+    require_numbers(values.kernel[a], std::ssize(latent.kernel.parameters()), Sign::positive, of("kernel"));
+    require_numbers(values.signal_stddev[a], latent.size(), Sign::not_negative, of("signal_stddev"));
+    const Index n_functions = latent.free_loading.value_or(0), n_rows = n_functions > 0 ? latent.size() : 0;
+    const MatrixXd none;
+    const MatrixXd& C = values.has_free_loading(a) ? values.free_loading[a] : none;
+    if (C.rows() != n_rows || C.cols() != n_functions) {
+      throw InputError(
+          fmt::format("values: {} must be {} × {}, got {} × {}", of("free_loading")(), n_rows, n_functions, C.rows(), C.cols()));
+    }
+    if (!C.allFinite()) throw InputError(fmt::format("values: {} has a number that is not finite", of("free_loading")()));
+  }
+  require_count("noise_stddev", values.noise_stddev.size(), observations.size(), "observations");
+  for (std::size_t g = 0; g < observations.size(); ++g) {
+    require_numbers(values.noise_stddev[g], observations[g].view().size(), Sign::positive,
+                    [g] { return fmt::format("noise_stddev of observations {}", g + 1); });
+  }
+  require_numbers(values.parameters, std::ssize(prior.system->parameters()), Sign::any,
+                  [&] { return fmt::format("parameters of '{}'", prior.system->name()); });
+}
+
+void throw_moved(const char* type) {
+  throw InputError(fmt::format("{}: it was moved away; use the one that it was moved to", type));
+}
+
+}  // namespace gp2

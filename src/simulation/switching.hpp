@@ -1,0 +1,72 @@
+#pragma once
+
+#include <functional>
+#include <utility>
+#include <vector>
+
+#include <Eigen/Core>
+
+#include "gp2/simulate.hpp"
+
+namespace gp2 {
+
+/// A motion across the surfaces g(x) = 0 at which its acceleration jumps (Filippov 1988, Differential Equations with Discontinuous
+/// Righthand Sides). On each side of a surface the acceleration f₊ or f₋ of that side holds, continued smoothly over the surface
+/// until the motion is found to have crossed it. A motion that both sides drive onto the surface slides along it, as a body that
+/// dry friction holds at rest does: by f₊ − ½ (1 − σ)(f₊ − f₋), with σ ∈ [−1, 1] such that ġ = 0.
+class Switching {
+ public:
+  using Function = std::function<Eigen::VectorXd(const Eigen::Ref<const Eigen::VectorXd>& state)>;
+
+  /// @param tolerance  of velocities: a part of it is how far from a surface its sides are evaluated
+  Switching(const SwitchingFunctions& functions, Eigen::VectorXd parameters, StateLayout layout, double tolerance);
+
+  /// States beside a surface are put onto the constraints too: of redundant rows b means nothing off them, at rest least of all.
+  void put_onto(std::function<void(Eigen::VectorXd& state)> constraints) { constraints_ = std::move(constraints); }
+
+  [[nodiscard]] bool is_empty() const { return functions_.size() == 0; }
+  [[nodiscard]] bool is_sliding() const;
+
+  /// Takes the sides that a state is on; on a surface it slides or leaves.
+  void start(const Eigen::VectorXd& state, const Acceleration& acceleration);
+  /// Whether a state is past a surface, which is then no more on the side taken.
+  [[nodiscard]] bool has_crossed(const Eigen::VectorXd& state) const;
+  /// Takes the surfaces that a state is past as those it slides on, until settle() decides.
+  void cross(const Eigen::VectorXd& state);
+  /// Moves velocities by the least change onto the surfaces that the motion slides on.
+  void hold(Eigen::VectorXd& state) const;
+  /// Whether one of the surfaces slid on does not hold the motion.
+  bool is_let_go(const Eigen::VectorXd& state, const Acceleration& acceleration);
+  /// Leaves the surfaces that do not hold the motion any more.
+  void settle(const Eigen::VectorXd& state, const Acceleration& acceleration);
+
+  /// ddq on the sides taken, and on the surfaces that the motion slides on.
+  Eigen::VectorXd acceleration(const Eigen::VectorXd& state, const Acceleration& acceleration);
+  /// Another function of the state, mixed as the last acceleration was.
+  [[nodiscard]] Eigen::VectorXd mixed(const Eigen::VectorXd& state, const Function& function) const;
+
+ private:
+  struct Surfaces {
+    Eigen::VectorXd g;        // (n)
+    Eigen::MatrixXd normals;  // ∂g/∂dq  (n × nq)
+    Eigen::VectorXd drift;    // ∂g/∂q dq + ∂g/∂t  (n)
+    Eigen::VectorXd margin;   // |g| of a state that is beside a surface  (n)
+  };
+  [[nodiscard]] Surfaces surfaces_at(const Eigen::VectorXd& state) const;
+  [[nodiscard]] Eigen::VectorXd beside(Eigen::VectorXd state, const Surfaces& surfaces, const std::vector<int>& sides) const;
+  /// f on the sides taken, and ½ (f₊ − f₋) of each surface that the motion slides on.
+  void evaluate(const Eigen::VectorXd& state, const Surfaces& surfaces, const Function& function, Eigen::VectorXd& value,
+                Eigen::MatrixXd& jumps) const;
+  [[nodiscard]] std::vector<int> sliding() const;
+
+  SwitchingFunctions functions_;
+  Eigen::VectorXd parameters_;
+  StateLayout layout_;
+  double tolerance_;
+  std::function<void(Eigen::VectorXd&)> constraints_;
+  std::vector<int> sides_;  // of each surface: 1, −1; 0: the motion slides on it
+  Eigen::VectorXd share_;   // 1 − σ of each surface slid on, within [0, 2]
+  Eigen::VectorXd sigma_;   // beyond [−1, 1] where the surface does not hold the motion
+};
+
+}  // namespace gp2

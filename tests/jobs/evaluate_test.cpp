@@ -1,0 +1,125 @@
+// What is compared, and by which noise.
+#include <algorithm>
+#include <cmath>
+#include <numbers>
+
+#include <fmt/format.h>
+#include <gmock/gmock.h>
+
+#include "gp2/jobs/fit_job.hpp"
+#include "gp2/jobs/predict_job.hpp"
+#include "io_testing.hpp"
+
+namespace gp2 {
+namespace {
+
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+using testing::Contains;
+using testing::ElementsAre;
+using testing::HasSubstr;
+using testing::Not;
+
+Model sledge() {
+  return Model::parse(R"toml(
+name        = "sledge"
+coordinates = ["x", "y", "heading"]
+[mechanics]
+mass = [["1", "0", "0"], ["0", "1", "0"], ["0", "0", "0.3"]]
+[constraints]
+velocity = ["dx*sin(heading) - dy*cos(heading)"]
+[noise]
+ddq = 0.1
+[[latent]]
+name       = "drag"
+kernel     = "se"
+features   = ["dx", "dy", "heading", "dheading"]
+directions = "acceleration"
+)toml",
+                      "sledge.toml");
+}
+
+// states on the constraint, those of `straight` rows with a heading of exactly 0; ddq of the observed columns only
+CsvTable log_of(const std::string& name, int n, const std::string& columns, bool straight, const std::string& more = "") {
+  std::string text = "heading,dx,dy,dheading" + columns + "\n";
+  for (int i = 0; i < n; ++i) {
+    const double heading = straight ? 0 : 0.3 * std::sin(1.7 * i), speed = 1 + 0.5 * std::cos(2.3 * i);
+    text += fmt::format("{},{},{},{}", heading, speed * std::cos(heading), speed * std::sin(heading), std::sin(0.9 * i));
+    for (std::size_t k = 0; k < static_cast<std::size_t>(std::count(columns.begin(), columns.end(), ',')); ++k) {
+      text += fmt::format(",{}", more.empty() || k == 0 ? -0.5 * speed + 0.1 * std::sin(31.0 * i + static_cast<double>(k)) : 0.7);
+    }
+    text += '\n';
+  }
+  return CsvTable::parse(text, name);
+}
+
+FitOutcome fit_of(std::vector<Log> logs) {
+  FitRequest request;
+  request.model = sledge();
+  request.logs = std::move(logs);
+  request.restarts = 1;
+  request.max_iterations = 3;
+  return run_fit(prepare_fit(std::move(request)));
+}
+
+TEST(EvaluateJob, ComparesAllThatAnyLogObservedAndSaysWhatItLeavesOut) {
+  FitOutcome fit = fit_of({{log_of("a.csv", 20, ",ddx,ddy,ddheading", false)}});
+  // the same fit, had its first log observed ẍ and its second the heading's acceleration alone
+  const Observations& all = fit.file.observations.front();
+  const auto observed = [&](int row) {
+    return Observations(all.states(), View{View::Quantity::constrained_acceleration, {row}}, all.values().row(row),
+                        VectorXd::Constant(1, 0.1));
+  };
+  ModelValues values = fit.posterior.values();
+  values.noise_stddev = {VectorXd::Constant(1, 0.1), VectorXd::Constant(1, 0.2)};
+  const Posterior posterior(fit.posterior.prior(), {observed(0), observed(2)}, values);
+
+  EvaluateOutcome outcome = evaluate(fit.file, posterior, log_of("test.csv", 9, ",ddx,ddy,ddheading", false), {});
+  EXPECT_THAT(outcome.evaluation.outputs, ElementsAre("ddx", "ddheading"));
+  EXPECT_THAT(outcome.notes, Contains(HasSubstr("test.csv: not compared: ddy, which the fit did not observe")));
+
+  outcome = evaluate(fit.file, posterior, log_of("test.csv", 9, ",ddheading", false), {});
+  EXPECT_THAT(outcome.evaluation.outputs, ElementsAre("ddheading"));
+  EXPECT_THAT(outcome.notes, Contains(HasSubstr("test.csv: not compared: ddx, which it lacks")));
+  EXPECT_THAT(test::input_error_of([&] { evaluate(fit.file, posterior, log_of("test.csv", 9, ",ddy", false), {}); }),
+              HasSubstr("missing column 'ddx'"));
+}
+
+TEST(EvaluateJob, CountsWhatTheConstraintDecidesAsDecided) {
+  const FitOutcome fit = fit_of({{log_of("a.csv", 20, ",ddx,ddy,ddheading", false)}});
+  // straight ahead ÿ follows from the constraint, and what is left of its deviation is rounding of sin 0
+  const Evaluation straight = evaluate(fit.file, fit.posterior, log_of("s.csv", 8, ",ddx,ddy,ddheading", true), {}).evaluation;
+  EXPECT_EQ(straight.n_zero_variance, 8);
+  EXPECT_LT(straight.nlpd_latent, 50);
+  const Evaluation turned = evaluate(fit.file, fit.posterior, log_of("t.csv", 8, ",ddx,ddy,ddheading", false), {}).evaluation;
+  EXPECT_EQ(turned.n_zero_variance, 1) << "the first row of this log is straight";
+}
+
+TEST(EvaluateJob, MeasuresByTheNoiseThatTheTestLogStates) {
+  const FitOutcome fit = fit_of({{log_of("a.csv", 20, ",ddx,ddy,ddheading", false)}});
+  EvaluateRequest request;
+  request.outputs = {"ddx"};
+  const CsvTable test = log_of("test.csv", 9, ",ddx", false), stated = log_of("test.csv", 9, ",ddx,ddx_std", false, "0.7");
+  const Evaluation by_training = evaluate(fit.file, fit.posterior, test, request).evaluation;
+  const Evaluation by_test = evaluate(fit.file, fit.posterior, stated, request).evaluation;
+  EXPECT_EQ(by_training.rmse, by_test.rmse);
+  // errors are far below 0.7, so that the density is that of its normalisation
+  EXPECT_NEAR(by_test.nlpd, std::log(0.7) + 0.5 * std::log(2 * std::numbers::pi), 0.2);
+  EXPECT_GT(std::abs(by_training.nlpd - by_test.nlpd), 0.3);
+}
+
+TEST(EvaluateJob, TakesAFactorThatTrainingFoundForStatedNoise) {
+  FitOutcome fit = fit_of({{log_of("a.csv", 20, ",ddx,ddx_std", false, "0.7")}});
+  ModelValues values = fit.posterior.values();
+  ASSERT_TRUE(fit.posterior.observations().front().states_noise(0));
+  values.noise_stddev = {VectorXd::Constant(1, 3)};
+  const Posterior posterior(fit.posterior.prior(), fit.posterior.observations(), values);
+  EXPECT_EQ(measurement_noise(posterior, {0, 1}, 2, MatrixXd::Constant(2, 2, 0.5)),
+            (MatrixXd(2, 2) << 1.5, 1.5, 0.5, 0.5).finished());
+  const MatrixXd usual = measurement_noise(posterior, {0, 1}, 2);
+  EXPECT_DOUBLE_EQ(usual(0, 1), 2.1);
+  EXPECT_TRUE(std::isnan(usual(1, 0))) << "never observed";
+}
+
+}  // namespace
+}  // namespace gp2

@@ -1,0 +1,219 @@
+// Faults put into sound logs of every model on purpose: the share that check or fit names, and false alarms on sound logs.
+#include <functional>
+#include <iostream>
+#include <map>
+#include <numbers>
+
+#include <fmt/format.h>
+#include <gmock/gmock.h>
+#include <gtest/gtest.h>
+
+#include "gp2/error.hpp"
+#include "gp2/jobs/check_job.hpp"
+#include "gp2/jobs/fit_job.hpp"
+#include "jobs/data_of_model.hpp"
+#include "test_models.hpp"
+
+namespace gp2 {
+namespace {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::RowVectorXd;
+using test::LogData;
+
+bool is_alarm(const std::string& text) {
+  // what a sound log may be told too
+  for (const char* known : {"dependent columns", "not in the log", "constraints: none", "rank", "are off the constraint",
+                            "a row of A vanishes", "states off", "did not converge", "at its bound", "restart", "standard errors",
+                            "do not determine", "known force", "Coriolis"}) {
+    if (text.find(known) != std::string::npos) return false;
+  }
+  return true;
+}
+
+// what check and fit say against a log: warnings, errors, refusals
+std::vector<std::string> alarms_of(const LogData& data) {
+  std::vector<std::string> alarms;
+  const auto add = [&](const std::string& text) {
+    if (is_alarm(text)) alarms.push_back(text);
+  };
+  const CsvTable log = data.table();
+  try {
+    for (const Finding& finding : check(*data.model, &log)) {
+      if (finding.level != Finding::Level::good) add(finding.text);
+    }
+    FitRequest request;
+    request.model = *data.model;
+    request.logs = {{log}};
+    request.problem.mean = Prior::Mean::force;
+    if (data.model->noise.stddev.empty()) request.problem.noise_stddev = test::noise_of(*data.model)[0];
+    request.problem.estimate = std::vector<std::string>{};
+    request.restarts = 1;
+    request.max_iterations = 40;
+    request.max_escapes = 0;
+    FitJob job = prepare_fit(std::move(request));
+    for (const std::string& note : job.notes) {
+      if (note.starts_with("warning")) add(note);
+    }
+    for (const std::string& note : run_fit(job).notes) {
+      if (note.starts_with("warning")) add(note);
+    }
+  } catch (const InputError& error) {
+    alarms.push_back(error.what());
+  } catch (const NumericalError& error) {
+    alarms.push_back(error.what());
+  }
+  return alarms;
+}
+
+struct Fault {
+  std::string name;
+  /// Puts the fault into a log; false where the model has no place for it.
+  std::function<bool(LogData&, int)> put;
+  bool in_time = false;  // the log is a motion
+};
+
+StateLayout layout_of(const LogData& data) { return data.model->system->layout(); }
+
+// a coordinate that a constraint acts on, another one for each seed
+int constrained_coordinate(const LogData& data, int seed) {
+  const System& system = *data.model->system;
+  const SystemValues values = system.evaluate(data.states, system.parameter_values());
+  std::vector<int> found;
+  for (int j = 0; j < system.nq(); ++j) {
+    double size = 0;
+    for (int i = 0; i < values.n_states(); ++i) size = std::max(size, values.A(i).col(j).lpNorm<Eigen::Infinity>());
+    if (size > 1e-3) found.push_back(j);
+  }
+  return found.empty() ? -1 : found[static_cast<std::size_t>(seed) % found.size()];
+}
+
+template <typename Row>
+void roll(Row&& row, int by) {
+  const RowVectorXd before = row;
+  for (Index i = 0; i < before.size(); ++i) row[i] = before[std::max<Index>(0, i - by)];
+}
+
+const std::vector<Fault>& faults() {
+  static const std::vector<Fault> all = {
+      {"gravity in a sensor",
+       [](LogData& data, int seed) {
+         const int j = constrained_coordinate(data, seed);
+         if (j < 0 || data.model->system->coordinates()[static_cast<std::size_t>(j)].angle) return false;
+         data.accelerations.row(j).array() += 9.81;
+         return true;
+       }},
+      {"sign of an acceleration",
+       [](LogData& data, int seed) {
+         const int j = constrained_coordinate(data, seed);
+         if (j >= 0) data.accelerations.row(j) *= -1;
+         return j >= 0;
+       }},
+      {"millimetres",
+       [](LogData& data, int seed) {
+         const int j = constrained_coordinate(data, seed);
+         if (j < 0 || data.model->system->coordinates()[static_cast<std::size_t>(j)].angle) return false;
+         const StateLayout layout = layout_of(data);
+         data.states.row(layout.q(j)) *= 1000;
+         data.states.row(layout.dq(j)) *= 1000;
+         data.accelerations.row(j) *= 1000;
+         return true;
+       }},
+      {"degrees",
+       [](LogData& data, int seed) {
+         const auto& coordinates = data.model->system->coordinates();
+         const int j = constrained_coordinate(data, seed);
+         if (j < 0 || !coordinates[static_cast<std::size_t>(j)].angle) return false;
+         const StateLayout layout = layout_of(data);
+         constexpr double degrees = 180 / std::numbers::pi;
+         data.states.row(layout.q(j)) *= degrees;
+         data.states.row(layout.dq(j)) *= degrees;
+         data.accelerations.row(j) *= degrees;
+         return true;
+       }},
+      {"swapped columns",
+       [](LogData& data, int seed) {
+         const int j = constrained_coordinate(data, seed), nq = data.model->system->nq();
+         if (j < 0 || nq < 2) return false;
+         data.accelerations.row(j).swap(data.accelerations.row((j + 1) % nq));
+         return true;
+       }},
+      {"lagged column",
+       [](LogData& data, int seed) {
+         const int j = constrained_coordinate(data, seed);
+         if (j >= 0) roll(data.accelerations.row(j), 1 + seed % 3);
+         return j >= 0;
+       },
+       true},
+      {"doubled rows",
+       [](LogData& data, int) {
+         const Index n = data.states.cols() / 2;
+         data.states.rightCols(n) = MatrixXd(data.states.leftCols(n));
+         data.accelerations.rightCols(n) = MatrixXd(data.accelerations.leftCols(n));
+         return true;
+       }},
+      {"heading from north",
+       [](LogData& data, int seed) {
+         const auto& coordinates = data.model->system->coordinates();
+         const int j = constrained_coordinate(data, seed);
+         if (j < 0 || !coordinates[static_cast<std::size_t>(j)].angle) return false;
+         const StateLayout layout = layout_of(data);
+         data.states.row(layout.q(j)) = std::numbers::pi / 2 - data.states.row(layout.q(j)).array();
+         data.states.row(layout.dq(j)) *= -1;
+         data.accelerations.row(j) *= -1;
+         return true;
+       }},
+      {"clock in milliseconds",
+       [](LogData& data, int) {
+         data.states.row(layout_of(data).t()) *= 1000;
+         return true;
+       },
+       true},
+      {"stuck channel",
+       [](LogData& data, int seed) {
+         const int j = constrained_coordinate(data, seed);
+         if (j >= 0) data.accelerations.row(j).setConstant(data.accelerations(j, 0));
+         return j >= 0;
+       }},
+  };
+  return all;
+}
+
+LogData log_of(const std::string& file, bool in_time, std::uint64_t seed) {
+  return in_time ? test::moving_log(file, 60, 0.02, seed) : test::drawn_log(file, 40, seed);
+}
+
+TEST(FaultSweep, FaultsAreNamedAndSoundLogsAreNot) {
+  constexpr int n_seeds = 2;
+  int n_named = 0, n_faults = 0, n_false = 0, n_sound = 0;
+  std::map<std::string, std::pair<int, int>> by_fault;
+  for (const std::string& file : test::library_models()) {
+    for (int seed = 1; seed <= n_seeds; ++seed) {
+      for (const bool in_time : {false, true}) {
+        const std::vector<std::string> alarms = alarms_of(log_of(file, in_time, static_cast<std::uint64_t>(seed)));
+        ++n_sound;
+        if (!alarms.empty()) ++n_false;
+        for (const std::string& alarm : alarms) std::cout << file << ", seed " << seed << ", sound: " << alarm << '\n';
+      }
+      for (const Fault& fault : faults()) {
+        LogData data = log_of(file, fault.in_time, static_cast<std::uint64_t>(seed));
+        if (!fault.put(data, seed)) continue;
+        const bool is_named = !alarms_of(data).empty();
+        auto& [named, n] = by_fault[fault.name];
+        ++n;
+        ++n_faults;
+        named += is_named ? 1 : 0;
+        n_named += is_named ? 1 : 0;
+        if (!is_named) std::cout << file << ", seed " << seed << ", not named: " << fault.name << '\n';
+      }
+    }
+  }
+  for (const auto& [name, share] : by_fault) std::cout << name << ": " << share.first << " of " << share.second << '\n';
+  std::cout << n_named << " of " << n_faults << " faults named, " << n_false << " of " << n_sound << " sound logs alarmed\n";
+  EXPECT_GE(n_named, 0.9 * n_faults);
+  EXPECT_LE(n_false, 0.01 * n_sound);
+}
+
+}  // namespace
+}  // namespace gp2

@@ -1,0 +1,126 @@
+// Data that deny the model are not believed without a word, and data that do not are.
+#include <fmt/format.h>
+#include <gmock/gmock.h>
+
+#include "gp2/jobs/check_job.hpp"
+#include "gp2/jobs/fit_job.hpp"
+#include "gp2/simulation/generate.hpp"
+#include "jobs/data_of_model.hpp"
+#include "test_models.hpp"
+
+namespace gp2 {
+namespace {
+
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+using testing::Contains;
+using testing::HasSubstr;
+using testing::Not;
+
+using Data = test::LogData;
+
+Data data_of(const std::string& file, std::uint64_t seed) { return test::drawn_log(file, 60, seed); }
+
+std::vector<std::string> notes_of_fit(const Data& data, Prior::Mean mean = Prior::Mean::force) {
+  FitRequest request;
+  request.model = *data.model;
+  request.logs = {{data.table()}};
+  request.problem.mean = mean;
+  request.restarts = 1;
+  request.max_iterations = 60;
+  return run_fit(prepare_fit(std::move(request))).notes;
+}
+
+std::vector<std::string> findings_of(const Data& data, Finding::Level level) {
+  const CsvTable log = data.table();
+  std::vector<std::string> texts;
+  for (const Finding& finding : check(*data.model, &log)) {
+    if (finding.level == level) texts.push_back(finding.text);
+  }
+  return texts;
+}
+
+constexpr const char* of_fit = "values lie farther than noise from what all others predict";
+constexpr const char* of_constraint = "measured ddq on A ddq = b: rms residual";
+
+TEST(Residuals, OfSoundDataAreNoise) {
+  for (const char* file : {"models/surface.toml", "models/unicycle.toml"}) {
+    for (const std::uint64_t seed : {11, 12, 13}) {
+      SCOPED_TRACE(fmt::format("{}, seed {}", file, seed));
+      const Data data = data_of(file, seed);
+      EXPECT_THAT(findings_of(data, Finding::Level::good), Contains(HasSubstr(", expected 0.")));
+      EXPECT_THAT(findings_of(data, Finding::Level::warning), Not(Contains(HasSubstr("measured ddq"))));
+      EXPECT_THAT(findings_of(data, Finding::Level::error), testing::IsEmpty());
+      const std::vector<std::string> notes = notes_of_fit(data);
+      EXPECT_THAT(notes, Not(Contains(HasSubstr(of_fit))));
+      EXPECT_THAT(notes, Not(Contains(HasSubstr(of_constraint))));
+      EXPECT_THAT(notes, Not(Contains(HasSubstr("residuals go on from row to row"))));
+    }
+  }
+}
+
+TEST(Residuals, TellOfGravityLeftInASensor) {
+  Data data = data_of("models/surface.toml", 14);
+  data.accelerations.row(2).array() += 9.81;
+  EXPECT_THAT(findings_of(data, Finding::Level::error), Contains(testing::AllOf(HasSubstr(of_constraint), HasSubstr("mean -9.8"),
+                                                                                HasSubstr(" ×; "), HasSubstr("gravity"))));
+  const std::vector<std::string> notes = notes_of_fit(data);
+  EXPECT_THAT(notes, Contains(testing::AllOf(testing::StartsWith("warning: "), HasSubstr(of_constraint), HasSubstr("gravity"))));
+  EXPECT_THAT(notes, Contains(testing::AllOf(HasSubstr(of_fit), HasSubstr("ddq3"))));
+}
+
+TEST(Residuals, TellOfAColumnInAnotherUnit) {
+  Data data = data_of("models/unicycle.toml", 15);
+  data.accelerations.row(0) *= 10;
+  EXPECT_THAT(findings_of(data, Finding::Level::error), Contains(HasSubstr(of_constraint)));
+  EXPECT_THAT(notes_of_fit(data), Contains(HasSubstr(of_constraint)));
+}
+
+TEST(Residuals, WithoutANoiseAnOffsetOrNothingLeftOfTheCancellationIsFound) {
+  ConstraintResidual one{"row", 50, 1.0, 0.0, std::numeric_limits<double>::quiet_NaN(), 5.0, {}};
+  EXPECT_FALSE(one.is_too_large());
+  one.mean = 0.95;
+  EXPECT_TRUE(one.is_too_large());
+  one.mean = 0;
+  one.rms = 3;
+  EXPECT_TRUE(one.is_too_large());
+}
+
+TEST(Residuals, TellOfAKnownForceThatIsNotUsed) {
+  // the latent acts along the velocity, and gravity does not
+  const Model thrown = Model::parse(R"toml(
+coordinates = ["x", "y"]
+[mechanics]
+mass  = [["1", "0"], ["0", "1"]]
+force = ["0", "-9.81"]
+[noise]
+ddq = 0.05
+[[latent]]
+kernel     = "se"
+features   = ["dx", "dy"]
+directions = { force = [["-dx"], ["-dy"]] }
+[truth]
+force = ["-0.3*dx", "-0.3*dy"]
+[sampling]
+dx = [-2, 2]
+dy = [-2, 2]
+)toml",
+                                    "thrown.toml");
+  GeneratedData drawn = generate(thrown, GenerateOptions{60, 16, test::noise_of(thrown)});
+  Data data = {&thrown, std::move(drawn.states), std::move(drawn.accelerations)};
+  EXPECT_THAT(notes_of_fit(data, Prior::Mean::zero),
+              Contains(HasSubstr("the known force of [mechanics] is not used: with `mean=force` the log likelihood")));
+  EXPECT_THAT(notes_of_fit(data, Prior::Mean::force), Not(Contains(HasSubstr("known force"))));
+  // and these features know nothing of the inputs
+  data = data_of("models/surface.toml", 16);
+  std::string text = data.model->text;
+  const std::size_t first = text.find("features   = ["), last = text.find(']', first);
+  text.replace(first, last + 1 - first, R"(features = ["dq1", "dq2", "dq3"])");
+  const Model narrow = Model::parse(text, "narrow.toml");
+  data.model = &narrow;
+  EXPECT_THAT(notes_of_fit(data, Prior::Mean::zero),
+              Contains(HasSubstr("warning: the known force of [mechanics] is not used, and no feature reads u1, u2, u3")));
+}
+
+}  // namespace
+}  // namespace gp2

@@ -1,0 +1,64 @@
+// Where a motion starts whose log was written by other lengths.
+#include <cmath>
+
+#include <fmt/format.h>
+#include <gmock/gmock.h>
+
+#include "gp2/jobs/simulate_job.hpp"
+
+namespace gp2 {
+namespace {
+
+using Eigen::VectorXd;
+using testing::Contains;
+using testing::HasSubstr;
+using testing::IsEmpty;
+
+// a pendulum in maximal coordinates
+Model pendulum(const std::string& more) {
+  return Model::parse(R"toml(
+name        = "pendulum"
+coordinates = ["x", "y", { name = "a", angle = true }]
+[parameters]
+l = 1.1
+[mechanics]
+mass  = [["1", "0", "0"], ["0", "1", "0"], ["0", "0", "0.1"]]
+force = ["0", "-9.81", "0"]
+[constraints]
+position = ["x - l*sin(a)", "y + l*cos(a)"]
+)toml" + more,
+                      "pendulum.toml");
+}
+
+// a = 0.8 and da = 0.5 are measured, the rest computed by a length
+SimulateJob job_of(const Model& model, double length) {
+  const double a = 0.8, da = 0.5;
+  const CsvTable log =
+      CsvTable::parse(fmt::format("x,y,a,dx,dy,da\n{},{},{},{},{},{}\n", length * std::sin(a), -length * std::cos(a), a,
+                                  length * std::cos(a) * da, length * std::sin(a) * da, da),
+                      "log.csv");
+  SimulateRequest request;
+  request.start = log;
+  request.times = VectorXd::LinSpaced(2, 0, 0.1);
+  return prepare_simulation(model, request);
+}
+
+TEST(StartOfALog, KeepsWhatWasMeasuredAndSolvesForTheRest) {
+  for (const char* more : {"", "[sampling]\na = [-1, 1]\nda = [-1, 1]\n"}) {
+    const SimulateJob job = job_of(pendulum(more), 1);
+    EXPECT_EQ(job.start[2], 0.8);
+    EXPECT_EQ(job.start[5], 0.5);
+    EXPECT_NEAR(job.start[0], 1.1 * std::sin(0.8), 1e-12);
+    EXPECT_NEAR(job.start[4], 1.1 * std::sin(0.8) * 0.5, 1e-12);
+    EXPECT_THAT(job.notes, Contains(HasSubstr("start: from the constraints x = ")));
+  }
+}
+
+TEST(StartOfALog, IsTakenAsItIsWhereItIsOnTheConstraints) {
+  const SimulateJob job = job_of(pendulum(""), 1.1);
+  EXPECT_THAT(job.notes, IsEmpty());
+  EXPECT_EQ(job.start[0], 1.1 * std::sin(0.8));
+}
+
+}  // namespace
+}  // namespace gp2

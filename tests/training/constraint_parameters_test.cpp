@@ -1,0 +1,107 @@
+// Parameters that vanish from A and b are found where the logged states are, or stay where they started.
+#include <cmath>
+
+#include <fmt/format.h>
+#include <gmock/gmock.h>
+#include <gtest/gtest.h>
+
+#include "base/random.hpp"
+#include "gp2/fit.hpp"
+#include "gp2/model.hpp"
+#include "gp2/training/laplace.hpp"
+#include "test_models.hpp"
+
+namespace gp2 {
+namespace {
+
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+
+// a bead on a wire about (0, h), of radius l; nothing depends on p
+Model bead(const std::string& constraint) {
+  return Model::parse(fmt::format(R"toml(
+name        = "bead"
+coordinates = ["x", "y"]
+[parameters]
+l = {{ value = 1.3, bounds = [0.5, 2], estimate = true }}
+h = {{ value = 0.4, bounds = [-1, 1] }}
+p = {{ value = 0.7, bounds = [0.1, 3] }}
+[mechanics]
+mass  = [["1", "0"], ["0", "1"]]
+force = ["0", "-9.81"]
+[constraints]
+position = ["{}"]
+[[latent]]
+kernel     = "se"
+features   = ["x", "y", "dx", "dy"]
+directions = "acceleration"
+)toml",
+                                  constraint),
+                      "bead");
+}
+
+Observations observe(const Model& model, double position_noise, std::uint64_t seed, double h = 0) {
+  constexpr int n = 40;
+  RandomStream random(seed);
+  MatrixXd states = MatrixXd::Zero(model.system->layout().size(), n), values(2, n);
+  for (int i = 0; i < n; ++i) {
+    const double angle = 6 * random.uniform(), rate = random.normal(), ddq = -9.81 * std::cos(angle) - 0.2 * rate;
+    states.col(i).head(4) << std::cos(angle) + position_noise * random.normal(),
+        h + std::sin(angle) + position_noise * random.normal(), -rate * std::sin(angle), rate * std::cos(angle);
+    values.col(i) << -ddq * std::sin(angle) - rate * rate * std::cos(angle),
+        ddq * std::cos(angle) - rate * rate * std::sin(angle);
+    for (double& value : values.col(i)) value += 0.05 * random.normal();
+  }
+  return {std::move(states), View::constrained_acceleration(*model.system), std::move(values), VectorXd::Constant(2, 0.05)};
+}
+
+struct Found {
+  double value, stddev;
+};
+
+std::vector<Found> fit_of(const Model& model, const Observations& data, const std::vector<std::string>& estimated) {
+  PriorOptions options;
+  options.mean = Prior::Mean::force;
+  const Prior prior = make_prior(model, options);
+  FitOptions fit_options;
+  fit_options.n_restarts = 2;
+  fit_options.max_iterations = 60;
+  const FitReport report = fit(prior, {data}, default_hyperparameters(prior, {data}, estimated, Protocol()), fit_options).report;
+  std::vector<Found> found;
+  for (std::size_t k = 0; k < report.hyperparameters.size(); ++k) {
+    const Hyperparameter& h = report.hyperparameters[k];
+    if (h.is_system_parameter()) found.push_back({h.value, report.uncertainty->stddev[static_cast<Eigen::Index>(k)]});
+  }
+  return found;
+}
+
+TEST(ConstraintParameters, AreFoundFromTheStatesWhereAccelerationsAreSilent) {
+  const Model model = bead("x^2 + y^2 - l^2");
+  for (const std::uint64_t seed : {1, 2, 3}) {
+    const std::vector<Found> exact = fit_of(model, observe(model, 0, seed), {"l"});
+    EXPECT_NEAR(exact[0].value, 1, 1e-5);
+    const std::vector<Found> noisy = fit_of(model, observe(model, 0.02, seed), {"l"});
+    EXPECT_NEAR(noisy[0].value, 1, 4 * noisy[0].stddev);
+    EXPECT_GT(noisy[0].stddev, 0.3 * 0.02 / std::sqrt(40));
+    EXPECT_LT(noisy[0].stddev, 3 * 0.02 / std::sqrt(40));
+  }
+}
+
+TEST(ConstraintParameters, AreFoundBesideOthersThatTheConstraintHas) {
+  // h enters A, l does not: a wrong h must not spoil l
+  const Model model = bead("x^2 + (y - h)^2 - l^2");
+  const std::vector<Found> found = fit_of(model, observe(model, 1e-3, 4, 0.25), {"l", "h"});
+  EXPECT_NEAR(found[0].value, 1, 0.01);
+  EXPECT_NEAR(found[1].value, 0.25, 0.05);
+}
+
+TEST(ConstraintParameters, KeepTheirStartWhereNothingKnowsThem) {
+  const Model model = bead("x^2 + y^2 - l^2");
+  const std::vector<Found> found = fit_of(model, observe(model, 1e-3, 5), {"l", "p"});
+  EXPECT_NEAR(found[0].value, 1, 0.01);
+  EXPECT_NEAR(found[1].value, 0.7, 1e-3);
+  EXPECT_GT(found[1].stddev, 1) << "nothing is known of it";
+}
+
+}  // namespace
+}  // namespace gp2
