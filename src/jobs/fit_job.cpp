@@ -1,6 +1,7 @@
 #include "gp2/jobs/fit_job.hpp"
 
 #include <cmath>
+#include <exception>
 #include <utility>
 
 #include <fmt/format.h>
@@ -243,8 +244,13 @@ FitOutcome run_fit(const FitJob& job, const std::function<void(const Progress&)>
   FitOutcome outcome{job.file, std::move(result.posterior), distrust_notes(job.problem, result.report)};
   for (std::string& note : notes_of(result.report)) outcome.notes.push_back(std::move(note));
   if (result.report.termination != FitReport::interrupted) {
-    add_force_note(outcome.posterior, outcome.notes);
-    add_residual_notes(outcome.posterior, outcome.notes);
+    // a fit that has taken hours is not lost to what is said of it
+    try {
+      add_force_note(outcome.posterior, outcome.notes);
+      add_residual_notes(outcome.posterior, outcome.notes);
+    } catch (const std::exception& error) {
+      outcome.notes.push_back(fmt::format("the residuals of the fit were not tested: {}", error.what()));
+    }
   }
   outcome.file.observations = outcome.posterior.observations();
   outcome.file.report = std::move(result.report);
