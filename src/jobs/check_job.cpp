@@ -155,7 +155,7 @@ std::string better_rate(const Eigen::RowVectorXd& t, const Eigen::RowVectorXd& v
   }
   for (const int lag : {1, -1, 2, -2, 3, -3}) {
     const double correlation = steps_of(t, value, rates[own], is_angle, lag).correlation();
-    if (correlation > sure && 1 - correlation < 0.3 * (1 - now.correlation())) {
+    if (correlation > sure && 1 - correlation < 0.1 * (1 - now.correlation())) {
       return fmt::format("the column {} by {} row{}", lag > 0 ? "lags" : "leads", std::abs(lag), std::abs(lag) == 1 ? "" : "s");
     }
   }
