@@ -1,10 +1,14 @@
-# Compiles all files of a room as one: what they share of Eigen's templates is compiled once, which is quicker from scratch. After an edit a
-# room is more to compile than a file, so the presets for daily work go without.
-option(GP2_UNITY_BUILD "Compile each room of the library as one file" OFF)
+# Compiles many files as one: what they share of Eigen's templates is compiled once, which is quicker from scratch. After an edit there
+# is more to compile than a file, so the presets for daily work go without. Names that are local to a file differ from those of its
+# neighbours.
+option(GP2_UNITY_BUILD "Compile each room of the library, and some files of the rest, as one file" OFF)
 
-#   gp2_compile_by_room(TARGET)
-#
-# Sources have relative names, ROOM/FILE.cpp.
+# Some files of a target as one: enough to share templates, few enough for several processors.
+function(gp2_compile_in_batches target)
+  set_target_properties(${target} PROPERTIES UNITY_BUILD ${GP2_UNITY_BUILD} UNITY_BUILD_BATCH_SIZE 5)
+endfunction()
+
+# All files of a room as one. Sources have relative names, ROOM/FILE.cpp.
 function(gp2_compile_by_room target)
   if(NOT GP2_UNITY_BUILD)
     return()

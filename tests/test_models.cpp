@@ -41,6 +41,10 @@ Eigen::VectorXd random_vector(Eigen::Index size, RandomStream& random) {
   return v;
 }
 
+Eigen::MatrixXd random_matrix(Eigen::Index rows, Eigen::Index cols, RandomStream& random) {
+  return random_vector(rows * cols, random).reshaped(rows, cols);
+}
+
 GeneratedData draw(const Model& model, int n, std::uint64_t seed) {
   return generate(model, {n, seed, Eigen::VectorXd::Zero(model.system->nq())});
 }

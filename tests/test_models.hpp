@@ -39,6 +39,7 @@ const Model& model(const std::string& file);
 double largest(const Eigen::MatrixXd& matrix);
 
 Eigen::VectorXd random_vector(Eigen::Index size, RandomStream& random);
+Eigen::MatrixXd random_matrix(Eigen::Index rows, Eigen::Index cols, RandomStream& random);
 
 /// States and noise-free accelerations drawn from a model's [sampling].
 GeneratedData draw(const Model& model, int n, std::uint64_t seed);

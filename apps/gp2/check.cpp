@@ -14,7 +14,7 @@ namespace gp2::command {
 
 namespace {
 
-struct Arguments {
+struct CheckArguments {
   std::string model, data;
   CheckOptions options;
 };
@@ -31,7 +31,7 @@ int print(const std::vector<Finding>& findings) {
   return n_errors;
 }
 
-void run(const Arguments& arguments) {
+void run(const CheckArguments& arguments) {
   const Model model = Model::read(arguments.model);
   std::optional<CsvTable> log;
   if (!arguments.data.empty()) log = CsvTable::read(arguments.data, CsvTable::Keep::numbers);
@@ -42,7 +42,7 @@ void run(const Arguments& arguments) {
 }  // namespace
 
 Command check_command() {
-  const auto a = std::make_shared<Arguments>();
+  const auto a = std::make_shared<CheckArguments>();
   Command command{
       "check",
       "Is a model well-posed, and does a log fit it? Rank, definiteness, derivatives, data on the constraint, dependent columns",

@@ -18,7 +18,7 @@ namespace gp2::command {
 
 namespace {
 
-struct Arguments {
+struct DeriveArguments {
   std::string log, model, output;
   DeriveOptions options;
 };
@@ -109,7 +109,7 @@ void report(const DerivedData& data, const System& system) {
   }
 }
 
-void run(Arguments& arguments) {
+void run(DeriveArguments& arguments) {
   require_output(arguments.output, {arguments.log, arguments.model});
   arguments.options.episodes = without_ranges(arguments.options.episodes);
   const Model model = Model::read(arguments.model);
@@ -130,7 +130,7 @@ void run(Arguments& arguments) {
 }  // namespace
 
 Command derive_command() {
-  const auto a = std::make_shared<Arguments>();
+  const auto a = std::make_shared<DeriveArguments>();
   Command command{"derive",
                   "Smooth a raw log of positions into velocities and accelerations for a fit",
                   "gp2 derive encoders.csv --model models/double_pendulum.toml --map theta1=q3,theta2=q6 -o data.csv",

@@ -17,7 +17,7 @@ namespace {
 
 using Json = nlohmann::ordered_json;
 
-struct Arguments {
+struct EvaluateArguments {
   std::string fit, data, system;
   EvaluateRequest request;
   bool json = false;
@@ -56,7 +56,7 @@ void print_text(const Evaluation& e) {
                e.n_missing > 0 ? fmt::format("   ({} values not measured)", e.n_missing) : "");
 }
 
-void run(Arguments& arguments) {
+void run(EvaluateArguments& arguments) {
   const FitFile fit = FitFile::read(arguments.fit);
   const CsvTable table = CsvTable::read(arguments.data, CsvTable::Keep::numbers);
   arguments.request.system = read_other_system(arguments.system);
@@ -72,7 +72,7 @@ void run(Arguments& arguments) {
 }  // namespace
 
 Command evaluate_command() {
-  const auto a = std::make_shared<Arguments>();
+  const auto a = std::make_shared<EvaluateArguments>();
   Command command{"evaluate",
                   "Compare predictions of the constrained acceleration with measured or true values",
                   "gp2 evaluate fit.json --data test.csv --json",

@@ -25,7 +25,7 @@ namespace {
 using Eigen::Index;
 using Json = nlohmann::ordered_json;
 
-struct Arguments {
+struct FitArguments {
   std::string model, again, output;
   std::vector<std::string> data, also;
   bool json = false;
@@ -126,7 +126,7 @@ void print_text(const FitReport& report) {
 }
 
 // what a fit reads and must not replace; where it starts from may be where it ends
-std::vector<std::string> inputs_of(const Arguments& arguments) {
+std::vector<std::string> inputs_of(const FitArguments& arguments) {
   std::vector<std::string> inputs = {arguments.model, arguments.again};
   const auto add = [&](const std::string& log) {
     const auto [path, model] = split_at_system(log);
@@ -151,20 +151,20 @@ std::string interrupted_by(const Interruption& interruption) {
   return fmt::format("interrupted by signal {} ({})", interruption.signal(), strsignal(interruption.signal()));
 }
 
-std::string data_source_of(const Arguments& arguments) {
+std::string data_source_of(const FitArguments& arguments) {
   std::vector<std::string> sources = arguments.data;
   sources.insert(sources.end(), arguments.also.begin(), arguments.also.end());
   return fmt::format("{}", fmt::join(sources, ", "));
 }
 
-void read_data(Arguments& arguments) {
+void read_data(FitArguments& arguments) {
   FitRequest& request = arguments.request;
   request.data_source = data_source_of(arguments);
   for (const std::string& text : arguments.data) request.logs.push_back(read_log(text));
   for (const std::string& text : arguments.also) request.also.push_back(read_side_information(text));
 }
 
-FitJob prepare(Arguments& arguments) {
+FitJob prepare(FitArguments& arguments) {
   if (arguments.again.empty()) {
     arguments.request.model = Model::read(arguments.model);
     read_data(arguments);
@@ -180,7 +180,7 @@ FitJob prepare(Arguments& arguments) {
 }
 
 // A fit needs a model and data, or another fit whose options it takes.
-void require_inputs(const Arguments& arguments, const std::set<std::string>& given) {
+void require_inputs(const FitArguments& arguments, const std::set<std::string>& given) {
   if (arguments.again.empty()) {
     if (arguments.model.empty()) throw UsageError{"MODEL is required"};
     if (arguments.data.empty() && arguments.also.empty()) throw UsageError{"--data is required, or --also alone"};
@@ -196,7 +196,7 @@ void require_inputs(const Arguments& arguments, const std::set<std::string>& giv
   if (arguments.data.empty() && !arguments.also.empty()) throw InputError("`again`: `also` goes with `data`");
 }
 
-void run(Arguments& arguments, const std::set<std::string>& given) {
+void run(FitArguments& arguments, const std::set<std::string>& given) {
   require_inputs(arguments, given);
   require_output(arguments.output, inputs_of(arguments));
   const FitJob job = prepare(arguments);
@@ -240,7 +240,7 @@ void run(Arguments& arguments, const std::set<std::string>& given) {
 }  // namespace
 
 Command fit_command() {
-  const auto a = std::make_shared<Arguments>();
+  const auto a = std::make_shared<FitArguments>();
   Command command{"fit",
                   "Fit a model to a log of states and accelerations",
                   "gp2 fit models/surface.toml --data train.csv --mean force -o fit.json",

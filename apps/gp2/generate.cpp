@@ -13,12 +13,12 @@ namespace gp2::command {
 
 namespace {
 
-struct Arguments {
+struct GenerateArguments {
   std::string model, output;
   GenerateRequest request;
 };
 
-void run(const Arguments& arguments) {
+void run(const GenerateArguments& arguments) {
   const GenerateRequest& request = arguments.request;
   if (request.n.has_value() != request.grid.empty()) throw InputError("give either --n or --grid; see gp2 generate --help");
   require_output(arguments.output, {arguments.model});
@@ -31,7 +31,7 @@ void run(const Arguments& arguments) {
 }  // namespace
 
 Command generate_command() {
-  const auto a = std::make_shared<Arguments>();
+  const auto a = std::make_shared<GenerateArguments>();
   Command command{"generate",
                   "Draw states from a model's [sampling] and measure its [truth]",
                   "gp2 generate models/surface.toml --n 100 --seed 1 -o train.csv",

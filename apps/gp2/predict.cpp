@@ -15,7 +15,7 @@ namespace gp2::command {
 
 namespace {
 
-struct Arguments {
+struct PredictArguments {
   std::string fit, states, output, system;
   PredictRequest request;
 };
@@ -54,7 +54,7 @@ std::string joined(const CsvTable& input, const PredictOutcome& added) {
   return csv;
 }
 
-void run(Arguments& arguments) {
+void run(PredictArguments& arguments) {
   require_output(arguments.output, {arguments.fit, arguments.states, arguments.system});
   PredictRequest& request = arguments.request;
   const FitFile fit = FitFile::read(arguments.fit);
@@ -69,7 +69,7 @@ void run(Arguments& arguments) {
 }  // namespace
 
 Command predict_command() {
-  const auto a = std::make_shared<Arguments>();
+  const auto a = std::make_shared<PredictArguments>();
   Command command{"predict",
                   "Predict accelerations at given states, with their uncertainty",
                   "gp2 predict fit.json --states states.csv --cov std -o prediction.csv",

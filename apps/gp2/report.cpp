@@ -11,12 +11,12 @@ namespace gp2::command {
 
 namespace {
 
-struct Arguments {
+struct ReportArguments {
   std::string output;
   ReportOptions options;
 };
 
-void run(const Arguments& arguments) {
+void run(const ReportArguments& arguments) {
   const ReportOptions& options = arguments.options;
   require_output(arguments.output, {options.fit, options.data, options.truth});
   if (!options.columns.empty() && options.data.empty()) {
@@ -34,7 +34,7 @@ void run(const Arguments& arguments) {
 }  // namespace
 
 Command report_command() {
-  const auto a = std::make_shared<Arguments>();
+  const auto a = std::make_shared<ReportArguments>();
   Command command{
       "report",
       "Write a fit as one HTML page: what was fitted, how well, pictures of residuals, calibration and motion, and what "

@@ -12,12 +12,12 @@ namespace gp2::command {
 
 namespace {
 
-struct Arguments {
+struct ResampleArguments {
   std::string log, model, output;
   ResampleOptions options;
 };
 
-void run(const Arguments& arguments) {
+void run(const ResampleArguments& arguments) {
   require_output(arguments.output, {arguments.log, arguments.model});
   const Model model = Model::read(arguments.model);
   const CsvTable log = CsvTable::read(arguments.log);
@@ -33,7 +33,7 @@ void run(const Arguments& arguments) {
 }  // namespace
 
 Command resample_command() {
-  const auto a = std::make_shared<Arguments>();
+  const auto a = std::make_shared<ResampleArguments>();
   Command command{"resample",
                   "Choose the rows of a log that cover its states best: farthest points in the model's features",
                   "gp2 resample log.csv --model models/surface.toml -n 50 -o subset.csv",

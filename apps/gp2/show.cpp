@@ -10,7 +10,7 @@ namespace gp2::command {
 
 namespace {
 
-struct Arguments {
+struct ShowArguments {
   std::string model;
   ShowRequest request;
 };
@@ -18,7 +18,7 @@ struct Arguments {
 }  // namespace
 
 Command show_command() {
-  const auto a = std::make_shared<Arguments>();
+  const auto a = std::make_shared<ShowArguments>();
   Command command{
       "show", "Print the derived A, b, M, F, the parameters and the features of a model", "gp2 show models/surface.toml", {}, {}};
   command.options = options(a->request);

@@ -21,7 +21,7 @@ namespace gp2::command {
 
 namespace {
 
-struct Arguments {
+struct SimulateArguments {
   std::string file, start, inputs, output;
   std::optional<double> t_start, t_end, time_step;
   SimulateRequest request;
@@ -155,7 +155,7 @@ nlohmann::ordered_json report_of(const std::vector<Motion>& motions, const Syste
   return report;
 }
 
-std::vector<std::string> notes_of(const std::vector<Motion>& motions, const System& system, const Arguments& arguments) {
+std::vector<std::string> notes_of(const std::vector<Motion>& motions, const System& system, const SimulateArguments& arguments) {
   std::vector<std::string> notes;
   const Trajectory& first = motions[0].trajectory;
   constexpr double worth_saying = 1e-9;
@@ -202,7 +202,7 @@ std::vector<std::string> notes_of(const std::vector<Motion>& motions, const Syst
 }
 
 // The request with the files that the arguments name.
-SimulateRequest read_request(const Arguments& arguments, const Model& model) {
+SimulateRequest read_request(const SimulateArguments& arguments, const Model& model) {
   SimulateRequest request = arguments.request;
   if (arguments.start.find('=') != std::string::npos) {
     request.start = parse_start(arguments.start);
@@ -226,7 +226,7 @@ std::vector<Motion> with_uncertainty(std::vector<Trajectory> trajectories, const
   return motions;
 }
 
-void run(const Arguments& arguments) {
+void run(const SimulateArguments& arguments) {
   require_output(arguments.output, {arguments.file, arguments.start, arguments.inputs});
   const Subject subject = read_subject(arguments.file);
   const SimulateRequest request = read_request(arguments, subject.model);
@@ -253,7 +253,7 @@ void run(const Arguments& arguments) {
 }  // namespace
 
 Command simulate_command() {
-  const auto a = std::make_shared<Arguments>();
+  const auto a = std::make_shared<SimulateArguments>();
   Command command{"simulate",
                   "Integrate the motion of a fit or of a model, on its constraints",
                   "gp2 simulate fit.json --start q1=0.4,q2=0.8,dq1=0.8,dq2=1 --t-end 6 -o motion.csv",

@@ -22,7 +22,7 @@ using test::TemporaryFolder;
 using testing::AllOf;
 using testing::HasSubstr;
 
-FitFile fit_of(Baseline::Kind kind) {
+FitFile fit_file_of(Baseline::Kind kind) {
   FitFile fit;
   fit.model = test::model("models/unicycle.toml");
   const VectorXd noise_stddev = VectorXd::Constant(fit.model.system->nq(), 0.1);
@@ -46,7 +46,7 @@ TEST(BaselineFile, PredictsTheSameBitsAfterItWasWrittenAndRead) {
   for (const Baseline::Kind kind : {Baseline::Kind::se, Baseline::Kind::icm, Baseline::Kind::lmc}) {
     SCOPED_TRACE(Baseline::word(kind));
     const TemporaryFolder folder;
-    const FitFile fit = fit_of(kind);
+    const FitFile fit = fit_file_of(kind);
     fit.write(folder / "fit.json");
     const FitFile read = FitFile::read(folder / "fit.json");
     ASSERT_TRUE(read.prior_options.baseline.has_value());
@@ -63,7 +63,7 @@ TEST(BaselineFile, PredictsTheSameBitsAfterItWasWrittenAndRead) {
 
 TEST(BaselineFile, ThatIsDamagedIsRefused) {
   const TemporaryFolder folder;
-  fit_of(Baseline::Kind::lmc).write(folder / "fit.json");
+  fit_file_of(Baseline::Kind::lmc).write(folder / "fit.json");
   const Json whole = test::without_checksum(Json::parse(read_file(folder / "fit.json")));
   const auto refusal = [&](const std::function<void(Json&)>& damage) {
     Json json = whole;

@@ -32,7 +32,7 @@ struct Change {
   std::string text;
 };
 
-CsvTable log_of(const std::vector<Change>& changes, const std::vector<std::string>& stated = {}, int n = 12) {
+CsvTable gappy_log_of(const std::vector<Change>& changes, const std::vector<std::string>& stated = {}, int n = 12) {
   const GeneratedData data = generate(surface(), {n, seed, VectorXd::Constant(3, 0.1)});
   const CsvTable whole = as_table(data, *surface().system, "log.csv");
   std::vector<std::string> header = whole.header();
@@ -62,7 +62,7 @@ FitOptions unoptimised() {
 }
 
 TEST(MissingValuesFileTest, AnEmptyCellOfAnAccelerationIsNotMeasured) {
-  const FitProblem problem = problem_of(log_of({{"ddq1", 0, ""}, {"ddq1", 3, "  "}, {"ddq3", 3, ""}}));
+  const FitProblem problem = problem_of(gappy_log_of({{"ddq1", 0, ""}, {"ddq1", 3, "  "}, {"ddq3", 3, ""}}));
   const MatrixXd& values = problem.observations.front().values();
   ASSERT_EQ(values.cols(), 12);
   EXPECT_TRUE(std::isnan(values(0, 0)) && std::isnan(values(0, 3)) && std::isnan(values(2, 3)));
@@ -72,44 +72,44 @@ TEST(MissingValuesFileTest, AnEmptyCellOfAnAccelerationIsNotMeasured) {
 }
 
 TEST(MissingValuesFileTest, ARowThatMeasuresNothingIsLeftOutAsIfItWereNotThere) {
-  const FitProblem problem = problem_of(log_of({{"ddq1", 2, ""}, {"ddq2", 2, ""}, {"ddq3", 2, ""}}));
+  const FitProblem problem = problem_of(gappy_log_of({{"ddq1", 2, ""}, {"ddq2", 2, ""}, {"ddq3", 2, ""}}));
   EXPECT_EQ(problem.observations.front().n_data(), 11);
   EXPECT_THAT(problem.lines.front(), ElementsAre(2, 3, 5, 6, 7, 8, 9, 10, 11, 12, 13)) << "the header is line 1";
   EXPECT_THAT(problem.notes, Contains("log.csv: 1 rows left out: they measure nothing"));
-  const FitProblem without = problem_of(log_of({}).take({0, 1, 3, 4, 5, 6, 7, 8, 9, 10, 11}));
+  const FitProblem without = problem_of(gappy_log_of({}).take({0, 1, 3, 4, 5, 6, 7, 8, 9, 10, 11}));
   EXPECT_EQ(fit(problem, unoptimised()).report.negative_log_likelihood,
             fit(without, unoptimised()).report.negative_log_likelihood);
   FitProblemOptions few;
   few.max_points = 5;
-  EXPECT_THAT(problem_of(log_of({{"ddq1", 2, ""}, {"ddq2", 2, ""}, {"ddq3", 2, ""}}), few).notes,
+  EXPECT_THAT(problem_of(gappy_log_of({{"ddq1", 2, ""}, {"ddq2", 2, ""}, {"ddq3", 2, ""}}), few).notes,
               Contains("log.csv: 5 of 11 rows taken, by seed 0"));
 }
 
 TEST(MissingValuesFileTest, WhatIsNoNumberStaysAnError) {
   EXPECT_EQ(input_error_of([] {
-              problem_of(log_of({{"ddq2", 4, "nan"}}));
+              problem_of(gappy_log_of({{"ddq2", 4, "nan"}}));
             }),
             "log.csv:6: column 'ddq2': 'nan' is not a finite number");
   EXPECT_EQ(input_error_of([] {
-              problem_of(log_of({{"ddq2", 4, "lost"}}));
+              problem_of(gappy_log_of({{"ddq2", 4, "lost"}}));
             }),
             "log.csv:6: column 'ddq2': 'lost' is not a finite number");
   EXPECT_EQ(input_error_of([] {
-              problem_of(log_of({{"ddq2", -1, ""}}));
+              problem_of(gappy_log_of({{"ddq2", -1, ""}}));
             }),
             "log.csv: column 'ddq2': every cell is empty, so nothing is measured there; observe others (`observe`)");
   FitProblemOptions others;
   others.observe = {"ddq1", "ddq3"};
-  EXPECT_EQ(problem_of(log_of({{"ddq2", -1, ""}}), others).observations.front().values().rows(), 2);
+  EXPECT_EQ(problem_of(gappy_log_of({{"ddq2", -1, ""}}), others).observations.front().values().rows(), 2);
   EXPECT_EQ(input_error_of([] {
-              problem_of(log_of({{"dq2", 4, ""}}));
+              problem_of(gappy_log_of({{"dq2", 4, ""}}));
             }),
             "log.csv:6: column 'dq2': the cell is empty; a number is needed here");
 }
 
 TEST(MissingValuesFileTest, StatedDeviationsGoWithTheirValues) {
   const std::vector<std::string> stated = {"ddq1_std", "ddq2_std", "ddq3_std"};
-  const CsvTable log = log_of({{"ddq1", 0, ""}, {"ddq1_std", 0, ""}, {"ddq2", 1, ""}, {"ddq3_std", 2, ""}}, stated);
+  const CsvTable log = gappy_log_of({{"ddq1", 0, ""}, {"ddq1_std", 0, ""}, {"ddq2", 1, ""}, {"ddq3_std", 2, ""}}, stated);
   const FitProblem problem = problem_of(log);
   const Observations& group = problem.observations.front();
   EXPECT_TRUE(std::isnan(group.values()(0, 0)) && std::isnan(group.values()(1, 1)) && std::isnan(group.values()(2, 2)));
@@ -119,20 +119,20 @@ TEST(MissingValuesFileTest, StatedDeviationsGoWithTheirValues) {
   EXPECT_TRUE(std::isfinite(fit(problem, unoptimised()).report.negative_log_likelihood));
   for (const char* text : {"0", "-0.1"}) {
     EXPECT_EQ(input_error_of([&] {
-                problem_of(log_of({{"ddq1_std", 3, text}}, stated));
+                problem_of(gappy_log_of({{"ddq1_std", 3, text}}, stated));
               }),
               fmt::format("log.csv:5: column 'ddq1_std': the standard deviation of ddq1 must be positive, got {}; leave the cell "
                           "empty where nothing is measured",
                           text));
   }
   EXPECT_EQ(input_error_of([&] {
-              problem_of(log_of({{"ddq1_std", -1, ""}}, stated));
+              problem_of(gappy_log_of({{"ddq1_std", -1, ""}}, stated));
             }),
             "log.csv: column 'ddq1_std': every cell is empty, so nothing is measured there; leave the column out");
 }
 
 TEST(MissingValuesFileTest, ScalesAreThoseOfTheMeasuredValues) {
-  const FitProblem problem = problem_of(log_of({{"ddq1", 0, ""}, {"ddq1", 5, ""}}));
+  const FitProblem problem = problem_of(gappy_log_of({{"ddq1", 0, ""}, {"ddq1", 5, ""}}));
   const Observations& group = problem.observations.front();
   std::vector<double> measured;
   for (const double value : group.values().row(0)) {
@@ -147,7 +147,7 @@ TEST(MissingValuesFileTest, ScalesAreThoseOfTheMeasuredValues) {
 TEST(MissingValuesFileTest, AFileKeepsThemToTheBit) {
   const test::TemporaryFolder folder;
   for (const std::vector<std::string>& stated : {std::vector<std::string>{}, {"ddq1_std", "ddq2_std", "ddq3_std"}}) {
-    const FitProblem problem = problem_of(log_of({{"ddq1", 0, ""}, {"ddq3", 4, ""}}, stated));
+    const FitProblem problem = problem_of(gappy_log_of({{"ddq1", 0, ""}, {"ddq3", 4, ""}}, stated));
     const Fit fitted = fit(problem, unoptimised());
     FitFile file;
     file.model = surface();
@@ -177,7 +177,7 @@ TEST(MissingValuesFileTest, AKnowledgeMayHaveThemToo) {
   options.also_noise_stddev = 0.1;
   const SideInformation knowledge{
       View::Quantity::unconstrained_acceleration, "", {CsvTable::from_cells("rest.csv", header, cells), nullptr}};
-  const FitProblem problem = make_fit_problem(surface(), {Log{log_of({})}}, {knowledge}, options);
+  const FitProblem problem = make_fit_problem(surface(), {Log{gappy_log_of({})}}, {knowledge}, options);
   EXPECT_EQ(problem.observations[1].n_data(), 2);
   EXPECT_THAT(problem.lines[1], ElementsAre(2, 4));
   EXPECT_TRUE(std::isnan(problem.observations[1].values()(1, 1)));
@@ -185,7 +185,7 @@ TEST(MissingValuesFileTest, AKnowledgeMayHaveThemToo) {
 }
 
 TEST(MissingValuesFileTest, ACheckLooksAtTheRowsWhereAllIsMeasured) {
-  const CsvTable log = log_of({{"ddq1", 0, ""}});
+  const CsvTable log = gappy_log_of({{"ddq1", 0, ""}});
   LogReader reader = open_log(surface(), log, {});
   const WholeLog whole = read_whole_log(surface(), reader);
   const VectorXd parameters = surface().system->parameter_values();
@@ -201,8 +201,8 @@ TEST(MissingValuesFileTest, ACheckLooksAtTheRowsWhereAllIsMeasured) {
 // ---------------------------------------------------------------- --project
 
 TEST(ProjectOptionTest, StatesAreMovedOntoTheConstraintsBeforeTheFitAndTheNotesSayHowFar) {
-  const double height = std::stod(log_of({}).cell(4, log_of({}).find("q3")));
-  const CsvTable off = log_of({{"q3", 4, fmt::format("{}", height + 0.01)}});
+  const double height = std::stod(gappy_log_of({}).cell(4, gappy_log_of({}).find("q3")));
+  const CsvTable off = gappy_log_of({{"q3", 4, fmt::format("{}", height + 0.01)}});
   FitProblemOptions options;
   EXPECT_THAT(problem_of(off).notes, Contains(HasSubstr("states are off the constraint")));
   options.project = true;
@@ -256,10 +256,12 @@ ddq = 0.1
     EXPECT_THAT(make_fit_problem(free, log, options).notes, Contains(HasSubstr("log.csv: nothing to project: '")));
   }
   options.baseline = Baseline::Kind::se;
-  EXPECT_EQ(input_error_of([&] { problem_of(log_of({}), options); }), "`baseline=se` knows no constraints: leave out `project`");
+  EXPECT_EQ(input_error_of([&] { problem_of(gappy_log_of({}), options); }),
+            "`baseline=se` knows no constraints: leave out `project`");
   options.project = false;
   options.robust = true;
-  EXPECT_EQ(input_error_of([&] { problem_of(log_of({}), options); }), "`baseline=se` is fitted as published: leave out `robust`");
+  EXPECT_EQ(input_error_of([&] { problem_of(gappy_log_of({}), options); }),
+            "`baseline=se` is fitted as published: leave out `robust`");
 }
 
 // ---------------------------------------------------------------- --robust
@@ -267,7 +269,7 @@ ddq = 0.1
 TEST(RobustOptionTest, ScalesDoNotComeFromAGrossErrorAndItsLineIsNamed) {
   FitProblemOptions options;
   options.robust = true;
-  const CsvTable wrong = log_of({{"ddq2", 7, "1e6"}}, {}, 40);
+  const CsvTable wrong = gappy_log_of({{"ddq2", 7, "1e6"}}, {}, 40);
   const FitProblem problem = problem_of(wrong, options);
   for (const Hyperparameter& h : problem.hyperparameters) {
     if (h.kind != Hyperparameter::Kind::signal_stddev) continue;
@@ -282,7 +284,7 @@ TEST(RobustOptionTest, ScalesDoNotComeFromAGrossErrorAndItsLineIsNamed) {
   EXPECT_THAT(distrust_notes(problem, robust.report),
               ElementsAre(HasSubstr("robust: 1 of 120 values distrusted: ddq2 in line 9 (")));
   EXPECT_GT(robust.posterior.observations().front().noise().scale()(1, 7), 1e4);
-  EXPECT_THAT(distrust_notes(problem_of(log_of({})), robust.report), testing::IsEmpty());
+  EXPECT_THAT(distrust_notes(problem_of(gappy_log_of({})), robust.report), testing::IsEmpty());
 }
 
 }  // namespace

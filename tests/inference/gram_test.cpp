@@ -18,8 +18,8 @@ using Eigen::MatrixXd;
 using Eigen::VectorXd;
 using test::Problem;
 
-constexpr std::uint64_t seed = 50505;
-constexpr int n_data = 75;  // more than one tile of pairs
+constexpr std::uint64_t gram_seed = 50505;
+constexpr int n_gram_data = 75;  // more than one tile of pairs
 
 // The reduced observations of a problem; the rows point into it.
 struct Reduced {
@@ -37,9 +37,9 @@ struct Reduced {
 };
 
 // several latents, functions and components; ranks that differ
-std::vector<Problem> problems() {
+std::vector<Problem> gram_problems() {
   std::vector<Problem> chosen;
-  for (Problem& p : test::problems(n_data, seed)) {
+  for (Problem& p : test::problems(n_gram_data, gram_seed)) {
     if (p.name.starts_with("friction, two latents") || p.name == "a row that vanishes at some states") {
       chosen.push_back(std::move(p));
     }
@@ -85,7 +85,7 @@ void expect_slope(double derivative, const std::function<double(double)>& f) {
 }
 
 TEST(GramTest, ItsValueIsTheDensityOfTheReducedObservations) {
-  for (const Problem& p : problems()) {
+  for (const Problem& p : gram_problems()) {
     SCOPED_TRACE(p.name);
     const Reduced of(p);
     const Eigen::LLT<MatrixXd> factor(covariance(of.rows));
@@ -99,7 +99,7 @@ TEST(GramTest, ItsValueIsTheDensityOfTheReducedObservations) {
 }
 
 TEST(GramTest, ItsGradientIsThatOfItsValue) {
-  for (const Problem& p : problems()) {
+  for (const Problem& p : gram_problems()) {
     SCOPED_TRACE(p.name);
     Reduced of(p);
     DenseGram gram;
@@ -154,7 +154,7 @@ TEST(GramTest, ItsGradientIsThatOfItsValue) {
 }
 
 TEST(GramTest, ItsInverseHoldsTheBlocksOfEachSample) {
-  for (const Problem& p : problems()) {
+  for (const Problem& p : gram_problems()) {
     SCOPED_TRACE(p.name);
     const Reduced of(p);
     DenseGram gram;
@@ -174,7 +174,7 @@ TEST(GramTest, ItsInverseHoldsTheBlocksOfEachSample) {
 }
 
 TEST(GramTest, ItsGradientAndThePosteriorAgreeOnTheMeanOfTheLatents) {
-  for (const Problem& p : problems()) {
+  for (const Problem& p : gram_problems()) {
     SCOPED_TRACE(p.name);
     const Reduced of(p);
     DenseGram gram;
@@ -197,7 +197,7 @@ TEST(GramTest, ItsGradientAndThePosteriorAgreeOnTheMeanOfTheLatents) {
 }
 
 TEST(LatentPosteriorTest, ItsWhiteningIsATriangleThatMakesTheCovarianceOfTheBasisOne) {
-  for (const Problem& p : problems()) {
+  for (const Problem& p : gram_problems()) {
     SCOPED_TRACE(p.name);
     const Reduced of(p);
     const std::unique_ptr<LatentPosterior> posterior = DenseGram().condition(of.rows);
@@ -215,7 +215,7 @@ TEST(LatentPosteriorTest, ItsWhiteningIsATriangleThatMakesTheCovarianceOfTheBasi
 }
 
 TEST(LatentPosteriorTest, SamplesThatCameAndWentLeaveItAsItWas) {
-  for (const Problem& p : problems()) {
+  for (const Problem& p : gram_problems()) {
     SCOPED_TRACE(p.name);
     const Reduced of(p);
     const std::unique_ptr<LatentPosterior> before = DenseGram().condition(of.rows);

@@ -11,7 +11,7 @@ using Eigen::Index;
 using Eigen::MatrixXd;
 using Eigen::VectorXd;
 
-constexpr std::uint64_t seed = 40404;
+constexpr std::uint64_t growing_cholesky_seed = 40404;
 
 // I + X Xᵀ, well conditioned, and a right-hand side
 struct Equations {
@@ -19,7 +19,7 @@ struct Equations {
   VectorXd y;
 
   explicit Equations(Index n, std::uint64_t stream = 0) {
-    RandomStream random(seed, stream);
+    RandomStream random(growing_cholesky_seed, stream);
     const MatrixXd X = test::random_vector(n * 5, random).reshaped(n, 5);
     K = MatrixXd::Identity(n, n) + X * X.transpose();
     y = test::random_vector(n, random);
@@ -84,7 +84,7 @@ TEST(GrowingCholeskyTest, RowsComeAndGoForLong) {
   const Equations e(60);
   std::vector<Index> rows = rows_to(20);
   GrowingCholesky factor = factor_of(e, rows);
-  RandomStream random(seed, 1);
+  RandomStream random(growing_cholesky_seed, 1);
   Index next = 20;
   for (int step = 0; step < 400; ++step) {
     const Index gone = static_cast<Index>(random.uniform() * static_cast<double>(rows.size()));

@@ -10,7 +10,7 @@ using Eigen::Index;
 using Eigen::MatrixXd;
 using Eigen::VectorXd;
 
-constexpr std::uint64_t seed = 60611;
+constexpr std::uint64_t learned_directions_seed = 60611;
 constexpr int n_data = 8;
 
 // "acceleration", or a matrix of expressions, in place of the directions
@@ -59,7 +59,7 @@ struct Learned {
 };
 
 Learned learned(const Case& c) {
-  RandomStream random(seed);
+  RandomStream random(learned_directions_seed);
   const Model model = sledge(c.constraint, "\"acceleration\"");
   Learned p{make_prior(model), {}, {}};
   for (Latent& latent : p.prior.latents) latent.free_loading = 1 + latent.size();  // [W, diag √κ] of one column W

@@ -12,7 +12,7 @@ using Eigen::MatrixXd;
 using Eigen::VectorXd;
 using test::Problem;
 
-constexpr std::uint64_t seed = 40402;
+constexpr std::uint64_t likelihood_gradient_seed = 40402;
 
 class Gradient {
  public:
@@ -83,7 +83,7 @@ INSTANTIATE_TEST_SUITE_P(EveryModel, LikelihoodGradient, testing::ValuesIn(probl
 });
 
 void expect_gradient(const Problem& p) {
-  SCOPED_TRACE(fmt::format("{}, mean {}, seed {}", p.name, static_cast<int>(p.prior.mean), seed));
+  SCOPED_TRACE(fmt::format("{}, mean {}, seed {}", p.name, static_cast<int>(p.prior.mean), likelihood_gradient_seed));
   Gradient gradient(p);
   int n_expected_nonzero = 0;
   for (std::size_t a = 0; a < p.prior.latents.size(); ++a) {
@@ -125,7 +125,7 @@ void expect_gradient(const Problem& p) {
 
 TEST_P(LikelihoodGradient, MatchesDifferencesInEveryHyperparameter) {
   int n_problems = 0;
-  for (const Problem& p : test::problems(9, seed)) {
+  for (const Problem& p : test::problems(9, likelihood_gradient_seed)) {
     if (!p.name.starts_with(GetParam())) continue;
     ++n_problems;
     expect_gradient(p);
@@ -135,11 +135,11 @@ TEST_P(LikelihoodGradient, MatchesDifferencesInEveryHyperparameter) {
 
 TEST(LikelihoodGradientTest, MatchesDifferencesWhereEachValueHasItsOwnNoise) {
   std::vector<std::string> seen;
-  for (const Problem& p : test::problems(9, seed)) {
+  for (const Problem& p : test::problems(9, likelihood_gradient_seed)) {
     const std::string model = p.name.substr(0, p.name.find(','));
     if (std::find(seen.begin(), seen.end(), model) != seen.end()) continue;
     seen.push_back(model);
-    expect_gradient(test::with_noise_scale(p, seed));
+    expect_gradient(test::with_noise_scale(p, likelihood_gradient_seed));
   }
   EXPECT_GT(seen.size(), 3U);
 }
@@ -147,7 +147,7 @@ TEST(LikelihoodGradientTest, MatchesDifferencesWhereEachValueHasItsOwnNoise) {
 // the sums over pairs of samples go tile by tile: here are several, and samples whose ranks differ
 TEST(LikelihoodGradientTest, MatchesDifferencesOverSeveralTiles) {
   int n_problems = 0;
-  for (const Problem& p : test::problems(3 + 2 * static_cast<int>(tile_size) + 11, seed)) {
+  for (const Problem& p : test::problems(3 + 2 * static_cast<int>(tile_size) + 11, likelihood_gradient_seed)) {
     if (!p.name.starts_with("a row that vanishes")) continue;
     ++n_problems;
     expect_gradient(p);
@@ -156,7 +156,7 @@ TEST(LikelihoodGradientTest, MatchesDifferencesOverSeveralTiles) {
 }
 
 TEST(LikelihoodGradientTest, IsTheSameToTheBitOnAnyNumberOfThreads) {
-  for (const Problem& p : test::problems(3 + 530, seed)) {
+  for (const Problem& p : test::problems(3 + 530, likelihood_gradient_seed)) {
     if (!p.name.starts_with("a row that vanishes") && !p.name.starts_with("friction")) continue;
     SCOPED_TRACE(p.name);
     Likelihood::Options options;
@@ -179,7 +179,7 @@ TEST(LikelihoodGradientTest, IsTheSameToTheBitOnAnyNumberOfThreads) {
 }
 
 TEST(LikelihoodGradientTest, IsAllThatWasAskedForAndZeroElsewhere) {
-  const Problem p = test::problems(9, seed).front();
+  const Problem p = test::problems(9, likelihood_gradient_seed).front();
   Likelihood::Workspace workspace;
   ModelGradient gradient;
   Likelihood(p.prior, p.observations, p.values, {}).evaluate(p.values, &gradient, workspace);
@@ -200,8 +200,8 @@ TEST(LikelihoodGradientTest, IsAllThatWasAskedForAndZeroElsewhere) {
 }
 
 TEST(LikelihoodGradientTest, IsFiniteWhenEverySampleIsAtRest) {
-  for (Problem p : test::problems(9, seed)) {
-    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, seed));
+  for (Problem p : test::problems(9, likelihood_gradient_seed)) {
+    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, likelihood_gradient_seed));
     const StateLayout layout = p.prior.system->layout();
     for (Observations& group : p.observations) {
       MatrixXd states = group.states();

@@ -13,10 +13,10 @@ using Eigen::MatrixXd;
 using Eigen::VectorXd;
 using test::Problem;
 
-constexpr std::uint64_t seed = 40401;
+constexpr std::uint64_t likelihood_seed = 40401;
 constexpr double infinity = std::numeric_limits<double>::infinity();
 
-double evaluate(const Problem& p, const Likelihood::Options& options = {}) {
+double likelihood_of(const Problem& p, const Likelihood::Options& options = {}) {
   const Likelihood likelihood(p.prior, p.observations, p.values, options);
   Likelihood::Workspace workspace;
   return likelihood.evaluate(p.values, nullptr, workspace);
@@ -30,18 +30,18 @@ double tolerance(const Problem& p, double value) {
 }
 
 TEST(LikelihoodTest, ReducedIsTheDenseMultivariateNormalDensity) {
-  for (const Problem& p : test::problems(12, seed)) {
-    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, seed));
+  for (const Problem& p : test::problems(12, likelihood_seed)) {
+    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, likelihood_seed));
     const double dense = test::dense_negative_log_likelihood(p);
-    EXPECT_NEAR(evaluate(p), dense, tolerance(p, dense));
+    EXPECT_NEAR(likelihood_of(p), dense, tolerance(p, dense));
     EXPECT_LT(tolerance(p, dense), 1e-6 * std::abs(dense)) << "too badly conditioned to test anything";
     EXPECT_NEAR(Posterior(p.prior, p.observations, p.values).negative_log_likelihood(), dense, tolerance(p, dense));
   }
 }
 
 TEST(LikelihoodTest, KeepsNothingBetweenCallsThatMattersToTheNext) {
-  for (const Problem& p : test::problems(9, seed)) {
-    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, seed));
+  for (const Problem& p : test::problems(9, likelihood_seed)) {
+    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, likelihood_seed));
     Likelihood::Options options;
     options.noise_gradient = true;
     const Likelihood likelihood(p.prior, p.observations, p.values, options);
@@ -61,7 +61,7 @@ TEST(LikelihoodTest, KeepsNothingBetweenCallsThatMattersToTheNext) {
 
 TEST(LikelihoodTest, FactorsOneRowPerFreeDirectionThatIsSeen) {
   const auto reduced_size = [](const std::string& name) {
-    for (const Problem& p : test::problems(12, seed)) {
+    for (const Problem& p : test::problems(12, likelihood_seed)) {
       if (p.name == name) return Likelihood(p.prior, p.observations, p.values, {}).reduced_size();
     }
     return -1;
@@ -88,10 +88,10 @@ TEST(LikelihoodTest, ARowThatSaysNothingNewChangesNothing) {
   ASSERT_EQ(doubled.system->nc(), 2);
   Likelihood::Options options;
   options.gradient_parameters = {2, 3};
-  for (Problem p : test::problems(12, seed)) {
+  for (Problem p : test::problems(12, likelihood_seed)) {
     // the multipliers of a row written twice are other numbers: each row carries its share
     if (!p.name.starts_with("surface") || p.name.ends_with("multipliers")) continue;
-    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, seed));
+    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, likelihood_seed));
     ModelGradient gradient, gradient_doubled;
     Likelihood::Workspace workspace;
     const double value = Likelihood(p.prior, p.observations, p.values, options).evaluate(p.values, &gradient, workspace);
@@ -106,7 +106,7 @@ TEST(LikelihoodTest, ARowThatSaysNothingNewChangesNothing) {
 
 TEST(LikelihoodTest, IsInfiniteWhereAParameterMakesTheMassMatrixIndefinite) {
   const Model& model = test::model("models/unicycle.toml");
-  for (Problem p : test::problems(9, seed)) {
+  for (Problem p : test::problems(9, likelihood_seed)) {
     if (!p.name.starts_with("unicycle")) continue;
     const int Ic = model.system->parameter_index("Ic");
     Likelihood::Options options;
@@ -127,7 +127,7 @@ TEST(LikelihoodTest, IsInfiniteWhereAParameterMakesTheMassMatrixIndefinite) {
 }
 
 TEST(LikelihoodTest, IsInfiniteWhereTheCovarianceCannotBeFactored) {
-  Problem p = test::problems(9, seed).front();
+  Problem p = test::problems(9, likelihood_seed).front();
   Likelihood::Workspace workspace;
   const Likelihood likelihood(p.prior, p.observations, p.values, {});
   ModelValues absurd = p.values;
@@ -136,7 +136,7 @@ TEST(LikelihoodTest, IsInfiniteWhereTheCovarianceCannotBeFactored) {
 }
 
 TEST(PosteriorTest, RefusesANoiseTooSmallForDoublePrecision) {
-  Problem p = test::problems(12, seed).front();
+  Problem p = test::problems(12, likelihood_seed).front();
   // every state twice: the covariance of the signal alone is singular
   Observations& group = p.observations[0];
   MatrixXd states = group.states();

@@ -24,7 +24,7 @@ using test::Quantity;
 using testing::HasSubstr;
 using Status = Predictor::Status;
 
-constexpr std::uint64_t seed = 50606;
+constexpr std::uint64_t massless_coordinate_seed = 50606;
 
 // models/massless_rod.toml with what is unknown at the hinge alone, and the pendulum that it is
 const Model& rod() {
@@ -78,8 +78,8 @@ ModelValues some_values(const Observations& group) {
 }
 
 TEST(MasslessCoordinate, HasTheLikelihoodTheGradientTheFitAndThePredictionsOfTheModelWithoutIt) {
-  SCOPED_TRACE(fmt::format("seed {}", seed));
-  const GeneratedData data = generate(rod(), {30, seed, VectorXd::Constant(3, 0.2)});
+  SCOPED_TRACE(fmt::format("seed {}", massless_coordinate_seed));
+  const GeneratedData data = generate(rod(), {30, massless_coordinate_seed, VectorXd::Constant(3, 0.2)});
   const MatrixXd values = data.accelerations.row(2);
   const Observations here = angle_observed({Quantity::constrained_acceleration, {2}}, data.states, values);
   const Observations there = angle_observed({Quantity::constrained_acceleration, {0}}, of_pendulum(data.states), values);
@@ -115,7 +115,7 @@ TEST(MasslessCoordinate, HasTheLikelihoodTheGradientTheFitAndThePredictionsOfThe
   // the optimiser stops at a gradient of 1e-5 in logarithms: the objective is then within about its square, what it depends on
   // within about itself
   EXPECT_NEAR(fitted.report.negative_log_likelihood, fitted_without.report.negative_log_likelihood, 1e-7);
-  const MatrixXd states = test::draw(rod(), 20, seed + 1).states;
+  const MatrixXd states = test::draw(rod(), 20, massless_coordinate_seed + 1).states;
   const Posterior::Marginal marginal = fitted.posterior.marginal(here.view(), states);
   const Posterior::Marginal other = fitted_without.posterior.marginal(there.view(), of_pendulum(states));
   EXPECT_LE(test::largest(marginal.mean - other.mean), 1e-4 * (1 + test::largest(other.mean)));
@@ -123,18 +123,18 @@ TEST(MasslessCoordinate, HasTheLikelihoodTheGradientTheFitAndThePredictionsOfThe
 }
 
 // everything observed that can be, with the model's own prior on all three forces
-struct Problem {
+struct MasslessProblem {
   Prior prior;
   std::vector<Observations> observations;
   ModelValues values;
   MatrixXd queries;
 };
 
-Problem problem(Prior::Mean mean) {
+MasslessProblem problem(Prior::Mean mean) {
   const Model& model = test::model("models/massless_rod.toml");
-  const MatrixXd states = test::draw(model, 24, seed).states;
-  Problem p{make_prior(model, {mean, std::nullopt}), {}, {}, states.rightCols(3)};
-  RandomStream random(seed, mean == Prior::Mean::force ? 1 : 2);
+  const MatrixXd states = test::draw(model, 24, massless_coordinate_seed).states;
+  MasslessProblem p{make_prior(model, {mean, std::nullopt}), {}, {}, states.rightCols(3)};
+  RandomStream random(massless_coordinate_seed, mean == Prior::Mean::force ? 1 : 2);
   Index first = 0;
   for (const Quantity quantity : {Quantity::constrained_acceleration, Quantity::constraint_force, Quantity::multipliers}) {
     const View view = View::all(quantity, *model.system);
@@ -147,7 +147,7 @@ Problem problem(Prior::Mean mean) {
 
 TEST(MasslessCoordinate, HasTheExactGradientOfTheLikelihoodInEveryParameter) {
   for (const Prior::Mean mean : {Prior::Mean::zero, Prior::Mean::force}) {
-    const Problem p = problem(mean);
+    const MasslessProblem p = problem(mean);
     Likelihood::Options options;
     options.noise_gradient = true;
     options.gradient_parameters = {0, 1, 2};
@@ -184,7 +184,7 @@ TEST(MasslessCoordinate, HasTheExactGradientOfTheLikelihoodInEveryParameter) {
 
 TEST(MasslessCoordinate, IsPredictedByThePredictorAsByThePosteriorAndDifferentiatedExactly) {
   for (const Prior::Mean mean : {Prior::Mean::zero, Prior::Mean::force}) {
-    const Problem p = problem(mean);
+    const MasslessProblem p = problem(mean);
     const Posterior posterior(p.prior, p.observations, p.values);
     for (const Quantity quantity : {Quantity::constrained_acceleration, Quantity::constraint_force, Quantity::next_velocity}) {
       for (const std::optional<int>& latent : {std::optional<int>(), std::optional(0)}) {
@@ -258,7 +258,7 @@ directions = "{}"
 // M_θθ = 0: the torque that the hinge can be expected to see is that of the ball on its rod
 TEST(MasslessCoordinate, HasAForceScaleOfTheMassThatItsConstraintsLendIt) {
   const Model& model = test::model("models/massless_rod.toml");
-  const GeneratedData data = test::draw(model, 30, seed);
+  const GeneratedData data = test::draw(model, 30, massless_coordinate_seed);
   for (const int row : {0, 2}) {
     const Observations group{
         data.states, {Quantity::constrained_acceleration, {row}}, data.accelerations.row(row), VectorXd::Constant(1, 0.1), false};
@@ -274,9 +274,9 @@ TEST(MasslessCoordinate, HasAForceScaleOfTheMassThatItsConstraintsLendIt) {
 TEST(MasslessCoordinate, WithAPriorOnTheAccelerationThereIsNoPosterior) {
   const Model& model = test::model("models/massless_rod.toml");
   const Prior prior = make_prior(model, {Prior::Mean::zero, Latent::Base::acceleration});
-  RandomStream random(seed);
+  RandomStream random(massless_coordinate_seed);
   const Observations group = test::observe(model, View::all(Quantity::constrained_acceleration, *model.system),
-                                           test::draw(model, 5, seed).states, random);
+                                           test::draw(model, 5, massless_coordinate_seed).states, random);
   const ModelValues values = test::random_values(prior, {group}, random);
   EXPECT_THAT(test::input_error_of([&] { Posterior(prior, {group}, values); }),
               HasSubstr("M is singular, so that there is no M⁻¹, but the latent 'unknown force' acts on"));

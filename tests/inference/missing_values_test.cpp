@@ -19,12 +19,12 @@ using test::largest;
 using test::Problem;
 using test::Quantity;
 
-constexpr std::uint64_t seed = 40711;
+constexpr std::uint64_t missing_values_seed = 40711;
 constexpr double nan = std::numeric_limits<double>::quiet_NaN();
 
 // with a third of the values gone, at one state all of them
 Problem with_gaps(Problem p, std::uint64_t stream) {
-  RandomStream random(seed, stream);
+  RandomStream random(missing_values_seed, stream);
   for (Observations& group : p.observations) {
     MatrixXd values = group.values();
     for (double& value : values.reshaped()) {
@@ -39,23 +39,23 @@ Problem with_gaps(Problem p, std::uint64_t stream) {
 }
 
 // plain ones, and some with a noise of its own for each value
-std::vector<Problem> problems() {
+std::vector<Problem> gappy_problems() {
   std::vector<Problem> all;
-  for (const Problem& p : test::problems(9, seed)) {
+  for (const Problem& p : test::problems(9, missing_values_seed)) {
     const std::uint64_t stream = all.size();
-    all.push_back(with_gaps(stream % 2 == 0 ? p : test::with_noise_scale(p, seed + stream), stream));
+    all.push_back(with_gaps(stream % 2 == 0 ? p : test::with_noise_scale(p, missing_values_seed + stream), stream));
   }
   return all;
 }
 
-double rounding(const Problem& p) {
+double gappy_rounding(const Problem& p) {
   Problem whole = p;
   for (Observations& group : whole.observations) {
     const MatrixXd& scale = group.noise().scale();
     if (group.noise().has_scale()) group = test::with_scale(group, (scale.array() > 0).select(scale, 1));
     group = group.with_values(MatrixXd::Zero(group.values().rows(), group.values().cols()));
   }
-  return 1e4 * test::eps * test::condition(whole);
+  return test::rounding(whole);
 }
 
 // −log N of the measured values alone
@@ -70,25 +70,6 @@ double dense_density_of_measured(const Problem& p) {
   const long double log_det_half = Extended(factor.matrixL()).diagonal().array().log().sum();
   return static_cast<double>(white.squaredNorm() / 2 + log_det_half +
                              static_cast<long double>(rows.size()) * std::log(2 * std::numbers::pi_v<long double>) / 2);
-}
-
-Likelihood::Options every_derivative(const Problem& p) {
-  Likelihood::Options options;
-  options.noise_gradient = true;
-  for (int k = 0; k < static_cast<int>(p.values.parameters.size()); ++k) options.gradient_parameters.push_back(k);
-  return options;
-}
-
-struct Evaluated {
-  double value = 0;
-  ModelGradient gradient;
-};
-
-Evaluated evaluate(const Problem& p) {
-  Likelihood::Workspace workspace;
-  Evaluated out;
-  out.value = Likelihood(p.prior, p.observations, p.values, every_derivative(p)).evaluate(p.values, &out.gradient, workspace);
-  return out;
 }
 
 // the same data with a group for each state, whose view has the measured rows alone
@@ -115,47 +96,44 @@ Problem taken_apart(const Problem& p) {
   return apart;
 }
 
-View every_acceleration(const Problem& p) { return View::all(Quantity::unconstrained_acceleration, *p.prior.system); }
-
-Posterior posterior_of(const Problem& p) { return {p.prior, p.observations, p.values}; }
-
 TEST(MissingValuesTest, TheLikelihoodIsTheDenseDensityOfTheMeasuredValuesAlone) {
   int n_well_conditioned = 0;
-  for (const Problem& p : problems()) {
-    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, seed));
+  for (const Problem& p : gappy_problems()) {
+    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, missing_values_seed));
     const double dense = dense_density_of_measured(p);
     ASSERT_TRUE(std::isfinite(dense));
-    EXPECT_NEAR(evaluate(p).value, dense, rounding(p) * (1 + std::abs(dense)));
-    EXPECT_NEAR(posterior_of(p).negative_log_likelihood(), dense, rounding(p) * (1 + std::abs(dense)));
-    if (rounding(p) > 1e-9) continue;
-    EXPECT_NEAR(evaluate(p).value, dense, 1e-12 * (1 + std::abs(dense)));
+    EXPECT_NEAR(test::evaluate(p).value, dense, gappy_rounding(p) * (1 + std::abs(dense)));
+    EXPECT_NEAR(test::posterior_of(p).negative_log_likelihood(), dense, gappy_rounding(p) * (1 + std::abs(dense)));
+    if (gappy_rounding(p) > 1e-9) continue;
+    EXPECT_NEAR(test::evaluate(p).value, dense, 1e-12 * (1 + std::abs(dense)));
     ++n_well_conditioned;
   }
   EXPECT_GT(n_well_conditioned, 10);
 }
 
 TEST(MissingValuesTest, GapsAreTheSameAsAViewOfItsOwnForEachState) {
-  for (const Problem& p : problems()) {
-    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, seed));
+  for (const Problem& p : gappy_problems()) {
+    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, missing_values_seed));
     const Problem apart = taken_apart(p);
-    const Evaluated got = evaluate(p), expected = evaluate(apart);
-    EXPECT_NEAR(got.value, expected.value, rounding(p) * (1 + std::abs(expected.value)));
+    const test::Evaluated got = test::evaluate(p), expected = test::evaluate(apart);
+    EXPECT_NEAR(got.value, expected.value, gappy_rounding(p) * (1 + std::abs(expected.value)));
     for (std::size_t a = 0; a < p.prior.latents.size(); ++a) {
       EXPECT_LE(largest(got.gradient.log_kernel[a] - expected.gradient.log_kernel[a]),
-                rounding(p) * (1 + largest(expected.gradient.log_kernel[a])));
+                gappy_rounding(p) * (1 + largest(expected.gradient.log_kernel[a])));
       EXPECT_LE(largest(got.gradient.log_signal_stddev[a] - expected.gradient.log_signal_stddev[a]),
-                rounding(p) * (1 + largest(expected.gradient.log_signal_stddev[a])));
+                gappy_rounding(p) * (1 + largest(expected.gradient.log_signal_stddev[a])));
     }
-    const MatrixXd mean = posterior_of(apart).mean(every_acceleration(p), p.queries);
-    EXPECT_LE(largest(posterior_of(p).mean(every_acceleration(p), p.queries) - mean), rounding(p) * (1 + largest(mean)));
+    const MatrixXd mean = test::posterior_of(apart).mean(test::every_acceleration(p), p.queries);
+    EXPECT_LE(largest(test::posterior_of(p).mean(test::every_acceleration(p), p.queries) - mean),
+              gappy_rounding(p) * (1 + largest(mean)));
   }
 }
 
 TEST(MissingValuesTest, TheGradientIsThatOfTheLikelihood) {
   int n_nonzero = 0;
-  for (const Problem& p : problems()) {
-    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, seed));
-    const Likelihood likelihood(p.prior, p.observations, p.values, every_derivative(p));
+  for (const Problem& p : gappy_problems()) {
+    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, missing_values_seed));
+    const Likelihood likelihood(p.prior, p.observations, p.values, test::every_derivative(p));
     Likelihood::Workspace workspace;
     ModelGradient gradient;
     const double value = likelihood.evaluate(p.values, &gradient, workspace);
@@ -167,7 +145,7 @@ TEST(MissingValuesTest, TheGradientIsThatOfTheLikelihood) {
       };
       const double scale = positive ? 0.5 : 0.05 * (x == 0 ? 1 : std::abs(x));
       const test::Difference difference =
-          test::central_difference(at, positive ? std::log(x) : x, scale, std::max(64 * test::eps, rounding(p) / 100));
+          test::central_difference(at, positive ? std::log(x) : x, scale, std::max(64 * test::eps, gappy_rounding(p) / 100));
       EXPECT_TRUE(test::matches(VectorXd::Constant(1, analytic), difference)) << "value " << value;
       if (std::abs(analytic) > 10 * difference.error[0]) ++n_nonzero;
     };
@@ -191,14 +169,14 @@ TEST(MissingValuesTest, TheGradientIsThatOfTheLikelihood) {
 }
 
 TEST(MissingValuesTest, WhatStandsBesideAGapChangesNoBit) {
-  for (const Problem& p : problems()) {
-    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, seed));
+  for (const Problem& p : gappy_problems()) {
+    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, missing_values_seed));
     Problem other = p;
     for (Observations& group : other.observations) {
       if (!group.noise().has_scale()) continue;
       group = test::with_scale(group, group.values().array().isNaN().select(nan, group.noise().scale()));
     }
-    const Evaluated expected = evaluate(p), got = evaluate(other);
+    const test::Evaluated expected = test::evaluate(p), got = test::evaluate(other);
     EXPECT_EQ(got.value, expected.value);
     for (std::size_t g = 0; g < p.observations.size(); ++g) {
       EXPECT_EQ(got.gradient.log_noise_stddev[g], expected.gradient.log_noise_stddev[g]);
@@ -207,9 +185,9 @@ TEST(MissingValuesTest, WhatStandsBesideAGapChangesNoBit) {
 }
 
 TEST(MissingValuesTest, APosteriorGrowsAndShrinksWithThem) {
-  const Problem p = problems().front();
+  const Problem p = gappy_problems().front();
   const Observations& all = p.observations[0];
-  Posterior posterior = posterior_of(p).without_data();
+  Posterior posterior = test::posterior_of(p).without_data();
   const auto part = [&](int first, int last) {
     std::vector<int> states;
     for (int i = first; i <= last; ++i) states.push_back(i);
@@ -217,14 +195,14 @@ TEST(MissingValuesTest, APosteriorGrowsAndShrinksWithThem) {
   };
   posterior = update(std::move(posterior), part(0, 3));
   posterior = update(std::move(posterior), part(4, all.n_data() - 1));
-  const MatrixXd mean = posterior_of(p).mean(every_acceleration(p), p.queries);
-  EXPECT_LE(largest(posterior.mean(every_acceleration(p), p.queries) - mean), rounding(p) * (1 + largest(mean)));
-  EXPECT_NEAR(posterior.negative_log_likelihood(), posterior_of(p).negative_log_likelihood(),
-              rounding(p) * (1 + std::abs(posterior.negative_log_likelihood())));
+  const MatrixXd mean = test::posterior_of(p).mean(test::every_acceleration(p), p.queries);
+  EXPECT_LE(largest(posterior.mean(test::every_acceleration(p), p.queries) - mean), gappy_rounding(p) * (1 + largest(mean)));
+  EXPECT_NEAR(posterior.negative_log_likelihood(), test::posterior_of(p).negative_log_likelihood(),
+              gappy_rounding(p) * (1 + std::abs(posterior.negative_log_likelihood())));
   posterior = remove_oldest(std::move(posterior), 2);
   const Posterior expected(p.prior, {part(2, all.n_data() - 1)}, p.values);
-  const MatrixXd rest = expected.mean(every_acceleration(p), p.queries);
-  EXPECT_LE(largest(posterior.mean(every_acceleration(p), p.queries) - rest), rounding(p) * (1 + largest(rest)));
+  const MatrixXd rest = expected.mean(test::every_acceleration(p), p.queries);
+  EXPECT_LE(largest(posterior.mean(test::every_acceleration(p), p.queries) - rest), gappy_rounding(p) * (1 + largest(rest)));
 }
 
 TEST(MissingValuesTest, FiguresOfARowAreThoseOfItsMeasuredValues) {
@@ -242,9 +220,9 @@ TEST(MissingValuesTest, FiguresOfARowAreThoseOfItsMeasuredValues) {
 }
 
 TEST(MissingValuesTest, AnEvaluationLeavesThemOut) {
-  const Problem p = problems().front();
+  const Problem p = gappy_problems().front();
   const View every = View::all(Quantity::constrained_acceleration, *p.prior.system);
-  const Posterior posterior = posterior_of(p);
+  const Posterior posterior = test::posterior_of(p);
   const MatrixXd mean = posterior.mean(every, p.queries);
   MatrixXd targets = mean;
   for (Index i = 0; i < targets.cols(); ++i) targets(0, i) += 1 + static_cast<double>(i);
@@ -259,11 +237,11 @@ TEST(MissingValuesTest, AnEvaluationLeavesThemOut) {
 }
 
 TEST(LeaveOneOutTest, EachValueIsPredictedAsByAPosteriorThatHasNotSeenIt) {
-  for (const Problem& p : problems()) {
-    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, seed));
-    const std::vector<LeaveOneOut> left_out = leave_one_out(posterior_of(p));
+  for (const Problem& p : gappy_problems()) {
+    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, missing_values_seed));
+    const std::vector<LeaveOneOut> left_out = leave_one_out(test::posterior_of(p));
     ASSERT_EQ(left_out.size(), p.observations.size());
-    RandomStream random(seed, 99);
+    RandomStream random(missing_values_seed, 99);
     for (std::size_t g = 0; g < p.observations.size(); ++g) {
       const Observations& group = p.observations[g];
       int n_compared = 0;
@@ -278,11 +256,11 @@ TEST(LeaveOneOutTest, EachValueIsPredictedAsByAPosteriorThatHasNotSeenIt) {
           MatrixXd values = group.values();
           values(k, i) = nan;
           without.observations[g] = group.with_values(values);
-          const Posterior::Marginal expected = posterior_of(without).marginal(group.view(), group.states().col(i));
+          const Posterior::Marginal expected = test::posterior_of(without).marginal(group.view(), group.states().col(i));
           const double variance = expected.covariance.col(0)[k * group.view().size() + k];
           const double size = largest(expected.mean) + std::sqrt(variance) + group.noise().stddev()[k];
-          EXPECT_NEAR(left_out[g].mean(k, i), expected.mean(k, 0), rounding(p) * (1 + size));
-          EXPECT_NEAR(left_out[g].variance(k, i), variance, rounding(p) * (1 + size * size));
+          EXPECT_NEAR(left_out[g].mean(k, i), expected.mean(k, 0), gappy_rounding(p) * (1 + size));
+          EXPECT_NEAR(left_out[g].variance(k, i), variance, gappy_rounding(p) * (1 + size * size));
         }
       }
       EXPECT_GT(n_compared, 0);

@@ -18,15 +18,15 @@ using Eigen::VectorXd;
 using test::input_error_of;
 using testing::HasSubstr;
 
-struct Case {
+struct NotFiniteCase {
   std::string name, kernel, feature, direction, force;
   std::string text;  // of the error
 };
 
-void PrintTo(const Case& c, std::ostream* out) { *out << c.name; }
+void PrintTo(const NotFiniteCase& c, std::ostream* out) { *out << c.name; }
 
 // a particle; each case has a root of the negative x in another place
-Prior prior_of(const Case& c) {
+Prior prior_of(const NotFiniteCase& c) {
   const std::string text = fmt::format(R"toml(
 name        = "particle"
 coordinates = ["x", "y"]
@@ -52,7 +52,7 @@ MatrixXd states_from(const Prior& prior, double first_x) {
   return states;
 }
 
-class NotFinite : public testing::TestWithParam<Case> {
+class NotFinite : public testing::TestWithParam<NotFiniteCase> {
  protected:
   NotFinite() : sound_(states_from(prior_, 3)), broken_(states_from(prior_, -1)) {}
 
@@ -67,13 +67,13 @@ class NotFinite : public testing::TestWithParam<Case> {
 
 INSTANTIATE_TEST_SUITE_P(
     Each, NotFinite,
-    testing::Values(Case{"FeatureSe", "se", "sqrt(x)", "1", "0", "latent 'drag': the feature 'sqrt(x)'"},
-                    Case{"FeatureMatern", "matern32", "sqrt(x)", "1", "0", "latent 'drag': the feature 'sqrt(x)'"},
-                    Case{"FeaturePeriodic", "periodic", "sqrt(x)", "1", "0", "latent 'drag': the feature 'sqrt(x)'"},
-                    Case{"FeatureRq", "rq + linear", "sqrt(x)", "1", "0", "latent 'drag': the feature 'sqrt(x)'"},
-                    Case{"FeatureInfinite", "se", "1/(x + 1)", "1", "0", "latent 'drag': the feature '1/(x + 1)'"},
-                    Case{"Direction", "se", "x", "sqrt(x)", "0", "latent 'drag': 'direction 1' along 'y'"},
-                    Case{"Force", "se", "x", "1", "sqrt(x)", "the applied force on 'y'"}),
+    testing::Values(NotFiniteCase{"FeatureSe", "se", "sqrt(x)", "1", "0", "latent 'drag': the feature 'sqrt(x)'"},
+                    NotFiniteCase{"FeatureMatern", "matern32", "sqrt(x)", "1", "0", "latent 'drag': the feature 'sqrt(x)'"},
+                    NotFiniteCase{"FeaturePeriodic", "periodic", "sqrt(x)", "1", "0", "latent 'drag': the feature 'sqrt(x)'"},
+                    NotFiniteCase{"FeatureRq", "rq + linear", "sqrt(x)", "1", "0", "latent 'drag': the feature 'sqrt(x)'"},
+                    NotFiniteCase{"FeatureInfinite", "se", "1/(x + 1)", "1", "0", "latent 'drag': the feature '1/(x + 1)'"},
+                    NotFiniteCase{"Direction", "se", "x", "sqrt(x)", "0", "latent 'drag': 'direction 1' along 'y'"},
+                    NotFiniteCase{"Force", "se", "x", "1", "sqrt(x)", "the applied force on 'y'"}),
     [](const auto& one) { return one.param.name; });
 
 TEST_P(NotFinite, IsRefusedAtEveryDoorByStateAndName) {

@@ -14,11 +14,11 @@ using test::largest;
 using test::Problem;
 using test::Quantity;
 
-constexpr std::uint64_t seed = 40406;
+constexpr std::uint64_t posterior_batch_seed = 40406;
 
 // more samples than one chunk of the sums over them holds
 Problem many_samples(const std::string& name) {
-  for (const Problem& p : test::problems(300, seed)) {
+  for (const Problem& p : test::problems(300, posterior_batch_seed)) {
     if (p.name == name) return p;
   }
   throw std::runtime_error("no problem " + name);
@@ -64,14 +64,14 @@ TEST(PosteriorBatchTest, AStateHasTheSameBitsInEveryBatchAndOnAnyNumberOfThreads
 }
 
 TEST(PosteriorBatchTest, NoStatesGiveNoNumbers) {
-  const Problem p = test::problems(9, seed).front();
+  const Problem p = test::problems(9, posterior_batch_seed).front();
   const Posterior posterior(p.prior, p.observations, p.values);
   const View view = View::all(Quantity::constrained_acceleration, *p.prior.system);
   const MatrixXd none(p.queries.rows(), 0);
   EXPECT_EQ(posterior.mean(view, none, 2).cols(), 0);
   EXPECT_EQ(posterior.marginal(view, none, 2).covariance.cols(), 0);
   EXPECT_EQ(posterior.joint(view, none).mean.size(), 0);
-  EXPECT_EQ(posterior.sample({{view, none}}, 3, seed).rows(), 0);
+  EXPECT_EQ(posterior.sample({{view, none}}, 3, posterior_batch_seed).rows(), 0);
 }
 
 TEST(PosteriorBatchTest, JudgesContradictingConstraintsAtEachStateWhateverElseIsAskedFor) {

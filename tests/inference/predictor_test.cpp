@@ -29,15 +29,15 @@ using testing::HasSubstr;
 using Status = Predictor::Status;
 using Storage = Predictor::Storage;
 
-constexpr std::uint64_t seed = 50505;
+constexpr std::uint64_t predictor_seed = 50505;
 
-const std::vector<Problem>& problems() {
-  static const std::vector<Problem> all = test::problems(21, seed);
+const std::vector<Problem>& predictor_problems() {
+  static const std::vector<Problem> all = test::problems(21, predictor_seed);
   return all;
 }
 
 // every view, with some rows and with one latent alone too, and those under other systems
-std::vector<View> views_of(const Problem& p) {
+std::vector<View> predicted_views_of(const Problem& p) {
   std::vector<View> views;
   const System& system = *p.prior.system;
   for (const Quantity quantity : Quantity::all()) {
@@ -59,7 +59,7 @@ std::vector<View> views_of(const Problem& p) {
 
 std::string describe(const Problem& p, const View& view) {
   return fmt::format("{}, {} ({} rows, latent {}{}), seed {}", p.name, view.quantity->word(), view.size(),
-                     view.latent.value_or(-1), view.other_system ? ", elsewhere" : "", seed);
+                     view.latent.value_or(-1), view.other_system ? ", elsewhere" : "", predictor_seed);
 }
 
 MatrixXd known(const MatrixXd& states) { return states.array().isNaN().select(0, states); }
@@ -82,11 +82,11 @@ struct Prediction {
 };
 
 TEST(PredictorTest, IsThePosteriorInEveryView) {
-  for (const Problem& p : problems()) {
+  for (const Problem& p : predictor_problems()) {
     const Posterior posterior(p.prior, p.observations, p.values);
     const MatrixXd states = known(p.queries);
     for (const Posterior& of : {posterior, posterior.without_data()}) {
-      for (const View& view : views_of(p)) {
+      for (const View& view : predicted_views_of(p)) {
         SCOPED_TRACE(describe(p, view));
         const Predictor predictor(of, view);
         Predictor::Workspace workspace = predictor.make_workspace();
@@ -109,17 +109,17 @@ TEST(PredictorTest, IsThePosteriorInEveryView) {
 
 TEST(PredictorTest, DifferentiatesExactly) {
   double size = 0;
-  for (const Problem& p : problems()) {
+  for (const Problem& p : predictor_problems()) {
     // off the constraint its rows contradict each other
     if (p.prior.system->name().find("redundant") != std::string::npos) continue;
     const Posterior posterior(p.prior, p.observations, p.values);
-    for (const View& view : views_of(p)) {
+    for (const View& view : predicted_views_of(p)) {
       const Predictor predictor(posterior, view);
       Predictor::Workspace workspace = predictor.make_workspace();
       for (Index i = 0; i < 2; ++i) {
         SCOPED_TRACE(fmt::format("{}, state {}", describe(p, view), i));
         // off the constraint too
-        RandomStream random(seed, static_cast<std::uint64_t>(i));
+        RandomStream random(predictor_seed, static_cast<std::uint64_t>(i));
         VectorXd state = known(p.queries.col(i)) + 0.02 * test::random_vector(p.queries.rows(), random);
         const Prediction prediction(predictor, state, workspace);
         ASSERT_EQ(prediction.status, Status::ok);
@@ -141,7 +141,7 @@ TEST(PredictorTest, DifferentiatesExactly) {
 }
 
 TEST(PredictorTest, ObeysTheConstraintAndItsDerivativeInBothPrecisions) {
-  for (const Problem& p : problems()) {
+  for (const Problem& p : predictor_problems()) {
     const System& system = *p.prior.system;
     if (system.nc() == 0 || system.name().find("redundant") != std::string::npos) continue;
     SCOPED_TRACE(p.name);
@@ -195,7 +195,7 @@ directions = "force"
 )toml",
                                                  constraints),
                                      "two in a groove");
-    RandomStream random(seed);
+    RandomStream random(predictor_seed);
     const MatrixXd states = test::random_vector(5 * 12, random).reshaped(5, 12);
     const MatrixXd values = test::random_vector(2 * 12, random).reshaped(2, 12);
     const View a_bar = View::all(Quantity::unconstrained_acceleration, *model.system);
@@ -239,7 +239,7 @@ features   = ["x", "dy"]
 directions = "force"
 )toml",
                                    "two in a groove");
-  RandomStream random(seed);
+  RandomStream random(predictor_seed);
   const MatrixXd states = test::random_vector(5 * 12, random).reshaped(5, 12);
   const MatrixXd values = test::random_vector(2 * 12, random).reshaped(2, 12);
   const VectorXd noise = VectorXd::Constant(2, 0.3);
@@ -265,9 +265,9 @@ directions = "force"
 }
 
 TEST(PredictorTest, AllocatesNothing) {
-  for (const Problem& p : problems()) {
+  for (const Problem& p : predictor_problems()) {
     const Posterior posterior(p.prior, p.observations, p.values);
-    for (const View& view : views_of(p)) {
+    for (const View& view : predicted_views_of(p)) {
       for (const Storage storage : {Storage::double_precision, Storage::single_precision}) {
         SCOPED_TRACE(describe(p, view));
         const Predictor predictor(posterior, view, {.storage = storage});
@@ -291,7 +291,7 @@ TEST(PredictorTest, AllocatesNothing) {
 }
 
 TEST(PredictorTest, GivesTheSameBitsOnSeveralThreadsAndOutlivesItsPosterior) {
-  const Problem& p = problems().front();
+  const Problem& p = predictor_problems().front();
   const View view = View::all(Quantity::constrained_acceleration, *p.prior.system);
   std::optional<Posterior> posterior(Posterior(p.prior, p.observations, p.values));
   const Predictor predictor(*posterior, view);
@@ -323,7 +323,7 @@ TEST(PredictorTest, GivesTheSameBitsOnSeveralThreadsAndOutlivesItsPosterior) {
 
 TEST(PredictorTest, InSinglePrecisionIsOffByNoMoreThanItSays) {
   std::optional<Problem> found;
-  for (const Problem& p : test::problems(61, seed)) {
+  for (const Problem& p : test::problems(61, predictor_seed)) {
     if (p.name == "surface, every row") found = p;
   }
   ASSERT_TRUE(found);
@@ -368,7 +368,7 @@ TEST(PredictorTest, InSinglePrecisionIsOffByNoMoreThanItSays) {
 }
 
 TEST(PredictorTest, InSinglePrecisionIsThePosteriorUnderEveryKernel) {
-  for (const Problem& p : problems()) {
+  for (const Problem& p : predictor_problems()) {
     const Posterior posterior(p.prior, p.observations, p.values);
     const View view = View::all(Quantity::unconstrained_acceleration, *p.prior.system);
     SCOPED_TRACE(p.name);
@@ -447,7 +447,7 @@ TEST(PredictorTest, TellsWhatIsWrongWithAStateAndGoesOn) {
 }
 
 TEST(PredictorTest, NamesWhatIsWrongWithAnArgument) {
-  const Posterior posterior = test::surface_posterior(seed);
+  const Posterior posterior = test::surface_posterior(predictor_seed);
   const System& system = *posterior.prior().system;
   EXPECT_EQ(test::input_error_of([&] { Predictor(posterior, View::all(Quantity::next_velocity, system)); }),
             "view 'next-velocity' needs a time step");

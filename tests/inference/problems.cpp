@@ -420,4 +420,24 @@ double condition(const Problem& p) {
   return white.norm();
 }
 
+double rounding(const Problem& p) { return 1e4 * eps * condition(p); }
+
+Posterior posterior_of(const Problem& p) { return {p.prior, p.observations, p.values}; }
+
+View every_acceleration(const Problem& p) { return View::all(Quantity::unconstrained_acceleration, *p.prior.system); }
+
+Likelihood::Options every_derivative(const Problem& p) {
+  Likelihood::Options options;
+  options.noise_gradient = true;
+  for (int k = 0; k < static_cast<int>(p.values.parameters.size()); ++k) options.gradient_parameters.push_back(k);
+  return options;
+}
+
+Evaluated evaluate(const Problem& p) {
+  Likelihood::Workspace workspace;
+  Evaluated out;
+  out.value = Likelihood(p.prior, p.observations, p.values, every_derivative(p)).evaluate(p.values, &out.gradient, workspace);
+  return out;
+}
+
 }  // namespace gp2::test

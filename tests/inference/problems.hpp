@@ -95,4 +95,19 @@ std::pair<VectorXd, MatrixXd> dense_posterior(const Problem& p, const View& view
 /// Largest over smallest eigenvalue of K̃ + I, or a little more: the signal to noise ratio. Bounds the loss of accuracy.
 double condition(const Problem& p);
 
+/// ε times that, after mechanics with κ(M) of some hundreds.
+double rounding(const Problem& p);
+
+Posterior posterior_of(const Problem& p);
+
+View every_acceleration(const Problem& p);  // ā
+
+/// Every derivative that the likelihood has, and its value with them.
+Likelihood::Options every_derivative(const Problem& p);
+struct Evaluated {
+  double value = 0;
+  ModelGradient gradient;
+};
+Evaluated evaluate(const Problem& p);
+
 }  // namespace gp2::test

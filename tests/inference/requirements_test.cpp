@@ -28,7 +28,7 @@ using testing::Not;
 using Quantity = View::Quantity;
 using Kind = Hyperparameter::Kind;
 
-constexpr double nan = std::numeric_limits<double>::quiet_NaN();
+constexpr double not_a_number = std::numeric_limits<double>::quiet_NaN();
 
 /// The surface model with seven observed states, and all that is made of them.
 struct Surface {
@@ -98,7 +98,7 @@ TEST(Requirements, AViewHasTheRowsTheLatentAndTheTimeStepThatItNames) {
   expect("view 'next-velocity' needs a time step");
   view.time_step = -0.1;
   expect("view 'next-velocity': the time step must be positive, got -0.1");
-  view.time_step = nan;
+  view.time_step = not_a_number;
   expect("view 'next-velocity': the time step must be positive, got nan");
 }
 
@@ -150,7 +150,7 @@ TEST(Requirements, StatesAreThoseOfTheSystem) {
 TEST(Requirements, AStateThatIsNotKnownIsNamedByItsEntry) {
   const Surface s;
   MatrixXd states = s.data.states;
-  states(0, 2) = nan;
+  states(0, 2) = not_a_number;
   const std::string text = "of what the equations read q1 is nan at state 3 (q2 = ";
   expect_refusal(doors_of_prediction(s, s.ddq, states), text);
   expect_refusal(doors_of_learning(s, {test::with_states(s.observations[0], states)}), text);
@@ -174,7 +174,7 @@ TEST(Requirements, ValuesAreOfThePriorAndItsObservations) {
   expect("values: kernel is of 0 latents, there are 1");
   change([](ModelValues& v) { v.kernel[0].conservativeResize(1); });
   expect("values: kernel of latent '");
-  change([](ModelValues& v) { v.kernel[0][0] = nan; });
+  change([](ModelValues& v) { v.kernel[0][0] = not_a_number; });
   expect("must be finite and positive, got nan");
   change([](ModelValues& v) { v.signal_stddev[0][0] = -1; });
   expect("must be finite and not negative, got -1");
@@ -182,7 +182,7 @@ TEST(Requirements, ValuesAreOfThePriorAndItsObservations) {
   expect("values: noise_stddev is of 0 observations, there are 1");
   change([](ModelValues& v) { v.noise_stddev[0].resize(0); });
   expect("values: noise_stddev of observations 1 must have 3 numbers, got 0");
-  for (const double noise : {nan, 0.0, -1.0}) {
+  for (const double noise : {not_a_number, 0.0, -1.0}) {
     change([&](ModelValues& v) { v.noise_stddev[0][1] = noise; });
     expect("values: noise_stddev of observations 1 must be finite and positive, got");
   }
@@ -230,7 +230,7 @@ TEST(Requirements, HyperparametersAreOfThePriorAndInOrder) {
   of_another(Kind::parameter, 0, 99);
   change([](Hyperparameter& h) { std::swap(h.lower, h.upper); });
   expect("its bounds must be finite and positive, the lower one below the upper, got [");
-  change([](Hyperparameter& h) { h.value = nan; });
+  change([](Hyperparameter& h) { h.value = not_a_number; });
   expect_everywhere("its value must be finite and positive, got nan");
   change([](Hyperparameter& h) { h.hyperprior = {HyperPrior::Form::normal, 1, 0}; });
   expect("its hyper-prior has the median 1 and the deviation 0");
@@ -242,7 +242,7 @@ TEST(Requirements, AFitHasSomethingToLearnFromAndOptionsThatMeanSomething) {
   const Surface s;
   for (const bool empty : {true, false}) {
     std::vector<Observations> observations;
-    if (!empty) observations = {s.observations[0].with_values(MatrixXd::Constant(3, 7, nan))};
+    if (!empty) observations = {s.observations[0].with_values(MatrixXd::Constant(3, 7, not_a_number))};
     Doors doors = doors_of_learning(s, observations);
     for (const char* other : {"Likelihood", "Posterior", "update", "laplace_uncertainty"}) doors.erase(other);
     if (empty) doors.erase("fit_robust");  // its hyperparameters are those of observations
@@ -261,7 +261,8 @@ TEST(Requirements, AFitHasSomethingToLearnFromAndOptionsThatMeanSomething) {
   EXPECT_EQ(refusal([](FitOptions& o) { o.max_iterations = -1; }), "fit: max_iterations must be at least 0, got -1");
   EXPECT_EQ(refusal([](FitOptions& o) { o.n_threads = -1; }), "fit: n_threads must be at least 0, got -1");
   EXPECT_EQ(refusal([](FitOptions& o) { o.max_side_by_side = -1; }), "fit: max_side_by_side must be at least 0, got -1");
-  EXPECT_EQ(refusal([](FitOptions& o) { o.gradient_tolerance = nan; }), "fit: gradient_tolerance must be at least 0, got nan");
+  EXPECT_EQ(refusal([](FitOptions& o) { o.gradient_tolerance = not_a_number; }),
+            "fit: gradient_tolerance must be at least 0, got nan");
   EXPECT_EQ(refusal([](FitOptions& o) { o.reduction_tolerance = -1; }), "fit: reduction_tolerance must be at least 0, got -1");
   EXPECT_EQ(refusal([](FitOptions& o) { o.max_escapes = -1; }), "fit: max_escapes must be at least 0, got -1");
   const auto robust = [&](const RobustOptions& options) {

@@ -15,24 +15,24 @@ using test::largest;
 using test::Problem;
 using test::Quantity;
 
-constexpr std::uint64_t seed = 60606;
+constexpr std::uint64_t sample_seed = 60606;
 
 TEST(PosteriorSampleTest, HasTheMeanAndCovarianceOfTheJoint) {
-  for (const Problem& p : test::problems(9, seed)) {
-    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, seed));
+  for (const Problem& p : test::problems(9, sample_seed)) {
+    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, sample_seed));
     const Posterior posterior(p.prior, p.observations, p.values);
     std::vector<ViewAt> quantities = test::both_accelerations(*p.prior.system, p.queries);
     quantities.push_back({View::all(Quantity::constraint_force, *p.prior.system), p.queries.leftCols(1)});
     quantities.back().view.latent = static_cast<int>(p.prior.latents.size()) - 1;
-    test::expect_moments(posterior.sample(quantities, 2000, seed), posterior.joint(quantities));
+    test::expect_moments(posterior.sample(quantities, 2000, sample_seed), posterior.joint(quantities));
   }
 }
 
 TEST(PosteriorSampleTest, ObeysGaussPrincipleSampleBySample) {
-  for (const Problem& p : test::problems(9, seed)) {
-    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, seed));
+  for (const Problem& p : test::problems(9, sample_seed)) {
+    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, sample_seed));
     const Posterior posterior(p.prior, p.observations, p.values);
-    test::expect_gauss_principle(posterior.sample(test::both_accelerations(*p.prior.system, p.queries), 50, seed),
+    test::expect_gauss_principle(posterior.sample(test::both_accelerations(*p.prior.system, p.queries), 50, sample_seed),
                                  require_mechanics(*p.prior.system, p.queries, p.values.parameters));
   }
 }
@@ -41,11 +41,11 @@ TEST(PosteriorSampleTest, ObeysTheConstraintAsTheMeanDoes) {
   const Model& surface = test::model("models/surface.toml");
   const System& system = *surface.system;
   const View ddq = View::all(Quantity::constrained_acceleration, system);
-  const Posterior posterior = test::surface_posterior(seed);
-  const MatrixXd states = test::draw(surface, 100, seed + 1).states;
+  const Posterior posterior = test::surface_posterior(sample_seed);
+  const MatrixXd states = test::draw(surface, 100, sample_seed + 1).states;
   const VectorXd parameters = posterior.values().parameters;
   const double of_mean = max_constraint_error(system, states, parameters, posterior.mean(ddq, states));
-  const MatrixXd samples = posterior.sample({{ddq, states}}, 1000, seed);
+  const MatrixXd samples = posterior.sample({{ddq, states}}, 1000, sample_seed);
   double of_samples = 0;
   for (const auto& sample : samples.colwise()) {
     of_samples = std::max(of_samples, max_constraint_error(system, states, parameters, sample.reshaped(3, 100)));
@@ -56,13 +56,13 @@ TEST(PosteriorSampleTest, ObeysTheConstraintAsTheMeanDoes) {
 }
 
 TEST(PosteriorSampleTest, EqualStatesInTwoQuantitiesAreOneDraw) {
-  for (const Problem& p : test::problems(9, seed)) {
-    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, seed));
+  for (const Problem& p : test::problems(9, sample_seed)) {
+    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, sample_seed));
     const View ddq = View::all(Quantity::constrained_acceleration, *p.prior.system);
     MatrixXd twice(p.queries.rows(), 2);
     twice << p.queries.col(1), p.queries.col(0);
     const Posterior posterior(p.prior, p.observations, p.values);
-    const MatrixXd samples = posterior.sample({{ddq, p.queries}, {ddq, twice}}, 5, seed);
+    const MatrixXd samples = posterior.sample({{ddq, p.queries}, {ddq, twice}}, 5, sample_seed);
     const Index d = ddq.size(), second = d * p.queries.cols();
     EXPECT_EQ(samples.middleRows(0, d), samples.middleRows(second + d, d));
     EXPECT_EQ(samples.middleRows(d, d), samples.middleRows(second, d));
@@ -70,17 +70,17 @@ TEST(PosteriorSampleTest, EqualStatesInTwoQuantitiesAreOneDraw) {
 }
 
 TEST(PosteriorSampleTest, SameSeedSameBitsAnotherSeedOthers) {
-  const Posterior posterior = test::surface_posterior(seed);
+  const Posterior posterior = test::surface_posterior(sample_seed);
   const Model& surface = test::model("models/surface.toml");
-  const ViewAt ddq{View::all(Quantity::constrained_acceleration, *surface.system), test::draw(surface, 4, seed).states};
+  const ViewAt ddq{View::all(Quantity::constrained_acceleration, *surface.system), test::draw(surface, 4, sample_seed).states};
   const MatrixXd samples = posterior.sample({ddq}, 3, 7);
   EXPECT_EQ(samples, posterior.sample({ddq}, 3, 7));
   EXPECT_NE(samples, posterior.sample({ddq}, 3, 8));
 }
 
 TEST(PosteriorSampleTest, WithoutDataIsThePrior) {
-  for (const Problem& p : test::problems(9, seed)) {
-    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, seed));
+  for (const Problem& p : test::problems(9, sample_seed)) {
+    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, sample_seed));
     const View ddq = View::all(Quantity::constrained_acceleration, *p.prior.system);
     const Posterior prior = Posterior(p.prior, p.observations, p.values).without_data();
     EXPECT_TRUE(prior.observations().empty());
@@ -94,13 +94,13 @@ TEST(PosteriorSampleTest, WithoutDataIsThePrior) {
     EXPECT_LE(largest(joint.mean - mean), rounding);
     EXPECT_LE(largest(joint.covariance - covariance), rounding);
     EXPECT_EQ(prior.mean(ddq, p.queries).reshaped(), joint.mean);
-    test::expect_moments(prior.sample({{ddq, p.queries}}, 1000, seed), joint);
+    test::expect_moments(prior.sample({{ddq, p.queries}}, 1000, sample_seed), joint);
   }
 }
 
 TEST(PosteriorJointTest, CovarianceOfTheAccelerationIsThatOfTheUnconstrainedOneProjected) {
-  for (const Problem& p : test::problems(9, seed)) {
-    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, seed));
+  for (const Problem& p : test::problems(9, sample_seed)) {
+    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, sample_seed));
     const System& system = *p.prior.system;
     const Index nq = system.nq(), n = p.queries.cols();
     const MechanicsBatch mechanics = require_mechanics(system, p.queries, p.values.parameters);
@@ -126,9 +126,9 @@ TEST(PosteriorJointTest, CovarianceOfTheAccelerationIsThatOfTheUnconstrainedOneP
 }
 
 TEST(PosteriorJointTest, IsSymmetricAndHoldsTheJointsOfItsParts) {
-  const Posterior posterior = test::surface_posterior(seed);
+  const Posterior posterior = test::surface_posterior(sample_seed);
   const Model& surface = test::model("models/surface.toml");
-  const MatrixXd states = test::draw(surface, 5, seed).states;
+  const MatrixXd states = test::draw(surface, 5, sample_seed).states;
   const ViewAt force{View{Quantity::constraint_force, {2, 0}}, states.leftCols(3)};
   const ViewAt lambda{View::all(Quantity::multipliers, *surface.system), states.rightCols(2)};
   const Posterior::Joint joint = posterior.joint({force, lambda});
@@ -147,7 +147,7 @@ TEST(PosteriorJointTest, KnowingThatNothingAcceleratesAtRestNeverRaisesAVariance
     const Model& model = test::model(file);
     const System& system = *model.system;
     const StateLayout layout = system.layout();
-    const GeneratedData data = generate(model, {40, seed, VectorXd::Constant(system.nq(), 0.1)});
+    const GeneratedData data = generate(model, {40, sample_seed, VectorXd::Constant(system.nq(), 0.1)});
     const View ddq = View::all(Quantity::constrained_acceleration, system);
     const View a_bar = View::all(Quantity::unconstrained_acceleration, system);
     const MatrixXd states = data.states.rightCols(20);
@@ -157,7 +157,7 @@ TEST(PosteriorJointTest, KnowingThatNothingAcceleratesAtRestNeverRaisesAVariance
     const Prior prior = make_prior(model);
     std::vector<Observations> observations{
         {data.states.leftCols(20), ddq, data.accelerations.leftCols(20), VectorXd::Constant(system.nq(), 0.1), false}};
-    RandomStream random(seed);
+    RandomStream random(sample_seed);
     ModelValues values = test::random_values(prior, observations, random);
     const Posterior before(prior, observations, values);
     observations.push_back({rest, a_bar, MatrixXd::Zero(system.nq(), rest.cols()), VectorXd::Constant(system.nq(), 1e-3), false});

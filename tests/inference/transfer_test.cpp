@@ -17,7 +17,7 @@ using test::Problem;
 using test::under;
 using Quantity = View::Quantity;
 
-constexpr std::uint64_t seed = 40403;
+constexpr std::uint64_t transfer_seed = 40403;
 
 /// Problems with an observation of another system, and that system.
 struct Elsewhere {
@@ -27,7 +27,7 @@ struct Elsewhere {
 
 std::vector<Elsewhere> problems_elsewhere() {
   std::vector<Elsewhere> all;
-  for (Problem& p : test::problems(12, seed)) {
+  for (Problem& p : test::problems(12, transfer_seed)) {
     for (const Observations& group : p.observations) {
       if (!group.view().other_system) continue;
       all.push_back({p, group.view().other_system});
@@ -42,7 +42,7 @@ double size_of(const MatrixXd& matrix) { return 1 + matrix.cwiseAbs().maxCoeff()
 TEST(TransferTest, PredictsTheAccelerationOfTheOtherConstraint) {
   int n = 0;
   for (const auto& [p, other_system] : problems_elsewhere()) {
-    SCOPED_TRACE(fmt::format("{}, mean {}, seed {}", p.name, static_cast<int>(p.prior.mean), seed));
+    SCOPED_TRACE(fmt::format("{}, mean {}, seed {}", p.name, static_cast<int>(p.prior.mean), transfer_seed));
     ++n;
     const Posterior posterior(p.prior, p.observations, p.values);
     const System& there = *other_system->prior.system;
@@ -73,7 +73,7 @@ TEST(TransferTest, PredictsTheAccelerationOfTheOtherConstraint) {
 
 TEST(TransferTest, AgreesWithTheTextbookProcess) {
   for (const auto& [p, other_system] : problems_elsewhere()) {
-    SCOPED_TRACE(fmt::format("{}, mean {}, seed {}", p.name, static_cast<int>(p.prior.mean), seed));
+    SCOPED_TRACE(fmt::format("{}, mean {}, seed {}", p.name, static_cast<int>(p.prior.mean), transfer_seed));
     const Posterior posterior(p.prior, p.observations, p.values);
     for (const Quantity quantity : {Quantity::constrained_acceleration, Quantity::unconstrained_acceleration,
                                     Quantity::constraint_force, Quantity::multipliers}) {
@@ -91,7 +91,7 @@ TEST(TransferTest, ToTheSameSystemIsThePlainPredictionBitByBit) {
   for (const std::string& file : test::library_models()) {
     SCOPED_TRACE(file);
     const Model& model = test::model(file);
-    for (const Problem& p : test::problems(9, seed)) {
+    for (const Problem& p : test::problems(9, transfer_seed)) {
       if (p.name != test::stem(file) + ", force as mean") continue;
       const Posterior posterior(p.prior, p.observations, p.values);
       PriorOptions options;
@@ -112,7 +112,7 @@ TEST(TransferTest, AFittedParameterGoesAlongWhereItIsShared) {
   const Model& home = test::model("models/surface.toml");
   const auto other_system = make_other_system(home, test::another_surface());
   Problem p = [] {
-    for (Problem& problem : test::problems(9, seed)) {
+    for (Problem& problem : test::problems(9, transfer_seed)) {
       if (problem.name == "surface, every row") return problem;
     }
     throw std::logic_error("no such problem");
@@ -130,7 +130,7 @@ TEST(TransferTest, AFittedParameterGoesAlongWhereItIsShared) {
 TEST(EvaluationTest, MeasuresTheConstraintOfTheOtherSystem) {
   const Model& home = test::model("models/surface.toml");
   const auto other_system = make_other_system(home, test::another_surface());
-  for (const Problem& p : test::problems(9, seed)) {
+  for (const Problem& p : test::problems(9, transfer_seed)) {
     if (p.name != "surface, every row") continue;
     const Posterior posterior(p.prior, p.observations, p.values);
     const MatrixXd targets = MatrixXd::Random(3, p.queries.cols());
@@ -142,7 +142,7 @@ TEST(EvaluationTest, MeasuresTheConstraintOfTheOtherSystem) {
 }
 
 TEST(EvaluationTest, NormalisesByTheSpreadOfAllLogs) {
-  for (const Problem& p : test::problems(12, seed)) {
+  for (const Problem& p : test::problems(12, transfer_seed)) {
     if (p.name != "surface, pooled with another surface") continue;
     const Posterior posterior(p.prior, p.observations, p.values);
     MatrixXd all(3, p.observations[0].n_data() + p.observations[1].n_data());
@@ -195,7 +195,7 @@ TEST(SeveralLatents, AreToldApartWhereTheirDirectionsAndFeaturesDiffer) {
   options.mean = Prior::Mean::force;
   const Prior prior = make_prior(model, options);
   const VectorXd noise = VectorXd::Constant(2, 0.02);
-  const GeneratedData data = generate(model, {80, seed, noise});
+  const GeneratedData data = generate(model, {80, transfer_seed, noise});
   const std::vector<Observations> observations = {
       {data.states, View::all(Quantity::constrained_acceleration, *model.system), data.accelerations, noise, false}};
   FitOptions fit_options;
@@ -203,7 +203,7 @@ TEST(SeveralLatents, AreToldApartWhereTheirDirectionsAndFeaturesDiffer) {
   const Posterior posterior =
       fit(prior, observations, default_hyperparameters(prior, observations, {}, {}), fit_options).posterior;
 
-  const MatrixXd states = test::draw(model, 200, seed + 1).states;
+  const MatrixXd states = test::draw(model, 200, transfer_seed + 1).states;
   const StateLayout layout = model.system->layout();
   MatrixXd friction(2, states.cols()), drive = MatrixXd::Zero(2, states.cols());
   for (Index i = 0; i < states.cols(); ++i) {

@@ -19,7 +19,7 @@ using test::largest;
 using test::Problem;
 using test::Quantity;
 
-constexpr std::uint64_t seed = 40405;
+constexpr std::uint64_t update_seed = 40405;
 
 // columns of one of a problem's Observations, with the noise that its values give
 Observations part_of(const Problem& p, std::size_t group, const std::vector<Index>& columns) {
@@ -60,9 +60,9 @@ Posterior built_anew(const Problem& p, const Ages& ages) {
 
 TEST(UpdateTest, AnyOrderOfAddingAndRemovingGivesThePosteriorBuiltAnew) {
   std::uint64_t stream = 0;
-  for (const Problem& p : test::problems(12, seed)) {
-    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, seed));
-    RandomStream random(seed, ++stream);
+  for (const Problem& p : test::problems(12, update_seed)) {
+    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, update_seed));
+    RandomStream random(update_seed, ++stream);
     const auto below = [&](Index n) { return static_cast<Index>(random.uniform() * static_cast<double>(n)); };
     Ages ages;
     Posterior posterior = without_data(p);
@@ -87,9 +87,9 @@ TEST(UpdateTest, AnyOrderOfAddingAndRemovingGivesThePosteriorBuiltAnew) {
 }
 
 TEST(UpdateTest, RemovesInTheOrderOfAdding) {
-  for (const Problem& p : test::problems(9, seed)) {
+  for (const Problem& p : test::problems(9, update_seed)) {
     if (p.observations.size() < 2) continue;
-    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, seed));
+    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, update_seed));
     // the constructor's observations group after group, whatever their rank; then those of the first group again
     Ages ages;
     for (std::size_t group = 0; group < p.observations.size(); ++group) {
@@ -110,7 +110,7 @@ TEST(UpdateTest, RemovesInTheOrderOfAdding) {
 }
 
 TEST(UpdateTest, AWindowThatMovesForLongDoesNotDrift) {
-  const Problem p = test::problems(30, seed).front();
+  const Problem p = test::problems(30, update_seed).front();
   ASSERT_EQ(p.observations.size(), 1U);
   Posterior posterior = without_data(p);
   Ages ages;
@@ -126,7 +126,7 @@ TEST(UpdateTest, AWindowThatMovesForLongDoesNotDrift) {
 }
 
 TEST(UpdateTest, AWindowWhoseNoiseVariesHoldsNoGroupsWithoutStates) {
-  const Problem p = test::problems(30, seed).front();
+  const Problem p = test::problems(30, update_seed).front();
   Posterior posterior(p.prior, p.observations, p.values);
   const int n_given = p.observations[0].n_data();
   std::vector<Observations> added;
@@ -151,7 +151,7 @@ TEST(UpdateTest, AWindowWhoseNoiseVariesHoldsNoGroupsWithoutStates) {
 }
 
 TEST(UpdateTest, AGrownPosteriorIsDescribedByItsObservationsAndValues) {
-  const Problem p = test::problems(9, seed).front();
+  const Problem p = test::problems(9, update_seed).front();
   Posterior posterior(p.prior, p.observations, p.values);
   const Index n = p.observations[0].n_data();
   // the same view and noise: the same group
@@ -184,8 +184,8 @@ TEST(UpdateTest, AGrownPosteriorIsDescribedByItsObservationsAndValues) {
 }
 
 TEST(UpdateTest, WithoutItsDataIsThePriorAndLearnsAgain) {
-  for (const Problem& p : test::problems(9, seed)) {
-    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, seed));
+  for (const Problem& p : test::problems(9, update_seed)) {
+    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, update_seed));
     Posterior posterior(p.prior, p.observations, p.values);
     int n = 0;
     for (const Observations& group : p.observations) n += group.n_data();
@@ -206,7 +206,7 @@ TEST(UpdateTest, WithoutItsDataIsThePriorAndLearnsAgain) {
 }
 
 TEST(UpdateTest, ManyAtOnceAreAsGoodAsOneAfterAnother) {
-  const Problem p = test::problems(60, seed).front();
+  const Problem p = test::problems(60, update_seed).front();
   Posterior at_once = update(without_data(p), p.observations[0]);
   Posterior halves = update(Posterior(p.prior, {part_of(p, 0, {0, 1, 2})}, p.values),
                             {p.observations[0].states().rightCols(57), p.observations[0].view(),
@@ -217,7 +217,7 @@ TEST(UpdateTest, ManyAtOnceAreAsGoodAsOneAfterAnother) {
 }
 
 TEST(UpdateTest, NothingAddedOrRemovedChangesNothing) {
-  const Problem p = test::problems(9, seed).front();
+  const Problem p = test::problems(9, update_seed).front();
   const Posterior before(p.prior, p.observations, p.values);
   Posterior posterior = before;
   posterior = update(std::move(posterior), part_of(p, 0, {}));
@@ -227,7 +227,7 @@ TEST(UpdateTest, NothingAddedOrRemovedChangesNothing) {
 }
 
 TEST(UpdateTest, HappensInPlaceUnlessAnotherHoldsThePosterior) {
-  const Problem p = test::problems(9, seed).front();
+  const Problem p = test::problems(9, update_seed).front();
   Posterior posterior(p.prior, p.observations, p.values);
   const Prior* where = &posterior.prior();
   posterior = update(std::move(posterior), part_of(p, 0, {0}));
@@ -243,7 +243,7 @@ TEST(UpdateTest, HappensInPlaceUnlessAnotherHoldsThePosterior) {
   EXPECT_EQ(held.mean(view, p.queries), mean);
   EXPECT_NE(posterior.mean(view, p.queries), mean);
 
-  const PathwiseSamples paths = sample_paths(posterior, 1, {100, seed});
+  const PathwiseSamples paths = sample_paths(posterior, 1, {100, update_seed});
   const MatrixXd path = paths.evaluate(0, view, p.queries);
   posterior = remove_oldest(std::move(posterior), 3);
   EXPECT_EQ(paths.evaluate(0, view, p.queries), path);
@@ -251,15 +251,16 @@ TEST(UpdateTest, HappensInPlaceUnlessAnotherHoldsThePosterior) {
 
 TEST(UpdateTest, SamplesOfAGrownPosteriorHaveItsMoments) {
   const Model& surface = test::model("models/surface.toml");
-  const GeneratedData data = generate(surface, {40, seed, VectorXd::Constant(3, 0.1)});
+  const GeneratedData data = generate(surface, {40, update_seed, VectorXd::Constant(3, 0.1)});
   const View ddq = View::all(Quantity::constrained_acceleration, *surface.system);
-  Posterior posterior = test::surface_posterior(seed);
+  Posterior posterior = test::surface_posterior(update_seed);
   posterior = update(std::move(posterior), {data.states, ddq, data.accelerations, VectorXd::Constant(3, 0.2), false});
   posterior = remove_oldest(std::move(posterior), 11);
-  const std::vector<ViewAt> quantities = test::both_accelerations(*surface.system, test::draw(surface, 2, seed + 1).states);
+  const std::vector<ViewAt> quantities =
+      test::both_accelerations(*surface.system, test::draw(surface, 2, update_seed + 1).states);
   const Posterior::Joint joint = posterior.joint(quantities);
-  test::expect_moments(posterior.sample(quantities, 4000, seed), joint);
-  const PathwiseSamples paths = sample_paths(posterior, 1000, {200, seed});
+  test::expect_moments(posterior.sample(quantities, 4000, update_seed), joint);
+  const PathwiseSamples paths = sample_paths(posterior, 1000, {200, update_seed});
   MatrixXd values(joint.mean.size(), paths.n_samples());
   for (int s = 0; s < paths.n_samples(); ++s) {
     Index row = 0;
@@ -274,7 +275,7 @@ TEST(UpdateTest, SamplesOfAGrownPosteriorHaveItsMoments) {
 
 // the call fails with a text that holds `text`, and leaves the posterior usable
 template <typename Error, typename Call>
-void expect_refusal(Posterior& posterior, const std::string& text, const Call& call) {
+void expect_update_refused(Posterior& posterior, const std::string& text, const Call& call) {
   const double before = posterior.negative_log_likelihood();
   const int size = posterior.reduced_size();
   try {
@@ -288,16 +289,16 @@ void expect_refusal(Posterior& posterior, const std::string& text, const Call& c
 }
 
 TEST(UpdateTest, RefusesWhatDoesNotFitAndKeepsThePosterior) {
-  const Problem p = test::problems(9, seed).front();
+  const Problem p = test::problems(9, update_seed).front();
   Posterior posterior(p.prior, p.observations, p.values);
   const Observations added = part_of(p, 0, {0, 1});
-  expect_refusal<InputError>(posterior, "states: a column is a state of", [&](Posterior& it) {
+  expect_update_refused<InputError>(posterior, "states: a column is a state of", [&](Posterior& it) {
     it = update(std::move(it), test::with_states(added, added.states().topRows(3)));
   });
   for (int n : {-1, 10}) {
-    expect_refusal<InputError>(posterior,
-                               fmt::format("remove_oldest: there are 9 observed states, so n must be 0 … 9, got {}", n),
-                               [&](Posterior& it) { it = remove_oldest(std::move(it), n); });
+    expect_update_refused<InputError>(posterior,
+                                      fmt::format("remove_oldest: there are 9 observed states, so n must be 0 … 9, got {}", n),
+                                      [&](Posterior& it) { it = remove_oldest(std::move(it), n); });
   }
   expect_equal(posterior, Posterior(p.prior, p.observations, p.values), p);
 }
@@ -324,16 +325,16 @@ directions = "acceleration"
   MatrixXd singular = added.states();
   singular(0, 0) = 2;
   added = test::with_states(added, singular);
-  expect_refusal<InputError>(posterior, "mass matrix", [&](Posterior& it) { it = update(std::move(it), added); });
+  expect_update_refused<InputError>(posterior, "mass matrix", [&](Posterior& it) { it = update(std::move(it), added); });
 }
 
 TEST(UpdateTest, RefusesNoiseTooSmallForDoublePrecisionAndKeepsThePosterior) {
-  const Problem p = test::problems(9, seed).front();
+  const Problem p = test::problems(9, update_seed).front();
   Posterior posterior(p.prior, p.observations, p.values);
   // the same state over and over, known to 1e-12 of its size
   const Observations added = test::with_stddev(part_of(p, 0, {0, 0, 0, 0, 0, 0, 0, 0}), 1e-12 * p.values.noise_stddev[0]);
-  expect_refusal<NumericalError>(posterior, "cannot be factored in double precision",
-                                 [&](Posterior& it) { it = update(std::move(it), added); });
+  expect_update_refused<NumericalError>(posterior, "cannot be factored in double precision",
+                                        [&](Posterior& it) { it = update(std::move(it), added); });
   posterior = update(std::move(posterior), part_of(p, 0, {0}));
   expect_equal(posterior, Posterior(p.prior, posterior.observations(), posterior.values()), p);
 }
@@ -341,7 +342,7 @@ TEST(UpdateTest, RefusesNoiseTooSmallForDoublePrecisionAndKeepsThePosterior) {
 TEST(KernelColumnsTest, PointsComeAndGo) {
   const std::vector<std::string> names = {"x", "y"};
   const Kernel kernel = Kernel::parse("se*periodic + matern32 + linear", names);
-  RandomStream random(seed);
+  RandomStream random(update_seed);
   const MatrixXd features = test::random_vector(80, random).reshaped(40, 2);
   const VectorXd values = VectorXd::Constant(static_cast<Index>(kernel.parameters().size()), 1.3);
   KernelColumns columns(kernel, features.topRows(5), values);

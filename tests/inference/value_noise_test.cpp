@@ -17,98 +17,77 @@ using test::largest;
 using test::Problem;
 using test::Quantity;
 
-constexpr std::uint64_t seed = 40411;
+constexpr std::uint64_t value_noise_seed = 40411;
 
-std::vector<Problem> problems() {
+std::vector<Problem> value_noise_problems() {
   std::vector<Problem> all;
-  for (const Problem& p : test::problems(9, seed)) all.push_back(test::with_noise_scale(p, seed + all.size()));
+  for (const Problem& p : test::problems(9, value_noise_seed))
+    all.push_back(test::with_noise_scale(p, value_noise_seed + all.size()));
   return all;
 }
 
-struct Evaluated {
-  double value = 0;
-  ModelGradient gradient;
-};
-
-// under every derivative there is
-Evaluated evaluate(const Problem& p) {
-  Likelihood::Options options;
-  options.noise_gradient = true;
-  for (int k = 0; k < static_cast<int>(p.values.parameters.size()); ++k) options.gradient_parameters.push_back(k);
-  Likelihood::Workspace workspace;
-  Evaluated out;
-  out.value = Likelihood(p.prior, p.observations, p.values, options).evaluate(p.values, &out.gradient, workspace);
-  return out;
-}
-
-View every_acceleration(const Problem& p) { return View::all(Quantity::unconstrained_acceleration, *p.prior.system); }
-
-Posterior posterior_of(const Problem& p) { return {p.prior, p.observations, p.values}; }
-
-// ε times the condition number of K̃ + I, after mechanics with κ(M) of some hundreds
-double rounding(const Problem& p) { return 1e4 * test::eps * test::condition(p); }
-
 TEST(ValueNoiseTest, TheLikelihoodIsTheDenseMultivariateNormalDensity) {
-  for (const Problem& p : problems()) {
-    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, seed));
+  for (const Problem& p : value_noise_problems()) {
+    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, value_noise_seed));
     const double dense = test::dense_negative_log_likelihood(p);
-    EXPECT_NEAR(evaluate(p).value, dense, rounding(p) * (1 + std::abs(dense)));
-    EXPECT_NEAR(posterior_of(p).negative_log_likelihood(), dense, rounding(p) * (1 + std::abs(dense)));
-    EXPECT_LT(rounding(p), 1e-6) << "too badly conditioned to test anything";
+    EXPECT_NEAR(test::evaluate(p).value, dense, test::rounding(p) * (1 + std::abs(dense)));
+    EXPECT_NEAR(test::posterior_of(p).negative_log_likelihood(), dense, test::rounding(p) * (1 + std::abs(dense)));
+    EXPECT_LT(test::rounding(p), 1e-6) << "too badly conditioned to test anything";
   }
 }
 
 TEST(ValueNoiseTest, ThePosteriorIsTheTextbookGaussianProcess) {
-  for (const Problem& p : problems()) {
-    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, seed));
-    const auto [mean, covariance] = test::dense_posterior(p, every_acceleration(p), p.queries);
-    const Posterior::Joint joint = posterior_of(p).joint(every_acceleration(p), p.queries);
-    EXPECT_LE(largest(joint.mean - mean), rounding(p) * (1 + largest(mean)));
-    EXPECT_LE(largest(joint.covariance - covariance), rounding(p) * (1 + largest(covariance)));
+  for (const Problem& p : value_noise_problems()) {
+    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, value_noise_seed));
+    const auto [mean, covariance] = test::dense_posterior(p, test::every_acceleration(p), p.queries);
+    const Posterior::Joint joint = test::posterior_of(p).joint(test::every_acceleration(p), p.queries);
+    EXPECT_LE(largest(joint.mean - mean), test::rounding(p) * (1 + largest(mean)));
+    EXPECT_LE(largest(joint.covariance - covariance), test::rounding(p) * (1 + largest(covariance)));
   }
 }
 
 TEST(ValueNoiseTest, AScaleOfOneChangesNoBit) {
-  for (const Problem& p : test::problems(9, seed)) {
-    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, seed));
+  for (const Problem& p : test::problems(9, value_noise_seed)) {
+    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, value_noise_seed));
     Problem scaled = p;
     for (Observations& group : scaled.observations) {
       group = test::with_scale(group, MatrixXd::Ones(group.values().rows(), group.values().cols()));
     }
-    const Evaluated expected = evaluate(p), got = evaluate(scaled);
+    const test::Evaluated expected = test::evaluate(p), got = test::evaluate(scaled);
     EXPECT_EQ(got.value, expected.value);
     EXPECT_EQ(got.gradient.log_kernel, expected.gradient.log_kernel);
     EXPECT_EQ(got.gradient.log_noise_stddev, expected.gradient.log_noise_stddev);
     EXPECT_EQ(got.gradient.parameters, expected.gradient.parameters);
-    const Posterior plain = posterior_of(p), of_scaled = posterior_of(scaled);
+    const Posterior plain = test::posterior_of(p), of_scaled = test::posterior_of(scaled);
     EXPECT_EQ(of_scaled.negative_log_likelihood(), plain.negative_log_likelihood());
-    EXPECT_EQ(of_scaled.mean(every_acceleration(p), p.queries), plain.mean(every_acceleration(p), p.queries));
+    EXPECT_EQ(of_scaled.mean(test::every_acceleration(p), p.queries), plain.mean(test::every_acceleration(p), p.queries));
   }
 }
 
 TEST(ValueNoiseTest, OnlyTheProductOfFactorAndScaleCounts) {
-  for (const Problem& p : problems()) {
-    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, seed));
+  for (const Problem& p : value_noise_problems()) {
+    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, value_noise_seed));
     Problem other = p;
     for (std::size_t g = 0; g < p.observations.size(); ++g) {
       other.observations[g] = test::with_scale(p.observations[g], 3 * p.observations[g].noise().scale());
       other.values.noise_stddev[g] /= 3;
     }
-    const Evaluated expected = evaluate(p), got = evaluate(other);
-    EXPECT_NEAR(got.value, expected.value, rounding(p) * (1 + std::abs(expected.value)));
+    const test::Evaluated expected = test::evaluate(p), got = test::evaluate(other);
+    EXPECT_NEAR(got.value, expected.value, test::rounding(p) * (1 + std::abs(expected.value)));
     for (std::size_t g = 0; g < p.observations.size(); ++g) {
       EXPECT_LE(largest(got.gradient.log_noise_stddev[g] - expected.gradient.log_noise_stddev[g]),
-                rounding(p) * (1 + largest(expected.gradient.log_noise_stddev[g])));
+                test::rounding(p) * (1 + largest(expected.gradient.log_noise_stddev[g])));
       EXPECT_FALSE(expected.gradient.log_noise_stddev[g].isZero(1e-3));
     }
-    const MatrixXd mean = posterior_of(p).mean(every_acceleration(p), p.queries);
-    EXPECT_LE(largest(posterior_of(other).mean(every_acceleration(p), p.queries) - mean), rounding(p) * (1 + largest(mean)));
+    const MatrixXd mean = test::posterior_of(p).mean(test::every_acceleration(p), p.queries);
+    EXPECT_LE(largest(test::posterior_of(other).mean(test::every_acceleration(p), p.queries) - mean),
+              test::rounding(p) * (1 + largest(mean)));
   }
 }
 
 TEST(ValueNoiseTest, AValueOfVastNoiseSaysNothing) {
-  for (Problem p : problems()) {
-    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, seed));
+  for (Problem p : value_noise_problems()) {
+    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, value_noise_seed));
     Problem without = p;
     for (Problem* each : {&p, &without}) {
       each->observations.erase(each->observations.begin() + 1, each->observations.end());
@@ -119,15 +98,15 @@ TEST(ValueNoiseTest, AValueOfVastNoiseSaysNothing) {
     vast.col(0).setConstant(1e7);
     p.observations[0] = test::with_scale(p.observations[0], vast);
     without.observations[0].remove_first(1);
-    const MatrixXd expected = posterior_of(without).mean(every_acceleration(p), p.queries);
-    const MatrixXd got = posterior_of(p).mean(every_acceleration(p), p.queries);
-    EXPECT_LE(largest(got - expected), (1e-11 + rounding(without)) * (1 + largest(expected)));
+    const MatrixXd expected = test::posterior_of(without).mean(test::every_acceleration(p), p.queries);
+    const MatrixXd got = test::posterior_of(p).mean(test::every_acceleration(p), p.queries);
+    EXPECT_LE(largest(got - expected), (1e-11 + test::rounding(without)) * (1 + largest(expected)));
   }
 }
 
 TEST(ValueNoiseTest, APosteriorThatGrowsAndShrinksIsTheOneBuiltAnew) {
-  for (const Problem& p : problems()) {
-    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, seed));
+  for (const Problem& p : value_noise_problems()) {
+    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, value_noise_seed));
     const auto columns = [&](std::size_t g, const auto& some) {
       const Observations& all = p.observations[g];
       return Observations{MatrixXd(all.states()(Eigen::all, some)),
@@ -137,18 +116,18 @@ TEST(ValueNoiseTest, APosteriorThatGrowsAndShrinksIsTheOneBuiltAnew) {
                           false,
                           MatrixXd(all.noise().scale()(Eigen::all, some))};
     };
-    Posterior posterior = posterior_of(p).without_data();
+    Posterior posterior = test::posterior_of(p).without_data();
     for (std::size_t g = 0; g < p.observations.size(); ++g) {
       posterior = update(std::move(posterior), columns(g, Eigen::seq(0, 1)));
       posterior = update(std::move(posterior), columns(g, Eigen::seq(2, Eigen::last)));
     }
     ASSERT_EQ(posterior.observations().size(), p.observations.size()) << "one noise and view is one group";
     const auto expect_equal = [&](const Problem& anew) {
-      const Posterior expected = posterior_of(anew);
+      const Posterior expected = test::posterior_of(anew);
       EXPECT_NEAR(posterior.negative_log_likelihood(), expected.negative_log_likelihood(),
-                  rounding(p) * (1 + std::abs(expected.negative_log_likelihood())));
-      const MatrixXd mean = expected.mean(every_acceleration(p), p.queries);
-      EXPECT_LE(largest(posterior.mean(every_acceleration(p), p.queries) - mean), rounding(p) * (1 + largest(mean)));
+                  test::rounding(p) * (1 + std::abs(expected.negative_log_likelihood())));
+      const MatrixXd mean = expected.mean(test::every_acceleration(p), p.queries);
+      EXPECT_LE(largest(posterior.mean(test::every_acceleration(p), p.queries) - mean), test::rounding(p) * (1 + largest(mean)));
       EXPECT_EQ(posterior.observations()[0].noise().scale(), anew.observations[0].noise().scale());
     };
     expect_equal(p);
@@ -160,9 +139,9 @@ TEST(ValueNoiseTest, APosteriorThatGrowsAndShrinksIsTheOneBuiltAnew) {
 }
 
 TEST(ValueNoiseTest, ValuesOfOneNoiseAndOfTheirOwnAreGroupsApart) {
-  const Problem p = problems().front();
+  const Problem p = value_noise_problems().front();
   const Observations plain = p.observations[0].with_noise(Noise(p.values.noise_stddev[0]));
-  Posterior posterior = update(posterior_of(p), plain);
+  Posterior posterior = update(test::posterior_of(p), plain);
   ASSERT_EQ(posterior.observations().size(), 2U);
   EXPECT_FALSE(posterior.observations()[1].noise().has_scale());
   posterior = remove_oldest(std::move(posterior), plain.n_data());
@@ -181,11 +160,11 @@ TEST(ValueNoiseTest, TheUsualNoiseIsTheMedian) {
 }
 
 TEST(ValueNoiseTest, AnEvaluationMeasuresByTheUsualNoise) {
-  for (const Problem& p : problems()) {
+  for (const Problem& p : value_noise_problems()) {
     const View every = View::all(Quantity::constrained_acceleration, *p.prior.system);
     if (!(p.observations[0].view() == every)) continue;
     const MatrixXd targets = MatrixXd::Zero(every.size(), p.queries.cols());
-    const Posterior posterior = posterior_of(p);
+    const Posterior posterior = test::posterior_of(p);
     const Posterior::Marginal prediction = posterior.marginal(every, p.queries);
     const VectorXd noise = p.observations[0].usual_noise(p.values.noise_stddev[0]);
     const Eigen::ArrayXXd variance = prediction.stddev().array().square().colwise() + noise.array().square();
@@ -198,7 +177,7 @@ TEST(ValueNoiseTest, AnEvaluationMeasuresByTheUsualNoise) {
 }
 
 TEST(ValueNoiseTest, AScaleOfTheWrongShapeOrSignIsRefused) {
-  const Problem p = problems().front();
+  const Problem p = value_noise_problems().front();
   const auto refused = [&](const auto& change) {
     MatrixXd scale = p.observations[0].noise().scale();
     change(scale);

@@ -180,7 +180,7 @@ const std::vector<Fault>& faults() {
   return all;
 }
 
-LogData log_of(const std::string& file, bool in_time, std::uint64_t seed) {
+LogData generated_log_of(const std::string& file, bool in_time, std::uint64_t seed) {
   return in_time ? test::moving_log(file, 60, 0.02, seed) : test::drawn_log(file, 40, seed);
 }
 
@@ -191,13 +191,13 @@ TEST(FaultSweep, FaultsAreNamedAndSoundLogsAreNot) {
   for (const std::string& file : test::library_models()) {
     for (int seed = 1; seed <= n_seeds; ++seed) {
       for (const bool in_time : {false, true}) {
-        const std::vector<std::string> alarms = alarms_of(log_of(file, in_time, static_cast<std::uint64_t>(seed)));
+        const std::vector<std::string> alarms = alarms_of(generated_log_of(file, in_time, static_cast<std::uint64_t>(seed)));
         ++n_sound;
         if (!alarms.empty()) ++n_false;
         for (const std::string& alarm : alarms) std::cout << file << ", seed " << seed << ", sound: " << alarm << '\n';
       }
       for (const Fault& fault : faults()) {
-        LogData data = log_of(file, fault.in_time, static_cast<std::uint64_t>(seed));
+        LogData data = generated_log_of(file, fault.in_time, static_cast<std::uint64_t>(seed));
         if (!fault.put(data, seed)) continue;
         const bool is_named = !alarms_of(data).empty();
         auto& [named, n] = by_fault[fault.name];

@@ -19,7 +19,7 @@ using testing::HasSubstr;
 constexpr double gigabyte = 1e9;
 
 /// A fit of the surface, of which each state measures two of three accelerations independently; states are repeated.
-FitProblem problem_of(int n_states) {
+FitProblem problem_of_size(int n_states) {
   const Model& model = test::model("models/surface.toml");
   const Eigen::VectorXd noise_stddev = Eigen::VectorXd::Constant(3, 0.1);
   const GeneratedData data = generate(model, {50, 3, noise_stddev});
@@ -41,19 +41,19 @@ FitOptions on_threads(int n) {
 }
 
 TEST(FitMemory, GrowsWithTheSquareOfTheReducedSizeAndWithTheRunsSideBySide) {
-  const FitMemory one = fit_memory(problem_of(10000), on_threads(1));
+  const FitMemory one = fit_memory(problem_of_size(10000), on_threads(1));
   EXPECT_EQ(one.reduced_size, 20000);
   EXPECT_EQ(one.side_by_side, 1);
   // the triangle that is factored, or the square where the system has huge pages always
   EXPECT_GT(one.evaluation, 0.5 * 8 * 20000. * 20000);
   EXPECT_LT(one.evaluation, 1.25 * 8 * 20000. * 20000);
-  const FitMemory four = fit_memory(problem_of(10000), on_threads(4));
+  const FitMemory four = fit_memory(problem_of_size(10000), on_threads(4));
   EXPECT_EQ(four.side_by_side, 4);
   EXPECT_NEAR(four.bytes() - one.bytes(), 3 * one.evaluation, 1);
-  EXPECT_NEAR(fit_memory(problem_of(20000), on_threads(1)).bytes() / one.bytes(), 4, 0.2);
+  EXPECT_NEAR(fit_memory(problem_of_size(20000), on_threads(1)).bytes() / one.bytes(), 4, 0.2);
   FitOptions once = on_threads(4);
   once.max_iterations = 0;
-  EXPECT_EQ(fit_memory(problem_of(100), once).side_by_side, 1) << "nothing is optimised";
+  EXPECT_EQ(fit_memory(problem_of_size(100), once).side_by_side, 1) << "nothing is optimised";
 }
 
 TEST(FitMemory, OfABaselineIsThatOfOneOutputAtATime) {
@@ -68,7 +68,7 @@ TEST(FitMemory, OfABaselineIsThatOfOneOutputAtATime) {
 }
 
 TEST(WithinMemory, ThatIsEnoughOrUnknownNothingChanges) {
-  const FitProblem problem = problem_of(10000);
+  const FitProblem problem = problem_of_size(10000);
   std::vector<std::string> notes;
   EXPECT_EQ(within_memory(problem, on_threads(4), std::nullopt, notes).max_side_by_side, 0);
   EXPECT_EQ(within_memory(problem, on_threads(4), 1000 * gigabyte, notes).max_side_by_side, 0);
@@ -77,12 +77,12 @@ TEST(WithinMemory, ThatIsEnoughOrUnknownNothingChanges) {
 
 TEST(WithinMemory, ASmallFitIsNeverRefused) {
   std::vector<std::string> notes;
-  EXPECT_EQ(within_memory(problem_of(100), on_threads(4), 0, notes).max_side_by_side, 0);
-  EXPECT_NE(input_error_of([&] { within_memory(problem_of(10000), on_threads(4), 0, notes); }), "");
+  EXPECT_EQ(within_memory(problem_of_size(100), on_threads(4), 0, notes).max_side_by_side, 0);
+  EXPECT_NE(input_error_of([&] { within_memory(problem_of_size(10000), on_threads(4), 0, notes); }), "");
 }
 
 TEST(WithinMemory, ThatHoldsFewerFewerRunSideBySide) {
-  const FitProblem problem = problem_of(10000);
+  const FitProblem problem = problem_of_size(10000);
   const FitMemory memory = fit_memory(problem, on_threads(4));
   std::vector<std::string> notes;
   const FitOptions fewer = within_memory(problem, on_threads(4), (memory.shared + 2.5 * memory.evaluation) / 0.9, notes);
@@ -96,19 +96,19 @@ TEST(WithinMemory, ThatHoldsFewerFewerRunSideBySide) {
 
 TEST(WithinMemory, ThatHoldsNoneIsToldTheRowsThatFit) {
   std::vector<std::string> notes;
-  const std::string error = input_error_of([&] { within_memory(problem_of(10000), on_threads(4), 0.5 * gigabyte, notes); });
+  const std::string error = input_error_of([&] { within_memory(problem_of_size(10000), on_threads(4), 0.5 * gigabyte, notes); });
   EXPECT_THAT(error, AllOf(HasSubstr("the fit of 10000 rows factors a matrix of size 20000 and takes "),
                            HasSubstr("GB of memory, of which 0.5 GB are free"), HasSubstr("take so many with `max_points="),
                            HasSubstr("or choose them with gp2 resample")));
   // so many fit, and not many more
   const int most = std::stoi(error.substr(error.find("`max_points=") + 12));
   EXPECT_GT(most, 1000);
-  EXPECT_EQ(within_memory(problem_of(most), on_threads(1), 0.5 * gigabyte, notes).max_side_by_side, 0);
-  EXPECT_NE(input_error_of([&] { within_memory(problem_of(most + most / 10), on_threads(1), 0.5 * gigabyte, notes); }), "");
+  EXPECT_EQ(within_memory(problem_of_size(most), on_threads(1), 0.5 * gigabyte, notes).max_side_by_side, 0);
+  EXPECT_NE(input_error_of([&] { within_memory(problem_of_size(most + most / 10), on_threads(1), 0.5 * gigabyte, notes); }), "");
 }
 
 TEST(WithinMemory, TheResultIsTheSame) {
-  const FitProblem problem = problem_of(30);
+  const FitProblem problem = problem_of_size(30);
   FitOptions options = on_threads(3);
   options.n_restarts = 3;
   options.max_iterations = 5;
@@ -122,7 +122,7 @@ TEST(WithinMemory, TheResultIsTheSame) {
 }
 
 TEST(WithinMemory, WhatTheSystemDoesNotGiveIsNotBegun) {
-  const FitProblem problem = problem_of(1000);  // the square of 2000 and a buffer of BLAS: 32 MB and 134 MB
+  const FitProblem problem = problem_of_size(1000);  // the square of 2000 and a buffer of BLAS: 32 MB and 134 MB
   const auto with_limit = [&](double limit, std::vector<std::string>& notes) {
     return within_memory(problem, on_threads(4), std::nullopt, notes, [&](double bytes, int n) { return n * bytes <= limit; });
   };

@@ -32,7 +32,7 @@ TEST(FitNotes, NameWhatEndedAtABound) {
   EXPECT_THAT(notes_of(report), testing::IsEmpty());
 }
 
-Model cart(const std::string& constraints) {
+Model constrained_cart(const std::string& constraints) {
   return Model::parse("coordinates = ['x', 'y']\n[mechanics]\nmass = [['2', '0'], ['0', '1']]\n" + constraints +
                           "[[latent]]\nkernel = 'se'\nfeatures = ['dx']\ndirections = 'acceleration'\n",
                       "cart");
@@ -48,13 +48,13 @@ FitProblem problem_of(const Model& model, const CsvTable& log) {
 TEST(FitNotes, TellThatThereIsNothingToProjectOnto) {
   const CsvTable log = CsvTable::parse("x,y,dx,dy,ddx,ddy\n1,2,3,4,5,0\n2,3,4,5,6,0\n", "log.csv");
   for (const char* constraints : {"", "[constraints]\nacceleration = ['ddx - ddy']\n"}) {
-    EXPECT_THAT(problem_of(cart(constraints), log).notes,
-                Contains(HasSubstr("log.csv: nothing to project: 'cart' has no position or velocity constraints")));
+    EXPECT_THAT(problem_of(constrained_cart(constraints), log).notes,
+                Contains(HasSubstr("log.csv: nothing to project: 'constrained_cart' has no position or velocity constraints")));
   }
 }
 
 TEST(FitNotes, TellWhichStatesTheConstraintsDoNotKnow) {
-  const Model model = cart("[constraints]\nposition = ['y - sqrt(x)']\n");
+  const Model model = constrained_cart("[constraints]\nposition = ['y - sqrt(x)']\n");
   const CsvTable log = CsvTable::parse("x,y,dx,dy,ddx,ddy\n1,1,2,1,0,0\n-2,4,6,0,1,1\n", "log.csv");
   EXPECT_THAT(input_error_of([&] { problem_of(model, log); }),
               AllOf(StartsWith("`project`: log.csv: 1 of 2 states have no state on the constraints near them (line 3): "),
@@ -64,7 +64,7 @@ TEST(FitNotes, TellWhichStatesTheConstraintsDoNotKnow) {
 // a column that does not vary gives no scale for its noise
 TEST(FitNotes, NoiseThatIsEstimatedStartsAtAScaleOfTheColumn) {
   const CsvTable log = CsvTable::parse("x,y,dx,dy,ddx,ddy\n1,2,3,4,5,0\n2,3,4,5,7,0\n", "log.csv");
-  const FitProblem problem = problem_of(cart(""), log);
+  const FitProblem problem = problem_of(constrained_cart(""), log);
   std::vector<double> noise;
   for (const Hyperparameter& h : problem.hyperparameters) {
     if (h.kind == Hyperparameter::Kind::noise_stddev) noise.push_back(h.value);

@@ -45,7 +45,7 @@ constexpr const char* of_constraint = "measured ddq on A ddq = b: rms residual";
 
 TEST(Residuals, OfSoundDataAreNoise) {
   for (const char* file : {"models/surface.toml", "models/unicycle.toml"}) {
-    for (const std::uint64_t seed : {11, 12, 13}) {
+    for (const std::uint64_t seed : {11U, 12U, 13U}) {
       SCOPED_TRACE(fmt::format("{}, seed {}", file, seed));
       const Data data = data_of(file, seed);
       EXPECT_THAT(findings_of(data, Finding::Level::good), Contains(HasSubstr(", expected 0.")));

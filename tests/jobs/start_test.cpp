@@ -14,8 +14,8 @@ using testing::Contains;
 using testing::HasSubstr;
 using testing::IsEmpty;
 
-// a pendulum in maximal coordinates
-Model pendulum(const std::string& more) {
+// a wire_pendulum in maximal coordinates
+Model wire_pendulum(const std::string& more) {
   return Model::parse(R"toml(
 name        = "pendulum"
 coordinates = ["x", "y", { name = "a", angle = true }]
@@ -45,7 +45,7 @@ SimulateJob job_of(const Model& model, double length) {
 
 TEST(StartOfALog, KeepsWhatWasMeasuredAndSolvesForTheRest) {
   for (const char* more : {"", "[sampling]\na = [-1, 1]\nda = [-1, 1]\n"}) {
-    const SimulateJob job = job_of(pendulum(more), 1);
+    const SimulateJob job = job_of(wire_pendulum(more), 1);
     EXPECT_EQ(job.start[2], 0.8);
     EXPECT_EQ(job.start[5], 0.5);
     EXPECT_NEAR(job.start[0], 1.1 * std::sin(0.8), 1e-12);
@@ -55,7 +55,7 @@ TEST(StartOfALog, KeepsWhatWasMeasuredAndSolvesForTheRest) {
 }
 
 TEST(StartOfALog, IsTakenAsItIsWhereItIsOnTheConstraints) {
-  const SimulateJob job = job_of(pendulum(""), 1.1);
+  const SimulateJob job = job_of(wire_pendulum(""), 1.1);
   EXPECT_THAT(job.notes, IsEmpty());
   EXPECT_EQ(job.start[0], 1.1 * std::sin(0.8));
 }

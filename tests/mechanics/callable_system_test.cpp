@@ -27,7 +27,7 @@ using testing::HasSubstr;
 using testing::IsEmpty;
 using testing::SizeIs;
 
-constexpr std::uint64_t seed = 50501;
+constexpr std::uint64_t callable_system_seed = 50501;
 constexpr double nan = std::numeric_limits<double>::quiet_NaN();
 
 const System& text_surface() { return *test::model("models/surface.toml").system; }
@@ -44,11 +44,11 @@ const System& surface() {
 }
 
 MatrixXd states_of(int n) {
-  const MatrixXd drawn = test::draw(test::model("models/surface.toml"), n, seed).states;
+  const MatrixXd drawn = test::draw(test::model("models/surface.toml"), n, callable_system_seed).states;
   return drawn.array().isNaN().select(0, drawn);
 }
 
-MatrixXd stack(const SystemValues& values) {
+MatrixXd stack_values(const SystemValues& values) {
   MatrixXd all(values.mass.rows() + values.constraint_matrix.rows() + values.constraint_vector.rows() + values.force.rows(),
                values.n_states());
   all << values.mass, values.constraint_matrix, values.constraint_vector, values.force;
@@ -66,12 +66,12 @@ void expect_close(const MatrixXd& got, const MatrixXd& expected, double toleranc
 TEST(CallableSystemTest, HasTheNumbersOfTheSameSystemAsText) {
   const MatrixXd states = states_of(20);
   const VectorXd parameters = text_surface().parameter_values() * 1.05;
-  expect_close(stack(surface().evaluate(states, parameters)), stack(text_surface().evaluate(states, parameters)));
+  expect_close(stack_values(surface().evaluate(states, parameters)), stack_values(text_surface().evaluate(states, parameters)));
   expect_close(surface().residuals(states, parameters), text_surface().residuals(states, parameters));
   for (int p = 0; p < static_cast<int>(surface().parameters().size()); ++p) {
-    const MatrixXd expected = stack(text_surface().differentiate(states, parameters, p));
+    const MatrixXd expected = stack_values(text_surface().differentiate(states, parameters, p));
     EXPECT_GT(expected.cwiseAbs().maxCoeff(), 0);
-    expect_close(stack(surface().differentiate(states, parameters, p)), expected);
+    expect_close(stack_values(surface().differentiate(states, parameters, p)), expected);
   }
   EXPECT_EQ(surface().nc(), 1);
   EXPECT_THAT(surface().constraint_labels(), ElementsAre("the surface"));
@@ -118,10 +118,10 @@ TEST(CallableSystemTest, WithoutDerivativesTakesDifferencesOfTheStatedError) {
   };
   const CallableSystem system(differenced);
   const MatrixXd states = states_of(20);
-  const MatrixXd values = stack(text_surface().evaluate(states, parameters));
+  const MatrixXd values = stack_values(text_surface().evaluate(states, parameters));
   for (int p = 0; p < static_cast<int>(declared.size()); ++p) {
-    const MatrixXd expected = stack(text_surface().differentiate(states, parameters, p));
-    const MatrixXd got = stack(system.differentiate(states, parameters, p));
+    const MatrixXd expected = stack_values(text_surface().differentiate(states, parameters, p));
+    const MatrixXd got = stack_values(system.differentiate(states, parameters, p));
     // ε^(2/3) of f/s, and of s²f‴: with p5 q1 up to 6 that is 200 of them at most; one-sided, twice
     const double tolerance = 2 * 200 * std::pow(test::eps, 2.0 / 3) * values.cwiseAbs().maxCoeff() / std::abs(parameters[p]);
     EXPECT_LE((got - expected).cwiseAbs().maxCoeff(), tolerance) << declared[static_cast<std::size_t>(p)].name;

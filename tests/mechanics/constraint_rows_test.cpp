@@ -10,7 +10,7 @@ namespace {
 using Eigen::MatrixXd;
 using Eigen::VectorXd;
 
-constexpr std::uint64_t seed = 20202;
+constexpr std::uint64_t constraint_rows_seed = 20202;
 
 class ConstraintRows : public testing::TestWithParam<std::string> {};
 INSTANTIATE_TEST_SUITE_P(EveryModel, ConstraintRows, testing::ValuesIn(test::every_model()), test::model_test_name);
@@ -20,12 +20,12 @@ TEST_P(ConstraintRows, TheirResidualChangesAlongTheMotionAsAAndBSay) {
   const System& system = *test::model(GetParam()).system;
   const StateLayout layout = system.layout();
   const VectorXd parameters = system.parameter_values();
-  RandomStream random(seed);
+  RandomStream random(constraint_rows_seed);
   int n_compared = 0;
-  for (const test::StateFamily& family : test::state_families(GetParam(), seed)) {
+  for (const test::StateFamily& family : test::state_families(GetParam(), constraint_rows_seed)) {
     const SystemValues values = system.evaluate(family.states, parameters);
     for (int i = 0; i < values.n_states(); ++i) {
-      SCOPED_TRACE(fmt::format("{}, state {} of those {}, seed {}", GetParam(), i, family.name, seed));
+      SCOPED_TRACE(fmt::format("{}, state {} of those {}, seed {}", GetParam(), i, family.name, constraint_rows_seed));
       const VectorXd x = family.states.col(i);
       const VectorXd ddq = test::random_vector(layout.nq, random);
       const auto residuals_at = [&](double tau) -> VectorXd {

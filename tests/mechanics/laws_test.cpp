@@ -13,7 +13,7 @@ using Eigen::MatrixXd;
 using Eigen::VectorXd;
 using test::eps;
 
-constexpr std::uint64_t seed = 20201;
+constexpr std::uint64_t laws_seed = 20201;
 
 /// What a law sees of one state.
 struct Case {
@@ -52,10 +52,10 @@ class MechanicsLaws : public testing::TestWithParam<std::string> {
   template <typename Law>
   void for_every_state(const Law& law) {
     const System& system = *test::model(GetParam()).system;
-    for (const test::StateFamily& family : test::state_families(GetParam(), seed)) {
+    for (const test::StateFamily& family : test::state_families(GetParam(), laws_seed)) {
       const MechanicsBatch batch = require_mechanics(system, family.states, system.parameter_values());
       for (int i = 0; i < batch.values.n_states(); ++i) {
-        SCOPED_TRACE(fmt::format("{}, state {} of those {}, seed {}", GetParam(), i, family.name, seed));
+        SCOPED_TRACE(fmt::format("{}, state {} of those {}, seed {}", GetParam(), i, family.name, laws_seed));
         const MatrixXd M = batch.values.M(i);
         law(Case{M, batch.values.A(i), batch.values.b(i), batch.projections[static_cast<std::size_t>(i)],
                  32 * eps * static_cast<double>(M.rows()) * condition(M)});
@@ -104,7 +104,7 @@ TEST_P(MechanicsLaws, LIsAGeneralisedInverseOfAWhichTurnsBIntoAnAcceleration) {
 }
 
 TEST_P(MechanicsLaws, ScalingTheRowsOfTheConstraintChangesNothing) {
-  RandomStream random(seed);
+  RandomStream random(laws_seed);
   for_every_state([&](const Case& c) {
     VectorXd scale(c.A.rows());
     for (double& entry : scale) entry = std::pow(10.0, 12 * random.uniform() - 6);
@@ -117,7 +117,7 @@ TEST_P(MechanicsLaws, ScalingTheRowsOfTheConstraintChangesNothing) {
 }
 
 TEST_P(MechanicsLaws, ARowThatFollowsFromTheOthersChangesNothing) {
-  RandomStream random(seed);
+  RandomStream random(laws_seed);
   for_every_state([&](const Case& c) {
     const VectorXd weights = test::random_vector(c.A.rows(), random);
     for (const VectorXd& w : {VectorXd(VectorXd::Unit(c.A.rows(), 0)), weights}) {
@@ -141,7 +141,7 @@ TEST_P(MechanicsLaws, AZeroRowIsDroppedAndCounted) {
 }
 
 TEST_P(MechanicsLaws, TheConstrainedAccelerationSolvesTheEquationsOfMotionWithMultipliers) {
-  RandomStream random(seed);
+  RandomStream random(laws_seed);
   for_every_state([&](const Case& c) {
     if (c.projection.rank() < c.A.rows()) return;  // the KKT matrix of a redundant set is singular
     const Eigen::Index n = c.M.rows(), m = c.A.rows();
@@ -163,7 +163,7 @@ TEST_P(MechanicsLaws, TheConstrainedAccelerationSolvesTheEquationsOfMotionWithMu
 }
 
 TEST_P(MechanicsLaws, NoAdmissibleAccelerationIsCloserToTheUnconstrainedOneThanGaussPrincipleSays) {
-  RandomStream random(seed);
+  RandomStream random(laws_seed);
   for_every_state([&](const Case& c) {
     const VectorXd a_bar = test::random_vector(c.M.rows(), random);
     const VectorXd ddq = c.projection.constrain(a_bar);
@@ -185,7 +185,7 @@ TEST_P(MechanicsLaws, NoAdmissibleAccelerationIsCloserToTheUnconstrainedOneThanG
 
 // With rows 0 and a combination of others among them: multipliers are the shortest, and a row that vanishes has none.
 TEST(UdwadiaKalabaTest, MultipliersOfRedundantAndVanishingRowsAreThoseOfThePseudoinverse) {
-  RandomStream random(seed);
+  RandomStream random(laws_seed);
   for (int trial = 0; trial < 50; ++trial) {
     MatrixXd A = MatrixXd::Zero(5, 4);
     for (int row : {0, 2}) A.row(row) = test::random_vector(4, random);
@@ -211,8 +211,8 @@ TEST(UdwadiaKalabaTest, WithoutConstraintsTheMotionIsTheUnconstrainedOne) {
 }
 
 TEST(UdwadiaKalabaTest, TheConstrainedAccelerationMeetsTheConstraintToRoundingWhateverTheConditionOfM) {
-  SCOPED_TRACE(fmt::format("seed {}", seed));
-  RandomStream random(seed);
+  SCOPED_TRACE(fmt::format("seed {}", laws_seed));
+  RandomStream random(laws_seed);
   for (int trial = 0; trial < 50; ++trial) {
     // κ(M) = 1e6
     MatrixXd V(4, 4);

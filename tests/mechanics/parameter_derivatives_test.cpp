@@ -13,7 +13,7 @@ namespace {
 using Eigen::MatrixXd;
 using Eigen::VectorXd;
 
-constexpr std::uint64_t seed = 20203;
+constexpr std::uint64_t parameter_derivatives_seed = 20203;
 
 class ParameterDerivatives : public testing::TestWithParam<std::string> {};
 INSTANTIATE_TEST_SUITE_P(EveryModel, ParameterDerivatives, testing::ValuesIn(test::every_model()), test::model_test_name);
@@ -46,9 +46,10 @@ TEST_P(ParameterDerivatives, OfTheProjectionMatchDifferences) {
   for (int p = 0; p < static_cast<int>(parameters.size()); ++p) {
     const std::string& name = system.parameters()[static_cast<std::size_t>(p)].name;
     double largest_derivative = 0;
-    for (const test::StateFamily& family : test::state_families(GetParam(), seed)) {
+    for (const test::StateFamily& family : test::state_families(GetParam(), parameter_derivatives_seed)) {
       for (int i = 0; i < static_cast<int>(family.states.cols()); ++i) {
-        SCOPED_TRACE(fmt::format("{}, parameter {}, state {} of those {}, seed {}", GetParam(), name, i, family.name, seed));
+        SCOPED_TRACE(fmt::format("{}, parameter {}, state {} of those {}, seed {}", GetParam(), name, i, family.name,
+                                 parameter_derivatives_seed));
         const auto projection_at = [&](double value) {
           VectorXd moved = parameters;
           moved[p] = value;
@@ -85,13 +86,13 @@ TEST_P(ParameterDerivatives, OfARedundantSetAreThoseOfTheSetWithoutItsRedundantR
   const System& system = *test::model(GetParam()).system;
   const VectorXd parameters = system.parameter_values();
   const int n_rows = n_rows_to_use(GetParam(), system);
-  RandomStream random(seed);
-  const MatrixXd states = test::draw(test::model(GetParam()), 10, seed).states;
+  RandomStream random(parameter_derivatives_seed);
+  const MatrixXd states = test::draw(test::model(GetParam()), 10, parameter_derivatives_seed).states;
   for (int p = 0; p < static_cast<int>(parameters.size()); ++p) {
     const SystemValues values = system.evaluate(states, parameters);
     const SystemValues d = system.differentiate(states, parameters, p);
     for (int i = 0; i < values.n_states(); ++i) {
-      SCOPED_TRACE(fmt::format("{}, parameter {}, state {}, seed {}", GetParam(), p, i, seed));
+      SCOPED_TRACE(fmt::format("{}, parameter {}, state {}, seed {}", GetParam(), p, i, parameter_derivatives_seed));
       const MatrixXd A = values.A(i).topRows(n_rows), dA = d.A(i).topRows(n_rows);
       const VectorXd b = values.b(i).head(n_rows), db = d.b(i).head(n_rows);
       const VectorXd w = test::random_vector(n_rows, random), dw = test::random_vector(n_rows, random);

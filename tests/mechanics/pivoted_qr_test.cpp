@@ -13,7 +13,7 @@ using Eigen::MatrixXd;
 using Eigen::VectorXd;
 using test::eps;
 
-constexpr std::uint64_t seed = 20302;
+constexpr std::uint64_t pivoted_qr_seed = 20302;
 
 struct Decomposition {
   MatrixXd W;  // in place
@@ -41,8 +41,8 @@ MatrixXd random_of_rank(Index rows, Index cols, Index rank, RandomStream& random
 }
 
 TEST(PivotedQrTest, DecomposesMatricesOfAnyShapeAndRank) {
-  SCOPED_TRACE(fmt::format("seed {}", seed));
-  RandomStream random(seed);
+  SCOPED_TRACE(fmt::format("seed {}", pivoted_qr_seed));
+  RandomStream random(pivoted_qr_seed);
   for (const auto& [rows, cols, rank] : {std::tuple<Index, Index, Index>{1, 1, 1},
                                          {3, 1, 1},
                                          {1, 4, 1},

@@ -14,26 +14,20 @@ using Eigen::MatrixXd;
 using Eigen::VectorXd;
 using test::eps;
 
-constexpr std::uint64_t seed = 20301;
-
-MatrixXd random_matrix(Index rows, Index cols, RandomStream& random) {
-  MatrixXd matrix(rows, cols);
-  for (double& entry : matrix.reshaped()) entry = random.normal();
-  return matrix;
-}
+constexpr std::uint64_t reuse_seed = 20301;
 
 /// M with κ(M) of order ten, A of n_rows rows of which the last n_redundant follow from the others, and b to match.
-struct Problem {
+struct ReuseProblem {
   MatrixXd M, A;
   VectorXd b;
 };
 
-Problem random_problem(Index nq, Index n_rows, Index n_redundant, RandomStream& random) {
-  const MatrixXd V = random_matrix(nq, nq, random);
-  Problem p{V * V.transpose() / static_cast<double>(nq) + MatrixXd::Identity(nq, nq), random_matrix(n_rows, nq, random),
-            test::random_vector(n_rows, random)};
+ReuseProblem random_problem(Index nq, Index n_rows, Index n_redundant, RandomStream& random) {
+  const MatrixXd V = test::random_matrix(nq, nq, random);
+  ReuseProblem p{V * V.transpose() / static_cast<double>(nq) + MatrixXd::Identity(nq, nq),
+                 test::random_matrix(n_rows, nq, random), test::random_vector(n_rows, random)};
   const Index n_free = n_rows - n_redundant;
-  const MatrixXd weights = random_matrix(n_redundant, n_free, random);
+  const MatrixXd weights = test::random_matrix(n_redundant, n_free, random);
   p.A.bottomRows(n_redundant) = weights * p.A.topRows(n_free);
   p.b.tail(n_redundant) = weights * p.b.head(n_free);
   return p;
@@ -54,12 +48,12 @@ TEST(AllocationCountTest, SeesNewAndEigen) {
 }
 
 TEST(UdwadiaKalabaReuse, GivesWhatTheTextbookGives) {
-  SCOPED_TRACE(fmt::format("seed {}", seed));
-  RandomStream random(seed);
+  SCOPED_TRACE(fmt::format("seed {}", reuse_seed));
+  RandomStream random(reuse_seed);
   UdwadiaKalaba projection;
   for (const Size& size : sizes) {
     SCOPED_TRACE(fmt::format("{} coordinates, {} rows, {} redundant", size.nq, size.n_rows, size.n_redundant));
-    const Problem p = random_problem(size.nq, size.n_rows, size.n_redundant, random);
+    const ReuseProblem p = random_problem(size.nq, size.n_rows, size.n_redundant, random);
     projection.compute(p.M, p.A, p.b);
     EXPECT_EQ(projection.rank(), size.n_rows - size.n_redundant);
     const MatrixXd M_inverse = p.M.inverse();
@@ -82,12 +76,12 @@ TEST(UdwadiaKalabaReuse, GivesWhatTheTextbookGives) {
 }
 
 TEST(UdwadiaKalabaReuse, GivesTheBitsOfANewObjectWhateverCameBefore) {
-  SCOPED_TRACE(fmt::format("seed {}", seed));
-  RandomStream random(seed, 1);
+  SCOPED_TRACE(fmt::format("seed {}", reuse_seed));
+  RandomStream random(reuse_seed, 1);
   UdwadiaKalaba reused;
   for (int trial = 0; trial < 3; ++trial) {
     for (const Size& size : sizes) {
-      const Problem p = random_problem(size.nq, size.n_rows, size.n_redundant, random);
+      const ReuseProblem p = random_problem(size.nq, size.n_rows, size.n_redundant, random);
       reused.compute(p.M, p.A, p.b);
       const UdwadiaKalaba fresh(p.M, p.A, p.b);
       EXPECT_EQ(reused.rank(), fresh.rank());
@@ -103,19 +97,19 @@ TEST(UdwadiaKalabaReuse, GivesTheBitsOfANewObjectWhateverCameBefore) {
 }
 
 TEST(UdwadiaKalabaReuse, AllocatesNothingWhereTheSizesAreThoseOfTheCallBefore) {
-  SCOPED_TRACE(fmt::format("seed {}", seed));
-  RandomStream random(seed, 2);
+  SCOPED_TRACE(fmt::format("seed {}", reuse_seed));
+  RandomStream random(reuse_seed, 2);
   for (const Size& size : sizes) {
     SCOPED_TRACE(fmt::format("{} coordinates, {} rows, {} redundant", size.nq, size.n_rows, size.n_redundant));
-    const Problem p = random_problem(size.nq, size.n_rows, size.n_redundant, random);
-    const Problem other = random_problem(size.nq, size.n_rows, size.n_redundant == 0 ? 0 : size.n_redundant - 1, random);
+    const ReuseProblem p = random_problem(size.nq, size.n_rows, size.n_redundant, random);
+    const ReuseProblem other = random_problem(size.nq, size.n_rows, size.n_redundant == 0 ? 0 : size.n_redundant - 1, random);
     const VectorXd a_bar = test::random_vector(size.nq, random);
     MatrixXd K;
     VectorXd ddq(size.nq);
     UdwadiaKalaba projection;
     UdwadiaKalaba::Workspace workspace;
     const auto use = [&] {
-      for (const Problem* problem : {&p, &other}) {
+      for (const ReuseProblem* problem : {&p, &other}) {
         projection.compute(problem->M, problem->A, problem->b);
         projection.constrain(a_bar, ddq, workspace);
         projection.solve_mass_in_place(ddq);
@@ -133,8 +127,8 @@ INSTANTIATE_TEST_SUITE_P(EveryModel, BatchReuse, testing::ValuesIn(test::every_m
 TEST_P(BatchReuse, GivesTheBitsOfANewBatchAndAllocatesNothing) {
   const System& system = *test::model(GetParam()).system;
   const VectorXd parameters = system.parameter_values();
-  const MatrixXd first = test::draw(test::model(GetParam()), 100, seed).states;
-  const MatrixXd second = test::draw(test::model(GetParam()), 100, seed + 1).states;
+  const MatrixXd first = test::draw(test::model(GetParam()), 100, reuse_seed).states;
+  const MatrixXd second = test::draw(test::model(GetParam()), 100, reuse_seed + 1).states;
   MechanicsBatch reused;
   evaluate_mechanics(system, first, parameters, reused);
   EXPECT_EQ(test::allocations_of([&] { evaluate_mechanics(system, second, parameters, reused); }), 0U);

@@ -25,13 +25,7 @@ using testing::AllOf;
 using testing::HasSubstr;
 using Mass = UdwadiaKalaba::Mass;
 
-constexpr std::uint64_t seed = 20601;
-
-MatrixXd random_matrix(Index rows, Index cols, RandomStream& random) {
-  MatrixXd matrix(rows, cols);
-  for (double& entry : matrix.reshaped()) entry = random.normal();
-  return matrix;
-}
+constexpr std::uint64_t singular_mass_seed = 20601;
 
 // M = JᵀJ with J (rank × nq), A with one redundant row where asked for, b = A ddq of some ddq
 struct Problem {
@@ -39,7 +33,7 @@ struct Problem {
   VectorXd ddq, force;
 
   Problem(Index nq, Index rank, Index nc, bool redundant, RandomStream& random)
-      : J(random_matrix(rank, nq, random)), A(random_matrix(nc, nq, random)), ddq(nq), force(nq) {
+      : J(test::random_matrix(rank, nq, random)), A(test::random_matrix(nc, nq, random)), ddq(nq), force(nq) {
     // coordinates of one kind: some with mass, some without any, and some that share theirs
     if (rank + 1 < nq) J.col(nq - 1).setZero();
     if (redundant) A.row(nc - 1) = 2 * A.row(0) - (nc > 2 ? MatrixXd(A.row(1)) : MatrixXd(A.row(0)));
@@ -57,15 +51,15 @@ MatrixXd stacked(const MatrixXd& above, const MatrixXd& below) {
 }
 
 // of a matrix of given rank
-double condition(const MatrixXd& matrix, Index rank) {
+double condition_of_rank(const MatrixXd& matrix, Index rank) {
   const VectorXd sizes = Eigen::JacobiSVD<MatrixXd>(matrix).singularValues();
   return sizes[0] / sizes[rank - 1];
 }
 
 template <typename Law>
 void for_every_problem(const Law& law) {
-  SCOPED_TRACE(fmt::format("seed {}", seed));
-  RandomStream random(seed);
+  SCOPED_TRACE(fmt::format("seed {}", singular_mass_seed));
+  RandomStream random(singular_mass_seed);
   for (int trial = 0; trial < 200; ++trial) {
     for (const auto& [nq, rank, nc, redundant] : {std::tuple{2, 1, 1, false},
                                                   {3, 1, 2, false},
@@ -80,8 +74,8 @@ void for_every_problem(const Law& law) {
       const VectorXd masses = p.M().diagonal();
       const double lightest = (masses.array() > 0).select(masses, test::largest(masses)).minCoeff();
       const double worst =
-          std::max({lightest > 0 ? std::sqrt(test::largest(masses) / lightest) : 1, condition(stacked(p.M(), p.A), nq),
-                    condition(stacked(across * p.M(), p.A), nq), condition(p.A, redundant ? nc - 1 : nc)});
+          std::max({lightest > 0 ? std::sqrt(test::largest(masses) / lightest) : 1, condition_of_rank(stacked(p.M(), p.A), nq),
+                    condition_of_rank(stacked(across * p.M(), p.A), nq), condition_of_rank(p.A, redundant ? nc - 1 : nc)});
       if (worst > 100) continue;
       SCOPED_TRACE(fmt::format("{} coordinates, rank of M {}, {} rows, trial {}", nq, rank, nc, trial));
       const UdwadiaKalaba projection(p.M(), p.A, p.b());
@@ -123,7 +117,7 @@ TEST(SingularMass, TheMotionAndTheConstraintForceSolveTheEquationsWithMultiplier
     VectorXd right(nq + nc);
     right << p.force, p.b();
     const VectorXd solution = kkt.fullPivLu().solve(right);
-    const double rounding_of_both = rounding + 64 * eps * condition(kkt, nq + nc);
+    const double rounding_of_both = rounding + 64 * eps * condition_of_rank(kkt, nq + nc);
     EXPECT_LE(test::largest(ddq - solution.head(nq)), rounding_of_both * size);
     EXPECT_LE(test::largest(lambda - solution.tail(nc)),
               rounding_of_both * (size + test::largest(lambda)) * (1 + test::largest(p.M())));
@@ -131,7 +125,7 @@ TEST(SingularMass, TheMotionAndTheConstraintForceSolveTheEquationsWithMultiplier
 }
 
 TEST(SingularMass, NoAdmissibleAccelerationHasASmallerGaussCost) {
-  RandomStream random(seed, 1);
+  RandomStream random(singular_mass_seed, 1);
   for_every_problem([&](const Problem& p, const UdwadiaKalaba& projection, double rounding) {
     // ½ ddqᵀM ddq − F̄ᵀddq, which is ½ (ddq − ā)ᵀM(ddq − ā) and a constant where there is an ā
     const VectorXd ddq = projection.constrain(projection.solve_mass(p.force));
@@ -146,7 +140,7 @@ TEST(SingularMass, NoAdmissibleAccelerationHasASmallerGaussCost) {
 }
 
 TEST(SingularMass, UnitsOfCoordinatesAndTheScaleOfRowsChangeNothing) {
-  RandomStream random(seed, 2);
+  RandomStream random(singular_mass_seed, 2);
   for_every_problem([&](const Problem& p, const UdwadiaKalaba& projection, double rounding) {
     const Index nq = p.A.cols(), nc = p.A.rows();
     // powers of two, so that nothing rounds
@@ -231,12 +225,12 @@ TEST(SingularMass, AMassThatIsIllConditionedAndThatAConstraintDoesNotCompleteIsU
 
 // M, A, b that change smoothly while the ranks stay; against differences
 TEST(SingularMassDerivatives, AreThoseOfTheMotion) {
-  RandomStream random(seed, 3);
+  RandomStream random(singular_mass_seed, 3);
   double size = 0;
   for_every_problem([&](const Problem& p, const UdwadiaKalaba& projection, double /*rounding*/) {
-    const MatrixXd dJ = random_matrix(p.J.rows(), p.J.cols(), random).array() * (p.J.array() != 0).cast<double>();
+    const MatrixXd dJ = test::random_matrix(p.J.rows(), p.J.cols(), random).array() * (p.J.array() != 0).cast<double>();
     const Index nq = p.A.cols(), nc = p.A.rows();
-    MatrixXd dA = random_matrix(nc, nq, random);
+    MatrixXd dA = test::random_matrix(nc, nq, random);
     const VectorXd dddq = test::random_vector(nq, random);
     if (projection.rank() < nc) dA = 0.3 * p.A;  // rows stay dependent
     const auto moved = [&](double x) {
@@ -278,7 +272,7 @@ TEST(SingularMassDerivatives, AreThoseOfTheMotion) {
 }
 
 TEST(SingularMass, ReuseGivesTheBitsOfANewObjectAndAllocatesNothing) {
-  RandomStream random(seed, 4);
+  RandomStream random(singular_mass_seed, 4);
   for (const Index nq : {3, 6, 20}) {
     const Problem p(nq, nq / 2, nq - 1, false, random), other(nq, nq / 2, nq - 1, false, random);
     const MatrixXd M = p.M(), regular = M + MatrixXd::Identity(nq, nq), indefinite = -M, M2 = other.M();
@@ -353,7 +347,7 @@ TEST(SingularMassFaults, ADirectionThatNothingDeterminesIsNamed) {
 }
 
 TEST(SingularMassFaults, WhatSpeaksOfTheUnconstrainedAccelerationIsRefused) {
-  const MatrixXd states = test::draw(rod(), 3, seed).states;
+  const MatrixXd states = test::draw(rod(), 3, singular_mass_seed).states;
   const VectorXd parameters = rod().system->parameter_values();
   const auto fault = [&](const PriorOptions& options, View::Quantity quantity) {
     const Prior prior = make_prior(rod(), options);
@@ -392,7 +386,7 @@ TEST(SingularMassFaults, ATrueAccelerationIsRefusedUnlessItIsZero) {
 
 // m l² θ̈ = −m g l sin θ + u1 + friction, the whole motion and the force of the rod from θ
 TEST(SingularMassModel, MovesAsTheOneWithoutTheRedundantCoordinatesDoes) {
-  const GeneratedData data = test::draw(rod(), 50, seed);
+  const GeneratedData data = test::draw(rod(), 50, singular_mass_seed);
   const double m = 0.5, l = 0.6, g = 9.81;
   const Prior prior = make_prior(rod(), {Prior::Mean::force, std::nullopt});
   const VectorXd parameters = rod().system->parameter_values();
@@ -433,7 +427,7 @@ TEST(SingularMassModel, MovesAsTheOneWithoutTheRedundantCoordinatesDoes) {
 TEST(SingularMassModel, ViewsOfThePriorHaveExactDerivativesInTheParameters) {
   const Prior prior = make_prior(rod(), {Prior::Mean::force, std::nullopt});
   const System& system = *rod().system;
-  const MatrixXd states = test::draw(rod(), 5, seed).states;
+  const MatrixXd states = test::draw(rod(), 5, singular_mass_seed).states;
   const VectorXd parameters = system.parameter_values();
   for (const View::Quantity quantity : {View::Quantity::constrained_acceleration, View::Quantity::constraint_force,
                                         View::Quantity::multipliers, View::Quantity::next_velocity}) {

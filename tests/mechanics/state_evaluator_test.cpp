@@ -20,7 +20,7 @@ using Eigen::VectorXd;
 using Quantity = StateEvaluator::Quantity;
 using testing::HasSubstr;
 
-constexpr std::uint64_t seed = 20303;
+constexpr std::uint64_t state_evaluator_seed = 20303;
 
 /// M, A, b, F as one vector, as a batch gives them.
 VectorXd values_at(const System& system, const VectorXd& state) {
@@ -64,9 +64,9 @@ TEST_P(StateEvaluators, GiveTheBitsOfABatch) {
   const auto with = system().make_evaluator(system().parameter_values(), true);
   const auto without = system().make_evaluator(system().parameter_values(), false);
   EXPECT_TRUE(without->derivatives().empty());
-  for (const test::StateFamily& family : test::state_families(GetParam(), seed)) {
+  for (const test::StateFamily& family : test::state_families(GetParam(), state_evaluator_seed)) {
     for (Index i = 0; i < family.states.cols(); ++i) {
-      SCOPED_TRACE(fmt::format("state {} of those {}, seed {}", i, family.name, seed));
+      SCOPED_TRACE(fmt::format("state {} of those {}, seed {}", i, family.name, state_evaluator_seed));
       const VectorXd expected = values_at(system(), family.states.col(i));
       for (StateEvaluator* evaluator : {with.get(), without.get()}) {
         evaluator->evaluate(family.states.col(i));
@@ -81,7 +81,7 @@ TEST_P(StateEvaluators, GiveTheBitsOfABatch) {
 TEST_P(StateEvaluators, DifferentiateExactly) {
   const auto evaluator = system().make_evaluator(system().parameter_values(), true);
   double largest = 0;
-  for (const test::StateFamily& family : test::state_families(GetParam(), seed)) {
+  for (const test::StateFamily& family : test::state_families(GetParam(), state_evaluator_seed)) {
     // where the velocity is tiny, that of friction has a kink within any step
     if (family.name == "at rest" || family.name == "tiny velocities" || family.name == "nearly singular") continue;
     for (Index i = 0; i < std::min<Index>(family.states.cols(), 5); ++i) {
@@ -89,7 +89,7 @@ TEST_P(StateEvaluators, DifferentiateExactly) {
       evaluator->evaluate(state);
       const MatrixXd jacobian = jacobian_of(*evaluator, system());
       for (Index k = 0; k < state.size(); ++k) {
-        SCOPED_TRACE(fmt::format("x_{}, state {} of those {}, seed {}", k, i, family.name, seed));
+        SCOPED_TRACE(fmt::format("x_{}, state {} of those {}, seed {}", k, i, family.name, state_evaluator_seed));
         const test::Difference difference = test::central_difference(
             [&](double value) {
               VectorXd moved = state;
@@ -107,7 +107,7 @@ TEST_P(StateEvaluators, DifferentiateExactly) {
 
 TEST_P(StateEvaluators, AreDefinedAtRest) {
   const auto evaluator = system().make_evaluator(system().parameter_values(), true);
-  for (const test::StateFamily& family : test::state_families(GetParam(), seed)) {
+  for (const test::StateFamily& family : test::state_families(GetParam(), state_evaluator_seed)) {
     if (family.name != "at rest") continue;
     for (Index i = 0; i < family.states.cols(); ++i) {
       evaluator->evaluate(family.states.col(i));
@@ -118,7 +118,7 @@ TEST_P(StateEvaluators, AreDefinedAtRest) {
 }
 
 TEST_P(StateEvaluators, AllocateNothing) {
-  const MatrixXd states = test::draw(test::model(GetParam()), 10, seed).states;
+  const MatrixXd states = test::draw(test::model(GetParam()), 10, state_evaluator_seed).states;
   const auto evaluator = system().make_evaluator(system().parameter_values(), true);
   double sum = 0;
   EXPECT_EQ(test::allocations_of([&] {
@@ -132,7 +132,7 @@ TEST_P(StateEvaluators, AllocateNothing) {
 
 TEST_P(StateEvaluators, DoNotSpreadWhatIsNotRead) {
   const auto evaluator = system().make_evaluator(system().parameter_values(), true);
-  VectorXd state = test::draw(test::model(GetParam()), 1, seed).states.col(0);
+  VectorXd state = test::draw(test::model(GetParam()), 1, state_evaluator_seed).states.col(0);
   const std::vector<bool> mechanics = system().reads(SystemPart::mechanics), force = system().reads(SystemPart::force);
   for (Index k = 0; k < state.size(); ++k) {
     const auto index = static_cast<std::size_t>(k);
@@ -146,7 +146,7 @@ TEST_P(StateEvaluators, DoNotSpreadWhatIsNotRead) {
 TEST_P(StateEvaluators, OfTwoThreadsDoNotDisturbEachOther) {
   // a system of its own, so that both ask for the derivatives first
   const Model model = Model::read(std::filesystem::path(GP2_SOURCE_DIR) / GetParam());
-  const MatrixXd states = test::draw(model, 50, seed).states;
+  const MatrixXd states = test::draw(model, 50, state_evaluator_seed).states;
   std::vector<VectorXd> sums(2);
   const auto work = [&](std::size_t thread) {
     const auto evaluator = model.system->make_evaluator(model.system->parameter_values(), true);
@@ -195,7 +195,7 @@ TEST_P(StateEvaluators, OfAnySystemTakeDifferencesOfTheStatedError) {
   const auto exact = system().make_evaluator(system().parameter_values(), true);
   const auto differences = opaque.make_evaluator(opaque.parameter_values(), true);
   EXPECT_TRUE(opaque.make_evaluator(opaque.parameter_values(), false)->derivatives().empty());
-  const MatrixXd states = test::draw(test::model(GetParam()), 10, seed).states;
+  const MatrixXd states = test::draw(test::model(GetParam()), 10, state_evaluator_seed).states;
   for (Index i = 0; i < states.cols(); ++i) {
     exact->evaluate(states.col(i));
     differences->evaluate(states.col(i));
@@ -209,7 +209,7 @@ TEST_P(StateEvaluators, OfAnySystemTakeDifferencesOfTheStatedError) {
 TEST_P(StateEvaluators, HaveTheirLikeInTheFeaturesAndDirectionsOfALatent) {
   const Model& model = test::model(GetParam());
   const Prior prior = make_prior(model);
-  const MatrixXd states = test::draw(model, 3, seed).states;
+  const MatrixXd states = test::draw(model, 3, state_evaluator_seed).states;
   const auto check = [&](const StateFunction& function, const VectorXd& parameters, const char* what) {
     const auto evaluator = function.make_evaluator(parameters);
     const std::vector<StateDerivatives::Entry>& entries = evaluator->entries();
@@ -222,7 +222,7 @@ TEST_P(StateEvaluators, HaveTheirLikeInTheFeaturesAndDirectionsOfALatent) {
         jacobian(entries[k].output, entries[k].state_index) = values[static_cast<Index>(k)];
       }
       for (Index k = 0; k < state.size(); ++k) {
-        SCOPED_TRACE(fmt::format("{}, x_{}, state {}, seed {}", what, k, i, seed));
+        SCOPED_TRACE(fmt::format("{}, x_{}, state {}, seed {}", what, k, i, state_evaluator_seed));
         const test::Difference difference = test::central_difference(
             [&](double value) -> VectorXd {
               VectorXd moved = state;

@@ -18,10 +18,10 @@ using test::input_error_of;
 using test::TemporaryFolder;
 using testing::HasSubstr;
 
-constexpr std::uint64_t seed = 60602;
+constexpr std::uint64_t code_latents_seed = 60602;
 
 // A bead on a parabola that a force along a direction of its own pushes: B = [h x, 1 + h dx²].
-constexpr const char* bead = R"(
+constexpr const char* bead_text = R"(
 name = "bead"
 coordinates = ["x", "z"]
 [parameters]
@@ -77,13 +77,13 @@ ModelCode::OfLatent code(bool with_derivative = true) {
           {directions, with_derivative ? decltype(StateCode::differentiate)(directions_derivative) : nullptr, read_names}};
 }
 
-const Model& text_model() {
-  static const Model model = Model::parse(std::string(bead) + words, "bead.toml");
+const Model& text_bead() {
+  static const Model model = Model::parse(std::string(bead_text) + words, "bead.toml");
   return model;
 }
 
-Model code_model(const ModelCode::OfLatent& latent = code()) {
-  return Model::parse(std::string(bead) + left_to_code, "bead.toml", ModelCode{{}, {{"contact", latent}}});
+Model code_bead(const ModelCode::OfLatent& latent = code()) {
+  return Model::parse(std::string(bead_text) + left_to_code, "bead.toml", ModelCode{{}, {{"contact", latent}}});
 }
 
 LatentSpec words_of_spec() {
@@ -105,26 +105,26 @@ LatentSpec code_of_spec() {
 }
 
 std::vector<Observations> observations() {
-  const GeneratedData data = test::draw(text_model(), 30, seed);
-  return {{data.states, View::constrained_acceleration(*text_model().system), data.accelerations, VectorXd::Constant(2, 0.05)}};
+  const GeneratedData data = test::draw(text_bead(), 30, code_latents_seed);
+  return {{data.states, View::constrained_acceleration(*text_bead().system), data.accelerations, VectorXd::Constant(2, 0.05)}};
 }
 
-struct Evaluated {
+struct EvaluatedPrior {
   double value = 0;
   ModelGradient gradient;
 };
 
-Evaluated evaluated(const Prior& prior) {
+EvaluatedPrior evaluated_prior(const Prior& prior) {
   const std::vector<Observations> data = observations();
   ModelValues values = model_values(prior, data, default_hyperparameters(prior, data, {}, Protocol()));
   values.parameters *= 1.02;
-  Evaluated out;
+  EvaluatedPrior out;
   Likelihood::Workspace workspace;
   out.value = Likelihood(prior, data, values, {{0}, true}).evaluate(values, &out.gradient, workspace);
   return out;
 }
 
-FitFile fitted(const Model& model) {
+FitFile fitted_bead(const Model& model) {
   FitFile fit;
   fit.model = model;
   fit.data_source = "bead.csv";
@@ -139,11 +139,11 @@ FitFile fitted(const Model& model) {
 }
 
 TEST(CodeLatents, OfWordsAreThoseOfAModelFileToTheBit) {
-  const Prior prior = make_prior(text_model().system, {words_of_spec()});
-  const Evaluated here = evaluated(prior), there = evaluated(make_prior(text_model()));
+  const Prior prior = make_prior(text_bead().system, {words_of_spec()});
+  const EvaluatedPrior here = evaluated_prior(prior), there = evaluated_prior(make_prior(text_bead()));
   EXPECT_EQ(here.value, there.value);
   EXPECT_EQ(here.gradient.parameters, there.gradient.parameters);
-  EXPECT_EQ(prior.reads(), make_prior(text_model()).reads());
+  EXPECT_EQ(prior.reads(), make_prior(text_bead()).reads());
 }
 
 TEST(CodeLatents, OfWordsTakeAngles) {
@@ -163,29 +163,29 @@ mass = [["1"]]
 }
 
 TEST(CodeLatents, HaveTheLikelihoodAndItsGradient) {
-  const Evaluated text = evaluated(make_prior(text_model()));
+  const EvaluatedPrior text = evaluated_prior(make_prior(text_bead()));
   EXPECT_GT(std::abs(text.gradient.parameters[0]), 1e-3);
   for (const bool with_derivative : {true, false}) {
-    const Evaluated here = evaluated(make_prior(code_model(code(with_derivative))));
+    const EvaluatedPrior here = evaluated_prior(make_prior(code_bead(code(with_derivative))));
     EXPECT_NEAR(here.value, text.value, 1e-12 * std::abs(text.value));
     // differences are good to ε^(2/3) ≈ 4e-11 of terms that cancel in part
     EXPECT_NEAR(here.gradient.parameters[0], text.gradient.parameters[0],
                 (with_derivative ? 1e-12 : 1e-8) * std::abs(text.gradient.parameters[0]));
   }
-  const Evaluated without_file = evaluated(make_prior(text_model().system, {code_of_spec()}));
+  const EvaluatedPrior without_file = evaluated_prior(make_prior(text_bead().system, {code_of_spec()}));
   EXPECT_NEAR(without_file.value, text.value, 1e-12 * std::abs(text.value));
-  EXPECT_EQ(make_prior(code_model()).reads(), make_prior(text_model()).reads());
+  EXPECT_EQ(make_prior(code_bead()).reads(), make_prior(text_bead()).reads());
 }
 
 TEST(CodeLatents, ServeInALoop) {
-  FitFile text = fitted(text_model()), code = fitted(code_model());
+  FitFile text = fitted_bead(text_bead()), code = fitted_bead(code_bead());
   code.report = text.report;
   for (Hyperparameter& h : code.report.hyperparameters) {
     if (h.kind == Hyperparameter::Kind::signal_stddev) h.name = "signal_std[contact:normal]";
   }
   const Predictor of_text(text.posterior()), of_code(code.posterior());
   Predictor::Workspace text_memory = of_text.make_workspace(), code_memory = of_code.make_workspace();
-  const MatrixXd states = test::draw(text_model(), 5, seed + 1).states;
+  const MatrixXd states = test::draw(text_bead(), 5, code_latents_seed + 1).states;
   for (Index i = 0; i < states.cols(); ++i) {
     VectorXd expected(2), mean(2), stddev(2), expected_stddev(2);
     MatrixXd jacobian(2, 5), expected_jacobian(2, 5);
@@ -202,25 +202,25 @@ TEST(CodeLatents, ServeInALoop) {
 TEST(CodeLatents, HaveADiscrepancyBesideThem) {
   PriorOptions options;
   options.discrepancy = Discrepancy{VectorXd{{0.3, 0.4}}, VectorXd::Constant(2, 0.01)};
-  const double text = evaluated(make_prior(text_model(), options)).value;
-  EXPECT_NEAR(evaluated(make_prior(code_model(), options)).value, text, 1e-12 * std::abs(text));
+  const double text = evaluated_prior(make_prior(text_bead(), options)).value;
+  EXPECT_NEAR(evaluated_prior(make_prior(code_bead(), options)).value, text, 1e-12 * std::abs(text));
 }
 
 TEST(CodeLatents, ComeBackFromAFitFileToTheBit) {
   const TemporaryFolder folder;
-  const MatrixXd states = test::draw(text_model(), 5, seed + 2).states;
-  const View view = View::constrained_acceleration(*text_model().system);
+  const MatrixXd states = test::draw(text_bead(), 5, code_latents_seed + 2).states;
+  const View view = View::constrained_acceleration(*text_bead().system);
   // the latent alone is code, or everything is
-  for (const Model& model : {code_model(), Model::from_code(text_model().system, {code_of_spec()})}) {
-    const FitFile fit = fitted(model);
+  for (const Model& model : {code_bead(), Model::from_code(text_bead().system, {code_of_spec()})}) {
+    const FitFile fit = fitted_bead(model);
     fit.write(folder / "fit.json");
     EXPECT_EQ(FitFile::read(folder / "fit.json", model.code).posterior().mean(view, states), fit.posterior().mean(view, states));
     EXPECT_THAT(input_error_of([&] { FitFile::read(folder / "fit.json"); }), HasSubstr("are code, which a file cannot hold"));
   }
-  EXPECT_THAT(input_error_of([&] { FitFile::read(folder / "fit.json", code_model().code); }),
+  EXPECT_THAT(input_error_of([&] { FitFile::read(folder / "fit.json", code_bead().code); }),
               HasSubstr("the mechanics of its model 'bead' are code"));
-  fitted(text_model()).write(folder / "fit.json");
-  EXPECT_THAT(input_error_of([&] { FitFile::read(folder / "fit.json", code_model().code); }),
+  fitted_bead(text_bead()).write(folder / "fit.json");
+  EXPECT_THAT(input_error_of([&] { FitFile::read(folder / "fit.json", code_bead().code); }),
               HasSubstr("code is given, but this fit is all text"));
 }
 
@@ -231,21 +231,21 @@ TEST(CodeLatents, WithoutAFileDeclareEverythingThatTheyHave) {
   LatentSpec plain;
   plain.name = R"(a "quoted" name)";
   plain.features = {"x"};
-  const Model model = Model::from_code(text_model().system, {spec, plain});
+  const Model model = Model::from_code(text_bead().system, {spec, plain});
   ASSERT_EQ(model.latents.size(), 2U);
   EXPECT_EQ(model.latents[0].directions, spec.directions);
   EXPECT_EQ(model.latents[0].lengthscale.upper, 10);
   EXPECT_EQ(model.latents[0].lengthscale.log_stddev, 0.5);
   EXPECT_EQ(model.latents[0].signal_stddev.initial, 2);
   EXPECT_EQ(model.latents[1].name, plain.name);
-  EXPECT_EQ(model.system, text_model().system);
+  EXPECT_EQ(model.system, text_bead().system);
 }
 
 TEST(CodeLatents, AreRefusedWhereTheyDoNotFit) {
   const auto spec_refused = [](const std::function<void(LatentSpec&)>& change) {
     LatentSpec spec = code_of_spec();
     change(spec);
-    return input_error_of([&] { evaluated(make_prior(text_model().system, {spec})); });
+    return input_error_of([&] { evaluated_prior(make_prior(text_bead().system, {spec})); });
   };
   EXPECT_EQ(spec_refused([](LatentSpec& s) { s.features.clear(); }),
             "latent 'contact': it needs at least one feature; code needs a name for each of its numbers");
@@ -281,7 +281,7 @@ TEST(CodeLatents, AreRefusedWhereTheyDoNotFit) {
 
 TEST(CodeLatents, AreGivenForWhatTheFileLeavesToThem) {
   const auto refused = [](const std::string& text, const ModelCode& given) {
-    return input_error_of([&] { Model::parse(bead + text, "bead.toml", given); });
+    return input_error_of([&] { Model::parse(bead_text + text, "bead.toml", given); });
   };
   const auto given = [](const std::string& name, const ModelCode::OfLatent& latent) { return ModelCode{{}, {{name, latent}}}; };
   EXPECT_THAT(refused(left_to_code, {}), testing::MatchesRegex(".*latent.features: those of 'contact' are code, and none is "
@@ -296,7 +296,7 @@ TEST(CodeLatents, AreGivenForWhatTheFileLeavesToThem) {
               HasSubstr("a latent needs at least one feature"));
   FitPriorOptions baseline;
   baseline.baseline = Baseline{Baseline::Kind::se, VectorXd::Zero(2), VectorXd::Zero(2), VectorXd::Ones(2)};
-  EXPECT_THAT(input_error_of([&] { make_prior(code_model(), baseline); }), HasSubstr("a baseline needs features as expressions"));
+  EXPECT_THAT(input_error_of([&] { make_prior(code_bead(), baseline); }), HasSubstr("a baseline needs features as expressions"));
 }
 
 }  // namespace

@@ -26,7 +26,7 @@ using testing::AllOf;
 using testing::HasSubstr;
 using testing::StartsWith;
 
-constexpr std::uint64_t seed = 60601;
+constexpr std::uint64_t code_mechanics_seed = 60601;
 
 const Model& text_model() { return test::model("models/surface.toml"); }
 
@@ -134,7 +134,7 @@ TEST(CodeMechanics, MustBeASystemAsTheFileDeclaresIt) {
 // ---- data
 
 TEST(CodeMechanics, GenerateTheDataOfTheText) {
-  const auto drawn = [](const Model& model) { return generate(model, {30, seed, VectorXd::Constant(3, 0.1)}); };
+  const auto drawn = [](const Model& model) { return generate(model, {30, code_mechanics_seed, VectorXd::Constant(3, 0.1)}); };
   const GeneratedData code = drawn(code_model()), text = drawn(text_model());
   EXPECT_EQ(code.known, text.known);
   expect_close(code.states, text.states, 1e-14);
@@ -147,7 +147,7 @@ TEST(CodeMechanics, WithoutResidualsLeaveNothingToSolveFor) {
     d.mechanics_reads->push_back("q3");
   }));
   EXPECT_EQ(
-      input_error_of([&] { test::draw(code, 3, seed); }),
+      input_error_of([&] { test::draw(code, 3, code_mechanics_seed); }),
       "surface.toml: [sampling] says nothing of 'q3', which the model reads, and no constraint decides it: add q3 = [lower, "
       "upper]");
 }
@@ -159,24 +159,27 @@ TEST(CodeMechanics, SolveOnlyForWhatTheResidualsDecide) {
     d.force_reads.reset();
     d.residuals_read.reset();
   }));
-  EXPECT_THAT(input_error_of([&] { test::draw(code, 3, seed); }),
+  EXPECT_THAT(input_error_of([&] { test::draw(code, 3, code_mechanics_seed); }),
               HasSubstr("[sampling] says nothing of 't', which the model reads"));
   std::string text = test::surface_without_mechanics() + "t = \"0\"\n";
   const Model timed =
       Model::parse(text, "surface.toml", {changed_surface([](auto& d) { d.mechanics_reads = d.force_reads = std::nullopt; })});
-  expect_close(test::draw(timed, 5, seed).accelerations, test::draw(text_model(), 5, seed).accelerations, 1e-13);
+  expect_close(test::draw(timed, 5, code_mechanics_seed).accelerations,
+               test::draw(text_model(), 5, code_mechanics_seed).accelerations, 1e-13);
 
   const std::string q2 = "q2  = [-2, 2]\n";
   text.erase(text.find(q2), q2.size());
   const Model open = Model::parse(text, "surface.toml", {test::callable_surface});
-  EXPECT_THAT(input_error_of([&] { test::draw(open, 3, seed); }), HasSubstr("decide only 1 of the 2 unknowns q2, q3"));
+  EXPECT_THAT(input_error_of([&] { test::draw(open, 3, code_mechanics_seed); }),
+              HasSubstr("decide only 1 of the 2 unknowns q2, q3"));
   text += "q2 = [-2, 2]\nq3 = [5, 6]\n";
   const Model off = Model::parse(text, "surface.toml", {test::callable_surface});
-  EXPECT_THAT(input_error_of([&] { test::draw(off, 3, seed); }), HasSubstr("is off the constraint \"the surface\" by"));
+  EXPECT_THAT(input_error_of([&] { test::draw(off, 3, code_mechanics_seed); }),
+              HasSubstr("is off the constraint \"the surface\" by"));
 }
 
 TEST(CodeMechanics, MoveAsTheText) {
-  const VectorXd start = test::draw(text_model(), 1, seed).states.col(0);
+  const VectorXd start = test::draw(text_model(), 1, code_mechanics_seed).states.col(0);
   const auto motion = [&](const Model& model) {
     SimulateOptions options;
     options.times = VectorXd::LinSpaced(11, 0, 2);
@@ -192,7 +195,7 @@ TEST(CodeMechanics, MoveAsTheText) {
 // ---- learning
 
 std::vector<Observations> observations_of(int n) {
-  const GeneratedData data = generate(text_model(), {n, seed, VectorXd::Constant(3, 0.1)});
+  const GeneratedData data = generate(text_model(), {n, code_mechanics_seed, VectorXd::Constant(3, 0.1)});
   return {{data.states, View::all(View::Quantity::constrained_acceleration, *text_model().system), data.accelerations,
            VectorXd::Constant(3, 0.1), true}};
 }
@@ -254,7 +257,7 @@ FitFile fitted(const Model& model, int max_iterations = 200) {
 
 TEST(CodeMechanics, FitAndPredictLikeTheText) {
   const FitFile text = fitted(text_model());
-  const MatrixXd states = test::draw(text_model(), 10, seed + 1).states;
+  const MatrixXd states = test::draw(text_model(), 10, code_mechanics_seed + 1).states;
   EXPECT_TRUE(text.report.converged);
   for (const MechanicsSource& mechanics : {MechanicsSource(test::callable_surface), MechanicsSource(test::differenced_surface)}) {
     const FitFile code = fitted(code_model(mechanics));
@@ -312,7 +315,7 @@ TEST(CodeMechanics, AreToldAFitFileAgain) {
   const FitFile read = FitFile::read(folder / "fit.json", {test::callable_surface});
   EXPECT_TRUE(read.model.code);
   EXPECT_EQ(read.model.text, fit.model.text);
-  const MatrixXd states = test::draw(text_model(), 5, seed + 1).states;
+  const MatrixXd states = test::draw(text_model(), 5, code_mechanics_seed + 1).states;
   const View view = View::all(View::Quantity::constrained_acceleration, *fit.model.system);
   EXPECT_EQ(read.posterior().mean(view, states), fit.posterior().mean(view, states));
   EXPECT_EQ(read.posterior().marginal(view, states).covariance, fit.posterior().marginal(view, states).covariance);

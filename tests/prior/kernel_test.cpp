@@ -19,7 +19,7 @@ using Eigen::VectorXd;
 using testing::AllOf;
 using testing::HasSubstr;
 
-constexpr std::uint64_t seed = 30301;
+constexpr std::uint64_t kernel_seed = 30301;
 const std::vector<std::string> two_features = {"a", "b"};
 
 // parameters between 0.5 and 2
@@ -74,8 +74,8 @@ INSTANTIATE_TEST_SUITE_P(Each, KernelPrimitives,
                          [](const auto& instance) { return instance.param; });
 
 TEST_P(KernelPrimitives, AreTheirPrintedFormulas) {
-  SCOPED_TRACE(fmt::format("seed {}", seed));
-  RandomStream random(seed);
+  SCOPED_TRACE(fmt::format("seed {}", kernel_seed));
+  RandomStream random(kernel_seed);
   const Kernel kernel = Kernel::parse(GetParam(), two_features);
   for (int trial = 0; trial < 200; ++trial) {
     const VectorXd values = random_parameters(kernel, random);
@@ -96,8 +96,8 @@ TEST_P(KernelPrimitives, AreOneAtNoDistanceUnlessLinear) {
 }
 
 TEST(KernelTest, SumsAndProductsCombineTheirPartsAndAmplitudesScaleLaterTerms) {
-  SCOPED_TRACE(fmt::format("seed {}", seed));
-  RandomStream random(seed);
+  SCOPED_TRACE(fmt::format("seed {}", kernel_seed));
+  RandomStream random(kernel_seed);
   const Kernel kernel = Kernel::parse(" se*linear + periodic + rq * matern32*constant", two_features);
   EXPECT_EQ(names_of(kernel),
             (std::vector<std::string>{"se.lengthscale(a)", "se.lengthscale(b)", "linear.lengthscale(a)", "linear.lengthscale(b)",
@@ -117,7 +117,7 @@ TEST(KernelTest, SumsAndProductsCombineTheirPartsAndAmplitudesScaleLaterTerms) {
 }
 
 TEST(KernelTest, ManyPointsAtOnceAreThePointsOneByOne) {
-  RandomStream random(seed);
+  RandomStream random(kernel_seed);
   for (const char* text : {"matern52", "se + linear*periodic"}) {
     const Kernel kernel = Kernel::parse(text, two_features);
     const VectorXd values = random_parameters(kernel, random);
@@ -157,8 +157,8 @@ INSTANTIATE_TEST_SUITE_P(Each, KernelGradients,
                          [](const auto& instance) { return fmt::format("Kernel{}", instance.index); });
 
 TEST_P(KernelGradients, MatchDifferencesInTheLogarithmOfEveryParameter) {
-  SCOPED_TRACE(fmt::format("kernel {}, seed {}", GetParam(), seed));
-  RandomStream random(seed);
+  SCOPED_TRACE(fmt::format("kernel {}, seed {}", GetParam(), kernel_seed));
+  RandomStream random(kernel_seed);
   const Kernel kernel = Kernel::parse(GetParam(), two_features);
   const VectorXd values = random_parameters(kernel, random);
   MatrixXd points = random_points(7, 2, random);
@@ -192,8 +192,8 @@ TEST_P(KernelGradients, MatchDifferencesInTheLogarithmOfEveryParameter) {
 }
 
 TEST_P(KernelGradients, MatchDifferencesInEveryFeatureOfAPoint) {
-  SCOPED_TRACE(fmt::format("kernel {}, seed {}", GetParam(), seed));
-  RandomStream random(seed);
+  SCOPED_TRACE(fmt::format("kernel {}, seed {}", GetParam(), kernel_seed));
+  RandomStream random(kernel_seed);
   const Kernel kernel = Kernel::parse(GetParam(), two_features);
   const VectorXd values = random_parameters(kernel, random);
   const MatrixXd points = random_points(21, 2, random);
@@ -224,10 +224,10 @@ INSTANTIATE_TEST_SUITE_P(Each, KernelGrams,
                          [](const auto& instance) { return fmt::format("Kernel{}", instance.index); });
 
 TEST_P(KernelGrams, ArePositiveSemidefinite) {
-  RandomStream random(seed);
+  RandomStream random(kernel_seed);
   const Kernel kernel = Kernel::parse(GetParam(), two_features);
   for (int trial = 0; trial < 10; ++trial) {
-    SCOPED_TRACE(fmt::format("kernel {}, seed {}, trial {}", GetParam(), seed, trial));
+    SCOPED_TRACE(fmt::format("kernel {}, seed {}, trial {}", GetParam(), kernel_seed, trial));
     const VectorXd values = random_parameters(kernel, random);
     const MatrixXd points = random_points(25, 2, random);
     const MatrixXd gram = kernel.evaluate(points, points, values);

@@ -13,7 +13,7 @@ namespace {
 using Eigen::MatrixXd;
 using Eigen::VectorXd;
 
-constexpr std::uint64_t seed = 30302;
+constexpr std::uint64_t prior_seed = 30302;
 
 // directions and a force with parameters in them, on a mass matrix with parameters; the speed has no derivative at rest
 const Model& friction_model() {
@@ -78,8 +78,8 @@ std::vector<PriorCase> prior_cases() {
 }
 
 MatrixXd states_of(const Model& model) {
-  if (!model.sampling.empty()) return test::draw(model, 5, seed).states;
-  RandomStream random(seed);
+  if (!model.sampling.empty()) return test::draw(model, 5, prior_seed).states;
+  RandomStream random(prior_seed);
   MatrixXd states(model.system->layout().size(), 6);
   for (double& entry : states.reshaped()) entry = random.normal();
   states.col(5).segment(model.system->nq(), model.system->nq()).setZero();  // at rest
@@ -135,7 +135,7 @@ TEST(PriorTest, DerivativesInEveryParameterMatchDifferences) {
     const bool redundant = prior.system->name().find("redundant") != std::string::npos;
     for (int p = 0; p < static_cast<int>(parameters.size()); ++p) {
       const std::string& name = prior.system->parameters()[static_cast<std::size_t>(p)].name;
-      SCOPED_TRACE(fmt::format("{}, mean {}, parameter {}, seed {}", one.name, static_cast<int>(prior.mean), name, seed));
+      SCOPED_TRACE(fmt::format("{}, mean {}, parameter {}, seed {}", one.name, static_cast<int>(prior.mean), name, prior_seed));
       const PriorValues d = differentiate_prior(prior, states, parameters, mechanics, values_at(parameters),
                                                 prior.system->differentiate(states, parameters, p), p);
       const test::Difference difference = test::central_difference(
@@ -179,7 +179,7 @@ TEST(PriorTest, AnAngleIsReadThroughItsSineAndCosineUnlessAskedForRaw) {
   EXPECT_EQ(raw.latents[0].feature_names, (std::vector<std::string>{"dq1", "dq2", "q3", "dq3", "u1", "u2"}));
 
   // features of a state in the order of their names
-  const MatrixXd states = test::draw(model, 3, seed).states;
+  const MatrixXd states = test::draw(model, 3, prior_seed).states;
   const StateLayout layout = model.system->layout();
   const MatrixXd features = evaluate_features(raw, 0, states);
   ASSERT_EQ(features.rows(), 3);

@@ -16,7 +16,7 @@ using Eigen::Index;
 using Eigen::MatrixXd;
 using Eigen::VectorXd;
 
-constexpr std::uint64_t seed = 50505;
+constexpr std::uint64_t random_features_seed = 50505;
 const std::vector<std::string> three_features = {"a", "b", "c"};
 
 struct Case {
@@ -27,7 +27,7 @@ struct Case {
 };
 
 Case make_case(const std::string& text) {
-  RandomStream random(seed);
+  RandomStream random(random_features_seed);
   Case c{Kernel::parse(text, three_features), {}, MatrixXd(4, 3), MatrixXd(4, 4)};
   c.values.resize(static_cast<Index>(c.kernel.parameters().size()));
   for (double& value : c.values) value = std::exp2(2 * random.uniform() - 1);
@@ -37,7 +37,7 @@ Case make_case(const std::string& text) {
 }
 
 MatrixXd covariance_of_features(const Case& c, int n_features, std::uint64_t stream) {
-  RandomStream random(seed, stream);
+  RandomStream random(random_features_seed, stream);
   const RandomFeatures features(c.kernel, c.values, n_features, random);
   MatrixXd psi(features.size(), c.points.rows());
   for (Index j = 0; j < psi.cols(); ++j) features.evaluate(c.points.row(j).transpose(), psi.col(j));
@@ -73,7 +73,7 @@ TEST(RandomFeaturesTest, HaveTheCovarianceOfTheirKernel) {
         // five standard errors of the mean over draws
         EXPECT_NEAR(found.mean(i, j), c.covariance(i, j),
                     5 * found.stddev(i, j) / std::sqrt(n_draws) + 1e-12 * (1 + std::abs(c.covariance(i, j))))
-            << text << ", points " << i << " and " << j << ", seed " << seed;
+            << text << ", points " << i << " and " << j << ", seed " << random_features_seed;
       }
     }
   }
@@ -110,7 +110,7 @@ TEST(RandomFeaturesTest, AreExactForPolynomialKernels) {
 TEST(RandomFeaturesTest, AreAsManyAsAskedForRoundedUp) {
   const auto size = [](const std::string& text, int n_features) {
     const Case c = make_case(text);
-    RandomStream random(seed);
+    RandomStream random(random_features_seed);
     return RandomFeatures(c.kernel, c.values, n_features, random).size();
   };
   EXPECT_EQ(size("se", 2000), 2000);
@@ -123,7 +123,7 @@ TEST(RandomFeaturesTest, AreAsManyAsAskedForRoundedUp) {
 TEST(RandomFeaturesTest, AreSinesAndCosinesWhateverTheAngle) {
   // one frequency, found from a point where its angle is small; elsewhere the angle is as good as its rounding
   const Kernel kernel = Kernel::parse("se", std::vector<std::string>{"a"});
-  RandomStream random(seed);
+  RandomStream random(random_features_seed);
   const RandomFeatures features(kernel, VectorXd::Ones(1), 2, random);
   const auto at = [&](double x) {
     VectorXd psi(2);

@@ -20,7 +20,7 @@ using Eigen::MatrixXd;
 using Eigen::VectorXd;
 using test::eps;
 
-constexpr std::uint64_t seed = 20273;
+constexpr std::uint64_t chain_seed = 20273;
 
 // of the processor: other programs run beside the tests
 double seconds_of(const std::function<void()>& work) {
@@ -46,7 +46,7 @@ TEST_P(Chain, IsCheckedGeneratedFittedPredictedAndSimulated) {
   ASSERT_EQ(system.nc(), 2 * n_links);
 
   GeneratedData data;
-  step("generate", [&] { data = generate(model, {100, seed, VectorXd::Constant(n, 0.05)}); });
+  step("generate", [&] { data = generate(model, {100, chain_seed, VectorXd::Constant(n, 0.05)}); });
   std::vector<Finding> findings;
   step("check", [&] {
     findings = check_system(system, data.states, system.parameter_values());
@@ -89,7 +89,7 @@ TEST_P(Chain, IsCheckedGeneratedFittedPredictedAndSimulated) {
   const double evaluations = fitted->report.restarts.front().evaluations;
   RecordProperty("evaluations", fmt::format("{}", evaluations));
 
-  const MatrixXd queries = test::draw(model, 20, seed + 1).states;
+  const MatrixXd queries = test::draw(model, 20, chain_seed + 1).states;
   const View ddq = View::all(View::Quantity::constrained_acceleration, system);
   Posterior::Marginal marginal;
   step("predict", [&] { marginal = fitted->posterior.marginal(ddq, queries); });
@@ -128,7 +128,7 @@ TEST(ChainTest, TheWorkPerStateGrowsAsTheCubeOfTheLinks) {
   std::vector<double> seconds;
   for (const int n_links : {5, 10, 20}) {
     const Model model = Model::parse(test::chain_of_links(n_links), "a chain");
-    const MatrixXd states = test::draw(model, 20, seed).states;
+    const MatrixXd states = test::draw(model, 20, chain_seed).states;
     MechanicsBatch batch;
     // a clock that ticks in microseconds
     double best = 1e9;

@@ -20,14 +20,14 @@ using test::eps;
 using test::Problem;
 using test::Quantity;
 
-constexpr std::uint64_t seed = 20271;
+constexpr std::uint64_t edge_cases_seed = 20271;
 
 Problem surface_problem(int n) {
   const Model& model = test::model("models/surface.toml");
-  RandomStream random(seed);
-  Problem p{"surface", make_prior(model), {}, {}, test::draw(model, 5, seed + 1).states, {}};
+  RandomStream random(edge_cases_seed);
+  Problem p{"surface", make_prior(model), {}, {}, test::draw(model, 5, edge_cases_seed + 1).states, {}};
   p.observations = {test::observe(model, View::all(Quantity::constrained_acceleration, *model.system),
-                                  test::draw(model, n, seed).states, random)};
+                                  test::draw(model, n, edge_cases_seed).states, random)};
   p.values = test::random_values(p.prior, p.observations, random);
   return p;
 }
@@ -37,10 +37,10 @@ TEST(EdgeCaseTest, APointMeasuredTwiceIsOneOfHalfTheVariance) {
   const Problem p = surface_problem(30);
   const Observations& first = p.observations[0];
   MatrixXd again = first.values();
-  RandomStream random(seed, 2);
+  RandomStream random(edge_cases_seed, 2);
   for (double& y : again.reshaped()) y += 0.1 * random.normal();
   for (const double apart : {0.0, 1e-15, 1e-12}) {
-    SCOPED_TRACE(fmt::format("apart {:g}, seed {}", apart, seed));
+    SCOPED_TRACE(fmt::format("apart {:g}, seed {}", apart, edge_cases_seed));
     MatrixXd moved = first.states();
     for (double& entry : moved.reshaped()) entry *= 1 + apart * random.normal();
     Observations twice = first;
@@ -148,7 +148,7 @@ TEST(EdgeCaseTest, FeaturesThatDoNotVarySayNothing) {
 TEST(EdgeCaseTest, OfManyCoordinatesThoseAreFoundThatDetermineTheOthers) {
   const Model chain = Model::parse(test::chain_of_links(5), "chain");
   const System& system = *chain.system;
-  const GeneratedData data = generate(chain, {8, seed, VectorXd::Zero(system.nq())});
+  const GeneratedData data = generate(chain, {8, edge_cases_seed, VectorXd::Zero(system.nq())});
   const auto rows = dependent_columns(system, data.states, system.parameter_values(), data.accelerations);
   ASSERT_TRUE(rows.has_value());
   ASSERT_EQ(rows->size(), 5U);
@@ -176,7 +176,7 @@ directions = "acceleration"
 )toml",
                         "linkage");
   };
-  RandomStream random(seed);
+  RandomStream random(edge_cases_seed);
   MatrixXd states(7, 15);
   for (double& entry : states.reshaped()) entry = random.normal();
   for (const auto& [constraints, freedom] : std::vector<std::pair<std::string, int>>{

@@ -18,7 +18,7 @@ using Real = boost::multiprecision::cpp_bin_float_50;
 using RealMatrix = Eigen::Matrix<Real, Eigen::Dynamic, Eigen::Dynamic>;
 using RealVector = Eigen::Matrix<Real, Eigen::Dynamic, 1>;
 
-constexpr std::uint64_t seed = 20270;
+constexpr std::uint64_t likelihood_precision_seed = 20270;
 
 // Everything that can be tuned, in 50 digits: logarithms of lengthscales, signal and noise standard deviations.
 struct Tuned {
@@ -84,11 +84,11 @@ class Reference {
 };
 
 // @param stretch  of the lengthscales: long ones bring the smallest eigenvalues of K̃ down to nothing, and those of K̃ + I to 1
-Problem surface_problem(double stretch, double signal) {
+Problem stretched_surface_problem(double stretch, double signal) {
   const Model& model = test::model("models/surface.toml");
-  RandomStream random(seed);
+  RandomStream random(likelihood_precision_seed);
   Problem p{"surface", make_prior(model), {}, {}, {}, {}};
-  const MatrixXd states = test::draw(model, 14, seed).states;
+  const MatrixXd states = test::draw(model, 14, likelihood_precision_seed).states;
   p.observations = {test::observe(model, View::all(View::Quantity::constrained_acceleration, *model.system), states, random)};
   p.values = test::random_values(p.prior, p.observations, random);
   p.values.kernel[0] *= stretch;
@@ -122,10 +122,11 @@ TEST(LikelihoodPrecisionTest, IsWhatFiftyDigitsSayToRoundingTimesTheConditionNum
                                                                               {1e3, 1e8},
                                                                               {1e3, 1e10},
                                                                               {1e3, 1e12}}) {
-    const double signal = std::sqrt(target / largest_eigenvalue(surface_problem(stretch, 1)));
-    const Problem p = surface_problem(stretch, signal);
+    const double signal = std::sqrt(target / largest_eigenvalue(stretched_surface_problem(stretch, 1)));
+    const Problem p = stretched_surface_problem(stretch, signal);
     const double kappa = largest_eigenvalue(p);
-    SCOPED_TRACE(fmt::format("lengthscales {} times as long, condition {:.1e}, seed {}", stretch, kappa, seed));
+    SCOPED_TRACE(
+        fmt::format("lengthscales {} times as long, condition {:.1e}, seed {}", stretch, kappa, likelihood_precision_seed));
     EXPECT_NEAR(std::log10(kappa), std::log10(target), 0.5);
 
     Likelihood::Options options;

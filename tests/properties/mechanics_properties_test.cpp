@@ -23,7 +23,7 @@ RandomStream stream() { return RandomStream(test::random_seed()); }
 
 UdwadiaKalaba projection_of(const RandomMechanics& mechanics) { return {mechanics.M, mechanics.A, mechanics.b}; }
 
-void expect_at_most(double value, double bound, const char* law) {
+void expect_within(double value, double bound, const char* law) {
   RC_LOG() << law << ": " << value << ", allowed " << bound << '\n';
   RC_ASSERT(value <= bound);
 }
@@ -40,11 +40,11 @@ RC_GTEST_PROP(MechanicsProperty, TheProjectionIsTheOneOfItsLaws, ()) {
   const auto [B, norms] = white.rows(mechanics.A.cast<long double>());
   // A T = 0, T² = T, M T = Tᵀ M, and trace T = n − rank: whitened, T is an orthogonal projection
   const double backward = mechanics.rounding() / mechanics.condition_of_rows;
-  expect_at_most(largest_extended(B * T), backward, "A T = 0");
-  expect_at_most(largest_extended(T * T - T), backward, "T² = T");
-  expect_at_most(largest_extended(T - T.transpose()), backward, "M T = Tᵀ M");
-  expect_at_most(std::abs(static_cast<double>(T.trace()) - static_cast<double>(mechanics.n() - mechanics.rank())),
-                 backward * static_cast<double>(mechanics.n()), "trace T = n − rank A");
+  expect_within(largest_extended(B * T), backward, "A T = 0");
+  expect_within(largest_extended(T * T - T), backward, "T² = T");
+  expect_within(largest_extended(T - T.transpose()), backward, "M T = Tᵀ M");
+  expect_within(std::abs(static_cast<double>(T.trace()) - static_cast<double>(mechanics.n() - mechanics.rank())),
+                backward * static_cast<double>(mechanics.n()), "trace T = n − rank A");
 }
 
 RC_GTEST_PROP(MechanicsProperty, LIsAGeneralisedInverse, ()) {
@@ -56,12 +56,12 @@ RC_GTEST_PROP(MechanicsProperty, LIsAGeneralisedInverse, ()) {
   // whitened and of the unit rows, L is B⁺: as large as the rows' conditioning
   const Extended LA = Extended::Identity(mechanics.n(), mechanics.n()) - white.map(projection.T().cast<long double>());
   const Extended L_A = white.map((projection.L() * mechanics.A).cast<long double>());
-  expect_at_most(largest_extended(L_A - LA), mechanics.rounding(), "T = I − L A");
-  expect_at_most(largest_extended(B * L_A - B), mechanics.rounding(), "A L A = A");
+  expect_within(largest_extended(L_A - LA), mechanics.rounding(), "T = I − L A");
+  expect_within(largest_extended(B * L_A - B), mechanics.rounding(), "A L A = A");
   const ExtendedVector Lb = white.acceleration(projection.Lb().cast<long double>());
   const ExtendedVector b = mechanics.b.cast<long double>().cwiseQuotient(norms);
   const double size = static_cast<double>(white.acceleration(mechanics.x.cast<long double>()).norm());
-  expect_at_most(largest_extended(B * Lb - b), mechanics.rounding() * size, "A L b = b");
+  expect_within(largest_extended(B * Lb - b), mechanics.rounding() * size, "A L b = b");
   RC_ASSERT(projection.inconsistency() <= mechanics.rounding() * size);
 }
 
@@ -73,9 +73,9 @@ RC_GTEST_PROP(MechanicsProperty, TheEquationsOfMotionWithMultipliersGiveTheSame,
   const test::ExactProjection exact = test::solve_equations_of_motion(mechanics.M, mechanics.A(mechanics.independent, Eigen::all),
                                                                       mechanics.b(mechanics.independent));
   const double size = 1 + static_cast<double>(white.acceleration(mechanics.x.cast<long double>()).norm());
-  expect_at_most(largest_extended(white.map(projection.T().cast<long double>() - exact.T)), mechanics.rounding(), "T");
-  expect_at_most(largest_extended(white.acceleration(projection.Lb().cast<long double>() - exact.Lb)),
-                 mechanics.rounding() * size, "L b");
+  expect_within(largest_extended(white.map(projection.T().cast<long double>() - exact.T)), mechanics.rounding(), "T");
+  expect_within(largest_extended(white.acceleration(projection.Lb().cast<long double>() - exact.Lb)), mechanics.rounding() * size,
+                "L b");
 }
 
 RC_GTEST_PROP(MechanicsProperty, GaussPrincipleHolds, ()) {
@@ -90,11 +90,11 @@ RC_GTEST_PROP(MechanicsProperty, GaussPrincipleHolds, ()) {
   const double size = static_cast<double>(ddq.norm() + white.acceleration(a_bar.cast<long double>()).norm());
   // admissible, …
   const ExtendedVector b = mechanics.b(mechanics.independent).cast<long double>().cwiseQuotient(norms);
-  expect_at_most(largest_extended(B * ddq - b), mechanics.rounding() * size, "A ddq = b");
+  expect_within(largest_extended(B * ddq - b), mechanics.rounding() * size, "A ddq = b");
   // … and the step from ā, in the metric of M, is a combination of the rows: at right angles to what they leave free
   ExtendedVector free = moved;
   if (mechanics.rank() > 0) free -= B.transpose() * B.transpose().colPivHouseholderQr().solve(moved);
-  expect_at_most(largest_extended(free), mechanics.rounding() * size, "right angles");
+  expect_within(largest_extended(free), mechanics.rounding() * size, "right angles");
 }
 
 RC_GTEST_PROP(MechanicsProperty, ScalingRowsChangesTheMultipliersOnly, ()) {
@@ -107,9 +107,9 @@ RC_GTEST_PROP(MechanicsProperty, ScalingRowsChangesTheMultipliersOnly, ()) {
   RC_ASSERT(scaled.rank() == projection.rank());
   const test::Whitening white(mechanics.M);
   const double size = 1 + static_cast<double>(white.acceleration(mechanics.x.cast<long double>()).norm());
-  expect_at_most(largest_extended(white.map((scaled.T() - projection.T()).cast<long double>())), mechanics.rounding(), "T");
-  expect_at_most(largest_extended(white.acceleration((scaled.Lb() - projection.Lb()).cast<long double>())),
-                 mechanics.rounding() * size, "L b");
+  expect_within(largest_extended(white.map((scaled.T() - projection.T()).cast<long double>())), mechanics.rounding(), "T");
+  expect_within(largest_extended(white.acceleration((scaled.Lb() - projection.Lb()).cast<long double>())),
+                mechanics.rounding() * size, "L b");
   // λ of independent rows is that of the rows as written: Aᵀλ is the same force
   if (mechanics.rank() < mechanics.A.rows()) return;
   const VectorXd force = mechanics.M * (projection.Lb() - mechanics.x);
@@ -117,8 +117,8 @@ RC_GTEST_PROP(MechanicsProperty, ScalingRowsChangesTheMultipliersOnly, ()) {
   const VectorXd of_scaled = scale.cwiseProduct(scaled.multipliers_of_force() * force);
   const auto [B, norms] = white.rows(mechanics.A.cast<long double>());
   // … from a force whose parts along rows at small angles to each other cancel
-  expect_at_most(largest_extended(norms.cwiseProduct((of_scaled - lambda).cast<long double>())),
-                 mechanics.rounding() * mechanics.condition_of_rows * size, "λ");
+  expect_within(largest_extended(norms.cwiseProduct((of_scaled - lambda).cast<long double>())),
+                mechanics.rounding() * mechanics.condition_of_rows * size, "λ");
 }
 
 RC_GTEST_PROP(MechanicsProperty, ARowThatFollowsFromTheOthersChangesTheMultipliersOnly, ()) {
@@ -140,10 +140,10 @@ RC_GTEST_PROP(MechanicsProperty, ARowThatFollowsFromTheOthersChangesTheMultiplie
   const ExtendedVector norms = white.rows(A.cast<long double>()).second;
   const double lost = static_cast<double>(weights.cwiseAbs().cast<long double>().dot(norms.head(m)) / norms[m]);
   const double size = 1 + static_cast<double>(white.acceleration(mechanics.x.cast<long double>()).norm());
-  expect_at_most(largest_extended(white.map((extended.T() - projection.T()).cast<long double>())), lost * mechanics.rounding(),
-                 "T");
-  expect_at_most(largest_extended(white.acceleration((extended.Lb() - projection.Lb()).cast<long double>())),
-                 lost * mechanics.rounding() * size, "L b");
+  expect_within(largest_extended(white.map((extended.T() - projection.T()).cast<long double>())), lost * mechanics.rounding(),
+                "T");
+  expect_within(largest_extended(white.acceleration((extended.Lb() - projection.Lb()).cast<long double>())),
+                lost * mechanics.rounding() * size, "L b");
 }
 
 // A motion of M, A and b along which the rank stays: A(τ) = W (R + τ R') (I + τ X), rows combined as they were.
@@ -230,22 +230,22 @@ RC_GTEST_PROP(MechanicsProperty, ANearlyRedundantRowIsNeverAWrongNumber, ()) {
   const double backward = mechanics.rounding() / mechanics.condition_of_rows + refined;
   // a projection it is, and a motion that satisfies the constraints, to what was dropped
   const double dropped = projection.rank() == mechanics.rank() ? 100 * UdwadiaKalaba::rank_tolerance : 0;
-  expect_at_most(largest_extended(T * T - T), backward, "T² = T");
-  expect_at_most(largest_extended(T - T.transpose()), backward, "M T = Tᵀ M");
-  expect_at_most(largest_extended(B * T), backward + dropped, "A T = 0");
+  expect_within(largest_extended(T * T - T), backward, "T² = T");
+  expect_within(largest_extended(T - T.transpose()), backward, "M T = Tᵀ M");
+  expect_within(largest_extended(B * T), backward + dropped, "A T = 0");
   RC_ASSERT(projection.rank() == mechanics.rank() || projection.rank() == mechanics.rank() + 1);
   // what the rank leaves unsatisfied is what is reported
   const ExtendedVector Lb = white.acceleration(projection.Lb().cast<long double>());
   const ExtendedVector residual = B * Lb - b.cast<long double>().cwiseQuotient(norms);
   const double scale = size + static_cast<double>(Lb.norm());
-  expect_at_most(std::abs(largest_extended(residual) - projection.inconsistency()), mechanics.rounding() * scale,
-                 "the residual reported");
+  expect_within(std::abs(largest_extended(residual) - projection.inconsistency()), mechanics.rounding() * scale,
+                "the residual reported");
   if (projection.rank() == mechanics.rank()) {
     // what was dropped is no more than the tolerance allows: the row's distance from the span of the others
     const test::ExactProjection others =
         test::project_by_qr(mechanics.M, mechanics.A(mechanics.independent, Eigen::all), mechanics.b(mechanics.independent));
-    expect_at_most(largest_extended(B.row(m) * white.map(others.T)),
-                   10 * UdwadiaKalaba::rank_tolerance * mechanics.condition_of_rows + backward, "the row dropped");
+    expect_within(largest_extended(B.row(m) * white.map(others.T)),
+                  10 * UdwadiaKalaba::rank_tolerance * mechanics.condition_of_rows + backward, "the row dropped");
     return;
   }
   // kept: the projection of all these rows, to what the small angle leaves of double precision
@@ -254,8 +254,8 @@ RC_GTEST_PROP(MechanicsProperty, ANearlyRedundantRowIsNeverAWrongNumber, ()) {
   const test::ExactProjection exact = test::project_by_qr(mechanics.M, A(independent, Eigen::all), b(independent));
   const double angle = test::condition_number(B(independent, Eigen::all).cast<double>());
   const double tolerance = backward * angle;
-  expect_at_most(largest_extended(T - white.map(exact.T)), tolerance, "T");
-  expect_at_most(largest_extended(white.acceleration(projection.Lb().cast<long double>() - exact.Lb)), tolerance * scale, "L b");
+  expect_within(largest_extended(T - white.map(exact.T)), tolerance, "T");
+  expect_within(largest_extended(white.acceleration(projection.Lb().cast<long double>() - exact.Lb)), tolerance * scale, "L b");
 }
 
 // One state of many where the constraints contradict each other.

@@ -25,10 +25,6 @@ inline std::uint64_t random_seed() {
   return *rc::gen::noShrink(rc::gen::resize(rc::kNominalSize, rc::gen::arbitrary<std::uint32_t>())).as("stream");
 }
 
-inline MatrixXd random_matrix(Index rows, Index columns, RandomStream& random) {
-  return random_vector(rows * columns, random).reshaped(rows, columns);
-}
-
 inline MatrixXd random_orthogonal(Index n, RandomStream& random) {
   return random_matrix(n, n, random).householderQr().householderQ();
 }

@@ -20,7 +20,7 @@ using Eigen::MatrixXd;
 using Eigen::VectorXd;
 using Quantity = View::Quantity;
 
-constexpr std::uint64_t seed = 20274;
+constexpr std::uint64_t threads_seed = 20274;
 constexpr int n_threads = 6;
 
 void in_parallel(const std::function<void(int)>& work) {
@@ -39,8 +39,8 @@ struct Shared {
 
 Shared shared(const std::string& file) {
   const Model& model = test::model(file);
-  const GeneratedData data = generate(model, {24, seed, VectorXd::Constant(model.system->nq(), 0.1)});
-  Shared out{make_prior(model), {}, {}, test::draw(model, 10, seed + 1).states};
+  const GeneratedData data = generate(model, {24, threads_seed, VectorXd::Constant(model.system->nq(), 0.1)});
+  Shared out{make_prior(model), {}, {}, test::draw(model, 10, threads_seed + 1).states};
   out.observations = {{data.states, View::all(Quantity::constrained_acceleration, *model.system), data.accelerations,
                        VectorXd::Constant(model.system->nq(), 0.1), true}};
   out.hyperparameters = default_hyperparameters(out.prior, out.observations, {}, {});
@@ -57,7 +57,7 @@ VectorXd everything(const Posterior& posterior, const Predictor& predictor, cons
     add(posterior.mean(view, queries, 2));
     add(posterior.marginal(view, queries, 2).covariance);
     add(posterior.joint(view, queries.leftCols(2)).covariance);
-    add(posterior.sample({{view, queries.leftCols(2)}}, 2, seed));
+    add(posterior.sample({{view, queries.leftCols(2)}}, 2, threads_seed));
   }
   Predictor::Workspace workspace = predictor.make_workspace();
   VectorXd mean(system.nq()), stddev(system.nq());

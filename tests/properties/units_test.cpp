@@ -16,7 +16,7 @@ using Eigen::VectorXd;
 using test::eps;
 using test::Quantity;
 
-constexpr std::uint64_t seed = 20272;
+constexpr std::uint64_t units_seed = 20272;
 
 /// Numbers in the new units for one of the old.
 struct Units {
@@ -109,11 +109,11 @@ double factor(const Hyperparameter& h, const Prior& prior, const Units& units, b
 }
 
 void expect_same(const Units& units, const Case& c) {
-  SCOPED_TRACE(fmt::format("{}, kernel {}, directions {}, seed {}", units.name, c.kernel, c.directions, seed));
+  SCOPED_TRACE(fmt::format("{}, kernel {}, directions {}, seed {}", units.name, c.kernel, c.directions, units_seed));
   // on the surface, in metres, seconds and joules
   const Model& surface = test::model("models/surface.toml");
-  const MatrixXd states = test::draw(surface, 46, seed).states;
-  RandomStream random(seed);
+  const MatrixXd states = test::draw(surface, 46, units_seed).states;
+  RandomStream random(units_seed);
   MatrixXd accelerations = true_acceleration(surface, states);
   for (double& a : accelerations.reshaped()) a += 0.1 * random.normal();
   const MatrixXd observed = states.leftCols(40), queries = states.rightCols(6);

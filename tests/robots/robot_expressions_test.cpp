@@ -75,7 +75,7 @@ std::filesystem::path written(const std::string& text, const char* name) {
   return path;
 }
 
-std::filesystem::path source(const char* path) { return std::filesystem::path(GP2_SOURCE_DIR) / path; }
+std::filesystem::path source_path(const char* path) { return std::filesystem::path(GP2_SOURCE_DIR) / path; }
 
 Model model_of(const std::filesystem::path& robot, const std::string& more = "") {
   return Model::parse(fmt::format("robot = '{}'\n{}", robot.string(), more), "robot model");
@@ -92,7 +92,7 @@ double largest_difference(const MatrixXd& a, const MatrixXd& b) { return (a - b)
 class RobotOfFile : public testing::TestWithParam<const char*> {
  protected:
   static std::filesystem::path path() {
-    return std::string(GetParam()) == "tree" ? written(tree, "tree.xml") : source(GetParam());
+    return std::string(GetParam()) == "tree" ? written(tree, "tree.xml") : source_path(GetParam());
   }
 };
 
@@ -274,7 +274,7 @@ TEST(RobotExpressions, ForceIsLessThePotentialsSlopeAtRest) {
 }
 
 TEST(RobotExpressions, NumbersOfTheRobotAreParametersWithExactDerivatives) {
-  const Model model = model_of(source("experiments/arm_on_surface/iiwa7.xml"), R"toml(
+  const Model model = model_of(source_path("experiments/arm_on_surface/iiwa7.xml"), R"toml(
 [parameters]
 m = { of = "mass('link7')", value = 1.7, estimate = true }
 cx = { of = 'com("link7").x', value = 0.03 }
@@ -306,7 +306,7 @@ f = { of = 'friction("q5")', value = 0.4 }
 
 // the description with another mass is the same robot as the parameter with that value
 TEST(RobotExpressions, MassAsAParameterIsTheMassOfTheBody) {
-  RobotDescription robot = read_robot(source("experiments/arm_on_surface/iiwa7.xml"));
+  RobotDescription robot = read_robot(source_path("experiments/arm_on_surface/iiwa7.xml"));
   const Model named = Model::parse("robot = 'x'\n[parameters]\nm = { of = \"mass('link7')\", value = 2.2 }", "named",
                                    RobotSource([&](const std::string&) { return robot; }));
   robot.bodies.back().mass = 2.2;
@@ -321,7 +321,7 @@ TEST(RobotExpressions, MassAsAParameterIsTheMassOfTheBody) {
 }
 
 TEST(RobotExpressions, StateDerivativesAreThoseOfDifferences) {
-  const Model model = model_of(source("experiments/arm_on_surface/iiwa7.xml"),
+  const Model model = model_of(source_path("experiments/arm_on_surface/iiwa7.xml"),
                                "inputs = ['u1','u2','u3','u4','u5','u6','u7']\n[constraints]\nposition = ['site(\"tip\").z - "
                                "0.1*sin(site(\"tip\").x)']\n");
   const System& system = *model.system;
@@ -370,7 +370,7 @@ TEST(RobotExpressions, OfALongChainTakeDifferencesInTheState) {
 }
 
 TEST(RobotModel, SaysWhatIsWrong) {
-  const std::string arm = fmt::format("robot = '{}'\n", source("experiments/arm_on_surface/iiwa7.xml").string());
+  const std::string arm = fmt::format("robot = '{}'\n", source_path("experiments/arm_on_surface/iiwa7.xml").string());
   const auto message = [&](const std::string& more) {
     return test::input_error_of([&] { Model::parse(arm + more, "arm.toml"); });
   };

@@ -57,11 +57,11 @@ std::string changed(const std::string& pointer, const Json& value) {
   return json.dump();
 }
 
-std::string error_of(const std::string& text) {
+std::string json_error_of(const std::string& text) {
   return input_error_of([&] { robot_from_json(text); });
 }
 
-std::string error_of_changed(const std::string& pointer, const Json& value) { return error_of(changed(pointer, value)); }
+std::string error_of_changed(const std::string& pointer, const Json& value) { return json_error_of(changed(pointer, value)); }
 
 TEST(RobotJson, ADescriptionComesBackToTheLastBit) {
   const RobotDescription robot = robot_with_everything();
@@ -103,18 +103,18 @@ TEST(RobotJson, JointsAreThoseOfAllBodiesInOrder) {
 
 TEST(RobotJson, TextThatIsNoJsonIsAnError) {
   for (const std::string text : {"", "{", "{\"name\": 1e999}", "nonsense"}) {
-    EXPECT_EQ(error_of(text), "robot: not valid JSON: the text is cut short or damaged") << text;
+    EXPECT_EQ(json_error_of(text), "robot: not valid JSON: the text is cut short or damaged") << text;
   }
-  EXPECT_EQ(error_of("[]"), "robot: array stands where an object must");
-  EXPECT_EQ(error_of(std::string(100000, '[')), "robot: not valid JSON: the text is cut short or damaged");
-  EXPECT_EQ(error_of(std::string(100000, '[') + std::string(100000, ']')), "robot: array stands where an object must");
+  EXPECT_EQ(json_error_of("[]"), "robot: array stands where an object must");
+  EXPECT_EQ(json_error_of(std::string(100000, '[')), "robot: not valid JSON: the text is cut short or damaged");
+  EXPECT_EQ(json_error_of(std::string(100000, '[') + std::string(100000, ']')), "robot: array stands where an object must");
 }
 
 TEST(RobotJson, AKeyThatIsMissingOrUnknownIsNamed) {
-  EXPECT_EQ(error_of("{}"), "robot: 'name' is missing");
+  EXPECT_EQ(json_error_of("{}"), "robot: 'name' is missing");
   Json json = Json::parse(to_json(robot_with_everything()));
   json["bodies"][1]["joints"][0].erase("damping");
-  EXPECT_EQ(error_of(json.dump()), "robot.bodies[1].joints[0]: 'damping' is missing");
+  EXPECT_EQ(json_error_of(json.dump()), "robot.bodies[1].joints[0]: 'damping' is missing");
   EXPECT_EQ(error_of_changed("/sites/0/colour", "red"),
             "robot.sites[0]: 'colour' is not known; there is: name, body, position, rotation");
 }
@@ -151,7 +151,7 @@ TEST(RobotJson, IndicesAreInRange) {
             "coupling 'held': a length has neither joints nor segments");
   Json json = Json::parse(to_json(robot_with_everything()));
   json["couplings"][0]["x"].push_back(json["couplings"][0]["x"][0]);
-  EXPECT_EQ(error_of(json.dump()), "coupling 'gear': x must hold one length or none, got 2");
+  EXPECT_EQ(json_error_of(json.dump()), "coupling 'gear': x must hold one length or none, got 2");
 }
 
 TEST(RobotJson, NumbersObeyTheirLaws) {

@@ -24,7 +24,7 @@ namespace {
 using Eigen::MatrixXd;
 using Eigen::VectorXd;
 
-Model read(const char* file) { return Model::read(std::filesystem::path(GP2_SOURCE_DIR) / file); }
+Model read_model(const char* file) { return Model::read(std::filesystem::path(GP2_SOURCE_DIR) / file); }
 
 GeneratedData motion_of(const Model& model, int n, double noise = 0, std::uint64_t seed = 1) {
   return generate(model, {n, seed, VectorXd::Constant(model.system->nq(), noise)});
@@ -38,7 +38,7 @@ double value_of(const Model& model, const std::string& text, const VectorXd& sta
 }
 
 TEST(Motion, OfTheArmKeepsItsTipOnThePlaneAndPointingDown) {
-  const Model model = read("experiments/arm_on_surface/arm.toml");
+  const Model model = read_model("experiments/arm_on_surface/arm.toml");
   const GeneratedData data = motion_of(model, 240);
   double moved = 0;
   for (Eigen::Index i = 0; i < data.states.cols(); ++i) {
@@ -81,14 +81,14 @@ targets = { q1 = [2, 2.000001] }
 }
 
 TEST(Motion, IsTheSameForAnyNoiseAndTheSameSeedOnly) {
-  const Model model = read("models/four_bar.toml");
+  const Model model = read_model("models/four_bar.toml");
   const GeneratedData quiet = motion_of(model, 40), noisy = motion_of(model, 40, 0.1), other = motion_of(model, 40, 0, 2);
   EXPECT_EQ(quiet.states, noisy.states);
   EXPECT_NE(quiet.accelerations, noisy.accelerations);
   EXPECT_NE(quiet.states, other.states);
 }
 
-std::string error_of(const std::string& text) {
+std::string model_error_of(const std::string& text) {
   return test::input_error_of([&] { motion_of(Model::parse(text, "m"), 2); });
 }
 
@@ -97,7 +97,7 @@ TEST(Motion, SaysWhatIsWrongWithIt) {
   const std::string truth = "[truth]\nacceleration = ['0']\n";
   const std::string motion = "[motion]\nrate = 10\nsegment = [1, 2]\n";
   const auto expect = [&](const std::string& text, const std::string& part) {
-    EXPECT_NE(error_of(text).find(part), std::string::npos) << error_of(text);
+    EXPECT_NE(model_error_of(text).find(part), std::string::npos) << model_error_of(text);
   };
   expect(head + truth + motion, "missing targets = { q1 = [lower, upper], … }");
   expect(head + truth + motion + "targets = {}\n", "a motion needs at least one target");
@@ -156,7 +156,7 @@ TEST(RobotFit, IsReadBackWithoutTheRobotsFileAndPredictsTheSameBits) {
 }
 
 TEST(RobotFit, OfTheFourBarStaysOnItsLoopForAMinute) {
-  const Model model = read("models/four_bar.toml");
+  const Model model = read_model("models/four_bar.toml");
   FitProblem problem;
   const Fit fitted = fit_of(model, problem, 100);
   VectorXd start = VectorXd::Zero(model.system->layout().size());
@@ -174,7 +174,7 @@ TEST(RobotFit, OfTheFourBarStaysOnItsLoopForAMinute) {
 
 // two state Jacobians: exact derivatives of the robot's expressions, and differences of the mean
 TEST(RobotFit, PredictorHasTheJacobianOfItsMean) {
-  const Model model = read("models/four_bar.toml");
+  const Model model = read_model("models/four_bar.toml");
   FitProblem problem;
   const Fit fitted = fit_of(model, problem, 40);
   const View view = View::all(View::Quantity::constrained_acceleration, *model.system);

@@ -77,7 +77,7 @@ std::vector<Found> fit_of(const Model& model, const Observations& data, const st
 
 TEST(ConstraintParameters, AreFoundFromTheStatesWhereAccelerationsAreSilent) {
   const Model model = bead("x^2 + y^2 - l^2");
-  for (const std::uint64_t seed : {1, 2, 3}) {
+  for (const std::uint64_t seed : {1U, 2U, 3U}) {
     const std::vector<Found> exact = fit_of(model, observe(model, 0, seed), {"l"});
     EXPECT_NEAR(exact[0].value, 1, 1e-5);
     const std::vector<Found> noisy = fit_of(model, observe(model, 0.02, seed), {"l"});

@@ -17,7 +17,7 @@ using Eigen::VectorXd;
 using testing::HasSubstr;
 using Kind = Hyperparameter::Kind;
 
-constexpr std::uint64_t seed = 50502;
+constexpr std::uint64_t fit_seed = 50502;
 
 struct Problem {
   Prior prior;
@@ -28,7 +28,7 @@ struct Problem {
 Problem problem(const std::string& file, int n, const std::vector<std::string>& estimated = {}, const Protocol& protocol = {},
                 bool estimate_noise = false, double noise_stddev = 0.05) {
   const Model& model = test::model(file);
-  GenerateOptions options{n, seed, {}};
+  GenerateOptions options{n, fit_seed, {}};
   options.noise_stddev = VectorXd::Constant(model.system->nq(), noise_stddev);
   const GeneratedData data = generate(model, options);
   Problem p{make_prior(model), {}, {}};
@@ -123,7 +123,7 @@ TEST(FitTest, ReportsTheObjectiveAtTheValuesItReturns) {
     for (const Protocol& protocol :
          {Protocol{}, Protocol{Protocol::Name::paper, true}, Protocol{Protocol::Name::standard, false}}) {
       SCOPED_TRACE(fmt::format("{}, protocol {}, hyper-prior {}, seed {}", file, static_cast<int>(protocol.name),
-                               protocol.hyperprior, seed));
+                               protocol.hyperprior, fit_seed));
       const Problem p = problem(file, 20, {}, protocol, true);
       const FitReport report = fit(p.prior, p.observations, p.hyperparameters, quick()).report;
       const double start = objective(p, p.hyperparameters);

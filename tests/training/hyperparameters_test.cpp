@@ -20,10 +20,10 @@ using testing::AllOf;
 using testing::HasSubstr;
 using Kind = Hyperparameter::Kind;
 
-constexpr std::uint64_t seed = 50501;
+constexpr std::uint64_t hyperparameters_seed = 50501;
 
-std::vector<Observations> observe(const Model& model, int n, bool estimate_noise, std::vector<int> rows = {}) {
-  const GeneratedData data = test::draw(model, n, seed);
+std::vector<Observations> observe_drawn(const Model& model, int n, bool estimate_noise, std::vector<int> rows = {}) {
+  const GeneratedData data = test::draw(model, n, hyperparameters_seed);
   View view = View::all(View::Quantity::constrained_acceleration, *model.system);
   if (!rows.empty()) view.rows = rows;
   MatrixXd values(view.size(), n);
@@ -47,7 +47,7 @@ void expect_same(double got, double want) { EXPECT_NEAR(got, want, 64 * test::ep
 TEST(HyperparametersTest, ThePaperProtocolHasThePapersBox) {
   const Model& model = test::model("experiments/surface_published.toml");
   const Prior prior = make_prior(model, {Prior::Mean::zero, std::nullopt, true});
-  const std::vector<Observations> observations = observe(model, 60, false);
+  const std::vector<Observations> observations = observe_drawn(model, 60, false);
   const auto all = default_hyperparameters(prior, observations, {"p1", "p4", "p7"}, {Protocol::Name::paper, true});
   ASSERT_EQ(all.size(), 9u + 1u + 3u);
   const MatrixXd features = evaluate_features(prior, 0, observations[0].states());
@@ -80,7 +80,7 @@ TEST(HyperparametersTest, ThePaperProtocolHasThePapersBox) {
 TEST(HyperparametersTest, ThePaperProtocolKeepsToTheFilesBounds) {
   const Model& model = test::model("models/unicycle.toml");
   const Prior prior = make_prior(model);
-  const auto all = default_hyperparameters(prior, observe(model, 30, false), {"R", "Ic"}, {Protocol::Name::paper, true});
+  const auto all = default_hyperparameters(prior, observe_drawn(model, 30, false), {"R", "Ic"}, {Protocol::Name::paper, true});
   EXPECT_EQ(find(all, "R").lower, 0.05 - 0.02);
   EXPECT_EQ(find(all, "R").upper, 0.05 + 0.02);
   EXPECT_EQ(find(all, "Ic").lower, 0.005145) << "where M stays positive definite";
@@ -90,7 +90,7 @@ TEST(HyperparametersTest, ThePaperProtocolKeepsToTheFilesBounds) {
 TEST(HyperparametersTest, TheStandardProtocolHasItsOwnBoxAndHyperPriors) {
   const Model& model = test::model("models/unicycle.toml");
   const Prior prior = make_prior(model);
-  const std::vector<Observations> observations = observe(model, 40, true);
+  const std::vector<Observations> observations = observe_drawn(model, 40, true);
   const auto all = default_hyperparameters(prior, observations, {"R"}, {});
   using Standard = Protocol::Standard;
   ASSERT_EQ(all.size(), 7u + 3u + 3u + 1u);
@@ -133,7 +133,7 @@ Model with_priors(const std::string& p1) {
 TEST(HyperparametersTest, PriorsOfTheModelReplaceTheWeakOnes) {
   const Model model = with_priors("{ value = 0.08, bounds = [0.01, 1], prior = { median = 0.09, log_stddev = 0.2 } }");
   const Prior prior = make_prior(model);
-  const std::vector<Observations> observations = observe(model, 30, false);
+  const std::vector<Observations> observations = observe_drawn(model, 30, false);
   const auto all = default_hyperparameters(prior, observations, {"p1"}, {});
   const double spread = stddev(evaluate_features(prior, 0, observations[0].states()).col(0));
   expect_same(find(all, "lengthscale(q1)").hyperprior.median, 2 * spread);
@@ -157,15 +157,16 @@ TEST(HyperparametersTest, PriorsOfTheModelReplaceTheWeakOnes) {
 
 TEST(HyperparametersTest, APriorOfALogarithmNeedsBoundsAboveZero) {
   const Model model = with_priors("{ value = 0.08, bounds = [-1, 1], prior = { median = 0.09, log_stddev = 0.2 } }");
-  EXPECT_THAT(test::input_error_of([&] { default_hyperparameters(make_prior(model), observe(model, 5, false), {"p1"}, {}); }),
-              HasSubstr("parameter 'p1': a prior of the logarithm needs bounds above 0, got [-1, 1]"));
+  EXPECT_THAT(
+      test::input_error_of([&] { default_hyperparameters(make_prior(model), observe_drawn(model, 5, false), {"p1"}, {}); }),
+      HasSubstr("parameter 'p1': a prior of the logarithm needs bounds above 0, got [-1, 1]"));
 }
 
 TEST(HyperparametersTest, TheGradientOfPriorsIsThatOfTheirSum) {
   for (const char* p1 : {"{ value = 0.08, bounds = [0.01, 1], prior = { median = 0.2, log_stddev = 0.3 } }",
                          "{ value = 0.08, bounds = [-1, 1], prior = { mean = 0.09, stddev = 0.02 } }"}) {
     const Model model = with_priors(p1);
-    const auto all = default_hyperparameters(make_prior(model), observe(model, 20, false), {"p1"}, {});
+    const auto all = default_hyperparameters(make_prior(model), observe_drawn(model, 20, false), {"p1"}, {});
     const VectorXd x = coordinates(all);
     const auto sum_at = [&](Eigen::Index k, double step) {
       std::vector<Hyperparameter> moved = all;
@@ -186,7 +187,7 @@ TEST(HyperparametersTest, TheGradientOfPriorsIsThatOfTheirSum) {
 
 TEST(HyperparametersTest, AFixedNoiseIsNoHyperparameter) {
   const Model& model = test::model("models/duffing.toml");
-  for (const Hyperparameter& h : default_hyperparameters(make_prior(model), observe(model, 20, false), {}, {})) {
+  for (const Hyperparameter& h : default_hyperparameters(make_prior(model), observe_drawn(model, 20, false), {}, {})) {
     EXPECT_NE(h.kind, Kind::noise_stddev);
     EXPECT_NE(h.kind, Kind::parameter);
   }
@@ -204,7 +205,7 @@ TEST(HyperparametersTest, NamesAreUnique) {
       if (!in_features.contains(model.system->parameter_index(parameter.name))) parameters.push_back(parameter.name);
     }
     std::set<std::string> names;
-    for (const Hyperparameter& h : default_hyperparameters(prior, observe(model, 12, true), parameters, {})) {
+    for (const Hyperparameter& h : default_hyperparameters(prior, observe_drawn(model, 12, true), parameters, {})) {
       EXPECT_TRUE(names.insert(h.name).second) << file << ": " << h.name;
       EXPECT_TRUE(h.lower <= h.value && h.value <= h.upper) << file << ": " << h.name;
       EXPECT_TRUE(std::isfinite(h.lower) && std::isfinite(h.upper) && h.lower < h.upper) << file << ": " << h.name;
@@ -232,7 +233,7 @@ features   = ["x"]
 directions = "acceleration"
 )toml",
                                    "cart");
-  RandomStream random(seed);
+  RandomStream random(hyperparameters_seed);
   MatrixXd states(5, 10), values(2, 10);
   for (double& entry : states.reshaped()) entry = random.normal();
   for (double& entry : values.reshaped()) entry = random.normal();
@@ -252,7 +253,7 @@ directions = "acceleration"
 TEST(HyperparametersTest, AParameterThatStandsInAFeatureCannotBeEstimated) {
   const Model& model = test::model("models/arm_on_moving_plane.toml");
   const Prior prior = make_prior(model);
-  const std::vector<Observations> observations = observe(model, 10, false);
+  const std::vector<Observations> observations = observe_drawn(model, 10, false);
   EXPECT_NO_THROW(default_hyperparameters(prior, observations, {"m2"}, {}));
   EXPECT_THAT(test::input_error_of([&] { default_hyperparameters(prior, observations, {"l1"}, {}); }),
               AllOf(HasSubstr("'l1'"), HasSubstr("feature"), HasSubstr("friction of the tip")));
@@ -260,7 +261,7 @@ TEST(HyperparametersTest, AParameterThatStandsInAFeatureCannotBeEstimated) {
 
 TEST(HyperparametersTest, TheScaleOfAnUnobservedAccelerationComesFromEqualKineticScale) {
   const Model& model = test::model("models/double_pendulum.toml");
-  const std::vector<Observations> observations = observe(model, 50, false, {2, 5});
+  const std::vector<Observations> observations = observe_drawn(model, 50, false, {2, 5});
   const Scales scales = default_scales(make_prior(model), observations);
   const VectorXd p = model.system->parameter_values();
   const auto parameter = [&](const char* name) { return p[model.system->parameter_index(name)]; };
@@ -276,7 +277,7 @@ TEST(HyperparametersTest, TheScaleOfAnUnobservedAccelerationComesFromEqualKineti
 
 TEST(HyperparametersTest, AFeatureThatDoesNotVaryStillHasAScale) {
   const Model& model = test::model("models/surface.toml");
-  std::vector<Observations> observations = observe(model, 20, false);
+  std::vector<Observations> observations = observe_drawn(model, 20, false);
   const StateLayout layout = model.system->layout();
   MatrixXd states = observations[0].states();
   states.row(layout.u(0)).setZero();
@@ -290,7 +291,7 @@ TEST(HyperparametersTest, AFeatureThatDoesNotVaryStillHasAScale) {
 TEST(HyperparametersTest, ModelValuesPutEachNumberInItsPlace) {
   const Model& model = test::model("models/arm_on_moving_plane.toml");
   const Prior prior = make_prior(model);
-  const std::vector<Observations> observations = observe(model, 20, true);
+  const std::vector<Observations> observations = observe_drawn(model, 20, true);
   auto all = default_hyperparameters(prior, observations, {"m2"}, {});
   for (std::size_t k = 0; k < all.size(); ++k) all[k].value = 1 + static_cast<double>(k);
   const ModelValues values = model_values(prior, observations, all);

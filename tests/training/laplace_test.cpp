@@ -19,7 +19,7 @@ using Eigen::MatrixXd;
 using Eigen::VectorXd;
 using Kind = Hyperparameter::Kind;
 
-constexpr std::uint64_t seed = 60611;
+constexpr std::uint64_t laplace_seed = 60611;
 
 /// ddx = p x + r + friction, two parameters in which the likelihood is quadratic: their covariance is (Zᵀ C⁻¹ Z)⁻¹.
 const Model& line() {
@@ -47,33 +47,33 @@ dx = [-1, 1]
   return model;
 }
 
-struct Problem {
+struct LaplaceProblem {
   Prior prior;
   std::vector<Observations> observations;
   std::vector<Hyperparameter> hyperparameters;
 };
 
-Problem problem(const Model& model, int n, const std::vector<std::string>& estimated, std::uint64_t of_seed = seed,
-                double noise_stddev = 0.3) {
+LaplaceProblem laplace_problem(const Model& model, int n, const std::vector<std::string>& estimated,
+                               std::uint64_t of_seed = laplace_seed, double noise_stddev = 0.3) {
   GenerateOptions options{n, of_seed, VectorXd::Constant(model.system->nq(), noise_stddev)};
   const GeneratedData data = generate(model, options);
   PriorOptions with_force;
   with_force.mean = Prior::Mean::force;
-  Problem p{make_prior(model, with_force), {}, {}};
+  LaplaceProblem p{make_prior(model, with_force), {}, {}};
   p.observations.push_back({data.states, View::all(View::Quantity::constrained_acceleration, *model.system), data.accelerations,
                             options.noise_stddev});
   p.hyperparameters = default_hyperparameters(p.prior, p.observations, estimated, {});
   return p;
 }
 
-Problem only(Problem p, const std::vector<Kind>& kinds) {
+LaplaceProblem only(LaplaceProblem p, const std::vector<Kind>& kinds) {
   std::erase_if(p.hyperparameters,
                 [&](const Hyperparameter& h) { return std::find(kinds.begin(), kinds.end(), h.kind) == kinds.end(); });
   return p;
 }
 
 TEST(LaplaceTest, IsExactWhereTheLikelihoodIsQuadratic) {
-  const Problem p = only(problem(line(), 30, {"p", "r"}), {Kind::parameter});
+  const LaplaceProblem p = only(laplace_problem(line(), 30, {"p", "r"}), {Kind::parameter});
   const LaplaceUncertainty uncertainty = laplace_uncertainty(p.prior, p.observations, p.hyperparameters, 1);
 
   const Observations& observed = p.observations.front();
@@ -98,7 +98,7 @@ TEST(LaplaceTest, IsExactWhereTheLikelihoodIsQuadratic) {
 }
 
 TEST(LaplaceTest, DistanceFromTheOptimumIsMeasuredInStandardDeviations) {
-  Problem p = only(problem(line(), 30, {"p"}), {Kind::parameter});
+  LaplaceProblem p = only(laplace_problem(line(), 30, {"p"}), {Kind::parameter});
   FitOptions options;
   options.n_restarts = 1;
   options.n_threads = 1;
@@ -111,7 +111,7 @@ TEST(LaplaceTest, DistanceFromTheOptimumIsMeasuredInStandardDeviations) {
 
 TEST(LaplaceTest, TheDeviationOfALogarithmOfNoiseIsThatOfCounting) {
   // noise alone: log σ of n numbers is known to 1/√(2n)
-  Problem p = problem(line(), 200, {});
+  LaplaceProblem p = laplace_problem(line(), 200, {});
   p.observations[0] = test::with_estimated_noise(p.observations[0], true);
   p.hyperparameters = default_hyperparameters(p.prior, p.observations, {}, Protocol{.hyperprior = false});
   for (Hyperparameter& h : p.hyperparameters) {
@@ -131,7 +131,7 @@ TEST(LaplaceTest, TheDeviationOfALogarithmOfNoiseIsThatOfCounting) {
 }
 
 TEST(LaplaceTest, WhatIsAtABoundIsHeld) {
-  Problem p = only(problem(line(), 20, {"p", "r"}), {Kind::parameter});
+  LaplaceProblem p = only(laplace_problem(line(), 20, {"p", "r"}), {Kind::parameter});
   p.hyperparameters[0].value = p.hyperparameters[0].lower;
   const LaplaceUncertainty uncertainty = laplace_uncertainty(p.prior, p.observations, p.hyperparameters, 1);
   EXPECT_EQ(uncertainty.held, std::vector<int>{0});
@@ -144,7 +144,7 @@ TEST(LaplaceTest, ParametersThatEnterByTheirSumOnlyAreNamedUndetermined) {
   std::string text = line().text;
   text.replace(text.find("p*x + r"), 7, "p + 2*r");
   const Model model = Model::parse(text, "sum");
-  const Problem p = only(problem(model, 20, {"p", "r"}), {Kind::parameter});
+  const LaplaceProblem p = only(laplace_problem(model, 20, {"p", "r"}), {Kind::parameter});
   const LaplaceUncertainty uncertainty = laplace_uncertainty(p.prior, p.observations, p.hyperparameters, 1);
   EXPECT_TRUE(std::isinf(uncertainty.stddev[0]));
   EXPECT_TRUE(std::isinf(uncertainty.stddev[1]));
@@ -155,7 +155,7 @@ TEST(LaplaceTest, ParametersThatEnterByTheirSumOnlyAreNamedUndetermined) {
 }
 
 TEST(LaplaceTest, IsTheSameForAnyNumberOfThreads) {
-  const Problem p = problem(line(), 20, {"p", "r"});
+  const LaplaceProblem p = laplace_problem(line(), 20, {"p", "r"});
   const LaplaceUncertainty one = laplace_uncertainty(p.prior, p.observations, p.hyperparameters, 1);
   const LaplaceUncertainty three = laplace_uncertainty(p.prior, p.observations, p.hyperparameters, 3);
   EXPECT_EQ(one.stddev, three.stddev);
@@ -170,7 +170,7 @@ TEST(LaplaceTest, StatedDeviationsCoverTheErrorsOfManyFits) {
   options.max_escapes = 0;
   double sum_of_squares = 0;
   for (int set = 0; set < n_sets; ++set) {
-    Problem p = problem(line(), 25, {"p"}, seed + 1 + static_cast<std::uint64_t>(set));
+    LaplaceProblem p = laplace_problem(line(), 25, {"p"}, laplace_seed + 1 + static_cast<std::uint64_t>(set));
     p.hyperparameters = fit(p.prior, p.observations, p.hyperparameters, options).report.hyperparameters;
     const LaplaceUncertainty uncertainty = laplace_uncertainty(p.prior, p.observations, p.hyperparameters, 1);
     for (std::size_t k = 0; k < p.hyperparameters.size(); ++k) {
@@ -226,7 +226,7 @@ TEST(LaplaceTest, ParametersKnownToAMillionthOfTheirBoxAreFittedToTheirOptimum) 
   std::string text = rolling().text;
   text.replace(text.find("bounds = [0.1, 5]"), 17, "bounds = [0.1, 1e4]");
   const Model model = Model::parse(text, "wide");
-  const Problem p = problem(model, 60, {"r"}, seed, 0.01);
+  const LaplaceProblem p = laplace_problem(model, 60, {"r"}, laplace_seed, 0.01);
   const FitReport report = fit(p.prior, p.observations, p.hyperparameters, one_run()).report;
   ASSERT_TRUE(report.uncertainty.has_value());
   EXPECT_LT(report.uncertainty->distance_from_optimum, 0.02);
@@ -241,7 +241,7 @@ TEST(LaplaceTest, AFitAtTheEdgeOfItsModelSaysThatItHasNoStandardErrors) {
   std::string text = line().text;
   text.replace(text.find("p*x + r"), 7, "p*x + sqrt(r)");
   text.replace(text.find("value = 0.2"), 11, "value = 1e-7");
-  Problem p = problem(Model::parse(text, "edge"), 20, {"r"});
+  LaplaceProblem p = laplace_problem(Model::parse(text, "edge"), 20, {"r"});
   try {
     laplace_uncertainty(p.prior, p.observations, p.hyperparameters, 1);
     FAIL() << "no error";
@@ -261,16 +261,16 @@ TEST(LaplaceTest, AFitAtTheEdgeOfItsModelSaysThatItHasNoStandardErrors) {
 }
 
 TEST(LaplaceTest, NoFitWithoutParametersPaysForStandardErrors) {
-  const Problem p = problem(line(), 20, {});
+  const LaplaceProblem p = laplace_problem(line(), 20, {});
   EXPECT_FALSE(fit(p.prior, p.observations, p.hyperparameters, one_run()).report.uncertainty.has_value());
-  const Problem with = problem(line(), 20, {"p"});
+  const LaplaceProblem with = laplace_problem(line(), 20, {"p"});
   EXPECT_FALSE(fit(with.prior, with.observations, with.hyperparameters, one_run(false)).report.uncertainty.has_value());
 }
 
 TEST(LaplaceTest, NotesSayWhichParametersAreKnownOnlyTogether) {
   std::string text = line().text;
   text.replace(text.find("p*x + r"), 7, "p + 2*r");
-  const Problem p = problem(Model::parse(text, "sum"), 20, {"p", "r"});
+  const LaplaceProblem p = laplace_problem(Model::parse(text, "sum"), 20, {"p", "r"});
   const FitReport report = fit(p.prior, p.observations, p.hyperparameters, one_run()).report;
   const std::vector<UncertaintyNote> notes = uncertainty_notes(report);
   ASSERT_EQ(notes.size(), 1U);
@@ -282,7 +282,7 @@ TEST(LaplaceTest, APriorDeterminesWhatDataDoNot) {
   std::string text = line().text;
   text.replace(text.find("p*x + r"), 7, "p + 2*r");
   text.replace(text.find("r = { value = 0.2,"), 18, "r = { value = 0.2, prior = { mean = 0.1, stddev = 0.05 },");
-  const Problem p = problem(Model::parse(text, "sum"), 20, {"p", "r"});
+  const LaplaceProblem p = laplace_problem(Model::parse(text, "sum"), 20, {"p", "r"});
   const FitReport report = fit(p.prior, p.observations, p.hyperparameters, one_run()).report;
   ASSERT_TRUE(report.uncertainty.has_value());
   const auto r = static_cast<Index>(report.hyperparameters.size()) - 1;

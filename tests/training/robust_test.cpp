@@ -16,7 +16,7 @@ using Eigen::Index;
 using Eigen::MatrixXd;
 using Eigen::VectorXd;
 
-constexpr std::uint64_t seed = 40731;
+constexpr std::uint64_t robust_seed = 40731;
 
 struct Data {
   const Model& model;
@@ -33,7 +33,7 @@ Data data_of(const std::string& file, int n) {
   const Model& model = test::model(file);
   Data data{model, make_prior(model), {}, {}, {}};
   const VectorXd noise = Eigen::Map<const VectorXd>(model.noise.stddev.data(), static_cast<Index>(model.noise.stddev.size()));
-  const GeneratedData drawn = generate(model, {n, seed, noise});
+  const GeneratedData drawn = generate(model, {n, robust_seed, noise});
   data.observations.push_back(
       {drawn.states, View::all(View::Quantity::constrained_acceleration, *model.system), drawn.accelerations, noise});
   data.set_hyperparameters();
@@ -44,7 +44,7 @@ Data data_of(const std::string& file, int n) {
 Data with_outliers(Data data, double share, bool whole_states) {
   MatrixXd values = data.observations.front().values();
   const VectorXd spread = row_stddev(values);
-  RandomStream random(seed);
+  RandomStream random(robust_seed);
   for (Index i = 0; i < values.cols(); ++i) {
     const bool is_wrong = random.uniform() < share;
     for (Index k = 0; k < values.rows(); ++k) {
@@ -58,7 +58,7 @@ Data with_outliers(Data data, double share, bool whole_states) {
   return data;
 }
 
-FitOptions quick() {
+FitOptions quick_robust() {
   FitOptions options;
   options.n_restarts = 1;
   options.max_escapes = 1;
@@ -66,22 +66,24 @@ FitOptions quick() {
 }
 
 double error_of(const Data& data, const Posterior& posterior) {
-  const GeneratedData truth = generate(data.model, {200, seed + 1, VectorXd::Zero(data.model.system->nq())});
+  const GeneratedData truth = generate(data.model, {200, robust_seed + 1, VectorXd::Zero(data.model.system->nq())});
   std::vector<int> rows = data.observations.front().view().rows;
   return evaluate_predictions(posterior, truth.states, rows, truth.accelerations).nrmse;
 }
 
 TEST(RobustTest, OutliersAreFoundAndTheFitIsNearlyThatOfCleanData) {
   for (const char* file : {"models/surface.toml", "models/unicycle.toml"}) {
-    SCOPED_TRACE(fmt::format("{}, seed {}", file, seed));
+    SCOPED_TRACE(fmt::format("{}, seed {}", file, robust_seed));
     const Data clean = data_of(file, 100);
-    const double error_clean = error_of(clean, fit(clean.prior, clean.observations, clean.hyperparameters, quick()).posterior);
+    const double error_clean =
+        error_of(clean, fit(clean.prior, clean.observations, clean.hyperparameters, quick_robust()).posterior);
     for (const bool whole_states : {false, true}) {
       SCOPED_TRACE(whole_states ? "all values of some states" : "some values");
       const Data dirty = with_outliers(clean, 0.05, whole_states);
       ASSERT_GT(dirty.wrong.size(), 5U);
-      const double error_plain = error_of(dirty, fit(dirty.prior, dirty.observations, dirty.hyperparameters, quick()).posterior);
-      const Fit robust = fit_robust(dirty.prior, dirty.observations, dirty.hyperparameters, quick());
+      const double error_plain =
+          error_of(dirty, fit(dirty.prior, dirty.observations, dirty.hyperparameters, quick_robust()).posterior);
+      const Fit robust = fit_robust(dirty.prior, dirty.observations, dirty.hyperparameters, quick_robust());
       const double error_robust = error_of(dirty, robust.posterior);
       std::set<std::pair<Index, Index>> found;
       for (const DistrustedValue& value : robust.report.distrusted) found.emplace(value.row, value.state);
@@ -98,10 +100,10 @@ TEST(RobustTest, OutliersAreFoundAndTheFitIsNearlyThatOfCleanData) {
 
 TEST(RobustTest, OfCleanDataNextToNothingIsDistrusted) {
   for (const char* file : {"models/surface.toml", "models/unicycle.toml"}) {
-    SCOPED_TRACE(fmt::format("{}, seed {}", file, seed));
+    SCOPED_TRACE(fmt::format("{}, seed {}", file, robust_seed));
     const Data clean = data_of(file, 100);
-    const Fit plain = fit(clean.prior, clean.observations, clean.hyperparameters, quick());
-    const Fit robust = fit_robust(clean.prior, clean.observations, clean.hyperparameters, quick());
+    const Fit plain = fit(clean.prior, clean.observations, clean.hyperparameters, quick_robust());
+    const Fit robust = fit_robust(clean.prior, clean.observations, clean.hyperparameters, quick_robust());
     // 300 Gaussian values have one beyond 4 σ in one of fifty data sets
     EXPECT_LE(robust.report.distrusted.size(), 1U);
     EXPECT_LE(error_of(clean, robust.posterior), 1.05 * error_of(clean, plain.posterior));

@@ -14,7 +14,7 @@ namespace gp2::command {
 
 namespace {
 
-struct Arguments {
+struct ReproduceArguments {
   std::string what, protocol = "both", data, output, experiments;
   std::optional<int> runs;
   int threads = 0;
@@ -50,7 +50,7 @@ std::filesystem::path definitions(const std::string& told) {
   throw InputError("the definitions of the experiments are not where this command was installed: give --experiments DIR");
 }
 
-void run(const Arguments& arguments) {
+void run(const ReproduceArguments& arguments) {
   require_threads(arguments.threads);
   ReproduceOptions options;
   options.experiments = definitions(arguments.experiments);
@@ -85,7 +85,7 @@ void run(const Arguments& arguments) {
 }  // namespace
 
 Command reproduce_command() {
-  const auto a = std::make_shared<Arguments>();
+  const auto a = std::make_shared<ReproduceArguments>();
   std::vector<std::pair<std::string, std::string>> names = {{"all", "all"}};
   for (const Experiment& experiment : experiments) names.emplace_back(experiment.name, experiment.name);
   Command command{"reproduce",
