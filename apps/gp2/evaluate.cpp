@@ -25,6 +25,13 @@ struct EvaluateArguments {
 
 Json number(double value) { return std::isfinite(value) ? Json(value) : Json(); }
 
+Json to_json(const Evaluation::Part& part) {
+  return {{"n", part.n},
+          {"nrmse", number(part.nrmse)},
+          {"coverage95", number(part.coverage95)},
+          {"coverage95_latent", number(part.coverage95_latent)}};
+}
+
 Json to_json(const Evaluation& e) {
   Json rmse = Json::object();
   for (std::size_t k = 0; k < e.outputs.size(); ++k) rmse[e.outputs[k]] = e.rmse[static_cast<Eigen::Index>(k)];
@@ -38,6 +45,8 @@ Json to_json(const Evaluation& e) {
           {"nlpd_latent", number(e.nlpd_latent)},
           {"coverage95_latent", number(e.coverage95_latent)},
           {"n_zero_variance", e.n_zero_variance},
+          {"near", to_json(e.near)},
+          {"far", to_json(e.far)},
           {"n", e.n},
           {"n_missing", e.n_missing}};
 }
@@ -52,6 +61,12 @@ void print_text(const Evaluation& e) {
   print_result("nlpd, 95 % coverage         {:.4g}, {:.3g}   (with measurement noise)\n", e.nlpd, e.coverage95);
   print_result("the same, noise-free        {:.4g}, {:.3g}   ({} marginals without variance left out)\n", e.nlpd_latent,
                e.coverage95_latent, e.n_zero_variance);
+  if (e.far.n > 0) {
+    print_result("near the data               {:.3g} % of the points: nrmse {:.4g}, coverage {:.3g}\n", 100.0 * e.near.n / e.n,
+                 e.near.nrmse, e.near.coverage95);
+    print_result("far from them               {:.3g} % of the points: nrmse {:.4g}, coverage {:.3g}\n", 100.0 * e.far.n / e.n,
+                 e.far.nrmse, e.far.coverage95);
+  }
   print_result("points                      {}{}\n", e.n,
                e.n_missing > 0 ? fmt::format("   ({} values not measured)", e.n_missing) : "");
 }

@@ -90,6 +90,7 @@ std::string csv_of(const std::vector<Motion>& motions, const Subject& subject, b
     line.insert(line.end(), multipliers.begin(), multipliers.end());
   }
   for (std::size_t j = 0; with_stddev && j < accelerations.size(); ++j) line.push_back(accelerations[j] + "_std");
+  if (with_stddev) line.emplace_back("distance_from_data");
   if (subject.model.potential) line.emplace_back("energy");
   end_line();
 
@@ -105,7 +106,10 @@ std::string csv_of(const std::vector<Motion>& motions, const Subject& subject, b
       add(trajectory.accelerations.col(i));
       add(trajectory.states.col(i).tail(layout.nu));
       if (system.nc() > 0) add(trajectory.records.col(i));
-      if (with_stddev) add(motions[k].uncertainty->stddev.col(i));
+      if (with_stddev) {
+        add(motions[k].uncertainty->stddev.col(i));
+        line.push_back(shortest(motions[k].uncertainty->distance[i]));
+      }
       if (motions[k].energy) line.push_back(shortest((*motions[k].energy)[i]));
       end_line();
     }
@@ -171,10 +175,10 @@ std::vector<std::string> notes_of(const std::vector<Motion>& motions, const Syst
   for (std::size_t k = 0; k < motions.size(); ++k) {
     if (!motions[k].uncertainty || !motions[k].uncertainty->leaves_data) continue;
     notes.push_back(
-        fmt::format("warning: {}leaves the region of the data at t = {:.6g}: the standard deviation of {} exceeds half "
-                    "the prior's",
+        fmt::format("warning: {}leaves the region of the data at t = {:.6g}: at its farthest it is {:.3g} times as far from the "
+                    "observed states as those are from each other",
                     motions.size() > 1 ? fmt::format("sample {} ", k) : "the motion ", *motions[k].uncertainty->leaves_data,
-                    motions[k].uncertainty->acceleration));
+                    motions[k].uncertainty->distance.maxCoeff()));
     break;  // the first sample stands for the others
   }
   for (const Motion& motion : motions) {

@@ -10,7 +10,9 @@ Every prediction obeys the constraint A(q, dq, t) ddq = b(q, dq, t) to rounding 
 
 from gp2 import _objects as _objects
 from gp2._gp2 import (
+    FAR_FROM_DATA,
     Evaluation,
+    EvaluationPart,
     Finding,
     FitReport,
     Hyperparameter,
@@ -41,7 +43,9 @@ from gp2._gp2 import (
 )
 
 __all__ = [
+    "FAR_FROM_DATA",
     "Evaluation",
+    "EvaluationPart",
     "Finding",
     "FitReport",
     "Hyperparameter",

@@ -44,6 +44,7 @@ ViewRequest view_request(const ViewArguments& arguments) {
 struct Prediction {
   py::array mean;
   std::optional<py::array> std, cov;
+  py::array distance_from_data;
   std::vector<std::string> names;
   int n_clipped = 0;
 };
@@ -91,6 +92,12 @@ Prediction predict(const PyPosterior& self, const py::object& data, const ViewAr
     });
     if (PyErr_CheckSignals() != 0) throw py::error_already_set();
   }
+  VectorXd distance;
+  {
+    const py::gil_scoped_release release;
+    distance = posterior.distance_from_data(at.view, x, n_threads);
+  }
+  out.distance_from_data = to_vector(std::move(distance));
   out.names = at.names;
   out.mean = to_rows(std::move(mean));
   if (!mean_only) {
@@ -206,7 +213,7 @@ void update_with(PyPosterior& self, const py::object& data, const std::vector<st
 
 struct Motion {
   Trajectory trajectory;
-  std::optional<MatrixXd> stddev;
+  std::optional<MotionUncertainty> uncertainty;
 };
 
 MotionStart start_argument(const py::object& start, const System& system) {
@@ -266,9 +273,8 @@ py::object simulate_posterior(const PyPosterior& self, const py::object& start, 
   std::vector<Motion> motions = run_motions(job);
   if (request.n_samples) return py::cast(std::move(motions));
   {
-    const View view = View::constrained_acceleration(self.system());
     const py::gil_scoped_release release;
-    motions[0].stddev = posterior.marginal(view, motions[0].trajectory.states, /*n_threads=*/0).stddev();
+    motions[0].uncertainty = motion_uncertainty(posterior, motions[0].trajectory);
   }
   return py::cast(std::move(motions[0]));
 }
@@ -409,6 +415,9 @@ void add_prediction(py::module_& module) {
           "std", [](const Prediction& p) { return asked_for(p.std); }, "Standard deviations (n, d).")
       .def_property_readonly(
           "cov", [](const Prediction& p) { return asked_for(p.cov); }, "Covariance at each state (n, d, d).")
+      .def_readonly("distance_from_data", &Prediction::distance_from_data,
+                    "How far each state lies from the observed ones (n): beyond gp2.FAR_FROM_DATA deviations are too small as a "
+                    "rule.")
       .def_readonly("names", &Prediction::names, "Of the d rows, as the columns of gp2 predict.")
       .def_readonly("n_clipped", &Prediction::n_clipped, "Variances that rounding made negative; they are 0.")
       .def("__repr__", [](const Prediction& p) {
@@ -417,6 +426,12 @@ void add_prediction(py::module_& module) {
 }
 
 void add_evaluation(py::module_& module) {
+  module.attr("FAR_FROM_DATA") = Posterior::far_from_data;
+  py::class_<Evaluation::Part>(module, "EvaluationPart", "Figures of some of the points; NaN where there is nothing to average.")
+      .def_readonly("n", &Evaluation::Part::n)
+      .def_readonly("nrmse", &Evaluation::Part::nrmse, "Rms error over rms of the test spreads of all points.")
+      .def_readonly("coverage95", &Evaluation::Part::coverage95)
+      .def_readonly("coverage95_latent", &Evaluation::Part::coverage95_latent);
   py::class_<Evaluation>(module, "Evaluation", "How well a posterior predicts measured accelerations.")
       .def_readonly("outputs", &Evaluation::outputs)
       .def_property_readonly(
@@ -431,6 +446,8 @@ void add_evaluation(py::module_& module) {
       .def_readonly("coverage95_latent", &Evaluation::coverage95_latent)
       .def_readonly("n_zero_variance", &Evaluation::n_zero_variance,
                     "Marginals without variance, left out of the latent figures.")
+      .def_readonly("near", &Evaluation::near, "Of the points near the data.")
+      .def_readonly("far", &Evaluation::far, "Of those farther from the data than FAR_FROM_DATA.")
       .def_readonly("n", &Evaluation::n)
       .def_readonly("n_missing", &Evaluation::n_missing, "Targets that are not measured, left out of all figures.")
       .def("__repr__", [](const Evaluation& e) {
@@ -463,10 +480,19 @@ void add_motion(py::module_& module) {
       .def_property_readonly(
           "std",
           [](const Motion& m) -> py::object {
-            if (!m.stddev) return py::none();
-            return to_rows(*m.stddev);
+            if (!m.uncertainty) return py::none();
+            return to_rows(m.uncertainty->stddev);
           },
           "Of ddq along the mean's motion (n, nq); None of a model's own motion or a sample's.")
+      .def_property_readonly(
+          "distance_from_data",
+          [](const Motion& m) -> py::object {
+            if (!m.uncertainty) return py::none();
+            return to_vector(m.uncertainty->distance);
+          },
+          "As of Prediction, along the mean's motion (n); None as std.")
+      .def_property_readonly(
+          "multipliers", [](const Motion& m) { return to_rows(m.trajectory.records); }, "lambda of the constraints (n, nc)")
       .def_property_readonly("max_position_drift", [](const Motion& m) { return m.trajectory.max_position_drift; })
       .def_property_readonly("max_velocity_drift", [](const Motion& m) { return m.trajectory.max_velocity_drift; })
       .def_property_readonly(

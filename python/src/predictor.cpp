@@ -48,6 +48,16 @@ class PyPredictor {
     return py::make_tuple(mean, jacobian);
   }
 
+  double distance_from_data(const py::object& state) {
+    const auto x = state_of(state);
+    double distance = 0;
+    require([&](Predictor::Workspace& workspace) {
+      distance = predictor_.distance_from_data(map(x), workspace);
+      return Predictor::Status::ok;
+    });
+    return distance;
+  }
+
  private:
   using State = py::array_t<double, py::array::c_style>;
 
@@ -125,7 +135,9 @@ A state is (len(state_names)). A state without a prediction raises InputError.)"
       .def("mean", &PyPredictor::mean, "state"_a, "(d)")
       .def("mean_and_std", &PyPredictor::mean_and_std, "state"_a, "(d), (d)")
       .def("mean_and_jacobian", &PyPredictor::mean_and_jacobian, "state"_a,
-           "(d), and its exact derivative in the state (d, len(state_names)).");
+           "(d), and its exact derivative in the state (d, len(state_names)).")
+      .def("distance_from_data", &PyPredictor::distance_from_data, "state"_a,
+           "As of Prediction; nan where a feature is not finite.");
 }
 
 }  // namespace gp2::python

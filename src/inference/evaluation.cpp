@@ -37,6 +37,27 @@ struct Calibration {
   [[nodiscard]] double coverage() const { return n == 0 ? not_a_number : static_cast<double>(inside) / n; }
 };
 
+// What errors of some points come to.
+struct Scores {
+  Calibration measured, latent;
+  VectorXd squares, counts;  // per output
+  int n = 0;                 // points
+
+  explicit Scores(Index n_outputs) : squares(VectorXd::Zero(n_outputs)), counts(squares) {}
+
+  void add(Index output, double error, double stddev, double noise, bool has_variance) {
+    squares[output] += error * error;
+    counts[output] += 1;
+    if (std::isfinite(noise)) measured.add(error, std::hypot(stddev, noise));
+    if (has_variance) latent.add(error, stddev);
+  }
+  [[nodiscard]] VectorXd rmse() const { return (squares.array() / counts.array()).sqrt(); }
+  [[nodiscard]] Evaluation::Part part(double spread) const {
+    const VectorXd of_observed = (counts.array() > 0).select(rmse(), 0);
+    return {n, counts.sum() > 0 ? of_observed.norm() / spread : not_a_number, measured.coverage(), latent.coverage()};
+  }
+};
+
 // Calls visit(group number, row of its view) for all observations of row `row` of ddq.
 template <typename Visit>
 void for_each_observed(const Posterior& posterior, int row, const Visit& visit) {
@@ -202,35 +223,40 @@ Evaluation evaluate_predictions(const Posterior& posterior, const Ref<const Matr
   e.n = static_cast<int>(states.cols());
   e.outputs = View{View::Quantity::constrained_acceleration, rows}.names(system);
   e.rmse.resize(std::ssize(rows));
-  Calibration measured, latent;
-  double normalised = 0;
-  for (Index k = 0; k < e.rmse.size(); ++k) {
-    const Index row = rows[static_cast<std::size_t>(k)];
-    const VectorXd error = (targets.row(k) - prediction.mean.row(row)).transpose();
-    const Eigen::Array<bool, Eigen::Dynamic, 1> is_measured = !targets.row(k).transpose().array().isNaN();
-    const Index n_measured = is_measured.count();
-    e.n_missing += e.n - static_cast<int>(n_measured);
-    e.rmse[k] = std::sqrt(is_measured.select(error, 0).squaredNorm() / static_cast<double>(n_measured));
-    normalised += e.rmse[k] / training_spread(posterior, rows[static_cast<std::size_t>(k)]);
-    for (int i = 0; i < e.n; ++i) {
-      if (!is_measured[i]) continue;
-      if (std::isfinite(noise(k, i))) measured.add(error[i], std::hypot(stddev(row, i), noise(k, i)));
-      // rounding may leave a variance of 0 where the data say all
-      if (decided(row, i) || stddev(row, i) == 0) {
-        ++e.n_zero_variance;
-      } else {
-        latent.add(error[i], stddev(row, i));
+  const VectorXd distance = posterior.distance_from_data(all, states, options.n_threads);
+  Scores whole(e.rmse.size()), near(e.rmse.size()), far(e.rmse.size());
+  for (int i = 0; i < e.n; ++i) {
+    Scores& part = distance[i] > Posterior::far_from_data ? far : near;
+    for (Scores* scores : {&whole, &part}) ++scores->n;
+    for (Index k = 0; k < e.rmse.size(); ++k) {
+      const Index row = rows[static_cast<std::size_t>(k)];
+      const double error = targets(k, i) - prediction.mean(row, i);
+      if (std::isnan(targets(k, i))) {
+        ++e.n_missing;
+        continue;
       }
+      // rounding may leave a variance of 0 where the data say all
+      const bool has_variance = !decided(row, i) && stddev(row, i) > 0;
+      if (!has_variance) ++e.n_zero_variance;
+      for (Scores* scores : {&whole, &part}) scores->add(k, error, stddev(row, i), noise(k, i), has_variance);
     }
   }
+  const double spread = row_stddev(targets).norm();
+  e.rmse = whole.rmse();
+  double normalised = 0;
+  for (Index k = 0; k < e.rmse.size(); ++k) {
+    normalised += e.rmse[k] / training_spread(posterior, rows[static_cast<std::size_t>(k)]);
+  }
   e.rmse_normalised = normalised / static_cast<double>(rows.size());
-  e.nrmse = e.rmse.norm() / row_stddev(targets).norm();
+  e.nrmse = e.rmse.norm() / spread;
+  e.near = near.part(spread);
+  e.far = far.part(spread);
   e.max_constraint_error = max_constraint_error(system, states, system.parameter_values(), prediction.mean);
   e.max_constraint_error_fitted = max_constraint_error(system, states, parameters, prediction.mean);
-  e.nlpd = measured.nlpd();
-  e.coverage95 = measured.coverage();
-  e.nlpd_latent = latent.nlpd();
-  e.coverage95_latent = latent.coverage();
+  e.nlpd = whole.measured.nlpd();
+  e.coverage95 = whole.measured.coverage();
+  e.nlpd_latent = whole.latent.nlpd();
+  e.coverage95_latent = whole.latent.coverage();
   return e;
 }
 

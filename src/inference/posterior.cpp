@@ -9,6 +9,7 @@
 #include "base/simd.hpp"
 #include "gp2/error.hpp"
 #include "inference/assemble.hpp"
+#include "inference/data_distance.hpp"
 #include "inference/dense_gram.hpp"
 #include "inference/latent_sums.hpp"
 #include "inference/query.hpp"
@@ -198,6 +199,26 @@ MatrixXd Posterior::Marginal::stddev() const {
   MatrixXd stddev(d, mean.cols());
   for (Index j = 0; j < d; ++j) stddev.row(j) = covariance.row(j * d + j).cwiseSqrt();
   return stddev;
+}
+
+VectorXd Posterior::distance_from_data(const View& view, const Ref<const MatrixXd>& states, int n_threads) const {
+  const Implementation& self = implementation();
+  require_query(self, view, states);
+  const DataDistance distance(self, view);
+  std::vector<MatrixXd> features(self.prior.latents.size());
+  for (std::size_t a = 0; a < features.size(); ++a) {
+    if (view.has_latent(a)) features[a] = evaluate_features(self.prior, a, states).transpose();
+  }
+  constexpr Index block_size = 64;
+  VectorXd distances(states.cols());
+  for_each_block(states.cols(), block_size, thread_count(n_threads), [&](Index first, Index n, int) {
+    VectorXd z(distance.n_coordinates());
+    for (Index i = first; i < first + n; ++i) {
+      distance.write_coordinates([&](std::size_t a) { return features[a].col(i); }, z);
+      distances[i] = distance.at(z);
+    }
+  });
+  return distances;
 }
 
 namespace {

@@ -11,6 +11,7 @@
 #include "base/not_a_number.hpp"
 #include "gp2/error.hpp"
 #include "gp2/mechanics/state_evaluator.hpp"
+#include "inference/data_distance.hpp"
 #include "inference/posterior_implementation.hpp"
 #include "inference/predictor_data.hpp"
 #include "inference/requirements.hpp"
@@ -39,6 +40,7 @@ struct Predictor::Implementation {
   bool needs_acceleration = false;                // ā itself, which is none where M is singular
   PredictorData<double> in_double;
   PredictorData<float> in_single;
+  DataDistance distance;
 
   Implementation(const Posterior::Implementation& posterior, View viewed, Options given);
 
@@ -53,6 +55,8 @@ struct Predictor::Implementation {
   void write_stddev(const StateEvaluator& at, Workspace::Implementation& w, Ref<VectorXd> stddev) const;
   void write_jacobian(const Ref<const VectorXd>& state, const StateEvaluator& at, Workspace::Implementation& w,
                       Ref<MatrixXd> jacobian) const;
+
+  [[nodiscard]] double distance_at(const Ref<const VectorXd>& state, Workspace::Implementation& w) const;
 
   [[nodiscard]] const Latent& latent(const PredictorTerm& term) const { return prior.latents[term.latent]; }
   [[nodiscard]] bool has_mean_force() const { return view.has_mean() && prior.mean == Prior::Mean::force; }
@@ -110,6 +114,7 @@ struct Predictor::Workspace::Implementation {
   MatrixXd Gt, M_inverse_Gt;       // Gᵀ of the view (nq × d)
   std::vector<MatrixXd> loadings;  // ℓ, per term (F × d)
   VectorXd variance;               // (d)
+  VectorXd coordinates;            // of the distance from the data
   PredictorData<double>::Memory in_double;
   PredictorData<float>::Memory in_single;
 
@@ -188,6 +193,7 @@ Predictor::Implementation::Implementation(const Posterior::Implementation& poste
     has_forced_latent = has_forced_latent || prior.latents[a].base == Latent::Base::force;
   }
   has_force = has_mean_force() || has_forced_latent;
+  distance = DataDistance(posterior, view);
   if (options.storage == Storage::single_precision) {
     in_single.store(*posterior.latents, terms, options.stddev);
   } else {
@@ -202,6 +208,7 @@ Predictor::Workspace::Implementation::Implementation(std::shared_ptr<const Predi
   if (self.options.jacobian) values_and_derivatives = self.prior.system->make_evaluator(self.parameters, true);
   reserve_mechanics();
   for (const PredictorTerm& term : self.terms) reserve_term(term);
+  coordinates.setZero(self.distance.n_coordinates());
   self.with_data(*this, [&](const auto& data, auto& memory) {
     memory = data.make_memory(self.terms, self.view.size(), self.options.stddev);
   });
@@ -503,6 +510,21 @@ void Predictor::Implementation::write_jacobian(const Ref<const VectorXd>& state,
   }
 }
 
+double Predictor::Implementation::distance_at(const Ref<const VectorXd>& state, Workspace::Implementation& w) const {
+  for (Workspace::Implementation::AtState& here : w.terms) {
+    here.of_features->evaluate(state, here.features);
+    if (!is_finite(here.features)) return not_a_number;
+  }
+  distance.write_coordinates(
+      [&](std::size_t latent) -> const VectorXd& {
+        std::size_t a = 0;
+        while (terms[a].latent != latent) ++a;
+        return w.terms[a].features;
+      },
+      w.coordinates);
+  return distance.at(w.coordinates);
+}
+
 // ---------------------------------------------------------------- the public class
 
 Predictor::Predictor(const Posterior& posterior)
@@ -527,12 +549,16 @@ const Predictor::Options& Predictor::options() const { return implementation().o
 
 namespace {
 
-void check_arguments(const Predictor::Implementation& predictor, const Ref<const VectorXd>& state, const Ref<VectorXd>& mean,
+void check_arguments(const Predictor::Implementation& predictor, const Ref<const VectorXd>& state,
                      const Predictor::Workspace::Implementation* workspace) {
   if (workspace == nullptr || workspace->predictor.get() != &predictor) {
     throw InputError("Predictor: the workspace is of another predictor; use make_workspace() of this one");
   }
   check_size("a state", state.size(), predictor.prior.system->layout().size());
+}
+void check_arguments(const Predictor::Implementation& predictor, const Ref<const VectorXd>& state, const Ref<VectorXd>& mean,
+                     const Predictor::Workspace::Implementation* workspace) {
+  check_arguments(predictor, state, workspace);
   check_size("the mean", mean.size(), predictor.view.size());
 }
 
@@ -577,6 +603,12 @@ Status Predictor::mean_and_jacobian(const Ref<const VectorXd>& state, Ref<Vector
   }
   if (status != Status::ok) jacobian.setConstant(not_a_number);
   return status;
+}
+
+double Predictor::distance_from_data(const Ref<const VectorXd>& state, Workspace& workspace) const {
+  check_arguments(implementation(), state, workspace.implementation_.get());
+  Workspace::Implementation& w = *workspace.implementation_;
+  return implementation_->distance_at(state, w);
 }
 
 }  // namespace gp2

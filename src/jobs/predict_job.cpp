@@ -68,6 +68,19 @@ void add_samples(const Posterior& posterior, const View& view, const MatrixXd& s
   }
 }
 
+void add_distance(const Posterior& posterior, const View& view, const MatrixXd& states, PredictOutcome& out) {
+  const Eigen::VectorXd distance = posterior.distance_from_data(view, states, /*n_threads=*/0);
+  out.names.emplace_back("distance_from_data");
+  out.values.conservativeResize(out.values.rows() + 1, Eigen::NoChange);
+  out.values.bottomRows(1) = distance.transpose();
+  const Index n_far = (distance.array() > Posterior::far_from_data).count();
+  if (n_far == 0) return;
+  out.notes.push_back(
+      fmt::format("{} of {} states are far from the data, where deviations are too small as a rule: "
+                  "distance_from_data is above {:.3g}, up to {:.3g}",
+                  n_far, distance.size(), Posterior::far_from_data, distance.maxCoeff()));
+}
+
 Option columns_option(std::map<std::string, std::string>& columns) {
   return {"map", &columns, "LOGNAME=NAME,…", "columns by other names", "", "columns"};
 }
@@ -132,6 +145,7 @@ PredictOutcome predict(const FitFile& fit, const CsvTable& states, const Predict
   PredictOutcome out{at.names, {}, std::move(log.notes)};
   at_states_of(states, [&] { predict_marginals(posterior, at.view, log.states, request.covariance, out); });
   if (request.n_samples) add_samples(posterior, at.view, log.states, *request.n_samples, request.seed, out);
+  if (!request.unconditioned) add_distance(posterior, at.view, log.states, out);
   return out;
 }
 

@@ -315,6 +315,14 @@ void test_advice(const Report& report, const ReportData& data, std::vector<Advic
   const ReportData& training = report.data.front();
   if (training.is_test || training.outputs != data.outputs) return;
   const Evaluation& e = data.evaluation;
+  if (e.far.n > 0.05 * e.n) {
+    advice.push_back(
+        {Level::warning,
+         fmt::format("{:.0f} % of the test states are far from those of training: nrmse {:.3g} there, {:.3g} at the others.",
+                     100.0 * e.far.n / e.n, e.far.nrmse, e.near.nrmse),
+         "Deviations are too small there as a rule. Take training data where the test goes."});
+    return;
+  }
   const double ratio = e.rmse.norm() / training.evaluation.rmse.norm();
   const bool beyond_noise = (e.rmse.array() > 2 * data.noise_stddev.rowwise().mean().array()).any();
   if (ratio > 3 && beyond_noise) {

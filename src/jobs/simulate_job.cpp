@@ -295,18 +295,12 @@ std::vector<std::vector<double>> multiplier_sign_changes(const Trajectory& traje
 }
 
 MotionUncertainty motion_uncertainty(const Posterior& posterior, const Trajectory& trajectory) {
-  const System& system = *posterior.prior().system;
-  const View view = View::constrained_acceleration(system);
+  const View view = View::constrained_acceleration(*posterior.prior().system);
   MotionUncertainty out;
-  out.stddev = posterior.marginal(view, trajectory.states).stddev();
-  const MatrixXd prior = posterior.without_data().marginal(view, trajectory.states).stddev();
-  for (Index i = 0; i < prior.cols() && !out.leaves_data; ++i) {
-    for (Index j = 0; j < prior.rows() && !out.leaves_data; ++j) {
-      if (!(out.stddev(j, i) > prior(j, i) / 2)) continue;
-      out.leaves_data = trajectory.times[i];
-      out.acceleration = system.coordinates()[static_cast<std::size_t>(j)].acceleration();
-    }
-  }
+  out.stddev = posterior.marginal(view, trajectory.states, /*n_threads=*/0).stddev();
+  out.distance = posterior.distance_from_data(view, trajectory.states, /*n_threads=*/0);
+  const auto far = std::find_if(out.distance.begin(), out.distance.end(), [](double d) { return d > Posterior::far_from_data; });
+  if (far != out.distance.end()) out.leaves_data = trajectory.times[far - out.distance.begin()];
   return out;
 }
 

@@ -6,6 +6,7 @@
 #include <fmt/format.h>
 #include <gmock/gmock.h>
 
+#include "gp2/base/statistics.hpp"
 #include "gp2/jobs/fit_job.hpp"
 #include "gp2/jobs/predict_job.hpp"
 #include "io_testing.hpp"
@@ -93,6 +94,22 @@ TEST(EvaluateJob, CountsWhatTheConstraintDecidesAsDecided) {
   EXPECT_LT(straight.nlpd_latent, 50);
   const Evaluation turned = evaluate(fit.file, fit.posterior, log_of("t.csv", 8, ",ddx,ddy,ddheading", false), {}).evaluation;
   EXPECT_EQ(turned.n_zero_variance, 1) << "the first row of this log is straight";
+}
+
+TEST(EvaluateJob, ScoresPointsNearTheDataAndFarFromThemApart) {
+  const FitOutcome fit = fit_of({{log_of("a.csv", 40, ",ddx,ddy,ddheading", false)}});
+  MatrixXd states = fit.posterior.observations().front().states().leftCols(30);
+  const MatrixXd targets = MatrixXd::Random(3, 30);
+  states.rightCols(10).middleRows(3, 3) *= 30;
+  const Evaluation both = evaluate_predictions(fit.posterior, states, {0, 1, 2}, targets);
+  EXPECT_EQ(both.near.n, 20);
+  EXPECT_EQ(both.far.n, 10);
+  // the parts make the whole, output by output where those are alike
+  EXPECT_NEAR(both.coverage95, (20 * both.near.coverage95 + 10 * both.far.coverage95) / 30, 1e-12);
+  const Evaluation near = evaluate_predictions(fit.posterior, states.leftCols(20), {0, 1, 2}, targets.leftCols(20));
+  EXPECT_NEAR(both.near.nrmse * row_stddev(targets).norm(), near.rmse.norm(), 1e-12);
+  EXPECT_EQ(near.far.n, 0);
+  EXPECT_TRUE(std::isnan(near.far.nrmse));
 }
 
 TEST(EvaluateJob, MeasuresByTheNoiseThatTheTestLogStates) {

@@ -84,6 +84,14 @@ def test_results_are_the_callers_own(posterior, arm_states):
         array[:] = 0
 
 
+def test_the_distance_from_the_data_is_that_of_the_predictor(posterior, arm_states):
+    distance = posterior.predict(arm_states).distance_from_data
+    assert distance.shape == (len(arm_states),)
+    predictor = gp2.Predictor(posterior)
+    np.testing.assert_allclose([predictor.distance_from_data(x) for x in arm_states], distance, rtol=1e-12)
+    assert (posterior.predict(100 * arm_states).distance_from_data > gp2.FAR_FROM_DATA).all()
+
+
 def test_two_predictions_share_no_memory(posterior, arm_states):
     first, second = posterior.predict(arm_states), posterior.predict(arm_states)
     first.mean[:] = np.nan

@@ -211,6 +211,10 @@ Json figures_json(const ReportData& data) {
           {"nlpd_latent", number(e.nlpd_latent)},
           {"coverage95_latent", number(e.coverage95_latent)},
           {"n_zero_variance", e.n_zero_variance},
+          {"n_far", e.far.n},
+          {"nrmse_near", number(e.near.nrmse)},
+          {"nrmse_far", number(e.far.nrmse)},
+          {"coverage95_far", number(e.far.coverage95)},
           {"n", e.n}};
 }
 

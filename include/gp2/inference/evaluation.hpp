@@ -25,8 +25,15 @@ struct Evaluation {
   double nlpd = 0, coverage95 = 0;                // of measurements: noise included
   double nlpd_latent = 0, coverage95_latent = 0;  // of noise-free targets
   int n_zero_variance = 0;  // outputs that the constraint decides at their state, left out of the latent figures
-  int n = 0;                // points
-  int n_missing = 0;        // targets that are not measured (NaN), left out of all figures
+  /// The points near the data, and those far from them: beyond Posterior::far_from_data.
+  struct Part {
+    int n = 0;
+    double nrmse = 0;                              // rms error of the part over the rms of all test stds; NaN without values
+    double coverage95 = 0, coverage95_latent = 0;  // as above
+  };
+  Part near, far;
+  int n = 0;          // points
+  int n_missing = 0;  // targets that are not measured (NaN), left out of all figures
 };
 
 /// Rows of ddq that any observation of a posterior has, in order.

@@ -55,7 +55,7 @@ struct PredictRequest {
 std::vector<Option> options(PredictRequest& request);
 
 struct PredictOutcome {
-  std::vector<std::string> names;  // NAME of the view, NAME_std, cov_NAME1_NAME2, NAME_sample1, …
+  std::vector<std::string> names;  // NAME of the view, NAME_std, cov_NAME1_NAME2, NAME_sample1, …, distance_from_data
   Eigen::MatrixXd values;          // (names × N)
   std::vector<std::string> notes;
 };

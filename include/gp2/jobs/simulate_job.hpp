@@ -77,8 +77,8 @@ std::vector<std::vector<double>> multiplier_sign_changes(const Trajectory& traje
 /// The uncertainty of ddq along a motion, and where it leaves the region of the data.
 struct MotionUncertainty {
   Eigen::MatrixXd stddev;             // (nq × N)
-  std::optional<double> leaves_data;  // first time at which a standard deviation exceeds half the prior's
-  std::string acceleration;           // which one
+  Eigen::VectorXd distance;           // (N) Posterior::distance_from_data
+  std::optional<double> leaves_data;  // first time at which that is beyond Posterior::far_from_data
 };
 MotionUncertainty motion_uncertainty(const Posterior& posterior, const Trajectory& trajectory);
 

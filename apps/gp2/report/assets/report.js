@@ -181,6 +181,9 @@
       ["95 % coverage, with noise", ...of((e) => e.coverage95)],
       ["nlpd, without noise", ...of((e) => e.nlpd_latent)],
       ["95 % coverage, without noise", ...of((e) => e.coverage95_latent)],
+      ["points far from the data", ...of((e) => e.n_far)],
+      ["nrmse near the data", ...of((e) => e.nrmse_near)],
+      ["nrmse far from them", ...of((e) => e.nrmse_far)],
       ["max |A q̈ − b|, model", ...of((e) => e.max_constraint_error)],
       ["max |A q̈ − b|, fitted", ...of((e) => e.max_constraint_error_fitted)]);
     byId("figures").append(table("Figures of quality", [{ label: "figure" }, ...report.data.map((data) => ({ label: data.name, number: true }))], rows));
