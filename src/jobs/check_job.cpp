@@ -9,6 +9,7 @@
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
+#include "base/not_a_number.hpp"
 #include "gp2/base/statistics.hpp"
 #include "gp2/jobs/fit_problem.hpp"
 #include "gp2/prior.hpp"
@@ -120,16 +121,24 @@ struct Steps {
   [[nodiscard]] double slope() const { return xx > 0 ? xy / xx : 0; }
 };
 
-/// @param lag  rows by which the rate is late
-Steps steps_of(const Eigen::RowVectorXd& t, const Eigen::RowVectorXd& value, const Eigen::RowVectorXd& rate, bool is_angle,
-               int lag) {
+/// The lengths of a log's steps, NaN where it pauses.
+std::vector<double> lengths_of_steps(const Eigen::RowVectorXd& t) {
   std::vector<double> lengths;
   for (Eigen::Index i = 0; i + 1 < t.size(); ++i) lengths.push_back(t[i + 1] - t[i]);
   const double usual = median(lengths);
+  for (double& length : lengths) {
+    if (length > 1.5 * usual) length = not_a_number;
+  }
+  return lengths;
+}
+
+/// @param lag  rows by which the rate is late
+Steps steps_of(const std::vector<double>& lengths, const Eigen::RowVectorXd& value, const Eigen::RowVectorXd& rate, bool is_angle,
+               int lag) {
   Steps steps;
-  for (Eigen::Index i = 0; i + 1 < t.size(); ++i) {
+  for (Eigen::Index i = 0; i + 1 < value.size(); ++i) {
     const double dt = lengths[static_cast<std::size_t>(i)];
-    if (i + lag < 0 || i + 1 + lag >= t.size() || !(dt > 0) || dt > 1.5 * usual) continue;
+    if (i + lag < 0 || i + 1 + lag >= value.size() || std::isnan(dt)) continue;
     const double x = 0.5 * (rate[i + lag] + rate[i + 1 + lag]) * dt;
     double y = value[i + 1] - value[i];
     if (is_angle) y = std::remainder(y, 2 * std::numbers::pi);
@@ -143,25 +152,25 @@ Steps steps_of(const Eigen::RowVectorXd& t, const Eigen::RowVectorXd& value, con
 }
 
 // What else the rate would have to be for the values to follow from it; empty where it is right, or nothing explains them better.
-std::string better_rate(const Eigen::RowVectorXd& t, const Eigen::RowVectorXd& value,
+std::string better_rate(const std::vector<double>& lengths, const Eigen::RowVectorXd& value,
                         const std::vector<Eigen::RowVectorXd>& rates, const std::vector<std::string>& names, std::size_t own,
                         bool is_angle) {
   constexpr double sure = 0.95;
-  const Steps now = steps_of(t, value, rates[own], is_angle, 0);
+  const Steps now = steps_of(lengths, value, rates[own], is_angle, 0);
   if (now.n < 20) return "";
   if (std::abs(now.correlation()) > sure) {
     const double slope = now.slope();
     return std::abs(slope - 1) < 0.3 ? "" : fmt::format("it is {:.3g} × what is measured: a unit or a sign, or the clock", slope);
   }
   for (const int lag : {1, -1, 2, -2, 3, -3}) {
-    const double correlation = steps_of(t, value, rates[own], is_angle, lag).correlation();
+    const double correlation = steps_of(lengths, value, rates[own], is_angle, lag).correlation();
     if (correlation > sure && 1 - correlation < 0.1 * (1 - now.correlation())) {
       return fmt::format("the column {} by {} row{}", lag > 0 ? "lags" : "leads", std::abs(lag), std::abs(lag) == 1 ? "" : "s");
     }
   }
   for (std::size_t other = 0; other < rates.size(); ++other) {
     if (other == own || rates[other].hasNaN()) continue;
-    const Steps steps = steps_of(t, value, rates[other], is_angle, 0);
+    const Steps steps = steps_of(lengths, value, rates[other], is_angle, 0);
     if (std::abs(steps.correlation()) > sure && std::abs(now.correlation()) < 0.5) {
       return fmt::format("it is measured by the column of {}: swapped?", names[other]);
     }
@@ -175,6 +184,7 @@ void check_rates(const WholeLog& log, const System& system, std::vector<Finding>
   const Eigen::RowVectorXd t = log.states.row(layout.t());
   constexpr Eigen::Index fewest = 30;
   if (t.hasNaN() || t.size() < fewest || !((t.tail(t.size() - 1) - t.head(t.size() - 1)).array() > 0).all()) return;
+  const std::vector<double> lengths = lengths_of_steps(t);
   std::vector<Eigen::RowVectorXd> q, dq, ddq;
   std::vector<std::string> velocities;
   for (int j = 0; j < system.nq(); ++j) {
@@ -189,8 +199,8 @@ void check_rates(const WholeLog& log, const System& system, std::vector<Finding>
     const auto add = [&](const std::string& of, const std::string& rate, const std::string& text) {
       if (!text.empty()) findings.push_back({Level::warning, fmt::format("{} is not the rate of {} over t: {}", rate, of, text)});
     };
-    if (!q[j].hasNaN()) add(coordinate.name, velocities[j], better_rate(t, q[j], dq, velocities, j, coordinate.angle));
-    if (!dq[j].hasNaN()) add(velocities[j], accelerations[j], better_rate(t, dq[j], ddq, accelerations, j, false));
+    if (!q[j].hasNaN()) add(coordinate.name, velocities[j], better_rate(lengths, q[j], dq, velocities, j, coordinate.angle));
+    if (!dq[j].hasNaN()) add(velocities[j], accelerations[j], better_rate(lengths, dq[j], ddq, accelerations, j, false));
   }
 }
 
