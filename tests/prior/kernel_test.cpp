@@ -116,6 +116,51 @@ TEST(KernelTest, SumsAndProductsCombineTheirPartsAndAmplitudesScaleLaterTerms) {
   }
 }
 
+TEST(KernelTest, ParenthesesAreMultipliedOutAndKeepOneSetOfParameters) {
+  SCOPED_TRACE(fmt::format("seed {}", kernel_seed));
+  RandomStream random(kernel_seed);
+  const Kernel kernel = Kernel::parse(" ((se) + linear )* periodic", two_features);
+  EXPECT_EQ(kernel.text(), "((se) + linear )* periodic") << "as written";
+  EXPECT_EQ(names_of(kernel), (std::vector<std::string>{"se.lengthscale(a)", "se.lengthscale(b)", "periodic.lengthscale(a)",
+                                                        "periodic.lengthscale(b)", "periodic.period(a)", "periodic.period(b)",
+                                                        "linear.lengthscale(a)", "linear.lengthscale(b)", "linear.amplitude"}));
+  for (int trial = 0; trial < 100; ++trial) {
+    const VectorXd v = random_parameters(kernel, random);
+    const VectorXd x = test::random_vector(2, random), y = test::random_vector(2, random);
+    const long double expected =
+        (printed_formula("se", x, y, &v[0]) + static_cast<long double>(v[8]) * v[8] * printed_formula("linear", x, y, &v[6])) *
+        printed_formula("periodic", x, y, &v[2]);
+    EXPECT_NEAR(value_at(kernel, x, y, v), static_cast<double>(expected),
+                512 * test::eps * (10 + std::abs(static_cast<double>(expected))));
+  }
+}
+
+TEST(KernelTest, EveryProductOfParenthesesHasAnAmplitudeOfItsOwnName) {
+  const std::vector<std::string> one = {"q"};
+  EXPECT_EQ(
+      names_of(Kernel::parse("(se + linear)*(matern32 + matern52)", one)),
+      (std::vector<std::string>{"se.lengthscale(q)", "matern32.lengthscale(q)", "matern52.lengthscale(q)", "matern52.amplitude",
+                                "linear.lengthscale(q)", "linear.amplitude", "linear.matern52.amplitude"}));
+  EXPECT_EQ(names_of(Kernel::parse("(se)", one)), (std::vector<std::string>{"lengthscale(q)"}));
+  EXPECT_EQ(names_of(Kernel::parse("se + (linear + se)", one)),
+            (std::vector<std::string>{"se1.lengthscale(q)", "linear.lengthscale(q)", "linear.amplitude", "se2.lengthscale(q)",
+                                      "se2.amplitude"}));
+}
+
+TEST(KernelTest, AMalformedKernelIsRefusedWithAPlace) {
+  const auto error_of = [](const std::string& text) { return test::input_error_of([&] { Kernel::parse(text, two_features); }); };
+  EXPECT_EQ(error_of("se*(linear + rq"), "kernel \"se*(linear + rq\", column 4: this '(' is not closed");
+  EXPECT_EQ(error_of("se + linear)"), "kernel \"se + linear)\", column 12: ')' closes nothing");
+  EXPECT_EQ(error_of("(se + linear) rq"), "kernel \"(se + linear) rq\", column 15: expected '+' or '*' after ')'");
+  EXPECT_EQ(error_of("se(linear)"), "kernel \"se(linear)\", column 3: expected '+' or '*' before '('");
+  EXPECT_THAT(error_of("se*()"), HasSubstr("unknown kernel ''"));
+  EXPECT_THAT(error_of(std::string(101, '(') + "se" + std::string(101, ')')),
+              HasSubstr("column 101: parentheses are nested deeper than 100"));
+  std::string many = "(constant + constant)";
+  for (int k = 0; k < 20; ++k) many += "*(constant + constant)";
+  EXPECT_THAT(error_of(many), HasSubstr("more than 20000 factors, its parentheses multiplied out"));
+}
+
 TEST(KernelTest, ManyPointsAtOnceAreThePointsOneByOne) {
   RandomStream random(kernel_seed);
   for (const char* text : {"matern52", "se + linear*periodic"}) {
@@ -153,7 +198,8 @@ struct Columns {
 class KernelGradients : public testing::TestWithParam<std::string> {};
 INSTANTIATE_TEST_SUITE_P(Each, KernelGradients,
                          testing::Values("se", "matern32", "matern52", "rq", "periodic", "linear", "constant",
-                                         "se + linear*periodic", "rq*matern32 + matern52*periodic + constant", "se + se*se"),
+                                         "se + linear*periodic", "rq*matern32 + matern52*periodic + constant", "se + se*se",
+                                         "(se + linear)*periodic", "(rq + constant)*(matern32 + linear)"),
                          [](const auto& instance) { return fmt::format("Kernel{}", instance.index); });
 
 TEST_P(KernelGradients, MatchDifferencesInTheLogarithmOfEveryParameter) {
@@ -220,7 +266,7 @@ TEST_P(KernelGradients, MatchDifferencesInEveryFeatureOfAPoint) {
 class KernelGrams : public testing::TestWithParam<std::string> {};
 INSTANTIATE_TEST_SUITE_P(Each, KernelGrams,
                          testing::Values("se", "matern32", "matern52", "rq", "periodic", "linear", "constant",
-                                         "se + linear*periodic"),
+                                         "se + linear*periodic", "(se + linear)*periodic"),
                          [](const auto& instance) { return fmt::format("Kernel{}", instance.index); });
 
 TEST_P(KernelGrams, ArePositiveSemidefinite) {

@@ -22,7 +22,8 @@ namespace gp2 GP2_API {
 ///     constant  1
 ///
 /// The first term of a sum has amplitude 1 (the latent's signal standard deviation scales the whole); term k ≥ 2 is multiplied by
-/// w_k², its amplitude relative to the first. All parameters are positive. Sources: Rasmussen & Williams 2006, ch. 4.
+/// w_k², its amplitude relative to the first. All parameters are positive. Parentheses are multiplied out: of (se + linear)*periodic
+/// the terms are se*periodic and linear*periodic, with one and the same periodic. Sources: Rasmussen & Williams 2006, ch. 4.
 class Kernel {
  public:
   enum class Primitive { se, matern32, matern52, rq, periodic, linear, constant };
@@ -42,9 +43,9 @@ class Kernel {
 
   Kernel() = default;
 
-  /// @param text      sums and products of the names above: "se", "se + linear*periodic"
+  /// @param text      sums and products of the names above, in parentheses where wanted: "se", "(se + linear)*periodic"
   /// @param features  the D feature names, for the names of the parameters
-  /// @throws InputError naming what was found and the kernels there are.
+  /// @throws InputError naming what was found, where, and the kernels there are.
   static Kernel parse(std::string_view text, std::span<const std::string> features);
 
   [[nodiscard]] const std::string& text() const { return text_; }
