@@ -121,7 +121,9 @@ void print_text(const FitReport& report) {
     const double stddev = h.kind == Hyperparameter::Kind::parameter ? stddev_of(report, k) : std::nan("");
     const std::string error = std::isfinite(stddev) ? fmt::format(" ± {:.2g}", stddev) : std::isinf(stddev) ? " ± ∞" : "";
     print_result("  {:<34} {:>13.6g}{}   [{:.3g}, {:.3g}]{}\n", h.name, h.value, error, h.lower, h.upper,
-                 h.at_bound() ? "   at its bound" : "");
+                 h.is_fixed()   ? "   held"
+                 : h.at_bound() ? "   at its bound"
+                                : "");
   }
 }
 

@@ -25,6 +25,7 @@ struct Latent {
   };
 
   /// How a parameter of the kernel starts and is bounded, relative to its default scale (scales: training/default_hyperparameters.hpp).
+  /// Equal bounds hold it at their value.
   struct Range {
     double initial = 0;  // 0: the protocol's default
     double lower = 0;    // 0: the protocol's default
@@ -45,6 +46,7 @@ struct Latent {
   bool kernel_is_fixed = false;                     // the kernel's parameters are 1, in the units that its features have
   bool signal_is_fixed = false;                     // s = 1, in the units that its directions have
   Range lengthscale, signal_stddev;
+  std::vector<Range> feature_lengthscales;  // of each feature, in its unit, before `lengthscale` (D); empty: of none
 
   [[nodiscard]] int size() const { return static_cast<int>(column_names.size()); }  // p
   [[nodiscard]] int n_features() const { return static_cast<int>(feature_names.size()); }

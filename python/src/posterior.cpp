@@ -354,7 +354,9 @@ std::string text_of(const FitReport& self) {
     const bool has_error = self.uncertainty && h.kind == Hyperparameter::Kind::parameter && !h.at_bound();
     const std::string error = has_error ? fmt::format(" ± {:.2g}", self.uncertainty->stddev[static_cast<Eigen::Index>(k)]) : "";
     text += fmt::format("\n  {:<34} {:>13.6g}{}   [{:.3g}, {:.3g}]{}", h.name, h.value, error, h.lower, h.upper,
-                        h.at_bound() ? "   at its bound" : "");
+                        h.is_fixed()   ? "   held"
+                        : h.at_bound() ? "   at its bound"
+                                       : "");
   }
   return text;
 }
@@ -392,7 +394,9 @@ void add_reports(py::module_& module) {
       .def_property_readonly("at_bound", &Hyperparameter::at_bound)
       .def("__repr__", [](const Hyperparameter& h) {
         return fmt::format("<{} = {:.6g} in [{:.3g}, {:.3g}]{}>", h.name, h.value, h.lower, h.upper,
-                           h.at_bound() ? ", at its bound" : "");
+                           h.is_fixed()   ? ", held"
+                           : h.at_bound() ? ", at its bound"
+                                          : "");
       });
   py::class_<RestartReport>(module, "RestartReport", "How one run of the optimiser ended.")
       .def_readonly("objective", &RestartReport::objective)

@@ -82,6 +82,17 @@ std::string directions_text(const Model& model, const LatentSpec& latent, bool f
   return matrix_text(directions, full);
 }
 
+// "0.5   held", "from 0.5   in [0.1, 2]"
+std::string range_text(const Latent::Range& range) {
+  if (range.upper > 0 && range.lower == range.upper) return fmt::format("{}   held", range.upper);
+  std::string text = range.initial > 0 ? fmt::format("from {}", range.initial) : "";
+  if (range.upper > 0) text += fmt::format("{}in [{}, {}]", text.empty() ? "" : "   ", range.lower, range.upper);
+  if (range.log_stddev > 0) {
+    text += fmt::format("{}median {}, log_stddev {}", text.empty() ? "" : "   ", range.median, range.log_stddev);
+  }
+  return text;
+}
+
 std::string latents_text(const Model& model, bool full) {
   std::string text;
   const Prior prior = make_prior(model);
@@ -89,6 +100,9 @@ std::string latents_text(const Model& model, bool full) {
     const Latent& latent = prior.latents[a];
     text += fmt::format("\nlatent '{}'\n  kernel      {}\n  features    {}\n  acts on     {}\n", latent.name,
                         latent.kernel.text(), fmt::join(latent.feature_names, ", "), fmt::join(latent.column_names, ", "));
+    for (const auto& [feature, range] : model.latents[a].lengthscales) {
+      text += fmt::format("  lengthscale {} {}\n", feature, range_text(range));
+    }
     if (!latent.directions) continue;
     text += fmt::format("  directions{}\n{}", latent.base == Latent::Base::force ? " (forces)" : "",
                         directions_text(model, model.latents[a], full));

@@ -184,29 +184,57 @@ class ModelReader : private TomlReader {
     for (const auto& [name, node] : entries_of(table(*root_.get("parameters"), "parameters"))) {
       const std::string key = fmt::format("parameters.{}", name);
       declare(name, *node, key);
-      Parameter parameter{name, 0, std::nullopt, false};
-      if (node->is_table()) {
-        const toml::table& entry = *node->as_table();
-        only_keys(entry, key, {"value", "bounds", "estimate", "of", "prior"});
-        if (entry.contains("of")) parameter.value = read_robot_number(*entry.get("of"), key + ".of", name);
-        if (entry.contains("value")) {
-          parameter.value = number(*entry.get("value"), key + ".value");
-        } else if (!entry.contains("of")) {
-          fail(*node, key, "missing value; write { value = 1.0, bounds = [0.5, 2.0], estimate = true }");
-        }
-        if (entry.contains("bounds")) parameter.bounds = range(*entry.get("bounds"), key + ".bounds");
-        if (entry.contains("estimate")) parameter.estimate = boolean(*entry.get("estimate"), key + ".estimate");
-        if (entry.contains("prior")) parameter.prior = belief(*entry.get("prior"), key + ".prior");
-        if (parameter.bounds && (parameter.value < parameter.bounds->first || parameter.value > parameter.bounds->second)) {
-          fail(*node, key,
-               fmt::format("the value {} is outside its bounds [{}, {}]", parameter.value, parameter.bounds->first,
-                           parameter.bounds->second));
-        }
-      } else {
-        parameter.value = number(*node, key);
+      const Tuned entry = tuned(*node, key, {"value", "bounds", "estimate", "of", "prior"});
+      Parameter parameter{name, 0, entry.bounds, entry.estimate.value_or(false), entry.prior};
+      const toml::table* const more = node->as_table();
+      const bool is_of_robot = more != nullptr && more->contains("of");
+      if (is_of_robot) parameter.value = read_robot_number(*more->get("of"), key + ".of", name);
+      if (entry.value != nullptr) {
+        parameter.value = number(*entry.value, entry.key);
+      } else if (!is_of_robot) {
+        fail(*node, key, "missing value; write { value = 1.0, bounds = [0.5, 2.0], estimate = true }");
       }
+      require_within(parameter.value, entry.bounds, *node, key);
       definition_.parameters.push_back(parameter);
     }
+  }
+
+  // A number that a fit may adjust, or several that go together, as the file states it: alone, or as a table.
+  struct Tuned {
+    const toml::node* value = nullptr;  // null: not given
+    std::string key;                    // of the value
+    std::optional<std::pair<double, double>> bounds = std::nullopt;
+    std::optional<bool> estimate = std::nullopt;
+    std::optional<Parameter::Belief> prior = std::nullopt;
+  };
+
+  /// @param keys  that its table may have; "initial", where it is among them, is another word for "value", bounds may be equal
+  ///   and priors are of logarithms
+  Tuned tuned(const toml::node& node, const std::string& key, const std::vector<std::string>& keys) const {
+    if (!node.is_table()) return {&node, key};
+    const toml::table& entry = *node.as_table();
+    only_keys(entry, key, keys);
+    const bool is_positive = std::find(keys.begin(), keys.end(), "initial") != keys.end();
+    Tuned out;
+    for (const char* word : {"value", "initial"}) {
+      if (!entry.contains(word)) continue;
+      if (out.value != nullptr) fail(entry, key, "value and initial are two words for one number: leave out one");
+      out.value = entry.get(word);
+      out.key = fmt::format("{}.{}", key, word);
+    }
+    if (entry.contains("bounds")) out.bounds = range(*entry.get("bounds"), key + ".bounds", is_positive);
+    if (entry.contains("estimate")) out.estimate = boolean(*entry.get("estimate"), key + ".estimate");
+    if (out.bounds && out.bounds->first == out.bounds->second && out.estimate.value_or(false)) {
+      fail(node, key, fmt::format("its bounds [{0}, {0}] hold it: widen them, or leave out estimate = true", out.bounds->first));
+    }
+    if (entry.contains("prior")) out.prior = belief(*entry.get("prior"), key + ".prior", !is_positive);
+    return out;
+  }
+
+  using Bounds = std::optional<std::pair<double, double>>;
+  void require_within(double value, const Bounds& bounds, const toml::node& node, const std::string& key) const {
+    if (!bounds || (value >= bounds->first && value <= bounds->second)) return;
+    fail(node, key, fmt::format("the value {} is outside its bounds [{}, {}]", value, bounds->first, bounds->second));
   }
 
   // { mean = 2, stddev = 0.1 } of a parameter, or { median = 2, log_stddev = 0.1 } of one that is positive
@@ -549,39 +577,64 @@ class ModelReader : private TomlReader {
     }
   }
 
-  Latent::Range latent_range(const toml::table& latent, const std::string& name) const {
-    Latent::Range out;
-    if (!latent.contains(name)) return out;
-    const std::string key = "latent." + name;
-    if (!latent.get(name)->is_table()) {
-      fail(*latent.get(name), key,
-           fmt::format("expected a table such as {{ initial = 1, bounds = [0.1, 10] }}, got {}", written(*latent.get(name))));
-    }
-    const toml::table& entry = *latent.get(name)->as_table();
-    only_keys(entry, key, {"initial", "bounds", "prior"});
-    const auto require_positive = [&](const char* what, double value) {
-      if (!(value > 0)) {
-        fail(*entry.get(what), fmt::format("{}.{}", key, what),
-             fmt::format("values are factors of the default scale and must be positive, got {}", value));
-      }
+  // A hyperparameter of a latent: equal bounds hold it at their value.
+  /// @param relative  whether its values are factors of a default scale
+  Latent::Range latent_range(const toml::node& node, const std::string& key, bool relative) const {
+    const Tuned entry = tuned(node, key, {"value", "initial", "bounds", "estimate", "prior"});
+    const auto require_positive = [&](const toml::node& at, const std::string& at_key, double value) {
+      if (value > 0) return;
+      if (!relative) fail(at, at_key, fmt::format("a lengthscale must be positive, got {}", value));
+      fail(at, at_key, fmt::format("values are factors of the default scale and must be positive, got {}", value));
     };
-    if (entry.contains("bounds")) {
-      std::tie(out.lower, out.upper) = range(*entry.get("bounds"), key + ".bounds");
-      require_positive("bounds", out.lower);
+    Latent::Range out;
+    if (entry.bounds) {
+      std::tie(out.lower, out.upper) = *entry.bounds;
+      require_positive(node, key + ".bounds", out.lower);
     }
-    if (entry.contains("initial")) {
-      out.initial = number(*entry.get("initial"), key + ".initial");
-      require_positive("initial", out.initial);
+    if (entry.value != nullptr) {
+      out.initial = number(*entry.value, entry.key);
+      require_positive(*entry.value, entry.key, out.initial);
+      require_within(out.initial, entry.bounds, node, key);
     }
-    if (entry.contains("prior")) {
-      const Parameter::Belief prior = belief(*entry.get("prior"), key + ".prior", false);
-      out.median = prior.median;
-      out.log_stddev = prior.stddev;
-    }
-    if (out.initial > 0 && out.upper > 0 && (out.initial < out.lower || out.initial > out.upper)) {
-      fail(entry, key, fmt::format("initial = {} is outside bounds = [{}, {}]", out.initial, out.lower, out.upper));
-    }
+    if (entry.prior) std::tie(out.median, out.log_stddev) = std::pair(entry.prior->median, entry.prior->stddev);
+    if (node.is_table() && entry.estimate.value_or(true)) return out;
+    const bool is_held = out.upper > 0 && out.lower == out.upper;
+    if (out.initial == 0 && !is_held)
+      fail(node, key, "estimate = false needs the value to hold: { value = 1, estimate = false }");
+    if (out.initial > 0) out.lower = out.upper = out.initial;
     return out;
+  }
+
+  // Factors of a default scale.
+  Latent::Range relative_range(const toml::table& latent, const std::string& name) const {
+    if (!latent.contains(name)) return {};
+    const toml::node& node = *latent.get(name);
+    const std::string key = "latent." + name;
+    if (!node.is_table()) {
+      fail(node, key, fmt::format("expected a table such as {{ initial = 1, bounds = [0.1, 10] }}, got {}", written(node)));
+    }
+    return latent_range(node, key, true);
+  }
+
+  // { dx = 0.5, dz = { value = 2, bounds = [1, 4] } }, in the units of the features
+  void read_lengthscales(const toml::node& node, LatentSpec& latent) const {
+    const std::string section = "latent.lengthscales";
+    std::vector<std::string> features;
+    for (const std::string& feature : latent.features) {
+      const std::vector<std::string> names =
+          latent.feature_code ? std::vector<std::string>{feature} : expand_angle(feature, definition_.coordinates);
+      features.insert(features.end(), names.begin(), names.end());
+    }
+    const Kernel kernel = Kernel::parse(latent.kernel, features);
+    for (const auto& [name, entry] : entries_of(table(node, section))) {
+      const std::string key = fmt::format("{}.{}", section, name);
+      latent.lengthscales.emplace_back(name, latent_range(*entry, key, false));
+      try {
+        static_cast<void>(lengthscales_of(latent, kernel, features, definition_.coordinates));
+      } catch (const InputError& error) {
+        fail(*entry, key, error.what());
+      }
+    }
   }
 
   void read_latents() {
@@ -594,7 +647,7 @@ class ModelReader : private TomlReader {
     std::set<std::string> names;
     for (const toml::node& node : array(*root_.get("latent"), "latent")) {
       const toml::table& entry = table(node, "latent");
-      only_keys(entry, "latent", {"name", "kernel", "features", "directions", "lengthscale", "signal_stddev"});
+      only_keys(entry, "latent", {"name", "kernel", "features", "directions", "lengthscale", "lengthscales", "signal_stddev"});
       LatentSpec latent;
       latent.name =
           entry.contains("name") ? text(*entry.get("name"), "latent.name") : fmt::format("latent {}", model_.latents.size() + 1);
@@ -605,13 +658,14 @@ class ModelReader : private TomlReader {
       if (!entry.contains("features")) fail(node, "latent", R"(missing features = ["q1", …])");
       read_features(*entry.get("features"), latent);
       if (entry.contains("directions")) read_directions(*entry.get("directions"), latent);
-      latent.lengthscale = latent_range(entry, "lengthscale");
-      latent.signal_stddev = latent_range(entry, "signal_stddev");
+      latent.lengthscale = relative_range(entry, "lengthscale");
+      latent.signal_stddev = relative_range(entry, "signal_stddev");
       try {
         static_cast<void>(Kernel::parse(latent.kernel, latent.features));
       } catch (const InputError& error) {
         fail(entry.contains("kernel") ? *entry.get("kernel") : node, "latent.kernel", error.what());
       }
+      if (entry.contains("lengthscales")) read_lengthscales(*entry.get("lengthscales"), latent);
       model_.latents.push_back(std::move(latent));
     }
     if (model_.latents.empty()) add_default_latent();

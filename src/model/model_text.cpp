@@ -48,14 +48,25 @@ std::string parameter_text(const Parameter& parameter) {
   return fmt::format("{} = {}\n", quoted(parameter.name), table(entries));
 }
 
-std::string range_text(const char* name, const Latent::Range& range) {
+std::string range_text(const std::string& name, const Latent::Range& range) {
   std::vector<std::string> entries;
   if (range.initial > 0) entries.push_back(fmt::format("initial = {}", range.initial));
   if (range.upper > 0) entries.push_back(fmt::format("bounds = [{}, {}]", range.lower, range.upper));
   if (range.log_stddev > 0) {
     entries.push_back(belief_text("median", range.median, "log_stddev", range.log_stddev));
   }
-  return entries.empty() ? "" : fmt::format("{} = {}\n", name, table(entries));
+  return entries.empty() ? "" : fmt::format("{} = {}", name, table(entries));
+}
+
+std::string ranges_text(const LatentSpec& spec) {
+  std::vector<std::string> lines = {range_text("lengthscale", spec.lengthscale), range_text("signal_stddev", spec.signal_stddev)};
+  std::vector<std::string> each;
+  for (const auto& [feature, range] : spec.lengthscales) each.push_back(range_text(quoted(feature), range));
+  std::erase(each, "");
+  if (!each.empty()) lines.push_back("lengthscales = " + table(each));
+  std::string text;
+  for (const std::string& line : lines) text += line.empty() ? "" : line + "\n";
+  return text;
 }
 
 std::string directions_text(const LatentSpec& spec) {
@@ -73,7 +84,7 @@ std::string latent_text(const LatentSpec& spec) {
   const std::string features = quoted_list(spec.features);
   return fmt::format("\n[[latent]]\nname = {}\nkernel = {}\nfeatures = {}\n", quoted(spec.name), quoted(spec.kernel),
                      spec.feature_code ? fmt::format("{{ code = {} }}", features) : features) +
-         directions_text(spec) + range_text("lengthscale", spec.lengthscale) + range_text("signal_stddev", spec.signal_stddev);
+         directions_text(spec) + ranges_text(spec);
 }
 
 }  // namespace

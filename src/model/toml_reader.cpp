@@ -134,12 +134,13 @@ bool TomlReader::boolean(const toml::node& node, const std::string& key) const {
   return node.as_boolean()->get();
 }
 
-std::pair<double, double> TomlReader::range(const toml::node& node, const std::string& key) const {
+std::pair<double, double> TomlReader::range(const toml::node& node, const std::string& key, bool may_be_equal) const {
   const toml::array& pair = array(node, key);
   if (pair.size() != 2) fail(node, key, fmt::format("expected [lower, upper], got {}", written(node)));
   const double lower = number(*pair.get(0), key);
   const double upper = number(*pair.get(1), key);
-  if (!(lower < upper)) fail(node, key, fmt::format("the lower end {} must be below the upper end {}", lower, upper));
+  if (!(lower < upper || (may_be_equal && lower == upper)))
+    fail(node, key, fmt::format("the lower end {} must be below the upper end {}", lower, upper));
   return {lower, upper};
 }
 

@@ -48,7 +48,7 @@ class TomlReader {
   [[nodiscard]] std::string text(const toml::node& node, const std::string& key) const;
   [[nodiscard]] double number(const toml::node& node, const std::string& key) const;
   [[nodiscard]] bool boolean(const toml::node& node, const std::string& key) const;
-  [[nodiscard]] std::pair<double, double> range(const toml::node& node, const std::string& key) const;
+  [[nodiscard]] std::pair<double, double> range(const toml::node& node, const std::string& key, bool may_be_equal = false) const;
 
  private:
   std::string name_;

@@ -5,7 +5,9 @@
 #include <utility>
 
 #include <fmt/format.h>
+#include <fmt/ranges.h>
 
+#include "base/suggestion.hpp"
 #include "gp2/error.hpp"
 #include "prior/code_function.hpp"
 #include "prior/expression_function.hpp"
@@ -42,6 +44,8 @@ class LatentMaker {
     latent.signal_stddev = spec.signal_stddev;
     set_features(spec, latent);
     latent.kernel = named(spec, [&] { return Kernel::parse(spec.kernel, latent.feature_names); });
+    latent.feature_lengthscales =
+        named(spec, [&] { return lengthscales_of(spec, latent.kernel, latent.feature_names, system_->coordinates()); });
     set_directions(spec, latent);
     return latent;
   }
@@ -158,6 +162,31 @@ std::vector<std::string> expand_angle(const std::string& feature, const std::vec
       std::any_of(coordinates.begin(), coordinates.end(), [&](const Coordinate& c) { return c.angle && c.name == feature; });
   if (!angle) return {feature};
   return {fmt::format("sin({})", feature), fmt::format("cos({})", feature)};
+}
+
+std::vector<Latent::Range> lengthscales_of(const LatentSpec& spec, const Kernel& kernel, const std::vector<std::string>& features,
+                                           const std::vector<Coordinate>& coordinates) {
+  std::vector<Latent::Range> ranges(spec.lengthscales.empty() ? 0 : features.size());
+  std::vector<bool> is_taken(ranges.size(), false);
+  for (const auto& [name, range] : spec.lengthscales) {
+    const std::vector<std::string> meant = expand_angle(name, coordinates);
+    bool is_known = false;
+    for (std::size_t d = 0; d < features.size(); ++d) {
+      if (features[d] != name && std::find(meant.begin(), meant.end(), features[d]) == meant.end()) continue;
+      if (is_taken[d]) throw InputError(fmt::format("the lengthscale of '{}' is given twice; leave out one", features[d]));
+      is_taken[d] = is_known = true;
+      ranges[d] = range;
+    }
+    if (is_known) continue;
+    std::string mend = suggestion(name, features);
+    if (mend.empty()) mend = fmt::format("; its features are {}", fmt::join(features, ", "));
+    throw InputError(fmt::format("no feature of this latent is called '{}'{}", name, mend));
+  }
+  const auto has_unit = [](const Kernel::Parameter& p) { return p.kind == Kernel::ParameterKind::lengthscale; };
+  if (!ranges.empty() && std::none_of(kernel.parameters().begin(), kernel.parameters().end(), has_unit)) {
+    throw InputError(fmt::format("the kernel \"{}\" has no lengthscale in the unit of a feature", kernel.text()));
+  }
+  return ranges;
 }
 
 Expression PriorWords::with_values(Expression e, const System& system) const {

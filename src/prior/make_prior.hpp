@@ -30,4 +30,9 @@ void require_system(const std::shared_ptr<const System>& system);
 /// A feature that is an angle becomes its sine and cosine; another stays.
 std::vector<std::string> expand_angle(const std::string& feature, const std::vector<Coordinate>& coordinates);
 
+/// The lengthscales of single features, in their order; empty where the latent has none.
+/// @throws InputError when no feature goes by a name, one has two, or the kernel has none in the unit of a feature.
+std::vector<Latent::Range> lengthscales_of(const LatentSpec& spec, const Kernel& kernel, const std::vector<std::string>& features,
+                                           const std::vector<Coordinate>& coordinates);
+
 }  // namespace gp2

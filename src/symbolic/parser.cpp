@@ -1,11 +1,11 @@
 #include <algorithm>
 #include <charconv>
 #include <numbers>
-#include <numeric>
 #include <utility>
 
 #include <fmt/format.h>
 
+#include "base/suggestion.hpp"
 #include "gp2/error.hpp"
 #include "gp2/symbolic/expression.hpp"
 #include "symbolic/functions.hpp"
@@ -25,41 +25,6 @@ constexpr int max_depth = 200;
 bool is_digit(char c) { return c >= '0' && c <= '9'; }
 bool is_letter(char c) { return (c >= 'a' && c <= 'z') || (c >= 'A' && c <= 'Z') || c == '_'; }
 bool is_space(char c) { return c == ' ' || c == '\t' || c == '\n' || c == '\r'; }
-
-/// Levenshtein distance: the least number of characters inserted, removed or changed between a and b.
-std::size_t edit_distance(std::string_view a, std::string_view b) {
-  std::vector<std::size_t> row(b.size() + 1);
-  std::iota(row.begin(), row.end(), std::size_t{0});
-  for (std::size_t i = 1; i <= a.size(); ++i) {
-    std::size_t diagonal = std::exchange(row[0], i);
-    for (std::size_t j = 1; j <= b.size(); ++j) {
-      const std::size_t change = diagonal + (a[i - 1] == b[j - 1] ? 0 : 1);
-      diagonal = std::exchange(row[j], std::min({row[j] + 1, row[j - 1] + 1, change}));
-    }
-  }
-  return row.back();
-}
-
-/// ", did you mean 'dq3'?" for the candidate nearest to `name`; at a tie the one with more of its beginning, then the later one.
-/// Empty if none is near.
-template <class Names>
-std::string suggestion(std::string_view name, const Names& candidates) {
-  if (name.empty() || name.size() > 64) return "";
-  // a name that shares nothing with it is none that was meant
-  std::size_t nearest = std::min((name.size() + 2) / 3, name.size() - 1), longest_start = 0;
-  std::string_view best;
-  for (const std::string_view candidate : candidates) {
-    if (candidate.size() > 64) continue;
-    const std::size_t distance = edit_distance(name, candidate);
-    const auto differs = std::mismatch(name.begin(), name.end(), candidate.begin(), candidate.end()).first;
-    const auto start = static_cast<std::size_t>(differs - name.begin());
-    if (distance > nearest || (distance == nearest && start < longest_start)) continue;
-    nearest = distance;
-    longest_start = start;
-    best = candidate;
-  }
-  return best.empty() ? "" : fmt::format(", did you mean '{}'?", best);
-}
 
 template <class Names>
 std::string joined(const Names& names, std::string_view separator) {

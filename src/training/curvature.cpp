@@ -24,7 +24,7 @@ bool is_stopped(const std::atomic<bool>* stop) { return stop != nullptr && stop-
 std::vector<int> free_ones(const std::vector<Hyperparameter>& hyperparameters) {
   std::vector<int> free;
   for (std::size_t k = 0; k < hyperparameters.size(); ++k) {
-    if (!hyperparameters[k].at_bound()) free.push_back(static_cast<int>(k));
+    if (!hyperparameters[k].at_bound() && !hyperparameters[k].is_fixed()) free.push_back(static_cast<int>(k));
   }
   return free;
 }

@@ -22,26 +22,39 @@ std::string unit_of(const std::string& quantity) { return fmt::format("unit of {
 
 bool has_hyperpriors(const Protocol& protocol) { return protocol.name == Protocol::Name::standard && protocol.hyperprior; }
 
-// the model's own range, and where it says nothing the protocol's
-Latent::Range filled(const Latent::Range& own, const Latent::Range& defaults) {
+// The model's own range, and where it says nothing the protocol's. A start lies within its bounds: the standard protocol's make
+// room for it, and into the paper's box it is moved.
+Latent::Range filled(const Latent::Range& own, Latent::Range defaults, const Protocol& protocol) {
   const auto choose = [](double mine, double fallback) { return mine > 0 ? mine : fallback; };
-  return {choose(own.initial, defaults.initial), choose(own.lower, defaults.lower), choose(own.upper, defaults.upper),
-          choose(own.median, defaults.median), choose(own.log_stddev, defaults.log_stddev)};
+  if (own.initial > 0 && protocol.name == Protocol::Name::standard) {
+    defaults.lower = std::min(defaults.lower, own.initial);
+    defaults.upper = std::max(defaults.upper, own.initial);
+  }
+  Latent::Range range = {choose(own.initial, defaults.initial), choose(own.lower, defaults.lower),
+                         choose(own.upper, defaults.upper), choose(own.median, defaults.median),
+                         choose(own.log_stddev, defaults.log_stddev)};
+  range.initial = std::clamp(range.initial, range.lower, std::max(range.lower, range.upper));
+  return range;
 }
 
-// start, bounds and hyper-prior, from factors of a scale
-void set_range(Hyperparameter& h, const Latent::Range& range, double scale, const Protocol& protocol) {
-  h.value = range.initial * scale;
-  h.lower = range.lower * scale;
-  h.upper = range.upper * scale;
-  if (has_hyperpriors(protocol)) h.hyperprior = {HyperPrior::Form::log_normal, range.median * scale, range.log_stddev};
+Latent::Range scaled(const Latent::Range& range, double scale) {
+  return {range.initial * scale, range.lower * scale, range.upper * scale, range.median * scale, range.log_stddev};
+}
+
+void set_range(Hyperparameter& h, const Latent::Range& range, const Protocol& protocol) {
+  h.value = range.initial;
+  h.lower = range.lower;
+  h.upper = range.upper;
+  if (has_hyperpriors(protocol) && !h.is_fixed()) {
+    h.hyperprior = {HyperPrior::Form::log_normal, range.median, range.log_stddev};
+  }
 }
 
 Latent::Range lengthscale_range(const Latent& latent, const Protocol& protocol) {
   const Latent::Range paper = {1, 0.5, 20, Standard::lengthscale_median, Standard::lengthscale_log_stddev};
   const Latent::Range standard = {Standard::lengthscale_initial, Standard::lengthscale_lower, Standard::lengthscale_upper,
                                   Standard::lengthscale_median, Standard::lengthscale_log_stddev};
-  return filled(latent.lengthscale, protocol.name == Protocol::Name::paper ? paper : standard);
+  return filled(latent.lengthscale, protocol.name == Protocol::Name::paper ? paper : standard, protocol);
 }
 
 Hyperparameter kernel_hyperparameter(const Latent& latent, std::size_t owner, std::size_t index, const Scales& scales,
@@ -50,18 +63,18 @@ Hyperparameter kernel_hyperparameter(const Latent& latent, std::size_t owner, st
   Hyperparameter h = Hyperparameter::of(Kind::kernel, owner, index);
   h.unit = std::string("1");
   Latent::Range range = {1, 1e-3, 1e3, 1, Standard::shape_log_stddev};
-  double scale = 1;
   switch (parameter.kind) {
     case Kernel::ParameterKind::lengthscale:
-      scale = scales.feature_stddev[owner][parameter.feature];
-      range = lengthscale_range(latent, protocol);
+      range = scaled(lengthscale_range(latent, protocol), scales.feature_stddev[owner][parameter.feature]);
+      if (!latent.feature_lengthscales.empty()) {
+        range = filled(latent.feature_lengthscales[static_cast<std::size_t>(parameter.feature)], range, protocol);
+      }
       break;
     case Kernel::ParameterKind::periodic_lengthscale:
       range = lengthscale_range(latent, protocol);
       break;
     case Kernel::ParameterKind::period:
-      scale = scales.feature_range[owner][parameter.feature];
-      range = {0.5, 0.02, 20, 0.5, Standard::shape_log_stddev};
+      range = scaled({0.5, 0.02, 20, 0.5, Standard::shape_log_stddev}, scales.feature_range[owner][parameter.feature]);
       break;
     case Kernel::ParameterKind::shape:
     case Kernel::ParameterKind::amplitude:
@@ -69,8 +82,7 @@ Hyperparameter kernel_hyperparameter(const Latent& latent, std::size_t owner, st
   }
   const bool has_unit = parameter.kind == Kernel::ParameterKind::lengthscale || parameter.kind == Kernel::ParameterKind::period;
   if (has_unit) h.unit = unit_of(latent.feature_names[static_cast<std::size_t>(parameter.feature)]);
-  range.initial = std::clamp(range.initial, range.lower, range.upper);
-  set_range(h, range, scale, protocol);
+  set_range(h, range, protocol);
   return h;
 }
 
@@ -79,9 +91,7 @@ Hyperparameter shared_signal(const Latent& latent, std::size_t owner, const Scal
   Hyperparameter h = Hyperparameter::of(Kind::shared_signal_stddev, owner, 0);
   h.unit = "default scale of each column";
   h.column_scale = scales.signal_stddev[owner];
-  Latent::Range range = filled(latent.signal_stddev, {1, 0.5, 10, 0, 0});
-  range.initial = std::clamp(range.initial, range.lower, range.upper);
-  set_range(h, range, 1, protocol);
+  set_range(h, filled(latent.signal_stddev, {1, 0.5, 10, 0, 0}, protocol), protocol);
   return h;
 }
 
@@ -91,7 +101,8 @@ Hyperparameter column_signal(const Latent& latent, std::size_t owner, std::size_
   h.unit = unit_of(latent.column_names[column]);
   const Latent::Range standard = {Standard::signal_initial, Standard::signal_lower, Standard::signal_upper,
                                   Standard::signal_median, Standard::signal_log_stddev};
-  set_range(h, filled(latent.signal_stddev, standard), scales.signal_stddev[owner][static_cast<Index>(column)], protocol);
+  set_range(h, scaled(filled(latent.signal_stddev, standard, protocol), scales.signal_stddev[owner][static_cast<Index>(column)]),
+            protocol);
   return h;
 }
 

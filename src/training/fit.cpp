@@ -200,10 +200,10 @@ class Training {
     if (reports_[from].iterations >= options_.max_iterations) return false;
     constexpr int n_points = 9;
     const VectorXd x = coordinates(results_[from]);
-    // a box that is no more than a limit is too wide to scan
+    // a box that is no more than a limit is too wide to scan, one without width has one point
     std::vector<std::size_t> scanned;
     for (std::size_t k = 0; k < hyperparameters_.size(); ++k) {
-      if (hyperparameters_[k].size == 0) scanned.push_back(k);
+      if (hyperparameters_[k].size == 0 && !hyperparameters_[k].is_fixed()) scanned.push_back(k);
     }
     if (scanned.empty()) return false;
     const auto moved = [&](int trial) {

@@ -53,6 +53,7 @@ Hyperparameter Hyperparameter::of(Kind kind, std::size_t owner, std::size_t inde
 }
 
 bool Hyperparameter::at_bound() const {
+  if (is_fixed()) return false;
   const double tolerance = 1e-6;
   if (positive) return std::log(value / lower) <= tolerance || std::log(upper / value) <= tolerance;
   return value - lower <= tolerance * (upper - lower) || upper - value <= tolerance * (upper - lower);

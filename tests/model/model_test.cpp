@@ -168,6 +168,40 @@ signal_stddev = { initial = 0.5 }
   EXPECT_EQ(model.latents[1].signal_stddev.initial, 0.5);
 }
 
+TEST(Model, EqualBoundsOrEstimateFalseHoldAHyperparameter) {
+  const Model model = parse(base + R"([[latent]]
+features = ["q1"]
+lengthscale = { bounds = [2, 2] }
+signal_stddev = { value = 0.5, estimate = false }
+[[latent]]
+features = ["q1"]
+lengthscale = { value = 3, bounds = [1, 4], estimate = false }
+signal_stddev = { value = 0.5, bounds = [0.1, 1], estimate = true }
+)");
+  const auto bounds = [](const Latent::Range& range) { return std::pair(range.lower, range.upper); };
+  EXPECT_EQ(bounds(model.latents[0].lengthscale), std::pair(2.0, 2.0));
+  EXPECT_EQ(bounds(model.latents[0].signal_stddev), std::pair(0.5, 0.5));
+  EXPECT_EQ(bounds(model.latents[1].lengthscale), std::pair(3.0, 3.0));
+  EXPECT_EQ(bounds(model.latents[1].signal_stddev), std::pair(0.1, 1.0));
+}
+
+TEST(Model, LengthscalesOfFeaturesAreInTheirUnits) {
+  const Model model = parse(base + R"([[latent]]
+features = ["q1", "q2", "dq1 - dq2"]
+lengthscales = { q1 = 0.5, q2 = { value = 2, bounds = [1, 4] }, "dq1 - dq2" = { prior = { median = 3, log_stddev = 0.2 } } }
+)");
+  const Latent latent = make_prior(model).latents[0];
+  ASSERT_THAT(latent.feature_names, ElementsAre("q1", "sin(q2)", "cos(q2)", "dq1 - dq2"));
+  ASSERT_THAT(latent.feature_lengthscales, SizeIs(4));
+  EXPECT_EQ(latent.feature_lengthscales[0].lower, 0.5) << "a number by itself is held";
+  EXPECT_EQ(latent.feature_lengthscales[0].upper, 0.5);
+  for (const std::size_t d : {1u, 2u}) {
+    EXPECT_EQ(latent.feature_lengthscales[d].initial, 2);
+    EXPECT_EQ(latent.feature_lengthscales[d].upper, 4);
+  }
+  EXPECT_EQ(latent.feature_lengthscales[3].median, 3);
+}
+
 TEST(Model, ParametersKeepTheOrderOfTheFile) {
   const Model model = parse(with_parameter("z = 1\nm = { value = 2, bounds = [2, 3], estimate = true }\na = -1"));
   const std::vector<Parameter>& parameters = model.system->parameters();
@@ -407,8 +441,26 @@ std::vector<Complaint> complaints() {
       {"LatentWithOneBracket", base + "[latent]\n" + features,
        "7: latent: write [[latent]], with two brackets: there may be several"},
       {"LatentIsANumber", "latent = 3\n" + base, "1: latent: expected an array [ … ], got 3"},
-      {"LatentWithAnUnknownKey", latent + "lengthscales = 1\n" + features,
-       "8: latent.lengthscales: unknown key; known here: name, kernel, features, directions, lengthscale, signal_stddev"},
+      {"LatentWithAnUnknownKey", latent + "lengths = 1\n" + features,
+       "8: latent.lengths: unknown key; known here: name, kernel, features, directions, lengthscale, lengthscales, "
+       "signal_stddev"},
+      {"LengthscalesAreNoTable", latent + features + "lengthscales = 1\n", "9: latent.lengthscales: expected a table, got 1"},
+      {"LengthscaleOfNoFeature", latent + "features = [\"dq1\"]\nlengthscales = { dq2 = 1 }\n",
+       "9: latent.lengthscales.dq2: no feature of this latent is called 'dq2', did you mean 'dq1'?"},
+      {"LengthscaleOfNoFeatureAndNoneNear", latent + features + "lengthscales = { u1 = 1 }\n",
+       "9: latent.lengthscales.u1: no feature of this latent is called 'u1'; its features are q1"},
+      {"LengthscaleTwice", latent + "features = [\"q2\"]\nlengthscales = { q2 = 1, 'sin(q2)' = 2 }\n",
+       "9: latent.lengthscales.sin(q2): the lengthscale of 'sin(q2)' is given twice; leave out one"},
+      {"LengthscaleOfAPeriodicKernel", latent + features + "kernel = \"periodic\"\nlengthscales = { q1 = 1 }\n",
+       "10: latent.lengthscales.q1: the kernel \"periodic\" has no lengthscale in the unit of a feature"},
+      {"NegativeLengthscale", latent + features + "lengthscales = { q1 = -1 }\n",
+       "9: latent.lengthscales.q1: a lengthscale must be positive, got -1"},
+      {"HeldWithoutAValue", latent + features + "lengthscale = { estimate = false }\n",
+       "9: latent.lengthscale: estimate = false needs the value to hold: { value = 1, estimate = false }"},
+      {"HeldAndEstimated", latent + features + "lengthscale = { bounds = [2, 2], estimate = true }\n",
+       "9: latent.lengthscale: its bounds [2, 2] hold it: widen them, or leave out estimate = true"},
+      {"ValueAndInitial", latent + features + "lengthscale = { value = 2, initial = 2 }\n",
+       "9: latent.lengthscale: value and initial are two words for one number: leave out one"},
       {"LatentWithoutFeatures", latent + "kernel = \"se\"\n", "7: latent: missing features = [\"q1\", …]"},
       {"LatentOfNoFeature", latent + "features = []\n", "8: latent.features: a latent needs at least one feature"},
       {"LatentNameTwice", latent + "name = \"a\"\n" + features + "[[latent]]\nname = \"a\"\n" + features,
@@ -449,7 +501,7 @@ std::vector<Complaint> complaints() {
       {"SignalOfZero", latent + features + "signal_stddev = { initial = 0 }\n",
        "9: latent.signal_stddev.initial: values are factors of the default scale and must be positive, got 0"},
       {"SignalOutsideItsBounds", latent + features + "signal_stddev = { initial = 5, bounds = [1, 2] }\n",
-       "9: latent.signal_stddev: initial = 5 is outside bounds = [1, 2]"},
+       "9: latent.signal_stddev: the value 5 is outside its bounds [1, 2]"},
       // noise
       {"NoiseOfAnUnknownQuantity", base + "[noise]\nq1 = 0.1\n", "8: noise.q1: unknown key; known here: ddq"},
       {"NoiseOfZero", base + "[noise]\nddq = 0\n", "8: noise.ddq: a noise standard deviation must be positive, got 0"},

@@ -155,6 +155,68 @@ TEST(HyperparametersTest, PriorsOfTheModelReplaceTheWeakOnes) {
   EXPECT_EQ(find(of_normal, "p1").hyperprior.form, HyperPrior::Form::normal);
 }
 
+// the surface's model with more keys of its latent
+Model surface_with_latent_keys(const std::string& keys) {
+  std::string text = test::model("models/surface.toml").text;
+  text.insert(text.find("[[latent]]") + 10, "\n" + keys + "\n");
+  return Model::parse(text, "with keys");
+}
+
+TEST(HyperparametersTest, EqualBoundsHoldAValueAndLeaveItNoPrior) {
+  const Model model =
+      surface_with_latent_keys("lengthscale = { bounds = [2, 2] }\nsignal_stddev = { value = 4, estimate = false }");
+  const Prior prior = make_prior(model);
+  const std::vector<Observations> observations = observe_drawn(model, 30, true);
+  const double spread = stddev(evaluate_features(prior, 0, observations[0].states()).col(0));
+  const auto all = default_hyperparameters(prior, observations, {}, {});
+  for (const char* name : {"lengthscale(q1)", "signal_stddev(ddq1)"}) {
+    const Hyperparameter& h = find(all, name);
+    EXPECT_TRUE(h.is_fixed()) << name;
+    EXPECT_EQ(h.value, h.lower) << name;
+    EXPECT_FALSE(h.at_bound()) << name;
+    EXPECT_EQ(h.hyperprior.form, HyperPrior::Form::none) << name;
+  }
+  expect_same(find(all, "lengthscale(q1)").value, 2 * spread);
+  EXPECT_FALSE(find(all, "noise_stddev(ddq1)").is_fixed());
+  for (const Hyperparameter& h : default_hyperparameters(prior, observations, {}, {Protocol::Name::paper, true})) {
+    if (h.kind == Kind::kernel) EXPECT_TRUE(h.is_fixed()) << h.name;
+  }
+}
+
+TEST(HyperparametersTest, LengthscalesInUnitsOfFeaturesComeBeforeRelativeOnes) {
+  const Model model = surface_with_latent_keys(
+      "lengthscale = { initial = 2, bounds = [1, 3] }\nlengthscales = { q1 = 0.7, q2 = { value = 1e-6 }, q3 = { bounds = [5, 6] "
+      "} }");
+  const Prior prior = make_prior(model);
+  const std::vector<Observations> observations = observe_drawn(model, 30, false);
+  const auto all = default_hyperparameters(prior, observations, {}, {});
+  EXPECT_EQ(find(all, "lengthscale(q1)").value, 0.7) << "to the bit";
+  EXPECT_TRUE(find(all, "lengthscale(q1)").is_fixed());
+  EXPECT_EQ(find(all, "lengthscale(q2)").value, 1e-6);
+  EXPECT_EQ(find(all, "lengthscale(q2)").lower, 1e-6) << "bounds that are not its own make room for a start";
+  expect_same(find(all, "lengthscale(q2)").upper, 3 * stddev(evaluate_features(prior, 0, observations[0].states()).col(1)));
+  EXPECT_EQ(find(all, "lengthscale(q3)").lower, 5);
+  EXPECT_EQ(find(all, "lengthscale(q3)").value, 5);
+  EXPECT_EQ(find(all, "lengthscale(q3)").upper, 6);
+  const double spread = stddev(evaluate_features(prior, 0, observations[0].states()).col(3));
+  expect_same(find(all, "lengthscale(dq1)").value, 2 * spread);
+}
+
+TEST(HyperparametersTest, AFitLeavesWhatIsHeld) {
+  const Model model = surface_with_latent_keys("lengthscales = { q1 = 0.7 }\nsignal_stddev = { value = 2, estimate = false }");
+  const Prior prior = make_prior(model);
+  const std::vector<Observations> observations = observe_drawn(model, 12, true);
+  const auto all = default_hyperparameters(prior, observations, {}, {});
+  FitOptions options;
+  options.n_restarts = 2;
+  options.max_iterations = 15;
+  options.n_threads = 1;
+  const FitReport report = fit(prior, observations, all, options).report;
+  EXPECT_EQ(find(report.hyperparameters, "lengthscale(q1)").value, 0.7);
+  EXPECT_EQ(find(report.hyperparameters, "signal_stddev(ddq1)").value, find(all, "signal_stddev(ddq1)").value);
+  EXPECT_NE(find(report.hyperparameters, "lengthscale(q2)").value, find(all, "lengthscale(q2)").value);
+}
+
 TEST(HyperparametersTest, APriorOfALogarithmNeedsBoundsAboveZero) {
   const Model model = with_priors("{ value = 0.08, bounds = [-1, 1], prior = { median = 0.09, log_stddev = 0.2 } }");
   EXPECT_THAT(

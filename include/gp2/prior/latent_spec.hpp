@@ -4,6 +4,7 @@
 #include <memory>
 #include <optional>
 #include <string>
+#include <utility>
 #include <vector>
 
 #include <Eigen/Core>
@@ -45,6 +46,8 @@ struct LatentSpec {
   std::vector<std::string> direction_names = {};          // of code, its columns (p)
   StateCode direction_code = {};                          // B(x) column-major (nq·p × N); neither: B = I
   Latent::Range lengthscale = {}, signal_stddev = {};
+  /// Lengthscales of single features, in their units and not relative. An angle's name stands for its sine and its cosine.
+  std::vector<std::pair<std::string, Latent::Range>> lengthscales = {};
 };
 
 /// What the model's kernel would rule out without reason: a second latent of fixed, short lengthscales and a size below the

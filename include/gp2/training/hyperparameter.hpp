@@ -70,8 +70,10 @@ struct Hyperparameter {
   /// A hyperparameter of no name and value: positive unless of the system's parameters or a loading.
   static Hyperparameter of(Kind kind, std::size_t owner, std::size_t index);
 
-  /// Within 1e-6 of a bound, on the scale it is optimised on.
+  /// Within 1e-6 of a bound, on the scale it is optimised on; not where it is held.
   [[nodiscard]] bool at_bound() const;
+  /// Held at its value: its bounds leave it no room.
+  [[nodiscard]] bool is_fixed() const { return lower == upper; }
   [[nodiscard]] bool is_system_parameter() const { return kind == Kind::parameter; }
   /// Entries of a loading enter by C Cᵀ: where all of one latent's that may be negative are 0, so is their gradient.
   [[nodiscard]] bool is_stationary_at_zero() const { return kind == Kind::loading && !positive; }
