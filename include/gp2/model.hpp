@@ -67,6 +67,13 @@ class Model {
     bool estimate = false;
   };
 
+  /// An entry of [parameters] that follows from others.
+  struct DerivedParameter {
+    std::string name, text;
+    Expression expression;  // of the system's parameters
+    double value = 0;       // where these have theirs
+  };
+
   /// One entry of [sampling]: a uniform range, or an expression of other entries.
   struct SamplingRule {
     std::string name;
@@ -98,6 +105,7 @@ class Model {
   std::optional<RobotDescription> robot;   // that the model file names
   std::shared_ptr<ExpressionGraph> graph;  // of every expression here
   std::shared_ptr<const System> system;
+  std::vector<DerivedParameter> derived_parameters;
   std::vector<LatentSpec> latents;
   Noise noise;
   std::optional<Expression> potential;         // V(q, t) [J], for the energy that `simulate` reports

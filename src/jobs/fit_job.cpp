@@ -232,7 +232,7 @@ FitJob prepare_fit_again(const FitFile& fit, int threads) {
   problem.systems = fit.systems;
   problem.systems.resize(problem.observations.size());
   problem.lines.resize(problem.observations.size());
-  problem.hyperparameters = starting_hyperparameters(problem, request.problem);
+  problem.hyperparameters = starting_hyperparameters(fit.model, problem, request.problem);
   return job_of(std::move(request), std::move(problem));
 }
 

@@ -51,7 +51,7 @@ FitProblem make_baseline_problem(const Model& model, const std::vector<Log>& log
   }
   problem.prior_options.baseline = standardised_by(problem.observations, problem.prior, *options.baseline);
   problem.prior = make_prior(model, problem.prior_options);
-  problem.hyperparameters = starting_hyperparameters(problem, options);
+  problem.hyperparameters = starting_hyperparameters(model, problem, options);
   return problem;
 }
 
@@ -76,11 +76,24 @@ void note_parameters(const Model& home, const LoggedSystem& logged, const std::v
   }
 }
 
+// @throws InputError for a parameter that follows from others.
+void require_own_parameters(const Model& model, const std::vector<std::string>& names) {
+  for (const Model::DerivedParameter& derived : model.derived_parameters) {
+    if (std::find(names.begin(), names.end(), derived.name) == names.end()) continue;
+    throw InputError(
+        fmt::format("`estimate`: the parameter '{}' of '{}' follows from others: {} = {}; estimate those, and it follows them",
+                    derived.name, model.name, derived.name, derived.text));
+  }
+}
+
 // The parameters to estimate: those asked for, else those that the model says.
-std::vector<std::string> estimated_parameters(const System& system, const FitProblemOptions& options) {
-  if (options.estimate) return *options.estimate;
+std::vector<std::string> estimated_parameters(const Model& model, const FitProblemOptions& options) {
+  if (options.estimate) {
+    require_own_parameters(model, *options.estimate);
+    return *options.estimate;
+  }
   std::vector<std::string> names;
-  for (const Parameter& parameter : system.parameters()) {
+  for (const Parameter& parameter : model.system->parameters()) {
     if (parameter.estimate) names.push_back(parameter.name);
   }
   return names;
@@ -190,10 +203,11 @@ std::vector<std::string> notes_of(const FitReport& report) {
   return notes;
 }
 
-std::vector<Hyperparameter> starting_hyperparameters(const FitProblem& problem, const FitProblemOptions& options) {
+std::vector<Hyperparameter> starting_hyperparameters(const Model& model, const FitProblem& problem,
+                                                     const FitProblemOptions& options) {
   if (options.baseline) return baseline_hyperparameters(problem.prior, problem.observations);
-  return default_hyperparameters(problem.prior, trusted_observations(problem),
-                                 estimated_parameters(*problem.prior.system, options), options.protocol);
+  return default_hyperparameters(problem.prior, trusted_observations(problem), estimated_parameters(model, options),
+                                 options.protocol);
 }
 
 FitOptions default_fit_options(const FitProblem& problem) {
@@ -307,14 +321,14 @@ FitProblem make_fit_problem(const Model& model, const std::vector<Log>& logs, co
   }
   FitProblem problem = start_problem(model, options);
   require_columns(model, logs, also, options);
-  const std::vector<std::string> estimated = estimated_parameters(*model.system, options);
+  const std::vector<std::string> estimated = estimated_parameters(model, options);
   for (const Log& log : logs) {
     problem.observations.push_back(
         read_log(add_system(model, log, estimated, problem), log, options, problem.lines.emplace_back(), problem.notes));
   }
   add_side_information(model, also, options, estimated, problem);
   if (has_discrepancy(problem, options)) add_discrepancy(model, problem);
-  problem.hyperparameters = starting_hyperparameters(problem, options);
+  problem.hyperparameters = starting_hyperparameters(model, problem, options);
   return problem;
 }
 

@@ -62,12 +62,15 @@ std::string robot_text(const RobotDescription& robot) {
 }
 
 // "  0.1   in [0, 1]   estimated"
-std::string parameters_text(const System& system) {
+std::string parameters_text(const Model& model, const System& system) {
   std::string text = "\nparameters\n";
   for (const Parameter& parameter : system.parameters()) {
     text += fmt::format("  {:<12} {}", parameter.name, parameter.value);
     if (parameter.bounds) text += fmt::format("   in [{}, {}]", parameter.bounds->first, parameter.bounds->second);
     text += parameter.estimate ? "   estimated\n" : "\n";
+  }
+  for (const Model::DerivedParameter& derived : model.derived_parameters) {
+    text += fmt::format("  {:<12} {}   = {}\n", derived.name, derived.value, derived.text);
   }
   return text;
 }
@@ -125,7 +128,7 @@ std::string whole_text(const Model& model, const SymbolicSystem& system, const s
     text += fmt::format("  {} = 0   ({} level)\n", row.text, level);
   }
   text += fmt::format("A\n{}b\n{}", matrix_text(A, full), matrix_text(b, full));
-  return text + parameters_text(system) + latents_text(model, full);
+  return text + parameters_text(model, system) + latents_text(model, full);
 }
 
 }  // namespace

@@ -38,6 +38,7 @@ class ModelReader : private TomlReader {
     refuse_names_of_other_columns();
     read_parameters();
     declare_symbols();
+    read_derived_parameters();
     read_let();
     if (model_.code.mechanics) {
       ask_for_mechanics();
@@ -184,6 +185,8 @@ class ModelReader : private TomlReader {
     for (const auto& [name, node] : entries_of(table(*root_.get("parameters"), "parameters"))) {
       const std::string key = fmt::format("parameters.{}", name);
       declare(name, *node, key);
+      if (node->is_string()) continue;  // follows from others
+      refuse_text_among_keys(*node, name, key);
       const Tuned entry = tuned(*node, key, {"value", "bounds", "estimate", "of", "prior"});
       Parameter parameter{name, 0, entry.bounds, entry.estimate.value_or(false), entry.prior};
       const toml::table* const more = node->as_table();
@@ -197,6 +200,42 @@ class ModelReader : private TomlReader {
       require_within(parameter.value, entry.bounds, *node, key);
       definition_.parameters.push_back(parameter);
     }
+  }
+
+  // I2 = { value = "2*m", … }
+  void refuse_text_among_keys(const toml::node& node, const std::string& name, const std::string& key) const {
+    const toml::table* const entry = node.as_table();
+    if (entry == nullptr || !entry->contains("value") || !entry->get("value")->is_string()) return;
+    fail(
+        node, key,
+        fmt::format("a parameter that follows from others has no bounds, no prior and no estimate of its own: write {} = \"{}\", "
+                    "and say of those others what is to be estimated",
+                    name, shortened(entry->get("value")->as_string()->get())));
+  }
+
+  // Parameters that follow from others stand for their expressions wherever they are used.
+  void read_derived_parameters() {
+    if (!root_.contains("parameters")) return;
+    auto entries = entries_of(table(*root_.get("parameters"), "parameters"));
+    std::erase_if(entries, [](const auto& entry) { return !entry.second->is_string(); });
+    const std::vector<Parameter>& parameters = definition_.parameters;
+    std::map<std::string, Expression> values;
+    for (const Parameter& parameter : parameters) values.emplace(parameter.name, model_.graph->constant(parameter.value));
+    // to suggest from are parameters only
+    const std::vector<std::string> all_names = model_.symbol_names_;
+    model_.symbol_names_.clear();
+    for (const Parameter& parameter : parameters) model_.symbol_names_.push_back(parameter.name);
+    define_in_order(entries, "parameters", [&](const std::string& name, const toml::node& node, const std::string& key) {
+      const Expression expression = unexpanded(node, key);
+      allow_only(node, key, expression, symbols_->state(), "a parameter may follow from other parameters only");
+      allow_only(node, key, expression, symbols_->ddq, "a parameter may follow from other parameters only");
+      const Expression value = model_.graph->substitute(expression, values);
+      if (!value.is_constant()) fail(node, key, "its value is no finite number where the other parameters have theirs");
+      model_.derived_parameters.push_back({name, text(node, key), expression, value.constant_value()});
+      return expression;
+    });
+    model_.symbol_names_ = all_names;
+    for (const Model::DerivedParameter& derived : model_.derived_parameters) model_.symbol_names_.push_back(derived.name);
   }
 
   // A number that a fit may adjust, or several that go together, as the file states it: alone, or as a table.
@@ -290,15 +329,21 @@ class ModelReader : private TomlReader {
     for (Expression symbol : symbols_->ddq) model_.define(symbol.variable_name(), symbol);
   }
 
-  // names may stand in any order and use each other, but not in a circle
   void read_let() {
     if (!root_.contains("let")) return;
     const auto entries = entries_of(table(*root_.get("let"), "let"));
+    for (const auto& [name, node] : entries) declare(name, *node, fmt::format("let.{}", name));
+    define_in_order(entries, "let",
+                    [&](const std::string&, const toml::node& node, const std::string& key) { return unexpanded(node, key); });
+  }
+
+  // Names may stand in any order and use each other, but not in a circle.
+  /// @param read  the expression of an entry, when those it uses are defined
+  template <class Entries, class Read>
+  void define_in_order(const Entries& entries, const char* section, const Read& read) {
+    const auto key_of = [&](const std::string& name) { return fmt::format("{}.{}", section, name); };
     std::map<std::string, std::size_t> position;
-    for (const auto& [name, node] : entries) {
-      declare(name, *node, fmt::format("let.{}", name));
-      position.emplace(name, position.size());
-    }
+    for (const auto& entry : entries) position.emplace(entry.first, position.size());
     std::vector<std::vector<std::size_t>> uses;
     for (const auto& [name, node] : entries) {
       uses.emplace_back();
@@ -310,11 +355,11 @@ class ModelReader : private TomlReader {
     const Order order = order_by_use(uses);
     if (!order.circle.empty()) {
       const auto& [name, node] = entries[order.circle.front()];
-      fail(*node, fmt::format("let.{}", name), "defined in terms of itself" + circle_text(order.circle, entries));
+      fail(*node, key_of(name), "defined in terms of itself" + circle_text(order.circle, entries));
     }
     for (const std::size_t k : order.positions) {
       const auto& [name, node] = entries[k];
-      model_.define(name, unexpanded(*node, fmt::format("let.{}", name)));
+      model_.define(name, read(name, *node, key_of(name)));
     }
   }
 

@@ -74,5 +74,17 @@ TEST(FitNotes, NoiseThatIsEstimatedStartsAtAScaleOfTheColumn) {
   EXPECT_EQ(noise[1], 0.05);
 }
 
+TEST(FitNotes, AParameterThatFollowsFromOthersIsNotEstimated) {
+  const Model model = Model::parse(
+      "coordinates = ['x']\n[parameters]\nm = 2\nw = '2*m'\n[mechanics]\nmass = [['w']]\n[[latent]]\nfeatures = ['dx']\n",
+      "cart");
+  FitProblemOptions options;
+  options.noise_stddev = 0.1;
+  options.estimate = {"w"};
+  const CsvTable log = CsvTable::parse("x,dx,ddx\n1,2,3\n2,3,4\n", "log.csv");
+  EXPECT_EQ(input_error_of([&] { make_fit_problem(model, log, options); }),
+            "`estimate`: the parameter 'w' of 'cart' follows from others: w = 2*m; estimate those, and it follows them");
+}
+
 }  // namespace
 }  // namespace gp2

@@ -202,6 +202,22 @@ lengthscales = { q1 = 0.5, q2 = { value = 2, bounds = [1, 4] }, "dq1 - dq2" = { 
   EXPECT_EQ(latent.feature_lengthscales[3].median, 3);
 }
 
+TEST(Model, AParameterMayFollowFromOthers) {
+  const std::string text = replaced(with_parameter("I3 = \"I2 + n\"\nm = 2.0\nI2 = \"2*m\"\nn = 0.5"), "\"1\"]]", "\"I3\"]]");
+  const Model model = parse(text);
+  ASSERT_THAT(model.system->parameters(), SizeIs(2));
+  ASSERT_THAT(model.derived_parameters, SizeIs(2));
+  EXPECT_EQ(model.derived_parameters[0].name, "I2");
+  EXPECT_EQ(model.derived_parameters[0].text, "2*m");
+  EXPECT_EQ(model.derived_parameters[0].value, 4);
+  EXPECT_EQ(model.derived_parameters[1].value, 4.5);
+  // it follows m, and so does the derivative
+  const Eigen::VectorXd state = Eigen::VectorXd::Zero(6), moved = Eigen::Vector2d(3, 0.5);
+  EXPECT_EQ(model.system->evaluate(state, moved).M(0)(1, 1), 6.5);
+  EXPECT_EQ(model.system->differentiate(state, moved, 0).M(0)(1, 1), 2);
+  EXPECT_EQ(to_string(model.expression("I3*q1")), "(2*m + n)*q1");
+}
+
 TEST(Model, ParametersKeepTheOrderOfTheFile) {
   const Model model = parse(with_parameter("z = 1\nm = { value = 2, bounds = [2, 3], estimate = true }\na = -1"));
   const std::vector<Parameter>& parameters = model.system->parameters();
@@ -356,7 +372,19 @@ std::vector<Complaint> complaints() {
       // parameters
       {"ParameterWithoutAValue", with_parameter("m = { bounds = [1, 2] }"),
        "4: parameters.m: missing value; write { value = 1.0, bounds = [0.5, 2.0], estimate = true }"},
-      {"ParameterIsText", with_parameter("m = \"2\""), "4: parameters.m: expected a finite number, got '2'"},
+      {"DerivedParameterOfAnUnknownName", with_parameter("m = \"2*n\""),
+       "4: parameters.m: \"2*n\", column 3: unknown symbol 'n'; known here: none"},
+      {"DerivedParameterOfAState", with_parameter("m = \"2*q1\""),
+       "4: parameters.m: a parameter may follow from other parameters only, but this entry depends on 'q1'"},
+      {"DerivedParameterOfTime", with_parameter("m = \"2*t\""),
+       "4: parameters.m: a parameter may follow from other parameters only, but this entry depends on 't'"},
+      {"DerivedParametersInACircle", with_parameter("m = \"n + 1\"\nn = \"2*m\""),
+       "4: parameters.m: defined in terms of itself: m uses n uses m"},
+      {"DerivedParameterWithoutAValue", with_parameter("m = \"1/n\"\nn = 0"),
+       "4: parameters.m: its value is no finite number where the other parameters have theirs"},
+      {"DerivedParameterToEstimate", with_parameter("m = { value = \"2*n\", estimate = true }\nn = 1"),
+       "4: parameters.m: a parameter that follows from others has no bounds, no prior and no estimate of its own: write m = "
+       "\"2*n\", and say of those others what is to be estimated"},
       {"ParameterIsInfinite", with_parameter("m = inf"), "4: parameters.m: expected a finite number, got inf"},
       {"PriorOfAParameterHalfGiven", with_parameter("m = { value = 2, prior = { mean = 2 } }"),
        "4: parameters.m.prior: missing stddev; write { mean = 2.0, stddev = 0.1 }, or, of a positive one, { median = 2.0, "

@@ -82,7 +82,8 @@ FitProblem make_fit_problem(const Model& model, const CsvTable& log, const FitPr
 FitOptions default_fit_options(const FitProblem& problem);
 
 /// Where the hyperparameters of a problem start, and their bounds.
-std::vector<Hyperparameter> starting_hyperparameters(const FitProblem& problem, const FitProblemOptions& options);
+std::vector<Hyperparameter> starting_hyperparameters(const Model& model, const FitProblem& problem,
+                                                     const FitProblemOptions& options);
 
 /// fit() or, of a baseline, fit_baseline(), or fit_robust() where that is asked for.
 Fit fit(const FitProblem& problem, const FitOptions& options);
