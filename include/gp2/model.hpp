@@ -63,8 +63,10 @@ class Model {
   static Model from_code(std::shared_ptr<const System> system, const std::vector<LatentSpec>& latents);
 
   struct Noise {
-    std::vector<double> stddev;  // per coordinate; empty when the file has no [noise]
+    std::vector<double> stddev;  // per coordinate; empty when the file states none
     bool estimate = false;
+    std::vector<std::pair<double, double>> bounds;  // of an estimate, per coordinate; empty: the protocol's
+    std::vector<double> floor;                      // what stated deviations lack, per coordinate; empty: nothing
   };
 
   /// An entry of [parameters] that follows from others.

@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <limits>
+#include <tuple>
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
@@ -203,11 +204,35 @@ std::vector<std::string> notes_of(const FitReport& report) {
   return notes;
 }
 
+namespace {
+
+// What [noise] says of the range of an estimated σ, where the log states no deviations of which it is a factor.
+void bound_noise(const Model& model, const FitProblem& problem, Hyperparameter& h) {
+  const auto group = static_cast<std::size_t>(h.owner);
+  const Observations& observations = problem.observations[group];
+  const bool is_of_accelerations = observations.view().quantity->is_acceleration() && !observations.view().latent;
+  if (!is_of_accelerations || observations.states_noise(h.index)) return;
+  const Model::Noise& noise = (problem.systems[group] ? *problem.systems[group] : model).noise;
+  if (noise.bounds.empty() && noise.floor.empty()) return;
+  const auto row = static_cast<std::size_t>(observations.view().rows[static_cast<std::size_t>(h.index)]);
+  if (!noise.bounds.empty()) std::tie(h.lower, h.upper) = noise.bounds[row];
+  if (!noise.floor.empty()) h.lower = std::max(h.lower, noise.floor[row]);
+  h.upper = std::max(h.lower, h.upper);
+  h.value = std::clamp(observations.noise().stddev()[h.index], h.lower, h.upper);
+  if (h.hyperprior.form != HyperPrior::Form::none) h.hyperprior.median = h.value;
+}
+
+}  // namespace
+
 std::vector<Hyperparameter> starting_hyperparameters(const Model& model, const FitProblem& problem,
                                                      const FitProblemOptions& options) {
   if (options.baseline) return baseline_hyperparameters(problem.prior, problem.observations);
-  return default_hyperparameters(problem.prior, trusted_observations(problem), estimated_parameters(model, options),
-                                 options.protocol);
+  std::vector<Hyperparameter> out = default_hyperparameters(problem.prior, trusted_observations(problem),
+                                                            estimated_parameters(model, options), options.protocol);
+  for (Hyperparameter& h : out) {
+    if (h.kind == Hyperparameter::Kind::noise_stddev) bound_noise(model, problem, h);
+  }
+  return out;
 }
 
 FitOptions default_fit_options(const FitProblem& problem) {

@@ -1,5 +1,6 @@
 #include "jobs/observation_noise.hpp"
 
+#include <algorithm>
 #include <cmath>
 #include <limits>
 
@@ -97,10 +98,17 @@ std::vector<std::string> stated_accelerations(std::vector<std::string> names, co
   return names;
 }
 
-MatrixXd stated_stddevs(const std::vector<std::string>& names, LogReader& reader, Index n_rows) {
+MatrixXd stated_stddevs(const Model& model, const std::vector<std::string>& names, LogReader& reader, Index n_rows) {
   MatrixXd stddev = MatrixXd::Constant(std::ssize(names), n_rows, std::numeric_limits<double>::quiet_NaN());
+  const std::vector<std::string> every = model.system->acceleration_names();
   for (std::size_t k = 0; k < names.size(); ++k) {
-    if (!reader.stddev_column(names[k]).empty()) stddev.row(static_cast<Index>(k)) = reader.stddevs({names[k]});
+    if (reader.stddev_column(names[k]).empty()) continue;
+    auto row = stddev.row(static_cast<Index>(k));
+    row = reader.stddevs({names[k]});
+    const auto coordinate = static_cast<std::size_t>(std::find(every.begin(), every.end(), names[k]) - every.begin());
+    if (coordinate >= model.noise.floor.size()) continue;
+    const double floor = model.noise.floor[coordinate];
+    row = (row.array().square() + floor * floor).sqrt();
   }
   return stddev;
 }
@@ -110,8 +118,8 @@ bool estimates_factor(const FitProblemOptions& options) {
   return can_estimate && (options.estimate_noise || !options.trust_stated_noise);
 }
 
-MatrixXd stated_noise(const std::vector<std::string>& observed, const FitProblemOptions& options, LogReader& reader,
-                      const CsvTable& log, std::vector<std::string>& notes) {
+MatrixXd stated_noise(const Model& model, const std::vector<std::string>& observed, const FitProblemOptions& options,
+                      LogReader& reader, const CsvTable& log, std::vector<std::string>& notes) {
   const std::vector<std::string> stated = stated_accelerations(observed, reader);
   if (stated.empty()) return {};
   const std::vector<std::string> columns = stddev_columns(stated, reader);
@@ -120,9 +128,10 @@ MatrixXd stated_noise(const std::vector<std::string>& observed, const FitProblem
                                 fmt::join(columns, ", ")));
     return {};
   }
-  notes.push_back(fmt::format("{}: the noise of each value is that in {}{}", log.name(), fmt::join(columns, ", "),
+  notes.push_back(fmt::format("{}: the noise of each value is that in {}{}{}", log.name(), fmt::join(columns, ", "),
+                              model.noise.floor.empty() ? "" : " and the floor of [noise]",
                               estimates_factor(options) ? ", times a factor that is estimated" : ""));
-  return stated_stddevs(observed, reader, log.n_rows());
+  return stated_stddevs(model, observed, reader, log.n_rows());
 }
 
 VectorXd noise_of(const Model& model, const FitProblemOptions& options, const Readings& readings, bool estimate) {

@@ -11,15 +11,15 @@ namespace gp2 {
 /// Those of the accelerations whose standard deviations the log states, for each value.
 std::vector<std::string> stated_accelerations(std::vector<std::string> names, const LogReader& reader);
 
-/// These deviations, NaN where none is stated (accelerations × N).
-Eigen::MatrixXd stated_stddevs(const std::vector<std::string>& names, LogReader& reader, Eigen::Index n_rows);
+/// √(floor² + stated²) of these, the floor that of the model's [noise]; NaN where none is stated (accelerations × N).
+Eigen::MatrixXd stated_stddevs(const Model& model, const std::vector<std::string>& names, LogReader& reader, Eigen::Index n_rows);
 
 /// Whether a common factor of the stated standard deviations is estimated.
 bool estimates_factor(const FitProblemOptions& options);
 
 /// σ of each value where the log states it, NaN elsewhere (d × N); empty when it states none, or the options override them.
-Eigen::MatrixXd stated_noise(const std::vector<std::string>& observed, const FitProblemOptions& options, LogReader& reader,
-                             const CsvTable& log, std::vector<std::string>& notes);
+Eigen::MatrixXd stated_noise(const Model& model, const std::vector<std::string>& observed, const FitProblemOptions& options,
+                             LogReader& reader, const CsvTable& log, std::vector<std::string>& notes);
 
 /// σ of each row or, where the log states it, the factor 1 of it.
 /// @throws InputError when it is unknown, not positive, or too small for double precision.

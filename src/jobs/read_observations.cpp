@@ -321,7 +321,7 @@ Observations read_log(const LoggedSystem& logged, const Log& log, const FitProbl
   readings.states = states_of(logged.prior, readings.view, reader, options.project);
   const std::vector<std::string> observed = readings.view.names(system);
   readings.values = reader.measurements(observed);
-  readings.stated_stddev = stated_noise(observed, options, reader, log.table, notes);
+  readings.stated_stddev = stated_noise(logged.model, observed, options, reader, log.table, notes);
   const MatrixXd all_values = all_accelerations(system, reader, log.table);
   const MatrixXd state_stddevs = options.project ? stated_state_deviations(system, reader, log.table) : MatrixXd();
   note_reading(reader, log.table, notes);
@@ -430,7 +430,7 @@ LogStates read_log_states(const Prior& prior, const View& view, const Model& mod
   LogReader reader = open_log(model, log, columns);
   LogStates out{states_of(prior, view, reader), reader.measurements(accelerations), {}, {}};
   const std::vector<std::string> stated = stated_accelerations(accelerations, reader);
-  if (!stated.empty()) out.stated_stddev = stated_stddevs(accelerations, reader, log.n_rows());
+  if (!stated.empty()) out.stated_stddev = stated_stddevs(model, accelerations, reader, log.n_rows());
   note_reading(reader, log, out.notes);
   note_violation(*prior.system, out.states, prior.system->parameter_values(), log, out.notes);
   return out;
@@ -477,7 +477,7 @@ WholeLog read_whole_log(const Model& model, LogReader& reader) {
     }
     if (!model.noise.stddev.empty()) log.stddev.row(row).setConstant(model.noise.stddev[static_cast<std::size_t>(row)]);
     if (!reader.stddev_column(name).empty()) {
-      log.stddev.row(row) = reader.stddevs({name});
+      log.stddev.row(row) = stated_stddevs(model, {name}, reader, log.stddev.cols());
       log.stated.push_back(static_cast<int>(row));
     }
     ++row;

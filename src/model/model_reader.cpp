@@ -249,7 +249,9 @@ class ModelReader : private TomlReader {
 
   /// @param keys  that its table may have; "initial", where it is among them, is another word for "value", bounds may be equal
   ///   and priors are of logarithms
-  Tuned tuned(const toml::node& node, const std::string& key, const std::vector<std::string>& keys) const {
+  /// @param has_one_range  of bounds; else the caller reads them
+  Tuned tuned(const toml::node& node, const std::string& key, const std::vector<std::string>& keys,
+              bool has_one_range = true) const {
     if (!node.is_table()) return {&node, key};
     const toml::table& entry = *node.as_table();
     only_keys(entry, key, keys);
@@ -261,7 +263,7 @@ class ModelReader : private TomlReader {
       out.value = entry.get(word);
       out.key = fmt::format("{}.{}", key, word);
     }
-    if (entry.contains("bounds")) out.bounds = range(*entry.get("bounds"), key + ".bounds", is_positive);
+    if (entry.contains("bounds") && has_one_range) out.bounds = range(*entry.get("bounds"), key + ".bounds", is_positive);
     if (entry.contains("estimate")) out.estimate = boolean(*entry.get("estimate"), key + ".estimate");
     if (out.bounds && out.bounds->first == out.bounds->second && out.estimate.value_or(false)) {
       fail(node, key, fmt::format("its bounds [{0}, {0}] hold it: widen them, or leave out estimate = true", out.bounds->first));
@@ -836,27 +838,59 @@ class ModelReader : private TomlReader {
     const toml::table& noise = table(*root_.get("noise"), "noise");
     only_keys(noise, "noise", {"ddq"});
     if (!noise.contains("ddq")) return;
-    const toml::node* node = noise.get("ddq");
-    if (node->is_table()) {
-      const toml::table& entry = *node->as_table();
-      only_keys(entry, "noise.ddq", {"estimate", "initial"});
-      if (entry.contains("estimate")) model_.noise.estimate = boolean(*entry.get("estimate"), "noise.ddq.estimate");
-      if (!entry.contains("initial")) fail(entry, "noise.ddq", "missing initial: where the estimate starts");
-      node = entry.get("initial");
+    const toml::node& node = *noise.get("ddq");
+    const std::string key = "noise.ddq";
+    Model::Noise& out = model_.noise;
+    const toml::table* const more = node.as_table();
+    if (more != nullptr && more->contains("floor")) out.floor = each_noise(*more->get("floor"), key + ".floor");
+    if (more != nullptr && more->contains("bounds")) out.bounds = each_range(*more->get("bounds"), key + ".bounds");
+    const Tuned entry = tuned(node, key, {"value", "initial", "bounds", "estimate", "floor"}, false);
+    out.estimate = entry.estimate.value_or(false);
+    if (entry.value == nullptr) {
+      if (out.floor.empty() || out.estimate) fail(node, key, "missing initial: where the estimate starts");
+      return;
     }
+    out.stddev = each_noise(*entry.value, key);
+    for (std::size_t j = 0; j < out.stddev.size(); ++j) {
+      if (!out.bounds.empty()) require_within(out.stddev[j], out.bounds[j], node, key);
+      if (out.floor.empty() || out.stddev[j] >= out.floor[j]) continue;
+      fail(node, key, fmt::format("the value {} is below its floor {}", out.stddev[j], out.floor[j]));
+    }
+  }
+
+  // One [lower, upper], or one per coordinate.
+  std::vector<std::pair<double, double>> each_range(const toml::node& node, const std::string& key) const {
     const std::size_t nq = definition_.coordinates.size();
-    if (node->is_array()) {
-      for (const toml::node& entry : *node->as_array()) model_.noise.stddev.push_back(number(entry, "noise.ddq"));
-      if (model_.noise.stddev.size() != nq) {
-        fail(*node, "noise.ddq",
-             fmt::format("expected one value or {}, one per coordinate, got {}", nq, model_.noise.stddev.size()));
+    const toml::array& entries = array(node, key);
+    std::vector<std::pair<double, double>> ranges;
+    const bool is_one = entries.empty() || !entries.get(0)->is_array();
+    for (std::size_t j = 0; j < (is_one ? 1 : entries.size()); ++j) ranges.push_back(range(is_one ? node : *entries.get(j), key));
+    if (is_one) ranges.resize(nq, ranges.front());
+    if (ranges.size() != nq) {
+      fail(node, key, fmt::format("expected one range or {}, one per coordinate, got {}", nq, ranges.size()));
+    }
+    for (const auto& one : ranges) {
+      if (!(one.first > 0)) fail(node, key, fmt::format("a noise standard deviation must be positive, got {}", one.first));
+    }
+    return ranges;
+  }
+
+  // One positive number, or one per coordinate.
+  std::vector<double> each_noise(const toml::node& node, const std::string& key) const {
+    const std::size_t nq = definition_.coordinates.size();
+    std::vector<double> values;
+    if (const toml::array* const entries = node.as_array()) {
+      for (const toml::node& entry : *entries) values.push_back(number(entry, key));
+      if (values.size() != nq) {
+        fail(node, key, fmt::format("expected one value or {}, one per coordinate, got {}", nq, values.size()));
       }
     } else {
-      model_.noise.stddev.assign(nq, number(*node, "noise.ddq"));
+      values.assign(nq, number(node, key));
     }
-    for (double stddev : model_.noise.stddev) {
-      if (!(stddev > 0)) fail(*node, "noise.ddq", fmt::format("a noise standard deviation must be positive, got {}", stddev));
+    for (const double value : values) {
+      if (!(value > 0)) fail(node, key, fmt::format("a noise standard deviation must be positive, got {}", value));
     }
+    return values;
   }
 
   void read_truth() {

@@ -295,5 +295,29 @@ TEST(StatedNoise, TellsACheckWhichAccelerationsAreMeasured) {
   EXPECT_THAT(texts({"ddx_std", "ddy_std"}), Contains(HasSubstr("not good: dependent columns")));
 }
 
+TEST(StatedNoise, HasTheFloorOfTheModel) {
+  const Model model = slope_with("[noise]\nddq = { floor = [0.03, 0.5] }\n");
+  const FitProblem problem = make_fit_problem(model, log_of({"ddx_std"}), trusting());
+  const MatrixXd& scale = problem.observations.front().noise().scale();
+  for (Index i = 0; i < scale.cols(); ++i) {
+    const double stated = 0.01 * static_cast<double>(i + 1);
+    EXPECT_NEAR(scale(0, i), std::sqrt(0.03 * 0.03 + stated * stated), 1e-15);
+  }
+  EXPECT_THAT(problem.notes, Contains(HasSubstr("the noise of each value is that in ddx_std and the floor of [noise]")));
+}
+
+TEST(StatedNoise, BoundsOfTheModelAreThoseOfAnEstimateThatIsNoFactor) {
+  const Model model = slope_with("[noise]\nddq = { value = 0.1, estimate = true, bounds = [0.05, 0.2], floor = 0.08 }\n");
+  FitProblemOptions options;
+  options.observe = {"ddx"};
+  const Hyperparameter estimated = noise_in(make_fit_problem(model, log_of({}), options));
+  EXPECT_EQ(estimated.lower, 0.08);
+  EXPECT_EQ(estimated.upper, 0.2);
+  EXPECT_EQ(estimated.value, 0.1);
+  const Hyperparameter factor = noise_in(make_fit_problem(model, log_of({"ddx_std"}), options));
+  EXPECT_EQ(factor.value, 1);
+  EXPECT_GT(factor.upper, 0.2);
+}
+
 }  // namespace
 }  // namespace gp2

@@ -281,6 +281,19 @@ TEST(Model, NoiseIsOneValueOrOnePerCoordinateAndMayBeEstimated) {
   EXPECT_THAT(parse(base + "[noise]\n").noise.stddev, IsEmpty());
 }
 
+TEST(Model, NoiseMayHaveBoundsAndAFloor) {
+  const Model::Noise noise =
+      parse(base + "[noise]\nddq = { value = 0.1, estimate = true, bounds = [0.05, 1], floor = [0.01, 0.02] }\n").noise;
+  EXPECT_THAT(noise.stddev, ElementsAre(0.1, 0.1));
+  EXPECT_THAT(noise.bounds, ElementsAre(Pair(0.05, 1), Pair(0.05, 1)));
+  EXPECT_THAT(noise.floor, ElementsAre(0.01, 0.02));
+  EXPECT_THAT(parse(base + "[noise]\nddq = { value = 0.1, bounds = [[0.05, 1], [0.1, 3]] }\n").noise.bounds,
+              ElementsAre(Pair(0.05, 1), Pair(0.1, 3)));
+  const Model::Noise only_floor = parse(base + "[noise]\nddq = { floor = 0.01 }\n").noise;
+  EXPECT_THAT(only_floor.stddev, IsEmpty());
+  EXPECT_THAT(only_floor.floor, ElementsAre(0.01, 0.01));
+}
+
 TEST(Model, SamplingComesInAnOrderInWhichItCanBeDrawn) {
   const Model model = parse(
       base + "[sampling]\nq1 = \"r*cos(a)\"\na = \"2*b\"\nr = [0, 1]\nb = [0, 3]\ndq2 = 4\nstart = { q2 = 0.1, dq1 = 1 }\n");
@@ -538,6 +551,16 @@ std::vector<Complaint> complaints() {
        "8: noise.ddq: expected one value or 2, one per coordinate, got 1"},
       {"NoiseWithoutAStart", base + "[noise]\nddq = { estimate = true }\n",
        "8: noise.ddq: missing initial: where the estimate starts"},
+      {"NoiseBelowItsFloor", base + "[noise]\nddq = { value = [0.1, 0.02], floor = 0.05 }\n",
+       "8: noise.ddq: the value 0.02 is below its floor 0.05"},
+      {"NoiseOutsideItsBounds", base + "[noise]\nddq = { value = 0.1, bounds = [[0.01, 1], [0.2, 1]] }\n",
+       "8: noise.ddq: the value 0.1 is outside its bounds [0.2, 1]"},
+      {"NoiseWithBoundsOfTheWrongLength", base + "[noise]\nddq = { value = 0.1, bounds = [[0.01, 1]] }\n",
+       "8: noise.ddq.bounds: expected one range or 2, one per coordinate, got 1"},
+      {"NoiseBoundOfZero", base + "[noise]\nddq = { value = 0.1, bounds = [0, 1] }\n",
+       "8: noise.ddq.bounds: a noise standard deviation must be positive, got 0"},
+      {"NoiseFloorOfZero", base + "[noise]\nddq = { value = 0.1, floor = 0 }\n",
+       "8: noise.ddq.floor: a noise standard deviation must be positive, got 0"},
       {"NoiseIsText", base + "[noise]\nddq = \"estimate\"\n", "8: noise.ddq: expected a finite number, got 'estimate'"},
       // truth and sampling
       {"TruthWithoutAcceleration", base + "[truth]\n", "7: truth: missing acceleration = [ … ] or force = [ … ]"},
