@@ -45,7 +45,7 @@ class Interruption {
   // a handler may call sigaction and write, and touch atomics without a lock, and little else
   static void ask(int signal) {
     constexpr std::string_view text =
-        "\ngp2: stopping after the evaluation at hand, which takes long with many rows; once more ends at once, without a fit\n";
+        "\ngp2: stopping, which takes some seconds with many rows; once more ends at once, without a fit\n";
     const int error = errno;
     signal_ = signal;
     stop_ = true;

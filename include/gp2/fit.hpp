@@ -37,8 +37,8 @@ struct FitOptions {
   int max_escapes = 5;                            // scans for lower optima from the best one
   bool standard_errors = true;                    // FitReport::uncertainty, where parameters are estimated
   std::function<void(const Progress&)> progress;  // called from worker threads, one at a time
-  /// Set: return the best so far, as not converged: interrupted. That takes as long as the evaluations of the likelihood and its
-  /// gradient that are under way, and the one that conditions the prior: of n measured numbers some n³ and n³/3 multiplications.
+  /// Set: return the best so far, as not converged: interrupted. The evaluations under way are given up within a second or so,
+  /// and the posterior is conditioned when it is first asked (Posterior::lazy).
   const std::atomic<bool>* stop = nullptr;
 };
 
@@ -103,7 +103,7 @@ struct Fit {
 /// Same seed, same bits, for any number of threads.
 ///
 /// @throws InputError, NumericalError  as Likelihood, Posterior and require_hyperparameters; InputError when nothing is measured,
-/// a start lies outside its bounds, or an option has no meaning; NumericalError when no restart reached a finite likelihood.
+/// a start lies outside its bounds, or an option has no meaning; NumericalError when no restart reached a finite likelihood, or `stop` was set before one did.
 Fit fit(const Prior& prior, const std::vector<Observations>& observations, const std::vector<Hyperparameter>& hyperparameters,
         const FitOptions& options = {});
 

@@ -130,7 +130,9 @@ class Model {
 
  private:
   void define(const std::string& symbol, Expression value);
-  [[nodiscard]] Expression parse_symbols(std::string_view text) const;  // points of the robot stay as they are
+  /// Points of the robot stay as they are.
+  /// @param forbidden  symbols that an error about an unknown one does not list or suggest, with all that depend on them
+  [[nodiscard]] Expression parse_symbols(std::string_view text, const std::vector<Expression>& forbidden = {}) const;
 
   std::shared_ptr<RobotExpressions> robot_expressions_;  // null without a robot
   std::map<std::string, Expression, std::less<>> symbols_;

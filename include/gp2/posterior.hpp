@@ -33,6 +33,8 @@ class Posterior {
   /// require_prior_values, at an observed state.
   /// @throws NumericalError when the covariance cannot be factored in double precision (noise too small).
   Posterior(Prior prior, std::vector<Observations> observations, ModelValues values);
+  /// The same, conditioned when it is first asked for more than what it was given: that call throws what the constructor throws.
+  [[nodiscard]] static Posterior lazy(Prior prior, std::vector<Observations> observations, ModelValues values);
 
   /// E[view] at N states (d × N). A state's result is the same, to the bit, whatever other states are asked for and however many
   /// threads work.

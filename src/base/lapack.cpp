@@ -1,6 +1,14 @@
 #include "base/lapack.hpp"
 
+#include <algorithm>
+#include <atomic>
 #include <mutex>
+
+#include <fmt/format.h>
+
+#include "base/mapped_memory.hpp"
+#include "base/parallel.hpp"
+#include "gp2/error.hpp"
 
 // present in OpenBLAS only; another BLAS keeps its own threading
 extern "C" {
@@ -25,17 +33,102 @@ void set_threads(int n) {
 void set_threads_again(int n) {
   if (openblas_get_num_threads() == threads_set) set_threads(n);
 }
+
+// A thread that calls OpenBLAS. There are as many buffers as there ever were of these at a time; before there is one more the system
+// is asked for it.
+class BufferInUse {
+ public:
+  BufferInUse() {
+    const int n = ++n_in_use_;
+    if (n <= n_buffers_) return;
+    const std::scoped_lock lock(thread_mutex);
+    if (n <= n_buffers_) return;
+    if (!maps(blas_buffer, 1)) {
+      --n_in_use_;
+      throw InputError(fmt::format(
+          "OpenBLAS needs a buffer of {:.0f} MB, which the system does not give: raise the limit on memory (ulimit -v)",
+          blas_buffer / 1e6));
+    }
+    n_buffers_ = n;
+  }
+  ~BufferInUse() { --n_in_use_; }
+  BufferInUse(const BufferInUse&) = delete;
+  BufferInUse& operator=(const BufferInUse&) = delete;
+
+ private:
+  static inline std::atomic<int> n_in_use_ = 0, n_buffers_ = 0;
+};
+
+// A matrix in memory, by its first entry.
+struct Block {
+  double* data;
+  int stride;
+
+  [[nodiscard]] Block at(int row, int column) const {
+    return {data + row + column * static_cast<std::ptrdiff_t>(stride), stride};
+  }
+};
+
+// Calls work(first, how many) for pieces of n rows or columns, each of which takes so many operations; false when stopped.
+template <typename Work>
+bool in_pieces(int n, double per_row, const Pieces& pieces, const Work& work) {
+  constexpr int multiple = 64;  // that OpenBLAS works fast with
+  const int most = std::max(1, static_cast<int>(std::min(pieces.operations / std::max(per_row, 1.0), 1e9)) / multiple) * multiple;
+  for (int first = 0; first < n; first += most) {
+    if (is_set(pieces.stop)) return false;
+    work(first, std::min(most, n - first));
+  }
+  return true;
+}
+
+// Where a triangle of n rows is cut in two.
+int first_half(int n) { return (n / 2 + 7) / 8 * 8; }
+bool is_one_piece(int n, const Pieces& pieces) { return static_cast<double>(n) * n * n / 3 <= pieces.operations; }
+
+// The lower triangle of C (n × n) plus sign times B Bᵀ, B (n × k), or Bᵀ B, B (k × n).
+bool add_square(bool transposed, int n, int k, double sign, Block B, Block C, const Pieces& pieces) {
+  const double one = 1;
+  return in_pieces(n, 2. * n * k, pieces, [&](int first, int columns) {
+    const int below = n - first - columns;
+    const auto rows_of_B = [&](int row) { return transposed ? B.at(0, row) : B.at(row, 0); };
+    const Block left = rows_of_B(first), rest = rows_of_B(first + columns);
+    dsyrk_("L", transposed ? "T" : "N", &columns, &k, &sign, left.data, &left.stride, &one, C.at(first, first).data, &C.stride, 1,
+           1);
+    if (below == 0) return;
+    dgemm_(transposed ? "T" : "N", transposed ? "N" : "T", &below, &columns, &k, &sign, rest.data, &rest.stride, left.data,
+           &left.stride, &one, C.at(first + columns, first).data, &C.stride, 1, 1);
+  });
+}
+
+// [A11 ·; A21 A22] = [L11 0; L21 L22][L11 0; L21 L22]ᵀ: L21 = A21 L11⁻ᵀ, L22 L22ᵀ = A22 − L21 L21ᵀ
+bool factorise(int n, Block A, const Pieces& pieces) {
+  if (is_set(pieces.stop)) return false;
+  if (is_one_piece(n, pieces)) {
+    int info = 0;
+    if (n > 0) dpotrf_("L", &n, A.data, &A.stride, &info, 1);
+    return info == 0;
+  }
+  const int first = first_half(n), second = n - first;
+  const Block A21 = A.at(first, 0), A22 = A.at(first, first);
+  const double one = 1;
+  return factorise(first, A, pieces) &&
+         in_pieces(second, static_cast<double>(first) * first, pieces,
+                   [&](int row, int rows) {
+                     dtrsm_("R", "L", "T", "N", &rows, &first, &one, A.data, &A.stride, A21.at(row, 0).data, &A.stride, 1, 1, 1,
+                            1);
+                   }) &&
+         add_square(false, second, first, -1, A21, A22, pieces) && factorise(second, A22, pieces);
+}
+
 }  // namespace
 
-bool factorise(Eigen::Ref<Eigen::MatrixXd> A) {
-  const int n = static_cast<int>(A.rows());
-  const int lda = static_cast<int>(A.outerStride());
-  int info = 0;
-  if (n > 0) dpotrf_("L", &n, A.data(), &lda, &info, 1);
-  return info == 0;
+bool factorise(Eigen::Ref<Eigen::MatrixXd> A, const Pieces& pieces) {
+  const BufferInUse buffer;
+  return factorise(static_cast<int>(A.rows()), {A.data(), static_cast<int>(A.outerStride())}, pieces);
 }
 
 PivotedFactor factorise_semidefinite(Eigen::MatrixXd A) {
+  const BufferInUse buffer;
   const int n = static_cast<int>(A.rows());
   PivotedFactor factor{Eigen::MatrixXd(n, 0), std::vector<int>(static_cast<std::size_t>(n))};
   if (n == 0) return factor;
@@ -67,35 +160,58 @@ void invert_small_triangle(int n, double* L, std::ptrdiff_t lda) {
 }
 
 // [L11 0; L21 L22]⁻¹ = [X11 0; −X22 L21 X11, X22]
-void invert_triangle(int n, double* L, int lda) {
+bool invert_triangle(int n, Block L, const Pieces& pieces) {
   constexpr int small = 24;
   if (n <= small) {
-    invert_small_triangle(n, L, lda);
-    return;
+    invert_small_triangle(n, L.data, L.stride);
+    return true;
   }
-  const int first = (n / 2 + 7) / 8 * 8;
-  const int second = n - first;
-  double* const L21 = L + first;
-  double* const L22 = L21 + static_cast<std::ptrdiff_t>(first) * lda;
-  invert_triangle(first, L, lda);
-  invert_triangle(second, L22, lda);
+  const int first = first_half(n), second = n - first;
+  const Block L21 = L.at(first, 0), L22 = L.at(first, first);
   const double minus_one = -1, one = 1;
-  dtrmm_("R", "L", "N", "N", &second, &first, &minus_one, L, &lda, L21, &lda, 1, 1, 1, 1);
-  dtrmm_("L", "L", "N", "N", &second, &first, &one, L22, &lda, L21, &lda, 1, 1, 1, 1);
+  return invert_triangle(first, L, pieces) && invert_triangle(second, L22, pieces) &&
+         in_pieces(second, static_cast<double>(first) * first, pieces,
+                   [&](int row, int rows) {
+                     dtrmm_("R", "L", "N", "N", &rows, &first, &minus_one, L.data, &L.stride, L21.at(row, 0).data, &L.stride, 1,
+                            1, 1, 1);
+                   }) &&
+         in_pieces(first, static_cast<double>(second) * second, pieces, [&](int column, int columns) {
+           dtrmm_("L", "L", "N", "N", &second, &columns, &one, L22.data, &L.stride, L21.at(0, column).data, &L.stride, 1, 1, 1,
+                  1);
+         });
+}
+
+// [X11 0; X21 X22]ᵀ[X11 0; X21 X22] = [X11ᵀX11 + X21ᵀX21, ·; X22ᵀX21, X22ᵀX22]
+bool square_triangle(int n, Block X, const Pieces& pieces) {
+  if (is_set(pieces.stop)) return false;
+  if (is_one_piece(n, pieces)) {
+    int info = 0;
+    dlauum_("L", &n, X.data, &X.stride, &info, 1);
+    return true;
+  }
+  const int first = first_half(n), second = n - first;
+  const Block X21 = X.at(first, 0), X22 = X.at(first, first);
+  const double one = 1;
+  return square_triangle(first, X, pieces) && add_square(true, first, second, 1, X21, X, pieces) &&
+         in_pieces(first, static_cast<double>(second) * second, pieces,
+                   [&](int column, int columns) {
+                     dtrmm_("L", "L", "T", "N", &second, &columns, &one, X22.data, &X.stride, X21.at(0, column).data, &X.stride,
+                            1, 1, 1, 1);
+                   }) &&
+         square_triangle(second, X22, pieces);
 }
 
 }  // namespace
 
-void invert_factored(Eigen::Ref<Eigen::MatrixXd> L) {
+void invert_factored(Eigen::Ref<Eigen::MatrixXd> L, const Pieces& pieces) {
+  const BufferInUse buffer;
   const int n = static_cast<int>(L.rows());
-  const int lda = static_cast<int>(L.outerStride());
-  int info = 0;
-  if (n == 0) return;
-  invert_triangle(n, L.data(), lda);
-  dlauum_("L", &n, L.data(), &lda, &info, 1);
+  const Block block{L.data(), static_cast<int>(L.outerStride())};
+  if (n > 0 && invert_triangle(n, block, pieces)) square_triangle(n, block, pieces);
 }
 
 void solve_lower(const Eigen::Ref<const Eigen::MatrixXd>& L, bool transposed, Eigen::Ref<Eigen::MatrixXd> B) {
+  const BufferInUse buffer;
   const int n = static_cast<int>(L.rows());
   const int n_columns = static_cast<int>(B.cols());
   const int lda = static_cast<int>(L.outerStride());

@@ -1,5 +1,6 @@
 #pragma once
 
+#include <atomic>
 #include <vector>
 
 #include <Eigen/Core>
@@ -18,12 +19,24 @@ void dtrsm_(const char* side, const char* uplo, const char* trans, const char* d
 void dtrmm_(const char* side, const char* uplo, const char* trans, const char* diag, const int* m, const int* n,
             const double* alpha, const double* a, const int* lda, double* b, const int* ldb, std::size_t, std::size_t,
             std::size_t, std::size_t);
+void dsyrk_(const char* uplo, const char* trans, const int* n, const int* k, const double* alpha, const double* a, const int* lda,
+            const double* beta, double* c, const int* ldc, std::size_t, std::size_t);
+void dgemm_(const char* transa, const char* transb, const int* m, const int* n, const int* k, const double* alpha,
+            const double* a, const int* lda, const double* b, const int* ldb, const double* beta, double* c, const int* ldc,
+            std::size_t, std::size_t);
 }
 
 namespace gp2::lapack {
 
-/// A = L Lᵀ in the lower triangle, in place; false when A is not positive definite.
-bool factorise(Eigen::Ref<Eigen::MatrixXd> A);
+/// OpenBLAS cannot be interrupted. Of large matrices it is given pieces of about so many multiplications and additions, a second
+/// or two of one processor core, and between them a caller may ask for an end. Smaller matrices are one piece.
+struct Pieces {
+  const std::atomic<bool>* stop = nullptr;
+  double operations = 4e10;
+};
+
+/// A = L Lᵀ in the lower triangle, in place; false when A is not positive definite, or when stopped.
+bool factorise(Eigen::Ref<Eigen::MatrixXd> A, const Pieces& pieces = {});
 
 /// Pᵀ A P = L Lᵀ of a positive semidefinite A, with the largest of what is left as the next pivot, down to its size times ε.
 struct PivotedFactor {
@@ -33,8 +46,8 @@ struct PivotedFactor {
 PivotedFactor factorise_semidefinite(Eigen::MatrixXd A);
 
 /// The lower triangle of A⁻¹ from that of L, in place: (L⁻¹)ᵀL⁻¹. Faster than dpotri, whose triangular inverse is slow up to a
-/// size of some hundred.
-void invert_factored(Eigen::Ref<Eigen::MatrixXd> L);
+/// size of some hundred. When stopped what stands there is neither.
+void invert_factored(Eigen::Ref<Eigen::MatrixXd> L, const Pieces& pieces = {});
 
 /// B ← L⁻¹ B, or L⁻ᵀ B.
 void solve_lower(const Eigen::Ref<const Eigen::MatrixXd>& L, bool transposed, Eigen::Ref<Eigen::MatrixXd> B);

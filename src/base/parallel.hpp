@@ -14,6 +14,9 @@ inline int thread_count(int wanted) {
   return wanted > 0 ? wanted : std::max(1, static_cast<int>(std::thread::hardware_concurrency()));
 }
 
+/// Whether a caller asks for an end; null: never.
+inline bool is_set(const std::atomic<bool>* stop) { return stop != nullptr && stop->load(); }
+
 /// Calls work(task, thread) once for every task 0 … n_tasks − 1, in an order that differs from run to run, on the calling thread
 /// and up to n_threads − 1 others; thread 0 … n_threads − 1 is the one that works.
 /// The first exception is thrown again when all are done.

@@ -5,6 +5,7 @@
 
 #include <fmt/format.h>
 
+#include "base/parallel.hpp"
 #include "gp2/error.hpp"
 #include "inference/requirements.hpp"
 
@@ -146,11 +147,14 @@ Fit fit_outputs(const Prior& prior, const std::vector<Observations>& observation
   const RestartReport& best = all.restarts.front();
   all.negative_log_likelihood = best.negative_log_likelihood;
   all.objective = best.objective;
-  const bool interrupted = options.stop != nullptr && options.stop->load();
+  const bool interrupted = is_set(options.stop);
   all.converged = best.converged && !interrupted;
   all.termination = interrupted ? FitReport::interrupted : best.termination;
   all.iterations = best.iterations;
-  return {Posterior(prior, observations, model_values(prior, observations, all.hyperparameters)), std::move(all)};
+  ModelValues values = model_values(prior, observations, all.hyperparameters);
+  return {
+      interrupted ? Posterior::lazy(prior, observations, std::move(values)) : Posterior(prior, observations, std::move(values)),
+      std::move(all)};
 }
 
 // a baseline learns every acceleration

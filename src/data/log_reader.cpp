@@ -78,6 +78,24 @@ int LogReader::find(const std::string& name) const {
   return -1;
 }
 
+// What to do first about a missing column. Where a log has no rate of its kind at all, none has another name: they are to be computed.
+const char* LogReader::mend_for_missing(const std::string& name) const {
+  const auto lacks_all = [&](const auto& name_of) {
+    bool is_of_kind = false, has_one = false;
+    for (const Coordinate& coordinate : system_.coordinates()) {
+      const std::string rate = name_of(coordinate);
+      is_of_kind = is_of_kind || rate == name;
+      has_one = has_one || has(rate);
+    }
+    return is_of_kind && !has_one;
+  };
+  if (lacks_all([](const Coordinate& one) { return one.acceleration(); }))
+    return "It has no accelerations: gp2 derive computes them from positions over time; or";
+  if (lacks_all([](const Coordinate& one) { return one.velocity(); }))
+    return "It has no velocities: gp2 derive computes them from positions over time; or";
+  return "Rename it, or";
+}
+
 int LogReader::require(const std::string& name) {
   const int column = find(name);
   if (column < 0) {
@@ -86,8 +104,9 @@ int LogReader::require(const std::string& name) {
     if (const auto aliases = aliases_.find(name); aliases != aliases_.end()) {
       tried.insert(tried.end(), aliases->second.begin(), aliases->second.end());
     }
-    throw InputError(fmt::format("{}: missing column '{}' (looked for {}); the file has: {}. Rename it, or give `map=LOGNAME={}`",
-                                 table_.name(), name, fmt::join(tried, ", "), fmt::join(table_.header(), ", "), name));
+    throw InputError(fmt::format("{}: missing column '{}' (looked for {}); the file has: {}. {} give `map=LOGNAME={}`",
+                                 table_.name(), name, fmt::join(tried, ", "), fmt::join(table_.header(), ", "),
+                                 mend_for_missing(name), name));
   }
   const std::string& found = table_.header()[static_cast<std::size_t>(column)];
   const auto [used, is_new] = used_.emplace(column, name);

@@ -1,5 +1,7 @@
 #pragma once
 
+#include <atomic>
+
 #include <Eigen/Core>
 
 #include "base/simd.hpp"
@@ -14,7 +16,8 @@ inline constexpr Eigen::Index tile_size = 64;
 constexpr Eigen::Index whole_vectors_before(Eigen::Index j) { return j / simd::lanes<double> * simd::lanes<double>; }
 
 /// K̃ + I in the lower triangle. What stands above the diagonal is left alone.
-/// @param K  (rows.size() × rows.size())
-void assemble(const LatentRows& rows, int n_threads, Eigen::Ref<Eigen::MatrixXd> K);
+/// @param K     (rows.size() × rows.size())
+/// @param stop  set: leaves the rest as it was
+void assemble(const LatentRows& rows, int n_threads, Eigen::Ref<Eigen::MatrixXd> K, const std::atomic<bool>* stop = nullptr);
 
 }  // namespace gp2

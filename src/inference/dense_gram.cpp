@@ -1,6 +1,7 @@
 #include "inference/dense_gram.hpp"
 
 #include "base/lapack.hpp"
+#include "base/parallel.hpp"
 #include "inference/assemble.hpp"
 #include "inference/pair_sweep.hpp"
 
@@ -22,15 +23,15 @@ int DenseGram::n_blas_threads(const LatentRows& rows) const { return rows.size()
 std::optional<GramValue> DenseGram::factorise(const LatentRows& rows) {
   const lapack::ManyThreads many_threads(n_blas_threads(rows));
   factor_.resize(rows.size());
-  assemble(rows, n_threads(rows), factor_.lower());
-  if (!factor_.factorise(rows.reduction->y)) return std::nullopt;
+  assemble(rows, n_threads(rows), factor_.lower(), stop_);
+  if (is_set(stop_) || !factor_.factorise(rows.reduction->y, stop_)) return std::nullopt;
   return GramValue{0.5 * factor_.z().squaredNorm(), factor_.log_det_half()};
 }
 
 GramGradient DenseGram::differentiate(const LatentRows& rows, const std::vector<GramGradientParts>& parts) {
   const lapack::ManyThreads many_threads(n_blas_threads(rows));
   const Eigen::VectorXd alpha = factor_.solve();
-  return sweep_pairs(rows, factor_.invert(), alpha, parts, n_threads(rows));
+  return sweep_pairs(rows, factor_.invert(stop_), alpha, parts, n_threads(rows), stop_);
 }
 
 Gram::Inverse DenseGram::invert(const LatentRows& rows) {

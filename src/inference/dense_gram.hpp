@@ -1,5 +1,7 @@
 #pragma once
 
+#include <atomic>
+
 #include "inference/gram.hpp"
 #include "inference/growing_cholesky.hpp"
 
@@ -9,7 +11,8 @@ namespace gp2 {
 class DenseGram final : public Gram {
  public:
   /// @param n_threads  that it may use where there are samples enough for it to pay
-  explicit DenseGram(int n_threads = 1) : n_threads_(n_threads) {}
+  /// @param stop       set: factorise() gives nothing and differentiate() anything, within a second or so
+  explicit DenseGram(int n_threads = 1, const std::atomic<bool>* stop = nullptr) : n_threads_(n_threads), stop_(stop) {}
 
   [[nodiscard]] std::optional<GramValue> factorise(const LatentRows& rows) override;
   [[nodiscard]] GramGradient differentiate(const LatentRows& rows, const std::vector<GramGradientParts>& parts) override;
@@ -21,6 +24,7 @@ class DenseGram final : public Gram {
   [[nodiscard]] int n_blas_threads(const LatentRows& rows) const;
 
   int n_threads_;
+  const std::atomic<bool>* stop_;
   GrowingCholesky factor_;
 };
 

@@ -187,16 +187,25 @@ std::vector<TrainingResidual> training_residuals(const Posterior& posterior) {
   return residuals;
 }
 
+std::vector<ConstraintResidual> constraint_residuals(const Posterior& posterior,
+                                                     const std::shared_ptr<const OtherSystem>& other_system,
+                                                     const Ref<const MatrixXd>& states, const std::vector<int>& rows,
+                                                     const Ref<const MatrixXd>& measured,
+                                                     const Ref<const MatrixXd>& noise_stddev) {
+  View view = View::constrained_acceleration(*posterior.prior().system);
+  view.other_system = other_system;
+  const System& system = prior_of(posterior.prior(), view).reference_system();
+  MatrixXd accelerations = MatrixXd::Constant(system.nq(), states.cols(), not_a_number), stddev = accelerations;
+  accelerations(rows, Eigen::all) = measured;
+  stddev(rows, Eigen::all) = noise_stddev;
+  return constraint_residuals(system, states, parameters_of(view, posterior.values().parameters), accelerations, stddev);
+}
+
 std::vector<ConstraintResidual> constraint_residuals(const Posterior& posterior, std::size_t group) {
   const Observations& of = posterior.observations()[group];
-  const System& system = prior_of(posterior.prior(), of.view()).reference_system();
-  MatrixXd accelerations = MatrixXd::Constant(system.nq(), of.n_data(), not_a_number), stddev = accelerations;
-  accelerations(of.view().rows, Eigen::all) = of.values();
-  for (int i = 0; i < of.n_data(); ++i) {
-    stddev(of.view().rows, i) = of.noise().at(posterior.values().noise_stddev[group], i);
-  }
-  return constraint_residuals(system, of.states(), parameters_of(of.view(), posterior.values().parameters), accelerations,
-                              stddev);
+  MatrixXd noise(of.view().size(), of.n_data());
+  for (int i = 0; i < of.n_data(); ++i) noise.col(i) = of.noise().at(posterior.values().noise_stddev[group], i);
+  return constraint_residuals(posterior, of.view().other_system, of.states(), of.view().rows, of.values(), noise);
 }
 
 Evaluation evaluate_predictions(const Posterior& posterior, const Ref<const MatrixXd>& states, const std::vector<int>& rows,

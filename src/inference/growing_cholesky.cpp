@@ -46,8 +46,8 @@ void GrowingCholesky::resize(Index n) {
   size_ = n;
 }
 
-Eigen::Block<const MatrixXd> GrowingCholesky::invert() {
-  lapack::invert_factored(lower());
+Eigen::Block<const MatrixXd> GrowingCholesky::invert(const std::atomic<bool>* stop) {
+  lapack::invert_factored(lower(), {stop});
   return L();
 }
 
@@ -57,8 +57,8 @@ VectorXd GrowingCholesky::solve() const {
   return solution;
 }
 
-bool GrowingCholesky::factorise(const Ref<const VectorXd>& y) {
-  if (!lapack::factorise(lower())) return false;
+bool GrowingCholesky::factorise(const Ref<const VectorXd>& y, const std::atomic<bool>* stop) {
+  if (!lapack::factorise(lower(), {stop})) return false;
   z_ = y;
   lapack::solve_lower(L(), false, z_);
   return true;

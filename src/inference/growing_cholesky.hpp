@@ -1,5 +1,6 @@
 #pragma once
 
+#include <atomic>
 #include <vector>
 
 #include <Eigen/Core>
@@ -33,10 +34,12 @@ class GrowingCholesky {
   void resize(Eigen::Index n);
 
   /// From K in the lower triangle of lower() to L and z = L⁻¹y; false where K is not positive definite.
-  [[nodiscard]] bool factorise(const Eigen::Ref<const Eigen::VectorXd>& y);
+  /// @param stop  set: gives up, and is false
+  [[nodiscard]] bool factorise(const Eigen::Ref<const Eigen::VectorXd>& y, const std::atomic<bool>* stop = nullptr);
 
   /// The lower triangle of K⁻¹, in the place of L, which is lost.
-  [[nodiscard]] Eigen::Block<const Eigen::MatrixXd> invert();
+  /// @param stop  set: gives up, and what stands there is neither
+  [[nodiscard]] Eigen::Block<const Eigen::MatrixXd> invert(const std::atomic<bool>* stop = nullptr);
 
   /// L and z of [K k; kᵀ κ] and [y; υ], in O(n² m) operations. False, and nothing has changed, where that is not positive
   /// definite.

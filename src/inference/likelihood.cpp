@@ -4,6 +4,7 @@
 #include <limits>
 #include <utility>
 
+#include "base/parallel.hpp"
 #include "inference/dense_gram.hpp"
 #include "inference/requirements.hpp"
 #include "inference/sample_gradient.hpp"
@@ -32,11 +33,13 @@ struct Likelihood::Implementation {
 };
 
 struct Likelihood::Workspace::Implementation {
-  explicit Implementation(int n_threads) : gram(std::make_unique<DenseGram>(n_threads)) {}
+  Implementation(int n_threads, const std::atomic<bool>* stop_flag)
+      : gram(std::make_unique<DenseGram>(n_threads, stop_flag)), stop(stop_flag) {}
 
   // of the likelihood whose data stands below; held, so that no other can have it
   std::shared_ptr<const char> owner;
   std::unique_ptr<Gram> gram;
+  const std::atomic<bool>* stop;
 
   std::vector<ObservationModel> own_models;  // where parameters are estimated …
   VectorXd modelled;                         // … at these, none: not yet
@@ -114,7 +117,8 @@ void Likelihood::Workspace::Implementation::update_rows(const Likelihood::Implem
   }
 }
 
-Likelihood::Workspace::Workspace(int n_threads) : implementation_(std::make_unique<Implementation>(n_threads)) {}
+Likelihood::Workspace::Workspace(int n_threads, const std::atomic<bool>* stop)
+    : implementation_(std::make_unique<Implementation>(n_threads, stop)) {}
 Likelihood::Workspace::~Workspace() = default;
 
 Likelihood::Likelihood(Prior prior, std::vector<Observations> observations, const ModelValues& initial, Options options)
@@ -203,6 +207,7 @@ double Likelihood::evaluate(const ModelValues& values, ModelGradient* gradient, 
   // T14
   const std::vector<GramGradientParts> parts = self.parts(reduction, values);
   const GramGradient of_gram = work.gram->differentiate(work.rows, parts);
+  if (is_set(work.stop)) return infinity;  // the gradient may be that of a part
   *gradient = ModelGradient::zero(values);
   for (std::size_t a = 0; a < parts.size(); ++a) {
     const GramGradient::OfLatent& of_latent = of_gram.latents[a];

@@ -50,7 +50,7 @@ class PairSweep {
     }
   }
 
-  PairSums run(int n_threads) const {
+  PairSums run(int n_threads, const std::atomic<bool>* stop) const {
     const Index n_tiles = (n_samples() + tile_size - 1) / tile_size;
     const int n_tasks = static_cast<int>(std::clamp<Index>(n_tiles, 1, 32));
     std::vector<PairSums> sums(static_cast<std::size_t>(n_tasks), zero());
@@ -58,7 +58,8 @@ class PairSweep {
       Tile tile(*this);
       // columns of tiles get shorter: dealt out in turn, every task has about as much
       for (Index J = task; J < n_tiles; J += n_tasks) {
-        for (Index I = J; I < n_tiles; ++I) tile.add(I * tile_size, J * tile_size, sums[static_cast<std::size_t>(task)]);
+        for (Index I = J; I < n_tiles && !is_set(stop); ++I)
+          tile.add(I * tile_size, J * tile_size, sums[static_cast<std::size_t>(task)]);
       }
     });
     for (std::size_t task = 1; task < sums.size(); ++task) sums[0].add(sums[task]);
@@ -256,8 +257,8 @@ class PairSweep {
 }  // namespace
 
 GramGradient sweep_pairs(const LatentRows& rows, const Ref<const MatrixXd>& P, const VectorXd& alpha,
-                         const std::vector<GramGradientParts>& parts, int n_threads) {
-  PairSums sums = PairSweep(rows, P, alpha, parts).run(n_threads);
+                         const std::vector<GramGradientParts>& parts, int n_threads, const std::atomic<bool>* stop) {
+  PairSums sums = PairSweep(rows, P, alpha, parts).run(n_threads, stop);
   GramGradient gradient{alpha, {}};
   for (PairSums::OfLatent& of : sums.latents) {
     gradient.latents.push_back({0.5 * of.kernel.colwise().sum().transpose(), of.columns.colwise().sum().transpose(),

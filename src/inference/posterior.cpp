@@ -56,18 +56,39 @@ void Posterior::Implementation::erase_samples(const std::vector<Index>& gone) {
   samples.resize(static_cast<std::size_t>(close_gaps(samples.data(), static_cast<Index>(samples.size()), gone)));
 }
 
-Posterior::Posterior(Prior prior, std::vector<Observations> observations, ModelValues values) {
+namespace {
+
+// Everything but the latents.
+std::shared_ptr<Posterior::Implementation> unconditioned(Prior prior, std::vector<Observations> observations,
+                                                         ModelValues values) {
   require_observations(prior, observations);
   require_values(prior, observations, values);
-  auto self = std::make_shared<Implementation>();
+  auto self = std::make_shared<Posterior::Implementation>();
   self->prior = std::move(prior);
   self->observations = std::move(observations);
   self->values = std::move(values);
   self->n_given_groups = self->observations.size();
   for (std::size_t a = 0; a < self->prior.latents.size(); ++a) self->C.push_back(self->values.loading(a));
+  return self;
+}
+
+}  // namespace
+
+void Posterior::Implementation::condition() {
   const lapack::SingleThread single_thread;
-  self->add_samples(self->observations, self->values.noise_stddev, 0);
-  implementation_ = std::move(self);
+  add_samples(observations, values.noise_stddev, 0);
+}
+
+Posterior::Posterior(Prior prior, std::vector<Observations> observations, ModelValues values) {
+  const std::shared_ptr<Implementation> self = unconditioned(std::move(prior), std::move(observations), std::move(values));
+  self->condition();
+  implementation_ = self;
+}
+
+Posterior Posterior::lazy(Prior prior, std::vector<Observations> observations, ModelValues values) {
+  const std::shared_ptr<Implementation> self = unconditioned(std::move(prior), std::move(observations), std::move(values));
+  self->conditioning = std::make_shared<std::once_flag>();
+  return Posterior(self);
 }
 
 namespace {
@@ -290,10 +311,19 @@ Posterior Posterior::without_data() const {
 
 Posterior::Posterior(std::shared_ptr<const Implementation> implementation) : implementation_(std::move(implementation)) {}
 
-const Posterior::Implementation& Posterior::implementation() const { return require_held(implementation_, "Posterior"); }
-const Prior& Posterior::prior() const { return implementation().prior; }
-const std::vector<Observations>& Posterior::observations() const { return implementation().observations; }
-const ModelValues& Posterior::values() const { return implementation().values; }
+const Posterior::Implementation& Posterior::implementation() const {
+  const Implementation& self = require_held(implementation_, "Posterior");
+  if (self.conditioning) {
+    std::call_once(*self.conditioning, [this] { std::const_pointer_cast<Implementation>(implementation_)->condition(); });
+  }
+  return self;
+}
+
+const Prior& Posterior::prior() const { return require_held(implementation_, "Posterior").prior; }
+const std::vector<Observations>& Posterior::observations() const {
+  return require_held(implementation_, "Posterior").observations;
+}
+const ModelValues& Posterior::values() const { return require_held(implementation_, "Posterior").values; }
 int Posterior::reduced_size() const { return static_cast<int>(implementation().latents->size()); }
 
 double Posterior::negative_log_likelihood() const {

@@ -2,6 +2,7 @@
 
 #include <cstdint>
 #include <memory>
+#include <mutex>
 #include <vector>
 
 #include "gp2/posterior.hpp"
@@ -25,8 +26,12 @@ struct Posterior::Implementation {
   std::vector<Sample> samples;               // in the order of adding to `latents`
   std::shared_ptr<LatentPosterior> latents;  // not shared: see own_implementation
   std::int64_t next_number = 0;
-  std::size_t n_given_groups = 0;  // of `observations`, that the constructor was given: the first ones
+  std::shared_ptr<std::once_flag> conditioning;  // of a lazy posterior: whether `latents` stand; null: they do
+  std::size_t n_given_groups = 0;                // of `observations`, that the constructor was given: the first ones
 
+  /// The latents given `observations`.
+  /// @throws as add_samples
+  void condition();
   /// Samples of more observations; `observations` stay as they are. On an error nothing has changed.
   /// @param noise_stddev  per group
   /// @param first_group   the group of `observations` that groups[0] is, or is going to be

@@ -15,6 +15,7 @@ namespace gp2 {
 using Eigen::Index;
 
 std::shared_ptr<Posterior::Implementation> Posterior::own_implementation() const {
+  static_cast<void>(implementation());  // it is conditioned
   if (implementation_.use_count() > 1) {
     auto copy = std::make_shared<Implementation>(*implementation_);
     copy->latents = implementation_->latents->clone();

@@ -7,9 +7,11 @@
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
+#include "base/parallel.hpp"
 #include "gp2/error.hpp"
 #include "gp2/inference/evaluation.hpp"
 #include "gp2/jobs/fit_memory.hpp"
+#include "gp2/jobs/fit_time.hpp"
 
 namespace gp2 {
 
@@ -72,6 +74,7 @@ FitJob job_of(FitRequest request, FitProblem problem) {
   const FitOptions asked = optimiser_options(request, problem);
   job.notes = problem.notes;
   job.options = within_memory(problem, asked, free_memory(), job.notes);
+  note_time(problem, job.options, fit_memory(problem, job.options).reduced_size, job.notes);
   job.file.options = options_json(options(request));
   job.file.prior_options = problem.prior_options;
   job.file.systems = problem.systems;
@@ -243,7 +246,7 @@ FitOutcome run_fit(const FitJob& job, const std::function<void(const Progress&)>
   Fit result = fit(job.problem, options);
   FitOutcome outcome{job.file, std::move(result.posterior), distrust_notes(job.problem, result.report)};
   for (std::string& note : notes_of(result.report)) outcome.notes.push_back(std::move(note));
-  if (result.report.termination != FitReport::interrupted) {
+  if (result.report.termination != FitReport::interrupted && !is_set(stop)) {
     // a fit that has taken hours is not lost to what is said of it
     try {
       add_force_note(outcome.posterior, outcome.notes);

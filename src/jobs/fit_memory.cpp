@@ -6,10 +6,9 @@
 #include <fstream>
 #include <sstream>
 
-#include <sys/mman.h>
-
 #include <fmt/format.h>
 
+#include "base/mapped_memory.hpp"
 #include "base/parallel.hpp"
 #include "gp2/error.hpp"
 
@@ -78,9 +77,6 @@ PerState per_state(const FitProblem& problem, double rank) {
   (n_parameters > 0 ? count.evaluation : count.shared) += model * (1 + static_cast<double>(n_parameters));
   return count;
 }
-
-// OpenBLAS maps a buffer for each thread that calls it, and where it gets none tries again for ever.
-constexpr double blas_buffer = 128 * 1024. * 1024;
 
 // A fit of so many states and reduced rows, one evaluation at a time.
 FitMemory memory_of(double n_states, double r, const PerState& count) {
@@ -191,18 +187,7 @@ std::optional<double> free_memory(const std::filesystem::path& root) {
   return free;
 }
 
-bool is_given(double bytes, int n_pieces) {
-  const auto size = static_cast<std::size_t>(bytes);
-  std::vector<void*> pieces;
-  bool all = true;
-  for (int k = 0; k < n_pieces && all; ++k) {
-    void* const piece = mmap(nullptr, size, PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS, -1, 0);
-    all = piece != MAP_FAILED;
-    if (all) pieces.push_back(piece);
-  }
-  for (void* const piece : pieces) munmap(piece, size);
-  return all;
-}
+bool is_given(double bytes, int n_pieces) { return maps(bytes, n_pieces); }
 
 namespace {
 

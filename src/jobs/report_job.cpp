@@ -68,10 +68,7 @@ ReportData data_at(const Posterior& posterior, const MatrixXd& states, const std
   for (int i = 0; i < values.n_states() && reference.nc() > 0; ++i) {
     data.constraint_error.col(i) = (values.A(i) * data.predicted.col(i) - values.b(i)).cwiseAbs();
   }
-  MatrixXd accelerations = MatrixXd::Constant(reference.nq(), states.cols(), not_a_number), noise = accelerations;
-  accelerations(rows, Eigen::all) = measured;
-  noise(rows, Eigen::all) = data.noise_stddev;
-  data.constraint_residuals = constraint_residuals(reference, states, parameters, accelerations, noise);
+  data.constraint_residuals = constraint_residuals(posterior, other_system, states, rows, measured, data.noise_stddev);
   data.lower_rank = states_of_lower_rank(reference, states, parameters);
   if (reference.nc() > 0) data.violation = largest_violation(reference, states, parameters);
 

@@ -328,19 +328,31 @@ void check_independence(const MechanicsBatch& mechanics, std::vector<Finding>& f
                                    n_states, mechanics.values.n_states(), worst, state + 1)});
 }
 
-// an M that changes with the motion comes with forces that are quadratic in the velocities
-void check_coriolis(const System& system, const MechanicsBatch& mechanics, std::vector<Finding>& findings) {
-  const MatrixXd& M = mechanics.values.mass;
-  const std::vector<bool> force = system.reads(SystemPart::force);
+// The part of F that stays when all velocities change their sign, less F at rest: Coriolis and centrifugal forces, quadratic in dq.
+MatrixXd even_force(const System& system, MatrixXd states, const Ref<const VectorXd>& parameters) {
   const StateLayout layout = system.layout();
-  const bool reads_velocities =
-      std::any_of(force.begin() + layout.dq(0), force.begin() + layout.dq(0) + layout.nq, [](bool one) { return one; });
+  auto velocities = states.middleRows(layout.dq(0), layout.nq);
+  // where a log is at rest, or has no velocities since nothing reads them
+  for (double& one : velocities.reshaped()) one = one == 0 || std::isnan(one) ? 1 : one;
+  const MatrixXd moving = system.evaluate(states, parameters).force;
+  velocities *= -1;
+  const MatrixXd back = system.evaluate(states, parameters).force;
+  velocities.setZero();
+  const MatrixXd even = (moving + back) / 2 - system.evaluate(states, parameters).force;
+  // but for rounding
+  return (even.array().abs() > 1e-12 * (moving.array().abs() + back.array().abs())).select(even, 0);
+}
+
+// an M that changes with the motion comes with forces that are quadratic in the velocities
+void check_coriolis(const System& system, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters,
+                    const MatrixXd& M, std::vector<Finding>& findings) {
   const double change = (M.colwise() - M.col(0)).cwiseAbs().maxCoeff();
-  if (reads_velocities || !(change > 1e-9 * M.cwiseAbs().maxCoeff())) return;
+  if (!(change > 1e-9 * M.cwiseAbs().maxCoeff())) return;
+  if (!even_force(system, states, parameters).isZero(0)) return;
   findings.push_back(
       {Level::warning,
-       "mass matrix: it changes with the motion, but the force depends on no velocity: the Coriolis and centrifugal "
-       "forces are missing; write coriolis = true in [mechanics]"});
+       "mass matrix: it changes with the motion, but no part of the force is quadratic in the velocities: the Coriolis and "
+       "centrifugal forces are missing; write coriolis = true in [mechanics]"});
 }
 
 // M is symmetric, and definite or completed by A
@@ -431,9 +443,10 @@ void check_row_sizes(const System& system, const MechanicsBatch& mechanics, std:
 }
 
 // M, A, b: definite or completed by A, of constant rank, consistent
-void check_mechanics(const System& system, const MechanicsBatch& mechanics, std::vector<Finding>& findings) {
+void check_mechanics(const System& system, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters,
+                     const MechanicsBatch& mechanics, std::vector<Finding>& findings) {
   check_mass(system, mechanics, findings);
-  check_coriolis(system, mechanics, findings);
+  check_coriolis(system, states, parameters, mechanics.values.mass, findings);
   if (system.nc() == 0) {
     findings.push_back({Level::warning, "constraints: none; T = I, and ddq is the unconstrained acceleration"});
     return;
@@ -551,7 +564,7 @@ std::vector<Finding> check_system(const System& system, const Ref<const MatrixXd
     findings.push_back({Level::error, fmt::format("{} at state {}", mechanics.fault->text, mechanics.fault->state + 1)});
     return findings;
   }
-  check_mechanics(system, mechanics, findings);
+  check_mechanics(system, states, parameters, mechanics, findings);
   check_parameter_derivatives(system, states, parameters, findings);
   check_motion(system, states, parameters, findings);
   return findings;

@@ -100,7 +100,13 @@ void Model::define(const std::string& symbol, Expression value) {
   if (symbols_.emplace(symbol, value).second) symbol_names_.push_back(symbol);
 }
 
-Expression Model::parse_symbols(std::string_view written) const {
+Expression Model::parse_symbols(std::string_view written, const std::vector<Expression>& forbidden) const {
+  std::vector<std::string> known;
+  for (const std::string& name : symbol_names_) {
+    const Expression value = symbols_.find(name)->second;
+    const auto is_read = [&](const Expression& one) { return graph->depends_on(value, one); };
+    if (std::none_of(forbidden.begin(), forbidden.end(), is_read)) known.push_back(name);
+  }
   return parse_expression(
       written, *graph,
       [&](std::string_view symbol) -> std::optional<Expression> {
@@ -108,7 +114,7 @@ Expression Model::parse_symbols(std::string_view written) const {
         if (found != symbols_.end()) return found->second;
         return robot_expressions_ ? robot_expressions_->variable(std::string(symbol)) : std::nullopt;
       },
-      symbol_names_);
+      known);
 }
 
 Expression Model::expression(std::string_view written) const {

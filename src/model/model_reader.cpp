@@ -59,21 +59,31 @@ class ModelReader : private TomlReader {
   }
 
  private:
-  // an expression given as text or as a number
-  Expression expression(const toml::node& node, const std::string& key) const {
-    const Expression value = unexpanded(node, key);
-    return robot() ? robot()->expand(value) : value;
+  // an expression given as text or as a number, which by some rule does not depend on the forbidden symbols
+  Expression expression_without(const toml::node& node, const std::string& key, const std::vector<Expression>& forbidden,
+                                const char* rule) const {
+    Expression value = unexpanded(node, key, forbidden);
+    if (robot()) value = robot()->expand(value);
+    allow_only(node, key, value, forbidden, rule);
+    return value;
   }
 
-  // the same, the points of the robot left as they are
-  Expression unexpanded(const toml::node& node, const std::string& key) const {
+  // the points of the robot left as they are
+  Expression unexpanded(const toml::node& node, const std::string& key, const std::vector<Expression>& forbidden = {}) const {
     if (node.is_number()) return definition_.graph->constant(number(node, key));
     if (!node.is_string()) fail(node, key, fmt::format("expected an expression in quotes, or a number, got {}", written(node)));
     try {
-      return model_.parse_symbols(text(node, key));
+      return model_.parse_symbols(text(node, key), forbidden);
     } catch (const InputError& error) {
       fail(node, key, fmt::format("\"{}\", {}", shortened(text(node, key)), error.what()));
     }
+  }
+
+  // what changes while coordinates, t and parameters do not
+  [[nodiscard]] std::vector<Expression> of_motion() const {
+    std::vector<Expression> symbols = symbols_->dq;
+    for (const auto* group : {&symbols_->ddq, &symbols_->u}) symbols.insert(symbols.end(), group->begin(), group->end());
+    return symbols;
   }
 
   // null without a robot
@@ -467,12 +477,8 @@ class ModelReader : private TomlReader {
       definition_.mass.emplace_back();
       for (std::size_t j = 0; j < nq; ++j) {
         const std::string entry_key = fmt::format("mechanics.mass row {} column {}", i + 1, j + 1);
-        const Expression entry = expression(*entries.get(j), entry_key);
-        for (const auto* group : {&symbols_->dq, &symbols_->ddq, &symbols_->u}) {
-          allow_only(*entries.get(j), entry_key, entry, *group,
-                     "the mass matrix may depend on coordinates, t and parameters only");
-        }
-        definition_.mass.back().push_back(entry);
+        definition_.mass.back().push_back(expression_without(*entries.get(j), entry_key, of_motion(),
+                                                             "the mass matrix may depend on coordinates, t and parameters only"));
       }
     }
   }
@@ -516,8 +522,7 @@ class ModelReader : private TomlReader {
       }
       for (std::size_t j = 0; j < nq; ++j) {
         const std::string key = fmt::format("{}.force entry {}", section, j + 1);
-        forces[j] = expression(*force.get(j), key);
-        allow_only(*force.get(j), key, forces[j], symbols_->ddq, "a force may not depend on accelerations");
+        forces[j] = expression_without(*force.get(j), key, symbols_->ddq, "a force may not depend on accelerations");
       }
     }
     if (!entries.contains("force_on")) return forces;
@@ -525,8 +530,7 @@ class ModelReader : private TomlReader {
     if (!robot()) fail(node, section + ".force_on", "only a model with a robot = \"FILE\" has points for a force to act on");
     for (const auto& [name, entry] : entries_of(table(node, section + ".force_on"))) {
       const std::string key = fmt::format("{}.force_on.{}", section, name);
-      const Expression force = expression(*entry, key);
-      allow_only(*entry, key, force, symbols_->ddq, "a force may not depend on accelerations");
+      const Expression force = expression_without(*entry, key, symbols_->ddq, "a force may not depend on accelerations");
       for (std::size_t j = 0; j < nq; ++j) forces[j] = forces[j] + robot_quantity(*entry, key, name).jacobian[j] * force;
     }
     return forces;
@@ -549,12 +553,9 @@ class ModelReader : private TomlReader {
     const toml::table& mechanics = *root_.get("mechanics")->as_table();
     if (!mechanics.contains("potential")) return;
     const toml::node& node = *mechanics.get("potential");
-    const Expression potential = expression(node, "mechanics.potential");
+    const Expression potential = expression_without(node, "mechanics.potential", of_motion(),
+                                                    "the potential may depend on coordinates, t and parameters only");
     model_.potential = model_.potential ? *model_.potential + potential : potential;
-    for (const auto* group : {&symbols_->dq, &symbols_->ddq, &symbols_->u}) {
-      allow_only(node, "mechanics.potential", *model_.potential, *group,
-                 "the potential may depend on coordinates, t and parameters only");
-    }
   }
 
   void allow_only(const toml::node& node, const std::string& key, Expression e, const std::vector<Expression>& forbidden,
@@ -599,6 +600,15 @@ class ModelReader : private TomlReader {
                                       definition_.parameters);
   }
 
+  // what derive_constraint refuses
+  [[nodiscard]] std::vector<Expression> forbidden_in(Level level) const {
+    if (level == Level::position) return of_motion();
+    if (level == Level::acceleration) return {};
+    std::vector<Expression> symbols = symbols_->ddq;
+    symbols.insert(symbols.end(), symbols_->u.begin(), symbols_->u.end());
+    return symbols;
+  }
+
   void read_constraints() {
     if (robot()) {
       for (auto& [c, name] : robot()->loops()) definition_.constraints.push_back(derive(Level::position, c, std::move(name)));
@@ -614,7 +624,7 @@ class ModelReader : private TomlReader {
       for (std::size_t k = 0; k < rows.size(); ++k) {
         const toml::node& node = *rows.get(k);
         const std::string key = fmt::format("constraints.{} entry {}", level_name, k + 1);
-        const Expression c = unexpanded(node, key);
+        const Expression c = unexpanded(node, key, forbidden_in(level));
         try {
           definition_.constraints.push_back(derive(level, c, node.is_string() ? text(node, key) : to_string(c)));
         } catch (const InputError& error) {
@@ -734,8 +744,7 @@ class ModelReader : private TomlReader {
       for (const std::string& name : names_of_code(node, key)) add(node, name, {name});
     } else {
       for (const toml::node& entry : array(node, key)) {
-        const Expression value = expression(entry, key);
-        allow_only(entry, key, value, symbols_->ddq, "a feature may not depend on accelerations");
+        const Expression value = expression_without(entry, key, symbols_->ddq, "a feature may not depend on accelerations");
         const std::string feature = written_expression(entry, key, value);
         add(entry, feature, expand_angle(feature, definition_.coordinates));
       }
@@ -826,8 +835,7 @@ class ModelReader : private TomlReader {
       }
       latent.directions.emplace_back();
       for (const toml::node& entry : row) {
-        const Expression value = expression(entry, key);
-        allow_only(entry, key, value, symbols_->ddq, "a direction may not depend on accelerations");
+        const Expression value = expression_without(entry, key, symbols_->ddq, "a direction may not depend on accelerations");
         latent.directions.back().push_back(written_expression(entry, key, value));
       }
     }
@@ -908,8 +916,8 @@ class ModelReader : private TomlReader {
     }
     for (std::size_t j = 0; j < nq; ++j) {
       const toml::node& row = *rows.get(j);
-      model_.truth[j] = expression(row, "truth.acceleration");
-      allow_only(row, "truth.acceleration", model_.truth[j], symbols_->ddq, "the true acceleration may not depend on itself");
+      model_.truth[j] =
+          expression_without(row, "truth.acceleration", symbols_->ddq, "the true acceleration may not depend on itself");
     }
   }
 
@@ -938,8 +946,7 @@ class ModelReader : private TomlReader {
       if (node->is_array()) {
         rule.range = range(*node, key);
       } else {
-        rule.value = expression(*node, key);
-        allow_only(*node, key, rule.value, symbols_->ddq, "a sample may not depend on accelerations");
+        rule.value = expression_without(*node, key, symbols_->ddq, "a sample may not depend on accelerations");
       }
       rules.push_back(std::move(rule));
     }

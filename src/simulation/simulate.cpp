@@ -52,7 +52,9 @@ bool is_finite(const Phase& phase) {
 class Integration {
  public:
   Integration(const System& system, const VectorXd& parameters, const Acceleration& acceleration, const SimulateOptions& options)
-      : layout_(system.layout()),
+      : system_(system),
+        parameters_(parameters),
+        layout_(system.layout()),
         acceleration_(acceleration),
         options_(options),
         projection_(system, parameters),
@@ -62,6 +64,7 @@ class Integration {
 
   Trajectory run(const Ref<const VectorXd>& start, bool redundant) {
     project_stages_ = redundant;
+    switching_.move_along([this](const VectorXd& state) { return tangent_at(state); });
     if (redundant) switching_.put_onto([this](VectorXd& state) { projection_.apply(state); });
     const Index n = options_.times.size();
     out_.times = options_.times;
@@ -166,6 +169,12 @@ class Integration {
     std::copy(x.begin(), x.end(), state_.begin());
     state_[layout_.t()] = t;
     options_.inputs.evaluate(t, state_.tail(layout_.nu));
+  }
+
+  // T, or I where the mechanics have a fault, which the acceleration tells of
+  [[nodiscard]] MatrixXd tangent_at(const VectorXd& state) const {
+    const MechanicsBatch mechanics = evaluate_mechanics(system_, state, parameters_);
+    return mechanics.fault ? MatrixXd::Identity(layout_.nq, layout_.nq) : mechanics.projections[0].T();
   }
 
   // whether the projection changed x
@@ -347,6 +356,8 @@ class Integration {
     out_.records.col(row) = recorded;
   }
 
+  const System& system_;
+  const VectorXd& parameters_;
   const StateLayout layout_;
   const Acceleration& acceleration_;
   const SimulateOptions& options_;

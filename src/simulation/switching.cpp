@@ -42,8 +42,8 @@ void SwitchingFunctions::evaluate(const Eigen::Ref<const VectorXd>& state, const
 
 namespace {
 
-// The arguments of sign() in expressions that read a velocity and no input, each once, without constant factors: sign(v) and
-// sign(−2 v) are of one surface.
+// The arguments of sign() in expressions, and of |·| in denominators, that read a velocity and no input, each once, without constant
+// factors: sign(v), sign(−2 v) and v/|v| are of one surface.
 class ArgumentsOfSign {
  public:
   ArgumentsOfSign(ExpressionGraph& graph, const SystemSymbols& symbols) : graph_(graph), symbols_(symbols) {}
@@ -51,6 +51,7 @@ class ArgumentsOfSign {
   void add(Expression e) {
     if (!seen_.insert(e.id()).second || e.operation() <= Operation::variable) return;
     if (e.operation() == Operation::sign) add_surface(e.left());
+    if (e.operation() == Operation::divide && e.right().operation() == Operation::abs) add_surface(e.right().left());
     add(e.left());
     if (is_binary(e.operation())) add(e.right());
   }
@@ -161,8 +162,15 @@ VectorXd Switching::beside(VectorXd state, const Surfaces& surfaces, const std::
   if (rows.empty()) return state;
   const MatrixXd normals = surfaces.normals(rows, Eigen::all);
   if (!normals.allFinite()) return state;
-  state.segment(layout_.dq(0), layout_.nq) += normals.completeOrthogonalDecomposition().solve(
-      Eigen::Map<const VectorXd>(changes.data(), static_cast<Index>(rows.size())));
+  const MatrixXd T = tangent_ ? tangent_(state) : MatrixXd::Identity(layout_.nq, layout_.nq);
+  MatrixXd along = normals * T;
+  // Where the constraints hardly let the motion leave a surface, as a slider at its dead centre, its sides hardly act on the motion.
+  constexpr double least = 1e-4;
+  for (Index k = 0; k < along.rows(); ++k) {
+    if (along.row(k).norm() <= least * normals.row(k).norm()) along.row(k).setZero();
+  }
+  state.segment(layout_.dq(0), layout_.nq) += T * along.completeOrthogonalDecomposition().solve(Eigen::Map<const VectorXd>(
+                                                      changes.data(), static_cast<Index>(rows.size())));
   if (constraints_) constraints_(state);
   return state;
 }

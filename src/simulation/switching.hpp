@@ -21,6 +21,9 @@ class Switching {
   /// @param tolerance  of velocities: a part of it is how far from a surface its sides are evaluated
   Switching(const SwitchingFunctions& functions, Eigen::VectorXd parameters, StateLayout layout, double tolerance);
 
+  /// T at a state: velocities change within what the constraints allow. Changed in any way and put back onto the constraints
+  /// they would be no more where they were wanted: near a dead centre hardly moved at all.
+  void move_along(std::function<Eigen::MatrixXd(const Eigen::VectorXd& state)> tangent) { tangent_ = std::move(tangent); }
   /// States beside a surface are put onto the constraints too: of redundant rows b means nothing off them, at rest least of all.
   void put_onto(std::function<void(Eigen::VectorXd& state)> constraints) { constraints_ = std::move(constraints); }
 
@@ -63,6 +66,7 @@ class Switching {
   Eigen::VectorXd parameters_;
   StateLayout layout_;
   double tolerance_;
+  std::function<Eigen::MatrixXd(const Eigen::VectorXd&)> tangent_;
   std::function<void(Eigen::VectorXd&)> constraints_;
   std::vector<int> sides_;  // of each surface: 1, −1; 0: the motion slides on it
   Eigen::VectorXd share_;   // 1 − σ of each surface slid on, within [0, 2]

@@ -19,8 +19,6 @@ using Eigen::VectorXd;
 
 namespace {
 
-bool is_stopped(const std::atomic<bool>* stop) { return stop != nullptr && stop->load(); }
-
 std::vector<int> free_ones(const std::vector<Hyperparameter>& hyperparameters) {
   std::vector<int> free;
   for (std::size_t k = 0; k < hyperparameters.size(); ++k) {
@@ -42,7 +40,7 @@ class Differences {
     const auto n = static_cast<Index>(free_.size());
     MatrixXd H(n, n);
     parallel_for(static_cast<int>(n), n_threads, [&](int k, int) {
-      Likelihood::Workspace workspace;
+      Likelihood::Workspace workspace(1, stop_);
       H.col(k) = is_parameter(k) ? parameter_column(k, workspace) : central(k, within_box(k, 3e-3, 1), workspace);
     });
     for (Index k = 0; k < n; ++k) {
@@ -85,7 +83,7 @@ class Differences {
   }
 
   [[nodiscard]] VectorXd gradient_at(Index k, double distance, Likelihood::Workspace& workspace) const {
-    if (is_stopped(stop_)) throw NumericalError("stopped on request: no standard errors");
+    if (is_set(stop_)) throw NumericalError("stopped on request: no standard errors");
     VectorXd there = x_, gradient(x_.size());
     there[free_[static_cast<std::size_t>(k)]] += distance;
     if (!std::isfinite(objective_(there, &gradient, workspace))) {
@@ -116,7 +114,7 @@ Curvature curvature_at(const Objective& objective, const VectorXd& x, const std:
   const Differences differences(objective, x, hyperparameters, stop);
   Curvature out;
   out.free = differences.free();
-  Likelihood::Workspace workspace(n_threads);
+  Likelihood::Workspace workspace(n_threads, stop);
   VectorXd gradient = VectorXd::Zero(x.size());
   objective(x, &gradient, workspace);
   out.gradient = gradient(out.free);
@@ -139,8 +137,8 @@ VectorXd scales_of_parameters(const Objective& objective, const VectorXd& x, con
   if (std::none_of(hyperparameters.begin(), hyperparameters.end(), [](const auto& h) { return h.is_system_parameter(); })) {
     return scales;
   }
-  if (is_stopped(stop) || !std::isfinite(objective(x, &gradient, workspace))) return scales;
-  for (Index k = 0; k < x.size() && !is_stopped(stop); ++k) {
+  if (is_set(stop) || !std::isfinite(objective(x, &gradient, workspace))) return scales;
+  for (Index k = 0; k < x.size() && !is_set(stop); ++k) {
     const Hyperparameter& h = hyperparameters[static_cast<std::size_t>(k)];
     if (!h.is_system_parameter()) continue;
     constexpr double step = 1e-5;  // of the box, away from the nearer bound

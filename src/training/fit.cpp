@@ -102,7 +102,7 @@ class Training {
   [[nodiscard]] int n_escapes() const { return n_escapes_; }
   [[nodiscard]] const std::optional<LaplaceUncertainty>& uncertainty() const { return uncertainty_; }
 
-  [[nodiscard]] bool stopped() const { return options_.stop != nullptr && options_.stop->load(); }
+  [[nodiscard]] bool stopped() const { return is_set(options_.stop); }
 
  private:
   [[nodiscard]] bool estimates_parameters() const {
@@ -144,7 +144,7 @@ class Training {
     constexpr int n_attempts = 2;
     const std::size_t from = best();
     try {
-      Likelihood::Workspace workspace(n_threads_);
+      Likelihood::Workspace workspace(n_threads_, options_.stop);
       for (int attempt = 0;; ++attempt) {
         const std::vector<Hyperparameter>& at = results_[from];
         const Curvature curvature = curvature_at(objective_, coordinates(at), at, n_side_by_side_, options_.stop);
@@ -215,7 +215,7 @@ class Training {
     std::vector<double> values(scanned.size() * n_points);
     parallel_for(static_cast<int>(values.size()), n_side_by_side_, [&](int trial, int) {
       if (stopped()) return;
-      Likelihood::Workspace workspace;
+      Likelihood::Workspace workspace(1, options_.stop);
       values[static_cast<std::size_t>(trial)] = objective_(moved(trial), nullptr, workspace);
     });
     if (stopped()) return false;
@@ -223,7 +223,7 @@ class Training {
     const auto lowest = std::min_element(values.begin(), values.end());
     const double before = reports_[from].objective;
     if (!(*lowest < before)) return false;
-    Likelihood::Workspace workspace(n_threads_);
+    Likelihood::Workspace workspace(n_threads_, options_.stop);
     const LbfgsbResult result =
         optimise(static_cast<int>(from), objective_.at(moved(static_cast<int>(lowest - values.begin()))), workspace);
     if (!(result.value < before)) return false;
@@ -240,7 +240,7 @@ class Training {
       return;
     }
     RandomStream random(options_.seed, static_cast<std::uint64_t>(restart));
-    Likelihood::Workspace workspace(n_threads);
+    Likelihood::Workspace workspace(n_threads, options_.stop);
     // a random start may lie where M is not positive definite: draw again, a few times
     constexpr int max_draws = 20;
     LbfgsbResult result;
@@ -271,7 +271,7 @@ class Training {
       for (Hyperparameter& h : start) {
         if (h.is_stationary_at_zero() && at_zero.contains(h.owner)) h.value = share * h.size * random.normal();
       }
-      Likelihood::Workspace workspace;
+      Likelihood::Workspace workspace(1, options_.stop);
       drawn[static_cast<std::size_t>(draw)] = optimise(static_cast<int>(from), start, workspace);
     });
     const auto lowest =
@@ -350,6 +350,7 @@ Fit fit(const Prior& prior, const std::vector<Observations>& observations, const
   const std::size_t best = training.best();
   const RestartReport& winner = training.reports()[best];
   if (!std::isfinite(winner.objective)) {
+    if (training.stopped()) throw NumericalError("stopped before the likelihood was evaluated once: there is no fit");
     throw NumericalError("no restart reached a finite likelihood: check the bounds of the estimated parameters and the noise");
   }
   FitReport report;
@@ -365,7 +366,9 @@ Fit fit(const Prior& prior, const std::vector<Observations>& observations, const
   report.n_escapes = training.n_escapes();
   report.uncertainty = training.uncertainty();
   report.restarts = training.reports();
-  Posterior posterior(prior, observations, model_values(prior, observations, report.hyperparameters));
+  ModelValues values = model_values(prior, observations, report.hyperparameters);
+  Posterior posterior =
+      interrupted ? Posterior::lazy(prior, observations, std::move(values)) : Posterior(prior, observations, std::move(values));
   report.seconds = std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
   return {std::move(posterior), std::move(report)};
 }

@@ -31,7 +31,7 @@ class Minimisation {
     best_ = {.x = x, .gradient = VectorXd::Zero(x.size())};
     if (!evaluate_objective(best_)) {
       best_.value = std::numeric_limits<double>::infinity();
-      result_.termination = "no finite value at the start";
+      result_.termination = options_.stop() ? "stopped on request" : "no finite value at the start";
       return false;
     }
     if (options_.max_iterations == 0 || x.size() == 0) {
@@ -44,6 +44,7 @@ class Minimisation {
   bool evaluate(Point& trial) {
     if (options_.stop()) return stop_on_request();
     if (!evaluate_objective(trial)) {
+      if (options_.stop()) return stop_on_request();
       ++result_.failed_evaluations;
       failed_in_search_ = is_at_edge_ = true;
       turn_back(trial);

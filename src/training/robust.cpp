@@ -10,6 +10,7 @@
 
 #include <fmt/format.h>
 
+#include "base/parallel.hpp"
 #include "gp2/error.hpp"
 #include "inference/requirements.hpp"
 
@@ -126,7 +127,9 @@ class Search {
   /// Fits until the choice stays. Stopped on request, the best is that so far.
   void run(Choice choice, std::vector<Hyperparameter> start, const FitOptions& options) {
     for (int round = 0; round < robust_.max_rounds && (!best_ || !stopped()); ++round) {
-      Fit fitted = fit(prior_, choice.observations, start, options);
+      std::optional<Fit> next_fit = fit_unless_stopped(choice, start, options);
+      if (!next_fit) break;
+      Fit& fitted = *next_fit;
       start = fitted.report.hyperparameters;
       std::optional<Choice> next;
       if (!stopped()) next = choose(observations_, fitted.posterior, robust_.threshold);
@@ -148,7 +151,17 @@ class Search {
   void forget_cost() { lowest_cost_ = std::numeric_limits<double>::infinity(); }
 
  private:
-  [[nodiscard]] bool stopped() const { return options_.stop != nullptr && options_.stop->load(); }
+  [[nodiscard]] bool stopped() const { return is_set(options_.stop); }
+  /// Nothing where it is stopped before it has anything and there is a best already.
+  [[nodiscard]] std::optional<Fit> fit_unless_stopped(const Choice& choice, const std::vector<Hyperparameter>& start,
+                                                      const FitOptions& options) const {
+    try {
+      return fit(prior_, choice.observations, start, options);
+    } catch (const NumericalError&) {
+      if (!best_ || !stopped()) throw;
+      return std::nullopt;
+    }
+  }
   // what distrusting a value at the threshold lowers the objective by: ½ (z² − 1 − log z²)
   [[nodiscard]] double price() const {
     const double square = robust_.threshold * robust_.threshold;

@@ -26,8 +26,12 @@ MatrixXd side_by_side(const std::vector<MatrixXd>& parts) {
   return all;
 }
 
-// a spread that bounds and starting points can be multiples of, even where the data do not vary
-double usable(double spread, double fallback) { return spread > 0 && std::isfinite(spread) ? spread : fallback; }
+// a spread that bounds and starting points can be multiples of, even where the data do not vary; a smaller one has no square, and
+// at last no reciprocal, among the doubles
+double usable(double spread, double fallback) {
+  constexpr double least = 1e-150;
+  return spread >= least && std::isfinite(spread) ? spread : fallback;
+}
 
 // of what is measured
 VectorXd size_of_rows(const Eigen::Ref<const MatrixXd>& values) {

@@ -91,6 +91,23 @@ TEST_F(FitCommand, IsRefusedUnderALimitOfMemoryInsteadOfWaitingForEver) {
       << outcome.err;
 }
 
+TEST_F(FitCommand, LeavesAFileThatNoCommandReadsForEverUnderALimitOfMemory) {
+#if defined(__SANITIZE_ADDRESS__) || defined(__SANITIZE_THREAD__)
+  GTEST_SKIP() << "a sanitizer maps more than any limit";
+#endif
+  const std::string limited = "ulimit -v 300000; export OPENBLAS_NUM_THREADS=2; ";
+  if (desk.run(limited + "gp2 --version").status != 0) GTEST_SKIP() << "the command does not load within this limit here";
+  desk.done("gp2 fit models/surface.toml --data train.csv --max-iterations 0 -o limited.json");
+  for (const char* command :
+       {"predict limited.json --states train.csv --cov std -o out.csv", "evaluate limited.json --data train.csv",
+        "simulate limited.json --start q1=0.4,q2=0.8 --t-end 1 -o out.csv", "report limited.json -o out.html",
+        "check models/surface.toml --data train.csv"}) {
+    const Outcome outcome = desk.run(limited + "timeout -s KILL 60 gp2 " + command);
+    const bool refused = outcome.status == 2 && outcome.said("OpenBLAS needs a buffer of 134 MB, which the system does not give");
+    EXPECT_TRUE(refused || outcome.status == 0) << command << ": " << outcome.status << ", " << outcome.err;
+  }
+}
+
 TEST_F(FitCommand, TellsWhatItWasAskedAndTheFileDoesToo) {
   const nlohmann::json report = short_fit("--mean force --observe ddq1,ddq3 --noise-std 0.2 --seed 7 --estimate none");
   const nlohmann::json expected = {{"discrepancy", "default"},

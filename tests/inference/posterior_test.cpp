@@ -46,6 +46,20 @@ TEST(PosteriorTest, IsTheTextbookGaussianProcess) {
   }
 }
 
+TEST(PosteriorTest, ALazyOneIsTheSameToTheBitAndConditionedWhenAsked) {
+  for (const Problem& p : test::problems(3, seed)) {
+    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, seed));
+    const Posterior eager(p.prior, p.observations, p.values), lazy = Posterior::lazy(p.prior, p.observations, p.values);
+    EXPECT_EQ(lazy.observations().size(), p.observations.size());
+    const View view = View::all(Quantity::constrained_acceleration, *p.prior.system);
+    EXPECT_EQ(lazy.mean(view, p.queries), eager.mean(view, p.queries));
+    EXPECT_EQ(lazy.negative_log_likelihood(), eager.negative_log_likelihood());
+    const Posterior fresh = Posterior::lazy(p.prior, p.observations, p.values);
+    const Posterior updated = update(Posterior(fresh), p.observations[0]), same = update(Posterior(eager), p.observations[0]);
+    EXPECT_EQ(updated.mean(view, p.queries), same.mean(view, p.queries));
+  }
+}
+
 TEST(PosteriorTest, TheLatentsAddUpToTheWhole) {
   for (const Problem& p : test::problems(9, posterior_seed)) {
     SCOPED_TRACE(fmt::format("{}, seed {}", p.name, posterior_seed));

@@ -1,8 +1,11 @@
-// Faults put into sound logs of every model on purpose: the share that check or fit names, and false alarms on sound logs.
+// Faults put into sound logs of every model on purpose: the share that check, fit or report names, and false alarms on sound logs.
+#include <cstdlib>
 #include <functional>
 #include <iostream>
 #include <map>
+#include <memory>
 #include <numbers>
+#include <regex>
 
 #include <fmt/format.h>
 #include <gmock/gmock.h>
@@ -11,6 +14,8 @@
 #include "gp2/error.hpp"
 #include "gp2/jobs/check_job.hpp"
 #include "gp2/jobs/fit_job.hpp"
+#include "gp2/jobs/report_job.hpp"
+#include "io_testing.hpp"
 #include "jobs/data_of_model.hpp"
 #include "test_models.hpp"
 
@@ -20,19 +25,30 @@ namespace {
 using Eigen::Index;
 using Eigen::MatrixXd;
 using Eigen::RowVectorXd;
+using Eigen::VectorXd;
 using test::LogData;
 
 bool is_alarm(const std::string& text) {
   // what a sound log may be told too
-  for (const char* known : {"dependent columns", "not in the log", "constraints: none", "rank", "are off the constraint",
-                            "a row of A vanishes", "states off", "did not converge", "at its bound", "restart", "standard errors",
-                            "do not determine", "known force", "Coriolis"}) {
+  for (const char* known :
+       {"dependent columns", "not in the log", "constraints: none", "rank", "are off the constraint", "a row of A vanishes",
+        "states off", "did not converge", "at its bound", "restart", "standard errors", "do not determine", "known force"}) {
     if (text.find(known) != std::string::npos) return false;
   }
   return true;
 }
 
-// what check and fit say against a log: warnings, errors, refusals
+// The page that gp2 report would write of a fit.
+std::vector<Advice> advice_on(const FitOutcome& fit) {
+  const test::TemporaryFolder folder;
+  ReportOptions options;
+  options.fit = folder / "fit.json";
+  fit.file.write(options.fit);
+  std::vector<std::string> notes;
+  return learning_advice(collect_report(options, notes));
+}
+
+// what check, fit and report say against a log: warnings, errors, refusals
 std::vector<std::string> alarms_of(const LogData& data) {
   std::vector<std::string> alarms;
   const auto add = [&](const std::string& text) {
@@ -56,8 +72,12 @@ std::vector<std::string> alarms_of(const LogData& data) {
     for (const std::string& note : job.notes) {
       if (note.starts_with("warning")) add(note);
     }
-    for (const std::string& note : run_fit(job).notes) {
+    const FitOutcome fit = run_fit(job);
+    for (const std::string& note : fit.notes) {
       if (note.starts_with("warning")) add(note);
+    }
+    for (const Advice& advice : advice_on(fit)) {
+      if (advice.level == Advice::Level::warning) add("report: " + advice.text);
     }
   } catch (const InputError& error) {
     alarms.push_back(error.what());
@@ -87,6 +107,71 @@ int constrained_coordinate(const LogData& data, int seed) {
     if (size > 1e-3) found.push_back(j);
   }
   return found.empty() ? -1 : found[static_cast<std::size_t>(seed) % found.size()];
+}
+
+// Another model in the place of the one that made the log; kept as long as the program runs.
+void believe(LogData& data, const std::string& text) {
+  static std::vector<std::unique_ptr<const Model>> believed;
+  believed.push_back(std::make_unique<const Model>(Model::parse(text, data.model->name)));
+  data.model = believed.back().get();
+}
+
+// The text of a model with one of its [parameters] larger by a tenth, or smaller where bounds forbid it; empty where it has none of
+// that name as a number.
+std::string with_wrong_constant(const Model& model, const std::string& parameter) {
+  const std::regex line("\n" + parameter + R"(( *= *(?:\{ *value *= *)?)([0-9.eE+-]+))");
+  std::smatch match;
+  if (!std::regex_search(model.text, match, line)) return "";
+  for (const double factor : {1.1, 0.9}) {
+    const std::string text = fmt::format("{}\n{}{}{}{}", match.prefix().str(), parameter, match[1].str(),
+                                         factor * std::stod(match[2].str()), match.suffix().str());
+    try {
+      static_cast<void>(Model::parse(text, model.name));
+      return text;
+    } catch (const InputError&) {
+      continue;
+    }
+  }
+  return "";
+}
+
+// Whether a parameter is one of the constraint: c, A or b change with it.
+bool is_of_constraint(const LogData& data, int parameter) {
+  const System& system = *data.model->system;
+  VectorXd changed = system.parameter_values();
+  changed[parameter] *= 1.1;
+  const SystemValues here = system.evaluate(data.states, system.parameter_values()),
+                     there = system.evaluate(data.states, changed);
+  const MatrixXd c = system.residuals(data.states, system.parameter_values()), moved = system.residuals(data.states, changed);
+  return !here.constraint_matrix.isApprox(there.constraint_matrix, 1e-9) ||
+         !here.constraint_vector.isApprox(there.constraint_vector, 1e-9) || (c - moved).cwiseAbs().maxCoeff() > 1e-9;
+}
+
+bool spoil_constraint_constant(LogData& data, int seed) {
+  std::vector<std::string> wrong;
+  const std::vector<Parameter>& parameters = data.model->system->parameters();
+  for (int k = 0; k < static_cast<int>(parameters.size()); ++k) {
+    if (!is_of_constraint(data, k)) continue;
+    const std::string text = with_wrong_constant(*data.model, parameters[static_cast<std::size_t>(k)].name);
+    if (!text.empty()) wrong.push_back(text);
+  }
+  if (wrong.empty()) return false;
+  believe(data, wrong[static_cast<std::size_t>(seed) % wrong.size()]);
+  return true;
+}
+
+// The Coriolis and centrifugal parts of forces, as the models write them.
+bool leave_out_coriolis(LogData& data, int) {
+  static const std::vector<std::string> parts = {" + beta*sin(elbow)*(2*dshoulder*delbow + delbow^2)",
+                                                 " - beta*sin(elbow)*dshoulder^2", " + m*R*dq3^2*cos(q3)",
+                                                 " + m*R*dq3^2*sin(q3)"};
+  std::string text = data.model->text;
+  for (const std::string& part : parts) {
+    if (const std::size_t at = text.find(part); at != std::string::npos) text.erase(at, part.size());
+  }
+  if (text == data.model->text) return false;
+  believe(data, text);
+  return true;
 }
 
 template <typename Row>
@@ -170,6 +255,8 @@ const std::vector<Fault>& faults() {
          return true;
        },
        true},
+      {"wrong constraint constant", spoil_constraint_constant},
+      {"missing Coriolis", leave_out_coriolis},
       {"stuck channel",
        [](LogData& data, int seed) {
          const int j = constrained_coordinate(data, seed);
@@ -185,11 +272,14 @@ LogData generated_log_of(const std::string& file, bool in_time, std::uint64_t se
 }
 
 TEST(FaultSweep, FaultsAreNamedAndSoundLogsAreNot) {
-  constexpr int n_seeds = 2;
+  const char* const first_seed = std::getenv("GP2_SWEEP_FIRST_SEED");
+  const char* const number_of_seeds = std::getenv("GP2_SWEEP_SEEDS");
+  const int first = first_seed == nullptr ? 1 : std::atoi(first_seed);
+  const int n_seeds = number_of_seeds == nullptr ? 2 : std::atoi(number_of_seeds);
   int n_named = 0, n_faults = 0, n_false = 0, n_sound = 0;
   std::map<std::string, std::pair<int, int>> by_fault;
   for (const std::string& file : test::library_models()) {
-    for (int seed = 1; seed <= n_seeds; ++seed) {
+    for (int seed = first; seed < first + n_seeds; ++seed) {
       for (const bool in_time : {false, true}) {
         const std::vector<std::string> alarms = alarms_of(generated_log_of(file, in_time, static_cast<std::uint64_t>(seed)));
         ++n_sound;

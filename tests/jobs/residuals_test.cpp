@@ -4,6 +4,7 @@
 
 #include "gp2/jobs/check_job.hpp"
 #include "gp2/jobs/fit_job.hpp"
+#include "gp2/jobs/predict_job.hpp"
 #include "gp2/simulation/generate.hpp"
 #include "jobs/data_of_model.hpp"
 #include "test_models.hpp"
@@ -67,6 +68,21 @@ TEST(Residuals, TellOfGravityLeftInASensor) {
   const std::vector<std::string> notes = notes_of_fit(data);
   EXPECT_THAT(notes, Contains(testing::AllOf(testing::StartsWith("warning: "), HasSubstr(of_constraint), HasSubstr("gravity"))));
   EXPECT_THAT(notes, Contains(testing::AllOf(HasSubstr(of_fit), HasSubstr("ddq3"))));
+}
+
+TEST(Residuals, OfATestLogAreTold) {
+  FitRequest request;
+  request.model = *data_of("models/surface.toml", 16).model;
+  request.logs = {{data_of("models/surface.toml", 16).table()}};
+  request.restarts = 1;
+  request.max_iterations = 5;
+  const FitOutcome fit = run_fit(prepare_fit(std::move(request)));
+  Data data = data_of("models/surface.toml", 17);
+  EXPECT_THAT(evaluate(fit.file, fit.posterior, data.table(), {}).notes, Not(Contains(HasSubstr(of_constraint))));
+  data.accelerations.row(2).array() += 9.81;
+  EXPECT_THAT(
+      evaluate(fit.file, fit.posterior, data.table(), {}).notes,
+      Contains(testing::AllOf(testing::StartsWith("warning: log.csv: "), HasSubstr(of_constraint), HasSubstr("gravity"))));
 }
 
 TEST(Residuals, TellOfAColumnInAnotherUnit) {

@@ -59,6 +59,30 @@ TEST(Check, ConstraintsThatAreNotThereOrLeaveNoFreedomAreToldOf) {
   EXPECT_EQ(said("[constraints]\nacceleration = ['ddz - x*ddx']"), "");
 }
 
+TEST(Check, CoriolisForcesThatAreMissingAreFoundBesideFriction) {
+  // two links, h = k sin(b − a)
+  const auto is_told = [](const std::string& force) {
+    const Model model = Model::parse(
+        "coordinates = ['a', 'b']\n[parameters]\nk = 0.7\n[mechanics]\nmass = [['3', 'k*cos(b - a)'], ['k*cos(b - a)', '1']]\n" +
+            force,
+        "arm");
+    MatrixXd states = MatrixXd::Random(5, 20);
+    bool told = false, told_at_rest = false;
+    for (bool* const one : {&told, &told_at_rest}) {
+      for (const Finding& finding : check_system(*model.system, states, model.system->parameter_values())) {
+        *one = *one || finding.text.find("centrifugal forces are missing") != std::string::npos;
+      }
+      states.middleRows(2, 2).setZero();
+    }
+    EXPECT_EQ(told, told_at_rest) << force;
+    return told;
+  };
+  EXPECT_TRUE(is_told("force = ['-a', '0']"));
+  EXPECT_TRUE(is_told("force = ['-a - 0.1*da - 0.2*da*abs(da)', '-tanh(db)']"));
+  EXPECT_FALSE(is_told("force = ['-a - 0.1*da', '-tanh(db)']\ncoriolis = true"));
+  EXPECT_FALSE(is_told("force = ['k*sin(b - a)*db^2 - 0.1*da', '-k*sin(b - a)*da^2']"));
+}
+
 TEST(Check, AWrongBIsFound) {
   const Model model = bead();
   CallableSystem::Definition wrong;

@@ -453,6 +453,18 @@ std::vector<Complaint> complaints() {
       {"ForceOfTheWrongLength", base + "force = [\"0\"]\n", "7: mechanics.force: expected 2 entries, one per coordinate, got 1"},
       {"ForceOfAnAcceleration", base + "force = [\"0\", \"ddq1\"]\n",
        "7: mechanics.force entry 2: a force may not depend on accelerations, but this entry depends on 'ddq1'"},
+      // what may not stand there is not listed as known
+      {"ForceOfAnUnknownSymbol", base + "force = [\"0\", \"friction*dq1\"]\n",
+       "7: mechanics.force entry 2: \"friction*dq1\", column 1: unknown symbol 'friction'; known here: q1, q2, dq1, dq2, t, u1, "
+       "m"},
+      {"MassOfAnUnknownSymbol", with_mass("[[\"inertia\", \"0\"], [\"0\", \"1\"]]"),
+       "6: mechanics.mass row 1 column 1: \"inertia\", column 1: unknown symbol 'inertia'; known here: q1, q2, t, m"},
+      {"ForceOfAnUnknownSymbolBesideALet",
+       base + "force = [\"0\", \"friction\"]\n[let]\njerk = \"2*ddq1\"\nspeed = \"abs(dq1)\"\n",
+       "7: mechanics.force entry 2: \"friction\", column 1: unknown symbol 'friction'; known here: q1, q2, dq1, dq2, t, u1, m, "
+       "speed"},
+      {"PositionOfAnUnknownSymbol", base + "[constraints]\nposition = [\"q1 - width\"]\n",
+       "8: constraints.position entry 1: \"q1 - width\", column 6: unknown symbol 'width'; known here: q1, q2, t, m"},
       // constraints
       {"ConstraintsWithAnUnknownLevel", base + "[constraints]\nspeed = [\"dq1\"]\n",
        "8: constraints.speed: unknown key; known here: position, velocity, acceleration"},

@@ -169,6 +169,15 @@ TEST(SimulateDryFriction, BringsABodyToRestAndHoldsItThere) {
   }
 }
 
+TEST(SimulateDryFriction, OfAVelocityOverItsSizeIsThatOfItsSign) {
+  const Model sign = bodies({"x"}, {"-x - 0.3*sign(dx)"}), size = bodies({"x"}, {"-x - 0.3*dx/abs(dx)"});
+  const SimulateOptions options = with_tolerance(times(20, 201), 1e-9);
+  const Trajectory of_sign = simulate_switching(sign, state_of(sign, {{"x", 1}}), options);
+  const Trajectory of_size = simulate_switching(size, state_of(size, {{"x", 1}}), options);
+  EXPECT_LT((of_sign.states - of_size.states).cwiseAbs().maxCoeff(), 1e-8);
+  EXPECT_LT(of_size.steps + of_size.rejected_steps, 500);
+}
+
 TEST(SimulateDryFriction, ASpringPullsABodyToWhereItSticks) {
   // half swings about ±μ/k, each shorter by 2 μ/k: 1, −0.4, −0.2, which is within ±0.3
   const Model model = bodies({"x"}, {"-x - 0.3*sign(dx)"});
@@ -240,6 +249,32 @@ TEST(SimulateDryFriction, BringsAMechanismOfRedundantConstraintsToRest) {
   EXPECT_LT(out.states.col(100).segment(3, 3).cwiseAbs().maxCoeff(), 1e-9);
   EXPECT_LT(out.accelerations.col(100).cwiseAbs().maxCoeff(), 1e-6);
   EXPECT_LT(out.steps, nearly.steps);
+}
+
+TEST(SimulateDryFriction, AMechanismStopsWhereverItIsNearADeadCentreToo) {
+  std::string text = test::model("models/slider_crank.toml").text;
+  const std::string smooth = "tanh(20*dq3)";
+  const Model dry = Model::parse(text.replace(text.find(smooth), smooth.size(), "sign(dq3)"), "slider_crank.toml");
+  for (const double q1 : {0.0, 0.001, 0.3, 1.0, 3.1, 3.141592653589793, 6.2}) {
+    for (const double dq1 : {-2.0, 0.01, 0.5, 3.0}) {
+      SCOPED_TRACE(fmt::format("q1 = {}, dq1 = {}", q1, dq1));
+      SimulateOptions options = with_tolerance(times(3, 101), 1e-9);
+      options.max_steps = 5000;
+      const double q2 = -std::asin(std::sin(q1) / 3), q3 = 0.1 * std::cos(q1) + 0.3 * std::cos(q2);
+      const VectorXd start = solved_state(dry, {{"q1", q1}, {"q2", q2}, {"q3", q3}, {"dq1", dq1}});
+      const Trajectory out = simulate_switching(dry, start, options);
+      EXPECT_LT(out.steps + out.rejected_steps, 1000);
+      // friction takes energy, and does not give any
+      const SystemValues values = dry.system->evaluate(out.states, dry.system->parameter_values());
+      double before = std::numeric_limits<double>::infinity();
+      for (int i = 0; i < values.n_states(); ++i) {
+        const auto dq = out.states.col(i).segment(3, 3);
+        const double energy = 0.5 * dq.dot(values.M(i) * dq);
+        EXPECT_LE(energy, before * (1 + 1e-6) + 1e-15) << i;
+        before = energy;
+      }
+    }
+  }
 }
 
 TEST(SimulateDryFriction, IsFoundInForcesTruthAndLatents) {

@@ -1,4 +1,6 @@
 #include <atomic>
+#include <chrono>
+#include <thread>
 
 #include <gmock/gmock.h>
 #include <gtest/gtest.h>
@@ -310,10 +312,16 @@ TEST(FitTest, EndsWithTheEvaluationUnderWayWhereverItIsAskedToStop) {
     prior.system = counting_surface(n_calls, stop_at, stop);
     FitOptions options = quick();
     options.stop = &stop;
-    const FitReport report = (robust ? fit_robust(prior, p.observations, p.hyperparameters, options)
-                                     : fit(prior, p.observations, p.hyperparameters, options))
-                                 .report;
-    EXPECT_TRUE(report.termination == FitReport::interrupted || stop_at < 0) << stop_at;
+    constexpr int of_first_evaluation = 8;  // those of the scales of the parameters before it
+    try {
+      const FitReport report = (robust ? fit_robust(prior, p.observations, p.hyperparameters, options)
+                                       : fit(prior, p.observations, p.hyperparameters, options))
+                                   .report;
+      EXPECT_TRUE(report.termination == FitReport::interrupted || stop_at < 0) << stop_at;
+    } catch (const NumericalError& error) {
+      EXPECT_LE(stop_at, of_first_evaluation) << error.what();
+      EXPECT_STREQ(error.what(), "stopped before the likelihood was evaluated once: there is no fit");
+    }
     return n_calls.load();
   };
   for (const bool robust : {false, true}) {
@@ -323,6 +331,29 @@ TEST(FitTest, EndsWithTheEvaluationUnderWayWhereverItIsAskedToStop) {
       EXPECT_LE(n_evaluations(stop_at, robust), stop_at + 3) << stop_at << " of " << all;
     }
   }
+}
+
+TEST(FitTest, ALargeOneIsStoppedWithinItsFirstEvaluation) {
+  const Problem p = problem("models/surface.toml", 3500);  // 7000 reduced rows: a minute of one core
+  std::atomic<bool> stop = false;
+  FitOptions options = quick();
+  options.n_restarts = 1;
+  options.stop = &stop;
+  std::chrono::steady_clock::time_point asked;
+  std::jthread asking([&] {
+    std::this_thread::sleep_for(std::chrono::seconds(3));
+    asked = std::chrono::steady_clock::now();
+    stop = true;
+  });
+  try {
+    static_cast<void>(fit(p.prior, p.observations, p.hyperparameters, options));
+    FAIL() << "it was not stopped";
+  } catch (const NumericalError& error) {
+    EXPECT_STREQ(error.what(), "stopped before the likelihood was evaluated once: there is no fit");
+  }
+  asking.join();
+  const double seconds = std::chrono::duration<double>(std::chrono::steady_clock::now() - asked).count();
+  EXPECT_LT(seconds, 20) << "a second or two on a core of its own";
 }
 
 TEST(FitTest, TellsItsProgressOneCallAtATime) {

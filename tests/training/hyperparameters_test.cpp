@@ -350,6 +350,24 @@ TEST(HyperparametersTest, AFeatureThatDoesNotVaryStillHasAScale) {
   EXPECT_EQ(scales.feature_stddev[0][7], 3);
 }
 
+TEST(HyperparametersTest, AFeatureTooSmallForItsSquareIsFittedLikeOneThatIsZero) {
+  const Model& model = test::model("models/surface.toml");
+  std::vector<Observations> observations = observe(model, 12, false);
+  MatrixXd states = observations[0].states();
+  FitOptions options;
+  options.n_restarts = 1;
+  options.max_iterations = 3;
+  const auto fitted = [&](double constant) {
+    states.row(model.system->layout().u(1)).setConstant(constant);
+    observations[0] = test::with_states(observations[0], states);
+    const Prior prior = make_prior(model);
+    return fit(prior, observations, default_hyperparameters(prior, observations, {}, {}), options).report.objective;
+  };
+  const double of_zero = fitted(0);
+  EXPECT_EQ(fitted(1e-310), of_zero);
+  EXPECT_EQ(fitted(-3e-200), of_zero);
+}
+
 TEST(HyperparametersTest, ModelValuesPutEachNumberInItsPlace) {
   const Model& model = test::model("models/arm_on_moving_plane.toml");
   const Prior prior = make_prior(model);

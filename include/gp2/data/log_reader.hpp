@@ -52,6 +52,7 @@ class LogReader {
  private:
   [[nodiscard]] int find(const std::string& name) const;
   [[nodiscard]] int require(const std::string& name);
+  [[nodiscard]] const char* mend_for_missing(const std::string& name) const;
   using Number = double (CsvTable::*)(int row, int column) const;
   [[nodiscard]] Eigen::MatrixXd read_states(const std::vector<bool>& reads, Number number);
 

@@ -77,6 +77,18 @@ struct TrainingResidual {
 /// One for each row of each observation of ddq. Costs a factorisation and an inverse.
 std::vector<TrainingResidual> training_residuals(const Posterior& posterior);
 
+/// Measured accelerations against A ddq = b under the fitted parameters.
+/// @param rows          of ddq that are measured
+/// @param measured      (rows × N); NaN: not measured
+/// @param other_system  as EvaluationOptions
+/// @param noise_stddev  of what is measured (rows × N); NaN: not known
+std::vector<ConstraintResidual> constraint_residuals(const Posterior& posterior,
+                                                     const std::shared_ptr<const OtherSystem>& other_system,
+                                                     const Eigen::Ref<const Eigen::MatrixXd>& states,
+                                                     const std::vector<int>& rows,
+                                                     const Eigen::Ref<const Eigen::MatrixXd>& measured,
+                                                     const Eigen::Ref<const Eigen::MatrixXd>& noise_stddev);
+
 /// The observations of a group, of ddq, against A ddq = b under the fitted parameters and noise.
 std::vector<ConstraintResidual> constraint_residuals(const Posterior& posterior, std::size_t group);
 

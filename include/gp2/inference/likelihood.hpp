@@ -1,5 +1,6 @@
 #pragma once
 
+#include <atomic>
 #include <memory>
 #include <optional>
 #include <vector>
@@ -41,7 +42,8 @@ class Likelihood {
    public:
     /// @param n_threads  that one evaluation may use, where there are samples enough for it to pay. The sums keep their order
     ///                   whatever it is; a factorisation of more than 2000 rows on several threads is rounded differently.
-    explicit Workspace(int n_threads = 1);
+    /// @param stop       set: `evaluate` gives up within a second or so and returns +∞
+    explicit Workspace(int n_threads = 1, const std::atomic<bool>* stop = nullptr);
     ~Workspace();
 
    private:
@@ -50,7 +52,8 @@ class Likelihood {
     std::unique_ptr<Implementation> implementation_;
   };
 
-  /// −log p(y | values): +∞ where the mechanics or the prior have a fault (evaluate_mechanics, evaluate_prior) or the factorisation fails.
+  /// −log p(y | values): +∞ where the mechanics or the prior have a fault (evaluate_mechanics, evaluate_prior) or the factorisation fails,
+  /// and where the workspace is told to stop.
   ///
   /// @param gradient  when not null, receives the gradient: zero in a fixed kernel, and where the options do not ask for the noise
   ///                  or a parameter. Left as it was when the value is +∞.
