@@ -23,22 +23,22 @@ using Eigen::MatrixXd;
 using Eigen::VectorXd;
 
 /// Samples of a motion, measured with noise.
-struct Motion {
+struct ArmMotion {
   GeneratedData measured;
   MatrixXd truth;  // (nq × N)
 
-  [[nodiscard]] Motion only(const std::vector<int>& samples) const {
+  [[nodiscard]] ArmMotion only(const std::vector<int>& samples) const {
     return {{measured.states(Eigen::all, samples), measured.accelerations(Eigen::all, samples), measured.known},
             truth(Eigen::all, samples)};
   }
 };
 
-Motion motion_of(const Model& model, const Section& section) {
+ArmMotion motion_of(const Model& model, const Section& section) {
   GenerateOptions options;
   options.n = section.integer("samples");
   options.seed = static_cast<std::uint64_t>(section.integer("seed"));
   options.noise_stddev = Eigen::Map<const VectorXd>(model.noise.stddev.data(), model.system->nq());
-  Motion motion{generate(model, options), {}};
+  ArmMotion motion{generate(model, options), {}};
   motion.truth = true_acceleration(model, motion.measured.states);
   return motion;
 }
@@ -79,7 +79,7 @@ Split split_of(const Section& training, const Section& blocks) {
 }
 
 /// n samples that cover a motion best, each n's among the next one's.
-std::vector<int> informative(const Model& model, const Motion& motion, int n) {
+std::vector<int> informative(const Model& model, const ArmMotion& motion, int n) {
   ResampleOptions options;
   options.n = n;
   return resample(model, as_table(motion.measured, *model.system, model.name), options).rows;
@@ -90,7 +90,7 @@ struct Errors {
   double mean_constraint_error = 0, max_constraint_error = 0;  // of |A ddq − b|
 };
 
-Errors errors_of(const Posterior& posterior, const System& system, const Motion& motion) {
+Errors errors_of(const Posterior& posterior, const System& system, const ArmMotion& motion) {
   const MatrixXd& states = motion.measured.states;
   const MatrixXd prediction = posterior.mean(View::constrained_acceleration(system), states);
   Errors errors;
@@ -187,15 +187,15 @@ void reproduce_arm_on_surface(const ReproduceOptions& options) {
   const std::vector<double> sizes = definition.numbers("n");
   const Section training = definition.section("training"), elsewhere = definition.section("independent");
 
-  const Motion whole = motion_of(model, training);
+  const ArmMotion whole = motion_of(model, training);
   const Split split = split_of(training, definition.section("blocks"));
-  const Motion candidates = whole.only(split.training), blocks = whole.only(split.blocks);
+  const ArmMotion candidates = whole.only(split.training), blocks = whole.only(split.blocks);
   const auto largest = static_cast<int>(*std::max_element(sizes.begin(), sizes.end()));
-  const Motion chosen = candidates.only(informative(model, candidates, largest));
+  const ArmMotion chosen = candidates.only(informative(model, candidates, largest));
   const CsvTable log = as_table(chosen.measured, system, model.name);
 
-  const Motion other = motion_of(model, elsewhere);
-  const Motion independent = other.only(samples_of(elsewhere));
+  const ArmMotion other = motion_of(model, elsewhere);
+  const ArmMotion independent = other.only(samples_of(elsewhere));
 
   Table table;
   std::map<std::string, std::vector<Hyperparameter>> fitted;  // to fewer points, by method
@@ -242,9 +242,9 @@ void reproduce_arm_mass(const ReproduceOptions& options) {
   const Model moving = Model::read(options.experiments / definition.text("truth"));
   const Model model = Model::read(options.experiments / definition.text("model"));
   const Section truth = definition.section("true"), stop = definition.section("stop");
-  const Motion whole = motion_of(moving, definition.section("training"));
-  const Motion candidates = whole.only(samples_of(definition.section("training")));
-  const Motion chosen = candidates.only(informative(moving, candidates, definition.integer("n")));
+  const ArmMotion whole = motion_of(moving, definition.section("training"));
+  const ArmMotion candidates = whole.only(samples_of(definition.section("training")));
+  const ArmMotion chosen = candidates.only(informative(moving, candidates, definition.integer("n")));
   const CsvTable log = as_table(chosen.measured, *moving.system, moving.name);
 
   Table table, correlations;
