@@ -352,7 +352,7 @@ TEST(HyperparametersTest, AFeatureThatDoesNotVaryStillHasAScale) {
 
 TEST(HyperparametersTest, AFeatureTooSmallForItsSquareIsFittedLikeOneThatIsZero) {
   const Model& model = test::model("models/surface.toml");
-  std::vector<Observations> observations = observe(model, 12, false);
+  std::vector<Observations> observations = observe_drawn(model, 12, false);
   MatrixXd states = observations[0].states();
   FitOptions options;
   options.n_restarts = 1;
