@@ -9,7 +9,16 @@
 
 #include <fmt/format.h>
 
+// What messages make of words that somebody wrote.
 namespace gp2 {
+
+/// A text for a message, its end left out where it is long, between two characters of UTF-8.
+inline std::string shortened(std::string_view text, std::size_t max_size = 60) {
+  if (text.size() <= max_size) return std::string(text);
+  std::size_t end = max_size - 3;
+  while (end > 0 && (static_cast<unsigned char>(text[end]) & 0xC0U) == 0x80U) --end;
+  return std::string(text.substr(0, end)) + "...";
+}
 
 /// Levenshtein distance: the least number of characters inserted, removed or changed between a and b.
 inline std::size_t edit_distance(std::string_view a, std::string_view b) {

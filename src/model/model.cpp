@@ -101,20 +101,30 @@ void Model::define(const std::string& symbol, Expression value) {
 }
 
 Expression Model::parse_symbols(std::string_view written, const std::vector<Expression>& forbidden) const {
-  std::vector<std::string> known;
-  for (const std::string& name : symbol_names_) {
-    const Expression value = symbols_.find(name)->second;
-    const auto is_read = [&](const Expression& one) { return graph->depends_on(value, one); };
-    if (std::none_of(forbidden.begin(), forbidden.end(), is_read)) known.push_back(name);
+  bool is_unknown = false;
+  const auto resolve = [&](std::string_view symbol) -> std::optional<Expression> {
+    if (const auto found = symbols_.find(symbol); found != symbols_.end()) return found->second;
+    const std::optional<Expression> of_robot =
+        robot_expressions_ ? robot_expressions_->variable(std::string(symbol)) : std::nullopt;
+    is_unknown = !of_robot;
+    return of_robot;
+  };
+  constexpr std::size_t most_listed = 1000;  // nobody reads more
+  const bool has_many = symbol_names_.size() > most_listed;
+  if (forbidden.empty() || has_many) return parse_expression(written, *graph, resolve, symbol_names_);
+  try {
+    return parse_expression(written, *graph, resolve, {});
+  } catch (const InputError&) {
+    if (!is_unknown) throw;
   }
-  return parse_expression(
-      written, *graph,
-      [&](std::string_view symbol) -> std::optional<Expression> {
-        const auto found = symbols_.find(symbol);
-        if (found != symbols_.end()) return found->second;
-        return robot_expressions_ ? robot_expressions_->variable(std::string(symbol)) : std::nullopt;
-      },
-      known);
+  // again, now that there is need of the names that may stand there
+  std::vector<std::string> allowed;
+  for (const std::string& symbol : symbol_names_) {
+    const Expression value = symbols_.find(symbol)->second;
+    const auto is_read = [&](const Expression& one) { return graph->depends_on(value, one); };
+    if (std::none_of(forbidden.begin(), forbidden.end(), is_read)) allowed.push_back(symbol);
+  }
+  return parse_expression(written, *graph, resolve, allowed);
 }
 
 Expression Model::expression(std::string_view written) const {

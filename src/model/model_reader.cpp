@@ -10,6 +10,7 @@
 #include <fmt/ranges.h>
 
 #include "base/random.hpp"
+#include "base/suggestion.hpp"
 #include "gp2/error.hpp"
 #include "model/name_order.hpp"
 #include "model/toml_reader.hpp"

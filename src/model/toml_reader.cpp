@@ -8,16 +8,11 @@
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
+#include "base/suggestion.hpp"
+
 namespace gp2 {
 
 int line_of(const toml::node& node) { return static_cast<int>(node.source().begin.line); }
-
-std::string shortened(const std::string& text, std::size_t max_size) {
-  if (text.size() <= max_size) return text;
-  std::size_t end = max_size - 3;
-  while (end > 0 && (static_cast<unsigned char>(text[end]) & 0xC0U) == 0x80U) --end;
-  return text.substr(0, end) + "...";
-}
 
 void require_safe(std::string_view text, const std::string& file_name) {
   constexpr int max_depth = 32, max_dots = 16;

@@ -29,9 +29,6 @@ int line_of(const toml::node& node);
 /// A value as the file has it, to show what was got; at most 60 bytes.
 std::string written(const toml::node& node);
 
-/// At most so many bytes of a text, cut between characters.
-std::string shortened(const std::string& text, std::size_t max_size = 60);
-
 /// Typed access to the nodes of a TOML file; what does not fit is an error "FILE:LINE: KEY: what was expected, what was got".
 class TomlReader {
  public:

@@ -10,6 +10,7 @@
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
+#include "base/suggestion.hpp"
 #include "gp2/error.hpp"
 #include "prior/kernel_columns.hpp"
 #include "prior/primitive.hpp"
@@ -41,8 +42,8 @@ Primitive primitive_of(std::string_view name, std::string_view text) {
   constexpr std::pair<std::string_view, std::string_view> others[] = {
       {"rbf", "se"}, {"gaussian", "se"}, {"squaredexponential", "se"}, {"matern", "matern52"}, {"rationalquadratic", "rq"}};
   const auto other = std::find_if(std::begin(others), std::end(others), [&](const auto& one) { return one.first == name; });
-  throw InputError(fmt::format("kernel \"{}\": unknown kernel '{}'{}; use sums and products of {}", text, name,
-                               other == std::end(others) ? "" : fmt::format(", here called {}", other->second),
+  throw InputError(fmt::format("kernel \"{}\": unknown kernel '{}'{}; use sums and products of {}", shortened(text),
+                               shortened(name), other == std::end(others) ? "" : fmt::format(", here called {}", other->second),
                                fmt::join(known, " ")));
 }
 
@@ -68,7 +69,7 @@ class KernelText {
   static constexpr int max_depth = 100;
 
   [[noreturn]] void fail(std::size_t position, const std::string& what) const {
-    throw InputError(fmt::format("kernel \"{}\", column {}: {}", text_, position + 1, what));
+    throw InputError(fmt::format("kernel \"{}\", column {}: {}", shortened(text_), position + 1, what));
   }
 
   [[nodiscard]] char peek() {

@@ -139,19 +139,19 @@ class Parser {
     position_ = static_cast<std::size_t>(end - text_.data());
     const std::string_view written = text_.substr(start, position_ - start);
     if (error == std::errc::result_out_of_range) {
-      fail(start, fmt::format("the number {} does not fit a double (2.2e-308 to 1.8e308 in size)", shortened(written)));
+      fail(start, fmt::format("the number {} does not fit a double (2.2e-308 to 1.8e308 in size)", shortened(written, 40)));
     }
     if (position_ < text_.size() && text_[position_] == '.') {
-      fail(position_, fmt::format("found a second '.' in the number {}.; write one decimal point", shortened(written)));
+      fail(position_, fmt::format("found a second '.' in the number {}.; write one decimal point", shortened(written, 40)));
     }
     // 2q1, 2(q1 + 1): the most common slip
     if (position_ < text_.size() && (is_letter(text_[position_]) || text_[position_] == '(')) {
       std::size_t stop = position_ + 1;
       while (stop < text_.size() && (is_letter(text_[stop]) || is_digit(text_[stop]))) ++stop;
       const std::string right =
-          text_[position_] == '(' ? std::string("(...)") : shortened(text_.substr(position_, stop - position_));
+          text_[position_] == '(' ? std::string("(...)") : shortened(text_.substr(position_, stop - position_), 40);
       fail(position_, fmt::format("found '{}' right after a number; a product needs its sign, write {}*{}", right,
-                                  shortened(written), right));
+                                  shortened(written, 40), right));
     }
     skip_space();
     return graph_.constant(value);
@@ -173,7 +173,7 @@ class Parser {
     if (find_function(name) != nullptr) fail(start, fmt::format("the function '{}' has no argument; write {}(...)", name, name));
     std::string mend = suggestion(name, known_names_);
     if (mend.empty()) mend = "; known here: " + (known_names_.empty() ? "none" : joined(known_names_, ", "));
-    fail(start, fmt::format("unknown symbol '{}'{}", shortened(name), mend));
+    fail(start, fmt::format("unknown symbol '{}'{}", shortened(name, 40), mend));
   }
 
   /// A symbol that is no single word, such as site("tip").z or point("link7", 0, 0, 0.1).x, resolved by its text with double
@@ -207,7 +207,7 @@ class Parser {
     } catch (const InputError& error) {
       fail(start, error.what());
     }
-    if (!resolved) fail(start, fmt::format("unknown symbol '{}'; only a model with a robot has points", shortened(symbol)));
+    if (!resolved) fail(start, fmt::format("unknown symbol '{}'; only a model with a robot has points", shortened(symbol, 40)));
     return *resolved;
   }
 
@@ -217,12 +217,12 @@ class Parser {
     if (function == nullptr) {
       if (name == "pi" || resolve_(name)) {
         fail(position_, fmt::format("found '(' right after '{}', which is not a function; a product is written {}*(...)",
-                                    shortened(name), shortened(name)));
+                                    shortened(name, 40), shortened(name, 40)));
       }
       std::vector<std::string_view> names;
       for (const Function& known : functions) names.push_back(known.text);
       const std::string mend = suggestion(name, names);
-      fail(start, fmt::format("unknown function '{}'{} Functions are {}", shortened(name), mend.empty() ? "." : mend,
+      fail(start, fmt::format("unknown function '{}'{} Functions are {}", shortened(name, 40), mend.empty() ? "." : mend,
                               joined(names, " ")));
     }
 
@@ -284,7 +284,7 @@ class Parser {
     if (is_letter(peek()) || is_digit(peek())) {
       std::size_t stop = position_;
       while (stop < text_.size() && (is_letter(text_[stop]) || is_digit(text_[stop]))) ++stop;
-      return fmt::format("'{}'", shortened(text_.substr(position_, stop - position_)));
+      return fmt::format("'{}'", shortened(text_.substr(position_, stop - position_), 40));
     }
     constexpr std::string_view known = "+-*/^().,";
     if (known.find(peek()) != std::string_view::npos) return fmt::format("'{}'", peek());
@@ -312,10 +312,6 @@ class Parser {
     if (byte < 0x20 || byte == 0x7F)
       fail(position_, fmt::format("control character 0x{:02X} has no meaning here; {}", byte, allowed));
     fail(position_, fmt::format("character '{}' has no meaning here; {}", peek(), allowed));
-  }
-
-  static std::string shortened(std::string_view text) {
-    return text.size() <= 40 ? std::string(text) : std::string(text.substr(0, 37)) + "...";
   }
 
   /// Columns count characters, not bytes.

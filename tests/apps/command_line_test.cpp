@@ -75,8 +75,8 @@ TEST(CommandLine, JsonStandsAloneOnStdoutWithTheContractedKeys) {
   }
   const Outcome evaluation = desk.done("gp2 evaluate fit.json --data train.csv --json");
   EXPECT_THAT(keys(evaluation.json()),
-              ElementsAre("coverage95", "coverage95_latent", "max_constraint_error", "max_constraint_error_fitted", "n",
-                          "n_missing", "n_zero_variance", "nlpd", "nlpd_latent", "nrmse", "rmse", "rmse_normalised"));
+              ElementsAre("coverage95", "coverage95_latent", "far", "max_constraint_error", "max_constraint_error_fitted", "n",
+                          "n_missing", "n_zero_variance", "near", "nlpd", "nlpd_latent", "nrmse", "rmse", "rmse_normalised"));
   EXPECT_THAT(keys(evaluation.json()["rmse"]), ElementsAre("ddq1", "ddq2", "ddq3"));
 }
 

@@ -46,7 +46,7 @@ TEST_F(MainJob, PredictsEveryRowInOrderAfterTheInputColumns) {
   desk.done("gp2 predict fit.json --states test.csv -o prediction.csv");
   const CsvTable test = desk.table("test.csv"), prediction = desk.table("prediction.csv");
   EXPECT_THAT(prediction.header(), ElementsAre("q1", "q2", "q3", "dq1", "dq2", "dq3", "u1", "u2", "u3", "ddq1_input",
-                                               "ddq2_input", "ddq3_input", "ddq1", "ddq2", "ddq3"));
+                                               "ddq2_input", "ddq3_input", "ddq1", "ddq2", "ddq3", "distance_from_data"));
   ASSERT_EQ(prediction.n_rows(), test.n_rows());
   for (int i = 0; i < test.n_rows(); ++i) {
     for (int column = 0; column < test.n_columns(); ++column) EXPECT_EQ(prediction.cell(i, column), test.cell(i, column));
@@ -58,7 +58,7 @@ TEST_F(MainJob, WritesTheLibrarysDoublesToTheLastBit) {
   const CsvTable prediction = desk.table("prediction.csv");
   const std::vector<std::string> header(prediction.header().begin() + 12, prediction.header().end());
   EXPECT_THAT(header, ElementsAre("ddq1", "ddq2", "ddq3", "ddq1_std", "ddq2_std", "ddq3_std", "cov_ddq1_ddq1", "cov_ddq1_ddq2",
-                                  "cov_ddq1_ddq3", "cov_ddq2_ddq2", "cov_ddq2_ddq3", "cov_ddq3_ddq3"));
+                                  "cov_ddq1_ddq3", "cov_ddq2_ddq2", "cov_ddq2_ddq3", "cov_ddq3_ddq3", "distance_from_data"));
   const Read in = read("test.csv");
   const View view = View::all(View::Quantity::constrained_acceleration, *in.fit.model.system);
   const Posterior::Marginal expected = in.fit.posterior().marginal(view, in.states);

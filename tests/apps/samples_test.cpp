@@ -40,7 +40,8 @@ TEST_F(PredictSamples, AddAColumnForEachOutputAndSample) {
   for (int s = 1; s <= 2; ++s) {
     for (int k = 1; k <= 3; ++k) expected.push_back(fmt::format("ddq{}_sample{}", k, s));
   }
-  const std::vector<std::string> added(table.header().end() - 12, table.header().end());
+  expected.emplace_back("distance_from_data");
+  const std::vector<std::string> added(table.header().end() - 13, table.header().end());
   EXPECT_THAT(added, ElementsAreArray(expected));
   // the draws stand about the mean, some standard deviations off at most, and are not the mean
   double largest = 0;

@@ -142,7 +142,7 @@ TEST_F(SimulateFit, StaysOnTheConstraintAndWritesItsUncertainty) {
   EXPECT_LE(report["max_velocity_drift"], 1e-12);
   const CsvTable motion = desk.table("motion.csv");
   EXPECT_THAT(motion.header(), ElementsAre("t", "q1", "q2", "q3", "dq1", "dq2", "dq3", "ddq1", "ddq2", "ddq3", "u1", "u2", "u3",
-                                           "lambda1", "ddq1_std", "ddq2_std", "ddq3_std", "energy"));
+                                           "lambda1", "ddq1_std", "ddq2_std", "ddq3_std", "distance_from_data", "energy"));
   EXPECT_GT(number(motion, 50, "ddq1_std"), 0);
   // the same numbers as predict's
   desk.done("gp2 predict fit.json --states motion.csv --cov std -o prediction.csv");
