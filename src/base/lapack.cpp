@@ -43,7 +43,8 @@ class BufferInUse {
     if (n <= n_buffers_) return;
     const std::scoped_lock lock(thread_mutex);
     if (n <= n_buffers_) return;
-    if (!maps(blas_buffer, 1)) {
+    // and for as much again, since other threads take memory of their own meanwhile
+    if (!maps(blas_buffer, 2)) {
       --n_in_use_;
       throw InputError(fmt::format(
           "OpenBLAS needs a buffer of {:.0f} MB, which the system does not give: raise the limit on memory (ulimit -v)",

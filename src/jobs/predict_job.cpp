@@ -170,6 +170,7 @@ EvaluateOutcome evaluate(const FitFile& fit, const Posterior& posterior, const C
   options.noise_stddev = measurement_noise(posterior, rows, states.states.cols(), states.stated_stddev);
   out.evaluation =
       at_states_of(log, [&] { return evaluate_predictions(posterior, states.states, rows, states.accelerations, options); });
+  if (at.prior.reference) return out;  // a baseline knows no constraint
   for (const ConstraintResidual& one :
        constraint_residuals(posterior, at.view.other_system, states.states, rows, states.accelerations, options.noise_stddev)) {
     if (one.is_too_large()) out.notes.push_back(fmt::format("warning: {}: {}", log.name(), one.text()));
