@@ -29,6 +29,7 @@ class Interruption {
       struct sigaction action = {};
       action.sa_handler = ask;
       action.sa_flags = SA_RESTART;
+      for (const int signal : signals) sigaddset(&action.sa_mask, signal);  // one after the other
       sigaction(signals[k], &action, nullptr);
     }
   }
@@ -47,9 +48,13 @@ class Interruption {
     constexpr std::string_view text =
         "\ngp2: stopping, which takes some seconds with many rows; once more ends at once, without a fit\n";
     const int error = errno;
-    signal_ = signal;
-    stop_ = true;
+    const bool is_second = stop_.exchange(true);
+    if (!is_second) signal_ = signal;
     restore();
+    if (is_second) {  // it came to another thread while the first was on its way
+      ::raise(signal);
+      return;
+    }
     static_cast<void>(::write(STDERR_FILENO, text.data(), text.size()) == 0);
     errno = error;
   }

