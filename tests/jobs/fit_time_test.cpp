@@ -57,8 +57,8 @@ TEST(FitTime, IsAboutThatOfAnEvaluation) {
   objective(coordinates(problem.hyperparameters), &gradient, workspace);
   const double measured = std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
   // other programs may take the processor meanwhile
-  EXPECT_LT(estimated, 5 * measured);
-  EXPECT_GT(estimated, measured / 5);
+  EXPECT_LT(estimated, 10 * measured);
+  EXPECT_GT(estimated, measured / 10);
 }
 
 }  // namespace
