@@ -103,7 +103,8 @@ struct Fit {
 /// Same seed, same bits, for any number of threads.
 ///
 /// @throws InputError, NumericalError  as Likelihood, Posterior and require_hyperparameters; InputError when nothing is measured,
-/// a start lies outside its bounds, or an option has no meaning; NumericalError when no restart reached a finite likelihood, or `stop` was set before one did.
+/// a start lies outside its bounds, or an option has no meaning; NumericalError when no restart reached a finite likelihood, or
+/// `stop` was set before one did.
 Fit fit(const Prior& prior, const std::vector<Observations>& observations, const std::vector<Hyperparameter>& hyperparameters,
         const FitOptions& options = {});
 

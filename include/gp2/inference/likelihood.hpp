@@ -52,8 +52,8 @@ class Likelihood {
     std::unique_ptr<Implementation> implementation_;
   };
 
-  /// −log p(y | values): +∞ where the mechanics or the prior have a fault (evaluate_mechanics, evaluate_prior) or the factorisation fails,
-  /// and where the workspace is told to stop.
+  /// −log p(y | values): +∞ where the mechanics or the prior have a fault (evaluate_mechanics, evaluate_prior), the factorisation
+  /// fails, or the workspace is told to stop.
   ///
   /// @param gradient  when not null, receives the gradient: zero in a fixed kernel, and where the options do not ask for the noise
   ///                  or a parameter. Left as it was when the value is +∞.
