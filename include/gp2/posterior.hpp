@@ -55,9 +55,9 @@ class Posterior {
   [[nodiscard]] Marginal marginal(const View& view, const Eigen::Ref<const Eigen::MatrixXd>& states, int n_threads = 1) const;
 
   /// How far states lie from the observed ones (N), in the features that the latents of the view read, each weighed by what it
-  /// changes (theory.md, T30): under the hyperparameters of this posterior. Nineteen of twenty observed states are within 1 of those
-  /// observed at other times; beyond `far_from_data` a standard deviation is too small as a rule. 0 where no feature is read, infinite without
-  /// observations, NaN where all of them are of one time.
+  /// changes (theory.md, T30). Nineteen of twenty observed states are within 1 of those observed at other times; beyond
+  /// `far_from_data` standard deviations are too small as a rule. 0 where no feature is read, infinite without observations, NaN
+  /// where all of them are of one time.
   [[nodiscard]] Eigen::VectorXd distance_from_data(const View& view, const Eigen::Ref<const Eigen::MatrixXd>& states,
                                                    int n_threads = 1) const;
   static constexpr double far_from_data = 1.5;

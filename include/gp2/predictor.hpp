@@ -113,8 +113,7 @@ class Predictor {
                                          Eigen::Ref<Eigen::MatrixXd> jacobian, Workspace& workspace) const;
 
   /// As Posterior::distance_from_data at a state, at the cost of a sum over the observed ones; NaN where a feature is not finite.
-  /// It says what the standard deviation cannot:
-  /// that nothing like this state was seen.
+  /// It says what the standard deviation cannot: that nothing like this state was seen.
   [[nodiscard]] double distance_from_data(const Eigen::Ref<const Eigen::VectorXd>& state, Workspace& workspace) const;
 
   [[nodiscard]] const View& view() const;
