@@ -90,8 +90,9 @@ enum class SystemPart { mechanics /* M, A, b */, force, residuals };
 /// Immutable; every member function may be called from several threads at once.
 class System {
  public:
+  /// @param constraint_noise  constraint_noise(); empty: every constraint is exact
   System(std::string name, std::vector<Coordinate> coordinates, std::vector<std::string> inputs,
-         std::vector<Parameter> parameters, std::vector<std::string> constraint_labels);
+         std::vector<Parameter> parameters, std::vector<std::string> constraint_labels, Eigen::VectorXd constraint_noise = {});
   virtual ~System() = default;
   System(const System&) = delete;
   System& operator=(const System&) = delete;
@@ -101,6 +102,10 @@ class System {
   [[nodiscard]] const std::vector<std::string>& inputs() const { return inputs_; }
   [[nodiscard]] const std::vector<Parameter>& parameters() const { return parameters_; }
   [[nodiscard]] const std::vector<std::string>& constraint_labels() const { return constraint_labels_; }  // one per row of A
+  /// ς of soft constraints: motions of the system obey A ddq = b, measured ones A ddq = b + ς ε, ε ~ N(0, I), as where a wheel
+  /// slips (nc) [unit of the row]. 0 where a constraint is exact.
+  [[nodiscard]] const Eigen::VectorXd& constraint_noise() const { return constraint_noise_; }
+  [[nodiscard]] bool has_constraint_noise() const { return (constraint_noise_.array() > 0).any(); }
   [[nodiscard]] int nq() const { return static_cast<int>(coordinates_.size()); }
   [[nodiscard]] int nc() const { return static_cast<int>(constraint_labels_.size()); }
   [[nodiscard]] StateLayout layout() const { return {nq(), static_cast<int>(inputs_.size())}; }
@@ -157,6 +162,7 @@ class System {
   std::vector<std::string> inputs_;
   std::vector<Parameter> parameters_;
   std::vector<std::string> constraint_labels_;
+  Eigen::VectorXd constraint_noise_;
 };
 
 }  // namespace gp2

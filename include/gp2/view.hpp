@@ -90,13 +90,19 @@ MechanicsBatch require_mechanics(const Prior& prior, const View& view, const Eig
 /// What of a view of a prior has no meaning where M is singular, as a text; nothing where all has.
 std::optional<std::string> what_needs_acceleration(const Prior& prior, const View& view);
 
-/// G and d of a view, or their derivatives in one parameter, at N states.
+/// G, d and N of a view, or their derivatives in one parameter, at N states: what is measured is G ā + d + N ε, ε ~ N(0, I), where
+/// m constraints are soft. Column k of N is the change of d as b grows by ς_k e_k.
 struct ViewValues {
   Eigen::MatrixXd matrix;  // G  (d·nq × N), column-major blocks
   Eigen::MatrixXd offset;  // d  (d × N)
+  Eigen::MatrixXd slip;    // N  (d·m × N); no rows where every constraint is exact, or the view is of one latent
 
   [[nodiscard]] Eigen::Map<const Eigen::MatrixXd> G(int i) const {
     return {matrix.col(i).data(), offset.rows(), offset.rows() == 0 ? 0 : matrix.rows() / offset.rows()};
+  }
+  [[nodiscard]] bool has_slip() const { return slip.rows() > 0; }
+  [[nodiscard]] Eigen::Map<const Eigen::MatrixXd> N(int i) const {
+    return {slip.col(i).data(), offset.rows(), offset.rows() == 0 ? 0 : slip.rows() / offset.rows()};
   }
 };
 

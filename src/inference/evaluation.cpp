@@ -145,6 +145,17 @@ MatrixXd measurement_noise(const Posterior& posterior, const std::vector<int>& r
   return noise;
 }
 
+MatrixXd with_slip(const Posterior& posterior, const View& view, const Ref<const MatrixXd>& states, MatrixXd noise_stddev) {
+  const Prior& prior = prior_of(posterior.prior(), view);
+  if (!prior.system->has_constraint_noise()) return noise_stddev;
+  const VectorXd parameters = parameters_of(view, posterior.values().parameters);
+  const ViewValues values = evaluate_view(view, require_mechanics(prior, view, states, parameters), states);
+  for (int i = 0; i < states.cols(); ++i) {
+    noise_stddev.col(i) = (noise_stddev.col(i).array().square() + values.N(i).rowwise().squaredNorm().array()).sqrt();
+  }
+  return noise_stddev;
+}
+
 bool TrainingResidual::is_too_large() const {
   // fitted hyperparameters of few rows are too sure of themselves: they make rms of 1.8 with 89 % inside
   return n >= 10 && rms > 2 && coverage95 < 0.85 && rms * rms > 1 + 6 * std::sqrt(2.0 / n);
@@ -226,7 +237,8 @@ Evaluation evaluate_predictions(const Posterior& posterior, const Ref<const Matr
   const MatrixXd stddev = prediction.stddev();
   const auto decided = decided_entries(*prior.system, states, parameters);
   const MatrixXd noise =
-      options.noise_stddev.size() > 0 ? options.noise_stddev : measurement_noise(posterior, rows, states.cols());
+      with_slip(posterior, compared, states,
+                options.noise_stddev.size() > 0 ? options.noise_stddev : measurement_noise(posterior, rows, states.cols()));
 
   Evaluation e;
   e.n = static_cast<int>(states.cols());

@@ -37,11 +37,17 @@ std::vector<LeaveOneOut> leave_one_out(const Posterior& posterior) {
     for (Index c = 0; c < rank; ++c)
       alpha[c] = inverse.alpha[reduction.offset[static_cast<std::size_t>(c)] + static_cast<Index>(s)];
     // the inverse of the covariance of all whitened values, and what it makes of theirs
-    const VectorXd alpha_e = sample.Q * alpha + sample.e_out;
-    const MatrixXd P_e = MatrixXd::Identity(sample.Q.rows(), sample.Q.rows()) +
-                         sample.Q * (inverse.blocks[s] - MatrixXd::Identity(rank, rank)) * sample.Q.transpose();
+    VectorXd alpha_e = sample.Q * alpha + sample.e_out;
+    MatrixXd P_e = MatrixXd::Identity(sample.Q.rows(), sample.Q.rows()) +
+                   sample.Q * (inverse.blocks[s] - MatrixXd::Identity(rank, rank)) * sample.Q.transpose();
     const auto g = static_cast<std::size_t>(sample.group);
     const VectorXd noise = observations[g].noise_at(values.noise_stddev[g], sample.index);
+    if (sample.C.size() > 0) {  // from values whitened by C to those in units of σ
+      const MatrixXd to_unit = sample.C.triangularView<Eigen::Lower>().solve(
+          MatrixXd(noise.unaryExpr([](double one) { return std::isfinite(one) ? one : 1; }).asDiagonal()));
+      alpha_e = to_unit.transpose() * alpha_e;
+      P_e = to_unit.transpose() * P_e * to_unit;
+    }
     for (Index k = 0; k < noise.size(); ++k) {
       if (!std::isfinite(noise[k])) continue;  // not measured
       const double p = P_e(k, k);

@@ -4,6 +4,8 @@
 #include <cmath>
 #include <numbers>
 
+#include <Eigen/QR>
+
 #include "mechanics/pivoted_qr.hpp"
 
 namespace gp2 {
@@ -48,6 +50,18 @@ class Whitening {
   Index n_measured_;
 };
 
+// C of diag(σ²) + N Nᵀ = C Cᵀ: with Ñ = diag(σ)⁻¹N it is diag(σ) times the R of [I; Ñᵀ] = Q R, transposed, which loses no more than
+// rounding of Ñ. A value that is not measured has σ = ∞ and a row of the identity.
+MatrixXd noise_factor(const Eigen::Ref<const VectorXd>& whitening, const Eigen::Ref<const MatrixXd>& N) {
+  const Index d = N.rows(), m = N.cols();
+  MatrixXd stacked(d + m, d);
+  stacked << MatrixXd::Identity(d, d), (whitening.asDiagonal() * N).transpose();
+  const MatrixXd R = stacked.householderQr().matrixQR().topRows(d);
+  MatrixXd C = MatrixXd::Zero(d, d);
+  for (Index k = 0; k < d; ++k) C.col(k).tail(d - k) = (R(k, k) < 0 ? -1 : 1) * R.row(k).tail(d - k).transpose();
+  return (whitening.array() > 0).select(whitening.cwiseInverse(), VectorXd::Ones(d)).asDiagonal() * C;
+}
+
 // W = Q R and e = Q ỹ + e_out of one sample, and the memory for it.
 class Split {
  public:
@@ -57,7 +71,15 @@ class Split {
     const VectorXd& diagonal = whitening.diagonal();
     // W P = Q R', so R = Qᵀ W
     const auto G = model.values.view.G(i);
-    W_.noalias() = diagonal.asDiagonal() * G;
+    double log_det_S_half = whitening.log_det_S_half();
+    if (model.values.view.has_slip()) {
+      sample.C = noise_factor(diagonal, model.values.view.N(i));
+      log_det_S_half = sample.C.diagonal().array().log().sum();
+      W_ = sample.C.triangularView<Eigen::Lower>().solve((diagonal.array() > 0).cast<double>().matrix().asDiagonal() * G);
+    } else {
+      sample.C.resize(0, 0);
+      W_.noalias() = diagonal.asDiagonal() * G;
+    }
     factors_ = W_;
     reflection_.resize(std::min(W_.rows(), W_.cols()));
     order_.resize(W_.cols());
@@ -67,12 +89,16 @@ class Split {
     sample.R.noalias() = sample.Q.transpose().lazyProduct(W_);
     sample.e = group.values().col(i) - model.values.view.offset.col(i);
     sample.e.noalias() -= G.lazyProduct(model.values.prior.mean.col(i));
-    sample.e.array() *= diagonal.array();
     if (!whitening.is_complete()) sample.e = (diagonal.array() > 0).select(sample.e, 0);
+    if (sample.C.size() > 0) {
+      sample.C.triangularView<Eigen::Lower>().solveInPlace(sample.e);
+    } else {
+      sample.e.array() *= diagonal.array();
+    }
     sample.y.noalias() = sample.Q.transpose().lazyProduct(sample.e);
     sample.e_out = sample.e;
     sample.e_out.noalias() -= sample.Q.lazyProduct(sample.y);
-    sample.constant = 0.5 * sample.e_out.squaredNorm() + whitening.log_det_S_half() +
+    sample.constant = 0.5 * sample.e_out.squaredNorm() + log_det_S_half +
                       0.5 * static_cast<double>(whitening.n_measured()) * std::log(2 * std::numbers::pi);
   }
 

@@ -9,7 +9,8 @@
 namespace gp2 {
 
 /// Observations whitened by their noise and split: W = S^{-1/2}G = Q R, e = S^{-1/2}(y − d − Gμ), ỹ = Qᵀe. A value that is not
-/// measured has S = ∞: its rows of W and e are zero, and its log S is no part of the density.
+/// measured has S = ∞: its rows of W and e are zero, and its log S is no part of the density. S is diagonal, or where constraints
+/// are soft diag(σ²) + N Nᵀ = C Cᵀ, C lower triangular, which stands for S^{1/2}.
 ///
 /// Samples are sorted by falling rank and numbers stored component by component: row (c, k) of every reduced vector belongs to
 /// component c of sorted sample k and stands at offset[c] + k, for k < count[c]. So each pair of components is one dense block.
@@ -20,6 +21,7 @@ struct Reduction {
     Eigen::VectorXd e;      // (d)
     Eigen::VectorXd y;      // Qᵀe (r)
     Eigen::VectorXd e_out;  // (I − QQᵀ) e
+    Eigen::MatrixXd C;      // (d × d), with ones on the diagonal where nothing is measured; empty where S is diagonal
     double constant = 0;    // ½ ‖(I − QQᵀ)e‖² + ½ log|S| + ½ dim y log 2π
   };
   std::vector<Sample> samples;              // sorted

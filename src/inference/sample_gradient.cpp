@@ -25,6 +25,7 @@ void SampleGradient::add(Index i, ModelGradient& gradient) {
   const ObservationModel& model = models_[group];
   whitening_ = observations_[group].noise_at(noise_stddev_[group], sample.index).cwiseInverse();
   differentiate_split(i, sample, model);
+  if (sample.C.size() > 0) differentiate_noise(sample);
   if (options_.noise_gradient) add_noise(sample, model, gradient.log_noise_stddev[group]);
   if (!options_.gradient_parameters.empty()) add_parameters(sample, model, gradient.parameters);
 }
@@ -52,8 +53,25 @@ void SampleGradient::differentiate_split(Index i, const Reduction::Sample& sampl
   d_W_.noalias() -= sample.e_out.lazyProduct(mean_.transpose());
 }
 
+// NLL is a function of C⁻¹G and C⁻¹r, plus log|C|, and of C only through S = C Cᵀ: with B = (∂NLL/∂W)Wᵀ + (∂NLL/∂e)eᵀ, which is
+// symmetric, ∂NLL/∂S = ½C⁻ᵀ(I − B)C⁻¹
+void SampleGradient::differentiate_noise(const Reduction::Sample& sample) {
+  const auto C = sample.C.triangularView<Eigen::Lower>();
+  d_S_ = -(d_W_ * sample.R.transpose()) * sample.Q.transpose() - d_e_ * sample.e.transpose();
+  d_S_.diagonal().array() += (whitening_.array() > 0).cast<double>();
+  C.transpose().solveInPlace(d_S_);
+  d_S_ = 0.25 * C.transpose().solve(MatrixXd(d_S_.transpose()));
+  d_S_ += MatrixXd(d_S_.transpose());
+}
+
 // S^{-1/2} scales the rows of W and e, and σ_k the whole row k of S^{1/2}
 void SampleGradient::add_noise(const Reduction::Sample& sample, const ObservationModel& model, VectorXd& d_noise) const {
+  if (sample.C.size() > 0) {
+    for (Index k = 0; k < d_noise.size(); ++k) {
+      if (whitening_[k] > 0) d_noise[k] += 2 * d_S_(k, k) / (whitening_[k] * whitening_[k]);
+    }
+    return;
+  }
   const auto G = model.values.view.G(sample.index);
   // a value of weight 0, which is not measured, has no log S
   d_noise.array() += (whitening_.array() > 0).cast<double>() - d_e_.array() * sample.e.array() -
@@ -63,8 +81,13 @@ void SampleGradient::add_noise(const Reduction::Sample& sample, const Observatio
 // e = S^{-1/2}(y − d − Gμ) and W = S^{-1/2}G: ∂NLL/∂d, ∂NLL/∂G, ∂NLL/∂μ and ∂NLL/∂E, then along θ
 void SampleGradient::add_parameters(const Reduction::Sample& sample, const ObservationModel& model, VectorXd& d_parameters) {
   const auto G = model.values.view.G(sample.index);
-  d_offset_ = -whitening_.cwiseProduct(d_e_);
-  d_G_ = whitening_.asDiagonal() * d_W_;
+  if (sample.C.size() > 0) {
+    d_offset_ = -sample.C.triangularView<Eigen::Lower>().transpose().solve(d_e_);
+    d_G_ = sample.C.triangularView<Eigen::Lower>().transpose().solve(d_W_);
+  } else {
+    d_offset_ = -whitening_.cwiseProduct(d_e_);
+    d_G_ = whitening_.asDiagonal() * d_W_;
+  }
   d_G_.noalias() += d_offset_.lazyProduct(model.values.prior.mean.col(sample.index).transpose());
   d_mean_.noalias() = G.transpose().lazyProduct(d_offset_);
   for (std::size_t a = 0; a < V_.size(); ++a) {
@@ -76,6 +99,7 @@ void SampleGradient::add_parameters(const Reduction::Sample& sample, const Obser
     double slope = d_offset_.dot(d.view.offset.col(sample.index)) + d_G_.cwiseProduct(d.view.G(sample.index)).sum() +
                    d_mean_.dot(d.prior.mean.col(sample.index));
     for (std::size_t a = 0; a < V_.size(); ++a) slope += V_[a].cwiseProduct(d.prior.E(a, sample.index)).sum();
+    if (sample.C.size() > 0) slope += 2 * (d_S_ * model.values.view.N(sample.index)).cwiseProduct(d.view.N(sample.index)).sum();
     d_parameters[options_.gradient_parameters[p]] += slope;
   }
 }

@@ -24,6 +24,8 @@ class SampleGradient {
  private:
   // α_i and ∂NLL/∂W_i
   void differentiate_split(Eigen::Index i, const Reduction::Sample& sample, const ObservationModel& model);
+  // ∂NLL/∂S where constraints are soft
+  void differentiate_noise(const Reduction::Sample& sample);
   void add_noise(const Reduction::Sample& sample, const ObservationModel& model, Eigen::VectorXd& d_noise) const;
   void add_parameters(const Reduction::Sample& sample, const ObservationModel& model, Eigen::VectorXd& d_parameters);
 
@@ -36,7 +38,7 @@ class SampleGradient {
   std::vector<Eigen::MatrixXd> loading_;  // per latent: C_a
   // memory used again at each sample
   std::vector<Eigen::MatrixXd> V_;
-  Eigen::MatrixXd V_E_, E_, d_W_, d_G_;
+  Eigen::MatrixXd V_E_, E_, d_W_, d_G_, d_S_;
   Eigen::VectorXd whitening_;  // S^{-1/2}
   Eigen::VectorXd alpha_i_, d_e_, mean_, d_offset_, d_mean_;
 };

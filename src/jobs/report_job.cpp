@@ -71,6 +71,10 @@ ReportData data_at(const Posterior& posterior, const MatrixXd& states, const std
   data.constraint_residuals = constraint_residuals(posterior, other_system, states, rows, measured, data.noise_stddev);
   data.lower_rank = states_of_lower_rank(reference, states, parameters);
   if (reference.nc() > 0) data.violation = largest_violation(reference, states, parameters);
+  View measured_view = View::constrained_acceleration(reference);
+  measured_view.rows = rows;
+  measured_view.other_system = other_system;
+  data.noise_stddev = with_slip(posterior, measured_view, states, std::move(data.noise_stddev));
 
   for (std::size_t a = 0; a < prior.latents.size(); ++a) {
     const Latent& latent = prior.latents[a];

@@ -23,11 +23,17 @@ std::vector<std::string> labels_of(const std::vector<CallableSystem::Constraint>
   return labels;
 }
 
+VectorXd noise_of(const std::vector<CallableSystem::Constraint>& constraints) {
+  VectorXd noise(std::ssize(constraints));
+  std::transform(constraints.begin(), constraints.end(), noise.begin(), [](const auto& one) { return one.noise; });
+  return noise;
+}
+
 }  // namespace
 
 CallableSystem::CallableSystem(Definition definition)
     : System(definition.declaration.name, definition.declaration.coordinates, definition.declaration.inputs,
-             definition.declaration.parameters, labels_of(definition.constraints)),
+             definition.declaration.parameters, labels_of(definition.constraints), noise_of(definition.constraints)),
       definition_(std::move(definition)),
       mechanics_reads_(marks_of(definition_.mechanics_reads, "mechanics_reads", *this)),
       force_reads_(marks_of(definition_.force_reads, "force_reads", *this)),

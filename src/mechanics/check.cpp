@@ -268,6 +268,7 @@ std::vector<ConstraintResidual> constraint_residuals(const System& system, const
       }
       // a row that vanishes says nothing of ddq
       if (!std::isfinite(r) || variance == 0) continue;
+      variance += std::pow(system.constraint_noise()[row], 2);
       ++one.n;
       one.rms += r * r;
       one.mean += r;

@@ -65,7 +65,7 @@ Expression rate(Expression e, const std::vector<Expression>& x, const std::vecto
 
 ConstraintRow derive_constraint(ConstraintLevel level, Expression c, std::string text, const SystemSymbols& symbols) {
   ExpressionGraph& graph = c.graph();
-  ConstraintRow row{level, std::move(text), {}, c, {}};
+  ConstraintRow row{level, std::move(text), {}, c, {}, 0};
   Expression bias = c;  // the part of the differentiated constraint that has no ddq
   const std::vector<Expression>* acted_on = &symbols.ddq;
   switch (level) {
@@ -143,6 +143,13 @@ std::vector<std::string> labels_of(const SymbolicSystem::Definition& definition)
   return labels;
 }
 
+VectorXd noise_of(const SymbolicSystem::Definition& definition) {
+  VectorXd noise(std::ssize(definition.constraints));
+  std::transform(definition.constraints.begin(), definition.constraints.end(), noise.begin(),
+                 [](const ConstraintRow& row) { return row.noise; });
+  return noise;
+}
+
 }  // namespace
 
 // The derivatives are taken in a graph of their own: that of the definition may be growing elsewhere.
@@ -155,7 +162,8 @@ struct SymbolicSystem::StateTape {
 };
 
 SymbolicSystem::SymbolicSystem(Definition definition)
-    : System(definition.name, definition.coordinates, definition.inputs, definition.parameters, labels_of(definition)),
+    : System(definition.name, definition.coordinates, definition.inputs, definition.parameters, labels_of(definition),
+             noise_of(definition)),
       definition_(std::move(definition)) {
   ExpressionGraph& graph = *definition_.graph;
   const SystemSymbols symbols(graph, coordinates(), inputs(), parameters());

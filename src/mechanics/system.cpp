@@ -8,12 +8,18 @@
 namespace gp2 {
 
 System::System(std::string name, std::vector<Coordinate> coordinates, std::vector<std::string> inputs,
-               std::vector<Parameter> parameters, std::vector<std::string> constraint_labels)
+               std::vector<Parameter> parameters, std::vector<std::string> constraint_labels, Eigen::VectorXd constraint_noise)
     : name_(std::move(name)),
       coordinates_(std::move(coordinates)),
       inputs_(std::move(inputs)),
       parameters_(std::move(parameters)),
-      constraint_labels_(std::move(constraint_labels)) {}
+      constraint_labels_(std::move(constraint_labels)),
+      constraint_noise_(std::move(constraint_noise)) {
+  if (constraint_noise_.size() == 0) constraint_noise_.setZero(nc());
+  if (constraint_noise_.size() != nc() || !(constraint_noise_.array() >= 0).all() || !constraint_noise_.allFinite()) {
+    throw InputError(fmt::format("'{}': constraint_noise must hold {} finite numbers ≥ 0, one per constraint", name_, nc()));
+  }
+}
 
 std::vector<std::string> System::state_names() const {
   std::vector<std::string> names;

@@ -455,6 +455,10 @@ std::optional<std::string> fault_at(const System& system, const SystemValues& va
   if (!is_indefinite && (!values.A(i).allFinite() || !values.b(i).allFinite())) {
     return "A or b is not a finite number" + internal::unknown_entries(system, states, i, system.reads(SystemPart::mechanics));
   }
+  if (system.has_constraint_noise() && projection.rank() + projection.n_zero_rows() < system.nc()) {
+    return "the constraints are redundant, so that none of them may have a noise of its own: leave out rows that follow from "
+           "others";
+  }
   return mass_fault(system, values, i, projection);
 }
 
@@ -499,6 +503,7 @@ MechanicsBatch evaluate_mechanics(const System& system, const Ref<const MatrixXd
 void evaluate_mechanics(const System& system, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters,
                         MechanicsBatch& batch) {
   system.evaluate_into(states, parameters, batch.values);
+  batch.constraint_noise = system.constraint_noise();
   batch.fault.reset();
   const int n_states = batch.values.n_states();
   batch.projections.resize(static_cast<std::size_t>(n_states));

@@ -623,15 +623,32 @@ class ModelReader : private TomlReader {
       if (!constraints.contains(level_name)) continue;
       const toml::array& rows = array(*constraints.get(level_name), fmt::format("constraints.{}", level_name));
       for (std::size_t k = 0; k < rows.size(); ++k) {
-        const toml::node& node = *rows.get(k);
-        const std::string key = fmt::format("constraints.{} entry {}", level_name, k + 1);
-        const Expression c = unexpanded(node, key, forbidden_in(level));
-        try {
-          definition_.constraints.push_back(derive(level, c, node.is_string() ? text(node, key) : to_string(c)));
-        } catch (const InputError& error) {
-          fail(node, key, error.what());
-        }
+        definition_.constraints.push_back(
+            read_constraint(level, *rows.get(k), fmt::format("constraints.{} entry {}", level_name, k + 1)));
       }
+    }
+  }
+
+  // "c", or { expr = "c", noise = 0.05 }
+  ConstraintRow read_constraint(Level level, const toml::node& entry, const std::string& key) const {
+    if (!entry.is_table()) return read_exact_constraint(level, entry, key);
+    const toml::table& soft = *entry.as_table();
+    only_keys(soft, key, {"expr", "noise"});
+    if (!soft.contains("expr") || !soft.contains("noise")) {
+      fail(entry, key, "expected { expr = \"dx*sin(heading) - dy*cos(heading)\", noise = 0.05 }");
+    }
+    ConstraintRow row = read_exact_constraint(level, *soft.get("expr"), key);
+    row.noise = number(*soft.get("noise"), key + ".noise");
+    if (row.noise < 0) fail(*soft.get("noise"), key + ".noise", "a standard deviation must not be negative");
+    return row;
+  }
+
+  ConstraintRow read_exact_constraint(Level level, const toml::node& node, const std::string& key) const {
+    const Expression c = unexpanded(node, key, forbidden_in(level));
+    try {
+      return derive(level, c, node.is_string() ? text(node, key) : to_string(c));
+    } catch (const InputError& error) {
+      fail(node, key, error.what());
     }
   }
 

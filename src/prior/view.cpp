@@ -172,6 +172,39 @@ StateMechanics mechanics_at(const View& view, const MechanicsBatch& mechanics, i
   return {mechanics.projections[static_cast<std::size_t>(i)], mechanics.values.A(i), view.required_time_step()};
 }
 
+// Columns of N, or their derivatives, at every state.
+class Slip {
+ public:
+  Slip(const View& view, const MechanicsBatch& mechanics) : view_(view), mechanics_(mechanics) {
+    for (Index row = 0; row < mechanics.constraint_noise.size() && !view.latent; ++row) {
+      if (mechanics.constraint_noise[row] > 0) soft_.push_back(row);
+    }
+  }
+
+  /// @param column  writes d, or its derivative, of one motion, all rows, to a (size × 1) matrix, given its projection
+  template <typename Column>
+  [[nodiscard]] MatrixXd collect(Index n_rows, const Column& column) const {
+    const Index n_states = mechanics_.values.n_states();
+    MatrixXd out(view_.size() * std::ssize(soft_), n_states);
+    MatrixXd all(n_rows, 1);
+    UdwadiaKalaba unit;
+    for (int i = 0; i < n_states; ++i) {
+      for (std::size_t k = 0; k < soft_.size(); ++k) {
+        unit.compute(mechanics_.values.M(i), mechanics_.values.A(i),
+                     mechanics_.constraint_noise[soft_[k]] * VectorXd::Unit(mechanics_.constraint_noise.size(), soft_[k]));
+        column(i, unit, all);
+        out.col(i).segment(static_cast<Index>(k) * view_.size(), view_.size()) = all(view_.rows, 0);
+      }
+    }
+    return out;
+  }
+
+ private:
+  const View& view_;
+  const MechanicsBatch& mechanics_;
+  std::vector<Index> soft_;
+};
+
 // ∂A/∂p, for any number of motions
 class ParameterChange final : public ConstraintChange {
  public:
@@ -196,7 +229,7 @@ template <typename At>
 ViewValues collect(const View& view, const MechanicsBatch& mechanics, const At& at) {
   const Index nq = mechanics.values.force.rows();
   const int n_states = mechanics.values.n_states();
-  ViewValues out{MatrixXd(view.size() * nq, n_states), MatrixXd(view.size(), n_states)};
+  ViewValues out{MatrixXd(view.size() * nq, n_states), MatrixXd(view.size(), n_states), {}};
   for (int i = 0; i < n_states; ++i) {
     const Affine& affine = at(i);
     Eigen::Map<MatrixXd>(out.matrix.col(i).data(), view.size(), nq) = affine.G(view.rows, Eigen::all);
@@ -231,6 +264,10 @@ ViewValues evaluate_view(const View& view, const MechanicsBatch& mechanics, cons
   for (int k = 0; k < view.size(); ++k) {
     if (const std::optional<int> entry = view.added_entry(layout, k)) out.offset.row(k) += states.row(*entry);
   }
+  out.slip = Slip(view, mechanics).collect(all.d.rows(), [&](int i, const UdwadiaKalaba& unit, MatrixXd& d) {
+    motion.evaluate(unit, mechanics.values.M(i), view.quantity->parts());
+    view.quantity->evaluate({unit, mechanics.values.A(i), view.required_time_step()}, motion.constant(), d, workspace);
+  });
   return out;
 }
 
@@ -238,7 +275,7 @@ ViewValues differentiate_view(const View& view, const MechanicsBatch& mechanics,
   QuantityKind::Workspace workspace;
   AffineMotion motion, dmotion;
   Affine all = affine_of(view, mechanics.values);
-  return collect(view, mechanics, [&](int i) -> const Affine& {
+  ViewValues out = collect(view, mechanics, [&](int i) -> const Affine& {
     const StateMechanics at = mechanics_at(view, mechanics, i);
     const auto M = mechanics.values.M(i);
     const ParameterChange dA(derivative.A(i));
@@ -249,6 +286,15 @@ ViewValues differentiate_view(const View& view, const MechanicsBatch& mechanics,
     view.quantity->differentiate(at, motion.constant(), dmotion.constant(), dA, all.d, workspace);
     return all;
   });
+  const VectorXd db = VectorXd::Zero(mechanics.constraint_noise.size());
+  out.slip = Slip(view, mechanics).collect(all.d.rows(), [&](int i, const UdwadiaKalaba& unit, MatrixXd& d) {
+    const auto M = mechanics.values.M(i);
+    motion.evaluate(unit, M, view.quantity->parts());
+    dmotion.differentiate(unit, M, derivative.M(i), derivative.A(i), db, view.quantity->parts());
+    view.quantity->differentiate({unit, mechanics.values.A(i), view.required_time_step()}, motion.constant(), dmotion.constant(),
+                                 ParameterChange(derivative.A(i)), d, workspace);
+  });
+  return out;
 }
 
 }  // namespace gp2

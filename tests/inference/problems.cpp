@@ -61,6 +61,32 @@ directions = [["c^2*dx + k"], ["m"]]
   return model;
 }
 
+const Model& model_with_a_slipping_wheel() {
+  static const Model model = Model::parse(R"toml(
+name        = "slipping wheels"
+coordinates = ["x", "y", { name = "heading", angle = true }, "z"]
+inputs      = ["u"]
+[parameters]
+m = 2.0
+e = 0.3
+c = 0.7
+[mechanics]
+mass  = [["m", "0", "-m*e*sin(heading)", "0"], ["0", "m", "m*e*cos(heading)", "0"],
+         ["-m*e*sin(heading)", "m*e*cos(heading)", "1.1", "0.1"], ["0", "0", "0.1", "0.4"]]
+force = ["u - c*dx", "-c*dy", "-c*dheading", "-z"]
+[constraints]
+velocity     = [{ expr = "dx*sin(heading) - dy*cos(heading) + e*dheading", noise = 0.4 }]
+acceleration = ["ddz - c*x*ddx", { expr = "m*ddy + e*dz*ddheading - y", noise = 1.5 }]
+[[latent]]
+name       = "f"
+kernel     = "se"
+features   = ["dx", "dheading"]
+directions = "acceleration"
+)toml",
+                                          "slipping wheels");
+  return model;
+}
+
 std::string changed(std::string text, const std::vector<std::pair<std::string, std::string>>& changes) {
   for (const auto& [from, to] : changes) {
     const std::size_t place = text.find(from);
@@ -207,6 +233,17 @@ std::vector<Problem> problems(int n, std::uint64_t seed) {
     add("a row that vanishes at some states, two rows and all", m, {mean, std::nullopt, false}, vanishing,
         {View{Quantity::constrained_acceleration, {1, 0}}, View::all(Quantity::constrained_acceleration, *m.system)});
   }
+  for (Prior::Mean mean : {Prior::Mean::zero, Prior::Mean::force}) {
+    const Model& m = model_with_a_slipping_wheel();
+    const MatrixXd states = random_states(m);
+    const PriorOptions options{mean, std::nullopt, false};
+    const View ddq = View::all(Quantity::constrained_acceleration, *m.system);
+    add("slipping wheels", m, options, states, {ddq});
+    add("slipping wheels, two rows and the constraint force", m, options, states,
+        {View{Quantity::constrained_acceleration, {2, 0}}, View{Quantity::constraint_force, {0, 1, 3}}});
+    add("slipping wheels, multipliers and a velocity", m, options, states,
+        {View::all(Quantity::multipliers, *m.system), View::next_velocity(*m.system, 0.1)});
+  }
   // x scaled: the row is dropped at x = 0 whatever c, so the rank stays as c varies
   for (Prior::Mean mean : {Prior::Mean::zero, Prior::Mean::force}) {
     const Model& m = model_with_friction();
@@ -266,18 +303,20 @@ DenseView dense_view(const Prior& home, const ModelValues& values, const View& v
   const System& system = *prior.system;
   const Index nq = system.nq();
   const SystemValues mechanics = system.evaluate(states, parameters);
-  DenseView dense{ExtendedVector(view.size() * states.cols()), {}, {}};
+  DenseView dense{ExtendedVector(view.size() * states.cols()), {}, {}, {}};
   for (std::size_t a = 0; a < prior.latents.size(); ++a) dense.features.push_back(evaluate_features(prior, a, states));
   for (int i = 0; i < static_cast<int>(states.cols()); ++i) {
     const Extended M_inverse = Extended(mechanics.M(i).cast<long double>()).fullPivLu().inverse();
     // rows to unit norm, so that their size does not decide the rank
     Extended A = mechanics.A(i).cast<long double>();
     ExtendedVector b = mechanics.b(i).cast<long double>();
+    ExtendedVector slip = system.constraint_noise().cast<long double>();
     for (Index row = 0; row < A.rows(); ++row) {
       const long double norm = A.row(row).norm();
       if (norm == 0) continue;
       A.row(row) /= norm;
       b[row] /= norm;
+      slip[row] /= norm;
     }
     Extended L(nq, 0);
     if (A.rows() > 0) L = M_inverse * A.transpose() * pseudo_inverse(A * M_inverse * A.transpose());
@@ -286,22 +325,28 @@ DenseView dense_view(const Prior& home, const ModelValues& values, const View& v
     const ExtendedVector Lb = A.rows() > 0 ? ExtendedVector(L * b) : ExtendedVector(ExtendedVector::Zero(nq));
     const Extended identity = Extended::Identity(nq, nq);
     const Extended M = mechanics.M(i).cast<long double>();
-    Extended all_G = identity;
+    Extended all_G = identity, all_N = Extended::Zero(nq, A.rows());
+    const Extended Lslip = L * slip.asDiagonal();
     ExtendedVector all_d = ExtendedVector::Zero(nq);
     if (view.quantity == Quantity::constrained_acceleration) {
       all_G = T;
       all_d = Lb;
+      all_N = Lslip;
     } else if (view.quantity == Quantity::constraint_force) {
       all_G = M * (T - identity);
       all_d = M * Lb;
+      all_N = M * Lslip;
     } else if (view.quantity == Quantity::multipliers) {
       const Extended K = pseudo_inverse(mechanics.A(i).transpose().cast<long double>());
       all_G = K * M * (T - identity);
       all_d = K * M * Lb;
+      all_N = K * M * Lslip;
     } else if (view.quantity == Quantity::next_velocity) {
       all_G = *view.time_step * T;
       all_d = states.col(i).segment(nq, nq).cast<long double>() + *view.time_step * Lb;
+      all_N = *view.time_step * Lslip;
     }
+    dense.slip.push_back(view.latent ? Extended(Extended::Zero(view.size(), A.rows())) : Extended(all_N(view.rows, Eigen::all)));
     const Extended G = all_G(view.rows, Eigen::all);
     const ExtendedVector offset =
         view.latent ? ExtendedVector(ExtendedVector::Zero(view.size())) : ExtendedVector(all_d(view.rows));
@@ -379,6 +424,11 @@ DenseObservations dense_observations(const Problem& p) {
     for (Index k = first[g]; k < first[g + 1]; ++k) {
       const long double s = sigma.reshaped()[k - first[g]];
       dense.covariance(k, k) += s * s;
+    }
+    const Index d = sigma.rows();
+    for (Index i = 0; i < sigma.cols(); ++i) {
+      const Extended& N = dense.views[g].slip[static_cast<std::size_t>(i)];
+      dense.covariance.block(first[g] + i * d, first[g] + i * d, d, d) += N * N.transpose();
     }
   }
   return dense;

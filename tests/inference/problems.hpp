@@ -42,6 +42,9 @@ const Model& model_with_friction();
 /// `text` with every `from` changed to `to`.
 std::string changed(std::string text, const std::vector<std::pair<std::string, std::string>>& changes);
 
+/// Two wheels' constraints, one of which slips, that share a length, and an exact one.
+const Model& model_with_a_slipping_wheel();
+
 /// Another, heavier particle on another surface; m, p1 and p5 are those of models/surface.toml.
 const Model& another_surface();
 
@@ -62,6 +65,7 @@ std::vector<Problem> problems(int n, std::uint64_t seed);
 struct DenseView {
   ExtendedVector mean;                         // (d·N)
   std::vector<std::vector<Extended>> loading;  // [state][latent] G E diag(s)  (d × p)
+  std::vector<Extended> slip;                  // [state] of soft constraints (d × nc)
   std::vector<MatrixXd> features;              // per latent (N × D)
 };
 

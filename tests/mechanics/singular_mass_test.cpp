@@ -456,8 +456,8 @@ TEST(SingularMassModel, ViewsOfThePriorHaveExactDerivativesInTheParameters) {
       const SystemValues ds = system.differentiate(states, parameters, k);
       const ViewValues dv = differentiate_view(view, mechanics, ds);
       const PriorValues dp = differentiate_prior(prior, states, parameters, mechanics, p, ds, k);
-      const ViewValues shift{v.matrix, dv.offset};  // G dμ + dd, then dG μ
-      ViewValues turn{dv.matrix, 0 * dv.offset};
+      const ViewValues shift{v.matrix, dv.offset, {}};  // G dμ + dd, then dG μ
+      ViewValues turn{dv.matrix, 0 * dv.offset, {}};
       const VectorXd exact = numbers(shift, dp) + numbers(turn, p);
       const test::Difference difference = test::central_difference(
           [&](double value) {

@@ -46,9 +46,15 @@ std::vector<int> observed_rows(const Posterior& posterior);
 Eigen::MatrixXd measurement_noise(const Posterior& posterior, const std::vector<int>& rows, Eigen::Index n_states,
                                   const Eigen::MatrixXd& stated = {});
 
+/// √(σ² + (N Nᵀ)_kk): how far measured values lie from the motion where constraints are soft too; σ itself where all are exact.
+/// @param view          of ddq
+/// @param noise_stddev  σ of its rows (rows × N)
+Eigen::MatrixXd with_slip(const Posterior& posterior, const View& view, const Eigen::Ref<const Eigen::MatrixXd>& states,
+                          Eigen::MatrixXd noise_stddev);
+
 struct EvaluationOptions {
   std::shared_ptr<const OtherSystem> other_system = nullptr;  // under which the targets were measured; null: the prior's own
-  Eigen::MatrixXd noise_stddev = {};  // of the targets (rows × N); NaN: not known; empty: measurement_noise
+  Eigen::MatrixXd noise_stddev = {};  // of the targets (rows × N); NaN: not known; empty: measurement_noise. Without slip
   int n_threads = 1;                  // as in Posterior::marginal
 };
 

@@ -20,7 +20,8 @@ struct LeaveOneOut {
 ///
 ///     y_k − mean_k = σ_k α_k / p_k,    variance_k = σ_k² (1/p_k − 1),    α = Qα̃ + (I − QQᵀ) e,  p = diag(Q P Qᵀ + I − QQᵀ).
 ///
-/// They hold the hyperparameters. Costs as much as the posterior and its inverse.
+/// Where constraints are soft, α and the inverse are taken from values whitened by C to those in units of σ, and the variance holds
+/// what slips beyond what the other rows of the state say of it. They hold the hyperparameters. Costs as much as the posterior and its inverse.
 /// @throws InputError, NumericalError  as Posterior.
 std::vector<LeaveOneOut> leave_one_out(const Posterior& posterior);
 

@@ -29,6 +29,7 @@ class CallableSystem final : public System {
   struct Constraint {
     std::string text;                                       // what it goes by
     ConstraintLevel level = ConstraintLevel::acceleration;  // decides its residuals, where there are any
+    double noise = 0;                                       // ς of System::constraint_noise
   };
 
   /// The functions must give the same for the same arguments and may be called from several threads at once. What they throw goes

@@ -30,6 +30,7 @@ struct ConstraintRow {
   std::vector<Expression> A;  // (nq)
   Expression b;
   std::vector<Expression> residuals;  // position: c and ċ; velocity: c; acceleration: none
+  double noise = 0;                   // ς of System::constraint_noise
 };
 
 /// Derives a row of A and b from the expression c of a constraint c = 0.

@@ -160,12 +160,13 @@ class UdwadiaKalaba {
 struct MechanicsBatch {
   SystemValues values;
   std::vector<UdwadiaKalaba> projections;
+  Eigen::VectorXd constraint_noise;  // of the system
 
   /// The first state at which M is singular, −1: none.
   [[nodiscard]] int first_singular() const;
 
-  /// What makes the numbers unusable: the first state at which M is indefinite, nothing determines ddq in some direction, or the
-  /// constraints are inconsistent.
+  /// What makes the numbers unusable: the first state at which M is indefinite, nothing determines ddq in some direction, the
+  /// constraints are inconsistent, or redundant though some are soft: what one row slips, the others would deny.
   struct Fault {
     int state = 0;
     std::string text;

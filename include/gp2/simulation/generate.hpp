@@ -17,14 +17,14 @@ namespace gp2 GP2_API {
 /// States drawn from a model's [sampling] and what its [truth] says of them.
 struct GeneratedData {
   Eigen::MatrixXd states;         // (layout size × N); NaN where the model does not read an entry
-  Eigen::MatrixXd accelerations;  // ddq = L b + T (M⁻¹F + truth), plus noise (nq × N)
+  Eigen::MatrixXd accelerations;  // ddq = L b + T (M⁻¹F + truth), plus noise and slip (nq × N)
   std::vector<bool> known;        // which entries of a state are drawn or solved for (layout size)
 };
 
 struct GenerateOptions {
   int n = 100;
   std::uint64_t seed = 1;
-  Eigen::VectorXd noise_stddev;  // (nq), ≥ 0
+  Eigen::VectorXd noise_stddev;  // (nq), ≥ 0; all 0: soft constraints do not slip either
   /// A grid instead of n draws: the number of points of every range in [sampling], evenly from end to end.
   std::map<std::string, int> grid = {};
 };
