@@ -25,30 +25,44 @@ struct EvaluateArguments {
 
 Json number(double value) { return std::isfinite(value) ? Json(value) : Json(); }
 
+void add_to(Json& json, const Calibration& calibration) {
+  json["coverage50"] = number(calibration.coverage50);
+  json["coverage80"] = number(calibration.coverage80);
+  json["coverage95"] = number(calibration.coverage95);
+  json["coverage50_latent"] = number(calibration.coverage50_latent);
+  json["coverage80_latent"] = number(calibration.coverage80_latent);
+  json["coverage95_latent"] = number(calibration.coverage95_latent);
+  json["pit"] = Json::array();
+  for (const double share : calibration.pit) json["pit"].push_back(number(share));
+}
+
 Json to_json(const Evaluation::Part& part) {
-  return {{"n", part.n},
-          {"nrmse", number(part.nrmse)},
-          {"coverage95", number(part.coverage95)},
-          {"coverage95_latent", number(part.coverage95_latent)}};
+  Json json = {{"n", part.n}, {"nrmse", number(part.nrmse)}};
+  add_to(json, part);
+  return json;
 }
 
 Json to_json(const Evaluation& e) {
   Json rmse = Json::object();
   for (std::size_t k = 0; k < e.outputs.size(); ++k) rmse[e.outputs[k]] = e.rmse[static_cast<Eigen::Index>(k)];
-  return {{"rmse", rmse},
-          {"rmse_normalised", number(e.rmse_normalised)},
-          {"nrmse", number(e.nrmse)},
-          {"max_constraint_error", e.max_constraint_error},
-          {"max_constraint_error_fitted", e.max_constraint_error_fitted},
-          {"nlpd", number(e.nlpd)},
-          {"coverage95", number(e.coverage95)},
-          {"nlpd_latent", number(e.nlpd_latent)},
-          {"coverage95_latent", number(e.coverage95_latent)},
-          {"n_zero_variance", e.n_zero_variance},
-          {"near", to_json(e.near)},
-          {"far", to_json(e.far)},
-          {"n", e.n},
-          {"n_missing", e.n_missing}};
+  Json json = {{"rmse", rmse},
+               {"rmse_normalised", number(e.rmse_normalised)},
+               {"nrmse", number(e.nrmse)},
+               {"max_constraint_error", e.max_constraint_error},
+               {"max_constraint_error_fitted", e.max_constraint_error_fitted},
+               {"nlpd", number(e.nlpd)},
+               {"nlpd_latent", number(e.nlpd_latent)}};
+  add_to(json, e);
+  json["n_zero_variance"] = e.n_zero_variance;
+  json["near"] = to_json(e.near);
+  json["far"] = to_json(e.far);
+  json["n"] = e.n;
+  json["n_missing"] = e.n_missing;
+  return json;
+}
+
+std::string coverages(const Calibration& of) {
+  return fmt::format("{:.3g}, {:.3g}, {:.3g}", of.coverage50, of.coverage80, of.coverage95);
 }
 
 void print_text(const Evaluation& e) {
@@ -58,14 +72,14 @@ void print_text(const Evaluation& e) {
   print_result("nrmse                       {:.6g}   (rms error / rms of the test spreads)\n", e.nrmse);
   print_result("max |A ddq - b|             {:.3g}   (fitted parameters; those of the model file: {:.3g})\n",
                e.max_constraint_error_fitted, e.max_constraint_error);
-  print_result("nlpd, 95 % coverage         {:.4g}, {:.3g}   (with measurement noise)\n", e.nlpd, e.coverage95);
-  print_result("the same, noise-free        {:.4g}, {:.3g}   ({} marginals without variance left out)\n", e.nlpd_latent,
-               e.coverage95_latent, e.n_zero_variance);
+  print_result("nlpd; 50, 80, 95 % coverage {:.4g}; {}   (with measurement noise)\n", e.nlpd, coverages(e));
+  print_result("the same, noise-free        {:.4g}; {:.3g}, {:.3g}, {:.3g}   ({} marginals without variance left out)\n",
+               e.nlpd_latent, e.coverage50_latent, e.coverage80_latent, e.coverage95_latent, e.n_zero_variance);
   if (e.far.n > 0) {
-    print_result("near the data               {:.3g} % of the points: nrmse {:.4g}, coverage {:.3g}\n", 100.0 * e.near.n / e.n,
-                 e.near.nrmse, e.near.coverage95);
-    print_result("far from them               {:.3g} % of the points: nrmse {:.4g}, coverage {:.3g}\n", 100.0 * e.far.n / e.n,
-                 e.far.nrmse, e.far.coverage95);
+    print_result("near the data               {:.3g} % of the points: nrmse {:.4g}; coverage {}\n", 100.0 * e.near.n / e.n,
+                 e.near.nrmse, coverages(e.near));
+    print_result("far from them               {:.3g} % of the points: nrmse {:.4g}; coverage {}\n", 100.0 * e.far.n / e.n,
+                 e.far.nrmse, coverages(e.far));
   }
   print_result("points                      {}{}\n", e.n,
                e.n_missing > 0 ? fmt::format("   ({} values not measured)", e.n_missing) : "");

@@ -15,6 +15,7 @@
 #include "gp2/data/csv.hpp"
 #include "gp2/error.hpp"
 #include "gp2/jobs/fit_job.hpp"
+#include "gp2/training/laplace.hpp"
 #include "interruption.hpp"
 #include "streams.hpp"
 
@@ -58,19 +59,45 @@ void print_progress(const Progress& p) {
   if (last >= 0 && p.seconds - last < 0.1) return;
   last = p.seconds;
   const double left = p.fraction > 0 ? p.seconds * (1 - p.fraction) / p.fraction : 0;
+  if (p.is_drawing) {
+    print_message("\rgp2: drawing hyperparameters  best {:.4f}  about {:.0f} s left             ", p.best, left);
+    return;
+  }
   print_message("\rgp2: restart {}/{}  iteration {}  best {:.4f}  about {:.0f} s left   ", p.restart + 1, p.n_restarts,
                 p.iteration, p.best, left);
 }
 
 Json number_or_null(double value) { return std::isfinite(value) ? Json(value) : Json(); }
 
-// of a parameter; NaN where it is not known, ∞ where the data do not determine it
-double stddev_of(const FitReport& report, std::size_t k) {
-  if (!report.uncertainty || report.hyperparameters[k].at_bound()) return std::numeric_limits<double>::quiet_NaN();
-  return report.uncertainty->stddev[static_cast<Index>(k)];
+Json draws_json(const FitReport& report) {
+  const HyperparameterDraws& draws = *report.draws;
+  Json of_each = Json::array();
+  for (std::size_t h = 0; h < report.hyperparameters.size(); ++h) {
+    const auto k = static_cast<Index>(h);
+    of_each.push_back({{"name", report.hyperparameters[h].name},
+                       {"mean", draws.mean[k]},
+                       {"stddev", draws.stddev[k]},
+                       {"lower95", draws.lower[k]},
+                       {"upper95", draws.upper[k]},
+                       {"r_hat", draws.r_hat[k]},
+                       {"effective_size", draws.effective_size[k]}});
+  }
+  return {{"n_draws", draws.size()},
+          {"n_chains", draws.n_chains},
+          {"evaluations", draws.evaluations},
+          {"acceptance", draws.acceptance},
+          {"hyperparameters", of_each}};
 }
 
-Json to_json(const FitProblem& problem, const FitReport& report, const std::string& options) {
+Json to_json(const Evaluation::Part& scores) {
+  return {{"nrmse", number_or_null(scores.nrmse)},
+          {"coverage50", number_or_null(scores.coverage50)},
+          {"coverage80", number_or_null(scores.coverage80)},
+          {"coverage95", number_or_null(scores.coverage95)}};
+}
+
+Json to_json(const FitProblem& problem, const FitOutcome& outcome) {
+  const FitReport& report = outcome.file.report;
   Json hyperparameters = Json::array();
   Json errors = Json::array();  // of parameters, with their correlations
   for (std::size_t k = 0; k < report.hyperparameters.size(); ++k) {
@@ -81,21 +108,34 @@ Json to_json(const FitProblem& problem, const FitReport& report, const std::stri
                                {"upper", h.upper},
                                {"unit", h.unit},
                                {"at_bound", h.at_bound()}});
-    if (h.kind != Hyperparameter::Kind::parameter || !report.uncertainty) continue;
+    if (h.kind != Hyperparameter::Kind::parameter || !(report.uncertainty || report.draws)) continue;
     Json correlation = Json::object();
     for (std::size_t l = 0; l < report.hyperparameters.size(); ++l) {
       const Hyperparameter& other = report.hyperparameters[l];
       if (other.kind != Hyperparameter::Kind::parameter) continue;
-      correlation[other.name] = number_or_null(report.uncertainty->correlation(static_cast<Index>(k), static_cast<Index>(l)));
+      correlation[other.name] = number_or_null(parameter_correlation(report, k, l));
     }
-    errors.push_back({{"name", h.name}, {"stddev", number_or_null(stddev_of(report, k))}, {"correlation", correlation}});
+    const ParameterUncertainty known = parameter_uncertainty(report, k);
+    errors.push_back({{"name", h.name}, {"stddev", number_or_null(known.stddev)}, {"correlation", correlation}});
+    if (known.is_of_draws) errors.back().update(Json{{"mean", known.mean}, {"lower95", known.lower}, {"upper95", known.upper}});
   }
-  Json json = {{"nll", report.negative_log_likelihood}, {"termination", report.termination},
-               {"iterations", report.iterations},       {"seconds", report.seconds},
-               {"options", Json::parse(options)},       {"hyperparameters", hyperparameters}};
+  Json json = {{"nll", report.negative_log_likelihood},
+               {"termination", report.termination},
+               {"iterations", report.iterations},
+               {"seconds", report.seconds},
+               {"options", Json::parse(outcome.file.options)},
+               {"hyperparameters", hyperparameters}};
   if (report.uncertainty) {
     json["standard_errors"] = {{"parameters", errors},
                                {"distance_from_optimum", number_or_null(report.uncertainty->distance_from_optimum)}};
+  } else if (!errors.empty()) {
+    json["standard_errors"] = {{"parameters", errors}};
+  }
+  if (report.draws) json["draws"] = draws_json(report);
+  if (outcome.cross_validation) {
+    json["left_out"]["one_by_one"] = to_json(outcome.cross_validation->one_by_one);
+    const std::optional<Evaluation::Part>& stretches = outcome.cross_validation->stretches;
+    json["left_out"]["stretches"] = stretches ? to_json(*stretches) : Json();
   }
   if (!problem.robust) return json;
   json["distrusted"] = Json::array();
@@ -112,14 +152,29 @@ Json to_json(const FitProblem& problem, const FitReport& report, const std::stri
   return json;
 }
 
+void print_draws(const FitReport& report) {
+  const HyperparameterDraws& draws = *report.draws;
+  Index slowest = 0, worst = 0;
+  const double size = draws.effective_size.minCoeff(&slowest), r_hat = draws.r_hat.maxCoeff(&worst);
+  const auto name = [&](Index k) { return report.hyperparameters[static_cast<std::size_t>(k)].name; };
+  print_result(
+      "hyperparameters integrated: {} draws of {} chains, R̂ at most {:.3f} ({}), worth {:.0f} independent ones or more ({})\n",
+      draws.size(), draws.n_chains, r_hat, name(worst), size, name(slowest));
+}
+
 void print_text(const FitReport& report) {
   print_result("negative log likelihood {:.6f}\n", report.negative_log_likelihood);
   print_result("{} after {} iterations ({} restarts, best: {}), {:.2f} s\n", report.termination, report.iterations,
                report.restarts.size(), report.best_restart + 1, report.seconds);
+  if (report.draws) print_draws(report);
   for (std::size_t k = 0; k < report.hyperparameters.size(); ++k) {
     const Hyperparameter& h = report.hyperparameters[k];
-    const double stddev = h.kind == Hyperparameter::Kind::parameter ? stddev_of(report, k) : std::nan("");
-    const std::string error = std::isfinite(stddev) ? fmt::format(" ± {:.2g}", stddev) : std::isinf(stddev) ? " ± ∞" : "";
+    const ParameterUncertainty known =
+        h.is_system_parameter() ? parameter_uncertainty(report, k) : ParameterUncertainty{.stddev = std::nan("")};
+    std::string error = std::isfinite(known.stddev) ? fmt::format(" ± {:.2g}", known.stddev)
+                        : std::isinf(known.stddev)  ? " ± ∞"
+                                                    : "";
+    if (known.is_of_draws) error += fmt::format(" (mean {:.6g}, 95 % {:.4g} … {:.4g})", known.mean, known.lower, known.upper);
     print_result("  {:<34} {:>13.6g}{}   [{:.3g}, {:.3g}]{}\n", h.name, h.value, error, h.lower, h.upper,
                  h.is_fixed()   ? "   held"
                  : h.at_bound() ? "   at its bound"
@@ -216,9 +271,10 @@ void run(FitArguments& arguments, const std::set<std::string>& given) {
   const FitFile& file = outcome->file;
   const auto print = [&] {
     if (arguments.json) {
-      print_result("{}\n", to_json(job.problem, file.report, file.options).dump(2));
+      print_result("{}\n", to_json(job.problem, *outcome).dump(2));
     } else {
       print_text(file.report);
+      if (outcome->cross_validation) print_result("{}\n", outcome->cross_validation->text());
     }
   };
   try {

@@ -22,7 +22,8 @@ struct Progress {
   int iteration = 0;
   double best = 0;  // lowest objective so far, over all restarts
   double seconds = 0;
-  double fraction = 0;  // of the work, estimated
+  double fraction = 0;      // of the work, estimated
+  bool is_drawing = false;  // hyperparameters, after the restarts
 };
 
 struct FitOptions {
@@ -36,9 +37,10 @@ struct FitOptions {
   double reduction_tolerance = 1e-12;             // stop when an iteration lowers the objective by less, relatively
   int max_escapes = 5;                            // scans for lower optima from the best one
   bool standard_errors = true;                    // FitReport::uncertainty, where parameters are estimated
+  int n_draws = 0;                                // of hyperparameters, over which the posterior is then the mixture; 0: none
   std::function<void(const Progress&)> progress;  // called from worker threads, one at a time
   /// Set: return the best so far, as not converged: interrupted. The evaluations under way are given up within a second or so,
-  /// and the posterior is conditioned when it is first asked (Posterior::lazy).
+  /// draws that are not complete are dropped, and the posterior is conditioned when it is first asked (Posterior::lazy).
   const std::atomic<bool>* stop = nullptr;
 };
 
@@ -74,6 +76,26 @@ struct LaplaceUncertainty {
   double distance_from_optimum = 0;
 };
 
+/// Draws of the hyperparameters given the data, by Hamiltonian Monte Carlo about the optima that the restarts found (theory.md,
+/// T31). Parameters that A or b depends on are held at the optimum, so that means and samples of the mixture obey one constraint.
+struct HyperparameterDraws {
+  static constexpr double largest_r_hat = 1.1;  // beyond, chains do not agree
+
+  Eigen::MatrixXd values;  // physical units, the likeliest first (n × draws)
+  // over all steps of the chains, of which `values` are some: each (n), in the units of the hyperparameters
+  Eigen::VectorXd mean, stddev;    // 0 where held
+  Eigen::VectorXd lower, upper;    // of what 95 % of the steps lie within
+  Eigen::VectorXd r_hat;           // split R̂ (Gelman et al. 2013, sec. 11.4): near 1 where the chains agree
+  Eigen::VectorXd effective_size;  // how many independent draws the steps are worth (ibid. sec. 11.5)
+  Eigen::MatrixXd correlation;     // 0 where one is held (n × n)
+  int n_chains = 0, evaluations = 0;
+  double acceptance = 0;
+
+  [[nodiscard]] int size() const { return static_cast<int>(values.cols()); }
+  /// Whether hyperparameter k was drawn, not held.
+  [[nodiscard]] bool is_drawn(Eigen::Index k) const { return stddev[k] > 0; }
+};
+
 struct FitReport {
   static constexpr const char* interrupted = "interrupted";  // termination of a fit that was stopped on request
 
@@ -87,6 +109,7 @@ struct FitReport {
   int n_escapes = 0;  // times the scan from the best optimum found a lower one
   std::vector<RestartReport> restarts;
   std::optional<LaplaceUncertainty> uncertainty;  // of the hyperparameters, in their order
+  std::optional<HyperparameterDraws> draws;       // of FitOptions::n_draws
   std::vector<DistrustedValue> distrusted;        // of a robust fit, the farthest first
   double seconds = 0;
 };
@@ -96,11 +119,23 @@ struct Fit {
   FitReport report;
 };
 
+/// The fitted hyperparameters' values or, where there are draws, those of each of them.
+/// @throws InputError  as model_values, and where draws are not of the hyperparameters.
+std::vector<ModelValues> values_of(const Prior& prior, const std::vector<Observations>& observations, const FitReport& report);
+
+/// The posterior under the fitted hyperparameters, or the mixture over their draws.
+/// @throws InputError, NumericalError  as Posterior and model_values.
+Posterior posterior_of(const Prior& prior, const std::vector<Observations>& observations, const FitReport& report);
+
+/// Evaluations of the likelihood, with gradients, that drawing takes at most beside those of the curvature at the optima.
+inline constexpr int draw_evaluations = 3600;
+
 /// Maximises the posterior density of the hyperparameters (marginal likelihood times hyper-priors) by L-BFGS-B from several
 /// starting points. From the best optimum each hyperparameter is then scanned over its box by itself, the others held, and the
 /// optimiser runs again from the lowest point found: an optimum in a corner of the box often hides a lower one. The prior is
 /// conditioned there. Loadings that start at zero, a stationary point, stay there in every run and are let go from the best.
-/// Same seed, same bits, for any number of threads.
+/// Same seed, same bits, for any number of threads. With n_draws hyperparameters are drawn about the optima then, at the cost of
+/// at most `draw_evaluations` more gradients, and the posterior is the mixture.
 ///
 /// @throws InputError, NumericalError  as Likelihood, Posterior and require_hyperparameters; InputError when nothing is measured,
 /// a start lies outside its bounds, or an option has no meaning; NumericalError when no restart reached a finite likelihood, or

@@ -27,6 +27,9 @@ struct ViewAt {
 /// constrained means and samples obey A ddq = b, and covariances A Σ Aᵀ = 0, to rounding. Without observations it is the prior.
 /// Immutable, cheap to copy, thread-safe. One that is given away can grow and shrink with its data: update, remove_oldest. Every
 /// member function throws InputError when the posterior was moved away.
+///
+/// It may be a mixture, of posteriors under equally likely draws of hyperparameters (theory.md, T31): means and covariances are then
+/// those of the mixture, and each sample is of one of its components.
 class Posterior {
  public:
   /// @throws InputError when prior, observations and values do not fit each other; and as require_mechanics and
@@ -35,6 +38,14 @@ class Posterior {
   Posterior(Prior prior, std::vector<Observations> observations, ModelValues values);
   /// The same, conditioned when it is first asked for more than what it was given: that call throws what the constructor throws.
   [[nodiscard]] static Posterior lazy(Prior prior, std::vector<Observations> observations, ModelValues values);
+
+  /// One component for each of several values, the first of which values() and negative_log_likelihood() tell.
+  /// @throws InputError when there are none; and as the constructor.
+  static Posterior mixture(const Prior& prior, const std::vector<Observations>& observations,
+                           const std::vector<ModelValues>& values);
+  [[nodiscard]] int n_components() const;
+  /// @throws InputError when there is no such component.
+  [[nodiscard]] Posterior component(int k) const;
 
   /// E[view] at N states (d × N). A state's result is the same, to the bit, whatever other states are asked for and however many
   /// threads work.
@@ -92,12 +103,16 @@ class Posterior {
   friend Posterior update(Posterior&& posterior, Observations added);
   friend Posterior remove_oldest(Posterior&& posterior, int n);
 
-  explicit Posterior(std::shared_ptr<const Implementation> implementation);
-  [[nodiscard]] const Implementation& implementation() const;  // throws when it was moved away
-  // this one's where nobody else holds it, else a copy
-  [[nodiscard]] std::shared_ptr<Implementation> own_implementation() const;
+  using Components = std::vector<std::shared_ptr<const Implementation>>;
 
-  std::shared_ptr<const Implementation> implementation_;
+  explicit Posterior(Components components);
+  [[nodiscard]] const Components& held() const;                // throws when it was moved away
+  [[nodiscard]] const Components& components() const;          // those, conditioned
+  [[nodiscard]] const Implementation& implementation() const;  // the first component; throws likewise
+  // those of this one where nobody else holds them, else copies
+  [[nodiscard]] std::vector<std::shared_ptr<Implementation>> own_components() const;
+
+  Components components_;
 };
 
 /// The posterior of more observations, by extending its factor: O(n²) operations for each new number, where the reduced size is n

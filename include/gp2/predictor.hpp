@@ -1,6 +1,7 @@
 #pragma once
 
 #include <memory>
+#include <vector>
 
 #include <Eigen/Core>
 
@@ -25,6 +26,8 @@ namespace gp2 GP2_API {
 /// Its error is of the same order: |X c| is off by O(n ε κ) ‖c‖ where the solve is off by O(n ε κ) |X c| (Higham 2002, ch. 8 and
 /// 14), κ the condition number of L, and ‖X‖ ≤ 1 since no eigenvalue of K̃ + I is below 1. A variance that rounding makes negative
 /// is 0.
+///
+/// Of a mixture they are its moments, at the cost of one prediction for each of its components.
 ///
 /// Immutable, cheap to copy, thread-safe; it holds its own copy of what it needs of the posterior. Every member function throws
 /// InputError when the predictor was moved away.
@@ -71,7 +74,7 @@ class Predictor {
 
    private:
     friend class Predictor;
-    std::unique_ptr<Implementation> implementation_;
+    std::vector<std::unique_ptr<Implementation>> components_;
   };
   [[nodiscard]] Workspace make_workspace() const { return Workspace(*this); }
 
@@ -120,9 +123,11 @@ class Predictor {
   [[nodiscard]] const Options& options() const;
 
  private:
-  [[nodiscard]] const Implementation& implementation() const;  // throws when it was moved away
+  [[nodiscard]] const Implementation& implementation() const;  // of the first component; throws when it was moved away
+  template <typename Evaluate>
+  Status for_each_component(Workspace& workspace, Eigen::Ref<Eigen::VectorXd>& mean, const Evaluate& evaluate) const;
 
-  std::shared_ptr<const Implementation> implementation_;
+  std::vector<std::shared_ptr<const Implementation>> components_;
 };
 
 }  // namespace gp2

@@ -35,6 +35,8 @@ struct Latent {
   };
 
   std::string name;
+  /// The one direction that this is of a [[latent]] with lengthscales for each; empty where they are shared.
+  std::string direction = {};
   Kernel kernel;
   std::vector<std::string> feature_names;         // of φ(x), D of them
   std::shared_ptr<const StateFunction> features;  // φ; parameters in it keep the model's values
@@ -90,8 +92,8 @@ struct PriorValues {
   /// The first state at which the known force or a direction is not a finite number.
   std::optional<MechanicsBatch::Fault> fault = {};
 
-  /// Leaves what one latent adds to ā: no μ, no other latent.
-  void keep_only(std::size_t latent);
+  /// Leaves what n latents from the first on add to ā: no μ, no other latent.
+  void keep_only(int first, int n);
 
   [[nodiscard]] Eigen::Map<const Eigen::MatrixXd> E(std::size_t latent, int i) const {
     return {directions[latent].col(i).data(), mean.rows(), directions[latent].rows() / mean.rows()};

@@ -23,6 +23,17 @@ struct OtherSystem {
   [[nodiscard]] Eigen::VectorXd parameters(const Eigen::Ref<const Eigen::VectorXd>& home) const;
 };
 
+/// Latents of a prior that follow each other: one, or those that one [[latent]] with lengthscales of its own for each direction
+/// became.
+struct LatentRange {
+  int first = 0, n = 1;
+
+  LatentRange(int one) : first(one) {}  // NOLINT(google-explicit-constructor): a latent is a range of one
+  LatentRange(int first_of, int n_of) : first(first_of), n(n_of) {}
+  [[nodiscard]] bool has(std::size_t a) const { return static_cast<int>(a) >= first && static_cast<int>(a) < first + n; }
+  bool operator==(const LatentRange&) const = default;
+};
+
 /// Rows of a quantity that is affine in the unconstrained acceleration ā of a prior: v(x) = G(x) ā(x) + d(x). Where M is singular
 /// ā stands for M'⁻¹F̄, the M' of UdwadiaKalaba, and cannot be viewed itself; elsewhere M' = M.
 struct View {
@@ -32,7 +43,7 @@ struct View {
   std::vector<int> rows;                 // of the quantity, in this order
   std::optional<double> time_step = {};  // Δt, of a quantity that needs one: next_velocity [s]
   /// What one latent alone adds: G E_a f_a, without μ and d. Not given: everything.
-  std::optional<int> latent = {};
+  std::optional<LatentRange> latent = {};
   /// The quantity as it is under another system. Null: the prior's own system.
   std::shared_ptr<const OtherSystem> other_system = nullptr;
 
@@ -52,7 +63,7 @@ struct View {
   [[nodiscard]] double required_time_step() const;
   /// Whether μ, or latent a, is part of it.
   [[nodiscard]] bool has_mean() const { return !latent; }
-  [[nodiscard]] bool has_latent(std::size_t a) const { return !latent || *latent == static_cast<int>(a); }
+  [[nodiscard]] bool has_latent(std::size_t a) const { return !latent || latent->has(a); }
   /// The entry of the state that is added to row k of the view, where there is one.
   [[nodiscard]] std::optional<int> added_entry(const StateLayout& layout, int k) const;
   /// Which entries of a state the view reads beyond those of the mechanics (layout size).

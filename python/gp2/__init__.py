@@ -11,6 +11,8 @@ Every prediction obeys the constraint A(q, dq, t) ddq = b(q, dq, t) to rounding 
 from gp2 import _objects as _objects
 from gp2._gp2 import (
     FAR_FROM_DATA,
+    Calibration,
+    CrossValidation,
     Evaluation,
     EvaluationPart,
     Finding,
@@ -44,6 +46,8 @@ from gp2._gp2 import (
 
 __all__ = [
     "FAR_FROM_DATA",
+    "Calibration",
+    "CrossValidation",
     "Evaluation",
     "EvaluationPart",
     "Finding",

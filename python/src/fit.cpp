@@ -212,6 +212,7 @@ void add_fit(py::module_& module) {
       .def_readonly("iteration", &Progress::iteration)
       .def_readonly("best", &Progress::best, "Lowest objective so far.")
       .def_readonly("seconds", &Progress::seconds)
+      .def_readonly("is_drawing", &Progress::is_drawing, "Whether hyperparameters are drawn, after the restarts.")
       .def_readonly("fraction", &Progress::fraction, "Of the work, estimated.");
 
   {

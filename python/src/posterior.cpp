@@ -10,9 +10,11 @@
 #include "arrays.hpp"
 #include "bindings.hpp"
 #include "gp2/error.hpp"
+#include "gp2/jobs/fit_job.hpp"
 #include "gp2/jobs/fit_problem.hpp"
 #include "gp2/jobs/predict_job.hpp"
 #include "gp2/jobs/simulate_job.hpp"
+#include "gp2/training/laplace.hpp"
 #include "options.hpp"
 
 namespace gp2::python {
@@ -319,10 +321,9 @@ py::list distrusted_values(const FitReport& self) {
 
 py::dict standard_errors(const FitReport& self) {
   py::dict errors;
-  for (std::size_t k = 0; self.uncertainty && k < self.hyperparameters.size(); ++k) {
+  for (std::size_t k = 0; (self.uncertainty || self.draws) && k < self.hyperparameters.size(); ++k) {
     const Hyperparameter& h = self.hyperparameters[k];
-    if (h.kind != Hyperparameter::Kind::parameter) continue;
-    errors[py::str(h.name)] = h.at_bound() ? std::nan("") : self.uncertainty->stddev[static_cast<Eigen::Index>(k)];
+    if (h.is_system_parameter()) errors[py::str(h.name)] = parameter_uncertainty(self, k).stddev;
   }
   return errors;
 }
@@ -330,12 +331,29 @@ py::dict standard_errors(const FitReport& self) {
 double correlation(const FitReport& self, const std::string& a, const std::string& b) {
   const auto index = [&](const std::string& name) {
     for (std::size_t k = 0; k < self.hyperparameters.size(); ++k) {
-      if (self.hyperparameters[k].name == name) return static_cast<Eigen::Index>(k);
+      if (self.hyperparameters[k].name == name) return k;
     }
     throw py::key_error(name);
   };
-  const Eigen::Index k = index(a), l = index(b);
-  return self.uncertainty ? self.uncertainty->correlation(k, l) : std::nan("");
+  return parameter_correlation(self, index(a), index(b));
+}
+
+// name -> what the draws say of a hyperparameter; None where there are none
+py::object draws_of(const FitReport& self) {
+  if (!self.draws) return py::none();
+  py::dict all;
+  for (std::size_t h = 0; h < self.hyperparameters.size(); ++h) {
+    const auto k = static_cast<Eigen::Index>(h);
+    py::dict one;
+    one["values"] = to_vector(Eigen::VectorXd(self.draws->values.row(k)));
+    one["mean"] = self.draws->mean[k];
+    one["std"] = self.draws->stddev[k];
+    one["interval95"] = py::make_tuple(self.draws->lower[k], self.draws->upper[k]);
+    one["r_hat"] = self.draws->r_hat[k];
+    one["effective_size"] = self.draws->effective_size[k];
+    all[py::str(self.hyperparameters[h].name)] = one;
+  }
+  return all;
 }
 
 double value_of(const FitReport& self, const std::string& name) {
@@ -351,8 +369,8 @@ std::string text_of(const FitReport& self) {
                                  self.best_restart + 1, self.seconds);
   for (std::size_t k = 0; k < self.hyperparameters.size(); ++k) {
     const Hyperparameter& h = self.hyperparameters[k];
-    const bool has_error = self.uncertainty && h.kind == Hyperparameter::Kind::parameter && !h.at_bound();
-    const std::string error = has_error ? fmt::format(" ± {:.2g}", self.uncertainty->stddev[static_cast<Eigen::Index>(k)]) : "";
+    const double stddev = h.is_system_parameter() ? parameter_uncertainty(self, k).stddev : std::nan("");
+    const std::string error = std::isnan(stddev) ? "" : fmt::format(" ± {:.2g}", stddev);
     text += fmt::format("\n  {:<34} {:>13.6g}{}   [{:.3g}, {:.3g}]{}", h.name, h.value, error, h.lower, h.upper,
                         h.is_fixed()   ? "   held"
                         : h.at_bound() ? "   at its bound"
@@ -376,9 +394,14 @@ void define_report(py::class_<FitReport>& report) {
           "distrusted", &distrusted_values,
           "Values that a robust fit distrusts, the farthest first: `log` and `state` count from 0, `row` among the observed.")
       .def_readonly("seconds", &FitReport::seconds)
+      .def_property_readonly("standard_errors", &standard_errors,
+                             "Of estimated parameters, by name: inf where the data do not determine one, nan where it is at a "
+                             "bound. Of the draws, where "
+                             "all that are estimated were drawn.")
       .def_property_readonly(
-          "standard_errors", &standard_errors,
-          "Of estimated parameters, by name: inf where the data do not determine one, nan where it is at a bound.")
+          "draws", &draws_of,
+          "Of hyperparameters='integrate': by name a dict of values (one for each component of the posterior), mean, "
+          "std, interval95, r_hat and effective_size; else None.")
       .def("correlation", &correlation, "a"_a, "b"_a, "Of the errors of two hyperparameters; nan where one is not determined.")
       .def("__getitem__", &value_of)
       .def("__repr__", &text_of);
@@ -431,12 +454,28 @@ void add_prediction(py::module_& module) {
 
 void add_evaluation(py::module_& module) {
   module.attr("FAR_FROM_DATA") = Posterior::far_from_data;
-  py::class_<Evaluation::Part>(module, "EvaluationPart", "Figures of some of the points; NaN where there is nothing to average.")
+  py::class_<Calibration>(module, "Calibration",
+                          "How errors lie within their predicted Gaussian marginals; NaN where there are none.")
+      .def_readonly("coverage50", &Calibration::coverage50, "Share of measurements in their 50 % intervals.")
+      .def_readonly("coverage80", &Calibration::coverage80)
+      .def_readonly("coverage95", &Calibration::coverage95)
+      .def_readonly("coverage50_latent", &Calibration::coverage50_latent, "The same of noise-free targets.")
+      .def_readonly("coverage80_latent", &Calibration::coverage80_latent)
+      .def_readonly("coverage95_latent", &Calibration::coverage95_latent)
+      .def_property_readonly(
+          "pit", [](const Calibration& c) { return to_vector(c.pit); },
+          "Share of measurements in each tenth of their predictive distributions: all 0.1 where errors are as predicted.");
+  py::class_<Evaluation::Part, Calibration>(module, "EvaluationPart", "Figures of some of the points.")
       .def_readonly("n", &Evaluation::Part::n)
-      .def_readonly("nrmse", &Evaluation::Part::nrmse, "Rms error over rms of the test spreads of all points.")
-      .def_readonly("coverage95", &Evaluation::Part::coverage95)
-      .def_readonly("coverage95_latent", &Evaluation::Part::coverage95_latent);
-  py::class_<Evaluation>(module, "Evaluation", "How well a posterior predicts measured accelerations.")
+      .def_readonly("nrmse", &Evaluation::Part::nrmse, "Rms error over rms of the test spreads of all points.");
+  py::class_<CrossValidation>(module, "CrossValidation", "Scores of the data of a fit, where it has not seen them.")
+      .def_readonly("one_by_one", &CrossValidation::one_by_one, "Each value from all others.")
+      .def_readonly(
+          "stretches", &CrossValidation::stretches,
+          "Each of five stretches of time from the rest: what a motion elsewhere would meet. None where the rows are in "
+          "no order of time.")
+      .def("__repr__", [](const CrossValidation& c) { return fmt::format("<gp2.CrossValidation: {}>", c.text()); });
+  py::class_<Evaluation, Calibration>(module, "Evaluation", "How well a posterior predicts measured accelerations.")
       .def_readonly("outputs", &Evaluation::outputs)
       .def_property_readonly(
           "rmse", [](const Evaluation& e) { return to_vector(e.rmse); }, "Per output, physical units.")
@@ -445,9 +484,7 @@ void add_evaluation(py::module_& module) {
       .def_readonly("max_constraint_error", &Evaluation::max_constraint_error, "max |A ddq - b|, the model's parameters.")
       .def_readonly("max_constraint_error_fitted", &Evaluation::max_constraint_error_fitted, "The same with the fitted ones.")
       .def_readonly("nlpd", &Evaluation::nlpd, "Negative log predictive density of measurements.")
-      .def_readonly("coverage95", &Evaluation::coverage95, "Share of measurements in their 95 % intervals.")
       .def_readonly("nlpd_latent", &Evaluation::nlpd_latent, "The same of noise-free targets.")
-      .def_readonly("coverage95_latent", &Evaluation::coverage95_latent)
       .def_readonly("n_zero_variance", &Evaluation::n_zero_variance,
                     "Marginals without variance, left out of the latent figures.")
       .def_readonly("near", &Evaluation::near, "Of the points near the data.")
@@ -543,6 +580,10 @@ void define_files_and_facts(py::class_<PyPosterior>& posterior) {
             for (std::size_t k = 0; k < parameters.size(); ++k) {
               values[py::str(parameters[k].name)] = self.posterior.values().parameters[static_cast<Index>(k)];
             }
+            // of a mixture each component has its own
+            for (const Hyperparameter& h : self.file.report.hyperparameters) {
+              if (h.is_system_parameter()) values[py::str(h.name)] = h.value;
+            }
             return values;
           },
           "The system's parameters, with the fitted values of those that were estimated.");
@@ -600,6 +641,13 @@ void define_evaluate_and_update(py::class_<PyPosterior>& posterior) {
   posterior
       .def("evaluate", &evaluate_posterior, "data"_a, "system"_a = nullptr, "outputs"_a = std::vector<std::string>(),
            "columns"_a = py::none(), "threads"_a = 0, "Compare with measured or true accelerations: the figures of gp2 evaluate.")
+      .def(
+          "cross_validate",
+          [](const PyPosterior& self) {
+            return cross_validate(self.posterior, keeps_row_order(self.file, self.posterior.observations()));
+          },
+          py::call_guard<py::gil_scoped_release>(),
+          "How well the data predict themselves: each value from all others, and each of five stretches of time from the rest.")
       .def("update", &update_with, "data"_a, "observe"_a = std::vector<std::string>(), "noise_std"_a = py::none(),
            "columns"_a = py::none(),
            "Add measured accelerations, in place: O(N²) per row. Hyperparameters, parameters and scales are held.")

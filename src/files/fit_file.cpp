@@ -381,12 +381,13 @@ Json observations_json(const Observations& group, const Prior& home, const Model
   Json json = {{"view", group.view().quantity->word()},
                {"rows", group.view().rows},
                {"time_step", group.view().time_step.value_or(0)},
-               {"latent", group.view().latent.value_or(-1)},
+               {"latent", group.view().latent.value_or(-1).first},
                {"n", group.n_data()},
                {"noise_stddev", vector_json(group.noise().stddev())},
                {"estimate_noise", group.noise().is_estimated()},
                {"states", rows_json(group.states(), system.state_names())},
                {"values", measured_json(group.values(), group.view().names(system))}};
+  if (group.view().latent && group.view().latent->n > 1) json["n_latents"] = group.view().latent->n;
   if (group.noise().has_scale()) json["noise_scale"] = measured_json(group.noise().scale(), group.view().names(system));
   if (other != nullptr) json["system"] = model_json(*other);
   return json;
@@ -409,7 +410,7 @@ View view_from(const ParsedJson& json, const Prior& home, std::shared_ptr<const 
   if (latent < -1 || latent >= static_cast<int>(prior.latents.size())) {
     throw InputError(fmt::format("latent {} of a view is outside -1 … {}", latent, prior.latents.size() - 1));
   }
-  if (latent >= 0) view.latent = latent;
+  if (latent >= 0) view.latent = {latent, json.contains("n_latents") ? integer(json.at("n_latents")) : 1};
   const int n_rows = View::all(*quantity, *prior.system).size();
   for (const ParsedJson& row : array(json.at("rows"))) {
     const int index = integer(row);
@@ -514,6 +515,61 @@ LaplaceUncertainty uncertainty_from(const ParsedJson& json, std::size_t n) {
   if (out.correlation.cols() != out.correlation.rows()) throw InputError("correlations that are not square");
   out.undetermined = columns(json.at("undetermined"));
   out.distance_from_optimum = number_or_infinity(json.at("distance_from_optimum"));
+  return out;
+}
+
+Json draws_json(const HyperparameterDraws& draws) {
+  return {{"values", columns_json(draws.values)},
+          {"mean", vector_json(draws.mean)},
+          {"stddev", vector_json(draws.stddev)},
+          {"lower", vector_json(draws.lower)},
+          {"upper", vector_json(draws.upper)},
+          {"r_hat", vector_json(draws.r_hat)},
+          {"effective_size", vector_json(draws.effective_size)},
+          {"correlation", columns_json(draws.correlation)},
+          {"n_chains", draws.n_chains},
+          {"evaluations", draws.evaluations},
+          {"acceptance", draws.acceptance}};
+}
+
+HyperparameterDraws draws_from(const ParsedJson& json, const std::vector<Hyperparameter>& hyperparameters) {
+  const auto column = [&](const ParsedJson& values) {
+    if (array(values).size() != hyperparameters.size()) {
+      throw InputError(fmt::format("draws of {} of {} hyperparameters", values.size(), hyperparameters.size()));
+    }
+    VectorXd out = vector_from(values);
+    if (!(out.cwiseAbs().array() <= largest_number).all()) throw InputError("draws hold a number that is too large");
+    return out;
+  };
+  const auto columns = [&](const ParsedJson& values) {
+    MatrixXd out(std::ssize(hyperparameters), static_cast<Index>(array(values).size()));
+    for (Index k = 0; k < out.cols(); ++k) out.col(k) = column(values[static_cast<std::size_t>(k)]);
+    return out;
+  };
+  // each is a matrix to factor
+  constexpr std::size_t most = 1000;
+  if (array(json.at("values")).empty() || json.at("values").size() > most) {
+    throw InputError(fmt::format("{} draws of hyperparameters, expected 1 … {}", json.at("values").size(), most));
+  }
+  HyperparameterDraws out;
+  out.values = columns(json.at("values"));
+  for (Index k = 0; k < out.values.rows(); ++k) {
+    const Hyperparameter& h = hyperparameters[static_cast<std::size_t>(k)];
+    if (!h.positive || out.values.row(k).minCoeff() >= smallest_scale) continue;
+    throw InputError(
+        fmt::format("a draw of hyperparameter '{}' has the impossible value {}", h.name, out.values.row(k).minCoeff()));
+  }
+  out.mean = column(json.at("mean"));
+  out.stddev = column(json.at("stddev"));
+  out.lower = column(json.at("lower"));
+  out.upper = column(json.at("upper"));
+  out.r_hat = column(json.at("r_hat"));
+  out.effective_size = column(json.at("effective_size"));
+  out.correlation = columns(json.at("correlation"));
+  if (out.correlation.cols() != out.correlation.rows()) throw InputError("correlations that are not square");
+  out.n_chains = integer(json.at("n_chains"));
+  out.evaluations = integer(json.at("evaluations"));
+  out.acceptance = number(json.at("acceptance"));
   return out;
 }
 
@@ -632,14 +688,16 @@ FitFile::FitFile(Model fitted_model, FitPriorOptions options_of_prior, const Fit
                     "at observations {}: {}",
                     g + 1, differs));
   }
-  if (are_same(model_values(made, observations, report.hyperparameters), fit.posterior.values())) return;
+  const std::vector<ModelValues> values = values_of(made, observations, report);
+  bool same = static_cast<int>(values.size()) == fit.posterior.n_components();
+  for (int k = 0; same && k < fit.posterior.n_components(); ++k) {
+    same = are_same(values[static_cast<std::size_t>(k)], fit.posterior.component(k).values());
+  }
+  if (same) return;
   throw InputError("FitFile: the hyperparameters of the report are not those of the posterior");
 }
 
-Posterior FitFile::posterior() const {
-  const Prior prior_of_model = prior();
-  return {prior_of_model, observations, model_values(prior_of_model, observations, report.hyperparameters)};
-}
+Posterior FitFile::posterior() const { return posterior_of(prior(), observations, report); }
 
 void FitFile::write(const std::filesystem::path& path) const {
   Json json;
@@ -649,7 +707,9 @@ void FitFile::write(const std::filesystem::path& path) const {
   json["model"] = model_json(model);
   json["prior"] = {{"mean", name_of(means, prior_options.mean)},
                    {"directions", name_of(directions, prior_options.base)},
-                   {"raw_angles", prior_options.raw_angles}};
+                   {"raw_angles", prior_options.raw_angles},
+                   {"kernel", prior_options.kernel},
+                   {"per_direction", prior_options.per_direction}};
   if (prior_options.baseline) json["prior"]["baseline"] = baseline_json(*prior_options.baseline);
   if (prior_options.discrepancy) {
     json["prior"]["discrepancy"] = {{"lengthscale", vector_json(prior_options.discrepancy->lengthscale)},
@@ -669,6 +729,7 @@ void FitFile::write(const std::filesystem::path& path) const {
                     {"restarts", Json::array()}};
   for (const RestartReport& restart : report.restarts) json["report"]["restarts"].push_back(restart_json(restart));
   if (report.uncertainty) json["report"]["uncertainty"] = uncertainty_json(*report.uncertainty);
+  if (report.draws) json["report"]["draws"] = draws_json(*report.draws);
   if (!options.empty()) json["options"] = Json::parse(options);
   json["data_source"] = data_source;
   json["observations"] = Json::array();
@@ -714,6 +775,13 @@ FitFile read_fit(std::string_view text, const std::filesystem::path& path, const
     fit.prior_options.mean = choice_from(prior_json.at("mean"), means, "prior mean");
     fit.prior_options.base = choice_from(prior_json.at("directions"), directions, "choice of directions");
     prior_json.at("raw_angles").get_to(fit.prior_options.raw_angles);
+    // until format 6 a latent without a kernel had this one
+    fit.prior_options.kernel = "se";
+    fit.prior_options.per_direction = false;
+    if (prior_json.contains("kernel")) {
+      prior_json.at("kernel").get_to(fit.prior_options.kernel);
+      prior_json.at("per_direction").get_to(fit.prior_options.per_direction);
+    }
     if (prior_json.contains("discrepancy")) fit.prior_options.discrepancy = discrepancy_from(prior_json.at("discrepancy"));
     if (prior_json.contains("baseline")) fit.prior_options.baseline = baseline_from(prior_json.at("baseline"));
     json.at("data_source").get_to(fit.data_source);
@@ -748,6 +816,7 @@ FitFile read_fit(std::string_view text, const std::filesystem::path& path, const
     if (report.contains("uncertainty")) {
       fit.report.uncertainty = uncertainty_from(report.at("uncertainty"), fit.report.hyperparameters.size());
     }
+    if (report.contains("draws")) fit.report.draws = draws_from(report.at("draws"), fit.report.hyperparameters);
   } catch (const Json::exception& error) {
     throw InputError(fmt::format("{}: not a whole fit file: {}", path.string(), error.what()));
   } catch (const InputError& error) {

@@ -1,5 +1,7 @@
 #include "inference/dense_gram.hpp"
 
+#include <algorithm>
+
 #include "base/lapack.hpp"
 #include "base/parallel.hpp"
 #include "inference/assemble.hpp"
@@ -34,20 +36,24 @@ GramGradient DenseGram::differentiate(const LatentRows& rows, const std::vector<
   return sweep_pairs(rows, factor_.invert(stop_), alpha, parts, n_threads(rows), stop_);
 }
 
-Gram::Inverse DenseGram::invert(const LatentRows& rows) {
+Gram::Inverse DenseGram::invert(const LatentRows& rows, const std::vector<std::vector<Index>>& sets) {
   const lapack::ManyThreads many_threads(n_blas_threads(rows));
-  Inverse inverse{factor_.solve(), {}};
+  Inverse inverse{factor_.solve(), {}, {}};
   const Ref<const MatrixXd> P = factor_.invert();
-  const std::vector<Index>& offset = rows.reduction->offset;
-  for (Index sample = 0; sample < rows.n_samples(); ++sample) {
-    const Index rank = rows.reduction->samples[static_cast<std::size_t>(sample)].R.rows();
-    MatrixXd& block = inverse.blocks.emplace_back(rank, rank);
-    for (Index c = 0; c < rank; ++c) {
-      for (Index d = 0; d <= c; ++d) {
-        block(c, d) = block(d, c) = P(offset[static_cast<std::size_t>(c)] + sample, offset[static_cast<std::size_t>(d)] + sample);
+  const Reduction& reduction = *rows.reduction;
+  const auto block = [&](const std::vector<Index>& of) {
+    MatrixXd P_of(std::ssize(of), std::ssize(of));
+    for (Index j = 0; j < P_of.cols(); ++j) {
+      for (Index i = j; i < P_of.rows(); ++i) {
+        const auto [low, high] = std::minmax(of[static_cast<std::size_t>(i)], of[static_cast<std::size_t>(j)]);
+        P_of(i, j) = P_of(j, i) = P(high, low);
       }
     }
-  }
+    return P_of;
+  };
+  for (Index sample = 0; sample < rows.n_samples(); ++sample)
+    inverse.blocks.push_back(block(rows_of_samples(reduction, {sample})));
+  for (const std::vector<Index>& set : sets) inverse.of_set.push_back(block(rows_of_samples(reduction, set)));
   return inverse;
 }
 

@@ -16,7 +16,7 @@ class DenseGram final : public Gram {
 
   [[nodiscard]] std::optional<GramValue> factorise(const LatentRows& rows) override;
   [[nodiscard]] GramGradient differentiate(const LatentRows& rows, const std::vector<GramGradientParts>& parts) override;
-  [[nodiscard]] Inverse invert(const LatentRows& rows) override;
+  [[nodiscard]] Inverse invert(const LatentRows& rows, const std::vector<std::vector<Eigen::Index>>& sets) override;
   [[nodiscard]] std::unique_ptr<LatentPosterior> condition(const LatentRows& rows) const override;
 
  private:

@@ -21,25 +21,22 @@ using Eigen::VectorXd;
 
 namespace {
 
-// mean negative log density and share inside ±1.96 σ of Gaussian marginals
-struct Calibration {
+// Standardised errors under Gaussian marginals, and their mean negative log density.
+struct StandardisedErrors {
   double sum = 0;
-  int inside = 0, n = 0;
+  std::vector<double> z;
 
   void add(double error, double stddev) {
-    const double z = error / stddev;
-    sum += 0.5 * z * z + std::log(stddev) + 0.5 * std::log(2 * std::numbers::pi);
-    constexpr double z95 = 1.959963984540054;
-    if (std::abs(z) <= z95) ++inside;
-    ++n;
+    z.push_back(error / stddev);
+    sum += 0.5 * z.back() * z.back() + std::log(stddev) + 0.5 * std::log(2 * std::numbers::pi);
   }
-  [[nodiscard]] double nlpd() const { return n == 0 ? not_a_number : sum / n; }
-  [[nodiscard]] double coverage() const { return n == 0 ? not_a_number : static_cast<double>(inside) / n; }
+  [[nodiscard]] double nlpd() const { return z.empty() ? not_a_number : sum / static_cast<double>(z.size()); }
+  [[nodiscard]] Eigen::Map<const VectorXd> vector() const { return {z.data(), std::ssize(z)}; }
 };
 
 // What errors of some points come to.
 struct Scores {
-  Calibration measured, latent;
+  StandardisedErrors measured, latent;
   VectorXd squares, counts;  // per output
   int n = 0;                 // points
 
@@ -52,9 +49,21 @@ struct Scores {
     if (has_variance) latent.add(error, stddev);
   }
   [[nodiscard]] VectorXd rmse() const { return (squares.array() / counts.array()).sqrt(); }
+  [[nodiscard]] Calibration calibration() const {
+    const Eigen::Vector3d levels(0.5, 0.8, 0.95);
+    const VectorXd of_measured = central_coverage(measured.vector(), levels),
+                   of_latent = central_coverage(latent.vector(), levels);
+    return {of_measured[0],
+            of_measured[1],
+            of_measured[2],
+            of_latent[0],
+            of_latent[1],
+            of_latent[2],
+            pit_histogram(measured.vector(), Calibration::n_bins)};
+  }
   [[nodiscard]] Evaluation::Part part(double spread) const {
     const VectorXd of_observed = (counts.array() > 0).select(rmse(), 0);
-    return {n, counts.sum() > 0 ? of_observed.norm() / spread : not_a_number, measured.coverage(), latent.coverage()};
+    return {calibration(), n, counts.sum() > 0 ? of_observed.norm() / spread : not_a_number};
   }
 };
 
@@ -118,6 +127,31 @@ double max_constraint_error(const System& system, const Ref<const MatrixXd>& sta
   return worst;
 }
 
+VectorXd central_coverage(const Ref<const VectorXd>& z, const Ref<const VectorXd>& levels) {
+  VectorXd n_within = VectorXd::Zero(levels.size());
+  double n = 0;
+  for (const double one : z) {
+    if (std::isnan(one)) continue;
+    ++n;
+    // the central interval that just holds it
+    const double probability = std::erf(std::abs(one) / std::numbers::sqrt2);
+    for (Index l = 0; l < levels.size(); ++l) n_within[l] += probability <= levels[l] ? 1 : 0;
+  }
+  return n_within / n;
+}
+
+VectorXd pit_histogram(const Ref<const VectorXd>& z, int n_bins) {
+  VectorXd n_within = VectorXd::Zero(n_bins);
+  double n = 0;
+  for (const double one : z) {
+    if (std::isnan(one)) continue;
+    ++n;
+    const double pit = 0.5 * std::erfc(-one / std::numbers::sqrt2);
+    n_within[std::min(static_cast<Index>(pit * n_bins), n_within.size() - 1)] += 1;
+  }
+  return n_within / n;
+}
+
 std::vector<int> observed_rows(const Posterior& posterior) {
   std::set<int> rows;
   for (const Observations& group : posterior.observations()) {
@@ -126,7 +160,10 @@ std::vector<int> observed_rows(const Posterior& posterior) {
   return {rows.begin(), rows.end()};
 }
 
-MatrixXd measurement_noise(const Posterior& posterior, const std::vector<int>& rows, Index n_states, const MatrixXd& stated) {
+namespace {
+
+// of one component
+MatrixXd measurement_noise_of(const Posterior& posterior, const std::vector<int>& rows, Index n_states, const MatrixXd& stated) {
   MatrixXd noise(std::ssize(rows), n_states);
   for (Index r = 0; r < noise.rows(); ++r) {
     double usual = not_a_number, factor = 1;
@@ -143,6 +180,18 @@ MatrixXd measurement_noise(const Posterior& posterior, const std::vector<int>& r
     }
   }
   return noise;
+}
+
+}  // namespace
+
+MatrixXd measurement_noise(const Posterior& posterior, const std::vector<int>& rows, Index n_states, const MatrixXd& stated) {
+  const int n = posterior.n_components();
+  if (n == 1) return measurement_noise_of(posterior, rows, n_states, stated);
+  MatrixXd variance = MatrixXd::Zero(std::ssize(rows), n_states);
+  for (int k = 0; k < n; ++k) {
+    variance += measurement_noise_of(posterior.component(k), rows, n_states, stated).cwiseAbs2() / n;
+  }
+  return variance.cwiseSqrt();
 }
 
 MatrixXd with_slip(const Posterior& posterior, const View& view, const Ref<const MatrixXd>& states, MatrixXd noise_stddev) {
@@ -165,8 +214,9 @@ bool TrainingResidual::is_correlated() const {
   return n >= 30 && serial_correlation > 0.5 && serial_correlation > 4 / std::sqrt(n);
 }
 
-std::vector<TrainingResidual> training_residuals(const Posterior& posterior) {
-  const std::vector<LeaveOneOut> left_out = leave_one_out(posterior);
+namespace {
+
+std::vector<TrainingResidual> training_residuals(const Posterior& posterior, const std::vector<LeaveOneOut>& left_out) {
   std::vector<TrainingResidual> residuals;
   for (std::size_t g = 0; g < left_out.size(); ++g) {
     const Observations& group = posterior.observations()[g];
@@ -177,25 +227,75 @@ std::vector<TrainingResidual> training_residuals(const Posterior& posterior) {
       one.group = g;
       one.output = names[static_cast<std::size_t>(k)];
       double before = not_a_number, products = 0;
-      Calibration calibration;
+      StandardisedErrors errors;
       for (Index i = 0; i < group.n_data(); ++i) {
         const double error = group.values()(k, i) - left_out[g].mean(k, i);
         if (std::isnan(error)) continue;
         const double stddev =
             std::hypot(std::sqrt(left_out[g].variance(k, i)), group.noise_at(posterior.values().noise_stddev[g], i)[k]);
         const double z = error / stddev;
-        calibration.add(error, stddev);
+        errors.add(error, stddev);
         one.rms += z * z;
         if (!std::isnan(before)) products += before * z;
         before = z;
       }
-      one.n = calibration.n;
-      one.coverage95 = calibration.coverage();
+      one.n = static_cast<int>(errors.z.size());
+      one.coverage95 = central_coverage(errors.vector(), VectorXd::Constant(1, 0.95))[0];
       one.serial_correlation = one.rms > 0 ? products / one.rms : 0;
       one.rms = std::sqrt(one.rms / std::max(1, one.n));
     }
   }
   return residuals;
+}
+
+// Of the measured values of ddq, row by row over all observations.
+Evaluation::Part scores_of(const Posterior& posterior, const std::vector<LeaveOneOut>& left_out) {
+  const std::vector<int> rows = observed_rows(posterior);
+  Scores scores(std::ssize(rows));
+  VectorXd spread(std::ssize(rows));
+  for (Index r = 0; r < spread.size(); ++r) {
+    spread[r] = training_spread(posterior, rows[static_cast<std::size_t>(r)]);
+    for_each_observed(posterior, rows[static_cast<std::size_t>(r)], [&](std::size_t g, Index k) {
+      const Observations& group = posterior.observations()[g];
+      for (Index i = 0; i < group.n_data(); ++i) {
+        const double error = group.values()(k, i) - left_out[g].mean(k, i);
+        if (std::isnan(error)) continue;
+        scores.add(r, error, std::sqrt(left_out[g].variance(k, i)), group.noise_at(posterior.values().noise_stddev[g], i)[k],
+                   /*has_variance=*/false);
+      }
+    });
+  }
+  for (const Observations& group : posterior.observations()) scores.n += group.view().is_of_ddq() ? group.n_data() : 0;
+  return scores.part(spread.norm());
+}
+
+// Whether stretches of the observations are stretches of time.
+bool has_stretches(const Posterior& posterior, bool has_time_order) {
+  const int t = posterior.prior().system->layout().t();
+  int n_states = 0;
+  for (const Observations& group : posterior.observations()) {
+    has_time_order = has_time_order || group.states().row(t).allFinite();
+    n_states += group.n_data();
+  }
+  return has_time_order && n_states >= 2 * CrossValidation::n_stretches;
+}
+
+}  // namespace
+
+CrossValidation cross_validate(const Posterior& posterior, bool has_time_order) {
+  const LeftOut left_out = leave_out(posterior, has_stretches(posterior, has_time_order) ? CrossValidation::n_stretches : 0);
+  CrossValidation out{scores_of(posterior, left_out.values), std::nullopt, training_residuals(posterior, left_out.values)};
+  if (!left_out.stretches.empty()) out.stretches = scores_of(posterior, left_out.stretches);
+  return out;
+}
+
+std::string CrossValidation::text() const {
+  std::string text =
+      fmt::format("left out one by one: nrmse {:.3g}, 95 % coverage {:.3g}", one_by_one.nrmse, one_by_one.coverage95);
+  if (stretches) {
+    text += fmt::format("; in {} stretches of the log: {:.3g}, {:.3g}", n_stretches, stretches->nrmse, stretches->coverage95);
+  }
+  return text;
 }
 
 std::vector<ConstraintResidual> constraint_residuals(const Posterior& posterior,
@@ -262,6 +362,7 @@ Evaluation evaluate_predictions(const Posterior& posterior, const Ref<const Matr
       for (Scores* scores : {&whole, &part}) scores->add(k, error, stddev(row, i), noise(k, i), has_variance);
     }
   }
+  static_cast<Calibration&>(e) = whole.calibration();
   const double spread = row_stddev(targets).norm();
   e.rmse = whole.rmse();
   double normalised = 0;
@@ -275,9 +376,7 @@ Evaluation evaluate_predictions(const Posterior& posterior, const Ref<const Matr
   e.max_constraint_error = max_constraint_error(system, states, system.parameter_values(), prediction.mean);
   e.max_constraint_error_fitted = max_constraint_error(system, states, parameters, prediction.mean);
   e.nlpd = whole.measured.nlpd();
-  e.coverage95 = whole.measured.coverage();
   e.nlpd_latent = whole.latent.nlpd();
-  e.coverage95_latent = whole.latent.coverage();
   return e;
 }
 

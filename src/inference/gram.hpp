@@ -111,9 +111,11 @@ class Gram {
   struct Inverse {
     Eigen::VectorXd alpha;                // α̃
     std::vector<Eigen::MatrixXd> blocks;  // P_ii of each sample (r × r)
+    std::vector<Eigen::MatrixXd> of_set;  // P_BB of each set B of samples, one after the other (Σ r × Σ r)
   };
   /// Once after factorise of the same rows.
-  [[nodiscard]] virtual Inverse invert(const LatentRows& rows) = 0;
+  /// @param sets  of samples, of which P_BB is asked for
+  [[nodiscard]] virtual Inverse invert(const LatentRows& rows, const std::vector<std::vector<Eigen::Index>>& sets) = 0;
 
   /// The latents given the observations; null where K̃ + I is not positive definite in double precision.
   [[nodiscard]] virtual std::unique_ptr<LatentPosterior> condition(const LatentRows& rows) const = 0;

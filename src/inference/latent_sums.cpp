@@ -14,8 +14,8 @@ namespace {
 constexpr Index chunk = 256;  // points of the basis whose features stay in the L1 cache
 }  // namespace
 
-void LatentSums::evaluate(const std::vector<MatrixXd>& features, std::optional<int> latent, const std::vector<MatrixXd>* loadings,
-                          MatrixXd* cross) {
+void LatentSums::evaluate(const std::vector<MatrixXd>& features, std::optional<LatentRange> latent,
+                          const std::vector<MatrixXd>* loadings, MatrixXd* cross) {
   const std::size_t n_latents = posterior_.latents().size();
   const Index n_states = features.front().rows();
   const Index d = cross == nullptr || n_states == 0 ? 0 : cross->cols() / n_states;

@@ -18,14 +18,14 @@ class LatentSums {
   [[nodiscard]] const std::vector<Eigen::MatrixXd>& mean() const { return mean_; }
 
   /// @param features  per latent (n × D)
-  /// @param latent    the one that is needed; not given: all
+  /// @param latent    those that are needed; not given: all
   /// @param loadings  per latent: ℓ_aᵀ at each state (F·d × n); where not null, `cross` receives cov(basis variables,
   ///                  Σ_a ℓ_aᵀ f_a), d columns per state
-  void evaluate(const std::vector<Eigen::MatrixXd>& features, std::optional<int> latent,
+  void evaluate(const std::vector<Eigen::MatrixXd>& features, std::optional<LatentRange> latent,
                 const std::vector<Eigen::MatrixXd>* loadings = nullptr, Eigen::MatrixXd* cross = nullptr);
 
  private:
-  [[nodiscard]] bool needs(std::size_t a) const { return !latent_ || *latent_ == static_cast<int>(a); }
+  [[nodiscard]] bool needs(std::size_t a) const { return !latent_ || latent_->has(a); }
   Eigen::VectorXd& point(std::size_t a, Eigen::Index i) { return points_[a][static_cast<std::size_t>(i)]; }
   void add_chunk(std::size_t a, Eigen::Index first, Eigen::Index n, Eigen::Index i);
   void write_cross(Eigen::Index first, Eigen::Index n, Eigen::Index i, const std::vector<Eigen::MatrixXd>& loadings,
@@ -37,7 +37,7 @@ class LatentSums {
   Eigen::VectorXd products_, sums_;
   std::vector<Eigen::MatrixXd> mean_;
   KernelColumns::Workspace kernel_;
-  std::optional<int> latent_;
+  std::optional<LatentRange> latent_;
 };
 
 }  // namespace gp2

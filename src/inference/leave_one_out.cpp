@@ -1,6 +1,11 @@
 #include "gp2/inference/leave_one_out.hpp"
 
+#include <algorithm>
 #include <cmath>
+#include <numeric>
+
+#include <fmt/format.h>
+#include <Eigen/Cholesky>
 
 #include "base/lapack.hpp"
 #include "base/not_a_number.hpp"
@@ -13,23 +18,22 @@ using Eigen::Index;
 using Eigen::MatrixXd;
 using Eigen::VectorXd;
 
-std::vector<LeaveOneOut> leave_one_out(const Posterior& posterior) {
-  const lapack::SingleThread single_thread;
-  const Prior& prior = posterior.prior();
-  const std::vector<Observations>& observations = posterior.observations();
-  const ModelValues& values = posterior.values();
-  Reduction reduction;
-  reduce(prior, observations, require_models(prior, observations, values.parameters, {}), values.noise_stddev, reduction);
-  const LatentRows rows = latent_rows(prior, observations, reduction, values);
-  DenseGram gram;
-  if (!gram.factorise(rows)) throw NumericalError("leave_one_out: the covariance of the observations cannot be factored");
-  const Gram::Inverse inverse = gram.invert(rows);
+namespace {
 
+std::vector<LeaveOneOut> unknown(const std::vector<Observations>& observations) {
   std::vector<LeaveOneOut> out;
   for (const Observations& group : observations) {
-    out.push_back({MatrixXd::Constant(group.values().rows(), group.values().cols(), not_a_number),
-                   MatrixXd::Constant(group.values().rows(), group.values().cols(), not_a_number)});
+    const MatrixXd none = MatrixXd::Constant(group.values().rows(), group.values().cols(), not_a_number);
+    out.push_back({none, none});
   }
+  return out;
+}
+
+// Each value from all others.
+std::vector<LeaveOneOut> each_value(const Posterior& posterior, const Reduction& reduction, const Gram::Inverse& inverse) {
+  const std::vector<Observations>& observations = posterior.observations();
+  const ModelValues& values = posterior.values();
+  std::vector<LeaveOneOut> out = unknown(observations);
   for (std::size_t s = 0; s < reduction.samples.size(); ++s) {
     const Reduction::Sample& sample = reduction.samples[s];
     const Index rank = sample.R.rows();
@@ -57,5 +61,147 @@ std::vector<LeaveOneOut> leave_one_out(const Posterior& posterior) {
   }
   return out;
 }
+
+// The samples of each stretch, which is the same share of the states of every Observations.
+std::vector<std::vector<Index>> samples_of_stretches(const Posterior& posterior, const Reduction& reduction, int n_stretches) {
+  if (n_stretches == 0) return {};
+  const std::vector<Observations>& observations = posterior.observations();
+  std::vector<std::vector<int>> stretch_of;  // by Observations and state
+  for (const Observations& group : observations) {
+    std::vector<int> order(static_cast<std::size_t>(group.n_data()));
+    std::iota(order.begin(), order.end(), 0);
+    const auto t = group.states().row(posterior.prior().system->layout().t());
+    if (t.allFinite()) std::stable_sort(order.begin(), order.end(), [&](int i, int j) { return t[i] < t[j]; });
+    std::vector<int>& of_states = stretch_of.emplace_back(order.size());
+    for (std::size_t k = 0; k < order.size(); ++k) {
+      of_states[static_cast<std::size_t>(order[k])] = static_cast<int>(k * static_cast<std::size_t>(n_stretches) / order.size());
+    }
+  }
+  std::vector<std::vector<Index>> samples(static_cast<std::size_t>(n_stretches));
+  for (Index s = 0; s < reduction.n_samples(); ++s) {
+    const Reduction::Sample& sample = reduction.samples[static_cast<std::size_t>(s)];
+    const int stretch = stretch_of[static_cast<std::size_t>(sample.group)][static_cast<std::size_t>(sample.index)];
+    samples[static_cast<std::size_t>(stretch)].push_back(s);
+  }
+  return samples;
+}
+
+// The values of one sample, where those of its stretch say nothing.
+// @param pull        its rows of P_BB⁻¹α̃_B
+// @param covariance  its block of P_BB⁻¹
+void add_sample(const Posterior& posterior, const Reduction::Sample& sample, const VectorXd& pull, const MatrixXd& covariance,
+                std::vector<LeaveOneOut>& out) {
+  const auto g = static_cast<std::size_t>(sample.group);
+  const Observations& group = posterior.observations()[g];
+  const VectorXd noise = group.noise_at(posterior.values().noise_stddev[g], sample.index);
+  MatrixXd root = sample.C;  // S^{1/2}
+  if (root.size() == 0) root = noise.unaryExpr([](double one) { return std::isfinite(one) ? one : 1; }).asDiagonal();
+  const VectorXd error = root * (sample.Q * pull + sample.e_out);
+  const MatrixXd rooted = root * sample.Q;
+  const MatrixXd latent = rooted * (covariance - MatrixXd::Identity(pull.size(), pull.size())) * rooted.transpose();
+  for (Index k = 0; k < noise.size(); ++k) {
+    if (!std::isfinite(noise[k])) continue;  // not measured
+    const double slip = root.row(k).squaredNorm() - noise[k] * noise[k];
+    out[g].mean(k, sample.index) = group.values()(k, sample.index) - error[k];
+    out[g].variance(k, sample.index) = std::max(0.0, latent(k, k) + slip);
+  }
+}
+
+// Each value from those of other stretches; empty where double precision cannot tell.
+std::vector<LeaveOneOut> each_stretch(const Posterior& posterior, const Reduction& reduction, const Gram::Inverse& inverse,
+                                      const std::vector<std::vector<Index>>& stretches) {
+  std::vector<LeaveOneOut> out = unknown(posterior.observations());
+  for (std::size_t b = 0; b < stretches.size(); ++b) {
+    const Eigen::LLT<MatrixXd> factor(inverse.of_set[b]);
+    if (factor.info() != Eigen::Success) return {};
+    const VectorXd pull = factor.solve(inverse.alpha(rows_of_samples(reduction, stretches[b])));
+    const MatrixXd root = factor.matrixL().solve(MatrixXd::Identity(pull.size(), pull.size()));
+    Index first = 0;
+    for (const Index s : stretches[b]) {
+      const Reduction::Sample& sample = reduction.samples[static_cast<std::size_t>(s)];
+      const Index rank = sample.R.rows();
+      const auto columns = root.bottomRows(root.rows() - first).middleCols(first, rank);  // root is a lower triangle
+      add_sample(posterior, sample, pull.segment(first, rank), columns.transpose() * columns, out);
+      first += rank;
+    }
+  }
+  return out;
+}
+
+// log of w_k, but for a constant, of one value
+double log_weight(double error, double variance) { return 0.5 * (error * error / variance + std::log(variance)); }
+
+// Of one Observations, from what each component says of it.
+// @param weigh  by w_k, each value; else all are equal
+LeaveOneOut mixed(const Posterior& posterior, std::size_t group, const std::vector<const LeaveOneOut*>& of, bool weigh) {
+  const Observations& observed = posterior.observations()[group];
+  const auto n = of.size();
+  std::vector<VectorXd> noise_stddev;
+  for (std::size_t k = 0; k < n; ++k) {
+    noise_stddev.push_back(posterior.component(static_cast<int>(k)).values().noise_stddev[group]);
+  }
+  LeaveOneOut out = *of.front();
+  VectorXd weight(static_cast<Index>(n)), mean(weight.size()), variance(weight.size());
+  for (Index i = 0; i < out.mean.cols(); ++i) {
+    for (Index r = 0; r < out.mean.rows(); ++r) {
+      if (std::isnan(out.mean(r, i))) continue;
+      for (std::size_t k = 0; k < n; ++k) {
+        const auto at = static_cast<Index>(k);
+        mean[at] = of[k]->mean(r, i);
+        variance[at] = of[k]->variance(r, i);
+        const double noise = observed.noise_at(noise_stddev[k], static_cast<int>(i))[r];
+        weight[at] = log_weight(observed.values()(r, i) - mean[at], variance[at] + noise * noise);
+      }
+      if (!weigh) weight.setZero();
+      weight = (weight.array() - weight.maxCoeff()).exp();
+      weight /= weight.sum();
+      out.mean(r, i) = weight.dot(mean);
+      out.variance(r, i) = weight.dot(VectorXd(variance.array() + (mean.array() - out.mean(r, i)).square()));
+    }
+  }
+  return out;
+}
+
+// under one set of hyperparameters
+LeftOut leave_out_of(const Posterior& posterior, int n_stretches) {
+  const Prior& prior = posterior.prior();
+  const std::vector<Observations>& observations = posterior.observations();
+  const ModelValues& values = posterior.values();
+  Reduction reduction;
+  reduce(prior, observations, require_models(prior, observations, values.parameters, {}), values.noise_stddev, reduction);
+  const LatentRows rows = latent_rows(prior, observations, reduction, values);
+  DenseGram gram;
+  if (!gram.factorise(rows)) throw NumericalError("leave_one_out: the covariance of the observations cannot be factored");
+  const std::vector<std::vector<Index>> stretches = samples_of_stretches(posterior, reduction, n_stretches);
+  const Gram::Inverse inverse = gram.invert(rows, stretches);
+  LeftOut out{each_value(posterior, reduction, inverse), {}};
+  if (n_stretches > 0) out.stretches = each_stretch(posterior, reduction, inverse, stretches);
+  return out;
+}
+
+}  // namespace
+
+LeftOut leave_out(const Posterior& posterior, int n_stretches) {
+  if (n_stretches < 0) throw InputError(fmt::format("leave_out: n_stretches must not be negative, got {}", n_stretches));
+  const lapack::SingleThread single_thread;
+  if (posterior.n_components() == 1) return leave_out_of(posterior, n_stretches);
+  std::vector<LeftOut> of_components;
+  for (int k = 0; k < posterior.n_components(); ++k) of_components.push_back(leave_out_of(posterior.component(k), n_stretches));
+  const auto all = [&](std::vector<LeaveOneOut> LeftOut::*part, bool weigh) {
+    std::vector<LeaveOneOut> out;
+    for (std::size_t g = 0; g < posterior.observations().size(); ++g) {
+      std::vector<const LeaveOneOut*> of_group;
+      for (const LeftOut& component : of_components) {
+        if ((component.*part).empty()) return std::vector<LeaveOneOut>{};
+        of_group.push_back(&(component.*part)[g]);
+      }
+      out.push_back(mixed(posterior, g, of_group, weigh));
+    }
+    return out;
+  };
+  return {all(&LeftOut::values, true), all(&LeftOut::stretches, false)};
+}
+
+std::vector<LeaveOneOut> leave_one_out(const Posterior& posterior) { return leave_out(posterior, 0).values; }
 
 }  // namespace gp2

@@ -53,9 +53,9 @@ bool model_observations(const Prior& prior, const std::vector<Observations>& obs
           {differentiate_view(group.view(), model.mechanics, d),
            differentiate_prior(there, group.states(), theta, model.mechanics, model.values.prior, d, index)});
     }
-    if (group.view().latent) {
-      model.values.prior.keep_only(static_cast<std::size_t>(*group.view().latent));
-      for (ObservationModel::Values& d : model.derivatives) d.prior.keep_only(static_cast<std::size_t>(*group.view().latent));
+    if (const std::optional<LatentRange>& latent = group.view().latent) {
+      model.values.prior.keep_only(latent->first, latent->n);
+      for (ObservationModel::Values& d : model.derivatives) d.prior.keep_only(latent->first, latent->n);
     }
   }
   return true;

@@ -1,6 +1,7 @@
 #include "gp2/inference/pathwise.hpp"
 
 #include <algorithm>
+#include <span>
 
 #include <fmt/format.h>
 
@@ -49,8 +50,11 @@ MatrixXd evaluate_prior_path(const LatentPath& path, const KernelColumns& kernel
 }  // namespace
 
 struct PathwiseSamples::Implementation {
-  std::shared_ptr<const Posterior::Implementation> posterior;
-  std::vector<std::vector<LatentPath>> samples;  // [sample][latent]
+  struct Sample {
+    std::shared_ptr<const Posterior::Implementation> posterior;  // the component that it is of
+    std::vector<LatentPath> paths;                               // per latent
+  };
+  std::vector<Sample> samples;
 };
 
 PathwiseSamples::PathwiseSamples(std::shared_ptr<const Implementation> implementation)
@@ -66,8 +70,8 @@ MatrixXd PathwiseSamples::evaluate(int sample, const View& view, const Ref<const
   if (sample < 0 || sample >= n_samples()) {
     throw InputError(fmt::format("sample {}: there are {} samples, 0 is the first", sample, n_samples()));
   }
-  const Posterior::Implementation& posterior = *implementation().posterior;
-  const std::vector<LatentPath>& paths = implementation().samples[static_cast<std::size_t>(sample)];
+  const auto& [component, paths] = implementation().samples[static_cast<std::size_t>(sample)];
+  const Posterior::Implementation& posterior = *component;
   const Query query = make_query(posterior, view, states);
   std::vector<MatrixXd> f(paths.size());
   KernelColumns::Workspace workspace;
@@ -98,32 +102,34 @@ PathwiseSamples sample_paths(const Posterior& posterior, int n_samples, const Pa
   if (n_samples < 1) throw InputError(fmt::format("sample_paths: n_samples must be 1 or more, got {}", n_samples));
   if (options.n_features < 1)
     throw InputError(fmt::format("sample_paths: n_features must be 1 or more, got {}", options.n_features));
-  static_cast<void>(posterior.implementation());  // it was not moved away
-  auto self = std::make_shared<PathwiseSamples::Implementation>();
-  self->posterior = posterior.implementation_;
-  const Posterior::Implementation& conditioned = *self->posterior;
   const lapack::SingleThread single_thread;
-
-  // solved in blocks that are always as wide, so that the bits of a sample do not depend on how many there are
-  constexpr int block_size = 8;
-  const LatentPosterior& latents = *conditioned.latents;
-  MatrixXd misfits = MatrixXd::Zero(latents.size(), block_size);
-  for (int first = 0; first < n_samples; first += block_size) {
-    const int end = std::min(first + block_size, n_samples);
-    for (int s = first; s < end; ++s) {
-      RandomStream random(options.seed, static_cast<std::uint64_t>(s));
-      std::vector<LatentPath>& paths = self->samples.emplace_back();
-      std::vector<MatrixXd> f;
-      for (std::size_t a = 0; a < conditioned.prior.latents.size(); ++a) {
-        paths.push_back(draw_prior_path(conditioned, a, options.n_features, random));
-        f.push_back(evaluate_prior_path(paths.back(), latents.latents()[a].kernel));
+  auto self = std::make_shared<PathwiseSamples::Implementation>();
+  self->samples.resize(static_cast<std::size_t>(n_samples));
+  const std::vector<std::vector<Index>> samples_of = samples_of_components(posterior.n_components(), n_samples, options.seed);
+  for (std::size_t k = 0; k < samples_of.size(); ++k) {
+    const auto& component = posterior.components()[k];
+    const LatentPosterior& latents = *component->latents;
+    // solved in blocks that are always as wide, so that the bits of a sample do not depend on how many there are
+    constexpr std::size_t block_size = 8;
+    MatrixXd misfits = MatrixXd::Zero(latents.size(), block_size);
+    for (std::size_t first = 0; first < samples_of[k].size(); first += block_size) {
+      const std::span<const Index> block(samples_of[k].data() + first, std::min(block_size, samples_of[k].size() - first));
+      for (std::size_t b = 0; b < block.size(); ++b) {
+        RandomStream random(options.seed, static_cast<std::uint64_t>(block[b]));
+        PathwiseSamples::Implementation::Sample& sample = self->samples[static_cast<std::size_t>(block[b])];
+        sample.posterior = component;
+        std::vector<MatrixXd> f;
+        for (std::size_t a = 0; a < component->prior.latents.size(); ++a) {
+          sample.paths.push_back(draw_prior_path(*component, a, options.n_features, random));
+          f.push_back(evaluate_prior_path(sample.paths.back(), latents.latents()[a].kernel));
+        }
+        misfits.col(static_cast<Index>(b)) = latents.misfit(f, random);
       }
-      misfits.col(s - first) = latents.misfit(f, random);
-    }
-    std::vector<std::vector<MatrixXd>> weights = latents.weights(misfits);
-    for (int s = first; s < end; ++s) {
-      std::vector<LatentPath>& paths = self->samples[static_cast<std::size_t>(s)];
-      for (std::size_t a = 0; a < paths.size(); ++a) paths[a].beta = std::move(weights[static_cast<std::size_t>(s - first)][a]);
+      std::vector<std::vector<MatrixXd>> weights = latents.weights(misfits);
+      for (std::size_t b = 0; b < block.size(); ++b) {
+        std::vector<LatentPath>& paths = self->samples[static_cast<std::size_t>(block[b])].paths;
+        for (std::size_t a = 0; a < paths.size(); ++a) paths[a].beta = std::move(weights[b][a]);
+      }
     }
   }
   return PathwiseSamples(std::move(self));

@@ -4,6 +4,8 @@
 #include <numeric>
 #include <utility>
 
+#include <fmt/format.h>
+
 #include "base/lapack.hpp"
 #include "base/parallel.hpp"
 #include "base/simd.hpp"
@@ -80,15 +82,32 @@ void Posterior::Implementation::condition() {
 }
 
 Posterior::Posterior(Prior prior, std::vector<Observations> observations, ModelValues values) {
-  const std::shared_ptr<Implementation> self = unconditioned(std::move(prior), std::move(observations), std::move(values));
+  std::shared_ptr<Implementation> self = unconditioned(std::move(prior), std::move(observations), std::move(values));
   self->condition();
-  implementation_ = self;
+  components_ = {std::move(self)};
 }
 
 Posterior Posterior::lazy(Prior prior, std::vector<Observations> observations, ModelValues values) {
-  const std::shared_ptr<Implementation> self = unconditioned(std::move(prior), std::move(observations), std::move(values));
+  std::shared_ptr<Implementation> self = unconditioned(std::move(prior), std::move(observations), std::move(values));
   self->conditioning = std::make_shared<std::once_flag>();
-  return Posterior(self);
+  return Posterior(Components{std::move(self)});
+}
+
+Posterior Posterior::mixture(const Prior& prior, const std::vector<Observations>& observations,
+                             const std::vector<ModelValues>& values) {
+  if (values.empty()) throw InputError("Posterior::mixture: there are no values");
+  Components components;
+  for (const ModelValues& of_one : values) components.push_back(Posterior(prior, observations, of_one).components_.front());
+  return Posterior(std::move(components));
+}
+
+int Posterior::n_components() const { return static_cast<int>(held().size()); }
+
+Posterior Posterior::component(int k) const {
+  if (k < 0 || k >= n_components()) {
+    throw InputError(fmt::format("Posterior: component {}: there are {}, 0 is the first", k, n_components()));
+  }
+  return Posterior(Components{components_[static_cast<std::size_t>(k)]});
 }
 
 namespace {
@@ -111,8 +130,9 @@ void add_prior_covariance(double k, const double* left, const double* right, Ind
 
 }  // namespace
 
-MatrixXd Posterior::mean(const View& view, const Ref<const MatrixXd>& states, int n_threads) const {
-  const Implementation& self = implementation();
+namespace {
+
+MatrixXd mean_of(const Posterior::Implementation& self, const View& view, const Ref<const MatrixXd>& states, int n_threads) {
   require_query(self, view, states);
   constexpr Index block_size = 256;
   n_threads = thread_count(n_threads);
@@ -126,6 +146,22 @@ MatrixXd Posterior::mean(const View& view, const Ref<const MatrixXd>& states, in
     sum.evaluate(query.features, view.latent);
     query.view_of(self, sum.mean(), mean.middleCols(first, n));
   });
+  return mean;
+}
+
+}  // namespace
+
+MatrixXd Posterior::mean(const View& view, const Ref<const MatrixXd>& states, int n_threads) const {
+  MatrixXd mean;
+  for (const auto& component : components()) {
+    MatrixXd one = mean_of(*component, view, states, n_threads);
+    if (mean.size() == 0) {
+      mean = std::move(one);
+    } else {
+      mean += one;
+    }
+  }
+  if (components_.size() > 1) mean /= static_cast<double>(components_.size());
   return mean;
 }
 
@@ -197,22 +233,52 @@ class MarginalBlock {
 
 }  // namespace
 
-Posterior::Marginal Posterior::marginal(const View& view, const Ref<const MatrixXd>& states, int n_threads) const {
-  const Implementation& self = implementation();
+namespace {
+
+// Mean and covariance of a mixture of equal weights (theory.md, T31); of one component they are its own.
+template <typename Gaussian, typename AddSquare>
+Gaussian mixed(std::vector<Gaussian> components, const AddSquare& add_square) {
+  Gaussian out = components.front();
+  if (components.size() == 1) return out;
+  for (std::size_t k = 1; k < components.size(); ++k) {
+    out.mean += components[k].mean;
+    out.covariance += components[k].covariance;
+  }
+  out.mean /= static_cast<double>(components.size());
+  for (const Gaussian& component : components) add_square(out.covariance, component.mean - out.mean);
+  out.covariance /= static_cast<double>(components.size());
+  return out;
+}
+
+Posterior::Marginal marginal_of(const Posterior::Implementation& self, const View& view, const Ref<const MatrixXd>& states,
+                                int n_threads) {
   require_query(self, view, states);
-  const lapack::SingleThread single_thread;
   constexpr Index block_size = 64;
   n_threads = thread_count(n_threads);
   const Index d = view.size();
   std::vector<MarginalBlock> blocks(static_cast<std::size_t>(n_threads), MarginalBlock(self));
   std::vector<int> n_clipped(static_cast<std::size_t>(n_threads));
-  Marginal marginal{MatrixXd(d, states.cols()), MatrixXd(d * d, states.cols()), 0};
+  Posterior::Marginal marginal{MatrixXd(d, states.cols()), MatrixXd(d * d, states.cols()), 0};
   for_each_block(states.cols(), block_size, n_threads, [&](Index first, Index n, int thread) {
     const std::size_t own = static_cast<std::size_t>(thread);
     n_clipped[own] += blocks[own].evaluate(view, states, first, n, marginal);
   });
   marginal.n_clipped = std::accumulate(n_clipped.begin(), n_clipped.end(), 0);
   return marginal;
+}
+
+}  // namespace
+
+Posterior::Marginal Posterior::marginal(const View& view, const Ref<const MatrixXd>& states, int n_threads) const {
+  const lapack::SingleThread single_thread;
+  std::vector<Marginal> of_components;
+  for (const auto& component : components()) of_components.push_back(marginal_of(*component, view, states, n_threads));
+  const Index d = view.size();
+  return mixed(std::move(of_components), [d](MatrixXd& covariance, const MatrixXd& deviation) {
+    for (Index i = 0; i < deviation.cols(); ++i) {
+      Map<MatrixXd>(covariance.col(i).data(), d, d) += deviation.col(i) * deviation.col(i).transpose();
+    }
+  });
 }
 
 MatrixXd Posterior::Marginal::stddev() const {
@@ -263,9 +329,9 @@ void add_prior_covariance(const Posterior::Implementation& self, const Query& le
 
 }  // namespace
 
-Posterior::Joint Posterior::joint(const std::vector<ViewAt>& quantities) const {
-  const Implementation& self = implementation();
-  const lapack::SingleThread single_thread;
+namespace {
+
+Posterior::Joint joint_of(const Posterior::Implementation& self, const std::vector<ViewAt>& quantities) {
   std::vector<Query> queries;
   std::vector<std::vector<MatrixXd>> loadings;
   std::vector<Index> first;  // row of each query
@@ -276,7 +342,7 @@ Posterior::Joint Posterior::joint(const std::vector<ViewAt>& quantities) const {
     first.push_back(size);
     size += query.n_rows() * query.size();
   }
-  Joint joint{VectorXd(size), MatrixXd::Zero(size, size)};
+  Posterior::Joint joint{VectorXd(size), MatrixXd::Zero(size, size)};
   MatrixXd cross(self.latents->size(), size), cross_of_query;
   LatentSums sums(*self.latents);
   for (std::size_t q = 0; q < queries.size(); ++q) {
@@ -298,32 +364,47 @@ Posterior::Joint Posterior::joint(const std::vector<ViewAt>& quantities) const {
   return joint;
 }
 
+}  // namespace
+
+Posterior::Joint Posterior::joint(const std::vector<ViewAt>& quantities) const {
+  const lapack::SingleThread single_thread;
+  std::vector<Joint> of_components;
+  for (const auto& component : components()) of_components.push_back(joint_of(*component, quantities));
+  return mixed(std::move(of_components), [](MatrixXd& covariance, const VectorXd& deviation) {
+    covariance.noalias() += deviation * deviation.transpose();
+  });
+}
+
 Posterior::Joint Posterior::joint(const View& view, const Ref<const MatrixXd>& states) const {
   return joint({ViewAt{view, states}});
 }
 
 Posterior Posterior::without_data() const {
-  const Implementation& self = implementation();
-  ModelValues values = self.values;
-  values.noise_stddev.clear();
-  return {self.prior, {}, std::move(values)};
-}
-
-Posterior::Posterior(std::shared_ptr<const Implementation> implementation) : implementation_(std::move(implementation)) {}
-
-const Posterior::Implementation& Posterior::implementation() const {
-  const Implementation& self = require_held(implementation_, "Posterior");
-  if (self.conditioning) {
-    std::call_once(*self.conditioning, [this] { std::const_pointer_cast<Implementation>(implementation_)->condition(); });
+  std::vector<ModelValues> values;
+  for (const auto& component : components()) {
+    values.push_back(component->values);
+    values.back().noise_stddev.clear();
   }
-  return self;
+  return mixture(prior(), {}, values);
 }
 
-const Prior& Posterior::prior() const { return require_held(implementation_, "Posterior").prior; }
-const std::vector<Observations>& Posterior::observations() const {
-  return require_held(implementation_, "Posterior").observations;
+Posterior::Posterior(Components components) : components_(std::move(components)) {}
+
+const Posterior::Components& Posterior::held() const {
+  if (components_.empty()) throw_moved("Posterior");
+  return components_;
 }
-const ModelValues& Posterior::values() const { return require_held(implementation_, "Posterior").values; }
+const Posterior::Components& Posterior::components() const {
+  for (const auto& component : held()) {
+    if (!component->conditioning) continue;
+    std::call_once(*component->conditioning, [&] { std::const_pointer_cast<Implementation>(component)->condition(); });
+  }
+  return components_;
+}
+const Posterior::Implementation& Posterior::implementation() const { return *components().front(); }
+const Prior& Posterior::prior() const { return held().front()->prior; }
+const std::vector<Observations>& Posterior::observations() const { return held().front()->observations; }
+const ModelValues& Posterior::values() const { return held().front()->values; }
 int Posterior::reduced_size() const { return static_cast<int>(implementation().latents->size()); }
 
 double Posterior::negative_log_likelihood() const {

@@ -43,4 +43,7 @@ struct Posterior::Implementation {
   void erase_empty_groups();
 };
 
+/// Which samples are of which component: each of one that chance chooses, by the seed and its number alone.
+std::vector<std::vector<Eigen::Index>> samples_of_components(int n_components, int n_samples, std::uint64_t seed);
+
 }  // namespace gp2

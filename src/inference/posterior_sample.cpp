@@ -80,11 +80,8 @@ LatentGaussian latent_posterior(const Posterior::Implementation& self, const Lat
   return out;
 }
 
-}  // namespace
-
-MatrixXd Posterior::sample(const std::vector<ViewAt>& quantities, int n_samples, std::uint64_t seed) const {
-  const Implementation& self = implementation();
-  const lapack::SingleThread single_thread;
+MatrixXd sample_of(const Posterior::Implementation& self, const std::vector<ViewAt>& quantities, int n_samples,
+                   RandomStream random) {
   std::vector<Query> queries;
   Index n_rows = 0;
   for (const ViewAt& quantity : quantities) {
@@ -96,7 +93,6 @@ MatrixXd Posterior::sample(const std::vector<ViewAt>& quantities, int n_samples,
 
   // f = mean + P L ξ, of a covariance Pᵀ Σ P = L Lᵀ that may be singular
   const lapack::PivotedFactor factor = lapack::factorise_semidefinite(latents.covariance);
-  RandomStream random(seed);
   MatrixXd xi(points.size, n_samples);
   for (double& entry : xi.reshaped()) entry = random.normal();
   MatrixXd f(points.size, n_samples);
@@ -116,6 +112,32 @@ MatrixXd Posterior::sample(const std::vector<ViewAt>& quantities, int n_samples,
       }
       samples.middleRows(row, query.n_rows()) = (query.view.G(i) * a_bar).colwise() + query.view.offset.col(i);
     }
+  }
+  return samples;
+}
+
+}  // namespace
+
+std::vector<std::vector<Index>> samples_of_components(int n_components, int n_samples, std::uint64_t seed) {
+  std::vector<std::vector<Index>> samples_of(static_cast<std::size_t>(n_components));
+  for (int s = 0; s < n_samples; ++s) {
+    // a stream of its own, that no sample draws from
+    RandomStream random(~seed, static_cast<std::uint64_t>(s));
+    samples_of[static_cast<std::size_t>(random.uniform() * n_components)].push_back(s);
+  }
+  return samples_of;
+}
+
+MatrixXd Posterior::sample(const std::vector<ViewAt>& quantities, int n_samples, std::uint64_t seed) const {
+  const lapack::SingleThread single_thread;
+  const std::vector<std::vector<Index>> samples_of = samples_of_components(n_components(), n_samples, seed);
+  MatrixXd samples;
+  for (std::size_t k = 0; k < samples_of.size(); ++k) {
+    if (samples_of[k].empty() && k > 0) continue;
+    const MatrixXd of_one =
+        sample_of(*components()[k], quantities, static_cast<int>(samples_of[k].size()), RandomStream(seed, k));
+    samples.resize(of_one.rows(), n_samples);
+    samples(Eigen::all, samples_of[k]) = of_one;
   }
   return samples;
 }

@@ -14,41 +14,75 @@ namespace gp2 {
 
 using Eigen::Index;
 
-std::shared_ptr<Posterior::Implementation> Posterior::own_implementation() const {
-  static_cast<void>(implementation());  // it is conditioned
-  if (implementation_.use_count() > 1) {
-    auto copy = std::make_shared<Implementation>(*implementation_);
-    copy->latents = implementation_->latents->clone();
-    return copy;
+namespace {
+
+std::shared_ptr<Posterior::Implementation> copy_of(const Posterior::Implementation& of) {
+  auto copy = std::make_shared<Posterior::Implementation>(of);
+  copy->latents = of.latents->clone();
+  return copy;
+}
+
+void add(Posterior::Implementation& self, const Observations& added) {
+  // the group that has this view and noise, or one of its own
+  std::size_t group = 0;
+  const auto belongs = [&] {
+    const Observations& there = self.observations[group];
+    return there.view() == added.view() && self.values.noise_stddev[group] == added.noise().stddev() &&
+           there.noise().has_scale() == added.noise().has_scale();
+  };
+  while (group < self.observations.size() && !belongs()) ++group;
+  self.add_samples({added}, {added.noise().stddev()}, static_cast<int>(group));
+  if (group < self.observations.size()) {
+    self.observations[group].append(added);
+  } else {
+    self.values.noise_stddev.push_back(added.noise().stddev());
+    self.observations.push_back(added);
   }
-  // What another thread read through a copy that it has just let go was read before what is written now: to count down acquires
-  // what it released. A fence would do, but the thread sanitizer does not know them.
-  std::shared_ptr<const Implementation>(implementation_).reset();
-  return std::const_pointer_cast<Implementation>(implementation_);
+}
+
+void remove_oldest_of(Posterior::Implementation& self, int n) {
+  std::vector<Index> gone(self.samples.size());
+  std::iota(gone.begin(), gone.end(), Index{0});
+  const auto is_older = [&](Index i, Index j) {
+    return self.samples[static_cast<std::size_t>(i)].number < self.samples[static_cast<std::size_t>(j)].number;
+  };
+  std::partial_sort(gone.begin(), gone.begin() + n, gone.end(), is_older);
+  gone.resize(static_cast<std::size_t>(n));
+  std::sort(gone.begin(), gone.end());
+
+  // in each group the oldest stand first
+  std::vector<int> n_gone(self.observations.size());
+  for (const Index sample : gone) ++n_gone[static_cast<std::size_t>(self.samples[static_cast<std::size_t>(sample)].group)];
+  self.erase_samples(gone);
+  for (std::size_t group = 0; group < n_gone.size(); ++group) self.observations[group].remove_first(n_gone[group]);
+  self.erase_empty_groups();
+}
+
+}  // namespace
+
+std::vector<std::shared_ptr<Posterior::Implementation>> Posterior::own_components() const {
+  std::vector<std::shared_ptr<Implementation>> own;
+  for (const auto& component : components()) {
+    // of several, one that fails must leave the others as they were
+    if (components_.size() > 1 || component.use_count() > 1) {
+      own.push_back(copy_of(*component));
+      continue;
+    }
+    // What another thread read through a copy that it has just let go was read before what is written now: to count down acquires
+    // what it released. A fence would do, but the thread sanitizer does not know them.
+    std::shared_ptr<const Implementation>(component).reset();
+    own.push_back(std::const_pointer_cast<Implementation>(component));
+  }
+  return own;
 }
 
 Posterior update(Posterior&& posterior, Observations added) {
   require_observations(posterior.prior(), added);
   const lapack::SingleThread single_thread;
-  const auto self = posterior.own_implementation();
-
-  // the group that has this view and noise, or one of its own
-  std::size_t group = 0;
-  const auto belongs = [&] {
-    const Observations& there = self->observations[group];
-    return there.view() == added.view() && self->values.noise_stddev[group] == added.noise().stddev() &&
-           there.noise().has_scale() == added.noise().has_scale();
-  };
-  while (group < self->observations.size() && !belongs()) ++group;
-  self->add_samples({added}, {added.noise().stddev()}, static_cast<int>(group));
-  if (group < self->observations.size()) {
-    self->observations[group].append(added);
-  } else {
-    self->values.noise_stddev.push_back(added.noise().stddev());
-    self->observations.push_back(std::move(added));
-  }
-  posterior.implementation_.reset();
-  return Posterior(self);
+  const auto own = posterior.own_components();
+  for (const auto& component : own) add(*component, added);
+  posterior.components_.clear();
+  return Posterior(Posterior::Components(own.begin(), own.end()));
 }
 
 Posterior remove_oldest(Posterior&& posterior, int n) {
@@ -58,24 +92,10 @@ Posterior remove_oldest(Posterior&& posterior, int n) {
         fmt::format("remove_oldest: there are {} observed states, so n must be 0 … {}, got {}", n_samples, n_samples, n));
   }
   const lapack::SingleThread single_thread;
-  const auto self = posterior.own_implementation();
-  std::vector<Index> gone(n_samples);
-  std::iota(gone.begin(), gone.end(), Index{0});
-  const auto is_older = [&](Index i, Index j) {
-    return self->samples[static_cast<std::size_t>(i)].number < self->samples[static_cast<std::size_t>(j)].number;
-  };
-  std::partial_sort(gone.begin(), gone.begin() + n, gone.end(), is_older);
-  gone.resize(static_cast<std::size_t>(n));
-  std::sort(gone.begin(), gone.end());
-
-  // in each group the oldest stand first
-  std::vector<int> n_gone(self->observations.size());
-  for (const Index sample : gone) ++n_gone[static_cast<std::size_t>(self->samples[static_cast<std::size_t>(sample)].group)];
-  self->erase_samples(gone);
-  for (std::size_t group = 0; group < n_gone.size(); ++group) self->observations[group].remove_first(n_gone[group]);
-  self->erase_empty_groups();
-  posterior.implementation_.reset();
-  return Posterior(self);
+  const auto own = posterior.own_components();
+  for (const auto& component : own) remove_oldest_of(*component, n);
+  posterior.components_.clear();
+  return Posterior(Posterior::Components(own.begin(), own.end()));
 }
 
 void Posterior::Implementation::erase_empty_groups() {

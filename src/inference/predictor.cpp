@@ -40,7 +40,7 @@ struct Predictor::Implementation {
   bool needs_acceleration = false;                // ā itself, which is none where M is singular
   PredictorData<double> in_double;
   PredictorData<float> in_single;
-  DataDistance distance;
+  DataDistance distance;  // of the first component of a mixture alone
 
   Implementation(const Posterior::Implementation& posterior, View viewed, Options given);
 
@@ -115,6 +115,8 @@ struct Predictor::Workspace::Implementation {
   std::vector<MatrixXd> loadings;  // ℓ, per term (F × d)
   VectorXd variance;               // (d)
   VectorXd coordinates;            // of the distance from the data
+  VectorXd mean, stddev;           // of a component of a mixture (d)
+  MatrixXd jacobian;               // likewise (d × layout size)
   PredictorData<double>::Memory in_double;
   PredictorData<float>::Memory in_single;
 
@@ -193,7 +195,6 @@ Predictor::Implementation::Implementation(const Posterior::Implementation& poste
     has_forced_latent = has_forced_latent || prior.latents[a].base == Latent::Base::force;
   }
   has_force = has_mean_force() || has_forced_latent;
-  distance = DataDistance(posterior, view);
   if (options.storage == Storage::single_precision) {
     in_single.store(*posterior.latents, terms, options.stddev);
   } else {
@@ -231,6 +232,8 @@ void Predictor::Workspace::Implementation::reserve_mechanics() {
   Gt.setZero(nq, d);
   M_inverse_Gt = Gt;
   variance.setZero(d);
+  mean = stddev = variance;
+  jacobian.setZero(d, n_state);
   // rows that are all the same, so that the memory for redundant ones is there too
   const MatrixXd rows = MatrixXd::Ones(nc, nq);
   projection.compute(MatrixXd::Identity(nq, nq), rows, VectorXd::Zero(nc));
@@ -532,55 +535,90 @@ Predictor::Predictor(const Posterior& posterior)
 Predictor::Predictor(const Posterior& posterior, View view) : Predictor(posterior, std::move(view), Options()) {}
 Predictor::Predictor(const Posterior& posterior, View view, Options options) {
   require_view(posterior.prior(), view);
-  implementation_ = std::make_shared<const Implementation>(posterior.implementation(), std::move(view), options);
+  for (const auto& component : posterior.components()) {
+    const auto own = std::make_shared<Implementation>(*component, view, options);
+    if (components_.empty()) own->distance = DataDistance(*component, view);
+    components_.push_back(own);
+  }
 }
 
 Predictor::Workspace::Workspace(const Predictor& predictor) {
   static_cast<void>(predictor.implementation());  // it was not moved away
-  implementation_ = std::make_unique<Implementation>(predictor.implementation_);
+  for (const auto& component : predictor.components_) components_.push_back(std::make_unique<Implementation>(component));
 }
 Predictor::Workspace::~Workspace() = default;
 Predictor::Workspace::Workspace(Workspace&&) noexcept = default;
 Predictor::Workspace& Predictor::Workspace::operator=(Workspace&&) noexcept = default;
 
-const Predictor::Implementation& Predictor::implementation() const { return require_held(implementation_, "Predictor"); }
+const Predictor::Implementation& Predictor::implementation() const {
+  if (components_.empty()) throw_moved("Predictor");
+  return *components_.front();
+}
 const View& Predictor::view() const { return implementation().view; }
 const Predictor::Options& Predictor::options() const { return implementation().options; }
 
 namespace {
 
+using WorkspaceParts = std::vector<std::unique_ptr<Predictor::Workspace::Implementation>>;
+
 void check_arguments(const Predictor::Implementation& predictor, const Ref<const VectorXd>& state,
-                     const Predictor::Workspace::Implementation* workspace) {
-  if (workspace == nullptr || workspace->predictor.get() != &predictor) {
+                     const WorkspaceParts& workspace) {
+  if (workspace.empty() || workspace.front()->predictor.get() != &predictor) {
     throw InputError("Predictor: the workspace is of another predictor; use make_workspace() of this one");
   }
   check_size("a state", state.size(), predictor.prior.system->layout().size());
 }
 void check_arguments(const Predictor::Implementation& predictor, const Ref<const VectorXd>& state, const Ref<VectorXd>& mean,
-                     const Predictor::Workspace::Implementation* workspace) {
+                     const WorkspaceParts& workspace) {
   check_arguments(predictor, state, workspace);
   check_size("the mean", mean.size(), predictor.view.size());
 }
 
 }  // namespace
 
+// evaluate(component, its memory, its mean) of each, and the mean of their means; NaN where one has none
+template <typename Evaluate>
+Status Predictor::for_each_component(Workspace& workspace, Ref<VectorXd>& mean, const Evaluate& evaluate) const {
+  if (components_.size() == 1) return evaluate(*components_.front(), *workspace.components_.front(), mean);
+  mean.setZero();
+  for (std::size_t k = 0; k < components_.size(); ++k) {
+    Workspace::Implementation& w = *workspace.components_[k];
+    const Status status = evaluate(*components_[k], w, w.mean);
+    if (status != Status::ok) {
+      mean.setConstant(not_a_number);
+      return status;
+    }
+    mean += w.mean;
+  }
+  mean /= static_cast<double>(components_.size());
+  return Status::ok;
+}
+
 Status Predictor::mean(const Ref<const VectorXd>& state, Ref<VectorXd> mean, Workspace& workspace) const {
-  check_arguments(implementation(), state, mean, workspace.implementation_.get());
-  Workspace::Implementation& w = *workspace.implementation_;
-  return implementation_->write_mean(state, *w.values, w, mean);
+  check_arguments(implementation(), state, mean, workspace.components_);
+  return for_each_component(workspace, mean, [&](const Implementation& self, Workspace::Implementation& w, Ref<VectorXd> mean_k) {
+    return self.write_mean(state, *w.values, w, mean_k);
+  });
 }
 
 Status Predictor::mean_and_stddev(const Ref<const VectorXd>& state, Ref<VectorXd> mean, Ref<VectorXd> stddev,
                                   Workspace& workspace) const {
   if (!options().stddev) throw InputError("Predictor: it was made without Options::stddev");
   check_size("the standard deviation", stddev.size(), view().size());
-  check_arguments(implementation(), state, mean, workspace.implementation_.get());
-  Workspace::Implementation& w = *workspace.implementation_;
-  const Status status = implementation_->write_mean(state, *w.values, w, mean);
-  if (status == Status::ok) {
-    implementation_->write_stddev(*w.values, w, stddev);
-  } else {
+  check_arguments(implementation(), state, mean, workspace.components_);
+  const bool is_mixture = components_.size() > 1;
+  const Status status =
+      for_each_component(workspace, mean, [&](const Implementation& self, Workspace::Implementation& w, Ref<VectorXd> mean_k) {
+        const Status of_one = self.write_mean(state, *w.values, w, mean_k);
+        if (of_one == Status::ok) self.write_stddev(*w.values, w, is_mixture ? Ref<VectorXd>(w.stddev) : stddev);
+        return of_one;
+      });
+  if (status != Status::ok) {
     stddev.setConstant(not_a_number);
+  } else if (is_mixture) {
+    stddev.setZero();
+    for (const auto& w : workspace.components_) stddev.array() += w->stddev.array().square() + (w->mean - mean).array().square();
+    stddev = (stddev / static_cast<double>(components_.size())).cwiseSqrt();
   }
   return status;
 }
@@ -588,27 +626,29 @@ Status Predictor::mean_and_stddev(const Ref<const VectorXd>& state, Ref<VectorXd
 Status Predictor::mean_and_jacobian(const Ref<const VectorXd>& state, Ref<VectorXd> mean, Ref<MatrixXd> jacobian,
                                     Workspace& workspace) const {
   if (!options().jacobian) throw InputError("Predictor: it was made without Options::jacobian");
-  check_arguments(implementation(), state, mean, workspace.implementation_.get());
+  check_arguments(implementation(), state, mean, workspace.components_);
   check_size("a column of the Jacobian", jacobian.rows(), view().size());
   check_size("a row of the Jacobian", jacobian.cols(), state.size());
-  Workspace::Implementation& w = *workspace.implementation_;
-  StateEvaluator& at = *w.values_and_derivatives;
-  Status status = implementation_->write_mean(state, at, w, mean);
-  if (status == Status::ok) {
-    implementation_->write_jacobian(state, at, w, jacobian);
-    if (!is_finite(jacobian)) {
-      mean.setConstant(not_a_number);
-      status = Status::not_finite;
-    }
-  }
-  if (status != Status::ok) jacobian.setConstant(not_a_number);
+  const bool is_mixture = components_.size() > 1;
+  if (is_mixture) jacobian.setZero();
+  Status status =
+      for_each_component(workspace, mean, [&](const Implementation& self, Workspace::Implementation& w, Ref<VectorXd> mean_k) {
+        StateEvaluator& at = *w.values_and_derivatives;
+        const Status of_one = self.write_mean(state, at, w, mean_k);
+        if (of_one != Status::ok) return of_one;
+        self.write_jacobian(state, at, w, is_mixture ? Ref<MatrixXd>(w.jacobian) : jacobian);
+        if (is_mixture) jacobian += w.jacobian / static_cast<double>(components_.size());
+        return is_finite(jacobian) ? Status::ok : Status::not_finite;
+      });
+  if (status == Status::ok) return status;
+  mean.setConstant(not_a_number);
+  jacobian.setConstant(not_a_number);
   return status;
 }
 
 double Predictor::distance_from_data(const Ref<const VectorXd>& state, Workspace& workspace) const {
-  check_arguments(implementation(), state, workspace.implementation_.get());
-  Workspace::Implementation& w = *workspace.implementation_;
-  return implementation_->distance_at(state, w);
+  check_arguments(implementation(), state, workspace.components_);
+  return implementation().distance_at(state, *workspace.components_.front());
 }
 
 }  // namespace gp2

@@ -19,7 +19,7 @@ void Query::evaluate(const Posterior::Implementation& posterior, const View& vie
   view = evaluate_view(viewed, mechanics, block);
   prior = require_prior_values(there, block, parameters, mechanics);
   latent = viewed.latent;
-  if (latent) prior.keep_only(static_cast<std::size_t>(*latent));
+  if (latent) prior.keep_only(latent->first, latent->n);
   features.resize(there.latents.size());
   for (std::size_t a = 0; a < features.size(); ++a) features[a] = evaluate_features(there, a, block);
 }

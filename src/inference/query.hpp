@@ -15,11 +15,11 @@ struct Query {
   ViewValues view;
   PriorValues prior;
   std::vector<Eigen::MatrixXd> features;  // per latent (n × D)
-  std::optional<int> latent;              // the one that is viewed alone
+  std::optional<LatentRange> latent;      // the one that is viewed alone
 
   [[nodiscard]] Eigen::Index size() const { return view.offset.cols(); }    // n
   [[nodiscard]] Eigen::Index n_rows() const { return view.offset.rows(); }  // d
-  [[nodiscard]] bool needs(std::size_t a) const { return !latent || *latent == static_cast<int>(a); }
+  [[nodiscard]] bool needs(std::size_t a) const { return !latent || latent->has(a); }
 
   /// Of the states first … first + n − 1, in the memory of what was there.
   /// @throws InputError as require_mechanics of the prior for all states.

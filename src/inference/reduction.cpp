@@ -154,6 +154,15 @@ bool has_same_directions(const Latent& latent, const Reduction& reduction, const
 
 }  // namespace
 
+std::vector<Index> rows_of_samples(const Reduction& reduction, const std::vector<Index>& samples) {
+  std::vector<Index> rows;
+  for (const Index sample : samples) {
+    const Index rank = reduction.samples[static_cast<std::size_t>(sample)].R.rows();
+    for (Index c = 0; c < rank; ++c) rows.push_back(reduction.offset[static_cast<std::size_t>(c)] + sample);
+  }
+  return rows;
+}
+
 void reduce(const Prior& prior, const std::vector<Observations>& observations, const std::vector<ObservationModel>& models,
             const std::vector<VectorXd>& noise_stddev, Reduction& reduction) {
   std::size_t n_samples = 0;

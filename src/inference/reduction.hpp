@@ -36,6 +36,9 @@ struct Reduction {
   [[nodiscard]] Eigen::Index n_samples() const { return static_cast<Eigen::Index>(samples.size()); }
 };
 
+/// The reduced rows of these samples, sample after sample, each component by component.
+std::vector<Eigen::Index> rows_of_samples(const Reduction& reduction, const std::vector<Eigen::Index>& samples);
+
 /// @param reduction  receives the result; what it held is memory to be used again
 void reduce(const Prior& prior, const std::vector<Observations>& observations, const std::vector<ObservationModel>& models,
             const std::vector<Eigen::VectorXd>& noise_stddev, Reduction& reduction);

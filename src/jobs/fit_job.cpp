@@ -1,5 +1,6 @@
 #include "gp2/jobs/fit_job.hpp"
 
+#include <algorithm>
 #include <cmath>
 #include <exception>
 #include <utility>
@@ -54,6 +55,25 @@ FitOptions optimiser_options(FitRequest& request, const FitProblem& problem) {
   return options;
 }
 
+// How many hyperparameters are drawn.
+int settled_draws(const FitRequest& request, const FitProblem& problem, const FitOptions& options) {
+  switch (request.hyperparameters) {
+    case HyperparameterChoice::optimise:
+      return 0;
+    case HyperparameterChoice::automatic:
+      return integration_pays(problem, options) ? n_mixed_draws : 0;
+    case HyperparameterChoice::integrate:
+      break;
+  }
+  if (problem.prior_options.baseline) {
+    throw InputError("`hyperparameters=integrate` is not for a `baseline`, whose hyperparameters are optimised");
+  }
+  if (options.max_iterations == 0) {
+    throw InputError("`hyperparameters=integrate` draws about the optimum: it cannot be with `max_iterations=0`");
+  }
+  return n_mixed_draws;
+}
+
 std::string source_of(const FitRequest& request) {
   if (!request.data_source.empty()) return request.data_source;
   std::vector<std::string> names;
@@ -71,7 +91,8 @@ FitJob job_of(FitRequest request, FitProblem problem) {
     for (const Hyperparameter& h : problem.hyperparameters) request.start.values[h.name] = h.value;
   }
   FitJob job;
-  const FitOptions asked = optimiser_options(request, problem);
+  FitOptions asked = optimiser_options(request, problem);
+  asked.n_draws = settled_draws(request, problem, asked);
   job.notes = problem.notes;
   job.options = within_memory(problem, asked, free_memory(), job.notes);
   note_time(problem, job.options, fit_memory(problem, job.options).reduced_size, job.notes);
@@ -85,7 +106,8 @@ FitJob job_of(FitRequest request, FitProblem problem) {
 }
 
 // What the residuals say against the data, the constraints or the noise.
-void add_residual_notes(const Posterior& posterior, std::vector<std::string>& notes) {
+void add_residual_notes(const Posterior& posterior, const std::vector<TrainingResidual>& residuals,
+                        std::vector<std::string>& notes) {
   for (std::size_t g = 0; g < posterior.observations().size(); ++g) {
     if (!posterior.observations()[g].view().is_of_ddq()) continue;
     for (const ConstraintResidual& one : constraint_residuals(posterior, g)) {
@@ -93,7 +115,7 @@ void add_residual_notes(const Posterior& posterior, std::vector<std::string>& no
     }
   }
   std::vector<std::string> large, correlated;
-  for (const TrainingResidual& one : training_residuals(posterior)) {
+  for (const TrainingResidual& one : residuals) {
     if (one.is_too_large()) {
       large.push_back(fmt::format("{} (z rms {:.2g}, {:.0f} % within 95 %)", one.output, one.rms, 100 * one.coverage95));
     } else if (one.is_correlated()) {
@@ -112,6 +134,25 @@ void add_residual_notes(const Posterior& posterior, std::vector<std::string>& no
         "and the rows are fewer measurements than they seem: deviations are too small",
         fmt::join(correlated, ", ")));
   }
+}
+
+// Whether the draws of the hyperparameters can be relied on.
+void add_draw_notes(const FitReport& report, std::vector<std::string>& notes) {
+  if (!report.draws) {
+    notes.push_back(
+        "warning: no hyperparameters were drawn: none is free, or the likelihood is not finite near the optimum; the "
+        "fit is that of the optimum");
+    return;
+  }
+  Eigen::Index k = 0;
+  const double worst = report.draws->r_hat.maxCoeff(&k);
+  if (!(worst > HyperparameterDraws::largest_r_hat)) return;
+  notes.push_back(
+      fmt::format("the chains that draw hyperparameters have not mixed (R̂ {:.2f} of {}, near 1 where they have): they stay with "
+                  "explanations of "
+                  "their own, whose shares rest on Laplace's approximation; the same fit with another `seed` tells what it means "
+                  "for predictions",
+                  worst, report.hyperparameters[static_cast<std::size_t>(k)].name));
 }
 
 // What this fit leaves out of the force that its model knows: that the latents cannot stand for it, or that the same data are far
@@ -194,6 +235,16 @@ std::vector<Option> options(FitRequest& request) {
       {"max_points", &problem.max_points, "N", "take this many rows of each log, the first of a shuffle by `seed`", "all"},
       {"seed", &problem.seed, "S", "of restarts and `max_points`"},
       threads_option(request.threads),
+      {"hyperparameters",
+       choice(request.hyperparameters, {{"optimise", HyperparameterChoice::optimise},
+                                        {"integrate", HyperparameterChoice::integrate},
+                                        {"auto", HyperparameterChoice::automatic}}),
+       "",
+       fmt::format(
+           "optimise: take the likeliest as known; integrate: draw them given the data, and mix the predictions of {} draws "
+           "(docs/theory.md, T31), at about {} evaluations of the likelihood; auto: integrate where the directions of a latent "
+           "have their own, as in the default prior, and rows times free directions of motion are at most {}",
+           n_mixed_draws, draw_evaluations, largest_integrated_size)},
       {"standard_errors", YesByDefault{&request.standard_errors}, "",
        "the standard errors of estimated parameters, which take a few dozen gradients"},
       {"max_escapes", &request.max_escapes, "K", "scans for lower optima from the best one", "5"},
@@ -202,6 +253,13 @@ std::vector<Option> options(FitRequest& request) {
       {"reduction_tolerance", &request.reduction_tolerance, "R",
        "stop when an iteration lowers the objective by less, relatively", "1e-12; of a baseline 1e-9"},
   };
+}
+
+bool integration_pays(const FitProblem& problem, const FitOptions& options) {
+  const bool has_many = std::any_of(problem.prior.latents.begin(), problem.prior.latents.end(),
+                                    [](const Latent& latent) { return !latent.direction.empty(); });
+  return has_many && options.max_iterations > 0 && !problem.prior_options.baseline &&
+         fit_memory(problem, options).reduced_size <= largest_integrated_size;
 }
 
 FitJob prepare_fit(FitRequest request) {
@@ -217,6 +275,7 @@ FitRequest request_of(const FitFile& fit) {
   FitRequest request;
   request.model = fit.model;
   request.data_source = fit.data_source;
+  request.hyperparameters = HyperparameterChoice::optimise;  // formats before 7 do not say
   read_options(fit.options, options(request), "options of the fit");
   return request;
 }
@@ -239,18 +298,28 @@ FitJob prepare_fit_again(const FitFile& fit, int threads) {
   return job_of(std::move(request), std::move(problem));
 }
 
+bool keeps_row_order(const FitFile& fit, const std::vector<Observations>& observations) {
+  if (fit.options.empty()) return false;
+  const std::optional<int> max_points = request_of(fit).problem.max_points;
+  return std::all_of(observations.begin(), observations.end(),
+                     [&](const Observations& group) { return !max_points || group.n_data() < *max_points; });
+}
+
 FitOutcome run_fit(const FitJob& job, const std::function<void(const Progress&)>& progress, const std::atomic<bool>* stop) {
   FitOptions options = job.options;
   options.progress = progress;
   options.stop = stop;
   Fit result = fit(job.problem, options);
-  FitOutcome outcome{job.file, std::move(result.posterior), distrust_notes(job.problem, result.report)};
+  FitOutcome outcome{job.file, std::move(result.posterior), distrust_notes(job.problem, result.report), std::nullopt};
   for (std::string& note : notes_of(result.report)) outcome.notes.push_back(std::move(note));
   if (result.report.termination != FitReport::interrupted && !is_set(stop)) {
+    if (options.n_draws > 0) add_draw_notes(result.report, outcome.notes);
     // a fit that has taken hours is not lost to what is said of it
     try {
       add_force_note(outcome.posterior, outcome.notes);
-      add_residual_notes(outcome.posterior, outcome.notes);
+      outcome.cross_validation =
+          cross_validate(outcome.posterior, keeps_row_order(outcome.file, outcome.posterior.observations()));
+      add_residual_notes(outcome.posterior, outcome.cross_validation->residuals, outcome.notes);
     } catch (const std::exception& error) {
       outcome.notes.push_back(fmt::format("the residuals of the fit were not tested: {}", error.what()));
     }

@@ -78,16 +78,16 @@ PerState per_state(const FitProblem& problem, double rank) {
   return count;
 }
 
-// A fit of so many states and reduced rows, one evaluation at a time.
-FitMemory memory_of(double n_states, double r, const PerState& count) {
+// A fit of so many states and reduced rows, one evaluation at a time, whose posterior is a mixture of so many.
+FitMemory memory_of(double n_states, double r, const PerState& count, int n_components) {
   constexpr double blas = 1e7;  // OpenBLAS packs blocks of a matrix into memory of its own, one for each thread that calls it
   FitMemory memory;
   memory.reduced_size = static_cast<int>(std::lround(r));
   memory.shared = number * n_states * count.shared;
   memory.evaluation = triangle(r / count.n_parts) + number * n_states * count.evaluation + blas;
-  memory.posterior = triangle(r) + number * n_states * count.evaluation + blas;
+  memory.posterior = n_components * (triangle(r) + number * n_states * count.evaluation) + blas;
   memory.asked_by_evaluation = number * (r / count.n_parts) * (r / count.n_parts) + blas_buffer;
-  memory.asked_by_posterior = number * r * r + blas_buffer;
+  memory.asked_by_posterior = n_components * number * r * r + blas_buffer;
   return memory;
 }
 
@@ -96,6 +96,8 @@ double n_states(const FitProblem& problem, double most_per_log = HUGE_VAL) {
   for (const Observations& group : problem.observations) sum += std::min<double>(group.n_data(), most_per_log);
   return sum;
 }
+
+int n_components(const FitOptions& options) { return std::max(1, options.n_draws); }
 
 struct Sizes {
   double rank = 0;  // mean of the states
@@ -154,7 +156,7 @@ double FitMemory::bytes() const { return shared + std::max(side_by_side * evalua
 FitMemory fit_memory(const FitProblem& problem, const FitOptions& options) {
   const Sizes sizes = sizes_of(problem);
   const double n = n_states(problem);
-  FitMemory memory = memory_of(n, sizes.rank * n, sizes.count);
+  FitMemory memory = memory_of(n, sizes.rank * n, sizes.count, n_components(options));
   memory.side_by_side = side_by_side(problem, options);
   return memory;
 }
@@ -192,14 +194,15 @@ bool is_given(double bytes, int n_pieces) { return maps(bytes, n_pieces); }
 namespace {
 
 // The most rows of each log with which `fits`, by halving.
-int most_affordable_rows(const FitProblem& problem, const std::function<bool(const FitMemory&)>& fits) {
+int most_affordable_rows(const FitProblem& problem, const FitOptions& options,
+                         const std::function<bool(const FitMemory&)>& fits) {
   const Sizes sizes = sizes_of(problem);
   int most = 0, too_many = 0;
   for (const Observations& group : problem.observations) too_many = std::max(too_many, group.n_data());
   while (too_many - most > 1) {
     const int middle = most + (too_many - most) / 2;
     const double n = n_states(problem, middle);
-    (fits(memory_of(n, sizes.rank * n, sizes.count)) ? most : too_many) = middle;
+    (fits(memory_of(n, sizes.rank * n, sizes.count, n_components(options))) ? most : too_many) = middle;
   }
   return most;
 }
@@ -222,7 +225,7 @@ FitOptions within_given(const FitProblem& problem, const FitOptions& options, st
                     memory.side_by_side, n));
     return fewer;
   }
-  const int most = most_affordable_rows(problem, [&](const FitMemory& fewer) { return is_possible(fewer, 1); });
+  const int most = most_affordable_rows(problem, options, [&](const FitMemory& fewer) { return is_possible(fewer, 1); });
   const double asked = std::max(memory.asked_by_evaluation, memory.asked_by_posterior);
   if (most == 0) {
     throw InputError(
@@ -257,7 +260,8 @@ FitOptions within_memory(const FitProblem& problem, const FitOptions& all_option
     return fewer;
   }
 
-  const int most = most_affordable_rows(problem, [&](const FitMemory& fewer_rows) { return fewer_rows.bytes() <= usable; });
+  const int most =
+      most_affordable_rows(problem, options, [&](const FitMemory& fewer_rows) { return fewer_rows.bytes() <= usable; });
   const double alone = memory.shared + std::max(memory.evaluation, memory.posterior);
   throw InputError(fmt::format(
       "the fit of {:.0f} rows factors a matrix of size {} and takes {:.1f} GB of memory, of which {:.1f} GB are free; {} rows "

@@ -114,16 +114,23 @@ std::vector<Observations> trusted_observations(const FitProblem& problem) {
   return problem.robust ? without_gross_errors(problem.observations) : problem.observations;
 }
 
-// what a discrepancy is a share of
-bool observes_accelerations(const FitProblem& problem) {
-  return std::any_of(problem.observations.begin(), problem.observations.end(),
-                     [](const Observations& group) { return group.view().quantity == View::Quantity::constrained_acceleration; });
+// what a discrepancy is a share of: accelerations whose noise is known. One of a guessed noise would swallow the true one
+bool knows_noise_of_accelerations(const FitProblem& problem) {
+  const auto is_of_ddq = [](const Observations& group) {
+    return group.view().quantity == View::Quantity::constrained_acceleration;
+  };
+  return std::any_of(problem.observations.begin(), problem.observations.end(), is_of_ddq) &&
+         std::none_of(problem.observations.begin(), problem.observations.end(),
+                      [&](const Observations& group) { return is_of_ddq(group) && group.noise().is_estimated(); });
 }
 
-bool has_discrepancy(const FitProblem& problem, const FitProblemOptions& options) {
+bool has_discrepancy(const Model& model, const FitProblem& problem, const FitProblemOptions& options) {
   const bool standard = options.protocol.name == Protocol::Name::standard && options.protocol.hyperprior;
-  return options.discrepancy && standard && problem.prior.latents.size() == 1 && !problem.prior.latents.front().directions &&
-         observes_accelerations(problem) && !has_singular_mass(problem);
+  const bool acts_everywhere =
+      model.latents.size() == 1 &&
+      (options.base || (model.latents.front().directions.empty() && !model.latents.front().direction_code));
+  return options.discrepancy && standard && acts_everywhere && knows_noise_of_accelerations(problem) &&
+         !has_singular_mass(problem);
 }
 
 // a share of the noise, as the fit starts with it, in each acceleration; where one is not measured, of its spread the same share
@@ -288,6 +295,10 @@ FitProblem start_problem(const Model& model, const FitProblemOptions& options) {
   problem.prior_options.mean = options.mean;
   problem.prior_options.base = paper ? std::optional(Latent::Base::acceleration) : options.base;
   problem.prior_options.raw_angles = paper;
+  if (paper) {
+    problem.prior_options.kernel = "se";
+    problem.prior_options.per_direction = false;
+  }
   problem.prior = make_prior(model, problem.prior_options);
   return problem;
 }
@@ -352,7 +363,7 @@ FitProblem make_fit_problem(const Model& model, const std::vector<Log>& logs, co
         read_log(add_system(model, log, estimated, problem), log, options, problem.lines.emplace_back(), problem.notes));
   }
   add_side_information(model, also, options, estimated, problem);
-  if (has_discrepancy(problem, options)) add_discrepancy(model, problem);
+  if (has_discrepancy(model, problem, options)) add_discrepancy(model, problem);
   problem.hyperparameters = starting_hyperparameters(model, problem, options);
   return problem;
 }

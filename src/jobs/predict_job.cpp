@@ -114,7 +114,7 @@ PredictedView predicted_view(const FitFile& fit, const Prior& prior, const ViewR
     throw InputError(fmt::format("`view={}`: '{}' has no constraints", request.quantity->word(), out.prior.system->name()));
   }
   set_time_step(out.view, request.time_step);
-  if (request.latent) out.view.latent = latent_index(prior, *request.latent, "`latent`");
+  if (request.latent) out.view.latent = latents_called(prior, *request.latent, "`latent`");
   out.names = out.view.names(*out.prior.system, request.latent.value_or(""));
   return out;
 }

@@ -365,7 +365,7 @@ Observations read_side_information(const LoggedSystem& logged, const Prior& fitt
   View& view = readings.view;
   view = View::all(side_information.quantity, system);
   view.other_system = logged.other_system;
-  if (!side_information.latent.empty()) view.latent = latent_index(fitted, side_information.latent, option);
+  if (!side_information.latent.empty()) view.latent = latents_called(fitted, side_information.latent, option);
   if (side_information.quantity->needs_time_step()) {
     if (!options.time_step) throw InputError(option + " needs the time step: `dt=SECONDS`");
     if (!(*options.time_step > 0)) throw InputError(fmt::format("`dt`: must be positive, got {}", *options.time_step));
@@ -405,14 +405,15 @@ std::vector<int> acceleration_rows(const System& system, const std::vector<std::
   return rows;
 }
 
-int latent_index(const Prior& prior, const std::string& name, const std::string& option) {
-  std::vector<std::string> names;
-  for (const Latent& latent : prior.latents) names.push_back(latent.name);
-  const auto found = std::find(names.begin(), names.end(), name);
-  if (found == names.end()) {
-    throw InputError(fmt::format("{}: no latent is called '{}'; there is: {}", option, name, fmt::join(names, ", ")));
+LatentRange latents_called(const Prior& prior, const std::string& name, const std::string& option) {
+  std::vector<std::string> all;
+  for (const Latent& latent : prior.latents) all.push_back(latent.name);
+  const auto first = std::find(all.begin(), all.end(), name);
+  if (first != all.end()) {
+    return {static_cast<int>(first - all.begin()), static_cast<int>(std::count(first, all.end(), name))};
   }
-  return static_cast<int>(found - names.begin());
+  all.erase(std::unique(all.begin(), all.end()), all.end());
+  throw InputError(fmt::format("{}: no latent is called '{}'; there is: {}", option, name, fmt::join(all, ", ")));
 }
 
 std::map<std::string, std::string> checked_columns(const Model& model, const std::vector<const CsvTable*>& logs,

@@ -181,7 +181,7 @@ void residual_advice(const Report& report, std::vector<Advice>& advice) {
            "of the columns, and at the constants of the constraint."});
     }
   }
-  for (const TrainingResidual& one : report.residuals) {
+  for (const TrainingResidual& one : report.cross_validation.residuals) {
     if (one.is_too_large()) {
       advice.push_back(
           {Level::warning,
@@ -221,17 +221,6 @@ std::string noise_mend(const Report& report, const char* too) {
       });
   if (!is_stated) return fmt::format("the noise is too {}: `noise_std=estimate`", too);
   return fmt::format("the deviations in the log's columns NAME_std are too {}, and one factor for all does not mend them", too);
-}
-
-// (measured − predicted) / √(stddev² + noise²) of each output (d × N); NaN where one is not known
-Eigen::MatrixXd standardised_errors(const ReportData& data) {
-  Eigen::MatrixXd z(data.measured.rows(), data.measured.cols());
-  for (Eigen::Index k = 0; k < z.rows(); ++k) {
-    const int row = data.rows[static_cast<std::size_t>(k)];
-    z.row(k) = (data.measured.row(k) - data.predicted.row(row)).array() /
-               (data.stddev.row(row).array().square() + data.noise_stddev.row(k).array().square()).sqrt();
-  }
-  return z;
 }
 
 // Single errors far beyond the bands, and errors that follow a feature.
@@ -288,10 +277,10 @@ void coverage_advice(const Report& report, const ReportData& data, std::vector<A
   if (!(std::isfinite(e.coverage95) && e.coverage95 > nominal + tolerance)) return;
   // errors below the noise, where the noise of training is what its residuals are
   const bool is_below_noise = (e.rmse.array() < 0.7 * data.noise_stddev.rowwise().mean().array()).all();
-  const bool noise_is_right =
-      std::none_of(report.residuals.begin(), report.residuals.end(), [](const auto& one) { return one.rms < 0.7; });
+  const bool noise_is_right = std::none_of(report.cross_validation.residuals.begin(), report.cross_validation.residuals.end(),
+                                           [](const auto& one) { return one.rms < 0.7; });
   const bool is_covered = std::isfinite(e.coverage95_latent) && std::abs(e.coverage95_latent - nominal) <= tolerance;
-  const bool is_noise_free = is_covered || (is_below_noise && noise_is_right && !report.residuals.empty());
+  const bool is_noise_free = is_covered || (is_below_noise && noise_is_right && !report.cross_validation.residuals.empty());
   if (is_noise_free && std::isfinite(e.coverage95_latent) && e.coverage95_latent < nominal - tolerance) {
     advice.push_back(
         {Level::warning,

@@ -54,6 +54,7 @@ ReportData data_at(const Posterior& posterior, const MatrixXd& states, const std
   Posterior::Marginal prediction = posterior.marginal(view, states, /*n_threads=*/0);
   data.predicted = prediction.mean;
   data.stddev = prediction.stddev();
+  data.distance = posterior.distance_from_data(view, states, /*n_threads=*/0);
   view.quantity = View::Quantity::unconstrained_acceleration;
   MechanicsBatch mechanics;
   evaluate_mechanics(prior, view, states, parameters, mechanics);
@@ -207,7 +208,14 @@ std::vector<Relevance> relevance_of(const Posterior& posterior) {
       one.spread = scales.feature_stddev[a][parameter.feature];
       one.relevance = (periodic ? 1 : one.spread) / one.lengthscale;
       if (!values.has_free_loading(a)) one.effect = largest_signal * one.relevance;
-      all.push_back(std::move(one));
+      const auto known = std::find_if(all.begin(), all.end(), [&](const Relevance& other) {
+        return other.latent == one.latent && other.feature == one.feature;
+      });
+      if (known == all.end()) {
+        all.push_back(std::move(one));
+      } else if (std::pair(one.effect.value_or(0), one.relevance) > std::pair(known->effect.value_or(0), known->relevance)) {
+        *known = std::move(one);
+      }
     }
   }
   return all;
@@ -231,31 +239,36 @@ VectorXd ReportData::rmse_to_truth() const {
   return rmse;
 }
 
+MatrixXd standardised_errors(const ReportData& data) {
+  MatrixXd z(data.measured.rows(), data.measured.cols());
+  for (Index k = 0; k < z.rows(); ++k) {
+    const int row = data.rows[static_cast<std::size_t>(k)];
+    z.row(k) = (data.measured.row(k) - data.predicted.row(row)).array() /
+               (data.stddev.row(row).array().square() + data.noise_stddev.row(k).array().square()).sqrt();
+  }
+  return z;
+}
+
 MatrixXd coverage(const ReportData& data, const Ref<const VectorXd>& levels) {
-  const Index d = std::ssize(data.rows), n = data.measured.cols();
-  MatrixXd share = MatrixXd::Zero(levels.size(), d + 1);
-  Index n_known = 0;
-  for (Index k = 0; k < d; ++k) {
-    const Index row = data.rows[static_cast<std::size_t>(k)];
-    Index n_measured = 0;
-    for (Index i = 0; i < n; ++i) {
-      const double z = (data.measured(k, i) - data.predicted(row, i)) / std::hypot(data.stddev(row, i), data.noise_stddev(k, i));
-      if (std::isnan(z)) continue;
-      ++n_measured;
-      // the central interval that just holds the measurement
-      const double probability = std::erf(std::abs(z) / std::numbers::sqrt2);
-      for (Index l = 0; l < levels.size(); ++l) share(l, k) += probability <= levels[l] ? 1 : 0;
-    }
-    n_known += n_measured;
-    share.col(d) += share.col(k);
-    share.col(k) /= static_cast<double>(n_measured);  // NaN where the noise is not known
-  }
-  if (n_known == 0) {
-    share.col(d).setConstant(not_a_number);
-  } else {
-    share.col(d) /= static_cast<double>(n_known);
-  }
+  const MatrixXd z = standardised_errors(data);
+  MatrixXd share(levels.size(), z.rows() + 1);
+  for (Index k = 0; k < z.rows(); ++k) share.col(k) = central_coverage(z.row(k).transpose(), levels);
+  share.rightCols<1>() = central_coverage(z.reshaped(), levels);
   return share;
+}
+
+MatrixXd pit_counts(const ReportData& data, bool far) {
+  MatrixXd z = standardised_errors(data);
+  for (Index i = 0; i < z.cols(); ++i) {
+    if ((data.distance[i] > Posterior::far_from_data) != far) z.col(i).setConstant(not_a_number);
+  }
+  MatrixXd counts = MatrixXd::Zero(Calibration::n_bins, z.rows() + 1);
+  for (Index k = 0; k < z.rows(); ++k) {
+    const auto n = static_cast<double>(z.cols() - z.row(k).array().isNaN().count());
+    if (n > 0) counts.col(k) = n * pit_histogram(z.row(k).transpose(), Calibration::n_bins);
+    counts.rightCols<1>() += counts.col(k);
+  }
+  return counts;
 }
 
 namespace {
@@ -371,7 +384,7 @@ Report collect_report(const ReportOptions& options, std::vector<std::string>& no
   report.file_date = date_of(options.fit);
   const Posterior posterior = report.fit.posterior();
   report.data = training_data(report.fit, posterior);
-  report.residuals = training_residuals(posterior);
+  report.cross_validation = cross_validate(posterior, keeps_row_order(report.fit, posterior.observations()));
   report.relevance = relevance_of(posterior);
   if (!options.data.empty()) {
     report.data.push_back(test_data(options, report.fit, posterior, notes));

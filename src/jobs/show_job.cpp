@@ -99,16 +99,22 @@ std::string range_text(const Latent::Range& range) {
 std::string latents_text(const Model& model, bool full) {
   std::string text;
   const Prior prior = make_prior(model);
-  for (std::size_t a = 0; a < prior.latents.size(); ++a) {
-    const Latent& latent = prior.latents[a];
-    text += fmt::format("\nlatent '{}'\n  kernel      {}\n  features    {}\n  acts on     {}\n", latent.name,
-                        latent.kernel.text(), fmt::join(latent.feature_names, ", "), fmt::join(latent.column_names, ", "));
-    for (const auto& [feature, range] : model.latents[a].lengthscales) {
+  for (const LatentSpec& spec : model.latents) {
+    const auto is_of_it = [&](const Latent& latent) { return latent.name == spec.name; };
+    const Latent& latent = *std::find_if(prior.latents.begin(), prior.latents.end(), is_of_it);
+    std::vector<std::string> columns;
+    for (const Latent& one : prior.latents) {
+      if (is_of_it(one)) columns.insert(columns.end(), one.column_names.begin(), one.column_names.end());
+    }
+    text += fmt::format("\nlatent '{}'\n  kernel      {}{}\n  features    {}\n  acts on     {}\n", latent.name,
+                        latent.kernel.text(), latent.direction.empty() ? "" : "   one for each direction",
+                        fmt::join(latent.feature_names, ", "), fmt::join(columns, ", "));
+    for (const auto& [feature, range] : spec.lengthscales) {
       text += fmt::format("  lengthscale {} {}\n", feature, range_text(range));
     }
-    if (!latent.directions) continue;
+    if (spec.directions.empty() && !spec.direction_code) continue;
     text += fmt::format("  directions{}\n{}", latent.base == Latent::Base::force ? " (forces)" : "",
-                        directions_text(model, model.latents[a], full));
+                        directions_text(model, spec, full));
   }
   return text;
 }

@@ -691,7 +691,7 @@ class ModelReader : private TomlReader {
     return latent_range(node, key, true);
   }
 
-  // { dx = 0.5, dz = { value = 2, bounds = [1, 4] } }, in the units of the features
+  // "per direction", "shared", or { dx = 0.5, dz = { value = 2, bounds = [1, 4] } }, in the units of the features
   void read_lengthscales(const toml::node& node, LatentSpec& latent) const {
     const std::string section = "latent.lengthscales";
     std::vector<std::string> features;
@@ -700,7 +700,16 @@ class ModelReader : private TomlReader {
           latent.feature_code ? std::vector<std::string>{feature} : expand_angle(feature, definition_.coordinates);
       features.insert(features.end(), names.begin(), names.end());
     }
-    const Kernel kernel = Kernel::parse(latent.kernel, features);
+    if (node.is_string()) {
+      const std::string word = text(node, section);
+      if (word != "shared" && word != "per direction") {
+        fail(node, section,
+             fmt::format(R"(expected "shared", "per direction" or a table such as {{ dx = 0.5 }}, got "{}")", shortened(word)));
+      }
+      latent.per_direction = word == "per direction";
+      return;
+    }
+    const Kernel kernel = Kernel::parse(latent.kernel.empty() ? PriorOptions().kernel : latent.kernel, features);
     for (const auto& [name, entry] : entries_of(table(node, section))) {
       const std::string key = fmt::format("{}.{}", section, name);
       latent.lengthscales.emplace_back(name, latent_range(*entry, key, false));
@@ -729,14 +738,14 @@ class ModelReader : private TomlReader {
       if (!names.insert(latent.name).second) fail(node, "latent.name", fmt::format("'{}' is taken already", latent.name));
       if (latent.name == "discrepancy")
         fail(node, "latent.name", "'discrepancy' is the name of the latent that gp2 adds; take another");
-      latent.kernel = entry.contains("kernel") ? text(*entry.get("kernel"), "latent.kernel") : "se";
+      latent.kernel = entry.contains("kernel") ? text(*entry.get("kernel"), "latent.kernel") : "";
       if (!entry.contains("features")) fail(node, "latent", R"(missing features = ["q1", …])");
       read_features(*entry.get("features"), latent);
       if (entry.contains("directions")) read_directions(*entry.get("directions"), latent);
       latent.lengthscale = relative_range(entry, "lengthscale");
       latent.signal_stddev = relative_range(entry, "signal_stddev");
       try {
-        static_cast<void>(Kernel::parse(latent.kernel, latent.features));
+        if (entry.contains("kernel")) static_cast<void>(Kernel::parse(latent.kernel, latent.features));
       } catch (const InputError& error) {
         fail(entry.contains("kernel") ? *entry.get("kernel") : node, "latent.kernel", error.what());
       }
@@ -808,7 +817,7 @@ class ModelReader : private TomlReader {
     }
   }
 
-  // one squared-exponential latent on the acceleration, over everything a state has but the time
+  // one latent on the acceleration, over everything a state has but the time
   void add_default_latent() {
     LatentSpec latent;
     latent.name = "unconstrained acceleration";

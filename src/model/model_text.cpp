@@ -64,6 +64,9 @@ std::string ranges_text(const LatentSpec& spec) {
   for (const auto& [feature, range] : spec.lengthscales) each.push_back(range_text(quoted(feature), range));
   std::erase(each, "");
   if (!each.empty()) lines.push_back("lengthscales = " + table(each));
+  if (each.empty() && spec.per_direction) {
+    lines.push_back(fmt::format("lengthscales = {}", quoted(*spec.per_direction ? "per direction" : "shared")));
+  }
   std::string text;
   for (const std::string& line : lines) text += line.empty() ? "" : line + "\n";
   return text;
@@ -82,7 +85,8 @@ std::string directions_text(const LatentSpec& spec) {
 
 std::string latent_text(const LatentSpec& spec) {
   const std::string features = quoted_list(spec.features);
-  return fmt::format("\n[[latent]]\nname = {}\nkernel = {}\nfeatures = {}\n", quoted(spec.name), quoted(spec.kernel),
+  return fmt::format("\n[[latent]]\nname = {}\n{}features = {}\n", quoted(spec.name),
+                     spec.kernel.empty() ? "" : fmt::format("kernel = {}\n", quoted(spec.kernel)),
                      spec.feature_code ? fmt::format("{{ code = {} }}", features) : features) +
          directions_text(spec) + ranges_text(spec);
 }

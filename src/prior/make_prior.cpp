@@ -30,24 +30,46 @@ auto named(const LatentSpec& spec, const Work& work) {
   }
 }
 
+// n of the numbers that code gives; of another number than `total` all, for the check of CodeFunction to refuse
+StateCode rows_of(StateCode code, Index first, Index n, Index total) {
+  const auto take = [=](MatrixXd all) -> MatrixXd { return all.rows() == total ? all.middleRows(first, n) : all; };
+  if (code.differentiate) {
+    code.differentiate = [of = code.differentiate, take](const auto& states, const auto& parameters, int index) {
+      return take(of(states, parameters, index));
+    };
+  }
+  code.evaluate = [of = code.evaluate, take](const auto& states, const auto& parameters) { return take(of(states, parameters)); };
+  return code;
+}
+
 /// Makes the latents of one prior.
 class LatentMaker {
  public:
   LatentMaker(std::shared_ptr<const System> system, const PriorOptions& options, const PriorWords& words)
       : system_(std::move(system)), options_(options), words_(words) {}
 
-  [[nodiscard]] Latent make(const LatentSpec& spec) {
+  /// One latent, or one for each direction.
+  [[nodiscard]] std::vector<Latent> make(const LatentSpec& spec) {
     Latent latent;
     latent.name = spec.name;
     latent.base = options_.base.value_or(spec.base);
     latent.lengthscale = spec.lengthscale;
     latent.signal_stddev = spec.signal_stddev;
     set_features(spec, latent);
-    latent.kernel = named(spec, [&] { return Kernel::parse(spec.kernel, latent.feature_names); });
+    latent.kernel =
+        named(spec, [&] { return Kernel::parse(spec.kernel.empty() ? options_.kernel : spec.kernel, latent.feature_names); });
     latent.feature_lengthscales =
         named(spec, [&] { return lengthscales_of(spec, latent.kernel, latent.feature_names, system_->coordinates()); });
-    set_directions(spec, latent);
-    return latent;
+    if (!spec.per_direction.value_or(spec.kernel.empty() && options_.per_direction)) {
+      set_directions(spec, latent);
+      return {std::move(latent)};
+    }
+    std::vector<Latent> latents;
+    for (std::size_t column = 0; column < direction_names(spec, latent.base).size(); ++column) {
+      set_directions(spec, latents.emplace_back(latent), column);
+      latents.back().direction = latents.back().column_names.front();
+    }
+    return latents;
   }
 
   /// Features in units of the lengthscales, directions of the standard deviations: nothing is left to tune.
@@ -106,25 +128,45 @@ class LatentMaker {
     latent.features = ExpressionFunction::of_state(values, words_.symbols);
   }
 
-  void set_directions(const LatentSpec& spec, Latent& latent) {
-    if (options_.base || (spec.directions.empty() && !spec.direction_code)) {
-      const bool force = latent.base == Latent::Base::force;
+  [[nodiscard]] bool is_of_every_coordinate(const LatentSpec& spec) const {
+    return options_.base || (spec.directions.empty() && !spec.direction_code);
+  }
+
+  [[nodiscard]] std::vector<std::string> direction_names(const LatentSpec& spec, Latent::Base base) const {
+    std::vector<std::string> names;
+    if (is_of_every_coordinate(spec)) {
       for (const Coordinate& coordinate : system_->coordinates()) {
-        latent.column_names.push_back(force ? "force_" + coordinate.name : coordinate.acceleration());
+        names.push_back(base == Latent::Base::force ? "force_" + coordinate.name : coordinate.acceleration());
       }
-      return;
+      return names;
     }
-    if (spec.direction_code) {
-      latent.column_names = spec.direction_names;
-      latent.directions = std::make_shared<CodeFunction>(spec.direction_code, fmt::format("latent '{}': directions", spec.name),
+    if (spec.direction_code) return spec.direction_names;
+    for (std::size_t column = 1; column <= spec.directions.front().size(); ++column) {
+      names.push_back(fmt::format("direction {}", column));
+    }
+    return names;
+  }
+
+  /// @param only  the one column that is meant; not given: all
+  void set_directions(const LatentSpec& spec, Latent& latent, std::optional<std::size_t> only = {}) {
+    latent.column_names = direction_names(spec, latent.base);
+    const std::size_t first = only.value_or(0), last = only ? *only + 1 : latent.column_names.size();
+    if (only) latent.column_names = {latent.column_names[*only]};
+    if (is_of_every_coordinate(spec) && !only) return;
+    if (spec.direction_code && !options_.base) {
+      StateCode code = spec.direction_code;
+      if (only)
+        code = rows_of(code, static_cast<Index>(first) * system_->nq(), system_->nq(),
+                       std::ssize(spec.direction_names) * system_->nq());
+      latent.directions = std::make_shared<CodeFunction>(std::move(code), fmt::format("latent '{}': directions", spec.name),
                                                          system_->nq() * latent.size(), system_);
       return;
     }
     std::vector<Expression> entries;
-    for (std::size_t column = 0; column < spec.directions.front().size(); ++column) {
-      latent.column_names.push_back(fmt::format("direction {}", column + 1));
-      for (const std::vector<std::string>& row : spec.directions) {
-        entries.push_back(named(spec, [&] { return words_.parse(row[column]); }));
+    for (std::size_t column = first; column < last; ++column) {
+      for (std::size_t row = 0; row < system_->coordinates().size(); ++row) {
+        entries.push_back(is_of_every_coordinate(spec) ? words_.graph.constant(row == column ? 1 : 0)
+                                                       : named(spec, [&] { return words_.parse(spec.directions[row][column]); }));
       }
     }
     latent.directions = ExpressionFunction::of_state_and_parameters(entries, words_.symbols, words_.graph);
@@ -211,7 +253,9 @@ Prior make_prior(std::shared_ptr<const System> system, const std::vector<LatentS
   }
   LatentMaker maker(system, options, words);
   Prior prior{std::move(system), {}, options.mean, {}};
-  for (const LatentSpec& spec : latents) prior.latents.push_back(maker.make(spec));
+  for (const LatentSpec& spec : latents) {
+    for (Latent& latent : maker.make(spec)) prior.latents.push_back(std::move(latent));
+  }
   if (options.discrepancy && !latents.empty()) {
     prior.latents.push_back(maker.make_discrepancy(latents.front(), *options.discrepancy));
   }

@@ -89,10 +89,10 @@ std::vector<bool> Prior::reads() const {
   return reads;
 }
 
-void PriorValues::keep_only(std::size_t latent) {
+void PriorValues::keep_only(int first, int n) {
   mean.setZero();
   for (std::size_t a = 0; a < directions.size(); ++a) {
-    if (a != latent) directions[a].setZero();
+    if (static_cast<int>(a) < first || static_cast<int>(a) >= first + n) directions[a].setZero();
   }
 }
 

@@ -72,9 +72,10 @@ void require_view(const Prior& home, const View& view) {
     throw InputError(fmt::format("view '{}' is of no rows; View::all has every one", view.quantity->word()));
   }
   const int n_latents = static_cast<int>(home.latents.size());
-  if (view.latent && (*view.latent < 0 || *view.latent >= n_latents)) {
+  const LatentRange shown = view.latent.value_or(0);
+  if (view.latent && (shown.first < 0 || shown.n < 1 || shown.first > n_latents - shown.n)) {
     throw InputError(fmt::format("view '{}': the prior has {} latents, numbered from 0, got the latent {}", view.quantity->word(),
-                                 n_latents, *view.latent));
+                                 n_latents, shown.n == 1 ? shown.first : shown.first + shown.n - 1));
   }
   static_cast<void>(view.required_time_step());
 }

@@ -130,4 +130,37 @@ void weigh_by_residuals(const Prior& prior, const std::vector<Observations>& obs
   }
 }
 
+namespace {
+
+bool are_same(const MatrixXd& a, const MatrixXd& b) { return (a.array() == b.array() || a.array().isNaN()).all(); }
+
+bool has_one_constraint(const System& system, const MatrixXd& states, const VectorXd& here, const VectorXd& there) {
+  const SystemValues a = system.evaluate(states, here), b = system.evaluate(states, there);
+  return are_same(a.constraint_matrix, b.constraint_matrix) && are_same(a.constraint_vector, b.constraint_vector);
+}
+
+}  // namespace
+
+std::vector<bool> enter_the_constraint(const Prior& prior, const std::vector<Observations>& observations,
+                                       const std::vector<Hyperparameter>& hyperparameters) {
+  VectorXd parameters = prior.system->parameter_values();
+  for (const Hyperparameter& h : hyperparameters) {
+    if (h.is_system_parameter()) parameters[h.index] = h.value;
+  }
+  std::vector<bool> enters(hyperparameters.size());
+  for (std::size_t k = 0; k < enters.size(); ++k) {
+    const Hyperparameter& h = hyperparameters[k];
+    if (!h.is_system_parameter() || h.is_fixed()) continue;
+    VectorXd moved = parameters;
+    moved[h.index] += 1e-6 * (h.value < (h.lower + h.upper) / 2 ? 1 : -1) * (h.upper - h.lower);
+    enters[k] = std::any_of(observations.begin(), observations.end(), [&](const Observations& group) {
+      const View& view = group.view();
+      return !has_one_constraint(*prior.system, group.states(), parameters, moved) ||
+             (view.other_system && !has_one_constraint(*prior_of(prior, view).system, group.states(),
+                                                       parameters_of(view, parameters), parameters_of(view, moved)));
+    });
+  }
+  return enters;
+}
+
 }  // namespace gp2

@@ -15,4 +15,9 @@ namespace gp2 {
 void weigh_by_residuals(const Prior& prior, const std::vector<Observations>& observations,
                         std::vector<Hyperparameter>& hyperparameters);
 
+/// Which hyperparameters are parameters that A or b depend on, of the prior's own system or another one of the observations, at
+/// their states.
+std::vector<bool> enter_the_constraint(const Prior& prior, const std::vector<Observations>& observations,
+                                       const std::vector<Hyperparameter>& hyperparameters);
+
 }  // namespace gp2

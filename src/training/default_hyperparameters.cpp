@@ -1,6 +1,7 @@
 #include "gp2/training/default_hyperparameters.hpp"
 
 #include <algorithm>
+#include <set>
 #include <tuple>
 #include <utility>
 
@@ -125,10 +126,15 @@ void add_latent(const Latent& latent, std::size_t owner, const std::string& pref
 
 void add_latents(const Prior& prior, const Scales& scales, const Protocol& protocol, std::vector<Hyperparameter>& out) {
   const auto is_tuned = [](const Latent& latent) { return !latent.kernel_is_fixed || !latent.signal_is_fixed; };
-  const bool one_is_tuned = std::count_if(prior.latents.begin(), prior.latents.end(), is_tuned) == 1;
+  std::set<std::string> tuned;
+  for (const Latent& latent : prior.latents) {
+    if (is_tuned(latent)) tuned.insert(latent.name);
+  }
   for (std::size_t a = 0; a < prior.latents.size(); ++a) {
     const Latent& latent = prior.latents[a];
-    if (is_tuned(latent)) add_latent(latent, a, one_is_tuned ? "" : latent.name + ".", scales, protocol, out);
+    if (!is_tuned(latent)) continue;
+    const std::string name = tuned.size() == 1 ? "" : latent.name + ".";
+    add_latent(latent, a, latent.direction.empty() ? name : name + latent.direction + ".", scales, protocol, out);
   }
 }
 
@@ -149,8 +155,18 @@ Hyperparameter noise_hyperparameter(const Observations& observations, std::size_
     if (!scale.empty()) h.lower /= *std::min_element(scale.begin(), scale.end());
     h.upper = std::max(h.upper / observations.usual_noise(VectorXd::Ones(observations.view().size()))[k], 2 * h.lower);
   }
+  // Who states deviations knows them to a factor of some size. Errors that go on from row to row, as smoothing leaves them, would
+  // have the factor collapse: neighbours agree, and the latents follow them.
+  constexpr double stated_lower = 0.2, stated_log_stddev = 0.5;
+  const bool is_stated = observations.states_noise(k);
+  if (is_stated) {
+    h.lower = std::max(h.lower, stated_lower * observations.noise().stddev()[k]);
+    h.upper = std::max(h.upper, 2 * h.lower);
+  }
   h.value = std::clamp(observations.noise().stddev()[k], h.lower, h.upper);
-  if (has_hyperpriors(protocol)) h.hyperprior = {HyperPrior::Form::log_normal, h.value, Standard::noise_log_stddev};
+  if (has_hyperpriors(protocol)) {
+    h.hyperprior = {HyperPrior::Form::log_normal, h.value, is_stated ? stated_log_stddev : Standard::noise_log_stddev};
+  }
   return h;
 }
 

@@ -4,6 +4,7 @@
 #include <cmath>
 #include <limits>
 #include <mutex>
+#include <numeric>
 #include <random>
 #include <set>
 
@@ -15,7 +16,9 @@
 #include "gp2/error.hpp"
 #include "gp2/fit.hpp"
 #include "inference/requirements.hpp"
+#include "training/constraint_parameters.hpp"
 #include "training/curvature.hpp"
+#include "training/hamiltonian.hpp"
 #include "training/lbfgsb.hpp"
 #include "training/objective.hpp"
 
@@ -65,7 +68,9 @@ class Training {
  public:
   Training(const Prior& prior, const std::vector<Observations>& observations, const std::vector<Hyperparameter>& hyperparameters,
            const FitOptions& options)
-      : hyperparameters_(hyperparameters),
+      : prior_(prior),
+        observations_(observations),
+        hyperparameters_(hyperparameters),
         options_(options),
         objective_(prior, observations, hyperparameters),
         reports_(static_cast<std::size_t>(n_restarts())),
@@ -89,6 +94,7 @@ class Training {
     release();
     while (n_escapes_ < options_.max_escapes && !stopped() && escape()) ++n_escapes_;
     if (options_.standard_errors && options_.max_iterations > 0 && !stopped() && estimates_parameters()) estimate_errors();
+    if (options_.n_draws > 0 && options_.max_iterations > 0 && !stopped()) draw_from_posterior();
   }
 
   // the lowest objective; of equal ones the first
@@ -101,6 +107,7 @@ class Training {
   [[nodiscard]] const std::vector<Hyperparameter>& result(std::size_t restart) const { return results_[restart]; }
   [[nodiscard]] int n_escapes() const { return n_escapes_; }
   [[nodiscard]] const std::optional<LaplaceUncertainty>& uncertainty() const { return uncertainty_; }
+  [[nodiscard]] const std::optional<HyperparameterDraws>& draws() const { return draws_; }
 
   [[nodiscard]] bool stopped() const { return is_set(options_.stop); }
 
@@ -137,6 +144,45 @@ class Training {
     result.x = result.x.cwiseProduct(scales);
     return result;
   }
+
+  // Draws about the optima of the restarts, the best one first.
+  void draw_from_posterior() {
+    std::vector<std::size_t> order(reports_.size());
+    std::iota(order.begin(), order.end(), std::size_t{0});
+    std::stable_sort(order.begin(), order.end(), [&](auto a, auto b) { return reports_[a].objective < reports_[b].objective; });
+    std::vector<std::vector<Hyperparameter>> optima;
+    for (const std::size_t restart : order) {
+      if (std::isfinite(reports_[restart].objective)) optima.push_back(results_[restart]);
+    }
+    if (optima.empty()) return;
+    const std::vector<bool> held = enter_the_constraint(prior_, observations_, optima.front());
+    bool is_any_drawn = false;
+    for (std::size_t k = 0; k < held.size(); ++k) is_any_drawn = is_any_drawn || !(held[k] || hyperparameters_[k].is_fixed());
+    if (!is_any_drawn) return;
+    HamiltonianOptions options{.seed = options_.seed, .n_side_by_side = n_side_by_side_, .stop = options_.stop};
+    options.progress = [&](double fraction) { report_drawing(fraction); };
+    try {
+      draws_ = draw_about(objective_, optima, held, options_.n_draws, options);
+    } catch (const NumericalError& error) {
+      // the fit stands, and says why it has none
+      reports_[order.front()].termination += fmt::format("; {}", error.what());
+    }
+  }
+
+  void report_drawing(double fraction) {
+    if (!options_.progress) return;
+    options_.progress({.restart = n_restarts() - 1,
+                       .n_restarts = n_restarts(),
+                       .best = best_,
+                       .seconds = seconds(),
+                       .fraction = share_of_restarts() + (1 - share_of_restarts()) * fraction,
+                       .is_drawing = true});
+  }
+  [[nodiscard]] double seconds() const {
+    return std::chrono::duration<double>(std::chrono::steady_clock::now() - start_).count();
+  }
+  // of the evaluations, where hyperparameters are drawn too: about
+  [[nodiscard]] double share_of_restarts() const { return options_.n_draws > 0 ? 0.2 : 1; }
 
   // Where the best run stopped short of its optimum it goes on, now that the curvatures are known, in units of them.
   void estimate_errors() {
@@ -287,12 +333,14 @@ class Training {
       fractions_[static_cast<std::size_t>(restart)] = iteration / (iteration + 100.0);
       double done = 0;
       for (double fraction : fractions_) done += fraction;
-      const double seconds = std::chrono::duration<double>(std::chrono::steady_clock::now() - start_).count();
-      options_.progress({restart, n_restarts(), iteration, best_, seconds, done / static_cast<double>(fractions_.size())});
+      const double fraction = share_of_restarts() * done / static_cast<double>(fractions_.size());
+      options_.progress({restart, n_restarts(), iteration, best_, seconds(), fraction});
     }
     return !stopped();
   }
 
+  const Prior& prior_;
+  const std::vector<Observations>& observations_;
   const std::vector<Hyperparameter>& hyperparameters_;
   const FitOptions& options_;
   int n_threads_ = thread_count(options_.n_threads);
@@ -305,6 +353,7 @@ class Training {
   } box_;  // as the optimiser sees it
   int n_escapes_ = 0;
   std::optional<LaplaceUncertainty> uncertainty_;
+  std::optional<HyperparameterDraws> draws_;
 
   std::mutex mutex_;  // guards what follows
   std::vector<double> fractions_;
@@ -323,6 +372,7 @@ void require_options(const FitOptions& options) {
   require("gradient_tolerance", options.gradient_tolerance, 0.0);
   require("reduction_tolerance", options.reduction_tolerance, 0.0);
   require("max_escapes", options.max_escapes, 0);
+  require("n_draws", options.n_draws, 0);
 }
 
 void require_starts(const std::vector<Hyperparameter>& hyperparameters) {
@@ -365,10 +415,11 @@ Fit fit(const Prior& prior, const std::vector<Observations>& observations, const
   report.best_restart = static_cast<int>(best);
   report.n_escapes = training.n_escapes();
   report.uncertainty = training.uncertainty();
+  report.draws = training.draws();
   report.restarts = training.reports();
-  ModelValues values = model_values(prior, observations, report.hyperparameters);
-  Posterior posterior =
-      interrupted ? Posterior::lazy(prior, observations, std::move(values)) : Posterior(prior, observations, std::move(values));
+  Posterior posterior = interrupted && !report.draws
+                            ? Posterior::lazy(prior, observations, model_values(prior, observations, report.hyperparameters))
+                            : posterior_of(prior, observations, report);
   report.seconds = std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
   return {std::move(posterior), std::move(report)};
 }

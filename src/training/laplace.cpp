@@ -69,6 +69,36 @@ LaplaceUncertainty laplace_uncertainty(const Prior& prior, const std::vector<Obs
 
 namespace {
 
+bool draws_know_parameters(const FitReport& report) {
+  if (!report.draws) return false;
+  for (std::size_t k = 0; k < report.hyperparameters.size(); ++k) {
+    const Hyperparameter& h = report.hyperparameters[k];
+    if (h.is_system_parameter() && !h.is_fixed() && !report.draws->is_drawn(static_cast<Index>(k))) return false;
+  }
+  return true;
+}
+
+}  // namespace
+
+ParameterUncertainty parameter_uncertainty(const FitReport& report, std::size_t k) {
+  constexpr double nan = std::numeric_limits<double>::quiet_NaN();
+  const Hyperparameter& h = report.hyperparameters[k];
+  const auto at = static_cast<Index>(k);
+  if (draws_know_parameters(report) && report.draws->is_drawn(at)) {
+    const HyperparameterDraws& draws = *report.draws;
+    return {true, draws.stddev[at], draws.mean[at], draws.lower[at], draws.upper[at]};
+  }
+  return {.stddev = !report.uncertainty || h.at_bound() ? nan : report.uncertainty->stddev[at]};
+}
+
+double parameter_correlation(const FitReport& report, std::size_t k, std::size_t l) {
+  const auto a = static_cast<Index>(k), b = static_cast<Index>(l);
+  if (draws_know_parameters(report)) return report.draws->correlation(a, b);
+  return report.uncertainty ? report.uncertainty->correlation(a, b) : std::numeric_limits<double>::quiet_NaN();
+}
+
+namespace {
+
 // "R by +1 %, Ic by +0.98 %": θ along a direction, as far as the one that changes most changes by a hundredth
 std::string changes_along(const std::vector<Hyperparameter>& hyperparameters, const std::vector<int>& parameters,
                           const VectorXd& direction) {

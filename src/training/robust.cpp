@@ -202,14 +202,31 @@ Fit fit_robust(const Prior& prior, const std::vector<Observations>& observations
   // Outliers hide behind each other where a fit explains them all, by a signal that is large and short. From a choice that is
   // too strict at first it is not drawn there; the objective, at a price for each value distrusted, decides between them.
   const std::vector<VectorXd> noise = model_values(prior, observations, hyperparameters).noise_stddev;
-  Search search(prior, observations, options, robust);
+  FitOptions full = options;
+  full.n_draws = quick.n_draws = 0;  // drawn once, at the end
+  Search search(prior, observations, full, robust);
   for (const double threshold : {gross, suspicious}) {
     search.run(choose_at_sight(observations, noise, threshold), hyperparameters, quick);
   }
   Choice choice{search.best().posterior.observations(), search.best().report.distrusted};
   search.forget_cost();
-  search.run(std::move(choice), hyperparameters, options);
-  return search.best();
+  search.run(std::move(choice), hyperparameters, full);
+  Fit out = search.best();
+  if (options.n_draws == 0 || is_set(options.stop)) return out;
+  FitOptions about_best = quick;
+  about_best.n_draws = options.n_draws;
+  about_best.standard_errors = false;
+  try {
+    out.report.draws = fit(prior, out.posterior.observations(), out.report.hyperparameters, about_best).report.draws;
+  } catch (const NumericalError&) {
+    if (!is_set(options.stop)) throw;
+  }
+  if (is_set(options.stop)) {
+    out.report.converged = false;
+    out.report.termination = FitReport::interrupted;
+  }
+  if (out.report.draws) out.posterior = posterior_of(prior, out.posterior.observations(), out.report);
+  return out;
 }
 
 }  // namespace gp2

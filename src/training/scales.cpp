@@ -139,7 +139,7 @@ VectorXd usable_spreads(VectorXd spreads, const MatrixXd& features) {
   return spreads;
 }
 
-// σ_j, M_jj σ_j, or of directions of its own σ̄ / rms(E column)
+// σ_j, M_jj σ_j, or of a direction of its own the size that moves the coordinates by their σ: 1 / rms |E column / σ|
 VectorXd signal_scales(const Latent& latent, const MatrixXd& directions, const VectorXd& mass_diagonal, const VectorXd& sigma) {
   if (!latent.directions) {
     return latent.base == Latent::Base::force ? VectorXd(mass_diagonal.cwiseProduct(sigma)) : sigma;
@@ -147,8 +147,8 @@ VectorXd signal_scales(const Latent& latent, const MatrixXd& directions, const V
   VectorXd signal(latent.size());
   for (Index l = 0; l < signal.size(); ++l) {
     const auto column = directions.middleRows(l * sigma.size(), sigma.size());
-    const double rms = std::sqrt(column.squaredNorm() / static_cast<double>(column.size()));
-    signal[l] = sigma.mean() / usable(rms, 1);
+    const double rms = std::sqrt((sigma.cwiseInverse().asDiagonal() * column).squaredNorm() / static_cast<double>(column.cols()));
+    signal[l] = 1 / usable(rms, 1 / sigma.mean());
   }
   return signal;
 }

@@ -68,15 +68,21 @@ TEST(CommandLine, JsonStandsAloneOnStdoutWithTheContractedKeys) {
   const Outcome fit =
       desk.done("gp2 fit models/surface.toml --data train.csv --max-iterations 3 --restarts 1 --json -o fit.json");
   const auto report = fit.json();
-  EXPECT_THAT(keys(report), ElementsAre("hyperparameters", "iterations", "nll", "options", "seconds", "termination"));
+  EXPECT_THAT(keys(report), ElementsAre("hyperparameters", "iterations", "left_out", "nll", "options", "seconds", "termination"));
+  for (const char* how : {"one_by_one", "stretches"}) {
+    EXPECT_THAT(keys(report["left_out"][how]), ElementsAre("coverage50", "coverage80", "coverage95", "nrmse"));
+  }
   ASSERT_EQ(report["hyperparameters"].size(), 12u);
   for (const auto& one : report["hyperparameters"]) {
     EXPECT_THAT(keys(one), ElementsAre("at_bound", "lower", "name", "unit", "upper", "value"));
   }
   const Outcome evaluation = desk.done("gp2 evaluate fit.json --data train.csv --json");
   EXPECT_THAT(keys(evaluation.json()),
-              ElementsAre("coverage95", "coverage95_latent", "far", "max_constraint_error", "max_constraint_error_fitted", "n",
-                          "n_missing", "n_zero_variance", "near", "nlpd", "nlpd_latent", "nrmse", "rmse", "rmse_normalised"));
+              ElementsAre("coverage50", "coverage50_latent", "coverage80", "coverage80_latent", "coverage95", "coverage95_latent",
+                          "far", "max_constraint_error", "max_constraint_error_fitted", "n", "n_missing", "n_zero_variance",
+                          "near", "nlpd", "nlpd_latent", "nrmse", "pit", "rmse", "rmse_normalised"));
+  EXPECT_THAT(keys(evaluation.json()["near"]), ElementsAre("coverage50", "coverage50_latent", "coverage80", "coverage80_latent",
+                                                           "coverage95", "coverage95_latent", "n", "nrmse", "pit"));
   EXPECT_THAT(keys(evaluation.json()["rmse"]), ElementsAre("ddq1", "ddq2", "ddq3"));
 }
 

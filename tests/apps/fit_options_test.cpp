@@ -113,6 +113,7 @@ TEST_F(FitCommand, TellsWhatItWasAskedAndTheFileDoesToo) {
   const nlohmann::json expected = {{"discrepancy", "default"},
                                    {"estimate", nlohmann::json::array()},
                                    {"gradient_tolerance", 1e-5},
+                                   {"hyperparameters", "auto"},
                                    {"hyperprior", "default"},
                                    {"max_escapes", 5},
                                    {"max_iterations", 6},
@@ -130,6 +131,22 @@ TEST_F(FitCommand, TellsWhatItWasAskedAndTheFileDoesToo) {
   const nlohmann::json again = fit("--start fit.json --max-iterations 0", "again.json");
   desk.write("start.json", again["options"]["start"].dump());
   EXPECT_EQ(fit("--start start.json --max-iterations 0")["hyperparameters"], again["hyperparameters"]);
+}
+
+TEST_F(FitCommand, TellsOfTheHyperparametersThatItDrew) {
+  const nlohmann::json report = fit("--restarts 1 --max-escapes 0 --max-points 12 --estimate none --hyperparameters integrate");
+  const nlohmann::json& draws = report.at("draws");
+  EXPECT_EQ(draws.at("n_draws"), 25);
+  EXPECT_EQ(draws.at("n_chains"), 8);
+  ASSERT_EQ(draws.at("hyperparameters").size(), report.at("hyperparameters").size());
+  for (const nlohmann::json& one : draws.at("hyperparameters")) {
+    EXPECT_LE(one.at("lower95"), one.at("mean"));
+    EXPECT_GE(one.at("upper95"), one.at("mean"));
+    EXPECT_GE(one.at("r_hat"), 1);
+    EXPECT_GT(one.at("effective_size"), 0);
+  }
+  EXPECT_TRUE(desk.json("fit.json").at("report").contains("draws"));
+  EXPECT_FALSE(short_fit("").contains("draws"));
 }
 
 TEST_F(FitCommand, StartTakesValuesByName) {

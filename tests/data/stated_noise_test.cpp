@@ -138,9 +138,10 @@ TEST(StatedNoise, IsMultipliedByAFactorThatIsEstimatedUnlessItIsTrusted) {
   EXPECT_EQ(factor.unit, "stated deviation of ddx");
   EXPECT_EQ(factor.value, 1);
   EXPECT_EQ(factor.hyperprior.median, 1);
-  // the smallest deviation stays above 1e-6 of the spread, the usual one below twice the spread
+  EXPECT_EQ(factor.hyperprior.stddev, 0.5);
+  // no fit says that stated deviations are more than five times too large; the usual one stays below twice the spread
   const double spread = row_stddev(problem.observations.front().values())[0];
-  EXPECT_DOUBLE_EQ(factor.lower, 1e-6 * spread / 0.01);
+  EXPECT_EQ(factor.lower, 0.2);
   EXPECT_DOUBLE_EQ(factor.upper, 2 * spread / 0.21);
   EXPECT_TRUE(problem.observations.front().noise().is_estimated());
 }
@@ -174,7 +175,7 @@ TEST(StatedNoise, FollowsTheRowsThatAreTaken) {
 }
 
 TEST(StatedNoise, SizesTheDiscrepancyByTheUsualDeviation) {
-  const FitProblem problem = make_fit_problem(slope_with(), log_of({"ddx_std"}), {});
+  const FitProblem problem = make_fit_problem(slope_with(), log_of({"ddx_std"}), trusting());
   ASSERT_TRUE(problem.prior_options.discrepancy.has_value());
   EXPECT_DOUBLE_EQ(problem.prior_options.discrepancy->stddev[0], 0.4 * 0.21);
 }

@@ -228,6 +228,59 @@ TEST(FitFile, StandardErrorsSurvive) {
   EXPECT_EQ(read.distance_from_optimum, written.distance_from_optimum);
 }
 
+// three draws about the fitted values
+FitFile drawn_fit() {
+  FitFile fit = fit_of(unicycle());
+  const auto n = static_cast<Eigen::Index>(fit.report.hyperparameters.size());
+  HyperparameterDraws& draws = fit.report.draws.emplace();
+  draws.values.resize(n, 3);
+  for (Eigen::Index h = 0; h < n; ++h) {
+    const double value = fit.report.hyperparameters[static_cast<std::size_t>(h)].value;
+    draws.values.row(h) << value, 1.1 * value, 0.95 * value;
+  }
+  draws.mean = draws.values.rowwise().mean();
+  draws.stddev = Eigen::VectorXd::LinSpaced(n, 0.1, 0.7);
+  draws.lower = draws.mean - draws.stddev;
+  draws.upper = draws.mean + 2 * draws.stddev;
+  draws.r_hat = Eigen::VectorXd::LinSpaced(n, 1, 1.2);
+  draws.effective_size = Eigen::VectorXd::LinSpaced(n, 90, 200);
+  draws.correlation = Eigen::MatrixXd::Identity(n, n);
+  draws.correlation(0, 2) = draws.correlation(2, 0) = -0.3;
+  draws.n_chains = 4;
+  draws.evaluations = 3500;
+  draws.acceptance = 0.81;
+  return fit;
+}
+
+TEST(FitFile, DrawsSurviveAndThePosteriorIsTheirMixture) {
+  EXPECT_FALSE(written_json(fit_of(unicycle())).at("report").contains("draws"));
+  const FitFile fit = drawn_fit(), read = written_and_read(fit);
+  const HyperparameterDraws &a = *fit.report.draws, &b = read.report.draws.value();
+  EXPECT_EQ(b.values, a.values);
+  EXPECT_EQ(b.mean, a.mean);
+  EXPECT_EQ(b.stddev, a.stddev);
+  EXPECT_EQ(b.lower, a.lower);
+  EXPECT_EQ(b.upper, a.upper);
+  EXPECT_EQ(b.r_hat, a.r_hat);
+  EXPECT_EQ(b.effective_size, a.effective_size);
+  EXPECT_EQ(b.correlation, a.correlation);
+  EXPECT_EQ(std::tie(b.n_chains, b.evaluations, b.acceptance), std::tie(a.n_chains, a.evaluations, a.acceptance));
+  EXPECT_EQ(read.posterior().n_components(), 3);
+  expect_same_predictions(fit, read);
+  // a file of the fit, and of one whose posterior is another
+  const Fit whole{fit.posterior(), fit.report};
+  EXPECT_EQ(FitFile(fit.model, fit.prior_options, whole).posterior().n_components(), 3);
+  EXPECT_EQ(input_error_of([&] {
+              FitFile(fit.model, fit.prior_options, {fit.posterior().component(0), fit.report});
+            }),
+            "FitFile: the hyperparameters of the report are not those of the posterior");
+  FitFile torn = fit;
+  torn.report.draws->values.conservativeResize(2, Eigen::NoChange);
+  EXPECT_EQ(input_error_of([&] { static_cast<void>(torn.posterior()); }),
+            fmt::format("the draws of a fit must hold one number for each of its {} hyperparameters, got 2 × 3",
+                        fit.report.hyperparameters.size()));
+}
+
 TEST(FitFile, TheSameFitGivesTheSameBytes) {
   const TemporaryFolder folder;
   fit_of(unicycle()).write(folder / "a.json");
@@ -247,9 +300,10 @@ TEST(FitFile, TellsWhatWasAskedOfTheFit) {
 }
 
 class OldFit : public testing::TestWithParam<int> {};
-INSTANTIATE_TEST_SUITE_P(OfFormat, OldFit, testing::Values(1, 2, 4, 5));
+INSTANTIATE_TEST_SUITE_P(OfFormat, OldFit, testing::Values(1, 2, 4, 5, 6));
 
-// written by gp2 when that format was its newest: alone; with a log of another system; with a noise per value; of a robot
+// written by gp2 when that format was its newest: alone; with a log of another system; with a noise per value; of a robot;
+// without draws
 TEST_P(OldFit, IsReadAndWrittenAsTheNewest) {
   const auto path = std::filesystem::path(GP2_SOURCE_DIR) / "tests/files/old_fits" / fmt::format("version_{}.json", GetParam());
   ASSERT_EQ(Json::parse(read_file(path)).at("version"), GetParam());
@@ -257,7 +311,7 @@ TEST_P(OldFit, IsReadAndWrittenAsTheNewest) {
   // on another way, and by another machine
   const double nll = old.report.negative_log_likelihood;
   EXPECT_NEAR(old.posterior().negative_log_likelihood(), nll, 1e-9 * (1 + std::abs(nll)));
-  EXPECT_EQ(old.options, "");
+  EXPECT_EQ(old.options.empty(), GetParam() < 6);
   const Json json = written_json(old);
   EXPECT_EQ(json.at("version"), FitFile::format_version);
   const FitFile again = written_and_read(old);
@@ -316,6 +370,27 @@ class DamagedFit : public testing::Test {
 
 TEST_F(DamagedFit, TheWholeFitIsRead) {
   EXPECT_EQ(error_after([](Json&) {}), "");
+}
+
+TEST_F(DamagedFit, DrawsThatDoNotHoldTogetherAreRefused) {
+  const Json draws = written_json(drawn_fit()).at("report").at("draws");
+  const auto refused = [&](const std::function<void(Json&)>& damage) {
+    return error_after([&](Json& json) { damage(json["report"]["draws"] = draws); });
+  };
+  EXPECT_EQ(refused([](Json&) {}), "");
+  const std::size_t n = whole_.at("hyperparameters").size();
+  const auto first = whole_.at("hyperparameters")[0].at("name").get<std::string>();
+  EXPECT_EQ(refused([](Json& d) { d["values"] = Json::array(); }), "0 draws of hyperparameters, expected 1 … 1000");
+  EXPECT_EQ(refused([](Json& d) { d["values"] = std::vector<int>(1001, 1); }),
+            "1001 draws of hyperparameters, expected 1 … 1000");
+  EXPECT_EQ(refused([](Json& d) { d["values"][1].erase(0); }), fmt::format("draws of {} of {} hyperparameters", n - 1, n));
+  EXPECT_EQ(refused([](Json& d) { d["values"][1][0] = -1; }),
+            fmt::format("a draw of hyperparameter '{}' has the impossible value -1", first));
+  EXPECT_EQ(refused([](Json& d) { d["values"][1][0] = 1e200; }), "draws hold a number that is too large");
+  EXPECT_EQ(refused([](Json& d) { d["values"][1][0] = nullptr; }), "null stands where a number must");
+  EXPECT_EQ(refused([](Json& d) { d["correlation"].erase(0); }), "correlations that are not square");
+  EXPECT_EQ(refused([](Json& d) { d["n_chains"] = 1.5; }), "1.5 stands where a whole number must");
+  EXPECT_THAT(refused([](Json& d) { d.erase("r_hat"); }), StartsWith("not a whole fit file"));
 }
 
 /// A fit of some kilobytes, as it is written.
@@ -401,7 +476,7 @@ TEST_F(DamagedFit, WrittenAnewByOtherProgramsIsTheSame) {
 
 TEST_F(DamagedFit, OfAnOlderVersionInNameOnlyIsRefused) {
   std::string text = small_fit();
-  text.replace(text.find("\"version\": 6"), 12, "\"version\": 5");
+  text.replace(text.find("\"version\": 7"), 12, "\"version\": 5");
   EXPECT_THAT(error_of(text), HasSubstr("changed after gp2 wrote it"));
 }
 

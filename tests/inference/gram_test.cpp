@@ -159,7 +159,7 @@ TEST(GramTest, ItsInverseHoldsTheBlocksOfEachSample) {
     const Reduced of(p);
     DenseGram gram;
     ASSERT_TRUE(gram.factorise(of.rows).has_value());
-    const Gram::Inverse inverse = gram.invert(of.rows);
+    const Gram::Inverse inverse = gram.invert(of.rows, {{2, 0}});
     const MatrixXd P = covariance(of.rows).inverse();
     EXPECT_LE((inverse.alpha - P * of.reduction.y).norm(), 1e-9 * inverse.alpha.norm());
     ASSERT_EQ(inverse.blocks.size(), of.reduction.samples.size());
@@ -170,6 +170,10 @@ TEST(GramTest, ItsInverseHoldsTheBlocksOfEachSample) {
       }
       EXPECT_LE((inverse.blocks[s] - P(rows, rows)).norm(), 1e-9);
     }
+    const std::vector<Index> of_both = rows_of_samples(of.reduction, {2, 0});
+    ASSERT_EQ(inverse.of_set.size(), 1u);
+    EXPECT_LE((inverse.of_set[0] - P(of_both, of_both)).norm(), 1e-9);
+    EXPECT_EQ(inverse.of_set[0].bottomRightCorner(inverse.blocks[0].rows(), inverse.blocks[0].cols()), inverse.blocks[0]);
   }
 }
 

@@ -235,6 +235,7 @@ mass  = [["x", "0"], ["0", "1"]]
 [constraints]
 acceleration = ["{}"]
 [[latent]]
+kernel     = "se"
 features   = ["y"]
 directions = "{}"
 )toml",

@@ -1,9 +1,14 @@
+#include <algorithm>
+#include <cmath>
+
+#include <gmock/gmock.h>
 #include <gtest/gtest.h>
 
 #include "gp2/error.hpp"
 #include "gp2/inference/evaluation.hpp"
 #include "gp2/inference/leave_one_out.hpp"
 #include "inference/sampling.hpp"
+#include "input_error.hpp"
 #include "observations_testing.hpp"
 
 // Observations some of whose values are not measured, and what is predicted of a value when it is left out.
@@ -304,6 +309,66 @@ TEST(LeaveOneOutTest, EachValueIsPredictedAsByAPosteriorThatHasNotSeenIt) {
       EXPECT_GT(n_compared, 0);
     }
   }
+}
+
+// in order of t where all states have one, else in their own
+std::vector<std::vector<int>> stretches_of(const Problem& p, const Observations& group, int n) {
+  std::vector<int> order;
+  for (int i = 0; i < group.n_data(); ++i) order.push_back(i);
+  const VectorXd t = group.states().row(p.prior.system->layout().t()).transpose();
+  if (t.allFinite()) std::stable_sort(order.begin(), order.end(), [&](int i, int j) { return t[i] < t[j]; });
+  std::vector<std::vector<int>> stretches(static_cast<std::size_t>(n));
+  for (std::size_t k = 0; k < order.size(); ++k) stretches[k * static_cast<std::size_t>(n) / order.size()].push_back(order[k]);
+  return stretches;
+}
+
+TEST(LeaveOutTest, EachStretchIsPredictedAsByAPosteriorThatHasNotSeenIt) {
+  constexpr int n_stretches = 3;
+  for (const Problem& p : gappy_problems()) {
+    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, missing_values_seed));
+    const LeftOut left_out = leave_out(test::posterior_of(p), n_stretches);
+    ASSERT_EQ(left_out.stretches.size(), p.observations.size());
+    for (std::size_t b = 0; b < n_stretches; ++b) {
+      Problem without = p;
+      for (std::size_t g = 0; g < p.observations.size(); ++g) {
+        MatrixXd values = p.observations[g].values();
+        values(Eigen::all, stretches_of(p, p.observations[g], n_stretches)[b]).setConstant(nan);
+        without.observations[g] = p.observations[g].with_values(values);
+      }
+      const Posterior posterior = test::posterior_of(without);
+      for (std::size_t g = 0; g < p.observations.size(); ++g) {
+        const Observations& group = p.observations[g];
+        const Posterior::Marginal expected = posterior.marginal(group.view(), group.states());
+        const MatrixXd slip =
+            with_slip(posterior, group.view(), group.states(), MatrixXd::Zero(group.view().size(), group.n_data()));
+        const std::vector<int> stretch = stretches_of(p, group, n_stretches)[b];
+        for (const int i : stretch) {
+          for (Index k = 0; k < group.values().rows(); ++k) {
+            EXPECT_EQ(std::isnan(left_out.stretches[g].mean(k, i)), std::isnan(group.values()(k, i)));
+            if (std::isnan(group.values()(k, i))) continue;
+            const double variance = std::pow(expected.stddev()(k, i), 2) + std::pow(slip(k, i), 2);
+            const double size = largest(expected.mean) + std::sqrt(variance) + group.noise().stddev()[k];
+            EXPECT_NEAR(left_out.stretches[g].mean(k, i), expected.mean(k, i), gappy_rounding(p) * (1 + size));
+            EXPECT_NEAR(left_out.stretches[g].variance(k, i), variance, gappy_rounding(p) * (1 + size * size));
+          }
+        }
+      }
+    }
+  }
+}
+
+TEST(LeaveOutTest, SaysTheSameOfEachValueWhateverTheStretches) {
+  const Problem p = gappy_problems().front();
+  const std::vector<LeaveOneOut> values = leave_one_out(test::posterior_of(p));
+  const LeftOut left_out = leave_out(test::posterior_of(p), 4);
+  for (std::size_t g = 0; g < values.size(); ++g) {
+    const auto measured = !p.observations[g].values().array().isNaN();
+    EXPECT_TRUE((values[g].mean.array() == left_out.values[g].mean.array() || !measured).all());
+    EXPECT_TRUE((values[g].variance.array() == left_out.values[g].variance.array() || !measured).all());
+  }
+  EXPECT_TRUE(leave_out(test::posterior_of(p), 0).stretches.empty());
+  EXPECT_THAT(test::input_error_of([&] { leave_out(test::posterior_of(p), -1); }),
+              testing::HasSubstr("n_stretches must not be negative, got -1"));
 }
 
 }  // namespace

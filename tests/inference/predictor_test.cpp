@@ -59,7 +59,7 @@ std::vector<View> predicted_views_of(const Problem& p) {
 
 std::string describe(const Problem& p, const View& view) {
   return fmt::format("{}, {} ({} rows, latent {}{}), seed {}", p.name, view.quantity->word(), view.size(),
-                     view.latent.value_or(-1), view.other_system ? ", elsewhere" : "", predictor_seed);
+                     view.latent.value_or(-1).first, view.other_system ? ", elsewhere" : "", predictor_seed);
 }
 
 MatrixXd known(const MatrixXd& states) { return states.array().isNaN().select(0, states); }

@@ -362,7 +362,7 @@ DenseView dense_view(const Prior& home, const ModelValues& values, const View& v
         E = Extended(entries.reshaped(nq, latent.size()).cast<long double>());
       }
       if (latent.base == Latent::Base::force) E = M_inverse * E;
-      if (view.latent >= 0 && view.latent != static_cast<int>(a)) E.setZero();
+      if (!view.has_latent(a)) E.setZero();
       loadings.push_back(G * E * values.signal_stddev[a].cast<long double>().asDiagonal());
     }
   }

@@ -1,7 +1,9 @@
 // What is compared, and by which noise.
 #include <algorithm>
 #include <cmath>
+#include <limits>
 #include <numbers>
+#include <optional>
 
 #include <fmt/format.h>
 #include <gmock/gmock.h>
@@ -98,18 +100,85 @@ TEST(EvaluateJob, CountsWhatTheConstraintDecidesAsDecided) {
 
 TEST(EvaluateJob, ScoresPointsNearTheDataAndFarFromThemApart) {
   const FitOutcome fit = fit_of({{log_of("a.csv", 40, ",ddx,ddy,ddheading", false)}});
-  MatrixXd states = fit.posterior.observations().front().states().leftCols(30);
+  // without the first, which is straight
+  MatrixXd states = fit.posterior.observations().front().states().middleCols(1, 30);
   const MatrixXd targets = MatrixXd::Random(3, 30);
   states.rightCols(10).middleRows(3, 3) *= 30;
   const Evaluation both = evaluate_predictions(fit.posterior, states, {0, 1, 2}, targets);
   EXPECT_EQ(both.near.n, 20);
   EXPECT_EQ(both.far.n, 10);
   // the parts make the whole, output by output where those are alike
-  EXPECT_NEAR(both.coverage95, (20 * both.near.coverage95 + 10 * both.far.coverage95) / 30, 1e-12);
+  for (const auto share : {&Calibration::coverage50, &Calibration::coverage80, &Calibration::coverage95}) {
+    EXPECT_NEAR(both.*share, (20 * both.near.*share + 10 * both.far.*share) / 30, 1e-12);
+  }
+  EXPECT_LE(both.coverage50, both.coverage80);
+  EXPECT_LE(both.coverage80, both.coverage95);
+  EXPECT_NEAR(both.pit.sum(), 1, 1e-12);
+  EXPECT_LE((both.pit - (20 * both.near.pit + 10 * both.far.pit) / 30).norm(), 1e-12);
   const Evaluation near = evaluate_predictions(fit.posterior, states.leftCols(20), {0, 1, 2}, targets.leftCols(20));
   EXPECT_NEAR(both.near.nrmse * row_stddev(targets).norm(), near.rmse.norm(), 1e-12);
   EXPECT_EQ(near.far.n, 0);
   EXPECT_TRUE(std::isnan(near.far.nrmse));
+  EXPECT_TRUE(std::isnan(near.far.coverage50) && near.far.pit.array().isNaN().all());
+}
+
+TEST(Calibration, CountsTheErrorsWithinAndTheTenthsTheyFallInto) {
+  VectorXd z(7);  // of Φ: .5, .691, .159, .992, NaN, 0 and 1 to rounding
+  z << 0, 0.5, -1, 2.4, std::numeric_limits<double>::quiet_NaN(), -50, 50;
+  EXPECT_LE((central_coverage(z, Eigen::Vector4d(0.3, 0.5, 0.8, 0.99)) - Eigen::Vector4d(1, 2, 3, 4) / 6).norm(), 1e-12);
+  VectorXd expected(10);
+  expected << 1, 1, 0, 0, 0, 1, 1, 0, 0, 2;
+  EXPECT_LE((pit_histogram(z, 10) - expected / 6).norm(), 1e-12);
+  EXPECT_TRUE(central_coverage(VectorXd(), Eigen::Vector2d(0.5, 0.9)).array().isNaN().all());
+  EXPECT_TRUE(pit_histogram(VectorXd::Constant(1, std::nan("")), 10).array().isNaN().all());
+}
+
+// a slow motion: the state of a row is nearly that of the next
+FitOutcome fit_of_slow_motion(std::optional<int> max_points = std::nullopt) {
+  std::string text = "heading,dx,dy,dheading,ddx,ddheading\n";
+  for (int i = 0; i < 60; ++i) {
+    const double heading = 1.2 * std::sin(0.1 * i), speed = 1 + 0.9 * std::cos(0.07 * i), turn = std::cos(0.05 * i);
+    text +=
+        fmt::format("{},{},{},{},{},{}\n", heading, speed * std::cos(heading), speed * std::sin(heading), turn,
+                    -speed * speed * std::cos(heading) - turn * speed * std::sin(heading), -std::sin(2 * turn) + 0.5 * heading);
+  }
+  FitRequest request;
+  request.model = sledge();
+  request.logs = {{CsvTable::parse(text, "slow.csv")}};
+  request.problem.observe = {"ddx", "ddheading"};
+  request.restarts = 1;
+  request.problem.max_points = max_points;
+  return run_fit(prepare_fit(std::move(request)));
+}
+
+TEST(CrossValidation, OfStretchesIsWorseThanOfSingleRowsOfASlowMotion) {
+  const FitOutcome fit = fit_of_slow_motion();
+  ASSERT_TRUE(fit.cross_validation && fit.cross_validation->stretches);
+  const Evaluation::Part &rows = fit.cross_validation->one_by_one, &stretches = *fit.cross_validation->stretches;
+  EXPECT_EQ(rows.n, 60);
+  EXPECT_GT(stretches.nrmse, 1.2 * rows.nrmse);
+  EXPECT_EQ(fit.cross_validation->text(),
+            fmt::format("left out one by one: nrmse {:.3g}, 95 % coverage {:.3g}; in 5 stretches of the log: {:.3g}, {:.3g}",
+                        rows.nrmse, rows.coverage95, stretches.nrmse, stretches.coverage95));
+
+  // the same figures by a posterior that has not seen the stretch
+  const Observations& all = fit.posterior.observations().front();
+  double squares = 0;
+  for (int b = 0; b < 5; ++b) {
+    MatrixXd values = all.values();
+    values.middleCols(12 * b, 12).setConstant(std::nan(""));
+    const Posterior without(fit.posterior.prior(), {all.with_values(values)}, fit.posterior.values());
+    squares += (without.mean(all.view(), all.states()) - all.values()).middleCols(12 * b, 12).squaredNorm();
+  }
+  EXPECT_NEAR(stretches.nrmse, std::sqrt(squares / 60) / row_stddev(all.values()).norm(), 1e-6);
+}
+
+TEST(CrossValidation, HasNoStretchesWithoutTimeOrder) {
+  const FitOutcome shuffled = fit_of_slow_motion(40);
+  ASSERT_TRUE(shuffled.cross_validation);
+  EXPECT_FALSE(shuffled.cross_validation->stretches);
+  EXPECT_THAT(shuffled.cross_validation->text(), Not(HasSubstr("stretches")));
+  EXPECT_TRUE(fit_of_slow_motion(61).cross_validation->stretches);
 }
 
 TEST(EvaluateJob, MeasuresByTheNoiseThatTheTestLogStates) {

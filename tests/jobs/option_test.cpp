@@ -18,8 +18,8 @@ json json_of(FitRequest& request) { return json::parse(options_json(options(requ
 
 TEST(Options, OfANewFitAreTheDefaults) {
   FitRequest request;
-  EXPECT_EQ(json_of(request),
-            json::parse(R"({"discrepancy": "default", "hyperprior": "default", "max_iterations": 1000, "mean": "zero",
+  EXPECT_EQ(json_of(request), json::parse(R"({"discrepancy": "default", "hyperparameters": "auto", "hyperprior": "default",
+                            "max_iterations": 1000, "mean": "zero",
                             "protocol": "default", "seed": 0, "standard_errors": true})"));
 }
 
@@ -45,6 +45,7 @@ FitRequest request_with_every_option() {
   request.gradient_tolerance = 1e-5;
   request.reduction_tolerance = 1e-12;
   request.max_iterations = 7;
+  request.hyperparameters = HyperparameterChoice::integrate;
   request.standard_errors = false;
   request.start.values = {{"m2", 0.7}};
   return request;
@@ -52,7 +53,7 @@ FitRequest request_with_every_option() {
 
 constexpr const char* every_option =
     R"({"also_noise_std": 0.2, "baseline": "icm", "discrepancy": "none", "dt": 0.01, "estimate": [], "gradient_tolerance": 1e-5,
-        "hyperprior": "none", "map": ["theta1=q3"], "max_escapes": 0, "max_iterations": 7, "max_points": 30, "mean": "force",
+        "hyperparameters": "integrate", "hyperprior": "none", "map": ["theta1=q3"], "max_escapes": 0, "max_iterations": 7, "max_points": 30, "mean": "force",
         "noise_std": 0.1, "observe": ["ddq1", "ddq3"], "prior": "force", "project": true, "protocol": "paper",
         "reduction_tolerance": 1e-12, "restarts": 3, "robust": true, "seed": 18446744073709551615, "standard_errors": false,
         "start": {"m2": 0.7}})";
@@ -73,6 +74,7 @@ TEST(Options, ReadBackAreThoseThatWereWritten) {
   EXPECT_EQ(json_of(request), json::parse(every_option));
   EXPECT_EQ(request.problem.columns, (std::map<std::string, std::string>{{"q3", "theta1"}}));
   EXPECT_EQ(request.problem.protocol.name, Protocol::Name::paper);
+  EXPECT_EQ(request.hyperparameters, HyperparameterChoice::integrate);
   EXPECT_FALSE(request.standard_errors);
   EXPECT_EQ(request.problem.seed, 18446744073709551615U);
   read_options(R"({"noise_std": "stated"})", options(request), "fit.json");

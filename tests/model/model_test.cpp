@@ -74,7 +74,7 @@ TEST_P(ShippedModel, IsReadWhole) {
   EXPECT_THAT(model.truth, SizeIs(static_cast<std::size_t>(model.system->nq())));
   EXPECT_TRUE(!model.sampling.empty() || model.motion);
   for (const bool raw_angles : {false, true}) {
-    EXPECT_THAT(make_prior(model, {Prior::Mean::force, std::nullopt, raw_angles}).latents, SizeIs(model.latents.size()));
+    EXPECT_GE(make_prior(model, {Prior::Mean::force, std::nullopt, raw_angles}).latents.size(), model.latents.size());
   }
 }
 
@@ -101,7 +101,7 @@ TEST(Model, WithoutALatentTheAccelerationHasOneOverTheWholeStateButTime) {
     const Model model = parse(added + base);
     ASSERT_THAT(model.latents, SizeIs(1));
     EXPECT_EQ(model.latents[0].name, "unconstrained acceleration");
-    EXPECT_EQ(model.latents[0].kernel, "se");
+    EXPECT_EQ(model.latents[0].kernel, "");
     EXPECT_EQ(model.latents[0].base, Latent::Base::acceleration);
     EXPECT_THAT(model.latents[0].features, ElementsAre("q1", "q2", "dq1", "dq2", "u1"));
     EXPECT_THAT(make_prior(model).latents[0].feature_names, ElementsAre("q1", "sin(q2)", "cos(q2)", "dq1", "dq2", "u1"));
@@ -128,7 +128,7 @@ TEST(Model, DirectionsHaveFiveForms) {
                            Form{R"([["-dq1"], [0]])", Latent::Base::acceleration, 1},
                            Form{R"({ acceleration = [["1", "0"], ["0", "q1"]] })", Latent::Base::acceleration, 2},
                            Form{R"({ force = [["-dq1"], ["m"]] })", Latent::Base::force, 1}}) {
-    const Model model = parse(base + "[[latent]]\nfeatures = [\"q1\"]\ndirections = " + form.text + "\n");
+    const Model model = parse(base + "[[latent]]\nkernel = \"se\"\nfeatures = [\"q1\"]\ndirections = " + form.text + "\n");
     const Latent latent = make_prior(model).latents[0];
     EXPECT_EQ(latent.base, form.base) << form.text;
     EXPECT_EQ(latent.directions == nullptr, form.n_columns == 0) << form.text;
@@ -137,7 +137,7 @@ TEST(Model, DirectionsHaveFiveForms) {
 }
 
 TEST(Model, DirectionsMayBeReplacedWhereThereIsOneLatent) {
-  const std::string latent = "[[latent]]\nfeatures = [\"q1\"]\ndirections = [[\"1\"], [\"0\"]]\n";
+  const std::string latent = "[[latent]]\nkernel = \"se\"\nfeatures = [\"q1\"]\ndirections = [[\"1\"], [\"0\"]]\n";
   const Latent replaced_latent = make_prior(parse(base + latent), {Prior::Mean::zero, Latent::Base::force}).latents[0];
   EXPECT_EQ(replaced_latent.base, Latent::Base::force);
   EXPECT_EQ(replaced_latent.directions, nullptr);

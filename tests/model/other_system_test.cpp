@@ -87,7 +87,7 @@ TEST(MakeSetting, NamesWhatDiffers) {
   EXPECT_EQ(input_error_of([&] { make_other_system(home(), Model::parse(of_z, "other.toml")); }),
             rule + "its coordinates are x, z there, but x, y here");
   EXPECT_EQ(refused(with(&BeadText::inputs, R"("u", "v")")), rule + "its inputs are u, v there, but u here");
-  EXPECT_EQ(refused(with(&BeadText::extra, "[[latent]]\nfeatures = [\"x\"]")),
+  EXPECT_EQ(refused(with(&BeadText::extra, "[[latent]]\nkernel = \"se\"\nfeatures = [\"x\"]")),
             rule + "the number of its latents is 2 there, but 1 here");
   EXPECT_EQ(refused(with(&BeadText::kernel, "se + linear")),
             rule + "the kernel of its latent 1, 'drag', is se+linear there, but se here");

@@ -151,7 +151,7 @@ RandomProblem random_problem() {
   RC_PRE(p.mechanics_condition < 1e3);
   RC_LOG() << model.text;
   for (const Observations& group : p.observations) {
-    RC_LOG() << group.view().quantity->word() << ", latent " << group.view().latent.value_or(-1) << ", noise "
+    RC_LOG() << group.view().quantity->word() << ", latent " << group.view().latent.value_or(-1).first << ", noise "
              << group.noise().stddev().transpose() << ", at\n"
              << group.states() << "\n:\n"
              << group.values() << '\n';

@@ -9,7 +9,7 @@ from conftest import MODELS
 SURFACE_KEYS = {
     "coordinates": ["q1", "q2", "q3"],
     "inputs": ["u1", "u2", "u3"],
-    "latents": [{"features": ["q1", "q2", "q3", "dq1", "dq2", "dq3", "u1", "u2", "u3"]}],
+    "latents": [{"kernel": "se", "features": ["q1", "q2", "q3", "dq1", "dq2", "dq3", "u1", "u2", "u3"]}],
     "noise": 0.1,
 }
 

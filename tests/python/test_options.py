@@ -53,6 +53,20 @@ def test_options_of_a_fit_are_under_the_names_of_the_command(arm, arm_log):
     assert posterior.options["standard_errors"] is False
 
 
+def test_hyperparameters_are_integrated_over(arm, arm_log, tmp_path):
+    posterior = gp2.fit(arm, arm_log, restarts=1, max_escapes=0, max_points=12, hyperparameters="integrate")
+    draws = posterior.report.draws
+    assert set(draws) == {h.name for h in posterior.report.hyperparameters}
+    for of_one in draws.values():
+        assert len(of_one["values"]) == 25
+        assert of_one["interval95"][0] <= of_one["mean"] <= of_one["interval95"][1]
+        assert of_one["r_hat"] >= 1 and of_one["effective_size"] > 0
+    posterior.save(tmp_path / "fit.json")
+    states = arm.generate(4, seed=9)
+    assert (gp2.load(tmp_path / "fit.json").predict(states).std == posterior.predict(states).std).all()
+    assert gp2.fit(arm, arm_log, restarts=1, max_iterations=3).report.draws is None
+
+
 def test_start_may_be_a_dict(arm, arm_log):
     first = gp2.fit(arm, arm_log, restarts=1, max_iterations=3)
     values = {h.name: h.value for h in first.report.hyperparameters}

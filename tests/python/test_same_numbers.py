@@ -129,7 +129,8 @@ def test_the_command_fits_generates_evaluates_and_simulates_the_same(arm, comman
         if name in ("near", "far"):
             part = getattr(figures, name)
             value = {key: np.nan if number is None else number for key, number in value.items()}
-            np.testing.assert_allclose([getattr(part, key) for key in value], list(value.values()), rtol=1e-9, atol=1e-12)
+            for key, number in value.items():
+                np.testing.assert_allclose(getattr(part, key), np.array(number, dtype=float), rtol=1e-9, atol=1e-12)
             continue
         np.testing.assert_allclose(getattr(figures, name), value, rtol=1e-9, atol=1e-12)
 

@@ -199,9 +199,9 @@ TEST(Advice, TellsOfResidualsThatNoiseDoesNotExplain) {
                                                            "units, signs")));
   report.data[0].constraint_residuals[0].rms = report.data[0].constraint_residuals[0].mean = 0.21;
   EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::good, "", "")));
-  report.residuals = {{0, "ddq1", 100, 4, 0.4, 0}};
+  report.cross_validation.residuals = {{0, "ddq1", 100, 4, 0.4, 0}};
   EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::warning, "Values of ddq1 lie farther than noise", "lags")));
-  report.residuals = {{0, "ddq1", 100, 1, 0.95, 0.8}};
+  report.cross_validation.residuals = {{0, "ddq1", 100, 1, 0.95, 0.8}};
   EXPECT_THAT(learning_advice(report),
               ElementsAre(advises(Level::note, "Residuals of ddq1 go on from row to row", "farther apart")));
 }
@@ -236,7 +236,7 @@ TEST(Advice, DoesNotBlameTheNoiseWhereTheTestHasNone) {
   Report report = good_report();
   report.data = {good_data("training"), good_data("test")};
   Evaluation& test = report.data[1].evaluation;
-  report.residuals = {{0, "ddq1", 100, 1, 0.95, 0}};
+  report.cross_validation.residuals = {{0, "ddq1", 100, 1, 0.95, 0}};
   test.coverage95 = 1;
   test.rmse[0] = 0.02;
   test.coverage95_latent = 0.99;
@@ -244,7 +244,7 @@ TEST(Advice, DoesNotBlameTheNoiseWhereTheTestHasNone) {
   test.coverage95_latent = 0.7;
   EXPECT_THAT(learning_advice(report),
               ElementsAre(advises(Level::warning, "Over-confident: 70.0 % of the test data, which seem", "")));
-  report.residuals[0].rms = 0.3;
+  report.cross_validation.residuals[0].rms = 0.3;
   EXPECT_THAT(learning_advice(report), ElementsAre(advises(Level::note, "Too cautious: 100.0 %", "`noise_std=estimate`")));
 }
 

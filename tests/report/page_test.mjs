@@ -130,7 +130,7 @@ for (const model of ["surface", "duffing", "unicycle"]) {
     near(figures["rmse / training std"], row((e) => e.rmse_normalised), "rmse_normalised");
     near(figures["nrmse"], row((e) => e.nrmse), "nrmse");
     near(figures["nlpd, with noise"], row((e) => e.nlpd), "nlpd");
-    near(figures["95 % coverage, with noise"], row((e) => e.coverage95), "coverage95");
+    for (const share of [50, 80, 95]) near(figures[`${share} % coverage, with noise`], row((e) => e[`coverage${share}`]), `coverage${share}`);
     assert.deepEqual(figures["max |A q̈ − b|, fitted"], row((e) => e.max_constraint_error_fitted));
     assert.deepEqual(figures.points, [100, 60]);
     await close();

@@ -124,11 +124,19 @@ TEST_F(ReportOf, HasTheVeryFiguresOfEvaluate) {
     for (const char* key : {"rmse_normalised", "nrmse", "max_constraint_error", "max_constraint_error_fitted", "n"}) {
       EXPECT_EQ(figures[key], told[key]) << key;
     }
-    for (const char* key : {"nlpd", "coverage95", "nlpd_latent", "coverage95_latent"}) {
+    for (const char* key :
+         {"nlpd", "coverage50", "coverage80", "coverage95", "nlpd_latent", "coverage50_latent", "coverage95_latent"}) {
       EXPECT_NEAR(figures[key].get<double>(), told[key].get<double>(), 1e-9 * std::abs(told[key].get<double>())) << key;
     }
     EXPECT_EQ(figures["rmse"][2], told["rmse"]["ddq3"]);
+    const Evaluation& e = r.data[static_cast<std::size_t>(k)].evaluation;
+    const MatrixXd near = pit_counts(r.data[static_cast<std::size_t>(k)], /*far=*/false);
+    const MatrixXd far = pit_counts(r.data[static_cast<std::size_t>(k)], /*far=*/true);
+    EXPECT_EQ((near + far).sum(), 2 * 3 * e.n) << "each output, and all together";
+    EXPECT_LE(((near + far).col(3) / (3 * e.n) - e.pit).norm(), 1e-12);
   }
+  EXPECT_EQ(json["left_out"], r.cross_validation.text());
+  EXPECT_THAT(r.cross_validation.text(), HasSubstr("in 5 stretches of the log"));
   EXPECT_NEAR(coverage(r.data[1], VectorXd::Constant(1, 0.95))(0, 3), r.data[1].evaluation.coverage95, 1e-12);
   EXPECT_EQ(json["fit"]["nll"], desk.json("fit.json")["report"]["nll"]);
   EXPECT_EQ(json["hyperparameters"].size(), desk.json("fit.json")["hyperparameters"].size());

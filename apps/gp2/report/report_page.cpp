@@ -12,6 +12,7 @@
 #include "gp2/base/version.hpp"
 #include "gp2/data/csv.hpp"
 #include "gp2/error.hpp"
+#include "gp2/training/laplace.hpp"
 #include "report/assets.hpp"
 #include "report/report_page.hpp"
 
@@ -112,7 +113,7 @@ Json prior_json(const FitFile& fit) {
       add("latent " + latent.name, "small and fixed: what the kernel would rule out without reason");
       continue;
     }
-    add("latent " + latent.name,
+    add("latent " + latent.name + (latent.direction.empty() ? "" : ", " + latent.direction),
         fmt::format("{} of {}; acts on {}{}", latent.kernel.text(), fmt::join(latent.feature_names, ", "),
                     fmt::join(latent.column_names, ", "), latent.base == Latent::Base::force ? " (forces)" : ""));
   }
@@ -125,7 +126,8 @@ Json observations_json(const FitFile& fit) {
   Json groups = Json::array();
   for (std::size_t g = 0; g < fit.observations.size(); ++g) {
     const Observations& group = fit.observations[g];
-    const std::string latent = !group.view().latent ? "" : home.latents[static_cast<std::size_t>(*group.view().latent)].name;
+    const std::string latent =
+        !group.view().latent ? "" : home.latents[static_cast<std::size_t>(group.view().latent->first)].name;
     Json noise = Json::array();
     for (const double one : group.usual_noise(values.noise_stddev[g])) noise.push_back(number(one));
     groups.push_back({{"names", group.view().names(*prior_of(home, group.view()).system, latent)},
@@ -148,10 +150,8 @@ Json parameters_json(const FitFile& fit) {
       row["lower"] = h.lower;
       row["upper"] = h.upper;
       row["at_bound"] = h.at_bound();
-      if (fit.report.uncertainty && !h.at_bound()) {
-        const double stddev = fit.report.uncertainty->stddev[static_cast<Eigen::Index>(k)];
-        row["stddev"] = std::isinf(stddev) ? Json("not determined") : number(stddev);
-      }
+      const double stddev = parameter_uncertainty(fit.report, k).stddev;
+      if (!std::isnan(stddev)) row["stddev"] = std::isinf(stddev) ? Json("not determined") : number(stddev);
     }
     rows.push_back(row);
   }
@@ -207,8 +207,12 @@ Json figures_json(const ReportData& data) {
           {"max_constraint_error", number(e.max_constraint_error)},
           {"max_constraint_error_fitted", number(e.max_constraint_error_fitted)},
           {"nlpd", number(e.nlpd)},
+          {"coverage50", number(e.coverage50)},
+          {"coverage80", number(e.coverage80)},
           {"coverage95", number(e.coverage95)},
           {"nlpd_latent", number(e.nlpd_latent)},
+          {"coverage50_latent", number(e.coverage50_latent)},
+          {"coverage80_latent", number(e.coverage80_latent)},
           {"coverage95_latent", number(e.coverage95_latent)},
           {"n_zero_variance", e.n_zero_variance},
           {"n_far", e.far.n},
@@ -255,6 +259,8 @@ Json data_json(const Report& report, const ReportData& data) {
                {"noise", noise},
                {"levels", row_json(levels)},
                {"coverage", rows_json(coverage(data, levels).transpose())},
+               {"pit_near", rows_json(pit_counts(data, /*far=*/false).transpose())},
+               {"pit_far", rows_json(pit_counts(data, /*far=*/true).transpose())},
                {"columns", columns},
                {"measured", rows_json(data.measured, stride)},
                {"predicted", rows_json(data.predicted, stride)},
@@ -327,6 +333,7 @@ std::string report_json(const Report& report) {
                {"parameters", parameters_json(report.fit)},
                {"hyperparameters", hyperparameters_json(report.fit.report)},
                {"fit", fit_json(report.fit.report)},
+               {"left_out", report.data.empty() ? "" : report.cross_validation.text()},
                {"advice", advice_json(learning_advice(report))},
                {"relevance", relevance_json(report.relevance)},
                {"data", Json::array()}};

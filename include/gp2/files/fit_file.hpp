@@ -28,9 +28,9 @@ struct FitFile {
   ///   hyperparameters of another posterior.
   FitFile(Model model, FitPriorOptions prior_options, const Fit& fit, std::vector<std::shared_ptr<const Model>> systems = {});
 
-  /// 6: a checksum and options, values that are not measured; 5: robots; 4: values with a noise of their own; 3: mechanics that
-  /// are code; 2: observations of other systems. All of them are read; 6 is written.
-  static constexpr int format_version = 6;
+  /// 7: draws of hyperparameters; 6: a checksum and options, values that are not measured; 5: robots; 4: values with a noise of
+  /// their own; 3: mechanics that are code; 2: observations of other systems. All of them are read; 7 is written.
+  static constexpr int format_version = 7;
 
   Model model;
   FitPriorOptions prior_options;
@@ -42,7 +42,7 @@ struct FitFile {
   std::string options;  // what was asked of the fit, a JSON object (options_json); empty: not known
 
   [[nodiscard]] Prior prior() const { return make_prior(model, prior_options); }
-  /// The prior conditioned on the data, under the fitted hyperparameters.
+  /// The prior conditioned on the data, under the fitted hyperparameters or as the mixture over their draws.
   /// @throws InputError as model_values.
   [[nodiscard]] Posterior posterior() const;
 

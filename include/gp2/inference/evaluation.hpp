@@ -1,6 +1,7 @@
 #pragma once
 
 #include <memory>
+#include <optional>
 #include <string>
 #include <vector>
 
@@ -12,8 +13,24 @@
 
 namespace gp2 GP2_API {
 
+/// Share of the standardised errors z (N) within the central interval of each probability p (K): erf(|z|/√2) ≤ p. NaN entries of
+/// z are left out; NaN where none is left.
+Eigen::VectorXd central_coverage(const Eigen::Ref<const Eigen::VectorXd>& z, const Eigen::Ref<const Eigen::VectorXd>& levels);
+
+/// Histogram of the probability integral transform Φ(z), flat for errors as large as predicted: the share of it in each of `n_bins`
+/// equal parts of [0, 1]. NaN as central_coverage.
+Eigen::VectorXd pit_histogram(const Eigen::Ref<const Eigen::VectorXd>& z, int n_bins);
+
+/// How errors lie within their predicted Gaussian marginals; NaN where there is nothing to average.
+struct Calibration {
+  static constexpr int n_bins = 10;
+  double coverage50 = 0, coverage80 = 0, coverage95 = 0;                       // of measurements: noise included
+  double coverage50_latent = 0, coverage80_latent = 0, coverage95_latent = 0;  // of noise-free targets
+  Eigen::VectorXd pit;                                                         // pit_histogram of measurements (n_bins)
+};
+
 /// How well a posterior predicts measured constrained accelerations.
-struct Evaluation {
+struct Evaluation : Calibration {
   std::vector<std::string> outputs;
   Eigen::VectorXd rmse;                    // per output, physical units
   double rmse_normalised = 0;              // mean over outputs of rmse / training std (Geist & Trimpe 2020, table 1); NaN when an
@@ -22,14 +39,12 @@ struct Evaluation {
   double max_constraint_error = 0;         // max |A ddq − b| over points and rows, with the parameters as in the model file
   double max_constraint_error_fitted = 0;  // the same with the fitted parameters
   // per-output Gaussian marginals; NaN when there is nothing to average
-  double nlpd = 0, coverage95 = 0;                // of measurements: noise included
-  double nlpd_latent = 0, coverage95_latent = 0;  // of noise-free targets
+  double nlpd = 0, nlpd_latent = 0;
   int n_zero_variance = 0;  // outputs that the constraint decides at their state, left out of the latent figures
   /// The points near the data, and those far from them: beyond Posterior::far_from_data.
-  struct Part {
+  struct Part : Calibration {
     int n = 0;
-    double nrmse = 0;                              // rms error of the part over the rms of all test stds; NaN without values
-    double coverage95 = 0, coverage95_latent = 0;  // as above
+    double nrmse = 0;  // rms error of the part over the rms of all test stds; NaN without values
   };
   Part near, far;
   int n = 0;          // points
@@ -80,8 +95,22 @@ struct TrainingResidual {
   /// Whether z goes on from state to state: the states follow each other in time, and something is missing that lasts longer.
   [[nodiscard]] bool is_correlated() const;
 };
-/// One for each row of each observation of ddq. Costs a factorisation and an inverse.
-std::vector<TrainingResidual> training_residuals(const Posterior& posterior);
+
+/// How well a fit predicts its own data where it has not seen them, under the hyperparameters that it has from all of them.
+struct CrossValidation {
+  static constexpr int n_stretches = 5;
+  /// Scores of the measured values of ddq, by the spread of each output over all data; no latent figures.
+  Evaluation::Part one_by_one;                // each from all others: between the data
+  std::optional<Evaluation::Part> stretches;  // leave_out in n_stretches: what a motion elsewhere would meet
+  std::vector<TrainingResidual> residuals;    // one for each row of each observation of ddq
+
+  [[nodiscard]] std::string text() const;
+};
+
+/// Costs a factorisation and an inverse, with a tenth of that for the stretches.
+/// @param has_time_order  whether the states of observations without t follow each other as they were measured; without time order,
+///                        and with less than two states for each stretch, none are left out
+CrossValidation cross_validate(const Posterior& posterior, bool has_time_order = true);
 
 /// Measured accelerations against A ddq = b under the fitted parameters.
 /// @param rows          of ddq that are measured

@@ -22,7 +22,32 @@ struct LeaveOneOut {
 ///
 /// Where constraints are soft, α and the inverse are taken from values whitened by C to those in units of σ, and the variance holds
 /// what slips beyond what the other rows of the state say of it. They hold the hyperparameters. Costs as much as the posterior and its inverse.
+/// Draws of a mixture are of the density given all values; given all but y_k draw i counts in proportion to 1/p_i(y_k | others), and
+/// these are the moments of the components so weighed:
+///
+///     mean_k = Σ_i w_i mean_ki,    variance_k = Σ_i w_i (variance_ki + (mean_ki − mean_k)²),
+///     w_i ∝ 1/p_i(y_k | others),    Σ_i w_i = 1.
+///
 /// @throws InputError, NumericalError  as Posterior.
 std::vector<LeaveOneOut> leave_one_out(const Posterior& posterior);
+
+/// Every value as predicted without itself, and without the stretch of time around it.
+struct LeftOut {
+  std::vector<LeaveOneOut> values;     // leave_one_out
+  std::vector<LeaveOneOut> stretches;  // what all but those of its own stretch say of each value; empty where not asked for, or
+                                       // where double precision cannot tell
+};
+
+/// The states of each Observations are taken in time order: by t where all of them have one, else in their own. They are cut into
+/// `n_stretches` parts of equal number; the first parts of all Observations are left out together, then the second parts, … A part
+/// B of whole states is left out as a value is, by the same inversion:
+///
+///     ỹ_B − mean_B = P_BB⁻¹ α̃_B,    covariance_B = P_BB⁻¹ − I,
+///
+/// which Q brings to the whitened values e and S^{1/2} to the values. The variance holds what slips where constraints are soft. Of a
+/// mixture all components count alike.
+/// @param n_stretches  0: none
+/// @throws InputError, NumericalError  as Posterior.
+LeftOut leave_out(const Posterior& posterior, int n_stretches);
 
 }  // namespace gp2

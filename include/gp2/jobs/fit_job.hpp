@@ -9,11 +9,26 @@
 #include "gp2/export.hpp"
 #include "gp2/files/fit_file.hpp"
 #include "gp2/fit.hpp"
+#include "gp2/inference/evaluation.hpp"
 #include "gp2/jobs/fit_problem.hpp"
 #include "gp2/jobs/option.hpp"
 #include "gp2/model.hpp"
 
 namespace gp2 GP2_API {
+
+/// What becomes of the hyperparameters that data do not determine.
+enum class HyperparameterChoice {
+  optimise,   // the likeliest are taken as known
+  integrate,  // drawn given the data; the posterior is the mixture over the draws
+  automatic,  // integrate where integration_pays, else optimise
+};
+
+/// Draws that `integrate` mixes, and the largest reduced size (FitMemory) up to which `auto` does: minutes on two cores.
+inline constexpr int n_mixed_draws = 25, largest_integrated_size = 800;
+
+/// The rule of `auto`: the directions of a latent have hyperparameters of their own, as in the default prior, the reduced size is
+/// small enough, it is no baseline, and the optimiser runs.
+bool integration_pays(const FitProblem& problem, const FitOptions& options);
 
 /// What a fit is asked for: a model, its data, and options.
 struct FitRequest {
@@ -28,6 +43,7 @@ struct FitRequest {
   std::optional<double> gradient_tolerance, reduction_tolerance;
   int max_iterations = 1000;
   int threads = 0;
+  HyperparameterChoice hyperparameters = HyperparameterChoice::automatic;
   bool standard_errors = true;
 };
 
@@ -56,10 +72,14 @@ FitJob prepare_fit_again(const FitFile& fit, int threads = 0);
 
 /// What a fit gives.
 struct FitOutcome {
-  FitFile file;                    // ready to be written
-  Posterior posterior;             // as file.posterior()
-  std::vector<std::string> notes;  // what a person should know
+  FitFile file;                                     // ready to be written
+  Posterior posterior;                              // as file.posterior()
+  std::vector<std::string> notes;                   // what a person should know
+  std::optional<CrossValidation> cross_validation;  // unless the fit was interrupted, or its residuals cannot be told
 };
+
+/// Whether its observations stand in the order of their logs: `max_points` shuffles them.
+bool keeps_row_order(const FitFile& fit, const std::vector<Observations>& observations);
 
 /// @param progress  called from other threads, one at a time
 /// @param stop      set: ends with the best so far, whose termination is FitReport::interrupted

@@ -99,7 +99,7 @@ std::vector<std::string> notes_of(const FitReport& report);
 std::vector<std::string> distrust_notes(const FitProblem& problem, const FitReport& report);
 
 /// Which latent of a prior has a name. @throws InputError naming `option` and the latents there are.
-int latent_index(const Prior& prior, const std::string& name, const std::string& option);
+LatentRange latents_called(const Prior& prior, const std::string& name, const std::string& option);
 
 /// Names of columns for logs that are read together: those given, then the model's own [columns].
 /// @throws InputError when `columns` names what the model does not have, or none of the logs has.

@@ -15,7 +15,7 @@
 
 namespace gp2 GP2_API {
 
-/// How much one feature of a latent matters.
+/// How much a feature of a latent matters: in the factor of its kernel, and the direction, where it does most.
 struct Relevance {
   std::string latent, feature;
   double lengthscale = 0;
@@ -42,6 +42,7 @@ struct ReportData {
   Eigen::MatrixXd unconstrained;         // ā    (nq × N), empty where M is singular
   Eigen::MatrixXd unconstrained_stddev;  //      (nq × N)
   Eigen::MatrixXd constraint_error;      // |A ddq − b| of the predicted mean, fitted parameters (nc × N)
+  Eigen::VectorXd distance;              // from the data, as Posterior::distance_from_data (N)
   Eigen::MatrixXd truth;                 // the true ddq (nq × N), NaN where unknown; empty where it is not asked for
   std::vector<std::pair<std::string, Eigen::VectorXd>> features;  // φ by name (N each)
   std::optional<ConstraintViolation> violation;
@@ -53,11 +54,18 @@ struct ReportData {
   [[nodiscard]] Eigen::VectorXd rmse_to_truth() const;
 };
 
+/// (measured − predicted) / √(stddev² + noise²)  (d × N); NaN where one is not known.
+Eigen::MatrixXd standardised_errors(const ReportData& data);
+
 /// Share of measurements within the central interval of nominal probability p, measurement noise included.
 ///
 /// @param levels  p (K)
 /// @returns (K × d + 1): each output, then all of them; NaN columns where the noise is not known
 Eigen::MatrixXd coverage(const ReportData& data, const Eigen::Ref<const Eigen::VectorXd>& levels);
+
+/// pit_histogram of the same errors, of the points near the data or of those far from them, as counts.
+/// @returns (Calibration::n_bins × d + 1) as coverage
+Eigen::MatrixXd pit_counts(const ReportData& data, bool far);
 
 /// The points of a position constraint c(q) = 0 in three coordinates, as sheets over a grid in two of them.
 struct ConstraintSurface {
@@ -85,7 +93,7 @@ struct Report {
   std::string library;    // the version that fitted
   std::string file_date;  // of the fit file, YYYY-MM-DD
   std::vector<ReportData> data;
-  std::vector<TrainingResidual> residuals;  // of the training data, leave one out
+  CrossValidation cross_validation;  // of the training data
   std::vector<Relevance> relevance;
   std::optional<ConstraintSurface> surface;
   std::string truth_source;  // the model that tells the truth

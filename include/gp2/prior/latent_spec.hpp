@@ -38,7 +38,7 @@ struct StateCode {
 /// What a latent is made from: words, as in the [[latent]] of a model file (docs/model-files.md), or code.
 struct LatentSpec {
   std::string name;
-  std::string kernel = "se";
+  std::string kernel = {};            // empty: PriorOptions::kernel
   std::vector<std::string> features;  // φ(x): expressions of the state; of code, what its numbers are called
   StateCode feature_code = {};        // empty: features are expressions
   Latent::Base base = Latent::Base::acceleration;
@@ -46,6 +46,9 @@ struct LatentSpec {
   std::vector<std::string> direction_names = {};          // of code, its columns (p)
   StateCode direction_code = {};                          // B(x) column-major (nq·p × N); neither: B = I
   Latent::Range lengthscale = {}, signal_stddev = {};
+  /// Whether each direction has lengthscales, and all else of the kernel, of its own: p latents of one direction. Not given: where
+  /// the kernel is not given either and PriorOptions::per_direction says so.
+  std::optional<bool> per_direction = {};
   /// Lengthscales of single features, in their units and not relative. An angle's name stands for its sine and its cosine.
   std::vector<std::pair<std::string, Latent::Range>> lengthscales = {};
 };
@@ -63,6 +66,10 @@ struct PriorOptions {
   std::optional<Latent::Base> base;             // replaces the directions of the one latent by the identity or M⁻¹
   bool raw_angles = false;                      // a feature that is an angle stays as it is instead of its sine and cosine
   std::optional<Discrepancy> discrepancy = {};  // beside the first latent
+  /// Of a latent that gives no kernel: what machines are made of, a part that is linear in the features and a smooth one; the p
+  /// directions of such a latent have hyperparameters of their own.
+  std::string kernel = "se + linear";
+  bool per_direction = true;
 };
 
 /// A prior without a model file. Expressions are of the system's coordinates, velocities, t, inputs and parameters.

@@ -17,6 +17,20 @@ namespace gp2 GP2_API {
 LaplaceUncertainty laplace_uncertainty(const Prior& prior, const std::vector<Observations>& observations,
                                        const std::vector<Hyperparameter>& hyperparameters, int n_threads = 0);
 
+/// How well the data know estimated parameters of the system: by the draws of the hyperparameters, where every parameter that is
+/// free was drawn; else by Laplace's approximation.
+struct ParameterUncertainty {
+  bool is_of_draws = false;
+  double stddev = 0;  // NaN where it is not known, ∞ where the data do not determine it
+  // of draws only
+  double mean = 0;
+  double lower = 0, upper = 0;  // of the 95 % interval
+};
+/// @param k  index in report.hyperparameters
+ParameterUncertainty parameter_uncertainty(const FitReport& report, std::size_t k);
+/// Of two of them; NaN where it is not known.
+double parameter_correlation(const FitReport& report, std::size_t k, std::size_t l);
+
 /// What a person should know of an uncertainty, and what to do about it.
 struct UncertaintyNote {
   bool is_warning = true;

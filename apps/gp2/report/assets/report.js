@@ -178,8 +178,12 @@
     rows.push(["rmse / training std", ...of((e) => e.rmse_normalised)],
       ["nrmse", ...of((e) => e.nrmse)],
       ["nlpd, with noise", ...of((e) => e.nlpd)],
+      ["50 % coverage, with noise", ...of((e) => e.coverage50)],
+      ["80 % coverage, with noise", ...of((e) => e.coverage80)],
       ["95 % coverage, with noise", ...of((e) => e.coverage95)],
       ["nlpd, without noise", ...of((e) => e.nlpd_latent)],
+      ["50 % coverage, without noise", ...of((e) => e.coverage50_latent)],
+      ["80 % coverage, without noise", ...of((e) => e.coverage80_latent)],
       ["95 % coverage, without noise", ...of((e) => e.coverage95_latent)],
       ["points far from the data", ...of((e) => e.n_far)],
       ["nrmse near the data", ...of((e) => e.nrmse_near)],
@@ -190,11 +194,12 @@
     byId("figures").append(make("dl", { class: "rows muted" }, ...[
       ["rmse", "root mean square error, in the units of the output" + (report.truth ? "; “truth” compares with the true acceleration, free of noise" : "")],
       ["rmse / training std", "mean over outputs"], ["nrmse", "rms error over the rms of the spreads of these data"],
-      ["nlpd, coverage", "mean negative log density, and share within the central 95 %; “with noise” is right for measurements, “without noise” for targets free of noise"],
+      ["nlpd, coverage", "mean negative log density, and share within the central 50, 80 and 95 %; “with noise” is right for measurements, “without noise” for targets free of noise"],
       ["max |A q̈ − b|", "of the predicted mean, with the parameters of the model file and with the fitted ones"],
     ].flatMap(([label, value]) => [make("dt", { text: label }), make("dd", { text: value })])));
     const list = report.data.map((data) => `${data.name}: ${data.source}`).join("; ");
     byId("figures").append(make("p", { class: "muted", text: `Data – ${list}.` }));
+    if (report.left_out) byId("figures").append(make("p", { id: "left-out", text: `Training data ${report.left_out}.` }));
   }
 
   // ---- charts -------------------------------------------------------------------------------------------------------------
@@ -229,7 +234,7 @@
 
   /**
    * A chart by uPlot. spec: {title, summary, x: {label, values}, y: {label, log, zero}, square, diagonal, height, trace,
-   * series: [{label, values, colour, kind: "points" | "line", hollow, low, high}]}; low and high are a band or error bars.
+   * series: [{label, values, colour, kind: "points" | "line", hollow, steps, low, high}]}; low and high are a band or error bars.
    * trace: a line from point to point in the order of the data.
    */
   function chart(host, spec) {
@@ -254,7 +259,7 @@
         else bars.push({ high: series.length - 2, low: series.length - 1, ink });
       }
       series.push(one.kind === "line"
-        ? { label: one.label, stroke: ink, width: 1.75, dash: one.dash, points: { show: false } }
+        ? { label: one.label, stroke: ink, width: 1.75, dash: one.dash, points: { show: false }, ...(one.steps ? { paths: uPlot.paths.stepped({ align: 1 }) } : {}) }
         : { label: one.label, stroke: ink, paths: () => null, points: { show: true, space: 0, size, width: one.hollow ? 1.4 : 0, stroke: ink, fill: one.hollow ? "transparent" : ink } });
       data.push(pick(one.values));
     }
@@ -395,12 +400,32 @@
     const host = byId("calibration-chart");
     const k = Number(byId("calibration-output").value);
     const shares = data.coverage[k];
+    clear(byId("pit-chart"));
     if (shares.every((share) => share === null)) return note(host, "The noise of this output is not known: training did not observe it.");
     const at95 = shares[data.levels.indexOf(0.95)];
     chart(host, {
       title: `Coverage, ${data.name} data`, summary: `${percent(at95)} of the measurements lie within their 95 % interval.`,
       x: { label: "nominal probability", values: data.levels, range: [0, 1] }, y: { label: "share of measurements", range: [0, 1] }, diagonal: true, height: 320,
       series: [{ label: "share within", values: shares, colour: "--c1", kind: "line" }],
+    });
+    drawPit(k);
+  }
+
+  /** Histogram of Φ(z): as densities, so that what is near the data and what is far from them compare. */
+  function drawPit(k) {
+    const sum = (counts) => counts.reduce((a, b) => a + b, 0);
+    const parts = [["near the data", data.pit_near[k], "--c1"], ["far from them", data.pit_far[k], "--c2"]].filter(([, counts]) => sum(counts) > 0);
+    const bins = parts[0][1].length;
+    const density = (counts) => numbers(bins + 1).map((b) => counts[Math.min(b, bins - 1)] * bins / sum(counts));
+    const top = Math.max(2, ...parts.flatMap(([, counts]) => density(counts)));
+    const ends = (counts) => percent((counts[0] + counts[bins - 1]) / sum(counts));
+    chart(byId("pit-chart"), {
+      title: `Where measurements lie in their predictions, ${data.name} data`,
+      summary: `${parts.map(([label, counts]) => `${ends(counts)} of ${sum(counts)} values ${label}`).join(", ")} in the outermost two tenths, which should hold 20 %.`,
+      x: { label: "predicted probability of less than the measurement", values: numbers(bins + 1).map((b) => b / bins), range: [0, 1] },
+      y: { label: "density", range: [0, 1.05 * top] }, height: 220,
+      series: [...parts.map(([label, counts, colour]) => ({ label, values: density(counts), colour, kind: "line", steps: true })),
+        { label: "calibrated", values: numbers(bins + 1).map(() => 1), colour: "--muted", kind: "line", dash: [4, 4] }],
     });
   }
 

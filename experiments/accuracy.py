@@ -1,0 +1,136 @@
+"""How accurate fits of small logs are, and how honest: many mechanisms, priors, seeds and numbers of rows.
+
+    PYTHONPATH=build/test/python python3 experiments/accuracy.py --half report --n 20 50 --seeds 1 2 --out cells.csv
+    python3 experiments/accuracy.py --table cells.csv
+
+A cell is one mechanism, one N and one seed. Each prior is fitted to the same N noisy rows with the known force as mean, and scored on
+300 fresh states without noise, and on the same with the velocities doubled. Mechanisms are those of experiments/mechanisms and models,
+in the order of their names; every other one belongs to the half to choose on.
+"""
+
+import argparse
+import csv
+import math
+import pathlib
+import re
+import statistics
+import sys
+import time
+
+FOLDER = pathlib.Path(__file__).parent
+# what a latent is made of, and what its hyperparameters are
+PRIORS = {
+    "today": ('kernel = "se"\n', {"hyperparameters": "optimise"}),
+    "default": ("", {}),
+    "no discrepancy": ("", {"discrepancy": False}),
+    "default optimised": ("", {"hyperparameters": "optimise"}),
+    "and quadratic": ('kernel = "rq + linear + linear*linear"\nlengthscales = "per direction"\n', {}),
+    "se + linear": ('kernel = "se + linear"\nlengthscales = "per direction"\n', {}),
+    "rq + linear shared": ('kernel = "rq + linear"\n', {"hyperparameters": "integrate", "discrepancy": False}),
+}
+# no plain latent in every direction
+LEFT_OUT = {"massless_rod", "four_bar"}
+FIGURES = ["nrmse", "coverage", "nrmse 2x", "coverage 2x"]
+
+
+def mechanisms(half):
+    files = sorted([*FOLDER.glob("mechanisms/*.toml"), *(FOLDER.parent / "models").glob("*.toml")], key=lambda f: f.name)
+    files = [f for f in files if f.stem not in LEFT_OUT and len(re.findall(r"^\[\[latent\]\]", f.read_text(), re.M)) == 1
+             and not re.search(r"^directions *= *[\[{]", f.read_text(), re.M)]
+    return {"choose": files[::2], "report": files[1::2], "all": files}[half]
+
+
+def with_prior(file, latent):
+    import gp2
+
+    text = re.sub(r"^(kernel|lengthscales) *=.*\n", "", file.read_text(), flags=re.M)
+    return gp2.System.parse(text.replace("[[latent]]\n", "[[latent]]\n" + latent), str(file))
+
+
+def scores(predict, states, truth):
+    import numpy as np
+
+    mean, std = predict(states)
+    error = mean - truth
+    spread = math.sqrt(np.sum(np.var(truth, axis=0)))
+    # what the constraint decides has no deviation but rounding's
+    decided = std < 1e-7 * spread
+    inside = np.abs(error) <= 1.959964 * std
+    return [math.sqrt(np.mean(np.sum(error**2, axis=1))) / spread, float(np.mean(inside[~decided]))]
+
+
+def cell(file, prior, n, seed, threads):
+    import gp2
+    import numpy as np
+
+    latent, options = PRIORS[prior]
+    system = with_prior(file, latent)
+    train = system.generate(n, seed=seed)
+    began = time.monotonic()
+    posterior = gp2.fit(system, train, mean="force", estimate=[], threads=threads, **options)
+    seconds = time.monotonic() - began
+
+    def predict(states):
+        prediction = posterior.predict(states)
+        return prediction.mean, prediction.std
+
+    slow = np.array(system.states(system.generate(300, seed=seed + 5000, noise_std=0.0)))
+    fast = slow.copy()
+    nq = len(system.coordinates)
+    fast[:, nq : 2 * nq] *= 2
+    return [*scores(predict, slow, system.true_acceleration(slow)), *scores(predict, fast, system.true_acceleration(fast)), seconds]
+
+
+def table(path, beside="today"):
+    cells = {}
+    for row in csv.DictReader(open(path)):
+        cells.setdefault(row["prior"], {})[row["mechanism"], int(row["n"]), row["seed"]] = row
+    for n in sorted({key[1] for rows in cells.values() for key in rows}):
+        print(f"N = {n}: nRMSE beside {beside} (geometric mean, worst cell), coverage (mean, worst mechanism over its seeds)")
+        for prior, rows in cells.items():
+            keys = [k for k in rows if k[1] == n and k in cells[beside]]
+            if not keys:
+                continue
+            line = f"  {prior:20} {len(keys):3} cells"
+            for figure in ("", " 2x"):
+                ratio = {k: float(rows[k]["nrmse" + figure]) / float(cells[beside][k]["nrmse" + figure]) for k in keys}
+                mean = math.exp(statistics.fmean(math.log(r) for r in ratio.values()))
+                by_mechanism = {}
+                for k in keys:
+                    by_mechanism.setdefault(k[0], []).append(float(rows[k]["coverage" + figure]))
+                covered = {m: statistics.fmean(c) for m, c in by_mechanism.items()}
+                worst, least = max(ratio, key=ratio.get), min(covered, key=covered.get)
+                line += (f" |{figure} {mean:.2f} ({ratio[worst]:.2f} {worst[0]}), {statistics.fmean(covered.values()):.3f}"
+                         f" ({covered[least]:.2f} {least})")
+            print(line + f" | {statistics.median(float(rows[k]['seconds']) for k in keys):.1f} s")
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("--half", choices=["choose", "report", "all"], default="choose")
+    parser.add_argument("--n", type=int, nargs="+", default=[20, 50, 100])
+    parser.add_argument("--seeds", type=int, nargs="+", default=[1])
+    parser.add_argument("--priors", nargs="+", choices=PRIORS, default=["today", "default"])
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--out", type=pathlib.Path, help="CSV file that cells are added to")
+    parser.add_argument("--table", type=pathlib.Path, help="print the table of such a file instead")
+    arguments = parser.parse_args()
+    if arguments.table:
+        table(arguments.table)
+        return
+    is_new = not arguments.out or not arguments.out.exists()
+    with open(arguments.out, "a") if arguments.out else sys.stdout as out:
+        writer = csv.writer(out)
+        if is_new:
+            writer.writerow(["mechanism", "prior", "n", "seed", *FIGURES, "seconds"])
+        for n in arguments.n:
+            for seed in arguments.seeds:
+                for file in mechanisms(arguments.half):
+                    for prior in arguments.priors:
+                        figures = cell(file, prior, n, seed, arguments.threads)
+                        writer.writerow([file.stem, prior, n, seed, *(f"{f:.5g}" for f in figures)])
+                        out.flush()
+
+
+if __name__ == "__main__":
+    main()

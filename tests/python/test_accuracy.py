@@ -1,0 +1,40 @@
+"""A small part of the bench of experiments/accuracy.py; the whole is docs/accuracy.md's."""
+
+import importlib.util
+import math
+import pathlib
+import statistics
+
+import pytest
+
+SCRIPT = pathlib.Path(__file__).parents[2] / "experiments" / "accuracy.py"
+
+
+@pytest.fixture(scope="module")
+def bench():
+    spec = importlib.util.spec_from_file_location("accuracy", SCRIPT)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_halves_are_apart_and_whole(bench):
+    choose, report = bench.mechanisms("choose"), bench.mechanisms("report")
+    assert not set(choose) & set(report)
+    assert sorted(choose + report) == sorted(bench.mechanisms("all"))
+    assert len(choose) + len(report) >= 16
+
+
+def test_the_default_prior_is_sharper_and_more_honest_than_one_kernel_for_all_directions(bench):
+    ratios, fast_ratios, covered = [], [], []
+    for file in bench.mechanisms("report"):
+        if file.stem not in {"pulley", "surface", "two_link_tip"}:
+            continue
+        today, default = (bench.cell(file, prior, 20, 3, 2) for prior in ("today", "default"))
+        ratios.append(default[0] / today[0])
+        fast_ratios.append(default[2] / today[2])
+        covered.append(default[1])
+    assert len(ratios) == 3
+    assert math.exp(statistics.fmean(map(math.log, ratios))) < 1
+    assert math.exp(statistics.fmean(map(math.log, fast_ratios))) < 0.9
+    assert statistics.fmean(covered) > 0.85
