@@ -206,7 +206,9 @@ Label label_of(const Hyperparameter& h, const Prior& prior) {
 
 Json hyperprior_json(const HyperPrior& prior) {
   const bool normal = prior.form == HyperPrior::Form::normal;
-  return {{normal ? "mean" : "median", prior.median}, {normal ? "stddev" : "log_stddev", prior.stddev}};
+  Json json = {{normal ? "mean" : "median", prior.median}, {normal ? "stddev" : "log_stddev", prior.stddev}};
+  if (!prior.family.empty()) json.update({{"family", prior.family}, {"correlation", prior.correlation}});
+  return json;
 }
 
 Json hyperparameter_json(const Hyperparameter& h, const Prior& prior) {
@@ -216,6 +218,8 @@ Json hyperparameter_json(const Hyperparameter& h, const Prior& prior) {
   if (h.column_scale.size() > 0) json["scale"] = vector_json(h.column_scale);
   if (h.size > 0) json["scale"] = Json::array({h.size});
   if (h.hyperprior.form != HyperPrior::Form::none) json["hyperprior"] = hyperprior_json(h.hyperprior);
+  for (const Hyperparameter::Follower& f : h.followers)
+    json["followers"].push_back({{"latent", f.latent}, {"column", f.column}, {"share", f.share}});
   return json;
 }
 
@@ -223,6 +227,10 @@ HyperPrior hyperprior_from(const ParsedJson& json) {
   const bool normal = json.contains("mean");
   HyperPrior prior{normal ? HyperPrior::Form::normal : HyperPrior::Form::log_normal, number(json.at(normal ? "mean" : "median")),
                    number(json.at(normal ? "stddev" : "log_stddev"))};
+  if (json.contains("family")) {
+    json.at("family").get_to(prior.family);
+    prior.correlation = number(json.at("correlation"));
+  }
   return prior.stddev > 0 ? prior : HyperPrior{};
 }
 
@@ -256,6 +264,10 @@ Hyperparameter hyperparameter_from(const ParsedJson& json) {
   if (has_size) h.size = scale[0];
   if (h.kind == Kind::shared_signal_stddev) h.column_scale = scale;
   if (json.contains("hyperprior")) h.hyperprior = hyperprior_from(json.at("hyperprior"));
+  if (json.contains("followers")) {
+    for (const ParsedJson& follower : json.at("followers"))
+      h.followers.push_back({integer(follower.at("latent")), integer(follower.at("column")), number(follower.at("share"))});
+  }
   return h;
 }
 

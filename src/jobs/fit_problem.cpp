@@ -114,22 +114,15 @@ std::vector<Observations> trusted_observations(const FitProblem& problem) {
   return problem.robust ? without_gross_errors(problem.observations) : problem.observations;
 }
 
-// what a discrepancy is a share of: accelerations whose noise is known. One of a guessed noise would swallow the true one
-bool knows_noise_of_accelerations(const FitProblem& problem) {
-  const auto is_of_ddq = [](const Observations& group) {
-    return group.view().quantity == View::Quantity::constrained_acceleration;
-  };
-  return std::any_of(problem.observations.begin(), problem.observations.end(), is_of_ddq) &&
-         std::none_of(problem.observations.begin(), problem.observations.end(),
-                      [&](const Observations& group) { return is_of_ddq(group) && group.noise().is_estimated(); });
-}
+bool is_of_accelerations(const Observations& group) { return group.view().quantity == View::Quantity::constrained_acceleration; }
 
 bool has_discrepancy(const Model& model, const FitProblem& problem, const FitProblemOptions& options) {
   const bool standard = options.protocol.name == Protocol::Name::standard && options.protocol.hyperprior;
   const bool acts_everywhere =
       model.latents.size() == 1 &&
       (options.base || (model.latents.front().directions.empty() && !model.latents.front().direction_code));
-  return options.discrepancy && standard && acts_everywhere && knows_noise_of_accelerations(problem) &&
+  return options.discrepancy && standard && acts_everywhere &&
+         std::any_of(problem.observations.begin(), problem.observations.end(), is_of_accelerations) &&
          !has_singular_mass(problem);
 }
 
@@ -141,7 +134,7 @@ Discrepancy discrepancy_of(const FitProblem& problem) {
   double share = 0;
   int n_shares = 0;
   for (const Observations& group : problem.observations) {
-    if (group.view().quantity != View::Quantity::constrained_acceleration) continue;
+    if (!is_of_accelerations(group)) continue;
     const VectorXd usual = group.usual_noise(group.noise().stddev());
     for (Index k = 0; k < usual.size(); ++k) {
       const int row = group.view().rows[static_cast<std::size_t>(k)];
@@ -155,6 +148,38 @@ Discrepancy discrepancy_of(const FitProblem& problem) {
   }
   return {Protocol::Standard::discrepancy_lengthscale * scales.feature_stddev.front(),
           Protocol::Standard::discrepancy_stddev * noise};
+}
+
+// Where the noise is estimated, the discrepancy stays a share of it: one of a guess would take its place. An acceleration that no
+// estimated noise is of goes with the first.
+void tie_discrepancy(const FitProblem& problem, std::vector<Hyperparameter>& hyperparameters) {
+  const auto latent = static_cast<int>(problem.prior.latents.size()) - 1;
+  std::vector<Hyperparameter*> leaders(static_cast<std::size_t>(problem.prior.system->nq()), nullptr);
+  std::vector<bool> is_observed(leaders.size(), false);
+  std::vector<double> largest(leaders.size(), 0);
+  Hyperparameter* first = nullptr;
+  for (std::size_t g = 0; g < problem.observations.size(); ++g) {
+    const Observations& group = problem.observations[g];
+    if (!is_of_accelerations(group)) continue;
+    const VectorXd usual = group.usual_noise(group.noise().stddev());
+    for (Index k = 0; k < usual.size(); ++k) {
+      const auto j = static_cast<std::size_t>(group.view().rows[static_cast<std::size_t>(k)]);
+      is_observed[j] = true;
+      if (usual[k] <= largest[j]) continue;
+      largest[j] = usual[k];
+      const auto h = std::find_if(hyperparameters.begin(), hyperparameters.end(), [&](const Hyperparameter& other) {
+        return other.kind == Hyperparameter::Kind::noise_stddev && other.owner == static_cast<int>(g) && other.index == k;
+      });
+      leaders[j] = h == hyperparameters.end() ? nullptr : &*h;
+      if (first == nullptr) first = leaders[j];
+    }
+  }
+  for (std::size_t j = 0; j < leaders.size(); ++j) {
+    Hyperparameter* leader = is_observed[j] ? leaders[j] : first;
+    if (leader == nullptr) continue;
+    const double start = problem.observations[static_cast<std::size_t>(leader->owner)].noise().stddev()[leader->index];
+    leader->followers.push_back({latent, static_cast<int>(j), 1 / start});
+  }
 }
 
 }  // namespace
@@ -239,6 +264,7 @@ std::vector<Hyperparameter> starting_hyperparameters(const Model& model, const F
   for (Hyperparameter& h : out) {
     if (h.kind == Hyperparameter::Kind::noise_stddev) bound_noise(model, problem, h);
   }
+  if (problem.prior_options.discrepancy) tie_discrepancy(problem, out);
   return out;
 }
 

@@ -455,7 +455,8 @@ std::optional<std::string> fault_at(const System& system, const SystemValues& va
   if (!is_indefinite && (!values.A(i).allFinite() || !values.b(i).allFinite())) {
     return "A or b is not a finite number" + internal::unknown_entries(system, states, i, system.reads(SystemPart::mechanics));
   }
-  if (system.has_constraint_noise() && projection.rank() + projection.n_zero_rows() < system.nc()) {
+  if (system.has_constraint_noise() && projection.motion_is_determined() &&
+      projection.rank() + projection.n_zero_rows() < system.nc()) {
     return "the constraints are redundant, so that none of them may have a noise of its own: leave out rows that follow from "
            "others";
   }

@@ -30,16 +30,16 @@ auto named(const LatentSpec& spec, const Work& work) {
   }
 }
 
-// n of the numbers that code gives; of another number than `total` all, for the check of CodeFunction to refuse
-StateCode rows_of(StateCode code, Index first, Index n, Index total) {
-  const auto take = [=](MatrixXd all) -> MatrixXd { return all.rows() == total ? all.middleRows(first, n) : all; };
-  if (code.differentiate) {
-    code.differentiate = [of = code.differentiate, take](const auto& states, const auto& parameters, int index) {
-      return take(of(states, parameters, index));
-    };
-  }
-  code.evaluate = [of = code.evaluate, take](const auto& states, const auto& parameters) { return take(of(states, parameters)); };
-  return code;
+// n of the numbers that a function gives, which checks that it gives all of them
+StateCode rows_of(std::shared_ptr<const StateFunction> all, Index first, Index n) {
+  StateCode rows;
+  rows.evaluate = [=](const auto& states, const auto& parameters) -> MatrixXd {
+    return all->evaluate(states, parameters).middleRows(first, n);
+  };
+  rows.differentiate = [=](const auto& states, const auto& parameters, int index) -> MatrixXd {
+    return all->differentiate(states, parameters, index).middleRows(first, n);
+  };
+  return rows;
 }
 
 /// Makes the latents of one prior.
@@ -154,12 +154,13 @@ class LatentMaker {
     if (only) latent.column_names = {latent.column_names[*only]};
     if (is_of_every_coordinate(spec) && !only) return;
     if (spec.direction_code && !options_.base) {
-      StateCode code = spec.direction_code;
-      if (only)
-        code = rows_of(code, static_cast<Index>(first) * system_->nq(), system_->nq(),
-                       std::ssize(spec.direction_names) * system_->nq());
-      latent.directions = std::make_shared<CodeFunction>(std::move(code), fmt::format("latent '{}': directions", spec.name),
-                                                         system_->nq() * latent.size(), system_);
+      const std::string what = fmt::format("latent '{}': directions", spec.name);
+      const int nq = system_->nq(), n_all = nq * static_cast<int>(spec.direction_names.size());
+      latent.directions = std::make_shared<CodeFunction>(spec.direction_code, what, n_all, system_);
+      if (!only) return;
+      StateCode column = rows_of(latent.directions, static_cast<Index>(first) * nq, nq);
+      column.reads = spec.direction_code.reads;
+      latent.directions = std::make_shared<CodeFunction>(std::move(column), what, nq, system_);
       return;
     }
     std::vector<Expression> entries;

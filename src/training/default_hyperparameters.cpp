@@ -124,6 +124,19 @@ void add_latent(const Latent& latent, std::size_t owner, const std::string& pref
   }
 }
 
+// What the data say of a feature in one direction is expected in the others and in every term of the kernel: they are of one machine.
+void make_families(const Latent& latent, std::vector<Hyperparameter>::iterator first,
+                   std::vector<Hyperparameter>::iterator last) {
+  if (latent.direction.empty()) return;
+  for (; first != last; ++first) {
+    if (first->kind != Kind::kernel || first->is_fixed()) continue;
+    const Kernel::Parameter& parameter = latent.kernel.parameters()[static_cast<std::size_t>(first->index)];
+    if (parameter.kind != Kernel::ParameterKind::lengthscale) continue;
+    first->hyperprior.family = latent.name + "." + latent.feature_names[static_cast<std::size_t>(parameter.feature)];
+    first->hyperprior.correlation = Standard::lengthscale_correlation;
+  }
+}
+
 void add_latents(const Prior& prior, const Scales& scales, const Protocol& protocol, std::vector<Hyperparameter>& out) {
   const auto is_tuned = [](const Latent& latent) { return !latent.kernel_is_fixed || !latent.signal_is_fixed; };
   std::set<std::string> tuned;
@@ -134,7 +147,9 @@ void add_latents(const Prior& prior, const Scales& scales, const Protocol& proto
     const Latent& latent = prior.latents[a];
     if (!is_tuned(latent)) continue;
     const std::string name = tuned.size() == 1 ? "" : latent.name + ".";
+    const std::ptrdiff_t first = std::ssize(out);
     add_latent(latent, a, latent.direction.empty() ? name : name + latent.direction + ".", scales, protocol, out);
+    if (has_hyperpriors(protocol)) make_families(latent, out.begin() + first, out.end());
   }
 }
 

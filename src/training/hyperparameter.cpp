@@ -21,26 +21,12 @@ double CoordinateMap::value_slope(double value) const { return is_logarithm ? va
 
 double CoordinateMap::logarithm_slope(double value) const { return is_logarithm ? 1 : unit / value; }
 
-namespace {
-
-// z of ½ z²
-double standardised(const HyperPrior& prior, double value) {
-  const double distance = prior.form == HyperPrior::Form::normal ? value - prior.median : std::log(value / prior.median);
-  return distance / prior.stddev;
+double HyperPrior::standardised(double value) const {
+  return (form == Form::normal ? value - median : std::log(value / median)) / stddev;
 }
 
-}  // namespace
-
-double HyperPrior::negative_log(double value) const {
-  if (form == Form::none) return 0;
-  const double z = standardised(*this, value);
-  return 0.5 * z * z;
-}
-
-double HyperPrior::slope(double value, const CoordinateMap& map) const {
-  if (form == Form::none) return 0;
-  const double inner = form == Form::normal ? map.value_slope(value) : map.logarithm_slope(value);
-  return standardised(*this, value) / stddev * inner;
+double HyperPrior::standardised_slope(double value, const CoordinateMap& map) const {
+  return (form == Form::normal ? map.value_slope(value) : map.logarithm_slope(value)) / stddev;
 }
 
 Hyperparameter Hyperparameter::of(Kind kind, std::size_t owner, std::size_t index) {
@@ -81,25 +67,32 @@ void Hyperparameter::write(ModelValues& values) const {
       values.parameters[index] = value;
       break;
   }
+  for (const Follower& f : followers) values.signal_stddev[static_cast<std::size_t>(f.latent)][f.column] = f.share * value;
 }
 
 double Hyperparameter::likelihood_slope(const ModelGradient& gradient) const {
   const auto of = static_cast<std::size_t>(owner);
+  double by_logarithm = 0;  // ∂NLL/∂log v
+  for (const Follower& f : followers) by_logarithm += gradient.log_signal_stddev[static_cast<std::size_t>(f.latent)][f.column];
   switch (kind) {
     case Kind::kernel:
-      return gradient.log_kernel[of][index] * map().logarithm_slope(value);
+      by_logarithm += gradient.log_kernel[of][index];
+      break;
     case Kind::signal_stddev:
-      return gradient.log_signal_stddev[of][index] * map().logarithm_slope(value);
+      by_logarithm += gradient.log_signal_stddev[of][index];
+      break;
     case Kind::shared_signal_stddev:
-      return gradient.log_signal_stddev[of].sum() * map().logarithm_slope(value);
+      by_logarithm += gradient.log_signal_stddev[of].sum();
+      break;
+    case Kind::noise_stddev:
+      by_logarithm += gradient.log_noise_stddev[of][index];
+      break;
     case Kind::loading:
       return gradient.free_loading[of].reshaped()[index] * map().value_slope(value);
-    case Kind::noise_stddev:
-      return gradient.log_noise_stddev[of][index] * map().logarithm_slope(value);
     case Kind::parameter:
       return gradient.parameters[index] * map().value_slope(value);
   }
-  return 0;
+  return by_logarithm * map().logarithm_slope(value);
 }
 
 void Hyperparameter::ask_for_gradient(Likelihood::Options& options) const {
@@ -145,9 +138,13 @@ bool is_possible(const Hyperparameter& h, double value) { return std::isfinite(v
 void require_places(const Prior& prior, const std::vector<Observations>& observations,
                     const std::vector<Hyperparameter>& hyperparameters) {
   require_prior(prior);
+  const auto has_place = [&](const Hyperparameter::Follower& f) {
+    return f.latent >= 0 && f.latent < std::ssize(prior.latents) && f.column >= 0 &&
+           f.column < prior.latents[static_cast<std::size_t>(f.latent)].size() && std::isfinite(f.share) && f.share > 0;
+  };
   for (const Hyperparameter& h : hyperparameters) {
     const Index n = n_places(h, prior, observations);
-    if (h.index < 0 || h.index >= n) {
+    if (h.index < 0 || h.index >= n || !std::all_of(h.followers.begin(), h.followers.end(), has_place)) {
       throw InputError(fmt::format(
           "hyperparameter '{}' belongs to nothing of this prior and these observations: was it made for others?", h.name));
     }
@@ -169,9 +166,9 @@ void require_hyperprior(const Hyperparameter& h) {
   const HyperPrior& prior = h.hyperprior;
   if (prior.form == HyperPrior::Form::none) return;
   const bool has_median = std::isfinite(prior.median) && (prior.form == HyperPrior::Form::normal || prior.median > 0);
-  if (prior.stddev > 0 && has_median) return;
-  throw InputError(fmt::format("hyperparameter '{}': its hyper-prior has the median {} and the deviation {}", h.name,
-                               prior.median, prior.stddev));
+  if (prior.stddev > 0 && has_median && prior.correlation >= 0 && prior.correlation < 1) return;
+  throw InputError(fmt::format("hyperparameter '{}': its hyper-prior has the median {}, the deviation {} and the correlation {}",
+                               h.name, prior.median, prior.stddev, prior.correlation));
 }
 
 }  // namespace

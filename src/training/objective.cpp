@@ -1,17 +1,40 @@
 #include "training/objective.hpp"
 
 #include <cmath>
+#include <map>
+#include <string_view>
 
 namespace gp2 {
 
 using Eigen::Index;
 using Eigen::VectorXd;
 
+// ½ zᵀ ((1 − ρ) I + ρ 1 1ᵀ)⁻¹ z of each family of n, = ½ (zᵀz − ρ (1ᵀz)²/(1 + (n − 1) ρ))/(1 − ρ)
 double negative_log_hyperpriors(const std::vector<Hyperparameter>& hyperparameters, VectorXd* gradient) {
+  struct Family {
+    int n = 0;
+    double sum = 0, correlation = 0;
+    [[nodiscard]] double of_all() const { return correlation * sum / (1 + (n - 1) * correlation); }
+  };
+  std::map<std::string_view, Family> families;
+  for (const Hyperparameter& h : hyperparameters) {
+    const HyperPrior& prior = h.hyperprior;
+    if (prior.form == HyperPrior::Form::none || prior.family.empty()) continue;
+    Family& family = families[prior.family];
+    ++family.n;
+    family.sum += prior.standardised(h.value);
+    family.correlation = prior.correlation;
+  }
   double sum = 0;
   for (std::size_t k = 0; k < hyperparameters.size(); ++k) {
-    sum += hyperparameters[k].negative_log_hyperprior();
-    if (gradient != nullptr) (*gradient)[static_cast<Index>(k)] += hyperparameters[k].hyperprior_slope();
+    const HyperPrior& prior = hyperparameters[k].hyperprior;
+    if (prior.form == HyperPrior::Form::none) continue;
+    const double z = prior.standardised(hyperparameters[k].value);
+    const double slope = prior.family.empty() ? z : (z - families[prior.family].of_all()) / (1 - prior.correlation);
+    sum += 0.5 * z * slope;
+    if (gradient != nullptr) {
+      (*gradient)[static_cast<Index>(k)] += slope * prior.standardised_slope(hyperparameters[k].value, hyperparameters[k].map());
+    }
   }
   return sum;
 }

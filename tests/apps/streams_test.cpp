@@ -35,7 +35,8 @@ TEST_F(Streams, AResultIsWrittenWhereNothingCanBeSaid) {
 }
 
 TEST_F(Streams, AnInterruptedFitIsSavedWhereNothingCanBeSaid) {
-  const std::string line = "timeout --preserve-status -s TERM 2 gp2 fit models/surface.toml --data train.csv --restarts 5000 -o ";
+  const std::string line =
+      "timeout --preserve-status -s TERM 6 gp2 fit models/surface.toml --data train.csv --restarts 20000 -o ";
   EXPECT_EQ(desk.run(line + "full.json 2>/dev/full").status, 128 + SIGTERM);
   EXPECT_EQ(FitFile::read(desk / "full.json").report.termination, FitReport::interrupted);
   // both streams go to a program that has ended, as of Ctrl-C in "gp2 fit … 2>&1 | tee log"

@@ -180,6 +180,9 @@ TEST(FitFile, TheReportSurvives) {
   fit.report.best_restart = 1;
   constexpr double infinity = std::numeric_limits<double>::infinity();
   fit.report.restarts = {{infinity, infinity, 0, 1, 1, false, "no finite start"}, {-2.5, -3.5, 12, 20, 2, true, "because"}};
+  Hyperparameter& changed = fit.report.hyperparameters.front();
+  changed.hyperprior = {HyperPrior::Form::log_normal, 2, 3, "siblings", 0.5};
+  changed.followers = {{0, 2, 0.1}};
   const FitFile read = written_and_read(fit);
   EXPECT_EQ(read.data_source, "log.csv");
   EXPECT_EQ(read.model.text, fit.model.text);
@@ -201,8 +204,14 @@ TEST(FitFile, TheReportSurvives) {
     const Hyperparameter& b = read.report.hyperparameters[k];
     EXPECT_EQ(std::tie(a.kind, a.owner, a.index, a.name, a.unit, a.value, a.lower, a.upper, a.positive, a.size),
               std::tie(b.kind, b.owner, b.index, b.name, b.unit, b.value, b.lower, b.upper, b.positive, b.size));
-    EXPECT_EQ(std::tie(a.hyperprior.form, a.hyperprior.median, a.hyperprior.stddev),
-              std::tie(b.hyperprior.form, b.hyperprior.median, b.hyperprior.stddev));
+    EXPECT_EQ(
+        std::tie(a.hyperprior.form, a.hyperprior.median, a.hyperprior.stddev, a.hyperprior.family, a.hyperprior.correlation),
+        std::tie(b.hyperprior.form, b.hyperprior.median, b.hyperprior.stddev, b.hyperprior.family, b.hyperprior.correlation));
+    ASSERT_EQ(a.followers.size(), b.followers.size());
+    for (std::size_t f = 0; f < a.followers.size(); ++f) {
+      EXPECT_EQ(std::tie(a.followers[f].latent, a.followers[f].column, a.followers[f].share),
+                std::tie(b.followers[f].latent, b.followers[f].column, b.followers[f].share));
+    }
   }
 }
 

@@ -233,7 +233,11 @@ TEST(Requirements, HyperparametersAreOfThePriorAndInOrder) {
   change([](Hyperparameter& h) { h.value = not_a_number; });
   expect_everywhere("its value must be finite and positive, got nan");
   change([](Hyperparameter& h) { h.hyperprior = {HyperPrior::Form::normal, 1, 0}; });
-  expect("its hyper-prior has the median 1 and the deviation 0");
+  expect("its hyper-prior has the median 1, the deviation 0 and the correlation 0");
+  change([](Hyperparameter& h) { h.hyperprior = {HyperPrior::Form::normal, 1, 1, "all", 1}; });
+  expect("its hyper-prior has the median 1, the deviation 1 and the correlation 1");
+  change([](Hyperparameter& h) { h.followers.push_back({0, 99, 1}); });
+  expect_everywhere("belongs to nothing of this prior and these observations");
   change([](Hyperparameter& h) { h.value = 2 * h.upper; });
   EXPECT_THAT(input_error_of([&] { fit(s.prior, s.observations, hyperparameters); }), HasSubstr("outside its bounds ["));
 }

@@ -257,6 +257,9 @@ TEST(CodeLatents, AreRefusedWhereTheyDoNotFit) {
             "latent 'contact': its directions are given twice, as expressions and as code; leave out one");
   EXPECT_EQ(spec_refused([](LatentSpec& s) { s.direction_names.clear(); }),
             "latent 'contact': directions that are code need a name for each column");
+  // as many numbers as one of the two directions has
+  EXPECT_EQ(spec_refused([](LatentSpec& s) { s.direction_names.emplace_back("second"); }),
+            "latent 'contact': directions: evaluate returned the shape 2 × 30, expected 4 × 30 for 30 states");
   EXPECT_THAT(spec_refused([](LatentSpec& s) { s.direction_code.reads = {{"q9"}}; }),
               HasSubstr("latent 'contact': directions: 'q9' is no entry of the state, which has x, z, dx, dz, t"));
   EXPECT_EQ(spec_refused([](LatentSpec& s) {

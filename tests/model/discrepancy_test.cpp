@@ -202,10 +202,42 @@ TEST(Discrepancy, TakesTheNoiseThatIsKnown) {
   FitProblemOptions stated;
   stated.noise_stddev = 0.5;
   EXPECT_EQ(problem_of(bead(), stated).prior_options.discrepancy->stddev, VectorXd::Constant(2, 0.4 * 0.5));
-  FitProblemOptions estimated;
-  estimated.estimate_noise = true;
-  EXPECT_FALSE(has_discrepancy(bead("", "ddq = { estimate = true, initial = [0.2, 0.4] }"), estimated));
-  EXPECT_FALSE(has_discrepancy(bead(), estimated)) << "a share of a guess would take the place of the noise";
+}
+
+TEST(Discrepancy, StaysAShareOfTheNoiseThatIsEstimated) {
+  FitProblemOptions options;
+  options.estimate_noise = true;
+  for (const char* observed : {"", "ddy"}) {
+    if (*observed != 0) options.observe = {observed};
+    FitProblem problem = problem_of(bead("", "ddq = { estimate = true, initial = [0.2, 0.4] }"), options);
+    std::vector<double> factor;
+    for (Hyperparameter& h : problem.hyperparameters) {
+      if (h.kind == Hyperparameter::Kind::noise_stddev) h.value *= factor.emplace_back(factor.empty() ? 3 : 0.25);
+    }
+    ASSERT_EQ(factor.size(), *observed != 0 ? 1U : 2U);
+    const ModelValues values = model_values(problem.prior, problem.observations, problem.hyperparameters);
+    // what is not observed goes with what is
+    EXPECT_TRUE(values.signal_stddev.back().isApprox(Eigen::Vector2d(factor.front(), factor.back()), 4 * eps)) << observed;
+
+    // the gradient in the logarithm of a noise is that of the noise and of what follows it
+    const Likelihood likelihood(problem.prior, problem.observations, values, {{}, true});
+    Likelihood::Workspace workspace;
+    ModelGradient gradient;
+    likelihood.evaluate(values, &gradient, workspace);
+    for (const Hyperparameter& h : problem.hyperparameters) {
+      if (h.kind != Hyperparameter::Kind::noise_stddev) continue;
+      const auto at = [&](double step) {
+        Hyperparameter moved = h;
+        moved.value *= std::exp(step);
+        ModelValues there = values;
+        moved.write(there);
+        return likelihood.evaluate(there, nullptr, workspace);
+      };
+      const double slope = h.likelihood_slope(gradient);
+      // rounding of 1e-13 × 1e3 over a step of 1e-5, and its square
+      EXPECT_NEAR(slope, (at(1e-5) - at(-1e-5)) / 2e-5, 1e-5 * (1 + std::abs(slope))) << h.name;
+    }
+  }
 }
 
 TEST(Discrepancy, TakesTheLargestNoiseOfSeveralLogs) {

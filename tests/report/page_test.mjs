@@ -90,7 +90,7 @@ for (const model of ["surface", "duffing", "unicycle"]) {
       const { page, close } = await open(`${model}.html`, { scheme });
       const outputs = json(`${model}.json`).observations[0].rows.length;
       const charts = await inked(page);
-      assert.equal(charts.length, 2 * outputs + 5, "residuals and scatter per output, calibration, constraint error, two accelerations, motion");
+      assert.equal(charts.length, 2 * outputs + 6, "residuals and scatter per output, calibration, PIT, constraint error, two accelerations, motion");
       for (const { title, count } of charts) assert.ok(count > 20, `${title}: ${count} pixels in ${scheme}`);
       for (const select of scheme === "dark" ? [] : await page.locator("select:visible").all()) {
         for (const value of await select.locator("option").evaluateAll((all) => all.map((one) => one.value))) {

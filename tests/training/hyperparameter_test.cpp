@@ -5,6 +5,7 @@
 #include <gtest/gtest.h>
 
 #include "test_models.hpp"
+#include "training/objective.hpp"
 
 // Where a hyperparameter lives, its map, and its hyper-prior.
 namespace gp2 {
@@ -57,21 +58,43 @@ TEST(HyperparameterTest, TheSlopesOfAMapAreThoseOfDifferences) {
   }
 }
 
-TEST(HyperPriorTest, IsHalfASquareWhoseSlopeIsThatOfDifferencesInEveryMap) {
+TEST(HyperPriorTest, CountsInDeviationsAndItsSlopeIsThatOfDifferencesInEveryMap) {
   for (const HyperPrior& prior :
        {HyperPrior{HyperPrior::Form::normal, 1.5, 0.5}, HyperPrior{HyperPrior::Form::log_normal, 1.5, 0.5}}) {
     const bool normal = prior.form == HyperPrior::Form::normal;
-    EXPECT_DOUBLE_EQ(prior.negative_log(normal ? 2.5 : 1.5 * std::exp(1.0)), 2) << "two deviations";
-    EXPECT_EQ(prior.negative_log(1.5), 0);
+    EXPECT_DOUBLE_EQ(prior.standardised(normal ? 2.5 : 1.5 * std::exp(1.0)), 2);
+    EXPECT_EQ(prior.standardised(1.5), 0);
     for (const CoordinateMap& map : {CoordinateMap{}, CoordinateMap{false, 0.5, 2.5}}) {
       const double value = 1.9;
-      const auto at = [&](double x) -> VectorXd { return VectorXd::Constant(1, prior.negative_log(map.value(x))); };
-      EXPECT_TRUE(test::matches(VectorXd::Constant(1, prior.slope(value, map)),
+      const auto at = [&](double x) -> VectorXd { return VectorXd::Constant(1, prior.standardised(map.value(x))); };
+      EXPECT_TRUE(test::matches(VectorXd::Constant(1, prior.standardised_slope(value, map)),
                                 test::central_difference(at, map.coordinate(value), 0.1)));
     }
   }
-  EXPECT_EQ(HyperPrior().negative_log(7), 0);
-  EXPECT_EQ(HyperPrior().slope(7, {}), 0);
+}
+
+TEST(HyperPriorTest, OfAFamilyIsTheGaussianOfAllOfThem) {
+  constexpr double rho = 0.9, stddev = 2;
+  const VectorXd z{{0.3, -1.2, 2.5, 0.7}};
+  const int n_family = 3;
+  std::vector<Hyperparameter> all;
+  for (int k = 0; k < 4; ++k) {
+    Hyperparameter& h = all.emplace_back(Hyperparameter::of(Hyperparameter::Kind::kernel, 0, static_cast<std::size_t>(k)));
+    h.value = 5 * std::exp(stddev * z[k]);
+    h.hyperprior = {HyperPrior::Form::log_normal, 5, stddev};
+    if (k < n_family) h.hyperprior = {HyperPrior::Form::log_normal, 5, stddev, "lengthscale", rho};
+  }
+  all.push_back(Hyperparameter::of(Hyperparameter::Kind::parameter, 0, 0));  // without a hyper-prior
+  MatrixXd covariance = MatrixXd::Identity(5, 5);
+  covariance.topLeftCorner(n_family, n_family).setConstant(rho);
+  covariance.diagonal().setOnes();
+  VectorXd of_all = VectorXd::Zero(5);
+  of_all.head(4) = z;
+  const VectorXd solved = covariance.inverse() * of_all;
+  VectorXd gradient = VectorXd::Zero(5);
+  // a condition of 1 + 2ρ over 1 − ρ
+  EXPECT_NEAR(negative_log_hyperpriors(all, &gradient), 0.5 * of_all.dot(solved), 1e-13 * of_all.squaredNorm());
+  EXPECT_LE((gradient - solved / stddev).norm(), 1e-13 * solved.norm());
 }
 
 TEST(HyperparameterTest, TheGradientIsReadWhereTheValueIsWritten) {

@@ -24,6 +24,7 @@ struct Protocol {
   struct Standard {
     static constexpr double lengthscale_initial = 3, lengthscale_lower = 0.05, lengthscale_upper = 1e6;
     static constexpr double lengthscale_median = 300, lengthscale_log_stddev = 4;
+    static constexpr double lengthscale_correlation = 0.8;  // of one feature, between directions and terms of the kernel
     static constexpr double signal_initial = 1, signal_lower = 1e-3, signal_upper = 1e5;
     static constexpr double signal_median = 1, signal_log_stddev = 3;
     static constexpr double shape_log_stddev = 1.5;  // of α, periods and relative amplitudes

@@ -23,20 +23,25 @@ struct CoordinateMap {
   [[nodiscard]] double logarithm_slope(double value) const;  // d log v/dx
 };
 
-/// A hyper-prior of a value v: −log of its density, without constants, is added to the objective.
+/// A hyper-prior of a value v, standard normal in z: −log of its density, without constants, is added to the objective. It is ½ z²,
+/// or that of all z of a family together, any two of which have the same correlation ρ: what the data say of one is then expected
+/// of its siblings.
 struct HyperPrior {
   enum class Form {
     none,
-    normal,      // ½ ((v − median)/stddev)²
-    log_normal,  // ½ (log(v/median)/stddev)²
+    normal,      // z = (v − median)/stddev
+    log_normal,  // z = log(v/median)/stddev
   };
   Form form = Form::none;
   double median = 0;
-  double stddev = 0;  // of v, or of log v
+  double stddev = 0;        // of v, or of log v
+  std::string family = {};  // empty: of its own
+  double correlation = 0;   // ρ in [0, 1), the same throughout the family
 
-  [[nodiscard]] double negative_log(double value) const;
-  /// Derivative of negative_log in the map's coordinate.
-  [[nodiscard]] double slope(double value, const CoordinateMap& map) const;
+  /// z
+  [[nodiscard]] double standardised(double value) const;
+  /// dz/dx in the map's coordinate
+  [[nodiscard]] double standardised_slope(double value, const CoordinateMap& map) const;
 };
 
 /// One number that training adjusts, in physical units: a place in ModelValues, a map to the optimiser's coordinate, bounds, and
@@ -66,6 +71,12 @@ struct Hyperparameter {
   /// the box tells.
   double size = 0;
   HyperPrior hyperprior;
+  /// A signal standard deviation that is `share` × this value, and no hyperparameter of its own.
+  struct Follower {
+    int latent = 0, column = 0;
+    double share = 0;
+  };
+  std::vector<Follower> followers;
 
   /// A hyperparameter of no name and value: positive unless of the system's parameters or a loading.
   static Hyperparameter of(Kind kind, std::size_t owner, std::size_t index);
@@ -93,8 +104,6 @@ struct Hyperparameter {
   // The objective in that coordinate.
   /// ∂NLL/∂x, given the gradient of the negative log likelihood at its value.
   [[nodiscard]] double likelihood_slope(const ModelGradient& gradient) const;
-  [[nodiscard]] double negative_log_hyperprior() const { return hyperprior.negative_log(value); }
-  [[nodiscard]] double hyperprior_slope() const { return hyperprior.slope(value, map()); }
 };
 
 /// @throws InputError when hyperparameters are not of this prior and these observations, a value is not finite or, where it is
