@@ -46,6 +46,15 @@ class Posterior {
   [[nodiscard]] int n_components() const;
   /// @throws InputError when there is no such component.
   [[nodiscard]] Posterior component(int k) const;
+  /// The mixture of these components.
+  /// @throws InputError when there are none, or one of them does not exist.
+  [[nodiscard]] Posterior components(const std::vector<int>& which) const;
+  /// Few components, in ascending order, whose mixture is within `largest_error` of this one: a prediction costs so many times that
+  /// of one component. The error is the root mean square, over the constrained accelerations at up to 300 of the observed states, of
+  /// the difference of means and of that of standard deviations, in units of the standard deviation. Found one by one, each the one
+  /// that lowers the error most; all where the error stays larger.
+  /// @throws InputError when the error is not above 0; as marginal().
+  [[nodiscard]] std::vector<int> fewest_components(double largest_error) const;
 
   /// E[view] at N states (d × N). A state's result is the same, to the bit, whatever other states are asked for and however many
   /// threads work.
@@ -92,6 +101,8 @@ class Posterior {
   [[nodiscard]] const Prior& prior() const;
   [[nodiscard]] const std::vector<Observations>& observations() const;
   [[nodiscard]] const ModelValues& values() const;
+  /// σ of Observations g; of a mixture the root mean square of those of its components.
+  [[nodiscard]] Eigen::VectorXd noise_stddev(std::size_t g) const;
   [[nodiscard]] double negative_log_likelihood() const;  // −log p(y), physical units, all constants
   [[nodiscard]] int reduced_size() const;                // rows of the factored matrix
 
@@ -107,7 +118,7 @@ class Posterior {
 
   explicit Posterior(Components components);
   [[nodiscard]] const Components& held() const;                // throws when it was moved away
-  [[nodiscard]] const Components& components() const;          // those, conditioned
+  [[nodiscard]] const Components& conditioned() const;         // those, conditioned
   [[nodiscard]] const Implementation& implementation() const;  // the first component; throws likewise
   // those of this one where nobody else holds them, else copies
   [[nodiscard]] std::vector<std::shared_ptr<Implementation>> own_components() const;

@@ -330,6 +330,7 @@ class Posterior:
         threads: int = 0,
     ) -> Evaluation: ...
     def cross_validate(self) -> CrossValidation: ...
+    def fewest_components(self, largest_error: float) -> Posterior: ...
     def update(
         self,
         data: _Table,
@@ -444,6 +445,7 @@ def fit(
     seed: int = 0,
     threads: int = 0,
     hyperparameters: Literal["optimise", "integrate", "auto"] = "auto",
+    thin: bool = True,
     standard_errors: bool = True,
     max_escapes: int | None = None,
     gradient_tolerance: float | None = None,

@@ -189,7 +189,7 @@ void update_with(PyPosterior& self, const py::object& data, const std::vector<st
     if (at_home == groups.end() || at_home->view().rows != view.rows) {
       throw InputError("noise_std: these accelerations were not observed in the fit; give their noise standard deviation");
     }
-    stddev = self.posterior.values().noise_stddev[static_cast<std::size_t>(at_home - groups.begin())];
+    stddev = self.posterior.noise_stddev(static_cast<std::size_t>(at_home - groups.begin()));
     bool states_noise = false;
     for (int k = 0; k < view.size(); ++k) states_noise = states_noise || at_home->states_noise(k);
     if (states_noise) {
@@ -648,6 +648,19 @@ void define_evaluate_and_update(py::class_<PyPosterior>& posterior) {
           },
           py::call_guard<py::gil_scoped_release>(),
           "How well the data predict themselves: each value from all others, and each of five stretches of time from the rest.")
+      .def(
+          "fewest_components",
+          [](const PyPosterior& self, double largest_error) {
+            const std::vector<int> few = self.posterior.fewest_components(largest_error);
+            PyPosterior out{self.file, self.posterior.components(few), {}};
+            std::optional<HyperparameterDraws>& draws = out.file.report.draws;
+            if (draws) draws->values = MatrixXd(draws->values(Eigen::all, few));
+            return out;
+          },
+          "largest_error"_a, py::call_guard<py::gil_scoped_release>(),
+          "The mixture of few of its components, for loops that cannot wait for all: at the observed states within this share of "
+          "a "
+          "standard deviation of it, root mean square over means and deviations.")
       .def("update", &update_with, "data"_a, "observe"_a = std::vector<std::string>(), "noise_std"_a = py::none(),
            "columns"_a = py::none(),
            "Add measured accelerations, in place: O(N²) per row. Hyperparameters, parameters and scales are held.")

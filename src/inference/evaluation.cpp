@@ -160,17 +160,14 @@ std::vector<int> observed_rows(const Posterior& posterior) {
   return {rows.begin(), rows.end()};
 }
 
-namespace {
-
-// of one component
-MatrixXd measurement_noise_of(const Posterior& posterior, const std::vector<int>& rows, Index n_states, const MatrixXd& stated) {
+MatrixXd measurement_noise(const Posterior& posterior, const std::vector<int>& rows, Index n_states, const MatrixXd& stated) {
   MatrixXd noise(std::ssize(rows), n_states);
   for (Index r = 0; r < noise.rows(); ++r) {
     double usual = not_a_number, factor = 1;
     bool is_first = true, is_first_stated = true;
     for_each_observed(posterior, rows[static_cast<std::size_t>(r)], [&](std::size_t g, Index k) {
       const Observations& group = posterior.observations()[g];
-      const VectorXd& sigma = posterior.values().noise_stddev[g];
+      const VectorXd sigma = posterior.noise_stddev(g);
       if (std::exchange(is_first, false)) usual = group.usual_noise(sigma)[k];
       if (group.states_noise(k) && std::exchange(is_first_stated, false)) factor = sigma[k];
     });
@@ -180,18 +177,6 @@ MatrixXd measurement_noise_of(const Posterior& posterior, const std::vector<int>
     }
   }
   return noise;
-}
-
-}  // namespace
-
-MatrixXd measurement_noise(const Posterior& posterior, const std::vector<int>& rows, Index n_states, const MatrixXd& stated) {
-  const int n = posterior.n_components();
-  if (n == 1) return measurement_noise_of(posterior, rows, n_states, stated);
-  MatrixXd variance = MatrixXd::Zero(std::ssize(rows), n_states);
-  for (int k = 0; k < n; ++k) {
-    variance += measurement_noise_of(posterior.component(k), rows, n_states, stated).cwiseAbs2() / n;
-  }
-  return variance.cwiseSqrt();
 }
 
 MatrixXd with_slip(const Posterior& posterior, const View& view, const Ref<const MatrixXd>& states, MatrixXd noise_stddev) {
@@ -222,6 +207,7 @@ std::vector<TrainingResidual> training_residuals(const Posterior& posterior, con
     const Observations& group = posterior.observations()[g];
     if (!group.view().is_of_ddq()) continue;
     const std::vector<std::string> names = group.view().names(*prior_of(posterior.prior(), group.view()).system);
+    const VectorXd noise = posterior.noise_stddev(g);
     for (Index k = 0; k < group.values().rows(); ++k) {
       TrainingResidual& one = residuals.emplace_back();
       one.group = g;
@@ -231,8 +217,7 @@ std::vector<TrainingResidual> training_residuals(const Posterior& posterior, con
       for (Index i = 0; i < group.n_data(); ++i) {
         const double error = group.values()(k, i) - left_out[g].mean(k, i);
         if (std::isnan(error)) continue;
-        const double stddev =
-            std::hypot(std::sqrt(left_out[g].variance(k, i)), group.noise_at(posterior.values().noise_stddev[g], i)[k]);
+        const double stddev = std::hypot(std::sqrt(left_out[g].variance(k, i)), group.noise_at(noise, i)[k]);
         const double z = error / stddev;
         errors.add(error, stddev);
         one.rms += z * z;
@@ -257,10 +242,11 @@ Evaluation::Part scores_of(const Posterior& posterior, const std::vector<LeaveOn
     spread[r] = training_spread(posterior, rows[static_cast<std::size_t>(r)]);
     for_each_observed(posterior, rows[static_cast<std::size_t>(r)], [&](std::size_t g, Index k) {
       const Observations& group = posterior.observations()[g];
+      const VectorXd noise = posterior.noise_stddev(g);
       for (Index i = 0; i < group.n_data(); ++i) {
         const double error = group.values()(k, i) - left_out[g].mean(k, i);
         if (std::isnan(error)) continue;
-        scores.add(r, error, std::sqrt(left_out[g].variance(k, i)), group.noise_at(posterior.values().noise_stddev[g], i)[k],
+        scores.add(r, error, std::sqrt(left_out[g].variance(k, i)), group.noise_at(noise, i)[k],
                    /*has_variance=*/false);
       }
     });
@@ -314,8 +300,9 @@ std::vector<ConstraintResidual> constraint_residuals(const Posterior& posterior,
 
 std::vector<ConstraintResidual> constraint_residuals(const Posterior& posterior, std::size_t group) {
   const Observations& of = posterior.observations()[group];
+  const VectorXd noise_stddev = posterior.noise_stddev(group);
   MatrixXd noise(of.view().size(), of.n_data());
-  for (int i = 0; i < of.n_data(); ++i) noise.col(i) = of.noise().at(posterior.values().noise_stddev[group], i);
+  for (int i = 0; i < of.n_data(); ++i) noise.col(i) = of.noise().at(noise_stddev, i);
   return constraint_residuals(posterior, of.view().other_system, of.states(), of.view().rows, of.values(), noise);
 }
 

@@ -107,7 +107,7 @@ PathwiseSamples sample_paths(const Posterior& posterior, int n_samples, const Pa
   self->samples.resize(static_cast<std::size_t>(n_samples));
   const std::vector<std::vector<Index>> samples_of = samples_of_components(posterior.n_components(), n_samples, options.seed);
   for (std::size_t k = 0; k < samples_of.size(); ++k) {
-    const auto& component = posterior.components()[k];
+    const auto& component = posterior.conditioned()[k];
     const LatentPosterior& latents = *component->latents;
     // solved in blocks that are always as wide, so that the bits of a sample do not depend on how many there are
     constexpr std::size_t block_size = 8;

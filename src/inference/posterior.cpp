@@ -110,6 +110,13 @@ Posterior Posterior::component(int k) const {
   return Posterior(Components{components_[static_cast<std::size_t>(k)]});
 }
 
+Posterior Posterior::components(const std::vector<int>& which) const {
+  if (which.empty()) throw InputError("Posterior::components: there are none");
+  Components chosen;
+  for (const int k : which) chosen.push_back(component(k).components_.front());
+  return Posterior(std::move(chosen));
+}
+
 namespace {
 
 // Calls work(first state, how many, thread) for every block of states.
@@ -153,7 +160,7 @@ MatrixXd mean_of(const Posterior::Implementation& self, const View& view, const 
 
 MatrixXd Posterior::mean(const View& view, const Ref<const MatrixXd>& states, int n_threads) const {
   MatrixXd mean;
-  for (const auto& component : components()) {
+  for (const auto& component : conditioned()) {
     MatrixXd one = mean_of(*component, view, states, n_threads);
     if (mean.size() == 0) {
       mean = std::move(one);
@@ -272,7 +279,7 @@ Posterior::Marginal marginal_of(const Posterior::Implementation& self, const Vie
 Posterior::Marginal Posterior::marginal(const View& view, const Ref<const MatrixXd>& states, int n_threads) const {
   const lapack::SingleThread single_thread;
   std::vector<Marginal> of_components;
-  for (const auto& component : components()) of_components.push_back(marginal_of(*component, view, states, n_threads));
+  for (const auto& component : conditioned()) of_components.push_back(marginal_of(*component, view, states, n_threads));
   const Index d = view.size();
   return mixed(std::move(of_components), [d](MatrixXd& covariance, const MatrixXd& deviation) {
     for (Index i = 0; i < deviation.cols(); ++i) {
@@ -369,7 +376,7 @@ Posterior::Joint joint_of(const Posterior::Implementation& self, const std::vect
 Posterior::Joint Posterior::joint(const std::vector<ViewAt>& quantities) const {
   const lapack::SingleThread single_thread;
   std::vector<Joint> of_components;
-  for (const auto& component : components()) of_components.push_back(joint_of(*component, quantities));
+  for (const auto& component : conditioned()) of_components.push_back(joint_of(*component, quantities));
   return mixed(std::move(of_components), [](MatrixXd& covariance, const VectorXd& deviation) {
     covariance.noalias() += deviation * deviation.transpose();
   });
@@ -381,7 +388,7 @@ Posterior::Joint Posterior::joint(const View& view, const Ref<const MatrixXd>& s
 
 Posterior Posterior::without_data() const {
   std::vector<ModelValues> values;
-  for (const auto& component : components()) {
+  for (const auto& component : conditioned()) {
     values.push_back(component->values);
     values.back().noise_stddev.clear();
   }
@@ -394,17 +401,24 @@ const Posterior::Components& Posterior::held() const {
   if (components_.empty()) throw_moved("Posterior");
   return components_;
 }
-const Posterior::Components& Posterior::components() const {
+const Posterior::Components& Posterior::conditioned() const {
   for (const auto& component : held()) {
     if (!component->conditioning) continue;
     std::call_once(*component->conditioning, [&] { std::const_pointer_cast<Implementation>(component)->condition(); });
   }
   return components_;
 }
-const Posterior::Implementation& Posterior::implementation() const { return *components().front(); }
+const Posterior::Implementation& Posterior::implementation() const { return *conditioned().front(); }
 const Prior& Posterior::prior() const { return held().front()->prior; }
 const std::vector<Observations>& Posterior::observations() const { return held().front()->observations; }
 const ModelValues& Posterior::values() const { return held().front()->values; }
+VectorXd Posterior::noise_stddev(std::size_t g) const {
+  VectorXd out = values().noise_stddev[g];
+  if (held().size() == 1) return out;
+  out.setZero();
+  for (const auto& component : held()) out += component->values.noise_stddev[g].cwiseAbs2();
+  return (out / static_cast<double>(held().size())).cwiseSqrt();
+}
 int Posterior::reduced_size() const { return static_cast<int>(implementation().latents->size()); }
 
 double Posterior::negative_log_likelihood() const {

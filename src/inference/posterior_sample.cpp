@@ -135,7 +135,7 @@ MatrixXd Posterior::sample(const std::vector<ViewAt>& quantities, int n_samples,
   for (std::size_t k = 0; k < samples_of.size(); ++k) {
     if (samples_of[k].empty() && k > 0) continue;
     const MatrixXd of_one =
-        sample_of(*components()[k], quantities, static_cast<int>(samples_of[k].size()), RandomStream(seed, k));
+        sample_of(*conditioned()[k], quantities, static_cast<int>(samples_of[k].size()), RandomStream(seed, k));
     samples.resize(of_one.rows(), n_samples);
     samples(Eigen::all, samples_of[k]) = of_one;
   }

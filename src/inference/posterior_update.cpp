@@ -62,7 +62,7 @@ void remove_oldest_of(Posterior::Implementation& self, int n) {
 
 std::vector<std::shared_ptr<Posterior::Implementation>> Posterior::own_components() const {
   std::vector<std::shared_ptr<Implementation>> own;
-  for (const auto& component : components()) {
+  for (const auto& component : conditioned()) {
     // of several, one that fails must leave the others as they were
     if (components_.size() > 1 || component.use_count() > 1) {
       own.push_back(copy_of(*component));

@@ -535,7 +535,7 @@ Predictor::Predictor(const Posterior& posterior)
 Predictor::Predictor(const Posterior& posterior, View view) : Predictor(posterior, std::move(view), Options()) {}
 Predictor::Predictor(const Posterior& posterior, View view, Options options) {
   require_view(posterior.prior(), view);
-  for (const auto& component : posterior.components()) {
+  for (const auto& component : posterior.conditioned()) {
     const auto own = std::make_shared<Implementation>(*component, view, options);
     if (components_.empty()) own->distance = DataDistance(*component, view);
     components_.push_back(own);

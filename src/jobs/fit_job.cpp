@@ -96,6 +96,7 @@ FitJob job_of(FitRequest request, FitProblem problem) {
   job.notes = problem.notes;
   job.options = within_memory(problem, asked, free_memory(), job.notes);
   note_time(problem, job.options, fit_memory(problem, job.options).reduced_size, job.notes);
+  job.thin = request.thin && !problem.robust && request.problem.protocol.name == Protocol::Name::standard;
   job.file.options = options_json(options(request));
   job.file.prior_options = problem.prior_options;
   job.file.systems = problem.systems;
@@ -114,13 +115,10 @@ void add_residual_notes(const Posterior& posterior, const std::vector<TrainingRe
       if (one.is_too_large()) notes.push_back("warning: " + one.text());
     }
   }
-  std::vector<std::string> large, correlated;
+  std::vector<std::string> large;
   for (const TrainingResidual& one : residuals) {
-    if (one.is_too_large()) {
-      large.push_back(fmt::format("{} (z rms {:.2g}, {:.0f} % within 95 %)", one.output, one.rms, 100 * one.coverage95));
-    } else if (one.is_correlated()) {
-      correlated.push_back(fmt::format("{} ({:.2g})", one.output, one.serial_correlation));
-    }
+    if (!one.is_too_large()) continue;
+    large.push_back(fmt::format("{} (z rms {:.2g}, {:.0f} % within 95 %)", one.output, one.rms, 100 * one.coverage95));
   }
   if (!large.empty()) {
     notes.push_back(
@@ -128,12 +126,19 @@ void add_residual_notes(const Posterior& posterior, const std::vector<TrainingRe
                     "column is wrong or lags, or the constraints or features miss something; see gp2 check and gp2 report",
                     fmt::join(large, ", ")));
   }
-  if (!correlated.empty()) {
-    notes.push_back(fmt::format(
-        "warning: residuals go on from row to row, correlation {}: something that lasts longer than a sample is missing, "
-        "and the rows are fewer measurements than they seem: deviations are too small",
-        fmt::join(correlated, ", ")));
+}
+
+// Which residuals go on from row to row; empty where none do.
+std::string correlated_text(const std::vector<TrainingResidual>& residuals) {
+  std::vector<std::string> correlated;
+  for (const TrainingResidual& one : residuals) {
+    if (one.is_correlated()) correlated.push_back(fmt::format("{} ({:.2g})", one.output, one.serial_correlation));
   }
+  if (correlated.empty()) return {};
+  return fmt::format(
+      "residuals go on from row to row, correlation {}: something that lasts longer than a sample is missing, and "
+      "the rows are fewer measurements than they seem",
+      fmt::join(correlated, ", "));
 }
 
 // Whether the draws of the hyperparameters can be relied on.
@@ -245,6 +250,8 @@ std::vector<Option> options(FitRequest& request) {
            "(docs/theory.md, T31), at about {} evaluations of the likelihood; auto: integrate where the directions of a latent "
            "have their own, as in the default prior, and rows times free directions of motion are at most {}",
            n_mixed_draws, draw_evaluations, largest_integrated_size)},
+      {"thin", Switch{&request.thin, "auto", "none"}, "",
+       "where residuals go on from row to row, fit anew with as many rows as they are worth, evenly taken; or none"},
       {"standard_errors", YesByDefault{&request.standard_errors}, "",
        "the standard errors of estimated parameters, which take a few dozen gradients"},
       {"max_escapes", &request.max_escapes, "K", "scans for lower optima from the best one", "5"},
@@ -305,7 +312,25 @@ bool keeps_row_order(const FitFile& fit, const std::vector<Observations>& observ
                      [&](const Observations& group) { return !max_points || group.n_data() < *max_points; });
 }
 
-FitOutcome run_fit(const FitJob& job, const std::function<void(const Progress&)>& progress, const std::atomic<bool>* stop) {
+namespace {
+
+// How many rows of each Observations are worth one: as many as it takes for correlated residuals to forget, but not so many that
+// hardly any are left.
+std::vector<int> rows_per_measurement(const FitOutcome& outcome) {
+  constexpr double forgotten = 0.3;
+  constexpr int fewest = 40;
+  const std::vector<Observations>& observations = outcome.posterior.observations();
+  std::vector<int> rows(observations.size(), 1);
+  for (const TrainingResidual& one : outcome.cross_validation->residuals) {
+    if (!one.is_correlated()) continue;
+    const int most = std::max(1, observations[one.group].n_data() / fewest);
+    const double needed = std::ceil(std::log(forgotten) / std::log(std::min(one.serial_correlation, 0.999)));
+    rows[one.group] = std::max(rows[one.group], std::min(most, static_cast<int>(needed)));
+  }
+  return rows;
+}
+
+FitOutcome run_once(const FitJob& job, const std::function<void(const Progress&)>& progress, const std::atomic<bool>* stop) {
   FitOptions options = job.options;
   options.progress = progress;
   options.stop = stop;
@@ -320,6 +345,8 @@ FitOutcome run_fit(const FitJob& job, const std::function<void(const Progress&)>
       outcome.cross_validation =
           cross_validate(outcome.posterior, keeps_row_order(outcome.file, outcome.posterior.observations()));
       add_residual_notes(outcome.posterior, outcome.cross_validation->residuals, outcome.notes);
+      const std::string correlated = correlated_text(outcome.cross_validation->residuals);
+      if (!correlated.empty()) outcome.notes.push_back(fmt::format("warning: {}: deviations are too small", correlated));
     } catch (const std::exception& error) {
       outcome.notes.push_back(fmt::format("the residuals of the fit were not tested: {}", error.what()));
     }
@@ -327,6 +354,38 @@ FitOutcome run_fit(const FitJob& job, const std::function<void(const Progress&)>
   outcome.file.observations = outcome.posterior.observations();
   outcome.file.report = std::move(result.report);
   return outcome;
+}
+
+}  // namespace
+
+FitOutcome run_fit(const FitJob& job, const std::function<void(const Progress&)>& progress, const std::atomic<bool>* stop) {
+  FitOutcome all = run_once(job, progress, stop);
+  if (!job.thin || !all.cross_validation) return all;
+  const std::vector<int> rows = rows_per_measurement(all);
+  if (std::all_of(rows.begin(), rows.end(), [](int n) { return n == 1; })) return all;
+  FitFile thinned = all.file;
+  int n_all = 0, n_taken = 0;
+  for (std::size_t g = 0; g < rows.size(); ++g) {
+    Observations& group = thinned.observations[g];
+    n_all += group.n_data();
+    std::vector<int> taken;
+    for (int i = rows[g] / 2; i < group.n_data(); i += rows[g]) taken.push_back(i);
+    group = group.take(taken);
+    n_taken += group.n_data();
+  }
+  try {
+    FitOutcome fewer = run_fit(prepare_fit_again(thinned, job.options.n_threads), progress, stop);
+    if (fewer.file.report.termination == FitReport::interrupted) return all;
+    std::vector<std::string> notes;
+    add_residual_notes(all.posterior, all.cross_validation->residuals, notes);
+    notes.push_back(fmt::format("{}: fitted anew to {} of {}, evenly taken (`thin=none` fits all)",
+                                correlated_text(all.cross_validation->residuals), n_taken, n_all));
+    fewer.notes.insert(fewer.notes.begin(), notes.begin(), notes.end());
+    return fewer;
+  } catch (const Error& error) {
+    all.notes.push_back(fmt::format("fitted to all rows, because a fit to what they are worth failed: {}", error.what()));
+    return all;
+  }
 }
 
 }  // namespace gp2

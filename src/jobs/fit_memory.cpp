@@ -11,6 +11,7 @@
 #include "base/mapped_memory.hpp"
 #include "base/parallel.hpp"
 #include "gp2/error.hpp"
+#include "gp2/inference/evaluation.hpp"
 
 namespace gp2 {
 
@@ -85,7 +86,9 @@ FitMemory memory_of(double n_states, double r, const PerState& count, int n_comp
   memory.reduced_size = static_cast<int>(std::lround(r));
   memory.shared = number * n_states * count.shared;
   memory.evaluation = triangle(r / count.n_parts) + number * n_states * count.evaluation + blas;
-  memory.posterior = n_components * (triangle(r) + number * n_states * count.evaluation) + blas;
+  // at the end a factor, its inverse in place, and what of it belongs to each stretch of cross_validate, stand beside the posterior
+  const double left_out = triangle(r) + number * r * r / CrossValidation::n_stretches;
+  memory.posterior = n_components * (triangle(r) + number * n_states * count.evaluation) + left_out + blas;
   memory.asked_by_evaluation = number * (r / count.n_parts) * (r / count.n_parts) + blas_buffer;
   memory.asked_by_posterior = n_components * number * r * r + blas_buffer;
   return memory;

@@ -108,8 +108,9 @@ std::vector<ReportData> training_data(const FitFile& fit, const Posterior& poste
   for (std::size_t g = 0; g < fit.observations.size(); ++g) {
     const Observations& group = fit.observations[g];
     if (!group.view().is_of_ddq()) continue;
+    const VectorXd noise_stddev = posterior.noise_stddev(g);
     MatrixXd noise(group.view().size(), group.n_data());
-    for (int i = 0; i < group.n_data(); ++i) noise.col(i) = group.noise().at(posterior.values().noise_stddev[g], i);
+    for (int i = 0; i < group.n_data(); ++i) noise.col(i) = group.noise().at(noise_stddev, i);
     ReportData data =
         data_at(posterior, group.states(), group.view().rows, group.values(), std::move(noise), group.view().other_system);
     data.name = all.empty() ? "training" : fmt::format("training {}", all.size() + 1);

@@ -124,7 +124,8 @@ TEST_F(FitCommand, TellsWhatItWasAskedAndTheFileDoesToo) {
                                    {"reduction_tolerance", 1e-12},
                                    {"restarts", 1},
                                    {"seed", 7},
-                                   {"standard_errors", true}};
+                                   {"standard_errors", true},
+                                   {"thin", "auto"}};
   EXPECT_EQ(report["options"], expected);
   EXPECT_EQ(desk.json("fit.json")["options"], expected);
   // where it was told to start, too: the values can be given again as they are

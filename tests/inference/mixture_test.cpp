@@ -1,3 +1,4 @@
+#include <algorithm>
 #include <cmath>
 #include <vector>
 
@@ -144,12 +145,57 @@ TEST(Mixture, GrowsAndShrinksWithItsData) {
   EXPECT_EQ(mixture.n_components(), 3);
 }
 
+TEST(Mixture, OfFewComponentsIsWithinTheErrorThatIsAsked) {
+  for (const Problem& p : test::problems(9, mixture_seed)) {
+    SCOPED_TRACE(p.name);
+    std::vector<ModelValues> values;
+    for (const double factor : {1.0, 1.02, 1.3, 0.98, 0.8, 1.05, 1.01}) {
+      ModelValues& one = values.emplace_back(p.values);
+      for (VectorXd& signal : one.signal_stddev) signal *= factor;
+      for (VectorXd& noise : one.noise_stddev) noise /= factor;
+    }
+    const Posterior all = Posterior::mixture(p.prior, p.observations, values);
+    VectorXd square = VectorXd::Zero(p.values.noise_stddev[0].size());
+    for (const ModelValues& one : values) square += one.noise_stddev[0].cwiseAbs2() / 7;
+    EXPECT_TRUE(all.noise_stddev(0).isApprox(square.cwiseSqrt(), 1e-14));
+    const Observations& group = p.observations.front();
+    if (p.observations.size() > 1 || group.view().other_system || group.n_data() > 300) continue;
+    const View view = constrained(p);
+    const Posterior::Marginal exact = all.marginal(view, group.states());
+    std::size_t n_before = 8;
+    for (const double largest : {1e-9, 0.01, 0.1, 1e9}) {
+      const std::vector<int> few = all.fewest_components(largest);
+      EXPECT_TRUE(std::is_sorted(few.begin(), few.end()));
+      EXPECT_LE(few.size(), n_before);
+      n_before = few.size();
+      if (few.size() == 7) continue;
+      const Posterior::Marginal got = all.components(few).marginal(view, group.states());
+      double sum = 0;
+      int n = 0;
+      for (Index i = 0; i < exact.mean.size(); ++i) {
+        const double s = exact.stddev().reshaped()[i];
+        if (s < 1e-9) continue;
+        const double mean = (got.mean - exact.mean).reshaped()[i] / s, stddev = got.stddev().reshaped()[i] / s - 1;
+        sum += mean * mean + stddev * stddev;
+        ++n;
+      }
+      EXPECT_LE(std::sqrt(sum / n), 1.001 * largest);
+    }
+    EXPECT_EQ(all.fewest_components(1e-9).size(), 7U);
+    EXPECT_EQ(all.fewest_components(1e9).size(), 1U);
+  }
+}
+
 TEST(Mixture, OfNothingIsRefused) {
   const Problem p = test::problems(1, mixture_seed).front();
   EXPECT_EQ(test::input_error_of([&] { Posterior::mixture(p.prior, p.observations, {}); }),
             "Posterior::mixture: there are no values");
   EXPECT_EQ(test::input_error_of([&] { static_cast<void>(mixture_of(p).component(3)); }),
             "Posterior: component 3: there are 3, 0 is the first");
+  EXPECT_EQ(test::input_error_of([&] { static_cast<void>(mixture_of(p).components({})); }),
+            "Posterior::components: there are none");
+  EXPECT_EQ(test::input_error_of([&] { static_cast<void>(mixture_of(p).fewest_components(0)); }),
+            "Posterior::fewest_components: the error must be above 0");
 }
 
 }  // namespace

@@ -20,7 +20,7 @@ TEST(Options, OfANewFitAreTheDefaults) {
   FitRequest request;
   EXPECT_EQ(json_of(request), json::parse(R"({"discrepancy": "default", "hyperparameters": "auto", "hyperprior": "default",
                             "max_iterations": 1000, "mean": "zero",
-                            "protocol": "default", "seed": 0, "standard_errors": true})"));
+                            "protocol": "default", "seed": 0, "standard_errors": true, "thin": "auto"})"));
 }
 
 FitRequest request_with_every_option() {
@@ -48,6 +48,7 @@ FitRequest request_with_every_option() {
   request.hyperparameters = HyperparameterChoice::integrate;
   request.standard_errors = false;
   request.start.values = {{"m2", 0.7}};
+  request.thin = false;
   return request;
 }
 
@@ -56,7 +57,7 @@ constexpr const char* every_option =
         "hyperparameters": "integrate", "hyperprior": "none", "map": ["theta1=q3"], "max_escapes": 0, "max_iterations": 7, "max_points": 30, "mean": "force",
         "noise_std": 0.1, "observe": ["ddq1", "ddq3"], "prior": "force", "project": true, "protocol": "paper",
         "reduction_tolerance": 1e-12, "restarts": 3, "robust": true, "seed": 18446744073709551615, "standard_errors": false,
-        "start": {"m2": 0.7}})";
+        "start": {"m2": 0.7}, "thin": "none"})";
 
 TEST(Options, AreWrittenUnderTheirNames) {
   FitRequest request = request_with_every_option();

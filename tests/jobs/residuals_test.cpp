@@ -6,6 +6,7 @@
 #include "gp2/jobs/fit_job.hpp"
 #include "gp2/jobs/predict_job.hpp"
 #include "gp2/simulation/generate.hpp"
+#include "gp2/simulation/model_motion.hpp"
 #include "jobs/data_of_model.hpp"
 #include "test_models.hpp"
 
@@ -90,6 +91,49 @@ TEST(Residuals, TellOfAColumnInAnotherUnit) {
   data.accelerations.row(0) *= 10;
   EXPECT_THAT(findings_of(data, Finding::Level::error), Contains(HasSubstr(of_constraint)));
   EXPECT_THAT(notes_of_fit(data), Contains(HasSubstr(of_constraint)));
+}
+
+TEST(Residuals, ThatGoOnFromRowToRowAreFittedToAsManyRowsAsTheyAreWorth) {
+  constexpr int n = 300;
+  constexpr double rho = 0.9, noise = 0.1;
+  Data data = test::moving_log("models/double_pendulum.toml", n, 0.005, 21);
+  const MatrixXd truth = true_acceleration(*data.model, data.states);
+  RandomStream random(21);
+  VectorXd error = VectorXd::Zero(6);
+  for (int i = -100; i < n; ++i) {
+    for (double& one : error) one = rho * one + std::sqrt(1 - rho * rho) * noise * random.normal();
+    if (i >= 0) data.accelerations.col(i) = truth.col(i) + error;
+  }
+  const auto fit_of = [&](bool thin) {
+    FitRequest request;
+    request.model = *data.model;
+    request.logs = {{data.table()}};
+    request.problem.mean = Prior::Mean::force;
+    request.problem.noise_stddev = noise;
+    request.problem.estimate = std::vector<std::string>();
+    request.restarts = 1;
+    request.thin = thin;
+    return run_fit(prepare_fit(std::move(request)));
+  };
+  const auto coverage = [&](const FitOutcome& outcome) {
+    const Posterior::Marginal prediction =
+        outcome.posterior.marginal(View::constrained_acceleration(*data.model->system), data.states);
+    return ((prediction.mean - truth).array().abs() <= 1.96 * prediction.stddev().array() + 1e-9).cast<double>().mean();
+  };
+  const FitOutcome all = fit_of(false), fewer = fit_of(true);
+  EXPECT_EQ(all.posterior.observations().front().n_data(), n);
+  EXPECT_THAT(all.notes, Contains(testing::AllOf(testing::StartsWith("warning: residuals go on from row to row"),
+                                                 testing::EndsWith(": deviations are too small"))));
+  const int n_fewer = fewer.posterior.observations().front().n_data();
+  EXPECT_LE(n_fewer, n / 4);
+  EXPECT_GE(n_fewer, 40);
+  EXPECT_THAT(fewer.notes, Contains(HasSubstr(fmt::format("fitted anew to {} of {}, evenly taken", n_fewer, n))));
+  EXPECT_LT(coverage(all), 0.8);
+  EXPECT_GT(coverage(fewer), 0.85);
+  // the same fit again, from its own file
+  const FitOutcome again = run_fit(prepare_fit_again(fewer.file));
+  EXPECT_EQ(again.posterior.values().parameters, fewer.posterior.values().parameters);
+  EXPECT_EQ(again.file.report.objective, fewer.file.report.objective);
 }
 
 TEST(Residuals, WithoutANoiseAnOffsetOrNothingLeftOfTheCancellationIsFound) {

@@ -64,6 +64,11 @@ def test_hyperparameters_are_integrated_over(arm, arm_log, tmp_path):
     posterior.save(tmp_path / "fit.json")
     states = arm.generate(4, seed=9)
     assert (gp2.load(tmp_path / "fit.json").predict(states).std == posterior.predict(states).std).all()
+    few = posterior.fewest_components(0.1)
+    few.save(tmp_path / "few.json")
+    assert (gp2.load(tmp_path / "few.json").predict(states).std == few.predict(states).std).all()
+    assert 1 <= len(next(iter(few.report.draws.values()))["values"]) < 25
+    assert abs(few.predict(states).mean - posterior.predict(states).mean).max() < posterior.predict(states).std.max()
     assert gp2.fit(arm, arm_log, restarts=1, max_iterations=3).report.draws is None
 
 

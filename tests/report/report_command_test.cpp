@@ -39,6 +39,17 @@ TEST_F(ReportCommand, IsTheSameForTheSameFiles) {
   EXPECT_EQ(desk.read("a.html"), desk.read("b.html"));
 }
 
+TEST_F(ReportCommand, SaysWithinWhatHyperparametersWereDrawn) {
+  desk.done("gp2 generate models/duffing.toml --n 12 -o duffing.csv");
+  desk.done("gp2 fit models/duffing.toml --data duffing.csv --restarts 1 --hyperparameters integrate -o drawn.json");
+  desk.done("gp2 report drawn.json -o drawn.html");
+  desk.done("gp2 report fit.json -o fit.html");
+  for (const char* part : {"\"drawn95\":[", "\"draws\":{", "\"n_chains\":8", "\"n\":25"})
+    EXPECT_THAT(desk.read("drawn.html"), HasSubstr(part));
+  EXPECT_THAT(desk.read("fit.html"), HasSubstr("\"draws\":null"));
+  EXPECT_THAT(desk.read("fit.html"), Not(HasSubstr("\"drawn95\":[")));
+}
+
 TEST_F(ReportCommand, FindsColumnsOfTheTestByOtherNames) {
   const std::string log = desk.read("train.csv");
   const std::size_t line = log.find('\n');

@@ -160,13 +160,16 @@ Json parameters_json(const FitFile& fit) {
 
 Json hyperparameters_json(const FitReport& report) {
   Json rows = Json::array();
-  for (const Hyperparameter& h : report.hyperparameters) {
+  for (std::size_t k = 0; k < report.hyperparameters.size(); ++k) {
+    const Hyperparameter& h = report.hyperparameters[k];
     rows.push_back({{"name", h.name},
                     {"value", h.value},
                     {"lower", h.lower},
                     {"upper", h.upper},
                     {"unit", h.unit},
                     {"at_bound", h.at_bound()}});
+    const auto own = static_cast<Eigen::Index>(k);
+    if (report.draws) rows.back()["drawn95"] = {number(report.draws->lower[own]), number(report.draws->upper[own])};
   }
   return rows;
 }
@@ -182,7 +185,15 @@ Json fit_json(const FitReport& report) {
                         {"converged", one.converged},
                         {"termination", one.termination}});
   }
-  return {{"nll", report.negative_log_likelihood},
+  Json draws;
+  if (report.draws) {
+    draws = {{"n", report.draws->size()},
+             {"n_chains", report.draws->n_chains},
+             {"r_hat", number(report.draws->r_hat.maxCoeff())},
+             {"effective_size", number(report.draws->effective_size.minCoeff())}};
+  }
+  return {{"draws", draws},
+          {"nll", report.negative_log_likelihood},
           {"objective", report.objective},
           {"converged", report.converged},
           {"termination", report.termination},

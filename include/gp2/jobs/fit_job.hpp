@@ -45,6 +45,7 @@ struct FitRequest {
   int threads = 0;
   HyperparameterChoice hyperparameters = HyperparameterChoice::automatic;
   bool standard_errors = true;
+  bool thin = true;  // fewer rows where residuals go on from row to row
 };
 
 /// The table of its options.
@@ -56,6 +57,7 @@ struct FitJob {
   FitOptions options;
   FitFile file;  // all but the observations and the report
   std::vector<std::string> notes;
+  bool thin = true;
 };
 
 /// @throws InputError for options out of range; as make_fit_problem, read_start and within_memory.
@@ -81,6 +83,8 @@ struct FitOutcome {
 /// Whether its observations stand in the order of their logs: `max_points` shuffles them.
 bool keeps_row_order(const FitFile& fit, const std::vector<Observations>& observations);
 
+/// Where residuals go on from row to row, rows are fewer measurements than they seem: the fit is then done anew with as many rows of
+/// each log as they are worth, evenly taken, unless it is not to `thin`, or robust, or of the paper's protocol.
 /// @param progress  called from other threads, one at a time
 /// @param stop      set: ends with the best so far, whose termination is FitReport::interrupted
 /// @throws NumericalError  as fit(), also when stopped before there was anything to give.

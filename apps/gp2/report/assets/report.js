@@ -151,15 +151,17 @@
       parameters.append(table("Parameters of the system", [{ label: "parameter" }, { label: "in the model file", number: true }, { label: "fitted", number: true }, { label: "standard error", number: true }, { label: "lower bound", number: true }, { label: "upper bound", number: true }, { label: "" }],
         report.parameters.map((row) => [row.name, row.model, row.fitted === undefined ? "held" : row.fitted, row.stddev, row.lower, row.upper, bound(row)]), (r) => report.parameters[r].at_bound));
     }
-    byId("hyperparameters").append(table("Hyperparameters", [{ label: "name" }, { label: "value", number: true }, { label: "lower bound", number: true }, { label: "upper bound", number: true }, { label: "unit" }, { label: "" }],
-      report.hyperparameters.map((row) => [row.name, row.value, row.lower, row.upper, row.unit, bound(row)]), (r) => report.hyperparameters[r].at_bound));
+    const drawn = fit.draws ? [{ label: "2.5 % of draws", number: true }, { label: "97.5 % of draws", number: true }] : [];
+    byId("hyperparameters").append(table("Hyperparameters", [{ label: "name" }, { label: "value", number: true }, ...drawn, { label: "lower bound", number: true }, { label: "upper bound", number: true }, { label: "unit" }, { label: "" }],
+      report.hyperparameters.map((row) => [row.name, row.value, ...(row.drawn95 || []), row.lower, row.upper, row.unit, bound(row)]), (r) => report.hyperparameters[r].at_bound));
   }
 
   function fillOptimiser() {
     const again = fit.restarts[fit.best_restart];
     byId("optimiser-lead").textContent = `${fit.termination.charAt(0).toUpperCase()}${fit.termination.slice(1)}, after ${fit.iterations} iterations. ` +
       `Negative log likelihood ${format(fit.nll)}; with hyper-priors, the objective, ${format(fit.objective)}.` +
-      (again && again.objective !== null && again.objective - fit.objective > 1e-9 * Math.abs(fit.objective) ? " A scan from the best restart found a lower optimum than the restarts." : "");
+      (again && again.objective !== null && again.objective - fit.objective > 1e-9 * Math.abs(fit.objective) ? " A scan from the best restart found a lower optimum than the restarts." : "") +
+      (fit.draws ? ` Predictions mix ${fit.draws.n} draws of the hyperparameters by ${fit.draws.n_chains} chains: R̂ at most ${format(fit.draws.r_hat, 3)}, worth ${format(fit.draws.effective_size, 3)} independent ones or more.` : "");
     byId("restarts").append(table("Restarts of the optimiser", [{ label: "restart" }, { label: "objective", number: true }, { label: "neg. log likelihood", number: true }, { label: "iterations", number: true }, { label: "evaluations", number: true }, { label: "failed", number: true }, { label: "why it stopped", wrap: true }],
       fit.restarts.map((one, k) => [k === fit.best_restart ? make("span", {}, `${k + 1} `, badge("best", "good")) : String(k + 1), one.objective === null ? "∞" : one.objective, one.nll === null ? "∞" : one.nll, one.iterations, one.evaluations, one.failed, one.termination])));
   }
