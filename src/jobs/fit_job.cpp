@@ -3,6 +3,8 @@
 #include <algorithm>
 #include <cmath>
 #include <exception>
+#include <numeric>
+#include <optional>
 #include <utility>
 
 #include <fmt/format.h>
@@ -314,21 +316,27 @@ bool keeps_row_order(const FitFile& fit, const std::vector<Observations>& observ
 
 namespace {
 
-// How many rows of each Observations are worth one: as many as it takes for correlated residuals to forget, but not so many that
-// hardly any are left.
-std::vector<int> rows_per_measurement(const FitOutcome& outcome) {
-  constexpr double forgotten = 0.3;
-  constexpr int fewest = 40;
-  const std::vector<Observations>& observations = outcome.posterior.observations();
-  std::vector<int> rows(observations.size(), 1);
-  for (const TrainingResidual& one : outcome.cross_validation->residuals) {
-    if (!one.is_correlated()) continue;
-    const int most = std::max(1, observations[one.group].n_data() / fewest);
-    const double needed = std::ceil(std::log(forgotten) / std::log(std::min(one.serial_correlation, 0.999)));
-    rows[one.group] = std::max(rows[one.group], std::min(most, static_cast<int>(needed)));
+// What residuals say of how many rows are worth one measurement.
+struct Worth {
+  std::vector<int> rows;  // of each Observations
+  std::string text;       // which residuals say so
+
+  // As many rows as it takes for correlated residuals to forget, but not so many that hardly any are left.
+  Worth(const std::vector<TrainingResidual>& residuals, const std::vector<Observations>& observations)
+      : rows(observations.size(), 1), text(correlated_text(residuals)) {
+    constexpr double forgotten = 0.3;
+    constexpr int fewest = 40;
+    for (const TrainingResidual& one : residuals) {
+      if (!one.is_correlated()) continue;
+      const int most = std::max(1, observations[one.group].n_data() / fewest);
+      const double needed = std::ceil(std::log(forgotten) / std::log(std::min(one.serial_correlation, 0.999)));
+      rows[one.group] = std::max(rows[one.group], std::min(most, static_cast<int>(needed)));
+    }
   }
-  return rows;
-}
+  [[nodiscard]] bool is_less() const {
+    return std::any_of(rows.begin(), rows.end(), [](int n) { return n > 1; });
+  }
+};
 
 FitOutcome run_once(const FitJob& job, const std::function<void(const Progress&)>& progress, const std::atomic<bool>* stop) {
   FitOptions options = job.options;
@@ -356,35 +364,74 @@ FitOutcome run_once(const FitJob& job, const std::function<void(const Progress&)
   return outcome;
 }
 
-}  // namespace
-
-FitOutcome run_fit(const FitJob& job, const std::function<void(const Progress&)>& progress, const std::atomic<bool>* stop) {
-  FitOutcome all = run_once(job, progress, stop);
-  if (!job.thin || !all.cross_validation) return all;
-  const std::vector<int> rows = rows_per_measurement(all);
-  if (std::all_of(rows.begin(), rows.end(), [](int n) { return n == 1; })) return all;
-  FitFile thinned = all.file;
+// The fit to every k-th row.
+FitOutcome run_thinned(const FitJob& job, const Worth& worth, const std::function<void(const Progress&)>& progress,
+                       const std::atomic<bool>* stop) {
+  FitFile file = job.file;
+  file.observations = job.problem.observations;
   int n_all = 0, n_taken = 0;
-  for (std::size_t g = 0; g < rows.size(); ++g) {
-    Observations& group = thinned.observations[g];
+  for (std::size_t g = 0; g < worth.rows.size(); ++g) {
+    Observations& group = file.observations[g];
     n_all += group.n_data();
     std::vector<int> taken;
-    for (int i = rows[g] / 2; i < group.n_data(); i += rows[g]) taken.push_back(i);
+    for (int i = worth.rows[g] / 2; i < group.n_data(); i += worth.rows[g]) taken.push_back(i);
     group = group.take(taken);
     n_taken += group.n_data();
   }
+  FitOutcome outcome = run_fit(prepare_fit_again(file, job.options.n_threads), progress, stop);
+  outcome.notes.insert(outcome.notes.begin(),
+                       fmt::format("{}: fitted to {} of {}, evenly taken (`thin=none` fits all)", worth.text, n_taken, n_all));
+  return outcome;
+}
+
+// What a stretch of a long log says, before all of it is fitted at the cost of N³; nothing of a short one.
+std::optional<Worth> worth_of_stretch(const FitJob& job, const std::atomic<bool>* stop) {
+  constexpr int enough = 200;
+  const std::vector<Observations>& all = job.problem.observations;
+  const auto is_short = [](const Observations& group) { return group.n_data() <= 2 * enough; };
+  if (job.options.max_iterations == 0 || std::all_of(all.begin(), all.end(), is_short) || !keeps_row_order(job.file, all)) {
+    return std::nullopt;
+  }
+  FitFile file = job.file;
+  file.observations = all;
+  for (Observations& group : file.observations) {
+    if (is_short(group)) continue;
+    std::vector<int> stretch(enough);
+    std::iota(stretch.begin(), stretch.end(), (group.n_data() - enough) / 2);
+    group = group.take(stretch);
+  }
+  FitJob quick = prepare_fit_again(file, job.options.n_threads);
+  quick.options.n_restarts = 1;
+  quick.options.n_draws = quick.options.max_escapes = 0;
+  quick.options.standard_errors = false;
+  const FitOutcome outcome = run_once(quick, {}, stop);
+  if (!outcome.cross_validation) return std::nullopt;
+  return Worth(outcome.cross_validation->residuals, all);
+}
+
+}  // namespace
+
+FitOutcome run_fit(const FitJob& job, const std::function<void(const Progress&)>& progress, const std::atomic<bool>* stop) {
+  if (!job.thin) return run_once(job, progress, stop);
+  std::optional<FitOutcome> all;
   try {
-    FitOutcome fewer = run_fit(prepare_fit_again(thinned, job.options.n_threads), progress, stop);
-    if (fewer.file.report.termination == FitReport::interrupted) return all;
+    const std::optional<Worth> before = worth_of_stretch(job, stop);
+    if (before && before->is_less()) return run_thinned(job, *before, progress, stop);
+    all = run_once(job, progress, stop);
+    if (!all->cross_validation) return *all;
+    const Worth worth(all->cross_validation->residuals, job.problem.observations);
+    if (!worth.is_less()) return *all;
+    FitOutcome fewer = run_thinned(job, worth, progress, stop);
+    if (fewer.file.report.termination == FitReport::interrupted) return *all;
     std::vector<std::string> notes;
-    add_residual_notes(all.posterior, all.cross_validation->residuals, notes);
-    notes.push_back(fmt::format("{}: fitted anew to {} of {}, evenly taken (`thin=none` fits all)",
-                                correlated_text(all.cross_validation->residuals), n_taken, n_all));
+    add_residual_notes(all->posterior, all->cross_validation->residuals, notes);
     fewer.notes.insert(fewer.notes.begin(), notes.begin(), notes.end());
     return fewer;
   } catch (const Error& error) {
-    all.notes.push_back(fmt::format("fitted to all rows, because a fit to what they are worth failed: {}", error.what()));
-    return all;
+    if (!all) return run_once(job, progress, stop);
+    if (!is_set(stop))
+      all->notes.push_back(fmt::format("fitted to all rows, because a fit to what they are worth failed: {}", error.what()));
+    return *all;
   }
 }
 

@@ -93,18 +93,22 @@ TEST(Residuals, TellOfAColumnInAnotherUnit) {
   EXPECT_THAT(notes_of_fit(data), Contains(HasSubstr(of_constraint)));
 }
 
-TEST(Residuals, ThatGoOnFromRowToRowAreFittedToAsManyRowsAsTheyAreWorth) {
-  constexpr int n = 300;
-  constexpr double rho = 0.9, noise = 0.1;
-  Data data = test::moving_log("models/double_pendulum.toml", n, 0.005, 21);
-  const MatrixXd truth = true_acceleration(*data.model, data.states);
-  RandomStream random(21);
-  VectorXd error = VectorXd::Zero(6);
-  for (int i = -100; i < n; ++i) {
-    for (double& one : error) one = rho * one + std::sqrt(1 - rho * rho) * noise * random.normal();
-    if (i >= 0) data.accelerations.col(i) = truth.col(i) + error;
+// a motion whose measured accelerations have errors that last
+struct LastingErrors {
+  static constexpr double noise = 0.1;
+  Data data;
+  MatrixXd truth;
+
+  explicit LastingErrors(int n, double correlation)
+      : data(test::moving_log("models/double_pendulum.toml", n, 0.005, 21)), truth(true_acceleration(*data.model, data.states)) {
+    RandomStream random(21);
+    VectorXd error = VectorXd::Zero(6);
+    for (int i = -100; i < n; ++i) {
+      for (double& one : error) one = correlation * one + std::sqrt(1 - correlation * correlation) * noise * random.normal();
+      if (i >= 0) data.accelerations.col(i) = truth.col(i) + error;
+    }
   }
-  const auto fit_of = [&](bool thin) {
+  [[nodiscard]] FitOutcome fit(bool thin) const {
     FitRequest request;
     request.model = *data.model;
     request.logs = {{data.table()}};
@@ -114,26 +118,40 @@ TEST(Residuals, ThatGoOnFromRowToRowAreFittedToAsManyRowsAsTheyAreWorth) {
     request.restarts = 1;
     request.thin = thin;
     return run_fit(prepare_fit(std::move(request)));
-  };
-  const auto coverage = [&](const FitOutcome& outcome) {
+  }
+  [[nodiscard]] double coverage(const FitOutcome& outcome) const {
     const Posterior::Marginal prediction =
         outcome.posterior.marginal(View::constrained_acceleration(*data.model->system), data.states);
     return ((prediction.mean - truth).array().abs() <= 1.96 * prediction.stddev().array() + 1e-9).cast<double>().mean();
-  };
-  const FitOutcome all = fit_of(false), fewer = fit_of(true);
-  EXPECT_EQ(all.posterior.observations().front().n_data(), n);
+  }
+};
+
+int n_rows(const FitOutcome& outcome) { return outcome.posterior.observations().front().n_data(); }
+
+TEST(Residuals, ThatGoOnFromRowToRowAreFittedToAsManyRowsAsTheyAreWorth) {
+  const LastingErrors log(300, 0.9);
+  const FitOutcome all = log.fit(false), fewer = log.fit(true);
+  EXPECT_EQ(n_rows(all), 300);
   EXPECT_THAT(all.notes, Contains(testing::AllOf(testing::StartsWith("warning: residuals go on from row to row"),
                                                  testing::EndsWith(": deviations are too small"))));
-  const int n_fewer = fewer.posterior.observations().front().n_data();
-  EXPECT_LE(n_fewer, n / 4);
-  EXPECT_GE(n_fewer, 40);
-  EXPECT_THAT(fewer.notes, Contains(HasSubstr(fmt::format("fitted anew to {} of {}, evenly taken", n_fewer, n))));
-  EXPECT_LT(coverage(all), 0.8);
-  EXPECT_GT(coverage(fewer), 0.85);
+  EXPECT_LE(n_rows(fewer), 75);
+  EXPECT_GE(n_rows(fewer), 40);
+  EXPECT_THAT(fewer.notes, Contains(HasSubstr(fmt::format("fitted to {} of 300, evenly taken", n_rows(fewer)))));
+  EXPECT_LT(log.coverage(all), 0.8);
+  EXPECT_GT(log.coverage(fewer), 0.85);
   // the same fit again, from its own file
   const FitOutcome again = run_fit(prepare_fit_again(fewer.file));
-  EXPECT_EQ(again.posterior.values().parameters, fewer.posterior.values().parameters);
+  EXPECT_EQ(n_rows(again), n_rows(fewer));
   EXPECT_EQ(again.file.report.objective, fewer.file.report.objective);
+}
+
+TEST(Residuals, OfALongLogAreAskedOfAStretchFirst) {
+  const LastingErrors lasting(1500, 0.9);
+  const FitOutcome fewer = lasting.fit(true);  // all would take a matrix of 3000
+  EXPECT_LE(n_rows(fewer), 375);
+  EXPECT_GT(lasting.coverage(fewer), 0.85);
+  const LastingErrors white(410, 0);
+  EXPECT_EQ(n_rows(white.fit(true)), 410);
 }
 
 TEST(Residuals, WithoutANoiseAnOffsetOrNothingLeftOfTheCancellationIsFound) {
