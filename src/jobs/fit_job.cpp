@@ -379,8 +379,8 @@ FitOutcome run_thinned(const FitJob& job, const Worth& worth, const std::functio
     n_taken += group.n_data();
   }
   FitOutcome outcome = run_fit(prepare_fit_again(file, job.options.n_threads), progress, stop);
-  outcome.notes.insert(outcome.notes.begin(),
-                       fmt::format("{}: fitted to {} of {}, evenly taken (`thin=none` fits all)", worth.text, n_taken, n_all));
+  outcome.notes.push_back(fmt::format("{}: fitted to {} of {}, evenly taken (`thin=none` fits all)", worth.text, n_taken, n_all));
+  std::rotate(outcome.notes.begin(), outcome.notes.end() - 1, outcome.notes.end());
   return outcome;
 }
 
