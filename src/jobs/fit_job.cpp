@@ -84,6 +84,16 @@ std::string source_of(const FitRequest& request) {
   return fmt::format("{}", fmt::join(names, ", "));
 }
 
+constexpr int rows_of_stretch = 200;
+
+bool is_short(const Observations& group) { return group.n_data() <= 2 * rows_of_stretch; }
+
+// Whether a stretch of a log may tell what its rows are worth.
+bool asks_a_stretch(const FitOptions& options, const FitFile& file, const std::vector<Observations>& observations) {
+  return options.max_iterations > 0 && !std::all_of(observations.begin(), observations.end(), is_short) &&
+         keeps_row_order(file, observations);
+}
+
 // What both kinds of preparation end with.
 FitJob job_of(FitRequest request, FitProblem problem) {
   // a file of starting values may change: the record has the values
@@ -96,10 +106,16 @@ FitJob job_of(FitRequest request, FitProblem problem) {
   FitOptions asked = optimiser_options(request, problem);
   asked.n_draws = settled_draws(request, problem, asked);
   job.notes = problem.notes;
-  job.options = within_memory(problem, asked, free_memory(), job.notes);
-  note_time(problem, job.options, fit_memory(problem, job.options).reduced_size, job.notes);
   job.thin = request.thin && !problem.robust && request.problem.protocol.name == Protocol::Name::standard;
   job.file.options = options_json(options(request));
+  try {
+    job.options = within_memory(problem, asked, free_memory(), job.notes);
+    note_time(problem, job.options, fit_memory(problem, job.options).reduced_size, job.notes);
+  } catch (const InputError& error) {
+    if (!job.thin || !asks_a_stretch(asked, job.file, problem.observations)) throw;
+    job.options = asked;
+    job.unaffordable = error.what();
+  }
   job.file.prior_options = problem.prior_options;
   job.file.systems = problem.systems;
   job.file.data_source = source_of(request);
@@ -386,18 +402,14 @@ FitOutcome run_thinned(const FitJob& job, const Worth& worth, const std::functio
 
 // What a stretch of a long log says, before all of it is fitted at the cost of N³; nothing of a short one.
 std::optional<Worth> worth_of_stretch(const FitJob& job, const std::atomic<bool>* stop) {
-  constexpr int enough = 200;
   const std::vector<Observations>& all = job.problem.observations;
-  const auto is_short = [](const Observations& group) { return group.n_data() <= 2 * enough; };
-  if (job.options.max_iterations == 0 || std::all_of(all.begin(), all.end(), is_short) || !keeps_row_order(job.file, all)) {
-    return std::nullopt;
-  }
+  if (!asks_a_stretch(job.options, job.file, all)) return std::nullopt;
   FitFile file = job.file;
   file.observations = all;
   for (Observations& group : file.observations) {
     if (is_short(group)) continue;
-    std::vector<int> stretch(enough);
-    std::iota(stretch.begin(), stretch.end(), (group.n_data() - enough) / 2);
+    std::vector<int> stretch(rows_of_stretch);
+    std::iota(stretch.begin(), stretch.end(), (group.n_data() - rows_of_stretch) / 2);
     group = group.take(stretch);
   }
   FitJob quick = prepare_fit_again(file, job.options.n_threads);
@@ -417,6 +429,7 @@ FitOutcome run_fit(const FitJob& job, const std::function<void(const Progress&)>
   try {
     const std::optional<Worth> before = worth_of_stretch(job, stop);
     if (before && before->is_less()) return run_thinned(job, *before, progress, stop);
+    if (!job.unaffordable.empty()) throw InputError(job.unaffordable);
     all = run_once(job, progress, stop);
     if (!all->cross_validation) return *all;
     const Worth worth(all->cross_validation->residuals, job.problem.observations);
@@ -428,6 +441,7 @@ FitOutcome run_fit(const FitJob& job, const std::function<void(const Progress&)>
     fewer.notes.insert(fewer.notes.begin(), notes.begin(), notes.end());
     return fewer;
   } catch (const Error& error) {
+    if (!job.unaffordable.empty()) throw;
     if (!all) return run_once(job, progress, stop);
     if (!is_set(stop))
       all->notes.push_back(fmt::format("fitted to all rows, because a fit to what they are worth failed: {}", error.what()));

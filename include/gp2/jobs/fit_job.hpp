@@ -58,9 +58,10 @@ struct FitJob {
   FitFile file;  // all but the observations and the report
   std::vector<std::string> notes;
   bool thin = true;
+  std::string unaffordable;  // why not all of a long log can be fitted, if that is so: what it is worth may be less
 };
 
-/// @throws InputError for options out of range; as make_fit_problem, read_start and within_memory.
+/// @throws InputError for options out of range; as make_fit_problem, read_start and, where rows are not to be left out, within_memory.
 FitJob prepare_fit(FitRequest request);
 
 /// The model and the options of a fit as it was asked for, without its data.
@@ -87,6 +88,7 @@ bool keeps_row_order(const FitFile& fit, const std::vector<Observations>& observ
 /// each log as they are worth, evenly taken, unless it is not to `thin`, or robust, or of the paper's protocol.
 /// @param progress  called from other threads, one at a time
 /// @param stop      set: ends with the best so far, whose termination is FitReport::interrupted
+/// @throws InputError      as within_memory, where the rows of a long log are worth too many
 /// @throws NumericalError  as fit(), also when stopped before there was anything to give.
 FitOutcome run_fit(const FitJob& job, const std::function<void(const Progress&)>& progress = {},
                    const std::atomic<bool>* stop = nullptr);
