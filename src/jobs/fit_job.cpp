@@ -300,7 +300,9 @@ FitRequest request_of(const FitFile& fit) {
   FitRequest request;
   request.model = fit.model;
   request.data_source = fit.data_source;
-  request.hyperparameters = HyperparameterChoice::optimise;  // formats before 7 do not say
+  // what formats before 7 do not say, and gp2 did not do then
+  request.hyperparameters = HyperparameterChoice::optimise;
+  request.thin = false;
   read_options(fit.options, options(request), "options of the fit");
   return request;
 }
