@@ -4,8 +4,11 @@
 #include <charconv>
 #include <memory>
 #include <optional>
+#include <set>
 #include <string_view>
 #include <system_error>
+
+#include <unistd.h>
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
@@ -13,6 +16,7 @@
 #include "command.hpp"
 #include "gp2/base/file.hpp"
 #include "gp2/base/statistics.hpp"
+#include "streams.hpp"
 
 namespace gp2::command {
 
@@ -113,18 +117,22 @@ void run(DeriveArguments& arguments) {
   require_output(arguments.output, {arguments.log, arguments.model});
   arguments.options.episodes = without_ranges(arguments.options.episodes);
   const Model model = Model::read(arguments.model);
-  const CsvTable log = CsvTable::read(arguments.log);
-  const DerivedData data = derive(model, log, arguments.options);
+  if (isatty(STDERR_FILENO) != 0) {
+    arguments.options.progress = [](double fraction) {
+      print_message("\rgp2: smoothing {:3.0f} %{}", 100 * fraction, fraction < 1 ? "" : "\n");
+    };
+  }
+  const DerivedData data = derive(model, CsvTable::read(arguments.log), arguments.options);
 
   const CsvTable table = as_table(data, *model.system, arguments.output);
   write_file(arguments.output, table.text());
   print_notes(data.notes);
   report(data, *model.system);
+  const std::set<std::string> episodes(data.episodes.begin(), data.episodes.end());  // parts of one have its name
   std::vector<std::string> independent;
   for (const int j : data.independent) independent.push_back(model.system->acceleration_names()[static_cast<std::size_t>(j)]);
-  print_notes(
-      {fmt::format("{}: {} rows, {}; independent accelerations: {}", arguments.output, table.n_rows(),
-                   count_of(static_cast<int>(data.episodes.size()), "episode", "episodes"), fmt::join(independent, ", "))});
+  print_notes({fmt::format("{}: {} rows, {}; independent accelerations: {}", arguments.output, table.n_rows(),
+                           count_of(static_cast<int>(episodes.size()), "episode", "episodes"), fmt::join(independent, ", "))});
 }
 
 }  // namespace

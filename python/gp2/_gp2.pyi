@@ -471,11 +471,12 @@ def derive(
     # options of derive: written by scripts/options
     episode: str = "",
     episodes: Sequence[str] = [],
+    time_unit: Literal["auto", "s", "ms", "us", "ns"] = "auto",
     rate: float = 0.0,
     every: int = 1,
     hold_constraints: bool = False,
     outlier_threshold: float = 5.0,
-    smoothness: Literal["5/2", "7/2", "9/2"] = "9/2",
+    smoothness: Literal["auto", "5/2", "7/2", "9/2"] = "auto",
     keep: Sequence[str] = [],
     columns: Mapping[str, str] | None = None,
     # end of options

@@ -309,7 +309,7 @@ independent, notes. docs/raw-logs.md.
   module.def("resample", &resample_table, py::arg("system"), py::arg("data"), py::arg("n"),
              (signature("resample", "system: System, data: object, n: int, *,", options(of_resample), "", "Table") + R"(
 The n rows of a table that cover its states best, whole, in the order of choice: farthest points in the features of the system's
-first latent, or in expressions given, each divided by its standard deviation. The first is the row nearest to the mean or, with a
+latents, or in expressions given, each divided by its standard deviation. The first is the row nearest to the mean or, with a
 seed, a random one. Rows without a number in some feature are left out.
 
 )" + documentation(options(of_resample)))

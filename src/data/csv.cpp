@@ -1,6 +1,7 @@
 #include "gp2/data/csv.hpp"
 
 #include <algorithm>
+#include <array>
 #include <charconv>
 #include <cmath>
 #include <limits>
@@ -387,7 +388,17 @@ std::string CsvTable::text() const {
   };
   for (int column = 0; column < n_columns(); ++column) add(header()[static_cast<std::size_t>(column)], column);
   for (int row = 0; row < n_rows(); ++row) {
-    for (int column = 0; column < n_columns(); ++column) add(cell(row, column), column);
+    for (int column = 0; column < n_columns(); ++column) {
+      const std::optional<std::string_view> written = content_->text(row, column);
+      const double value = written ? nan : content_->number(row, column);
+      if (std::isnan(value)) {
+        add(std::string(written.value_or("")), column);
+        continue;
+      }
+      std::array<char, 32> digits{};
+      csv.append(digits.data(), std::to_chars(digits.data(), digits.data() + digits.size(), value).ptr);
+      csv += column + 1 < n_columns() ? ',' : '\n';
+    }
   }
   return csv;
 }

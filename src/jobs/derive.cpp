@@ -5,6 +5,7 @@
 #include <limits>
 #include <map>
 #include <memory>
+#include <mutex>
 #include <numbers>
 #include <numeric>
 #include <set>
@@ -28,7 +29,8 @@ using Eigen::VectorXd;
 namespace {
 
 constexpr double nan = std::numeric_limits<double>::quiet_NaN();
-constexpr int least_for_own_model = 40;  // samples
+constexpr std::size_t least_for_own_model = 40;  // samples
+constexpr std::size_t least_rows = 5;
 constexpr double most_rows = 1e7;
 
 /// An empty cell, or one of the words that loggers write instead.
@@ -60,7 +62,8 @@ struct Task {
   int coordinate = 0, episode = 0;
   Channel channel;
   SmootherFit fit;
-  SmoothedMotion motion;
+  SmoothedMotion motion;  // its covariances only where constraints are held
+  Eigen::Matrix3Xd stddev;
 };
 
 std::string in_episode(const Episode& episode) {
@@ -76,6 +79,7 @@ class Deriver {
     check_options();
     find_columns();
     find_episodes();
+    split_at_pauses();
     read_channels();
     smooth_channels();
     collect_rows();
@@ -185,9 +189,134 @@ class Deriver {
     }
   }
 
+  [[nodiscard]] std::string time_place() const {
+    return fmt::format("{}: column '{}'", log_.name(), log_.header()[static_cast<std::size_t>(time_column_)]);
+  }
+
+  /// Seconds in what the times count, by the usual step.
+  double unit_of(double usual_step) {
+    struct Unit {
+      TimeUnit unit;
+      const char* name;
+      double seconds, below;
+    };
+    static constexpr std::array<Unit, 4> units = {{{TimeUnit::seconds, "seconds", 1, 0.5},
+                                                   {TimeUnit::milliseconds, "milliseconds", 1e-3, 500},
+                                                   {TimeUnit::microseconds, "microseconds", 1e-6, 5e5},
+                                                   {TimeUnit::nanoseconds, "nanoseconds", 1e-9, HUGE_VAL}}};
+    const bool automatic = options_.time_unit == TimeUnit::automatic;
+    const Unit& unit = *std::find_if(units.begin(), units.end(), [&](const Unit& one) {
+      return automatic ? usual_step < one.below : one.unit == options_.time_unit;
+    });
+    if (automatic && unit.unit != TimeUnit::seconds) {
+      data_.notes.push_back(fmt::format("{} is taken to count {}: its usual step is {:.6g}; `time_unit=s` if these are seconds",
+                                        time_place(), unit.name, usual_step));
+    }
+    return unit.seconds;
+  }
+
+  // What comes after a long pause is no continuation: times from one start would lose digits, and nothing bridges it.
+  void split_at_pauses() {
+    constexpr double pause = 1000;  // usual steps
+    std::vector<double> steps;
+    for (const Episode& episode : episodes_) {
+      for (std::size_t k = 1; k < episode.distinct.size(); ++k) steps.push_back(episode.distinct[k] - episode.distinct[k - 1]);
+      if (episode.rows.size() >= least_rows && episode.distinct.size() == 1) {
+        throw InputError(fmt::format("{}: all {} rows{} have the time {}; without times there are no velocities", time_place(),
+                                     episode.rows.size(), in_episode(episode), episode.start));
+      }
+    }
+    if (steps.empty()) return;
+    const double usual = median(steps), unit = unit_of(usual);
+    std::vector<Episode> parts;
+    int n_pauses = 0, n_left_out = 0;
+    double longest = 0;
+    for (const Episode& episode : episodes_) {
+      std::vector<Episode> of_this;
+      for (std::size_t k = 0; k < episode.rows.size(); ++k) {
+        const double since = episode.times[k];
+        if (k == 0 || since - episode.times[k - 1] > pause * usual) {
+          if (k > 0) longest = std::max(longest, unit * (since - episode.times[k - 1]));
+          // the log's own number: a difference from the far start has lost digits
+          of_this.push_back({episode.label, {}, {}, log_.number(episode.rows[k], time_column_), {}});
+        }
+        Episode& part = of_this.back();
+        const double here = unit * (log_.number(episode.rows[k], time_column_) - part.start);
+        if (part.times.empty() || here > part.times.back()) part.distinct.push_back(here);
+        part.rows.push_back(episode.rows[k]);
+        part.times.push_back(here);
+      }
+      n_pauses += static_cast<int>(of_this.size()) - 1;
+      for (Episode& part : of_this) {
+        part.start *= unit;
+        if (of_this.size() > 1 && !moves(part)) {
+          n_left_out += static_cast<int>(part.rows.size());
+        } else {
+          parts.push_back(std::move(part));
+        }
+      }
+    }
+    if (n_pauses > 0) {
+      data_.notes.push_back(fmt::format(
+          "warning: {} pauses {}, for {:.3g} s at most: each part is smoothed by itself{}", time_place(),
+          n_pauses == 1 ? "once" : fmt::format("{} times", n_pauses), longest,
+          n_left_out > 0 ? fmt::format("; {} rows of parts that are too short, or where nothing moves, are left out", n_left_out)
+                         : ""));
+    }
+    if (parts.empty()) {
+      throw InputError(fmt::format(
+          "{}: in every part between pauses of more than {:g} usual steps there are too few samples, or nothing moves",
+          time_place(), pause));
+    }
+    episodes_ = std::move(parts);
+    data_.episodes.clear();
+    for (const Episode& part : episodes_) data_.episodes.push_back(part.label);
+  }
+
+  /// Whether every measured coordinate has enough samples in a part, and two of them differ.
+  [[nodiscard]] bool moves(const Episode& part) const {
+    return std::all_of(data_.measured.begin(), data_.measured.end(), [&](int j) {
+      std::size_t n = 0;
+      std::set<std::string> values;
+      for (const int row : part.rows) {
+        const std::string cell = log_.cell(row, position_column_.at(j));
+        if (is_missing(cell)) continue;
+        ++n;
+        if (values.size() < 2) values.insert(cell);
+      }
+      return n >= least_rows && values.size() > 1;
+    });
+  }
+
+  /// Where the samples before say that an angle is by now: on the line through the last few, whose medians no single one spoils.
+  class Course {
+   public:
+    [[nodiscard]] double at(double time) const {
+      if (last_.empty()) return nan;
+      std::vector<double> rates, values;
+      for (std::size_t k = 1; k < last_.size(); ++k)
+        rates.push_back((last_[k].second - last_[k - 1].second) / (last_[k].first - last_[k - 1].first));
+      // across a pause the rate says little
+      constexpr double reach = 20;
+      const double step = rates.empty() ? 0 : (last_.back().first - last_.front().first) / static_cast<double>(rates.size());
+      const double rate = rates.size() < 2 || time - last_.back().first > reach * step ? 0 : median(rates);
+      for (const auto& [before, value] : last_) values.push_back(value + rate * (time - before));
+      return last_.size() < 3 ? values.back() : median(values);
+    }
+
+    void add(double time, double value) {
+      constexpr std::size_t most = 5;
+      if (!last_.empty() && !(time > last_.back().first)) return;
+      last_.emplace_back(time, value);
+      if (last_.size() > most) last_.erase(last_.begin());
+    }
+
+   private:
+    std::vector<std::pair<double, double>> last_;  // time, value
+  };
+
   /// Values of a column at the times of an episode, in the order of the log.
-  void read_column(const Episode& episode, int column, bool velocity, bool angle, Channel& channel) const {
-    double offset = 0, before = nan;
+  void read_column(const Episode& episode, int column, bool velocity, Channel& channel) const {
     std::vector<double> at_one_time;
     double time = nan;
     for (std::size_t k = 0; k < episode.rows.size(); ++k) {
@@ -195,14 +324,7 @@ class Deriver {
         ++channel.missing;
         continue;
       }
-      double value = log_.number(episode.rows[k], column) + offset;
-      if (angle && std::abs(value - before) > std::numbers::pi) {
-        const double turn = -2 * std::numbers::pi * std::round((value - before) / (2 * std::numbers::pi));
-        offset += turn;
-        value += turn;
-        ++channel.wraps;
-      }
-      before = value;
+      const double value = log_.number(episode.rows[k], column);
       if (episode.times[k] != time) at_one_time.clear();
       time = episode.times[k];
       if (std::find(at_one_time.begin(), at_one_time.end(), value) != at_one_time.end()) {
@@ -214,6 +336,46 @@ class Deriver {
     }
   }
 
+  /// Takes the turns out of an angle that is written within one turn.
+  void unwrap(const Episode& episode, int column, Channel& channel) {
+    constexpr double turn = 2 * std::numbers::pi;
+    std::vector<double> values;
+    int jumps = 0;
+    for (const Measurement& one : channel.measurements) {
+      jumps += !values.empty() && std::abs(one.value - values.back()) > turn / 2 ? 1 : 0;
+      values.push_back(one.value);
+    }
+    if (jumps == 0) return;
+    // single errors do not count
+    std::sort(values.begin(), values.end());
+    const std::size_t aside = values.size() / 50;
+    const double range = values[values.size() - 1 - aside] - values[aside];
+    constexpr double little = 0.05;  // of a turn
+    if (range <= (1 + little) * turn) {
+      Course course;
+      double turns = 0;
+      for (Measurement& one : channel.measurements) {
+        const double expected = course.at(one.time);
+        const double here = std::isnan(expected) ? 0 : std::round((expected - one.value) / turn);
+        one.value += turn * here;
+        channel.wraps += here != turns ? 1 : 0;
+        turns = here;
+        course.add(one.time, one.value);
+      }
+      jumps = 0;
+      for (std::size_t k = 1; k < channel.measurements.size(); ++k)
+        jumps += std::abs(channel.measurements[k].value - channel.measurements[k - 1].value) > turn / 2 ? 1 : 0;
+      jumps = std::max(jumps, channel.wraps);
+    }
+    constexpr double often = 0.2;
+    if (jumps > often * static_cast<double>(values.size())) {
+      data_.notes.push_back(fmt::format(
+          "warning: {}: column '{}'{} moves by more than half a turn between {} of {} samples, over a range of {:.3g}: is "
+          "it in rad, and sampled often enough?",
+          log_.name(), log_.header()[static_cast<std::size_t>(column)], in_episode(episode), jumps, values.size(), range));
+    }
+  }
+
   void read_channels() {
     for (const int j : data_.measured) {
       for (int e = 0; e < static_cast<int>(episodes_.size()); ++e) {
@@ -222,15 +384,17 @@ class Deriver {
         task.coordinate = j;
         task.episode = e;
         Channel& channel = task.channel;
-        read_column(episode, position_column_.at(j), false, system_.coordinates()[static_cast<std::size_t>(j)].angle, channel);
+        read_column(episode, position_column_.at(j), false, channel);
         require_motion(episode, position_column_.at(j), channel);
         std::vector<double> values;
         for (const Measurement& one : channel.measurements) values.push_back(one.value);
-        channel.mean = std::accumulate(values.begin(), values.end(), 0.0) / static_cast<double>(values.size());
         channel.resolution = resolution_of(values);
+        if (system_.coordinates()[static_cast<std::size_t>(j)].angle) unwrap(episode, position_column_.at(j), channel);
+        for (const Measurement& one : channel.measurements) channel.mean += one.value / static_cast<double>(values.size());
         for (Measurement& one : channel.measurements) one.value -= channel.mean;
+        if (channel.resolution > 0) share_out_runs(channel.measurements);
         if (velocity_column_.at(j) >= 0) {
-          read_column(episode, velocity_column_.at(j), true, false, channel);
+          read_column(episode, velocity_column_.at(j), true, channel);
           std::stable_sort(channel.measurements.begin(), channel.measurements.end(),
                            [](const Measurement& a, const Measurement& b) { return a.time < b.time; });
         }
@@ -238,14 +402,22 @@ class Deriver {
     }
   }
 
+  /// Samples that an encoder gave the same value have one error between them, not one each.
+  static void share_out_runs(std::vector<Measurement>& positions) {
+    for (std::size_t first = 0, last = 0; first < positions.size(); first = last) {
+      while (last < positions.size() && positions[last].value == positions[first].value) ++last;
+      const double factor = std::sqrt(static_cast<double>(last - first));
+      for (std::size_t k = first; k < last; ++k) positions[k].noise_factor = factor;
+    }
+  }
+
   void require_motion(const Episode& episode, int column, const Channel& channel) const {
     const std::string where =
         fmt::format("{}: column '{}'{}", log_.name(), log_.header()[static_cast<std::size_t>(column)], in_episode(episode));
     const std::string way_out = episode.label.empty() ? "" : "; leave that episode out";
-    constexpr std::size_t least = 5;
-    if (channel.measurements.size() < least) {
+    if (channel.measurements.size() < least_rows) {
       throw InputError(fmt::format("{}: {} samples are too few to find a motion in; {} are needed{}", where,
-                                   channel.measurements.size(), least, way_out));
+                                   channel.measurements.size(), least_rows, way_out));
     }
     const double first = channel.measurements.front().value;
     if (std::all_of(channel.measurements.begin(), channel.measurements.end(),
@@ -268,44 +440,81 @@ class Deriver {
     return VectorXd::LinSpaced(n, 0, static_cast<double>(n - 1)) / options_.rate;
   }
 
+  // each series is fitted, then smoothed
+  void tell_progress() {
+    const std::lock_guard lock(progress_lock_);
+    if (options_.progress) options_.progress(++n_done_ / (2.0 * static_cast<double>(tasks_.size())));
+  }
+
   void smooth_channels() {
     SmootherFitOptions options;
     options.smoothness = options_.smoothness;
     options.outlier_threshold = options_.outlier_threshold;
     const int n_threads = thread_count(options_.n_threads);
-    const auto is_short = [](const Task& task) { return task.channel.measurements.size() < least_for_own_model; };
+    const auto is_short = [](const Task& task) {
+      return task.fit.trusted.size() + task.fit.outliers.size() < least_for_own_model;
+    };
     parallel_for(static_cast<int>(tasks_.size()), n_threads, [&](int k, int) {
       Task& task = tasks_[static_cast<std::size_t>(k)];
       SmootherFitOptions own = options;
       own.least_noise_stddev = task.channel.resolution / std::sqrt(12.0);  // of rounding
       task.fit = fit_smoother(task.channel.measurements, own);
+      task.channel.measurements = {};  // a long log is told once
+      tell_progress();
     });
     // few samples do not tell their own smoothness
     std::vector<bool> shared(tasks_.size(), false);
     for (std::size_t k = 0; k < tasks_.size(); ++k) {
       if (!is_short(tasks_[k])) continue;
-      std::array<std::vector<double>, SmootherModel::n_parameters> others;
+      std::vector<SmootherModel> others;
       for (const Task& other : tasks_) {
-        if (other.coordinate != tasks_[k].coordinate || is_short(other)) continue;
-        const SmootherModel& model = other.fit.model;
-        others[0].push_back(model.lengthscale);
-        others[1].push_back(model.signal_stddev);
-        others[2].push_back(model.noise_stddev);
-        others[3].push_back(model.velocity_noise_stddev);
-        others[4].push_back(model.time_stddev);
+        if (other.coordinate == tasks_[k].coordinate && !is_short(other)) others.push_back(other.fit.model);
       }
-      if (others[0].empty()) continue;
-      tasks_[k].fit.model = {options_.smoothness, median(others[0]), median(others[1]),
-                             median(others[2]),   median(others[3]), median(others[4])};
+      if (others.empty()) continue;
+      const auto middle = others.begin() + static_cast<std::ptrdiff_t>(others.size() / 2);
+      std::nth_element(others.begin(), middle, others.end(),
+                       [](const SmootherModel& a, const SmootherModel& b) { return a.lengthscale < b.lengthscale; });
+      tasks_[k].fit.model = *middle;
       shared[k] = true;
     }
+    data_.series.resize(tasks_.size());
     parallel_for(static_cast<int>(tasks_.size()), n_threads, [&](int k, int) {
       Task& task = tasks_[static_cast<std::size_t>(k)];
       const VectorXd times = times_to_write(episodes_[static_cast<std::size_t>(task.episode)]);
       task.motion = smooth(task.fit.model, task.fit.trusted, times);
       task.motion.mean.row(0).array() += task.channel.mean;
+      task.stddev.resize(3, times.size());
+      for (Index i = 0; i < times.size(); ++i)
+        task.stddev.col(i) = task.motion.covariance[static_cast<std::size_t>(i)].diagonal().cwiseMax(0).cwiseSqrt();
+      if (!options_.hold_constraints) task.motion.covariance = {};
+      data_.series[static_cast<std::size_t>(k)] = report_of(task, shared[static_cast<std::size_t>(k)]);
+      task.fit.trusted = {};
+      tell_progress();
     });
-    for (std::size_t k = 0; k < tasks_.size(); ++k) data_.series.push_back(report_of(tasks_[k], shared[k]));
+    warn_of_fast_motions();
+  }
+
+  // heavy tails alone may be the sensor's; where the motion fills the band that samples can tell they are the motion's
+  void warn_of_fast_motions() {
+    constexpr double even = 6;  // kurtosis, 3 for a normal distribution; errors beyond 3 × the best had more in simulated logs
+    constexpr double share = 0.5;  // of the Nyquist frequency
+    for (const int j : data_.measured) {
+      int n = 0, n_fast = 0;
+      double rate = 0;
+      for (const DerivedSeries& one : data_.series) {
+        if (one.coordinate != j) continue;
+        ++n;
+        if (!(one.kurtosis > even && one.bandwidth > share * one.rate / 2)) continue;
+        ++n_fast;
+        rate = one.rate;
+      }
+      if (n_fast == 0) continue;
+      data_.notes.push_back(
+          fmt::format("warning: {}: {} moves too fast in places for {:.3g} samples per second{}: there its "
+                      "accelerations are smoothed too much; log at a higher rate",
+                      log_.name(), system_.coordinates()[static_cast<std::size_t>(j)].name, rate,
+                      n > 1 ? fmt::format(", in {} of {} episodes", n_fast, n) : ""));
+    }
   }
 
   static DerivedSeries report_of(const Task& task, bool shared) {
@@ -316,6 +525,7 @@ class Deriver {
     out.model = task.fit.model;
     out.noise_at_least = task.fit.noise_at_least && task.channel.resolution > 0;
     out.shared_model = shared;
+    out.kurtosis = task.fit.kurtosis;
     out.resolution = task.channel.resolution;
     out.used = static_cast<int>(used.size());
     out.missing = task.channel.missing;
@@ -332,6 +542,7 @@ class Deriver {
       ++out.gaps;
       out.longest_gap = std::max(out.longest_gap, space);
     }
+    out.rate = 1 / usual;
     out.bandwidth = bandwidth_of(task.fit.model, usual);
     return out;
   }
@@ -395,7 +606,7 @@ class Deriver {
           if (series.episode == e && (!slowest || series.bandwidth < slowest->bandwidth)) slowest = &series;
         }
         Channel channel;
-        read_column(episode, input_column_[u], false, false, channel);
+        read_column(episode, input_column_[u], false, channel);
         if (channel.measurements.empty()) {
           throw InputError(fmt::format("{}: column '{}'{}: there is no value", log_.name(),
                                        log_.header()[static_cast<std::size_t>(input_column_[u])], in_episode(episode)));
@@ -416,6 +627,8 @@ class Deriver {
     const ConstrainedStates states(model_, data_.measured);
     data_.completed = states.completed();
     data_.independent = data_.measured;
+    data_.is_independent = DerivedData::Mask::Constant(system_.nq(), data_.states.cols(), false);
+    for (const int j : data_.measured) data_.is_independent.row(j) = true;
     if (data_.states.cols() == 0) return;
 
     const VectorXd start = start_of_newton();
@@ -427,7 +640,8 @@ class Deriver {
     parallel_for(static_cast<int>(episodes_.size()), thread_count(options_.n_threads),
                  [&](int e, int) { put_episode_together(states, e, conditioned, start); });
     if (!completed.empty()) data_.notes.push_back(fmt::format("from the constraints: {}", fmt::join(completed, ", ")));
-    if (conditioned) data_.independent = independent_accelerations(states);
+    if (!conditioned) return;
+    std::erase_if(data_.independent, [&](int j) { return !data_.is_independent.row(j).any(); });
   }
 
   /// Where the model file wants the coordinates that are not measured to be sought: q, dq.
@@ -481,8 +695,8 @@ class Deriver {
     for (Index i = first; i < last; ++i) {
       VectorXd state = started(i, from);
       std::vector<Eigen::Matrix3d> covariance;
-      for (const Task* task : tasks) covariance.push_back(task->motion.covariance[static_cast<std::size_t>(i - first)]);
       if (conditioned) {
+        for (const Task* task : tasks) covariance.push_back(task->motion.covariance[static_cast<std::size_t>(i - first)]);
         states.condition(state, data_.accelerations.col(i), covariance);
       } else {
         states.complete(state, data_.accelerations.col(i));
@@ -490,21 +704,20 @@ class Deriver {
       data_.states.col(i) = state;
       from = state.head(2 * layout.nq);
       for (std::size_t k = 0; k < tasks.size(); ++k) {
-        for (int d = 0; d < 3; ++d) {
-          data_.stddev(d * layout.nq + tasks[k]->coordinate, i) = std::sqrt(std::max(covariance[k](d, d), 0.0));
-        }
+        const Eigen::Vector3d stddev =
+            conditioned ? covariance[k].diagonal().cwiseMax(0).cwiseSqrt().eval() : tasks[k]->stddev.col(i - first).eval();
+        for (int d = 0; d < 3; ++d) data_.stddev(d * layout.nq + tasks[k]->coordinate, i) = stddev[d];
       }
+      // once the constraints hold some accelerations say all others: which may change along the motion
+      if (!conditioned) continue;
+      VectorXd stddev(static_cast<Index>(data_.measured.size()));
+      for (Index k = 0; k < stddev.size(); ++k) {
+        stddev[k] = std::max(data_.stddev(2 * layout.nq + data_.measured[static_cast<std::size_t>(k)], i),
+                             std::numeric_limits<double>::min());
+      }
+      data_.is_independent.col(i) = false;
+      for (const int j : states.independent_accelerations(state, stddev)) data_.is_independent(j, i) = true;
     }
-  }
-
-  /// Accelerations that say all others once the constraints hold, by their usual deviations.
-  [[nodiscard]] std::vector<int> independent_accelerations(const ConstrainedStates& states) const {
-    VectorXd stddev(static_cast<Index>(data_.measured.size()));
-    for (Index k = 0; k < stddev.size(); ++k) {
-      const auto row = data_.stddev.row(2 * system_.nq() + data_.measured[static_cast<std::size_t>(k)]);
-      stddev[k] = std::max(median({row.begin(), row.end()}), std::numeric_limits<double>::min());
-    }
-    return states.independent_accelerations(data_.states, stddev);
   }
 
   // a first row that is solved as well as it can be, to look at
@@ -525,6 +738,7 @@ class Deriver {
     data_.states = data_.states(Eigen::all, rows).eval();
     data_.accelerations = data_.accelerations(Eigen::all, rows).eval();
     data_.stddev = data_.stddev(Eigen::all, rows).eval();
+    data_.is_independent = data_.is_independent(Eigen::all, rows).eval();
     const auto thin = [&](auto& values) {
       for (std::size_t k = 0; k < rows.size(); ++k) values[k] = values[static_cast<std::size_t>(rows[k])];
       values.resize(rows.size());
@@ -545,23 +759,32 @@ class Deriver {
   std::vector<Episode> episodes_;
   std::vector<Task> tasks_;
   std::vector<Index> first_row_;  // of each episode
+  std::mutex progress_lock_;
+  int n_done_ = 0;
 };
 
 }  // namespace
 
 std::vector<Option> options(DeriveOptions& options) {
-  std::vector<std::pair<std::string, Smoothness>> orders;
-  for (const std::string& word : smoothness_words()) orders.emplace_back(word, *smoothness_of(word));
+  std::vector<std::pair<std::string, std::optional<Smoothness>>> orders = {{"auto", std::nullopt}};
+  for (const std::string& word : smoothness_words()) orders.emplace_back(word, smoothness_of(word));
+  const Choice time_units = choice(options.time_unit, {{"auto", TimeUnit::automatic},
+                                                       {"s", TimeUnit::seconds},
+                                                       {"ms", TimeUnit::milliseconds},
+                                                       {"us", TimeUnit::microseconds},
+                                                       {"ns", TimeUnit::nanoseconds}});
   return {
       {"episode", &options.episode_column, "COLUMN", "column that tells episodes apart", "episode, where the log has it"},
       {"episodes", &options.episodes, "0-12,15", "only these", "all"},
+      {"time_unit", time_units, "", "what t counts; auto: as if the log had 2 to 2000 rows per second"},
       {"rate", &options.rate, "HZ", "rows per second, evenly within an episode, through gaps too", "where there are samples"},
       {"every", &options.every, "K", "only each so many rows of an episode"},
       {"hold_constraints", &options.hold_constraints, "",
        "condition each row on the constraints, where more is measured than they leave free"},
       {"outlier_threshold", &options.outlier_threshold, "S",
        "a sample is distrusted that is farther than this many standard deviations from what the others say; 0: none is"},
-      {"smoothness", choice(options.smoothness, orders), "", "order of the Matérn kernel of the motion"},
+      {"smoothness", choice(options.smoothness, orders), "",
+       "order of the Matérn kernel of the motion; auto: the likelier of 7/2 and 9/2"},
       {"keep", &options.keep, "NAME,…", "further columns of the log to pass on"},
       {"map", &options.columns, "LOGNAME=NAME,…", "columns by other names", "", "columns"},
   };
@@ -595,8 +818,8 @@ CsvTable as_table(const DerivedData& data, const System& system, std::string nam
       add(state_names[static_cast<std::size_t>(row)] + "_std", data.stddev, row);
     }
   }
-  for (const int j : data.independent)
-    add(acceleration_names[static_cast<std::size_t>(j)] + "_std", data.stddev, 2 * layout.nq + j);
+  const MatrixXd of_independent = data.is_independent.select(data.stddev.bottomRows(layout.nq), nan);
+  for (const int j : data.independent) add(acceleration_names[static_cast<std::size_t>(j)] + "_std", of_independent, j);
   for (std::size_t k = 0; k < data.kept.size(); ++k) columns.push_back({data.kept_names[k], {}, data.kept[k]});
   return CsvTable::from_columns(std::move(name), std::move(columns));
 }

@@ -202,6 +202,12 @@ std::vector<std::string> observed_accelerations(const System& system, const FitP
                                                 const CsvTable& log, std::vector<std::string>& notes) {
   if (!options.observe.empty() || options.baseline) return options.observe;
   std::vector<std::string> stated = stated_accelerations(system.acceleration_names(), reader);
+  // of accelerations that are independent here or there a choice of rows may have none
+  const auto is_empty = [&](const std::string& name) {
+    const int column = log.find(reader.stddev_column(name));
+    return std::ranges::all_of(counted(log.n_rows()), [&](int row) { return log.is_empty(row, column); });
+  };
+  if (!std::all_of(stated.begin(), stated.end(), is_empty)) std::erase_if(stated, is_empty);
   if (!stated.empty() && stated.size() < system.coordinates().size()) {
     notes.push_back(fmt::format("{}: observes {}: the log gives the deviations of these alone; others with `observe`", log.name(),
                                 fmt::join(stated, ", ")));

@@ -42,14 +42,30 @@ namespace {
 
 struct Features {
   std::vector<std::string> names;
-  std::shared_ptr<const StateFunction> function;
+  std::vector<std::shared_ptr<const StateFunction>>
+      functions;            // whose values, one below the other, are these; and some that repeat
+  std::vector<Index> rows;  // those of `names` among these values
+
+  void add(const std::vector<std::string>& further, std::shared_ptr<const StateFunction> function) {
+    Index row = 0;
+    for (const auto& one : functions) row += one->size();
+    for (const std::string& name : further) {
+      if (std::find(names.begin(), names.end(), name) == names.end()) {
+        names.push_back(name);
+        rows.push_back(row);
+      }
+      ++row;
+    }
+    functions.push_back(std::move(function));
+  }
 };
 
-// those asked for, with angles and parameters as the prior has them, or the prior's
+// those asked for, with angles and parameters as the prior has them, or those of all latents of the prior
 Features features_of(const Model& model, const std::vector<std::string>& asked) {
+  Features out;
   if (asked.empty()) {
-    const Latent first = make_prior(model).latents.front();
-    return {first.feature_names, first.features};
+    for (const Latent& latent : make_prior(model).latents) out.add(latent.feature_names, latent.features);
+    return out;
   }
   const PriorWords words = prior_words(model);
   std::vector<std::string> names;
@@ -64,7 +80,8 @@ Features features_of(const Model& model, const std::vector<std::string>& asked) 
       names.push_back(name);
     }
   }
-  return {std::move(names), ExpressionFunction::of_state(values, words.symbols)};
+  out.add(names, ExpressionFunction::of_state(values, words.symbols));
+  return out;
 }
 
 // divided by their standard deviation; 0 where they do not vary
@@ -84,7 +101,7 @@ MatrixXd standardised(const MatrixXd& values) {
 std::vector<Option> options(ResampleOptions& options) {
   return {
       {"features", &options.features, "q1,dq1,…", "expressions of the model's symbols to measure by",
-       "the features of the model's first latent"},
+       "the features of the model's latents"},
       {"seed", &options.seed, "S", "start at a random row", "at the row nearest to the mean"},
       {"map", &options.columns, "LOGNAME=NAME,…", "columns by other names", "", "columns"},
   };
@@ -94,8 +111,18 @@ Resample resample(const Model& model, const CsvTable& log, const ResampleOptions
   if (options.n < 1) throw InputError(fmt::format("resample: n must be positive, got {}", options.n));
   Features features = features_of(model, options.features);
   std::vector<bool> reads;
-  for (int k = 0; k < model.system->layout().size(); ++k) reads.push_back(features.function->reads(k));
-  const MatrixXd values = features.function->evaluate(open_log(model, log, options.columns).states_with_gaps(reads), VectorXd());
+  for (int k = 0; k < model.system->layout().size(); ++k) {
+    reads.push_back(std::any_of(features.functions.begin(), features.functions.end(),
+                                [&](const auto& function) { return function->reads(k); }));
+  }
+  const MatrixXd states = open_log(model, log, options.columns).states_with_gaps(reads);
+  MatrixXd all(0, states.cols());
+  for (const auto& function : features.functions) {
+    const MatrixXd of_this = function->evaluate(states, VectorXd());
+    all.conservativeResize(all.rows() + of_this.rows(), Eigen::NoChange);
+    all.bottomRows(of_this.rows()) = of_this;
+  }
+  const MatrixXd values = all(features.rows, Eigen::all);
 
   std::vector<int> usable;
   for (int i = 0; i < log.n_rows(); ++i) {

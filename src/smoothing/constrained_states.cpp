@@ -3,13 +3,11 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
-#include <set>
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 #include <Eigen/Cholesky>
 #include <Eigen/QR>
-#include <Eigen/SVD>
 
 #include "base/decompositions.hpp"
 #include "gp2/error.hpp"
@@ -169,39 +167,15 @@ int ConstrainedStates::redundancy(const VectorXd& state) const {
   return static_cast<int>(rank_of(A) - rank_of(A(Eigen::all, free_)));
 }
 
-std::vector<int> ConstrainedStates::independent_accelerations(const MatrixXd& states, const VectorXd& stddev) const {
-  // all accelerations that A allows are Z times n − rank A numbers; rows of Z that stay far from singular say them all
-  constexpr int n_looked_at = 25;
-  std::vector<MatrixXd> bases;
-  std::set<std::vector<int>> candidates;
-  const Index stride = std::max<Index>(1, states.cols() / n_looked_at);
-  for (Index i = 0; i < states.cols(); i += stride) {
-    const MatrixXd A = system_.evaluate(without_blind(states.col(i)), parameters_).A(0);
-    const MatrixXd Z = stddev.cwiseInverse().asDiagonal() * null_space(A)(measured_, Eigen::all);
-    const Eigen::ColPivHouseholderQR<MatrixXd> qr(Z.transpose());
-    std::vector<int> chosen;
-    for (Index k = 0; k < Z.cols(); ++k) chosen.push_back(qr.colsPermutation().indices()[k]);
-    std::sort(chosen.begin(), chosen.end());
-    candidates.insert(chosen);
-    bases.push_back(Z);
-  }
-  std::vector<int> best;
-  double best_worst = -1;
-  for (const std::vector<int>& candidate : candidates) {
-    double worst = std::numeric_limits<double>::infinity();
-    for (const MatrixXd& Z : bases) {
-      if (candidate.size() != static_cast<std::size_t>(Z.cols()))
-        worst = 0;
-      else
-        worst = std::min(worst, Eigen::JacobiSVD<MatrixXd>(Z(candidate, Eigen::all)).singularValues().tail(1).sum());
-    }
-    if (worst > best_worst) {
-      best_worst = worst;
-      best = candidate;
-    }
-  }
-  for (int& k : best) k = measured_[static_cast<std::size_t>(k)];
-  return best;
+std::vector<int> ConstrainedStates::independent_accelerations(const VectorXd& state, const VectorXd& stddev) const {
+  // all accelerations that A allows are Z times n − rank A numbers: rows of Z that are far from singular, by greedy choice, say all
+  const MatrixXd A = system_.evaluate(without_blind(state), parameters_).A(0);
+  const MatrixXd Z = stddev.cwiseInverse().asDiagonal() * null_space(A)(measured_, Eigen::all);
+  const Eigen::ColPivHouseholderQR<MatrixXd> qr(Z.transpose());
+  std::vector<int> chosen;
+  for (Index k = 0; k < std::min(Z.rows(), Z.cols()); ++k)
+    chosen.push_back(measured_[static_cast<std::size_t>(qr.colsPermutation().indices()[k])]);
+  return chosen;
 }
 
 ConstrainedStates::Linearisation ConstrainedStates::linearise(const VectorXd& state, const VectorXd& acceleration) const {

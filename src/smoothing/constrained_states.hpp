@@ -32,9 +32,9 @@ class ConstrainedStates {
   /// @throws InputError naming what the constraints leave open at that state.
   [[nodiscard]] int redundancy(const Eigen::VectorXd& state) const;
 
-  /// n − rank A accelerations of measured coordinates that are farthest from depending on each other at all of the states.
+  /// n − rank A accelerations of measured coordinates that are far from depending on each other at that state.
   /// @param stddev  of the measured ones' accelerations
-  [[nodiscard]] std::vector<int> independent_accelerations(const Eigen::MatrixXd& states, const Eigen::VectorXd& stddev) const;
+  [[nodiscard]] std::vector<int> independent_accelerations(const Eigen::VectorXd& state, const Eigen::VectorXd& stddev) const;
 
   /// Conditions z = (q, dq, ddq) of the measured coordinates on c = 0, ċ = 0, A ddq = b, and solves for the others.
   /// @param covariance  of (q, dq, ddq) of each measured coordinate; that of the result takes its place

@@ -2,6 +2,7 @@
 #include <array>
 #include <cmath>
 #include <limits>
+#include <numbers>
 
 #include <fmt/format.h>
 
@@ -28,7 +29,45 @@ double square(double x) { return x * x; }
 struct Roughness {
   std::vector<int> measurement;
   std::vector<double> residual;
+
+  /// The noise, and what of the motion is no cubic.
+  [[nodiscard]] double noise_stddev() const { return quantile_size(0.5) / median_of_normal; }
+  /// What the noise cannot be above: the motion is a cubic nearly somewhere.
+  [[nodiscard]] double most_noise_stddev() const {
+    constexpr double quartile_of_normal = 0.3186, margin = 2;  // of |x|, x standard normal
+    return margin * quantile_size(0.25) / quartile_of_normal;
+  }
+
+ private:
+  [[nodiscard]] double quantile_size(double share) const {
+    std::vector<double> sizes;
+    // an encoder at rest makes no residual, which tells nothing
+    for (const double one : residual) {
+      if (one != 0) sizes.push_back(std::abs(one));
+    }
+    if (sizes.empty()) return 0;
+    const auto at = sizes.begin() + static_cast<std::ptrdiff_t>(share * static_cast<double>(sizes.size()));
+    std::nth_element(sizes.begin(), at, sizes.end());
+    return *at;
+  }
 };
+
+/// The usual time from one measurement to the next, and how long the motion is without the pauses [s].
+struct Spacing {
+  double usual = 0, duration = 0;
+};
+
+Spacing spacing_of(const std::vector<Measurement>& measurements) {
+  std::vector<double> steps;
+  for (std::size_t k = 1; k < measurements.size(); ++k) {
+    const double step = measurements[k].time - measurements[k - 1].time;
+    if (step > 0) steps.push_back(step);
+  }
+  constexpr double pause = 100;
+  Spacing out{steps.empty() ? 0 : median(steps), 0};
+  for (const double step : steps) out.duration += std::min(step, pause * out.usual);
+  return out;
+}
 
 Roughness roughness_of(const std::vector<Measurement>& all, const std::vector<int>& positions) {
   Roughness out;
@@ -70,31 +109,38 @@ std::vector<int> peaks(const std::vector<double>& sizes, double threshold) {
   return out;
 }
 
+/// Of the positions about their median.
+double spread_of(const std::vector<Measurement>& measurements) {
+  std::vector<double> values;
+  for (const Measurement& one : measurements) {
+    if (!one.velocity) values.push_back(one.value);
+  }
+  const double centre = median(values);
+  double sum = 0;
+  for (const double value : values) sum += square(value - centre);
+  return std::sqrt(sum / static_cast<double>(values.size()));
+}
+
 /// What values and differences say before anything is fitted, by medians: outliers do not matter.
 SmootherModel rough_model(const std::vector<Measurement>& all, const std::vector<int>& positions, const Roughness& roughness,
                           const SmootherFitOptions& options) {
-  std::vector<double> values, rates, rough;
-  for (const int k : positions) values.push_back(all[static_cast<std::size_t>(k)].value);
-  const double centre = median(values);
-  double spread = 0;
-  for (const double value : values) spread += square(value - centre);
+  std::vector<double> rates;
   SmootherModel model;
-  model.smoothness = options.smoothness;
-  model.signal_stddev = std::sqrt(spread / static_cast<double>(values.size()));
+  if (options.smoothness) model.smoothness = *options.smoothness;
+  model.signal_stddev = spread_of(all);
   for (std::size_t k = 1; k < positions.size(); ++k) {
     const Measurement &here = all[static_cast<std::size_t>(positions[k])],
                       &before = all[static_cast<std::size_t>(positions[k - 1])];
     if (here.time > before.time) rates.push_back(std::abs((here.value - before.value) / (here.time - before.time)));
   }
-  const double span = all.back().time - all.front().time;
+  const double duration = spacing_of(all).duration;
   double rate = rates.empty() ? 0 : median(rates) / median_of_normal;
-  if (!(rate > 0)) rate = model.signal_stddev * 10 / span;
+  if (!(rate > 0)) rate = model.signal_stddev * 10 / duration;
   // var dq = s² 2ν/ℓ² E ω², E ω² = 1/(2ν − 2)
-  const double twice_order = 2.0 * static_cast<int>(options.smoothness) + 1;
-  model.lengthscale = std::min(model.signal_stddev / rate * std::sqrt(twice_order / (twice_order - 2)), span);
-  for (const double residual : roughness.residual) rough.push_back(std::abs(residual));
-  model.noise_stddev = std::clamp(rough.empty() ? 0 : median(rough) / median_of_normal,
-                                  std::max(options.least_noise_stddev, 1e-6 * model.signal_stddev), model.signal_stddev);
+  const double twice_order = 2.0 * static_cast<int>(model.smoothness) + 1;
+  model.lengthscale = std::min(model.signal_stddev / rate * std::sqrt(twice_order / (twice_order - 2)), duration);
+  model.noise_stddev =
+      std::clamp(roughness.noise_stddev(), std::max(options.least_noise_stddev, 1e-6 * model.signal_stddev), model.signal_stddev);
   model.velocity_noise_stddev = std::max(options.least_velocity_noise_stddev, 1e-2 * rate);
   return model;
 }
@@ -110,34 +156,43 @@ SmootherModel of_logarithms(const VectorXd& x, Smoothness smoothness) {
   return {smoothness, values[0], values[1], values[2], values[3], values[4]};
 }
 
-/// The maximum of the likelihood near a start.
-void maximise(const std::vector<Measurement>& measurements, const SmootherModel& rough, const SmootherFitOptions& options,
-              SmootherFit& fit) {
-  const double span = measurements.back().time - measurements.front().time;
-  const double least_noise = std::max(options.least_noise_stddev, 1e-7 * rough.signal_stddev);
-  const double least_velocity_noise =
-      std::max(options.least_velocity_noise_stddev, 1e-6 * rough.signal_stddev / rough.lengthscale);
-  const double shortest = 0.1 * span / static_cast<double>(measurements.size());
+/// What lengthscale, size and noises may be, in logarithms.
+struct Box {
+  VectorXd lower, upper;
+  double time_stddev = 1;  // a τ that makes half of the noise, to start at
+};
+
+Box box_of(const std::vector<Measurement>& measurements, const SmootherModel& rough, double most_noise,
+           const SmootherFitOptions& options) {
+  const Spacing spacing = spacing_of(measurements);
   const double size = rough.signal_stddev, rate = size / rough.lengthscale;
+  const double least_noise = std::max(options.least_noise_stddev, 1e-7 * size);
+  const double least_velocity_noise = std::max(options.least_velocity_noise_stddev, 1e-6 * rate);
+  // a motion's corner frequency, √(2ν)/ℓ, is at most half of what samples can tell
+  const double order = static_cast<int>(rough.smoothness) + 0.5;
+  const double shortest = 2 * std::sqrt(2 * order) * spacing.usual / std::numbers::pi;
   // no τ that is felt, or none at all where no rate is known
   double fastest = 0;
   for (const Measurement& one : measurements) fastest = std::max(fastest, std::abs(one.rate));
-  const bool with_time = fastest > 0;
-  const double least_time = with_time ? 0.01 * least_noise / fastest : 1;
-  const VectorXd lower = logarithms(shortest, 1e-3 * size, least_noise, least_velocity_noise, least_time);
-  const VectorXd upper = logarithms(100 * span, 1e4 * size, 10 * size + 2 * least_noise, 10 * rate + 2 * least_velocity_noise,
-                                    with_time ? 0.1 * span : 1);
-  const SmootherModel& from = fit.model;
+  const double least_time = fastest > 0 ? 0.01 * least_noise / fastest : 1;
+  return {logarithms(shortest, 1e-3 * size, least_noise, least_velocity_noise, least_time),
+          logarithms(std::max(100 * spacing.duration, 2 * shortest), 1e4 * size, std::max(most_noise, 2 * least_noise),
+                     10 * rate + 2 * least_velocity_noise, fastest > 0 ? std::max(spacing.usual, 2 * least_time) : 1),
+          fastest > 0 ? 0.5 * rough.noise_stddev / fastest : 1};
+}
+
+/// The maximum of the likelihood near fit.model.
+void maximise(const std::vector<Measurement>& measurements, const Box& box, SmootherFit& fit) {
+  const bool with_time = box.upper[4] > box.lower[4];
+  const SmootherModel from = fit.model;
   const VectorXd start = logarithms(from.lengthscale, from.signal_stddev, from.noise_stddev, from.velocity_noise_stddev,
-                                    with_time && !(from.time_stddev > 0) ? 0.5 * from.noise_stddev / fastest
-                                    : with_time                          ? from.time_stddev
-                                                                         : 1)
-                             .cwiseMax(lower)
-                             .cwiseMin(upper);
+                                    from.time_stddev > 0 ? from.time_stddev : box.time_stddev)
+                             .cwiseMax(box.lower)
+                             .cwiseMin(box.upper);
   const auto n = static_cast<double>(measurements.size());
   const auto objective = [&](const VectorXd& x, VectorXd& gradient) {
     VectorXd by_logarithm;
-    const double value = log_likelihood(of_logarithms(x, options.smoothness), measurements, &by_logarithm);
+    const double value = log_likelihood(of_logarithms(x, from.smoothness), measurements, &by_logarithm);
     gradient = -by_logarithm / n;
     return -value / n;
   };
@@ -145,13 +200,57 @@ void maximise(const std::vector<Measurement>& measurements, const SmootherModel&
   optimiser.max_iterations = 200;
   optimiser.gradient_tolerance = 1e-6;
   optimiser.reduction_tolerance = 1e-11;
-  const LbfgsbResult result = minimise(objective, start, lower, upper, optimiser);
-  fit.model = of_logarithms(result.x, options.smoothness);
+  const LbfgsbResult result = minimise(objective, start, box.lower, box.upper, optimiser);
+  fit.model = of_logarithms(result.x, from.smoothness);
   if (!with_time) fit.model.time_stddev = 0;
   fit.log_likelihood = -result.value * n;
   fit.converged = result.converged;
   fit.evaluations += result.evaluations;
-  fit.noise_at_least = result.x[2] <= lower[2] + 1e-9;
+  fit.noise_at_least = result.x[2] <= box.lower[2] + 1e-9;
+}
+
+/// Stretches of consecutive measurements, evenly spread, about so many in all.
+std::vector<Measurement> excerpt(const std::vector<Measurement>& measurements, std::size_t most) {
+  if (measurements.size() <= most) return measurements;
+  constexpr std::size_t n_stretches = 8;
+  std::vector<Measurement> out;
+  for (std::size_t k = 0; k < n_stretches; ++k) {
+    const std::size_t first = k * (measurements.size() - most / n_stretches) / (n_stretches - 1);
+    out.insert(out.end(), measurements.begin() + static_cast<std::ptrdiff_t>(first),
+               measurements.begin() + static_cast<std::ptrdiff_t>(first + most / n_stretches));
+  }
+  return out;
+}
+
+/// The likeliest of the maxima near several lengthscales: one alone may end where all motion is noise, or all noise motion.
+void search(const std::vector<Measurement>& measurements, const Box& box, const SmootherModel& rough,
+            const SmootherFitOptions& options, SmootherFit& fit) {
+  constexpr std::size_t most = 2000;
+  const std::vector<Measurement> some = excerpt(measurements, most);
+  SmootherFit best;
+  best.log_likelihood = -std::numeric_limits<double>::infinity();
+  std::vector<SmootherModel> starts;
+  if (fit.evaluations > 0) starts.push_back(fit.model);
+  std::vector<Smoothness> orders = {Smoothness::matern92, Smoothness::matern72};
+  if (options.smoothness) orders = {*options.smoothness};
+  for (const Smoothness order : orders) {
+    for (const double factor : {1.0, 0.25, 4.0}) {
+      SmootherModel& start = starts.emplace_back(rough);
+      start.smoothness = order;
+      start.lengthscale *= factor;
+      start.signal_stddev *= factor;  // the same velocities
+    }
+  }
+  best.evaluations = fit.evaluations;
+  for (const SmootherModel& start : starts) {
+    SmootherFit one;
+    one.model = start;
+    one.evaluations = best.evaluations;
+    maximise(some, box, one);
+    best.evaluations = one.evaluations;
+    if (one.log_likelihood > best.log_likelihood) best = one;
+  }
+  fit = best;
 }
 
 std::vector<Measurement> those_used(const std::vector<Measurement>& measurements, const std::vector<bool>& used) {
@@ -214,29 +313,120 @@ std::vector<int> positions_among(const std::vector<Measurement>& measurements) {
   return positions;
 }
 
-/// Leaves out outliers far above everything else, which would hide the smaller ones.
-void drop_gross_errors(const Roughness& roughness, double noise_stddev, double threshold, std::vector<bool>& used) {
-  constexpr double gross = 20;
-  std::vector<double> sizes(used.size(), 0);
-  for (std::size_t k = 0; k < roughness.measurement.size(); ++k) {
-    sizes[static_cast<std::size_t>(roughness.measurement[k])] = std::abs(roughness.residual[k]) / noise_stddev;
+/// Which measurements are used. All but those that the others contradict.
+class Trust {
+ public:
+  Trust(const std::vector<Measurement>& measurements, const std::vector<int>& positions, double noise_stddev, double threshold)
+      : threshold_(threshold),
+        limit_(measurements.size(), threshold),
+        used_(measurements.size(), true),
+        accused_(measurements.size(), false),
+        gross_(accused_),
+        settled_(accused_) {
+    if (!(threshold > 0)) return;
+    drop_gross_errors(measurements, positions, noise_stddev);
+    // nothing beyond the ends says whether they are right: they are taken back, inner ones first, if all others agree with them
+    constexpr std::size_t least = 20;
+    const std::size_t n = positions.size();
+    if (n < least) return;
+    for (const auto& [inner, outer] : {std::pair(positions[1], positions[0]), std::pair(positions[n - 2], positions[n - 1])}) {
+      ends_.emplace_back(inner, outer);
+      for (const int k : {inner, outer}) {
+        used_[static_cast<std::size_t>(k)] = false;
+        limit_[static_cast<std::size_t>(k)] = 2 * threshold;  // beyond an end a motion is guessed
+      }
+    }
   }
-  for (const int k : peaks(sizes, std::max(gross, threshold))) used[static_cast<std::size_t>(k)] = false;
-}
 
-/// Leaves out what hindsight distrusts, and takes back, once, what it trusts after all. Returns whether anything changed.
-bool choose_again(std::vector<double> sizes, double threshold, std::vector<bool>& used, std::vector<bool>& taken_back) {
-  bool changed = false;
+  [[nodiscard]] const std::vector<bool>& used() const { return used_; }
+
+  /// Leaves out what hindsight distrusts, and takes back, once, what it trusts after all. Returns whether anything changed.
+  bool choose_again(const std::vector<double>& sizes) {
+    if (!(threshold_ > 0)) return false;
+    const std::vector<bool> before = used_;
+    std::vector<double> suspected = sizes;
+    for (std::size_t k = 0; k < sizes.size(); ++k) {
+      if (!used_[k] && sizes[k] <= limit_[k] && !settled_[k]) {
+        used_[k] = true;
+        settled_[k] = accused_[k];
+      }
+      if (settled_[k] || !before[k] || sizes[k] <= limit_[k]) suspected[k] = 0;
+    }
+    // what is far from a guess may be near, and yet contradict its neighbour
+    for (const auto& [inner, outer] : ends_) {
+      if (used_[inner] && !before[inner]) used_[outer] = before[outer];
+    }
+    for (const int k : peaks(suspected, threshold_)) leave_out(static_cast<std::size_t>(k));
+    take_back_what_is_not_alone(sizes);
+    return used_ != before;
+  }
+
+ private:
+  /// Leaves out errors far above everything else, which would hide the smaller ones: the largest of each neighbourhood, and again.
+  void drop_gross_errors(const std::vector<Measurement>& all, std::vector<int> positions, double noise_stddev) {
+    constexpr int max_rounds = 5;
+    for (int round = 0; round < max_rounds; ++round) {
+      const Roughness roughness = roughness_of(all, positions);
+      std::vector<double> sizes(used_.size(), 0);
+      for (std::size_t k = 0; k < roughness.measurement.size(); ++k)
+        sizes[static_cast<std::size_t>(roughness.measurement[k])] = std::abs(roughness.residual[k]) / noise_stddev;
+      const std::vector<int> dropped = peaks(sizes, std::max(gross, threshold_));
+      if (dropped.empty()) break;
+      for (const int k : dropped) leave_out(static_cast<std::size_t>(k));
+      std::erase_if(positions, [&](int k) { return !used_[static_cast<std::size_t>(k)]; });
+    }
+    // many together may be a rough place: hindsight decides
+    gross_ = accused_;
+    for (const std::vector<std::size_t>& together : neighbourhoods_left_out()) {
+      for (const std::size_t k : together) gross_[k] = accused_[k] = together.size() <= 2;
+    }
+  }
+
+  void leave_out(std::size_t k) {
+    used_[k] = false;
+    accused_[k] = true;
+  }
+
+  /// Trusts for good what stands out a little and not alone: errors are single, but where a motion is rougher than elsewhere, or
+  /// begins, each sample that is left out leaves the next one to stand out.
+  void take_back_what_is_not_alone(const std::vector<double>& sizes) {
+    for (const std::vector<std::size_t>& together : neighbourhoods_left_out()) {
+      const bool little =
+          std::all_of(together.begin(), together.end(), [&](std::size_t k) { return !gross_[k] && sizes[k] <= gross; });
+      if (!little || together.size() == 1) continue;
+      for (const std::size_t k : together) used_[k] = settled_[k] = true;
+    }
+  }
+
+  [[nodiscard]] std::vector<std::vector<std::size_t>> neighbourhoods_left_out() const {
+    constexpr std::size_t gap = 2;
+    std::vector<std::vector<std::size_t>> out;
+    for (std::size_t k = 0; k < used_.size(); ++k) {
+      if (used_[k]) continue;
+      if (out.empty() || k - out.back().back() > gap) out.emplace_back();
+      out.back().push_back(k);
+    }
+    return out;
+  }
+
+  static constexpr double gross = 20;  // standard deviations: what is no end of a distribution
+
+  double threshold_;
+  std::vector<std::pair<std::size_t, std::size_t>> ends_;  // the last but one and the last
+  std::vector<double> limit_;                              // standard deviations, of each
+  std::vector<bool> used_, accused_, gross_, settled_;
+};
+
+/// The kurtosis of how far measurements are off what the others say.
+double kurtosis_of(const std::vector<double>& sizes, const std::vector<bool>& used) {
+  double n = 0, second = 0, fourth = 0;
   for (std::size_t k = 0; k < sizes.size(); ++k) {
-    if (used[k]) continue;
-    if (sizes[k] <= threshold && !taken_back[k]) used[k] = taken_back[k] = changed = true;
-    sizes[k] = 0;
+    if (!used[k]) continue;
+    ++n;
+    second += square(sizes[k]);
+    fourth += square(square(sizes[k]));
   }
-  for (const int k : peaks(sizes, threshold)) {
-    used[static_cast<std::size_t>(k)] = false;
-    changed = true;
-  }
-  return changed;
+  return second > 0 ? n * fourth / square(second) : 0;
 }
 
 }  // namespace
@@ -246,46 +436,79 @@ SmootherFit fit_smoother(const std::vector<Measurement>& measurements, const Smo
   const std::vector<int> positions = positions_among(measurements);
   const Roughness roughness = roughness_of(measurements, positions);
   const SmootherModel rough = rough_model(measurements, positions, roughness, options);
-  const double threshold = options.outlier_threshold;
-  std::vector<bool> used(measurements.size(), true);
-  if (threshold > 0) drop_gross_errors(roughness, rough.noise_stddev, threshold, used);
-
+  Trust trust(measurements, positions, rough.noise_stddev, options.outlier_threshold);
+  // of a long log a part tells the model if it moves as the whole does, and all that is left is to judge the samples
+  constexpr std::size_t most_fitted = 20'000;
+  constexpr double as_much = 0.5;
+  const std::vector<Measurement> part = excerpt(measurements, most_fitted);
+  const bool is_long = part.size() < measurements.size() && spread_of(part) > as_much * rough.signal_stddev;
   SmootherFit fit;
-  fit.model = rough;
+  if (is_long) fit = fit_smoother(part, options);
   std::vector<Measurement> all = measurements;
-  std::vector<bool> taken_back(all.size(), false);
   constexpr int max_rounds = 20;
   for (int round = 0; round < max_rounds; ++round) {
-    maximise(those_used(all, used), rough, options, fit);
-    const Hindsight hindsight = hindsight_of(all, used, fit.model);
-    bool changed = threshold > 0 && choose_again(hindsight.sizes, threshold, used, taken_back);
+    if (!is_long) {
+      const std::vector<Measurement> some = those_used(all, trust.used());
+      const Box box = box_of(some, rough, roughness.most_noise_stddev(), options);
+      // errors that are gone by the second round have led the first astray
+      if (round < 2) search(some, box, rough, options, fit);
+      maximise(some, box, fit);
+    }
+    const Hindsight hindsight = hindsight_of(all, trust.used(), fit.model);
+    fit.kurtosis = kurtosis_of(hindsight.sizes, trust.used());
+    bool changed = trust.choose_again(hindsight.sizes);
     if (options.estimate_time_stddev) {
       for (std::size_t k = 0; k < all.size(); ++k) all[k].rate = hindsight.rates[k];
-      changed = changed || round == 0;
+      changed = changed || (round == 0 && !is_long);
     }
     if (!changed) break;
   }
+  fit.outliers.clear();
   for (std::size_t k = 0; k < all.size(); ++k) {
-    if (!used[k]) fit.outliers.push_back(static_cast<int>(k));
+    if (!trust.used()[k]) fit.outliers.push_back(static_cast<int>(k));
   }
-  fit.trusted = those_used(all, used);
+  fit.trusted = those_used(all, trust.used());
   return fit;
 }
 
 double resolution_of(const std::vector<double>& values) {
   std::vector<double> sorted = values;
   std::sort(sorted.begin(), sorted.end());
-  sorted.erase(std::unique(sorted.begin(), sorted.end()), sorted.end());
-  constexpr std::size_t least_values = 5;
-  if (sorted.size() < least_values) return 0;
-  double step = std::numeric_limits<double>::infinity();
-  for (std::size_t k = 1; k < sorted.size(); ++k) step = std::min(step, sorted[k] - sorted[k - 1]);
-  constexpr double tolerance = 0.05;  // of a step: numbers in a log are rounded
-  for (std::size_t k = 1; k < sorted.size(); ++k) {
-    const double steps = (sorted[k] - sorted[k - 1]) / step;
-    if (std::abs(steps - std::round(steps)) > tolerance) return 0;
+  if (sorted.empty()) return 0;
+  constexpr double rounding = 1e-12, tolerance = 0.05;  // of the values, of a step
+  constexpr double share = 0.95;                        // the rest are errors
+  constexpr std::size_t least_differences = 4;
+  double usual = sorted.front();  // the value that is there most often
+  std::vector<double> values_seen, seen_often;
+  std::size_t longest = 0;
+  for (std::size_t first = 0, last = 0; first < sorted.size(); first = last) {
+    const double same = sorted[first] + rounding * std::max(std::abs(sorted.front()), std::abs(sorted.back()));
+    while (last < sorted.size() && sorted[last] <= same) ++last;
+    values_seen.push_back(sorted[first]);
+    if (last - first > 1) seen_often.push_back(sorted[first]);
+    if (last - first > longest) usual = sorted[first];
+    longest = std::max(longest, last - first);
   }
-  return step;
+  if (values_seen.size() <= least_differences) return 0;
+  // an error is seldom there twice
+  if (seen_often.size() > least_differences) values_seen = seen_often;
+  std::vector<double> differences;
+  for (std::size_t k = 1; k < values_seen.size(); ++k) differences.push_back(values_seen[k] - values_seen[k - 1]);
+  std::sort(differences.begin(), differences.end());
+  const auto is_step = [&](double step) {
+    const auto on_grid = std::count_if(sorted.begin(), sorted.end(), [&](double value) {
+      return std::abs((value - usual) / step - std::round((value - usual) / step)) <= tolerance;
+    });
+    return static_cast<double>(on_grid) >= share * static_cast<double>(sorted.size());
+  };
+  // the smallest differences are one step where values are many, errors aside
+  for (const double at : {0.0, 0.02, 0.05, 0.1, 0.2}) {
+    const double least = differences[static_cast<std::size_t>(at * static_cast<double>(differences.size()))];
+    for (const int parts : {1, 2, 3}) {
+      if (is_step(least / parts)) return least / parts;
+    }
+  }
+  return 0;
 }
 
 }  // namespace gp2

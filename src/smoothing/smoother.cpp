@@ -136,7 +136,7 @@ class Filter {
       }
       if (moment.interval < 0) break;
       const typename Motion::Step& step = steps_[static_cast<std::size_t>(moment.interval)];
-      const Belief& before = updated_[k - 1];
+      const Belief before = updated(k - 1);
       // of x ← Φ x, P ← Φ P Φᵀ + Q with dΦ = F Φ dτ and dQ = g gᵀ dτ
       const Matrix by_covariance = 0.5 * (r * r.transpose() - N);
       const Matrix moved = step.transition * before.root;
@@ -158,11 +158,12 @@ class Filter {
   /// @param write  called with each moment's number, mean and covariance, from the last to the first
   template <typename Write>
   void smooth(const Write& write) const {
-    Belief smoothed = updated_.back();
+    Belief smoothed = updated(line_.moments.size() - 1);
     for (std::size_t k = line_.moments.size(); k-- > 0;) {
       if (k + 1 < line_.moments.size()) {
         const typename Motion::Step& step = steps_[static_cast<std::size_t>(line_.moments[k + 1].interval)];
-        const Belief &here = updated_[k], &next = predicted_[k + 1];
+        const Belief here = updated(k);
+        const Belief next = predicted_[k + 1].belief();
         // J = P Φᵀ (S Sᵀ)⁻¹ with S the root of the predicted covariance
         const Matrix moved = step.transition * here.root;
         const auto S = next.root.template triangularView<Eigen::Lower>();
@@ -191,6 +192,28 @@ class Filter {
     Vector mean;
     Matrix root;
   };
+  /// A belief without the zeros of its root.
+  struct Stored {
+    Vector mean;
+    Eigen::Matrix<double, D*(D + 1) / 2, 1> root;
+
+    static Stored of(const Belief& belief) {
+      Stored out{belief.mean, {}};
+      int next = 0;
+      for (int j = 0; j < D; ++j) {
+        for (int i = j; i < D; ++i) out.root[next++] = belief.root(i, j);
+      }
+      return out;
+    }
+    [[nodiscard]] Belief belief() const {
+      Belief out{mean, Matrix::Zero()};
+      int next = 0;
+      for (int j = 0; j < D; ++j) {
+        for (int i = j; i < D; ++i) out.root(i, j) = root[next++];
+      }
+      return out;
+    }
+  };
   /// What a measurement did.
   struct Update {
     int derivative = 0;  // 0: of q, 1: of dq
@@ -201,7 +224,6 @@ class Filter {
 
   void run() {
     predicted_.resize(line_.moments.size());
-    updated_.resize(line_.moments.size());
     updates_.resize(measurements_.size());
     Belief belief{Vector::Zero(), motion_.stationary_root()};
     for (std::size_t k = 0; k < line_.moments.size(); ++k) {
@@ -213,13 +235,25 @@ class Filter {
         belief.root = triangular_root<D, 2 * D>(columns);
         belief.mean = (step.transition * belief.mean).eval();
       }
-      predicted_[k] = belief;
+      predicted_[k] = Stored::of(belief);
       for (int m = moment.first; m < moment.last; ++m) take_in(m, belief);
-      updated_[k] = belief;
     }
   }
 
+  // what is believed of a moment after its measurements: less to find again than to keep
+  [[nodiscard]] Belief updated(std::size_t k) const {
+    Belief belief = predicted_[k].belief();
+    for (int m = line_.moments[k].first; m < line_.moments[k].last; ++m) apply(updates_[static_cast<std::size_t>(m)], belief);
+    return belief;
+  }
+
   // Potter's update: P − P Hᵀ H P / F = S (I − f fᵀ/F) Sᵀ with f = Sᵀ Hᵀ, and I − f fᵀ/F = (I − γ f fᵀ)², γ = 1/(F + √(F R))
+  static void apply(const Update& update, Belief& belief) {
+    const Vector f = belief.root.row(update.derivative).transpose();
+    belief.mean += update.gain * update.residual;
+    belief.root -= update.gain / (1 + std::sqrt(update.noise_variance / update.variance)) * f.transpose();
+  }
+
   void take_in(int m, Belief& belief) {
     const Measurement& measurement = measurements_[static_cast<std::size_t>(m)];
     Update& update = updates_[static_cast<std::size_t>(m)];
@@ -231,13 +265,10 @@ class Filter {
     update.value = measurement.value / unit;
     update.noise_variance = noise * noise;
     update.time_share = late * late / (read * read + late * late);
-    const Vector f = belief.root.row(update.derivative).transpose();
-    update.variance = f.squaredNorm() + update.noise_variance;
+    update.variance = belief.root.row(update.derivative).squaredNorm() + update.noise_variance;
     update.residual = update.value - belief.mean[update.derivative];
-    const Vector covariance = belief.root * f;
-    update.gain = covariance / update.variance;
-    belief.mean += update.gain * update.residual;
-    belief.root -= covariance / (update.variance + std::sqrt(update.variance) * noise) * f.transpose();
+    update.gain = belief.root * belief.root.row(update.derivative).transpose() / update.variance;
+    apply(update, belief);
     log_likelihood_ -=
         0.5 * (update.residual * update.residual / update.variance + std::log(2 * std::numbers::pi * update.variance)) +
         std::log(unit);
@@ -250,7 +281,7 @@ class Filter {
   double rate_;                           // dτ/dt
   std::array<double, n_outputs> unit_{};  // of q, dq, ddq
   std::vector<typename Motion::Step> steps_;
-  std::vector<Belief> predicted_, updated_;  // at each moment, before and after its measurements
+  std::vector<Stored> predicted_;  // at each moment, before its measurements
   std::vector<Update> updates_;
   double log_likelihood_ = 0;
 };

@@ -252,6 +252,11 @@ class Training {
       if (hyperparameters_[k].size == 0 && !hyperparameters_[k].is_fixed()) scanned.push_back(k);
     }
     if (scanned.empty()) return false;
+    // many hyperparameters would cost more than all restarts
+    constexpr int always = 40;
+    int spent = n_points * always;
+    for (const RestartReport& report : reports_) spent += report.evaluations;
+    if (n_points * std::ssize(scanned) > spent) return false;
     const auto moved = [&](int trial) {
       VectorXd there = x;
       const std::size_t k = scanned[static_cast<std::size_t>(trial / n_points)];

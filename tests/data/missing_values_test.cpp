@@ -125,8 +125,13 @@ TEST(MissingValuesFileTest, StatedDeviationsGoWithTheirValues) {
                           "empty where nothing is measured",
                           text));
   }
+  // a column without any deviation is not observed, unless that is asked for
+  EXPECT_THAT(problem_of(gappy_log_of({{"ddq1_std", -1, ""}}, stated)).notes,
+              Contains("log.csv: observes ddq2, ddq3: the log gives the deviations of these alone; others with `observe`"));
+  FitProblemOptions all;
+  all.observe = {"ddq1", "ddq2", "ddq3"};
   EXPECT_EQ(input_error_of([&] {
-              problem_of(gappy_log_of({{"ddq1_std", -1, ""}}, stated));
+              problem_of(gappy_log_of({{"ddq1_std", -1, ""}}, stated), all);
             }),
             "log.csv: column 'ddq1_std': every cell is empty, so nothing is measured there; leave the column out");
 }

@@ -146,6 +146,29 @@ TEST(Resample, MeasuresByTheFeaturesOfTheModelInTheirStandardDeviations) {
   EXPECT_EQ(chosen.n_skipped, 0);
 }
 
+TEST(Resample, MeasuresByTheFeaturesOfAllLatents) {
+  const Model two = Model::parse(R"(
+name = "two latents"
+coordinates = ["x", "y"]
+[mechanics]
+mass = [["1", "0"], ["0", "1"]]
+force = ["0", "0"]
+[[latent]]
+name = "first"
+features = ["x", "dx"]
+directions = [["1"], ["0"]]
+[[latent]]
+name = "second"
+features = ["dx", "y"]
+directions = [["0"], ["1"]]
+)",
+                                 "two.toml");
+  const CsvTable log = CsvTable::parse("x,y,dx\n0,0,0\n0,5,0\n0,0,1\n1,0,0\n0,0.1,0\n", "log.csv");
+  const Resample chosen = resample(two, log, choose(4));
+  EXPECT_THAT(chosen.features, ElementsAre("x", "dx", "y"));
+  EXPECT_THAT(chosen.rows, testing::UnorderedElementsAre(4, 1, 2, 3)) << "the row that differs in y alone is not left out";
+}
+
 TEST(Resample, DoesNotDependOnTheUnits) {
   const Resample here = resample(model(), log_in(1), choose(20)), there = resample(model(), log_in(1e6), choose(20));
   EXPECT_EQ(here.rows, there.rows);

@@ -268,6 +268,21 @@ TEST(Smoother, DistrustsWhatTheOthersContradictAndNothingElse) {
   EXPECT_THAT(fit_smoother(spoiled, {.outlier_threshold = 0}).outliers, ElementsAre());
 }
 
+TEST(Smoother, FindsTheMotionOfALongLogThatMostlyRests) {
+  // where none of the stretches that would tell the model is
+  std::vector<Measurement> log;
+  for (int k = 0; k < 40000; ++k) {
+    const bool moves = k > 3200 && k < 4200;
+    log.push_back({0.002 * k, moves ? std::round(1e4 * (1 - std::cos(0.002 * std::numbers::pi * (k - 3200)))) / 1e4 : 0});
+  }
+  const SmootherFit fit = fit_smoother(log, {.smoothness = Smoothness::matern52,
+                                             .least_noise_stddev = 1e-4 / std::sqrt(12.0),
+                                             .outlier_threshold = 0,
+                                             .estimate_time_stddev = false});
+  const SmoothedMotion motion = smooth(fit.model, fit.trusted, Eigen::VectorXd{{0.002 * 3450}});
+  EXPECT_NEAR(motion.mean(1, 0), std::numbers::pi, 0.01);
+}
+
 TEST(Smoother, FindsTheStepOfAnEncoder) {
   std::vector<double> counts, rounded, smooth_values;
   RandomStream random(8);

@@ -1,5 +1,6 @@
 #pragma once
 
+#include <functional>
 #include <map>
 #include <optional>
 #include <string>
@@ -15,54 +16,64 @@
 
 namespace gp2 GP2_API {
 
+/// What the times of a log count. automatic: by the usual step, as if the log had 2 to 2000 rows per second.
+enum class TimeUnit { automatic, seconds, milliseconds, microseconds, nanoseconds };
+
 struct DeriveOptions {
   std::map<std::string, std::string> columns = {};  // model's name -> log's name, before the model's own [columns]
   std::string episode_column = {};                  // empty: "episode" where the log has it
   std::vector<std::string> episodes = {};           // to take, by what the column says; empty: all of them
   std::vector<std::string> keep = {};               // further columns of the log to pass on
+  TimeUnit time_unit = TimeUnit::automatic;
   double rate = 0;                // rows per second, evenly from the first sample of an episode; 0: where there are samples
   int every = 1;                  // of these rows, the first and then each so many
   bool hold_constraints = false;  // condition each row on the constraints
-  Smoothness smoothness = Smoothness::matern92;
-  double outlier_threshold = 5;  // as SmootherFitOptions
-  int n_threads = 0;             // 0: all cores; the numbers do not depend on it
+  std::optional<Smoothness> smoothness = {};           // none: the likelier of 7/2 and 9/2
+  double outlier_threshold = 5;                        // as SmootherFitOptions
+  int n_threads = 0;                                   // 0: all cores; the numbers do not depend on it
+  std::function<void(double fraction)> progress = {};  // of the work done; called from worker threads, one at a time
 };
 
 std::vector<Option> options(DeriveOptions& options);
 
-/// What became of one column of the log in one episode.
+/// What became of one column of the log in one episode, or in one part of it where it pauses.
 struct DerivedSeries {
   int coordinate = 0;           // of the system
   int episode = 0;              // among DerivedData::episodes
   SmootherModel model;          // of the positions about their mean
   bool noise_at_least = false;  // the noise ended at that of rounding to the resolution
-  bool shared_model = false;    // too short for a model of its own: the median of the others
+  bool shared_model = false;    // too short for a model of its own: that of the others' middle lengthscale
   double resolution = 0;        // step of the encoder; 0: none found
+  double kurtosis = 0;          // as SmootherFit
+  double rate = 0;              // usual, of its samples [Hz]
   double bandwidth = 0;         // up to which the motion stands out of the noise [Hz]
   int used = 0;                 // measurements
   int missing = 0;              // empty cells and NaN
   int repeated = 0;             // the same value at the same time
   int outliers = 0;             // distrusted
-  int wraps = 0;                // jumps of 2π taken out
+  int wraps = 0;                // turns taken out
   int gaps = 0;                 // spaces of more than three usual ones
   double longest_gap = 0;       // [s]
 };
 
 /// Motions with their derivatives, as a fit wants them.
 struct DerivedData {
-  std::vector<std::string> episodes;  // what the column says; one empty text without such a column
+  using Mask = Eigen::Array<bool, Eigen::Dynamic, Eigen::Dynamic>;
+
+  std::vector<std::string> episodes;  // what the column says, once for each part between pauses; empty texts without a column
   std::vector<int> episode;           // of each row (N)
   Eigen::MatrixXd states;             // [q; dq; t; u] (layout size × N), NaN where unknown
   Eigen::MatrixXd accelerations;      // ddq (nq × N), NaN where unknown
   Eigen::MatrixXd stddev;             // of q, dq, ddq (3 nq × N), NaN where not measured
   std::vector<int> measured;          // coordinates the log has
   std::vector<int> completed;         // coordinates that follow from them
-  std::vector<int> independent;       // accelerations that are independent measurements
+  std::vector<int> independent;       // accelerations that are independent measurements somewhere …
+  Mask is_independent;                // … and where (nq × N)
   std::vector<DerivedSeries> series;  // coordinate by coordinate, episode by episode
   std::vector<std::string> kept_names;
   std::vector<std::vector<std::string>> kept;  // cells of each kept column (N)
   std::string episode_column;                  // its name; empty without one
-  std::vector<std::string> notes;              // what a person should know
+  std::vector<std::string> notes;              // what a person should know; what may be wrong begins with "warning: "
 };
 
 /// Positions, and velocities where logged, to velocities and accelerations with a standard deviation for each value.

@@ -30,7 +30,7 @@ FarthestPoints farthest_points(const Eigen::Ref<const Eigen::MatrixXd>& points, 
 
 struct ResampleOptions {
   int n = 0;
-  std::vector<std::string> features = {};           // expressions; empty: those of the model's first latent
+  std::vector<std::string> features = {};           // expressions; empty: those of the model's latents
   std::optional<std::uint64_t> seed = {};           // of a random first row; not given: the row nearest to the mean
   std::map<std::string, std::string> columns = {};  // model's name -> log's name, before the model's own [columns]
 };
