@@ -14,7 +14,9 @@
 #include "command.hpp"
 #include "gp2/data/csv.hpp"
 #include "gp2/error.hpp"
+#include "gp2/base/file.hpp"
 #include "gp2/jobs/fit_job.hpp"
+#include "gp2/jobs/raw_fit.hpp"
 #include "gp2/training/laplace.hpp"
 #include "interruption.hpp"
 #include "streams.hpp"
@@ -29,6 +31,8 @@ using Json = nlohmann::ordered_json;
 struct FitArguments {
   std::string model, again, output;
   std::vector<std::string> data, also;
+  std::string raw, smoothed;
+  RawFitOptions raw_options;
   bool json = false;
   FitRequest request;
 };
@@ -191,6 +195,7 @@ std::vector<std::string> inputs_of(const FitArguments& arguments) {
   };
   for (const std::string& log : arguments.data) add(log);
   for (const std::string& log : arguments.also) add(log.substr(log.find(':') + 1));
+  inputs.push_back(arguments.raw);
   return inputs;
 }
 
@@ -210,6 +215,7 @@ std::string interrupted_by(const Interruption& interruption) {
 
 std::string data_source_of(const FitArguments& arguments) {
   std::vector<std::string> sources = arguments.data;
+  if (!arguments.raw.empty()) sources.push_back(arguments.raw);
   sources.insert(sources.end(), arguments.also.begin(), arguments.also.end());
   return fmt::format("{}", fmt::join(sources, ", "));
 }
@@ -221,10 +227,28 @@ void read_data(FitArguments& arguments) {
   for (const std::string& text : arguments.also) request.also.push_back(read_side_information(text));
 }
 
-FitJob prepare(FitArguments& arguments) {
+// The rows of a raw log, which learning and smoothing by turns finds.
+void read_raw(FitArguments& arguments, const std::atomic<bool>* stop) {
+  FitRequest& request = arguments.request;
+  const LearnedLog log = learn_and_smooth(request, CsvTable::read(arguments.raw), arguments.raw_options, stop);
+  print_notes(log.data.notes);
+  print_notes(log.notes);
+  const System& system = *request.model.system;
+  if (!arguments.smoothed.empty()) {
+    const CsvTable smoothed = as_table(log.data, system, arguments.smoothed);
+    write_file(arguments.smoothed, smoothed.text());
+    print_notes({fmt::format("{}: {} rows, smoothed", arguments.smoothed, smoothed.n_rows())});
+  }
+  request.problem.columns.clear();
+  request.problem.max_points.reset();
+  request.logs.push_back({log.table(system, arguments.raw)});
+}
+
+FitJob prepare(FitArguments& arguments, const Interruption& interruption) {
   if (arguments.again.empty()) {
     arguments.request.model = Model::read(arguments.model);
     read_data(arguments);
+    if (!arguments.raw.empty()) read_raw(arguments, interruption.stop());
     return prepare_fit(std::move(arguments.request));
   }
   const FitFile fit = FitFile::read(arguments.again);
@@ -240,7 +264,9 @@ FitJob prepare(FitArguments& arguments) {
 void require_inputs(const FitArguments& arguments, const std::set<std::string>& given) {
   if (arguments.again.empty()) {
     if (arguments.model.empty()) throw UsageError{"MODEL is required"};
-    if (arguments.data.empty() && arguments.also.empty()) throw UsageError{"--data is required, or --also alone"};
+    if (!arguments.raw.empty() && !arguments.data.empty()) throw UsageError{"--raw stands for --data: leave out one of them"};
+    if (arguments.data.empty() && arguments.also.empty() && arguments.raw.empty())
+      throw UsageError{"--data or --raw is required, or --also alone"};
     return;
   }
   const std::set<std::string> allowed = {"again", "data", "also", "threads", "json", "output"};
@@ -256,10 +282,11 @@ void require_inputs(const FitArguments& arguments, const std::set<std::string>& 
 void run(FitArguments& arguments, const std::set<std::string>& given) {
   require_inputs(arguments, given);
   require_output(arguments.output, inputs_of(arguments));
-  const FitJob job = prepare(arguments);
+  if (!arguments.smoothed.empty()) require_output(arguments.smoothed, inputs_of(arguments));
+  const Interruption interruption;
+  const FitJob job = prepare(arguments, interruption);
   print_notes(job.notes);
   const bool on_terminal = isatty(STDERR_FILENO) != 0;
-  const Interruption interruption;
   const std::optional<FitOutcome> outcome = fit_until(interruption, job, on_terminal);
   if (on_terminal) print_message("\r\033[K");
   if (!outcome) {
@@ -312,7 +339,11 @@ Command fit_command() {
       {"also", Repeated{&a->also}, "VIEW[@LATENT]:CSV[@OTHER.toml]",
        "another quantity, measured or known, say unconstrained:rest.csv with abar_q1 …: the columns that are there are observed. "
        "May be given several times, and without --data"},
+      {"raw", &a->raw, "LOG",
+       "instead of --data: CSV log of t and positions, which learning and smoothing by turns makes data of (docs/raw-logs.md)"},
+      {"smoothed", &a->smoothed, "CSV", "file to write q, dq and ddq of the raw log to, with deviations", "", "", "", "raw"},
   };
+  for (Option& option : options(a->raw_options)) command.options.push_back(std::move(option));
   for (Option& option : options(a->request)) command.options.push_back(std::move(option));
   command.options.insert(
       command.options.end(),

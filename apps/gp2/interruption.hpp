@@ -4,6 +4,8 @@
 #include <atomic>
 #include <cerrno>
 #include <csignal>
+#include <cstdint>
+#include <ctime>
 #include <string_view>
 
 #include <unistd.h>
@@ -16,13 +18,15 @@ struct Interrupted {
 };
 
 /// While it lives Ctrl-C, SIGTERM and a terminal that is closed (SIGHUP) ask for an end instead of being one: the first of them
-/// sets stop(). From then on they do what they did before, so that a second one ends the process at once. One that was ignored
-/// before, as by nohup, stays ignored. There is one at a time.
+/// sets stop(). The next one does what it did before and ends the process at once, unless it is the same within half a second: `timeout`
+/// sends its signal to a process and then to the group it is in. One that was ignored before, as by nohup, stays ignored.
+/// There is one at a time.
 class Interruption {
  public:
   Interruption() {
     stop_ = false;
     signal_ = 0;
+    asked_at_ = never;
     for (std::size_t k = 0; k < signals.size(); ++k) {
       sigaction(signals[k], nullptr, &before_[k]);
       if (before_[k].sa_handler == SIG_IGN) continue;
@@ -43,28 +47,36 @@ class Interruption {
  private:
   static constexpr std::array<int, 3> signals = {SIGINT, SIGTERM, SIGHUP};
 
-  // a handler may call sigaction and write, and touch atomics without a lock, and little else
+  static constexpr std::int64_t never = -1, one_wish = 500;  // [ms]
+
+  // a handler may call clock_gettime, sigaction and write, and touch atomics without a lock, and little else
   static void ask(int signal) {
     constexpr std::string_view text =
         "\ngp2: stopping, which takes some seconds with many rows; once more ends at once, without a fit\n";
     const int error = errno;
-    const bool is_second = stop_.exchange(true);
-    if (!is_second) signal_ = signal;
-    restore();
-    if (is_second) {  // it came to another thread while the first was on its way
+    timespec now = {};
+    clock_gettime(CLOCK_MONOTONIC, &now);
+    const std::int64_t here = std::int64_t{now.tv_sec} * 1000 + now.tv_nsec / 1'000'000;
+    std::int64_t first = never;
+    if (asked_at_.compare_exchange_strong(first, here)) {
+      signal_ = signal;
+      stop_ = true;
+      static_cast<void>(::write(STDERR_FILENO, text.data(), text.size()) == 0);
+    } else if (signal != signal_ || here - first > one_wish) {
+      restore();
       ::raise(signal);
-      return;
     }
-    static_cast<void>(::write(STDERR_FILENO, text.data(), text.size()) == 0);
     errno = error;
   }
   static void restore() {
     for (std::size_t k = 0; k < signals.size(); ++k) sigaction(signals[k], &before_[k], nullptr);
   }
 
-  static_assert(std::atomic<bool>::is_always_lock_free && std::atomic<int>::is_always_lock_free);
+  static_assert(std::atomic<bool>::is_always_lock_free && std::atomic<int>::is_always_lock_free &&
+                std::atomic<std::int64_t>::is_always_lock_free);
   static inline std::atomic<bool> stop_ = false;
   static inline std::atomic<int> signal_ = 0;
+  static inline std::atomic<std::int64_t> asked_at_ = never;  // [ms]
   static inline std::array<struct sigaction, 3> before_ = {};
 };
 

@@ -62,6 +62,10 @@ struct Task {
   int coordinate = 0, episode = 0;
   Channel channel;
   SmootherFit fit;
+  SmootherModel model;      // of the positions about their mean
+  double kurtosis = 0;
+  Eigen::Matrix3Xd course;  // the learned motion that the fit is about; empty: the mean
+  double gain = 0;          // by it, in log likelihood
   SmoothedMotion motion;  // its covariances only where constraints are held
   Eigen::Matrix3Xd stddev;
 };
@@ -72,8 +76,13 @@ std::string in_episode(const Episode& episode) {
 
 class Deriver {
  public:
-  Deriver(const Model& model, const CsvTable& log, const DeriveOptions& options)
-      : model_(model), system_(*model.system), log_(log), options_(options), reader_(open_log(model, log, options.columns)) {}
+  Deriver(const Model& model, const CsvTable& log, const DeriveOptions& options, const MatrixXd* learned)
+      : model_(model),
+        system_(*model.system),
+        log_(log),
+        options_(options),
+        learned_(learned),
+        reader_(open_log(model, log, options.columns)) {}
 
   DerivedData run() {
     check_options();
@@ -459,6 +468,9 @@ class Deriver {
       SmootherFitOptions own = options;
       own.least_noise_stddev = task.channel.resolution / std::sqrt(12.0);  // of rounding
       task.fit = fit_smoother(task.channel.measurements, own);
+      task.model = task.fit.model;
+      task.kurtosis = task.fit.kurtosis;
+      if (learned_ && !is_short(task)) take_learned(task, own);
       task.channel.measurements = {};  // a long log is told once
       tell_progress();
     });
@@ -468,13 +480,13 @@ class Deriver {
       if (!is_short(tasks_[k])) continue;
       std::vector<SmootherModel> others;
       for (const Task& other : tasks_) {
-        if (other.coordinate == tasks_[k].coordinate && !is_short(other)) others.push_back(other.fit.model);
+        if (other.coordinate == tasks_[k].coordinate && !is_short(other)) others.push_back(other.model);
       }
       if (others.empty()) continue;
       const auto middle = others.begin() + static_cast<std::ptrdiff_t>(others.size() / 2);
       std::nth_element(others.begin(), middle, others.end(),
                        [](const SmootherModel& a, const SmootherModel& b) { return a.lengthscale < b.lengthscale; });
-      tasks_[k].fit.model = *middle;
+      tasks_[k].model = tasks_[k].fit.model = *middle;
       shared[k] = true;
     }
     data_.series.resize(tasks_.size());
@@ -483,6 +495,7 @@ class Deriver {
       const VectorXd times = times_to_write(episodes_[static_cast<std::size_t>(task.episode)]);
       task.motion = smooth(task.fit.model, task.fit.trusted, times);
       task.motion.mean.row(0).array() += task.channel.mean;
+      if (task.course.size() > 0) task.motion.mean += task.course;
       task.stddev.resize(3, times.size());
       for (Index i = 0; i < times.size(); ++i)
         task.stddev.col(i) = task.motion.covariance[static_cast<std::size_t>(i)].diagonal().cwiseMax(0).cwiseSqrt();
@@ -492,6 +505,63 @@ class Deriver {
       tell_progress();
     });
     warn_of_fast_motions();
+  }
+
+  /// The motion p of a series under the learned acceleration, at the times of its samples; d²q̂/dt² − u is linear between them.
+  [[nodiscard]] Eigen::Matrix3Xd course_of(const Task& task) const {
+    Index first = 0;
+    for (int e = 0; e < task.episode; ++e) first += static_cast<Index>(episodes_[static_cast<std::size_t>(e)].distinct.size());
+    const VectorXd times = times_to_write(episodes_[static_cast<std::size_t>(task.episode)]);
+    Eigen::Matrix3Xd course = smooth(task.fit.model, task.fit.trusted, times).mean;
+    course.row(0).array() += task.channel.mean;
+    const Eigen::RowVectorXd misfit = course.row(2) - learned_->row(task.coordinate).segment(first, times.size());
+    // as slow as drift needs: what follows the samples below ω has their noise
+    constexpr double share = 0.01;
+    const double bandwidth = bandwidth_of(task.model, median(spaces_of(task.fit.trusted)));
+    const double w = 2 * std::numbers::pi * share * std::max(bandwidth, 1 / times.tail<1>()[0]);
+    double r = 0, v = 0;
+    for (Index i = 0; i < times.size(); ++i) {
+      if (i > 0) {
+        // a + b t solves it but for its start, which (A + B t) e^(−ωt) makes good
+        const double h = times[i] - times[i - 1];
+        const double b = (misfit[i] - misfit[i - 1]) / h / (w * w), a = misfit[i - 1] / (w * w) - 2 * b / w;
+        const double A = r - a, B = v - b + w * A, decay = std::exp(-w * h);
+        r = a + b * h + (A + B * h) * decay;
+        v = b + (B - w * (A + B * h)) * decay;
+      }
+      course.col(i) -= Eigen::Vector3d(r, v, misfit[i] - 2 * w * v - w * w * r);
+    }
+    return course;
+  }
+
+  /// Smooths a series about the learned motion where that is likelier.
+  void take_learned(Task& task, const SmootherFitOptions& options) const {
+    const std::vector<double>& times = episodes_[static_cast<std::size_t>(task.episode)].distinct;
+    const Eigen::Matrix3Xd course = course_of(task);
+    std::vector<Measurement> about = task.channel.measurements;
+    Index at = 0;
+    double sum = 0, n = 0;
+    for (Measurement& one : about) {
+      while (times[static_cast<std::size_t>(at)] < one.time) ++at;
+      one.value += one.velocity ? -course(1, at) : task.channel.mean - course(0, at);
+      if (!one.velocity) sum += one.value, ++n;
+    }
+    const double mean = sum / n;
+    for (Measurement& one : about) one.value -= one.velocity ? 0 : mean;
+    SmootherFit fit = fit_smoother(about, options);
+    const double gain = score(fit, options) - score(task.fit, options);
+    if (!(gain > 0)) return;
+    task.fit = std::move(fit);
+    task.course = course;
+    task.channel.mean = mean;
+    task.gain = gain;
+  }
+
+  /// Log likelihood, in which an outlier counts as a sample that is just trusted.
+  static double score(const SmootherFit& fit, const SmootherFitOptions& options) {
+    const double just_trusted = -0.5 * options.outlier_threshold * options.outlier_threshold -
+                                std::log(fit.model.noise_stddev * std::sqrt(2 * std::numbers::pi));
+    return fit.log_likelihood + static_cast<double>(fit.outliers.size()) * just_trusted;
   }
 
   // heavy tails alone may be the sensor's; where the motion fills the band that samples can tell they are the motion's
@@ -517,25 +587,31 @@ class Deriver {
     }
   }
 
+  static std::vector<double> spaces_of(const std::vector<Measurement>& used) {
+    std::vector<double> spaces;
+    for (std::size_t k = 1; k < used.size(); ++k) {
+      if (used[k].time > used[k - 1].time) spaces.push_back(used[k].time - used[k - 1].time);
+    }
+    return spaces;
+  }
+
   static DerivedSeries report_of(const Task& task, bool shared) {
     const std::vector<Measurement>& used = task.fit.trusted;
     DerivedSeries out;
     out.coordinate = task.coordinate;
     out.episode = task.episode;
-    out.model = task.fit.model;
+    out.model = task.model;
     out.noise_at_least = task.fit.noise_at_least && task.channel.resolution > 0;
     out.shared_model = shared;
-    out.kurtosis = task.fit.kurtosis;
+    out.kurtosis = task.kurtosis;
+    out.gain = task.gain;
     out.resolution = task.channel.resolution;
     out.used = static_cast<int>(used.size());
     out.missing = task.channel.missing;
     out.repeated = task.channel.repeated;
     out.outliers = static_cast<int>(task.fit.outliers.size());
     out.wraps = task.channel.wraps;
-    std::vector<double> spaces;
-    for (std::size_t k = 1; k < used.size(); ++k) {
-      if (used[k].time > used[k - 1].time) spaces.push_back(used[k].time - used[k - 1].time);
-    }
+    const std::vector<double> spaces = spaces_of(used);
     const double usual = median(spaces);
     for (const double space : spaces) {
       if (space <= 3 * usual) continue;
@@ -543,7 +619,7 @@ class Deriver {
       out.longest_gap = std::max(out.longest_gap, space);
     }
     out.rate = 1 / usual;
-    out.bandwidth = bandwidth_of(task.fit.model, usual);
+    out.bandwidth = bandwidth_of(task.model, usual);
     return out;
   }
 
@@ -751,6 +827,7 @@ class Deriver {
   const System& system_;
   const CsvTable& log_;
   const DeriveOptions& options_;
+  const MatrixXd* learned_;  // accelerations (nq × samples); null: none
   LogReader reader_;
   DerivedData data_;
   int time_column_ = -1;
@@ -791,7 +868,14 @@ std::vector<Option> options(DeriveOptions& options) {
 }
 
 DerivedData derive(const Model& model, const CsvTable& log, const DeriveOptions& options) {
-  return Deriver(model, log, options).run();
+  return Deriver(model, log, options, nullptr).run();
+}
+
+DerivedData derive(const Model& model, const CsvTable& log, const DeriveOptions& options, const MatrixXd& learned) {
+  if (options.rate != 0 || options.every != 1) {
+    throw InputError("smoothing by what was learned is of the samples: `rate` and `every` do not go with it");
+  }
+  return Deriver(model, log, options, &learned).run();
 }
 
 CsvTable as_table(const DerivedData& data, const System& system, std::string name) {

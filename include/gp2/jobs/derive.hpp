@@ -45,6 +45,7 @@ struct DerivedSeries {
   bool shared_model = false;    // too short for a model of its own: that of the others' middle lengthscale
   double resolution = 0;        // step of the encoder; 0: none found
   double kurtosis = 0;          // as SmootherFit
+  double gain = 0;              // in log likelihood by what was learned; 0: smoothed without it
   double rate = 0;              // usual, of its samples [Hz]
   double bandwidth = 0;         // up to which the motion stands out of the noise [Hz]
   int used = 0;                 // measurements
@@ -89,6 +90,16 @@ struct DerivedData {
 ///   samples, a column that never moves, an unknown episode or column, coordinates that the log leaves open.
 /// @throws NumericalError when Newton's method does not reach the constraints.
 DerivedData derive(const Model& model, const CsvTable& log, const DeriveOptions& options = {});
+
+/// The same by what was learned of the motion: accelerations u that a fit predicts at the rows of a derive with rate 0 and every 1
+/// (nq × N). The mean of a series is then not constant but the motion p under u,
+///
+///     p = q̂ − r,    r̈ + 2ω ṙ + ω² r = d²q̂/dt² − u,
+///
+/// which follows the motion q̂ that is smoothed without it below ω, a hundredth of the bandwidth, and u above. A series is smoothed so
+/// where that makes its samples likelier, and is not too short for a model of its own.
+/// @throws InputError also for other options `rate` and `every`.
+DerivedData derive(const Model& model, const CsvTable& log, const DeriveOptions& options, const Eigen::MatrixXd& learned);
 
 /// Columns: the episode where there is one, t, q, dq, u, ddq as far as known, NAME_std of what was measured (of accelerations:
 /// of independent ones), what is kept.
