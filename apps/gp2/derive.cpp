@@ -1,12 +1,8 @@
 #include "gp2/jobs/derive.hpp"
 
 #include <algorithm>
-#include <charconv>
 #include <memory>
-#include <optional>
 #include <set>
-#include <string_view>
-#include <system_error>
 
 #include <unistd.h>
 
@@ -26,32 +22,6 @@ struct DeriveArguments {
   std::string log, model, output;
   DeriveOptions options;
 };
-
-// A whole number, all of the text.
-std::optional<int> whole_number(std::string_view text) {
-  int number = 0;
-  const auto [end, error] = std::from_chars(text.data(), text.data() + text.size(), number);
-  return error == std::errc() && end == text.data() + text.size() ? std::optional(number) : std::nullopt;
-}
-
-// {"0-12", "15"} -> 0 … 12, 15; what is no range of whole numbers is a name.
-std::vector<std::string> without_ranges(const std::vector<std::string>& items) {
-  std::vector<std::string> episodes;
-  for (const std::string& item : items) {
-    const std::size_t dash = item.find('-', 1);
-    const auto first = whole_number(std::string_view(item).substr(0, dash));
-    const auto last = dash == std::string::npos ? std::nullopt : whole_number(std::string_view(item).substr(dash + 1));
-    if (!first || !last) {
-      episodes.push_back(item);
-      continue;
-    }
-    constexpr int most = 1'000'000;
-    if (*last < *first || *last - *first > most)
-      throw InputError(fmt::format("--episodes: '{}' is not a range FIRST-LAST, say 0-12", item));
-    for (int k = *first; k <= *last; ++k) episodes.push_back(std::to_string(k));
-  }
-  return episodes;
-}
 
 // "2 gaps, the longest 0.3 s"
 std::string count_of(int n, const std::string& one, const std::string& many) {
@@ -115,7 +85,6 @@ void report(const DerivedData& data, const System& system) {
 
 void run(DeriveArguments& arguments) {
   require_output(arguments.output, {arguments.log, arguments.model});
-  arguments.options.episodes = without_ranges(arguments.options.episodes);
   const Model model = Model::read(arguments.model);
   if (isatty(STDERR_FILENO) != 0) {
     arguments.options.progress = [](double fraction) {

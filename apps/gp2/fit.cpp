@@ -199,18 +199,20 @@ std::vector<std::string> inputs_of(const FitArguments& arguments) {
   return inputs;
 }
 
-// The fit; nothing where a signal asked for its end before there was anything to give.
-std::optional<FitOutcome> fit_until(const Interruption& interruption, const FitJob& job, bool on_terminal) {
-  try {
-    return run_fit(job, on_terminal ? print_progress : std::function<void(const Progress&)>(), interruption.stop());
-  } catch (const NumericalError&) {
-    if (interruption.signal() == 0) throw;
-    return std::nullopt;
-  }
-}
-
 std::string interrupted_by(const Interruption& interruption) {
   return fmt::format("interrupted by signal {} ({})", interruption.signal(), strsignal(interruption.signal()));
+}
+
+// What work() gives; where a signal asked for its end before there was anything to give it is said, and the command ends.
+template <typename Work>
+auto unless_interrupted(const Interruption& interruption, const Work& work) {
+  try {
+    return work();
+  } catch (const NumericalError&) {
+    if (interruption.signal() == 0) throw;
+    print_notes({fmt::format("{} before there was a fit: nothing is written", interrupted_by(interruption))});
+    throw Interrupted{interruption.signal()};
+  }
 }
 
 std::string data_source_of(const FitArguments& arguments) {
@@ -284,24 +286,22 @@ void run(FitArguments& arguments, const std::set<std::string>& given) {
   require_output(arguments.output, inputs_of(arguments));
   if (!arguments.smoothed.empty()) require_output(arguments.smoothed, inputs_of(arguments));
   const Interruption interruption;
-  const FitJob job = prepare(arguments, interruption);
+  const FitJob job = unless_interrupted(interruption, [&] { return prepare(arguments, interruption); });
   print_notes(job.notes);
   const bool on_terminal = isatty(STDERR_FILENO) != 0;
-  const std::optional<FitOutcome> outcome = fit_until(interruption, job, on_terminal);
+  const FitOutcome outcome = unless_interrupted(interruption, [&] {
+    return run_fit(job, on_terminal ? print_progress : std::function<void(const Progress&)>(), interruption.stop());
+  });
   if (on_terminal) print_message("\r\033[K");
-  if (!outcome) {
-    print_notes({fmt::format("{} before there was a fit: nothing is written", interrupted_by(interruption))});
-    throw Interrupted{interruption.signal()};
-  }
 
-  print_notes(outcome->notes);
-  const FitFile& file = outcome->file;
+  print_notes(outcome.notes);
+  const FitFile& file = outcome.file;
   const auto print = [&] {
     if (arguments.json) {
-      print_result("{}\n", to_json(job.problem, *outcome).dump(2));
+      print_result("{}\n", to_json(job.problem, outcome).dump(2));
     } else {
       print_text(file.report);
-      if (outcome->cross_validation) print_result("{}\n", outcome->cross_validation->text());
+      if (outcome.cross_validation) print_result("{}\n", outcome.cross_validation->text());
     }
   };
   try {
@@ -343,8 +343,7 @@ Command fit_command() {
        "instead of --data: CSV log of t and positions, which learning and smoothing by turns makes data of (docs/raw-logs.md)"},
       {"smoothed", &a->smoothed, "CSV", "file to write q, dq and ddq of the raw log to, with deviations", "", "", "", "raw"},
   };
-  for (Option& option : options(a->raw_options)) command.options.push_back(std::move(option));
-  for (Option& option : options(a->request)) command.options.push_back(std::move(option));
+  for (Option& option : options(a->request, a->raw_options)) command.options.push_back(std::move(option));
   command.options.insert(
       command.options.end(),
       {{"again", &a->again, "FIT.json",

@@ -7,6 +7,7 @@
 #include "bindings.hpp"
 #include "gp2/error.hpp"
 #include "gp2/jobs/derive.hpp"
+#include "gp2/jobs/raw_fit.hpp"
 #include "gp2/jobs/fit_job.hpp"
 #include "gp2/jobs/resample.hpp"
 #include "gp2/jobs/show_job.hpp"
@@ -231,11 +232,14 @@ void add_fit(py::module_& module) {
         FitRequest fit;
         SimulateRequest simulate;
         DeriveOptions derive;
+        FitRequest fit_of_raw;
+        RawFitOptions raw;
         ResampleOptions resample;
         ShowRequest show;
         const std::map<std::string, std::vector<Option>> tables = {{"fit", options(fit)},
                                                                    {"simulate", options(simulate)},
                                                                    {"derive", options(derive)},
+                                                                   {"learn_and_smooth", options(fit_of_raw, raw)},
                                                                    {"resample", options(resample)},
                                                                    {"show", options(show)}};
         return stub_lines(tables.at(job));

@@ -9,6 +9,7 @@
 #include "bindings.hpp"
 #include "gp2/error.hpp"
 #include "gp2/jobs/derive.hpp"
+#include "gp2/jobs/raw_fit.hpp"
 #include "gp2/jobs/fit_job.hpp"
 #include "gp2/jobs/generate_job.hpp"
 #include "gp2/jobs/predict_job.hpp"
@@ -175,6 +176,7 @@ std::string declaration(const Option& option) {
 // Every option that a message may name, with its kind.
 const std::vector<Option>& every_option() {
   static FitRequest fit;
+  static RawFitOptions raw;
   static PredictRequest predict;
   static EvaluateRequest evaluate;
   static SimulateRequest simulate;
@@ -183,7 +185,7 @@ const std::vector<Option>& every_option() {
   static ResampleOptions resample;
   static const std::vector<Option> all = [] {
     std::vector<Option> list;
-    for (std::vector<Option> table : {options(fit), options(predict), options(evaluate), options(simulate), options(generate),
+    for (std::vector<Option> table : {options(fit, raw), options(predict), options(evaluate), options(simulate), options(generate),
                                       options(derive), options(resample)}) {
       list.insert(list.end(), table.begin(), table.end());
     }

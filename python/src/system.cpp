@@ -9,6 +9,7 @@
 #include "gp2/error.hpp"
 #include "gp2/jobs/check_job.hpp"
 #include "gp2/jobs/derive.hpp"
+#include "gp2/jobs/raw_fit.hpp"
 #include "gp2/jobs/fit_problem.hpp"
 #include "gp2/jobs/generate_job.hpp"
 #include "gp2/jobs/resample.hpp"
@@ -125,6 +126,25 @@ py::tuple derive_table(const PySystem& self, const py::object& data, const py::k
     derived = derive(*self.model, table, asked);
   }
   return py::make_tuple(as_table(derived, self.system(), "derived data"), report_of(derived, self.system()));
+}
+
+py::tuple learn_and_smooth_table(const PySystem& self, const py::object& data, const py::kwargs& keywords) {
+  FitRequest request;
+  RawFitOptions asked;
+  read_keywords("learn_and_smooth", keywords, options(request, asked));
+  request.model = *self.model;
+  const CsvTable table = to_table(data, "data", CsvTable::Keep::text);
+  LearnedLog log;
+  {
+    const py::gil_scoped_release release;
+    log = learn_and_smooth(request, table, asked);
+  }
+  py::dict report = report_of(log.data, self.system());
+  std::vector<std::string> notes = log.data.notes;
+  notes.insert(notes.end(), log.notes.begin(), log.notes.end());
+  report["notes"] = notes;
+  report["gains"] = log.gains;
+  return py::make_tuple(log.table(self.system(), "rows of raw data"), as_table(log.data, self.system(), "smoothed data"), report);
 }
 
 py::list check_system_and_log(const PySystem& self, const py::object& data, const py::object& columns) {
@@ -306,6 +326,19 @@ independent, notes. docs/raw-logs.md.
 
 )" + documentation(options(of_derive)))
           .c_str());
+  FitRequest of_fit;
+  RawFitOptions of_raw;
+  const std::vector<Option> of_both = options(of_fit, of_raw);
+  module.def("learn_and_smooth", &learn_and_smooth_table, py::arg("system"), py::arg("data"),
+             (signature("learn_and_smooth", "system: System, data: object, *,", of_both, "",
+                        "tuple[Table, Table, dict[str, Any]]") +
+              R"(
+A raw log of t and positions, smoothed and learned from by turns, as `gp2 fit --raw` does it: the rows to fit to, a Table for fit
+with the same options; all rows, smoothed; and a report (dict) as that of derive, with `gains`, the log likelihood of positions
+that the fits have not seen, of each pass that was kept. docs/raw-logs.md.
+
+)" + documentation(of_both))
+                 .c_str());
   module.def("resample", &resample_table, py::arg("system"), py::arg("data"), py::arg("n"),
              (signature("resample", "system: System, data: object, n: int, *,", options(of_resample), "", "Table") + R"(
 The n rows of a table that cover its states best, whole, in the order of choice: farthest points in the features of the system's

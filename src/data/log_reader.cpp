@@ -56,7 +56,7 @@ LogReader::LogReader(const CsvTable& table, const System& system, const std::map
     if (!number.empty()) aliases_[input] = {"tau" + number};
     if (input == "u") aliases_[input] = {"tau"};
   }
-  aliases_["t"] = {"time", "timestamp"};
+  aliases_["t"] = {"time", "timestamp", "__time"};
   // in a model with a coordinate v1, the column v1 is that coordinate, not the velocity of q1
   for (auto& [name, aliases] : aliases_) {
     std::erase_if(aliases, [&](const std::string& alias) {

@@ -1,6 +1,7 @@
 #include "gp2/jobs/derive.hpp"
 
 #include <algorithm>
+#include <charconv>
 #include <cmath>
 #include <limits>
 #include <map>
@@ -8,7 +9,10 @@
 #include <mutex>
 #include <numbers>
 #include <numeric>
+#include <optional>
 #include <set>
+#include <string_view>
+#include <system_error>
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
@@ -40,6 +44,32 @@ bool is_missing(const std::string& cell) {
   return word.empty() || word == "nan" || word == "-nan" || word == "na" || word == "null" || word == "none";
 }
 
+// A whole number, all of the text.
+std::optional<int> whole_number(std::string_view text) {
+  int number = 0;
+  const auto [end, error] = std::from_chars(text.data(), text.data() + text.size(), number);
+  return error == std::errc() && end == text.data() + text.size() ? std::optional(number) : std::nullopt;
+}
+
+// {"0-12", "15"} -> 0 … 12, 15; what is no range of whole numbers is a name.
+std::vector<std::string> without_ranges(const std::vector<std::string>& items) {
+  std::vector<std::string> episodes;
+  for (const std::string& item : items) {
+    const std::size_t dash = item.find('-', 1);
+    const auto first = whole_number(std::string_view(item).substr(0, dash));
+    const auto last = dash == std::string::npos ? std::nullopt : whole_number(std::string_view(item).substr(dash + 1));
+    if (!first || !last) {
+      episodes.push_back(item);
+      continue;
+    }
+    constexpr int most = 1'000'000;
+    if (*last < *first || *last - *first > most)
+      throw InputError(fmt::format("episodes: '{}' is not a range FIRST-LAST, say 0-12", item));
+    for (int k = *first; k <= *last; ++k) episodes.push_back(std::to_string(k));
+  }
+  return episodes;
+}
+
 /// Rows of one episode in the log, and their times.
 struct Episode {
   std::string label;
@@ -66,6 +96,7 @@ struct Task {
   double kurtosis = 0;
   Eigen::Matrix3Xd course;  // the learned motion that the fit is about; empty: the mean
   double gain = 0;          // by it, in log likelihood
+  std::vector<Eigen::Matrix3d> covariance;  // of the motion smoothed without it
   SmoothedMotion motion;  // its covariances only where constraints are held
   Eigen::Matrix3Xd stddev;
 };
@@ -165,13 +196,14 @@ class Deriver {
       const std::string label = column < 0 ? "" : log_.cell(row, column);
       if (number.emplace(label, number.size()).second) labels.push_back(label);
     }
-    for (const std::string& wanted : options_.episodes) {
+    const std::vector<std::string> all_wanted = without_ranges(options_.episodes);
+    for (const std::string& wanted : all_wanted) {
       if (!number.contains(wanted)) {
         throw InputError(
             fmt::format("episodes: {} has no episode '{}'; it has: {}", log_.name(), wanted, fmt::join(labels, ", ")));
       }
     }
-    const std::set<std::string> taken(options_.episodes.begin(), options_.episodes.end());
+    const std::set<std::string> taken(all_wanted.begin(), all_wanted.end());
     std::map<std::string, std::size_t> place;
     for (const std::string& label : labels) {
       if (!taken.empty() && !taken.contains(label)) continue;
@@ -495,7 +527,10 @@ class Deriver {
       const VectorXd times = times_to_write(episodes_[static_cast<std::size_t>(task.episode)]);
       task.motion = smooth(task.fit.model, task.fit.trusted, times);
       task.motion.mean.row(0).array() += task.channel.mean;
-      if (task.course.size() > 0) task.motion.mean += task.course;
+      if (task.course.size() > 0) {
+        task.motion.mean += task.course;
+        task.motion.covariance = std::move(task.covariance);
+      }
       task.stddev.resize(3, times.size());
       for (Index i = 0; i < times.size(); ++i)
         task.stddev.col(i) = task.motion.covariance[static_cast<std::size_t>(i)].diagonal().cwiseMax(0).cwiseSqrt();
@@ -508,11 +543,13 @@ class Deriver {
   }
 
   /// The motion p of a series under the learned acceleration, at the times of its samples; d²q̂/dt² − u is linear between them.
-  [[nodiscard]] Eigen::Matrix3Xd course_of(const Task& task) const {
+  [[nodiscard]] Eigen::Matrix3Xd course_of(Task& task) const {
     Index first = 0;
     for (int e = 0; e < task.episode; ++e) first += static_cast<Index>(episodes_[static_cast<std::size_t>(e)].distinct.size());
     const VectorXd times = times_to_write(episodes_[static_cast<std::size_t>(task.episode)]);
-    Eigen::Matrix3Xd course = smooth(task.fit.model, task.fit.trusted, times).mean;
+    SmoothedMotion plain = smooth(task.fit.model, task.fit.trusted, times);
+    task.covariance = std::move(plain.covariance);
+    Eigen::Matrix3Xd course = std::move(plain.mean);
     course.row(0).array() += task.channel.mean;
     const Eigen::RowVectorXd misfit = course.row(2) - learned_->row(task.coordinate).segment(first, times.size());
     // as slow as drift needs: what follows the samples below ω has their noise

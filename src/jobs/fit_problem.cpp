@@ -214,12 +214,18 @@ void read_start(const NamedNumbers& start, int max_iterations, FitProblem& probl
 }
 
 std::vector<std::string> notes_of(const FitReport& report) {
-  std::vector<std::string> collapsed;
+  std::vector<std::string> collapsed, notes;
   for (const Hyperparameter& h : report.hyperparameters) {
     const bool at_lower = h.at_bound() && h.value < 2 * h.lower;
-    if (h.kind == Hyperparameter::Kind::noise_stddev && at_lower) collapsed.push_back(h.name);
+    if (h.kind != Hyperparameter::Kind::noise_stddev || !at_lower) continue;
+    if (h.unit.starts_with("stated deviation")) {
+      notes.push_back(fmt::format("{} ended at the lower bound: the log states deviations that are {:.2g} times as large as they "
+                                  "seem, or more",
+                                  h.name, 1 / h.lower));
+    } else {
+      collapsed.push_back(h.name);
+    }
   }
-  std::vector<std::string> notes;
   for (const Hyperparameter& h : report.hyperparameters) {
     if (h.kind != Hyperparameter::Kind::parameter || !h.at_bound() || report.iterations == 0) continue;
     notes.push_back(

@@ -7,6 +7,7 @@
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
+#include "gp2/error.hpp"
 #include "gp2/jobs/resample.hpp"
 
 namespace gp2 {
@@ -64,12 +65,19 @@ std::vector<Option> options(RawFitOptions& options) {
   return table;
 }
 
+std::vector<Option> options(FitRequest& request, RawFitOptions& raw) {
+  std::vector<Option> table = options(request);
+  for (Option& option : options(raw)) table.push_back(std::move(option));
+  return table;
+}
+
 CsvTable LearnedLog::table(const System& system, std::string name) const {
   return as_table(data, system, std::move(name)).take(rows);
 }
 
 LearnedLog learn_and_smooth(const FitRequest& request, const CsvTable& log, const RawFitOptions& options,
                             const std::atomic<bool>* stop) {
+  if (options.most_passes < 0) throw InputError(fmt::format("passes: must not be negative, got {}", options.most_passes));
   const System& system = *request.model.system;
   DeriveOptions smoothing = options.derive;
   smoothing.columns = request.problem.columns;

@@ -104,5 +104,42 @@ TEST(DeriveCommand, RealEncodersPredictFastSwingingFromSlow) {
   }
 }
 
+class FitRaw : public testing::Test {
+ protected:
+  FitRaw() { desk.write("log.csv", encoder_log(desk)); }
+
+  const std::string fit = "gp2 fit models/double_pendulum.toml --map theta1=q3,theta2=q6 --prior force --mean force --restarts 1 ";
+  Desk desk;
+};
+
+TEST_F(FitRaw, GoesFromPositionsToAFit) {
+  const Outcome outcome = desk.done(
+      fit + "--raw log.csv --max-points 40 --hyperparameters optimise --passes 2 --smoothed smoothed.csv -o fit.json --json");
+  EXPECT_TRUE(outcome.said("from the constraints: q1, q2, q4, q5")) << outcome.err;
+  EXPECT_TRUE(outcome.said("what was learned")) << outcome.err;
+  EXPECT_TRUE(outcome.said("smoothed.csv: 402 rows, smoothed")) << outcome.err;
+  EXPECT_TRUE(outcome.said("fit.json: fit of 'double pendulum' to 40 rows")) << outcome.err;
+  EXPECT_EQ(desk.table("smoothed.csv").n_rows(), 402);
+  EXPECT_GE(desk.table("smoothed.csv").find("ddq6_std"), 0);
+  EXPECT_LT(outcome.json()["left_out"]["stretches"]["nrmse"], 0.1);
+  // the rows are in the file
+  desk.done("gp2 fit --again fit.json -o again.json");
+  EXPECT_EQ(desk.read("again.json"), desk.read("fit.json"));
+}
+
+TEST_F(FitRaw, RefusesWhatDoesNotGoTogether) {
+  const auto refusal = [&](const std::string& options) {
+    const Outcome outcome = desk.run(fit + options + " -o fit.json");
+    EXPECT_EQ(outcome.status, 2) << options;
+    EXPECT_FALSE(desk.has("fit.json"));
+    return outcome.err;
+  };
+  EXPECT_THAT(refusal("--raw log.csv --data log.csv"), HasSubstr("--raw stands for --data: leave out one of them"));
+  EXPECT_THAT(refusal("--data log.csv --passes 2"), HasSubstr("--raw"));
+  EXPECT_THAT(refusal("--raw log.csv --smoothed log.csv"), HasSubstr("log.csv"));
+  EXPECT_THAT(refusal("--raw log.csv --passes -1"), HasSubstr("passes: must not be negative, got -1"));
+  EXPECT_THAT(refusal("--raw absent.csv"), HasSubstr("absent.csv"));
+}
+
 }  // namespace
 }  // namespace gp2::test

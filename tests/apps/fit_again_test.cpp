@@ -74,7 +74,7 @@ TEST_F(FitAgain, RefusesWhatItDoesNotTake) {
   EXPECT_THAT(refusal("--again fit.json --also unconstrained:train.csv"), HasSubstr("--again: --also goes with --data"));
   EXPECT_THAT(refusal("--again absent.json"), HasSubstr("absent.json: cannot be read"));
   EXPECT_THAT(refusal("--data train.csv"), HasSubstr("MODEL is required"));
-  EXPECT_THAT(refusal("models/surface.toml"), HasSubstr("--data is required, or --also alone"));
+  EXPECT_THAT(refusal("models/surface.toml"), HasSubstr("--data or --raw is required, or --also alone"));
   EXPECT_THAT(desk.run("gp2 fit --again fit.json -o fit.json").err, HasSubstr("that is the input fit.json"));
 }
 

@@ -1,6 +1,7 @@
 """gp2.derive: a raw log of positions, from a table to a fit."""
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import gp2
@@ -51,3 +52,32 @@ def test_errors_name_what_is_wrong(spring):
         gp2.derive(spring, backwards)
     with pytest.raises(gp2.InputError, match="smoothness: expected one of"):
         gp2.derive(spring, log(), smoothness="3/2")
+
+
+def test_topics_with_times_of_their_own_are_one_log(spring, tmp_path):
+    driven = gp2.System(
+        coordinates=["x"], inputs=["u"], parameters={"k": 9.0}, mass=[["1"]], force=["u - k*x"], latents=[{"features": ["x", "dx"]}]
+    )
+    one, other = log(), {"t": 0.003 + 0.02 * np.arange(200), "u": np.sin(0.02 * np.arange(200) + 0.003)}
+    both = pd.DataFrame(one).merge(pd.DataFrame(other), on="t", how="outer").sort_values("t")
+    table, _ = gp2.derive(driven, both)
+    t = np.asarray(table["t"])
+    assert len(t) == 600
+    inner = (t > 0.2) & (t < 3.7)
+    assert np.max(np.abs(np.asarray(table["u"]) - np.sin(t))[inner]) < 0.01
+    assert np.max(np.abs(np.asarray(table["ddx"]) + 9 * np.cos(3 * t))[inner]) < 0.5
+
+    np.savez(tmp_path / "log.npz", **one)
+    with np.load(tmp_path / "log.npz") as file:
+        np.testing.assert_array_equal(gp2.derive(spring, file)[0]["ddx"], gp2.derive(spring, one)[0]["ddx"])
+
+
+def test_learning_and_smoothing_by_turns_gives_rows_to_fit_to(spring):
+    rows, smoothed, report = gp2.learn_and_smooth(spring, log(noise=1e-2), mean="force", max_points=30, restarts=1, passes=2)
+    assert (len(rows), len(smoothed)) == (30, 400)
+    assert any("what was learned" in note for note in report["notes"])
+    assert report["gains"] == sorted(report["gains"])
+    posterior = gp2.fit(spring, rows, mean="force", restarts=1)
+    assert abs(posterior.predict(np.array([[0.5, 1.0, 0.0]])).mean[0, 0] + 4.5) < 0.2
+    with pytest.raises(gp2.InputError, match="passes: must not be negative"):
+        gp2.learn_and_smooth(spring, log(), passes=-1)

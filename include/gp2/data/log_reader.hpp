@@ -14,7 +14,7 @@ namespace gp2 GP2_API {
 
 /// Finds a system's states and accelerations in a log by the names of its columns, in any order. A name is looked up as given by
 /// `columns`, then as itself, then under its aliases: for coordinate q1: velocity qd1, v1, qvel1, acceleration qdd1, a1, qacc1;
-/// for any coordinate NAME, and the name `columns` gives it: NAME_dot and NAME_ddot; for input u1: tau1; for t: time, timestamp.
+/// for any coordinate NAME, and the name `columns` gives it: NAME_dot and NAME_ddot; for input u1: tau1; for t: time, timestamp, __time (PlotJuggler).
 /// An alias that is a name of the model itself, say of a coordinate v1, is none.
 class LogReader {
  public:

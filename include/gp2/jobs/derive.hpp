@@ -22,7 +22,7 @@ enum class TimeUnit { automatic, seconds, milliseconds, microseconds, nanosecond
 struct DeriveOptions {
   std::map<std::string, std::string> columns = {};  // model's name -> log's name, before the model's own [columns]
   std::string episode_column = {};                  // empty: "episode" where the log has it
-  std::vector<std::string> episodes = {};           // to take, by what the column says; empty: all of them
+  std::vector<std::string> episodes = {};           // to take, by what the column says, or "0-12"; empty: all
   std::vector<std::string> keep = {};               // further columns of the log to pass on
   TimeUnit time_unit = TimeUnit::automatic;
   double rate = 0;                // rows per second, evenly from the first sample of an episode; 0: where there are samples
@@ -97,7 +97,8 @@ DerivedData derive(const Model& model, const CsvTable& log, const DeriveOptions&
 ///     p = q̂ − r,    r̈ + 2ω ṙ + ω² r = d²q̂/dt² − u,
 ///
 /// which follows the motion q̂ that is smoothed without it below ω, a hundredth of the bandwidth, and u above. A series is smoothed so
-/// where that makes its samples likelier, and is not too short for a model of its own.
+/// where that makes its samples likelier, and is not too short for a model of its own. Its deviations stay those of a smoothing without
+/// what was learned: what that misses, friction that sets in say, no smooth remainder tells.
 /// @throws InputError also for other options `rate` and `every`.
 DerivedData derive(const Model& model, const CsvTable& log, const DeriveOptions& options, const Eigen::MatrixXd& learned);
 

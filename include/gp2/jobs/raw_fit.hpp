@@ -21,6 +21,8 @@ struct RawFitOptions {
 
 /// The table of its options.
 std::vector<Option> options(RawFitOptions& options);
+/// Those of a fit and these.
+std::vector<Option> options(FitRequest& request, RawFitOptions& raw);
 
 /// A log of positions, smoothed, and what to learn from it.
 struct LearnedLog {

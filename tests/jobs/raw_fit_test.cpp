@@ -1,0 +1,138 @@
+#include "gp2/jobs/raw_fit.hpp"
+
+#include <gmock/gmock.h>
+#include <gtest/gtest.h>
+
+#include "base/random.hpp"
+#include "gp2/error.hpp"
+#include "gp2/jobs/fit_job.hpp"
+#include "input_error.hpp"
+#include "smoothing/simulated_logs.hpp"
+#include "test_models.hpp"
+
+namespace gp2::test {
+namespace {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+using testing::ElementsAre;
+using testing::HasSubstr;
+
+const Model& pendulum() {
+  static const Model file = model("models/double_pendulum.toml");
+  return file;
+}
+
+/// Two motions whose encoders are coarse.
+const SimulatedLog& noisy_log() {
+  static const SimulatedLog log = simulated_log(pendulum(), {{2.4, 2.0, 0, 0}, {3.6, 2.9, 1, -1}}, 2, {2e-3, 1e-5, 0, 0}, 1);
+  return log;
+}
+
+/// What truly accelerates the pendulum, at the rows of a derive.
+MatrixXd true_accelerations(const DerivedData& data) {
+  MatrixXd out(pendulum().system->nq(), data.states.cols());
+  for (Index i = 0; i < out.cols(); ++i) {
+    const Trajectory& truth = noisy_log().episodes[static_cast<std::size_t>(data.episode[static_cast<std::size_t>(i)])];
+    out.col(i) = truth.accelerations.col(i % truth.times.size());
+  }
+  return out;
+}
+
+FitRequest request() {
+  FitRequest out;
+  out.model = pendulum();
+  out.problem.mean = Prior::Mean::force;
+  out.problem.max_points = 50;
+  out.restarts = 1;
+  out.max_escapes = 0;
+  return out;
+}
+
+TEST(LearnedMotion, WhoKnowsTheAccelerationsSmoothsBetter) {
+  const DerivedData plain = derive(pendulum(), noisy_log().table);
+  const DerivedData learned = derive(pendulum(), noisy_log().table, {}, true_accelerations(plain));
+  const Score before = score_of(plain, noisy_log(), *pendulum().system, 0);
+  const Score after = score_of(learned, noisy_log(), *pendulum().system, 0);
+  for (int d = 0; d < 3; ++d) EXPECT_LT(after.rms[d], before.rms[d] / 2) << d;
+  EXPECT_LT(after.rms[2], before.rms[2] / 10);
+  for (const DerivedSeries& one : learned.series) EXPECT_GT(one.gain, 10);
+  // deviations are no promise of that
+  EXPECT_EQ(learned.stddev.bottomRows(6).array().isNaN().count(), plain.stddev.bottomRows(6).array().isNaN().count());
+  EXPECT_TRUE((learned.stddev.array() == plain.stddev.array() || plain.stddev.array().isNaN()).all());
+}
+
+TEST(LearnedMotion, VelocityAndAccelerationAreTheDerivativesOfItsPosition) {
+  const DerivedData plain = derive(pendulum(), noisy_log().table);
+  const DerivedData learned = derive(pendulum(), noisy_log().table, {}, true_accelerations(plain));
+  constexpr double step = 1 / 500.0;
+  const StateLayout layout = pendulum().system->layout();
+  for (const int j : {2, 5}) {
+    const VectorXd q = learned.states.row(layout.q(j)), dq = learned.states.row(layout.dq(j)), ddq = learned.accelerations.row(j);
+    const double fastest = ddq.cwiseAbs().maxCoeff();
+    for (Index i = 1; i < 900; ++i) {
+      // central differences are off by h²/6 of the next derivative, which is below 100 times the largest of this one
+      EXPECT_NEAR((q[i + 1] - q[i - 1]) / (2 * step), dq[i], step * step / 6 * 100 * fastest) << i;
+      EXPECT_NEAR((dq[i + 1] - dq[i - 1]) / (2 * step), ddq[i], step * step / 6 * 1e4 * fastest) << i;
+    }
+  }
+}
+
+TEST(LearnedMotion, WhatDoesNotExplainTheSamplesIsNotTaken) {
+  const DerivedData plain = derive(pendulum(), noisy_log().table);
+  RandomStream random(1);
+  MatrixXd wild = true_accelerations(plain);
+  for (double& one : wild.reshaped()) one = 1000 * random.normal();
+  const DerivedData learned = derive(pendulum(), noisy_log().table, {}, wild);
+  for (const DerivedSeries& one : learned.series) EXPECT_EQ(one.gain, 0);
+  EXPECT_EQ(learned.accelerations, plain.accelerations);
+}
+
+TEST(LearnedMotion, IsOfTheSamples) {
+  const DerivedData plain = derive(pendulum(), noisy_log().table);
+  EXPECT_THAT(input_error_of([&] { derive(pendulum(), noisy_log().table, {.every = 2}, true_accelerations(plain)); }),
+              HasSubstr("`rate` and `every` do not go with it"));
+}
+
+TEST(LearnAndSmooth, LearnsMoreThanFromOneSmoothing) {
+  const auto error_of = [](const LearnedLog& log) {
+    FitRequest asked = request();
+    asked.problem.max_points.reset();
+    asked.hyperparameters = HyperparameterChoice::optimise;
+    asked.logs = {{log.table(*pendulum().system, "rows")}};
+    const Posterior posterior = run_fit(prepare_fit(std::move(asked))).posterior;
+    double error = 0;
+    for (const Trajectory& truth : noisy_log().episodes) {
+      const MatrixXd mean = posterior.mean(View::constrained_acceleration(*pendulum().system), truth.states);
+      for (const int j : {2, 5}) error += (mean.row(j) - truth.accelerations.row(j)).squaredNorm();
+    }
+    return std::sqrt(error);
+  };
+  const LearnedLog once = learn_and_smooth(request(), noisy_log().table, {.most_passes = 0});
+  const LearnedLog turns = learn_and_smooth(request(), noisy_log().table, {});
+  EXPECT_THAT(once.rows, testing::SizeIs(50));
+  EXPECT_EQ(once.data.accelerations, derive(pendulum(), noisy_log().table, {.hold_constraints = true}).accelerations);
+  EXPECT_TRUE(once.gains.empty());
+  ASSERT_FALSE(turns.gains.empty());
+  EXPECT_TRUE(std::is_sorted(turns.gains.begin(), turns.gains.end()));
+  EXPECT_THAT(turns.notes, ElementsAre(HasSubstr("smoothed by what was learned")));
+  EXPECT_LT(error_of(turns), 0.9 * error_of(once));
+  const Score before = score_of(once.data, noisy_log(), *pendulum().system, 0);
+  EXPECT_LT(score_of(turns.data, noisy_log(), *pendulum().system, 0).rms[2], 0.5 * before.rms[2]);
+}
+
+TEST(LearnAndSmooth, SameBitsForAnyNumberOfThreads) {
+  FitRequest one = request(), three = request();
+  one.threads = 1, three.threads = 3;
+  RawFitOptions options;
+  options.most_passes = 1;
+  const LearnedLog a = learn_and_smooth(one, noisy_log().table, options);
+  options.derive.n_threads = 1;
+  const LearnedLog b = learn_and_smooth(three, noisy_log().table, options);
+  EXPECT_EQ(a.rows, b.rows);
+  EXPECT_EQ(a.data.accelerations, b.data.accelerations);
+}
+
+}  // namespace
+}  // namespace gp2::test
