@@ -12,9 +12,9 @@
 #include <nlohmann/json.hpp>
 
 #include "command.hpp"
+#include "gp2/base/file.hpp"
 #include "gp2/data/csv.hpp"
 #include "gp2/error.hpp"
-#include "gp2/base/file.hpp"
 #include "gp2/jobs/fit_job.hpp"
 #include "gp2/jobs/raw_fit.hpp"
 #include "gp2/training/laplace.hpp"
@@ -239,7 +239,6 @@ void read_raw(FitArguments& arguments, const std::atomic<bool>* stop) {
   if (!arguments.smoothed.empty()) {
     const CsvTable smoothed = as_table(log.data, system, arguments.smoothed);
     write_file(arguments.smoothed, smoothed.text());
-    print_notes({fmt::format("{}: {} rows, smoothed", arguments.smoothed, smoothed.n_rows())});
   }
   request.problem.columns.clear();
   request.problem.max_points.reset();

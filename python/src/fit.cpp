@@ -7,8 +7,8 @@
 #include "bindings.hpp"
 #include "gp2/error.hpp"
 #include "gp2/jobs/derive.hpp"
-#include "gp2/jobs/raw_fit.hpp"
 #include "gp2/jobs/fit_job.hpp"
+#include "gp2/jobs/raw_fit.hpp"
 #include "gp2/jobs/resample.hpp"
 #include "gp2/jobs/show_job.hpp"
 #include "gp2/jobs/simulate_job.hpp"
@@ -236,12 +236,10 @@ void add_fit(py::module_& module) {
         RawFitOptions raw;
         ResampleOptions resample;
         ShowRequest show;
-        const std::map<std::string, std::vector<Option>> tables = {{"fit", options(fit)},
-                                                                   {"simulate", options(simulate)},
-                                                                   {"derive", options(derive)},
-                                                                   {"learn_and_smooth", options(fit_of_raw, raw)},
-                                                                   {"resample", options(resample)},
-                                                                   {"show", options(show)}};
+        const std::map<std::string, std::vector<Option>> tables = {
+            {"fit", options(fit)},           {"simulate", options(simulate)},
+            {"derive", options(derive)},     {"learn_and_smooth", options(fit_of_raw, raw)},
+            {"resample", options(resample)}, {"show", options(show)}};
         return stub_lines(tables.at(job));
       },
       "job"_a);

@@ -9,10 +9,10 @@
 #include "bindings.hpp"
 #include "gp2/error.hpp"
 #include "gp2/jobs/derive.hpp"
-#include "gp2/jobs/raw_fit.hpp"
 #include "gp2/jobs/fit_job.hpp"
 #include "gp2/jobs/generate_job.hpp"
 #include "gp2/jobs/predict_job.hpp"
+#include "gp2/jobs/raw_fit.hpp"
 #include "gp2/jobs/resample.hpp"
 #include "gp2/jobs/simulate_job.hpp"
 
@@ -185,8 +185,8 @@ const std::vector<Option>& every_option() {
   static ResampleOptions resample;
   static const std::vector<Option> all = [] {
     std::vector<Option> list;
-    for (std::vector<Option> table : {options(fit, raw), options(predict), options(evaluate), options(simulate), options(generate),
-                                      options(derive), options(resample)}) {
+    for (std::vector<Option> table : {options(fit, raw), options(predict), options(evaluate), options(simulate),
+                                      options(generate), options(derive), options(resample)}) {
       list.insert(list.end(), table.begin(), table.end());
     }
     return list;

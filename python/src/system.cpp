@@ -9,9 +9,9 @@
 #include "gp2/error.hpp"
 #include "gp2/jobs/check_job.hpp"
 #include "gp2/jobs/derive.hpp"
-#include "gp2/jobs/raw_fit.hpp"
 #include "gp2/jobs/fit_problem.hpp"
 #include "gp2/jobs/generate_job.hpp"
+#include "gp2/jobs/raw_fit.hpp"
 #include "gp2/jobs/resample.hpp"
 #include "gp2/jobs/show_job.hpp"
 #include "options.hpp"
@@ -329,16 +329,16 @@ independent, notes. docs/raw-logs.md.
   FitRequest of_fit;
   RawFitOptions of_raw;
   const std::vector<Option> of_both = options(of_fit, of_raw);
-  module.def("learn_and_smooth", &learn_and_smooth_table, py::arg("system"), py::arg("data"),
-             (signature("learn_and_smooth", "system: System, data: object, *,", of_both, "",
-                        "tuple[Table, Table, dict[str, Any]]") +
-              R"(
+  module.def(
+      "learn_and_smooth", &learn_and_smooth_table, py::arg("system"), py::arg("data"),
+      (signature("learn_and_smooth", "system: System, data: object, *,", of_both, "", "tuple[Table, Table, dict[str, Any]]") +
+       R"(
 A raw log of t and positions, smoothed and learned from by turns, as `gp2 fit --raw` does it: the rows to fit to, a Table for fit
 with the same options; all rows, smoothed; and a report (dict) as that of derive, with `gains`, the log likelihood of positions
 that the fits have not seen, of each pass that was kept. docs/raw-logs.md.
 
 )" + documentation(of_both))
-                 .c_str());
+          .c_str());
   module.def("resample", &resample_table, py::arg("system"), py::arg("data"), py::arg("n"),
              (signature("resample", "system: System, data: object, n: int, *,", options(of_resample), "", "Table") + R"(
 The n rows of a table that cover its states best, whole, in the order of choice: farthest points in the features of the system's

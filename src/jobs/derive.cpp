@@ -64,7 +64,7 @@ std::vector<std::string> without_ranges(const std::vector<std::string>& items) {
     }
     constexpr int most = 1'000'000;
     if (*last < *first || *last - *first > most)
-      throw InputError(fmt::format("episodes: '{}' is not a range FIRST-LAST, say 0-12", item));
+      throw InputError(fmt::format("`episodes`: '{}' is not a range FIRST-LAST, say 0-12", item));
     for (int k = *first; k <= *last; ++k) episodes.push_back(std::to_string(k));
   }
   return episodes;
@@ -92,12 +92,12 @@ struct Task {
   int coordinate = 0, episode = 0;
   Channel channel;
   SmootherFit fit;
-  SmootherModel model;      // of the positions about their mean
+  SmootherModel model;  // of the positions about their mean
   double kurtosis = 0;
-  Eigen::Matrix3Xd course;  // the learned motion that the fit is about; empty: the mean
-  double gain = 0;          // by it, in log likelihood
+  Eigen::Matrix3Xd course;                  // the learned motion that the fit is about; empty: the mean
+  double gain = 0;                          // by it, in log likelihood
   std::vector<Eigen::Matrix3d> covariance;  // of the motion smoothed without it
-  SmoothedMotion motion;  // its covariances only where constraints are held
+  SmoothedMotion motion;                    // its covariances only where constraints are held
   Eigen::Matrix3Xd stddev;
 };
 
@@ -107,7 +107,7 @@ std::string in_episode(const Episode& episode) {
 
 class Deriver {
  public:
-  Deriver(const Model& model, const CsvTable& log, const DeriveOptions& options, const MatrixXd* learned)
+  Deriver(const Model& model, const CsvTable& log, const DeriveOptions& options, const LearnedAccelerations* learned)
       : model_(model),
         system_(*model.system),
         log_(log),
@@ -543,21 +543,27 @@ class Deriver {
   }
 
   /// The motion p of a series under the learned acceleration, at the times of its samples; d²q̂/dt² − u is linear between them.
-  [[nodiscard]] Eigen::Matrix3Xd course_of(Task& task) const {
+  /// @param plain  the motion q̂ smoothed without it
+  /// @param weigh  takes as little of u, beside q̂, as their variances say
+  [[nodiscard]] Eigen::Matrix3Xd course_of(const Task& task, const SmoothedMotion& plain, bool weigh) const {
     Index first = 0;
     for (int e = 0; e < task.episode; ++e) first += static_cast<Index>(episodes_[static_cast<std::size_t>(e)].distinct.size());
     const VectorXd times = times_to_write(episodes_[static_cast<std::size_t>(task.episode)]);
-    SmoothedMotion plain = smooth(task.fit.model, task.fit.trusted, times);
-    task.covariance = std::move(plain.covariance);
-    Eigen::Matrix3Xd course = std::move(plain.mean);
-    course.row(0).array() += task.channel.mean;
-    const Eigen::RowVectorXd misfit = course.row(2) - learned_->row(task.coordinate).segment(first, times.size());
+    const Index n = times.size();
+    Eigen::RowVectorXd misfit = plain.mean.row(2) - learned_->mean.row(task.coordinate).segment(first, n);
+    for (Index i = 0; i < n && weigh; ++i) {
+      const double known = plain.covariance[static_cast<std::size_t>(i)](2, 2),
+                   stddev = learned_->stddev(task.coordinate, first + i);
+      misfit[i] *= known / (known + stddev * stddev);
+    }
     // as slow as drift needs: what follows the samples below ω has their noise
     constexpr double share = 0.01;
     const double bandwidth = bandwidth_of(task.model, median(spaces_of(task.fit.trusted)));
-    const double w = 2 * std::numbers::pi * share * std::max(bandwidth, 1 / times.tail<1>()[0]);
+    const double w = 2 * std::numbers::pi * share * std::max(bandwidth, 1 / times[n - 1]);
+    Eigen::Matrix3Xd course = plain.mean;
+    course.row(0).array() += task.channel.mean;
     double r = 0, v = 0;
-    for (Index i = 0; i < times.size(); ++i) {
+    for (Index i = 0; i < n; ++i) {
       if (i > 0) {
         // a + b t solves it but for its start, which (A + B t) e^(−ωt) makes good
         const double h = times[i] - times[i - 1];
@@ -571,27 +577,35 @@ class Deriver {
     return course;
   }
 
-  /// Smooths a series about the learned motion where that is likelier.
-  void take_learned(Task& task, const SmootherFitOptions& options) const {
+  /// Positions about a course and their own mean there, velocities about its.
+  [[nodiscard]] std::pair<std::vector<Measurement>, double> about(const Eigen::Matrix3Xd& course, const Task& task) const {
     const std::vector<double>& times = episodes_[static_cast<std::size_t>(task.episode)].distinct;
-    const Eigen::Matrix3Xd course = course_of(task);
-    std::vector<Measurement> about = task.channel.measurements;
+    std::vector<Measurement> measurements = task.channel.measurements;
     Index at = 0;
     double sum = 0, n = 0;
-    for (Measurement& one : about) {
+    for (Measurement& one : measurements) {
       while (times[static_cast<std::size_t>(at)] < one.time) ++at;
       one.value += one.velocity ? -course(1, at) : task.channel.mean - course(0, at);
       if (!one.velocity) sum += one.value, ++n;
     }
-    const double mean = sum / n;
-    for (Measurement& one : about) one.value -= one.velocity ? 0 : mean;
-    SmootherFit fit = fit_smoother(about, options);
-    const double gain = score(fit, options) - score(task.fit, options);
+    for (Measurement& one : measurements) one.value -= one.velocity ? 0 : sum / n;
+    return {std::move(measurements), sum / n};
+  }
+
+  /// Smooths a series about the learned motion where that makes its samples likelier, which u as it is tells: a motion that goes by
+  /// variances has the noise of the samples wherever little is learned.
+  void take_learned(Task& task, const SmootherFitOptions& options) const {
+    const VectorXd times = times_to_write(episodes_[static_cast<std::size_t>(task.episode)]);
+    SmoothedMotion plain = smooth(task.fit.model, task.fit.trusted, times);
+    const SmootherFit tried = fit_smoother(about(course_of(task, plain, false), task).first, options);
+    const double gain = score(tried, options) - score(task.fit, options);
     if (!(gain > 0)) return;
-    task.fit = std::move(fit);
-    task.course = course;
+    task.course = course_of(task, plain, true);
+    const auto [measurements, mean] = about(task.course, task);
+    task.fit = fit_smoother(measurements, options);
     task.channel.mean = mean;
     task.gain = gain;
+    task.covariance = std::move(plain.covariance);
   }
 
   /// Log likelihood, in which an outlier counts as a sample that is just trusted.
@@ -864,7 +878,7 @@ class Deriver {
   const System& system_;
   const CsvTable& log_;
   const DeriveOptions& options_;
-  const MatrixXd* learned_;  // accelerations (nq × samples); null: none
+  const LearnedAccelerations* learned_;  // may be null
   LogReader reader_;
   DerivedData data_;
   int time_column_ = -1;
@@ -908,7 +922,7 @@ DerivedData derive(const Model& model, const CsvTable& log, const DeriveOptions&
   return Deriver(model, log, options, nullptr).run();
 }
 
-DerivedData derive(const Model& model, const CsvTable& log, const DeriveOptions& options, const MatrixXd& learned) {
+DerivedData derive(const Model& model, const CsvTable& log, const DeriveOptions& options, const LearnedAccelerations& learned) {
   if (options.rate != 0 || options.every != 1) {
     throw InputError("smoothing by what was learned is of the samples: `rate` and `every` do not go with it");
   }

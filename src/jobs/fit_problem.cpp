@@ -219,9 +219,10 @@ std::vector<std::string> notes_of(const FitReport& report) {
     const bool at_lower = h.at_bound() && h.value < 2 * h.lower;
     if (h.kind != Hyperparameter::Kind::noise_stddev || !at_lower) continue;
     if (h.unit.starts_with("stated deviation")) {
-      notes.push_back(fmt::format("{} ended at the lower bound: the log states deviations that are {:.2g} times as large as they "
-                                  "seem, or more",
-                                  h.name, 1 / h.lower));
+      notes.push_back(
+          fmt::format("{} ended at the lower bound: the log states deviations that are {:.2g} times as large as they "
+                      "seem, or more",
+                      h.name, 1 / h.lower));
     } else {
       collapsed.push_back(h.name);
     }

@@ -24,9 +24,10 @@ int part_of(Index row, Index n_rows) { return static_cast<int>(row * n_pieces / 
 
 // Accelerations at all states, each by what the other parts tell.
 // @param lines  of the observed states, in the table of all states
-MatrixXd left_out_accelerations(const Posterior& posterior, const std::vector<int>& lines, const MatrixXd& states) {
+LearnedAccelerations left_out_accelerations(const Posterior& posterior, const std::vector<int>& lines, const MatrixXd& states) {
   const View view = View::constrained_acceleration(*posterior.prior().system);
-  MatrixXd out(posterior.prior().system->nq(), states.cols());
+  const int nq = posterior.prior().system->nq();
+  LearnedAccelerations out{MatrixXd(nq, states.cols()), MatrixXd(nq, states.cols())};
   for (int part = 0; part < n_parts; ++part) {
     constexpr int first_line = 2;
     std::vector<int> others;
@@ -39,8 +40,10 @@ MatrixXd left_out_accelerations(const Posterior& posterior, const std::vector<in
     }
     std::vector<Observations> seen = posterior.observations();
     seen.front() = seen.front().take(others);
-    out(Eigen::all, here) =
-        Posterior(posterior.prior(), std::move(seen), posterior.values()).mean(view, states(Eigen::all, here), 0);
+    const Posterior::Marginal seen_from_there =
+        Posterior(posterior.prior(), std::move(seen), posterior.values()).marginal(view, states(Eigen::all, here), 0);
+    out.mean(Eigen::all, here) = seen_from_there.mean;
+    out.stddev(Eigen::all, here) = seen_from_there.stddev();
   }
   return out;
 }
@@ -119,9 +122,10 @@ LearnedLog learn_and_smooth(const FitRequest& request, const CsvTable& log, cons
   best.notes.push_back(
       gains.empty()
           ? "learning from a smoothing by what was learned makes positions that the fit has not seen no likelier: it is not kept"
-          : fmt::format("smoothed by what was learned, {} times: log likelihood of positions that the fits have not seen + {:.4g}, "
-                        "learned from that + {:.4g}",
-                        gains.size(), first, fmt::join(gains, ", + ")));
+          : fmt::format(
+                "smoothed by what was learned, {} times: log likelihood of positions that the fits have not seen + {:.4g}, "
+                "learned from that + {:.4g}",
+                gains.size(), first, fmt::join(gains, ", + ")));
   best.gains = std::move(gains);
   return best;
 }

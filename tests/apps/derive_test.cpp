@@ -108,7 +108,8 @@ class FitRaw : public testing::Test {
  protected:
   FitRaw() { desk.write("log.csv", encoder_log(desk)); }
 
-  const std::string fit = "gp2 fit models/double_pendulum.toml --map theta1=q3,theta2=q6 --prior force --mean force --restarts 1 ";
+  const std::string fit =
+      "gp2 fit models/double_pendulum.toml --map theta1=q3,theta2=q6 --prior force --mean force --restarts 1 ";
   Desk desk;
 };
 
@@ -117,7 +118,6 @@ TEST_F(FitRaw, GoesFromPositionsToAFit) {
       fit + "--raw log.csv --max-points 40 --hyperparameters optimise --passes 2 --smoothed smoothed.csv -o fit.json --json");
   EXPECT_TRUE(outcome.said("from the constraints: q1, q2, q4, q5")) << outcome.err;
   EXPECT_TRUE(outcome.said("what was learned")) << outcome.err;
-  EXPECT_TRUE(outcome.said("smoothed.csv: 402 rows, smoothed")) << outcome.err;
   EXPECT_TRUE(outcome.said("fit.json: fit of 'double pendulum' to 40 rows")) << outcome.err;
   EXPECT_EQ(desk.table("smoothed.csv").n_rows(), 402);
   EXPECT_GE(desk.table("smoothed.csv").find("ddq6_std"), 0);

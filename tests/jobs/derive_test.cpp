@@ -366,7 +366,7 @@ TEST(Derive, SaysWhatIsWrongWithALog) {
               HasSubstr("log.csv:9: column 'q1': '1,5' is not a finite number"));
   EXPECT_THAT(fault(edit([](auto& rows) { rows[7][0] = ""; })), HasSubstr("log.csv:9: column 't': the cell is empty"));
   EXPECT_THAT(fault(cart_log([](auto&) {}, {"clock", "q1"})),
-              HasSubstr("log.csv: missing column 't' (looked for t, time, timestamp)"));
+              HasSubstr("log.csv: missing column 't' (looked for t, time, timestamp, __time)"));
   EXPECT_THAT(
       fault(cart_log([](auto&) {}, {"t", "angle"})),
       HasSubstr(

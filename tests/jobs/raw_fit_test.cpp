@@ -31,13 +31,13 @@ const SimulatedLog& noisy_log() {
 }
 
 /// What truly accelerates the pendulum, at the rows of a derive.
-MatrixXd true_accelerations(const DerivedData& data) {
+LearnedAccelerations true_accelerations(const DerivedData& data, double stddev = 0) {
   MatrixXd out(pendulum().system->nq(), data.states.cols());
   for (Index i = 0; i < out.cols(); ++i) {
     const Trajectory& truth = noisy_log().episodes[static_cast<std::size_t>(data.episode[static_cast<std::size_t>(i)])];
     out.col(i) = truth.accelerations.col(i % truth.times.size());
   }
-  return out;
+  return {out, MatrixXd::Constant(out.rows(), out.cols(), stddev)};
 }
 
 FitRequest request() {
@@ -82,11 +82,19 @@ TEST(LearnedMotion, VelocityAndAccelerationAreTheDerivativesOfItsPosition) {
 TEST(LearnedMotion, WhatDoesNotExplainTheSamplesIsNotTaken) {
   const DerivedData plain = derive(pendulum(), noisy_log().table);
   RandomStream random(1);
-  MatrixXd wild = true_accelerations(plain);
-  for (double& one : wild.reshaped()) one = 1000 * random.normal();
+  LearnedAccelerations wild = true_accelerations(plain);
+  for (double& one : wild.mean.reshaped()) one = 1000 * random.normal();
   const DerivedData learned = derive(pendulum(), noisy_log().table, {}, wild);
   for (const DerivedSeries& one : learned.series) EXPECT_EQ(one.gain, 0);
   EXPECT_EQ(learned.accelerations, plain.accelerations);
+}
+
+TEST(LearnedMotion, WhatIsPredictedWithoutKnowledgeChangesNothing) {
+  const DerivedData plain = derive(pendulum(), noisy_log().table);
+  const DerivedData learned = derive(pendulum(), noisy_log().table, {}, true_accelerations(plain, 1e9));
+  // p is q̂, and what samples are off it is noise
+  const double spread = std::sqrt(plain.accelerations.row(5).squaredNorm() / static_cast<double>(plain.accelerations.cols()));
+  EXPECT_LT(largest(learned.accelerations - plain.accelerations), 0.02 * spread);
 }
 
 TEST(LearnedMotion, IsOfTheSamples) {

@@ -33,6 +33,7 @@ def test_the_guide_has_blocks():
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_the_blocks_run(page, tmp_path):
+    (tmp_path / "examples").symlink_to(ROOT / "examples")
     script = tmp_path / f"{page.stem}.py"
     script.write_text(script_of(page), encoding="utf-8")
     environment = os.environ | {"PYTHONPATH": str(Path(gp2.__file__).resolve().parents[1])}

@@ -91,16 +91,21 @@ struct DerivedData {
 /// @throws NumericalError when Newton's method does not reach the constraints.
 DerivedData derive(const Model& model, const CsvTable& log, const DeriveOptions& options = {});
 
-/// The same by what was learned of the motion: accelerations u that a fit predicts at the rows of a derive with rate 0 and every 1
-/// (nq × N). The mean of a series is then not constant but the motion p under u,
+/// The accelerations that a fit predicts at the rows of a derive with rate 0 and every 1 (nq × N each).
+struct LearnedAccelerations {
+  Eigen::MatrixXd mean, stddev;
+};
+
+/// The same by what was learned of the motion. The mean of a series is then not constant but the motion p under the accelerations u,
 ///
-///     p = q̂ − r,    r̈ + 2ω ṙ + ω² r = d²q̂/dt² − u,
+///     p = q̂ − r,    r̈ + 2ω ṙ + ω² r = (d²q̂/dt² − u) ŝ² / (ŝ² + s²),
 ///
-/// which follows the motion q̂ that is smoothed without it below ω, a hundredth of the bandwidth, and u above. A series is smoothed so
-/// where that makes its samples likelier, and is not too short for a model of its own. Its deviations stay those of a smoothing without
-/// what was learned: what that misses, friction that sets in say, no smooth remainder tells.
+/// which follows the motion q̂ that is smoothed without them below ω, a hundredth of the bandwidth; above, it follows u as far as its
+/// variance s² is smaller than that of d²q̂/dt², ŝ². A series is smoothed so where that makes its samples likelier, and is not too
+/// short for a model of its own. Its deviations stay those of a smoothing without what was learned: what that misses, friction that
+/// sets in say, no smooth remainder tells.
 /// @throws InputError also for other options `rate` and `every`.
-DerivedData derive(const Model& model, const CsvTable& log, const DeriveOptions& options, const Eigen::MatrixXd& learned);
+DerivedData derive(const Model& model, const CsvTable& log, const DeriveOptions& options, const LearnedAccelerations& learned);
 
 /// Columns: the episode where there is one, t, q, dq, u, ddq as far as known, NAME_std of what was measured (of accelerations:
 /// of independent ones), what is kept.
