@@ -101,6 +101,7 @@ LearnedLog learn_and_smooth(const FitRequest& request, const CsvTable& log, cons
     quick.standard_errors = quick.thin = quick.problem.robust = false;
     const FitJob job = prepare_fit(std::move(quick));
     const FitOutcome fit = run_fit(job, {}, stop);
+    if (stop != nullptr && *stop) throw NumericalError("stopped while the raw log was learned from");
     return with_rows(derive(request.model, log, smoothing,
                             left_out_accelerations(fit.posterior, job.problem.lines.front(), before.data.states)));
   };

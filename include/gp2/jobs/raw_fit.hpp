@@ -44,8 +44,9 @@ inline constexpr int n_raw_rows = 200;
 /// The gain in likelihood thus tells how well the fit predicts what it has not seen, and so which smoothing is the best to learn
 /// from: the turns go on as long as it rises.
 /// @param request  model and options of the fit, without data
+/// @param stop     set: ends within a second or so, by throwing
 /// @throws InputError      as derive, resample and prepare_fit
-/// @throws NumericalError  as derive and run_fit
+/// @throws NumericalError  as derive and run_fit, and when stopped
 LearnedLog learn_and_smooth(const FitRequest& request, const CsvTable& log, const RawFitOptions& options,
                             const std::atomic<bool>* stop = nullptr);
 
