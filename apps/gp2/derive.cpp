@@ -19,7 +19,7 @@ namespace gp2::command {
 namespace {
 
 struct DeriveArguments {
-  std::string log, model, output;
+  std::string log, model, like, output;
   DeriveOptions options;
 };
 
@@ -84,8 +84,9 @@ void report(const DerivedData& data, const System& system) {
 }
 
 void run(DeriveArguments& arguments) {
-  require_output(arguments.output, {arguments.log, arguments.model});
+  require_output(arguments.output, {arguments.log, arguments.model, arguments.like});
   const Model model = Model::read(arguments.model);
+  if (!arguments.like.empty()) arguments.options.like = CsvTable::read(arguments.like);
   if (isatty(STDERR_FILENO) != 0) {
     arguments.options.progress = [](double fraction) {
       print_message("\rgp2: smoothing {:3.0f} %{}", 100 * fraction, fraction < 1 ? "" : "\n");
@@ -114,7 +115,11 @@ Command derive_command() {
                   {},
                   {}};
   command.options = {argument("LOG", a->log, "CSV of t and positions, and of velocities and inputs where there are"),
-                     required({"model", &a->model, "MODEL", "model file"})};
+                     required({"model", &a->model, "MODEL", "model file"}),
+                     {"like", &a->like, "LOG",
+                      "another raw log: smooth this one by the models found for that one, so that what is learned from one and "
+                      "tested on the other has gone through one filter",
+                      "models of its own"}};
   for (Option& option : options(a->options)) command.options.push_back(std::move(option));
   command.options.push_back(output(a->output, "CSV", "CSV file to write"));
   command.run = [a](const std::set<std::string>&) { run(*a); };

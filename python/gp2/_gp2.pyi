@@ -467,6 +467,7 @@ def read_csv(path: _Path) -> Table: ...
 def derive(
     system: System,
     data: _Table,
+    like: _Table | None = None,
     *,
     # options of derive: written by scripts/options
     episode: str = "",

@@ -116,9 +116,10 @@ py::dict report_of(const DerivedData& derived, const System& system) {
   return report;
 }
 
-py::tuple derive_table(const PySystem& self, const py::object& data, const py::kwargs& keywords) {
+py::tuple derive_table(const PySystem& self, const py::object& data, const py::object& like, const py::kwargs& keywords) {
   DeriveOptions asked;
   read_keywords("derive", keywords, options(asked));
+  if (!like.is_none()) asked.like = to_table(like, "like", CsvTable::Keep::text);
   const CsvTable table = to_table(data, "data", CsvTable::Keep::text);
   DerivedData derived;
   {
@@ -317,15 +318,19 @@ M, F, the constraints with the A and b derived from them, the parameters and the
 
 )" + documentation(options(of_show)))
                  .c_str());
-  module.def(
-      "derive", &derive_table, py::arg("system"), py::arg("data"),
-      (signature("derive", "system: System, data: object, *,", options(of_derive), "", "tuple[Table, dict[str, Any]]") + R"(
+  module.def("derive", &derive_table, py::arg("system"), py::arg("data"), py::arg("like") = py::none(),
+             (signature("derive", "system: System, data: object, like: object = None, *,", options(of_derive), "",
+                        "tuple[Table, dict[str, Any]]") +
+              R"(
 A raw log of t and positions as states and accelerations with a standard deviation for each value: a Table for fit, and a report
 (dict): what was found of each coordinate in each episode, what was completed from the constraints, which accelerations are
 independent, notes. docs/raw-logs.md.
 
+like  another raw log: this one goes through the filter that is found for that one, so that what is learned from one and tested
+      on the other has gone through the same
+
 )" + documentation(options(of_derive)))
-          .c_str());
+                 .c_str());
   FitRequest of_fit;
   RawFitOptions of_raw;
   const std::vector<Option> of_both = options(of_fit, of_raw);

@@ -116,17 +116,21 @@ class Deriver {
         reader_(open_log(model, log, options.columns)) {}
 
   DerivedData run() {
-    check_options();
-    find_columns();
-    find_episodes();
-    split_at_pauses();
-    read_channels();
+    fit_channels();
     smooth_channels();
     collect_rows();
     add_inputs();
     put_together();
     take_each();
     return std::move(data_);
+  }
+
+  /// The model of each measured coordinate.
+  std::map<int, SmootherModel> models() {
+    fit_channels();
+    std::map<int, SmootherModel> found;
+    for (const Task& task : tasks_) found.emplace(task.coordinate, middle_model(task.coordinate).value_or(task.model));
+    return found;
   }
 
  private:
@@ -481,24 +485,55 @@ class Deriver {
     return VectorXd::LinSpaced(n, 0, static_cast<double>(n - 1)) / options_.rate;
   }
 
-  // each series is fitted, then smoothed
   void tell_progress() {
     const std::lock_guard lock(progress_lock_);
     if (options_.progress) options_.progress(++n_done_ / (2.0 * static_cast<double>(tasks_.size())));
   }
 
-  void smooth_channels() {
-    SmootherFitOptions options;
-    options.smoothness = options_.smoothness;
-    options.outlier_threshold = options_.outlier_threshold;
-    const int n_threads = thread_count(options_.n_threads);
-    const auto is_short = [](const Task& task) {
-      return task.fit.trusted.size() + task.fit.outliers.size() < least_for_own_model;
-    };
-    parallel_for(static_cast<int>(tasks_.size()), n_threads, [&](int k, int) {
+  static bool is_short(const Task& task) { return task.fit.trusted.size() + task.fit.outliers.size() < least_for_own_model; }
+
+  /// The model of the middle lengthscale, of the episodes that are long enough for one of their own; nothing where none is.
+  [[nodiscard]] std::optional<SmootherModel> middle_model(int coordinate) const {
+    std::vector<SmootherModel> models;
+    for (const Task& task : tasks_) {
+      if (task.coordinate == coordinate && !is_short(task)) models.push_back(task.model);
+    }
+    if (models.empty()) return std::nullopt;
+    const auto middle = models.begin() + static_cast<std::ptrdiff_t>(models.size() / 2);
+    std::nth_element(models.begin(), middle, models.end(),
+                     [](const SmootherModel& a, const SmootherModel& b) { return a.lengthscale < b.lengthscale; });
+    return *middle;
+  }
+
+  void find_models_to_be_like() {
+    DeriveOptions options = options_;
+    options.like.reset();
+    options.episodes.clear();
+    options.keep.clear();
+    options.progress = {};
+    models_ = Deriver(model_, *options_.like, options, nullptr).models();
+    for (const int j : data_.measured) {
+      if (models_.contains(j)) continue;
+      throw InputError(fmt::format("like: {} has no column {}, which {} has", options_.like->name(),
+                                   system_.coordinates()[static_cast<std::size_t>(j)].name, log_.name()));
+    }
+  }
+
+  // each series is fitted, then smoothed
+  void fit_channels() {
+    check_options();
+    find_columns();
+    find_episodes();
+    split_at_pauses();
+    read_channels();
+    if (options_.like) find_models_to_be_like();
+    parallel_for(static_cast<int>(tasks_.size()), thread_count(options_.n_threads), [&](int k, int) {
       Task& task = tasks_[static_cast<std::size_t>(k)];
-      SmootherFitOptions own = options;
+      SmootherFitOptions own;
+      own.smoothness = options_.smoothness;
+      own.outlier_threshold = options_.outlier_threshold;
       own.least_noise_stddev = task.channel.resolution / std::sqrt(12.0);  // of rounding
+      if (options_.like) own.model = models_.at(task.coordinate);
       task.fit = fit_smoother(task.channel.measurements, own);
       task.model = task.fit.model;
       task.kurtosis = task.fit.kurtosis;
@@ -506,23 +541,19 @@ class Deriver {
       task.channel.measurements = {};  // a long log is told once
       tell_progress();
     });
+  }
+
+  void smooth_channels() {
     // few samples do not tell their own smoothness
     std::vector<bool> shared(tasks_.size(), false);
-    for (std::size_t k = 0; k < tasks_.size(); ++k) {
-      if (!is_short(tasks_[k])) continue;
-      std::vector<SmootherModel> others;
-      for (const Task& other : tasks_) {
-        if (other.coordinate == tasks_[k].coordinate && !is_short(other)) others.push_back(other.model);
-      }
-      if (others.empty()) continue;
-      const auto middle = others.begin() + static_cast<std::ptrdiff_t>(others.size() / 2);
-      std::nth_element(others.begin(), middle, others.end(),
-                       [](const SmootherModel& a, const SmootherModel& b) { return a.lengthscale < b.lengthscale; });
+    for (std::size_t k = 0; k < tasks_.size() && !options_.like; ++k) {
+      const std::optional<SmootherModel> middle = is_short(tasks_[k]) ? middle_model(tasks_[k].coordinate) : std::nullopt;
+      if (!middle) continue;
       tasks_[k].model = tasks_[k].fit.model = *middle;
       shared[k] = true;
     }
     data_.series.resize(tasks_.size());
-    parallel_for(static_cast<int>(tasks_.size()), n_threads, [&](int k, int) {
+    parallel_for(static_cast<int>(tasks_.size()), thread_count(options_.n_threads), [&](int k, int) {
       Task& task = tasks_[static_cast<std::size_t>(k)];
       const VectorXd times = times_to_write(episodes_[static_cast<std::size_t>(task.episode)]);
       task.motion = smooth(task.fit.model, task.fit.trusted, times);
@@ -879,6 +910,7 @@ class Deriver {
   const CsvTable& log_;
   const DeriveOptions& options_;
   const LearnedAccelerations* learned_;  // may be null
+  std::map<int, SmootherModel> models_;  // of the log that this one is to be like
   LogReader reader_;
   DerivedData data_;
   int time_column_ = -1;

@@ -442,12 +442,17 @@ SmootherFit fit_smoother(const std::vector<Measurement>& measurements, const Smo
   constexpr double as_much = 0.5;
   const std::vector<Measurement> part = excerpt(measurements, most_fitted);
   const bool is_long = part.size() < measurements.size() && spread_of(part) > as_much * rough.signal_stddev;
+  const bool is_known = options.model.has_value() || is_long;
   SmootherFit fit;
-  if (is_long) fit = fit_smoother(part, options);
+  if (options.model) {
+    fit.model = *options.model;
+  } else if (is_long) {
+    fit = fit_smoother(part, options);
+  }
   std::vector<Measurement> all = measurements;
   constexpr int max_rounds = 20;
   for (int round = 0; round < max_rounds; ++round) {
-    if (!is_long) {
+    if (!is_known) {
       const std::vector<Measurement> some = those_used(all, trust.used());
       const Box box = box_of(some, rough, roughness.most_noise_stddev(), options);
       // errors that are gone by the second round have led the first astray

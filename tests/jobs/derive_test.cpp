@@ -339,6 +339,21 @@ TEST(Derive, AShortEpisodeTakesTheModelOfTheOthers) {
   EXPECT_EQ(data.series[1].model.lengthscale, data.series[0].model.lengthscale);
 }
 
+TEST(Derive, LikeAnotherLogItGoesThroughTheSameFilter) {
+  const CsvTable log = cart_log(), slow = cart_log([](std::vector<Row>&rows) {
+                                     for (Row& row : rows) row[0] = std::to_string(2 * std::stod(row[0]));
+                                     rows[100][1] = "9";
+                                   });
+  const DerivedData own = derive(cart(), log), slow_own = derive(cart(), slow), like = derive(cart(), slow, {.like = log});
+  ASSERT_EQ(like.series.size(), 1U);
+  EXPECT_GT(slow_own.series[0].model.lengthscale, 1.5 * own.series[0].model.lengthscale);
+  EXPECT_EQ(like.series[0].model.lengthscale, own.series[0].model.lengthscale);
+  EXPECT_EQ(like.series[0].model.noise_stddev, own.series[0].model.noise_stddev);
+  EXPECT_EQ(like.series[0].outliers, 1);
+  // a log is like itself
+  EXPECT_EQ(derive(cart(), log, {.like = log}).accelerations, own.accelerations);
+}
+
 TEST(Derive, SaysWhatIsWrongWithALog) {
   const auto fault = [](const CsvTable& log, const DeriveOptions& options = {}, const Model& model = cart()) {
     return test::input_error_of([&] { derive(model, log, options); });
@@ -380,6 +395,8 @@ TEST(Derive, SaysWhatIsWrongWithALog) {
   EXPECT_THAT(fault(cart_log(), {.keep = {"q1"}, .rate = 10}), HasSubstr("keep: rows of an even rate are not those of the log"));
   EXPECT_THAT(fault(cart_log(), {.rate = -1}), HasSubstr("rate: must be positive, got -1"));
   EXPECT_THAT(fault(cart_log(), {.rate = 1e9}), HasSubstr("rows; at most 1e+07 are written"));
+  EXPECT_THAT(fault(short_log().table, {.like = cart_log([](auto&) {}, {"t", "q3"})}, pendulum()),
+              HasSubstr("like: log.csv has no column q6, which simulated log has"));
   EXPECT_THAT(fault(cart_log(), {.every = 0}), HasSubstr("every: must be at least 1, got 0"));
   EXPECT_THAT(fault(cart_log(), {.outlier_threshold = -1}), HasSubstr("outlier threshold: must not be negative, got -1"));
   EXPECT_THAT(fault(cart_log(

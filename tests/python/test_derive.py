@@ -24,6 +24,12 @@ def log(n=400, noise=1e-4, seed=1):
     return {"t": t, "x": x}
 
 
+def test_a_log_like_another_goes_through_its_filter(spring):
+    own, other = gp2.derive(spring, log())[1], log(n=200, seed=2)
+    assert gp2.derive(spring, other, like=log())[1]["series"][0]["noise_std"] == own["series"][0]["noise_std"]
+    assert gp2.derive(spring, other)[1]["series"][0]["noise_std"] != own["series"][0]["noise_std"]
+
+
 def test_derivatives_and_their_deviations_are_those_of_the_motion(spring):
     table, report = gp2.derive(spring, log())
     t = np.asarray(table["t"], float)

@@ -29,6 +29,7 @@ struct DeriveOptions {
   int every = 1;                  // of these rows, the first and then each so many
   bool hold_constraints = false;  // condition each row on the constraints
   std::optional<Smoothness> smoothness = {};           // none: the likelier of 7/2 and 9/2
+  std::optional<CsvTable> like = {};                   // a log whose smoothing this one is to have, see below
   double outlier_threshold = 5;                        // as SmootherFitOptions
   int n_threads = 0;                                   // 0: all cores; the numbers do not depend on it
   std::function<void(double fraction)> progress = {};  // of the work done; called from worker threads, one at a time
@@ -85,6 +86,9 @@ struct DerivedData {
 ///
 /// With `hold_constraints` each row's estimate z = (q, dq, ddq) ~ N(ẑ, Σ) is conditioned on c = 0, ċ = 0 and A ddq = b,
 /// linearised where it ends: z ← ẑ + Σ Jᵀ (J Σ Jᵀ)⁺ (−r(z) − J (ẑ − z)), J = ∂r/∂z.
+///
+/// With `like` each coordinate is smoothed by the model of that log, of its episodes the one of the middle lengthscale: what is
+/// learned from one log and tested on another has then gone through one filter.
 ///
 /// @throws InputError naming the log, episode, column and row: no time, no coordinate, time that runs backwards, too few
 ///   samples, a column that never moves, an unknown episode or column, coordinates that the log leaves open.

@@ -64,6 +64,7 @@ SmoothedMotion smooth(const SmootherModel& model, const std::vector<Measurement>
 
 struct SmootherFitOptions {
   std::optional<Smoothness> smoothness = {};  // none: the likelier of 7/2 and 9/2
+  std::optional<SmootherModel> model = {};    // known: measurements are judged by it; none: it is found
   double least_noise_stddev = 0;              // of a measured q
   double least_velocity_noise_stddev = 0;     // of a measured dq
   /// A measurement that is farther from what the others say of it than this many standard deviations of that difference is
