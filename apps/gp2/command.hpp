@@ -29,6 +29,7 @@ Command resample_command();
 Command fit_command();
 Command predict_command();
 Command simulate_command();
+Command shoot_command();
 Command evaluate_command();
 Command report_command();
 Command reproduce_command();

@@ -329,6 +329,14 @@ class Posterior:
         columns: Mapping[str, str] | None = None,
         threads: int = 0,
     ) -> Evaluation: ...
+    def shoot(
+        self,
+        data: _Table,
+        duration: float | None = None,
+        stretches: int = 50,
+        columns: Mapping[str, str] | None = None,
+        threads: int = 0,
+    ) -> tuple[Posterior, dict[str, Any]]: ...
     def cross_validate(self) -> CrossValidation: ...
     def fewest_components(self, largest_error: float) -> Posterior: ...
     def update(

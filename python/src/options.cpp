@@ -14,6 +14,7 @@
 #include "gp2/jobs/predict_job.hpp"
 #include "gp2/jobs/raw_fit.hpp"
 #include "gp2/jobs/resample.hpp"
+#include "gp2/jobs/shoot_job.hpp"
 #include "gp2/jobs/simulate_job.hpp"
 
 namespace gp2::python {
@@ -183,10 +184,11 @@ const std::vector<Option>& every_option() {
   static GenerateRequest generate;
   static DeriveOptions derive;
   static ResampleOptions resample;
+  static ShootRequest shoot;
   static const std::vector<Option> all = [] {
     std::vector<Option> list;
     for (std::vector<Option> table : {options(fit, raw), options(predict), options(evaluate), options(simulate),
-                                      options(generate), options(derive), options(resample)}) {
+                                      options(generate), options(derive), options(resample), options(shoot)}) {
       list.insert(list.end(), table.begin(), table.end());
     }
     return list;

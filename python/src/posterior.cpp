@@ -13,6 +13,7 @@
 #include "gp2/jobs/fit_job.hpp"
 #include "gp2/jobs/fit_problem.hpp"
 #include "gp2/jobs/predict_job.hpp"
+#include "gp2/jobs/shoot_job.hpp"
 #include "gp2/jobs/simulate_job.hpp"
 #include "gp2/training/laplace.hpp"
 #include "options.hpp"
@@ -156,6 +157,36 @@ Evaluation evaluate_posterior(const PyPosterior& self, const py::object& data, c
   }
   tell(outcome.notes);
   return std::move(outcome.evaluation);
+}
+
+py::tuple shoot_posterior(const PyPosterior& self, const py::object& data, std::optional<double> duration, int stretches,
+                          const py::object& columns, int n_threads) {
+  using namespace py::literals;
+  const ShootRequest request{duration, stretches, columns_argument(columns), n_threads};
+  const CsvTable table = to_table(data, "data", CsvTable::Keep::text);
+  FitFile file = self.file;
+  file.observations = self.posterior.observations();
+  ShootOutcome shot;
+  std::optional<Posterior> posterior;
+  {
+    const py::gil_scoped_release release;
+    shot = shoot(file, table, request);
+    posterior = shot.fit.posterior();
+  }
+  tell(shot.notes);
+  py::dict parameters, rms;
+  for (const ShotParameter& one : shot.parameters) {
+    parameters[py::str(one.name)] = py::dict("one_by_one"_a = one.one_step, "one_by_one_std"_a = one.one_step_stddev,
+                                             "value"_a = one.value, "std"_a = one.stddev);
+  }
+  for (std::size_t c = 0; c < shot.coordinates.size(); ++c) {
+    const auto k = static_cast<Index>(c);
+    rms[py::str(shot.coordinates[c])] = py::make_tuple(shot.rms_before[k], shot.rms_after[k]);
+  }
+  shot.fit.observations.clear();
+  py::dict report("parameters"_a = parameters, "rms"_a = rms, "duration"_a = shot.duration, "stretches"_a = shot.n_stretches,
+                  "iterations"_a = shot.iterations, "converged"_a = shot.converged);
+  return py::make_tuple(PyPosterior{std::move(shot.fit), std::move(*posterior), {}}, report);
 }
 
 // ---------------------------------------------------------------- data that grow
@@ -641,6 +672,11 @@ void define_evaluate_and_update(py::class_<PyPosterior>& posterior) {
   posterior
       .def("evaluate", &evaluate_posterior, "data"_a, "system"_a = nullptr, "outputs"_a = std::vector<std::string>(),
            "columns"_a = py::none(), "threads"_a = 0, "Compare with measured or true accelerations: the figures of gp2 evaluate.")
+      .def("shoot", &shoot_posterior, "data"_a, "duration"_a = py::none(), "stretches"_a = ShootRequest().most_stretches,
+           "columns"_a = py::none(), "threads"_a = 0,
+           "The estimated parameters anew, by multiple shooting over stretches of a log of consecutive rows (t, coordinates,\n"
+           "velocities, inputs), as gp2 shoot: the posterior under them, and a report (dict) with parameters, the rms of what\n"
+           "motions are off in each coordinate before and after, duration, stretches, iterations, converged.")
       .def(
           "cross_validate",
           [](const PyPosterior& self) {

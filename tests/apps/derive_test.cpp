@@ -127,6 +127,18 @@ TEST_F(FitRaw, GoesFromPositionsToAFit) {
   EXPECT_EQ(desk.read("again.json"), desk.read("fit.json"));
 }
 
+TEST_F(FitRaw, ItsParametersMayBeEstimatedAnewFromTheMotion) {
+  desk.done(
+      fit +
+      "--raw log.csv --max-points 40 --hyperparameters optimise --passes 0 --estimate c1 --smoothed smoothed.csv -o fit.json");
+  const Outcome outcome = desk.done("gp2 shoot fit.json --data smoothed.csv --stretches 4 -o shot.json");
+  EXPECT_TRUE(outcome.said("shot.json: 4 stretches of")) << outcome.err;
+  EXPECT_THAT(outcome.out, testing::ContainsRegex("c1 +[0-9.e-]+ ± [0-9.e-]+ +[0-9.e-]+ ± "));
+  EXPECT_THAT(outcome.out, testing::ContainsRegex("rms off in q3 +[0-9.e-]+ +[0-9.e-]+"));
+  desk.done("gp2 predict shot.json --states smoothed.csv -o prediction.csv");
+  EXPECT_THAT(desk.run("gp2 shoot fit.json --data log.csv -o shot.json").err, HasSubstr("missing column"));
+}
+
 TEST_F(FitRaw, RefusesWhatDoesNotGoTogether) {
   const auto refusal = [&](const std::string& options) {
     const Outcome outcome = desk.run(fit + options + " -o fit.json");

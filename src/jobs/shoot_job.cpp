@@ -1,0 +1,484 @@
+#include "gp2/jobs/shoot_job.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <numbers>
+#include <numeric>
+#include <optional>
+#include <utility>
+
+#include <fmt/format.h>
+#include <fmt/ranges.h>
+#include <Eigen/Eigenvalues>
+#include <Eigen/QR>
+
+#include "base/parallel.hpp"
+#include "gp2/base/statistics.hpp"
+#include "gp2/error.hpp"
+#include "gp2/inference/pathwise.hpp"
+#include "gp2/jobs/fit_problem.hpp"
+#include "gp2/simulate.hpp"
+#include "gp2/training/laplace.hpp"
+
+namespace gp2 {
+
+namespace {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+
+/// Rows of the log, and where the motion over them starts.
+struct Stretch {
+  Index first = 0, size = 0;
+  VectorXd start;
+};
+
+/// The motion over a stretch beside the log, and how both change.
+struct Linearised {
+  VectorXd residual;  // measured − predicted, row after row (compared · rows)
+  MatrixXd by_theta;  // ∂ predicted / ∂x
+  MatrixXd by_start;  // along `basis`
+  MatrixXd basis;     // of changes of the start that keep to the constraints (2 nq × r)
+};
+
+class Shooter {
+ public:
+  Shooter(const FitFile& fit, const CsvTable& log, const ShootRequest& request)
+      : fit_(fit),
+        prior_(fit.prior()),
+        system_(*fit.model.system),
+        view_(View::constrained_acceleration(system_)),
+        switching_(switching_functions(fit.model, /*of_latents=*/true)),
+        n_threads_(thread_count(request.threads)),
+        hyperparameters_(fit.report.hyperparameters) {
+    find_parameters();
+    read(log, request.columns);
+    cut(log, request);
+  }
+
+  ShootOutcome run() {
+    drop_what_cannot_be_followed();
+    ShootOutcome out;
+    for (const int j : compared_) out.coordinates.push_back(system_.coordinates()[static_cast<std::size_t>(j)].name);
+    std::vector<VectorXd> residuals = residuals_at(hyperparameters_, stretches_);
+    out.rms_before = rms_of(residuals);
+    double objective = objective_of(residuals);
+    Step step;
+    VectorXd weights;
+    while (true) {
+      weights = rms_of(residuals).cwiseInverse();
+      const std::vector<Linearised> all = linearise(residuals);
+      step = gauss_newton(all, weights);
+      // an iteration that would change θ by a hundredth of its deviation is none
+      out.converged = step.of_theta.cwiseAbs2().cwiseQuotient(step.covariance.diagonal()).maxCoeff() < 1e-4;
+      if (out.converged || out.iterations == most_iterations || !advance(all, weights, step.of_theta, objective, residuals))
+        break;
+      ++out.iterations;
+    }
+    const MatrixXd covariance = step.covariance + covariance_by_latents(step, weights, residuals);
+    out.rms_after = rms_of(residuals);
+    out.duration = duration_;
+    out.n_stretches = static_cast<int>(stretches_.size());
+    out.notes = std::move(notes_);
+    for (std::size_t a = 0; a < parameters_.size(); ++a) {
+      const std::size_t k = parameters_[a];
+      const Hyperparameter& before = fit_.report.hyperparameters[k];
+      const Hyperparameter& after = hyperparameters_[k];
+      const auto i = static_cast<Index>(a);
+      out.parameters.push_back({before.name, before.unit, before.value, parameter_uncertainty(fit_.report, k).stddev, after.value,
+                                std::sqrt(covariance(i, i)) * std::abs(after.map().value_slope(after.value))});
+      if (after.at_bound()) out.notes.push_back(fmt::format("warning: {} ended at a bound", after.name));
+    }
+    if (!out.converged) out.notes.emplace_back("warning: the last step still changed the parameters: shorter stretches may help");
+    out.fit = fit_;
+    out.fit.report.hyperparameters = hyperparameters_;
+    out.fit.report.draws.reset();
+    out.fit.report.uncertainty.reset();
+    out.fit.report.negative_log_likelihood = posterior_at(hyperparameters_).negative_log_likelihood();
+    out.fit.report.termination = "parameters by multiple shooting";
+    return out;
+  }
+
+ private:
+  void find_parameters() {
+    for (std::size_t k = 0; k < hyperparameters_.size(); ++k) {
+      if (hyperparameters_[k].is_system_parameter() && !hyperparameters_[k].is_fixed()) parameters_.push_back(k);
+    }
+    if (parameters_.empty()) {
+      throw InputError(
+          fmt::format("the fit of '{}' estimates no parameter of the system; mark one by `estimate`, or by estimate = "
+                      "true in the model, and fit again",
+                      system_.name()));
+    }
+  }
+
+  void read(const CsvTable& log, const std::map<std::string, std::string>& columns) {
+    LogReader reader = open_log(fit_.model, log, columns);
+    states_ = reader.states(std::vector<bool>(static_cast<std::size_t>(system_.layout().size()), true));
+    for (int j = 0; j < system_.nq(); ++j) {
+      if (!reader.stddev_column(system_.coordinates()[static_cast<std::size_t>(j)].name).empty()) compared_.push_back(j);
+    }
+    if (!compared_.empty()) return;
+    compared_.resize(system_.coordinates().size());
+    std::iota(compared_.begin(), compared_.end(), 0);
+  }
+
+  [[nodiscard]] auto times() const { return states_.row(system_.layout().t()); }
+
+  // where the log goes on without a break
+  void cut(const CsvTable& log, const ShootRequest& request) {
+    const Index n = states_.cols();
+    std::vector<double> steps;
+    for (Index i = 1; i < n; ++i) {
+      if (const double step = times()[i] - times()[i - 1]; step > 0) steps.push_back(step);
+    }
+    const double usual = steps.empty() ? 0 : median(steps);
+    const int episode = log.find("episode");
+    std::vector<std::pair<Index, Index>> parts;
+    for (Index i = 0; i < n; ++i) {
+      const double step = i == 0 ? 0 : times()[i] - times()[i - 1];
+      const bool goes_on = step > 0 && step < most_steps * usual &&
+                           (episode < 0 || log.cell(static_cast<int>(i), episode) == log.cell(static_cast<int>(i - 1), episode));
+      if (!goes_on) parts.emplace_back(i, 0);
+      ++parts.back().second;
+    }
+    duration_ = request.duration.value_or(usual_duration(parts));
+    if (!(duration_ > 0) || !std::isfinite(duration_))
+      throw InputError(fmt::format("`duration`: must be positive and finite, got {}", duration_));
+    if (request.most_stretches < 1)
+      throw InputError(fmt::format("`stretches`: must be at least 1, got {}", request.most_stretches));
+    const auto size = static_cast<Index>(std::floor(duration_ / std::max(usual, std::numeric_limits<double>::min()) + 1e-9)) + 1;
+    std::vector<Stretch> found;
+    for (const auto& [first, rows] : parts) {
+      for (Index i = first; i + size <= first + rows; i += size) found.push_back({i, size, states_.col(i)});
+    }
+    if (size < least_rows || found.empty()) {
+      throw InputError(
+          fmt::format("{}: no stretch of {:.3g} s with at least {} rows without a break; rows are {:.3g} s apart: "
+                      "another `duration`, or a log of all rows in order of time",
+                      log.name(), duration_, least_rows, usual));
+    }
+    const std::size_t n_taken = std::min(found.size(), static_cast<std::size_t>(request.most_stretches));
+    for (std::size_t k = 0; k < n_taken; ++k) stretches_.push_back(found[k * found.size() / n_taken]);
+    spread_.resize(2 * Index{system_.nq()});
+    for (Index e = 0; e < spread_.size(); ++e) {
+      const double spread = row_stddev(states_.row(e))[0];
+      spread_[e] = spread > 0 ? spread : 1;
+    }
+  }
+
+  /// 2/ω of the middle coordinate, the best of 1, 2, 4 on simulated logs: rms of its velocity over that of its changes in velocity.
+  [[nodiscard]] double usual_duration(const std::vector<std::pair<Index, Index>>& parts) const {
+    std::vector<double> durations;
+    for (const int j : compared_) {
+      const auto dq = states_.row(system_.layout().dq(j));
+      double velocity = 0, acceleration = 0;
+      for (const auto& [first, rows] : parts) {
+        for (Index i = first + 1; i < first + rows; ++i) {
+          velocity += dq[i] * dq[i];
+          acceleration += std::pow((dq[i] - dq[i - 1]) / (times()[i] - times()[i - 1]), 2);
+        }
+      }
+      if (acceleration > 0) durations.push_back(std::sqrt(velocity / acceleration));
+    }
+    constexpr double factor = 2;
+    return durations.empty() ? std::numeric_limits<double>::quiet_NaN() : factor * median(std::move(durations));
+  }
+
+  [[nodiscard]] Posterior posterior_at(const std::vector<Hyperparameter>& hyperparameters) const {
+    return {prior_, fit_.observations, model_values(prior_, fit_.observations, hyperparameters)};
+  }
+
+  /// Measured less predicted positions, row after row; nothing where the motion does not reach the end.
+  [[nodiscard]] std::optional<VectorXd> residual(const Posterior& posterior, const Stretch& stretch,
+                                                 const VectorXd& start) const {
+    const Acceleration mean = [&](const Eigen::Ref<const VectorXd>& x) -> VectorXd { return posterior.mean(view_, x).col(0); };
+    return residual(mean, posterior.values().parameters, stretch, start);
+  }
+  [[nodiscard]] std::optional<VectorXd> residual(const Acceleration& acceleration, const VectorXd& parameters,
+                                                 const Stretch& stretch, const VectorXd& start) const {
+    SimulateOptions options;
+    options.times = times().segment(stretch.first, stretch.size).transpose();
+    options.relative_tolerance = 1e-8;
+    options.absolute_tolerance = 1e-11;
+    options.max_steps = most_steps_per_row * static_cast<int>(stretch.size);  // a motion that runs away takes ever more
+    options.switching = switching_;
+    const StateLayout layout = system_.layout();
+    if (layout.nu > 0) options.inputs = {options.times, states_.block(layout.u(0), stretch.first, layout.nu, stretch.size)};
+    MatrixXd off(compared_.size(), stretch.size);
+    try {
+      const Trajectory motion = simulate(system_, parameters, acceleration, start, options);
+      for (std::size_t c = 0; c < compared_.size(); ++c) {
+        const int j = compared_[c];
+        for (Index i = 0; i < stretch.size; ++i) {
+          const double here = states_(layout.q(j), stretch.first + i) - motion.states(layout.q(j), i);
+          off(static_cast<Index>(c), i) =
+              system_.coordinates()[static_cast<std::size_t>(j)].angle ? std::remainder(here, 2 * std::numbers::pi) : here;
+        }
+      }
+    } catch (const NumericalError&) {
+      return std::nullopt;
+    }
+    if (!off.allFinite()) return std::nullopt;
+    return VectorXd(off.reshaped());
+  }
+
+  void drop_what_cannot_be_followed() {
+    const Posterior posterior = posterior_at(hyperparameters_);
+    std::vector<char> followed(stretches_.size());
+    parallel_for(static_cast<int>(stretches_.size()), n_threads_, [&](int k, int) {
+      const Stretch& stretch = stretches_[static_cast<std::size_t>(k)];
+      followed[static_cast<std::size_t>(k)] = residual(posterior, stretch, stretch.start).has_value() ? 1 : 0;
+    });
+    std::vector<Stretch> kept;
+    for (std::size_t k = 0; k < stretches_.size(); ++k) {
+      if (followed[k] != 0) kept.push_back(stretches_[k]);
+    }
+    if (kept.empty()) throw NumericalError("no stretch of the log can be followed by the motion of the fit");
+    if (kept.size() < stretches_.size()) {
+      notes_.push_back(fmt::format("warning: {} of {} stretches are left out: the motion of the fit does not reach their end",
+                                   stretches_.size() - kept.size(), stretches_.size()));
+    }
+    stretches_ = std::move(kept);
+  }
+
+  /// Empty where a motion cannot be followed.
+  [[nodiscard]] std::vector<VectorXd> residuals_at(const std::vector<Hyperparameter>& hyperparameters,
+                                                   const std::vector<Stretch>& stretches) const {
+    const Posterior posterior = posterior_at(hyperparameters);
+    std::vector<VectorXd> residuals(stretches.size());
+    parallel_for(static_cast<int>(stretches.size()), n_threads_, [&](int k, int) {
+      const Stretch& stretch = stretches[static_cast<std::size_t>(k)];
+      residuals[static_cast<std::size_t>(k)] = residual(posterior, stretch, stretch.start).value_or(VectorXd());
+    });
+    const bool all = std::none_of(residuals.begin(), residuals.end(), [](const VectorXd& one) { return one.size() == 0; });
+    return all ? residuals : std::vector<VectorXd>();
+  }
+
+  [[nodiscard]] VectorXd rms_of(const std::vector<VectorXd>& residuals) const {
+    VectorXd sum = VectorXd::Zero(static_cast<Index>(compared_.size()));
+    double n = 0;
+    for (const VectorXd& one : residuals) {
+      sum += one.reshaped(sum.size(), one.size() / sum.size()).rowwise().squaredNorm();
+      n += static_cast<double>(one.size() / sum.size());
+    }
+    VectorXd rms = (sum / n).cwiseSqrt();
+    constexpr double rounding = 1e-12;
+    for (std::size_t c = 0; c < compared_.size(); ++c) {
+      double& one = rms[static_cast<Index>(c)];
+      one = std::max(one, rounding * spread_[compared_[c]]);
+    }
+    return rms;
+  }
+
+  [[nodiscard]] double objective_of(const std::vector<VectorXd>& residuals) const {
+    return residuals.empty() ? std::numeric_limits<double>::infinity() : rms_of(residuals).array().log().sum();
+  }
+
+  /// Changes of a start that keep to the constraints, in units of the spreads in the log: what is left of changes of each entry by
+  /// itself once they are projected.
+  [[nodiscard]] MatrixXd tangents(const VectorXd& parameters, const VectorXd& start) const {
+    if (system_.nc() == 0) return spread_.asDiagonal();
+    const auto n = spread_.size();
+    const VectorXd at = project_onto_constraints(system_, parameters, start);
+    MatrixXd changes(n, n);
+    for (Index e = 0; e < n; ++e) {
+      VectorXd moved = at;
+      moved[e] += relative_width * spread_[e];
+      changes.col(e) =
+          (project_onto_constraints(system_, parameters, moved) - at).head(n).cwiseQuotient(spread_) / relative_width;
+    }
+    Eigen::ColPivHouseholderQR<MatrixXd> qr(changes);
+    qr.setThreshold(0.03);  // beyond what curvature leaves of a change that the constraints forbid
+    return spread_.asDiagonal() * MatrixXd(qr.householderQ()).leftCols(qr.rank());
+  }
+
+  [[nodiscard]] std::vector<Linearised> linearise(const std::vector<VectorXd>& residuals) const {
+    const Posterior here = posterior_at(hyperparameters_);
+    std::vector<std::pair<Posterior, Posterior>> beside;
+    std::vector<double> widths;
+    for (const std::size_t k : parameters_) {
+      const Hyperparameter& h = hyperparameters_[k];
+      const double x = h.coordinate();
+      const double width =
+          h.map().is_logarithm
+              ? relative_width
+              : relative_width * std::max(std::abs(h.value), relative_width * (h.upper - h.lower)) / h.map().unit;
+      const auto moved = [&](double to) {
+        std::vector<Hyperparameter> all = hyperparameters_;
+        all[k].value = h.map().value(to);
+        return posterior_at(all);
+      };
+      beside.emplace_back(moved(x + width), moved(x - width));
+      widths.push_back(width);
+    }
+    std::vector<Linearised> all(stretches_.size());
+    parallel_for(static_cast<int>(stretches_.size()), n_threads_, [&](int k, int) {
+      const Stretch& stretch = stretches_[static_cast<std::size_t>(k)];
+      Linearised& out = all[static_cast<std::size_t>(k)];
+      out.residual = residuals[static_cast<std::size_t>(k)];
+      const auto slope = [&](const Posterior& more, const VectorXd& start_more, const Posterior& less, const VectorXd& start_less,
+                             double width) -> VectorXd {
+        const std::optional<VectorXd> a = residual(more, stretch, start_more), b = residual(less, stretch, start_less);
+        // one that cannot be followed beside here says nothing of its slope
+        if (!a || !b) return VectorXd::Zero(out.residual.size());
+        return (*b - *a) / (2 * width);
+      };
+      out.by_theta.resize(out.residual.size(), static_cast<Index>(parameters_.size()));
+      for (std::size_t a = 0; a < parameters_.size(); ++a)
+        out.by_theta.col(static_cast<Index>(a)) =
+            slope(beside[a].first, stretch.start, beside[a].second, stretch.start, widths[a]);
+      out.basis = tangents(here.values().parameters, stretch.start);
+      out.by_start.resize(out.residual.size(), out.basis.cols());
+      for (Index e = 0; e < out.basis.cols(); ++e) {
+        VectorXd more = stretch.start, less = stretch.start;
+        more.head(spread_.size()) += relative_width * out.basis.col(e);
+        less.head(spread_.size()) -= relative_width * out.basis.col(e);
+        out.by_start.col(e) = slope(here, more, here, less, relative_width);
+      }
+    });
+    return all;
+  }
+
+  [[nodiscard]] static VectorXd row_weights(const VectorXd& weights, Index size) {
+    return weights.replicate(size / weights.size(), 1);
+  }
+
+  struct Step {
+    std::vector<MatrixXd> J;  // per stretch: weighed derivatives by θ, without what those by its start explain
+    MatrixXd inverse;         // A⁻¹, A = Σ JᵀJ
+    MatrixXd covariance;      // of errors that stretches do not share
+    VectorXd of_theta;
+  };
+
+  [[nodiscard]] Step gauss_newton(const std::vector<Linearised>& all, const VectorXd& weights) const {
+    const auto p = static_cast<Index>(parameters_.size());
+    Step step;
+    MatrixXd A = MatrixXd::Zero(p, p), scatter = A;
+    VectorXd g = VectorXd::Zero(p);
+    for (const Linearised& one : all) {
+      const VectorXd w = row_weights(weights, one.residual.size());
+      const Eigen::ColPivHouseholderQR<MatrixXd> qr(w.asDiagonal() * one.by_start);
+      MatrixXd J = qr.householderQ().adjoint() * (w.asDiagonal() * one.by_theta);
+      J.topRows(qr.rank()).setZero();
+      J = qr.householderQ() * J;
+      const VectorXd gradient = J.transpose() * w.cwiseProduct(one.residual);
+      A += J.transpose() * J;
+      g += gradient;
+      scatter += gradient * gradient.transpose();
+      step.J.push_back(std::move(J));
+    }
+    const VectorXd unit = A.diagonal().cwiseSqrt();
+    if (!(unit.minCoeff() > 0)) throw NumericalError(fmt::format("the motions do not tell apart: {}", fmt::join(names(), ", ")));
+    const auto scaled = unit.cwiseInverse().asDiagonal();
+    const MatrixXd correlation = scaled * A * scaled;
+    constexpr double determined = 1e-10;
+    if (!(Eigen::SelfAdjointEigenSolver<MatrixXd>(correlation).eigenvalues()[0] > determined))
+      throw NumericalError(fmt::format("the motions do not tell apart: {}", fmt::join(names(), ", ")));
+    step.inverse = scaled * correlation.inverse() * scaled;
+    const auto K = static_cast<double>(all.size());
+    step.covariance = step.inverse * scatter * step.inverse * (K / std::max(K - static_cast<double>(p), 1.0));
+    step.of_theta = step.inverse * g;
+    return step;
+  }
+
+  /// What is not known of the latents bends the motions of all stretches alike: the covariance of the steps that motions of functions
+  /// drawn from the posterior would ask for.
+  [[nodiscard]] MatrixXd covariance_by_latents(const Step& step, const VectorXd& weights,
+                                               const std::vector<VectorXd>& residuals) const {
+    const Posterior posterior = posterior_at(hyperparameters_);
+    const PathwiseSamples samples = sample_paths(posterior, n_samples, {.seed = 1});
+    std::vector<MatrixXd> asked(stretches_.size(), MatrixXd::Zero(static_cast<Index>(parameters_.size()), n_samples));
+    parallel_for(static_cast<int>(stretches_.size()), n_threads_, [&](int k, int) {
+      const auto at = static_cast<std::size_t>(k);
+      for (int s = 0; s < n_samples; ++s) {
+        const Acceleration drawn = [&](const Eigen::Ref<const VectorXd>& x) -> VectorXd {
+          return samples.evaluate(s, view_, x).col(0);
+        };
+        const std::optional<VectorXd> there =
+            residual(drawn, posterior.values().parameters, stretches_[at], stretches_[at].start);
+        if (!there) continue;
+        asked[at].col(s) = step.J[at].transpose() * row_weights(weights, there->size()).cwiseProduct(*there - residuals[at]);
+      }
+    });
+    MatrixXd sum = MatrixXd::Zero(static_cast<Index>(parameters_.size()), n_samples);
+    for (const MatrixXd& one : asked) sum += one;
+    const MatrixXd steps = step.inverse * sum;
+    return steps * steps.transpose() / n_samples;
+  }
+
+  [[nodiscard]] std::vector<std::string> names() const {
+    std::vector<std::string> out;
+    for (const std::size_t k : parameters_) out.push_back(hyperparameters_[k].name);
+    return out;
+  }
+
+  /// Goes along a step as far as that brings the motions nearer. @return false where nothing does
+  bool advance(const std::vector<Linearised>& all, const VectorXd& weights, const VectorXd& step, double& objective,
+               std::vector<VectorXd>& residuals) {
+    double length = 1;
+    for (int halving = 0; halving < most_halvings; ++halving, length /= 2) {
+      std::vector<Hyperparameter> there = hyperparameters_;
+      for (std::size_t a = 0; a < parameters_.size(); ++a) {
+        Hyperparameter& h = there[parameters_[a]];
+        h.value = h.value_at(h.coordinate() + length * step[static_cast<Index>(a)]);
+      }
+      std::vector<Stretch> stretches = stretches_;
+      for (std::size_t k = 0; k < all.size(); ++k) {
+        const VectorXd w = row_weights(weights, all[k].residual.size());
+        const VectorXd left = all[k].residual - all[k].by_theta * step;
+        const VectorXd change = (w.asDiagonal() * all[k].by_start).colPivHouseholderQr().solve(w.asDiagonal() * left);
+        stretches[k].start.head(spread_.size()) += length * all[k].basis * change;
+      }
+      std::vector<VectorXd> moved = residuals_at(there, stretches);
+      if (const double value = objective_of(moved); value < objective) {
+        objective = value;
+        residuals = std::move(moved);
+        hyperparameters_ = std::move(there);
+        stretches_ = std::move(stretches);
+        return true;
+      }
+    }
+    return false;
+  }
+
+  static constexpr Index least_rows = 8;   // of a stretch
+  static constexpr double most_steps = 5;  // usual ones, beyond which the log does not go on
+  static constexpr int most_steps_per_row = 50;
+  static constexpr double relative_width = 1e-3;  // of differences: in a logarithm, or in units of a size
+  static constexpr int n_samples = 16;            // of the posterior, for standard deviations
+  static constexpr int most_iterations = 20, most_halvings = 8;
+
+  const FitFile& fit_;
+  Prior prior_;
+  const System& system_;
+  View view_;
+  SwitchingFunctions switching_;
+  int n_threads_;
+  std::vector<Hyperparameter> hyperparameters_;
+  std::vector<std::size_t> parameters_;  // that are estimated, among the hyperparameters
+  std::vector<int> compared_;            // coordinates
+  MatrixXd states_;                      // of the log
+  VectorXd spread_;                      // of q and dq over it (2 nq)
+  double duration_ = 0;
+  std::vector<Stretch> stretches_;
+  std::vector<std::string> notes_;
+};
+
+}  // namespace
+
+std::vector<Option> options(ShootRequest& request) {
+  return {{"duration", &request.duration, "S", "of a stretch [s]", "twice the time in which velocities change by their own size"},
+          {"stretches", &request.most_stretches, "K", "at most so many, evenly taken"},
+          {"map", &request.columns, "LOGNAME=NAME,…", "columns by other names", "", "columns"},
+          threads_option(request.threads)};
+}
+
+ShootOutcome shoot(const FitFile& fit, const CsvTable& log, const ShootRequest& request) {
+  require_threads(request.threads);
+  return Shooter(fit, log, request).run();
+}
+
+}  // namespace gp2
