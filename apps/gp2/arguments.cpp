@@ -1,6 +1,8 @@
 #include <cctype>
 #include <charconv>
+#include <cmath>
 #include <cstdio>
+#include <cstdlib>
 #include <filesystem>
 #include <optional>
 #include <system_error>
@@ -64,6 +66,65 @@ std::map<std::string, std::string> parse_map(const std::string& text) {
           fmt::format("--map: '{}' is given two columns, '{}' and '{}'", name, twice->second, item.substr(0, equals)));
   }
   return columns;
+}
+
+namespace {
+
+// {"q1", "0.4"} of "q1=0.4"; nothing where there is no =
+std::optional<std::pair<std::string, std::string>> split_at_equals(const std::string& item) {
+  const std::size_t equals = item.find('=');
+  if (equals == std::string::npos) return std::nullopt;
+  return std::pair(item.substr(0, equals), item.substr(equals + 1));
+}
+
+// nothing where it is no finite number
+std::optional<double> finite_number(const std::string& text) {
+  char* end = nullptr;
+  const double value = std::strtod(text.c_str(), &end);
+  return text.empty() || *end != '\0' || !std::isfinite(value) ? std::nullopt : std::optional(value);
+}
+
+std::map<std::string, double> parse_start(const std::string& text) {
+  std::map<std::string, double> start;
+  for (const std::string& item : parse_list(text, "--start")) {
+    const auto entry = split_at_equals(item);
+    if (!entry) throw InputError(fmt::format("--start: '{}' is not NAME=VALUE, say q1=0.4", item));
+    const auto& [name, written] = *entry;
+    const std::optional<double> value = finite_number(written);
+    if (!value) throw InputError(fmt::format("--start: {} = '{}' is not a finite number", name, written));
+    if (!start.emplace(name, *value).second) throw InputError(fmt::format("--start: '{}' is given twice", name));
+  }
+  return start;
+}
+
+}  // namespace
+
+Limits parse_limits(const std::string& text, const std::string& option) {
+  Limits limits;
+  for (const std::string& item : parse_list(text, option)) {
+    const auto entry = split_at_equals(item);
+    const std::size_t colon = entry ? entry->second.find(':') : std::string::npos;
+    if (colon == std::string::npos)
+      throw InputError(fmt::format("{}: '{}' is not NAME=LOWEST:HIGHEST, say u1=-5:5", option, item));
+    const auto& [name, range] = *entry;
+    const std::optional<double> lower = finite_number(range.substr(0, colon)), upper = finite_number(range.substr(colon + 1));
+    if (!lower || !upper) throw InputError(fmt::format("{}: {} = '{}' is not two finite numbers", option, name, range));
+    if (!limits.emplace(name, std::pair(*lower, *upper)).second) {
+      throw InputError(fmt::format("{}: '{}' is given twice", option, name));
+    }
+  }
+  return limits;
+}
+
+MotionStart read_start(const std::string& text) {
+  if (text.find('=') != std::string::npos) return parse_start(text);
+  return CsvTable::read(text, CsvTable::Keep::numbers);
+}
+
+Option start_option(std::string& value) {
+  return required({"start", &value, "NAME=VALUE,… or CSV",
+                   "coordinates and velocities, or a CSV whose first row is taken. What is not given follows from the "
+                   "constraints, or is 0"});
 }
 
 void require_output(const std::string& output, const std::vector<std::string>& inputs) {

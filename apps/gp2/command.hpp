@@ -9,7 +9,9 @@
 #include <vector>
 
 #include "gp2/error.hpp"
+#include "gp2/jobs/excite_job.hpp"
 #include "gp2/jobs/option.hpp"
+#include "gp2/jobs/simulate_job.hpp"
 #include "gp2/model.hpp"
 
 namespace gp2::command {
@@ -30,6 +32,7 @@ Command fit_command();
 Command predict_command();
 Command simulate_command();
 Command shoot_command();
+Command excite_command();
 Command evaluate_command();
 Command report_command();
 Command reproduce_command();
@@ -62,6 +65,15 @@ std::vector<std::string> parse_list(const std::string& text, const std::string& 
 /// "q1=5,dq1=3" -> numbers by name.
 /// @throws InputError when it is not of that form.
 std::map<std::string, int> parse_counts(const std::string& text, const std::string& option);
+
+/// "u1=-5:5,u2=0:1" -> lowest and highest values by name.
+/// @throws InputError when it is not of that form.
+Limits parse_limits(const std::string& text, const std::string& option);
+/// The start of a motion: "q1=0.4,dq1=0.8", or the path of a CSV.
+/// @throws InputError when it is neither.
+MotionStart read_start(const std::string& text);
+/// --start, as read_start takes it.
+Option start_option(std::string& value);
 
 /// Whether a file can be written at the end: better said before an hour of work than after.
 /// @param inputs  files that are read, which it must not replace; "" for none

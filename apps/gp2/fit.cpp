@@ -199,10 +199,6 @@ std::vector<std::string> inputs_of(const FitArguments& arguments) {
   return inputs;
 }
 
-std::string interrupted_by(const Interruption& interruption) {
-  return fmt::format("interrupted by signal {} ({})", interruption.signal(), strsignal(interruption.signal()));
-}
-
 // What work() gives; where a signal asked for its end before there was anything to give it is said, and the command ends.
 template <typename Work>
 auto unless_interrupted(const Interruption& interruption, const Work& work) {
@@ -210,7 +206,7 @@ auto unless_interrupted(const Interruption& interruption, const Work& work) {
     return work();
   } catch (const NumericalError&) {
     if (interruption.signal() == 0) throw;
-    print_notes({fmt::format("{} before there was a fit: nothing is written", interrupted_by(interruption))});
+    print_notes({fmt::format("{} before there was a fit: nothing is written", interruption.text())});
     throw Interrupted{interruption.signal()};
   }
 }
@@ -314,8 +310,8 @@ void run(FitArguments& arguments, const std::set<std::string>& given) {
   print_notes({fmt::format("{}: fit of '{}' to {} rows", arguments.output, file.model.system->name(), n_rows)});
   print();
   if (file.report.termination == FitReport::interrupted) {
-    print_notes({fmt::format("{}: {} holds the best so far, not converged; --start {} goes on from there",
-                             interrupted_by(interruption), arguments.output, arguments.output)});
+    print_notes({fmt::format("{}: {} holds the best so far, not converged; --start {} goes on from there", interruption.text(),
+                             arguments.output, arguments.output)});
     if (file.report.iterations == 0) print_notes({"the best so far are starting values: no run has got lower yet"});
     throw Interrupted{interruption.signal()};
   }

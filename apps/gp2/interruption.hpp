@@ -5,10 +5,14 @@
 #include <cerrno>
 #include <csignal>
 #include <cstdint>
+#include <cstring>
 #include <ctime>
+#include <string>
 #include <string_view>
 
 #include <unistd.h>
+
+#include <fmt/format.h>
 
 namespace gp2::command {
 
@@ -43,6 +47,8 @@ class Interruption {
 
   [[nodiscard]] const std::atomic<bool>* stop() const { return &stop_; }
   [[nodiscard]] int signal() const { return signal_; }  // 0: none came
+  /// Of the signal that came.
+  [[nodiscard]] std::string text() const { return fmt::format("interrupted by signal {} ({})", signal(), strsignal(signal())); }
 
  private:
   static constexpr std::array<int, 3> signals = {SIGINT, SIGTERM, SIGHUP};
@@ -52,7 +58,7 @@ class Interruption {
   // a handler may call clock_gettime, sigaction and write, and touch atomics without a lock, and little else
   static void ask(int signal) {
     constexpr std::string_view text =
-        "\ngp2: stopping, which takes some seconds with many rows; once more ends at once, without a fit\n";
+        "\ngp2: stopping, which takes some seconds with many rows; once more ends at once, with nothing saved\n";
     const int error = errno;
     timespec now = {};
     clock_gettime(CLOCK_MONOTONIC, &now);

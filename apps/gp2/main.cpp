@@ -96,11 +96,12 @@ int main(int argc, char** argv) {
       "  gp2 fit models/surface.toml --data train.csv -o fit.json\n"
       "  gp2 predict fit.json --states train.csv --cov std -o prediction.csv\n\n"
       "Exit codes: 0 done, 1 numerical failure, 2 bad input, 128 + n ended by signal n (130 Ctrl-C, 143 SIGTERM; gp2 fit "
-      "saves the best so far). Results go to stdout, talk to stderr.");
-  for (const auto command : {gp2::command::show_command, gp2::command::check_command, gp2::command::generate_command,
-                             gp2::command::derive_command, gp2::command::resample_command, gp2::command::fit_command,
-                             gp2::command::predict_command, gp2::command::simulate_command, gp2::command::evaluate_command,
-                             gp2::command::shoot_command, gp2::command::report_command, gp2::command::reproduce_command}) {
+      "and gp2 excite save the best so far). Results go to stdout, talk to stderr.");
+  for (const auto command :
+       {gp2::command::show_command, gp2::command::check_command, gp2::command::generate_command, gp2::command::derive_command,
+        gp2::command::resample_command, gp2::command::fit_command, gp2::command::predict_command, gp2::command::simulate_command,
+        gp2::command::excite_command, gp2::command::evaluate_command, gp2::command::shoot_command, gp2::command::report_command,
+        gp2::command::reproduce_command}) {
     gp2::command::add_command(app, command());
   }
 

@@ -45,23 +45,6 @@ Subject read_subject(const std::string& file) {
   return {std::move(fit.model), std::move(posterior)};
 }
 
-// "q1=0.4,dq1=0.8"
-std::map<std::string, double> parse_start(const std::string& text) {
-  std::map<std::string, double> start;
-  for (const std::string& item : parse_list(text, "--start")) {
-    const std::size_t equals = item.find('=');
-    if (equals == std::string::npos) throw InputError(fmt::format("--start: '{}' is not NAME=VALUE, say q1=0.4", item));
-    const std::string name = item.substr(0, equals), written = item.substr(equals + 1);
-    char* end = nullptr;
-    const double value = std::strtod(written.c_str(), &end);
-    if (written.empty() || *end != '\0' || !std::isfinite(value)) {
-      throw InputError(fmt::format("--start: {} = '{}' is not a finite number", name, written));
-    }
-    if (!start.emplace(name, value).second) throw InputError(fmt::format("--start: '{}' is given twice", name));
-  }
-  return start;
-}
-
 /// One motion and what goes with it.
 struct Motion {
   Trajectory trajectory;
@@ -208,11 +191,7 @@ std::vector<std::string> notes_of(const std::vector<Motion>& motions, const Syst
 // The request with the files that the arguments name.
 SimulateRequest read_request(const SimulateArguments& arguments, const Model& model) {
   SimulateRequest request = arguments.request;
-  if (arguments.start.find('=') != std::string::npos) {
-    request.start = parse_start(arguments.start);
-  } else {
-    request.start = CsvTable::read(arguments.start, CsvTable::Keep::numbers);
-  }
+  request.start = read_start(arguments.start);
   const double t_start = arguments.t_start ? *arguments.t_start : start_time(model, request.start, request.columns).value_or(0);
   request.times = motion_times(t_start, *arguments.t_end, arguments.time_step);
   if (!arguments.inputs.empty()) request.inputs = CsvTable::read(arguments.inputs, CsvTable::Keep::numbers);
@@ -265,10 +244,7 @@ Command simulate_command() {
                   {}};
   command.options = {
       argument("FILE", a->file, "file written by gp2 fit, or a model file: its force and [truth]"),
-      required(
-          {"start", &a->start, "NAME=VALUE,… or CSV",
-           "coordinates and velocities, or a CSV whose first row is taken. What is not given follows from the constraints, or "
-           "is 0"}),
+      start_option(a->start),
       required({"t_end", &a->t_end, "SECONDS", "end of the motion [s]"}),
       {"t_start", &a->t_start, "SECONDS", "its start [s]", "t of the CSV of --start, or 0"},
       {"dt", &a->time_step, "SECONDS", "time between written rows; the end is always written [s]", "100 rows"},

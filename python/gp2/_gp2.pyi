@@ -269,6 +269,46 @@ class Motion:
     @property
     def evaluations(self) -> int: ...
 
+class _Known(TypedDict):
+    now: float
+    after: float
+    random: float
+
+class _LimitUse(TypedDict):
+    lower: float
+    upper: float
+    lowest: float
+    highest: float
+    share: float
+
+class Excitation:
+    @property
+    def motion(self) -> Motion: ...
+    @property
+    def table(self) -> Table: ...
+    @property
+    def parameters(self) -> dict[str, _Known]: ...
+    @property
+    def accelerations(self) -> dict[str, _Known]: ...
+    @property
+    def limits(self) -> dict[str, _LimitUse]: ...
+    @property
+    def factor(self) -> float: ...
+    @property
+    def random_factor(self) -> float: ...
+    @property
+    def highest_frequency(self) -> float: ...
+    @property
+    def leaves_data(self) -> float | None: ...
+    @property
+    def n_motions(self) -> int: ...
+    @property
+    def n_random(self) -> int: ...
+    @property
+    def n_failed(self) -> int: ...
+    @property
+    def seconds(self) -> float: ...
+
 class Posterior:
     @staticmethod
     def load(path: _Path, system: System | None = None) -> Posterior: ...
@@ -564,3 +604,20 @@ def simulate(
     columns: Mapping[str, str] | None = None,
     # end of options
 ) -> Motion: ...
+def excite(
+    posterior: Posterior,
+    start: Mapping[str, float] | npt.ArrayLike,
+    duration: float,
+    inputs_within: Mapping[str, tuple[float, float]],
+    within: Mapping[str, tuple[float, float]] | None = None,
+    *,
+    # options of excite: written by scripts/options
+    target: Literal["auto", "parameters", "accelerations"] = "auto",
+    n_rows: int = 200,
+    n_harmonics: int = 8,
+    n_motions: int = 1000,
+    seed: int = 0,
+    columns: Mapping[str, str] | None = None,
+    threads: int = 0,
+    # end of options
+) -> Excitation: ...

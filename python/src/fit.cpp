@@ -7,6 +7,7 @@
 #include "bindings.hpp"
 #include "gp2/error.hpp"
 #include "gp2/jobs/derive.hpp"
+#include "gp2/jobs/excite_job.hpp"
 #include "gp2/jobs/fit_job.hpp"
 #include "gp2/jobs/raw_fit.hpp"
 #include "gp2/jobs/resample.hpp"
@@ -236,10 +237,12 @@ void add_fit(py::module_& module) {
         RawFitOptions raw;
         ResampleOptions resample;
         ShowRequest show;
+        ExciteRequest excite;
         const std::map<std::string, std::vector<Option>> tables = {
             {"fit", options(fit)},           {"simulate", options(simulate)},
             {"derive", options(derive)},     {"learn_and_smooth", options(fit_of_raw, raw)},
-            {"resample", options(resample)}, {"show", options(show)}};
+            {"resample", options(resample)}, {"show", options(show)},
+            {"excite", options(excite)}};
         return stub_lines(tables.at(job));
       },
       "job"_a);

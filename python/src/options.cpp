@@ -9,6 +9,7 @@
 #include "bindings.hpp"
 #include "gp2/error.hpp"
 #include "gp2/jobs/derive.hpp"
+#include "gp2/jobs/excite_job.hpp"
 #include "gp2/jobs/fit_job.hpp"
 #include "gp2/jobs/generate_job.hpp"
 #include "gp2/jobs/predict_job.hpp"
@@ -184,11 +185,12 @@ const std::vector<Option>& every_option() {
   static GenerateRequest generate;
   static DeriveOptions derive;
   static ResampleOptions resample;
+  static ExciteRequest excite;
   static ShootRequest shoot;
   static const std::vector<Option> all = [] {
     std::vector<Option> list;
     for (std::vector<Option> table : {options(fit, raw), options(predict), options(evaluate), options(simulate),
-                                      options(generate), options(derive), options(resample), options(shoot)}) {
+                                      options(generate), options(derive), options(resample), options(excite), options(shoot)}) {
       list.insert(list.end(), table.begin(), table.end());
     }
     return list;

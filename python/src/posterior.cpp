@@ -10,6 +10,7 @@
 #include "arrays.hpp"
 #include "bindings.hpp"
 #include "gp2/error.hpp"
+#include "gp2/jobs/excite_job.hpp"
 #include "gp2/jobs/fit_job.hpp"
 #include "gp2/jobs/fit_problem.hpp"
 #include "gp2/jobs/predict_job.hpp"
@@ -316,6 +317,101 @@ std::string simulate_documentation(const std::string& first) {
   SimulateRequest request;
   return signature("simulate", first + "start: Mapping[str, float] | ArrayLike, times: ArrayLike, inputs: object = None, *,",
                    options(request), "", first == "self: Posterior, " ? "Motion | list[Motion]" : "Motion");
+}
+
+// ---------------------------------------------------------------- the next experiment
+
+/// gp2.Excitation
+struct PyExcitation {
+  Excitation found;
+  Motion motion;
+  std::shared_ptr<const System> system;
+};
+
+Limits limits_argument(const py::object& limits, const std::string& name) {
+  if (limits.is_none()) return {};
+  try {
+    return limits.cast<Limits>();
+  } catch (const py::cast_error&) {
+    throw py::type_error(
+        fmt::format("{}: expected a dict of names to (lowest, highest), got {}", name, std::string(py::repr(limits))));
+  }
+}
+
+PyExcitation excite_posterior(const PyPosterior& self, const py::object& start, double duration, const py::object& inputs_within,
+                              const py::object& within, const py::kwargs& keywords) {
+  ExciteRequest request;
+  read_keywords("excite", keywords, options(request));
+  request.start = start_argument(start, self.system());
+  request.duration = duration;
+  request.inputs_within = limits_argument(inputs_within, "inputs_within");
+  request.within = limits_argument(within, "within");
+  const Posterior posterior = self.posterior;
+  const auto search = [&](const std::atomic<bool>* stop) {
+    Excitation found = excite(self.file.model, posterior, self.file.report.hyperparameters, request, {}, stop);
+    MotionUncertainty uncertainty = motion_uncertainty(posterior, found.motion);
+    return PyExcitation{found, {found.motion, std::move(uncertainty)}, self.file.model.system};
+  };
+  std::atomic<bool> stop = false;
+  std::exception_ptr raised;
+  std::optional<PyExcitation> out;
+  try {
+    out = run_interruptibly([&] { return search(&stop); }, stop, raised, [] {});
+  } catch (const NumericalError&) {
+    if (!raised) throw;
+  }
+  if (raised) std::rethrow_exception(raised);
+  tell(out->found.notes);
+  return std::move(*out);
+}
+
+py::dict known_dict(const std::vector<Excitation::Known>& known) {
+  using namespace py::literals;
+  py::dict out;
+  for (const Excitation::Known& one : known) {
+    out[py::str(one.name)] = py::dict("now"_a = one.now, "after"_a = one.after, "random"_a = one.random);
+  }
+  return out;
+}
+
+py::dict limits_dict(const std::vector<Excitation::LimitUse>& limits) {
+  using namespace py::literals;
+  py::dict out;
+  for (const Excitation::LimitUse& one : limits) {
+    out[py::str(one.name)] = py::dict("lower"_a = one.lower, "upper"_a = one.upper, "lowest"_a = one.lowest,
+                                      "highest"_a = one.highest, "share"_a = one.share);
+  }
+  return out;
+}
+
+void add_excitation(py::module_& module) {
+  py::class_<PyExcitation>(module, "Excitation", "A motion to drive a system along, and what measuring it is expected to tell.")
+      .def_readonly("motion", &PyExcitation::motion, "As the fit predicts it.")
+      .def_property_readonly(
+          "table", [](const PyExcitation& e) { return as_table(e.found.motion, *e.system, "excitation"); },
+          "t, q, dq, ddq and the inputs: simulate takes it as inputs.")
+      .def_property_readonly(
+          "parameters", [](const PyExcitation& e) { return known_dict(e.found.parameters); },
+          "Standard deviation of each estimated parameter: now, after this motion, after a random one (median).")
+      .def_property_readonly(
+          "accelerations", [](const PyExcitation& e) { return known_dict(e.found.accelerations); },
+          "The same of accelerations, root mean square where motions within the limits go; of target='accelerations'.")
+      .def_property_readonly(
+          "limits", [](const PyExcitation& e) { return limits_dict(e.found.limits); },
+          "Of each limit: lower, upper; lowest and highest of the motion; the share that it uses.")
+      .def_property_readonly(
+          "factor", [](const PyExcitation& e) { return e.found.factor; }, "By what factor deviations fall.")
+      .def_property_readonly(
+          "random_factor", [](const PyExcitation& e) { return e.found.random_factor; }, "By a random motion (median).")
+      .def_property_readonly(
+          "highest_frequency", [](const PyExcitation& e) { return e.found.highest_frequency; }, "Of inputs [Hz].")
+      .def_property_readonly(
+          "leaves_data", [](const PyExcitation& e) { return e.found.leaves_data; },
+          "When the motion first is far from the data [s]; None: never.")
+      .def_property_readonly("n_motions", [](const PyExcitation& e) { return e.found.n_motions; })
+      .def_property_readonly("n_random", [](const PyExcitation& e) { return e.found.n_random; })
+      .def_property_readonly("n_failed", [](const PyExcitation& e) { return e.found.n_failed; })
+      .def_property_readonly("seconds", [](const PyExcitation& e) { return e.found.seconds; });
 }
 
 // ---------------------------------------------------------------- files
@@ -740,6 +836,32 @@ Returns a Motion, or with n_samples a list of them. Raises NumericalError, with 
           .c_str());
 }
 
+void define_excite(py::module_& module) {
+  using namespace py::literals;
+  ExciteRequest request;
+  py::options own_signature;
+  own_signature.disable_function_signatures();
+  module.def(
+      "excite", &excite_posterior, "posterior"_a, "start"_a, "duration"_a, "inputs_within"_a, "within"_a = py::none(),
+      (signature("excite",
+                 "posterior: Posterior, start: Mapping[str, float] | ArrayLike, duration: float, inputs_within: Mapping[str, "
+                 "tuple[float, float]], within: Mapping[str, tuple[float, float]] | None = None, *,",
+                 options(request), "", "Excitation") +
+       R"(
+Find the motion, within limits, that measuring will tell most of what is not known: which experiment next.
+
+start          as of Posterior.simulate
+duration       [s]
+inputs_within  {"u": (-5, 5)}: lowest and highest value of every input
+within         {"q": (-1, 1), "dq": (-3, 3)}: of coordinates, velocities and accelerations; default: they may go anywhere
+
+)" + documentation(options(request)) +
+       R"(
+Returns an Excitation. Same seed, same motion, for any number of threads; Ctrl-C ends the search.
+Raises InputError for limits that do not fit, or that no motion keeps; NumericalError when none could be integrated.)")
+          .c_str());
+}
+
 }  // namespace
 
 void add_posterior(py::module_& module) {
@@ -748,6 +870,7 @@ void add_posterior(py::module_& module) {
   add_prediction(module);
   add_evaluation(module);
   add_motion(module);
+  add_excitation(module);
 
   using namespace py::literals;
   py::class_<PyPosterior> posterior(module, "Posterior", "A prior conditioned on data. Made by gp2.fit or gp2.load.");
@@ -762,6 +885,7 @@ void add_posterior(py::module_& module) {
       "Read a FIT.json: a Posterior.\n\nsystem: where the fit was of one with Python functions, that one; they are not in the "
       "file.\n\nRaises InputError naming the file and what is wrong.");
   define_simulate(posterior, module);
+  define_excite(module);
 }
 
 }  // namespace gp2::python

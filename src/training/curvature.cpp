@@ -109,6 +109,12 @@ double Curvature::distance_from_optimum() const {
   return std::sqrt((eigenvalues.array() > zero).select(slopes.array().square() / eigenvalues.array().max(zero), 0).sum());
 }
 
+MatrixXd Curvature::information() const {
+  const VectorXd steep = (eigenvalues.array() > zero).select(eigenvalues, 0);
+  const MatrixXd axes = unit.cwiseInverse().asDiagonal() * eigenvectors;
+  return axes * steep.asDiagonal() * axes.transpose();
+}
+
 Curvature curvature_at(const Objective& objective, const VectorXd& x, const std::vector<Hyperparameter>& hyperparameters,
                        int n_threads, const std::atomic<bool>* stop) {
   const Differences differences(objective, x, hyperparameters, stop);

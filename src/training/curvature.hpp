@@ -28,6 +28,8 @@ struct Curvature {
   /// √(gᵀH⁻¹g), how many standard deviations the minimum is away, without directions of no curvature; ∞ where the objective
   /// curves downwards along a direction, so that there is no minimum near.
   [[nodiscard]] double distance_from_optimum() const;
+  /// H of the free hyperparameters without what may be zero: positive semidefinite.
+  [[nodiscard]] Eigen::MatrixXd information() const;
 };
 
 /// H by differences of the exact gradient: two evaluations for each free hyperparameter, six for each θ. The results do not

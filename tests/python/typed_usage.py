@@ -50,3 +50,9 @@ def wrong(posterior: gp2.Posterior) -> None:
 
 if __name__ == "__main__":
     main(sys.argv[1])
+
+
+def next_experiment(posterior: gp2.Posterior) -> float:
+    plan = gp2.excite(posterior, {"q": 0.1}, 5, {"u": (-1, 1)}, within={"dq": (-3, 3)}, target="parameters", n_motions=100)
+    motion: gp2.Motion = posterior.simulate({"q": 0.1}, plan.motion.t, inputs=plan.table)
+    return plan.parameters["m"]["after"] + plan.limits["u"]["share"] + float(motion.q[-1, 0])
