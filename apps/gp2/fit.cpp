@@ -31,7 +31,7 @@ using Json = nlohmann::ordered_json;
 struct FitArguments {
   std::string model, again, output;
   std::vector<std::string> data, also;
-  std::string raw, smoothed;
+  std::string raw, smoothed, commands;
   RawFitOptions raw_options;
   bool json = false;
   FitRequest request;
@@ -136,6 +136,14 @@ Json to_json(const FitProblem& problem, const FitOutcome& outcome) {
     json["standard_errors"] = {{"parameters", errors}};
   }
   if (report.draws) json["draws"] = draws_json(report);
+  for (const ActuatorEstimate& one : report.actuators) {
+    json["actuators"].push_back({{"name", one.name},
+                                 {"value", one.value},
+                                 {"stddev", number_or_null(one.stddev)},
+                                 {"lower", one.lower},
+                                 {"upper", one.upper},
+                                 {"at_bound", one.at_lower() || one.at_upper()}});
+  }
   if (outcome.cross_validation) {
     json["left_out"]["one_by_one"] = to_json(outcome.cross_validation->one_by_one);
     const std::optional<Evaluation::Part>& stretches = outcome.cross_validation->stretches;
@@ -171,6 +179,13 @@ void print_text(const FitReport& report) {
   print_result("{} after {} iterations ({} restarts, best: {}), {:.2f} s\n", report.termination, report.iterations,
                report.restarts.size(), report.best_restart + 1, report.seconds);
   if (report.draws) print_draws(report);
+  for (const ActuatorEstimate& one : report.actuators) {
+    const std::string error = std::isnan(one.stddev)   ? ""
+                              : std::isinf(one.stddev) ? " ± ∞"
+                                                       : fmt::format(" ± {:.2g}", one.stddev);
+    print_result("  {:<34} {:>13.6g}{}   [{:.3g}, {:.3g}]{}\n", one.name, one.value, error, one.lower, one.upper,
+                 one.at_lower() || one.at_upper() ? "   at its bound" : "");
+  }
   for (std::size_t k = 0; k < report.hyperparameters.size(); ++k) {
     const Hyperparameter& h = report.hyperparameters[k];
     const ParameterUncertainty known =
@@ -195,7 +210,7 @@ std::vector<std::string> inputs_of(const FitArguments& arguments) {
   };
   for (const std::string& log : arguments.data) add(log);
   for (const std::string& log : arguments.also) add(log.substr(log.find(':') + 1));
-  inputs.push_back(arguments.raw);
+  inputs.insert(inputs.end(), {arguments.raw, arguments.commands});
   return inputs;
 }
 
@@ -222,6 +237,7 @@ void read_data(FitArguments& arguments) {
   FitRequest& request = arguments.request;
   request.data_source = data_source_of(arguments);
   for (const std::string& text : arguments.data) request.logs.push_back(read_log(text));
+  if (!arguments.commands.empty()) request.problem.commands = CsvTable::read(arguments.commands, CsvTable::Keep::numbers);
   for (const std::string& text : arguments.also) request.also.push_back(read_side_information(text));
 }
 
@@ -239,6 +255,7 @@ void read_raw(FitArguments& arguments, const std::atomic<bool>* stop) {
   request.problem.columns.clear();
   request.problem.max_points.reset();
   request.logs.push_back({log.table(system, arguments.raw)});
+  request.problem.commands = as_table(log.data, system, arguments.raw);
 }
 
 FitJob prepare(FitArguments& arguments, const Interruption& interruption) {
@@ -266,7 +283,7 @@ void require_inputs(const FitArguments& arguments, const std::set<std::string>& 
       throw UsageError{"--data or --raw is required, or --also alone"};
     return;
   }
-  const std::set<std::string> allowed = {"again", "data", "also", "threads", "json", "output"};
+  const std::set<std::string> allowed = {"again", "data", "commands", "also", "threads", "json", "output"};
   for (const std::string& name : given) {
     if (!allowed.contains(name)) {
       throw InputError(fmt::format("`again`: {} has its model and options: leave out {}", arguments.again,
@@ -334,6 +351,8 @@ Command fit_command() {
       {"also", Repeated{&a->also}, "VIEW[@LATENT]:CSV[@OTHER.toml]",
        "another quantity, measured or known, say unconstrained:rest.csv with abar_q1 …: the columns that are there are observed. "
        "May be given several times, and without --data"},
+      {"commands", &a->commands, "CSV",
+       "the whole log of t and inputs, and of episode where there are, that --data are rows of: where inputs act late"},
       {"raw", &a->raw, "LOG",
        "instead of --data: CSV log of t and positions, which learning and smoothing by turns makes data of (docs/raw-logs.md)"},
       {"smoothed", &a->smoothed, "CSV", "file to write q, dq and ddq of the raw log to, with deviations", "", "", "", "raw"},

@@ -52,12 +52,15 @@ struct Motion {
   std::optional<Eigen::VectorXd> energy;         // of a model with a potential
 };
 
-std::string csv_of(const std::vector<Motion>& motions, const Subject& subject, bool with_sample, bool with_stddev) {
+/// @param commands  written as the inputs, so that the file reads as a log does
+std::string csv_of(const std::vector<Motion>& motions, const Subject& subject, const InputSignal& commands, bool with_sample,
+                   bool with_stddev) {
   const System& system = subject.system();
   const StateLayout layout = system.layout();
   const std::vector<std::string> names = system.state_names();
   std::string csv;
   std::vector<std::string> line;
+  Eigen::VectorXd command(layout.nu);
   const auto end_line = [&] {
     csv += fmt::format("{}\n", fmt::join(line, ","));
     line.clear();
@@ -87,7 +90,8 @@ std::string csv_of(const std::vector<Motion>& motions, const Subject& subject, b
       line.push_back(shortest(trajectory.times[i]));
       add(trajectory.states.col(i).head(2 * layout.nq));
       add(trajectory.accelerations.col(i));
-      add(trajectory.states.col(i).tail(layout.nu));
+      commands.evaluate(trajectory.times[i], command);
+      add(command);
       if (system.nc() > 0) add(trajectory.records.col(i));
       if (with_stddev) {
         add(motions[k].uncertainty->stddev.col(i));
@@ -226,8 +230,8 @@ void run(const SimulateArguments& arguments) {
   }
   const std::vector<Motion> motions = with_uncertainty(std::move(trajectories), subject, job);
   if (motions.empty()) throw NumericalError(unfinished);
-  write_file(arguments.output,
-             csv_of(motions, subject, request.n_samples.has_value(), subject.posterior.has_value() && !request.n_samples));
+  write_file(arguments.output, csv_of(motions, subject, job.commands, request.n_samples.has_value(),
+                                      subject.posterior.has_value() && !request.n_samples));
   print_notes(notes_of(motions, subject.system(), arguments));
   if (arguments.json) print_result("{}\n", report_of(motions, subject.system()).dump(2));
   if (!unfinished.empty()) throw NumericalError(fmt::format("{}; {} holds what was reached", unfinished, arguments.output));

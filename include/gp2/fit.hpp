@@ -96,6 +96,17 @@ struct HyperparameterDraws {
   [[nodiscard]] bool is_drawn(Eigen::Index k) const { return stddev[k] > 0; }
 };
 
+/// A delay or lag of an input (gp2/actuator.hpp), estimated before all else.
+struct ActuatorEstimate {
+  std::string name;
+  double value = 0;             // [s]
+  double stddev = 0;            // [s] NaN at a bound, ∞ where the data do not determine it
+  double lower = 0, upper = 0;  // bounds [s]
+
+  [[nodiscard]] bool at_lower() const { return value - lower <= 1e-6 * (upper - lower); }
+  [[nodiscard]] bool at_upper() const { return upper - value <= 1e-6 * (upper - lower); }
+};
+
 struct FitReport {
   static constexpr const char* interrupted = "interrupted";  // termination of a fit that was stopped on request
 
@@ -110,6 +121,7 @@ struct FitReport {
   std::vector<RestartReport> restarts;
   std::optional<LaplaceUncertainty> uncertainty;  // of the hyperparameters, in their order
   std::optional<HyperparameterDraws> draws;       // of FitOptions::n_draws
+  std::vector<ActuatorEstimate> actuators;        // known from then on: nothing above allows for their errors
   std::vector<DistrustedValue> distrusted;        // of a robust fit, the farthest first
   double seconds = 0;
 };

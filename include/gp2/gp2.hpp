@@ -2,6 +2,7 @@
 
 /// Everything that a first program needs: a model and its logs in, a posterior and its predictions out.
 
+#include "gp2/actuator.hpp"
 #include "gp2/data/csv.hpp"
 #include "gp2/error.hpp"
 #include "gp2/files/fit_file.hpp"

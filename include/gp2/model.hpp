@@ -12,6 +12,7 @@
 
 #include <Eigen/Core>
 
+#include "gp2/actuator.hpp"
 #include "gp2/export.hpp"
 #include "gp2/mechanics/symbolic_system.hpp"
 #include "gp2/prior/latent_spec.hpp"
@@ -107,6 +108,7 @@ class Model {
   std::optional<RobotDescription> robot;   // that the model file names
   std::shared_ptr<ExpressionGraph> graph;  // of every expression here
   std::shared_ptr<const System> system;
+  std::vector<Actuator> actuators;  // of each input; of a fit that estimated them with its values
   std::vector<DerivedParameter> derived_parameters;
   std::vector<LatentSpec> latents;
   Noise noise;
@@ -146,6 +148,9 @@ const SymbolicSystem& require_symbolic_system(const Model& model);
 /// The prior of a model file. Not to be called from several threads for one model: its expression graph grows.
 /// @throws InputError when a kernel or feature is wrong, or `base` is asked for and the model has several latents.
 Prior make_prior(const Model& model, const PriorOptions& options = {});
+
+/// The actuators of `other`: a delay or lag that it marks `estimate = true` is that of the same input of `home`.
+std::vector<Actuator> shared_actuators(const std::vector<Actuator>& home, const Model& other);
 
 /// The system of `other` for the latents of `home` to act in. A parameter that `other` marks `estimate = true` and `home` has
 /// by the same name is one and the same; every other keeps the value of its own file. As make_prior, not to be called from

@@ -61,7 +61,8 @@ class Observations {
   [[nodiscard]] const Noise& noise() const { return noise_; }
   [[nodiscard]] int n_data() const { return static_cast<int>(states_.cols()); }
 
-  /// The same states with another view, other values, another noise. @throws InputError as the constructor.
+  /// The same with other states, another view, other values, another noise. @throws InputError as the constructor.
+  [[nodiscard]] Observations with_states(Eigen::MatrixXd states) const { return {std::move(states), view_, values_, noise_}; }
   [[nodiscard]] Observations with_view(View view) const { return {states_, std::move(view), values_, noise_}; }
   [[nodiscard]] Observations with_values(Eigen::MatrixXd values) const { return {states_, view_, std::move(values), noise_}; }
   [[nodiscard]] Observations with_noise(Noise noise) const { return {states_, view_, values_, std::move(noise)}; }

@@ -8,6 +8,7 @@
 
 #include <Eigen/Core>
 
+#include "gp2/actuator.hpp"
 #include "gp2/error.hpp"
 #include "gp2/export.hpp"
 #include "gp2/mechanics/check.hpp"
@@ -19,26 +20,32 @@ namespace gp2 GP2_API {
 /// ddq at one state [q; dq; t; u]: a model's own, a posterior mean, or one sample of a posterior.
 using Acceleration = std::function<Eigen::VectorXd(const Eigen::Ref<const Eigen::VectorXd>& state)>;
 
-/// Inputs over time: zero, or a table that is linear in between and held at its ends.
+/// Inputs over time: zero, or a table of commands that is linear in between and held at its ends, as their actuators follow it,
+/// exactly; they are at rest before the table.
 class InputSignal {
  public:
   InputSignal() = default;  // zero
-  /// @param times   (K), strictly increasing
-  /// @param values  (nu × K)
+  /// @param times      (K), strictly increasing
+  /// @param values     (nu × K)
+  /// @param actuators  of each input; empty: the commands act themselves
   /// @throws InputError when the sizes differ, K = 0, times do not increase, or a number is not finite.
-  InputSignal(Eigen::VectorXd times, Eigen::MatrixXd values);
+  InputSignal(Eigen::VectorXd times, Eigen::MatrixXd values, const std::vector<Actuator>& actuators = {});
 
   [[nodiscard]] bool is_zero() const { return times_.size() == 0; }
   [[nodiscard]] int size() const { return static_cast<int>(values_.rows()); }  // nu; 0 of the zero signal
 
-  /// u(t).
+  /// What acts at t.
   void evaluate(double t, Eigen::Ref<Eigen::VectorXd> u) const;
   /// The first time after t at which a slope changes; +∞ when there is none.
   [[nodiscard]] double next_kink(double t) const;
 
  private:
+  void find_kinks();
+
   Eigen::VectorXd times_;
   Eigen::MatrixXd values_;
+  Eigen::VectorXd delay_, lag_;  // of each input (nu)
+  Eigen::MatrixXd acting_;       // when each command arrives, at times_ + delay_ (nu × K)
   std::vector<double> kinks_;
 };
 

@@ -59,7 +59,7 @@ class System:
         mass: Sequence[Sequence[_Text]] | npt.NDArray[Any] | None = None,
         robot: _Path | None = None,
         name: str | None = None,
-        inputs: Sequence[str] = (),
+        inputs: Sequence[str | Mapping[str, Any]] = (),
         parameters: Mapping[str, float | Mapping[str, Any]] | None = None,
         let: Mapping[str, _Text] | None = None,
         force: Sequence[_Text] | None = None,
@@ -160,6 +160,8 @@ class FitReport:
     def restarts(self) -> list[RestartReport]: ...
     @property
     def distrusted(self) -> list[dict[str, Any]]: ...
+    @property
+    def actuators(self) -> list[dict[str, Any]]: ...
     @property
     def seconds(self) -> float: ...
     @property
@@ -470,6 +472,7 @@ def fit(
     system: System,
     data: _Table | Log | _Arrays | list[Any],  # of these
     *,
+    commands: _Table | None = None,
     also: Sequence[SideInformation] = [],
     # options of fit: written by scripts/options
     also_noise_std: float | None = None,

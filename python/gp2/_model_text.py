@@ -15,7 +15,7 @@ def model_text(
     mass: Sequence[Sequence[Any]] | None = None,
     robot: str | PathLike[str] | None = None,
     name: str | None = None,
-    inputs: Sequence[str] = (),
+    inputs: Sequence[str | Mapping[str, Any]] = (),
     parameters: Mapping[str, Any] | None = None,
     let: Mapping[str, Any] | None = None,
     force: Sequence[Any] | None = None,

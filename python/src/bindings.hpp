@@ -72,7 +72,8 @@ void tell(const std::vector<std::string>& notes);
 class States {
  public:
   /// @throws InputError when an entry that the prior or the view reads is not finite; as Rows and read_log_states.
-  States(const py::object& data, const Prior& prior, const View& view, const Model& model, const py::object& columns);
+  States(const py::object& data, const Prior& prior, const View& view, const Model& model, const std::vector<Actuator>& actuators,
+         const py::object& columns);
 
   [[nodiscard]] Eigen::Map<const Eigen::MatrixXd> matrix() const;  // (layout size × n)
 

@@ -58,7 +58,7 @@ CsvTable table_of(const py::tuple& arrays, const System& system) {
 }
 
 std::vector<Log> logs_of(const py::object& data, const System& system) {
-  if (py::isinstance<py::tuple>(data)) return {{table_of(data, system), nullptr}};
+  if (py::isinstance<py::tuple>(data)) return {{table_of(data, system), nullptr, false}};
   if (!py::isinstance<py::list>(data)) {
     if (py::isinstance<PyLog>(data)) return logs_of(py::list(py::make_tuple(data)), system);
     return {log_of(data, std::nullopt, "data")};
@@ -70,7 +70,7 @@ std::vector<Log> logs_of(const py::object& data, const System& system) {
       const auto& log = entry.cast<const PyLog&>();
       logs.push_back(log_of(log.data, log.system, what));
     } else if (py::isinstance<py::tuple>(entry)) {
-      logs.push_back({table_of(entry.cast<py::tuple>(), system), nullptr});
+      logs.push_back({table_of(entry.cast<py::tuple>(), system), nullptr, false});
     } else {
       logs.push_back(log_of(entry.cast<py::object>(), std::nullopt, what));
     }
@@ -146,7 +146,9 @@ PyPosterior fit_model(const PySystem& system, const py::object& data, const py::
   FitRequest request;
   const auto progress = take<py::object>(keywords, "progress", py::none());
   const auto also = take<std::vector<PySideInformation>>(keywords, "also", {});
+  const auto commands = take<py::object>(keywords, "commands", py::none());
   read_keywords("fit", keywords, options(request));
+  if (!commands.is_none()) request.problem.commands = to_table(commands, "commands");
   request.model = *system.model;
   request.logs = logs_of(data, system.system());
   request.also = side_information_of(also);
@@ -171,13 +173,15 @@ PyPosterior fit_again(const py::object& path, const py::object& data, const std:
 std::string fit_documentation() {
   FitRequest request;
   const std::vector<Option> table = options(request);
-  return signature("fit", "system: System, data: object, *, also: Sequence[SideInformation] = [],", table,
-                   ", progress: Callable[[Progress], object] | None = None", "Posterior") +
+  return signature("fit", "system: System, data: object, *, commands: object = None, also: Sequence[SideInformation] = [],",
+                   table, ", progress: Callable[[Progress], object] | None = None", "Posterior") +
          R"(
 Fit a system to measured accelerations.
 
 data        a path, Table, pandas frame or mapping with columns named as the model's (or aliases); or (states, accelerations),
             arrays (n, len(state_names)) and (n, nq); or a list of these and of Log, empty where `also` is all there is. NaN, or None, of an acceleration is "not measured"
+commands    where inputs act late and `data` are rows of a longer log: that log, t and inputs, and `episode` where there is one.
+            Inputs of tables are commands; those of arrays are what acts
 also        list of SideInformation: other quantities, measured or known
 progress    called with a Progress some times a second
 

@@ -67,7 +67,7 @@ Prediction predict(const PyPosterior& self, const py::object& data, const ViewAr
   require_at_least(0, n_threads, "threads");
   const ViewRequest request = view_request(arguments);
   const PredictedView at = predicted_view(self.file, self.posterior.prior(), request);
-  const States states(data, at.prior, at.view, *at.model, columns);
+  const States states(data, at.prior, at.view, *at.model, at.actuators, columns);
   const auto x = states.matrix();
   const Index d = at.view.size(), n = x.cols();
   MatrixXd mean(d, n), stddev(mean_only ? 0 : d, n), covariance(mean_only ? 0 : d * d, n);
@@ -119,7 +119,7 @@ py::array asked_for(const std::optional<py::array>& values) {
 py::tuple joint(const PyPosterior& self, const py::object& data, const ViewArguments& arguments, const py::object& columns) {
   const ViewRequest request = view_request(arguments);
   const PredictedView at = predicted_view(self.file, self.posterior.prior(), request);
-  const States states(data, at.prior, at.view, *at.model, columns);
+  const States states(data, at.prior, at.view, *at.model, at.actuators, columns);
   const Posterior posterior = self.posterior;
   Posterior::Joint result = states.named([&] {
     const py::gil_scoped_release release;
@@ -134,7 +134,7 @@ py::array sample(const PyPosterior& self, const py::object& data, int n_samples,
   require_at_least(1, n_samples, "n_samples");
   const ViewRequest request = view_request(arguments);
   const PredictedView at = predicted_view(self.file, self.posterior.prior(), request);
-  const States states(data, at.prior, at.view, *at.model, columns);
+  const States states(data, at.prior, at.view, *at.model, at.actuators, columns);
   const Posterior posterior = self.posterior;
   MatrixXd samples = states.named([&] {
     const py::gil_scoped_release release;
@@ -432,6 +432,20 @@ void save(const PyPosterior& self, const py::object& path) {
 
 // ---------------------------------------------------------------- report
 
+py::list actuators_of(const FitReport& self) {
+  py::list out;
+  for (const ActuatorEstimate& one : self.actuators) {
+    py::dict entry;
+    entry["name"] = one.name;
+    entry["value"] = one.value;
+    entry["stddev"] = one.stddev;
+    entry["lower"] = one.lower;
+    entry["upper"] = one.upper;
+    out.append(entry);
+  }
+  return out;
+}
+
 py::list distrusted_values(const FitReport& self) {
   py::list list;
   for (const DistrustedValue& value : self.distrusted) {
@@ -520,6 +534,10 @@ void define_report(py::class_<FitReport>& report) {
       .def_property_readonly(
           "distrusted", &distrusted_values,
           "Values that a robust fit distrusts, the farthest first: `log` and `state` count from 0, `row` among the observed.")
+      .def_property_readonly(
+          "actuators", &actuators_of,
+          "Delays and lags of inputs that were estimated, in s: dicts of name, value, stddev (nan at a bound, inf "
+          "where the data do not determine it), lower and upper.")
       .def_readonly("seconds", &FitReport::seconds)
       .def_property_readonly("standard_errors", &standard_errors,
                              "Of estimated parameters, by name: inf where the data do not determine one, nan where it is at a "

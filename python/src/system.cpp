@@ -193,11 +193,12 @@ void tell(const std::vector<std::string>& notes) {
   }
 }
 
-States::States(const py::object& data, const Prior& prior, const View& view, const Model& model, const py::object& columns) {
+States::States(const py::object& data, const Prior& prior, const View& view, const Model& model,
+               const std::vector<Actuator>& actuators, const py::object& columns) {
   const System& system = *prior.system;
   if (!is_array(data)) {
     const CsvTable table = to_table(data, "states");
-    LogStates log = read_log_states(prior, view, model, table, columns_argument(columns));
+    LogStates log = read_log_states(prior, view, model, table, columns_argument(columns), {}, actuators);
     tell(log.notes);
     table_ = table.name();
     read_ = std::move(log.states);

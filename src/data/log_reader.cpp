@@ -183,6 +183,12 @@ MatrixXd LogReader::stddevs(const std::vector<std::string>& names) {
   return stddevs;
 }
 
+int LogReader::episode_column() {
+  const int column = table_.find("episode");
+  if (column >= 0) used_.emplace(column, "episode");
+  return column;
+}
+
 std::vector<std::string> LogReader::unused_columns() const {
   std::vector<std::string> unused;
   for (int column = 0; column < table_.n_columns(); ++column) {

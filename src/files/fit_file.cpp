@@ -56,6 +56,19 @@ Choice choice_from(const ParsedJson& json, const std::array<Named<Choice>, n>& c
   return known->first;
 }
 
+// NaN and ∞ are null
+Json actuators_json(const std::vector<ActuatorEstimate>& estimates) {
+  Json json = Json::array();
+  for (const ActuatorEstimate& one : estimates) {
+    json.push_back({{"name", one.name},
+                    {"value", one.value},
+                    {"stddev", std::isfinite(one.stddev) ? Json(one.stddev) : Json()},
+                    {"lower", one.lower},
+                    {"upper", one.upper}});
+  }
+  return json;
+}
+
 // a value to show in a message
 std::string shown(const ParsedJson& json) { return json.is_structured() ? json.type_name() : json.dump(); }
 
@@ -742,6 +755,7 @@ void FitFile::write(const std::filesystem::path& path) const {
   for (const RestartReport& restart : report.restarts) json["report"]["restarts"].push_back(restart_json(restart));
   if (report.uncertainty) json["report"]["uncertainty"] = uncertainty_json(*report.uncertainty);
   if (report.draws) json["report"]["draws"] = draws_json(*report.draws);
+  if (!report.actuators.empty()) json["actuators"] = actuators_json(report.actuators);
   if (!options.empty()) json["options"] = Json::parse(options);
   json["data_source"] = data_source;
   json["observations"] = Json::array();
@@ -758,6 +772,27 @@ void FitFile::write(const std::filesystem::path& path) const {
 }
 
 namespace {
+
+// delays and lags by name, where they are not those of the text
+void read_actuators(const ParsedJson& json, FitFile& fit) {
+  std::map<std::string, double> values;
+  for (const ParsedJson& one : array(json)) {
+    ActuatorEstimate estimate;
+    one.at("name").get_to(estimate.name);
+    estimate.value = number(one.at("value"));
+    if (!(estimate.value >= 0)) throw InputError(fmt::format("{} must not be negative, got {}", estimate.name, estimate.value));
+    const bool is_known = std::ranges::any_of(fit.model.actuators, [&](const Actuator& actuator) {
+      return actuator.delay.name == estimate.name || actuator.lag.name == estimate.name;
+    });
+    if (!is_known) throw InputError(fmt::format("'{}' is not of this model", estimate.name));
+    values.emplace(estimate.name, estimate.value);
+    estimate.lower = number(one.at("lower"));
+    estimate.upper = number(one.at("upper"));
+    estimate.stddev = one.at("stddev").is_null() ? std::numeric_limits<double>::quiet_NaN() : number(one.at("stddev"));
+    fit.report.actuators.push_back(std::move(estimate));
+  }
+  set_values(values, fit.model.actuators);
+}
 
 bool is_fit(const ParsedJson& json) { return json.is_object() && json.contains("format") && json.at("format") == format_name; }
 
@@ -828,6 +863,7 @@ FitFile read_fit(std::string_view text, const std::filesystem::path& path, const
     if (report.contains("uncertainty")) {
       fit.report.uncertainty = uncertainty_from(report.at("uncertainty"), fit.report.hyperparameters.size());
     }
+    if (json.contains("actuators")) read_actuators(json.at("actuators"), fit);
     if (report.contains("draws")) fit.report.draws = draws_from(report.at("draws"), fit.report.hyperparameters);
   } catch (const Json::exception& error) {
     throw InputError(fmt::format("{}: not a whole fit file: {}", path.string(), error.what()));

@@ -22,6 +22,7 @@
 #include "gp2/data/log_reader.hpp"
 #include "gp2/error.hpp"
 #include "gp2/jobs/fit_problem.hpp"
+#include "gp2/simulate.hpp"
 #include "smoothing/constrained_states.hpp"
 
 namespace gp2 {
@@ -120,7 +121,10 @@ class Deriver {
     smooth_channels();
     collect_rows();
     add_inputs();
+    const MatrixXd commands = data_.states.bottomRows(system_.layout().nu);
+    let_inputs_act();
     put_together();
+    data_.states.bottomRows(system_.layout().nu) = commands;
     take_each();
     return std::move(data_);
   }
@@ -776,6 +780,24 @@ class Deriver {
         const SmoothedMotion motion = smooth(slowest->model, channel.measurements, times);
         data_.states.row(system_.layout().u(static_cast<int>(u))).segment(first_row_[static_cast<std::size_t>(e)], times.size()) =
             motion.mean.row(0).array() + channel.mean;
+      }
+    }
+  }
+
+  // what acts late, by the model's delays and lags, for constraints that read it
+  void let_inputs_act() {
+    for (std::size_t u = 0; u < input_column_.size(); ++u) {
+      if (input_column_[u] < 0 || model_.actuators[u].is_direct()) continue;
+      for (int e = 0; e < static_cast<int>(episodes_.size()); ++e) {
+        const VectorXd times = times_to_write(episodes_[static_cast<std::size_t>(e)]);
+        auto acting = data_.states.row(system_.layout().u(static_cast<int>(u)))
+                          .segment(first_row_[static_cast<std::size_t>(e)], times.size());
+        const InputSignal signal(times, acting, {model_.actuators[u]});
+        for (Index i = 0; i < times.size(); ++i) {
+          VectorXd now(1);
+          signal.evaluate(times[i], now);
+          acting[i] = now[0];
+        }
       }
     }
   }

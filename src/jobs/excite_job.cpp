@@ -28,7 +28,7 @@ using Eigen::Index;
 using Eigen::MatrixXd;
 using Eigen::VectorXd;
 
-constexpr double infinity = std::numeric_limits<double>::infinity();
+constexpr double boundless = std::numeric_limits<double>::infinity();
 constexpr int region_size = 100;
 constexpr int most_steps_per_row = 10;  // of the integrator: a motion that takes more is too fast for its rows
 
@@ -128,8 +128,11 @@ void require_start_within(const VectorXd& start, const std::vector<Limit>& limit
 /// Inputs middle + half width tanh(s) at fixed times, s the Fourier series of given coefficients.
 class InputFamily {
  public:
-  InputFamily(std::vector<Limit> limits, VectorXd times, int n_harmonics)
-      : limits_(std::move(limits)), times_(std::move(times)), basis_(1 + 2 * n_harmonics, times_.size()) {
+  InputFamily(std::vector<Limit> limits, VectorXd times, int n_harmonics, std::vector<Actuator> actuators)
+      : limits_(std::move(limits)),
+        times_(std::move(times)),
+        actuators_(std::move(actuators)),
+        basis_(1 + 2 * n_harmonics, times_.size()) {
     const double duration = times_[times_.size() - 1] - times_[0];
     const Eigen::ArrayXd phase = 2 * std::numbers::pi / duration * (times_.array() - times_[0]);
     basis_.row(0).setOnes();
@@ -146,7 +149,8 @@ class InputFamily {
   // coefficients of a size at which the root mean square of s is 1
   [[nodiscard]] double unit() const { return 1 / std::sqrt(static_cast<double>(basis_.rows() + 1) / 2); }
 
-  [[nodiscard]] InputSignal at(const VectorXd& coefficients) const {
+  /// (nu × times)
+  [[nodiscard]] MatrixXd commands(const VectorXd& coefficients) const {
     MatrixXd values(std::ssize(limits_), times_.size());
     Index first = 0;
     for (Index j = 0; j < values.rows(); ++j) {
@@ -157,12 +161,15 @@ class InputFamily {
       values.row(j) = (limit.middle() + limit.half_width() * s.tanh()).max(limit.lower).min(limit.upper);
       first += basis_.rows();
     }
-    return {times_, values};
+    return values;
   }
+  /// What acts.
+  [[nodiscard]] InputSignal at(const VectorXd& coefficients) const { return {times_, commands(coefficients), actuators_}; }
 
  private:
   std::vector<Limit> limits_;
   VectorXd times_;
+  std::vector<Actuator> actuators_;
   MatrixXd basis_;
 };
 
@@ -228,13 +235,16 @@ class Search {
     return std::exp((one.known.log_volume - now_.log_volume) / static_cast<double>(now_.stddev.size()));
   }
 
+  /// Of the best motion (nu × rows).
+  [[nodiscard]] MatrixXd commands() const { return inputs_.commands(best().coefficients); }
+
  private:
   using Clock = std::chrono::steady_clock;
 
   [[nodiscard]] Candidate integrated(VectorXd coefficients) const {
     SimulateJob job = motion_;
     job.options.inputs = inputs_.at(coefficients);
-    Candidate out{.coefficients = std::move(coefficients), .violation = infinity};
+    Candidate out{.coefficients = std::move(coefficients), .violation = boundless};
     try {
       out.motion = run_simulation(job, stop_).front();
     } catch (const SimulationStopped&) {
@@ -477,8 +487,8 @@ Excitation excite(const Model& model, const Posterior& posterior, const std::vec
   require_start_within(motion.start, limits);
   out.notes = motion.notes;
 
-  Search search(std::move(motion), information, InputFamily(inputs, of_motion.times, request.n_harmonics), limits, out.target,
-                request, stop);
+  Search search(std::move(motion), information, InputFamily(inputs, of_motion.times, request.n_harmonics, model.actuators),
+                limits, out.target, request, stop);
   search.run(progress);
   require_within(search.best(), limits, search.n_motions());
 
@@ -501,11 +511,12 @@ Excitation excite(const Model& model, const Posterior& posterior, const std::vec
   }
   std::vector<Limit> all = inputs;
   all.insert(all.end(), limits.begin(), limits.end());
-  out.limits = limit_uses(out.motion, all);
   out.n_motions = search.n_motions();
   out.n_failed = search.n_failed();
   out.highest_frequency = request.n_harmonics / request.duration;
   out.leaves_data = motion_uncertainty(information.posterior(), out.motion).leaves_data;
+  out.motion.states.bottomRows(system.layout().nu) = search.commands();  // what a logger writes, and `simulate` reads
+  out.limits = limit_uses(out.motion, all);
   out.interrupted = is_set(stop);
   out.seconds = search.seconds();
   return out;

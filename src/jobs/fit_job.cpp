@@ -13,6 +13,7 @@
 #include "base/parallel.hpp"
 #include "gp2/error.hpp"
 #include "gp2/inference/evaluation.hpp"
+#include "gp2/jobs/actuator_fit.hpp"
 #include "gp2/jobs/fit_memory.hpp"
 #include "gp2/jobs/fit_time.hpp"
 
@@ -379,9 +380,32 @@ FitOutcome run_once(const FitJob& job, const std::function<void(const Progress&)
       outcome.notes.push_back(fmt::format("the residuals of the fit were not tested: {}", error.what()));
     }
   }
+  for (std::string& note : actuator_notes(job.actuators)) outcome.notes.push_back(std::move(note));
   outcome.file.observations = outcome.posterior.observations();
   outcome.file.report = std::move(result.report);
+  outcome.file.report.actuators = job.actuators;
   return outcome;
+}
+
+// The job with its delays and lags estimated, and known from then on.
+FitJob with_actuators(FitJob job, const std::atomic<bool>* stop) {
+  if (job.problem.late.empty() || job.options.max_iterations == 0) return job;
+  FitOptions options = job.options;
+  options.stop = stop;
+  job.actuators = estimate_actuators(job.problem, options);
+  std::map<std::string, double> values;
+  for (const ActuatorEstimate& one : job.actuators) values.emplace(one.name, one.value);
+  set_values(values, job.file.model.actuators);
+  FitProblem& problem = job.problem;
+  for (std::size_t g = 0; g < problem.observations.size(); ++g) {
+    if (problem.commanded[g]) problem.observations[g] = problem.commanded[g]->under(values, problem.observations[g]);
+  }
+  problem.late.clear();
+  // hyperparameters start anew, by the spread of what acts
+  const FitRequest request = request_of(job.file);
+  problem.hyperparameters = starting_hyperparameters(job.file.model, problem, request.problem);
+  if (!request.start.empty()) read_start(request.start, request.max_iterations, problem);
+  return job;
 }
 
 // The fit to every k-th row.
@@ -398,7 +422,9 @@ FitOutcome run_thinned(const FitJob& job, const Worth& worth, const std::functio
     group = group.take(taken);
     n_taken += group.n_data();
   }
-  FitOutcome outcome = run_fit(prepare_fit_again(file, job.options.n_threads), progress, stop);
+  FitJob fewer = prepare_fit_again(file, job.options.n_threads);
+  fewer.actuators = job.actuators;
+  FitOutcome outcome = run_fit(fewer, progress, stop);
   outcome.notes.push_back(fmt::format("{}: fitted to {} of {}, evenly taken (`thin=none` fits all)", worth.text, n_taken, n_all));
   std::rotate(outcome.notes.begin(), outcome.notes.end() - 1, outcome.notes.end());
   return outcome;
@@ -427,7 +453,8 @@ std::optional<Worth> worth_of_stretch(const FitJob& job, const std::atomic<bool>
 
 }  // namespace
 
-FitOutcome run_fit(const FitJob& job, const std::function<void(const Progress&)>& progress, const std::atomic<bool>* stop) {
+FitOutcome run_fit(const FitJob& asked, const std::function<void(const Progress&)>& progress, const std::atomic<bool>* stop) {
+  const FitJob job = with_actuators(asked, stop);
   if (!job.thin) return run_once(job, progress, stop);
   std::optional<FitOutcome> all;
   try {

@@ -38,6 +38,22 @@ void require_baseline_options(const FitProblemOptions& options, const std::vecto
   refuse(elsewhere, "knows no system", "@OTHER.toml");
 }
 
+std::vector<Parameter*> parameters_of(std::vector<Actuator>& actuators) {
+  std::vector<Parameter*> all;
+  for (Actuator& actuator : actuators) all.insert(all.end(), {&actuator.delay, &actuator.lag});
+  return all;
+}
+
+// Those of a model, marked where this fit estimates them.
+std::vector<Actuator> fitted_actuators(const Model& model, const FitProblemOptions& options) {
+  std::vector<Actuator> actuators = model.actuators;
+  for (Parameter* one : parameters_of(actuators)) {
+    if (options.estimate) one->estimate = std::ranges::count(*options.estimate, one->name) > 0;
+    if (options.baseline) one->estimate = false;
+  }
+  return actuators;
+}
+
 // the same under every protocol
 FitProblem make_baseline_problem(const Model& model, const std::vector<Log>& logs, FitProblemOptions options) {
   options.protocol.name = Protocol::Name::paper;  // fixed noise
@@ -46,8 +62,10 @@ FitProblem make_baseline_problem(const Model& model, const std::vector<Log>& log
   problem.prior_options.baseline = unstandardised(model, *options.baseline);
   problem.prior = make_prior(model, problem.prior_options);
   for (const Log& log : logs) {
-    const LoggedSystem logged = logged_system(model, problem.prior, problem.prior_options, log);
-    problem.observations.push_back(read_log(logged, log, options, problem.lines.emplace_back(), problem.notes));
+    LogRows rows;
+    const LoggedSystem logged = logged_system(model, fitted_actuators(model, options), problem.prior, problem.prior_options, log);
+    problem.observations.push_back(read_log(logged, log, options, rows, problem.notes));
+    problem.lines.push_back(std::move(rows.lines));
     problem.systems.push_back(nullptr);
   }
   problem.prior_options.baseline = standardised_by(problem.observations, problem.prior, *options.baseline);
@@ -91,7 +109,10 @@ void require_own_parameters(const Model& model, const std::vector<std::string>& 
 std::vector<std::string> estimated_parameters(const Model& model, const FitProblemOptions& options) {
   if (options.estimate) {
     require_own_parameters(model, *options.estimate);
-    return *options.estimate;
+    std::vector<std::string> names = *options.estimate;
+    std::vector<Actuator> actuators = model.actuators;
+    for (const Parameter* one : parameters_of(actuators)) std::erase(names, one->name);
+    return names;
   }
   std::vector<std::string> names;
   for (const Parameter& parameter : model.system->parameters()) {
@@ -337,11 +358,36 @@ FitProblem start_problem(const Model& model, const FitProblemOptions& options) {
 }
 
 // the system of a log that is read next
-LoggedSystem add_system(const Model& model, const Log& log, const std::vector<std::string>& estimated, FitProblem& problem) {
-  LoggedSystem logged = logged_system(model, problem.prior, problem.prior_options, log);
+LoggedSystem add_system(const Model& model, const Log& log, const FitProblemOptions& options,
+                        const std::vector<std::string>& estimated, FitProblem& problem) {
+  LoggedSystem logged = logged_system(model, fitted_actuators(model, options), problem.prior, problem.prior_options, log);
   note_parameters(model, logged, estimated, problem.notes);
   problem.systems.push_back(logged.other);
   return logged;
+}
+
+void add_rows(LogRows rows, FitProblem& problem) {
+  problem.lines.push_back(std::move(rows.lines));
+  problem.commanded.push_back(std::move(rows.commanded));
+}
+
+// Delays and lags of inputs that some observations read.
+void add_late(const Model& model, const FitProblemOptions& options, FitProblem& problem) {
+  std::vector<Actuator> actuators = fitted_actuators(model, options);
+  for (std::size_t k = 0; k < actuators.size(); ++k) {
+    const bool is_read = std::ranges::any_of(problem.commanded, [&](const std::optional<CommandedRows>& rows) {
+      return rows && std::ranges::count(rows->record->inputs(), static_cast<int>(k)) > 0;
+    });
+    for (const Parameter& one : {actuators[k].delay, actuators[k].lag}) {
+      if (one.estimate && is_read) problem.late.push_back(one);
+      if (one.estimate && !is_read) {
+        problem.notes.push_back(
+            fmt::format("warning: {} is not estimated: nothing that this fit reads depends on what is commanded; "
+                        "see `mean=force`, or make the input a feature",
+                        one.name));
+      }
+    }
+  }
 }
 
 // what else is known; its noise is judged by the size of the measured signals
@@ -359,9 +405,11 @@ void add_side_information(const Model& model, const std::vector<SideInformation>
     signal_stddev = default_scales(problem.prior, trusted_observations(problem)).signal_stddev;
   }
   for (const SideInformation& side_information : also) {
-    const LoggedSystem logged = add_system(model, side_information.log, estimated, problem);
-    problem.observations.push_back(read_side_information(logged, problem.prior, side_information, options, signal_stddev,
-                                                         problem.lines.emplace_back(), problem.notes));
+    const LoggedSystem logged = add_system(model, side_information.log, options, estimated, problem);
+    LogRows rows;
+    problem.observations.push_back(
+        read_side_information(logged, problem.prior, side_information, options, signal_stddev, rows, problem.notes));
+    add_rows(std::move(rows), problem);
   }
 }
 
@@ -392,10 +440,13 @@ FitProblem make_fit_problem(const Model& model, const std::vector<Log>& logs, co
   require_columns(model, logs, also, options);
   const std::vector<std::string> estimated = estimated_parameters(model, options);
   for (const Log& log : logs) {
+    LogRows rows;
     problem.observations.push_back(
-        read_log(add_system(model, log, estimated, problem), log, options, problem.lines.emplace_back(), problem.notes));
+        read_log(add_system(model, log, options, estimated, problem), log, options, rows, problem.notes));
+    add_rows(std::move(rows), problem);
   }
   add_side_information(model, also, options, estimated, problem);
+  add_late(model, options, problem);
   if (has_discrepancy(model, problem, options)) add_discrepancy(model, problem);
   problem.hyperparameters = starting_hyperparameters(model, problem, options);
   return problem;

@@ -38,6 +38,13 @@ std::vector<Option> options(GenerateRequest& request) {
 }
 
 GeneratedData generate(const Model& model, const GenerateRequest& request) {
+  for (const Actuator& actuator : model.actuators) {
+    if (actuator.is_direct() && !actuator.is_estimated()) continue;
+    throw InputError(
+        fmt::format("generate: {}: states are drawn one by one, but with {} and {} what acts depends on what was commanded "
+                    "before: simulate a motion, or leave both out",
+                    model.name, actuator.delay.name, actuator.lag.name));
+  }
   if (request.n && *request.n < 1) throw InputError(fmt::format("`n`: must be positive, got {}", *request.n));
   return generate(model,
                   GenerateOptions{request.n.value_or(1), request.seed, noise_of(model, request.noise_stddev), request.grid});

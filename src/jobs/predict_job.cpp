@@ -101,10 +101,11 @@ std::vector<Option> options(ViewRequest& request) {
 }
 
 PredictedView predicted_view(const FitFile& fit, const Prior& prior, const ViewRequest& request) {
-  PredictedView out{View{}, &fit.model, prior, {}};
+  PredictedView out{View{}, &fit.model, fit.model.actuators, prior, {}};
   std::shared_ptr<const OtherSystem> other_system;
   if (request.system && !is_same(*request.system, fit.model)) {
     out.model = request.system.get();
+    out.actuators = shared_actuators(fit.model.actuators, *out.model);
     other_system = make_other_system(fit.model, *out.model, fit.prior_options);
     out.prior = other_system->prior;
   }
@@ -141,7 +142,7 @@ PredictOutcome predict(const FitFile& fit, const CsvTable& states, const Predict
   }
   const Posterior posterior = request.unconditioned ? fit.posterior().without_data() : fit.posterior();
   const PredictedView at = predicted_view(fit, posterior.prior(), request.view);
-  LogStates log = read_log_states(at.prior, at.view, *at.model, states, request.columns);
+  LogStates log = read_log_states(at.prior, at.view, *at.model, states, request.columns, {}, at.actuators);
   PredictOutcome out{at.names, {}, std::move(log.notes)};
   at_states_of(states, [&] { predict_marginals(posterior, at.view, log.states, request.covariance, out); });
   if (request.n_samples) add_samples(posterior, at.view, log.states, *request.n_samples, request.seed, out);
@@ -164,7 +165,7 @@ EvaluateOutcome evaluate(const FitFile& fit, const Posterior& posterior, const C
   const std::vector<std::string> outputs =
       request.outputs.empty() ? outputs_to_compare(posterior, *at.model, log, request.columns, out.notes) : request.outputs;
   const std::vector<int> rows = acceleration_rows(*fit.model.system, outputs, "`outputs`");
-  const LogStates states = read_log_states(at.prior, at.view, *at.model, log, request.columns, outputs);
+  const LogStates states = read_log_states(at.prior, at.view, *at.model, log, request.columns, outputs, at.actuators);
   out.notes.insert(out.notes.end(), states.notes.begin(), states.notes.end());
   EvaluationOptions options{at.view.other_system, {}, request.threads};
   options.noise_stddev = measurement_noise(posterior, rows, states.states.cols(), states.stated_stddev);

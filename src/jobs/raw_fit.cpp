@@ -9,6 +9,7 @@
 
 #include "gp2/error.hpp"
 #include "gp2/jobs/resample.hpp"
+#include "jobs/read_observations.hpp"
 
 namespace gp2 {
 
@@ -46,6 +47,15 @@ LearnedAccelerations left_out_accelerations(const Posterior& posterior, const st
     out.stddev(Eigen::all, here) = seen_from_there.stddev();
   }
   return out;
+}
+
+// The states of a smoothed log, with what acts for its commands.
+MatrixXd acting_states(const Model& model, const DerivedData& data, const CsvTable& table) {
+  LogReader reader(table, *model.system);
+  MatrixXd states = data.states;
+  std::vector<std::string> notes;
+  static_cast<void>(take_commands(*model.system, model.actuators, reader, std::nullopt, {}, states, notes));
+  return states;
 }
 
 double total_gain(const DerivedData& data) {
@@ -92,9 +102,13 @@ LearnedLog learn_and_smooth(const FitRequest& request, const CsvTable& log, cons
     std::sort(out.rows.begin(), out.rows.end());
     return out;
   };
+  std::vector<Actuator> actuators = request.model.actuators;  // estimated anew by each fit, from where the last one found them
   const auto smoothed_by_fit_to = [&](const LearnedLog& before) {
     FitRequest quick = request;
     quick.logs = {{before.table(system, log.name())}};
+    const CsvTable whole = as_table(before.data, system, log.name());
+    quick.model.actuators = actuators;
+    quick.problem.commands = whole;
     quick.problem.columns.clear();
     quick.problem.max_points.reset();
     quick.hyperparameters = HyperparameterChoice::optimise;
@@ -102,8 +116,10 @@ LearnedLog learn_and_smooth(const FitRequest& request, const CsvTable& log, cons
     const FitJob job = prepare_fit(std::move(quick));
     const FitOutcome fit = run_fit(job, {}, stop);
     if (stop != nullptr && *stop) throw NumericalError("stopped while the raw log was learned from");
-    return with_rows(derive(request.model, log, smoothing,
-                            left_out_accelerations(fit.posterior, job.problem.lines.front(), before.data.states)));
+    actuators = fit.file.model.actuators;
+    return with_rows(derive(
+        request.model, log, smoothing,
+        left_out_accelerations(fit.posterior, job.problem.lines.front(), acting_states(fit.file.model, before.data, whole))));
   };
 
   LearnedLog best = with_rows(derive(request.model, log, smoothing));

@@ -71,6 +71,43 @@ MatrixXd states_of(const Prior& prior, const View& view, LogReader& reader, bool
   return reader.states(reads);
 }
 
+// Whether what acts is known at a row, not resting on commands before the log.
+bool is_known(const CommandedRows& rows, std::size_t row) {
+  double reach = 0;
+  for (const int k : rows.record->inputs()) reach = std::max(reach, rows.actuators[static_cast<std::size_t>(k)].reach());
+  return rows.record->knows(rows.places[row], reach);
+}
+
+std::string unknown_text(const CsvTable& log, std::size_t n, const char* consequence) {
+  return fmt::format("{}: {} of {} rows {}: what acts there depends on commands before the log", log.name(), n, log.n_rows(),
+                     consequence);
+}
+
+// The rows at which what acts is known.
+void keep_known(const std::optional<CommandedRows>& commanded, const CsvTable& log, std::vector<int>& rows,
+                std::vector<std::string>& notes) {
+  if (!commanded) return;
+  const std::size_t n = std::erase_if(rows, [&](int row) { return !is_known(*commanded, static_cast<std::size_t>(row)); });
+  if (n == 0) return;
+  if (rows.empty()) {
+    throw InputError(
+        fmt::format("{}: at none of its rows is known what acts: inputs are so late that all depend on commands before "
+                    "the log; give the whole log as `commands`, a longer one, or narrower bounds of delays and lags",
+                    log.name()));
+  }
+  notes.push_back(unknown_text(log, n, "left out"));
+}
+
+// Of chosen rows; only what is estimated need be known any more.
+std::optional<CommandedRows> of_rows(std::optional<CommandedRows> commanded, const std::vector<int>& rows) {
+  const auto is_estimated = [](const Actuator& actuator) { return actuator.is_estimated(); };
+  if (!commanded || std::ranges::none_of(commanded->actuators, is_estimated)) return std::nullopt;
+  std::vector<CommandRecord::Place> places;
+  for (const int row : rows) places.push_back(commanded->places[static_cast<std::size_t>(row)]);
+  commanded->places = std::move(places);
+  return commanded;
+}
+
 std::vector<int> counted(Index n) {
   std::vector<int> numbers(static_cast<std::size_t>(n));
   std::iota(numbers.begin(), numbers.end(), 0);
@@ -290,6 +327,37 @@ void check_columns(const System& system, const std::vector<const CsvTable*>& log
   }
 }
 
+std::optional<CommandedRows> take_commands(const System& system, const std::vector<Actuator>& actuators, LogReader& reader,
+                                           const std::optional<CsvTable>& whole,
+                                           const std::map<std::string, std::string>& columns, MatrixXd& states,
+                                           std::vector<std::string>& notes) {
+  std::vector<int> late;
+  double lateness = 0;
+  for (int k = 0; k < static_cast<int>(actuators.size()); ++k) {
+    const Actuator& actuator = actuators[static_cast<std::size_t>(k)];
+    if ((actuator.is_direct() && !actuator.is_estimated()) || states.row(system.layout().u(k)).array().isNaN().all()) continue;
+    late.push_back(k);
+    lateness = std::max(lateness, actuator.largest_delay() + actuator.largest_lag());
+  }
+  if (late.empty()) return std::nullopt;
+  CommandedRows out{nullptr, {}, actuators};
+  if (whole) {
+    LogReader of_whole(*whole, system, columns);
+    out.record = std::make_shared<const CommandRecord>(system, of_whole, late);
+  } else {
+    out.record = std::make_shared<const CommandRecord>(system, reader, late);
+    if (out.record->usual_step() > lateness) {
+      notes.push_back(
+          fmt::format("warning: {}: rows are {:.3g} s apart as a rule, inputs at most {:.3g} s late: what acts in between is not "
+                      "known; log faster, or, where these are rows of a longer log, give that as `commands`",
+                      reader.table().name(), out.record->usual_step(), lateness));
+    }
+  }
+  out.places = out.record->places(reader);
+  out.record->act(actuators, out.places, system.layout(), states);
+  return out;
+}
+
 int n_repeated_rows(const MatrixXd& states, const MatrixXd& values) {
   // NaN is not equal to itself
   const auto cleared = [](const MatrixXd& matrix) {
@@ -308,23 +376,30 @@ int n_repeated_rows(const MatrixXd& states, const MatrixXd& values) {
   return n;
 }
 
-LoggedSystem logged_system(const Model& fitted, const Prior& prior, const FitPriorOptions& options, const Log& log) {
-  if (!log.model) return {fitted, nullptr, nullptr, prior, fitted.system->parameter_values()};
+LoggedSystem logged_system(const Model& fitted, const std::vector<Actuator>& actuators, const Prior& prior,
+                           const FitPriorOptions& options, const Log& log) {
+  const std::vector<Actuator> there = !log.is_commanded ? std::vector<Actuator>()
+                                      : log.model       ? shared_actuators(actuators, *log.model)
+                                                        : actuators;
+  if (!log.model) return {fitted, nullptr, nullptr, prior, fitted.system->parameter_values(), there};
   std::shared_ptr<const OtherSystem> other_system = make_other_system(fitted, *log.model, options);
-  const Prior& there = other_system->prior;
+  const Prior& prior_there = other_system->prior;
   VectorXd parameters = other_system->parameters(fitted.system->parameter_values());
-  return {*log.model, log.model, std::move(other_system), there, std::move(parameters)};
+  return {*log.model, log.model, std::move(other_system), prior_there, std::move(parameters), there};
 }
 
-Observations read_log(const LoggedSystem& logged, const Log& log, const FitProblemOptions& options, std::vector<int>& lines,
+Observations read_log(const LoggedSystem& logged, const Log& log, const FitProblemOptions& options, LogRows& of_log,
                       std::vector<std::string>& notes) {
   const System& system = logged.system();
-  LogReader reader(log.table, system, columns_of(logged.model, options.columns));
+  const std::map<std::string, std::string> columns = columns_of(logged.model, options.columns);
+  LogReader reader(log.table, system, columns);
   Readings readings;
   const std::vector<std::string> observe = observed_accelerations(system, options, reader, log.table, notes);
   readings.view = {
       View::Quantity::constrained_acceleration, acceleration_rows(system, observe, "`observe`"), {}, {}, logged.other_system};
   readings.states = states_of(logged.prior, readings.view, reader, options.project);
+  std::optional<CommandedRows> commanded =
+      take_commands(system, logged.actuators, reader, options.commands, columns, readings.states, notes);
   const std::vector<std::string> observed = readings.view.names(system);
   readings.values = reader.measurements(observed);
   readings.stated_stddev = stated_noise(logged.model, observed, options, reader, log.table, notes);
@@ -337,14 +412,15 @@ Observations read_log(const LoggedSystem& logged, const Log& log, const FitProbl
   note_repeats(readings, log.table, notes);
 
   const int n_rows = log.table.n_rows();
-  const std::vector<int> measured = measured_rows(readings, observed, log.table, notes);
+  std::vector<int> measured = measured_rows(readings, observed, log.table, notes);
+  keep_known(commanded, log.table, measured, notes);
   const std::vector<int> rows = chosen_rows(measured, options.max_points.value_or(n_rows), options.seed);
   if (rows.size() < measured.size()) {
     notes.push_back(
         fmt::format("{}: {} of {} rows taken, by seed {}", log.table.name(), rows.size(), measured.size(), options.seed));
   }
   if (static_cast<int>(rows.size()) < n_rows) readings.keep(rows);
-  lines = lines_of(rows, log.table);
+  of_log = {lines_of(rows, log.table), of_rows(std::move(commanded), rows)};
   require_mechanics_at(logged, readings.view, readings.states, rows, log.table, notes);
 
   const bool model_estimates = logged.model.noise.estimate && !options.noise_stddev;
@@ -362,8 +438,8 @@ Observations read_log(const LoggedSystem& logged, const Log& log, const FitProbl
 }
 
 Observations read_side_information(const LoggedSystem& logged, const Prior& fitted, const SideInformation& side_information,
-                                   const FitProblemOptions& options, const std::vector<VectorXd>& signal_stddev,
-                                   std::vector<int>& lines, std::vector<std::string>& notes) {
+                                   const FitProblemOptions& options, const std::vector<VectorXd>& signal_stddev, LogRows& of_log,
+                                   std::vector<std::string>& notes) {
   const System& system = logged.system();
   const CsvTable& table = side_information.log.table;
   const std::string option = "`also=" + side_information.quantity->word() + "`";
@@ -377,18 +453,22 @@ Observations read_side_information(const LoggedSystem& logged, const Prior& fitt
     if (!(*options.time_step > 0)) throw InputError(fmt::format("`dt`: must be positive, got {}", *options.time_step));
     view.time_step = options.time_step;
   }
-  LogReader reader(table, system, columns_of(logged.model, options.columns));
+  const std::map<std::string, std::string> columns = columns_of(logged.model, options.columns);
+  LogReader reader(table, system, columns);
   view.rows = side_information_rows(view, view.names(system, side_information.latent), reader, option, table, system);
   const std::vector<std::string> names = view.names(system, side_information.latent);
   readings.values = reader.measurements(names);
   readings.states = states_of(logged.prior, view, reader, options.project);
+  std::optional<CommandedRows> commanded =
+      take_commands(system, logged.actuators, reader, options.commands, columns, readings.states, notes);
   const MatrixXd state_stddevs = options.project ? stated_state_deviations(system, reader, table) : MatrixXd();
   note_reading(reader, table, notes);
   if (options.project) project(logged, table, state_stddevs, readings.states, notes);
   note_violation(system, readings.states, logged.parameters, table, notes);
-  const std::vector<int> measured = measured_rows(readings, names, table, notes);
+  std::vector<int> measured = measured_rows(readings, names, table, notes);
+  keep_known(commanded, table, measured, notes);
   readings.keep(measured);
-  lines = lines_of(measured, table);
+  of_log = {lines_of(measured, table), of_rows(std::move(commanded), measured)};
   require_mechanics_at(logged, view, readings.states, measured, table, notes);
   VectorXd stddev = noise_of_side_information(logged, side_information, options, readings, signal_stddev);
   return {std::move(readings.states), std::move(readings.view), std::move(readings.values), std::move(stddev)};
@@ -433,11 +513,24 @@ LogReader open_log(const Model& model, const CsvTable& log, const std::map<std::
 }
 
 LogStates read_log_states(const Prior& prior, const View& view, const Model& model, const CsvTable& log,
-                          const std::map<std::string, std::string>& columns, const std::vector<std::string>& accelerations) {
+                          const std::map<std::string, std::string>& columns, const std::vector<std::string>& accelerations,
+                          const std::optional<std::vector<Actuator>>& actuators) {
   LogReader reader = open_log(model, log, columns);
   LogStates out{states_of(prior, view, reader), reader.measurements(accelerations), {}, {}};
   const std::vector<std::string> stated = stated_accelerations(accelerations, reader);
   if (!stated.empty()) out.stated_stddev = stated_stddevs(model, accelerations, reader, log.n_rows());
+  const std::optional<CommandedRows> commanded =
+      take_commands(*prior.system, actuators.value_or(model.actuators), reader, std::nullopt, columns, out.states, out.notes);
+  std::size_t n_unknown = 0;
+  for (Index i = 0; commanded && i < out.states.cols(); ++i) {
+    if (is_known(*commanded, static_cast<std::size_t>(i))) continue;
+    ++n_unknown;
+    out.accelerations.col(i).setConstant(std::numeric_limits<double>::quiet_NaN());
+  }
+  if (n_unknown > 0) {
+    out.notes.push_back(
+        unknown_text(log, n_unknown, accelerations.empty() ? "as if the inputs had been at rest before" : "not compared"));
+  }
   note_reading(reader, log, out.notes);
   note_violation(*prior.system, out.states, prior.system->parameter_values(), log, out.notes);
   return out;
@@ -473,6 +566,8 @@ WholeLog read_whole_log(const Model& model, LogReader& reader) {
   for (std::size_t k = 0; k < reads.size(); ++k) reads[k] = reads[k] || reader.has(names[k]);
   WholeLog log;
   log.states = reader.states(reads);
+  std::vector<std::string> notes;
+  take_commands(system, model.actuators, reader, std::nullopt, {}, log.states, notes);
   log.accelerations = MatrixXd::Constant(system.nq(), log.states.cols(), std::numeric_limits<double>::quiet_NaN());
   log.stddev = log.accelerations;
   Index row = 0;

@@ -15,20 +15,36 @@ void check_columns(const System& system, const std::vector<const CsvTable*>& log
                    const std::map<std::string, std::string>& columns);
 
 /// @param fitted  the model that is fitted, with its prior
-LoggedSystem logged_system(const Model& fitted, const Prior& prior, const FitPriorOptions& options, const Log& log);
+/// What acts takes the place of what was commanded, in the states of a whole log.
+/// @param actuators  of the log's system
+/// @param reader     of the log
+/// @param whole      the log that this one has rows of; not given: itself
+/// @return where commands make a difference
+std::optional<CommandedRows> take_commands(const System& system, const std::vector<Actuator>& actuators, LogReader& reader,
+                                           const std::optional<CsvTable>& whole,
+                                           const std::map<std::string, std::string>& columns, Eigen::MatrixXd& states,
+                                           std::vector<std::string>& notes);
+
+/// @param actuators  of the model that is fitted
+LoggedSystem logged_system(const Model& fitted, const std::vector<Actuator>& actuators, const Prior& prior,
+                           const FitPriorOptions& options, const Log& log);
+
+/// What reading a log leaves beside its observations.
+struct LogRows {
+  std::vector<int> lines;                  // of each state in the log
+  std::optional<CommandedRows> commanded;  // where inputs act late
+};
 
 /// The accelerations that a log measures.
-/// @param lines  receives the line of each state in the log
-Observations read_log(const LoggedSystem& logged, const Log& log, const FitProblemOptions& options, std::vector<int>& lines,
+Observations read_log(const LoggedSystem& logged, const Log& log, const FitProblemOptions& options, LogRows& rows,
                       std::vector<std::string>& notes);
 
 /// What else is measured or known.
 /// @param fitted         the prior of the model that is fitted
 /// @param signal_stddev  of each latent, by which the noise is judged
-/// @param lines          receives the line of each state in the log
 Observations read_side_information(const LoggedSystem& logged, const Prior& fitted, const SideInformation& side_information,
                                    const FitProblemOptions& options, const std::vector<Eigen::VectorXd>& signal_stddev,
-                                   std::vector<int>& lines, std::vector<std::string>& notes);
+                                   LogRows& rows, std::vector<std::string>& notes);
 
 /// How many states, with the values measured there, are those of an earlier one to the last bit.
 int n_repeated_rows(const Eigen::MatrixXd& states, const Eigen::MatrixXd& values);

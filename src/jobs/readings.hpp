@@ -16,6 +16,7 @@ struct LoggedSystem {
   std::shared_ptr<const OtherSystem> other_system;  // null: the system that is fitted
   const Prior& prior;
   Eigen::VectorXd parameters;
+  std::vector<Actuator> actuators;  // of its inputs; `estimate` says what this fit estimates
 
   [[nodiscard]] const System& system() const { return *prior.system; }
 };

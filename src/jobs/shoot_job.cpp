@@ -20,6 +20,7 @@
 #include "gp2/jobs/fit_problem.hpp"
 #include "gp2/simulate.hpp"
 #include "gp2/training/laplace.hpp"
+#include "jobs/read_observations.hpp"
 
 namespace gp2 {
 
@@ -54,12 +55,12 @@ class Shooter {
         n_threads_(thread_count(request.threads)),
         hyperparameters_(fit.report.hyperparameters) {
     find_parameters();
-    read(log, request.columns);
+    read(log, request.columns, notes_);
     cut(log, request);
   }
 
   ShootOutcome run() {
-    drop_what_cannot_be_followed();
+    drop_what_cannot_be_followed(notes_);
     ShootOutcome out;
     for (const int j : compared_) out.coordinates.push_back(system_.coordinates()[static_cast<std::size_t>(j)].name);
     std::vector<VectorXd> residuals = residuals_at(hyperparameters_, stretches_);
@@ -114,9 +115,10 @@ class Shooter {
     }
   }
 
-  void read(const CsvTable& log, const std::map<std::string, std::string>& columns) {
+  void read(const CsvTable& log, const std::map<std::string, std::string>& columns, std::vector<std::string>& notes) {
     LogReader reader = open_log(fit_.model, log, columns);
     states_ = reader.states(std::vector<bool>(static_cast<std::size_t>(system_.layout().size()), true));
+    static_cast<void>(take_commands(system_, fit_.model.actuators, reader, std::nullopt, columns, states_, notes));
     for (int j = 0; j < system_.nq(); ++j) {
       if (!reader.stddev_column(system_.coordinates()[static_cast<std::size_t>(j)].name).empty()) compared_.push_back(j);
     }
@@ -225,7 +227,7 @@ class Shooter {
     return VectorXd(off.reshaped());
   }
 
-  void drop_what_cannot_be_followed() {
+  void drop_what_cannot_be_followed(std::vector<std::string>& notes) {
     const Posterior posterior = posterior_at(hyperparameters_);
     std::vector<char> followed(stretches_.size());
     parallel_for(static_cast<int>(stretches_.size()), n_threads_, [&](int k, int) {
@@ -238,8 +240,8 @@ class Shooter {
     }
     if (kept.empty()) throw NumericalError("no stretch of the log can be followed by the motion of the fit");
     if (kept.size() < stretches_.size()) {
-      notes_.push_back(fmt::format("warning: {} of {} stretches are left out: the motion of the fit does not reach their end",
-                                   stretches_.size() - kept.size(), stretches_.size()));
+      notes.push_back(fmt::format("warning: {} of {} stretches are left out: the motion of the fit does not reach their end",
+                                  stretches_.size() - kept.size(), stretches_.size()));
     }
     stretches_ = std::move(kept);
   }

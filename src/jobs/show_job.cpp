@@ -62,13 +62,24 @@ std::string robot_text(const RobotDescription& robot) {
 }
 
 // "  0.1   in [0, 1]   estimated"
+std::string parameter_text(const Parameter& parameter) {
+  std::string text = fmt::format("  {:<12} {}", parameter.name, parameter.value);
+  if (parameter.bounds) text += fmt::format("   in [{}, {}]", parameter.bounds->first, parameter.bounds->second);
+  return text + (parameter.estimate ? "   estimated\n" : "\n");
+}
+
+// delays and lags [s]; nothing where every command acts itself
+std::string actuators_text(const Model& model) {
+  std::string text;
+  for (const Actuator& actuator : model.actuators) {
+    if (!actuator.is_direct() || actuator.is_estimated()) text += parameter_text(actuator.delay) + parameter_text(actuator.lag);
+  }
+  return text.empty() ? text : "\nactuators\n" + text;
+}
+
 std::string parameters_text(const Model& model, const System& system) {
   std::string text = "\nparameters\n";
-  for (const Parameter& parameter : system.parameters()) {
-    text += fmt::format("  {:<12} {}", parameter.name, parameter.value);
-    if (parameter.bounds) text += fmt::format("   in [{}, {}]", parameter.bounds->first, parameter.bounds->second);
-    text += parameter.estimate ? "   estimated\n" : "\n";
-  }
+  for (const Parameter& parameter : system.parameters()) text += parameter_text(parameter);
   for (const Model::DerivedParameter& derived : model.derived_parameters) {
     text += fmt::format("  {:<12} {}   = {}\n", derived.name, derived.value, derived.text);
   }
@@ -134,7 +145,7 @@ std::string whole_text(const Model& model, const SymbolicSystem& system, const s
     text += fmt::format("  {} = 0   ({} level{})\n", row.text, level, row.noise > 0 ? fmt::format(", noise {}", row.noise) : "");
   }
   text += fmt::format("A\n{}b\n{}", matrix_text(A, full), matrix_text(b, full));
-  return text + parameters_text(model, system) + latents_text(model, full);
+  return text + actuators_text(model) + parameters_text(model, system) + latents_text(model, full);
 }
 
 }  // namespace

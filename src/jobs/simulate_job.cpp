@@ -135,9 +135,10 @@ VectorXd start_state(const Model& model, const VectorXd& parameters, const Simul
 }
 
 // Inputs must cover the motion: they are not extrapolated.
-InputSignal input_signal(const System& system, const SimulateRequest& request,
+InputSignal input_signal(const Model& model, const std::vector<Actuator>& actuators, const SimulateRequest& request,
                          const std::map<std::string, std::string>& columns) {
   if (!request.inputs) return {};
+  const System& system = *model.system;
   const CsvTable& table = *request.inputs;
   if (system.inputs().empty()) throw InputError(fmt::format("`inputs`: '{}' has no inputs", system.name()));
   LogReader reader(table, system, columns);
@@ -145,7 +146,7 @@ InputSignal input_signal(const System& system, const SimulateRequest& request,
   const MatrixXd values = reader.values(system.inputs());
   const double t_start = request.times[0], t_end = request.times[request.times.size() - 1];
   try {
-    InputSignal signal(times, values);
+    InputSignal signal(times, values, actuators);
     const double slack = 1e-9 * (t_end - t_start);
     if (times[0] > t_start + slack || times[times.size() - 1] < t_end - slack) {
       throw InputError(
@@ -171,7 +172,8 @@ SimulateJob prepare(const Model& model, VectorXd parameters, const SimulateReque
   job.options.absolute_tolerance = request.absolute_tolerance;
   job.options.max_steps = request.max_steps;
   job.options.project = request.project;
-  job.options.inputs = input_signal(*model.system, request, columns);
+  job.options.inputs = input_signal(model, model.actuators, request, columns);
+  job.commands = input_signal(model, {}, request, columns);
   job.start = start_state(model, parameters, request, columns, job.notes);
   job.parameters = std::move(parameters);
   return job;

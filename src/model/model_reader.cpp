@@ -166,9 +166,36 @@ class ModelReader : private TomlReader {
   void read_inputs() {
     if (!root_.contains("inputs")) return;
     for (const toml::node& entry : array(*root_.get("inputs"), "inputs")) {
-      definition_.inputs.push_back(text(entry, "inputs"));
+      const toml::table* const more = entry.as_table();
+      if (more != nullptr) only_keys(*more, "inputs", {"name", "delay", "lag"});
+      if (more != nullptr && !more->contains("name"))
+        fail(entry, "inputs", R"(expected { name = "u", delay = 0.02, lag = 0.05 })");
+      definition_.inputs.push_back(more != nullptr ? text(*more->get("name"), "inputs.name") : text(entry, "inputs"));
       declare(definition_.inputs.back(), entry, "inputs");
+      Actuator& actuator = model_.actuators.emplace_back(Actuator::direct(definition_.inputs.back()));
+      if (more == nullptr) continue;
+      read_lateness(*more, "delay", actuator.delay);
+      read_lateness(*more, "lag", actuator.lag);
     }
+  }
+
+  // delay = 0.02, or { value = 0.02, bounds = [0, 0.1], estimate = true }
+  void read_lateness(const toml::table& input, const std::string& word, Parameter& out) const {
+    if (!input.contains(word)) return;
+    const toml::node& node = *input.get(word);
+    const std::string key = "inputs." + word;
+    const Tuned entry = tuned(node, key, {"value", "bounds", "estimate", "prior"});
+    if (entry.value != nullptr) out.value = number(*entry.value, entry.key);
+    const auto require_not_negative = [&](double seconds) {
+      if (seconds >= 0) return;
+      fail(node, key, fmt::format("a {} [s] must not be negative, got {}: nothing acts before it is commanded", word, seconds));
+    };
+    require_not_negative(out.value);
+    out.estimate = entry.estimate.value_or(false);
+    out.bounds = entry.bounds;
+    if (out.bounds) require_not_negative(out.bounds->first);
+    require_within(out.value, out.bounds, node, key);
+    out.prior = entry.prior;
   }
 
   // A log or a prediction of the coordinate x has columns x_std, ddx_std, abar_x, … beside those of x itself.

@@ -77,6 +77,15 @@ std::shared_ptr<const OtherSystem> share_parameters(const Model& home, const Pri
   return std::make_shared<const OtherSystem>(std::move(other_system));
 }
 
+std::vector<Actuator> shared_actuators(const std::vector<Actuator>& home, const Model& other) {
+  std::vector<Actuator> there = other.actuators;
+  for (std::size_t k = 0; k < std::min(home.size(), there.size()); ++k) {
+    if (there[k].delay.estimate) there[k].delay = home[k].delay;
+    if (there[k].lag.estimate) there[k].lag = home[k].lag;
+  }
+  return there;
+}
+
 std::shared_ptr<const OtherSystem> make_other_system(const Model& home, const Model& other, const PriorOptions& options) {
   // a discrepancy is sized for the features at home: first see whether they are the same there
   PriorOptions without_discrepancy = options;

@@ -13,7 +13,12 @@ using Eigen::Index;
 using Eigen::MatrixXd;
 using Eigen::VectorXd;
 
-InputSignal::InputSignal(VectorXd times, MatrixXd values) : times_(std::move(times)), values_(std::move(values)) {
+InputSignal::InputSignal(VectorXd times, MatrixXd values, const std::vector<Actuator>& actuators)
+    : times_(std::move(times)),
+      values_(std::move(values)),
+      delay_(VectorXd::Zero(values_.rows())),
+      lag_(VectorXd::Zero(values_.rows())),
+      acting_(values_) {
   const Index n = times_.size();
   if (n == 0 || values_.cols() != n) {
     throw InputError(fmt::format("inputs: {} times for {} columns of values; give as many, at least one", n, values_.cols()));
@@ -23,9 +28,23 @@ InputSignal::InputSignal(VectorXd times, MatrixXd values) : times_(std::move(tim
     if (times_[k] > times_[k - 1]) continue;
     throw InputError(fmt::format("inputs: times must increase, but {} follows {}", times_[k], times_[k - 1]));
   }
+  if (!actuators.empty() && std::ssize(actuators) != values_.rows()) {
+    throw InputError(fmt::format("inputs: {} actuators for {} inputs", actuators.size(), values_.rows()));
+  }
+  for (Index j = 0; j < std::ssize(actuators); ++j) {
+    const Actuator& actuator = actuators[static_cast<std::size_t>(j)];
+    delay_[j] = actuator.delay.value;
+    lag_[j] = actuator.lag.value;
+    for (Index k = 1; k < n; ++k)
+      acting_(j, k) = lagged(acting_(j, k - 1), values_(j, k - 1), values_(j, k), times_[k] - times_[k - 1], lag_[j]);
+  }
+  find_kinks();
+}
 
-  // where the slope changes by more than rounding; it is zero outside the table
+// where the slope of a command changes by more than rounding; it is zero outside the table
+void InputSignal::find_kinks() {
   constexpr double rounding = 1e-9;
+  const Index n = times_.size();
   const VectorXd size = values_.cwiseAbs().rowwise().maxCoeff();
   VectorXd slope_before = VectorXd::Zero(values_.rows());
   for (Index k = 0; k < n; ++k) {
@@ -34,24 +53,30 @@ InputSignal::InputSignal(VectorXd times, MatrixXd values) : times_(std::move(tim
     double span = std::numeric_limits<double>::infinity();
     if (k > 0) span = std::min(span, times_[k] - times_[k - 1]);
     if (k + 1 < n) span = std::min(span, times_[k + 1] - times_[k]);
-    if (n > 1 && ((slope_after - slope_before).array().abs() * span > rounding * size.array()).any()) kinks_.push_back(times_[k]);
+    for (Index j = 0; n > 1 && j < values_.rows(); ++j) {
+      if (std::abs(slope_after[j] - slope_before[j]) * span > rounding * size[j]) kinks_.push_back(times_[k] + delay_[j]);
+    }
     slope_before = slope_after;
   }
+  std::sort(kinks_.begin(), kinks_.end());
+  kinks_.erase(std::unique(kinks_.begin(), kinks_.end()), kinks_.end());
 }
 
 void InputSignal::evaluate(double t, Eigen::Ref<VectorXd> u) const {
   const Index n = times_.size();
-  if (n == 0) {
-    u.setZero();
-    return;
+  if (n == 0) u.setZero();
+  for (Index j = 0; j < values_.rows(); ++j) {
+    const double sent = t - delay_[j];  // the command that arrives
+    const Index after = std::upper_bound(times_.begin(), times_.end(), sent) - times_.begin();
+    if (after == 0) {
+      u[j] = values_(j, 0);
+      continue;
+    }
+    const double since = sent - times_[after - 1], before = values_(j, after - 1);
+    const double share = after == n ? 0 : since / (times_[after] - times_[after - 1]);
+    const double command = after == n ? before : (1 - share) * before + share * values_(j, after);
+    u[j] = lagged(acting_(j, after - 1), before, command, since, lag_[j]);
   }
-  const Index after = std::upper_bound(times_.begin(), times_.end(), t) - times_.begin();
-  if (after == 0 || after == n) {
-    u = values_.col(after == 0 ? 0 : n - 1);
-    return;
-  }
-  const double share = (t - times_[after - 1]) / (times_[after] - times_[after - 1]);
-  u = (1 - share) * values_.col(after - 1) + share * values_.col(after);
 }
 
 double InputSignal::next_kink(double t) const {

@@ -43,9 +43,12 @@ class LogReader {
   /// measurements.
   [[nodiscard]] Eigen::MatrixXd stddevs(const std::vector<std::string>& names);
 
+  [[nodiscard]] const CsvTable& table() const { return table_; }
   [[nodiscard]] bool has(const std::string& name) const { return find(name) >= 0; }
   /// Where a name of the model stands in the table; it counts as used then. −1 when it is not there.
   [[nodiscard]] int column(const std::string& name) { return has(name) ? require(name) : -1; }
+  /// Where the log says what belongs together; −1 where it does not.
+  [[nodiscard]] int episode_column();
   [[nodiscard]] const std::map<std::string, std::string>& aliases_used() const { return aliases_used_; }  // model's -> log's name
   [[nodiscard]] std::vector<std::string> unused_columns() const;  // after the reading is done
 

@@ -64,7 +64,7 @@ struct DerivedData {
 
   std::vector<std::string> episodes;  // what the column says, once for each part between pauses; empty texts without a column
   std::vector<int> episode;           // of each row (N)
-  Eigen::MatrixXd states;             // [q; dq; t; u] (layout size × N), NaN where unknown
+  Eigen::MatrixXd states;             // [q; dq; t; u] (layout size × N), u as commanded, NaN where unknown
   Eigen::MatrixXd accelerations;      // ddq (nq × N), NaN where unknown
   Eigen::MatrixXd stddev;             // of q, dq, ddq (3 nq × N), NaN where not measured
   std::vector<int> measured;          // coordinates the log has

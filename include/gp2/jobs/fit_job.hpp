@@ -58,6 +58,7 @@ struct FitJob {
   FitFile file;  // all but the observations and the report
   std::vector<std::string> notes;
   bool thin = true;
+  std::vector<ActuatorEstimate> actuators;  // that were estimated already
   std::string unaffordable;  // why not all of a long log can be fitted, if that is so: what it is worth may be less
 };
 
@@ -84,6 +85,7 @@ struct FitOutcome {
 /// Whether its observations stand in the order of their logs: `max_points` shuffles them.
 bool keeps_row_order(const FitFile& fit, const std::vector<Observations>& observations);
 
+/// Delays and lags of inputs are estimated first (actuator_fit.hpp), and known from then on.
 /// Where residuals go on from row to row, rows are fewer measurements than they seem: the fit is then done anew with as many rows of
 /// each log as they are worth, evenly taken, unless it is not to `thin`, or robust, or of the paper's protocol.
 /// @param progress  called from other threads, one at a time

@@ -12,6 +12,7 @@
 #include "gp2/export.hpp"
 #include "gp2/files/fit_file.hpp"
 #include "gp2/fit.hpp"
+#include "gp2/jobs/command_record.hpp"
 #include "gp2/jobs/option.hpp"
 #include "gp2/model.hpp"
 
@@ -21,6 +22,7 @@ namespace gp2 GP2_API {
 struct Log {
   CsvTable table;
   std::shared_ptr<const Model> model = nullptr;  // of that system; null: the model that is fitted
+  bool is_commanded = true;                      // its inputs are commands; else they are what acts
 };
 
 /// Another quantity that is measured or known at some states: the columns of its rows that the table holds, at least one.
@@ -48,6 +50,7 @@ struct FitProblemOptions {
   /// A discrepancy latent beside the model's one, where that acts in every direction, under the standard protocol with
   /// hyper-priors.
   bool discrepancy = true;
+  std::optional<CsvTable> commands;         // the whole log of inputs over t, where the logs are rows of it
   std::optional<int> max_points;            // of each log: the first of a shuffle by `seed`
   std::optional<double> also_noise_stddev;  // of every row that is known; not given: [noise], where it is an acceleration
   std::optional<double> time_step;          // Δt of a known next velocity
@@ -63,7 +66,9 @@ struct FitProblem {
   std::vector<Observations> observations;             // of each log, then of each knowledge
   std::vector<std::shared_ptr<const Model>> systems;  // per Observations: its model where that is another; for FitFile
   std::vector<Hyperparameter> hyperparameters;
-  std::vector<std::vector<int>> lines;  // per Observations: the line in its log of each state
+  std::vector<std::vector<int>> lines;                  // per Observations: the line in its log of each state
+  std::vector<Parameter> late;                          // delays and lags to estimate before all else …
+  std::vector<std::optional<CommandedRows>> commanded;  // … from these Observations (per Observations, or none)
   bool robust = false;
   std::vector<std::string> notes;  // what a person should know: columns taken by alias, states off the constraint, …
 };
@@ -110,7 +115,9 @@ std::map<std::string, std::string> checked_columns(const Model& model, const std
 /// @throws InputError when `columns` names what the model or the log does not have.
 LogReader open_log(const Model& model, const CsvTable& log, const std::map<std::string, std::string>& columns);
 
-/// States of a log for a prior and a view, with the columns that only the constraint residuals read where the log has them.
+/// States of a log for a prior and a view, with the columns that only the constraint residuals read where the log has them. Its
+/// inputs are commands; where what acts depends on some before the log, accelerations count as not measured.
+/// @param actuators  not given: the model's
 struct LogStates {
   Eigen::MatrixXd states;
   Eigen::MatrixXd accelerations;  // those asked for (accelerations × N); NaN: not measured
@@ -118,7 +125,8 @@ struct LogStates {
   std::vector<std::string> notes;
 };
 LogStates read_log_states(const Prior& prior, const View& view, const Model& model, const CsvTable& log,
-                          const std::map<std::string, std::string>& columns, const std::vector<std::string>& accelerations = {});
+                          const std::map<std::string, std::string>& columns, const std::vector<std::string>& accelerations = {},
+                          const std::optional<std::vector<Actuator>>& actuators = {});
 
 /// work(), with the log named in what it throws: a posterior knows the number of a state only.
 template <typename Work>
@@ -130,7 +138,7 @@ auto at_states_of(const CsvTable& log, const Work& work) {
   }
 }
 
-/// All that a log has of states and accelerations.
+/// All that a log has of states, with what acts for its commands, and accelerations.
 struct WholeLog {
   Eigen::MatrixXd states;            // NaN where neither the model reads an entry nor the log has it (layout size × N)
   Eigen::MatrixXd accelerations;     // NaN where not measured, or not in the log (nq × N)

@@ -32,8 +32,9 @@ std::vector<Option> options(ViewRequest& request);
 /// A view, and the system under which it is.
 struct PredictedView {
   View view;
-  const Model* model = nullptr;  // of that system: the fit's or the request's, which outlive this
-  Prior prior;                   // there
+  const Model* model = nullptr;     // of that system: the fit's or the request's, which outlive this
+  std::vector<Actuator> actuators;  // of its inputs
+  Prior prior;                      // there
   std::vector<std::string> names;
 };
 

@@ -27,7 +27,7 @@ using MotionStart = std::variant<std::map<std::string, double>, CsvTable, Eigen:
 struct SimulateRequest {
   MotionStart start;
   Eigen::VectorXd times;           // at which states are wanted [s]; the first is the start
-  std::optional<CsvTable> inputs;  // t and every input, linear in between; not given: zero
+  std::optional<CsvTable> inputs;  // t and every input as commanded, linear in between; not given: zero
 
   std::map<std::string, std::string> columns;  // model's name -> log's name, before the model's own [columns]
   double relative_tolerance = 1e-6, absolute_tolerance = 1e-9;
@@ -54,6 +54,7 @@ struct SimulateJob {
   std::vector<Acceleration> accelerations;  // one for each motion
   std::vector<Acceleration> records;        // the multipliers λ of each motion; none without constraints
   SimulateOptions options;
+  InputSignal commands;            // of which options.inputs is what acts
   std::vector<std::string> notes;  // how the start was completed
 };
 

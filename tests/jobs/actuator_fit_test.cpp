@@ -1,0 +1,187 @@
+#include "gp2/jobs/actuator_fit.hpp"
+
+#include <cmath>
+
+#include <fmt/format.h>
+#include <gmock/gmock.h>
+#include <gtest/gtest.h>
+#include <nlohmann/json.hpp>
+
+#include "gp2/base/file.hpp"
+#include "gp2/jobs/fit_job.hpp"
+#include "gp2/jobs/predict_job.hpp"
+#include "gp2/jobs/raw_fit.hpp"
+#include "input_error.hpp"
+#include "io_testing.hpp"
+#include "jobs/late_cart.hpp"
+
+namespace gp2::test {
+namespace {
+
+using testing::Contains;
+using testing::HasSubstr;
+
+const char* const estimated = R"({ name = "u", delay = { estimate = true }, lag = { estimate = true } })";
+
+FitRequest request_for(const std::string& input, const CsvTable& log) {
+  FitRequest request;
+  request.model = late_cart(input);
+  request.logs = {{log}};
+  request.problem.mean = Prior::Mean::force;
+  request.problem.max_points = 120;
+  request.restarts = 2;
+  request.hyperparameters = HyperparameterChoice::optimise;
+  return request;
+}
+
+FitOutcome fit_of(const std::string& input, const CsvTable& log) { return run_fit(prepare_fit(request_for(input, log))); }
+
+double nrmse(const FitOutcome& fit, const CsvTable& test) { return evaluate(fit.file, fit.posterior, test, {}).evaluation.nrmse; }
+
+TEST(ActuatorFit, FindsDelayAndLagWithinTheirErrorsAndLearnsAsIfTheyWereKnown) {
+  struct Truth {
+    double delay, lag, rate;
+  };
+  // of two deviations 95 % are within; each seed tells both
+  int n_within = 0, n = 0;
+  double known = 0, found = 0, ignored = 0;
+  for (const Truth truth : {Truth{0.02, 0.05, 250}, Truth{0.05, 0.02, 100}}) {
+    for (std::uint64_t seed = 21; seed < 27; ++seed) {
+      const CsvTable log = late_cart_log(truth.delay, truth.lag, truth.rate, 6, seed),
+                     test = late_cart_log(truth.delay, truth.lag, truth.rate, 4, 100 + seed, 0);
+      const FitOutcome fit = fit_of(estimated, log);
+      ASSERT_EQ(fit.file.report.actuators.size(), 2);
+      for (const ActuatorEstimate& one : fit.file.report.actuators) {
+        const double off = std::abs(one.value - (one.name == "u.delay" ? truth.delay : truth.lag));
+        EXPECT_LT(one.stddev, 0.004) << one.name;
+        EXPECT_LT(off, 4 * one.stddev) << one.name << " of seed " << seed;
+        n_within += off < 2 * one.stddev ? 1 : 0;
+        ++n;
+      }
+      const std::string given = fmt::format("{{ name = \"u\", delay = {}, lag = {} }}", truth.delay, truth.lag);
+      found += std::log(nrmse(fit, test));
+      known += std::log(nrmse(fit_of(given, log), test));
+      ignored += std::log(nrmse(fit_of(R"("u")", log), test));
+    }
+  }
+  EXPECT_GE(n_within, 0.8 * n);
+  EXPECT_LT(std::exp((found - known) / (n / 2.0)), 1.3);
+  EXPECT_GT(std::exp((ignored - known) / (n / 2.0)), 5);
+}
+
+TEST(ActuatorFit, SameSeedSameBitsForAnyNumberOfThreads) {
+  const CsvTable log = late_cart_log(0.02, 0.05, 100, 4, 3);
+  std::vector<FitOutcome> fits;
+  for (const int threads : {1, 3}) {
+    FitRequest request = request_for(estimated, log);
+    request.threads = threads;
+    fits.push_back(run_fit(prepare_fit(std::move(request))));
+  }
+  for (std::size_t k = 0; k < 2; ++k) {
+    EXPECT_EQ(fits[0].file.report.actuators[k].value, fits[1].file.report.actuators[k].value);
+    EXPECT_EQ(fits[0].file.report.actuators[k].stddev, fits[1].file.report.actuators[k].stddev);
+  }
+  EXPECT_EQ(fits[0].file.report.objective, fits[1].file.report.objective);
+}
+
+TEST(ActuatorFit, AFitKeepsItsEstimatesInItsFileAndIsDoneAgainFromThere) {
+  const CsvTable log = late_cart_log(0.02, 0.05, 100, 4, 3);
+  const FitOutcome fit = fit_of(estimated, log);
+  const TemporaryFolder folder;
+  fit.file.write(folder / "late.json");
+  const FitFile read = FitFile::read(folder / "late.json");
+  ASSERT_EQ(read.report.actuators.size(), 2);
+  EXPECT_EQ(read.model.actuators[0].delay.value, fit.file.report.actuators[0].value);
+  EXPECT_EQ(read.model.actuators[0].lag.value, fit.file.report.actuators[1].value);
+  EXPECT_EQ(read.report.actuators[1].stddev, fit.file.report.actuators[1].stddev);
+  EXPECT_EQ(nrmse(fit, log), evaluate(read, read.posterior(), log, {}).evaluation.nrmse);
+  const FitOutcome again = run_fit(prepare_fit_again(read));
+  EXPECT_EQ(again.file.report.objective, fit.file.report.objective);
+  EXPECT_EQ(again.file.model.actuators[0].delay.value, read.model.actuators[0].delay.value);
+}
+
+TEST(ActuatorFit, FromARawLogToo) {
+  const CsvTable log = late_cart_log(0.03, 0.02, 200, 4, 5);
+  std::vector<CsvTable::Column> columns;
+  for (const char* name : {"t", "x", "u"}) {
+    columns.push_back({name, {}});
+    for (int row = 0; row < log.n_rows(); ++row) {
+      const double value = log.number(row, log.find(name));
+      columns.back().numbers.push_back(columns.size() == 2 ? std::round(value * 1e5) / 1e5 : value);
+    }
+  }
+  FitRequest request = request_for(estimated, log);
+  RawFitOptions options;
+  options.most_passes = 1;
+  const LearnedLog learned = learn_and_smooth(request, CsvTable::from_columns("raw", columns), options);
+  const System& system = *request.model.system;
+  request.logs = {{learned.table(system, "rows")}};
+  request.problem.commands = as_table(learned.data, system, "all rows");
+  const FitOutcome fit = run_fit(prepare_fit(request));
+  EXPECT_NEAR(fit.file.model.actuators[0].delay.value, 0.03, 0.003);
+  EXPECT_NEAR(fit.file.model.actuators[0].lag.value, 0.02, 0.003);
+  EXPECT_NEAR(fit.file.model.actuators[0].delay.value + fit.file.model.actuators[0].lag.value, 0.05, 0.001);
+}
+
+TEST(ActuatorFit, AFileWithTheDelayOfNoInputIsRefused) {
+  const TemporaryFolder folder;
+  fit_of(R"({ name = "u", delay = { estimate = true } })", late_cart_log(0.02, 0, 100, 2, 3)).file.write(folder / "late.json");
+  const auto json = nlohmann::json::parse(read_file(folder / "late.json"));
+  const auto error_of = [&](const char* key, const auto& value) {
+    auto changed = without_checksum(json);
+    changed["actuators"][0][key] = value;
+    return input_error_of([&] { FitFile::parse(changed.dump(), "late.json"); });
+  };
+  EXPECT_EQ(error_of("name", "u.delay"), "");
+  EXPECT_EQ(error_of("name", "v.delay"), "late.json: 'v.delay' is not of this model");
+  EXPECT_EQ(error_of("value", -1), "late.json: u.delay must not be negative, got -1");
+}
+
+TEST(ActuatorFit, SaysWhatTheDataDoNotDetermine) {
+  // a constant force, which is as it is however late
+  const CsvTable moving = late_cart_log(0, 0, 100, 3, 3);
+  std::vector<CsvTable::Column> columns;
+  for (const std::string& name : moving.header()) {
+    columns.push_back({name, {}});
+    for (int row = 0; row < moving.n_rows(); ++row)
+      columns.back().numbers.push_back(name == "u" ? 1 : moving.number(row, moving.find(name)));
+  }
+  const FitOutcome fit = fit_of(estimated, CsvTable::from_columns("steady", columns));
+  for (const ActuatorEstimate& one : fit.file.report.actuators) EXPECT_FALSE(std::isfinite(one.stddev)) << one.name;
+  EXPECT_THAT(fit.notes, Contains(HasSubstr("the data do not determine u.delay")));
+}
+
+TEST(ActuatorFit, SaysWhereABoundHolds) {
+  const CsvTable log = late_cart_log(0.06, 0, 100, 4, 3);
+  const FitOutcome fit = fit_of(R"({ name = "u", delay = { bounds = [0, 0.03], estimate = true } })", log);
+  EXPECT_DOUBLE_EQ(fit.file.report.actuators[0].value, 0.03);
+  EXPECT_TRUE(std::isnan(fit.file.report.actuators[0].stddev));
+  EXPECT_THAT(fit.notes, Contains("warning: u.delay ended at its bound, 0.03 s. It may lie beyond: give it wider bounds"));
+}
+
+TEST(ActuatorFit, APriorWeighs) {
+  const CsvTable log = late_cart_log(0.06, 0, 100, 4, 3);
+  const FitOutcome free = fit_of(R"({ name = "u", delay = { estimate = true } })", log);
+  const FitOutcome sure = fit_of(R"({ name = "u", delay = { estimate = true, prior = { mean = 0.03, stddev = 1e-6 } } })", log);
+  EXPECT_NEAR(free.file.report.actuators[0].value, 0.06, 0.002);
+  EXPECT_NEAR(sure.file.report.actuators[0].value, 0.03, 1e-4);
+  EXPECT_NEAR(sure.file.report.actuators[0].stddev, 1e-6, 1e-8);
+}
+
+TEST(ActuatorFit, EstimatesWhatIsAskedFor) {
+  const CsvTable log = late_cart_log(0.02, 0.03, 100, 3, 3);
+  FitRequest none = request_for(estimated, log), one = request_for(R"({ name = "u", lag = 0.03 })", log);
+  none.problem.estimate.emplace();
+  one.problem.estimate = {"u.delay"};
+  EXPECT_TRUE(prepare_fit(none).problem.late.empty());
+  const FitJob job = prepare_fit(one);
+  ASSERT_EQ(job.problem.late.size(), 1);
+  EXPECT_EQ(job.problem.late[0].name, "u.delay");
+  // what nothing reads
+  FitRequest unread = request_for(estimated, log);
+  unread.problem.mean = Prior::Mean::zero;
+  EXPECT_THAT(prepare_fit(unread).notes, Contains(HasSubstr("warning: u.delay is not estimated: nothing that this fit reads")));
+}
+
+}  // namespace
+}  // namespace gp2::test

@@ -1,0 +1,163 @@
+#include "gp2/jobs/command_record.hpp"
+
+#include <gmock/gmock.h>
+#include <gtest/gtest.h>
+
+#include "gp2/jobs/derive.hpp"
+#include "gp2/jobs/fit_problem.hpp"
+#include "gp2/jobs/generate_job.hpp"
+#include "gp2/jobs/show_job.hpp"
+#include "gp2/simulate.hpp"
+#include "input_error.hpp"
+#include "jobs/late_cart.hpp"
+
+namespace gp2::test {
+namespace {
+
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+using testing::Contains;
+using testing::ElementsAre;
+using testing::HasSubstr;
+
+const char* const both = R"({ name = "u", delay = 0.02, lag = 0.04 })";
+
+FitProblemOptions with_force() {
+  FitProblemOptions options;
+  options.mean = Prior::Mean::force;
+  return options;
+}
+
+MatrixXd states_read(const Model& model, const CsvTable& log, const FitProblemOptions& options = with_force()) {
+  return make_fit_problem(model, log, options).observations.front().states();
+}
+
+TEST(CommandRecord, APlainInputHasTheBitsOfTheLog) {
+  const CsvTable log = late_cart_log(0, 0, 100, 2, 1);
+  EXPECT_EQ(states_read(late_cart(R"({ name = "u", delay = 0, lag = 0 })"), log)(Eigen::all, Eigen::all).row(3),
+            states_read(late_cart(R"("u")"), log).row(3));
+  EXPECT_EQ(states_read(late_cart(R"("u")"), log)(3, 7), log.number(7, log.find("u")));
+}
+
+TEST(CommandRecord, WhatActsIsWhatTheSimulationHad) {
+  const CsvTable log = late_cart_log(0.02, 0.04, 100, 2, 1, 0);
+  const MatrixXd states = states_read(late_cart(both), log);
+  // 0.02 s + 5 · 0.04 s are left out
+  EXPECT_EQ(states.cols(), log.n_rows() - 22);
+  const int first = log.n_rows() - static_cast<int>(states.cols());
+  for (int i = 0; i < states.cols(); ++i) {
+    const double dx = states(1, i), ddx = log.number(first + i, log.find("ddx"));
+    EXPECT_NEAR(states(3, i) - 2 * dx - std::tanh(5 * dx), 1.5 * ddx, 1e-12);
+  }
+}
+
+TEST(CommandRecord, RowsOfALogAreToldByTheWholeLog) {
+  const CsvTable log = late_cart_log(0.02, 0.04, 100, 2, 1);
+  const std::vector<int> some = {150, 40, 90};
+  FitProblemOptions options = with_force();
+  options.commands = log;
+  const MatrixXd all = states_read(late_cart(both), log), chosen = states_read(late_cart(both), log.take(some), options);
+  ASSERT_EQ(chosen.cols(), 3);
+  for (int k = 0; k < 3; ++k) EXPECT_EQ(chosen(3, k), all(3, some[static_cast<std::size_t>(k)] - 22));
+}
+
+TEST(CommandRecord, EpisodesAndWhatFollowsAPauseBeginAtRest) {
+  const CsvTable log = late_cart_log(0.02, 0.04, 100, 3, 1);
+  const auto column = [&](const char* name, const std::vector<int>& rows, double shift) {
+    std::vector<double> out;
+    for (const int row : rows) out.push_back(log.number(row, log.find(name)) + (row >= 150 ? shift : 0));
+    return out;
+  };
+  std::vector<int> rows;
+  for (int row = 0; row < log.n_rows(); ++row) rows.push_back(row);
+  const auto table = [&](double pause, bool with_episodes) {
+    std::vector<CsvTable::Column> columns = {{"t", column("t", rows, pause)}};
+    for (const char* name : {"x", "dx", "ddx", "u"}) columns.push_back({name, column(name, rows, 0)});
+    if (!with_episodes) return CsvTable::from_columns("log", columns);
+    std::vector<double> episode(rows.size(), 1);
+    std::fill(episode.begin() + 150, episode.end(), 2);
+    columns.push_back({"episode", episode});
+    return CsvTable::from_columns("log", columns);
+  };
+  const Model model = late_cart(both);
+  // 0.18 s are no pause at 100 Hz
+  EXPECT_EQ(states_read(model, table(0.18, false)).cols(), log.n_rows() - 22);
+  const MatrixXd paused = states_read(model, table(5, false)), episodes = states_read(model, table(-1, true));
+  EXPECT_EQ(paused.cols(), log.n_rows() - 44);
+  ASSERT_EQ(episodes.cols(), log.n_rows() - 44);
+  EXPECT_LT((paused.row(3) - episodes.row(3)).cwiseAbs().maxCoeff(), 1e-12);
+}
+
+TEST(CommandRecord, SaysWhatIsLeftOutAndWhatIsTooCoarse) {
+  const CsvTable log = late_cart_log(0.02, 0.04, 10, 10, 1);
+  const FitProblem problem = make_fit_problem(late_cart(both), log, with_force());
+  EXPECT_THAT(problem.notes, Contains("late cart: 3 of 101 rows left out: what acts there depends on commands before the log"));
+  EXPECT_THAT(problem.notes, Contains(HasSubstr("rows are 0.1 s apart as a rule, inputs at most 0.06 s late")));
+}
+
+TEST(CommandRecord, NeedsTimesInOrderAndRowsLateEnough) {
+  const CsvTable log = late_cart_log(0, 0, 100, 1, 1);
+  const Model model = late_cart(both);
+  const auto error_of = [&](const CsvTable& table) {
+    return input_error_of([&] { make_fit_problem(model, table, with_force()); });
+  };
+  const CsvTable without_time = CsvTable::parse("x,dx,ddx,u\n1,2,3,4\n", "no time");
+  EXPECT_EQ(
+      error_of(without_time),
+      "no time: u acts late, which takes the times of the whole log, but it has no column t; it has: x, dx, ddx, u. Where its "
+      "inputs are what acts, give the model no delay and no lag");
+  EXPECT_EQ(
+      error_of(log.take({3, 2})),
+      "late cart: u acts late, which takes rows in the order of time, but late cart:4: column 't' has t = 0.02 after 0.03. Sort "
+      "the rows, or name what belongs together in a column 'episode'");
+  EXPECT_EQ(
+      error_of(log.first_rows(20)),
+      "late cart: at none of its rows is known what acts: inputs are so late that all depend on commands before the log; give "
+      "the whole log as `commands`, a longer one, or narrower bounds of delays and lags");
+  // where nothing reads u, nothing is needed
+  EXPECT_EQ(input_error_of([&] { make_fit_problem(model, without_time, {}); }).find("late"), std::string::npos);
+}
+
+TEST(CommandRecord, WhatDependsOnWhatWasBeforeIsPredictedAndNotCompared) {
+  const CsvTable log = late_cart_log(0.02, 0.04, 100, 2, 1);
+  const Model model = late_cart(both);
+  PriorOptions options;
+  options.mean = Prior::Mean::force;
+  const Prior prior = make_prior(model, options);
+  const View view = View::constrained_acceleration(*model.system);
+  const LogStates predicted = read_log_states(prior, view, model, log, {}),
+                  compared = read_log_states(prior, view, model, log, {}, {"ddx"});
+  EXPECT_EQ(predicted.states.cols(), log.n_rows());
+  EXPECT_TRUE(predicted.states.row(3).allFinite());
+  EXPECT_THAT(predicted.notes, Contains(HasSubstr("22 of 201 rows as if the inputs had been at rest before")));
+  EXPECT_EQ(compared.accelerations.array().isNaN().count(), 22);
+}
+
+TEST(CommandRecord, AnotherSystemSharesWhatItMarks) {
+  const Model home = late_cart(both);
+  const Model marked = late_cart(R"({ name = "u", delay = { value = 0.07, estimate = true }, lag = 0.01 })");
+  const std::vector<Actuator> there = shared_actuators(home.actuators, marked);
+  EXPECT_EQ(there[0].delay.value, 0.02);
+  EXPECT_EQ(there[0].lag.value, 0.01);
+}
+
+TEST(CommandRecord, DerivePassesCommandsOn) {
+  const CsvTable log = late_cart_log(0.02, 0.04, 200, 2, 1, 0);
+  const MatrixXd plain = derive(late_cart(R"("u")"), log).states, late = derive(late_cart(both), log).states;
+  EXPECT_EQ(late, plain);
+}
+
+TEST(CommandRecord, GenerateDrawsNoMotion) {
+  EXPECT_EQ(input_error_of([&] { generate(late_cart(both), GenerateRequest{}); }),
+            "generate: late_cart.toml: states are drawn one by one, but with u.delay and u.lag what acts depends on what was "
+            "commanded before: simulate a motion, or leave both out");
+}
+
+TEST(CommandRecord, ShowPrintsDelaysAndLags) {
+  EXPECT_THAT(show(late_cart(R"({ name = "u", delay = { estimate = true }, lag = 0.04 })"), {}),
+              HasSubstr("\nactuators\n  u.delay      0   estimated\n  u.lag        0.04\n"));
+  EXPECT_EQ(show(late_cart(R"("u")"), {}).find("actuators"), std::string::npos);
+}
+
+}  // namespace
+}  // namespace gp2::test

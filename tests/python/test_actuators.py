@@ -1,0 +1,56 @@
+"""Inputs that act later than they are commanded."""
+
+import numpy as np
+import pytest
+
+import gp2
+
+LATE = {"name": "u", "delay": {"estimate": True}, "lag": 0.05}
+
+
+def cart(*inputs):
+    return gp2.System(
+        name="cart", coordinates=["x"], inputs=inputs, mass=[[1.5]], force=["u"],
+        latents=[{"features": ["dx"], "directions": "force"}], noise=0.05, truth={"force": ["-2*dx - tanh(5*dx)"]})
+
+
+def log_of(delay, lag, seconds=4.0, rate=100):
+    t = np.arange(round(seconds * rate) + 1) / rate
+    u = sum(1.5 * np.sin(2 * np.pi * f * t + f) for f in (0.3, 0.9, 1.7, 2.3, 3.1))
+    motion = gp2.simulate(cart({"name": "u", "delay": delay, "lag": lag}), {"x": 0, "dx": 0}, t, inputs={"t": t, "u": u})
+    noise = 0.05 * np.random.default_rng(3).standard_normal(len(t))
+    return {"t": t, "x": motion.states[:, 0], "dx": motion.states[:, 1], "ddx": motion.ddq[:, 0] + noise, "u": u}
+
+
+def taken(log, rows):
+    return {name: values[rows] for name, values in log.items()}
+
+
+def test_a_delay_is_estimated_and_reported():
+    posterior = gp2.fit(cart(LATE), log_of(0.03, 0.05), mean="force", max_points=100, restarts=2, hyperparameters="optimise")
+    (estimate,) = posterior.report.actuators
+    assert estimate["name"] == "u.delay"
+    assert abs(estimate["value"] - 0.03) < 3 * estimate["stddev"] < 0.01
+
+
+def test_rows_are_told_by_the_whole_log_what_acts():
+    system, log = cart({"name": "u", "delay": 0.03, "lag": 0.05}), log_of(0.03, 0.05)
+    rows = np.arange(60, 400, 7)
+    options = dict(mean="force", max_iterations=0, thin=False)
+    of_rows = gp2.fit(system, taken(log, rows), commands=log, **options)
+    acting = system.states(log)[rows]
+    of_arrays = gp2.fit(system, (acting, log["ddx"][rows, None]), **options)
+    assert of_rows.negative_log_likelihood == of_arrays.negative_log_likelihood
+
+
+def test_arrays_are_what_acts_and_tables_what_is_commanded():
+    system, log = cart({"name": "u", "delay": 0.03, "lag": 0.05}), log_of(0.03, 0.05)
+    posterior = gp2.fit(system, log, mean="force", max_points=60, restarts=1, hyperparameters="optimise")
+    np.testing.assert_array_equal(posterior.predict(log).mean, posterior.predict(system.states(log)).mean)
+
+
+def test_a_log_without_times_is_refused():
+    log = log_of(0.03, 0.05, seconds=1)
+    del log["t"]
+    with pytest.raises(gp2.InputError, match="u acts late, which takes the times of the whole log, but it has no column t"):
+        gp2.fit(cart(LATE), log, mean="force")
