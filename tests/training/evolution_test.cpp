@@ -38,7 +38,7 @@ TEST(EvolutionStrategy, FindsTheMinimumOfAnEllipsoidWhoseAxesDifferAThousandfold
       sum += std::pow(1e6, static_cast<double>(i) / static_cast<double>(x.size() - 1)) * x[i] * x[i];
     return sum;
   };
-  for (const std::uint64_t seed : {1, 2, 3}) EXPECT_LT(lowest(ellipsoid, VectorXd::Ones(8), 600, seed), 1e-10) << seed;
+  for (const std::uint64_t seed : {1U, 2U, 3U}) EXPECT_LT(lowest(ellipsoid, VectorXd::Ones(8), 600, seed), 1e-10) << seed;
   EXPECT_GT(lowest(ellipsoid, VectorXd::Ones(8), 20, 1), 1e-3) << "no task at all";
 }
 
