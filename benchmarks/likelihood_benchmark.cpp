@@ -61,7 +61,7 @@ void known_parameters_two_threads(benchmark::State& state) { likelihood_and_grad
 void estimated_noise(benchmark::State& state) { likelihood_and_gradient(state, {}, true); }
 void estimated_parameters(benchmark::State& state) { likelihood_and_gradient(state, {"p1", "p2", "p3", "p4", "p5"}, false); }
 
-// K̃ + I alone, on 1 or 2 threads
+// K̃ alone, on 1 or 2 threads
 void assembly(benchmark::State& state) {
   const Problem problem(static_cast<int>(state.range(0)), {}, false);
   const gp2::ModelValues values = gp2::model_values(problem.prior, problem.observations, problem.hyperparameters);

@@ -43,7 +43,21 @@ class Noise {
   Eigen::MatrixXd scale_;
 };
 
+/// A measured sum of one entry of a view over states that stand one after the other (theory.md, T36):
+///
+///     z_r = Σ_i w_i v_k(x_{first + i}) + σ_k Σ_j L_rj ξ_j,   ξ_j ~ N(0, 1), one for each sum.
+struct WeightedSum {
+  int row = 0;              // k: of the view
+  int first = 0;            // state
+  Eigen::VectorXd weights;  // w
+  double value = 0;         // z
+  Eigen::VectorXd noise;    // row r of L, a lower triangle, as far as it is not zero: its last entry, > 0, belongs to the sum itself
+};
+
 /// N noisy measurements of one view: y_i = G(x_i) ā(x_i) + d(x_i) + ε_i.
+///
+/// They may have sums. Then these are what is learned from, and the values are only what they say about single states: what
+/// hyperparameters start from, and what is shown.
 class Observations {
  public:
   /// @param states  x_i  (layout size × N)
@@ -59,15 +73,22 @@ class Observations {
   [[nodiscard]] const View& view() const { return view_; }
   [[nodiscard]] const Eigen::MatrixXd& values() const { return values_; }
   [[nodiscard]] const Noise& noise() const { return noise_; }
+  [[nodiscard]] const std::vector<WeightedSum>& sums() const { return sums_; }
+  [[nodiscard]] bool has_sums() const { return !sums_.empty(); }
   [[nodiscard]] int n_data() const { return static_cast<int>(states_.cols()); }
 
-  /// The same with other states, another view, other values, another noise. @throws InputError as the constructor.
+  /// The same with other states, another view, other values, another noise, and without sums.
+  /// @throws InputError as the constructor.
   [[nodiscard]] Observations with_states(Eigen::MatrixXd states) const { return {std::move(states), view_, values_, noise_}; }
   [[nodiscard]] Observations with_view(View view) const { return {states_, std::move(view), values_, noise_}; }
   [[nodiscard]] Observations with_values(Eigen::MatrixXd values) const { return {states_, view_, std::move(values), noise_}; }
   [[nodiscard]] Observations with_noise(Noise noise) const { return {states_, view_, values_, std::move(noise)}; }
+  /// The same with these sums.
+  /// @throws InputError when one is of rows or states that there are not, has numbers that are not finite, a last entry of L that is
+  /// not positive, or noise in common with a sum of another row.
+  [[nodiscard]] Observations with_sums(std::vector<WeightedSum> sums) const;
 
-  /// These states, in this order.
+  /// These states, in this order. @throws InputError where there are sums, as append() and remove_first() do.
   [[nodiscard]] Observations take(const std::vector<int>& states) const;
   /// Adds the states of `more` behind one's own; its view and σ are taken to be the same.
   /// @throws InputError when one has a noise of each value and the other has not.
@@ -89,6 +110,7 @@ class Observations {
   View view_;
   Eigen::MatrixXd values_;
   Noise noise_;
+  std::vector<WeightedSum> sums_;
 };
 
 }  // namespace gp2

@@ -113,7 +113,6 @@ void assemble(const LatentRows& rows, int n_threads, Ref<MatrixXd> K, const std:
     TileColumn tiles(rows, J, K);
     for (Index I = J; I < rows.n_samples() && !is_set(stop); I += tile_size) tiles.write_tile(I);
   });
-  K.diagonal().array() += 1;
 }
 
 }  // namespace gp2

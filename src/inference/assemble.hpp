@@ -15,7 +15,7 @@ inline constexpr Eigen::Index tile_size = 64;
 /// Rows above the diagonal that a column of a tile on the diagonal may leave out, in whole vectors.
 constexpr Eigen::Index whole_vectors_before(Eigen::Index j) { return j / simd::lanes<double> * simd::lanes<double>; }
 
-/// K̃ + I in the lower triangle. What stands above the diagonal is left alone.
+/// K̃ in the lower triangle. What stands above the diagonal is left alone.
 /// @param K     (rows.size() × rows.size())
 /// @param stop  set: leaves the rest as it was
 void assemble(const LatentRows& rows, int n_threads, Eigen::Ref<Eigen::MatrixXd> K, const std::atomic<bool>* stop = nullptr);

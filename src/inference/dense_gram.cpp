@@ -24,8 +24,16 @@ int DenseGram::n_blas_threads(const LatentRows& rows) const { return rows.size()
 
 std::optional<GramValue> DenseGram::factorise(const LatentRows& rows) {
   const lapack::ManyThreads many_threads(n_blas_threads(rows));
-  factor_.resize(rows.size());
-  assemble(rows, n_threads(rows), factor_.lower(), stop_);
+  const std::optional<Sums>& sums = rows.reduction->sums;
+  factor_.resize(rows.reduction->n_measured());
+  if (sums) {
+    of_rows_.resize(rows.size(), rows.size());
+    assemble(rows, n_threads(rows), of_rows_, stop_);
+    sums->of_rows(of_rows_, factor_.lower());
+  } else {
+    assemble(rows, n_threads(rows), factor_.lower(), stop_);
+  }
+  factor_.lower().diagonal().array() += 1;
   if (is_set(stop_) || !factor_.factorise(rows.reduction->y, stop_)) return std::nullopt;
   return GramValue{0.5 * factor_.z().squaredNorm(), factor_.log_det_half()};
 }
@@ -33,7 +41,13 @@ std::optional<GramValue> DenseGram::factorise(const LatentRows& rows) {
 GramGradient DenseGram::differentiate(const LatentRows& rows, const std::vector<GramGradientParts>& parts) {
   const lapack::ManyThreads many_threads(n_blas_threads(rows));
   const Eigen::VectorXd alpha = factor_.solve();
-  return sweep_pairs(rows, factor_.invert(stop_), alpha, parts, n_threads(rows), stop_);
+  const Ref<const MatrixXd> P = factor_.invert(stop_);
+  const std::optional<Sums>& sums = rows.reduction->sums;
+  if (!sums) return sweep_pairs(rows, P, alpha, parts, n_threads(rows), stop_);
+  GramGradient gradient =
+      sweep_pairs(rows, sums->to_rows(P), sums->weights_of_rows(alpha), parts, n_threads(rows), stop_);
+  gradient.log_noise = P.diagonal() - alpha.cwiseAbs2();
+  return gradient;
 }
 
 Gram::Inverse DenseGram::invert(const LatentRows& rows, const std::vector<std::vector<Index>>& sets) {

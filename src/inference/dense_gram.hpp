@@ -26,9 +26,11 @@ class DenseGram final : public Gram {
   int n_threads_;
   const std::atomic<bool>* stop_;
   GrowingCholesky factor_;
+  Eigen::MatrixXd of_rows_;  // K̃ of the rows, where sums of these are measured
 };
 
-/// The latents given the observations by L: the samples are the basis, ỹ the basis variables and X = L⁻¹.
+/// The latents given the observations by L: the samples are the basis, ỹ, or sums of rows before they are whitened, the basis
+/// variables and X = L⁻¹, times the inverse of the Cholesky factor of the sums' noise.
 class DensePosterior final : public LatentPosterior {
  public:
   /// Without observations; latents and kernels as those of `like`.
@@ -49,6 +51,8 @@ class DensePosterior final : public LatentPosterior {
   [[nodiscard]] bool factorise(const LatentRows& rows);
   [[nodiscard]] bool extend(const LatentRows& more);
   void append_basis(const LatentRows& more);
+  // α̃ of the rows
+  [[nodiscard]] Eigen::VectorXd weights_of_rows(Eigen::VectorXd alpha) const;
   // β_j = Z_jᵀ α̃_j (n_rows × F)
   [[nodiscard]] Eigen::MatrixXd latent_weights(std::size_t a, const Eigen::VectorXd& alpha) const;
   void refresh_weights();

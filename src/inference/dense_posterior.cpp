@@ -27,18 +27,27 @@ std::unique_ptr<LatentPosterior> DensePosterior::clone() const { return std::mak
 
 GramValue DensePosterior::value() const { return {0.5 * factor_.z().squaredNorm(), factor_.log_det_half()}; }
 
-void DensePosterior::whiten(Ref<MatrixXd> c) const { lapack::solve_lower(factor_.L(), false, c); }
+void DensePosterior::whiten(Ref<MatrixXd> c) const {
+  if (sums_) sums_->whiten(c);
+  lapack::solve_lower(factor_.L(), false, c);
+}
 
 MatrixXd DensePosterior::whitening_columns(Index first, Index n) const {
   const Index below = size() - first;
   MatrixXd columns = MatrixXd::Identity(below, n);
+  if (sums_) {
+    MatrixXd whole = MatrixXd::Zero(size(), n);
+    whole.bottomRows(below) = columns;
+    sums_->whiten(whole);
+    columns = whole.bottomRows(below);
+  }
   lapack::solve_lower(factor_.L().bottomRightCorner(below, below), false, columns);
   return columns;
 }
 
 // ỹ − Σ_a Z_a f̃_a − ε
 VectorXd DensePosterior::misfit(const std::vector<MatrixXd>& f, RandomStream& random) const {
-  VectorXd misfit = y_;
+  VectorXd misfit = sums_ ? VectorXd(VectorXd::Zero(n_rows())) : y_;
   for (std::size_t a = 0; a < latents_.size(); ++a) {
     const Index n_functions = latents_[a].n_functions;
     for (Index j = 0; j < n_samples_; ++j) {
@@ -48,6 +57,11 @@ VectorXd DensePosterior::misfit(const std::vector<MatrixXd>& f, RandomStream& ra
         misfit[row] -= latents_[a].Z.row(j).segment(static_cast<Index>(c) * n_functions, n_functions) * f[a].col(j);
       }
     }
+  }
+  if (sums_) {
+    misfit = (sums_->D * misfit).eval();
+    sums_->whiten(misfit);
+    misfit += y_;
   }
   for (double& entry : misfit) entry -= random.normal();
   return misfit;
@@ -60,9 +74,14 @@ std::vector<std::vector<MatrixXd>> DensePosterior::weights(MatrixXd misfits) con
   std::vector<std::vector<MatrixXd>> weights;
   for (Index column = 0; column < alpha.cols(); ++column) {
     std::vector<MatrixXd>& of_column = weights.emplace_back();
-    for (std::size_t a = 0; a < latents_.size(); ++a) of_column.push_back(latent_weights(a, alpha.col(column)));
+    const VectorXd of_rows = weights_of_rows(alpha.col(column));
+    for (std::size_t a = 0; a < latents_.size(); ++a) of_column.push_back(latent_weights(a, of_rows));
   }
   return weights;
+}
+
+VectorXd DensePosterior::weights_of_rows(VectorXd alpha) const {
+  return sums_ ? sums_->weights_of_rows(std::move(alpha)) : alpha;
 }
 
 MatrixXd DensePosterior::latent_weights(std::size_t a, const VectorXd& alpha) const {
@@ -81,7 +100,7 @@ MatrixXd DensePosterior::latent_weights(std::size_t a, const VectorXd& alpha) co
 }
 
 void DensePosterior::refresh_weights() {
-  const VectorXd alpha = factor_.solve();
+  const VectorXd alpha = weights_of_rows(factor_.solve());
   for (std::size_t a = 0; a < latents_.size(); ++a) latents_[a].beta = latent_weights(a, alpha);
 }
 
@@ -93,10 +112,19 @@ bool DensePosterior::append(const LatentRows& more) {
 }
 
 bool DensePosterior::factorise(const LatentRows& rows) {
-  GrowingCholesky factor(rows.size());
-  assemble(rows, 1, factor.lower());
+  const std::optional<Sums>& sums = rows.reduction->sums;
+  GrowingCholesky factor(rows.reduction->n_measured());
+  if (sums) {
+    MatrixXd of_rows(rows.size(), rows.size());
+    assemble(rows, 1, of_rows);
+    sums->of_rows(of_rows, factor.lower());
+  } else {
+    assemble(rows, 1, factor.lower());
+  }
+  factor.lower().diagonal().array() += 1;
   if (!factor.factorise(rows.reduction->y)) return false;
   factor_ = std::move(factor);
+  sums_ = sums;
   return true;
 }
 
@@ -105,6 +133,7 @@ bool DensePosterior::extend(const LatentRows& more) {
   const Index n_new = more.n_samples(), n_components = reduction.n_components();
   MatrixXd kappa(more.size(), more.size());
   assemble(more, 1, kappa);
+  kappa.diagonal().array() += 1;
   // row c of Z at a sample is the loading of its component c
   std::vector<MatrixXd> features, loadings;
   for (const LatentRows::OfLatent& latent : more.latents) {
@@ -118,14 +147,17 @@ bool DensePosterior::extend(const LatentRows& more) {
       k.col(reduction.offset[static_cast<std::size_t>(c)] + j) = cross.col(j * n_components + c);
     }
   }
-  return factor_.append(std::move(k), std::move(kappa), reduction.y);
+  if (sums_) sums_->whiten(k);
+  if (!factor_.append(std::move(k), std::move(kappa), reduction.y)) return false;
+  if (sums_) sums_->append_rows(more.size());
+  return true;
 }
 
 void DensePosterior::append_basis(const LatentRows& more) {
   const Reduction& reduction = *more.reduction;
-  const Index n_old = n_samples_, n_new = more.n_samples(), first_row = y_.size();
-  y_.conservativeResize(first_row + more.size());
-  y_.tail(more.size()) = reduction.y;
+  const Index n_old = n_samples_, n_new = more.n_samples(), first_row = n_rows() - more.size();
+  y_.conservativeResize(size());
+  y_.tail(reduction.n_measured()) = reduction.y;
   if (row_of_.size() < reduction.count.size()) {
     row_of_.resize(reduction.count.size(), std::vector<Index>(static_cast<std::size_t>(n_old), -1));
   }

@@ -40,12 +40,13 @@ struct GramGradient {
     Eigen::MatrixXd V;        // ∂/∂Z_i = V_i = Σ_j S_ij Z_j k_ij, by component              (N × components·functions)
     Eigen::MatrixXd mean;     // Σ_j k_ij Z_jᵀα̃_j, the posterior mean of f_a at the samples  (N × functions)
   };
-  Eigen::VectorXd alpha;  // ∂/∂ỹ = α̃ = Pỹ  (size)
+  Eigen::VectorXd alpha;      // ∂/∂ỹ = α̃ = Pỹ; where there are sums, of the rows that they are of  (size)
+  Eigen::VectorXd log_noise;  // of sums: ∂(−log p)/∂log of the noise of each, log|L| left out  (sums)
   std::vector<OfLatent> latents;
 };
 
 /// The latents given the observations. They are known through numbers that are linear in the latents at the points of a basis,
-/// here called basis variables: ỹ at the samples (dense), or inducing values. With c = cov(basis variables, ·),
+/// here called basis variables: ỹ at the samples or sums of its rows (dense), or inducing values. With c = cov(basis variables, ·),
 ///
 ///     E[f_a(φ)] = Σ_j k_a(φ, φ_j) β_a,j,    cov = cov of the prior − (X c)ᵀ X c'.
 class LatentPosterior {
@@ -62,8 +63,12 @@ class LatentPosterior {
   [[nodiscard]] virtual std::unique_ptr<LatentPosterior> clone() const = 0;
 
   [[nodiscard]] const std::vector<Basis>& latents() const { return latents_; }
-  /// Which basis variable is component c of point j: [c][j]; −1: the point has fewer components.
+  /// Which row is component c of point j: [c][j]; −1: the point has fewer components. Rows are the basis variables, unless there
+  /// are sums.
   [[nodiscard]] const std::vector<std::vector<Eigen::Index>>& row_of() const { return row_of_; }
+  /// The basis variables as sums of rows; null: each is a row.
+  [[nodiscard]] const Sums* sums() const { return sums_ ? &*sums_ : nullptr; }
+  [[nodiscard]] Eigen::Index n_rows() const { return sums_ ? sums_->D.cols() : size(); }
 
   [[nodiscard]] virtual Eigen::Index size() const = 0;  // basis variables
   [[nodiscard]] virtual GramValue value() const = 0;
@@ -94,6 +99,7 @@ class LatentPosterior {
 
   std::vector<Basis> latents_;
   std::vector<std::vector<Eigen::Index>> row_of_;
+  std::optional<Sums> sums_;
 };
 
 /// A solver of K̃ + I. It has memory that is used again: one per thread.

@@ -27,6 +27,9 @@ void LatentSums::evaluate(const std::vector<MatrixXd>& features, std::optional<L
     for (Index i = 0; i < n_states; ++i) basis.kernel.scale(features[a].row(i).transpose(), point(a, i));
     mean_[a].setZero(basis.n_functions, n_states);
   }
+  MatrixXd of_rows;
+  MatrixXd* const to = cross == nullptr || posterior_.sums() == nullptr ? cross : &of_rows;
+  if (to == &of_rows) of_rows.resize(posterior_.n_rows(), cross->cols());
   const Index n_rows = posterior_.latents().front().kernel.n_rows();
   for (Index first = 0; first < n_rows; first += chunk) {
     const Index n = std::min(chunk, n_rows - first);
@@ -34,9 +37,10 @@ void LatentSums::evaluate(const std::vector<MatrixXd>& features, std::optional<L
       for (std::size_t a = 0; a < n_latents; ++a) {
         if (needs(a)) add_chunk(a, first, n, i);
       }
-      if (cross != nullptr) write_cross(first, n, i, *loadings, cross->middleCols(i * d, d));
+      if (to != nullptr) write_cross(first, n, i, *loadings, to->middleCols(i * d, d));
     }
   }
+  if (to == &of_rows) *cross = posterior_.sums()->D * of_rows;
 }
 
 // the kernel between points of a chunk and state i, and its part of the mean
@@ -50,7 +54,7 @@ void LatentSums::add_chunk(std::size_t a, Index first, Index n, Index i) {
   for (Index l = 0; l < basis.n_functions; ++l) mean_[a](l, i) += sums_[l];
 }
 
-// Σ_a k_a Z_a ℓ_a of a chunk, to the rows of its points (basis variables × d)
+// Σ_a k_a Z_a ℓ_a of a chunk, to the rows of its points (rows × d)
 void LatentSums::write_cross(Index first, Index n, Index i, const std::vector<MatrixXd>& loadings, Ref<MatrixXd> cross) {
   for (std::size_t c = 0; c < posterior_.row_of().size(); ++c) {
     const std::vector<Index>& row_of = posterior_.row_of()[c];

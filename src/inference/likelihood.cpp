@@ -225,6 +225,12 @@ double Likelihood::evaluate(const ModelValues& values, ModelGradient* gradient, 
   if (!self.differentiates_samples()) return value;
   SampleGradient of_sample(self.options, self.observations, *models, reduction, values, of_gram);
   for (Index i = 0; i < reduction.n_samples(); ++i) of_sample.add(i, *gradient);
+  if (reduction.sums && self.options.noise_gradient) {
+    for (Index r = 0; r < reduction.sums->size(); ++r) {
+      const Sums::Of& of = reduction.sums->of[static_cast<std::size_t>(r)];
+      if (of.group >= 0) gradient->log_noise_stddev[static_cast<std::size_t>(of.group)][of.row] += of_gram.log_noise[r];
+    }
+  }
   return value;
 }
 

@@ -259,7 +259,7 @@ class PairSweep {
 GramGradient sweep_pairs(const LatentRows& rows, const Ref<const MatrixXd>& P, const VectorXd& alpha,
                          const std::vector<GramGradientParts>& parts, int n_threads, const std::atomic<bool>* stop) {
   PairSums sums = PairSweep(rows, P, alpha, parts).run(n_threads, stop);
-  GramGradient gradient{alpha, {}};
+  GramGradient gradient{alpha, {}, {}};
   for (PairSums::OfLatent& of : sums.latents) {
     gradient.latents.push_back({0.5 * of.kernel.colwise().sum().transpose(), of.columns.colwise().sum().transpose(),
                                 std::move(of.V), std::move(of.mean)});

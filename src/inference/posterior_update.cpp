@@ -27,7 +27,7 @@ void add(Posterior::Implementation& self, const Observations& added) {
   std::size_t group = 0;
   const auto belongs = [&] {
     const Observations& there = self.observations[group];
-    return there.view() == added.view() && self.values.noise_stddev[group] == added.noise().stddev() &&
+    return !there.has_sums() && there.view() == added.view() && self.values.noise_stddev[group] == added.noise().stddev() &&
            there.noise().has_scale() == added.noise().has_scale();
   };
   while (group < self.observations.size() && !belongs()) ++group;
@@ -78,6 +78,7 @@ std::vector<std::shared_ptr<Posterior::Implementation>> Posterior::own_component
 
 Posterior update(Posterior&& posterior, Observations added) {
   require_observations(posterior.prior(), added);
+  if (added.has_sums()) throw InputError("update: sums over states cannot be added; give them to the posterior when it is made");
   const lapack::SingleThread single_thread;
   const auto own = posterior.own_components();
   for (const auto& component : own) add(*component, added);
@@ -90,6 +91,10 @@ Posterior remove_oldest(Posterior&& posterior, int n) {
   if (n < 0 || static_cast<std::size_t>(n) > n_samples) {
     throw InputError(
         fmt::format("remove_oldest: there are {} observed states, so n must be 0 … {}, got {}", n_samples, n_samples, n));
+  }
+  const std::vector<Observations>& observations = posterior.observations();
+  if (n > 0 && std::any_of(observations.begin(), observations.end(), [](const auto& group) { return group.has_sums(); })) {
+    throw InputError("remove_oldest: the posterior is of sums over states, of which none can be taken away");
   }
   const lapack::SingleThread single_thread;
   const auto own = posterior.own_components();

@@ -45,6 +45,7 @@ void PredictorData<T>::store(const LatentPosterior& posterior, const std::vector
   row_of_ = posterior.row_of();
   n_samples_ = row_of_.empty() ? 0 : static_cast<Index>(row_of_.front().size());
   reduced_size_ = posterior.size();
+  if (posterior.sums() != nullptr) sums_ = posterior.sums()->D.cast<T>();
   for (const PredictorTerm& term : terms) {
     const LatentPosterior::Basis& from = posterior.latents()[term.latent];
     const Index n = from.kernel.n_points(), n_rows = simd::padded<T>(n);
@@ -109,6 +110,7 @@ typename PredictorData<T>::Memory PredictorData<T>::make_memory(const std::vecto
   if (stddev) {
     memory.products.setZero(n_padded);
     memory.cross.setZero(simd::padded<T>(reduced_size_), n_columns);
+    memory.rows.setZero(sums_.cols(), n_columns);
   }
   return memory;
 }
@@ -190,13 +192,26 @@ void PredictorData<T>::add_products(const PredictorTerm& term, std::size_t a, st
                                  memory.products.data());
 }
 
-// memory.products, one component of each sample, to its rows of the factor
+// memory.products, one component of each sample, to its rows
 template <typename T>
 void PredictorData<T>::scatter(std::size_t component, Index column, Memory& memory) const {
   const std::vector<Index>& rows = row_of_[component];
-  T* const to = memory.cross.col(column).data();
+  T* const to = (sums_.size() > 0 ? memory.rows : memory.cross).col(column).data();
   for (std::size_t j = 0; j < rows.size(); ++j) {
     if (rows[j] >= 0) to[rows[j]] = memory.products[static_cast<Index>(j)];
+  }
+}
+
+template <typename T>
+void PredictorData<T>::sum_up(Memory& memory) const {
+  for (Index column = 0; column < memory.rows.cols(); ++column) {
+    for (Index r = 0; r < sums_.rows(); ++r) {
+      T sum = 0;
+      for (typename Eigen::SparseMatrix<T, Eigen::RowMajor>::InnerIterator entry(sums_, r); entry; ++entry) {
+        sum += entry.value() * memory.rows(entry.col(), column);
+      }
+      memory.cross(r, column) = sum;
+    }
   }
 }
 
@@ -241,6 +256,7 @@ void PredictorData<T>::subtract_explained(const std::vector<PredictorTerm>& term
   } else {
     write_cross_of_rows(terms, loadings, memory);
   }
+  if (sums_.size() > 0) sum_up(memory);
   // entry i of X c for row r of the view, from the sums of row i of X with the columns of `cross`
   const auto entry = [&](Index r) {
     if (!by_function) return static_cast<double>(memory.sums[r]);

@@ -34,7 +34,8 @@ class PredictorData {
     Vector sums;      // of any few columns
     Vector products;  // (n_rows)
     Vector loading;   // (F)
-    Matrix cross;     // cov(ỹ, ·), by row of the factor (reduced size, padded × columns)
+    Matrix rows;      // where there are sums: cov of each row of a sample with · (rows × columns)
+    Matrix cross;     // cov(basis variables, ·) (basis variables, padded × columns)
 
     Eigen::VectorXd k_in_double;  // of a kernel that is no se
     KernelColumns::Workspace kernel;
@@ -74,12 +75,14 @@ class PredictorData {
   void add_products(const PredictorTerm& term, std::size_t a, std::size_t component, Eigen::Index first, Eigen::Index n,
                     const T* loading, Memory& memory) const;
   void scatter(std::size_t component, Eigen::Index column, Memory& memory) const;
+  void sum_up(Memory& memory) const;
   void write_cross_of_rows(const std::vector<PredictorTerm>& terms, const std::vector<Eigen::MatrixXd>& loadings,
                            Memory& memory) const;
   void write_cross_of_functions(const std::vector<PredictorTerm>& terms, Memory& memory) const;
 
   std::vector<LatentData> latents_;                // per term
   std::vector<std::vector<Eigen::Index>> row_of_;  // [component][sample], as in LatentPosterior
+  Eigen::SparseMatrix<T, Eigen::RowMajor> sums_;   // D, as in LatentPosterior; empty: there are none
   Eigen::Index n_samples_ = 0, reduced_size_ = 0;
   std::vector<T> inverse_;  // X row by row, each padded with zeros to whole vectors
 };

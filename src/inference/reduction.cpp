@@ -108,6 +108,28 @@ class Split {
   Eigen::VectorXi order_;
 };
 
+// One sample of which only sums are measured.
+void keep_whole(const ObservationModel& model, Reduction::Sample& sample) {
+  const auto G = model.values.view.G(sample.index);
+  sample.Q.setIdentity(G.rows(), G.rows());
+  sample.R = G;
+  sample.C.resize(0, 0);
+  sample.y = -model.values.view.offset.col(sample.index);
+  sample.y.noalias() -= G.lazyProduct(model.values.prior.mean.col(sample.index));
+  sample.e = sample.y;
+  sample.e_out.setZero(G.rows());
+  sample.constant = 0;
+}
+
+// log|σL| + ½ m log 2π
+double constant_of_sums(const Observations& group, const VectorXd& noise_stddev) {
+  double constant = 0;
+  for (const WeightedSum& sum : group.sums()) {
+    constant += std::log(noise_stddev[sum.row] * sum.noise[sum.noise.size() - 1]) + 0.5 * std::log(2 * std::numbers::pi);
+  }
+  return constant;
+}
+
 // Sorts the samples by falling rank: component c belongs to those of rank > c, which are then the first ones.
 void sort_by_rank(Reduction& reduction) {
   std::vector<Reduction::Sample>& samples = reduction.samples;
@@ -143,8 +165,54 @@ void stack(const Prior& prior, const std::vector<ObservationModel>& models, Redu
   }
 }
 
+// D and L, and z̃ from the rows of single samples
+void sum_up(const std::vector<Observations>& observations, const std::vector<VectorXd>& noise_stddev, Reduction& reduction) {
+  std::vector<std::vector<Index>> sample_of;  // by group and state
+  for (const Observations& group : observations) sample_of.emplace_back(static_cast<std::size_t>(group.n_data()));
+  Sums& sums = reduction.sums.emplace();
+  std::vector<Eigen::Triplet<double>> D, L;
+  const auto add = [&](Sums::Of of) {
+    sums.of.push_back(of);
+    return std::ssize(sums.of) - 1;
+  };
+  for (Index s = 0; s < reduction.n_samples(); ++s) {
+    const Reduction::Sample& sample = reduction.samples[static_cast<std::size_t>(s)];
+    sample_of[static_cast<std::size_t>(sample.group)][static_cast<std::size_t>(sample.index)] = s;
+    if (observations[static_cast<std::size_t>(sample.group)].has_sums()) continue;
+    for (const Index row : rows_of_samples(reduction, {s})) {
+      const Index r = add({});
+      D.emplace_back(r, row, 1);
+      L.emplace_back(r, r, 1);
+    }
+  }
+  const Index n_alone = std::ssize(sums.of);
+  std::vector<double> values;
+  for (std::size_t g = 0; g < observations.size(); ++g) {
+    for (const WeightedSum& sum : observations[g].sums()) {
+      const Index r = add({static_cast<int>(g), sum.row});
+      values.push_back(sum.value);
+      for (Index i = 0; i < sum.weights.size(); ++i) {
+        const Index s = sample_of[g][static_cast<std::size_t>(sum.first + i)];
+        D.emplace_back(r, reduction.offset[static_cast<std::size_t>(sum.row)] + s, sum.weights[i]);
+      }
+      for (Index j = 0; j < sum.noise.size(); ++j) {
+        L.emplace_back(r, r - sum.noise.size() + 1 + j, noise_stddev[g][sum.row] * sum.noise[j]);
+      }
+    }
+  }
+  const Index n = std::ssize(sums.of);
+  sums.D.resize(n, reduction.size());
+  sums.D.setFromTriplets(D.begin(), D.end());
+  sums.L.resize(n, n);
+  sums.L.setFromTriplets(L.begin(), L.end());
+  VectorXd z = sums.D * reduction.y;
+  z.tail(n - n_alone) += Eigen::Map<const VectorXd>(values.data(), std::ssize(values));
+  sums.whiten(z);
+  reduction.y = std::move(z);
+}
+
 bool has_same_directions(const Latent& latent, const Reduction& reduction, const MatrixXd& directions) {
-  bool same = latent.free_loading.has_value();
+  bool same = latent.free_loading.has_value() && !reduction.sums;
   for (std::size_t c = 0; same && c < reduction.count.size(); ++c) {
     const auto block = directions.middleRows(reduction.offset[c], reduction.count[c]);
     same = reduction.count[c] == reduction.count.front() && (block.rowwise() - block.row(0)).isZero(0);
@@ -153,6 +221,51 @@ bool has_same_directions(const Latent& latent, const Reduction& reduction, const
 }
 
 }  // namespace
+
+void Sums::whiten(Eigen::Ref<MatrixXd> c) const { L.triangularView<Eigen::Lower>().solveInPlace(c); }
+
+void Sums::whiten_transposed(Eigen::Ref<MatrixXd> c) const { L.transpose().triangularView<Eigen::Upper>().solveInPlace(c); }
+
+void Sums::of_rows(const Eigen::Ref<const MatrixXd>& K, Eigen::Ref<MatrixXd> of_sums) const {
+  MatrixXd whole = K.selfadjointView<Eigen::Lower>();
+  MatrixXd half = (D * whole).transpose();
+  whole = D * half;
+  whiten(whole);
+  half = whole.transpose();
+  whiten(half);
+  of_sums.triangularView<Eigen::Lower>() = half;
+}
+
+MatrixXd Sums::to_rows(const Eigen::Ref<const MatrixXd>& P) const {
+  MatrixXd half = P.selfadjointView<Eigen::Lower>();
+  whiten_transposed(half);
+  half.transposeInPlace();
+  whiten_transposed(half);
+  half = (D.transpose() * half).transpose().eval();
+  return D.transpose() * half;
+}
+
+VectorXd Sums::weights_of_rows(VectorXd alpha) const {
+  whiten_transposed(alpha);
+  return D.transpose() * alpha;
+}
+
+void Sums::append_rows(Index n) {
+  const auto extended = [n](const auto& matrix) {
+    std::vector<Eigen::Triplet<double>> entries;
+    using Matrix = std::decay_t<decltype(matrix)>;
+    for (Index k = 0; k < matrix.outerSize(); ++k) {
+      for (typename Matrix::InnerIterator entry(matrix, k); entry; ++entry) entries.emplace_back(entry.row(), entry.col(), entry.value());
+    }
+    for (Index k = 0; k < n; ++k) entries.emplace_back(matrix.rows() + k, matrix.cols() + k, 1);
+    Matrix out(matrix.rows() + n, matrix.cols() + n);
+    out.setFromTriplets(entries.begin(), entries.end());
+    return out;
+  };
+  of.resize(of.size() + static_cast<std::size_t>(n));
+  D = extended(D);
+  L = extended(L);
+}
 
 std::vector<Index> rows_of_samples(const Reduction& reduction, const std::vector<Index>& samples) {
   std::vector<Index> rows;
@@ -176,13 +289,22 @@ void reduce(const Prior& prior, const std::vector<Observations>& observations, c
     for (int i = 0; i < observations[g].n_data(); ++i, ++sample) {
       sample->group = static_cast<int>(g);
       sample->index = i;
-      whitening.move_to(i);
-      split(observations[g], models[g], whitening, *sample);
+      if (observations[g].has_sums()) {
+        keep_whole(models[g], *sample);
+        if (i == 0) sample->constant = constant_of_sums(observations[g], noise_stddev[g]);
+      } else {
+        whitening.move_to(i);
+        split(observations[g], models[g], whitening, *sample);
+      }
       reduction.constant += sample->constant;
     }
   }
   sort_by_rank(reduction);
   stack(prior, models, reduction);
+  reduction.sums.reset();
+  if (std::any_of(observations.begin(), observations.end(), [](const auto& group) { return group.has_sums(); })) {
+    sum_up(observations, noise_stddev, reduction);
+  }
   reduction.same_directions.clear();
   for (std::size_t a = 0; a < prior.latents.size(); ++a) {
     reduction.same_directions.push_back(has_same_directions(prior.latents[a], reduction, reduction.directions[a]));

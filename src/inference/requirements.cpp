@@ -16,7 +16,11 @@ using Eigen::VectorXd;
 
 void require_observations(const Prior& prior, const Observations& observations) {
   require_view(prior, observations.view());
-  prior_of(prior, observations.view()).system->require_states(observations.states());
+  const System& system = *prior_of(prior, observations.view()).system;
+  system.require_states(observations.states());
+  if (observations.has_sums() && system.has_constraint_noise()) {
+    throw InputError("sums over states cannot be of a system whose constraints are soft");
+  }
 }
 
 void require_observations(const Prior& prior, const std::vector<Observations>& observations) {

@@ -23,10 +23,15 @@ void SampleGradient::add(Index i, ModelGradient& gradient) {
   const Reduction::Sample& sample = reduction_.samples[static_cast<std::size_t>(i)];
   const std::size_t group = static_cast<std::size_t>(sample.group);
   const ObservationModel& model = models_[group];
-  whitening_ = observations_[group].noise_at(noise_stddev_[group], sample.index).cwiseInverse();
+  const bool is_summed = observations_[group].has_sums();
+  if (is_summed) {
+    whitening_.setOnes(sample.Q.rows());
+  } else {
+    whitening_ = observations_[group].noise_at(noise_stddev_[group], sample.index).cwiseInverse();
+  }
   differentiate_split(i, sample, model);
   if (sample.C.size() > 0) differentiate_noise(sample);
-  if (options_.noise_gradient) add_noise(sample, model, gradient.log_noise_stddev[group]);
+  if (options_.noise_gradient && !is_summed) add_noise(sample, model, gradient.log_noise_stddev[group]);
   if (!options_.gradient_parameters.empty()) add_parameters(sample, model, gradient.parameters);
 }
 

@@ -144,6 +144,15 @@ TEST(LikelihoodGradientTest, MatchesDifferencesWhereEachValueHasItsOwnNoise) {
   EXPECT_GT(seen.size(), 3U);
 }
 
+TEST(LikelihoodGradientTest, MatchesDifferencesWhereSumsAreMeasured) {
+  int n_problems = 0;
+  for (const Problem& p : test::problems(9, likelihood_gradient_seed)) {
+    if (p.prior.system->has_constraint_noise()) continue;
+    expect_gradient(test::with_sums(p, ++n_problems % 2 == 0, likelihood_gradient_seed));
+  }
+  EXPECT_GT(n_problems, 5);
+}
+
 // the sums over pairs of samples go tile by tile: here are several, and samples whose ranks differ
 TEST(LikelihoodGradientTest, MatchesDifferencesOverSeveralTiles) {
   int n_problems = 0;

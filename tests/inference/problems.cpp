@@ -402,35 +402,94 @@ Problem with_noise_scale(Problem p, std::uint64_t seed) {
   return p;
 }
 
+Problem with_sums(Problem p, bool every, std::uint64_t seed) {
+  RandomStream random(seed, 3);
+  const auto below = [&](Index n) { return static_cast<Index>(random.uniform() * static_cast<double>(n)); };
+  for (std::size_t g = 0; g < (every ? p.observations.size() : 1); ++g) {
+    Observations& group = p.observations[g];
+    const double scale = group.values().array().abs().mean();
+    std::vector<WeightedSum> sums;
+    for (int row = 0; row < group.view().size(); ++row) {
+      // such sums as overlap, whose noise goes together with that of those before
+      for (Index r = 0; r < group.n_data(); ++r) {
+        WeightedSum& sum = sums.emplace_back();
+        sum.row = row;
+        sum.weights.resize(1 + below(std::min<Index>(4, group.n_data())));
+        for (double& weight : sum.weights) weight = random.normal();
+        sum.first = static_cast<int>(below(group.n_data() - sum.weights.size() + 1));
+        sum.value = scale * random.normal();
+        sum.noise.resize(1 + below(std::min<Index>(3, r + 1)));
+        for (double& entry : sum.noise) entry = 0.3 * random.normal();
+        sum.noise[sum.noise.size() - 1] = 0.5 + random.uniform();
+      }
+    }
+    group = group.with_sums(std::move(sums));
+  }
+  return p;
+}
+
+namespace {
+
+// What is observed of a group as sums of the values of its view, and the covariance of its noise.
+std::pair<Extended, Extended> sums_of(const Problem& p, std::size_t g, const DenseView& view) {
+  const Observations& group = p.observations[g];
+  const MatrixXd sigma = noise_of_values(p, g);
+  const Index d = sigma.rows();
+  if (!group.has_sums()) {
+    Extended S = sigma.reshaped().cwiseAbs2().cast<long double>().asDiagonal();
+    for (Index i = 0; i < sigma.cols(); ++i) {
+      const Extended& N = view.slip[static_cast<std::size_t>(i)];
+      S.block(i * d, i * d, d, d) += N * N.transpose();
+    }
+    return {Extended::Identity(sigma.size(), sigma.size()), S};
+  }
+  const Index n = std::ssize(group.sums());
+  Extended T = Extended::Zero(n, sigma.size()), L = Extended::Zero(n, n);
+  for (Index r = 0; r < n; ++r) {
+    const WeightedSum& sum = group.sums()[static_cast<std::size_t>(r)];
+    for (Index i = 0; i < sum.weights.size(); ++i) T(r, (sum.first + i) * d + sum.row) = sum.weights[i];
+    for (Index j = 0; j < sum.noise.size(); ++j) {
+      L(r, r - sum.noise.size() + 1 + j) = static_cast<long double>(p.values.noise_stddev[g][sum.row]) * sum.noise[j];
+    }
+  }
+  return {T, L * L.transpose()};
+}
+
+ExtendedVector values_of(const Observations& group) {
+  if (!group.has_sums()) return group.values().reshaped().cast<long double>();
+  ExtendedVector values(std::ssize(group.sums()));
+  for (Index r = 0; r < values.size(); ++r) values[r] = group.sums()[static_cast<std::size_t>(r)].value;
+  return values;
+}
+
+}  // namespace
+
 DenseObservations dense_observations(const Problem& p) {
   DenseObservations dense;
-  std::vector<Index> first{0};
-  for (const Observations& group : p.observations) {
-    dense.views.push_back(dense_view(p.prior, p.values, group.view(), group.states()));
-    first.push_back(first.back() + group.values().size());
-  }
-  dense.residual.resize(first.back());
-  dense.covariance.resize(first.back(), first.back());
+  std::vector<Index> first{0}, first_observed{0};
+  std::vector<std::pair<Extended, Extended>> sums;
   for (std::size_t g = 0; g < p.observations.size(); ++g) {
     const Observations& group = p.observations[g];
-    dense.residual.segment(first[g], group.values().size()) = group.values().reshaped().cast<long double>() - dense.views[g].mean;
+    dense.views.push_back(dense_view(p.prior, p.values, group.view(), group.states()));
+    sums.push_back(sums_of(p, g, dense.views.back()));
+    first.push_back(first.back() + group.values().size());
+    first_observed.push_back(first_observed.back() + sums.back().first.rows());
+  }
+  Extended K(first.back(), first.back());
+  dense.residual.resize(first_observed.back());
+  dense.noise = Extended::Zero(first_observed.back(), first_observed.back());
+  dense.sums = Extended::Zero(first_observed.back(), first.back());
+  for (std::size_t g = 0; g < p.observations.size(); ++g) {
+    const auto& [T, S] = sums[g];
+    dense.sums.block(first_observed[g], first[g], T.rows(), T.cols()) = T;
+    dense.noise.block(first_observed[g], first_observed[g], S.rows(), S.cols()) = S;
+    dense.residual.segment(first_observed[g], T.rows()) = values_of(p.observations[g]) - T * dense.views[g].mean;
     for (std::size_t h = 0; h < p.observations.size(); ++h) {
-      dense.covariance.block(first[g], first[h], first[g + 1] - first[g], first[h + 1] - first[h]) =
+      K.block(first[g], first[h], first[g + 1] - first[g], first[h + 1] - first[h]) =
           dense_covariance(p.prior, p.values, dense.views[g], dense.views[h]);
     }
   }
-  for (std::size_t g = 0; g < p.observations.size(); ++g) {
-    const MatrixXd sigma = noise_of_values(p, g);
-    for (Index k = first[g]; k < first[g + 1]; ++k) {
-      const long double s = sigma.reshaped()[k - first[g]];
-      dense.covariance(k, k) += s * s;
-    }
-    const Index d = sigma.rows();
-    for (Index i = 0; i < sigma.cols(); ++i) {
-      const Extended& N = dense.views[g].slip[static_cast<std::size_t>(i)];
-      dense.covariance.block(first[g] + i * d, first[g] + i * d, d, d) += N * N.transpose();
-    }
-  }
+  dense.covariance = dense.sums * K * dense.sums.transpose() + dense.noise;
   return dense;
 }
 
@@ -446,12 +505,13 @@ double dense_negative_log_likelihood(const Problem& p) {
 std::pair<VectorXd, MatrixXd> dense_posterior(const Problem& p, const View& view, const MatrixXd& states) {
   const DenseObservations dense = dense_observations(p);
   const DenseView at = dense_view(p.prior, p.values, view, states);
-  Extended cross(dense.residual.size(), at.mean.size());
+  Extended cross(dense.sums.cols(), at.mean.size());
   Index first = 0;
   for (const DenseView& observed : dense.views) {
     cross.middleRows(first, observed.mean.size()) = dense_covariance(p.prior, p.values, observed, at);
     first += observed.mean.size();
   }
+  cross = (dense.sums * cross).eval();
   const Eigen::LLT<Extended> factor(dense.covariance);
   const ExtendedVector mean = at.mean + cross.transpose() * factor.solve(dense.residual);
   const Extended covariance = dense_covariance(p.prior, p.values, at, at) - cross.transpose() * factor.solve(cross);
@@ -460,14 +520,8 @@ std::pair<VectorXd, MatrixXd> dense_posterior(const Problem& p, const View& view
 
 double condition(const Problem& p) {
   const DenseObservations dense = dense_observations(p);
-  VectorXd whitening(dense.residual.size());
-  Index first = 0;
-  for (std::size_t g = 0; g < p.observations.size(); ++g) {
-    whitening.segment(first, p.observations[g].values().size()) = noise_of_values(p, g).reshaped().cwiseInverse();
-    first += p.observations[g].values().size();
-  }
-  const MatrixXd white = whitening.asDiagonal() * dense.covariance.cast<double>() * whitening.asDiagonal();
-  return white.norm();
+  const Eigen::LLT<Extended> noise(dense.noise);
+  return static_cast<double>(noise.matrixL().solve(noise.matrixL().solve(dense.covariance).transpose()).norm());
 }
 
 double rounding(const Problem& p) { return 1e4 * eps * condition(p); }

@@ -81,10 +81,15 @@ MatrixXd noise_of_values(const Problem& p, std::size_t g);
 /// The problem with a noise of its own for each value, from a third to three times that of its row.
 Problem with_noise_scale(Problem p, std::uint64_t seed);
 
+/// The problem with random sums over its states, as many as it has values: of every group where `every`, else of the first.
+Problem with_sums(Problem p, bool every, std::uint64_t seed);
+
 /// Everything observed, state after state, group after group: y ~ N(mean, K + S).
 struct DenseObservations {
   ExtendedVector residual;  // y − mean
   Extended covariance;      // K + S
+  Extended noise;           // S
+  Extended sums;            // what is observed as sums of the values of the views
   std::vector<DenseView> views;
 };
 

@@ -1,0 +1,169 @@
+#include "gp2/smoothing/windows.hpp"
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+
+#include <Eigen/Cholesky>
+
+namespace gp2 {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+
+double WindowGrid::weight(int window, double time) const {
+  const double x = std::abs((time - begin(window)) / spacing - 2);
+  if (x >= 2) return 0;
+  return x >= 1 ? std::pow(2 - x, 3) / 6 : 2.0 / 3 - x * x + x * x * x / 2;
+}
+
+namespace {
+
+// Positions of one time each: several at one time are their mean.
+struct Samples {
+  std::vector<double> time, value, variance;
+
+  Samples(const std::vector<Measurement>& positions, const SmootherModel& model) {
+    std::vector<int> n;
+    for (const Measurement& one : positions) {
+      if (one.velocity) continue;
+      const double own = std::pow(one.noise_factor * model.noise_stddev, 2) + std::pow(model.time_stddev * one.rate, 2);
+      if (time.empty() || one.time > time.back()) {
+        time.push_back(one.time), value.push_back(0), variance.push_back(0), n.push_back(0);
+      }
+      value.back() += one.value, variance.back() += own, ++n.back();
+    }
+    for (std::size_t i = 0; i < time.size(); ++i) value[i] /= n[i], variance[i] /= n[i] * n[i];
+  }
+  [[nodiscard]] Index size() const { return std::ssize(time); }
+};
+
+// What one window makes of samples first, first + 1, …: weights b(t_i) of those inside it.
+struct Window {
+  Index first = 0;
+  VectorXd b;
+};
+
+// Whether the samples tell what happens in the window.
+bool is_covered(const Samples& samples, const WindowGrid& grid, int window) {
+  const double begin = std::max(grid.begin(window), samples.time.front()), end = std::min(grid.end(window), samples.time.back());
+  if (!(end - begin > 2 * grid.spacing)) return false;
+  auto at = std::lower_bound(samples.time.begin(), samples.time.end(), begin);
+  double last = begin;
+  for (; at != samples.time.end() && *at < end; ++at) {
+    if (*at - last > grid.spacing) return false;
+    last = *at;
+  }
+  return end - last <= grid.spacing;
+}
+
+Window make_window(const Samples& samples, const WindowGrid& grid, int window) {
+  const auto after = [&](double time) { return std::upper_bound(samples.time.begin(), samples.time.end(), time) - samples.time.begin(); };
+  Window out;
+  out.first = std::max<Index>(1, after(grid.begin(window)));
+  const Index last = std::min(samples.size() - 2, after(grid.end(window)) - 1);
+  out.b.resize(std::max<Index>(0, last - out.first + 1));
+  for (Index i = 0; i < out.b.size(); ++i) out.b[i] = grid.weight(window, samples.time[static_cast<std::size_t>(out.first + i)]);
+  return out;
+}
+
+// Σ_i b_i ((q_{i+1} − q_i)/h_i − (q_i − q_{i−1})/h_{i−1}) as weights of the q, from q_{first−1} on
+VectorXd weights_of_positions(const Samples& samples, const Window& window) {
+  VectorXd c = VectorXd::Zero(window.b.size() + 2);
+  for (Index i = 0; i < window.b.size(); ++i) {
+    const auto at = static_cast<std::size_t>(window.first + i);
+    const double before = 1 / (samples.time[at] - samples.time[at - 1]), after = 1 / (samples.time[at + 1] - samples.time[at]);
+    c[i] += window.b[i] * before;
+    c[i + 1] -= window.b[i] * (before + after);
+    c[i + 2] += window.b[i] * after;
+  }
+  return c;
+}
+
+// Adds weight × the cubic through the values at the four states nearest to a time.
+void add_interpolation(const VectorXd& times, double time, double weight, VectorXd& weights) {
+  const Index above = std::upper_bound(times.begin(), times.end(), time) - times.begin();
+  const Index first = std::clamp<Index>(above - 2, 0, times.size() - 4);
+  for (Index a = first; a < first + 4; ++a) {
+    double cardinal = weight;
+    for (Index b = first; b < first + 4; ++b) {
+      if (b != a) cardinal *= (time - times[b]) / (times[a] - times[b]);
+    }
+    weights[a] += cardinal;
+  }
+}
+
+// ∫ Λ(t) ℓ(t) dt for the cubics ℓ of the states: by three points of Gauss between samples and states, where it is a polynomial of
+// degree 4
+VectorXd weights_of_states(const Samples& samples, const Window& window, const VectorXd& times) {
+  VectorXd weights = VectorXd::Zero(times.size());
+  const std::array<double, 3> place{0.5 - std::sqrt(0.15), 0.5, 0.5 + std::sqrt(0.15)}, share{5.0 / 18, 8.0 / 18, 5.0 / 18};
+  for (Index i = -1; i < window.b.size(); ++i) {
+    const auto at = static_cast<std::size_t>(window.first + i);
+    const double left = samples.time[at], right = samples.time[at + 1];
+    const double b_left = i < 0 ? 0 : window.b[i], b_right = i + 1 < window.b.size() ? window.b[i + 1] : 0;
+    double from = left;
+    auto state = std::upper_bound(times.begin(), times.end(), left);
+    while (from < right) {
+      const double to = state != times.end() && *state < right ? *state++ : right;
+      for (std::size_t g = 0; g < place.size(); ++g) {
+        const double time = from + (to - from) * place[g], x = (time - left) / (right - left);
+        add_interpolation(times, time, share[g] * (to - from) * ((1 - x) * b_left + x * b_right), weights);
+      }
+      from = to;
+    }
+  }
+  return weights;
+}
+
+}  // namespace
+
+std::vector<WeightedSum> windowed_accelerations(const std::vector<Measurement>& positions, const SmootherModel& model,
+                                                const WindowGrid& grid, const std::vector<int>& windows, const VectorXd& times,
+                                                int row, int first_state) {
+  const Samples samples(positions, model);
+  std::vector<Window> made;
+  std::vector<VectorXd> of_positions;
+  std::vector<WeightedSum> sums;
+  for (const int number : windows) {
+    if (samples.size() < 3 || !is_covered(samples, grid, number)) continue;
+    const Window window = make_window(samples, grid, number);
+    if (window.b.size() == 0 || !(window.b.maxCoeff() > 0)) continue;
+    const VectorXd c = weights_of_positions(samples, window) / grid.spacing;
+    const VectorXd weights = weights_of_states(samples, window, times) / grid.spacing;
+    Index from = 0, to = weights.size();
+    while (from < to && weights[from] == 0) ++from;
+    while (to > from && weights[to - 1] == 0) --to;
+    WeightedSum& sum = sums.emplace_back();
+    sum.row = row;
+    sum.first = first_state + static_cast<int>(from);
+    sum.weights = weights.segment(from, to - from);
+    // differences of positions from one of them lose no digits to where zero is
+    const double origin = samples.value[static_cast<std::size_t>(window.first)];
+    for (Index i = 0; i < c.size(); ++i) sum.value += c[i] * (samples.value[static_cast<std::size_t>(window.first - 1 + i)] - origin);
+    made.push_back(window);
+    of_positions.push_back(c);
+  }
+  const Index n = std::ssize(sums);
+  MatrixXd covariance = MatrixXd::Zero(n, n);
+  for (Index r = 0; r < n; ++r) {
+    for (Index s = r; s >= 0; --s) {
+      const VectorXd &c = of_positions[static_cast<std::size_t>(r)], &d = of_positions[static_cast<std::size_t>(s)];
+      const Index first = made[static_cast<std::size_t>(r)].first, shift = first - made[static_cast<std::size_t>(s)].first;
+      if (shift >= d.size()) break;
+      for (Index i = 0; i < std::min(c.size(), d.size() - shift); ++i) {
+        covariance(r, s) += c[i] * d[shift + i] * samples.variance[static_cast<std::size_t>(first - 1 + i)];
+      }
+    }
+  }
+  const Eigen::LLT<MatrixXd> factor(covariance);
+  for (Index r = 0; r < n; ++r) {
+    Index from = 0;
+    while (from < r && covariance(r, from) == 0) ++from;
+    sums[static_cast<std::size_t>(r)].noise = MatrixXd(factor.matrixL()).row(r).segment(from, r - from + 1).transpose();
+  }
+  return sums;
+}
+
+}  // namespace gp2
