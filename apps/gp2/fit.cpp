@@ -243,19 +243,15 @@ void read_data(FitArguments& arguments) {
 
 // The rows of a raw log, which learning and smoothing by turns finds.
 void read_raw(FitArguments& arguments, const std::atomic<bool>* stop) {
-  FitRequest& request = arguments.request;
+  const FitRequest& request = arguments.request;
   const LearnedLog log = learn_and_smooth(request, CsvTable::read(arguments.raw), arguments.raw_options, stop);
   print_notes(log.data.notes);
   print_notes(log.notes);
-  const System& system = *request.model.system;
   if (!arguments.smoothed.empty()) {
-    const CsvTable smoothed = as_table(log.data, system, arguments.smoothed);
+    const CsvTable smoothed = as_table(log.data, *request.model.system, arguments.smoothed);
     write_file(arguments.smoothed, smoothed.text());
   }
-  request.problem.columns.clear();
-  request.problem.max_points.reset();
-  request.logs.push_back({log.table(system, arguments.raw)});
-  request.problem.commands = as_table(log.data, system, arguments.raw);
+  arguments.request = log.request(std::move(arguments.request), arguments.raw);
 }
 
 FitJob prepare(FitArguments& arguments, const Interruption& interruption) {

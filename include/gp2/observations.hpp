@@ -51,7 +51,8 @@ struct WeightedSum {
   int first = 0;            // state
   Eigen::VectorXd weights;  // w
   double value = 0;         // z
-  Eigen::VectorXd noise;    // row r of L, a lower triangle, as far as it is not zero: its last entry, > 0, belongs to the sum itself
+  Eigen::VectorXd
+      noise;  // row r of L, a lower triangle, as far as it is not zero: its last entry, > 0, belongs to the sum itself
 };
 
 /// N noisy measurements of one view: y_i = G(x_i) ā(x_i) + d(x_i) + ε_i.
@@ -77,9 +78,9 @@ class Observations {
   [[nodiscard]] bool has_sums() const { return !sums_.empty(); }
   [[nodiscard]] int n_data() const { return static_cast<int>(states_.cols()); }
 
-  /// The same with other states, another view, other values, another noise, and without sums.
-  /// @throws InputError as the constructor.
-  [[nodiscard]] Observations with_states(Eigen::MatrixXd states) const { return {std::move(states), view_, values_, noise_}; }
+  /// The same with as many other states. @throws InputError as the constructor.
+  [[nodiscard]] Observations with_states(Eigen::MatrixXd states) const;
+  /// The same with another view, other values, another noise, and without sums. @throws InputError as the constructor.
   [[nodiscard]] Observations with_view(View view) const { return {states_, std::move(view), values_, noise_}; }
   [[nodiscard]] Observations with_values(Eigen::MatrixXd values) const { return {states_, view_, std::move(values), noise_}; }
   [[nodiscard]] Observations with_noise(Noise noise) const { return {states_, view_, values_, std::move(noise)}; }
@@ -87,6 +88,9 @@ class Observations {
   /// @throws InputError when one is of rows or states that there are not, has numbers that are not finite, a last entry of L that is
   /// not positive, or noise in common with a sum of another row.
   [[nodiscard]] Observations with_sums(std::vector<WeightedSum> sums) const;
+  /// @throws InputError where there are some.
+  void require_no_sums() const;
+  [[nodiscard]] Observations without_sums() const { return {states_, view_, values_, noise_}; }
 
   /// These states, in this order. @throws InputError where there are sums, as append() and remove_first() do.
   [[nodiscard]] Observations take(const std::vector<int>& states) const;

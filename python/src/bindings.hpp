@@ -17,6 +17,7 @@
 #include "gp2/data/csv.hpp"
 #include "gp2/error.hpp"
 #include "gp2/files/fit_file.hpp"
+#include "gp2/jobs/derive.hpp"
 #include "gp2/model.hpp"
 #include "gp2/posterior.hpp"
 
@@ -53,6 +54,9 @@ struct PyPosterior {
 
 /// A str, bytes or os.PathLike.
 std::string path_argument(const py::object& path);
+
+/// What became of each column of a raw log.
+pybind11::dict report_of(const DerivedData& derived, const System& system);
 
 /// A table from a gp2.Table, a path, a pandas frame, or a mapping of column names to arrays.
 /// @param what  stands for the argument in messages

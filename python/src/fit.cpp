@@ -155,6 +155,34 @@ PyPosterior fit_model(const PySystem& system, const py::object& data, const py::
   return run(prepare_fit(std::move(request)), progress);
 }
 
+py::tuple fit_raw(const PySystem& system, const py::object& data, const py::kwargs& kwargs) {
+  py::dict keywords = kwargs;
+  FitRequest request;
+  RawFitOptions raw;
+  const auto progress = take<py::object>(keywords, "progress", py::none());
+  read_keywords("fit_raw", keywords, options(request, raw));
+  request.model = *system.model;
+  const CsvTable table = to_table(data, "data", CsvTable::Keep::text);
+  std::atomic<bool> stop = false;
+  std::exception_ptr raised;
+  std::optional<LearnedLog> log;
+  try {
+    log = run_interruptibly([&] { return learn_and_smooth(request, table, raw, &stop); }, stop, raised, [] {});
+  } catch (const Error&) {
+    if (!raised) throw;
+  }
+  if (raised) std::rethrow_exception(raised);
+  py::dict report = report_of(log->data, system.system());
+  std::vector<std::string> notes = log->data.notes;
+  notes.insert(notes.end(), log->notes.begin(), log->notes.end());
+  tell(notes);
+  report["notes"] = notes;
+  report["gains"] = log->gains;
+  CsvTable smoothed = as_table(log->data, system.system(), "smoothed data");
+  request = log->request(std::move(request), "raw data");
+  return py::make_tuple(run(prepare_fit(std::move(request)), progress), std::move(smoothed), std::move(report));
+}
+
 PyPosterior fit_again(const py::object& path, const py::object& data, const std::vector<PySideInformation>& also,
                       const PySystem* system, int threads, const py::object& progress) {
   const FitFile file = FitFile::read(path_argument(path), code_of(system));
@@ -193,6 +221,23 @@ more memory than is free is refused, with the rows that would fit.
 Raises InputError for data or options that do not fit; NumericalError when nothing could be fitted.)";
 }
 
+std::string fit_raw_documentation() {
+  FitRequest request;
+  RawFitOptions raw;
+  const std::vector<Option> table = options(request, raw);
+  return signature("fit_raw", "system: System, data: object, *,", table, ", progress: Callable[[Progress], object] | None = None",
+                   "tuple[Posterior, Table, dict[str, Any]]") +
+         R"(
+Fit a system to a raw log of t and positions, as `gp2 fit --raw` does it: smoothed and learned from by turns, then fitted to what the
+positions tell of accelerations over windows of time. Gives the Posterior; the log smoothed, a Table; and a report (dict) as that of
+derive, with `gains`, the log likelihood of positions that the fits have not seen, of each pass that was kept. docs/raw-logs.md.
+
+data        a path, Table, pandas frame or mapping: t, positions, inputs
+progress    as in fit
+
+)" + documentation(table);
+}
+
 }  // namespace
 
 void require_at_least(int smallest, const std::optional<int>& value, const char* what) {
@@ -226,6 +271,11 @@ void add_fit(py::module_& module) {
     own_signature.disable_function_signatures();
     module.def("fit", &fit_model, "system"_a, "data"_a, fit_documentation().c_str());
   }
+  {
+    py::options own_signature;
+    own_signature.disable_function_signatures();
+    module.def("fit_raw", &fit_raw, "system"_a, "data"_a, fit_raw_documentation().c_str());
+  }
   module.def(
       "fit_again", &fit_again, "path"_a, "data"_a = py::none(), py::kw_only(), "also"_a = std::vector<PySideInformation>(),
       "system"_a = nullptr, "threads"_a = 0, "progress"_a = py::none(),
@@ -244,7 +294,7 @@ void add_fit(py::module_& module) {
         ExciteRequest excite;
         const std::map<std::string, std::vector<Option>> tables = {
             {"fit", options(fit)},           {"simulate", options(simulate)},
-            {"derive", options(derive)},     {"learn_and_smooth", options(fit_of_raw, raw)},
+            {"derive", options(derive)},     {"fit_raw", options(fit_of_raw, raw)},
             {"resample", options(resample)}, {"show", options(show)},
             {"excite", options(excite)}};
         return stub_lines(tables.at(job));

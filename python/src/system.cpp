@@ -11,12 +11,45 @@
 #include "gp2/jobs/derive.hpp"
 #include "gp2/jobs/fit_problem.hpp"
 #include "gp2/jobs/generate_job.hpp"
-#include "gp2/jobs/raw_fit.hpp"
 #include "gp2/jobs/resample.hpp"
 #include "gp2/jobs/show_job.hpp"
 #include "options.hpp"
 
 namespace gp2::python {
+
+py::dict report_of(const DerivedData& derived, const System& system) {
+  const auto named = [&](const std::vector<int>& coordinates) {
+    py::list names;
+    for (const int j : coordinates) names.append(system.coordinates()[static_cast<std::size_t>(j)].name);
+    return names;
+  };
+  py::list series;
+  for (const DerivedSeries& one : derived.series) {
+    py::dict entry;
+    entry["coordinate"] = system.coordinates()[static_cast<std::size_t>(one.coordinate)].name;
+    entry["episode"] = derived.episodes[static_cast<std::size_t>(one.episode)];
+    entry["lengthscale"] = one.model.lengthscale;
+    entry["signal_std"] = one.model.signal_stddev;
+    entry["noise_std"] = one.model.noise_stddev;
+    entry["bandwidth"] = one.bandwidth;
+    entry["resolution"] = one.resolution;
+    entry["used"] = one.used;
+    entry["missing"] = one.missing;
+    entry["repeated"] = one.repeated;
+    entry["outliers"] = one.outliers;
+    entry["wraps"] = one.wraps;
+    entry["gaps"] = one.gaps;
+    entry["longest_gap"] = one.longest_gap;
+    series.append(entry);
+  }
+  py::dict report;
+  report["series"] = series;
+  report["measured"] = named(derived.measured);
+  report["completed"] = named(derived.completed);
+  report["independent"] = named(derived.independent);
+  report["notes"] = derived.notes;
+  return report;
+}
 
 namespace {
 
@@ -81,41 +114,6 @@ CsvTable resample_table(const PySystem& self, const py::object& data, int n, con
   return table.take(resample(*self.model, table, asked).rows);
 }
 
-// what became of each column of a raw log
-py::dict report_of(const DerivedData& derived, const System& system) {
-  const auto named = [&](const std::vector<int>& coordinates) {
-    py::list names;
-    for (const int j : coordinates) names.append(system.coordinates()[static_cast<std::size_t>(j)].name);
-    return names;
-  };
-  py::list series;
-  for (const DerivedSeries& one : derived.series) {
-    py::dict entry;
-    entry["coordinate"] = system.coordinates()[static_cast<std::size_t>(one.coordinate)].name;
-    entry["episode"] = derived.episodes[static_cast<std::size_t>(one.episode)];
-    entry["lengthscale"] = one.model.lengthscale;
-    entry["signal_std"] = one.model.signal_stddev;
-    entry["noise_std"] = one.model.noise_stddev;
-    entry["bandwidth"] = one.bandwidth;
-    entry["resolution"] = one.resolution;
-    entry["used"] = one.used;
-    entry["missing"] = one.missing;
-    entry["repeated"] = one.repeated;
-    entry["outliers"] = one.outliers;
-    entry["wraps"] = one.wraps;
-    entry["gaps"] = one.gaps;
-    entry["longest_gap"] = one.longest_gap;
-    series.append(entry);
-  }
-  py::dict report;
-  report["series"] = series;
-  report["measured"] = named(derived.measured);
-  report["completed"] = named(derived.completed);
-  report["independent"] = named(derived.independent);
-  report["notes"] = derived.notes;
-  return report;
-}
-
 py::tuple derive_table(const PySystem& self, const py::object& data, const py::object& like, const py::kwargs& keywords) {
   DeriveOptions asked;
   read_keywords("derive", keywords, options(asked));
@@ -127,25 +125,6 @@ py::tuple derive_table(const PySystem& self, const py::object& data, const py::o
     derived = derive(*self.model, table, asked);
   }
   return py::make_tuple(as_table(derived, self.system(), "derived data"), report_of(derived, self.system()));
-}
-
-py::tuple learn_and_smooth_table(const PySystem& self, const py::object& data, const py::kwargs& keywords) {
-  FitRequest request;
-  RawFitOptions asked;
-  read_keywords("learn_and_smooth", keywords, options(request, asked));
-  request.model = *self.model;
-  const CsvTable table = to_table(data, "data", CsvTable::Keep::text);
-  LearnedLog log;
-  {
-    const py::gil_scoped_release release;
-    log = learn_and_smooth(request, table, asked);
-  }
-  py::dict report = report_of(log.data, self.system());
-  std::vector<std::string> notes = log.data.notes;
-  notes.insert(notes.end(), log.notes.begin(), log.notes.end());
-  report["notes"] = notes;
-  report["gains"] = log.gains;
-  return py::make_tuple(log.table(self.system(), "rows of raw data"), as_table(log.data, self.system(), "smoothed data"), report);
 }
 
 py::list check_system_and_log(const PySystem& self, const py::object& data, const py::object& columns) {
@@ -332,19 +311,6 @@ like  another raw log: this one goes through the filter that is found for that o
 
 )" + documentation(options(of_derive)))
                  .c_str());
-  FitRequest of_fit;
-  RawFitOptions of_raw;
-  const std::vector<Option> of_both = options(of_fit, of_raw);
-  module.def(
-      "learn_and_smooth", &learn_and_smooth_table, py::arg("system"), py::arg("data"),
-      (signature("learn_and_smooth", "system: System, data: object, *,", of_both, "", "tuple[Table, Table, dict[str, Any]]") +
-       R"(
-A raw log of t and positions, smoothed and learned from by turns, as `gp2 fit --raw` does it: the rows to fit to, a Table for fit
-with the same options; all rows, smoothed; and a report (dict) as that of derive, with `gains`, the log likelihood of positions
-that the fits have not seen, of each pass that was kept. docs/raw-logs.md.
-
-)" + documentation(of_both))
-          .c_str());
   module.def("resample", &resample_table, py::arg("system"), py::arg("data"), py::arg("n"),
              (signature("resample", "system: System, data: object, n: int, *,", options(of_resample), "", "Table") + R"(
 The n rows of a table that cover its states best, whole, in the order of choice: farthest points in the features of the system's

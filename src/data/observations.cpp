@@ -3,7 +3,6 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
-#include <string_view>
 #include <utility>
 
 #include <fmt/format.h>
@@ -97,49 +96,53 @@ Observations::Observations(MatrixXd states, View view, MatrixXd values, VectorXd
     : Observations(std::move(states), std::move(view), std::move(values),
                    Noise(std::move(noise_stddev), estimate_noise, std::move(noise_scale))) {}
 
+Observations Observations::with_states(MatrixXd states) const {
+  Observations out(std::move(states), view_, values_, noise_);
+  out.sums_ = sums_;
+  return out;
+}
+
 Observations Observations::with_sums(std::vector<WeightedSum> sums) const {
   for (std::size_t r = 0; r < sums.size(); ++r) {
     const WeightedSum& one = sums[r];
-    const auto fail = [&](std::string_view what) { throw InputError(fmt::format("observations: sum {}: {}", r + 1, what)); };
-    if (one.row < 0 || one.row >= view_.size()) fail(fmt::format("row {}: the view has {}, 0 is the first", one.row, view_.size()));
-    if (one.first < 0 || one.weights.size() == 0 || one.first + one.weights.size() > n_data()) {
-      fail(fmt::format("states {} … {}: there are {}, 0 is the first", one.first, one.first + one.weights.size() - 1, n_data()));
+    const Index n_weights = one.weights.size(), n = one.noise.size();
+    if (one.row < 0 || one.row >= view_.size() || one.first < 0 || n_weights == 0 || one.first + n_weights > n_data()) {
+      throw InputError(fmt::format("observations: sum {} is of row {} and {} states from {} on: there are {} rows and {} states",
+                                   r + 1, one.row, n_weights, one.first, view_.size(), n_data()));
     }
-    if (!one.weights.allFinite() || !std::isfinite(one.value)) fail("its value and weights must be finite");
-    const Index n = one.noise.size();
-    if (n == 0 || n > static_cast<Index>(r) + 1 || !one.noise.allFinite() || !(one.noise[n - 1] > 0)) {
-      fail("its noise must be finite, its last entry positive, and those before it must belong to sums before it");
-    }
-    for (Index j = 1; j < n; ++j) {
-      if (sums[r - static_cast<std::size_t>(j)].row != one.row) fail("it has noise in common with a sum of another row");
-    }
+    bool is_sound = one.weights.allFinite() && std::isfinite(one.value) && one.noise.allFinite() && n > 0 &&
+                    n <= static_cast<Index>(r) + 1 && one.noise[n - 1] > 0;
+    for (Index j = 1; is_sound && j < n; ++j) is_sound = sums[r - static_cast<std::size_t>(j)].row == one.row;
+    if (is_sound) continue;
+    throw InputError(
+        fmt::format("observations: sum {}: its numbers must be finite, its own noise positive, and what comes before that "
+                    "of sums of the same row before it",
+                    r + 1));
   }
   Observations out = *this;
   out.sums_ = std::move(sums);
   return out;
 }
 
-namespace {
-void require_no_sums(const Observations& observations) {
-  if (observations.has_sums()) throw InputError("observations that have sums over states stay as they are");
+void Observations::require_no_sums() const {
+  if (has_sums()) throw InputError("observations that have sums over states neither grow nor shrink: condition on others anew");
 }
-}  // namespace
 
 Observations Observations::take(const std::vector<int>& states) const {
-  require_no_sums(*this);
+  require_no_sums();
   return {MatrixXd(states_(Eigen::all, states)), view_, MatrixXd(values_(Eigen::all, states)), noise_.take(states)};
 }
 
 void Observations::append(const Observations& more) {
-  require_no_sums(*this);
-  require_no_sums(more);
+  require_no_sums();
+  more.require_no_sums();
   noise_.append(more.noise_);
   append_columns(states_, more.states_);
   append_columns(values_, more.values_);
 }
 
 void Observations::remove_first(int n) {
-  if (n > 0) require_no_sums(*this);
+  if (n > 0) require_no_sums();
   erase_first_columns(states_, n);
   erase_first_columns(values_, n);
   noise_.remove_first(n);

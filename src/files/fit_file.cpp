@@ -415,6 +415,13 @@ Json observations_json(const Observations& group, const Prior& home, const Model
   if (group.view().latent && group.view().latent->n > 1) json["n_latents"] = group.view().latent->n;
   if (group.noise().has_scale()) json["noise_scale"] = measured_json(group.noise().scale(), group.view().names(system));
   if (other != nullptr) json["system"] = model_json(*other);
+  for (const WeightedSum& sum : group.sums()) {
+    json["sums"].push_back({{"row", sum.row},
+                            {"first", sum.first},
+                            {"weights", vector_json(sum.weights)},
+                            {"value", sum.value},
+                            {"noise", vector_json(sum.noise)}});
+  }
   return json;
 }
 
@@ -472,7 +479,15 @@ Observations observations_from(const ParsedJson& json, const Prior& home, std::s
   const std::vector<bool> of_view = view.reads(system);
   for (std::size_t k = 0; k < reads.size(); ++k) reads[k] = reads[k] || of_view[k];
   MatrixXd states = rows_from(json.at("states"), system.state_names(), reads, n);
-  return {std::move(states), std::move(view), std::move(values), std::move(noise_stddev), estimate_noise, std::move(noise_scale)};
+  const Observations observations(std::move(states), std::move(view), std::move(values), std::move(noise_stddev), estimate_noise,
+                                  std::move(noise_scale));
+  if (!json.contains("sums")) return observations;
+  std::vector<WeightedSum> sums;
+  for (const ParsedJson& sum : array(json.at("sums"))) {
+    sums.push_back({integer(sum.at("row")), integer(sum.at("first")), vector_from(sum.at("weights")), number(sum.at("value")),
+                    vector_from(sum.at("noise"))});
+  }
+  return observations.with_sums(std::move(sums));
 }
 
 // a restart without a finite start has the objective ∞, which JSON has not: null

@@ -44,8 +44,7 @@ GramGradient DenseGram::differentiate(const LatentRows& rows, const std::vector<
   const Ref<const MatrixXd> P = factor_.invert(stop_);
   const std::optional<Sums>& sums = rows.reduction->sums;
   if (!sums) return sweep_pairs(rows, P, alpha, parts, n_threads(rows), stop_);
-  GramGradient gradient =
-      sweep_pairs(rows, sums->to_rows(P), sums->weights_of_rows(alpha), parts, n_threads(rows), stop_);
+  GramGradient gradient = sweep_pairs(rows, sums->to_rows(P), sums->weights_of_rows(alpha), parts, n_threads(rows), stop_);
   gradient.log_noise = P.diagonal() - alpha.cwiseAbs2();
   return gradient;
 }

@@ -226,7 +226,8 @@ std::vector<TrainingResidual> training_residuals(const Posterior& posterior, con
       }
       one.n = static_cast<int>(errors.z.size());
       one.coverage95 = central_coverage(errors.vector(), VectorXd::Constant(1, 0.95))[0];
-      one.serial_correlation = one.rms > 0 ? products / one.rms : 0;
+      // values that sums stand for are smoothed, and so their errors
+      one.serial_correlation = one.rms > 0 && !group.has_sums() ? products / one.rms : 0;
       one.rms = std::sqrt(one.rms / std::max(1, one.n));
     }
   }

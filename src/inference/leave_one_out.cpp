@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <numeric>
+#include <set>
 
 #include <fmt/format.h>
 #include <Eigen/Cholesky>
@@ -11,6 +12,8 @@
 #include "base/not_a_number.hpp"
 #include "gp2/error.hpp"
 #include "inference/dense_gram.hpp"
+#include "inference/latent_sums.hpp"
+#include "inference/query.hpp"
 
 namespace gp2 {
 
@@ -162,17 +165,98 @@ LeaveOneOut mixed(const Posterior& posterior, std::size_t group, const std::vect
   return out;
 }
 
+// What is predicted where some of the sums over samples that are measured say nothing: with P the inverse of the covariance of the
+// measured, α = P(y − mean) and c its covariance with what is predicted, the mean without those in B is less by (Pc)_Bᵀ P_BB⁻¹ α_B,
+// the covariance more by (Pc)_Bᵀ P_BB⁻¹ (Pc)_B (theory.md, T36).
+class WithoutSums {
+ public:
+  WithoutSums(const Posterior& posterior, const Posterior::Implementation& self, const Reduction& reduction)
+      : posterior_(posterior), self_(self), reduction_(reduction) {
+    const MatrixXd X = self_.latents->whitening_columns(0, self_.latents->size());
+    P_.noalias() = X.triangularView<Eigen::Lower>().transpose() * X;
+    alpha_ = P_ * (reduction.sums->L * reduction.y);
+  }
+
+  /// @param sets  of samples, of each of which all is predicted from what is no sum over any of them
+  [[nodiscard]] std::vector<LeaveOneOut> leave_out(const std::vector<std::vector<Index>>& sets) const {
+    std::vector<LeaveOneOut> out = unknown(posterior_.observations());
+    const std::vector<Prediction> all = predictions();
+    std::vector<std::vector<Index>> sums_of_row(static_cast<std::size_t>(reduction_.size()));
+    const auto& D = reduction_.sums->D;
+    for (Index r = 0; r < D.rows(); ++r) {
+      for (std::decay_t<decltype(D)>::InnerIterator entry(D, r); entry; ++entry) {
+        if (entry.value() != 0) sums_of_row[static_cast<std::size_t>(entry.col())].push_back(r);
+      }
+    }
+    for (const std::vector<Index>& set : sets) {
+      std::set<Index> left_out;
+      for (const Index row : rows_of_samples(reduction_, set)) {
+        const std::vector<Index>& sums = sums_of_row[static_cast<std::size_t>(row)];
+        left_out.insert(sums.begin(), sums.end());
+      }
+      const std::vector<Index> B(left_out.begin(), left_out.end());
+      const Eigen::LLT<MatrixXd> factor(P_(B, B));
+      const VectorXd pull = factor.solve(alpha_(B));
+      for (const Index s : set) {
+        const Reduction::Sample& sample = reduction_.samples[static_cast<std::size_t>(s)];
+        const auto g = static_cast<std::size_t>(sample.group);
+        const Observations& group = posterior_.observations()[g];
+        const Index d = group.view().size();
+        const MatrixXd Pc = all[g].P_cross.middleCols(d * sample.index, d)(B, Eigen::all), white = factor.matrixL().solve(Pc);
+        for (Index k = 0; k < d; ++k) {
+          if (std::isnan(group.values()(k, sample.index))) continue;
+          out[g].mean(k, sample.index) = all[g].marginal.mean(k, sample.index) - Pc.col(k).dot(pull);
+          out[g].variance(k, sample.index) =
+              std::max(0.0, all[g].marginal.covariance(k * (d + 1), sample.index) + white.col(k).squaredNorm());
+        }
+      }
+    }
+    return out;
+  }
+
+ private:
+  struct Prediction {
+    Posterior::Marginal marginal;
+    MatrixXd P_cross;
+  };
+
+  // at the states of every Observations
+  [[nodiscard]] std::vector<Prediction> predictions() const {
+    std::vector<Prediction> out;
+    for (const Observations& group : posterior_.observations()) {
+      const Query query = make_query(self_, group.view(), group.states());
+      const std::vector<MatrixXd> loadings = query.loadings(self_);
+      MatrixXd cross(self_.latents->size(), query.n_rows() * query.size());
+      LatentSums(*self_.latents).evaluate(query.features, query.latent, &loadings, &cross);
+      out.push_back({posterior_.marginal(group.view(), group.states()), P_ * cross});
+    }
+    return out;
+  }
+
+  const Posterior& posterior_;
+  const Posterior::Implementation& self_;
+  const Reduction& reduction_;
+  MatrixXd P_;
+  VectorXd alpha_;
+};
+
 // under one set of hyperparameters
-LeftOut leave_out_of(const Posterior& posterior, int n_stretches) {
+LeftOut leave_out_of(const Posterior& posterior, const Posterior::Implementation& self, int n_stretches) {
   const Prior& prior = posterior.prior();
   const std::vector<Observations>& observations = posterior.observations();
   const ModelValues& values = posterior.values();
   Reduction reduction;
   reduce(prior, observations, require_models(prior, observations, values.parameters, {}), values.noise_stddev, reduction);
+  const std::vector<std::vector<Index>> stretches = samples_of_stretches(posterior, reduction, n_stretches);
+  if (reduction.sums) {
+    std::vector<std::vector<Index>> each;
+    for (Index s = 0; s < reduction.n_samples(); ++s) each.push_back({s});
+    const WithoutSums without(posterior, self, reduction);
+    return {without.leave_out(each), n_stretches > 0 ? without.leave_out(stretches) : std::vector<LeaveOneOut>{}};
+  }
   const LatentRows rows = latent_rows(prior, observations, reduction, values);
   DenseGram gram;
   if (!gram.factorise(rows)) throw NumericalError("leave_one_out: the covariance of the observations cannot be factored");
-  const std::vector<std::vector<Index>> stretches = samples_of_stretches(posterior, reduction, n_stretches);
   const Gram::Inverse inverse = gram.invert(rows, stretches);
   LeftOut out{each_value(posterior, reduction, inverse), {}};
   if (n_stretches > 0) out.stretches = each_stretch(posterior, reduction, inverse, stretches);
@@ -184,9 +268,12 @@ LeftOut leave_out_of(const Posterior& posterior, int n_stretches) {
 LeftOut leave_out(const Posterior& posterior, int n_stretches) {
   if (n_stretches < 0) throw InputError(fmt::format("leave_out: n_stretches must not be negative, got {}", n_stretches));
   const lapack::SingleThread single_thread;
-  if (posterior.n_components() == 1) return leave_out_of(posterior, n_stretches);
   std::vector<LeftOut> of_components;
-  for (int k = 0; k < posterior.n_components(); ++k) of_components.push_back(leave_out_of(posterior.component(k), n_stretches));
+  for (int k = 0; k < posterior.n_components(); ++k) {
+    of_components.push_back(
+        leave_out_of(posterior.component(k), *posterior.conditioned()[static_cast<std::size_t>(k)], n_stretches));
+  }
+  if (of_components.size() == 1) return std::move(of_components.front());
   const auto all = [&](std::vector<LeaveOneOut> LeftOut::*part, bool weigh) {
     std::vector<LeaveOneOut> out;
     for (std::size_t g = 0; g < posterior.observations().size(); ++g) {

@@ -78,7 +78,7 @@ std::vector<std::shared_ptr<Posterior::Implementation>> Posterior::own_component
 
 Posterior update(Posterior&& posterior, Observations added) {
   require_observations(posterior.prior(), added);
-  if (added.has_sums()) throw InputError("update: sums over states cannot be added; give them to the posterior when it is made");
+  added.require_no_sums();
   const lapack::SingleThread single_thread;
   const auto own = posterior.own_components();
   for (const auto& component : own) add(*component, added);
@@ -92,10 +92,7 @@ Posterior remove_oldest(Posterior&& posterior, int n) {
     throw InputError(
         fmt::format("remove_oldest: there are {} observed states, so n must be 0 … {}, got {}", n_samples, n_samples, n));
   }
-  const std::vector<Observations>& observations = posterior.observations();
-  if (n > 0 && std::any_of(observations.begin(), observations.end(), [](const auto& group) { return group.has_sums(); })) {
-    throw InputError("remove_oldest: the posterior is of sums over states, of which none can be taken away");
-  }
+  for (const Observations& group : posterior.observations()) group.require_no_sums();
   const lapack::SingleThread single_thread;
   const auto own = posterior.own_components();
   for (const auto& component : own) remove_oldest_of(*component, n);

@@ -255,7 +255,8 @@ void Sums::append_rows(Index n) {
     std::vector<Eigen::Triplet<double>> entries;
     using Matrix = std::decay_t<decltype(matrix)>;
     for (Index k = 0; k < matrix.outerSize(); ++k) {
-      for (typename Matrix::InnerIterator entry(matrix, k); entry; ++entry) entries.emplace_back(entry.row(), entry.col(), entry.value());
+      for (typename Matrix::InnerIterator entry(matrix, k); entry; ++entry)
+        entries.emplace_back(entry.row(), entry.col(), entry.value());
     }
     for (Index k = 0; k < n; ++k) entries.emplace_back(matrix.rows() + k, matrix.cols() + k, 1);
     Matrix out(matrix.rows() + n, matrix.cols() + n);

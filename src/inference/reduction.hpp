@@ -60,7 +60,7 @@ struct Reduction {
   std::vector<bool> same_directions;        // per latent: C is free, and R_i E_a(x_i) is the same at every sample
   double constant = 0;                      // Σ of the samples' own; that of a group's sums is its first sample's
 
-  [[nodiscard]] Eigen::Index size() const { return offset.back(); }      // rows
+  [[nodiscard]] Eigen::Index size() const { return offset.back(); }  // rows
   [[nodiscard]] Eigen::Index n_measured() const { return y.size(); }
   [[nodiscard]] int n_components() const { return static_cast<int>(count.size()); }
   [[nodiscard]] Eigen::Index n_samples() const { return static_cast<Eigen::Index>(samples.size()); }

@@ -36,7 +36,7 @@ class ThinnedProblem {
     for (std::size_t g = 0; g < trusted.size(); ++g) {
       std::vector<int> rows;
       for (int i = every / 2; i < trusted[g].n_data(); i += every) rows.push_back(i);
-      observations_.push_back(trusted[g].take(rows));
+      observations_.push_back(trusted[g].without_sums().take(rows));
       std::optional<CommandedRows>& commanded = commanded_.emplace_back(problem.commanded[g]);
       if (!commanded) continue;
       for (std::size_t k = 0; k < rows.size(); ++k) commanded->places[k] = commanded->places[static_cast<std::size_t>(rows[k])];

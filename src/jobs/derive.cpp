@@ -570,11 +570,30 @@ class Deriver {
       for (Index i = 0; i < times.size(); ++i)
         task.stddev.col(i) = task.motion.covariance[static_cast<std::size_t>(i)].diagonal().cwiseMax(0).cwiseSqrt();
       if (!options_.hold_constraints) task.motion.covariance = {};
-      data_.series[static_cast<std::size_t>(k)] = report_of(task, shared[static_cast<std::size_t>(k)]);
+      DerivedSeries& series = data_.series[static_cast<std::size_t>(k)];
+      series = report_of(task, shared[static_cast<std::size_t>(k)]);
+      series.start = episodes_[static_cast<std::size_t>(task.episode)].start;
+      if (options_.keep_positions) series.positions = positions_of(task, times);
       task.fit.trusted = {};
       tell_progress();
     });
     warn_of_fast_motions();
+  }
+
+  /// The positions that are trusted, from what they are about a course and a mean.
+  /// @param times  of the samples
+  static std::vector<Measurement> positions_of(const Task& task, const VectorXd& times) {
+    std::vector<Measurement> positions;
+    Index at = 0;
+    for (const Measurement& one : task.fit.trusted) {
+      if (one.velocity) continue;
+      positions.push_back(one);
+      positions.back().value += task.channel.mean;
+      if (task.course.size() == 0) continue;
+      while (times[at] < one.time) ++at;
+      positions.back().value += task.course(0, at);
+    }
+    return positions;
   }
 
   /// The motion p of a series under the learned acceleration, at the times of its samples; d²q̂/dt² − u is linear between them.

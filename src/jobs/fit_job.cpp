@@ -107,7 +107,8 @@ FitJob job_of(FitRequest request, FitProblem problem) {
   FitOptions asked = optimiser_options(request, problem);
   asked.n_draws = settled_draws(request, problem, asked);
   job.notes = problem.notes;
-  job.thin = request.thin && !problem.robust && request.problem.protocol.name == Protocol::Name::standard;
+  const bool has_sums = std::ranges::any_of(problem.observations, [](const Observations& group) { return group.has_sums(); });
+  job.thin = request.thin && !has_sums && !problem.robust && request.problem.protocol.name == Protocol::Name::standard;
   job.file.options = options_json(options(request));
   try {
     job.options = within_memory(problem, asked, free_memory(), job.notes);
@@ -257,8 +258,9 @@ std::vector<Option> options(FitRequest& request) {
        "per run, what follows an escape included; 0 conditions at the starting values"},
       {"start", &request.start, "FILE", "starting values: a file of JSON, {\"name\": value, …}, or a FIT.json"},
       {"max_points", &problem.max_points, "N",
-       "take this many rows of each log, the first of a shuffle by `seed`; of a raw log those that cover the motion best",
-       "all; of a raw log 200"},
+       "take this many rows of each log, the first of a shuffle by `seed`; of a raw log those that cover the motion best, "
+       "or so many states of windows",
+       "all; of a raw log 200, or 600 of windows"},
       {"seed", &problem.seed, "S", "of restarts and `max_points`"},
       threads_option(request.threads),
       {"hyperparameters",

@@ -38,6 +38,7 @@ double reduced_size(const FitProblem& problem, std::size_t g, ModelValues values
   constexpr Index enough = 256;
   const Observations& group = problem.observations[g];
   const Index n = group.n_data(), n_some = std::min(n, enough);
+  if (group.has_sums()) return static_cast<double>(n * group.view().size());
   std::vector<int> some;
   for (Index k = 0; k < n_some; ++k) some.push_back(static_cast<int>(k * n / n_some));
   values.noise_stddev = {values.noise_stddev[g]};

@@ -428,6 +428,34 @@ void add_discrepancy(const Model& model, FitProblem& problem) {
 
 }  // namespace
 
+namespace {
+
+// Sums over windows of time, in place of the rows that are only their states.
+Observations with_windows(const Observations& rows, const Windows& windows, const std::vector<int>& lines) {
+  std::vector<WeightedSum> sums;
+  for (const Windows::Series& series : windows.series) {
+    const auto row = std::find(rows.view().rows.begin(), rows.view().rows.end(), series.coordinate);
+    if (row == rows.view().rows.end()) continue;
+    std::vector<double> times;
+    int first = 0;
+    for (std::size_t i = 0; i < lines.size(); ++i) {
+      const Windows::State& state = windows.states.at(lines[i]);
+      if (state.episode != series.episode) continue;
+      if (times.empty()) first = static_cast<int>(i);
+      times.push_back(state.time);
+    }
+    if (times.size() < 4) continue;
+    for (WeightedSum& sum : windowed_accelerations(series.positions, series.model, series.grid, series.windows,
+                                                   Eigen::Map<const VectorXd>(times.data(), std::ssize(times)),
+                                                   static_cast<int>(row - rows.view().rows.begin()), first)) {
+      sums.push_back(std::move(sum));
+    }
+  }
+  return rows.with_sums(std::move(sums));
+}
+
+}  // namespace
+
 FitProblem make_fit_problem(const Model& model, const std::vector<Log>& logs, const std::vector<SideInformation>& also,
                             const FitProblemOptions& options) {
   if (logs.empty() && also.empty()) throw InputError("there is nothing to fit: give logs by `data`, or what is known by `also`");
@@ -449,11 +477,14 @@ FitProblem make_fit_problem(const Model& model, const std::vector<Log>& logs, co
   add_late(model, options, problem);
   if (has_discrepancy(model, problem, options)) add_discrepancy(model, problem);
   problem.hyperparameters = starting_hyperparameters(model, problem, options);
+  for (std::size_t g = 0; g < logs.size(); ++g) {
+    if (logs[g].windows) problem.observations[g] = with_windows(problem.observations[g], *logs[g].windows, problem.lines[g]);
+  }
   return problem;
 }
 
 FitProblem make_fit_problem(const Model& model, const CsvTable& log, const FitProblemOptions& options) {
-  return make_fit_problem(model, {Log{log}}, {}, options);
+  return make_fit_problem(model, {Log{.table = log}}, {}, options);
 }
 
 }  // namespace gp2

@@ -2,6 +2,8 @@
 
 #include <algorithm>
 #include <array>
+#include <cmath>
+#include <set>
 #include <utility>
 
 #include <fmt/format.h>
@@ -20,6 +22,7 @@ namespace {
 
 // Every fifth piece of a log belongs to one part, so that each part has seen all of the motion.
 constexpr int n_parts = 5, n_pieces = 30;
+constexpr int first_line = 2;  // of a table, that has its first row
 
 int part_of(Index row, Index n_rows) { return static_cast<int>(row * n_pieces / n_rows) % n_parts; }
 
@@ -30,7 +33,6 @@ LearnedAccelerations left_out_accelerations(const Posterior& posterior, const st
   const int nq = posterior.prior().system->nq();
   LearnedAccelerations out{MatrixXd(nq, states.cols()), MatrixXd(nq, states.cols())};
   for (int part = 0; part < n_parts; ++part) {
-    constexpr int first_line = 2;
     std::vector<int> others;
     std::vector<Index> here;
     for (std::size_t i = 0; i < lines.size(); ++i) {
@@ -48,6 +50,138 @@ LearnedAccelerations left_out_accelerations(const Posterior& posterior, const st
   }
   return out;
 }
+
+// Whether sums over windows say what the options ask to be learned.
+bool learns_from_windows(const FitRequest& request, const DerivedData& data, const CsvTable& log) {
+  const FitProblemOptions& problem = request.problem;
+  if (problem.robust || problem.baseline || problem.noise_stddev || problem.protocol.name == Protocol::Name::paper) return false;
+  const System& system = *request.model.system;
+  if (system.has_constraint_noise()) return false;
+  // velocities that are measured say more than the positions alone
+  LogReader reader(log, system);
+  return std::ranges::none_of(
+      data.measured, [&](int j) { return reader.column(system.coordinates()[static_cast<std::size_t>(j)].velocity()) >= 0; });
+}
+
+// Windows of a smoothed log, and the states that their sums are over: all of them, or such as lie about some rows.
+class WindowChoice {
+ public:
+  /// @param centres   rows, the most important first
+  /// @param n_states  about so many, at most
+  WindowChoice(const DerivedData& data, const System& system, const std::vector<int>& centres, int n_states)
+      : data_(data), time_(data.states.row(system.layout().t())), episodes_(data.episodes.size()) {
+    make_grids();
+    double n_all = 0;
+    for (const Episode& one : episodes_) n_all += one.end / one.step;
+    if (n_all <= n_states) {
+      // as near to each other as the number allows: where noise hides it a motion has more than stands out
+      for (Episode& one : episodes_) {
+        one.step *= n_all / n_states;
+        one.choose(0, one.n_windows() - 1);
+      }
+    } else {
+      choose_about(centres, n_states);
+    }
+    choose_rows();
+  }
+
+  [[nodiscard]] const std::vector<int>& rows() const { return rows_; }
+
+  [[nodiscard]] Windows windows() const {
+    Windows out;
+    for (const DerivedSeries& one : data_.series) {
+      const Episode& episode = episodes_[static_cast<std::size_t>(one.episode)];
+      if (episode.chosen.empty()) continue;
+      out.series.push_back(
+          {one.coordinate, one.episode, one.positions, one.model, episode.grid, {episode.chosen.begin(), episode.chosen.end()}});
+    }
+    for (const int row : rows_) out.states[row + first_line] = {data_.episode[static_cast<std::size_t>(row)], time_of(row)};
+    return out;
+  }
+
+ private:
+  struct Episode {
+    double start = 0, end = 0;  // what t was at time 0; time of the last position
+    double step = 0;            // between states
+    WindowGrid grid;
+    std::set<int> chosen;
+
+    // from the first that is half inside the episode to the last
+    [[nodiscard]] int n_windows() const { return static_cast<int>(std::ceil(end / grid.spacing)) + 1; }
+    [[nodiscard]] int last_about(double time) const { return static_cast<int>(std::floor((time - grid.start) / grid.spacing)); }
+    void choose(int first, int last) {
+      for (int j = std::max(0, first); j <= std::min(last, n_windows() - 1); ++j) chosen.insert(j);
+    }
+    [[nodiscard]] bool has_one_about(double time) const {
+      const int last = last_about(time);
+      const auto found = chosen.lower_bound(last - 3);
+      return found != chosen.end() && *found <= last;
+    }
+  };
+
+  [[nodiscard]] const Episode& episode_of(int row) const {
+    return episodes_[static_cast<std::size_t>(data_.episode[static_cast<std::size_t>(row)])];
+  }
+  [[nodiscard]] double time_of(int row) const { return time_[row] - episode_of(row).start; }
+
+  // windows and steps of states in periods of the frequency up to which the fastest motion of an episode stands out of the noise
+  void make_grids() {
+    std::vector<double> bandwidth(episodes_.size(), 0), rate(episodes_.size(), 0);
+    for (const DerivedSeries& one : data_.series) {
+      const auto e = static_cast<std::size_t>(one.episode);
+      bandwidth[e] = std::max(bandwidth[e], one.bandwidth);
+      rate[e] = std::max(rate[e], one.rate);
+      episodes_[e].start = one.start;
+      if (!one.positions.empty()) episodes_[e].end = std::max(episodes_[e].end, one.positions.back().time);
+    }
+    for (std::size_t e = 0; e < episodes_.size(); ++e) {
+      Episode& one = episodes_[e];
+      const double sample = 1 / rate[e], period = std::clamp(1 / bandwidth[e], 5 * sample, std::max(5 * sample, one.end / 4));
+      one.grid.spacing = windows_apart * period;
+      one.grid.start = -2 * one.grid.spacing;
+      one.step = states_apart * period;
+    }
+  }
+
+  void choose_about(const std::vector<int>& centres, int n_states) {
+    constexpr int n_before = 5,
+                  n_after = 2;  // windows that begin before a centre, of those that are not over there, and after it
+    double n = 0;
+    for (const int row : centres) {
+      if (n >= n_states) return;
+      Episode& one = episodes_[static_cast<std::size_t>(data_.episode[static_cast<std::size_t>(row)])];
+      const std::size_t before = one.chosen.size();
+      const int last = one.last_about(time_of(row));
+      one.choose(last - n_before, last + n_after);
+      // a group of windows has the states of three more
+      const auto n_new = static_cast<double>(one.chosen.size() - before);
+      n += (n_new > 0 ? n_new + 3 * n_new / (n_before + n_after + 1) : 0) * one.grid.spacing / one.step;
+    }
+  }
+
+  void choose_rows() {
+    const Episode* before = nullptr;
+    double last = 0;
+    for (int row = 0; row < static_cast<int>(data_.episode.size()); ++row) {
+      const Episode& one = episode_of(row);
+      const double time = time_of(row);
+      if (!one.has_one_about(time)) continue;
+      constexpr double rounding = 1e-6;
+      if (&one == before && time - last < (1 - rounding) * one.step) continue;
+      rows_.push_back(row);
+      before = &one;
+      last = time;
+    }
+  }
+
+  // Windows twice as far apart lose where noise is large, states at 0.4 everywhere.
+  static constexpr double windows_apart = 0.4, states_apart = 0.25;
+
+  const DerivedData& data_;
+  Eigen::RowVectorXd time_;
+  std::vector<Episode> episodes_;
+  std::vector<int> rows_;
+};
 
 // The states of a smoothed log, with what acts for its commands.
 MatrixXd acting_states(const Model& model, const DerivedData& data, const CsvTable& table) {
@@ -67,9 +201,13 @@ double total_gain(const DerivedData& data) {
 }  // namespace
 
 std::vector<Option> options(RawFitOptions& options) {
-  std::vector<Option> table = {{"passes", &options.most_passes, "K",
-                                "smooth the raw log anew by what was learned from it, at most so often, and as long as positions "
-                                "that the fit has not seen get likelier; 0: smooth, then learn"}};
+  std::vector<Option> table = {
+      {"passes", &options.most_passes, "K",
+       "smooth the raw log anew by what was learned from it, at most so often, and as long as positions "
+       "that the fit has not seen get likelier; 0: smooth, then learn"},
+      {"windows", Switch{&options.windows, "auto", "none"}, "",
+       "learn from what positions tell of accelerations over windows of time, without differentiating them "
+       "(docs/theory.md, T36), where that can be; or none: from rows of the smoothed log"}};
   static constexpr std::array left_out = {"rate", "every", "hold_constraints", "keep", "map"};
   for (Option& option : gp2::options(options.derive)) {
     if (std::find(left_out.begin(), left_out.end(), option.name) == left_out.end()) table.push_back(std::move(option));
@@ -84,8 +222,13 @@ std::vector<Option> options(FitRequest& request, RawFitOptions& raw) {
   return table;
 }
 
-CsvTable LearnedLog::table(const System& system, std::string name) const {
-  return as_table(data, system, std::move(name)).take(rows);
+FitRequest LearnedLog::request(FitRequest asked, const std::string& name) const {
+  CsvTable whole = as_table(data, *asked.model.system, name);
+  asked.logs = {{.table = whole.take(rows), .windows = windows}};
+  asked.problem.commands = std::move(whole);
+  asked.problem.columns.clear();
+  asked.problem.max_points.reset();
+  return asked;
 }
 
 LearnedLog learn_and_smooth(const FitRequest& request, const CsvTable& log, const RawFitOptions& options,
@@ -95,7 +238,7 @@ LearnedLog learn_and_smooth(const FitRequest& request, const CsvTable& log, cons
   DeriveOptions smoothing = options.derive;
   smoothing.columns = request.problem.columns;
   const auto with_rows = [&](DerivedData data) {
-    LearnedLog out{std::move(data), {}, {}, {}};
+    LearnedLog out{std::move(data), {}, {}, {}, {}};
     const CsvTable table = as_table(out.data, system, log.name());
     const int n = std::min(request.problem.max_points.value_or(n_raw_rows), table.n_rows());
     out.rows = resample(request.model, table, {.n = n}).rows;
@@ -104,13 +247,9 @@ LearnedLog learn_and_smooth(const FitRequest& request, const CsvTable& log, cons
   };
   std::vector<Actuator> actuators = request.model.actuators;  // estimated anew by each fit, from where the last one found them
   const auto smoothed_by_fit_to = [&](const LearnedLog& before) {
-    FitRequest quick = request;
-    quick.logs = {{before.table(system, log.name())}};
-    const CsvTable whole = as_table(before.data, system, log.name());
+    FitRequest quick = before.request(request, log.name());
+    const CsvTable whole = *quick.problem.commands;
     quick.model.actuators = actuators;
-    quick.problem.commands = whole;
-    quick.problem.columns.clear();
-    quick.problem.max_points.reset();
     quick.hyperparameters = HyperparameterChoice::optimise;
     quick.standard_errors = quick.thin = quick.problem.robust = false;
     const FitJob job = prepare_fit(std::move(quick));
@@ -122,8 +261,21 @@ LearnedLog learn_and_smooth(const FitRequest& request, const CsvTable& log, cons
         left_out_accelerations(fit.posterior, job.problem.lines.front(), acting_states(fit.file.model, before.data, whole))));
   };
 
+  const auto with_windows = [&](LearnedLog learned) {
+    if (!options.windows || !learns_from_windows(request, learned.data, log)) return learned;
+    const CsvTable table = as_table(learned.data, system, log.name());
+    constexpr int n_values = 2 * n_window_states;  // of accelerations, that are no more than can be fitted in a minute or two
+    const int n = request.problem.max_points.value_or(
+        std::min(n_window_states, n_values / static_cast<int>(std::ssize(learned.data.independent))));
+    const WindowChoice choice(learned.data, system, resample(request.model, table, {.n = std::min(n, table.n_rows())}).rows, n);
+    learned.rows = choice.rows();
+    learned.windows = std::make_shared<const Windows>(choice.windows());
+    for (DerivedSeries& series : learned.data.series) series.positions = {};
+    return learned;
+  };
+  smoothing.keep_positions = true;
   LearnedLog best = with_rows(derive(request.model, log, smoothing));
-  if (options.most_passes == 0) return best;
+  if (options.most_passes == 0) return with_windows(std::move(best));
   constexpr double decisive = 10;  // nats
   LearnedLog next = smoothed_by_fit_to(best);
   const double first = total_gain(next.data);
@@ -144,7 +296,7 @@ LearnedLog learn_and_smooth(const FitRequest& request, const CsvTable& log, cons
                 "learned from that + {:.4g}",
                 gains.size(), first, fmt::join(gains, ", + ")));
   best.gains = std::move(gains);
-  return best;
+  return with_windows(std::move(best));
 }
 
 }  // namespace gp2

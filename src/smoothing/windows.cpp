@@ -45,27 +45,26 @@ struct Window {
   VectorXd b;
 };
 
-// Whether the samples tell what happens in the window.
-bool is_covered(const Samples& samples, const WindowGrid& grid, int window) {
-  const double begin = std::max(grid.begin(window), samples.time.front()), end = std::min(grid.end(window), samples.time.back());
-  if (!(end - begin > 2 * grid.spacing)) return false;
-  auto at = std::lower_bound(samples.time.begin(), samples.time.end(), begin);
-  double last = begin;
-  for (; at != samples.time.end() && *at < end; ++at) {
-    if (*at - last > grid.spacing) return false;
-    last = *at;
-  }
-  return end - last <= grid.spacing;
-}
-
 Window make_window(const Samples& samples, const WindowGrid& grid, int window) {
-  const auto after = [&](double time) { return std::upper_bound(samples.time.begin(), samples.time.end(), time) - samples.time.begin(); };
+  const auto after = [&](double time) {
+    return std::upper_bound(samples.time.begin(), samples.time.end(), time) - samples.time.begin();
+  };
   Window out;
   out.first = std::max<Index>(1, after(grid.begin(window)));
   const Index last = std::min(samples.size() - 2, after(grid.end(window)) - 1);
   out.b.resize(std::max<Index>(0, last - out.first + 1));
   for (Index i = 0; i < out.b.size(); ++i) out.b[i] = grid.weight(window, samples.time[static_cast<std::size_t>(out.first + i)]);
   return out;
+}
+
+// Whether samples tell what happens in the window, half of it or more, without a pause among those that its sum is of.
+bool is_covered(const Samples& samples, const WindowGrid& grid, const Window& window) {
+  if (window.b.size() == 0) return false;
+  const auto first = static_cast<std::size_t>(window.first - 1), last = first + static_cast<std::size_t>(window.b.size()) + 1;
+  for (std::size_t i = first; i < last; ++i) {
+    if (samples.time[i + 1] - samples.time[i] > grid.spacing) return false;
+  }
+  return samples.time[last] - samples.time[first] > 2 * grid.spacing;
 }
 
 // Σ_i b_i ((q_{i+1} − q_i)/h_i − (q_i − q_{i−1})/h_{i−1}) as weights of the q, from q_{first−1} on
@@ -127,9 +126,8 @@ std::vector<WeightedSum> windowed_accelerations(const std::vector<Measurement>& 
   std::vector<VectorXd> of_positions;
   std::vector<WeightedSum> sums;
   for (const int number : windows) {
-    if (samples.size() < 3 || !is_covered(samples, grid, number)) continue;
     const Window window = make_window(samples, grid, number);
-    if (window.b.size() == 0 || !(window.b.maxCoeff() > 0)) continue;
+    if (!is_covered(samples, grid, window)) continue;
     const VectorXd c = weights_of_positions(samples, window) / grid.spacing;
     const VectorXd weights = weights_of_states(samples, window, times) / grid.spacing;
     Index from = 0, to = weights.size();
@@ -141,7 +139,8 @@ std::vector<WeightedSum> windowed_accelerations(const std::vector<Measurement>& 
     sum.weights = weights.segment(from, to - from);
     // differences of positions from one of them lose no digits to where zero is
     const double origin = samples.value[static_cast<std::size_t>(window.first)];
-    for (Index i = 0; i < c.size(); ++i) sum.value += c[i] * (samples.value[static_cast<std::size_t>(window.first - 1 + i)] - origin);
+    for (Index i = 0; i < c.size(); ++i)
+      sum.value += c[i] * (samples.value[static_cast<std::size_t>(window.first - 1 + i)] - origin);
     made.push_back(window);
     of_positions.push_back(c);
   }

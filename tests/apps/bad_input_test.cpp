@@ -211,7 +211,7 @@ const std::vector<BadInput> bad_inputs = {
     {"GenerateWithoutTruth", model_with("[truth]", "[unused]"), "gp2 generate model.toml --n 5 -o old.csv", {"model.toml"}},
     // the fit
     {"FitOfANewerFormat",
-     [](const Desk& desk) { desk.write("fit.json", replaced(desk.read("fit.json"), R"("version": 7)", R"("version": 99)")); },
+     [](const Desk& desk) { desk.write("fit.json", replaced(desk.read("fit.json"), R"("version": 8)", R"("version": 99)")); },
      predict_line,
      {"fit.json", "format 99", "use a newer gp2"}},
     {"FitChangedByHand",

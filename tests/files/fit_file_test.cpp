@@ -485,7 +485,7 @@ TEST_F(DamagedFit, WrittenAnewByOtherProgramsIsTheSame) {
 
 TEST_F(DamagedFit, OfAnOlderVersionInNameOnlyIsRefused) {
   std::string text = small_fit();
-  text.replace(text.find("\"version\": 7"), 12, "\"version\": 5");
+  text.replace(text.find("\"version\": 8"), 12, "\"version\": 5");
   EXPECT_THAT(error_of(text), HasSubstr("changed after gp2 wrote it"));
 }
 

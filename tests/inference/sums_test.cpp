@@ -2,6 +2,7 @@
 #include <gtest/gtest.h>
 
 #include "gp2/error.hpp"
+#include "gp2/inference/leave_one_out.hpp"
 #include "gp2/inference/pathwise.hpp"
 #include "gp2/predictor.hpp"
 #include "inference/sampling.hpp"
@@ -85,7 +86,8 @@ TEST(Sums, AreSeenByPredictorsAndSamplesAlike) {
       ASSERT_EQ(predictor.mean_and_stddev(p.queries.col(i).array().isNaN().select(0, p.queries.col(i)), mean, stddev, workspace),
                 Predictor::Status::ok);
       EXPECT_LE(largest(mean - marginal.mean.col(i)), tolerance * (1 + largest(marginal.mean)));
-      EXPECT_LE(largest(stddev.cwiseAbs2() - marginal.stddev().col(i).cwiseAbs2()), tolerance * (1 + largest(marginal.stddev().cwiseAbs2())));
+      EXPECT_LE(largest(stddev.cwiseAbs2() - marginal.stddev().col(i).cwiseAbs2()),
+                tolerance * (1 + largest(marginal.stddev().cwiseAbs2())));
     }
     const auto quantities = test::both_accelerations(*p.prior.system, p.queries);
     const PathwiseSamples paths = sample_paths(posterior, 400, {40, sums_seed});
@@ -110,11 +112,12 @@ TEST(Sums, GrowByOrdinaryValuesAndDoNotShrink) {
     both.values.noise_stddev = {p.values.noise_stddev.front(), p.values.noise_stddev.front()};
     const Observations added(p.observations.front().states(), p.observations.front().view(), p.observations.front().values(),
                              p.values.noise_stddev.front());
-    Posterior grown = update(Posterior(p.prior, {both.observations.front()}, [&] {
-                               ModelValues values = both.values;
-                               values.noise_stddev.pop_back();
-                               return values;
-                             }()),
+    Posterior grown = update(Posterior(p.prior, {both.observations.front()},
+                                       [&] {
+                                         ModelValues values = both.values;
+                                         values.noise_stddev.pop_back();
+                                         return values;
+                                       }()),
                              added);
     const Posterior anew = test::posterior_of(both);
     EXPECT_NEAR(grown.negative_log_likelihood(), anew.negative_log_likelihood(),
@@ -124,6 +127,37 @@ TEST(Sums, GrowByOrdinaryValuesAndDoNotShrink) {
               test::rounding(both) * (1 + largest(anew.mean(view, p.queries))));
     EXPECT_THROW(static_cast<void>(remove_oldest(std::move(grown), 1)), InputError);
   }
+}
+
+// with noise of their own the sums over a state are left out by leaving them out
+TEST(Sums, OverAStateSayNothingWhereItIsLeftOut) {
+  std::size_t n_left_out = 0;
+  for (const Problem& p : summed_problems()) {
+    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, sums_seed));
+    Problem alone = p;
+    std::vector<WeightedSum> sums = p.observations.front().sums();
+    for (WeightedSum& sum : sums) sum.noise = sum.noise.tail(1).eval();
+    alone.observations.front() = p.observations.front().with_sums(sums);
+    if (p.observations.size() > 1) continue;
+    const std::vector<LeaveOneOut> left_out = leave_one_out(test::posterior_of(alone));
+    for (const int i : {0, 2}) {
+      Problem without = alone;
+      std::vector<WeightedSum> others;
+      for (const WeightedSum& sum : sums) {
+        if (i < sum.first || i >= sum.first + sum.weights.size()) others.push_back(sum);
+      }
+      n_left_out += sums.size() - others.size();
+      without.observations.front() = p.observations.front().with_sums(others);
+      const View& view = p.observations.front().view();
+      const MatrixXd state = p.observations.front().states().col(i);
+      const Posterior::Marginal expected = test::posterior_of(without).marginal(view, state);
+      const double tolerance = test::rounding(p);
+      EXPECT_LE(largest(left_out[0].mean.col(i) - expected.mean), tolerance * (1 + largest(expected.mean)));
+      EXPECT_LE(largest(left_out[0].variance.col(i) - expected.stddev().cwiseAbs2()),
+                tolerance * (1 + largest(expected.stddev().cwiseAbs2())));
+    }
+  }
+  EXPECT_GT(n_left_out, 10U);
 }
 
 TEST(Sums, SayWhatIsWrongWithThem) {
@@ -138,17 +172,17 @@ TEST(Sums, SayWhatIsWrongWithThem) {
     change(one);
     return one;
   };
-  expect(changed([&](auto& one) { one.row = group.view().size(); }), "observations: sum 2: row");
-  expect(changed([&](auto& one) { one.first = group.n_data() - 1; }), "sum 2: states");
+  expect(changed([&](auto& one) { one.row = group.view().size(); }), "observations: sum 2 is of row");
+  expect(changed([&](auto& one) { one.first = group.n_data() - 1; }), "sum 2 is of row");
   expect(changed([](auto& one) { one.value = std::nan(""); }), "finite");
   expect(changed([](auto& one) { one.noise[0] = 0; }), "positive");
-  expect(changed([](auto& one) { one.noise = VectorXd::Ones(3); }), "sums before it");
+  expect(changed([](auto& one) { one.noise = VectorXd::Ones(3); }), "of the same row before it");
   if (group.view().size() > 1) {
     expect(changed([](auto& one) {
              one.row = 1;
              one.noise = VectorXd::Ones(2);
            }),
-           "another row");
+           "of the same row before it");
   }
   EXPECT_THROW(static_cast<void>(group.with_sums({good}).take({0})), InputError);
 }

@@ -114,10 +114,9 @@ TEST(ActuatorFit, FromARawLogToo) {
   RawFitOptions options;
   options.most_passes = 1;
   const LearnedLog learned = learn_and_smooth(request, CsvTable::from_columns("raw", columns), options);
-  const System& system = *request.model.system;
-  request.logs = {{learned.table(system, "rows")}};
-  request.problem.commands = as_table(learned.data, system, "all rows");
-  const FitOutcome fit = run_fit(prepare_fit(request));
+  EXPECT_NE(learned.windows, nullptr);
+  const FitOutcome fit = run_fit(prepare_fit(learned.request(request, "raw")));
+  EXPECT_TRUE(fit.posterior.observations().front().has_sums());
   EXPECT_NEAR(fit.file.model.actuators[0].delay.value, 0.03, 0.003);
   EXPECT_NEAR(fit.file.model.actuators[0].lag.value, 0.02, 0.003);
   EXPECT_NEAR(fit.file.model.actuators[0].delay.value + fit.file.model.actuators[0].lag.value, 0.05, 0.001);

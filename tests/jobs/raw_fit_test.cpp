@@ -1,5 +1,7 @@
 #include "gp2/jobs/raw_fit.hpp"
 
+#include <functional>
+
 #include <gmock/gmock.h>
 #include <gtest/gtest.h>
 
@@ -7,6 +9,7 @@
 #include "gp2/error.hpp"
 #include "gp2/jobs/fit_job.hpp"
 #include "input_error.hpp"
+#include "io_testing.hpp"
 #include "smoothing/simulated_logs.hpp"
 #include "test_models.hpp"
 
@@ -106,10 +109,8 @@ TEST(LearnedMotion, IsOfTheSamples) {
 TEST(LearnAndSmooth, LearnsMoreThanFromOneSmoothing) {
   const auto error_of = [](const LearnedLog& log) {
     FitRequest asked = request();
-    asked.problem.max_points.reset();
     asked.hyperparameters = HyperparameterChoice::optimise;
-    asked.logs = {{log.table(*pendulum().system, "rows")}};
-    const Posterior posterior = run_fit(prepare_fit(std::move(asked))).posterior;
+    const Posterior posterior = run_fit(prepare_fit(log.request(std::move(asked), "log"))).posterior;
     double error = 0;
     for (const Trajectory& truth : noisy_log().episodes) {
       const MatrixXd mean = posterior.mean(View::constrained_acceleration(*pendulum().system), truth.states);
@@ -117,8 +118,8 @@ TEST(LearnAndSmooth, LearnsMoreThanFromOneSmoothing) {
     }
     return std::sqrt(error);
   };
-  const LearnedLog once = learn_and_smooth(request(), noisy_log().table, {.most_passes = 0});
-  const LearnedLog turns = learn_and_smooth(request(), noisy_log().table, {});
+  const LearnedLog once = learn_and_smooth(request(), noisy_log().table, {.most_passes = 0, .windows = false});
+  const LearnedLog turns = learn_and_smooth(request(), noisy_log().table, {.windows = false});
   EXPECT_THAT(once.rows, testing::SizeIs(50));
   EXPECT_EQ(once.data.accelerations, derive(pendulum(), noisy_log().table, {.hold_constraints = true}).accelerations);
   EXPECT_TRUE(once.gains.empty());
@@ -128,6 +129,52 @@ TEST(LearnAndSmooth, LearnsMoreThanFromOneSmoothing) {
   EXPECT_LT(error_of(turns), 0.9 * error_of(once));
   const Score before = score_of(once.data, noisy_log(), *pendulum().system, 0);
   EXPECT_LT(score_of(turns.data, noisy_log(), *pendulum().system, 0).rms[2], 0.5 * before.rms[2]);
+}
+
+// from as many states as rows
+TEST(LearnAndSmooth, LearnsMoreFromWindowsThanFromRows) {
+  for (const int n_states : {50, 400}) {
+    const auto fit_of = [&](bool windows) {
+      FitRequest asked = request();
+      asked.problem.max_points = n_states;
+      asked.hyperparameters = HyperparameterChoice::optimise;
+      const LearnedLog log = learn_and_smooth(asked, noisy_log().table, {.most_passes = 0, .windows = windows});
+      EXPECT_EQ(log.windows != nullptr, windows);
+      return run_fit(prepare_fit(log.request(std::move(asked), "log")));
+    };
+    const auto error_of = [&](const FitOutcome& fit) {
+      double error = 0;
+      for (const Trajectory& truth : noisy_log().episodes) {
+        const MatrixXd mean = fit.posterior.mean(View::constrained_acceleration(*pendulum().system), truth.states);
+        for (const int j : {2, 5}) error += (mean.row(j) - truth.accelerations.row(j)).squaredNorm();
+      }
+      return std::sqrt(error);
+    };
+    const FitOutcome windows = fit_of(true);
+    EXPECT_TRUE(windows.posterior.observations().front().has_sums());
+    EXPECT_NEAR(windows.posterior.observations().front().n_data(), n_states, 0.4 * n_states);
+    EXPECT_LT(error_of(windows), 0.9 * error_of(fit_of(false))) << n_states;
+    // the same to the bit from its file
+    const TemporaryFolder folder;
+    windows.file.write(folder.path() / "fit.json");
+    const Posterior again = FitFile::read(folder.path() / "fit.json").posterior();
+    EXPECT_EQ(again.negative_log_likelihood(), windows.posterior.negative_log_likelihood());
+  }
+}
+
+TEST(LearnAndSmooth, LearnsFromRowsWhereWindowsDoNotSayWhatIsAsked) {
+  for (const auto& change : std::vector<std::function<void(FitRequest&)>>{
+           [](FitRequest& one) { one.problem.robust = true; },
+           [](FitRequest& one) { one.problem.noise_stddev = 0.1; },
+           [](FitRequest& one) { one.problem.baseline = Baseline::Kind::se; },
+           [](FitRequest& one) { one.problem.protocol.name = Protocol::Name::paper; },
+       }) {
+    FitRequest asked = request();
+    change(asked);
+    const LearnedLog log = learn_and_smooth(asked, noisy_log().table, {.most_passes = 0});
+    EXPECT_EQ(log.windows, nullptr);
+    EXPECT_THAT(log.rows, testing::SizeIs(50));
+  }
 }
 
 TEST(LearnAndSmooth, SameBitsForAnyNumberOfThreads) {

@@ -78,12 +78,14 @@ def test_topics_with_times_of_their_own_are_one_log(spring, tmp_path):
         np.testing.assert_array_equal(gp2.derive(spring, file)[0]["ddx"], gp2.derive(spring, one)[0]["ddx"])
 
 
-def test_learning_and_smoothing_by_turns_gives_rows_to_fit_to(spring):
-    rows, smoothed, report = gp2.learn_and_smooth(spring, log(noise=1e-2), mean="force", max_points=30, restarts=1, passes=2)
-    assert (len(rows), len(smoothed)) == (30, 400)
+@pytest.mark.parametrize("windows", ["auto", "none"])
+def test_a_raw_log_is_fitted_to(spring, windows):
+    posterior, smoothed, report = gp2.fit_raw(
+        spring, log(noise=1e-2), mean="force", max_points=60, restarts=1, passes=2, windows=windows
+    )
+    assert len(smoothed) == 400
     assert any("what was learned" in note for note in report["notes"])
     assert report["gains"] == sorted(report["gains"])
-    posterior = gp2.fit(spring, rows, mean="force", restarts=1)
     assert abs(posterior.predict(np.array([[0.5, 1.0, 0.0]])).mean[0, 0] + 4.5) < 0.2
     with pytest.raises(gp2.InputError, match="passes: must not be negative"):
-        gp2.learn_and_smooth(spring, log(), passes=-1)
+        gp2.fit_raw(spring, log(), passes=-1)

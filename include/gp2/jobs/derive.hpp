@@ -31,6 +31,7 @@ struct DeriveOptions {
   std::optional<Smoothness> smoothness = {};           // none: the likelier of 7/2 and 9/2
   std::optional<CsvTable> like = {};                   // a log whose smoothing this one is to have, see below
   double outlier_threshold = 5;                        // as SmootherFitOptions
+  bool keep_positions = false;                         // in each series, as they were taken
   int n_threads = 0;                                   // 0: all cores; the numbers do not depend on it
   std::function<void(double fraction)> progress = {};  // of the work done; called from worker threads, one at a time
 };
@@ -56,6 +57,9 @@ struct DerivedSeries {
   int wraps = 0;                // turns taken out
   int gaps = 0;                 // spaces of more than three usual ones
   double longest_gap = 0;       // [s]
+  double start = 0;             // what t was when the episode's time was 0
+  std::vector<Measurement> positions =
+      {};  // that are trusted, at times of the episode, turns taken out; where they were to be kept
 };
 
 /// Motions with their derivatives, as a fit wants them.

@@ -15,14 +15,33 @@
 #include "gp2/jobs/command_record.hpp"
 #include "gp2/jobs/option.hpp"
 #include "gp2/model.hpp"
+#include "gp2/smoothing/windows.hpp"
 
 namespace gp2 GP2_API {
+
+/// The positions that the rows of a log were smoothed from, and the windows over which their accelerations are to be learned from.
+struct Windows {
+  struct Series {
+    int coordinate = 0, episode = 0;
+    std::vector<Measurement> positions;
+    SmootherModel model;  // of their noise
+    WindowGrid grid;
+    std::vector<int> windows;
+  };
+  struct State {
+    int episode = 0;
+    double time = 0;  // as the positions count it [s]
+  };
+  std::vector<Series> series;
+  std::map<int, State> states;  // by their lines in the log
+};
 
 /// Measurements as a table, and the system they were taken on.
 struct Log {
   CsvTable table;
-  std::shared_ptr<const Model> model = nullptr;  // of that system; null: the model that is fitted
-  bool is_commanded = true;                      // its inputs are commands; else they are what acts
+  std::shared_ptr<const Model> model = nullptr;      // of that system; null: the model that is fitted
+  bool is_commanded = true;                          // its inputs are commands; else they are what acts
+  std::shared_ptr<const Windows> windows = nullptr;  // to learn from instead of the rows
 };
 
 /// Another quantity that is measured or known at some states: the columns of its rows that the table holds, at least one.

@@ -1,6 +1,7 @@
 #pragma once
 
 #include <atomic>
+#include <memory>
 #include <string>
 #include <vector>
 
@@ -17,6 +18,7 @@ struct RawFitOptions {
   /// How it is smoothed. Of no meaning are `columns`, for which the request has its own, `rate`, `every`, `keep`.
   DeriveOptions derive = {.hold_constraints = true};
   int most_passes = 4;  // of smoothing by what was learned; 0: smooth, then learn
+  bool windows = true;  // learn from sums over windows of time where that can be; else from rows
 };
 
 /// The table of its options.
@@ -27,18 +29,27 @@ std::vector<Option> options(FitRequest& request, RawFitOptions& raw);
 /// A log of positions, smoothed, and what to learn from it.
 struct LearnedLog {
   DerivedData data;
-  std::vector<int> rows;      // of data, to learn from: those that cover the motion best
+  std::vector<int> rows;  // of data, to learn from: the states of the windows, or those that cover the motion best
+  std::shared_ptr<const Windows> windows;  // null: the rows themselves are learned from
   std::vector<double> gains;  // of each pass that was kept: log likelihood of the positions, beside a smoothing without a model
   std::vector<std::string> notes;
 
-  /// These rows, as a fit reads them.
-  [[nodiscard]] CsvTable table(const System& system, std::string name) const;
+  /// The request of a fit to it, from that which it was learned for.
+  /// @param name  of the log
+  [[nodiscard]] FitRequest request(FitRequest asked, const std::string& name) const;
 };
 
-/// Rows that are learned from where the request does not say how many (FitProblemOptions::max_points).
-inline constexpr int n_raw_rows = 200;
+/// Rows that are learned from, and states that windows are over, where the request does not say how many
+/// (FitProblemOptions::max_points).
+inline constexpr int n_raw_rows = 200, n_window_states = 600;
 
-/// Smooths a log of positions and learns from it by turns. The first smoothing knows only that a motion is smooth. A later one
+/// Smooths a log of positions and learns from it by turns, then chooses what to fit to: windows of time over which positions tell sums
+/// of accelerations without being differentiated (smoothing/windows.hpp), 0.4 of the period apart up to which the fastest motion
+/// stands out of the noise; all of them, where their states are not too many, else groups of eight about the rows that cover the
+/// motion best. Such rows themselves, where the log has velocities, constraints are soft, or the fit is robust, a baseline, of
+/// `noise_std` or of the paper's protocol.
+///
+/// The first smoothing knows only that a motion is smooth. A later one
 /// smooths what the positions are off the motion under the accelerations that a fit to rows of the one before predicts (derive).
 /// In each of 30 pieces of the log these come from rows of other pieces, so that no sample is held against itself.
 /// The gain in likelihood thus tells how well the fit predicts what it has not seen, and so which smoothing is the best to learn
