@@ -1,20 +1,23 @@
-"""What learning and smoothing by turns gains over smoothing first: simulated encoder logs of many mechanisms.
+"""What a fit to positions gains by windows of time, and by learning and smoothing by turns: simulated encoder logs of many mechanisms.
 
     python3 experiments/raw_fit.py --gp2 build/test/apps/gp2/gp2 --seeds 21 22 --out cells.csv
 
-A cell is one mechanism, one level of noise (of positions, in parts of their spread) and one seed: `gp2 fit --raw` with `--passes 0`
-and as it is by default, scored along the true motion. Errors are those of the accelerations measured, in parts of their spread.
+A cell is one mechanism, one level of noise (of positions, in parts of their spread) and one seed: `gp2 fit --raw` to rows of a log
+smoothed once, to rows of one smoothed by turns, and as it is by default, to windows, scored along the true motion. Errors are those
+of the accelerations measured, in parts of their spread.
 """
 
 import argparse
 import concurrent.futures
 import csv
+import json
 import math
 import pathlib
 import random
 import statistics
 import subprocess
 import tempfile
+import time
 
 ROOT = pathlib.Path(__file__).parent.parent
 MECHANISMS = "experiments/mechanisms/"
@@ -37,6 +40,7 @@ LOGS = {
     "slider_crank": ("models/slider_crank.toml", "q1=0.3,dq1=5", 10, 200, ["q1"], {"u1": [(0.3, 0.4, 0), (0.25, 1, 1)]}),
 }
 LEVELS = [5e-4, 2.5e-3, 1e-2]
+WAYS = {"rows": ["--windows", "none", "--passes", 0], "rows by turns": ["--windows", "none"], "windows": []}
 
 
 def run(gp2, *arguments):
@@ -74,6 +78,13 @@ def error(columns, truth, names):
     return math.sqrt(sum(parts) / len(parts))
 
 
+def coverage(columns, truth, names):
+    """Of what is said to be within 95 %."""
+    inside = [abs(x - y) <= 1.96 * d for n in names if n + "_std" in columns
+              for x, y, d in zip(columns[n], truth[n], columns[n + "_std"]) if not math.isnan(d)]
+    return sum(inside) / len(inside)
+
+
 def cell(gp2, name, level, seed, options):
     model, _, _, _, measured, inputs = LOGS[name]
     accelerations = ["dd" + q for q in measured]
@@ -87,16 +98,18 @@ def cell(gp2, name, level, seed, options):
             stddev = level * statistics.pstdev(truth[q])
             log[q] = [value + noise.gauss(0, stddev) for value in truth[q]]
         write(folder / "log.csv", log)
-        for passes, turns in ((["--passes", 0], "once"), ([], "by turns")):
-            run(gp2, "fit", ROOT / model, "--raw", folder / "log.csv", "--mean", "force", "--threads", 1, *passes, *options,
+        for way, chosen in WAYS.items():
+            start = time.monotonic()
+            run(gp2, "fit", ROOT / model, "--raw", folder / "log.csv", "--mean", "force", "--threads", 1, *chosen, *options,
                 "--smoothed", folder / "smoothed.csv", "-o", folder / "fit.json")
-            run(gp2, "predict", folder / "fit.json", "--states", folder / "truth.csv", "-o", folder / "prediction.csv")
-            row["learned " + turns] = error(read(folder / "prediction.csv"), truth, accelerations)
-            smoothed = read(folder / "smoothed.csv")
-            row["smoothed " + turns] = error(smoothed, truth, accelerations)
-            inside = [abs(s - x) <= 1.96 * d for n in accelerations if n + "_std" in smoothed
-                      for s, x, d in zip(smoothed[n], truth[n], smoothed[n + "_std"]) if not math.isnan(d)]
-            row["coverage " + turns] = sum(inside) / len(inside)
+            row["seconds, " + way] = time.monotonic() - start
+            fitted = json.loads((folder / "fit.json").read_text())["hyperparameters"]
+            row["noise factor, " + way] = max(h["value"] for h in fitted if h["kind"] == "noise_stddev")
+            run(gp2, "predict", folder / "fit.json", "--states", folder / "truth.csv", "--cov", "std", "-o", folder / "prediction.csv")
+            for what, file in (("learned", "prediction.csv"), ("smoothed", "smoothed.csv")):
+                columns = read(folder / file)
+                row[f"{what}, {way}"] = error(columns, truth, accelerations)
+                row[f"{what} within, {way}"] = coverage(columns, truth, accelerations)
     return row
 
 
@@ -118,12 +131,14 @@ def main():
                 csv.writer(file).writerow(rows[0])
             csv.writer(file).writerow(rows[-1].values())
             file.flush()
-    for what in ("learned", "smoothed"):
-        ratios = sorted(row[what + " by turns"] / row[what + " once"] for row in rows)
-        print(f"{what}: error by turns beside once, geometric mean {statistics.geometric_mean(ratios):.3f}, worst {ratios[-1]:.2f}; "
+    for what, way, base in (("learned", "rows by turns", "rows"), ("learned", "windows", "rows"), ("smoothed", "rows by turns", "rows")):
+        ratios = sorted(row[f"{what}, {way}"] / row[f"{what}, {base}"] for row in rows)
+        print(f"{what}, {way} beside {base}: geometric mean of errors {statistics.geometric_mean(ratios):.3f}, worst {ratios[-1]:.2f}; "
               f"above 1.02 {sum(r > 1.02 for r in ratios)} of {len(ratios)}")
-    for turns in ("once", "by turns"):
-        print(f"within 95 %, {turns}: {statistics.mean(row['coverage ' + turns] for row in rows):.3f}")
+    for what in ("learned", "smoothed"):
+        for way in WAYS:
+            inside = [row[f"{what} within, {way}"] for row in rows]
+            print(f"{what} within 95 %, {way}: mean {statistics.mean(inside):.3f}, least {min(inside):.3f}")
 
 
 if __name__ == "__main__":

@@ -128,13 +128,13 @@ bool factorise(Eigen::Ref<Eigen::MatrixXd> A, const Pieces& pieces) {
   return factorise(static_cast<int>(A.rows()), {A.data(), static_cast<int>(A.outerStride())}, pieces);
 }
 
-PivotedFactor factorise_semidefinite(Eigen::MatrixXd A) {
+PivotedFactor factorise_semidefinite(Eigen::MatrixXd A, std::optional<double> smallest) {
   const BufferInUse buffer;
   const int n = static_cast<int>(A.rows());
   PivotedFactor factor{Eigen::MatrixXd(n, 0), std::vector<int>(static_cast<std::size_t>(n))};
   if (n == 0) return factor;
   int rank = 0, info = 0;
-  const double tolerance = -1;  // n ε times the largest entry of the diagonal
+  const double tolerance = smallest ? *smallest * A.diagonal().maxCoeff() : -1;  // −1: n ε times the largest of the diagonal
   Eigen::VectorXd work(2 * n);
   dpstrf_("L", &n, A.data(), &n, factor.rows.data(), &rank, &tolerance, work.data(), &info, 1);
   for (int& row : factor.rows) --row;  // Fortran counts from 1
@@ -227,6 +227,36 @@ void solve_lower(const Eigen::Ref<const Eigen::MatrixXd>& L, bool transposed, Ei
     return;
   }
   dtrsm_("L", "L", transposition, "N", &n, &n_columns, &one, L.data(), &lda, B.data(), &ldb, 1, 1, 1, 1);
+}
+
+void multiply_lower(const Eigen::Ref<const Eigen::MatrixXd>& L, Eigen::Ref<Eigen::MatrixXd> B) {
+  const BufferInUse buffer;
+  const int n = static_cast<int>(L.rows()), n_columns = static_cast<int>(B.cols()), lda = static_cast<int>(L.outerStride()),
+            ldb = static_cast<int>(B.outerStride());
+  const double one = 1;
+  if (n == 0 || n_columns == 0) return;
+  dtrmm_("L", "L", "N", "N", &n, &n_columns, &one, L.data(), &lda, B.data(), &ldb, 1, 1, 1, 1);
+}
+
+void add_product(const Eigen::Ref<const Eigen::MatrixXd>& A, bool transposed_A, const Eigen::Ref<const Eigen::MatrixXd>& B,
+                 bool transposed_B, Eigen::Ref<Eigen::MatrixXd> C) {
+  const BufferInUse buffer;
+  const int m = static_cast<int>(C.rows()), n = static_cast<int>(C.cols()),
+            k = static_cast<int>(transposed_A ? A.rows() : A.cols()), lda = static_cast<int>(A.outerStride()),
+            ldb = static_cast<int>(B.outerStride()), ldc = static_cast<int>(C.outerStride());
+  const double one = 1;
+  if (m == 0 || n == 0 || k == 0) return;
+  dgemm_(transposed_A ? "T" : "N", transposed_B ? "T" : "N", &m, &n, &k, &one, A.data(), &lda, B.data(), &ldb, &one, C.data(),
+         &ldc, 1, 1);
+}
+
+void add_square(const Eigen::Ref<const Eigen::MatrixXd>& A, Eigen::Ref<Eigen::MatrixXd> C) {
+  const BufferInUse buffer;
+  const int n = static_cast<int>(A.rows()), k = static_cast<int>(A.cols()), lda = static_cast<int>(A.outerStride()),
+            ldc = static_cast<int>(C.outerStride());
+  const double one = 1;
+  if (n == 0 || k == 0) return;
+  dsyrk_("L", "N", &n, &k, &one, A.data(), &lda, &one, C.data(), &ldc, 1, 1);
 }
 
 SingleThread::SingleThread() {

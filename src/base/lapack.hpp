@@ -1,6 +1,7 @@
 #pragma once
 
 #include <atomic>
+#include <optional>
 #include <vector>
 
 #include <Eigen/Core>
@@ -38,12 +39,13 @@ struct Pieces {
 /// A = L Lᵀ in the lower triangle, in place; false when A is not positive definite, or when stopped.
 bool factorise(Eigen::Ref<Eigen::MatrixXd> A, const Pieces& pieces = {});
 
-/// Pᵀ A P = L Lᵀ of a positive semidefinite A, with the largest of what is left as the next pivot, down to its size times ε.
+/// Pᵀ A P = L Lᵀ of a positive semidefinite A, with the largest of what is left as the next pivot, down to its size times ε, or to
+/// `smallest` times the largest of the diagonal.
 struct PivotedFactor {
   Eigen::MatrixXd L;      // (n × rank), lower triangular
   std::vector<int> rows;  // row k of L is row rows[k] of A
 };
-PivotedFactor factorise_semidefinite(Eigen::MatrixXd A);
+PivotedFactor factorise_semidefinite(Eigen::MatrixXd A, std::optional<double> smallest = std::nullopt);
 
 /// The lower triangle of A⁻¹ from that of L, in place: (L⁻¹)ᵀL⁻¹. Faster than dpotri, whose triangular inverse is slow up to a
 /// size of some hundred. When stopped what stands there is neither.
@@ -51,6 +53,16 @@ void invert_factored(Eigen::Ref<Eigen::MatrixXd> L, const Pieces& pieces = {});
 
 /// B ← L⁻¹ B, or L⁻ᵀ B.
 void solve_lower(const Eigen::Ref<const Eigen::MatrixXd>& L, bool transposed, Eigen::Ref<Eigen::MatrixXd> B);
+
+/// B ← L B.
+void multiply_lower(const Eigen::Ref<const Eigen::MatrixXd>& L, Eigen::Ref<Eigen::MatrixXd> B);
+
+/// C ← C + A B, with A or B transposed where that is said.
+void add_product(const Eigen::Ref<const Eigen::MatrixXd>& A, bool transposed_A, const Eigen::Ref<const Eigen::MatrixXd>& B,
+                 bool transposed_B, Eigen::Ref<Eigen::MatrixXd> C);
+
+/// The lower triangle of C ← C + A Aᵀ.
+void add_square(const Eigen::Ref<const Eigen::MatrixXd>& A, Eigen::Ref<Eigen::MatrixXd> C);
 
 /// While any of these lives, OpenBLAS computes on the calling thread only: our threads and its own do not fight, and sums keep
 /// their order. The previous setting returns with the last one, unless somebody has chosen another meanwhile.

@@ -11,7 +11,7 @@
 #include "base/lapack.hpp"
 #include "base/not_a_number.hpp"
 #include "gp2/error.hpp"
-#include "inference/dense_gram.hpp"
+#include "inference/inducing_gram.hpp"
 #include "inference/latent_sums.hpp"
 #include "inference/query.hpp"
 
@@ -255,9 +255,9 @@ LeftOut leave_out_of(const Posterior& posterior, const Posterior::Implementation
     return {without.leave_out(each), n_stretches > 0 ? without.leave_out(stretches) : std::vector<LeaveOneOut>{}};
   }
   const LatentRows rows = latent_rows(prior, observations, reduction, values);
-  DenseGram gram;
-  if (!gram.factorise(rows)) throw NumericalError("leave_one_out: the covariance of the observations cannot be factored");
-  const Gram::Inverse inverse = gram.invert(rows, stretches);
+  const std::unique_ptr<Gram> gram = make_gram(values);
+  if (!gram->factorise(rows)) throw NumericalError("leave_one_out: the covariance of the observations cannot be factored");
+  const Gram::Inverse inverse = gram->invert(rows, stretches);
   LeftOut out{each_value(posterior, reduction, inverse), {}};
   if (n_stretches > 0) out.stretches = each_stretch(posterior, reduction, inverse, stretches);
   return out;

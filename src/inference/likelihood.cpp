@@ -5,7 +5,7 @@
 #include <utility>
 
 #include "base/parallel.hpp"
-#include "inference/dense_gram.hpp"
+#include "inference/inducing_gram.hpp"
 #include "inference/requirements.hpp"
 #include "inference/sample_gradient.hpp"
 
@@ -33,13 +33,14 @@ struct Likelihood::Implementation {
 };
 
 struct Likelihood::Workspace::Implementation {
-  Implementation(int n_threads, const std::atomic<bool>* stop_flag)
-      : gram(std::make_unique<DenseGram>(n_threads, stop_flag)), stop(stop_flag) {}
+  Implementation(int threads, const std::atomic<bool>* stop_flag) : n_threads(threads), stop(stop_flag) {}
 
   // of the likelihood whose data stands below; held, so that no other can have it
   std::shared_ptr<const char> owner;
-  std::unique_ptr<Gram> gram;
+  int n_threads;
   const std::atomic<bool>* stop;
+  std::unique_ptr<Gram> gram;
+  std::shared_ptr<const InducingPoints> inducing;  // of `gram`
 
   std::vector<ObservationModel> own_models;  // where parameters are estimated …
   VectorXd modelled;                         // … at these, none: not yet
@@ -51,6 +52,7 @@ struct Likelihood::Workspace::Implementation {
   std::vector<MatrixXd> D;                      // per latent: R_i E_a, by component
 
   void start(const Likelihood::Implementation& self);
+  Gram& gram_of(const ModelValues& values);
   // null where the mechanics have a fault
   [[nodiscard]] const std::vector<ObservationModel>* models(const Likelihood::Implementation& self, const VectorXd& parameters,
                                                             bool with_derivatives);
@@ -64,6 +66,14 @@ void Likelihood::Workspace::Implementation::start(const Likelihood::Implementati
   modelled.resize(0);
   rows = {};
   owner = self.identity;
+}
+
+Gram& Likelihood::Workspace::Implementation::gram_of(const ModelValues& values) {
+  if (gram == nullptr || inducing != values.inducing) {
+    gram = make_gram(values, n_threads, stop);
+    inducing = values.inducing;
+  }
+  return *gram;
 }
 
 const std::vector<ObservationModel>* Likelihood::Workspace::Implementation::models(const Likelihood::Implementation& self,
@@ -154,7 +164,7 @@ std::vector<GramGradientParts> Likelihood::Implementation::parts(const Reduction
     const Latent& latent = prior.latents[a];
     GramGradientParts& part = parts.emplace_back();
     part.kernel = !latent.kernel_is_fixed && values.kernel[a].size() > 0;
-    part.alike = reduction.same_directions[a] && !differentiates_samples();
+    part.alike = reduction.same_directions[a] && !differentiates_samples() && !values.inducing;
     part.V = differentiates_samples() || (values.has_free_loading(a) && !part.alike);
     part.columns = part.kernel || part.V || !latent.signal_is_fixed;
     part.mean = differentiates_samples();
@@ -198,15 +208,16 @@ double Likelihood::evaluate(const ModelValues& values, ModelGradient* gradient, 
   work.update_rows(self, reduction, values);
 
   // T12
-  const std::optional<GramValue> gram = work.gram->factorise(work.rows);
-  if (!gram) return infinity;
-  const double value = reduction.constant + gram->data_fit + gram->complexity;
+  Gram& gram = work.gram_of(values);
+  const std::optional<GramValue> of_gram_value = gram.factorise(work.rows);
+  if (!of_gram_value) return infinity;
+  const double value = reduction.constant + of_gram_value->data_fit + of_gram_value->complexity;
   if (!std::isfinite(value)) return infinity;
   if (gradient == nullptr) return value;
 
   // T14
   const std::vector<GramGradientParts> parts = self.parts(reduction, values);
-  const GramGradient of_gram = work.gram->differentiate(work.rows, parts);
+  const GramGradient of_gram = gram.differentiate(work.rows, parts);
   if (is_set(work.stop)) return infinity;  // the gradient may be that of a part
   *gradient = ModelGradient::zero(values);
   for (std::size_t a = 0; a < parts.size(); ++a) {

@@ -12,7 +12,7 @@
 #include "gp2/error.hpp"
 #include "inference/assemble.hpp"
 #include "inference/data_distance.hpp"
-#include "inference/dense_gram.hpp"
+#include "inference/inducing_gram.hpp"
 #include "inference/latent_sums.hpp"
 #include "inference/query.hpp"
 #include "inference/requirements.hpp"
@@ -35,7 +35,7 @@ void Posterior::Implementation::add_samples(const std::vector<Observations>& gro
   if (latents) {
     is_positive_definite = latents->append(rows);
   } else {
-    latents = DenseGram().condition(rows);
+    latents = make_gram(values)->condition(rows);
     is_positive_definite = latents != nullptr;
   }
   if (!is_positive_definite) {

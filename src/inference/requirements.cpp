@@ -67,6 +67,19 @@ void require_count(const char* member, std::size_t got, std::size_t wanted, cons
   if (got != wanted) throw InputError(fmt::format("values: {} is of {} {}, there are {}", member, got, owners, wanted));
 }
 
+void require_inducing(const Prior& prior, const std::vector<Observations>& observations, const InducingPoints& points) {
+  require_count("inducing", points.features.size(), prior.latents.size(), "latents");
+  for (std::size_t a = 0; a < points.features.size(); ++a) {
+    const MatrixXd& features = points.features[a];
+    if (features.cols() == prior.latents[a].n_features() && features.allFinite()) continue;
+    throw InputError(fmt::format("values: inducing points of latent '{}' must be finite and have {} features, got {}",
+                                 prior.latents[a].name, prior.latents[a].n_features(), features.cols()));
+  }
+  for (const Observations& group : observations) {
+    if (group.has_sums()) throw InputError("values: sums over states are not learned through inducing points");
+  }
+}
+
 }  // namespace
 
 void require_values(const Prior& prior, const std::vector<Observations>& observations, const ModelValues& values) {
@@ -94,6 +107,7 @@ void require_values(const Prior& prior, const std::vector<Observations>& observa
     require_numbers(values.noise_stddev[g], observations[g].view().size(), Sign::positive,
                     [g] { return fmt::format("noise_stddev of observations {}", g + 1); });
   }
+  if (values.inducing) require_inducing(prior, observations, *values.inducing);
   require_numbers(values.parameters, std::ssize(prior.system->parameters()), Sign::any,
                   [&] { return fmt::format("parameters of '{}'", prior.system->name()); });
 }

@@ -180,6 +180,51 @@ void add_draw_notes(const FitReport& report, std::vector<std::string>& notes) {
                   worst, report.hyperparameters[static_cast<std::size_t>(k)].name));
 }
 
+// Where the constraint turns a prior mean of zero into accelerations far above those measured: it shares out what the prior leaves
+// out by the mass matrix, so that where an inertia is small it is nearly all that coordinate's.
+void add_constraint_note(const Posterior& posterior, std::vector<std::string>& notes) {
+  if (posterior.prior().mean != Prior::Mean::zero || posterior.prior().reference) return;
+  constexpr double far = 3;
+  std::vector<std::string> large;
+  for (const Observations& group : posterior.observations()) {
+    const View& view = group.view();
+    if (!view.is_of_ddq() || view.other_system || group.has_sums()) continue;
+    const MechanicsBatch mechanics =
+        require_mechanics(posterior.prior(), view, group.states(), parameters_of(view, posterior.values().parameters));
+    const MatrixXd of_constraint = evaluate_view(view, mechanics, group.states()).offset;
+    const std::vector<std::string> names = view.names(*posterior.prior().system);
+    for (int k = 0; k < view.size(); ++k) {
+      const auto is_measured = group.values().row(k).array().isFinite();
+      const double n = static_cast<double>(is_measured.count());
+      const double measured = std::sqrt(is_measured.select(group.values().row(k), 0).squaredNorm() / n);
+      const double constraint = std::sqrt(is_measured.select(of_constraint.row(k), 0).squaredNorm() / n);
+      if (constraint > far * measured)
+        large.push_back(
+            fmt::format("{} ({:.2g} rms, measured {:.2g})", names[static_cast<std::size_t>(k)], constraint, measured));
+    }
+  }
+  if (large.empty()) return;
+  notes.push_back(
+      fmt::format("warning: under a prior mean of zero the constraint alone makes far more than was measured: {}. It acts by the "
+                  "inertias, and "
+                  "on the smallest most; fit with `mean=force`, or see that the masses are right",
+                  fmt::join(large, ", ")));
+}
+
+// Where sums over windows of time deviate by far more than the noise of the positions makes them.
+void add_window_note(const Posterior& posterior, std::vector<std::string>& notes) {
+  constexpr double large = 2;  // in simulated logs it was 0.8 to 1.3
+  double factor = 0;
+  for (std::size_t g = 0; g < posterior.observations().size(); ++g) {
+    if (posterior.observations()[g].has_sums()) factor = std::max(factor, posterior.noise_stddev(g).maxCoeff());
+  }
+  if (!(factor > large)) return;
+  notes.push_back(fmt::format(
+      "warning: over windows of time the log deviates by {:.2g} times what the noise of its positions makes: the machine "
+      "does what the model cannot; compare a fit with `windows=none`",
+      factor));
+}
+
 // What this fit leaves out of the force that its model knows: that the latents cannot stand for it, or that the same data are far
 // more likely with it under the same hyperparameters.
 void add_force_note(const Posterior& posterior, std::vector<std::string>& notes) {
@@ -373,6 +418,8 @@ FitOutcome run_once(const FitJob& job, const std::function<void(const Progress&)
     // a fit that has taken hours is not lost to what is said of it
     try {
       add_force_note(outcome.posterior, outcome.notes);
+      add_constraint_note(outcome.posterior, outcome.notes);
+      add_window_note(outcome.posterior, outcome.notes);
       outcome.cross_validation =
           cross_validate(outcome.posterior, keeps_row_order(outcome.file, outcome.posterior.observations()));
       add_residual_notes(outcome.posterior, outcome.cross_validation->residuals, outcome.notes);

@@ -73,7 +73,8 @@ class WindowChoice {
     make_grids();
     double n_all = 0;
     for (const Episode& one : episodes_) n_all += one.end / one.step;
-    if (n_all <= n_states) {
+    covers_log_ = n_all <= n_states;
+    if (covers_log_) {
       // as near to each other as the number allows: where noise hides it a motion has more than stands out
       for (Episode& one : episodes_) {
         one.step *= n_all / n_states;
@@ -85,6 +86,7 @@ class WindowChoice {
     choose_rows();
   }
 
+  [[nodiscard]] bool covers_log() const { return covers_log_; }
   [[nodiscard]] const std::vector<int>& rows() const { return rows_; }
 
   [[nodiscard]] Windows windows() const {
@@ -180,6 +182,7 @@ class WindowChoice {
   const DerivedData& data_;
   Eigen::RowVectorXd time_;
   std::vector<Episode> episodes_;
+  bool covers_log_ = false;
   std::vector<int> rows_;
 };
 
@@ -268,6 +271,8 @@ LearnedLog learn_and_smooth(const FitRequest& request, const CsvTable& log, cons
     const int n = request.problem.max_points.value_or(
         std::min(n_window_states, n_values / static_cast<int>(std::ssize(learned.data.independent))));
     const WindowChoice choice(learned.data, system, resample(request.model, table, {.n = std::min(n, table.n_rows())}).rows, n);
+    // a group of eight windows takes eighteen states: of a few groups less is learned than from as many rows, which lie apart
+    if (n < n_raw_rows && !choice.covers_log()) return learned;
     learned.rows = choice.rows();
     learned.windows = std::make_shared<const Windows>(choice.windows());
     for (DerivedSeries& series : learned.data.series) series.positions = {};

@@ -1,5 +1,6 @@
 #include <gtest/gtest.h>
 
+#include "gp2/inference/inducing.hpp"
 #include "inference/assemble.hpp"
 #include "inference/problems.hpp"
 
@@ -151,6 +152,13 @@ TEST(LikelihoodGradientTest, MatchesDifferencesWhereSumsAreMeasured) {
     expect_gradient(test::with_sums(p, ++n_problems % 2 == 0, likelihood_gradient_seed));
   }
   EXPECT_GT(n_problems, 5);
+}
+
+TEST(LikelihoodGradientTest, MatchesDifferencesThroughInducingPoints) {
+  for (Problem p : test::problems(40, likelihood_gradient_seed)) {
+    p.values.inducing = choose_inducing_points(p.prior, p.observations, p.values, {.most = 25, .left_out = 1e-12}).points;
+    expect_gradient(p);
+  }
 }
 
 // the sums over pairs of samples go tile by tile: here are several, and samples whose ranks differ

@@ -2,6 +2,7 @@
 #include <fmt/format.h>
 #include <gmock/gmock.h>
 
+#include "base/random.hpp"
 #include "gp2/jobs/check_job.hpp"
 #include "gp2/jobs/fit_job.hpp"
 #include "gp2/jobs/predict_job.hpp"
@@ -198,6 +199,51 @@ dy = [-2, 2]
   data.model = &narrow;
   EXPECT_THAT(notes_of_fit(data, Prior::Mean::zero),
               Contains(HasSubstr("warning: the known force of [mechanics] is not used, and no feature reads u1, u2, u3")));
+}
+
+// a car whose axle is behind its centre of mass, driven such that it does not turn faster; its inertia is that of a coin
+TEST(Residuals, TellOfAConstraintThatSpinsWhatIsLight) {
+  const auto car = [](const char* inertia) {
+    return Model::parse(fmt::format(R"toml(
+coordinates = ["x", "y", "h"]
+[mechanics]
+mass  = [["1", "0", "0"], ["0", "1", "0"], ["0", "0", "{}"]]
+force = ["0", "0", "0"]
+[constraints]
+velocity = ["dx*sin(h) - dy*cos(h) + 0.1*dh"]
+[noise]
+ddq = 0.05
+[[latent]]
+kernel     = "se"
+features   = ["dx", "dy", "h", "dh"]
+directions = "acceleration"
+[truth]
+acceleration = ["0", "0", "0"]
+[sampling]
+v  = [1, 2]
+h  = [0, 6]
+dh = [-1, 1]
+dx = "v*cos(h) - 0.1*dh*sin(h)"
+dy = "v*sin(h) + 0.1*dh*cos(h)"
+)toml",
+                                    inertia),
+                        "car.toml");
+  };
+  for (const bool is_light : {true, false}) {
+    const Model model = car(is_light ? "1e-4" : "10");
+    GeneratedData drawn = generate(model, GenerateOptions{60, 16, test::noise_of(model)});
+    RandomStream random(16, 1);
+    for (Eigen::Index i = 0; i < drawn.states.cols(); ++i) {
+      const double h = drawn.states(2, i), along = drawn.states(3, i) * std::cos(h) + drawn.states(4, i) * std::sin(h);
+      drawn.accelerations.col(i) = -drawn.states(5, i) * along * Eigen::Vector3d(std::sin(h), -std::cos(h), 0);
+      for (int k = 0; k < 3; ++k) drawn.accelerations(k, i) += 0.05 * random.normal();
+    }
+    const Data data = {&model, std::move(drawn.states), std::move(drawn.accelerations)};
+    const testing::Matcher<std::vector<std::string>> is_told =
+        Contains(HasSubstr("the constraint alone makes far more than was measured: ddh"));
+    EXPECT_THAT(notes_of_fit(data, Prior::Mean::zero), is_light ? is_told : Not(is_told));
+    EXPECT_THAT(notes_of_fit(data, Prior::Mean::force), Not(is_told));
+  }
 }
 
 }  // namespace

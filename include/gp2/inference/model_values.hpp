@@ -1,5 +1,6 @@
 #pragma once
 
+#include <memory>
 #include <vector>
 
 #include <Eigen/Core>
@@ -8,6 +9,12 @@
 
 namespace gp2 GP2_API {
 
+/// Points at which latents are known, in the features of each; where there are more observations than K̃ + I can be factored for
+/// (theory.md, T37; choose_inducing_points).
+struct InducingPoints {
+  std::vector<Eigen::MatrixXd> features;  // per latent: φ_a, one row per point (m_a × D_a)
+};
+
 /// Everything about a prior and its observations that can be tuned, in physical units.
 struct ModelValues {
   std::vector<Eigen::VectorXd> kernel;         // per latent: the kernel's parameters
@@ -15,6 +22,7 @@ struct ModelValues {
   std::vector<Eigen::MatrixXd> free_loading;   // per latent: C where it is free (p × functions), else empty; may be left empty
   std::vector<Eigen::VectorXd> noise_stddev;   // per Observations: σ (d), of values with a noise of their own the common factor
   Eigen::VectorXd parameters;                  // of the system: θ
+  std::shared_ptr<const InducingPoints> inducing = {};  // null: exact
 
   [[nodiscard]] bool has_free_loading(std::size_t a) const { return a < free_loading.size() && free_loading[a].size() > 0; }
   /// C_a of latent a (p × functions).

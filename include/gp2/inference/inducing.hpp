@@ -1,0 +1,31 @@
+#pragma once
+
+#include <memory>
+#include <vector>
+
+#include "gp2/export.hpp"
+#include "gp2/inference/model_values.hpp"
+#include "gp2/observations.hpp"
+#include "gp2/prior.hpp"
+
+namespace gp2 GP2_API {
+
+struct InducingOptions {
+  int most = 1000;          // inducing variables of all latents together
+  double left_out = 1;      // t at which no more points are taken
+  int n_candidates = 5000;  // observed states that are looked at, spread evenly
+};
+
+struct InducingChoice {
+  std::shared_ptr<const InducingPoints> points;
+  double left_out = 0;  // t of all observations, estimated from the candidates
+  int n_variables = 0;  // M
+};
+
+/// Inducing points among the observed states, one after another: the latent and the state that reduce t of the bound most (greedy
+/// pivoted Cholesky factorisation; theory.md, T37), until t is small, nothing is left in double precision, or there are enough.
+/// @throws InputError where the options make no sense; and as Likelihood.
+InducingChoice choose_inducing_points(const Prior& prior, const std::vector<Observations>& observations,
+                                      const ModelValues& values, const InducingOptions& options = {});
+
+}  // namespace gp2

@@ -1,0 +1,115 @@
+#include "gp2/inference/inducing.hpp"
+
+#include <algorithm>
+#include <cmath>
+
+#include <fmt/format.h>
+
+#include "gp2/error.hpp"
+#include "inference/inducing_latents.hpp"
+#include "inference/requirements.hpp"
+
+namespace gp2 {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+
+namespace {
+
+// One latent at the candidates: what its points so far leave of its variance, and the factor that tells.
+class Candidates {
+ public:
+  Candidates(const LatentRows& rows, std::size_t a, const std::vector<Index>& samples)
+      : latent_(rows.latents[a]),
+        kernel_(latent_.kernel.kernel(), latent_.kernel.features()(samples, Eigen::all), latent_.kernel.values()) {
+    const Index n = kernel_.n_points();
+    weight_.setZero(n);
+    left_.resize(n);
+    VectorXd point;
+    for (Index i = 0; i < n; ++i) {
+      weight_[i] = latent_.Z.row(samples[static_cast<std::size_t>(i)]).squaredNorm();
+      kernel_.scale(i, point);
+      left_[i] = kernel_.variance(point);
+    }
+    smallest_ = smallest_pivot * (n > 0 ? left_.maxCoeff() : 0);
+  }
+
+  [[nodiscard]] Index n_functions() const { return latent_.n_functions; }
+  [[nodiscard]] double trace() const { return weight_.dot(left_); }
+  [[nodiscard]] MatrixXd points() const { return kernel_.features()(chosen_, Eigen::all); }
+
+  // what the best candidate would take from the trace at least: its own part
+  double largest() {
+    const double largest = weight_.cwiseProduct(left_).maxCoeff(&next_);
+    return left_[next_] > smallest_ ? largest : 0;
+  }
+
+  void take() {
+    const Index n = kernel_.n_points(), m = std::ssize(chosen_);
+    VectorXd point, k(kernel_.n_rows());
+    kernel_.scale(next_, point);
+    kernel_.evaluate(0, k.size(), point, k.data(), workspace_);
+    if (factor_.cols() == m) factor_.conservativeResize(n, std::max<Index>(32, 2 * m));
+    VectorXd column = k.head(n);
+    column.noalias() -= factor_.leftCols(m) * factor_.row(next_).head(m).transpose();
+    column /= std::sqrt(left_[next_]);
+    left_ = (left_ - column.cwiseAbs2()).cwiseMax(0);
+    left_[next_] = 0;
+    factor_.col(m) = column;
+    chosen_.push_back(next_);
+  }
+
+ private:
+  const LatentRows::OfLatent& latent_;
+  KernelColumns kernel_;
+  VectorXd weight_, left_;  // Σ_f ‖Γ_i,f‖²; k(φ_i, φ_i) − ‖w_i‖²
+  double smallest_ = 0;
+  Index next_ = 0;
+  std::vector<Index> chosen_;
+  MatrixXd factor_;  // column j: wᵀ of every candidate for point j
+  KernelColumns::Workspace workspace_;
+};
+
+}  // namespace
+
+InducingChoice choose_inducing_points(const Prior& prior, const std::vector<Observations>& observations,
+                                      const ModelValues& values, const InducingOptions& options) {
+  if (options.most < 1) throw InputError(fmt::format("inducing: there must be 1 point or more, got {}", options.most));
+  if (!(options.left_out > 0)) throw InputError(fmt::format("inducing: left_out must be positive, got {}", options.left_out));
+  if (options.n_candidates < 1)
+    throw InputError(fmt::format("inducing: n_candidates must be 1 or more, got {}", options.n_candidates));
+  require_observations(prior, observations);
+  require_values(prior, observations, values);
+  Reduction reduction;
+  reduce(prior, observations, require_models(prior, observations, values.parameters, {}), values.noise_stddev, reduction);
+  const LatentRows rows = latent_rows(prior, observations, reduction, values);
+  const Index n_samples = rows.n_samples(), n = std::min<Index>(n_samples, options.n_candidates);
+  std::vector<Index> samples;
+  for (Index i = 0; i < n; ++i) samples.push_back(i * n_samples / n);
+
+  std::vector<Candidates> latents;
+  for (std::size_t a = 0; a < rows.latents.size(); ++a) latents.emplace_back(rows, a, samples);
+  const double scale = n == 0 ? 0 : static_cast<double>(n_samples) / static_cast<double>(n);
+  InducingChoice choice;
+  for (;;) {
+    choice.left_out = 0;
+    Candidates* best = nullptr;
+    double largest = 0;
+    for (Candidates& latent : latents) {
+      choice.left_out += scale * latent.trace();
+      if (n == 0 || choice.n_variables + latent.n_functions() > options.most) continue;
+      const double part = latent.largest();
+      if (part > largest) largest = part, best = &latent;
+    }
+    if (choice.left_out <= options.left_out || best == nullptr) break;
+    best->take();
+    choice.n_variables += static_cast<int>(best->n_functions());
+  }
+  auto points = std::make_shared<InducingPoints>();
+  for (const Candidates& latent : latents) points->features.push_back(latent.points());
+  choice.points = std::move(points);
+  return choice;
+}
+
+}  // namespace gp2

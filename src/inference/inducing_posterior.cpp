@@ -1,0 +1,137 @@
+#include <algorithm>
+#include <utility>
+
+#include <Eigen/QR>
+
+#include "base/lapack.hpp"
+#include "gp2/error.hpp"
+#include "inference/inducing_gram.hpp"
+#include "prior/padded_rows.hpp"
+
+namespace gp2 {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::Ref;
+using Eigen::VectorXd;
+
+namespace {
+
+// A lower triangular T with TᵀT = I − B⁻¹, B = I + S. With S = C Cᵀ that is C (I + CᵀC)⁻¹Cᵀ, of which nothing cancels.
+MatrixXd root_of_explained(const MatrixXd& S) {
+  const Index M = S.rows();
+  const lapack::PivotedFactor factor = lapack::factorise_semidefinite(S, 0);
+  const Index rank = factor.L.cols();
+  MatrixXd half(rank, M);  // Cᵀ, its columns in reverse order
+  for (Index k = 0; k < M; ++k) half.col(M - 1 - factor.rows[static_cast<std::size_t>(k)]) = factor.L.row(k).transpose();
+  MatrixXd G = MatrixXd::Identity(rank, rank);
+  lapack::add_square(half, G);
+  lapack::factorise(G);
+  lapack::solve_lower(G, false, half);
+  // the triangle of the columns in reverse, in reverse
+  const MatrixXd R = half.householderQr().matrixQR().triangularView<Eigen::Upper>();
+  MatrixXd T = MatrixXd::Zero(M, M);
+  T.bottomRows(rank) = R.reverse();
+  return T;
+}
+
+}  // namespace
+
+InducingPosterior::InducingPosterior(InducingLatents inducing, InducingStatistics statistics)
+    : inducing_(std::move(inducing)), statistics_(std::move(statistics)) {
+  Index n_points = 0;
+  for (const InducingLatents::OfLatent& latent : inducing_.latents()) n_points = std::max(n_points, latent.n_points());
+  for (const InducingLatents::Function& function : inducing_.functions()) {
+    std::vector<Index>& rows = row_of_.emplace_back(static_cast<std::size_t>(n_points), -1);
+    for (Index j = 0; j < inducing_.latent_of(function).n_points(); ++j) rows[static_cast<std::size_t>(j)] = function.first + j;
+  }
+  for (std::size_t a = 0; a < inducing_.latents().size(); ++a) {
+    // all have as many points; those that a latent lacks have no weight
+    const InducingLatents::OfLatent& latent = inducing_.latents()[a];
+    MatrixXd points = MatrixXd::Zero(n_points, latent.kernel.features().cols());
+    points.topRows(latent.n_points()) = latent.kernel.features().topRows(latent.n_points());
+    Basis& basis = latents_.emplace_back(
+        Basis{KernelColumns(latent.kernel.kernel(), points, latent.kernel.values()), {}, {}, latent.n_functions});
+    basis.Z.setZero(basis.kernel.n_rows(), std::ssize(inducing_.functions()) * latent.n_functions);
+    for (std::size_t f = 0; f < inducing_.functions().size(); ++f) {
+      const InducingLatents::Function& function = inducing_.functions()[f];
+      if (function.latent != a) continue;
+      basis.Z.col(static_cast<Index>(f) * latent.n_functions + function.index).head(latent.n_points()).setOnes();
+    }
+  }
+}
+
+bool InducingPosterior::factorise() {
+  MatrixXd L = statistics_.B;
+  L.diagonal().array() += 1;
+  if (!lapack::factorise(L)) return false;
+  L_ = std::move(L);
+  mean_ = statistics_.c;
+  lapack::solve_lower(L_, false, mean_);
+  lapack::solve_lower(L_, true, mean_);
+  // X = T L⁻¹, from its transpose
+  MatrixXd transposed = root_of_explained(statistics_.B).transpose();
+  inducing_.solve(true, transposed);
+  X_ = transposed.transpose();
+  VectorXd weights = mean_;
+  inducing_.solve(true, weights);
+  std::vector<MatrixXd> beta = latent_weights(weights);
+  for (std::size_t a = 0; a < latents_.size(); ++a) latents_[a].beta = std::move(beta[a]);
+  return true;
+}
+
+std::vector<MatrixXd> InducingPosterior::latent_weights(const Ref<const VectorXd>& of_variables) const {
+  std::vector<MatrixXd> weights;
+  for (const Basis& latent : latents_) weights.emplace_back(MatrixXd::Zero(latent.kernel.n_rows(), latent.n_functions));
+  for (const InducingLatents::Function& function : inducing_.functions()) {
+    const Index n = inducing_.latent_of(function).n_points();
+    weights[function.latent].col(function.index).head(n) = of_variables.segment(function.first, n);
+  }
+  return weights;
+}
+
+GramValue InducingPosterior::value() const {
+  const double explained = (L_.transpose().triangularView<Eigen::Upper>() * mean_).squaredNorm();  // cᵀB⁻¹c
+  return {0.5 * (statistics_.yy - explained), L_.diagonal().array().log().sum() + 0.5 * statistics_.trace};
+}
+
+void InducingPosterior::whiten(Ref<MatrixXd> c) const { lapack::multiply_lower(X_, c); }
+
+MatrixXd InducingPosterior::whitening_columns(Index first, Index n) const {
+  return X_.block(first, first, size() - first, n).triangularView<Eigen::Lower>();
+}
+
+// B⁻¹c + L_B⁻ᵀε − L⁻¹f̃(Z): of the whitened variables, those of the function drawn from the posterior less those of f̃
+VectorXd InducingPosterior::misfit(const std::vector<MatrixXd>& f, RandomStream& random) const {
+  VectorXd drawn(size()), of_prior(size());
+  for (double& entry : drawn) entry = random.normal();
+  lapack::solve_lower(L_, true, drawn);
+  for (const InducingLatents::Function& function : inducing_.functions()) {
+    const Index n = inducing_.latent_of(function).n_points();
+    of_prior.segment(function.first, n) = f[function.latent].row(function.index).head(n).transpose();
+  }
+  inducing_.solve(false, of_prior);
+  return mean_ + drawn - of_prior;
+}
+
+std::vector<std::vector<MatrixXd>> InducingPosterior::weights(MatrixXd misfits) const {
+  inducing_.solve(true, misfits);
+  std::vector<std::vector<MatrixXd>> weights;
+  for (Index column = 0; column < misfits.cols(); ++column) weights.push_back(latent_weights(misfits.col(column)));
+  return weights;
+}
+
+bool InducingPosterior::append(const LatentRows& more) {
+  const InducingStatistics of_more(inducing_, more, 1);
+  const InducingStatistics before = statistics_;
+  statistics_.add(of_more);
+  if (factorise()) return true;
+  statistics_ = before;
+  return false;
+}
+
+void InducingPosterior::erase(const std::vector<Index>& /*samples*/) {
+  throw InputError("what was learned through inducing points cannot be taken away: the observations themselves are not kept");
+}
+
+}  // namespace gp2

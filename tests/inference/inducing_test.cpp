@@ -1,0 +1,162 @@
+#include "gp2/inference/inducing.hpp"
+
+#include <gmock/gmock.h>
+#include <gtest/gtest.h>
+
+#include "gp2/error.hpp"
+#include "gp2/inference/leave_one_out.hpp"
+#include "gp2/inference/pathwise.hpp"
+#include "gp2/predictor.hpp"
+#include "inference/sampling.hpp"
+#include "input_error.hpp"
+
+// Latents known through inducing points: with a point at every state all is as without, with fewer it is what the bound says.
+namespace gp2 {
+namespace {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+using test::largest;
+using test::Problem;
+using test::Quantity;
+
+constexpr std::uint64_t inducing_seed = 51117;
+
+std::vector<Problem> exact_problems(int n = 9) { return test::problems(n, inducing_seed); }
+
+InducingChoice chosen(const Problem& p, int most) {
+  return choose_inducing_points(p.prior, p.observations, p.values, {.most = most, .left_out = 1e-12});
+}
+
+Problem with_points(Problem p, int most) {
+  p.values.inducing = chosen(p, most).points;
+  return p;
+}
+
+constexpr int all = 100'000;
+
+TEST(Inducing, PointsAtEveryStateChangeNothing) {
+  for (const Problem& p : exact_problems()) {
+    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, inducing_seed));
+    const Problem through = with_points(p, all);
+    const test::Evaluated exact = test::evaluate(p), bound = test::evaluate(through);
+    const double tolerance = test::rounding(p);
+    EXPECT_NEAR(bound.value, exact.value, tolerance * (1 + std::abs(exact.value)));
+    const auto expect_alike = [&](const auto& left, const auto& right) {
+      for (std::size_t k = 0; k < left.size(); ++k) {
+        EXPECT_LE(largest(left[k] - right[k]), 1e4 * tolerance * (1 + largest(right[k]) + std::abs(exact.value)));
+      }
+    };
+    expect_alike(bound.gradient.log_kernel, exact.gradient.log_kernel);
+    expect_alike(bound.gradient.log_signal_stddev, exact.gradient.log_signal_stddev);
+    expect_alike(bound.gradient.log_noise_stddev, exact.gradient.log_noise_stddev);
+    expect_alike(std::vector{bound.gradient.parameters}, std::vector{exact.gradient.parameters});
+
+    const Posterior posterior = test::posterior_of(through), exact_posterior = test::posterior_of(p);
+    EXPECT_NEAR(posterior.negative_log_likelihood(), exact.value, 1e2 * tolerance * (1 + std::abs(exact.value)));
+    const View view = View::constrained_acceleration(*p.prior.system);
+    const Posterior::Joint joint = posterior.joint(view, p.queries), expected = exact_posterior.joint(view, p.queries);
+    EXPECT_LE(largest(joint.mean - expected.mean), 1e2 * tolerance * (1 + largest(expected.mean)));
+    EXPECT_LE(largest(joint.covariance - expected.covariance), 1e2 * tolerance * (1 + largest(expected.covariance)));
+    const std::vector<LeaveOneOut> left_out = leave_one_out(posterior), expected_left_out = leave_one_out(exact_posterior);
+    for (std::size_t g = 0; g < left_out.size(); ++g) {
+      const MatrixXd& mean = expected_left_out[g].mean;
+      EXPECT_LE(largest((left_out[g].mean - mean).eval().array().isNaN().select(0, left_out[g].mean - mean)),
+                1e3 * tolerance * (1 + largest(mean.array().isNaN().select(0, mean))));
+    }
+  }
+}
+
+TEST(Inducing, FewPointsGiveABoundThatRisesWithTheirNumber) {
+  for (const Problem& p : exact_problems()) {
+    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, inducing_seed));
+    const double exact = test::evaluate(p).value, tolerance = test::rounding(p) * (1 + std::abs(exact));
+    double before = std::numeric_limits<double>::infinity(), left_before = before;
+    for (const int most : {4, 8, 16, 40, all}) {
+      const InducingChoice choice = chosen(p, most);
+      EXPECT_LE(choice.n_variables, most);
+      EXPECT_LE(choice.left_out, left_before + tolerance);
+      Problem through = p;
+      through.values.inducing = choice.points;
+      const double value = test::evaluate(through).value;
+      EXPECT_GE(value, exact - tolerance);
+      EXPECT_LE(value, before + tolerance);
+      before = value;
+      left_before = choice.left_out;
+    }
+  }
+}
+
+TEST(Inducing, PredictorsAndSamplesSeeThePosterior) {
+  for (const Problem& p : exact_problems()) {
+    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, inducing_seed));
+    const Posterior posterior = test::posterior_of(with_points(p, 12));
+    const View view = View::all(Quantity::constrained_acceleration, *p.prior.system);
+    const Posterior::Marginal marginal = posterior.marginal(view, p.queries);
+    const Predictor predictor(posterior, view);
+    Predictor::Workspace workspace = predictor.make_workspace();
+    const double tolerance = test::rounding(p);
+    for (Index i = 0; i < p.queries.cols(); ++i) {
+      VectorXd mean(view.size()), stddev(view.size());
+      ASSERT_EQ(predictor.mean_and_stddev(p.queries.col(i).array().isNaN().select(0, p.queries.col(i)), mean, stddev, workspace),
+                Predictor::Status::ok);
+      EXPECT_LE(largest(mean - marginal.mean.col(i)), tolerance * (1 + largest(marginal.mean)));
+      EXPECT_LE(largest(stddev.cwiseAbs2() - marginal.stddev().col(i).cwiseAbs2()),
+                tolerance * (1 + largest(marginal.stddev().cwiseAbs2())));
+    }
+    const auto quantities = test::both_accelerations(*p.prior.system, p.queries);
+    const PathwiseSamples paths = sample_paths(posterior, 400, {200, inducing_seed});
+    MatrixXd samples(posterior.joint(quantities).mean.size(), paths.n_samples());
+    for (int s = 0; s < paths.n_samples(); ++s) {
+      Index row = 0;
+      for (const ViewAt& at : quantities) {
+        const MatrixXd values = paths.evaluate(s, at.view, at.states);
+        samples.col(s).segment(row, values.size()) = values.reshaped();
+        row += values.size();
+      }
+    }
+    test::expect_moments(samples, posterior.joint(quantities));
+  }
+}
+
+TEST(Inducing, PosteriorsGrowByMoreObservations) {
+  int n_grown = 0;
+  for (const Problem& p : exact_problems()) {
+    if (p.observations.size() > 1) continue;
+    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, inducing_seed));
+    const Problem through = with_points(p, 20);
+    const Observations& group = p.observations.front();
+    if (group.noise().has_scale()) continue;
+    const std::vector<int> first = {0, 1, 2, 3}, rest = {4, 5, 6, 7, 8};
+    Observations added = group.take(rest);
+    added = Observations(added.states(), added.view(), added.values(), p.values.noise_stddev.front());
+    Posterior grown = update(Posterior(p.prior, {group.take(first)}, through.values), added);
+    const Posterior anew = test::posterior_of(through);
+    const double tolerance = 1e2 * test::rounding(p);
+    EXPECT_NEAR(grown.negative_log_likelihood(), anew.negative_log_likelihood(),
+                tolerance * (1 + std::abs(anew.negative_log_likelihood())));
+    const View view = View::constrained_acceleration(*p.prior.system);
+    EXPECT_LE(largest(grown.mean(view, p.queries) - anew.mean(view, p.queries)),
+              tolerance * (1 + largest(anew.mean(view, p.queries))));
+    EXPECT_THROW(static_cast<void>(remove_oldest(std::move(grown), 1)), InputError);
+    ++n_grown;
+  }
+  EXPECT_GT(n_grown, 5);
+}
+
+TEST(Inducing, BadRequestsAreErrors) {
+  const Problem p = exact_problems().front();
+  const auto choose = [&](InducingOptions options) {
+    return test::input_error_of([&] { static_cast<void>(choose_inducing_points(p.prior, p.observations, p.values, options)); });
+  };
+  EXPECT_THAT(choose({.most = 0}), testing::HasSubstr("must be 1 point or more"));
+  EXPECT_THAT(choose({.left_out = 0}), testing::HasSubstr("left_out must be positive"));
+  EXPECT_THAT(choose({.n_candidates = 0}), testing::HasSubstr("n_candidates"));
+  Problem other = p;
+  other.values.inducing = std::make_shared<InducingPoints>();
+  EXPECT_THAT(test::input_error_of([&] { static_cast<void>(test::posterior_of(other)); }), testing::HasSubstr("inducing"));
+}
+
+}  // namespace
+}  // namespace gp2
