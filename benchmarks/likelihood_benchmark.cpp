@@ -9,6 +9,7 @@
 
 #include "base/lapack.hpp"
 #include "gp2/fit.hpp"
+#include "gp2/inference/inducing.hpp"
 #include "gp2/simulation/generate.hpp"
 #include "inference/assemble.hpp"
 
@@ -43,14 +44,18 @@ struct Problem {
 };
 
 void likelihood_and_gradient(benchmark::State& state, const std::vector<std::string>& estimated, bool estimate_noise,
-                             int n_threads = 1) {
+                             int n_threads = 1, int n_inducing = 0) {
   const gp2::lapack::SingleThread single_thread;
   const Problem problem(static_cast<int>(state.range(0)), estimated, estimate_noise);
   gp2::Likelihood::Options options;
   options.noise_gradient = estimate_noise;
   for (const std::string& name : estimated) options.gradient_parameters.push_back(problem.model.system->parameter_index(name));
-  const gp2::ModelValues values = gp2::model_values(problem.prior, problem.observations, problem.hyperparameters);
+  gp2::ModelValues values = gp2::model_values(problem.prior, problem.observations, problem.hyperparameters);
   const gp2::Likelihood likelihood(problem.prior, problem.observations, values, options);
+  if (n_inducing > 0) {
+    values.inducing =
+        gp2::choose_inducing_points(problem.prior, problem.observations, values, {.most = n_inducing, .left_out = 1e-9}).points;
+  }
   gp2::Likelihood::Workspace workspace(n_threads);
   gp2::ModelGradient gradient;
   for (auto _ : state) benchmark::DoNotOptimize(likelihood.evaluate(values, &gradient, workspace));
@@ -60,6 +65,16 @@ void known_parameters(benchmark::State& state) { likelihood_and_gradient(state, 
 void known_parameters_two_threads(benchmark::State& state) { likelihood_and_gradient(state, {}, false, 2); }
 void estimated_noise(benchmark::State& state) { likelihood_and_gradient(state, {}, true); }
 void estimated_parameters(benchmark::State& state) { likelihood_and_gradient(state, {"p1", "p2", "p3", "p4", "p5"}, false); }
+
+// 200 inducing points of three functions; beside it the rate of the matrix products of which B and the gradient consist
+void inducing_points(benchmark::State& state) {
+  constexpr int n_points = 200, n_functions = 3;
+  likelihood_and_gradient(state, {}, false, static_cast<int>(state.range(1)), n_functions * n_points);
+  // of each pair of functions one product for B, of one with itself half of one, and one for the gradient
+  constexpr double n_products = 0.5 * n_functions * n_functions + n_functions * n_functions;
+  state.counters["Gflop/s"] = benchmark::Counter(2e-9 * n_products * n_points * n_points * static_cast<double>(state.range(0)),
+                                                 benchmark::Counter::kIsIterationInvariantRate);
+}
 
 // K̃ alone, on 1 or 2 threads
 void assembly(benchmark::State& state) {
@@ -138,6 +153,7 @@ BENCHMARK(known_parameters)->ArgsProduct({sizes})->Unit(benchmark::kMillisecond)
 BENCHMARK(known_parameters_two_threads)->Arg(1000)->Arg(3000)->UseRealTime()->Unit(benchmark::kMillisecond);
 BENCHMARK(estimated_noise)->ArgsProduct({sizes})->Unit(benchmark::kMillisecond);
 BENCHMARK(estimated_parameters)->ArgsProduct({sizes})->Unit(benchmark::kMillisecond);
+BENCHMARK(inducing_points)->ArgsProduct({{10'000, 100'000, 1'000'000}, {1, 2}})->UseRealTime()->Unit(benchmark::kMillisecond);
 BENCHMARK(assembly)->Args({1000, 1})->Args({1000, 2})->Args({3000, 1})->Args({3000, 2})->UseRealTime()->Unit(
     benchmark::kMillisecond);
 
