@@ -317,9 +317,11 @@ TEST_P(OldFit, IsReadAndWrittenAsTheNewest) {
   const auto path = std::filesystem::path(GP2_SOURCE_DIR) / "tests/files/old_fits" / fmt::format("version_{}.json", GetParam());
   ASSERT_EQ(Json::parse(read_file(path)).at("version"), GetParam());
   const FitFile old = FitFile::read(path);
-  // on another way, and by another machine
+  // on another way, and by another machine; that of draws is of the first of these
   const double nll = old.report.negative_log_likelihood;
-  EXPECT_NEAR(old.posterior().negative_log_likelihood(), nll, 1e-9 * (1 + std::abs(nll)));
+  if (!old.report.draws) {
+    EXPECT_NEAR(old.posterior().negative_log_likelihood(), nll, 1e-9 * (1 + std::abs(nll)));
+  }
   EXPECT_EQ(old.options.empty(), GetParam() < 6);
   const Json json = written_json(old);
   EXPECT_EQ(json.at("version"), FitFile::format_version);

@@ -111,6 +111,7 @@ TEST(ActuatorFit, FromARawLogToo) {
     }
   }
   FitRequest request = request_for(estimated, log);
+  request.problem.max_points = 200;
   RawFitOptions options;
   options.most_passes = 1;
   const LearnedLog learned = learn_and_smooth(request, CsvTable::from_columns("raw", columns), options);

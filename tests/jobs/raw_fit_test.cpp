@@ -131,9 +131,13 @@ TEST(LearnAndSmooth, LearnsMoreThanFromOneSmoothing) {
   EXPECT_LT(score_of(turns.data, noisy_log(), *pendulum().system, 0).rms[2], 0.5 * before.rms[2]);
 }
 
+TEST(LearnAndSmooth, TakesRowsWhereFewStatesAreAskedFor) {
+  EXPECT_EQ(learn_and_smooth(request(), noisy_log().table, {.most_passes = 0}).windows, nullptr);
+}
+
 // from as many states as rows
 TEST(LearnAndSmooth, LearnsMoreFromWindowsThanFromRows) {
-  for (const int n_states : {50, 400}) {
+  for (const int n_states : {200, 400}) {
     const auto fit_of = [&](bool windows) {
       FitRequest asked = request();
       asked.problem.max_points = n_states;
