@@ -136,6 +136,15 @@ Json to_json(const FitProblem& problem, const FitOutcome& outcome) {
     json["standard_errors"] = {{"parameters", errors}};
   }
   if (report.draws) json["draws"] = draws_json(report);
+  if (report.inducing) {
+    json["inducing"] = {
+        {"n_variables", report.inducing->n_variables}, {"left_out", Json::object()}, {"n_start", report.inducing->n_start}};
+    for (std::size_t a = 0; a < problem.prior.latents.size(); ++a) {
+      const Latent& latent = problem.prior.latents[a];
+      const std::string name = latent.direction.empty() ? latent.name : latent.name + "." + latent.direction;
+      json["inducing"]["left_out"][name] = report.inducing->left_out[static_cast<Index>(a)];
+    }
+  }
   for (const ActuatorEstimate& one : report.actuators) {
     json["actuators"].push_back({{"name", one.name},
                                  {"value", one.value},

@@ -3,6 +3,7 @@
 #include <atomic>
 #include <cstdint>
 #include <functional>
+#include <memory>
 #include <optional>
 #include <string>
 #include <vector>
@@ -10,6 +11,7 @@
 #include <Eigen/Core>
 
 #include "gp2/export.hpp"
+#include "gp2/inference/inducing.hpp"
 #include "gp2/posterior.hpp"
 #include "gp2/training/default_hyperparameters.hpp"
 #include "gp2/training/hyperparameter.hpp"
@@ -38,6 +40,7 @@ struct FitOptions {
   int max_escapes = 5;                            // scans for lower optima from the best one
   bool standard_errors = true;                    // FitReport::uncertainty, where parameters are estimated
   int n_draws = 0;                                // of hyperparameters, over which the posterior is then the mixture; 0: none
+  int n_inducing = 0;                             // inducing variables at most, through which all is learned; 0: none, exact
   std::function<void(const Progress&)> progress;  // called from worker threads, one at a time
   /// Set: return the best so far, as not converged: interrupted. The evaluations under way are given up within a second or so,
   /// draws that are not complete are dropped, and the posterior is conditioned when it is first asked (Posterior::lazy).
@@ -107,6 +110,14 @@ struct ActuatorEstimate {
   [[nodiscard]] bool at_upper() const { return upper - value <= 1e-6 * (upper - lower); }
 };
 
+/// Of a fit through inducing points (theory.md, T37), whose likelihood is a lower bound of the exact one.
+struct InducingReport {
+  std::shared_ptr<const InducingPoints> points;
+  int n_variables = 0;       // M
+  Eigen::VectorXd left_out;  // t of all observations, per latent: left_out_by_points
+  int n_start = 0;           // states that the hyperparameters were fitted to before all of them
+};
+
 struct FitReport {
   static constexpr const char* interrupted = "interrupted";  // termination of a fit that was stopped on request
 
@@ -123,6 +134,7 @@ struct FitReport {
   std::optional<HyperparameterDraws> draws;       // of FitOptions::n_draws
   std::vector<ActuatorEstimate> actuators;        // known from then on: nothing above allows for their errors
   std::vector<DistrustedValue> distrusted;        // of a robust fit, the farthest first
+  std::optional<InducingReport> inducing;         // of FitOptions::n_inducing
   double seconds = 0;
 };
 

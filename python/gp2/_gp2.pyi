@@ -163,6 +163,8 @@ class FitReport:
     @property
     def actuators(self) -> list[dict[str, Any]]: ...
     @property
+    def inducing(self) -> dict[str, Any] | None: ...
+    @property
     def seconds(self) -> float: ...
     @property
     def standard_errors(self) -> dict[str, float]: ...
@@ -496,6 +498,7 @@ def fit(
     seed: int = 0,
     threads: int = 0,
     hyperparameters: Literal["optimise", "integrate", "auto"] = "auto",
+    inducing: float | Literal["auto", "none"] | None = None,
     thin: bool = True,
     standard_errors: bool = True,
     max_escapes: int | None = None,
@@ -530,6 +533,7 @@ def fit_raw(
     seed: int = 0,
     threads: int = 0,
     hyperparameters: Literal["optimise", "integrate", "auto"] = "auto",
+    inducing: float | Literal["auto", "none"] | None = None,
     thin: bool = True,
     standard_errors: bool = True,
     max_escapes: int | None = None,

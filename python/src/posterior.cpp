@@ -446,6 +446,15 @@ py::list actuators_of(const FitReport& self) {
   return out;
 }
 
+py::object inducing_of(const FitReport& self) {
+  if (!self.inducing) return py::none();
+  py::dict entry;
+  entry["n_variables"] = self.inducing->n_variables;
+  entry["left_out"] = self.inducing->left_out;
+  entry["n_start"] = self.inducing->n_start;
+  return entry;
+}
+
 py::list distrusted_values(const FitReport& self) {
   py::list list;
   for (const DistrustedValue& value : self.distrusted) {
@@ -538,6 +547,11 @@ void define_report(py::class_<FitReport>& report) {
           "actuators", &actuators_of,
           "Delays and lags of inputs that were estimated, in s: dicts of name, value, stddev (nan at a bound, inf "
           "where the data do not determine it), lower and upper.")
+      .def_property_readonly(
+          "inducing", &inducing_of,
+          "Of a fit through inducing points: n_variables, left_out, of each latent what they leave of its variance at all "
+          "rows, in units of the noise (twice the nats by which the likelihood is too low, about), and n_start, the rows "
+          "that hyperparameters were fitted to before all; else None.")
       .def_readonly("seconds", &FitReport::seconds)
       .def_property_readonly("standard_errors", &standard_errors,
                              "Of estimated parameters, by name: inf where the data do not determine one, nan where it is at a "

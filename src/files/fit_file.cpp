@@ -613,6 +613,39 @@ HyperparameterDraws draws_from(const ParsedJson& json, const std::vector<Hyperpa
   return out;
 }
 
+Json inducing_json(const InducingReport& inducing) {
+  Json points = Json::array();
+  for (const MatrixXd& features : inducing.points->features) points.push_back(columns_json(features));
+  return {{"points", points},
+          {"variables", inducing.n_variables},
+          {"left_out", vector_json(inducing.left_out)},
+          {"start", inducing.n_start}};
+}
+
+InducingReport inducing_from(const ParsedJson& json, const Prior& prior) {
+  auto points = std::make_shared<InducingPoints>();
+  for (const char* key : {"points", "left_out"}) {
+    const std::size_t n = array(json.at(key)).size();
+    if (n != prior.latents.size()) throw InputError(fmt::format("inducing points of {} of {} latents", n, prior.latents.size()));
+  }
+  for (const ParsedJson& features : array(json.at("points"))) {
+    const std::size_t n = array(features).empty() ? 0 : array(features.front()).size();
+    const int n_features = prior.latents[points->features.size()].n_features();
+    if (std::ssize(features) != n_features) {
+      throw InputError(fmt::format("inducing points of {} of {} features", features.size(), n_features));
+    }
+    MatrixXd& of_latent = points->features.emplace_back(static_cast<Index>(n), n_features);
+    for (Index d = 0; d < of_latent.cols(); ++d) {
+      const VectorXd feature = vector_from(features[static_cast<std::size_t>(d)]);
+      if (feature.size() != of_latent.rows()) throw InputError("inducing points whose features differ in number");
+      if (!(feature.cwiseAbs().array() <= largest_number).all())
+        throw InputError("inducing points hold a number that is too large");
+      of_latent.col(d) = feature;
+    }
+  }
+  return {std::move(points), integer(json.at("variables")), vector_from(json.at("left_out")), integer(json.at("start"))};
+}
+
 RestartReport restart_from(const ParsedJson& json) {
   return {number_or_infinity(json.at("objective")), number_or_infinity(json.at("nll")),     integer(json.at("iterations")),
           integer(json.at("evaluations")),          integer(json.at("failed_evaluations")), json.at("converged").get<bool>(),
@@ -632,9 +665,16 @@ bool are_same(const std::vector<VectorXd>& a, const std::vector<VectorXd>& b) {
   return std::equal(a.begin(), a.end(), b.begin(), b.end(), [](const auto& x, const auto& y) { return are_same(x, y); });
 }
 
+bool are_same(const std::shared_ptr<const InducingPoints>& a, const std::shared_ptr<const InducingPoints>& b) {
+  if (!a || !b) return a == b;
+  return std::equal(a->features.begin(), a->features.end(), b->features.begin(), b->features.end(),
+                    [](const MatrixXd& x, const MatrixXd& y) { return are_same(x, y); });
+}
+
 bool are_same(const ModelValues& a, const ModelValues& b) {
   const bool all_but_loadings = are_same(a.kernel, b.kernel) && are_same(a.signal_stddev, b.signal_stddev) &&
-                                are_same(a.noise_stddev, b.noise_stddev) && are_same(a.parameters, b.parameters);
+                                are_same(a.noise_stddev, b.noise_stddev) && are_same(a.parameters, b.parameters) &&
+                                are_same(a.inducing, b.inducing);
   for (std::size_t k = 0; all_but_loadings && k < a.kernel.size(); ++k) {
     if (!are_same(a.loading(k), b.loading(k))) return false;
   }
@@ -770,6 +810,7 @@ void FitFile::write(const std::filesystem::path& path) const {
   for (const RestartReport& restart : report.restarts) json["report"]["restarts"].push_back(restart_json(restart));
   if (report.uncertainty) json["report"]["uncertainty"] = uncertainty_json(*report.uncertainty);
   if (report.draws) json["report"]["draws"] = draws_json(*report.draws);
+  if (report.inducing) json["report"]["inducing"] = inducing_json(*report.inducing);
   if (!report.actuators.empty()) json["actuators"] = actuators_json(report.actuators);
   if (!options.empty()) json["options"] = Json::parse(options);
   json["data_source"] = data_source;
@@ -880,6 +921,7 @@ FitFile read_fit(std::string_view text, const std::filesystem::path& path, const
     }
     if (json.contains("actuators")) read_actuators(json.at("actuators"), fit);
     if (report.contains("draws")) fit.report.draws = draws_from(report.at("draws"), fit.report.hyperparameters);
+    if (report.contains("inducing")) fit.report.inducing = inducing_from(report.at("inducing"), prior);
   } catch (const Json::exception& error) {
     throw InputError(fmt::format("{}: not a whole fit file: {}", path.string(), error.what()));
   } catch (const InputError& error) {

@@ -4,6 +4,7 @@
 #include <cmath>
 #include <limits>
 #include <numbers>
+#include <numeric>
 
 #include "base/not_a_number.hpp"
 
@@ -41,19 +42,23 @@ DataDistance::DataDistance(const Posterior::Implementation& posterior, const Vie
   for (std::size_t a = 0; a < prior.latents.size(); ++a) {
     if (!view.has_latent(a)) continue;
     // of what is observed, in units of the noise
-    const double variance = n_states == 0 ? 1 : posterior.latents->latents()[a].Z.squaredNorm() / static_cast<double>(n_states);
+    const double variance = n_states == 0 ? 1 : posterior.latents->squared_weight(a) / static_cast<double>(n_states);
     add_coordinates(a, prior.latents[a].kernel, posterior.values.kernel[a], variance);
   }
-  observed_.resize(n_coordinates(), n_states);
+  // of a long log some rows, evenly taken, are as near as all
+  constexpr Index most = 5000;
+  const Index step = std::max<Index>(1, (n_states + most - 1) / most);
+  std::vector<Index> n_of_group;
+  for (const Observations& group : posterior.observations) n_of_group.push_back((group.n_data() + step - 1) / step);
+  observed_.resize(n_coordinates(), std::accumulate(n_of_group.begin(), n_of_group.end(), Index{0}));
   const auto features = features_by_group(prior, posterior.observations);
   Index i = 0;
-  for (const std::vector<Eigen::MatrixXd>& group : features) {
-    const Index n = group.empty() ? 0 : group.front().rows();
-    for (Index k = 0; k < n; ++k) {
-      write_coordinates([&](std::size_t a) { return group[a].row(k).transpose(); }, observed_.col(i++));
+  for (std::size_t g = 0; g < features.size() && n_coordinates() > 0; ++g) {
+    for (Index k = 0; k < n_of_group[g]; ++k) {
+      write_coordinates([&](std::size_t a) { return features[g][a].row(k * step).transpose(); }, observed_.col(i++));
     }
   }
-  set_unit(posterior.observations);
+  set_unit(n_of_group);
 }
 
 void DataDistance::add_coordinates(std::size_t latent, const Kernel& kernel, const VectorXd& values, double variance) {
@@ -78,14 +83,14 @@ void DataDistance::add_coordinates(std::size_t latent, const Kernel& kernel, con
 
 // Rows of a log follow each other, so those around a state say nothing of how well its surroundings are known: a tenth of its log,
 // half before and half after, is left out. Nineteen of twenty observed states are nearer to the others than a unit.
-void DataDistance::set_unit(const std::vector<Observations>& observations) {
+void DataDistance::set_unit(const std::vector<Index>& n_of_group) {
   constexpr Index most = 1000;  // states that are looked at
   const Index n_all = observed_.cols();
   const Index step = std::max<Index>(1, n_all / most);
   std::vector<double> distances;
   Index first = 0;
-  for (const Observations& group : observations) {
-    const Index n = group.n_data(), margin = n / 20;
+  for (const Index n : n_of_group) {
+    const Index margin = n / 20;
     for (Index k = 0; k < n; k += step) {
       const Index i = first + k, before = std::max(first, i - margin), after = std::min(first + n, i + margin + 1);
       const double nearest = std::min(smallest(observed_.leftCols(before), observed_.col(i)),

@@ -41,7 +41,8 @@ class DataDistance {
     [[nodiscard]] double of(const Eigen::Ref<const Eigen::VectorXd>& features) const;
   };
   void add_coordinates(std::size_t latent, const Kernel& kernel, const Eigen::VectorXd& values, double variance);
-  void set_unit(const std::vector<Observations>& observations);
+  /// @param n_of_group  observed states of each Observations, one after the other
+  void set_unit(const std::vector<Eigen::Index>& n_of_group);
 
   std::vector<Coordinate> coordinates_;
   Eigen::MatrixXd observed_;  // z of the observed states, group after group (coordinates × N)

@@ -1,6 +1,9 @@
 #include "inference/dense_gram.hpp"
 
 #include <algorithm>
+#include <utility>
+
+#include <Eigen/Cholesky>
 
 #include "base/lapack.hpp"
 #include "base/parallel.hpp"
@@ -12,6 +15,7 @@ namespace gp2 {
 using Eigen::Index;
 using Eigen::MatrixXd;
 using Eigen::Ref;
+using Eigen::VectorXd;
 
 namespace {
 constexpr Index large_size = 2000;   // of a matrix that OpenBLAS works on faster with several threads
@@ -66,7 +70,22 @@ Gram::Inverse DenseGram::invert(const LatentRows& rows, const std::vector<std::v
   };
   for (Index sample = 0; sample < rows.n_samples(); ++sample)
     inverse.blocks.push_back(block(rows_of_samples(reduction, {sample})));
-  for (const std::vector<Index>& set : sets) inverse.of_set.push_back(block(rows_of_samples(reduction, set)));
+  for (const std::vector<Index>& set : sets) {
+    const std::vector<Index> of = rows_of_samples(reduction, set);
+    const Eigen::LLT<MatrixXd> factor(block(of));
+    if (factor.info() != Eigen::Success) return {std::move(inverse.alpha), std::move(inverse.blocks), {}};
+    const VectorXd pull = factor.solve(inverse.alpha(of));
+    const MatrixXd root = factor.matrixL().solve(MatrixXd::Identity(pull.size(), pull.size()));
+    WithoutSet& without = inverse.without.emplace_back();
+    Index first = 0;
+    for (const Index sample : set) {
+      const Index rank = reduction.samples[static_cast<std::size_t>(sample)].R.rows();
+      const auto columns = root.bottomRows(root.rows() - first).middleCols(first, rank);  // root is a lower triangle
+      without.pull.emplace_back(pull.segment(first, rank));
+      without.covariance.emplace_back(columns.transpose() * columns);
+      first += rank;
+    }
+  }
   return inverse;
 }
 

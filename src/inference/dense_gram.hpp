@@ -39,6 +39,7 @@ class DensePosterior final : public LatentPosterior {
 
   [[nodiscard]] Eigen::Index size() const override { return factor_.size(); }
   [[nodiscard]] GramValue value() const override;
+  [[nodiscard]] double squared_weight(std::size_t latent) const override { return latents_[latent].Z.squaredNorm(); }
   void whiten(Eigen::Ref<Eigen::MatrixXd> c) const override;
   [[nodiscard]] Eigen::MatrixXd whitening_columns(Eigen::Index first, Eigen::Index n) const override;
   [[nodiscard]] Eigen::VectorXd misfit(const std::vector<Eigen::MatrixXd>& f, RandomStream& random) const override;

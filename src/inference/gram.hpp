@@ -72,6 +72,8 @@ class LatentPosterior {
 
   [[nodiscard]] virtual Eigen::Index size() const = 0;  // basis variables
   [[nodiscard]] virtual GramValue value() const = 0;
+  /// Σ ‖Z_i,a‖² over the observed samples.
+  [[nodiscard]] virtual double squared_weight(std::size_t latent) const = 0;
 
   /// c ← X c.
   virtual void whiten(Eigen::Ref<Eigen::MatrixXd> c) const = 0;
@@ -114,13 +116,18 @@ class Gram {
   /// @param parts  per latent
   [[nodiscard]] virtual GramGradient differentiate(const LatentRows& rows, const std::vector<GramGradientParts>& parts) = 0;
 
+  /// What all others say of a set B of samples (leave_one_out.hpp).
+  struct WithoutSet {
+    std::vector<Eigen::VectorXd> pull;        // of each sample: its rows of P_BB⁻¹α̃_B (r)
+    std::vector<Eigen::MatrixXd> covariance;  // its block of P_BB⁻¹ (r × r)
+  };
   struct Inverse {
     Eigen::VectorXd alpha;                // α̃
     std::vector<Eigen::MatrixXd> blocks;  // P_ii of each sample (r × r)
-    std::vector<Eigen::MatrixXd> of_set;  // P_BB of each set B of samples, one after the other (Σ r × Σ r)
+    std::vector<WithoutSet> without;      // per set; empty where double precision cannot tell
   };
   /// Once after factorise of the same rows.
-  /// @param sets  of samples, of which P_BB is asked for
+  /// @param sets  of samples: none, or each sample in one of them
   [[nodiscard]] virtual Inverse invert(const LatentRows& rows, const std::vector<std::vector<Eigen::Index>>& sets) = 0;
 
   /// The latents given the observations; null where K̃ + I is not positive definite in double precision.

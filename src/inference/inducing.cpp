@@ -5,6 +5,7 @@
 
 #include <fmt/format.h>
 
+#include "base/lapack.hpp"
 #include "gp2/error.hpp"
 #include "inference/inducing_latents.hpp"
 #include "inference/requirements.hpp"
@@ -71,6 +72,21 @@ class Candidates {
   KernelColumns::Workspace workspace_;
 };
 
+// observations as latents see them under values, which must outlive it
+struct Seen {
+  Reduction reduction;
+  LatentRows rows;
+
+  Seen(const Prior& prior, const std::vector<Observations>& observations, const ModelValues& values) {
+    require_observations(prior, observations);
+    require_values(prior, observations, values);
+    reduce(prior, observations, require_models(prior, observations, values.parameters, {}), values.noise_stddev, reduction);
+    rows = latent_rows(prior, observations, reduction, values);
+  }
+  Seen(const Seen&) = delete;
+  Seen& operator=(const Seen&) = delete;
+};
+
 }  // namespace
 
 InducingChoice choose_inducing_points(const Prior& prior, const std::vector<Observations>& observations,
@@ -79,11 +95,8 @@ InducingChoice choose_inducing_points(const Prior& prior, const std::vector<Obse
   if (!(options.left_out > 0)) throw InputError(fmt::format("inducing: left_out must be positive, got {}", options.left_out));
   if (options.n_candidates < 1)
     throw InputError(fmt::format("inducing: n_candidates must be 1 or more, got {}", options.n_candidates));
-  require_observations(prior, observations);
-  require_values(prior, observations, values);
-  Reduction reduction;
-  reduce(prior, observations, require_models(prior, observations, values.parameters, {}), values.noise_stddev, reduction);
-  const LatentRows rows = latent_rows(prior, observations, reduction, values);
+  const Seen seen(prior, observations, values);
+  const LatentRows& rows = seen.rows;
   const Index n_samples = rows.n_samples(), n = std::min<Index>(n_samples, options.n_candidates);
   std::vector<Index> samples;
   for (Index i = 0; i < n; ++i) samples.push_back(i * n_samples / n);
@@ -110,6 +123,24 @@ InducingChoice choose_inducing_points(const Prior& prior, const std::vector<Obse
   for (const Candidates& latent : latents) points->features.push_back(latent.points());
   choice.points = std::move(points);
   return choice;
+}
+
+VectorXd left_out_by_points(const Prior& prior, const std::vector<Observations>& observations, const ModelValues& values,
+                            int n_threads) {
+  if (!values.inducing) throw InputError("left_out_by_points: the values have no inducing points");
+  const lapack::SingleThread single_thread;
+  const Seen seen(prior, observations, values);
+  const InducingLatents latents(*values.inducing, seen.rows);
+  std::vector<VectorXd> sums(n_block_parts, VectorXd::Zero(std::ssize(seen.rows.latents)));
+  for_each_block(latents, seen.rows, n_threads, nullptr, [&](std::size_t part, const InducingBlock& block) {
+    for (std::size_t f = 0; f < latents.functions().size(); ++f) {
+      const std::size_t a = latents.functions()[f].latent;
+      const Eigen::ArrayXd left = block.variance(a) - block.w(a).colwise().squaredNorm().transpose();
+      sums[part][static_cast<Index>(a)] += (block.weight_product(f, f) * left).sum();
+    }
+  });
+  for (std::size_t part = 1; part < sums.size(); ++part) sums.front() += sums[part];
+  return sums.front();
 }
 
 }  // namespace gp2

@@ -169,7 +169,7 @@ void InducingGram::add_variance_gradient(const LatentRows& rows, std::size_t a, 
     const Index sample = block.first() + i, before = sample - sample % simd::lanes<double>;
     kernel.scale(sample, point);
     kernel.evaluate(before, k.size(), point, k.data(), workspace);
-    w[sample - before] = 0.5 * weights[i];
+    w[sample - before] = 0.5 * (1 + smallest_pivot) * weights[i];
     kernel.add_gradient(before, k.size(), point, k.data(), w.data(), sums, workspace);
     w[sample - before] = 0;
   }
@@ -201,35 +201,107 @@ void InducingGram::add_points_gradient(std::size_t a, const MatrixXd& P, MatrixX
   }
 }
 
+MatrixXd InducingGram::loadings(const InducingBlock& block, Index component) const {
+  MatrixXd Psi(latents_.size(), block.n());
+  for (std::size_t f = 0; f < latents_.functions().size(); ++f) {
+    const InducingLatents::Function& function = latents_.functions()[f];
+    const auto w = block.w(function.latent);
+    Psi.middleRows(function.first, w.rows()) = w * block.weight(f, component).asDiagonal();
+  }
+  return Psi;
+}
+
+// With P = I − Ψ B⁻¹Ψᵀ the inverse of a set is P_BB⁻¹ = I + Ψ_B B₋⁻¹Ψ_Bᵀ, and P_BB⁻¹α̃_B = ỹ_B − Ψ_B B₋⁻¹c₋, where B₋ and c₋ are of
+// all other samples: sums of what each set says, so that nothing is taken from anything.
 Gram::Inverse InducingGram::invert(const LatentRows& rows, const std::vector<std::vector<Index>>& sets) {
   const lapack::SingleThread single_thread;
   const Reduction& reduction = *rows.reduction;
-  const std::vector<InducingLatents::Function>& functions = latents_.functions();
-  Inverse inverse{alpha(reduction), {}, {}};
-  // P = I − Ψ B⁻¹Ψᵀ = I − (L⁻¹Ψᵀ)ᵀ L⁻¹Ψᵀ
-  MatrixXd half(latents_.size(), reduction.size());
-  for_each_block(latents_, rows, n_threads_, stop_, [&](std::size_t, const InducingBlock& block) {
-    for (Index c = 0; c < reduction.n_components(); ++c) {
-      const auto k = static_cast<std::size_t>(c);
-      const Index n = std::min(block.n(), reduction.count[k] - block.first());
-      if (n <= 0) continue;
-      auto columns = half.middleCols(reduction.offset[k] + block.first(), n);
-      for (std::size_t f = 0; f < functions.size(); ++f) {
-        const auto w = block.w(functions[f].latent);
-        columns.middleRows(functions[f].first, w.rows()) = w.leftCols(n) * block.weight(f, c).head(n).asDiagonal();
+  const Index n_samples = rows.n_samples(), n_components = reduction.n_components();
+  const MatrixXd y = by_component(reduction, reduction.y);
+  const std::size_t n_sets = sets.size();
+  std::vector<std::size_t> set_of(static_cast<std::size_t>(n_samples), n_sets), place_of(set_of.size(), 0);
+  for (std::size_t k = 0; k < n_sets; ++k) {
+    for (std::size_t place = 0; place < sets[k].size(); ++place) {
+      set_of[static_cast<std::size_t>(sets[k][place])] = k;
+      place_of[static_cast<std::size_t>(sets[k][place])] = place;
+    }
+  }
+  const auto members = [&](const InducingBlock& block, std::size_t set) {
+    ArrayXd is_member(block.n());
+    for (Index i = 0; i < block.n(); ++i) is_member[i] = set_of[static_cast<std::size_t>(block.first() + i)] == set ? 1 : 0;
+    return is_member;
+  };
+
+  // the factor of B and the mean without each set
+  struct Others {
+    MatrixXd L;
+    VectorXd mean;
+  };
+  std::vector<Others> others;
+  if (n_sets > 0) {
+    std::vector<InducingStatistics> said(n_sets + 1, InducingStatistics(latents_));
+    MatrixXd memory;
+    for_each_block(latents_, rows, 1, stop_, [&](std::size_t, const InducingBlock& block) {
+      for (std::size_t k = 0; k <= n_sets; ++k) {
+        const ArrayXd share = members(block, k);
+        if ((share > 0).any()) said[k].add(latents_, block, y, share, memory);
       }
-      lapack::solve_lower(L_, false, columns);
+    });
+    for (std::size_t k = 0; k < n_sets; ++k) {
+      InducingStatistics of_others(latents_);
+      for (std::size_t other = 0; other <= n_sets; ++other) {
+        if (other != k) of_others.add(said[other]);
+      }
+      of_others.B.diagonal().array() += 1;
+      if (!lapack::factorise(of_others.B, {.stop = stop_})) return {alpha(reduction), {}, {}};
+      lapack::solve_lower(of_others.B, false, of_others.c);
+      lapack::solve_lower(of_others.B, true, of_others.c);
+      others.push_back({std::move(of_others.B), std::move(of_others.c)});
+    }
+  }
+
+  Inverse inverse{alpha(reduction), std::vector<MatrixXd>(set_of.size()), std::vector<WithoutSet>(n_sets)};
+  for (std::size_t k = 0; k < n_sets; ++k) {
+    inverse.without[k].pull.resize(sets[k].size());
+    inverse.without[k].covariance.resize(sets[k].size());
+  }
+  const auto rank_of = [&](Index sample) { return reduction.samples[static_cast<std::size_t>(sample)].R.rows(); };
+  // I ± Ψ_i(LLᵀ)⁻¹Ψ_iᵀ
+  const auto block_of = [&](const std::vector<MatrixXd>& half, Index i, Index rank, double sign) {
+    MatrixXd square = MatrixXd::Identity(rank, rank);
+    for (Index c = 0; c < rank; ++c) {
+      for (Index d = 0; d < rank; ++d)
+        square(c, d) += sign * half[static_cast<std::size_t>(c)].col(i).dot(half[static_cast<std::size_t>(d)].col(i));
+    }
+    return square;
+  };
+  for_each_block(latents_, rows, n_threads_, stop_, [&](std::size_t, const InducingBlock& block) {
+    std::vector<MatrixXd> Psi;
+    for (Index c = 0; c < n_components; ++c) Psi.push_back(loadings(block, c));
+    const auto halves = [&](const MatrixXd& L) {
+      std::vector<MatrixXd> half = Psi;
+      for (MatrixXd& one : half) lapack::solve_lower(L, false, one);
+      return half;
+    };
+    const std::vector<MatrixXd> half = halves(L_);
+    for (Index i = 0; i < block.n(); ++i) {
+      const Index sample = block.first() + i;
+      inverse.blocks[static_cast<std::size_t>(sample)] = block_of(half, i, rank_of(sample), -1);
+    }
+    for (std::size_t k = 0; k < n_sets; ++k) {
+      const ArrayXd is_member = members(block, k);
+      if ((is_member == 0).all()) continue;
+      const std::vector<MatrixXd> of_others = halves(others[k].L);
+      for (Index i = 0; i < block.n(); ++i) {
+        if (is_member[i] == 0) continue;
+        const Index sample = block.first() + i, rank = rank_of(sample);
+        const std::size_t place = place_of[static_cast<std::size_t>(sample)];
+        VectorXd& pull = inverse.without[k].pull[place] = y.row(sample).head(rank);
+        for (Index c = 0; c < rank; ++c) pull[c] -= Psi[static_cast<std::size_t>(c)].col(i).dot(others[k].mean);
+        inverse.without[k].covariance[place] = block_of(of_others, i, rank, 1);
+      }
     }
   });
-  const auto block_of = [&](const std::vector<Index>& of) {
-    const MatrixXd columns = half(Eigen::all, of);
-    MatrixXd P = MatrixXd::Identity(columns.cols(), columns.cols());
-    P.noalias() -= columns.transpose() * columns;
-    return P;
-  };
-  for (Index sample = 0; sample < rows.n_samples(); ++sample)
-    inverse.blocks.push_back(block_of(rows_of_samples(reduction, {sample})));
-  for (const std::vector<Index>& set : sets) inverse.of_set.push_back(block_of(rows_of_samples(reduction, set)));
   return inverse;
 }
 

@@ -24,6 +24,8 @@ class InducingGram final : public Gram {
 
  private:
   [[nodiscard]] Eigen::VectorXd alpha(const Reduction& reduction) const;
+  /// Ψᵀ of one component of the samples of a block (M × n).
+  [[nodiscard]] Eigen::MatrixXd loadings(const InducingBlock& block, Eigen::Index component) const;
   void add_variance_gradient(const LatentRows& rows, std::size_t a, const InducingBlock& block, Eigen::MatrixXd& sums,
                              KernelColumns::Workspace& workspace) const;
   void add_points_gradient(std::size_t a, const Eigen::MatrixXd& P, Eigen::MatrixXd& sums) const;
@@ -49,6 +51,9 @@ class InducingPosterior final : public LatentPosterior {
 
   [[nodiscard]] Eigen::Index size() const override { return inducing_.size(); }
   [[nodiscard]] GramValue value() const override;
+  [[nodiscard]] double squared_weight(std::size_t latent) const override {
+    return statistics_.weight[static_cast<Eigen::Index>(latent)];
+  }
   void whiten(Eigen::Ref<Eigen::MatrixXd> c) const override;
   [[nodiscard]] Eigen::MatrixXd whitening_columns(Eigen::Index first, Eigen::Index n) const override;
   [[nodiscard]] Eigen::VectorXd misfit(const std::vector<Eigen::MatrixXd>& f, RandomStream& random) const override;

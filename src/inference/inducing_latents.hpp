@@ -12,7 +12,8 @@
 
 namespace gp2 {
 
-/// Of k(φ, φ): a point at which the others leave less of the variance tells nothing more in double precision.
+/// Of k(φ, φ): what is left of it is known to no better in double precision. A point at which the others leave less tells nothing
+/// more, and t counts as much more as left out, so that the bound is one and no optimiser gains by rounding.
 constexpr double smallest_pivot = 1e-15;
 
 /// Latents at their inducing points Z_a under one set of values. The inducing variables are f_a,l(Z_j), point after point of
@@ -65,7 +66,7 @@ class InducingBlock {
   /// k_a(Z, φ_i) (points, padded × n), and w = L⁻¹k (points × n).
   [[nodiscard]] const Eigen::MatrixXd& k(std::size_t latent) const { return k_[latent]; }
   [[nodiscard]] auto w(std::size_t latent) const { return w_[latent].leftCols(n_); }
-  /// k_a(φ_i, φ_i) (n)
+  /// k_a(φ_i, φ_i) at most (n)
   [[nodiscard]] auto variance(std::size_t latent) const { return variance_[latent].head(n_); }
   [[nodiscard]] auto weight(std::size_t f, Eigen::Index component) const {
     const InducingLatents::Function& function = latents_->functions()[f];
@@ -105,17 +106,24 @@ void for_each_block(const InducingLatents& latents, const LatentRows& rows, int 
 
 /// What observations say of whitened inducing variables: sums over blocks of samples.
 struct InducingStatistics {
-  Eigen::MatrixXd B;  // Σ ΨᵀΨ, lower triangle (M × M)
-  Eigen::VectorXd c;  // Σ Ψᵀỹ (M)
-  double yy = 0;      // Σ ỹᵀỹ
-  double trace = 0;   // t
+  Eigen::MatrixXd B;       // Σ ΨᵀΨ, lower triangle (M × M)
+  Eigen::VectorXd c;       // Σ Ψᵀỹ (M)
+  double yy = 0;           // Σ ỹᵀỹ
+  double trace = 0;        // t
+  Eigen::VectorXd weight;  // per latent: Σ ‖Γ‖²
 
   InducingStatistics() = default;
   /// The same bits for any number of threads.
   InducingStatistics(const InducingLatents& latents, const LatentRows& rows, int n_threads,
                      const std::atomic<bool>* stop = nullptr);
-  explicit InducingStatistics(Eigen::Index size) : B(Eigen::MatrixXd::Zero(size, size)), c(Eigen::VectorXd::Zero(size)) {}
+  explicit InducingStatistics(const InducingLatents& latents);  // of no samples
   void add(const InducingStatistics& other);
+  /// Adds a block of samples.
+  /// @param y       ỹ, by component
+  /// @param share   of each sample: 1, or 0 where it is left out (n)
+  /// @param memory  that is used again
+  void add(const InducingLatents& latents, const InducingBlock& block, const Eigen::MatrixXd& y, const Eigen::ArrayXd& share,
+           Eigen::MatrixXd& memory);
 };
 
 }  // namespace gp2

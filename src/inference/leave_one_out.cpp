@@ -113,19 +113,12 @@ void add_sample(const Posterior& posterior, const Reduction::Sample& sample, con
 // Each value from those of other stretches; empty where double precision cannot tell.
 std::vector<LeaveOneOut> each_stretch(const Posterior& posterior, const Reduction& reduction, const Gram::Inverse& inverse,
                                       const std::vector<std::vector<Index>>& stretches) {
+  if (inverse.without.empty()) return {};
   std::vector<LeaveOneOut> out = unknown(posterior.observations());
   for (std::size_t b = 0; b < stretches.size(); ++b) {
-    const Eigen::LLT<MatrixXd> factor(inverse.of_set[b]);
-    if (factor.info() != Eigen::Success) return {};
-    const VectorXd pull = factor.solve(inverse.alpha(rows_of_samples(reduction, stretches[b])));
-    const MatrixXd root = factor.matrixL().solve(MatrixXd::Identity(pull.size(), pull.size()));
-    Index first = 0;
-    for (const Index s : stretches[b]) {
-      const Reduction::Sample& sample = reduction.samples[static_cast<std::size_t>(s)];
-      const Index rank = sample.R.rows();
-      const auto columns = root.bottomRows(root.rows() - first).middleCols(first, rank);  // root is a lower triangle
-      add_sample(posterior, sample, pull.segment(first, rank), columns.transpose() * columns, out);
-      first += rank;
+    for (std::size_t k = 0; k < stretches[b].size(); ++k) {
+      const Reduction::Sample& sample = reduction.samples[static_cast<std::size_t>(stretches[b][k])];
+      add_sample(posterior, sample, inverse.without[b].pull[k], inverse.without[b].covariance[k], out);
     }
   }
   return out;

@@ -41,6 +41,11 @@ void require_in_range(const FitRequest& request) {
   require_not_negative("max_escapes", request.max_escapes);
   require_positive("gradient_tolerance", request.gradient_tolerance);
   require_positive("reduction_tolerance", request.reduction_tolerance);
+  if (request.inducing &&
+      !(*request.inducing >= 1 && *request.inducing <= 1e5 && std::floor(*request.inducing) == *request.inducing)) {
+    throw InputError(
+        fmt::format("`inducing`: expected a whole number from 1 to 100000, 'auto' or 'none', got '{}'", *request.inducing));
+  }
 }
 
 // The options of the optimiser: those asked for or, where nothing was, those of the problem, which the request then says too.
@@ -56,6 +61,25 @@ FitOptions optimiser_options(FitRequest& request, const FitProblem& problem) {
   options.n_threads = request.threads;
   options.standard_errors = request.standard_errors;
   return options;
+}
+
+// How many inducing variables there may be; 0: none, exact.
+int settled_inducing(const FitRequest& request, const FitProblem& problem, const FitOptions& options) {
+  const bool has_sums = std::ranges::any_of(problem.observations, [](const Observations& group) { return group.has_sums(); });
+  if (request.inducing) {
+    if (problem.prior_options.baseline) throw InputError("`inducing` is not for a `baseline`");
+    if (has_sums) throw InputError("`inducing` is not for windows of a raw log: `windows=none` learns from its rows");
+    if (request.hyperparameters == HyperparameterChoice::integrate) {
+      throw InputError("`hyperparameters=integrate` is not with `inducing` points");
+    }
+    const auto most = static_cast<int>(*request.inducing);
+    return most < fit_memory(problem, options).reduced_size ? most : 0;  // else it is exact that takes less
+  }
+  const bool is_possible = !problem.prior_options.baseline && !has_sums && !problem.robust &&
+                           request.hyperparameters != HyperparameterChoice::integrate &&
+                           request.problem.protocol.name == Protocol::Name::standard;
+  if (request.is_exact || !is_possible) return 0;
+  return fit_memory(problem, options).reduced_size > largest_exact_size ? most_inducing_variables : 0;
 }
 
 // How many hyperparameters are drawn.
@@ -105,7 +129,8 @@ FitJob job_of(FitRequest request, FitProblem problem) {
   }
   FitJob job;
   FitOptions asked = optimiser_options(request, problem);
-  asked.n_draws = settled_draws(request, problem, asked);
+  asked.n_inducing = settled_inducing(request, problem, asked);
+  asked.n_draws = asked.n_inducing > 0 ? 0 : settled_draws(request, problem, asked);
   job.notes = problem.notes;
   const bool has_sums = std::ranges::any_of(problem.observations, [](const Observations& group) { return group.has_sums(); });
   job.thin = request.thin && !has_sums && !problem.robust && request.problem.protocol.name == Protocol::Name::standard;
@@ -209,6 +234,21 @@ void add_constraint_note(const Posterior& posterior, std::vector<std::string>& n
                   "inertias, and "
                   "on the smallest most; fit with `mean=force`, or see that the masses are right",
                   fmt::join(large, ", ")));
+}
+
+// What inducing points leave out makes deviations larger than they need be. Of the small latent that a fit adds to those of the model it
+// may be much.
+void add_inducing_note(const Prior& prior, const InducingReport& inducing, std::vector<std::string>& notes) {
+  constexpr double much = 3;  // nats
+  double of_model = 0, of_discrepancy = 0;
+  for (std::size_t a = 0; a < prior.latents.size(); ++a) {
+    (prior.latents[a].name == "discrepancy" ? of_discrepancy : of_model) += 0.5 * inducing.left_out[static_cast<Eigen::Index>(a)];
+  }
+  of_model = std::max(0.0, of_model);
+  notes.push_back(fmt::format(
+      "learned through {} inducing variables: what they leave out is worth about {:.2g} nats{}{}", inducing.n_variables, of_model,
+      of_discrepancy > much ? fmt::format(", of the small latent 'discrepancy' {:.2g}", of_discrepancy) : "",
+      of_model > much ? "; more may tell more (`inducing=M`)" : ""));
 }
 
 // Where sums over windows of time deviate by far more than the noise of the positions makes them.
@@ -318,6 +358,14 @@ std::vector<Option> options(FitRequest& request) {
            "(docs/theory.md, T31), at about {} evaluations of the likelihood; auto: integrate where the directions of a latent "
            "have their own, as in the default prior, and rows times free directions of motion are at most {}",
            n_mixed_draws, draw_evaluations, largest_integrated_size)},
+      {"inducing", NumberOrWord{&request.inducing, {{"auto", &request.is_exact_where_small}, {"none", &request.is_exact}}}, "M",
+       fmt::format(
+           "learn from all rows through points that stand for them (docs/theory.md, T37), in time proportional to their number: "
+           "at most so many variables, each one function of a latent at one point; none: exactly; auto: exactly up to {} rows "
+           "times "
+           "free directions of motion, through at most {} variables beyond",
+           largest_exact_size, most_inducing_variables),
+       "auto"},
       {"thin", Switch{&request.thin, "auto", "none"}, "",
        "where residuals go on from row to row, fit anew with as many rows as they are worth, evenly taken; or none"},
       {"standard_errors", YesByDefault{&request.standard_errors}, "",
@@ -413,6 +461,7 @@ FitOutcome run_once(const FitJob& job, const std::function<void(const Progress&)
   Fit result = fit(job.problem, options);
   FitOutcome outcome{job.file, std::move(result.posterior), distrust_notes(job.problem, result.report), std::nullopt};
   for (std::string& note : notes_of(result.report)) outcome.notes.push_back(std::move(note));
+  if (result.report.inducing) add_inducing_note(outcome.posterior.prior(), *result.report.inducing, outcome.notes);
   if (result.report.termination != FitReport::interrupted && !is_set(stop)) {
     if (options.n_draws > 0) add_draw_notes(result.report, outcome.notes);
     // a fit that has taken hours is not lost to what is said of it
@@ -457,20 +506,29 @@ FitJob with_actuators(FitJob job, const std::atomic<bool>* stop) {
   return job;
 }
 
+// The file with some of the states of each of its Observations, and a discrepancy for so many.
+template <typename States>
+FitFile with_states(FitFile file, const std::vector<Observations>& all, const States& states_of) {
+  file.observations.clear();
+  for (std::size_t g = 0; g < all.size(); ++g) file.observations.push_back(all[g].take(states_of(g)));
+  if (std::optional<Discrepancy>& discrepancy = file.prior_options.discrepancy) {
+    discrepancy->stddev *= discrepancy_share(file.observations) / discrepancy_share(all);
+  }
+  return file;
+}
+
 // The fit to every k-th row.
 FitOutcome run_thinned(const FitJob& job, const Worth& worth, const std::function<void(const Progress&)>& progress,
                        const std::atomic<bool>* stop) {
-  FitFile file = job.file;
-  file.observations = job.problem.observations;
+  const std::vector<Observations>& all = job.problem.observations;
   int n_all = 0, n_taken = 0;
-  for (std::size_t g = 0; g < worth.rows.size(); ++g) {
-    Observations& group = file.observations[g];
-    n_all += group.n_data();
+  const FitFile file = with_states(job.file, all, [&](std::size_t g) {
     std::vector<int> taken;
-    for (int i = worth.rows[g] / 2; i < group.n_data(); i += worth.rows[g]) taken.push_back(i);
-    group = group.take(taken);
-    n_taken += group.n_data();
-  }
+    for (int i = worth.rows[g] / 2; i < all[g].n_data(); i += worth.rows[g]) taken.push_back(i);
+    n_all += all[g].n_data();
+    n_taken += static_cast<int>(taken.size());
+    return taken;
+  });
   FitJob fewer = prepare_fit_again(file, job.options.n_threads);
   fewer.actuators = job.actuators;
   FitOutcome outcome = run_fit(fewer, progress, stop);
@@ -483,14 +541,12 @@ FitOutcome run_thinned(const FitJob& job, const Worth& worth, const std::functio
 std::optional<Worth> worth_of_stretch(const FitJob& job, const std::atomic<bool>* stop) {
   const std::vector<Observations>& all = job.problem.observations;
   if (!asks_a_stretch(job.options, job.file, all)) return std::nullopt;
-  FitFile file = job.file;
-  file.observations = all;
-  for (Observations& group : file.observations) {
-    if (is_short(group)) continue;
-    std::vector<int> stretch(rows_of_stretch);
-    std::iota(stretch.begin(), stretch.end(), (group.n_data() - rows_of_stretch) / 2);
-    group = group.take(stretch);
-  }
+  const FitFile file = with_states(job.file, all, [&](std::size_t g) {
+    const int n = all[g].n_data(), n_taken = is_short(all[g]) ? n : rows_of_stretch;
+    std::vector<int> stretch(static_cast<std::size_t>(n_taken));
+    std::iota(stretch.begin(), stretch.end(), (n - n_taken) / 2);
+    return stretch;
+  });
   FitJob quick = prepare_fit_again(file, job.options.n_threads);
   quick.options.n_restarts = 1;
   quick.options.n_draws = quick.options.max_escapes = 0;

@@ -12,6 +12,7 @@
 #include "base/parallel.hpp"
 #include "gp2/error.hpp"
 #include "gp2/inference/evaluation.hpp"
+#include "inference/inducing_latents.hpp"
 
 namespace gp2 {
 
@@ -80,12 +81,22 @@ PerState per_state(const FitProblem& problem, double rank) {
   return count;
 }
 
-// A fit of so many states and reduced rows, one evaluation at a time, whose posterior is a mixture of so many.
-FitMemory memory_of(double n_states, double r, const PerState& count, int n_components) {
+// A fit of so many states and reduced rows, one evaluation at a time.
+FitMemory memory_of(double n_states, double r, const PerState& count, const FitOptions& options) {
   constexpr double blas = 1e7;  // OpenBLAS packs blocks of a matrix into memory of its own, one for each thread that calls it
   FitMemory memory;
   memory.reduced_size = static_cast<int>(std::lround(r));
   memory.shared = number * n_states * count.shared;
+  if (options.n_inducing > 0) {
+    // sums of each part of the rows and of each stretch of cross_validate, with what is made of them
+    const double square = number * std::pow(std::min<double>(options.n_inducing, r), 2);
+    memory.evaluation = (n_block_parts + 6) * square + number * n_states * count.evaluation + blas;
+    memory.posterior =
+        (n_block_parts + 2 * CrossValidation::n_stretches + 6) * square + number * n_states * count.evaluation + blas;
+    memory.asked_by_evaluation = memory.asked_by_posterior = square + blas_buffer;
+    return memory;
+  }
+  const double n_components = std::max(1, options.n_draws);
   memory.evaluation = triangle(r / count.n_parts) + number * n_states * count.evaluation + blas;
   // at the end a factor, its inverse in place, and what of it belongs to each stretch of cross_validate, stand beside the posterior
   const double left_out = triangle(r) + number * r * r / CrossValidation::n_stretches;
@@ -100,8 +111,6 @@ double n_states(const FitProblem& problem, double most_per_log = HUGE_VAL) {
   for (const Observations& group : problem.observations) sum += std::min<double>(group.n_data(), most_per_log);
   return sum;
 }
-
-int n_components(const FitOptions& options) { return std::max(1, options.n_draws); }
 
 struct Sizes {
   double rank = 0;  // mean of the states
@@ -118,7 +127,7 @@ Sizes sizes_of(const FitProblem& problem) {
 
 // evaluations at a time that a fit asks for; a scan for lower optima has more tasks than there are threads
 int side_by_side(const FitProblem& problem, const FitOptions& options) {
-  if (options.max_iterations == 0 || problem.hyperparameters.empty()) return 1;
+  if (options.max_iterations == 0 || problem.hyperparameters.empty() || options.n_inducing > 0) return 1;
   const int n_threads = thread_count(options.n_threads);
   const int n = options.max_side_by_side > 0 ? std::min(options.max_side_by_side, n_threads) : n_threads;
   return options.max_escapes > 0 ? n : std::min(n, std::max(1, options.n_restarts));
@@ -160,7 +169,7 @@ double FitMemory::bytes() const { return shared + std::max(side_by_side * evalua
 FitMemory fit_memory(const FitProblem& problem, const FitOptions& options) {
   const Sizes sizes = sizes_of(problem);
   const double n = n_states(problem);
-  FitMemory memory = memory_of(n, sizes.rank * n, sizes.count, n_components(options));
+  FitMemory memory = memory_of(n, sizes.rank * n, sizes.count, options);
   memory.side_by_side = side_by_side(problem, options);
   return memory;
 }
@@ -206,7 +215,7 @@ int most_affordable_rows(const FitProblem& problem, const FitOptions& options,
   while (too_many - most > 1) {
     const int middle = most + (too_many - most) / 2;
     const double n = n_states(problem, middle);
-    (fits(memory_of(n, sizes.rank * n, sizes.count, n_components(options))) ? most : too_many) = middle;
+    (fits(memory_of(n, sizes.rank * n, sizes.count, options)) ? most : too_many) = middle;
   }
   return most;
 }

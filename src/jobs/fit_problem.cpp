@@ -147,7 +147,7 @@ bool has_discrepancy(const Model& model, const FitProblem& problem, const FitPro
          !has_singular_mass(problem);
 }
 
-// a share of the noise, as the fit starts with it, in each acceleration; where one is not measured, of its spread the same share
+// That share of the noise, as the fit starts with it, in each acceleration; where one is not measured, of its spread the same share
 // as in the others
 Discrepancy discrepancy_of(const FitProblem& problem) {
   const Scales scales = default_scales(problem.prior, trusted_observations(problem));
@@ -168,7 +168,7 @@ Discrepancy discrepancy_of(const FitProblem& problem) {
     if (noise[j] == 0) noise[j] = share / n_shares * scales.acceleration_stddev[j];
   }
   return {Protocol::Standard::discrepancy_lengthscale * scales.feature_stddev.front(),
-          Protocol::Standard::discrepancy_stddev * noise};
+          discrepancy_share(problem.observations) * noise};
 }
 
 // Where the noise is estimated, the discrepancy stays a share of it: one of a guess would take its place. An acceleration that no
@@ -204,6 +204,13 @@ void tie_discrepancy(const FitProblem& problem, std::vector<Hyperparameter>& hyp
 }
 
 }  // namespace
+
+double discrepancy_share(const std::vector<Observations>& observations) {
+  double n_states = 0;
+  for (const Observations& group : observations) n_states += group.n_data();
+  return Protocol::Standard::discrepancy_stddev *
+         std::pow(std::min(1.0, Protocol::Standard::discrepancy_states / n_states), 0.25);
+}
 
 void read_start(const NamedNumbers& start, int max_iterations, FitProblem& problem) {
   const std::string source = start.file.empty() ? "`start`" : start.file;

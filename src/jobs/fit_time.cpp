@@ -80,13 +80,14 @@ void note_time(double seconds, int reduced_size, std::vector<std::string>& notes
   if (!(seconds > worth_telling)) return;
   notes.push_back(fmt::format(
       "one evaluation of the likelihood factors a matrix of size {} and takes about {} here, and a fit takes hundreds: it can be "
-      "interrupted at any time; fewer rows (`max_points`) take less, with the cube of their number",
+      "interrupted at any time; fewer rows (`max_points`) take less, with the cube of their number, and inducing points "
+      "(`inducing=auto`) in proportion to it",
       reduced_size, about(seconds)));
 }
 
 void note_time(const FitProblem& problem, const FitOptions& options, int reduced_size, std::vector<std::string>& notes) {
   // one of twice the timed size takes eight times as long as the piece
-  if (reduced_size < 2 * timed_size) return;
+  if (reduced_size < 2 * timed_size || options.n_inducing > 0) return;
   note_time(evaluation_seconds(problem, options, reduced_size), reduced_size, notes);
 }
 

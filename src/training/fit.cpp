@@ -67,12 +67,12 @@ std::vector<Hyperparameter> draw_start(std::vector<Hyperparameter> hyperparamete
 class Training {
  public:
   Training(const Prior& prior, const std::vector<Observations>& observations, const std::vector<Hyperparameter>& hyperparameters,
-           const FitOptions& options)
+           const FitOptions& options, std::shared_ptr<const InducingPoints> points = nullptr)
       : prior_(prior),
         observations_(observations),
         hyperparameters_(hyperparameters),
         options_(options),
-        objective_(prior, observations, hyperparameters),
+        objective_(prior, observations, hyperparameters, std::move(points)),
         reports_(static_cast<std::size_t>(n_restarts())),
         results_(static_cast<std::size_t>(n_restarts())),
         fractions_(static_cast<std::size_t>(n_restarts()), 0.0) {
@@ -378,6 +378,10 @@ void require_options(const FitOptions& options) {
   require("reduction_tolerance", options.reduction_tolerance, 0.0);
   require("max_escapes", options.max_escapes, 0);
   require("n_draws", options.n_draws, 0);
+  require("n_inducing", options.n_inducing, 0);
+  if (options.n_inducing > 0 && options.n_draws > 0) {
+    throw InputError("fit: hyperparameters are not drawn where all is learned through inducing points");
+  }
 }
 
 void require_starts(const std::vector<Hyperparameter>& hyperparameters) {
@@ -390,17 +394,11 @@ void require_starts(const std::vector<Hyperparameter>& hyperparameters) {
   }
 }
 
-}  // namespace
-
-Fit fit(const Prior& prior, const std::vector<Observations>& observations, const std::vector<Hyperparameter>& hyperparameters,
-        const FitOptions& options) {
-  const auto start = std::chrono::steady_clock::now();
-  require_options(options);
-  require_observations(prior, observations);
-  require_measured(observations, "fit");
-  require_hyperparameters(prior, observations, hyperparameters);
-  require_starts(hyperparameters);
-  Training training(prior, observations, hyperparameters, options);
+// Of the optimum, without the posterior.
+FitReport trained(const Prior& prior, const std::vector<Observations>& observations,
+                  const std::vector<Hyperparameter>& hyperparameters, const FitOptions& options,
+                  std::shared_ptr<const InducingPoints> points = nullptr) {
+  Training training(prior, observations, hyperparameters, options, std::move(points));
   training.run();
   const std::size_t best = training.best();
   const RestartReport& winner = training.reports()[best];
@@ -422,8 +420,114 @@ Fit fit(const Prior& prior, const std::vector<Observations>& observations, const
   report.uncertainty = training.uncertainty();
   report.draws = training.draws();
   report.restarts = training.reports();
-  Posterior posterior = interrupted && !report.draws
-                            ? Posterior::lazy(prior, observations, model_values(prior, observations, report.hyperparameters))
+  return report;
+}
+
+int n_states(const std::vector<Observations>& observations) {
+  int n = 0;
+  for (const Observations& group : observations) n += group.n_data();
+  return n;
+}
+
+// About n states, of each Observations the same share, evenly.
+std::vector<Observations> evenly(const std::vector<Observations>& observations, int n) {
+  const double share = std::min(1.0, static_cast<double>(n) / n_states(observations));
+  std::vector<Observations> some;
+  for (const Observations& group : observations) {
+    const int n_of_group = std::max(std::min(1, group.n_data()), static_cast<int>(std::lround(share * group.n_data())));
+    std::vector<int> states;
+    for (int k = 0; k < n_of_group; ++k) states.push_back(static_cast<int>(std::int64_t{k} * group.n_data() / n_of_group));
+    some.push_back(group.take(states));
+  }
+  return some;
+}
+
+// Hyperparameters from few states, exactly, then through inducing points from more and more. The points stay while the optimiser
+// runs, are chosen anew where it has ended, and kept where the bound rises.
+class TrainingThroughPoints {
+ public:
+  TrainingThroughPoints(const Prior& prior, const std::vector<Observations>& observations, const FitOptions& options)
+      : prior_(prior), observations_(observations), options_(options) {}
+
+  FitReport run(std::vector<Hyperparameter> hyperparameters) const {
+    const int n_all = n_states(observations_);
+    const bool optimises = options_.max_iterations > 0 && !hyperparameters.empty();
+    std::vector<int> stages;
+    for (int n = n_exact; optimises && n < n_all && (n == n_exact || n <= n_all / 4); n *= 25) stages.push_back(n);
+    const int n_start = stages.empty() ? 0 : n_exact;
+    FitReport report;
+    for (std::size_t stage = 0; stage < stages.size() && !is_set(options_.stop); ++stage) {
+      FitOptions options = of_stage(stage, stages.size() + 1);
+      const std::vector<Observations> some = evenly(observations_, stages[stage]);
+      options.standard_errors = false;
+      report = stage == 0 ? trained(prior_, some, hyperparameters, options) : through_points(some, hyperparameters, options);
+      hyperparameters = report.hyperparameters;
+    }
+    report = through_points(observations_, hyperparameters, of_stage(stages.size(), stages.size() + 1));
+    report.inducing->n_start = n_start;
+    return report;
+  }
+
+ private:
+  static constexpr int n_exact = 400;  // states that tell where hyperparameters stand, in seconds
+  static constexpr int n_rounds = 3;
+  static constexpr double enough = 0.5;  // nats, below which other points are not worth another run
+
+  [[nodiscard]] FitOptions of_stage(std::size_t stage, std::size_t n_stages) const {
+    FitOptions options = options_;
+    options.n_draws = options.n_inducing = 0;
+    if (!options_.progress) return options;
+    options.progress = [this, stage, n_stages](Progress progress) {
+      progress.fraction = (static_cast<double>(stage) + progress.fraction) / static_cast<double>(n_stages);
+      options_.progress(progress);
+    };
+    return options;
+  }
+
+  [[nodiscard]] FitReport through_points(const std::vector<Observations>& observations, std::vector<Hyperparameter> from,
+                                         FitOptions options) const {
+    // a gain of a thousandth of a nat is none
+    options.reduction_tolerance = std::max(options.reduction_tolerance, 1e-3 / n_states(observations));
+    options.n_restarts = 1;
+    options.max_escapes = 0;
+    std::optional<FitReport> best;
+    for (int round = 0; round < n_rounds; ++round) {
+      ModelValues values = model_values(prior_, observations, from);
+      const InducingChoice choice = choose_inducing_points(prior_, observations, values, {.most = options_.n_inducing});
+      FitReport report = trained(prior_, observations, from, options, choice.points);
+      const double gain = best ? best->objective - report.objective : std::numeric_limits<double>::infinity();
+      const bool are_fewer = best && choice.n_variables < best->inducing->n_variables;
+      if (!(gain > (are_fewer ? -enough : 0))) break;
+      from = report.hyperparameters;
+      report.inducing = {.points = choice.points, .n_variables = choice.n_variables, .left_out = {}};
+      best = std::move(report);
+      if (gain < enough || options.max_iterations == 0 || is_set(options.stop)) break;
+    }
+    ModelValues values = model_values(prior_, observations, best->hyperparameters);
+    values.inducing = best->inducing->points;
+    best->inducing->left_out = left_out_by_points(prior_, observations, values, thread_count(options.n_threads));
+    return *std::move(best);
+  }
+
+  const Prior& prior_;
+  const std::vector<Observations>& observations_;
+  const FitOptions& options_;
+};
+
+}  // namespace
+
+Fit fit(const Prior& prior, const std::vector<Observations>& observations, const std::vector<Hyperparameter>& hyperparameters,
+        const FitOptions& options) {
+  const auto start = std::chrono::steady_clock::now();
+  require_options(options);
+  require_observations(prior, observations);
+  require_measured(observations, "fit");
+  require_hyperparameters(prior, observations, hyperparameters);
+  require_starts(hyperparameters);
+  FitReport report = options.n_inducing > 0 ? TrainingThroughPoints(prior, observations, options).run(hyperparameters)
+                                            : trained(prior, observations, hyperparameters, options);
+  Posterior posterior = report.termination == FitReport::interrupted && !report.draws
+                            ? Posterior::lazy(prior, observations, values_of(prior, observations, report).front())
                             : posterior_of(prior, observations, report);
   report.seconds = std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
   return {std::move(posterior), std::move(report)};

@@ -9,7 +9,12 @@ namespace gp2 {
 using Eigen::Index;
 
 std::vector<ModelValues> values_of(const Prior& prior, const std::vector<Observations>& observations, const FitReport& report) {
-  if (!report.draws) return {model_values(prior, observations, report.hyperparameters)};
+  const auto values_at = [&](const std::vector<Hyperparameter>& hyperparameters) {
+    ModelValues values = model_values(prior, observations, hyperparameters);
+    if (report.inducing) values.inducing = report.inducing->points;
+    return values;
+  };
+  if (!report.draws) return {values_at(report.hyperparameters)};
   if (report.draws->values.rows() != std::ssize(report.hyperparameters) || report.draws->size() == 0) {
     throw InputError(fmt::format("the draws of a fit must hold one number for each of its {} hyperparameters, got {} × {}",
                                  report.hyperparameters.size(), report.draws->values.rows(), report.draws->size()));
@@ -18,7 +23,7 @@ std::vector<ModelValues> values_of(const Prior& prior, const std::vector<Observa
   std::vector<Hyperparameter> drawn = report.hyperparameters;
   for (const auto& draw : report.draws->values.colwise()) {
     for (std::size_t h = 0; h < drawn.size(); ++h) drawn[h].value = draw[static_cast<Index>(h)];
-    values.push_back(model_values(prior, observations, drawn));
+    values.push_back(values_at(drawn));
   }
   return values;
 }

@@ -3,6 +3,7 @@
 #include <cmath>
 #include <map>
 #include <string_view>
+#include <utility>
 
 namespace gp2 {
 
@@ -50,11 +51,18 @@ Likelihood::Options likelihood_options(const std::vector<Hyperparameter>& hyperp
 }  // namespace
 
 Objective::Objective(const Prior& prior, const std::vector<Observations>& observations,
-                     const std::vector<Hyperparameter>& hyperparameters)
+                     const std::vector<Hyperparameter>& hyperparameters, std::shared_ptr<const InducingPoints> points)
     : prior_(prior),
       observations_(observations),
       hyperparameters_(hyperparameters),
-      likelihood_(prior, observations, model_values(prior, observations, hyperparameters), likelihood_options(hyperparameters)) {}
+      points_(std::move(points)),
+      likelihood_(prior, observations, values(hyperparameters), likelihood_options(hyperparameters)) {}
+
+ModelValues Objective::values(const std::vector<Hyperparameter>& hyperparameters) const {
+  ModelValues values = model_values(prior_, observations_, hyperparameters);
+  values.inducing = points_;
+  return values;
+}
 
 std::vector<Hyperparameter> Objective::at(const VectorXd& x) const {
   std::vector<Hyperparameter> hyperparameters = hyperparameters_;
@@ -67,8 +75,7 @@ std::vector<Hyperparameter> Objective::at(const VectorXd& x) const {
 double Objective::operator()(const VectorXd& x, VectorXd* gradient, Likelihood::Workspace& workspace) const {
   const std::vector<Hyperparameter> hyperparameters = at(x);
   ModelGradient model_gradient;
-  const double value = likelihood_.evaluate(model_values(prior_, observations_, hyperparameters),
-                                            gradient == nullptr ? nullptr : &model_gradient, workspace);
+  const double value = likelihood_.evaluate(values(hyperparameters), gradient == nullptr ? nullptr : &model_gradient, workspace);
   if (!std::isfinite(value)) return value;
   for (std::size_t k = 0; gradient != nullptr && k < hyperparameters.size(); ++k) {
     (*gradient)[static_cast<Index>(k)] = hyperparameters[k].likelihood_slope(model_gradient);

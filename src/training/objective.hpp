@@ -1,5 +1,6 @@
 #pragma once
 
+#include <memory>
 #include <vector>
 
 #include <Eigen/Core>
@@ -15,8 +16,9 @@ double negative_log_hyperpriors(const std::vector<Hyperparameter>& hyperparamete
 class Objective {
  public:
   /// @param prior, observations  outlive it
-  Objective(const Prior& prior, const std::vector<Observations>& observations,
-            const std::vector<Hyperparameter>& hyperparameters);
+  /// @param points  through which all is learned; null: exact
+  Objective(const Prior& prior, const std::vector<Observations>& observations, const std::vector<Hyperparameter>& hyperparameters,
+            std::shared_ptr<const InducingPoints> points = nullptr);
 
   /// @param x         the hyperparameters' coordinates
   /// @param gradient  in x, of the size of x; not computed when null; left as it was when the value is +∞
@@ -26,9 +28,12 @@ class Objective {
   [[nodiscard]] std::vector<Hyperparameter> at(const Eigen::VectorXd& x) const;
 
  private:
+  [[nodiscard]] ModelValues values(const std::vector<Hyperparameter>& hyperparameters) const;
+
   const Prior& prior_;
   const std::vector<Observations>& observations_;
   std::vector<Hyperparameter> hyperparameters_;
+  std::shared_ptr<const InducingPoints> points_;
   Likelihood likelihood_;
 };
 

@@ -290,6 +290,29 @@ TEST(FitFile, DrawsSurviveAndThePosteriorIsTheirMixture) {
                         fit.report.hyperparameters.size()));
 }
 
+/// A fit through three inducing points of each latent.
+FitFile fit_through_points() {
+  FitFile fit = fit_of(unicycle());
+  InducingReport& inducing = fit.report.inducing.emplace();
+  const InducingChoice choice = choose_inducing_points(fit.prior(), fit.observations, fit.posterior().values(), {.most = 9});
+  inducing = {choice.points, choice.n_variables, Eigen::VectorXd::Constant(std::ssize(choice.points->features), 0.25), 4};
+  return fit;
+}
+
+TEST(FitFile, InducingPointsSurvive) {
+  EXPECT_FALSE(written_json(fit_of(unicycle())).at("report").contains("inducing"));
+  const FitFile fit = fit_through_points(), read = written_and_read(fit);
+  const InducingReport &a = *fit.report.inducing, &b = read.report.inducing.value();
+  EXPECT_EQ(b.points->features, a.points->features);
+  EXPECT_EQ(std::tie(b.n_variables, b.left_out, b.n_start), std::tie(a.n_variables, a.left_out, a.n_start));
+  expect_same_predictions(fit, read);
+  EXPECT_NE(fit.posterior().negative_log_likelihood(), fit_of(unicycle()).posterior().negative_log_likelihood());
+  // a posterior without them is another
+  const Fit exact{fit_of(unicycle()).posterior(), fit.report};
+  EXPECT_EQ(input_error_of([&] { FitFile(fit.model, fit.prior_options, exact); }),
+            "FitFile: the hyperparameters of the report are not those of the posterior");
+}
+
 TEST(FitFile, TheSameFitGivesTheSameBytes) {
   const TemporaryFolder folder;
   fit_of(unicycle()).write(folder / "a.json");
@@ -309,10 +332,10 @@ TEST(FitFile, TellsWhatWasAskedOfTheFit) {
 }
 
 class OldFit : public testing::TestWithParam<int> {};
-INSTANTIATE_TEST_SUITE_P(OfFormat, OldFit, testing::Values(1, 2, 4, 5, 6, 7));
+INSTANTIATE_TEST_SUITE_P(OfFormat, OldFit, testing::Values(1, 2, 4, 5, 6, 7, 8));
 
 // written by gp2 when that format was its newest: alone; with a log of another system; with a noise per value; of a robot;
-// without draws; without sums over states
+// without draws; without sums over states; without inducing points
 TEST_P(OldFit, IsReadAndWrittenAsTheNewest) {
   const auto path = std::filesystem::path(GP2_SOURCE_DIR) / "tests/files/old_fits" / fmt::format("version_{}.json", GetParam());
   ASSERT_EQ(Json::parse(read_file(path)).at("version"), GetParam());
@@ -404,6 +427,23 @@ TEST_F(DamagedFit, DrawsThatDoNotHoldTogetherAreRefused) {
   EXPECT_THAT(refused([](Json& d) { d.erase("r_hat"); }), StartsWith("not a whole fit file"));
 }
 
+TEST_F(DamagedFit, InducingPointsThatDoNotHoldTogetherAreRefused) {
+  const Json inducing = written_json(fit_through_points()).at("report").at("inducing");
+  const auto refused = [&](const std::function<void(Json&)>& damage) {
+    return error_after([&](Json& json) { damage(json["report"]["inducing"] = inducing); });
+  };
+  EXPECT_EQ(refused([](Json&) {}), "");
+  EXPECT_EQ(refused([](Json& i) { i["points"][0][0].erase(0); }), "inducing points whose features differ in number");
+  EXPECT_EQ(refused([](Json& i) { i["points"][0][0][0] = 1e200; }), "inducing points hold a number that is too large");
+  EXPECT_EQ(refused([](Json& i) { i["points"][0][0][0] = nullptr; }), "null stands where a number must");
+  const std::size_t n_latents = inducing.at("points").size(), n_features = inducing.at("points")[0].size();
+  EXPECT_EQ(refused([](Json& i) { i["points"].erase(0); }),
+            fmt::format("inducing points of {} of {} latents", n_latents - 1, n_latents));
+  EXPECT_EQ(refused([](Json& i) { i["points"][0].erase(0); }),
+            fmt::format("inducing points of {} of {} features", n_features - 1, n_features));
+  EXPECT_THAT(refused([](Json& i) { i.erase("left_out"); }), StartsWith("not a whole fit file"));
+}
+
 /// A fit of some kilobytes, as it is written.
 std::string small_fit() {
   const Model model = Model::parse(R"(coordinates = ["x"]
@@ -487,7 +527,7 @@ TEST_F(DamagedFit, WrittenAnewByOtherProgramsIsTheSame) {
 
 TEST_F(DamagedFit, OfAnOlderVersionInNameOnlyIsRefused) {
   std::string text = small_fit();
-  text.replace(text.find("\"version\": 8"), 12, "\"version\": 5");
+  text.replace(text.find(fmt::format("\"version\": {}", FitFile::format_version)), 12, "\"version\": 5");
   EXPECT_THAT(error_of(text), HasSubstr("changed after gp2 wrote it"));
 }
 
@@ -716,7 +756,9 @@ TEST_F(StartValues, MayComeFromAFitEvenOneWithMoreToTune) {
 }
 
 TEST_F(StartValues, FromADamagedFitAreRefused) {
-  EXPECT_THAT(error_of("{\"format\": \"gp2 fit\", \"version\": 9}"), HasSubstr("of format 9"));
+  const int newer = FitFile::format_version + 1;
+  EXPECT_THAT(error_of(fmt::format("{{\"format\": \"gp2 fit\", \"version\": {}}}", newer)),
+              HasSubstr(fmt::format("of format {}", newer)));
   EXPECT_THAT(error_of("{\"format\": \"gp2 fit\", \"version\": 1}"), HasSubstr("not a whole fit file"));
 }
 

@@ -171,9 +171,16 @@ TEST(GramTest, ItsInverseHoldsTheBlocksOfEachSample) {
       EXPECT_LE((inverse.blocks[s] - P(rows, rows)).norm(), 1e-9);
     }
     const std::vector<Index> of_both = rows_of_samples(of.reduction, {2, 0});
-    ASSERT_EQ(inverse.of_set.size(), 1u);
-    EXPECT_LE((inverse.of_set[0] - P(of_both, of_both)).norm(), 1e-9);
-    EXPECT_EQ(inverse.of_set[0].bottomRightCorner(inverse.blocks[0].rows(), inverse.blocks[0].cols()), inverse.blocks[0]);
+    const MatrixXd of_set = MatrixXd(P(of_both, of_both)).inverse();
+    const VectorXd pull = of_set * (P * of.reduction.y)(of_both);
+    ASSERT_EQ(inverse.without.size(), 1u);
+    Index first = 0;
+    for (std::size_t k = 0; k < 2; ++k) {
+      const Index rank = of.reduction.samples[k == 0 ? 2 : 0].R.rows();
+      EXPECT_LE((inverse.without[0].pull[k] - pull.segment(first, rank)).norm(), 1e-9 * (1 + pull.norm()));
+      EXPECT_LE((inverse.without[0].covariance[k] - of_set.block(first, first, rank, rank)).norm(), 1e-9 * of_set.norm());
+      first += rank;
+    }
   }
 }
 

@@ -58,6 +58,17 @@ TEST(FitMemory, GrowsWithTheSquareOfTheReducedSizeAndWithTheRunsSideBySide) {
   EXPECT_EQ(fit_memory(problem_of_size(100), once).side_by_side, 1) << "nothing is optimised";
 }
 
+TEST(FitMemory, ThroughInducingPointsGrowsWithTheirNumberAndInProportionToTheData) {
+  FitOptions options = on_threads(4);
+  options.n_inducing = 500;
+  const FitMemory memory = fit_memory(problem_of_size(10000), options), more = fit_memory(problem_of_size(40000), options);
+  EXPECT_EQ(memory.reduced_size, 20000);
+  EXPECT_LT(memory.bytes(), 0.1 * gigabyte);
+  EXPECT_LT(more.bytes(), 4 * memory.bytes());
+  options.n_inducing = 1000;
+  EXPECT_NEAR((fit_memory(problem_of_size(10000), options).evaluation - memory.evaluation) / (8. * 500 * 500), 3 * 14, 1);
+}
+
 TEST(FitMemory, OfABaselineIsThatOfOneOutputAtATime) {
   const Model& model = test::model("models/surface.toml");
   FitProblemOptions options;

@@ -104,6 +104,68 @@ TEST(FitTest, AnotherSeedDrawsOtherStarts) {
   EXPECT_EQ(fit(p.prior, p.observations, p.hyperparameters, options).report.objective, alone);
 }
 
+// twice as many states as tell where the hyperparameters stand
+Problem large_problem() { return problem("models/duffing.toml", 800); }
+
+TEST(FitThroughInducingPoints, IsWithinANatOfTheExactOneAtItsHyperparameters) {
+  const Problem p = large_problem();
+  FitOptions options = quick();
+  options.n_inducing = 200;
+  const Fit result = fit(p.prior, p.observations, p.hyperparameters, options);
+  ASSERT_TRUE(result.report.inducing.has_value());
+  EXPECT_GT(result.report.inducing->n_start, 0);
+  EXPECT_LE(result.report.inducing->n_variables, 200);
+  EXPECT_LE(result.report.inducing->left_out.sum(), 1.5);
+  const double exact = Posterior(p.prior, p.observations, model_values(p.prior, p.observations, result.report.hyperparameters))
+                           .negative_log_likelihood();
+  const double bound = result.report.negative_log_likelihood, rounding = 1e-9 * std::abs(exact);
+  EXPECT_GE(bound, exact - rounding);
+  EXPECT_LE(bound, exact + 1);
+  EXPECT_NEAR(result.posterior.negative_log_likelihood(), bound, rounding);
+  EXPECT_NEAR(result.report.objective, objective(p, result.report.hyperparameters) + bound - exact, rounding);
+  // all states tell more than those of the start: the objective falls
+  FitOptions at_start = options;
+  at_start.max_iterations = 0;
+  EXPECT_LT(result.report.objective, fit(p.prior, p.observations, p.hyperparameters, at_start).report.objective);
+}
+
+TEST(FitThroughInducingPoints, GivesTheSameBitsForAnyNumberOfThreads) {
+  const Problem p = large_problem();
+  std::vector<std::vector<double>> values;
+  std::vector<MatrixXd> means;
+  for (int n_threads : {1, 2, 3}) {
+    FitOptions options = quick();
+    options.n_inducing = 60;
+    options.n_threads = n_threads;
+    const Fit result = fit(p.prior, p.observations, p.hyperparameters, options);
+    values.push_back(values_of(result.report.hyperparameters));
+    means.push_back(result.posterior.mean(p.observations[0].view(), p.observations[0].states()));
+  }
+  EXPECT_EQ(values[0], values[1]);
+  EXPECT_EQ(values[0], values[2]);
+  EXPECT_EQ(means[0], means[1]);
+  EXPECT_EQ(means[0], means[2]);
+}
+
+TEST(FitThroughInducingPoints, WithoutIterationsConditionsAtTheStart) {
+  const Problem p = large_problem();
+  FitOptions options = quick();
+  options.n_inducing = 60;
+  options.max_iterations = 0;
+  const Fit result = fit(p.prior, p.observations, p.hyperparameters, options);
+  EXPECT_EQ(values_of(result.report.hyperparameters), values_of(p.hyperparameters));
+  EXPECT_EQ(result.report.inducing->n_start, 0);
+  EXPECT_EQ(result.posterior.values().inducing, result.report.inducing->points);
+}
+
+TEST(FitThroughInducingPoints, DrawsNoHyperparameters) {
+  const Problem p = problem("models/duffing.toml", 15);
+  FitOptions options = quick();
+  options.n_inducing = 10;
+  options.n_draws = 5;
+  EXPECT_THROW(fit(p.prior, p.observations, p.hyperparameters, options), InputError);
+}
+
 TEST(FitTest, NoIterationsConditionsAtTheStart) {
   const Problem p = problem("models/surface.toml", 20, {"p1"});
   FitOptions options = quick();

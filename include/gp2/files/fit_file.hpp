@@ -28,9 +28,9 @@ struct FitFile {
   ///   hyperparameters of another posterior.
   FitFile(Model model, FitPriorOptions prior_options, const Fit& fit, std::vector<std::shared_ptr<const Model>> systems = {});
 
-  /// 8: sums over states; 7: draws of hyperparameters; 6: a checksum and options, values that are not measured; 5: robots; 4: values with a noise of
-  /// their own; 3: mechanics that are code; 2: observations of other systems. All of them are read; 8 is written.
-  static constexpr int format_version = 8;
+  /// 9: inducing points; 8: sums over states; 7: draws of hyperparameters; 6: a checksum and options, values that are not measured; 5: robots; 4: values with a noise of
+  /// their own; 3: mechanics that are code; 2: observations of other systems. All of them are read; 9 is written.
+  static constexpr int format_version = 9;
 
   Model model;
   FitPriorOptions prior_options;

@@ -26,6 +26,10 @@ enum class HyperparameterChoice {
 /// Draws that `integrate` mixes, and the largest reduced size (FitMemory) up to which `auto` does: minutes on two cores.
 inline constexpr int n_mixed_draws = 25, largest_integrated_size = 800;
 
+/// The largest reduced size that is solved exactly unless a person says otherwise, and the inducing variables at most beyond it:
+/// minutes on two cores.
+inline constexpr int largest_exact_size = 3000, most_inducing_variables = 1000;
+
 /// The rule of `auto`: the directions of a latent have hyperparameters of their own, as in the default prior, the reduced size is
 /// small enough, it is no baseline, and the optimiser runs.
 bool integration_pays(const FitProblem& problem, const FitOptions& options);
@@ -46,6 +50,9 @@ struct FitRequest {
   HyperparameterChoice hyperparameters = HyperparameterChoice::automatic;
   bool standard_errors = true;
   bool thin = true;  // fewer rows where residuals go on from row to row
+  /// Inducing variables at most; not given: as largest_exact_size says, and none where `is_exact`.
+  std::optional<double> inducing;
+  bool is_exact = false, is_exact_where_small = false;
 };
 
 /// The table of its options.

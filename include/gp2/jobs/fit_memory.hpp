@@ -12,7 +12,8 @@
 namespace gp2 GP2_API {
 
 /// The memory of a fit at its peak, estimated before it is taken. What grows with the square of the data are triangles of the
-/// reduced size r = Σ rank of what each state measures: one for each evaluation of the likelihood, one for the posterior.
+/// reduced size r = Σ rank of what each state measures: one for each evaluation of the likelihood, one for the posterior. Through
+/// inducing points they are a few squares of the number of inducing variables.
 struct FitMemory {
   int reduced_size = 0;   // r
   int side_by_side = 1;   // evaluations at a time

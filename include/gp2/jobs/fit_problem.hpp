@@ -102,6 +102,9 @@ FitProblem make_fit_problem(const Model& model, const std::vector<Log>& logs, co
                             const FitProblemOptions& options);
 FitProblem make_fit_problem(const Model& model, const CsvTable& log, const FitProblemOptions& options);
 
+/// The standard deviation of the discrepancy in units of that of the noise (theory.md, T23).
+double discrepancy_share(const std::vector<Observations>& observations);
+
 /// How a problem is fitted unless told otherwise: a baseline has options of its own.
 FitOptions default_fit_options(const FitProblem& problem);
 

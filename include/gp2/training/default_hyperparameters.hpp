@@ -31,7 +31,8 @@ struct Protocol {
     static constexpr double noise_lower = 1e-6, noise_upper = 2;
     static constexpr double noise_log_stddev = 2;
     static constexpr double discrepancy_lengthscale = 1.25;  // of the feature's spread
-    static constexpr double discrepancy_stddev = 0.4;        // of the noise
+    static constexpr double discrepancy_stddev = 0.4;        // of the noise …
+    static constexpr double discrepancy_states = 1600;       // … of up to so many, beyond in proportion to N^(−1/4)
     static constexpr double start_log_stddev = 1.5;          // of random starts about the first one
   };
 };

@@ -1,0 +1,119 @@
+// Many rows learned through inducing points, as it is asked of a fit.
+#include <algorithm>
+
+#include <fmt/format.h>
+#include <gmock/gmock.h>
+
+#include "data_of_model.hpp"
+#include "gp2/error.hpp"
+#include "gp2/jobs/fit_job.hpp"
+#include "input_error.hpp"
+#include "io_testing.hpp"
+#include "test_models.hpp"
+
+namespace gp2 {
+namespace {
+
+using Eigen::MatrixXd;
+using test::input_error_of;
+using testing::Contains;
+using testing::HasSubstr;
+
+constexpr const char* surface = "models/surface.toml";  // two of three directions are free
+
+FitRequest request_of_rows(int n) {
+  FitRequest request;
+  request.model = test::model(surface);
+  request.logs = {{test::drawn_log(surface, n, 4).table(), nullptr}};
+  request.problem.mean = Prior::Mean::force;
+  request.restarts = 1;
+  request.max_escapes = 0;
+  request.threads = 2;
+  return request;
+}
+
+int n_inducing(int n, const std::function<void(FitRequest&)>& change) {
+  FitRequest request = request_of_rows(n);
+  change(request);
+  return prepare_fit(std::move(request)).options.n_inducing;
+}
+
+TEST(InducingFit, AutoIsExactWhereThatTakesMinutes) {
+  const auto as_it_is = [](FitRequest&) {};
+  const int n = largest_exact_size / 2;
+  EXPECT_EQ(n_inducing(n, as_it_is), 0);
+  EXPECT_EQ(n_inducing(n + 1, as_it_is), most_inducing_variables);
+  EXPECT_EQ(n_inducing(n + 1, [](FitRequest& request) { request.is_exact = true; }), 0);
+  EXPECT_EQ(n_inducing(n + 1, [](FitRequest& request) { request.problem.protocol.name = Protocol::Name::paper; }), 0);
+  EXPECT_EQ(n_inducing(n + 1, [](FitRequest& request) { request.hyperparameters = HyperparameterChoice::integrate; }), 0);
+  EXPECT_EQ(n_inducing(n + 1, [](FitRequest& request) { request.problem.robust = true; }), 0);
+  EXPECT_EQ(n_inducing(n + 1, [](FitRequest& request) { request.problem.max_points = 20; }), 0);
+}
+
+TEST(InducingFit, AsManyAsAskedForUnlessExactTakesLess) {
+  EXPECT_EQ(n_inducing(50, [](FitRequest& request) { request.inducing = 60; }), 60);
+  EXPECT_EQ(n_inducing(50, [](FitRequest& request) { request.inducing = 100; }), 0);
+}
+
+TEST(InducingFit, WhatDoesNotGoWithPointsIsRefused) {
+  const auto refused = [](const std::function<void(FitRequest&)>& change) {
+    return input_error_of([&] {
+      n_inducing(12, [&](FitRequest& request) {
+        request.inducing = 5;
+        change(request);
+      });
+    });
+  };
+  for (const double number : {0.0, -1.0, 2.5, 1e9}) {
+    EXPECT_EQ(refused([&](FitRequest& request) { request.inducing = number; }),
+              fmt::format("`inducing`: expected a whole number from 1 to 100000, 'auto' or 'none', got '{}'", number));
+  }
+  EXPECT_EQ(refused([](FitRequest& request) {
+              request.problem.baseline = Baseline::Kind::icm, request.problem.mean = Prior::Mean::zero;
+            }),
+            "`inducing` is not for a `baseline`");
+  EXPECT_EQ(refused([](FitRequest& request) { request.hyperparameters = HyperparameterChoice::integrate; }),
+            "`hyperparameters=integrate` is not with `inducing` points");
+}
+
+TEST(InducingFit, TellsWhatIsLeftOutAndItsFileGivesItAgain) {
+  FitRequest request = request_of_rows(500);
+  request.inducing = 80;
+  const FitOutcome outcome = run_fit(prepare_fit(std::move(request)));
+  const InducingReport& inducing = outcome.file.report.inducing.value();
+  EXPECT_LE(inducing.n_variables, 80);
+  EXPECT_THAT(outcome.notes, Contains(HasSubstr(fmt::format("learned through {} inducing variables", inducing.n_variables))));
+  ASSERT_TRUE(outcome.cross_validation && outcome.cross_validation->stretches);
+  EXPECT_NEAR(outcome.cross_validation->one_by_one.coverage95, 0.95, 0.04);
+  const test::TemporaryFolder folder;
+  outcome.file.write(folder / "fit.json");
+  const FitFile read = FitFile::read(folder / "fit.json");
+  const View view = View::constrained_acceleration(*outcome.file.model.system);
+  const MatrixXd& states = outcome.posterior.observations().front().states();
+  EXPECT_EQ(read.posterior().marginal(view, states).covariance, outcome.posterior.marginal(view, states).covariance);
+  // and again, from its options and data
+  const FitOutcome again = run_fit(prepare_fit_again(read, 1));
+  EXPECT_EQ(again.posterior.mean(view, states), outcome.posterior.mean(view, states));
+}
+
+TEST(InducingFit, OfARobustOneDistrustsTheSame) {
+  const auto distrusted = [](double inducing) {
+    test::LogData log = test::drawn_log(surface, 200, 4);
+    for (int i = 10; i < 200; i += 50) log.accelerations(1, i) += 30;
+    FitRequest request = request_of_rows(12);
+    request.logs = {{log.table(), nullptr}};
+    request.problem.robust = true;
+    request.inducing = inducing;
+    const FitReport report = run_fit(prepare_fit(std::move(request))).file.report;
+    EXPECT_EQ(report.inducing.has_value(), inducing < 400);
+    std::vector<int> states;
+    for (const DistrustedValue& value : report.distrusted) states.push_back(value.state);
+    std::sort(states.begin(), states.end());
+    return states;
+  };
+  EXPECT_THAT(distrusted(100), testing::ElementsAre(10, 60, 110, 160));
+  EXPECT_THAT(distrusted(1000), testing::ElementsAre(10, 60, 110, 160));
+}
+
+}  // namespace
+}  // namespace gp2
