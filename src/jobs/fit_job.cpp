@@ -75,7 +75,7 @@ int settled_inducing(const FitRequest& request, const FitProblem& problem, const
     const auto most = static_cast<int>(*request.inducing);
     return most < fit_memory(problem, options).reduced_size ? most : 0;  // else it is exact that takes less
   }
-  const bool is_possible = !problem.prior_options.baseline && !has_sums && !problem.robust &&
+  const bool is_possible = !problem.prior_options.baseline && !has_sums &&
                            request.hyperparameters != HyperparameterChoice::integrate &&
                            request.problem.protocol.name == Protocol::Name::standard;
   if (request.is_exact || !is_possible) return 0;

@@ -2,10 +2,12 @@
 #include <functional>
 #include <ostream>
 
+#include <fmt/format.h>
 #include <gmock/gmock.h>
 #include <gtest/gtest.h>
 
 #include "apps/command_line.hpp"
+#include "gp2/files/fit_file.hpp"
 
 // Bad input exits with 2, says where, what, and the mend, and leaves every file as it was.
 namespace gp2::test {
@@ -211,7 +213,10 @@ const std::vector<BadInput> bad_inputs = {
     {"GenerateWithoutTruth", model_with("[truth]", "[unused]"), "gp2 generate model.toml --n 5 -o old.csv", {"model.toml"}},
     // the fit
     {"FitOfANewerFormat",
-     [](const Desk& desk) { desk.write("fit.json", replaced(desk.read("fit.json"), R"("version": 8)", R"("version": 99)")); },
+     [](const Desk& desk) {
+       desk.write("fit.json",
+                  replaced(desk.read("fit.json"), fmt::format("\"version\": {}", FitFile::format_version), R"("version": 99)"));
+     },
      predict_line,
      {"fit.json", "format 99", "use a newer gp2"}},
     {"FitChangedByHand",

@@ -46,7 +46,7 @@ TEST(InducingFit, AutoIsExactWhereThatTakesMinutes) {
   EXPECT_EQ(n_inducing(n + 1, [](FitRequest& request) { request.is_exact = true; }), 0);
   EXPECT_EQ(n_inducing(n + 1, [](FitRequest& request) { request.problem.protocol.name = Protocol::Name::paper; }), 0);
   EXPECT_EQ(n_inducing(n + 1, [](FitRequest& request) { request.hyperparameters = HyperparameterChoice::integrate; }), 0);
-  EXPECT_EQ(n_inducing(n + 1, [](FitRequest& request) { request.problem.robust = true; }), 0);
+  EXPECT_EQ(n_inducing(n + 1, [](FitRequest& request) { request.problem.robust = true; }), most_inducing_variables);
   EXPECT_EQ(n_inducing(n + 1, [](FitRequest& request) { request.problem.max_points = 20; }), 0);
 }
 
