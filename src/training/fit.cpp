@@ -454,18 +454,27 @@ class TrainingThroughPoints {
     const bool optimises = options_.max_iterations > 0 && !hyperparameters.empty();
     std::vector<int> stages;
     for (int n = n_exact; optimises && n < n_all && (n == n_exact || n <= n_all / 4); n *= 25) stages.push_back(n);
-    const int n_start = stages.empty() ? 0 : n_exact;
-    FitReport report;
-    for (std::size_t stage = 0; stage < stages.size() && !is_set(options_.stop); ++stage) {
-      FitOptions options = of_stage(stage, stages.size() + 1);
-      const std::vector<Observations> some = evenly(observations_, stages[stage]);
-      options.standard_errors = false;
-      report = stage == 0 ? trained(prior_, some, hyperparameters, options) : through_points(some, hyperparameters, options);
-      hyperparameters = report.hyperparameters;
+    stages.push_back(n_all);
+    std::optional<FitReport> report;
+    for (std::size_t stage = 0; stage < stages.size() && !(report && is_set(options_.stop)); ++stage) {
+      const bool is_last = stage + 1 == stages.size();
+      FitOptions options = of_stage(stage, stages.size());
+      options.standard_errors = options.standard_errors && is_last;
+      const std::vector<Observations> some = is_last ? observations_ : evenly(observations_, stages[stage]);
+      report = unless_stopped(report, [&] {
+        return is_last || stage > 0 ? through_points(some, hyperparameters, options)
+                                    : trained(prior_, some, hyperparameters, options);
+      });
+      hyperparameters = report->hyperparameters;
     }
-    report = through_points(observations_, hyperparameters, of_stage(stages.size(), stages.size() + 1));
-    report.inducing->n_start = n_start;
-    return report;
+    if (!report->inducing) report->inducing = points_of(chosen(observations_, hyperparameters));
+    report->inducing->left_out = left_out(*report);
+    report->inducing->n_start = stages.size() > 1 ? n_exact : 0;
+    if (is_set(options_.stop)) {
+      report->termination = FitReport::interrupted;
+      report->converged = false;
+    }
+    return *std::move(report);
   }
 
  private:
@@ -484,6 +493,27 @@ class TrainingThroughPoints {
     return options;
   }
 
+  [[nodiscard]] static InducingReport points_of(const InducingChoice& choice) {
+    return {.points = choice.points, .n_variables = choice.n_variables, .left_out = {}};
+  }
+
+  // What `work` gives; where it is stopped before it has anything, what there was before.
+  template <typename Work>
+  [[nodiscard]] FitReport unless_stopped(std::optional<FitReport> before, const Work& work) const {
+    try {
+      return work();
+    } catch (const NumericalError&) {
+      if (!before || !is_set(options_.stop)) throw;
+      return *std::move(before);
+    }
+  }
+
+  [[nodiscard]] InducingChoice chosen(const std::vector<Observations>& observations,
+                                      const std::vector<Hyperparameter>& hyperparameters) const {
+    return choose_inducing_points(prior_, observations, model_values(prior_, observations, hyperparameters),
+                                  {.most = options_.n_inducing});
+  }
+
   [[nodiscard]] FitReport through_points(const std::vector<Observations>& observations, std::vector<Hyperparameter> from,
                                          FitOptions options) const {
     // a gain of a thousandth of a nat is none
@@ -491,22 +521,32 @@ class TrainingThroughPoints {
     options.n_restarts = 1;
     options.max_escapes = 0;
     std::optional<FitReport> best;
-    for (int round = 0; round < n_rounds; ++round) {
-      ModelValues values = model_values(prior_, observations, from);
-      const InducingChoice choice = choose_inducing_points(prior_, observations, values, {.most = options_.n_inducing});
-      FitReport report = trained(prior_, observations, from, options, choice.points);
-      const double gain = best ? best->objective - report.objective : std::numeric_limits<double>::infinity();
+    for (int round = 0; round < n_rounds && !(best && is_set(options.stop)); ++round) {
+      const InducingChoice choice = chosen(observations, from);
+      FitReport next = unless_stopped(best, [&] {
+        FitReport report = trained(prior_, observations, from, options, choice.points);
+        report.inducing = points_of(choice);
+        return report;
+      });
+      const double gain = best ? best->objective - next.objective : std::numeric_limits<double>::infinity();
       const bool are_fewer = best && choice.n_variables < best->inducing->n_variables;
       if (!(gain > (are_fewer ? -enough : 0))) break;
-      from = report.hyperparameters;
-      report.inducing = {.points = choice.points, .n_variables = choice.n_variables, .left_out = {}};
-      best = std::move(report);
-      if (gain < enough || options.max_iterations == 0 || is_set(options.stop)) break;
+      from = next.hyperparameters;
+      best = std::move(next);
+      if (gain < enough || options.max_iterations == 0) break;
     }
-    ModelValues values = model_values(prior_, observations, best->hyperparameters);
-    values.inducing = best->inducing->points;
-    best->inducing->left_out = left_out_by_points(prior_, observations, values, thread_count(options.n_threads));
     return *std::move(best);
+  }
+
+  // Of all states; where the fit is stopped, as some of them tell.
+  [[nodiscard]] VectorXd left_out(const FitReport& report) const {
+    constexpr int few = 5000;
+    const int n_all = n_states(observations_), n = is_set(options_.stop) ? std::min(few, n_all) : n_all;
+    const std::vector<Observations> some = n < n_all ? evenly(observations_, n) : observations_;
+    ModelValues values = model_values(prior_, some, report.hyperparameters);
+    values.inducing = report.inducing->points;
+    return static_cast<double>(n_all) / n_states(some) *
+           left_out_by_points(prior_, some, values, thread_count(options_.n_threads));
   }
 
   const Prior& prior_;

@@ -147,6 +147,29 @@ TEST(FitThroughInducingPoints, GivesTheSameBitsForAnyNumberOfThreads) {
   EXPECT_EQ(means[0], means[2]);
 }
 
+TEST(FitThroughInducingPoints, StoppedAnywhereItHasWhatWasFound) {
+  const Problem p = large_problem();
+  int n_calls = 0;
+  FitOptions options = quick();
+  options.n_inducing = 60;
+  options.progress = [&](const Progress&) { ++n_calls; };
+  const double whole = fit(p.prior, p.observations, p.hyperparameters, options).report.objective;
+  for (const int call : {1, n_calls / 2, n_calls - 1}) {
+    SCOPED_TRACE(call);
+    std::atomic<bool> stop = false;
+    int n = 0;
+    options.stop = &stop;
+    options.progress = [&](const Progress&) { stop = ++n >= call; };
+    const Fit result = fit(p.prior, p.observations, p.hyperparameters, options);
+    EXPECT_EQ(result.report.termination, FitReport::interrupted);
+    EXPECT_FALSE(result.report.converged);
+    ASSERT_TRUE(result.report.inducing.has_value());
+    EXPECT_EQ(result.report.inducing->left_out.size(), std::ssize(p.prior.latents));
+    EXPECT_TRUE(result.posterior.mean(p.observations[0].view(), p.observations[0].states()).allFinite());
+    EXPECT_GE(objective(p, result.report.hyperparameters), whole - 1) << "the whole one went on from there";
+  }
+}
+
 TEST(FitThroughInducingPoints, WithoutIterationsConditionsAtTheStart) {
   const Problem p = large_problem();
   FitOptions options = quick();

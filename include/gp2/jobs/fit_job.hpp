@@ -28,7 +28,7 @@ inline constexpr int n_mixed_draws = 25, largest_integrated_size = 800;
 
 /// The largest reduced size that is solved exactly unless a person says otherwise, and the inducing variables at most beyond it:
 /// minutes on two cores.
-inline constexpr int largest_exact_size = 3000, most_inducing_variables = 1000;
+inline constexpr int largest_exact_size = 1500, most_inducing_variables = 1000;
 
 /// The rule of `auto`: the directions of a latent have hyperparameters of their own, as in the default prior, the reduced size is
 /// small enough, it is no baseline, and the optimiser runs.
