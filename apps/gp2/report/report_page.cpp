@@ -117,6 +117,7 @@ Json prior_json(const FitFile& fit) {
         fmt::format("{} of {}; acts on {}{}", latent.kernel.text(), fmt::join(latent.feature_names, ", "),
                     fmt::join(latent.column_names, ", "), latent.base == Latent::Base::force ? " (forces)" : ""));
   }
+  if (fit.report.inducing) add("learned through", fmt::format("{} inducing variables", fit.report.inducing->n_variables));
   return rows;
 }
 
