@@ -11,6 +11,7 @@
 #include "gp2/training/laplace.hpp"
 #include "gp2/training/robust.hpp"
 #include "jobs/read_observations.hpp"
+#include "training/evenly.hpp"
 
 namespace gp2 {
 
@@ -206,10 +207,8 @@ void tie_discrepancy(const FitProblem& problem, std::vector<Hyperparameter>& hyp
 }  // namespace
 
 double discrepancy_share(const std::vector<Observations>& observations) {
-  double n_states = 0;
-  for (const Observations& group : observations) n_states += group.n_data();
-  return Protocol::Standard::discrepancy_stddev *
-         std::pow(std::min(1.0, Protocol::Standard::discrepancy_states / n_states), 0.25);
+  const double few = Protocol::Standard::discrepancy_states / n_states(observations);
+  return Protocol::Standard::discrepancy_stddev * std::pow(std::min(1.0, few), 0.25);
 }
 
 void read_start(const NamedNumbers& start, int max_iterations, FitProblem& problem) {

@@ -8,6 +8,7 @@
 
 #include "base/lapack.hpp"
 #include "base/parallel.hpp"
+#include "training/evenly.hpp"
 #include "training/objective.hpp"
 
 namespace gp2 {
@@ -25,19 +26,6 @@ double seconds_of(const auto& work) {
   const auto start = std::chrono::steady_clock::now();
   work();
   return std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
-}
-
-// About a share of the states of each Observations, evenly from all.
-std::vector<Observations> share_of(const std::vector<Observations>& observations, double share) {
-  std::vector<Observations> some;
-  for (const Observations& group : observations) {
-    const Index n = group.n_data();
-    const Index n_some = std::clamp<Index>(std::lround(share * static_cast<double>(n)), std::min<Index>(n, 1), n);
-    std::vector<int> chosen;
-    for (Index k = 0; k < n_some; ++k) chosen.push_back(static_cast<int>(k * n / n_some));
-    some.push_back(group.take(chosen));
-  }
-  return some;
 }
 
 // The factor and the inverse of a matrix of the timed size.
@@ -65,7 +53,8 @@ double evaluation_seconds(const FitProblem& problem, const FitOptions& options, 
   const int n_threads = options.n_restarts == 1 ? thread_count(options.n_threads) : 1;
   const double cubic = cubic_seconds(n_threads);
   const double scale = static_cast<double>(reduced_size) / timed_size;
-  const std::vector<Observations> some = share_of(problem.observations, 1 / scale);
+  const std::vector<Observations> some =
+      evenly(problem.observations, static_cast<int>(std::lround(n_states(problem.observations) / scale)));
   const Objective objective(problem.prior, some, problem.hyperparameters);
   Likelihood::Workspace workspace(n_threads);
   VectorXd gradient(static_cast<Index>(problem.hyperparameters.size()));

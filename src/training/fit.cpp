@@ -18,6 +18,7 @@
 #include "inference/requirements.hpp"
 #include "training/constraint_parameters.hpp"
 #include "training/curvature.hpp"
+#include "training/evenly.hpp"
 #include "training/hamiltonian.hpp"
 #include "training/lbfgsb.hpp"
 #include "training/objective.hpp"
@@ -423,25 +424,6 @@ FitReport trained(const Prior& prior, const std::vector<Observations>& observati
   return report;
 }
 
-int n_states(const std::vector<Observations>& observations) {
-  int n = 0;
-  for (const Observations& group : observations) n += group.n_data();
-  return n;
-}
-
-// About n states, of each Observations the same share, evenly.
-std::vector<Observations> evenly(const std::vector<Observations>& observations, int n) {
-  const double share = std::min(1.0, static_cast<double>(n) / n_states(observations));
-  std::vector<Observations> some;
-  for (const Observations& group : observations) {
-    const int n_of_group = std::max(std::min(1, group.n_data()), static_cast<int>(std::lround(share * group.n_data())));
-    std::vector<int> states;
-    for (int k = 0; k < n_of_group; ++k) states.push_back(static_cast<int>(std::int64_t{k} * group.n_data() / n_of_group));
-    some.push_back(group.take(states));
-  }
-  return some;
-}
-
 // Hyperparameters from few states, exactly, then through inducing points from more and more. The points stay while the optimiser
 // runs, are chosen anew where it has ended, and kept where the bound rises.
 class TrainingThroughPoints {
@@ -460,10 +442,10 @@ class TrainingThroughPoints {
       const bool is_last = stage + 1 == stages.size();
       FitOptions options = of_stage(stage, stages.size());
       options.standard_errors = options.standard_errors && is_last;
-      const std::vector<Observations> some = is_last ? observations_ : evenly(observations_, stages[stage]);
+      const std::vector<Observations> some = is_last ? std::vector<Observations>() : evenly(observations_, stages[stage]);
       report = unless_stopped(report, [&] {
-        return is_last || stage > 0 ? through_points(some, hyperparameters, options)
-                                    : trained(prior_, some, hyperparameters, options);
+        if (is_last) return through_points(observations_, hyperparameters, options);
+        return stage > 0 ? through_points(some, hyperparameters, options) : trained(prior_, some, hyperparameters, options);
       });
       hyperparameters = report->hyperparameters;
     }
@@ -541,12 +523,14 @@ class TrainingThroughPoints {
   // Of all states; where the fit is stopped, as some of them tell.
   [[nodiscard]] VectorXd left_out(const FitReport& report) const {
     constexpr int few = 5000;
-    const int n_all = n_states(observations_), n = is_set(options_.stop) ? std::min(few, n_all) : n_all;
-    const std::vector<Observations> some = n < n_all ? evenly(observations_, n) : observations_;
-    ModelValues values = model_values(prior_, some, report.hyperparameters);
-    values.inducing = report.inducing->points;
-    return static_cast<double>(n_all) / n_states(some) *
-           left_out_by_points(prior_, some, values, thread_count(options_.n_threads));
+    const auto of = [&](const std::vector<Observations>& observations) {
+      ModelValues values = model_values(prior_, observations, report.hyperparameters);
+      values.inducing = report.inducing->points;
+      return left_out_by_points(prior_, observations, values, thread_count(options_.n_threads));
+    };
+    if (!is_set(options_.stop)) return of(observations_);
+    const std::vector<Observations> some = evenly(observations_, few);
+    return static_cast<double>(n_states(observations_)) / n_states(some) * of(some);
   }
 
   const Prior& prior_;

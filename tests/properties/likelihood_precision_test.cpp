@@ -184,7 +184,8 @@ Problem drawn_from_its_prior(int n, double stretch, double noise_to_signal) {
   return p;
 }
 
-// At n = 300 it is off by 5e-7, 0.005 and 0.4 nats. Elsewhere a jitter is added to k(Z, Z) here. The factor with pivots takes what double precision holds, and needs none.
+// Elsewhere a jitter is added to k(Z, Z) here. The factor with pivots takes what double precision holds, and needs none. At n = 300
+// the bound is off by 5e-7, 0.005 and 0.4 nats.
 TEST(LikelihoodPrecisionTest, ThroughInducingPointsIsWhatFiftyDigitsSayHoweverSmallTheNoise) {
   constexpr int n = 60;
   for (const double stretch : {3.0, 1e3}) {

@@ -1,0 +1,29 @@
+#include "training/evenly.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+
+namespace gp2 {
+
+int n_states(const std::vector<Observations>& observations) {
+  int n = 0;
+  for (const Observations& group : observations) n += group.n_data();
+  return n;
+}
+
+std::vector<Observations> evenly(const std::vector<Observations>& observations, int n) {
+  const double share = static_cast<double>(n) / n_states(observations);
+  std::vector<Observations> some;
+  for (const Observations& group : observations) {
+    const std::int64_t all = group.n_data();
+    const std::int64_t taken =
+        std::clamp<std::int64_t>(std::lround(share * static_cast<double>(all)), std::min<std::int64_t>(all, 1), all);
+    std::vector<int> states;
+    for (std::int64_t k = 0; k < taken; ++k) states.push_back(static_cast<int>(k * all / taken));
+    some.push_back(group.take(states));
+  }
+  return some;
+}
+
+}  // namespace gp2

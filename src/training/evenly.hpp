@@ -1,0 +1,15 @@
+#pragma once
+
+#include <vector>
+
+#include "gp2/observations.hpp"
+
+namespace gp2 {
+
+/// States of all observations together.
+int n_states(const std::vector<Observations>& observations);
+
+/// About n states, of each Observations the same share and at least one where there are any, evenly from all; not more than there are.
+std::vector<Observations> evenly(const std::vector<Observations>& observations, int n);
+
+}  // namespace gp2
