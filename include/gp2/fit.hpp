@@ -11,6 +11,7 @@
 #include <Eigen/Core>
 
 #include "gp2/export.hpp"
+#include "gp2/inference/evaluation.hpp"
 #include "gp2/inference/inducing.hpp"
 #include "gp2/posterior.hpp"
 #include "gp2/training/default_hyperparameters.hpp"
@@ -41,6 +42,7 @@ struct FitOptions {
   bool standard_errors = true;                    // FitReport::uncertainty, where parameters are estimated
   int n_draws = 0;                                // of hyperparameters, over which the posterior is then the mixture; 0: none
   int n_inducing = 0;                             // inducing variables at most, through which all is learned; 0: none, exact
+  int n_train = 0;                                // states at most that hyperparameters are found from, evenly taken; 0: all
   std::function<void(const Progress&)> progress;  // called from worker threads, one at a time
   /// Set: return the best so far, as not converged: interrupted. The evaluations under way are given up within a second or so,
   /// draws that are not complete are dropped, and the posterior is conditioned when it is first asked (Posterior::lazy).
@@ -113,9 +115,11 @@ struct ActuatorEstimate {
 /// Of a fit through inducing points (theory.md, T37), whose likelihood is a lower bound of the exact one.
 struct InducingReport {
   std::shared_ptr<const InducingPoints> points;
-  int n_variables = 0;       // M
+  std::shared_ptr<const InducingSummary> summary;  // Posterior::summary
+  int n_variables = 0;                             // M
   Eigen::VectorXd left_out;  // t of all observations, per latent: left_out_by_points
   int n_start = 0;           // states that the hyperparameters were fitted to before all of them
+  std::optional<Evaluation::Part> stretches;  // CrossValidation::stretches of all observations, which no file can tell again
 };
 
 struct FitReport {
@@ -149,7 +153,9 @@ std::vector<ModelValues> values_of(const Prior& prior, const std::vector<Observa
 
 /// The posterior under the fitted hyperparameters, or the mixture over their draws.
 /// @throws InputError, NumericalError  as Posterior and model_values.
-Posterior posterior_of(const Prior& prior, const std::vector<Observations>& observations, const FitReport& report);
+/// @param observations  where the report has a summary those that the posterior has kept
+Posterior posterior_of(const Prior& prior, const std::vector<Observations>& observations, const FitReport& report,
+                       int n_threads = 1);
 
 /// Evaluations of the likelihood, with gradients, that drawing takes at most beside those of the curvature at the optima.
 inline constexpr int draw_evaluations = 3600;

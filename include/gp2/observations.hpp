@@ -30,6 +30,7 @@ class Noise {
 
   /// The noise of these states, in this order.
   [[nodiscard]] Noise take(const std::vector<int>& states) const;
+  [[nodiscard]] Noise slice(int first, int n) const;
   void append(const Noise& more);
   void remove_first(int n);
 
@@ -94,6 +95,8 @@ class Observations {
 
   /// These states, in this order. @throws InputError where there are sums, as append() and remove_first() do.
   [[nodiscard]] Observations take(const std::vector<int>& states) const;
+  /// n states from the first on. @throws as take().
+  [[nodiscard]] Observations slice(int first, int n) const;
   /// Adds the states of `more` behind one's own; its view and σ are taken to be the same.
   /// @throws InputError when one has a noise of each value and the other has not.
   void append(const Observations& more);

@@ -14,6 +14,7 @@
 namespace gp2 GP2_API {
 
 class PathwiseSamples;
+struct InducingSummary;
 struct PathwiseOptions;
 
 /// A view at N states: a quantity to predict, of d·N numbers.
@@ -35,14 +36,24 @@ class Posterior {
   /// @throws InputError when prior, observations and values do not fit each other; and as require_mechanics and
   /// require_prior_values, at an observed state.
   /// @throws NumericalError when the covariance cannot be factored in double precision (noise too small).
-  Posterior(Prior prior, std::vector<Observations> observations, ModelValues values);
+  /// @param n_threads  that may work on it where it is through inducing points; it is the same for any number
+  Posterior(Prior prior, std::vector<Observations> observations, ModelValues values, int n_threads = 1);
   /// The same, conditioned when it is first asked for more than what it was given: that call throws what the constructor throws.
+  /// Through inducing points, which takes little, it is conditioned at once.
   [[nodiscard]] static Posterior lazy(Prior prior, std::vector<Observations> observations, ModelValues values);
+
+  /// The posterior through inducing points that a summary is of.
+  /// @param observations  that it still has
+  /// @throws InputError when they do not fit each other; NumericalError as the constructor.
+  static Posterior of_summary(Prior prior, std::vector<Observations> observations, ModelValues values,
+                              const InducingSummary& summary);
+  /// What it knows of its observations where it is through inducing points, else null.
+  [[nodiscard]] std::shared_ptr<const InducingSummary> summary() const;
 
   /// One component for each of several values, the first of which values() and negative_log_likelihood() tell.
   /// @throws InputError when there are none; and as the constructor.
   static Posterior mixture(const Prior& prior, const std::vector<Observations>& observations,
-                           const std::vector<ModelValues>& values);
+                           const std::vector<ModelValues>& values, int n_threads = 1);
   [[nodiscard]] int n_components() const;
   /// @throws InputError when there is no such component.
   [[nodiscard]] Posterior component(int k) const;
@@ -99,7 +110,11 @@ class Posterior {
   [[nodiscard]] Posterior without_data() const;
 
   [[nodiscard]] const Prior& prior() const;
+  /// Through inducing points (ModelValues::inducing) of more than 5000 states so many, evenly taken: memory does not grow with the
+  /// number of rows that are learned from.
   [[nodiscard]] const std::vector<Observations>& observations() const;
+  /// Observed states, in observations() or not.
+  [[nodiscard]] std::int64_t n_states() const;
   [[nodiscard]] const ModelValues& values() const;
   /// σ of Observations g; of a mixture the root mean square of those of its components.
   [[nodiscard]] Eigen::VectorXd noise_stddev(std::size_t g) const;
@@ -149,7 +164,7 @@ class Posterior {
 /// after group. Rows leave the factor by plane rotations, O(n²) operations each, as stable as a posterior built anew. A group that
 /// update() added goes with its last state; one that was given to the constructor stays, without states, and keeps its noise,
 /// since hyperparameters call it by its number. In place and otherwise as update.
-/// @throws InputError when there are fewer; `posterior` is left as it was.
+/// @throws InputError when there are fewer, or what was learned went through inducing points; `posterior` is left as it was.
 [[nodiscard]] Posterior remove_oldest(Posterior&& posterior, int n);
 
 }  // namespace gp2

@@ -166,7 +166,7 @@ py::tuple shoot_posterior(const PyPosterior& self, const py::object& data, std::
   const ShootRequest request{duration, stretches, columns_argument(columns), n_threads};
   const CsvTable table = to_table(data, "data", CsvTable::Keep::text);
   FitFile file = self.file;
-  file.observations = self.posterior.observations();
+  file.take_data(self.posterior);
   ShootOutcome shot;
   std::optional<Posterior> posterior;
   {
@@ -426,7 +426,7 @@ PyPosterior load(const py::object& path, const PySystem* system) {
 
 void save(const PyPosterior& self, const py::object& path) {
   FitFile file = self.file;
-  file.observations = self.posterior.observations();
+  file.take_data(self.posterior);
   file.write(path_argument(path));
 }
 
@@ -724,11 +724,7 @@ void define_files_and_facts(py::class_<PyPosterior>& posterior) {
           "What the fit was asked, a dict under the names of the options of gp2 fit; None where a file does not say.")
       .def_readonly("notes", &PyPosterior::notes, "What the reading of the data had to say.")
       .def_property_readonly("n_data",
-                             [](const PyPosterior& self) {
-                               int n = 0;
-                               for (const Observations& group : self.posterior.observations()) n += group.n_data();
-                               return n;
-                             })
+[](const PyPosterior& self) { return self.posterior.n_states(); })
       .def_property_readonly("negative_log_likelihood",
                              [](const PyPosterior& self) { return self.posterior.negative_log_likelihood(); })
       .def_property_readonly(
@@ -808,7 +804,7 @@ void define_evaluate_and_update(py::class_<PyPosterior>& posterior) {
       .def(
           "cross_validate",
           [](const PyPosterior& self) {
-            return cross_validate(self.posterior, keeps_row_order(self.file, self.posterior.observations()));
+            return cross_validate(self.file, self.posterior);
           },
           py::call_guard<py::gil_scoped_release>(),
           "How well the data predict themselves: each value from all others, and each of five stretches of time from the rest.")

@@ -42,6 +42,10 @@ Noise Noise::take(const std::vector<int>& states) const {
   return Noise(stddev_, is_estimated_, has_scale() ? MatrixXd(scale_(Eigen::all, states)) : MatrixXd());
 }
 
+Noise Noise::slice(int first, int n) const {
+  return Noise(stddev_, is_estimated_, has_scale() ? MatrixXd(scale_.middleCols(first, n)) : MatrixXd());
+}
+
 void Noise::append(const Noise& more) {
   if (has_scale() != more.has_scale()) {
     throw InputError("observations: some have a noise of each value and some have not; give all of them a noise_scale, or none");
@@ -131,6 +135,11 @@ void Observations::require_no_sums() const {
 Observations Observations::take(const std::vector<int>& states) const {
   require_no_sums();
   return {MatrixXd(states_(Eigen::all, states)), view_, MatrixXd(values_(Eigen::all, states)), noise_.take(states)};
+}
+
+Observations Observations::slice(int first, int n) const {
+  require_no_sums();
+  return {MatrixXd(states_.middleCols(first, n)), view_, MatrixXd(values_.middleCols(first, n)), noise_.slice(first, n)};
 }
 
 void Observations::append(const Observations& more) {

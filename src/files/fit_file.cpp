@@ -2,7 +2,11 @@
 
 #include <algorithm>
 #include <array>
+#include <bit>
+#include <charconv>
 #include <cmath>
+#include <cstdint>
+#include <iterator>
 #include <limits>
 #include <set>
 
@@ -14,6 +18,7 @@
 #include "gp2/base/version.hpp"
 #include "gp2/data/csv.hpp"
 #include "gp2/error.hpp"
+#include "inference/inducing_summary.hpp"
 #include "inference/requirements.hpp"
 #include "symbolic/graph.hpp"
 
@@ -613,13 +618,129 @@ HyperparameterDraws draws_from(const ParsedJson& json, const std::vector<Hyperpa
   return out;
 }
 
+// Doubles to the bit, sixteen hexadecimal digits each: matrices are read in no time.
+std::string bits_of(const Eigen::Ref<const VectorXd>& values) {
+  std::string text;
+  text.reserve(16 * static_cast<std::size_t>(values.size()));
+  for (const double value : values) fmt::format_to(std::back_inserter(text), "{:016x}", std::bit_cast<std::uint64_t>(value));
+  return text;
+}
+
+/// @param n  numbers expected
+VectorXd bits_from(const ParsedJson& json, Index n) {
+  const auto& text = json.get_ref<const std::string&>();
+  if (std::ssize(text) != 16 * n) throw InputError(fmt::format("{} hexadecimal digits, expected {}", text.size(), 16 * n));
+  VectorXd values(n);
+  for (Index k = 0; k < n; ++k) {
+    const char* const first = text.data() + 16 * k;
+    std::uint64_t bits = 0;
+    const auto [end, error] = std::from_chars(first, first + 16, bits, 16);
+    values[k] = std::bit_cast<double>(bits);
+    if (end != first + 16 || error != std::errc() || !std::isfinite(values[k])) {
+      throw InputError(fmt::format("'{}' is not a finite number in hexadecimal digits", text.substr(16 * static_cast<std::size_t>(k), 16)));
+    }
+  }
+  return values;
+}
+
+// column by column
+std::string triangle_bits(const MatrixXd& L) {
+  std::string text;
+  for (Index k = 0; k < L.cols(); ++k) text += bits_of(L.col(k).tail(L.rows() - k));
+  return text;
+}
+
+MatrixXd triangle_from(const ParsedJson& json, Index n) {
+  const VectorXd values = bits_from(json, n * (n + 1) / 2);
+  MatrixXd L = MatrixXd::Zero(n, n);
+  for (Index k = 0, at = 0; k < n; at += n - k, ++k) L.col(k).tail(n - k) = values.segment(at, n - k);
+  return L;
+}
+
+Json part_json(const Evaluation::Part& part) {
+  return {{"n", part.n},
+          {"nrmse", number_or_null(part.nrmse)},
+          {"coverage", numbers_or_null(Eigen::Vector3d(part.coverage50, part.coverage80, part.coverage95))},
+          {"pit", numbers_or_null(part.pit)}};
+}
+
+Evaluation::Part part_from(const ParsedJson& json) {
+  const auto numbers = [&](const char* key, std::size_t n) {
+    if (array(json.at(key)).size() != n) throw InputError(fmt::format("{} {}, expected {}", json.at(key).size(), key, n));
+    VectorXd values(static_cast<Index>(n));
+    std::transform(json.at(key).begin(), json.at(key).end(), values.begin(), number_or_missing);
+    return values;
+  };
+  Evaluation::Part part;
+  part.n = integer(json.at("n"));
+  part.nrmse = number_or_missing(json.at("nrmse"));
+  const VectorXd coverage = numbers("coverage", 3);
+  part.coverage50 = coverage[0], part.coverage80 = coverage[1], part.coverage95 = coverage[2];
+  part.pit = numbers("pit", Calibration::n_bins);
+  part.coverage50_latent = part.coverage80_latent = part.coverage95_latent = std::numeric_limits<double>::quiet_NaN();
+  return part;
+}
+
+// B, c, … of all observations, and the factors they are whitened by: what another processor rounds otherwise
+Json summary_json(const InducingSummary& summary) {
+  Json factors = Json::array();
+  for (const InducingLatents::OfLatent& latent : summary.latents.latents()) {
+    factors.push_back({{"points", latent.chosen}, {"L", triangle_bits(latent.L)}});
+  }
+  const InducingStatistics& all = summary.all;
+  return {{"states", summary.kept.n_states}, {"step", summary.kept.step},  {"factors", factors},
+          {"B", triangle_bits(all.B)},       {"c", bits_of(all.c)},        {"yy", all.yy},
+          {"trace", all.trace},              {"constant", all.constant},   {"weight", vector_json(all.weight)}};
+}
+
+std::shared_ptr<const InducingSummary> summary_from(const ParsedJson& json, const Prior& prior, const ModelValues& values,
+                                                    const std::vector<Observations>& observations) {
+  InducingSummary summary;
+  summary.kept.step = integer(json.at("step"));
+  if (summary.kept.step < 1) throw InputError(fmt::format("a step of {} states is not possible", summary.kept.step));
+  for (const ParsedJson& n : array(json.at("states"))) {
+    if (!n.is_number_unsigned()) throw InputError(fmt::format("{} stands where a number of states must", shown(n)));
+    summary.kept.n_states.push_back(n.get<std::int64_t>());
+  }
+  if (summary.kept.n_states.size() != observations.size()) {
+    throw InputError(fmt::format("numbers of states of {} of {} observations", summary.kept.n_states.size(), observations.size()));
+  }
+  std::vector<lapack::PivotedFactor> factors;
+  for (const ParsedJson& of_latent : array(json.at("factors"))) {
+    if (factors.size() == prior.latents.size()) throw InputError("factors of more latents than there are");
+    const Index n_points = values.inducing->features[factors.size()].rows();
+    lapack::PivotedFactor factor;
+    for (const ParsedJson& point : array(of_latent.at("points"))) {
+      factor.rows.push_back(integer(point));
+      if (factor.rows.back() < 0 || factor.rows.back() >= n_points) throw InputError(fmt::format("{} is no inducing point", factor.rows.back()));
+    }
+    factor.L = triangle_from(of_latent.at("L"), std::ssize(factor.rows));
+    if (!(factor.L.diagonal().array() > 0).all()) throw InputError("a factor of inducing points is not positive");
+    factors.push_back(std::move(factor));
+  }
+  if (factors.size() != prior.latents.size()) throw InputError(fmt::format("factors of {} of {} latents", factors.size(), prior.latents.size()));
+  summary.latents = InducingLatents(prior, values, std::move(factors));
+  const Index M = summary.latents.size();
+  summary.all.B = triangle_from(json.at("B"), M);
+  summary.all.c = bits_from(json.at("c"), M);
+  summary.all.yy = number(json.at("yy"));
+  summary.all.trace = number(json.at("trace"));
+  summary.all.constant = number(json.at("constant"));
+  summary.all.weight = vector_from(json.at("weight"));
+  if (summary.all.weight.size() != std::ssize(prior.latents)) throw InputError("weights of some latents only");
+  return std::make_shared<InducingSummary>(std::move(summary));
+}
+
 Json inducing_json(const InducingReport& inducing) {
   Json points = Json::array();
   for (const MatrixXd& features : inducing.points->features) points.push_back(columns_json(features));
-  return {{"points", points},
-          {"variables", inducing.n_variables},
-          {"left_out", vector_json(inducing.left_out)},
-          {"start", inducing.n_start}};
+  Json json = {{"points", points},
+               {"variables", inducing.n_variables},
+               {"left_out", vector_json(inducing.left_out)},
+               {"start", inducing.n_start}};
+  if (inducing.stretches) json["stretches"] = part_json(*inducing.stretches);
+  if (inducing.summary) json["summary"] = summary_json(*inducing.summary);
+  return json;
 }
 
 InducingReport inducing_from(const ParsedJson& json, const Prior& prior) {
@@ -643,7 +764,13 @@ InducingReport inducing_from(const ParsedJson& json, const Prior& prior) {
       of_latent.col(d) = feature;
     }
   }
-  return {std::move(points), integer(json.at("variables")), vector_from(json.at("left_out")), integer(json.at("start"))};
+  InducingReport inducing;
+  inducing.points = std::move(points);
+  inducing.n_variables = integer(json.at("variables"));
+  inducing.left_out = vector_from(json.at("left_out"));
+  inducing.n_start = integer(json.at("start"));
+  if (json.contains("stretches")) inducing.stretches = part_from(json.at("stretches"));
+  return inducing;
 }
 
 RestartReport restart_from(const ParsedJson& json) {
@@ -775,6 +902,21 @@ FitFile::FitFile(Model fitted_model, FitPriorOptions options_of_prior, const Fit
   }
   if (same) return;
   throw InputError("FitFile: the hyperparameters of the report are not those of the posterior");
+}
+
+std::vector<std::int64_t> FitFile::n_states() const {
+  if (report.inducing && report.inducing->summary) return report.inducing->summary->kept.n_states;
+  std::vector<std::int64_t> n;
+  for (const Observations& group : observations) n.push_back(group.n_data());
+  return n;
+}
+
+void FitFile::take_data(const Posterior& posterior) {
+  observations = posterior.observations();
+  if (!report.inducing) return;
+  const std::shared_ptr<const InducingSummary> before = std::exchange(report.inducing->summary, posterior.summary());
+  // scores are of the data that there were
+  if (before && before->kept.n_states != report.inducing->summary->kept.n_states) report.inducing->stretches.reset();
 }
 
 Posterior FitFile::posterior() const { return posterior_of(prior(), observations, report); }
@@ -921,7 +1063,15 @@ FitFile read_fit(std::string_view text, const std::filesystem::path& path, const
     }
     if (json.contains("actuators")) read_actuators(json.at("actuators"), fit);
     if (report.contains("draws")) fit.report.draws = draws_from(report.at("draws"), fit.report.hyperparameters);
-    if (report.contains("inducing")) fit.report.inducing = inducing_from(report.at("inducing"), prior);
+    if (report.contains("inducing")) {
+      const ParsedJson& inducing = report.at("inducing");
+      fit.report.inducing = inducing_from(inducing, prior);
+      if (inducing.contains("summary")) {
+        const ModelValues values = values_of(prior, fit.observations, fit.report).front();
+        require_values(prior, fit.observations, values);
+        fit.report.inducing->summary = summary_from(inducing.at("summary"), prior, values, fit.observations);
+      }
+    }
   } catch (const Json::exception& error) {
     throw InputError(fmt::format("{}: not a whole fit file: {}", path.string(), error.what()));
   } catch (const InputError& error) {

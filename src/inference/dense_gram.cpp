@@ -1,6 +1,7 @@
 #include "inference/dense_gram.hpp"
 
 #include <algorithm>
+#include <cassert>
 #include <utility>
 
 #include <Eigen/Cholesky>
@@ -26,6 +27,33 @@ int DenseGram::n_threads(const LatentRows& rows) const { return rows.n_samples()
 
 int DenseGram::n_blas_threads(const LatentRows& rows) const { return rows.size() >= large_size ? n_threads(rows) : 1; }
 
+namespace {
+
+// all rows in one block; null where it has a fault
+const RowBlock* whole(const RowBlocks& blocks, RowBlocks::Memory& memory) {
+  assert(blocks.n_blocks() == 1);
+  return blocks.block(0, true, memory);
+}
+
+}  // namespace
+
+std::optional<GramValue> DenseGram::value(const RowBlocks& blocks) {
+  RowBlocks::Memory memory;
+  const RowBlock* const block = whole(blocks, memory);
+  return block == nullptr ? std::nullopt : factorise(block->rows);
+}
+
+std::optional<GramValue> DenseGram::differentiate(const RowBlocks& blocks, const std::vector<GramGradientParts>& parts,
+                                                  GramGradient& gradient, const OfRows& of_rows) {
+  RowBlocks::Memory memory;
+  const RowBlock* const block = whole(blocks, memory);
+  const std::optional<GramValue> value = block == nullptr ? std::nullopt : factorise(block->rows);
+  if (!value) return std::nullopt;
+  gradient = differentiate(block->rows, parts);
+  of_rows(0, *block, gradient);
+  return value;
+}
+
 std::optional<GramValue> DenseGram::factorise(const LatentRows& rows) {
   const lapack::ManyThreads many_threads(n_blas_threads(rows));
   const std::optional<Sums>& sums = rows.reduction->sums;
@@ -39,7 +67,7 @@ std::optional<GramValue> DenseGram::factorise(const LatentRows& rows) {
   }
   factor_.lower().diagonal().array() += 1;
   if (is_set(stop_) || !factor_.factorise(rows.reduction->y, stop_)) return std::nullopt;
-  return GramValue{0.5 * factor_.z().squaredNorm(), factor_.log_det_half()};
+  return GramValue{0.5 * factor_.z().squaredNorm(), factor_.log_det_half(), rows.reduction->constant};
 }
 
 GramGradient DenseGram::differentiate(const LatentRows& rows, const std::vector<GramGradientParts>& parts) {
@@ -53,9 +81,9 @@ GramGradient DenseGram::differentiate(const LatentRows& rows, const std::vector<
   return gradient;
 }
 
-Gram::Inverse DenseGram::invert(const LatentRows& rows, const std::vector<std::vector<Index>>& sets) {
+LatentPosterior::Inverse DenseGram::invert(const LatentRows& rows, const std::vector<std::vector<Index>>& sets) {
   const lapack::ManyThreads many_threads(n_blas_threads(rows));
-  Inverse inverse{factor_.solve(), {}, {}};
+  LatentPosterior::Inverse inverse{factor_.solve(), {}, {}};
   const Ref<const MatrixXd> P = factor_.invert();
   const Reduction& reduction = *rows.reduction;
   const auto block = [&](const std::vector<Index>& of) {
@@ -76,7 +104,7 @@ Gram::Inverse DenseGram::invert(const LatentRows& rows, const std::vector<std::v
     if (factor.info() != Eigen::Success) return {std::move(inverse.alpha), std::move(inverse.blocks), {}};
     const VectorXd pull = factor.solve(inverse.alpha(of));
     const MatrixXd root = factor.matrixL().solve(MatrixXd::Identity(pull.size(), pull.size()));
-    WithoutSet& without = inverse.without.emplace_back();
+    LatentPosterior::WithoutSet& without = inverse.without.emplace_back();
     Index first = 0;
     for (const Index sample : set) {
       const Index rank = reduction.samples[static_cast<std::size_t>(sample)].R.rows();
@@ -87,12 +115,6 @@ Gram::Inverse DenseGram::invert(const LatentRows& rows, const std::vector<std::v
     }
   }
   return inverse;
-}
-
-std::unique_ptr<LatentPosterior> DenseGram::condition(const LatentRows& rows) const {
-  auto posterior = std::make_unique<DensePosterior>(rows);
-  if (!posterior->append(rows)) return nullptr;
-  return posterior;
 }
 
 }  // namespace gp2

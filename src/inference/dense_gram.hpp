@@ -14,10 +14,15 @@ class DenseGram final : public Gram {
   /// @param stop       set: factorise() gives nothing and differentiate() anything, within a second or so
   explicit DenseGram(int n_threads = 1, const std::atomic<bool>* stop = nullptr) : n_threads_(n_threads), stop_(stop) {}
 
-  [[nodiscard]] std::optional<GramValue> factorise(const LatentRows& rows) override;
-  [[nodiscard]] GramGradient differentiate(const LatentRows& rows, const std::vector<GramGradientParts>& parts) override;
-  [[nodiscard]] Inverse invert(const LatentRows& rows, const std::vector<std::vector<Eigen::Index>>& sets) override;
-  [[nodiscard]] std::unique_ptr<LatentPosterior> condition(const LatentRows& rows) const override;
+  /// Of all rows in one block.
+  [[nodiscard]] std::optional<GramValue> value(const RowBlocks& blocks) override;
+  [[nodiscard]] std::optional<GramValue> differentiate(const RowBlocks& blocks, const std::vector<GramGradientParts>& parts,
+                                                       GramGradient& gradient, const OfRows& of_rows) override;
+
+  [[nodiscard]] std::optional<GramValue> factorise(const LatentRows& rows);
+  /// Once after factorise of the same rows; so is invert.
+  [[nodiscard]] GramGradient differentiate(const LatentRows& rows, const std::vector<GramGradientParts>& parts);
+  [[nodiscard]] LatentPosterior::Inverse invert(const LatentRows& rows, const std::vector<std::vector<Eigen::Index>>& sets);
 
  private:
   [[nodiscard]] int n_threads(const LatentRows& rows) const;
@@ -35,6 +40,8 @@ class DensePosterior final : public LatentPosterior {
  public:
   /// Without observations; latents and kernels as those of `like`.
   explicit DensePosterior(const LatentRows& like);
+  /// Null where K̃ + I is not positive definite in double precision.
+  [[nodiscard]] static std::unique_ptr<LatentPosterior> condition(const LatentRows& rows);
   [[nodiscard]] std::unique_ptr<LatentPosterior> clone() const override;
 
   [[nodiscard]] Eigen::Index size() const override { return factor_.size(); }
@@ -44,7 +51,9 @@ class DensePosterior final : public LatentPosterior {
   [[nodiscard]] Eigen::MatrixXd whitening_columns(Eigen::Index first, Eigen::Index n) const override;
   [[nodiscard]] Eigen::VectorXd misfit(const std::vector<Eigen::MatrixXd>& f, RandomStream& random) const override;
   [[nodiscard]] std::vector<std::vector<Eigen::MatrixXd>> weights(Eigen::MatrixXd misfits) const override;
-  [[nodiscard]] bool append(const LatentRows& more) override;
+  [[nodiscard]] bool append(const RowBlocks& more) override;
+  [[nodiscard]] bool append(const LatentRows& more);
+  [[nodiscard]] Inverse invert(const LatentRows& rows, const std::vector<std::vector<Eigen::Index>>& sets) const override;
   void erase(const std::vector<Eigen::Index>& samples) override;
 
  private:

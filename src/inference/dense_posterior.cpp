@@ -3,6 +3,7 @@
 #include <utility>
 
 #include "base/lapack.hpp"
+#include "gp2/error.hpp"
 #include "inference/assemble.hpp"
 #include "inference/dense_gram.hpp"
 #include "inference/latent_sums.hpp"
@@ -102,6 +103,23 @@ MatrixXd DensePosterior::latent_weights(std::size_t a, const VectorXd& alpha) co
 void DensePosterior::refresh_weights() {
   const VectorXd alpha = weights_of_rows(factor_.solve());
   for (std::size_t a = 0; a < latents_.size(); ++a) latents_[a].beta = latent_weights(a, alpha);
+}
+
+std::unique_ptr<LatentPosterior> DensePosterior::condition(const LatentRows& rows) {
+  auto posterior = std::make_unique<DensePosterior>(rows);
+  if (!posterior->append(rows)) return nullptr;
+  return posterior;
+}
+
+LatentPosterior::Inverse DensePosterior::invert(const LatentRows& rows, const std::vector<std::vector<Index>>& sets) const {
+  DenseGram gram;
+  if (!gram.factorise(rows)) throw NumericalError("leave_one_out: the covariance of the observations cannot be factored");
+  return gram.invert(rows, sets);
+}
+
+bool DensePosterior::append(const RowBlocks& more) {
+  RowBlocks::Memory memory;
+  return append(more.block(0, false, memory)->rows);
 }
 
 bool DensePosterior::append(const LatentRows& more) {

@@ -9,6 +9,7 @@
 #include <fmt/format.h>
 
 #include "base/not_a_number.hpp"
+#include "data/evenly.hpp"
 #include "gp2/error.hpp"
 #include "gp2/inference/leave_one_out.hpp"
 
@@ -202,6 +203,8 @@ bool TrainingResidual::is_correlated() const {
 namespace {
 
 std::vector<TrainingResidual> training_residuals(const Posterior& posterior, const std::vector<LeaveOneOut>& left_out) {
+  // of many states some are left, which do not follow each other
+  const bool are_all = posterior.n_states() == n_states(posterior.observations());
   std::vector<TrainingResidual> residuals;
   for (std::size_t g = 0; g < left_out.size(); ++g) {
     const Observations& group = posterior.observations()[g];
@@ -227,7 +230,7 @@ std::vector<TrainingResidual> training_residuals(const Posterior& posterior, con
       one.n = static_cast<int>(errors.z.size());
       one.coverage95 = central_coverage(errors.vector(), VectorXd::Constant(1, 0.95))[0];
       // values that sums stand for are smoothed, and so their errors
-      one.serial_correlation = one.rms > 0 && !group.has_sums() ? products / one.rms : 0;
+      one.serial_correlation = one.rms > 0 && are_all && !group.has_sums() ? products / one.rms : 0;
       one.rms = std::sqrt(one.rms / std::max(1, one.n));
     }
   }
@@ -259,12 +262,10 @@ Evaluation::Part scores_of(const Posterior& posterior, const std::vector<LeaveOn
 // Whether stretches of the observations are stretches of time.
 bool has_stretches(const Posterior& posterior, bool has_time_order) {
   const int t = posterior.prior().system->layout().t();
-  int n_states = 0;
   for (const Observations& group : posterior.observations()) {
     has_time_order = has_time_order || group.states().row(t).allFinite();
-    n_states += group.n_data();
   }
-  return has_time_order && n_states >= 2 * CrossValidation::n_stretches;
+  return has_time_order && posterior.n_states() >= 2 * CrossValidation::n_stretches;
 }
 
 }  // namespace

@@ -1,5 +1,6 @@
 #pragma once
 
+#include <functional>
 #include <memory>
 #include <optional>
 #include <vector>
@@ -7,19 +8,20 @@
 #include <Eigen/Core>
 
 #include "base/random.hpp"
-#include "inference/latent_rows.hpp"
+#include "inference/row_blocks.hpp"
 
 // The seam between reduced observations and all that is inferred from them. How K̃ + I is solved stands behind it and nowhere
 // else:
 //
-//     Reduction ─> LatentRows ─> Gram ─┬─> GramValue, GramGradient ─> Likelihood
-//                                      └─> LatentPosterior ─> Posterior, PathwiseSamples, Predictor
+//     Reduction ─> LatentRows ─> RowBlocks ─┬─> Gram ─> GramValue, GramGradient ─> Likelihood
+//                                           └─> LatentPosterior ─> Posterior, PathwiseSamples, Predictor
 namespace gp2 {
 
 /// −log N(ỹ; 0, K̃ + I) = data_fit + complexity + ½ size log 2π.
 struct GramValue {
   double data_fit = 0;    // ½ ỹᵀ(K̃ + I)⁻¹ỹ
   double complexity = 0;  // ½ log|K̃ + I|
+  double constant = 0;    // of the rows' reductions: what no latent enters, with all log 2π
 };
 
 /// Which derivatives of one latent are needed.
@@ -31,7 +33,8 @@ struct GramGradientParts {
 };
 
 /// Derivatives of −log N(ỹ; 0, K̃ + I). Those in every hyperparameter and parameter follow from them by the chain rule at single
-/// samples (theory.md, T13 and T14), whatever the solver. P = (K̃ + I)⁻¹, S_ij = P_ij − α̃_iα̃_jᵀ.
+/// samples (theory.md, T13 and T14), whatever the solver. P = (K̃ + I)⁻¹, S_ij = P_ij − α̃_iα̃_jᵀ. `kernel` and `columns` are of all
+/// rows, the rest is of those of one block.
 struct GramGradient {
   struct OfLatent {
     Eigen::VectorXd kernel;   // ∂/∂log v: ½ Σ_ij ⟨S_ij, Z_i Z_jᵀ⟩ ∂k_ij/∂log v              (parameters)
@@ -90,9 +93,23 @@ class LatentPosterior {
   [[nodiscard]] virtual std::vector<std::vector<Eigen::MatrixXd>> weights(Eigen::MatrixXd misfits) const = 0;
 
   /// Conditions on more observations. False, and nothing has changed, where the covariance is not positive definite.
-  [[nodiscard]] virtual bool append(const LatentRows& more) = 0;
+  [[nodiscard]] virtual bool append(const RowBlocks& more) = 0;
   /// Takes observed samples away, by rising numbers in the order of adding.
   virtual void erase(const std::vector<Eigen::Index>& samples) = 0;
+
+  /// What all others say of a set B of samples (leave_one_out.hpp).
+  struct WithoutSet {
+    std::vector<Eigen::VectorXd> pull;        // of each sample: its rows of P_BB⁻¹α̃_B (r)
+    std::vector<Eigen::MatrixXd> covariance;  // its block of P_BB⁻¹ (r × r)
+  };
+  struct Inverse {
+    Eigen::VectorXd alpha;                // α̃
+    std::vector<Eigen::MatrixXd> blocks;  // P_ii of each sample (r × r)
+    std::vector<WithoutSet> without;      // per set; empty where double precision cannot tell
+  };
+  /// @param rows  of the observations that it is conditioned on, or of some of them, which are in `sets` as they were then
+  /// @param sets  of samples: none, or each sample in one of them
+  [[nodiscard]] virtual Inverse invert(const LatentRows& rows, const std::vector<std::vector<Eigen::Index>>& sets) const = 0;
 
  protected:
   LatentPosterior() = default;
@@ -109,29 +126,19 @@ class Gram {
  public:
   virtual ~Gram() = default;
 
-  /// Sums up the observations; nothing where K̃ + I is not positive definite in double precision.
-  [[nodiscard]] virtual std::optional<GramValue> factorise(const LatentRows& rows) = 0;
+  /// Nothing where K̃ + I is not positive definite in double precision, or a block has a fault.
+  [[nodiscard]] virtual std::optional<GramValue> value(const RowBlocks& blocks) = 0;
 
-  /// Once after factorise of the same rows.
+  /// Sums over blocks are of so many parts, each of blocks that follow each other: the same bits for any number of threads.
+  static constexpr int n_parts = 8;
+  /// Takes what belongs to the rows of a block; those of different parts at the same time.
+  using OfRows = std::function<void(int part, const RowBlock& block, const GramGradient& of_rows)>;
+
+  /// The value, and `kernel` and `columns` of its gradient.
   /// @param parts  per latent
-  [[nodiscard]] virtual GramGradient differentiate(const LatentRows& rows, const std::vector<GramGradientParts>& parts) = 0;
-
-  /// What all others say of a set B of samples (leave_one_out.hpp).
-  struct WithoutSet {
-    std::vector<Eigen::VectorXd> pull;        // of each sample: its rows of P_BB⁻¹α̃_B (r)
-    std::vector<Eigen::MatrixXd> covariance;  // its block of P_BB⁻¹ (r × r)
-  };
-  struct Inverse {
-    Eigen::VectorXd alpha;                // α̃
-    std::vector<Eigen::MatrixXd> blocks;  // P_ii of each sample (r × r)
-    std::vector<WithoutSet> without;      // per set; empty where double precision cannot tell
-  };
-  /// Once after factorise of the same rows.
-  /// @param sets  of samples: none, or each sample in one of them
-  [[nodiscard]] virtual Inverse invert(const LatentRows& rows, const std::vector<std::vector<Eigen::Index>>& sets) = 0;
-
-  /// The latents given the observations; null where K̃ + I is not positive definite in double precision.
-  [[nodiscard]] virtual std::unique_ptr<LatentPosterior> condition(const LatentRows& rows) const = 0;
+  [[nodiscard]] virtual std::optional<GramValue> differentiate(const RowBlocks& blocks,
+                                                               const std::vector<GramGradientParts>& parts,
+                                                               GramGradient& gradient, const OfRows& of_rows) = 0;
 };
 
 }  // namespace gp2

@@ -6,6 +6,7 @@
 #include <fmt/format.h>
 
 #include "base/lapack.hpp"
+#include "data/evenly.hpp"
 #include "gp2/error.hpp"
 #include "inference/inducing_latents.hpp"
 #include "inference/requirements.hpp"
@@ -21,15 +22,13 @@ namespace {
 // One latent at the candidates: what its points so far leave of its variance, and the factor that tells.
 class Candidates {
  public:
-  Candidates(const LatentRows& rows, std::size_t a, const std::vector<Index>& samples)
-      : latent_(rows.latents[a]),
-        kernel_(latent_.kernel.kernel(), latent_.kernel.features()(samples, Eigen::all), latent_.kernel.values()) {
+  Candidates(const LatentRows& rows, std::size_t a) : latent_(rows.latents[a]), kernel_(latent_.kernel) {
     const Index n = kernel_.n_points();
     weight_.setZero(n);
     left_.resize(n);
     VectorXd point;
     for (Index i = 0; i < n; ++i) {
-      weight_[i] = latent_.Z.row(samples[static_cast<std::size_t>(i)]).squaredNorm();
+      weight_[i] = latent_.Z.row(i).squaredNorm();
       kernel_.scale(i, point);
       left_[i] = kernel_.variance(point);
     }
@@ -63,28 +62,13 @@ class Candidates {
 
  private:
   const LatentRows::OfLatent& latent_;
-  KernelColumns kernel_;
+  const KernelColumns& kernel_;
   VectorXd weight_, left_;  // Σ_f ‖Γ_i,f‖²; k(φ_i, φ_i) − ‖w_i‖²
   double smallest_ = 0;
   Index next_ = 0;
   std::vector<Index> chosen_;
   MatrixXd factor_;  // column j: wᵀ of every candidate for point j
   KernelColumns::Workspace workspace_;
-};
-
-// observations as latents see them under values, which must outlive it
-struct Seen {
-  Reduction reduction;
-  LatentRows rows;
-
-  Seen(const Prior& prior, const std::vector<Observations>& observations, const ModelValues& values) {
-    require_observations(prior, observations);
-    require_values(prior, observations, values);
-    reduce(prior, observations, require_models(prior, observations, values.parameters, {}), values.noise_stddev, reduction);
-    rows = latent_rows(prior, observations, reduction, values);
-  }
-  Seen(const Seen&) = delete;
-  Seen& operator=(const Seen&) = delete;
 };
 
 }  // namespace
@@ -95,15 +79,17 @@ InducingChoice choose_inducing_points(const Prior& prior, const std::vector<Obse
   if (!(options.left_out > 0)) throw InputError(fmt::format("inducing: left_out must be positive, got {}", options.left_out));
   if (options.n_candidates < 1)
     throw InputError(fmt::format("inducing: n_candidates must be 1 or more, got {}", options.n_candidates));
-  const Seen seen(prior, observations, values);
-  const LatentRows& rows = seen.rows;
-  const Index n_samples = rows.n_samples(), n = std::min<Index>(n_samples, options.n_candidates);
-  std::vector<Index> samples;
-  for (Index i = 0; i < n; ++i) samples.push_back(i * n_samples / n);
-
+  require_observations(prior, observations);
+  require_values(prior, observations, values);
+  const int n_all = n_states(observations);
+  const std::vector<Observations> some = n_all > options.n_candidates ? evenly(observations, options.n_candidates) : observations;
+  Reduction reduction;
+  reduce(prior, some, require_models(prior, some, values.parameters, {}), values.noise_stddev, reduction);
+  const LatentRows rows = latent_rows(prior, some, reduction, values);
+  const Index n = rows.n_samples();
   std::vector<Candidates> latents;
-  for (std::size_t a = 0; a < rows.latents.size(); ++a) latents.emplace_back(rows, a, samples);
-  const double scale = n == 0 ? 0 : static_cast<double>(n_samples) / static_cast<double>(n);
+  for (std::size_t a = 0; a < rows.latents.size(); ++a) latents.emplace_back(rows, a);
+  const double scale = n == 0 ? 0 : static_cast<double>(n_all) / static_cast<double>(n);
   InducingChoice choice;
   for (;;) {
     choice.left_out = 0;
@@ -128,17 +114,21 @@ InducingChoice choose_inducing_points(const Prior& prior, const std::vector<Obse
 VectorXd left_out_by_points(const Prior& prior, const std::vector<Observations>& observations, const ModelValues& values,
                             int n_threads) {
   if (!values.inducing) throw InputError("left_out_by_points: the values have no inducing points");
+  require_observations(prior, observations);
+  require_values(prior, observations, values);
   const lapack::SingleThread single_thread;
-  const Seen seen(prior, observations, values);
-  const InducingLatents latents(*values.inducing, seen.rows);
-  std::vector<VectorXd> sums(n_block_parts, VectorXd::Zero(std::ssize(seen.rows.latents)));
-  for_each_block(latents, seen.rows, n_threads, nullptr, [&](std::size_t part, const InducingBlock& block) {
+  const InducingLatents latents(prior, values);
+  std::vector<VectorXd> sums(Gram::n_parts, VectorXd::Zero(std::ssize(prior.latents)));
+  const auto add = [&](int part, const RowBlock&, const InducingBlock& block) {
     for (std::size_t f = 0; f < latents.functions().size(); ++f) {
       const std::size_t a = latents.functions()[f].latent;
       const Eigen::ArrayXd left = block.variance(a) - block.w(a).colwise().squaredNorm().transpose();
-      sums[part][static_cast<Index>(a)] += (block.weight_product(f, f) * left).sum();
+      sums[static_cast<std::size_t>(part)][static_cast<Index>(a)] += (block.weight_product(f, f) * left).sum();
     }
-  });
+  };
+  if (!for_each_block(latents, BlocksOfStates(prior, observations, values), false, n_threads, nullptr, add)) {
+    static_cast<void>(require_models(prior, observations, values.parameters, {}));  // names the state
+  }
   for (std::size_t part = 1; part < sums.size(); ++part) sums.front() += sums[part];
   return sums.front();
 }

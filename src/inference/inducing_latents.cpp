@@ -13,15 +13,31 @@ using Eigen::MatrixXd;
 using Eigen::Ref;
 using Eigen::VectorXd;
 
-InducingLatents::InducingLatents(const InducingPoints& points, const LatentRows& rows) {
-  for (std::size_t a = 0; a < rows.latents.size(); ++a) {
-    const KernelColumns& kernel = rows.latents[a].kernel;
-    const MatrixXd& Z = points.features[a];
-    lapack::PivotedFactor factor =
-        lapack::factorise_semidefinite(kernel.kernel().evaluate(Z, Z, kernel.values()), smallest_pivot);
+namespace {
+
+std::vector<lapack::PivotedFactor> factors_of(const Prior& prior, const ModelValues& values) {
+  std::vector<lapack::PivotedFactor> factors;
+  for (std::size_t a = 0; a < prior.latents.size(); ++a) {
+    const MatrixXd& Z = values.inducing->features[a];
+    lapack::PivotedFactor& factor = factors.emplace_back(
+        lapack::factorise_semidefinite(prior.latents[a].kernel.evaluate(Z, Z, values.kernel[a]), smallest_pivot));
     factor.rows.resize(static_cast<std::size_t>(factor.L.cols()));
-    OfLatent& latent = latents_.emplace_back(OfLatent{KernelColumns(kernel.kernel(), Z(factor.rows, Eigen::all), kernel.values()),
-                                                      factor.L.topRows(factor.L.cols()), rows.latents[a].n_functions});
+    factor.L = factor.L.topRows(factor.L.cols()).eval();
+  }
+  return factors;
+}
+
+}  // namespace
+
+InducingLatents::InducingLatents(const Prior& prior, const ModelValues& values)
+    : InducingLatents(prior, values, factors_of(prior, values)) {}
+
+InducingLatents::InducingLatents(const Prior& prior, const ModelValues& values, std::vector<lapack::PivotedFactor> factors) {
+  for (std::size_t a = 0; a < prior.latents.size(); ++a) {
+    const MatrixXd Z = values.inducing->features[a](factors[a].rows, Eigen::all);
+    OfLatent& latent = latents_.emplace_back(OfLatent{KernelColumns(prior.latents[a].kernel, Z, values.kernel[a]),
+                                                      std::move(factors[a].L), std::move(factors[a].rows),
+                                                      values.loading(a).cols()});
     for (Index l = 0; l < latent.n_functions; ++l, size_ += latent.n_points()) functions_.push_back({a, l, size_});
   }
 }
@@ -33,34 +49,52 @@ void InducingLatents::solve(bool transposed, Ref<MatrixXd> c) const {
   }
 }
 
-InducingBlock::InducingBlock(const InducingLatents& latents, const LatentRows& rows) : latents_(&latents), rows_(&rows) {
-  for (const InducingLatents::OfLatent& latent : latents.latents()) {
-    k_.emplace_back(latent.kernel.n_rows(), size);
-    w_.emplace_back(latent.n_points(), size);
-    variance_.emplace_back(size);
-  }
-}
+InducingBlock::InducingBlock(const InducingLatents& latents)
+    : latents_(&latents), k_(latents.latents().size()), w_(k_.size()), variance_(k_.size()) {}
 
-void InducingBlock::move_to(Index first) {
-  first_ = first;
-  n_ = std::min(size, rows_->n_samples() - first);
+void InducingBlock::move_to(const LatentRows& rows) {
+  rows_ = &rows;
+  y_ = by_component(*rows.reduction, rows.reduction->y);
   for (std::size_t a = 0; a < k_.size(); ++a) {
     const InducingLatents::OfLatent& latent = latents_->latents()[a];
-    const MatrixXd& features = rows_->latents[a].kernel.features();
-    for (Index i = 0; i < n_; ++i) {
-      latent.kernel.scale(features.row(first + i).transpose(), point_);
+    const MatrixXd& features = rows.latents[a].kernel.features();
+    k_[a].resize(latent.kernel.n_rows(), n());
+    variance_[a].resize(n());
+    for (Index i = 0; i < n(); ++i) {
+      latent.kernel.scale(features.row(i).transpose(), point_);
       latent.kernel.evaluate(0, k_[a].rows(), point_, k_[a].col(i).data(), workspace_);
       variance_[a][i] = (1 + smallest_pivot) * latent.kernel.variance(point_);
     }
-    w_[a].leftCols(n_) = k_[a].topLeftCorner(latent.n_points(), n_);
-    lapack::solve_lower(latent.L, false, w_[a].leftCols(n_));
+    w_[a] = k_[a].topRows(latent.n_points());
+    lapack::solve_lower(latent.L, false, w_[a]);
   }
 }
 
 ArrayXd InducingBlock::weight_product(std::size_t f, std::size_t g) const {
-  ArrayXd sum = ArrayXd::Zero(n_);
-  for (Index c = 0; c < rows_->reduction->n_components(); ++c) sum += weight(f, c).array() * weight(g, c).array();
+  ArrayXd sum = ArrayXd::Zero(n());
+  for (Index c = 0; c < y_.cols(); ++c) sum += weight(f, c).array() * weight(g, c).array();
   return sum;
+}
+
+MatrixXd InducingBlock::loadings(Index component) const {
+  MatrixXd Psi(latents_->size(), n());
+  for (std::size_t f = 0; f < latents_->functions().size(); ++f) {
+    const InducingLatents::Function& function = latents_->functions()[f];
+    const MatrixXd& w = w_[function.latent];
+    Psi.middleRows(function.first, w.rows()) = w * weight(f, component).asDiagonal();
+  }
+  return Psi;
+}
+
+MatrixXd InducingBlock::misfit(const Ref<const VectorXd>& m) const {
+  MatrixXd misfit = y();
+  for (std::size_t f = 0; f < latents_->functions().size(); ++f) {
+    const InducingLatents::Function& function = latents_->functions()[f];
+    const MatrixXd& w = w_[function.latent];
+    const VectorXd mean = w.transpose() * m.segment(function.first, w.rows());
+    for (Index c = 0; c < misfit.cols(); ++c) misfit.col(c) -= weight(f, c).cwiseProduct(mean);
+  }
+  return misfit;
 }
 
 InducingStatistics::InducingStatistics(const InducingLatents& latents)
@@ -68,16 +102,18 @@ InducingStatistics::InducingStatistics(const InducingLatents& latents)
       c(VectorXd::Zero(latents.size())),
       weight(VectorXd::Zero(std::ssize(latents.latents()))) {}
 
-InducingStatistics::InducingStatistics(const InducingLatents& latents, const LatentRows& rows, int n_threads,
-                                       const std::atomic<bool>* stop)
-    : InducingStatistics(latents) {
-  const MatrixXd y = by_component(*rows.reduction, rows.reduction->y);
-  std::vector<InducingStatistics> sums(n_block_parts, *this);
-  std::vector<MatrixXd> memory(n_block_parts);
-  for_each_block(latents, rows, n_threads, stop, [&](std::size_t part, const InducingBlock& block) {
-    sums[part].add(latents, block, y, ArrayXd::Ones(block.n()), memory[part]);
+std::optional<InducingStatistics> InducingStatistics::of(const InducingLatents& latents, const RowBlocks& rows, int n_threads,
+                                                         const std::atomic<bool>* stop) {
+  InducingStatistics all(latents);
+  std::vector<InducingStatistics> sums(Gram::n_parts, all);
+  std::vector<MatrixXd> memory(Gram::n_parts);
+  const bool is_sound = for_each_block(latents, rows, false, n_threads, stop, [&](int part, const RowBlock&, const InducingBlock& block) {
+    const auto p = static_cast<std::size_t>(part);
+    sums[p].add(latents, block, memory[p]);
   });
-  for (const InducingStatistics& one : sums) add(one);
+  if (!is_sound) return std::nullopt;
+  for (const InducingStatistics& one : sums) all.add(one);
+  return all;
 }
 
 void InducingStatistics::add(const InducingStatistics& other) {
@@ -85,25 +121,24 @@ void InducingStatistics::add(const InducingStatistics& other) {
   c += other.c;
   yy += other.yy;
   trace += other.trace;
+  constant += other.constant;
   weight += other.weight;
 }
 
-void InducingStatistics::add(const InducingLatents& latents, const InducingBlock& block, const MatrixXd& y, const ArrayXd& share,
-                             MatrixXd& memory) {
+void InducingStatistics::add(const InducingLatents& latents, const InducingBlock& block, MatrixXd& memory) {
   const std::vector<InducingLatents::Function>& functions = latents.functions();
-  const auto y_of_block = y.middleRows(block.first(), block.n());
   for (std::size_t f = 0; f < functions.size(); ++f) {
-    const auto w = block.w(functions[f].latent);
-    const ArrayXd square = share * block.weight_product(f, f);
+    const MatrixXd& w = block.w(functions[f].latent);
+    const ArrayXd square = block.weight_product(f, f);
     trace += (square * (block.variance(functions[f].latent).array() - w.colwise().squaredNorm().transpose().array())).sum();
     weight[static_cast<Index>(functions[f].latent)] += square.sum();
     if (w.rows() == 0) continue;
     ArrayXd of_y = ArrayXd::Zero(block.n());
-    for (Index k = 0; k < y.cols(); ++k) of_y += block.weight(f, k).array() * y_of_block.col(k).array();
-    c.segment(functions[f].first, w.rows()).noalias() += w * (share * of_y).matrix();
+    for (Index k = 0; k < block.y().cols(); ++k) of_y += block.weight(f, k).array() * block.y().col(k).array();
+    c.segment(functions[f].first, w.rows()).noalias() += w * of_y.matrix();
     for (std::size_t g = 0; g <= f; ++g) {
-      const auto v = block.w(functions[g].latent);
-      const ArrayXd product = f == g ? ArrayXd(square.sqrt()) : ArrayXd(share * block.weight_product(f, g));
+      const MatrixXd& v = block.w(functions[g].latent);
+      const ArrayXd product = f == g ? ArrayXd(square.sqrt()) : block.weight_product(f, g);
       if (v.rows() == 0 || (product == 0).all()) continue;
       memory = v * product.matrix().asDiagonal();
       auto to = B.block(functions[f].first, functions[g].first, w.rows(), v.rows());
@@ -114,7 +149,8 @@ void InducingStatistics::add(const InducingLatents& latents, const InducingBlock
       }
     }
   }
-  yy += (share * y_of_block.array().square().rowwise().sum()).sum();
+  yy += block.y().squaredNorm();
+  constant += block.rows().reduction->constant;
 }
 
 }  // namespace gp2

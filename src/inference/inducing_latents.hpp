@@ -1,13 +1,15 @@
 #pragma once
 
 #include <atomic>
+#include <optional>
 #include <vector>
 
 #include <Eigen/Core>
 
+#include "base/lapack.hpp"
 #include "base/parallel.hpp"
 #include "gp2/inference/model_values.hpp"
-#include "inference/latent_rows.hpp"
+#include "inference/gram.hpp"
 #include "prior/kernel_columns.hpp"
 
 namespace gp2 {
@@ -21,8 +23,9 @@ constexpr double smallest_pivot = 1e-15;
 class InducingLatents {
  public:
   struct OfLatent {
-    KernelColumns kernel;  // k_a between the points and another
-    Eigen::MatrixXd L;     // k_a(Z, Z) = L Lᵀ
+    KernelColumns kernel;     // k_a between the points and another
+    Eigen::MatrixXd L;        // k_a(Z, Z) = L Lᵀ
+    std::vector<int> chosen;  // which of the points that were given Z are, in order
     Eigen::Index n_functions = 0;
 
     [[nodiscard]] Eigen::Index n_points() const { return L.rows(); }
@@ -35,7 +38,9 @@ class InducingLatents {
 
   InducingLatents() = default;
   /// Points whose functions the others already tell, to double precision, are left out.
-  InducingLatents(const InducingPoints& points, const LatentRows& rows);
+  InducingLatents(const Prior& prior, const ModelValues& values);
+  /// @param factors  per latent: of k_a(Z, Z), as they were found before; another processor might choose others
+  InducingLatents(const Prior& prior, const ModelValues& values, std::vector<lapack::PivotedFactor> factors);
 
   [[nodiscard]] Eigen::Index size() const { return size_; }  // M
   [[nodiscard]] const std::vector<OfLatent>& latents() const { return latents_; }
@@ -55,53 +60,64 @@ class InducingLatents {
 /// T37). One per thread.
 class InducingBlock {
  public:
-  static constexpr Eigen::Index size = 256;  // samples
+  explicit InducingBlock(const InducingLatents& latents);
 
-  InducingBlock(const InducingLatents& latents, const LatentRows& rows);
+  /// @param rows  must outlive what is asked
+  void move_to(const LatentRows& rows);
 
-  void move_to(Eigen::Index first);
-
-  [[nodiscard]] Eigen::Index first() const { return first_; }
-  [[nodiscard]] Eigen::Index n() const { return n_; }
+  [[nodiscard]] const LatentRows& rows() const { return *rows_; }
+  [[nodiscard]] Eigen::Index n() const { return rows_->n_samples(); }
+  /// ỹ, by component (n × components)
+  [[nodiscard]] auto y() const { return y_.topRows(n()); }
   /// k_a(Z, φ_i) (points, padded × n), and w = L⁻¹k (points × n).
   [[nodiscard]] const Eigen::MatrixXd& k(std::size_t latent) const { return k_[latent]; }
-  [[nodiscard]] auto w(std::size_t latent) const { return w_[latent].leftCols(n_); }
+  [[nodiscard]] const Eigen::MatrixXd& w(std::size_t latent) const { return w_[latent]; }
   /// k_a(φ_i, φ_i) at most (n)
-  [[nodiscard]] auto variance(std::size_t latent) const { return variance_[latent].head(n_); }
+  [[nodiscard]] const Eigen::VectorXd& variance(std::size_t latent) const { return variance_[latent]; }
   [[nodiscard]] auto weight(std::size_t f, Eigen::Index component) const {
     const InducingLatents::Function& function = latents_->functions()[f];
     const LatentRows::OfLatent& latent = rows_->latents[function.latent];
-    return latent.Z.col(component * latent.n_functions + function.index).segment(first_, n_);
+    return latent.Z.col(component * latent.n_functions + function.index).head(n());
   }
   /// Σ_c Γ_i,f Γ_i,g (n)
   [[nodiscard]] Eigen::ArrayXd weight_product(std::size_t f, std::size_t g) const;
+  /// Ψᵀ of one component (M × n).
+  [[nodiscard]] Eigen::MatrixXd loadings(Eigen::Index component) const;
+  /// ỹ − Ψ m, by component (n × components)
+  [[nodiscard]] Eigen::MatrixXd misfit(const Eigen::Ref<const Eigen::VectorXd>& m) const;
 
  private:
   const InducingLatents* latents_;
-  const LatentRows* rows_;
-  Eigen::Index first_ = 0, n_ = 0;
+  const LatentRows* rows_ = nullptr;
+  Eigen::MatrixXd y_;
   std::vector<Eigen::MatrixXd> k_, w_;
   std::vector<Eigen::VectorXd> variance_;
   Eigen::VectorXd point_;
   KernelColumns::Workspace workspace_;
 };
 
-/// Sums over blocks are of so many parts, each of blocks that follow each other, whatever the number of threads.
-constexpr int n_block_parts = 8;
-
-/// Calls work(part, block) for every block of samples.
+/// Calls work(part, RowBlock, InducingBlock) for every block of rows, as Gram::n_parts says.
 /// @param stop  set: leaves out the rest
+/// @returns whether no block has a fault
 template <typename Work>
-void for_each_block(const InducingLatents& latents, const LatentRows& rows, int n_threads, const std::atomic<bool>* stop,
-                    const Work& work) {
-  const Eigen::Index n_blocks = (rows.n_samples() + InducingBlock::size - 1) / InducingBlock::size;
-  parallel_for(n_block_parts, n_threads, [&](int part, int) {
-    InducingBlock block(latents, rows);
-    for (Eigen::Index b = part * n_blocks / n_block_parts; b < (part + 1) * n_blocks / n_block_parts && !is_set(stop); ++b) {
-      block.move_to(b * InducingBlock::size);
-      work(static_cast<std::size_t>(part), block);
+bool for_each_block(const InducingLatents& latents, const RowBlocks& rows, bool with_derivatives, int n_threads,
+                    const std::atomic<bool>* stop, const Work& work) {
+  std::atomic<bool> is_sound = true;
+  parallel_for(Gram::n_parts, n_threads, [&](int part, int) {
+    RowBlocks::Memory memory;
+    InducingBlock block(latents);
+    const Eigen::Index n = rows.n_blocks();
+    for (Eigen::Index b = part * n / Gram::n_parts; b < (part + 1) * n / Gram::n_parts && is_sound && !is_set(stop); ++b) {
+      const RowBlock* const of_rows = rows.block(b, with_derivatives, memory);
+      if (of_rows == nullptr) {
+        is_sound = false;
+        return;
+      }
+      block.move_to(of_rows->rows);
+      work(part, *of_rows, block);
     }
   });
+  return is_sound;
 }
 
 /// What observations say of whitened inducing variables: sums over blocks of samples.
@@ -110,20 +126,18 @@ struct InducingStatistics {
   Eigen::VectorXd c;       // Σ Ψᵀỹ (M)
   double yy = 0;           // Σ ỹᵀỹ
   double trace = 0;        // t
+  double constant = 0;     // of the reductions
   Eigen::VectorXd weight;  // per latent: Σ ‖Γ‖²
 
   InducingStatistics() = default;
-  /// The same bits for any number of threads.
-  InducingStatistics(const InducingLatents& latents, const LatentRows& rows, int n_threads,
-                     const std::atomic<bool>* stop = nullptr);
   explicit InducingStatistics(const InducingLatents& latents);  // of no samples
+  /// Nothing where a block has a fault.
+  [[nodiscard]] static std::optional<InducingStatistics> of(const InducingLatents& latents, const RowBlocks& rows, int n_threads,
+                                                            const std::atomic<bool>* stop = nullptr);
   void add(const InducingStatistics& other);
   /// Adds a block of samples.
-  /// @param y       ỹ, by component
-  /// @param share   of each sample: 1, or 0 where it is left out (n)
   /// @param memory  that is used again
-  void add(const InducingLatents& latents, const InducingBlock& block, const Eigen::MatrixXd& y, const Eigen::ArrayXd& share,
-           Eigen::MatrixXd& memory);
+  void add(const InducingLatents& latents, const InducingBlock& block, Eigen::MatrixXd& memory);
 };
 
 }  // namespace gp2

@@ -4,7 +4,6 @@
 #include <Eigen/QR>
 
 #include "base/lapack.hpp"
-#include "gp2/error.hpp"
 #include "inference/inducing_gram.hpp"
 #include "prior/padded_rows.hpp"
 
@@ -37,8 +36,8 @@ MatrixXd root_of_explained(const MatrixXd& S) {
 
 }  // namespace
 
-InducingPosterior::InducingPosterior(InducingLatents inducing, InducingStatistics statistics)
-    : inducing_(std::move(inducing)), statistics_(std::move(statistics)) {
+InducingPosterior::InducingPosterior(InducingLatents inducing, std::vector<InducingStatistics> stretches)
+    : inducing_(std::move(inducing)), stretches_(std::move(stretches)) {
   Index n_points = 0;
   for (const InducingLatents::OfLatent& latent : inducing_.latents()) n_points = std::max(n_points, latent.n_points());
   for (const InducingLatents::Function& function : inducing_.functions()) {
@@ -62,15 +61,18 @@ InducingPosterior::InducingPosterior(InducingLatents inducing, InducingStatistic
 }
 
 bool InducingPosterior::factorise() {
-  MatrixXd L = statistics_.B;
+  InducingStatistics all(inducing_);
+  for (const InducingStatistics& stretch : stretches_) all.add(stretch);
+  MatrixXd L = all.B;
   L.diagonal().array() += 1;
   if (!lapack::factorise(L)) return false;
+  all_ = std::move(all);
   L_ = std::move(L);
-  mean_ = statistics_.c;
+  mean_ = all_.c;
   lapack::solve_lower(L_, false, mean_);
   lapack::solve_lower(L_, true, mean_);
   // X = T L⁻¹, from its transpose
-  MatrixXd transposed = root_of_explained(statistics_.B).transpose();
+  MatrixXd transposed = root_of_explained(all_.B).transpose();
   inducing_.solve(true, transposed);
   X_ = transposed.transpose();
   VectorXd weights = mean_;
@@ -92,7 +94,7 @@ std::vector<MatrixXd> InducingPosterior::latent_weights(const Ref<const VectorXd
 
 GramValue InducingPosterior::value() const {
   const double explained = (L_.transpose().triangularView<Eigen::Upper>() * mean_).squaredNorm();  // cᵀB⁻¹c
-  return {0.5 * (statistics_.yy - explained), L_.diagonal().array().log().sum() + 0.5 * statistics_.trace};
+  return {0.5 * (all_.yy - explained), L_.diagonal().array().log().sum() + 0.5 * all_.trace, all_.constant};
 }
 
 void InducingPosterior::whiten(Ref<MatrixXd> c) const { lapack::multiply_lower(X_, c); }
@@ -121,17 +123,65 @@ std::vector<std::vector<MatrixXd>> InducingPosterior::weights(MatrixXd misfits) 
   return weights;
 }
 
-bool InducingPosterior::append(const LatentRows& more) {
-  const InducingStatistics of_more(inducing_, more, 1);
-  const InducingStatistics before = statistics_;
-  statistics_.add(of_more);
-  if (factorise()) return true;
-  statistics_ = before;
-  return false;
+bool InducingPosterior::append(const RowBlocks& more) {
+  const std::optional<InducingStatistics> of_more = InducingStatistics::of(inducing_, more, 1);
+  if (!of_more) return false;
+  std::vector<InducingStatistics> before = std::exchange(stretches_, {all_, *of_more});
+  if (!factorise()) {
+    stretches_ = std::move(before);
+    return false;
+  }
+  stretches_ = {all_};
+  return true;
 }
 
-void InducingPosterior::erase(const std::vector<Index>& /*samples*/) {
-  throw InputError("what was learned through inducing points cannot be taken away: the observations themselves are not kept");
+// With P = I − Ψ B⁻¹Ψᵀ the inverse of a set is P_BB⁻¹ = I + Ψ_B B₋⁻¹Ψ_Bᵀ, and P_BB⁻¹α̃_B = ỹ_B − Ψ_B B₋⁻¹c₋, where B₋ and c₋ are of
+// all other samples: sums of what each stretch says, so that nothing is taken from anything.
+LatentPosterior::Inverse InducingPosterior::invert(const LatentRows& rows, const std::vector<std::vector<Index>>& sets) const {
+  const lapack::SingleThread single_thread;
+  const Reduction& reduction = *rows.reduction;
+  InducingBlock block(inducing_);
+  block.move_to(rows);
+  std::vector<MatrixXd> Psi;
+  for (Index c = 0; c < reduction.n_components(); ++c) Psi.push_back(block.loadings(c));
+  // I ± Ψ_i(LLᵀ)⁻¹Ψ_iᵀ from L⁻¹Ψᵀ by component
+  const auto halves = [&](const MatrixXd& L) {
+    std::vector<MatrixXd> half = Psi;
+    for (MatrixXd& one : half) lapack::solve_lower(L, false, one);
+    return half;
+  };
+  const auto rank_of = [&](Index sample) { return reduction.samples[static_cast<std::size_t>(sample)].R.rows(); };
+  const auto block_of = [&](const std::vector<MatrixXd>& half, Index i, double sign) {
+    const Index rank = rank_of(i);
+    MatrixXd square = MatrixXd::Identity(rank, rank);
+    for (Index c = 0; c < rank; ++c) {
+      for (Index d = 0; d < rank; ++d)
+        square(c, d) += sign * half[static_cast<std::size_t>(c)].col(i).dot(half[static_cast<std::size_t>(d)].col(i));
+    }
+    return square;
+  };
+
+  Inverse inverse{in_rows(reduction, block.misfit(mean_)), {}, {}};
+  const std::vector<MatrixXd> half = halves(L_);
+  for (Index i = 0; i < rows.n_samples(); ++i) inverse.blocks.push_back(block_of(half, i, -1));
+  for (std::size_t k = 0; k < sets.size(); ++k) {
+    InducingStatistics others(inducing_);
+    for (std::size_t other = 0; other < stretches_.size(); ++other) {
+      if (other != k) others.add(stretches_[other]);
+    }
+    others.B.diagonal().array() += 1;
+    if (!lapack::factorise(others.B)) return {std::move(inverse.alpha), std::move(inverse.blocks), {}};
+    lapack::solve_lower(others.B, false, others.c);
+    lapack::solve_lower(others.B, true, others.c);
+    const MatrixXd pull = block.misfit(others.c);
+    const std::vector<MatrixXd> of_others = halves(others.B);
+    WithoutSet& without = inverse.without.emplace_back();
+    for (const Index sample : sets[k]) {
+      without.pull.emplace_back(pull.row(sample).head(rank_of(sample)));
+      without.covariance.push_back(block_of(of_others, sample, 1));
+    }
+  }
+  return inverse;
 }
 
 }  // namespace gp2

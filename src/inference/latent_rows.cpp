@@ -9,7 +9,11 @@ using Eigen::MatrixXd;
 
 LatentRows latent_rows(const Prior& prior, const std::vector<Observations>& observations, const Reduction& reduction,
                        const ModelValues& values) {
-  const std::vector<MatrixXd> features = sorted_features(prior, features_by_group(prior, observations), reduction);
+  return latent_rows(prior, sorted_features(prior, features_by_group(prior, observations), reduction), reduction, values);
+}
+
+LatentRows latent_rows(const Prior& prior, const std::vector<MatrixXd>& features, const Reduction& reduction,
+                       const ModelValues& values) {
   LatentRows rows{&reduction, {}};
   for (std::size_t a = 0; a < prior.latents.size(); ++a) {
     const MatrixXd C = values.loading(a);
@@ -49,6 +53,14 @@ MatrixXd by_component(const Reduction& reduction, const MatrixXd& rows) {
     padded.block(0, c * rows.cols(), n, rows.cols()) = rows.middleRows(reduction.offset[static_cast<std::size_t>(c)], n);
   }
   return padded;
+}
+
+Eigen::VectorXd in_rows(const Reduction& reduction, const MatrixXd& by_component) {
+  Eigen::VectorXd rows(reduction.size());
+  for (std::size_t c = 0; c < reduction.count.size(); ++c) {
+    rows.segment(reduction.offset[c], reduction.count[c]) = by_component.col(static_cast<Index>(c)).head(reduction.count[c]);
+  }
+  return rows;
 }
 
 }  // namespace gp2

@@ -28,6 +28,9 @@ struct LatentRows {
 /// @param reduction  of these observations; must outlive the result
 LatentRows latent_rows(const Prior& prior, const std::vector<Observations>& observations, const Reduction& reduction,
                        const ModelValues& values);
+/// @param features  sorted_features
+LatentRows latent_rows(const Prior& prior, const std::vector<Eigen::MatrixXd>& features, const Reduction& reduction,
+                       const ModelValues& values);
 
 /// φ_a at the states of each Observations: [group][latent] (N × D_a).
 std::vector<std::vector<Eigen::MatrixXd>> features_by_group(const Prior& prior, const std::vector<Observations>& observations);
@@ -40,5 +43,7 @@ std::vector<Eigen::MatrixXd> sorted_features(const Prior& prior,
 /// Reduced rows laid out for the loops over samples: column c·(columns of `rows`) + l holds entry l of component c of each
 /// sample, in the order of the reduction, zero where a sample has no such component, and padded to whole vectors (simd.hpp).
 Eigen::MatrixXd by_component(const Reduction& reduction, const Eigen::MatrixXd& rows);
+/// And back, of single numbers (samples × components).
+Eigen::VectorXd in_rows(const Reduction& reduction, const Eigen::MatrixXd& by_component);
 
 }  // namespace gp2

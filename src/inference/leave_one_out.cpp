@@ -11,9 +11,9 @@
 #include "base/lapack.hpp"
 #include "base/not_a_number.hpp"
 #include "gp2/error.hpp"
-#include "inference/inducing_gram.hpp"
 #include "inference/latent_sums.hpp"
 #include "inference/query.hpp"
+#include "inference/stretches.hpp"
 
 namespace gp2 {
 
@@ -33,7 +33,7 @@ std::vector<LeaveOneOut> unknown(const std::vector<Observations>& observations) 
 }
 
 // Each value from all others.
-std::vector<LeaveOneOut> each_value(const Posterior& posterior, const Reduction& reduction, const Gram::Inverse& inverse) {
+std::vector<LeaveOneOut> each_value(const Posterior& posterior, const Reduction& reduction, const LatentPosterior::Inverse& inverse) {
   const std::vector<Observations>& observations = posterior.observations();
   const ModelValues& values = posterior.values();
   std::vector<LeaveOneOut> out = unknown(observations);
@@ -66,18 +66,19 @@ std::vector<LeaveOneOut> each_value(const Posterior& posterior, const Reduction&
 }
 
 // The samples of each stretch, which is the same share of the states of every Observations.
-std::vector<std::vector<Index>> samples_of_stretches(const Posterior& posterior, const Reduction& reduction, int n_stretches) {
-  if (n_stretches == 0) return {};
-  const std::vector<Observations>& observations = posterior.observations();
+std::vector<std::vector<Index>> samples_of_stretches(const Posterior::Implementation& self, const Reduction& reduction,
+                                                     int n_stretches) {
+  if (n_stretches == 0 || (self.kept && self.kept->stretch_of.empty())) return {};
   std::vector<std::vector<int>> stretch_of;  // by Observations and state
-  for (const Observations& group : observations) {
-    std::vector<int> order(static_cast<std::size_t>(group.n_data()));
-    std::iota(order.begin(), order.end(), 0);
-    const auto t = group.states().row(posterior.prior().system->layout().t());
-    if (t.allFinite()) std::stable_sort(order.begin(), order.end(), [&](int i, int j) { return t[i] < t[j]; });
-    std::vector<int>& of_states = stretch_of.emplace_back(order.size());
-    for (std::size_t k = 0; k < order.size(); ++k) {
-      of_states[static_cast<std::size_t>(order[k])] = static_cast<int>(k * static_cast<std::size_t>(n_stretches) / order.size());
+  if (self.kept) {
+    stretch_of = self.kept->stretch_of;
+  } else {
+    for (const Observations& group : self.observations) {
+      std::vector<int>& of_states = stretch_of.emplace_back(static_cast<std::size_t>(group.n_data()));
+      const auto states = states_of_stretches(group, self.prior.system->layout().t(), n_stretches);
+      for (std::size_t k = 0; k < states.size(); ++k) {
+        for (const int i : states[k]) of_states[static_cast<std::size_t>(i)] = static_cast<int>(k);
+      }
     }
   }
   std::vector<std::vector<Index>> samples(static_cast<std::size_t>(n_stretches));
@@ -111,7 +112,7 @@ void add_sample(const Posterior& posterior, const Reduction::Sample& sample, con
 }
 
 // Each value from those of other stretches; empty where double precision cannot tell.
-std::vector<LeaveOneOut> each_stretch(const Posterior& posterior, const Reduction& reduction, const Gram::Inverse& inverse,
+std::vector<LeaveOneOut> each_stretch(const Posterior& posterior, const Reduction& reduction, const LatentPosterior::Inverse& inverse,
                                       const std::vector<std::vector<Index>>& stretches) {
   if (inverse.without.empty()) return {};
   std::vector<LeaveOneOut> out = unknown(posterior.observations());
@@ -240,19 +241,17 @@ LeftOut leave_out_of(const Posterior& posterior, const Posterior::Implementation
   const ModelValues& values = posterior.values();
   Reduction reduction;
   reduce(prior, observations, require_models(prior, observations, values.parameters, {}), values.noise_stddev, reduction);
-  const std::vector<std::vector<Index>> stretches = samples_of_stretches(posterior, reduction, n_stretches);
+  const std::vector<std::vector<Index>> stretches = samples_of_stretches(self, reduction, n_stretches);
   if (reduction.sums) {
     std::vector<std::vector<Index>> each;
     for (Index s = 0; s < reduction.n_samples(); ++s) each.push_back({s});
     const WithoutSums without(posterior, self, reduction);
     return {without.leave_out(each), n_stretches > 0 ? without.leave_out(stretches) : std::vector<LeaveOneOut>{}};
   }
-  const LatentRows rows = latent_rows(prior, observations, reduction, values);
-  const std::unique_ptr<Gram> gram = make_gram(values);
-  if (!gram->factorise(rows)) throw NumericalError("leave_one_out: the covariance of the observations cannot be factored");
-  const Gram::Inverse inverse = gram->invert(rows, stretches);
+  const LatentPosterior::Inverse inverse =
+      self.latents->invert(latent_rows(prior, observations, reduction, values), stretches);
   LeftOut out{each_value(posterior, reduction, inverse), {}};
-  if (n_stretches > 0) out.stretches = each_stretch(posterior, reduction, inverse, stretches);
+  if (!stretches.empty()) out.stretches = each_stretch(posterior, reduction, inverse, stretches);
   return out;
 }
 
@@ -260,6 +259,10 @@ LeftOut leave_out_of(const Posterior& posterior, const Posterior::Implementation
 
 LeftOut leave_out(const Posterior& posterior, int n_stretches) {
   if (n_stretches < 0) throw InputError(fmt::format("leave_out: n_stretches must not be negative, got {}", n_stretches));
+  if (posterior.values().inducing && n_stretches != 0 && n_stretches != LeftOut::n_stretches) {
+    throw InputError(fmt::format("leave_out: n_stretches must be 0 or {} through inducing points, got {}",
+                                 LeftOut::n_stretches, n_stretches));
+  }
   const lapack::SingleThread single_thread;
   std::vector<LeftOut> of_components;
   for (int k = 0; k < posterior.n_components(); ++k) {

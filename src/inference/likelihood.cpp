@@ -5,6 +5,7 @@
 #include <utility>
 
 #include "base/parallel.hpp"
+#include "inference/dense_gram.hpp"
 #include "inference/inducing_gram.hpp"
 #include "inference/requirements.hpp"
 #include "inference/sample_gradient.hpp"
@@ -19,17 +20,23 @@ struct Likelihood::Implementation {
   Prior prior;
   std::vector<Observations> observations;
   Options options;
-  std::vector<std::vector<MatrixXd>> features;  // [group][latent] (N × D)
+  std::vector<std::vector<MatrixXd>> features;  // [group][latent] (N × D); none through inducing points
 
   // kept when nothing they depend on can change
   std::optional<std::vector<ObservationModel>> fixed_models;
   std::optional<Reduction> fixed_reduction;
+  std::vector<BlocksOfStates::Kept> kept_blocks;  // through inducing points, where they are small enough
   int initial_size = 0;
   std::shared_ptr<const char> identity = std::make_shared<const char>();
 
+  // what is made once, under the values that nothing changes
+  void prepare(const ModelValues& initial);
+  void prepare_blocks(const ModelValues& initial);
   // whether derivatives at single samples are asked for
   [[nodiscard]] bool differentiates_samples() const { return options.noise_gradient || !options.gradient_parameters.empty(); }
-  [[nodiscard]] std::vector<GramGradientParts> parts(const Reduction& reduction, const ModelValues& values) const;
+  [[nodiscard]] std::vector<GramGradientParts> parts(const Reduction* reduction, const ModelValues& values) const;
+  // adds what belongs to the rows of a block
+  void add_rows(const RowBlock& block, const GramGradient& of_rows, const ModelValues& values, ModelGradient& gradient) const;
 };
 
 struct Likelihood::Workspace::Implementation {
@@ -39,20 +46,20 @@ struct Likelihood::Workspace::Implementation {
   std::shared_ptr<const char> owner;
   int n_threads;
   const std::atomic<bool>* stop;
-  std::unique_ptr<Gram> gram;
-  std::shared_ptr<const InducingPoints> inducing;  // of `gram`
+  DenseGram gram{n_threads, stop};
 
   std::vector<ObservationModel> own_models;  // where parameters are estimated …
   VectorXd modelled;                         // … at these, none: not yet
   bool has_derivatives = false;              // whether own_models has them
   Reduction own_reduction;                   // where parameters or the noise are estimated
 
-  LatentRows rows;
-  std::vector<std::pair<int, int>> sample_ids;  // (group, index) of the samples in `rows`
+  RowBlock whole;
+  std::vector<std::pair<int, int>> sample_ids;  // (group, index) of the samples in `whole`
   std::vector<MatrixXd> D;                      // per latent: R_i E_a, by component
 
   void start(const Likelihood::Implementation& self);
-  Gram& gram_of(const ModelValues& values);
+  // all rows under these values; false where the mechanics have a fault
+  [[nodiscard]] bool move_to(const Likelihood::Implementation& self, const ModelValues& values, bool with_derivatives);
   // null where the mechanics have a fault
   [[nodiscard]] const std::vector<ObservationModel>* models(const Likelihood::Implementation& self, const VectorXd& parameters,
                                                             bool with_derivatives);
@@ -64,16 +71,18 @@ struct Likelihood::Workspace::Implementation {
 void Likelihood::Workspace::Implementation::start(const Likelihood::Implementation& self) {
   if (owner == self.identity) return;
   modelled.resize(0);
-  rows = {};
+  whole = {};
   owner = self.identity;
 }
 
-Gram& Likelihood::Workspace::Implementation::gram_of(const ModelValues& values) {
-  if (gram == nullptr || inducing != values.inducing) {
-    gram = make_gram(values, n_threads, stop);
-    inducing = values.inducing;
-  }
-  return *gram;
+bool Likelihood::Workspace::Implementation::move_to(const Likelihood::Implementation& self, const ModelValues& values,
+                                                    bool with_derivatives) {
+  start(self);
+  whole.models = models(self, values.parameters, with_derivatives);
+  if (whole.models == nullptr) return false;
+  whole.observations = &self.observations;
+  update_rows(self, reduction(self, *whole.models, values), values);
+  return true;
 }
 
 const std::vector<ObservationModel>* Likelihood::Workspace::Implementation::models(const Likelihood::Implementation& self,
@@ -99,6 +108,7 @@ const Reduction& Likelihood::Workspace::Implementation::reduction(const Likeliho
 
 void Likelihood::Workspace::Implementation::update_rows(const Likelihood::Implementation& self, const Reduction& reduction,
                                                         const ModelValues& values) {
+  LatentRows& rows = whole.rows;
   const std::size_t n_latents = self.prior.latents.size();
   std::vector<std::pair<int, int>> ids;
   ids.reserve(reduction.samples.size());
@@ -140,14 +150,45 @@ Likelihood::Likelihood(Prior prior, std::vector<Observations> observations, cons
   self.prior = std::move(prior);
   self.observations = std::move(observations);
   self.options = std::move(options);
-  self.features = features_by_group(self.prior, self.observations);
-  std::vector<ObservationModel> models = require_models(self.prior, self.observations, initial.parameters, {});
+  if (initial.inducing) {
+    self.prepare_blocks(initial);
+  } else {
+    self.prepare(initial);
+  }
+}
+
+void Likelihood::Implementation::prepare(const ModelValues& initial) {
+  features = features_by_group(prior, observations);
+  std::vector<ObservationModel> models = require_models(prior, observations, initial.parameters, {});
   Reduction reduction;
-  reduce(self.prior, self.observations, models, initial.noise_stddev, reduction);
-  self.initial_size = static_cast<int>(reduction.size());
-  if (!self.options.gradient_parameters.empty()) return;
-  if (!self.options.noise_gradient) self.fixed_reduction = std::move(reduction);
-  self.fixed_models = std::move(models);
+  reduce(prior, observations, models, initial.noise_stddev, reduction);
+  initial_size = static_cast<int>(reduction.size());
+  if (!options.gradient_parameters.empty()) return;
+  if (!options.noise_gradient) fixed_reduction = std::move(reduction);
+  fixed_models = std::move(models);
+}
+
+void Likelihood::Implementation::prepare_blocks(const ModelValues& initial) {
+  const BlocksOfStates blocks(prior, observations, initial);
+  std::vector<BlocksOfStates::Kept> kept(static_cast<std::size_t>(blocks.n_blocks()));
+  std::atomic<std::size_t> bytes = 0;
+  std::atomic<bool> is_sound = true;
+  std::atomic<Index> size = 0;
+  parallel_for(static_cast<int>(blocks.n_blocks()), options.n_threads, [&](int b, int) {
+    RowBlocks::Memory memory;
+    const RowBlock* const block = blocks.block(b, false, memory);
+    if (block == nullptr) {
+      is_sound = false;
+      return;
+    }
+    size += block->rows.size();
+    if (!options.gradient_parameters.empty() || bytes > BlocksOfStates::most_kept_bytes) return;
+    kept[static_cast<std::size_t>(b)] = blocks.keep(*block, !options.noise_gradient);
+    bytes += kept[static_cast<std::size_t>(b)].bytes();
+  });
+  if (!is_sound) static_cast<void>(require_models(prior, observations, initial.parameters, {}));  // names the state
+  initial_size = static_cast<int>(size);
+  if (options.gradient_parameters.empty() && bytes <= BlocksOfStates::most_kept_bytes) kept_blocks = std::move(kept);
 }
 
 Likelihood::~Likelihood() = default;
@@ -158,13 +199,14 @@ const Prior& Likelihood::prior() const { return implementation().prior; }
 const std::vector<Observations>& Likelihood::observations() const { return implementation().observations; }
 int Likelihood::reduced_size() const { return implementation().initial_size; }
 
-std::vector<GramGradientParts> Likelihood::Implementation::parts(const Reduction& reduction, const ModelValues& values) const {
+// @param reduction  of all rows; null: through inducing points
+std::vector<GramGradientParts> Likelihood::Implementation::parts(const Reduction* reduction, const ModelValues& values) const {
   std::vector<GramGradientParts> parts;
   for (std::size_t a = 0; a < prior.latents.size(); ++a) {
     const Latent& latent = prior.latents[a];
     GramGradientParts& part = parts.emplace_back();
     part.kernel = !latent.kernel_is_fixed && values.kernel[a].size() > 0;
-    part.alike = reduction.same_directions[a] && !differentiates_samples() && !values.inducing;
+    part.alike = reduction != nullptr && reduction->same_directions[a] && !differentiates_samples();
     part.V = differentiates_samples() || (values.has_free_loading(a) && !part.alike);
     part.columns = part.kernel || part.V || !latent.signal_is_fixed;
     part.mean = differentiates_samples();
@@ -187,12 +229,33 @@ MatrixXd loading_gradient(const GramGradient::OfLatent& of_gram, bool alike, con
   }
   MatrixXd gradient = MatrixXd::Zero(p, m);
   for (Index c = 0; c < n_components; ++c) {
-    gradient.noalias() += D.middleCols(c * p, p).transpose() * of_gram.V.middleCols(c * m, m);
+    gradient.noalias() += D.block(0, c * p, of_gram.V.rows(), p).transpose() * of_gram.V.middleCols(c * m, m);
   }
   return gradient;
 }
 
 }  // namespace
+
+void Likelihood::Implementation::add_rows(const RowBlock& block, const GramGradient& of_rows, const ModelValues& values,
+                                          ModelGradient& gradient) const {
+  const Reduction& reduction = *block.rows.reduction;
+  for (std::size_t a = 0; a < prior.latents.size(); ++a) {
+    if (!values.has_free_loading(a) || of_rows.latents[a].columns.size() + of_rows.latents[a].V.size() == 0) continue;
+    const bool is_alike = of_rows.latents[a].V.size() == 0;
+    gradient.free_loading[a] += loading_gradient(of_rows.latents[a], is_alike, by_component(reduction, reduction.directions[a]),
+                                                 reduction.n_components(), values.loading(a));
+  }
+  if (!differentiates_samples()) return;
+  // T13
+  SampleGradient of_sample(options, block, values, of_rows);
+  for (Index i = 0; i < reduction.n_samples(); ++i) of_sample.add(i, gradient);
+  if (reduction.sums && options.noise_gradient) {
+    for (Index r = 0; r < reduction.sums->size(); ++r) {
+      const Sums::Of& of = reduction.sums->of[static_cast<std::size_t>(r)];
+      if (of.group >= 0) gradient.log_noise_stddev[static_cast<std::size_t>(of.group)][of.row] += of_rows.log_noise[r];
+    }
+  }
+}
 
 double Likelihood::evaluate(const ModelValues& values, ModelGradient* gradient, Workspace& workspace) const {
   constexpr double infinity = std::numeric_limits<double>::infinity();
@@ -200,47 +263,37 @@ double Likelihood::evaluate(const ModelValues& values, ModelGradient* gradient, 
   Workspace::Implementation& work = require_held(workspace.implementation_, "Likelihood::Workspace");
   require_values(self.prior, self.observations, values);
 
-  // T10, T11: the observations under these values
-  work.start(self);
-  const std::vector<ObservationModel>* const models = work.models(self, values.parameters, gradient != nullptr);
-  if (models == nullptr) return infinity;
-  const Reduction& reduction = work.reduction(self, *models, values);
-  work.update_rows(self, reduction, values);
-
-  // T12
-  Gram& gram = work.gram_of(values);
-  const std::optional<GramValue> of_gram_value = gram.factorise(work.rows);
-  if (!of_gram_value) return infinity;
-  const double value = reduction.constant + of_gram_value->data_fit + of_gram_value->complexity;
-  if (!std::isfinite(value)) return infinity;
-  if (gradient == nullptr) return value;
-
-  // T14
-  const std::vector<GramGradientParts> parts = self.parts(reduction, values);
-  const GramGradient of_gram = gram.differentiate(work.rows, parts);
-  if (is_set(work.stop)) return infinity;  // the gradient may be that of a part
-  *gradient = ModelGradient::zero(values);
-  for (std::size_t a = 0; a < parts.size(); ++a) {
-    const GramGradient::OfLatent& of_latent = of_gram.latents[a];
-    if (parts[a].kernel) gradient->log_kernel[a] = of_latent.kernel;
-    if (!parts[a].columns) continue;
-    if (values.has_free_loading(a)) {
-      gradient->free_loading[a] =
-          loading_gradient(of_latent, parts[a].alike, work.D[a], reduction.n_components(), values.loading(a));
-    } else {
-      gradient->log_signal_stddev[a] = of_latent.columns;
-    }
+  // T10, T11: the observations under these values, and what solves for them
+  std::unique_ptr<RowBlocks> blocks;
+  std::unique_ptr<InducingGram> through_points;
+  if (values.inducing) {
+    blocks = std::make_unique<BlocksOfStates>(self.prior, self.observations, values, self.options.gradient_parameters,
+                                              self.kept_blocks.empty() ? nullptr : &self.kept_blocks);
+    through_points = std::make_unique<InducingGram>(InducingLatents(self.prior, values), work.n_threads, work.stop);
+  } else {
+    if (!work.move_to(self, values, gradient != nullptr)) return infinity;
+    blocks = std::make_unique<WholeRows>(work.whole);
   }
+  Gram& gram = through_points ? static_cast<Gram&>(*through_points) : work.gram;
 
-  // T13
-  if (!self.differentiates_samples()) return value;
-  SampleGradient of_sample(self.options, self.observations, *models, reduction, values, of_gram);
-  for (Index i = 0; i < reduction.n_samples(); ++i) of_sample.add(i, *gradient);
-  if (reduction.sums && self.options.noise_gradient) {
-    for (Index r = 0; r < reduction.sums->size(); ++r) {
-      const Sums::Of& of = reduction.sums->of[static_cast<std::size_t>(r)];
-      if (of.group >= 0) gradient->log_noise_stddev[static_cast<std::size_t>(of.group)][of.row] += of_gram.log_noise[r];
-    }
+  // T12, T14
+  const auto total = [](const std::optional<GramValue>& value) {
+    const double sum = value ? value->data_fit + value->complexity + value->constant : infinity;
+    return std::isfinite(sum) ? sum : infinity;
+  };
+  if (gradient == nullptr) return total(gram.value(*blocks));
+  const std::vector<GramGradientParts> parts = self.parts(through_points ? nullptr : work.whole.rows.reduction, values);
+  std::vector<ModelGradient> of_part(Gram::n_parts, ModelGradient::zero(values));
+  GramGradient of_gram;
+  const double value = total(gram.differentiate(*blocks, parts, of_gram, [&](int part, const RowBlock& block, const GramGradient& of_rows) {
+    self.add_rows(block, of_rows, values, of_part[static_cast<std::size_t>(part)]);
+  }));
+  if (value == infinity || is_set(work.stop)) return infinity;  // the gradient may be that of a part
+  *gradient = std::move(of_part.front());
+  for (std::size_t part = 1; part < of_part.size(); ++part) gradient->add(of_part[part]);
+  for (std::size_t a = 0; a < parts.size(); ++a) {
+    if (parts[a].kernel) gradient->log_kernel[a] = of_gram.latents[a].kernel;
+    if (parts[a].columns && !values.has_free_loading(a)) gradient->log_signal_stddev[a] = of_gram.latents[a].columns;
   }
   return value;
 }

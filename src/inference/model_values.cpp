@@ -20,4 +20,15 @@ ModelGradient ModelGradient::zero(const ModelValues& values) {
   return gradient;
 }
 
+void ModelGradient::add(const ModelGradient& other) {
+  const auto add_each = [](auto& to, const auto& from) {
+    for (std::size_t k = 0; k < to.size(); ++k) to[k] += from[k];
+  };
+  add_each(log_kernel, other.log_kernel);
+  add_each(log_signal_stddev, other.log_signal_stddev);
+  add_each(free_loading, other.free_loading);
+  add_each(log_noise_stddev, other.log_noise_stddev);
+  parameters += other.parameters;
+}
+
 }  // namespace gp2

@@ -12,7 +12,7 @@
 #include "gp2/error.hpp"
 #include "inference/assemble.hpp"
 #include "inference/data_distance.hpp"
-#include "inference/inducing_gram.hpp"
+#include "inference/dense_gram.hpp"
 #include "inference/latent_sums.hpp"
 #include "inference/query.hpp"
 #include "inference/requirements.hpp"
@@ -26,23 +26,25 @@ using Eigen::MatrixXd;
 using Eigen::Ref;
 using Eigen::VectorXd;
 
+void throw_not_definite() {
+  throw NumericalError(
+      "the covariance of the observations cannot be factored in double precision: the noise is too small for the "
+      "signal; use a larger noise standard deviation");
+}
+
 void Posterior::Implementation::add_samples(const std::vector<Observations>& groups, const std::vector<VectorXd>& noise_stddev,
                                             int first_group) {
   Reduction reduction;
   reduce(prior, groups, require_models(prior, groups, values.parameters, {}), noise_stddev, reduction);
-  const LatentRows rows = latent_rows(prior, groups, reduction, values);
+  const RowBlock block{latent_rows(prior, groups, reduction, values)};
   bool is_positive_definite = true;
   if (latents) {
-    is_positive_definite = latents->append(rows);
+    is_positive_definite = latents->append(WholeRows(block));
   } else {
-    latents = make_gram(values)->condition(rows);
+    latents = DensePosterior::condition(block.rows);
     is_positive_definite = latents != nullptr;
   }
-  if (!is_positive_definite) {
-    throw NumericalError(
-        "the covariance of the observations cannot be factored in double precision: the noise is too small for the "
-        "signal; use a larger noise standard deviation");
-  }
+  if (!is_positive_definite) throw_not_definite();
 
   std::vector<std::int64_t> number{next_number};  // of the first sample of each group
   for (const Observations& group : groups) number.push_back(number.back() + group.n_data());
@@ -58,46 +60,42 @@ void Posterior::Implementation::erase_samples(const std::vector<Index>& gone) {
   samples.resize(static_cast<std::size_t>(close_gaps(samples.data(), static_cast<Index>(samples.size()), gone)));
 }
 
-namespace {
-
-// Everything but the latents.
-std::shared_ptr<Posterior::Implementation> unconditioned(Prior prior, std::vector<Observations> observations,
-                                                         ModelValues values) {
+Posterior::Implementation::Implementation(Prior of, std::vector<Observations> observed, ModelValues under)
+    : prior(std::move(of)), observations(std::move(observed)), values(std::move(under)), n_given_groups(observations.size()) {
   require_observations(prior, observations);
   require_values(prior, observations, values);
-  auto self = std::make_shared<Posterior::Implementation>();
-  self->prior = std::move(prior);
-  self->observations = std::move(observations);
-  self->values = std::move(values);
-  self->n_given_groups = self->observations.size();
-  for (std::size_t a = 0; a < self->prior.latents.size(); ++a) self->C.push_back(self->values.loading(a));
-  return self;
+  for (std::size_t a = 0; a < prior.latents.size(); ++a) C.push_back(values.loading(a));
 }
 
-}  // namespace
-
-void Posterior::Implementation::condition() {
+void Posterior::Implementation::condition(int n_threads) {
   const lapack::SingleThread single_thread;
-  add_samples(observations, values.noise_stddev, 0);
+  if (values.inducing) {
+    condition_through_points(n_threads);
+  } else {
+    add_samples(observations, values.noise_stddev, 0);
+  }
 }
 
-Posterior::Posterior(Prior prior, std::vector<Observations> observations, ModelValues values) {
-  std::shared_ptr<Implementation> self = unconditioned(std::move(prior), std::move(observations), std::move(values));
-  self->condition();
+Posterior::Posterior(Prior prior, std::vector<Observations> observations, ModelValues values, int n_threads) {
+  auto self = std::make_shared<Implementation>(std::move(prior), std::move(observations), std::move(values));
+  self->condition(n_threads);
   components_ = {std::move(self)};
 }
 
 Posterior Posterior::lazy(Prior prior, std::vector<Observations> observations, ModelValues values) {
-  std::shared_ptr<Implementation> self = unconditioned(std::move(prior), std::move(observations), std::move(values));
+  if (values.inducing) return Posterior(std::move(prior), std::move(observations), std::move(values));
+  auto self = std::make_shared<Implementation>(std::move(prior), std::move(observations), std::move(values));
   self->conditioning = std::make_shared<std::once_flag>();
   return Posterior(Components{std::move(self)});
 }
 
 Posterior Posterior::mixture(const Prior& prior, const std::vector<Observations>& observations,
-                             const std::vector<ModelValues>& values) {
+                             const std::vector<ModelValues>& values, int n_threads) {
   if (values.empty()) throw InputError("Posterior::mixture: there are no values");
   Components components;
-  for (const ModelValues& of_one : values) components.push_back(Posterior(prior, observations, of_one).components_.front());
+  for (const ModelValues& of_one : values) {
+    components.push_back(Posterior(prior, observations, of_one, n_threads).components_.front());
+  }
   return Posterior(std::move(components));
 }
 
@@ -404,7 +402,7 @@ const Posterior::Components& Posterior::held() const {
 const Posterior::Components& Posterior::conditioned() const {
   for (const auto& component : held()) {
     if (!component->conditioning) continue;
-    std::call_once(*component->conditioning, [&] { std::const_pointer_cast<Implementation>(component)->condition(); });
+    std::call_once(*component->conditioning, [&] { std::const_pointer_cast<Implementation>(component)->condition(1); });
   }
   return components_;
 }
@@ -423,7 +421,7 @@ int Posterior::reduced_size() const { return static_cast<int>(implementation().l
 
 double Posterior::negative_log_likelihood() const {
   const GramValue value = implementation().latents->value();
-  double sum = value.data_fit + value.complexity;
+  double sum = value.data_fit + value.complexity + value.constant;
   for (const Implementation::Sample& sample : implementation().samples) sum += sample.constant;
   return sum;
 }

@@ -3,10 +3,12 @@
 #include <cstdint>
 #include <memory>
 #include <mutex>
+#include <optional>
 #include <vector>
 
 #include "gp2/posterior.hpp"
 #include "inference/gram.hpp"
+#include "inference/inducing_summary.hpp"
 
 namespace gp2 {
 
@@ -19,29 +21,40 @@ struct Posterior::Implementation {
     double constant = 0;      // what it adds to −log p(y) beside N(ỹ; 0, K̃ + I)
   };
 
+  /// Not conditioned.
+  /// @throws InputError when they do not fit each other.
+  Implementation(Prior prior, std::vector<Observations> observations, ModelValues values);
+
   Prior prior;
   std::vector<Observations> observations;
   ModelValues values;
   std::vector<Eigen::MatrixXd> C;            // per latent: loading (p × F)
-  std::vector<Sample> samples;               // in the order of adding to `latents`
+  std::vector<Sample> samples;               // in the order of adding to `latents`; none through inducing points
   std::shared_ptr<LatentPosterior> latents;  // not shared: see own_implementation
   std::int64_t next_number = 0;
   std::shared_ptr<std::once_flag> conditioning;  // of a lazy posterior: whether `latents` stand; null: they do
   std::size_t n_given_groups = 0;                // of `observations`, that the constructor was given: the first ones
 
+  std::optional<KeptStates> kept;  // through inducing points: which `observations` still are here
+
   /// The latents given `observations`.
   /// @throws as add_samples
-  void condition();
+  void condition(int n_threads);
   /// Samples of more observations; `observations` stay as they are. On an error nothing has changed.
   /// @param noise_stddev  per group
   /// @param first_group   the group of `observations` that groups[0] is, or is going to be
   /// @throws as the constructor of Posterior.
   void add_samples(const std::vector<Observations>& groups, const std::vector<Eigen::VectorXd>& noise_stddev, int first_group);
+  /// What condition and add_samples are through inducing points: of many observations some are kept.
+  void condition_through_points(int n_threads);
+  void add_through_points(const Observations& more, std::size_t group);
   /// Takes samples away, at rising indices; `observations` stay as they are.
   void erase_samples(const std::vector<Eigen::Index>& gone);
   /// Groups without states go, but for those that the constructor was given.
   void erase_empty_groups();
 };
+
+[[noreturn]] void throw_not_definite();
 
 /// Which samples are of which component: each of one that chance chooses, by the seed and its number alone.
 std::vector<std::vector<Eigen::Index>> samples_of_components(int n_components, int n_samples, std::uint64_t seed);

@@ -31,6 +31,10 @@ void add(Posterior::Implementation& self, const Observations& added) {
            there.noise().has_scale() == added.noise().has_scale();
   };
   while (group < self.observations.size() && !belongs()) ++group;
+  if (self.kept) {
+    self.add_through_points(added, group);
+    return;
+  }
   self.add_samples({added}, {added.noise().stddev()}, static_cast<int>(group));
   if (group < self.observations.size()) {
     self.observations[group].append(added);
@@ -87,6 +91,9 @@ Posterior update(Posterior&& posterior, Observations added) {
 }
 
 Posterior remove_oldest(Posterior&& posterior, int n) {
+  if (posterior.implementation().kept) {
+    throw InputError("what was learned through inducing points cannot be taken away: the observations themselves are not kept");
+  }
   const std::size_t n_samples = posterior.implementation().samples.size();
   if (n < 0 || static_cast<std::size_t>(n) > n_samples) {
     throw InputError(

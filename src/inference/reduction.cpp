@@ -282,6 +282,7 @@ void reduce(const Prior& prior, const std::vector<Observations>& observations, c
   std::size_t n_samples = 0;
   for (const Observations& group : observations) n_samples += static_cast<std::size_t>(group.n_data());
   reduction.samples.resize(n_samples);
+  reduction.n = std::ssize(reduction.samples);
   reduction.constant = 0;
   Split split;
   auto sample = reduction.samples.begin();

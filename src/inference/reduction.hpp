@@ -52,7 +52,8 @@ struct Reduction {
     Eigen::MatrixXd C;      // (d × d), with ones on the diagonal where nothing is measured; empty where S is diagonal
     double constant = 0;    // ½ ‖(I − QQᵀ)e‖² + ½ log|S| + ½ dim y log 2π
   };
-  std::vector<Sample> samples;              // sorted
+  std::vector<Sample> samples;              // sorted; may be given up where nothing but rows is wanted
+  Eigen::Index n = 0;                       // samples
   std::vector<Eigen::Index> count, offset;  // per component; offset has one more entry, the reduced size
   Eigen::VectorXd y;                        // ỹ: of rows, or where there are sums of these
   std::optional<Sums> sums;                 // none: every row is measured itself
@@ -63,7 +64,7 @@ struct Reduction {
   [[nodiscard]] Eigen::Index size() const { return offset.back(); }  // rows
   [[nodiscard]] Eigen::Index n_measured() const { return y.size(); }
   [[nodiscard]] int n_components() const { return static_cast<int>(count.size()); }
-  [[nodiscard]] Eigen::Index n_samples() const { return static_cast<Eigen::Index>(samples.size()); }
+  [[nodiscard]] Eigen::Index n_samples() const { return n; }
 };
 
 /// The reduced rows of these samples, sample after sample, each component by component.

@@ -6,13 +6,13 @@ using Eigen::Index;
 using Eigen::MatrixXd;
 using Eigen::VectorXd;
 
-SampleGradient::SampleGradient(const Likelihood::Options& options, const std::vector<Observations>& observations,
-                               const std::vector<ObservationModel>& models, const Reduction& reduction, const ModelValues& values,
+SampleGradient::SampleGradient(const Likelihood::Options& options, const RowBlock& block, const ModelValues& values,
                                const GramGradient& of_gram)
     : options_(options),
-      observations_(observations),
-      models_(models),
-      reduction_(reduction),
+      observations_(*block.observations),
+      models_(*block.models),
+      reduction_(*block.rows.reduction),
+      first_group_(block.first_group),
       noise_stddev_(values.noise_stddev),
       of_gram_(of_gram),
       V_(of_gram.latents.size()) {
@@ -27,11 +27,11 @@ void SampleGradient::add(Index i, ModelGradient& gradient) {
   if (is_summed) {
     whitening_.setOnes(sample.Q.rows());
   } else {
-    whitening_ = observations_[group].noise_at(noise_stddev_[group], sample.index).cwiseInverse();
+    whitening_ = observations_[group].noise_at(noise_stddev_[first_group_ + group], sample.index).cwiseInverse();
   }
   differentiate_split(i, sample, model);
   if (sample.C.size() > 0) differentiate_noise(sample);
-  if (options_.noise_gradient && !is_summed) add_noise(sample, model, gradient.log_noise_stddev[group]);
+  if (options_.noise_gradient && !is_summed) add_noise(sample, model, gradient.log_noise_stddev[first_group_ + group]);
   if (!options_.gradient_parameters.empty()) add_parameters(sample, model, gradient.parameters);
 }
 

@@ -14,8 +14,7 @@ namespace gp2 {
 class SampleGradient {
  public:
   /// @param of_gram  with V and mean of every latent
-  SampleGradient(const Likelihood::Options& options, const std::vector<Observations>& observations,
-                 const std::vector<ObservationModel>& models, const Reduction& reduction, const ModelValues& values,
+  SampleGradient(const Likelihood::Options& options, const RowBlock& block, const ModelValues& values,
                  const GramGradient& of_gram);
 
   /// Adds what sorted sample i contributes.
@@ -33,6 +32,7 @@ class SampleGradient {
   const std::vector<Observations>& observations_;
   const std::vector<ObservationModel>& models_;
   const Reduction& reduction_;
+  std::size_t first_group_;  // of all Observations, that observations_.front() is
   const std::vector<Eigen::VectorXd>& noise_stddev_;
   const GramGradient& of_gram_;
   std::vector<Eigen::MatrixXd> loading_;  // per latent: C_a

@@ -11,6 +11,7 @@
 #include <fmt/ranges.h>
 
 #include "base/parallel.hpp"
+#include "data/evenly.hpp"
 #include "gp2/error.hpp"
 #include "gp2/inference/evaluation.hpp"
 #include "gp2/jobs/actuator_fit.hpp"
@@ -33,6 +34,7 @@ void require_in_range(const FitRequest& request) {
   require_positive("restarts", request.restarts);
   require_not_negative("max_iterations", request.max_iterations);
   require_positive("max_points", request.problem.max_points);
+  require_positive("train_on", request.train_on);
   require_threads(request.threads);
   const std::optional<double>& noise = request.problem.noise_stddev;
   if (noise && (!(*noise > 0) || !std::isfinite(*noise))) {
@@ -60,6 +62,7 @@ FitOptions optimiser_options(FitRequest& request, const FitProblem& problem) {
   options.seed = request.problem.seed;
   options.n_threads = request.threads;
   options.standard_errors = request.standard_errors;
+  options.n_train = request.train_on.value_or(0);
   return options;
 }
 
@@ -293,9 +296,10 @@ void add_force_note(const Posterior& posterior, std::vector<std::string>& notes)
     is_zero = is_zero && F.isZero(0);
   }
   if (is_zero) return;
+  // of the rows that are still here, if not of all
+  const double without = Posterior(prior, observations, posterior.values()).negative_log_likelihood();
   prior.mean = Prior::Mean::force;
-  const Posterior with_force(prior, observations, posterior.values());
-  const double gain = posterior.negative_log_likelihood() - with_force.negative_log_likelihood();
+  const double gain = without - Posterior(prior, observations, posterior.values()).negative_log_likelihood();
   if (gain <= 10) return;
   notes.push_back(fmt::format(
       "the known force of [mechanics] is not used: with `mean=force` the log likelihood of these data is {:.3g} higher, "
@@ -366,6 +370,8 @@ std::vector<Option> options(FitRequest& request) {
            "free directions of motion, through at most {} variables beyond",
            largest_exact_size, most_inducing_variables),
        "auto"},
+      {"train_on", &request.train_on, "N",
+       "find the hyperparameters from so many rows, evenly taken from all logs together, and learn from all under these", "all rows"},
       {"thin", Switch{&request.thin, "auto", "none"}, "",
        "where residuals go on from row to row, fit anew with as many rows as they are worth, evenly taken; or none"},
       {"standard_errors", YesByDefault{&request.standard_errors}, "",
@@ -412,6 +418,12 @@ FitJob prepare_fit_again(const FitFile& fit, int threads) {
   if (request.problem.robust) {
     throw InputError("`again`: the data of a robust fit are marked by what it distrusts; give its logs by `data`");
   }
+  const std::vector<std::int64_t> n = fit.n_states();
+  const std::int64_t n_all = std::accumulate(n.begin(), n.end(), std::int64_t{0});
+  if (n_all > n_states(fit.observations)) {
+    throw InputError(fmt::format("`again`: the file holds what {} rows say, and {} of them; give its logs by `data`: {}", n_all,
+                                 n_states(fit.observations), fit.data_source));
+  }
   FitProblem problem;
   problem.prior_options = fit.prior_options;
   problem.prior = fit.prior();
@@ -423,11 +435,26 @@ FitJob prepare_fit_again(const FitFile& fit, int threads) {
   return job_of(std::move(request), std::move(problem));
 }
 
-bool keeps_row_order(const FitFile& fit, const std::vector<Observations>& observations) {
+namespace {
+
+bool keeps_row_order(const FitFile& fit, const std::vector<std::int64_t>& n_states) {
   if (fit.options.empty()) return false;
   const std::optional<int> max_points = request_of(fit).problem.max_points;
-  return std::all_of(observations.begin(), observations.end(),
-                     [&](const Observations& group) { return !max_points || group.n_data() < *max_points; });
+  return std::ranges::all_of(n_states, [&](std::int64_t n) { return !max_points || n < *max_points; });
+}
+
+}  // namespace
+
+bool keeps_row_order(const FitFile& fit, const std::vector<Observations>& observations) {
+  std::vector<std::int64_t> n_states;
+  for (const Observations& group : observations) n_states.push_back(group.n_data());
+  return keeps_row_order(fit, n_states);
+}
+
+CrossValidation cross_validate(const FitFile& fit, const Posterior& posterior) {
+  CrossValidation scores = cross_validate(posterior, keeps_row_order(fit, fit.n_states()));
+  if (!scores.stretches && fit.report.inducing) scores.stretches = fit.report.inducing->stretches;
+  return scores;
 }
 
 namespace {
@@ -469,8 +496,8 @@ FitOutcome run_once(const FitJob& job, const std::function<void(const Progress&)
       add_force_note(outcome.posterior, outcome.notes);
       add_constraint_note(outcome.posterior, outcome.notes);
       add_window_note(outcome.posterior, outcome.notes);
-      outcome.cross_validation =
-          cross_validate(outcome.posterior, keeps_row_order(outcome.file, outcome.posterior.observations()));
+      outcome.cross_validation = cross_validate(outcome.posterior, keeps_row_order(outcome.file, job.problem.observations));
+      if (result.report.inducing) result.report.inducing->stretches = outcome.cross_validation->stretches;
       add_residual_notes(outcome.posterior, outcome.cross_validation->residuals, outcome.notes);
       const std::string correlated = correlated_text(outcome.cross_validation->residuals);
       if (!correlated.empty()) outcome.notes.push_back(fmt::format("warning: {}: deviations are too small", correlated));
@@ -479,8 +506,8 @@ FitOutcome run_once(const FitJob& job, const std::function<void(const Progress&)
     }
   }
   for (std::string& note : actuator_notes(job.actuators)) outcome.notes.push_back(std::move(note));
-  outcome.file.observations = outcome.posterior.observations();
   outcome.file.report = std::move(result.report);
+  outcome.file.take_data(outcome.posterior);
   outcome.file.report.actuators = job.actuators;
   return outcome;
 }

@@ -12,7 +12,7 @@
 #include "base/parallel.hpp"
 #include "gp2/error.hpp"
 #include "gp2/inference/evaluation.hpp"
-#include "inference/inducing_latents.hpp"
+#include "inference/gram.hpp"
 
 namespace gp2 {
 
@@ -50,6 +50,7 @@ double reduced_size(const FitProblem& problem, std::size_t g, ModelValues values
 // What grows in proportion to the data, per state.
 struct PerState {
   double shared = 0, evaluation = 0;  // numbers
+  double observed = 0;                // of them in the observations themselves
   double n_parts = 1;                 // that are fitted one after the other, each with its share of the reduced size
 };
 
@@ -62,7 +63,8 @@ PerState per_state(const FitProblem& problem, double rank) {
                                           [](const auto& h) { return h.kind == Hyperparameter::Kind::parameter; });
   // states and values as they stand in the problem, the likelihood and the posterior
   PerState count;
-  count.shared = 3 * (static_cast<double>(system.state_names().size()) + d);
+  count.observed = static_cast<double>(system.state_names().size()) + d;
+  count.shared = 3 * count.observed;
   // M and its factor, A, L, T and what they are made of; G
   double model = 3 * n * n + 4 * m * n + 4 * n + d * n;
   // Q, R, e, ỹ of a sample, with what the allocator adds
@@ -88,11 +90,14 @@ FitMemory memory_of(double n_states, double r, const PerState& count, const FitO
   memory.reduced_size = static_cast<int>(std::lround(r));
   memory.shared = number * n_states * count.shared;
   if (options.n_inducing > 0) {
-    // sums of each part of the rows and of each stretch of cross_validate, with what is made of them
+    // the observations as they stand in the problem and its copy, the likelihood and the posterior or a stage before all of them, and
+    // what is kept of blocks; sums of each part of the rows and of each stretch, with what is made of them
+    constexpr double n_copies = 4;
     const double square = number * std::pow(std::min<double>(options.n_inducing, r), 2);
-    memory.evaluation = (n_block_parts + 6) * square + number * n_states * count.evaluation + blas;
-    memory.posterior =
-        (n_block_parts + 2 * CrossValidation::n_stretches + 6) * square + number * n_states * count.evaluation + blas;
+    memory.shared = number * n_states * n_copies * count.observed;
+    memory.evaluation = (Gram::n_parts + 6) * square +
+                        std::min<double>(BlocksOfStates::most_kept_bytes, number * n_states * count.evaluation) + blas;
+    memory.posterior = (Gram::n_parts + 2 * CrossValidation::n_stretches + 6) * square + blas;
     memory.asked_by_evaluation = memory.asked_by_posterior = square + blas_buffer;
     return memory;
   }

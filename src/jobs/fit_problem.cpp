@@ -11,7 +11,7 @@
 #include "gp2/training/laplace.hpp"
 #include "gp2/training/robust.hpp"
 #include "jobs/read_observations.hpp"
-#include "training/evenly.hpp"
+#include "data/evenly.hpp"
 
 namespace gp2 {
 

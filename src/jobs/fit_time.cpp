@@ -8,7 +8,7 @@
 
 #include "base/lapack.hpp"
 #include "base/parallel.hpp"
-#include "training/evenly.hpp"
+#include "data/evenly.hpp"
 #include "training/objective.hpp"
 
 namespace gp2 {

@@ -385,7 +385,7 @@ Report collect_report(const ReportOptions& options, std::vector<std::string>& no
   report.file_date = date_of(options.fit);
   const Posterior posterior = report.fit.posterior();
   report.data = training_data(report.fit, posterior);
-  report.cross_validation = cross_validate(posterior, keeps_row_order(report.fit, posterior.observations()));
+  report.cross_validation = cross_validate(report.fit, posterior);
   report.relevance = relevance_of(posterior);
   if (!options.data.empty()) {
     report.data.push_back(test_data(options, report.fit, posterior, notes));

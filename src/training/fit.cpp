@@ -7,6 +7,7 @@
 #include <numeric>
 #include <random>
 #include <set>
+#include <utility>
 
 #include <fmt/format.h>
 
@@ -18,7 +19,7 @@
 #include "inference/requirements.hpp"
 #include "training/constraint_parameters.hpp"
 #include "training/curvature.hpp"
-#include "training/evenly.hpp"
+#include "data/evenly.hpp"
 #include "training/hamiltonian.hpp"
 #include "training/lbfgsb.hpp"
 #include "training/objective.hpp"
@@ -73,7 +74,7 @@ class Training {
         observations_(observations),
         hyperparameters_(hyperparameters),
         options_(options),
-        objective_(prior, observations, hyperparameters, std::move(points)),
+        objective_(prior, observations, hyperparameters, std::move(points), thread_count(options.n_threads)),
         reports_(static_cast<std::size_t>(n_restarts())),
         results_(static_cast<std::size_t>(n_restarts())),
         fractions_(static_cast<std::size_t>(n_restarts()), 0.0) {
@@ -380,6 +381,7 @@ void require_options(const FitOptions& options) {
   require("max_escapes", options.max_escapes, 0);
   require("n_draws", options.n_draws, 0);
   require("n_inducing", options.n_inducing, 0);
+  require("n_train", options.n_train, 0);
   if (options.n_inducing > 0 && options.n_draws > 0) {
     throw InputError("fit: hyperparameters are not drawn where all is learned through inducing points");
   }
@@ -433,23 +435,25 @@ class TrainingThroughPoints {
 
   FitReport run(std::vector<Hyperparameter> hyperparameters) const {
     const int n_all = n_states(observations_);
+    const int n_train = options_.n_train > 0 ? std::min(options_.n_train, n_all) : n_all;
     const bool optimises = options_.max_iterations > 0 && !hyperparameters.empty();
     std::vector<int> stages;
-    for (int n = n_exact; optimises && n < n_all && (n == n_exact || n <= n_all / 4); n *= 25) stages.push_back(n);
-    stages.push_back(n_all);
+    for (int n = n_exact; optimises && n < n_train && (n == n_exact || n <= n_train / 4); n *= 25) stages.push_back(n);
+    stages.push_back(n_train);
     std::optional<FitReport> report;
     for (std::size_t stage = 0; stage < stages.size() && !(report && is_set(options_.stop)); ++stage) {
-      const bool is_last = stage + 1 == stages.size();
+      const bool is_last = stage + 1 == stages.size(), is_exact = stages[stage] <= n_exact && stages[stage] < n_all;
       FitOptions options = of_stage(stage, stages.size());
       options.standard_errors = options.standard_errors && is_last;
-      const std::vector<Observations> some = is_last ? std::vector<Observations>() : evenly(observations_, stages[stage]);
+      const std::vector<Observations> some =
+          stages[stage] < n_all ? evenly(observations_, stages[stage]) : std::vector<Observations>();
+      const std::vector<Observations>& of_stage = stages[stage] < n_all ? some : observations_;
       report = unless_stopped(report, [&] {
-        if (is_last) return through_points(observations_, hyperparameters, options);
-        return stage > 0 ? through_points(some, hyperparameters, options) : trained(prior_, some, hyperparameters, options);
+        return is_exact ? trained(prior_, of_stage, hyperparameters, options) : through_points(of_stage, hyperparameters, options);
       });
       hyperparameters = report->hyperparameters;
     }
-    if (!report->inducing) report->inducing = points_of(chosen(observations_, hyperparameters));
+    if (!report->inducing || n_train < n_all) report->inducing = points_of(chosen(observations_, hyperparameters));
     report->inducing->left_out = left_out(*report);
     report->inducing->n_start = stages.size() > 1 ? n_exact : 0;
     if (is_set(options_.stop)) {
@@ -476,7 +480,10 @@ class TrainingThroughPoints {
   }
 
   [[nodiscard]] static InducingReport points_of(const InducingChoice& choice) {
-    return {.points = choice.points, .n_variables = choice.n_variables, .left_out = {}};
+    InducingReport report;
+    report.points = choice.points;
+    report.n_variables = choice.n_variables;
+    return report;
   }
 
   // What `work` gives; where it is stopped before it has anything, what there was before.
@@ -548,11 +555,18 @@ Fit fit(const Prior& prior, const std::vector<Observations>& observations, const
   require_measured(observations, "fit");
   require_hyperparameters(prior, observations, hyperparameters);
   require_starts(hyperparameters);
+  const bool is_part = options.n_train > 0 && options.n_train < n_states(observations);
   FitReport report = options.n_inducing > 0 ? TrainingThroughPoints(prior, observations, options).run(hyperparameters)
-                                            : trained(prior, observations, hyperparameters, options);
+                                            : trained(prior, is_part ? evenly(observations, options.n_train) : observations,
+                                                      hyperparameters, options);
   Posterior posterior = report.termination == FitReport::interrupted && !report.draws
                             ? Posterior::lazy(prior, observations, values_of(prior, observations, report).front())
-                            : posterior_of(prior, observations, report);
+                            : posterior_of(prior, observations, report, thread_count(options.n_threads));
+  if (report.inducing) report.inducing->summary = posterior.summary();
+  if (is_part) {  // what is said of the part is not of all
+    const double of_part = std::exchange(report.negative_log_likelihood, posterior.negative_log_likelihood());
+    report.objective += report.negative_log_likelihood - of_part;
+  }
   report.seconds = std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
   return {std::move(posterior), std::move(report)};
 }

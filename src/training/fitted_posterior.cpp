@@ -28,8 +28,13 @@ std::vector<ModelValues> values_of(const Prior& prior, const std::vector<Observa
   return values;
 }
 
-Posterior posterior_of(const Prior& prior, const std::vector<Observations>& observations, const FitReport& report) {
-  return Posterior::mixture(prior, observations, values_of(prior, observations, report));
+Posterior posterior_of(const Prior& prior, const std::vector<Observations>& observations, const FitReport& report,
+                       int n_threads) {
+  const std::vector<ModelValues> values = values_of(prior, observations, report);
+  if (report.inducing && report.inducing->summary) {
+    return Posterior::of_summary(prior, observations, values.front(), *report.inducing->summary);
+  }
+  return Posterior::mixture(prior, observations, values, n_threads);
 }
 
 }  // namespace gp2

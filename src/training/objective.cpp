@@ -42,8 +42,9 @@ double negative_log_hyperpriors(const std::vector<Hyperparameter>& hyperparamete
 
 namespace {
 
-Likelihood::Options likelihood_options(const std::vector<Hyperparameter>& hyperparameters) {
+Likelihood::Options likelihood_options(const std::vector<Hyperparameter>& hyperparameters, int n_threads) {
   Likelihood::Options options;
+  options.n_threads = n_threads;
   for (const Hyperparameter& h : hyperparameters) h.ask_for_gradient(options);
   return options;
 }
@@ -51,12 +52,13 @@ Likelihood::Options likelihood_options(const std::vector<Hyperparameter>& hyperp
 }  // namespace
 
 Objective::Objective(const Prior& prior, const std::vector<Observations>& observations,
-                     const std::vector<Hyperparameter>& hyperparameters, std::shared_ptr<const InducingPoints> points)
+                     const std::vector<Hyperparameter>& hyperparameters, std::shared_ptr<const InducingPoints> points,
+                     int n_threads)
     : prior_(prior),
       observations_(observations),
       hyperparameters_(hyperparameters),
       points_(std::move(points)),
-      likelihood_(prior, observations, values(hyperparameters), likelihood_options(hyperparameters)) {}
+      likelihood_(prior, observations, values(hyperparameters), likelihood_options(hyperparameters, n_threads)) {}
 
 ModelValues Objective::values(const std::vector<Hyperparameter>& hyperparameters) const {
   ModelValues values = model_values(prior_, observations_, hyperparameters);

@@ -159,7 +159,7 @@ TEST(GramTest, ItsInverseHoldsTheBlocksOfEachSample) {
     const Reduced of(p);
     DenseGram gram;
     ASSERT_TRUE(gram.factorise(of.rows).has_value());
-    const Gram::Inverse inverse = gram.invert(of.rows, {{2, 0}});
+    const LatentPosterior::Inverse inverse = gram.invert(of.rows, {{2, 0}});
     const MatrixXd P = covariance(of.rows).inverse();
     EXPECT_LE((inverse.alpha - P * of.reduction.y).norm(), 1e-9 * inverse.alpha.norm());
     ASSERT_EQ(inverse.blocks.size(), of.reduction.samples.size());
@@ -192,7 +192,7 @@ TEST(GramTest, ItsGradientAndThePosteriorAgreeOnTheMeanOfTheLatents) {
     ASSERT_TRUE(gram.factorise(of.rows).has_value());
     const GramGradient gradient =
         gram.differentiate(of.rows, std::vector<GramGradientParts>(of.rows.latents.size(), {.mean = true}));
-    const std::unique_ptr<LatentPosterior> posterior = gram.condition(of.rows);
+    const std::unique_ptr<LatentPosterior> posterior = DensePosterior::condition(of.rows);
     ASSERT_NE(posterior, nullptr);
     std::vector<MatrixXd> features;
     for (const LatentRows::OfLatent& latent : of.rows.latents) {
@@ -211,7 +211,7 @@ TEST(LatentPosteriorTest, ItsWhiteningIsATriangleThatMakesTheCovarianceOfTheBasi
   for (const Problem& p : gram_problems()) {
     SCOPED_TRACE(p.name);
     const Reduced of(p);
-    const std::unique_ptr<LatentPosterior> posterior = DenseGram().condition(of.rows);
+    const std::unique_ptr<LatentPosterior> posterior = DensePosterior::condition(of.rows);
     ASSERT_NE(posterior, nullptr);
     const Index n = posterior->size();
     MatrixXd X = MatrixXd::Identity(n, n);
@@ -229,10 +229,11 @@ TEST(LatentPosteriorTest, SamplesThatCameAndWentLeaveItAsItWas) {
   for (const Problem& p : gram_problems()) {
     SCOPED_TRACE(p.name);
     const Reduced of(p);
-    const std::unique_ptr<LatentPosterior> before = DenseGram().condition(of.rows);
+    const std::unique_ptr<LatentPosterior> before = DensePosterior::condition(of.rows);
     ASSERT_NE(before, nullptr);
     const std::unique_ptr<LatentPosterior> after = before->clone();
-    ASSERT_TRUE(after->append(of.rows));
+    const RowBlock block{of.rows};
+    ASSERT_TRUE(after->append(WholeRows(block)));
     EXPECT_EQ(after->size(), 2 * before->size());
     EXPECT_EQ(before->size(), of.rows.size()) << "a clone is of its own";
     std::vector<Index> first_half;

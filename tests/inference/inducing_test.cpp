@@ -64,7 +64,7 @@ TEST(Inducing, PointsAtEveryStateChangeNothing) {
     if (exact_distance.allFinite()) {
       EXPECT_LE(largest(distance - exact_distance), 1e-9 * (1 + largest(exact_distance)));
     }
-    constexpr int n_stretches = 3;
+    constexpr int n_stretches = LeftOut::n_stretches;
     const LeftOut left_out = leave_out(posterior, n_stretches), expected_left_out = leave_out(exact_posterior, n_stretches);
     const auto expect_alike_left_out = [&](const std::vector<LeaveOneOut>& left, const std::vector<LeaveOneOut>& right) {
       ASSERT_EQ(left.size(), right.size());

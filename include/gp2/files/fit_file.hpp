@@ -1,5 +1,6 @@
 #pragma once
 
+#include <cstdint>
 #include <filesystem>
 #include <map>
 #include <memory>
@@ -15,7 +16,8 @@
 namespace gp2 GP2_API {
 
 /// A fitted model as a file: the model's text, the options its prior was made with, the data and the hyperparameters. The
-/// posterior is computed anew from these, so a file loaded gives the same bits as before it was saved.
+/// posterior is computed anew from these, so a file loaded gives the same bits as before it was saved. Of a fit through inducing points
+/// it holds what all data say, and of many data some.
 struct FitFile {
   /// An empty one, for who fills in its members.
   FitFile() = default;
@@ -28,9 +30,10 @@ struct FitFile {
   ///   hyperparameters of another posterior.
   FitFile(Model model, FitPriorOptions prior_options, const Fit& fit, std::vector<std::shared_ptr<const Model>> systems = {});
 
-  /// 9: inducing points; 8: sums over states; 7: draws of hyperparameters; 6: a checksum and options, values that are not measured; 5: robots; 4: values with a noise of
-  /// their own; 3: mechanics that are code; 2: observations of other systems. All of them are read; 9 is written.
-  static constexpr int format_version = 9;
+  /// 10: what many observations say, in their place; 9: inducing points; 8: sums over states; 7: draws of hyperparameters; 6: a
+  /// checksum and options, values that are not measured; 5: robots; 4: values with a noise of their own; 3: mechanics that are code; 2:
+  /// observations of other systems. All of them are read; 10 is written.
+  static constexpr int format_version = 10;
 
   Model model;
   FitPriorOptions prior_options;
@@ -42,6 +45,10 @@ struct FitFile {
   std::string options;  // what was asked of the fit, a JSON object (options_json); empty: not known
 
   [[nodiscard]] Prior prior() const { return make_prior(model, prior_options); }
+  /// States that were fitted to, per Observations: more than `observations` have, where the file holds what they say in their place.
+  [[nodiscard]] std::vector<std::int64_t> n_states() const;
+  /// The data of a posterior of this fit, which may have more since: they stand in `observations` and `report`.
+  void take_data(const Posterior& posterior);
   /// The prior conditioned on the data, under the fitted hyperparameters or as the mixture over their draws.
   /// @throws InputError as model_values.
   [[nodiscard]] Posterior posterior() const;

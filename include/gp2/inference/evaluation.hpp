@@ -8,6 +8,7 @@
 #include <Eigen/Core>
 
 #include "gp2/export.hpp"
+#include "gp2/inference/leave_one_out.hpp"
 #include "gp2/mechanics/check.hpp"
 #include "gp2/posterior.hpp"
 
@@ -98,7 +99,7 @@ struct TrainingResidual {
 
 /// How well a fit predicts its own data where it has not seen them, under the hyperparameters that it has from all of them.
 struct CrossValidation {
-  static constexpr int n_stretches = 5;
+  static constexpr int n_stretches = LeftOut::n_stretches;
   /// Scores of the measured values of ddq, by the spread of each output over all data; no latent figures.
   Evaluation::Part one_by_one;                // each from all others: between the data
   std::optional<Evaluation::Part> stretches;  // leave_out in n_stretches: what a motion elsewhere would meet

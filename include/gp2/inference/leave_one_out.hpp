@@ -35,9 +35,12 @@ std::vector<LeaveOneOut> leave_one_out(const Posterior& posterior);
 
 /// Every value as predicted without itself, and without the stretch of time around it.
 struct LeftOut {
+  static constexpr int n_stretches = 5;  // that are known through inducing points
+
   std::vector<LeaveOneOut> values;     // leave_one_out
-  std::vector<LeaveOneOut> stretches;  // what all but those of its own stretch say of each value; empty where not asked for, or
-                                       // where double precision cannot tell
+  std::vector<LeaveOneOut> stretches;  // what all but those of its own stretch say of each value; empty where not asked for,
+                                       // where double precision cannot tell, and where what was learned through inducing points
+                                       // was read from a file or got more observations
 };
 
 /// The states of each Observations are taken in time order: by t where all of them have one, else in their own. They are cut into
@@ -48,7 +51,7 @@ struct LeftOut {
 ///
 /// which Q brings to the whitened values e and S^{1/2} to the values. The variance holds what slips where constraints are soft. Of a
 /// mixture all components count alike.
-/// @param n_stretches  0: none
+/// @param n_stretches  0: none; through inducing points none, or LeftOut::n_stretches
 /// @throws InputError, NumericalError  as Posterior.
 LeftOut leave_out(const Posterior& posterior, int n_stretches);
 

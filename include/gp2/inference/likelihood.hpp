@@ -28,6 +28,7 @@ class Likelihood {
   struct Options {
     std::vector<int> gradient_parameters;  // indices of the system's parameters whose derivative `evaluate` gives
     bool noise_gradient = false;           // whether it gives the derivatives in the noise
+    int n_threads = 1;                     // that may work on what is made once, where it is through inducing points
   };
 
   /// @param initial  values at which everything that has no gradient stays: fixed noise and parameters are reduced once, here.

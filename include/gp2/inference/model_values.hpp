@@ -39,6 +39,7 @@ struct ModelGradient {
   Eigen::VectorXd parameters;
 
   static ModelGradient zero(const ModelValues& values);
+  void add(const ModelGradient& other);
 };
 
 }  // namespace gp2

@@ -53,6 +53,7 @@ struct FitRequest {
   /// Inducing variables at most; not given: as largest_exact_size says, and none where `is_exact`.
   std::optional<double> inducing;
   bool is_exact = false, is_exact_where_small = false;
+  std::optional<int> train_on;  // states at most that hyperparameters are found from; not given: all
 };
 
 /// The table of its options.
@@ -78,7 +79,7 @@ FitRequest request_of(const FitFile& fit);
 
 /// A fit again, from the data that are in its file: the same bits, on the same machine.
 /// @param threads  as FitRequest
-/// @throws InputError as request_of, and for robust fits, whose data are marked by the first one.
+/// @throws InputError as request_of, for robust fits, whose data are marked by the first one, and where the file has but some of them.
 FitJob prepare_fit_again(const FitFile& fit, int threads = 0);
 
 /// What a fit gives.
@@ -91,6 +92,9 @@ struct FitOutcome {
 
 /// Whether its observations stand in the order of their logs: `max_points` shuffles them.
 bool keeps_row_order(const FitFile& fit, const std::vector<Observations>& observations);
+
+/// cross_validate of the posterior of a fit; what the fit knows and the posterior does not, stretches of many rows, is as it was then.
+CrossValidation cross_validate(const FitFile& fit, const Posterior& posterior);
 
 /// Delays and lags of inputs are estimated first (actuator_fit.hpp), and known from then on.
 /// Where residuals go on from row to row, rows are fewer measurements than they seem: the fit is then done anew with as many rows of

@@ -1,4 +1,4 @@
-#include "training/evenly.hpp"
+#include "data/evenly.hpp"
 
 #include <algorithm>
 #include <cmath>

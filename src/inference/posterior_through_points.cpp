@@ -1,0 +1,115 @@
+#include <numeric>
+#include <utility>
+
+#include "data/evenly.hpp"
+#include "gp2/inference/leave_one_out.hpp"
+#include "inference/inducing_gram.hpp"
+#include "inference/posterior_implementation.hpp"
+#include "inference/stretches.hpp"
+
+// Posteriors through inducing points: sums over all observations, of which some are kept.
+namespace gp2 {
+
+namespace {
+
+/// @throws InputError as require_models
+InducingStatistics require_statistics(const Prior& prior, const std::vector<Observations>& observations,
+                                      const ModelValues& values, const InducingLatents& latents, int n_threads) {
+  std::optional<InducingStatistics> statistics =
+      InducingStatistics::of(latents, BlocksOfStates(prior, observations, values), n_threads);
+  if (!statistics) static_cast<void>(require_models(prior, observations, values.parameters, {}));  // names the state
+  return *std::move(statistics);
+}
+
+// Every second of the states that are kept, until they are few.
+void keep_some(std::vector<Observations>& observations, KeptStates& kept) {
+  while (n_states(observations) > KeptStates::most) {
+    kept.step *= 2;
+    for (std::size_t g = 0; g < observations.size(); ++g) {
+      std::vector<int> states, stretch_of;
+      for (int i = 0; i < observations[g].n_data(); i += 2) {
+        states.push_back(i);
+        if (!kept.stretch_of.empty()) stretch_of.push_back(kept.stretch_of[g][static_cast<std::size_t>(i)]);
+      }
+      observations[g] = observations[g].take(states);
+      if (!kept.stretch_of.empty()) kept.stretch_of[g] = std::move(stretch_of);
+    }
+  }
+}
+
+}  // namespace
+
+void Posterior::Implementation::condition_through_points(int n_threads) {
+  constexpr std::size_t n_stretches = LeftOut::n_stretches;
+  KeptStates all;
+  std::vector<std::vector<std::vector<int>>> states;  // by Observations and stretch
+  for (const Observations& group : observations) {
+    all.n_states.push_back(group.n_data());
+    states.push_back(states_of_stretches(group, prior.system->layout().t(), n_stretches));
+    std::vector<int>& stretch_of = all.stretch_of.emplace_back(static_cast<std::size_t>(group.n_data()));
+    for (std::size_t k = 0; k < n_stretches; ++k) {
+      for (const int i : states.back()[k]) stretch_of[static_cast<std::size_t>(i)] = static_cast<int>(k);
+    }
+  }
+  InducingLatents inducing(prior, values);
+  std::vector<InducingStatistics> stretches;
+  for (std::size_t k = 0; k < n_stretches; ++k) {
+    std::vector<Observations> stretch;
+    for (std::size_t g = 0; g < observations.size(); ++g) stretch.push_back(observations[g].take(states[g][k]));
+    stretches.push_back(require_statistics(prior, stretch, values, inducing, n_threads));
+  }
+  auto through = std::make_shared<InducingPosterior>(std::move(inducing), std::move(stretches));
+  if (!through->factorise()) throw_not_definite();
+  latents = std::move(through);
+  kept = std::move(all);
+  keep_some(observations, *kept);
+}
+
+void Posterior::Implementation::add_through_points(const Observations& more, std::size_t group) {
+  const std::vector<Observations> added = {more};
+  ModelValues under = values;
+  under.noise_stddev = {more.noise().stddev()};
+  if (!latents->append(BlocksOfStates(prior, added, under))) {
+    static_cast<void>(require_models(prior, added, values.parameters, {}));  // names the state
+    throw_not_definite();
+  }
+  if (group == observations.size()) {
+    observations.push_back(more.take({}));
+    values.noise_stddev.push_back(more.noise().stddev());
+    kept->n_states.push_back(0);
+  }
+  kept->stretch_of.clear();  // what is new is of none
+  // every so manieth of all
+  std::int64_t& n_states = kept->n_states[group];
+  std::vector<int> states;
+  for (int i = 0; i < more.n_data(); ++i, ++n_states) {
+    if (n_states % kept->step == 0) states.push_back(i);
+  }
+  observations[group].append(more.take(states));
+  keep_some(observations, *kept);
+}
+
+Posterior Posterior::of_summary(Prior prior, std::vector<Observations> observations, ModelValues values,
+                                const InducingSummary& summary) {
+  auto self = std::make_shared<Implementation>(std::move(prior), std::move(observations), std::move(values));
+  auto through = std::make_shared<InducingPosterior>(summary.latents, std::vector{summary.all});
+  if (!through->factorise()) throw_not_definite();
+  self->latents = std::move(through);
+  self->kept = summary.kept;
+  return Posterior(Components{std::move(self)});
+}
+
+std::shared_ptr<const InducingSummary> Posterior::summary() const {
+  const Implementation& self = implementation();
+  if (!self.kept) return nullptr;
+  const auto& through = static_cast<const InducingPosterior&>(*self.latents);
+  return std::make_shared<InducingSummary>(InducingSummary{through.inducing(), through.all(), *self.kept});
+}
+
+std::int64_t Posterior::n_states() const {
+  const Implementation& self = *held().front();
+  return self.kept ? std::accumulate(self.kept->n_states.begin(), self.kept->n_states.end(), std::int64_t{0})
+                   : gp2::n_states(self.observations);
+}
+
+}  // namespace gp2

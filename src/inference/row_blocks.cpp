@@ -1,0 +1,80 @@
+#include "inference/row_blocks.hpp"
+
+#include <algorithm>
+#include <utility>
+
+namespace gp2 {
+
+using Eigen::Index;
+
+std::size_t BlocksOfStates::Kept::bytes() const {
+  Index n = reduction ? reduction->y.size() : 0;
+  for (const Eigen::MatrixXd& one : features) n += one.size();
+  for (const ObservationModel& model : models) {
+    n += model.values.view.matrix.size() + model.values.view.offset.size() + model.values.prior.mean.size();
+    for (const Eigen::MatrixXd& one : model.values.prior.directions) n += one.size();
+  }
+  if (reduction) {
+    for (const Eigen::MatrixXd& one : reduction->directions) n += one.size();
+  }
+  return static_cast<std::size_t>(n) * sizeof(double);
+}
+
+BlocksOfStates::BlocksOfStates(const Prior& prior, const std::vector<Observations>& observations, const ModelValues& values,
+                               std::vector<int> gradient_parameters, const std::vector<Kept>* kept)
+    : prior_(prior),
+      observations_(observations),
+      values_(values),
+      gradient_parameters_(std::move(gradient_parameters)),
+      kept_(kept) {
+  for (std::size_t g = 0; g < observations.size(); ++g) {
+    const int n = observations[g].n_data();
+    for (int first = 0; first < n; first += block_size) states_.push_back({g, first, std::min(block_size, n - first)});
+  }
+}
+
+const RowBlock* BlocksOfStates::block(Index b, bool with_derivatives, Memory& memory) const {
+  const auto& [group, first, n] = states_[static_cast<std::size_t>(b)];
+  const Kept* const kept = kept_ == nullptr ? nullptr : &(*kept_)[static_cast<std::size_t>(b)];
+  RowBlock& block = memory.block;
+  block.first_group = group;
+  block.observations = nullptr;
+  block.models = nullptr;
+  if (kept != nullptr && kept->reduction) {
+    block.rows = latent_rows(prior_, kept->features, *kept->reduction, values_);
+    return &block;
+  }
+  memory.observations.clear();
+  memory.observations.push_back(observations_[group].slice(first, n));
+  block.observations = &memory.observations;
+  if (kept != nullptr) {
+    block.models = &kept->models;
+  } else {
+    const std::vector<int> in = with_derivatives ? gradient_parameters_ : std::vector<int>{};
+    if (!model_observations(prior_, memory.observations, values_.parameters, in, memory.models)) return nullptr;
+    block.models = &memory.models;
+  }
+  reduce(prior_, memory.observations, *block.models, {values_.noise_stddev[group]}, memory.reduction);
+  block.rows = kept == nullptr
+                   ? latent_rows(prior_, memory.observations, memory.reduction, values_)
+                   : latent_rows(prior_, sorted_features(prior_, {kept->features}, memory.reduction), memory.reduction, values_);
+  return &block;
+}
+
+BlocksOfStates::Kept BlocksOfStates::keep(const RowBlock& block, bool with_reduction) const {
+  Kept kept;
+  if (!with_reduction) {
+    kept.models = *block.models;
+    for (ObservationModel& model : kept.models) model.mechanics = {};
+    kept.features = std::move(features_by_group(prior_, *block.observations).front());
+    return kept;
+  }
+  kept.reduction = *block.rows.reduction;
+  kept.reduction->samples = {};
+  for (const LatentRows::OfLatent& latent : block.rows.latents) {
+    kept.features.emplace_back(latent.kernel.features().topRows(block.rows.n_samples()));
+  }
+  return kept;
+}
+
+}  // namespace gp2

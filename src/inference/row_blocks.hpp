@@ -1,0 +1,90 @@
+#pragma once
+
+#include <cstddef>
+#include <optional>
+#include <vector>
+
+#include <Eigen/Core>
+
+#include "inference/latent_rows.hpp"
+
+namespace gp2 {
+
+/// Some observations, reduced and as the latents see them, with what they come from.
+struct RowBlock {
+  LatentRows rows;
+  const std::vector<Observations>* observations = nullptr;
+  const std::vector<ObservationModel>* models = nullptr;  // null where nothing but the rows is kept
+  std::size_t first_group = 0;                            // of all Observations, that observations->front() is of
+};
+
+/// Observations as a solver is given them: block after block, each perhaps made when it is asked for.
+class RowBlocks {
+ public:
+  /// What a block is made in; one per thread.
+  struct Memory {
+    std::vector<Observations> observations;
+    std::vector<ObservationModel> models;
+    Reduction reduction;
+    RowBlock block;
+  };
+
+  virtual ~RowBlocks() = default;
+  [[nodiscard]] virtual Eigen::Index n_blocks() const = 0;
+  /// Null where the mechanics or the prior have a fault at one of its states.
+  /// @param with_derivatives  whether its models need those in the parameters
+  [[nodiscard]] virtual const RowBlock* block(Eigen::Index b, bool with_derivatives, Memory& memory) const = 0;
+};
+
+/// All rows as one block, which must outlive it.
+class WholeRows final : public RowBlocks {
+ public:
+  explicit WholeRows(const RowBlock& block) : block_(block) {}
+  [[nodiscard]] Eigen::Index n_blocks() const override { return 1; }
+  [[nodiscard]] const RowBlock* block(Eigen::Index, bool, Memory&) const override { return &block_; }
+
+ private:
+  const RowBlock& block_;
+};
+
+/// Blocks of few states of one Observations each, so that memory beside the observations does not grow with their number.
+class BlocksOfStates final : public RowBlocks {
+ public:
+  static constexpr int block_size = 256;
+  static constexpr std::size_t most_kept_bytes = 500'000'000;  // of which there is more is made anew each time
+
+  /// What is made of blocks once, where parameters, or parameters and noise, stay.
+  struct Kept {
+    std::vector<ObservationModel> models;   // without the mechanics …
+    std::optional<Reduction> reduction;     // … or in their place, without samples
+    std::vector<Eigen::MatrixXd> features;  // per latent: of the states, or as sorted by the reduction
+
+    [[nodiscard]] std::size_t bytes() const;
+  };
+
+  /// What it is given by reference must outlive it.
+  /// @param gradient_parameters  in which the models may have derivatives
+  /// @param kept                 of keep(), for the same observations; null: every block is made anew each time
+  BlocksOfStates(const Prior& prior, const std::vector<Observations>& observations, const ModelValues& values,
+                 std::vector<int> gradient_parameters = {}, const std::vector<Kept>* kept = nullptr);
+
+  [[nodiscard]] Eigen::Index n_blocks() const override { return std::ssize(states_); }
+  [[nodiscard]] const RowBlock* block(Eigen::Index b, bool with_derivatives, Memory& memory) const override;
+
+  /// @param with_reduction  whether the noise stays too
+  [[nodiscard]] Kept keep(const RowBlock& block, bool with_reduction) const;
+
+ private:
+  struct States {
+    std::size_t group;
+    int first, n;
+  };
+  const Prior& prior_;
+  const std::vector<Observations>& observations_;
+  const ModelValues& values_;
+  std::vector<int> gradient_parameters_;
+  const std::vector<Kept>* kept_;
+  std::vector<States> states_;
+};
+
+}  // namespace gp2
