@@ -34,6 +34,7 @@ Command simulate_command();
 Command shoot_command();
 Command excite_command();
 Command evaluate_command();
+Command update_command();
 Command report_command();
 Command reproduce_command();
 

@@ -327,9 +327,7 @@ void run(FitArguments& arguments, const std::set<std::string>& given) {
     print();  // what an hour has found is not lost to a full disk
     throw;
   }
-  int n_rows = 0;
-  for (const Observations& group : file.observations) n_rows += group.n_data();
-  print_notes({fmt::format("{}: fit of '{}' to {} rows", arguments.output, file.model.system->name(), n_rows)});
+  print_notes({fmt::format("{}: fit of '{}' to {} rows", arguments.output, file.model.system->name(), outcome.posterior.n_states())});
   print();
   if (file.report.termination == FitReport::interrupted) {
     print_notes({fmt::format("{}: {} holds the best so far, not converged; --start {} goes on from there", interruption.text(),

@@ -1,5 +1,7 @@
 #pragma once
 
+#include <memory>
+#include <utility>
 #include <vector>
 
 #include <Eigen/Core>
@@ -9,6 +11,20 @@
 #include "gp2/view.hpp"
 
 namespace gp2 GP2_API {
+
+/// A matrix that its copies share until one of them is changed: many rows stand in memory once, whoever holds them.
+class SharedMatrix {
+ public:
+  SharedMatrix() = default;
+  explicit SharedMatrix(Eigen::MatrixXd matrix) : matrix_(std::make_shared<Eigen::MatrixXd>(std::move(matrix))) {}
+
+  [[nodiscard]] const Eigen::MatrixXd& get() const;
+  /// Its own from now on.
+  [[nodiscard]] Eigen::MatrixXd& change();
+
+ private:
+  std::shared_ptr<Eigen::MatrixXd> matrix_;  // null: empty
+};
 
 /// Noise of N measurements of d values each: ε_i ~ N(0, diag(σ_i²)),  σ_ki = σ_k s_ki. Each row of values has one σ_k, and s = 1,
 /// or each value has a scale s_ki of its own. What belongs to one state alone is a column of a matrix, so that rows of data are
@@ -22,8 +38,8 @@ class Noise {
 
   [[nodiscard]] const Eigen::VectorXd& stddev() const { return stddev_; }
   [[nodiscard]] bool is_estimated() const { return is_estimated_; }
-  [[nodiscard]] const Eigen::MatrixXd& scale() const { return scale_; }
-  [[nodiscard]] bool has_scale() const { return scale_.size() > 0; }
+  [[nodiscard]] const Eigen::MatrixXd& scale() const { return scale_.get(); }
+  [[nodiscard]] bool has_scale() const { return scale().size() > 0; }
 
   /// σ_i (d) of state i under a σ that may differ from stddev(), as an estimate does.
   [[nodiscard]] Eigen::VectorXd at(const Eigen::Ref<const Eigen::VectorXd>& stddev, Eigen::Index i) const;
@@ -41,7 +57,7 @@ class Noise {
  private:
   Eigen::VectorXd stddev_;
   bool is_estimated_;
-  Eigen::MatrixXd scale_;
+  SharedMatrix scale_;
 };
 
 /// A measured sum of one entry of a view over states that stand one after the other (theory.md, T36):
@@ -71,19 +87,21 @@ class Observations {
   Observations(Eigen::MatrixXd states, View view, Eigen::MatrixXd values, Eigen::VectorXd noise_stddev,
                bool estimate_noise = false, Eigen::MatrixXd noise_scale = {});
 
-  [[nodiscard]] const Eigen::MatrixXd& states() const { return states_; }
+  [[nodiscard]] const Eigen::MatrixXd& states() const { return states_.get(); }
   [[nodiscard]] const View& view() const { return view_; }
-  [[nodiscard]] const Eigen::MatrixXd& values() const { return values_; }
+  [[nodiscard]] const Eigen::MatrixXd& values() const { return values_.get(); }
   [[nodiscard]] const Noise& noise() const { return noise_; }
   [[nodiscard]] const std::vector<WeightedSum>& sums() const { return sums_; }
   [[nodiscard]] bool has_sums() const { return !sums_.empty(); }
-  [[nodiscard]] int n_data() const { return static_cast<int>(states_.cols()); }
+  [[nodiscard]] int n_data() const { return static_cast<int>(states().cols()); }
 
   /// The same with as many other states. @throws InputError as the constructor.
   [[nodiscard]] Observations with_states(Eigen::MatrixXd states) const;
   /// The same with another view, other values, another noise, and without sums. @throws InputError as the constructor.
   [[nodiscard]] Observations with_view(View view) const { return {states_, std::move(view), values_, noise_}; }
-  [[nodiscard]] Observations with_values(Eigen::MatrixXd values) const { return {states_, view_, std::move(values), noise_}; }
+  [[nodiscard]] Observations with_values(Eigen::MatrixXd values) const {
+    return {states_, view_, SharedMatrix(std::move(values)), noise_};
+  }
   [[nodiscard]] Observations with_noise(Noise noise) const { return {states_, view_, values_, std::move(noise)}; }
   /// The same with these sums.
   /// @throws InputError when one is of rows or states that there are not, has numbers that are not finite, a last entry of L that is
@@ -113,9 +131,11 @@ class Observations {
   [[nodiscard]] Eigen::VectorXd usual_noise(const Eigen::Ref<const Eigen::VectorXd>& stddev) const;
 
  private:
-  Eigen::MatrixXd states_;
+  Observations(SharedMatrix states, View view, SharedMatrix values, Noise noise);
+
+  SharedMatrix states_;
   View view_;
-  Eigen::MatrixXd values_;
+  SharedMatrix values_;
   Noise noise_;
   std::vector<WeightedSum> sums_;
 };

@@ -129,6 +129,7 @@ class Posterior {
   friend Posterior update(Posterior&& posterior, Observations added);
   friend struct LeftOut leave_out(const Posterior& posterior, int n_stretches);
   friend Posterior remove_oldest(Posterior&& posterior, int n);
+  friend Posterior forget(Posterior&& posterior, double share);
 
   using Components = std::vector<std::shared_ptr<const Implementation>>;
 
@@ -159,6 +160,11 @@ class Posterior {
 /// @throws InputError when the states are not as large as those of the system, and as the constructor; it and
 /// NumericalError leave `posterior` as it was. Otherwise it is empty, as after any move.
 [[nodiscard]] Posterior update(Posterior&& posterior, Observations added);
+
+/// The posterior in which the likelihood of all observations so far counts as its power `share`, 0 < share ≤ 1: before each update
+/// what is old fades, as where a machine wears. Through inducing points only; O(M³). In place and otherwise as update.
+/// @throws InputError when the share is out of range, or observations are known one by one: those go by remove_oldest.
+[[nodiscard]] Posterior forget(Posterior&& posterior, double share);
 
 /// The posterior without the n observed states that were added first; those given to the constructor count in their order, group
 /// after group. Rows leave the factor by plane rotations, O(n²) operations each, as stable as a posterior built anew. A group that

@@ -16,6 +16,7 @@
 #include "gp2/jobs/predict_job.hpp"
 #include "gp2/jobs/shoot_job.hpp"
 #include "gp2/jobs/simulate_job.hpp"
+#include "gp2/jobs/update_job.hpp"
 #include "gp2/training/laplace.hpp"
 #include "options.hpp"
 
@@ -199,48 +200,16 @@ std::optional<Posterior> kept_by_others(const PyPosterior& self) {
 }
 
 void update_with(PyPosterior& self, const py::object& data, const std::vector<std::string>& observe,
-                 const std::optional<double>& noise_stddev, const py::object& columns) {
-  const System& system = self.system();
-  const std::vector<Observations>& groups = self.posterior.observations();
-  const auto at_home = std::find_if(groups.begin(), groups.end(), [](const Observations& group) {
-    return group.view().is_of_ddq() && group.view().other_system == nullptr;
-  });
-  View view = View::constrained_acceleration(system);
-  std::vector<std::string> names = observe;
-  if (names.empty() && at_home != groups.end()) names = at_home->view().names(system);
-  view.rows = acceleration_rows(system, names, "observe");
-  if (names.empty()) names = view.names(system);
-
-  const CsvTable table = to_table(data, "data");
-  LogStates log = read_log_states(self.posterior.prior(), view, self.file.model, table, columns_argument(columns), names);
-
-  // the noise that the fit has for these rows, unless told otherwise; where it is a factor of stated ones, the log states them
-  VectorXd stddev = VectorXd::Constant(view.size(), noise_stddev.value_or(std::numeric_limits<double>::quiet_NaN()));
-  MatrixXd scale;
-  if (!noise_stddev) {
-    if (at_home == groups.end() || at_home->view().rows != view.rows) {
-      throw InputError("noise_std: these accelerations were not observed in the fit; give their noise standard deviation");
-    }
-    stddev = self.posterior.noise_stddev(static_cast<std::size_t>(at_home - groups.begin()));
-    bool states_noise = false;
-    for (int k = 0; k < view.size(); ++k) states_noise = states_noise || at_home->states_noise(k);
-    if (states_noise) {
-      LogReader reader = open_log(self.file.model, table, columns_argument(columns));
-      for (const std::string& name : names) {
-        if (!reader.stddev_column(name).empty()) continue;
-        throw InputError(
-            fmt::format("noise_std: in the fit each value of {} has a noise of its own; give that of these in a column "
-                        "{}_std, or one for all",
-                        name, name));
-      }
-      scale = reader.stddevs(names);
-    }
-  }
-  tell(log.notes);
-  Observations added(std::move(log.states), std::move(view), std::move(log.accelerations), std::move(stddev), false,
-                     std::move(scale));
+                 const std::optional<double>& noise_stddev, const py::object& columns, const std::optional<double>& share,
+                 const std::optional<int>& window) {
+  const UpdateRequest request{observe, noise_stddev, columns_argument(columns), share, window};
+  std::vector<std::string> notes;
+  Observations more = more_observations(self.file, self.posterior, to_table(data, "data"), request, notes);
+  tell(notes);
   const std::optional<Posterior> kept = kept_by_others(self);
-  self.posterior = update(std::move(self.posterior), std::move(added));
+  if (share) self.posterior = forget(std::move(self.posterior), *share);
+  self.posterior = update(std::move(self.posterior), std::move(more));
+  keep_newest(self.posterior, request);
 }
 
 // ---------------------------------------------------------------- motion
@@ -822,8 +791,10 @@ void define_evaluate_and_update(py::class_<PyPosterior>& posterior) {
           "a "
           "standard deviation of it, root mean square over means and deviations.")
       .def("update", &update_with, "data"_a, "observe"_a = std::vector<std::string>(), "noise_std"_a = py::none(),
-           "columns"_a = py::none(),
-           "Add measured accelerations, in place: O(N²) per row. Hyperparameters, parameters and scales are held.")
+           "columns"_a = py::none(), "forget"_a = py::none(), "window"_a = py::none(),
+           "Add measured accelerations, in place: O(N²) per row, or O(M²) through M inducing variables. Hyperparameters, parameters "
+           "and scales are held. `forget`: first let what was learned count as this share of it, through inducing points; `window`: "
+           "then leave the newest so many states, of an exact fit.")
       .def(
           "remove_oldest",
           [](PyPosterior& self, int n) {

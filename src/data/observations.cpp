@@ -29,32 +29,47 @@ void erase_first_columns(MatrixXd& matrix, Index n) {
 
 }  // namespace
 
+const MatrixXd& SharedMatrix::get() const {
+  static const MatrixXd empty;
+  return matrix_ ? *matrix_ : empty;
+}
+
+MatrixXd& SharedMatrix::change() {
+  if (!matrix_ || matrix_.use_count() > 1) {
+    matrix_ = std::make_shared<MatrixXd>(get());
+  } else {
+    // what another thread read through a copy that it has just let go was read before what is written now
+    std::shared_ptr<const MatrixXd>(matrix_).reset();
+  }
+  return *matrix_;
+}
+
 Noise::Noise(VectorXd stddev, bool is_estimated, MatrixXd scale)
-    : stddev_(std::move(stddev)), is_estimated_(is_estimated), scale_(std::move(scale)) {}
+    : stddev_(std::move(stddev)), is_estimated_(is_estimated), scale_(SharedMatrix(std::move(scale))) {}
 
 VectorXd Noise::at(const Eigen::Ref<const VectorXd>& stddev, Index i) const {
   VectorXd noise = stddev;
-  if (has_scale()) noise.array() *= scale_.col(i).array();
+  if (has_scale()) noise.array() *= scale().col(i).array();
   return noise;
 }
 
 Noise Noise::take(const std::vector<int>& states) const {
-  return Noise(stddev_, is_estimated_, has_scale() ? MatrixXd(scale_(Eigen::all, states)) : MatrixXd());
+  return Noise(stddev_, is_estimated_, has_scale() ? MatrixXd(scale()(Eigen::all, states)) : MatrixXd());
 }
 
 Noise Noise::slice(int first, int n) const {
-  return Noise(stddev_, is_estimated_, has_scale() ? MatrixXd(scale_.middleCols(first, n)) : MatrixXd());
+  return Noise(stddev_, is_estimated_, has_scale() ? MatrixXd(scale().middleCols(first, n)) : MatrixXd());
 }
 
 void Noise::append(const Noise& more) {
   if (has_scale() != more.has_scale()) {
     throw InputError("observations: some have a noise of each value and some have not; give all of them a noise_scale, or none");
   }
-  if (has_scale()) append_columns(scale_, more.scale_);
+  if (has_scale()) append_columns(scale_.change(), more.scale());
 }
 
 void Noise::remove_first(int n) {
-  if (has_scale()) erase_first_columns(scale_, n);
+  if (has_scale()) erase_first_columns(scale_.change(), n);
 }
 
 void Noise::require_noise_of(const MatrixXd& values) const {
@@ -67,32 +82,35 @@ void Noise::require_noise_of(const MatrixXd& values) const {
     throw InputError(fmt::format("observations: `noise_stddev` must be positive and finite, got {}", sigma));
   }
   if (!has_scale()) return;
-  if (scale_.rows() != values.rows() || scale_.cols() != values.cols()) {
+  if (scale().rows() != values.rows() || scale().cols() != values.cols()) {
     throw InputError(
         fmt::format("noise_scale must hold one number for each of the {} × {} values, got {} × {}; leave it empty where "
                     "each row has one noise",
-                    values.rows(), values.cols(), scale_.rows(), scale_.cols()));
+                    values.rows(), values.cols(), scale().rows(), scale().cols()));
   }
   for (Index entry = 0; entry < values.size(); ++entry) {
-    const double scale = scale_.reshaped()[entry];
-    if ((scale > 0 && std::isfinite(scale)) || std::isnan(values.reshaped()[entry])) continue;
+    const double one = scale().reshaped()[entry];
+    if ((one > 0 && std::isfinite(one)) || std::isnan(values.reshaped()[entry])) continue;
     throw InputError(fmt::format(
-        "noise_scale must be positive and finite, got {}; a value that is worth nothing is NaN, not measured", scale));
+        "noise_scale must be positive and finite, got {}; a value that is worth nothing is NaN, not measured", one));
   }
 }
 
 Observations::Observations(MatrixXd states, View view, MatrixXd values, Noise noise)
+    : Observations(SharedMatrix(std::move(states)), std::move(view), SharedMatrix(std::move(values)), std::move(noise)) {}
+
+Observations::Observations(SharedMatrix states, View view, SharedMatrix values, Noise noise)
     : states_(std::move(states)), view_(std::move(view)), values_(std::move(values)), noise_(std::move(noise)) {
-  if (values_.rows() != view_.size() || values_.cols() != states_.cols()) {
+  if (this->values().rows() != view_.size() || this->values().cols() != n_data()) {
     throw InputError(
         fmt::format("observations: `values` must have a row for each of the view's {} and a column for each of the {} "
                     "states, got {} × {}",
-                    view_.size(), states_.cols(), values_.rows(), values_.cols()));
+                    view_.size(), n_data(), this->values().rows(), this->values().cols()));
   }
-  if (values_.array().isInf().any()) {
+  if (this->values().array().isInf().any()) {
     throw InputError("observations: `values` must be finite, or NaN where nothing is measured; got one that is infinite");
   }
-  noise_.require_noise_of(values_);
+  noise_.require_noise_of(this->values());
 }
 
 Observations::Observations(MatrixXd states, View view, MatrixXd values, VectorXd noise_stddev, bool estimate_noise,
@@ -101,7 +119,7 @@ Observations::Observations(MatrixXd states, View view, MatrixXd values, VectorXd
                    Noise(std::move(noise_stddev), estimate_noise, std::move(noise_scale))) {}
 
 Observations Observations::with_states(MatrixXd states) const {
-  Observations out(std::move(states), view_, values_, noise_);
+  Observations out(SharedMatrix(std::move(states)), view_, values_, noise_);
   out.sums_ = sums_;
   return out;
 }
@@ -134,33 +152,33 @@ void Observations::require_no_sums() const {
 
 Observations Observations::take(const std::vector<int>& states) const {
   require_no_sums();
-  return {MatrixXd(states_(Eigen::all, states)), view_, MatrixXd(values_(Eigen::all, states)), noise_.take(states)};
+  return {MatrixXd(this->states()(Eigen::all, states)), view_, MatrixXd(values()(Eigen::all, states)), noise_.take(states)};
 }
 
 Observations Observations::slice(int first, int n) const {
   require_no_sums();
-  return {MatrixXd(states_.middleCols(first, n)), view_, MatrixXd(values_.middleCols(first, n)), noise_.slice(first, n)};
+  return {MatrixXd(states().middleCols(first, n)), view_, MatrixXd(values().middleCols(first, n)), noise_.slice(first, n)};
 }
 
 void Observations::append(const Observations& more) {
   require_no_sums();
   more.require_no_sums();
   noise_.append(more.noise_);
-  append_columns(states_, more.states_);
-  append_columns(values_, more.values_);
+  append_columns(states_.change(), more.states());
+  append_columns(values_.change(), more.values());
 }
 
 void Observations::remove_first(int n) {
   if (n > 0) require_no_sums();
-  erase_first_columns(states_, n);
-  erase_first_columns(values_, n);
+  erase_first_columns(states_.change(), n);
+  erase_first_columns(values_.change(), n);
   noise_.remove_first(n);
 }
 
 VectorXd Observations::noise_at(const Eigen::Ref<const VectorXd>& stddev, Index i) const {
   VectorXd noise = noise_.at(stddev, i);
   for (Index k = 0; k < noise.size(); ++k) {
-    if (std::isnan(values_(k, i))) noise[k] = std::numeric_limits<double>::infinity();
+    if (std::isnan(values()(k, i))) noise[k] = std::numeric_limits<double>::infinity();
   }
   return noise;
 }
@@ -173,8 +191,8 @@ bool Observations::states_noise(Index k) const {
 
 std::vector<double> Observations::measured_scales(Index k) const {
   std::vector<double> scales;
-  for (Index i = 0; i < values_.cols(); ++i) {
-    if (!std::isnan(values_(k, i))) scales.push_back(noise_.scale()(k, i));
+  for (Index i = 0; i < values().cols(); ++i) {
+    if (!std::isnan(values()(k, i))) scales.push_back(noise_.scale()(k, i));
   }
   return scales;
 }

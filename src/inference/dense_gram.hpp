@@ -1,6 +1,7 @@
 #pragma once
 
 #include <atomic>
+#include <cassert>
 
 #include "inference/gram.hpp"
 #include "inference/growing_cholesky.hpp"
@@ -55,6 +56,7 @@ class DensePosterior final : public LatentPosterior {
   [[nodiscard]] bool append(const LatentRows& more);
   [[nodiscard]] Inverse invert(const LatentRows& rows, const std::vector<std::vector<Eigen::Index>>& sets) const override;
   void erase(const std::vector<Eigen::Index>& samples) override;
+  void forget(double /*share*/) override { assert(false); }
 
  private:
   // the factor of K̃ + I, of all rows or extended by more; false where it is not positive definite

@@ -94,8 +94,10 @@ class LatentPosterior {
 
   /// Conditions on more observations. False, and nothing has changed, where the covariance is not positive definite.
   [[nodiscard]] virtual bool append(const RowBlocks& more) = 0;
-  /// Takes observed samples away, by rising numbers in the order of adding.
+  /// Takes observed samples away, by rising numbers in the order of adding: of one that knows them one by one.
   virtual void erase(const std::vector<Eigen::Index>& samples) = 0;
+  /// Lets the likelihood of all observations count as its power `share`: of one that knows them by their sums.
+  virtual void forget(double share) = 0;
 
   /// What all others say of a set B of samples (leave_one_out.hpp).
   struct WithoutSet {

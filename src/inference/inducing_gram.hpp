@@ -66,8 +66,8 @@ class InducingPosterior final : public LatentPosterior {
   [[nodiscard]] Eigen::VectorXd misfit(const std::vector<Eigen::MatrixXd>& f, RandomStream& random) const override;
   [[nodiscard]] std::vector<std::vector<Eigen::MatrixXd>> weights(Eigen::MatrixXd misfits) const override;
   [[nodiscard]] bool append(const RowBlocks& more) override;
-  /// Not possible: nothing is kept of single samples.
   void erase(const std::vector<Eigen::Index>& /*samples*/) override { assert(false); }
+  void forget(double share) override;
   /// @param sets  one for each stretch
   [[nodiscard]] Inverse invert(const LatentRows& rows, const std::vector<std::vector<Eigen::Index>>& sets) const override;
 

@@ -116,13 +116,13 @@ std::optional<InducingStatistics> InducingStatistics::of(const InducingLatents& 
   return all;
 }
 
-void InducingStatistics::add(const InducingStatistics& other) {
-  B += other.B;
-  c += other.c;
-  yy += other.yy;
-  trace += other.trace;
-  constant += other.constant;
-  weight += other.weight;
+void InducingStatistics::add(const InducingStatistics& other, double share) {
+  B += share * other.B;
+  c += share * other.c;
+  yy += share * other.yy;
+  trace += share * other.trace;
+  constant += share * other.constant;
+  weight += share * other.weight;
 }
 
 void InducingStatistics::add(const InducingLatents& latents, const InducingBlock& block, MatrixXd& memory) {

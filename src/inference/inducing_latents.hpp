@@ -134,7 +134,8 @@ struct InducingStatistics {
   /// Nothing where a block has a fault.
   [[nodiscard]] static std::optional<InducingStatistics> of(const InducingLatents& latents, const RowBlocks& rows, int n_threads,
                                                             const std::atomic<bool>* stop = nullptr);
-  void add(const InducingStatistics& other);
+  /// @param share  as which the likelihood of the other counts
+  void add(const InducingStatistics& other, double share = 1);
   /// Adds a block of samples.
   /// @param memory  that is used again
   void add(const InducingLatents& latents, const InducingBlock& block, Eigen::MatrixXd& memory);

@@ -135,6 +135,13 @@ bool InducingPosterior::append(const RowBlocks& more) {
   return true;
 }
 
+void InducingPosterior::forget(double share) {
+  InducingStatistics faded(inducing_);
+  faded.add(all_, share);
+  stretches_ = {std::move(faded)};
+  static_cast<void>(factorise());  // I + share (B − I) is no less definite than B
+}
+
 // With P = I − Ψ B⁻¹Ψᵀ the inverse of a set is P_BB⁻¹ = I + Ψ_B B₋⁻¹Ψ_Bᵀ, and P_BB⁻¹α̃_B = ỹ_B − Ψ_B B₋⁻¹c₋, where B₋ and c₋ are of
 // all other samples: sums of what each stretch says, so that nothing is taken from anything.
 LatentPosterior::Inverse InducingPosterior::invert(const LatentRows& rows, const std::vector<std::vector<Index>>& sets) const {

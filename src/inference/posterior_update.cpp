@@ -90,6 +90,18 @@ Posterior update(Posterior&& posterior, Observations added) {
   return Posterior(Posterior::Components(own.begin(), own.end()));
 }
 
+Posterior forget(Posterior&& posterior, double share) {
+  if (!(share > 0 && share <= 1)) throw InputError(fmt::format("`forget`: a share is above 0 and at most 1, got {}", share));
+  if (!posterior.implementation().kept) {
+    throw InputError("`forget`: observations of an exact fit are known one by one: the oldest go by `window`");
+  }
+  const lapack::SingleThread single_thread;
+  const auto own = posterior.own_components();
+  for (const auto& component : own) component->latents->forget(share);
+  posterior.components_.clear();
+  return Posterior(Posterior::Components(own.begin(), own.end()));
+}
+
 Posterior remove_oldest(Posterior&& posterior, int n) {
   if (posterior.implementation().kept) {
     throw InputError("what was learned through inducing points cannot be taken away: the observations themselves are not kept");

@@ -15,6 +15,7 @@
 #include "base/not_a_number.hpp"
 #include "base/parallel.hpp"
 #include "base/random.hpp"
+#include "data/evenly.hpp"
 #include "gp2/error.hpp"
 #include "gp2/inference/evaluation.hpp"
 #include "training/evolution.hpp"
@@ -486,6 +487,10 @@ Excitation excite(const Model& model, const Posterior& posterior, const std::vec
   motion.records.clear();
   require_start_within(motion.start, limits);
   out.notes = motion.notes;
+  if (posterior.n_states() > n_states(posterior.observations())) {
+    out.notes.push_back(fmt::format("what is known already is reckoned from {} of the {} rows of the fit",
+                                    n_states(posterior.observations()), posterior.n_states()));
+  }
 
   Search search(std::move(motion), information, InputFamily(inputs, of_motion.times, request.n_harmonics, model.actuators),
                 limits, out.target, request, stop);

@@ -90,9 +90,9 @@ FitMemory memory_of(double n_states, double r, const PerState& count, const FitO
   memory.reduced_size = static_cast<int>(std::lround(r));
   memory.shared = number * n_states * count.shared;
   if (options.n_inducing > 0) {
-    // the observations as they stand in the problem and its copy, the likelihood and the posterior or a stage before all of them, and
-    // what is kept of blocks; sums of each part of the rows and of each stretch, with what is made of them
-    constexpr double n_copies = 4;
+    // the observations, those of a stage before all of them, or of a stretch, and what is kept of blocks; sums of each part of the rows
+    // and of each stretch, with what is made of them
+    constexpr double n_copies = 1.5;
     const double square = number * std::pow(std::min<double>(options.n_inducing, r), 2);
     memory.shared = number * n_states * n_copies * count.observed;
     memory.evaluation = (Gram::n_parts + 6) * square +

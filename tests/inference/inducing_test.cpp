@@ -1,5 +1,9 @@
 #include "gp2/inference/inducing.hpp"
 
+#include <cmath>
+#include <numeric>
+#include <stdexcept>
+
 #include <gmock/gmock.h>
 #include <gtest/gtest.h>
 
@@ -169,6 +173,70 @@ TEST(Inducing, PosteriorsGrowByMoreObservations) {
     ++n_grown;
   }
   EXPECT_GT(n_grown, 5);
+}
+
+// the first problem of one Observations of ddq, with many states
+Problem of_many_states(int n) {
+  for (Problem& p : exact_problems(n)) {
+    if (p.observations.size() == 1 && p.observations.front().view().is_of_ddq()) return with_points(std::move(p), 12);
+  }
+  throw std::logic_error("no such problem");
+}
+
+TEST(Inducing, AllOfManyStatesAreLearnedFromAndSomeAreKept) {
+  const Problem p = of_many_states(11'000);
+  const Posterior posterior(p.prior, p.observations, p.values);
+  EXPECT_EQ(posterior.n_states(), 11'000);
+  EXPECT_EQ(posterior.observations().front().n_data(), 2750) << "every fourth";
+  EXPECT_EQ(posterior.observations().front().states().col(1), p.observations.front().states().col(4));
+  EXPECT_NEAR(posterior.negative_log_likelihood(), test::evaluate(p).value, 1e-9 * std::abs(test::evaluate(p).value));
+
+  const View view = View::constrained_acceleration(*p.prior.system);
+  const Posterior on_threads(p.prior, p.observations, p.values, 3);
+  EXPECT_EQ(on_threads.marginal(view, p.queries).covariance, posterior.marginal(view, p.queries).covariance);
+
+  // in halves, one after the other
+  std::vector<int> first(5500), rest(5500);
+  std::iota(first.begin(), first.end(), 0);
+  std::iota(rest.begin(), rest.end(), 5500);
+  const Observations& all = p.observations.front();
+  const Observations more = all.take(rest);
+  const Posterior grown = update(Posterior(p.prior, {all.take(first)}, p.values),
+                                 {more.states(), more.view(), more.values(), p.values.noise_stddev.front()});
+  EXPECT_EQ(grown.n_states(), 11'000);
+  EXPECT_LE(grown.observations().front().n_data(), 5000);
+  const MatrixXd mean = posterior.mean(view, p.queries);
+  EXPECT_LE(largest(grown.mean(view, p.queries) - mean), 1e-9 * (1 + largest(mean)));
+
+  const LeftOut left_out = leave_out(posterior, LeftOut::n_stretches);
+  EXPECT_EQ(left_out.stretches.front().mean.cols(), 2750);
+  EXPECT_TRUE(leave_out(grown, LeftOut::n_stretches).stretches.empty()) << "what came later is of no stretch";
+}
+
+// The power of a Gaussian density is one of a larger noise, but for a constant.
+TEST(Inducing, WhatIsForgottenCountsAsIfItsNoiseHadBeenLarger) {
+  int n_forgotten = 0;
+  for (const Problem& p : exact_problems()) {
+    if (p.observations.size() > 1 || p.observations.front().view().latent) continue;
+    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, inducing_seed));
+    constexpr double share = 0.25;
+    Problem through = with_points(p, 12), noisier = through;
+    for (VectorXd& stddev : noisier.values.noise_stddev) stddev /= std::sqrt(share);
+    if (p.prior.system->has_constraint_noise()) continue;
+    const Posterior faded = forget(test::posterior_of(through), share), expected = test::posterior_of(noisier);
+    const View view = View::constrained_acceleration(*p.prior.system);
+    const Posterior::Marginal got = faded.marginal(view, p.queries), wanted = expected.marginal(view, p.queries);
+    const double tolerance = 1e2 * test::rounding(p);
+    EXPECT_LE(largest(got.mean - wanted.mean), tolerance * (1 + largest(wanted.mean)));
+    EXPECT_LE(largest(got.covariance - wanted.covariance), tolerance * (1 + largest(wanted.covariance)));
+    ++n_forgotten;
+  }
+  EXPECT_GT(n_forgotten, 5);
+  const Problem p = exact_problems().front();
+  EXPECT_THAT(test::input_error_of([&] { static_cast<void>(forget(test::posterior_of(with_points(p, 5)), 0)); }),
+              testing::HasSubstr("a share is above 0 and at most 1, got 0"));
+  EXPECT_THAT(test::input_error_of([&] { static_cast<void>(forget(test::posterior_of(p), 0.5)); }),
+              testing::HasSubstr("the oldest go by `window`"));
 }
 
 TEST(Inducing, BadRequestsAreErrors) {

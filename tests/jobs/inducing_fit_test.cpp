@@ -7,6 +7,7 @@
 #include "data_of_model.hpp"
 #include "gp2/error.hpp"
 #include "gp2/jobs/fit_job.hpp"
+#include "gp2/jobs/update_job.hpp"
 #include "input_error.hpp"
 #include "io_testing.hpp"
 #include "test_models.hpp"
@@ -94,6 +95,43 @@ TEST(InducingFit, TellsWhatIsLeftOutAndItsFileGivesItAgain) {
   // and again, from its options and data
   const FitOutcome again = run_fit(prepare_fit_again(read, 1));
   EXPECT_EQ(again.posterior.mean(view, states), outcome.posterior.mean(view, states));
+}
+
+TEST(InducingFit, AFileOfManyRowsHoldsWhatTheySayAndSomeOfThem) {
+  FitRequest request = request_of_rows(6000);
+  request.inducing = 40;
+  request.train_on = 300;
+  const FitOutcome outcome = run_fit(prepare_fit(std::move(request)));
+  EXPECT_EQ(outcome.posterior.n_states(), 6000);
+  EXPECT_EQ(outcome.file.report.negative_log_likelihood, outcome.posterior.negative_log_likelihood()) << "of all rows";
+  ASSERT_TRUE(outcome.cross_validation && outcome.cross_validation->stretches);
+  EXPECT_NEAR(outcome.cross_validation->stretches->coverage95, 0.95, 0.02);
+  const test::TemporaryFolder folder;
+  outcome.file.write(folder / "fit.json");
+  const FitFile read = FitFile::read(folder / "fit.json");
+  EXPECT_THAT(read.n_states(), testing::ElementsAre(6000));
+  EXPECT_EQ(read.observations.front().n_data(), 3000);
+  const Posterior posterior = read.posterior();
+  EXPECT_EQ(posterior.n_states(), 6000);
+  const View view = View::constrained_acceleration(*outcome.file.model.system);
+  const MatrixXd states = outcome.posterior.observations().front().states().leftCols(50);
+  EXPECT_EQ(posterior.marginal(view, states).covariance, outcome.posterior.marginal(view, states).covariance);
+  EXPECT_EQ(posterior.distance_from_data(view, states), outcome.posterior.distance_from_data(view, states));
+  const CrossValidation scores = cross_validate(read, posterior);
+  EXPECT_EQ(scores.one_by_one.nrmse, outcome.cross_validation->one_by_one.nrmse);
+  EXPECT_EQ(scores.stretches->nrmse, outcome.cross_validation->stretches->nrmse);
+  EXPECT_THAT(input_error_of([&] { static_cast<void>(prepare_fit_again(read)); }),
+              HasSubstr("`again`: the file holds what 6000 rows say, and 3000 of them; give its logs by `data`"));
+
+  // more of the same, kept in a file too
+  const UpdateOutcome updated = update(read, {test::drawn_log(surface, 200, 5).table()}, {});
+  EXPECT_EQ(updated.n_added, 200);
+  EXPECT_EQ(updated.n_states, 6200);
+  updated.fit.write(folder / "more.json");
+  const FitFile more = FitFile::read(folder / "more.json");
+  EXPECT_THAT(more.n_states(), testing::ElementsAre(6200));
+  EXPECT_FALSE(more.report.inducing->stretches) << "they were of other data";
+  EXPECT_LE(more.posterior().marginal(view, states).stddev().mean(), posterior.marginal(view, states).stddev().mean());
 }
 
 TEST(InducingFit, OfARobustOneDistrustsTheSame) {

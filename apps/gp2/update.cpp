@@ -1,0 +1,47 @@
+#include <memory>
+
+#include <fmt/format.h>
+
+#include "command.hpp"
+#include "gp2/data/csv.hpp"
+#include "gp2/jobs/update_job.hpp"
+
+namespace gp2::command {
+
+namespace {
+
+struct UpdateArguments {
+  std::string fit, output;
+  std::vector<std::string> data;
+  UpdateRequest request;
+};
+
+void run(const UpdateArguments& arguments) {
+  require_output(arguments.output, arguments.data);  // the fit itself may be replaced
+  std::vector<CsvTable> logs;
+  for (const std::string& path : arguments.data) logs.push_back(CsvTable::read(path));
+  const UpdateOutcome outcome = update(FitFile::read(arguments.fit), logs, arguments.request);
+  outcome.fit.write(arguments.output);
+  print_notes(outcome.notes);
+  print_notes({fmt::format("{}: {} rows more, {} in all; hyperparameters as they were", arguments.output, outcome.n_added,
+                           outcome.n_states)});
+}
+
+}  // namespace
+
+Command update_command() {
+  const auto a = std::make_shared<UpdateArguments>();
+  Command command{"update",
+                  "Add more data to a fit, its hyperparameters held: what a machine logs while it runs",
+                  "gp2 update fit.json --data today.csv -o fit.json",
+                  {},
+                  {}};
+  command.options = {argument("FIT.json", a->fit, "file written by gp2 fit"),
+                     required({"data", Repeated{&a->data}, "CSV", "log to add; several may be given"})};
+  for (Option& option : options(a->request)) command.options.push_back(std::move(option));
+  command.options.push_back(output(a->output, "JSON", "the fit with these data; may be FIT.json itself"));
+  command.run = [a](const std::set<std::string>&) { run(*a); };
+  return command;
+}
+
+}  // namespace gp2::command

@@ -1,0 +1,47 @@
+#pragma once
+
+#include <cstdint>
+#include <map>
+#include <optional>
+#include <string>
+#include <vector>
+
+#include "gp2/data/csv.hpp"
+#include "gp2/export.hpp"
+#include "gp2/files/fit_file.hpp"
+#include "gp2/jobs/option.hpp"
+
+namespace gp2 GP2_API {
+
+/// How more data are added to a fit, its hyperparameters held.
+struct UpdateRequest {
+  std::vector<std::string> observe;            // accelerations; empty: those that the fit observed
+  std::optional<double> noise_stddev;          // of each; not given: as in the fit
+  std::map<std::string, std::string> columns;  // model's name -> log's name, before the model's own [columns]
+  std::optional<double> forget;                // before: what was learned counts as this share of it
+  std::optional<int> window;                   // after: the newest states that are left
+};
+std::vector<Option> options(UpdateRequest& request);
+
+/// What a log adds to the observations of a fit.
+/// @param posterior  of the fit
+/// @param notes      receives what the reading has to say
+/// @throws InputError when the log lacks a column, or the noise of what it measures is not known.
+Observations more_observations(const FitFile& fit, const Posterior& posterior, const CsvTable& log, const UpdateRequest& request,
+                               std::vector<std::string>& notes);
+
+/// Leaves the newest states that a window asks for.
+/// @throws InputError as remove_oldest, and for a window that is not positive.
+void keep_newest(Posterior& posterior, const UpdateRequest& request);
+
+struct UpdateOutcome {
+  FitFile fit;
+  std::int64_t n_added = 0, n_states = 0;  // states: of the logs, and of the fit then
+  std::vector<std::string> notes;
+};
+
+/// The fit with these logs too, one after the other: update, forget and remove_oldest of its posterior.
+/// @throws InputError as more_observations, forget and remove_oldest; NumericalError as update.
+UpdateOutcome update(FitFile fit, const std::vector<CsvTable>& logs, const UpdateRequest& request);
+
+}  // namespace gp2
