@@ -327,7 +327,8 @@ void run(FitArguments& arguments, const std::set<std::string>& given) {
     print();  // what an hour has found is not lost to a full disk
     throw;
   }
-  print_notes({fmt::format("{}: fit of '{}' to {} rows", arguments.output, file.model.system->name(), outcome.posterior.n_states())});
+  print_notes(
+      {fmt::format("{}: fit of '{}' to {} rows", arguments.output, file.model.system->name(), outcome.posterior.n_states())});
   print();
   if (file.report.termination == FitReport::interrupted) {
     print_notes({fmt::format("{}: {} holds the best so far, not converged; --start {} goes on from there", interruption.text(),

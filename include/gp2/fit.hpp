@@ -117,9 +117,9 @@ struct InducingReport {
   std::shared_ptr<const InducingPoints> points;
   std::shared_ptr<const InducingSummary> summary;  // Posterior::summary
   int n_variables = 0;                             // M
-  Eigen::VectorXd left_out;  // t of all observations, per latent: left_out_by_points
-  int n_start = 0;           // states that the hyperparameters were fitted to before all of them
-  std::optional<Evaluation::Part> stretches;  // CrossValidation::stretches of all observations, which no file can tell again
+  Eigen::VectorXd left_out;                        // t of all observations, per latent: left_out_by_points
+  int n_start = 0;                                 // states that the hyperparameters were fitted to before all of them
+  std::optional<Evaluation::Part> stretches;       // CrossValidation::stretches of all observations, which no file can tell again
 };
 
 struct FitReport {

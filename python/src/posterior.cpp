@@ -692,8 +692,7 @@ void define_files_and_facts(py::class_<PyPosterior>& posterior) {
           },
           "What the fit was asked, a dict under the names of the options of gp2 fit; None where a file does not say.")
       .def_readonly("notes", &PyPosterior::notes, "What the reading of the data had to say.")
-      .def_property_readonly("n_data",
-[](const PyPosterior& self) { return self.posterior.n_states(); })
+      .def_property_readonly("n_data", [](const PyPosterior& self) { return self.posterior.n_states(); })
       .def_property_readonly("negative_log_likelihood",
                              [](const PyPosterior& self) { return self.posterior.negative_log_likelihood(); })
       .def_property_readonly(
@@ -771,10 +770,7 @@ void define_evaluate_and_update(py::class_<PyPosterior>& posterior) {
            "velocities, inputs), as gp2 shoot: the posterior under them, and a report (dict) with parameters, the rms of what\n"
            "motions are off in each coordinate before and after, duration, stretches, iterations, converged.")
       .def(
-          "cross_validate",
-          [](const PyPosterior& self) {
-            return cross_validate(self.file, self.posterior);
-          },
+          "cross_validate", [](const PyPosterior& self) { return cross_validate(self.file, self.posterior); },
           py::call_guard<py::gil_scoped_release>(),
           "How well the data predict themselves: each value from all others, and each of five stretches of time from the rest.")
       .def(
@@ -792,8 +788,10 @@ void define_evaluate_and_update(py::class_<PyPosterior>& posterior) {
           "standard deviation of it, root mean square over means and deviations.")
       .def("update", &update_with, "data"_a, "observe"_a = std::vector<std::string>(), "noise_std"_a = py::none(),
            "columns"_a = py::none(), "forget"_a = py::none(), "window"_a = py::none(),
-           "Add measured accelerations, in place: O(N²) per row, or O(M²) through M inducing variables. Hyperparameters, parameters "
-           "and scales are held. `forget`: first let what was learned count as this share of it, through inducing points; `window`: "
+           "Add measured accelerations, in place: O(N²) per row, or O(M²) through M inducing variables. Hyperparameters, "
+           "parameters "
+           "and scales are held. `forget`: first let what was learned count as this share of it, through inducing points; "
+           "`window`: "
            "then leave the newest so many states, of an exact fit.")
       .def(
           "remove_oldest",

@@ -91,8 +91,8 @@ void Noise::require_noise_of(const MatrixXd& values) const {
   for (Index entry = 0; entry < values.size(); ++entry) {
     const double one = scale().reshaped()[entry];
     if ((one > 0 && std::isfinite(one)) || std::isnan(values.reshaped()[entry])) continue;
-    throw InputError(fmt::format(
-        "noise_scale must be positive and finite, got {}; a value that is worth nothing is NaN, not measured", one));
+    throw InputError(
+        fmt::format("noise_scale must be positive and finite, got {}; a value that is worth nothing is NaN, not measured", one));
   }
 }
 

@@ -637,7 +637,8 @@ VectorXd bits_from(const ParsedJson& json, Index n) {
     const auto [end, error] = std::from_chars(first, first + 16, bits, 16);
     values[k] = std::bit_cast<double>(bits);
     if (end != first + 16 || error != std::errc() || !std::isfinite(values[k])) {
-      throw InputError(fmt::format("'{}' is not a finite number in hexadecimal digits", text.substr(16 * static_cast<std::size_t>(k), 16)));
+      throw InputError(
+          fmt::format("'{}' is not a finite number in hexadecimal digits", text.substr(16 * static_cast<std::size_t>(k), 16)));
     }
   }
   return values;
@@ -666,7 +667,8 @@ Json part_json(const Evaluation::Part& part) {
 
 Evaluation::Part part_from(const ParsedJson& json) {
   const auto numbers = [&](const char* key, std::size_t n) {
-    if (array(json.at(key)).size() != n) throw InputError(fmt::format("{} {}, expected {}", json.at(key).size(), key, n));
+    if (array(json.at(key)).size() != n)
+      throw InputError(fmt::format("scores have {} {}, expected {}", json.at(key).size(), key, n));
     VectorXd values(static_cast<Index>(n));
     std::transform(json.at(key).begin(), json.at(key).end(), values.begin(), number_or_missing);
     return values;
@@ -688,9 +690,15 @@ Json summary_json(const InducingSummary& summary) {
     factors.push_back({{"points", latent.chosen}, {"L", triangle_bits(latent.L)}});
   }
   const InducingStatistics& all = summary.all;
-  return {{"states", summary.kept.n_states}, {"step", summary.kept.step},  {"factors", factors},
-          {"B", triangle_bits(all.B)},       {"c", bits_of(all.c)},        {"yy", all.yy},
-          {"trace", all.trace},              {"constant", all.constant},   {"weight", vector_json(all.weight)}};
+  return {{"states", summary.kept.n_states},
+          {"step", summary.kept.step},
+          {"factors", factors},
+          {"B", triangle_bits(all.B)},
+          {"c", bits_of(all.c)},
+          {"yy", all.yy},
+          {"trace", all.trace},
+          {"constant", all.constant},
+          {"weight", vector_json(all.weight)}};
 }
 
 std::shared_ptr<const InducingSummary> summary_from(const ParsedJson& json, const Prior& prior, const ModelValues& values,
@@ -703,7 +711,8 @@ std::shared_ptr<const InducingSummary> summary_from(const ParsedJson& json, cons
     summary.kept.n_states.push_back(n.get<std::int64_t>());
   }
   if (summary.kept.n_states.size() != observations.size()) {
-    throw InputError(fmt::format("numbers of states of {} of {} observations", summary.kept.n_states.size(), observations.size()));
+    throw InputError(
+        fmt::format("numbers of states of {} of {} observations", summary.kept.n_states.size(), observations.size()));
   }
   std::vector<lapack::PivotedFactor> factors;
   for (const ParsedJson& of_latent : array(json.at("factors"))) {
@@ -712,13 +721,15 @@ std::shared_ptr<const InducingSummary> summary_from(const ParsedJson& json, cons
     lapack::PivotedFactor factor;
     for (const ParsedJson& point : array(of_latent.at("points"))) {
       factor.rows.push_back(integer(point));
-      if (factor.rows.back() < 0 || factor.rows.back() >= n_points) throw InputError(fmt::format("{} is no inducing point", factor.rows.back()));
+      if (factor.rows.back() < 0 || factor.rows.back() >= n_points)
+        throw InputError(fmt::format("{} is no inducing point", factor.rows.back()));
     }
     factor.L = triangle_from(of_latent.at("L"), std::ssize(factor.rows));
     if (!(factor.L.diagonal().array() > 0).all()) throw InputError("a factor of inducing points is not positive");
     factors.push_back(std::move(factor));
   }
-  if (factors.size() != prior.latents.size()) throw InputError(fmt::format("factors of {} of {} latents", factors.size(), prior.latents.size()));
+  if (factors.size() != prior.latents.size())
+    throw InputError(fmt::format("factors of {} of {} latents", factors.size(), prior.latents.size()));
   summary.latents = InducingLatents(prior, values, std::move(factors));
   const Index M = summary.latents.size();
   summary.all.B = triangle_from(json.at("B"), M);

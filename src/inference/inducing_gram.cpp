@@ -38,10 +38,9 @@ std::optional<GramValue> InducingGram::value(const RowBlocks& rows) {
   const lapack::SingleThread single_thread;
   if (!factorise(rows)) return std::nullopt;
   VectorXd misfit = VectorXd::Zero(n_parts);
-  const bool is_sound =
-      for_each_block(latents_, rows, false, n_threads_, stop_, [&](int part, const RowBlock&, const InducingBlock& block) {
-        misfit[part] += block.misfit(mean_).squaredNorm();
-      });
+  const bool is_sound = for_each_block(
+      latents_, rows, false, n_threads_, stop_,
+      [&](int part, const RowBlock&, const InducingBlock& block) { misfit[part] += block.misfit(mean_).squaredNorm(); });
   if (!is_sound || is_set(stop_)) return std::nullopt;
   return value_of(misfit.sum());
 }
@@ -67,78 +66,78 @@ std::optional<GramValue> InducingGram::differentiate(const RowBlocks& rows, cons
     zero.columns.emplace_back(VectorXd::Zero(latent.n_functions));
   }
   std::vector<Sums> sums(n_parts, zero);
-  const bool is_sound = for_each_block(latents_, rows, true, n_threads_, stop_, [&](int part, const RowBlock& row_block,
-                                                                                   const InducingBlock& block) {
-    Sums& sum = sums[static_cast<std::size_t>(part)];
-    const Index n = block.n();
-    const MatrixXd alpha = block.misfit(mean_);
-    const Index n_components = alpha.cols();
-    sum.misfit += alpha.squaredNorm();
-    // per function −L_aᵀ ∂NLL/∂k(Z, φ_i), and V by component
-    std::vector<MatrixXd> U, V;
-    std::vector<VectorXd> mean;
-    for (const InducingLatents::Function& f : functions) {
-      const MatrixXd& w = block.w(f.latent);
-      const std::size_t at = U.size();
-      mean.emplace_back(w.transpose() * mean_.segment(f.first, w.rows()));
-      ArrayXd beta = ArrayXd::Zero(n);
-      V.emplace_back(n, n_components);
-      for (Index c = 0; c < n_components; ++c) {
-        const ArrayXd alpha_c = alpha.col(c).array(), weight = block.weight(at, c).array();
-        beta += weight * alpha_c;
-        V.back().col(c) = weight * block.variance(f.latent).array() - alpha_c * mean.back().array();
-      }
-      U.emplace_back(mean_.segment(f.first, w.rows()) * beta.matrix().transpose());
-    }
-    MatrixXd product;
-    for (std::size_t g = 0; g < functions.size(); ++g) {
-      const MatrixXd& w = block.w(functions[g].latent);
-      product.setZero(latents_.size(), n);
-      lapack::add_product(explained.middleCols(functions[g].first, w.rows()), false, w, false, product);
-      for (std::size_t f = 0; f < functions.size(); ++f) {
-        const MatrixXd& v = block.w(functions[f].latent);
-        const auto of_f = product.middleRows(functions[f].first, v.rows());
-        U[f] += of_f * block.weight_product(f, g).matrix().asDiagonal();
-        const VectorXd explained_by_g = of_f.cwiseProduct(v).colwise().sum();
-        for (Index c = 0; c < n_components; ++c) V[f].col(c) -= block.weight(g, c).cwiseProduct(explained_by_g);
-      }
-    }
-    GramGradient of_block;
-    of_block.alpha = in_rows(*block.rows().reduction, alpha);
-    for (std::size_t a = 0; a < parts.size(); ++a) {
-      const Index n_functions = latents_.latents()[a].n_functions;
-      of_block.latents.push_back({{}, {}, MatrixXd(parts[a].V ? n : 0, n_components * n_functions),
-                                  MatrixXd(parts[a].mean ? n : 0, n_functions)});
-    }
-    for (std::size_t f = 0; f < functions.size(); ++f) {
-      const std::size_t a = functions[f].latent;
-      const InducingLatents::OfLatent& latent = latents_.latents()[a];
-      const Index l = functions[f].index;
-      GramGradient::OfLatent& out = of_block.latents[a];
-      for (Index c = 0; c < n_components; ++c) {
-        sum.columns[a][l] += V[f].col(c).dot(block.weight(f, c));
-        if (parts[a].V) out.V.col(c * latent.n_functions + l) = V[f].col(c);
-      }
-      if (parts[a].mean) out.mean.col(l) = mean[f];
-      if (l > 0) U[f - static_cast<std::size_t>(l)] += U[f];
-    }
-    of_rows(part, row_block, of_block);
-    KernelColumns::Workspace workspace;
-    VectorXd point;
-    for (std::size_t f = 0; f < functions.size(); ++f) {
-      const std::size_t a = functions[f].latent;
-      if (functions[f].index > 0 || !parts[a].kernel) continue;
-      const InducingLatents::OfLatent& latent = latents_.latents()[a];
-      lapack::solve_lower(latent.L, true, U[f]);
-      MatrixXd H = MatrixXd::Zero(latent.kernel.n_rows(), n);
-      H.topRows(latent.n_points()) = -U[f];
-      for (Index i = 0; i < n; ++i) {
-        latent.kernel.scale(block.rows().latents[a].kernel.features().row(i).transpose(), point);
-        latent.kernel.add_gradient(0, H.rows(), point, block.k(a).col(i).data(), H.col(i).data(), sum.kernel[a], workspace);
-      }
-      add_variance_gradient(a, block, sum.kernel[a], workspace);
-    }
-  });
+  const bool is_sound = for_each_block(
+      latents_, rows, true, n_threads_, stop_, [&](int part, const RowBlock& row_block, const InducingBlock& block) {
+        Sums& sum = sums[static_cast<std::size_t>(part)];
+        const Index n = block.n();
+        const MatrixXd alpha = block.misfit(mean_);
+        const Index n_components = alpha.cols();
+        sum.misfit += alpha.squaredNorm();
+        // per function −L_aᵀ ∂NLL/∂k(Z, φ_i), and V by component
+        std::vector<MatrixXd> U, V;
+        std::vector<VectorXd> mean;
+        for (const InducingLatents::Function& f : functions) {
+          const MatrixXd& w = block.w(f.latent);
+          const std::size_t at = U.size();
+          mean.emplace_back(w.transpose() * mean_.segment(f.first, w.rows()));
+          ArrayXd beta = ArrayXd::Zero(n);
+          V.emplace_back(n, n_components);
+          for (Index c = 0; c < n_components; ++c) {
+            const ArrayXd alpha_c = alpha.col(c).array(), weight = block.weight(at, c).array();
+            beta += weight * alpha_c;
+            V.back().col(c) = weight * block.variance(f.latent).array() - alpha_c * mean.back().array();
+          }
+          U.emplace_back(mean_.segment(f.first, w.rows()) * beta.matrix().transpose());
+        }
+        MatrixXd product;
+        for (std::size_t g = 0; g < functions.size(); ++g) {
+          const MatrixXd& w = block.w(functions[g].latent);
+          product.setZero(latents_.size(), n);
+          lapack::add_product(explained.middleCols(functions[g].first, w.rows()), false, w, false, product);
+          for (std::size_t f = 0; f < functions.size(); ++f) {
+            const MatrixXd& v = block.w(functions[f].latent);
+            const auto of_f = product.middleRows(functions[f].first, v.rows());
+            U[f] += of_f * block.weight_product(f, g).matrix().asDiagonal();
+            const VectorXd explained_by_g = of_f.cwiseProduct(v).colwise().sum();
+            for (Index c = 0; c < n_components; ++c) V[f].col(c) -= block.weight(g, c).cwiseProduct(explained_by_g);
+          }
+        }
+        GramGradient of_block;
+        of_block.alpha = in_rows(*block.rows().reduction, alpha);
+        for (std::size_t a = 0; a < parts.size(); ++a) {
+          const Index n_functions = latents_.latents()[a].n_functions;
+          of_block.latents.push_back(
+              {{}, {}, MatrixXd(parts[a].V ? n : 0, n_components * n_functions), MatrixXd(parts[a].mean ? n : 0, n_functions)});
+        }
+        for (std::size_t f = 0; f < functions.size(); ++f) {
+          const std::size_t a = functions[f].latent;
+          const InducingLatents::OfLatent& latent = latents_.latents()[a];
+          const Index l = functions[f].index;
+          GramGradient::OfLatent& out = of_block.latents[a];
+          for (Index c = 0; c < n_components; ++c) {
+            sum.columns[a][l] += V[f].col(c).dot(block.weight(f, c));
+            if (parts[a].V) out.V.col(c * latent.n_functions + l) = V[f].col(c);
+          }
+          if (parts[a].mean) out.mean.col(l) = mean[f];
+          if (l > 0) U[f - static_cast<std::size_t>(l)] += U[f];
+        }
+        of_rows(part, row_block, of_block);
+        KernelColumns::Workspace workspace;
+        VectorXd point;
+        for (std::size_t f = 0; f < functions.size(); ++f) {
+          const std::size_t a = functions[f].latent;
+          if (functions[f].index > 0 || !parts[a].kernel) continue;
+          const InducingLatents::OfLatent& latent = latents_.latents()[a];
+          lapack::solve_lower(latent.L, true, U[f]);
+          MatrixXd H = MatrixXd::Zero(latent.kernel.n_rows(), n);
+          H.topRows(latent.n_points()) = -U[f];
+          for (Index i = 0; i < n; ++i) {
+            latent.kernel.scale(block.rows().latents[a].kernel.features().row(i).transpose(), point);
+            latent.kernel.add_gradient(0, H.rows(), point, block.k(a).col(i).data(), H.col(i).data(), sum.kernel[a], workspace);
+          }
+          add_variance_gradient(a, block, sum.kernel[a], workspace);
+        }
+      });
   if (!is_sound || is_set(stop_)) return std::nullopt;
 
   Sums all = std::move(zero);

@@ -35,9 +35,9 @@ InducingLatents::InducingLatents(const Prior& prior, const ModelValues& values)
 InducingLatents::InducingLatents(const Prior& prior, const ModelValues& values, std::vector<lapack::PivotedFactor> factors) {
   for (std::size_t a = 0; a < prior.latents.size(); ++a) {
     const MatrixXd Z = values.inducing->features[a](factors[a].rows, Eigen::all);
-    OfLatent& latent = latents_.emplace_back(OfLatent{KernelColumns(prior.latents[a].kernel, Z, values.kernel[a]),
-                                                      std::move(factors[a].L), std::move(factors[a].rows),
-                                                      values.loading(a).cols()});
+    OfLatent& latent =
+        latents_.emplace_back(OfLatent{KernelColumns(prior.latents[a].kernel, Z, values.kernel[a]), std::move(factors[a].L),
+                                       std::move(factors[a].rows), values.loading(a).cols()});
     for (Index l = 0; l < latent.n_functions; ++l, size_ += latent.n_points()) functions_.push_back({a, l, size_});
   }
 }
@@ -107,10 +107,11 @@ std::optional<InducingStatistics> InducingStatistics::of(const InducingLatents& 
   InducingStatistics all(latents);
   std::vector<InducingStatistics> sums(Gram::n_parts, all);
   std::vector<MatrixXd> memory(Gram::n_parts);
-  const bool is_sound = for_each_block(latents, rows, false, n_threads, stop, [&](int part, const RowBlock&, const InducingBlock& block) {
-    const auto p = static_cast<std::size_t>(part);
-    sums[p].add(latents, block, memory[p]);
-  });
+  const bool is_sound =
+      for_each_block(latents, rows, false, n_threads, stop, [&](int part, const RowBlock&, const InducingBlock& block) {
+        const auto p = static_cast<std::size_t>(part);
+        sums[p].add(latents, block, memory[p]);
+      });
   if (!is_sound) return std::nullopt;
   for (const InducingStatistics& one : sums) all.add(one);
   return all;

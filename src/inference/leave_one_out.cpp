@@ -33,7 +33,8 @@ std::vector<LeaveOneOut> unknown(const std::vector<Observations>& observations) 
 }
 
 // Each value from all others.
-std::vector<LeaveOneOut> each_value(const Posterior& posterior, const Reduction& reduction, const LatentPosterior::Inverse& inverse) {
+std::vector<LeaveOneOut> each_value(const Posterior& posterior, const Reduction& reduction,
+                                    const LatentPosterior::Inverse& inverse) {
   const std::vector<Observations>& observations = posterior.observations();
   const ModelValues& values = posterior.values();
   std::vector<LeaveOneOut> out = unknown(observations);
@@ -112,8 +113,8 @@ void add_sample(const Posterior& posterior, const Reduction::Sample& sample, con
 }
 
 // Each value from those of other stretches; empty where double precision cannot tell.
-std::vector<LeaveOneOut> each_stretch(const Posterior& posterior, const Reduction& reduction, const LatentPosterior::Inverse& inverse,
-                                      const std::vector<std::vector<Index>>& stretches) {
+std::vector<LeaveOneOut> each_stretch(const Posterior& posterior, const Reduction& reduction,
+                                      const LatentPosterior::Inverse& inverse, const std::vector<std::vector<Index>>& stretches) {
   if (inverse.without.empty()) return {};
   std::vector<LeaveOneOut> out = unknown(posterior.observations());
   for (std::size_t b = 0; b < stretches.size(); ++b) {
@@ -248,8 +249,7 @@ LeftOut leave_out_of(const Posterior& posterior, const Posterior::Implementation
     const WithoutSums without(posterior, self, reduction);
     return {without.leave_out(each), n_stretches > 0 ? without.leave_out(stretches) : std::vector<LeaveOneOut>{}};
   }
-  const LatentPosterior::Inverse inverse =
-      self.latents->invert(latent_rows(prior, observations, reduction, values), stretches);
+  const LatentPosterior::Inverse inverse = self.latents->invert(latent_rows(prior, observations, reduction, values), stretches);
   LeftOut out{each_value(posterior, reduction, inverse), {}};
   if (!stretches.empty()) out.stretches = each_stretch(posterior, reduction, inverse, stretches);
   return out;
@@ -260,8 +260,8 @@ LeftOut leave_out_of(const Posterior& posterior, const Posterior::Implementation
 LeftOut leave_out(const Posterior& posterior, int n_stretches) {
   if (n_stretches < 0) throw InputError(fmt::format("leave_out: n_stretches must not be negative, got {}", n_stretches));
   if (posterior.values().inducing && n_stretches != 0 && n_stretches != LeftOut::n_stretches) {
-    throw InputError(fmt::format("leave_out: n_stretches must be 0 or {} through inducing points, got {}",
-                                 LeftOut::n_stretches, n_stretches));
+    throw InputError(
+        fmt::format("leave_out: n_stretches must be 0 or {} through inducing points, got {}", LeftOut::n_stretches, n_stretches));
   }
   const lapack::SingleThread single_thread;
   std::vector<LeftOut> of_components;

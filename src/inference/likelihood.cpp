@@ -285,9 +285,10 @@ double Likelihood::evaluate(const ModelValues& values, ModelGradient* gradient, 
   const std::vector<GramGradientParts> parts = self.parts(through_points ? nullptr : work.whole.rows.reduction, values);
   std::vector<ModelGradient> of_part(Gram::n_parts, ModelGradient::zero(values));
   GramGradient of_gram;
-  const double value = total(gram.differentiate(*blocks, parts, of_gram, [&](int part, const RowBlock& block, const GramGradient& of_rows) {
-    self.add_rows(block, of_rows, values, of_part[static_cast<std::size_t>(part)]);
-  }));
+  const double value =
+      total(gram.differentiate(*blocks, parts, of_gram, [&](int part, const RowBlock& block, const GramGradient& of_rows) {
+        self.add_rows(block, of_rows, values, of_part[static_cast<std::size_t>(part)]);
+      }));
   if (value == infinity || is_set(work.stop)) return infinity;  // the gradient may be that of a part
   *gradient = std::move(of_part.front());
   for (std::size_t part = 1; part < of_part.size(); ++part) gradient->add(of_part[part]);

@@ -91,6 +91,7 @@ void Posterior::Implementation::add_through_points(const Observations& more, std
 
 Posterior Posterior::of_summary(Prior prior, std::vector<Observations> observations, ModelValues values,
                                 const InducingSummary& summary) {
+  const lapack::SingleThread single_thread;
   auto self = std::make_shared<Implementation>(std::move(prior), std::move(observations), std::move(values));
   auto through = std::make_shared<InducingPosterior>(summary.latents, std::vector{summary.all});
   if (!through->factorise()) throw_not_definite();

@@ -7,11 +7,11 @@
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
+#include "data/evenly.hpp"
 #include "gp2/error.hpp"
 #include "gp2/training/laplace.hpp"
 #include "gp2/training/robust.hpp"
 #include "jobs/read_observations.hpp"
-#include "data/evenly.hpp"
 
 namespace gp2 {
 

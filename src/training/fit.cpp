@@ -14,12 +14,12 @@
 #include "base/lapack.hpp"
 #include "base/parallel.hpp"
 #include "base/random.hpp"
+#include "data/evenly.hpp"
 #include "gp2/error.hpp"
 #include "gp2/fit.hpp"
 #include "inference/requirements.hpp"
 #include "training/constraint_parameters.hpp"
 #include "training/curvature.hpp"
-#include "data/evenly.hpp"
 #include "training/hamiltonian.hpp"
 #include "training/lbfgsb.hpp"
 #include "training/objective.hpp"
@@ -449,7 +449,8 @@ class TrainingThroughPoints {
           stages[stage] < n_all ? evenly(observations_, stages[stage]) : std::vector<Observations>();
       const std::vector<Observations>& of_stage = stages[stage] < n_all ? some : observations_;
       report = unless_stopped(report, [&] {
-        return is_exact ? trained(prior_, of_stage, hyperparameters, options) : through_points(of_stage, hyperparameters, options);
+        return is_exact ? trained(prior_, of_stage, hyperparameters, options)
+                        : through_points(of_stage, hyperparameters, options);
       });
       hyperparameters = report->hyperparameters;
     }

@@ -184,11 +184,11 @@ Problem of_many_states(int n) {
 }
 
 TEST(Inducing, AllOfManyStatesAreLearnedFromAndSomeAreKept) {
-  const Problem p = of_many_states(11'000);
+  const Problem p = of_many_states(5'200);
   const Posterior posterior(p.prior, p.observations, p.values);
-  EXPECT_EQ(posterior.n_states(), 11'000);
-  EXPECT_EQ(posterior.observations().front().n_data(), 2750) << "every fourth";
-  EXPECT_EQ(posterior.observations().front().states().col(1), p.observations.front().states().col(4));
+  EXPECT_EQ(posterior.n_states(), 5'200);
+  EXPECT_EQ(posterior.observations().front().n_data(), 2600) << "every second";
+  EXPECT_EQ(posterior.observations().front().states().col(1), p.observations.front().states().col(2));
   EXPECT_NEAR(posterior.negative_log_likelihood(), test::evaluate(p).value, 1e-9 * std::abs(test::evaluate(p).value));
 
   const View view = View::constrained_acceleration(*p.prior.system);
@@ -196,20 +196,20 @@ TEST(Inducing, AllOfManyStatesAreLearnedFromAndSomeAreKept) {
   EXPECT_EQ(on_threads.marginal(view, p.queries).covariance, posterior.marginal(view, p.queries).covariance);
 
   // in halves, one after the other
-  std::vector<int> first(5500), rest(5500);
+  std::vector<int> first(2600), rest(2600);
   std::iota(first.begin(), first.end(), 0);
-  std::iota(rest.begin(), rest.end(), 5500);
+  std::iota(rest.begin(), rest.end(), 2600);
   const Observations& all = p.observations.front();
   const Observations more = all.take(rest);
   const Posterior grown = update(Posterior(p.prior, {all.take(first)}, p.values),
                                  {more.states(), more.view(), more.values(), p.values.noise_stddev.front()});
-  EXPECT_EQ(grown.n_states(), 11'000);
+  EXPECT_EQ(grown.n_states(), 5'200);
   EXPECT_LE(grown.observations().front().n_data(), 5000);
   const MatrixXd mean = posterior.mean(view, p.queries);
   EXPECT_LE(largest(grown.mean(view, p.queries) - mean), 1e-9 * (1 + largest(mean)));
 
   const LeftOut left_out = leave_out(posterior, LeftOut::n_stretches);
-  EXPECT_EQ(left_out.stretches.front().mean.cols(), 2750);
+  EXPECT_EQ(left_out.stretches.front().mean.cols(), 2600);
   EXPECT_TRUE(leave_out(grown, LeftOut::n_stretches).stretches.empty()) << "what came later is of no stretch";
 }
 

@@ -64,7 +64,7 @@ TEST(UpdateJob, AWindowLeavesTheNewest) {
   request.window = 8;
   const UpdateOutcome updated = update(fit, {log}, request);
   EXPECT_EQ(updated.n_states, 8);
-  EXPECT_EQ(updated.fit.observations.front().states(), more_of(fit, log).states().rightCols(8));
+  EXPECT_EQ(updated.fit.observations.front().values(), more_of(fit, log).values().rightCols(8));
 }
 
 TEST(UpdateJob, WhatCannotBeIsAnError) {
