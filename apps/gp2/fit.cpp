@@ -19,6 +19,7 @@
 #include "gp2/jobs/raw_fit.hpp"
 #include "gp2/training/laplace.hpp"
 #include "interruption.hpp"
+#include "ranks.hpp"
 #include "streams.hpp"
 
 namespace gp2::command {
@@ -302,8 +303,11 @@ void run(FitArguments& arguments, const std::set<std::string>& given) {
   require_inputs(arguments, given);
   require_output(arguments.output, inputs_of(arguments));
   if (!arguments.smoothed.empty()) require_output(arguments.smoothed, inputs_of(arguments));
-  const Interruption interruption;
-  const FitJob job = unless_interrupted(interruption, [&] { return prepare(arguments, interruption); });
+  const std::shared_ptr<const Ranks> ranks = join_ranks();
+  const Interruption interruption(!ranks);  // mpirun ends its processes
+  FitJob job = unless_interrupted(interruption, [&] { return prepare(arguments, interruption); });
+  if (ranks) require_same_data(*ranks, job.problem.observations);
+  job.options.ranks = ranks;
   print_notes(job.notes);
   const bool on_terminal = isatty(STDERR_FILENO) != 0;
   const FitOutcome outcome = unless_interrupted(interruption, [&] {
@@ -321,6 +325,7 @@ void run(FitArguments& arguments, const std::set<std::string>& given) {
       if (outcome.cross_validation) print_result("{}\n", outcome.cross_validation->text());
     }
   };
+  if (ranks && ranks->rank() > 0) return;
   try {
     file.write(arguments.output);
   } catch (const InputError&) {

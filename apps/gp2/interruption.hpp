@@ -27,7 +27,9 @@ struct Interrupted {
 /// There is one at a time.
 class Interruption {
  public:
-  Interruption() {
+  /// @param is_on  false: signals do what they did before
+  explicit Interruption(bool is_on = true) : is_on_(is_on) {
+    if (!is_on_) return;
     stop_ = false;
     signal_ = 0;
     asked_at_ = never;
@@ -41,7 +43,9 @@ class Interruption {
       sigaction(signals[k], &action, nullptr);
     }
   }
-  ~Interruption() { restore(); }
+  ~Interruption() {
+    if (is_on_) restore();
+  }
   Interruption(const Interruption&) = delete;
   Interruption& operator=(const Interruption&) = delete;
 
@@ -84,6 +88,7 @@ class Interruption {
   static inline std::atomic<int> signal_ = 0;
   static inline std::atomic<std::int64_t> asked_at_ = never;  // [ms]
   static inline std::array<struct sigaction, 3> before_ = {};
+  bool is_on_;
 };
 
 }  // namespace gp2::command

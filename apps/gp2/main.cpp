@@ -18,6 +18,7 @@
 #include "gp2/base/version.hpp"
 #include "gp2/error.hpp"
 #include "interruption.hpp"
+#include "ranks.hpp"
 #include "streams.hpp"
 
 namespace {
@@ -28,6 +29,7 @@ constexpr int exit_bad_input = 2;
 int failed(int exit_code, const std::string& text) {
   static_cast<void>(std::fflush(stdout));  // where both go to one terminal or file, the results came first
   gp2::command::print_message("gp2: {}\n", text);
+  gp2::command::abort_ranks(exit_code, text);
   return exit_code;
 }
 
@@ -107,6 +109,9 @@ int main(int argc, char** argv) {
 
   try {
     require_known_command(app, argc, argv);
+    if (argc > 1 && std::string(argv[1]) != "fit" && gp2::command::n_started_together() > 1) {
+      throw gp2::InputError("mpirun is for gp2 fit; start this command alone");
+    }
     app.parse(argc, argv);
   } catch (const CLI::Success& help_or_version) {
     std::ostringstream text;
@@ -127,5 +132,6 @@ int main(int argc, char** argv) {
   } catch (const std::exception& error) {
     return failed(exit_numerical, fmt::format("internal error: {}", error.what()));
   }
+  gp2::command::leave_ranks();
   return finished();
 }

@@ -42,6 +42,7 @@ struct FitOptions {
   bool standard_errors = true;                    // FitReport::uncertainty, where parameters are estimated
   int n_draws = 0;                                // of hyperparameters, over which the posterior is then the mixture; 0: none
   int n_inducing = 0;                             // inducing variables at most, through which all is learned; 0: none, exact
+  std::shared_ptr<const Ranks> ranks = nullptr;   // other processes that work on the same fit, through inducing points
   int n_train = 0;                                // states at most that hyperparameters are found from, evenly taken; 0: all
   std::function<void(const Progress&)> progress;  // called from worker threads, one at a time
   /// Set: return the best so far, as not converged: interrupted. The evaluations under way are given up within a second or so,
@@ -155,7 +156,7 @@ std::vector<ModelValues> values_of(const Prior& prior, const std::vector<Observa
 /// @throws InputError, NumericalError  as Posterior and model_values.
 /// @param observations  where the report has a summary those that the posterior has kept
 Posterior posterior_of(const Prior& prior, const std::vector<Observations>& observations, const FitReport& report,
-                       int n_threads = 1);
+                       const Workers& workers = {});
 
 /// Evaluations of the likelihood, with gradients, that drawing takes at most beside those of the curvature at the optima.
 inline constexpr int draw_evaluations = 3600;

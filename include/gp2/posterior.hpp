@@ -6,6 +6,7 @@
 
 #include <Eigen/Core>
 
+#include "gp2/base/workers.hpp"
 #include "gp2/export.hpp"
 #include "gp2/inference/likelihood.hpp"
 #include "gp2/observations.hpp"
@@ -36,8 +37,8 @@ class Posterior {
   /// @throws InputError when prior, observations and values do not fit each other; and as require_mechanics and
   /// require_prior_values, at an observed state.
   /// @throws NumericalError when the covariance cannot be factored in double precision (noise too small).
-  /// @param n_threads  that may work on it where it is through inducing points; it is the same for any number
-  Posterior(Prior prior, std::vector<Observations> observations, ModelValues values, int n_threads = 1);
+  /// @param workers  on it, where it is through inducing points
+  Posterior(Prior prior, std::vector<Observations> observations, ModelValues values, const Workers& workers = {});
   /// The same, conditioned when it is first asked for more than what it was given: that call throws what the constructor throws.
   /// Through inducing points, which takes little, it is conditioned at once.
   [[nodiscard]] static Posterior lazy(Prior prior, std::vector<Observations> observations, ModelValues values);
@@ -53,7 +54,7 @@ class Posterior {
   /// One component for each of several values, the first of which values() and negative_log_likelihood() tell.
   /// @throws InputError when there are none; and as the constructor.
   static Posterior mixture(const Prior& prior, const std::vector<Observations>& observations,
-                           const std::vector<ModelValues>& values, int n_threads = 1);
+                           const std::vector<ModelValues>& values, const Workers& workers = {});
   [[nodiscard]] int n_components() const;
   /// @throws InputError when there is no such component.
   [[nodiscard]] Posterior component(int k) const;

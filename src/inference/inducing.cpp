@@ -112,7 +112,7 @@ InducingChoice choose_inducing_points(const Prior& prior, const std::vector<Obse
 }
 
 VectorXd left_out_by_points(const Prior& prior, const std::vector<Observations>& observations, const ModelValues& values,
-                            int n_threads) {
+                            const Workers& workers) {
   if (!values.inducing) throw InputError("left_out_by_points: the values have no inducing points");
   require_observations(prior, observations);
   require_values(prior, observations, values);
@@ -126,11 +126,16 @@ VectorXd left_out_by_points(const Prior& prior, const std::vector<Observations>&
       sums[static_cast<std::size_t>(part)][static_cast<Index>(a)] += (block.weight_product(f, f) * left).sum();
     }
   };
-  if (!for_each_block(latents, BlocksOfStates(prior, observations, values), false, n_threads, nullptr, add)) {
+  if (!for_each_block(latents, BlocksOfStates(prior, observations, values), false, workers, nullptr, add)) {
     static_cast<void>(require_models(prior, observations, values.parameters, {}));  // names the state
   }
-  for (std::size_t part = 1; part < sums.size(); ++part) sums.front() += sums[part];
-  return sums.front();
+  VectorXd all = VectorXd::Zero(std::ssize(prior.latents));
+  for (int part = 0; part < Gram::n_parts; ++part) {
+    VectorXd& sum = sums[static_cast<std::size_t>(part)];
+    workers.share({sum.data(), static_cast<std::size_t>(sum.size())}, part, Gram::n_parts);
+    all += sum;
+  }
+  return all;
 }
 
 }  // namespace gp2

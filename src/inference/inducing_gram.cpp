@@ -14,7 +14,7 @@ using Eigen::MatrixXd;
 using Eigen::VectorXd;
 
 bool InducingGram::factorise(const RowBlocks& rows) {
-  std::optional<InducingStatistics> sums = InducingStatistics::of(latents_, rows, n_threads_, stop_);
+  std::optional<InducingStatistics> sums = InducingStatistics::of(latents_, rows, workers_, stop_);
   if (!sums) return false;
   B_ = std::move(sums->B);
   B_.diagonal().array() += 1;
@@ -39,9 +39,10 @@ std::optional<GramValue> InducingGram::value(const RowBlocks& rows) {
   if (!factorise(rows)) return std::nullopt;
   VectorXd misfit = VectorXd::Zero(n_parts);
   const bool is_sound = for_each_block(
-      latents_, rows, false, n_threads_, stop_,
+      latents_, rows, false, workers_, stop_,
       [&](int part, const RowBlock&, const InducingBlock& block) { misfit[part] += block.misfit(mean_).squaredNorm(); });
   if (!is_sound || is_set(stop_)) return std::nullopt;
+  for (int part = 0; part < n_parts; ++part) workers_.share({&misfit[part], 1}, part, n_parts);
   return value_of(misfit.sum());
 }
 
@@ -66,8 +67,8 @@ std::optional<GramValue> InducingGram::differentiate(const RowBlocks& rows, cons
     zero.columns.emplace_back(VectorXd::Zero(latent.n_functions));
   }
   std::vector<Sums> sums(n_parts, zero);
-  const bool is_sound = for_each_block(
-      latents_, rows, true, n_threads_, stop_, [&](int part, const RowBlock& row_block, const InducingBlock& block) {
+  const bool is_sound =
+      for_each_block(latents_, rows, true, workers_, stop_, [&](int part, const RowBlock& row_block, const InducingBlock& block) {
         Sums& sum = sums[static_cast<std::size_t>(part)];
         const Index n = block.n();
         const MatrixXd alpha = block.misfit(mean_);
@@ -139,6 +140,12 @@ std::optional<GramValue> InducingGram::differentiate(const RowBlocks& rows, cons
         }
       });
   if (!is_sound || is_set(stop_)) return std::nullopt;
+  for (int part = 0; part < n_parts; ++part) {
+    Sums& sum = sums[static_cast<std::size_t>(part)];
+    workers_.share({&sum.misfit, 1}, part, n_parts);
+    for (MatrixXd& one : sum.kernel) workers_.share({one.data(), static_cast<std::size_t>(one.size())}, part, n_parts);
+    for (VectorXd& one : sum.columns) workers_.share({one.data(), static_cast<std::size_t>(one.size())}, part, n_parts);
+  }
 
   Sums all = std::move(zero);
   for (const Sums& sum : sums) {

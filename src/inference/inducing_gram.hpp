@@ -17,8 +17,8 @@ namespace gp2 {
 class InducingGram final : public Gram {
  public:
   /// @param latents  at their points, under the values of the rows
-  explicit InducingGram(InducingLatents latents, int n_threads = 1, const std::atomic<bool>* stop = nullptr)
-      : latents_(std::move(latents)), n_threads_(n_threads), stop_(stop) {}
+  explicit InducingGram(InducingLatents latents, Workers workers = {}, const std::atomic<bool>* stop = nullptr)
+      : latents_(std::move(latents)), workers_(std::move(workers)), stop_(stop) {}
 
   [[nodiscard]] std::optional<GramValue> value(const RowBlocks& rows) override;
   [[nodiscard]] std::optional<GramValue> differentiate(const RowBlocks& rows, const std::vector<GramGradientParts>& parts,
@@ -34,7 +34,7 @@ class InducingGram final : public Gram {
   void add_points_gradient(std::size_t a, const Eigen::MatrixXd& P, Eigen::MatrixXd& sums) const;
 
   InducingLatents latents_;
-  int n_threads_;
+  Workers workers_;
   const std::atomic<bool>* stop_;
   Eigen::MatrixXd B_, L_;  // B and its factor
   Eigen::VectorXd mean_;   // of the whitened variables, B⁻¹c

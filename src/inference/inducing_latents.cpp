@@ -102,18 +102,28 @@ InducingStatistics::InducingStatistics(const InducingLatents& latents)
       c(VectorXd::Zero(latents.size())),
       weight(VectorXd::Zero(std::ssize(latents.latents()))) {}
 
-std::optional<InducingStatistics> InducingStatistics::of(const InducingLatents& latents, const RowBlocks& rows, int n_threads,
-                                                         const std::atomic<bool>* stop) {
+std::optional<InducingStatistics> InducingStatistics::of(const InducingLatents& latents, const RowBlocks& rows,
+                                                         const Workers& workers, const std::atomic<bool>* stop) {
   InducingStatistics all(latents);
   std::vector<InducingStatistics> sums(Gram::n_parts, all);
   std::vector<MatrixXd> memory(Gram::n_parts);
   const bool is_sound =
-      for_each_block(latents, rows, false, n_threads, stop, [&](int part, const RowBlock&, const InducingBlock& block) {
+      for_each_block(latents, rows, false, workers, stop, [&](int part, const RowBlock&, const InducingBlock& block) {
         const auto p = static_cast<std::size_t>(part);
         sums[p].add(latents, block, memory[p]);
       });
   if (!is_sound) return std::nullopt;
-  for (const InducingStatistics& one : sums) all.add(one);
+  for (int part = 0; part < Gram::n_parts; ++part) {
+    InducingStatistics& one = sums[static_cast<std::size_t>(part)];
+    const auto share = [&](double* numbers, Index n) {
+      workers.share({numbers, static_cast<std::size_t>(n)}, part, Gram::n_parts);
+    };
+    share(one.B.data(), one.B.size());
+    share(one.c.data(), one.c.size());
+    share(one.weight.data(), one.weight.size());
+    for (double* number : {&one.yy, &one.trace, &one.constant}) share(number, 1);
+    all.add(one);
+  }
   return all;
 }
 

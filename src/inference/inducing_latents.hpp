@@ -8,6 +8,7 @@
 
 #include "base/lapack.hpp"
 #include "base/parallel.hpp"
+#include "gp2/base/workers.hpp"
 #include "gp2/inference/model_values.hpp"
 #include "inference/gram.hpp"
 #include "prior/kernel_columns.hpp"
@@ -98,12 +99,13 @@ class InducingBlock {
 
 /// Calls work(part, RowBlock, InducingBlock) for every block of rows, as Gram::n_parts says.
 /// @param stop  set: leaves out the rest
-/// @returns whether no block has a fault
+/// @returns whether no block has a fault, of any process
 template <typename Work>
-bool for_each_block(const InducingLatents& latents, const RowBlocks& rows, bool with_derivatives, int n_threads,
+bool for_each_block(const InducingLatents& latents, const RowBlocks& rows, bool with_derivatives, const Workers& workers,
                     const std::atomic<bool>* stop, const Work& work) {
   std::atomic<bool> is_sound = true;
-  parallel_for(Gram::n_parts, n_threads, [&](int part, int) {
+  parallel_for(Gram::n_parts, workers.n_threads, [&](int part, int) {
+    if (!workers.owns(part, Gram::n_parts)) return;
     RowBlocks::Memory memory;
     InducingBlock block(latents);
     const Eigen::Index n = rows.n_blocks();
@@ -117,7 +119,13 @@ bool for_each_block(const InducingLatents& latents, const RowBlocks& rows, bool 
       work(part, *of_rows, block);
     }
   });
-  return is_sound;
+  bool are_all_sound = true;
+  for (int part = 0; part < Gram::n_parts; ++part) {
+    double is_fault = is_sound ? 0 : 1;
+    workers.share({&is_fault, 1}, part, Gram::n_parts);
+    are_all_sound = are_all_sound && is_fault == 0;
+  }
+  return are_all_sound;
 }
 
 /// What observations say of whitened inducing variables: sums over blocks of samples.
@@ -132,8 +140,8 @@ struct InducingStatistics {
   InducingStatistics() = default;
   explicit InducingStatistics(const InducingLatents& latents);  // of no samples
   /// Nothing where a block has a fault.
-  [[nodiscard]] static std::optional<InducingStatistics> of(const InducingLatents& latents, const RowBlocks& rows, int n_threads,
-                                                            const std::atomic<bool>* stop = nullptr);
+  [[nodiscard]] static std::optional<InducingStatistics> of(const InducingLatents& latents, const RowBlocks& rows,
+                                                            const Workers& workers, const std::atomic<bool>* stop = nullptr);
   /// @param share  as which the likelihood of the other counts
   void add(const InducingStatistics& other, double share = 1);
   /// Adds a block of samples.

@@ -40,13 +40,13 @@ struct Likelihood::Implementation {
 };
 
 struct Likelihood::Workspace::Implementation {
-  Implementation(int threads, const std::atomic<bool>* stop_flag) : n_threads(threads), stop(stop_flag) {}
+  Implementation(const Workers& who, const std::atomic<bool>* stop_flag) : workers(who), stop(stop_flag) {}
 
   // of the likelihood whose data stands below; held, so that no other can have it
   std::shared_ptr<const char> owner;
-  int n_threads;
+  Workers workers;
   const std::atomic<bool>* stop;
-  DenseGram gram{n_threads, stop};
+  DenseGram gram{workers.n_threads, stop};
 
   std::vector<ObservationModel> own_models;  // where parameters are estimated …
   VectorXd modelled;                         // … at these, none: not yet
@@ -137,8 +137,8 @@ void Likelihood::Workspace::Implementation::update_rows(const Likelihood::Implem
   }
 }
 
-Likelihood::Workspace::Workspace(int n_threads, const std::atomic<bool>* stop)
-    : implementation_(std::make_unique<Implementation>(n_threads, stop)) {}
+Likelihood::Workspace::Workspace(const Workers& workers, const std::atomic<bool>* stop)
+    : implementation_(std::make_unique<Implementation>(workers, stop)) {}
 Likelihood::Workspace::~Workspace() = default;
 
 Likelihood::Likelihood(Prior prior, std::vector<Observations> observations, const ModelValues& initial, Options options)
@@ -170,24 +170,31 @@ void Likelihood::Implementation::prepare(const ModelValues& initial) {
 
 void Likelihood::Implementation::prepare_blocks(const ModelValues& initial) {
   const BlocksOfStates blocks(prior, observations, initial);
-  std::vector<BlocksOfStates::Kept> kept(static_cast<std::size_t>(blocks.n_blocks()));
+  const Index n = blocks.n_blocks();
+  std::vector<BlocksOfStates::Kept> kept(static_cast<std::size_t>(n));
   std::atomic<std::size_t> bytes = 0;
   std::atomic<bool> is_sound = true;
-  std::atomic<Index> size = 0;
-  parallel_for(static_cast<int>(blocks.n_blocks()), options.n_threads, [&](int b, int) {
+  std::vector<double> size(Gram::n_parts);
+  parallel_for(Gram::n_parts, options.workers.n_threads, [&](int part, int) {
+    if (!options.workers.owns(part, Gram::n_parts)) return;
     RowBlocks::Memory memory;
-    const RowBlock* const block = blocks.block(b, false, memory);
-    if (block == nullptr) {
-      is_sound = false;
-      return;
+    for (Index b = part * n / Gram::n_parts; b < (part + 1) * n / Gram::n_parts && is_sound; ++b) {
+      const RowBlock* const block = blocks.block(b, false, memory);
+      if (block == nullptr) {
+        is_sound = false;
+        return;
+      }
+      size[static_cast<std::size_t>(part)] += static_cast<double>(block->rows.size());
+      if (!options.gradient_parameters.empty() || bytes > BlocksOfStates::most_kept_bytes) continue;
+      BlocksOfStates::Kept& of_block = kept[static_cast<std::size_t>(b)] = blocks.keep(*block, !options.noise_gradient);
+      bytes += of_block.bytes();
     }
-    size += block->rows.size();
-    if (!options.gradient_parameters.empty() || bytes > BlocksOfStates::most_kept_bytes) return;
-    kept[static_cast<std::size_t>(b)] = blocks.keep(*block, !options.noise_gradient);
-    bytes += kept[static_cast<std::size_t>(b)].bytes();
   });
   if (!is_sound) static_cast<void>(require_models(prior, observations, initial.parameters, {}));  // names the state
-  initial_size = static_cast<int>(size);
+  for (int part = 0; part < Gram::n_parts; ++part) {
+    options.workers.share({&size[static_cast<std::size_t>(part)], 1}, part, Gram::n_parts);
+    initial_size += static_cast<int>(size[static_cast<std::size_t>(part)]);
+  }
   if (options.gradient_parameters.empty() && bytes <= BlocksOfStates::most_kept_bytes) kept_blocks = std::move(kept);
 }
 
@@ -269,7 +276,7 @@ double Likelihood::evaluate(const ModelValues& values, ModelGradient* gradient, 
   if (values.inducing) {
     blocks = std::make_unique<BlocksOfStates>(self.prior, self.observations, values, self.options.gradient_parameters,
                                               self.kept_blocks.empty() ? nullptr : &self.kept_blocks);
-    through_points = std::make_unique<InducingGram>(InducingLatents(self.prior, values), work.n_threads, work.stop);
+    through_points = std::make_unique<InducingGram>(InducingLatents(self.prior, values), work.workers, work.stop);
   } else {
     if (!work.move_to(self, values, gradient != nullptr)) return infinity;
     blocks = std::make_unique<WholeRows>(work.whole);
@@ -290,8 +297,16 @@ double Likelihood::evaluate(const ModelValues& values, ModelGradient* gradient, 
         self.add_rows(block, of_rows, values, of_part[static_cast<std::size_t>(part)]);
       }));
   if (value == infinity || is_set(work.stop)) return infinity;  // the gradient may be that of a part
-  *gradient = std::move(of_part.front());
-  for (std::size_t part = 1; part < of_part.size(); ++part) gradient->add(of_part[part]);
+  *gradient = ModelGradient::zero(values);
+  for (int part = 0; part < Gram::n_parts; ++part) {
+    ModelGradient& one = of_part[static_cast<std::size_t>(part)];
+    if (through_points) {
+      one.for_each([&](double* numbers, Index n) {
+        work.workers.share({numbers, static_cast<std::size_t>(n)}, part, Gram::n_parts);
+      });
+    }
+    gradient->add(one);
+  }
   for (std::size_t a = 0; a < parts.size(); ++a) {
     if (parts[a].kernel) gradient->log_kernel[a] = of_gram.latents[a].kernel;
     if (parts[a].columns && !values.has_free_loading(a)) gradient->log_signal_stddev[a] = of_gram.latents[a].columns;

@@ -67,18 +67,18 @@ Posterior::Implementation::Implementation(Prior of, std::vector<Observations> ob
   for (std::size_t a = 0; a < prior.latents.size(); ++a) C.push_back(values.loading(a));
 }
 
-void Posterior::Implementation::condition(int n_threads) {
+void Posterior::Implementation::condition(const Workers& workers) {
   const lapack::SingleThread single_thread;
   if (values.inducing) {
-    condition_through_points(n_threads);
+    condition_through_points(workers);
   } else {
     add_samples(observations, values.noise_stddev, 0);
   }
 }
 
-Posterior::Posterior(Prior prior, std::vector<Observations> observations, ModelValues values, int n_threads) {
+Posterior::Posterior(Prior prior, std::vector<Observations> observations, ModelValues values, const Workers& workers) {
   auto self = std::make_shared<Implementation>(std::move(prior), std::move(observations), std::move(values));
-  self->condition(n_threads);
+  self->condition(workers);
   components_ = {std::move(self)};
 }
 
@@ -90,11 +90,11 @@ Posterior Posterior::lazy(Prior prior, std::vector<Observations> observations, M
 }
 
 Posterior Posterior::mixture(const Prior& prior, const std::vector<Observations>& observations,
-                             const std::vector<ModelValues>& values, int n_threads) {
+                             const std::vector<ModelValues>& values, const Workers& workers) {
   if (values.empty()) throw InputError("Posterior::mixture: there are no values");
   Components components;
   for (const ModelValues& of_one : values) {
-    components.push_back(Posterior(prior, observations, of_one, n_threads).components_.front());
+    components.push_back(Posterior(prior, observations, of_one, workers).components_.front());
   }
   return Posterior(std::move(components));
 }

@@ -39,14 +39,14 @@ struct Posterior::Implementation {
 
   /// The latents given `observations`.
   /// @throws as add_samples
-  void condition(int n_threads);
+  void condition(const Workers& workers);
   /// Samples of more observations; `observations` stay as they are. On an error nothing has changed.
   /// @param noise_stddev  per group
   /// @param first_group   the group of `observations` that groups[0] is, or is going to be
   /// @throws as the constructor of Posterior.
   void add_samples(const std::vector<Observations>& groups, const std::vector<Eigen::VectorXd>& noise_stddev, int first_group);
   /// What condition and add_samples are through inducing points: of many observations some are kept.
-  void condition_through_points(int n_threads);
+  void condition_through_points(const Workers& workers);
   void add_through_points(const Observations& more, std::size_t group);
   /// Takes samples away, at rising indices; `observations` stay as they are.
   void erase_samples(const std::vector<Eigen::Index>& gone);

@@ -14,9 +14,9 @@ namespace {
 
 /// @throws InputError as require_models
 InducingStatistics require_statistics(const Prior& prior, const std::vector<Observations>& observations,
-                                      const ModelValues& values, const InducingLatents& latents, int n_threads) {
+                                      const ModelValues& values, const InducingLatents& latents, const Workers& workers) {
   std::optional<InducingStatistics> statistics =
-      InducingStatistics::of(latents, BlocksOfStates(prior, observations, values), n_threads);
+      InducingStatistics::of(latents, BlocksOfStates(prior, observations, values), workers);
   if (!statistics) static_cast<void>(require_models(prior, observations, values.parameters, {}));  // names the state
   return *std::move(statistics);
 }
@@ -39,7 +39,7 @@ void keep_some(std::vector<Observations>& observations, KeptStates& kept) {
 
 }  // namespace
 
-void Posterior::Implementation::condition_through_points(int n_threads) {
+void Posterior::Implementation::condition_through_points(const Workers& workers) {
   constexpr std::size_t n_stretches = LeftOut::n_stretches;
   KeptStates all;
   std::vector<std::vector<std::vector<int>>> states;  // by Observations and stretch
@@ -56,7 +56,7 @@ void Posterior::Implementation::condition_through_points(int n_threads) {
   for (std::size_t k = 0; k < n_stretches; ++k) {
     std::vector<Observations> stretch;
     for (std::size_t g = 0; g < observations.size(); ++g) stretch.push_back(observations[g].take(states[g][k]));
-    stretches.push_back(require_statistics(prior, stretch, values, inducing, n_threads));
+    stretches.push_back(require_statistics(prior, stretch, values, inducing, workers));
   }
   auto through = std::make_shared<InducingPosterior>(std::move(inducing), std::move(stretches));
   if (!through->factorise()) throw_not_definite();

@@ -35,7 +35,8 @@ BlocksOfStates::BlocksOfStates(const Prior& prior, const std::vector<Observation
 
 const RowBlock* BlocksOfStates::block(Index b, bool with_derivatives, Memory& memory) const {
   const auto& [group, first, n] = states_[static_cast<std::size_t>(b)];
-  const Kept* const kept = kept_ == nullptr ? nullptr : &(*kept_)[static_cast<std::size_t>(b)];
+  const Kept* kept = kept_ == nullptr ? nullptr : &(*kept_)[static_cast<std::size_t>(b)];
+  if (kept != nullptr && kept->features.empty()) kept = nullptr;  // another process has kept it
   RowBlock& block = memory.block;
   block.first_group = group;
   block.observations = nullptr;

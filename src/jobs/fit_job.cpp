@@ -66,6 +66,15 @@ FitOptions optimiser_options(FitRequest& request, const FitProblem& problem) {
   return options;
 }
 
+}  // namespace
+
+int automatic_inducing_variables(std::int64_t n_rows) {
+  constexpr double work = 1e11;  // N M²
+  return static_cast<int>(std::min<double>(most_inducing_variables, std::sqrt(work / static_cast<double>(n_rows))));
+}
+
+namespace {
+
 // How many inducing variables there may be; 0: none, exact.
 int settled_inducing(const FitRequest& request, const FitProblem& problem, const FitOptions& options) {
   const bool has_sums = std::ranges::any_of(problem.observations, [](const Observations& group) { return group.has_sums(); });
@@ -82,7 +91,9 @@ int settled_inducing(const FitRequest& request, const FitProblem& problem, const
                            request.hyperparameters != HyperparameterChoice::integrate &&
                            request.problem.protocol.name == Protocol::Name::standard;
   if (request.is_exact || !is_possible) return 0;
-  return fit_memory(problem, options).reduced_size > largest_exact_size ? most_inducing_variables : 0;
+  return fit_memory(problem, options).reduced_size > largest_exact_size
+             ? automatic_inducing_variables(n_states(problem.observations))
+             : 0;
 }
 
 // How many hyperparameters are drawn.
@@ -367,7 +378,7 @@ std::vector<Option> options(FitRequest& request) {
            "learn from all rows through points that stand for them (docs/theory.md, T37), in time proportional to their number: "
            "at most so many variables, each one function of a latent at one point; none: exactly; auto: exactly up to {} rows "
            "times "
-           "free directions of motion, through at most {} variables beyond",
+           "free directions of motion, through at most {} variables beyond, fewer where there are more than 100 000 rows",
            largest_exact_size, most_inducing_variables),
        "auto"},
       {"train_on", &request.train_on, "N",

@@ -74,7 +74,8 @@ class Training {
         observations_(observations),
         hyperparameters_(hyperparameters),
         options_(options),
-        objective_(prior, observations, hyperparameters, std::move(points), thread_count(options.n_threads)),
+        objective_(prior, observations, hyperparameters, std::move(points),
+                   Workers(thread_count(options.n_threads), options.ranks)),
         reports_(static_cast<std::size_t>(n_restarts())),
         results_(static_cast<std::size_t>(n_restarts())),
         fractions_(static_cast<std::size_t>(n_restarts()), 0.0) {
@@ -192,7 +193,7 @@ class Training {
     constexpr int n_attempts = 2;
     const std::size_t from = best();
     try {
-      Likelihood::Workspace workspace(n_threads_, options_.stop);
+      Likelihood::Workspace workspace(Workers(n_threads_, options_.ranks), options_.stop);
       for (int attempt = 0;; ++attempt) {
         const std::vector<Hyperparameter>& at = results_[from];
         const Curvature curvature = curvature_at(objective_, coordinates(at), at, n_side_by_side_, options_.stop);
@@ -268,7 +269,7 @@ class Training {
     std::vector<double> values(scanned.size() * n_points);
     parallel_for(static_cast<int>(values.size()), n_side_by_side_, [&](int trial, int) {
       if (stopped()) return;
-      Likelihood::Workspace workspace(1, options_.stop);
+      Likelihood::Workspace workspace(Workers(1, options_.ranks), options_.stop);
       values[static_cast<std::size_t>(trial)] = objective_(moved(trial), nullptr, workspace);
     });
     if (stopped()) return false;
@@ -276,7 +277,7 @@ class Training {
     const auto lowest = std::min_element(values.begin(), values.end());
     const double before = reports_[from].objective;
     if (!(*lowest < before)) return false;
-    Likelihood::Workspace workspace(n_threads_, options_.stop);
+    Likelihood::Workspace workspace(Workers(n_threads_, options_.ranks), options_.stop);
     const LbfgsbResult result =
         optimise(static_cast<int>(from), objective_.at(moved(static_cast<int>(lowest - values.begin()))), workspace);
     if (!(result.value < before)) return false;
@@ -293,7 +294,7 @@ class Training {
       return;
     }
     RandomStream random(options_.seed, static_cast<std::uint64_t>(restart));
-    Likelihood::Workspace workspace(n_threads, options_.stop);
+    Likelihood::Workspace workspace(Workers(n_threads, options_.ranks), options_.stop);
     // a random start may lie where M is not positive definite: draw again, a few times
     constexpr int max_draws = 20;
     LbfgsbResult result;
@@ -324,7 +325,7 @@ class Training {
       for (Hyperparameter& h : start) {
         if (h.is_stationary_at_zero() && at_zero.contains(h.owner)) h.value = share * h.size * random.normal();
       }
-      Likelihood::Workspace workspace(1, options_.stop);
+      Likelihood::Workspace workspace(Workers(1, options_.ranks), options_.stop);
       drawn[static_cast<std::size_t>(draw)] = optimise(static_cast<int>(from), start, workspace);
     });
     const auto lowest =
@@ -510,6 +511,7 @@ class TrainingThroughPoints {
     options.reduction_tolerance = std::max(options.reduction_tolerance, 1e-3 / n_states(observations));
     options.n_restarts = 1;
     options.max_escapes = 0;
+    if (options.ranks) options.max_side_by_side = 1;  // all processes evaluate the same at a time
     std::optional<FitReport> best;
     for (int round = 0; round < n_rounds && !(best && is_set(options.stop)); ++round) {
       const InducingChoice choice = chosen(observations, from);
@@ -534,7 +536,7 @@ class TrainingThroughPoints {
     const auto of = [&](const std::vector<Observations>& observations) {
       ModelValues values = model_values(prior_, observations, report.hyperparameters);
       values.inducing = report.inducing->points;
-      return left_out_by_points(prior_, observations, values, thread_count(options_.n_threads));
+      return left_out_by_points(prior_, observations, values, Workers(thread_count(options_.n_threads), options_.ranks));
     };
     if (!is_set(options_.stop)) return of(observations_);
     const std::vector<Observations> some = evenly(observations_, few);
@@ -562,7 +564,7 @@ Fit fit(const Prior& prior, const std::vector<Observations>& observations, const
                                                       hyperparameters, options);
   Posterior posterior = report.termination == FitReport::interrupted && !report.draws
                             ? Posterior::lazy(prior, observations, values_of(prior, observations, report).front())
-                            : posterior_of(prior, observations, report, thread_count(options.n_threads));
+                            : posterior_of(prior, observations, report, Workers(thread_count(options.n_threads), options.ranks));
   if (report.inducing) report.inducing->summary = posterior.summary();
   if (is_part) {  // what is said of the part is not of all
     const double of_part = std::exchange(report.negative_log_likelihood, posterior.negative_log_likelihood());

@@ -29,12 +29,12 @@ std::vector<ModelValues> values_of(const Prior& prior, const std::vector<Observa
 }
 
 Posterior posterior_of(const Prior& prior, const std::vector<Observations>& observations, const FitReport& report,
-                       int n_threads) {
+                       const Workers& workers) {
   const std::vector<ModelValues> values = values_of(prior, observations, report);
   if (report.inducing && report.inducing->summary) {
     return Posterior::of_summary(prior, observations, values.front(), *report.inducing->summary);
   }
-  return Posterior::mixture(prior, observations, values, n_threads);
+  return Posterior::mixture(prior, observations, values, workers);
 }
 
 }  // namespace gp2

@@ -42,9 +42,9 @@ double negative_log_hyperpriors(const std::vector<Hyperparameter>& hyperparamete
 
 namespace {
 
-Likelihood::Options likelihood_options(const std::vector<Hyperparameter>& hyperparameters, int n_threads) {
+Likelihood::Options likelihood_options(const std::vector<Hyperparameter>& hyperparameters, const Workers& workers) {
   Likelihood::Options options;
-  options.n_threads = n_threads;
+  options.workers = workers;
   for (const Hyperparameter& h : hyperparameters) h.ask_for_gradient(options);
   return options;
 }
@@ -53,12 +53,12 @@ Likelihood::Options likelihood_options(const std::vector<Hyperparameter>& hyperp
 
 Objective::Objective(const Prior& prior, const std::vector<Observations>& observations,
                      const std::vector<Hyperparameter>& hyperparameters, std::shared_ptr<const InducingPoints> points,
-                     int n_threads)
+                     const Workers& workers)
     : prior_(prior),
       observations_(observations),
       hyperparameters_(hyperparameters),
       points_(std::move(points)),
-      likelihood_(prior, observations, values(hyperparameters), likelihood_options(hyperparameters, n_threads)) {}
+      likelihood_(prior, observations, values(hyperparameters), likelihood_options(hyperparameters, workers)) {}
 
 ModelValues Objective::values(const std::vector<Hyperparameter>& hyperparameters) const {
   ModelValues values = model_values(prior_, observations_, hyperparameters);

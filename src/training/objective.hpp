@@ -16,10 +16,10 @@ double negative_log_hyperpriors(const std::vector<Hyperparameter>& hyperparamete
 class Objective {
  public:
   /// @param prior, observations  outlive it
-  /// @param points     through which all is learned; null: exact
-  /// @param n_threads  as Likelihood::Options
+  /// @param points   through which all is learned; null: exact
+  /// @param workers  as Likelihood::Options
   Objective(const Prior& prior, const std::vector<Observations>& observations, const std::vector<Hyperparameter>& hyperparameters,
-            std::shared_ptr<const InducingPoints> points = nullptr, int n_threads = 1);
+            std::shared_ptr<const InducingPoints> points = nullptr, const Workers& workers = {});
 
   /// @param x         the hyperparameters' coordinates
   /// @param gradient  in x, of the size of x; not computed when null; left as it was when the value is +∞

@@ -51,6 +51,12 @@ TEST(InducingFit, AutoIsExactWhereThatTakesMinutes) {
   EXPECT_EQ(n_inducing(n + 1, [](FitRequest& request) { request.problem.max_points = 20; }), 0);
 }
 
+TEST(InducingFit, AnEvaluationOfAMillionRowsTakesFewerVariables) {
+  EXPECT_EQ(automatic_inducing_variables(1'000), most_inducing_variables);
+  EXPECT_EQ(automatic_inducing_variables(100'000), most_inducing_variables);
+  EXPECT_EQ(automatic_inducing_variables(1'000'000), 316);
+}
+
 TEST(InducingFit, AsManyAsAskedForUnlessExactTakesLess) {
   EXPECT_EQ(n_inducing(50, [](FitRequest& request) { request.inducing = 60; }), 60);
   EXPECT_EQ(n_inducing(50, [](FitRequest& request) { request.inducing = 100; }), 0);

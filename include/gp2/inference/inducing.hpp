@@ -3,6 +3,7 @@
 #include <memory>
 #include <vector>
 
+#include "gp2/base/workers.hpp"
 #include "gp2/export.hpp"
 #include "gp2/inference/model_values.hpp"
 #include "gp2/observations.hpp"
@@ -32,6 +33,6 @@ InducingChoice choose_inducing_points(const Prior& prior, const std::vector<Obse
 /// likelihood is higher than the bound, by about half of their sum where that is small.
 /// @throws InputError  where values have no inducing points; and as Likelihood.
 Eigen::VectorXd left_out_by_points(const Prior& prior, const std::vector<Observations>& observations, const ModelValues& values,
-                                   int n_threads = 1);
+                                   const Workers& workers = {});
 
 }  // namespace gp2

@@ -7,6 +7,7 @@
 
 #include <Eigen/Core>
 
+#include "gp2/base/workers.hpp"
 #include "gp2/export.hpp"
 #include "gp2/inference/model_values.hpp"
 #include "gp2/observations.hpp"
@@ -28,7 +29,7 @@ class Likelihood {
   struct Options {
     std::vector<int> gradient_parameters;  // indices of the system's parameters whose derivative `evaluate` gives
     bool noise_gradient = false;           // whether it gives the derivatives in the noise
-    int n_threads = 1;                     // that may work on what is made once, where it is through inducing points
+    Workers workers = {};                  // on what is made once, where it is through inducing points
   };
 
   /// @param initial  values at which everything that has no gradient stays: fixed noise and parameters are reduced once, here.
@@ -41,10 +42,10 @@ class Likelihood {
   /// Memory reused between calls; one per thread that calls.
   class Workspace {
    public:
-    /// @param n_threads  that one evaluation may use, where there are samples enough for it to pay. The sums keep their order
+    /// @param workers    on one evaluation; other processes through inducing points only. Threads are used where there are samples enough for it to pay. The sums keep their order
     ///                   whatever it is; a factorisation of more than 2000 rows on several threads is rounded differently.
     /// @param stop       set: `evaluate` gives up within a second or so and returns +∞
-    explicit Workspace(int n_threads = 1, const std::atomic<bool>* stop = nullptr);
+    explicit Workspace(const Workers& workers = {}, const std::atomic<bool>* stop = nullptr);
     ~Workspace();
 
    private:

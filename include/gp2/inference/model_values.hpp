@@ -40,6 +40,16 @@ struct ModelGradient {
 
   static ModelGradient zero(const ModelValues& values);
   void add(const ModelGradient& other);
+
+  /// Calls work(first number, how many) for every vector and matrix.
+  template <typename Work>
+  void for_each(const Work& work) {
+    for (auto* group : {&log_kernel, &log_signal_stddev, &log_noise_stddev}) {
+      for (Eigen::VectorXd& one : *group) work(one.data(), one.size());
+    }
+    for (Eigen::MatrixXd& one : free_loading) work(one.data(), one.size());
+    work(parameters.data(), parameters.size());
+  }
 };
 
 }  // namespace gp2

@@ -1,6 +1,7 @@
 #pragma once
 
 #include <atomic>
+#include <cstdint>
 #include <functional>
 #include <optional>
 #include <string>
@@ -29,6 +30,8 @@ inline constexpr int n_mixed_draws = 25, largest_integrated_size = 800;
 /// The largest reduced size that is solved exactly unless a person says otherwise, and the inducing variables at most beyond it:
 /// minutes on two cores.
 inline constexpr int largest_exact_size = 1500, most_inducing_variables = 1000;
+/// The same of so many rows: fewer beyond 100 000, so that an evaluation of the likelihood of a million takes some ten seconds.
+int automatic_inducing_variables(std::int64_t n_rows);
 
 /// The rule of `auto`: the directions of a latent have hyperparameters of their own, as in the default prior, the reduced size is
 /// small enough, it is no baseline, and the optimiser runs.

@@ -1,0 +1,41 @@
+#pragma once
+
+#include <cstddef>
+#include <memory>
+#include <span>
+#include <utility>
+
+#include "gp2/export.hpp"
+
+namespace gp2 GP2_API {
+
+/// Processes that work on one fit together: each has all data, sums up a share of the rows, and gets what the others have summed up.
+/// All of them do the same in the same order.
+class Ranks {
+ public:
+  virtual ~Ranks() = default;
+  [[nodiscard]] virtual int rank() const = 0;  // 0 … size() − 1
+  [[nodiscard]] virtual int size() const = 0;
+  /// The numbers of one rank, to all.
+  virtual void broadcast(std::span<double> numbers, int from) const = 0;
+
+  /// The rank that works on one of so many parts.
+  [[nodiscard]] int owner(int part, int n_parts) const { return size() < n_parts ? part * size() / n_parts : part; }
+};
+
+/// Who may work on sums over rows: threads, and other processes where there are. Results are the same bits whoever does.
+struct Workers {
+  int n_threads = 1;
+  std::shared_ptr<const Ranks> ranks = nullptr;  // null: this process alone
+
+  Workers(int threads = 1, std::shared_ptr<const Ranks> others = nullptr) : n_threads(threads), ranks(std::move(others)) {}
+
+  /// Whether a part is this process' to work on.
+  [[nodiscard]] bool owns(int part, int n_parts) const { return !ranks || ranks->owner(part, n_parts) == ranks->rank(); }
+  /// Numbers of a part, from who works on it to all.
+  void share(std::span<double> numbers, int part, int n_parts) const {
+    if (ranks) ranks->broadcast(numbers, ranks->owner(part, n_parts));
+  }
+};
+
+}  // namespace gp2
