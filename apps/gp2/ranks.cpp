@@ -41,11 +41,6 @@ bool are_alike(const Ranks& ranks, const std::vector<double>& numbers) {
   return is_alike;
 }
 
-std::vector<double> as_numbers(std::string text) {
-  text.resize(256);
-  return {text.begin(), text.end()};
-}
-
 }  // namespace
 
 int n_started_together() {
@@ -70,6 +65,11 @@ void require_same_data(const Ranks& ranks, const std::vector<Observations>& obse
 namespace {
 
 int own_stderr = -1;  // of a process that was silenced
+
+std::vector<double> as_numbers(std::string text) {
+  text.resize(256);
+  return {text.begin(), text.end()};
+}
 
 class MpiRanks final : public Ranks {
  public:

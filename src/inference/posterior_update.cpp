@@ -121,19 +121,19 @@ Posterior remove_oldest(Posterior&& posterior, int n) {
 
 void Posterior::Implementation::erase_empty_groups() {
   std::vector<int> renumbered;
-  std::size_t kept = 0;
+  std::size_t n_kept = 0;
   for (std::size_t group = 0; group < observations.size(); ++group) {
-    renumbered.push_back(static_cast<int>(kept));
+    renumbered.push_back(static_cast<int>(n_kept));
     if (group >= n_given_groups && observations[group].n_data() == 0) continue;
-    if (kept < group) {
-      observations[kept] = std::move(observations[group]);
-      values.noise_stddev[kept] = std::move(values.noise_stddev[group]);
+    if (n_kept < group) {
+      observations[n_kept] = std::move(observations[group]);
+      values.noise_stddev[n_kept] = std::move(values.noise_stddev[group]);
     }
-    ++kept;
+    ++n_kept;
   }
-  if (kept == observations.size()) return;
-  observations.erase(observations.begin() + static_cast<std::ptrdiff_t>(kept), observations.end());
-  values.noise_stddev.resize(kept);
+  if (n_kept == observations.size()) return;
+  observations.erase(observations.begin() + static_cast<std::ptrdiff_t>(n_kept), observations.end());
+  values.noise_stddev.resize(n_kept);
   for (Sample& sample : samples) sample.group = renumbered[static_cast<std::size_t>(sample.group)];
 }
 

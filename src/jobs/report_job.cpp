@@ -15,6 +15,7 @@
 
 #include "base/not_a_number.hpp"
 #include "gp2/error.hpp"
+#include "gp2/jobs/fit_job.hpp"
 #include "gp2/jobs/fit_problem.hpp"
 #include "gp2/simulation/generate.hpp"
 #include "jobs/read_observations.hpp"

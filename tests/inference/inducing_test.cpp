@@ -199,9 +199,9 @@ TEST(Inducing, AllOfManyStatesAreLearnedFromAndSomeAreKept) {
   std::vector<int> first(2600), rest(2600);
   std::iota(first.begin(), first.end(), 0);
   std::iota(rest.begin(), rest.end(), 2600);
-  const Observations& all = p.observations.front();
-  const Observations more = all.take(rest);
-  const Posterior grown = update(Posterior(p.prior, {all.take(first)}, p.values),
+  const Observations& group = p.observations.front();
+  const Observations more = group.take(rest);
+  const Posterior grown = update(Posterior(p.prior, {group.take(first)}, p.values),
                                  {more.states(), more.view(), more.values(), p.values.noise_stddev.front()});
   EXPECT_EQ(grown.n_states(), 5'200);
   EXPECT_LE(grown.observations().front().n_data(), 5000);
