@@ -95,6 +95,26 @@ std::optional<std::string> other_than_text(std::string_view begin) {
 
 }  // namespace
 
+namespace {
+
+FileVersion version_of(const struct stat& status) {
+  return {status.st_dev, status.st_ino, static_cast<std::uint64_t>(status.st_size), status.st_mtim.tv_sec,
+          status.st_mtim.tv_nsec};
+}
+
+}  // namespace
+
+void throw_changed(const std::filesystem::path& path) {
+  throw InputError(
+      fmt::format("{}: changed while it was read; read it when nothing writes to it any more, or read a copy", path.string()));
+}
+
+std::optional<FileVersion> file_version(const std::filesystem::path& path) {
+  struct stat status = {};
+  if (stat(path.c_str(), &status) != 0 || !S_ISREG(status.st_mode)) return std::nullopt;
+  return version_of(status);
+}
+
 void read_blocks(const std::filesystem::path& path, const std::function<void(std::string_view)>& take, std::size_t max_size) {
   const auto fail = [&](const std::string& why) { throw InputError(fmt::format("{}: {}", path.string(), why)); };
   const auto require = [&](bool good) {
@@ -124,6 +144,9 @@ void read_blocks(const std::filesystem::path& path, const std::function<void(std
     take_counted(block);
   };
   read_to_end(file, is_pipe, take_text, require, fail);
+  struct stat after = {};
+  require(fstat(file.descriptor, &after) == 0);
+  if (S_ISREG(status.st_mode) && version_of(after) != version_of(status)) throw_changed(path);
 }
 
 std::string read_file(const std::filesystem::path& path, std::size_t max_size) {

@@ -268,19 +268,29 @@ CsvTable::CsvTable() : content_(std::make_shared<const Content>()) {}
 
 CsvTable::CsvTable(std::shared_ptr<const Content> content) : content_(std::move(content)) {}
 
-CsvTable CsvTable::read(const std::filesystem::path& path, Keep keep) {
-  Builder builder(path.string(), keep);
+namespace {
+
+// Calls take(line) for every line of a file, without its end.
+template <typename Take>
+void for_each_line(const std::filesystem::path& path, const Take& take) {
   std::string rest;  // of a line that goes on in the next block
   read_blocks(path, [&](std::string_view block) {
     for (std::size_t end = block.find('\n'); end != std::string_view::npos; end = block.find('\n')) {
       const std::string_view line = block.substr(0, end);
-      builder.add_line(rest.empty() ? line : std::string_view(rest += line));
+      take(rest.empty() ? line : std::string_view(rest += line));
       rest.clear();
       block.remove_prefix(end + 1);
     }
     rest += block;
   });
-  if (!rest.empty()) builder.add_line(rest);
+  if (!rest.empty()) take(std::string_view(rest));
+}
+
+}  // namespace
+
+CsvTable CsvTable::read(const std::filesystem::path& path, Keep keep) {
+  Builder builder(path.string(), keep);
+  for_each_line(path, [&](std::string_view line) { builder.add_line(line); });
   return builder.finish();
 }
 
@@ -407,7 +417,8 @@ void CsvWriter::begin_cell() {
 
 void CsvWriter::add(std::string_view cell) {
   begin_cell();
-  const bool plain = cell.find_first_of(",\"") == std::string_view::npos && trim(cell) == cell && !cell.starts_with(byte_order_mark);
+  const bool plain =
+      cell.find_first_of(",\"") == std::string_view::npos && trim(cell) == cell && !cell.starts_with(byte_order_mark);
   if (plain) {
     block_ += cell;
     return;
@@ -434,6 +445,36 @@ void CsvWriter::end_line() {
 void CsvWriter::flush() {
   put_(block_);
   block_.clear();
+}
+
+void CsvWriter::add_printed(std::string_view cells) {
+  begin_cell();
+  block_ += cells;
+}
+
+void for_each_row(const std::filesystem::path& path, const std::function<void(std::string_view)>& take) {
+  bool is_first_line = true, is_header = true;
+  std::string printed;
+  for_each_line(path, [&](std::string_view line) {
+    if (std::exchange(is_first_line, false) && line.starts_with(byte_order_mark)) line.remove_prefix(byte_order_mark.size());
+    line = trim(line);
+    if (line.empty() || std::exchange(is_header, false)) return;
+    const bool is_plain =
+        std::ranges::none_of(std::string_view("\" \t\r\xef"), [&](char c) { return line.find(c) != std::string_view::npos; });
+    if (is_plain) {
+      take(line);
+      return;
+    }
+    printed.clear();
+    CsvWriter csv([&](std::string_view block) { printed += block; });
+    while (true) {
+      csv.add(take_cell(line).value_or(""));
+      if (line.empty()) break;
+      line.remove_prefix(1);  // the comma
+    }
+    csv.flush();
+    take(printed);
+  });
 }
 
 void write_csv(const std::filesystem::path& path, const std::function<void(CsvWriter&)>& print) {

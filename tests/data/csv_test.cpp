@@ -3,6 +3,7 @@
 #include <bit>
 #include <cmath>
 #include <csignal>
+#include <fstream>
 #include <limits>
 #include <random>
 #include <thread>
@@ -12,6 +13,7 @@
 #include <sys/wait.h>
 #include <unistd.h>
 
+#include <fmt/format.h>
 #include <gmock/gmock.h>
 
 #include "io_testing.hpp"
@@ -463,6 +465,53 @@ TEST(WriteFile, ManyThreadsLeaveOneWholeFile) {
   const std::string content = read_file(folder / "log.csv");
   EXPECT_EQ(content, std::string(5000, content.front()));
   EXPECT_EQ(n_files(folder), 1U);
+}
+
+// ---- a log that is read twice
+
+TEST(Csv, RowsOfAFileComeAgainAsTheyArePrinted) {
+  const TemporaryFolder folder;
+  const std::filesystem::path path = folder / "log.csv";
+  std::string text = "\xef\xbb\xbfq1, remark\r\n\n 1.50 ,\"a, b\"\r\n2,\"say \"\"no\"\"\"\n,\n3,\xef\xbb\xbfx\n \t\n";
+  for (int k = 0; k < 20000; ++k) text += fmt::format("{},x{}\n", k, k);  // more than a block
+  write_file(path, text + "4,end");
+  const CsvTable table = CsvTable::read(path);
+  int row = 0;
+  for_each_row(path, [&](std::string_view cells) {
+    std::string printed;
+    CsvWriter csv([&](std::string_view block) { printed += block; });
+    for (int column = 0; column < 2; ++column) csv.add(table.cell(row, column));
+    csv.flush();
+    EXPECT_EQ(cells, printed) << row;
+    ++row;
+  });
+  EXPECT_EQ(row, table.n_rows());
+  EXPECT_EQ(row, 20005);
+}
+
+TEST(Csv, AFileThatChangesWhileItIsReadIsRefused) {
+  const TemporaryFolder folder;
+  const std::filesystem::path path = folder / "log.csv";
+  const auto write_rows = [&](int n) {
+    std::string text = "q1\n";
+    for (int k = 0; k < n; ++k) text += "0.123456789\n";
+    write_file(path, text);
+  };
+  write_rows(20000);
+  const std::optional<FileVersion> version = file_version(path);
+  ASSERT_TRUE(version);
+  EXPECT_EQ(file_version(path), version);
+  int n_blocks = 0;
+  EXPECT_EQ(input_error_of([&] {
+              read_blocks(path, [&](std::string_view) {
+                if (n_blocks++ == 0) std::ofstream(path, std::ios::app) << "1\n";
+              });
+            }),
+            path.string() + ": changed while it was read; read it when nothing writes to it any more, or read a copy");
+  EXPECT_GT(n_blocks, 1);
+  EXPECT_NE(file_version(path), version);
+  EXPECT_FALSE(file_version("/dev/null"));
+  EXPECT_FALSE(file_version(folder / "absent.csv"));
 }
 
 }  // namespace

@@ -95,8 +95,9 @@ class CsvWriter {
  public:
   explicit CsvWriter(std::function<void(std::string_view)> put) : put_(std::move(put)) {}
 
-  void add(std::string_view cell);  // quoted where it must be to read back
-  void add(double value);           // in its shortest form
+  void add(std::string_view cell);           // quoted where it must be to read back
+  void add(double value);                    // in its shortest form
+  void add_printed(std::string_view cells);  // as they are, commas between them
   void end_line();
   void flush();  // hands on what is left
 
@@ -107,6 +108,11 @@ class CsvWriter {
   std::string block_;  // whole lines and the one that is being printed
   bool is_line_begin_ = true;
 };
+
+/// Calls take(cells of a row as CsvWriter prints them) for each row of a file, those of CsvTable::read in their order: a log may be
+/// too long for all of its text to be in memory.
+/// @throws InputError as CsvTable::read for what is no text, and what `take` throws.
+void for_each_row(const std::filesystem::path& path, const std::function<void(std::string_view)>& take);
 
 /// Writes a file of comma-separated values whole or not at all, without ever having its text in memory.
 /// @throws InputError as write_file, and what `print` throws.
