@@ -2,6 +2,7 @@
 
 #include <cmath>
 #include <memory>
+#include <utility>
 
 #include <fmt/format.h>
 #include <nlohmann/json.hpp>
@@ -87,9 +88,9 @@ void print_text(const Evaluation& e) {
 
 void run(EvaluateArguments& arguments) {
   const FitFile fit = FitFile::read(arguments.fit);
-  const CsvTable table = CsvTable::read(arguments.data, CsvTable::Keep::numbers);
+  CsvTable table = CsvTable::read(arguments.data, CsvTable::Keep::numbers);
   arguments.request.system = read_other_system(arguments.system);
-  const auto [evaluation, notes] = evaluate(fit, fit.posterior(), table, arguments.request);
+  const auto [evaluation, notes] = evaluate(fit, fit.posterior(), std::move(table), arguments.request);
   print_notes(notes);
   if (arguments.json) {
     print_result("{}\n", to_json(evaluation).dump(2));

@@ -2,9 +2,9 @@
 #include <cstdint>
 #include <memory>
 #include <optional>
+#include <utility>
 
 #include <fmt/format.h>
-#include <fmt/ranges.h>
 
 #include "command.hpp"
 #include "gp2/base/file.hpp"
@@ -35,35 +35,45 @@ std::vector<std::string> kept_names(const std::vector<std::string>& input, const
   return kept;
 }
 
-// the input as it was, then the new columns
-std::string joined(const CsvTable& input, const PredictOutcome& added) {
-  std::string csv;
-  std::vector<std::string> line;
-  const auto end_line = [&] {
-    csv += fmt::format("{}\n", fmt::join(line, ","));
-    line.clear();
-  };
-  for (const std::string& name : kept_names(input.header(), added.names)) line.push_back(csv_cell(name));
-  line.insert(line.end(), added.names.begin(), added.names.end());
-  end_line();
-  for (int i = 0; i < input.n_rows(); ++i) {
-    for (int column = 0; column < input.n_columns(); ++column) line.push_back(csv_cell(input.cell(i, column)));
-    for (const double value : added.values.col(i)) line.push_back(shortest(value));
-    end_line();
-  }
-  return csv;
-}
-
 void run(PredictArguments& arguments) {
   require_output(arguments.output, {arguments.fit, arguments.states, arguments.system});
   PredictRequest& request = arguments.request;
   const FitFile fit = FitFile::read(arguments.fit);
-  const CsvTable table = CsvTable::read(arguments.states);
+  // a file is read a second time for what is written in it, so that no more than numbers are in memory
+  const std::optional<FileVersion> version = file_version(arguments.states);
+  CsvTable table = CsvTable::read(arguments.states, version ? CsvTable::Keep::numbers : CsvTable::Keep::text);
+  const CsvTable text = version ? CsvTable() : table;
+  const std::vector<std::string> header = table.header();
+  const int n_rows = table.n_rows();
   request.view.system = read_other_system(arguments.system);
-  const PredictOutcome predictions = predict(fit, table, request);
+  const PredictOutcome predictions = predict(fit, std::move(table), request);
   print_notes(predictions.notes);
-  write_file(arguments.output, joined(table, predictions));
-  print_notes({fmt::format("{}: {} predictions, view {}", arguments.output, table.n_rows(), request.view.quantity->word())});
+
+  write_csv(arguments.output, [&](CsvWriter& csv) {
+    for (const std::string& name : kept_names(header, predictions.names)) csv.add(name);
+    for (const std::string& name : predictions.names) csv.add(name);
+    csv.end_line();
+    int row = 0;
+    const auto add_predictions = [&] {
+      for (const double value : predictions.values.col(row)) csv.add(value);
+      csv.end_line();
+      ++row;
+    };
+    if (!version) {
+      while (row < n_rows) {
+        for (int column = 0; column < text.n_columns(); ++column) csv.add(text.cell(row, column));
+        add_predictions();
+      }
+      return;
+    }
+    for_each_row(arguments.states, [&](std::string_view cells) {
+      if (row == n_rows) throw_changed(arguments.states);
+      csv.add_printed(cells);
+      add_predictions();
+    });
+    if (row != n_rows || file_version(arguments.states) != version) throw_changed(arguments.states);
+  });
+  print_notes({fmt::format("{}: {} predictions, view {}", arguments.output, n_rows, request.view.quantity->word())});
 }
 
 }  // namespace

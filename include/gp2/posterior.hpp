@@ -1,6 +1,7 @@
 #pragma once
 
 #include <cstdint>
+#include <functional>
 #include <memory>
 #include <vector>
 
@@ -85,6 +86,10 @@ class Posterior {
   /// for any number of threads; which other states are asked for may change its last digits, since triangular systems are solved
   /// for blocks of states.
   [[nodiscard]] Marginal marginal(const View& view, const Eigen::Ref<const Eigen::MatrixXd>& states, int n_threads = 1) const;
+  /// The same, to the bit, in the memory of a block of states: take(number of the first state of a block, marginal of its states),
+  /// block after block.
+  void for_each_marginal(const View& view, const Eigen::Ref<const Eigen::MatrixXd>& states, int n_threads,
+                         const std::function<void(Eigen::Index first, const Marginal&)>& take) const;
 
   /// How far states lie from the observed ones (N), in the features that the latents of the view read, each weighed by what it
   /// changes (theory.md, T30). Nineteen of twenty observed states are within 1 of those observed at other times; beyond

@@ -130,8 +130,14 @@ py::tuple derive_table(const PySystem& self, const py::object& data, const py::o
 py::list check_system_and_log(const PySystem& self, const py::object& data, const py::object& columns) {
   std::optional<CsvTable> table;
   if (!data.is_none()) table = to_table(data, "data");
+  const CheckOptions options{columns_argument(columns)};
+  std::vector<Finding> findings;
+  {
+    const py::gil_scoped_release release;
+    findings = check(*self.model, table ? &*table : nullptr, options);
+  }
   py::list list;
-  for (Finding& finding : check(*self.model, table ? &*table : nullptr, {columns_argument(columns)})) {
+  for (Finding& finding : findings) {
     finding.text = with_keywords(finding.text);
     list.append(std::move(finding));
   }

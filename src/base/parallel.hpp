@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <atomic>
+#include <cstddef>
 #include <exception>
 #include <mutex>
 #include <thread>
@@ -46,6 +47,16 @@ void parallel_for(int n_tasks, int n_threads, const Work& work) {
     run(0);
   }
   if (failure) std::rethrow_exception(failure);
+}
+
+/// work(first, n, thread) for every block of at most `size` of n_all things, as parallel_for.
+template <typename Work>
+void for_each_block(std::ptrdiff_t n_all, std::ptrdiff_t size, int n_threads, const Work& work) {
+  const auto n_blocks = static_cast<int>((n_all + size - 1) / size);
+  parallel_for(n_blocks, n_threads, [&](int block, int thread) {
+    const std::ptrdiff_t first = block * size;
+    work(first, std::min(size, n_all - first), thread);
+  });
 }
 
 }  // namespace gp2

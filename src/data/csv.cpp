@@ -268,19 +268,29 @@ CsvTable::CsvTable() : content_(std::make_shared<const Content>()) {}
 
 CsvTable::CsvTable(std::shared_ptr<const Content> content) : content_(std::move(content)) {}
 
-CsvTable CsvTable::read(const std::filesystem::path& path, Keep keep) {
-  Builder builder(path.string(), keep);
+namespace {
+
+// Calls take(line) for every line of a file, without its end.
+template <typename Take>
+void for_each_line(const std::filesystem::path& path, const Take& take) {
   std::string rest;  // of a line that goes on in the next block
   read_blocks(path, [&](std::string_view block) {
     for (std::size_t end = block.find('\n'); end != std::string_view::npos; end = block.find('\n')) {
       const std::string_view line = block.substr(0, end);
-      builder.add_line(rest.empty() ? line : std::string_view(rest += line));
+      take(rest.empty() ? line : std::string_view(rest += line));
       rest.clear();
       block.remove_prefix(end + 1);
     }
     rest += block;
   });
-  if (!rest.empty()) builder.add_line(rest);
+  if (!rest.empty()) take(std::string_view(rest));
+}
+
+}  // namespace
+
+CsvTable CsvTable::read(const std::filesystem::path& path, Keep keep) {
+  Builder builder(path.string(), keep);
+  for_each_line(path, [&](std::string_view line) { builder.add_line(line); });
   return builder.finish();
 }
 
@@ -371,36 +381,108 @@ CsvTable CsvTable::take(const std::vector<int>& rows) const {
   return CsvTable(std::make_shared<const Content>(std::move(taken)));
 }
 
-std::string csv_cell(const std::string& text) {
-  const bool plain = text.find_first_of(",\"") == std::string::npos && trim(text) == text && !text.starts_with(byte_order_mark);
-  if (plain) return text;
-  std::string cell = "\"";
-  for (char c : text) cell.append(c == '"' ? 2 : 1, c);  // a quote is written twice
-  return cell += '"';
+void CsvTable::print(CsvWriter& csv) const {
+  for (const std::string& name : header()) csv.add(name);
+  csv.end_line();
+  for (int row = 0; row < n_rows(); ++row) {
+    for (int column = 0; column < n_columns(); ++column) {
+      const double value = content_->number(row, column);
+      if (const std::optional<std::string_view> written = content_->text(row, column)) {
+        csv.add(*written);
+      } else if (std::isnan(value)) {
+        csv.add("");
+      } else {
+        csv.add(value);
+      }
+    }
+    csv.end_line();
+  }
 }
 
 std::string CsvTable::text() const {
-  std::string csv;
-  const auto add = [&](const std::string& cell, int column) {
-    // the line of one empty cell would be blank
-    csv += cell.empty() && n_columns() == 1 ? "\"\"" : csv_cell(cell);
-    csv += column + 1 < n_columns() ? ',' : '\n';
-  };
-  for (int column = 0; column < n_columns(); ++column) add(header()[static_cast<std::size_t>(column)], column);
-  for (int row = 0; row < n_rows(); ++row) {
-    for (int column = 0; column < n_columns(); ++column) {
-      const std::optional<std::string_view> written = content_->text(row, column);
-      const double value = written ? nan : content_->number(row, column);
-      if (std::isnan(value)) {
-        add(std::string(written.value_or("")), column);
-        continue;
-      }
-      std::array<char, 32> digits{};
-      csv.append(digits.data(), std::to_chars(digits.data(), digits.data() + digits.size(), value).ptr);
-      csv += column + 1 < n_columns() ? ',' : '\n';
-    }
+  std::string text;
+  CsvWriter csv([&](std::string_view block) { text += block; });
+  print(csv);
+  csv.flush();
+  return text;
+}
+
+void CsvTable::write(const std::filesystem::path& path) const {
+  write_csv(path, [&](CsvWriter& csv) { print(csv); });
+}
+
+void CsvWriter::begin_cell() {
+  if (!std::exchange(is_line_begin_, false)) block_ += ',';
+}
+
+void CsvWriter::add(std::string_view cell) {
+  begin_cell();
+  const bool plain =
+      cell.find_first_of(",\"") == std::string_view::npos && trim(cell) == cell && !cell.starts_with(byte_order_mark);
+  if (plain) {
+    block_ += cell;
+    return;
   }
-  return csv;
+  block_ += '"';
+  for (const char c : cell) block_.append(c == '"' ? 2 : 1, c);  // a quote is written twice
+  block_ += '"';
+}
+
+void CsvWriter::add(double value) {
+  begin_cell();
+  std::array<char, 32> digits{};
+  block_.append(digits.data(), std::to_chars(digits.data(), digits.data() + digits.size(), value).ptr);
+}
+
+void CsvWriter::end_line() {
+  constexpr std::size_t enough = std::size_t{1} << 16;
+  if (block_.empty() || block_.back() == '\n') block_ += "\"\"";  // the line of one empty cell would be blank
+  block_ += '\n';
+  is_line_begin_ = true;
+  if (block_.size() >= enough) flush();
+}
+
+void CsvWriter::flush() {
+  put_(block_);
+  block_.clear();
+}
+
+void CsvWriter::add_printed(std::string_view cells) {
+  begin_cell();
+  block_ += cells;
+}
+
+void for_each_row(const std::filesystem::path& path, const std::function<void(std::string_view)>& take) {
+  bool is_first_line = true, is_header = true;
+  std::string printed;
+  for_each_line(path, [&](std::string_view line) {
+    if (std::exchange(is_first_line, false) && line.starts_with(byte_order_mark)) line.remove_prefix(byte_order_mark.size());
+    line = trim(line);
+    if (line.empty() || std::exchange(is_header, false)) return;
+    const bool is_plain =
+        std::ranges::none_of(std::string_view("\" \t\r\xef"), [&](char c) { return line.find(c) != std::string_view::npos; });
+    if (is_plain) {
+      take(line);
+      return;
+    }
+    printed.clear();
+    CsvWriter csv([&](std::string_view block) { printed += block; });
+    while (true) {
+      csv.add(take_cell(line).value_or(""));
+      if (line.empty()) break;
+      line.remove_prefix(1);  // the comma
+    }
+    csv.flush();
+    take(printed);
+  });
+}
+
+void write_csv(const std::filesystem::path& path, const std::function<void(CsvWriter&)>& print) {
+  write_blocks(path, [&](const auto& put) {
+    CsvWriter csv(put);
+    print(csv);
+    csv.flush();
+  });
 }
 
 const std::string& CsvTable::name() const { return content_->name; }

@@ -22,17 +22,51 @@ using Eigen::VectorXd;
 
 namespace {
 
+// Counts of standardised errors within central intervals; NaN is none.
+struct CentralCounts {
+  VectorXd levels, n_within = VectorXd::Zero(levels.size());
+  double n = 0;
+
+  void add(double z) {
+    if (std::isnan(z)) return;
+    ++n;
+    // the central interval that just holds it
+    const double probability = std::erf(std::abs(z) / std::numbers::sqrt2);
+    for (Index l = 0; l < levels.size(); ++l) n_within[l] += probability <= levels[l] ? 1 : 0;
+  }
+  [[nodiscard]] VectorXd shares() const { return n_within / n; }
+};
+
+// Counts of Φ(z) in equal parts of [0, 1].
+struct PitCounts {
+  VectorXd n_within;
+  double n = 0;
+
+  explicit PitCounts(int n_bins) : n_within(VectorXd::Zero(n_bins)) {}
+  void add(double z) {
+    if (std::isnan(z)) return;
+    ++n;
+    const double pit = 0.5 * std::erfc(-z / std::numbers::sqrt2);
+    n_within[std::min(static_cast<Index>(pit * static_cast<double>(n_within.size())), n_within.size() - 1)] += 1;
+  }
+  [[nodiscard]] VectorXd shares() const { return n_within / n; }
+};
+
 // Standardised errors under Gaussian marginals, and their mean negative log density.
 struct StandardisedErrors {
   double sum = 0;
-  std::vector<double> z;
+  int n = 0;
+  CentralCounts within{Eigen::Vector3d(0.5, 0.8, 0.95)};
+  PitCounts pit{Calibration::n_bins};
 
   void add(double error, double stddev) {
-    z.push_back(error / stddev);
-    sum += 0.5 * z.back() * z.back() + std::log(stddev) + 0.5 * std::log(2 * std::numbers::pi);
+    const double z = error / stddev;
+    sum += 0.5 * z * z + std::log(stddev) + 0.5 * std::log(2 * std::numbers::pi);
+    ++n;
+    within.add(z);
+    pit.add(z);
   }
-  [[nodiscard]] double nlpd() const { return z.empty() ? not_a_number : sum / static_cast<double>(z.size()); }
-  [[nodiscard]] Eigen::Map<const VectorXd> vector() const { return {z.data(), std::ssize(z)}; }
+  [[nodiscard]] double nlpd() const { return n == 0 ? not_a_number : sum / n; }
 };
 
 // What errors of some points come to.
@@ -51,16 +85,8 @@ struct Scores {
   }
   [[nodiscard]] VectorXd rmse() const { return (squares.array() / counts.array()).sqrt(); }
   [[nodiscard]] Calibration calibration() const {
-    const Eigen::Vector3d levels(0.5, 0.8, 0.95);
-    const VectorXd of_measured = central_coverage(measured.vector(), levels),
-                   of_latent = central_coverage(latent.vector(), levels);
-    return {of_measured[0],
-            of_measured[1],
-            of_measured[2],
-            of_latent[0],
-            of_latent[1],
-            of_latent[2],
-            pit_histogram(measured.vector(), Calibration::n_bins)};
+    const VectorXd of_measured = measured.within.shares(), of_latent = latent.within.shares();
+    return {of_measured[0], of_measured[1], of_measured[2], of_latent[0], of_latent[1], of_latent[2], measured.pit.shares()};
   }
   [[nodiscard]] Evaluation::Part part(double spread) const {
     const VectorXd of_observed = (counts.array() > 0).select(rmse(), 0);
@@ -92,21 +118,18 @@ double training_spread(const Posterior& posterior, int row) {
 
 // Where A ddq = b alone decides an entry of ddq (nq × N): its row of T, in the metric of M, is what rounding leaves of it.
 Eigen::Array<bool, Eigen::Dynamic, Eigen::Dynamic> decided_entries(const System& system, const Ref<const MatrixXd>& states,
-                                                                   const Ref<const VectorXd>& parameters) {
+                                                                   const Ref<const VectorXd>& parameters, int n_threads) {
   constexpr double rounding = 1e-10;
-  constexpr Index block = 256;  // in the memory of a few states
   Eigen::Array<bool, Eigen::Dynamic, Eigen::Dynamic> decided(system.nq(), states.cols());
-  MechanicsBatch mechanics;
-  for (Index first = 0; first < states.cols(); first += block) {
-    const Index n = std::min(block, states.cols() - first);
-    evaluate_mechanics(system, states.middleCols(first, n), parameters, mechanics);
-    for (Index i = 0; i < n; ++i) {
-      const UdwadiaKalaba& projection = mechanics.projections[static_cast<std::size_t>(i)];
+  const auto look = [&](Index first, const MechanicsBatch& mechanics) {
+    for (std::size_t i = 0; i < mechanics.projections.size(); ++i) {
+      const UdwadiaKalaba& projection = mechanics.projections[i];
       const VectorXd unit = projection.mass().diagonal().cwiseSqrt().cwiseInverse();
       const VectorXd size = (projection.T() * unit.asDiagonal()).rowwise().norm();
-      decided.col(first + i) = size.array() <= rounding * unit.array();
+      decided.col(first + static_cast<Index>(i)) = size.array() <= rounding * unit.array();
     }
-  }
+  };
+  static_cast<void>(for_each_mechanics(system, states, parameters, n_threads, look));
   return decided;
 }
 
@@ -129,28 +152,15 @@ double max_constraint_error(const System& system, const Ref<const MatrixXd>& sta
 }
 
 VectorXd central_coverage(const Ref<const VectorXd>& z, const Ref<const VectorXd>& levels) {
-  VectorXd n_within = VectorXd::Zero(levels.size());
-  double n = 0;
-  for (const double one : z) {
-    if (std::isnan(one)) continue;
-    ++n;
-    // the central interval that just holds it
-    const double probability = std::erf(std::abs(one) / std::numbers::sqrt2);
-    for (Index l = 0; l < levels.size(); ++l) n_within[l] += probability <= levels[l] ? 1 : 0;
-  }
-  return n_within / n;
+  CentralCounts counts{levels};
+  for (const double one : z) counts.add(one);
+  return counts.shares();
 }
 
 VectorXd pit_histogram(const Ref<const VectorXd>& z, int n_bins) {
-  VectorXd n_within = VectorXd::Zero(n_bins);
-  double n = 0;
-  for (const double one : z) {
-    if (std::isnan(one)) continue;
-    ++n;
-    const double pit = 0.5 * std::erfc(-one / std::numbers::sqrt2);
-    n_within[std::min(static_cast<Index>(pit * n_bins), n_within.size() - 1)] += 1;
-  }
-  return n_within / n;
+  PitCounts counts(n_bins);
+  for (const double one : z) counts.add(one);
+  return counts.shares();
 }
 
 std::vector<int> observed_rows(const Posterior& posterior) {
@@ -184,10 +194,15 @@ MatrixXd with_slip(const Posterior& posterior, const View& view, const Ref<const
   const Prior& prior = prior_of(posterior.prior(), view);
   if (!prior.system->has_constraint_noise()) return noise_stddev;
   const VectorXd parameters = parameters_of(view, posterior.values().parameters);
-  const ViewValues values = evaluate_view(view, require_mechanics(prior, view, states, parameters), states);
-  for (int i = 0; i < states.cols(); ++i) {
-    noise_stddev.col(i) = (noise_stddev.col(i).array().square() + values.N(i).rowwise().squaredNorm().array()).sqrt();
-  }
+  const auto fault = for_each_mechanics(*prior.system, states, parameters, 1, [&](Index first, const MechanicsBatch& mechanics) {
+    const Index n = mechanics.values.n_states();
+    const ViewValues values = evaluate_view(view, mechanics, states.middleCols(first, n));
+    for (Index i = 0; i < n; ++i) {
+      auto column = noise_stddev.col(first + i);
+      column = (column.array().square() + values.N(static_cast<int>(i)).rowwise().squaredNorm().array()).sqrt();
+    }
+  });
+  if (fault) static_cast<void>(require_mechanics(prior, view, states, parameters));
   return noise_stddev;
 }
 
@@ -227,8 +242,8 @@ std::vector<TrainingResidual> training_residuals(const Posterior& posterior, con
         if (!std::isnan(before)) products += before * z;
         before = z;
       }
-      one.n = static_cast<int>(errors.z.size());
-      one.coverage95 = central_coverage(errors.vector(), VectorXd::Constant(1, 0.95))[0];
+      one.n = errors.n;
+      one.coverage95 = errors.within.shares()[2];
       // values that sums stand for are smoothed, and so their errors
       one.serial_correlation = one.rms > 0 && are_all && !group.has_sums() ? products / one.rms : 0;
       one.rms = std::sqrt(one.rms / std::max(1, one.n));
@@ -308,6 +323,15 @@ std::vector<ConstraintResidual> constraint_residuals(const Posterior& posterior,
   return constraint_residuals(posterior, of.view().other_system, of.states(), of.view().rows, of.values(), noise);
 }
 
+namespace {
+
+// NaN stays
+void add_largest(double one, double& largest) {
+  if (!std::isnan(largest) && !(one <= largest)) largest = one;
+}
+
+}  // namespace
+
 Evaluation evaluate_predictions(const Posterior& posterior, const Ref<const MatrixXd>& states, const std::vector<int>& rows,
                                 const Ref<const MatrixXd>& targets, const EvaluationOptions& options) {
   View all = View::constrained_acceleration(*posterior.prior().system);
@@ -322,9 +346,7 @@ Evaluation evaluate_predictions(const Posterior& posterior, const Ref<const Matr
   const Prior& prior = prior_of(posterior.prior(), all);
   const System& system = prior.reference_system();
   const VectorXd parameters = parameters_of(all, posterior.values().parameters);
-  const Posterior::Marginal prediction = posterior.marginal(all, states, options.n_threads);
-  const MatrixXd stddev = prediction.stddev();
-  const auto decided = decided_entries(*prior.system, states, parameters);
+  const auto decided = decided_entries(*prior.system, states, parameters, options.n_threads);
   const MatrixXd noise =
       with_slip(posterior, compared, states,
                 options.noise_stddev.size() > 0 ? options.noise_stddev : measurement_noise(posterior, rows, states.cols()));
@@ -335,22 +357,29 @@ Evaluation evaluate_predictions(const Posterior& posterior, const Ref<const Matr
   e.rmse.resize(std::ssize(rows));
   const VectorXd distance = posterior.distance_from_data(all, states, options.n_threads);
   Scores whole(e.rmse.size()), near(e.rmse.size()), far(e.rmse.size());
-  for (int i = 0; i < e.n; ++i) {
-    Scores& part = distance[i] > Posterior::far_from_data ? far : near;
-    for (Scores* scores : {&whole, &part}) ++scores->n;
-    for (Index k = 0; k < e.rmse.size(); ++k) {
-      const Index row = rows[static_cast<std::size_t>(k)];
-      const double error = targets(k, i) - prediction.mean(row, i);
-      if (std::isnan(targets(k, i))) {
-        ++e.n_missing;
-        continue;
+  posterior.for_each_marginal(all, states, options.n_threads, [&](Index first, const Posterior::Marginal& prediction) {
+    const MatrixXd stddev = prediction.stddev();
+    for (Index i = 0; i < stddev.cols(); ++i) {
+      const Index state = first + i;
+      Scores& part = distance[state] > Posterior::far_from_data ? far : near;
+      for (Scores* scores : {&whole, &part}) ++scores->n;
+      for (Index k = 0; k < e.rmse.size(); ++k) {
+        const Index row = rows[static_cast<std::size_t>(k)];
+        const double error = targets(k, state) - prediction.mean(row, i);
+        if (std::isnan(targets(k, state))) {
+          ++e.n_missing;
+          continue;
+        }
+        // rounding may leave a variance of 0 where the data say all
+        const bool has_variance = !decided(row, state) && stddev(row, i) > 0;
+        if (!has_variance) ++e.n_zero_variance;
+        for (Scores* scores : {&whole, &part}) scores->add(k, error, stddev(row, i), noise(k, state), has_variance);
       }
-      // rounding may leave a variance of 0 where the data say all
-      const bool has_variance = !decided(row, i) && stddev(row, i) > 0;
-      if (!has_variance) ++e.n_zero_variance;
-      for (Scores* scores : {&whole, &part}) scores->add(k, error, stddev(row, i), noise(k, i), has_variance);
     }
-  }
+    const auto states_here = states.middleCols(first, stddev.cols());
+    add_largest(max_constraint_error(system, states_here, system.parameter_values(), prediction.mean), e.max_constraint_error);
+    add_largest(max_constraint_error(system, states_here, parameters, prediction.mean), e.max_constraint_error_fitted);
+  });
   static_cast<Calibration&>(e) = whole.calibration();
   const double spread = row_stddev(targets).norm();
   e.rmse = whole.rmse();
@@ -362,8 +391,6 @@ Evaluation evaluate_predictions(const Posterior& posterior, const Ref<const Matr
   e.nrmse = e.rmse.norm() / spread;
   e.near = near.part(spread);
   e.far = far.part(spread);
-  e.max_constraint_error = max_constraint_error(system, states, system.parameter_values(), prediction.mean);
-  e.max_constraint_error_fitted = max_constraint_error(system, states, parameters, prediction.mean);
   e.nlpd = whole.measured.nlpd();
   e.nlpd_latent = whole.latent.nlpd();
   return e;

@@ -117,16 +117,6 @@ Posterior Posterior::components(const std::vector<int>& which) const {
 
 namespace {
 
-// Calls work(first state, how many, thread) for every block of states.
-template <typename Work>
-void for_each_block(Index n_states, Index block_size, int n_threads, const Work& work) {
-  const int n_blocks = static_cast<int>((n_states + block_size - 1) / block_size);
-  parallel_for(n_blocks, n_threads, [&](int block, int thread) {
-    const Index first = block * block_size;
-    work(first, std::min(block_size, n_states - first), thread);
-  });
-}
-
 // cov(v(x_i), v'(x_j)) of the prior from ℓ_aᵀ of both and k_a, per latent: added to (d × d')
 void add_prior_covariance(double k, const double* left, const double* right, Index n_functions, Ref<MatrixXd> covariance) {
   const Map<const MatrixXd> l(left, n_functions, covariance.rows()), r(right, n_functions, covariance.cols());
@@ -177,19 +167,20 @@ class MarginalBlock {
  public:
   explicit MarginalBlock(const Posterior::Implementation& posterior) : posterior_(posterior), sums_(*posterior.latents) {}
 
-  // Of the states first … first + n − 1, to their columns of `marginal`. Returns how many variances it set to 0.
-  int evaluate(const View& view, const Ref<const MatrixXd>& states, Index first, Index n, Posterior::Marginal& marginal) {
+  // Of the states first … first + n − 1, to the columns of `marginal` from `column` on. Returns how many variances it set to 0.
+  int evaluate(const View& view, const Ref<const MatrixXd>& states, Index first, Index n, Posterior::Marginal& marginal,
+               Index column) {
     const Index d = view.size();
     query_.evaluate(posterior_, view, states, first, n);
     const std::vector<MatrixXd> loadings = query_.loadings(posterior_);
     cross_.resize(posterior_.latents->size(), d * n);
     sums_.evaluate(query_.features, view.latent, &loadings, &cross_);
-    query_.view_of(posterior_, sums_.mean(), marginal.mean.middleCols(first, n));
+    query_.view_of(posterior_, sums_.mean(), marginal.mean.middleCols(column, n));
     posterior_.latents->whiten(cross_);
 
     // the prior's covariance at each state, less what the data explain
-    marginal.covariance.middleCols(first, n).setZero();
-    const auto covariance_at = [&](Index i) { return Map<MatrixXd>(marginal.covariance.col(first + i).data(), d, d); };
+    marginal.covariance.middleCols(column, n).setZero();
+    const auto covariance_at = [&](Index i) { return Map<MatrixXd>(marginal.covariance.col(column + i).data(), d, d); };
     for (std::size_t a = 0; a < loadings.size(); ++a) {
       if (!query_.needs(a)) continue;
       const VectorXd variances = prior_variances(a);
@@ -255,34 +246,48 @@ Gaussian mixed(std::vector<Gaussian> components, const AddSquare& add_square) {
   return out;
 }
 
+// Of the states first … first + n − 1.
 Posterior::Marginal marginal_of(const Posterior::Implementation& self, const View& view, const Ref<const MatrixXd>& states,
-                                int n_threads) {
+                                Index first, Index n, int n_threads) {
   require_query(self, view, states);
   constexpr Index block_size = 64;
   n_threads = thread_count(n_threads);
   const Index d = view.size();
   std::vector<MarginalBlock> blocks(static_cast<std::size_t>(n_threads), MarginalBlock(self));
   std::vector<int> n_clipped(static_cast<std::size_t>(n_threads));
-  Posterior::Marginal marginal{MatrixXd(d, states.cols()), MatrixXd(d * d, states.cols()), 0};
-  for_each_block(states.cols(), block_size, n_threads, [&](Index first, Index n, int thread) {
+  Posterior::Marginal marginal{MatrixXd(d, n), MatrixXd(d * d, n), 0};
+  for_each_block(n, block_size, n_threads, [&](Index start, Index size, int thread) {
     const std::size_t own = static_cast<std::size_t>(thread);
-    n_clipped[own] += blocks[own].evaluate(view, states, first, n, marginal);
+    n_clipped[own] += blocks[own].evaluate(view, states, first + start, size, marginal, start);
   });
   marginal.n_clipped = std::accumulate(n_clipped.begin(), n_clipped.end(), 0);
   return marginal;
 }
 
-}  // namespace
-
-Posterior::Marginal Posterior::marginal(const View& view, const Ref<const MatrixXd>& states, int n_threads) const {
+Posterior::Marginal mixed_marginal(const std::vector<std::shared_ptr<const Posterior::Implementation>>& components,
+                                   const View& view, const Ref<const MatrixXd>& states, Index first, Index n, int n_threads) {
   const lapack::SingleThread single_thread;
-  std::vector<Marginal> of_components;
-  for (const auto& component : conditioned()) of_components.push_back(marginal_of(*component, view, states, n_threads));
+  std::vector<Posterior::Marginal> of_components;
+  for (const auto& component : components) of_components.push_back(marginal_of(*component, view, states, first, n, n_threads));
   const Index d = view.size();
   return mixed(std::move(of_components), [d](MatrixXd& covariance, const MatrixXd& deviation) {
     for (Index i = 0; i < deviation.cols(); ++i) {
       Map<MatrixXd>(covariance.col(i).data(), d, d) += deviation.col(i) * deviation.col(i).transpose();
     }
+  });
+}
+
+}  // namespace
+
+Posterior::Marginal Posterior::marginal(const View& view, const Ref<const MatrixXd>& states, int n_threads) const {
+  return mixed_marginal(conditioned(), view, states, 0, states.cols(), n_threads);
+}
+
+void Posterior::for_each_marginal(const View& view, const Ref<const MatrixXd>& states, int n_threads,
+                                  const std::function<void(Index, const Marginal&)>& take) const {
+  constexpr Index block_size = 1 << 14;  // of whole blocks of marginal_of
+  for_each_block(states.cols(), block_size, 1, [&](Index first, Index n, int) {
+    take(first, mixed_marginal(conditioned(), view, states, first, n, n_threads));
   });
 }
 
@@ -297,17 +302,17 @@ VectorXd Posterior::distance_from_data(const View& view, const Ref<const MatrixX
   const Implementation& self = implementation();
   require_query(self, view, states);
   const DataDistance distance(self, view);
-  std::vector<MatrixXd> features(self.prior.latents.size());
-  for (std::size_t a = 0; a < features.size(); ++a) {
-    if (view.has_latent(a)) features[a] = evaluate_features(self.prior, a, states).transpose();
-  }
   constexpr Index block_size = 64;
   VectorXd distances(states.cols());
   for_each_block(states.cols(), block_size, thread_count(n_threads), [&](Index first, Index n, int) {
+    std::vector<MatrixXd> features(self.prior.latents.size());
+    for (std::size_t a = 0; a < features.size(); ++a) {
+      if (view.has_latent(a)) features[a] = features_of_block(self.prior, a, states, first, n).transpose();
+    }
     VectorXd z(distance.n_coordinates());
-    for (Index i = first; i < first + n; ++i) {
+    for (Index i = 0; i < n; ++i) {
       distance.write_coordinates([&](std::size_t a) { return features[a].col(i); }, z);
-      distances[i] = distance.at(z);
+      distances[first + i] = distance.at(z);
     }
   });
   return distances;

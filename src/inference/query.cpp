@@ -1,5 +1,7 @@
 #include "inference/query.hpp"
 
+#include "gp2/error.hpp"
+
 namespace gp2 {
 
 using Eigen::Index;
@@ -21,7 +23,16 @@ void Query::evaluate(const Posterior::Implementation& posterior, const View& vie
   latent = viewed.latent;
   if (latent) prior.keep_only(latent->first, latent->n);
   features.resize(there.latents.size());
-  for (std::size_t a = 0; a < features.size(); ++a) features[a] = evaluate_features(there, a, block);
+  for (std::size_t a = 0; a < features.size(); ++a) features[a] = features_of_block(there, a, states, first, n);
+}
+
+MatrixXd features_of_block(const Prior& prior, std::size_t a, const Ref<const MatrixXd>& states, Index first, Index n) {
+  try {
+    return evaluate_features(prior, a, states.middleCols(first, n));
+  } catch (const InputError&) {
+    static_cast<void>(evaluate_features(prior, a, states));
+    throw;
+  }
 }
 
 void Query::view_of(const Posterior::Implementation& posterior, const std::vector<MatrixXd>& f, Ref<MatrixXd> values) const {

@@ -34,6 +34,11 @@ struct Query {
   [[nodiscard]] std::vector<Eigen::MatrixXd> loadings(const Posterior::Implementation& posterior) const;
 };
 
+/// evaluate_features at the states first … first + n − 1.
+/// @throws InputError as it, which counts a state among all.
+Eigen::MatrixXd features_of_block(const Prior& prior, std::size_t a, const Eigen::Ref<const Eigen::MatrixXd>& states,
+                                  Eigen::Index first, Eigen::Index n);
+
 /// @throws InputError as require_view and System::require_states.
 void require_query(const Posterior::Implementation& posterior, const View& view, const Eigen::Ref<const Eigen::MatrixXd>& states);
 

@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <iterator>
+#include <mutex>
 #include <numbers>
 #include <utility>
 
@@ -22,6 +23,8 @@ namespace gp2 {
 namespace {
 
 using Level = Finding::Level;
+
+constexpr int all_threads = 0;
 
 void append(std::vector<Finding>& findings, std::vector<Finding> more) {
   for (Finding& finding : more) findings.push_back(std::move(finding));
@@ -67,15 +70,31 @@ void check_columns_of(const CsvTable& table, const LogReader& reader, const Whol
   if (!unused.empty()) good(fmt::format("columns not needed: {}", fmt::join(unused, ", ")));
 }
 
+// The first state at which M is singular, −1: none.
+int first_singular_mass(const System& system, const Eigen::MatrixXd& states) {
+  std::mutex mutex;
+  int first_of_all = -1;
+  for_each_mechanics(system, states, system.parameter_values(), all_threads,
+                     [&](Eigen::Index first, const MechanicsBatch& mechanics) {
+                       const int here = mechanics.first_singular(), state = static_cast<int>(first) + here;
+                       const std::scoped_lock lock(mutex);
+                       if (here >= 0 && (first_of_all < 0 || state < first_of_all)) first_of_all = state;
+                     });
+  return first_of_all;
+}
+
 // The system, and where that is sound what the prior asks of it.
 void check_mechanics(const Model& model, const Eigen::MatrixXd& states, std::vector<Finding>& findings) {
   const System& system = *model.system;
-  append(findings, check_system(system, states, system.parameter_values()));
+  append(findings, check_system(system, states, system.parameter_values(), all_threads));
   if (has_error(findings)) return;
+  const Prior prior = make_prior(model);
+  const View view = View::constrained_acceleration(system);
+  const int singular = what_needs_acceleration(prior, view) ? first_singular_mass(system, states) : -1;
+  if (singular < 0) return;
   MechanicsBatch mechanics;
-  evaluate_mechanics(make_prior(model), View::constrained_acceleration(system), states, system.parameter_values(), mechanics);
-  if (!mechanics.fault) return;
-  findings.push_back({Level::error, fmt::format("{} at state {}", mechanics.fault->text, mechanics.fault->state + 1)});
+  evaluate_mechanics(prior, view, states.col(singular), system.parameter_values(), mechanics);
+  if (mechanics.fault) findings.push_back({Level::error, fmt::format("{} at state {}", mechanics.fault->text, singular + 1)});
 }
 
 // Columns that do not vary, and rows that repeat others.

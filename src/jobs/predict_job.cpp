@@ -36,23 +36,25 @@ void predict_marginals(const Posterior& posterior, const View& view, const Matri
     out.values = posterior.mean(view, states, /*n_threads=*/0);
     return;
   }
-  const Posterior::Marginal prediction = posterior.marginal(view, states, /*n_threads=*/0);
-  if (prediction.n_clipped > 0) {
-    out.notes.push_back(fmt::format("{} variances were negative by rounding and set to 0", prediction.n_clipped));
-  }
   const std::vector<std::string> names = out.names;
   for (const std::string& name : names) out.names.push_back(name + "_std");
-  const bool full = covariance == PredictRequest::Covariance::full;
-  out.values.resize(2 * d + (full ? d * (d + 1) / 2 : 0), states.cols());
-  out.values.topRows(d) = prediction.mean;
-  out.values.middleRows(d, d) = prediction.stddev();
-  Index row = 2 * d;
-  for (Index j = 0; full && j < d; ++j) {
+  std::vector<Index> upper;  // rows of Posterior::Marginal::covariance
+  for (Index j = 0; covariance == PredictRequest::Covariance::full && j < d; ++j) {
     for (Index k = j; k < d; ++k) {
       out.names.push_back(fmt::format("cov_{}_{}", names[static_cast<std::size_t>(j)], names[static_cast<std::size_t>(k)]));
-      out.values.row(row++) = prediction.covariance.row(k * d + j);
+      upper.push_back(k * d + j);
     }
   }
+  out.values.resize(2 * d + std::ssize(upper), states.cols());
+  int n_clipped = 0;
+  posterior.for_each_marginal(view, states, /*n_threads=*/0, [&](Index first, const Posterior::Marginal& prediction) {
+    auto values = out.values.middleCols(first, prediction.mean.cols());
+    values.topRows(d) = prediction.mean;
+    values.middleRows(d, d) = prediction.stddev();
+    values.bottomRows(std::ssize(upper)) = prediction.covariance(upper, Eigen::all);
+    n_clipped += prediction.n_clipped;
+  });
+  if (n_clipped > 0) out.notes.push_back(fmt::format("{} variances were negative by rounding and set to 0", n_clipped));
 }
 
 // NAME_sample1 … of every name, then NAME_sample2 …: draws of the view at all states together.
@@ -136,15 +138,17 @@ std::vector<Option> options(PredictRequest& request) {
   return table;
 }
 
-PredictOutcome predict(const FitFile& fit, const CsvTable& states, const PredictRequest& request) {
+PredictOutcome predict(const FitFile& fit, CsvTable states, const PredictRequest& request) {
   if (request.n_samples && *request.n_samples < 1) {
     throw InputError(fmt::format("`samples`: must be at least 1, got {}", *request.n_samples));
   }
   const Posterior posterior = request.unconditioned ? fit.posterior().without_data() : fit.posterior();
   const PredictedView at = predicted_view(fit, posterior.prior(), request.view);
   LogStates log = read_log_states(at.prior, at.view, *at.model, states, request.columns, {}, at.actuators);
+  const std::string name = states.name();
+  states = CsvTable();  // a long log in memory once
   PredictOutcome out{at.names, {}, std::move(log.notes)};
-  at_states_of(states, [&] { predict_marginals(posterior, at.view, log.states, request.covariance, out); });
+  at_states_of(name, [&] { predict_marginals(posterior, at.view, log.states, request.covariance, out); });
   if (request.n_samples) add_samples(posterior, at.view, log.states, *request.n_samples, request.seed, out);
   if (!request.unconditioned) add_distance(posterior, at.view, log.states, out);
   return out;
@@ -156,7 +160,7 @@ std::vector<Option> options(EvaluateRequest& request) {
           threads_option(request.threads)};
 }
 
-EvaluateOutcome evaluate(const FitFile& fit, const Posterior& posterior, const CsvTable& log, const EvaluateRequest& request) {
+EvaluateOutcome evaluate(const FitFile& fit, const Posterior& posterior, CsvTable log, const EvaluateRequest& request) {
   require_threads(request.threads);
   EvaluateOutcome out;
   ViewRequest constrained;
@@ -167,14 +171,16 @@ EvaluateOutcome evaluate(const FitFile& fit, const Posterior& posterior, const C
   const std::vector<int> rows = acceleration_rows(*fit.model.system, outputs, "`outputs`");
   const LogStates states = read_log_states(at.prior, at.view, *at.model, log, request.columns, outputs, at.actuators);
   out.notes.insert(out.notes.end(), states.notes.begin(), states.notes.end());
+  const std::string name = log.name();
+  log = CsvTable();
   EvaluationOptions options{at.view.other_system, {}, request.threads};
   options.noise_stddev = measurement_noise(posterior, rows, states.states.cols(), states.stated_stddev);
   out.evaluation =
-      at_states_of(log, [&] { return evaluate_predictions(posterior, states.states, rows, states.accelerations, options); });
+      at_states_of(name, [&] { return evaluate_predictions(posterior, states.states, rows, states.accelerations, options); });
   if (at.prior.reference) return out;  // a baseline knows no constraint
   for (const ConstraintResidual& one :
        constraint_residuals(posterior, at.view.other_system, states.states, rows, states.accelerations, options.noise_stddev)) {
-    if (one.is_too_large()) out.notes.push_back(fmt::format("warning: {}: {}", log.name(), one.text()));
+    if (one.is_too_large()) out.notes.push_back(fmt::format("warning: {}: {}", name, one.text()));
   }
   return out;
 }

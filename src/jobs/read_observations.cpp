@@ -1,7 +1,9 @@
 #include "jobs/read_observations.hpp"
 
 #include <algorithm>
+#include <bit>
 #include <cmath>
+#include <cstdint>
 #include <limits>
 #include <numeric>
 
@@ -262,7 +264,7 @@ MatrixXd all_accelerations(const System& system, LogReader& reader, const CsvTab
 }
 
 // accelerations that follow from others are no measurements
-void note_dependence(const LoggedSystem& logged, const MatrixXd& states, const MatrixXd& accelerations, std::size_t n_observed,
+void note_dependence(const LoggedSystem& logged, const MatrixXd& states, MatrixXd accelerations, std::size_t n_observed,
                      const CsvTable& log, std::vector<std::string>& notes) {
   if (accelerations.size() == 0) return;
   const std::vector<std::string> every = logged.system().acceleration_names();
@@ -359,20 +361,32 @@ std::optional<CommandedRows> take_commands(const System& system, const std::vect
 }
 
 int n_repeated_rows(const MatrixXd& states, const MatrixXd& values) {
-  // NaN is not equal to itself
-  const auto cleared = [](const MatrixXd& matrix) {
-    return MatrixXd(matrix.unaryExpr([](double one) { return std::isnan(one) ? 0.0 : one; }));
+  // NaN is not equal to itself, and −0 is 0
+  const auto entry = [&](Index k, int i) {
+    const double one = k < states.rows() ? states(k, i) : values(k - states.rows(), i);
+    return std::isnan(one) || one == 0 ? 0.0 : one;
   };
-  const MatrixXd x = cleared(states), y = cleared(values);
-  std::vector<int> order = counted(x.cols());
-  const auto less = [](const MatrixXd& matrix, int a, int b) {
-    return std::lexicographical_compare(matrix.col(a).begin(), matrix.col(a).end(), matrix.col(b).begin(), matrix.col(b).end());
-  };
-  std::sort(order.begin(), order.end(), [&](int a, int b) { return x.col(a) == x.col(b) ? less(y, a, b) : less(x, a, b); });
-  int n = 0;
-  for (std::size_t k = 1; k < order.size(); ++k) {
-    if (x.col(order[k]) == x.col(order[k - 1]) && y.col(order[k]) == y.col(order[k - 1])) ++n;
+  const Index n_entries = states.rows() + values.rows();
+  // negative, 0 or positive as row a comes before b, repeats it, or comes behind it: rows are sorted by a hash of their bits first
+  std::vector<std::uint64_t> hashes(static_cast<std::size_t>(states.cols()), 0);
+  for (int i = 0; i < static_cast<int>(states.cols()); ++i) {
+    std::uint64_t& hash = hashes[static_cast<std::size_t>(i)];
+    for (Index k = 0; k < n_entries; ++k) {
+      hash = (std::rotl(hash, 23) ^ std::bit_cast<std::uint64_t>(entry(k, i))) * 0x9e3779b97f4a7c15U;
+    }
   }
+  const auto compare = [&](int a, int b) {
+    const std::uint64_t hash_a = hashes[static_cast<std::size_t>(a)], hash_b = hashes[static_cast<std::size_t>(b)];
+    if (hash_a != hash_b) return hash_a < hash_b ? -1 : 1;
+    for (Index k = 0; k < n_entries; ++k) {
+      if (entry(k, a) != entry(k, b)) return entry(k, a) < entry(k, b) ? -1 : 1;
+    }
+    return 0;
+  };
+  std::vector<int> order = counted(states.cols());
+  std::sort(order.begin(), order.end(), [&](int a, int b) { return compare(a, b) < 0; });
+  int n = 0;
+  for (std::size_t k = 1; k < order.size(); ++k) n += compare(order[k - 1], order[k]) == 0 ? 1 : 0;
   return n;
 }
 
@@ -403,12 +417,12 @@ Observations read_log(const LoggedSystem& logged, const Log& log, const FitProbl
   const std::vector<std::string> observed = readings.view.names(system);
   readings.values = reader.measurements(observed);
   readings.stated_stddev = stated_noise(logged.model, observed, options, reader, log.table, notes);
-  const MatrixXd all_values = all_accelerations(system, reader, log.table);
+  MatrixXd all_values = all_accelerations(system, reader, log.table);
   const MatrixXd state_stddevs = options.project ? stated_state_deviations(system, reader, log.table) : MatrixXd();
   note_reading(reader, log.table, notes);
   if (options.project) project(logged, log.table, state_stddevs, readings.states, notes);
   note_violation(system, readings.states, logged.parameters, log.table, notes);
-  note_dependence(logged, readings.states, all_values, observed.size(), log.table, notes);
+  note_dependence(logged, readings.states, std::move(all_values), observed.size(), log.table, notes);
   note_repeats(readings, log.table, notes);
 
   const int n_rows = log.table.n_rows();

@@ -134,7 +134,7 @@ ReportData test_data(const ReportOptions& options, const FitFile& fit, const Pos
   const View all = View::constrained_acceleration(*prior.system);
   const LogStates log = read_log_states(prior, all, fit.model, table, options.columns, view.names(*fit.model.system));
   notes.insert(notes.end(), log.notes.begin(), log.notes.end());
-  ReportData data = at_states_of(table, [&] {
+  ReportData data = at_states_of(table.name(), [&] {
     MatrixXd noise = measurement_noise(posterior, rows, log.states.cols(), log.stated_stddev);
     return data_at(posterior, log.states, rows, log.accelerations, std::move(noise), nullptr);
   });

@@ -1,9 +1,13 @@
 #include "gp2/mechanics/check.hpp"
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <functional>
+#include <limits>
+#include <mutex>
 #include <numeric>
+#include <tuple>
 #include <utility>
 
 #include <fmt/format.h>
@@ -11,6 +15,8 @@
 #include <Eigen/Cholesky>
 
 #include "base/decompositions.hpp"
+#include "base/parallel.hpp"
+#include "gp2/error.hpp"
 #include "gp2/mechanics/udwadia_kalaba.hpp"
 
 namespace gp2 {
@@ -23,6 +29,21 @@ using Eigen::VectorXd;
 namespace {
 
 using Level = Finding::Level;
+
+// work(first, states) for every block of states, so that a long log is looked at in the memory of a few rows. What a system has to
+// say against a state it says again of all together, by the number of the state among them.
+template <typename Work>
+void in_blocks(const Ref<const MatrixXd>& states, int n_threads, const Work& work) {
+  constexpr Index block_size = 256;
+  const auto visit = [&](Index first, const Ref<const MatrixXd>& block) { work(first, block); };
+  try {
+    for_each_block(states.cols(), block_size, thread_count(n_threads),
+                   [&](Index first, Index n, int) { visit(first, states.middleCols(first, n)); });
+  } catch (const InputError&) {
+    visit(0, states);
+    throw;
+  }
+}
 
 // standard deviation of a row, or its magnitude where it does not vary; 0 where it is not measured
 double spread(const Ref<const Eigen::RowVectorXd>& row) {
@@ -113,25 +134,48 @@ std::vector<int> complete_states(const Ref<const MatrixXd>& accelerations) {
 
 std::optional<ConstraintViolation> largest_violation(const System& system, const Ref<const MatrixXd>& states,
                                                      const Ref<const VectorXd>& parameters) {
-  const MatrixXd residuals = system.residuals(states, parameters);
-  const SystemValues values = system.evaluate(states, parameters);
+  struct OfResidual {
+    double largest = -1, squares = 0;
+    Index at = 0;
+    bool is_measured = true;
+    VectorXd weights;  // largest |A|
+  };
+  const std::vector<System::Residual>& labels = system.residual_labels();
+  std::vector<OfResidual> all(labels.size());
+  for (OfResidual& one : all) one.weights.setZero(system.nq());
+  in_blocks(states, 1, [&](Index first, const Ref<const MatrixXd>& block) {
+    const MatrixXd residuals = system.residuals(block, parameters);
+    const SystemValues values = system.evaluate(block, parameters);
+    for (std::size_t k = 0; k < labels.size(); ++k) {
+      OfResidual& one = all[k];
+      for (Index i = 0; i < block.cols(); ++i) {
+        const double size = std::abs(residuals(static_cast<Index>(k), i));
+        one.is_measured = one.is_measured && !std::isnan(size);
+        one.squares += size * size;
+        if (size > one.largest) one.largest = size, one.at = first + i;
+        const auto A = values.A(static_cast<int>(i)).row(labels[k].row);
+        for (Index j = 0; j < A.size(); ++j) one.weights[j] = std::max(one.weights[j], std::abs(A[j]));
+      }
+    }
+  });
   const StateLayout layout = system.layout();
+  VectorXd spreads = VectorXd::Constant(2 * layout.nq, -1);
+  const auto spread_of = [&](int row) {
+    if (spreads[row] < 0) spreads[row] = spread(states.row(row));
+    return spreads[row];
+  };
   std::optional<ConstraintViolation> worst;
-  for (Index k = 0; k < residuals.rows(); ++k) {
-    if (residuals.row(k).hasNaN()) continue;  // not measured
-    const System::Residual& label = system.residual_labels()[static_cast<std::size_t>(k)];
+  for (std::size_t k = 0; k < labels.size(); ++k) {
+    const OfResidual& one = all[k];
+    if (!one.is_measured) continue;
     double scale = 0;
     for (int j = 0; j < system.nq(); ++j) {
-      double weight = 0;
-      for (int i = 0; i < values.n_states(); ++i) weight = std::max(weight, std::abs(values.A(i)(label.row, j)));
-      scale += weight * spread(states.row(label.velocity ? layout.dq(j) : layout.q(j)));
+      scale += one.weights[j] * spread_of(labels[k].velocity ? layout.dq(j) : layout.q(j));
     }
-    Index state = 0;
-    const double value = residuals.row(k).cwiseAbs().maxCoeff(&state);
     if (scale == 0) scale = 1;
-    const double relative = value / scale;
-    const double rms = residuals.row(k).norm() / std::sqrt(static_cast<double>(residuals.cols())) / scale;
-    if (!worst || relative > worst->relative) worst = {relative, rms, value, static_cast<int>(state), label.text};
+    const double relative = one.largest / scale;
+    const double rms = std::sqrt(one.squares) / std::sqrt(static_cast<double>(states.cols())) / scale;
+    if (!worst || relative > worst->relative) worst = {relative, rms, one.largest, static_cast<int>(one.at), labels[k].text};
   }
   return worst;
 }
@@ -150,63 +194,73 @@ LowerRank lower_of(const std::vector<int>& ranks) {
   return lower;
 }
 
-void append_ranks(const MechanicsBatch& mechanics, std::vector<int>& ranks) {
-  for (const UdwadiaKalaba& projection : mechanics.projections) ranks.push_back(projection.rank());
-}
-
 }  // namespace
 
 LowerRank states_of_lower_rank(const MechanicsBatch& mechanics) {
   std::vector<int> ranks;
-  if (!mechanics.fault) append_ranks(mechanics, ranks);
+  if (mechanics.fault) return {};
+  for (const UdwadiaKalaba& projection : mechanics.projections) ranks.push_back(projection.rank());
   return lower_of(ranks);
 }
 
 LowerRank states_of_lower_rank(const System& system, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters) {
   if (system.nc() == 0) return {};
-  constexpr Index block = 256;
-  std::vector<int> ranks;
-  for (Index first = 0; first < states.cols(); first += block) {
-    const Index n = std::min(block, states.cols() - first);
-    const MechanicsBatch mechanics = evaluate_mechanics(system, states.middleCols(first, n), parameters);
-    if (mechanics.fault) return {};
-    append_ranks(mechanics, ranks);
-  }
-  return lower_of(ranks);
+  std::vector<int> ranks(static_cast<std::size_t>(states.cols()));
+  const auto fault = for_each_mechanics(system, states, parameters, 1, [&](Index first, const MechanicsBatch& mechanics) {
+    std::transform(mechanics.projections.begin(), mechanics.projections.end(), ranks.begin() + first,
+                   [](const UdwadiaKalaba& projection) { return projection.rank(); });
+  });
+  return fault ? LowerRank{} : lower_of(ranks);
 }
+
+namespace {
+
+// Whether A ddq = b holds to rounding wherever all accelerations are measured.
+bool obey_to_rounding(const System& system, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters,
+                      const Ref<const MatrixXd>& accelerations) {
+  // a log with 7 digits or more of a computed quantity; measured accelerations are never that good
+  constexpr double tolerance = 1e-6;
+  bool obey = true;
+  in_blocks(states, 1, [&](Index first, const Ref<const MatrixXd>& block) {
+    if (!obey) return;
+    const SystemValues values = system.evaluate(block, parameters);
+    for (int i = 0; i < values.n_states(); ++i) {
+      const auto ddq = accelerations.col(first + i);
+      if (ddq.hasNaN()) continue;
+      const VectorXd residual = values.A(i) * ddq - values.b(i);
+      const VectorXd size = values.A(i).cwiseAbs() * ddq.cwiseAbs() + values.b(i).cwiseAbs();
+      obey = obey && !((residual.array().abs() > tolerance * size.array())).any();
+    }
+  });
+  return obey;
+}
+
+}  // namespace
 
 std::optional<std::vector<int>> dependent_columns(const System& system, const Ref<const MatrixXd>& states,
                                                   const Ref<const VectorXd>& parameters,
                                                   const Ref<const MatrixXd>& accelerations) {
+  if (system.nc() == 0 || !obey_to_rounding(system, states, parameters, accelerations)) return std::nullopt;
   if (accelerations.hasNaN()) {
     const std::vector<int> complete = complete_states(accelerations);
     if (complete.empty()) return std::nullopt;
     return dependent_columns(system, states(Eigen::all, complete), parameters, accelerations(Eigen::all, complete));
   }
-  const MechanicsBatch mechanics = evaluate_mechanics(system, states, parameters);
-  if (mechanics.fault || system.nc() == 0) return std::nullopt;
-  // a log with 7 digits or more of a computed quantity; measured accelerations are never that good
-  constexpr double tolerance = 1e-6;
-  int rank = 0;
-  for (int i = 0; i < mechanics.values.n_states(); ++i) {
-    const MatrixXd A = mechanics.values.A(i);
-    const VectorXd b = mechanics.values.b(i);
-    const VectorXd residual = A * accelerations.col(i) - b;
-    const VectorXd size = A.cwiseAbs() * accelerations.col(i).cwiseAbs() + b.cwiseAbs();
-    if (((residual.array().abs() > tolerance * size.array())).any()) return std::nullopt;
-    rank = std::max(rank, mechanics.projections[static_cast<std::size_t>(i)].rank());
-  }
-  if (rank == 0) return std::nullopt;
-
   VectorXd scale(system.nq());
   for (Index j = 0; j < scale.size(); ++j) scale[j] = std::max(spread(accelerations.row(j)), 1e-300);
+  int rank = 0;
   std::vector<MatrixXd> scaled_T;
-  constexpr int max_states = 50;
-  const int stride = std::max(1, mechanics.values.n_states() / max_states);
-  for (int i = 0; i < mechanics.values.n_states(); i += stride) {
-    scaled_T.emplace_back(scale.cwiseInverse().asDiagonal() * mechanics.projections[static_cast<std::size_t>(i)].T() *
-                          scale.asDiagonal());
-  }
+  constexpr Index max_states = 50;
+  const Index stride = std::max<Index>(1, states.cols() / max_states);
+  const auto fault = for_each_mechanics(system, states, parameters, 1, [&](Index first, const MechanicsBatch& mechanics) {
+    for (std::size_t i = 0; i < mechanics.projections.size(); ++i) {
+      const UdwadiaKalaba& projection = mechanics.projections[i];
+      rank = std::max(rank, projection.rank());
+      if ((first + static_cast<Index>(i)) % stride != 0) continue;
+      scaled_T.emplace_back(scale.cwiseInverse().asDiagonal() * projection.T() * scale.asDiagonal());
+    }
+  });
+  if (fault || rank == 0) return std::nullopt;
   return independent_rows(scaled_T, system.nq() - rank);
 }
 
@@ -251,40 +305,50 @@ std::vector<ConstraintResidual> constraint_residuals(const System& system, const
                                                      const Ref<const VectorXd>& parameters,
                                                      const Ref<const MatrixXd>& accelerations,
                                                      const Ref<const MatrixXd>& stddev) {
-  const SystemValues values = system.evaluate(states, parameters);
-  std::vector<ConstraintResidual> all;
-  for (int row = 0; row < system.nc(); ++row) {
-    ConstraintResidual one;
-    one.constraint = system.constraint_labels()[static_cast<std::size_t>(row)];
-    std::vector<std::pair<double, int>> distances;
-    for (int i = 0; i < values.n_states(); ++i) {
-      double r = -values.b(i)[row], size = std::abs(r), variance = 0;
-      for (int j = 0; j < system.nq(); ++j) {
-        const double a = values.A(i)(row, j);
-        if (a == 0) continue;
-        r += a * accelerations(j, i);
-        size += std::abs(a * accelerations(j, i));
-        variance += a * a * stddev(j, i) * stddev(j, i);
+  constexpr std::size_t n_worst = 3;
+  using Distances = std::vector<std::pair<double, int>>;  // of the worst states, the largest first
+  std::vector<ConstraintResidual> all(static_cast<std::size_t>(system.nc()));
+  std::vector<Distances> distances(all.size());
+  in_blocks(states, 1, [&](Index first, const Ref<const MatrixXd>& block) {
+    const SystemValues values = system.evaluate(block, parameters);
+    for (int row = 0; row < system.nc(); ++row) {
+      ConstraintResidual& one = all[static_cast<std::size_t>(row)];
+      Distances& worst = distances[static_cast<std::size_t>(row)];
+      for (int i = 0; i < values.n_states(); ++i) {
+        const Index state = first + i;
+        double r = -values.b(i)[row], size = std::abs(r), variance = 0;
+        for (int j = 0; j < system.nq(); ++j) {
+          const double a = values.A(i)(row, j);
+          if (a == 0) continue;
+          r += a * accelerations(j, state);
+          size += std::abs(a * accelerations(j, state));
+          variance += a * a * stddev(j, state) * stddev(j, state);
+        }
+        // a row that vanishes says nothing of ddq
+        if (!std::isfinite(r) || variance == 0) continue;
+        variance += std::pow(system.constraint_noise()[row], 2);
+        ++one.n;
+        one.rms += r * r;
+        one.mean += r;
+        one.size += size * size;
+        one.expected += variance;
+        const std::pair distance(std::isfinite(variance) ? std::abs(r) / std::sqrt(variance) : std::abs(r),
+                                 static_cast<int>(state));
+        if (worst.size() == n_worst && distance < worst.back()) continue;
+        worst.insert(std::upper_bound(worst.begin(), worst.end(), distance, std::greater<>()), distance);
+        worst.resize(std::min(worst.size(), n_worst));
       }
-      // a row that vanishes says nothing of ddq
-      if (!std::isfinite(r) || variance == 0) continue;
-      variance += std::pow(system.constraint_noise()[row], 2);
-      ++one.n;
-      one.rms += r * r;
-      one.mean += r;
-      one.size += size * size;
-      one.expected += variance;
-      distances.emplace_back(std::isfinite(variance) ? std::abs(r) / std::sqrt(variance) : std::abs(r), i);
     }
+  });
+  for (std::size_t row = 0; row < all.size(); ++row) {
+    ConstraintResidual& one = all[row];
+    one.constraint = system.constraint_labels()[row];
     if (one.n == 0) continue;
     one.mean /= one.n;
     for (double* const square : {&one.rms, &one.size, &one.expected}) *square = std::sqrt(*square / one.n);
-    const std::size_t n_worst = std::min<std::size_t>(3, distances.size());
-    std::partial_sort(distances.begin(), distances.begin() + static_cast<std::ptrdiff_t>(n_worst), distances.end(),
-                      std::greater<>());
-    for (std::size_t k = 0; k < n_worst; ++k) one.worst.push_back(distances[k].second);
-    all.push_back(std::move(one));
+    for (const auto& [distance, state] : distances[row]) one.worst.push_back(state);
   }
+  std::erase_if(all, [](const ConstraintResidual& one) { return one.n == 0; });
   return all;
 }
 
@@ -302,31 +366,77 @@ int rank_of_mass(const MatrixXd& M) {
   return static_cast<int>((eigenvalues.array() > UdwadiaKalaba::mass_tolerance).count());
 }
 
-// rows that nearly follow from each other: accelerations are a difference of large numbers
-void check_independence(const MechanicsBatch& mechanics, std::vector<Finding>& findings) {
-  // half of the digits are left; a row with noise that was meant to follow from the others is worse
-  constexpr double tolerance = 1e-7;
-  double worst = 1;
-  int state = 0, n_states = 0;
+// What the mechanics of some states say.
+struct MechanicsSummary {
+  // M
+  double asymmetry = 0, worst_condition = 0, largest_entry = 0;
+  double largest_change = 0;  // from the first state
+  int n_singular = 0, lowest_rank_of_mass = 0;
+  // A
+  double smallest_ratio = 1;  // of singular values
+  int state_of_smallest = 0, n_nearly_dependent = 0;
+  int n_zero_rows = 0;
+
+  void add(const MechanicsSummary& other) {
+    asymmetry = std::max(asymmetry, other.asymmetry);
+    worst_condition = std::max(worst_condition, other.worst_condition);
+    largest_entry = std::max(largest_entry, other.largest_entry);
+    largest_change = std::max(largest_change, other.largest_change);
+    n_singular += other.n_singular;
+    lowest_rank_of_mass = std::min(lowest_rank_of_mass, other.lowest_rank_of_mass);
+    const std::pair mine(smallest_ratio, state_of_smallest), its(other.smallest_ratio, other.state_of_smallest);
+    std::tie(smallest_ratio, state_of_smallest) = std::min(mine, its);
+    n_nearly_dependent += other.n_nearly_dependent;
+    n_zero_rows += other.n_zero_rows;
+  }
+};
+
+constexpr double dependence_tolerance = 1e-7;  // half of the digits are left; a row with noise that was meant to follow is worse
+
+/// @param first       the number of the first state among all
+/// @param first_mass  M at the first of all
+MechanicsSummary summary_of(const MechanicsBatch& mechanics, Index first, const MatrixXd& first_mass) {
+  MechanicsSummary out;
+  out.lowest_rank_of_mass = static_cast<int>(first_mass.rows());
   for (int i = 0; i < mechanics.values.n_states(); ++i) {
     const UdwadiaKalaba& projection = mechanics.projections[static_cast<std::size_t>(i)];
-    if (projection.rank() == 0) continue;
+    out.n_singular += projection.mass_is_singular() ? 1 : 0;
+    out.n_zero_rows += projection.n_zero_rows();
+    const auto M = mechanics.values.M(i);
+    // most often M is that of the state before
+    if (i == 0 || M != mechanics.values.M(i - 1)) {
+      const double largest = M.cwiseAbs().maxCoeff();
+      out.largest_entry = std::max(out.largest_entry, largest);
+      out.largest_change = std::max(out.largest_change, (M - first_mass).cwiseAbs().maxCoeff());
+      if (largest > 0) out.asymmetry = std::max(out.asymmetry, (M - M.transpose()).cwiseAbs().maxCoeff() / largest);
+      if (projection.mass_is_singular()) {
+        out.lowest_rank_of_mass = std::min(out.lowest_rank_of_mass, rank_of_mass(M));
+      } else {
+        const VectorXd eigenvalues = eigenvalues_of(M);
+        out.worst_condition = std::max(out.worst_condition, eigenvalues.maxCoeff() / eigenvalues.minCoeff());
+      }
+    }
+    if (projection.rank() < 2) continue;
     // rows of A M^{-1/2}, of unit norm
     MatrixXd B = projection.mass().llt().matrixL().solve(mechanics.values.A(i).transpose());
     for (Index row = 0; row < B.cols(); ++row) B.col(row).stableNormalize();
     const VectorXd values = Eigen::JacobiSVD<MatrixXd>(B).singularValues();
-    const double smallest = values[projection.rank() - 1] / values[0];
-    n_states += smallest < tolerance ? 1 : 0;
-    if (smallest >= worst) continue;
-    worst = smallest;
-    state = i;
+    const double ratio = values[projection.rank() - 1] / values[0];
+    out.n_nearly_dependent += ratio < dependence_tolerance ? 1 : 0;
+    if (ratio < out.smallest_ratio) out.smallest_ratio = ratio, out.state_of_smallest = static_cast<int>(first) + i;
   }
-  if (n_states == 0) return;
+  return out;
+}
+
+// rows that nearly follow from each other: accelerations are a difference of large numbers
+void report_independence(const MechanicsSummary& mechanics, Index n_states, std::vector<Finding>& findings) {
+  if (mechanics.n_nearly_dependent == 0) return;
   findings.push_back(
-      {Level::warning, fmt::format("constraints: rows nearly follow from each other at {} of {} states (singular values down to "
-                                   "{:.1e} of the largest, at state {}); leave out what is redundant, or write it so that it is "
-                                   "so to rounding",
-                                   n_states, mechanics.values.n_states(), worst, state + 1)});
+      {Level::warning,
+       fmt::format("constraints: rows nearly follow from each other at {} of {} states (singular values down to "
+                   "{:.1e} of the largest, at state {}); leave out what is redundant, or write it so that it is "
+                   "so to rounding",
+                   mechanics.n_nearly_dependent, n_states, mechanics.smallest_ratio, mechanics.state_of_smallest + 1)});
 }
 
 // The part of F that stays when all velocities change their sign, less F at rest: Coriolis and centrifugal forces, quadratic in dq.
@@ -346,10 +456,13 @@ MatrixXd even_force(const System& system, MatrixXd states, const Ref<const Vecto
 
 // an M that changes with the motion comes with forces that are quadratic in the velocities
 void check_coriolis(const System& system, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters,
-                    const MatrixXd& M, std::vector<Finding>& findings) {
-  const double change = (M.colwise() - M.col(0)).cwiseAbs().maxCoeff();
-  if (!(change > 1e-9 * M.cwiseAbs().maxCoeff())) return;
-  if (!even_force(system, states, parameters).isZero(0)) return;
+                    const MechanicsSummary& mechanics, std::vector<Finding>& findings) {
+  if (!(mechanics.largest_change > 1e-9 * mechanics.largest_entry)) return;
+  bool is_zero = true;
+  in_blocks(states, 1, [&](Index, const Ref<const MatrixXd>& block) {
+    is_zero = is_zero && even_force(system, block, parameters).isZero(0);
+  });
+  if (!is_zero) return;
   findings.push_back(
       {Level::warning,
        "mass matrix: it changes with the motion, but no part of the force is quadratic in the velocities: the Coriolis and "
@@ -357,54 +470,42 @@ void check_coriolis(const System& system, const Ref<const MatrixXd>& states, con
 }
 
 // M is symmetric, and definite or completed by A
-void check_mass(const System& system, const MechanicsBatch& mechanics, std::vector<Finding>& findings) {
-  const int n_states = mechanics.values.n_states();
-  double worst_condition = 0, asymmetry = 0;
-  int n_singular = 0, mass_rank = system.nq();
-  for (int i = 0; i < n_states; ++i) {
-    const MatrixXd M = mechanics.values.M(i);
-    const double largest = M.cwiseAbs().maxCoeff();
-    if (largest > 0) asymmetry = std::max(asymmetry, (M - M.transpose()).cwiseAbs().maxCoeff() / largest);
-    if (mechanics.projections[static_cast<std::size_t>(i)].mass_is_singular()) {
-      ++n_singular;
-      mass_rank = std::min(mass_rank, rank_of_mass(M));
-    } else {
-      const VectorXd eigenvalues = eigenvalues_of(M);
-      worst_condition = std::max(worst_condition, eigenvalues.maxCoeff() / eigenvalues.minCoeff());
-    }
-  }
-  findings.push_back(
-      {asymmetry > 1e-10 ? Level::error : Level::good,
-       fmt::format("mass matrix: positive definite at all {} states, condition number up to {:.3g}", n_states, worst_condition)});
-  if (n_singular > 0) {
+void report_mass(const System& system, const MechanicsSummary& mechanics, Index n_states, std::vector<Finding>& findings) {
+  findings.push_back({mechanics.asymmetry > 1e-10 ? Level::error : Level::good,
+                      fmt::format("mass matrix: positive definite at all {} states, condition number up to {:.3g}", n_states,
+                                  mechanics.worst_condition)});
+  if (mechanics.n_singular > 0) {
     findings.back().text = fmt::format(
         "mass matrix: singular at {} of {} states, rank {} of {}{}; the constraints determine the motion all the same, and the "
         "latents must act on forces: directions = \"force\"",
-        n_singular, n_states, mass_rank, system.nq(),
-        n_singular < n_states ? fmt::format("; elsewhere positive definite, condition number up to {:.3g}", worst_condition)
-                              : "");
+        mechanics.n_singular, n_states, mechanics.lowest_rank_of_mass, system.nq(),
+        mechanics.n_singular < n_states
+            ? fmt::format("; elsewhere positive definite, condition number up to {:.3g}", mechanics.worst_condition)
+            : "");
   }
-  if (asymmetry > 1e-10) findings.back().text = fmt::format("mass matrix: not symmetric (relative difference {:.3g})", asymmetry);
+  if (mechanics.asymmetry > 1e-10) {
+    findings.back().text = fmt::format("mass matrix: not symmetric (relative difference {:.3g})", mechanics.asymmetry);
+  }
 }
 
 // the rank of A is the same at all states, and leaves some freedom
-void check_rank(const System& system, const MechanicsBatch& mechanics, std::vector<Finding>& findings) {
-  const LowerRank lower = states_of_lower_rank(mechanics);
+void report_rank(const System& system, const std::vector<int>& ranks, const MechanicsSummary& mechanics,
+                 std::vector<Finding>& findings) {
+  const LowerRank lower = lower_of(ranks);
   const int highest = lower.usual;
   if (!lower.states.empty()) {
     findings.push_back(
         {Level::warning,
          fmt::format("constraints: the rank of A changes over the states, from {} to {} of {} rows; it is lower at {} of {} "
                      "states, first at state {}",
-                     lower.lowest, highest, system.nc(), lower.states.size(), mechanics.values.n_states(),
-                     lower.states.front() + 1)});
+                     lower.lowest, highest, system.nc(), lower.states.size(), ranks.size(), lower.states.front() + 1)});
   } else if (highest < system.nc()) {
     findings.push_back({Level::good, fmt::format("constraints: rank {} of {} rows: {} redundant, which is allowed", highest,
                                                  system.nc(), system.nc() - highest)});
   } else {
     findings.push_back({Level::good, fmt::format("constraints: {} rows, independent at every state", system.nc())});
   }
-  check_independence(mechanics, findings);
+  report_independence(mechanics, std::ssize(ranks), findings);
   if (highest >= system.nq()) {
     findings.push_back(
         {Level::warning, "constraints: they leave no freedom (rank = number of coordinates): nothing is left to learn"});
@@ -412,143 +513,185 @@ void check_rank(const System& system, const MechanicsBatch& mechanics, std::vect
 }
 
 // a row of A that nearly vanishes somewhere decides the direction of its force from rounding
-void check_row_sizes(const System& system, const MechanicsBatch& mechanics, std::vector<Finding>& findings) {
-  int zero_rows = 0;
-  for (const UdwadiaKalaba& projection : mechanics.projections) zero_rows += projection.n_zero_rows();
+/// @param sizes  norms of the rows of A (nc × N)
+void report_row_sizes(const System& system, const MatrixXd& sizes, int n_zero_rows, std::vector<Finding>& findings) {
   for (int row = 0; row < system.nc(); ++row) {
-    std::vector<double> sizes;
-    for (int i = 0; i < mechanics.values.n_states(); ++i) sizes.push_back(mechanics.values.A(i).row(row).norm());
-    if (std::all_of(sizes.begin(), sizes.end(), [](double size) { return size == 0; })) {
+    const std::string& label = system.constraint_labels()[static_cast<std::size_t>(row)];
+    if (sizes.row(row).isZero(0)) {
       // a loop in a plane, closed in space
-      zero_rows -= mechanics.values.n_states();
-      findings.push_back({Level::good, fmt::format("constraint '{}': nothing moves along it, its row of A is zero at every state",
-                                                   system.constraint_labels()[static_cast<std::size_t>(row)])});
+      n_zero_rows -= static_cast<int>(sizes.cols());
+      findings.push_back(
+          {Level::good, fmt::format("constraint '{}': nothing moves along it, its row of A is zero at every state", label)});
       continue;
     }
-    std::vector<double> sorted = sizes;
+    std::vector<double> sorted(sizes.row(row).begin(), sizes.row(row).end());
     std::nth_element(sorted.begin(), sorted.begin() + static_cast<std::ptrdiff_t>(sorted.size() / 2), sorted.end());
     const double usual = sorted[sorted.size() / 2];
-    const auto smallest = std::min_element(sizes.begin(), sizes.end());
-    if (*smallest > 0 && *smallest < 1e-6 * usual) {
+    Index at = 0;
+    const double smallest = sizes.row(row).minCoeff(&at);
+    if (smallest > 0 && smallest < 1e-6 * usual) {
       findings.push_back(
           {Level::warning, fmt::format("constraint '{}': its row of A is {:.2g} of its usual size at state {}; write the "
                                        "constraint so that the row does not vanish",
-                                       system.constraint_labels()[static_cast<std::size_t>(row)], *smallest / usual,
-                                       smallest - sizes.begin() + 1)});
+                                       label, smallest / usual, at + 1)});
     }
   }
-  if (zero_rows > 0) {
+  if (n_zero_rows > 0) {
     findings.push_back(
-        {Level::warning, fmt::format("constraints: a row of A vanishes {} times; it is dropped there", zero_rows)});
+        {Level::warning, fmt::format("constraints: a row of A vanishes {} times; it is dropped there", n_zero_rows)});
   }
 }
 
-// M, A, b: definite or completed by A, of constant rank, consistent
-void check_mechanics(const System& system, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters,
-                     const MechanicsBatch& mechanics, std::vector<Finding>& findings) {
-  check_mass(system, mechanics, findings);
-  check_coriolis(system, states, parameters, mechanics.values.mass, findings);
+// M, A, b: definite or completed by A, of constant rank, consistent. False where numbers are unusable.
+bool check_mechanics(const System& system, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters,
+                     int n_threads, std::vector<Finding>& findings) {
+  const MatrixXd first_mass = system.evaluate(states.leftCols(1), parameters).M(0);
+  MechanicsSummary mechanics;
+  mechanics.lowest_rank_of_mass = system.nq();
+  std::vector<int> ranks(static_cast<std::size_t>(states.cols()));
+  MatrixXd sizes(system.nc(), states.cols());
+  std::mutex mutex;
+  const auto fault = for_each_mechanics(system, states, parameters, n_threads, [&](Index first, const MechanicsBatch& block) {
+    for (int i = 0; i < block.values.n_states(); ++i) {
+      ranks[static_cast<std::size_t>(first + i)] = block.projections[static_cast<std::size_t>(i)].rank();
+      sizes.col(first + i) = block.values.A(i).rowwise().norm();
+    }
+    const MechanicsSummary summary = summary_of(block, first, first_mass);
+    const std::scoped_lock lock(mutex);
+    mechanics.add(summary);
+  });
+  if (fault) {
+    findings.push_back({Level::error, fmt::format("{} at state {}", fault->text, fault->state + 1)});
+    return false;
+  }
+  report_mass(system, mechanics, states.cols(), findings);
+  check_coriolis(system, states, parameters, mechanics, findings);
   if (system.nc() == 0) {
     findings.push_back({Level::warning, "constraints: none; T = I, and ddq is the unconstrained acceleration"});
-    return;
+    return true;
   }
-  check_rank(system, mechanics, findings);
-  check_row_sizes(system, mechanics, findings);
+  report_rank(system, ranks, mechanics, findings);
+  report_row_sizes(system, sizes, mechanics.n_zero_rows, findings);
+  return true;
 }
 
 // exact derivatives in the parameters against central differences
 void check_parameter_derivatives(const System& system, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters,
-                                 std::vector<Finding>& findings) {
-  double worst = 0;
-  std::string worst_name;
-  for (int p = 0; p < static_cast<int>(system.parameters().size()); ++p) {
-    // a step of ε^(1/3) balances truncation and rounding: about 1e-10 of the values is left
-    const double step = 6e-6 * std::max(std::abs(parameters[p]), 1e-3);
-    VectorXd above = parameters, below = parameters;
-    above[p] += step;
-    below[p] -= step;
-    const SystemValues d = system.differentiate(states, parameters, p);
-    const SystemValues high = system.evaluate(states, above);
-    const SystemValues low = system.evaluate(states, below);
-    const auto compare = [&](const MatrixXd& exact, const MatrixXd& up, const MatrixXd& down, const MatrixXd& value) {
-      // an entry that is rounding beside the others is as good as zero
-      const double rounding = 1e-6 * exact.lpNorm<Eigen::Infinity>();
-      for (Index k = 0; k < exact.size(); ++k) {
-        const double difference = (up.reshaped()[k] - down.reshaped()[k]) / (above[p] - below[p]);
-        if (!std::isfinite(difference) || !std::isfinite(exact.reshaped()[k])) continue;
-        const double size = std::abs(exact.reshaped()[k]) + rounding +
-                            1e-4 * std::abs(value.reshaped()[k]) / std::max(std::abs(parameters[p]), 1e-3);
-        const double error = std::abs(difference - exact.reshaped()[k]) / std::max(size, 1e-12);
-        if (error > worst) {
-          worst = error;
-          worst_name = system.parameters()[static_cast<std::size_t>(p)].name;
+                                 int n_threads, std::vector<Finding>& findings) {
+  if (system.parameters().empty()) return;
+  const int n_parameters = static_cast<int>(system.parameters().size());
+  const auto parts_of = [](const SystemValues& values) {
+    return std::array{&values.mass, &values.constraint_matrix, &values.constraint_vector, &values.force};
+  };
+  std::mutex mutex;
+  MatrixXd largest = MatrixXd::Zero(4, n_parameters);  // derivatives of each part
+  in_blocks(states, n_threads, [&](Index, const Ref<const MatrixXd>& block) {
+    MatrixXd here(4, n_parameters);
+    for (int p = 0; p < n_parameters; ++p) {
+      const SystemValues d = system.differentiate(block, parameters, p);
+      for (std::size_t part = 0; part < 4; ++part)
+        here(static_cast<Index>(part), p) = parts_of(d)[part]->lpNorm<Eigen::Infinity>();
+    }
+    const std::scoped_lock lock(mutex);
+    largest = largest.cwiseMax(here);
+  });
+  VectorXd errors = VectorXd::Zero(n_parameters);
+  in_blocks(states, n_threads, [&](Index, const Ref<const MatrixXd>& block) {
+    const SystemValues value = system.evaluate(block, parameters);
+    VectorXd here = VectorXd::Zero(n_parameters);
+    for (int p = 0; p < n_parameters; ++p) {
+      const double parameter = std::max(std::abs(parameters[p]), 1e-3);
+      // a step of ε^(1/3) balances truncation and rounding: about 1e-10 of the values is left
+      const double step = 6e-6 * parameter;
+      VectorXd above = parameters, below = parameters;
+      above[p] += step;
+      below[p] -= step;
+      const SystemValues d = system.differentiate(block, parameters, p);
+      const SystemValues high = system.evaluate(block, above), low = system.evaluate(block, below);
+      for (std::size_t part = 0; part < 4; ++part) {
+        const auto entries = [&](const SystemValues& of) { return parts_of(of)[part]->reshaped(); };
+        // an entry that is rounding beside the others is as good as zero
+        const double rounding = 1e-6 * largest(static_cast<Index>(part), p);
+        for (Index k = 0; k < entries(d).size(); ++k) {
+          const double exact = entries(d)[k], difference = (entries(high)[k] - entries(low)[k]) / (above[p] - below[p]);
+          if (!std::isfinite(difference) || !std::isfinite(exact)) continue;
+          const double size = std::abs(exact) + rounding + 1e-4 * std::abs(entries(value)[k]) / parameter;
+          here[p] = std::max(here[p], std::abs(difference - exact) / std::max(size, 1e-12));
         }
       }
-    };
-    const SystemValues value = system.evaluate(states, parameters);
-    compare(d.mass, high.mass, low.mass, value.mass);
-    compare(d.constraint_matrix, high.constraint_matrix, low.constraint_matrix, value.constraint_matrix);
-    compare(d.constraint_vector, high.constraint_vector, low.constraint_vector, value.constraint_vector);
-    compare(d.force, high.force, low.force, value.force);
-  }
-  if (system.parameters().empty()) return;
-  findings.push_back({worst > 1e-4 ? Level::error : Level::good,
-                      fmt::format("derivatives of M, A, b, F in the parameters: equal to central differences to {:.1e}{}", worst,
-                                  worst_name.empty() ? "" : " (largest for '" + worst_name + "')")});
+    }
+    const std::scoped_lock lock(mutex);
+    errors = errors.cwiseMax(here);
+  });
+  Index at = 0;
+  const double worst = errors.maxCoeff(&at);
+  findings.push_back(
+      {worst > 1e-4 ? Level::error : Level::good,
+       fmt::format("derivatives of M, A, b, F in the parameters: equal to central differences to {:.1e}{}", worst,
+                   worst > 0 ? " (largest for '" + system.parameters()[static_cast<std::size_t>(at)].name + "')" : "")});
 }
 
 // A ddq − b against the second difference of each constraint along q(t + h) = q + h dq + ½h² ddq
-void check_motion(const System& system, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters,
+void check_motion(const System& system, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters, int n_threads,
                   std::vector<Finding>& findings) {
-  if (system.residual_labels().empty()) return;
+  const auto n_residuals = std::ssize(system.residual_labels());
+  if (n_residuals == 0) return;
   const StateLayout layout = system.layout();
-  const SystemValues values = system.evaluate(states, parameters);
-  // an arbitrary acceleration of the size of the velocities
-  MatrixXd ddq =
-      states.middleRows(layout.dq(0), layout.nq).unaryExpr([](double v) { return std::isnan(v) ? 0.0 : 0.7 * v + 0.3; });
-  const double h = 1e-4;
-  const auto moved = [&](double step) {
-    MatrixXd x = states;
-    for (int j = 0; j < layout.nq; ++j) {
-      x.row(layout.q(j)) += step * states.row(layout.dq(j)) + 0.5 * step * step * ddq.row(j);
-      x.row(layout.dq(j)) += step * ddq.row(j);
+  // errors relative to the largest over the states: at one that rests there is nothing to be relative to
+  Eigen::ArrayXd error = Eigen::ArrayXd::Zero(n_residuals), size = error;
+  std::mutex mutex;
+  in_blocks(states, n_threads, [&](Index, const Ref<const MatrixXd>& block) {
+    const SystemValues values = system.evaluate(block, parameters);
+    // an arbitrary acceleration of the size of the velocities
+    const MatrixXd ddq =
+        block.middleRows(layout.dq(0), layout.nq).unaryExpr([](double v) { return std::isnan(v) ? 0.0 : 0.7 * v + 0.3; });
+    const double h = 1e-4;
+    const auto moved = [&](double step) {
+      MatrixXd x = block;
+      for (int j = 0; j < layout.nq; ++j) {
+        x.row(layout.q(j)) += step * block.row(layout.dq(j)) + 0.5 * step * step * ddq.row(j);
+        x.row(layout.dq(j)) += step * ddq.row(j);
+      }
+      x.row(layout.t()).array() += step;
+      return system.residuals(x, parameters);
+    };
+    const MatrixXd now = system.residuals(block, parameters);
+    const MatrixXd difference = (moved(h) - moved(-h)) / (2 * h);
+    Eigen::ArrayXd error_in_block = Eigen::ArrayXd::Zero(n_residuals), size_in_block = error_in_block;
+    for (Index k = 0; k < n_residuals; ++k) {
+      const System::Residual& label = system.residual_labels()[static_cast<std::size_t>(k)];
+      for (Index i = 0; i < now.cols(); ++i) {
+        // d/dt of a velocity-level residual is A ddq − b; d/dt of a position-level one is the residual that follows it
+        const auto A = values.A(static_cast<int>(i)).row(label.row);
+        double expected = 0, size_here = 0;
+        if (label.velocity) {
+          const double b = values.b(static_cast<int>(i))[label.row];
+          expected = A.dot(ddq.col(i)) - b;
+          size_here = A.cwiseAbs().dot(ddq.col(i).cwiseAbs()) + std::abs(b);
+        } else {
+          expected = now(k + 1, i);
+          size_here = std::abs(expected);
+          for (int j = 0; j < layout.nq; ++j) {
+            const double rate = A[j] * block(layout.dq(j), i);
+            if (std::isfinite(rate)) size_here += std::abs(rate);
+          }
+        }
+        const double error_here = std::abs(difference(k, i) - expected);
+        if (!std::isfinite(error_here) || !std::isfinite(size_here)) continue;
+        error_in_block[k] = std::max(error_in_block[k], error_here);
+        size_in_block[k] = std::max(size_in_block[k], size_here);
+      }
     }
-    x.row(layout.t()).array() += step;
-    return system.residuals(x, parameters);
-  };
-  const MatrixXd now = system.residuals(states, parameters);
-  const MatrixXd difference = (moved(h) - moved(-h)) / (2 * h);
+    const std::scoped_lock lock(mutex);
+    error = error.max(error_in_block);
+    size = size.max(size_in_block);
+  });
   double worst = 0;
   std::string worst_label;
-  for (Index k = 0; k < now.rows(); ++k) {
-    const System::Residual& label = system.residual_labels()[static_cast<std::size_t>(k)];
-    // errors relative to the largest over the states: at one that rests there is nothing to be relative to
-    double error = 0, size = 0;
-    for (Index i = 0; i < now.cols(); ++i) {
-      // d/dt of a velocity-level residual is A ddq − b; d/dt of a position-level one is the residual that follows it
-      const auto A = values.A(static_cast<int>(i)).row(label.row);
-      double expected = 0, size_here = 0;
-      if (label.velocity) {
-        const double b = values.b(static_cast<int>(i))[label.row];
-        expected = A.dot(ddq.col(i)) - b;
-        size_here = A.cwiseAbs().dot(ddq.col(i).cwiseAbs()) + std::abs(b);
-      } else {
-        expected = now(k + 1, i);
-        size_here = std::abs(expected);
-        for (int j = 0; j < layout.nq; ++j) {
-          const double rate = A[j] * states(layout.dq(j), i);
-          if (std::isfinite(rate)) size_here += std::abs(rate);
-        }
-      }
-      const double error_here = std::abs(difference(k, i) - expected);
-      if (!std::isfinite(error_here) || !std::isfinite(size_here)) continue;
-      error = std::max(error, error_here);
-      size = std::max(size, size_here);
-    }
-    if (error > worst * size && size > 0) {
-      worst = error / size;
-      worst_label = label.text;
-    }
+  for (Index k = 0; k < n_residuals; ++k) {
+    if (!(error[k] > worst * size[k] && size[k] > 0)) continue;
+    worst = error[k] / size[k];
+    worst_label = system.residual_labels()[static_cast<std::size_t>(k)].text;
   }
   findings.push_back({worst > 1e-3 ? Level::warning : Level::good,
                       fmt::format("A and b: equal to differences of the constraints along a motion to {:.1e}{}", worst,
@@ -557,17 +700,12 @@ void check_motion(const System& system, const Ref<const MatrixXd>& states, const
 
 }  // namespace
 
-std::vector<Finding> check_system(const System& system, const Ref<const MatrixXd>& states,
-                                  const Ref<const VectorXd>& parameters) {
+std::vector<Finding> check_system(const System& system, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters,
+                                  int n_threads) {
   std::vector<Finding> findings;
-  const MechanicsBatch mechanics = evaluate_mechanics(system, states, parameters);
-  if (mechanics.fault) {
-    findings.push_back({Level::error, fmt::format("{} at state {}", mechanics.fault->text, mechanics.fault->state + 1)});
-    return findings;
-  }
-  check_mechanics(system, states, parameters, mechanics, findings);
-  check_parameter_derivatives(system, states, parameters, findings);
-  check_motion(system, states, parameters, findings);
+  if (!check_mechanics(system, states, parameters, n_threads, findings)) return findings;
+  check_parameter_derivatives(system, states, parameters, n_threads, findings);
+  check_motion(system, states, parameters, n_threads, findings);
   return findings;
 }
 

@@ -1,6 +1,8 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <map>
+#include <mutex>
 #include <string>
 #include <utility>
 #include <vector>
@@ -9,6 +11,7 @@
 #include <Eigen/SVD>
 
 #include "base/decompositions.hpp"
+#include "base/parallel.hpp"
 #include "gp2/error.hpp"
 #include "gp2/mechanics/udwadia_kalaba.hpp"
 #include "mechanics/describe_fault.hpp"
@@ -501,8 +504,19 @@ MechanicsBatch evaluate_mechanics(const System& system, const Ref<const MatrixXd
   return batch;
 }
 
-void evaluate_mechanics(const System& system, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters,
-                        MechanicsBatch& batch) {
+namespace {
+
+// b is quadratic in the velocities, and where others move those at rest may be 1e-6 of theirs by rounding
+double rounding_of(double size_of_b) { return std::max(1e-12 * size_of_b, std::numeric_limits<double>::min()); }
+
+std::optional<std::string> contradiction(bool is_beyond_rounding) {
+  if (!is_beyond_rounding) return std::nullopt;
+  return "the constraints contradict each other: no acceleration satisfies A ddq = b";
+}
+
+// Each state by itself, up to the first with a fault. Returns the largest |b|.
+double evaluate_each(const System& system, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters,
+                     MechanicsBatch& batch) {
   system.evaluate_into(states, parameters, batch.values);
   batch.constraint_noise = system.constraint_noise();
   batch.fault.reset();
@@ -514,18 +528,60 @@ void evaluate_mechanics(const System& system, const Ref<const MatrixXd>& states,
     projection.compute(batch.values.M(i), batch.values.A(i), batch.values.b(i));
     if (std::optional<std::string> text = fault_at(system, batch.values, states, i, projection)) {
       batch.fault = {i, std::move(*text)};
-      return;
+      break;
     }
     size_of_b = std::max(size_of_b, projection.size_of_b());
   }
-  // b is quadratic in the velocities, and where others move those at rest may be 1e-6 of theirs by rounding
-  const double rounding = std::max(1e-12 * size_of_b, std::numeric_limits<double>::min());
-  for (int i = 0; i < n_states; ++i) {
-    if (batch.projections[static_cast<std::size_t>(i)].is_contradictory(batch.values.F(i), rounding)) {
-      batch.fault = {i, "the constraints contradict each other: no acceleration satisfies A ddq = b"};
-      return;
-    }
+  return size_of_b;
+}
+
+}  // namespace
+
+void evaluate_mechanics(const System& system, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters,
+                        MechanicsBatch& batch) {
+  const double rounding = rounding_of(evaluate_each(system, states, parameters, batch));
+  for (int i = 0; i < batch.values.n_states() && !batch.fault; ++i) {
+    const UdwadiaKalaba& projection = batch.projections[static_cast<std::size_t>(i)];
+    if (const auto text = contradiction(projection.is_contradictory(batch.values.F(i), rounding))) batch.fault = {i, *text};
   }
+}
+
+std::optional<MechanicsBatch::Fault> for_each_mechanics(const System& system, const Ref<const MatrixXd>& states,
+                                                        const Ref<const VectorXd>& parameters, int n_threads,
+                                                        const std::function<void(Index, const MechanicsBatch&)>& visit) {
+  constexpr Index block_size = 256;
+  n_threads = thread_count(n_threads);
+  std::vector<MechanicsBatch> batches(static_cast<std::size_t>(n_threads));
+  std::mutex mutex;
+  std::optional<MechanicsBatch::Fault> fault;  // the first of a state by itself
+  std::map<int, double> suspects;              // states that contradict themselves unless that is rounding
+  double size_of_b = 0;
+  try {
+    for_each_block(states.cols(), block_size, n_threads, [&](Index first, Index n, int thread) {
+      MechanicsBatch& batch = batches[static_cast<std::size_t>(thread)];
+      const double size_in_block = evaluate_each(system, states.middleCols(first, n), parameters, batch);
+      if (!batch.fault) visit(first, batch);
+      const std::scoped_lock lock(mutex);
+      size_of_b = std::max(size_of_b, size_in_block);
+      if (batch.fault) {
+        const int state = static_cast<int>(first) + batch.fault->state;
+        if (!fault || state < fault->state) fault = {state, batch.fault->text};
+        return;
+      }
+      for (int i = 0; i < static_cast<int>(n); ++i) {
+        const UdwadiaKalaba& projection = batch.projections[static_cast<std::size_t>(i)];
+        if (projection.is_contradictory(batch.values.F(i))) suspects[static_cast<int>(first) + i] = projection.inconsistency();
+      }
+    });
+  } catch (const InputError&) {
+    static_cast<void>(system.evaluate(states, parameters));  // which names a state by its number among all
+    throw;
+  }
+  for (const auto& [state, inconsistency] : suspects) {
+    if (fault) break;
+    if (const auto text = contradiction(inconsistency > rounding_of(size_of_b))) fault = {state, *text};
+  }
+  return fault;
 }
 
 MechanicsBatch require_mechanics(const System& system, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters) {

@@ -99,8 +99,9 @@ SizeSummary summarise_sizes(const Ref<const VectorXd>& sizes) {
 std::vector<Finding> check_states(const System& system, const Ref<const MatrixXd>& states,
                                   const Ref<const VectorXd>& parameters) {
   const auto violation = largest_violation(system, states, parameters);
+  if (!violation || violation->relative <= constraint_violation_tolerance) return {};
   const MatrixXd residuals = system.residuals(states, parameters);
-  if (!violation || violation->relative <= constraint_violation_tolerance || residuals.hasNaN()) return {};
+  if (residuals.hasNaN()) return {};
   using Level = Finding::Level;
   std::vector<Finding> findings;
   for (Index k = 0; k < residuals.rows(); ++k) {

@@ -72,5 +72,24 @@ TEST_F(Streams, AReaderThatHasSeenEnoughEndsItAsOtherPrograms) {
   EXPECT_EQ(outcome.err, "");
 }
 
+TEST_F(Streams, ALogFromAPipeIsPredictedAsItsFile) {
+  desk.done(fit_line);
+  desk.done("gp2 predict fit.json --states train.csv --cov full -o file.csv");
+  desk.done("cat train.csv | gp2 predict fit.json --states /dev/stdin --cov full -o pipe.csv");
+  EXPECT_EQ(desk.read("pipe.csv"), desk.read("file.csv"));
+  EXPECT_NE(desk.read("file.csv"), "");
+}
+
+TEST_F(Streams, ALogThatChangesBetweenReadingAndWritingIsRefused) {
+  desk.done(fit_line);
+  desk.done("gp2 generate models/surface.toml --n 3000 -o long.csv && mkfifo prediction");
+  // what reads the predictions changes the log when it has seen the first of them
+  desk.run(
+      "(gp2 predict fit.json --states long.csv -o prediction 2>err; echo $? >status) & "
+      "{ head -c 1 >/dev/null; echo >>long.csv; cat >/dev/null; } <prediction; wait");
+  EXPECT_EQ(desk.read("status"), "2\n");
+  EXPECT_THAT(desk.read("err"), HasSubstr("long.csv: changed while it was read"));
+}
+
 }  // namespace
 }  // namespace gp2::test

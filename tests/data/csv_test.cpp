@@ -3,6 +3,7 @@
 #include <bit>
 #include <cmath>
 #include <csignal>
+#include <fstream>
 #include <limits>
 #include <random>
 #include <thread>
@@ -12,6 +13,7 @@
 #include <sys/wait.h>
 #include <unistd.h>
 
+#include <fmt/format.h>
 #include <gmock/gmock.h>
 
 #include "io_testing.hpp"
@@ -378,6 +380,39 @@ TEST(WriteFile, LeavesTheOldFileIntactWhenTheDiskIsFull) {
   EXPECT_EQ(n_files(folder), 1U);
 }
 
+TEST(WriteFile, LeavesTheOldFileIntactWhenWhatIsWrittenIsNotThere) {
+  const TemporaryFolder folder;
+  const auto path = folder.write("data.csv", "old");
+  EXPECT_EQ(input_error_of([&] {
+              write_blocks(path, [](const auto& put) {
+                put("half of it");
+                throw InputError("no more");
+              });
+            }),
+            "no more");
+  EXPECT_EQ(read_file(path), "old");
+  EXPECT_EQ(n_files(folder), 1U);
+}
+
+TEST(WriteFile, WritesATableInBlocks) {
+  std::vector<std::string> cells;
+  for (int k = 0; k < 30000; ++k) cells.push_back(k % 3 == 0 ? "a, \"b\"" : std::to_string(k) + ".5");
+  const CsvTable table = CsvTable::from_cells("data.csv", {"x"}, cells);
+  const TemporaryFolder folder;
+  table.write(folder / "data.csv");
+  EXPECT_EQ(read_file(folder / "data.csv"), table.text());
+
+  std::size_t n_blocks = 0, largest = 0;
+  CsvWriter csv([&](std::string_view block) { ++n_blocks, largest = std::max(largest, block.size()); });
+  for (const std::string& cell : cells) {
+    csv.add(cell);
+    csv.end_line();
+  }
+  csv.flush();
+  EXPECT_GT(n_blocks, 3U);
+  EXPECT_LT(largest, 70000U);
+}
+
 mode_t permissions(const std::filesystem::path& path) {
   struct stat status = {};
   EXPECT_EQ(stat(path.c_str(), &status), 0);
@@ -430,6 +465,53 @@ TEST(WriteFile, ManyThreadsLeaveOneWholeFile) {
   const std::string content = read_file(folder / "log.csv");
   EXPECT_EQ(content, std::string(5000, content.front()));
   EXPECT_EQ(n_files(folder), 1U);
+}
+
+// ---- a log that is read twice
+
+TEST(Csv, RowsOfAFileComeAgainAsTheyArePrinted) {
+  const TemporaryFolder folder;
+  const std::filesystem::path path = folder / "log.csv";
+  std::string text = "\xef\xbb\xbfq1, remark\r\n\n 1.50 ,\"a, b\"\r\n2,\"say \"\"no\"\"\"\n,\n3,\xef\xbb\xbfx\n \t\n";
+  for (int k = 0; k < 20000; ++k) text += fmt::format("{},x{}\n", k, k);  // more than a block
+  write_file(path, text + "4,end");
+  const CsvTable table = CsvTable::read(path);
+  int row = 0;
+  for_each_row(path, [&](std::string_view cells) {
+    std::string printed;
+    CsvWriter csv([&](std::string_view block) { printed += block; });
+    for (int column = 0; column < 2; ++column) csv.add(table.cell(row, column));
+    csv.flush();
+    EXPECT_EQ(cells, printed) << row;
+    ++row;
+  });
+  EXPECT_EQ(row, table.n_rows());
+  EXPECT_EQ(row, 20005);
+}
+
+TEST(Csv, AFileThatChangesWhileItIsReadIsRefused) {
+  const TemporaryFolder folder;
+  const std::filesystem::path path = folder / "log.csv";
+  const auto write_rows = [&](int n) {
+    std::string text = "q1\n";
+    for (int k = 0; k < n; ++k) text += "0.123456789\n";
+    write_file(path, text);
+  };
+  write_rows(20000);
+  const std::optional<FileVersion> version = file_version(path);
+  ASSERT_TRUE(version);
+  EXPECT_EQ(file_version(path), version);
+  int n_blocks = 0;
+  EXPECT_EQ(input_error_of([&] {
+              read_blocks(path, [&](std::string_view) {
+                if (n_blocks++ == 0) std::ofstream(path, std::ios::app) << "1\n";
+              });
+            }),
+            path.string() + ": changed while it was read; read it when nothing writes to it any more, or read a copy");
+  EXPECT_GT(n_blocks, 1);
+  EXPECT_NE(file_version(path), version);
+  EXPECT_FALSE(file_version("/dev/null"));
+  EXPECT_FALSE(file_version(folder / "absent.csv"));
 }
 
 }  // namespace

@@ -46,6 +46,27 @@ TEST(PosteriorTest, IsTheTextbookGaussianProcess) {
   }
 }
 
+TEST(PosteriorTest, MarginalsComeBlockByBlockToTheBit) {
+  const Problem p = test::problems(1, posterior_seed).front();
+  const Posterior posterior(p.prior, p.observations, p.values);
+  const View view = View::all(Quantity::constrained_acceleration, *p.prior.system);
+  const MatrixXd states = p.queries.replicate(1, 17000 / p.queries.cols());
+  const Posterior::Marginal all = posterior.marginal(view, states);
+  for (const int n_threads : {1, 2}) {
+    Index next = 0;
+    int n_blocks = 0;
+    posterior.for_each_marginal(view, states, n_threads, [&](Index first, const Posterior::Marginal& block) {
+      EXPECT_EQ(first, next);
+      next += block.mean.cols();
+      EXPECT_EQ(block.mean, all.mean.middleCols(first, block.mean.cols()));
+      EXPECT_EQ(block.covariance, all.covariance.middleCols(first, block.mean.cols()));
+      ++n_blocks;
+    });
+    EXPECT_EQ(next, states.cols());
+    EXPECT_GT(n_blocks, 1);
+  }
+}
+
 TEST(PosteriorTest, ALazyOneIsTheSameToTheBitAndConditionedWhenAsked) {
   for (const Problem& p : test::problems(3, posterior_seed)) {
     SCOPED_TRACE(fmt::format("{}, seed {}", p.name, posterior_seed));

@@ -1,5 +1,7 @@
 #include "gp2/mechanics/check.hpp"
 
+#include <cmath>
+
 #include <gmock/gmock.h>
 
 #include "gp2/mechanics/callable_system.hpp"
@@ -97,6 +99,76 @@ TEST(Check, AWrongBIsFound) {
   const Finding finding = motion_finding(CallableSystem(wrong), bead_states());
   EXPECT_EQ(finding.level, Finding::Level::warning);
   EXPECT_THAT(finding.text, HasSubstr("largest for 'd/dt of wire'"));
+}
+
+std::string all_of(const std::vector<Finding>& findings) {
+  std::string text;
+  for (const Finding& finding : findings) text += finding.text + "\n";
+  return text;
+}
+
+TEST(Check, ALongLogIsLookedAtRowByRow) {
+  const Model model = Model::parse(R"(
+coordinates = ["x", "z"]
+[parameters]
+a = 0.5
+[mechanics]
+mass = [["1 + x^2", "0"], ["0", "1"]]
+coriolis = true
+[constraints]
+position = ["z - a*x^2"]
+)",
+                                   "a bead on a wire");
+  const Eigen::VectorXd parameters = model.system->parameter_values();
+  MatrixXd states = bead_states().replicate(1, 400);
+  const std::string sound = all_of(check_system(*model.system, states, parameters));
+  EXPECT_THAT(sound, HasSubstr("positive definite at all 1200 states, condition number up to 1.64"));
+  EXPECT_EQ(all_of(check_system(*model.system, states, parameters, 2)), sound);
+
+  const MatrixXd free = MatrixXd::Random(2, 1200), noise = MatrixXd::Constant(2, 1200, 1e-3);
+  states.col(1001)[1] += 0.125;
+  const auto violation = largest_violation(*model.system, states, parameters);
+  EXPECT_EQ(violation->state, 1001);
+  EXPECT_NEAR(violation->value, 0.125, 1e-15);
+  // accelerations that obey the constraint but in the last block of rows
+  const MechanicsBatch mechanics = evaluate_mechanics(*model.system, states, parameters);
+  MatrixXd ddq(2, 1200);
+  for (int i = 0; i < 1200; ++i) ddq.col(i) = mechanics.projections[static_cast<std::size_t>(i)].constrain(free.col(i));
+  EXPECT_TRUE(dependent_columns(*model.system, states, parameters, ddq));
+  ddq(1, 1190) += 1;
+  EXPECT_FALSE(dependent_columns(*model.system, states, parameters, ddq));
+  const ConstraintResidual residual = constraint_residuals(*model.system, states, parameters, ddq, noise).front();
+  EXPECT_EQ(residual.n, 1200);
+  EXPECT_EQ(residual.worst.front(), 1190);
+  EXPECT_NEAR(residual.rms, std::sqrt(1 / 1200.0), 1e-9);
+
+  states(0, 800) = states(0, 700) = std::nan("");
+  for (const int n_threads : {1, 2}) {
+    EXPECT_THAT(all_of(check_system(*model.system, states, parameters, n_threads)), HasSubstr("x is nan at state 701\n"));
+  }
+}
+
+TEST(Check, WhatIsRoundingIsJudgedOverAllRows) {
+  const Model model = Model::parse(R"(
+coordinates = ["x"]
+[mechanics]
+mass = [["1"]]
+[constraints]
+acceleration = ["ddx - t", "ddx - t - 1e-14"]
+)",
+                                   "two rows that agree to rounding");
+  MatrixXd states = MatrixXd::Zero(3, 600);  // x dx t
+  for (const double largest : {0.0, 1e-3, 1.0}) {
+    states(2, 599) = largest;
+    const std::optional<MechanicsBatch::Fault> all = evaluate_mechanics(*model.system, states, Eigen::VectorXd()).fault;
+    EXPECT_EQ(all.has_value(), largest < 1);
+    for (const int n_threads : {1, 2}) {
+      const auto fault = for_each_mechanics(*model.system, states, Eigen::VectorXd(), n_threads, [](auto, const auto&) {});
+      ASSERT_EQ(fault.has_value(), all.has_value()) << largest;
+      if (fault) EXPECT_EQ(fault->state, all->state);
+      if (fault) EXPECT_EQ(fault->text, all->text);
+    }
+  }
 }
 
 }  // namespace

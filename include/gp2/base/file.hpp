@@ -1,8 +1,10 @@
 #pragma once
 
 #include <cstddef>
+#include <cstdint>
 #include <filesystem>
 #include <functional>
+#include <optional>
 #include <string>
 #include <string_view>
 
@@ -17,6 +19,11 @@ namespace gp2 GP2_API {
 /// @throws InputError naming the path and the system's reason when that fails; an old file at `path` is then intact.
 void write_file(const std::filesystem::path& path, std::string_view content);
 
+/// The same of what `produce` hands on block after block, so that a long text need not be in memory as a whole.
+/// @throws InputError as write_file, and what `produce` throws.
+void write_blocks(const std::filesystem::path& path,
+                  const std::function<void(const std::function<void(std::string_view)>& put)>& produce);
+
 /// @throws InputError as write_file would, for what can be told before there is content: no such folder, a folder of that name,
 /// no permission.
 void require_writable(const std::filesystem::path& path);
@@ -25,13 +32,27 @@ void require_writable(const std::filesystem::path& path);
 inline constexpr std::size_t max_file_size = std::size_t{1} << 30;
 
 /// The content of a file, or of a pipe or device to its end.
-/// @throws InputError when it cannot be read, holds more than `max_size` bytes, or is a pipe that nothing writes to.
+/// @throws InputError when it cannot be read, holds more than `max_size` bytes, changes while it is read, or is a pipe that nothing
+///   writes to.
 std::string read_file(const std::filesystem::path& path, std::size_t max_size = max_file_size);
 
 /// The same, handed on block after block as it is read.
 /// @throws InputError as read_file, and what `take` throws.
 void read_blocks(const std::filesystem::path& path, const std::function<void(std::string_view)>& take,
                  std::size_t max_size = max_file_size);
+
+/// What tells one state of a file from another.
+struct FileVersion {
+  std::uint64_t device = 0, inode = 0, size = 0;
+  std::int64_t seconds = 0, nanoseconds = 0;  // of its last change
+  bool operator==(const FileVersion&) const = default;
+};
+
+/// Nothing of a pipe or device, which is read once, nor where there is no such file.
+std::optional<FileVersion> file_version(const std::filesystem::path& path);
+
+/// @throws InputError, that the file is another one than when it was read first.
+[[noreturn]] void throw_changed(const std::filesystem::path& path);
 
 /// The shortest text that reads back to the same double.
 std::string shortest(double value);

@@ -152,11 +152,11 @@ LogStates read_log_states(const Prior& prior, const View& view, const Model& mod
 
 /// work(), with the log named in what it throws: a posterior knows the number of a state only.
 template <typename Work>
-auto at_states_of(const CsvTable& log, const Work& work) {
+auto at_states_of(const std::string& log, const Work& work) {
   try {
     return work();
   } catch (const InputError& error) {
-    throw InputError(log.name() + ": " + error.what());
+    throw InputError(log + ": " + error.what());
   }
 }
 

@@ -62,7 +62,7 @@ struct PredictOutcome {
 };
 
 /// @throws InputError for states that are missing, not finite or contradict the constraints, with the table's name.
-PredictOutcome predict(const FitFile& fit, const CsvTable& states, const PredictRequest& request);
+PredictOutcome predict(const FitFile& fit, CsvTable states, const PredictRequest& request);
 
 struct EvaluateRequest {
   std::vector<std::string> outputs;               // accelerations; empty: those observed in the fit
@@ -78,6 +78,6 @@ struct EvaluateOutcome {
 };
 
 /// Compares predictions with measured or true accelerations.
-EvaluateOutcome evaluate(const FitFile& fit, const Posterior& posterior, const CsvTable& log, const EvaluateRequest& request);
+EvaluateOutcome evaluate(const FitFile& fit, const Posterior& posterior, CsvTable log, const EvaluateRequest& request);
 
 }  // namespace gp2

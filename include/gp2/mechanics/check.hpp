@@ -84,9 +84,10 @@ std::vector<ConstraintResidual> constraint_residuals(const System& system, const
 /// neither nearly zero nor nearly redundant, b in the range of A, derivatives in the parameters equal to finite differences, A
 /// and b equal to the second derivative of the constraints along a motion.
 ///
-/// @param states  (layout size × N), as good as on the constraint
+/// @param states     (layout size × N), as good as on the constraint
+/// @param n_threads  that may work on it; 0: as many as the machine has
 std::vector<Finding> check_system(const System& system, const Eigen::Ref<const Eigen::MatrixXd>& states,
-                                  const Eigen::Ref<const Eigen::VectorXd>& parameters);
+                                  const Eigen::Ref<const Eigen::VectorXd>& parameters, int n_threads = 1);
 
 /// How a log fits the system: states on the constraint, accelerations on A ddq = b, independent columns.
 ///

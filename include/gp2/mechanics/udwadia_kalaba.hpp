@@ -1,5 +1,6 @@
 #pragma once
 
+#include <functional>
 #include <limits>
 #include <optional>
 #include <string>
@@ -183,6 +184,15 @@ MechanicsBatch evaluate_mechanics(const System& system, const Eigen::Ref<const E
 /// later states is left as it was.
 void evaluate_mechanics(const System& system, const Eigen::Ref<const Eigen::MatrixXd>& states,
                         const Eigen::Ref<const Eigen::VectorXd>& parameters, MechanicsBatch& batch);
+
+/// The same of any number of states, block after block in the memory of a few. What is rounding is judged over all of them.
+/// @param visit  called with the number of the first state of each block and its mechanics, where no state of it has a fault of its
+///               own; by several threads at a time, in any order
+/// @returns the fault, by its state among all
+/// @throws InputError as the system, which names a state by its number among all; what `visit` throws
+std::optional<MechanicsBatch::Fault> for_each_mechanics(
+    const System& system, const Eigen::Ref<const Eigen::MatrixXd>& states, const Eigen::Ref<const Eigen::VectorXd>& parameters,
+    int n_threads, const std::function<void(Eigen::Index first, const MechanicsBatch& mechanics)>& visit);
 
 /// The same, where a fault is an error.
 /// @throws InputError naming the state and the rule; where nothing determines ddq in some direction, this direction too.
