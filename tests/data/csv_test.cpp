@@ -16,6 +16,7 @@
 #include <fmt/format.h>
 #include <gmock/gmock.h>
 
+#include "gp2/error.hpp"
 #include "io_testing.hpp"
 
 namespace gp2 {
