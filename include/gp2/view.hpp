@@ -1,5 +1,6 @@
 #pragma once
 
+#include <functional>
 #include <memory>
 #include <optional>
 #include <string>
@@ -92,6 +93,12 @@ void require_view(const Prior& home, const View& view);
 /// @param parameters  of its system
 void evaluate_mechanics(const Prior& prior, const View& view, const Eigen::Ref<const Eigen::MatrixXd>& states,
                         const Eigen::Ref<const Eigen::VectorXd>& parameters, MechanicsBatch& batch);
+
+/// The same of any number of states, block after block in order: for_each_mechanics of udwadia_kalaba.hpp.
+std::optional<MechanicsBatch::Fault> for_each_mechanics(
+    const Prior& prior, const View& view, const Eigen::Ref<const Eigen::MatrixXd>& states,
+    const Eigen::Ref<const Eigen::VectorXd>& parameters,
+    const std::function<void(Eigen::Index first, const MechanicsBatch& mechanics)>& visit);
 
 /// The same, where a fault is an error.
 /// @throws InputError naming the state and the rule.

@@ -3,6 +3,8 @@
 #include <algorithm>
 #include <utility>
 
+#include "data/evenly.hpp"
+
 namespace gp2 {
 
 using Eigen::Index;
@@ -20,6 +22,24 @@ std::size_t BlocksOfStates::Kept::bytes() const {
   return static_cast<std::size_t>(n) * sizeof(double);
 }
 
+namespace {
+
+// of some states, evenly taken
+double largest_b(const Prior& prior, const Observations& group, const Eigen::VectorXd& parameters) {
+  constexpr int few = 256;
+  const System& system = *prior_of(prior, group.view()).system;
+  if (system.nc() == 0) return 0;
+  const Observations some = evenly({group}, few).front();
+  double largest = 0;
+  for (const UdwadiaKalaba& projection :
+       evaluate_mechanics(system, some.states(), parameters_of(group.view(), parameters)).projections) {
+    largest = std::max(largest, projection.size_of_b());
+  }
+  return largest;
+}
+
+}  // namespace
+
 BlocksOfStates::BlocksOfStates(const Prior& prior, const std::vector<Observations>& observations, const ModelValues& values,
                                std::vector<int> gradient_parameters, const std::vector<Kept>* kept)
     : prior_(prior),
@@ -30,6 +50,7 @@ BlocksOfStates::BlocksOfStates(const Prior& prior, const std::vector<Observation
   for (std::size_t g = 0; g < observations.size(); ++g) {
     const int n = observations[g].n_data();
     for (int first = 0; first < n; first += block_size) states_.push_back({g, first, std::min(block_size, n - first)});
+    size_of_b_.push_back(n > block_size && kept == nullptr ? largest_b(prior, observations[g], values.parameters) : 0);
   }
 }
 
@@ -51,6 +72,8 @@ const RowBlock* BlocksOfStates::block(Index b, bool with_derivatives, Memory& me
   if (kept != nullptr) {
     block.models = &kept->models;
   } else {
+    memory.models.resize(1);
+    memory.models.front().mechanics.size_of_b_elsewhere = size_of_b_[group];
     const std::vector<int> in = with_derivatives ? gradient_parameters_ : std::vector<int>{};
     if (!model_observations(prior_, memory.observations, values_.parameters, in, memory.models)) return nullptr;
     block.models = &memory.models;

@@ -85,6 +85,8 @@ class BlocksOfStates final : public RowBlocks {
   std::vector<int> gradient_parameters_;
   const std::vector<Kept>* kept_;
   std::vector<States> states_;
+  std::vector<double>
+      size_of_b_;  // per Observations, of some states evenly taken: what is rounding is not judged by a block alone
 };
 
 }  // namespace gp2

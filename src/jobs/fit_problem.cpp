@@ -1,6 +1,7 @@
 #include "gp2/jobs/fit_problem.hpp"
 
 #include <algorithm>
+#include <atomic>
 #include <limits>
 #include <tuple>
 
@@ -127,7 +128,12 @@ bool has_singular_mass(const FitProblem& problem) {
   const VectorXd parameters = problem.prior.system->parameter_values();
   return std::any_of(problem.observations.begin(), problem.observations.end(), [&](const Observations& group) {
     const Prior& there = prior_of(problem.prior, group.view());
-    return evaluate_mechanics(*there.system, group.states(), parameters_of(group.view(), parameters)).first_singular() >= 0;
+    std::atomic<bool> is_singular = false;
+    static_cast<void>(for_each_mechanics(*there.system, group.states(), parameters_of(group.view(), parameters), 1,
+                                         [&](Eigen::Index, const MechanicsBatch& block) {
+                                           if (block.first_singular() >= 0) is_singular = true;
+                                         }));
+    return is_singular.load();
   });
 }
 

@@ -76,8 +76,14 @@ VectorXd spread_of(const Readings& readings, const FitProblemOptions& options) {
 
 // Size of G ā in each row of a view: the spread of the values or, for those that hardly vary, as exact zeros, what the prior
 // expects: its standard deviation, root mean square over the states, with the signals at their default scales.
-VectorXd signal_size(const LoggedSystem& logged, const Readings& readings, const std::vector<VectorXd>& signal_stddev) {
-  const Index n_data = readings.states.cols();
+VectorXd signal_size(const LoggedSystem& logged, Readings readings, const std::vector<VectorXd>& signal_stddev) {
+  constexpr Index enough = 10'000;  // states, evenly taken
+  const Index n_all = readings.states.cols(), n_data = std::min(n_all, enough);
+  if (n_data < n_all) {
+    std::vector<int> some;
+    for (Index i = 0; i < n_data; ++i) some.push_back(static_cast<int>(i * n_all / n_data));
+    readings.keep(some);
+  }
   const MechanicsBatch mechanics = require_mechanics(logged.prior, readings.view, readings.states, logged.parameters);
   const ViewValues view = evaluate_view(readings.view, mechanics, readings.states);
   PriorValues prior = require_prior_values(logged.prior, readings.states, logged.parameters, mechanics);

@@ -167,14 +167,18 @@ std::vector<int> lines_of(const std::vector<int>& rows, const CsvTable& log) {
 // them is counted
 void require_mechanics_at(const LoggedSystem& logged, const View& view, const MatrixXd& states, const std::vector<int>& rows,
                           const CsvTable& log, std::vector<std::string>& notes) {
-  MechanicsBatch mechanics;
-  evaluate_mechanics(logged.prior, view, states, logged.parameters, mechanics);
   const auto data_row = [&](int state) { return rows[static_cast<std::size_t>(state)] + 1; };
-  if (mechanics.fault) {
+  std::vector<int> ranks(rows.size());
+  const auto fault =
+      for_each_mechanics(logged.prior, view, states, logged.parameters, [&](Index first, const MechanicsBatch& block) {
+        for (std::size_t i = 0; i < block.projections.size(); ++i)
+          ranks[static_cast<std::size_t>(first) + i] = block.projections[i].rank();
+      });
+  if (fault) {
     throw InputError(fmt::format("{}: data row {}: {} ('{}' with the model's parameters; see gp2 check)", log.name(),
-                                 data_row(mechanics.fault->state), mechanics.fault->text, logged.system().name()));
+                                 data_row(fault->state), fault->text, logged.system().name()));
   }
-  const LowerRank lower = states_of_lower_rank(mechanics);
+  const LowerRank lower = states_of_lower_rank(ranks);
   if (lower.states.empty()) return;
   notes.push_back(
       fmt::format("warning: {}: the constraints have rank {} but at {} of {} rows, where it is as low as {}, first at "

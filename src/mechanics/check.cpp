@@ -180,9 +180,7 @@ std::optional<ConstraintViolation> largest_violation(const System& system, const
   return worst;
 }
 
-namespace {
-
-LowerRank lower_of(const std::vector<int>& ranks) {
+LowerRank states_of_lower_rank(const std::vector<int>& ranks) {
   LowerRank lower;
   if (ranks.empty()) return lower;
   const auto [lowest, highest] = std::minmax_element(ranks.begin(), ranks.end());
@@ -194,13 +192,11 @@ LowerRank lower_of(const std::vector<int>& ranks) {
   return lower;
 }
 
-}  // namespace
-
 LowerRank states_of_lower_rank(const MechanicsBatch& mechanics) {
   std::vector<int> ranks;
   if (mechanics.fault) return {};
   for (const UdwadiaKalaba& projection : mechanics.projections) ranks.push_back(projection.rank());
-  return lower_of(ranks);
+  return states_of_lower_rank(ranks);
 }
 
 LowerRank states_of_lower_rank(const System& system, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters) {
@@ -210,7 +206,7 @@ LowerRank states_of_lower_rank(const System& system, const Ref<const MatrixXd>& 
     std::transform(mechanics.projections.begin(), mechanics.projections.end(), ranks.begin() + first,
                    [](const UdwadiaKalaba& projection) { return projection.rank(); });
   });
-  return fault ? LowerRank{} : lower_of(ranks);
+  return fault ? LowerRank{} : states_of_lower_rank(ranks);
 }
 
 namespace {
@@ -491,7 +487,7 @@ void report_mass(const System& system, const MechanicsSummary& mechanics, Index 
 // the rank of A is the same at all states, and leaves some freedom
 void report_rank(const System& system, const std::vector<int>& ranks, const MechanicsSummary& mechanics,
                  std::vector<Finding>& findings) {
-  const LowerRank lower = lower_of(ranks);
+  const LowerRank lower = states_of_lower_rank(ranks);
   const int highest = lower.usual;
   if (!lower.states.empty()) {
     findings.push_back(

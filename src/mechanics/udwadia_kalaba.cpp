@@ -539,7 +539,7 @@ double evaluate_each(const System& system, const Ref<const MatrixXd>& states, co
 
 void evaluate_mechanics(const System& system, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters,
                         MechanicsBatch& batch) {
-  const double rounding = rounding_of(evaluate_each(system, states, parameters, batch));
+  const double rounding = rounding_of(std::max(batch.size_of_b_elsewhere, evaluate_each(system, states, parameters, batch)));
   for (int i = 0; i < batch.values.n_states() && !batch.fault; ++i) {
     const UdwadiaKalaba& projection = batch.projections[static_cast<std::size_t>(i)];
     if (const auto text = contradiction(projection.is_contradictory(batch.values.F(i), rounding))) batch.fault = {i, *text};

@@ -149,14 +149,35 @@ std::optional<std::string> what_needs_acceleration(const Prior& prior, const Vie
       of_acceleration->name);
 }
 
+namespace {
+
+std::optional<MechanicsBatch::Fault> singular_fault(const Prior& prior, const View& view, int state) {
+  const std::optional<std::string> text = what_needs_acceleration(prior, view);
+  if (!text) return std::nullopt;
+  return MechanicsBatch::Fault{state, fmt::format("the mass matrix M is singular, so that there is no M⁻¹, but {}", *text)};
+}
+
+}  // namespace
+
 void evaluate_mechanics(const Prior& prior, const View& view, const Ref<const MatrixXd>& states,
                         const Ref<const VectorXd>& parameters, MechanicsBatch& batch) {
   require_prior(prior);
   evaluate_mechanics(*prior.system, states, parameters, batch);
   const int singular = batch.first_singular();
-  if (batch.fault || singular < 0) return;
-  const std::optional<std::string> text = what_needs_acceleration(prior, view);
-  if (text) batch.fault = {singular, fmt::format("the mass matrix M is singular, so that there is no M⁻¹, but {}", *text)};
+  if (!batch.fault && singular >= 0) batch.fault = singular_fault(prior, view, singular);
+}
+
+std::optional<MechanicsBatch::Fault> for_each_mechanics(
+    const Prior& prior, const View& view, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters,
+    const std::function<void(Index first, const MechanicsBatch& mechanics)>& visit) {
+  require_prior(prior);
+  int singular = -1;
+  const auto fault = for_each_mechanics(*prior.system, states, parameters, 1, [&](Index first, const MechanicsBatch& block) {
+    const int one = block.first_singular();
+    if (singular < 0 && one >= 0) singular = static_cast<int>(first) + one;
+    visit(first, block);
+  });
+  return fault || singular < 0 ? fault : singular_fault(prior, view, singular);
 }
 
 MechanicsBatch require_mechanics(const Prior& prior, const View& view, const Ref<const MatrixXd>& states,

@@ -2,6 +2,7 @@
 #include <cmath>
 #include <optional>
 
+#include "data/evenly.hpp"
 #include "gp2/base/statistics.hpp"
 #include "gp2/training/default_hyperparameters.hpp"
 #include "inference/requirements.hpp"
@@ -102,7 +103,9 @@ struct PooledStates {
   VectorXd mass_diagonal;            // M_jj at its median (nq)
 };
 
-PooledStates pooled_states(const Prior& prior, const std::vector<Observations>& observations) {
+PooledStates pooled_states(const Prior& prior, const std::vector<Observations>& all) {
+  constexpr int enough = 10'000;  // states, evenly taken, for spreads and medians
+  const std::vector<Observations> observations = n_states(all) > enough ? evenly(all, enough) : all;
   const System& system = *prior.system;
   std::vector<std::vector<MatrixXd>> features(prior.latents.size()), directions(prior.latents.size());
   std::vector<std::vector<double>> mass(static_cast<std::size_t>(system.nq()));

@@ -239,6 +239,26 @@ TEST(Inducing, WhatIsForgottenCountsAsIfItsNoiseHadBeenLarger) {
               testing::HasSubstr("the oldest go by `window`"));
 }
 
+// Where a machine rests, rounding of b is all that there is of it: whether constraints contradict each other is not told by a block alone.
+TEST(Inducing, AStretchAtRestIsNoContradiction) {
+  const auto p = [] {
+    for (Problem& one : exact_problems(600)) {
+      if (one.prior.system->name().find("redundant") != std::string::npos) return std::move(one);
+    }
+    throw std::logic_error("no such problem");
+  }();
+  MatrixXd states = p.observations.front().states();
+  const StateLayout layout = p.prior.system->layout();
+  states.block(layout.dq(0), 0, layout.nq, 300) *= 1e-9;
+  Problem resting = p;
+  resting.observations = {p.observations.front().with_states(states)};
+  const double exact = test::evaluate(resting).value;
+  ASSERT_TRUE(std::isfinite(exact));
+  const double bound = test::evaluate(with_points(resting, all)).value;
+  EXPECT_GE(bound, exact - 1e-6 * std::abs(exact));
+  EXPECT_TRUE(std::isfinite(bound));
+}
+
 TEST(Inducing, BadRequestsAreErrors) {
   const Problem p = exact_problems().front();
   const auto choose = [&](InducingOptions options) {

@@ -41,6 +41,8 @@ struct LowerRank {
   int lowest = 0;           // of A over the states
   std::vector<int> states;  // where it is below the highest, in order
 };
+/// @param ranks  of A at each state
+LowerRank states_of_lower_rank(const std::vector<int>& ranks);
 LowerRank states_of_lower_rank(const MechanicsBatch& mechanics);
 /// The same of any number of states, in the memory of a few.
 LowerRank states_of_lower_rank(const System& system, const Eigen::Ref<const Eigen::MatrixXd>& states,

@@ -162,6 +162,7 @@ struct MechanicsBatch {
   SystemValues values;
   std::vector<UdwadiaKalaba> projections;
   Eigen::VectorXd constraint_noise;  // of the system
+  double size_of_b_elsewhere = 0;    // of states that these are a part of: an input, by which rounding is judged
 
   /// The first state at which M is singular, −1: none.
   [[nodiscard]] int first_singular() const;
