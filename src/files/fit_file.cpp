@@ -389,7 +389,8 @@ Json baseline_json(const Baseline& baseline) {
 
 Discrepancy discrepancy_from(const ParsedJson& json) {
   Discrepancy discrepancy{vector_from(json.at("lengthscale")), vector_from(json.at("stddev"))};
-  if (!(discrepancy.lengthscale.array() > 0).all() || !(discrepancy.stddev.array() > 0).all()) {
+  if (discrepancy.lengthscale.size() == 0 || !(discrepancy.lengthscale.array() > 0).all() ||
+      !(discrepancy.stddev.array() > 0).all()) {
     throw InputError("lengthscale and stddev of the discrepancy must be positive");
   }
   return discrepancy;

@@ -146,9 +146,9 @@ bool is_of_accelerations(const Observations& group) { return group.view().quanti
 
 bool has_discrepancy(const Model& model, const FitProblem& problem, const FitProblemOptions& options) {
   const bool standard = options.protocol.name == Protocol::Name::standard && options.protocol.hyperprior;
-  const bool acts_everywhere =
-      model.latents.size() == 1 &&
-      (options.base || (model.latents.front().directions.empty() && !model.latents.front().direction_code));
+  const bool acts_everywhere = std::ranges::any_of(model.latents, [&](const LatentSpec& latent) {
+    return options.base || (latent.directions.empty() && !latent.direction_code);
+  });
   return options.discrepancy && standard && acts_everywhere &&
          std::any_of(problem.observations.begin(), problem.observations.end(), is_of_accelerations) &&
          !has_singular_mass(problem);
@@ -174,7 +174,7 @@ Discrepancy discrepancy_of(const FitProblem& problem) {
   for (Index j = 0; j < noise.size(); ++j) {
     if (noise[j] == 0) noise[j] = share / n_shares * scales.acceleration_stddev[j];
   }
-  return {Protocol::Standard::discrepancy_lengthscale * scales.feature_stddev.front(),
+  return {Protocol::Standard::discrepancy_lengthscale * scales.feature_stddev.back(),
           discrepancy_share(problem.observations) * noise};
 }
 
@@ -426,8 +426,8 @@ void add_side_information(const Model& model, const std::vector<SideInformation>
 }
 
 // a discrepancy is part of the prior, and of that on every other system
-void add_discrepancy(const Model& model, FitProblem& problem) {
-  problem.prior_options.discrepancy = discrepancy_of(problem);
+void set_discrepancy(const Model& model, const Discrepancy& discrepancy, FitProblem& problem) {
+  problem.prior_options.discrepancy = discrepancy;
   problem.prior = make_prior(model, problem.prior_options);
   for (std::size_t g = 0; g < problem.observations.size(); ++g) {
     const std::shared_ptr<const Model>& other = problem.systems[g];
@@ -436,6 +436,12 @@ void add_discrepancy(const Model& model, FitProblem& problem) {
     view.other_system = make_other_system(model, *other, problem.prior_options);
     problem.observations[g] = problem.observations[g].with_view(std::move(view));
   }
+}
+
+// First in units of its features, to see how they spread.
+void add_discrepancy(const Model& model, FitProblem& problem) {
+  set_discrepancy(model, {{}, VectorXd::Ones(model.system->nq())}, problem);
+  set_discrepancy(model, discrepancy_of(problem), problem);
 }
 
 }  // namespace

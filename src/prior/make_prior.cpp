@@ -75,12 +75,14 @@ class LatentMaker {
   /// Features in units of the lengthscales, directions of the standard deviations: nothing is left to tune.
   [[nodiscard]] Latent make_discrepancy(const LatentSpec& spec, const Discrepancy& discrepancy) {
     Latent latent;
-    set_features(spec, latent, &discrepancy.lengthscale);
+    const bool has_lengthscales = discrepancy.lengthscale.size() > 0;
+    set_features(spec, latent, has_lengthscales ? &discrepancy.lengthscale : nullptr);
     latent.name = "discrepancy";
     latent.kernel = Kernel::parse("se", latent.feature_names);
     latent.kernel_is_fixed = latent.signal_is_fixed = true;
     const auto nq = static_cast<std::size_t>(system_->nq());
-    if (discrepancy.lengthscale.size() != latent.n_features() || discrepancy.stddev.size() != system_->nq()) {
+    if ((has_lengthscales && discrepancy.lengthscale.size() != latent.n_features()) ||
+        discrepancy.stddev.size() != system_->nq()) {
       throw InputError(fmt::format("a discrepancy must hold {} lengthscales and {} standard deviations, got {} and {}",
                                    latent.n_features(), nq, discrepancy.lengthscale.size(), discrepancy.stddev.size()));
     }
@@ -178,6 +180,19 @@ class LatentMaker {
   const PriorWords& words_;
 };
 
+// What several latents leave out need not be a function of their features, but is one of what these are made of.
+std::vector<std::string> entries_read_by_latents(const Prior& prior) {
+  const std::vector<std::string> names = prior.system->state_names();
+  std::vector<std::string> entries;
+  for (int k = 0; k < std::ssize(names); ++k) {
+    const auto reads = [k](const Latent& latent) {
+      return latent.features->reads(k) || (latent.directions && latent.directions->reads(k));
+    };
+    if (std::ranges::any_of(prior.latents, reads)) entries.push_back(names[static_cast<std::size_t>(k)]);
+  }
+  return entries;
+}
+
 // what a model file's reader asks of a [[latent]], where there is no file
 void require_well_formed(const LatentSpec& spec, const System& system) {
   const auto fail = [&](const std::string& text) { throw InputError(fmt::format("latent '{}': {}", spec.name, text)); };
@@ -258,7 +273,9 @@ Prior make_prior(std::shared_ptr<const System> system, const std::vector<LatentS
     for (Latent& latent : maker.make(spec)) prior.latents.push_back(std::move(latent));
   }
   if (options.discrepancy && !latents.empty()) {
-    prior.latents.push_back(maker.make_discrepancy(latents.front(), *options.discrepancy));
+    const LatentSpec spec =
+        latents.size() == 1 ? latents.front() : LatentSpec{.name = "discrepancy", .features = entries_read_by_latents(prior)};
+    prior.latents.push_back(maker.make_discrepancy(spec, *options.discrepancy));
   }
   return prior;
 }

@@ -158,8 +158,22 @@ TEST(Discrepancy, IsLeftOutOfThePapersProtocolOfMaximumLikelihoodAndWhereAskedTo
 TEST(Discrepancy, IsLeftOutWhereTheModelSaysHowItsLatentsAct) {
   EXPECT_FALSE(has_discrepancy(bead("directions = [[\"-dx\"], [\"-dy\"]]\n")));
   EXPECT_FALSE(has_discrepancy(bead("directions = [[\"1\", \"0\"], [\"0\", \"1\"]]\n"))) << "written out is structured too";
-  EXPECT_FALSE(has_discrepancy(
-      bead("directions = \"acceleration\"\n[[latent]]\nname = \"drive\"\nkernel = \"se\"\nfeatures = [\"u\"]\n")));
+}
+
+TEST(Discrepancy, StandsBesideSeveralLatentsOfWhichOneActsInEveryDirection) {
+  const std::string drive = "[[latent]]\nname = \"drive\"\nkernel = \"se\"\nfeatures = [\"u*dx\"]\n";
+  const std::string one_way = "directions = { force = [[\"1\"], [\"0\"]] }\n";
+  EXPECT_FALSE(has_discrepancy(bead(one_way + drive + one_way)));
+  for (const std::string& own : {std::string(), one_way}) {
+    const Model model = bead(own + drive);
+    EXPECT_TRUE(has_discrepancy(model));
+    const FitProblem problem = problem_of(model);
+    ASSERT_EQ(problem.prior.latents.size(), 3U);
+    // of the entries that they read, not of features made of them
+    EXPECT_THAT(problem.prior.latents[2].feature_names, ElementsAre("x", "dx", "u"));
+    EXPECT_EQ(problem.prior_options.discrepancy->lengthscale,
+              1.25 * default_scales(problem.prior, problem.observations).feature_stddev[0]);
+  }
 }
 
 // ---- how large it is
@@ -422,6 +436,8 @@ TEST(Discrepancy, ThatIsNoneInAFitFileIsRefused) {
   EXPECT_EQ(error_after([](Json&) {}), "");
   EXPECT_EQ(error_after([](Json& of) { of["lengthscale"].erase(0); }),
             "a discrepancy must hold 3 lengthscales and 2 standard deviations, got 2 and 2");
+  EXPECT_EQ(error_after([](Json& of) { of["lengthscale"] = Json::array(); }),
+            "lengthscale and stddev of the discrepancy must be positive");
   EXPECT_EQ(error_after([](Json& of) { of["stddev"].push_back(1); }),
             "a discrepancy must hold 3 lengthscales and 2 standard deviations, got 3 and 3");
   EXPECT_EQ(error_after([](Json& of) { of["stddev"] = Json::array(); }),

@@ -66,7 +66,7 @@ struct FitProblemOptions {
   /// paper and for baselines they are in any case.
   bool trust_stated_noise = false;
   Protocol protocol;
-  /// A discrepancy latent beside the model's one, where that acts in every direction, under the standard protocol with
+  /// A discrepancy latent beside the model's, where one of them acts in every direction, under the standard protocol with
   /// hyper-priors.
   bool discrepancy = true;
   std::optional<CsvTable> commands;         // the whole log of inputs over t, where the logs are rows of it

@@ -57,7 +57,7 @@ struct LatentSpec {
 /// noise. It hardly moves the mean, but keeps a standard deviation where the fit would call an effect absent that the data cannot
 /// see.
 struct Discrepancy {
-  Eigen::VectorXd lengthscale;  // of each feature of the model's latent (D)
+  Eigen::VectorXd lengthscale;  // of each of its features (D); empty: 1
   Eigen::VectorXd stddev;       // of each acceleration (nq)
 };
 
@@ -65,7 +65,7 @@ struct PriorOptions {
   Prior::Mean mean = Prior::Mean::zero;
   std::optional<Latent::Base> base;             // replaces the directions of the one latent by the identity or M⁻¹
   bool raw_angles = false;                      // a feature that is an angle stays as it is instead of its sine and cosine
-  std::optional<Discrepancy> discrepancy = {};  // beside the first latent
+  std::optional<Discrepancy> discrepancy = {};  // beside the model's latents
   /// Of a latent that gives no kernel: what machines are made of, a part that is linear in the features and a smooth one; the p
   /// directions of such a latent have hyperparameters of their own.
   std::string kernel = "se + linear";
