@@ -122,6 +122,7 @@ class Writer {
   void write_stddev();
   void write_jacobian();
   void write_tests();
+  [[nodiscard]] std::pair<double, double> rounding_at(const VectorXd& state, double prior_stddev) const;
   void require_single_precision() const;
 
   [[nodiscard]] const System& system() const { return *prior_.system; }
@@ -258,7 +259,6 @@ void Writer::set_sizes() {
       {"small_norm", single ? "1e-15f" : "1e-140"},
       {"large_norm", single ? "1e15f" : "1e140"},
       {"smallest_row", single ? "1.17549435e-38f" : "2.2250738585072014e-308"},
-      {"tolerance", single ? "1e-3f" : "1e-9"},
       {"if_singular", what_needs_acceleration(prior_, view_) ? "NO_UNCONSTRAINED_ACCELERATION" : "OK"},
   };
   std::string guard = options_.name + "_H";
@@ -381,6 +381,22 @@ std::string Writer::inverse_of(const LatentPosterior& latents, std::size_t k) {
   return table("real", fmt::format("inverse_{}", k), entries);
 }
 
+// what each factor of a kernel multiplies the features by
+VectorXd scales_of(const KernelColumns& columns) {
+  const Kernel& kernel = columns.kernel();
+  VectorXd scales(kernel.n_scaled_columns());
+  for (const Kernel::Term& product : kernel.terms()) {
+    for (const Kernel::Factor& factor : product.factors) {
+      if (factor.primitive == Kernel::Primitive::constant) continue;
+      for (Index d = 0; d < kernel.n_features(); ++d) {
+        const double* const values = columns.values().data() + factor.first_parameter;
+        scales[factor.first_column + d] = feature_scale(factor.primitive, values, kernel.n_features(), d);
+      }
+    }
+  }
+  return scales;
+}
+
 void Writer::write_tables() {
   texts_["tables"];
   if (!all_rows_) {
@@ -400,16 +416,7 @@ void Writer::write_tables() {
       const Term& term = terms_[a];
       const LatentPosterior::Basis& basis = latents.latents()[term.latent];
       const MatrixXd C = component.C[term.latent], weights = basis.beta * C.transpose(), points = basis.kernel.features();
-      const VectorXd values = basis.kernel.values();
-      VectorXd scales(term.kernel.n_scaled_columns());
-      for (const Kernel::Term& product : term.kernel.terms()) {
-        for (const Kernel::Factor& factor : product.factors) {
-          if (factor.primitive == Kernel::Primitive::constant) continue;
-          for (Index d = 0; d < term.D; ++d) {
-            scales[factor.first_column + d] = feature_scale(factor.primitive, values.data() + factor.first_parameter, term.D, d);
-          }
-        }
-      }
+      const VectorXd values = basis.kernel.values(), scales = scales_of(basis.kernel);
       const auto name = [&](const char* what) { return fmt::format("{}_{}_{}", what, k, a); };
       const auto of = [&](const char* what, const auto& matrix) {
         return matrix.size() == 0 ? std::string("0") : table(name(what), matrix.data(), matrix.size());
@@ -875,43 +882,10 @@ void Writer::write_jacobian() {
 
 // ---------------------------------------------------------------- tests
 
-void Writer::write_tests() {
-  const MatrixXd& observed = components_.front()->observations.front().states();
-  const Predictor predictor(posterior_, view_, {options_.stddev, options_.jacobian, Predictor::Storage::double_precision});
-  const Predictor before(posterior_.without_data(), view_, {options_.stddev, false, Predictor::Storage::double_precision});
-  Predictor::Workspace workspace = predictor.make_workspace(), workspace_before = before.make_workspace();
-  const Index nr = view_.size(), nx = layout_.size();
-  VectorXd mean(nr), stddev(nr), prior(nr);
-  MatrixXd jacobian(nr, nx);
-  std::string& text = texts_["tests"];
-  int n = 0;
-  // evenly among the observed, those that have a prediction
-  for (Index i = 0; i < observed.cols() && n < n_tests; i += std::max<Index>(1, observed.cols() / n_tests)) {
-    VectorXd state = observed.col(i).array().isNaN().select(0, observed.col(i));
-    Predictor::Status status = predictor.mean(state, mean, workspace);
-    if (has("jacobian") && status == Predictor::Status::ok)
-      status = predictor.mean_and_jacobian(state, mean, jacobian, workspace);
-    if (has("stddev") && status == Predictor::Status::ok) {
-      status = predictor.mean_and_stddev(state, mean, stddev, workspace);
-      static_cast<void>(before.mean_and_stddev(state, prior, prior, workspace_before));
-    }
-    if (status != Predictor::Status::ok) continue;
-    ++n;
-    text += fmt::format("    {{{{{}}}, {{{}}},\n", numbers(state.data(), nx), numbers(mean.data(), nr));
-    if (has("stddev")) text += fmt::format("     {{{}}}, {{{}}},\n", numbers(stddev.data(), nr), numbers(prior.data(), nr));
-    if (has("jacobian")) text += fmt::format("     {{{}}},\n", numbers(jacobian.data(), nr * nx));
-    text += "    },\n";
-  }
-  if (n == 0)
-    throw InputError("export to C: no observed state has a prediction of this view, so that there is nothing to test it by");
-  texts_["n_tests"] = std::to_string(n);
-}
-
-// ---------------------------------------------------------------- single precision
-
-// The standard deviations of the functions of a latent at a state, and Σ_j |k_j β_j| of their means.
+// The functions of a latent at a state: their standard deviations, that of the prior, and Σ_j |k_j β_j| of their means.
 struct FunctionsAt {
   VectorXd stddev, sizes;  // (F)
+  double prior_stddev = 0;
 };
 FunctionsAt functions_at(const LatentPosterior& latents, std::size_t latent, const VectorXd& features) {
   const LatentPosterior::Basis& basis = latents.latents()[latent];
@@ -930,13 +904,71 @@ FunctionsAt functions_at(const LatentPosterior& latents, std::size_t latent, con
   }
   MatrixXd cross = latents.sums() != nullptr ? MatrixXd(latents.sums()->D * rows) : std::move(rows);
   latents.whiten(cross);
-  FunctionsAt out{VectorXd(F), VectorXd(F)};
+  FunctionsAt out{VectorXd(F), VectorXd(F), std::sqrt(basis.kernel.variance(point))};
   for (Index f = 0; f < F; ++f) {
     out.stddev[f] = std::sqrt(std::max(0.0, basis.kernel.variance(point) - cross.col(f).squaredNorm()));
     out.sizes[f] = k.cwiseProduct(basis.beta.col(f)).cwiseAbs().sum();
   }
   return out;
 }
+
+// What rounding may make of the mean at a state, and how much more of its derivatives. Weights that cancel leave a function off by
+// rounding of Σ_j |k_j β_j|, and a row is at most its deviation under the prior, in units of the function's, times as large.
+std::pair<double, double> Writer::rounding_at(const VectorXd& state, double prior_stddev) const {
+  double cancelled = 0, steepest = 1;
+  for (const Component& component : components_) {
+    double of_component = 0;
+    for (const Term& term : terms_) {
+      VectorXd features(term.D);
+      term.features->evaluate(state, features);
+      const FunctionsAt at = functions_at(*component->latents, term.latent, features);
+      if (at.prior_stddev > 0) of_component += at.sizes.norm() / at.prior_stddev;
+      const VectorXd scales = scales_of(component->latents->latents()[term.latent].kernel);
+      if (scales.size() > 0) steepest = std::max(steepest, scales.maxCoeff());
+    }
+    cancelled = std::max(cancelled, of_component);
+  }
+  return {32 * (options_.single_precision ? 6e-8 : 1.1e-16) * prior_stddev * cancelled, steepest};
+}
+
+void Writer::write_tests() {
+  const MatrixXd& observed = components_.front()->observations.front().states();
+  const Predictor predictor(posterior_, view_, {options_.stddev, options_.jacobian, Predictor::Storage::double_precision});
+  const Predictor before(posterior_.without_data(), view_, {true, false, Predictor::Storage::double_precision});
+  Predictor::Workspace workspace = predictor.make_workspace(), workspace_before = before.make_workspace();
+  const Index nr = view_.size(), nx = layout_.size();
+  VectorXd mean(nr), stddev = VectorXd::Zero(nr), at_zero(nr), prior(nr);
+  MatrixXd jacobian(nr, nx);
+  std::string& text = texts_["tests"];
+  int n = 0;
+  // evenly among the observed, those that have a prediction
+  for (Index i = 0; i < observed.cols() && n < n_tests; i += std::max<Index>(1, observed.cols() / n_tests)) {
+    VectorXd state = observed.col(i).array().isNaN().select(0, observed.col(i));
+    Predictor::Status status = predictor.mean(state, mean, workspace);
+    if (has("jacobian") && status == Predictor::Status::ok)
+      status = predictor.mean_and_jacobian(state, mean, jacobian, workspace);
+    if (has("stddev") && status == Predictor::Status::ok) status = predictor.mean_and_stddev(state, mean, stddev, workspace);
+    if (status != Predictor::Status::ok) continue;
+    ++n;
+    static_cast<void>(before.mean_and_stddev(state, at_zero, prior, workspace_before));
+    const double size = prior.maxCoeff(), precision = options_.single_precision ? 1e-4 : 1e-9;
+    const auto [rounding, steepest] = rounding_at(state, size);
+    const VectorXd variance = stddev.array().square();
+    text += fmt::format("    {{{{{}}}, {{{}}},\n", numbers(state.data(), nx), numbers(mean.data(), nr));
+    if (has("stddev")) text += fmt::format("     {{{}}},\n", numbers(variance.data(), nr));
+    if (has("jacobian")) text += fmt::format("     {{{}}},\n", numbers(jacobian.data(), nr * nx));
+    std::vector<std::string> errors = {number(precision * std::max(1.0, mean.cwiseAbs().maxCoeff()) + rounding)};
+    if (has("stddev")) errors.push_back(number(precision * size * size));
+    if (has("jacobian"))
+      errors.push_back(number(precision * std::max(1.0, jacobian.cwiseAbs().maxCoeff()) + rounding * steepest));
+    text += fmt::format("     {}}},\n", fmt::join(errors, ", "));
+  }
+  if (n == 0)
+    throw InputError("export to C: no observed state has a prediction of this view, so that there is nothing to test it by");
+  texts_["n_tests"] = std::to_string(n);
+}
+
+// ---------------------------------------------------------------- single precision
 
 void Writer::require_single_precision() const {
   constexpr double epsilon = 6e-8;  // half the spacing of floats at 1

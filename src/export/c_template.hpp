@@ -1031,50 +1031,38 @@ status @name@_mean(const real *state, real *mean, workspace *w)
 
 /* ---------------------------------------------------------------- self test */
 
-/* Whether n numbers are what they should be, within the tolerance of the largest of them. */
-static int agree(int n, const real *is, const real *should)
+static int agree(int n, const real *is, const real *should, real error)
 {
-  real size = 1, off = 0;
   for (int i = 0; i < n; ++i) {
-    if (fabs(should[i]) > size) size = fabs(should[i]);
-    if (fabs(is[i] - should[i]) > off) off = fabs(is[i] - should[i]);
+    if (!(fabs(is[i] - should[i]) <= error)) return 0;
   }
-  return off <= @tolerance@ * size;
+  return 1;
 }
-{stddev}
-{stddev}/* A variance is what the observations leave of the prior's, and is off by rounding of that. */
-{stddev}static int deviations_agree(const real *is, const real *should, const real *prior)
-{stddev}{
-{stddev}  real size = 0;
-{stddev}  for (int r = 0; r < NR; ++r) {
-{stddev}    if (prior[r] > size) size = prior[r];
-{stddev}  }
-{stddev}  for (int r = 0; r < NR; ++r) {
-{stddev}    if (!(fabs(is[r] * is[r] - should[r] * should[r]) <= @tolerance@ * size * size)) return 0;
-{stddev}  }
-{stddev}  return 1;
-{stddev}}
 
 int @name@_self_test(workspace *w)
 {
   enum { TESTS = @n_tests@ };
   static const struct {
     real state[NX], mean[NR];
-{stddev}    real stddev[NR], prior_stddev[NR];
+{stddev}    real variance[NR];
 {jacobian}    real jacobian[NR * NX];
+    real mean_error; /* what rounding may make of each */
+{stddev}    real variance_error;
+{jacobian}    real jacobian_error;
   } tests[TESTS] = {
 @tests@  };
   for (int k = 0; k < TESTS; ++k) {
     real mean[NR];
-    if (@name@_mean(tests[k].state, mean, w) != @name@_OK || !agree(NR, mean, tests[k].mean)) return k + 1;
+    if (@name@_mean(tests[k].state, mean, w) != @name@_OK || !agree(NR, mean, tests[k].mean, tests[k].mean_error)) {
+      return k + 1;
+    }
 {stddev}    real stddev[NR];
-{stddev}    if (@name@_mean_and_stddev(tests[k].state, mean, stddev, w) != @name@_OK ||
-{stddev}        !deviations_agree(stddev, tests[k].stddev, tests[k].prior_stddev)) {
-{stddev}      return k + 1;
-{stddev}    }
+{stddev}    if (@name@_mean_and_stddev(tests[k].state, mean, stddev, w) != @name@_OK) return k + 1;
+{stddev}    for (int r = 0; r < NR; ++r) stddev[r] *= stddev[r];
+{stddev}    if (!agree(NR, stddev, tests[k].variance, tests[k].variance_error)) return k + 1;
 {jacobian}    real jacobian[NR * NX];
 {jacobian}    if (@name@_mean_and_jacobian(tests[k].state, mean, jacobian, w) != @name@_OK ||
-{jacobian}        !agree(NR * NX, jacobian, tests[k].jacobian)) {
+{jacobian}        !agree(NR * NX, jacobian, tests[k].jacobian, tests[k].jacobian_error)) {
 {jacobian}      return k + 1;
 {jacobian}    }
   }

@@ -258,6 +258,21 @@ directions = "force"
   EXPECT_GE(seen.size(), 4U);
 }
 
+TEST(CSourceTest, TestsItself) {
+  Problem p = problem_of("surface");
+  const View view = View::constrained_acceleration(*p.prior.system);
+  // weights that cancel are no fault of the compiler …
+  for (VectorXd& noise : p.values.noise_stddev) noise *= 1e-4;
+  CSource c = export_c(test::posterior_of(p), view);
+  Exported sound(c, "gp2_model", compiler(1) + " -ffp-contract=fast");
+  EXPECT_EQ(sound.self_test(sound.workspace()), 0);
+  // … and one that is another is seen
+  const std::size_t weights = c.source.find("{\n  ", c.source.find("real weights_0_0["));
+  c.source.insert(weights + 4, "1.0 + ");
+  Exported broken(c, "gp2_model", "gcc -O2");
+  EXPECT_NE(broken.self_test(broken.workspace()), 0);
+}
+
 TEST(CSourceTest, RunsUnderTheSanitizers) {
   const Problem p = problem_of("unicycle");
   const CSource c = export_c(test::posterior_of(p), View::all(Quantity::multipliers, *p.prior.system));
