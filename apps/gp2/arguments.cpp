@@ -142,6 +142,12 @@ void require_output(const std::string& output, const std::vector<std::string>& i
   }
 }
 
+void make_folder(const std::string& output) {
+  std::error_code error;
+  std::filesystem::create_directories(output, error);
+  if (error) throw InputError(fmt::format("-o {}: the folder cannot be made: {}", output, error.message()));
+}
+
 std::shared_ptr<const Model> read_other_system(const std::string& path) {
   return path.empty() ? nullptr : std::make_shared<const Model>(Model::read(path));
 }

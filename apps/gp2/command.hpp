@@ -35,6 +35,7 @@ Command shoot_command();
 Command excite_command();
 Command evaluate_command();
 Command update_command();
+Command export_command();
 Command report_command();
 Command reproduce_command();
 
@@ -80,6 +81,10 @@ Option start_option(std::string& value);
 /// @param inputs  files that are read, which it must not replace; "" for none
 /// @throws InputError when its folder does not exist, it is an input, or as require_writable.
 void require_output(const std::string& output, const std::vector<std::string>& inputs);
+
+/// The folder -o, which need not be there.
+/// @throws InputError when it cannot be made.
+void make_folder(const std::string& output);
 
 /// The model of another system; null for an empty path.
 std::shared_ptr<const Model> read_other_system(const std::string& path);

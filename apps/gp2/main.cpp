@@ -103,7 +103,7 @@ int main(int argc, char** argv) {
        {gp2::command::show_command, gp2::command::check_command, gp2::command::generate_command, gp2::command::derive_command,
         gp2::command::resample_command, gp2::command::fit_command, gp2::command::predict_command, gp2::command::simulate_command,
         gp2::command::excite_command, gp2::command::evaluate_command, gp2::command::update_command, gp2::command::shoot_command,
-        gp2::command::report_command, gp2::command::reproduce_command}) {
+        gp2::command::report_command, gp2::command::export_command, gp2::command::reproduce_command}) {
     gp2::command::add_command(app, command());
   }
 

@@ -134,6 +134,7 @@ class Posterior {
   friend PathwiseSamples sample_paths(const Posterior& posterior, int n_samples, const PathwiseOptions& options);
   friend Posterior update(Posterior&& posterior, Observations added);
   friend struct LeftOut leave_out(const Posterior& posterior, int n_stretches);
+  friend struct CSource export_c(const Posterior& posterior, const View& view, const struct CSourceOptions& options);
   friend Posterior remove_oldest(Posterior&& posterior, int n);
   friend Posterior forget(Posterior&& posterior, double share);
 

@@ -394,6 +394,23 @@ class Posterior:
     ) -> None: ...
     def remove_oldest(self, n: int = 1) -> None: ...
     def without_data(self) -> Posterior: ...
+    def export(
+        self,
+        folder: _Path,
+        system: System | None = None,
+        *,
+        # options of export: written by scripts/options
+        to: Literal["c", "casadi", "acados"] = "c",
+        name: str = "",
+        view: Literal["constrained", "unconstrained", "constraint-force", "multipliers", "next-velocity"] = "constrained",
+        dt: float | None = None,
+        latent: str | None = None,
+        std: bool = True,
+        jacobian: bool = True,
+        single: bool = False,
+        draws_within: float | None = None,
+        # end of options
+    ) -> list[str]: ...
     @overload
     def simulate(
         self,

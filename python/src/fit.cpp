@@ -8,6 +8,7 @@
 #include "gp2/error.hpp"
 #include "gp2/jobs/derive.hpp"
 #include "gp2/jobs/excite_job.hpp"
+#include "gp2/jobs/export_job.hpp"
 #include "gp2/jobs/fit_job.hpp"
 #include "gp2/jobs/raw_fit.hpp"
 #include "gp2/jobs/resample.hpp"
@@ -292,11 +293,12 @@ void add_fit(py::module_& module) {
         ResampleOptions resample;
         ShowRequest show;
         ExciteRequest excite;
+        ExportRequest exported;
         const std::map<std::string, std::vector<Option>> tables = {
             {"fit", options(fit)},           {"simulate", options(simulate)},
             {"derive", options(derive)},     {"fit_raw", options(fit_of_raw, raw)},
             {"resample", options(resample)}, {"show", options(show)},
-            {"excite", options(excite)}};
+            {"excite", options(excite)},     {"export", options(exported)}};
         return stub_lines(tables.at(job));
       },
       "job"_a);

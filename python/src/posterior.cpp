@@ -1,5 +1,6 @@
 #include <algorithm>
 #include <cmath>
+#include <filesystem>
 #include <limits>
 #include <thread>
 
@@ -9,8 +10,10 @@
 
 #include "arrays.hpp"
 #include "bindings.hpp"
+#include "gp2/base/file.hpp"
 #include "gp2/error.hpp"
 #include "gp2/jobs/excite_job.hpp"
+#include "gp2/jobs/export_job.hpp"
 #include "gp2/jobs/fit_job.hpp"
 #include "gp2/jobs/fit_problem.hpp"
 #include "gp2/jobs/predict_job.hpp"
@@ -859,6 +862,42 @@ Raises InputError for limits that do not fit, or that no motion keeps; Numerical
           .c_str());
 }
 
+std::vector<std::string> export_posterior(const PyPosterior& self, const py::object& folder, const PySystem* system,
+                                          const py::kwargs& keywords) {
+  ExportRequest request;
+  read_keywords("export", keywords, options(request));
+  if (system != nullptr) request.view.system = system->model;
+  const std::filesystem::path to = path_argument(folder);
+  const Posterior posterior = self.posterior;
+  ExportOutcome outcome;
+  {
+    const py::gil_scoped_release release;
+    outcome = export_fit(self.file, posterior, request);
+  }
+  tell(outcome.notes);
+  std::vector<std::string> written;
+  for (const auto& [name, text] : outcome.files) {
+    write_file(to / name, text);
+    written.push_back((to / name).string());
+  }
+  return written;
+}
+
+void define_export(py::class_<PyPosterior>& posterior) {
+  using namespace py::literals;
+  ExportRequest request;
+  py::options own_signature;
+  own_signature.disable_function_signatures();
+  posterior.def("export", &export_posterior, "folder"_a, "system"_a = nullptr,
+                (signature("export", "self: Posterior, folder: str | os.PathLike, system: System | None = None, *,",
+                           options(request), "", "list[str]") +
+                 R"(
+Write the posterior as C for machines without gp2, as gp2 export: the paths of the files, in a folder that exists.
+
+)" + documentation(options(request)))
+                    .c_str());
+}
+
 }  // namespace
 
 void add_posterior(py::module_& module) {
@@ -881,6 +920,7 @@ void add_posterior(py::module_& module) {
       "load", &load, "path"_a, "system"_a = nullptr,
       "Read a FIT.json: a Posterior.\n\nsystem: where the fit was of one with Python functions, that one; they are not in the "
       "file.\n\nRaises InputError naming the file and what is wrong.");
+  define_export(posterior);
   define_simulate(posterior, module);
   define_excite(module);
 }

@@ -12,9 +12,9 @@
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
-#include <boost/crc.hpp>
 #include <nlohmann/json.hpp>
 
+#include "base/checksum.hpp"
 #include "gp2/base/version.hpp"
 #include "gp2/data/csv.hpp"
 #include "gp2/error.hpp"
@@ -116,14 +116,10 @@ ParsedJson parse_json(std::string_view text, const std::filesystem::path& path) 
   return json;
 }
 
-// CRC-64 of xz over the compact text with sorted keys, in which only what is meant counts. It sees every change within eight
-// bytes in a row, and others but for one in 2⁶⁴. It guards against damage and slips of the pen, not against intent, so no
-// cryptographic digest, and no library for one, is needed: who means a change is told the checksum to write.
+// Over the compact text with sorted keys, in which only what is meant counts. It guards against damage and slips of the pen, not
+// against intent, so no cryptographic digest, and no library for one, is needed: who means a change is told the checksum to write.
 std::string checksum_of(const ParsedJson& json) {
-  boost::crc_optimal<64, 0x42F0E1EBA9EA3693, 0xFFFFFFFFFFFFFFFF, 0xFFFFFFFFFFFFFFFF, true, true> crc;
-  const std::string text = json.dump(-1, ' ', false, ParsedJson::error_handler_t::replace);
-  crc.process_bytes(text.data(), text.size());
-  return fmt::format("{:016x}", crc.checksum());
+  return checksum(json.dump(-1, ' ', false, ParsedJson::error_handler_t::replace));
 }
 
 // Out of a file, where it must be right. Formats before the sixth have none; one that is there counts all the same, so that a

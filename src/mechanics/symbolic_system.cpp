@@ -232,6 +232,8 @@ class SymbolicSystem::Evaluator final : public StateEvaluator {
             std::span<const StateDerivatives::Entry> derivatives)
       : StateEvaluator(system, parameters, derivatives), tape_(tape), workspace_(tape.make_workspace(parameters)) {}
 
+  [[nodiscard]] const Tape* tape() const override { return &tape_; }
+
  private:
   void evaluate_all(const Ref<const VectorXd>& state) override { tape_.evaluate_at(state, workspace_, all_values()); }
 

@@ -66,6 +66,7 @@ class ExpressionFunction::TapeEvaluator final : public Evaluator {
   void differentiate(const Ref<const VectorXd>& state, Ref<VectorXd> derivatives) override {
     derivatives_.tape.evaluate_at(state, workspace_of_derivatives_, derivatives);
   }
+  [[nodiscard]] Tapes tapes() const override { return {&values_, &derivatives_.tape}; }
 
  private:
   const Tape& values_;

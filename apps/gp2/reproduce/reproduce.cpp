@@ -65,9 +65,7 @@ void run(const ReproduceArguments& arguments) {
   if (arguments.protocol != "paper") options.protocols.push_back(Protocol::Name::standard);
   options.runs = arguments.runs;
   options.threads = arguments.threads;
-  std::error_code error;
-  std::filesystem::create_directories(options.output, error);
-  if (error) throw InputError(fmt::format("-o {}: the folder cannot be made: {}", arguments.output, error.message()));
+  make_folder(arguments.output);
   // hours of numbers do not wait for a picture
   std::vector<std::string> not_drawn;
   for (const Experiment& experiment : experiments) {

@@ -56,6 +56,10 @@ class StateEvaluator {
     return {values_.data() + n_values(), static_cast<Eigen::Index>(derivatives_.size())};
   }
 
+  /// The program from [state; parameters] to M, A, b, F and the derivatives, as long as the evaluator lives; null where they are
+  /// not expressions.
+  [[nodiscard]] virtual const Tape* tape() const { return nullptr; }
+
  protected:
   /// @param entries  the derivatives: `output` counts the numbers of M, A, b, F, each column-major; sorted by state_index
   /// @throws InputError when `parameters` has the wrong size.

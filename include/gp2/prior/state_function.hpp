@@ -29,6 +29,14 @@ class StateFunction {
     [[nodiscard]] virtual const std::vector<StateDerivatives::Entry>& entries() const = 0;
     /// … and their values, in this order.
     virtual void differentiate(const Eigen::Ref<const Eigen::VectorXd>& state, Eigen::Ref<Eigen::VectorXd> derivatives) = 0;
+
+    /// The programs from [state; parameters] to the numbers and to the derivatives, as long as the function lives; null where they
+    /// are not expressions.
+    struct Tapes {
+      const Tape* values = nullptr;
+      const Tape* derivatives = nullptr;
+    };
+    [[nodiscard]] virtual Tapes tapes() const { return {}; }
   };
 
   StateFunction() = default;

@@ -185,6 +185,14 @@ class Tape {
   void evaluate_at(const Eigen::Ref<const Eigen::VectorXd>& point, Eigen::VectorXd& workspace,
                    Eigen::Ref<Eigen::VectorXd> results) const;
 
+  /// The program as statements of C99, one a line, behind `indent`: they assign the outputs to `results`. What is used once and
+  /// short stands where it is used; the rest is called v1, v2, …, or v1_, … where an input is called so. C's functions of double
+  /// or, in single precision, of float; sign_of, smaller, larger, product_or_zero, square and integer_power are left to define.
+  /// @param inputs   the text for each input: "q1", "parameters[0]"
+  /// @param results  what each output is assigned to: "M[0]"
+  [[nodiscard]] std::string as_c(std::span<const std::string> inputs, std::span<const std::string> results, bool single_precision,
+                                 std::string_view indent = "  ") const;
+
   [[nodiscard]] int n_outputs() const { return static_cast<int>(outputs_.size()); }
   [[nodiscard]] bool uses_input(int index) const { return uses_input_[static_cast<std::size_t>(index)]; }
   [[nodiscard]] std::size_t n_instructions() const { return instructions_.size(); }

@@ -1,0 +1,56 @@
+#include "export/shims.hpp"
+
+#include <fmt/format.h>
+
+#include "export/fill_template.hpp"
+#include "export/shim_template.hpp"
+#include "gp2/base/file.hpp"
+
+namespace gp2 {
+
+namespace {
+
+// a dense pattern of CasADi in its full form, which everyone reads; or one without entries
+std::string pattern(int rows, int columns, bool is_dense = true) {
+  std::string text = fmt::format("{}, {}", rows, columns);
+  for (int j = 0; j <= columns; ++j) text += fmt::format(", {}", is_dense ? rows * j : 0);
+  for (int k = 0; is_dense && k < rows * columns; ++k) text += fmt::format(", {}", k % rows);
+  return text;
+}
+
+}  // namespace
+
+std::string casadi_source(const std::string& name, const StateLayout& layout, int n_rows, const CSourceOptions& options) {
+  std::set<std::string> conditions;
+  if (options.stddev) conditions.insert("stddev");
+  if (options.jacobian) conditions.insert("jacobian");
+  if (layout.nu > 0) conditions.insert("inputs");
+  return c_export::filled(c_export::casadi_template, conditions,
+                          {{"name", name},
+                           {"nq", std::to_string(layout.nq)},
+                           {"nu", std::to_string(layout.nu)},
+                           {"n_state", std::to_string(layout.size())},
+                           {"n_rows", std::to_string(n_rows)},
+                           {"pattern_q", pattern(layout.nq, 1)},
+                           {"pattern_t", pattern(1, 1)},
+                           {"pattern_u", pattern(layout.nu, 1)},
+                           {"pattern_rows", pattern(n_rows, 1)},
+                           {"pattern_nothing", pattern(n_rows, 1, false)},
+                           {"pattern_rows_q", pattern(n_rows, layout.nq)},
+                           {"pattern_rows_t", pattern(n_rows, 1)},
+                           {"pattern_rows_u", pattern(n_rows, layout.nu)}});
+}
+
+std::string acados_source(const CSource& model, const std::string& name, const StateLayout& layout, double time_step,
+                          bool reads_time) {
+  std::string source = model.source;
+  const std::string include = fmt::format("#include \"{}.h\"\n", name);
+  source.erase(source.find(include), include.size());
+  std::set<std::string> conditions;
+  if (reads_time) conditions.insert("timed");
+  return model.header + "\n" + source +
+         c_export::filled(c_export::acados_template, conditions,
+                          {{"name", name}, {"nu", std::to_string(layout.nu)}, {"time_step", shortest(time_step)}});
+}
+
+}  // namespace gp2

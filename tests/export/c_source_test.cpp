@@ -1,0 +1,346 @@
+#include "gp2/export/c_source.hpp"
+
+#include <array>
+#include <cstdlib>
+#include <limits>
+#include <memory>
+#include <set>
+
+#include <dlfcn.h>
+
+#include <gmock/gmock.h>
+#include <gtest/gtest.h>
+
+#include "export/compiled.hpp"
+#include "gp2/error.hpp"
+#include "gp2/mechanics/state_evaluator.hpp"
+#include "gp2/predictor.hpp"
+#include "gp2/prior/latent_spec.hpp"
+#include "inference/problems.hpp"
+#include "input_error.hpp"
+
+// The exported C must be the Predictor.
+namespace gp2 {
+namespace {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+using test::eps;
+using test::Exported;
+using test::ExportedOf;
+using test::input_error_of;
+using test::largest;
+using test::Problem;
+using testing::HasSubstr;
+using Quantity = View::Quantity;
+using Status = Predictor::Status;
+
+constexpr std::uint64_t export_seed = 191919;
+
+// at states near the observed ones and far off
+MatrixXd random_states(const MatrixXd& observed, int n, std::uint64_t seed) {
+  RandomStream random(seed);
+  MatrixXd states(observed.rows(), n);
+  for (Index i = 0; i < n; ++i) {
+    const VectorXd from = observed.col(i % observed.cols()).array().isNaN().select(0, observed.col(i % observed.cols()));
+    const double size = i % 4 == 3 ? 1 : 0.1;
+    states.col(i) =
+        from + size * test::random_vector(from.size(), random).cwiseProduct(VectorXd::Ones(from.size()) + from.cwiseAbs());
+  }
+  return states;
+}
+
+// the same numbers, and the same status; returns how many states had a prediction
+int expect_predictor(const Posterior& posterior, const View& view, Exported& c, const MatrixXd& states, const Problem& p) {
+  const double tolerance = 1e-12 * std::max(1.0, 1e-3 * test::condition(p));
+  const Predictor predictor(posterior, view), before(posterior.without_data(), view);
+  Predictor::Workspace workspace = predictor.make_workspace(), workspace_before = before.make_workspace();
+  const Index d = view.size(), n = states.rows();
+  VectorXd mean(d), stddev(d), prior(d), c_mean(d), c_stddev(d);
+  MatrixXd jacobian(d, n), c_jacobian(d, n);
+  int n_good = 0;
+  const bool had_failed = testing::Test::HasFailure();
+  for (Index i = 0; i < states.cols(); ++i) {
+    const VectorXd state = states.col(i);
+    const Status status = predictor.mean_and_jacobian(state, mean, jacobian, workspace);
+    EXPECT_EQ(c.mean_and_jacobian(state.data(), c_mean.data(), c_jacobian.data(), c.workspace()), static_cast<int>(status));
+    EXPECT_EQ(predictor.mean_and_stddev(state, mean, stddev, workspace),
+              c.mean_and_stddev(state.data(), c_mean.data(), c_stddev.data(), c.workspace()) == 0 ? Status::ok : status);
+    if (status != Status::ok) {
+      EXPECT_TRUE(std::isnan(c_mean[0]));
+      continue;
+    }
+    ++n_good;
+    static_cast<void>(before.mean_and_stddev(state, prior, prior, workspace_before));
+    EXPECT_LE(largest(c_mean - mean), tolerance * (1 + largest(mean)));
+    EXPECT_LE(largest(c_jacobian - jacobian), tolerance * (1 + largest(jacobian)));
+    // a variance is a difference of numbers of the size of the prior's
+    for (Index r = 0; r < d; ++r) {
+      EXPECT_NEAR(c_stddev[r] * c_stddev[r], stddev[r] * stddev[r], tolerance * (prior.squaredNorm() + eps)) << r;
+    }
+    EXPECT_EQ(c.mean(state.data(), c_stddev.data(), c.workspace()), 0);
+    EXPECT_EQ(c_stddev, c_mean);
+    if (testing::Test::HasFailure() && !had_failed) {
+      ADD_FAILURE() << "at state " << i << ": " << state.transpose();
+      break;
+    }
+  }
+  return n_good;
+}
+
+// the two compilers by turns
+std::string compiler(std::size_t turn) {
+  return turn % 2 == 1 && std::system("clang --version >/dev/null 2>&1") == 0 ? "clang -O2" : "gcc -O2";
+}
+
+TEST(CSourceTest, IsThePredictorInEveryView) {
+  int n_good = 0;
+  std::size_t turn = 0;
+  for (const Problem& p : test::problems(21, export_seed)) {
+    const Posterior posterior(p.prior, p.observations, p.values);
+    View view = View::all(Quantity::all()[turn++ % Quantity::all().size()], *p.prior.system);
+    if (view.size() == 0) view = View::constrained_acceleration(*p.prior.system);
+    if (view.quantity->needs_time_step()) view.time_step = 0.1;
+    if (turn % 7 == 3) view.latent = static_cast<int>(p.prior.latents.size()) - 1;
+    if (turn % 5 == 4) view.rows = {view.rows.back(), 0};
+    for (const Observations& group : p.observations) {
+      if (turn % 3 == 0 && group.view().other_system) view = group.view();
+    }
+    SCOPED_TRACE(fmt::format("{}, {} rows of {}, seed {}", p.name, view.size(), view.quantity->word(), export_seed));
+    Exported c(export_c(posterior, view), "gp2_model", compiler(turn));
+    EXPECT_EQ(c.self_test(c.workspace()), 0);
+    n_good += expect_predictor(posterior, view, c, random_states(p.queries, 400, export_seed), p);
+  }
+  EXPECT_GT(n_good, 6000);
+}
+
+// the first problem of a name
+Problem problem_of(const std::string& name) {
+  for (const Problem& p : test::problems(21, export_seed)) {
+    if (p.name.find(name) != std::string::npos) return p;
+  }
+  throw std::runtime_error("no problem " + name);
+}
+
+TEST(CSourceTest, IsThePredictorOfMixturesInducingPointsAndSums) {
+  RandomStream random(export_seed);
+  const Problem p = problem_of("surface");
+  const View view = View::constrained_acceleration(*p.prior.system);
+  const MatrixXd states = random_states(p.queries, 100, export_seed);
+
+  const std::vector<ModelValues> draws = {p.values, test::random_values(p.prior, p.observations, random),
+                                          test::random_values(p.prior, p.observations, random)};
+  const Posterior mixture = Posterior::mixture(p.prior, p.observations, draws);
+  Exported of_mixture(export_c(mixture, view), "gp2_model", "gcc -O2");
+  EXPECT_EQ(of_mixture.self_test(of_mixture.workspace()), 0);
+  EXPECT_GT(expect_predictor(mixture, view, of_mixture, states, p), 0);
+
+  ModelValues inducing = p.values;
+  const auto points = std::make_shared<InducingPoints>();
+  for (std::size_t a = 0; a < p.prior.latents.size(); ++a) {
+    points->features.push_back(evaluate_features(p.prior, a, p.observations[0].states()).topRows(5));
+  }
+  inducing.inducing = points;
+  const Posterior through_points(p.prior, p.observations, inducing);
+  Exported of_points(export_c(through_points, view), "gp2_model", "gcc -O2");
+  EXPECT_EQ(of_points.self_test(of_points.workspace()), 0);
+  EXPECT_GT(expect_predictor(through_points, view, of_points, states, p), 0);
+
+  const Problem summed = test::with_sums(p, true, export_seed);
+  const Posterior of_sums = test::posterior_of(summed);
+  Exported c(export_c(of_sums, view), "gp2_model", "gcc -O2");
+  EXPECT_EQ(c.self_test(c.workspace()), 0);
+  EXPECT_GT(expect_predictor(of_sums, view, c, states, summed), 0);
+}
+
+const Model& model_with_every_kernel() {
+  static const Model model = Model::parse(R"toml(
+name        = "every kernel"
+coordinates = ["x", "int"]
+inputs      = ["u"]
+[parameters]
+v1 = 1.3
+[mechanics]
+mass  = [["2 + sin(int)", "0.3*x"], ["0.3*x", "v1"]]
+force = ["-x*abs(dx)*dx + min(x, u)", "max(int, dx)^3 - sign(x)*sqrt(1 + int^2) + x^(-2)"]
+[constraints]
+acceleration = ["ddx*cos(int) + x*ddint - dx*dint"]
+[[latent]]
+kernel     = "se*periodic + matern32*linear + rq + matern52 + constant + periodic*matern32"
+features   = ["x", "dint", "u^2"]
+directions = [["x", "0"], ["v1", "exp(-int^2)"]]
+[[latent]]
+kernel     = "linear"
+features   = ["x"]
+directions = "force"
+)toml",
+                                          "every kernel");
+  return model;
+}
+
+TEST(CSourceTest, HasEveryKernelAndEveryOperation) {
+  const Model& model = model_with_every_kernel();
+  Problem p;
+  p.name = "every kernel";
+  p.prior = make_prior(model, {Prior::Mean::force, std::nullopt, false});
+  RandomStream random(export_seed);
+  const MatrixXd states = test::random_matrix(6, 15, random);
+  p.observations = {test::observe(model, View::constrained_acceleration(*model.system), states, random)};
+  p.values = test::random_values(p.prior, p.observations, random);
+  const Posterior posterior = test::posterior_of(p);
+  for (const std::size_t turn : {0U, 1U}) {
+    Exported c(export_c(posterior, View::constrained_acceleration(*model.system)), "gp2_model", compiler(turn));
+    EXPECT_EQ(c.self_test(c.workspace()), 0);
+    EXPECT_GT(
+        expect_predictor(posterior, View::constrained_acceleration(*model.system), c, random_states(states, 200, export_seed), p),
+        150);
+  }
+}
+
+TEST(CSourceTest, ObeysTheConstraint) {
+  const Problem p = problem_of("double_pendulum");
+  const System& system = *p.prior.system;
+  const Posterior posterior = test::posterior_of(p);
+  Exported c(export_c(posterior, View::constrained_acceleration(system), {.stddev = false}), "gp2_model", "gcc -O2");
+  EXPECT_EQ(c.mean_and_stddev, nullptr);
+  const auto at = system.make_evaluator(p.values.parameters, false);
+  VectorXd ddq(system.nq());
+  const MatrixXd states = random_states(p.queries, 100, export_seed);
+  for (const VectorXd state : states.colwise()) {
+    MatrixXd jacobian(system.nq(), state.size());
+    ASSERT_EQ(c.mean_and_jacobian(state.data(), ddq.data(), jacobian.data(), c.workspace()), 0);
+    at->evaluate(state);
+    EXPECT_LE(largest(at->A() * ddq - at->b()), 100 * eps * (1 + largest(at->A())) * (1 + largest(ddq)));
+  }
+}
+
+// a state without a prediction has the Predictor's status: an entry that is not finite, rows that contradict each other, no mass
+TEST(CSourceTest, SaysWhatAStateIsLike) {
+  const Model model = Model::parse(R"toml(
+name        = "two on a line"
+coordinates = ["x", "y"]
+[mechanics]
+mass  = [["x", "0"], ["0", "1"]]
+force = ["0", "-y"]
+[constraints]
+acceleration = ["ddx - ddy", "ddx - ddy + y - 1"]
+[[latent]]
+kernel     = "se"
+features   = ["x", "dy"]
+directions = "force"
+)toml",
+                                   "two on a line");
+  Problem p;
+  p.prior = make_prior(model, {Prior::Mean::force, std::nullopt, false});
+  RandomStream random(export_seed);
+  MatrixXd states = test::random_matrix(5, 6, random).cwiseAbs();
+  states.row(1).setOnes();
+  p.observations = {{states, View::constrained_acceleration(*model.system), MatrixXd(test::random_matrix(2, 6, random)),
+                     VectorXd::Constant(2, 0.3), false}};
+  p.values = test::random_values(p.prior, p.observations, random);
+  const Posterior posterior = test::posterior_of(p);
+  const View view = View::constrained_acceleration(*model.system);
+  const Predictor predictor(posterior, view);
+  Predictor::Workspace workspace = predictor.make_workspace();
+  Exported c(export_c(posterior, view), "gp2_model", "gcc -O2");
+  const double nan = std::numeric_limits<double>::quiet_NaN();
+  std::set<Status> seen;
+  for (const auto& [x, y, dy] :
+       std::vector<std::array<double, 3>>{{1, 1, 1}, {0, 1, 1}, {1, 5, 1}, {-9, 1, 1}, {nan, 1, 1}, {1, 1, nan}}) {
+    const VectorXd state = Eigen::Vector<double, 5>(x, y, 0, dy, 0);
+    VectorXd mean(2), c_mean(2);
+    const Status status = predictor.mean(state, mean, workspace);
+    EXPECT_EQ(c.mean(state.data(), c_mean.data(), c.workspace()), static_cast<int>(status)) << state.transpose();
+    EXPECT_EQ(std::isnan(c_mean[0]), status != Status::ok);
+    seen.insert(status);
+  }
+  EXPECT_GE(seen.size(), 4U);
+}
+
+TEST(CSourceTest, TestsItself) {
+  Problem p = problem_of("surface");
+  const View view = View::constrained_acceleration(*p.prior.system);
+  // weights that cancel are no fault of the compiler …
+  for (VectorXd& noise : p.values.noise_stddev) noise *= 1e-4;
+  CSource c = export_c(test::posterior_of(p), view);
+  Exported sound(c, "gp2_model", compiler(1) + " -ffp-contract=fast");
+  EXPECT_EQ(sound.self_test(sound.workspace()), 0);
+  // … and one that is another is seen
+  const std::size_t weights = c.source.find("{\n  ", c.source.find("real weights_0_0["));
+  c.source.insert(weights + 4, "1.0 + ");
+  Exported broken(c, "gp2_model", "gcc -O2");
+  EXPECT_NE(broken.self_test(broken.workspace()), 0);
+}
+
+TEST(CSourceTest, RunsUnderTheSanitizers) {
+  const Problem p = problem_of("unicycle");
+  const CSource c = export_c(test::posterior_of(p), View::all(Quantity::multipliers, *p.prior.system));
+  const test::TemporaryFolder folder;
+  static_cast<void>(folder.write("gp2_model.h", c.header));
+  static_cast<void>(folder.write("gp2_model.c", c.source));
+  static_cast<void>(folder.write("main.c", R"c(#include "gp2_model.h"
+static gp2_model_workspace w;
+int main(void)
+{
+  return gp2_model_self_test(&w);
+}
+)c"));
+  const std::string build =
+      "cd '" + folder.path().string() +
+      "' && gcc -std=c99 -O1 -g -fsanitize=address,undefined -fno-sanitize-recover=all *.c -lm -o run && ./run";
+  EXPECT_EQ(std::system(build.c_str()), 0);
+}
+
+TEST(CSourceTest, InSinglePrecisionIsRefusedWhereItWouldShow) {
+  Problem p = problem_of("surface");
+  const View view = View::constrained_acceleration(*p.prior.system);
+  CSourceOptions options;
+  options.single_precision = true;
+  const Posterior posterior = test::posterior_of(p);
+  ExportedOf<float> c(export_c(posterior, view, options), "gp2_model", "gcc -O2");
+  EXPECT_EQ(c.self_test(c.workspace()), 0);
+  const Predictor predictor(posterior, view);
+  Predictor::Workspace workspace = predictor.make_workspace();
+  VectorXd mean(view.size());
+  Eigen::VectorXf c_mean(view.size());
+  for (const VectorXd state : p.observations[0].states().colwise()) {
+    ASSERT_EQ(predictor.mean(state, mean, workspace), Status::ok);
+    const Eigen::VectorXf single = state.cast<float>();
+    ASSERT_EQ(c.mean(single.data(), c_mean.data(), c.workspace()), 0);
+    EXPECT_LE(largest(c_mean.cast<double>() - mean), 1e-4 * (1 + largest(mean)));
+  }
+
+  for (VectorXd& noise : p.values.noise_stddev) noise *= 1e-4;
+  for (VectorXd& kernel : p.values.kernel) kernel *= 5;
+  EXPECT_THAT(input_error_of([&] { static_cast<void>(export_c(test::posterior_of(p), view, options)); }),
+              HasSubstr("export to C: in single precision latent "));
+}
+
+TEST(CSourceTest, SaysWhatCannotBeWritten) {
+  const Problem p = problem_of("surface");
+  const View view = View::constrained_acceleration(*p.prior.system);
+  CSourceOptions options;
+  options.name = "double";
+  EXPECT_THAT(input_error_of([&] { static_cast<void>(export_c(test::posterior_of(p), view, options)); }),
+              HasSubstr("`name`: must be a name of C, of letters, digits and _, got 'double'"));
+  EXPECT_THAT(input_error_of([&] { static_cast<void>(export_c(test::posterior_of(p).without_data(), view)); }),
+              HasSubstr("export to C: nothing was observed"));
+
+  const Model& model = test::model("models/surface.toml");
+  LatentSpec code;
+  code.name = "from code";
+  code.kernel = "se";
+  code.features = {"x"};
+  code.feature_code.evaluate = [](const auto& states, const auto& /*parameters*/) { return MatrixXd(states.topRows(1)); };
+  Problem coded;
+  coded.prior = make_prior(model.system, {code});
+  RandomStream random(export_seed);
+  coded.observations = {test::observe(model, view, p.queries, random)};
+  coded.values = test::random_values(coded.prior, coded.observations, random);
+  EXPECT_THAT(input_error_of([&] { static_cast<void>(export_c(test::posterior_of(coded), view)); }),
+              HasSubstr("export to C: features of latent 'from code' are code, which has no text"));
+}
+
+}  // namespace
+}  // namespace gp2
