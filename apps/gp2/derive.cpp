@@ -10,7 +10,6 @@
 #include <fmt/ranges.h>
 
 #include "command.hpp"
-#include "gp2/base/file.hpp"
 #include "gp2/base/statistics.hpp"
 #include "streams.hpp"
 
@@ -95,7 +94,7 @@ void run(DeriveArguments& arguments) {
   const DerivedData data = derive(model, CsvTable::read(arguments.log), arguments.options);
 
   const CsvTable table = as_table(data, *model.system, arguments.output);
-  write_file(arguments.output, table.text());
+  table.write(arguments.output);
   print_notes(data.notes);
   report(data, *model.system);
   const std::set<std::string> episodes(data.episodes.begin(), data.episodes.end());  // parts of one have its name

@@ -9,7 +9,6 @@
 #include <nlohmann/json.hpp>
 
 #include "command.hpp"
-#include "gp2/base/file.hpp"
 #include "gp2/error.hpp"
 #include "gp2/files/fit_file.hpp"
 #include "interruption.hpp"
@@ -125,7 +124,7 @@ void run(ExciteArguments& arguments) {
   }();
   if (on_terminal) print_message("\r\033[K");
 
-  write_file(arguments.output, as_table(found.motion, *fit.model.system, arguments.output).text());
+  as_table(found.motion, *fit.model.system, arguments.output).write(arguments.output);
   print_notes(notes_of(found, arguments));
   if (arguments.json) print_result("{}\n", to_json(found).dump(2));
   if (!found.interrupted) return;

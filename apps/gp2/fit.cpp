@@ -12,7 +12,6 @@
 #include <nlohmann/json.hpp>
 
 #include "command.hpp"
-#include "gp2/base/file.hpp"
 #include "gp2/data/csv.hpp"
 #include "gp2/error.hpp"
 #include "gp2/jobs/fit_job.hpp"
@@ -257,8 +256,7 @@ void read_raw(FitArguments& arguments, const std::atomic<bool>* stop) {
   print_notes(log.data.notes);
   print_notes(log.notes);
   if (!arguments.smoothed.empty()) {
-    const CsvTable smoothed = as_table(log.data, *request.model.system, arguments.smoothed);
-    write_file(arguments.smoothed, smoothed.text());
+    as_table(log.data, *request.model.system, arguments.smoothed).write(arguments.smoothed);
   }
   arguments.request = log.request(std::move(arguments.request), arguments.raw);
 }

@@ -5,7 +5,6 @@
 #include <fmt/format.h>
 
 #include "command.hpp"
-#include "gp2/base/file.hpp"
 #include "gp2/data/csv.hpp"
 #include "gp2/error.hpp"
 
@@ -24,7 +23,7 @@ void run(const GenerateArguments& arguments) {
   require_output(arguments.output, {arguments.model});
   const Model model = Model::read(arguments.model);
   const GeneratedData data = generate(model, request);
-  write_file(arguments.output, as_table(data, *model.system, arguments.output).text());
+  as_table(data, *model.system, arguments.output).write(arguments.output);
   print_notes({fmt::format("{}: {} rows of '{}'", arguments.output, data.states.cols(), model.system->name())});
 }
 

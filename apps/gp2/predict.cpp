@@ -4,10 +4,8 @@
 #include <optional>
 
 #include <fmt/format.h>
-#include <fmt/ranges.h>
 
 #include "command.hpp"
-#include "gp2/base/file.hpp"
 #include "gp2/data/csv.hpp"
 #include "gp2/jobs/predict_job.hpp"
 
@@ -36,22 +34,15 @@ std::vector<std::string> kept_names(const std::vector<std::string>& input, const
 }
 
 // the input as it was, then the new columns
-std::string joined(const CsvTable& input, const PredictOutcome& added) {
-  std::string csv;
-  std::vector<std::string> line;
-  const auto end_line = [&] {
-    csv += fmt::format("{}\n", fmt::join(line, ","));
-    line.clear();
-  };
-  for (const std::string& name : kept_names(input.header(), added.names)) line.push_back(csv_cell(name));
-  line.insert(line.end(), added.names.begin(), added.names.end());
-  end_line();
+void print_joined(const CsvTable& input, const PredictOutcome& added, CsvWriter& csv) {
+  for (const std::string& name : kept_names(input.header(), added.names)) csv.add(name);
+  for (const std::string& name : added.names) csv.add(name);
+  csv.end_line();
   for (int i = 0; i < input.n_rows(); ++i) {
-    for (int column = 0; column < input.n_columns(); ++column) line.push_back(csv_cell(input.cell(i, column)));
-    for (const double value : added.values.col(i)) line.push_back(shortest(value));
-    end_line();
+    for (int column = 0; column < input.n_columns(); ++column) csv.add(input.cell(i, column));
+    for (const double value : added.values.col(i)) csv.add(value);
+    csv.end_line();
   }
-  return csv;
 }
 
 void run(PredictArguments& arguments) {
@@ -62,7 +53,7 @@ void run(PredictArguments& arguments) {
   request.view.system = read_other_system(arguments.system);
   const PredictOutcome predictions = predict(fit, table, request);
   print_notes(predictions.notes);
-  write_file(arguments.output, joined(table, predictions));
+  write_csv(arguments.output, [&](CsvWriter& csv) { print_joined(table, predictions, csv); });
   print_notes({fmt::format("{}: {} predictions, view {}", arguments.output, table.n_rows(), request.view.quantity->word())});
 }
 

@@ -6,7 +6,6 @@
 #include <fmt/ranges.h>
 
 #include "command.hpp"
-#include "gp2/base/file.hpp"
 
 namespace gp2::command {
 
@@ -22,7 +21,7 @@ void run(const ResampleArguments& arguments) {
   const Model model = Model::read(arguments.model);
   const CsvTable log = CsvTable::read(arguments.log);
   const Resample chosen = resample(model, log, arguments.options);
-  write_file(arguments.output, log.take(chosen.rows).text());
+  log.take(chosen.rows).write(arguments.output);
   if (chosen.n_skipped > 0)
     print_notes({fmt::format("{}: {} rows skipped: no number in some feature", arguments.log, chosen.n_skipped)});
   print_notes({fmt::format("measured by {}, each in its standard deviations", fmt::join(chosen.features, ", ")),

@@ -6,7 +6,6 @@
 #include <optional>
 
 #include <fmt/format.h>
-#include <fmt/ranges.h>
 #include <nlohmann/json.hpp>
 
 #include "command.hpp"
@@ -53,41 +52,34 @@ struct Motion {
 };
 
 /// @param commands  written as the inputs, so that the file reads as a log does
-std::string csv_of(const std::vector<Motion>& motions, const Subject& subject, const InputSignal& commands, bool with_sample,
-                   bool with_stddev) {
+void print_motions(const std::vector<Motion>& motions, const Subject& subject, const InputSignal& commands, bool with_sample,
+                   bool with_stddev, CsvWriter& csv) {
   const System& system = subject.system();
   const StateLayout layout = system.layout();
   const std::vector<std::string> names = system.state_names();
-  std::string csv;
-  std::vector<std::string> line;
   Eigen::VectorXd command(layout.nu);
-  const auto end_line = [&] {
-    csv += fmt::format("{}\n", fmt::join(line, ","));
-    line.clear();
-  };
   const std::vector<std::string> accelerations = system.acceleration_names();
-  if (with_sample) line.emplace_back("sample");
-  line.emplace_back("t");
-  line.insert(line.end(), names.begin(), names.begin() + layout.t());
-  line.insert(line.end(), accelerations.begin(), accelerations.end());
-  line.insert(line.end(), system.inputs().begin(), system.inputs().end());
+  if (with_sample) csv.add("sample");
+  csv.add("t");
+  for (int k = 0; k < layout.t(); ++k) csv.add(names[static_cast<std::size_t>(k)]);
+  for (const std::string& name : accelerations) csv.add(name);
+  for (const std::string& name : system.inputs()) csv.add(name);
   if (system.nc() > 0) {
-    const std::vector<std::string> multipliers = View::multipliers(system).names(system);
-    line.insert(line.end(), multipliers.begin(), multipliers.end());
+    for (const std::string& name : View::multipliers(system).names(system)) csv.add(name);
   }
-  for (std::size_t j = 0; with_stddev && j < accelerations.size(); ++j) line.push_back(accelerations[j] + "_std");
-  if (with_stddev) line.emplace_back("distance_from_data");
-  if (subject.model.potential) line.emplace_back("energy");
-  end_line();
+  for (std::size_t j = 0; with_stddev && j < accelerations.size(); ++j) csv.add(accelerations[j] + "_std");
+  if (with_stddev) csv.add("distance_from_data");
+  if (subject.model.potential) csv.add("energy");
+  csv.end_line();
 
   for (std::size_t k = 0; k < motions.size(); ++k) {
     const Trajectory& trajectory = motions[k].trajectory;
     const auto add = [&](const auto& values) {
-      for (const double value : values) line.push_back(shortest(value));
+      for (const double value : values) csv.add(value);
     };
     for (Eigen::Index i = 0; i < trajectory.states.cols(); ++i) {
-      if (with_sample) line.push_back(std::to_string(k));
-      line.push_back(shortest(trajectory.times[i]));
+      if (with_sample) csv.add(std::to_string(k));
+      csv.add(trajectory.times[i]);
       add(trajectory.states.col(i).head(2 * layout.nq));
       add(trajectory.accelerations.col(i));
       commands.evaluate(trajectory.times[i], command);
@@ -95,13 +87,12 @@ std::string csv_of(const std::vector<Motion>& motions, const Subject& subject, c
       if (system.nc() > 0) add(trajectory.records.col(i));
       if (with_stddev) {
         add(motions[k].uncertainty->stddev.col(i));
-        line.push_back(shortest(motions[k].uncertainty->distance[i]));
+        csv.add(motions[k].uncertainty->distance[i]);
       }
-      if (motions[k].energy) line.push_back(shortest((*motions[k].energy)[i]));
-      end_line();
+      if (motions[k].energy) csv.add((*motions[k].energy)[i]);
+      csv.end_line();
     }
   }
-  return csv;
 }
 
 double largest_change(const Eigen::VectorXd& energy) { return (energy.array() - energy[0]).abs().maxCoeff(); }
@@ -230,8 +221,10 @@ void run(const SimulateArguments& arguments) {
   }
   const std::vector<Motion> motions = with_uncertainty(std::move(trajectories), subject, job);
   if (motions.empty()) throw NumericalError(unfinished);
-  write_file(arguments.output, csv_of(motions, subject, job.commands, request.n_samples.has_value(),
-                                      subject.posterior.has_value() && !request.n_samples));
+  write_csv(arguments.output, [&](CsvWriter& csv) {
+    print_motions(motions, subject, job.commands, request.n_samples.has_value(),
+                  subject.posterior.has_value() && !request.n_samples, csv);
+  });
   print_notes(notes_of(motions, subject.system(), arguments));
   if (arguments.json) print_result("{}\n", report_of(motions, subject.system()).dump(2));
   if (!unfinished.empty()) throw NumericalError(fmt::format("{}; {} holds what was reached", unfinished, arguments.output));

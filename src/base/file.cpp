@@ -247,31 +247,58 @@ void require_writable(const std::filesystem::path& path) {
   require_written(path, is_folder && faccessat(AT_FDCWD, folder.c_str(), W_OK | X_OK, AT_EACCESS) == 0);
 }
 
-void write_file(const std::filesystem::path& path, std::string_view content) {
-  const Target target = target_of(path);
-  // /dev/stdout, a pipe: nothing to replace, and a rename would destroy the device
-  if (!target.is_regular()) {
-    const int device = open(target.path.c_str(), O_WRONLY | O_CLOEXEC);
-    require_written(path, device >= 0);
-    const bool good = write_all(device, content);
-    const int reason = errno;
-    const bool closed = close(device) == 0;
-    if (!good) errno = reason;
-    require_written(path, good && closed);
-    return;
+namespace {
+
+/// What is written: a device as it is, or a new file that takes the place of the old one in the end. Gone, should that not come.
+class Output {
+ public:
+  explicit Output(const std::filesystem::path& path) : path_(path), target_(target_of(path)) {}
+  ~Output() {
+    if (file_ >= 0) close(file_);
+    if (!temporary_.empty()) unlink(temporary_.c_str());
+  }
+  Output(const Output&) = delete;
+  Output& operator=(const Output&) = delete;
+
+  void begin() {
+    // /dev/stdout, a pipe: nothing to replace, and a rename would destroy the device
+    file_ = is_new_file() ? open_beside(target_.path, temporary_) : open(target_.path.c_str(), O_WRONLY | O_CLOEXEC);
+    require_written(path_, file_ >= 0);
+    if (is_new_file() && target_.exists) require_written(path_, fchmod(file_, target_.status.st_mode & 07777) == 0);
   }
 
-  std::string temporary;
-  const int file = open_beside(target.path, temporary);
-  require_written(path, file >= 0);
-  bool good = !target.exists || fchmod(file, target.status.st_mode & 07777) == 0;
-  good = good && write_all(file, content) && fsync(file) == 0 && give_name(file, target.path, temporary);
-  good = good && std::rename(temporary.c_str(), target.path.c_str()) == 0;
-  const int reason = errno;
-  close(file);  // after fsync it has nothing left to fail at
-  if (!good && !temporary.empty()) unlink(temporary.c_str());
-  errno = reason;
-  require_written(path, good);
+  void put(std::string_view content) const { require_written(path_, write_all(file_, content)); }
+
+  void finish() {
+    if (is_new_file()) {
+      require_written(path_, fsync(file_) == 0 && give_name(file_, target_.path, temporary_) &&
+                                 std::rename(temporary_.c_str(), target_.path.c_str()) == 0);
+      temporary_.clear();
+    }
+    require_written(path_, close(std::exchange(file_, -1)) == 0);
+  }
+
+ private:
+  [[nodiscard]] bool is_new_file() const { return target_.is_regular(); }
+
+  const std::filesystem::path& path_;
+  Target target_;
+  int file_ = -1;
+  std::string temporary_;  // the new file's name, as soon as it has one
+};
+
+}  // namespace
+
+void write_blocks(const std::filesystem::path& path,
+                  const std::function<void(const std::function<void(std::string_view)>& put)>& produce) {
+  Output output(path);
+  output.begin();
+  produce([&](std::string_view block) { output.put(block); });
+  output.finish();
+}
+
+void write_file(const std::filesystem::path& path, std::string_view content) {
+  write_blocks(path, [&](const auto& put) { put(content); });
 }
 
 }  // namespace gp2

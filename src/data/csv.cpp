@@ -371,36 +371,78 @@ CsvTable CsvTable::take(const std::vector<int>& rows) const {
   return CsvTable(std::make_shared<const Content>(std::move(taken)));
 }
 
-std::string csv_cell(const std::string& text) {
-  const bool plain = text.find_first_of(",\"") == std::string::npos && trim(text) == text && !text.starts_with(byte_order_mark);
-  if (plain) return text;
-  std::string cell = "\"";
-  for (char c : text) cell.append(c == '"' ? 2 : 1, c);  // a quote is written twice
-  return cell += '"';
+void CsvTable::print(CsvWriter& csv) const {
+  for (const std::string& name : header()) csv.add(name);
+  csv.end_line();
+  for (int row = 0; row < n_rows(); ++row) {
+    for (int column = 0; column < n_columns(); ++column) {
+      const double value = content_->number(row, column);
+      if (const std::optional<std::string_view> written = content_->text(row, column)) {
+        csv.add(*written);
+      } else if (std::isnan(value)) {
+        csv.add("");
+      } else {
+        csv.add(value);
+      }
+    }
+    csv.end_line();
+  }
 }
 
 std::string CsvTable::text() const {
-  std::string csv;
-  const auto add = [&](const std::string& cell, int column) {
-    // the line of one empty cell would be blank
-    csv += cell.empty() && n_columns() == 1 ? "\"\"" : csv_cell(cell);
-    csv += column + 1 < n_columns() ? ',' : '\n';
-  };
-  for (int column = 0; column < n_columns(); ++column) add(header()[static_cast<std::size_t>(column)], column);
-  for (int row = 0; row < n_rows(); ++row) {
-    for (int column = 0; column < n_columns(); ++column) {
-      const std::optional<std::string_view> written = content_->text(row, column);
-      const double value = written ? nan : content_->number(row, column);
-      if (std::isnan(value)) {
-        add(std::string(written.value_or("")), column);
-        continue;
-      }
-      std::array<char, 32> digits{};
-      csv.append(digits.data(), std::to_chars(digits.data(), digits.data() + digits.size(), value).ptr);
-      csv += column + 1 < n_columns() ? ',' : '\n';
-    }
+  std::string text;
+  CsvWriter csv([&](std::string_view block) { text += block; });
+  print(csv);
+  csv.flush();
+  return text;
+}
+
+void CsvTable::write(const std::filesystem::path& path) const {
+  write_csv(path, [&](CsvWriter& csv) { print(csv); });
+}
+
+void CsvWriter::begin_cell() {
+  if (!std::exchange(is_line_begin_, false)) block_ += ',';
+}
+
+void CsvWriter::add(std::string_view cell) {
+  begin_cell();
+  const bool plain =
+      cell.find_first_of(",\"") == std::string_view::npos && trim(cell) == cell && !cell.starts_with(byte_order_mark);
+  if (plain) {
+    block_ += cell;
+    return;
   }
-  return csv;
+  block_ += '"';
+  for (const char c : cell) block_.append(c == '"' ? 2 : 1, c);  // a quote is written twice
+  block_ += '"';
+}
+
+void CsvWriter::add(double value) {
+  begin_cell();
+  std::array<char, 32> digits{};
+  block_.append(digits.data(), std::to_chars(digits.data(), digits.data() + digits.size(), value).ptr);
+}
+
+void CsvWriter::end_line() {
+  constexpr std::size_t enough = std::size_t{1} << 16;
+  if (block_.empty() || block_.back() == '\n') block_ += "\"\"";  // the line of one empty cell would be blank
+  block_ += '\n';
+  is_line_begin_ = true;
+  if (block_.size() >= enough) flush();
+}
+
+void CsvWriter::flush() {
+  put_(block_);
+  block_.clear();
+}
+
+void write_csv(const std::filesystem::path& path, const std::function<void(CsvWriter&)>& print) {
+  write_blocks(path, [&](const auto& put) {
+    CsvWriter csv(put);
+    print(csv);
+    csv.flush();
+  });
 }
 
 const std::string& CsvTable::name() const { return content_->name; }

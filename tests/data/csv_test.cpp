@@ -14,6 +14,7 @@
 
 #include <gmock/gmock.h>
 
+#include "gp2/error.hpp"
 #include "io_testing.hpp"
 
 namespace gp2 {
@@ -376,6 +377,39 @@ TEST(WriteFile, LeavesTheOldFileIntactWhenTheDiskIsFull) {
   EXPECT_EQ(status, 0);
   EXPECT_EQ(read_file(path), "old");
   EXPECT_EQ(n_files(folder), 1U);
+}
+
+TEST(WriteFile, LeavesTheOldFileIntactWhenWhatIsWrittenIsNotThere) {
+  const TemporaryFolder folder;
+  const auto path = folder.write("data.csv", "old");
+  EXPECT_EQ(input_error_of([&] {
+              write_blocks(path, [](const auto& put) {
+                put("half of it");
+                throw InputError("no more");
+              });
+            }),
+            "no more");
+  EXPECT_EQ(read_file(path), "old");
+  EXPECT_EQ(n_files(folder), 1U);
+}
+
+TEST(WriteFile, WritesATableInBlocks) {
+  std::vector<std::string> cells;
+  for (int k = 0; k < 30000; ++k) cells.push_back(k % 3 == 0 ? "a, \"b\"" : std::to_string(k) + ".5");
+  const CsvTable table = CsvTable::from_cells("data.csv", {"x"}, cells);
+  const TemporaryFolder folder;
+  table.write(folder / "data.csv");
+  EXPECT_EQ(read_file(folder / "data.csv"), table.text());
+
+  std::size_t n_blocks = 0, largest = 0;
+  CsvWriter csv([&](std::string_view block) { ++n_blocks, largest = std::max(largest, block.size()); });
+  for (const std::string& cell : cells) {
+    csv.add(cell);
+    csv.end_line();
+  }
+  csv.flush();
+  EXPECT_GT(n_blocks, 3U);
+  EXPECT_LT(largest, 70000U);
 }
 
 mode_t permissions(const std::filesystem::path& path) {

@@ -3,7 +3,6 @@
 #include <cmath>
 
 #include <fmt/format.h>
-#include <fmt/ranges.h>
 
 #include "command.hpp"
 #include "gp2/data/csv.hpp"
@@ -12,29 +11,27 @@ namespace gp2::command {
 
 namespace {
 
-std::string cell(const Table::Row& value) {
-  if (value.is_null()) return "";
-  if (value.is_number_float()) return shortest(value.get<double>());
-  return value.is_string() ? csv_cell(value.get<std::string>()) : value.dump();
+void print_cell(const Table::Row& value, CsvWriter& csv) {
+  if (value.is_number_float()) {
+    csv.add(value.get<double>());
+  } else {
+    csv.add(value.is_null() ? "" : value.is_string() ? value.get<std::string>() : value.dump());
+  }
 }
 
 }  // namespace
 
 void Table::write(const std::filesystem::path& stem) const {
-  std::string csv;
-  nlohmann::ordered_json json = nlohmann::ordered_json::array();
-  for (const Row& row : rows_) {
-    std::vector<std::string> names, cells;
-    for (const auto& [name, value] : row.items()) {
-      names.push_back(name);
-      cells.push_back(cell(value));
+  write_csv(stem.string() + ".csv", [&](CsvWriter& csv) {
+    if (rows_.empty()) return;
+    for (const auto& [name, value] : rows_.front().items()) csv.add(name);
+    csv.end_line();
+    for (const Row& row : rows_) {
+      for (const auto& [name, value] : row.items()) print_cell(value, csv);
+      csv.end_line();
     }
-    if (csv.empty()) csv = fmt::format("{}\n", fmt::join(names, ","));
-    csv += fmt::format("{}\n", fmt::join(cells, ","));
-    json.push_back(row);
-  }
-  write_file(stem.string() + ".csv", csv);
-  write_file(stem.string() + ".json", json.dump(1) + "\n");
+  });
+  write_file(stem.string() + ".json", nlohmann::ordered_json(rows_).dump(1) + "\n");
 }
 
 nlohmann::ordered_json number_or_null(double value) {

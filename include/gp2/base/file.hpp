@@ -17,6 +17,11 @@ namespace gp2 GP2_API {
 /// @throws InputError naming the path and the system's reason when that fails; an old file at `path` is then intact.
 void write_file(const std::filesystem::path& path, std::string_view content);
 
+/// The same of what `produce` hands on block after block, so that a long text need not be in memory as a whole.
+/// @throws InputError as write_file, and what `produce` throws.
+void write_blocks(const std::filesystem::path& path,
+                  const std::function<void(const std::function<void(std::string_view)>& put)>& produce);
+
 /// @throws InputError as write_file would, for what can be told before there is content: no such folder, a folder of that name,
 /// no permission.
 void require_writable(const std::filesystem::path& path);

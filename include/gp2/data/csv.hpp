@@ -1,15 +1,19 @@
 #pragma once
 
 #include <filesystem>
+#include <functional>
 #include <memory>
 #include <string>
 #include <string_view>
+#include <utility>
 #include <vector>
 
 #include "gp2/base/file.hpp"
 #include "gp2/export.hpp"
 
 namespace gp2 GP2_API {
+
+class CsvWriter;
 
 /// A table of comma-separated values with one header line. Cells may be quoted; blank lines are skipped. Columns are kept as
 /// doubles, parsed once; a cell that is no number is kept as text, and is an error only when it is asked for as a number, so
@@ -53,6 +57,8 @@ class CsvTable {
   [[nodiscard]] CsvTable take(const std::vector<int>& rows) const;
   /// As a file has it.
   [[nodiscard]] std::string text() const;
+  /// @throws InputError as write_file.
+  void write(const std::filesystem::path& path) const;
 
   [[nodiscard]] const std::string& name() const;
   [[nodiscard]] const std::vector<std::string>& header() const;
@@ -78,12 +84,32 @@ class CsvTable {
  private:
   struct Content;
   class Builder;
+  void print(CsvWriter& csv) const;
   explicit CsvTable(std::shared_ptr<const Content> content);
 
   std::shared_ptr<const Content> content_;
 };
 
-/// A cell of a CSV file that reads back as `text`.
-std::string csv_cell(const std::string& text);
+/// Prints comma-separated values, cell after cell, and hands the text on in blocks.
+class CsvWriter {
+ public:
+  explicit CsvWriter(std::function<void(std::string_view)> put) : put_(std::move(put)) {}
+
+  void add(std::string_view cell);  // quoted where it must be to read back
+  void add(double value);           // in its shortest form
+  void end_line();
+  void flush();  // hands on what is left
+
+ private:
+  void begin_cell();
+
+  std::function<void(std::string_view)> put_;
+  std::string block_;  // whole lines and the one that is being printed
+  bool is_line_begin_ = true;
+};
+
+/// Writes a file of comma-separated values whole or not at all, without ever having its text in memory.
+/// @throws InputError as write_file, and what `print` throws.
+void write_csv(const std::filesystem::path& path, const std::function<void(CsvWriter&)>& print);
 
 }  // namespace gp2
