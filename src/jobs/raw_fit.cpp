@@ -226,7 +226,13 @@ std::vector<Option> options(FitRequest& request, RawFitOptions& raw) {
 }
 
 FitRequest LearnedLog::request(FitRequest asked, const std::string& name) const {
-  CsvTable whole = as_table(data, *asked.model.system, name);
+  DerivedData told = data;
+  if (windows) {
+    // windows are of the positions that were measured, each with its own noise, not of rows on which the constraints hold
+    told.independent = told.measured;
+    for (const int j : told.measured) told.is_independent.row(j) = true;
+  }
+  CsvTable whole = as_table(told, *asked.model.system, name);
   asked.logs = {{.table = whole.take(rows), .windows = windows}};
   asked.problem.commands = std::move(whole);
   asked.problem.columns.clear();
@@ -275,7 +281,7 @@ LearnedLog learn_and_smooth(const FitRequest& request, const CsvTable& log, cons
     if (n < n_raw_rows && !choice.covers_log()) return learned;
     learned.rows = choice.rows();
     learned.windows = std::make_shared<const Windows>(choice.windows());
-    for (DerivedSeries& series : learned.data.series) series.positions = {};
+    for (DerivedSeries& series : learned.data.series) series.positions = std::vector<Measurement>();  // `= {}` keeps the memory
     return learned;
   };
   smoothing.keep_positions = true;

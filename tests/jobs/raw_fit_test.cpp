@@ -135,6 +135,17 @@ TEST(LearnAndSmooth, TakesRowsWhereFewStatesAreAskedFor) {
   EXPECT_EQ(learn_and_smooth(request(), noisy_log().table, {.most_passes = 0}).windows, nullptr);
 }
 
+TEST(LearnedLog, WindowsAreOfAllPositionsWhateverConstraintsHoldAmongThem) {
+  LearnedLog log{derive(pendulum(), noisy_log().table), {0, 1, 2, 3}, {}, {}, {}};
+  log.data.independent = {2};  // as where one constraint holds among q3 and q6, which both are measured
+  const auto says_noise = [&](const char* name) { return log.request(request(), "log").logs.front().table.find(name) >= 0; };
+  EXPECT_TRUE(says_noise("ddq3_std"));
+  EXPECT_FALSE(says_noise("ddq6_std"));
+  log.windows = std::make_shared<const Windows>();
+  EXPECT_TRUE(says_noise("ddq3_std"));
+  EXPECT_TRUE(says_noise("ddq6_std"));
+}
+
 // from as many states as rows
 TEST(LearnAndSmooth, LearnsMoreFromWindowsThanFromRows) {
   for (const int n_states : {200, 400}) {
