@@ -38,6 +38,12 @@ constexpr std::size_t least_for_own_model = 40;  // samples
 constexpr std::size_t least_rows = 5;
 constexpr double most_rows = 1e7;
 
+// Frees what a vector holds of a long log; `= {}` keeps its memory.
+template <typename T>
+void release(std::vector<T>& values) {
+  values = std::vector<T>();
+}
+
 /// An empty cell, or one of the words that loggers write instead.
 bool is_missing(const std::string& cell) {
   std::string word = cell;
@@ -542,7 +548,7 @@ class Deriver {
       task.model = task.fit.model;
       task.kurtosis = task.fit.kurtosis;
       if (learned_ && !is_short(task)) take_learned(task, own);
-      task.channel.measurements = {};  // a long log is told once
+      release(task.channel.measurements);  // a long log is told once
       tell_progress();
     });
   }
@@ -569,12 +575,12 @@ class Deriver {
       task.stddev.resize(3, times.size());
       for (Index i = 0; i < times.size(); ++i)
         task.stddev.col(i) = task.motion.covariance[static_cast<std::size_t>(i)].diagonal().cwiseMax(0).cwiseSqrt();
-      if (!options_.hold_constraints) task.motion.covariance = {};
+      if (!options_.hold_constraints) release(task.motion.covariance);
       DerivedSeries& series = data_.series[static_cast<std::size_t>(k)];
       series = report_of(task, shared[static_cast<std::size_t>(k)]);
       series.start = episodes_[static_cast<std::size_t>(task.episode)].start;
       if (options_.keep_positions) series.positions = positions_of(task, times);
-      task.fit.trusted = {};
+      release(task.fit.trusted);
       tell_progress();
     });
     warn_of_fast_motions();
@@ -669,9 +675,10 @@ class Deriver {
     return fit.log_likelihood + static_cast<double>(fit.outliers.size()) * just_trusted;
   }
 
-  // heavy tails alone may be the sensor's; where the motion fills the band that samples can tell they are the motion's
+  // heavy tails, or many that stand out, may be the sensor's; where the motion fills the band that samples can tell they are the motion's
   void warn_of_fast_motions() {
     constexpr double even = 6;  // kurtosis, 3 for a normal distribution; errors beyond 3 × the best had more in simulated logs
+    constexpr double many = 0.02;  // of the samples, that are left out
     constexpr double share = 0.5;  // of the Nyquist frequency
     for (const int j : data_.measured) {
       int n = 0, n_fast = 0;
@@ -679,7 +686,8 @@ class Deriver {
       for (const DerivedSeries& one : data_.series) {
         if (one.coordinate != j) continue;
         ++n;
-        if (!(one.kurtosis > even && one.bandwidth > share * one.rate / 2)) continue;
+        const bool stands_out = one.kurtosis > even || one.outliers >= many * (one.used + one.outliers);
+        if (!stands_out || !(one.bandwidth > share * one.rate / 2)) continue;
         ++n_fast;
         rate = one.rate;
       }
@@ -726,16 +734,6 @@ class Deriver {
     out.rate = 1 / usual;
     out.bandwidth = bandwidth_of(task.model, usual);
     return out;
-  }
-
-  /// Where the spectrum of the motion, s² c/λ / (1 + (ω/λ)²)^D, sinks into that of the noise, σ² Δt [Hz].
-  static double bandwidth_of(const SmootherModel& model, double time_step) {
-    const int D = static_cast<int>(model.smoothness) + 1;
-    const double rate = std::sqrt(2.0 * D - 1) / model.lengthscale;
-    double intensity = 2;
-    for (int k = 1; k < D; ++k) intensity *= 4.0 * k * k / ((2.0 * k) * (2.0 * k - 1));
-    const double ratio = std::pow(model.signal_stddev / model.noise_stddev, 2) * intensity / (rate * time_step);
-    return ratio > 1 ? rate * std::sqrt(std::pow(ratio, 1.0 / D) - 1) / (2 * std::numbers::pi) : 0;
   }
 
   // rows of all episodes, one after another

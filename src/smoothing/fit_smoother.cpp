@@ -450,6 +450,7 @@ SmootherFit fit_smoother(const std::vector<Measurement>& measurements, const Smo
     fit = fit_smoother(part, options);
   }
   std::vector<Measurement> all = measurements;
+  bool with_time = options.estimate_time_stddev;
   constexpr int max_rounds = 20;
   for (int round = 0; round < max_rounds; ++round) {
     if (!is_known) {
@@ -462,7 +463,11 @@ SmootherFit fit_smoother(const std::vector<Measurement>& measurements, const Smo
     const Hindsight hindsight = hindsight_of(all, trust.used(), fit.model);
     fit.kurtosis = kurtosis_of(hindsight.sizes, trust.used());
     bool changed = trust.choose_again(hindsight.sizes);
-    if (options.estimate_time_stddev) {
+    // the first round knows no rates, and so has no τ
+    constexpr double share = 0.5;  // of the Nyquist frequency
+    const double step = spacing_of(all).usual;
+    if (round == 0 && !is_known && bandwidth_of(fit.model, step) > share / (2 * step)) with_time = false;
+    if (with_time) {
       for (std::size_t k = 0; k < all.size(); ++k) all[k].rate = hindsight.rates[k];
       changed = changed || (round == 0 && !is_long);
     }

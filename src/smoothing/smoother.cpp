@@ -315,6 +315,16 @@ std::optional<Smoothness> smoothness_of(const std::string& word) {
   return std::nullopt;
 }
 
+double bandwidth_of(const SmootherModel& model, double time_step) {
+  // where the spectrum of the motion, s² c/λ / (1 + (ω/λ)²)^D, sinks into that of the noise, σ² Δt
+  const int D = static_cast<int>(model.smoothness) + 1;
+  const double rate = std::sqrt(2.0 * D - 1) / model.lengthscale;
+  double intensity = 2;
+  for (int k = 1; k < D; ++k) intensity *= 4.0 * k * k / ((2.0 * k) * (2.0 * k - 1));
+  const double ratio = std::pow(model.signal_stddev / model.noise_stddev, 2) * intensity / (rate * time_step);
+  return ratio > 1 ? rate * std::sqrt(std::pow(ratio, 1.0 / D) - 1) / (2 * std::numbers::pi) : 0;
+}
+
 double log_likelihood(const SmootherModel& model, const std::vector<Measurement>& measurements, VectorXd* gradient) {
   check(model, measurements, "log_likelihood");
   return with_filter(model, measurements, timeline_of(measurements), [&](const auto& filter) {

@@ -252,6 +252,16 @@ TEST(Smoother, FindsLengthscaleNoiseAndTimingOfAMotion) {
   EXPECT_GT(fit.log_likelihood, punctual.log_likelihood + 100);
 }
 
+TEST(Smoother, TakesFastPlacesOfAMotionForNoTiming) {
+  // bursts between which it hardly moves, a few samples each
+  std::vector<Measurement> measurements;
+  for (int k = 0; k < 300; ++k) {
+    const double t = 0.02 * k, burst = std::sin(1.7 * t);
+    measurements.push_back({t, 3 * t + 0.5 * std::pow(burst, 7) * std::sin(45 * t)});
+  }
+  EXPECT_EQ(fit_smoother(measurements).model.time_stddev, 0);
+}
+
 TEST(Smoother, DistrustsWhatTheOthersContradictAndNothingElse) {
   RandomStream random(7);
   std::vector<Measurement> clean;

@@ -32,6 +32,9 @@ struct SmootherModel {
   static constexpr int n_parameters = 5;
 };
 
+/// Up to which frequency a motion stands out of the noise of positions that are so far apart in time [Hz].
+double bandwidth_of(const SmootherModel& model, double time_step);
+
 /// One number read off a motion.
 struct Measurement {
   double time = 0;          // [s]
@@ -70,7 +73,8 @@ struct SmootherFitOptions {
   /// A measurement that is farther from what the others say of it than this many standard deviations of that difference is
   /// distrusted; 0: none is.
   double outlier_threshold = 5;
-  /// Also estimates τ: the faster a joint, the more a sample suffers from being taken a little early or late.
+  /// Also estimates τ: the faster a joint, the more a sample suffers from being taken a little early or late. Not where the motion
+  /// stands out of the noise up to half the Nyquist frequency: its fast places, where τ is felt, would pass for noise.
   bool estimate_time_stddev = true;
 };
 
