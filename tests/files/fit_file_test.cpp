@@ -295,7 +295,12 @@ FitFile fit_through_points() {
   FitFile fit = fit_of(unicycle());
   InducingReport& inducing = fit.report.inducing.emplace();
   const InducingChoice choice = choose_inducing_points(fit.prior(), fit.observations, fit.posterior().values(), {.most = 9});
-  inducing = {choice.points, choice.n_variables, Eigen::VectorXd::Constant(std::ssize(choice.points->features), 0.25), 4};
+  inducing.points = choice.points;
+  inducing.n_variables = choice.n_variables;
+  inducing.left_out = Eigen::VectorXd::Constant(std::ssize(choice.points->features), 0.25);
+  inducing.n_start = 4;
+  inducing.summary = fit.posterior().summary();
+  inducing.stretches.emplace().pit = Eigen::VectorXd::Constant(Calibration::n_bins, 0.1);
   return fit;
 }
 
@@ -435,6 +440,24 @@ TEST_F(DamagedFit, InducingPointsThatDoNotHoldTogetherAreRefused) {
   EXPECT_EQ(refused([](Json&) {}), "");
   EXPECT_EQ(refused([](Json& i) { i["points"][0][0].erase(0); }), "inducing points whose features differ in number");
   EXPECT_EQ(refused([](Json& i) { i["points"][0][0][0] = 1e200; }), "inducing points hold a number that is too large");
+  EXPECT_EQ(refused([](Json& i) { i["stretches"]["pit"].erase(0); }), "scores have 9 pit, expected 10");
+  const auto refused_summary = [&](const std::function<void(Json&)>& damage) {
+    return refused([&](Json& i) { damage(i["summary"]); });
+  };
+  EXPECT_EQ(refused_summary([](Json& s) { s["step"] = 0; }), "a step of 0 states is not possible");
+  EXPECT_EQ(refused_summary([](Json& s) { s["states"][0] = -1; }), "-1 stands where a number of states must");
+  EXPECT_THAT(refused_summary([](Json& s) { s["states"].push_back(1); }), StartsWith("numbers of states of 2 of 1 observations"));
+  EXPECT_EQ(refused_summary([](Json& s) { s["c"] = "00"; }),
+            fmt::format("2 hexadecimal digits, expected {}", 16 * inducing.at("variables").get<int>()));
+  EXPECT_EQ(refused_summary([](Json& s) { s["c"] = "7ff0000000000000" + s["c"].get<std::string>().substr(16); }),
+            "'7ff0000000000000' is not a finite number in hexadecimal digits");
+  EXPECT_EQ(refused_summary([](Json& s) { s["factors"].push_back(s["factors"][0]); }), "factors of more latents than there are");
+  EXPECT_THAT(refused_summary([](Json& s) { s["factors"].clear(); }), StartsWith("factors of 0 of "));
+  EXPECT_EQ(refused_summary([](Json& s) { s["factors"][0]["points"][0] = 99; }), "99 is no inducing point");
+  EXPECT_EQ(refused_summary(
+                [](Json& s) { s["factors"][0]["L"] = "8000000000000000" + s["factors"][0]["L"].get<std::string>().substr(16); }),
+            "a factor of inducing points is not positive");
+  EXPECT_EQ(refused_summary([](Json& s) { s["weight"].push_back(1); }), "weights of some latents only");
   EXPECT_EQ(refused([](Json& i) { i["points"][0][0][0] = nullptr; }), "null stands where a number must");
   const std::size_t n_latents = inducing.at("points").size(), n_features = inducing.at("points")[0].size();
   EXPECT_EQ(refused([](Json& i) { i["points"].erase(0); }),
