@@ -1008,7 +1008,7 @@ CSource Writer::write() {
       view_.names(system(), view_.latent ? prior_.latents[static_cast<std::size_t>(view_.latent->first)].name : "");
   texts_["title"] = in_comment(fmt::format("{}: {} as learned by gp2 {}.", system().name(), fmt::join(names, ", "), version()));
   std::string& about = texts_["about"];
-  about += fmt::format(" * The {} view, of {} observed states{}.\n", view_.quantity->word(), components_.front()->samples.size(),
+  about += fmt::format(" * The {} view, of {} observed states{}.\n", view_.quantity->word(), posterior_.n_states(),
                        has("mixture") ? fmt::format(", a mixture over {} draws of hyperparameters", components_.size()) : "");
   for (const std::string& line : options_.about) about += " * " + in_comment(line) + "\n";
   for (const std::string& label : system().constraint_labels()) about += in_comment(fmt::format(" * It obeys {} = 0.\n", label));
@@ -1052,7 +1052,7 @@ CSource export_c(const Posterior& posterior, const View& view, const CSourceOpti
     throw InputError(fmt::format("`name`: must be a name of C, of letters, digits and _, got '{}'", options.name));
   }
   const auto& components = posterior.conditioned();
-  if (components.front()->samples.empty()) throw InputError("export to C: nothing was observed, so there is nothing to export");
+  if (posterior.n_states() == 0) throw InputError("export to C: nothing was observed, so there is nothing to export");
   return Writer(posterior, components, view, options).write();
 }
 

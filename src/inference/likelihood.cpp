@@ -285,7 +285,7 @@ double Likelihood::evaluate(const ModelValues& values, ModelGradient* gradient, 
 
   // T12, T14
   const auto total = [](const std::optional<GramValue>& value) {
-    const double sum = value ? value->data_fit + value->complexity + value->constant : infinity;
+    const double sum = value ? value->constant + value->data_fit + value->complexity : infinity;
     return std::isfinite(sum) ? sum : infinity;
   };
   if (gradient == nullptr) return total(gram.value(*blocks));

@@ -154,7 +154,9 @@ namespace {
 std::optional<MechanicsBatch::Fault> singular_fault(const Prior& prior, const View& view, int state) {
   const std::optional<std::string> text = what_needs_acceleration(prior, view);
   if (!text) return std::nullopt;
-  return MechanicsBatch::Fault{state, fmt::format("the mass matrix M is singular, so that there is no M⁻¹, but {}", *text)};
+  MechanicsBatch::Fault fault{state, {}};
+  fault.text = fmt::format("the mass matrix M is singular, so that there is no M⁻¹, but {}", *text);
+  return fault;
 }
 
 }  // namespace

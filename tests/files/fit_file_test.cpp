@@ -550,7 +550,8 @@ TEST_F(DamagedFit, WrittenAnewByOtherProgramsIsTheSame) {
 
 TEST_F(DamagedFit, OfAnOlderVersionInNameOnlyIsRefused) {
   std::string text = small_fit();
-  text.replace(text.find(fmt::format("\"version\": {}", FitFile::format_version)), 12, "\"version\": 5");
+  const std::string version = fmt::format("\"version\": {}", FitFile::format_version);
+  text.replace(text.find(version), version.size(), "\"version\": 5");
   EXPECT_THAT(error_of(text), HasSubstr("changed after gp2 wrote it"));
 }
 

@@ -85,11 +85,11 @@ def test_python_threads_predict_at_the_same_time_as_the_data_grow(posterior, arm
 
 def test_update_is_the_fit_of_all_data_under_the_same_hyperparameters(arm, arm_log, arm_states, tmp_path):
     first, more = ({name: values[part] for name, values in columns_of(arm_log).items()} for part in (slice(20), slice(20, 30)))
-    posterior = gp2.fit(arm, first, max_iterations=0)
+    posterior = gp2.fit(arm, first, max_iterations=0, discrepancy="none")
     posterior.save(tmp_path / "first.json")
     posterior.update(more)
     assert posterior.n_data == 30
-    anew = gp2.fit(arm, arm_log, start=tmp_path / "first.json", max_iterations=0)
+    anew = gp2.fit(arm, arm_log, start=tmp_path / "first.json", max_iterations=0, discrepancy="none")
     updated, expected = posterior.predict(arm_states), anew.predict(arm_states)
     np.testing.assert_allclose(updated.mean, expected.mean, rtol=0, atol=1e-10 * np.abs(expected.mean).max())
     np.testing.assert_allclose(updated.cov, expected.cov, rtol=0, atol=1e-10 * np.abs(expected.cov).max())
@@ -104,12 +104,12 @@ def test_update_is_the_fit_of_all_data_under_the_same_hyperparameters(arm, arm_l
 
 
 def test_removed_data_are_as_if_they_had_not_been(arm, arm_log, arm_states, tmp_path):
-    posterior = gp2.fit(arm, arm_log, max_iterations=0)
+    posterior = gp2.fit(arm, arm_log, max_iterations=0, discrepancy="none")
     posterior.save(tmp_path / "all.json")
     posterior.remove_oldest(12)
     assert posterior.n_data == 18
     rest = {name: values[12:] for name, values in columns_of(arm_log).items()}
-    anew = gp2.fit(arm, rest, start=tmp_path / "all.json", max_iterations=0)
+    anew = gp2.fit(arm, rest, start=tmp_path / "all.json", max_iterations=0, discrepancy="none")
     # scales are held, those of another fit are its own data's; what starts by value is equal
     expected = anew.predict(arm_states).mean
     np.testing.assert_allclose(posterior.predict(arm_states).mean, expected, rtol=0, atol=1e-10 * np.abs(expected).max())

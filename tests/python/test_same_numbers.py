@@ -9,7 +9,7 @@ import gp2
 from conftest import MODELS, program, run, write_csv
 
 VIEWS = ["constrained", "unconstrained", "constraint-force", "multipliers", "next-velocity"]
-LATENTS = [None, "friction of the tip", "friction of the joints"]
+LATENTS = [None, "friction of the tip", "friction of the joints", "discrepancy"]
 TOLERANCE = 1e-12  # of the largest number of a kind
 
 # states of the arm lie off the other plane
