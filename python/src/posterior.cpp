@@ -210,9 +210,16 @@ void update_with(PyPosterior& self, const py::object& data, const std::vector<st
   Observations more = more_observations(self.file, self.posterior, to_table(data, "data"), request, notes);
   tell(notes);
   const std::optional<Posterior> kept = kept_by_others(self);
-  if (share) self.posterior = forget(std::move(self.posterior), *share);
-  self.posterior = update(std::move(self.posterior), std::move(more));
-  keep_newest(self.posterior, request);
+  if (!share && !window) {
+    self.posterior = update(std::move(self.posterior), std::move(more));
+    return;
+  }
+  // a step that is refused undoes those before it
+  Posterior next = self.posterior;
+  if (share) next = forget(std::move(next), *share);
+  next = update(std::move(next), std::move(more));
+  keep_newest(next, request);
+  self.posterior = std::move(next);
 }
 
 // ---------------------------------------------------------------- motion
