@@ -47,10 +47,12 @@ BlocksOfStates::BlocksOfStates(const Prior& prior, const std::vector<Observation
       values_(values),
       gradient_parameters_(std::move(gradient_parameters)),
       kept_(kept) {
+  const bool makes_blocks =
+      kept == nullptr || std::any_of(kept->begin(), kept->end(), [](const Kept& one) { return one.features.empty(); });
   for (std::size_t g = 0; g < observations.size(); ++g) {
     const int n = observations[g].n_data();
     for (int first = 0; first < n; first += block_size) states_.push_back({g, first, std::min(block_size, n - first)});
-    size_of_b_.push_back(n > block_size && kept == nullptr ? largest_b(prior, observations[g], values.parameters) : 0);
+    size_of_b_.push_back(n > block_size && makes_blocks ? largest_b(prior, observations[g], values.parameters) : 0);
   }
 }
 
