@@ -20,5 +20,6 @@ setup(
         "-DGP2_INSTALL=OFF",
         "-DBUILD_SHARED_LIBS=OFF",
         "-DGP2_PYTHON_INSTALL_DIR=.",
+        "-DGP2_PYTHON_BUNDLE=ON",
     ],
 )

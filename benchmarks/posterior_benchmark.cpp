@@ -32,7 +32,7 @@ struct Problem {
       const gp2::Scales scales = gp2::default_scales(prior, observations);
       gp2::PriorOptions options;
       options.discrepancy = {Standard::discrepancy_lengthscale * scales.feature_stddev[0],
-                             Eigen::VectorXd::Constant(3, Standard::discrepancy_stddev * 0.1)};
+                             Eigen::VectorXd::Constant(3, Standard::discrepancy_median * 0.1)};
       prior = gp2::make_prior(model, options);
     }
     values = gp2::model_values(prior, observations, gp2::default_hyperparameters(prior, observations, {}, {}));

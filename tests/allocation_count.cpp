@@ -11,10 +11,11 @@
 #endif
 
 namespace {
-thread_local std::size_t count = 0;
+thread_local std::size_t count = 0, releases = 0;
 }  // namespace
 
 std::size_t gp2::test::n_allocations() { return count; }
+std::size_t gp2::test::n_releases() { return releases; }
 
 #ifdef GP2_TEST_SANITIZER_ALLOCATES
 
@@ -22,8 +23,8 @@ std::size_t gp2::test::n_allocations() { return count; }
 extern "C" int __sanitizer_install_malloc_and_free_hooks(void (*malloc_hook)(const volatile void*, std::size_t),
                                                          void (*free_hook)(const volatile void*));
 namespace {
-[[maybe_unused]] const int installed =
-    __sanitizer_install_malloc_and_free_hooks([](const volatile void*, std::size_t) { ++count; }, [](const volatile void*) {});
+[[maybe_unused]] const int installed = __sanitizer_install_malloc_and_free_hooks(
+    [](const volatile void*, std::size_t) { ++count; }, [](const volatile void*) { ++releases; });
 }  // namespace
 
 #else
@@ -34,6 +35,7 @@ void* __libc_malloc(std::size_t size);
 void* __libc_calloc(std::size_t n, std::size_t size);
 void* __libc_realloc(void* memory, std::size_t size);
 void* __libc_memalign(std::size_t alignment, std::size_t size);
+void __libc_free(void* memory);
 
 void* malloc(std::size_t size) {
   ++count;
@@ -59,6 +61,10 @@ int posix_memalign(void** memory, std::size_t alignment, std::size_t size) {
   ++count;
   *memory = __libc_memalign(alignment, size);
   return *memory == nullptr ? ENOMEM : 0;
+}
+void free(void* memory) {
+  if (memory != nullptr) ++releases;
+  __libc_free(memory);
 }
 }
 

@@ -6,8 +6,9 @@
 // a test that uses it has allocation_count.cpp among its sources.
 namespace gp2::test {
 
-/// How often this thread has allocated so far.
+/// How often this thread has allocated, and freed, so far.
 std::size_t n_allocations();
+std::size_t n_releases();
 
 /// How often f() allocates.
 template <typename Function>

@@ -127,17 +127,18 @@ Option start_option(std::string& value) {
                    "constraints, or is 0"});
 }
 
-void require_output(const std::string& output, const std::vector<std::string>& inputs) {
+void require_output(const std::string& output, const std::vector<std::string>& inputs, const char* option) {
   const std::filesystem::path folder = std::filesystem::path(output).parent_path();
   if (!folder.empty() && !std::filesystem::is_directory(folder)) {
-    throw InputError(fmt::format("-o {}: there is no folder '{}'; make it first", output, folder.string()));
+    throw InputError(fmt::format("{} {}: there is no folder '{}'; make it first", option, output, folder.string()));
   }
   require_writable(output);
   std::error_code not_there;
   if (!std::filesystem::is_regular_file(output, not_there)) return;
   for (const std::string& input : inputs) {
     if (std::filesystem::equivalent(output, input, not_there)) {
-      throw InputError(fmt::format("-o {}: that is the input {}, which would be lost; write to another file", output, input));
+      throw InputError(
+          fmt::format("{} {}: that is the input {}, which would be lost; write to another file", option, output, input));
     }
   }
 }
@@ -177,6 +178,13 @@ Option output(std::string& value, const std::string& sample, const std::string& 
   return required(std::move(option));
 }
 
+Option quiet_option() {
+  static bool quiet = false;
+  Option option{"quiet", &quiet, "", "neither progress nor notes on stderr; warnings and errors remain"};
+  option.flag = "-q,--quiet";
+  return option;
+}
+
 Option required(Option option) {
   option.is_required = true;
   return option;
@@ -197,7 +205,9 @@ std::string with_flags(const std::string& message) {
 }
 
 void print_notes(const std::vector<std::string>& notes) {
-  for (const std::string& note : notes) print_message("gp2: {}\n", with_flags(note));
+  for (const std::string& note : notes) {
+    if (!is_quiet() || note.starts_with("warning")) print_message("gp2: {}\n", with_flags(note));
+  }
 }
 
 }  // namespace gp2::command

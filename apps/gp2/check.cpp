@@ -1,9 +1,11 @@
 #include "gp2/jobs/check_job.hpp"
 
+#include <algorithm>
 #include <memory>
 #include <optional>
 
 #include <fmt/format.h>
+#include <nlohmann/json.hpp>
 
 #include "command.hpp"
 #include "gp2/data/csv.hpp"
@@ -16,27 +18,45 @@ namespace {
 
 struct CheckArguments {
   std::string model, data;
+  bool json = false;
   CheckOptions options;
 };
 
-int print(const std::vector<Finding>& findings) {
-  int n_errors = 0;
+const char* word_of(Finding::Level level) {
+  return level == Finding::Level::good ? "ok" : level == Finding::Level::warning ? "warning" : "error";
+}
+
+int count(const std::vector<Finding>& findings, Finding::Level level) {
+  return static_cast<int>(
+      std::count_if(findings.begin(), findings.end(), [&](const Finding& one) { return one.level == level; }));
+}
+
+void print_json(const std::vector<Finding>& findings) {
+  nlohmann::ordered_json list = nlohmann::ordered_json::array();
+  for (const Finding& finding : findings) list.push_back({{"level", word_of(finding.level)}, {"text", with_flags(finding.text)}});
+  const nlohmann::ordered_json all = {{"errors", count(findings, Finding::Level::error)},
+                                      {"warnings", count(findings, Finding::Level::warning)},
+                                      {"findings", list}};
+  print_result("{}\n", all.dump(2));
+}
+
+void print(const std::vector<Finding>& findings) {
   for (const Finding& finding : findings) {
     const char* mark = finding.level == Finding::Level::good      ? "ok     "
                        : finding.level == Finding::Level::warning ? "warning"
                                                                   : "ERROR  ";
     print_result("{}  {}\n", mark, with_flags(finding.text));
-    if (finding.level == Finding::Level::error) ++n_errors;
   }
-  return n_errors;
 }
 
 void run(const CheckArguments& arguments) {
   const Model model = Model::read(arguments.model);
   std::optional<CsvTable> log;
   if (!arguments.data.empty()) log = CsvTable::read(arguments.data, CsvTable::Keep::numbers);
-  const int n_errors = print(check(model, log ? &*log : nullptr, arguments.options));
-  if (n_errors > 0) throw InputError(fmt::format("{}: {} of the checks failed", arguments.model, n_errors));
+  const std::vector<Finding> findings = check(model, log ? &*log : nullptr, arguments.options);
+  (arguments.json ? print_json : print)(findings);
+  if (const int n_errors = count(findings, Finding::Level::error); n_errors > 0)
+    throw InputError(fmt::format("{}: {} of the checks failed", arguments.model, n_errors));
 }
 
 }  // namespace
@@ -52,6 +72,7 @@ Command check_command() {
   command.options = {argument("MODEL", a->model, "model file"),
                      {"data", &a->data, "CSV", "CSV log", "states of the model's [sampling] or [motion]"}};
   for (Option& option : options(a->options)) command.options.push_back(std::move(option));
+  command.options.push_back({"json", &a->json, "", "findings as JSON on stdout"});
   command.run = [a](const std::set<std::string>&) { run(*a); };
   return command;
 }

@@ -38,12 +38,19 @@ Command update_command();
 Command export_command();
 Command report_command();
 Command reproduce_command();
+Command completion_command();
+Command help_command(const std::vector<std::string>& names);
+
+/// In the order of --help.
+std::vector<Command> all_commands();
 
 /// An argument by its position, which must be given: MODEL.
 Option argument(const std::string& flag, std::string& value, const std::string& text);
 /// -o, --output, which must be given.
 /// @param sample  CSV, say
 Option output(std::string& value, const std::string& sample, const std::string& text);
+/// -q, --quiet, of commands that say how far they are.
+Option quiet_option();
 /// An option that must be given.
 Option required(Option option);
 
@@ -79,8 +86,9 @@ Option start_option(std::string& value);
 
 /// Whether a file can be written at the end: better said before an hour of work than after.
 /// @param inputs  files that are read, which it must not replace; "" for none
+/// @param option  that names it, for messages
 /// @throws InputError when its folder does not exist, it is an input, or as require_writable.
-void require_output(const std::string& output, const std::vector<std::string>& inputs);
+void require_output(const std::string& output, const std::vector<std::string>& inputs, const char* option = "-o");
 
 /// The folder -o, which need not be there.
 /// @throws InputError when it cannot be made.

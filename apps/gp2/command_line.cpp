@@ -1,5 +1,6 @@
 #include "command_line.hpp"
 
+#include <algorithm>
 #include <charconv>
 #include <cstdint>
 #include <map>
@@ -10,23 +11,21 @@
 #include <utility>
 #include <variant>
 
+#include <sys/ioctl.h>
+#include <unistd.h>
+
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 #include <CLI/CLI.hpp>
 
+#include "base/suggestion.hpp"
 #include "gp2/error.hpp"
+#include "pages.hpp"
+#include "streams.hpp"
 
 namespace gp2::command {
 
 namespace {
-
-// "docs/priors.md" stays in help; `seed` becomes --seed
-std::string help_of(const Option& option) {
-  std::string text = with_flags(option.text);
-  if (std::holds_alternative<YesByDefault>(option.value)) text = "leave out " + text;
-  if (!option.otherwise.empty()) text += fmt::format(" (default: {})", option.otherwise);
-  return text;
-}
 
 void set_number_or_word(const NumberOrWord& one, const Option& option, const std::string& text) {
   for (const auto& [word, flag] : one.words) {
@@ -64,34 +63,13 @@ void set_from_text(const Option& option, const std::string& text) {
 // `--mean zero` \| `force`
 std::string usage_of(const Option& option) {
   const std::string flag = flag_of(option);
-  const auto words = [&](const std::vector<std::string>& all) { return fmt::format("`{} {}`", flag, fmt::join(all, "` \\| `")); };
-  return std::visit(Overloaded{[&](const Choice& one) { return words(one.words); },
-                               [&](const Switch& one) {
-                                 return words({one.on, one.off});
-                               },
-                               [&](const NumberOrWord& one) {
-                                 std::vector<std::string> all = {option.sample};
-                                 for (const auto& [word, flag_value] : one.words) all.push_back(word);
-                                 return words(all);
-                               },
-                               [&](const auto&) {
-                                 const std::size_t comma = flag.find(',');  // of -o,--output
-                                 const std::string sample = option.sample.empty() ? "" : " " + option.sample;
-                                 return fmt::format("`{}{}`", flag.substr(0, comma), sample);
-                               }},
-                    option.value);
-}
-
-// What a new request holds, where that says it.
-std::string default_of(const Option& option) {
-  const auto word = [](const std::string& text) { return text.empty() ? text : "`" + text + "`"; };
-  return std::visit(
-      Overloaded{[&](const Choice& one) { return word(one.get()); },
-                 [&](const Switch& one) { return word(*one.value ? one.on : one.off); },
-                 [](int* number) { return std::to_string(*number); },
-                 [](std::uint64_t* number) { return std::to_string(*number); },
-                 [](double* number) { return fmt::format("{}", *number); }, [](const auto&) { return std::string(); }},
-      option.value);
+  if (std::vector<std::string> words = words_of(option); !words.empty()) {
+    if (!option.sample.empty()) words.insert(words.begin(), option.sample);
+    return fmt::format("`{} {}`", flag, fmt::join(words, "` \\| `"));
+  }
+  const std::size_t comma = flag.find(',');  // of -o,--output
+  const std::string sample = option.sample.empty() ? "" : " " + option.sample;
+  return fmt::format("`{}{}`", flag.substr(0, comma), sample);
 }
 
 // docs/priors.md -> [priors.md](priors.md)
@@ -107,6 +85,14 @@ CLI::Validator not_negative() {
     std::uint64_t number = 0;
     const auto [end, error] = std::from_chars(text.data(), text.data() + text.size(), number);
     return error == std::errc::result_out_of_range ? "must be below 2^64, got " + text : std::string();
+  };
+  return {check, ""};
+}
+
+CLI::Validator one_of(const std::vector<std::string>& words) {
+  const auto check = [words](const std::string& text) {
+    if (std::find(words.begin(), words.end(), text) != words.end()) return std::string();
+    return fmt::format("'{}' is none of {}{}", text, fmt::join(words, ", "), suggestion(text, words));
   };
   return {check, ""};
 }
@@ -133,10 +119,44 @@ class Parsing {
       const auto text = texts_.find(option.name);
       if (text != texts_.end()) set_from_text(option, text->second);
     }
+    if (given.contains("quiet")) be_quiet();
+    take_streams(given);
     command_.run(given);
   }
 
  private:
+  // - is standard input or, of a file that is written, standard output; also in --data -@OTHER.toml and --also VIEW:-.
+  void take_streams(const std::set<std::string>& given) const {
+    int n_read = 0, n_written = 0;
+    const auto take = [&](const Option& option, std::string& text) {
+      if (option.name == "output" || option.name == "smoothed") {
+        if (text != "-") return;
+        text = "/dev/stdout";
+        ++n_written;
+        return;
+      }
+      const std::size_t colon = text.find(":-"), place = colon == std::string::npos ? 0 : colon + 1;
+      if (text.substr(place) != "-" && !text.substr(place).starts_with("-@")) return;
+      if (option.name == "checkpoint") throw UsageError{"--checkpoint - is written again and again: name a file"};
+      text.replace(place, 1, "/dev/stdin");
+      ++n_read;
+    };
+    for (const Option& option : command_.options) {
+      if (!given.contains(option.name)) continue;
+      std::visit(Overloaded{[&](std::string* text) { take(option, *text); },
+                            [&](const Repeated& texts) {
+                              for (std::string& text : *texts.values) take(option, text);
+                            },
+                            [&](NamedNumbers* numbers) { take(option, numbers->file); }, [](const auto&) {}},
+                 option.value);
+    }
+    if (n_read > 1) throw UsageError{"standard input is read once, but - stands for several files: name all others"};
+    if (n_written > 1) throw UsageError{"standard output is one file, but - stands for several: name all others"};
+    if (n_written == 0) return;
+    if (given.contains("json")) throw UsageError{"--json prints to standard output, which is the file too: name a file"};
+    leave_stdout_to_a_file();
+  }
+
   CLI::Option* add(const Option& option) {
     const std::string flag = flag_of(option), help = help_of(option);
     CLI::Option* added = std::visit(
@@ -168,7 +188,7 @@ class Parsing {
 
   CLI::Option* add_words(const Option& option, const std::vector<std::string>& words, const std::string& chosen) {
     std::string& text = texts_[option.name] = chosen;
-    CLI::Option* added = app_.add_option(flag_of(option), text, help_of(option))->check(CLI::IsMember(words));
+    CLI::Option* added = app_.add_option(flag_of(option), text, help_of(option))->check(one_of(words));
     return chosen.empty() ? added : added->capture_default_str();
   }
 
@@ -189,10 +209,63 @@ class Parsing {
 
 }  // namespace
 
+// "docs/priors.md" stays in help; `seed` becomes --seed
+std::string help_of(const Option& option) {
+  std::string text = with_flags(option.text);
+  if (std::holds_alternative<YesByDefault>(option.value)) text = "leave out " + text;
+  if (!option.otherwise.empty()) text += fmt::format(" (default: {})", option.otherwise);
+  return text;
+}
+
+std::vector<std::string> words_of(const Option& option) {
+  return std::visit(Overloaded{[](const Choice& one) { return one.words; },
+                               [](const Switch& one) {
+                                 return std::vector<std::string>{one.on, one.off};
+                               },
+                               [](const NumberOrWord& one) {
+                                 std::vector<std::string> words;
+                                 for (const auto& [word, flag] : one.words) words.push_back(word);
+                                 return words;
+                               },
+                               [](const auto&) { return std::vector<std::string>(); }},
+                    option.value);
+}
+
+std::string default_of(const Option& option) {
+  return std::visit(
+      Overloaded{[&](const Choice& one) { return one.get(); }, [&](const Switch& one) { return *one.value ? one.on : one.off; },
+                 [](int* number) { return std::to_string(*number); },
+                 [](std::uint64_t* number) { return std::to_string(*number); },
+                 [](double* number) { return fmt::format("{}", *number); }, [](const auto&) { return std::string(); }},
+      option.value);
+}
+
+std::size_t help_width() {
+  constexpr std::size_t usual = 80, readable = 110;
+  winsize size = {};
+  if (ioctl(STDOUT_FILENO, TIOCGWINSZ, &size) != 0 || size.ws_col == 0) return usual;
+  return std::clamp<std::size_t>(size.ws_col, 40, readable);
+}
+
+std::string unknown_option(const CLI::App& app) {
+  for (const CLI::App* command : app.get_subcommands()) {
+    std::vector<std::string> flags;
+    for (const CLI::Option* option : command->get_options()) {
+      for (const std::string& name : option->get_lnames()) flags.push_back("--" + name);
+    }
+    for (const std::string& given : command->remaining()) {
+      if (given.size() < 2 || given[0] != '-') continue;
+      const std::string flag = given.substr(0, given.find('='));
+      return fmt::format("gp2 {} has no option {}{}", command->get_name(), flag, suggestion(flag, flags));
+    }
+  }
+  return "";
+}
+
 void add_command(CLI::App& app, Command command) {
   CLI::App* subcommand = app.add_subcommand(command.name, command.text);
-  subcommand->footer("Example:\n  " + command.example);
   const auto parsing = std::make_shared<Parsing>(*subcommand, std::move(command));
+  subcommand->formatter_fn([parsing](auto&&...) { return help_page(parsing->command(), help_width()); });
   subcommand->callback([parsing] { parsing->run(); });
   // for scripts/options; like --version it asks for nothing else
   subcommand->set_version_flag("--options-as-markdown", [parsing] { return markdown_table(parsing->command()); })->group("");
@@ -202,9 +275,11 @@ std::string markdown_table(const Command& command) {
   std::string table = "| option | default | |\n|---|---|---|\n";
   for (const Option& option : command.options) {
     const std::string usage = usage_of(option);
-    const std::string otherwise = option.is_required         ? "required"
-                                  : option.otherwise.empty() ? default_of(option)
-                                                             : option.otherwise;
+    std::string otherwise = option.is_required ? "required" : option.otherwise;
+    if (otherwise.empty()) {
+      otherwise = default_of(option);
+      if (!otherwise.empty() && !words_of(option).empty()) otherwise = "`" + otherwise + "`";
+    }
     std::string text = with_flags(option.text);
     if (std::holds_alternative<YesByDefault>(option.value)) text = "leaves out " + text;
     table += fmt::format("| {} | {} | {} |\n", usage, otherwise, with_links(text));

@@ -4,8 +4,6 @@
 #include <memory>
 #include <set>
 
-#include <unistd.h>
-
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
@@ -86,12 +84,11 @@ void run(DeriveArguments& arguments) {
   require_output(arguments.output, {arguments.log, arguments.model, arguments.like});
   const Model model = Model::read(arguments.model);
   if (!arguments.like.empty()) arguments.options.like = CsvTable::read(arguments.like);
-  if (isatty(STDERR_FILENO) != 0) {
-    arguments.options.progress = [](double fraction) {
-      print_message("\rgp2: smoothing {:3.0f} %{}", 100 * fraction, fraction < 1 ? "" : "\n");
-    };
-  }
+  arguments.options.progress = [](double fraction) {
+    if (progress_is_due()) print_progress(fmt::format("smoothing {:3.0f} %", 100 * fraction));
+  };
   const DerivedData data = derive(model, CsvTable::read(arguments.log), arguments.options);
+  end_progress();
 
   const CsvTable table = as_table(data, *model.system, arguments.output);
   table.write(arguments.output);
@@ -120,6 +117,7 @@ Command derive_command() {
                       "tested on the other has gone through one filter",
                       "models of its own"}};
   for (Option& option : options(a->options)) command.options.push_back(std::move(option));
+  command.options.push_back(quiet_option());
   command.options.push_back(output(a->output, "CSV", "CSV file to write"));
   command.run = [a](const std::set<std::string>&) { run(*a); };
   return command;

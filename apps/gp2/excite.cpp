@@ -3,8 +3,6 @@
 #include <cmath>
 #include <memory>
 
-#include <unistd.h>
-
 #include <fmt/format.h>
 #include <nlohmann/json.hpp>
 
@@ -96,11 +94,11 @@ std::vector<std::string> notes_of(const Excitation& found, const ExciteArguments
   return notes;
 }
 
-// one line that rewrites itself, on a terminal only
 void print_search(const ExciteProgress& p) {
+  if (!progress_is_due()) return;
   const double left = p.seconds * (p.n_all - p.n_motions) / p.n_motions;
   const std::string best = std::isnan(p.best) ? "none within the limits yet" : fmt::format("deviations fall to {:.3g}", p.best);
-  print_message("\rgp2: motion {}/{}  {}  about {:.0f} s left   ", p.n_motions, p.n_all, best, std::max(left, 0.0));
+  print_progress(fmt::format("motion {}/{}  {}  about {:.0f} s left", p.n_motions, p.n_all, best, std::max(left, 0.0)));
 }
 
 void run(ExciteArguments& arguments) {
@@ -111,18 +109,16 @@ void run(ExciteArguments& arguments) {
   arguments.request.within = parse_limits(arguments.within, "--within");
 
   const Interruption interruption;
-  const bool on_terminal = isatty(STDERR_FILENO) != 0;
   const Excitation found = [&] {
     try {
-      return excite(fit.model, fit.posterior(), fit.report.hyperparameters, arguments.request,
-                    on_terminal ? print_search : std::function<void(const ExciteProgress&)>(), interruption.stop());
+      return excite(fit.model, fit.posterior(), fit.report.hyperparameters, arguments.request, print_search, interruption.stop());
     } catch (const NumericalError&) {
       if (interruption.signal() == 0) throw;
       print_notes({fmt::format("{} before there was a motion: nothing is written", interruption.text())});
       throw Interrupted{interruption.signal()};
     }
   }();
-  if (on_terminal) print_message("\r\033[K");
+  end_progress();
 
   as_table(found.motion, *fit.model.system, arguments.output).write(arguments.output);
   print_notes(notes_of(found, arguments));
@@ -151,6 +147,7 @@ Command excite_command() {
   };
   for (Option& option : options(a->request)) command.options.push_back(std::move(option));
   command.options.push_back({"json", &a->json, "", "report on stdout as JSON"});
+  command.options.push_back(quiet_option());
   command.options.push_back(
       output(a->output, "CSV", "CSV file to write: t, the planned q, dq and ddq, and the inputs, for gp2 simulate too"));
   command.run = [a](const std::set<std::string>&) { run(*a); };

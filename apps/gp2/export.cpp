@@ -21,11 +21,19 @@ struct ExportArguments {
 void run(ExportArguments& arguments) {
   const FitFile fit = FitFile::read(arguments.fit);
   arguments.request.view.system = read_other_system(arguments.system);
-  const ExportOutcome outcome = export_fit(fit, fit.posterior(), arguments.request);
-  make_folder(arguments.output);
+  // a robot's file is one, and is called as it is asked for
+  const bool is_robot = arguments.request.to == ExportRequest::Target::mjcf;
+  const ExportOutcome outcome =
+      is_robot ? export_robot(fit, arguments.request) : export_fit(fit, fit.posterior(), arguments.request);
+  if (is_robot) {
+    require_output(arguments.output, {arguments.fit, outcome.robot});
+  } else {
+    make_folder(arguments.output);
+  }
   std::vector<std::string> written;
   for (const auto& [name, text] : outcome.files) {
-    const std::filesystem::path path = std::filesystem::path(arguments.output) / name;
+    std::filesystem::path path = arguments.output;
+    if (!is_robot) path /= name;
     write_file(path, text);
     written.push_back(fmt::format("{} ({:.0f} kB)", path.string(), static_cast<double>(text.size()) / 1e3));
   }
@@ -37,14 +45,17 @@ void run(ExportArguments& arguments) {
 
 Command export_command() {
   const auto a = std::make_shared<ExportArguments>();
-  Command command{"export",
-                  "Write a fit as C: predictions that obey the constraints on machines without gp2, in CasADi and in acados",
-                  "gp2 export fit.json --to c -o controller",
-                  {},
-                  {}};
+  Command command{
+      "export",
+      "Write a fit as C: predictions that obey the constraints on machines without gp2, in CasADi and in acados; or the "
+      "parameters of a robot into its own file",
+      "gp2 export fit.json --to c -o controller",
+      {},
+      {}};
   command.options = {argument("FIT.json", a->fit, "file written by gp2 fit"), {"system", &a->system, "OTHER.toml", system_help}};
   for (Option& option : options(a->request)) command.options.push_back(std::move(option));
-  command.options.push_back(output(a->output, "DIR", "folder for the files; it is made where there is none"));
+  command.options.push_back(
+      output(a->output, "OUT", "folder for the files, which is made where there is none; of mjcf the file"));
   command.run = [a](const std::set<std::string>&) { run(*a); };
   return command;
 }

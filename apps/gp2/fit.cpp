@@ -5,8 +5,6 @@
 #include <limits>
 #include <memory>
 
-#include <unistd.h>
-
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 #include <nlohmann/json.hpp>
@@ -57,18 +55,14 @@ SideInformation read_side_information(const std::string& text) {
   return {*quantity, at == std::string::npos ? "" : view.substr(at + 1), read_log(text.substr(colon + 1))};
 }
 
-// one line that rewrites itself, on a terminal only, ten times a second
-void print_progress(const Progress& p) {
-  static double last = -1;
-  if (last >= 0 && p.seconds - last < 0.1) return;
-  last = p.seconds;
+void say_how_far(const Progress& p) {
+  if (!progress_is_due()) return;
   const double left = p.fraction > 0 ? p.seconds * (1 - p.fraction) / p.fraction : 0;
   if (p.is_drawing) {
-    print_message("\rgp2: drawing hyperparameters  best {:.4f}  about {:.0f} s left             ", p.best, left);
-    return;
+    return print_progress(fmt::format("drawing hyperparameters  best {:.4f}  about {:.0f} s left", p.best, left));
   }
-  print_message("\rgp2: restart {}/{}  iteration {}  best {:.4f}  about {:.0f} s left   ", p.restart + 1, p.n_restarts,
-                p.iteration, p.best, left);
+  print_progress(fmt::format("restart {}/{}  iteration {}  best {:.4f}  about {:.0f} s left", p.restart + 1, p.n_restarts,
+                             p.iteration, p.best, left));
 }
 
 Json number_or_null(double value) { return std::isfinite(value) ? Json(value) : Json(); }
@@ -275,7 +269,7 @@ FitJob prepare(FitArguments& arguments, const Interruption& interruption) {
   arguments.request = request_of(fit);
   arguments.request.threads = threads;
   read_data(arguments);
-  return prepare_fit(std::move(arguments.request));
+  return prepare_fit_again(fit, std::move(arguments.request));
 }
 
 // A fit needs a model and data, or another fit whose options it takes.
@@ -287,7 +281,7 @@ void require_inputs(const FitArguments& arguments, const std::set<std::string>& 
       throw UsageError{"--data or --raw is required, or --also alone"};
     return;
   }
-  const std::set<std::string> allowed = {"again", "data", "commands", "also", "threads", "json", "output"};
+  const std::set<std::string> allowed = {"again", "data", "commands", "also", "threads", "checkpoint", "json", "quiet", "output"};
   for (const std::string& name : given) {
     if (!allowed.contains(name)) {
       throw InputError(fmt::format("`again`: {} has its model and options: leave out {}", arguments.again,
@@ -300,18 +294,26 @@ void require_inputs(const FitArguments& arguments, const std::set<std::string>& 
 void run(FitArguments& arguments, const std::set<std::string>& given) {
   require_inputs(arguments, given);
   require_output(arguments.output, inputs_of(arguments));
-  if (!arguments.smoothed.empty()) require_output(arguments.smoothed, inputs_of(arguments));
+  if (!arguments.smoothed.empty()) require_output(arguments.smoothed, inputs_of(arguments), "--smoothed");
+  const std::string checkpoint = arguments.request.checkpoint;
+  if (!checkpoint.empty()) require_output(checkpoint, inputs_of(arguments), "--checkpoint");
   const std::shared_ptr<const Ranks> ranks = join_ranks();
-  const Interruption interruption(!ranks);  // mpirun ends its processes
+  const LastWord last_word(checkpoint);
+  const Interruption interruption(!ranks, checkpoint.empty() ? nullptr : &last_word);  // mpirun ends its processes
   FitJob job = unless_interrupted(interruption, [&] { return prepare(arguments, interruption); });
   if (ranks) require_same_data(*ranks, job.problem.observations);
   job.options.ranks = ranks;
+  job.checkpoint = checkpoint;
   print_notes(job.notes);
-  const bool on_terminal = isatty(STDERR_FILENO) != 0;
   const FitOutcome outcome = unless_interrupted(interruption, [&] {
-    return run_fit(job, on_terminal ? print_progress : std::function<void(const Progress&)>(), interruption.stop());
+    try {
+      return run_fit(job, say_how_far, interruption.stop());
+    } catch (...) {
+      last_word.say();
+      throw;
+    }
   });
-  if (on_terminal) print_message("\r\033[K");
+  end_progress();
 
   print_notes(outcome.notes);
   const FitFile& file = outcome.file;
@@ -350,7 +352,7 @@ Command fit_command() {
                   "gp2 fit models/surface.toml --data train.csv --mean force -o fit.json",
                   {},
                   {}};
-  command.options = {
+  const std::vector<Option> inputs = {
       argument("MODEL", a->model, "model file"),
       {"data", Repeated{&a->data}, "LOG[@OTHER.toml]",
        "CSV log; columns are found by name, in any order. Several: --data A.csv --data B.csv@OTHER.toml, where B was measured on "
@@ -364,13 +366,14 @@ Command fit_command() {
        "instead of --data: CSV log of t and positions, which learning and smoothing by turns makes data of (docs/raw-logs.md)"},
       {"smoothed", &a->smoothed, "CSV", "file to write q, dq and ddq of the raw log to, with deviations", "", "", "", "raw"},
   };
-  for (Option& option : options(a->request, a->raw_options)) command.options.push_back(std::move(option));
-  command.options.insert(
-      command.options.end(),
-      {{"again", &a->again, "FIT.json",
-        "instead of MODEL and options: those of an earlier fit, and its data unless others are given. Same bits"},
-       {"json", &a->json, "", "report as JSON on stdout"},
-       output(a->output, "FIT.json", "fitted model to write (JSON)")});
+  command.options =
+      joined({in_group("Data", inputs),
+              options(a->request, a->raw_options),
+              {{"again", &a->again, "FIT.json",
+                "instead of MODEL and options: those of an earlier fit, and its data unless others are given. Same bits"},
+               {"json", &a->json, "", "report as JSON on stdout"},
+               quiet_option(),
+               output(a->output, "FIT.json", "fitted model to write (JSON)")}});
   command.options.front().is_required = false;  // --again stands for it
   command.run = [a](const std::set<std::string>& given) { run(*a, given); };
   return command;

@@ -12,12 +12,15 @@
 #include <fmt/ranges.h>
 #include <CLI/CLI.hpp>
 
+#include "base/suggestion.hpp"
 #include "blas_choice.hpp"
+#include "command.hpp"
 #include "command_line.hpp"
 #include "gp2/base/blas.hpp"
 #include "gp2/base/version.hpp"
 #include "gp2/error.hpp"
 #include "interruption.hpp"
+#include "pages.hpp"
 #include "ranks.hpp"
 #include "streams.hpp"
 
@@ -68,47 +71,57 @@ std::string build_and_machine() {
 }
 
 // CLI11 would only say that a command is missing
-void require_known_command(const CLI::App& app, int argc, char** argv) {
+void require_known_command(const std::vector<gp2::command::Command>& commands, int argc, char** argv) {
   if (argc < 2 || argv[1][0] == '-') return;
   std::vector<std::string> names;
-  for (const CLI::App* command : app.get_subcommands(nullptr)) names.push_back(command->get_name());
+  for (const gp2::command::Command& command : commands) names.push_back(command.name);
   if (std::find(names.begin(), names.end(), argv[1]) != names.end()) return;
-  throw CLI::ParseError(fmt::format("there is no command '{}'; there are: {}", argv[1], fmt::join(names, ", ")), exit_bad_input);
+  std::string mend = gp2::suggestion(argv[1], names);
+  if (mend.empty()) mend = fmt::format("; there are: {}", fmt::join(names, ", "));
+  throw gp2::command::UsageError{fmt::format("there is no command '{}'{}", argv[1], mend)};
+}
+
+int usage_error(const std::string& text) {
+  return failed(exit_bad_input, fmt::format("error: {}\nRun gp2 --help, or gp2 COMMAND --help.", text));
 }
 
 }  // namespace
+
+namespace gp2::command {
+
+std::vector<Command> all_commands() {
+  std::vector<Command> commands;
+  std::vector<std::string> names;
+  for (const auto command : {show_command, check_command, generate_command, derive_command, resample_command, fit_command,
+                             predict_command, simulate_command, excite_command, evaluate_command, update_command, shoot_command,
+                             report_command, export_command, reproduce_command, completion_command}) {
+    commands.push_back(command());
+    names.push_back(commands.back().name);
+  }
+  names.emplace_back("help");
+  commands.push_back(help_command(names));
+  return commands;
+}
+
+}  // namespace gp2::command
 
 int main(int argc, char** argv) {
   gp2::command::choose_blas_kernel(argv);
   gp2::command::prepare_streams();
   std::signal(SIGXFSZ, SIG_IGN);  // a file beyond the limit (ulimit -f) is an error to tell, like a full disk
-  CLI::App app{
-      "Learn the dynamics of constrained mechanical systems from measured data, with predictions that obey the constraints "
-      "exactly."};
+  CLI::App app;
   app.name("gp2");
   app.require_subcommand(1);
   bool verbose = false;
-  CLI::Option* verbose_flag =
-      app.add_flag("--verbose", verbose, "With --version: also the compiler, the BLAS and what it uses of the processor");
+  CLI::Option* verbose_flag = app.add_flag("--verbose", verbose);
   const auto version_text = [&verbose]() -> std::string { return verbose ? build_and_machine() : gp2::version(); };
-  verbose_flag->needs(app.set_version_flag("--version", version_text));
-  app.footer(
-      "Example:\n"
-      "  gp2 generate models/surface.toml --n 100 -o train.csv\n"
-      "  gp2 fit models/surface.toml --data train.csv -o fit.json\n"
-      "  gp2 predict fit.json --states train.csv --cov std -o prediction.csv\n\n"
-      "Exit codes: 0 done, 1 numerical failure, 2 bad input, 128 + n ended by signal n (130 Ctrl-C, 143 SIGTERM; gp2 fit "
-      "and gp2 excite save the best so far). Results go to stdout, talk to stderr.");
-  for (const auto command :
-       {gp2::command::show_command, gp2::command::check_command, gp2::command::generate_command, gp2::command::derive_command,
-        gp2::command::resample_command, gp2::command::fit_command, gp2::command::predict_command, gp2::command::simulate_command,
-        gp2::command::excite_command, gp2::command::evaluate_command, gp2::command::update_command, gp2::command::shoot_command,
-        gp2::command::report_command, gp2::command::export_command, gp2::command::reproduce_command}) {
-    gp2::command::add_command(app, command());
-  }
+  verbose_flag->needs(app.set_version_flag("-V,--version", version_text));
+  const std::vector<gp2::command::Command> commands = gp2::command::all_commands();
+  for (const gp2::command::Command& command : commands) gp2::command::add_command(app, command);
+  app.formatter_fn([&](auto&&...) { return gp2::command::help_page(commands, gp2::command::help_width()); });
 
   try {
-    require_known_command(app, argc, argv);
+    require_known_command(commands, argc, argv);
     if (argc > 1 && std::string(argv[1]) != "fit" && gp2::command::n_started_together() > 1) {
       throw gp2::InputError("mpirun is for gp2 fit; start this command alone");
     }
@@ -118,9 +131,11 @@ int main(int argc, char** argv) {
     app.exit(help_or_version, text, text);
     gp2::command::write_stdout(text.str());
   } catch (const CLI::ParseError& error) {
-    return failed(exit_bad_input, fmt::format("error: {}\nRun gp2 --help, or gp2 COMMAND --help.", error.what()));
+    // CLI11 names an option that is missing before one that is misspelt
+    const std::string unknown = gp2::command::unknown_option(app);
+    return usage_error(unknown.empty() ? error.what() : unknown);
   } catch (const gp2::command::UsageError& error) {
-    return failed(exit_bad_input, fmt::format("error: {}\nRun gp2 --help, or gp2 COMMAND --help.", error.text));
+    return usage_error(error.text);
   } catch (const gp2::command::Interrupted& interrupted) {
     return 128 + interrupted.signal;
   } catch (const gp2::InputError& error) {

@@ -73,7 +73,9 @@ void run(PredictArguments& arguments) {
     });
     if (row != n_rows || file_version(arguments.states) != version) throw_changed(arguments.states);
   });
-  print_notes({fmt::format("{}: {} predictions, view {}", arguments.output, n_rows, request.view.quantity->word())});
+  print_notes({request.inverse_dynamics
+                   ? fmt::format("{}: inputs at {} states", arguments.output, n_rows)
+                   : fmt::format("{}: {} predictions, view {}", arguments.output, n_rows, request.view.quantity->word())});
 }
 
 }  // namespace

@@ -18,7 +18,7 @@ struct ReportArguments {
 
 void run(const ReportArguments& arguments) {
   const ReportOptions& options = arguments.options;
-  require_output(arguments.output, {options.fit, options.data, options.truth});
+  require_output(arguments.output, {options.fit, options.data, options.system, options.truth});
   if (!options.columns.empty() && options.data.empty()) {
     throw InputError("--map names columns of --data, which is not given; the fit has its own data");
   }

@@ -21,7 +21,7 @@ namespace gp2::command {
 namespace {
 
 struct SimulateArguments {
-  std::string file, start, inputs, output;
+  std::string file, system, start, inputs, output;
   std::optional<double> t_start, t_end, time_step;
   SimulateRequest request;
   bool json = false;
@@ -29,19 +29,30 @@ struct SimulateArguments {
 
 /// What is simulated: a model by its own equations, or a fit by its posterior.
 struct Subject {
-  Model model;
-  std::optional<Posterior> posterior;  // of a fit
+  std::shared_ptr<const Model> model;  // of what moves
+  std::optional<Posterior> posterior;  // of a fit …
+  std::optional<FitSystem> asked;      // … and the system that moves
 
-  [[nodiscard]] const System& system() const { return *model.system; }
+  [[nodiscard]] const System& system() const { return *model->system; }
 };
 
-Subject read_subject(const std::string& file) {
-  const std::string text = read_file(file);
+Subject read_subject(const SimulateArguments& arguments) {
+  std::string text = read_file(arguments.file);
   const std::size_t first = text.find_first_not_of(" \t\r\n");
-  if (first == std::string::npos || text[first] != '{') return {Model::read(file), std::nullopt};
-  FitFile fit = FitFile::read(file);
-  Posterior posterior = fit.posterior();
-  return {std::move(fit.model), std::move(posterior)};
+  if (first == std::string::npos || text[first] != '{') {
+    if (!arguments.system.empty()) {
+      throw InputError(
+          fmt::format("--system goes with a FIT.json; {} is a model: simulate {} itself", arguments.file, arguments.system));
+    }
+    return {std::make_shared<const Model>(Model::parse(std::move(text), arguments.file)), {}, {}};
+  }
+  const auto fit = std::make_shared<const FitFile>(FitFile::parse(text, arguments.file));
+  const Posterior posterior = fit->posterior();
+  const std::shared_ptr<const Model> other = read_other_system(arguments.system);
+  FitSystem asked = system_of(*fit, posterior.prior(), other);
+  // keeps alive what it is part of
+  const std::shared_ptr<const Model> model = asked.model == other.get() ? other : std::shared_ptr<const Model>(fit, &fit->model);
+  return {model, posterior, std::move(asked)};
 }
 
 /// One motion and what goes with it.
@@ -51,9 +62,11 @@ struct Motion {
   std::optional<Eigen::VectorXd> energy;         // of a model with a potential
 };
 
-/// @param commands  written as the inputs, so that the file reads as a log does
-void print_motions(const std::vector<Motion>& motions, const Subject& subject, const InputSignal& commands, bool with_sample,
+/// The inputs are written as commanded, and those of contacts as the motion made them, so that the file reads as a log does.
+void print_motions(const std::vector<Motion>& motions, const Subject& subject, const SimulateJob& job, bool with_sample,
                    bool with_stddev, CsvWriter& csv) {
+  const InputSignal& commands = job.commands;
+  const std::vector<Contact>& contacts = job.options.contacts;
   const System& system = subject.system();
   const StateLayout layout = system.layout();
   const std::vector<std::string> names = system.state_names();
@@ -69,7 +82,7 @@ void print_motions(const std::vector<Motion>& motions, const Subject& subject, c
   }
   for (std::size_t j = 0; with_stddev && j < accelerations.size(); ++j) csv.add(accelerations[j] + "_std");
   if (with_stddev) csv.add("distance_from_data");
-  if (subject.model.potential) csv.add("energy");
+  if (subject.model->potential) csv.add("energy");
   csv.end_line();
 
   for (std::size_t k = 0; k < motions.size(); ++k) {
@@ -83,6 +96,7 @@ void print_motions(const std::vector<Motion>& motions, const Subject& subject, c
       add(trajectory.states.col(i).head(2 * layout.nq));
       add(trajectory.accelerations.col(i));
       commands.evaluate(trajectory.times[i], command);
+      for (const Contact& contact : contacts) command[contact.input] = trajectory.states(layout.u(contact.input), i);
       add(command);
       if (system.nc() > 0) add(trajectory.records.col(i));
       if (with_stddev) {
@@ -93,6 +107,26 @@ void print_motions(const std::vector<Motion>& motions, const Subject& subject, c
       csv.end_line();
     }
   }
+}
+
+const char* word_of(ContactEvent::Kind kind) {
+  return kind == ContactEvent::Kind::impact ? "impact" : kind == ContactEvent::Kind::made ? "made" : "released";
+}
+
+// "contacts: 12 impacts, made 1, released 0 times, the first at t = 0.45; the impacts took 3.2 J"
+std::optional<std::string> contacts_note(const Trajectory& motion) {
+  if (motion.events.empty()) return std::nullopt;
+  const auto count = [&](ContactEvent::Kind kind) {
+    return std::count_if(motion.events.begin(), motion.events.end(), [&](const ContactEvent& one) { return one.kind == kind; });
+  };
+  double loss = 0;
+  for (const ContactEvent& event : motion.events) loss += event.energy_loss;
+  const ContactEvent& last = motion.events.back();
+  return fmt::format(
+      "contacts: {} impacts, made {} and released {} times, the first event at t = {:.6g}, the last, {}, at {:.6g}; "
+      "impacts took {:.6g} J",
+      count(ContactEvent::Kind::impact), count(ContactEvent::Kind::made), count(ContactEvent::Kind::released),
+      motion.events.front().time, word_of(last.kind), last.time, loss);
 }
 
 double largest_change(const Eigen::VectorXd& energy) { return (energy.array() - energy[0]).abs().maxCoeff(); }
@@ -128,6 +162,15 @@ nlohmann::ordered_json report_of(const std::vector<Motion>& motions, const Syste
   report["start_displacement"] = motions[0].trajectory.start_displacement;
   report["max_energy_drift"] = motions[0].energy ? nlohmann::ordered_json(energy_drift) : nullptr;
   report["n_lower_rank"] = n_lower_rank;
+  nlohmann::ordered_json events = nlohmann::ordered_json::array();
+  for (const ContactEvent& event : motions[0].trajectory.events) {
+    events.push_back({{"t", event.time},
+                      {"contact", system.constraint_labels()[static_cast<std::size_t>(event.row)]},
+                      {"kind", word_of(event.kind)},
+                      {"approach", event.approach},
+                      {"energy_loss", event.energy_loss}});
+  }
+  report["contact_events"] = std::move(events);
   report["multiplier_sign_changes"] = nlohmann::ordered_json::object();
   const std::vector<std::vector<double>> changes = multiplier_sign_changes(motions[0].trajectory);
   for (std::size_t k = 0; k < changes.size(); ++k) {
@@ -175,6 +218,7 @@ std::vector<std::string> notes_of(const std::vector<Motion>& motions, const Syst
   notes.push_back(fmt::format("{}: {} rows, {} steps; drift |c| ≤ {:.3g}, |dc/dt| ≤ {:.3g}", arguments.output, n_rows,
                               report["steps"].get<int>(), report["max_position_drift"].get<double>(),
                               report["max_velocity_drift"].get<double>()));
+  if (const std::optional<std::string> note = contacts_note(first)) notes.push_back(*note);
   if (motions[0].energy) {
     const Eigen::VectorXd& energy = *motions[0].energy;
     notes.push_back(fmt::format("energy: {:.6g} J at the start, {:.6g} J at the end, largest change {:.3g} J", energy[0],
@@ -198,18 +242,20 @@ std::vector<Motion> with_uncertainty(std::vector<Trajectory> trajectories, const
   for (Trajectory& trajectory : trajectories) {
     if (trajectory.times.size() == 0) continue;
     Motion& motion = motions.emplace_back(Motion{std::move(trajectory), {}, {}});
-    if (subject.posterior) motion.uncertainty = motion_uncertainty(*subject.posterior, motion.trajectory);
-    if (subject.model.potential) motion.energy = mechanical_energy(subject.model, job.parameters, motion.trajectory.states);
+    if (subject.posterior) {
+      motion.uncertainty = motion_uncertainty(*subject.posterior, motion.trajectory, subject.asked->other_system);
+    }
+    if (subject.model->potential) motion.energy = mechanical_energy(*subject.model, job.parameters, motion.trajectory.states);
   }
   return motions;
 }
 
 void run(const SimulateArguments& arguments) {
-  require_output(arguments.output, {arguments.file, arguments.start, arguments.inputs});
-  const Subject subject = read_subject(arguments.file);
-  const SimulateRequest request = read_request(arguments, subject.model);
-  const SimulateJob job = subject.posterior ? prepare_simulation(subject.model, *subject.posterior, request)
-                                            : prepare_simulation(subject.model, request);
+  require_output(arguments.output, {arguments.file, arguments.system, arguments.start, arguments.inputs});
+  const Subject subject = read_subject(arguments);
+  const SimulateRequest request = read_request(arguments, *subject.model);
+  const SimulateJob job = subject.posterior ? prepare_simulation(*subject.asked, *subject.posterior, request)
+                                            : prepare_simulation(*subject.model, request);
   print_notes(job.notes);
   std::vector<Trajectory> trajectories;
   std::string unfinished;
@@ -222,8 +268,7 @@ void run(const SimulateArguments& arguments) {
   const std::vector<Motion> motions = with_uncertainty(std::move(trajectories), subject, job);
   if (motions.empty()) throw NumericalError(unfinished);
   write_csv(arguments.output, [&](CsvWriter& csv) {
-    print_motions(motions, subject, job.commands, request.n_samples.has_value(),
-                  subject.posterior.has_value() && !request.n_samples, csv);
+    print_motions(motions, subject, job, request.n_samples.has_value(), subject.posterior.has_value() && !request.n_samples, csv);
   });
   print_notes(notes_of(motions, subject.system(), arguments));
   if (arguments.json) print_result("{}\n", report_of(motions, subject.system()).dump(2));
@@ -241,6 +286,7 @@ Command simulate_command() {
                   {}};
   command.options = {
       argument("FILE", a->file, "file written by gp2 fit, or a model file: its force and [truth]"),
+      {"system", &a->system, "OTHER.toml", system_help},
       start_option(a->start),
       required({"t_end", &a->t_end, "SECONDS", "end of the motion [s]"}),
       {"t_start", &a->t_start, "SECONDS", "its start [s]", "t of the CSV of --start, or 0"},

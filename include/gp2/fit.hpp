@@ -29,7 +29,11 @@ struct Progress {
   bool is_drawing = false;  // hyperparameters, after the restarts
 };
 
+struct FitReport;
+
 struct FitOptions {
+  static constexpr double seconds_between_improvements = 5;
+
   int n_restarts = 5;                             // runs of the optimiser; the first starts at the hyperparameters' own values
   int max_iterations = 1000;                      // per restart; 0: condition at the starting values
   std::uint64_t seed = 0;                         // of the other starting points
@@ -42,9 +46,12 @@ struct FitOptions {
   bool standard_errors = true;                    // FitReport::uncertainty, where parameters are estimated
   int n_draws = 0;                                // of hyperparameters, over which the posterior is then the mixture; 0: none
   int n_inducing = 0;                             // inducing variables at most, through which all is learned; 0: none, exact
-  std::shared_ptr<const Ranks> ranks = nullptr;   // other processes that work on the same fit, through inducing points
+  std::shared_ptr<const Ranks> ranks = nullptr;   // other processes that work on the same fit
   int n_train = 0;                                // states at most that hyperparameters are found from, evenly taken; 0: all
   std::function<void(const Progress&)> progress;  // called from worker threads, one at a time
+  /// Told of the best so far, as if the fit were interrupted there, with the observations that it was found from: whenever a run of the
+  /// optimiser has got lower, and while one does every `seconds_between_improvements`. Called as `progress` is.
+  std::function<void(const FitReport&, const std::vector<Observations>&)> improved = {};
   /// Set: return the best so far, as not converged: interrupted. The evaluations under way are given up within a second or so,
   /// draws that are not complete are dropped, and the posterior is conditioned when it is first asked (Posterior::lazy).
   const std::atomic<bool>* stop = nullptr;

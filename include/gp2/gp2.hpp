@@ -7,6 +7,7 @@
 #include "gp2/error.hpp"
 #include "gp2/files/fit_file.hpp"
 #include "gp2/fit.hpp"
+#include "gp2/inference/online_predictor.hpp"
 #include "gp2/jobs/fit_problem.hpp"
 #include "gp2/model.hpp"
 #include "gp2/observations.hpp"

@@ -134,7 +134,9 @@ class Model {
   void define(const std::string& symbol, Expression value);
   /// Points of the robot stay as they are.
   /// @param forbidden  symbols that an error about an unknown one does not list or suggest, with all that depend on them
-  [[nodiscard]] Expression parse_symbols(std::string_view text, const std::vector<Expression>& forbidden = {}) const;
+  /// @param parse  reads the text: parse_expression or parse_condition
+  [[nodiscard]] Expression parse_symbols(std::string_view text, const std::vector<Expression>& forbidden = {},
+                                         decltype(parse_expression)& parse = parse_expression) const;
 
   std::shared_ptr<RobotExpressions> robot_expressions_;  // null without a robot
   std::map<std::string, Expression, std::less<>> symbols_;

@@ -131,6 +131,7 @@ class Posterior {
 
  private:
   friend class Predictor;
+  friend class OnlinePredictor;
   friend PathwiseSamples sample_paths(const Posterior& posterior, int n_samples, const PathwiseOptions& options);
   friend Posterior update(Posterior&& posterior, Observations added);
   friend struct LeftOut leave_out(const Posterior& posterior, int n_stretches);

@@ -22,6 +22,7 @@ struct Latent {
   enum class Base {
     acceleration,  // E = B
     force,         // E = M⁻¹B; where M is singular M'⁻¹B, M' as in UdwadiaKalaba
+    admissible,    // E = B Π, Π the orthogonal projector onto the null space of A B: A E = 0; B diagonal, constant and positive
   };
 
   /// How a parameter of the kernel starts and is bounded, relative to its default scale (scales: training/default_hyperparameters.hpp).
@@ -40,13 +41,14 @@ struct Latent {
   Kernel kernel;
   std::vector<std::string> feature_names;         // of φ(x), D of them
   std::shared_ptr<const StateFunction> features;  // φ; parameters in it keep the model's values
+  std::vector<bool> is_of_place;                  // per feature: reads coordinates and t alone (D); of code all are or none
   std::vector<int> feature_parameters;            // the system's parameters that φ uses: they cannot be estimated
   Base base = Base::acceleration;
   std::vector<std::string> column_names;            // p of them, for the names of the signal standard deviations
   std::shared_ptr<const StateFunction> directions;  // B (nq × p), column-major; null: B = I, p = nq
   std::optional<int> free_loading;                  // columns of a free loading C; not given: C = diag(s)
   bool kernel_is_fixed = false;                     // the kernel's parameters are 1, in the units that its features have
-  bool signal_is_fixed = false;                     // s = 1, in the units that its directions have
+  bool has_one_signal = false;                      // s = (c, …, c), in the units that its directions have
   Range lengthscale, signal_stddev;
   std::vector<Range> feature_lengthscales;  // of each feature, in its unit, before `lengthscale` (D); empty: of none
 
@@ -91,9 +93,6 @@ struct PriorValues {
   std::vector<Eigen::MatrixXd> directions;  // E_a  (nq·p_a × N), column-major blocks, without the loadings C_a
   /// The first state at which the known force or a direction is not a finite number.
   std::optional<MechanicsBatch::Fault> fault = {};
-
-  /// Leaves what n latents from the first on add to ā: no μ, no other latent.
-  void keep_only(int first, int n);
 
   [[nodiscard]] Eigen::Map<const Eigen::MatrixXd> E(std::size_t latent, int i) const {
     return {directions[latent].col(i).data(), mean.rows(), directions[latent].rows() / mean.rows()};

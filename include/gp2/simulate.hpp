@@ -71,6 +71,27 @@ class SwitchingFunctions {
 /// latents. Not to be called from several threads for one model: its expression graph grows.
 SwitchingFunctions switching_functions(const Model& model, bool of_latents);
 
+/// A constraint c(q, t) = 0 that can only push: the gap c is never negative. The input that its row of A and b is switched by says
+/// whether there is contact; in a motion it follows from the motion.
+struct Contact {
+  int row = 0;             // of A
+  int input = 0;           // of the inputs: 1 in contact, 0 apart
+  double restitution = 0;  // e ∈ [0, 1]: an impact changes the rate of the gap from ċ to −e ċ
+};
+
+/// The contacts of a model. @throws InputError when a restitution is outside [0, 1].
+std::vector<Contact> contacts_of(const Model& model, const Eigen::Ref<const Eigen::VectorXd>& parameters);
+
+/// What happened to a contact in a motion.
+struct ContactEvent {
+  enum class Kind { impact /* and apart again */, made, released };
+  double time = 0;
+  int row = 0;  // of A
+  Kind kind = Kind::impact;
+  double approach = 0;     // −ċ before an impact, 0 of a release
+  double energy_loss = 0;  // kinetic energy that the impact took [J]
+};
+
 inline constexpr double least_relative_tolerance = 1e-14;
 
 struct SimulateOptions {
@@ -81,6 +102,8 @@ struct SimulateOptions {
   InputSignal inputs;                // u(t)
   int max_steps = 1'000'000;         // accepted and rejected
   SwitchingFunctions switching;      // where the acceleration jumps
+  std::vector<Contact> contacts;     // that are made and released
+  double shortest_flight = 1e-7;     // a rebound that would last no longer ends in contact [s]
   Acceleration record;               // another function of the state, of any size, that is wanted at the times; none
   double initial_step = 0;           // [s]; 0: found from the first two accelerations
 };
@@ -98,6 +121,8 @@ struct Trajectory {
   double start_position_residual = 0;  // the drift at the start as it was given
   double start_velocity_residual = 0;
   double start_displacement = 0;  // by how much the projection of the start changed an entry of q or dq, at most
+
+  std::vector<ContactEvent> events;  // in the order of time
 
   int steps = 0;           // accepted
   int rejected_steps = 0;  // error above the tolerance, or no finite acceleration
@@ -125,6 +150,12 @@ class UnfinishedMotion : public NumericalError {
 /// A zero of a switching function ends a step. There the motion crosses to the other side; or, where both sides drive it back, it
 /// stays on the zero with the mixture of both accelerations that keeps it there (Filippov), until that mixture leaves what lies
 /// between them: a body under dry friction rests, and breaks loose.
+///
+/// A contact ends a step where its gap closes, found on the dense output. It is an impact of Newton's law along M⁻¹Aᵀ, during which
+/// all other active constraints hold; where the rebound is over within `shortest_flight` the contact stays closed, so that the
+/// accumulating bounces of a ball end. A closed contact is released where the motion without it would open the gap, which is where
+/// its multiplier would pull. One at a time: where several contacts close or open together, those whose impulse would pull are let
+/// go one after the other, which is not the complementarity problem of many contacts.
 ///
 /// @param parameters  of the system's constraints and mass matrix (system.parameters().size())
 /// @param start       [q; dq; …] (layout size), t and u are set from the options. Off the constraint it is projected, or taken as

@@ -90,9 +90,11 @@ enum class SystemPart { mechanics /* M, A, b */, force, residuals };
 /// Immutable; every member function may be called from several threads at once.
 class System {
  public:
-  /// @param constraint_noise  constraint_noise(); empty: every constraint is exact
+  /// @param constraint_noise       constraint_noise(); empty: every constraint is exact
+  /// @param constraint_conditions  constraint_conditions(); empty: every constraint holds always
   System(std::string name, std::vector<Coordinate> coordinates, std::vector<std::string> inputs,
-         std::vector<Parameter> parameters, std::vector<std::string> constraint_labels, Eigen::VectorXd constraint_noise = {});
+         std::vector<Parameter> parameters, std::vector<std::string> constraint_labels, Eigen::VectorXd constraint_noise = {},
+         std::vector<std::string> constraint_conditions = {});
   virtual ~System() = default;
   System(const System&) = delete;
   System& operator=(const System&) = delete;
@@ -106,6 +108,11 @@ class System {
   /// slips (nc) [unit of the row]. 0 where a constraint is exact.
   [[nodiscard]] const Eigen::VectorXd& constraint_noise() const { return constraint_noise_; }
   [[nodiscard]] bool has_constraint_noise() const { return (constraint_noise_.array() > 0).any(); }
+  /// Of each row of A the condition under which it is there, as written, "gap <= 0"; empty: always. Elsewhere it and its entry of b
+  /// are zero, so that it is dropped.
+  [[nodiscard]] const std::vector<std::string>& constraint_conditions() const { return constraint_conditions_; }
+  [[nodiscard]] bool is_conditional(int row) const { return !constraint_conditions_[static_cast<std::size_t>(row)].empty(); }
+  [[nodiscard]] bool has_conditional_constraints() const;
   [[nodiscard]] int nq() const { return static_cast<int>(coordinates_.size()); }
   [[nodiscard]] int nc() const { return static_cast<int>(constraint_labels_.size()); }
   [[nodiscard]] StateLayout layout() const { return {nq(), static_cast<int>(inputs_.size())}; }
@@ -156,6 +163,9 @@ class System {
   /// Which entries of a state the named part reads (size layout().size()).
   [[nodiscard]] virtual std::vector<bool> reads(SystemPart part) const = 0;
 
+  /// Whether M, A, b or F may depend on parameters()[index].
+  [[nodiscard]] virtual bool depends_on_parameter(int /*index*/) const { return true; }
+
  private:
   std::string name_;
   std::vector<Coordinate> coordinates_;
@@ -163,6 +173,7 @@ class System {
   std::vector<Parameter> parameters_;
   std::vector<std::string> constraint_labels_;
   Eigen::VectorXd constraint_noise_;
+  std::vector<std::string> constraint_conditions_;
 };
 
 }  // namespace gp2

@@ -43,7 +43,7 @@ struct View {
   Quantity quantity = Quantity::constrained_acceleration;
   std::vector<int> rows;                 // of the quantity, in this order
   std::optional<double> time_step = {};  // Δt, of a quantity that needs one: next_velocity [s]
-  /// What one latent alone adds: G E_a f_a, without μ and d. Not given: everything.
+  /// What one latent alone adds: G E_a f_a, without μ and d. Not given: everything, of the learned force what all latents add.
   std::optional<LatentRange> latent = {};
   /// The quantity as it is under another system. Null: the prior's own system.
   std::shared_ptr<const OtherSystem> other_system = nullptr;
@@ -55,6 +55,7 @@ struct View {
   static View constraint_force(const System& system) { return all(Quantity::constraint_force, system); }
   static View multipliers(const System& system) { return all(Quantity::multipliers, system); }
   static View next_velocity(const System& system, double time_step);
+  static View learned_force(const System& system) { return all(Quantity::learned_force, system); }
 
   [[nodiscard]] int size() const { return static_cast<int>(rows.size()); }
   /// Whether it is of measured accelerations: ddq, to which every latent adds.
@@ -63,7 +64,7 @@ struct View {
   /// @throws InputError where it is needed and not given.
   [[nodiscard]] double required_time_step() const;
   /// Whether μ, or latent a, is part of it.
-  [[nodiscard]] bool has_mean() const { return !latent; }
+  [[nodiscard]] bool has_mean() const { return !latent && quantity->has_mean(); }
   [[nodiscard]] bool has_latent(std::size_t a) const { return !latent || latent->has(a); }
   /// The entry of the state that is added to row k of the view, where there is one.
   [[nodiscard]] std::optional<int> added_entry(const StateLayout& layout, int k) const;
@@ -73,7 +74,7 @@ struct View {
   /// The same rows of the same quantity, under the same OtherSystem object.
   bool operator==(const View&) const = default;
   /// ddq1 … (constrained), abar_q1 … (unconstrained), fc_q1 … (constraint force), lambda1 … (multipliers), dq1_next … (next
-  /// velocity), with @LATENT behind where one latent is viewed alone.
+  /// velocity), force_q1 … (learned force), with @LATENT behind where one latent is viewed alone.
   /// @param latent_name  of that latent
   [[nodiscard]] std::vector<std::string> names(const System& system, const std::string& latent_name = "") const;
 };
@@ -104,6 +105,9 @@ std::optional<MechanicsBatch::Fault> for_each_mechanics(
 /// @throws InputError naming the state and the rule.
 MechanicsBatch require_mechanics(const Prior& prior, const View& view, const Eigen::Ref<const Eigen::MatrixXd>& states,
                                  const Eigen::Ref<const Eigen::VectorXd>& parameters);
+
+/// Leaves of μ and E what a view has: no μ where it is none of it, no latent but those that are viewed.
+void keep_viewed(const View& view, PriorValues& values);
 
 /// What of a view of a prior has no meaning where M is singular, as a text; nothing where all has.
 std::optional<std::string> what_needs_acceleration(const Prior& prior, const View& view);

@@ -17,7 +17,7 @@ _Path = Union[str, bytes, os.PathLike[str], os.PathLike[bytes]]
 _Table = Union[Table, str, os.PathLike[str], os.PathLike[bytes], _Columns]
 _Arrays = tuple[npt.ArrayLike, npt.ArrayLike]  # states, accelerations
 _Text = Union[str, float]  # an expression or a number
-_View = Literal["constrained", "unconstrained", "constraint-force", "multipliers", "next-velocity"]
+_View = Literal["constrained", "unconstrained", "constraint-force", "multipliers", "next-velocity", "force"]
 _Parameters = dict[str, float]
 _Matrices = tuple[npt.ArrayLike, Union[npt.ArrayLike, None], Union[npt.ArrayLike, None], npt.ArrayLike]  # M, A, b, F
 
@@ -186,6 +186,18 @@ class Prediction:
     def names(self) -> list[str]: ...
     @property
     def n_clipped(self) -> int: ...
+
+class Inputs:
+    @property
+    def inputs(self) -> _Array: ...
+    @property
+    def std(self) -> _Array: ...
+    @property
+    def cov(self) -> _Array: ...
+    @property
+    def missed(self) -> _Array: ...
+    @property
+    def names(self) -> list[str]: ...
 
 class Calibration:
     @property
@@ -365,6 +377,15 @@ class Posterior:
         dt: float | None = None,
         columns: Mapping[str, str] | None = None,
     ) -> _Array: ...
+    def inverse_dynamics(
+        self,
+        states: npt.ArrayLike | _Table,
+        accelerations: npt.ArrayLike | None = None,
+        *,
+        outputs: Sequence[str] = [],
+        system: System | None = None,
+        columns: Mapping[str, str] | None = None,
+    ) -> Inputs: ...
     def evaluate(
         self,
         data: _Table,
@@ -400,9 +421,10 @@ class Posterior:
         system: System | None = None,
         *,
         # options of export: written by scripts/options
-        to: Literal["c", "casadi", "acados"] = "c",
+        to: Literal["c", "casadi", "acados", "mjcf"] = "c",
         name: str = "",
-        view: Literal["constrained", "unconstrained", "constraint-force", "multipliers", "next-velocity"] = "constrained",
+        robot: str = "",
+        view: Literal["constrained", "unconstrained", "constraint-force", "multipliers", "next-velocity", "force"] = "constrained",
         dt: float | None = None,
         latent: str | None = None,
         std: bool = True,
@@ -417,6 +439,7 @@ class Posterior:
         start: Mapping[str, float] | npt.ArrayLike,
         times: npt.ArrayLike,
         inputs: _Table | None = None,
+        system: System | None = None,
         *,
         rtol: float = 1e-06,
         atol: float = 1e-09,
@@ -432,6 +455,7 @@ class Posterior:
         start: Mapping[str, float] | npt.ArrayLike,
         times: npt.ArrayLike,
         inputs: _Table | None = None,
+        system: System | None = None,
         *,
         rtol: float = 1e-06,
         atol: float = 1e-09,
@@ -448,6 +472,8 @@ class Predictor:
         posterior: Posterior,
         view: _View = "constrained",
         *,
+        system: System | None = None,
+        latent: str | None = None,
         dt: float | None = None,
         std: bool = True,
         jacobian: bool = True,
@@ -500,30 +526,31 @@ def fit(
     dt: float | None = None,
     columns: Mapping[str, str] | None = None,
     observe: Sequence[str] = [],
+    noise_std: float | Literal["estimate", "stated"] | None = None,
+    max_points: int | None = None,
+    thin: bool = True,
+    project: bool = False,
+    robust: bool = False,
     mean: Literal["zero", "force"] = "zero",
     prior: Literal["acceleration", "force"] | None = None,
     baseline: Literal["se", "icm", "lmc"] | None = None,
     estimate: Sequence[str] | None = None,
-    noise_std: float | Literal["estimate", "stated"] | None = None,
     protocol: Literal["default", "paper"] = "default",
     hyperprior: bool = True,
     discrepancy: bool = True,
-    project: bool = False,
-    robust: bool = False,
     restarts: int | None = None,
     max_iterations: int = 1000,
-    start: _Path | Mapping[str, float] | None = None,
-    max_points: int | None = None,
-    seed: int = 0,
-    threads: int = 0,
-    hyperparameters: Literal["optimise", "integrate", "auto"] = "auto",
-    inducing: float | Literal["auto", "none"] | None = None,
-    train_on: int | None = None,
-    thin: bool = True,
-    standard_errors: bool = True,
     max_escapes: int | None = None,
     gradient_tolerance: float | None = None,
     reduction_tolerance: float | None = None,
+    start: _Path | Mapping[str, float] | None = None,
+    seed: int = 0,
+    hyperparameters: Literal["optimise", "integrate", "auto"] = "auto",
+    standard_errors: bool = True,
+    inducing: float | Literal["auto", "none"] | None = None,
+    train_on: int | None = None,
+    threads: int = 0,
+    checkpoint: str = "",
     # end of options
     progress: Callable[[Progress], object] | None = None,
 ) -> Posterior: ...
@@ -536,30 +563,31 @@ def fit_raw(
     dt: float | None = None,
     columns: Mapping[str, str] | None = None,
     observe: Sequence[str] = [],
+    noise_std: float | Literal["estimate", "stated"] | None = None,
+    max_points: int | None = None,
+    thin: bool = True,
+    project: bool = False,
+    robust: bool = False,
     mean: Literal["zero", "force"] = "zero",
     prior: Literal["acceleration", "force"] | None = None,
     baseline: Literal["se", "icm", "lmc"] | None = None,
     estimate: Sequence[str] | None = None,
-    noise_std: float | Literal["estimate", "stated"] | None = None,
     protocol: Literal["default", "paper"] = "default",
     hyperprior: bool = True,
     discrepancy: bool = True,
-    project: bool = False,
-    robust: bool = False,
     restarts: int | None = None,
     max_iterations: int = 1000,
-    start: _Path | Mapping[str, float] | None = None,
-    max_points: int | None = None,
-    seed: int = 0,
-    threads: int = 0,
-    hyperparameters: Literal["optimise", "integrate", "auto"] = "auto",
-    inducing: float | Literal["auto", "none"] | None = None,
-    train_on: int | None = None,
-    thin: bool = True,
-    standard_errors: bool = True,
     max_escapes: int | None = None,
     gradient_tolerance: float | None = None,
     reduction_tolerance: float | None = None,
+    start: _Path | Mapping[str, float] | None = None,
+    seed: int = 0,
+    hyperparameters: Literal["optimise", "integrate", "auto"] = "auto",
+    standard_errors: bool = True,
+    inducing: float | Literal["auto", "none"] | None = None,
+    train_on: int | None = None,
+    threads: int = 0,
+    checkpoint: str = "",
     passes: int = 4,
     windows: bool = True,
     episode: str = "",

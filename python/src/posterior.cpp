@@ -12,6 +12,7 @@
 #include "bindings.hpp"
 #include "gp2/base/file.hpp"
 #include "gp2/error.hpp"
+#include "gp2/inference/inverse_dynamics.hpp"
 #include "gp2/jobs/excite_job.hpp"
 #include "gp2/jobs/export_job.hpp"
 #include "gp2/jobs/fit_job.hpp"
@@ -148,6 +149,59 @@ py::array sample(const PyPosterior& self, const py::object& data, int n_samples,
   return to_rows(std::move(samples)).attr("reshape")(n_samples, n, d);
 }
 
+// ---------------------------------------------------------------- inverse dynamics
+
+/// gp2.Inputs
+struct Inputs {
+  InverseDynamics found;
+  std::vector<std::string> names;
+};
+
+Inputs inverse_dynamics_of(const PyPosterior& self, const py::object& data, const py::object& accelerations,
+                           const std::vector<std::string>& outputs, const PySystem* system, const py::object& columns) {
+  const FitSystem at = system_of(self.file, self.posterior.prior(), system == nullptr ? nullptr : system->model);
+  const System& there = *at.model->system;
+  WantedMotion wanted;
+  if (is_array(data)) {
+    wanted.view = {View::Quantity::constrained_acceleration, acceleration_rows(there, outputs, "`outputs`")};
+    const Rows states(data, there.state_names(), "states"), values(accelerations, wanted.view.names(there), "accelerations");
+    wanted.states = states.matrix();
+    wanted.accelerations = values.matrix();
+  } else {
+    if (!accelerations.is_none() || !outputs.empty()) {
+      throw InputError("accelerations and outputs go with an array of states; those of a table are its columns");
+    }
+    wanted = read_wanted_motion(at.prior, *at.model, to_table(data, "states"), columns_argument(columns));
+    tell(wanted.notes);
+  }
+  wanted.view.other_system = at.other_system;
+  const Posterior posterior = self.posterior;
+  const py::gil_scoped_release release;
+  return {inverse_dynamics(posterior, wanted.view, wanted.states, wanted.accelerations), there.inputs()};
+}
+
+void add_inputs(py::module_& module) {
+  py::class_<Inputs>(module, "Inputs", "Inputs that produce wanted accelerations at n states.")
+      .def_property_readonly(
+          "inputs", [](const Inputs& i) { return to_rows(i.found.inputs); }, "What acts (n, nu).")
+      .def_property_readonly(
+          "std", [](const Inputs& i) { return to_rows(i.found.stddev()); }, "Standard deviations (n, nu).")
+      .def_property_readonly(
+          "cov",
+          [](const Inputs& i) {
+            const Index nu = i.found.inputs.rows();
+            return to_matrices(i.found.covariance, nu, nu);
+          },
+          "Covariance at each state (n, nu, nu).")
+      .def_property_readonly(
+          "missed", [](const Inputs& i) { return to_rows(i.found.missed); },
+          "Wanted less predicted accelerations under these inputs (n, d): rounding where the wanted can be produced.")
+      .def_readonly("names", &Inputs::names, "Of the inputs.")
+      .def("__repr__", [](const Inputs& i) {
+        return fmt::format("<gp2.Inputs {} at {} states>", fmt::join(i.names, ", "), i.found.inputs.cols());
+      });
+}
+
 // ---------------------------------------------------------------- figures
 
 Evaluation evaluate_posterior(const PyPosterior& self, const py::object& data, const PySystem* system,
@@ -276,26 +330,28 @@ Motion simulate_model(const PySystem& system, const py::object& start, const py:
 }
 
 py::object simulate_posterior(const PyPosterior& self, const py::object& start, const py::object& times, const py::object& inputs,
-                              const py::kwargs& keywords) {
+                              const PySystem* system, const py::kwargs& keywords) {
   const SimulateRequest request = simulate_request(self.system(), start, times, inputs, keywords);
   const Posterior posterior = self.posterior;
+  const FitSystem asked = system_of(self.file, posterior.prior(), system == nullptr ? nullptr : system->model);
   const SimulateJob job = [&] {
     const py::gil_scoped_release release;
-    return prepare_simulation(self.file.model, posterior, request);
+    return prepare_simulation(asked, posterior, request);
   }();
   std::vector<Motion> motions = run_motions(job);
   if (request.n_samples) return py::cast(std::move(motions));
   {
     const py::gil_scoped_release release;
-    motions[0].uncertainty = motion_uncertainty(posterior, motions[0].trajectory);
+    motions[0].uncertainty = motion_uncertainty(posterior, motions[0].trajectory, asked.other_system);
   }
   return py::cast(std::move(motions[0]));
 }
 
-std::string simulate_documentation(const std::string& first) {
+std::string simulate_documentation(const std::string& first, const std::string& last, const std::string& result) {
   SimulateRequest request;
-  return signature("simulate", first + "start: Mapping[str, float] | ArrayLike, times: ArrayLike, inputs: object = None, *,",
-                   options(request), "", first == "self: Posterior, " ? "Motion | list[Motion]" : "Motion");
+  return signature("simulate",
+                   first + "start: Mapping[str, float] | ArrayLike, times: ArrayLike, inputs: object = None, " + last + "*,",
+                   options(request), "", result);
 }
 
 // ---------------------------------------------------------------- the next experiment
@@ -429,7 +485,7 @@ py::object inducing_of(const FitReport& self) {
   if (!self.inducing) return py::none();
   py::dict entry;
   entry["n_variables"] = self.inducing->n_variables;
-  entry["left_out"] = self.inducing->left_out;
+  entry["left_out"] = to_vector(self.inducing->left_out);
   entry["n_start"] = self.inducing->n_start;
   return entry;
 }
@@ -736,7 +792,7 @@ void define_predict(py::class_<PyPosterior>& posterior) {
       R"(Predict a view at states (n, len(state_names)), or at those of a table by column names.
 
 view       'constrained': ddq (d = nq); 'unconstrained': the acceleration without constraints; 'constraint-force': A'λ;
-           'multipliers': λ (d = nc); 'next-velocity': dq + dt ddq
+           'multipliers': λ (d = nc); 'next-velocity': dq + dt ddq; 'force': the applied force that was learned, in N or N m
 system     another System with the same coordinates, inputs and latents: under its constraints, masses and parameters
 latent     only what this latent adds, by its name
 mean_only  leaves out std and cov, which cost more by two orders
@@ -766,6 +822,22 @@ void define_joint_and_sample(py::class_<PyPosterior>& posterior) {
           "states"_a, "n_samples"_a = 1, "seed"_a = 0, "view"_a = "constrained", py::kw_only(), "system"_a = nullptr,
           "latent"_a = py::none(), "dt"_a = py::none(), "columns"_a = py::none(),
           "Draws of a view at all states together (n_samples, n, d). Each obeys A ddq = b. Same seed, same samples.");
+}
+
+void define_inverse_dynamics(py::class_<PyPosterior>& posterior) {
+  using namespace py::literals;
+  posterior.def("inverse_dynamics", &inverse_dynamics_of, "states"_a, "accelerations"_a = py::none(), py::kw_only(),
+                "outputs"_a = std::vector<std::string>(), "system"_a = nullptr, "columns"_a = py::none(),
+                R"(The inputs that produce wanted accelerations under the constraints, with their deviation.
+
+states         (n, len(state_names)), whose inputs are where the search begins; or a table with the states and, as its columns
+               ddq…, the accelerations that are wanted
+accelerations  of an array of states: those wanted (n, d)
+outputs        which they are; default: all
+system         another System with the same coordinates, inputs and latents
+
+Returns Inputs. Where no inputs produce the accelerations it is those that come nearest, in the sense of Gauss' principle; where several
+inputs do the same, the least change of them. Raises NumericalError where none are found.)");
 }
 
 /// What takes measured data, or gives them up.
@@ -825,22 +897,23 @@ void define_simulate(py::class_<PyPosterior>& posterior, py::module_& module) {
   const std::string motion_options = documentation(options(motion));
   py::options own_signature;
   own_signature.disable_function_signatures();
-  posterior.def("simulate", &simulate_posterior, "start"_a, "times"_a, "inputs"_a = py::none(),
-                (simulate_documentation("self: Posterior, ") + R"(
+  posterior.def("simulate", &simulate_posterior, "start"_a, "times"_a, "inputs"_a = py::none(), "system"_a = nullptr,
+                (simulate_documentation("self: Posterior, ", "system: System | None = None, ", "Motion | list[Motion]") + R"(
 Integrate the mean's motion, or n_samples motions, each of one function drawn from the posterior.
 
 start   {"q1": 0.4, "dq1": 1.0}: what is not named follows from the constraints; or all of q and dq
 times   at which states are wanted (n) [s]; the first is the start
 inputs  a table with t and every input, linear in between, that covers the motion; default: zero
+system  another System with the same coordinates, inputs and latents: its motion
 
 )" + motion_options +
                  R"(
 Returns a Motion, or with n_samples a list of them. Raises NumericalError, with the time, when it cannot go on.)")
                     .c_str());
-  module.def(
-      "simulate", &simulate_model, "system"_a, "start"_a, "times"_a, "inputs"_a = py::none(),
-      (simulate_documentation("system: System, ") + "\nIntegrate a system by its own force and [truth]. As Posterior.simulate.")
-          .c_str());
+  module.def("simulate", &simulate_model, "system"_a, "start"_a, "times"_a, "inputs"_a = py::none(),
+             (simulate_documentation("system: System, ", "", "Motion") +
+              "\nIntegrate a system by its own force and [truth]. As Posterior.simulate.")
+                 .c_str());
 }
 
 void define_excite(py::module_& module) {
@@ -899,7 +972,8 @@ void define_export(py::class_<PyPosterior>& posterior) {
                 (signature("export", "self: Posterior, folder: str | os.PathLike, system: System | None = None, *,",
                            options(request), "", "list[str]") +
                  R"(
-Write the posterior as C for machines without gp2, as gp2 export: the paths of the files, in a folder that exists.
+Write the posterior as C for machines without gp2, or a robot's parameters into its own file, as gp2 export: the paths of the files,
+in a folder that exists.
 
 )" + documentation(options(request)))
                     .c_str());
@@ -911,6 +985,7 @@ void add_posterior(py::module_& module) {
   // a class comes before the functions that return it, for their signatures to name it
   add_reports(module);
   add_prediction(module);
+  add_inputs(module);
   add_evaluation(module);
   add_motion(module);
   add_excitation(module);
@@ -920,6 +995,7 @@ void add_posterior(py::module_& module) {
   define_files_and_facts(posterior);
   define_predict(posterior);
   define_joint_and_sample(posterior);
+  define_inverse_dynamics(posterior);
   define_evaluate_and_update(posterior);
   posterior.def("__repr__", [](const PyPosterior& self) { return fmt::format("<gp2.Posterior of '{}'>", self.system().name()); });
 

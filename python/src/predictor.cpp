@@ -109,9 +109,10 @@ class PyPredictor {
   Eigen::Index size_ = 0;
 };
 
-PyPredictor make(const PyPosterior& posterior, const std::string& quantity, const std::optional<double>& dt, bool std,
-                 bool jacobian, const std::string& storage) {
-  const ViewRequest request{quantity_argument(quantity), dt, std::nullopt, nullptr};
+PyPredictor make(const PyPosterior& posterior, const std::string& quantity, const PySystem* system,
+                 const std::optional<std::string>& latent, const std::optional<double>& dt, bool std, bool jacobian,
+                 const std::string& storage) {
+  const ViewRequest request{quantity_argument(quantity), dt, latent, system == nullptr ? nullptr : system->model};
   const View view = predicted_view(posterior.file, posterior.posterior.prior(), request).view;
   if (storage != "double" && storage != "single") {
     throw InputError(fmt::format("storage: expected 'double' or 'single', got '{}'", storage));
@@ -126,12 +127,13 @@ void add_predictor(py::module_& module) {
   using namespace py::literals;
   py::class_<PyPredictor>(module, "Predictor", R"(A view at one state after another, for control loops: microseconds a call.
 
+system, latent, dt  as of Posterior.predict
 std, jacobian  whether they will be asked for
 storage        'double', or 'single': half the memory and faster, constraints still exact; include/gp2/predictor.hpp has its error
 
 A state is (len(state_names)). A state without a prediction raises InputError.)")
-      .def(py::init(&make), "posterior"_a, "view"_a = "constrained", py::kw_only(), "dt"_a = py::none(), "std"_a = true,
-           "jacobian"_a = true, "storage"_a = "double")
+      .def(py::init(&make), "posterior"_a, "view"_a = "constrained", py::kw_only(), "system"_a = nullptr, "latent"_a = py::none(),
+           "dt"_a = py::none(), "std"_a = true, "jacobian"_a = true, "storage"_a = "double")
       .def("mean", &PyPredictor::mean, "state"_a, "(d)")
       .def("mean_and_std", &PyPredictor::mean_and_std, "state"_a, "(d), (d)")
       .def("mean_and_jacobian", &PyPredictor::mean_and_jacobian, "state"_a,

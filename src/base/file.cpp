@@ -235,17 +235,26 @@ std::filesystem::path followed(std::filesystem::path path) {
   return path;
 }
 
+// Standard output is written to as it is, also where a shell has made it a file: what else is printed there stays.
+bool is_standard_output(const std::filesystem::path& path) { return path == "/dev/stdout"; }
+
 // A file to be written: a link stays, what it points at is replaced or made.
 struct Target {
   std::string path;
   bool exists = false;
   struct stat status = {};
 
-  [[nodiscard]] bool is_regular() const { return !exists || S_ISREG(status.st_mode); }
+  [[nodiscard]] bool is_regular() const { return !is_standard_output(path) && (!exists || S_ISREG(status.st_mode)); }
 };
 
 Target target_of(const std::filesystem::path& path) {
   Target target;
+  if (is_standard_output(path)) {
+    target.path = path.string();
+    target.exists = true;
+    require_written(path, fstat(STDOUT_FILENO, &target.status) == 0);
+    return target;
+  }
   std::error_code no_such_file;
   const std::filesystem::path resolved = std::filesystem::canonical(path, no_such_file);
   target.path = no_such_file ? followed(path).string() : resolved.string();
@@ -285,7 +294,9 @@ class Output {
 
   void begin() {
     // /dev/stdout, a pipe: nothing to replace, and a rename would destroy the device
-    file_ = is_new_file() ? open_beside(target_.path, temporary_) : open(target_.path.c_str(), O_WRONLY | O_CLOEXEC);
+    file_ = is_new_file()                      ? open_beside(target_.path, temporary_)
+            : is_standard_output(target_.path) ? dup(STDOUT_FILENO)
+                                               : open(target_.path.c_str(), O_WRONLY | O_CLOEXEC);
     require_written(path_, file_ >= 0);
     if (is_new_file() && target_.exists) require_written(path_, fchmod(file_, target_.status.st_mode & 07777) == 0);
   }

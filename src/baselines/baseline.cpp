@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <array>
+#include <iterator>
 
 #include <fmt/format.h>
 
@@ -124,6 +125,7 @@ Fit fit_outputs(const Prior& prior, const std::vector<Observations>& observation
   double best_so_far = 0;
   for (int output = 0; output < n_outputs; ++output) {
     FitOptions own = options;
+    own.improved = {};
     if (options.progress) {
       own.progress = [&, output](Progress p) {
         p.best += best_so_far;
@@ -143,6 +145,15 @@ Fit fit_outputs(const Prior& prior, const std::vector<Observations>& observation
     all.n_escapes += report.n_escapes;
     all.seconds += report.seconds;
     best_so_far += report.objective;
+    if (!options.improved) continue;
+    // the outputs that follow stand where they start
+    FitReport so_far = all;
+    std::copy_if(hyperparameters.begin(), hyperparameters.end(), std::back_inserter(so_far.hyperparameters),
+                 [output](const Hyperparameter& h) { return h.owner > output; });
+    so_far.objective = so_far.negative_log_likelihood = best_so_far;
+    so_far.converged = false;
+    so_far.termination = FitReport::interrupted;
+    options.improved(so_far, observations);
   }
   const RestartReport& best = all.restarts.front();
   all.negative_log_likelihood = best.negative_log_likelihood;

@@ -39,12 +39,13 @@ void require_size(const Eigen::VectorXd& values, std::size_t size, const char* w
 // What a baseline's latents are made of: the features of the model's latents, each once, and every entry of the state that the
 // mechanics read and no latent does. What a latent need not learn a baseline must.
 struct Parts {
+  std::shared_ptr<const System> home;
   PriorWords words;
   std::vector<std::string> names;
   std::vector<Expression> raw;
   std::size_t n_of_latents = 0;
 
-  explicit Parts(const Model& model) : words(prior_words(model)) {
+  explicit Parts(const Model& model) : home(model.system), words(prior_words(model)) {
     for (const LatentSpec& latent : model.latents) {
       if (latent.feature_code) {
         throw InputError(fmt::format("{}: a baseline needs features as expressions, but those of the latent '{}' are code",
@@ -84,7 +85,7 @@ struct Parts {
     Latent latent;
     latent.name = std::move(name);
     latent.feature_names = names;
-    latent.features = ExpressionFunction::of_state(features, words.symbols);
+    latent.features = ExpressionFunction::of_state(features, words.symbols, home);
     latent.kernel = Kernel::parse(kernel, latent.feature_names);
     return latent;
   }
@@ -147,7 +148,7 @@ Prior make_baseline_prior(const Model& model, const Baseline& baseline) {
       latent.column_names = {output};
       std::vector<Expression> unit(n_outputs, graph.constant(0));
       unit[j] = graph.constant(1);
-      latent.directions = ExpressionFunction::of_state_and_parameters(unit, parts.words.symbols, graph);
+      latent.directions = ExpressionFunction::of_state_and_parameters(unit, parts.words.symbols, graph, model.system);
       prior.latents.push_back(std::move(latent));
     }
     return prior;

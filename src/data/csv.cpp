@@ -13,6 +13,7 @@
 
 #include <fmt/format.h>
 
+#include "base/checksum.hpp"
 #include "gp2/error.hpp"
 
 namespace gp2 {
@@ -158,6 +159,7 @@ class CellTexts {
 
 struct CsvTable::Content {
   std::string name;
+  std::optional<LogFile> file;
   std::vector<std::string> header;
   std::vector<std::vector<double>> columns;  // NaN where a cell is empty or no finite number
   std::vector<int> lines;                    // line in the file of each row
@@ -190,11 +192,14 @@ class CsvTable::Builder {
     }
   }
 
-  CsvTable finish() {
+  /// @param file  that the lines are of
+  CsvTable finish(std::optional<LogFile> file = std::nullopt) {
     if (content_.header.empty()) {
       throw InputError(fmt::format("{}: the file is empty; expected a header line and data rows", content_.name));
     }
     if (content_.lines.empty()) throw InputError(fmt::format("{}: no data rows after the header", content_.name));
+    if (file) file->rows = std::ssize(content_.lines);
+    content_.file = std::move(file);
     return CsvTable(std::make_shared<const Content>(std::move(content_)));
   }
 
@@ -270,11 +275,12 @@ CsvTable::CsvTable(std::shared_ptr<const Content> content) : content_(std::move(
 
 namespace {
 
-// Calls take(line) for every line of a file, without its end.
+// Calls take(line) for every line of a file, without its end, and begin(block) before those of a block.
 template <typename Take>
-void for_each_line(const std::filesystem::path& path, const Take& take) {
+void for_each_line(const std::filesystem::path& path, const Take& take, const std::function<void(std::string_view)>& begin = {}) {
   std::string rest;  // of a line that goes on in the next block
   read_blocks(path, [&](std::string_view block) {
+    if (begin) begin(block);
     for (std::size_t end = block.find('\n'); end != std::string_view::npos; end = block.find('\n')) {
       const std::string_view line = block.substr(0, end);
       take(rest.empty() ? line : std::string_view(rest += line));
@@ -290,8 +296,16 @@ void for_each_line(const std::filesystem::path& path, const Take& take) {
 
 CsvTable CsvTable::read(const std::filesystem::path& path, Keep keep) {
   Builder builder(path.string(), keep);
-  for_each_line(path, [&](std::string_view line) { builder.add_line(line); });
-  return builder.finish();
+  LogFile file{path.string()};
+  Checksum checksum;
+  for_each_line(
+      path, [&](std::string_view line) { builder.add_line(line); },
+      [&](std::string_view block) {
+        file.bytes += block.size();
+        checksum.add(block);
+      });
+  file.checksum = checksum.text();
+  return builder.finish(std::move(file));
 }
 
 CsvTable CsvTable::parse(std::string_view text, std::string name, Keep keep) {
@@ -486,6 +500,8 @@ void write_csv(const std::filesystem::path& path, const std::function<void(CsvWr
 }
 
 const std::string& CsvTable::name() const { return content_->name; }
+
+const std::optional<LogFile>& CsvTable::file() const { return content_->file; }
 
 const std::vector<std::string>& CsvTable::header() const { return content_->header; }
 

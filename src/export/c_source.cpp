@@ -81,8 +81,13 @@ struct Term {
   Index first = 0;            // of its functions among all
   Index n_points = 0;         // the most of all components
   std::unique_ptr<StateFunction::Evaluator> features, directions;
+  VectorXd admissible;  // s, of directions that the constraint changes; else empty
 
   [[nodiscard]] bool has_directions() const { return of->directions != nullptr; }
+  [[nodiscard]] bool is_admissible() const { return admissible.size() > 0; }
+  [[nodiscard]] bool reads_load() const {
+    return features->tapes().n_loads > 0 || (has_directions() && directions->tapes().n_loads > 0);
+  }
   [[nodiscard]] bool reads_features() const {
     return std::any_of(kernel.terms().begin(), kernel.terms().end(), [](const Kernel::Term& term) {
       return std::any_of(term.factors.begin(), term.factors.end(),
@@ -113,7 +118,8 @@ class Writer {
   void write_tables();
   [[nodiscard]] std::string inverse_of(const LatentPosterior& latents, std::size_t k);
   void write_expressions();
-  [[nodiscard]] std::string program(const Tape& tape, const std::vector<std::string>& results, bool with_parameters) const;
+  [[nodiscard]] std::string program(const Tape& tape, const std::vector<std::string>& results, bool with_parameters,
+                                    int n_loads = 0) const;
   void write_kernels();
   [[nodiscard]] std::string factor_call(const std::string& verb, const Kernel::Factor& factor, Index D,
                                         const std::string& value) const;
@@ -136,6 +142,7 @@ class Writer {
   Prior prior_;  // where the view looks
   StateLayout layout_;
   std::vector<std::string> inputs_;  // what C calls the entries of a state, then the parameters
+  std::vector<std::string> loads_;   // and the multipliers λ₀
   std::vector<Term> terms_;
   std::unique_ptr<StateEvaluator> values_, derivatives_;
   bool all_rows_ = true;
@@ -180,18 +187,23 @@ Writer::Writer(const Posterior& posterior, std::vector<Component> components, Vi
     if (!term.has_directions()) continue;
     term.directions = of.directions->make_evaluator(parameters);
     require_expressions(term.directions->tapes().values, fmt::format("directions of latent '{}'", of.name));
+    if (of.base != Latent::Base::admissible || system().nc() == 0) continue;
+    VectorXd B(term.p * term.p);
+    term.directions->evaluate(VectorXd::Zero(layout_.size()), B);
+    term.admissible = B.reshaped(term.p, term.p).diagonal();
   }
   std::set<std::string> taken = taken_names();
-  const auto add_input = [&](std::string name) {
+  const auto add_name = [&](std::string name, std::vector<std::string>& names) {
     for (char& c : name) {
       if (!std::isalnum(static_cast<unsigned char>(c))) c = '_';
     }
     while (taken.contains(name)) name += '_';
     taken.insert(name);
-    inputs_.push_back(std::move(name));
+    names.push_back(std::move(name));
   };
-  for (const std::string& name : system().state_names()) add_input(name);
-  for (const Parameter& parameter : system().parameters()) add_input(parameter.name);
+  for (const std::string& name : system().state_names()) add_name(name, inputs_);
+  for (const Parameter& parameter : system().parameters()) add_name(parameter.name, inputs_);
+  for (int k = 1; k <= system().nc(); ++k) add_name(fmt::format("lambda0_{}", k), loads_);
   for (std::size_t r = 0; r < view_.rows.size(); ++r) all_rows_ = all_rows_ && view_.rows[r] == static_cast<int>(r);
   set_conditions();
   set_sizes();
@@ -204,6 +216,7 @@ void Writer::set_conditions() {
   };
   const bool has_forced_latent = std::any_of(terms_.begin(), terms_.end(), [](const Term& term) { return term.is_forced(); });
   set("rows", system().nc() > 0);
+  set("admissible", std::any_of(terms_.begin(), terms_.end(), [](const Term& term) { return term.is_admissible(); }));
   set("several", system().nc() > 1);
   set("all", view_.has_mean());
   set("known", view_.has_mean() && prior_.mean == Prior::Mean::force);
@@ -213,13 +226,16 @@ void Writer::set_conditions() {
   set("moved", parts.constrained_acceleration || parts.constraint_force);
   set("reaction", parts.constraint_force);
   set("abar", parts.unconstrained_acceleration);
+  set("applied", parts.applied_force);
   set("multipliers", view_.quantity == View::Quantity::multipliers);
+  set("load", std::any_of(terms_.begin(), terms_.end(), [](const Term& term) { return term.reads_load(); }));
+  set("least_norm", has("multipliers") || has("load"));
   set("stddev", options_.stddev);
   set("jacobian", options_.jacobian);
   set("mixture", components_.size() > 1);
   set("sums", options_.stddev && components_.front()->latents->sums() != nullptr);
   set("by_function", n_functions_ < view_.size());
-  set("forced_solves", has("forced") || (options_.jacobian && has("moved")));
+  set("forced_solves", has("forced") || has("load") || (options_.jacobian && has("moved")));
   set("solves", has("rows") || has("forced_solves"));
 }
 
@@ -283,20 +299,24 @@ void Writer::set_sizes() {
     add_workspace(fmt::format("int order2[{}];", std::min(nq, nc)));
   }
   add(fmt::format("a_bar[{0}], force[{0}], a_of_force[{0}]", nq));
+  if (has("load")) add(fmt::format("x[{}], a0[{}]", nx + nc, nq));
   if (has("moved")) add(fmt::format("a[{0}], gap[{0}], of_constraint[{0}]", nq));
+  if (has("applied")) add(fmt::format("applied[{}]", nq));
   Index widest = 0, most_points = 1, most_derivatives = 1;
   for (std::size_t a = 0; a < terms_.size(); ++a) {
     const Term& term = terms_[a];
     add(fmt::format("phi_{0}[{1}], k_{0}[{2}], signal_{0}[{3}]", a, term.D, term.n_points, term.p));
     if (term.has_directions()) add(fmt::format("B_{}[{}]", a, nq * term.p));
+    if (term.is_admissible()) add(fmt::format("stated_M[{0}], P[{0}], L_P[{1}]", nq * nq, nc * nq));
     widest = std::max(widest, term.D * term.p);
     most_points = std::max(most_points, term.n_points);
-    most_derivatives = std::max(most_derivatives, std::ssize(term.features->entries()));
-    if (term.has_directions()) most_derivatives = std::max(most_derivatives, std::ssize(term.directions->entries()));
+    most_derivatives = std::max(most_derivatives, std::ssize(*term.features->tapes().entries));
+    if (term.has_directions()) most_derivatives = std::max(most_derivatives, std::ssize(*term.directions->tapes().entries));
   }
   add(fmt::format("scratch[{}]", 2 * most_points));
-  if (has("multipliers")) {
-    add(fmt::format("K[{}], lambda[{}]", nc * nq, nc));
+  if (has("multipliers")) add(fmt::format("lambda[{}]", nc));
+  if (has("least_norm")) {
+    add(fmt::format("K[{}]", nc * nq));
     if (has("several")) {
       add(fmt::format("null_space[{0}], null_rows[{0}], null_tau[{1}]", nc * nc, nc));
       add_workspace(fmt::format("int null_order[{}];", nc));
@@ -314,10 +334,12 @@ void Writer::set_sizes() {
     add(fmt::format("dsignal[{}], derivative[{}]", widest, most_derivatives));
     add(fmt::format("d_of_rest[{0}], d_force[{0}]", n));
     if (has("abar")) add(fmt::format("d_a_bar[{}]", n));
+    if (has("applied")) add(fmt::format("d_applied[{}]", n));
     if (has("moved")) add(fmt::format("d_a[{0}], d_of_constraint[{0}]", n));
     if (has("moved") && has("rows")) add(fmt::format("d_forced[{}], d_rows[{}]", n, nc * nx));
     if (has("reaction")) add(fmt::format("d_mass_a_bar[{}]", n));
     if (has("multipliers")) add(fmt::format("of_rows[{}]", nc * nx));
+    if (has("load")) add(fmt::format("d_forced0[{0}], d_rows0[{1}], d_along[{1}], d_lambda0[{1}]", n, nc * nx));
   }
   if (has("mixture")) add(has("jacobian") ? fmt::format("mean[{}], jacobian[{}]", nr, nr * nx) : fmt::format("mean[{}]", nr));
 }
@@ -466,20 +488,23 @@ std::string Writer::function(const std::string& wanted, const std::string& head,
   return known->second;
 }
 
-std::string Writer::program(const Tape& tape, const std::vector<std::string>& results, bool with_parameters) const {
+// @param n_loads  of λ₀, which stand behind the state
+std::string Writer::program(const Tape& tape, const std::vector<std::string>& results, bool with_parameters, int n_loads) const {
   std::string text;
-  const int n_state = layout_.size();
-  const int n_inputs = with_parameters ? static_cast<int>(inputs_.size()) : n_state;
+  const int n_varying = layout_.size() + n_loads;
+  std::vector<std::string> inputs(inputs_.begin(), inputs_.begin() + layout_.size());
+  inputs.insert(inputs.end(), loads_.begin(), loads_.begin() + n_loads);
+  if (with_parameters) inputs.insert(inputs.end(), inputs_.begin() + layout_.size(), inputs_.end());
   bool reads_state = false, reads_parameters = false;
-  for (int i = 0; i < n_inputs; ++i) {
+  for (int i = 0; i < static_cast<int>(inputs.size()); ++i) {
     if (!tape.uses_input(i)) continue;
-    (i < n_state ? reads_state : reads_parameters) = true;
-    text += fmt::format("  const real {} = {}[{}];\n", inputs_[static_cast<std::size_t>(i)], i < n_state ? "state" : "parameters",
-                        i < n_state ? i : i - n_state);
+    (i < n_varying ? reads_state : reads_parameters) = true;
+    text += fmt::format("  const real {} = {}[{}];\n", inputs[static_cast<std::size_t>(i)],
+                        i < n_varying ? "state" : "parameters", i < n_varying ? i : i - n_varying);
   }
   if (!reads_state) text += "  (void)state;\n";
   if (with_parameters && !reads_parameters) text += "  (void)parameters;\n";
-  return text + tape.as_c(std::span(inputs_).first(static_cast<std::size_t>(n_inputs)), results, options_.single_precision);
+  return text + tape.as_c(inputs, results, options_.single_precision);
 }
 
 void Writer::write_expressions() {
@@ -503,7 +528,9 @@ void Writer::write_expressions() {
       results.push_back(fmt::format("w->{}[{}]", names[static_cast<std::size_t>(one.quantity)], of.size()));
       of.push_back(fmt::format("{{{}, {}, {}}}", one.row, one.column, one.state_index));
     }
-    const bool is_read[] = {true, has("moved"), has("moved") && has("all"), has("known")};
+    const bool load = has("load");
+    const bool is_read[] = {true, has("moved") || load || has("admissible"), (has("moved") && has("all")) || load,
+                            has("known") || load};
     for (std::size_t quantity = 0; quantity < 4; ++quantity) {
       if (entries[quantity].empty()) continue;
       add_workspace(fmt::format("{}_real {}[{}];", options_.name, names[quantity], entries[quantity].size()));
@@ -525,13 +552,14 @@ void Writer::write_expressions() {
   const auto write = [&](const std::string& name, StateFunction::Evaluator& of, Index n, bool with_parameters,
                          bool is_differentiated) {
     const std::string arguments = std::string(with_parameters ? "const real *parameters, " : "") + "const real *state, real *out";
-    const auto [values, derivatives] = of.tapes();
-    texts_[name] = function(name, arguments, program(*values, vector("out", n), with_parameters));
-    const Index n_entries = std::ssize(of.entries());
+    const StateFunction::Evaluator::Tapes tapes = of.tapes();
+    texts_[name] = function(name, arguments, program(*tapes.values, vector("out", n), with_parameters, tapes.n_loads));
+    const Index n_entries = std::ssize(*tapes.entries);
     if (!is_differentiated || n_entries == 0) return;
-    texts_["d_" + name] = function("d_" + name, arguments, program(*derivatives, vector("out", n_entries), with_parameters));
+    texts_["d_" + name] =
+        function("d_" + name, arguments, program(*tapes.derivatives, vector("out", n_entries), with_parameters, tapes.n_loads));
     std::vector<std::string> entries;
-    for (const StateDerivatives::Entry& entry : of.entries()) {
+    for (const StateDerivatives::Entry& entry : *tapes.entries) {
       entries.push_back(with_parameters ? fmt::format("{{{}, {}, {}}}", entry.output % nq, entry.output / nq, entry.state_index)
                                         : fmt::format("{{{}, {}}}", entry.output, entry.state_index));
     }
@@ -546,8 +574,11 @@ void Writer::write_expressions() {
   };
   for (std::size_t a = 0; a < terms_.size(); ++a) {
     write(fmt::format("features_{}", a), *terms_[a].features, terms_[a].D, false, has("jacobian") && terms_[a].reads_features());
-    if (terms_[a].has_directions())
+    if (terms_[a].is_admissible()) {
+      texts_["admissible"] = table("admissible", terms_[a].admissible.data(), terms_[a].p);
+    } else if (terms_[a].has_directions()) {
       write(fmt::format("directions_{}", a), *terms_[a].directions, nq * terms_[a].p, true, has("jacobian"));
+    }
   }
   // what they call
   const std::pair<const char*, const char*> helpers[] = {
@@ -655,7 +686,7 @@ void Writer::write_kernels() {
           fmt::format("variance_{}", a), "const latent *a, const real *p, real *out",
           fmt::format("{}{}{}  *out = sum;\n", reads_a ? "" : "  (void)a;\n", is_constant ? "  (void)p;\n" : "", variance));
     }
-    if (has("jacobian") && term.reads_features() && !term.features->entries().empty()) {
+    if (has("jacobian") && term.reads_features() && !term.features->tapes().entries->empty()) {
       texts_[fmt::format("gradient_{}", a)] =
           function(fmt::format("gradient_{}", a), "const latent *a, const real *p, const real *k, real *scratch, real *out",
                    body_of(fmt::format("  for (int j = 0; j < {}; ++j) out[j] = 0;\n{}", D * term.p, gradient)));
@@ -679,6 +710,9 @@ void Writer::write_kernels() {
 
 // ---------------------------------------------------------------- mean
 
+// where a function finds its state
+const char* state_of(const StateFunction::Evaluator& function) { return function.tapes().n_loads > 0 ? "w->x" : "state"; }
+
 void Writer::write_signals() {
   std::string& text = texts_["signals"];
   for (std::size_t a = 0; a < terms_.size(); ++a) {
@@ -687,7 +721,7 @@ void Writer::write_signals() {
     text +=
         fmt::format("\n  /* latent {}: {} of {} */\n", in_comment(term.of->name.empty() ? std::to_string(a + 1) : term.of->name),
                     in_comment(term.kernel.text()), in_comment(fmt::format("{}", fmt::join(term.of->feature_names, ", "))));
-    text += fmt::format("  {}(state, w->phi_{});\n", texts_[fmt::format("features_{}", a)], a);
+    text += fmt::format("  {}({}, w->phi_{});\n", texts_[fmt::format("features_{}", a)], state_of(*term.features), a);
     text += fmt::format("  if (!is_finite({}, w->phi_{})) return {}_NOT_FINITE;\n", term.D, a, options_.name);
     text +=
         fmt::format("  {0}(&c->latents[{1}], w->phi_{1}, w->k_{1}, w->scratch);\n", texts_[fmt::format("covariance_{}", a)], a);
@@ -696,7 +730,10 @@ void Writer::write_signals() {
         "    w->signal_{0}[l] = weighted_sum(a->n, w->k_{0}, a->weights + a->n * l);\n  }}\n",
         a, term.p);
     if (term.has_directions()) {
-      text += fmt::format("  {}(c->parameters, state, w->B_{});\n", texts_[fmt::format("directions_{}", a)], a);
+      text += term.is_admissible() ? fmt::format("  for (int i = 0; i < NQ * NQ; ++i) w->B_{}[i] = w->P[i] * {}[i / NQ];\n", a,
+                                                 texts_["admissible"])
+                                   : fmt::format("  {}(c->parameters, {}, w->B_{});\n", texts_[fmt::format("directions_{}", a)],
+                                                 state_of(*term.directions), a);
       text += fmt::format("  for (int l = 0; l < {}; ++l) {{\n", term.p);
       text +=
           fmt::format("    for (int i = 0; i < NQ; ++i) w->{0}[i] += w->B_{1}[i + NQ * l] * w->signal_{1}[l];\n  }}\n", to, a);
@@ -729,6 +766,10 @@ void Writer::write_view() {
     value = fmt::format("    {}mean[r] = w->a_bar[{}];\n", each_row, r);
     matrix = each_column(fmt::format("({} == j)", r));
     change = each_entry(fmt::format("w->d_a_bar[{} + NQ * k]", r));
+  } else if (quantity == View::Quantity::learned_force) {
+    value = fmt::format("    {}mean[r] = w->applied[{}];\n", each_row, r);
+    matrix = each_column(fmt::format("w->mass[{} + NQ * j]", r));
+    change = each_entry(fmt::format("w->d_applied[{} + NQ * k]", r));
   } else if (quantity == View::Quantity::next_velocity) {
     const std::string added = view_.has_mean() ? fmt::format("state[NQ + {}] + ", r) : "";
     value = fmt::format("    {}mean[r] = {}{} * w->a[{}];\n", each_row, added, dt, r);
@@ -825,58 +866,90 @@ void Writer::write_stddev() {
 
 // ---------------------------------------------------------------- Jacobian
 
+// the change by entry e of the derivatives of a function, of what stands for ā in `to`
+std::string added_change(const StateFunction::Evaluator& function, const std::string& to, const std::string& slope) {
+  return function.tapes().n_loads > 0 ? fmt::format("add_change(w->{}, i, k, {}, w);\n", to, slope)
+                                      : fmt::format("w->{}[i + NQ * k] += {};\n", to, slope);
+}
+
 void Writer::write_jacobian() {
-  std::string &signals = texts_["dsignals"], &mechanics = texts_["dmechanics"];
+  std::string &signals = texts_["dsignals"], &mechanics = texts_["dmechanics"], &load = texts_["dload"];
   if (!has("jacobian")) return;
   bool reads_state = false, reads_component = false;
   for (std::size_t a = 0; a < terms_.size(); ++a) {
     const Term& term = terms_[a];
     const std::string to = term.is_forced() ? "d_force" : "d_of_rest";
     const std::string features = fmt::format("features_{}", a), directions = fmt::format("directions_{}", a);
-    if (const std::size_t n = term.features->entries().size(); n > 0 && term.reads_features()) {
-      reads_state = reads_component = true;
+    if (const std::size_t n = term.features->tapes().entries->size(); n > 0 && term.reads_features()) {
+      reads_component = true;
+      reads_state = reads_state || term.features->tapes().n_loads == 0;
       signals += fmt::format("  {0}(&c->latents[{1}], w->phi_{1}, w->k_{1}, w->scratch, w->dsignal);\n",
                              texts_[fmt::format("gradient_{}", a)], a);
-      signals += fmt::format("  {}(state, w->derivative);\n  for (int e = 0; e < {}; ++e) {{\n", texts_["d_" + features], n);
+      signals += fmt::format("  {}({}, w->derivative);\n  for (int e = 0; e < {}; ++e) {{\n", texts_["d_" + features],
+                             state_of(*term.features), n);
       signals += fmt::format("    const int d = {0}[e][0], k = {0}[e][1];\n    for (int i = 0; i < NQ; ++i) {{\n",
                              texts_["of_" + features]);
       if (term.has_directions()) {
         signals += fmt::format(
             "      real sum = 0;\n      for (int l = 0; l < {}; ++l) sum += w->B_{}[i + NQ * l] * w->dsignal[d + {} * l];\n",
             term.p, a, term.D);
-        signals += fmt::format("      w->{}[i + NQ * k] += sum * w->derivative[e];\n    }}\n  }}\n", to);
+        signals += "      " + added_change(*term.features, to, "sum * w->derivative[e]") + "    }\n  }\n";
       } else {
-        signals +=
-            fmt::format("      w->{}[i + NQ * k] += w->dsignal[d + {} * i] * w->derivative[e];\n    }}\n  }}\n", to, term.D);
+        const std::string slope = fmt::format("w->dsignal[d + {} * i] * w->derivative[e]", term.D);
+        signals += "      " + added_change(*term.features, to, slope) + "    }\n  }\n";
       }
     }
-    if (!term.has_directions() || term.directions->entries().empty()) continue;
-    reads_state = reads_component = true;
-    signals += fmt::format("  {}(c->parameters, state, w->derivative);\n  for (int e = 0; e < {}; ++e) {{\n",
-                           texts_["d_" + directions], term.directions->entries().size());
+    if (term.is_admissible() && has("d_A")) {
+      signals += fmt::format(
+          "  real along[NQ], multiplier[NC]; /* dE g = -(L dA E g + E B dA' lambda), lambda = L' B^-1 g */\n"
+          "  for (int i = 0; i < NQ; ++i) {{\n    along[i] = 0;\n"
+          "    for (int l = 0; l < NQ; ++l) along[i] += w->B_{0}[i + NQ * l] * w->signal_{0}[l];\n  }}\n"
+          "  for (int k = 0; k < NC; ++k) {{\n    multiplier[k] = 0;\n"
+          "    for (int i = 0; i < NQ; ++i) multiplier[k] += w->L_P[i + NQ * k] * w->signal_{0}[i] / {1}[i];\n  }}\n"
+          "  for (int e = 0; e < {2}; ++e) {{\n    const int i = of_d_A[e][0], j = of_d_A[e][1], k = of_d_A[e][2];\n"
+          "    for (int l = 0; l < NQ; ++l) {{\n      w->d_of_rest[l + NQ * k] -=\n"
+          "          w->d_A[e] * (along[j] * w->L_P[l + NQ * i] + multiplier[i] * {1}[j] * w->B_{0}[l + NQ * j]);\n    }}\n  "
+          "}}\n",
+          a, texts_["admissible"], texts_["n_d_A"]);
+      continue;
+    }
+    if (!term.has_directions() || term.directions->tapes().entries->empty()) continue;
+    reads_component = true;
+    reads_state = reads_state || term.directions->tapes().n_loads == 0;
+    signals += fmt::format("  {}(c->parameters, {}, w->derivative);\n  for (int e = 0; e < {}; ++e) {{\n",
+                           texts_["d_" + directions], state_of(*term.directions), term.directions->tapes().entries->size());
     signals += fmt::format("    const int i = {0}[e][0], l = {0}[e][1], k = {0}[e][2];\n", texts_["of_" + directions]);
-    signals += fmt::format("    w->{}[i + NQ * k] += w->derivative[e] * w->signal_{}[l];\n  }}\n", to, a);
+    signals += "    " + added_change(*term.directions, to, fmt::format("w->derivative[e] * w->signal_{}[l]", a)) + "  }\n";
   }
   if (!reads_state) signals += "  (void)state;\n";
   if (!reads_component) signals += "  (void)c;\n";
-  const auto each = [&](const std::string& of, const std::vector<std::string>& statements) {
+  const auto each = [&](std::string& text, const std::string& of, const std::vector<std::string>& statements) {
     if (!has(of) || statements.empty()) return;
     const bool is_matrix = of == "d_M" || of == "d_A";
-    mechanics += fmt::format("  for (int e = 0; e < {}; ++e) {{\n    const int i = of_{}[e][0],", texts_["n_" + of], of);
-    if (is_matrix) mechanics += fmt::format(" j = of_{}[e][1],", of);
-    mechanics += fmt::format(" k = of_{}[e][2];\n", of);
-    for (const std::string& statement : statements) mechanics += "    " + statement + "\n";
-    mechanics += "  }\n";
+    text += fmt::format("  for (int e = 0; e < {}; ++e) {{\n    const int i = of_{}[e][0],", texts_["n_" + of], of);
+    if (is_matrix) text += fmt::format(" j = of_{}[e][1],", of);
+    text += fmt::format(" k = of_{}[e][2];\n", of);
+    for (const std::string& statement : statements) text += "    " + statement + "\n";
+    text += "  }\n";
   };
   std::vector<std::string> of_M{"w->d_force[i + NQ * k] -= w->d_M[e] * w->a_of_force[j];"}, of_A, of_b, of_F;
   if (has("moved")) of_M.emplace_back("w->d_of_constraint[i + NQ * k] += w->d_M[e] * w->gap[j];");
+  if (has("applied")) of_M.emplace_back("w->d_applied[i + NQ * k] += w->d_M[e] * w->a_bar[j];");
   if (has("moved")) of_A = {"w->d_forced[j + NQ * k] += w->d_A[e] * lambda[i];", "w->d_rows[i + NC * k] -= w->d_A[e] * w->a[j];"};
   if (has("moved") && has("all")) of_b = {"w->d_rows[i + NC * k] += w->d_b[e];"};
   if (has("known")) of_F = {"w->d_force[i + NQ * k] += w->d_F[e];"};
-  each("d_M", of_M);
-  each("d_A", of_A);
-  each("d_b", of_b);
-  each("d_F", of_F);
+  each(mechanics, "d_M", of_M);
+  each(mechanics, "d_A", of_A);
+  each(mechanics, "d_b", of_b);
+  each(mechanics, "d_F", of_F);
+  if (has("load")) {
+    each(load, "d_M", {"w->d_forced0[i + NQ * k] -= w->d_M[e] * w->a0[j];"});
+    each(load, "d_A",
+         {"w->d_forced0[j + NQ * k] += w->d_A[e] * lambda0[i];", "w->d_rows0[i + NC * k] -= w->d_A[e] * w->a0[j];",
+          "w->d_along[i + NC * k] += w->d_A[e] * along[j];"});
+    each(load, "d_b", {"w->d_rows0[i + NC * k] += w->d_b[e];"});
+    each(load, "d_F", {"w->d_forced0[i + NQ * k] += w->d_F[e];"});
+  }
   if (mechanics.empty() && !has("moved")) mechanics = "  (void)w;\n";
 }
 

@@ -10,8 +10,10 @@
 //     moved               the view is of ddq or of the force of constraints
 //     reaction            it is of the force of constraints, or its multipliers (multipliers)
 //     abar                it is of abar
+//     applied             it is of the learned force
 //     all                 mu and b are part of it: it is not of one latent alone
 //     known, constant     mu = M^-1 F; mu is constant
+//     load                a latent reads lambda0; multipliers or it: least_norm
 //     solves              triangular systems of M are solved; of M itself (forced_solves)
 //     stddev, jacobian    these functions are asked for
 //     mixture             there are several components
@@ -511,6 +513,21 @@ static status project(workspace *w)
 {rows}  }
 {rows}  return is_contradictory(w) ? @name@_CONTRADICTING_CONSTRAINTS : @name@_OK;
 }
+{admissible}
+{admissible}/* P = I - W A' (A W A')^+ A with W = diag(@admissible@)^2, and the L of it: what `project` makes of the mass matrix W^-1 */
+{admissible}static void project_admissible(workspace *w)
+{admissible}{
+{admissible}  for (int i = 0; i < NQ * NQ; ++i) {
+{admissible}    w->stated_M[i] = w->M[i];
+{admissible}    w->M[i] = i % (NQ + 1) == 0 ? 1 / (@admissible@[i / NQ] * @admissible@[i / NQ]) : 0;
+{admissible}  }
+{admissible}  (void)project(w); /* it tells of A and b again when M is back */
+{admissible}  for (int i = 0; i < NQ * NQ; ++i) {
+{admissible}    w->P[i] = w->T[i];
+{admissible}    w->M[i] = w->stated_M[i];
+{admissible}  }
+{admissible}  for (int i = 0; i < NQ * NC; ++i) w->L_P[i] = w->L[i] * w->row_scale[i / NQ];
+{admissible}}
 {rows,moved}
 {rows,moved}/* ddq = L b + T abar, with one step of refinement onto A ddq = b */
 {rows,moved}static void constrain(workspace *w)
@@ -530,30 +547,59 @@ static status project(workspace *w)
 {rows,moved,all}    for (int k = 0; k < NC; ++k) w->a[i] += w->L[i + NQ * k] * w->residual[k];
 {rows,moved,all}  }
 {rows,moved}}
-{multipliers}
-{multipliers}/* K, of which lambda = K A' lambda: of redundant rows the multipliers of least norm */
-{multipliers}static void multipliers_of_force(workspace *w)
-{multipliers}{
-{multipliers}  for (int j = 0; j < NQ; ++j) {
-{multipliers}    for (int k = 0; k < NC; ++k) w->K[k + NC * j] = w->row_scale[k] * w->L[j + NQ * k];
-{multipliers}  }
-{multipliers,several}  const int rank = w->rank, n_redundant = NC - w->n_zero_rows - rank, n = NC - rank;
-{multipliers,several}  if (n_redundant == 0 || rank == 0) return;
-{multipliers,several}  /* takes away what lies in the null space of A': of unit rows it is spanned by the last columns of Q2 */
-{multipliers,several}  for (int i = 0; i < NC * n; ++i) w->null_space[i] = i == rank + i / NC * (NC + 1);
-{multipliers,several}  apply_Q(NC, w->R, w->tau2, rank, n, w->null_space);
-{multipliers,several}  for (int j = 0; j < n; ++j) {
-{multipliers,several}    for (int i = 0; i < NC; ++i) {
-{multipliers,several}      w->null_rows[w->order[i] + NC * j] = w->row_scale[w->order[i]] * w->null_space[i + NC * j];
-{multipliers,several}    }
-{multipliers,several}  }
-{multipliers,several}  pivoted_qr(NC, n, w->null_rows, w->null_tau, w->null_order, 0);
-{multipliers,several}  apply_Q_transposed(NC, w->null_rows, w->null_tau, n_redundant, NQ, w->K);
-{multipliers,several}  for (int j = 0; j < NQ; ++j) {
-{multipliers,several}    for (int k = 0; k < n_redundant; ++k) w->K[k + NC * j] = 0;
-{multipliers,several}  }
-{multipliers,several}  apply_Q(NC, w->null_rows, w->null_tau, n_redundant, NQ, w->K);
-{multipliers}}
+{least_norm}
+{least_norm}/* K, of which lambda = K A' lambda: of redundant rows the multipliers of least norm */
+{least_norm}static void multipliers_of_force(workspace *w)
+{least_norm}{
+{least_norm}  for (int j = 0; j < NQ; ++j) {
+{least_norm}    for (int k = 0; k < NC; ++k) w->K[k + NC * j] = w->row_scale[k] * w->L[j + NQ * k];
+{least_norm}  }
+{least_norm,several}  const int rank = w->rank, n_redundant = NC - w->n_zero_rows - rank, n = NC - rank;
+{least_norm,several}  if (n_redundant == 0 || rank == 0) return;
+{least_norm,several}  /* takes away what lies in the null space of A': of unit rows it is spanned by the last columns of Q2 */
+{least_norm,several}  for (int i = 0; i < NC * n; ++i) w->null_space[i] = i == rank + i / NC * (NC + 1);
+{least_norm,several}  apply_Q(NC, w->R, w->tau2, rank, n, w->null_space);
+{least_norm,several}  for (int j = 0; j < n; ++j) {
+{least_norm,several}    for (int i = 0; i < NC; ++i) {
+{least_norm,several}      w->null_rows[w->order[i] + NC * j] = w->row_scale[w->order[i]] * w->null_space[i + NC * j];
+{least_norm,several}    }
+{least_norm,several}  }
+{least_norm,several}  pivoted_qr(NC, n, w->null_rows, w->null_tau, w->null_order, 0);
+{least_norm,several}  apply_Q_transposed(NC, w->null_rows, w->null_tau, n_redundant, NQ, w->K);
+{least_norm,several}  for (int j = 0; j < NQ; ++j) {
+{least_norm,several}    for (int k = 0; k < n_redundant; ++k) w->K[k + NC * j] = 0;
+{least_norm,several}  }
+{least_norm,several}  apply_Q(NC, w->null_rows, w->null_tau, n_redundant, NQ, w->K);
+{least_norm}}
+{load}
+{load}/* lambda0, the multipliers under the known force, M a0 = F + A' lambda0 with A a0 = b; x is the state and lambda0 */
+{load}static void known_multipliers(const real *state, workspace *w)
+{load}{
+{load}  real without[NQ], force[NQ];
+{load}  for (int i = 0; i < NQ; ++i) without[i] = w->F[i];
+{load}  solve_mass(w->C, 1, without);
+{load}  for (int i = 0; i < NQ; ++i) {
+{load}    w->a0[i] = w->Lb[i];
+{load}    for (int j = 0; j < NQ; ++j) w->a0[i] += w->T[i + NQ * j] * without[j];
+{load}  }
+{load}  for (int k = 0; k < NC; ++k) {
+{load}    w->residual[k] = w->b_unit[k];
+{load}    for (int i = 0; i < NQ; ++i) w->residual[k] -= w->A_unit[k + NC * i] * w->a0[i];
+{load}  }
+{load}  for (int i = 0; i < NQ; ++i) {
+{load}    for (int k = 0; k < NC; ++k) w->a0[i] += w->L[i + NQ * k] * w->residual[k];
+{load}  }
+{load}  for (int i = 0; i < NQ; ++i) {
+{load}    force[i] = -w->F[i];
+{load}    for (int j = 0; j < NQ; ++j) force[i] += w->M[i + NQ * j] * w->a0[j];
+{load}  }
+{load}  multipliers_of_force(w);
+{load}  for (int i = 0; i < NX; ++i) w->x[i] = state[i];
+{load}  for (int k = 0; k < NC; ++k) {
+{load}    w->x[NX + k] = 0;
+{load}    for (int i = 0; i < NQ; ++i) w->x[NX + k] += w->K[k + NC * i] * force[i];
+{load}  }
+{load}}
 
 )c";
 
@@ -790,11 +836,21 @@ static status evaluate_prior(const component *c, const real *state, workspace *w
 {known}    w->force[i] = w->F[i];
 {!known}    w->force[i] = 0;
   }
+{load}  known_multipliers(state, w);
 @signals@  for (int i = 0; i < NQ; ++i) w->a_of_force[i] = w->force[i];
 {forced}  solve_mass(w->C, 1, w->a_of_force);
 {forced}  for (int i = 0; i < NQ; ++i) w->a_bar[i] += w->a_of_force[i];
   return is_finite(NQ, w->a_bar) ? @name@_OK : @name@_NOT_FINITE;
 }
+{applied}
+{applied}/* the applied force M abar */
+{applied}static void evaluate_applied_force(workspace *w)
+{applied}{
+{applied}  for (int i = 0; i < NQ; ++i) {
+{applied}    w->applied[i] = w->force[i];
+{applied}    for (int j = 0; j < NQ; ++j) w->applied[i] += w->M[i + NQ * j] * (w->a_bar[j] - w->a_of_force[j]);
+{applied}  }
+{applied}}
 {moved}
 {moved}/* ddq, and the force A' lambda = M (ddq - abar) of the constraints */
 {moved}static void evaluate_motion(workspace *w)
@@ -813,10 +869,12 @@ static status evaluate_prior(const component *c, const real *state, workspace *w
 /* The mean after the mechanics at a state stand in the workspace. */
 static status evaluate_mean(const component *c, const real *state, real *mean, workspace *w)
 {
+{admissible}  project_admissible(w);
   status s = project(w);
   if (s == @name@_OK) s = evaluate_prior(c, state, w);
   if (s == @name@_OK) {
 {moved}    evaluate_motion(w);
+{applied}    evaluate_applied_force(w);
 @value@
     if (!is_finite(NR, mean)) s = @name@_NOT_FINITE;
   }
@@ -947,13 +1005,58 @@ status @name@_mean(const real *state, real *mean, workspace *w)
 {jacobian} *     dddq  = T (P + M^-1 (R + dM (abar - ddq - a_of_force) + dA' lambda)) + L (db - dA ddq)
 {jacobian} */
 {jacobian}
+{jacobian,load}/* d lambda0 = K (M da0 - r) + (I - K A') dA K' lambda0, da0 = T M^-1 r + L (db - dA a0), r = dF + dA' lambda0 - dM a0 */
+{jacobian,load}static void differentiate_known_multipliers(workspace *w)
+{jacobian,load}{
+{jacobian,load}  const real *const lambda0 = w->x + NX;
+{jacobian,load}  real along[NQ]; /* K' lambda0 */
+{jacobian,load}  for (int j = 0; j < NQ; ++j) {
+{jacobian,load}    along[j] = 0;
+{jacobian,load}    for (int i = 0; i < NC; ++i) along[j] += w->K[i + NC * j] * lambda0[i];
+{jacobian,load}  }
+{jacobian,load}  for (int i = 0; i < NQ * NX; ++i) w->d_forced0[i] = 0;
+{jacobian,load}  for (int i = 0; i < NC * NX; ++i) w->d_rows0[i] = w->d_along[i] = 0;
+@dload@
+{jacobian,load}  for (int k = 0; k < NX; ++k) {
+{jacobian,load}    real *const r = w->d_forced0 + NQ * k, *const d_along = w->d_along + NC * k;
+{jacobian,load}    real solved[NQ], da0[NQ];
+{jacobian,load}    for (int i = 0; i < NQ; ++i) solved[i] = r[i];
+{jacobian,load}    solve_mass(w->C, 1, solved);
+{jacobian,load}    for (int i = 0; i < NQ; ++i) {
+{jacobian,load}      da0[i] = 0;
+{jacobian,load}      for (int j = 0; j < NQ; ++j) da0[i] += w->T[i + NQ * j] * solved[j];
+{jacobian,load}      for (int j = 0; j < NC; ++j) da0[i] += w->L[i + NQ * j] * w->row_scale[j] * w->d_rows0[j + NC * k];
+{jacobian,load}    }
+{jacobian,load}    for (int i = 0; i < NQ; ++i) {
+{jacobian,load}      r[i] = -r[i];
+{jacobian,load}      for (int j = 0; j < NQ; ++j) r[i] += w->M[i + NQ * j] * da0[j];
+{jacobian,load}    }
+{jacobian,load}    for (int i = 0; i < NC; ++i) {
+{jacobian,load}      if (w->rank == NC) d_along[i] = 0; /* K A' = I */
+{jacobian,load}      for (int j = 0; j < NQ; ++j) r[j] -= w->A[i + NC * j] * d_along[i];
+{jacobian,load}    }
+{jacobian,load}    for (int i = 0; i < NC; ++i) {
+{jacobian,load}      w->d_lambda0[i + NC * k] = d_along[i];
+{jacobian,load}      for (int j = 0; j < NQ; ++j) w->d_lambda0[i + NC * k] += w->K[i + NC * j] * r[j];
+{jacobian,load}    }
+{jacobian,load}  }
+{jacobian,load}}
+{jacobian,load}
+{jacobian,load}/* sum (NQ x NX) += slope in row i, for entry k of x */
+{jacobian,load}static void add_change(real *sum, int i, int k, real slope, const workspace *w)
+{jacobian,load}{
+{jacobian,load}  if (k < NX) sum[i + NQ * k] += slope;
+{jacobian,load}  for (int j = 0; k >= NX && j < NX; ++j) sum[i + NQ * j] += slope * w->d_lambda0[k - NX + NC * j];
+{jacobian,load}}
+{jacobian,load}
 {jacobian}static void differentiate_prior(const component *c, const real *state, workspace *w)
 {jacobian}{
+{jacobian,load}  differentiate_known_multipliers(w);
 {jacobian}  for (int i = 0; i < NQ * NX; ++i) w->d_of_rest[i] = w->d_force[i] = 0;
 @dsignals@
 {jacobian}}
 {jacobian}
-{jacobian}/* R - dM a_of_force, dA' lambda, dM (ddq - abar), db - dA ddq */
+{jacobian}/* R - dM a_of_force, dA' lambda, dM (ddq - abar), dM abar, db - dA ddq */
 {jacobian}static void differentiate_mechanics(workspace *w)
 {jacobian}{
 {jacobian,moved,rows}  real lambda[NC];
@@ -962,17 +1065,24 @@ status @name@_mean(const real *state, real *mean, workspace *w)
 {jacobian,moved,rows}    for (int i = 0; i < NQ; ++i) lambda[k] += w->row_scale[k] * w->L[i + NQ * k] * w->of_constraint[i];
 {jacobian,moved,rows}  }
 {jacobian,moved}  for (int i = 0; i < NQ * NX; ++i) w->d_of_constraint[i] = 0;
+{jacobian,applied}  for (int i = 0; i < NQ * NX; ++i) w->d_applied[i] = 0;
 {jacobian,moved,rows}  for (int i = 0; i < NQ * NX; ++i) w->d_forced[i] = 0;
 {jacobian,moved,rows}  for (int i = 0; i < NC * NX; ++i) w->d_rows[i] = 0;
 @dmechanics@
 {jacobian}}
 {jacobian}
-{jacobian}/* dabar, dddq and d(A' lambda), those that the prediction needs */
+{jacobian}/* dabar, d(M abar), dddq and d(A' lambda), those that the prediction needs */
 {jacobian}static void differentiate_motion(workspace *w)
 {jacobian}{
 {jacobian,abar}  for (int i = 0; i < NQ * NX; ++i) w->d_a_bar[i] = w->d_force[i];
 {jacobian,abar,forced}  solve_mass(w->C, NX, w->d_a_bar);
 {jacobian,abar}  for (int i = 0; i < NQ * NX; ++i) w->d_a_bar[i] += w->d_of_rest[i];
+{jacobian,applied}  for (int k = 0; k < NX; ++k) {
+{jacobian,applied}    for (int i = 0; i < NQ; ++i) {
+{jacobian,applied}      w->d_applied[i + NQ * k] += w->d_force[i + NQ * k];
+{jacobian,applied}      for (int j = 0; j < NQ; ++j) w->d_applied[i + NQ * k] += w->M[i + NQ * j] * w->d_of_rest[j + NQ * k];
+{jacobian,applied}    }
+{jacobian,applied}  }
 {jacobian,reaction}  for (int k = 0; k < NX; ++k) {
 {jacobian,reaction}    for (int i = 0; i < NQ; ++i) {
 {jacobian,reaction}      real sum = w->d_force[i + NQ * k];

@@ -48,6 +48,9 @@ constexpr std::array<Named<Prior::Mean>, 2> means = {{{Prior::Mean::zero, "zero"
 constexpr std::array<Named<std::optional<Latent::Base>>, 3> directions = {
     {{std::nullopt, "model"}, {Latent::Base::acceleration, "acceleration"}, {Latent::Base::force, "force"}}};
 
+constexpr std::array<Named<Latent::Base>, 2> discrepancy_directions = {
+    {{Latent::Base::admissible, "admissible"}, {Latent::Base::acceleration, "acceleration"}}};
+
 template <class Choice, std::size_t n>
 const char* name_of(const std::array<Named<Choice>, n>& choices, Choice choice) {
   return std::find_if(choices.begin(), choices.end(), [&](const auto& known) { return known.first == choice; })->second;
@@ -299,7 +302,9 @@ struct Labels {
       for (const LoadingEntry& entry : loading_entries(latent)) {
         needed.insert({LoadingEntry::word(entry.kind), static_cast<int>(a), entry.index});
       }
-      if (!latent.free_loading && !latent.signal_is_fixed) add(needed, Kind::signal_stddev, a, latent.column_names.size());
+      // one signal for all is 1 where it is not told, as in files of before it was learned
+      if (!latent.free_loading)
+        add(latent.has_one_signal ? optional : needed, Kind::signal_stddev, a, latent.column_names.size());
     }
     for (std::size_t group = 0; group < observations.size(); ++group) {
       add(optional, Kind::noise_stddev, group, observations[group].view().rows.size());
@@ -384,7 +389,10 @@ Json baseline_json(const Baseline& baseline) {
 }
 
 Discrepancy discrepancy_from(const ParsedJson& json) {
-  Discrepancy discrepancy{vector_from(json.at("lengthscale")), vector_from(json.at("stddev"))};
+  Discrepancy discrepancy{vector_from(json.at("lengthscale")), vector_from(json.at("stddev")), Latent::Base::acceleration};
+  if (json.contains("directions")) {  // since format 11
+    discrepancy.base = choice_from(json.at("directions"), discrepancy_directions, "direction of a discrepancy");
+  }
   if (discrepancy.lengthscale.size() == 0 || !(discrepancy.lengthscale.array() > 0).all() ||
       !(discrepancy.stddev.array() > 0).all()) {
     throw InputError("lengthscale and stddev of the discrepancy must be positive");
@@ -490,6 +498,25 @@ Observations observations_from(const ParsedJson& json, const Prior& home, std::s
                     vector_from(sum.at("noise"))});
   }
   return observations.with_sums(std::move(sums));
+}
+
+Json logs_json(const std::vector<LogFile>& logs) {
+  Json json = Json::array();
+  for (const LogFile& log : logs)
+    json.push_back({{"name", log.name}, {"bytes", log.bytes}, {"rows", log.rows}, {"checksum", log.checksum}});
+  return json;
+}
+
+std::vector<LogFile> logs_from(const ParsedJson& json) {
+  std::vector<LogFile> logs;
+  for (const ParsedJson& log : array(json)) {
+    for (const char* key : {"bytes", "rows"}) {
+      if (!log.at(key).is_number_unsigned())
+        throw InputError(fmt::format("{} stands where a whole number must", shown(log.at(key))));
+    }
+    logs.push_back({log.at("name"), log.at("bytes"), log.at("rows"), log.at("checksum")});
+  }
+  return logs;
 }
 
 // a restart without a finite start has the objective ∞, which JSON has not: null
@@ -835,7 +862,7 @@ std::string difference_of_latents(const Prior& made, const Prior& fitted) {
     if (mine.base != its.base || mine.column_names != its.column_names || mine.free_loading != its.free_loading) {
       return differ("the directions");
     }
-    if (mine.kernel_is_fixed != its.kernel_is_fixed || mine.signal_is_fixed != its.signal_is_fixed) {
+    if (mine.kernel_is_fixed != its.kernel_is_fixed || mine.has_one_signal != its.has_one_signal) {
       return differ("what is fixed");
     }
   }
@@ -919,6 +946,11 @@ std::vector<std::int64_t> FitFile::n_states() const {
   return n;
 }
 
+bool FitFile::has_learned(const LogFile& log) const {
+  return std::ranges::any_of(logs,
+                             [&](const LogFile& known) { return known.checksum == log.checksum && known.bytes == log.bytes; });
+}
+
 void FitFile::take_data(const Posterior& posterior) {
   observations = posterior.observations();
   if (!report.inducing) return;
@@ -935,15 +967,14 @@ void FitFile::write(const std::filesystem::path& path) const {
   json["version"] = format_version;
   json["library"] = version();
   json["model"] = model_json(model);
-  json["prior"] = {{"mean", name_of(means, prior_options.mean)},
-                   {"directions", name_of(directions, prior_options.base)},
-                   {"raw_angles", prior_options.raw_angles},
-                   {"kernel", prior_options.kernel},
-                   {"per_direction", prior_options.per_direction}};
+  json["prior"] = {{"mean", name_of(means, prior_options.mean)},   {"directions", name_of(directions, prior_options.base)},
+                   {"raw_angles", prior_options.raw_angles},       {"kernel", prior_options.kernel},
+                   {"per_direction", prior_options.per_direction}, {"feature_centres", prior_options.feature_centres}};
   if (prior_options.baseline) json["prior"]["baseline"] = baseline_json(*prior_options.baseline);
   if (prior_options.discrepancy) {
     json["prior"]["discrepancy"] = {{"lengthscale", vector_json(prior_options.discrepancy->lengthscale)},
-                                    {"stddev", vector_json(prior_options.discrepancy->stddev)}};
+                                    {"stddev", vector_json(prior_options.discrepancy->stddev)},
+                                    {"directions", name_of(discrepancy_directions, prior_options.discrepancy->base)}};
   }
   json["hyperparameters"] = Json::array();
   const Prior home = prior();
@@ -964,6 +995,7 @@ void FitFile::write(const std::filesystem::path& path) const {
   if (!report.actuators.empty()) json["actuators"] = actuators_json(report.actuators);
   if (!options.empty()) json["options"] = Json::parse(options);
   json["data_source"] = data_source;
+  if (!logs.empty()) json["logs"] = logs_json(logs);
   json["observations"] = Json::array();
   for (std::size_t g = 0; g < observations.size(); ++g) {
     const Model* other = observations[g].view().other_system && g < systems.size() ? systems[g].get() : nullptr;
@@ -1035,9 +1067,16 @@ FitFile read_fit(std::string_view text, const std::filesystem::path& path, const
       prior_json.at("kernel").get_to(fit.prior_options.kernel);
       prior_json.at("per_direction").get_to(fit.prior_options.per_direction);
     }
+    if (prior_json.contains("feature_centres")) {
+      if (!prior_json.at("feature_centres").is_object()) throw InputError("feature_centres must be an object of numbers");
+      for (const auto& [feature, centre] : prior_json.at("feature_centres").items()) {
+        fit.prior_options.feature_centres.emplace(feature, number(centre));
+      }
+    }
     if (prior_json.contains("discrepancy")) fit.prior_options.discrepancy = discrepancy_from(prior_json.at("discrepancy"));
     if (prior_json.contains("baseline")) fit.prior_options.baseline = baseline_from(prior_json.at("baseline"));
     json.at("data_source").get_to(fit.data_source);
+    if (json.contains("logs")) fit.logs = logs_from(json.at("logs"));
     if (json.contains("options")) {
       if (!json.at("options").is_object())
         throw InputError(fmt::format("options must be an object, got {}", shown(json.at("options"))));

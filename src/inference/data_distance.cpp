@@ -1,12 +1,14 @@
 #include "inference/data_distance.hpp"
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <limits>
 #include <numbers>
 #include <numeric>
 
 #include "base/not_a_number.hpp"
+#include "base/simd.hpp"
 
 namespace gp2 {
 
@@ -15,20 +17,19 @@ using Eigen::Ref;
 using Eigen::VectorXd;
 using Primitive = Kernel::Primitive;
 
-namespace {
-
-// smallest |z − z_j|² over columns
-double smallest(const Ref<const Eigen::MatrixXd>& points, const Ref<const VectorXd>& z) {
+double DataDistance::smallest(const Ref<const VectorXd>& z, Index first, Index last) const {
+  constexpr Index block = 64 * simd::lanes<double>;
+  std::array<double, block> squares;
   double nearest = std::numeric_limits<double>::infinity();
-  for (Index j = 0; j < points.cols(); ++j) {
-    double sum = 0;
-    for (Index c = 0; c < z.size(); ++c) sum += (points(c, j) - z[c]) * (points(c, j) - z[c]);
-    nearest = std::min(nearest, sum);
+  for (Index begin = 0; begin < n_observed_; begin += block) {
+    const Index n_rows = std::min(block, observed_.rows() - begin), n = std::min(block, n_observed_ - begin);
+    simd::loops().squared_distance(n_rows, z.size(), observed_.data() + begin, observed_.rows(), z.data(), squares.data());
+    for (Index i = 0; i < n; ++i) {
+      if (begin + i < first || begin + i >= last) nearest = std::min(nearest, squares[static_cast<std::size_t>(i)]);
+    }
   }
   return nearest;
 }
-
-}  // namespace
 
 double DataDistance::Coordinate::of(const Ref<const VectorXd>& features) const {
   const double phi = features[feature];
@@ -50,12 +51,15 @@ DataDistance::DataDistance(const Posterior::Implementation& posterior, const Vie
   const Index step = std::max<Index>(1, (n_states + most - 1) / most);
   std::vector<Index> n_of_group;
   for (const Observations& group : posterior.observations) n_of_group.push_back((group.n_data() + step - 1) / step);
-  observed_.resize(n_coordinates(), std::accumulate(n_of_group.begin(), n_of_group.end(), Index{0}));
+  n_observed_ = std::accumulate(n_of_group.begin(), n_of_group.end(), Index{0});
+  observed_.setZero(simd::padded(n_observed_), n_coordinates());
+  VectorXd z(n_coordinates());
   const auto features = features_by_group(prior, posterior.observations);
   Index i = 0;
   for (std::size_t g = 0; g < features.size() && n_coordinates() > 0; ++g) {
     for (Index k = 0; k < n_of_group[g]; ++k) {
-      write_coordinates([&](std::size_t a) { return features[g][a].row(k * step).transpose(); }, observed_.col(i++));
+      write_coordinates([&](std::size_t a) { return features[g][a].row(k * step).transpose(); }, z);
+      observed_.row(i++) = z.transpose();
     }
   }
   set_unit(n_of_group);
@@ -85,16 +89,15 @@ void DataDistance::add_coordinates(std::size_t latent, const Kernel& kernel, con
 // half before and half after, is left out. Nineteen of twenty observed states are nearer to the others than a unit.
 void DataDistance::set_unit(const std::vector<Index>& n_of_group) {
   constexpr Index most = 1000;  // states that are looked at
-  const Index n_all = observed_.cols();
-  const Index step = std::max<Index>(1, n_all / most);
+  const Index step = std::max<Index>(1, n_observed_ / most);
   std::vector<double> distances;
   Index first = 0;
   for (const Index n : n_of_group) {
     const Index margin = n / 20;
     for (Index k = 0; k < n; k += step) {
-      const Index i = first + k, before = std::max(first, i - margin), after = std::min(first + n, i + margin + 1);
-      const double nearest = std::min(smallest(observed_.leftCols(before), observed_.col(i)),
-                                      smallest(observed_.rightCols(n_all - after), observed_.col(i)));
+      const Index i = first + k;
+      const VectorXd z = observed_.row(i).transpose();
+      const double nearest = smallest(z, std::max(first, i - margin), std::min(first + n, i + margin + 1));
       if (std::isfinite(nearest)) distances.push_back(std::sqrt(nearest));
     }
     first += n;
@@ -108,7 +111,7 @@ void DataDistance::set_unit(const std::vector<Index>& n_of_group) {
 
 double DataDistance::at(const Ref<const VectorXd>& z) const {
   if (z.size() == 0) return 0;
-  const double distance = std::sqrt(smallest(observed_, z));
+  const double distance = std::sqrt(smallest(z, 0, 0));
   if (distance == 0 || std::isinf(distance)) return distance;
   return distance / unit_;
 }

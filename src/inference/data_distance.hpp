@@ -43,9 +43,12 @@ class DataDistance {
   void add_coordinates(std::size_t latent, const Kernel& kernel, const Eigen::VectorXd& values, double variance);
   /// @param n_of_group  observed states of each Observations, one after the other
   void set_unit(const std::vector<Eigen::Index>& n_of_group);
+  // the smallest |z − z_j|² over the observed states but those from `first` to before `last`; allocates nothing
+  [[nodiscard]] double smallest(const Eigen::Ref<const Eigen::VectorXd>& z, Eigen::Index first, Eigen::Index last) const;
 
   std::vector<Coordinate> coordinates_;
-  Eigen::MatrixXd observed_;  // z of the observed states, group after group (coordinates × N)
+  Eigen::MatrixXd observed_;  // z of the observed states, group after group, padded (simd.hpp)  (N × coordinates)
+  Eigen::Index n_observed_ = 0;
   double unit_ = 0;
 };
 

@@ -46,6 +46,12 @@ MatrixXd DensePosterior::whitening_columns(Index first, Index n) const {
   return columns;
 }
 
+void DensePosterior::keep_root() {
+  // of sums X has the factor of their noise too
+  if (root_ || sums_) return;
+  root_.emplace().append(factor_.L());
+}
+
 // ỹ − Σ_a Z_a f̃_a − ε
 VectorXd DensePosterior::misfit(const std::vector<MatrixXd>& f, RandomStream& random) const {
   VectorXd misfit = sums_ ? VectorXd(VectorXd::Zero(n_rows())) : y_;
@@ -124,6 +130,8 @@ bool DensePosterior::append(const RowBlocks& more) {
 
 bool DensePosterior::append(const LatentRows& more) {
   if (!(size() == 0 ? factorise(more) : extend(more))) return false;
+  if (sums_) root_.reset();
+  if (root_) root_->append(factor_.L());
   append_basis(more);
   refresh_weights();
   return true;
@@ -209,6 +217,7 @@ void DensePosterior::erase(const std::vector<Index>& samples) {
   }
   std::sort(rows.begin(), rows.end());
   factor_.erase(rows);
+  if (root_) root_->erase(rows);
   std::vector<Index> kept(static_cast<std::size_t>(y_.size())), moved(kept.size());
   std::iota(kept.begin(), kept.end(), Index{0});
   kept.resize(static_cast<std::size_t>(close_gaps(kept.data(), y_.size(), rows)));

@@ -8,6 +8,7 @@
 #include <Eigen/Core>
 
 #include "base/random.hpp"
+#include "inference/inverse_root.hpp"
 #include "inference/row_blocks.hpp"
 
 // The seam between reduced observations and all that is inferred from them. How K̃ + I is solved stands behind it and nowhere
@@ -24,12 +25,10 @@ struct GramValue {
   double constant = 0;    // of the rows' reductions: what no latent enters, with all log 2π
 };
 
-/// Which derivatives of one latent are needed.
+/// Which derivatives of one latent are needed beside those in its columns.
 struct GramGradientParts {
-  bool kernel = false, columns = false, V = false, mean = false;
+  bool kernel = false, V = false, mean = false;
   bool alike = false;  // Z_i is the same at every sample and V not needed: `columns` are sums of pairs of components
-
-  [[nodiscard]] bool any() const { return kernel || columns || V || mean; }
 };
 
 /// Derivatives of −log N(ỹ; 0, K̃ + I). Those in every hyperparameter and parameter follow from them by the chain rule at single
@@ -91,6 +90,11 @@ class LatentPosterior {
   [[nodiscard]] virtual Eigen::VectorXd misfit(const std::vector<Eigen::MatrixXd>& f, RandomStream& random) const = 0;
   /// The weights in place of β that explain such misfits: [column of misfits][latent].
   [[nodiscard]] virtual std::vector<std::vector<Eigen::MatrixXd>> weights(Eigen::MatrixXd misfits) const = 0;
+
+  /// From here on X is kept as it grows and shrinks, so that root() has it at once. Nothing where it would take no less to keep.
+  virtual void keep_root() {}
+  /// X, or an orthogonal matrix times it; null where it is not kept.
+  [[nodiscard]] virtual const InverseRoot* root() const { return nullptr; }
 
   /// Conditions on more observations. False, and nothing has changed, where the covariance is not positive definite.
   [[nodiscard]] virtual bool append(const RowBlocks& more) = 0;

@@ -15,7 +15,9 @@ using Eigen::VectorXd;
 
 bool InducingGram::factorise(const RowBlocks& rows) {
   std::optional<InducingStatistics> sums = InducingStatistics::of(latents_, rows, workers_, stop_);
-  if (!sums) return false;
+  // what points leave out is never less than nothing: where it is, the signal is so far above the noise that rounding decides
+  constexpr double tolerance = 0.01;  // nats
+  if (!sums || sums->trace < -tolerance) return false;
   B_ = std::move(sums->B);
   B_.diagonal().array() += 1;
   L_ = B_;
@@ -103,8 +105,19 @@ std::optional<GramValue> InducingGram::differentiate(const RowBlocks& rows, cons
             for (Index c = 0; c < n_components; ++c) V[f].col(c) -= block.weight(g, c).cwiseProduct(explained_by_g);
           }
         }
+        // from the units of the enlarged noise to those without it
+        ArrayXd of_noise = block.rank().array() - (alpha.array() * block.y().array()).rowwise().sum();
+        for (std::size_t f = 0; f < functions.size(); ++f) {
+          for (Index c = 0; c < n_components; ++c) of_noise -= V[f].col(c).array() * block.weight(f, c).array();
+        }
+        for (std::size_t f = 0; f < functions.size(); ++f) {
+          V[f].array().colwise() /= block.noise().array();
+          if (!latents_.latent_of(functions[f]).is_local) continue;
+          for (Index c = 0; c < n_components; ++c) V[f].col(c).array() += block.of_noise(f, c, of_noise);
+        }
+        const MatrixXd alpha_before = alpha.array().colwise() / block.noise().array();
         GramGradient of_block;
-        of_block.alpha = in_rows(*block.rows().reduction, alpha);
+        of_block.alpha = in_rows(*block.rows().reduction, alpha_before);
         for (std::size_t a = 0; a < parts.size(); ++a) {
           const Index n_functions = latents_.latents()[a].n_functions;
           of_block.latents.push_back(
@@ -116,11 +129,14 @@ std::optional<GramValue> InducingGram::differentiate(const RowBlocks& rows, cons
           const Index l = functions[f].index;
           GramGradient::OfLatent& out = of_block.latents[a];
           for (Index c = 0; c < n_components; ++c) {
-            sum.columns[a][l] += V[f].col(c).dot(block.weight(f, c));
+            sum.columns[a][l] += V[f].col(c).dot(block.weight(f, c).cwiseProduct(block.noise()));
             if (parts[a].V) out.V.col(c * latent.n_functions + l) = V[f].col(c);
           }
           if (parts[a].mean) out.mean.col(l) = mean[f];
           if (l > 0) U[f - static_cast<std::size_t>(l)] += U[f];
+        }
+        for (std::size_t a = 0; a < parts.size(); ++a) {
+          if (parts[a].mean && latents_.latents()[a].is_local) block.add_mean_of_noise(a, alpha_before, of_block.latents[a].mean);
         }
         of_rows(part, row_block, of_block);
         KernelColumns::Workspace workspace;

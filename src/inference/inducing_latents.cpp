@@ -2,6 +2,8 @@
 
 #include <algorithm>
 
+#include <Eigen/Cholesky>
+
 #include "base/lapack.hpp"
 #include "base/simd.hpp"
 
@@ -35,9 +37,9 @@ InducingLatents::InducingLatents(const Prior& prior, const ModelValues& values)
 InducingLatents::InducingLatents(const Prior& prior, const ModelValues& values, std::vector<lapack::PivotedFactor> factors) {
   for (std::size_t a = 0; a < prior.latents.size(); ++a) {
     const MatrixXd Z = values.inducing->features[a](factors[a].rows, Eigen::all);
-    OfLatent& latent =
-        latents_.emplace_back(OfLatent{KernelColumns(prior.latents[a].kernel, Z, values.kernel[a]), std::move(factors[a].L),
-                                       std::move(factors[a].rows), values.loading(a).cols()});
+    OfLatent& latent = latents_.emplace_back(OfLatent{
+        KernelColumns(prior.latents[a].kernel, Z, values.kernel[a]), std::move(factors[a].L), std::move(factors[a].rows),
+        values.loading(a).cols(), prior.latents[a].kernel_is_fixed && prior.latents[a].base == Latent::Base::admissible});
     for (Index l = 0; l < latent.n_functions; ++l, size_ += latent.n_points()) functions_.push_back({a, l, size_});
   }
 }
@@ -50,7 +52,7 @@ void InducingLatents::solve(bool transposed, Ref<MatrixXd> c) const {
 }
 
 InducingBlock::InducingBlock(const InducingLatents& latents)
-    : latents_(&latents), k_(latents.latents().size()), w_(k_.size()), variance_(k_.size()) {}
+    : latents_(&latents), k_(latents.latents().size()), w_(k_.size()), variance_(k_.size()), left_(k_.size()) {}
 
 void InducingBlock::move_to(const LatentRows& rows) {
   rows_ = &rows;
@@ -67,6 +69,41 @@ void InducingBlock::move_to(const LatentRows& rows) {
     }
     w_[a] = k_[a].topRows(latent.n_points());
     lapack::solve_lower(latent.L, false, w_[a]);
+  }
+  add_noise();
+}
+
+// s_i² = 1 + Σ_a (k_a(φ_i, φ_i) − ‖w_i,a‖²) ‖Γ_i,a‖²/r_i over the local latents
+void InducingBlock::add_noise() {
+  rank_.resize(n());
+  for (Index i = 0; i < n(); ++i) rank_[i] = static_cast<double>(rows_->reduction->samples[static_cast<std::size_t>(i)].R.rows());
+  noise_.setOnes(n());
+  for (std::size_t a = 0; a < left_.size(); ++a) {
+    if (!latents_->latents()[a].is_local) continue;
+    const VectorXd held = w_[a].colwise().squaredNorm();
+    left_[a] = (variance_[a] - held).cwiseMax(0);
+    variance_[a] = held;
+    noise_.array() += left_[a] * rows_->latents[a].Z.topRows(n()).rowwise().squaredNorm().array() / rank_.array().max(1);
+  }
+  noise_ = noise_.cwiseSqrt();
+  y_.topRows(n()).array().colwise() /= noise_.array();
+}
+
+ArrayXd InducingBlock::of_noise(std::size_t f, Index component, const ArrayXd& slope) const {
+  // ∂log s/∂Γ = (k − ‖w‖²) Γ/(r s²), Γ in units of the noise without it
+  return slope * left_[latents_->functions()[f].latent] * weight(f, component).array() / (rank_.array().max(1) * noise_.array());
+}
+
+void InducingBlock::add_mean_of_noise(std::size_t a, const MatrixXd& alpha, MatrixXd& mean) const {
+  const LatentRows::OfLatent& latent = rows_->latents[a];
+  MatrixXd Gamma;
+  for (Index i = 0; i < n(); ++i) {
+    const auto rank = static_cast<Index>(rank_[i]);
+    if (rank == 0) continue;  // the constraint decides all that is measured
+    Gamma.resize(rank, latent.n_functions);
+    for (Index c = 0; c < rank; ++c) Gamma.row(c) = latent.Z.row(i).segment(c * latent.n_functions, latent.n_functions);
+    const VectorXd of_noise = (noise_[i] * noise_[i] - 1) * alpha.row(i).head(rank);
+    mean.row(i).transpose() += Gamma.transpose() * (Gamma * Gamma.transpose()).ldlt().solve(of_noise);
   }
 }
 
@@ -161,7 +198,7 @@ void InducingStatistics::add(const InducingLatents& latents, const InducingBlock
     }
   }
   yy += block.y().squaredNorm();
-  constant += block.rows().reduction->constant;
+  constant += block.rows().reduction->constant + block.log_noise();
 }
 
 }  // namespace gp2

@@ -28,6 +28,7 @@ class InducingLatents {
     Eigen::MatrixXd L;        // k_a(Z, Z) = L Lᵀ
     std::vector<int> chosen;  // which of the points that were given Z are, in order
     Eigen::Index n_functions = 0;
+    bool is_local = false;  // what points leave out of it counts as noise: they cannot hold what has short, fixed lengthscales
 
     [[nodiscard]] Eigen::Index n_points() const { return L.rows(); }
   };
@@ -58,7 +59,7 @@ class InducingLatents {
 };
 
 /// A block of samples beside inducing variables: Γ_i,f, component c of sample i, is the weight of function f in it (theory.md,
-/// T37). One per thread.
+/// T37). Weights and ỹ are in units of a noise that what is left of local latents has enlarged s_i-fold (T38). One per thread.
 class InducingBlock {
  public:
   explicit InducingBlock(const InducingLatents& latents);
@@ -73,12 +74,23 @@ class InducingBlock {
   /// k_a(Z, φ_i) (points, padded × n), and w = L⁻¹k (points × n).
   [[nodiscard]] const Eigen::MatrixXd& k(std::size_t latent) const { return k_[latent]; }
   [[nodiscard]] const Eigen::MatrixXd& w(std::size_t latent) const { return w_[latent]; }
-  /// k_a(φ_i, φ_i) at most (n)
+  /// s (n)
+  [[nodiscard]] const Eigen::VectorXd& noise() const { return noise_; }
+  /// Σ log s_i over the components of all samples
+  [[nodiscard]] double log_noise() const { return rank_.dot(noise_.array().log().matrix()); }
+  /// ∂/∂log s_i of a function of Γ and ỹ of samples, and of Σ log s_i, to its part of the gradient in Γ_i,f, component c, of a local
+  /// latent (n)
+  [[nodiscard]] Eigen::ArrayXd of_noise(std::size_t f, Eigen::Index component, const Eigen::ArrayXd& slope) const;
+  [[nodiscard]] const Eigen::VectorXd& rank() const { return rank_; }
+  /// Adds to the mean of a local latent's functions at the samples (n × functions) what it has where it counts as noise: m with
+  /// Γ_i m = (s_i² − 1) α̃_i, α̃ (n × components) in units of the noise without it.
+  void add_mean_of_noise(std::size_t a, const Eigen::MatrixXd& alpha, Eigen::MatrixXd& mean) const;
+  /// k_a(φ_i, φ_i) at most (n); of a local latent what the points hold of it
   [[nodiscard]] const Eigen::VectorXd& variance(std::size_t latent) const { return variance_[latent]; }
   [[nodiscard]] auto weight(std::size_t f, Eigen::Index component) const {
     const InducingLatents::Function& function = latents_->functions()[f];
     const LatentRows::OfLatent& latent = rows_->latents[function.latent];
-    return latent.Z.col(component * latent.n_functions + function.index).head(n());
+    return latent.Z.col(component * latent.n_functions + function.index).head(n()).cwiseQuotient(noise_);
   }
   /// Σ_c Γ_i,f Γ_i,g (n)
   [[nodiscard]] Eigen::ArrayXd weight_product(std::size_t f, std::size_t g) const;
@@ -88,11 +100,15 @@ class InducingBlock {
   [[nodiscard]] Eigen::MatrixXd misfit(const Eigen::Ref<const Eigen::VectorXd>& m) const;
 
  private:
+  void add_noise();
+
   const InducingLatents* latents_;
   const LatentRows* rows_ = nullptr;
   Eigen::MatrixXd y_;
   std::vector<Eigen::MatrixXd> k_, w_;
   std::vector<Eigen::VectorXd> variance_;
+  Eigen::VectorXd rank_, noise_;
+  std::vector<Eigen::ArrayXd> left_;  // of local latents: k_a(φ_i, φ_i) − ‖w_i‖² (n)
   Eigen::VectorXd point_;
   KernelColumns::Workspace workspace_;
 };

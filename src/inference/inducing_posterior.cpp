@@ -168,9 +168,10 @@ LatentPosterior::Inverse InducingPosterior::invert(const LatentRows& rows, const
     return square;
   };
 
-  Inverse inverse{in_rows(reduction, block.misfit(mean_)), {}, {}};
+  const auto& noise = block.noise();  // s, in units of which all of this is
+  Inverse inverse{in_rows(reduction, block.misfit(mean_).array().colwise() / noise.array()), {}, {}};
   const std::vector<MatrixXd> half = halves(L_);
-  for (Index i = 0; i < rows.n_samples(); ++i) inverse.blocks.push_back(block_of(half, i, -1));
+  for (Index i = 0; i < rows.n_samples(); ++i) inverse.blocks.push_back(block_of(half, i, -1) / (noise[i] * noise[i]));
   for (std::size_t k = 0; k < sets.size(); ++k) {
     InducingStatistics others(inducing_);
     for (std::size_t other = 0; other < stretches_.size(); ++other) {
@@ -184,8 +185,8 @@ LatentPosterior::Inverse InducingPosterior::invert(const LatentRows& rows, const
     const std::vector<MatrixXd> of_others = halves(others.B);
     WithoutSet& without = inverse.without.emplace_back();
     for (const Index sample : sets[k]) {
-      without.pull.emplace_back(pull.row(sample).head(rank_of(sample)));
-      without.covariance.push_back(block_of(of_others, sample, 1));
+      without.pull.emplace_back(noise[sample] * pull.row(sample).head(rank_of(sample)));
+      without.covariance.push_back(noise[sample] * noise[sample] * block_of(of_others, sample, 1));
     }
   }
   return inverse;

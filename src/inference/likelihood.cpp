@@ -215,7 +215,6 @@ std::vector<GramGradientParts> Likelihood::Implementation::parts(const Reduction
     part.kernel = !latent.kernel_is_fixed && values.kernel[a].size() > 0;
     part.alike = reduction != nullptr && reduction->same_directions[a] && !differentiates_samples();
     part.V = differentiates_samples() || (values.has_free_loading(a) && !part.alike);
-    part.columns = part.kernel || part.V || !latent.signal_is_fixed;
     part.mean = differentiates_samples();
   }
   return parts;
@@ -309,7 +308,7 @@ double Likelihood::evaluate(const ModelValues& values, ModelGradient* gradient, 
   }
   for (std::size_t a = 0; a < parts.size(); ++a) {
     if (parts[a].kernel) gradient->log_kernel[a] = of_gram.latents[a].kernel;
-    if (parts[a].columns && !values.has_free_loading(a)) gradient->log_signal_stddev[a] = of_gram.latents[a].columns;
+    if (!values.has_free_loading(a)) gradient->log_signal_stddev[a] = of_gram.latents[a].columns;
   }
   return value;
 }

@@ -53,10 +53,8 @@ bool model_observations(const Prior& prior, const std::vector<Observations>& obs
           {differentiate_view(group.view(), model.mechanics, d),
            differentiate_prior(there, group.states(), theta, model.mechanics, model.values.prior, d, index)});
     }
-    if (const std::optional<LatentRange>& latent = group.view().latent) {
-      model.values.prior.keep_only(latent->first, latent->n);
-      for (ObservationModel::Values& d : model.derivatives) d.prior.keep_only(latent->first, latent->n);
-    }
+    keep_viewed(group.view(), model.values.prior);
+    for (ObservationModel::Values& d : model.derivatives) keep_viewed(group.view(), d.prior);
   }
   return true;
 }

@@ -81,7 +81,7 @@ class PairSweep {
         return is_wanted ? MatrixXd::Zero(rows, columns) : MatrixXd();
       };
       sums.latents.push_back({zeros(parts.kernel, simd::lanes<double>, latent(a).kernel.values().size()),
-                              zeros(parts.columns, simd::lanes<double>, parts.alike ? n_components * n_components : n_functions),
+                              MatrixXd::Zero(simd::lanes<double>, parts.alike ? n_components * n_components : n_functions),
                               zeros(parts.V, n_rows, latent(a).Z.cols()), zeros(parts.mean, n_rows, n_functions)});
     }
     return sums;
@@ -107,7 +107,6 @@ class PairSweep {
           ones(VectorXd::Ones(tile_size)) {
       Index n = 1;
       for (std::size_t a = 0; a < k.size(); ++a) {
-        if (!of.parts_[a].any()) continue;
         k[a].resize(tile_size, tile_size);
         H[a].resize(tile_size, tile_size);
         n = std::max(n, of.latent(a).n_functions);
@@ -124,7 +123,6 @@ class PairSweep {
       const auto skipped = [diagonal](Index j) { return diagonal ? whole_vectors_before(j) : 0; };
 
       for (std::size_t a = 0; a < k.size(); ++a) {
-        if (!sweep.parts_[a].any()) continue;
         H[a].setZero();
         for (Index j = 0; j < nj; ++j) {
           sweep.latent(a).kernel.scale(J + j, point);
@@ -143,7 +141,6 @@ class PairSweep {
           load(left, I, n_rows, n, right, J, n_columns, diagonal);
           for (std::size_t a = 0; a < k.size(); ++a) {
             const GramGradientParts& parts = sweep.parts_[a];
-            if (!parts.kernel && !parts.columns && !parts.V) continue;
             if (parts.alike) {
               contract_alike(a, left, I, n, right, J, n_columns, diagonal,
                              sums.latents[a].columns.col(left * n_components + right));

@@ -15,6 +15,7 @@
 #include "inference/posterior_implementation.hpp"
 #include "inference/predictor_data.hpp"
 #include "inference/requirements.hpp"
+#include "prior/admissible_directions.hpp"
 
 namespace gp2 {
 
@@ -67,10 +68,10 @@ struct Predictor::Implementation {
   Status evaluate_mechanics(StateEvaluator& at, Workspace::Implementation& w) const;
   // ā there
   Status evaluate_prior(const Ref<const VectorXd>& state, const StateEvaluator& at, Workspace::Implementation& w) const;
-  // ddq, and Aᵀλ if the view or the Jacobian needs it
+  // those of F̄, ddq and Aᵀλ that the view or the Jacobian needs
   void evaluate_motion(const StateEvaluator& at, Workspace::Implementation& w) const;
   void write_loadings(Workspace::Implementation& w) const;
-  void differentiate_prior(const Ref<const VectorXd>& state, Workspace::Implementation& w) const;
+  void differentiate_prior(const Ref<const VectorXd>& state, const StateEvaluator& at, Workspace::Implementation& w) const;
   void differentiate_mechanics(const StateEvaluator& at, Workspace::Implementation& w) const;
   void differentiate_motion(const StateEvaluator& at, Workspace::Implementation& w) const;
 };
@@ -85,9 +86,10 @@ struct Predictor::Workspace::Implementation {
 
   struct AtState {
     std::unique_ptr<StateFunction::Evaluator> of_features, of_directions;
-    VectorXd features;                // φ (D)
-    VectorXd point;                   // scaled
-    VectorXd directions;              // B (nq·p), none where B = I
+    VectorXd features;    // φ (D)
+    VectorXd point;       // scaled
+    VectorXd directions;  // B or B Π (nq·p), none where B = I
+    std::optional<AdmissibleDirections> admissible;
     VectorXd dfeatures, ddirections;  // their derivatives that do not vanish
     VectorXd signal;                  // C g (p)
     MatrixXd dsignal;                 // d(C g)/dφ (D × p)
@@ -100,6 +102,7 @@ struct Predictor::Workspace::Implementation {
   VectorXd a;                      // ddq, or T ā of one latent alone
   VectorXd gap;                    // a − ā
   VectorXd of_constraint;          // Aᵀλ = M (a − ā)
+  VectorXd applied;                // F̄ = M ā
   VectorXd lambda;                 // λ (nc)
   MatrixXd L;                      // (nq × nc)
   MatrixXd d_of_rest;              // of dā, what is not multiplied by M⁻¹ (nq × layout size)
@@ -109,6 +112,7 @@ struct Predictor::Workspace::Implementation {
   MatrixXd d_a_bar, d_a;           // dā, da
   MatrixXd d_mass_a_bar;           // M dā
   MatrixXd d_of_constraint;        // dM (a − ā), then d(Aᵀλ)
+  MatrixXd d_applied;              // dM ā, then dF̄
   MatrixXd value, d_value;         // every row of the quantity (× 1), (× layout size)
   MatrixXd G;                      // every row (× nq)
   MatrixXd Gt, M_inverse_Gt;       // Gᵀ of the view (nq × d)
@@ -122,8 +126,12 @@ struct Predictor::Workspace::Implementation {
 
   explicit Implementation(std::shared_ptr<const Predictor::Implementation> owner);
 
-  [[nodiscard]] MotionColumns motion() const { return {columns_of(a), columns_of(a_bar), columns_of(of_constraint)}; }
-  [[nodiscard]] MotionColumns dmotion() const { return {columns_of(d_a), columns_of(d_a_bar), columns_of(d_of_constraint)}; }
+  [[nodiscard]] MotionColumns motion() const {
+    return {columns_of(a), columns_of(a_bar), columns_of(of_constraint), columns_of(applied)};
+  }
+  [[nodiscard]] MotionColumns dmotion() const {
+    return {columns_of(d_a), columns_of(d_a_bar), columns_of(d_of_constraint), columns_of(d_applied)};
+  }
   [[nodiscard]] StateMechanics mechanics(const Map<const MatrixXd>& A) const { return {projection, A, predictor->time_step}; }
 
  private:
@@ -220,11 +228,11 @@ void Predictor::Workspace::Implementation::reserve_mechanics() {
   const Index nq = system.nq(), nc = system.nc(), n_state = system.layout().size(), d = predictor->view.size();
   const Index n_rows = predictor->n_quantity_rows();
   a_bar.setZero(nq);
-  force = a_of_force = a = gap = of_constraint = a_bar;
+  force = a_of_force = a = gap = of_constraint = applied = a_bar;
   lambda.setZero(nc);
   L.setZero(nq, nc);
   d_a_bar.setZero(nq, n_state);
-  d_of_rest = d_force = d_forced = d_a = d_mass_a_bar = d_of_constraint = d_a_bar;
+  d_of_rest = d_force = d_forced = d_a = d_mass_a_bar = d_of_constraint = d_applied = d_a_bar;
   d_rows.setZero(nc, n_state);
   value.setZero(n_rows, 1);
   d_value.setZero(n_rows, n_state);
@@ -260,6 +268,11 @@ void Predictor::Workspace::Implementation::reserve_term(const PredictorTerm& ter
   at.of_directions = latent.directions->make_evaluator(predictor->parameters);
   at.directions.setZero(nq * p);
   at.ddirections.setZero(static_cast<Index>(at.of_directions->entries().size()));
+  if (latent.base != Latent::Base::admissible) return;
+  at.of_directions->evaluate(VectorXd::Zero(predictor->prior.system->layout().size()), at.directions);
+  at.admissible.emplace(Map<const MatrixXd>(at.directions.data(), nq, nq).diagonal());
+  at.admissible->compute(MatrixXd::Ones(predictor->prior.system->nc(), nq));
+  at.admissible->set_functions(at.signal);
 }
 
 // ---------------------------------------------------------------- mean
@@ -313,7 +326,11 @@ Status Predictor::Implementation::evaluate_prior(const Ref<const VectorXd>& stat
       all_features = all_features && is_finite(here.features);
       term.kernel.scale(here.features, here.point);
       data.evaluate_signal(term, a, here.point, memory, here.signal);
-      if (here.of_directions) here.of_directions->evaluate(state, here.directions);
+      if (here.admissible) {
+        here.directions = here.admissible->compute(at.A()).reshaped();
+      } else if (here.of_directions) {
+        here.of_directions->evaluate(state, here.directions);
+      }
       add_product(here.directions, here.signal, of.base == Latent::Base::force ? w.force : w.a_bar);
     }
   });
@@ -326,6 +343,11 @@ Status Predictor::Implementation::evaluate_prior(const Ref<const VectorXd>& stat
 }
 
 void Predictor::Implementation::evaluate_motion(const StateEvaluator& at, Workspace::Implementation& w) const {
+  if (parts.applied_force) {
+    w.applied = w.force;
+    w.applied.noalias() += at.M() * w.a_bar;
+    w.applied.noalias() -= at.M() * w.a_of_force;
+  }
   if (!is_constrained) return;
   if (view.has_mean()) {
     w.projection.constrain(w.a_bar, w.a, w.refinement);
@@ -413,7 +435,8 @@ void Predictor::Implementation::write_stddev(const StateEvaluator& at, Workspace
 // Derivatives are few: each entry of dM, dA, db, dF is added where it belongs.
 
 // what the latents add to P and R
-void Predictor::Implementation::differentiate_prior(const Ref<const VectorXd>& state, Workspace::Implementation& w) const {
+void Predictor::Implementation::differentiate_prior(const Ref<const VectorXd>& state, const StateEvaluator& at,
+                                                    Workspace::Implementation& w) const {
   const Index nq = w.a_bar.size();
   w.d_of_rest.setZero();
   w.d_force.setZero();
@@ -436,6 +459,16 @@ void Predictor::Implementation::differentiate_prior(const Ref<const VectorXd>& s
       const double value = here.dfeatures[static_cast<Index>(e)];
       for (Index i = 0; i < nq; ++i) sum(i, entry.state_index) += here.E_dsignal(i, entry.output) * value;
     }
+    // dE C g
+    if (here.admissible) {
+      here.admissible->set_functions(here.signal);
+      for (std::size_t e = 0; e < at.derivatives().size(); ++e) {
+        const auto [quantity, i, j, k] = at.derivatives()[e];
+        if (quantity != StateEvaluator::Quantity::constraint_matrix) continue;
+        here.admissible->add_change(i, j, at.derivative_values()[static_cast<Index>(e)], sum.col(k));
+      }
+      continue;
+    }
     // dB C g
     if (!here.of_directions) continue;
     here.of_directions->differentiate(state, here.ddirections);
@@ -446,7 +479,7 @@ void Predictor::Implementation::differentiate_prior(const Ref<const VectorXd>& s
   }
 }
 
-// R − dM a_of_force, dAᵀλ, dM (a − ā), db − dA a
+// R − dM a_of_force, dAᵀλ, dM (a − ā), dM ā, db − dA a
 void Predictor::Implementation::differentiate_mechanics(const StateEvaluator& at, Workspace::Implementation& w) const {
   if (is_constrained) {
     w.projection.write_L(w.L);
@@ -455,6 +488,7 @@ void Predictor::Implementation::differentiate_mechanics(const StateEvaluator& at
   w.d_forced.setZero();
   w.d_rows.setZero();
   w.d_of_constraint.setZero();
+  w.d_applied.setZero();
   const auto values = at.derivative_values();
   for (std::size_t e = 0; e < at.derivatives().size(); ++e) {
     const auto [quantity, i, j, k] = at.derivatives()[e];
@@ -463,6 +497,7 @@ void Predictor::Implementation::differentiate_mechanics(const StateEvaluator& at
       case StateEvaluator::Quantity::mass:
         w.d_force(i, k) -= value * w.a_of_force[j];
         w.d_of_constraint(i, k) += value * w.gap[j];
+        w.d_applied(i, k) += value * w.a_bar[j];
         break;
       case StateEvaluator::Quantity::constraint_matrix:
         w.d_forced(j, k) += value * w.lambda[i];
@@ -478,18 +513,19 @@ void Predictor::Implementation::differentiate_mechanics(const StateEvaluator& at
   }
 }
 
-// dā, da and d(Aᵀλ) = dM (a − ā) + M da − M dā, those that the view needs
+// dā, dF̄ = dM ā + M dā, da and d(Aᵀλ) = dM (a − ā) + M da − M dā, those that the view needs
 void Predictor::Implementation::differentiate_motion(const StateEvaluator& at, Workspace::Implementation& w) const {
   if (parts.unconstrained_acceleration) {
     w.d_a_bar = w.d_force;
     w.projection.solve_mass_in_place(w.d_a_bar);
     w.d_a_bar += w.d_of_rest;
   }
-  if (!is_constrained) return;
-  if (parts.constraint_force) {
+  if (parts.constraint_force || parts.applied_force) {
     w.d_mass_a_bar = w.d_force;
     w.d_mass_a_bar.noalias() += at.M().lazyProduct(w.d_of_rest);
   }
+  if (parts.applied_force) w.d_applied += w.d_mass_a_bar;
+  if (!is_constrained) return;
   w.d_force += w.d_forced - w.d_of_constraint;
   w.projection.solve_mass_in_place(w.d_force);
   w.d_of_rest += w.d_force;
@@ -503,7 +539,7 @@ void Predictor::Implementation::differentiate_motion(const StateEvaluator& at, W
 
 void Predictor::Implementation::write_jacobian(const Ref<const VectorXd>& state, const StateEvaluator& at,
                                                Workspace::Implementation& w, Ref<MatrixXd> jacobian) const {
-  differentiate_prior(state, w);
+  differentiate_prior(state, at, w);
   differentiate_mechanics(at, w);
   differentiate_motion(at, w);
   view.quantity->differentiate(w.mechanics(at.A()), w.motion(), w.dmotion(), StateChange(at), w.d_value, w.quantity);

@@ -68,6 +68,10 @@ void PredictorData<T>::store(const LatentPosterior& posterior, const std::vector
 template <typename T>
 void PredictorData<T>::store_inverse(const LatentPosterior& posterior) {
   const Index n = posterior.size();
+  if (const InverseRoot* const root = posterior.root()) {
+    store_root(*root);
+    return;
+  }
   std::vector<Index> first{0};  // of each row
   for (Index i = 0; i < n; ++i) first.push_back(first.back() + simd::padded<T>(i + 1));
   inverse_.resize(static_cast<std::size_t>(first.back()));
@@ -79,6 +83,19 @@ void PredictorData<T>::store_inverse(const LatentPosterior& posterior) {
     for (Index i = 0; i < below; ++i) {
       T* const row = inverse_.data() + first[static_cast<std::size_t>(j + i)] + j;
       for (Index l = 0; l < std::min(m, i + 1); ++l) row[l] = static_cast<T>(columns(i, l));
+    }
+  }
+}
+
+template <typename T>
+void PredictorData<T>::store_root(const InverseRoot& root) {
+  if constexpr (std::is_same_v<T, double>) {
+    inverse_ = root.numbers();
+  } else {
+    for (Index i = 0; i < root.size(); ++i) {
+      const auto first = static_cast<Index>(inverse_.size());
+      inverse_.resize(static_cast<std::size_t>(first + simd::padded<T>(i + 1)));
+      std::transform(root.row(i), root.row(i) + i + 1, inverse_.data() + first, [](double x) { return static_cast<T>(x); });
     }
   }
 }

@@ -69,6 +69,7 @@ class PredictorData {
   };
 
   void store_inverse(const LatentPosterior& posterior);
+  void store_root(const InverseRoot& root);
   void evaluate_kernel(const PredictorTerm& term, std::size_t a, const Eigen::VectorXd& point, Memory& memory, T* k) const;
   void move_point(const LatentData& data, const Eigen::VectorXd& point, Memory& memory) const;
   [[nodiscard]] bool is_by_function(const std::vector<PredictorTerm>& terms, Eigen::Index n_rows) const;

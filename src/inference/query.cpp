@@ -21,7 +21,7 @@ void Query::evaluate(const Posterior::Implementation& posterior, const View& vie
   view = evaluate_view(viewed, mechanics, block);
   prior = require_prior_values(there, block, parameters, mechanics);
   latent = viewed.latent;
-  if (latent) prior.keep_only(latent->first, latent->n);
+  keep_viewed(viewed, prior);
   features.resize(there.latents.size());
   for (std::size_t a = 0; a < features.size(); ++a) features[a] = features_of_block(there, a, states, first, n);
 }

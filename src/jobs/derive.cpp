@@ -120,7 +120,13 @@ class Deriver {
         log_(log),
         options_(options),
         learned_(learned),
-        reader_(open_log(model, log, options.columns)) {}
+        reader_(open_log(model, log, options.columns)) {
+    if (contacts_of(model, system_.parameter_values()).empty()) return;
+    throw InputError(fmt::format(
+        "{}: '{}' has contacts, at whose impacts velocities jump, so that positions are not smoothed across them: give a "
+        "log with velocities and accelerations, or raw logs of stretches without an impact and a model without contacts",
+        log.name(), system_.name()));
+  }
 
   DerivedData run() {
     fit_channels();

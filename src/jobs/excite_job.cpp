@@ -483,7 +483,9 @@ Excitation excite(const Model& model, const Posterior& posterior, const std::vec
   const double t_start = start_time(model, request.start, request.columns).value_or(0);
   of_motion.times = VectorXd::LinSpaced(request.n_rows, t_start, t_start + request.duration);
   of_motion.max_steps = most_steps_per_row * request.n_rows;
-  SimulateJob motion = prepare_simulation(model, information.posterior(), of_motion);
+  const Posterior& posterior_of_motion = information.posterior();
+  SimulateJob motion =
+      prepare_simulation({&model, model.actuators, nullptr, posterior_of_motion.prior()}, posterior_of_motion, of_motion);
   motion.records.clear();
   require_start_within(motion.start, limits);
   out.notes = motion.notes;

@@ -2,13 +2,23 @@
 
 #include <algorithm>
 #include <cctype>
+#include <cmath>
+#include <filesystem>
+#include <map>
+#include <optional>
 
 #include <fmt/format.h>
 
 #include "base/checksum.hpp"
+#include "export/mjcf.hpp"
 #include "export/shims.hpp"
+#include "gp2/base/file.hpp"
 #include "gp2/error.hpp"
 #include "gp2/export/c_source.hpp"
+#include "gp2/training/laplace.hpp"
+#include "model/model_reader.hpp"
+#include "robots/robot_expressions.hpp"
+#include "robots/robot_xml.hpp"
 
 namespace gp2 {
 
@@ -28,6 +38,15 @@ std::string name_of(const System& system) {
 }
 
 void require_options(const ExportRequest& request, const std::string& name) {
+  if (request.to == Target::mjcf) {
+    const ViewRequest whole;
+    if (request.view.quantity != whole.quantity || request.view.latent || request.view.time_step || request.view.system ||
+        request.single_precision || request.draws_within || !request.stddev || !request.jacobian) {
+      throw InputError("`to=mjcf` writes parameters, no functions: it goes with `robot` and `name` alone");
+    }
+    return;
+  }
+  if (!request.robot.empty()) throw InputError("`robot` goes with `to=mjcf`");
   if (request.to == Target::c) return;
   if (request.single_precision) {
     throw InputError("`float` goes with `to=c`: CasADi and acados compute in double precision");
@@ -48,14 +67,108 @@ void require_options(const ExportRequest& request, const std::string& name) {
   if (!request.jacobian) throw InputError("`to=acados` needs the Jacobian, which was left out");
 }
 
+// ---- a robot's own file
+
+// The numbers that the model has as parameters, at their fitted or held values; those held at the robot's own stay as they stand.
+std::vector<FittedNumber> fitted_numbers(const FitFile& fit, const std::map<std::string, std::string>& parameter_of) {
+  std::map<std::string, FittedNumber> of_parameters;
+  const std::vector<Parameter>& parameters = fit.model.system->parameters();
+  for (const Parameter& parameter : parameters) of_parameters[parameter.name].value = parameter.value;
+  for (std::size_t k = 0; k < fit.report.hyperparameters.size(); ++k) {
+    const Hyperparameter& h = fit.report.hyperparameters[k];
+    if (!h.is_system_parameter()) continue;
+    const ParameterUncertainty known = parameter_uncertainty(fit.report, k);
+    FittedNumber& number = of_parameters[parameters[static_cast<std::size_t>(h.index)].name];
+    number.value = known.is_of_draws ? known.mean : h.value;
+    number.is_estimated = !h.is_fixed();
+    number.stddev = known.stddev;
+  }
+  std::vector<FittedNumber> numbers;
+  for (const auto& [name, own] : robot_numbers(*fit.model.robot)) {
+    const auto parameter = parameter_of.find(name);
+    if (parameter == parameter_of.end()) continue;
+    FittedNumber number = of_parameters.at(parameter->second);
+    number.name = name;
+    if (number.is_estimated || number.value != own) numbers.push_back(std::move(number));
+  }
+  return numbers;
+}
+
+struct NumberDifference {
+  std::string name;
+  double is = 0, expected = 0;
+};
+
+// Of inertias within what another MuJoCo makes of the same file.
+std::optional<NumberDifference> first_difference(const RobotDescription& robot, const RobotDescription& expected) {
+  const auto numbers = robot_numbers(robot), others = robot_numbers(expected);
+  for (std::size_t k = 0; k < std::max(numbers.size(), others.size()); ++k) {
+    if (k == numbers.size()) return NumberDifference{others[k].first, std::nan(""), others[k].second};
+    const auto& [name, value] = numbers[k];
+    if (k == others.size() || others[k].first != name) return NumberDifference{name, value, std::nan("")};
+    double scale = std::abs(value) + std::abs(others[k].second);
+    for (const RobotDescription::Body& body : expected.bodies) {
+      if (name.starts_with(fmt::format("inertia(\"{}\")", body.name))) scale = body.inertia.trace();
+    }
+    if (!(std::abs(value - others[k].second) <= 1e-8 * scale)) return NumberDifference{name, value, others[k].second};
+  }
+  return std::nullopt;
+}
+
 }  // namespace
+
+ExportOutcome export_robot(const FitFile& fit, const ExportRequest& request) {
+  const std::string name = request.name.empty() ? name_of(*fit.model.system) : request.name;
+  require_options(request, name);
+  if (!fit.model.robot) throw InputError("`to=mjcf` writes into the file of a robot, but the model has none");
+  const RobotNames names = robot_names(fit.model);
+  const std::filesystem::path path = request.robot.empty() ? std::filesystem::path(fit.model.name).parent_path() / names.file
+                                                           : std::filesystem::path(request.robot);
+  const std::vector<FittedNumber> numbers = fitted_numbers(fit, names.parameters);
+  if (numbers.empty()) {
+    throw InputError(
+        "`to=mjcf`: the model has no number of its robot as a parameter that differs; write [parameters] m7 = { of = "
+        "'mass(\"link7\")', estimate = true } and fit again");
+  }
+  if (request.robot.empty() && !std::filesystem::exists(path)) {
+    throw InputError(
+        fmt::format("`robot`: the robot's file is not at '{}', where the model had it; say where it is", path.string()));
+  }
+  const std::string text = read_file(path);
+  if (read_robot_xml(text, path).is_urdf) {
+    throw InputError(
+        fmt::format("`to=mjcf`: '{}' is a URDF file, which is not written into; convert it to MJCF with MuJoCo and fit "
+                    "with that",
+                    path.string()));
+  }
+  if (const auto other = first_difference(read_robot(path), *fit.model.robot)) {
+    throw InputError(fmt::format("`robot`: '{}' is not the robot of the fit: its {} is {}, there it is {}", path.string(),
+                                 other->name, other->is, other->expected));
+  }
+  FittedMjcf written = fitted_mjcf(text, path.string(), *fit.model.robot, numbers);
+  if (written.is_physical) {
+    if (const auto other = first_difference(read_robot(path, written.text), written.robot)) {
+      throw InputError(
+          fmt::format("{}: MuJoCo would read {} = {} where {} is written: its compiler changes it by settotalmass, boundmass, "
+                      "boundinertia or balanceinertia; remove these",
+                      path.string(), other->name, other->is, other->expected));
+    }
+  }
+  if (text.find(" file=") != std::string::npos) {
+    written.notes.push_back(fmt::format("the file names others: it belongs into the folder of {}", path.string()));
+  }
+  return {{{name + ".xml", std::move(written.text)}}, std::move(written.notes), path.string()};
+}
 
 std::vector<Option> options(ExportRequest& request) {
   std::vector<Option> table = {
-      {"to", choice(request.to, {{"c", Target::c}, {"casadi", Target::casadi}, {"acados", Target::acados}}), "",
+      {"to",
+       choice(request.to, {{"c", Target::c}, {"casadi", Target::casadi}, {"acados", Target::acados}, {"mjcf", Target::mjcf}}), "",
        "c: NAME.h and NAME.c, C99 that needs <math.h> alone; casadi: also NAME_casadi.c, an external function with its Jacobian; "
-       "acados: NAME_acados.c, a generic discrete step of `dt` with its sensitivities"},
-      {"name", &request.name, "NAME", "what the files and every name in them begin with", "that of the system"}};
+       "acados: NAME_acados.c, a generic discrete step of `dt` with its sensitivities; mjcf: the robot's own file with the "
+       "numbers that the model has as parameters"},
+      {"name", &request.name, "NAME", "what the files and every name in them begin with", "that of the system"},
+      {"robot", &request.robot, "FILE", "of mjcf: the robot's file", "the one that the model names, beside the model's"}};
   for (Option& option : options(request.view)) {
     if (option.name == "dt")
       option = {"dt", option.value, option.sample, "time step of next-velocity, or of the step for acados [s]"};
@@ -78,6 +191,7 @@ ExportOutcome export_fit(const FitFile& fit, const Posterior& posterior, const E
   ExportOutcome out;
   const std::string name = request.name.empty() ? name_of(*fit.model.system) : request.name;
   require_options(request, name);
+  if (request.to == Target::mjcf) return export_robot(fit, request);
   ViewRequest viewed = request.view;
   if (request.to == Target::acados) viewed.time_step.reset();
   const PredictedView at = predicted_view(fit, posterior.prior(), viewed);

@@ -17,6 +17,7 @@
 #include "gp2/jobs/actuator_fit.hpp"
 #include "gp2/jobs/fit_memory.hpp"
 #include "gp2/jobs/fit_time.hpp"
+#include "inference/inducing_summary.hpp"
 
 namespace gp2 {
 
@@ -123,6 +124,17 @@ std::string source_of(const FitRequest& request) {
   return fmt::format("{}", fmt::join(names, ", "));
 }
 
+std::vector<LogFile> logs_of(const FitRequest& request) {
+  std::vector<LogFile> logs;
+  for (const Log& log : request.logs) {
+    if (log.table.file()) logs.push_back(*log.table.file());
+  }
+  for (const SideInformation& one : request.also) {
+    if (one.log.table.file()) logs.push_back(*one.log.table.file());
+  }
+  return logs;
+}
+
 constexpr int rows_of_stretch = 200;
 
 bool is_short(const Observations& group) { return group.n_data() <= 2 * rows_of_stretch; }
@@ -142,6 +154,7 @@ FitJob job_of(FitRequest request, FitProblem problem) {
     for (const Hyperparameter& h : problem.hyperparameters) request.start.values[h.name] = h.value;
   }
   FitJob job;
+  job.checkpoint = request.checkpoint;
   FitOptions asked = optimiser_options(request, problem);
   asked.n_inducing = settled_inducing(request, problem, asked);
   asked.n_draws = asked.n_inducing > 0 ? 0 : settled_draws(request, problem, asked);
@@ -160,6 +173,7 @@ FitJob job_of(FitRequest request, FitProblem problem) {
   job.file.prior_options = problem.prior_options;
   job.file.systems = problem.systems;
   job.file.data_source = source_of(request);
+  job.file.logs = logs_of(request);
   job.file.model = std::move(request.model);
   job.problem = std::move(problem);
   return job;
@@ -250,19 +264,12 @@ void add_constraint_note(const Posterior& posterior, std::vector<std::string>& n
                   fmt::join(large, ", ")));
 }
 
-// What inducing points leave out makes deviations larger than they need be. Of the small latent that a fit adds to those of the model it
-// may be much.
-void add_inducing_note(const Prior& prior, const InducingReport& inducing, std::vector<std::string>& notes) {
+// What inducing points leave out makes deviations larger than they need be; of the discrepancy it counts as noise.
+void add_inducing_note(const InducingReport& inducing, std::vector<std::string>& notes) {
   constexpr double much = 3;  // nats
-  double of_model = 0, of_discrepancy = 0;
-  for (std::size_t a = 0; a < prior.latents.size(); ++a) {
-    (prior.latents[a].name == "discrepancy" ? of_discrepancy : of_model) += 0.5 * inducing.left_out[static_cast<Eigen::Index>(a)];
-  }
-  of_model = std::max(0.0, of_model);
-  notes.push_back(fmt::format(
-      "learned through {} inducing variables: what they leave out is worth about {:.2g} nats{}{}", inducing.n_variables, of_model,
-      of_discrepancy > much ? fmt::format(", of the small latent 'discrepancy' {:.2g}", of_discrepancy) : "",
-      of_model > much ? "; more may tell more (`inducing=M`)" : ""));
+  const double left_out = 0.5 * inducing.left_out.cwiseMax(0).sum();
+  notes.push_back(fmt::format("learned through {} inducing variables: what they leave out is worth about {:.2g} nats{}",
+                              inducing.n_variables, left_out, left_out > much ? "; more may tell more (`inducing=M`)" : ""));
 }
 
 // Where sums over windows of time deviate by far more than the noise of the positions makes them.
@@ -322,78 +329,99 @@ void add_force_note(const Posterior& posterior, std::vector<std::string>& notes)
 
 std::vector<Option> options(FitRequest& request) {
   FitProblemOptions& problem = request.problem;
-  return {
-      {"also_noise_std", &problem.also_noise_stddev, "S", "noise standard deviation of what `also` gives",
-       "for accelerations: the model's [noise]"},
-      {"dt", &problem.time_step, "SECONDS", "time step of next velocities in `also` [s]"},
-      {"map", &problem.columns, "LOGNAME=NAME,…",
-       "columns by other names, in all logs together: theta1 for q3 also brings dtheta1, ddtheta1", "", "columns"},
-      {"observe", &problem.observe, "ddq3,ddq6", "accelerations to learn from; others need not be in the log",
-       "those with a column NAME_std in the log, or all"},
-      {"mean", choice(problem.mean, {{"zero", Prior::Mean::zero}, {"force", Prior::Mean::force}}), "",
-       "prior mean of the unconstrained acceleration: zero, or force = M⁻¹F of the model, where that is relied on"},
-      {"prior", choice(problem.base, {{"acceleration", Latent::Base::acceleration}, {"force", Latent::Base::force}}), "",
-       "put the model's latent on the acceleration or on the force", "as the model says"},
-      {"baseline",
-       choice(problem.baseline, {{"se", Baseline::Kind::se}, {"icm", Baseline::Kind::icm}, {"lmc", Baseline::Kind::lmc}}), "",
-       "learn ddq without mechanics (docs/priors.md): se (independent outputs), icm or lmc (multi-output), from the model's "
-       "features and what else of the state it reads"},
-      {"estimate", &problem.estimate, "p1,p2", "parameters to estimate, or none", "those the model says"},
-      {"noise_std",
-       NumberOrWord{&problem.noise_stddev, {{"estimate", &problem.estimate_noise}, {"stated", &problem.trust_stated_noise}}}, "S",
-       "noise standard deviation of every observed ddq, 'estimate', or 'stated' for the log's NAME_std as they are",
-       "the log's NAME_std times a factor that is estimated, or as the model says"},
-      {"protocol", choice(problem.protocol.name, {{"default", Protocol::Name::standard}, {"paper", Protocol::Name::paper}}), "",
-       "how hyperparameters start and are bounded (docs/priors.md): default, or paper: the set-up of Geist & Trimpe 2020"},
-      {"hyperprior", Switch{&problem.protocol.hyperprior, "default", "none"}, "",
-       "weak log-normal hyper-priors, or none: maximum likelihood within the same bounds"},
-      {"discrepancy", Switch{&problem.discrepancy, "default", "none"}, "",
-       "a small latent for what the kernel would rule out (docs/priors.md), or none"},
-      {"project", &problem.project, "",
-       "move states onto position and velocity constraints, with the model's parameters, before anything else"},
-      {"robust", &problem.robust, "", "distrust values that disagree with all others, and say which (docs/command-line.md)"},
-      {"restarts", &request.restarts, "R", "runs of the optimiser; the first starts at the model's values",
-       "5; of a baseline 30"},
-      {"max_iterations", &request.max_iterations, "K",
-       "per run, what follows an escape included; 0 conditions at the starting values"},
-      {"start", &request.start, "FILE", "starting values: a file of JSON, {\"name\": value, …}, or a FIT.json"},
-      {"max_points", &problem.max_points, "N",
-       "take this many rows of each log, the first of a shuffle by `seed`; of a raw log those that cover the motion best, "
-       "or so many states of windows",
-       "all; of a raw log 200, or 600 of windows"},
-      {"seed", &problem.seed, "S", "of restarts and `max_points`"},
-      threads_option(request.threads),
-      {"hyperparameters",
-       choice(request.hyperparameters, {{"optimise", HyperparameterChoice::optimise},
-                                        {"integrate", HyperparameterChoice::integrate},
-                                        {"auto", HyperparameterChoice::automatic}}),
-       "",
-       fmt::format(
-           "optimise: take the likeliest as known; integrate: draw them given the data, and mix the predictions of {} draws "
-           "(docs/theory.md, T31), at about {} evaluations of the likelihood; auto: integrate where the directions of a latent "
-           "have their own, as in the default prior, and rows times free directions of motion are at most {}",
-           n_mixed_draws, draw_evaluations, largest_integrated_size)},
-      {"inducing", NumberOrWord{&request.inducing, {{"auto", &request.is_exact_where_small}, {"none", &request.is_exact}}}, "M",
-       fmt::format(
-           "learn from all rows through points that stand for them (docs/theory.md, T37), in time proportional to their number: "
-           "at most so many variables, each one function of a latent at one point; none: exactly; auto: exactly up to {} rows "
-           "times "
-           "free directions of motion, through at most {} variables beyond, fewer where there are more than 100 000 rows",
-           largest_exact_size, most_inducing_variables),
-       "auto"},
-      {"train_on", &request.train_on, "N",
-       "find the hyperparameters from so many rows, evenly taken from all logs together, and learn from all under these",
-       "all rows"},
-      {"thin", Switch{&request.thin, "auto", "none"}, "",
-       "where residuals go on from row to row, fit anew with as many rows as they are worth, evenly taken; or none"},
-      {"standard_errors", YesByDefault{&request.standard_errors}, "",
-       "the standard errors of estimated parameters, which take a few dozen gradients"},
-      {"max_escapes", &request.max_escapes, "K", "scans for lower optima from the best one", "5"},
-      {"gradient_tolerance", &request.gradient_tolerance, "G", "stop when the largest entry of the projected gradient is below",
-       "1e-5"},
-      {"reduction_tolerance", &request.reduction_tolerance, "R",
-       "stop when an iteration lowers the objective by less, relatively", "1e-12; of a baseline 1e-9"},
-  };
+  return joined({
+      in_group(
+          "Data",
+          {
+              {"also_noise_std", &problem.also_noise_stddev, "S", "noise standard deviation of what `also` gives",
+               "for accelerations: the model's [noise]"},
+              {"dt", &problem.time_step, "SECONDS", "time step of next velocities in `also` [s]"},
+              {"map", &problem.columns, "LOGNAME=NAME,…",
+               "columns by other names, in all logs together: theta1 for q3 also brings dtheta1, ddtheta1", "", "columns"},
+              {"observe", &problem.observe, "ddq3,ddq6", "accelerations to learn from; others need not be in the log",
+               "those with a column NAME_std in the log, or all"},
+              {"noise_std",
+               NumberOrWord{&problem.noise_stddev,
+                            {{"estimate", &problem.estimate_noise}, {"stated", &problem.trust_stated_noise}}},
+               "S", "noise standard deviation of every observed ddq, 'estimate', or 'stated' for the log's NAME_std as they are",
+               "the log's NAME_std times a factor that is estimated, or as the model says"},
+              {"max_points", &problem.max_points, "N",
+               "take this many rows of each log, the first of a shuffle by `seed`; of a raw log those that cover the motion "
+               "best, or so many states of windows",
+               "all; of a raw log 200, or 600 of windows"},
+              {"thin", Switch{&request.thin, "auto", "none"}, "",
+               "where residuals go on from row to row, fit anew with as many rows as they are worth, evenly taken; or none"},
+              {"project", &problem.project, "",
+               "move states onto position and velocity constraints, with the model's parameters, before anything else"},
+              {"robust", &problem.robust, "",
+               "distrust values that disagree with all others, and say which (docs/command-line.md)"},
+          }),
+      in_group(
+          "What is learned",
+          {
+              {"mean", choice(problem.mean, {{"zero", Prior::Mean::zero}, {"force", Prior::Mean::force}}), "",
+               "prior mean of the unconstrained acceleration: zero, or force = M⁻¹F of the model, where that is relied on"},
+              {"prior", choice(problem.base, {{"acceleration", Latent::Base::acceleration}, {"force", Latent::Base::force}}), "",
+               "put the model's latent on the acceleration or on the force", "as the model says"},
+              {"baseline",
+               choice(problem.baseline, {{"se", Baseline::Kind::se}, {"icm", Baseline::Kind::icm}, {"lmc", Baseline::Kind::lmc}}),
+               "",
+               "learn ddq without mechanics (docs/priors.md): se (independent outputs), icm or lmc (multi-output), from the "
+               "model's features and what else of the state it reads"},
+              {"estimate", &problem.estimate, "p1,p2", "parameters to estimate, or none", "those the model says"},
+              {"protocol",
+               choice(problem.protocol.name, {{"default", Protocol::Name::standard}, {"paper", Protocol::Name::paper}}), "",
+               "how hyperparameters start and are bounded (docs/priors.md): default, or paper: the set-up of Geist & Trimpe "
+               "2020"},
+              {"hyperprior", Switch{&problem.protocol.hyperprior, "default", "none"}, "",
+               "weak log-normal hyper-priors, or none: maximum likelihood within the same bounds"},
+              {"discrepancy", Switch{&problem.discrepancy, "default", "none"}, "",
+               "a small latent for what the kernel would rule out (docs/priors.md), or none"},
+          }),
+      in_group(
+          "How it is learned",
+          {
+              {"restarts", &request.restarts, "R", "runs of the optimiser; the first starts at the model's values",
+               "5; of a baseline 30"},
+              {"max_iterations", &request.max_iterations, "K",
+               "per run, what follows an escape included; 0 conditions at the starting values"},
+              {"max_escapes", &request.max_escapes, "K", "scans for lower optima from the best one", "5"},
+              {"gradient_tolerance", &request.gradient_tolerance, "G",
+               "stop when the largest entry of the projected gradient is below", "1e-5"},
+              {"reduction_tolerance", &request.reduction_tolerance, "R",
+               "stop when an iteration lowers the objective by less, relatively", "1e-12; of a baseline 1e-9"},
+              {"start", &request.start, "FILE", "starting values: a file of JSON, {\"name\": value, …}, or a FIT.json"},
+              {"seed", &problem.seed, "S", "of restarts and `max_points`"},
+              {"hyperparameters",
+               choice(request.hyperparameters, {{"optimise", HyperparameterChoice::optimise},
+                                                {"integrate", HyperparameterChoice::integrate},
+                                                {"auto", HyperparameterChoice::automatic}}),
+               "",
+               fmt::format(
+                   "optimise: take the likeliest as known; integrate: draw them given the data, and mix the predictions of {} "
+                   "draws (docs/theory.md, T31), at about {} evaluations of the likelihood; auto: integrate where the directions "
+                   "of a latent have their own, as in the default prior, and rows times free directions of motion are at most {}",
+                   n_mixed_draws, draw_evaluations, largest_integrated_size)},
+              {"standard_errors", YesByDefault{&request.standard_errors}, "",
+               "the standard errors of estimated parameters, which take a few dozen gradients"},
+              {"inducing",
+               NumberOrWord{&request.inducing, {{"auto", &request.is_exact_where_small}, {"none", &request.is_exact}}}, "M",
+               fmt::format("learn from all rows through points that stand for them (docs/theory.md, T37), in time proportional "
+                           "to their number: at most so many variables, each one function of a latent at one point; none: "
+                           "exactly; auto: exactly up to {} rows times free directions of motion, through at most {} variables "
+                           "beyond, fewer where there are more than 100 000 rows",
+                           largest_exact_size, most_inducing_variables),
+               "auto"},
+              {"train_on", &request.train_on, "N",
+               "find the hyperparameters from so many rows, evenly taken from all logs together, and learn from all under these",
+               "all rows"},
+              threads_option(request.threads),
+              not_recorded({"checkpoint", &request.checkpoint, "FILE",
+                            "a FIT.json of the best so far, written anew whenever a run of the optimiser has got lower and every "
+                            "few seconds while one does; `start` goes on from it (docs/command-line.md)",
+                            "none"}),
+          }),
+  });
 }
 
 bool integration_pays(const FitProblem& problem, const FitOptions& options) {
@@ -444,7 +472,29 @@ FitJob prepare_fit_again(const FitFile& fit, int threads) {
   problem.systems.resize(problem.observations.size());
   problem.lines.resize(problem.observations.size());
   problem.hyperparameters = starting_hyperparameters(fit.model, problem, request.problem);
-  return job_of(std::move(request), std::move(problem));
+  FitJob job = job_of(std::move(request), std::move(problem));
+  job.file.logs = fit.logs;
+  return job;
+}
+
+FitJob prepare_fit_again(const FitFile& fit, FitRequest request) {
+  FitJob job = prepare_fit(std::move(request));
+  if (fit.logs.empty()) return job;
+  for (const LogFile& log : job.file.logs) {
+    if (fit.has_learned(log)) continue;
+    const auto named = std::ranges::find(fit.logs, log.name, &LogFile::name);
+    job.notes.push_back(
+        named == fit.logs.end()
+            ? fmt::format("warning: {} is not a log that the fit was learned from", log.name)
+            : fmt::format("warning: {} is not as the fit was learned from it: {} bytes, {} rows; then {} bytes, {} rows",
+                          log.name, log.bytes, log.rows, named->bytes, named->rows));
+  }
+  for (const LogFile& log : fit.logs) {
+    if (!job.file.has_learned(log) && std::ranges::find(job.file.logs, log.name, &LogFile::name) == job.file.logs.end()) {
+      job.notes.push_back(fmt::format("warning: the fit was learned from {} too, which is not given", log.name));
+    }
+  }
+  return job;
 }
 
 namespace {
@@ -493,14 +543,36 @@ struct Worth {
   }
 };
 
+// The best so far, with the rows that it was found from: of many as many as any file of a fit has.
+void save_checkpoint(const FitJob& job, const FitReport& report, const std::vector<Observations>& observations) {
+  FitFile file = job.file;
+  file.observations = n_states(observations) > KeptStates::most ? evenly(observations, KeptStates::most) : observations;
+  file.report = report;
+  file.report.actuators = job.actuators;
+  file.write(job.checkpoint);
+}
+
 FitOutcome run_once(const FitJob& job, const std::function<void(const Progress&)>& progress, const std::atomic<bool>* stop) {
   FitOptions options = job.options;
   options.progress = progress;
   options.stop = stop;
+  std::string unsaved;  // why
+  const bool is_first = !options.ranks || options.ranks->rank() == 0;
+  if (!job.checkpoint.empty() && is_first) {
+    options.improved = [&](const FitReport& report, const std::vector<Observations>& observations) {
+      try {
+        save_checkpoint(job, report, observations);
+        unsaved.clear();
+      } catch (const InputError& error) {
+        unsaved = error.what();  // a fit is not lost to a disk that is full for a while
+      }
+    };
+  }
   Fit result = fit(job.problem, options);
   FitOutcome outcome{job.file, std::move(result.posterior), distrust_notes(job.problem, result.report), std::nullopt};
+  if (!unsaved.empty()) outcome.notes.push_back(fmt::format("warning: a checkpoint was not saved: {}", unsaved));
   for (std::string& note : notes_of(result.report)) outcome.notes.push_back(std::move(note));
-  if (result.report.inducing) add_inducing_note(outcome.posterior.prior(), *result.report.inducing, outcome.notes);
+  if (result.report.inducing) add_inducing_note(*result.report.inducing, outcome.notes);
   if (result.report.termination != FitReport::interrupted && !is_set(stop)) {
     if (options.n_draws > 0) add_draw_notes(result.report, outcome.notes);
     // a fit that has taken hours is not lost to what is said of it
@@ -545,14 +617,11 @@ FitJob with_actuators(FitJob job, const std::atomic<bool>* stop) {
   return job;
 }
 
-// The file with some of the states of each of its Observations, and a discrepancy for so many.
+// The file with some of the states of each of its Observations.
 template <typename States>
 FitFile with_states(FitFile file, const std::vector<Observations>& all, const States& states_of) {
   file.observations.clear();
   for (std::size_t g = 0; g < all.size(); ++g) file.observations.push_back(all[g].take(states_of(g)));
-  if (std::optional<Discrepancy>& discrepancy = file.prior_options.discrepancy) {
-    discrepancy->stddev *= discrepancy_share(file.observations) / discrepancy_share(all);
-  }
   return file;
 }
 
@@ -570,6 +639,8 @@ FitOutcome run_thinned(const FitJob& job, const Worth& worth, const std::functio
   });
   FitJob fewer = prepare_fit_again(file, job.options.n_threads);
   fewer.actuators = job.actuators;
+  fewer.options.ranks = job.options.ranks;
+  fewer.checkpoint = job.checkpoint;
   FitOutcome outcome = run_fit(fewer, progress, stop);
   outcome.notes.push_back(fmt::format("{}: fitted to {} of {}, evenly taken (`thin=none` fits all)", worth.text, n_taken, n_all));
   std::rotate(outcome.notes.begin(), outcome.notes.end() - 1, outcome.notes.end());

@@ -154,31 +154,24 @@ bool has_discrepancy(const Model& model, const FitProblem& problem, const FitPro
          !has_singular_mass(problem);
 }
 
-// That share of the noise, as the fit starts with it, in each acceleration; where one is not measured, of its spread the same share
-// as in the others
+// As large as the noise that the fit starts with; of an acceleration that is not measured, in proportion to the spreads.
 Discrepancy discrepancy_of(const FitProblem& problem) {
   const Scales scales = default_scales(problem.prior, trusted_observations(problem));
-  VectorXd noise = VectorXd::Zero(scales.acceleration_stddev.size());
-  double share = 0;
-  int n_shares = 0;
+  VectorXd noise = VectorXd::Zero(scales.acceleration_stddev.size()), n_groups = noise;
   for (const Observations& group : problem.observations) {
     if (!is_of_accelerations(group)) continue;
     const VectorXd usual = group.usual_noise(group.noise().stddev());
-    for (Index k = 0; k < usual.size(); ++k) {
-      const int row = group.view().rows[static_cast<std::size_t>(k)];
-      noise[row] = std::max(noise[row], usual[k]);
-      share += usual[k] / scales.acceleration_stddev[row];
-      ++n_shares;
-    }
+    noise(group.view().rows) += usual;
+    n_groups(group.view().rows).array() += 1;
   }
-  for (Index j = 0; j < noise.size(); ++j) {
-    if (noise[j] == 0) noise[j] = share / n_shares * scales.acceleration_stddev[j];
-  }
+  const auto measured = n_groups.array() > 0;
+  const VectorXd shares = noise.cwiseQuotient(n_groups.cwiseProduct(scales.acceleration_stddev));
+  const double share = measured.select(shares, 0).sum() / static_cast<double>(measured.count());
   return {Protocol::Standard::discrepancy_lengthscale * scales.feature_stddev.back(),
-          discrepancy_share(problem.observations) * noise};
+          measured.select(noise.cwiseQuotient(n_groups), share * scales.acceleration_stddev)};
 }
 
-// Where the noise is estimated, the discrepancy stays a share of it: one of a guess would take its place. An acceleration that no
+// Where the noise is estimated, the discrepancy is in proportion to it: one of a guess would take its place. An acceleration that no
 // estimated noise is of goes with the first.
 void tie_discrepancy(const FitProblem& problem, std::vector<Hyperparameter>& hyperparameters) {
   const auto latent = static_cast<int>(problem.prior.latents.size()) - 1;
@@ -211,11 +204,6 @@ void tie_discrepancy(const FitProblem& problem, std::vector<Hyperparameter>& hyp
 }
 
 }  // namespace
-
-double discrepancy_share(const std::vector<Observations>& observations) {
-  const double few = Protocol::Standard::discrepancy_states / n_states(observations);
-  return Protocol::Standard::discrepancy_stddev * std::pow(std::min(1.0, few), 0.25);
-}
 
 void read_start(const NamedNumbers& start, int max_iterations, FitProblem& problem) {
   const std::string source = start.file.empty() ? "`start`" : start.file;
@@ -425,9 +413,8 @@ void add_side_information(const Model& model, const std::vector<SideInformation>
   }
 }
 
-// a discrepancy is part of the prior, and of that on every other system
-void set_discrepancy(const Model& model, const Discrepancy& discrepancy, FitProblem& problem) {
-  problem.prior_options.discrepancy = discrepancy;
+// what the prior is made of anew, on every other system too
+void remake_prior(const Model& model, FitProblem& problem) {
   problem.prior = make_prior(model, problem.prior_options);
   for (std::size_t g = 0; g < problem.observations.size(); ++g) {
     const std::shared_ptr<const Model>& other = problem.systems[g];
@@ -440,8 +427,28 @@ void set_discrepancy(const Model& model, const Discrepancy& discrepancy, FitProb
 
 // First in units of its features, to see how they spread.
 void add_discrepancy(const Model& model, FitProblem& problem) {
-  set_discrepancy(model, {{}, VectorXd::Ones(model.system->nq())}, problem);
-  set_discrepancy(model, discrepancy_of(problem), problem);
+  problem.prior_options.discrepancy = Discrepancy{{}, VectorXd::Ones(model.system->nq())};
+  remake_prior(model, problem);
+  problem.prior_options.discrepancy = discrepancy_of(problem);
+  remake_prior(model, problem);
+}
+
+// Where data are far from a coordinate's zero, as an angle about a turn, a force that is constant would seem to be linear in it. The
+// zero of a velocity or an input is no matter of choice.
+void centre_features(const Model& model, FitProblem& problem) {
+  if (std::ranges::none_of(model.latents, [](const LatentSpec& latent) { return latent.kernel.empty(); })) return;
+  const Scales scales = default_scales(problem.prior, trusted_observations(problem));
+  for (std::size_t a = 0; a < problem.prior.latents.size(); ++a) {
+    const Latent& latent = problem.prior.latents[a];
+    const auto spec = std::ranges::find(model.latents, latent.name, &LatentSpec::name);
+    if (!spec->kernel.empty()) continue;
+    for (std::size_t d = 0; d < latent.feature_names.size(); ++d) {
+      if (!latent.is_of_place[d]) continue;
+      problem.prior_options.feature_centres.emplace(latent.feature_names[d],
+                                                    scales.feature_mean[a][static_cast<Eigen::Index>(d)]);
+    }
+  }
+  if (!problem.prior_options.feature_centres.empty()) remake_prior(model, problem);
 }
 
 }  // namespace
@@ -493,6 +500,7 @@ FitProblem make_fit_problem(const Model& model, const std::vector<Log>& logs, co
   }
   add_side_information(model, also, options, estimated, problem);
   add_late(model, options, problem);
+  if (options.protocol.name == Protocol::Name::standard) centre_features(model, problem);
   if (has_discrepancy(model, problem, options)) add_discrepancy(model, problem);
   problem.hyperparameters = starting_hyperparameters(model, problem, options);
   for (std::size_t g = 0; g < logs.size(); ++g) {

@@ -87,7 +87,7 @@ VectorXd signal_size(const LoggedSystem& logged, Readings readings, const std::v
   const MechanicsBatch mechanics = require_mechanics(logged.prior, readings.view, readings.states, logged.parameters);
   const ViewValues view = evaluate_view(readings.view, mechanics, readings.states);
   PriorValues prior = require_prior_values(logged.prior, readings.states, logged.parameters, mechanics);
-  if (readings.view.latent) prior.keep_only(readings.view.latent->first, readings.view.latent->n);
+  keep_viewed(readings.view, prior);
   VectorXd variance = VectorXd::Zero(readings.view.size());
   for (int i = 0; i < n_data; ++i) {
     for (std::size_t a = 0; a < signal_stddev.size(); ++a) {

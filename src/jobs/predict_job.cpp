@@ -5,6 +5,7 @@
 #include <fmt/format.h>
 
 #include "gp2/error.hpp"
+#include "gp2/inference/inverse_dynamics.hpp"
 #include "gp2/jobs/fit_problem.hpp"
 #include "jobs/read_observations.hpp"
 
@@ -29,6 +30,20 @@ void set_time_step(View& view, const std::optional<double>& time_step) {
   view.time_step = *time_step;
 }
 
+// Adds NAME_std of each of d names, and cov_NAME1_NAME2 where that is asked for: of which rows of a covariance (d² × N) is returned.
+std::vector<Index> add_deviation_names(PredictRequest::Covariance covariance, std::vector<std::string>& names) {
+  const std::size_t d = names.size();
+  for (std::size_t k = 0; k < d; ++k) names.push_back(names[k] + "_std");
+  std::vector<Index> upper;
+  for (std::size_t j = 0; covariance == PredictRequest::Covariance::full && j < d; ++j) {
+    for (std::size_t k = j; k < d; ++k) {
+      names.push_back(fmt::format("cov_{}_{}", names[j], names[k]));
+      upper.push_back(static_cast<Index>(k * d + j));
+    }
+  }
+  return upper;
+}
+
 void predict_marginals(const Posterior& posterior, const View& view, const MatrixXd& states,
                        PredictRequest::Covariance covariance, PredictOutcome& out) {
   const Index d = view.size();
@@ -36,15 +51,7 @@ void predict_marginals(const Posterior& posterior, const View& view, const Matri
     out.values = posterior.mean(view, states, /*n_threads=*/0);
     return;
   }
-  const std::vector<std::string> names = out.names;
-  for (const std::string& name : names) out.names.push_back(name + "_std");
-  std::vector<Index> upper;  // rows of Posterior::Marginal::covariance
-  for (Index j = 0; covariance == PredictRequest::Covariance::full && j < d; ++j) {
-    for (Index k = j; k < d; ++k) {
-      out.names.push_back(fmt::format("cov_{}_{}", names[static_cast<std::size_t>(j)], names[static_cast<std::size_t>(k)]));
-      upper.push_back(k * d + j);
-    }
-  }
+  const std::vector<Index> upper = add_deviation_names(covariance, out.names);
   out.values.resize(2 * d + std::ssize(upper), states.cols());
   int n_clipped = 0;
   posterior.for_each_marginal(view, states, /*n_threads=*/0, [&](Index first, const Posterior::Marginal& prediction) {
@@ -95,24 +102,23 @@ std::vector<Option> options(ViewRequest& request) {
   return {
       {"view", choice(request.quantity, words), "",
        "constrained: ddq1 …; unconstrained: abar_q1 …; constraint-force: fc_q1 …; multipliers: lambda1 …; next-velocity: "
-       "dq1_next …, with `dt`"},
+       "dq1_next …, with `dt`; force: force_q1 …, what was learned, as an applied force"},
       {"dt", &request.time_step, "SECONDS", "time step of next-velocity [s]"},
       {"latent", &request.latent, "NAME",
        "only what this latent adds to the view, by its name: NAME@LATENT; the small one that a fit adds is called discrepancy"},
   };
 }
 
+FitSystem system_of(const FitFile& fit, const Prior& prior, const std::shared_ptr<const Model>& system) {
+  if (!system || is_same(*system, fit.model)) return {&fit.model, fit.model.actuators, nullptr, prior};
+  const auto other_system = make_other_system(fit.model, *system, fit.prior_options);
+  return {system.get(), shared_actuators(fit.model.actuators, *system), other_system, other_system->prior};
+}
+
 PredictedView predicted_view(const FitFile& fit, const Prior& prior, const ViewRequest& request) {
-  PredictedView out{View{}, &fit.model, fit.model.actuators, prior, {}};
-  std::shared_ptr<const OtherSystem> other_system;
-  if (request.system && !is_same(*request.system, fit.model)) {
-    out.model = request.system.get();
-    out.actuators = shared_actuators(fit.model.actuators, *out.model);
-    other_system = make_other_system(fit.model, *out.model, fit.prior_options);
-    out.prior = other_system->prior;
-  }
+  PredictedView out{system_of(fit, prior, request.system), {}, {}};
   out.view = View::all(request.quantity, *out.prior.system);
-  out.view.other_system = other_system;
+  out.view.other_system = out.other_system;
   if (out.view.size() == 0) {
     throw InputError(fmt::format("`view={}`: '{}' has no constraints", request.quantity->word(), out.prior.system->name()));
   }
@@ -134,15 +140,64 @@ std::vector<Option> options(PredictRequest& request) {
   table.push_back({"seed", &request.seed, "K", "of the samples; same seed, same samples", "", "", "", "samples"});
   table.push_back({"unconditioned", &request.unconditioned, "",
                    "predict from the prior under the fitted hyperparameters, as if there had been no data"});
+  table.push_back(
+      {"inverse_dynamics", &request.inverse_dynamics, "",
+       "instead of a view: the inputs that produce the accelerations ddq1 … which the CSV has, u1 …, and ddq1_missed …, "
+       "what is missed of them"});
   table.push_back(columns_option(request.columns));
   return table;
 }
+
+namespace {
+
+PredictOutcome predict_inputs(const FitFile& fit, const Posterior& posterior, const CsvTable& log,
+                              const PredictRequest& request) {
+  const ViewRequest& view = request.view;
+  if (view.quantity != View::Quantity::constrained_acceleration || view.latent || view.time_step || request.n_samples) {
+    throw InputError("`inverse_dynamics` stands in the place of a view: leave `view`, `latent`, `dt` and `samples` out");
+  }
+  const FitSystem at = system_of(fit, posterior.prior(), view.system);
+  WantedMotion wanted = read_wanted_motion(at.prior, *at.model, log, request.columns);
+  wanted.view.other_system = at.other_system;
+  const InverseDynamics found =
+      at_states_of(log.name(), [&] { return inverse_dynamics(posterior, wanted.view, wanted.states, wanted.accelerations); });
+  const System& system = *at.model->system;
+  PredictOutcome out{system.inputs(), {}, std::move(wanted.notes)};
+  std::vector<MatrixXd> blocks = {found.inputs};
+  if (request.covariance != PredictRequest::Covariance::none) {
+    blocks.push_back(found.stddev());
+    const std::vector<Index> upper = add_deviation_names(request.covariance, out.names);
+    blocks.emplace_back(found.covariance(upper, Eigen::all));
+  }
+  for (const std::string& name : wanted.view.names(system)) out.names.push_back(name + "_missed");
+  blocks.push_back(found.missed);
+  out.values.resize(std::ssize(out.names), found.inputs.cols());
+  Index row = 0;
+  for (const MatrixXd& block : blocks) {
+    out.values.middleRows(row, block.rows()) = block;
+    row += block.rows();
+  }
+  wanted.states.bottomRows(system.layout().nu) = found.inputs;
+  if (!request.unconditioned) add_distance(posterior, wanted.view, wanted.states, out);
+  constexpr double produced = 1e-6;  // of the size of what is wanted
+  const auto is_missed = found.missed.colwise().norm().array() > produced * wanted.accelerations.colwise().norm().array();
+  if (const Index n = is_missed.count(); n > 0) {
+    out.notes.push_back(
+        fmt::format("warning: {}: no inputs produce the accelerations at {} of {} rows; those that come nearest are given, "
+                    "and what is missed: see the columns {}_missed …",
+                    log.name(), n, is_missed.size(), wanted.view.names(system).front()));
+  }
+  return out;
+}
+
+}  // namespace
 
 PredictOutcome predict(const FitFile& fit, CsvTable states, const PredictRequest& request) {
   if (request.n_samples && *request.n_samples < 1) {
     throw InputError(fmt::format("`samples`: must be at least 1, got {}", *request.n_samples));
   }
   const Posterior posterior = request.unconditioned ? fit.posterior().without_data() : fit.posterior();
+  if (request.inverse_dynamics) return predict_inputs(fit, posterior, states, request);
   const PredictedView at = predicted_view(fit, posterior.prior(), request.view);
   LogStates log = read_log_states(at.prior, at.view, *at.model, states, request.columns, {}, at.actuators);
   const std::string name = states.name();

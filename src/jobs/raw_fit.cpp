@@ -216,14 +216,10 @@ std::vector<Option> options(RawFitOptions& options) {
     if (std::find(left_out.begin(), left_out.end(), option.name) == left_out.end()) table.push_back(std::move(option));
   }
   for (Option& option : table) option.needs = "raw";
-  return table;
+  return in_group("Raw logs", std::move(table));
 }
 
-std::vector<Option> options(FitRequest& request, RawFitOptions& raw) {
-  std::vector<Option> table = options(request);
-  for (Option& option : options(raw)) table.push_back(std::move(option));
-  return table;
-}
+std::vector<Option> options(FitRequest& request, RawFitOptions& raw) { return joined({options(request), options(raw)}); }
 
 FitRequest LearnedLog::request(FitRequest asked, const std::string& name) const {
   DerivedData told = data;

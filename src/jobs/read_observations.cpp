@@ -171,8 +171,8 @@ void require_mechanics_at(const LoggedSystem& logged, const View& view, const Ma
   std::vector<int> ranks(rows.size());
   const auto fault =
       for_each_mechanics(logged.prior, view, states, logged.parameters, [&](Index first, const MechanicsBatch& block) {
-        for (std::size_t i = 0; i < block.projections.size(); ++i)
-          ranks[static_cast<std::size_t>(first) + i] = block.projections[i].rank();
+        const std::vector<int> here = ranks_of(logged.system(), block);
+        std::copy(here.begin(), here.end(), ranks.begin() + first);
       });
   if (fault) {
     throw InputError(fmt::format("{}: data row {}: {} ('{}' with the model's parameters; see gp2 check)", log.name(),
@@ -551,6 +551,28 @@ LogStates read_log_states(const Prior& prior, const View& view, const Model& mod
   }
   note_reading(reader, log, out.notes);
   note_violation(*prior.system, out.states, prior.system->parameter_values(), log, out.notes);
+  return out;
+}
+
+WantedMotion read_wanted_motion(const Prior& prior, const Model& model, const CsvTable& log,
+                                const std::map<std::string, std::string>& columns) {
+  const System& system = *prior.system;
+  const StateLayout layout = system.layout();
+  LogReader reader = open_log(model, log, columns);
+  const std::vector<std::string> every = system.acceleration_names();
+  View view{View::Quantity::constrained_acceleration, {}};
+  for (int j = 0; j < layout.nq; ++j) {
+    if (reader.has(every[static_cast<std::size_t>(j)])) view.rows.push_back(j);
+  }
+  if (view.rows.empty()) {
+    throw InputError(fmt::format("{}: has none of the columns {}, the accelerations that are wanted; it has: {}", log.name(),
+                                 fmt::join(every, ", "), fmt::join(log.header(), ", ")));
+  }
+  std::vector<bool> reads = prior.reads();
+  std::fill(reads.end() - layout.nu, reads.end(), false);
+  WantedMotion out{reader.states(reads), view, reader.values(view.names(system)), {}};
+  out.states.bottomRows(layout.nu).setZero();
+  note_violation(system, out.states, system.parameter_values(), log, out.notes);
   return out;
 }
 

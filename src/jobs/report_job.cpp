@@ -17,6 +17,7 @@
 #include "gp2/error.hpp"
 #include "gp2/jobs/fit_job.hpp"
 #include "gp2/jobs/fit_problem.hpp"
+#include "gp2/jobs/predict_job.hpp"
 #include "gp2/simulation/generate.hpp"
 #include "jobs/read_observations.hpp"
 
@@ -116,6 +117,7 @@ std::vector<ReportData> training_data(const FitFile& fit, const Posterior& poste
         data_at(posterior, group.states(), group.view().rows, group.values(), std::move(noise), group.view().other_system);
     data.name = all.empty() ? "training" : fmt::format("training {}", all.size() + 1);
     const bool elsewhere = g < fit.systems.size() && fit.systems[g];
+    data.is_of_other_system = elsewhere;
     data.source = elsewhere ? fmt::format("measured on '{}'", fit.systems[g]->system->name()) : fit.data_source;
     data.independent = independent_outputs(prior_of(posterior.prior(), group.view()).reference_system(),
                                            parameters_of(group.view(), posterior.values().parameters), data);
@@ -127,23 +129,26 @@ std::vector<ReportData> training_data(const FitFile& fit, const Posterior& poste
 ReportData test_data(const ReportOptions& options, const FitFile& fit, const Posterior& posterior,
                      std::vector<std::string>& notes) {
   const CsvTable table = CsvTable::read(options.data, CsvTable::Keep::numbers);
+  ViewRequest constrained;
+  if (!options.system.empty()) constrained.system = std::make_shared<const Model>(Model::read(options.system));
+  const PredictedView at = predicted_view(fit, posterior.prior(), constrained);
+  const System& system = *at.model->system;
   const std::vector<int> rows =
-      acceleration_rows(*fit.model.system, outputs_to_compare(posterior, fit.model, table, options.columns, notes), "`data`");
-  View view{View::Quantity::constrained_acceleration, rows};
-  const Prior& prior = posterior.prior();
-  const View all = View::constrained_acceleration(*prior.system);
-  const LogStates log = read_log_states(prior, all, fit.model, table, options.columns, view.names(*fit.model.system));
+      acceleration_rows(system, outputs_to_compare(posterior, *at.model, table, options.columns, notes), "`data`");
+  const std::vector<std::string> outputs = View{View::Quantity::constrained_acceleration, rows}.names(system);
+  const LogStates log = read_log_states(at.prior, at.view, *at.model, table, options.columns, outputs, at.actuators);
   notes.insert(notes.end(), log.notes.begin(), log.notes.end());
   ReportData data = at_states_of(table.name(), [&] {
     MatrixXd noise = measurement_noise(posterior, rows, log.states.cols(), log.stated_stddev);
-    return data_at(posterior, log.states, rows, log.accelerations, std::move(noise), nullptr);
+    return data_at(posterior, log.states, rows, log.accelerations, std::move(noise), at.other_system);
   });
   data.name = "test";
-  data.source = options.data;
+  data.source = at.other_system ? fmt::format("{}, of '{}'", options.data, system.name()) : options.data;
   data.is_test = true;
+  data.is_of_other_system = at.other_system != nullptr;
   // what the fit does not read may still be drawn, and be read by the truth
-  LogReader reader = open_log(fit.model, table, options.columns);
-  const std::vector<std::string> names = fit.model.system->state_names();
+  LogReader reader = open_log(*at.model, table, options.columns);
+  const std::vector<std::string> names = system.state_names();
   for (std::size_t k = 0; k < names.size(); ++k) {
     if (!data.states.row(static_cast<Index>(k)).hasNaN() || !reader.has(names[k])) continue;
     std::vector<bool> only(names.size(), false);
@@ -171,6 +176,7 @@ void add_truth(const ReportOptions& options, Report& report) {
   const ModelMotion motion(truth);
   bool any = false;
   for (ReportData& data : report.data) {
+    if (!options.system.empty() && !data.is_test) continue;  // it is the truth of that system
     data.truth = motion.acceleration(data.states);
     for (Index i = 0; i < data.truth.cols(); ++i) {
       if (data.truth.col(i).allFinite()) {
@@ -374,6 +380,9 @@ std::optional<ConstraintSurface> constraint_surface(const SymbolicSystem& system
 std::vector<Option> options(ReportOptions& options) {
   return {
       {"data", &options.data, "CSV", "CSV with states and accelerations that the fit has not seen: a test"},
+      {"system", &options.system, "OTHER.toml",
+       "model file of another system with the same coordinates, inputs and latents, which `data` and `truth` are of", "", "", "",
+       "data"},
       {"truth", &options.truth, "MODEL", "model file whose [truth] is the true acceleration, shown beside the prediction"},
       {"map", &options.columns, "LOGNAME=NAME,…", "columns of `data` by other names", "", "columns"},
   };
@@ -381,8 +390,9 @@ std::vector<Option> options(ReportOptions& options) {
 
 Report collect_report(const ReportOptions& options, std::vector<std::string>& notes) {
   Report report;
-  report.fit = FitFile::read(options.fit);
-  report.library = nlohmann::json::parse(read_file(options.fit)).value("library", "");
+  const std::string text = read_file(options.fit);
+  report.fit = FitFile::parse(text, options.fit);
+  report.library = nlohmann::json::parse(text).value("library", "");
   report.file_date = date_of(options.fit);
   const Posterior posterior = report.fit.posterior();
   report.data = training_data(report.fit, posterior);
@@ -395,7 +405,7 @@ Report collect_report(const ReportOptions& options, std::vector<std::string>& no
   if (const SymbolicSystem* system = report.fit.model.symbolic_system(); system != nullptr && !report.data.empty()) {
     MatrixXd q(system->layout().size(), 0);
     for (const ReportData& data : report.data) {
-      if (&data != &report.data.front() && !data.is_test) continue;  // other systems have other surfaces
+      if (data.is_of_other_system) continue;  // which has another surface
       q.conservativeResize(Eigen::NoChange, q.cols() + data.states.cols());
       q.rightCols(data.states.cols()) = data.states;
     }

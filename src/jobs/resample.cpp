@@ -80,7 +80,7 @@ Features features_of(const Model& model, const std::vector<std::string>& asked) 
       names.push_back(name);
     }
   }
-  out.add(names, ExpressionFunction::of_state(values, words.symbols));
+  out.add(names, ExpressionFunction::of_state(values, words.symbols, model.system));
   return out;
 }
 

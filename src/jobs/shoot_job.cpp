@@ -116,6 +116,11 @@ class Shooter {
   }
 
   void read(const CsvTable& log, const std::map<std::string, std::string>& columns, std::vector<std::string>& notes) {
+    if (!contacts_of(fit_.model, system_.parameter_values()).empty()) {
+      throw InputError(fmt::format(
+          "'{}' has contacts, at whose impacts errors of a start jump: parameters are estimated from motions without them",
+          system_.name()));
+    }
     LogReader reader = open_log(fit_.model, log, columns);
     states_ = reader.states(std::vector<bool>(static_cast<std::size_t>(system_.layout().size()), true));
     static_cast<void>(take_commands(system_, fit_.model.actuators, reader, std::nullopt, columns, states_, notes));

@@ -142,7 +142,8 @@ std::string whole_text(const Model& model, const SymbolicSystem& system, const s
     const char* level = row.level == ConstraintRow::Level::position   ? "position"
                         : row.level == ConstraintRow::Level::velocity ? "velocity"
                                                                       : "acceleration";
-    text += fmt::format("  {} = 0   ({} level{})\n", row.text, level, row.noise > 0 ? fmt::format(", noise {}", row.noise) : "");
+    text += fmt::format("  {} = 0   ({} level{}{})\n", row.text, level, row.noise > 0 ? fmt::format(", noise {}", row.noise) : "",
+                        row.condition.empty() ? "" : (row.contact ? ", a contact, when " : ", when ") + row.condition);
   }
   text += fmt::format("A\n{}b\n{}", matrix_text(A, full), matrix_text(b, full));
   return text + actuators_text(model) + parameters_text(model, system) + latents_text(model, full);

@@ -143,7 +143,17 @@ InputSignal input_signal(const Model& model, const std::vector<Actuator>& actuat
   if (system.inputs().empty()) throw InputError(fmt::format("`inputs`: '{}' has no inputs", system.name()));
   LogReader reader(table, system, columns);
   const VectorXd times = reader.values({"t"}).row(0).transpose();
-  const MatrixXd values = reader.values(system.inputs());
+  // whether there is contact follows from the motion
+  std::vector<std::string> given = system.inputs();
+  for (const Contact& contact : contacts_of(model, system.parameter_values())) {
+    std::erase(given, system.inputs()[static_cast<std::size_t>(contact.input)]);
+  }
+  const MatrixXd read = reader.values(given);
+  MatrixXd values = MatrixXd::Zero(system.layout().nu, times.size());
+  for (std::size_t k = 0; k < given.size(); ++k) {
+    const auto row = std::find(system.inputs().begin(), system.inputs().end(), given[k]) - system.inputs().begin();
+    values.row(row) = read.row(static_cast<Index>(k));
+  }
   const double t_start = request.times[0], t_end = request.times[request.times.size() - 1];
   try {
     InputSignal signal(times, values, actuators);
@@ -159,7 +169,8 @@ InputSignal input_signal(const Model& model, const std::vector<Actuator>& actuat
 }
 
 // All but the accelerations.
-SimulateJob prepare(const Model& model, VectorXd parameters, const SimulateRequest& request) {
+SimulateJob prepare(const Model& model, const std::vector<Actuator>& actuators, VectorXd parameters,
+                    const SimulateRequest& request) {
   require_in_range(request);
   std::vector<const CsvTable*> tables;
   if (const auto* table = std::get_if<CsvTable>(&request.start)) tables.push_back(table);
@@ -172,7 +183,8 @@ SimulateJob prepare(const Model& model, VectorXd parameters, const SimulateReque
   job.options.absolute_tolerance = request.absolute_tolerance;
   job.options.max_steps = request.max_steps;
   job.options.project = request.project;
-  job.options.inputs = input_signal(model, model.actuators, request, columns);
+  job.options.inputs = input_signal(model, actuators, request, columns);
+  job.options.contacts = contacts_of(model, parameters);
   job.commands = input_signal(model, {}, request, columns);
   job.start = start_state(model, parameters, request, columns, job.notes);
   job.parameters = std::move(parameters);
@@ -231,7 +243,7 @@ VectorXd motion_times(double t_start, double t_end, const std::optional<double>&
 SimulateJob prepare_simulation(const Model& model, const SimulateRequest& request) {
   require_in_range(request);
   if (request.n_samples) throw InputError("`samples`: a model has no posterior to draw from; give a FIT.json");
-  SimulateJob job = prepare(model, model.system->parameter_values(), request);
+  SimulateJob job = prepare(model, model.actuators, model.system->parameter_values(), request);
   job.accelerations = {model_acceleration(model)};
   job.options.switching = switching_functions(model, /*of_latents=*/false);
   if (model.system->nc() > 0) {
@@ -241,11 +253,15 @@ SimulateJob prepare_simulation(const Model& model, const SimulateRequest& reques
   return job;
 }
 
-SimulateJob prepare_simulation(const Model& model, const Posterior& posterior, const SimulateRequest& request) {
-  SimulateJob job = prepare(model, posterior.values().parameters, request);
+SimulateJob prepare_simulation(const FitSystem& system, const Posterior& posterior, const SimulateRequest& request) {
+  const Model& model = *system.model;
+  const VectorXd& at_home = posterior.values().parameters;
+  SimulateJob job =
+      prepare(model, system.actuators, system.other_system ? system.other_system->parameters(at_home) : at_home, request);
   job.options.switching = switching_functions(model, /*of_latents=*/true);
   const auto add = [&](const auto& function) {
-    const auto of_view = [&](const View& view) -> Acceleration {
+    const auto of_view = [&](View view) -> Acceleration {
+      view.other_system = system.other_system;
       return [function, view](const Eigen::Ref<const VectorXd>& x) -> VectorXd { return function(view, x).col(0); };
     };
     job.accelerations.push_back(of_view(View::constrained_acceleration(*model.system)));
@@ -296,8 +312,10 @@ std::vector<std::vector<double>> multiplier_sign_changes(const Trajectory& traje
   return changes;
 }
 
-MotionUncertainty motion_uncertainty(const Posterior& posterior, const Trajectory& trajectory) {
-  const View view = View::constrained_acceleration(*posterior.prior().system);
+MotionUncertainty motion_uncertainty(const Posterior& posterior, const Trajectory& trajectory,
+                                     const std::shared_ptr<const OtherSystem>& other_system) {
+  View view = View::constrained_acceleration(*posterior.prior().system);
+  view.other_system = other_system;
   MotionUncertainty out;
   out.stddev = posterior.marginal(view, trajectory.states, /*n_threads=*/0).stddev();
   out.distance = posterior.distance_from_data(view, trajectory.states, /*n_threads=*/0);

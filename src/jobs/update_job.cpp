@@ -61,6 +61,9 @@ Observations more_observations(const FitFile& fit, const Posterior& posterior, c
     }
   }
   notes.insert(notes.end(), read.notes.begin(), read.notes.end());
+  if (log.file() && fit.has_learned(*log.file())) {
+    notes.push_back(fmt::format("warning: {} was learned from already: its rows count twice", log.name()));
+  }
   return {std::move(read.states), std::move(view), std::move(read.accelerations), std::move(stddev), false, std::move(scale)};
 }
 
@@ -78,6 +81,7 @@ UpdateOutcome update(FitFile fit, const std::vector<CsvTable>& logs, const Updat
   for (const CsvTable& log : logs) {
     Observations more = more_observations(fit, posterior, log, request, outcome.notes);
     outcome.n_added += more.n_data();
+    if (log.file()) fit.logs.push_back(*log.file());
     posterior = update(std::move(posterior), std::move(more));
   }
   keep_newest(posterior, request);

@@ -17,6 +17,7 @@
 #include "base/decompositions.hpp"
 #include "base/parallel.hpp"
 #include "gp2/error.hpp"
+#include "gp2/mechanics/symbolic_system.hpp"
 #include "gp2/mechanics/udwadia_kalaba.hpp"
 
 namespace gp2 {
@@ -180,6 +181,19 @@ std::optional<ConstraintViolation> largest_violation(const System& system, const
   return worst;
 }
 
+std::vector<int> ranks_of(const System& system, const MechanicsBatch& mechanics) {
+  std::vector<int> ranks;
+  for (const UdwadiaKalaba& projection : mechanics.projections) {
+    const auto i = static_cast<int>(ranks.size());
+    int rank = projection.rank();
+    for (int row = 0; row < system.nc(); ++row) {
+      if (system.is_conditional(row) && mechanics.values.A(i).row(row).isZero(0)) ++rank;
+    }
+    ranks.push_back(rank);
+  }
+  return ranks;
+}
+
 LowerRank states_of_lower_rank(const std::vector<int>& ranks) {
   LowerRank lower;
   if (ranks.empty()) return lower;
@@ -203,8 +217,8 @@ LowerRank states_of_lower_rank(const System& system, const Ref<const MatrixXd>& 
   if (system.nc() == 0) return {};
   std::vector<int> ranks(static_cast<std::size_t>(states.cols()));
   const auto fault = for_each_mechanics(system, states, parameters, 1, [&](Index first, const MechanicsBatch& mechanics) {
-    std::transform(mechanics.projections.begin(), mechanics.projections.end(), ranks.begin() + first,
-                   [](const UdwadiaKalaba& projection) { return projection.rank(); });
+    const std::vector<int> here = ranks_of(system, mechanics);
+    std::copy(here.begin(), here.end(), ranks.begin() + first);
   });
   return fault ? LowerRank{} : states_of_lower_rank(ranks);
 }
@@ -244,7 +258,7 @@ std::optional<std::vector<int>> dependent_columns(const System& system, const Re
   }
   VectorXd scale(system.nq());
   for (Index j = 0; j < scale.size(); ++j) scale[j] = std::max(spread(accelerations.row(j)), 1e-300);
-  int rank = 0;
+  int rank = 0, lowest_rank = system.nq();
   std::vector<MatrixXd> scaled_T;
   constexpr Index max_states = 50;
   const Index stride = std::max<Index>(1, states.cols() / max_states);
@@ -252,11 +266,14 @@ std::optional<std::vector<int>> dependent_columns(const System& system, const Re
     for (std::size_t i = 0; i < mechanics.projections.size(); ++i) {
       const UdwadiaKalaba& projection = mechanics.projections[i];
       rank = std::max(rank, projection.rank());
+      lowest_rank = std::min(lowest_rank, projection.rank());
       if ((first + static_cast<Index>(i)) % stride != 0) continue;
       scaled_T.emplace_back(scale.cwiseInverse().asDiagonal() * projection.T() * scale.asDiagonal());
     }
   });
   if (fault || rank == 0) return std::nullopt;
+  // where a constraint is not active all columns are measurements
+  if (system.has_conditional_constraints() && lowest_rank < rank) return std::nullopt;
   return independent_rows(scaled_T, system.nq() - rank);
 }
 
@@ -499,7 +516,8 @@ void report_rank(const System& system, const std::vector<int>& ranks, const Mech
     findings.push_back({Level::good, fmt::format("constraints: rank {} of {} rows: {} redundant, which is allowed", highest,
                                                  system.nc(), system.nc() - highest)});
   } else {
-    findings.push_back({Level::good, fmt::format("constraints: {} rows, independent at every state", system.nc())});
+    findings.push_back({Level::good, fmt::format("constraints: {} rows, independent at every state{}", system.nc(),
+                                                 system.has_conditional_constraints() ? " where they are active" : "")});
   }
   report_independence(mechanics, std::ssize(ranks), findings);
   if (highest >= system.nq()) {
@@ -508,11 +526,31 @@ void report_rank(const System& system, const std::vector<int>& ranks, const Mech
   }
 }
 
+// Where the rows that come and go are there.
+void report_conditions(const System& system, const MatrixXd& sizes, std::vector<Finding>& findings) {
+  for (int row = 0; row < system.nc(); ++row) {
+    if (!system.is_conditional(row)) continue;
+    const Index n_active = (sizes.row(row).array() > 0).count();
+    const std::string what =
+        fmt::format("constraint '{}': active, {}, at {} of {} states", system.constraint_labels()[static_cast<std::size_t>(row)],
+                    system.constraint_conditions()[static_cast<std::size_t>(row)], n_active, sizes.cols());
+    if (n_active == 0) {
+      findings.push_back({Level::warning, what + ": these states say nothing of it; look at the condition and its sign"});
+    } else {
+      findings.push_back({Level::good, what});
+    }
+  }
+}
+
 // a row of A that nearly vanishes somewhere decides the direction of its force from rounding
 /// @param sizes  norms of the rows of A (nc × N)
 void report_row_sizes(const System& system, const MatrixXd& sizes, int n_zero_rows, std::vector<Finding>& findings) {
   for (int row = 0; row < system.nc(); ++row) {
     const std::string& label = system.constraint_labels()[static_cast<std::size_t>(row)];
+    if (system.is_conditional(row)) {
+      n_zero_rows -= static_cast<int>((sizes.row(row).array() == 0).count());
+      continue;
+    }
     if (sizes.row(row).isZero(0)) {
       // a loop in a plane, closed in space
       n_zero_rows -= static_cast<int>(sizes.cols());
@@ -548,8 +586,9 @@ bool check_mechanics(const System& system, const Ref<const MatrixXd>& states, co
   MatrixXd sizes(system.nc(), states.cols());
   std::mutex mutex;
   const auto fault = for_each_mechanics(system, states, parameters, n_threads, [&](Index first, const MechanicsBatch& block) {
+    const std::vector<int> ranks_here = ranks_of(system, block);
+    std::copy(ranks_here.begin(), ranks_here.end(), ranks.begin() + first);
     for (int i = 0; i < block.values.n_states(); ++i) {
-      ranks[static_cast<std::size_t>(first + i)] = block.projections[static_cast<std::size_t>(i)].rank();
       sizes.col(first + i) = block.values.A(i).rowwise().norm();
     }
     const MechanicsSummary summary = summary_of(block, first, first_mass);
@@ -567,6 +606,7 @@ bool check_mechanics(const System& system, const Ref<const MatrixXd>& states, co
     return true;
   }
   report_rank(system, ranks, mechanics, findings);
+  report_conditions(system, sizes, findings);
   report_row_sizes(system, sizes, mechanics.n_zero_rows, findings);
   return true;
 }
@@ -642,21 +682,30 @@ void check_motion(const System& system, const Ref<const MatrixXd>& states, const
     const MatrixXd ddq =
         block.middleRows(layout.dq(0), layout.nq).unaryExpr([](double v) { return std::isnan(v) ? 0.0 : 0.7 * v + 0.3; });
     const double h = 1e-4;
-    const auto moved = [&](double step) {
+    const auto moved_by = [&](double step) {
       MatrixXd x = block;
       for (int j = 0; j < layout.nq; ++j) {
         x.row(layout.q(j)) += step * block.row(layout.dq(j)) + 0.5 * step * step * ddq.row(j);
         x.row(layout.dq(j)) += step * ddq.row(j);
       }
       x.row(layout.t()).array() += step;
-      return system.residuals(x, parameters);
+      return x;
     };
+    const MatrixXd after = moved_by(h), before = moved_by(-h);
     const MatrixXd now = system.residuals(block, parameters);
-    const MatrixXd difference = (moved(h) - moved(-h)) / (2 * h);
+    const MatrixXd difference = (system.residuals(after, parameters) - system.residuals(before, parameters)) / (2 * h);
+    // a row that comes or goes on the way has no difference
+    const auto switches = [&, values_after = system.has_conditional_constraints() ? system.evaluate(after, parameters) : values,
+                           values_before = system.has_conditional_constraints() ? system.evaluate(before, parameters) : values](
+                              int row, int i) {
+      const bool is_there = !values.A(i).row(row).isZero(0);
+      return !values_after.A(i).row(row).isZero(0) != is_there || !values_before.A(i).row(row).isZero(0) != is_there;
+    };
     Eigen::ArrayXd error_in_block = Eigen::ArrayXd::Zero(n_residuals), size_in_block = error_in_block;
     for (Index k = 0; k < n_residuals; ++k) {
       const System::Residual& label = system.residual_labels()[static_cast<std::size_t>(k)];
       for (Index i = 0; i < now.cols(); ++i) {
+        if (system.is_conditional(label.row) && switches(label.row, static_cast<int>(i))) continue;
         // d/dt of a velocity-level residual is A ddq − b; d/dt of a position-level one is the residual that follows it
         const auto A = values.A(static_cast<int>(i)).row(label.row);
         double expected = 0, size_here = 0;
@@ -694,6 +743,47 @@ void check_motion(const System& system, const Ref<const MatrixXd>& states, const
                                   worst > 1e-3 ? " (largest for '" + worst_label + "')" : "")});
 }
 
+// A contact only pushes, and its gap is positive where it is open.
+void check_contacts(const SymbolicSystem& system, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters,
+                    const Ref<const MatrixXd>& accelerations, std::vector<Finding>& findings) {
+  for (int row = 0; row < system.nc(); ++row) {
+    const ConstraintRow& constraint = system.definition().constraints[static_cast<std::size_t>(row)];
+    if (!constraint.contact) continue;
+    const int touch = system.layout().u(constraint.contact->input);
+    const auto& labels = system.residual_labels();
+    const auto gap = std::find_if(labels.begin(), labels.end(), [&](const auto& one) { return one.row == row; });
+    int n_closed = 0, n_pulling = 0, n_open = 0, n_beyond = 0;
+    const auto fault = for_each_mechanics(system, states, parameters, 1, [&](Index first, const MechanicsBatch& block) {
+      MatrixXd all_closed = states.middleCols(first, block.values.n_states());
+      all_closed.row(touch).setOnes();
+      const auto gaps = system.residuals(all_closed, parameters).row(gap - labels.begin()).eval();
+      for (int i = 0; i < block.values.n_states(); ++i) {
+        if (block.values.A(i).row(row).isZero(0)) {
+          ++n_open;
+          n_beyond += gaps[i] < 0 ? 1 : 0;
+          continue;
+        }
+        const VectorXd force = block.values.M(i) * accelerations.col(first + i) - block.values.F(i);
+        const double lambda = block.projections[static_cast<std::size_t>(i)].multipliers_of_force().row(row).dot(force);
+        if (!std::isfinite(lambda)) continue;
+        ++n_closed;
+        n_pulling += lambda < 0 ? 1 : 0;
+      }
+    });
+    if (fault) return;
+    const bool pulls = 2 * n_pulling > n_closed, is_beyond = 2 * n_beyond > n_open;
+    findings.push_back(
+        {pulls || is_beyond ? Level::warning : Level::good,
+         fmt::format(
+             "contact '{}': under the measured ddq and the known force it pulls at {} of {} states where it is closed, and its "
+             "gap is negative at {} of {} where it is open{}",
+             constraint.text, n_pulling, n_closed, n_beyond, n_open,
+             is_beyond ? "; a gap is not negative: change its sign, or the input that says where it is closed"
+             : pulls   ? "; a contact only pushes: change the sign of the gap, or give the force that presses it"
+                       : "")});
+  }
+}
+
 }  // namespace
 
 std::vector<Finding> check_system(const System& system, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters,
@@ -724,6 +814,9 @@ std::vector<Finding> check_data(const System& system, const Ref<const MatrixXd>&
     const bool is_all = one.is_too_large() && one.rms > 0.3 * one.size && !estimates;
     const std::string of_file = one.is_too_large() && estimates ? "; here with the parameters as in the model file" : "";
     findings.push_back({is_all ? Level::error : one.is_too_large() ? Level::warning : Level::good, one.text() + of_file});
+  }
+  if (const auto* symbolic = dynamic_cast<const SymbolicSystem*>(&system)) {
+    check_contacts(*symbolic, states, parameters, accelerations, findings);
   }
   const std::vector<std::string> every = system.acceleration_names();
   const auto rows = dependent_columns(system, states, parameters, accelerations);

@@ -81,7 +81,7 @@ class Multipliers final : public QuantityKind {
   [[nodiscard]] MotionParts parts() const override { return {.constraint_force = true}; }
   [[nodiscard]] bool is_per_coordinate() const override { return false; }
   void require_parameter_derivatives(const StateMechanics& at) const override {
-    if (at.projection.rank() == at.A.rows()) return;
+    if (at.projection.rank() + at.projection.n_zero_rows() == at.A.rows()) return;
     throw InputError(
         "multipliers of redundant constraints cannot be observed while parameters are estimated: leave out the rows "
         "that follow from others");
@@ -136,12 +136,31 @@ class NextVelocity final : public QuantityKind {
   }
 };
 
+// M'(ā − μ): the applied force that the latents add
+class LearnedForce final : public QuantityKind {
+ public:
+  [[nodiscard]] std::string word() const override { return "force"; }
+  [[nodiscard]] std::string name(const System& system, int row) const override { return "force_" + coordinate(system, row).name; }
+  [[nodiscard]] MotionParts parts() const override { return {.applied_force = true}; }
+  [[nodiscard]] bool has_mean() const override { return false; }
+  [[nodiscard]] double per_acceleration(double mass, double /*time_step*/) const override { return mass; }
+
+  void evaluate(const StateMechanics& /*at*/, const MotionColumns& motion, Ref<MatrixXd> out, Workspace& /*w*/) const override {
+    out = motion.applied_force;
+  }
+  void differentiate(const StateMechanics& /*at*/, const MotionColumns& /*motion*/, const MotionColumns& dmotion,
+                     const ConstraintChange& /*dA*/, Ref<MatrixXd> out, Workspace& /*w*/) const override {
+    out = dmotion.applied_force;
+  }
+};
+
 // constant-initialised: objects of other files may hold them before main
 constexpr ConstrainedAcceleration constrained_kind;
 constexpr UnconstrainedAcceleration unconstrained_kind;
 constexpr ConstraintForce force_kind;
 constexpr Multipliers multipliers_kind;
 constexpr NextVelocity next_velocity_kind;
+constexpr LearnedForce learned_force_kind;
 
 }  // namespace
 
@@ -150,10 +169,11 @@ constinit const Quantity Quantity::unconstrained_acceleration{unconstrained_kind
 constinit const Quantity Quantity::constraint_force{force_kind};
 constinit const Quantity Quantity::multipliers{multipliers_kind};
 constinit const Quantity Quantity::next_velocity{next_velocity_kind};
+constinit const Quantity Quantity::learned_force{learned_force_kind};
 
 const std::vector<Quantity>& Quantity::all() {
-  static const std::vector<Quantity> all = {constrained_acceleration, unconstrained_acceleration, constraint_force, multipliers,
-                                            next_velocity};
+  static const std::vector<Quantity> all = {
+      constrained_acceleration, unconstrained_acceleration, constraint_force, multipliers, next_velocity, learned_force};
   return all;
 }
 
@@ -179,6 +199,7 @@ void AffineMotion::evaluate(const UdwadiaKalaba& projection, const Ref<const Mat
   force_.resize(nq, nq);
   force_at_zero_.resize(nq);
   if (parts.unconstrained_acceleration) identity_.setIdentity(nq, nq);
+  if (parts.applied_force) mass_ = projection.mass();
   if (parts.constraint_force) {
     force_.noalias() = M * T_;
     force_ -= projection.mass();
@@ -193,6 +214,7 @@ void AffineMotion::differentiate(const UdwadiaKalaba& projection, const Ref<cons
   identity_.setZero(nq, nq);
   force_.setZero(nq, nq);
   force_at_zero_.setZero(nq);
+  if (parts.applied_force) mass_ = projection.differentiate_mass(dM, dA);
   if (!parts.constrained_acceleration && !parts.constraint_force) return;
   UdwadiaKalaba::Derivative d = projection.differentiate(dM, dA, db);
   T_ = std::move(d.T);

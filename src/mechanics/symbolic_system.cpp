@@ -36,8 +36,9 @@ std::vector<Expression> SystemSymbols::state() const {
   return state;
 }
 
-std::vector<Expression> SystemSymbols::state_and_parameters() const {
+std::vector<Expression> SystemSymbols::state_and_parameters(std::span<const Expression> between) const {
   std::vector<Expression> all = state();
+  all.insert(all.end(), between.begin(), between.end());
   all.insert(all.end(), parameters.begin(), parameters.end());
   return all;
 }
@@ -120,6 +121,14 @@ ConstraintRow derive_constraint(ConstraintLevel level, Expression c, std::string
   return row;
 }
 
+void switch_constraint(ConstraintRow& row, Expression active, std::string condition) {
+  const auto apply = [&](Expression& e) { e = active.graph().apply(Operation::multiply_or_zero, active, e); };
+  for (Expression& entry : row.A) apply(entry);
+  apply(row.b);
+  for (Expression& residual : row.residuals) apply(residual);
+  row.condition = std::move(condition);
+}
+
 namespace {
 
 // M (column-major), A (column-major), b, F in one list
@@ -150,6 +159,12 @@ VectorXd noise_of(const SymbolicSystem::Definition& definition) {
   return noise;
 }
 
+std::vector<std::string> conditions_of(const SymbolicSystem::Definition& definition) {
+  std::vector<std::string> conditions;
+  for (const ConstraintRow& row : definition.constraints) conditions.push_back(row.condition);
+  return conditions;
+}
+
 }  // namespace
 
 // The derivatives are taken in a graph of their own: that of the definition may be growing elsewhere.
@@ -163,7 +178,7 @@ struct SymbolicSystem::StateTape {
 
 SymbolicSystem::SymbolicSystem(Definition definition)
     : System(definition.name, definition.coordinates, definition.inputs, definition.parameters, labels_of(definition),
-             noise_of(definition)),
+             noise_of(definition), conditions_of(definition)),
       definition_(std::move(definition)) {
   ExpressionGraph& graph = *definition_.graph;
   const SystemSymbols symbols(graph, coordinates(), inputs(), parameters());

@@ -1,5 +1,7 @@
 #include "gp2/system.hpp"
 
+#include <algorithm>
+
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
@@ -8,17 +10,24 @@
 namespace gp2 {
 
 System::System(std::string name, std::vector<Coordinate> coordinates, std::vector<std::string> inputs,
-               std::vector<Parameter> parameters, std::vector<std::string> constraint_labels, Eigen::VectorXd constraint_noise)
+               std::vector<Parameter> parameters, std::vector<std::string> constraint_labels, Eigen::VectorXd constraint_noise,
+               std::vector<std::string> constraint_conditions)
     : name_(std::move(name)),
       coordinates_(std::move(coordinates)),
       inputs_(std::move(inputs)),
       parameters_(std::move(parameters)),
       constraint_labels_(std::move(constraint_labels)),
-      constraint_noise_(std::move(constraint_noise)) {
+      constraint_noise_(std::move(constraint_noise)),
+      constraint_conditions_(std::move(constraint_conditions)) {
+  constraint_conditions_.resize(constraint_labels_.size());
   if (constraint_noise_.size() == 0) constraint_noise_.setZero(nc());
   if (constraint_noise_.size() != nc() || !(constraint_noise_.array() >= 0).all() || !constraint_noise_.allFinite()) {
     throw InputError(fmt::format("'{}': constraint_noise must hold {} finite numbers ≥ 0, one per constraint", name_, nc()));
   }
+}
+
+bool System::has_conditional_constraints() const {
+  return std::any_of(constraint_conditions_.begin(), constraint_conditions_.end(), [](const auto& one) { return !one.empty(); });
 }
 
 std::vector<std::string> System::state_names() const {

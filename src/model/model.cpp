@@ -8,6 +8,7 @@
 
 #include "gp2/data/csv.hpp"
 #include "gp2/error.hpp"
+#include "mechanics/known_multipliers.hpp"
 #include "model/model_reader.hpp"
 #include "model/model_text.hpp"
 #include "model/prior_words.hpp"
@@ -100,10 +101,12 @@ void Model::define(const std::string& symbol, Expression value) {
   if (symbols_.emplace(symbol, value).second) symbol_names_.push_back(symbol);
 }
 
-Expression Model::parse_symbols(std::string_view written, const std::vector<Expression>& forbidden) const {
+Expression Model::parse_symbols(std::string_view written, const std::vector<Expression>& forbidden,
+                                decltype(parse_expression)& parse) const {
   bool is_unknown = false;
   const auto resolve = [&](std::string_view symbol) -> std::optional<Expression> {
     if (const auto found = symbols_.find(symbol); found != symbols_.end()) return found->second;
+    if (is_known_multiplier(symbol)) return graph->variable(symbol);
     const std::optional<Expression> of_robot =
         robot_expressions_ ? robot_expressions_->variable(std::string(symbol)) : std::nullopt;
     is_unknown = !of_robot;
@@ -111,9 +114,9 @@ Expression Model::parse_symbols(std::string_view written, const std::vector<Expr
   };
   constexpr std::size_t most_listed = 1000;  // nobody reads more
   const bool has_many = symbol_names_.size() > most_listed;
-  if (forbidden.empty() || has_many) return parse_expression(written, *graph, resolve, symbol_names_);
+  if (forbidden.empty() || has_many) return parse(written, *graph, resolve, symbol_names_);
   try {
-    return parse_expression(written, *graph, resolve, {});
+    return parse(written, *graph, resolve, {});
   } catch (const InputError&) {
     if (!is_unknown) throw;
   }
@@ -124,7 +127,7 @@ Expression Model::parse_symbols(std::string_view written, const std::vector<Expr
     const auto is_read = [&](const Expression& one) { return graph->depends_on(value, one); };
     if (std::none_of(forbidden.begin(), forbidden.end(), is_read)) allowed.push_back(symbol);
   }
-  return parse_expression(written, *graph, resolve, allowed);
+  return parse(written, *graph, resolve, allowed);
 }
 
 Expression Model::expression(std::string_view written) const {

@@ -12,6 +12,7 @@
 #include "base/random.hpp"
 #include "base/suggestion.hpp"
 #include "gp2/error.hpp"
+#include "mechanics/known_multipliers.hpp"
 #include "model/name_order.hpp"
 #include "model/toml_reader.hpp"
 #include "prior/make_prior.hpp"
@@ -20,6 +21,17 @@
 namespace gp2 {
 
 using Level = ConstraintRow::Level;
+
+namespace {
+
+// mass('link7') -> mass("link7")
+std::string robot_number_name(std::string written) {
+  std::replace(written.begin(), written.end(), '\'', '"');
+  std::erase(written, ' ');
+  return written;
+}
+
+}  // namespace
 
 /// Reads the tables of a model file one after the other; every complaint carries file, line and key.
 class ModelReader : private TomlReader {
@@ -63,18 +75,53 @@ class ModelReader : private TomlReader {
   // an expression given as text or as a number, which by some rule does not depend on the forbidden symbols
   Expression expression_without(const toml::node& node, const std::string& key, const std::vector<Expression>& forbidden,
                                 const char* rule) const {
-    Expression value = unexpanded(node, key, forbidden);
-    if (robot()) value = robot()->expand(value);
+    const Expression value = expanded(node, key, forbidden);
+    refuse_load(node, key, value);
     allow_only(node, key, value, forbidden, rule);
     return value;
+  }
+
+  // of the state, of parameters, and of λ₀ of the system, which is read already
+  Expression expression_with_load(const toml::node& node, const std::string& key, const char* rule) const {
+    const Expression value = expanded(node, key, symbols_->ddq);
+    for (const std::string& load : loads_of(value)) {
+      if (const auto fault = row_fault(load, model_.system->nc())) fail(node, key, *fault);
+    }
+    allow_only(node, key, value, symbols_->ddq, rule);
+    return value;
+  }
+
+  Expression expanded(const toml::node& node, const std::string& key, const std::vector<Expression>& forbidden) const {
+    const Expression value = unexpanded(node, key, forbidden);
+    return robot() ? robot()->expand(value) : value;
+  }
+
+  [[nodiscard]] std::vector<std::string> loads_of(Expression e) const {
+    std::vector<std::string> loads = definition_.graph->variables_of(e);
+    std::erase_if(loads, [](const std::string& variable) { return !is_known_multiplier(variable); });
+    return loads;
+  }
+
+  void refuse_load(const toml::node& node, const std::string& key, Expression e) const {
+    for (const std::string& load : loads_of(e)) {
+      fail(node, key,
+           fmt::format("{} follows from M, F and the constraints, so that it may stand in features, directions, [truth] and "
+                       "[let] only",
+                       load));
+    }
   }
 
   // the points of the robot left as they are
   Expression unexpanded(const toml::node& node, const std::string& key, const std::vector<Expression>& forbidden = {}) const {
     if (node.is_number()) return definition_.graph->constant(number(node, key));
     if (!node.is_string()) fail(node, key, fmt::format("expected an expression in quotes, or a number, got {}", written(node)));
+    return parsed(node, key, forbidden, parse_expression);
+  }
+
+  Expression parsed(const toml::node& node, const std::string& key, const std::vector<Expression>& forbidden,
+                    decltype(parse_expression)& parse) const {
     try {
-      return model_.parse_symbols(text(node, key), forbidden);
+      return model_.parse_symbols(text(node, key), forbidden, parse);
     } catch (const InputError& error) {
       fail(node, key, fmt::format("\"{}\", {}", shortened(text(node, key)), error.what()));
     }
@@ -91,8 +138,9 @@ class ModelReader : private TomlReader {
   [[nodiscard]] const std::shared_ptr<RobotExpressions>& robot() const { return model_.robot_expressions_; }
 
   void declare(const std::string& name, const toml::node& node, const std::string& key) {
-    static const std::set<std::string> reserved = {"pi",   "sin",  "cos", "tan", "asin", "acos", "atan", "atan2", "sinh",
-                                                   "cosh", "tanh", "exp", "log", "sqrt", "abs",  "sign", "min",   "max"};
+    static const std::set<std::string> reserved = {"pi",    "sin",  "cos",  "tan",  "asin",   "acos", "atan",
+                                                   "atan2", "sinh", "cosh", "tanh", "exp",    "log",  "sqrt",
+                                                   "abs",   "sign", "min",  "max",  "lambda0"};
     if (!is_identifier(name)) {
       fail(node, key, fmt::format("'{}' is not a name: use letters, digits and _, beginning with a letter", name));
     }
@@ -265,6 +313,7 @@ class ModelReader : private TomlReader {
     for (const Parameter& parameter : parameters) model_.symbol_names_.push_back(parameter.name);
     define_in_order(entries, "parameters", [&](const std::string& name, const toml::node& node, const std::string& key) {
       const Expression expression = unexpanded(node, key);
+      refuse_load(node, key, expression);
       allow_only(node, key, expression, symbols_->state(), "a parameter may follow from other parameters only");
       allow_only(node, key, expression, symbols_->ddq, "a parameter may follow from other parameters only");
       const Expression value = model_.graph->substitute(expression, values);
@@ -338,9 +387,7 @@ class ModelReader : private TomlReader {
 
   // mass("link7") or com('link7').x: a number of the robot that is this parameter from now on; gives the robot's own value
   double read_robot_number(const toml::node& node, const std::string& key, const std::string& parameter) {
-    std::string of = text(node, key);
-    std::replace(of.begin(), of.end(), '\'', '"');
-    std::erase(of, ' ');
+    const std::string of = robot_number_name(text(node, key));
     if (!model_.robot) fail(node, key, "only a model with a robot = \"FILE\" has such numbers; give a value instead");
     const auto [other, is_new] = robot_parameters_.emplace(of, parameter);
     if (!is_new) fail(node, key, fmt::format("{} is the parameter '{}' already", of, other->second));
@@ -541,6 +588,11 @@ class ModelReader : private TomlReader {
   // the coordinates as (∂r/∂q)ᵀ force
   std::vector<Expression> read_forces(const toml::table& entries, const std::string& section) const {
     const std::size_t nq = definition_.coordinates.size();
+    // λ₀ is that of the known force
+    const auto read = [&](const toml::node& node, const std::string& key) {
+      return section == "truth" ? expression_with_load(node, key, "a force may not depend on accelerations")
+                                : expression_without(node, key, symbols_->ddq, "a force may not depend on accelerations");
+    };
     std::vector<Expression> forces(nq, definition_.graph->constant(0));
     if (entries.contains("force")) {
       const toml::node& node = *entries.get("force");
@@ -550,7 +602,7 @@ class ModelReader : private TomlReader {
       }
       for (std::size_t j = 0; j < nq; ++j) {
         const std::string key = fmt::format("{}.force entry {}", section, j + 1);
-        forces[j] = expression_without(*force.get(j), key, symbols_->ddq, "a force may not depend on accelerations");
+        forces[j] = read(*force.get(j), key);
       }
     }
     if (!entries.contains("force_on")) return forces;
@@ -558,7 +610,7 @@ class ModelReader : private TomlReader {
     if (!robot()) fail(node, section + ".force_on", "only a model with a robot = \"FILE\" has points for a force to act on");
     for (const auto& [name, entry] : entries_of(table(node, section + ".force_on"))) {
       const std::string key = fmt::format("{}.force_on.{}", section, name);
-      const Expression force = expression_without(*entry, key, symbols_->ddq, "a force may not depend on accelerations");
+      const Expression force = read(*entry, key);
       for (std::size_t j = 0; j < nq; ++j) forces[j] = forces[j] + robot_quantity(*entry, key, name).jacobian[j] * force;
     }
     return forces;
@@ -656,22 +708,88 @@ class ModelReader : private TomlReader {
     }
   }
 
-  // "c", or { expr = "c", noise = 0.05 }
+  // "c", or { expr = "c", noise = 0.05, when = "gap <= 0" }, or { expr = "c", contact = "touch", restitution = 0.8 }
   ConstraintRow read_constraint(Level level, const toml::node& entry, const std::string& key) const {
     if (!entry.is_table()) return read_exact_constraint(level, entry, key);
-    const toml::table& soft = *entry.as_table();
-    only_keys(soft, key, {"expr", "noise"});
-    if (!soft.contains("expr") || !soft.contains("noise")) {
-      fail(entry, key, "expected { expr = \"dx*sin(heading) - dy*cos(heading)\", noise = 0.05 }");
+    const toml::table& more = *entry.as_table();
+    only_keys(more, key, {"expr", "noise", "when", "contact", "restitution"});
+    if (!more.contains("expr") || more.size() < 2) {
+      fail(entry, key,
+           "expected { expr = \"dx*sin(heading) - dy*cos(heading)\", noise = 0.05 }, or when = \"gap <= 0\", or contact = "
+           "\"touch\" in the place of noise");
     }
-    ConstraintRow row = read_exact_constraint(level, *soft.get("expr"), key);
-    row.noise = number(*soft.get("noise"), key + ".noise");
-    if (row.noise < 0) fail(*soft.get("noise"), key + ".noise", "a standard deviation must not be negative");
+    ConstraintRow row = read_exact_constraint(level, *more.get("expr"), key);
+    if (more.contains("noise")) {
+      row.noise = number(*more.get("noise"), key + ".noise");
+      if (row.noise < 0) fail(*more.get("noise"), key + ".noise", "a standard deviation must not be negative");
+    }
+    if (more.contains("when")) {
+      const toml::node& when = *more.get("when");
+      switch_constraint(row, read_condition(when, key + ".when"), text(when, key + ".when"));
+    }
+    read_contact(level, more, key, row);
     return row;
+  }
+
+  // contact = "touch", an input that is 1 in contact and 0 apart, and restitution
+  void read_contact(Level level, const toml::table& more, const std::string& key, ConstraintRow& row) const {
+    if (!more.contains("contact")) {
+      if (more.contains("restitution")) {
+        fail(*more.get("restitution"), key + ".restitution", "belongs to a contact: name its input, contact = \"touch\"");
+      }
+      return;
+    }
+    const toml::node& node = *more.get("contact");
+    const std::string name = text(node, key + ".contact");
+    const auto input = std::find(definition_.inputs.begin(), definition_.inputs.end(), name);
+    if (input == definition_.inputs.end()) {
+      fail(node, key + ".contact",
+           fmt::format("'{0}' is no input of this model: declare inputs = [\"{0}\"], which is 1 in contact and 0 apart",
+                       shortened(name)));
+    }
+    if (level != Level::position) fail(node, key + ".contact", "a contact is a gap, of position level: write it in position");
+    if (more.contains("when")) fail(node, key + ".contact", "says when the constraint is there: remove when");
+    const auto index = static_cast<std::size_t>(input - definition_.inputs.begin());
+    const bool is_taken =
+        std::any_of(definition_.constraints.begin(), definition_.constraints.end(),
+                    [&](const ConstraintRow& one) { return one.contact && one.contact->input == static_cast<int>(index); });
+    if (is_taken) fail(node, key + ".contact", fmt::format("'{}' is another contact's input: each needs its own", name));
+    if (!model_.actuators[index].is_direct()) {
+      fail(node, key + ".contact", fmt::format("'{}' is a contact, which has neither a delay nor a lag: remove them", name));
+    }
+    const std::string condition = name + " > 0.5";
+    switch_constraint(row, model_.parse_symbols(condition, {}, parse_condition), condition);
+    row.contact = {static_cast<int>(index), definition_.graph->constant(0)};
+    if (!more.contains("restitution")) return;
+    const toml::node& restitution = *more.get("restitution");
+    row.contact->restitution =
+        expression_without(restitution, key + ".restitution", symbols_->state(), "a restitution is a number, or of parameters");
+    const Expression& e = row.contact->restitution;
+    if (e.is_constant() && !(e.constant_value() >= 0 && e.constant_value() <= 1)) {
+      fail(restitution, key + ".restitution", fmt::format("must lie between 0 and 1, got {}", e.constant_value()));
+    }
+  }
+
+  // Whether an input says that there is contact.
+  [[nodiscard]] bool is_contact(const std::string& input) const {
+    return std::any_of(definition_.constraints.begin(), definition_.constraints.end(), [&](const ConstraintRow& row) {
+      return row.contact && definition_.inputs[static_cast<std::size_t>(row.contact->input)] == input;
+    });
+  }
+
+  // "gap <= 0", of a state and parameters
+  Expression read_condition(const toml::node& node, const std::string& key) const {
+    const Expression active = parsed(node, key, symbols_->ddq, parse_condition);
+    refuse_load(node, key, active);
+    const Expression value = robot() ? robot()->expand(active) : active;
+    allow_only(node, key, value, symbols_->ddq, "a condition may not depend on accelerations");
+    if (value.is_constant(0)) fail(node, key, "never holds: remove the constraint");
+    return value;
   }
 
   ConstraintRow read_exact_constraint(Level level, const toml::node& node, const std::string& key) const {
     const Expression c = unexpanded(node, key, forbidden_in(level));
+    refuse_load(node, key, c);
     try {
       return derive(level, c, node.is_string() ? text(node, key) : to_string(c));
     } catch (const InputError& error) {
@@ -798,7 +916,7 @@ class ModelReader : private TomlReader {
       for (const std::string& name : names_of_code(node, key)) add(node, name, {name});
     } else {
       for (const toml::node& entry : array(node, key)) {
-        const Expression value = expression_without(entry, key, symbols_->ddq, "a feature may not depend on accelerations");
+        const Expression value = expression_with_load(entry, key, "a feature may not depend on accelerations");
         const std::string feature = written_expression(entry, key, value);
         add(entry, feature, expand_angle(feature, definition_.coordinates));
       }
@@ -849,7 +967,7 @@ class ModelReader : private TomlReader {
     LatentSpec latent;
     latent.name = "unconstrained acceleration";
     for (Expression symbol : symbols_->state()) {
-      if (!(symbol == symbols_->t)) latent.features.push_back(symbol.variable_name());
+      if (!(symbol == symbols_->t) && !is_contact(symbol.variable_name())) latent.features.push_back(symbol.variable_name());
     }
     model_.latents.push_back(std::move(latent));
   }
@@ -889,7 +1007,7 @@ class ModelReader : private TomlReader {
       }
       latent.directions.emplace_back();
       for (const toml::node& entry : row) {
-        const Expression value = expression_without(entry, key, symbols_->ddq, "a direction may not depend on accelerations");
+        const Expression value = expression_with_load(entry, key, "a direction may not depend on accelerations");
         latent.directions.back().push_back(written_expression(entry, key, value));
       }
     }
@@ -970,8 +1088,7 @@ class ModelReader : private TomlReader {
     }
     for (std::size_t j = 0; j < nq; ++j) {
       const toml::node& row = *rows.get(j);
-      model_.truth[j] =
-          expression_without(row, "truth.acceleration", symbols_->ddq, "the true acceleration may not depend on itself");
+      model_.truth[j] = expression_with_load(row, "truth.acceleration", "the true acceleration may not depend on itself");
     }
   }
 
@@ -1076,7 +1193,11 @@ class ModelReader : private TomlReader {
   // a function y(q) of the coordinates, twice differentiated along the motion as a constraint is
   Model::Motion::Target read_target(const toml::node& node, const std::string& key, const std::string& written_target) const {
     try {
-      return {written_target, derive(Level::position, model_.parse_symbols(written_target), written_target), std::nullopt};
+      const Expression y = model_.parse_symbols(written_target);
+      refuse_load(node, key, y);
+      return {written_target, derive(Level::position, y, written_target), std::nullopt};
+    } catch (const LocatedError&) {
+      throw;
     } catch (const InputError& error) {
       fail(node, key, fmt::format("\"{}\" must be a function of the coordinates: {}", shortened(written_target), error.what()));
     }
@@ -1126,6 +1247,20 @@ class ModelReader : private TomlReader {
   std::optional<SystemSymbols> symbols_;
   const toml::node* mass_node_ = nullptr;
 };
+
+RobotNames robot_names(const Model& model) {
+  const toml::table root = toml::parse(model.text, model.name);
+  RobotNames names;
+  names.file = root["robot"].value_or(std::string());
+  if (const toml::table* const parameters = root["parameters"].as_table()) {
+    for (const auto& [parameter, node] : *parameters) {
+      const toml::table* const entry = node.as_table();
+      if (entry == nullptr || !entry->contains("of")) continue;
+      names.parameters[robot_number_name((*entry)["of"].value_or(std::string()))] = parameter.str();
+    }
+  }
+  return names;
+}
 
 void read_model(const toml::table& root, const RobotSource& robot, Model& model) { ModelReader(root, robot, model).read(); }
 

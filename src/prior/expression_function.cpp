@@ -3,6 +3,8 @@
 #include <fmt/format.h>
 
 #include "gp2/error.hpp"
+#include "mechanics/known_multipliers.hpp"
+#include "prior/load_function.hpp"
 
 namespace gp2 {
 
@@ -17,22 +19,31 @@ ExpressionFunction::ExpressionFunction(std::span<const Expression> expressions, 
       state_derivatives_(expressions, inputs, static_cast<int>(n_states)) {}
 
 std::shared_ptr<const StateFunction> ExpressionFunction::of_state(std::span<const Expression> expressions,
-                                                                  const SystemSymbols& symbols) {
-  const std::vector<Expression> state = symbols.state();
-  return std::shared_ptr<const StateFunction>(new ExpressionFunction(expressions, state, state.size()));
+                                                                  const SystemSymbols& symbols,
+                                                                  const std::shared_ptr<const System>& system) {
+  std::vector<Expression> inputs = symbols.state();
+  const std::vector<Expression> lambda0 = known_multipliers_in(expressions, *system);
+  inputs.insert(inputs.end(), lambda0.begin(), lambda0.end());
+  std::shared_ptr<const StateFunction> function(new ExpressionFunction(expressions, inputs, inputs.size()));
+  if (lambda0.empty()) return function;
+  return std::make_shared<LoadFunction>(std::move(function), system);
 }
 
 std::shared_ptr<const StateFunction> ExpressionFunction::of_state_and_parameters(std::span<const Expression> expressions,
                                                                                  const SystemSymbols& symbols,
-                                                                                 ExpressionGraph& graph) {
-  const std::vector<Expression> inputs = symbols.state_and_parameters();
-  const std::shared_ptr<ExpressionFunction> function(new ExpressionFunction(expressions, inputs, symbols.state().size()));
+                                                                                 ExpressionGraph& graph,
+                                                                                 const std::shared_ptr<const System>& system) {
+  const std::vector<Expression> lambda0 = known_multipliers_in(expressions, *system);
+  const std::vector<Expression> inputs = symbols.state_and_parameters(lambda0);
+  std::shared_ptr<ExpressionFunction> function(
+      new ExpressionFunction(expressions, inputs, inputs.size() - symbols.parameters.size()));
   for (const Expression parameter : symbols.parameters) {
     std::vector<Expression> derivatives;
     for (const Expression expression : expressions) derivatives.push_back(graph.differentiate(expression, parameter));
     function->parameter_derivatives_.emplace_back(derivatives, inputs);
   }
-  return function;
+  if (lambda0.empty()) return function;
+  return std::make_shared<LoadFunction>(std::move(function), system);
 }
 
 MatrixXd ExpressionFunction::evaluate(const States& states, const Parameters& parameters) const {
@@ -66,7 +77,7 @@ class ExpressionFunction::TapeEvaluator final : public Evaluator {
   void differentiate(const Ref<const VectorXd>& state, Ref<VectorXd> derivatives) override {
     derivatives_.tape.evaluate_at(state, workspace_of_derivatives_, derivatives);
   }
-  [[nodiscard]] Tapes tapes() const override { return {&values_, &derivatives_.tape}; }
+  [[nodiscard]] Tapes tapes() const override { return {&values_, &derivatives_.tape, &derivatives_.entries}; }
 
  private:
   const Tape& values_;

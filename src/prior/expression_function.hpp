@@ -8,14 +8,16 @@
 
 namespace gp2 {
 
-/// A StateFunction given by expressions.
+/// A StateFunction given by expressions, which may read the multipliers λ₀ of a system too.
 class ExpressionFunction final : public StateFunction {
  public:
   /// Features: expressions of the state alone.
-  static std::shared_ptr<const StateFunction> of_state(std::span<const Expression> expressions, const SystemSymbols& symbols);
+  static std::shared_ptr<const StateFunction> of_state(std::span<const Expression> expressions, const SystemSymbols& symbols,
+                                                       const std::shared_ptr<const System>& system);
   /// Directions: expressions of the state and the parameters, with their derivatives in each parameter.
   static std::shared_ptr<const StateFunction> of_state_and_parameters(std::span<const Expression> expressions,
-                                                                      const SystemSymbols& symbols, ExpressionGraph& graph);
+                                                                      const SystemSymbols& symbols, ExpressionGraph& graph,
+                                                                      const std::shared_ptr<const System>& system);
 
   [[nodiscard]] int size() const override { return values_.n_outputs(); }
   [[nodiscard]] Eigen::MatrixXd evaluate(const States& states, const Parameters& parameters) const override;

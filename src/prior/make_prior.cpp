@@ -9,6 +9,7 @@
 
 #include "base/suggestion.hpp"
 #include "gp2/error.hpp"
+#include "mechanics/known_multipliers.hpp"
 #include "prior/code_function.hpp"
 #include "prior/expression_function.hpp"
 #include "symbolic/graph.hpp"
@@ -72,14 +73,15 @@ class LatentMaker {
     return latents;
   }
 
-  /// Features in units of the lengthscales, directions of the standard deviations: nothing is left to tune.
+  /// Features in units of the lengthscales, directions of the standard deviations: but for one factor nothing is left to tune.
   [[nodiscard]] Latent make_discrepancy(const LatentSpec& spec, const Discrepancy& discrepancy) {
     Latent latent;
     const bool has_lengthscales = discrepancy.lengthscale.size() > 0;
     set_features(spec, latent, has_lengthscales ? &discrepancy.lengthscale : nullptr);
     latent.name = "discrepancy";
     latent.kernel = Kernel::parse("se", latent.feature_names);
-    latent.kernel_is_fixed = latent.signal_is_fixed = true;
+    latent.kernel_is_fixed = latent.has_one_signal = true;
+    latent.base = discrepancy.base;
     const auto nq = static_cast<std::size_t>(system_->nq());
     if ((has_lengthscales && discrepancy.lengthscale.size() != latent.n_features()) ||
         discrepancy.stddev.size() != system_->nq()) {
@@ -91,7 +93,7 @@ class LatentMaker {
       latent.column_names.push_back(system_->coordinates()[j].acceleration());
       directions[j * nq + j] = words_.graph.constant(discrepancy.stddev[static_cast<Index>(j)]);
     }
-    latent.directions = ExpressionFunction::of_state_and_parameters(directions, words_.symbols, words_.graph);
+    latent.directions = ExpressionFunction::of_state_and_parameters(directions, words_.symbols, words_.graph, system_);
     return latent;
   }
 
@@ -101,10 +103,19 @@ class LatentMaker {
     if (spec.feature_code) {
       latent.feature_names = spec.features;
       StateCode code = spec.feature_code;
+      latent.is_of_place.assign(spec.features.size(), code.reads && is_of_place(*code.reads));
       if (unit != nullptr) {
         code.evaluate = [of = code.evaluate, unit = *unit](const auto& states, const auto& parameters) -> MatrixXd {
           return of(states, parameters).array().colwise() / unit.array();
         };
+      } else {
+        Eigen::VectorXd centre(latent.n_features());
+        for (Index d = 0; d < centre.size(); ++d) centre[d] = centre_of(spec, spec.features[static_cast<std::size_t>(d)]);
+        if (!centre.isZero(0)) {
+          code.evaluate = [of = code.evaluate, centre](const auto& states, const auto& parameters) -> MatrixXd {
+            return of(states, parameters).colwise() - centre;
+          };
+        }
       }
       latent.features = std::make_shared<CodeFunction>(std::move(code), fmt::format("latent '{}': features", spec.name),
                                                        latent.n_features(), system_);
@@ -116,18 +127,36 @@ class LatentMaker {
            options_.raw_angles ? std::vector<std::string>{feature} : expand_angle(feature, system_->coordinates())) {
         latent.feature_names.push_back(name);
         const Expression value = named(spec, [&] { return words_.parse(name); });
-        for (std::size_t k = 0; k < words_.symbols.parameters.size(); ++k) {
-          if (words_.graph.depends_on(value, words_.symbols.parameters[k])) {
-            latent.feature_parameters.push_back(static_cast<int>(k));
+        const std::vector<std::string> read = words_.graph.variables_of(value);
+        const bool reads_lambda0 = std::any_of(read.begin(), read.end(), is_known_multiplier);
+        for (int k = 0; k < std::ssize(system_->parameters()); ++k) {
+          const std::string& parameter = system_->parameters()[static_cast<std::size_t>(k)].name;
+          if (std::binary_search(read.begin(), read.end(), parameter) || (reads_lambda0 && system_->depends_on_parameter(k))) {
+            latent.feature_parameters.push_back(k);
           }
         }
-        values.push_back(words_.with_values(value, *system_));
+        latent.is_of_place.push_back(is_of_place(read));
+        const double centre = unit == nullptr ? centre_of(spec, name) : 0;
+        values.push_back(words_.with_values(value, *system_) - words_.graph.constant(centre));
       }
     }
     for (std::size_t d = 0; unit != nullptr && d < std::min(values.size(), static_cast<std::size_t>(unit->size())); ++d) {
       values[d] = values[d] / words_.graph.constant((*unit)[static_cast<Index>(d)]);
     }
-    latent.features = ExpressionFunction::of_state(values, words_.symbols);
+    latent.features = named(spec, [&] { return ExpressionFunction::of_state(values, words_.symbols, system_); });
+  }
+
+  // parameters have their values there
+  [[nodiscard]] bool is_of_place(const std::vector<std::string>& read) const {
+    return std::ranges::all_of(read, [&](const std::string& name) {
+      return name == "t" || system_->parameter_index(name) >= 0 ||
+             std::ranges::find(system_->coordinates(), name, &Coordinate::name) != system_->coordinates().end();
+    });
+  }
+
+  [[nodiscard]] double centre_of(const LatentSpec& spec, const std::string& feature) const {
+    const auto centre = options_.feature_centres.find(feature);
+    return spec.kernel.empty() && centre != options_.feature_centres.end() ? centre->second : 0;
   }
 
   [[nodiscard]] bool is_of_every_coordinate(const LatentSpec& spec) const {
@@ -172,7 +201,8 @@ class LatentMaker {
                                                        : named(spec, [&] { return words_.parse(spec.directions[row][column]); }));
       }
     }
-    latent.directions = ExpressionFunction::of_state_and_parameters(entries, words_.symbols, words_.graph);
+    latent.directions =
+        named(spec, [&] { return ExpressionFunction::of_state_and_parameters(entries, words_.symbols, words_.graph, system_); });
   }
 
   std::shared_ptr<const System> system_;
@@ -292,6 +322,7 @@ Prior make_prior(std::shared_ptr<const System> system, const std::vector<LatentS
   }
   const auto parse = [&](const std::string& text) {
     const auto resolve = [&](std::string_view name) -> std::optional<Expression> {
+      if (is_known_multiplier(name)) return graph.variable(name);
       const auto found = known.find(name);
       return found == known.end() ? std::nullopt : std::optional(found->second);
     };

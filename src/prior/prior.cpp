@@ -7,6 +7,7 @@
 
 #include "gp2/error.hpp"
 #include "mechanics/describe_fault.hpp"
+#include "prior/admissible_directions.hpp"
 
 namespace gp2 {
 
@@ -25,6 +26,11 @@ MatrixXd evaluate_base(const Latent& latent, const Ref<const MatrixXd>& states, 
   if (latent.directions) return latent.directions->evaluate(states, parameters);
   const MatrixXd identity = MatrixXd::Identity(nq, nq);
   return identity.reshaped().replicate(1, states.cols());
+}
+
+// of a latent with Base::admissible
+AdmissibleDirections admissible_directions(const Ref<const VectorXd>& B, Index nq) {
+  return AdmissibleDirections(Map<const MatrixXd>(B.data(), nq, nq).diagonal());
 }
 
 struct Entry {
@@ -89,13 +95,6 @@ std::vector<bool> Prior::reads() const {
   return reads;
 }
 
-void PriorValues::keep_only(int first, int n) {
-  mean.setZero();
-  for (std::size_t a = 0; a < directions.size(); ++a) {
-    if (static_cast<int>(a) < first || static_cast<int>(a) >= first + n) directions[a].setZero();
-  }
-}
-
 MatrixXd evaluate_features(const Prior& prior, std::size_t latent, const Ref<const MatrixXd>& states) {
   const Latent& of = prior.latents.at(latent);
   if (!of.features) throw InputError(fmt::format("prior: the latent '{}' has no features", of.name));
@@ -139,6 +138,9 @@ PriorValues evaluate_prior(const Prior& prior, const Ref<const MatrixXd>& states
       for (int i = 0; i < n_states; ++i) {
         block(E, i, nq) = mechanics.projections[static_cast<std::size_t>(i)].solve_mass(block(E, i, nq));
       }
+    } else if (latent.base == Latent::Base::admissible && n_states > 0) {
+      AdmissibleDirections directions = admissible_directions(E.col(0), nq);
+      for (int i = 0; i < n_states; ++i) block(E, i, nq) = directions.compute(mechanics.values.A(i));
     }
     values.directions.push_back(std::move(E));
   }
@@ -173,6 +175,13 @@ PriorValues differentiate_prior(const Prior& prior, const Ref<const MatrixXd>& s
     // E = M⁻¹B: dE = M⁻¹(dB − dM E)
     if (latent.base == Latent::Base::force) {
       for (int i = 0; i < n_states; ++i) block(dE, i, nq) = solve(i, block(dE, i, nq), values.E(a, i));
+    } else if (latent.base == Latent::Base::admissible && n_states > 0) {
+      AdmissibleDirections directions =
+          admissible_directions(evaluate_base(latent, states.leftCols(1), parameters, nq).col(0), nq);
+      for (int i = 0; i < n_states; ++i) {
+        directions.compute(mechanics.values.A(i));
+        block(dE, i, nq) = directions.differentiate(derivative.A(i));
+      }
     }
     d.directions.push_back(std::move(dE));
   }

@@ -138,11 +138,18 @@ VectorXd parameters_of(const View& view, const Ref<const VectorXd>& home) {
   return view.other_system ? view.other_system->parameters(home) : VectorXd(home);
 }
 
+void keep_viewed(const View& view, PriorValues& values) {
+  if (!view.has_mean()) values.mean.setZero();
+  for (std::size_t a = 0; a < values.directions.size(); ++a) {
+    if (!view.has_latent(a)) values.directions[a].setZero();
+  }
+}
+
 std::optional<std::string> what_needs_acceleration(const Prior& prior, const View& view) {
   if (view.quantity->parts().unconstrained_acceleration) return "the view is of the unconstrained acceleration ā";
   if (prior.mean == Prior::Mean::constant) return "the prior's mean is an acceleration";
   const auto of_acceleration = std::find_if(prior.latents.begin(), prior.latents.end(),
-                                            [](const Latent& latent) { return latent.base == Latent::Base::acceleration; });
+                                            [](const Latent& latent) { return latent.base != Latent::Base::force; });
   if (of_acceleration == prior.latents.end()) return std::nullopt;
   return fmt::format(
       "the latent '{}' acts on the unconstrained acceleration ā: let it act on forces, directions = \"force\" or {{ force = … }}",

@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <array>
 #include <cctype>
+#include <iterator>
 #include <locale>
 #include <map>
 #include <optional>
@@ -15,6 +16,7 @@
 #include <boost/property_tree/ptree.hpp>
 #include <boost/property_tree/xml_parser.hpp>
 
+#include "gp2/base/file.hpp"
 #include "gp2/error.hpp"
 
 namespace gp2 {
@@ -184,6 +186,129 @@ class Urdf {
   std::map<std::string, std::string> parents_;  // of a link by its name
 };
 
+// A <mujoco> without the files that only give shapes and colours.
+class Mjcf {
+ public:
+  Mjcf(Tree& root, const std::filesystem::path& path) : root_(root), folder_(path.parent_path()) {
+    included_.insert(path.filename());
+    include(root_, folder_);
+  }
+
+  /// Whether there was anything to leave out.
+  bool drop_shapes() {
+    for (const auto& [tag, element] : root_) {
+      if (tag == "compiler" && attribute(element, "inertiafromgeom") == "true") return false;
+    }
+    for (auto& [tag, element] : root_) {
+      if (tag == "worldbody") drop_shapes_in(element, true);
+    }
+    for (const auto& [tag, element] : root_) {
+      if (tag != "asset") note_shapes_used(element);
+    }
+    for (auto& [tag, element] : root_) {
+      if (tag == "asset") drop_assets(element);
+      if (tag == "deformable") changed_ |= element.erase("skin") > 0;
+    }
+    return changed_;
+  }
+
+ private:
+  static void remove_attribute(Tree& element, const char* name) {
+    if (const auto attributes = element.get_child_optional("<xmlattr>")) attributes->erase(name);
+  }
+  static void set_attribute(Tree& element, const char* name, const std::string& value) {
+    element.put(Tree::path_type(fmt::format("<xmlattr>|{}", name), '|'), value);
+  }
+
+  // MuJoCo takes files from the folder of the first one; later versions also from that of the including one.
+  void include(Tree& element, const std::filesystem::path& folder) {
+    for (auto child = element.begin(); child != element.end();) {
+      if (child->first != "include") {
+        include(child->second, folder);
+        ++child;
+        continue;
+      }
+      const std::string name = attribute(child->second, "file").value_or("");
+      std::filesystem::path path = folder_ / name;
+      if (!std::filesystem::exists(path)) path = folder / name;
+      if (!included_.insert(path).second) throw InputError(fmt::format("{}: it is included twice", path.string()));
+      Tree other = parse(read_file(path), path.string());
+      child = element.erase(child);
+      if (other.empty()) continue;
+      include(other.front().second, path.parent_path());
+      for (auto& added : other.front().second) {
+        if (added.first != "<xmlattr>") child = std::next(element.insert(child, added));
+      }
+    }
+  }
+
+  void drop_shapes_in(Tree& element, bool has_inertia) {
+    for (auto& [tag, child] : element) {
+      if (tag == "body") {
+        drop_shapes_in(child, child.get_child_optional("inertial").has_value());
+      } else if (tag != "geom") {
+        drop_shapes_in(child, has_inertia);
+      } else if (has_inertia && (attribute(child, "mesh") || attribute(child, "hfield"))) {
+        // the geom stays, since others may name it
+        for (const char* name : {"mesh", "hfield", "fitscale"}) remove_attribute(child, name);
+        set_attribute(child, "type", "sphere");
+        set_attribute(child, "size", "0.001");
+        changed_ = true;
+      }
+    }
+  }
+
+  void note_shapes_used(const Tree& element) {
+    for (const auto& [tag, child] : element) {
+      for (const char* kind : {"mesh", "hfield"}) {
+        if (const auto name = attribute(child, kind)) used_.insert(*name);
+      }
+      note_shapes_used(child);
+    }
+  }
+
+  void drop_assets(Tree& assets) {
+    for (auto asset = assets.begin(); asset != assets.end();) {
+      auto& [tag, element] = *asset;
+      const std::string file = attribute(element, "file").value_or("");
+      const std::string name = attribute(element, "name").value_or(std::filesystem::path(file).stem().string());
+      const bool is_unused = tag == "skin" || ((tag == "mesh" || tag == "hfield") && used_.count(name) == 0);
+      if (is_unused) {
+        asset = assets.erase(asset);
+        changed_ = true;
+        continue;
+      }
+      if (tag == "texture") drop_picture(element, name);
+      ++asset;
+    }
+  }
+
+  void drop_picture(Tree& texture, const std::string& name) {
+    static constexpr std::array<const char*, 7> files = {"file",     "fileright", "fileleft", "fileup",
+                                                         "filedown", "filefront", "fileback"};
+    if (std::none_of(files.begin(), files.end(), [&](const char* file) { return attribute(texture, file).has_value(); })) return;
+    for (const char* file : files) remove_attribute(texture, file);
+    for (const char* other : {"gridsize", "gridlayout", "content_type"}) remove_attribute(texture, other);
+    set_attribute(texture, "name", name);
+    set_attribute(texture, "builtin", "flat");
+    set_attribute(texture, "width", "1");
+    set_attribute(texture, "height", "1");
+    changed_ = true;
+  }
+
+  Tree& root_;
+  std::filesystem::path folder_;
+  std::set<std::filesystem::path> included_;
+  std::set<std::string> used_;  // meshes and height fields that something still has
+  bool changed_ = false;
+};
+
+std::string text_of(const Tree& tree) {
+  std::ostringstream stream;
+  write_xml(stream, tree);
+  return stream.str();
+}
+
 }  // namespace
 
 RobotXml read_robot_xml(const std::string& text, const std::filesystem::path& path) {
@@ -195,10 +320,15 @@ RobotXml read_robot_xml(const std::string& text, const std::filesystem::path& pa
     throw InputError(fmt::format("{}: a robot is a MJCF file (<mujoco>) or a URDF file (<robot>){}", path.string(), root));
   }
   RobotXml xml = Urdf(*robot, path.string()).prepared();
-  std::ostringstream stream;
-  write_xml(stream, tree);
-  xml.text = stream.str();
+  xml.text = text_of(tree);
   return xml;
+}
+
+std::optional<std::string> mjcf_without_shapes(const std::string& text, const std::filesystem::path& path) {
+  Tree tree = parse(text, path.string());
+  const auto root = tree.get_child_optional("mujoco");
+  if (!root || !Mjcf(*root, path).drop_shapes()) return std::nullopt;
+  return text_of(tree);
 }
 
 }  // namespace gp2

@@ -1,8 +1,11 @@
 #pragma once
 
 #include <filesystem>
+#include <optional>
 #include <string>
 #include <vector>
+
+#include "gp2/robots/robot.hpp"
 
 namespace gp2 {
 
@@ -27,5 +30,15 @@ struct RobotXml {
 ///
 /// @throws InputError naming the path and the element.
 RobotXml read_robot_xml(const std::string& text, const std::filesystem::path& path);
+
+/// As read_robot(path), of a text in place of the file; others that it names lie where they would.
+RobotDescription read_robot(const std::filesystem::path& path, const std::string& text);
+
+/// MJCF text with its includes put in and without files that only give shapes and colours: meshes and height fields of geoms on
+/// bodies that have their <inertial>, or on the world; pictures of textures; skins. Nothing where the text has none of these, or
+/// takes its inertias from shapes (`inertiafromgeom="true"`).
+///
+/// @throws InputError naming an included file that cannot be read.
+std::optional<std::string> mjcf_without_shapes(const std::string& text, const std::filesystem::path& path);
 
 }  // namespace gp2

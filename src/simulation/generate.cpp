@@ -16,6 +16,7 @@
 #include "base/random.hpp"
 #include "gp2/error.hpp"
 #include "gp2/mechanics/udwadia_kalaba.hpp"
+#include "mechanics/known_multipliers.hpp"
 #include "simulation/controlled_motion.hpp"
 
 namespace gp2 {
@@ -287,7 +288,7 @@ class Sampler {
     const System& system = *model_.system;
     std::vector<Expression> added = model_.truth;
     added.insert(added.end(), model_.truth_force.begin(), model_.truth_force.end());
-    const Tape truth(added, symbols_.state_and_parameters());
+    const Tape truth(added, symbols_.state_and_parameters(known_multipliers_in(added, system)));
     const std::vector<bool> mechanics = system.reads(SystemPart::mechanics);
     const std::vector<bool> force = system.reads(SystemPart::force);
     const std::vector<bool> residuals = system.reads(SystemPart::residuals);

@@ -6,6 +6,7 @@
 #include "gp2/mechanics/quantity.hpp"
 #include "gp2/mechanics/udwadia_kalaba.hpp"
 #include "mechanics/describe_fault.hpp"
+#include "mechanics/known_multipliers.hpp"
 
 namespace gp2 {
 
@@ -19,14 +20,25 @@ void require_truth(const Model& model) {
 }
 
 ModelMotion::ModelMotion(const Model& model) : system_(model.system), parameters_(model.system->parameter_values()) {
-  truth_ = Tape(model.truth, model.symbols().state_and_parameters());
-  truth_force_ = Tape(model.truth_force, model.symbols().state_and_parameters());
+  std::vector<Expression> all = model.truth;
+  all.insert(all.end(), model.truth_force.begin(), model.truth_force.end());
+  const std::vector<Expression> lambda0 = known_multipliers_in(all, *system_);
+  reads_load_ = !lambda0.empty();
+  truth_ = Tape(model.truth, model.symbols().state_and_parameters(lambda0));
+  truth_force_ = Tape(model.truth_force, model.symbols().state_and_parameters(lambda0));
 }
 
 MatrixXd ModelMotion::unconstrained(const Eigen::Ref<const MatrixXd>& states, const MechanicsBatch& mechanics) const {
   MatrixXd truth = MatrixXd::Zero(system_->nq(), states.cols()), truth_force = truth;
-  if (truth_.n_outputs() > 0) truth_.evaluate(states, parameters_, truth);
-  if (truth_force_.n_outputs() > 0) truth_force_.evaluate(states, parameters_, truth_force);
+  const auto evaluate = [&](const Eigen::Ref<const MatrixXd>& x) {
+    if (truth_.n_outputs() > 0) truth_.evaluate(x, parameters_, truth);
+    if (truth_force_.n_outputs() > 0) truth_force_.evaluate(x, parameters_, truth_force);
+  };
+  if (reads_load_) {
+    evaluate(with_known_multipliers(*system_, states, parameters_));
+  } else {
+    evaluate(states);
+  }
   MatrixXd accelerations(system_->nq(), states.cols());
   for (int i = 0; i < static_cast<int>(states.cols()); ++i) {
     const UdwadiaKalaba& projection = mechanics.projections[static_cast<std::size_t>(i)];
@@ -62,8 +74,9 @@ MatrixXd ModelMotion::multipliers(const Eigen::Ref<const MatrixXd>& states) cons
     const UdwadiaKalaba& projection = mechanics.projections[static_cast<std::size_t>(i)];
     const Eigen::VectorXd ddq = projection.constrain(a_bar.col(i)), free = a_bar.col(i),
                           force = mechanics.values.M(i) * ddq - projection.mass() * free;
-    Quantity::multipliers->evaluate({projection, mechanics.values.A(i)}, {columns_of(ddq), columns_of(free), columns_of(force)},
-                                    multipliers.col(i), workspace);
+    Quantity::multipliers->evaluate({projection, mechanics.values.A(i)},
+                                    {columns_of(ddq), columns_of(free), columns_of(force), columns_of(free)}, multipliers.col(i),
+                                    workspace);
   }
   return multipliers;
 }

@@ -15,6 +15,7 @@
 #include "gp2/error.hpp"
 #include "gp2/mechanics/udwadia_kalaba.hpp"
 #include "gp2/simulation/model_motion.hpp"
+#include "simulation/contacts.hpp"
 #include "simulation/projection.hpp"
 #include "simulation/switching.hpp"
 
@@ -49,6 +50,16 @@ bool is_finite(const Phase& phase) {
   return std::all_of(phase.begin(), phase.end(), [](double x) { return std::isfinite(x); });
 }
 
+// whether some rows of A follow from the others; they show it on the constraint
+bool has_redundant_rows(const System& system, const VectorXd& parameters, const ConstraintProjection& projection,
+                        VectorXd state) {
+  if (system.nc() < 2) return false;
+  projection.apply(state);
+  const MechanicsBatch mechanics = evaluate_mechanics(system, state, parameters);
+  return !mechanics.projections.empty() && mechanics.projections[0].motion_is_determined() &&
+         ranks_of(system, mechanics)[0] < system.nc();
+}
+
 class Integration {
  public:
   Integration(const System& system, const VectorXd& parameters, const Acceleration& acceleration, const SimulateOptions& options)
@@ -59,6 +70,7 @@ class Integration {
         options_(options),
         projection_(system, parameters),
         switching_(options.switching, parameters, layout_, options.absolute_tolerance),
+        contacts_(system, parameters, options),
         stepper_(ErrorChecker(options.absolute_tolerance, options.relative_tolerance, 1, 0)),
         state_(VectorXd::Zero(layout_.size())) {}
 
@@ -75,6 +87,7 @@ class Integration {
     dxdt_.resize(x_.size());
     Index next = 0;
     try {
+      if (!contacts_.is_empty()) settle_contacts(/*at_start=*/true);
       switch_or_throw([&] { switching_.start(state_, counted()); });
       derivative_or_throw();
       write(next++, t_, x_, dxdt_);
@@ -169,6 +182,14 @@ class Integration {
     std::copy(x.begin(), x.end(), state_.begin());
     state_[layout_.t()] = t;
     options_.inputs.evaluate(t, state_.tail(layout_.nu));
+    if (!contacts_.is_empty()) contacts_.mark(state_);
+  }
+
+  // ddq of the motion, on the sides that it is on
+  [[nodiscard]] Acceleration of_motion() {
+    return [this](const Ref<const VectorXd>& state) -> VectorXd {
+      return switching_.is_empty() ? counted()(state) : switching_.acceleration(state, counted());
+    };
   }
 
   // T, or I where the mechanics have a fault, which the acceleration tells of
@@ -191,7 +212,7 @@ class Integration {
     VectorXd ddq;
     try {
       if (project_stages_) projection_.apply(state_);
-      ddq = switching_.is_empty() ? counted()(state_) : switching_.acceleration(state_, counted());
+      ddq = of_motion()(state_);
     } catch (const Error& error) {
       throw StageFault{error.what()};
     }
@@ -264,22 +285,34 @@ class Integration {
     return std::min({100 * h0, h1, span});
   }
 
-  // The first time in the step to t_new at which the motion has crossed a surface where the acceleration jumps, or is let go by
-  // one; x_crossing_ is the state then.
+  // The first time in the step to t_new at which the motion has crossed a surface where the acceleration jumps, has hit a contact,
+  // or is let go by one of them; x_crossing_ is the state then.
   std::optional<double> find_crossing(double t_new) {
-    if (switching_.is_empty()) return std::nullopt;
+    if (switching_.is_empty() && contacts_.is_empty()) return std::nullopt;
     x_crossing_.resize(x_.size());
-    const auto has_left = [&](double t, bool is_end) {
+    const auto move_to = [&](double t) {
       stepper_.stepper().calc_state(t, x_crossing_, x_, dxdt_, t_, x_new_, dxdt_new_, t_new);
       expand(x_crossing_, t);
-      return switching_.has_crossed(state_) || (is_end && is_let_go());
+      // a contact that is released leaves at rate 0, not at what interpolation makes of it
+      if (!contacts_.is_empty() && options_.project) project(x_crossing_, t);
+    };
+    const auto has_left = [&](double t, bool is_end) {
+      move_to(t);
+      return (!switching_.is_empty() && switching_.has_crossed(state_)) || (!contacts_.is_empty() && contacts_.is_hit(state_)) ||
+             (is_end && is_let_go());
     };
     constexpr int parts = 8;
     double before = t_, after = t_;
     for (int k = 1; k <= parts; ++k) {
-      before = k == parts ? t_ : after;  // whether the motion is let go is asked at the end alone
+      const double start = after;
+      before = k == parts ? t_ : start;  // whether the motion is let go is asked at the end alone
       after = k == parts ? t_new : t_ + (t_new - t_) * k / parts;
       if (has_left(after, k == parts)) break;
+      if (const std::optional<double> dip = find_dip(start, after, move_to)) {
+        before = start;
+        after = *dip;
+        break;
+      }
       if (k == parts) return std::nullopt;
     }
     for (double middle = std::midpoint(before, after); before < middle && middle < after; middle = std::midpoint(before, after)) {
@@ -289,12 +322,35 @@ class Integration {
     return after;
   }
 
-  // whether a surface that the motion slides on does not hold it at state_
+  // A time between two at which a gap that opens again is past its surface, where it is least.
+  template <typename Move>
+  std::optional<double> find_dip(double start, double end, const Move& move_to) const {
+    if (contacts_.is_empty()) return std::nullopt;
+    const auto rates_at = [&](double t) {
+      move_to(t);
+      return contacts_.rates(state_);
+    };
+    const VectorXd at_start = rates_at(start), at_end = rates_at(end);
+    for (Index k = 0; k < at_start.size(); ++k) {
+      if (!(at_start[k] < 0 && at_end[k] > 0)) continue;
+      double before = start, after = end;
+      for (double middle = std::midpoint(before, after); before < middle && middle < after;
+           middle = std::midpoint(before, after)) {
+        (rates_at(middle)[k] < 0 ? before : after) = middle;
+      }
+      move_to(before);
+      if (contacts_.is_hit(state_)) return before;
+    }
+    return std::nullopt;
+  }
+
+  // whether a surface that the motion slides on, or a contact, does not hold it at state_
   bool is_let_go() {
-    if (!switching_.is_sliding()) return false;
+    if (!switching_.is_sliding() && contacts_.is_empty()) return false;
     try {
       if (project_stages_) projection_.apply(state_);
-      return switching_.is_let_go(state_, counted());
+      if (!contacts_.is_empty() && contacts_.is_released(state_, of_motion())) return true;
+      return switching_.is_sliding() && switching_.is_let_go(state_, counted());
     } catch (const Error&) {
       return false;
     }
@@ -320,7 +376,8 @@ class Integration {
     std::swap(x_, x_new_);
     std::swap(dxdt_, dxdt_new_);
     t_ = t_new;
-    const bool switches = has_crossed || switching_.is_sliding();
+    if (has_crossed && !contacts_.is_empty()) settle_contacts(/*at_start=*/false);
+    const bool switches = !switching_.is_empty() && (has_crossed || switching_.is_sliding());
     if (switches) {
       expand(x_, t_);
       switching_.cross(state_);
@@ -329,7 +386,25 @@ class Integration {
     }
     const bool moved = options_.project && project(x_, t_);
     if (switches) switch_or_throw([&] { switching_.settle(state_, counted()); });
-    if (moved || switches) derivative_or_throw();
+    if (moved || switches || (has_crossed && !contacts_.is_empty())) derivative_or_throw();
+  }
+
+  // impacts and releases at (x_, t_)
+  void settle_contacts(bool at_start) {
+    expand(x_, t_);
+    try {
+      if (at_start) {
+        contacts_.start(state_, of_motion(), out_.events);
+      } else {
+        contacts_.settle(state_, of_motion(), out_.events);
+      }
+    } catch (const Error& error) {
+      if (at_start) throw;
+      throw NumericalError(fmt::format("simulate: no acceleration at t = {:.6g}: {}", t_, error.what()));
+    }
+    project_stages_ = has_redundant_rows(system_, parameters_, projection_, state_);
+    if (at_start && options_.project) projection_.apply(state_);
+    std::copy_n(state_.begin(), x_.size(), x_.begin());
   }
 
   // at (x_, t_), whose state is in state_
@@ -363,6 +438,7 @@ class Integration {
   const SimulateOptions& options_;
   const ConstraintProjection projection_;
   Switching switching_;
+  Contacts contacts_;
   ControlledStepper stepper_;
   bool project_stages_ = false;
   VectorXd state_;  // scratch
@@ -394,21 +470,12 @@ void require_options(const SimulateOptions& options, const System& system) {
   if (!(options.initial_step >= 0) || !std::isfinite(options.initial_step)) {
     throw InputError(fmt::format("simulate: the initial step must not be negative, got {}", options.initial_step));
   }
+  if (!options.contacts.empty()) require_positive("the shortest flight", options.shortest_flight);
   if (options.max_steps < 1) throw InputError(fmt::format("simulate: max_steps must be at least 1, got {}", options.max_steps));
   if (!options.inputs.is_zero() && options.inputs.size() != system.layout().nu) {
     throw InputError(fmt::format("simulate: the table of inputs has {} rows, the system {} inputs", options.inputs.size(),
                                  system.layout().nu));
   }
-}
-
-// whether some rows of A follow from the others; they show it on the constraint
-bool has_redundant_rows(const System& system, const VectorXd& parameters, const ConstraintProjection& projection,
-                        VectorXd state) {
-  if (system.nc() < 2) return false;
-  projection.apply(state);
-  const MechanicsBatch mechanics = evaluate_mechanics(system, state, parameters);
-  return !mechanics.projections.empty() && mechanics.projections[0].motion_is_determined() &&
-         mechanics.projections[0].rank() < system.nc();
 }
 
 }  // namespace

@@ -1,5 +1,6 @@
 #include <algorithm>
 #include <charconv>
+#include <cmath>
 #include <numbers>
 #include <utility>
 
@@ -39,8 +40,9 @@ std::string joined(const Names& names, std::string_view separator) {
 ///     product = factor { ("*" | "/") factor }
 ///     factor  = ("-" | "+") factor | power
 ///     power   = atom [ "^" factor ]
-///     atom    = number | symbol | function "(" sum { "," sum } ")" | quantity | "(" sum ")"
+///     atom    = number | symbol | function "(" sum { "," sum } ")" | quantity | multiplier | "(" sum ")"
 ///     quantity = symbol "(" name in quotes { "," number } ")" "." symbol
+///     multiplier = "lambda0" "(" number ")"
 class Parser {
  public:
   Parser(std::string_view text, ExpressionGraph& graph, const std::function<std::optional<Expression>(std::string_view)>& resolve,
@@ -48,10 +50,7 @@ class Parser {
       : text_(text), graph_(graph), resolve_(resolve), known_names_(known_names) {}
 
   Expression parse() {
-    if (text_.size() > max_text_length) {
-      throw InputError(fmt::format("the expression has {} characters, at most {} are allowed; give its parts names of their own",
-                                   text_.size(), max_text_length));
-    }
+    require_length();
     skip_space();
     if (at_end()) fail(0, "the expression is empty; write a number, a symbol or a formula such as 2*q1");
     const Expression result = sum();
@@ -59,7 +58,38 @@ class Parser {
     return result;
   }
 
+  /// a ≤ b is min(1, 1 + sign(b − a)), and a < b is max(0, sign(b − a)): exactly 0 or 1, without a derivative.
+  Expression parse_condition() {
+    require_length();
+    skip_space();
+    if (at_end()) fail(0, "the condition is empty; write a comparison such as gap <= 0");
+    const Expression left = sum();
+    if (peek() != '<' && peek() != '>') {
+      if (!at_end() && peek() != '=') fail_after_operand();
+      fail(position_, fmt::format("found {} where one of < <= > >= must stand: a condition compares two expressions, as gap <= 0",
+                                  peek() == '=' ? "'='" : found()));
+    }
+    const bool is_less = text_[position_++] == '<';
+    const bool or_equal = peek() == '=';
+    if (or_equal) ++position_;
+    skip_space();
+    const Expression right = sum();
+    if (!at_end()) {
+      if (peek() == '<' || peek() == '>') fail(position_, "a condition is one comparison: combine several by min and max");
+      fail_after_operand();
+    }
+    const Expression sign = graph_.apply(Operation::sign, is_less ? right - left : left - right);
+    const Expression one = graph_.constant(1);
+    return or_equal ? graph_.apply(Operation::min, one, one + sign) : graph_.apply(Operation::max, graph_.constant(0), sign);
+  }
+
  private:
+  void require_length() const {
+    if (text_.size() <= max_text_length) return;
+    throw InputError(fmt::format("the expression has {} characters, at most {} are allowed; give its parts names of their own",
+                                 text_.size(), max_text_length));
+  }
+
   /// Refuses the text when it nests too deep; lives as long as one level.
   class Level {
    public:
@@ -162,6 +192,7 @@ class Parser {
     while (position_ < text_.size() && (is_letter(text_[position_]) || is_digit(text_[position_]))) ++position_;
     const std::string_view name = text_.substr(start, position_ - start);
     skip_space();
+    if (name == "lambda0") return multiplier(start);
     if (peek() == '(') {
       const std::size_t inside = text_.find_first_not_of(" \t\n\r", position_ + 1);
       if (inside != std::string_view::npos && (text_[inside] == '"' || text_[inside] == '\'')) return quantity(name, start);
@@ -208,6 +239,25 @@ class Parser {
       fail(start, error.what());
     }
     if (!resolved) fail(start, fmt::format("unknown symbol '{}'; only a model with a robot has points", shortened(symbol, 40)));
+    return *resolved;
+  }
+
+  /// lambda0(1), a symbol that is resolved by its text without spaces.
+  Expression multiplier(std::size_t start) {
+    constexpr double most = 1e6;
+    const std::size_t open = position_;
+    double row = 0;
+    if (peek() == '(') {
+      take();
+      const Expression number = factor();
+      if (number.is_constant()) row = number.constant_value();
+    }
+    if (!(row >= 1 && row <= most) || row != std::floor(row)) {
+      fail(start, "lambda0 takes the number of a row of the constraints, counted from 1; write lambda0(1)");
+    }
+    close(open);
+    const auto resolved = resolve_(fmt::format("lambda0({})", static_cast<int>(row)));
+    if (!resolved) fail(start, "lambda0 is a multiplier of the constraints of a model, of which there is none here");
     return *resolved;
   }
 
@@ -291,8 +341,8 @@ class Parser {
     if (peek() == '=') fail(position_, "found '='; write an equation left = right as the expression left - (right)");
     if (peek() == '<' || peek() == '>') {
       fail(position_,
-           fmt::format("found '{}'; constraints that come and go are not supported: write the equation that holds as long "
-                       "as there is contact",
+           fmt::format("found '{}'; an expression has no comparison: a constraint that comes and goes is the equation that "
+                       "holds while there is contact, with when = \"gap <= 0\" beside it",
                        peek()));
     }
     if (peek() == '[' || peek() == '{') fail(position_, fmt::format("found '{}'; group with ( )", peek()));
@@ -349,6 +399,12 @@ Expression parse_expression(std::string_view text, ExpressionGraph& graph,
                             const std::function<std::optional<Expression>(std::string_view)>& resolve,
                             std::span<const std::string> known_names) {
   return Parser(text, graph, resolve, known_names).parse();
+}
+
+Expression parse_condition(std::string_view text, ExpressionGraph& graph,
+                           const std::function<std::optional<Expression>(std::string_view)>& resolve,
+                           std::span<const std::string> known_names) {
+  return Parser(text, graph, resolve, known_names).parse_condition();
 }
 
 }  // namespace gp2

@@ -36,13 +36,15 @@ class Differences {
   [[nodiscard]] const std::vector<int>& free() const { return free_; }
 
   // Of an entry between a parameter and another hyperparameter the parameter's column is the better one.
-  [[nodiscard]] MatrixXd hessian(int n_threads) const {
+  [[nodiscard]] MatrixXd hessian(const Evaluators& evaluators) const {
     const auto n = static_cast<Index>(free_.size());
     MatrixXd H(n, n);
-    parallel_for(static_cast<int>(n), n_threads, [&](int k, int) {
-      Likelihood::Workspace workspace(1, stop_);
-      H.col(k) = is_parameter(k) ? parameter_column(k, workspace) : central(k, within_box(k, 3e-3, 1), workspace);
-    });
+    share_out({H.data(), static_cast<std::size_t>(H.size())}, static_cast<int>(n), evaluators.side_by_side,
+              [&](int k, std::span<double> column) {
+                Likelihood::Workspace workspace(evaluators.within(), stop_);
+                Eigen::Map<VectorXd>(column.data(), n) =
+                    is_parameter(k) ? parameter_column(k, workspace) : central(k, within_box(k, 3e-3, 1), workspace);
+              });
     for (Index k = 0; k < n; ++k) {
       for (Index l = 0; l < k; ++l) {
         const bool known_better = is_parameter(k) != is_parameter(l);
@@ -116,16 +118,16 @@ MatrixXd Curvature::information() const {
 }
 
 Curvature curvature_at(const Objective& objective, const VectorXd& x, const std::vector<Hyperparameter>& hyperparameters,
-                       int n_threads, const std::atomic<bool>* stop) {
+                       const Evaluators& evaluators, const std::atomic<bool>* stop) {
   const Differences differences(objective, x, hyperparameters, stop);
   Curvature out;
   out.free = differences.free();
-  Likelihood::Workspace workspace(n_threads, stop);
+  Likelihood::Workspace workspace(evaluators.alone, stop);
   VectorXd gradient = VectorXd::Zero(x.size());
   objective(x, &gradient, workspace);
   out.gradient = gradient(out.free);
   if (out.free.empty()) return out;
-  const MatrixXd H = differences.hessian(n_threads);
+  const MatrixXd H = differences.hessian(evaluators);
   out.unit = H.diagonal().array().abs().max(1e-10).rsqrt();
   const Eigen::SelfAdjointEigenSolver<MatrixXd> eigen(MatrixXd(out.unit.asDiagonal() * H * out.unit.asDiagonal()));
   out.eigenvalues = eigen.eigenvalues();

@@ -32,12 +32,11 @@ struct Curvature {
   [[nodiscard]] Eigen::MatrixXd information() const;
 };
 
-/// H by differences of the exact gradient: two evaluations for each free hyperparameter, six for each θ. The results do not
-/// depend on n_threads.
+/// H by differences of the exact gradient: two evaluations for each free hyperparameter, six for each θ.
 /// @param stop  where it is given, and set: no further evaluation is begun
 /// @throws NumericalError when the objective is not finite about x, or on a stop
 Curvature curvature_at(const Objective& objective, const Eigen::VectorXd& x, const std::vector<Hyperparameter>& hyperparameters,
-                       int n_threads, const std::atomic<bool>* stop = nullptr);
+                       const Evaluators& evaluators, const std::atomic<bool>* stop = nullptr);
 
 LaplaceUncertainty laplace_uncertainty(const Curvature& curvature, const std::vector<Hyperparameter>& hyperparameters);
 

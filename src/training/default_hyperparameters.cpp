@@ -96,6 +96,19 @@ Hyperparameter shared_signal(const Latent& latent, std::size_t owner, const Scal
   return h;
 }
 
+// in units of what its directions are: of the noise as measured
+Hyperparameter size_of_discrepancy(const Latent& latent, std::size_t owner, const Protocol& protocol) {
+  Hyperparameter h = Hyperparameter::of(Kind::shared_signal_stddev, owner, 0);
+  h.name = latent.name + ".size";
+  h.unit = "noise";
+  h.column_scale = VectorXd::Ones(latent.size());
+  set_range(h,
+            {Standard::discrepancy_median, Standard::discrepancy_lower, Standard::discrepancy_upper, Standard::discrepancy_median,
+             Standard::discrepancy_log_stddev},
+            protocol);
+  return h;
+}
+
 Hyperparameter column_signal(const Latent& latent, std::size_t owner, std::size_t column, const Scales& scales,
                              const Protocol& protocol) {
   Hyperparameter h = Hyperparameter::of(Kind::signal_stddev, owner, column);
@@ -138,14 +151,16 @@ void make_families(const Latent& latent, std::vector<Hyperparameter>::iterator f
 }
 
 void add_latents(const Prior& prior, const Scales& scales, const Protocol& protocol, std::vector<Hyperparameter>& out) {
-  const auto is_tuned = [](const Latent& latent) { return !latent.kernel_is_fixed || !latent.signal_is_fixed; };
   std::set<std::string> tuned;
   for (const Latent& latent : prior.latents) {
-    if (is_tuned(latent)) tuned.insert(latent.name);
+    if (!latent.has_one_signal) tuned.insert(latent.name);
   }
   for (std::size_t a = 0; a < prior.latents.size(); ++a) {
     const Latent& latent = prior.latents[a];
-    if (!is_tuned(latent)) continue;
+    if (latent.has_one_signal) {
+      out.push_back(size_of_discrepancy(latent, a, protocol));
+      continue;
+    }
     const std::string name = tuned.size() == 1 ? "" : latent.name + ".";
     const std::ptrdiff_t first = std::ssize(out);
     add_latent(latent, a, latent.direction.empty() ? name : name + latent.direction + ".", scales, protocol, out);

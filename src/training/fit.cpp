@@ -7,6 +7,7 @@
 #include <numeric>
 #include <random>
 #include <set>
+#include <span>
 #include <utility>
 
 #include <fmt/format.h>
@@ -74,11 +75,13 @@ class Training {
         observations_(observations),
         hyperparameters_(hyperparameters),
         options_(options),
-        objective_(prior, observations, hyperparameters, std::move(points),
-                   Workers(thread_count(options.n_threads), options.ranks)),
+        evaluators_(options, points != nullptr),
+        objective_(prior, observations, hyperparameters, std::move(points), evaluators_.alone),
         reports_(static_cast<std::size_t>(n_restarts())),
         results_(static_cast<std::size_t>(n_restarts())),
         fractions_(static_cast<std::size_t>(n_restarts()), 0.0) {
+    for (int restart = 0; restart < n_restarts(); ++restart)
+      n_own_ += evaluators_.side_by_side.owns(restart, n_restarts()) ? 1 : 0;
     for (const Hyperparameter& h : hyperparameters) {
       box_.lower.push_back(h.lower_coordinate());
       box_.upper.push_back(h.upper_coordinate());
@@ -91,9 +94,10 @@ class Training {
 
   void run() {
     const lapack::SingleThread single_thread;
-    // restarts side by side; where there is one alone, its evaluations share the threads
-    parallel_for(n_restarts(), n_side_by_side_,
-                 [&](int restart, int) { run_restart(restart, n_restarts() == 1 ? n_threads_ : 1); });
+    const std::vector<LbfgsbResult> results = run_side_by_side(n_restarts(), [&](int restart) { return run_restart(restart); });
+    for (int restart = 0; restart < n_restarts(); ++restart) {
+      store(static_cast<std::size_t>(restart), results[static_cast<std::size_t>(restart)]);
+    }
     release();
     while (n_escapes_ < options_.max_escapes && !stopped() && escape()) ++n_escapes_;
     if (options_.standard_errors && options_.max_iterations > 0 && !stopped() && estimates_parameters()) estimate_errors();
@@ -133,7 +137,10 @@ class Training {
         options_.max_iterations - reports_[static_cast<std::size_t>(restart)].iterations;  // an escape goes on
     options.gradient_tolerance = options_.gradient_tolerance;
     options.reduction_tolerance = options_.reduction_tolerance;
-    options.iteration = [&](int iteration, double value) { return report_iteration(restart, iteration, value); };
+    options.iteration = [&](int iteration, const VectorXd& scaled, double value) {
+      tell_improvement(scaled.cwiseProduct(scales), value, FitOptions::seconds_between_improvements);
+      return report_iteration(restart, iteration, value);
+    };
     options.stop = [&] { return stopped(); };
     const Index n = static_cast<Index>(from.size());
     LbfgsbResult result = minimise(
@@ -146,6 +153,40 @@ class Training {
         Eigen::Map<const VectorXd>(box_.upper.data(), n).cwiseQuotient(scales), options);
     result.x = result.x.cwiseProduct(scales);
     return result;
+  }
+
+  /// run(k) for each of n, each by one of those who work on this; what all of them found, to all.
+  template <typename Run>
+  std::vector<LbfgsbResult> run_side_by_side(int n, const Run& run) {
+    const Index n_x = std::ssize(hyperparameters_);
+    std::vector<LbfgsbResult> results(static_cast<std::size_t>(n));
+    Eigen::MatrixXd numbers(n_x + 5, n);  // x, and the rest
+    const auto numbers_of = [&](int k) { return std::span(numbers.col(k).data(), static_cast<std::size_t>(n_x + 5)); };
+    share_out({numbers.data(), static_cast<std::size_t>(numbers.size())}, n, evaluators_.side_by_side,
+              [&](int k, std::span<double> column) {
+                const LbfgsbResult& one = results[static_cast<std::size_t>(k)] = run(k);
+                double* const rest = std::copy(one.x.begin(), one.x.end(), column.data());
+                rest[0] = one.value, rest[1] = one.converged ? 1 : 0;
+                rest[2] = one.iterations, rest[3] = one.evaluations, rest[4] = one.failed_evaluations;
+              });
+    for (int k = 0; k < n; ++k) {
+      LbfgsbResult& one = results[static_cast<std::size_t>(k)];
+      const std::span<const double> column = numbers_of(k), rest = column.last(5);
+      one.x = Eigen::Map<const VectorXd>(column.data(), n_x);
+      one.value = rest[0], one.converged = rest[1] == 1;
+      one.iterations = static_cast<int>(rest[2]), one.evaluations = static_cast<int>(rest[3]);
+      one.failed_evaluations = static_cast<int>(rest[4]);
+      share(one.termination, evaluators_.side_by_side, k, n);
+    }
+    return results;
+  }
+
+  [[nodiscard]] LbfgsbResult not_begun() const {
+    LbfgsbResult none;
+    none.x = coordinates(hyperparameters_);
+    none.value = std::numeric_limits<double>::infinity();
+    none.termination = "not begun: stopped on request";
+    return none;
   }
 
   // Draws about the optima of the restarts, the best one first.
@@ -162,7 +203,7 @@ class Training {
     bool is_any_drawn = false;
     for (std::size_t k = 0; k < held.size(); ++k) is_any_drawn = is_any_drawn || !(held[k] || hyperparameters_[k].is_fixed());
     if (!is_any_drawn) return;
-    HamiltonianOptions options{.seed = options_.seed, .n_side_by_side = n_side_by_side_, .stop = options_.stop};
+    HamiltonianOptions options{.seed = options_.seed, .evaluators = evaluators_, .stop = options_.stop};
     options.progress = [&](double fraction) { report_drawing(fraction); };
     try {
       draws_ = draw_about(objective_, optima, held, options_.n_draws, options);
@@ -193,10 +234,10 @@ class Training {
     constexpr int n_attempts = 2;
     const std::size_t from = best();
     try {
-      Likelihood::Workspace workspace(Workers(n_threads_, options_.ranks), options_.stop);
+      Likelihood::Workspace workspace(evaluators_.alone, options_.stop);
       for (int attempt = 0;; ++attempt) {
         const std::vector<Hyperparameter>& at = results_[from];
-        const Curvature curvature = curvature_at(objective_, coordinates(at), at, n_side_by_side_, options_.stop);
+        const Curvature curvature = curvature_at(objective_, coordinates(at), at, evaluators_, options_.stop);
         const bool may_go_on = attempt < n_attempts && reports_[from].iterations < options_.max_iterations && !stopped();
         if (curvature.distance_from_optimum() <= near || !may_go_on) {
           uncertainty_ = laplace_uncertainty(curvature, at);
@@ -239,6 +280,22 @@ class Training {
     report.failed_evaluations += result.failed_evaluations;
     report.converged = result.converged;
     report.termination = result.termination;
+    tell_improvement(result.x, result.value, 0);
+  }
+
+  /// @param pause  since the last time, below which this one is left out [s]
+  void tell_improvement(const VectorXd& x, double value, double pause) {
+    if (!options_.improved || options_.max_iterations == 0) return;
+    const std::scoped_lock lock(mutex_);
+    if (!(value < told_) || seconds() - told_at_ < pause) return;
+    FitReport report;
+    report.hyperparameters = objective_.at(x);
+    report.objective = value;
+    report.negative_log_likelihood = value - negative_log_hyperpriors(report.hyperparameters, nullptr);
+    report.termination = FitReport::interrupted;
+    options_.improved(report, observations_);
+    told_ = value;
+    told_at_ = seconds();
   }
 
   // scans each hyperparameter over its box from the best optimum; true when the optimiser got lower from the best point of the
@@ -267,17 +324,17 @@ class Training {
       return there;
     };
     std::vector<double> values(scanned.size() * n_points);
-    parallel_for(static_cast<int>(values.size()), n_side_by_side_, [&](int trial, int) {
+    share_out(values, static_cast<int>(values.size()), evaluators_.side_by_side, [&](int trial, std::span<double> value) {
       if (stopped()) return;
-      Likelihood::Workspace workspace(Workers(1, options_.ranks), options_.stop);
-      values[static_cast<std::size_t>(trial)] = objective_(moved(trial), nullptr, workspace);
+      Likelihood::Workspace workspace(evaluators_.within(), options_.stop);
+      value.front() = objective_(moved(trial), nullptr, workspace);
     });
     if (stopped()) return false;
     reports_[from].evaluations += static_cast<int>(values.size());
     const auto lowest = std::min_element(values.begin(), values.end());
     const double before = reports_[from].objective;
     if (!(*lowest < before)) return false;
-    Likelihood::Workspace workspace(Workers(n_threads_, options_.ranks), options_.stop);
+    Likelihood::Workspace workspace(evaluators_.alone, options_.stop);
     const LbfgsbResult result =
         optimise(static_cast<int>(from), objective_.at(moved(static_cast<int>(lowest - values.begin()))), workspace);
     if (!(result.value < before)) return false;
@@ -286,15 +343,11 @@ class Training {
     return before - result.value > 1e-6 * (1 + std::abs(before));
   }
 
-  void run_restart(int restart, int n_threads) {
-    if (restart > 0 && stopped()) {
-      constexpr double infinity = std::numeric_limits<double>::infinity();
-      reports_[static_cast<std::size_t>(restart)] = {
-          .objective = infinity, .negative_log_likelihood = infinity, .termination = "not begun: stopped on request"};
-      return;
-    }
+  LbfgsbResult run_restart(int restart) {
+    if (restart > 0 && stopped()) return not_begun();
     RandomStream random(options_.seed, static_cast<std::uint64_t>(restart));
-    Likelihood::Workspace workspace(Workers(n_threads, options_.ranks), options_.stop);
+    // where there is one alone its evaluations share the threads
+    Likelihood::Workspace workspace(n_restarts() == 1 ? evaluators_.alone : evaluators_.within(), options_.stop);
     // a random start may lie where M is not positive definite: draw again, a few times
     constexpr int max_draws = 20;
     LbfgsbResult result;
@@ -302,9 +355,10 @@ class Training {
       result = optimise(restart, restart == 0 ? hyperparameters_ : draw_start(hyperparameters_, random), workspace);
       if (std::isfinite(result.value) || restart == 0 || stopped()) break;
     }
-    store(static_cast<std::size_t>(restart), result);
+    tell_improvement(result.x, result.value, 0);
     const std::scoped_lock lock(mutex_);
     fractions_[static_cast<std::size_t>(restart)] = 1;
+    return result;
   }
 
   // Where the loading of a latent is zero so is its gradient: every run stays in that smaller model, which has fewer optima. From
@@ -315,18 +369,15 @@ class Training {
     if (at_zero.empty() || stopped() || reports_[from].iterations >= options_.max_iterations) return;
     constexpr int n_draws = 4;
     constexpr double share = 0.1;  // of its size
-    LbfgsbResult not_begun;
-    not_begun.value = std::numeric_limits<double>::infinity();
-    std::vector<LbfgsbResult> drawn(n_draws, not_begun);
-    parallel_for(n_draws, n_side_by_side_, [&](int draw, int) {
-      if (stopped()) return;
+    const std::vector<LbfgsbResult> drawn = run_side_by_side(n_draws, [&](int draw) {
+      if (stopped()) return not_begun();
       RandomStream random(options_.seed, static_cast<std::uint64_t>(n_restarts() + draw));
       std::vector<Hyperparameter> start = results_[from];
       for (Hyperparameter& h : start) {
         if (h.is_stationary_at_zero() && at_zero.contains(h.owner)) h.value = share * h.size * random.normal();
       }
-      Likelihood::Workspace workspace(Workers(1, options_.ranks), options_.stop);
-      drawn[static_cast<std::size_t>(draw)] = optimise(static_cast<int>(from), start, workspace);
+      Likelihood::Workspace workspace(evaluators_.within(), options_.stop);
+      return optimise(static_cast<int>(from), start, workspace);
     });
     const auto lowest =
         std::min_element(drawn.begin(), drawn.end(), [](const auto& a, const auto& b) { return a.value < b.value; });
@@ -341,7 +392,7 @@ class Training {
       fractions_[static_cast<std::size_t>(restart)] = iteration / (iteration + 100.0);
       double done = 0;
       for (double fraction : fractions_) done += fraction;
-      const double fraction = share_of_restarts() * done / static_cast<double>(fractions_.size());
+      const double fraction = share_of_restarts() * done / std::max(n_own_, 1);
       options_.progress({restart, n_restarts(), iteration, best_, seconds(), fraction});
     }
     return !stopped();
@@ -351,9 +402,9 @@ class Training {
   const std::vector<Observations>& observations_;
   const std::vector<Hyperparameter>& hyperparameters_;
   const FitOptions& options_;
-  int n_threads_ = thread_count(options_.n_threads);
-  int n_side_by_side_ = options_.max_side_by_side > 0 ? std::min(options_.max_side_by_side, n_threads_) : n_threads_;
+  Evaluators evaluators_;
   Objective objective_;
+  int n_own_ = 0;  // restarts of this process
   std::vector<RestartReport> reports_;
   std::vector<std::vector<Hyperparameter>> results_;
   struct {
@@ -366,6 +417,7 @@ class Training {
   std::mutex mutex_;  // guards what follows
   std::vector<double> fractions_;
   double best_ = std::numeric_limits<double>::infinity();
+  double told_ = std::numeric_limits<double>::infinity(), told_at_ = 0;  // objective, and when [s]
   std::chrono::steady_clock::time_point start_ = std::chrono::steady_clock::now();
 };
 
@@ -428,7 +480,9 @@ FitReport trained(const Prior& prior, const std::vector<Observations>& observati
 }
 
 // Hyperparameters from few states, exactly, then through inducing points from more and more. The points stay while the optimiser
-// runs, are chosen anew where it has ended, and kept where the bound rises.
+// runs, are chosen anew where it has ended, and kept where the bound rises. What few states cannot see they turn off, and from
+// there no slope leads back: so the first run through points starts from the first values as well, and from what it has ended
+// at with that turned on again which it has turned off.
 class TrainingThroughPoints {
  public:
   TrainingThroughPoints(const Prior& prior, const std::vector<Observations>& observations, const FitOptions& options)
@@ -438,6 +492,8 @@ class TrainingThroughPoints {
     const int n_all = n_states(observations_);
     const int n_train = options_.n_train > 0 ? std::min(options_.n_train, n_all) : n_all;
     const bool optimises = options_.max_iterations > 0 && !hyperparameters.empty();
+    const int n_exact = states_of_exact(hyperparameters);
+    const std::vector<Hyperparameter> first = hyperparameters;
     std::vector<int> stages;
     for (int n = n_exact; optimises && n < n_train && (n == n_exact || n <= n_train / 4); n *= 25) stages.push_back(n);
     stages.push_back(n_train);
@@ -449,14 +505,31 @@ class TrainingThroughPoints {
       const std::vector<Observations> some =
           stages[stage] < n_all ? evenly(observations_, stages[stage]) : std::vector<Observations>();
       const std::vector<Observations>& of_stage = stages[stage] < n_all ? some : observations_;
-      report = unless_stopped(report, [&] {
-        return is_exact ? trained(prior_, of_stage, hyperparameters, options)
-                        : through_points(of_stage, hyperparameters, options);
-      });
+      std::optional<FitReport> best;
+      const auto try_from = [&](const std::vector<Hyperparameter>& start, bool may_fail) {
+        if (best && is_set(options_.stop)) return;
+        try {
+          FitReport found = unless_stopped(best ? best : report, [&] {
+            return is_exact ? trained(prior_, of_stage, start, options) : through_points(of_stage, start, options);
+          });
+          if (!best || found.objective < best->objective) best = std::move(found);
+        } catch (const NumericalError&) {
+          if (!may_fail) throw;
+        }
+      };
+      const bool has_alternative = stage == 1;
+      try_from(hyperparameters, has_alternative);
+      if (has_alternative) {
+        try_from(first, best.has_value());
+        if (const auto start = turned_on(best->hyperparameters, first)) try_from(*start, true);
+      }
+      report = std::move(best);
       hyperparameters = report->hyperparameters;
     }
     if (!report->inducing || n_train < n_all) report->inducing = points_of(chosen(observations_, hyperparameters));
-    report->inducing->left_out = left_out(*report);
+    report->inducing->left_out =
+        is_set(options_.stop) ? left_out_as_some_tell(*report)
+                              : left_out(observations_, *report, Workers(thread_count(options_.n_threads), options_.ranks));
     report->inducing->n_start = stages.size() > 1 ? n_exact : 0;
     if (is_set(options_.stop)) {
       report->termination = FitReport::interrupted;
@@ -466,7 +539,14 @@ class TrainingThroughPoints {
   }
 
  private:
-  static constexpr int n_exact = 400;  // states that tell where hyperparameters stand, in seconds
+  // States that tell where hyperparameters stand, in seconds: of a reduced size of about 800.
+  [[nodiscard]] int states_of_exact(const std::vector<Hyperparameter>& hyperparameters) const {
+    constexpr int reduced_size = 800, most = 400;
+    const std::vector<Observations> some = evenly(observations_, most);
+    const int size = Likelihood(prior_, some, model_values(prior_, some, hyperparameters), {}).reduced_size();
+    return std::max(1, n_states(some) * reduced_size / std::max(size, reduced_size));
+  }
+
   static constexpr int n_rounds = 3;
   static constexpr double enough = 0.5;  // nats, below which other points are not worth another run
 
@@ -505,16 +585,36 @@ class TrainingThroughPoints {
                                   {.most = options_.n_inducing});
   }
 
+  // With the signals as they were at first that have all but vanished; none: there are no such.
+  [[nodiscard]] static std::optional<std::vector<Hyperparameter>> turned_on(std::vector<Hyperparameter> found,
+                                                                            const std::vector<Hyperparameter>& first) {
+    constexpr double vanished = 0.01;
+    bool is_any = false;
+    for (std::size_t k = 0; k < found.size(); ++k) {
+      if (found[k].kind != Hyperparameter::Kind::signal_stddev || found[k].value > vanished * first[k].value) continue;
+      found[k].value = first[k].value;
+      is_any = true;
+    }
+    return is_any ? std::optional(std::move(found)) : std::nullopt;
+  }
+
   [[nodiscard]] FitReport through_points(const std::vector<Observations>& observations, std::vector<Hyperparameter> from,
                                          FitOptions options) const {
     // a gain of a thousandth of a nat is none
     options.reduction_tolerance = std::max(options.reduction_tolerance, 1e-3 / n_states(observations));
     options.n_restarts = 1;
     options.max_escapes = 0;
-    if (options.ranks) options.max_side_by_side = 1;  // all processes evaluate the same at a time
     std::optional<FitReport> best;
     for (int round = 0; round < n_rounds && !(best && is_set(options.stop)); ++round) {
       const InducingChoice choice = chosen(observations, from);
+      if (options_.improved) {
+        options.improved = [&](FitReport so_far, const std::vector<Observations>& of_stage) {
+          if (best && !(so_far.objective < best->objective)) return;
+          so_far.inducing = points_of(choice);
+          so_far.inducing->left_out = left_out_as_some_tell(so_far);
+          options_.improved(so_far, of_stage);
+        };
+      }
       FitReport next = unless_stopped(best, [&] {
         FitReport report = trained(prior_, observations, from, options, choice.points);
         report.inducing = points_of(choice);
@@ -530,17 +630,19 @@ class TrainingThroughPoints {
     return *std::move(best);
   }
 
-  // Of all states; where the fit is stopped, as some of them tell.
-  [[nodiscard]] VectorXd left_out(const FitReport& report) const {
+  [[nodiscard]] VectorXd left_out(const std::vector<Observations>& observations, const FitReport& report,
+                                  const Workers& workers) const {
+    ModelValues values = model_values(prior_, observations, report.hyperparameters);
+    values.inducing = report.inducing->points;
+    return left_out_by_points(prior_, observations, values, workers);
+  }
+
+  // Of all states, while nothing else is under way on other processes.
+  [[nodiscard]] VectorXd left_out_as_some_tell(const FitReport& report) const {
     constexpr int few = 5000;
-    const auto of = [&](const std::vector<Observations>& observations) {
-      ModelValues values = model_values(prior_, observations, report.hyperparameters);
-      values.inducing = report.inducing->points;
-      return left_out_by_points(prior_, observations, values, Workers(thread_count(options_.n_threads), options_.ranks));
-    };
-    if (!is_set(options_.stop)) return of(observations_);
     const std::vector<Observations> some = evenly(observations_, few);
-    return static_cast<double>(n_states(observations_)) / n_states(some) * of(some);
+    return static_cast<double>(n_states(observations_)) / n_states(some) *
+           left_out(some, report, thread_count(options_.n_threads));
   }
 
   const Prior& prior_;

@@ -7,6 +7,7 @@
 #include <numbers>
 #include <numeric>
 #include <optional>
+#include <span>
 
 #include <Eigen/Eigenvalues>
 
@@ -49,13 +50,13 @@ class StepLength {
 class Chain {
  public:
   Chain(const Objective& objective, const HamiltonianStart& start, const VectorXd& lower, const VectorXd& upper,
-        RandomStream random, const std::atomic<bool>* stop)
+        RandomStream random, const Workers& workers, const std::atomic<bool>* stop)
       : objective_(objective),
         W_(start.W),
         lower_(lower),
         upper_(upper),
         random_(random),
-        workspace_(1, stop),
+        workspace_(workers, stop),
         x_(start.x),
         gradient_(VectorXd::Zero(x_.size())) {
     J_ = objective_(x_, &gradient_, workspace_);
@@ -197,6 +198,26 @@ struct Steps {
   std::vector<double> objective;
   double acceptance = 0;  // sum
   int evaluations = 0;
+
+  Steps() = default;
+  /// As print() has them.
+  Steps(const Eigen::Ref<const VectorXd>& numbers, Index n_x)
+      : acceptance(numbers[1]), evaluations(static_cast<int>(numbers[2])) {
+    Index at = 3;
+    for (auto n = static_cast<int>(numbers[0]); n > 0; --n, at += n_x + 1) {
+      x.emplace_back(numbers.segment(at, n_x));
+      objective.push_back(numbers[at + n_x]);
+    }
+  }
+  void print(std::span<double> numbers) const {
+    std::fill(numbers.begin(), numbers.end(), 0.0);
+    numbers[0] = static_cast<double>(x.size()), numbers[1] = acceptance, numbers[2] = evaluations;
+    auto out = numbers.begin() + 3;
+    for (std::size_t s = 0; s < x.size(); ++s) {
+      out = std::copy(x[s].begin(), x[s].end(), out);
+      *out++ = objective[s];
+    }
+  }
 };
 
 // what progress(evaluations since) hears of
@@ -237,11 +258,17 @@ HamiltonianDraws draw_coordinates(const Objective& objective, const std::vector<
     if (options.progress) options.progress(std::min(1.0, n_done / options.max_evaluations));
   };
   const int of_chain = options.max_evaluations / static_cast<int>(starts.size());
-  parallel_for(static_cast<int>(starts.size()), options.n_side_by_side, [&](int c, int) {
-    const auto own = static_cast<std::size_t>(c);
-    Chain chain(objective, starts[own], lower, upper, RandomStream(options.seed, own), options.stop);
-    kept[own] = run_chain(chain, of_chain, options.stop, progress);
-  });
+  const Index n_x = lower.size();
+  // of each chain: steps kept, acceptance, evaluations, and of each step x and the objective; a step takes an evaluation or more
+  MatrixXd numbers(3 + of_chain * (n_x + 1), std::ssize(starts));
+  share_out({numbers.data(), static_cast<std::size_t>(numbers.size())}, static_cast<int>(starts.size()),
+            options.evaluators.side_by_side, [&](int c, std::span<double> column) {
+              const auto own = static_cast<std::size_t>(c);
+              Chain chain(objective, starts[own], lower, upper, RandomStream(options.seed, own), options.evaluators.within(),
+                          options.stop);
+              run_chain(chain, of_chain, options.stop, progress).print(column);
+            });
+  for (std::size_t c = 0; c < starts.size(); ++c) kept[c] = Steps(numbers.col(static_cast<Index>(c)), n_x);
   if (is_set(options.stop)) throw NumericalError("stopped before all hyperparameters were drawn");
 
   // as many of each chain, the last ones
@@ -297,10 +324,10 @@ Mode mode_at(const Objective& objective, const std::vector<Hyperparameter>& opti
              const Box& box, const HamiltonianOptions& options) {
   constexpr double longest = 2;
   Mode mode{{coordinates(optimum), MatrixXd::Zero(box.lower.size(), box.lower.size())}};
-  Likelihood::Workspace workspace(options.n_side_by_side, options.stop);
+  Likelihood::Workspace workspace(options.evaluators.alone, options.stop);
   VectorXd gradient = VectorXd::Zero(mode.at.x.size());
   mode.objective = objective(mode.at.x, &gradient, workspace);
-  const Curvature curvature = curvature_at(objective, mode.at.x, optimum, options.n_side_by_side, options.stop);
+  const Curvature curvature = curvature_at(objective, mode.at.x, optimum, options.evaluators, options.stop);
   const VectorXd most = (0.5 * (box.upper - box.lower)).cwiseMin(longest);
   mode.log_mass = -mode.objective;
 
@@ -371,7 +398,7 @@ std::vector<HamiltonianStart> starts_at(const Objective& objective, const std::v
   for (const Mode& mode : modes) largest = std::max(largest, mode.log_mass);
   for (const Mode& mode : modes) sum += std::exp(mode.log_mass - largest);
   RandomStream random(~options.seed);
-  Likelihood::Workspace workspace(options.n_side_by_side, options.stop);
+  Likelihood::Workspace workspace(options.evaluators.alone, options.stop);
   std::vector<HamiltonianStart> starts;
   std::size_t m = 0;
   double below = std::exp(modes[0].log_mass - largest) / sum;

@@ -15,7 +15,7 @@ namespace gp2 {
 struct HamiltonianOptions {
   int max_evaluations = draw_evaluations;  // of all chains together
   std::uint64_t seed = 0;
-  int n_side_by_side = 1;  // chains at a time; results do not depend on it
+  Evaluators evaluators;  // chains go on side by side
   const std::atomic<bool>* stop = nullptr;
   std::function<void(double fraction)> progress = {};  // called from worker threads, one at a time
 };

@@ -55,7 +55,7 @@ void Hyperparameter::write(ModelValues& values) const {
       values.signal_stddev[of][index] = value;
       break;
     case Kind::shared_signal_stddev:
-      values.signal_stddev[of] = value * column_scale;
+      values.signal_stddev[of].array() *= value * column_scale.array();
       break;
     case Kind::loading:
       values.free_loading[of].reshaped()[index] = value;
@@ -67,7 +67,7 @@ void Hyperparameter::write(ModelValues& values) const {
       values.parameters[index] = value;
       break;
   }
-  for (const Follower& f : followers) values.signal_stddev[static_cast<std::size_t>(f.latent)][f.column] = f.share * value;
+  for (const Follower& f : followers) values.signal_stddev[static_cast<std::size_t>(f.latent)][f.column] *= f.share * value;
 }
 
 double Hyperparameter::likelihood_slope(const ModelGradient& gradient) const {

@@ -48,6 +48,8 @@ class Minimisation {
       ++result_.failed_evaluations;
       failed_in_search_ = is_at_edge_ = true;
       turn_back(trial);
+    } else if (leaps(trial)) {
+      turn_back(trial);
     }
     return true;
   }
@@ -60,7 +62,7 @@ class Minimisation {
     failed_in_search_ = false;
     best_ = iterate;
     result_.iterations = iteration;
-    if (!options_.iteration(iteration, iterate.value)) return stop_on_request();
+    if (!options_.iteration(iteration, iterate.x, iterate.value)) return stop_on_request();
     if (iteration >= options_.max_iterations) {
       result_.termination = "the limit of iterations was reached";
       return false;
@@ -99,6 +101,14 @@ class Minimisation {
     point.value = f_(point.x, point.gradient);
     ++result_.evaluations;
     return std::isfinite(point.value) && point.gradient.allFinite();
+  }
+
+  // Little is known of curvature at first, and a steep slope points into a corner of the box: where even that is better than the
+  // start, what is on the way is better still.
+  [[nodiscard]] bool leaps(const Point& trial) const {
+    constexpr int first_steps = 5;
+    constexpr double far = 5;
+    return result_.iterations < first_steps && trial.value < best_.value && (trial.x - best_.x).lpNorm<Eigen::Infinity>() > far;
   }
 
   // Answers with the parabola along the step that has the known value and slope at the last iterate and its minimum at a tenth of

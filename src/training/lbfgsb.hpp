@@ -12,8 +12,8 @@ struct LbfgsbOptions {
   int memory = 30;  // pairs kept for the Hessian; with as many as there are hyperparameters a fit takes a quarter of the steps
   double gradient_tolerance = 1e-5;
   double reduction_tolerance = 1e-12;
-  /// Called after each iteration with its number and value; false stops.
-  std::function<bool(int, double)> iteration = [](int, double) { return true; };
+  /// Called after each iteration with its number, its point and its value; false stops.
+  std::function<bool(int, const Eigen::VectorXd&, double)> iteration = [](int, const Eigen::VectorXd&, double) { return true; };
   /// Asked before each evaluation but that of the start; true stops.
   std::function<bool()> stop = [] { return false; };
 };

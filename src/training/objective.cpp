@@ -1,5 +1,6 @@
 #include "training/objective.hpp"
 
+#include <algorithm>
 #include <cmath>
 #include <map>
 #include <string_view>
@@ -83,6 +84,22 @@ double Objective::operator()(const VectorXd& x, VectorXd* gradient, Likelihood::
     (*gradient)[static_cast<Index>(k)] = hyperparameters[k].likelihood_slope(model_gradient);
   }
   return value + negative_log_hyperpriors(hyperparameters, gradient);
+}
+
+void share(std::string& text, const Workers& workers, int part, int n_parts) {
+  auto size = static_cast<double>(text.size());
+  workers.share({&size, 1}, part, n_parts);
+  text.resize(static_cast<std::size_t>(size));
+  std::vector<double> characters(text.begin(), text.end());
+  workers.share(characters, part, n_parts);
+  std::transform(characters.begin(), characters.end(), text.begin(), [](double one) { return static_cast<char>(one); });
+}
+
+Evaluators::Evaluators(const FitOptions& options, bool through_points) : Evaluators(thread_count(options.n_threads)) {
+  const int most = options.max_side_by_side;
+  if (most > 0) side_by_side.n_threads = std::min(most, side_by_side.n_threads);
+  if (options.ranks && through_points) side_by_side = 1;
+  (through_points ? alone : side_by_side).ranks = options.ranks;
 }
 
 VectorXd coordinates(const std::vector<Hyperparameter>& hyperparameters) {

@@ -1,10 +1,16 @@
 #pragma once
 
+#include <cstddef>
 #include <memory>
+#include <span>
+#include <string>
 #include <vector>
 
 #include <Eigen/Core>
 
+#include "base/parallel.hpp"
+#include "gp2/error.hpp"
+#include "gp2/fit.hpp"
 #include "gp2/training/hyperparameter.hpp"
 
 namespace gp2 {
@@ -37,6 +43,46 @@ class Objective {
   std::shared_ptr<const InducingPoints> points_;
   Likelihood likelihood_;
 };
+
+/// Who evaluates an objective: exactly several evaluations go on at a time, each on a process of its own; through inducing points all
+/// processes work on one. Results do not depend on it.
+struct Evaluators {
+  Workers side_by_side;  // on so many evaluations at a time
+  Workers alone;         // on one that no other goes on beside
+
+  Evaluators(int n_threads = 1) : side_by_side(n_threads), alone(n_threads) {}
+  Evaluators(const FitOptions& options, bool through_points);
+  /// On each of several.
+  [[nodiscard]] Workers within() const { return alone.ranks ? alone : Workers(1); }
+};
+
+/// A text, from who works on a part to all.
+void share(std::string& text, const Workers& workers, int part, int n_parts);
+
+/// work(task, its numbers) for every task, by whoever works on it; then all have all numbers, as many of each task, one task after
+/// the other. Of tasks that fail the first says why, to all.
+/// @throws NumericalError as work
+template <typename Work>
+void share_out(std::span<double> numbers, int n_tasks, const Workers& workers, const Work& work) {
+  const std::size_t size = n_tasks > 0 ? numbers.size() / static_cast<std::size_t>(n_tasks) : 0;
+  const auto of = [&](int task) { return numbers.subspan(static_cast<std::size_t>(task) * size, size); };
+  std::vector<std::string> faults(static_cast<std::size_t>(n_tasks));
+  parallel_for(n_tasks, workers.n_threads, [&](int task, int) {
+    if (!workers.owns(task, n_tasks)) return;
+    try {
+      work(task, of(task));
+    } catch (const NumericalError& error) {
+      faults[static_cast<std::size_t>(task)] = error.what();
+    }
+  });
+  for (int task = 0; task < n_tasks; ++task) {
+    workers.share(of(task), task, n_tasks);
+    share(faults[static_cast<std::size_t>(task)], workers, task, n_tasks);
+  }
+  for (const std::string& fault : faults) {
+    if (!fault.empty()) throw NumericalError(fault);
+  }
+}
 
 /// x: where hyperparameters stand, in their coordinates.
 Eigen::VectorXd coordinates(const std::vector<Hyperparameter>& hyperparameters);

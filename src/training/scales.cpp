@@ -178,6 +178,7 @@ Scales default_scales(const Prior& prior, const std::vector<Observations>& obser
   scales.acceleration_stddev = coordinate_scales(*prior.system, observations, pooled.mass_diagonal);
   for (std::size_t a = 0; a < prior.latents.size(); ++a) {
     const MatrixXd& features = pooled.features[a];
+    scales.feature_mean.push_back(row_mean(features));
     scales.feature_stddev.push_back(usable_spreads(row_stddev(features), features));
     scales.feature_range.push_back(usable_spreads(features.rowwise().maxCoeff() - features.rowwise().minCoeff(), features));
     scales.signal_stddev.push_back(

@@ -113,6 +113,10 @@ TEST(Check, FailsWhereTheModelIsNotWellPosedAndSaysAtWhichState) {
     EXPECT_EQ(checked.status, 2);
     EXPECT_THAT(checked.out, testing::AllOf(HasSubstr("ERROR"), HasSubstr(one.finding)));
     EXPECT_THAT(checked.err, HasSubstr(std::string(one.name) + ": 1 of the checks failed"));
+    const Outcome as_json = desk.run(std::string("gp2 check ") + one.name + " --data log.csv --json");
+    EXPECT_EQ(as_json.status, 2);
+    EXPECT_EQ(as_json.json()["errors"], 1);
+    EXPECT_THAT(as_json.out, HasSubstr("\"level\": \"error\""));
   }
 }
 

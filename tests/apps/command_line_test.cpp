@@ -1,5 +1,7 @@
 #include "apps/command_line.hpp"
 
+#include <algorithm>
+
 #include <gmock/gmock.h>
 #include <gtest/gtest.h>
 
@@ -27,13 +29,98 @@ TEST_P(Help, ExplainsTheCommandWithAnExample) {
   EXPECT_THAT(outcome.out, HasSubstr("Example:\n  gp2 " + (GetParam().empty() ? "generate" : GetParam())));
 }
 
-INSTANTIATE_TEST_SUITE_P(OfEveryCommand, Help, testing::Values("", "show", "check", "generate", "fit", "predict", "evaluate"),
+INSTANTIATE_TEST_SUITE_P(OfEveryCommand, Help,
+                         testing::Values("", "show", "check", "generate", "fit", "predict", "evaluate", "help"),
                          [](const auto& one) { return one.param.empty() ? "gp2" : one.param; });
 
 TEST(CommandLine, VersionIsTheLibrarys) {
-  const Outcome outcome = Desk().run("gp2 --version");
-  EXPECT_EQ(outcome.status, 0);
-  EXPECT_EQ(outcome.out, std::string(version()) + "\n");
+  for (const char* line : {"gp2 --version", "gp2 -V"}) {
+    const Outcome outcome = Desk().run(line);
+    EXPECT_EQ(outcome.status, 0);
+    EXPECT_EQ(outcome.out, std::string(version()) + "\n");
+  }
+}
+
+TEST(CommandLine, HelpOfACommandIsTheSameEitherWay) {
+  const Desk desk;
+  EXPECT_EQ(desk.done("gp2 help fit").out, desk.done("gp2 fit --help").out);
+  EXPECT_EQ(desk.done("gp2 help").out, desk.done("gp2 --help").out);
+}
+
+TEST(CommandLine, HelpIsGroupedAndNoLineIsWiderThanTheTerminal) {
+  const Desk desk;
+  const std::string line = "gp2 fit --help";
+  const auto widest = [](const std::string& text) {
+    std::size_t most = 0, now = 0;
+    for (const char c : text.substr(0, text.find("Example:"))) {  // which is to be copied as it is
+      if ((c & 0xC0) != 0x80 && c != '\r') now = c == '\n' ? 0 : now + 1;
+      most = std::max(most, now);
+    }
+    return most;
+  };
+  const std::string piped = desk.done(line).out;
+  EXPECT_LE(widest(piped), 80u);
+  for (const char* part : {"\nArguments:\n  MODEL", "\nData:\n  --data", "\nHow it is learned:\n", "\nRaw logs:\n",
+                           "--restarts R", "-o, --output FIT.json", "(required)", "--mean zero|force", "(default: zero)"}) {
+    EXPECT_THAT(piped, HasSubstr(part));
+  }
+  if (desk.run("command -v script").status != 0) GTEST_SKIP() << "no command 'script' to make a terminal with";
+  EXPECT_LE(widest(desk.done("script -qec 'stty cols 60; " + line + "' /dev/null").out), 60u);
+  EXPECT_GT(widest(desk.done("script -qec 'stty cols 200; " + line + "' /dev/null").out), 80u);
+}
+
+TEST(CommandLine, WhatIsMisspeltIsSuggested) {
+  const Desk desk;
+  for (const auto& [line, said] : std::vector<std::pair<const char*, const char*>>{
+           {"gp2 fitt", "error: there is no command 'fitt', did you mean 'fit'?"},
+           {"gp2 learn", "error: there is no command 'learn'; there are: show, "},
+           {"gp2 help fitt", "help, did you mean 'fit'?"},
+           {"gp2 show models/surface.toml --latx", "error: gp2 show has no option --latx, did you mean '--latex'?"},
+           {"gp2 fit models/surface.toml --data a.csv --restart=3 --ouput b.json",
+            "error: gp2 fit has no option --restart, did you mean '--restarts'?"},
+           {"gp2 show models/surface.toml --colour", "error: gp2 show has no option --colour\n"},
+           {"gp2 fit models/surface.toml --data a.csv --mean forec -o b.json",
+            "'forec' is none of zero, force, did you mean 'force'?"}}) {
+    const Outcome outcome = desk.run(line);
+    EXPECT_EQ(outcome.status, 2);
+    EXPECT_THAT(outcome.err, HasSubstr(said));
+  }
+}
+
+TEST(CommandLine, CompletionOfBashOffersCommandsOptionsAndWords) {
+  const Desk desk;
+  const auto offered = [&](const std::string& words, const std::string& current, const std::string& before) {
+    return desk
+        .done("bash -ec 'source <(gp2 completion bash); compopt() { :; }; COMP_WORDS=(" + words +
+              "); COMP_CWORD=$((${#COMP_WORDS[@]} - 1)); "
+              "_gp2 gp2 \"" +
+              current + "\" \"" + before + "\"; echo ${COMPREPLY[@]}'")
+        .out;
+  };
+  EXPECT_EQ(offered("gp2 ex", "ex", "gp2"), "excite export\n");
+  EXPECT_EQ(offered("gp2 --v", "--v", "gp2"), "--version --verbose\n");
+  EXPECT_EQ(offered("gp2 fit m.toml --rest", "--rest", "m.toml"), "--restarts\n");
+  EXPECT_EQ(offered("gp2 fit --mean \"\"", "", "--mean"), "zero force\n");
+  EXPECT_EQ(offered("gp2 fit --data \"\"", "", "--data"), "\n");  // files, by bash itself
+  EXPECT_EQ(offered("gp2 help ev", "ev", "help"), "evaluate\n");
+}
+
+TEST(CommandLine, CompletionsAndManPagesAreFreeOfErrors) {
+  const Desk desk;
+  desk.done("gp2 completion all -o share");
+  EXPECT_EQ(desk.read("share/bash-completion/completions/gp2"), desk.done("gp2 completion bash").out);
+  EXPECT_THAT(desk.read("share/man/man1/gp2-fit.1"), HasSubstr(".B \\-\\-restarts R\n"));
+  EXPECT_THAT(desk.read("share/man/man1/gp2.1"), HasSubstr(".BR gp2\\-fit (1)"));
+  for (const auto& [tool, line] : std::vector<std::pair<std::string, std::string>>{
+           {"bash", "bash -n share/bash-completion/completions/gp2"},
+           {"zsh", "zsh -n share/zsh/site-functions/_gp2"},
+           {"fish", "fish --no-execute share/fish/vendor_completions.d/gp2.fish"},
+           {"man", "for page in share/man/man1/*; do man --warnings -E UTF-8 -l -Tutf8 $page >/dev/null; done"}}) {
+    if (desk.run("command -v " + tool).status != 0) continue;
+    EXPECT_EQ(desk.done(line).err, "") << line;
+  }
+  EXPECT_TRUE(desk.run("gp2 completion fish -o share").said("-o goes with 'all'"));
+  EXPECT_TRUE(desk.run("gp2 completion all").said("'all' needs -o DIR"));
 }
 
 TEST(CommandLine, WhatIsNotKnownExitsWith2AndPointsAtTheHelp) {
@@ -72,7 +159,7 @@ TEST(CommandLine, JsonStandsAloneOnStdoutWithTheContractedKeys) {
   for (const char* how : {"one_by_one", "stretches"}) {
     EXPECT_THAT(keys(report["left_out"][how]), ElementsAre("coverage50", "coverage80", "coverage95", "nrmse"));
   }
-  ASSERT_EQ(report["hyperparameters"].size(), 12u);
+  ASSERT_EQ(report["hyperparameters"].size(), 13u);
   for (const auto& one : report["hyperparameters"]) {
     EXPECT_THAT(keys(one), ElementsAre("at_bound", "lower", "name", "unit", "upper", "value"));
   }
@@ -101,6 +188,26 @@ TEST(CommandLine, TalkGoesToStderrAndResultsToStdout) {
   EXPECT_EQ(predicted.out, "");
   EXPECT_THAT(predicted.err, HasSubstr("prediction.csv: 20 predictions"));
   EXPECT_THAT(desk.done("gp2 evaluate fit.json --data train.csv").out, HasSubstr("max |A ddq - b|"));
+}
+
+TEST(CommandLine, QuietKeepsWarningsAndDropsNotesAndProgress) {
+  const Desk desk;
+  desk.done("gp2 generate models/surface.toml --n 20 -o train.csv");
+  const std::string line = "gp2 fit models/surface.toml --data train.csv --restarts 1 --max-iterations 3 -o fit.json";
+  const Outcome loud = desk.done(line), quiet = desk.done(line + " -q");
+  EXPECT_TRUE(loud.said("fit.json: fit of"));
+  EXPECT_EQ(quiet.err, "");
+  EXPECT_THAT(quiet.out, HasSubstr("negative log likelihood"));
+  EXPECT_TRUE(desk.run("gp2 fit models/surface.toml --data none.csv --quiet -o fit.json").said("error: none.csv"));
+  desk.done("gp2 fit --again fit.json -q -o again.json");
+}
+
+TEST(CommandLine, CheckTellsItsFindingsAsJson) {
+  const Desk desk;
+  const nlohmann::json good = desk.done("gp2 check models/unicycle.toml --json").json();
+  EXPECT_EQ(good["errors"], 0);
+  EXPECT_FALSE(good["findings"].empty());
+  EXPECT_THAT(keys(good["findings"][0]), ElementsAre("level", "text"));
 }
 
 TEST(CommandLine, ProgressIsShownOnATerminalOnly) {

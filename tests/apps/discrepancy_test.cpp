@@ -25,7 +25,8 @@ class DiscrepancyOption : public testing::Test {
 TEST_F(DiscrepancyOption, IsOnByDefaultAndLeftOutWhereAskedTo) {
   fit();
   EXPECT_TRUE(fit_has_one());
-  EXPECT_EQ(desk.json("fit.json")["prior"]["discrepancy"]["stddev"], (std::vector<double>{0.4 * 0.1, 0.4 * 0.1, 0.4 * 0.1}));
+  const auto stddevs = desk.json("fit.json")["prior"]["discrepancy"]["stddev"].get<std::vector<double>>();
+  for (const double stddev : stddevs) EXPECT_NEAR(stddev, 0.1, 1e-6);  // the noise
   for (const char* options : {"--discrepancy none", "--hyperprior none", "--protocol paper", "--baseline se"}) {
     fit(options);
     EXPECT_FALSE(fit_has_one()) << options;
@@ -49,11 +50,11 @@ TEST_F(DiscrepancyOption, IsALatentThatCanBePredictedAlone) {
     EXPECT_NEAR(small.number(i, alone) + large.number(i, main), both.number(i, sum), 1e-12);
     // data only ever lower a standard deviation
     EXPECT_GT(small.number(i, stddev), 0);
-    EXPECT_LE(small.number(i, stddev), 0.4 * 0.1);
+    EXPECT_LE(small.number(i, stddev), 0.5 * 0.1);
     largest = std::max(largest, std::abs(small.number(i, alone)));
   }
   EXPECT_GT(largest, 0);
-  EXPECT_LT(largest, 3 * 0.4 * 0.1) << "it hardly moves the mean";
+  EXPECT_LT(largest, 3 * 0.5 * 0.1) << "it hardly moves the mean";
 
   fit("--discrepancy none");
   const Outcome outcome = desk.run("gp2 predict fit.json --states train.csv --latent discrepancy -o no.csv");

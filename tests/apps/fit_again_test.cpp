@@ -34,6 +34,31 @@ TEST_F(FitAgain, GivesTheSameBitsFromItsFileAndFromItsLog) {
   }
 }
 
+TEST_F(FitAgain, SaysWhichLogIsNotTheOneThatWasLearnedFrom) {
+  desk.done("gp2 generate models/surface.toml --n 10 --seed 5 -o more.csv");
+  desk.done("gp2 fit models/surface.toml --data train.csv --data more.csv --max-iterations 0 -o fit.json");
+  const std::string again = "gp2 fit --again fit.json -o again.json ";
+  EXPECT_THAT(desk.done(again + "--data train.csv --data more.csv").err, Not(HasSubstr("warning")));
+  desk.done("cp more.csv copy.csv");
+  EXPECT_THAT(desk.done(again + "--data train.csv --data copy.csv").err, Not(HasSubstr("copy.csv is not")));
+  EXPECT_THAT(desk.done(again + "--data train.csv").err,
+              HasSubstr("warning: the fit was learned from more.csv too, which is not given"));
+  desk.done("gp2 generate models/surface.toml --n 12 --seed 6 -o more.csv");
+  const std::string err = desk.done(again + "--data train.csv --data more.csv --data copy.csv").err;
+  EXPECT_THAT(err, testing::ContainsRegex("warning: more.csv is not as the fit was learned from it: [0-9]+ bytes, 12 rows; then "
+                                          "[0-9]+ bytes, 10 rows"));
+  desk.done("gp2 generate models/surface.toml --n 12 --seed 7 -o new.csv");
+  EXPECT_THAT(desk.done(again + "--data train.csv --data copy.csv --data new.csv").err,
+              HasSubstr("warning: new.csv is not a log that the fit was learned from"));
+
+  // an update knows what was learned, and what it adds
+  EXPECT_THAT(desk.done("gp2 update fit.json --data new.csv -o more.json").err, Not(HasSubstr("already")));
+  for (const std::string log : {"new.csv", "copy.csv"}) {
+    EXPECT_THAT(desk.done("gp2 update more.json --data " + log + " -o twice.json").err,
+                HasSubstr("warning: " + log + " was learned from already: its rows count twice"));
+  }
+}
+
 TEST_F(FitAgain, StartsWhereTheFitStarted) {
   desk.write("start.json", R"json({"lengthscale(q1)": 2.5})json");
   desk.done("gp2 fit models/surface.toml --data train.csv --start start.json --max-iterations 3 --restarts 1 -o fit.json");

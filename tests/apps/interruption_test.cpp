@@ -124,6 +124,42 @@ TEST(InterruptedTwice, AFitEndsAtOnceAndLeavesTheOldFile) {
   EXPECT_EQ(files(desk), before);
 }
 
+TEST(Killed, AFitLeavesItsCheckpointWhichAnotherGoesOnFrom) {
+  const Desk desk;
+  desk.done("gp2 generate models/surface.toml --n 60 -o train.csv");
+  Running fit(desk, {"fit", "models/surface.toml", "--data", "train.csv", "--restarts", "5000", "--checkpoint", "last.json", "-o",
+                     "fit.json"});
+  for (int k = 0; k < 6000 && !desk.has("last.json"); ++k) Running::pause(0.01);
+  Running::pause(0.2);
+  fit.send(SIGKILL);
+  ASSERT_TRUE(WIFSIGNALED(fit.end())) << fit.err();
+  EXPECT_FALSE(desk.has("fit.json"));
+  const FitFile saved = FitFile::read(desk / "last.json");
+  EXPECT_EQ(saved.report.termination, FitReport::interrupted);
+  desk.done("gp2 predict last.json --states train.csv -o prediction.csv");
+  desk.done(
+      "gp2 fit models/surface.toml --data train.csv --restarts 1 --hyperparameters optimise --start last.json "
+      "--checkpoint last.json -o last.json");
+  EXPECT_LE(FitFile::read(desk / "last.json").report.objective, saved.report.objective);
+}
+
+TEST(InterruptedTwice, AFitSaysWhereItsCheckpointIs) {
+  const Desk desk;
+  desk.done("gp2 generate models/surface.toml --n 60 -o train.csv");
+  Running fit(desk, {"fit", "models/surface.toml", "--data", "train.csv", "--restarts", "5000", "--checkpoint", "last.json", "-o",
+                     "fit.json"});
+  for (int k = 0; k < 6000 && !desk.has("last.json"); ++k) Running::pause(0.01);
+  fit.send(SIGINT);
+  fit.send(SIGTERM);
+  const int status = fit.end();
+  // what is under way may be given up before the second signal comes
+  if (WIFSIGNALED(status)) {
+    EXPECT_THAT(fit.err(), HasSubstr("gp2: last.json holds the best so far; --start last.json goes on from there\n"));
+  } else {
+    EXPECT_EQ(FitFile::read(desk / "fit.json").report.termination, FitReport::interrupted);
+  }
+}
+
 TEST(InterruptedOnce, ASignalThatWasIgnoredStaysIgnored) {
   const Desk desk;
   desk.done("gp2 generate models/surface.toml --n 200 -o train.csv");

@@ -44,6 +44,18 @@ TEST_F(ManyRanks, FitTheSameBits) {
   }
 }
 
+TEST_F(ManyRanks, ShareOutTheRunsAndChainsOfAnExactFit) {
+  const std::string exact =
+      "gp2 fit models/surface.toml --data log.csv --max-points 20 --estimate m --hyperparameters integrate --max-iterations 20 "
+      "--threads 1 ";
+  desk.done(exact + "-o alone.json");
+  for (const int n : {2, 4}) {
+    const Outcome outcome = on(n, exact + fmt::format("-o on_{}.json", n));
+    ASSERT_EQ(outcome.status, 0) << outcome.err;
+    EXPECT_EQ(desk.read(fmt::format("on_{}.json", n)), desk.read("alone.json"));
+  }
+}
+
 TEST_F(ManyRanks, AnErrorOfAllIsToldOnceAndEndsThem) {
   const Outcome outcome = on(2, "gp2 fit models/surface.toml --data none.csv -o fit.json");
   EXPECT_NE(outcome.status, 0);
@@ -61,6 +73,22 @@ TEST_F(ManyRanks, WhoReadsOtherDataEndsAll) {
   EXPECT_NE(outcome.status, 0);
   EXPECT_THAT(outcome.err, HasSubstr("have read different data"));
   EXPECT_FALSE(desk.has("fit.json"));
+}
+
+TEST_F(ManyRanks, WhereOneDiesTheCheckpointIsNamed) {
+  const std::string long_fit =
+      "gp2 fit models/surface.toml --data log.csv --mean force --max-points 60 --threads 1 --restarts 5000 --checkpoint "
+      "last.json "
+      "-o fit.json";
+  const Outcome outcome =
+      desk.run(fmt::format("{0} --oversubscribe -n 1 {1} : -n 1 sh -c 'echo $$ > pid; exec {1}' &\n"
+                           "for k in $(seq 600); do [ -e last.json ] && break; sleep 0.1; done\n"
+                           "kill -9 $(cat pid)\nwait $!",
+                           GP2_MPIRUN, long_fit));
+  EXPECT_NE(outcome.status, 0);
+  EXPECT_THAT(outcome.err, HasSubstr("gp2: last.json holds the best so far; --start last.json goes on from there"));
+  EXPECT_FALSE(desk.has("fit.json"));
+  desk.done("gp2 predict last.json --states log.csv -o prediction.csv");
 }
 
 TEST_F(ManyRanks, AreForFitsOnly) {

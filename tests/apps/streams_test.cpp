@@ -80,6 +80,95 @@ TEST_F(Streams, ALogFromAPipeIsPredictedAsItsFile) {
   EXPECT_NE(desk.read("file.csv"), "");
 }
 
+// Each command by names of files, and with - for one of them: the same is written and printed.
+TEST_F(Streams, ADashIsStandardInputOrOutputInEveryCommand) {
+  desk.done(fit_line);
+  desk.done("gp2 simulate models/surface.toml --start q1=0.3,dq2=0.5 --t-end 1 --dt 0.01 -o motion.csv");
+  desk.done("gp2 generate models/unicycle.toml --n 20 -o unicycle.csv");
+  struct Case {
+    std::string line;   // with IN for the file that is read
+    std::string input;  // OUT: what is written
+  };
+  const std::string start = "--start q1=0.3,dq2=0.5 --t-end 0.2 ";
+  for (const auto& [line, input] : {
+           Case{"gp2 show IN", "models/surface.toml"},
+           Case{"gp2 check IN --data train.csv", "models/surface.toml"},
+           Case{"gp2 check models/surface.toml --data IN", "train.csv"},
+           Case{"gp2 generate IN --n 5 -o OUT", "models/surface.toml"},
+           Case{"gp2 derive IN --model models/surface.toml -o OUT", "motion.csv"},
+           Case{"gp2 resample IN --model models/surface.toml -n 5 -o OUT", "train.csv"},
+           Case{"gp2 predict fit.json --states IN --cov std -o OUT", "train.csv"},
+           Case{"gp2 predict IN --states train.csv -o OUT", "fit.json"},
+           Case{"gp2 simulate IN " + start + "-o OUT", "fit.json"},
+           Case{"gp2 simulate IN " + start + "-o OUT", "models/surface.toml"},
+           Case{"gp2 simulate fit.json " + start + "--system IN -o OUT", "models/surface.toml"},
+           Case{"gp2 simulate fit.json --start IN --t-start 0 --t-end 0.2 -o OUT", "motion.csv"},
+           Case{"gp2 evaluate fit.json --data IN", "train.csv"},
+           Case{"gp2 evaluate IN --data train.csv --json", "fit.json"},
+           Case{"gp2 update IN --data train.csv -o OUT", "fit.json"},
+           Case{"gp2 report IN -o OUT", "fit.json"},
+           Case{"gp2 export IN --name surface -o folder && cat folder/surface.c", "fit.json"},
+       }) {
+    SCOPED_TRACE(line);
+    const auto filled = [&, &line = line](const std::string& in, const std::string& out) {
+      std::string text = line;
+      text.replace(text.find("IN"), 2, in);
+      if (const std::size_t at = text.find("OUT"); at != std::string::npos) text.replace(at, 3, out);
+      return text;
+    };
+    // what names a file, when it was written
+    const auto neutral = [&, &input = input](std::string text) {
+      for (const std::string& name : {input, std::string("/dev/stdin")}) {
+        for (std::size_t at = text.find(name); at != std::string::npos; at = text.find(name))
+          text.replace(at, name.size(), "FILE");
+      }
+      const std::size_t date = text.find("\"file_date\":\"");
+      if (date != std::string::npos) text.erase(date, 25);
+      return text;
+    };
+    const bool is_written = line.find("OUT") != std::string::npos;
+    desk.done("rm -f by_name");
+    const Outcome by_name = desk.done(filled(input, "by_name"));
+    const std::string expected = neutral(is_written ? desk.read("by_name") : by_name.out);
+    EXPECT_FALSE(expected.empty());
+    EXPECT_EQ(neutral(desk.done("cat " + input + " | { " + filled("-", "-") + "; }").out), expected);
+    EXPECT_EQ(neutral(desk.done("{ " + filled("-", "-") + "; } <" + input).out), expected);
+  }
+
+  // a fit says how long it took
+  const Outcome piped = desk.done("cat train.csv | gp2 fit models/surface.toml --data - --restarts 1 --max-iterations 3 -o -");
+  EXPECT_EQ(piped.json()["hyperparameters"], desk.json("fit.json")["hyperparameters"]);
+  EXPECT_THAT(piped.err, HasSubstr("negative log likelihood"));
+  desk.done(
+      "gp2 fit models/surface.toml --data -@models/surface.toml --data train.csv --max-iterations 0 -o two.json <train.csv");
+  EXPECT_EQ(desk.json("two.json")["data_source"], "/dev/stdin@models/surface.toml, train.csv");
+}
+
+TEST_F(Streams, WhatElseStandsInAFileOfStandardOutputStays) {
+  desk.done(
+      "{ echo before; gp2 generate models/surface.toml --n 2 -o -; echo after; } >both.csv; gp2 generate models/surface.toml --n "
+      "2 -o one.csv");
+  EXPECT_EQ(desk.read("both.csv"), "before\n" + desk.read("one.csv") + "after\n");
+}
+
+TEST_F(Streams, OneStreamIsOneFile) {
+  desk.done(fit_line);
+  const auto refusal = [&](const std::string& line) {
+    const Outcome outcome = desk.run(line + " <train.csv");
+    EXPECT_EQ(outcome.status, 2) << line;
+    return outcome.err;
+  };
+  EXPECT_THAT(refusal("gp2 predict - --states - -o out.csv"),
+              HasSubstr("standard input is read once, but - stands for several files: name all others"));
+  EXPECT_THAT(refusal("gp2 fit models/surface.toml --data - --json -o -"),
+              HasSubstr("--json prints to standard output, which is the file too: name a file"));
+  EXPECT_THAT(refusal("gp2 fit models/surface.toml --raw train.csv --smoothed - -o -"),
+              HasSubstr("standard output is one file, but - stands for several: name all others"));
+  EXPECT_THAT(refusal("gp2 fit models/surface.toml --data - --checkpoint - -o out.json"),
+              HasSubstr("--checkpoint - is written again and again: name a file"));
+  EXPECT_THAT(refusal("gp2 export fit.json -o -"), HasSubstr("cannot be made"));
+}
+
 TEST_F(Streams, ALogThatChangesBetweenReadingAndWritingIsRefused) {
   desk.done(fit_line);
   desk.done("gp2 generate models/surface.toml --n 3000 -o long.csv && mkfifo prediction");

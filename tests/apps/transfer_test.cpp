@@ -5,6 +5,7 @@
 
 #include "apps/command_line.hpp"
 #include "gp2/jobs/fit_problem.hpp"
+#include "gp2/jobs/report_job.hpp"
 
 // Other systems, several logs and other views, from the command line: what it writes is what the library computes.
 namespace gp2::test {
@@ -56,6 +57,7 @@ TEST_F(Transfer, PredictsUnderAnotherSystem) {
   for (const auto& [word, quantity, names] :
        {Case{"constrained", View::Quantity::constrained_acceleration, ddq},
         Case{"unconstrained", View::Quantity::unconstrained_acceleration, {"abar_q1", "abar_q2", "abar_q3"}},
+        Case{"force", View::Quantity::learned_force, {"force_q1", "force_q2", "force_q3"}},
         Case{"multipliers", View::Quantity::multipliers, {"lambda1"}}}) {
     SCOPED_TRACE(word);
     desk.done("gp2 predict fit.json --system other.toml --states test.csv --cov std -o there.csv --view " + word);
@@ -85,6 +87,53 @@ TEST_F(Transfer, EvaluatesWithTheConstraintOfTheOtherSystem) {
   const nlohmann::json there = desk.done(evaluate + " --system other.toml").json(), here = desk.done(evaluate).json();
   EXPECT_LT(there["max_constraint_error"], 1e-12);
   EXPECT_LT(there["nrmse"], here["nrmse"]);
+}
+
+// the motion is on the other constraint, and its accelerations and multipliers are those that predict tells along it
+TEST_F(Transfer, SimulatesTheOtherSystem) {
+  static_cast<void>(fit("--data train.csv"));
+  const std::string simulate = "gp2 simulate fit.json --start q1=0.4,q2=-0.3,dq1=0.5 --t-end 0.5 --dt 0.1 --json ";
+  const nlohmann::json report = desk.done(simulate + "--system other.toml -o motion.csv").json();
+  EXPECT_LT(report["max_position_drift"], 1e-12);
+  EXPECT_LT(report["max_velocity_drift"], 1e-11);
+  desk.done("gp2 predict fit.json --system other.toml --states motion.csv --cov std -o ddq.csv");
+  desk.done("gp2 predict fit.json --system other.toml --states motion.csv --view multipliers -o lambda.csv");
+  const std::vector<std::string> stddevs = {"ddq1_std", "ddq2_std", "ddq3_std"}, lambda = {"lambda1"};
+  const auto expect_equal = [&](const std::string& file, const std::vector<std::string>& names) {
+    const MatrixXd predicted = columns(desk.table(file), names), along = columns(desk.table("motion.csv"), names);
+    EXPECT_LE((predicted - along).cwiseAbs().maxCoeff(), 1e-11 * (1 + predicted.cwiseAbs().maxCoeff())) << file;
+  };
+  expect_equal("ddq.csv", ddq);
+  expect_equal("ddq.csv", stddevs);
+  expect_equal("lambda.csv", lambda);
+
+  desk.done(simulate + "-o here.csv");
+  EXPECT_GT((columns(desk.table("here.csv"), {"q3"}) - columns(desk.table("motion.csv"), {"q3"})).norm(), 0.01);
+  desk.done(simulate + "--system models/surface.toml -o same.csv");
+  EXPECT_EQ(desk.read("same.csv"), desk.read("here.csv"));
+  EXPECT_THAT(refusal("gp2 simulate other.toml --system models/surface.toml --start q1=0 --t-end 1 -o x.csv"),
+              HasSubstr("--system goes with a FIT.json; other.toml is a model: simulate models/surface.toml itself"));
+}
+
+TEST_F(Transfer, ReportsOnATestOfTheOtherSystem) {
+  static_cast<void>(fit("--data train.csv"));
+  const nlohmann::json figures = desk.done("gp2 evaluate fit.json --data test.csv --system other.toml --json").json();
+  ReportOptions options;
+  options.fit = desk / "fit.json";
+  options.data = desk / "test.csv";
+  options.system = options.truth = desk / "other.toml";
+  std::vector<std::string> notes;
+  const Report report = collect_report(options, notes);
+  ASSERT_EQ(report.data.size(), 2U);
+  EXPECT_EQ(report.data[1].evaluation.nrmse, figures["nrmse"]);
+  EXPECT_LT(report.data[1].constraint_error.maxCoeff(), 1e-11);
+  // the measurements are without noise, and the truth is of that system alone
+  EXPECT_LE((report.data[1].truth - report.data[1].measured).cwiseAbs().maxCoeff(), 1e-11);
+  EXPECT_EQ(report.data[0].truth.size(), 0);
+  desk.done("gp2 report fit.json --data test.csv --system other.toml --truth other.toml -o report.html");
+  EXPECT_NE(desk.read("report.html").find("test.csv, of '"), std::string::npos);
+  desk.run("gp2 report fit.json --system other.toml -o report.html");
+  EXPECT_THAT(refusal("gp2 report fit.json --system other.toml -o report.html"), HasSubstr("--system requires --data"));
 }
 
 TEST_F(Transfer, PoolsLogsOfSeveralSystems) {

@@ -16,6 +16,7 @@
 #include <fmt/format.h>
 #include <gmock/gmock.h>
 
+#include "base/checksum.hpp"
 #include "gp2/error.hpp"
 #include "io_testing.hpp"
 
@@ -28,6 +29,19 @@ using testing::ElementsAre;
 using testing::EndsWith;
 using testing::HasSubstr;
 using testing::StartsWith;
+
+TEST(CsvFile, IsKnownByItsSizeAndChecksum) {
+  const TemporaryFolder folder;
+  const auto path = folder.write("log.csv", "x,y\n1,2\n\n3,4");
+  const CsvTable table = CsvTable::read(path, CsvTable::Keep::numbers);
+  ASSERT_TRUE(table.file());
+  EXPECT_EQ(table.file()->name, path.string());
+  EXPECT_EQ(table.file()->bytes, 12U);
+  EXPECT_EQ(table.file()->rows, 2);
+  EXPECT_EQ(table.file()->checksum, checksum("x,y\n1,2\n\n3,4"));
+  EXPECT_FALSE(table.first_rows(1).file());
+  EXPECT_FALSE(CsvTable::parse("x\n1\n", "text").file());
+}
 
 CsvTable parse(std::string_view text) { return CsvTable::parse(text, "log.csv"); }
 

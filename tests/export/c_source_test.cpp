@@ -183,7 +183,7 @@ TEST(CSourceTest, HasEveryKernelAndEveryOperation) {
   const Model& model = model_with_every_kernel();
   Problem p;
   p.name = "every kernel";
-  p.prior = make_prior(model, {Prior::Mean::force, std::nullopt, false});
+  p.prior = make_prior(model, {Prior::Mean::force, std::nullopt, false, Discrepancy{{}, Eigen::Vector2d(0.3, 0.7)}});
   RandomStream random(export_seed);
   const MatrixXd states = test::random_matrix(6, 15, random);
   p.observations = {test::observe(model, View::constrained_acceleration(*model.system), states, random)};

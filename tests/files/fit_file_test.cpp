@@ -327,6 +327,19 @@ TEST(FitFile, TheSameFitGivesTheSameBytes) {
   EXPECT_EQ(read_file(folder / "a.json"), read_file(folder / "c.json"));
 }
 
+TEST(FitFile, KnowsTheLogsItWasLearnedFrom) {
+  FitFile fit = fit_of(unicycle());
+  EXPECT_TRUE(written_and_read(fit).logs.empty());
+  fit.logs = {{"a.csv", 123, 4, "0123456789abcdef"}, {"b.csv", 5'000'000'000, 3'000'000'000, "fedcba9876543210"}};
+  const FitFile read = written_and_read(fit);
+  ASSERT_EQ(read.logs.size(), 2U);
+  EXPECT_EQ(read.logs[1].name, "b.csv");
+  EXPECT_EQ(read.logs[1].bytes, 5'000'000'000U);
+  EXPECT_EQ(read.logs[1].rows, 3'000'000'000);
+  EXPECT_TRUE(read.has_learned({"elsewhere.csv", 123, 4, "0123456789abcdef"})) << "it is the content that counts";
+  EXPECT_FALSE(read.has_learned({"a.csv", 123, 4, "0123456789abcdee"}));
+}
+
 TEST(FitFile, TellsWhatWasAskedOfTheFit) {
   FitRequest request;
   const std::string text = options_json(options(request));
@@ -337,10 +350,11 @@ TEST(FitFile, TellsWhatWasAskedOfTheFit) {
 }
 
 class OldFit : public testing::TestWithParam<int> {};
-INSTANTIATE_TEST_SUITE_P(OfFormat, OldFit, testing::Values(1, 2, 4, 5, 6, 7, 8, 9));
+INSTANTIATE_TEST_SUITE_P(OfFormat, OldFit, testing::Values(1, 2, 4, 5, 6, 7, 8, 9, 10));
 
 // written by gp2 when that format was its newest: alone; with a log of another system; with a noise per value; of a robot;
-// without draws; without sums over states; without inducing points; of rows where sums over them stand now
+// without draws; without sums over states; without inducing points; of rows where sums over them stand now; with a
+// discrepancy in every direction, without the logs
 TEST_P(OldFit, IsReadAndWrittenAsTheNewest) {
   const auto path = std::filesystem::path(GP2_SOURCE_DIR) / "tests/files/old_fits" / fmt::format("version_{}.json", GetParam());
   ASSERT_EQ(Json::parse(read_file(path)).at("version"), GetParam());
@@ -406,6 +420,11 @@ class DamagedFit : public testing::Test {
     return test::without_checksum(Json::parse(read_file(folder_ / "whole.json")));
   }();
 };
+
+TEST_F(DamagedFit, LogsWithoutASizeAreRefused) {
+  const Json log = {{"name", "a.csv"}, {"bytes", -1}, {"rows", 4}, {"checksum", "0"}};
+  EXPECT_EQ(error_after([&](Json& json) { json["logs"] = Json::array({log}); }), "-1 stands where a whole number must");
+}
 
 TEST_F(DamagedFit, TheWholeFitIsRead) {
   EXPECT_EQ(error_after([](Json&) {}), "");
@@ -650,7 +669,7 @@ TEST_F(DamagedFit, ValuesOutOfPlaceAreNamed) {
   EXPECT_EQ(error_after([&](Json& json) { observation(json)["rows"] = {-1, 1, 2}; }), "row -1 of a view is outside 0 … 2");
   EXPECT_EQ(error_after([&](Json& json) { observation(json)["rows"] = {0, 1, 1}; }), "row 1 of a view stands twice");
   EXPECT_EQ(error_after([&](Json& json) { observation(json)["rows"] = Json::array(); }), "a view without rows");
-  EXPECT_EQ(error_after([&](Json& json) { observation(json)["view"] = "force"; }), "'force' is no view");
+  EXPECT_EQ(error_after([&](Json& json) { observation(json)["view"] = "velocity"; }), "'velocity' is no view");
   EXPECT_EQ(error_after([&](Json& json) { observation(json)["n"] = 0; }), "0 observations are not possible");
   EXPECT_EQ(error_after([&](Json& json) { observation(json)["n"] = 2000000000; }), "'ddq1' has 6 values, expected 2000000000");
   EXPECT_EQ(error_after([&](Json& json) { observation(json)["n"] = 1e18; }), "1e+18 stands where a whole number must");

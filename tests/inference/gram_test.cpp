@@ -104,8 +104,7 @@ TEST(GramTest, ItsGradientIsThatOfItsValue) {
     Reduced of(p);
     DenseGram gram;
     ASSERT_TRUE(gram.factorise(of.rows).has_value());
-    const std::vector<GramGradientParts> everything(of.rows.latents.size(),
-                                                    {.kernel = true, .columns = true, .V = true, .mean = true});
+    const std::vector<GramGradientParts> everything(of.rows.latents.size(), {.kernel = true, .V = true, .mean = true});
     const GramGradient gradient = gram.differentiate(of.rows, everything);
     for (Index row = 0; row < of.rows.size(); row += 31) {
       double& y = of.reduction.y[row];

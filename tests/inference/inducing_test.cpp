@@ -1,6 +1,7 @@
 #include "gp2/inference/inducing.hpp"
 
 #include <cmath>
+#include <functional>
 #include <numeric>
 #include <stdexcept>
 
@@ -115,6 +116,86 @@ TEST(Inducing, FewPointsGiveABoundThatRisesWithTheirNumber) {
       before = value;
       left_before = choice.left_out;
     }
+  }
+}
+
+/// Problems of a discrepancy that is 0.7 of the noise in every direction.
+std::vector<Problem> problems_of_a_discrepancy(double lengthscale) {
+  std::vector<Problem> problems;
+  for (Problem& p : exact_problems()) {
+    if (!p.name.ends_with(", a discrepancy") || p.observations.size() > 1) continue;
+    p.prior.latents.back().kernel_is_fixed = true;
+    p.values.kernel.back().setConstant(lengthscale);
+    p.values.signal_stddev.back().setConstant(0.7);
+    p.values.noise_stddev[0] = VectorXd::LinSpaced(p.prior.system->nq(), 0.3, 1.7);  // as the discrepancy's deviations
+    problems.push_back(std::move(p));
+  }
+  return problems;
+}
+
+/// With points at every state for the model's latents, and n for the discrepancy.
+Problem with_points_of_discrepancy(Problem p, Index n) {
+  p = with_points(p, all);
+  auto points = std::make_shared<InducingPoints>(*p.values.inducing);
+  points->features.back() = evaluate_features(p.prior, p.prior.latents.size() - 1, p.observations[0].states()).topRows(n).eval();
+  p.values.inducing = points;
+  return p;
+}
+
+// A discrepancy that no two states share is a larger noise: that is what becomes of it where it has no points.
+TEST(Inducing, WhatPointsLeaveOutOfADiscrepancyIsNoise) {
+  const std::vector<Problem> problems = problems_of_a_discrepancy(1e-3);
+  EXPECT_EQ(problems.size(), 3U);
+  for (const Problem& p : problems) {
+    for (const Index n : {0, 3}) {
+      SCOPED_TRACE(fmt::format("{}, {} points, seed {}", p.name, n, inducing_seed));
+      const Problem through = with_points_of_discrepancy(p, n);
+      const test::Evaluated exact = test::evaluate(p), bound = test::evaluate(through);
+      const double tolerance = 1e2 * test::rounding(p) * (1 + std::abs(exact.value));
+      EXPECT_NEAR(bound.value, exact.value, tolerance);
+      for (std::size_t a = 0; a < p.prior.latents.size(); ++a)
+        EXPECT_NEAR(bound.gradient.log_signal_stddev[a].sum(), exact.gradient.log_signal_stddev[a].sum(), 1e2 * tolerance);
+      EXPECT_LE(largest(bound.gradient.log_kernel[0] - exact.gradient.log_kernel[0]), 1e2 * tolerance);
+      EXPECT_LE(largest(bound.gradient.parameters - exact.gradient.parameters),
+                1e2 * tolerance * (1 + largest(exact.gradient.parameters)));
+
+      const Posterior posterior = test::posterior_of(through), exact_posterior = test::posterior_of(p);
+      EXPECT_NEAR(posterior.negative_log_likelihood(), exact.value, tolerance);
+      const View view = View::constrained_acceleration(*p.prior.system);
+      const Posterior::Joint joint = posterior.joint(view, p.queries), expected = exact_posterior.joint(view, p.queries);
+      EXPECT_LE(largest(joint.mean - expected.mean), tolerance * (1 + largest(expected.mean)));
+      EXPECT_LE(largest(joint.covariance - expected.covariance), tolerance * (1 + largest(expected.covariance)));
+      const LeftOut left_out = leave_out(posterior, LeftOut::n_stretches),
+                    wanted = leave_out(exact_posterior, LeftOut::n_stretches);
+      for (const auto part : {&LeaveOneOut::mean, &LeaveOneOut::variance}) {
+        EXPECT_LE(largest(left_out.values[0].*part - wanted.values[0].*part),
+                  1e2 * tolerance * (1 + largest(wanted.values[0].*part)));
+      }
+    }
+  }
+}
+
+TEST(Inducing, TheNoiseOfADiscrepancyHasDerivatives) {
+  for (Problem p : problems_of_a_discrepancy(1)) {
+    p.values.noise_stddev[0].reverseInPlace();  // no longer in proportion to the deviations
+    p = with_points_of_discrepancy(std::move(p), 3);
+    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, inducing_seed));
+    const test::Evaluated at = test::evaluate(p);
+    const auto expect_slope = [&](const char* what, double slope, const std::function<void(Problem&, double)>& move) {
+      const auto moved = [&](double step) {
+        Problem q = p;
+        move(q, step);
+        return test::evaluate(q).value;
+      };
+      // rounding of 1e-12 over a step of 1e-5, and its square
+      EXPECT_NEAR((moved(1e-5) - moved(-1e-5)) / 2e-5, slope, 1e-6 * (1 + std::abs(slope) + std::abs(at.value))) << what;
+    };
+    expect_slope("size", at.gradient.log_signal_stddev.back().sum(),
+                 [](Problem& q, double step) { q.values.signal_stddev.back() *= std::exp(step); });
+    expect_slope("noise", at.gradient.log_noise_stddev[0][0],
+                 [](Problem& q, double step) { q.values.noise_stddev[0][0] *= std::exp(step); });
+    expect_slope("signal", at.gradient.log_signal_stddev[0][0],
+                 [](Problem& q, double step) { q.values.signal_stddev[0][0] *= std::exp(step); });
   }
 }
 

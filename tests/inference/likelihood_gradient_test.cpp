@@ -73,7 +73,7 @@ class LikelihoodGradient : public testing::TestWithParam<std::string> {};
 std::vector<std::string> problem_names() {
   std::vector<std::string> names;
   for (const std::string& file : test::library_models()) names.push_back(test::stem(file));
-  names.insert(names.end(), {"a row that vanishes", "friction"});
+  names.insert(names.end(), {"a row that vanishes", "friction", "a load", "contacts"});
   return names;
 }
 

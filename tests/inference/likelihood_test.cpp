@@ -59,6 +59,37 @@ TEST(LikelihoodTest, KeepsNothingBetweenCallsThatMattersToTheNext) {
   }
 }
 
+// Rows in which a constraint is not active are those of the model without it, and where it is those of the model that has it always.
+TEST(LikelihoodTest, OfAConstraintThatComesAndGoesIsThatOfTheModelWithItOrWithout) {
+  const std::string text = test::model_with_contacts().text;
+  const std::string row = "{ expr = \"z - h*x^2 - 0.2*cos(y)\", when = \"touch > 0.5\" }";
+  for (const bool is_active : {false, true}) {
+    const Model always = Model::parse(test::changed(text, {{row, "\"z - h*x^2 - 0.2*cos(y)\""}}), "always");
+    const Model other = is_active ? always : Model::parse(test::changed(text, {{row, ""}, {"lambda0(1)", "0"}}), "without");
+    // the load of a row that is not there is that of none
+    const Model switched = test::model_with_contacts();
+    RandomStream random(likelihood_seed);
+    MatrixXd states(switched.system->layout().size(), 12);
+    for (double& entry : states.reshaped()) entry = random.normal();
+    states.bottomRows(1).setConstant(is_active ? 1 : 0);
+    const auto likelihood = [&](const Model& model) {
+      RandomStream draws(likelihood_seed + 1);
+      const Prior prior = make_prior(model, {Prior::Mean::force, std::nullopt, false});
+      const std::vector<Observations> data = {
+          test::observe(switched, View::all(View::Quantity::constrained_acceleration, *switched.system), states, draws)};
+      const ModelValues values = test::random_values(prior, data, draws);
+      ModelGradient gradient;
+      Likelihood::Workspace workspace;
+      const double value = Likelihood(prior, data, values, {}).evaluate(values, &gradient, workspace);
+      VectorXd all(1 + gradient.log_kernel[0].size());
+      all << value, gradient.log_kernel[0];
+      return all;
+    };
+    const VectorXd here = likelihood(switched), there = likelihood(other);
+    EXPECT_LE((here - there).lpNorm<Eigen::Infinity>(), 1e-12 * there.lpNorm<Eigen::Infinity>()) << is_active;
+  }
+}
+
 TEST(LikelihoodTest, FactorsOneRowPerFreeDirectionThatIsSeen) {
   const auto reduced_size = [](const std::string& name) {
     for (const Problem& p : test::problems(12, likelihood_seed)) {

@@ -145,6 +145,15 @@ MasslessProblem problem(Prior::Mean mean) {
   return p;
 }
 
+// M is singular and Mā is not the force: only the force itself, of which M'⁻¹ is ā, is left
+TEST(MasslessCoordinate, TheLearnedForceIsThatOfTheLatents) {
+  const MasslessProblem p = problem(Prior::Mean::force);
+  const Posterior prior = Posterior(p.prior, p.observations, p.values).without_data();
+  const MatrixXd stddev = prior.marginal(View::learned_force(*p.prior.system), p.queries).stddev();
+  // three independent forces along the coordinates
+  EXPECT_LE(test::largest(stddev.colwise() - p.values.signal_stddev[0]), 1e-13 * test::largest(stddev));
+}
+
 TEST(MasslessCoordinate, HasTheExactGradientOfTheLikelihoodInEveryParameter) {
   for (const Prior::Mean mean : {Prior::Mean::zero, Prior::Mean::force}) {
     const MasslessProblem p = problem(mean);
@@ -186,7 +195,8 @@ TEST(MasslessCoordinate, IsPredictedByThePredictorAsByThePosteriorAndDifferentia
   for (const Prior::Mean mean : {Prior::Mean::zero, Prior::Mean::force}) {
     const MasslessProblem p = problem(mean);
     const Posterior posterior(p.prior, p.observations, p.values);
-    for (const Quantity quantity : {Quantity::constrained_acceleration, Quantity::constraint_force, Quantity::next_velocity}) {
+    for (const Quantity quantity :
+         {Quantity::constrained_acceleration, Quantity::constraint_force, Quantity::next_velocity, Quantity::learned_force}) {
       for (const std::optional<int>& latent : {std::optional<int>(), std::optional(0)}) {
         View view = View::all(quantity, *p.prior.system);
         view.time_step = 0.1;

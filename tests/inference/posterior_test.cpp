@@ -19,9 +19,10 @@ constexpr std::uint64_t posterior_seed = 40403;
 // views of a problem's system to predict: everything, and some rows in another order
 std::vector<View> views_of(const Problem& p) {
   const System& system = *p.prior.system;
-  std::vector<View> views = {
-      View::all(Quantity::constrained_acceleration, system), View::all(Quantity::unconstrained_acceleration, system),
-      View{Quantity::constrained_acceleration, {system.nq() - 1, 0}}, View::all(Quantity::constraint_force, system)};
+  std::vector<View> views = {View::all(Quantity::constrained_acceleration, system),
+                             View::all(Quantity::unconstrained_acceleration, system),
+                             View{Quantity::constrained_acceleration, {system.nq() - 1, 0}},
+                             View::all(Quantity::constraint_force, system), View::learned_force(system)};
   if (system.nc() > 0) views.push_back(View::all(Quantity::multipliers, system));
   if (!p.queries.middleRows(system.nq(), system.nq()).hasNaN()) {
     views.push_back(View::all(Quantity::next_velocity, system));
@@ -95,6 +96,34 @@ TEST(PosteriorTest, TheLatentsAddUpToTheWhole) {
       sum += posterior.mean(view, p.queries);
     }
     EXPECT_LE(test::largest(sum - whole), 1e-13 * (1 + test::largest(whole) + test::largest(sum)));
+  }
+}
+
+// M(ā − μ), with its covariance, and the sum of what each latent adds
+TEST(PosteriorTest, TheLearnedForceIsMTimesWhatTheLatentsAddToTheAcceleration) {
+  for (const Problem& p : test::problems(9, posterior_seed)) {
+    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, posterior_seed));
+    const System& system = *p.prior.system;
+    const Posterior posterior(p.prior, p.observations, p.values);
+    const Posterior::Marginal a_bar = posterior.marginal(View::unconstrained_acceleration(system), p.queries);
+    const Posterior::Marginal force = posterior.marginal(View::learned_force(system), p.queries);
+    const MechanicsBatch mechanics = require_mechanics(system, p.queries, p.values.parameters);
+    const MatrixXd mu = evaluate_prior(p.prior, p.queries, p.values.parameters, mechanics).mean;
+    MatrixXd sum = MatrixXd::Zero(force.mean.rows(), force.mean.cols());
+    for (std::size_t a = 0; a < p.prior.latents.size(); ++a) {
+      View alone = View::learned_force(system);
+      alone.latent = static_cast<int>(a);
+      sum += posterior.mean(alone, p.queries);
+    }
+    const double rounding = 1e-12 * (1 + test::largest(mechanics.values.mass) * (test::largest(a_bar.mean) + test::largest(mu)));
+    EXPECT_LE(test::largest(sum - force.mean), rounding + 1e-13 * test::largest(sum));
+    const Index nq = system.nq();
+    for (int i = 0; i < static_cast<int>(p.queries.cols()); ++i) {
+      const auto M = mechanics.values.M(i);
+      EXPECT_LE(test::largest(M * (a_bar.mean.col(i) - mu.col(i)) - force.mean.col(i)), rounding);
+      const MatrixXd expected = M * a_bar.covariance.col(i).reshaped(nq, nq) * M;
+      EXPECT_LE(test::largest(expected - force.covariance.col(i).reshaped(nq, nq)), 1e-11 * (1 + test::largest(expected)));
+    }
   }
 }
 

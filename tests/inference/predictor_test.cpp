@@ -116,6 +116,9 @@ TEST(PredictorTest, DifferentiatesExactly) {
     for (const View& view : predicted_views_of(p)) {
       const Predictor predictor(posterior, view);
       Predictor::Workspace workspace = predictor.make_workspace();
+      const bool is_zero = view.latent &&
+                           p.prior.latents[static_cast<std::size_t>(view.latent->first)].base == Latent::Base::admissible &&
+                           (view.quantity == Quantity::constraint_force || view.quantity == Quantity::multipliers);
       for (Index i = 0; i < 2; ++i) {
         SCOPED_TRACE(fmt::format("{}, state {}", describe(p, view), i));
         // off the constraint too
@@ -130,6 +133,12 @@ TEST(PredictorTest, DifferentiatesExactly) {
             EXPECT_EQ(predictor.mean(moved, mean, workspace), Status::ok);
             return mean;
           };
+          // What the constraint admits needs no force of it: rounding, and more of it in the multipliers of a row that nearly vanishes.
+          if (is_zero) {
+            EXPECT_LE(largest(prediction.jacobian.col(k)), 1e6 * eps);
+            EXPECT_LE(largest(mean_at(state[k])), 1e6 * eps);
+            continue;
+          }
           EXPECT_TRUE(matches(prediction.jacobian.col(k), test::central_difference(mean_at, state[k], 0.02, 1e3 * eps)))
               << "entry " << k << " of the state";
         }

@@ -61,6 +61,47 @@ directions = [["c^2*dx + k"], ["m"]]
   return model;
 }
 
+const Model& model_with_a_load() {
+  static const Model model = Model::parse(R"toml(
+name        = "runner on a bank"
+coordinates = ["x", "y", "z", { name = "heading", angle = true }]
+inputs      = ["u"]
+[parameters]
+m = 2.0
+e = 0.3
+h = 0.4
+c = 0.7
+[let]
+load = "sqrt(lambda0(1)^2 + c)"
+side = "lambda0(2)"
+[mechanics]
+mass  = [["m", "0", "0", "e*cos(heading)"], ["0", "m", "0", "e"], ["0", "0", "m", "0"], ["e*cos(heading)", "e", "0", "1"]]
+force = ["u*cos(heading) - c*dx*abs(dx)", "u*sin(heading)", "-9.81*m", "-m*dheading"]
+[constraints]
+position = ["z - h*x^2 - 0.2*y^2"]
+velocity = ["dx*sin(heading) - dy*cos(heading) + e*dheading"]
+[[latent]]
+name       = "friction"
+kernel     = "se + linear"
+features   = ["dx", "heading"]
+directions = { force = [["-load*dx", "0"], ["-load*dy", "side"], ["-load*dz", "0"], ["c", "m*side*dheading"]] }
+[[latent]]
+name       = "wear"
+kernel     = "matern52"
+features   = ["lambda0(1)/m", "dx*lambda0(2)"]
+directions = [["c*side"], ["0"], ["1"], ["lambda0(1) + m"]]
+)toml",
+                                          "runner on a bank");
+  return model;
+}
+
+const Model& another_bank() {
+  static const Model other = Model::parse(
+      changed(model_with_a_load().text, {{"m = 2.0", "m = 2.6"}, {"h = 0.4", "h = 0.3"}, {"z - h*x^2", "z - h*x^2 + 0.1*x^3"}}),
+      "another bank");
+  return other;
+}
+
 const Model& model_with_a_slipping_wheel() {
   static const Model model = Model::parse(R"toml(
 name        = "slipping wheels"
@@ -84,6 +125,34 @@ features   = ["dx", "dheading"]
 directions = "acceleration"
 )toml",
                                           "slipping wheels");
+  return model;
+}
+
+const Model& model_with_contacts() {
+  static const Model model = Model::parse(R"toml(
+name        = "contacts"
+coordinates = ["x", "y", "z", "w"]
+inputs      = ["touch"]
+[parameters]
+m = 2.0
+h = 0.3
+c = 0.7
+[let]
+load = "sqrt(1 + lambda0(1)^2)"
+[mechanics]
+mass  = [["m", "0", "0.2", "0"], ["0", "m", "0", "0.1*sin(x)"], ["0.2", "0", "1.4", "0"], ["0", "0.1*sin(x)", "0", "0.8"]]
+force = ["-c*dx", "-c*y", "-m*9.81", "0.3*w"]
+[constraints]
+position     = [{ expr = "z - h*x^2 - 0.2*cos(y)", when = "touch > 0.5" }]
+velocity     = [{ expr = "dy + c*x*dw", when = "2*x >= w - 0.3" }]
+acceleration = [{ expr = "m*ddw - ddx*y - z", when = "dz < 0.2", noise = 0.3 }]
+[[latent]]
+name       = "friction"
+kernel     = "se"
+features   = ["dx", "dy"]
+directions = { force = [["-load*dx", "0"], ["0.4*load", "0"], ["0", "1"], ["0", "x"]] }
+)toml",
+                                          "contacts");
   return model;
 }
 
@@ -177,6 +246,7 @@ std::vector<Problem> problems(int n, std::uint64_t seed) {
                        const std::vector<View>& views) {
     RandomStream random(seed, ++stream);
     Problem problem{name, make_prior(model, options), {}, {}, states.rightCols(3), {}};
+    for (Latent& latent : problem.prior.latents) latent.kernel_is_fixed = false;  // that of a discrepancy has derivatives too
     // a different part of the states for each view
     const Index per_view = (states.cols() - 3) / static_cast<Index>(views.size());
     for (std::size_t v = 0; v < views.size(); ++v) {
@@ -211,6 +281,11 @@ std::vector<Problem> problems(int n, std::uint64_t seed) {
     add(name + ", two rows in another order and the unconstrained acceleration", m, {}, states,
         {View{Quantity::constrained_acceleration, {last, 0}}, a_bar});
     add(name + ", unconstrained acceleration", m, {}, states, {a_bar});
+    if (m.latents.size() == 1 && m.latents[0].base == Latent::Base::acceleration) {
+      PriorOptions options;
+      options.discrepancy = Discrepancy{{}, VectorXd::LinSpaced(last + 1, 0.3, 1.7)};
+      add(name + ", a discrepancy", m, options, states, {ddq});
+    }
     if (m.latents.size() == 1) {
       add(name + ", prior on the other base", m,
           {Prior::Mean::force, m.latents[0].base == Latent::Base::force ? Latent::Base::acceleration : Latent::Base::force,
@@ -230,7 +305,8 @@ std::vector<Problem> problems(int n, std::uint64_t seed) {
     const Model& m = model_with_a_vanishing_row();
     add("a row that vanishes at some states", m, {mean, std::nullopt, false}, vanishing,
         {View::all(Quantity::constrained_acceleration, *m.system)});
-    add("a row that vanishes at some states, two rows and all", m, {mean, std::nullopt, false}, vanishing,
+    add("a row that vanishes at some states, two rows and all, a discrepancy", m,
+        {mean, std::nullopt, false, Discrepancy{{}, VectorXd::LinSpaced(m.system->nq(), 0.3, 1.7)}}, vanishing,
         {View{Quantity::constrained_acceleration, {1, 0}}, View::all(Quantity::constrained_acceleration, *m.system)});
   }
   for (Prior::Mean mean : {Prior::Mean::zero, Prior::Mean::force}) {
@@ -284,6 +360,24 @@ std::vector<Problem> problems(int n, std::uint64_t seed) {
     if (m.system->nc() > 0 && Eigen::ColPivHouseholderQR<MatrixXd>(values.A(0)).rank() == m.system->nc()) {
       add(name + ", multipliers", m, {}, states, {View::all(Quantity::multipliers, *m.system)});
     }
+  }
+  for (Prior::Mean mean : {Prior::Mean::zero, Prior::Mean::force}) {
+    const Model& m = model_with_a_load();
+    const PriorOptions options{mean, std::nullopt, false};
+    const View ddq = View::all(Quantity::constrained_acceleration, *m.system);
+    const auto elsewhere = make_other_system(m, another_bank(), options);
+    add("a load, pooled with another bank", m, options, random_states(m),
+        {ddq, under(ddq, elsewhere), View::all(Quantity::constraint_force, *m.system)});
+  }
+  for (Prior::Mean mean : {Prior::Mean::zero, Prior::Mean::force}) {
+    const Model& m = model_with_contacts();
+    MatrixXd states = random_states(m);
+    for (Index i = 0; i < states.cols(); ++i) states(states.rows() - 1, i) = static_cast<double>(i % 2);
+    const PriorOptions options{mean, std::nullopt, false};
+    const View ddq = View::all(Quantity::constrained_acceleration, *m.system);
+    add("contacts", m, options, states, {ddq});
+    add("contacts, multipliers and a force of constraints", m, options, states,
+        {View::all(Quantity::multipliers, *m.system), View{Quantity::constraint_force, {0, 2}}});
   }
   return all;
 }
@@ -345,13 +439,15 @@ DenseView dense_view(const Prior& home, const ModelValues& values, const View& v
       all_G = *view.time_step * T;
       all_d = states.col(i).segment(nq, nq).cast<long double>() + *view.time_step * Lb;
       all_N = *view.time_step * Lslip;
+    } else if (view.quantity == Quantity::learned_force) {
+      all_G = M;
     }
     dense.slip.push_back(view.latent ? Extended(Extended::Zero(view.size(), A.rows())) : Extended(all_N(view.rows, Eigen::all)));
     const Extended G = all_G(view.rows, Eigen::all);
     const ExtendedVector offset =
         view.latent ? ExtendedVector(ExtendedVector::Zero(view.size())) : ExtendedVector(all_d(view.rows));
     ExtendedVector mean = ExtendedVector::Zero(nq);
-    if (prior.mean == Prior::Mean::force && !view.latent) mean = M_inverse * mechanics.F(i).cast<long double>();
+    if (prior.mean == Prior::Mean::force && view.has_mean()) mean = M_inverse * mechanics.F(i).cast<long double>();
     dense.mean.segment(i * view.size(), view.size()) = G * mean + offset;
     std::vector<Extended>& loadings = dense.loading.emplace_back();
     for (std::size_t a = 0; a < prior.latents.size(); ++a) {
@@ -362,6 +458,7 @@ DenseView dense_view(const Prior& home, const ModelValues& values, const View& v
         E = Extended(entries.reshaped(nq, latent.size()).cast<long double>());
       }
       if (latent.base == Latent::Base::force) E = M_inverse * E;
+      if (latent.base == Latent::Base::admissible) E -= E * pseudo_inverse(A * E) * (A * E);
       if (!view.has_latent(a)) E.setZero();
       loadings.push_back(G * E * values.signal_stddev[a].cast<long double>().asDiagonal());
     }

@@ -39,11 +39,20 @@ const Model& model_with_a_vanishing_row();
 /// Quadratic friction whose speed has no derivative at rest, with two latents, and a parameter everywhere.
 const Model& model_with_friction();
 
+/// Latents whose directions and features read λ₀ of two constraints, on a mass matrix and forces with parameters.
+const Model& model_with_a_load();
+
+/// The same on another bank, with another mass.
+const Model& another_bank();
+
 /// `text` with every `from` changed to `to`.
 std::string changed(std::string text, const std::vector<std::pair<std::string, std::string>>& changes);
 
 /// Two wheels' constraints, one of which slips, that share a length, and an exact one.
 const Model& model_with_a_slipping_wheel();
+
+/// Constraints of all levels that come and go by an input and by the state, one of which slips, and a load that reads their λ₀.
+const Model& model_with_contacts();
 
 /// Another, heavier particle on another surface; m, p1 and p5 are those of models/surface.toml.
 const Model& another_surface();

@@ -293,7 +293,8 @@ TEST(Excitation, IsWhatSimulateMakesOfItsInputs) {
   request.inputs = as_table(found.motion, *bench.model.system, "next.csv");
   request.start = *request.inputs;
   request.times = found.motion.times;
-  const Trajectory motion = run_simulation(prepare_simulation(bench.model, bench.fit.posterior, request)).front();
+  const FitSystem system{&bench.model, bench.model.actuators, nullptr, bench.fit.posterior.prior()};
+  const Trajectory motion = run_simulation(prepare_simulation(system, bench.fit.posterior, request)).front();
   EXPECT_LT((motion.states - found.motion.states).cwiseAbs().maxCoeff(), 1e-6);
 }
 

@@ -103,6 +103,21 @@ TEST(InducingFit, TellsWhatIsLeftOutAndItsFileGivesItAgain) {
   EXPECT_EQ(again.posterior.mean(view, states), outcome.posterior.mean(view, states));
 }
 
+TEST(InducingFit, ItsCheckpointIsTheBestSoFarOfAllRows) {
+  const test::TemporaryFolder folder;
+  FitRequest request = request_of_rows(1200);
+  request.inducing = 40;
+  request.thin = false;
+  request.checkpoint = folder / "last.json";
+  const FitOutcome outcome = run_fit(prepare_fit(std::move(request)));
+  EXPECT_GT(outcome.file.report.inducing->n_start, 0);
+  const FitFile last = FitFile::read(folder / "last.json");
+  EXPECT_EQ(last.report.termination, FitReport::interrupted);
+  EXPECT_EQ(last.n_states(), outcome.file.n_states());
+  EXPECT_EQ(last.report.objective, outcome.file.report.objective);
+  EXPECT_NEAR(last.posterior().negative_log_likelihood(), last.report.negative_log_likelihood, 1e-3);
+}
+
 TEST(InducingFit, AFileOfManyRowsHoldsWhatTheySayAndSomeOfThem) {
   FitRequest request = request_of_rows(6000);
   request.inducing = 40;

@@ -2,9 +2,11 @@
 
 #include <fmt/format.h>
 #include <gmock/gmock.h>
+#include <Eigen/QR>
 #include <nlohmann/json.hpp>
 
 #include "gp2/jobs/fit_problem.hpp"
+#include "gp2/predictor.hpp"
 #include "gp2/simulation/generate.hpp"
 #include "io_testing.hpp"
 #include "test_models.hpp"
@@ -178,11 +180,129 @@ TEST(Discrepancy, StandsBesideSeveralLatentsOfWhichOneActsInEveryDirection) {
 
 // ---- how large it is
 
-TEST(Discrepancy, HasAShareOfTheNoiseAndOfTheSpreadOfEachFeature) {
+/// The discrepancy's variance along the one free direction of a bead, in units of the noise as measured; per state.
+VectorXd variance_in_noise(const FitProblem& problem, const Eigen::Vector2d& noise) {
+  const View alone = view_of(problem.prior, Quantity::constrained_acceleration, 1);
+  const MatrixXd& states = problem.observations.front().states();
+  const MatrixXd covariance = start_of(problem).without_data().joint(alone, states).covariance;
+  VectorXd variance(states.cols());
+  for (Index i = 0; i < states.cols(); ++i)
+    variance[i] = covariance.diagonal().segment(2 * i, 2).cwiseQuotient(noise.cwiseAbs2()).sum();
+  return variance;
+}
+
+constexpr double start = Protocol::Standard::discrepancy_median;  // of the noise
+
+TEST(Discrepancy, IsAsLargeBesideTheNoiseWhateverTheConstraintPassesOn) {
+  for (const char* slope : {"0.05", "1", "30"}) {
+    for (const char* noise : {"[0.1, 0.1]", "[0.1, 3]"}) {
+      const FitProblem problem =
+          problem_of(bead("directions = \"acceleration\"\n", fmt::format("ddq = {}", noise), fmt::format("y - {}*x", slope)));
+      const VectorXd variance = variance_in_noise(problem, problem.observations.front().noise().stddev());
+      EXPECT_LE((variance.array() / (start * start) - 1).abs().maxCoeff(), 1e-12) << slope << " " << noise;
+    }
+  }
+  // where the direction of the wire changes too
+  const VectorXd variance = variance_in_noise(problem_of(bead()), {0.1, 0.3});
+  EXPECT_LE((variance.array() / (start * start) - 1).abs().maxCoeff(), 1e-12);
+}
+
+/// E of the discrepancy at each state, side by side, under the parameters given.
+MatrixXd directions_of(const Prior& prior, const MatrixXd& states, const VectorXd& parameters) {
+  const MechanicsBatch mechanics = require_mechanics(*prior.system, states, parameters);
+  const PriorValues values = require_prior_values(prior, states, parameters, mechanics);
+  return values.directions.back().reshaped(prior.system->nq(), prior.system->nq() * states.cols());
+}
+
+TEST(Discrepancy, IsDistributedAsTheNoiseIsGivenThatItObeysTheConstraint) {
+  for (const char* name : {"surface", "unicycle", "slider_crank", "double_pendulum", "duffing"}) {
+    SCOPED_TRACE(name);
+    const Model& model = test::model(fmt::format("models/{}.toml", name));
+    const FitProblem problem = problem_of(model);
+    const MatrixXd states = some_states(model);
+    const VectorXd parameters = model.system->parameter_values();
+    const MechanicsBatch mechanics = require_mechanics(*model.system, states, parameters);
+    const MatrixXd all = directions_of(problem.prior, states, parameters);
+    const MatrixXd N = problem.prior_options.discrepancy->stddev.asDiagonal();
+    const Index nq = N.rows();
+    for (int i = 0; i < states.cols(); ++i) {
+      const MatrixXd A = mechanics.values.A(i), E = all.middleCols(i * nq, nq), AN = A * N;
+      // cov(ε | A ε = 0) of ε ~ N(0, N²)
+      const MatrixXd conditional = N * N - N * (AN.completeOrthogonalDecomposition().pseudoInverse() * AN) * N;
+      EXPECT_LE((E * E.transpose() - conditional).cwiseAbs().maxCoeff(), 100 * eps * N.squaredNorm());
+      EXPECT_LE((A * E).cwiseAbs().maxCoeff(), 100 * eps * A.norm() * N.norm());
+    }
+  }
+}
+
+TEST(Discrepancy, FollowsTheParametersOfTheConstraintAndTheState) {
+  const std::string text = bead("").text, stated = "\"y - 0.7*x^2\"";
+  // once, and twice: rows that are redundant
+  for (const char* wire : {"\"y - p*x^2\"", "\"y - p*x^2\", \"2*y - 2*p*x^2\""}) {
+    std::string with = text;
+    with.replace(with.find(stated), stated.size(), wire);
+    with.insert(with.find("[mechanics]"), "[parameters]\np = 0.7\n");
+    const Model model = Model::parse(with, "bead.toml");
+    const FitProblem problem = problem_of(model);
+    const MatrixXd states = some_states(model);
+    const VectorXd p = model.system->parameter_values();
+    const auto at = [&](double step) { return directions_of(problem.prior, states, p + VectorXd::Constant(1, step)); };
+    const MechanicsBatch here = require_mechanics(*model.system, states, p);
+    const PriorValues derivative =
+        differentiate_prior(problem.prior, states, p, here, require_prior_values(problem.prior, states, p, here),
+                            model.system->differentiate(states, p, 0), 0);
+    // rounding over a step of 1e-5, and its square
+    const MatrixXd differences = (at(1e-5) - at(-1e-5)) / 2e-5;
+    EXPECT_GT(differences.cwiseAbs().maxCoeff(), 1e-3);
+    EXPECT_LE((derivative.directions.back().reshaped(2, 2 * states.cols()) - differences).cwiseAbs().maxCoeff(), 1e-9);
+
+    // of the discrepancy alone, so that nothing hides its part of the derivatives
+    const Posterior posterior = start_of(problem);
+    for (const Quantity quantity : {Quantity::constrained_acceleration, Quantity::unconstrained_acceleration}) {
+      const View view = view_of(problem.prior, quantity, 1);
+      const Predictor predictor(posterior, view, {true, true, Predictor::Storage::double_precision});
+      Predictor::Workspace workspace = predictor.make_workspace();
+      VectorXd mean(2), stddev(2), ahead(2), behind(2);
+      MatrixXd jacobian(2, states.rows());
+      for (Index i = 0; i < states.cols(); ++i) {
+        const VectorXd x = states.col(i);
+        ASSERT_EQ(predictor.mean_and_jacobian(x, mean, jacobian, workspace), Predictor::Status::ok);
+        ASSERT_EQ(predictor.mean_and_stddev(x, mean, stddev, workspace), Predictor::Status::ok);
+        EXPECT_LE((mean - posterior.mean(view, x)).norm(), 1e-12);
+        const MatrixXd covariance = posterior.marginal(view, x).covariance.reshaped(2, 2);
+        EXPECT_LE((stddev.cwiseAbs2() - covariance.diagonal()).norm(), 1e-14);
+        for (Index k = 0; k < x.size(); ++k) {
+          const VectorXd step = 1e-5 * VectorXd::Unit(x.size(), k);
+          ASSERT_EQ(predictor.mean(x + step, ahead, workspace), Predictor::Status::ok);
+          ASSERT_EQ(predictor.mean(x - step, behind, workspace), Predictor::Status::ok);
+          EXPECT_LE((jacobian.col(k) - (ahead - behind) / 2e-5).norm(), 1e-8) << k;
+        }
+      }
+    }
+  }
+}
+
+TEST(Discrepancy, HasAUsableDeviationInEveryModel) {
+  for (const char* name : {"surface", "unicycle", "slider_crank", "double_pendulum", "duffing"}) {
+    const Model& model = test::model(fmt::format("models/{}.toml", name));
+    const VectorXd stddev = problem_of(model).prior_options.discrepancy.value().stddev;
+    EXPECT_TRUE(stddev.allFinite() && (stddev.array() > 0).all()) << name << ": " << stddev.transpose();
+  }
+}
+
+TEST(Discrepancy, HasOneSizeThatIsLearned) {
+  const FitProblem problem = problem_of(bead());
+  const Hyperparameter& size = problem.hyperparameters.back();
+  EXPECT_EQ(size.name, "discrepancy.size");
+  EXPECT_EQ(size.value, start);
+  const ModelValues values = model_values(problem.prior, problem.observations, problem.hyperparameters);
+  EXPECT_EQ(values.signal_stddev.back(), VectorXd::Constant(2, start));
+}
+
+TEST(Discrepancy, HasAShareOfTheSpreadOfEachFeature) {
   const Model model = bead();
   const FitProblem problem = problem_of(model);
   const Discrepancy& discrepancy = *problem.prior_options.discrepancy;
-  EXPECT_EQ(discrepancy.stddev, 0.4 * Eigen::Vector2d(0.1, 0.3));
   // the features are entries of the state
   const MatrixXd& states = problem.observations.front().states();
   const StateLayout layout = model.system->layout();
@@ -203,11 +323,13 @@ TEST(Discrepancy, IsASquaredExponentialOfTheseSizes) {
   const MatrixXd covariance = start_of(problem).without_data().joint(alone, states).covariance;
   const StateLayout layout = model.system->layout();
   const std::vector<int> features = {layout.q(0), layout.dq(0), layout.u(0)};
+  const MatrixXd E = directions_of(problem.prior, states, model.system->parameter_values());
   for (Index i = 0; i < states.cols(); ++i) {
     for (Index k = 0; k < states.cols(); ++k) {
       const VectorXd distance = (states.col(i) - states.col(k))(features).cwiseQuotient(discrepancy.lengthscale);
-      const VectorXd variance = discrepancy.stddev.array().square() * std::exp(-0.5 * distance.squaredNorm());
-      EXPECT_LE((covariance.block(2 * i, 2 * k, 2, 2) - MatrixXd(variance.asDiagonal())).cwiseAbs().maxCoeff(), 20 * eps);
+      const MatrixXd wanted =
+          start * start * std::exp(-0.5 * distance.squaredNorm()) * E.middleCols(2 * i, 2) * E.middleCols(2 * k, 2).transpose();
+      EXPECT_LE((covariance.block(2 * i, 2 * k, 2, 2) - wanted).cwiseAbs().maxCoeff(), 20 * eps);
     }
   }
 }
@@ -215,7 +337,8 @@ TEST(Discrepancy, IsASquaredExponentialOfTheseSizes) {
 TEST(Discrepancy, TakesTheNoiseThatIsKnown) {
   FitProblemOptions stated;
   stated.noise_stddev = 0.5;
-  EXPECT_EQ(problem_of(bead(), stated).prior_options.discrepancy->stddev, VectorXd::Constant(2, 0.4 * 0.5));
+  const VectorXd variance = variance_in_noise(problem_of(bead(), stated), {0.5, 0.5});
+  EXPECT_LE((variance.array() / (start * start) - 1).abs().maxCoeff(), 1e-12);
 }
 
 TEST(Discrepancy, StaysAShareOfTheNoiseThatIsEstimated) {
@@ -231,7 +354,8 @@ TEST(Discrepancy, StaysAShareOfTheNoiseThatIsEstimated) {
     ASSERT_EQ(factor.size(), *observed != 0 ? 1U : 2U);
     const ModelValues values = model_values(problem.prior, problem.observations, problem.hyperparameters);
     // what is not observed goes with what is
-    EXPECT_TRUE(values.signal_stddev.back().isApprox(Eigen::Vector2d(factor.front(), factor.back()), 4 * eps)) << observed;
+    EXPECT_TRUE(values.signal_stddev.back().isApprox(start * Eigen::Vector2d(factor.front(), factor.back()), 4 * eps))
+        << observed;
 
     // the gradient in the logarithm of a noise is that of the noise and of what follows it
     const Likelihood likelihood(problem.prior, problem.observations, values, {{}, true});
@@ -239,13 +363,11 @@ TEST(Discrepancy, StaysAShareOfTheNoiseThatIsEstimated) {
     ModelGradient gradient;
     likelihood.evaluate(values, &gradient, workspace);
     for (const Hyperparameter& h : problem.hyperparameters) {
-      if (h.kind != Hyperparameter::Kind::noise_stddev) continue;
+      if (h.kind != Hyperparameter::Kind::noise_stddev && h.name != "discrepancy.size") continue;
       const auto at = [&](double step) {
-        Hyperparameter moved = h;
-        moved.value *= std::exp(step);
-        ModelValues there = values;
-        moved.write(there);
-        return likelihood.evaluate(there, nullptr, workspace);
+        std::vector<Hyperparameter> moved = problem.hyperparameters;
+        moved[static_cast<std::size_t>(&h - problem.hyperparameters.data())].value *= std::exp(step);
+        return likelihood.evaluate(model_values(problem.prior, problem.observations, moved), nullptr, workspace);
       };
       const double slope = h.likelihood_slope(gradient);
       // rounding of 1e-13 × 1e3 over a step of 1e-5, and its square
@@ -254,37 +376,32 @@ TEST(Discrepancy, StaysAShareOfTheNoiseThatIsEstimated) {
   }
 }
 
-TEST(Discrepancy, TakesTheLargestNoiseOfSeveralLogs) {
-  const auto quiet = std::make_shared<const Model>(bead("", "ddq = [0.05, 0.6]", "y - 0.7*x^2", "quiet.toml"));
-  const Model model = bead();
-  const FitProblem problem = make_fit_problem(model, {{log_of(model)}, {log_of(*quiet), quiet}}, {}, {});
-  EXPECT_EQ(problem.prior_options.discrepancy->stddev, 0.4 * Eigen::Vector2d(0.1, 0.6));
-}
-
-TEST(Discrepancy, GivesAnAccelerationThatIsNotMeasuredTheSameShareOfItsSpread) {
-  const Model model = bead();
-  for (const auto& [observed, measured] : {std::pair("ddx", 0), std::pair("ddy", 1)}) {
-    FitProblemOptions options;
-    options.observe = {observed};
-    const FitProblem problem = problem_of(model, options);
-    const VectorXd spread = default_scales(problem.prior, problem.observations).acceleration_stddev;
-    const VectorXd& stddev = problem.prior_options.discrepancy->stddev;
-    const double noise = problem.observations.front().noise().stddev()[0];
-    EXPECT_EQ(stddev[measured], 0.4 * noise) << observed;
-    EXPECT_NEAR(stddev[1 - measured], 0.4 * noise / spread[measured] * spread[1 - measured], 8 * eps) << observed;
-  }
-}
-
-TEST(Discrepancy, OfUnmeasuredAccelerationsTakesTheMeanShareOfTheMeasuredOnes) {
-  const Model& model = test::model("experiments/surface_published.toml");
+TEST(Discrepancy, OfAnAccelerationThatNothingTellsOfHasTheShareOfItsSpreadThatOthersHave) {
+  const Model model = Model::parse(R"toml(
+coordinates = ["x", "y"]
+[mechanics]
+mass  = [["2", "0"], ["0", "8"]]
+force = ["0", "0"]
+[truth]
+acceleration = ["-0.3*dx", "-0.3*dy"]
+[sampling]
+x  = [-1, 1]
+y  = [-1, 1]
+dx = [-1, 1]
+dy = [-1, 1]
+[noise]
+ddq = 0.1
+[[latent]]
+features   = ["x", "dx"]
+)toml",
+                                   "two.toml");
   FitProblemOptions options;
-  options.observe = {"ddq1", "ddq3"};
+  options.observe = {"ddx"};
   const FitProblem problem = problem_of(model, options);
   const VectorXd spread = default_scales(problem.prior, problem.observations).acceleration_stddev;
   const VectorXd& stddev = problem.prior_options.discrepancy->stddev;
-  const double share = (0.1 / spread[0] + 0.1 / spread[2]) / 2;
-  EXPECT_NEAR(stddev[1], 0.4 * share * spread[1], 8 * eps * stddev[1]);
-  EXPECT_EQ(stddev[0], 0.4 * 0.1);
+  EXPECT_NEAR(stddev[0], 0.1, 8 * eps);
+  EXPECT_NEAR(stddev[1], 0.1 / spread[0] * spread[1], 8 * eps);
 }
 
 TEST(Discrepancy, ThatDoesNotFitThePriorIsRefused) {
@@ -300,13 +417,13 @@ TEST(Discrepancy, ThatDoesNotFitThePriorIsRefused) {
 
 // ---- what it does
 
-TEST(Discrepancy, LeavesNothingToTuneAndTheNamesAsTheyAre) {
+TEST(Discrepancy, HasNothingElseToTuneAndLeavesTheNamesAsTheyAre) {
   FitProblemOptions without;
   without.discrepancy = false;
   const FitProblem a = problem_of(bead()), b = problem_of(bead(), without);
   std::vector<std::string> names;
-  ASSERT_EQ(a.hyperparameters.size(), b.hyperparameters.size());
-  for (std::size_t k = 0; k < a.hyperparameters.size(); ++k) {
+  ASSERT_EQ(a.hyperparameters.size(), b.hyperparameters.size() + 1);
+  for (std::size_t k = 0; k < b.hyperparameters.size(); ++k) {
     const Hyperparameter &with = a.hyperparameters[k], &alone = b.hyperparameters[k];
     names.push_back(with.name);
     EXPECT_EQ(std::tie(with.name, with.unit, with.value, with.lower, with.upper, with.hyperprior.median, with.hyperprior.stddev),
@@ -369,9 +486,9 @@ TEST(Discrepancy, ActsUnderTheSystemsOfAllLogs) {
   ASSERT_NE(other_system, nullptr);
   ASSERT_EQ(other_system->prior.latents.size(), 2U);
   EXPECT_EQ(other_system->prior.latents[1].name, "discrepancy");
-  // ā before data is the same function in both systems
+  // what the model's latent adds to ā before data is the same function in both systems
   const Posterior posterior = start_of(problem);
-  View here = view_of(problem.prior, Quantity::unconstrained_acceleration, 1), there = here;
+  View here = view_of(problem.prior, Quantity::unconstrained_acceleration, 0), there = here;
   there.other_system = other_system;
   const MatrixXd states = some_states(model);
   const Posterior::Joint joint = posterior.without_data().joint({{here, states}, {there, states}});
@@ -379,6 +496,12 @@ TEST(Discrepancy, ActsUnderTheSystemsOfAllLogs) {
   const double scale = joint.covariance.maxCoeff();
   EXPECT_LE((joint.covariance.topLeftCorner(n, n) - joint.covariance.topRightCorner(n, n)).cwiseAbs().maxCoeff(),
             8 * eps * scale);
+  // the discrepancy obeys the constraint of each
+  there.latent = 1;
+  const MatrixXd covariance = posterior.without_data().joint(there, states).covariance;
+  const MechanicsBatch mechanics = require_mechanics(*other->system, states, other->system->parameter_values());
+  for (int i = 0; i < states.cols(); ++i)
+    EXPECT_LE((mechanics.values.A(i) * covariance.block(2 * i, 2 * i, 2, 2)).cwiseAbs().maxCoeff(), 20 * eps * scale);
 
   const TemporaryFolder folder;
   file_of(model, problem).write(folder / "fit.json");

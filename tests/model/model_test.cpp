@@ -465,6 +465,26 @@ std::vector<Complaint> complaints() {
       {"ForceOfTheWrongLength", base + "force = [\"0\"]\n", "7: mechanics.force: expected 2 entries, one per coordinate, got 1"},
       {"ForceOfAnAcceleration", base + "force = [\"0\", \"ddq1\"]\n",
        "7: mechanics.force entry 2: a force may not depend on accelerations, but this entry depends on 'ddq1'"},
+      // λ₀ follows from M, F and the constraints, whatever name it goes by
+      {"MassOfALoad", with_mass("[[\"m\", \"0\"],\n[\"0\", \"1 + lambda0(1)\"]]"),
+       "7: mechanics.mass row 2 column 2: lambda0(1) follows from M, F and the constraints, so that it may stand in features, "
+       "directions, [truth] and [let] only"},
+      {"ForceOfALoad",
+       base + "force = [\"0\", \"-load*dq1\"]\n[let]\nload = \"lambda0( 1 )\"\n[constraints]\nposition = [\"q1\"]\n",
+       "7: mechanics.force entry 2: lambda0(1) follows from M, F and the constraints, so that it may stand in features, "
+       "directions, [truth] and [let] only"},
+      {"ConstraintOfALoad", base + "[constraints]\nacceleration = [\"ddq1 - lambda0(1)\"]\n",
+       "8: constraints.acceleration entry 1: lambda0(1) follows from M, F and the constraints, so that it may stand in features, "
+       "directions, [truth] and [let] only"},
+      {"LoadOfNoRow", base + "[constraints]\nposition = [\"q1\"]\n[[latent]]\nfeatures = [\"lambda0(2)\"]\n",
+       "10: latent.features: lambda0(2): there is no such row of the constraints, of which there are 1"},
+      {"LoadWithoutConstraints", base + "[truth]\nforce = [\"0\", \"lambda0(1)\"]\n",
+       "8: truth.force entry 2: lambda0(1): there is no such row of the constraints, of which there are 0"},
+      {"LoadWithoutARow", base + "[let]\nload = \"2*lambda0(q1)\"\n",
+       "8: let.load: \"2*lambda0(q1)\", column 3: lambda0 takes the number of a row of the constraints, counted from 1; write "
+       "lambda0(1)"},
+      {"NameOfTheLoad", base + "[let]\nlambda0 = \"1\"\n",
+       "8: let.lambda0: 'lambda0' is the name of a function or constant; choose another"},
       // what may not stand there is not listed as known
       {"ForceOfAnUnknownSymbol", base + "force = [\"0\", \"friction*dq1\"]\n",
        "7: mechanics.force entry 2: \"friction*dq1\", column 1: unknown symbol 'friction'; known here: q1, q2, dq1, dq2, t, u1, "

@@ -2,6 +2,7 @@
 #include <fmt/format.h>
 #include <gmock/gmock.h>
 
+#include "gp2/base/statistics.hpp"
 #include "gp2/jobs/fit_problem.hpp"
 #include "gp2/posterior.hpp"
 #include "gp2/simulation/generate.hpp"
@@ -14,8 +15,10 @@ namespace {
 using Eigen::Index;
 using Eigen::MatrixXd;
 using Eigen::VectorXd;
+using testing::DoubleEq;
 using testing::ElementsAre;
 using testing::HasSubstr;
+using testing::Pair;
 
 Model sledge(const std::string& latents) {
   return Model::parse(R"toml(
@@ -63,7 +66,7 @@ Value value_of(const FitProblem& problem, const std::vector<double>& values) {
   for (std::size_t k = 0; k < at.size(); ++k) at[k].value = values[k];
   const ModelValues model = model_values(problem.prior, problem.observations, at);
   Likelihood::Options options;
-  options.gradient_parameters = {0};
+  if (!problem.prior.system->parameters().empty()) options.gradient_parameters = {0};
   const Likelihood likelihood(problem.prior, problem.observations, model, options);
   Likelihood::Workspace workspace;
   Value value;
@@ -154,6 +157,46 @@ TEST(DefaultPrior, OfALatentWithoutAKernelIsForEachDirection) {
   EXPECT_EQ(make_prior(shared).latents.size(), 1U);
   const Model stated = sledge("[[latent]]\nfeatures = [\"x\"]\nkernel = \"matern32\"\n");
   EXPECT_EQ(make_prior(stated).latents.size(), 1U);
+}
+
+// The zero of a place is a matter of choice, that of a velocity or of an input is not.
+TEST(DefaultPrior, DoesNotDependOnWhereACoordinateHasItsZero) {
+  const auto rail_from = [](double zero, const std::string& kernel = "") {
+    return Model::parse(fmt::format(R"toml(
+coordinates = ["x", "y"]
+inputs      = ["u"]
+[mechanics]
+mass  = [["2", "0"], ["0", "1"]]
+force = ["u", "0"]
+[constraints]
+position = ["y - 0.3*(x - {0})^2"]
+[[latent]]
+features = ["x", "dx", "u"]
+{1}[noise]
+ddq = 0.05
+[sampling]
+x  = [{2}, {3}]
+dx = [0.5, 2]
+u  = [1, 2]
+[truth]
+acceleration = ["-0.4*dx", "0"]
+)toml",
+                                    zero, kernel, zero - 1, zero + 0.4),
+                        "rail.toml");
+  };
+  constexpr double zero = 16;
+  const Model here = rail_from(0), there = rail_from(zero);
+  GeneratedData data = generate(here, {15, 4, VectorXd::Constant(2, 0.05), {}});
+  const auto problem_of_data = [&](const Model& model) {
+    return make_fit_problem(model, as_table(data, *model.system, "log.csv"), FitProblemOptions());
+  };
+  const FitProblem near = problem_of_data(here);
+  data.states.row(0).array() += zero;
+  const FitProblem far = problem_of_data(there);
+  EXPECT_THAT(far.prior_options.feature_centres, ElementsAre(Pair("x", DoubleEq(row_mean(data.states)[0]))));
+  EXPECT_NEAR(value_of(far, some_values(near)).nll, value_of(near, some_values(near)).nll, 1e-9);
+  const Model stated = rail_from(zero, "kernel = \"se + linear\"\n");
+  EXPECT_TRUE(problem_of_data(stated).prior_options.feature_centres.empty());
 }
 
 TEST(DefaultPrior, OfThePapersProtocolIsOneSquaredExponential) {

@@ -62,6 +62,7 @@ TEST_F(Views, OfOtherQuantitiesCarryTheirNames) {
   EXPECT_EQ(first(Quantity::constraint_force), "fc_q1");
   EXPECT_EQ(first(Quantity::multipliers), "lambda1");
   EXPECT_EQ(first(Quantity::next_velocity), "dq1_next");
+  EXPECT_EQ(first(Quantity::learned_force), "force_q1");
   EXPECT_EQ((View{Quantity::unconstrained_acceleration, {1}, std::nullopt, 0}.names(system, "drag")),
             std::vector<std::string>{"abar_q2@drag"});
   for (const std::string& word : View::Quantity::words()) EXPECT_EQ((*View::Quantity::of_word(word))->word(), word);

@@ -118,7 +118,7 @@ RandomProblem random_problem() {
   const int n_groups = *rc::gen::inRange(1, 4).as("groups of observations");
   for (int g = 0; g < n_groups; ++g) {
     std::vector<Quantity> quantities = {Quantity::constrained_acceleration, Quantity::unconstrained_acceleration,
-                                        Quantity::constraint_force, Quantity::next_velocity};
+                                        Quantity::constraint_force, Quantity::next_velocity, Quantity::learned_force};
     if (n_rows > 0 && rank == n_rows) quantities.push_back(Quantity::multipliers);
     View view = View::all(*rc::gen::elementOf(quantities).as("quantity"), system);
     view.time_step = view.quantity == Quantity::next_velocity ? 0.1 : 0;

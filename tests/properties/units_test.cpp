@@ -169,6 +169,7 @@ void expect_same(const Units& units, const Case& c) {
   compare(Quantity::constrained_acceleration, units.acceleration());
   compare(Quantity::unconstrained_acceleration, units.acceleration());
   compare(Quantity::constraint_force, units.force());
+  compare(Quantity::learned_force, units.force());
   compare(Quantity::multipliers, VectorXd::Constant(1, units.energy / units.constraint));
 }
 

@@ -20,7 +20,7 @@ def refuses(call, error, *texts):
 
 
 @pytest.mark.parametrize(
-    ("view", "d"), [("constrained", 2), ("unconstrained", 2), ("constraint-force", 2), ("multipliers", 1), ("next-velocity", 2)]
+    ("view", "d"), [("constrained", 2), ("unconstrained", 2), ("constraint-force", 2), ("multipliers", 1), ("next-velocity", 2), ("force", 2)]
 )
 def test_shapes_are_the_same_for_every_view_even_with_one_row(view, d, posterior, arm_states):
     dt = 0.01 if view == "next-velocity" else None

@@ -182,7 +182,7 @@ def bead(**latent):
         noise=0.05,
         truth=["-0.8*dx", "0"],
         sampling={"x": [-1, 1], "dx": [-2, 2]},
-        latents=[{"name": "contact", **latent}],
+        latents=[{"name": "contact", "kernel": "se + linear", **latent}],
     )
 
 

@@ -207,6 +207,7 @@ def test_the_predictor_gives_what_predict_gives(posterior, arm_states):
         ("constraint-force", None),
         ("multipliers", None),
         ("next-velocity", 0.01),
+        ("force", None),
     ]:
         predictor = gp2.Predictor(posterior, view, dt=dt)
         expected = posterior.predict(arm_states, view, dt=dt)
@@ -216,6 +217,46 @@ def test_the_predictor_gives_what_predict_gives(posterior, arm_states):
             np.testing.assert_allclose(mean, expected.mean[k], rtol=0, atol=1e-12 * scale)
             np.testing.assert_array_equal(predictor.mean(state), mean)
             np.testing.assert_allclose(std**2, expected.std[k] ** 2, rtol=0, atol=1e-9 * np.square(expected.std).max())
+
+
+def test_another_system_moves_and_is_predicted_at_one_state_after_another(arm, posterior):
+    faster = gp2.System.parse(arm.text.replace("w  = 4.0", "w  = 5.0"))
+    start = {"shoulder": 0.3}
+    motion = posterior.simulate(start, np.linspace(0, 0.2, 5), system=faster)
+    assert motion.max_position_drift < 1e-12
+    assert not np.allclose(motion.q, posterior.simulate(start, np.linspace(0, 0.2, 5)).q, rtol=0, atol=1e-6)
+    there = posterior.predict(motion.states, system=faster)
+    np.testing.assert_allclose(motion.ddq, there.mean, rtol=0, atol=1e-11 * np.abs(there.mean).max())
+    np.testing.assert_allclose(motion.std, there.std, rtol=0, atol=1e-11 * np.abs(there.mean).max())
+    force = posterior.predict(motion.states, "force", system=faster, latent="friction of the tip")
+    for predictor, expected in [
+        (gp2.Predictor(posterior, system=faster), there),
+        (gp2.Predictor(posterior, "force", system=faster, latent="friction of the tip"), force),
+    ]:
+        for k, state in enumerate(motion.states):
+            np.testing.assert_allclose(predictor.mean(state), expected.mean[k], rtol=0, atol=1e-11 * np.abs(expected.mean).max())
+
+
+def test_forward_of_the_inverse_dynamics_is_what_was_wanted(arm, posterior, arm_states):
+    wanted = posterior.predict(arm_states).mean
+    start = arm_states.copy()
+    start[:, -2:] = 0
+    found = posterior.inverse_dynamics(start, wanted)
+    assert found.names == arm.inputs
+    there = arm_states.copy()
+    there[:, -2:] = found.inputs
+    reached = posterior.predict(there)
+    np.testing.assert_allclose(reached.mean, wanted, rtol=0, atol=1e-9 * np.abs(wanted).max())
+    np.testing.assert_allclose(found.missed, wanted - reached.mean, rtol=0, atol=1e-11 * np.abs(wanted).max())
+    np.testing.assert_allclose(found.std**2, np.diagonal(found.cov, axis1=1, axis2=2), rtol=1e-12)
+
+    table = {name: start[:, k] for k, name in enumerate(arm.state_names) if not name.startswith("tau")}
+    by_table = posterior.inverse_dynamics(table | {"ddelbow": wanted[:, 1]})
+    np.testing.assert_array_equal(
+        by_table.inputs, posterior.inverse_dynamics(start, wanted[:, 1:], outputs=["ddelbow"]).inputs
+    )
+    with pytest.raises(gp2.InputError, match="those of a table are its columns"):
+        posterior.inverse_dynamics(table, wanted)
 
 
 def test_the_predictors_jacobian_is_the_derivative(posterior, arm_states):
@@ -340,3 +381,10 @@ def test_the_blas_in_use_is_told():
     assert set(report) == {"library", "kernel", "threads", "fastest_kernel", "advice"}
     assert report["library"]
     assert report["threads"] >= 1
+
+
+def test_a_fit_through_inducing_points_says_what_they_leave_out(arm, arm_log):
+    told = gp2.fit(arm, arm_log, inducing=20, restarts=1, max_iterations=2).report.inducing
+    assert 0 < told["n_variables"] <= 20
+    assert told["left_out"].ndim == 1 and (told["left_out"] >= 0).all()
+    assert told["n_start"] >= 0

@@ -8,7 +8,7 @@ import pytest
 import gp2
 from conftest import MODELS, program, run, write_csv
 
-VIEWS = ["constrained", "unconstrained", "constraint-force", "multipliers", "next-velocity"]
+VIEWS = ["constrained", "unconstrained", "constraint-force", "multipliers", "next-velocity", "force"]
 LATENTS = [None, "friction of the tip", "friction of the joints", "discrepancy"]
 TOLERANCE = 1e-12  # of the largest number of a kind
 

@@ -495,6 +495,65 @@ TEST(Reader, AFileReadComesBackFromJsonToTheLastBit) {
   }
 }
 
+// ---- files that only give shapes
+
+// a body with its inertia, and what one sees of it
+std::string visible(const char* compiler = "", const char* inertia = inertial) {
+  return fmt::format(R"(<mujoco><compiler angle="radian" meshdir="shapes" {}/>
+      <default><default class="seen"><geom type="mesh" contype="0" conaffinity="0"/></default></default><include file="assets.xml"/>
+      <worldbody><geom name="ground" type="hfield" hfield="hills"/>
+        <body name="arm"><joint name="a" axis="0 1 0"/>{}<geom class="seen" mesh="arm" material="steel"/>
+          <site name="tip" pos="0 0 0.3"/></body></worldbody></mujoco>)",
+                     compiler, inertia);
+}
+
+constexpr const char* assets = R"(<mujoco><asset><mesh file="arm.stl"/><hfield name="hills" file="hills.png" size="1 1 1 1"/>
+    <texture file="steel.png" type="2d"/><material name="steel" texture="steel"/><skin file="arm.skn"/></asset></mujoco>)";
+
+TEST(Reader, MissingMeshesAndPicturesAreNoObstacleWhereInertiasAre) {
+  const TemporaryFolder folder;
+  folder.write("assets.xml", assets);
+  const auto path = folder.write("robot.xml", visible());
+  const RobotDescription robot = read_robot(path);
+  ASSERT_EQ(robot.bodies.size(), 1U);
+  EXPECT_EQ(robot.bodies[0].mass, 1);
+  EXPECT_EQ(robot.bodies[0].com, Vector3d(0, 0, 0.1));
+  EXPECT_TRUE(robot.bodies[0].inertia.isApprox(Matrix3d(Vector3d(0.01, 0.02, 0.015).asDiagonal()), 1e-15));
+  EXPECT_EQ(robot.sites[0].position, Vector3d(0, 0, 0.3));
+  EXPECT_THAT(robot.notes, ElementsAre(AllOf(StartsWith("meshes, height fields and pictures are left out, since MuJoCo says: "),
+                                             HasSubstr("'"))));
+}
+
+TEST(Reader, AMeshThatGivesAnInertiaMustBeThere) {
+  const TemporaryFolder folder;
+  folder.write("assets.xml", assets);
+  for (const std::string& text : {visible("inertiafromgeom=\"true\""), visible("", "")}) {
+    EXPECT_THAT(input_error_of([&] { read_robot(folder.write("robot.xml", text)); }),
+                EndsWith(". The file of a mesh, height field or texture is missing: put it there or remove the geom"));
+  }
+}
+
+TEST(Reader, WithoutShapesAFaultOfTheRobotIsFound) {
+  const TemporaryFolder folder;
+  folder.write("assets.xml", assets);
+  const auto path = folder.write("robot.xml", visible("", R"(<inertial pos="0 0 0" mass="1" diaginertia="1 1 3"/>)"));
+  EXPECT_THAT(input_error_of([&] { read_robot(path); }), EndsWith(". No rigid body has such an inertia: correct it"));
+}
+
+TEST(Reader, FilesIncludedAreFoundFromTheFirstFileOrTheIncludingOne) {
+  const TemporaryFolder folder;
+  std::filesystem::create_directory(folder / "parts");
+  folder.write("parts/assets.xml", R"(<mujoco><include file="materials.xml"/><asset><mesh file="arm.stl"/></asset></mujoco>)");
+  folder.write("parts/materials.xml", R"(<mujoco><asset><material name="steel"/></asset></mujoco>)");
+  std::string text = visible();
+  text.replace(text.find("assets.xml"), 10, "parts/assets.xml");
+  text.replace(text.find(R"(<geom name="ground" type="hfield" hfield="hills"/>)"), 50, "");
+  EXPECT_EQ(read_robot(folder.write("robot.xml", text)).bodies[0].mass, 1);
+
+  folder.write("parts/materials.xml", R"(<mujoco><include file="parts/assets.xml"/></mujoco>)");
+  EXPECT_THAT(input_error_of([&] { read_robot(folder / "robot.xml"); }), HasSubstr("assets.xml"));
+}
+
 // ---- errors
 
 TEST(ReaderErrors, JointsWithQuaternionsAreNamed) {
@@ -552,6 +611,21 @@ TEST(ReaderErrors, MujocosRefusalsAreQuotedWithWhatToDo) {
   EXPECT_THAT(
       error_of(mjcf(R"(<body><joint/><geom type="mesh" mesh="m"/></body>)", R"(<asset><mesh name="m" file="m.stl"/></asset>)")),
       EndsWith(". The file of a mesh, height field or texture is missing: put it there or remove the geom"));
+}
+
+TEST(ReaderErrors, AFileForAnotherMujocoIsNamedAsSuch) {
+  const char* const another =
+      "Where it is no slip of the pen, the file is for another version of MuJoCo: build gp2 with that one (GP2_MUJOCO_DIR)";
+  for (const char* attributes : {R"(damping="1 2 3")", R"(colour="red")"}) {
+    EXPECT_THAT(error_of(mjcf(fmt::format("<body><joint {}/>{}</body>", attributes, inertial))),
+                AllOf(StartsWith("robot.xml: MuJoCo "), HasSubstr("line 1"), EndsWith(another)));
+  }
+  EXPECT_THAT(error_of(mjcf("", "<machine/>")), EndsWith(another));
+  EXPECT_THAT(error_of(mjcf("", R"(<option integrator="leap"/>)")), EndsWith(another));
+#if mjVERSION_HEADER < 300
+  EXPECT_THAT(error_of(mjcf(fmt::format(R"(<body><joint range="0 1"/>{}</body>)", inertial))),
+              EndsWith(". From 3.0 on MuJoCo does the first of these by itself"));
+#endif
 }
 
 TEST(ReaderErrors, FilesThatAreNoRobotsAreRefused) {

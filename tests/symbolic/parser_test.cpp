@@ -123,8 +123,8 @@ TEST_F(ParserTest, ErrorsSayWhereWhatTheRuleAndTheMend) {
       {"min(q1)", "column 1: min takes 2 or more arguments, got 1"},
       {"max()", "column 1: max takes 2 or more arguments, got 0"},
       {"q1^2 > 0",
-       "column 6: found '>'; constraints that come and go are not supported: write the equation that holds as long as there is "
-       "contact"},
+       "column 6: found '>'; an expression has no comparison: a constraint that comes and goes is the equation that holds while "
+       "there is contact, with when = \"gap <= 0\" beside it"},
       {"q1² - 1", "column 3: found '²'; a power is written ^2"},
       {"g", "column 1: unknown symbol 'g'; known here: q1, q2, dq1, dq2, dq3, mass"},
       {"q1 = q2", "column 4: found '='; write an equation left = right as the expression left - (right)"},

@@ -1,5 +1,10 @@
+#include <algorithm>
 #include <atomic>
+#include <barrier>
 #include <chrono>
+#include <memory>
+#include <set>
+#include <span>
 #include <thread>
 
 #include <gmock/gmock.h>
@@ -86,6 +91,99 @@ TEST(FitTest, GivesTheSameBitsForAnyNumberOfThreads) {
   EXPECT_EQ(means[0], means[2]);
   EXPECT_EQ(objectives[0], objectives[1]);
   EXPECT_EQ(objectives[0], objectives[2]);
+}
+
+// Threads that stand for the processes of mpirun.
+class ThreadRanks final : public Ranks {
+ public:
+  struct Meeting {
+    explicit Meeting(int n) : size(n), barrier(n) {}
+    const int size;
+    std::barrier<> barrier;
+    std::span<double> sent;
+  };
+  ThreadRanks(Meeting& meeting, int rank) : meeting_(meeting), rank_(rank) {}
+  [[nodiscard]] int rank() const override { return rank_; }
+  [[nodiscard]] int size() const override { return meeting_.size; }
+  void broadcast(std::span<double> numbers, int from) const override {
+    if (rank_ == from) meeting_.sent = numbers;
+    meeting_.barrier.arrive_and_wait();
+    if (rank_ != from) std::copy(meeting_.sent.begin(), meeting_.sent.end(), numbers.begin());
+    meeting_.barrier.arrive_and_wait();
+  }
+
+ private:
+  Meeting& meeting_;
+  const int rank_;
+};
+
+TEST(FitTest, GivesTheSameBitsForAnyNumberOfRanksWhichShareOutItsRuns) {
+  const Problem p = problem("models/unicycle.toml", 15, {"R"}, {}, true);
+  FitOptions options = quick();
+  options.max_iterations = 5;  // so that no run goes on once all are known
+  options.n_draws = 3;
+  const FitReport alone = fit(p.prior, p.observations, p.hyperparameters, options).report;
+  ASSERT_TRUE(alone.draws && alone.uncertainty);
+  for (const int n : {2, 5}) {  // some of five have no run
+    ThreadRanks::Meeting meeting(n);
+    std::vector<FitReport> reports(static_cast<std::size_t>(n));
+    std::vector<std::set<int>> runs(reports.size());
+    {
+      std::vector<std::jthread> threads;
+      for (int rank = 0; rank < n; ++rank) {
+        threads.emplace_back([&, rank] {
+          const auto own = static_cast<std::size_t>(rank);
+          FitOptions on_rank = options;
+          on_rank.ranks = std::make_shared<ThreadRanks>(meeting, rank);
+          on_rank.n_threads = 1 + rank % 2;
+          on_rank.progress = [&](const Progress& progress) {
+            if (!progress.is_drawing) runs[own].insert(progress.restart);
+          };
+          reports[own] = fit(p.prior, p.observations, p.hyperparameters, on_rank).report;
+        });
+      }
+    }
+    std::set<int> all;
+    for (std::size_t rank = 0; rank < reports.size(); ++rank) {
+      const FitReport& report = reports[rank];
+      EXPECT_EQ(report.objective, alone.objective);
+      EXPECT_EQ(report.termination, alone.termination);
+      EXPECT_EQ(values_of(report.hyperparameters), values_of(alone.hyperparameters));
+      ASSERT_TRUE(report.draws && report.uncertainty);
+      EXPECT_EQ(report.draws->values, alone.draws->values);
+      EXPECT_EQ(report.draws->evaluations, alone.draws->evaluations);
+      EXPECT_EQ(report.uncertainty->stddev, alone.uncertainty->stddev);
+      ASSERT_EQ(report.restarts.size(), alone.restarts.size());
+      for (std::size_t k = 0; k < report.restarts.size(); ++k) {
+        EXPECT_EQ(report.restarts[k].objective, alone.restarts[k].objective);
+        EXPECT_EQ(report.restarts[k].evaluations, alone.restarts[k].evaluations);
+        EXPECT_EQ(report.restarts[k].termination, alone.restarts[k].termination);
+      }
+      EXPECT_LT(runs[rank].size(), alone.restarts.size()) << "of rank " << rank;
+      all.insert(runs[rank].begin(), runs[rank].end());
+    }
+    EXPECT_EQ(all.size(), alone.restarts.size());
+  }
+}
+
+TEST(FitTest, TellsOfTheBestSoFarWhereARunGetsLower) {
+  const Problem p = problem("models/unicycle.toml", 25, {"R"});
+  FitOptions options = quick();
+  std::vector<double> told;
+  FitReport last;
+  options.improved = [&](const FitReport& so_far, const std::vector<Observations>& observations) {
+    EXPECT_EQ(observations.front().n_data(), 25);
+    EXPECT_EQ(so_far.termination, FitReport::interrupted);
+    EXPECT_NEAR(so_far.objective, objective(p, so_far.hyperparameters), 1e-9 * std::abs(so_far.objective));
+    told.push_back(so_far.objective);
+    last = so_far;
+  };
+  const FitReport report = fit(p.prior, p.observations, p.hyperparameters, options).report;
+  ASSERT_FALSE(told.empty());
+  EXPECT_TRUE(std::is_sorted(told.rbegin(), told.rend()));
+  EXPECT_EQ(last.objective, report.objective);
+  EXPECT_EQ(last.negative_log_likelihood, report.negative_log_likelihood);
+  EXPECT_EQ(values_of(last.hyperparameters), values_of(report.hyperparameters));
 }
 
 TEST(FitTest, AnotherSeedDrawsOtherStarts) {

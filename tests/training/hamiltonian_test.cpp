@@ -170,7 +170,8 @@ TEST(HamiltonianTest, MomentsAreThoseOfTheDensityWithinItsBox) {
   }
   const GridMoments exact(p);
   const Objective objective(p.prior, p.observations, p.hyperparameters);
-  HamiltonianOptions options{.seed = hamiltonian_seed};
+  HamiltonianOptions options;
+  options.seed = hamiltonian_seed;
   options.max_evaluations = 10 * draw_evaluations;
   const HyperparameterDraws draws =
       draw_about(objective, {fit_of(p, drawing(0)).report.hyperparameters}, {false, false}, 25, options);

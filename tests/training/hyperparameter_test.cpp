@@ -120,6 +120,7 @@ TEST(HyperparameterTest, TheGradientIsReadWhereTheValueIsWritten) {
 
   Hyperparameter shared = with(Hyperparameter::of(Kind::shared_signal_stddev, 0, 0), 3, 0.5, 10);
   shared.column_scale = Eigen::Vector2d(1, 0.5);
+  values.signal_stddev[0].setOnes();
   shared.write(values);
   EXPECT_EQ(values.signal_stddev[0], Eigen::Vector2d(3, 1.5));
   gradient.log_signal_stddev[0] = Eigen::Vector2d(4, 5);

@@ -128,6 +128,17 @@ TEST(LbfgsbTest, ShortensAStepIntoTheInfiniteTenfold) {
   EXPECT_NEAR(visited[2], 1, 1e-12);
 }
 
+TEST(LbfgsbTest, DoesNotLeapIntoACornerThatIsBetterThanTheStart) {
+  // a wall at the start, a minimum near it and a plateau below the wall in the corner
+  const auto plateau = [](const VectorXd& x, VectorXd& gradient) {
+    const double e = std::exp(-10 * (x[0] + 1)), well = std::exp(-0.5 * (x[0] - 1) * (x[0] - 1));
+    gradient[0] = -10000 * e + 100 * (x[0] - 1) * well;
+    return 1000 * e - 100 * well;
+  };
+  const LbfgsbResult result = minimise(plateau, constant(1, -1), constant(1, -2), constant(1, 50), {});
+  EXPECT_NEAR(result.x[0], 1, 1e-3);
+}
+
 TEST(LbfgsbTest, EndsAtTheEdgeOfAnInfiniteRegionWithTheBestPointItSaw) {
   // the minimum lies beyond the edge; there is no stationary point to converge to, from wherever the edge is reached
   for (int k = 0; k < 200; ++k) {
@@ -180,7 +191,7 @@ struct Bounded {
 TEST(LbfgsbTest, TakesTheStepsOfTheFortran) {
   Bounded problem;
   std::vector<double> values;
-  problem.options.iteration = [&](int, double value) {
+  problem.options.iteration = [&](int, const VectorXd&, double value) {
     values.push_back(value);
     return true;
   };
@@ -243,7 +254,7 @@ TEST(LbfgsbTest, CallsTheRoundingErrorsOfTheObjectiveConvergence) {
       return value + 1e-12 * std::sin(1e12 * (x[0] + 2 * x[1]) + seed);
     };
     double lowest = infinity;
-    options.iteration = [&](int, double value) {
+    options.iteration = [&](int, const VectorXd&, double value) {
       lowest = std::min(lowest, value);
       return true;
     };
@@ -275,7 +286,7 @@ TEST(LbfgsbTest, KeepsTheLowestIterateOfAFunctionThatAnswersDifferentlyEachTime)
   options.gradient_tolerance = 0;
   options.reduction_tolerance = 0;
   double lowest = infinity;
-  options.iteration = [&](int, double value) {
+  options.iteration = [&](int, const VectorXd&, double value) {
     EXPECT_LE(value, lowest) << "an iteration never raises the value";
     lowest = value;
     return true;
@@ -365,7 +376,7 @@ TEST(LbfgsbTest, TheCallbackSeesEveryIterationAndCanStop) {
   std::vector<int> seen;
   double last = infinity;
   LbfgsbOptions options;
-  options.iteration = [&](int iteration, double value) {
+  options.iteration = [&](int iteration, const VectorXd&, double value) {
     seen.push_back(iteration);
     EXPECT_LE(value, last) << "an iteration never raises the value";
     last = value;

@@ -131,6 +131,7 @@ std::vector<Method> methods_at(const Section& definition, std::size_t k) {
     method.max_escapes = at(escapes);
     method.max_iterations = stop.integer("max_iterations");
     method.reduction_tolerance = stop.number("reduction_tolerance");
+    if (!method.baseline) method.n_inducing = at(definition.numbers("inducing"));
   }
   return methods;
 }
@@ -207,8 +208,8 @@ void reproduce_arm_on_surface(const ReproduceOptions& options) {
       const Method& method = methods[m];
       talk_over(fmt::format("arm-on-surface: n = {}: {}", n, method.name));
       const auto start = std::chrono::steady_clock::now();
-      const Trained trained =
-          train(models[m], {}, method, Protocol::Name::standard, log.first_rows(n), 0, options.threads, fitted[method.name]);
+      const Trained trained = train(models[m], {}, method, Protocol::Name::standard, log.first_rows(n), 0, options.threads,
+                                    method.baseline ? fitted[method.name] : std::vector<Hyperparameter>{});
       const double seconds = seconds_since(start);
       fitted[method.name] = trained.fit.report.hyperparameters;
       const Errors on_blocks = errors_of(trained.fit.posterior, system, blocks);

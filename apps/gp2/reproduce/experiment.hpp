@@ -67,6 +67,7 @@ struct Method {
   double reduction_tolerance = FitOptions().reduction_tolerance;  // where the optimiser stops
   int max_iterations = FitOptions().max_iterations;
   int max_escapes = FitOptions().max_escapes;
+  int n_inducing = 0;            // variables at most, through which it learns; 0: exactly
   bool standard_errors = false;  // of the system's parameters
   bool wide = false;             // of a baseline: bounds that do not matter instead of the published ones
 

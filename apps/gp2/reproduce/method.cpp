@@ -126,6 +126,7 @@ Trained train(const Model& model, const std::vector<std::string>& estimate, cons
   fit_options.n_threads = n_threads;
   fit_options.max_iterations = method.max_iterations;
   fit_options.max_escapes = method.max_escapes;
+  fit_options.n_inducing = method.n_inducing;
   fit_options.standard_errors = method.standard_errors;
   if (!method.baseline) fit_options.reduction_tolerance = method.reduction_tolerance;
   Fit result = fit(problem, fit_options);

@@ -15,7 +15,7 @@ namespace gp2 GP2_API {
 /// Writes `content` to a file whole or not at all: into a temporary file beside it, flushed, then renamed over `path`. The
 /// temporary file has no name until it is whole, where the file system can do that: then nothing is left of it however the
 /// process ends. A link stays and its target is replaced; an old file's permissions are kept, and one that is read-only is not
-/// replaced; a device or pipe, say /dev/stdout, is written to as it is.
+/// replaced; a device or pipe is written to as it is, and so is /dev/stdout, whatever it leads to.
 /// @throws InputError naming the path and the system's reason when that fails; an old file at `path` is then intact.
 void write_file(const std::filesystem::path& path, std::string_view content);
 

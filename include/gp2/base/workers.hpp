@@ -9,7 +9,7 @@
 
 namespace gp2 GP2_API {
 
-/// Processes that work on one fit together: each has all data, sums up a share of the rows, and gets what the others have summed up.
+/// Processes that work on one fit together: each has all data, does a share of the work, and gets what the others have found.
 /// All of them do the same in the same order.
 class Ranks {
  public:
@@ -23,7 +23,7 @@ class Ranks {
   [[nodiscard]] int owner(int part, int n_parts) const { return size() < n_parts ? part * size() / n_parts : part; }
 };
 
-/// Who may work on sums over rows: threads, and other processes where there are. Results are the same bits whoever does.
+/// Who may work on parts that do not wait for each other: threads and other processes. Results are the same bits whoever does.
 struct Workers {
   int n_threads = 1;
   std::shared_ptr<const Ranks> ranks = nullptr;  // null: this process alone

@@ -1,8 +1,10 @@
 #pragma once
 
+#include <cstdint>
 #include <filesystem>
 #include <functional>
 #include <memory>
+#include <optional>
 #include <string>
 #include <string_view>
 #include <utility>
@@ -14,6 +16,14 @@
 namespace gp2 GP2_API {
 
 class CsvWriter;
+
+/// A log as it was when it was read.
+struct LogFile {
+  std::string name;
+  std::uint64_t bytes = 0;
+  std::int64_t rows = 0;
+  std::string checksum = {};  // CRC-64 of xz, 16 hexadecimal digits
+};
 
 /// A table of comma-separated values with one header line. Cells may be quoted; blank lines are skipped. Columns are kept as
 /// doubles, parsed once; a cell that is no number is kept as text, and is an error only when it is asked for as a number, so
@@ -61,6 +71,8 @@ class CsvTable {
   void write(const std::filesystem::path& path) const;
 
   [[nodiscard]] const std::string& name() const;
+  /// The file that read() read; nothing of other tables, also of those that are made from it.
+  [[nodiscard]] const std::optional<LogFile>& file() const;
   [[nodiscard]] const std::vector<std::string>& header() const;
   [[nodiscard]] int n_rows() const;
   [[nodiscard]] int n_columns() const { return static_cast<int>(header().size()); }

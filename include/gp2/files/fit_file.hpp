@@ -9,6 +9,7 @@
 #include <vector>
 
 #include "gp2/baselines/baseline.hpp"
+#include "gp2/data/csv.hpp"
 #include "gp2/export.hpp"
 #include "gp2/fit.hpp"
 #include "gp2/model.hpp"
@@ -30,14 +31,16 @@ struct FitFile {
   ///   hyperparameters of another posterior.
   FitFile(Model model, FitPriorOptions prior_options, const Fit& fit, std::vector<std::shared_ptr<const Model>> systems = {});
 
-  /// 10: what many observations say, in their place; 9: inducing points; 8: sums over states; 7: draws of hyperparameters; 6: a
-  /// checksum and options, values that are not measured; 5: robots; 4: values with a noise of their own; 3: mechanics that are code; 2:
-  /// observations of other systems. All of them are read; 10 is written.
-  static constexpr int format_version = 10;
+  /// 11: a discrepancy that the constraint admits, centres of features, the logs; 10: what many observations say, in their place; 9:
+  /// inducing points; 8: sums over states; 7: draws of hyperparameters; 6: a checksum and options, values that are not measured; 5:
+  /// robots; 4: values with a noise of their own; 3: mechanics that are code; 2: observations of other systems. All of them are read;
+  /// 11 is written.
+  static constexpr int format_version = 11;
 
   Model model;
   FitPriorOptions prior_options;
-  std::string data_source;  // where the data came from, for people
+  std::string data_source;    // where the data came from, for people
+  std::vector<LogFile> logs;  // that it was learned from, as far as they are files
   std::vector<Observations> observations;
   /// Per Observations: the model file of its view's other system; null where it has none. May be shorter.
   std::vector<std::shared_ptr<const Model>> systems;
@@ -47,6 +50,8 @@ struct FitFile {
   [[nodiscard]] Prior prior() const { return make_prior(model, prior_options); }
   /// States that were fitted to, per Observations: more than `observations` have, where the file holds what they say in their place.
   [[nodiscard]] std::vector<std::int64_t> n_states() const;
+  /// Whether it was learned from a log with the content of this one.
+  [[nodiscard]] bool has_learned(const LogFile& log) const;
   /// The data of a posterior of this fit, which may have more since: they stand in `observations` and `report`.
   void take_data(const Posterior& posterior);
   /// The prior conditioned on the data, under the fitted hyperparameters or as the mixture over their draws.

@@ -2,6 +2,7 @@
 
 #include <atomic>
 #include <cstdint>
+#include <filesystem>
 #include <functional>
 #include <optional>
 #include <string>
@@ -57,6 +58,7 @@ struct FitRequest {
   std::optional<double> inducing;
   bool is_exact = false, is_exact_where_small = false;
   std::optional<int> train_on;  // states at most that hyperparameters are found from; not given: all
+  std::string checkpoint;       // file that the best so far is saved in, while the fit runs; empty: none
 };
 
 /// The table of its options.
@@ -70,6 +72,7 @@ struct FitJob {
   std::vector<std::string> notes;
   bool thin = true;
   std::vector<ActuatorEstimate> actuators;  // that were estimated already
+  std::filesystem::path checkpoint;         // of the request
   std::string unaffordable;  // why not all of a long log can be fitted, if that is so: what it is worth may be less
 };
 
@@ -84,6 +87,9 @@ FitRequest request_of(const FitFile& fit);
 /// @param threads  as FitRequest
 /// @throws InputError as request_of, for robust fits, whose data are marked by the first one, and where the file has but some of them.
 FitJob prepare_fit_again(const FitFile& fit, int threads = 0);
+/// The same from logs that are given: as prepare_fit, and its notes say where they are not those that the fit was learned from.
+/// @param request  of request_of(), with the logs
+FitJob prepare_fit_again(const FitFile& fit, FitRequest request);
 
 /// What a fit gives.
 struct FitOutcome {

@@ -102,9 +102,6 @@ FitProblem make_fit_problem(const Model& model, const std::vector<Log>& logs, co
                             const FitProblemOptions& options);
 FitProblem make_fit_problem(const Model& model, const CsvTable& log, const FitProblemOptions& options);
 
-/// The standard deviation of the discrepancy in units of that of the noise (theory.md, T23).
-double discrepancy_share(const std::vector<Observations>& observations);
-
 /// How a problem is fitted unless told otherwise: a baseline has options of its own.
 FitOptions default_fit_options(const FitProblem& problem);
 
@@ -149,6 +146,17 @@ struct LogStates {
 LogStates read_log_states(const Prior& prior, const View& view, const Model& model, const CsvTable& log,
                           const std::map<std::string, std::string>& columns, const std::vector<std::string>& accelerations = {},
                           const std::optional<std::vector<Actuator>>& actuators = {});
+
+/// States of a log and the accelerations that are wanted there: those of ddq for which it has columns.
+struct WantedMotion {
+  Eigen::MatrixXd states;         // their inputs are 0
+  View view;                      // of the accelerations
+  Eigen::MatrixXd accelerations;  // (view × N)
+  std::vector<std::string> notes;
+};
+/// @throws InputError as read_log_states, but that inputs need not be there; and where there is no acceleration.
+WantedMotion read_wanted_motion(const Prior& prior, const Model& model, const CsvTable& log,
+                                const std::map<std::string, std::string>& columns);
 
 /// work(), with the log named in what it throws: a posterior knows the number of a state only.
 template <typename Work>

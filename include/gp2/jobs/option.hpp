@@ -99,7 +99,19 @@ struct Option {
   std::string needs = {};      // another option without which it means nothing
   bool is_required = false;
   bool is_recorded = true;  // in FIT.json: the result depends on it
+  std::string group = {};   // heading in --help; empty: Options
 };
+
+/// Options under one heading of --help.
+inline std::vector<Option> in_group(const std::string& heading, std::vector<Option> options) {
+  for (Option& option : options) option.group = heading;
+  return options;
+}
+inline std::vector<Option> joined(const std::vector<std::vector<Option>>& tables) {
+  std::vector<Option> all;
+  for (const std::vector<Option>& table : tables) all.insert(all.end(), table.begin(), table.end());
+  return all;
+}
 
 /// An option on which no result depends.
 inline Option not_recorded(Option option) {

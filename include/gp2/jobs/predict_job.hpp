@@ -19,6 +19,19 @@
 
 namespace gp2 GP2_API {
 
+/// The system that a fit is asked about: its own, or another one in which its latents act.
+struct FitSystem {
+  const Model* model = nullptr;                               // the fit's or the other system's, which outlive this
+  std::vector<Actuator> actuators;                            // of its inputs
+  std::shared_ptr<const OtherSystem> other_system = nullptr;  // null: the fit's own
+  Prior prior;                                                // there
+};
+
+/// @param prior   of the posterior
+/// @param system  with the same coordinates, inputs and latents; null, or the same model: the fit's own
+/// @throws InputError as make_other_system.
+FitSystem system_of(const FitFile& fit, const Prior& prior, const std::shared_ptr<const Model>& system);
+
 /// What a fit is asked for: a quantity, of the fitted system or another one.
 struct ViewRequest {
   View::Quantity quantity = View::Quantity::constrained_acceleration;
@@ -30,17 +43,13 @@ struct ViewRequest {
 std::vector<Option> options(ViewRequest& request);
 
 /// A view, and the system under which it is.
-struct PredictedView {
+struct PredictedView : FitSystem {
   View view;
-  const Model* model = nullptr;     // of that system: the fit's or the request's, which outlive this
-  std::vector<Actuator> actuators;  // of its inputs
-  Prior prior;                      // there
   std::vector<std::string> names;
 };
 
 /// @param prior  of the posterior
-/// @throws InputError when the view needs a time step or constraints, there is no such latent, or the other system does not fit
-///   (make_other_system).
+/// @throws InputError when the view needs a time step or constraints, or there is no such latent; and as system_of.
 PredictedView predicted_view(const FitFile& fit, const Prior& prior, const ViewRequest& request);
 
 struct PredictRequest {
@@ -52,16 +61,20 @@ struct PredictRequest {
   std::optional<int> n_samples;  // draws of all rows together
   std::uint64_t seed = 0;
   bool unconditioned = false;  // from the prior, as if there had been no data
+  /// Instead of the view: the inputs that produce the accelerations which the states come with (inference/inverse_dynamics.hpp).
+  bool inverse_dynamics = false;
 };
 std::vector<Option> options(PredictRequest& request);
 
 struct PredictOutcome {
-  std::vector<std::string> names;  // NAME of the view, NAME_std, cov_NAME1_NAME2, NAME_sample1, …, distance_from_data
-  Eigen::MatrixXd values;          // (names × N)
+  /// NAME of the view or of an input, NAME_std, cov_NAME1_NAME2, ddqJ_missed of inverse dynamics, NAME_sample1, …, distance_from_data
+  std::vector<std::string> names;
+  Eigen::MatrixXd values;  // (names × N)
   std::vector<std::string> notes;
 };
 
-/// @throws InputError for states that are missing, not finite or contradict the constraints, with the table's name.
+/// @throws InputError for states that are missing, not finite or contradict the constraints, with the table's name; NumericalError as
+///   inverse_dynamics.
 PredictOutcome predict(const FitFile& fit, CsvTable states, const PredictRequest& request);
 
 struct EvaluateRequest {

@@ -32,6 +32,7 @@ struct ReportData {
   std::string name;    // "training", "training 2", "test"
   std::string source;  // where it came from, for people
   bool is_test = false;
+  bool is_of_other_system = false;
   Evaluation evaluation;
   std::vector<std::string> outputs;      // d
   std::vector<int> rows;                 // of ddq, d
@@ -104,9 +105,10 @@ struct ReportOptions {
   std::string data;                            // CSV of a test; empty: none
   std::string truth;                           // model file that tells the true acceleration; empty: none
   std::map<std::string, std::string> columns;  // model's name -> log's name, of `data`
+  std::string system = {};  // model file of the other system that `data` and `truth` are of; empty: the fit's own
 };
 
-/// data, truth, map.
+/// data, system, truth, map.
 std::vector<Option> options(ReportOptions& options);
 
 /// Predicts, evaluates and collects.

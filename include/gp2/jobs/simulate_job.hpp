@@ -14,6 +14,7 @@
 #include "gp2/data/csv.hpp"
 #include "gp2/export.hpp"
 #include "gp2/jobs/option.hpp"
+#include "gp2/jobs/predict_job.hpp"
 #include "gp2/model.hpp"
 #include "gp2/posterior.hpp"
 #include "gp2/simulate.hpp"
@@ -60,8 +61,8 @@ struct SimulateJob {
 
 /// The motion of a model by its own equations: its force and [truth].
 SimulateJob prepare_simulation(const Model& model, const SimulateRequest& request);
-/// The motion of the mean of a posterior, or of samples.
-SimulateJob prepare_simulation(const Model& model, const Posterior& posterior, const SimulateRequest& request);
+/// The motion of the mean of a posterior, or of samples, as a system of its fit moves.
+SimulateJob prepare_simulation(const FitSystem& system, const Posterior& posterior, const SimulateRequest& request);
 
 /// Thrown by run_simulation when it is asked to end.
 struct SimulationStopped {};
@@ -81,6 +82,8 @@ struct MotionUncertainty {
   Eigen::VectorXd distance;           // (N) Posterior::distance_from_data
   std::optional<double> leaves_data;  // first time at which that is beyond Posterior::far_from_data
 };
-MotionUncertainty motion_uncertainty(const Posterior& posterior, const Trajectory& trajectory);
+/// @param other_system  that moved; null: the fit's own
+MotionUncertainty motion_uncertainty(const Posterior& posterior, const Trajectory& trajectory,
+                                     const std::shared_ptr<const OtherSystem>& other_system = nullptr);
 
 }  // namespace gp2

@@ -41,7 +41,9 @@ struct LowerRank {
   int lowest = 0;           // of A over the states
   std::vector<int> states;  // where it is below the highest, in order
 };
-/// @param ranks  of A at each state
+/// The rank of A at each state, rows that their conditions switch off counted as rows that are there.
+std::vector<int> ranks_of(const System& system, const MechanicsBatch& mechanics);
+/// @param ranks  at each state
 LowerRank states_of_lower_rank(const std::vector<int>& ranks);
 LowerRank states_of_lower_rank(const MechanicsBatch& mechanics);
 /// The same of any number of states, in the memory of a few.

@@ -20,6 +20,7 @@ struct MotionColumns {
   Columns constrained_acceleration;    // ddq = T ā + L b       (nq × m)
   Columns unconstrained_acceleration;  // ā                     (nq × m)
   Columns constraint_force;            // Aᵀλ = M ddq − M'ā     (nq × m), the M' of UdwadiaKalaba
+  Columns applied_force;               // F̄ = M'ā               (nq × m)
 };
 
 /// The columns of a matrix or a vector, which must live as long.
@@ -33,6 +34,7 @@ struct MotionParts {
   bool constrained_acceleration = false;
   bool unconstrained_acceleration = false;
   bool constraint_force = false;
+  bool applied_force = false;
 };
 
 /// Changes of A in one or several directions, as products.
@@ -77,6 +79,8 @@ class QuantityKind {
   [[nodiscard]] virtual MotionParts parts() const = 0;
   /// Whether it depends on a time step Δt.
   [[nodiscard]] virtual bool needs_time_step() const { return false; }
+  /// Whether the mean μ of the prior is part of it, beside what the latents add.
+  [[nodiscard]] virtual bool has_mean() const { return true; }
   /// Whether row j is ddq_j or ā_j, in their unit.
   [[nodiscard]] virtual bool is_acceleration() const { return false; }
   /// Whether row j is of coordinate j.
@@ -116,10 +120,11 @@ class Quantity {
   static const Quantity constraint_force;            // Aᵀλ = M ddq − M'ā  G = M T − M'        d = M L b       [force]
   static const Quantity multipliers;    // λ, of minimum norm G = (Aᵀ)⁺(M T − M') d = (Aᵀ)⁺M L b  [force/row]
   static const Quantity next_velocity;  // dq + Δt ddq        G = Δt T            d = dq + Δt L b [dq]
+  static const Quantity learned_force;  // M'(ā − μ)          G = M', without μ   d = 0           [force]
 
   /// All of them.
   static const std::vector<Quantity>& all();
-  /// "constrained", "unconstrained", "constraint-force", "multipliers", "next-velocity".
+  /// "constrained", "unconstrained", "constraint-force", "multipliers", "next-velocity", "force".
   static const std::vector<std::string>& words();
   static std::optional<Quantity> of_word(std::string_view word);
 
@@ -131,8 +136,8 @@ class Quantity {
   const QuantityKind* kind_;
 };
 
-/// How the motion at a state depends on ā: as columns T, I, M T − M', and at ā = 0: L b, 0, M L b. Or the derivatives of these in
-/// a parameter. Only the parts that are asked for. In memory that is used again.
+/// How the motion at a state depends on ā: as columns T, I, M T − M', M', and at ā = 0: L b, 0, M L b, 0. Or the derivatives of
+/// these in a parameter. Only the parts that are asked for. In memory that is used again.
 class AffineMotion {
  public:
   void evaluate(const UdwadiaKalaba& projection, const Eigen::Ref<const Eigen::MatrixXd>& M, const MotionParts& parts);
@@ -142,14 +147,14 @@ class AffineMotion {
                      const Eigen::Ref<const Eigen::VectorXd>& db, const MotionParts& parts);
 
   [[nodiscard]] MotionColumns linear() const {
-    return {columns_of(T_), columns_of(identity_), columns_of(force_)};
+    return {columns_of(T_), columns_of(identity_), columns_of(force_), columns_of(mass_)};
   }  // nq columns
   [[nodiscard]] MotionColumns constant() const {
-    return {columns_of(Lb_), columns_of(zero_), columns_of(force_at_zero_)};
+    return {columns_of(Lb_), columns_of(zero_), columns_of(force_at_zero_), columns_of(zero_)};
   }  // one column
 
  private:
-  Eigen::MatrixXd T_, identity_, force_;  // (nq × nq)
+  Eigen::MatrixXd T_, identity_, force_, mass_;  // (nq × nq)
   Eigen::VectorXd Lb_, zero_, force_at_zero_;
 };
 

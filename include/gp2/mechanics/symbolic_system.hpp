@@ -2,6 +2,7 @@
 
 #include <memory>
 #include <mutex>
+#include <optional>
 #include <string>
 #include <vector>
 
@@ -18,8 +19,9 @@ struct SystemSymbols {
 
   SystemSymbols(ExpressionGraph& graph, const std::vector<Coordinate>& coordinates, const std::vector<std::string>& inputs,
                 const std::vector<Parameter>& parameters);
-  [[nodiscard]] std::vector<Expression> state() const;                 // in the order of StateLayout
-  [[nodiscard]] std::vector<Expression> state_and_parameters() const;  // inputs of most tapes
+  [[nodiscard]] std::vector<Expression> state() const;  // in the order of StateLayout
+  [[nodiscard]] std::vector<Expression> state_and_parameters(
+      std::span<const Expression> between = {}) const;  // inputs of most tapes
 };
 
 /// One row of A ddq = b, derived from a constraint.
@@ -31,12 +33,25 @@ struct ConstraintRow {
   Expression b;
   std::vector<Expression> residuals;  // position: c and ċ; velocity: c; acceleration: none
   double noise = 0;                   // ς of System::constraint_noise
+  std::string condition = {};         // of System::constraint_conditions
+
+  /// Of a unilateral contact c ≥ 0, which holds c = 0 where its input is above ½.
+  struct Contact {
+    int input = 0;           // of the system's inputs: 1 in contact, 0 apart
+    Expression restitution;  // e of the impact, of parameters
+  };
+  std::optional<Contact> contact = {};
 };
 
 /// Derives a row of A and b from the expression c of a constraint c = 0.
 ///
 /// @throws InputError when c depends on what its level does not allow, has no ddq to act on, or is not linear in ddq.
 ConstraintRow derive_constraint(ConstraintRow::Level level, Expression c, std::string text, const SystemSymbols& symbols);
+
+/// Makes a row vanish, with its entry of b and its residuals, wherever `active` is 0; where it is 1 they stay as they are. A
+/// constraint is differentiated as if it held always, and only then switched.
+/// @param condition  `active` as written
+void switch_constraint(ConstraintRow& row, Expression active, std::string condition);
 
 /// A System given by expressions: M(q,t), F(q,dq,t,u) and constraint rows, with exact derivatives in every parameter.
 class SymbolicSystem final : public System {
@@ -70,6 +85,7 @@ class SymbolicSystem final : public System {
                                           const Eigen::Ref<const Eigen::VectorXd>& parameters) const override;
   [[nodiscard]] const std::vector<Residual>& residual_labels() const override { return residual_labels_; }
   [[nodiscard]] std::vector<bool> reads(SystemPart part) const override;
+  [[nodiscard]] bool depends_on_parameter(int index) const override { return values_.uses_input(layout().size() + index); }
 
   [[nodiscard]] const Definition& definition() const { return definition_; }
 

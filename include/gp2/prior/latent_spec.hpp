@@ -1,6 +1,7 @@
 #pragma once
 
 #include <functional>
+#include <map>
 #include <memory>
 #include <optional>
 #include <string>
@@ -54,11 +55,12 @@ struct LatentSpec {
 };
 
 /// What the model's kernel would rule out without reason: a second latent of fixed, short lengthscales and a size below the
-/// noise. It hardly moves the mean, but keeps a standard deviation where the fit would call an effect absent that the data cannot
-/// see.
+/// noise, which is its one hyperparameter. It hardly moves the mean, but keeps a standard deviation where the fit would call an
+/// effect absent that the data cannot see.
 struct Discrepancy {
   Eigen::VectorXd lengthscale;  // of each of its features (D); empty: 1
-  Eigen::VectorXd stddev;       // of each acceleration (nq)
+  Eigen::VectorXd stddev;       // of each acceleration (nq), as large as the noise; the size is a factor of it
+  Latent::Base base = Latent::Base::admissible;
 };
 
 struct PriorOptions {
@@ -70,6 +72,9 @@ struct PriorOptions {
   /// directions of such a latent have hyperparameters of their own.
   std::string kernel = "se + linear";
   bool per_direction = true;
+  /// By a feature's name, what such a latent subtracts from it: its mean over the data, so that the linear part does not depend on
+  /// where a coordinate has its zero. Features that are not named stay as they are.
+  std::map<std::string, double> feature_centres = {};
 };
 
 /// A prior without a model file. Expressions are of the system's coordinates, velocities, t, inputs and parameters.

@@ -30,11 +30,13 @@ class StateFunction {
     /// … and their values, in this order.
     virtual void differentiate(const Eigen::Ref<const Eigen::VectorXd>& state, Eigen::Ref<Eigen::VectorXd> derivatives) = 0;
 
-    /// The programs from [state; parameters] to the numbers and to the derivatives, as long as the function lives; null where they
-    /// are not expressions.
+    /// The programs from [state; λ₀; parameters] to the numbers and to the derivatives, as long as the evaluator lives; null where
+    /// they are not expressions. λ₀ are the multipliers under the known force, of every row where any is read.
     struct Tapes {
       const Tape* values = nullptr;
       const Tape* derivatives = nullptr;
+      const std::vector<StateDerivatives::Entry>* entries = nullptr;  // of the derivatives, in [state; λ₀]
+      int n_loads = 0;                                                // of λ₀
     };
     [[nodiscard]] virtual Tapes tapes() const { return {}; }
   };

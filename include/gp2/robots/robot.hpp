@@ -99,15 +99,15 @@ struct RobotDescription {
 /// Whether this build has MuJoCo and so can read robots.
 bool can_read_robots();
 
-/// Reads a MJCF or URDF file with MuJoCo (≥ 2.2.2), which also knows its defaults, includes and units; the simulator is used for
-/// nothing else. Bodies, joints and sites without a name get one: body_3, joint_2, site_1, counted as MuJoCo does (the world is
-/// body 0). Entries of axes and rotations within 1e-9 of 0 or ±1 are taken as exact (a right angle written as 1.5707963268); a
-/// note says so when that is more than rounding. Of a URDF file, links fixed to others stay bodies of their own (unless it asks
-/// MuJoCo for `fusestatic`), meshes need not be there where inertias are, and a joint's <mimic> becomes a coupling.
+/// Reads a MJCF or URDF file with MuJoCo (2.2.2 to 3.x), which also knows its defaults, includes and units; the simulator is used
+/// for nothing else. Bodies, joints and sites without a name get one: body_3, joint_2, site_1, counted as MuJoCo does (the world
+/// is body 0). Entries of axes and rotations within 1e-9 of 0 or ±1 are taken as exact (a right angle written as 1.5707963268);
+/// a note says so when that is more than rounding. Of a URDF file, links fixed to others stay bodies of their own (unless it asks
+/// MuJoCo for `fusestatic`), and a joint's <mimic> becomes a coupling. Meshes need not be there where inertias are.
 ///
 /// @throws InputError when this build has no MuJoCo, with MuJoCo's own words when it refuses the file, and naming what has no
-///   place in a RobotDescription: ball and free joints, tendons held by an equality that wrap around geoms, springs, dampers or
-///   friction on tendons, motion in a fluid.
+///   place in a RobotDescription: ball and free joints, tendons held by an equality that wrap around geoms, springs, dampers,
+///   friction or armature of tendons, forces and inertias that only later versions of MuJoCo know, motion in a fluid.
 RobotDescription read_robot(const std::filesystem::path& path);
 
 /// The description as JSON text, exact to the last bit, and back: a fitted model keeps its robot this way and needs no MuJoCo.

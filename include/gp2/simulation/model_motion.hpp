@@ -35,6 +35,7 @@ class ModelMotion {
   std::shared_ptr<const System> system_;
   Eigen::VectorXd parameters_;
   Tape truth_, truth_force_;
+  bool reads_load_ = false;  // one of them has λ₀ among its inputs
 };
 
 /// The true acceleration L b + T (M⁻¹F + truth) at given states (nq × N).

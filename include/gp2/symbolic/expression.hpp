@@ -51,8 +51,8 @@ enum class Operation : std::uint8_t {
   atan2,  // atan2(a, b)
   min,
   max,
-  /// a · b, but 0 wherever a = 0, whatever b is. It appears in derivatives only: d√u = u̇ ⊗ 1/(2√u) is 0, not NaN, along a
-  /// direction in which u does not change.
+  /// a · b, but 0 wherever a = 0, whatever b is. It appears in derivatives, d√u = u̇ ⊗ 1/(2√u) is 0, not NaN, along a direction
+  /// in which u does not change, and in rows of constraints that come and go.
   multiply_or_zero,
 };
 
@@ -145,6 +145,14 @@ Expression operator-(Expression a);
 Expression parse_expression(std::string_view text, ExpressionGraph& graph,
                             const std::function<std::optional<Expression>(std::string_view)>& resolve,
                             std::span<const std::string> known_names);
+
+/// Reads a comparison of two expressions by <, <=, > or >= as the expression that is 1 where it holds and 0 where it does not, NaN
+/// where a side is. Its derivatives are 0.
+///
+/// @throws InputError as parse_expression, and where the text is no comparison.
+Expression parse_condition(std::string_view text, ExpressionGraph& graph,
+                           const std::function<std::optional<Expression>(std::string_view)>& resolve,
+                           std::span<const std::string> known_names);
 
 enum class Notation : std::uint8_t { text, latex, c, mathml };
 

@@ -31,14 +31,15 @@ struct Protocol {
     static constexpr double noise_lower = 1e-6, noise_upper = 2;
     static constexpr double noise_log_stddev = 2;
     static constexpr double discrepancy_lengthscale = 1.25;  // of the feature's spread
-    static constexpr double discrepancy_stddev = 0.4;        // of the noise …
-    static constexpr double discrepancy_states = 1600;       // … of up to so many, beyond in proportion to N^(−1/4)
-    static constexpr double start_log_stddev = 1.5;          // of random starts about the first one
+    static constexpr double discrepancy_lower = 1e-3, discrepancy_upper = 10;
+    static constexpr double discrepancy_median = 0.45, discrepancy_log_stddev = 0.15;  // of the noise
+    static constexpr double start_log_stddev = 1.5;                                    // of random starts about the first one
   };
 };
 
 /// The default scales of a data set, from which hyperparameters start and by which they are bounded.
 struct Scales {
+  std::vector<Eigen::VectorXd> feature_mean;    // per latent (D)
   std::vector<Eigen::VectorXd> feature_stddev;  // per latent (D)
   std::vector<Eigen::VectorXd> feature_range;   // per latent (D), largest minus smallest
   std::vector<Eigen::VectorXd> signal_stddev;   // per latent (p): σ_j, M_jj σ_j, or σ̄ / rms(E column)

@@ -71,7 +71,7 @@ struct Hyperparameter {
   /// the box tells.
   double size = 0;
   HyperPrior hyperprior;
-  /// A signal standard deviation that is `share` × this value, and no hyperparameter of its own.
+  /// A signal standard deviation of which `share` × this value is a factor, beside that of its latent.
   struct Follower {
     int latent = 0, column = 0;
     double share = 0;
@@ -89,7 +89,7 @@ struct Hyperparameter {
   /// Entries of a loading enter by C Cᵀ: where all of one latent's that may be negative are 0, so is their gradient.
   [[nodiscard]] bool is_stationary_at_zero() const { return kind == Kind::loading && !positive; }
 
-  // Its place in the model.
+  // Its place in the model, whose signal standard deviations are 1 before.
   void write(ModelValues& values) const;
   void ask_for_gradient(Likelihood::Options& options) const;
 

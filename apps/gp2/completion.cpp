@@ -1,0 +1,86 @@
+#include <filesystem>
+#include <memory>
+#include <utility>
+
+#include <fmt/format.h>
+
+#include "command.hpp"
+#include "command_line.hpp"
+#include "gp2/base/file.hpp"
+#include "pages.hpp"
+#include "streams.hpp"
+
+namespace gp2::command {
+
+namespace {
+
+struct CompletionArguments {
+  std::string shell, output;
+};
+
+// Man pages and completions where systems look for them below /usr/share, /usr/local/share or ~/.local/share.
+void write_share(const std::string& folder) {
+  const std::vector<Command> commands = all_commands();
+  const std::filesystem::path share = folder;
+  const auto write = [&](const std::filesystem::path& path, const std::string& text) {
+    make_folder((share / path.parent_path()).string());
+    write_file(share / path, text);
+  };
+  write("man/man1/gp2.1", man_page(commands));
+  for (const Command& command : commands) write(fmt::format("man/man1/gp2-{}.1", command.name), man_page(command));
+  write("bash-completion/completions/gp2", completion_script("bash", commands));
+  write("zsh/site-functions/_gp2", completion_script("zsh", commands));
+  write("fish/vendor_completions.d/gp2.fish", completion_script("fish", commands));
+}
+
+void run(const CompletionArguments& arguments) {
+  if (arguments.shell != "all") {
+    if (!arguments.output.empty()) throw UsageError{"-o goes with 'all': the script of one shell is printed"};
+    print_result("{}", completion_script(arguments.shell, all_commands()));
+    return;
+  }
+  if (arguments.output.empty()) throw UsageError{"'all' needs -o DIR, say ~/.local/share"};
+  write_share(arguments.output);
+}
+
+}  // namespace
+
+Command completion_command() {
+  const auto a = std::make_shared<CompletionArguments>();
+  Command command{
+      "completion",
+      "Print the script that lets a shell complete commands and options, or write those of all shells and the man pages",
+      "source <(gp2 completion bash)\n"
+      "gp2 completion fish > ~/.config/fish/completions/gp2.fish\n"
+      "gp2 completion all -o ~/.local/share",
+      {},
+      {}};
+  Option shell{"shell", choice(a->shell, {{"bash", "bash"}, {"zsh", "zsh"}, {"fish", "fish"}, {"all", "all"}}), "",
+               "bash, zsh, fish; all: every one of them and the man pages, into the folders below -o"};
+  shell.flag = "SHELL";
+  Option folder = output(a->output, "DIR", "folder like /usr/local/share or ~/.local/share");
+  folder.is_required = false;
+  command.options = {required(std::move(shell)), std::move(folder)};
+  command.run = [a](const std::set<std::string>&) { run(*a); };
+  return command;
+}
+
+Command help_command(const std::vector<std::string>& names) {
+  const auto name = std::make_shared<std::string>();
+  Command command{"help", "Explain gp2 or one of its commands", "gp2 help fit", {}, {}};
+  std::vector<std::pair<std::string, std::string>> words;
+  for (const std::string& one : names) words.emplace_back(one, one);
+  Option of{"command", choice(*name, words), "", "a command; without it all are listed"};
+  of.flag = "COMMAND";
+  command.options = {std::move(of)};
+  command.run = [name](const std::set<std::string>&) {
+    const std::vector<Command> commands = all_commands();
+    for (const Command& one : commands) {
+      if (one.name == *name) return write_stdout(help_page(one, help_width()));
+    }
+    write_stdout(help_page(commands, help_width()));
+  };
+  return command;
+}
+
+}  // namespace gp2::command

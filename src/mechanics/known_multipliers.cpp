@@ -1,0 +1,132 @@
+#include "mechanics/known_multipliers.hpp"
+
+#include <algorithm>
+
+#include <fmt/format.h>
+
+#include "base/not_a_number.hpp"
+#include "gp2/error.hpp"
+
+namespace gp2 {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::Ref;
+using Eigen::VectorXd;
+
+void KnownMultipliers::compute(const Matrix& M, const Matrix& A, const Vector& b, const Vector& F) {
+  M_ = M;
+  A_ = A;
+  lambda_.setConstant(A.rows(), not_a_number);
+  if (!M.allFinite() || !A.allFinite() || !b.allFinite() || !F.allFinite()) return;
+  projection_.compute(M, A, b);
+  if (!projection_.motion_is_determined()) return;
+
+  a_bar_ = F;
+  projection_.solve_mass_in_place(a_bar_);
+  a_.resize(F.size());
+  projection_.constrain(a_bar_, a_, workspace_);
+  force_ = -F;
+  force_.noalias() += M_ * a_;
+  projection_.write_multipliers_of_force(K_, workspace_);
+  lambda_.noalias() = K_ * force_;
+  along_.noalias() = K_.transpose() * lambda_;
+  L_.resize(M.rows(), A.rows());
+  projection_.write_L(L_);
+}
+
+void KnownMultipliers::start_derivatives(Index n) {
+  r_.setZero(M_.rows(), n);
+  of_rows_.setZero(A_.rows(), n);
+  dA_along_.setZero(A_.rows(), n);
+}
+
+void KnownMultipliers::add_derivative(Quantity of, Index row, Index column, Index variable, double value) {
+  switch (of) {
+    case Quantity::mass:
+      r_(row, variable) -= value * a_[column];
+      return;
+    case Quantity::constraint_matrix:
+      r_(column, variable) += value * lambda_[row];
+      of_rows_(row, variable) -= value * a_[column];
+      dA_along_(row, variable) += value * along_[column];
+      return;
+    case Quantity::constraint_vector:
+      of_rows_(row, variable) += value;
+      return;
+    case Quantity::force:
+      r_(row, variable) += value;
+      return;
+  }
+}
+
+const MatrixXd& KnownMultipliers::derivatives() {
+  dlambda_.resize(A_.rows(), r_.cols());
+  if (!lambda_.allFinite()) {
+    dlambda_.setConstant(not_a_number);
+    return dlambda_;
+  }
+  force_matrix_ = r_;
+  projection_.solve_mass_in_place(force_matrix_);
+  da_.noalias() = projection_.T() * force_matrix_;
+  da_.noalias() += L_ * of_rows_;
+  r_ *= -1;
+  r_.noalias() += M_ * da_;
+  dlambda_.noalias() = K_ * r_;
+  if (projection_.rank() == A_.rows()) return dlambda_;  // K Aᵀ = I
+
+  force_matrix_.noalias() = A_.transpose() * dA_along_;
+  dlambda_ += dA_along_;
+  dlambda_.noalias() -= K_ * force_matrix_;
+  return dlambda_;
+}
+
+namespace {
+constexpr std::string_view name_start = "lambda0(";
+}
+
+std::string known_multiplier_name(int row) { return fmt::format("{}{})", name_start, row + 1); }
+
+bool is_known_multiplier(std::string_view variable) { return variable.starts_with(name_start); }
+
+std::optional<std::string> row_fault(std::string_view known_multiplier, int nc) {
+  for (int row = 0; row < nc; ++row) {
+    if (known_multiplier == known_multiplier_name(row)) return std::nullopt;
+  }
+  return fmt::format("{}: there is no such row of the constraints, of which there are {}", known_multiplier, nc);
+}
+
+std::vector<Expression> known_multipliers_in(std::span<const Expression> expressions, const System& system) {
+  bool reads = false;
+  for (const Expression& expression : expressions) {
+    for (const std::string& variable : expression.graph().variables_of(expression)) {
+      if (!is_known_multiplier(variable)) continue;
+      reads = true;
+      if (const auto fault = row_fault(variable, system.nc())) throw InputError(*fault);
+    }
+  }
+  std::vector<Expression> variables;
+  for (int row = 0; reads && row < system.nc(); ++row) {
+    variables.push_back(expressions.front().graph().variable(known_multiplier_name(row)));
+  }
+  return variables;
+}
+
+MatrixXd with_known_multipliers(const System& system, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters) {
+  constexpr Index block = 256;
+  MatrixXd out(states.rows() + system.nc(), states.cols());
+  out.topRows(states.rows()) = states;
+  KnownMultipliers multipliers;
+  SystemValues values;
+  for (Index first = 0; first < states.cols(); first += block) {
+    const Index n = std::min(block, states.cols() - first);
+    system.evaluate_into(states.middleCols(first, n), parameters, values);
+    for (int i = 0; i < static_cast<int>(n); ++i) {
+      multipliers.compute(values.M(i), values.A(i), values.b(i), values.F(i));
+      out.col(first + i).tail(system.nc()) = multipliers.values();
+    }
+  }
+  return out;
+}
+
+}  // namespace gp2

@@ -1,0 +1,59 @@
+#pragma once
+
+#include <utility>
+
+#include <Eigen/Core>
+
+#include "gp2/mechanics/udwadia_kalaba.hpp"
+
+namespace gp2 {
+
+/// The directions of a latent with Latent::Base::admissible, one state after the other: with B = diag(s), W = B² and L and T those of
+/// a system whose mass matrix is W⁻¹,
+///
+///     E = B Π = T B,    dE = −(L dA E + E B dAᵀ Lᵀ B⁻¹)
+///
+/// Allocates nothing where the sizes are those of the call before.
+class AdmissibleDirections {
+ public:
+  using Matrix = Eigen::Ref<const Eigen::MatrixXd>;
+
+  /// @param stddev  s (nq), positive
+  explicit AdmissibleDirections(Eigen::VectorXd stddev)
+      : stddev_(std::move(stddev)), mass_(stddev_.cwiseAbs2().cwiseInverse().asDiagonal()), E_(mass_) {}
+
+  /// @param A  (nc × nq)
+  /// @returns E (nq × nq)
+  const Eigen::MatrixXd& compute(const Matrix& A) {
+    if (b_.size() != A.rows()) b_.setZero(A.rows());
+    projection_.compute(mass_, A, b_);
+    E_ = projection_.T() * stddev_.asDiagonal();
+    return E_;
+  }
+
+  /// dE where A, of the call before, changes by dA.
+  [[nodiscard]] Eigen::MatrixXd differentiate(const Matrix& dA) const {
+    const Eigen::MatrixXd L = projection_.L();
+    return -(L * dA * E_ + E_ * (stddev_.asDiagonal() * dA.transpose() * L.transpose() * stddev_.cwiseInverse().asDiagonal()));
+  }
+
+  /// What dE f needs of f (nq), and then adds to `out` where A_ij changes by `change`.
+  void set_functions(const Eigen::VectorXd& f) {
+    if (L_.size() != stddev_.size() * b_.size()) L_.resize(stddev_.size(), b_.size());
+    projection_.write_L(L_);
+    Ef_.noalias() = E_ * f;
+    scaled_ = f.cwiseQuotient(stddev_);
+    multipliers_.noalias() = L_.transpose() * scaled_;
+  }
+  void add_change(Eigen::Index i, Eigen::Index j, double change, Eigen::Ref<Eigen::VectorXd> out) const {
+    out -= change * (Ef_[j] * L_.col(i) + multipliers_[i] * stddev_[j] * E_.col(j));
+  }
+
+ private:
+  Eigen::VectorXd stddev_, b_;
+  Eigen::MatrixXd mass_, E_, L_;
+  Eigen::VectorXd Ef_, scaled_, multipliers_;
+  UdwadiaKalaba projection_;
+};
+
+}  // namespace gp2

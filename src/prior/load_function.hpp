@@ -1,0 +1,31 @@
+#pragma once
+
+#include <memory>
+
+#include "gp2/prior/state_function.hpp"
+#include "gp2/system.hpp"
+
+namespace gp2 {
+
+/// A StateFunction f(x, λ₀(x)) that reads the load of the constraints, their multipliers λ₀ under the known force of a system.
+class LoadFunction final : public StateFunction {
+ public:
+  /// @param function  f, whose states are [x; λ₀] and whose evaluator is exact
+  /// @param system    λ₀ is its own; where f has no parameters, with the system's own values of them
+  LoadFunction(std::shared_ptr<const StateFunction> function, std::shared_ptr<const System> system);
+
+  [[nodiscard]] int size() const override { return function_->size(); }
+  [[nodiscard]] Eigen::MatrixXd evaluate(const States& states, const Parameters& parameters) const override;
+  [[nodiscard]] Eigen::MatrixXd differentiate(const States& states, const Parameters& parameters, int index) const override;
+  [[nodiscard]] bool reads(int state_index) const override;
+  [[nodiscard]] std::unique_ptr<Evaluator> make_evaluator(const Parameters& parameters) const override;
+
+ private:
+  class ChainEvaluator;
+
+  std::shared_ptr<const StateFunction> function_;
+  std::shared_ptr<const System> system_;
+  std::vector<bool> lambda0_reads_;
+};
+
+}  // namespace gp2

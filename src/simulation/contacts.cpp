@@ -1,0 +1,221 @@
+#include "simulation/contacts.hpp"
+
+#include <algorithm>
+#include <cmath>
+
+#include <fmt/format.h>
+
+#include "gp2/error.hpp"
+#include "gp2/mechanics/symbolic_system.hpp"
+#include "gp2/mechanics/udwadia_kalaba.hpp"
+
+namespace gp2 {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+using Kind = ContactEvent::Kind;
+
+std::vector<Contact> contacts_of(const Model& model, const Eigen::Ref<const VectorXd>& parameters) {
+  std::vector<Contact> contacts;
+  const SymbolicSystem* const system = model.symbolic_system();
+  if (system == nullptr) return contacts;
+  const std::vector<ConstraintRow>& rows = system->definition().constraints;
+  for (std::size_t k = 0; k < rows.size(); ++k) {
+    if (!rows[k].contact) continue;
+    MatrixXd restitution;
+    Tape(std::span(&rows[k].contact->restitution, 1), model.symbols().state_and_parameters())
+        .evaluate(VectorXd::Zero(system->layout().size()), parameters, restitution);
+    const double e = restitution(0, 0);
+    if (!(e >= 0 && e <= 1)) {
+      throw InputError(
+          fmt::format("{}: the restitution of the contact '{}' must lie between 0 and 1, got {}", model.name, rows[k].text, e));
+    }
+    contacts.push_back({static_cast<int>(k), rows[k].contact->input, e});
+  }
+  return contacts;
+}
+
+Contacts::Contacts(const System& system, const VectorXd& parameters, const SimulateOptions& options)
+    : system_(system),
+      parameters_(parameters),
+      layout_(system.layout()),
+      contacts_(options.contacts),
+      shortest_flight_(options.shortest_flight),
+      is_closed_(contacts_.size(), false) {
+  const std::vector<System::Residual>& labels = system.residual_labels();
+  for (const Contact& contact : contacts_) {
+    const auto is_gap = [&](const System::Residual& one) { return one.row == contact.row && !one.velocity; };
+    const auto gap = std::find_if(labels.begin(), labels.end(), is_gap);
+    if (gap == labels.end() || contact.input < 0 || contact.input >= layout_.nu) {
+      throw InputError(
+          fmt::format("simulate: the contact of row {} of A needs a position-level constraint and one of the {} inputs",
+                      contact.row + 1, layout_.nu));
+    }
+    residuals_.push_back(static_cast<int>(gap - labels.begin()));
+  }
+}
+
+void Contacts::mark(VectorXd& state, const std::vector<bool>& closed) const {
+  for (std::size_t k = 0; k < contacts_.size(); ++k) state[layout_.u(contacts_[k].input)] = closed[k] ? 1 : 0;
+}
+
+Contacts::Gaps Contacts::gaps_at(VectorXd state) const {
+  constexpr double of_rounding = 1e-14;
+  mark(state, std::vector<bool>(contacts_.size(), true));
+  const VectorXd residuals = system_.residuals(state, parameters_).col(0);
+  const SystemValues values = system_.evaluate(state, parameters_);
+  const auto n = static_cast<Index>(contacts_.size());
+  Gaps out{VectorXd(n), VectorXd(n), VectorXd(n), MatrixXd(n, layout_.nq), VectorXd(n)};
+  for (Index k = 0; k < n; ++k) {
+    const auto contact = static_cast<std::size_t>(k);
+    const int row = contacts_[contact].row;
+    out.value[k] = residuals[residuals_[contact]];
+    out.rate[k] = residuals[residuals_[contact] + 1];
+    out.A.row(k) = values.A(0).row(row);
+    out.b[k] = values.b(0)[row];
+    out.margin[k] = of_rounding * out.A.row(k).cwiseAbs().dot(state.head(layout_.nq).cwiseAbs());
+  }
+  return out;
+}
+
+void Contacts::start(VectorXd& state, const Acceleration& acceleration, std::vector<ContactEvent>& events) {
+  constexpr double digits_of_a_log = 1e-6;
+  const Gaps gaps = gaps_at(state);
+  for (std::size_t k = 0; k < contacts_.size(); ++k) {
+    const auto row = static_cast<Index>(k);
+    const double lengths = 1 + gaps.A.row(row).cwiseAbs().dot(state.head(layout_.nq).cwiseAbs());
+    const double speeds = 1 + gaps.A.row(row).cwiseAbs().dot(state.segment(layout_.dq(0), layout_.nq).cwiseAbs());
+    if (gaps.value[row] < -digits_of_a_log * lengths) {
+      throw InputError(
+          fmt::format("simulate: the start is beyond the contact '{}', whose gap is {:.6g}: start where it is not negative, or "
+                      "change its sign",
+                      system_.constraint_labels()[static_cast<std::size_t>(contacts_[k].row)], gaps.value[row]));
+    }
+    is_closed_[k] = gaps.value[row] <= digits_of_a_log * lengths && std::abs(gaps.rate[row]) <= digits_of_a_log * speeds;
+  }
+  // none of these is a contact that was made or released on the way
+  std::vector<ContactEvent> of_start;
+  release(state, acceleration, of_start);
+  settle(state, acceleration, events);
+}
+
+bool Contacts::is_hit(const VectorXd& state) const {
+  const Gaps gaps = gaps_at(state);
+  for (std::size_t k = 0; k < contacts_.size(); ++k) {
+    const auto row = static_cast<Index>(k);
+    if (!is_closed_[k] && gaps.value[row] < -gaps.margin[row] && gaps.rate[row] < 0) return true;
+  }
+  return false;
+}
+
+// With one contact opened and all others held c̈ = −λ/Λ_kk, Λ = (A M⁻¹Aᵀ)⁻¹: it opens exactly where its multiplier would pull.
+double Contacts::opening(VectorXd state, std::size_t contact, const Acceleration& acceleration) const {
+  constexpr double rounding = 1e-12;
+  std::vector<bool> closed = is_closed_;
+  closed[contact] = false;
+  const Gaps gaps = gaps_at(state);
+  mark(state, closed);
+  const VectorXd ddq = acceleration(state);
+  const auto row = static_cast<Index>(contact);
+  const double value = gaps.A.row(row).dot(ddq) - gaps.b[row];
+  const double size = gaps.A.row(row).cwiseAbs().dot(ddq.cwiseAbs()) + std::abs(gaps.b[row]);
+  return std::abs(value) <= rounding * size ? 0 : value;
+}
+
+bool Contacts::is_released(const VectorXd& state, const Acceleration& acceleration) const {
+  for (std::size_t k = 0; k < contacts_.size(); ++k) {
+    if (is_closed_[k] && opening(state, k, acceleration) > 0) return true;
+  }
+  return false;
+}
+
+void Contacts::release(VectorXd& state, const Acceleration& acceleration, std::vector<ContactEvent>& events) {
+  for (bool has_changed = true; has_changed;) {
+    has_changed = false;
+    for (std::size_t k = 0; k < contacts_.size(); ++k) {
+      if (!is_closed_[k] || !(opening(state, k, acceleration) > 0)) continue;
+      is_closed_[k] = false;
+      has_changed = true;
+      events.push_back({state[layout_.t()], contacts_[k].row, Kind::released, 0, 0});
+    }
+  }
+  mark(state);
+}
+
+// Δdq = M⁻¹Aᵀ(A M⁻¹Aᵀ)⁺ r, with r = −(1 + e) ċ of the rows that are hit and 0 of all others that are active: L b of T2 with r for b.
+double Contacts::impact(VectorXd& state, const std::vector<bool>& hit, const VectorXd& restitution) {
+  const Gaps gaps = gaps_at(state);
+  std::vector<bool> active = is_closed_;
+  for (std::size_t k = 0; k < active.size(); ++k) active[k] = active[k] || hit[k];
+  while (true) {
+    mark(state, active);
+    const SystemValues values = system_.evaluate(state, parameters_);
+    VectorXd r = VectorXd::Zero(system_.nc());
+    for (std::size_t k = 0; k < contacts_.size(); ++k) {
+      const auto row = static_cast<Index>(k);
+      if (hit[k] && active[k]) r[contacts_[k].row] = -(1 + restitution[row]) * gaps.rate[row];
+    }
+    const UdwadiaKalaba projection(values.M(0), values.A(0), r);
+    if (!projection.motion_is_determined()) throw NumericalError("nothing determines what an impact does to the velocities");
+    const VectorXd change = projection.Lb();
+    const VectorXd impulses = projection.multipliers_of_force() * (values.M(0) * change);
+    // a contact only pushes
+    constexpr double rounding = 1e-12;
+    std::size_t worst = contacts_.size();
+    double least = -rounding * impulses.cwiseAbs().maxCoeff();
+    for (std::size_t k = 0; k < contacts_.size(); ++k) {
+      if (!active[k] || !(impulses[contacts_[k].row] < least)) continue;
+      least = impulses[contacts_[k].row];
+      worst = k;
+    }
+    if (worst < contacts_.size()) {
+      active[worst] = is_closed_[worst] = false;
+      continue;
+    }
+    auto dq = state.segment(layout_.dq(0), layout_.nq);
+    const double loss = -change.dot(values.M(0) * (dq + change / 2));
+    dq += change;
+    return loss;
+  }
+}
+
+void Contacts::settle(VectorXd& state, const Acceleration& acceleration, std::vector<ContactEvent>& events) {
+  const Gaps gaps = gaps_at(state);
+  const auto n = static_cast<Index>(contacts_.size());
+  std::vector<bool> hit(contacts_.size(), false);
+  VectorXd restitution(n);
+  for (Index k = 0; k < n; ++k) {
+    const auto contact = static_cast<std::size_t>(k);
+    hit[contact] = !is_closed_[contact] && gaps.value[k] < -gaps.margin[k] && gaps.rate[k] < 0;
+    restitution[k] = contacts_[contact].restitution;
+  }
+  if (std::find(hit.begin(), hit.end(), true) == hit.end()) {
+    release(state, acceleration, events);
+    return;
+  }
+  double loss = impact(state, hit, restitution);
+  mark(state);
+  // a rebound that is over at once is none
+  std::vector<bool> stays = hit;
+  const VectorXd rate = rates(state);
+  for (Index k = 0; k < n; ++k) {
+    const auto contact = static_cast<std::size_t>(k);
+    if (!hit[contact]) continue;
+    const double back = opening(state, contact, acceleration);
+    stays[contact] = restitution[k] == 0 || (back < 0 && 2 * rate[k] <= -back * shortest_flight_);
+  }
+  if (std::find(stays.begin(), stays.end(), true) != stays.end()) {
+    loss += impact(state, stays, VectorXd::Zero(n));
+    for (std::size_t k = 0; k < contacts_.size(); ++k) is_closed_[k] = is_closed_[k] || stays[k];
+    mark(state);
+  }
+  for (std::size_t k = 0; k < contacts_.size(); ++k) {
+    if (!hit[k]) continue;
+    events.push_back({state[layout_.t()], contacts_[k].row, stays[k] ? Kind::made : Kind::impact,
+                      -gaps.rate[static_cast<Index>(k)], std::exchange(loss, 0)});
+  }
+  release(state, acceleration, events);
+}
+
+}  // namespace gp2

@@ -1,0 +1,55 @@
+#pragma once
+
+#include <vector>
+
+#include <Eigen/Core>
+
+#include "gp2/simulate.hpp"
+
+namespace gp2 {
+
+/// Contacts that are made and released along a motion: which of them are closed, and what an impact makes of the velocities.
+class Contacts {
+ public:
+  Contacts(const System& system, const Eigen::VectorXd& parameters, const SimulateOptions& options);
+
+  [[nodiscard]] bool is_empty() const { return contacts_.empty(); }
+  /// Writes to the inputs of a state which contacts are closed.
+  void mark(Eigen::VectorXd& state) const { mark(state, is_closed_); }
+
+  /// Closes the contacts in which a motion starts. @throws InputError where it starts beyond a surface.
+  void start(Eigen::VectorXd& state, const Acceleration& acceleration, std::vector<ContactEvent>& events);
+  /// Whether a contact that is open is past its surface and moves on.
+  [[nodiscard]] bool is_hit(const Eigen::VectorXd& state) const;
+  /// The rates of all gaps (n).
+  [[nodiscard]] Eigen::VectorXd rates(const Eigen::VectorXd& state) const { return gaps_at(state).rate; }
+  /// Whether a contact that is closed would open without its constraint.
+  [[nodiscard]] bool is_released(const Eigen::VectorXd& state, const Acceleration& acceleration) const;
+  /// Impacts of the contacts that are hit, then releases.
+  void settle(Eigen::VectorXd& state, const Acceleration& acceleration, std::vector<ContactEvent>& events);
+
+ private:
+  struct Gaps {
+    Eigen::VectorXd value, rate;  // c and ċ  (n)
+    Eigen::VectorXd margin;       // |c| that rounding may make of 0  (n)
+    Eigen::MatrixXd A;            // their rows of A ddq = b, active or not  (n × nq)
+    Eigen::VectorXd b;            // (n)
+  };
+  [[nodiscard]] Gaps gaps_at(Eigen::VectorXd state) const;
+  void mark(Eigen::VectorXd& state, const std::vector<bool>& closed) const;
+  /// c̈ of a contact that is opened, all others as they are.
+  [[nodiscard]] double opening(Eigen::VectorXd state, std::size_t contact, const Acceleration& acceleration) const;
+  /// Takes the rates of the gaps in `hit` to −restitution times what they are, and gives the kinetic energy that this takes.
+  double impact(Eigen::VectorXd& state, const std::vector<bool>& hit, const Eigen::VectorXd& restitution);
+  void release(Eigen::VectorXd& state, const Acceleration& acceleration, std::vector<ContactEvent>& events);
+
+  const System& system_;
+  const Eigen::VectorXd& parameters_;
+  const StateLayout layout_;
+  std::vector<Contact> contacts_;
+  std::vector<int> residuals_;  // of each contact: its c among the residuals of the system, followed by ċ
+  double shortest_flight_;
+  std::vector<bool> is_closed_;
+};
+
+}  // namespace gp2

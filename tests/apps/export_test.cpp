@@ -1,0 +1,99 @@
+#include <regex>
+
+#include <gmock/gmock.h>
+#include <gtest/gtest.h>
+
+#include "apps/command_line.hpp"
+#include "gp2/robots/robot.hpp"
+#include "robots/robot_expressions.hpp"
+
+namespace gp2::test {
+namespace {
+
+using testing::HasSubstr;
+
+// A fitted mass and damping of a linkage in a copy of its file.
+class RobotExportCommand : public testing::Test {
+ protected:
+  void SetUp() override {
+    if (desk.run("gp2 show models/four_bar.toml").status != 0) GTEST_SKIP() << "built without MuJoCo";
+    desk.write("robot.xml", desk.read("models/four_bar.xml"));
+    desk.write("rocker.toml", R"toml(
+name        = "four-bar linkage with a rocker of unknown mass"
+robot       = "robot.xml"
+coordinates = ["crank", "coupler", "rocker"]
+inputs      = ["u"]
+[parameters]
+m = { of = 'mass("rocker")', bounds = [0.05, 1], estimate = true }
+d = { of = 'damping("rocker")', value = 0.01, bounds = [0.001, 0.1], estimate = true }
+[mechanics]
+force = ["u", "0", "0"]
+[[latent]]
+features   = ["dcrank", "drocker"]
+directions = "force"
+[noise]
+ddq = 0.05
+[truth]
+force = ["0", "0", "-0.02*drocker"]
+[motion]
+rate              = 50
+segment           = [1, 2]
+natural_frequency = 20
+targets           = { crank = [-6, 6] }
+)toml");
+    desk.done("gp2 generate rocker.toml --n 40 --seed 1 -o rocker.csv");
+    desk.done("gp2 fit rocker.toml --data rocker.csv --mean force --restarts 1 --hyperparameters optimise -o fit.json");
+  }
+
+  [[nodiscard]] double fitted(const std::string& name) const {
+    const nlohmann::json fit = desk.json("fit.json");
+    for (const auto& one : fit["hyperparameters"]) {
+      if (one["name"] == name) return one["value"];
+    }
+    throw std::runtime_error("no " + name);
+  }
+  [[nodiscard]] double number_of(const std::string& file, const std::string& name) const {
+    for (const auto& [known, value] : robot_numbers(read_robot(desk / file))) {
+      if (known == name) return value;
+    }
+    throw std::runtime_error("no " + name);
+  }
+  Desk desk;
+};
+
+TEST_F(RobotExportCommand, TheRobotsFileHasTheFittedNumbersAndIsElseAsItWas) {
+  const Outcome outcome = desk.done("gp2 export fit.json --to mjcf -o fitted.xml");
+  EXPECT_THAT(outcome.err, HasSubstr("fitted.xml ("));
+  EXPECT_EQ(number_of("fitted.xml", R"(damping("rocker"))"), fitted("d"));
+  EXPECT_EQ(number_of("fitted.xml", R"(mass("rocker"))"), fitted("m"));
+  EXPECT_EQ(number_of("fitted.xml", R"(mass("crank"))"), number_of("robot.xml", R"(mass("crank"))"));
+  // without what was added it is the robot's file, byte by byte
+  std::string text = desk.read("fitted.xml");
+  text = std::regex_replace(text, std::regex(" <!-- fitted: [^>]*-->"), "");
+  text = std::regex_replace(text, std::regex(" damping=\"[^\"]*\""), "");
+  text = std::regex_replace(text, std::regex("\\n *<inertial [^>]*/>"), "");
+  EXPECT_EQ(text, desk.read("robot.xml"));
+  // a model goes by it as by the other
+  desk.write("again.toml", replaced(desk.read("rocker.toml"), "robot.xml", "fitted.xml"));
+  desk.done("gp2 check again.toml");
+  // a pipe gets the same
+  EXPECT_EQ(desk.done("gp2 export fit.json --to mjcf -o -").out, desk.read("fitted.xml"));
+}
+
+TEST_F(RobotExportCommand, LeavesTheRobotAndTheFitAlone) {
+  const std::string robot = desk.read("robot.xml"), fit = desk.read("fit.json");
+  for (const char* output : {"robot.xml", "fit.json"}) {
+    const Outcome outcome = desk.run(std::string("gp2 export fit.json --to mjcf -o ") + output);
+    EXPECT_EQ(outcome.status, 2);
+    EXPECT_THAT(outcome.err, HasSubstr("that is the input"));
+  }
+  EXPECT_EQ(desk.read("robot.xml"), robot);
+  EXPECT_EQ(desk.read("fit.json"), fit);
+  const Outcome outcome = desk.run("gp2 export fit.json --to mjcf --view force -o fitted.xml");
+  EXPECT_EQ(outcome.status, 2);
+  EXPECT_THAT(outcome.err, HasSubstr("--to mjcf writes parameters, no functions: it goes with --robot and --name alone"));
+  EXPECT_FALSE(desk.has("fitted.xml"));
+}
+
+}  // namespace
+}  // namespace gp2::test

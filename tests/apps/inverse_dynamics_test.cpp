@@ -1,0 +1,65 @@
+#include <gmock/gmock.h>
+#include <gtest/gtest.h>
+
+#include "apps/command_line.hpp"
+
+namespace gp2::test {
+namespace {
+
+using Eigen::MatrixXd;
+using testing::HasSubstr;
+
+class InverseDynamicsCommand : public testing::Test {
+ protected:
+  void SetUp() override {
+    desk.done("gp2 generate models/arm_on_moving_plane.toml --n 30 --seed 1 -o train.csv");
+    desk.done("gp2 generate models/arm_on_moving_plane.toml --n 8 --seed 2 -o test.csv");
+    desk.done(
+        "gp2 fit models/arm_on_moving_plane.toml --data train.csv --mean force --restarts 1 --max-iterations 20 -o fit.json");
+    // what the fit itself says can be reached
+    desk.done("gp2 predict fit.json --states test.csv -o predicted.csv");
+    desk.done("sed 's/ddshoulder_input,ddelbow_input/measured1,measured2/' predicted.csv >wanted.csv");
+  }
+  const std::vector<std::string> ddq = {"ddshoulder", "ddelbow"}, inputs = {"tau1", "tau2"};
+  Desk desk;
+};
+
+TEST_F(InverseDynamicsCommand, PredictingWithTheInputsGivesWhatWasWanted) {
+  const Outcome outcome = desk.done("gp2 predict fit.json --states wanted.csv --inverse-dynamics --cov full -o inputs.csv");
+  EXPECT_THAT(outcome.err, HasSubstr("inputs.csv: inputs at 8 states"));
+  const CsvTable found = desk.table("inputs.csv");
+  const MatrixXd std = columns(found, {"tau1_std", "tau2_std"}), variance = columns(found, {"cov_tau1_tau1", "cov_tau2_tau2"});
+  EXPECT_LE((std.cwiseAbs2() - variance).cwiseAbs().maxCoeff(), 1e-12 * variance.maxCoeff());
+  EXPECT_GT(std.minCoeff(), 0);
+  desk.done("gp2 predict fit.json --states inputs.csv -o reached.csv");
+  const MatrixXd wanted = columns(desk.table("wanted.csv"), ddq), reached = columns(desk.table("reached.csv"), ddq);
+  EXPECT_LE((wanted - reached).cwiseAbs().maxCoeff(), 1e-10 * (1 + wanted.cwiseAbs().maxCoeff()));
+  EXPECT_LE(columns(found, {"ddshoulder_missed", "ddelbow_missed"}).cwiseAbs().maxCoeff(),
+            1e-10 * (1 + wanted.cwiseAbs().maxCoeff()));
+}
+
+TEST_F(InverseDynamicsCommand, SaysWhatIsMissed) {
+  // the plane moves: no acceleration of both that is 0
+  desk.done(
+      "sed 's/ddshoulder/a/;s/ddelbow/b/' wanted.csv | awk -F, 'NR==1{print $0\",ddshoulder,ddelbow\"} NR>1{print $0\",0,0\"}' "
+      ">still.csv");
+  const Outcome outcome = desk.done("gp2 predict fit.json --states still.csv --inverse-dynamics -o inputs.csv");
+  EXPECT_THAT(outcome.err, HasSubstr("warning: still.csv: no inputs produce the accelerations at 8 of 8 rows"));
+  EXPECT_GT(columns(desk.table("inputs.csv"), {"ddshoulder_missed"}).norm(), 1e-3);
+}
+
+TEST_F(InverseDynamicsCommand, RefusesWhatDoesNotGoWithIt) {
+  const auto refusal = [&](const std::string& options) {
+    const Outcome outcome = desk.run("gp2 predict fit.json --inverse-dynamics -o inputs.csv " + options);
+    EXPECT_EQ(outcome.status, 2) << options;
+    return outcome.err;
+  };
+  EXPECT_THAT(refusal("--states wanted.csv --view force"),
+              HasSubstr("--inverse-dynamics stands in the place of a view: leave --view, --latent, --dt and --samples out"));
+  desk.done("cut -d, -f1-6 train.csv | sed 's/dd/x/g' >bare.csv");
+  EXPECT_THAT(refusal("--states bare.csv"),
+              HasSubstr("has none of the columns ddshoulder, ddelbow, the accelerations that are wanted"));
+}
+
+}  // namespace
+}  // namespace gp2::test

@@ -1,0 +1,216 @@
+#include "gp2/inference/inverse_dynamics.hpp"
+
+#include <gmock/gmock.h>
+#include <gtest/gtest.h>
+#include <Eigen/QR>
+
+#include "gp2/error.hpp"
+#include "gp2/predictor.hpp"
+#include "inference/problems.hpp"
+#include "input_error.hpp"
+
+// Inverse dynamics, then forward, is what was wanted.
+namespace gp2 {
+namespace {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+using test::largest;
+using test::Problem;
+using test::Quantity;
+using testing::HasSubstr;
+
+constexpr std::uint64_t inverse_seed = 30517;
+
+MatrixXd with_inputs(MatrixXd states, const MatrixXd& inputs) {
+  states.bottomRows(inputs.rows()) = inputs;
+  return states;
+}
+
+// J of the inputs
+MatrixXd slope_at(const Posterior& posterior, const View& view, const VectorXd& state, Index nu) {
+  const Predictor predictor(posterior, view);
+  Predictor::Workspace workspace = predictor.make_workspace();
+  VectorXd mean(view.size());
+  MatrixXd jacobian(view.size(), state.size());
+  EXPECT_EQ(predictor.mean_and_jacobian(state, mean, jacobian, workspace), Predictor::Status::ok);
+  return jacobian.rightCols(nu);
+}
+
+// what some inputs make is wanted, and looked for from others near them: latents may read inputs, and be anything farther off
+TEST(InverseDynamicsTest, ForwardOfTheInputsFoundIsWhatWasWanted) {
+  int n = 0;
+  for (const Problem& p : test::problems(15, inverse_seed)) {
+    const Index nu = p.prior.system->layout().nu;
+    if (nu == 0) continue;
+    ++n;
+    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, inverse_seed));
+    const Posterior posterior(p.prior, p.observations, p.values);
+    const View view = View::constrained_acceleration(*p.prior.system);
+    const MatrixXd states = p.queries.array().isNaN().select(0, p.queries);
+    const MatrixXd wanted = posterior.mean(view, states);
+    RandomStream random(inverse_seed, static_cast<std::uint64_t>(n));
+    const MatrixXd off = 0.01 * test::random_matrix(nu, states.cols(), random);
+    const InverseDynamics found = inverse_dynamics(posterior, view, with_inputs(states, states.bottomRows(nu) + off), wanted);
+    const MatrixXd reached = posterior.mean(view, with_inputs(states, found.inputs));
+    const double tolerance = (1e-12 + 1e-3 * test::rounding(p)) * (1 + largest(wanted));
+    EXPECT_LE(largest(reached - wanted), 1e3 * tolerance);
+    EXPECT_LE(largest(wanted - reached - found.missed), tolerance);
+  }
+  EXPECT_GT(n, 20);
+}
+
+// The arm: two motors for one free direction, latents that read no input: affine in the inputs.
+struct Arm {
+  const Model& model = test::model("models/arm_on_moving_plane.toml");
+  const Prior prior = make_prior(model, {Prior::Mean::force, std::nullopt});
+  const View view = View::constrained_acceleration(*model.system);
+  const MatrixXd states = test::draw(model, 4, inverse_seed + 1).states;
+  const Posterior posterior = [this] {
+    RandomStream random(inverse_seed);
+    const std::vector<Observations> observations = {
+        test::observe(model, view, test::draw(model, 12, inverse_seed).states, random)};
+    return Posterior(prior, observations, test::random_values(prior, observations, random));
+  }();
+
+  [[nodiscard]] InverseDynamics inverse(const MatrixXd& wanted) const {
+    return inverse_dynamics(posterior, view, with_inputs(states, MatrixXd::Constant(2, states.cols(), std::nan(""))), wanted);
+  }
+};
+
+TEST(InverseDynamicsTest, OfInputsThatDoTheSameIsTheLeastChange) {
+  const Arm arm;
+  const MatrixXd wanted = arm.posterior.mean(arm.view, arm.states);
+  const InverseDynamics found = arm.inverse(wanted);
+  EXPECT_LE(largest(found.missed), 1e-11 * (1 + largest(wanted)));
+  const MechanicsBatch mechanics = require_mechanics(*arm.model.system, arm.states, arm.posterior.values().parameters);
+  for (int i = 0; i < 4; ++i) {
+    const MatrixXd J = slope_at(arm.posterior, arm.view, arm.states.col(i), 2);
+    const VectorXd idle = Eigen::FullPivLU<MatrixXd>(J).setThreshold(1e-9).kernel().col(0);
+    const VectorXd effect = (J.transpose() * mechanics.values.M(i) * J).diagonal();  // squared
+    const VectorXd u = found.inputs.col(i);
+    EXPECT_LE(std::abs(u.cwiseProduct(effect).dot(idle)), 1e-11 * u.cwiseProduct(effect).norm() * idle.norm());
+  }
+}
+
+TEST(InverseDynamicsTest, WhatNoInputsProduceIsMissedByTheLeastInTheSenseOfGauss) {
+  const Arm arm;
+  RandomStream random(inverse_seed, 2);
+  // off the constraint by chance
+  const MatrixXd wanted = test::random_matrix(2, 4, random);
+  const InverseDynamics found = arm.inverse(wanted);
+  const MatrixXd states = with_inputs(arm.states, found.inputs);
+  const MechanicsBatch mechanics = require_mechanics(*arm.model.system, states, arm.posterior.values().parameters);
+  for (int i = 0; i < 4; ++i) {
+    EXPECT_GT(found.missed.col(i).norm(), 1e-3);
+    const MatrixXd J = slope_at(arm.posterior, arm.view, states.col(i), 2);
+    EXPECT_LE(largest(J.transpose() * mechanics.values.M(i) * found.missed.col(i)), 1e-11 * (1 + largest(J)));
+    const VectorXd reached = arm.posterior.mean(arm.view, states.col(i));
+    EXPECT_LE(largest(mechanics.values.A(i) * reached - mechanics.values.b(i)), 1e-11 * (1 + largest(reached)));
+  }
+}
+
+// u is affine in w and in the latents, so that its covariance is that of ddq through the slope in w
+TEST(InverseDynamicsTest, TheDeviationIsThatOfTheAccelerations) {
+  const Arm arm;
+  const MatrixXd wanted = arm.posterior.mean(arm.view, arm.states);
+  const InverseDynamics found = arm.inverse(wanted);
+  const Posterior::Marginal ddq = arm.posterior.marginal(arm.view, with_inputs(arm.states, found.inputs));
+  std::vector<MatrixXd> slope(4, MatrixXd(2, 2));  // du/dw
+  for (Index k = 0; k < 2; ++k) {
+    MatrixXd more = wanted;
+    more.row(k).array() += 1;
+    const MatrixXd change = arm.inverse(more).inputs - found.inputs;
+    for (Index i = 0; i < 4; ++i) slope[static_cast<std::size_t>(i)].col(k) = change.col(i);
+  }
+  for (Index i = 0; i < 4; ++i) {
+    const MatrixXd& J = slope[static_cast<std::size_t>(i)];
+    const MatrixXd expected = J * ddq.covariance.col(i).reshaped(2, 2) * J.transpose();
+    EXPECT_LE(largest(found.covariance.col(i).reshaped(2, 2) - expected), 1e-9 * largest(expected));
+    EXPECT_NEAR(found.stddev()(0, i), std::sqrt(expected(0, 0)), 1e-9 * std::sqrt(largest(expected)));
+  }
+}
+
+TEST(InverseDynamicsTest, OfSomeAccelerationsUnderAnotherSystem) {
+  const Arm arm;
+  std::string text = arm.model.text;
+  text = test::changed(text, {{"w  = 4.0", "w  = 5.0"}});
+  const Model faster = Model::parse(text, "faster.toml");
+  View elbow = test::under({Quantity::constrained_acceleration, {1}},
+                           make_other_system(arm.model, faster, {Prior::Mean::force, std::nullopt}));
+  MatrixXd wanted = MatrixXd::Constant(1, 4, 2.5);
+  wanted(0, 3) = 0;  // no scale of its own
+  const InverseDynamics found = inverse_dynamics(arm.posterior, elbow, arm.states, wanted);
+  const MatrixXd reached = arm.posterior.mean(elbow, with_inputs(arm.states, found.inputs));
+  EXPECT_LE(largest(reached - wanted), 1e-11);
+  elbow.other_system = nullptr;
+  EXPECT_GT(largest(arm.posterior.mean(elbow, with_inputs(arm.states, found.inputs)) - wanted), 1e-6);
+}
+
+Model cart(const std::string& force) {
+  return Model::parse(R"toml(
+name        = "cart"
+coordinates = ["x"]
+inputs      = ["u"]
+[mechanics]
+mass  = [["2"]]
+force = [")toml" + force + R"toml("]
+[[latent]]
+kernel   = "se"
+features = ["dx"]
+)toml",
+                      "cart.toml");
+}
+
+TEST(InverseDynamicsTest, IsFoundByNewtonsMethodWhereTheInputsAreNotAffine) {
+  const Model model = cart("u + 5*u^3 - x");
+  const Posterior prior(make_prior(model, {Prior::Mean::force, std::nullopt}), {},
+                        {{VectorXd::Ones(1)}, {VectorXd::Ones(1)}, {}, {}, {}});
+  const View view = View::constrained_acceleration(*model.system);
+  MatrixXd states = MatrixXd::Zero(4, 3), wanted(1, 3);
+  states.row(0) << 0, 1, -2;
+  wanted << 40, -3, 1e-3;
+  const InverseDynamics found = inverse_dynamics(prior, view, states, wanted);
+  for (Index i = 0; i < 3; ++i) {
+    const double u = found.inputs(0, i);
+    EXPECT_NEAR((u + 5 * u * u * u - states(0, i)) / 2, wanted(0, i), 1e-12 * (1 + std::abs(wanted(0, i))));
+    // δu = δddq / (dddq/du), and the prior's deviation of ddq is 1
+    EXPECT_NEAR(found.stddev()(0, i), 2 / (1 + 15 * u * u), 1e-9);
+  }
+}
+
+TEST(InverseDynamicsTest, SaysWhatCannotBe) {
+  const Model model = cart("u^2");
+  const Posterior prior(make_prior(model, {Prior::Mean::force, std::nullopt}), {},
+                        {{VectorXd::Ones(1)}, {VectorXd::Ones(1)}, {}, {}, {}});
+  const View view = View::constrained_acceleration(*model.system);
+  const VectorXd state = Eigen::Vector4d(0, 0, 0, 1);
+  const MatrixXd wanted = MatrixXd::Constant(1, 1, -1);
+  try {
+    static_cast<void>(inverse_dynamics(prior, view, state, wanted));
+    ADD_FAILURE() << "no error";
+  } catch (const NumericalError& error) {
+    EXPECT_THAT(error.what(), HasSubstr("no inputs are found that produce the accelerations, or come nearest to them"));
+  }
+  const auto refusal = [&](const View& of, const MatrixXd& accelerations) {
+    return test::input_error_of([&] { static_cast<void>(inverse_dynamics(prior, of, state, accelerations)); });
+  };
+  EXPECT_THAT(refusal(View::unconstrained_acceleration(*model.system), wanted),
+              HasSubstr("must be of the constrained acceleration"));
+  EXPECT_THAT(refusal(view, MatrixXd::Zero(2, 1)), HasSubstr("expected accelerations of 1 rows at 1 states, got 2 × 1"));
+  EXPECT_THAT(refusal(view, MatrixXd::Constant(1, 1, std::nan(""))),
+              HasSubstr("an acceleration that is wanted is not a finite number"));
+  const Model& pendulum = test::model("models/double_pendulum.toml");
+  const Prior without_inputs = make_prior(pendulum);
+  EXPECT_THAT(test::input_error_of([&] {
+                static_cast<void>(inverse_dynamics(
+                    Posterior(without_inputs, {}, test::random_values(without_inputs, {}, *std::make_unique<RandomStream>(1))),
+                    View::constrained_acceleration(*pendulum.system), MatrixXd(pendulum.system->layout().size(), 0),
+                    MatrixXd(pendulum.system->nq(), 0)));
+              }),
+              HasSubstr("has no inputs"));
+}
+
+}  // namespace
+}  // namespace gp2

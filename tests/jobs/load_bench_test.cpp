@@ -1,0 +1,97 @@
+// Friction μ(v)|λ₀| of two machines: what a direction that knows the load gains, and that it holds beyond the data.
+#include <cmath>
+
+#include <fmt/format.h>
+#include <gtest/gtest.h>
+
+#include "data_of_model.hpp"
+#include "gp2/jobs/fit_job.hpp"
+#include "gp2/simulation/generate.hpp"
+#include "test_models.hpp"
+
+namespace gp2 {
+namespace {
+
+using Eigen::MatrixXd;
+
+struct Machine {
+  std::string file;
+  std::vector<std::pair<std::string, std::string>> twice_as_fast;
+  std::string features, along;  // of a latent that is the friction itself, along the contact
+};
+
+const Machine wire = {"experiments/mechanisms/bead_on_turning_wire.toml",
+                      {{"dr = [-1, 1]", "dr = [-2, 2]"}},
+                      R"x(["x*cos(w*t) + y*sin(w*t)", "dx*cos(w*t) + dy*sin(w*t)", "fx*sin(w*t) - fy*cos(w*t)", "fz", "v"])x",
+                      R"({ force = [["-rx/v"], ["-ry/v"], ["-dz/v"]] })"};
+const Machine finger = {"experiments/mechanisms/finger_on_plate.toml",
+                        {{"dx = [-0.8, 0.8]", "dx = [-1.6, 1.6]"}, {"dy = [-0.8, 0.8]", "dy = [-1.6, 1.6]"}},
+                        R"(["x", "y", "dx", "dy", "fx", "fy", "fz", "v"])",
+                        R"({ force = [["-dx/v"], ["-dy/v"], ["-dz/v"]] })"};
+
+std::string replaced(std::string text, const std::string& from, const std::string& to) {
+  const std::size_t at = text.find(from);
+  EXPECT_NE(at, std::string::npos) << from;
+  return text.replace(at, from.size(), to);
+}
+
+// the machine's model with the friction itself as its latent, of the default prior
+Model with_latent(const Machine& machine) {
+  std::string text = test::model(machine.file).text;
+  const std::size_t begin = text.find("[[latent]]"), end = text.find("[noise]");
+  text.replace(begin, end - begin, "[[latent]]\nfeatures = " + machine.features + "\ndirections = " + machine.along + "\n");
+  return Model::parse(text, machine.file);
+}
+
+Posterior fitted(const Model& model, const Machine& machine, int n, std::uint64_t seed) {
+  FitRequest request;
+  request.model = model;
+  request.logs = {{test::drawn_log(machine.file, n, seed).table(), nullptr}};
+  request.problem.mean = Prior::Mean::force;
+  request.hyperparameters = HyperparameterChoice::optimise;
+  request.restarts = 2;
+  request.threads = 2;
+  return run_fit(prepare_fit(std::move(request))).posterior;
+}
+
+struct Scores {
+  double nrmse = 0, coverage = 0;
+};
+
+Scores scores(const Posterior& posterior, const GeneratedData& test) {
+  const auto marginal = posterior.marginal(View::constrained_acceleration(*posterior.prior().system), test.states);
+  const MatrixXd error = marginal.mean - test.accelerations, stddev = marginal.stddev();
+  const MatrixXd centred = test.accelerations.colwise() - test.accelerations.rowwise().mean();
+  const auto inside = (error.array().abs() <= 1.959964 * stddev.array()).cast<double>();
+  return {error.norm() / centred.norm(), inside.mean()};
+}
+
+class FrictionOfALoad : public testing::TestWithParam<const Machine*> {};
+INSTANTIATE_TEST_SUITE_P(Machines, FrictionOfALoad, testing::Values(&wire, &finger),
+                         [](const auto& machine) { return test::stem(machine.param->file); });
+
+TEST_P(FrictionOfALoad, IsLearnedFromFewRowsAndHoldsAtTwiceTheVelocities) {
+  const Machine& machine = *GetParam();
+  const Model& model = test::model(machine.file);
+  std::string faster = model.text;
+  for (const auto& [from, to] : machine.twice_as_fast) faster = replaced(faster, from, to);
+  const Model fast_model = Model::parse(faster, machine.file);
+  const Model without_load = with_latent(machine);
+  double covered = 0, growth = 0, n_fits = 0;
+  for (const auto& [n, seed] : std::vector<std::pair<int, std::uint64_t>>{{20, 1}, {20, 2}, {20, 3}, {100, 1}}) {
+    SCOPED_TRACE(fmt::format("{}, N = {}, seed {}", machine.file, n, seed));
+    const GeneratedData test = test::draw(model, 200, seed + 5000), fast = test::draw(fast_model, 200, seed + 5000);
+    const Posterior posterior = fitted(model, machine, n, seed), other = fitted(without_load, machine, n, seed);
+    const Scores own = scores(posterior, test), own_fast = scores(posterior, fast);
+    EXPECT_LE(own.nrmse, scores(other, test).nrmse / 3);
+    EXPECT_LE(own_fast.nrmse, scores(other, fast).nrmse / 3);
+    covered += own.coverage;
+    growth += std::log(own_fast.nrmse / own.nrmse);
+    ++n_fits;
+  }
+  EXPECT_GE(covered / n_fits, 0.85);
+  EXPECT_LE(std::exp(growth / n_fits), 2.5);
+}
+
+}  // namespace
+}  // namespace gp2

@@ -1,0 +1,407 @@
+// Contacts that are made, bounced off and released, against closed forms.
+#include <cmath>
+#include <numeric>
+#include <optional>
+
+#include <fmt/format.h>
+#include <gmock/gmock.h>
+
+#include "gp2/error.hpp"
+#include "gp2/mechanics/check.hpp"
+#include "gp2/mechanics/symbolic_system.hpp"
+#include "gp2/simulate.hpp"
+#include "gp2/simulation/model_motion.hpp"
+#include "input_error.hpp"
+
+namespace gp2 {
+namespace {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+using testing::HasSubstr;
+using Kind = ContactEvent::Kind;
+
+constexpr double g = 9.81;
+constexpr double of_event = 1e-6;  // s, what is asked of the time of an event
+
+Model ball(const std::string& restitution) {
+  return Model::parse(fmt::format(R"toml(
+coordinates = ["x", "z"]
+inputs      = ["touch"]
+[parameters]
+e = 0.8
+[mechanics]
+mass      = [["2", "0"], ["0", "2"]]
+force     = ["0", "-2*9.81"]
+potential = "2*9.81*z"
+[constraints]
+position = [{{ expr = "z", contact = "touch", restitution = {} }}]
+)toml",
+                                  restitution),
+                      "ball");
+}
+
+// on a ball of radius 1
+Model bead() {
+  return Model::parse(R"toml(
+coordinates = ["x", "z"]
+inputs      = ["touch"]
+[mechanics]
+mass      = [["1", "0"], ["0", "1"]]
+force     = ["0", "-9.81"]
+potential = "9.81*z"
+[constraints]
+position = [{ expr = "sqrt(x^2 + z^2) - 1", contact = "touch" }]
+)toml",
+                      "bead");
+}
+
+Trajectory motion_of(const Model& model, const std::vector<double>& start, double t_end, int n, double tolerance = 0) {
+  SimulateOptions options;
+  options.times = VectorXd::LinSpaced(n, 0, t_end);
+  if (tolerance > 0) options.relative_tolerance = options.absolute_tolerance = tolerance;
+  options.contacts = contacts_of(model, model.system->parameter_values());
+  options.record = [motion = ModelMotion(model)](const Eigen::Ref<const VectorXd>& x) -> VectorXd {
+    return motion.multipliers(x).col(0);
+  };
+  VectorXd state = VectorXd::Zero(model.system->layout().size());
+  state.head(static_cast<Index>(start.size())) = Eigen::Map<const VectorXd>(start.data(), static_cast<Index>(start.size()));
+  return simulate(*model.system, model.system->parameter_values(), model_acceleration(model), state, options);
+}
+
+std::vector<ContactEvent> of_kind(const Trajectory& motion, Kind kind) {
+  std::vector<ContactEvent> found;
+  std::copy_if(motion.events.begin(), motion.events.end(), std::back_inserter(found),
+               [&](const ContactEvent& one) { return one.kind == kind; });
+  return found;
+}
+
+// A ddq = b of the rows that are active at each state
+void expect_constraints(const Model& model, const Trajectory& motion) {
+  const SystemValues values = model.system->evaluate(motion.states, model.system->parameter_values());
+  for (int i = 0; i < values.n_states(); ++i) {
+    const VectorXd ddq = motion.accelerations.col(i);
+    const VectorXd size = values.A(i).cwiseAbs() * ddq.cwiseAbs() + values.b(i).cwiseAbs();
+    EXPECT_LE((values.A(i) * ddq - values.b(i)).lpNorm<Eigen::Infinity>(), 1e-14 * (1 + size.maxCoeff())) << i;
+  }
+}
+
+TEST(Contact, OfABouncingBallHitsWhenTheClosedFormSays) {
+  const double h = 1.3, e = 0.8, v = std::sqrt(2 * g * h);
+  const Model model = ball("\"e\"");
+  const Trajectory motion = motion_of(model, {0, h, 0.5, 0}, 6, 601);
+  const std::vector<ContactEvent> impacts = of_kind(motion, Kind::impact);
+  ASSERT_GT(impacts.size(), 40U);
+  double t = v / g, speed = v, worst = 0;
+  for (const ContactEvent& one : impacts) {
+    worst = std::max(worst, std::abs(one.time - t));
+    EXPECT_NEAR(one.approach, speed, 1e-6 * v);
+    // ½ m v² (1 − e²)
+    EXPECT_NEAR(one.energy_loss, speed * speed * (1 - e * e), 1e-6 * v * v);
+    speed *= e;
+    t += 2 * speed / g;
+  }
+  EXPECT_LE(worst, of_event);
+  // the bounces end at v/g (1 + e)/(1 − e)
+  const std::vector<ContactEvent> made = of_kind(motion, Kind::made);
+  ASSERT_EQ(made.size(), 1U);
+  EXPECT_NEAR(made[0].time, v / g * (1 + e) / (1 - e), of_event);
+  EXPECT_TRUE(of_kind(motion, Kind::released).empty());
+  // it rests on the ground and slides on
+  for (Index i = 0; i < motion.times.size(); ++i) {
+    const bool rests = motion.times[i] > made[0].time;
+    EXPECT_EQ(motion.states(5, i), rests ? 1 : 0);
+    EXPECT_NEAR(motion.states(0, i), 0.5 * motion.times[i], 1e-9);
+    if (!rests) continue;
+    EXPECT_NEAR(motion.states(1, i), 0, 1e-20);
+    EXPECT_NEAR(motion.states(3, i), 0, 1e-20);
+    EXPECT_NEAR(motion.records(0, i), 2 * g, 1e-12);
+  }
+  expect_constraints(model, motion);
+}
+
+TEST(Contact, EnergyFallsByTheSquareOfTheRestitution) {
+  for (const double e : {0.3, 0.8, 1.0}) {
+    const Model model = ball(fmt::format("{}", e));
+    const double v = std::sqrt(2 * g);
+    const Trajectory motion = motion_of(model, {0, 1, 0, 0}, v / g * (1 + e), 2);  // to the top of the first rebound
+    ASSERT_EQ(motion.events.size(), 1U);
+    const VectorXd energy = mechanical_energy(model, model.system->parameter_values(), motion.states);
+    EXPECT_NEAR(energy[1] / energy[0], e * e, 1e-9);
+    EXPECT_NEAR(energy[0] - energy[1], motion.events[0].energy_loss, 1e-9 * energy[0]);
+  }
+}
+
+TEST(Contact, WithoutRestitutionIsMadeAtOnce) {
+  const Trajectory motion = motion_of(ball("0"), {0, 1, 0, 0}, 1, 11);
+  ASSERT_EQ(motion.events.size(), 1U);
+  EXPECT_EQ(motion.events[0].kind, Kind::made);
+  EXPECT_NEAR(motion.events[0].time, std::sqrt(2 / g), of_event);
+  EXPECT_NEAR(motion.events[0].energy_loss, 2 * g, 1e-9);
+}
+
+// dt = dθ/√(2g (cos θ₀ − cos θ)), with s² = cos θ₀ − cos θ
+double time_to_leave(double start, double end) {
+  const double last = std::sqrt(std::cos(start) - std::cos(end));
+  const auto f = [&](double s) {
+    const double cosine = std::cos(start) - s * s;
+    return 1 / std::sqrt(1 - cosine * cosine);
+  };
+  constexpr int n = 20000;
+  double sum = f(0) + f(last);
+  for (int k = 1; k < n; ++k) sum += (k % 2 == 1 ? 4 : 2) * f(k * last / n);
+  return std::sqrt(2 / g) * sum * last / n / 3;
+}
+
+TEST(Contact, OfABeadOnABallIsReleasedAtTwoThirds) {
+  const double start = 0.1, cosine = 2 * std::cos(start) / 3;
+  const double expected = time_to_leave(start, std::acos(cosine));
+  for (const double tolerance : {0.0, 1e-9}) {
+    const Trajectory motion = motion_of(bead(), {std::sin(start), std::cos(start), 0, 0}, 1.3 * expected, 201, tolerance);
+    ASSERT_EQ(motion.events.size(), 1U);
+    EXPECT_EQ(motion.events[0].kind, Kind::released);
+    EXPECT_NEAR(motion.events[0].time, expected, of_event);
+    expect_constraints(bead(), motion);
+    for (Index i = 0; i < motion.times.size(); ++i) {
+      const bool is_free = motion.times[i] > motion.events[0].time;
+      EXPECT_EQ(motion.states(5, i), is_free ? 0 : 1);
+      const double height = motion.states(1, i), gap = std::hypot(motion.states(0, i), height) - 1;
+      if (is_free) {
+        EXPECT_GT(gap, 0);
+        EXPECT_EQ(motion.records(0, i), 0);
+        EXPECT_NEAR(motion.accelerations(1, i), -g, 1e-14);
+      } else {
+        EXPECT_GE(motion.records(0, i), 0);
+        EXPECT_NEAR(gap, 0, 1e-15);
+        EXPECT_GE(height, cosine - 1e-4);
+      }
+    }
+    const VectorXd energy = mechanical_energy(bead(), VectorXd(0), motion.states);
+    EXPECT_LE((energy.array() - energy[0]).abs().maxCoeff(), tolerance > 0 ? 1e-8 : 1e-5);
+  }
+}
+
+// a plate that is moved up and down lets go where it accelerates downwards by g, and catches again
+TEST(Contact, WithAMovedPlateIsReleasedAndMadeAgain) {
+  const double size = 0.1, rate = 12;
+  const Model model = Model::parse(fmt::format(R"toml(
+coordinates = ["z"]
+inputs      = ["touch"]
+[mechanics]
+mass  = [["0.7"]]
+force = ["-0.7*9.81"]
+[constraints]
+position = [{{ expr = "z - {0}*sin({1}*t)", contact = "touch" }}]
+)toml",
+                                               size, rate),
+                                   "plate");
+  const Trajectory motion = motion_of(model, {0, size * rate}, 0.6, 61, 1e-10);
+  ASSERT_GE(motion.events.size(), 2U);
+  EXPECT_EQ(motion.events[0].kind, Kind::released);
+  const double t0 = std::asin(g / (size * rate * rate)) / rate;
+  EXPECT_NEAR(motion.events[0].time, t0, of_event);
+  EXPECT_EQ(motion.events[1].kind, Kind::made);
+  // the first zero of the gap of the flight
+  const auto gap = [&](double t) {
+    return size * std::sin(rate * t0) + size * rate * std::cos(rate * t0) * (t - t0) - g / 2 * (t - t0) * (t - t0) -
+           size * std::sin(rate * t);
+  };
+  double before = t0 + 0.05, after = before;
+  while (gap(after) > 0) after += 1e-3;
+  for (int k = 0; k < 60; ++k) (gap(std::midpoint(before, after)) > 0 ? before : after) = std::midpoint(before, after);
+  EXPECT_NEAR(motion.events[1].time, after, of_event);
+}
+
+TEST(Contact, KeepsOtherConstraintsThroughAnImpact) {
+  // a bead on a wire z = 2 − x that ends on the floor
+  const Model model = Model::parse(R"toml(
+coordinates = ["x", "z"]
+inputs      = ["touch"]
+[mechanics]
+mass  = [["1", "0"], ["0", "1"]]
+force = ["0", "-9.81"]
+[constraints]
+position = ["z + x - 2", { expr = "z", contact = "touch", restitution = 0.5 }]
+)toml",
+                                   "wire");
+  const Trajectory motion = motion_of(model, {1, 1, 0, 0}, 1, 101);
+  ASSERT_FALSE(motion.events.empty());
+  // along the wire g/2 of z̈
+  const double t = std::sqrt(4 / g);
+  EXPECT_NEAR(motion.events[0].time, t, of_event);
+  EXPECT_NEAR(motion.events[0].approach, g / 2 * t, 1e-9);
+  EXPECT_NEAR(motion.events[0].energy_loss, 0.75 * g, 1e-6);
+  EXPECT_LE(motion.max_position_drift, 1e-14);
+  EXPECT_LE(motion.max_velocity_drift, 1e-14);
+  expect_constraints(model, motion);
+}
+
+TEST(Contact, OfTwoBodiesKeepsTheirMomentum) {
+  const Model model = Model::parse(R"toml(
+coordinates = ["x", "y"]
+inputs      = ["touch"]
+[mechanics]
+mass  = [["3", "0"], ["0", "1"]]
+[constraints]
+position = [{ expr = "y - x - 0.2", contact = "touch", restitution = 1 }]
+)toml",
+                                   "two bodies");
+  const Trajectory motion = motion_of(model, {0, 1.2, 2, 0}, 1, 2);
+  ASSERT_EQ(motion.events.size(), 1U);
+  EXPECT_NEAR(motion.events[0].time, 0.5, of_event);
+  EXPECT_NEAR(motion.states(2, 1), 1, 1e-14);
+  EXPECT_NEAR(motion.states(3, 1), 3, 1e-14);
+}
+
+TEST(Contact, ThatIsShortIsNotSteppedOver) {
+  // a gap that is below 0 for 0.02 s of a step
+  const Model model = Model::parse(R"toml(
+coordinates = ["z"]
+inputs      = ["touch"]
+[mechanics]
+mass  = [["1"]]
+force = ["-z"]
+[constraints]
+position = [{ expr = "z + 0.99995", contact = "touch", restitution = 1 }]
+)toml",
+                                   "graze");
+  const Trajectory motion = motion_of(model, {1, 0}, 5, 2, 1e-4);
+  ASSERT_EQ(motion.events.size(), 1U);
+  EXPECT_NEAR(motion.events[0].time, std::acos(-0.99995), 1e-2);
+}
+
+TEST(Contact, HoldsForAnHour) {
+  // driven to and fro over hills that are too flat to leave
+  const Model model = Model::parse(R"toml(
+coordinates = ["x", "z"]
+inputs      = ["touch"]
+[mechanics]
+mass  = [["1", "0"], ["0", "1"]]
+force = ["0.3*sin(0.2*t) - 0.5*dx", "-9.81"]
+[constraints]
+position = [{ expr = "z - 0.05*sin(x)", contact = "touch", restitution = 0.5 }]
+)toml",
+                                   "hills");
+  const Trajectory motion = motion_of(model, {0, 0, 0, 0}, 3600, 361);
+  EXPECT_TRUE(motion.events.empty());
+  EXPECT_EQ(motion.states.row(5).minCoeff(), 1);
+  EXPECT_GT(motion.records.row(0).minCoeff(), 9);
+  EXPECT_LE(motion.max_position_drift, 1e-15);
+  EXPECT_LE(motion.max_velocity_drift, 1e-15);
+  expect_constraints(model, motion);
+}
+
+TEST(Contact, IsCheckedAgainstALog) {
+  const double start = 0.1;
+  const Trajectory log = motion_of(bead(), {std::sin(start), std::cos(start), 0, 0}, 1.1, 56);
+  const auto findings_of = [&](const Model& model, const MatrixXd& states) {
+    const VectorXd parameters = model.system->parameter_values();
+    std::vector<Finding> all = check_system(*model.system, states, parameters);
+    const MatrixXd stddev = MatrixXd::Constant(2, states.cols(), 0.01);
+    const std::vector<Finding> of_data = check_data(*model.system, states, parameters, log.accelerations, stddev);
+    all.insert(all.end(), of_data.begin(), of_data.end());
+    return all;
+  };
+  const auto warned = [](const std::vector<Finding>& findings, const std::string& text) {
+    for (const Finding& one : findings) {
+      if (one.text.find(text) != std::string::npos) return one.level == Finding::Level::warning ? "warning" : "good";
+    }
+    return "none";
+  };
+  const auto n_closed = static_cast<int>(log.states.row(5).sum());
+  ASSERT_GT(n_closed, 40);
+  ASSERT_LT(n_closed, 56);
+  const std::vector<Finding> right = findings_of(bead(), log.states);
+  EXPECT_STREQ(warned(right, fmt::format("active, touch > 0.5, at {} of 56 states", n_closed)), "good");
+  EXPECT_STREQ(warned(right, fmt::format("it pulls at 0 of {} states where it is closed", n_closed)), "good");
+  EXPECT_STREQ(warned(right, "independent at every state where they are active"), "good");
+  EXPECT_STREQ(warned(right, "the rank of A changes"), "none");
+  EXPECT_STREQ(warned(right, "dependent columns"), "none");
+  std::string text = bead().text;
+  text.replace(text.find("sqrt(x^2 + z^2) - 1"), 19, "1 - sqrt(x^2 + z^2)");
+  EXPECT_STREQ(warned(findings_of(Model::parse(text, "inside"), log.states), "a gap is not negative: change its sign"),
+               "warning");
+  MatrixXd apart = log.states;
+  apart.row(5).setZero();
+  EXPECT_STREQ(warned(findings_of(bead(), apart), "at 0 of 56 states: these states say nothing of it"), "warning");
+}
+
+TEST(Contact, ThatTheStartIsBeyondIsRefused) {
+  EXPECT_THAT(test::input_error_of([&] {
+                static_cast<void>(motion_of(ball("0.5"), {0, -0.1, 0, 0}, 1, 2));
+              }),
+              HasSubstr("the start is beyond the contact 'z', whose gap is -0.1"));
+}
+
+TEST(Contact, OfAnotherFormIsRefused) {
+  const auto message = [](const std::string& entry, const std::string& level = "position",
+                          const std::string& inputs = "\"touch\"") {
+    return test::input_error_of([&] {
+      static_cast<void>(Model::parse(fmt::format("coordinates = [\"z\"]\ninputs = [{}]\n[mechanics]\nmass = [[1]]\n"
+                                                 "[constraints]\n{} = [{}]\n",
+                                                 inputs, level, entry),
+                                     "it.toml"));
+    });
+  };
+  EXPECT_THAT(message(R"({ expr = "z", contact = "feel" })"), HasSubstr("it.toml:6: constraints.position entry 1.contact"));
+  EXPECT_THAT(message(R"({ expr = "z", contact = "feel" })"), HasSubstr("'feel' is no input of this model: declare inputs"));
+  EXPECT_THAT(message(R"({ expr = "dz", contact = "touch" })", "velocity"), HasSubstr("a contact is a gap, of position level"));
+  EXPECT_THAT(message(R"({ expr = "z", contact = "touch", when = "z < 0" })"), HasSubstr("remove when"));
+  EXPECT_THAT(message(R"({ expr = "z", restitution = 1 })"), HasSubstr("belongs to a contact: name its input"));
+  EXPECT_THAT(message(R"({ expr = "z", contact = "touch", restitution = 1.1 })"), HasSubstr("must lie between 0 and 1, got 1.1"));
+  EXPECT_THAT(message(R"({ expr = "z", contact = "touch", restitution = "z" })"), HasSubstr("a restitution is a number"));
+  EXPECT_THAT(message(R"({ expr = "z", contact = "touch" }, { expr = "2 - z", contact = "touch" })"),
+              HasSubstr("is another contact's input"));
+  EXPECT_THAT(message(R"({ expr = "z", contact = "touch" })", "position", R"({ name = "touch", delay = 0.1 })"),
+              HasSubstr("neither a delay nor a lag"));
+}
+
+// ---- constraints that come and go without being contacts
+
+TEST(Condition, IsOneComparison) {
+  ExpressionGraph graph;
+  const auto read = [&](const std::string& text) {
+    return parse_condition(text, graph, [&](std::string_view name) { return std::optional(graph.variable(name)); }, {});
+  };
+  const auto value = [&](const std::string& text, double a) {
+    const std::vector<Expression> inputs = {graph.variable("a")}, outputs = {read(text)};
+    MatrixXd out;
+    Tape(outputs, inputs).evaluate(VectorXd::Constant(1, a), VectorXd(0), out);
+    return out(0, 0);
+  };
+  for (const double a : {-1.0, 0.0, -0.0, 1e-300, 2.0}) {
+    EXPECT_EQ(value("a <= 0", a), a <= 0 ? 1 : 0);
+    EXPECT_EQ(value("a < 0", a), a < 0 ? 1 : 0);
+    EXPECT_EQ(value("0 <= a", a), a >= 0 ? 1 : 0);
+    EXPECT_EQ(value("a > 0", a), a > 0 ? 1 : 0);
+  }
+  EXPECT_TRUE(std::isnan(value("a <= 0", std::nan(""))));
+  EXPECT_TRUE(std::isnan(value("a > 0", std::nan(""))));
+  EXPECT_TRUE(graph.differentiate(read("a^2 <= 3"), graph.variable("a")).is_constant(0));
+  const auto message = [&](const std::string& text) { return test::input_error_of([&] { static_cast<void>(read(text)); }); };
+  EXPECT_THAT(message(""), HasSubstr("the condition is empty; write a comparison such as gap <= 0"));
+  EXPECT_THAT(message("a"), HasSubstr("found the end of the text where one of < <= > >= must stand"));
+  EXPECT_THAT(message("a == 1"), HasSubstr("found '=' where one of < <= > >= must stand"));
+  EXPECT_THAT(message("0 < a < 1"), HasSubstr("a condition is one comparison: combine several by min and max"));
+}
+
+TEST(Condition, OfAConstraintIsRefusedWhereItCannotBe) {
+  const auto message = [](const std::string& when) {
+    return test::input_error_of([&] {
+      static_cast<void>(
+          Model::parse("coordinates = [\"z\"]\n[mechanics]\nmass = [[1]]\n[constraints]\n"
+                       "position = [{ expr = \"z\", when = " +
+                           when + " }]\n",
+                       "it.toml"));
+    });
+  };
+  EXPECT_THAT(message("\"ddz < 0\""), HasSubstr("a condition may not depend on accelerations"));
+  EXPECT_THAT(message("\"lambda0(1) < 0\""), HasSubstr("lambda0(1) follows from M, F and the constraints"));
+  EXPECT_THAT(message("\"1 < 0\""), HasSubstr("never holds: remove the constraint"));
+  EXPECT_THAT(message("3"), HasSubstr("expected a text in quotes, got 3"));
+  EXPECT_THAT(message("\"z\""), HasSubstr("it.toml:5: constraints.position entry 1.when: \"z\", column 2"));
+}
+
+}  // namespace
+}  // namespace gp2
