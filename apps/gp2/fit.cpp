@@ -14,6 +14,7 @@
 #include "gp2/error.hpp"
 #include "gp2/jobs/fit_job.hpp"
 #include "gp2/jobs/raw_fit.hpp"
+#include "gp2/jobs/show_job.hpp"
 #include "gp2/training/laplace.hpp"
 #include "interruption.hpp"
 #include "ranks.hpp"
@@ -167,43 +168,6 @@ Json to_json(const FitProblem& problem, const FitOutcome& outcome) {
   return json;
 }
 
-void print_draws(const FitReport& report) {
-  const HyperparameterDraws& draws = *report.draws;
-  Index slowest = 0, worst = 0;
-  const double size = draws.effective_size.minCoeff(&slowest), r_hat = draws.r_hat.maxCoeff(&worst);
-  const auto name = [&](Index k) { return report.hyperparameters[static_cast<std::size_t>(k)].name; };
-  print_result(
-      "hyperparameters integrated: {} draws of {} chains, R̂ at most {:.3f} ({}), worth {:.0f} independent ones or more ({})\n",
-      draws.size(), draws.n_chains, r_hat, name(worst), size, name(slowest));
-}
-
-void print_text(const FitReport& report) {
-  print_result("negative log likelihood {:.6f}\n", report.negative_log_likelihood);
-  print_result("{} after {} iterations ({} restarts, best: {}), {:.2f} s\n", report.termination, report.iterations,
-               report.restarts.size(), report.best_restart + 1, report.seconds);
-  if (report.draws) print_draws(report);
-  for (const ActuatorEstimate& one : report.actuators) {
-    const std::string error = std::isnan(one.stddev)   ? ""
-                              : std::isinf(one.stddev) ? " ± ∞"
-                                                       : fmt::format(" ± {:.2g}", one.stddev);
-    print_result("  {:<34} {:>13.6g}{}   [{:.3g}, {:.3g}]{}\n", one.name, one.value, error, one.lower, one.upper,
-                 one.at_lower() || one.at_upper() ? "   at its bound" : "");
-  }
-  for (std::size_t k = 0; k < report.hyperparameters.size(); ++k) {
-    const Hyperparameter& h = report.hyperparameters[k];
-    const ParameterUncertainty known =
-        h.is_system_parameter() ? parameter_uncertainty(report, k) : ParameterUncertainty{.stddev = std::nan("")};
-    std::string error = std::isfinite(known.stddev) ? fmt::format(" ± {:.2g}", known.stddev)
-                        : std::isinf(known.stddev)  ? " ± ∞"
-                                                    : "";
-    if (known.is_of_draws) error += fmt::format(" (mean {:.6g}, 95 % {:.4g} … {:.4g})", known.mean, known.lower, known.upper);
-    print_result("  {:<34} {:>13.6g}{}   [{:.3g}, {:.3g}]{}\n", h.name, h.value, error, h.lower, h.upper,
-                 h.is_fixed()   ? "   held"
-                 : h.at_bound() ? "   at its bound"
-                                : "");
-  }
-}
-
 // what a fit reads and must not replace; where it starts from may be where it ends
 std::vector<std::string> inputs_of(const FitArguments& arguments) {
   std::vector<std::string> inputs = {arguments.model, arguments.again};
@@ -321,7 +285,7 @@ void run(FitArguments& arguments, const std::set<std::string>& given) {
     if (arguments.json) {
       print_result("{}\n", to_json(job.problem, outcome).dump(2));
     } else {
-      print_text(file.report);
+      print_result("{}", text_of(file.report));
       if (outcome.cross_validation) print_result("{}\n", outcome.cross_validation->text());
     }
   };

@@ -3,6 +3,7 @@
 #include <fmt/core.h>
 
 #include "command.hpp"
+#include "gp2/base/file.hpp"
 #include "gp2/jobs/show_job.hpp"
 #include "streams.hpp"
 
@@ -11,7 +12,7 @@ namespace gp2::command {
 namespace {
 
 struct ShowArguments {
-  std::string model;
+  std::string file;
   ShowRequest request;
 };
 
@@ -19,11 +20,18 @@ struct ShowArguments {
 
 Command show_command() {
   const auto a = std::make_shared<ShowArguments>();
-  Command command{
-      "show", "Print the derived A, b, M, F, the parameters and the features of a model", "gp2 show models/surface.toml", {}, {}};
+  Command command{"show",
+                  "Print the derived A, b, M, F, the parameters and the features of a model, and what a fit has found",
+                  "gp2 show models/surface.toml",
+                  {},
+                  {}};
   command.options = options(a->request);
-  command.options.insert(command.options.begin(), argument("MODEL", a->model, "model file"));
-  command.run = [a](const std::set<std::string>&) { print_result("{}", show(Model::read(a->model), a->request)); };
+  command.options.insert(command.options.begin(), argument("FILE", a->file, "model file, or file written by gp2 fit"));
+  command.run = [a](const std::set<std::string>&) {
+    const std::string text = read_file(a->file);
+    const bool is_fit = text.find_first_not_of(" \t\r\n") == text.find('{');  // no model file begins so
+    print_result("{}", is_fit ? show(FitFile::parse(text, a->file), a->request) : show(Model::parse(text, a->file), a->request));
+  };
   return command;
 }
 

@@ -46,9 +46,10 @@ class Posterior {
 
   /// The posterior through inducing points that a summary is of.
   /// @param observations  that it still has
+  /// @param values        of each component
   /// @throws InputError when they do not fit each other; NumericalError as the constructor.
-  static Posterior of_summary(Prior prior, std::vector<Observations> observations, ModelValues values,
-                              const InducingSummary& summary);
+  static Posterior of_summary(const Prior& prior, const std::vector<Observations>& observations,
+                              const std::vector<ModelValues>& values, const InducingSummary& summary);
   /// What it knows of its observations where it is through inducing points, else null.
   [[nodiscard]] std::shared_ptr<const InducingSummary> summary() const;
 

@@ -281,6 +281,7 @@ void update_with(PyPosterior& self, const py::object& data, const std::vector<st
 struct Motion {
   Trajectory trajectory;
   std::optional<MotionUncertainty> uncertainty;
+  std::shared_ptr<const System> system;
 };
 
 MotionStart start_argument(const py::object& start, const System& system) {
@@ -308,14 +309,14 @@ SimulateRequest simulate_request(const System& system, const py::object& start, 
 }
 
 /// Motions one after the other; Ctrl-C ends them.
-std::vector<Motion> run_motions(const SimulateJob& job) {
+std::vector<Motion> run_motions(const SimulateJob& job, const std::shared_ptr<const System>& system) {
   tell(job.notes);
   std::atomic<bool> stop = false;
   std::exception_ptr raised;
   std::vector<Motion> motions;
   try {
     for (Trajectory& trajectory : run_interruptibly([&] { return run_simulation(job, &stop); }, stop, raised, [] {})) {
-      motions.push_back({std::move(trajectory), std::nullopt});
+      motions.push_back({std::move(trajectory), std::nullopt, system});
     }
   } catch (const SimulationStopped&) {
   }
@@ -326,7 +327,7 @@ std::vector<Motion> run_motions(const SimulateJob& job) {
 Motion simulate_model(const PySystem& system, const py::object& start, const py::object& times, const py::object& inputs,
                       const py::kwargs& keywords) {
   const SimulateRequest request = simulate_request(system.system(), start, times, inputs, keywords);
-  return run_motions(prepare_simulation(*system.model, request)).front();
+  return run_motions(prepare_simulation(*system.model, request), system.model->system).front();
 }
 
 py::object simulate_posterior(const PyPosterior& self, const py::object& start, const py::object& times, const py::object& inputs,
@@ -338,7 +339,7 @@ py::object simulate_posterior(const PyPosterior& self, const py::object& start, 
     const py::gil_scoped_release release;
     return prepare_simulation(asked, posterior, request);
   }();
-  std::vector<Motion> motions = run_motions(job);
+  std::vector<Motion> motions = run_motions(job, system == nullptr ? self.file.model.system : system->model->system);
   if (request.n_samples) return py::cast(std::move(motions));
   {
     const py::gil_scoped_release release;
@@ -385,7 +386,7 @@ PyExcitation excite_posterior(const PyPosterior& self, const py::object& start, 
   const auto search = [&](const std::atomic<bool>* stop) {
     Excitation found = excite(self.file.model, posterior, self.file.report.hyperparameters, request, {}, stop);
     MotionUncertainty uncertainty = motion_uncertainty(posterior, found.motion);
-    return PyExcitation{found, {found.motion, std::move(uncertainty)}, self.file.model.system};
+    return PyExcitation{found, {found.motion, std::move(uncertainty), self.file.model.system}, self.file.model.system};
   };
   std::atomic<bool> stop = false;
   std::exception_ptr raised;
@@ -733,6 +734,9 @@ void add_motion(py::module_& module) {
       .def_property_readonly(
           "n_lower_rank", [](const Motion& m) { return m.trajectory.lower_rank.states.size(); },
           "Times at which the constraints have a lower rank than at others.")
+      .def_property_readonly(
+          "table", [](const Motion& m) { return as_table(m.trajectory, *m.system, "motion"); },
+          "t, q, dq, ddq and the inputs: fit takes it as a log, simulate as inputs.")
       .def_property_readonly("steps", [](const Motion& m) { return m.trajectory.steps; })
       .def_property_readonly("rejected_steps", [](const Motion& m) { return m.trajectory.rejected_steps; })
       .def_property_readonly("evaluations", [](const Motion& m) { return m.trajectory.evaluations; });

@@ -106,6 +106,14 @@ std::string show_system(const PySystem& self, const py::kwargs& keywords) {
   return show(*self.model, asked);
 }
 
+std::string show_posterior(const PyPosterior& self, const py::kwargs& keywords) {
+  ShowRequest asked;
+  read_keywords("show", keywords, options(asked));
+  FitFile fit = self.file;
+  fit.take_data(self.posterior);
+  return show(fit, asked);
+}
+
 CsvTable resample_table(const PySystem& self, const py::object& data, int n, const py::kwargs& keywords) {
   ResampleOptions asked;
   read_keywords("resample", keywords, options(asked));
@@ -299,11 +307,13 @@ void define_show_derive_and_resample(py::module_& module) {
   py::options own_signature;
   own_signature.disable_function_signatures();
   module.def("show", &show_system, py::arg("system"),
-             (signature("show", "system: System, *,", options(of_show), "", "str") + R"(
-M, F, the constraints with the A and b derived from them, the parameters and the latents, as text to print.
+             (signature("show", "system: System | Posterior, *,", options(of_show), "", "str") + R"(
+M, F, the constraints with the A and b derived from them, the parameters and the latents, as text to print; of a fit, first what it
+was learned from and what it found.
 
 )" + documentation(options(of_show)))
                  .c_str());
+  module.def("show", &show_posterior, py::arg("posterior"), "The same of a Posterior.");
   module.def("derive", &derive_table, py::arg("system"), py::arg("data"), py::arg("like") = py::none(),
              (signature("derive", "system: System, data: object, like: object = None, *,", options(of_derive), "",
                         "tuple[Table, dict[str, Any]]") +

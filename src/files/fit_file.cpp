@@ -709,35 +709,24 @@ Evaluation::Part part_from(const ParsedJson& json) {
 
 // B, c, … of all observations, and the factors they are whitened by: what another processor rounds otherwise
 Json summary_json(const InducingSummary& summary) {
-  Json factors = Json::array();
-  for (const InducingLatents::OfLatent& latent : summary.latents.latents()) {
-    factors.push_back({{"points", latent.chosen}, {"L", triangle_bits(latent.L)}});
+  Json components = Json::array();
+  for (const auto& [latents, all] : summary.components) {
+    Json factors = Json::array();
+    for (const InducingLatents::OfLatent& latent : latents.latents()) {
+      factors.push_back({{"points", latent.chosen}, {"L", triangle_bits(latent.L)}});
+    }
+    components.push_back({{"factors", factors},
+                          {"B", triangle_bits(all.B)},
+                          {"c", bits_of(all.c)},
+                          {"yy", all.yy},
+                          {"trace", all.trace},
+                          {"constant", all.constant},
+                          {"weight", vector_json(all.weight)}});
   }
-  const InducingStatistics& all = summary.all;
-  return {{"states", summary.kept.n_states},
-          {"step", summary.kept.step},
-          {"factors", factors},
-          {"B", triangle_bits(all.B)},
-          {"c", bits_of(all.c)},
-          {"yy", all.yy},
-          {"trace", all.trace},
-          {"constant", all.constant},
-          {"weight", vector_json(all.weight)}};
+  return {{"states", summary.kept.n_states}, {"step", summary.kept.step}, {"components", components}};
 }
 
-std::shared_ptr<const InducingSummary> summary_from(const ParsedJson& json, const Prior& prior, const ModelValues& values,
-                                                    const std::vector<Observations>& observations) {
-  InducingSummary summary;
-  summary.kept.step = integer(json.at("step"));
-  if (summary.kept.step < 1) throw InputError(fmt::format("a step of {} states is not possible", summary.kept.step));
-  for (const ParsedJson& n : array(json.at("states"))) {
-    if (!n.is_number_unsigned()) throw InputError(fmt::format("{} stands where a number of states must", shown(n)));
-    summary.kept.n_states.push_back(n.get<std::int64_t>());
-  }
-  if (summary.kept.n_states.size() != observations.size()) {
-    throw InputError(
-        fmt::format("numbers of states of {} of {} observations", summary.kept.n_states.size(), observations.size()));
-  }
+InducingSummary::Component component_from(const ParsedJson& json, const Prior& prior, const ModelValues& values) {
   std::vector<lapack::PivotedFactor> factors;
   for (const ParsedJson& of_latent : array(json.at("factors"))) {
     if (factors.size() == prior.latents.size()) throw InputError("factors of more latents than there are");
@@ -754,15 +743,41 @@ std::shared_ptr<const InducingSummary> summary_from(const ParsedJson& json, cons
   }
   if (factors.size() != prior.latents.size())
     throw InputError(fmt::format("factors of {} of {} latents", factors.size(), prior.latents.size()));
-  summary.latents = InducingLatents(prior, values, std::move(factors));
-  const Index M = summary.latents.size();
-  summary.all.B = triangle_from(json.at("B"), M);
-  summary.all.c = bits_from(json.at("c"), M);
-  summary.all.yy = number(json.at("yy"));
-  summary.all.trace = number(json.at("trace"));
-  summary.all.constant = number(json.at("constant"));
-  summary.all.weight = vector_from(json.at("weight"));
-  if (summary.all.weight.size() != std::ssize(prior.latents)) throw InputError("weights of some latents only");
+  InducingSummary::Component component{InducingLatents(prior, values, std::move(factors)), {}};
+  const Index M = component.latents.size();
+  component.all.B = triangle_from(json.at("B"), M);
+  component.all.c = bits_from(json.at("c"), M);
+  component.all.yy = number(json.at("yy"));
+  component.all.trace = number(json.at("trace"));
+  component.all.constant = number(json.at("constant"));
+  component.all.weight = vector_from(json.at("weight"));
+  if (component.all.weight.size() != std::ssize(prior.latents)) throw InputError("weights of some latents only");
+  return component;
+}
+
+std::shared_ptr<const InducingSummary> summary_from(const ParsedJson& json, const Prior& prior,
+                                                    const std::vector<ModelValues>& values,
+                                                    const std::vector<Observations>& observations) {
+  InducingSummary summary;
+  summary.kept.step = integer(json.at("step"));
+  if (summary.kept.step < 1) throw InputError(fmt::format("a step of {} states is not possible", summary.kept.step));
+  for (const ParsedJson& n : array(json.at("states"))) {
+    if (!n.is_number_unsigned()) throw InputError(fmt::format("{} stands where a number of states must", shown(n)));
+    summary.kept.n_states.push_back(n.get<std::int64_t>());
+  }
+  if (summary.kept.n_states.size() != observations.size()) {
+    throw InputError(
+        fmt::format("numbers of states of {} of {} observations", summary.kept.n_states.size(), observations.size()));
+  }
+  if (!json.contains("components")) {  // of one, before version 11
+    summary.components.push_back(component_from(json, prior, values.front()));
+  } else {
+    const ParsedJson& components = array(json.at("components"));
+    if (components.size() != values.size())
+      throw InputError(fmt::format("sums of {} components of {}", components.size(), values.size()));
+    for (const ParsedJson& component : components)
+      summary.components.push_back(component_from(component, prior, values[summary.components.size()]));
+  }
   return std::make_shared<InducingSummary>(std::move(summary));
 }
 
@@ -1114,8 +1129,8 @@ FitFile read_fit(std::string_view text, const std::filesystem::path& path, const
       const ParsedJson& inducing = report.at("inducing");
       fit.report.inducing = inducing_from(inducing, prior);
       if (inducing.contains("summary")) {
-        const ModelValues values = values_of(prior, fit.observations, fit.report).front();
-        require_values(prior, fit.observations, values);
+        const std::vector<ModelValues> values = values_of(prior, fit.observations, fit.report);
+        for (const ModelValues& of_one : values) require_values(prior, fit.observations, of_one);
         fit.report.inducing->summary = summary_from(inducing.at("summary"), prior, values, fit.observations);
       }
     }

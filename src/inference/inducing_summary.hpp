@@ -19,8 +19,11 @@ struct KeptStates {
 
 /// A posterior through inducing points but for its prior and values, as a file holds it.
 struct InducingSummary {
-  InducingLatents latents;
-  InducingStatistics all;
+  struct Component {
+    InducingLatents latents;
+    InducingStatistics all;
+  };
+  std::vector<Component> components;
   KeptStates kept;
 };
 

@@ -1,7 +1,10 @@
 #include <numeric>
 #include <utility>
 
+#include <fmt/format.h>
+
 #include "data/evenly.hpp"
+#include "gp2/error.hpp"
 #include "gp2/inference/leave_one_out.hpp"
 #include "inference/inducing_gram.hpp"
 #include "inference/posterior_implementation.hpp"
@@ -89,22 +92,34 @@ void Posterior::Implementation::add_through_points(const Observations& more, std
   keep_some(observations, *kept);
 }
 
-Posterior Posterior::of_summary(Prior prior, std::vector<Observations> observations, ModelValues values,
-                                const InducingSummary& summary) {
+Posterior Posterior::of_summary(const Prior& prior, const std::vector<Observations>& observations,
+                                const std::vector<ModelValues>& values, const InducingSummary& summary) {
   const lapack::SingleThread single_thread;
-  auto self = std::make_shared<Implementation>(std::move(prior), std::move(observations), std::move(values));
-  auto through = std::make_shared<InducingPosterior>(summary.latents, std::vector{summary.all});
-  if (!through->factorise()) throw_not_definite();
-  self->latents = std::move(through);
-  self->kept = summary.kept;
-  return Posterior(Components{std::move(self)});
+  if (values.empty() || values.size() != summary.components.size()) {
+    throw InputError(
+        fmt::format("Posterior::of_summary: sums of {} components, values of {}", summary.components.size(), values.size()));
+  }
+  Components components;
+  for (std::size_t k = 0; k < values.size(); ++k) {
+    auto self = std::make_shared<Implementation>(prior, observations, values[k]);
+    auto through = std::make_shared<InducingPosterior>(summary.components[k].latents, std::vector{summary.components[k].all});
+    if (!through->factorise()) throw_not_definite();
+    self->latents = std::move(through);
+    self->kept = summary.kept;
+    components.push_back(std::move(self));
+  }
+  return Posterior(std::move(components));
 }
 
 std::shared_ptr<const InducingSummary> Posterior::summary() const {
-  const Implementation& self = implementation();
-  if (!self.kept) return nullptr;
-  const auto& through = static_cast<const InducingPosterior&>(*self.latents);
-  return std::make_shared<InducingSummary>(InducingSummary{through.inducing(), through.all(), *self.kept});
+  if (!held().front()->kept) return nullptr;
+  auto summary = std::make_shared<InducingSummary>();
+  summary->kept = *held().front()->kept;
+  for (const auto& component : held()) {
+    const auto& through = static_cast<const InducingPosterior&>(*component->latents);
+    summary->components.push_back({through.inducing(), through.all()});
+  }
+  return summary;
 }
 
 std::int64_t Posterior::n_states() const {

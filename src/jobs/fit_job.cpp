@@ -82,15 +82,11 @@ int settled_inducing(const FitRequest& request, const FitProblem& problem, const
   if (request.inducing) {
     if (problem.prior_options.baseline) throw InputError("`inducing` is not for a `baseline`");
     if (has_sums) throw InputError("`inducing` is not for windows of a raw log: `windows=none` learns from its rows");
-    if (request.hyperparameters == HyperparameterChoice::integrate) {
-      throw InputError("`hyperparameters=integrate` is not with `inducing` points");
-    }
     const auto most = static_cast<int>(*request.inducing);
     return most < fit_memory(problem, options).reduced_size ? most : 0;  // else it is exact that takes less
   }
-  const bool is_possible = !problem.prior_options.baseline && !has_sums &&
-                           request.hyperparameters != HyperparameterChoice::integrate &&
-                           request.problem.protocol.name == Protocol::Name::standard;
+  const bool is_possible =
+      !problem.prior_options.baseline && !has_sums && request.problem.protocol.name == Protocol::Name::standard;
   if (request.is_exact || !is_possible) return 0;
   return fit_memory(problem, options).reduced_size > largest_exact_size
              ? automatic_inducing_variables(n_states(problem.observations))
@@ -103,7 +99,7 @@ int settled_draws(const FitRequest& request, const FitProblem& problem, const Fi
     case HyperparameterChoice::optimise:
       return 0;
     case HyperparameterChoice::automatic:
-      return integration_pays(problem, options) ? n_mixed_draws : 0;
+      return options.n_inducing == 0 && integration_pays(problem, options) ? n_mixed_draws : 0;
     case HyperparameterChoice::integrate:
       break;
   }
@@ -113,7 +109,7 @@ int settled_draws(const FitRequest& request, const FitProblem& problem, const Fi
   if (options.max_iterations == 0) {
     throw InputError("`hyperparameters=integrate` draws about the optimum: it cannot be with `max_iterations=0`");
   }
-  return n_mixed_draws;
+  return options.n_inducing > 0 ? n_mixed_draws_through_points : n_mixed_draws;
 }
 
 std::string source_of(const FitRequest& request) {
@@ -157,7 +153,7 @@ FitJob job_of(FitRequest request, FitProblem problem) {
   job.checkpoint = request.checkpoint;
   FitOptions asked = optimiser_options(request, problem);
   asked.n_inducing = settled_inducing(request, problem, asked);
-  asked.n_draws = asked.n_inducing > 0 ? 0 : settled_draws(request, problem, asked);
+  asked.n_draws = settled_draws(request, problem, asked);
   job.notes = problem.notes;
   const bool has_sums = std::ranges::any_of(problem.observations, [](const Observations& group) { return group.has_sums(); });
   job.thin = request.thin && !has_sums && !problem.robust && request.problem.protocol.name == Protocol::Name::standard;
@@ -399,9 +395,10 @@ std::vector<Option> options(FitRequest& request) {
                "",
                fmt::format(
                    "optimise: take the likeliest as known; integrate: draw them given the data, and mix the predictions of {} "
-                   "draws (docs/theory.md, T31), at about {} evaluations of the likelihood; auto: integrate where the directions "
-                   "of a latent have their own, as in the default prior, and rows times free directions of motion are at most {}",
-                   n_mixed_draws, draw_evaluations, largest_integrated_size)},
+                   "draws (docs/theory.md, T31), through inducing points of {}, at about {} evaluations of the likelihood; auto: "
+                   "integrate where the directions of a latent have their own, as in the default prior, and rows times free "
+                   "directions of motion are at most {}",
+                   n_mixed_draws, n_mixed_draws_through_points, draw_evaluations, largest_integrated_size)},
               {"standard_errors", YesByDefault{&request.standard_errors}, "",
                "the standard errors of estimated parameters, which take a few dozen gradients"},
               {"inducing",

@@ -89,6 +89,7 @@ FitMemory memory_of(double n_states, double r, const PerState& count, const FitO
   FitMemory memory;
   memory.reduced_size = static_cast<int>(std::lround(r));
   memory.shared = number * n_states * count.shared;
+  const double n_components = std::max(1, options.n_draws);
   if (options.n_inducing > 0) {
     // the observations, those of a stage before all of them, or of a stretch, and what is kept of blocks; sums of each part of the rows
     // and of each stretch, with what is made of them
@@ -97,11 +98,10 @@ FitMemory memory_of(double n_states, double r, const PerState& count, const FitO
     memory.shared = number * n_states * n_copies * count.observed;
     memory.evaluation = (Gram::n_parts + 6) * square +
                         std::min<double>(BlocksOfStates::most_kept_bytes, number * n_states * count.evaluation) + blas;
-    memory.posterior = (Gram::n_parts + 2 * CrossValidation::n_stretches + 6) * square + blas;
+    memory.posterior = (Gram::n_parts + 6 + n_components * 2 * CrossValidation::n_stretches) * square + blas;
     memory.asked_by_evaluation = memory.asked_by_posterior = square + blas_buffer;
     return memory;
   }
-  const double n_components = std::max(1, options.n_draws);
   memory.evaluation = triangle(r / count.n_parts) + number * n_states * count.evaluation + blas;
   // at the end a factor, its inverse in place, and what of it belongs to each stretch of cross_validate, stand beside the posterior
   const double left_out = triangle(r) + number * r * r / CrossValidation::n_stretches;

@@ -1,13 +1,35 @@
 #include "gp2/jobs/show_job.hpp"
 
 #include <algorithm>
+#include <cmath>
+#include <numeric>
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
+#include <nlohmann/json.hpp>
+
+#include "gp2/error.hpp"
+#include "gp2/training/laplace.hpp"
 
 namespace gp2 {
 
 namespace {
+
+using OrderedJson = nlohmann::ordered_json;
+using Rows = std::vector<std::vector<Expression>>;
+
+/// M, F, A and b.
+struct Derived {
+  explicit Derived(const SymbolicSystem& system) : M(system.definition().mass) {
+    for (const ConstraintRow& row : system.definition().constraints) {
+      A.push_back(row.A);
+      b.push_back({row.b});
+    }
+    for (const Expression entry : system.definition().force) F.push_back({entry});
+  }
+
+  Rows M, F, A, b;  // F and b of one column
+};
 
 // the expressions of a robot fill books
 std::string entry_text(Expression e, bool full) {
@@ -16,7 +38,7 @@ std::string entry_text(Expression e, bool full) {
   return full || size.written <= readable ? to_string(e) : fmt::format("({} operations)", size.operations);
 }
 
-std::string matrix_text(const std::vector<std::vector<Expression>>& rows, bool full) {
+std::string matrix_text(const Rows& rows, bool full) {
   // columns aligned
   std::vector<std::size_t> widths;
   for (const auto& row : rows) {
@@ -33,7 +55,7 @@ std::string matrix_text(const std::vector<std::vector<Expression>>& rows, bool f
   return out.empty() ? "  (no rows)\n" : out;
 }
 
-std::string matrix_latex(const char* name, const std::vector<std::vector<Expression>>& rows) {
+std::string matrix_latex(const char* name, const Rows& rows) {
   std::string out = fmt::format("{} = \\begin{{bmatrix}}\n", name);
   for (std::size_t i = 0; i < rows.size(); ++i) {
     std::vector<std::string> entries;
@@ -43,10 +65,9 @@ std::string matrix_latex(const char* name, const std::vector<std::vector<Express
   return out + "\\end{bmatrix}\n";
 }
 
-std::string latex_text(const SymbolicSystem::Definition& definition, const std::vector<std::vector<Expression>>& A,
-                       const std::vector<std::vector<Expression>>& b, const std::vector<std::vector<Expression>>& F) {
-  return fmt::format("\\begin{{align*}}\n{}\\\\\n{}\\\\\n{}\\\\\n{}\\end{{align*}}\n", matrix_latex("M", definition.mass),
-                     matrix_latex("F", F), matrix_latex("A", A), matrix_latex("b", b));
+std::string latex_text(const Derived& derived) {
+  return fmt::format("\\begin{{align*}}\n{}\\\\\n{}\\\\\n{}\\\\\n{}\\end{{align*}}\n", matrix_latex("M", derived.M),
+                     matrix_latex("F", derived.F), matrix_latex("A", derived.A), matrix_latex("b", derived.b));
 }
 
 std::string robot_text(const RobotDescription& robot) {
@@ -88,7 +109,7 @@ std::string parameters_text(const Model& model, const System& system) {
 
 std::string directions_text(const Model& model, const LatentSpec& latent, bool full) {
   if (latent.direction_code) return "  code\n";
-  std::vector<std::vector<Expression>> directions;
+  Rows directions;
   for (const std::vector<std::string>& row : latent.directions) {
     directions.emplace_back();
     for (const std::string& entry : row) directions.back().push_back(model.expression(entry));
@@ -107,65 +128,190 @@ std::string range_text(const Latent::Range& range) {
   return text;
 }
 
-std::string latents_text(const Model& model, bool full) {
-  std::string text;
+// What `use` makes of each latent of the model file, of what it is in the prior, and of the names of the directions it acts in.
+template <typename Use>
+void for_each_latent(const Model& model, const Use& use) {
   const Prior prior = make_prior(model);
   for (const LatentSpec& spec : model.latents) {
     const auto is_of_it = [&](const Latent& latent) { return latent.name == spec.name; };
-    const Latent& latent = *std::find_if(prior.latents.begin(), prior.latents.end(), is_of_it);
     std::vector<std::string> columns;
     for (const Latent& one : prior.latents) {
       if (is_of_it(one)) columns.insert(columns.end(), one.column_names.begin(), one.column_names.end());
     }
+    use(spec, *std::find_if(prior.latents.begin(), prior.latents.end(), is_of_it), columns);
+  }
+}
+
+std::string latents_text(const Model& model, bool full) {
+  std::string text;
+  for_each_latent(model, [&](const LatentSpec& spec, const Latent& latent, const std::vector<std::string>& columns) {
     text += fmt::format("\nlatent '{}'\n  kernel      {}{}\n  features    {}\n  acts on     {}\n", latent.name,
                         latent.kernel.text(), latent.direction.empty() ? "" : "   one for each direction",
                         fmt::join(latent.feature_names, ", "), fmt::join(columns, ", "));
     for (const auto& [feature, range] : spec.lengthscales) {
       text += fmt::format("  lengthscale {} {}\n", feature, range_text(range));
     }
-    if (spec.directions.empty() && !spec.direction_code) continue;
+    if (spec.directions.empty() && !spec.direction_code) return;
     text += fmt::format("  directions{}\n{}", latent.base == Latent::Base::force ? " (forces)" : "",
                         directions_text(model, spec, full));
-  }
+  });
   return text;
 }
 
-std::string whole_text(const Model& model, const SymbolicSystem& system, const std::vector<std::vector<Expression>>& A,
-                       const std::vector<std::vector<Expression>>& b, const std::vector<std::vector<Expression>>& F, bool full) {
+const char* word_of(ConstraintRow::Level level) {
+  return level == ConstraintRow::Level::position   ? "position"
+         : level == ConstraintRow::Level::velocity ? "velocity"
+                                                   : "acceleration";
+}
+
+std::string whole_text(const Model& model, const SymbolicSystem& system, bool full) {
+  const Derived derived(system);
   std::string text = fmt::format("{}\n  {} coordinates, {} inputs, {} constraints\n", system.name(), system.nq(),
                                  system.inputs().size(), system.nc());
   if (model.robot) text += robot_text(*model.robot);
-  text += fmt::format("\nmass matrix M\n{}", matrix_text(system.definition().mass, full));
-  text += fmt::format("\nknown force F\n{}", matrix_text(F, full));
+  text += fmt::format("\nmass matrix M\n{}", matrix_text(derived.M, full));
+  text += fmt::format("\nknown force F\n{}", matrix_text(derived.F, full));
   text += "\nconstraints A ddq = b\n";
   for (const ConstraintRow& row : system.definition().constraints) {
-    const char* level = row.level == ConstraintRow::Level::position   ? "position"
-                        : row.level == ConstraintRow::Level::velocity ? "velocity"
-                                                                      : "acceleration";
-    text += fmt::format("  {} = 0   ({} level{}{})\n", row.text, level, row.noise > 0 ? fmt::format(", noise {}", row.noise) : "",
+    text += fmt::format("  {} = 0   ({} level{}{})\n", row.text, word_of(row.level),
+                        row.noise > 0 ? fmt::format(", noise {}", row.noise) : "",
                         row.condition.empty() ? "" : (row.contact ? ", a contact, when " : ", when ") + row.condition);
   }
-  text += fmt::format("A\n{}b\n{}", matrix_text(A, full), matrix_text(b, full));
+  text += fmt::format("A\n{}b\n{}", matrix_text(derived.A, full), matrix_text(derived.b, full));
   return text + actuators_text(model) + parameters_text(model, system) + latents_text(model, full);
+}
+
+OrderedJson matrix_json(const Rows& rows) {
+  OrderedJson json = OrderedJson::array();
+  for (const auto& row : rows) {
+    json.push_back(OrderedJson::array());
+    for (const Expression entry : row) json.back().push_back(to_string(entry));
+  }
+  return json;
+}
+
+OrderedJson column_json(const Rows& rows) {
+  OrderedJson json = OrderedJson::array();
+  for (const auto& row : rows) json.push_back(to_string(row.front()));
+  return json;
+}
+
+OrderedJson parameter_json(const Parameter& parameter) {
+  OrderedJson json = {{"name", parameter.name}, {"value", parameter.value}};
+  if (parameter.bounds) json.update({{"lower", parameter.bounds->first}, {"upper", parameter.bounds->second}});
+  json["estimate"] = parameter.estimate;
+  return json;
+}
+
+OrderedJson model_json(const Model& model, const SymbolicSystem& system) {
+  const Derived derived(system);
+  OrderedJson coordinates, constraints, parameters, latents;
+  for (OrderedJson* list : {&coordinates, &constraints, &parameters, &latents}) *list = OrderedJson::array();
+  for (const Coordinate& q : system.coordinates()) coordinates.push_back(q.name);
+  for (const ConstraintRow& row : system.definition().constraints) {
+    constraints.push_back({{"text", row.text}, {"level", word_of(row.level)}, {"noise", row.noise}});
+    if (!row.condition.empty()) constraints.back().update({{"when", row.condition}, {"contact", row.contact.has_value()}});
+  }
+  for (const Parameter& parameter : system.parameters()) parameters.push_back(parameter_json(parameter));
+  for (const Model::DerivedParameter& one : model.derived_parameters) {
+    parameters.push_back({{"name", one.name}, {"value", one.value}, {"expression", one.text}});
+  }
+  for (const Actuator& actuator : model.actuators) {
+    if (actuator.is_direct() && !actuator.is_estimated()) continue;
+    for (const Parameter& parameter : {actuator.delay, actuator.lag}) parameters.push_back(parameter_json(parameter));
+  }
+  for_each_latent(model, [&](const LatentSpec&, const Latent& latent, const std::vector<std::string>& columns) {
+    latents.push_back({{"name", latent.name},
+                       {"kernel", latent.kernel.text()},
+                       {"per_direction", !latent.direction.empty()},
+                       {"features", latent.feature_names},
+                       {"acts_on", columns}});
+  });
+  return {{"name", system.name()},       {"coordinates", coordinates},  {"inputs", system.inputs()},
+          {"M", matrix_json(derived.M)}, {"F", column_json(derived.F)}, {"constraints", constraints},
+          {"A", matrix_json(derived.A)}, {"b", column_json(derived.b)}, {"parameters", parameters},
+          {"latents", latents}};
+}
+
+// "0.1 ± 0.02   [0, 1]   at its bound"
+std::string estimate_line(const std::string& name, double value, const std::string& error, double lower, double upper,
+                          const char* remark) {
+  return fmt::format("  {:<34} {:>13.6g}{}   [{:.3g}, {:.3g}]{}\n", name, value, error, lower, upper, remark);
+}
+
+// "", " ± ∞" or " ± 0.02"
+std::string error_text(double stddev) {
+  return std::isnan(stddev) ? "" : std::isinf(stddev) ? " ± ∞" : fmt::format(" ± {:.2g}", stddev);
+}
+
+std::string draws_text(const FitReport& report) {
+  const HyperparameterDraws& draws = *report.draws;
+  Eigen::Index slowest = 0, worst = 0;
+  const double size = draws.effective_size.minCoeff(&slowest), r_hat = draws.r_hat.maxCoeff(&worst);
+  const auto name = [&](Eigen::Index k) { return report.hyperparameters[static_cast<std::size_t>(k)].name; };
+  return fmt::format(
+      "hyperparameters integrated: {} draws of {} chains, R̂ at most {:.3f} ({}), worth {:.0f} independent ones or more ({})\n",
+      draws.size(), draws.n_chains, r_hat, name(worst), size, name(slowest));
 }
 
 }  // namespace
 
 std::vector<Option> options(ShowRequest& request) {
   return {{"latex", &request.latex, "", "as LaTeX"},
-          {"full", &request.full, "", "long expressions too, which otherwise are counted"}};
+          {"full", &request.full, "", "long expressions too, which otherwise are counted"},
+          {"json", &request.json, "", "as JSON, expressions in full"}};
 }
 
 std::string show(const Model& model, const ShowRequest& request) {
+  if (request.latex && request.json) throw InputError("`latex` and `json` are two forms of the same: leave out one");
   const SymbolicSystem& system = require_symbolic_system(model);
-  const SymbolicSystem::Definition& definition = system.definition();
-  std::vector<std::vector<Expression>> A, b, F;
-  for (const ConstraintRow& row : definition.constraints) {
-    A.push_back(row.A);
-    b.push_back({row.b});
+  if (request.json) return model_json(model, system).dump(2) + "\n";
+  return request.latex ? latex_text(Derived(system)) : whole_text(model, system, request.full);
+}
+
+std::string show(const FitFile& fit, const ShowRequest& request) {
+  const std::string of_model = show(fit.model, request);
+  if (request.latex) return of_model;
+  const std::vector<std::int64_t> n = fit.n_states();
+  const std::int64_t n_states = std::accumulate(n.begin(), n.end(), std::int64_t{0});
+  if (!request.json) {
+    return fmt::format("learned from {} states of {}\n{}\n{}", n_states, fit.data_source, text_of(fit.report), of_model);
   }
-  for (Expression entry : definition.force) F.push_back({entry});
-  return request.latex ? latex_text(definition, A, b, F) : whole_text(model, system, A, b, F, request.full);
+  OrderedJson json = OrderedJson::parse(of_model), hyperparameters = OrderedJson::object();
+  for (const Hyperparameter& h : fit.report.hyperparameters) hyperparameters[h.name] = h.value;
+  json["fit"] = {{"data", fit.data_source},
+                 {"states", n_states},
+                 {"nll", fit.report.negative_log_likelihood},
+                 {"termination", fit.report.termination},
+                 {"hyperparameters", hyperparameters},
+                 {"options", fit.options.empty() ? OrderedJson() : OrderedJson::parse(fit.options)}};
+  return json.dump(2) + "\n";
+}
+
+std::string text_of(const FitReport& report) {
+  std::string text = fmt::format("negative log likelihood {:.6f}\n{} after {} iterations ({} restarts, best: {})",
+                                 report.negative_log_likelihood, report.termination, report.iterations, report.restarts.size(),
+                                 report.best_restart + 1);
+  text += report.seconds > 0 ? fmt::format(", {:.2f} s\n", report.seconds) : "\n";  // no file holds how long it took
+  if (report.draws) text += draws_text(report);
+  for (const ActuatorEstimate& one : report.actuators) {
+    text += estimate_line(one.name, one.value, error_text(one.stddev), one.lower, one.upper,
+                          one.at_lower() || one.at_upper() ? "   at its bound" : "");
+  }
+  for (std::size_t k = 0; k < report.hyperparameters.size(); ++k) {
+    const Hyperparameter& h = report.hyperparameters[k];
+    std::string error;
+    if (h.is_system_parameter()) {
+      const ParameterUncertainty known = parameter_uncertainty(report, k);
+      error = error_text(known.stddev);
+      if (known.is_of_draws) error += fmt::format(" (mean {:.6g}, 95 % {:.4g} … {:.4g})", known.mean, known.lower, known.upper);
+    }
+    text += estimate_line(h.name, h.value, error, h.lower, h.upper,
+                          h.is_fixed()   ? "   held"
+                          : h.at_bound() ? "   at its bound"
+                                         : "");
+  }
+  return text;
 }
 
 }  // namespace gp2

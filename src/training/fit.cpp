@@ -435,9 +435,6 @@ void require_options(const FitOptions& options) {
   require("n_draws", options.n_draws, 0);
   require("n_inducing", options.n_inducing, 0);
   require("n_train", options.n_train, 0);
-  if (options.n_inducing > 0 && options.n_draws > 0) {
-    throw InputError("fit: hyperparameters are not drawn where all is learned through inducing points");
-  }
 }
 
 void require_starts(const std::vector<Hyperparameter>& hyperparameters) {
@@ -497,10 +494,12 @@ class TrainingThroughPoints {
     std::vector<int> stages;
     for (int n = n_exact; optimises && n < n_train && (n == n_exact || n <= n_train / 4); n *= 25) stages.push_back(n);
     stages.push_back(n_train);
+    const bool draws = options_.n_draws > 0 && optimises;
+    const std::size_t n_stages = stages.size() + (draws ? 1 : 0);
     std::optional<FitReport> report;
     for (std::size_t stage = 0; stage < stages.size() && !(report && is_set(options_.stop)); ++stage) {
       const bool is_last = stage + 1 == stages.size(), is_exact = stages[stage] <= n_exact && stages[stage] < n_all;
-      FitOptions options = of_stage(stage, stages.size());
+      FitOptions options = of_stage(stage, n_stages);
       options.standard_errors = options.standard_errors && is_last;
       const std::vector<Observations> some =
           stages[stage] < n_all ? evenly(observations_, stages[stage]) : std::vector<Observations>();
@@ -531,6 +530,8 @@ class TrainingThroughPoints {
         is_set(options_.stop) ? left_out_as_some_tell(*report)
                               : left_out(observations_, *report, Workers(thread_count(options_.n_threads), options_.ranks));
     report->inducing->n_start = stages.size() > 1 ? n_exact : 0;
+    if (draws && !is_set(options_.stop))
+      report->draws = drawn(evenly(observations_, n_exact), report->hyperparameters, of_stage(stages.size(), n_stages));
     if (is_set(options_.stop)) {
       report->termination = FitReport::interrupted;
       report->converged = false;
@@ -545,6 +546,25 @@ class TrainingThroughPoints {
     const std::vector<Observations> some = evenly(observations_, most);
     const int size = Likelihood(prior_, some, model_values(prior_, some, hyperparameters), {}).reduced_size();
     return std::max(1, n_states(some) * reduced_size / std::max(size, reduced_size));
+  }
+
+  // Of hyperparameters, given few states, exactly. What all states together tell far better than few, the noise and the parameters
+  // of the system, stays as it was found.
+  [[nodiscard]] std::optional<HyperparameterDraws> drawn(const std::vector<Observations>& some,
+                                                         std::vector<Hyperparameter> hyperparameters, FitOptions options) const {
+    options.n_draws = options_.n_draws;
+    options.standard_errors = false;
+    options.improved = nullptr;
+    for (Hyperparameter& h : hyperparameters) {
+      if (!h.is_system_parameter() && h.kind != Hyperparameter::Kind::noise_stddev) continue;
+      if (!h.positive && h.size == 0) h.size = h.upper - h.lower;  // its unit, which a box without width has none of
+      h.lower = h.upper = h.value;
+    }
+    try {
+      return trained(prior_, some, hyperparameters, options).draws;
+    } catch (const NumericalError&) {  // or stopped: the fit stands, without draws
+      return std::nullopt;
+    }
   }
 
   static constexpr int n_rounds = 3;

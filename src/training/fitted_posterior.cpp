@@ -32,7 +32,7 @@ Posterior posterior_of(const Prior& prior, const std::vector<Observations>& obse
                        const Workers& workers) {
   const std::vector<ModelValues> values = values_of(prior, observations, report);
   if (report.inducing && report.inducing->summary) {
-    return Posterior::of_summary(prior, observations, values.front(), *report.inducing->summary);
+    return Posterior::of_summary(prior, observations, values, *report.inducing->summary);
   }
   return Posterior::mixture(prior, observations, values, workers);
 }

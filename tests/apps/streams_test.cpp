@@ -92,6 +92,7 @@ TEST_F(Streams, ADashIsStandardInputOrOutputInEveryCommand) {
   const std::string start = "--start q1=0.3,dq2=0.5 --t-end 0.2 ";
   for (const auto& [line, input] : {
            Case{"gp2 show IN", "models/surface.toml"},
+           Case{"gp2 show IN --json", "fit.json"},
            Case{"gp2 check IN --data train.csv", "models/surface.toml"},
            Case{"gp2 check models/surface.toml --data IN", "train.csv"},
            Case{"gp2 generate IN --n 5 -o OUT", "models/surface.toml"},

@@ -466,17 +466,25 @@ TEST_F(DamagedFit, InducingPointsThatDoNotHoldTogetherAreRefused) {
   EXPECT_EQ(refused_summary([](Json& s) { s["step"] = 0; }), "a step of 0 states is not possible");
   EXPECT_EQ(refused_summary([](Json& s) { s["states"][0] = -1; }), "-1 stands where a number of states must");
   EXPECT_THAT(refused_summary([](Json& s) { s["states"].push_back(1); }), StartsWith("numbers of states of 2 of 1 observations"));
-  EXPECT_EQ(refused_summary([](Json& s) { s["c"] = "00"; }),
+  EXPECT_EQ(refused_summary([](Json& s) { s["components"][0]["c"] = "00"; }),
             fmt::format("2 hexadecimal digits, expected {}", 16 * inducing.at("variables").get<int>()));
-  EXPECT_EQ(refused_summary([](Json& s) { s["c"] = "7ff0000000000000" + s["c"].get<std::string>().substr(16); }),
+  EXPECT_EQ(refused_summary([](Json& s) {
+              s["components"][0]["c"] = "7ff0000000000000" + s["components"][0]["c"].get<std::string>().substr(16);
+            }),
             "'7ff0000000000000' is not a finite number in hexadecimal digits");
-  EXPECT_EQ(refused_summary([](Json& s) { s["factors"].push_back(s["factors"][0]); }), "factors of more latents than there are");
-  EXPECT_THAT(refused_summary([](Json& s) { s["factors"].clear(); }), StartsWith("factors of 0 of "));
-  EXPECT_EQ(refused_summary([](Json& s) { s["factors"][0]["points"][0] = 99; }), "99 is no inducing point");
-  EXPECT_EQ(refused_summary(
-                [](Json& s) { s["factors"][0]["L"] = "8000000000000000" + s["factors"][0]["L"].get<std::string>().substr(16); }),
+  EXPECT_EQ(refused_summary([](Json& s) { s["components"][0]["factors"].push_back(s["components"][0]["factors"][0]); }),
+            "factors of more latents than there are");
+  EXPECT_THAT(refused_summary([](Json& s) { s["components"][0]["factors"].clear(); }), StartsWith("factors of 0 of "));
+  EXPECT_EQ(refused_summary([](Json& s) { s["components"][0]["factors"][0]["points"][0] = 99; }), "99 is no inducing point");
+  EXPECT_EQ(refused_summary([](Json& s) {
+              s["components"][0]["factors"][0]["L"] =
+                  "8000000000000000" + s["components"][0]["factors"][0]["L"].get<std::string>().substr(16);
+            }),
             "a factor of inducing points is not positive");
-  EXPECT_EQ(refused_summary([](Json& s) { s["weight"].push_back(1); }), "weights of some latents only");
+  EXPECT_EQ(refused_summary([](Json& s) { s["components"][0]["weight"].push_back(1); }), "weights of some latents only");
+  EXPECT_EQ(refused_summary([](Json& s) { s["components"].push_back(s["components"][0]); }), "sums of 2 components of 1");
+  EXPECT_EQ(refused_summary([](Json& s) { s.update(Json(s["components"][0])), s.erase("components"); }), "")
+      << "before version 11";
   EXPECT_EQ(refused([](Json& i) { i["points"][0][0][0] = nullptr; }), "null stands where a number must");
   const std::size_t n_latents = inducing.at("points").size(), n_features = inducing.at("points")[0].size();
   EXPECT_EQ(refused([](Json& i) { i["points"].erase(0); }),

@@ -76,7 +76,7 @@ class DirectEvaluation {
       case Operation::abs:
         return std::fabs(a);
       case Operation::sign:
-        return std::isnan(a) ? a : a > 0 ? 1 : a < 0 ? -1 : 0;
+        return a > 0 ? 1 : a < 0 ? -1 : a;
       default:
         break;
     }
@@ -95,9 +95,9 @@ class DirectEvaluation {
       case Operation::atan2:
         return std::atan2(a, b);
       case Operation::min:
-        return std::isnan(a) || std::isnan(b) ? NAN : std::fmin(a, b);
+        return std::isnan(a) || a < b ? a : b;
       case Operation::max:
-        return std::isnan(a) || std::isnan(b) ? NAN : std::fmax(a, b);
+        return std::isnan(a) || a > b ? a : b;
       case Operation::multiply_or_zero:
         return a == 0 ? 0 : a * b;
       default:
@@ -118,8 +118,8 @@ class DirectEvaluation {
   std::unordered_map<std::uint32_t, double> known_;
 };
 
-// equal, a zero's sign aside: min and max take either zero
-bool same(double a, double b) { return a == b || (std::isnan(a) && std::isnan(b)); }
+// equal to a zero's sign, which a division turns into that of an infinity
+bool same(double a, double b) { return (a == b && std::signbit(a) == std::signbit(b)) || (std::isnan(a) && std::isnan(b)); }
 
 void compare_with_tape(const std::vector<Expression>& outputs, const std::vector<Expression>& inputs) {
   const gp2::Tape tape(outputs, inputs);

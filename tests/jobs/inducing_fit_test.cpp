@@ -46,7 +46,6 @@ TEST(InducingFit, AutoIsExactWhereThatTakesMinutes) {
   EXPECT_EQ(n_inducing(n + 1, as_it_is), most_inducing_variables);
   EXPECT_EQ(n_inducing(n + 1, [](FitRequest& request) { request.is_exact = true; }), 0);
   EXPECT_EQ(n_inducing(n + 1, [](FitRequest& request) { request.problem.protocol.name = Protocol::Name::paper; }), 0);
-  EXPECT_EQ(n_inducing(n + 1, [](FitRequest& request) { request.hyperparameters = HyperparameterChoice::integrate; }), 0);
   EXPECT_EQ(n_inducing(n + 1, [](FitRequest& request) { request.problem.robust = true; }), most_inducing_variables);
   EXPECT_EQ(n_inducing(n + 1, [](FitRequest& request) { request.problem.max_points = 20; }), 0);
 }
@@ -79,8 +78,6 @@ TEST(InducingFit, WhatDoesNotGoWithPointsIsRefused) {
               request.problem.baseline = Baseline::Kind::icm, request.problem.mean = Prior::Mean::zero;
             }),
             "`inducing` is not for a `baseline`");
-  EXPECT_EQ(refused([](FitRequest& request) { request.hyperparameters = HyperparameterChoice::integrate; }),
-            "`hyperparameters=integrate` is not with `inducing` points");
 }
 
 TEST(InducingFit, TellsWhatIsLeftOutAndItsFileGivesItAgain) {
@@ -153,6 +150,41 @@ TEST(InducingFit, AFileOfManyRowsHoldsWhatTheySayAndSomeOfThem) {
   EXPECT_THAT(more.n_states(), testing::ElementsAre(6200));
   EXPECT_FALSE(more.report.inducing->stretches) << "they were of other data";
   EXPECT_LE(more.posterior().marginal(view, states).stddev().mean(), posterior.marginal(view, states).stddev().mean());
+}
+
+TEST(InducingFit, HyperparametersDrawnFromSomeRowsMixWhatAllTell) {
+  FitRequest request = request_of_rows(300);
+  request.inducing = 40;
+  request.problem.estimate = {"m"};
+  request.problem.estimate_noise = true;
+  request.hyperparameters = HyperparameterChoice::integrate;
+  const FitOutcome outcome = run_fit(prepare_fit(std::move(request)));
+  const FitReport& report = outcome.file.report;
+  ASSERT_TRUE(report.draws && report.inducing);
+  EXPECT_EQ(report.draws->size(), n_mixed_draws_through_points);
+  EXPECT_EQ(outcome.posterior.n_components(), n_mixed_draws_through_points);
+  for (std::size_t h = 0; h < report.hyperparameters.size(); ++h) {
+    const auto k = static_cast<Eigen::Index>(h);
+    const Hyperparameter::Kind kind = report.hyperparameters[h].kind;
+    const bool all_tell = kind == Hyperparameter::Kind::parameter || kind == Hyperparameter::Kind::noise_stddev;
+    EXPECT_EQ(report.draws->is_drawn(k), !all_tell) << report.hyperparameters[h].name;
+    EXPECT_TRUE(!all_tell || report.draws->values(k, 0) == report.hyperparameters[h].value);
+  }
+  EXPECT_GT(report.uncertainty.value().stddev.maxCoeff(), 0) << "what is not known of m, by all rows";
+  const test::TemporaryFolder folder;
+  outcome.file.write(folder / "fit.json");
+  const FitFile read = FitFile::read(folder / "fit.json");
+  const View view = View::constrained_acceleration(*outcome.file.model.system);
+  const MatrixXd& states = outcome.posterior.observations().front().states();
+  EXPECT_EQ(read.posterior().marginal(view, states).covariance, outcome.posterior.marginal(view, states).covariance);
+  // each component is conditioned on all rows
+  const UpdateOutcome updated = update(read, {test::drawn_log(surface, 200, 5).table()}, {});
+  EXPECT_EQ(updated.n_states, 500);
+  const Posterior more = updated.fit.posterior();
+  for (int k = 0; k < n_mixed_draws_through_points; ++k) {
+    EXPECT_LT(more.component(k).marginal(view, states).stddev().mean(),
+              outcome.posterior.component(k).marginal(view, states).stddev().mean());
+  }
 }
 
 TEST(InducingFit, OfARobustOneDistrustsTheSame) {

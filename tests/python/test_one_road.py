@@ -1,5 +1,7 @@
 """What the command and Python did differently once, and do by one function now."""
 
+import json
+
 import numpy as np
 import pytest
 
@@ -78,3 +80,19 @@ def test_a_view_is_chosen_by_one_function(posterior, arm_fit_file, command, arm_
         assert outcome.returncode == 0, outcome.stderr
         table, prediction = gp2.read_csv(tmp_path / "out.csv"), posterior.predict(arm_states, view, dt=dt)
         assert np.array_equal(np.column_stack([table[name] for name in prediction.names]), prediction.mean)
+
+
+def test_show_of_a_fit_is_what_the_command_prints(command, arm, arm_log, tmp_path):
+    posterior = gp2.fit(arm, arm_log, restarts=1, max_iterations=2, max_escapes=0, standard_errors=False)
+    posterior.save(tmp_path / "fit.json")
+    shown = command("show", tmp_path / "fit.json").stdout
+    assert shown.startswith("learned from ") and "negative log likelihood" in shown and "mass matrix M" in shown
+    assert gp2.show(gp2.load(tmp_path / "fit.json")) == shown
+    assert gp2.show(posterior).splitlines()[0] == shown.splitlines()[0]
+    told = json.loads(command("show", tmp_path / "fit.json", "--json").stdout)
+    assert told["fit"]["states"] == posterior.n_data and told["coordinates"] == arm.coordinates
+    assert told["fit"]["hyperparameters"] == {h.name: h.value for h in posterior.report.hyperparameters}
+    model = json.loads(gp2.show(arm, json=True))
+    assert model == {key: value for key, value in told.items() if key != "fit"}
+    with pytest.raises(gp2.InputError, match="leave out one"):
+        gp2.show(arm, json=True, latex=True)

@@ -224,3 +224,29 @@ def test_states_are_projected_before_the_fit_where_asked_for(arm, arm_log):
     projected = gp2.fit(arm, log, project=True, max_iterations=0)
     assert any("states projected onto the constraints" in note for note in projected.notes)
     assert projected.negative_log_likelihood != gp2.fit(arm, log, max_iterations=0).negative_log_likelihood
+
+
+def test_results_are_pandas_frames(arm, arm_log, arm_fit_file, arm_states):
+    log = arm_log.to_frame()
+    assert list(log.columns) == arm_log.columns and np.array_equal(log["t"], arm_log["t"])
+    posterior = gp2.load(arm_fit_file)
+    prediction = posterior.predict(arm_states)
+    frame = prediction.to_frame()
+    assert list(frame.columns) == [*prediction.names, *(f"{name}_std" for name in prediction.names), "distance_from_data"]
+    assert np.array_equal(frame[prediction.names], prediction.mean)
+    assert np.array_equal(frame[f"{prediction.names[0]}_std"], prediction.std[:, 0])
+    mean = posterior.predict(arm_states, mean_only=True)
+    assert list(mean.to_frame().columns) == [*mean.names, "distance_from_data"]
+    start = arm_states[0, :4]
+    motion = posterior.simulate(start, np.linspace(0, 0.1, 3))
+    frame = motion.to_frame()
+    assert np.array_equal(frame[arm.coordinates], motion.q) and np.array_equal(frame["t"], motion.t)
+    assert np.array_equal(frame[[f"{name}_std" for name in arm.acceleration_names]], motion.std)
+    # a motion is a log, whose deviations are not those of a measurement
+    assert list(motion.table.columns) == [c for c in frame.columns if not c.endswith("_std") and c != "distance_from_data"]
+    assert list(gp2.simulate(arm, start, [0, 0.1]).to_frame().columns) == motion.table.columns
+
+
+def test_notebooks_show_systems_and_fits(arm, arm_fit_file):
+    assert arm._repr_html_().startswith("<pre>") and "mass matrix M" in arm._repr_html_()
+    assert "learned from 30 states" in gp2.load(arm_fit_file)._repr_html_()

@@ -25,8 +25,9 @@ enum class HyperparameterChoice {
   automatic,  // integrate where integration_pays, else optimise
 };
 
-/// Draws that `integrate` mixes, and the largest reduced size (FitMemory) up to which `auto` does: minutes on two cores.
-inline constexpr int n_mixed_draws = 25, largest_integrated_size = 800;
+/// Draws that `integrate` mixes, through inducing points fewer, each of which has sums of its own; and the largest reduced size
+/// (FitMemory) up to which `auto` does: minutes on two cores.
+inline constexpr int n_mixed_draws = 25, n_mixed_draws_through_points = 8, largest_integrated_size = 800;
 
 /// The largest reduced size that is solved exactly unless a person says otherwise, and the inducing variables at most beyond it:
 /// minutes on two cores.

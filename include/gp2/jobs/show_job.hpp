@@ -4,6 +4,7 @@
 #include <vector>
 
 #include "gp2/export.hpp"
+#include "gp2/files/fit_file.hpp"
 #include "gp2/jobs/option.hpp"
 #include "gp2/model.hpp"
 
@@ -12,11 +13,19 @@ namespace gp2 GP2_API {
 struct ShowRequest {
   bool latex = false;  // M, F, A and b alone
   bool full = false;   // long expressions too, which otherwise are counted
+  bool json = false;   // all of it, as JSON
 };
 std::vector<Option> options(ShowRequest& request);
 
 /// What a model means: the derived A, b, M, F, its parameters and latents, as text.
-/// @throws InputError where its mechanics are code.
+/// @throws InputError where its mechanics are code; for `latex` and `json` together.
 std::string show(const Model& model, const ShowRequest& request = {});
+
+/// What a fit was learned from and what it found, before what its model means.
+/// @throws InputError as of a model.
+std::string show(const FitFile& fit, const ShowRequest& request = {});
+
+/// How a fit ended, and its hyperparameters with their standard errors, a line each.
+std::string text_of(const FitReport& report);
 
 }  // namespace gp2
