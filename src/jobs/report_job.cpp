@@ -14,6 +14,7 @@
 #include <nlohmann/json.hpp>
 
 #include "base/not_a_number.hpp"
+#include "gp2/base/statistics.hpp"
 #include "gp2/error.hpp"
 #include "gp2/jobs/fit_job.hpp"
 #include "gp2/jobs/fit_problem.hpp"
@@ -231,6 +232,72 @@ std::vector<Relevance> relevance_of(const Posterior& posterior) {
 
 }  // namespace
 
+namespace {
+
+// The row of the training data that is nearest to the medians of what the prior reads, in spreads.
+VectorXd usual_state(const Prior& prior, const MatrixXd& states) {
+  const std::vector<bool> reads = prior.reads();
+  VectorXd distance = VectorXd::Zero(states.cols());
+  for (Index k = 0; k < states.rows(); ++k) {
+    if (!reads[static_cast<std::size_t>(k)]) continue;
+    const auto row = states.row(k).array();
+    const double middle = median({row.begin(), row.end()});
+    const double spread = (row - middle).abs().mean();
+    if (spread > 0) distance.array() += ((row - middle) / spread).square().transpose();
+  }
+  Index nearest = 0;
+  distance.minCoeff(&nearest);
+  return states.col(nearest);
+}
+
+}  // namespace
+
+std::vector<LearnedForce> learned_forces(const Posterior& posterior) {
+  constexpr Index n_points = 61;
+  constexpr std::size_t most = 6;        // entries of the state, of a latent
+  constexpr double worth_a_look = 0.02;  // of what the entry does that does most
+  const Prior& prior = posterior.prior();
+  const auto home = std::ranges::find_if(
+      posterior.observations(), [](const Observations& group) { return !group.view().other_system && group.n_data() > 0; });
+  if (prior.reference || home == posterior.observations().end()) return {};
+  const MatrixXd& states = home->states();
+  const VectorXd usual = usual_state(prior, states);
+  const std::vector<std::string> entries = prior.system->state_names();
+  const bool has_several = std::ranges::any_of(
+      prior.latents, [&](const Latent& latent) { return !latent.kernel_is_fixed && latent.name != prior.latents[0].name; });
+  std::vector<LearnedForce> all;
+  for (std::size_t a = 0; a < prior.latents.size(); ++a) {
+    const Latent& latent = prior.latents[a];
+    if (latent.kernel_is_fixed || (a > 0 && prior.latents[a - 1].name == latent.name)) continue;  // one for each direction
+    View view = View::learned_force(*prior.system);
+    const std::vector<std::string> whole_names = view.names(*prior.system);
+    view.latent = latents_called(prior, latent.name, "latent");
+    const std::vector<std::string> names = has_several ? view.names(*prior.system, latent.name) : whole_names;
+    std::vector<LearnedForce> of_latent;
+    for (std::size_t k = 0; k < entries.size(); ++k) {
+      const auto row = states.row(static_cast<Index>(k));
+      if (!latent.features->reads(static_cast<int>(k)) || !(row.maxCoeff() > row.minCoeff())) continue;
+      const VectorXd at = VectorXd::LinSpaced(n_points, row.minCoeff(), row.maxCoeff());
+      MatrixXd along = usual.replicate(1, n_points);
+      along.row(static_cast<Index>(k)) = at.transpose();
+      try {
+        const Posterior::Marginal marginal = posterior.marginal(view, along);
+        of_latent.push_back({latent.name, entries[k], names, at, marginal.mean, marginal.stddev()});
+      } catch (const InputError&) {  // where no data are a feature may have no value
+      }
+    }
+    const auto effect = [](const LearnedForce& one) {
+      return (one.mean.rowwise().maxCoeff() - one.mean.rowwise().minCoeff()).norm();
+    };
+    std::ranges::stable_sort(of_latent, std::greater(), effect);
+    const auto is_small = [&](const LearnedForce& one) { return !(effect(one) > worth_a_look * effect(of_latent.front())); };
+    const auto end = std::ranges::find_if(of_latent, is_small);
+    const auto n = std::min<std::size_t>(most, static_cast<std::size_t>(end - of_latent.begin()));
+    std::move(of_latent.begin(), of_latent.begin() + static_cast<std::ptrdiff_t>(n), std::back_inserter(all));
+  }
+  return all;
+}
+
 VectorXd ReportData::rmse_to_truth() const {
   VectorXd rmse = VectorXd::Constant(std::ssize(rows), not_a_number);
   for (std::size_t k = 0; k < rows.size() && truth.cols() > 0; ++k) {
@@ -398,6 +465,7 @@ Report collect_report(const ReportOptions& options, std::vector<std::string>& no
   report.data = training_data(report.fit, posterior);
   report.cross_validation = cross_validate(report.fit, posterior);
   report.relevance = relevance_of(posterior);
+  report.learned = learned_forces(posterior);
   if (!options.data.empty()) {
     report.data.push_back(test_data(options, report.fit, posterior, notes));
   }

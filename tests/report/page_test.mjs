@@ -90,7 +90,10 @@ for (const model of ["surface", "duffing", "unicycle"]) {
       const { page, close } = await open(`${model}.html`, { scheme });
       const outputs = json(`${model}.json`).observations[0].rows.length;
       const charts = await inked(page);
-      assert.equal(charts.length, 2 * outputs + 6, "residuals and scatter per output, calibration, PIT, constraint error, two accelerations, motion");
+      const learned = await page.evaluate(() => JSON.parse(document.getElementById("report").textContent).learned);
+      const shown = learned.filter((one) => one.name === learned[0].name);
+      assert.equal(charts.length, 2 * outputs + 6 + shown.length, "residuals and scatter per output, calibration, PIT, constraint error, two accelerations, motion, learned forces");
+      assert.deepEqual(new Set(await page.locator("#learned-force option").evaluateAll((all) => all.map((one) => one.value))), new Set(learned.map((one) => one.name)));
       for (const { title, count } of charts) assert.ok(count > 20, `${title}: ${count} pixels in ${scheme}`);
       for (const select of scheme === "dark" ? [] : await page.locator("select:visible").all()) {
         for (const value of await select.locator("option").evaluateAll((all) => all.map((one) => one.value))) {
@@ -254,7 +257,7 @@ test("a fit that learned from no acceleration has a page without pictures", asyn
   writeFileSync(join(folder, "no_pictures.json"), JSON.stringify(fit));
   gp2("report", "no_pictures.json", "-o", "no_pictures.html");
   const { page, close } = await open("no_pictures.html", { pictures: false });
-  assert.equal(await page.locator("canvas").count(), 0);
+  assert.equal(await page.locator("#pictures canvas").count(), 0);
   assert.ok(await page.getByText("No pictures").isVisible());
   assert.ok((await page.locator("#relevance-bars tbody tr").count()) > 0);
   for (const target of await page.locator("nav a").evaluateAll((all) => all.map((one) => one.getAttribute("href")))) {

@@ -157,6 +157,40 @@ TEST_F(ReportOf, KnowsTheTruthAndTheConstraint) {
   EXPECT_EQ(r.truth_source, "particle on a surface");
 }
 
+TEST_F(ReportOf, ShowsTheForceThatWasLearnedAlongWhatItDependsOn) {
+  const Report r = report("surface", "--noise-std 0.01", "--mean force");
+  const Posterior posterior = r.fit.posterior();
+  const MatrixXd& states = posterior.observations().front().states();
+  const std::vector<std::string> entries = r.fit.model.system->state_names();
+  ASSERT_FALSE(r.learned.empty());
+  EXPECT_LE(r.learned.size(), 6u);
+  double largest = std::numeric_limits<double>::infinity();
+  for (const LearnedForce& one : r.learned) {
+    SCOPED_TRACE(one.along);
+    EXPECT_THAT(one.names, testing::ElementsAre("force_q1", "force_q2", "force_q3"));
+    const auto k = std::find(entries.begin(), entries.end(), one.along) - entries.begin();
+    EXPECT_EQ(one.at[0], states.row(k).minCoeff());
+    EXPECT_EQ(one.at[one.at.size() - 1], states.row(k).maxCoeff());
+    // where it meets the usual row it is the prediction there
+    const auto is_of_it = [&](Eigen::Index i) {
+      MatrixXd there = states.col(i).replicate(1, one.at.size());
+      there.row(k) = one.at.transpose();
+      View view = View::learned_force(*r.fit.model.system);
+      view.latent = 0;  // the discrepancy stands beside it
+      return posterior.mean(view, there).isApprox(one.mean, 1e-9);
+    };
+    int n = 0;
+    for (Eigen::Index i = 0; i < states.cols(); ++i) n += is_of_it(i) ? 1 : 0;
+    EXPECT_EQ(n, 1) << "it is along a row of the data";
+    const double effect = (one.mean.rowwise().maxCoeff() - one.mean.rowwise().minCoeff()).norm();
+    EXPECT_LE(effect, largest);
+    largest = effect;
+  }
+  const auto curves = nlohmann::json::parse(report_json(r))["learned"];
+  EXPECT_EQ(curves.size(), 3 * r.learned.size());
+  EXPECT_NEAR(curves[1]["mean"][60], r.learned[0].mean(1, 60), 1e-5 * std::abs(r.learned[0].mean(1, 60)));
+}
+
 TEST_F(ReportOf, SeesThatComputedAccelerationsFollowFromEachOther) {
   const Report r = report("surface", "--noise-std 0", "--mean force --max-iterations 0", /*with_test=*/false);
   ASSERT_EQ(r.data.size(), 1u);

@@ -298,6 +298,23 @@ Json relevance_json(const std::vector<Relevance>& all) {
   return rows;
 }
 
+Json learned_json(const std::vector<LearnedForce>& all) {
+  Json curves = Json::array();
+  for (const LearnedForce& one : all) {
+    // coordinates that the latent does not act on have no picture
+    const VectorXd size = one.mean.cwiseAbs().rowwise().maxCoeff() + one.stddev.rowwise().maxCoeff();
+    for (Index k = 0; k < size.size(); ++k) {
+      if (!(size[k] > 1e-12 * size.maxCoeff())) continue;
+      curves.push_back({{"name", one.names[static_cast<std::size_t>(k)]},
+                        {"along", one.along},
+                        {"at", row_json(one.at)},
+                        {"mean", row_json(one.mean.row(k))},
+                        {"stddev", row_json(one.stddev.row(k))}});
+    }
+  }
+  return curves;
+}
+
 Json surface_json(const ConstraintSurface& surface) {
   Json sheets = Json::array();
   for (const MatrixXd& sheet : surface.sheets) sheets.push_back(rows_json(sheet));
@@ -349,6 +366,7 @@ std::string report_json(const Report& report) {
                {"left_out", report.data.empty() ? "" : report.cross_validation.text()},
                {"advice", advice_json(learning_advice(report))},
                {"relevance", relevance_json(report.relevance)},
+               {"learned", learned_json(report.learned)},
                {"data", Json::array()}};
   for (const ReportData& data : report.data) json["data"].push_back(data_json(report, data));
   if (report.surface) json["surface"] = surface_json(*report.surface);

@@ -27,6 +27,18 @@ struct Relevance {
   std::optional<double> effect = std::nullopt;
 };
 
+/// The force that a latent adds to F along one entry of the state, mean and standard deviation. All other entries are as in one row
+/// of the training data, the nearest to their medians.
+struct LearnedForce {
+  std::string latent, along;
+  std::vector<std::string> names;  // force_NAME, with @LATENT behind where there are several (d)
+  Eigen::VectorXd at;              // evenly over what the training data hold (n)
+  Eigen::MatrixXd mean, stddev;    // (d × n)
+};
+
+/// What each latent has learned, along the entries of the state that it reads and that change it most.
+std::vector<LearnedForce> learned_forces(const Posterior& posterior);
+
 /// Measured accelerations at N states, d outputs of them, and what the fit says there. Standard deviations are without noise.
 struct ReportData {
   std::string name;    // "training", "training 2", "test"
@@ -96,6 +108,7 @@ struct Report {
   std::vector<ReportData> data;
   CrossValidation cross_validation;  // of the training data
   std::vector<Relevance> relevance;
+  std::vector<LearnedForce> learned;
   std::optional<ConstraintSurface> surface;
   std::string truth_source;  // the model that tells the truth
 };

@@ -366,12 +366,44 @@
   }
   const predictedOutput = (k) => data.predicted[data.rows[k]];
 
+  /** Keeps n charts in the host. */
+  function keep(host, n) {
+    while (host.children.length > n) { clear(host.lastChild); host.lastChild.remove(); }
+    while (host.children.length < n) host.append(make("div"));
+    return host;
+  }
+
+  const band = (mean, std, sign) => mean.map((value, i) => (value === null || std[i] === null ? null : value + sign * 2 * std[i]));
+
+  const reach = (one) => Math.max(...one.mean) - Math.min(...one.mean);
+
+  function drawLearned() {
+    const shown = report.learned.filter((one) => one.name === byId("learned-force").value).sort((a, b) => reach(b) - reach(a));
+    const range = shown.flatMap((one) => [...band(one.mean, one.stddev, -1), ...band(one.mean, one.stddev, 1)]);
+    const y = { label: shown[0].name, range: padded(Math.min(...range), Math.max(...range), 0.08) };
+    const host = keep(byId("learned-charts"), shown.length);
+    shown.forEach((one, k) => chart(host.children[k], {
+      title: `${one.name} along ${one.along}`, summary: `From ${format(Math.min(...one.mean), 3)} to ${format(Math.max(...one.mean), 3)}, band of ±${format(2 * rms(one.stddev), 3)} on average.`,
+      x: { label: one.along, values: one.at }, y, band: true,
+      series: [{ label: "learned", values: one.mean, colour: "--c1", kind: "line", low: band(one.mean, one.stddev, -1), high: band(one.mean, one.stddev, 1) }],
+    }));
+  }
+
+  function fillLearned() {
+    if (!report.learned.length) return;
+    // what the data determine best comes first
+    const known = (one) => reach(one) / rms(one.stddev);
+    const names = new Set([...report.learned].sort((a, b) => known(b) - known(a)).map((one) => one.name));
+    options(byId("learned-force"), [...names].map((name) => [name, name]));
+    byId("learned-force").addEventListener("change", drawLearned);
+    drawLearned();
+    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", drawLearned);
+  }
+
   function drawResiduals() {
     const name = byId("residual-feature").value;
     const x = name === "" ? along() : { label: name, values: data.columns[name] };
-    const host = byId("residual-charts");
-    while (host.children.length > data.outputs.length) { clear(host.lastChild); host.lastChild.remove(); }
-    while (host.children.length < data.outputs.length) host.append(make("div"));
+    const host = keep(byId("residual-charts"), data.outputs.length);
     data.outputs.forEach((output, k) => {
       const values = data.measured[k].map((value, i) => value === null ? null : value - predictedOutput(k)[i]);
       const noise = data.noise[k];
@@ -384,9 +416,7 @@
 
   function drawScatter() {
     const truth = byId("scatter-against").value === "truth";
-    const host = byId("scatter-charts");
-    while (host.children.length > data.outputs.length) { clear(host.lastChild); host.lastChild.remove(); }
-    while (host.children.length < data.outputs.length) host.append(make("div"));
+    const host = keep(byId("scatter-charts"), data.outputs.length);
     data.outputs.forEach((output, k) => {
       const reference = truth ? data.truth[data.rows[k]] : data.measured[k];
       const rmse = truth ? data.figures.rmse_to_truth[k] : data.figures.rmse[k];
@@ -450,7 +480,6 @@
     const x = along();
     const kind = x.ordered ? "line" : "points";
     const coordinate = model.coordinates[j];
-    const band = (mean, std, sign) => mean.map((value, i) => (value === null || std[i] === null ? null : value + sign * 2 * std[i]));
     const withBand = (label, mean, std) => ({ label, values: mean, colour: "--c1", kind, low: band(mean, std, -1), high: band(mean, std, 1) });
     const series = [withBand("predicted", data.predicted[j], data.stddev[j])];
     const k = data.rows.indexOf(j);
@@ -693,11 +722,13 @@
       for (const part of document.querySelectorAll("#data-choice, #pictures section:not(#relevance)")) part.remove();
       byId("pictures").append(make("p", { class: "muted", text: "No pictures: the fit learned from no acceleration, and no --data was given." }));
     }
+    if (!report.learned.length) byId("learned").remove();
     fillHeader();
     fillAdvice();
     fillModel();
     fillOptimiser();
     fillFigures();
+    fillLearned();
     fillRelevance();
     if (!data) return;
     const choice = byId("data-choice");
