@@ -46,23 +46,35 @@ std::set<int> latents_at_zero(const std::vector<Hyperparameter>& hyperparameters
 
 // A random start: about the size where the box is no more than a limit, log-normal about the first start where the hyper-prior is
 // log-normal, else even in the box of the coordinate.
-double draw(const Hyperparameter& h, RandomStream& random) {
+/// @param common  what a normal deviate has half of its variance from, where that is not null
+double draw(const Hyperparameter& h, const double* common, RandomStream& random) {
   if (h.size > 0) {
     const double relative = random.normal();
     return std::clamp(h.size * (h.positive ? std::exp(relative) : relative), h.lower, h.upper);
   }
   if (h.hyperprior.form == HyperPrior::Form::log_normal) {
-    return std::clamp(h.value * std::exp(Protocol::Standard::start_log_stddev * random.normal()), h.lower, h.upper);
+    const double own = random.normal(), deviate = common == nullptr ? own : std::sqrt(0.5) * (own + *common);
+    return std::clamp(h.value * std::exp(Protocol::Standard::start_log_stddev * deviate), h.lower, h.upper);
   }
   const double lower = h.lower_coordinate();
   return h.value_at(lower + random.uniform() * (h.upper_coordinate() - lower));
 }
 
-// Loadings that are zero at the first start stay zero (see Training::release).
-std::vector<Hyperparameter> draw_start(std::vector<Hyperparameter> hyperparameters, RandomStream& random) {
+bool is_lengthscale(const Prior& prior, const Hyperparameter& h) {
+  if (h.kind != Hyperparameter::Kind::kernel) return false;
+  const Kernel& kernel = prior.latents[static_cast<std::size_t>(h.owner)].kernel;
+  return kernel.parameters()[static_cast<std::size_t>(h.index)].kind == Kernel::ParameterKind::lengthscale;
+}
+
+// Loadings that are zero at the first start stay zero (see Training::release). An optimum of short lengthscales wants all short that
+// matter, so that those of one latent have a part in common.
+std::vector<Hyperparameter> draw_start(const Prior& prior, std::vector<Hyperparameter> hyperparameters, RandomStream& random) {
   const std::set<int> at_zero = latents_at_zero(hyperparameters);
+  std::vector<double> common(prior.latents.size());
+  for (double& deviate : common) deviate = random.normal();
   for (Hyperparameter& h : hyperparameters) {
-    if (!h.is_stationary_at_zero() || !at_zero.contains(h.owner)) h.value = draw(h, random);
+    if (h.is_stationary_at_zero() && at_zero.contains(h.owner)) continue;
+    h.value = draw(h, is_lengthscale(prior, h) ? &common[static_cast<std::size_t>(h.owner)] : nullptr, random);
   }
   return hyperparameters;
 }
@@ -352,7 +364,7 @@ class Training {
     constexpr int max_draws = 20;
     LbfgsbResult result;
     for (int draw = 0; draw < max_draws; ++draw) {
-      result = optimise(restart, restart == 0 ? hyperparameters_ : draw_start(hyperparameters_, random), workspace);
+      result = optimise(restart, restart == 0 ? hyperparameters_ : draw_start(prior_, hyperparameters_, random), workspace);
       if (std::isfinite(result.value) || restart == 0 || stopped()) break;
     }
     tell_improvement(result.x, result.value, 0);
