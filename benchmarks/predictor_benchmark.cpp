@@ -11,6 +11,7 @@
 #include <Eigen/Core>
 
 #include "gp2/fit.hpp"
+#include "gp2/inference/inducing.hpp"
 #include "gp2/predictor.hpp"
 #include "gp2/simulation/generate.hpp"
 
@@ -28,8 +29,8 @@ struct Setup {
   Eigen::Index next = 0;
 
   // The surface with N observations, at hyperparameters where all of them matter; with or without the latent for what the model
-  // leaves out that `gp2 fit` adds by default.
-  [[nodiscard]] gp2::Posterior posterior(int n, bool discrepancy) const {
+  // leaves out that `gp2 fit` adds by default; through at most so many inducing variables, where 0 is exact.
+  [[nodiscard]] gp2::Posterior posterior(int n, bool discrepancy, int n_inducing = 0) const {
     const gp2::View ddq = gp2::View::all(gp2::View::Quantity::constrained_acceleration, *model.system);
     const gp2::GeneratedData data = gp2::generate(model, {n, 1, Eigen::VectorXd::Constant(3, 0.1)});
     const std::vector<gp2::Observations> observations{
@@ -43,7 +44,10 @@ struct Setup {
                              Eigen::VectorXd::Constant(3, Standard::discrepancy_median * 0.1)};
       prior = gp2::make_prior(model, options);
     }
-    const auto values = gp2::model_values(prior, observations, gp2::default_hyperparameters(prior, observations, {}, {}));
+    gp2::ModelValues values = gp2::model_values(prior, observations, gp2::default_hyperparameters(prior, observations, {}, {}));
+    if (n_inducing > 0) {
+      values.inducing = gp2::choose_inducing_points(prior, observations, values, {.most = n_inducing, .left_out = 1e-9}).points;
+    }
     return {prior, observations, values};
   }
 
@@ -67,9 +71,7 @@ struct Setup {
   }
 };
 
-void predict(benchmark::State& state, Call what, bool discrepancy, Predictor::Storage storage) {
-  Setup setup;
-  const gp2::Posterior posterior = setup.posterior(static_cast<int>(state.range(0)), discrepancy);
+void predict(benchmark::State& state, Setup& setup, const gp2::Posterior& posterior, Call what, Predictor::Storage storage) {
   const Predictor predictor(posterior, gp2::View::all(gp2::View::Quantity::constrained_acceleration, *posterior.prior().system),
                             {.stddev = what == Call::stddev, .jacobian = what == Call::jacobian, .storage = storage});
   Predictor::Workspace workspace = predictor.make_workspace();
@@ -89,6 +91,18 @@ void predict(benchmark::State& state, Call what, bool discrepancy, Predictor::St
   state.counters["p99/median"] = nanoseconds[nanoseconds.size() * 99 / 100] / median;
 }
 
+void predict(benchmark::State& state, Call what, bool discrepancy, Predictor::Storage storage) {
+  Setup setup;
+  predict(state, setup, setup.posterior(static_cast<int>(state.range(0)), discrepancy), what, storage);
+}
+
+// of many rows, through inducing variables
+void predict_through_points(benchmark::State& state, Call what) {
+  Setup setup;
+  const int n = static_cast<int>(state.range(0)), n_inducing = static_cast<int>(state.range(1));
+  predict(state, setup, setup.posterior(n, false, n_inducing), what, Predictor::Storage::double_precision);
+}
+
 constexpr auto in_double = Predictor::Storage::double_precision, in_single = Predictor::Storage::single_precision;
 
 void arguments(benchmark::internal::Benchmark* rows) { rows->Arg(100)->Arg(1000)->UseManualTime()->Iterations(100'000); }
@@ -102,6 +116,13 @@ BENCHMARK_CAPTURE(predict, mean_and_jacobian_two_latents, Call::jacobian, true, 
 BENCHMARK_CAPTURE(predict, mean_single, Call::mean, false, in_single)->Apply(arguments);
 BENCHMARK_CAPTURE(predict, mean_and_stddev_single, Call::stddev, false, in_single)->Apply(arguments);
 BENCHMARK_CAPTURE(predict, mean_and_jacobian_single, Call::jacobian, false, in_single)->Apply(arguments);
+
+void arguments_through_points(benchmark::internal::Benchmark* rows) {
+  for (const int n_inducing : {300, 999}) rows->Args({1'000'000, n_inducing})->UseManualTime()->Iterations(100'000);
+}
+
+BENCHMARK_CAPTURE(predict_through_points, mean, Call::mean)->Apply(arguments_through_points);
+BENCHMARK_CAPTURE(predict_through_points, mean_and_stddev, Call::stddev)->Apply(arguments_through_points);
 
 }  // namespace
 

@@ -135,10 +135,8 @@ class Gram {
   /// Nothing where K̃ + I is not positive definite in double precision, or a block has a fault.
   [[nodiscard]] virtual std::optional<GramValue> value(const RowBlocks& blocks) = 0;
 
-  /// Sums over blocks are of so many parts, each of blocks that follow each other: the same bits for any number of threads.
-  static constexpr int n_parts = 8;
-  /// Takes what belongs to the rows of a block; those of different parts at the same time.
-  using OfRows = std::function<void(int part, const RowBlock& block, const GramGradient& of_rows)>;
+  /// Takes what belongs to the rows of a block; those of different pieces (Pieces) at the same time.
+  using OfRows = std::function<void(int piece, const RowBlock& block, const GramGradient& of_rows)>;
 
   /// The value, and `kernel` and `columns` of its gradient.
   /// @param parts  per latent

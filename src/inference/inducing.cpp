@@ -118,24 +118,17 @@ VectorXd left_out_by_points(const Prior& prior, const std::vector<Observations>&
   require_values(prior, observations, values);
   const lapack::SingleThread single_thread;
   const InducingLatents latents(prior, values);
-  std::vector<VectorXd> sums(Gram::n_parts, VectorXd::Zero(std::ssize(prior.latents)));
-  const auto add = [&](int part, const RowBlock&, const InducingBlock& block) {
+  const auto add = [&](VectorSum& sum, int, const RowBlock&, const InducingBlock& block) {
     for (std::size_t f = 0; f < latents.functions().size(); ++f) {
       const std::size_t a = latents.functions()[f].latent;
       const Eigen::ArrayXd left = block.variance(a) - block.w(a).colwise().squaredNorm().transpose();
-      sums[static_cast<std::size_t>(part)][static_cast<Index>(a)] += (block.weight_product(f, f) * left).sum();
+      sum.sum[static_cast<Index>(a)] += (block.weight_product(f, f) * left).sum();
     }
   };
-  if (!for_each_block(latents, BlocksOfStates(prior, observations, values), false, workers, nullptr, add)) {
-    static_cast<void>(require_models(prior, observations, values.parameters, {}));  // names the state
-  }
-  VectorXd all = VectorXd::Zero(std::ssize(prior.latents));
-  for (int part = 0; part < Gram::n_parts; ++part) {
-    VectorXd& sum = sums[static_cast<std::size_t>(part)];
-    workers.share({sum.data(), static_cast<std::size_t>(sum.size())}, part, Gram::n_parts);
-    all += sum;
-  }
-  return all;
+  std::optional<VectorSum> all = sum_over_blocks(latents, BlocksOfStates(prior, observations, values), false, workers, nullptr,
+                                                 VectorSum{VectorXd::Zero(std::ssize(prior.latents))}, add);
+  if (!all) static_cast<void>(require_models(prior, observations, values.parameters, {}));  // names the state
+  return std::move(all->sum);
 }
 
 }  // namespace gp2

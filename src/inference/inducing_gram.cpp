@@ -1,6 +1,7 @@
 #include "inference/inducing_gram.hpp"
 
 #include <algorithm>
+#include <functional>
 #include <utility>
 
 #include "base/lapack.hpp"
@@ -39,13 +40,11 @@ GramValue InducingGram::value_of(double misfit) const {
 std::optional<GramValue> InducingGram::value(const RowBlocks& rows) {
   const lapack::SingleThread single_thread;
   if (!factorise(rows)) return std::nullopt;
-  VectorXd misfit = VectorXd::Zero(n_parts);
-  const bool is_sound = for_each_block(
-      latents_, rows, false, workers_, stop_,
-      [&](int part, const RowBlock&, const InducingBlock& block) { misfit[part] += block.misfit(mean_).squaredNorm(); });
-  if (!is_sound || is_set(stop_)) return std::nullopt;
-  for (int part = 0; part < n_parts; ++part) workers_.share({&misfit[part], 1}, part, n_parts);
-  return value_of(misfit.sum());
+  const std::optional<VectorSum> misfit = sum_over_blocks(
+      latents_, rows, false, workers_, stop_, VectorSum{VectorXd::Zero(1)},
+      [&](VectorSum& sum, int, const RowBlock&, const InducingBlock& block) { sum.sum[0] += block.misfit(mean_).squaredNorm(); });
+  if (!misfit || is_set(stop_)) return std::nullopt;
+  return value_of(misfit->sum[0]);
 }
 
 std::optional<GramValue> InducingGram::differentiate(const RowBlocks& rows, const std::vector<GramGradientParts>& parts,
@@ -62,16 +61,28 @@ std::optional<GramValue> InducingGram::differentiate(const RowBlocks& rows, cons
     std::vector<MatrixXd> kernel;   // (lanes × parameters)
     std::vector<VectorXd> columns;  // (functions)
     double misfit = 0;
+
+    void add(const Sums& other) {
+      misfit += other.misfit;
+      for (std::size_t a = 0; a < kernel.size(); ++a) {
+        kernel[a] += other.kernel[a];
+        columns[a] += other.columns[a];
+      }
+    }
+    void for_each(const std::function<void(double*, Index)>& take) {
+      take(&misfit, 1);
+      for (MatrixXd& one : kernel) take(one.data(), one.size());
+      for (VectorXd& one : columns) take(one.data(), one.size());
+    }
   };
   Sums zero;
   for (const InducingLatents::OfLatent& latent : latents_.latents()) {
     zero.kernel.emplace_back(MatrixXd::Zero(simd::lanes<double>, latent.kernel.values().size()));
     zero.columns.emplace_back(VectorXd::Zero(latent.n_functions));
   }
-  std::vector<Sums> sums(n_parts, zero);
-  const bool is_sound =
-      for_each_block(latents_, rows, true, workers_, stop_, [&](int part, const RowBlock& row_block, const InducingBlock& block) {
-        Sums& sum = sums[static_cast<std::size_t>(part)];
+  std::optional<Sums> all = sum_over_blocks(
+      latents_, rows, true, workers_, stop_, zero,
+      [&](Sums& sum, int piece, const RowBlock& row_block, const InducingBlock& block) {
         const Index n = block.n();
         const MatrixXd alpha = block.misfit(mean_);
         const Index n_components = alpha.cols();
@@ -138,7 +149,7 @@ std::optional<GramValue> InducingGram::differentiate(const RowBlocks& rows, cons
         for (std::size_t a = 0; a < parts.size(); ++a) {
           if (parts[a].mean && latents_.latents()[a].is_local) block.add_mean_of_noise(a, alpha_before, of_block.latents[a].mean);
         }
-        of_rows(part, row_block, of_block);
+        of_rows(piece, row_block, of_block);
         KernelColumns::Workspace workspace;
         VectorXd point;
         for (std::size_t f = 0; f < functions.size(); ++f) {
@@ -155,28 +166,14 @@ std::optional<GramValue> InducingGram::differentiate(const RowBlocks& rows, cons
           add_variance_gradient(a, block, sum.kernel[a], workspace);
         }
       });
-  if (!is_sound || is_set(stop_)) return std::nullopt;
-  for (int part = 0; part < n_parts; ++part) {
-    Sums& sum = sums[static_cast<std::size_t>(part)];
-    workers_.share({&sum.misfit, 1}, part, n_parts);
-    for (MatrixXd& one : sum.kernel) workers_.share({one.data(), static_cast<std::size_t>(one.size())}, part, n_parts);
-    for (VectorXd& one : sum.columns) workers_.share({one.data(), static_cast<std::size_t>(one.size())}, part, n_parts);
-  }
+  if (!all || is_set(stop_)) return std::nullopt;
 
-  Sums all = std::move(zero);
-  for (const Sums& sum : sums) {
-    all.misfit += sum.misfit;
-    for (std::size_t a = 0; a < parts.size(); ++a) {
-      all.kernel[a] += sum.kernel[a];
-      all.columns[a] += sum.columns[a];
-    }
-  }
   gradient = {};
   for (std::size_t a = 0; a < parts.size(); ++a) {
-    if (parts[a].kernel) add_points_gradient(a, P, all.kernel[a]);
-    gradient.latents.push_back({all.kernel[a].colwise().sum().transpose(), all.columns[a], {}, {}});
+    if (parts[a].kernel) add_points_gradient(a, P, all->kernel[a]);
+    gradient.latents.push_back({all->kernel[a].colwise().sum().transpose(), all->columns[a], {}, {}});
   }
-  return value_of(all.misfit);
+  return value_of(all->misfit);
 }
 
 // ½ Σ_i Σ_f ‖Γ_i,f‖² ∂k(φ_i, φ_i)/∂log v of a latent

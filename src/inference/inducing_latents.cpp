@@ -1,6 +1,7 @@
 #include "inference/inducing_latents.hpp"
 
 #include <algorithm>
+#include <functional>
 
 #include <Eigen/Cholesky>
 
@@ -141,27 +142,18 @@ InducingStatistics::InducingStatistics(const InducingLatents& latents)
 
 std::optional<InducingStatistics> InducingStatistics::of(const InducingLatents& latents, const RowBlocks& rows,
                                                          const Workers& workers, const std::atomic<bool>* stop) {
-  InducingStatistics all(latents);
-  std::vector<InducingStatistics> sums(Gram::n_parts, all);
-  std::vector<MatrixXd> memory(Gram::n_parts);
-  const bool is_sound =
-      for_each_block(latents, rows, false, workers, stop, [&](int part, const RowBlock&, const InducingBlock& block) {
-        const auto p = static_cast<std::size_t>(part);
-        sums[p].add(latents, block, memory[p]);
-      });
-  if (!is_sound) return std::nullopt;
-  for (int part = 0; part < Gram::n_parts; ++part) {
-    InducingStatistics& one = sums[static_cast<std::size_t>(part)];
-    const auto share = [&](double* numbers, Index n) {
-      workers.share({numbers, static_cast<std::size_t>(n)}, part, Gram::n_parts);
-    };
-    share(one.B.data(), one.B.size());
-    share(one.c.data(), one.c.size());
-    share(one.weight.data(), one.weight.size());
-    for (double* number : {&one.yy, &one.trace, &one.constant}) share(number, 1);
-    all.add(one);
-  }
-  return all;
+  struct Sum {
+    InducingStatistics of_blocks;
+    MatrixXd memory = {};
+    void add(const Sum& other) { of_blocks.add(other.of_blocks); }
+    void for_each(const std::function<void(double*, Index)>& take) { of_blocks.for_each(take); }
+  };
+  std::optional<Sum> sum = sum_over_blocks(latents, rows, false, workers, stop, Sum{InducingStatistics(latents)},
+                                           [&](Sum& sum_of_piece, int, const RowBlock&, const InducingBlock& block) {
+                                             sum_of_piece.of_blocks.add(latents, block, sum_of_piece.memory);
+                                           });
+  if (!sum) return std::nullopt;
+  return std::move(sum->of_blocks);
 }
 
 void InducingStatistics::add(const InducingStatistics& other, double share) {

@@ -2,6 +2,7 @@
 
 #include <atomic>
 #include <optional>
+#include <utility>
 #include <vector>
 
 #include <Eigen/Core>
@@ -11,6 +12,7 @@
 #include "gp2/base/workers.hpp"
 #include "gp2/inference/model_values.hpp"
 #include "inference/gram.hpp"
+#include "inference/piece_sums.hpp"
 #include "prior/kernel_columns.hpp"
 
 namespace gp2 {
@@ -113,35 +115,33 @@ class InducingBlock {
   KernelColumns::Workspace workspace_;
 };
 
-/// Calls work(part, RowBlock, InducingBlock) for every block of rows, as Gram::n_parts says.
+/// The sum of what work(sum, piece, RowBlock, InducingBlock) adds for every block of rows, in PieceSums.
 /// @param stop  set: leaves out the rest
-/// @returns whether no block has a fault, of any process
-template <typename Work>
-bool for_each_block(const InducingLatents& latents, const RowBlocks& rows, bool with_derivatives, const Workers& workers,
-                    const std::atomic<bool>* stop, const Work& work) {
+/// @returns nothing where a block has a fault, of any process
+template <typename Sum, typename Work>
+std::optional<Sum> sum_over_blocks(const InducingLatents& latents, const RowBlocks& rows, bool with_derivatives,
+                                   const Workers& workers, const std::atomic<bool>* stop, const Sum& zero, const Work& work) {
+  const Pieces pieces(rows.n_blocks());
+  PieceSums<Sum> sums(pieces.n, zero);
   std::atomic<bool> is_sound = true;
-  parallel_for(Gram::n_parts, workers.n_threads, [&](int part, int) {
-    if (!workers.owns(part, Gram::n_parts)) return;
+  parallel_for(pieces.n, workers.n_threads, [&](int piece, int) {
+    if (!workers.owns(piece, pieces.n)) return;
     RowBlocks::Memory memory;
     InducingBlock block(latents);
-    const Eigen::Index n = rows.n_blocks();
-    for (Eigen::Index b = part * n / Gram::n_parts; b < (part + 1) * n / Gram::n_parts && is_sound && !is_set(stop); ++b) {
+    Sum sum = zero;
+    for (Eigen::Index b = pieces.first(piece); b < pieces.first(piece + 1) && is_sound && !is_set(stop); ++b) {
       const RowBlock* const of_rows = rows.block(b, with_derivatives, memory);
       if (of_rows == nullptr) {
         is_sound = false;
         return;
       }
       block.move_to(of_rows->rows);
-      work(part, *of_rows, block);
+      work(sum, piece, *of_rows, block);
     }
+    sums.put(piece, std::move(sum));
   });
-  bool are_all_sound = true;
-  for (int part = 0; part < Gram::n_parts; ++part) {
-    double is_fault = is_sound ? 0 : 1;
-    workers.share({&is_fault, 1}, part, Gram::n_parts);
-    are_all_sound = are_all_sound && is_fault == 0;
-  }
-  return are_all_sound;
+  if (workers.sum(is_sound ? 0 : 1) > 0) return std::nullopt;
+  return sums.total(workers);
 }
 
 /// What observations say of whitened inducing variables: sums over blocks of samples.
@@ -160,6 +160,13 @@ struct InducingStatistics {
                                                             const Workers& workers, const std::atomic<bool>* stop = nullptr);
   /// @param share  as which the likelihood of the other counts
   void add(const InducingStatistics& other, double share = 1);
+  /// Calls work(first number, how many) for all numbers.
+  template <typename Work>
+  void for_each(const Work& work) {
+    for (double* number : {&yy, &trace, &constant}) work(number, 1);
+    work(B.data(), B.size());
+    for (Eigen::VectorXd* vector : {&c, &weight}) work(vector->data(), vector->size());
+  }
   /// Adds a block of samples.
   /// @param memory  that is used again
   void add(const InducingLatents& latents, const InducingBlock& block, Eigen::MatrixXd& memory);

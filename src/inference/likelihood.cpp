@@ -174,27 +174,25 @@ void Likelihood::Implementation::prepare_blocks(const ModelValues& initial) {
   std::vector<BlocksOfStates::Kept> kept(static_cast<std::size_t>(n));
   std::atomic<std::size_t> bytes = 0;
   std::atomic<bool> is_sound = true;
-  std::vector<double> size(Gram::n_parts);
-  parallel_for(Gram::n_parts, options.workers.n_threads, [&](int part, int) {
-    if (!options.workers.owns(part, Gram::n_parts)) return;
+  std::atomic<int> size = 0;
+  const Pieces pieces(n);
+  parallel_for(pieces.n, options.workers.n_threads, [&](int piece, int) {
+    if (!options.workers.owns(piece, pieces.n)) return;
     RowBlocks::Memory memory;
-    for (Index b = part * n / Gram::n_parts; b < (part + 1) * n / Gram::n_parts && is_sound; ++b) {
+    for (Index b = pieces.first(piece); b < pieces.first(piece + 1) && is_sound; ++b) {
       const RowBlock* const block = blocks.block(b, false, memory);
       if (block == nullptr) {
         is_sound = false;
         return;
       }
-      size[static_cast<std::size_t>(part)] += static_cast<double>(block->rows.size());
+      size += static_cast<int>(block->rows.size());
       if (!options.gradient_parameters.empty() || bytes > BlocksOfStates::most_kept_bytes) continue;
       BlocksOfStates::Kept& of_block = kept[static_cast<std::size_t>(b)] = blocks.keep(*block, !options.noise_gradient);
       bytes += of_block.bytes();
     }
   });
   if (!is_sound) static_cast<void>(require_models(prior, observations, initial.parameters, {}));  // names the state
-  for (int part = 0; part < Gram::n_parts; ++part) {
-    options.workers.share({&size[static_cast<std::size_t>(part)], 1}, part, Gram::n_parts);
-    initial_size += static_cast<int>(size[static_cast<std::size_t>(part)]);
-  }
+  initial_size = static_cast<int>(options.workers.sum(size));
   if (options.gradient_parameters.empty() && bytes <= BlocksOfStates::most_kept_bytes) kept_blocks = std::move(kept);
 }
 
@@ -289,23 +287,20 @@ double Likelihood::evaluate(const ModelValues& values, ModelGradient* gradient, 
   };
   if (gradient == nullptr) return total(gram.value(*blocks));
   const std::vector<GramGradientParts> parts = self.parts(through_points ? nullptr : work.whole.rows.reduction, values);
-  std::vector<ModelGradient> of_part(Gram::n_parts, ModelGradient::zero(values));
+  const Pieces pieces(blocks->n_blocks());
+  std::vector<ModelGradient> of_piece(static_cast<std::size_t>(pieces.n), ModelGradient::zero(values));
   GramGradient of_gram;
   const double value =
-      total(gram.differentiate(*blocks, parts, of_gram, [&](int part, const RowBlock& block, const GramGradient& of_rows) {
-        self.add_rows(block, of_rows, values, of_part[static_cast<std::size_t>(part)]);
+      total(gram.differentiate(*blocks, parts, of_gram, [&](int piece, const RowBlock& block, const GramGradient& of_rows) {
+        self.add_rows(block, of_rows, values, of_piece[static_cast<std::size_t>(piece)]);
       }));
   if (value == infinity || is_set(work.stop)) return infinity;  // the gradient may be that of a part
-  *gradient = ModelGradient::zero(values);
-  for (int part = 0; part < Gram::n_parts; ++part) {
-    ModelGradient& one = of_part[static_cast<std::size_t>(part)];
-    if (through_points) {
-      one.for_each([&](double* numbers, Index n) {
-        work.workers.share({numbers, static_cast<std::size_t>(n)}, part, Gram::n_parts);
-      });
-    }
-    gradient->add(one);
+  const Workers workers = through_points ? work.workers : Workers();
+  PieceSums<ModelGradient> sums(pieces.n, ModelGradient::zero(values));
+  for (int piece = 0; piece < pieces.n; ++piece) {
+    if (workers.owns(piece, pieces.n)) sums.put(piece, std::move(of_piece[static_cast<std::size_t>(piece)]));
   }
+  *gradient = sums.total(workers);
   for (std::size_t a = 0; a < parts.size(); ++a) {
     if (parts[a].kernel) gradient->log_kernel[a] = of_gram.latents[a].kernel;
     if (!values.has_free_loading(a)) gradient->log_signal_stddev[a] = of_gram.latents[a].columns;

@@ -96,9 +96,10 @@ FitMemory memory_of(double n_states, double r, const PerState& count, const FitO
     constexpr double n_copies = 1.5;
     const double square = number * std::pow(std::min<double>(options.n_inducing, r), 2);
     memory.shared = number * n_states * n_copies * count.observed;
-    memory.evaluation = (Gram::n_parts + 6) * square +
+    memory.evaluation = (Pieces::n_parts + thread_count(options.n_threads) + 6) * square +
                         std::min<double>(BlocksOfStates::most_kept_bytes, number * n_states * count.evaluation) + blas;
-    memory.posterior = (Gram::n_parts + 6 + n_components * 2 * CrossValidation::n_stretches) * square + blas;
+    memory.posterior =
+        (Pieces::n_parts + thread_count(options.n_threads) + 6 + n_components * 2 * CrossValidation::n_stretches) * square + blas;
     memory.asked_by_evaluation = memory.asked_by_posterior = square + blas_buffer;
     return memory;
   }

@@ -3,6 +3,7 @@
 #include <chrono>
 #include <cmath>
 #include <limits>
+#include <map>
 #include <mutex>
 #include <numeric>
 #include <random>
@@ -60,21 +61,24 @@ double draw(const Hyperparameter& h, const double* common, RandomStream& random)
   return h.value_at(lower + random.uniform() * (h.upper_coordinate() - lower));
 }
 
-bool is_lengthscale(const Prior& prior, const Hyperparameter& h) {
+// Whether all directions of its latent share this lengthscale.
+bool is_shared_lengthscale(const Prior& prior, const Hyperparameter& h) {
   if (h.kind != Hyperparameter::Kind::kernel) return false;
-  const Kernel& kernel = prior.latents[static_cast<std::size_t>(h.owner)].kernel;
-  return kernel.parameters()[static_cast<std::size_t>(h.index)].kind == Kernel::ParameterKind::lengthscale;
+  const Latent& latent = prior.latents[static_cast<std::size_t>(h.owner)];
+  const Kernel::Parameter& parameter = latent.kernel.parameters()[static_cast<std::size_t>(h.index)];
+  return latent.direction.empty() && parameter.kind == Kernel::ParameterKind::lengthscale;
 }
 
 // Loadings that are zero at the first start stay zero (see Training::release). An optimum of short lengthscales wants all short that
 // matter, so that those of one latent have a part in common.
 std::vector<Hyperparameter> draw_start(const Prior& prior, std::vector<Hyperparameter> hyperparameters, RandomStream& random) {
   const std::set<int> at_zero = latents_at_zero(hyperparameters);
-  std::vector<double> common(prior.latents.size());
-  for (double& deviate : common) deviate = random.normal();
+  std::map<int, double> common;  // by latent
   for (Hyperparameter& h : hyperparameters) {
     if (h.is_stationary_at_zero() && at_zero.contains(h.owner)) continue;
-    h.value = draw(h, is_lengthscale(prior, h) ? &common[static_cast<std::size_t>(h.owner)] : nullptr, random);
+    const bool is_shared = is_shared_lengthscale(prior, h);
+    if (is_shared && !common.contains(h.owner)) common[h.owner] = random.normal();
+    h.value = draw(h, is_shared ? &common[h.owner] : nullptr, random);
   }
   return hyperparameters;
 }

@@ -1,10 +1,8 @@
 #include <algorithm>
 #include <atomic>
-#include <barrier>
 #include <chrono>
 #include <memory>
 #include <set>
-#include <span>
 #include <thread>
 
 #include <gmock/gmock.h>
@@ -15,12 +13,14 @@
 #include "gp2/mechanics/callable_system.hpp"
 #include "gp2/training/robust.hpp"
 #include "test_models.hpp"
+#include "thread_ranks.hpp"
 
 namespace gp2 {
 namespace {
 
 using Eigen::MatrixXd;
 using Eigen::VectorXd;
+using test::ThreadRanks;
 using testing::HasSubstr;
 using Kind = Hyperparameter::Kind;
 
@@ -92,30 +92,6 @@ TEST(FitTest, GivesTheSameBitsForAnyNumberOfThreads) {
   EXPECT_EQ(objectives[0], objectives[1]);
   EXPECT_EQ(objectives[0], objectives[2]);
 }
-
-// Threads that stand for the processes of mpirun.
-class ThreadRanks final : public Ranks {
- public:
-  struct Meeting {
-    explicit Meeting(int n) : size(n), barrier(n) {}
-    const int size;
-    std::barrier<> barrier;
-    std::span<double> sent;
-  };
-  ThreadRanks(Meeting& meeting, int rank) : meeting_(meeting), rank_(rank) {}
-  [[nodiscard]] int rank() const override { return rank_; }
-  [[nodiscard]] int size() const override { return meeting_.size; }
-  void broadcast(std::span<double> numbers, int from) const override {
-    if (rank_ == from) meeting_.sent = numbers;
-    meeting_.barrier.arrive_and_wait();
-    if (rank_ != from) std::copy(meeting_.sent.begin(), meeting_.sent.end(), numbers.begin());
-    meeting_.barrier.arrive_and_wait();
-  }
-
- private:
-  Meeting& meeting_;
-  const int rank_;
-};
 
 TEST(FitTest, GivesTheSameBitsForAnyNumberOfRanksWhichShareOutItsRuns) {
   const Problem p = problem("models/unicycle.toml", 15, {"R"}, {}, true);

@@ -32,6 +32,20 @@ struct Workers {
 
   /// Whether a part is this process' to work on.
   [[nodiscard]] bool owns(int part, int n_parts) const { return !ranks || ranks->owner(part, n_parts) == ranks->rank(); }
+  /// Whether the same process works on two parts and all between them.
+  [[nodiscard]] bool have_one_owner(int first, int last, int n_parts) const {
+    return !ranks || ranks->owner(first, n_parts) == ranks->owner(last, n_parts);
+  }
+  /// The sum of whole numbers, of which each process has one.
+  [[nodiscard]] double sum(double own) const {
+    double sum = ranks ? 0 : own;
+    for (int rank = 0; ranks && rank < ranks->size(); ++rank) {
+      double of_rank = own;
+      ranks->broadcast({&of_rank, 1}, rank);
+      sum += of_rank;
+    }
+    return sum;
+  }
   /// Numbers of a part, from who works on it to all.
   void share(std::span<double> numbers, int part, int n_parts) const {
     if (ranks) ranks->broadcast(numbers, ranks->owner(part, n_parts));
