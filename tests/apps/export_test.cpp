@@ -1,3 +1,4 @@
+#include <cstdio>
 #include <regex>
 
 #include <gmock/gmock.h>
@@ -9,6 +10,21 @@
 
 namespace gp2::test {
 namespace {
+
+// examples/exported_loop, with errors of the path that do not depend on the machine
+TEST(ExportedLoopExample, FollowsItsPathBetterByWhatWasLearned) {
+  const Desk desk;
+  desk.done("gp2 generate models/unicycle.toml --n 60 --seed 1 -o log.csv");
+  desk.done("gp2 fit models/unicycle.toml --data log.csv --restarts 1 --hyperparameters optimise -o fit.json");
+  desk.done("gp2 export fit.json --name unicycle --no-std -o .");
+  desk.done("cc -std=c99 -O2 -Wall -Wextra -pedantic -Wconversion -Werror -I. '" GP2_SOURCE_DIR
+            "/examples/exported_loop/main.c' unicycle.c -lm -o loop");
+  const std::string printed = desk.done("./loop").out;
+  double known = 0, learned = 0;
+  ASSERT_EQ(std::sscanf(printed.c_str(), "known error %lf mm, %*[^\n] learned error %lf mm", &known, &learned), 2) << printed;
+  EXPECT_NEAR(known, 3.365, 0.001);
+  EXPECT_LT(learned, known / 3);
+}
 
 using testing::HasSubstr;
 
