@@ -101,7 +101,7 @@ inline constexpr std::string_view mechanics_template = R"c(/* @title@ See @name@
 typedef @name@_real real;
 typedef @name@_status status;
 typedef @name@_workspace workspace;
-
+@portable@
 enum {
   NQ = @nq@, /* coordinates */
 {rows}  NC = @nc@, /* constraints */
@@ -617,7 +617,7 @@ inline constexpr Piece kernel_pieces[] = {
 )c"},
     {"exponentials",
      R"c(/* x_i := e^x_i of x_i <= 0, to 1 ulp: 2^m e^r with m = x_i / log 2 rounded, and a polynomial for e^r. Below -708 it is e^-708.
- * Unlike exp() it is a loop that compilers turn into vectors; so are those below. */
+ * It is a loop that compilers turn into vectors, which exp is not; so are those below. */
 static void exponentials(int n, double *x)
 {
   for (int i = 0; i < n; ++i) x[i] = x[i] > -708 ? x[i] : -708;
