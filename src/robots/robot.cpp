@@ -47,7 +47,7 @@ std::vector<std::string> Joint::coordinates() const {
 std::vector<std::string> RobotDescription::coordinates() const {
   std::vector<std::string> all;
   for (const Joint* joint : joints()) {
-    for (std::string& name : joint->coordinates()) all.push_back(std::move(name));
+    for (std::string& coordinate : joint->coordinates()) all.push_back(std::move(coordinate));
   }
   return all;
 }

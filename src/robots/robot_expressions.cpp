@@ -38,7 +38,7 @@ std::vector<std::pair<std::string, double>> robot_numbers(const RobotDescription
   }
   for (const Joint* joint : robot.joints()) {
     numbers.emplace_back(number_name("damping", joint->name), joint->damping);
-    numbers.emplace_back(number_name("stiffness", joint->name), joint->stiffness);
+    if (!joint->has_quaternion()) numbers.emplace_back(number_name("stiffness", joint->name), joint->stiffness);
     numbers.emplace_back(number_name("friction", joint->name), joint->dry_friction);
     numbers.emplace_back(number_name("armature", joint->name), joint->armature);
   }
@@ -195,10 +195,10 @@ std::vector<std::vector<Expression>> RobotExpressions::mass_along_axes() const {
   std::vector<std::vector<Expression>> M(n, std::vector<Expression>(n, graph_.constant(0)));
   for (std::size_t i = 0; i < n; ++i) {
     const Link& link = composite[i];
-    ExpressionVector force = links_[i].turns ? cross(link.axis, link.first_moment) : link.axis * link.mass;
-    ExpressionVector moment = links_[i].turns ? link.inertia * link.axis : cross(link.first_moment, link.axis);
+    ExpressionVector force = link.turns ? cross(link.axis, link.first_moment) : link.axis * link.mass;
+    ExpressionVector moment = link.turns ? link.inertia * link.axis : cross(link.first_moment, link.axis);
     const Expression armature = number(number_name("armature", link.joint->name), link.joint->armature);
-    M[i][i] = dot(link.axis, links_[i].turns ? moment : force) + armature;
+    M[i][i] = dot(link.axis, link.turns ? moment : force) + armature;
     for (std::size_t at = i; links_[at].parent >= 0;) {
       const auto parent = static_cast<std::size_t>(links_[at].parent);
       force = links_[at].rotation * force;

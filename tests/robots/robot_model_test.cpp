@@ -118,6 +118,8 @@ TEST(Motion, OfAFreeBodyIsByForcesAlongItsAxes) {
   EXPECT_NE(message("inputs = ['f1', 'f2']").find("2 inputs for 6 axes of joints: give one per axis"), std::string::npos);
   EXPECT_NE(message("[mechanics]\nforce = ['0']").find("expected 6 entries, one per axis of the joints, got 1"),
             std::string::npos);
+  EXPECT_NE(message("[parameters]\nk = { of = 'stiffness(\"f\")' }").find("the robot has no number 'stiffness(\"f\")'"),
+            std::string::npos);
 }
 
 TEST(Motion, IsTheSameForAnyNoiseAndTheSameSeedOnly) {
