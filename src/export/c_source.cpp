@@ -253,6 +253,7 @@ void Writer::set_conditions() {
     if (holds) conditions_.insert(name);
   };
   const bool has_forced_latent = std::any_of(terms_.begin(), terms_.end(), [](const Term& term) { return term.is_forced(); });
+  set("portable", options_.portable_math);
   set("rows", system().nc() > 0);
   set("admissible", std::any_of(terms_.begin(), terms_.end(), [](const Term& term) { return term.is_admissible(); }));
   set("several", system().nc() > 1);

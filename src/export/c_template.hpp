@@ -19,6 +19,7 @@
 //     mixture             there are several components
 //     by_function         covariances are kept by latent functions, which are fewer than the rows of the view
 //     sums                observations are sums of rows
+//     portable            functions are its own
 namespace gp2::c_export {
 
 inline constexpr std::string_view header_template = R"c(/* @title@
@@ -79,6 +80,7 @@ typedef struct {
 
 /* Predicts at states whose predictions are stored with the model. Returns 0 where they agree, else the number of the first that
  * does not. */
+{portable}/* -1: the compiler has fused products, so that the bits are not those of other machines. */
 int @name@_self_test(@name@_workspace *w);
 
 #ifdef __cplusplus
@@ -101,6 +103,7 @@ inline constexpr std::string_view mechanics_template = R"c(/* @title@ See @name@
 typedef @name@_real real;
 typedef @name@_status status;
 typedef @name@_workspace workspace;
+
 @portable@
 enum {
   NQ = @nq@, /* coordinates */
@@ -1161,6 +1164,7 @@ int @name@_self_test(workspace *w)
 {jacobian}    real jacobian_error;
   } tests[TESTS] = {
 @tests@  };
+{portable}  if (products_are_fused()) return -1;
   for (int k = 0; k < TESTS; ++k) {
     real mean[NR];
     if (@name@_mean(tests[k].state, mean, w) != @name@_OK || !agree(NR, mean, tests[k].mean, tests[k].mean_error)) {

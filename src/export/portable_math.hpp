@@ -7,8 +7,8 @@
 // those of Taylor. A function comes after those that it calls.
 namespace gp2::c_export {
 
-inline constexpr std::string_view portable_head = R"c(
-/* What is computed is the same to the bit wherever numbers are those of IEEE 754: nothing may be contracted into fused products or
+inline constexpr std::string_view portable_head =
+    R"c(/* What is computed is the same to the bit wherever numbers are those of IEEE 754: nothing may be contracted into fused products or
  * kept with more digits, and functions are those below. */
 #if defined(__GNUC__) && !defined(__clang__)
 #pragma GCC optimize("fp-contract=off")
@@ -18,6 +18,13 @@ inline constexpr std::string_view portable_head = R"c(
 #if defined(__FLT_EVAL_METHOD__) && __FLT_EVAL_METHOD__ != 0 && __FLT_EVAL_METHOD__ != 16
 #error "@name@: this machine keeps more digits than a double has (on x86: -msse2 -mfpmath=sse)"
 #endif
+
+static int products_are_fused(void)
+{
+  const volatile double x = 1.0000000009313226; /* 1 + 2^-30, whose square is rounded to 1 + 2^-29 */
+  const double y = x, z = x;
+  return y * z - 1.0000000018626451 != 0;
+}
 )c";
 
 inline constexpr Piece portable_pieces[] = {

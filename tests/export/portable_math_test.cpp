@@ -200,6 +200,11 @@ TEST(PortableMath, GivesTheSameBitsByEveryCompiler) {
     EXPECT_GT(printed.size(), 200 * 16 * 10U) << "most states have a prediction";
     EXPECT_TRUE(printed == expected) << compiler;
   }
+  // who is told to fuse them all the same is told that the bits are others
+  if (shell("clang --version && grep -qw fma /proc/cpuinfo")) {
+    ASSERT_TRUE(shell("clang -O3 -march=native -ffp-contract=fast " + files)) << read_file(folder / "errors");
+    EXPECT_FALSE(shell("./run"));
+  }
 }
 
 TEST(PortableMath, SaysWhatItCannotDo) {
