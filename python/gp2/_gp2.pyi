@@ -436,6 +436,7 @@ class Posterior:
         std: bool = True,
         jacobian: bool = True,
         single: bool = False,
+        portable_math: bool = False,
         draws_within: float | None = None,
         # end of options
     ) -> list[str]: ...

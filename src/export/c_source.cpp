@@ -1,6 +1,7 @@
 #include "gp2/export/c_source.hpp"
 
 #include <algorithm>
+#include <cctype>
 #include <cmath>
 #include <limits>
 #include <map>
@@ -13,6 +14,7 @@
 
 #include "export/c_template.hpp"
 #include "export/fill_template.hpp"
+#include "export/portable_math.hpp"
 #include "gp2/base/file.hpp"
 #include "gp2/base/version.hpp"
 #include "gp2/error.hpp"
@@ -68,6 +70,42 @@ void use_float_functions(std::string& source) {
       if (is_whole_word) source.insert(at + std::string_view(function).size() - 1, 1, 'f');
     }
   }
+}
+
+// sin(x) -> portable_sin(x), but not in comments, and these functions for @portable@
+void use_portable_functions(std::string& source, const std::string& name) {
+  const auto is_of_name = [](char c) { return std::isalnum(static_cast<unsigned char>(c)) != 0 || c == '_'; };
+  const std::string_view prefix = "portable_";
+  std::string users;
+  for (std::size_t at = 0; at < source.size();) {
+    const bool is_comment = source.compare(at, 2, "/*") == 0;
+    std::size_t end = is_comment ? source.find("*/", at) + 2 : at + 1;
+    while (!is_comment && is_of_name(source[at]) && end < source.size() && is_of_name(source[end])) ++end;
+    const std::string word = source.substr(at, end - at) + "(";
+    if (!is_comment && source[end] == '(') {
+      if (word == "pow(") {
+        throw InputError("`portable_math`: the model has a power whose exponent is no whole number; write x^y as exp(y*log(x))");
+      }
+      const bool is_ours =
+          std::any_of(std::begin(c_export::portable_pieces), std::end(c_export::portable_pieces),
+                      [&](const auto& piece) { return word == std::string(piece.name.substr(prefix.size())) + "("; });
+      if (is_ours) {
+        source.insert(at, prefix);
+        users += std::string(prefix) + word;
+        end += prefix.size();
+      }
+    }
+    at = end;
+  }
+  std::string pieces;
+  for (auto piece = std::rbegin(c_export::portable_pieces); piece != std::rend(c_export::portable_pieces); ++piece) {
+    if (users.find(std::string(piece->name) + "(") == std::string::npos) continue;
+    pieces = "\n" + std::string(piece->text) + pieces;
+    users += piece->text;
+  }
+  std::string head(c_export::portable_head);
+  head.replace(head.find("@name@"), 6, name);
+  source.replace(source.find("@portable@"), 10, head + pieces);
 }
 
 // ---------------------------------------------------------------- one latent
@@ -215,6 +253,7 @@ void Writer::set_conditions() {
     if (holds) conditions_.insert(name);
   };
   const bool has_forced_latent = std::any_of(terms_.begin(), terms_.end(), [](const Term& term) { return term.is_forced(); });
+  set("portable", options_.portable_math);
   set("rows", system().nc() > 0);
   set("admissible", std::any_of(terms_.begin(), terms_.end(), [](const Term& term) { return term.is_admissible(); }));
   set("several", system().nc() > 1);
@@ -1077,6 +1116,7 @@ void Writer::require_single_precision() const {
 
 CSource Writer::write() {
   if (options_.single_precision) require_single_precision();
+  texts_["portable"] = options_.portable_math ? "@portable@" : "";
   const std::vector<std::string> names =
       view_.names(system(), view_.latent ? prior_.latents[static_cast<std::size_t>(view_.latent->first)].name : "");
   texts_["title"] = in_comment(fmt::format("{}: {} as learned by gp2 {}.", system().name(), fmt::join(names, ", "), version()));
@@ -1084,6 +1124,11 @@ CSource Writer::write() {
   about += fmt::format(" * The {} view, of {} observed states{}.\n", view_.quantity->word(), posterior_.n_states(),
                        has("mixture") ? fmt::format(", a mixture over {} draws of hyperparameters", components_.size()) : "");
   for (const std::string& line : options_.about) about += " * " + in_comment(line) + "\n";
+  if (options_.portable_math)
+    about +=
+        " * Its numbers are the same to the bit on every machine (compile with -ffp-contract=off). sin, cos and tan of more than "
+        "1e6\n"
+        " * are NaN.\n";
   for (const std::string& label : system().constraint_labels()) about += in_comment(fmt::format(" * It obeys {} = 0.\n", label));
   const auto unit = [&](int k) -> std::string {
     const int nq = layout_.nq;
@@ -1114,6 +1159,7 @@ CSource Writer::write() {
   out.source = c_export::filled(c_export::mechanics_template, conditions_, texts_) +
                c_export::filled(c_export::prediction_template, conditions_, texts_);
   if (options_.single_precision) use_float_functions(out.source);
+  if (options_.portable_math) use_portable_functions(out.source, options_.name);
   return out;
 }
 
@@ -1124,6 +1170,8 @@ CSource export_c(const Posterior& posterior, const View& view, const CSourceOpti
   if (!is_identifier(options.name)) {
     throw InputError(fmt::format("`name`: must be a name of C, of letters, digits and _, got '{}'", options.name));
   }
+  if (options.portable_math && options.single_precision)
+    throw InputError("`portable_math` is of double precision: leave `float` out");
   const auto& components = posterior.conditioned();
   if (posterior.n_states() == 0) throw InputError("export to C: nothing was observed, so there is nothing to export");
   return Writer(posterior, components, view, options).write();

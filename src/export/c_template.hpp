@@ -19,6 +19,7 @@
 //     mixture             there are several components
 //     by_function         covariances are kept by latent functions, which are fewer than the rows of the view
 //     sums                observations are sums of rows
+//     portable            functions are its own
 namespace gp2::c_export {
 
 inline constexpr std::string_view header_template = R"c(/* @title@
@@ -79,6 +80,7 @@ typedef struct {
 
 /* Predicts at states whose predictions are stored with the model. Returns 0 where they agree, else the number of the first that
  * does not. */
+{portable}/* -1: the compiler has fused products, so that the bits are not those of other machines. */
 int @name@_self_test(@name@_workspace *w);
 
 #ifdef __cplusplus
@@ -102,6 +104,7 @@ typedef @name@_real real;
 typedef @name@_status status;
 typedef @name@_workspace workspace;
 
+@portable@
 enum {
   NQ = @nq@, /* coordinates */
 {rows}  NC = @nc@, /* constraints */
@@ -617,7 +620,7 @@ inline constexpr Piece kernel_pieces[] = {
 )c"},
     {"exponentials",
      R"c(/* x_i := e^x_i of x_i <= 0, to 1 ulp: 2^m e^r with m = x_i / log 2 rounded, and a polynomial for e^r. Below -708 it is e^-708.
- * Unlike exp() it is a loop that compilers turn into vectors; so are those below. */
+ * It is a loop that compilers turn into vectors, which exp is not; so are those below. */
 static void exponentials(int n, double *x)
 {
   for (int i = 0; i < n; ++i) x[i] = x[i] > -708 ? x[i] : -708;
@@ -1161,6 +1164,7 @@ int @name@_self_test(workspace *w)
 {jacobian}    real jacobian_error;
   } tests[TESTS] = {
 @tests@  };
+{portable}  if (products_are_fused()) return -1;
   for (int k = 0; k < TESTS; ++k) {
     real mean[NR];
     if (@name@_mean(tests[k].state, mean, w) != @name@_OK || !agree(NR, mean, tests[k].mean, tests[k].mean_error)) {

@@ -41,7 +41,7 @@ void require_options(const ExportRequest& request, const std::string& name) {
   if (request.to == Target::mjcf) {
     const ViewRequest whole;
     if (request.view.quantity != whole.quantity || request.view.latent || request.view.time_step || request.view.system ||
-        request.single_precision || request.draws_within || !request.stddev || !request.jacobian) {
+        request.single_precision || request.portable_math || request.draws_within || !request.stddev || !request.jacobian) {
       throw InputError("`to=mjcf` writes parameters, no functions: it goes with `robot` and `name` alone");
     }
     return;
@@ -180,6 +180,10 @@ std::vector<Option> options(ExportRequest& request) {
   table.push_back(
       {"float", &request.single_precision, "", "in single precision; refused where its error would show", "", "single"});
   table.push_back(
+      {"portable_math", &request.portable_math, "",
+       "numbers that are the same to the bit on every machine and compiler: exp, sin and others of its own in place of "
+       "those of <math.h>"});
+  table.push_back(
       {"draws_within", &request.draws_within, "E",
        "of a fit whose hyperparameters are integrated: few draws, which stand for all within this share of a standard "
        "deviation",
@@ -205,6 +209,7 @@ ExportOutcome export_fit(const FitFile& fit, const Posterior& posterior, const E
       request.stddev && request.to != Target::acados,
       request.jacobian,
       request.single_precision,
+      request.portable_math,
       {fmt::format("Model '{}', CRC-64 of its text {}.", at.model->system->name(), checksum(at.model->text))}};
   const CSource c = export_c(exported, at.view, options);
   if (request.to == Target::acados) {

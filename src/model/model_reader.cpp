@@ -163,14 +163,14 @@ class ModelReader : private TomlReader {
   // the joints of the robot, unless the file has names of its own for them
   void take_coordinates_of_robot() {
     const toml::node& node = *root_.get("robot");
-    for (const RobotDescription::Joint* joint : model_.robot->joints()) {
-      if (!is_identifier(joint->name)) {
+    for (const std::string& coordinate : model_.robot->coordinates()) {
+      if (!is_identifier(coordinate)) {
         fail(node, "robot",
              fmt::format("its joint '{}' has a name that cannot stand in an expression: give names of your own, one "
                          "per joint in the order of the file, with coordinates = [\"q1\", …]",
-                         joint->name));
+                         coordinate));
       }
-      declare_coordinate({joint->name, false}, node, "robot");
+      declare_coordinate({coordinate, false}, node, "robot");
     }
   }
 
@@ -202,12 +202,12 @@ class ModelReader : private TomlReader {
       declare_coordinate(coordinate, entry, "coordinates");
     }
     if (definition_.coordinates.empty()) fail(node, "coordinates", "a system needs at least one coordinate");
-    if (model_.robot && model_.robot->joints().size() != definition_.coordinates.size()) {
-      std::vector<std::string> joints;
-      for (const RobotDescription::Joint* joint : model_.robot->joints()) joints.push_back(joint->name);
+    if (!model_.robot) return;
+    const std::vector<std::string> of_robot = model_.robot->coordinates();
+    if (of_robot.size() != definition_.coordinates.size()) {
       fail(node, "coordinates",
-           fmt::format("{} names for the {} joints of the robot; they are, in this order: {}", definition_.coordinates.size(),
-                       joints.size(), fmt::join(joints, ", ")));
+           fmt::format("{} names for the {} coordinates of the robot; they are, in this order: {}",
+                       definition_.coordinates.size(), of_robot.size(), fmt::join(of_robot, ", ")));
     }
   }
 
@@ -574,18 +574,19 @@ class ModelReader : private TomlReader {
     const bool inputs_are_written = mechanics != nullptr && mechanics->contains("force");
     const std::vector<Expression>& u = symbols_->u;
     if (!inputs_are_written && !u.empty()) {
-      if (u.size() != nq) {
+      if (u.size() != robot()->n_axes()) {
         fail(*root_.get("inputs"), "inputs",
-             fmt::format("{} inputs for {} joints: give one per joint, or say in [mechanics] force = [ … ] how they act",
-                         u.size(), nq));
+             fmt::format("{} inputs for {} axes of joints: give one per axis, or say in [mechanics] force = [ … ] how they act",
+                         u.size(), robot()->n_axes()));
       }
-      for (std::size_t j = 0; j < nq; ++j) applied[j] = applied[j] + u[j];
+      const std::vector<Expression> of_inputs = robot()->on_coordinates(u);
+      for (std::size_t j = 0; j < nq; ++j) applied[j] = applied[j] + of_inputs[j];
     }
     for (std::size_t j = 0; j < nq; ++j) definition_.force[j] = applied[j] + definition_.force[j];
   }
 
-  // force = [ … ], one per coordinate, and with a robot force_on = { 'site("tip").x' = … }: a force along a quantity r acts on
-  // the coordinates as (∂r/∂q)ᵀ force
+  // force = [ … ], one per coordinate, with a robot one per axis of its joints, and force_on = { 'site("tip").x' = … }: a force
+  // along a quantity r acts on the coordinates as (∂r/∂q)ᵀ force
   std::vector<Expression> read_forces(const toml::table& entries, const std::string& section) const {
     const std::size_t nq = definition_.coordinates.size();
     // λ₀ is that of the known force
@@ -597,13 +598,15 @@ class ModelReader : private TomlReader {
     if (entries.contains("force")) {
       const toml::node& node = *entries.get("force");
       const toml::array& force = array(node, section + ".force");
-      if (force.size() != nq) {
-        fail(node, section + ".force", fmt::format("expected {} entries, one per coordinate, got {}", nq, force.size()));
+      const std::size_t n = robot() ? robot()->n_axes() : nq;
+      if (force.size() != n) {
+        fail(node, section + ".force",
+             fmt::format("expected {} entries, one per {}, got {}", n, n == nq ? "coordinate" : "axis of the joints",
+                         force.size()));
       }
-      for (std::size_t j = 0; j < nq; ++j) {
-        const std::string key = fmt::format("{}.force entry {}", section, j + 1);
-        forces[j] = read(*force.get(j), key);
-      }
+      std::vector<Expression> given;
+      for (std::size_t j = 0; j < n; ++j) given.push_back(read(*force.get(j), fmt::format("{}.force entry {}", section, j + 1)));
+      forces = robot() ? robot()->on_coordinates(given) : given;
     }
     if (!entries.contains("force_on")) return forces;
     const toml::node& node = *entries.get("force_on");
@@ -691,7 +694,8 @@ class ModelReader : private TomlReader {
 
   void read_constraints() {
     if (robot()) {
-      for (auto& [c, name] : robot()->loops()) definition_.constraints.push_back(derive(Level::position, c, std::move(name)));
+      for (auto& [c, name] : robot()->constraints())
+        definition_.constraints.push_back(derive(Level::position, c, std::move(name)));
     }
     if (!root_.contains("constraints")) return;
     const toml::table& constraints = table(*root_.get("constraints"), "constraints");

@@ -90,4 +90,31 @@ inline ExpressionMatrix rotation_about(const Eigen::Vector3d& axis, Expression a
   return out;
 }
 
+/// A quaternion p = w + xi + yj + zk of any length but 0: it turns as p/|p| does.
+struct ExpressionQuaternion {
+  Expression w, x, y, z;
+};
+
+inline Expression dot(const ExpressionQuaternion& a, const ExpressionQuaternion& b) {
+  return a.w * b.w + a.x * b.x + a.y * b.y + a.z * b.z;
+}
+
+/// R(p/|p|): axes of the turned body in those that it is turned in.
+inline ExpressionMatrix rotation_by(const ExpressionQuaternion& p) {
+  const auto& [w, x, y, z] = p;
+  const Expression two_by_square = w.graph().constant(2) / dot(p, p), one = w.graph().constant(1);
+  const auto off = [&](Expression a, Expression b) { return two_by_square * (a + b); };
+  const auto on = [&](Expression a, Expression b) { return one - two_by_square * (a * a + b * b); };
+  const ExpressionVector first = {{on(y, z), off(x * y, w * z), off(x * z, -(w * y))}};
+  const ExpressionVector second = {{off(x * y, -(w * z)), on(x, z), off(y * z, w * x)}};
+  const ExpressionVector third = {{off(x * z, w * y), off(y * z, -(w * x)), on(x, y)}};
+  return {{first, second, third}};
+}
+
+/// E(p), with ω = 2 E(p) ṗ/|p|² the angular velocity in the axes of the turned body (3 × 4).
+inline std::array<std::array<Expression, 4>, 3> velocity_matrix(const ExpressionQuaternion& p) {
+  const auto& [w, x, y, z] = p;
+  return {{{{-x, w, z, -y}}, {{-y, -z, w, x}}, {{-z, y, -x, w}}}};
+}
+
 }  // namespace gp2

@@ -110,15 +110,11 @@ class Description {
 
   void refuse_what_has_no_place() const {
     for (int id = 0; id < m_.njnt; ++id) {
-      const int type = m_.jnt_type[id];
-      if (type == mjJNT_HINGE || type == mjJNT_SLIDE) continue;
-      const bool is_ball = type == mjJNT_BALL;
-      fail(
-          fmt::format("joint {} of body {} is a {} joint, which has a quaternion; only hinge and slide joints can be "
-                      "coordinates: {}",
-                      shown(mjOBJ_JOINT, id), shown(mjOBJ_BODY, m_.jnt_bodyid[id]), is_ball ? "ball" : "free",
-                      is_ball ? "write three hinges in its place"
-                              : "remove it if the body is fixed, or write three slides and three hinges in its place"));
+      if (!has_quaternion(id) || no_springs() || m_.jnt_stiffness[id] == 0) continue;
+      fail(fmt::format(
+          "joint {} of body {} is a ball or free joint with stiffness = {}, whose spring is not known: set it to 0 and "
+          "write it as mechanics.force",
+          shown(mjOBJ_JOINT, id), shown(mjOBJ_BODY, m_.jnt_bodyid[id]), m_.jnt_stiffness[id]));
     }
     if (m_.njnt == 0) fail("it has no joint: nothing can move");
     if (m_.opt.density != 0 || m_.opt.viscosity != 0) {
@@ -131,6 +127,7 @@ class Description {
     refuse_later_forces();
   }
 
+  [[nodiscard]] bool has_quaternion(int id) const { return m_.jnt_type[id] == mjJNT_BALL || m_.jnt_type[id] == mjJNT_FREE; }
   [[nodiscard]] bool no_springs() const { return disabled(mujoco::springs_off); }
   [[nodiscard]] bool no_dampers() const { return disabled(mujoco::dampers_off); }
 
@@ -257,6 +254,10 @@ class Description {
     body.inertia =
         is_round ? Matrix3d(moments.asDiagonal()) : rotated_inertia(tidying_.rotation(row<4>(m_.body_iquat, id)), moments);
     for (int k = 0; k < m_.body_jntnum[id]; ++k) body.joints.push_back(joint(m_.body_jntadr[id] + k));
+    if (!body.joints.empty() && body.joints.front().type == Joint::Type::free) {  // which says alone where the body is
+      body.position.setZero();
+      body.rotation.setIdentity();
+    }
     return body;
   }
 
@@ -264,15 +265,23 @@ class Description {
     const int dof = m_.jnt_dofadr[id];
     Joint joint;
     joint.name = joint_names_[static_cast<std::size_t>(id)];
-    joint.type = m_.jnt_type[id] == mjJNT_HINGE ? Joint::Type::hinge : Joint::Type::slide;
-    joint.axis = tidying_.axis(row<3>(m_.jnt_axis, id));
-    joint.anchor = position(row<3>(m_.jnt_pos, id));
-    joint.reference = m_.qpos0[m_.jnt_qposadr[id]];
     joint.armature = m_.dof_armature[dof];
     if (!no_dampers()) joint.damping = m_.dof_damping[dof];
+    if (!disabled(mjDSBL_FRICTIONLOSS | mjDSBL_CONSTRAINT)) joint.dry_friction = m_.dof_frictionloss[dof];
+    if (m_.jnt_type[id] == mjJNT_FREE) {
+      joint.type = Joint::Type::free;
+      return joint;
+    }
+    joint.anchor = position(row<3>(m_.jnt_pos, id));
+    if (m_.jnt_type[id] == mjJNT_BALL) {
+      joint.type = Joint::Type::ball;
+      return joint;
+    }
+    joint.type = m_.jnt_type[id] == mjJNT_HINGE ? Joint::Type::hinge : Joint::Type::slide;
+    joint.axis = tidying_.axis(row<3>(m_.jnt_axis, id));
+    joint.reference = m_.qpos0[m_.jnt_qposadr[id]];
     if (!no_springs()) joint.stiffness = m_.jnt_stiffness[id];
     joint.spring_reference = m_.qpos_spring[m_.jnt_qposadr[id]];
-    if (!disabled(mjDSBL_FRICTIONLOSS | mjDSBL_CONSTRAINT)) joint.dry_friction = m_.dof_frictionloss[dof];
     return joint;
   }
 

@@ -35,6 +35,23 @@ std::vector<const Joint*> RobotDescription::joints() const {
   return all;
 }
 
+std::vector<std::string> Joint::coordinates() const {
+  if (!has_quaternion()) return {name};
+  std::vector<std::string> names;
+  for (const char* component : {"x", "y", "z", "qw", "qx", "qy", "qz"}) {
+    if (type == Type::free || component[0] == 'q') names.push_back(fmt::format("{}_{}", name, component));
+  }
+  return names;
+}
+
+std::vector<std::string> RobotDescription::coordinates() const {
+  std::vector<std::string> all;
+  for (const Joint* joint : joints()) {
+    for (std::string& coordinate : joint->coordinates()) all.push_back(std::move(coordinate));
+  }
+  return all;
+}
+
 int RobotDescription::body_index(const std::string& body_name) const {
   const auto body = std::find_if(bodies.begin(), bodies.end(), [&](const Body& other) { return other.name == body_name; });
   return body == bodies.end() ? -1 : static_cast<int>(body - bodies.begin());
@@ -87,7 +104,6 @@ class Names {
     require(!name.empty(), fmt::format("{} {}", kind_, names_.size()), "it has no name");
     require(names_.insert(name).second, fmt::format("{} '{}'", kind_, name), "its name stands twice");
   }
-  [[nodiscard]] bool contains(const std::string& name) const { return names_.count(name) > 0; }
 
  private:
   const char* kind_;
@@ -106,6 +122,7 @@ void check_joint(const Joint& joint) {
   check_not_negative(joint.damping, where, "its damping");
   check_not_negative(joint.stiffness, where, "its stiffness");
   check_not_negative(joint.dry_friction, where, "its dry_friction");
+  require(!joint.has_quaternion() || joint.stiffness == 0, where, "only hinge and slide joints may have a stiffness");
 }
 
 void check_body(const Body& body, int index) {
@@ -117,12 +134,16 @@ void check_body(const Body& body, int index) {
   check_not_negative(body.mass, where, "its mass");
   check_finite(body.com, where, "its com");
   check_inertia(body.inertia, where);
+  const bool is_free =
+      std::any_of(body.joints.begin(), body.joints.end(), [](const Joint& j) { return j.type == Joint::Type::free; });
+  require(!is_free || (body.parent == -1 && body.joints.size() == 1), where,
+          "a free joint must be its only one, and the world its parent");
 }
 
 // closing loops
 class LoopChecks {
  public:
-  LoopChecks(const RobotDescription& robot, const Names& joints) : robot_(robot), joints_(joints) {}
+  explicit LoopChecks(const RobotDescription& robot) : robot_(robot), joints_(robot.joints()) {}
 
   void check_connect(const Connect& connect, const std::string& where) const {
     for (const int body : connect.bodies) {
@@ -136,7 +157,9 @@ class LoopChecks {
   void check_length(const Coupling::Length& length, const std::string& where) const {
     require(!length.joints.empty() || !length.segments.empty(), where, "a length has neither joints nor segments");
     for (const auto& [name, coefficient] : length.joints) {
-      require(joints_.contains(name), where, fmt::format("there is no joint '{}'", name));
+      const auto joint = std::find_if(joints_.begin(), joints_.end(), [&name = name](const Joint* j) { return j->name == name; });
+      require(joint != joints_.end(), where, fmt::format("there is no joint '{}'", name));
+      require(!(*joint)->has_quaternion(), where, fmt::format("joint '{}' has a quaternion, which is no length", name));
       check_finite(coefficient, where, "a coefficient");
     }
     for (const Coupling::Segment& segment : length.segments) {
@@ -159,7 +182,7 @@ class LoopChecks {
 
  private:
   const RobotDescription& robot_;
-  const Names& joints_;
+  const std::vector<const Joint*> joints_;
 };
 
 }  // namespace
@@ -186,7 +209,7 @@ void check_robot(const RobotDescription& robot) {
     check_finite(site.position, where, "its position");
     check_rotation(site.rotation, where);
   }
-  const LoopChecks loops(robot, joints);
+  const LoopChecks loops(robot);
   for (const Connect& connect : robot.connects) loops.check_connect(connect, fmt::format("connect '{}'", connect.name));
   for (const Weld& weld : robot.welds) {
     const std::string where = fmt::format("weld '{}'", weld.connect.name);
@@ -209,12 +232,14 @@ Json matrix_json(const Matrix3d& matrix) {
   return json;
 }
 
-constexpr const char* hinge = "hinge";
-constexpr const char* slide = "slide";
+constexpr std::array<std::pair<Joint::Type, const char*>, 4> joint_types = {
+    {{Joint::Type::hinge, "hinge"}, {Joint::Type::slide, "slide"}, {Joint::Type::ball, "ball"}, {Joint::Type::free, "free"}}};
 
 Json joint_json(const Joint& joint) {
+  const auto* const type =
+      std::find_if(joint_types.begin(), joint_types.end(), [&](const auto& known) { return known.first == joint.type; });
   return {{"name", joint.name},
-          {"type", joint.type == Joint::Type::hinge ? hinge : slide},
+          {"type", type->second},
           {"axis", vector_json(joint.axis)},
           {"anchor", vector_json(joint.anchor)},
           {"reference", joint.reference},
@@ -383,8 +408,10 @@ Joint joint_from(const Entry& entry) {
   Joint joint;
   joint.name = entry["name"].text();
   const std::string type = entry["type"].text();
-  if (type != hinge && type != slide) entry["type"].fail("hinge or slide");
-  joint.type = type == hinge ? Joint::Type::hinge : Joint::Type::slide;
+  const auto* const known =
+      std::find_if(joint_types.begin(), joint_types.end(), [&](const auto& one) { return one.second == type; });
+  if (known == joint_types.end()) entry["type"].fail("hinge, slide, ball or free");
+  joint.type = known->first;
   joint.axis = entry["axis"].vector();
   joint.anchor = entry["anchor"].vector();
   joint.reference = entry["reference"].number();

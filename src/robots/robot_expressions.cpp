@@ -38,7 +38,7 @@ std::vector<std::pair<std::string, double>> robot_numbers(const RobotDescription
   }
   for (const Joint* joint : robot.joints()) {
     numbers.emplace_back(number_name("damping", joint->name), joint->damping);
-    numbers.emplace_back(number_name("stiffness", joint->name), joint->stiffness);
+    if (!joint->has_quaternion()) numbers.emplace_back(number_name("stiffness", joint->name), joint->stiffness);
     numbers.emplace_back(number_name("friction", joint->name), joint->dry_friction);
     numbers.emplace_back(number_name("armature", joint->name), joint->armature);
   }
@@ -48,9 +48,8 @@ std::vector<std::pair<std::string, double>> robot_numbers(const RobotDescription
 RobotExpressions::RobotExpressions(RobotDescription robot, ExpressionGraph& graph, const SystemSymbols& symbols,
                                    std::map<std::string, Expression> numbers)
     : robot_(std::move(robot)), graph_(graph), q_(symbols.q), dq_(symbols.dq), ddq_(symbols.ddq), numbers_(std::move(numbers)) {
-  const std::size_t n = robot_.joints().size();
-  if (q_.size() != n)
-    throw InputError(fmt::format("robot '{}': it has {} joints, got {} coordinates", robot_.name, n, q_.size()));
+  const std::size_t n = robot_.coordinates().size();
+  if (q_.size() != n) throw InputError(fmt::format("robot '{}': it has {} coordinates, got {}", robot_.name, n, q_.size()));
   add_links();
 }
 
@@ -60,32 +59,78 @@ Expression RobotExpressions::number(const std::string& name, double value) const
 }
 
 void RobotExpressions::add_links() {
-  const Expression zero = graph_.constant(0);
+  std::size_t k = 0;  // the coordinate
   for (const RobotDescription::Body& body : robot_.bodies) {
     const Frame parent = body.parent < 0 ? Frame() : frames_[static_cast<std::size_t>(body.parent)];
     Frame frame{parent.link, parent.rotation * body.rotation, parent.position + parent.rotation * body.position};
     for (const Joint& joint : body.joints) {
-      const Expression moved = q_[links_.size()] - graph_.constant(joint.reference);
-      const ExpressionMatrix rest = constant(graph_, frame.rotation);
-      Link link;
-      link.joint = &joint;
-      link.parent = frame.link;
-      link.axis = constant(graph_, joint.axis);
-      link.position = constant(graph_, Vector3d(frame.position + frame.rotation * joint.anchor));
-      if (joint.type == Joint::Type::hinge) {
-        link.rotation = rest * rotation_about(joint.axis, moved);
-      } else {
-        link.rotation = rest;
-        link.position = link.position + constant(graph_, Vector3d(frame.rotation * joint.axis)) * moved;
+      switch (joint.type) {
+        case Joint::Type::hinge:
+        case Joint::Type::slide:
+          add_axis(joint, joint.type == Joint::Type::hinge, joint.axis, k, frame);
+          break;
+        case Joint::Type::free:
+          for (int i = 0; i < 3; ++i) add_axis(joint, false, Vector3d::Unit(i), k++, frame);
+          [[fallthrough]];
+        case Joint::Type::ball:
+          add_ball(joint, k, frame);
+          k += 3;
+          break;
       }
-      link.mass = zero;
-      link.first_moment = constant(graph_, Vector3d(Vector3d::Zero()));
-      link.inertia = constant(graph_, Matrix3d(Matrix3d::Zero()));
-      links_.push_back(link);
-      frame = {static_cast<int>(links_.size()) - 1, Matrix3d::Identity(), -joint.anchor};
+      ++k;
     }
     frames_.push_back(frame);
     if (frame.link >= 0) add_inertia(body, frame);
+  }
+}
+
+// not moved yet; whatever comes next stands in its frame
+RobotExpressions::Link& RobotExpressions::add_link(const Joint& joint, bool turns, const Vector3d& axis, Frame& frame) {
+  Link link;
+  link.joint = &joint;
+  link.turns = turns;
+  link.parent = frame.link;
+  link.axis = constant(graph_, axis);
+  link.rotation = constant(graph_, frame.rotation);
+  link.position = constant(graph_, Vector3d(frame.position + frame.rotation * joint.anchor));
+  link.mass = link.velocity = link.velocity_rate = graph_.constant(0);
+  link.first_moment = constant(graph_, Vector3d(Vector3d::Zero()));
+  link.inertia = constant(graph_, Matrix3d(Matrix3d::Zero()));
+  links_.push_back(link);
+  frame = {static_cast<int>(links_.size()) - 1, Matrix3d::Identity(), -joint.anchor};
+  return links_.back();
+}
+
+// a hinge or slide whose coordinate is q_k
+void RobotExpressions::add_axis(const Joint& joint, bool turns, const Vector3d& axis, std::size_t k, Frame& frame) {
+  const Expression moved = q_[k] - graph_.constant(joint.reference);
+  const Vector3d direction = frame.rotation * axis;
+  Link& link = add_link(joint, turns, axis, frame);
+  if (turns) {
+    link.rotation = link.rotation * rotation_about(axis, moved);
+  } else {
+    link.position = link.position + constant(graph_, direction) * moved;
+  }
+  link.velocity_of = {{k, graph_.constant(1)}};
+  link.velocity = dq_[k];
+}
+
+// ω = G dp with G = 2 E(p)/|p|², and dG/dt dp = −2 (pᵀdp)/|p|² ω, as E(dp) dp = 0
+void RobotExpressions::add_ball(const Joint& joint, std::size_t k, Frame& frame) {
+  const ExpressionQuaternion p = quaternion(k), dp = quaternion_rate(k);
+  const Expression two_by_square = graph_.constant(2) / dot(p, p);
+  const auto E = velocity_matrix(p);
+  balls_.emplace_back(k, links_.size());
+  for (int i = 0; i < 3; ++i) {
+    Link& link = add_link(joint, true, Vector3d::Unit(i), frame);
+    link.goes_on = i > 0;
+    if (i == 0) link.rotation = link.rotation * rotation_by(p);
+    for (std::size_t j = 0; j < 4; ++j) {
+      const Expression entry = two_by_square * E.at(static_cast<std::size_t>(i)).at(j);
+      link.velocity_of.emplace_back(k + j, entry);
+      link.velocity = link.velocity + entry * dq_[k + j];
+    }
+    link.velocity_rate = -(two_by_square * dot(p, dp) * link.velocity);
   }
 }
 
@@ -124,7 +169,7 @@ void RobotExpressions::add_inertia(const RobotDescription::Body& body, const Fra
   link.inertia = link.inertia + rotated_inertia(R, inertia) + point_inertia(mass, com);
 }
 
-std::vector<std::vector<Expression>> RobotExpressions::mass() const {
+std::vector<std::vector<Expression>> RobotExpressions::mass_along_axes() const {
   const std::size_t n = links_.size();
   std::vector<Link> composite = links_;  // with everything that hangs on it
   for (std::size_t i = n; i-- > 0;) {
@@ -150,16 +195,55 @@ std::vector<std::vector<Expression>> RobotExpressions::mass() const {
   std::vector<std::vector<Expression>> M(n, std::vector<Expression>(n, graph_.constant(0)));
   for (std::size_t i = 0; i < n; ++i) {
     const Link& link = composite[i];
-    ExpressionVector force = is_hinge(i) ? cross(link.axis, link.first_moment) : link.axis * link.mass;
-    ExpressionVector moment = is_hinge(i) ? link.inertia * link.axis : cross(link.first_moment, link.axis);
+    ExpressionVector force = link.turns ? cross(link.axis, link.first_moment) : link.axis * link.mass;
+    ExpressionVector moment = link.turns ? link.inertia * link.axis : cross(link.first_moment, link.axis);
     const Expression armature = number(number_name("armature", link.joint->name), link.joint->armature);
-    M[i][i] = dot(link.axis, is_hinge(i) ? moment : force) + armature;
+    M[i][i] = dot(link.axis, link.turns ? moment : force) + armature;
     for (std::size_t at = i; links_[at].parent >= 0;) {
       const auto parent = static_cast<std::size_t>(links_[at].parent);
       force = links_[at].rotation * force;
       moment = links_[at].rotation * moment + cross(links_[at].position, force);
-      M[i][parent] = M[parent][i] = dot(links_[parent].axis, is_hinge(parent) ? moment : force);
+      M[i][parent] = M[parent][i] = dot(links_[parent].axis, links_[parent].turns ? moment : force);
       at = parent;
+    }
+  }
+  return M;
+}
+
+std::vector<Expression> RobotExpressions::on_coordinates(const std::vector<Expression>& along_axes) const {
+  std::vector<Expression> out(q_.size(), graph_.constant(0));
+  for (std::size_t i = 0; i < links_.size(); ++i) {
+    for (const auto& [k, coefficient] : links_[i].velocity_of) out[k] = out[k] + coefficient * along_axes[i];
+  }
+  return out;
+}
+
+Expression RobotExpressions::quaternion_mass(const std::vector<std::vector<Expression>>& along_axes, std::size_t link) const {
+  return graph_.constant(4.0 / 3) * (along_axes[link][link] + along_axes[link + 1][link + 1] + along_axes[link + 2][link + 2]);
+}
+
+std::vector<std::vector<Expression>> RobotExpressions::mass() const {
+  const std::vector<std::vector<Expression>> along_axes = mass_along_axes();
+  if (balls_.empty()) return along_axes;
+
+  // Gᵀ M_v G, with the lower triangle in both halves
+  const std::size_t nq = q_.size();
+  std::vector<std::vector<Expression>> rows;  // M_v G
+  rows.reserve(along_axes.size());
+  for (const std::vector<Expression>& row : along_axes) rows.push_back(on_coordinates(row));
+  std::vector<std::vector<Expression>> M(nq, std::vector<Expression>(nq));
+  for (std::size_t j = 0; j < nq; ++j) {
+    std::vector<Expression> column;
+    for (const std::vector<Expression>& row : rows) column.push_back(row[j]);
+    column = on_coordinates(column);
+    for (std::size_t i = j; i < nq; ++i) M[i][j] = M[j][i] = column[i];
+  }
+
+  // + c p pᵀ
+  for (const auto& [k, link] : balls_) {
+    const Expression c = quaternion_mass(along_axes, link);
+    for (std::size_t i = k; i < k + 4; ++i) {
+      for (std::size_t j = k; j <= i; ++j) M[i][j] = M[j][i] = M[i][j] + c * (q_[i] * q_[j]);
     }
   }
   return M;
@@ -172,6 +256,7 @@ std::vector<Expression> RobotExpressions::force() const {
   const ExpressionVector world_acceleration = constant(graph_, Vector3d(-robot_.gravity));
   const Expression two = graph_.constant(2);
   std::vector<ExpressionVector> omega(n), alpha(n), acceleration(n), force(n), moment(n);  // in the link's own axes
+  std::vector<ExpressionVector> before(n);                                                 // ω without the joint's
 
   // outwards: motion where ddq = 0, and what it takes
   for (std::size_t i = 0; i < n; ++i) {
@@ -181,12 +266,13 @@ std::vector<Expression> RobotExpressions::force() const {
     const auto parent = static_cast<std::size_t>(in_world ? 0 : link.parent);
     const ExpressionVector &omega_p = in_world ? zero : omega[parent], &alpha_p = in_world ? zero : alpha[parent];
     const ExpressionVector& acceleration_p = in_world ? world_acceleration : acceleration[parent];
-    const ExpressionVector carried = to_link * omega_p, joint_velocity = link.axis * dq_[i];
-    omega[i] = is_hinge(i) ? carried + joint_velocity : carried;
+    const ExpressionVector carried = to_link * omega_p, joint_velocity = link.axis * link.velocity;
+    before[i] = link.goes_on ? before[parent] : carried;
+    omega[i] = link.turns ? carried + joint_velocity : carried;
     alpha[i] = to_link * alpha_p;
-    if (is_hinge(i)) alpha[i] = alpha[i] + cross(carried, joint_velocity);
+    if (link.turns) alpha[i] = alpha[i] + cross(before[i], joint_velocity) + link.axis * link.velocity_rate;
     acceleration[i] = to_link * (acceleration_p + cross(alpha_p, link.position) + cross(omega_p, cross(omega_p, link.position)));
-    if (!is_hinge(i)) acceleration[i] = acceleration[i] + cross(carried, joint_velocity) * two;
+    if (!link.turns) acceleration[i] = acceleration[i] + cross(carried, joint_velocity) * two;
 
     const ExpressionVector& h = link.first_moment;
     force[i] = acceleration[i] * link.mass + cross(alpha[i], h) + cross(omega[i], cross(omega[i], h));
@@ -198,12 +284,11 @@ std::vector<Expression> RobotExpressions::force() const {
   for (std::size_t i = n; i-- > 0;) {
     const Link& link = links_[i];
     const Joint& joint = *link.joint;
-    const Expression bias = dot(link.axis, is_hinge(i) ? moment[i] : force[i]);
-    const Expression spring =
-        number(number_name("stiffness", joint.name), joint.stiffness) * (q_[i] - graph_.constant(joint.spring_reference));
-    const Expression damper = number(number_name("damping", joint.name), joint.damping) * dq_[i];
+    const Expression bias = dot(link.axis, link.turns ? moment[i] : force[i]);
+    const Expression spring = number(number_name("stiffness", joint.name), joint.stiffness) * stretch(link);
+    const Expression damper = number(number_name("damping", joint.name), joint.damping) * link.velocity;
     const Expression friction =
-        number(number_name("friction", joint.name), joint.dry_friction) * graph_.apply(Operation::sign, dq_[i]);
+        number(number_name("friction", joint.name), joint.dry_friction) * graph_.apply(Operation::sign, link.velocity);
     out[i] = -bias - spring - damper - friction;
     if (link.parent < 0) continue;
     const auto parent = static_cast<std::size_t>(link.parent);
@@ -211,7 +296,20 @@ std::vector<Expression> RobotExpressions::force() const {
     force[parent] = force[parent] + carried;
     moment[parent] = moment[parent] + link.rotation * moment[i] + cross(link.position, carried);
   }
+  out = on_coordinates(out);
+  if (balls_.empty()) return out;
+  const std::vector<std::vector<Expression>> along_axes = mass_along_axes();
+  for (const auto& [k, link] : balls_) {
+    const Expression weight = quaternion_mass(along_axes, link) * dot(quaternion_rate(k), quaternion_rate(k));
+    for (std::size_t i = k; i < k + 4; ++i) out[i] = out[i] - weight * q_[i];
+  }
   return out;
+}
+
+// of a joint's spring; balls have none
+Expression RobotExpressions::stretch(const Link& link) const {
+  if (link.joint->has_quaternion()) return graph_.constant(0);
+  return q_[link.velocity_of.front().first] - graph_.constant(link.joint->spring_reference);
 }
 
 Expression RobotExpressions::potential() {
@@ -221,9 +319,8 @@ Expression RobotExpressions::potential() {
   for (std::size_t i = 0; i < links_.size(); ++i) {
     const Link& link = links_[i];
     potential = potential - dot(gravity, motion[i].position * link.mass + motion[i].rotation * link.first_moment);
-    const Expression stretch = q_[i] - graph_.constant(link.joint->spring_reference);
     const Expression stiffness = number(number_name("stiffness", link.joint->name), link.joint->stiffness);
-    potential = potential + graph_.constant(0.5) * stiffness * (stretch * stretch);
+    potential = potential + graph_.constant(0.5) * stiffness * (stretch(link) * stretch(link));
   }
   return potential;
 }
@@ -232,8 +329,8 @@ const std::vector<RobotExpressions::Motion>& RobotExpressions::motions() {
   if (!motions_.empty()) return motions_;
   const ExpressionVector zero = constant(graph_, Vector3d(Vector3d::Zero()));
   const Motion world{constant(graph_, Matrix3d(Matrix3d::Identity())), zero, zero, zero, zero, zero, zero};
-  for (std::size_t i = 0; i < links_.size(); ++i) {
-    const Link& link = links_[i];
+  ExpressionVector before = zero;  // angular velocity without the joint's
+  for (const Link& link : links_) {
     const Motion& parent = link.parent < 0 ? world : motions_[static_cast<std::size_t>(link.parent)];
     const ExpressionVector &omega = parent.angular_velocity, &alpha = parent.angular_acceleration;
     Motion motion = parent;
@@ -243,10 +340,11 @@ const std::vector<RobotExpressions::Motion>& RobotExpressions::motions() {
     motion.axis = motion.rotation * link.axis;
     motion.velocity = parent.velocity + cross(omega, r);
     motion.acceleration = parent.acceleration + cross(alpha, r) + cross(omega, cross(omega, r));
-    const ExpressionVector joint_velocity = motion.axis * dq_[i];
-    if (is_hinge(i)) {
+    const ExpressionVector joint_velocity = motion.axis * link.velocity;
+    if (!link.goes_on) before = omega;
+    if (link.turns) {
       motion.angular_velocity = omega + joint_velocity;
-      motion.angular_acceleration = alpha + cross(omega, joint_velocity);
+      motion.angular_acceleration = alpha + cross(before, joint_velocity) + motion.axis * link.velocity_rate;
     } else {
       motion.velocity = motion.velocity + joint_velocity;
       motion.acceleration = motion.acceleration + cross(omega, joint_velocity) * graph_.constant(2);
@@ -274,11 +372,13 @@ RobotQuantity RobotExpressions::point(const Frame& frame, const Vector3d& offset
   out.rate = (motion.velocity + cross(omega, r))[component];
   out.bias = (motion.acceleration + cross(alpha, r) + cross(omega, cross(omega, r)))[component];
   const std::vector<bool> moved_by = moves(frame.link);
+  std::vector<Expression> along_axes(links_.size(), zero);
   for (std::size_t j = 0; j < links_.size(); ++j) {
     if (!moved_by[j]) continue;
     const ExpressionVector& axis = motions_[j].axis;
-    out.jacobian[j] = (is_hinge(j) ? cross(axis, position - motions_[j].position) : axis)[component];
+    along_axes[j] = (links_[j].turns ? cross(axis, position - motions_[j].position) : axis)[component];
   }
+  out.jacobian = on_coordinates(along_axes);
   return out;
 }
 
@@ -294,9 +394,11 @@ RobotQuantity RobotExpressions::direction(const Frame& frame, const Vector3d& ow
   out.rate = cross(omega, e)[component];
   out.bias = (cross(alpha, e) + cross(omega, cross(omega, e)))[component];
   const std::vector<bool> moved_by = moves(frame.link);
+  std::vector<Expression> along_axes(links_.size(), zero);
   for (std::size_t j = 0; j < links_.size(); ++j) {
-    if (moved_by[j] && is_hinge(j)) out.jacobian[j] = cross(motions_[j].axis, e)[component];
+    if (moved_by[j] && links_[j].turns) along_axes[j] = cross(motions_[j].axis, e)[component];
   }
+  out.jacobian = on_coordinates(along_axes);
   return out;
 }
 
@@ -520,12 +622,11 @@ Expression squared_distance(const RobotDescription& robot, ExpressionGraph& grap
 
 Expression length_of(const RobotDescription& robot, ExpressionGraph& graph, const std::vector<Expression>& q,
                      const RobotDescription::Coupling::Length& length) {
-  const std::vector<const Joint*> joints = robot.joints();
+  const std::vector<std::string> coordinates = robot.coordinates();
   Expression sum = graph.constant(-length.reference);
   for (const auto& [name, coefficient] : length.joints) {
-    const auto joint =
-        std::find_if(joints.begin(), joints.end(), [&name = name](const Joint* other) { return other->name == name; });
-    sum = sum + graph.constant(coefficient) * q[static_cast<std::size_t>(joint - joints.begin())];
+    const auto coordinate = std::find(coordinates.begin(), coordinates.end(), name);
+    sum = sum + graph.constant(coefficient) * q[static_cast<std::size_t>(coordinate - coordinates.begin())];
   }
   for (const RobotDescription::Coupling::Segment& segment : length.segments) {
     const Expression square = squared_distance(robot, graph, segment);
@@ -549,8 +650,12 @@ void add_coupling(const RobotDescription& robot, ExpressionGraph& graph, const s
 
 }  // namespace
 
-std::vector<std::pair<Expression, std::string>> RobotExpressions::loops() {
+std::vector<std::pair<Expression, std::string>> RobotExpressions::constraints() {
   NamedExpressions rows;
+  for (const auto& [k, link] : balls_) {
+    rows.emplace_back(dot(quaternion(k), quaternion(k)) - graph_.constant(1),
+                      fmt::format("{}.quaternion", links_[link].joint->name));
+  }
   for (const RobotDescription::Connect& connect : robot_.connects) add_connect(robot_, graph_, connect, rows);
   for (const RobotDescription::Weld& weld : robot_.welds) add_weld(robot_, graph_, weld, rows);
   for (const RobotDescription::Coupling& coupling : robot_.couplings) add_coupling(robot_, graph_, q_, coupling, rows);

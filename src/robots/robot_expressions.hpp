@@ -36,7 +36,7 @@ struct RobotQuantity {
 /// chapters 5 and 6). They stay small: of the order of 100 operations per joint and pair of joints on a path.
 class RobotExpressions {
  public:
-  /// @param symbols  a coordinate per joint of the robot, in its order
+  /// @param symbols  the coordinates of the robot's joints, in their order
   /// @param numbers  expressions in place of numbers of the robot, by their names (robot_numbers)
   /// @throws InputError when sizes differ.
   RobotExpressions(RobotDescription robot, ExpressionGraph& graph, const SystemSymbols& symbols,
@@ -44,12 +44,20 @@ class RobotExpressions {
   RobotExpressions(const RobotExpressions&) = delete;
   RobotExpressions& operator=(const RobotExpressions&) = delete;
 
-  /// M(q)  (nq × nq)
+  /// M(q)  (nq × nq). With v = G dq the velocities along the axes of the joints it is Gᵀ M_v G; where a joint has a quaternion p,
+  /// which G does not read along p, the mass c p pᵀ is added (T43).
   [[nodiscard]] std::vector<std::vector<Expression>> mass() const;
 
   /// What acts without inputs (nq): −(Coriolis, centrifugal and gravity forces) − damping dq − stiffness (q − q_rest) − friction
-  /// sign(dq).
+  /// sign(dq); with −c p |dp|² for a quaternion p, so that its constraint has nothing to do (T43).
   [[nodiscard]] std::vector<Expression> force() const;
+
+  /// The axes of the joints: one of a hinge or slide, three of a ball, in the axes of its body, six of a free joint, three in those of
+  /// the world and three in those of its body.
+  [[nodiscard]] std::size_t n_axes() const { return links_.size(); }
+
+  /// What forces and torques along the axes are as forces on the coordinates: Gᵀ f  (nq).
+  [[nodiscard]] std::vector<Expression> on_coordinates(const std::vector<Expression>& along_axes) const;
 
   /// Of gravity and springs [J].
   [[nodiscard]] Expression potential();
@@ -71,21 +79,28 @@ class RobotExpressions {
                                   const std::vector<Coordinate>& coordinates, const std::vector<std::string>& inputs,
                                   const std::vector<Parameter>& parameters);
 
-  /// The position constraints that close the robot's loops, as expressions with quantities, and what they go by.
-  std::vector<std::pair<Expression, std::string>> loops();
+  /// The position constraints of the robot, as expressions with quantities, and what they go by: quaternions have length 1, loops
+  /// stay closed.
+  std::vector<std::pair<Expression, std::string>> constraints();
 
  private:
-  /// One joint and what is fixed to it. Its frame's origin is the joint's anchor; its axes are, at the joint's reference, those
-  /// of the body that the joint moves.
+  /// One axis of a joint and what is fixed to it. Its frame's origin is the joint's anchor; its axes are, at the joint's
+  /// reference, those of the body that the joint moves. A ball is three links in one place, of which the first turns by the
+  /// quaternion and the last has the mass.
   struct Link {
     const RobotDescription::Joint* joint = nullptr;
-    int parent = -1;                // link, or −1: the world
-    ExpressionMatrix rotation;      // of its axes in the parent's frame
-    ExpressionVector position;      // of its origin in the parent's frame
-    ExpressionVector axis;          // of the joint, in either frame's own axes
-    Expression mass;                // of what is fixed to it
-    ExpressionVector first_moment;  // Σ m c about its origin
-    ExpressionMatrix inertia;       // about its origin
+    bool turns = true;                                            // else it slides
+    bool goes_on = false;                                         // second or third axis of a ball
+    int parent = -1;                                              // link, or −1: the world
+    std::vector<std::pair<std::size_t, Expression>> velocity_of;  // v = Σ coefficient dq_k: a row of G
+    Expression velocity;                                          // v
+    Expression velocity_rate;                                     // dv/dt where ddq = 0
+    ExpressionMatrix rotation;                                    // of its axes in the parent's frame
+    ExpressionVector position;                                    // of its origin in the parent's frame
+    ExpressionVector axis;                                        // of the joint, in either frame's own axes
+    Expression mass;                                              // of what is fixed to it
+    ExpressionVector first_moment;                                // Σ m c about its origin
+    ExpressionMatrix inertia;                                     // about its origin
   };
   /// Where the frame of a body stands on its link.
   struct Frame {
@@ -99,9 +114,16 @@ class RobotExpressions {
     ExpressionVector position, axis, angular_velocity, velocity, angular_acceleration, acceleration;
   };
 
-  [[nodiscard]] bool is_hinge(std::size_t link) const { return links_[link].joint->type == RobotDescription::Joint::Type::hinge; }
   [[nodiscard]] Expression number(const std::string& name, double value) const;
+  [[nodiscard]] ExpressionQuaternion quaternion(std::size_t k) const { return {q_[k], q_[k + 1], q_[k + 2], q_[k + 3]}; }
+  [[nodiscard]] ExpressionQuaternion quaternion_rate(std::size_t k) const { return {dq_[k], dq_[k + 1], dq_[k + 2], dq_[k + 3]}; }
   void add_links();
+  Link& add_link(const RobotDescription::Joint& joint, bool turns, const Eigen::Vector3d& axis, Frame& frame);
+  void add_axis(const RobotDescription::Joint& joint, bool turns, const Eigen::Vector3d& axis, std::size_t k, Frame& frame);
+  void add_ball(const RobotDescription::Joint& joint, std::size_t k, Frame& frame);
+  [[nodiscard]] std::vector<std::vector<Expression>> mass_along_axes() const;  // M_v
+  [[nodiscard]] Expression quaternion_mass(const std::vector<std::vector<Expression>>& along_axes, std::size_t link) const;  // c
+  [[nodiscard]] Expression stretch(const Link& link) const;
   void add_inertia(const RobotDescription::Body& body, const Frame& frame);
   const std::vector<Motion>& motions();
   RobotQuantity point(const Frame& frame, const Eigen::Vector3d& offset, int component);
@@ -112,8 +134,9 @@ class RobotExpressions {
   ExpressionGraph& graph_;
   std::vector<Expression> q_, dq_, ddq_;
   std::map<std::string, Expression> numbers_;
-  std::vector<Link> links_;    // one per joint
-  std::vector<Frame> frames_;  // one per body
+  std::vector<Link> links_;                                 // one per axis of a joint
+  std::vector<std::pair<std::size_t, std::size_t>> balls_;  // first coordinate and first link of each quaternion
+  std::vector<Frame> frames_;                               // one per body
   std::vector<Motion> motions_;
   std::map<std::string, RobotQuantity> quantities_;
 };

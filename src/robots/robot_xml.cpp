@@ -137,12 +137,6 @@ class Urdf {
     if (std::find(types.begin(), types.end(), type) == types.end()) {
       fail(fmt::format("{}: its type is '{}'; there is: {}", where, type, fmt::join(types, ", ")));
     }
-    if (type == "floating") {
-      fail(
-          fmt::format("{}: it is floating, that is, it has a quaternion, which cannot be a coordinate: make it fixed, or write "
-                      "three prismatic and three revolute joints in its place",
-                      where));
-    }
     const std::string parent = link_of(joint, "parent", where);
     const std::string child = link_of(joint, "child", where);
     if (!parents_.emplace(child, parent).second) {

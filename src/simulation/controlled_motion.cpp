@@ -131,6 +131,13 @@ VectorXd start_of(const Model& model) {
   const System& system = *model.system;
   const std::vector<std::string> names = system.state_names();
   VectorXd state = VectorXd::Zero(system.layout().size());
+  // quaternions of a robot start unturned
+  Eigen::Index next = 0;
+  for (const RobotDescription::Joint* joint :
+       model.robot ? model.robot->joints() : std::vector<const RobotDescription::Joint*>()) {
+    next += static_cast<Eigen::Index>(joint->coordinates().size());
+    if (joint->has_quaternion()) state[next - 4] = 1;
+  }
   for (int k = 0; k < 2 * system.nq(); ++k) {
     const auto start = model.motion->start.find(names[static_cast<std::size_t>(k)]);
     if (start != model.motion->start.end()) state[k] = start->second;

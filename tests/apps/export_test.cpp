@@ -1,3 +1,4 @@
+#include <cstdio>
 #include <regex>
 
 #include <gmock/gmock.h>
@@ -9,6 +10,21 @@
 
 namespace gp2::test {
 namespace {
+
+// examples/exported_loop, with errors of the path that do not depend on the machine
+TEST(ExportedLoopExample, FollowsItsPathBetterByWhatWasLearned) {
+  const Desk desk;
+  desk.done("gp2 generate models/unicycle.toml --n 60 --seed 1 -o log.csv");
+  desk.done("gp2 fit models/unicycle.toml --data log.csv --restarts 1 --hyperparameters optimise -o fit.json");
+  desk.done("gp2 export fit.json --name unicycle --no-std -o .");
+  desk.done("cc -std=c99 -O2 -Wall -Wextra -pedantic -Wconversion -Werror -I. '" GP2_SOURCE_DIR
+            "/examples/exported_loop/main.c' unicycle.c -lm -o loop");
+  const std::string printed = desk.done("./loop").out;
+  double known = 0, learned = 0;
+  ASSERT_EQ(std::sscanf(printed.c_str(), "known error %lf mm, %*[^\n] learned error %lf mm", &known, &learned), 2) << printed;
+  EXPECT_NEAR(known, 3.365, 0.001);
+  EXPECT_LT(learned, known / 3);
+}
 
 using testing::HasSubstr;
 
@@ -34,7 +50,7 @@ directions = "force"
 [noise]
 ddq = 0.05
 [truth]
-force = ["0", "0", "-0.02*drocker"]
+force = ["0", "0", "-0.02*drocker - 0.2*tanh(5*drocker)"]
 [motion]
 rate              = 50
 segment           = [1, 2]
@@ -78,6 +94,25 @@ TEST_F(RobotExportCommand, TheRobotsFileHasTheFittedNumbersAndIsElseAsItWas) {
   desk.done("gp2 check again.toml");
   // a pipe gets the same
   EXPECT_EQ(desk.done("gp2 export fit.json --to mjcf -o -").out, desk.read("fitted.xml"));
+}
+
+// examples/mujoco_passive
+TEST_F(RobotExportCommand, TheLearnedForceIsAPassiveForceOfMujoco) {
+  if (desk.run("echo '#include <mujoco/mujoco.h>' | cc -E -").status != 0)
+    GTEST_SKIP() << "MuJoCo is not among the system's headers";
+  desk.done("gp2 export fit.json --to mjcf -o fitted.xml");
+  desk.done("gp2 export fit.json --view force --name rocker --no-std -o .");
+  desk.done("cc -std=c99 -O2 -Wall -Wextra -pedantic -Wconversion -Werror -I. '" GP2_SOURCE_DIR
+            "/examples/mujoco_passive/main.c' rocker.c -lmujoco -lm -o passive");
+  desk.done("./passive fitted.xml >motion.csv");
+  desk.done("gp2 predict fit.json --states motion.csv --view unconstrained -o same.csv");
+  desk.done("gp2 predict fit.json --states motion.csv --view force -o force.csv");
+  const std::vector<std::string> names = {"abar_crank", "abar_coupler", "abar_rocker"};
+  const Eigen::MatrixXd of_mujoco = columns(desk.table("motion.csv"), names), of_gp2 = columns(desk.table("same.csv"), names);
+  ASSERT_EQ(of_mujoco.cols(), 20);
+  EXPECT_LE((of_mujoco - of_gp2).cwiseAbs().maxCoeff(), 1e-11 * of_gp2.cwiseAbs().maxCoeff());
+  EXPECT_GT(columns(desk.table("force.csv"), {"force_coupler", "force_rocker"}).cwiseAbs().maxCoeff(), 1e-3)
+      << "the callback has something to add";
 }
 
 TEST_F(RobotExportCommand, LeavesTheRobotAndTheFitAlone) {

@@ -556,14 +556,22 @@ TEST(Reader, FilesIncludedAreFoundFromTheFirstFileOrTheIncludingOne) {
 
 // ---- errors
 
-TEST(ReaderErrors, JointsWithQuaternionsAreNamed) {
-  EXPECT_EQ(error_of(mjcf(fmt::format(R"(<body name="trunk"><freejoint name="root"/>{}</body>)", inertial))),
-            "robot.xml: joint 'root' of body 'trunk' is a free joint, which has a quaternion; only hinge and slide joints can be "
-            "coordinates: remove it if the body is fixed, or write three slides and three hinges in its place");
-  EXPECT_EQ(
-      error_of(mjcf(fmt::format(R"(<body><joint type="ball"/>{}</body>)", inertial))),
-      "robot.xml: joint 0 (without a name) of body 1 (without a name) is a ball joint, which has a quaternion; only hinge and "
-      "slide joints can be coordinates: write three hinges in its place");
+TEST(Reader, JointsWithQuaternionsAreRead) {
+  const RobotDescription robot =
+      read(mjcf(fmt::format(R"(<body name="trunk" pos="1 2 3"><freejoint name="root"/>{}<body name="arm" pos="0 0 1">
+      <joint name="neck" type="ball" pos="0 0 0.1" damping="0.2"/>{}</body></body>)",
+                            inertial, inertial)));
+  EXPECT_THAT(robot.coordinates(), ElementsAre("root_x", "root_y", "root_z", "root_qw", "root_qx", "root_qy", "root_qz",
+                                               "neck_qw", "neck_qx", "neck_qy", "neck_qz"));
+  EXPECT_EQ(robot.bodies[0].position, Eigen::Vector3d::Zero()) << "the joint says where it is";
+  EXPECT_EQ(robot.bodies[1].joints[0].damping, 0.2);
+  EXPECT_EQ(to_json(robot_from_json(to_json(robot))), to_json(robot));
+}
+
+TEST(ReaderErrors, SpringsOfQuaternionsAreRefused) {
+  EXPECT_EQ(error_of(mjcf(fmt::format(R"(<body><joint type="ball" stiffness="2"/>{}</body>)", inertial))),
+            "robot.xml: joint 0 (without a name) of body 1 (without a name) is a ball or free joint with stiffness = 2, whose "
+            "spring is not known: set it to 0 and write it as mechanics.force");
 }
 
 TEST(ReaderErrors, ForcesOfFluidsAndTendonsAreRefused) {
@@ -770,10 +778,11 @@ TEST(UrdfErrors, FaultsOfTheTreeAreNamed) {
             "robot.xml: joint 'a': it has no <parent link=\"…\"/>");
   EXPECT_EQ(error_of(urdf(R"(<link/>)")), "robot.xml: a <link> has no name");
   EXPECT_EQ(error_of(urdf(R"(<link name="a"><inertial/></link>)")), "robot.xml: link 'a': its <inertial> has no <mass>");
-  EXPECT_EQ(
-      error_of(urdf(link("base") + link("arm") + joint("root", "floating", "base", "arm"))),
-      "robot.xml: joint 'root': it is floating, that is, it has a quaternion, which cannot be a coordinate: make it fixed, or "
-      "write three prismatic and three revolute joints in its place");
+}
+
+TEST(Urdf, JointsThatFloatAreFree) {
+  const RobotDescription robot = read(urdf(R"(<link name="world"/>)" + link("arm") + joint("root", "floating", "world", "arm")));
+  EXPECT_EQ(robot.joints().front()->type, RobotDescription::Joint::Type::free);
 }
 
 TEST(UrdfErrors, FaultsOfMimicAreNamed) {

@@ -221,6 +221,154 @@ TEST(RobotExpressions, PointsAndAxesAreThoseOfMujoco) {
   EXPECT_LE(largest_difference(values.A(0).row(first + 4), oracle.jacobian(right, local).row(1)), 1e-12);
 }
 
+// A body that floats, an arm on a ball on it and a hinge, off all centres; a pendulum on a ball on a rail.
+constexpr const char* floating = R"(<mujoco>
+  <compiler angle="radian"/>
+  <option gravity="0.3 -0.4 -9.7"/>
+  <worldbody>
+    <body name="trunk" pos="1 2 3" euler="0.2 -0.3 0.4">
+      <inertial pos="0.02 0.01 -0.03" mass="2.5" fullinertia="0.02 0.03 0.04 0.001 -0.002 0.003"/>
+      <joint name="root" type="free" damping="0.2" armature="0.03"/>
+      <body name="upper" pos="0.1 0.05 0.2" euler="0.3 0.1 -0.2">
+        <inertial pos="0.05 -0.1 0.02" mass="0.7" fullinertia="0.004 0.005 0.006 0.0003 -0.0002 0.0001"/>
+        <joint name="shoulder" type="ball" pos="0.02 -0.01 0.03" damping="0.1" armature="0.01"/>
+        <body name="lower" pos="0 0.3 0">
+          <inertial pos="0 0.1 0.02" mass="0.4" diaginertia="0.002 0.001 0.0015"/>
+          <joint name="elbow" type="hinge" axis="1 0.2 0" pos="0 0.02 0" stiffness="2" springref="0.1"/>
+          <site name="hand" pos="0.02 0.2 0.03"/>
+        </body>
+      </body>
+    </body>
+    <body name="pendulum" pos="0 -1 1" euler="0.5 0.6 0.7">
+      <inertial pos="0 0 -0.4" mass="1.2" diaginertia="0.03 0.02 0.01"/>
+      <joint name="rail" type="slide" axis="0 1 1"/>
+      <joint name="pivot" type="ball" pos="0.01 0.02 0.05"/>
+    </body>
+  </worldbody>
+</mujoco>)";
+
+Eigen::Vector4d product(const Eigen::Vector4d& a, const Eigen::Vector4d& b) {
+  Eigen::Vector4d out;
+  out << a[0] * b[0] - a.tail<3>().dot(b.tail<3>()),
+      a[0] * b.tail<3>() + b[0] * a.tail<3>() + Vector3d(a.tail<3>()).cross(Vector3d(b.tail<3>()));
+  return out;
+}
+
+// a state with unit quaternions, for MuJoCo as (q, v) and for us as (q, dq)
+struct FloatingState {
+  static constexpr int first_coordinate[] = {3, 7, 13}, first_axis[] = {3, 6, 11}, nq = 17, nv = 14;
+
+  explicit FloatingState(RandomStream& random) : q(random_vector(random, nq)), v(random_vector(random, nv)) {
+    for (const int k : first_coordinate) q.segment<4>(k).normalize();
+    dq = to_coordinates(v);
+  }
+
+  // of velocities along the axes: dp = ½ p (0, ω)
+  [[nodiscard]] VectorXd to_coordinates(const VectorXd& along_axes) const {
+    VectorXd out(nq);
+    out << along_axes.head(3), VectorXd::Zero(8), along_axes.segment(9, 2), VectorXd::Zero(4);
+    for (int ball = 0; ball < 3; ++ball) {
+      Eigen::Vector4d omega(0, 0, 0, 0);
+      omega.tail<3>() = along_axes.segment<3>(first_axis[ball]);
+      out.segment<4>(first_coordinate[ball]) = 0.5 * product(q.segment<4>(first_coordinate[ball]), omega);
+    }
+    return out;
+  }
+
+  // of accelerations along the axes: d²p = ½ p (0, dω) − ¼ |ω|² p
+  [[nodiscard]] VectorXd acceleration(const VectorXd& along_axes) const {
+    VectorXd out = to_coordinates(along_axes);
+    for (int ball = 0; ball < 3; ++ball) {
+      const double square = v.segment<3>(first_axis[ball]).squaredNorm();
+      out.segment<4>(first_coordinate[ball]) -= 0.25 * square * q.segment<4>(first_coordinate[ball]);
+    }
+    return out;
+  }
+
+  VectorXd q, v, dq;
+};
+
+// What M of a quaternion has along it is ours (T43): the motion is the same, and the constraint has nothing to do.
+TEST(QuaternionJoints, AccelerateAsInMujoco) {
+  const std::filesystem::path path = written(floating, "floating.xml");
+  std::string inputs;
+  for (int k = 0; k < FloatingState::nv; ++k) inputs += fmt::format("'u{}', ", k);
+  const Model model = model_of(path, fmt::format("inputs = [{}]", inputs));
+  const System& system = *model.system;
+  ASSERT_EQ(system.nq(), FloatingState::nq);
+  ASSERT_EQ(system.nc(), 3);
+  EXPECT_EQ(system.coordinates()[3].name, "root_qw");
+  EXPECT_EQ(system.coordinates()[10].name, "shoulder_qz");
+  MujocoOracle oracle(path);
+  RandomStream random(11);
+  for (int i = 0; i < 100; ++i) {
+    const FloatingState at(random);
+    const VectorXd u = random_vector(random, FloatingState::nv);
+    oracle.set_state(at.q, at.v);
+    const VectorXd force = u + oracle.passive() - oracle.bias();
+    const VectorXd expected = at.acceleration(oracle.mass().ldlt().solve(force));
+    VectorXd state(system.layout().size());
+    state << at.q, at.dq, 0.0, u;
+    const SystemValues values = system.evaluate(state, system.parameter_values());
+    EXPECT_EQ(values.M(0), values.M(0).transpose());
+    const VectorXd free = values.M(0).llt().solve(values.F(0));
+    EXPECT_LE(largest_difference(free, expected), 1e-11 * (1 + expected.cwiseAbs().maxCoeff()));
+    EXPECT_LE(largest_difference(values.A(0) * expected, values.b(0)), 1e-12 * (1 + values.b(0).cwiseAbs().maxCoeff()));
+    EXPECT_LE(system.residuals(state, system.parameter_values()).cwiseAbs().maxCoeff(), 1e-14);
+  }
+}
+
+// also where the quaternions are of another length: A = ∂c/∂q, and b from the second derivative along a motion
+TEST(QuaternionJoints, CarryPointsWithExactDerivatives) {
+  const Model model = model_of(written(floating, "floating.xml"),
+                               R"(constraints.position = ['site("hand").x + site("hand").y', 'body("lower").rot_xz'])");
+  const System& system = *model.system;
+  const VectorXd parameters = system.parameter_values();
+  RandomStream random(12);
+  VectorXd q = random_vector(random, system.nq()), dq = random_vector(random, system.nq());
+  const auto state_at = [&](double time) {
+    VectorXd state(system.layout().size());
+    state << q + time * dq, dq, 0.0;
+    return state;
+  };
+  const auto residuals = [&](double time) { return VectorXd(system.residuals(state_at(time), parameters)); };
+  constexpr double h = 1e-5;
+  const VectorXd here = residuals(0), slope = (residuals(h) - residuals(-h)) / (2 * h);
+  const SystemValues values = system.evaluate(state_at(0), parameters);
+  const VectorXd rate = values.A(0) * dq;
+  for (int row = 0; row < system.nc(); ++row) {
+    EXPECT_NEAR(rate[row], slope[2 * row], 1e-8) << row;
+    EXPECT_NEAR(here[2 * row + 1], rate[row], 1e-12) << row;
+    EXPECT_NEAR(-values.b(0)[row], slope[2 * row + 1], 1e-7) << row;
+  }
+  EXPECT_GT(rate.tail(2).cwiseAbs().minCoeff(), 1e-2);
+}
+
+// d/dt (½ dqᵀ M dq + V) = dqᵀ F of the dampers: M, F and V are of one machine
+TEST(QuaternionJoints, KeepTheirEnergyButForDampers) {
+  const Model model = model_of(written(floating, "floating.xml"));
+  const System& system = *model.system;
+  const VectorXd parameters = system.parameter_values();
+  RandomStream random(13);
+  const FloatingState at(random);
+  const auto state_of = [&](const VectorXd& q, const VectorXd& dq) {
+    VectorXd state(system.layout().size());
+    state << q, dq, 0.0;
+    return state;
+  };
+  const SystemValues values = system.evaluate(state_of(at.q, at.dq), parameters);
+  const VectorXd ddq = values.M(0).llt().solve(values.F(0));
+  const auto energy = [&](double t) {
+    const VectorXd state = state_of(at.q + t * at.dq + t * t / 2 * ddq, at.dq + t * ddq), dq = state.segment(17, 17);
+    MatrixXd potential;
+    Tape(std::span(&*model.potential, 1), model.symbols().state_and_parameters()).evaluate(state, parameters, potential);
+    return 0.5 * dq.dot(system.evaluate(state, parameters).M(0) * dq) + potential(0, 0);
+  };
+  constexpr double h = 1e-5;
+  const double power = -0.2 * at.v.head(6).squaredNorm() - 0.1 * at.v.segment(6, 3).squaredNorm();
+  EXPECT_NEAR((energy(h) - energy(-h)) / (2 * h), power, 1e-6 * std::abs(power));
+}
+
 // MuJoCo writes the vector of the relative quaternion, ½ θ for small angles; we write the skew part of the rotation, 2 θ
 TEST(RobotExpressions, WeldHoldsWhatMujocosWeldHolds) {
   const std::filesystem::path path = written(R"(<mujoco>
@@ -377,8 +525,9 @@ TEST(RobotModel, SaysWhatIsWrong) {
   const auto expect = [&](const std::string& more, const std::string& part) {
     EXPECT_NE(message(more).find(part), std::string::npos) << message(more);
   };
-  expect("coordinates = ['q1']", "1 names for the 7 joints of the robot; they are, in this order: q1, q2");
-  expect("inputs = ['u1', 'u2']", "2 inputs for 7 joints: give one per joint");
+  expect("coordinates = ['q1']", "1 names for the 7 coordinates of the robot; they are, in this order: q1, q2");
+  expect("inputs = ['u1', 'u2']", "2 inputs for 7 axes of joints: give one per axis");
+  expect("[mechanics]\nforce = ['1']", "expected 7 entries, one per coordinate, got 1");
   expect("[mechanics]\nmass = [['1']]", "the mass matrix is the robot's");
   expect("[constraints]\nposition = ['site(\"tpi\").z']", "robot 'iiwa7' has no site 'tpi'; sites: tip");
   expect("[constraints]\nposition = ['body(\"link9\").z']", "has no body 'link9'; bodies: world, ");

@@ -128,8 +128,8 @@ TEST(RobotJson, AValueOfAnotherKindIsNamed) {
   EXPECT_EQ(error_of_changed("/bodies/0/parent", 4294967295U),
             "robot.bodies[0].parent: 4294967295 stands where a smaller number must");
   EXPECT_EQ(error_of_changed("/gravity", {1, 2}), "robot.gravity: has 2 entries, must have 3");
-  EXPECT_EQ(error_of_changed("/bodies/0/joints/0/type", "ball"),
-            "robot.bodies[0].joints[0].type: \"ball\" stands where hinge or slide must");
+  EXPECT_EQ(error_of_changed("/bodies/0/joints/0/type", "planar"),
+            "robot.bodies[0].joints[0].type: \"planar\" stands where hinge, slide, ball or free must");
   EXPECT_EQ(error_of_changed("/couplings/0/polynomial", {1}), "robot.couplings[0].polynomial: has 1 entries, must have 5");
 }
 

@@ -2,6 +2,7 @@
 
 #include <cmath>
 #include <filesystem>
+#include <fstream>
 #include <string>
 
 #include <fmt/format.h>
@@ -14,6 +15,7 @@
 #include "gp2/mechanics/udwadia_kalaba.hpp"
 #include "gp2/model.hpp"
 #include "gp2/predictor.hpp"
+#include "gp2/robots/robot.hpp"
 #include "gp2/simulate.hpp"
 #include "gp2/simulation/generate.hpp"
 #include "input_error.hpp"
@@ -78,6 +80,46 @@ targets = { q1 = [2, 2.000001] }
   EXPECT_EQ(data.states(0, 0), 0);
   EXPECT_NEAR(data.states(0, 299), 2, 2e-3);
   EXPECT_NEAR(data.states(0, 100), 1, 2e-2) << "half of the way in half of the time";
+}
+
+constexpr const char* drone = R"(
+robot = 'drone.xml'
+inputs = ["fx", "fy", "fz", "mx", "my", "mz"]
+[truth]
+force = ["0", "0", "0", "0", "0", "0"]
+[motion]
+rate = 100
+segment = [0.5, 0.500001]
+natural_frequency = 20
+targets = { f_x = [0.5, 0.500001], 'body("drone").rot_xz' = [0.3, 0.300001] }
+hold = ['f_y', 'f_z', 'body("drone").rot_yz', 'body("drone").rot_xy']
+)";
+
+Model read_drone(const std::string& text) {
+  const std::filesystem::path path = std::filesystem::path(testing::TempDir()) / "drone.xml";
+  std::ofstream(path) << R"(<mujoco><worldbody><body name="drone" pos="0 0 1"><freejoint name="f"/>
+    <inertial pos="0.01 0 0.02" mass="1" fullinertia="0.01 0.011 0.02 0.001 0 0.002"/></body></worldbody></mujoco>)";
+  return Model::parse(text, "drone", [&](const std::string&) { return read_robot(path); });
+}
+
+TEST(Motion, OfAFreeBodyReachesItsTargetsWithAQuaternionOfLengthOne) {
+  const Model model = read_drone(drone);
+  const GeneratedData data = motion_of(model, 60);
+  for (Eigen::Index i = 0; i < 60; ++i) EXPECT_NEAR(data.states.col(i).segment<4>(3).norm(), 1, 1e-14);
+  EXPECT_EQ(data.states.col(0).head(7), VectorXd::Unit(7, 3)) << "begins unturned";
+  EXPECT_NEAR(data.states(0, 59), 0.5, 5e-3);
+  EXPECT_NEAR(value_of(model, "body('drone').rot_xz", data.states.col(59)), 0.3, 5e-3);
+}
+
+TEST(Motion, OfAFreeBodyIsByForcesAlongItsAxes) {
+  const auto message = [](const std::string& more) {
+    return test::input_error_of([&] { read_drone("robot = 'drone.xml'\n" + more); });
+  };
+  EXPECT_NE(message("inputs = ['f1', 'f2']").find("2 inputs for 6 axes of joints: give one per axis"), std::string::npos);
+  EXPECT_NE(message("[mechanics]\nforce = ['0']").find("expected 6 entries, one per axis of the joints, got 1"),
+            std::string::npos);
+  EXPECT_NE(message("[parameters]\nk = { of = 'stiffness(\"f\")' }").find("the robot has no number 'stiffness(\"f\")'"),
+            std::string::npos);
 }
 
 TEST(Motion, IsTheSameForAnyNoiseAndTheSameSeedOnly) {

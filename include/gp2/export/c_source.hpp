@@ -14,6 +14,7 @@ struct CSourceOptions {
   bool stddev = true;                   // NAME_mean_and_stddev: stores n²/2 numbers of n reduced observations
   bool jacobian = true;                 // NAME_mean_and_jacobian
   bool single_precision = false;        // everything in float
+  bool portable_math = false;           // the same bits on every machine: functions of its own for those of <math.h>
   std::vector<std::string> about = {};  // lines at the head of the header
 };
 
@@ -31,7 +32,8 @@ struct CSource {
 /// (n/8 + 16) ε Σ_j |k_j β_j| of each latent function, is held against the standard deviation of that function at observed states.
 ///
 /// @throws InputError as require_view; when the name is no C identifier, there are no observations, the system, features or
-///   directions are code and not expressions, or single precision is off by more than a hundredth of a standard deviation.
+///   directions are code and not expressions, or single precision is off by more than a hundredth of a standard deviation; when
+///   portable_math meets single precision, or a power whose exponent is no whole number.
 [[nodiscard]] CSource export_c(const Posterior& posterior, const View& view, const CSourceOptions& options = {});
 
 }  // namespace gp2

@@ -29,6 +29,7 @@ struct ExportRequest {
   bool stddev = true;
   bool jacobian = true;
   bool single_precision = false;
+  bool portable_math = false;
   std::optional<double> draws_within;  // of a mixture: as Posterior::fewest_components
 };
 std::vector<Option> options(ExportRequest& request);

@@ -19,10 +19,15 @@ namespace gp2 GP2_API {
 /// an axis and an anchor are given in the body's own frame. Bodies come after their parents; index −1 is the world.
 struct RobotDescription {
   struct Joint {
-    enum class Type { hinge /* turns about an axis through its anchor */, slide /* moves along its axis */ };
+    enum class Type {
+      hinge,  // turns about an axis through its anchor
+      slide,  // moves along its axis
+      ball,   // turns about its anchor; its coordinates are a quaternion
+      free    // of a body of the world, which alone says where it is: its coordinates are position and quaternion
+    };
     std::string name;
     Type type = Type::hinge;
-    Eigen::Vector3d axis = Eigen::Vector3d::UnitZ();   // unit vector
+    Eigen::Vector3d axis = Eigen::Vector3d::UnitZ();   // unit vector, of a hinge or slide
     Eigen::Vector3d anchor = Eigen::Vector3d::Zero();  // [m]
     double reference = 0;                              // its coordinate where nothing is moved [rad or m]
     double armature = 0;                               // inertia of the rotor, as the joint feels it [kg m² or kg]
@@ -30,6 +35,9 @@ struct RobotDescription {
     double stiffness = 0;                              // [N m/rad or N/m]
     double spring_reference = 0;                       // its coordinate where the spring is at rest [rad or m]
     double dry_friction = 0;                           // force against the motion, whatever its speed [N m or N]
+
+    [[nodiscard]] bool has_quaternion() const { return type == Type::ball || type == Type::free; }
+    [[nodiscard]] std::vector<std::string> coordinates() const;  // j; j_x, j_y, j_z of a free joint, then j_qw, j_qx, j_qy, j_qz
   };
 
   struct Body {
@@ -92,7 +100,8 @@ struct RobotDescription {
   Eigen::Vector3d gravity = {0, 0, -9.81};  // [m/s²]
   std::vector<std::string> notes;           // what of the file has no place here: limits, contacts, actuators, …
 
-  [[nodiscard]] std::vector<const Joint*> joints() const;       // of all bodies, in their order: the coordinates
+  [[nodiscard]] std::vector<const Joint*> joints() const;       // of all bodies, in their order
+  [[nodiscard]] std::vector<std::string> coordinates() const;   // of all joints
   [[nodiscard]] int body_index(const std::string& name) const;  // −1 when there is none
 };
 
@@ -106,7 +115,7 @@ bool can_read_robots();
 /// MuJoCo for `fusestatic`), and a joint's <mimic> becomes a coupling. Meshes need not be there where inertias are.
 ///
 /// @throws InputError when this build has no MuJoCo, with MuJoCo's own words when it refuses the file, and naming what has no
-///   place in a RobotDescription: ball and free joints, tendons held by an equality that wrap around geoms, springs, dampers,
+///   place in a RobotDescription: springs of ball and free joints, tendons held by an equality that wrap around geoms, springs, dampers,
 ///   friction or armature of tendons, forces and inertias that only later versions of MuJoCo know, motion in a fluid.
 RobotDescription read_robot(const std::filesystem::path& path);
 
