@@ -123,11 +123,11 @@ def test_other_python_threads_run_during_a_fit(surface):
     ticker = threading.Thread(target=tick)
     ticker.start()
     begin = time.monotonic()
-    gp2.fit(surface, data, restarts=1, max_iterations=40, threads=1)
+    while time.monotonic() - begin < 0.3:  # however fast the machine is
+        gp2.fit(surface, data, restarts=1, max_iterations=40, threads=1)
     seconds = time.monotonic() - begin
     done.set()
     ticker.join()
-    assert seconds > 0.2  # else this shows nothing
     assert len([t for t in ticks if begin < t < begin + seconds]) > 0.02 * seconds / 0.005
 
 
