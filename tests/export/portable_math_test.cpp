@@ -187,10 +187,13 @@ TEST(PortableMath, GivesTheSameBitsByEveryCompiler) {
     // products that the machine could fuse, and GNU's C, which would; clang's -ffp-contract=fast disregards all pragmas
     builds.emplace_back(compiler + " -std=gnu99 -O3 -march=native" + (compiler == "gcc" ? " -ffp-contract=fast" : ""), "./run");
   }
-  if (shell("aarch64-linux-gnu-gcc --version && qemu-aarch64-static --version")) {
+  static_cast<void>(folder.write("nothing.c", "#include <math.h>\nint main(void) { return 0; }\n"));
+  if (shell("aarch64-linux-gnu-gcc -static nothing.c -o nothing && qemu-aarch64-static ./nothing")) {
     for (const char* flags : {" -O0", " -O3", " -std=gnu99 -O3 -ffp-contract=fast"}) {
       builds.emplace_back(fmt::format("aarch64-linux-gnu-gcc -static{}", flags), "qemu-aarch64-static ./run");
     }
+  } else {
+    fmt::print("not compared with aarch64: there is no compiler, C library or emulator for it\n");
   }
   std::string expected;
   for (const auto& [compiler, run] : builds) {
