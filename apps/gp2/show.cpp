@@ -29,7 +29,8 @@ Command show_command() {
   command.options.insert(command.options.begin(), argument("FILE", a->file, "model file, or file written by gp2 fit"));
   command.run = [a](const std::set<std::string>&) {
     const std::string text = read_file(a->file);
-    const bool is_fit = text.find_first_not_of(" \t\r\n") == text.find('{');  // no model file begins so
+    const std::size_t first = text.find_first_not_of(" \t\r\n");
+    const bool is_fit = first != std::string::npos && text[first] == '{';  // no model file begins so
     print_result("{}", is_fit ? show(FitFile::parse(text, a->file), a->request) : show(Model::parse(text, a->file), a->request));
   };
   return command;

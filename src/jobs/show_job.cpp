@@ -158,12 +158,6 @@ std::string latents_text(const Model& model, bool full) {
   return text;
 }
 
-const char* word_of(ConstraintRow::Level level) {
-  return level == ConstraintRow::Level::position   ? "position"
-         : level == ConstraintRow::Level::velocity ? "velocity"
-                                                   : "acceleration";
-}
-
 std::string whole_text(const Model& model, const SymbolicSystem& system, bool full) {
   const Derived derived(system);
   std::string text = fmt::format("{}\n  {} coordinates, {} inputs, {} constraints\n", system.name(), system.nq(),
@@ -286,6 +280,12 @@ std::string show(const FitFile& fit, const ShowRequest& request) {
                  {"hyperparameters", hyperparameters},
                  {"options", fit.options.empty() ? OrderedJson() : OrderedJson::parse(fit.options)}};
   return json.dump(2) + "\n";
+}
+
+const char* word_of(ConstraintRow::Level level) {
+  return level == ConstraintRow::Level::position   ? "position"
+         : level == ConstraintRow::Level::velocity ? "velocity"
+                                                   : "acceleration";
 }
 
 std::string text_of(const FitReport& report) {

@@ -149,6 +149,14 @@ TEST(CommandLine, ShowPrintsTheDerivedConstraint) {
   EXPECT_THAT(desk.done("gp2 show models/unicycle.toml --latex").out, HasSubstr("\\begin{bmatrix}"));
 }
 
+TEST(CommandLine, ShowTakesAnEmptyFileForAModel) {
+  const Desk desk;
+  desk.write("empty.toml", "");
+  const Outcome outcome = desk.run("gp2 show empty.toml");
+  EXPECT_EQ(outcome.status, 2);
+  EXPECT_THAT(outcome.err, HasSubstr("empty.toml:1: coordinates: missing"));
+}
+
 TEST(CommandLine, JsonStandsAloneOnStdoutWithTheContractedKeys) {
   const Desk desk;
   desk.done("gp2 generate models/surface.toml --n 20 -o train.csv");

@@ -12,6 +12,7 @@
 #include "gp2/base/version.hpp"
 #include "gp2/data/csv.hpp"
 #include "gp2/error.hpp"
+#include "gp2/jobs/show_job.hpp"
 #include "gp2/training/laplace.hpp"
 #include "report/assets.hpp"
 #include "report/report_page.hpp"
@@ -67,12 +68,6 @@ std::string matrix_mathml(const char* name, const std::vector<std::vector<Expres
       name, body);
 }
 
-const char* level_word(ConstraintRow::Level level) {
-  return level == ConstraintRow::Level::position   ? "position"
-         : level == ConstraintRow::Level::velocity ? "velocity"
-                                                   : "acceleration";
-}
-
 Json model_json(const FitFile& fit) {
   const System& system = *fit.model.system;
   std::vector<std::vector<Expression>> A, b;
@@ -81,7 +76,7 @@ Json model_json(const FitFile& fit) {
     for (const ConstraintRow& row : symbolic->definition().constraints) {
       A.push_back(row.A);
       b.push_back({row.b});
-      constraints.push_back({{"text", row.text}, {"level", level_word(row.level)}});
+      constraints.push_back({{"text", row.text}, {"level", word_of(row.level)}});
     }
   } else {
     for (const std::string& label : system.constraint_labels())

@@ -25,6 +25,9 @@ std::string show(const Model& model, const ShowRequest& request = {});
 /// @throws InputError as of a model.
 std::string show(const FitFile& fit, const ShowRequest& request = {});
 
+/// "position", "velocity" or "acceleration".
+const char* word_of(ConstraintRow::Level level);
+
 /// How a fit ended, and its hyperparameters with their standard errors, a line each.
 std::string text_of(const FitReport& report);
 
