@@ -46,8 +46,7 @@ std::set<int> latents_at_zero(const std::vector<Hyperparameter>& hyperparameters
 }
 
 // A random start: about the size where the box is no more than a limit, log-normal about the first start where the hyper-prior is
-// log-normal, else even in the box of the coordinate.
-/// @param common  what a normal deviate has half of its variance from, where that is not null
+// log-normal, else even in the box of the coordinate. Where `common` is not null, half of the variance of a log-normal one is its.
 double draw(const Hyperparameter& h, const double* common, RandomStream& random) {
   if (h.size > 0) {
     const double relative = random.normal();
