@@ -49,6 +49,7 @@ struct Latent {
   std::optional<int> free_loading;                  // columns of a free loading C; not given: C = diag(s)
   bool kernel_is_fixed = false;                     // the kernel's parameters are 1, in the units that its features have
   bool has_one_signal = false;                      // s = (c, …, c), in the units that its directions have
+  bool is_positive = false;                         // exp(C f) acts along the directions, not C f
   Range lengthscale, signal_stddev;
   std::vector<Range> feature_lengthscales;  // of each feature, in its unit, before `lengthscale` (D); empty: of none
 
@@ -61,6 +62,7 @@ struct Latent {
 ///
 ///     ā(x) = μ(x) + Σ_a E_a(x) C_a f_a(φ_a(x))
 ///
+/// with exp(C_a f_a) in place of C_a f_a where a latent is positive, and E_a(x, λ) where its directions read the multipliers.
 /// Immutable and cheap to copy.
 struct Prior {
   enum class Mean {
@@ -78,6 +80,10 @@ struct Prior {
   std::shared_ptr<const System> reference = nullptr;
 
   [[nodiscard]] const System& reference_system() const { return reference ? *reference : *system; }
+
+  /// Whether ā is no linear function of the latents: one acts through the multipliers that it changes, or by its exponential
+  /// (theory.md, T46 and T47).
+  [[nodiscard]] bool is_nonlinear() const;
 
   /// Which entries of a state the prior and the mechanics read (size layout().size()): the columns a data set must have.
   [[nodiscard]] std::vector<bool> reads() const;
@@ -104,16 +110,20 @@ struct PriorValues {
 Eigen::MatrixXd evaluate_features(const Prior& prior, std::size_t latent, const Eigen::Ref<const Eigen::MatrixXd>& states);
 
 /// A number that is not finite is told by the `fault` of what is returned …
+/// @param multipliers  λ of the motion at each state, for directions that read it (nc × N); null: λ₀
 PriorValues evaluate_prior(const Prior& prior, const Eigen::Ref<const Eigen::MatrixXd>& states,
-                           const Eigen::Ref<const Eigen::VectorXd>& parameters, const MechanicsBatch& mechanics);
+                           const Eigen::Ref<const Eigen::VectorXd>& parameters, const MechanicsBatch& mechanics,
+                           const Eigen::MatrixXd* multipliers = nullptr);
 
 /// … or here by an InputError that names the state.
 PriorValues require_prior_values(const Prior& prior, const Eigen::Ref<const Eigen::MatrixXd>& states,
-                                 const Eigen::Ref<const Eigen::VectorXd>& parameters, const MechanicsBatch& mechanics);
+                                 const Eigen::Ref<const Eigen::VectorXd>& parameters, const MechanicsBatch& mechanics,
+                                 const Eigen::MatrixXd* multipliers = nullptr);
 
 /// ∂μ/∂p and ∂E_a/∂p for parameter p = system parameters()[index], given the values and the system's derivative there.
 PriorValues differentiate_prior(const Prior& prior, const Eigen::Ref<const Eigen::MatrixXd>& states,
                                 const Eigen::Ref<const Eigen::VectorXd>& parameters, const MechanicsBatch& mechanics,
-                                const PriorValues& values, const SystemValues& derivative, int index);
+                                const PriorValues& values, const SystemValues& derivative, int index,
+                                const Eigen::MatrixXd* multipliers = nullptr);
 
 }  // namespace gp2

@@ -1167,6 +1167,7 @@ CSource Writer::write() {
 
 CSource export_c(const Posterior& posterior, const View& view, const CSourceOptions& options) {
   require_view(posterior.prior(), view);
+  require_linear(posterior.prior(), "export to C");
   if (!is_identifier(options.name)) {
     throw InputError(fmt::format("`name`: must be a name of C, of letters, digits and _, got '{}'", options.name));
   }

@@ -84,7 +84,7 @@ InducingChoice choose_inducing_points(const Prior& prior, const std::vector<Obse
   const int n_all = n_states(observations);
   const std::vector<Observations> some = n_all > options.n_candidates ? evenly(observations, options.n_candidates) : observations;
   Reduction reduction;
-  reduce(prior, some, require_models(prior, some, values.parameters, {}), values.noise_stddev, reduction);
+  reduce(prior, some, require_models(prior, some, values.parameters, nullptr), values.noise_stddev, reduction);
   const LatentRows rows = latent_rows(prior, some, reduction, values);
   const Index n = rows.n_samples();
   std::vector<Candidates> latents;
@@ -127,7 +127,7 @@ VectorXd left_out_by_points(const Prior& prior, const std::vector<Observations>&
   };
   std::optional<VectorSum> all = sum_over_blocks(latents, BlocksOfStates(prior, observations, values), false, workers, nullptr,
                                                  VectorSum{VectorXd::Zero(std::ssize(prior.latents))}, add);
-  if (!all) static_cast<void>(require_models(prior, observations, values.parameters, {}));  // names the state
+  if (!all) static_cast<void>(require_models(prior, observations, values.parameters, nullptr));  // names the state
   return std::move(all->sum);
 }
 

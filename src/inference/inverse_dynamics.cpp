@@ -10,6 +10,7 @@
 
 #include "gp2/error.hpp"
 #include "gp2/predictor.hpp"
+#include "inference/requirements.hpp"
 #include "mechanics/describe_fault.hpp"
 
 namespace gp2 {
@@ -108,6 +109,7 @@ MatrixXd InverseDynamics::stddev() const {
 InverseDynamics inverse_dynamics(const Posterior& posterior, const View& view, const Ref<const MatrixXd>& states,
                                  const Ref<const MatrixXd>& accelerations) {
   require_view(posterior.prior(), view);
+  require_linear(posterior.prior(), "inverse_dynamics");
   if (!view.is_of_ddq()) throw InputError("inverse_dynamics: the view must be of the constrained acceleration ddq");
   const Prior& prior = prior_of(posterior.prior(), view);
   const System& system = *prior.system;

@@ -241,7 +241,8 @@ LeftOut leave_out_of(const Posterior& posterior, const Posterior::Implementation
   const std::vector<Observations>& observations = posterior.observations();
   const ModelValues& values = posterior.values();
   Reduction reduction;
-  reduce(prior, observations, require_models(prior, observations, values.parameters, {}), values.noise_stddev, reduction);
+  reduce(prior, observations, require_models(prior, observations, values.parameters, self.about.get()), values.noise_stddev,
+         reduction);
   const std::vector<std::vector<Index>> stretches = samples_of_stretches(self, reduction, n_stretches);
   if (reduction.sums) {
     std::vector<std::vector<Index>> each;

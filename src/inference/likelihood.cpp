@@ -26,6 +26,7 @@ struct Likelihood::Implementation {
   std::optional<std::vector<ObservationModel>> fixed_models;
   std::optional<Reduction> fixed_reduction;
   std::vector<BlocksOfStates::Kept> kept_blocks;  // through inducing points, where they are small enough
+  std::shared_ptr<const Linearisation> about;     // of the initial values
   int initial_size = 0;
   std::shared_ptr<const char> identity = std::make_shared<const char>();
 
@@ -92,7 +93,7 @@ const std::vector<ObservationModel>* Likelihood::Workspace::Implementation::mode
   if (modelled.size() > 0 && modelled == parameters && (has_derivatives || !with_derivatives)) return &own_models;
   modelled.resize(0);
   const std::vector<int> in = with_derivatives ? self.options.gradient_parameters : std::vector<int>{};
-  if (!model_observations(self.prior, self.observations, parameters, in, own_models)) return nullptr;
+  if (!model_observations(self.prior, self.observations, parameters, in, self.about.get(), own_models)) return nullptr;
   modelled = parameters;
   has_derivatives = with_derivatives;
   return &own_models;
@@ -150,6 +151,8 @@ Likelihood::Likelihood(Prior prior, std::vector<Observations> observations, cons
   self.prior = std::move(prior);
   self.observations = std::move(observations);
   self.options = std::move(options);
+  self.about = initial.about;
+  require_learnable(self.prior, self.observations, initial, self.options.gradient_parameters);
   if (initial.inducing) {
     self.prepare_blocks(initial);
   } else {
@@ -159,7 +162,7 @@ Likelihood::Likelihood(Prior prior, std::vector<Observations> observations, cons
 
 void Likelihood::Implementation::prepare(const ModelValues& initial) {
   features = features_by_group(prior, observations);
-  std::vector<ObservationModel> models = require_models(prior, observations, initial.parameters, {});
+  std::vector<ObservationModel> models = require_models(prior, observations, initial.parameters, initial.about.get());
   Reduction reduction;
   reduce(prior, observations, models, initial.noise_stddev, reduction);
   initial_size = static_cast<int>(reduction.size());
@@ -191,7 +194,7 @@ void Likelihood::Implementation::prepare_blocks(const ModelValues& initial) {
       bytes += of_block.bytes();
     }
   });
-  if (!is_sound) static_cast<void>(require_models(prior, observations, initial.parameters, {}));  // names the state
+  if (!is_sound) static_cast<void>(require_models(prior, observations, initial.parameters, nullptr));  // names the state
   initial_size = static_cast<int>(options.workers.sum(size));
   if (options.gradient_parameters.empty() && bytes <= BlocksOfStates::most_kept_bytes) kept_blocks = std::move(kept);
 }

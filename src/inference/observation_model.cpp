@@ -1,7 +1,12 @@
 #include "inference/observation_model.hpp"
 
 #include <algorithm>
+#include <optional>
 #include <utility>
+
+#include "gp2/error.hpp"
+#include "inference/nonlinear_motion.hpp"
+#include "mechanics/describe_fault.hpp"
 
 namespace gp2 {
 
@@ -29,7 +34,8 @@ ObservationModel::Values zero_like(ObservationModel::Values values) {
 }  // namespace
 
 bool model_observations(const Prior& prior, const std::vector<Observations>& observations, const VectorXd& parameters,
-                        const std::vector<int>& gradient_parameters, std::vector<ObservationModel>& models) {
+                        const std::vector<int>& gradient_parameters, const Linearisation* about,
+                        std::vector<ObservationModel>& models) {
   models.resize(observations.size());
   for (std::size_t g = 0; g < observations.size(); ++g) {
     const Observations& group = observations[g];
@@ -41,6 +47,15 @@ bool model_observations(const Prior& prior, const std::vector<Observations>& obs
     model.values = {evaluate_view(group.view(), model.mechanics, group.states()),
                     evaluate_prior(there, group.states(), theta, model.mechanics)};
     if (model.values.prior.fault) return false;
+    const ViewValues unchanged = there.is_nonlinear() ? model.values.view : ViewValues();
+    std::optional<NonlinearMotion> nonlinear;
+    Linearisation::OfGroup at;
+    if (there.is_nonlinear()) {
+      nonlinear.emplace(there, group.states(), theta, model.mechanics);
+      at = about != nullptr ? about->groups[g] : nonlinear->without_signals();
+      if (about == nullptr && nonlinear->solve(at)) return false;
+      nonlinear->linearise(group.view(), at, model.values.view, model.values.prior);
+    }
     model.derivatives.clear();
     for (int parameter : gradient_parameters) {
       const int index = index_there(group.view(), parameter);
@@ -49,9 +64,13 @@ bool model_observations(const Prior& prior, const std::vector<Observations>& obs
         continue;
       }
       const SystemValues d = there.system->differentiate(group.states(), theta, index);
-      model.derivatives.push_back(
-          {differentiate_view(group.view(), model.mechanics, d),
-           differentiate_prior(there, group.states(), theta, model.mechanics, model.values.prior, d, index)});
+      ObservationModel::Values& of_parameter = model.derivatives.emplace_back();
+      of_parameter.view = differentiate_view(group.view(), model.mechanics, d);
+      if (nonlinear) {
+        nonlinear->differentiate(at, d, index, unchanged, of_parameter.view, of_parameter.prior);
+      } else {
+        of_parameter.prior = differentiate_prior(there, group.states(), theta, model.mechanics, model.values.prior, d, index);
+      }
     }
     keep_viewed(group.view(), model.values.prior);
     for (ObservationModel::Values& d : model.derivatives) keep_viewed(group.view(), d.prior);
@@ -60,15 +79,21 @@ bool model_observations(const Prior& prior, const std::vector<Observations>& obs
 }
 
 std::vector<ObservationModel> require_models(const Prior& prior, const std::vector<Observations>& observations,
-                                             const VectorXd& parameters, const std::vector<int>& gradient_parameters) {
+                                             const VectorXd& parameters, const Linearisation* about) {
   std::vector<ObservationModel> models;
-  if (model_observations(prior, observations, parameters, gradient_parameters, models)) return models;
+  if (model_observations(prior, observations, parameters, {}, about, models)) return models;
   // the error names the state
   for (const Observations& group : observations) {
     const Prior& there = prior_of(prior, group.view());
     const VectorXd theta = parameters_of(group.view(), parameters);
     const MechanicsBatch mechanics = require_mechanics(there, group.view(), group.states(), theta);
     static_cast<void>(require_prior_values(there, group.states(), theta, mechanics));
+    if (!there.is_nonlinear()) continue;
+    const NonlinearMotion nonlinear(there, group.states(), theta, mechanics);
+    Linearisation::OfGroup at = nonlinear.without_signals();
+    if (const auto fault = nonlinear.solve(at)) {
+      throw InputError(internal::describe_fault(*there.system, group.states(), *fault));
+    }
   }
   return models;
 }

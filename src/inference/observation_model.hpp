@@ -4,6 +4,7 @@
 
 #include <Eigen/Core>
 
+#include "gp2/inference/model_values.hpp"
 #include "gp2/observations.hpp"
 #include "gp2/prior.hpp"
 
@@ -21,14 +22,16 @@ struct ObservationModel {
   MechanicsBatch mechanics;         // that they come from
 };
 
+/// @param about   where a nonlinear prior is linearised; null: where no latent acts
 /// @param models  receives one per Observations; what it held is memory to be used again
 /// @returns whether neither the mechanics nor the prior have a fault at any state.
 bool model_observations(const Prior& prior, const std::vector<Observations>& observations, const Eigen::VectorXd& parameters,
-                        const std::vector<int>& gradient_parameters, std::vector<ObservationModel>& models);
+                        const std::vector<int>& gradient_parameters, const Linearisation* about,
+                        std::vector<ObservationModel>& models);
 
 /// The same, where a fault is an error.
 /// @throws InputError as require_mechanics of the prior.
 std::vector<ObservationModel> require_models(const Prior& prior, const std::vector<Observations>& observations,
-                                             const Eigen::VectorXd& parameters, const std::vector<int>& gradient_parameters);
+                                             const Eigen::VectorXd& parameters, const Linearisation* about);
 
 }  // namespace gp2

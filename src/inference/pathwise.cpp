@@ -72,12 +72,12 @@ MatrixXd PathwiseSamples::evaluate(int sample, const View& view, const Ref<const
   }
   const auto& [component, paths] = implementation().samples[static_cast<std::size_t>(sample)];
   const Posterior::Implementation& posterior = *component;
-  const Query query = make_query(posterior, view, states);
+  Query query = make_query(posterior, view, states);
   std::vector<MatrixXd> f(paths.size());
   KernelColumns::Workspace workspace;
   VectorXd psi, point, k, sums;
   for (std::size_t a = 0; a < paths.size(); ++a) {
-    if (!query.needs(a)) continue;
+    if (query.needed && !query.needed->has(a)) continue;
     const LatentPath& path = paths[a];
     const KernelColumns& kernel = posterior.latents->latents()[a].kernel;
     psi.resize(path.features.size());
@@ -94,6 +94,7 @@ MatrixXd PathwiseSamples::evaluate(int sample, const View& view, const Ref<const
     }
   }
   MatrixXd values(view.size(), query.size());
+  query.linearise(posterior, f);
   query.view_of(posterior, f, values);
   return values;
 }

@@ -35,7 +35,7 @@ void throw_not_definite() {
 void Posterior::Implementation::add_samples(const std::vector<Observations>& groups, const std::vector<VectorXd>& noise_stddev,
                                             int first_group) {
   Reduction reduction;
-  reduce(prior, groups, require_models(prior, groups, values.parameters, {}), noise_stddev, reduction);
+  reduce(prior, groups, require_models(prior, groups, values.parameters, about.get()), noise_stddev, reduction);
   const RowBlock block{latent_rows(prior, groups, reduction, values)};
   bool is_positive_definite = true;
   if (latents) {
@@ -64,6 +64,7 @@ Posterior::Implementation::Implementation(Prior of, std::vector<Observations> ob
     : prior(std::move(of)), observations(std::move(observed)), values(std::move(under)), n_given_groups(observations.size()) {
   require_observations(prior, observations);
   require_values(prior, observations, values);
+  require_learnable(prior, observations, values, {});
   for (std::size_t a = 0; a < prior.latents.size(); ++a) C.push_back(values.loading(a));
 }
 
@@ -71,6 +72,8 @@ void Posterior::Implementation::condition(const Workers& workers) {
   const lapack::SingleThread single_thread;
   if (values.inducing) {
     condition_through_points(workers);
+  } else if (prior.is_nonlinear() && !observations.empty()) {
+    condition_nonlinear();
   } else {
     add_samples(observations, values.noise_stddev, 0);
   }
@@ -138,7 +141,8 @@ MatrixXd mean_of(const Posterior::Implementation& self, const View& view, const 
     Query& query = queries[static_cast<std::size_t>(thread)];
     LatentSums& sum = sums[static_cast<std::size_t>(thread)];
     query.evaluate(self, view, states, first, n);
-    sum.evaluate(query.features, view.latent);
+    sum.evaluate(query.features, query.needed);
+    query.linearise(self, sum.mean());
     query.view_of(self, sum.mean(), mean.middleCols(first, n));
   });
   return mean;
@@ -172,9 +176,13 @@ class MarginalBlock {
                Index column) {
     const Index d = view.size();
     query_.evaluate(posterior_, view, states, first, n);
+    if (posterior_.prior.is_nonlinear()) {
+      sums_.evaluate(query_.features, query_.needed);
+      query_.linearise(posterior_, sums_.mean());
+    }
     const std::vector<MatrixXd> loadings = query_.loadings(posterior_);
     cross_.resize(posterior_.latents->size(), d * n);
-    sums_.evaluate(query_.features, view.latent, &loadings, &cross_);
+    sums_.evaluate(query_.features, query_.needed, &loadings, &cross_);
     query_.view_of(posterior_, sums_.mean(), marginal.mean.middleCols(column, n));
     posterior_.latents->whiten(cross_);
 
@@ -347,7 +355,12 @@ Posterior::Joint joint_of(const Posterior::Implementation& self, const std::vect
   std::vector<Index> first;  // row of each query
   Index size = 0;
   for (const ViewAt& quantity : quantities) {
-    const Query& query = queries.emplace_back(make_query(self, quantity.view, quantity.states));
+    Query& query = queries.emplace_back(make_query(self, quantity.view, quantity.states));
+    if (self.prior.is_nonlinear()) {
+      LatentSums mean(*self.latents);
+      mean.evaluate(query.features, query.needed);
+      query.linearise(self, mean.mean());
+    }
     loadings.push_back(query.loadings(self));
     first.push_back(size);
     size += query.n_rows() * query.size();
@@ -360,7 +373,7 @@ Posterior::Joint joint_of(const Posterior::Implementation& self, const std::vect
     const Index d = query.n_rows(), n = query.size();
     if (d * n == 0) continue;
     cross_of_query.resize(cross.rows(), d * n);
-    sums.evaluate(query.features, query.latent, &loadings[q], &cross_of_query);
+    sums.evaluate(query.features, query.needed, &loadings[q], &cross_of_query);
     cross.middleCols(first[q], d * n) = cross_of_query;
     query.view_of(self, sums.mean(), Map<MatrixXd>(joint.mean.data() + first[q], d, n));
     for (std::size_t r = 0; r <= q; ++r) {

@@ -35,11 +35,15 @@ struct Posterior::Implementation {
   std::shared_ptr<std::once_flag> conditioning;  // of a lazy posterior: whether `latents` stand; null: they do
   std::size_t n_given_groups = 0;                // of `observations`, that the constructor was given: the first ones
 
+  std::shared_ptr<const Linearisation> about;  // of a nonlinear prior: the posterior mean of its signals
+
   std::optional<KeptStates> kept;  // through inducing points: which `observations` still are here
 
   /// The latents given `observations`.
   /// @throws as add_samples
   void condition(const Workers& workers);
+  /// What condition is of a nonlinear prior: Gauss–Newton steps, each of which conditions a linear one (theory.md, T47).
+  void condition_nonlinear();
   /// Samples of more observations; `observations` stay as they are. On an error nothing has changed.
   /// @param noise_stddev  per group
   /// @param first_group   the group of `observations` that groups[0] is, or is going to be
@@ -55,6 +59,10 @@ struct Posterior::Implementation {
 };
 
 [[noreturn]] void throw_not_definite();
+
+/// Where a nonlinear prior is linearised under these values: at its posterior mean. @throws as Posterior
+std::shared_ptr<const Linearisation> linearisation_of(const Prior& prior, const std::vector<Observations>& observations,
+                                                      const ModelValues& values);
 
 /// Which samples are of which component: each of one that chance chooses, by the seed and its number alone.
 std::vector<std::vector<Eigen::Index>> samples_of_components(int n_components, int n_samples, std::uint64_t seed);

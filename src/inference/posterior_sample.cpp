@@ -11,6 +11,7 @@
 namespace gp2 {
 
 using Eigen::Index;
+using Eigen::Map;
 using Eigen::MatrixXd;
 using Eigen::Ref;
 using Eigen::VectorXd;
@@ -80,12 +81,32 @@ LatentGaussian latent_posterior(const Posterior::Implementation& self, const Lat
   return out;
 }
 
+// The views of query q of a nonlinear prior, sample by sample.
+Index view_samples(const Posterior::Implementation& self, const LatentPoints& points, std::size_t q, const MatrixXd& samples_of_f,
+                   Query& query, Ref<MatrixXd> out) {
+  std::vector<MatrixXd> f(self.C.size());
+  for (Index s = 0; s < out.cols(); ++s) {
+    for (std::size_t a = 0; a < f.size(); ++a) {
+      const Index n_points = points.features[a].rows();
+      f[a].resize(self.C[a].cols(), query.size());
+      for (Index i = 0; i < query.size(); ++i) {
+        for (Index l = 0; l < f[a].rows(); ++l) {
+          f[a](l, i) = samples_of_f(points.first[a] + l * n_points + points.of_state[q][static_cast<std::size_t>(i)], s);
+        }
+      }
+    }
+    query.linearise(self, f);
+    query.view_of(self, f, Map<MatrixXd>(out.col(s).data(), query.n_rows(), query.size()));
+  }
+  return out.rows();
+}
+
 MatrixXd sample_of(const Posterior::Implementation& self, const std::vector<ViewAt>& quantities, int n_samples,
                    RandomStream random) {
   std::vector<Query> queries;
   Index n_rows = 0;
   for (const ViewAt& quantity : quantities) {
-    const Query& query = queries.emplace_back(make_query(self, quantity.view, quantity.states));
+    Query& query = queries.emplace_back(make_query(self, quantity.view, quantity.states));
     n_rows += query.n_rows() * query.size();
   }
   const LatentPoints points(self, queries);
@@ -102,7 +123,11 @@ MatrixXd sample_of(const Posterior::Implementation& self, const std::vector<View
   MatrixXd samples(n_rows, n_samples);
   Index row = 0;
   for (std::size_t q = 0; q < queries.size(); ++q) {
-    const Query& query = queries[q];
+    Query& query = queries[q];
+    if (self.prior.is_nonlinear()) {
+      row += view_samples(self, points, q, f, query, samples.middleRows(row, query.n_rows() * query.size()));
+      continue;
+    }
     for (int i = 0; i < static_cast<int>(query.size()); ++i, row += query.n_rows()) {
       MatrixXd a_bar = query.prior.mean.col(i).replicate(1, n_samples);
       for (std::size_t a = 0; a < self.C.size(); ++a) {

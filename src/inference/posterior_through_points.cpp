@@ -20,7 +20,7 @@ InducingStatistics require_statistics(const Prior& prior, const std::vector<Obse
                                       const ModelValues& values, const InducingLatents& latents, const Workers& workers) {
   std::optional<InducingStatistics> statistics =
       InducingStatistics::of(latents, BlocksOfStates(prior, observations, values), workers);
-  if (!statistics) static_cast<void>(require_models(prior, observations, values.parameters, {}));  // names the state
+  if (!statistics) static_cast<void>(require_models(prior, observations, values.parameters, nullptr));  // names the state
   return *std::move(statistics);
 }
 
@@ -73,7 +73,7 @@ void Posterior::Implementation::add_through_points(const Observations& more, std
   ModelValues under = values;
   under.noise_stddev = {more.noise().stddev()};
   if (!latents->append(BlocksOfStates(prior, added, under))) {
-    static_cast<void>(require_models(prior, added, values.parameters, {}));  // names the state
+    static_cast<void>(require_models(prior, added, values.parameters, nullptr));  // names the state
     throw_not_definite();
   }
   if (group == observations.size()) {

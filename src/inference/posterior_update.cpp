@@ -81,6 +81,7 @@ std::vector<std::shared_ptr<Posterior::Implementation>> Posterior::own_component
 }
 
 Posterior update(Posterior&& posterior, Observations added) {
+  require_linear(posterior.prior(), "update");
   require_observations(posterior.prior(), added);
   added.require_no_sums();
   const lapack::SingleThread single_thread;
@@ -103,6 +104,7 @@ Posterior forget(Posterior&& posterior, double share) {
 }
 
 Posterior remove_oldest(Posterior&& posterior, int n) {
+  require_linear(posterior.prior(), "remove_oldest");
   if (posterior.implementation().kept) {
     throw InputError("what was learned through inducing points cannot be taken away: the observations themselves are not kept");
   }

@@ -1,6 +1,7 @@
 #include "inference/query.hpp"
 
 #include "gp2/error.hpp"
+#include "mechanics/describe_fault.hpp"
 
 namespace gp2 {
 
@@ -21,6 +22,17 @@ void Query::evaluate(const Posterior::Implementation& posterior, const View& vie
   view = evaluate_view(viewed, mechanics, block);
   prior = require_prior_values(there, block, parameters, mechanics);
   latent = viewed.latent;
+  needed = there.is_nonlinear() ? std::nullopt : latent;
+  nonlinear_.reset();
+  if (there.is_nonlinear()) {
+    nonlinear_ = std::make_shared<Nonlinear>();
+    nonlinear_->mechanics = std::move(mechanics);
+    nonlinear_->motion = std::make_unique<NonlinearMotion>(there, block, parameters, nonlinear_->mechanics);
+    nonlinear_->view = view;
+    nonlinear_->of = viewed;
+    nonlinear_->states = states;
+    nonlinear_->first = first;
+  }
   keep_viewed(viewed, prior);
   features.resize(there.latents.size());
   for (std::size_t a = 0; a < features.size(); ++a) features[a] = features_of_block(there, a, states, first, n);
@@ -33,6 +45,18 @@ MatrixXd features_of_block(const Prior& prior, std::size_t a, const Ref<const Ma
     static_cast<void>(evaluate_features(prior, a, states));
     throw;
   }
+}
+
+void Query::linearise(const Posterior::Implementation& posterior, const std::vector<MatrixXd>& f) {
+  if (!nonlinear_) return;
+  Linearisation::OfGroup at;
+  for (std::size_t a = 0; a < f.size(); ++a) at.signals.push_back(posterior.C[a] * f[a]);
+  if (auto fault = nonlinear_->motion->solve(at)) {
+    fault->state += static_cast<int>(nonlinear_->first);
+    throw InputError(internal::describe_fault(*prior_of(posterior.prior, nonlinear_->of).system, nonlinear_->states, *fault));
+  }
+  view = nonlinear_->view;
+  nonlinear_->motion->linearise(nonlinear_->of, at, view, prior);
 }
 
 void Query::view_of(const Posterior::Implementation& posterior, const std::vector<MatrixXd>& f, Ref<MatrixXd> values) const {

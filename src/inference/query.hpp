@@ -1,10 +1,12 @@
 #pragma once
 
+#include <memory>
 #include <optional>
 #include <vector>
 
 #include <Eigen/Core>
 
+#include "inference/nonlinear_motion.hpp"
 #include "inference/posterior_implementation.hpp"
 
 namespace gp2 {
@@ -16,6 +18,7 @@ struct Query {
   PriorValues prior;
   std::vector<Eigen::MatrixXd> features;  // per latent (n × D)
   std::optional<LatentRange> latent;      // the one that is viewed alone
+  std::optional<LatentRange> needed;      // those that it takes: of a nonlinear prior all, as λ does
 
   [[nodiscard]] Eigen::Index size() const { return view.offset.cols(); }    // n
   [[nodiscard]] Eigen::Index n_rows() const { return view.offset.rows(); }  // d
@@ -26,12 +29,28 @@ struct Query {
   void evaluate(const Posterior::Implementation& posterior, const View& view, const Eigen::Ref<const Eigen::MatrixXd>& states,
                 Eigen::Index first, Eigen::Index n);
 
+  /// Of a nonlinear prior: takes v to first order about f_a at each state, where it is exact, per latent (F × n). Before each of the two
+  /// below; of another prior it does nothing.
+  /// @throws InputError where a state has no motion under them
+  void linearise(const Posterior::Implementation& posterior, const std::vector<Eigen::MatrixXd>& f);
+
   /// v at every state, given f_a there, per latent (F × n).
   void view_of(const Posterior::Implementation& posterior, const std::vector<Eigen::MatrixXd>& f,
                Eigen::Ref<Eigen::MatrixXd> values) const;
 
   /// (G E_a C_a)ᵀ per latent: of v = … + Σ_a ℓ_aᵀ f_a at each state (F·d × n). Zero where the latent is not viewed.
   [[nodiscard]] std::vector<Eigen::MatrixXd> loadings(const Posterior::Implementation& posterior) const;
+
+ private:
+  struct Nonlinear {
+    MechanicsBatch mechanics;
+    std::unique_ptr<NonlinearMotion> motion;
+    ViewValues view;  // without latents
+    View of;
+    Eigen::MatrixXd states;  // all that were asked for, for the message
+    Eigen::Index first = 0;
+  };
+  std::shared_ptr<Nonlinear> nonlinear_;
 };
 
 /// evaluate_features at the states first … first + n − 1.

@@ -77,7 +77,7 @@ const RowBlock* BlocksOfStates::block(Index b, bool with_derivatives, Memory& me
     memory.models.resize(1);
     memory.models.front().mechanics.size_of_b_elsewhere = size_of_b_[group];
     const std::vector<int> in = with_derivatives ? gradient_parameters_ : std::vector<int>{};
-    if (!model_observations(prior_, memory.observations, values_.parameters, in, memory.models)) return nullptr;
+    if (!model_observations(prior_, memory.observations, values_.parameters, in, nullptr, memory.models)) return nullptr;
     block.models = &memory.models;
   }
   reduce(prior_, memory.observations, *block.models, {values_.noise_stddev[group]}, memory.reduction);

@@ -152,8 +152,8 @@ std::string latents_text(const Model& model, bool full) {
       text += fmt::format("  lengthscale {} {}\n", feature, range_text(range));
     }
     if (spec.directions.empty() && !spec.direction_code) return;
-    text += fmt::format("  directions{}\n{}", latent.base == Latent::Base::force ? " (forces)" : "",
-                        directions_text(model, spec, full));
+    text += fmt::format("  directions{}{}\n{}", latent.base == Latent::Base::force ? " (forces)" : "",
+                        latent.is_positive ? ", times the exponential of the latent" : "", directions_text(model, spec, full));
   });
   return text;
 }

@@ -82,34 +82,39 @@ const MatrixXd& KnownMultipliers::derivatives() {
 }
 
 namespace {
-constexpr std::string_view name_start = "lambda0(";
-}
 
-std::string known_multiplier_name(int row) { return fmt::format("{}{})", name_start, row + 1); }
+constexpr std::string_view known = "lambda0(", of_motion = "lambda(";
 
-bool is_known_multiplier(std::string_view variable) { return variable.starts_with(name_start); }
+std::string name_of(bool is_of_motion, int row) { return fmt::format("{}{})", is_of_motion ? of_motion : known, row + 1); }
 
-std::optional<std::string> row_fault(std::string_view known_multiplier, int nc) {
+}  // namespace
+
+bool is_multiplier(std::string_view variable) { return variable.starts_with(known) || variable.starts_with(of_motion); }
+
+std::optional<std::string> row_fault(std::string_view multiplier, int nc) {
   for (int row = 0; row < nc; ++row) {
-    if (known_multiplier == known_multiplier_name(row)) return std::nullopt;
+    if (multiplier == name_of(multiplier.starts_with(of_motion), row)) return std::nullopt;
   }
-  return fmt::format("{}: there is no such row of the constraints, of which there are {}", known_multiplier, nc);
+  return fmt::format("{}: there is no such row of the constraints, of which there are {}", multiplier, nc);
 }
 
-std::vector<Expression> known_multipliers_in(std::span<const Expression> expressions, const System& system) {
-  bool reads = false;
+Multipliers multipliers_in(std::span<const Expression> expressions, const System& system) {
+  bool reads_known = false;
+  Multipliers multipliers;
   for (const Expression& expression : expressions) {
     for (const std::string& variable : expression.graph().variables_of(expression)) {
-      if (!is_known_multiplier(variable)) continue;
-      reads = true;
+      if (!is_multiplier(variable)) continue;
       if (const auto fault = row_fault(variable, system.nc())) throw InputError(*fault);
+      (variable.starts_with(known) ? reads_known : multipliers.are_of_motion) = true;
     }
   }
-  std::vector<Expression> variables;
-  for (int row = 0; reads && row < system.nc(); ++row) {
-    variables.push_back(expressions.front().graph().variable(known_multiplier_name(row)));
+  if (reads_known && multipliers.are_of_motion) {
+    throw InputError("both lambda0 and lambda are read: write lambda for both, the multipliers of the motion itself");
   }
-  return variables;
+  for (int row = 0; (reads_known || multipliers.are_of_motion) && row < system.nc(); ++row) {
+    multipliers.variables.push_back(expressions.front().graph().variable(name_of(multipliers.are_of_motion, row)));
+  }
+  return multipliers;
 }
 
 MatrixXd with_known_multipliers(const System& system, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters) {

@@ -47,18 +47,20 @@ class KnownMultipliers {
   Eigen::MatrixXd r_, force_matrix_, da_, of_rows_, dA_along_, dlambda_;
 };
 
-/// What an expression calls λ₀ of row i, from 0: "lambda0(1)".
-std::string known_multiplier_name(int row);
-
-/// Whether this is the name of one.
-bool is_known_multiplier(std::string_view variable);
+/// Whether an expression means a multiplier by this name: λ₀ of row i "lambda0(i)" or λ, that of the motion itself, "lambda(i)".
+bool is_multiplier(std::string_view variable);
 
 /// What is wrong with reading such a one where there are nc rows.
-std::optional<std::string> row_fault(std::string_view known_multiplier, int nc);
+std::optional<std::string> row_fault(std::string_view multiplier, int nc);
 
-/// The variables λ₀ of every row, where an expression reads one of them; none elsewhere.
-/// @throws InputError where the system has no such row.
-std::vector<Expression> known_multipliers_in(std::span<const Expression> expressions, const System& system);
+/// The variables of every row, where an expression reads one of them; none elsewhere.
+struct Multipliers {
+  std::vector<Expression> variables;
+  bool are_of_motion = false;  // λ, not λ₀
+};
+
+/// @throws InputError where the system has no such row, or both λ₀ and λ are read.
+Multipliers multipliers_in(std::span<const Expression> expressions, const System& system);
 
 /// [states; λ₀] (layout size + nc × N).
 Eigen::MatrixXd with_known_multipliers(const System& system, const Eigen::Ref<const Eigen::MatrixXd>& states,

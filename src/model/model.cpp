@@ -106,7 +106,7 @@ Expression Model::parse_symbols(std::string_view written, const std::vector<Expr
   bool is_unknown = false;
   const auto resolve = [&](std::string_view symbol) -> std::optional<Expression> {
     if (const auto found = symbols_.find(symbol); found != symbols_.end()) return found->second;
-    if (is_known_multiplier(symbol)) return graph->variable(symbol);
+    if (is_multiplier(symbol)) return graph->variable(symbol);
     const std::optional<Expression> of_robot =
         robot_expressions_ ? robot_expressions_->variable(std::string(symbol)) : std::nullopt;
     is_unknown = !of_robot;

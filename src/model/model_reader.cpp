@@ -98,7 +98,7 @@ class ModelReader : private TomlReader {
 
   [[nodiscard]] std::vector<std::string> loads_of(Expression e) const {
     std::vector<std::string> loads = definition_.graph->variables_of(e);
-    std::erase_if(loads, [](const std::string& variable) { return !is_known_multiplier(variable); });
+    std::erase_if(loads, [](const std::string& variable) { return !is_multiplier(variable); });
     return loads;
   }
 
@@ -880,7 +880,8 @@ class ModelReader : private TomlReader {
     std::set<std::string> names;
     for (const toml::node& node : array(*root_.get("latent"), "latent")) {
       const toml::table& entry = table(node, "latent");
-      only_keys(entry, "latent", {"name", "kernel", "features", "directions", "lengthscale", "lengthscales", "signal_stddev"});
+      only_keys(entry, "latent",
+                {"name", "kernel", "features", "directions", "positive", "lengthscale", "lengthscales", "signal_stddev"});
       LatentSpec latent;
       latent.name =
           entry.contains("name") ? text(*entry.get("name"), "latent.name") : fmt::format("latent {}", model_.latents.size() + 1);
@@ -891,6 +892,7 @@ class ModelReader : private TomlReader {
       if (!entry.contains("features")) fail(node, "latent", R"(missing features = ["q1", …])");
       read_features(*entry.get("features"), latent);
       if (entry.contains("directions")) read_directions(*entry.get("directions"), latent);
+      if (entry.contains("positive")) read_positive(*entry.get("positive"), latent);
       latent.lengthscale = relative_range(entry, "lengthscale");
       latent.signal_stddev = relative_range(entry, "signal_stddev");
       try {
@@ -1015,6 +1017,13 @@ class ModelReader : private TomlReader {
         latent.directions.back().push_back(written_expression(entry, key, value));
       }
     }
+  }
+
+  void read_positive(const toml::node& node, LatentSpec& latent) const {
+    const std::string key = "latent.positive";
+    latent.is_positive = boolean(node, key);
+    if (!latent.is_positive || !latent.directions.empty() || latent.direction_code) return;
+    fail(node, key, "a positive latent needs directions of its own, which it acts along: directions = { force = [[…], …] }");
   }
 
   void read_noise() {

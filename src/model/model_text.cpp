@@ -88,7 +88,7 @@ std::string latent_text(const LatentSpec& spec) {
   return fmt::format("\n[[latent]]\nname = {}\n{}features = {}\n", quoted(spec.name),
                      spec.kernel.empty() ? "" : fmt::format("kernel = {}\n", quoted(spec.kernel)),
                      spec.feature_code ? fmt::format("{{ code = {} }}", features) : features) +
-         directions_text(spec) + ranges_text(spec);
+         directions_text(spec) + (spec.is_positive ? "positive = true\n" : "") + ranges_text(spec);
 }
 
 }  // namespace

@@ -22,10 +22,13 @@ std::shared_ptr<const StateFunction> ExpressionFunction::of_state(std::span<cons
                                                                   const SystemSymbols& symbols,
                                                                   const std::shared_ptr<const System>& system) {
   std::vector<Expression> inputs = symbols.state();
-  const std::vector<Expression> lambda0 = known_multipliers_in(expressions, *system);
-  inputs.insert(inputs.end(), lambda0.begin(), lambda0.end());
+  const Multipliers load = multipliers_in(expressions, *system);
+  if (load.are_of_motion) {
+    throw InputError("lambda is what the latents make it, so that only directions and [truth] may read it; write lambda0");
+  }
+  inputs.insert(inputs.end(), load.variables.begin(), load.variables.end());
   std::shared_ptr<const StateFunction> function(new ExpressionFunction(expressions, inputs, inputs.size()));
-  if (lambda0.empty()) return function;
+  if (load.variables.empty()) return function;
   return std::make_shared<LoadFunction>(std::move(function), system);
 }
 
@@ -33,8 +36,8 @@ std::shared_ptr<const StateFunction> ExpressionFunction::of_state_and_parameters
                                                                                  const SystemSymbols& symbols,
                                                                                  ExpressionGraph& graph,
                                                                                  const std::shared_ptr<const System>& system) {
-  const std::vector<Expression> lambda0 = known_multipliers_in(expressions, *system);
-  const std::vector<Expression> inputs = symbols.state_and_parameters(lambda0);
+  const Multipliers load = multipliers_in(expressions, *system);
+  const std::vector<Expression> inputs = symbols.state_and_parameters(load.variables);
   std::shared_ptr<ExpressionFunction> function(
       new ExpressionFunction(expressions, inputs, inputs.size() - symbols.parameters.size()));
   for (const Expression parameter : symbols.parameters) {
@@ -42,8 +45,8 @@ std::shared_ptr<const StateFunction> ExpressionFunction::of_state_and_parameters
     for (const Expression expression : expressions) derivatives.push_back(graph.differentiate(expression, parameter));
     function->parameter_derivatives_.emplace_back(derivatives, inputs);
   }
-  if (lambda0.empty()) return function;
-  return std::make_shared<LoadFunction>(std::move(function), system);
+  if (load.variables.empty()) return function;
+  return std::make_shared<LoadFunction>(std::move(function), system, load.are_of_motion);
 }
 
 MatrixXd ExpressionFunction::evaluate(const States& states, const Parameters& parameters) const {

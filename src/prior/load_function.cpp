@@ -26,8 +26,11 @@ void add_product(double slope, double change, double& sum) {
 
 }  // namespace
 
-LoadFunction::LoadFunction(std::shared_ptr<const StateFunction> function, std::shared_ptr<const System> system)
-    : function_(std::move(function)), system_(std::move(system)), lambda0_reads_(system_->reads(SystemPart::mechanics)) {
+LoadFunction::LoadFunction(std::shared_ptr<const StateFunction> function, std::shared_ptr<const System> system, bool is_of_motion)
+    : function_(std::move(function)),
+      system_(std::move(system)),
+      lambda0_reads_(system_->reads(SystemPart::mechanics)),
+      is_of_motion_(is_of_motion) {
   const std::vector<bool> force = system_->reads(SystemPart::force);
   for (std::size_t k = 0; k < force.size(); ++k) lambda0_reads_[k] = lambda0_reads_[k] || force[k];
 }

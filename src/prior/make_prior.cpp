@@ -56,6 +56,7 @@ class LatentMaker {
     latent.base = options_.base.value_or(spec.base);
     latent.lengthscale = spec.lengthscale;
     latent.signal_stddev = spec.signal_stddev;
+    latent.is_positive = spec.is_positive;
     set_features(spec, latent);
     latent.kernel =
         named(spec, [&] { return Kernel::parse(spec.kernel.empty() ? options_.kernel : spec.kernel, latent.feature_names); });
@@ -128,10 +129,11 @@ class LatentMaker {
         latent.feature_names.push_back(name);
         const Expression value = named(spec, [&] { return words_.parse(name); });
         const std::vector<std::string> read = words_.graph.variables_of(value);
-        const bool reads_lambda0 = std::any_of(read.begin(), read.end(), is_known_multiplier);
+        const bool reads_multipliers = std::any_of(read.begin(), read.end(), is_multiplier);
         for (int k = 0; k < std::ssize(system_->parameters()); ++k) {
           const std::string& parameter = system_->parameters()[static_cast<std::size_t>(k)].name;
-          if (std::binary_search(read.begin(), read.end(), parameter) || (reads_lambda0 && system_->depends_on_parameter(k))) {
+          if (std::binary_search(read.begin(), read.end(), parameter) ||
+              (reads_multipliers && system_->depends_on_parameter(k))) {
             latent.feature_parameters.push_back(k);
           }
         }
@@ -232,6 +234,7 @@ void require_well_formed(const LatentSpec& spec, const System& system) {
     if (spec.direction_names.empty()) fail("directions that are code need a name for each column");
     return;
   }
+  if (spec.directions.empty() && spec.is_positive) fail("a positive latent needs directions of its own, which it acts along");
   if (spec.directions.empty()) return;
   if (std::ssize(spec.directions) != system.nq()) {
     fail(fmt::format("directions: expected {} rows, one per coordinate, got {}", system.nq(), spec.directions.size()));
@@ -322,7 +325,7 @@ Prior make_prior(std::shared_ptr<const System> system, const std::vector<LatentS
   }
   const auto parse = [&](const std::string& text) {
     const auto resolve = [&](std::string_view name) -> std::optional<Expression> {
-      if (is_known_multiplier(name)) return graph.variable(name);
+      if (is_multiplier(name)) return graph.variable(name);
       const auto found = known.find(name);
       return found == known.end() ? std::nullopt : std::optional(found->second);
     };

@@ -1,5 +1,6 @@
 #include "gp2/prior.hpp"
 
+#include <algorithm>
 #include <cmath>
 #include <utility>
 
@@ -21,8 +22,17 @@ namespace {
 
 Map<MatrixXd> block(MatrixXd& matrix, int i, Index rows) { return {matrix.col(i).data(), rows, matrix.rows() / rows}; }
 
-// B(x) at N states
-MatrixXd evaluate_base(const Latent& latent, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters, Index nq) {
+MatrixXd stacked(const Ref<const MatrixXd>& above, const Ref<const MatrixXd>& below) {
+  MatrixXd all(above.rows() + below.rows(), above.cols());
+  all << above, below;
+  return all;
+}
+
+// B(x) or B(x, λ) at N states
+MatrixXd evaluate_base(const Latent& latent, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters, Index nq,
+                       const MatrixXd* multipliers) {
+  const StateFunction* const of_multipliers = multipliers && latent.directions ? latent.directions->of_multipliers() : nullptr;
+  if (of_multipliers != nullptr) return of_multipliers->evaluate(stacked(states, *multipliers), parameters);
   if (latent.directions) return latent.directions->evaluate(states, parameters);
   const MatrixXd identity = MatrixXd::Identity(nq, nq);
   return identity.reshaped().replicate(1, states.cols());
@@ -79,6 +89,12 @@ void require_prior(const Prior& prior) {
   for (const Latent& latent : prior.latents) require_latent(latent, nq);
 }
 
+bool Prior::is_nonlinear() const {
+  return std::ranges::any_of(latents, [](const Latent& latent) {
+    return latent.is_positive || (latent.directions && latent.directions->of_multipliers() != nullptr);
+  });
+}
+
 std::vector<bool> Prior::reads() const {
   require_prior(*this);
   std::vector<bool> reads = system->reads(SystemPart::mechanics);
@@ -112,7 +128,7 @@ MatrixXd evaluate_features(const Prior& prior, std::size_t latent, const Ref<con
 }
 
 PriorValues evaluate_prior(const Prior& prior, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters,
-                           const MechanicsBatch& mechanics) {
+                           const MechanicsBatch& mechanics, const MatrixXd* multipliers) {
   const Index nq = prior.system->nq();
   const int n_states = static_cast<int>(states.cols());
   PriorValues values{MatrixXd::Zero(nq, n_states), {}};
@@ -127,7 +143,7 @@ PriorValues evaluate_prior(const Prior& prior, const Ref<const MatrixXd>& states
     }
   }
   for (const Latent& latent : prior.latents) {
-    MatrixXd E = evaluate_base(latent, states, parameters, nq);
+    MatrixXd E = evaluate_base(latent, states, parameters, nq, multipliers);
     const std::optional<Entry> entry = values.fault ? std::nullopt : first_not_finite(E);
     if (entry) {
       values.fault = {entry->state, fmt::format("latent '{}': '{}' along '{}' is not a finite number", latent.name,
@@ -148,15 +164,15 @@ PriorValues evaluate_prior(const Prior& prior, const Ref<const MatrixXd>& states
 }
 
 PriorValues require_prior_values(const Prior& prior, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters,
-                                 const MechanicsBatch& mechanics) {
-  PriorValues values = evaluate_prior(prior, states, parameters, mechanics);
+                                 const MechanicsBatch& mechanics, const MatrixXd* multipliers) {
+  PriorValues values = evaluate_prior(prior, states, parameters, mechanics, multipliers);
   if (values.fault) throw InputError(internal::describe_fault(*prior.system, states, *values.fault));
   return values;
 }
 
 PriorValues differentiate_prior(const Prior& prior, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters,
                                 const MechanicsBatch& mechanics, const PriorValues& values, const SystemValues& derivative,
-                                int index) {
+                                int index, const MatrixXd* multipliers) {
   const Index nq = prior.system->nq();
   const int n_states = static_cast<int>(states.cols());
   PriorValues d{MatrixXd::Zero(nq, n_states), {}};
@@ -170,14 +186,16 @@ PriorValues differentiate_prior(const Prior& prior, const Ref<const MatrixXd>& s
   }
   for (std::size_t a = 0; a < prior.latents.size(); ++a) {
     const Latent& latent = prior.latents[a];
-    MatrixXd dE = latent.directions ? latent.directions->differentiate(states, parameters, index)
-                                    : MatrixXd::Zero(values.directions[a].rows(), n_states);
+    const StateFunction* const of_multipliers = multipliers && latent.directions ? latent.directions->of_multipliers() : nullptr;
+    MatrixXd dE = of_multipliers != nullptr ? of_multipliers->differentiate(stacked(states, *multipliers), parameters, index)
+                  : latent.directions       ? latent.directions->differentiate(states, parameters, index)
+                                            : MatrixXd::Zero(values.directions[a].rows(), n_states);
     // E = M⁻¹B: dE = M⁻¹(dB − dM E)
     if (latent.base == Latent::Base::force) {
       for (int i = 0; i < n_states; ++i) block(dE, i, nq) = solve(i, block(dE, i, nq), values.E(a, i));
     } else if (latent.base == Latent::Base::admissible && n_states > 0) {
       AdmissibleDirections directions =
-          admissible_directions(evaluate_base(latent, states.leftCols(1), parameters, nq).col(0), nq);
+          admissible_directions(evaluate_base(latent, states.leftCols(1), parameters, nq, nullptr).col(0), nq);
       for (int i = 0; i < n_states; ++i) {
         directions.compute(mechanics.values.A(i));
         block(dE, i, nq) = directions.differentiate(derivative.A(i));

@@ -288,7 +288,7 @@ class Sampler {
     const System& system = *model_.system;
     std::vector<Expression> added = model_.truth;
     added.insert(added.end(), model_.truth_force.begin(), model_.truth_force.end());
-    const Tape truth(added, symbols_.state_and_parameters(known_multipliers_in(added, system)));
+    const Tape truth(added, symbols_.state_and_parameters(multipliers_in(added, system).variables));
     const std::vector<bool> mechanics = system.reads(SystemPart::mechanics);
     const std::vector<bool> force = system.reads(SystemPart::force);
     const std::vector<bool> residuals = system.reads(SystemPart::residuals);

@@ -5,12 +5,15 @@
 #include "gp2/error.hpp"
 #include "gp2/mechanics/quantity.hpp"
 #include "gp2/mechanics/udwadia_kalaba.hpp"
+#include "gp2/view.hpp"
 #include "mechanics/describe_fault.hpp"
 #include "mechanics/known_multipliers.hpp"
+#include "mechanics/solve_multipliers.hpp"
 
 namespace gp2 {
 
 using Eigen::MatrixXd;
+using Eigen::VectorXd;
 
 void require_truth(const Model& model) {
   if (model.truth.empty()) {
@@ -22,10 +25,52 @@ void require_truth(const Model& model) {
 ModelMotion::ModelMotion(const Model& model) : system_(model.system), parameters_(model.system->parameter_values()) {
   std::vector<Expression> all = model.truth;
   all.insert(all.end(), model.truth_force.begin(), model.truth_force.end());
-  const std::vector<Expression> lambda0 = known_multipliers_in(all, *system_);
-  reads_load_ = !lambda0.empty();
-  truth_ = Tape(model.truth, model.symbols().state_and_parameters(lambda0));
-  truth_force_ = Tape(model.truth_force, model.symbols().state_and_parameters(lambda0));
+  const Multipliers load = multipliers_in(all, *system_);
+  const std::vector<Expression> inputs = model.symbols().state_and_parameters(load.variables);
+  truth_ = Tape(model.truth, inputs);
+  truth_force_ = Tape(model.truth_force, inputs);
+  if (load.variables.empty()) return;
+  load_ = load.are_of_motion ? Load::of_motion : Load::known;
+  if (load_ == Load::known) return;
+  const int n_states = system_->layout().size() + system_->nc();
+  truth_slopes_ = StateDerivatives(model.truth, inputs, n_states);
+  truth_force_slopes_ = StateDerivatives(model.truth_force, inputs, n_states);
+}
+
+// [states; λ]
+MatrixXd ModelMotion::with_load(const Eigen::Ref<const MatrixXd>& states, const MechanicsBatch& mechanics) const {
+  const Eigen::Index n_state = states.rows(), nq = system_->nq(), nc = system_->nc();
+  const ViewValues multipliers = evaluate_view(View::multipliers(*system_), mechanics, states);
+  MatrixXd x(n_state + nc, states.cols());
+  x.topRows(n_state) = states;
+  for (int i = 0; i < static_cast<int>(states.cols()); ++i) {
+    const UdwadiaKalaba& projection = mechanics.projections[static_cast<std::size_t>(i)];
+    VectorXd at = x.col(i);
+    // what of a truth, or of its change with λ, tapes give at this state
+    const auto values = [&](const Tape& tape, Eigen::Index n) {
+      MatrixXd out = MatrixXd::Zero(n, 1);
+      if (tape.n_outputs() > 0) tape.evaluate(at, parameters_, out);
+      return out;
+    };
+    const auto slopes = [&](const StateDerivatives& of) {
+      const MatrixXd derivatives = values(of.tape, 0);
+      MatrixXd slope = MatrixXd::Zero(nq, nc);
+      for (std::size_t e = 0; e < of.entries.size(); ++e) {
+        const Eigen::Index row = of.entries[e].state_index - n_state;
+        if (row >= 0) slope(of.entries[e].output, row) = derivatives(static_cast<Eigen::Index>(e), 0);
+      }
+      return slope;
+    };
+    const auto motion = [&](const VectorXd& lambda, VectorXd& a_bar, MatrixXd& slope) {
+      at.tail(nc) = lambda;
+      a_bar = projection.solve_mass(mechanics.values.F(i) + values(truth_force_, nq)) + values(truth_, nq);
+      slope = projection.solve_mass(slopes(truth_force_slopes_)) + slopes(truth_slopes_);
+    };
+    const auto lambda = solve_multipliers(multipliers.G(i), multipliers.offset.col(i), motion);
+    if (!lambda) throw InputError(internal::describe_fault(*system_, states, no_multipliers(i)));
+    x.col(i).tail(nc) = *lambda;
+  }
+  return x;
 }
 
 MatrixXd ModelMotion::unconstrained(const Eigen::Ref<const MatrixXd>& states, const MechanicsBatch& mechanics) const {
@@ -34,10 +79,16 @@ MatrixXd ModelMotion::unconstrained(const Eigen::Ref<const MatrixXd>& states, co
     if (truth_.n_outputs() > 0) truth_.evaluate(x, parameters_, truth);
     if (truth_force_.n_outputs() > 0) truth_force_.evaluate(x, parameters_, truth_force);
   };
-  if (reads_load_) {
-    evaluate(with_known_multipliers(*system_, states, parameters_));
-  } else {
-    evaluate(states);
+  switch (load_) {
+    case Load::none:
+      evaluate(states);
+      break;
+    case Load::known:
+      evaluate(with_known_multipliers(*system_, states, parameters_));
+      break;
+    case Load::of_motion:
+      evaluate(with_load(states, mechanics));
+      break;
   }
   MatrixXd accelerations(system_->nq(), states.cols());
   for (int i = 0; i < static_cast<int>(states.cols()); ++i) {

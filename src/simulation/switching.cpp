@@ -80,7 +80,7 @@ class ArgumentsOfSign {
     }
     // λ₀ is no expression of the state: where it changes its sign is not looked for
     const std::vector<std::string> variables = graph_.variables_of(g);
-    if (std::any_of(variables.begin(), variables.end(), is_known_multiplier)) return;
+    if (std::any_of(variables.begin(), variables.end(), is_multiplier)) return;
     const auto reads = [&](const Expression& x) { return graph_.depends_on(g, x); };
     if (std::none_of(symbols_.dq.begin(), symbols_.dq.end(), reads)) return;
     if (std::any_of(symbols_.u.begin(), symbols_.u.end(), reads)) return;

@@ -42,7 +42,7 @@ std::string joined(const Names& names, std::string_view separator) {
 ///     power   = atom [ "^" factor ]
 ///     atom    = number | symbol | function "(" sum { "," sum } ")" | quantity | multiplier | "(" sum ")"
 ///     quantity = symbol "(" name in quotes { "," number } ")" "." symbol
-///     multiplier = "lambda0" "(" number ")"
+///     multiplier = ("lambda0" | "lambda") "(" number ")"
 class Parser {
  public:
   Parser(std::string_view text, ExpressionGraph& graph, const std::function<std::optional<Expression>(std::string_view)>& resolve,
@@ -192,7 +192,7 @@ class Parser {
     while (position_ < text_.size() && (is_letter(text_[position_]) || is_digit(text_[position_]))) ++position_;
     const std::string_view name = text_.substr(start, position_ - start);
     skip_space();
-    if (name == "lambda0") return multiplier(start);
+    if (name == "lambda0" || (name == "lambda" && peek() == '(')) return multiplier(name, start);
     if (peek() == '(') {
       const std::size_t inside = text_.find_first_not_of(" \t\n\r", position_ + 1);
       if (inside != std::string_view::npos && (text_[inside] == '"' || text_[inside] == '\'')) return quantity(name, start);
@@ -242,8 +242,8 @@ class Parser {
     return *resolved;
   }
 
-  /// lambda0(1), a symbol that is resolved by its text without spaces.
-  Expression multiplier(std::size_t start) {
+  /// lambda0(1) or lambda(1), a symbol that is resolved by its text without spaces.
+  Expression multiplier(std::string_view name, std::size_t start) {
     constexpr double most = 1e6;
     const std::size_t open = position_;
     double row = 0;
@@ -253,11 +253,12 @@ class Parser {
       if (number.is_constant()) row = number.constant_value();
     }
     if (!(row >= 1 && row <= most) || row != std::floor(row)) {
-      fail(start, "lambda0 takes the number of a row of the constraints, counted from 1; write lambda0(1)");
+      fail(start, fmt::format("{0} takes the number of a row of the constraints, counted from 1; write {0}(1)", name));
     }
     close(open);
-    const auto resolved = resolve_(fmt::format("lambda0({})", static_cast<int>(row)));
-    if (!resolved) fail(start, "lambda0 is a multiplier of the constraints of a model, of which there is none here");
+    const auto resolved = resolve_(fmt::format("{}({})", name, static_cast<int>(row)));
+    if (!resolved)
+      fail(start, fmt::format("{} is a multiplier of the constraints of a model, of which there is none here", name));
     return *resolved;
   }
 

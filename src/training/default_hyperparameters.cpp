@@ -113,8 +113,10 @@ Hyperparameter column_signal(const Latent& latent, std::size_t owner, std::size_
                              const Protocol& protocol) {
   Hyperparameter h = Hyperparameter::of(Kind::signal_stddev, owner, column);
   h.unit = unit_of(latent.column_names[column]);
-  const Latent::Range standard = {Standard::signal_initial, Standard::signal_lower, Standard::signal_upper,
-                                  Standard::signal_median, Standard::signal_log_stddev};
+  const Latent::Range linear = {Standard::signal_initial, Standard::signal_lower, Standard::signal_upper, Standard::signal_median,
+                                Standard::signal_log_stddev};
+  const Latent::Range logarithmic = {1, 0.05, 5, 1, 0.7};  // of which a deviation of 1 is a factor of e
+  const Latent::Range& standard = latent.is_positive ? logarithmic : linear;
   set_range(h, scaled(filled(latent.signal_stddev, standard, protocol), scales.signal_stddev[owner][static_cast<Index>(column)]),
             protocol);
   return h;

@@ -19,6 +19,7 @@
 #include "data/evenly.hpp"
 #include "gp2/error.hpp"
 #include "gp2/fit.hpp"
+#include "inference/posterior_implementation.hpp"
 #include "inference/requirements.hpp"
 #include "training/constraint_parameters.hpp"
 #include "training/curvature.hpp"
@@ -85,13 +86,13 @@ std::vector<Hyperparameter> draw_start(const Prior& prior, std::vector<Hyperpara
 class Training {
  public:
   Training(const Prior& prior, const std::vector<Observations>& observations, const std::vector<Hyperparameter>& hyperparameters,
-           const FitOptions& options, std::shared_ptr<const InducingPoints> points = nullptr)
+           const FitOptions& options, Approximation approximation = {})
       : prior_(prior),
         observations_(observations),
         hyperparameters_(hyperparameters),
         options_(options),
-        evaluators_(options, points != nullptr),
-        objective_(prior, observations, hyperparameters, std::move(points), evaluators_.alone),
+        evaluators_(options, approximation.points != nullptr),
+        objective_(prior, observations, hyperparameters, std::move(approximation), evaluators_.alone),
         reports_(static_cast<std::size_t>(n_restarts())),
         results_(static_cast<std::size_t>(n_restarts())),
         fractions_(static_cast<std::size_t>(n_restarts()), 0.0) {
@@ -465,8 +466,8 @@ void require_starts(const std::vector<Hyperparameter>& hyperparameters) {
 // Of the optimum, without the posterior.
 FitReport trained(const Prior& prior, const std::vector<Observations>& observations,
                   const std::vector<Hyperparameter>& hyperparameters, const FitOptions& options,
-                  std::shared_ptr<const InducingPoints> points = nullptr) {
-  Training training(prior, observations, hyperparameters, options, std::move(points));
+                  Approximation approximation = {}) {
+  Training training(prior, observations, hyperparameters, options, std::move(approximation));
   training.run();
   const std::size_t best = training.best();
   const RestartReport& winner = training.reports()[best];
@@ -651,7 +652,7 @@ class TrainingThroughPoints {
         };
       }
       FitReport next = unless_stopped(best, [&] {
-        FitReport report = trained(prior_, observations, from, options, choice.points);
+        FitReport report = trained(prior_, observations, from, options, {choice.points, nullptr});
         report.inducing = points_of(choice);
         return report;
       });
@@ -685,6 +686,46 @@ class TrainingThroughPoints {
   const FitOptions& options_;
 };
 
+// Of a nonlinear prior: the hyperparameters under the linear one about the posterior mean of the latents, then that mean under these, and
+// so on. Where they stand still the objective is Laplace's evidence, its own dependence on the mean left out (theory.md, T47).
+FitReport trained_nonlinear(const Prior& prior, const std::vector<Observations>& observations,
+                            std::vector<Hyperparameter> hyperparameters, const FitOptions& options) {
+  constexpr int most = 20;
+  constexpr double enough = 1e-3;  // nats
+  FitOptions once = options;
+  once.n_draws = 0;
+  once.standard_errors = false;
+  Approximation approximation;
+  std::optional<FitReport> first;
+  double objective = std::numeric_limits<double>::infinity();
+  bool stands = options.max_iterations == 0;
+  for (int round = 0; round < most && !stands; ++round) {
+    FitReport report = trained(prior, observations, hyperparameters, once, approximation);
+    hyperparameters = report.hyperparameters;
+    stands = std::abs(report.objective - objective) < enough;
+    objective = report.objective;
+    if (!first) first = std::move(report);
+    if (is_set(options.stop)) break;
+    approximation.about = linearisation_of(prior, observations, model_values(prior, observations, hyperparameters));
+    once.n_restarts = 1;
+    once.max_escapes = 0;
+  }
+  once.n_draws = options.n_draws;
+  once.standard_errors = options.standard_errors;
+  FitReport report = trained(prior, observations, hyperparameters, once, approximation);
+  if (!first) return report;
+  // the run that searched is told of, not those that stood where it ended
+  report.restarts = std::move(first->restarts);
+  report.best_restart = first->best_restart;
+  report.iterations = first->iterations;
+  report.n_escapes = first->n_escapes;
+  report.converged = first->converged && stands;
+  report.termination = is_set(options.stop) ? FitReport::interrupted
+                       : stands             ? first->termination
+                                : fmt::format("the posterior mean of the latents still changed after {} rounds", most);
+  return report;
+}
+
 }  // namespace
 
 Fit fit(const Prior& prior, const std::vector<Observations>& observations, const std::vector<Hyperparameter>& hyperparameters,
@@ -696,14 +737,18 @@ Fit fit(const Prior& prior, const std::vector<Observations>& observations, const
   require_hyperparameters(prior, observations, hyperparameters);
   require_starts(hyperparameters);
   const bool is_part = options.n_train > 0 && options.n_train < n_states(observations);
-  FitReport report = options.n_inducing > 0 ? TrainingThroughPoints(prior, observations, options).run(hyperparameters)
-                                            : trained(prior, is_part ? evenly(observations, options.n_train) : observations,
-                                                      hyperparameters, options);
+  FitReport report = [&] {
+    if (options.n_inducing > 0) return TrainingThroughPoints(prior, observations, options).run(hyperparameters);
+    const std::vector<Observations> part = is_part ? evenly(observations, options.n_train) : std::vector<Observations>();
+    const std::vector<Observations>& of = is_part ? part : observations;
+    return prior.is_nonlinear() ? trained_nonlinear(prior, of, hyperparameters, options)
+                                : trained(prior, of, hyperparameters, options);
+  }();
   Posterior posterior = report.termination == FitReport::interrupted && !report.draws
                             ? Posterior::lazy(prior, observations, values_of(prior, observations, report).front())
                             : posterior_of(prior, observations, report, Workers(thread_count(options.n_threads), options.ranks));
   if (report.inducing) report.inducing->summary = posterior.summary();
-  if (is_part) {  // what is said of the part is not of all
+  if (is_part || prior.is_nonlinear()) {  // what is said of the part is not of all
     const double of_part = std::exchange(report.negative_log_likelihood, posterior.negative_log_likelihood());
     report.objective += report.negative_log_likelihood - of_part;
   }

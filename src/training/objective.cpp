@@ -53,17 +53,17 @@ Likelihood::Options likelihood_options(const std::vector<Hyperparameter>& hyperp
 }  // namespace
 
 Objective::Objective(const Prior& prior, const std::vector<Observations>& observations,
-                     const std::vector<Hyperparameter>& hyperparameters, std::shared_ptr<const InducingPoints> points,
-                     const Workers& workers)
+                     const std::vector<Hyperparameter>& hyperparameters, Approximation approximation, const Workers& workers)
     : prior_(prior),
       observations_(observations),
       hyperparameters_(hyperparameters),
-      points_(std::move(points)),
+      approximation_(std::move(approximation)),
       likelihood_(prior, observations, values(hyperparameters), likelihood_options(hyperparameters, workers)) {}
 
 ModelValues Objective::values(const std::vector<Hyperparameter>& hyperparameters) const {
   ModelValues values = model_values(prior_, observations_, hyperparameters);
-  values.inducing = points_;
+  values.inducing = approximation_.points;
+  values.about = approximation_.about;
   return values;
 }
 

@@ -18,14 +18,19 @@ namespace gp2 {
 /// −log of the hyper-priors at the hyperparameters' own values, and its derivative in their coordinates added to `gradient`.
 double negative_log_hyperpriors(const std::vector<Hyperparameter>& hyperparameters, Eigen::VectorXd* gradient);
 
+/// What the likelihood of all observations is told by.
+struct Approximation {
+  std::shared_ptr<const InducingPoints> points = nullptr;  // null: exact
+  std::shared_ptr<const Linearisation> about = nullptr;    // of a nonlinear prior; null: where no latent acts
+};
+
 /// What training minimises: the negative log likelihood plus hyper-priors. Thread-safe.
 class Objective {
  public:
   /// @param prior, observations  outlive it
-  /// @param points   through which all is learned; null: exact
   /// @param workers  as Likelihood::Options
   Objective(const Prior& prior, const std::vector<Observations>& observations, const std::vector<Hyperparameter>& hyperparameters,
-            std::shared_ptr<const InducingPoints> points = nullptr, const Workers& workers = {});
+            Approximation approximation = {}, const Workers& workers = {});
 
   /// @param x         the hyperparameters' coordinates
   /// @param gradient  in x, of the size of x; not computed when null; left as it was when the value is +∞
@@ -40,7 +45,7 @@ class Objective {
   const Prior& prior_;
   const std::vector<Observations>& observations_;
   std::vector<Hyperparameter> hyperparameters_;
-  std::shared_ptr<const InducingPoints> points_;
+  Approximation approximation_;
   Likelihood likelihood_;
 };
 

@@ -144,11 +144,11 @@ VectorXd usable_spreads(VectorXd spreads, const MatrixXd& features) {
 
 // σ_j, M_jj σ_j, or of a direction of its own the size that moves the coordinates by their σ: 1 / rms |E column / σ|
 VectorXd signal_scales(const Latent& latent, const MatrixXd& directions, const VectorXd& mass_diagonal, const VectorXd& sigma) {
-  if (!latent.directions) {
+  if (!latent.directions && !latent.is_positive) {
     return latent.base == Latent::Base::force ? VectorXd(mass_diagonal.cwiseProduct(sigma)) : sigma;
   }
-  VectorXd signal(latent.size());
-  for (Index l = 0; l < signal.size(); ++l) {
+  VectorXd signal = VectorXd::Ones(latent.size());  // of a positive one: an order of magnitude, nearly
+  for (Index l = 0; !latent.is_positive && l < signal.size(); ++l) {
     const auto column = directions.middleRows(l * sigma.size(), sigma.size());
     const double rms = std::sqrt((sigma.cwiseInverse().asDiagonal() * column).squaredNorm() / static_cast<double>(column.cols()));
     signal[l] = 1 / usable(rms, 1 / sigma.mean());

@@ -95,6 +95,55 @@ directions = [["c*side"], ["0"], ["1"], ["lambda0(1) + m"]]
   return model;
 }
 
+const Model& model_that_rubs() {
+  static const Model model = Model::parse(R"toml(
+name        = "runner that rubs"
+coordinates = ["x", "y", "z", { name = "heading", angle = true }]
+inputs      = ["u"]
+[parameters]
+m = 2.0
+e = 0.3
+h = 0.4
+c = 0.7
+[let]
+load = "sqrt(lambda(1)^2 + 0.5)"
+[mechanics]
+mass  = [["m", "0", "0", "e*cos(heading)"], ["0", "m", "0", "e"], ["0", "0", "m + 1", "0"], ["e*cos(heading)", "e", "0", "1"]]
+force = ["u*cos(heading) - c*dx*abs(dx)", "u*sin(heading)", "-9.81*m", "-m*dheading"]
+[constraints]
+position = ["z - h*x^2 - 0.2*y^2"]
+velocity = ["dx*sin(heading) - dy*cos(heading) + e*dheading"]
+[[latent]]
+name       = "friction"
+kernel     = "se"
+features   = ["dx", "heading"]
+directions = { force = [["-load*dx", "0"], ["-load*dy", "0.1*lambda(2)*abs(lambda(2))"], ["-load*dz", "0"], ["0", "0.2*load*dheading"]] }
+signal_stddev = { initial = 0.1, bounds = [0.01, 1] }
+[[latent]]
+name       = "damping"
+kernel     = "se + constant"
+features   = ["heading", "x"]
+positive   = true
+directions = { force = [["-c*dx"], ["-dy"], ["-c*dz"], ["-0.1*m*dheading"]] }
+[[latent]]
+name       = "rest"
+kernel     = "matern52"
+features   = ["x", "dheading"]
+directions = "acceleration"
+[sampling]
+x        = [-1, 1]
+y        = [-1, 1]
+heading  = [-1, 1]
+dx       = [-1, 1]
+dheading = [-1, 1]
+u        = [-2, 2]
+[truth]
+force = ["-0.1*load*dx", "-0.1*load*dy", "-0.1*load*dz", "-0.3*dheading"]
+)toml",
+                                          "runner that rubs");
+  return model;
+}
+
 const Model& another_bank() {
   static const Model other = Model::parse(
       changed(model_with_a_load().text, {{"m = 2.0", "m = 2.6"}, {"h = 0.4", "h = 0.3"}, {"z - h*x^2", "z - h*x^2 + 0.1*x^3"}}),

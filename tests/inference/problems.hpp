@@ -42,6 +42,10 @@ const Model& model_with_friction();
 /// Latents whose directions and features read λ₀ of two constraints, on a mass matrix and forces with parameters.
 const Model& model_with_a_load();
 
+/// The same runner, whose friction is as large as the multipliers that it changes, beside a damping that is never negative and a latent
+/// that is linear: none but the last is linear.
+const Model& model_that_rubs();
+
 /// The same on another bank, with another mass.
 const Model& another_bank();
 

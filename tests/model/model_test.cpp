@@ -527,8 +527,12 @@ std::vector<Complaint> complaints() {
        "7: latent: write [[latent]], with two brackets: there may be several"},
       {"LatentIsANumber", "latent = 3\n" + base, "1: latent: expected an array [ … ], got 3"},
       {"LatentWithAnUnknownKey", latent + "lengths = 1\n" + features,
-       "8: latent.lengths: unknown key; known here: name, kernel, features, directions, lengthscale, lengthscales, "
-       "signal_stddev"},
+       "8: latent.lengths: unknown key; known here: name, kernel, features, directions, positive, lengthscale, "
+       "lengthscales, signal_stddev"},
+      {"PositiveWithoutDirections", latent + features + "positive = true\n",
+       "9: latent.positive: a positive latent needs directions of its own, which it acts along: directions = { force = [[…], …] "
+       "}"},
+      {"PositiveIsNoTruth", latent + features + "positive = 1\n", "9: latent.positive: expected true or false, got 1"},
       {"LengthscalesAreNoTable", latent + features + "lengthscales = 1\n", "9: latent.lengthscales: expected a table, got 1"},
       {"LengthscaleOfNoFeature", latent + "features = [\"dq1\"]\nlengthscales = { dq2 = 1 }\n",
        "9: latent.lengthscales.dq2: no feature of this latent is called 'dq2', did you mean 'dq1'?"},

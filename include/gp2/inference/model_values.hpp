@@ -15,6 +15,15 @@ struct InducingPoints {
   std::vector<Eigen::MatrixXd> features;  // per latent: φ_a, one row per point (m_a × D_a)
 };
 
+/// Where latents that enter nonlinearly are made linear (Prior::is_nonlinear; theory.md, T47).
+struct Linearisation {
+  struct OfGroup {
+    std::vector<Eigen::MatrixXd> signals;  // C_a f_a at each state, per latent (p_a × N)
+    Eigen::MatrixXd multipliers;           // λ at each state (nc × N)
+  };
+  std::vector<OfGroup> groups;  // one per Observations
+};
+
 /// Everything about a prior and its observations that can be tuned, in physical units.
 struct ModelValues {
   std::vector<Eigen::VectorXd> kernel;         // per latent: the kernel's parameters
@@ -23,6 +32,8 @@ struct ModelValues {
   std::vector<Eigen::VectorXd> noise_stddev;   // per Observations: σ (d), of values with a noise of their own the common factor
   Eigen::VectorXd parameters;                  // of the system: θ
   std::shared_ptr<const InducingPoints> inducing = {};  // null: exact
+  /// Of a likelihood, as it is given at first; null: where no latent acts. A posterior finds its own.
+  std::shared_ptr<const Linearisation> about = {};
 
   [[nodiscard]] bool has_free_loading(std::size_t a) const { return a < free_loading.size() && free_loading[a].size() > 0; }
   /// C_a of latent a (p × functions).

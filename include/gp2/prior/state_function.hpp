@@ -55,6 +55,10 @@ class StateFunction {
   /// Their derivatives in one parameter of the system (size() × N).
   [[nodiscard]] virtual Eigen::MatrixXd differentiate(const States& states, const Parameters& parameters, int index) const = 0;
 
+  /// Where the numbers read the multipliers λ of the motion that they help to make: the function of [x; λ], whose evaluator is
+  /// exact. All else here is then at λ₀, the multipliers under the known force. Null elsewhere.
+  [[nodiscard]] virtual const StateFunction* of_multipliers() const { return nullptr; }
+
   /// Whether they depend on an entry of the state, which a log must have then.
   [[nodiscard]] virtual bool reads(int state_index) const = 0;
 

@@ -14,14 +14,16 @@ namespace gp2 GP2_API {
 void require_truth(const Model& model);
 
 /// The motion of a model as it is written: ddq = L b + T (M⁻¹(F + truth.force) + truth.acceleration), both 0 without [truth].
-/// Compiled once, for many calls.
+/// Where the truth reads lambda(i), the multipliers of this very motion, these are found with it (theory.md, T46). Compiled once, for
+/// many calls.
 class ModelMotion {
  public:
   explicit ModelMotion(const Model& model);
 
   /// @param states  (layout size × N)
   /// @return (nq × N), not finite where the truth is not
-  /// @throws InputError as require_mechanics, and where M is singular while truth.acceleration is not 0.
+  /// @throws InputError as require_mechanics, where M is singular while truth.acceleration is not 0, and where the load has no
+  /// solution.
   [[nodiscard]] Eigen::MatrixXd acceleration(const Eigen::Ref<const Eigen::MatrixXd>& states) const;
   /// ā = M⁻¹(F + truth.force) + truth.acceleration, which nothing constrains (nq × N). @throws as acceleration.
   [[nodiscard]] Eigen::MatrixXd unconstrained_acceleration(const Eigen::Ref<const Eigen::MatrixXd>& states) const;
@@ -34,8 +36,12 @@ class ModelMotion {
 
   std::shared_ptr<const System> system_;
   Eigen::VectorXd parameters_;
+  // what each gives at [states; multipliers], and where they are those of the motion, the multipliers
+  [[nodiscard]] Eigen::MatrixXd with_load(const Eigen::Ref<const Eigen::MatrixXd>& states, const MechanicsBatch& mechanics) const;
+
   Tape truth_, truth_force_;
-  bool reads_load_ = false;  // one of them has λ₀ among its inputs
+  StateDerivatives truth_slopes_, truth_force_slopes_;  // in [state; λ]
+  enum class Load { none, known, of_motion } load_ = Load::none;
 };
 
 /// The true acceleration L b + T (M⁻¹F + truth) at given states (nq × N).

@@ -1,0 +1,104 @@
+"""Friction as large as the load that it changes: what is gained beside the load under the known force, and beside no load at all.
+
+    PYTHONPATH=build/test/python python3 experiments/friction.py --n 100 --seeds 1 20
+
+Three mechanisms whose friction presses on its own constraint. Each model is fitted to the same N noisy rows with the known force as mean,
+and scored on 300 fresh states without noise and on the same at twice the velocities: nRMSE, median and worst seed. Coverage is of the
+friction coefficient, over the speeds of the fresh states: how often the true one is within two standard deviations, in all seeds, and in the worst.
+"""
+
+import argparse
+import math
+import pathlib
+import re
+import statistics
+
+FOLDER = pathlib.Path(__file__).parent / "mechanisms"
+MECHANISMS = ["rubbing_bead", "dragged_rod", "ladder"]
+
+
+def without_load(text):
+    """The latents' place taken by one on any force."""
+    coordinates, inputs = (re.findall(r'"(\w+)"', re.search(rf"^{key}.*", text, re.M)[0]) for key in ("coordinates", "inputs"))
+    features = ", ".join(f'"{name}"' for name in [*coordinates, *("d" + c for c in coordinates), *inputs])
+    head, *latents = re.split(r"(?=^\[\[latent\]\])", text, flags=re.M)
+    tail = re.search(r"^\[noise\].*", latents[-1], re.M | re.S).group(0)
+    return f'{head}[[latent]]\nname = "any force"\nfeatures = [{features}]\ndirections = "force"\n{tail}'
+
+
+def models(mechanism):
+    text = (FOLDER / f"{mechanism}.toml").read_text()
+    truth = text.index("[truth]")
+    known = text[:truth].replace("lambda(", "lambda0(") + text[truth:]
+    return {"any force": without_load(text), "lambda0": known, "lambda": text}
+
+
+def nrmse(posterior, states, truth):
+    import numpy as np
+
+    error = posterior.predict(states, mean_only=True).mean - truth
+    return math.sqrt(np.mean(np.sum(error**2, axis=1)) / np.sum(np.var(truth, axis=0)))
+
+
+def coefficients(mechanism, x, load):
+    """Each latent, the coordinate whose force it is read from, the direction there and the true coefficient."""
+    import numpy as np
+
+    if mechanism == "ladder":
+        sin, cos, rate = np.sin(x["a"]), np.cos(x["a"]), x["da"]
+        foot, head = 1.6 * cos * rate, -1.6 * sin * rate
+        at_foot, at_head = np.sqrt(foot**2 + 1e-4), np.sqrt(head**2 + 1e-4)
+        return [("floor", 0, -np.abs(load[:, 0]) * foot / at_foot, 0.15 + 0.2 * np.exp(-((at_foot / 0.5) ** 2))),
+                ("wall", 1, -np.abs(load[:, 1]) * head / at_head, 0.1 + 0.05 * at_head)]
+    if mechanism == "dragged_rod":
+        tip, along = x["x"] - 0.3 * np.sin(x["a"]), x["dx"] - 0.3 * np.cos(x["a"]) * x["da"]
+        slope, low, high = 0.6 * tip, 0.1, 0.15
+    else:
+        along, slope, low, high = x["dx"], x["x"], 0.15, 0.25
+    v = np.sqrt(along**2 * (1 + slope**2) + 1e-6)
+    press = np.abs(load[:, 0]) * np.sqrt(1 + slope**2)
+    return [("friction coefficient", 0, -press * along / v, low + high * np.exp(-((v / 0.4) ** 2)))]
+
+
+def coverage(posterior, mechanism, states):
+    import numpy as np
+
+    x = {name: np.asarray(states[name]) for name in states.columns}
+    inside = []
+    for latent, row, direction, true in coefficients(mechanism, x, posterior.predict(states, "multipliers").mean):
+        force = posterior.predict(states, "force", latent=latent)
+        inside.append(np.abs(force.mean[:, row] - true * direction) <= 2 * force.std[:, row])
+    return float(np.mean(inside))
+
+
+def main():
+    import gp2
+    import numpy as np
+
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--n", type=int, nargs="+", default=[100])
+    parser.add_argument("--seeds", type=int, nargs=2, default=[1, 20], help="first and last")
+    arguments = parser.parse_args()
+    for mechanism in MECHANISMS:
+        systems = {name: gp2.System.parse(text, f"{mechanism}: {name}") for name, text in models(mechanism).items()}
+        truth = systems["lambda"]
+        fast = re.sub(r"^(d\w+ *= *)\[(.*), (.*)\]", lambda m: f"{m[1]}[{2 * float(m[2])}, {2 * float(m[3])}]",
+                      (FOLDER / f"{mechanism}.toml").read_text(), flags=re.M)
+        tests = [system.generate(300, seed=1000, noise_std=0) for system in (truth, gp2.System.parse(fast, "fast"))]
+        for n in arguments.n:
+            errors, covered = {name: [[], []] for name in systems}, []
+            for seed in range(arguments.seeds[0], arguments.seeds[1] + 1):
+                data = truth.generate(n, seed=seed)
+                for name, system in systems.items():
+                    posterior = gp2.fit(system, data, mean="force")
+                    for k, test in enumerate(tests):
+                        values = np.column_stack([test["dd" + c] for c in system.coordinates])
+                        errors[name][k].append(nrmse(posterior, test, values))
+                    if name == "lambda":
+                        covered.append(coverage(posterior, mechanism, tests[0]))
+            text = " | ".join(" · ".join(f"{statistics.median(e):.2g} ({max(e):.2g})" for e in errors[name]) for name in systems)
+            print(f"| {mechanism} | {n} | {text} | {statistics.mean(covered):.3f} ({min(covered):.2f}) |", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,334 @@
+#include <cmath>
+
+#include <fmt/format.h>
+#include <gmock/gmock.h>
+#include <gtest/gtest.h>
+
+#include "gp2/fit.hpp"
+#include "gp2/inference/pathwise.hpp"
+#include "gp2/predictor.hpp"
+#include "gp2/simulation/model_motion.hpp"
+#include "inference/nonlinear_motion.hpp"
+#include "inference/problems.hpp"
+#include "input_error.hpp"
+
+// Latents that act through the multipliers that they change, or by their exponential.
+namespace gp2 {
+namespace {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+
+constexpr std::uint64_t nonlinear_seed = 52117;
+
+void expect_says(const std::function<void()>& work, const std::vector<std::string>& words) {
+  const std::string error = test::input_error_of(work);
+  for (const std::string& word : words) EXPECT_THAT(error, testing::HasSubstr(word));
+}
+
+/// A bead of unequal inertias on a wire z = h x², with friction μ |λ| |A| along it: friction presses on the wire.
+Model rubbing_bead(const std::string& lambda, const std::string& kernel = "constant", const std::string& more = "") {
+  return Model::parse(fmt::format(R"toml(
+name        = "rubbing bead"
+coordinates = ["x", "z"]
+inputs      = ["push"]
+[parameters]
+m = 0.2
+h = 0.5
+[let]
+v    = "sqrt(dx^2 + dz^2 + 1e-6)"
+load = "abs({0}(1))*sqrt(1 + 4*h^2*x^2)"
+mu   = "0.3"
+[mechanics]
+mass  = [["m", "0"], ["0", "m + 0.3"]]
+force = ["push", "-9.81*m"]
+[constraints]
+position = ["z - h*x^2"]
+[[latent]]
+name       = "friction coefficient"
+kernel     = "{1}"
+features   = ["v"]
+directions = {{ force = [["-load*dx/v"], ["-load*dz/v"]] }}
+{2}
+[sampling]
+x    = [-0.8, 0.8]
+dx   = [-1.5, 1.5]
+push = [-1, 1]
+[truth]
+force = ["-mu*load*dx/v", "-mu*load*dz/v"]
+)toml",
+                                  lambda, kernel, more),
+                      "bead");
+}
+
+TEST(Multipliers, OfATruthThatReadsThemAreThoseOfOneSlidingContact) {
+  const Model model = rubbing_bead("lambda"), known = rubbing_bead("lambda0");
+  const MatrixXd states = test::draw(model, 200, nonlinear_seed).states;
+  const ModelMotion motion(model);
+  const MatrixXd lambda = motion.multipliers(states), ddq = motion.acceleration(states);
+  double largest_kappa = 0;
+  for (Index i = 0; i < states.cols(); ++i) {
+    // λ = λ₀/(1 − σκμ), κ = (A M⁻¹Aᵀ)⁻¹A M⁻¹S
+    const double m = 0.2, x = states(0, i), dx = states(2, i), dz = states(3, i), v = std::sqrt(dx * dx + dz * dz + 1e-6);
+    const VectorXd M = (VectorXd(2) << m, m + 0.3).finished(), A = (VectorXd(2) << -x, 1).finished(),
+                   F = (VectorXd(2) << states(states.rows() - 1, i), -9.81 * m).finished(),
+                   S = std::sqrt(1 + x * x) / v * (VectorXd(2) << dx, dz).finished();
+    const double inertia = 1 / A.dot(A.cwiseQuotient(M)), lambda0 = inertia * (dx * dx - A.dot(F.cwiseQuotient(M))),
+                 kappa = inertia * A.dot(S.cwiseQuotient(M)), sigma = lambda0 > 0 ? 1 : -1;
+    EXPECT_NEAR(lambda(0, i), lambda0 / (1 - sigma * kappa * 0.3), 1e-12 * (1 + std::abs(lambda0)));
+    largest_kappa = std::max(largest_kappa, std::abs(kappa));
+    const VectorXd force = F - 0.3 * std::abs(lambda(0, i)) * S + A * lambda(0, i);
+    EXPECT_LE((M.cwiseProduct(ddq.col(i)) - force).cwiseAbs().maxCoeff(), 1e-12 * (1 + force.cwiseAbs().maxCoeff()));
+  }
+  EXPECT_GT(largest_kappa, 0.2) << "friction hardly presses on this wire";
+  EXPECT_GT((ModelMotion(known).acceleration(states) - ddq).cwiseAbs().maxCoeff(), 0.05);
+}
+
+TEST(Multipliers, ThatGrowFasterThanTheForceTheyNeedAreAnErrorThatNamesTheState) {
+  std::string text = rubbing_bead("lambda").text;
+  text.replace(text.find("\"0.3\""), 5, "\"30\"");
+  const Model model = Model::parse(text, "bead");
+  const MatrixXd states = test::draw(rubbing_bead("lambda"), 20, nonlinear_seed).states;
+  expect_says([&] { static_cast<void>(ModelMotion(model).acceleration(states)); }, {"Painlevé", "x = "});
+}
+
+// ---------------------------------------------------------------- the linear prior
+
+struct Rubs {
+  Model model = test::model_that_rubs();
+  Prior prior = [&] {
+    PriorOptions options;
+    options.mean = Prior::Mean::force;
+    return make_prior(model, options);
+  }();
+  MatrixXd states = test::draw(model, 6, nonlinear_seed).states;
+  VectorXd parameters = model.system->parameter_values();
+  MechanicsBatch mechanics = evaluate_mechanics(*model.system, states, parameters);
+
+  [[nodiscard]] Linearisation::OfGroup signals(double size) const {
+    RandomStream random(nonlinear_seed);
+    Linearisation::OfGroup at = NonlinearMotion(prior, states, parameters, mechanics).without_signals();
+    for (MatrixXd& s : at.signals) {
+      for (double& one : s.reshaped()) one = size * random.normal();
+    }
+    return at;
+  }
+};
+
+MatrixXd view_at(const ViewValues& view, const PriorValues& prior, const std::vector<MatrixXd>& signals) {
+  MatrixXd out(view.offset.rows(), view.offset.cols());
+  for (int i = 0; i < static_cast<int>(out.cols()); ++i) {
+    VectorXd a_bar = prior.mean.col(i);
+    for (std::size_t a = 0; a < signals.size(); ++a) a_bar += prior.E(a, i) * signals[a].col(i);
+    out.col(i) = view.G(i) * a_bar + view.offset.col(i);
+  }
+  return out;
+}
+
+TEST(NonlinearMotion, IsTangentToTheMotionAndItsAccelerationsHoldTheConstraints) {
+  const Rubs rubs;
+  for (const View& view : {View::constrained_acceleration(*rubs.model.system), View::constraint_force(*rubs.model.system),
+                           View::multipliers(*rubs.model.system), View::learned_force(*rubs.model.system)}) {
+    SCOPED_TRACE(view.quantity->word());
+    const NonlinearMotion motion(rubs.prior, rubs.states, rubs.parameters, rubs.mechanics);
+    const auto exact = [&](Linearisation::OfGroup at) {
+      EXPECT_FALSE(motion.solve(at));
+      ViewValues viewed = evaluate_view(view, rubs.mechanics, rubs.states);
+      PriorValues prior;
+      motion.linearise(view, at, viewed, prior);
+      return view_at(viewed, prior, at.signals);
+    };
+    Linearisation::OfGroup at = rubs.signals(0.1);
+    ASSERT_FALSE(motion.solve(at));
+    ViewValues viewed = evaluate_view(view, rubs.mechanics, rubs.states);
+    PriorValues prior;
+    motion.linearise(view, at, viewed, prior);
+    const MatrixXd value = view_at(viewed, prior, at.signals);
+    if (view.quantity == View::Quantity::multipliers) {
+      EXPECT_LE(test::largest(value - at.multipliers), 1e-12 * (1 + test::largest(value)));
+    }
+    // λ answers to every signal
+    const Linearisation::OfGroup along = rubs.signals(0.05);
+    const auto moved = [&](double t) {
+      Linearisation::OfGroup there = at;
+      for (std::size_t a = 0; a < there.signals.size(); ++a) there.signals[a] += t * along.signals[a];
+      return there;
+    };
+    const double t = 1e-4;
+    const MatrixXd slope = (exact(moved(t)) - exact(moved(-t))) / (2 * t),
+                   linear = (view_at(viewed, prior, moved(1).signals) - value);
+    EXPECT_LE(test::largest(slope - linear), 1e-7 * (1 + test::largest(linear)));
+    EXPECT_GT(test::largest(linear), 1e-3);
+    if (view.quantity != View::Quantity::constrained_acceleration) continue;
+    for (int i = 0; i < 6; ++i) {
+      const auto A = rubs.mechanics.values.A(i);
+      const double size = viewed.G(i).norm() * A.norm();
+      EXPECT_LE(test::largest(A * viewed.G(i)), 1e-13 * size);
+      EXPECT_LE(test::largest(A * value.col(i) - rubs.mechanics.values.b(i)), 1e-12 * (1 + A.norm() * value.col(i).norm()));
+    }
+  }
+}
+
+// ---------------------------------------------------------------- the posterior
+
+// One unknown number: Laplace's approximation is that of a function of one variable.
+TEST(NonlinearPosterior, OfOneNumberIsLaplacesApproximation) {
+  for (const bool is_positive : {false, true}) {
+    SCOPED_TRACE(is_positive ? "positive" : "of the multiplier");
+    const Model model = rubbing_bead("lambda", "constant", is_positive ? "positive = true" : "");
+    PriorOptions options;
+    options.mean = Prior::Mean::force;
+    const Prior prior = make_prior(model, options);
+    const MatrixXd states = test::draw(model, 25, nonlinear_seed).states;
+    const View view = View::constrained_acceleration(*model.system);
+    const double sigma = 0.2, s = is_positive ? 1.1 : 0.4;
+    RandomStream random(nonlinear_seed);
+    MatrixXd y = ModelMotion(model).acceleration(states);
+    for (double& one : y.reshaped()) one += sigma * random.normal();
+    const std::vector<Observations> observations{Observations(states, view, y, VectorXd::Constant(2, sigma))};
+    ModelValues values{
+        {VectorXd()}, {VectorXd::Constant(1, s)}, {}, {VectorXd::Constant(2, sigma)}, model.system->parameter_values()};
+    values.kernel[0] = VectorXd::Ones(std::ssize(prior.latents[0].kernel.parameters()));
+
+    const MechanicsBatch mechanics = evaluate_mechanics(*model.system, states, values.parameters);
+    const NonlinearMotion motion(prior, states, values.parameters, mechanics);
+    const auto ddq = [&](double signal) {
+      Linearisation::OfGroup at = motion.without_signals();
+      at.signals[0].setConstant(signal);
+      EXPECT_FALSE(motion.solve(at));
+      ViewValues viewed = evaluate_view(view, mechanics, states);
+      PriorValues linear;
+      motion.linearise(view, at, viewed, linear);
+      return view_at(viewed, linear, at.signals);
+    };
+    const auto objective = [&](double signal) {
+      return 0.5 * std::pow(signal / s, 2) + 0.5 * ((y - ddq(signal)) / sigma).squaredNorm();
+    };
+    // golden section, from a bracket
+    double low = -3, high = 0.9;
+    for (int step = 0; step < 90; ++step) {
+      const double left = high - 0.618034 * (high - low), right = low + 0.618034 * (high - low);
+      (objective(left) < objective(right) ? high : low) = objective(left) < objective(right) ? right : left;
+    }
+    const double best = 0.5 * (low + high), step = 1e-5;
+    const double curvature = 1 / (s * s) + ((ddq(best + step) - ddq(best - step)) / (2 * step * sigma)).squaredNorm();
+    const double n = static_cast<double>(y.size());
+    const double laplace =
+        objective(best) + 0.5 * std::log(curvature * s * s) + n * std::log(sigma) + 0.5 * n * std::log(2 * std::numbers::pi);
+
+    const Posterior posterior(prior, observations, values);
+    EXPECT_NEAR(posterior.negative_log_likelihood(), laplace, 1e-6 * (1 + std::abs(laplace)));
+    const MatrixXd elsewhere = test::draw(model, 25, nonlinear_seed).states;
+    EXPECT_LE(test::largest(posterior.mean(view, elsewhere) - ddq(best)), 2e-6);
+    const auto marginal = posterior.marginal(view, elsewhere);
+    const MatrixXd slope = (ddq(best + step) - ddq(best - step)) / (2 * step);
+    EXPECT_LE(test::largest(marginal.stddev() - slope.cwiseAbs() / std::sqrt(curvature)), 1e-6);
+  }
+}
+
+struct Fitted {
+  Model model;
+  Prior prior;
+  std::vector<Observations> observations;
+  explicit Fitted(Model of, int n) : model(std::move(of)) {
+    PriorOptions options;
+    options.mean = Prior::Mean::force;
+    prior = make_prior(model, options);
+    RandomStream random(nonlinear_seed);
+    const MatrixXd states = test::draw(model, n, nonlinear_seed).states;
+    MatrixXd y = ModelMotion(model).acceleration(states);
+    for (double& one : y.reshaped()) one += 0.01 * random.normal();
+    observations.push_back(
+        {states, View::constrained_acceleration(*model.system), y, VectorXd::Constant(model.system->nq(), 0.01)});
+  }
+};
+
+TEST(NonlinearPosterior, MeansSamplesAndPathsHoldTheConstraintsAndTheFixedPoint) {
+  const Fitted fitted(test::model_that_rubs(), 25);
+  ModelValues values =
+      model_values(fitted.prior, fitted.observations, default_hyperparameters(fitted.prior, fitted.observations, {}, {}));
+  const Posterior posterior(fitted.prior, fitted.observations, values);
+  const MatrixXd states = test::draw(fitted.model, 15, nonlinear_seed + 1).states;
+  const System& system = *fitted.model.system;
+  const View ddq = View::constrained_acceleration(system), force = View::constraint_force(system),
+             multipliers = View::multipliers(system), learned = View::learned_force(system);
+  const MechanicsBatch mechanics = evaluate_mechanics(system, states, values.parameters);
+  const auto expect_motion = [&](const MatrixXd& a, const MatrixXd& lambda, const MatrixXd& fc, const MatrixXd& fl) {
+    for (int i = 0; i < static_cast<int>(states.cols()); ++i) {
+      const auto A = mechanics.values.A(i);
+      const double size = 1 + A.norm() * a.col(i).norm();
+      EXPECT_LE(test::largest(A * a.col(i) - mechanics.values.b(i)), 1e-12 * size);
+      const double of_force = 1 + fc.col(i).norm() + mechanics.values.F(i).norm();
+      EXPECT_LE(test::largest(A.transpose() * lambda.col(i) - fc.col(i)), 1e-11 * of_force);
+      EXPECT_LE(test::largest(mechanics.values.M(i) * a.col(i) - mechanics.values.F(i) - fl.col(i) - fc.col(i)),
+                1e-11 * of_force);
+    }
+  };
+  expect_motion(posterior.mean(ddq, states), posterior.mean(multipliers, states), posterior.mean(force, states),
+                posterior.mean(learned, states));
+  const PathwiseSamples paths = sample_paths(posterior, 3, {.seed = 3});
+  for (int s = 0; s < 3; ++s) {
+    expect_motion(paths.evaluate(s, ddq, states), paths.evaluate(s, multipliers, states), paths.evaluate(s, force, states),
+                  paths.evaluate(s, learned, states));
+  }
+  const MatrixXd samples = posterior.sample({{ddq, states}, {multipliers, states}, {force, states}, {learned, states}}, 4, 5);
+  for (Index s = 0; s < samples.cols(); ++s) {
+    Index row = 0;
+    const auto next = [&](const View& view) {
+      const MatrixXd one = samples.col(s).segment(row, view.size() * states.cols()).reshaped(view.size(), states.cols());
+      row += one.size();
+      return one;
+    };
+    const MatrixXd a = next(ddq), lambda = next(multipliers), fc = next(force), fl = next(learned);
+    expect_motion(a, lambda, fc, fl);
+  }
+  // the mean and deviation of many samples of what is nearly linear are those of the marginal
+  const MatrixXd many = posterior.sample({{ddq, states}}, 4000, 7);
+  const auto marginal = posterior.marginal(ddq, states);
+  const VectorXd mean = many.rowwise().mean();
+  for (Index r = 0; r < many.rows(); ++r) {
+    const double stddev = marginal.stddev().reshaped()[r];
+    const double sampled = std::sqrt((many.row(r).array() - mean[r]).square().mean());
+    EXPECT_NEAR(mean[r], marginal.mean.reshaped()[r], 0.5 * stddev + 1e-9);
+    EXPECT_NEAR(sampled, stddev, 0.5 * stddev + 1e-9);
+  }
+}
+
+TEST(NonlinearFit, FindsACoefficientThatKnownMultipliersGetWrong) {
+  const std::string kernel = "constant + matern32";
+  const Fitted own(rubbing_bead("lambda", kernel), 60), known(rubbing_bead("lambda0", kernel), 60);
+  const MatrixXd states = test::draw(own.model, 300, nonlinear_seed + 1).states;
+  const MatrixXd truth = ModelMotion(own.model).acceleration(states);
+  const auto error = [&](const Fitted& of) {
+    const std::vector<Observations>& observations = own.observations;
+    FitOptions options;
+    options.n_restarts = 2;
+    const Fit found = fit(of.prior, observations, default_hyperparameters(of.prior, observations, {}, {}), options);
+    const View view = View::constrained_acceleration(*of.model.system);
+    const auto marginal = found.posterior.marginal(view, states);
+    EXPECT_NEAR(found.report.negative_log_likelihood, found.posterior.negative_log_likelihood(), 1e-9);
+    return std::pair((marginal.mean - truth).norm() / std::sqrt(static_cast<double>(truth.size())),
+                     ((marginal.mean - truth).array().abs() <= 2 * marginal.stddev().array() + 1e-12).cast<double>().mean());
+  };
+  const auto [of_own, coverage] = error(own);
+  EXPECT_LT(of_own, 0.01);
+  EXPECT_GT(coverage, 0.8);
+  EXPECT_LT(of_own, 0.2 * error(known).first);
+}
+
+TEST(NonlinearPrior, IsRefusedByNameWhereItCannotBe) {
+  const Fitted fitted(rubbing_bead("lambda"), 10);
+  const Posterior posterior(
+      fitted.prior, fitted.observations,
+      model_values(fitted.prior, fitted.observations, default_hyperparameters(fitted.prior, fitted.observations, {}, {})));
+  expect_says([&] { static_cast<void>(Predictor(posterior)); }, {"Predictor", "lambda0"});
+  expect_says([&] { static_cast<void>(update(Posterior(posterior), fitted.observations.front())); }, {"update", "lambda0"});
+  const std::string latent = "[[latent]]\nname = \"x\"\nfeatures = ";
+  expect_says([&] { static_cast<void>(make_prior(rubbing_bead("lambda", "constant", latent + "[\"lambda(1)\"]"))); },
+              {"only directions"});
+  expect_says([&] { rubbing_bead("lambda", "constant", latent + "[\"x\"]\npositive = true"); }, {"directions of its own"});
+}
+
+}  // namespace
+}  // namespace gp2
