@@ -6,7 +6,7 @@
 #include <Eigen/LU>
 
 #include "base/not_a_number.hpp"
-#include "mechanics/solve_multipliers.hpp"
+#include "mechanics/multiplier_solver.hpp"
 
 namespace gp2 {
 
@@ -112,15 +112,16 @@ Linearisation::OfGroup NonlinearMotion::without_signals() const {
 std::optional<MechanicsBatch::Fault> NonlinearMotion::solve(Linearisation::OfGroup& at) const {
   const std::vector<MatrixXd> c = amplitudes_of(prior_, at.signals);
   Directions directions(*this);
+  MultiplierSolver solver;
   at.multipliers.resize(prior_.system->nc(), n_states());
   std::optional<MechanicsBatch::Fault> fault;
   for (int i = 0; i < n_states(); ++i) {
     directions.move_to(i, c);
-    const auto lambda = solve_multipliers(
-        multipliers_.G(i), multipliers_.offset.col(i),
-        [&](const VectorXd& under, VectorXd& a_bar, MatrixXd& slope) { directions.evaluate(under, a_bar, slope); });
-    if (lambda) {
-      at.multipliers.col(i) = *lambda;
+    const auto motion = [&](const VectorXd& lambda, VectorXd& a_bar, MatrixXd& slope) {
+      directions.evaluate(lambda, a_bar, slope);
+    };
+    if (solver.solve(multipliers_.G(i), multipliers_.offset.col(i), motion)) {
+      at.multipliers.col(i) = solver.lambda();
     } else {
       at.multipliers.col(i).setConstant(not_a_number);
       if (!fault) fault = no_multipliers(i);
@@ -146,7 +147,7 @@ void NonlinearMotion::linearise(const View& view, const Linearisation::OfGroup& 
       prior.mean.col(i) += E * (c[a].col(i) - c[a].col(i).cwiseProduct(at.signals[a].col(i)));
       E = E * c[a].col(i).asDiagonal();
     }
-    if (view.latent) continue;  // at λ*, of which all latents are part
+    if (view.latent || at.multipliers.rows() == 0) continue;  // of one latent: at λ*, of which all are part
     directions.move_to(i, c);
     directions.evaluate(at.multipliers.col(i), a_bar, J);
     const auto G_lambda = multipliers_.G(i);
@@ -174,6 +175,7 @@ void NonlinearMotion::differentiate(const Linearisation::OfGroup& at, const Syst
       d_prior.mean.col(i) += dE * (c[a].col(i) - c[a].col(i).cwiseProduct(at.signals[a].col(i)));
       dE = dE * c[a].col(i).asDiagonal();
     }
+    if (at.multipliers.rows() == 0) continue;
     // dJ = −M⁻¹dM J; of a J on the acceleration it is 0
     const UdwadiaKalaba& projection = mechanics_.projections[static_cast<std::size_t>(i)];
     directions.move_to(i, c);

@@ -15,6 +15,7 @@
 #include "inference/posterior_implementation.hpp"
 #include "inference/predictor_data.hpp"
 #include "inference/requirements.hpp"
+#include "mechanics/multiplier_solver.hpp"
 #include "prior/admissible_directions.hpp"
 
 namespace gp2 {
@@ -39,6 +40,7 @@ struct Predictor::Implementation {
   bool has_force = false;                         // μ or a direction that is multiplied by M⁻¹ …
   bool has_forced_latent = false;                 // … of which the deviation needs the directions
   bool needs_acceleration = false;                // ā itself, which is none where M is singular
+  bool reads_multipliers = false;                 // a direction reads λ
   PredictorData<double> in_double;
   PredictorData<float> in_single;
   DataDistance distance;  // of the first component of a mixture alone
@@ -58,6 +60,12 @@ struct Predictor::Implementation {
                       Ref<MatrixXd> jacobian) const;
 
   [[nodiscard]] double distance_at(const Ref<const VectorXd>& state, Workspace::Implementation& w) const;
+
+  // E at λ, and c in the place of the signals
+  [[nodiscard]] bool evaluate_load(const Ref<const VectorXd>& state, const StateEvaluator& at,
+                                   Workspace::Implementation& w) const;
+  // G of every row, with what its change with λ adds, and G J D⁻¹
+  void write_G(const StateEvaluator& at, Workspace::Implementation& w) const;
 
   [[nodiscard]] const Latent& latent(const PredictorTerm& term) const { return prior.latents[term.latent]; }
   [[nodiscard]] bool has_mean_force() const { return view.has_mean() && prior.mean == Prior::Mean::force; }
@@ -85,7 +93,8 @@ struct Predictor::Workspace::Implementation {
   AffineMotion affine_motion;
 
   struct AtState {
-    std::unique_ptr<StateFunction::Evaluator> of_features, of_directions;
+    std::unique_ptr<StateFunction::Evaluator> of_features, of_directions;  // directions that read λ: at [x; λ]
+    bool reads_multipliers = false;
     VectorXd features;    // φ (D)
     VectorXd point;       // scaled
     VectorXd directions;  // B or B Π (nq·p), none where B = I
@@ -96,25 +105,32 @@ struct Predictor::Workspace::Implementation {
     MatrixXd E_dsignal;               // B d(C g)/dφ (nq × D)
   };
   std::vector<AtState> terms;
-  VectorXd a_bar;                  // ā
-  VectorXd force;                  // what is multiplied by M⁻¹ in it …
-  VectorXd a_of_force;             // … and the product
-  VectorXd a;                      // ddq, or T ā of one latent alone
-  VectorXd gap;                    // a − ā
-  VectorXd of_constraint;          // Aᵀλ = M (a − ā)
-  VectorXd applied;                // F̄ = M ā
-  VectorXd lambda;                 // λ (nc)
-  MatrixXd L;                      // (nq × nc)
-  MatrixXd d_of_rest;              // of dā, what is not multiplied by M⁻¹ (nq × layout size)
-  MatrixXd d_force;                // what is
-  MatrixXd d_forced;               // … in da alone
-  MatrixXd d_rows;                 // db − dA a (nc × layout size)
-  MatrixXd d_a_bar, d_a;           // dā, da
-  MatrixXd d_mass_a_bar;           // M dā
-  MatrixXd d_of_constraint;        // dM (a − ā), then d(Aᵀλ)
-  MatrixXd d_applied;              // dM ā, then dF̄
-  MatrixXd value, d_value;         // every row of the quantity (× 1), (× layout size)
-  MatrixXd G;                      // every row (× nq)
+  VectorXd a_bar;            // ā
+  VectorXd force;            // what is multiplied by M⁻¹ in it …
+  VectorXd a_of_force;       // … and the product
+  VectorXd a;                // ddq, or T ā of one latent alone
+  VectorXd gap;              // a − ā
+  VectorXd of_constraint;    // Aᵀλ = M (a − ā)
+  VectorXd applied;          // F̄ = M ā
+  VectorXd lambda;           // λ (nc)
+  MatrixXd L;                // (nq × nc)
+  MatrixXd d_of_rest;        // of dā, what is not multiplied by M⁻¹ (nq × layout size)
+  MatrixXd d_force;          // what is
+  MatrixXd d_forced;         // … in da alone
+  MatrixXd d_rows;           // db − dA a (nc × layout size)
+  MatrixXd d_a_bar, d_a;     // dā, da
+  MatrixXd d_mass_a_bar;     // M dā
+  MatrixXd d_of_constraint;  // dM (a − ā), then d(Aᵀλ)
+  MatrixXd d_applied;        // dM ā, then dF̄
+  MatrixXd value, d_value;   // every row of the quantity (× 1), (× layout size)
+  MatrixXd G;                // every row (× nq)
+  VectorXd x;                // [x; λ] where λ is read
+  MultiplierSolver solver;
+  VectorXd without_load;  // ā without the latents that read λ
+  MatrixXd slope, slope_transposed, K_transposed, G_lambda, d_lambda, D;
+  MatrixXd GK;             // G J D⁻¹ of every row (× nc)
+  MatrixXd d_multipliers;  // ∂(G_λ ā + d_λ)/∂x at held λ (nc × layout size)
+  Eigen::PartialPivLU<MatrixXd> D_transposed;
   MatrixXd Gt, M_inverse_Gt;       // Gᵀ of the view (nq × d)
   std::vector<MatrixXd> loadings;  // ℓ, per term (F × d)
   VectorXd variance;               // (d)
@@ -197,6 +213,13 @@ Predictor::Implementation::Implementation(const Posterior::Implementation& poste
       is_constrained(parts.constrained_acceleration || parts.constraint_force) {
   for (int r = 0; r < view.size(); ++r) added_entries.push_back(view.added_entry(prior.system->layout(), r));
   needs_acceleration = what_needs_acceleration(prior, view).has_value();
+  for (const Latent& latent : prior.latents) {
+    reads_multipliers = reads_multipliers || (latent.directions && latent.directions->of_multipliers() != nullptr);
+  }
+  if (reads_multipliers) {
+    parts.constrained_acceleration = parts.constraint_force = parts.unconstrained_acceleration = true;
+    is_constrained = true;
+  }
   for (std::size_t a = 0; a < prior.latents.size(); ++a) {
     if (!view.has_latent(a)) continue;
     terms.push_back({a, posterior.latents->latents()[a].kernel, posterior.C[a]});
@@ -237,6 +260,15 @@ void Predictor::Workspace::Implementation::reserve_mechanics() {
   value.setZero(n_rows, 1);
   d_value.setZero(n_rows, n_state);
   G.setZero(n_rows, nq);
+  x.setZero(n_state + nc);
+  slope.setZero(nq, nc);
+  slope_transposed = K_transposed = slope.transpose();
+  G_lambda.setZero(nc, nq);
+  d_lambda.setZero(nc, 1);
+  D.setZero(nc, nc);
+  GK.setZero(n_rows, nc);
+  d_multipliers.setZero(nc, n_state);
+  without_load = a_bar;
   Gt.setZero(nq, d);
   M_inverse_Gt = Gt;
   variance.setZero(d);
@@ -265,7 +297,9 @@ void Predictor::Workspace::Implementation::reserve_term(const PredictorTerm& ter
   loadings.emplace_back(MatrixXd::Zero(term.n_functions(), predictor->view.size()));
   at.dfeatures.setZero(static_cast<Index>(at.of_features->entries().size()));
   if (!latent.directions) return;
-  at.of_directions = latent.directions->make_evaluator(predictor->parameters);
+  const StateFunction* const of_multipliers = latent.directions->of_multipliers();
+  at.reads_multipliers = of_multipliers != nullptr;
+  at.of_directions = (at.reads_multipliers ? of_multipliers : latent.directions.get())->make_evaluator(predictor->parameters);
   at.directions.setZero(nq * p);
   at.ddirections.setZero(static_cast<Index>(at.of_directions->entries().size()));
   if (latent.base != Latent::Base::admissible) return;
@@ -326,6 +360,8 @@ Status Predictor::Implementation::evaluate_prior(const Ref<const VectorXd>& stat
       all_features = all_features && is_finite(here.features);
       term.kernel.scale(here.features, here.point);
       data.evaluate_signal(term, a, here.point, memory, here.signal);
+      if (of.is_positive) here.signal = here.signal.array().exp();
+      if (here.reads_multipliers) continue;
       if (here.admissible) {
         here.directions = here.admissible->compute(at.A()).reshaped();
       } else if (here.of_directions) {
@@ -334,12 +370,74 @@ Status Predictor::Implementation::evaluate_prior(const Ref<const VectorXd>& stat
       add_product(here.directions, here.signal, of.base == Latent::Base::force ? w.force : w.a_bar);
     }
   });
+  if (reads_multipliers && !evaluate_load(state, at, w)) return Status::not_finite;
   w.a_of_force = w.force;
   if (has_force) {
     w.projection.solve_mass_in_place(w.a_of_force);
     w.a_bar += w.a_of_force;
   }
   return is_finite(w.a_bar) && all_features ? Status::ok : Status::not_finite;
+}
+
+bool Predictor::Implementation::evaluate_load(const Ref<const VectorXd>& state, const StateEvaluator& at,
+                                              Workspace::Implementation& w) const {
+  const Index n_state = state.size(), nq = w.a_bar.size();
+  w.affine_motion.evaluate(w.projection, at.M(), parts);
+  Quantity::multipliers->evaluate(w.mechanics(at.A()), w.affine_motion.linear(), w.G_lambda, w.quantity);
+  Quantity::multipliers->evaluate(w.mechanics(at.A()), w.affine_motion.constant(), w.d_lambda, w.quantity);
+  w.without_load = w.force;
+  if (has_force) w.projection.solve_mass_in_place(w.without_load);
+  w.without_load += w.a_bar;
+  // B c, or with `slopes` its change with λ, of what acts on forces or on the acceleration
+  const auto add = [&](bool on_forces, bool slopes, auto&& sum) {
+    for (std::size_t a = 0; a < terms.size(); ++a) {
+      Workspace::Implementation::AtState& here = w.terms[a];
+      if (!here.reads_multipliers || (latent(terms[a]).base == Latent::Base::force) != on_forces) continue;
+      for (Index l = 0; !slopes && l < here.signal.size(); ++l)
+        sum.col(0) += here.signal[l] * here.directions.segment(l * nq, nq);
+      const auto& entries = here.of_directions->entries();
+      for (std::size_t e = 0; slopes && e < entries.size(); ++e) {
+        const Index row = entries[e].state_index - n_state, output = entries[e].output;
+        if (row >= 0) sum(output % nq, row) += here.ddirections[static_cast<Index>(e)] * here.signal[output / nq];
+      }
+    }
+  };
+  w.x.head(n_state) = state;
+  const auto motion = [&](const VectorXd& lambda, VectorXd& a_bar, MatrixXd& slope) {
+    w.x.tail(lambda.size()) = lambda;
+    for (Workspace::Implementation::AtState& here : w.terms) {
+      if (!here.reads_multipliers) continue;
+      here.of_directions->evaluate(w.x, here.directions);
+      here.of_directions->differentiate(w.x, here.ddirections);
+    }
+    a_bar.setZero();
+    slope.setZero();
+    add(true, false, a_bar);
+    add(true, true, slope);
+    w.projection.solve_mass_in_place(a_bar);
+    w.projection.solve_mass_in_place(slope);
+    a_bar += w.without_load;
+    add(false, false, a_bar);
+    add(false, true, slope);
+  };
+  if (!w.solver.solve(w.G_lambda, w.d_lambda.col(0), motion)) return false;
+  motion(w.solver.lambda(), w.a_of_force, w.slope);  // leaves directions, their derivatives and the slope at λ
+  add(true, false, w.force);
+  add(false, false, w.a_bar);
+  return true;
+}
+
+void Predictor::Implementation::write_G(const StateEvaluator& at, Workspace::Implementation& w) const {
+  w.affine_motion.evaluate(w.projection, at.M(), parts);
+  view.quantity->evaluate(w.mechanics(at.A()), w.affine_motion.linear(), w.G, w.quantity);
+  if (!reads_multipliers) return;
+  w.D.setIdentity();
+  w.D.noalias() -= w.slope.transpose().lazyProduct(w.G_lambda.transpose());
+  w.D_transposed.compute(w.D);
+  w.slope_transposed = w.slope.transpose();
+  w.K_transposed = w.D_transposed.solve(w.slope_transposed);
+  w.GK.noalias() = w.G.lazyProduct(w.K_transposed.transpose());
+  w.G.noalias() += w.GK.lazyProduct(w.G_lambda);
 }
 
 void Predictor::Implementation::evaluate_motion(const StateEvaluator& at, Workspace::Implementation& w) const {
@@ -403,7 +501,7 @@ void Predictor::Implementation::write_loadings(Workspace::Implementation& w) con
     loading.setZero();
     for (Index r = 0; r < loading.cols(); ++r) {
       for (Index l = 0; l < term.size(); ++l) {
-        const double value = along(l, r);
+        const double value = along(l, r) * (latent(term).is_positive ? w.terms[a].signal[l] : 1);
         for (Index f = 0; f < term.n_functions(); ++f) loading(f, r) += term.C(l, f) * value;
       }
       w.variance[r] += k * loading.col(r).squaredNorm();
@@ -412,8 +510,7 @@ void Predictor::Implementation::write_loadings(Workspace::Implementation& w) con
 }
 
 void Predictor::Implementation::write_stddev(const StateEvaluator& at, Workspace::Implementation& w, Ref<VectorXd> stddev) const {
-  w.affine_motion.evaluate(w.projection, at.M(), parts);
-  view.quantity->evaluate(w.mechanics(at.A()), w.affine_motion.linear(), w.G, w.quantity);
+  write_G(at, w);
   for (int r = 0; r < view.size(); ++r) w.Gt.col(r) = w.G.row(view.rows[static_cast<std::size_t>(r)]);
   if (has_forced_latent) {
     w.M_inverse_Gt = w.Gt;
@@ -445,6 +542,7 @@ void Predictor::Implementation::differentiate_prior(const Ref<const VectorXd>& s
     const Latent& of = latent(term);
     Workspace::Implementation::AtState& here = w.terms[a];
     with_data(w, [&](const auto& data, auto& memory) { data.differentiate_signal(term, a, here.point, memory, here.dsignal); });
+    if (of.is_positive) here.dsignal *= here.signal.asDiagonal();
     MatrixXd& sum = of.base == Latent::Base::force ? w.d_force : w.d_of_rest;
     // B d(C g)/dφ, then along the features
     if (here.directions.size() == 0) {
@@ -471,9 +569,10 @@ void Predictor::Implementation::differentiate_prior(const Ref<const VectorXd>& s
     }
     // dB C g
     if (!here.of_directions) continue;
-    here.of_directions->differentiate(state, here.ddirections);
+    if (!here.reads_multipliers) here.of_directions->differentiate(state, here.ddirections);
     for (std::size_t e = 0; e < here.of_directions->entries().size(); ++e) {
       const StateDerivatives::Entry& entry = here.of_directions->entries()[e];
+      if (entry.state_index >= sum.cols()) break;  // in λ, which follows
       sum(entry.output % nq, entry.state_index) += here.ddirections[static_cast<Index>(e)] * here.signal[entry.output / nq];
     }
   }
@@ -543,6 +642,13 @@ void Predictor::Implementation::write_jacobian(const Ref<const VectorXd>& state,
   differentiate_mechanics(at, w);
   differentiate_motion(at, w);
   view.quantity->differentiate(w.mechanics(at.A()), w.motion(), w.dmotion(), StateChange(at), w.d_value, w.quantity);
+  if (reads_multipliers) {
+    // dv = ∂v/∂x + G J dλ, D dλ = ∂(G_λ ā + d_λ)/∂x
+    write_G(at, w);
+    Quantity::multipliers->differentiate(w.mechanics(at.A()), w.motion(), w.dmotion(), StateChange(at), w.d_multipliers,
+                                         w.quantity);
+    w.d_value.noalias() += w.GK.lazyProduct(w.d_multipliers);
+  }
   for (std::size_t r = 0; r < view.rows.size(); ++r) {
     jacobian.row(static_cast<Index>(r)) = w.d_value.row(view.rows[r]);
     if (added_entries[r]) jacobian(static_cast<Index>(r), *added_entries[r]) += 1;
@@ -571,7 +677,7 @@ Predictor::Predictor(const Posterior& posterior)
 Predictor::Predictor(const Posterior& posterior, View view) : Predictor(posterior, std::move(view), Options()) {}
 Predictor::Predictor(const Posterior& posterior, View view, Options options) {
   require_view(posterior.prior(), view);
-  require_linear(prior_of(posterior.prior(), view), "Predictor");
+  if (view.latent || !view.has_mean()) require_linear(prior_of(posterior.prior(), view), "Predictor of a part of the motion");
   for (const auto& component : posterior.conditioned()) {
     const auto own = std::make_shared<Implementation>(*component, view, options);
     if (components_.empty()) own->distance = DataDistance(*component, view);

@@ -8,7 +8,7 @@
 #include "gp2/view.hpp"
 #include "mechanics/describe_fault.hpp"
 #include "mechanics/known_multipliers.hpp"
-#include "mechanics/solve_multipliers.hpp"
+#include "mechanics/multiplier_solver.hpp"
 
 namespace gp2 {
 
@@ -43,6 +43,7 @@ MatrixXd ModelMotion::with_load(const Eigen::Ref<const MatrixXd>& states, const 
   const ViewValues multipliers = evaluate_view(View::multipliers(*system_), mechanics, states);
   MatrixXd x(n_state + nc, states.cols());
   x.topRows(n_state) = states;
+  MultiplierSolver solver;
   for (int i = 0; i < static_cast<int>(states.cols()); ++i) {
     const UdwadiaKalaba& projection = mechanics.projections[static_cast<std::size_t>(i)];
     VectorXd at = x.col(i);
@@ -66,9 +67,10 @@ MatrixXd ModelMotion::with_load(const Eigen::Ref<const MatrixXd>& states, const 
       a_bar = projection.solve_mass(mechanics.values.F(i) + values(truth_force_, nq)) + values(truth_, nq);
       slope = projection.solve_mass(slopes(truth_force_slopes_)) + slopes(truth_slopes_);
     };
-    const auto lambda = solve_multipliers(multipliers.G(i), multipliers.offset.col(i), motion);
-    if (!lambda) throw InputError(internal::describe_fault(*system_, states, no_multipliers(i)));
-    x.col(i).tail(nc) = *lambda;
+    if (!solver.solve(multipliers.G(i), multipliers.offset.col(i), motion)) {
+      throw InputError(internal::describe_fault(*system_, states, no_multipliers(i)));
+    }
+    x.col(i).tail(nc) = solver.lambda();
   }
   return x;
 }

@@ -4,6 +4,7 @@
 #include <gmock/gmock.h>
 #include <gtest/gtest.h>
 
+#include "allocation_count.hpp"
 #include "gp2/fit.hpp"
 #include "gp2/inference/pathwise.hpp"
 #include "gp2/predictor.hpp"
@@ -295,6 +296,114 @@ TEST(NonlinearPosterior, MeansSamplesAndPathsHoldTheConstraintsAndTheFixedPoint)
   }
 }
 
+TEST(NonlinearPredictor, IsThePosteriorWithItsJacobianAndAllocatesNothing) {
+  for (const bool rubs : {true, false}) {
+    const Fitted fitted(rubs ? test::model_that_rubs() : rubbing_bead("lambda", "se + constant"), 25);
+    SCOPED_TRACE(fitted.model.name);
+    const Posterior posterior(
+        fitted.prior, fitted.observations,
+        model_values(fitted.prior, fitted.observations, default_hyperparameters(fitted.prior, fitted.observations, {}, {})));
+    const MatrixXd states = test::draw(fitted.model, 12, nonlinear_seed + 1).states;
+    const System& system = *fitted.model.system;
+    for (const View& view : {View::constrained_acceleration(system), View::multipliers(system), View::constraint_force(system),
+                             View::unconstrained_acceleration(system)}) {
+      SCOPED_TRACE(view.quantity->word());
+      const Predictor predictor(posterior, view);
+      auto memory = predictor.make_workspace();
+      const auto marginal = posterior.marginal(view, states);
+      VectorXd mean(view.size()), stddev(view.size()), above = mean, below = mean;
+      MatrixXd jacobian(view.size(), states.rows());
+      EXPECT_EQ(predictor.mean_and_stddev(states.col(0), mean, stddev, memory), Predictor::Status::ok);
+      EXPECT_EQ(predictor.mean_and_jacobian(states.col(0), mean, jacobian, memory), Predictor::Status::ok);
+      for (Index i = 0; i < states.cols(); ++i) {
+        const std::size_t n_allocations = test::allocations_of([&] {
+          EXPECT_EQ(predictor.mean_and_stddev(states.col(i), mean, stddev, memory), Predictor::Status::ok);
+          EXPECT_EQ(predictor.mean_and_jacobian(states.col(i), mean, jacobian, memory), Predictor::Status::ok);
+        });
+        EXPECT_EQ(n_allocations, 0U);
+        const double size = 1 + mean.norm();
+        EXPECT_LE(test::largest(mean - marginal.mean.col(i)), 1e-11 * size);
+        EXPECT_LE(test::largest(stddev - marginal.stddev().col(i)), 1e-8 * size);
+        for (Index k = 0; k < states.rows(); ++k) {
+          const double step = 1e-5;
+          VectorXd there = states.col(i);
+          there[k] += step;
+          static_cast<void>(predictor.mean(there, above, memory));
+          there[k] -= 2 * step;
+          static_cast<void>(predictor.mean(there, below, memory));
+          EXPECT_LE(test::largest(jacobian.col(k) - (above - below) / (2 * step)), 1e-6 * (size + jacobian.norm()));
+        }
+      }
+    }
+  }
+}
+
+// 1000 samples, each at states all over the region of the data and beyond
+TEST(PositiveLatent, AlongMinusTheVelocityFeedsNoEnergyInInAnySample) {
+  const Fitted fitted(rubbing_bead("lambda", "se + constant", "positive = true"), 30);
+  const Posterior posterior(
+      fitted.prior, fitted.observations,
+      model_values(fitted.prior, fitted.observations, default_hyperparameters(fitted.prior, fitted.observations, {}, {})));
+  MatrixXd states = test::draw(fitted.model, 20, nonlinear_seed + 1).states;
+  states.middleRows(2, 2).rightCols(10) *= 1.5;
+  const View learned = View::learned_force(*fitted.model.system);
+  const MatrixXd samples = posterior.sample({{learned, states}}, 1000, 3);
+  for (Index s = 0; s < samples.cols(); ++s) {
+    const MatrixXd force = samples.col(s).reshaped(2, states.cols());
+    EXPECT_LE(force.cwiseProduct(states.middleRows(2, 2)).colwise().sum().maxCoeff(), 0);
+  }
+}
+
+// Without a constraint, positive latents are all that is not linear.
+TEST(PositiveLatent, DampsAFreePendulum) {
+  const Model model = Model::parse(R"toml(
+name = "pendulum"
+coordinates = ["q"]
+[mechanics]
+mass = [["1"]]
+force = ["-9.81*sin(q)"]
+[[latent]]
+name = "damping"
+kernel = "se + constant"
+features = ["q"]
+positive = true
+directions = { force = [["-0.3*dq"]] }
+[sampling]
+q = [-2, 2]
+dq = [-3, 3]
+[truth]
+force = ["-(0.2 + 0.1*q^2)*dq"]
+)toml",
+                                   "pendulum");
+  const Fitted fitted(model, 50);
+  const Fit found =
+      fit(fitted.prior, fitted.observations, default_hyperparameters(fitted.prior, fitted.observations, {}, {}), FitOptions());
+  const MatrixXd states = test::draw(model, 100, nonlinear_seed + 1).states;
+  const View view = View::constrained_acceleration(*model.system);
+  EXPECT_LE(test::largest(found.posterior.mean(view, states) - ModelMotion(model).acceleration(states)), 0.03);
+  const Predictor predictor(found.posterior);
+  auto memory = predictor.make_workspace();
+  VectorXd mean(1);
+  EXPECT_EQ(predictor.mean(states.col(0), mean, memory), Predictor::Status::ok);
+  EXPECT_NEAR(mean[0], found.posterior.mean(view, states.leftCols(1))(0, 0), 1e-11);
+}
+
+TEST(NonlinearPosterior, GoesToAnotherSystem) {
+  const Fitted fitted(rubbing_bead("lambda", "se + constant"), 60);
+  const Fit found =
+      fit(fitted.prior, fitted.observations, default_hyperparameters(fitted.prior, fitted.observations, {}, {}), FitOptions());
+  std::string text = fitted.model.text;
+  text.replace(text.find("m = 0.2"), 7, "m = 0.4");
+  const Model heavier = Model::parse(text, "heavier");
+  PriorOptions options;
+  options.mean = Prior::Mean::force;
+  const View view =
+      test::under(View::constrained_acceleration(*heavier.system), make_other_system(fitted.model, heavier, options));
+  const MatrixXd states = test::draw(heavier, 100, nonlinear_seed + 1).states;
+  const MatrixXd truth = ModelMotion(heavier).acceleration(states);
+  EXPECT_LE((found.posterior.mean(view, states) - truth).norm(), 0.01 * truth.norm());
+}
+
 TEST(NonlinearFit, FindsACoefficientThatKnownMultipliersGetWrong) {
   const std::string kernel = "constant + matern32";
   const Fitted own(rubbing_bead("lambda", kernel), 60), known(rubbing_bead("lambda0", kernel), 60);
@@ -322,7 +431,8 @@ TEST(NonlinearPrior, IsRefusedByNameWhereItCannotBe) {
   const Posterior posterior(
       fitted.prior, fitted.observations,
       model_values(fitted.prior, fitted.observations, default_hyperparameters(fitted.prior, fitted.observations, {}, {})));
-  expect_says([&] { static_cast<void>(Predictor(posterior)); }, {"Predictor", "lambda0"});
+  const View learned = View::learned_force(*fitted.model.system);
+  expect_says([&] { static_cast<void>(Predictor(posterior, learned)); }, {"Predictor", "lambda0"});
   expect_says([&] { static_cast<void>(update(Posterior(posterior), fitted.observations.front())); }, {"update", "lambda0"});
   const std::string latent = "[[latent]]\nname = \"x\"\nfeatures = ";
   expect_says([&] { static_cast<void>(make_prior(rubbing_bead("lambda", "constant", latent + "[\"lambda(1)\"]"))); },

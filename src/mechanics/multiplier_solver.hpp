@@ -1,0 +1,83 @@
+#pragma once
+
+#include <limits>
+
+#include <Eigen/Core>
+#include <Eigen/LU>
+
+#include "gp2/mechanics/udwadia_kalaba.hpp"
+
+namespace gp2 {
+
+/// The multipliers under forces that they change themselves (theory.md, T46), at one state after another:
+///
+///     λ = G ā(λ) + d,    G = −(A M⁻¹Aᵀ)⁺A,    d = (A M⁻¹Aᵀ)⁺ b,
+///
+/// by Newton's method on r(λ) = λ − G ā_τ(λ) − d, ā_τ(λ) = ā(0) + τ (ā(λ) − ā(0)). One step is exact where forces are proportional to
+/// |λ| and no multiplier changes its sign. Allocates nothing where the sizes are those of the call before.
+class MultiplierSolver {
+ public:
+  /// @param G       (nc × nq)
+  /// @param motion  motion(λ, ā, ∂ā/∂λ) writes the last two (nq), (nq × nc)
+  /// @returns whether the solution was reached from forces without load. Else det(I − G ∂ā/∂λ) ≤ 0 on the way there: the load grows with
+  /// the force it causes as fast as that force, so that there is no motion, or more than one (Painlevé's paradox).
+  template <typename Matrix, typename Vector, typename Motion>
+  bool solve(const Matrix& G, const Vector& d, const Motion& motion) {
+    const Eigen::Index nc = G.rows(), nq = G.cols();
+    slope_.resize(nq, nc);
+    a_bar_.resize(nq);
+    D_.resize(nc, nc);
+    start(G, d, motion);
+    if (run(G, d, motion, 1)) return true;
+    constexpr int n_steps = 16;  // the load is let in bit by bit
+    start(G, d, motion);
+    for (int step = 1; step <= n_steps; ++step) {
+      if (!run(G, d, motion, static_cast<double>(step) / n_steps)) return false;
+    }
+    return true;
+  }
+
+  [[nodiscard]] const Eigen::VectorXd& lambda() const { return lambda_; }
+
+ private:
+  template <typename Matrix, typename Vector, typename Motion>
+  void start(const Matrix& G, const Vector& d, const Motion& motion) {
+    lambda_.setZero(G.rows());
+    motion(lambda_, a_bar_, slope_);
+    free_ = a_bar_;
+    lambda_ = d;
+    lambda_.noalias() += G.lazyProduct(free_);
+    size_ = lambda_.norm();
+  }
+
+  template <typename Matrix, typename Vector, typename Motion>
+  bool run(const Matrix& G, const Vector& d, const Motion& motion, double tau) {
+    constexpr int most = 40;
+    constexpr double enough = 64 * std::numeric_limits<double>::epsilon();
+    for (int step = 0; step < most; ++step) {
+      motion(lambda_, a_bar_, slope_);
+      if (lambda_.size() == 0) return true;
+      D_.setIdentity();
+      D_.noalias() -= tau * G.lazyProduct(slope_);
+      lu_.compute(D_);
+      if (!(lu_.determinant() > 0)) return false;
+      a_bar_ = free_ + tau * (a_bar_ - free_);
+      residual_ = lambda_ - d;
+      residual_.noalias() -= G.lazyProduct(a_bar_);
+      change_ = lu_.solve(residual_);
+      lambda_ -= change_;
+      if (change_.norm() <= enough * (size_ + lambda_.norm())) return lambda_.allFinite();
+    }
+    return false;
+  }
+
+  Eigen::VectorXd free_, lambda_, a_bar_, residual_, change_;
+  Eigen::MatrixXd slope_, D_;
+  Eigen::PartialPivLU<Eigen::MatrixXd> lu_;
+  double size_ = 0;
+};
+
+/// What is wrong with a state that has no solution.
+MechanicsBatch::Fault no_multipliers(int state);
+
+}  // namespace gp2
