@@ -16,6 +16,7 @@
 #include "gp2/prior.hpp"
 #include "gp2/simulation/generate.hpp"
 #include "gp2/simulation/projected_states.hpp"
+#include "inference/nonlinear_motion.hpp"
 #include "jobs/read_observations.hpp"
 
 namespace gp2 {
@@ -83,6 +84,102 @@ int first_singular_mass(const System& system, const Eigen::MatrixXd& states) {
   return first_of_all;
 }
 
+/// Latents whose directions read the load of the constraints, at states.
+class LoadCheck {
+ public:
+  /// @param rows  of the log, that the states are
+  LoadCheck(Prior prior, Eigen::MatrixXd states, std::vector<Eigen::Index> rows)
+      : prior_(std::move(prior)),
+        states_(std::move(states)),
+        rows_(std::move(rows)),
+        parameters_(prior_.system->parameter_values()),
+        mechanics_(require_mechanics(*prior_.system, states_, parameters_)),
+        multipliers_(evaluate_view(View::multipliers(*prior_.system), mechanics_, states_)),
+        values_(require_prior_values(prior_, states_, parameters_, mechanics_)) {}
+
+  void run(std::vector<Finding>& findings) const {
+    for (std::size_t a = 0; a < prior_.latents.size(); ++a) {
+      const Latent& latent = prior_.latents[a];
+      if (!latent.directions) continue;
+      for (int l = 0; l < latent.size(); ++l) {
+        const std::string name =
+            latent.size() == 1 ? fmt::format("latent '{}'", latent.name)
+                               : fmt::format("latent '{}', {}", latent.name, latent.column_names[static_cast<std::size_t>(l)]);
+        if (latent.directions->of_multipliers() != nullptr) {
+          add_jam(name, a, l, findings);
+        } else if (latent.directions->make_evaluator(parameters_)->tapes().n_loads > 0) {
+          add_left_out(name, a, l, findings);
+        }
+      }
+    }
+  }
+
+ private:
+  static constexpr double enough = 0.1;  // of the load, that a coefficient of 1 makes
+
+  // how much of the load under the known force a coefficient of 1 changes (theory.md, T46: κ)
+  void add_left_out(const std::string& name, std::size_t a, int l, std::vector<Finding>& findings) const {
+    double largest = 0;
+    for (int i = 0; i < states_.cols(); ++i) {
+      const UdwadiaKalaba& projection = mechanics_.projections[static_cast<std::size_t>(i)];
+      const Eigen::VectorXd known =
+          multipliers_.G(i) * projection.solve_mass(mechanics_.values.F(i)) + multipliers_.offset.col(i);
+      if (known.norm() > 0) largest = std::max(largest, (multipliers_.G(i) * values_.E(a, i).col(l)).norm() / known.norm());
+    }
+    if (largest < 1e-6) return;
+    findings.push_back({largest > enough ? Level::warning : Level::good,
+                        fmt::format("{}: where it is 1 it changes lambda0, the load that it reads, by up to {:.2g} of it; lambda "
+                                    "is the load with that",
+                                    name, largest)});
+  }
+
+  // the least coefficient that leaves a state without a motion
+  void add_jam(const std::string& name, std::size_t a, int l, std::vector<Finding>& findings) const {
+    const NonlinearMotion motion(prior_, states_, parameters_, mechanics_);
+    const auto fault = [&](double coefficient) {
+      Linearisation::OfGroup at = motion.without_signals();
+      at.signals[a].row(l).setConstant(prior_.latents[a].is_positive ? std::log(coefficient) : coefficient);
+      return motion.solve(at);
+    };
+    constexpr double most = 1e3;
+    double free = 0, jammed = 1e-3;
+    while (jammed < most && !fault(jammed)) free = std::exchange(jammed, 2 * jammed);
+    if (jammed >= most) {
+      findings.push_back({Level::good, fmt::format("{}: no coefficient jams the load that it reads", name)});
+      return;
+    }
+    for (int step = 0; step < 20; ++step) (fault(0.5 * (free + jammed)) ? jammed : free) = 0.5 * (free + jammed);
+    findings.push_back(
+        {Level::good, fmt::format("{}: from a coefficient of {:.3g} on it jams the load that it reads (Painlevé's paradox), at "
+                                  "state {} first",
+                                  name, jammed, rows_[static_cast<std::size_t>(fault(jammed)->state)] + 1)});
+  }
+
+  Prior prior_;
+  Eigen::MatrixXd states_;
+  std::vector<Eigen::Index> rows_;
+  Eigen::VectorXd parameters_;
+  MechanicsBatch mechanics_;
+  ViewValues multipliers_;
+  PriorValues values_;
+};
+
+void check_load(const Model& model, const Eigen::MatrixXd& states, std::vector<Finding>& findings) {
+  constexpr Eigen::Index enough = 300;  // states, evenly taken
+  PriorOptions options;
+  options.mean = Prior::Mean::force;
+  const Prior prior = make_prior(model, options);
+  const std::vector<bool> reads = prior.reads();
+  std::vector<Eigen::Index> rows;
+  for (Eigen::Index i = 0; i < states.cols(); i += std::max<Eigen::Index>(1, states.cols() / enough)) {
+    bool is_known = true;
+    for (std::size_t k = 0; k < reads.size(); ++k)
+      is_known = is_known && !(reads[k] && std::isnan(states(static_cast<Eigen::Index>(k), i)));
+    if (is_known) rows.push_back(i);
+  }
+  if (!rows.empty()) LoadCheck(prior, states(Eigen::all, rows), rows).run(findings);
+}
+
 // The system, and where that is sound what the prior asks of it.
 void check_mechanics(const Model& model, const Eigen::MatrixXd& states, std::vector<Finding>& findings) {
   const System& system = *model.system;
@@ -91,7 +188,10 @@ void check_mechanics(const Model& model, const Eigen::MatrixXd& states, std::vec
   const Prior prior = make_prior(model);
   const View view = View::constrained_acceleration(system);
   const int singular = what_needs_acceleration(prior, view) ? first_singular_mass(system, states) : -1;
-  if (singular < 0) return;
+  if (singular < 0) {
+    check_load(model, states, findings);
+    return;
+  }
   MechanicsBatch mechanics;
   evaluate_mechanics(prior, view, states.col(singular), system.parameter_values(), mechanics);
   if (mechanics.fault) findings.push_back({Level::error, fmt::format("{} at state {}", mechanics.fault->text, singular + 1)});

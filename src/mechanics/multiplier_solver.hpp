@@ -66,7 +66,9 @@ class MultiplierSolver {
       residual_.noalias() -= G.lazyProduct(a_bar_);
       change_ = lu_.solve(residual_);
       lambda_ -= change_;
-      if (change_.norm() <= enough * (size_ + lambda_.norm())) return lambda_.allFinite();
+      // where D is nearly singular steps do not get as small as what is left
+      const double size = size_ + lambda_.norm();
+      if (change_.norm() <= enough * size || residual_.norm() <= 0.1 * enough * size) return lambda_.allFinite();
     }
     return false;
   }

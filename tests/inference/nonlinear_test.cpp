@@ -7,7 +7,9 @@
 #include "allocation_count.hpp"
 #include "gp2/fit.hpp"
 #include "gp2/inference/pathwise.hpp"
+#include "gp2/jobs/check_job.hpp"
 #include "gp2/predictor.hpp"
+#include "gp2/simulation/generate.hpp"
 #include "gp2/simulation/model_motion.hpp"
 #include "inference/nonlinear_motion.hpp"
 #include "inference/problems.hpp"
@@ -92,6 +94,32 @@ TEST(Multipliers, ThatGrowFasterThanTheForceTheyNeedAreAnErrorThatNamesTheState)
   const Model model = Model::parse(text, "bead");
   const MatrixXd states = test::draw(rubbing_bead("lambda"), 20, nonlinear_seed).states;
   expect_says([&] { static_cast<void>(ModelMotion(model).acceleration(states)); }, {"Painlevé", "x = "});
+}
+
+TEST(CheckOfALoad, SaysWhatTheKnownForceLeavesOutAndFromWhereOnTheContactJams) {
+  const auto finding = [](const Model& model) {
+    for (const Finding& one : check(model, nullptr, {})) {
+      if (one.text.starts_with("latent 'friction coefficient'")) return one;
+    }
+    return Finding{};
+  };
+  const Model model = rubbing_bead("lambda");
+  const MatrixXd states = generate(model, {100, 1, VectorXd::Zero(2)}).states;
+  // |κ| of each state: D = 1 − σκμ
+  double largest = 0, jam = 1e9;
+  for (Index i = 0; i < states.cols(); ++i) {
+    const double x = states(0, i), dx = states(2, i), dz = states(3, i), v = std::sqrt(dx * dx + dz * dz + 1e-6);
+    const double inertia = 1 / (x * x / 0.2 + 1 / 0.5), kappa = inertia * std::sqrt(1 + x * x) / v * (-x * dx / 0.2 + dz / 0.5);
+    const double sigma = dx * dx + x * states(states.rows() - 1, i) / 0.2 + 9.81 * 0.4 > 0 ? 1 : -1;
+    largest = std::max(largest, std::abs(kappa));
+    if (sigma * kappa > 0) jam = std::min(jam, 1 / (sigma * kappa));
+  }
+  EXPECT_EQ(
+      finding(rubbing_bead("lambda0")).text,
+      fmt::format("latent 'friction coefficient': where it is 1 it changes lambda0, the load that it reads, by up to {:.2g} "
+                  "of it; lambda is the load with that",
+                  largest));
+  EXPECT_THAT(finding(model).text, testing::HasSubstr(fmt::format("from a coefficient of {:.3g} on it jams", jam)));
 }
 
 // ---------------------------------------------------------------- the linear prior

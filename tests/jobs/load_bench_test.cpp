@@ -93,5 +93,29 @@ TEST_P(FrictionOfALoad, IsLearnedFromFewRowsAndHoldsAtTwiceTheVelocities) {
   EXPECT_LE(std::exp(growth / n_fits), 2.5);
 }
 
+class FrictionOfAChangedLoad : public testing::TestWithParam<std::string> {};
+INSTANTIATE_TEST_SUITE_P(Machines, FrictionOfAChangedLoad, testing::Values("rubbing_bead", "dragged_rod", "ladder"),
+                         [](const auto& machine) { return machine.param; });
+
+TEST_P(FrictionOfAChangedLoad, IsLearnedTogetherWithIt) {
+  Machine machine;
+  machine.file = fmt::format("experiments/mechanisms/{}.toml", GetParam());
+  const Model& model = test::model(machine.file);
+  std::string text = model.text;
+  const std::size_t truth = text.find("[truth]");
+  for (std::size_t at = text.find("lambda("); at < truth; at = text.find("lambda(", at)) text.replace(at, 6, "lambda0");
+  const Model known = Model::parse(text, machine.file);
+  double covered = 0;
+  const std::vector<std::uint64_t> seeds = {41, 42, 43};
+  for (const std::uint64_t seed : seeds) {
+    SCOPED_TRACE(fmt::format("{}, seed {}", machine.file, seed));
+    const GeneratedData test = test::draw(model, 200, seed + 5000);
+    const Scores own = scores(fitted(model, machine, 60, seed), test), other = scores(fitted(known, machine, 60, seed), test);
+    EXPECT_LE(own.nrmse, other.nrmse / 4);
+    covered += own.coverage;
+  }
+  EXPECT_GE(covered / static_cast<double>(seeds.size()), 0.8);
+}
+
 }  // namespace
 }  // namespace gp2
