@@ -15,6 +15,7 @@
 #include "mechanics/known_multipliers.hpp"
 #include "model/name_order.hpp"
 #include "model/toml_reader.hpp"
+#include "prior/gradient_columns.hpp"
 #include "prior/make_prior.hpp"
 #include "robots/robot_expressions.hpp"
 
@@ -888,9 +889,15 @@ class ModelReader : private TomlReader {
       if (latent.name == "discrepancy")
         fail(node, "latent.name", "'discrepancy' is the name of the latent that gp2 adds; take another");
       latent.kernel = entry.contains("kernel") ? text(*entry.get("kernel"), "latent.kernel") : "";
-      if (!entry.contains("features")) fail(node, "latent", R"(missing features = ["q1", …])");
-      read_features(*entry.get("features"), latent);
       if (entry.contains("directions")) read_directions(*entry.get("directions"), latent);
+      if (entry.contains("features")) {
+        read_features(*entry.get("features"), latent);
+      } else if (latent.is_potential) {
+        for (const Coordinate& coordinate : definition_.coordinates) latent.features.push_back(coordinate.name);
+      } else {
+        fail(node, "latent", R"(missing features = ["q1", …])");
+      }
+      if (latent.is_potential) require_potential(entry, node, latent);
       latent.lengthscale = relative_range(entry, "lengthscale");
       latent.signal_stddev = relative_range(entry, "signal_stddev");
       try {
@@ -902,6 +909,30 @@ class ModelReader : private TomlReader {
       model_.latents.push_back(std::move(latent));
     }
     if (model_.latents.empty()) add_default_latent();
+  }
+
+  // V(φ(q, t)), which the force −Jᵀ∇V is of
+  void require_potential(const toml::table& entry, const toml::node& at, const LatentSpec& latent) const {
+    const toml::node& features = entry.contains("features") ? *entry.get("features") : at;
+    if (latent.feature_code) {
+      fail(features, "latent.features", "a potential needs features that are expressions, so that they can be differentiated");
+    }
+    if (features.is_array()) {
+      for (const toml::node& feature : array(features, "latent.features")) {
+        const Expression value = expression_with_load(feature, "latent.features", "a feature may not depend on accelerations");
+        refuse_load(feature, "latent.features", value);
+        allow_only(feature, "latent.features", value, of_motion(), "a potential depends on coordinates and t alone");
+      }
+    }
+    if (!entry.contains("kernel")) return;
+    const toml::node& kernel = *entry.get("kernel");
+    std::optional<std::string> text;
+    try {
+      text = what_hinders_gradient(Kernel::parse(latent.kernel, latent.features));
+    } catch (const InputError& error) {
+      fail(kernel, "latent.kernel", error.what());
+    }
+    if (text) fail(kernel, "latent.kernel", fmt::format("\"{}\" {}", shortened(latent.kernel), *text));
   }
 
   // [expressions], or { code = [names] }
@@ -982,11 +1013,13 @@ class ModelReader : private TomlReader {
     const toml::node* matrix = &node;
     if (node.is_string()) {
       const std::string value = text(node, key);
-      if (value != "acceleration" && value != "force") {
+      if (value != "acceleration" && value != "force" && value != "potential") {
         fail(node, key,
-             fmt::format(R"(expected "acceleration", "force" or a matrix of expressions [[…], …], got "{}")", shortened(value)));
+             fmt::format(R"(expected "acceleration", "force", "potential" or a matrix of expressions [[…], …], got "{}")",
+                         shortened(value)));
       }
-      latent.base = value == "force" ? Latent::Base::force : Latent::Base::acceleration;
+      latent.is_potential = value == "potential";
+      latent.base = value != "acceleration" ? Latent::Base::force : Latent::Base::acceleration;
       return;
     }
     if (node.is_table() && !node.as_table()->contains("code")) {

@@ -8,6 +8,7 @@
 #include "gp2/error.hpp"
 #include "mechanics/describe_fault.hpp"
 #include "prior/admissible_directions.hpp"
+#include "prior/gradient_columns.hpp"
 
 namespace gp2 {
 
@@ -64,6 +65,15 @@ void require_latent(const Latent& latent, Index nq) {
   const Index n_directions = latent.directions ? latent.directions->size() : nq * nq;
   if (latent.size() == 0 || n_directions != nq * latent.size()) {
     fail(fmt::format("has {} columns, but directions of {} numbers for {} coordinates", latent.size(), n_directions, nq));
+  }
+  if (latent.is_potential &&
+      (latent.base != Latent::Base::force || latent.size() != n_features || !latent.directions || latent.free_loading)) {
+    fail("is a potential without one direction on forces for each feature");
+  }
+  if (latent.is_potential) {
+    if (const std::optional<std::string> text = what_hinders_gradient(latent.kernel)) {
+      fail(fmt::format("is a potential, but its kernel {}", *text));
+    }
   }
   if (latent.n_functions() < 1) fail(fmt::format("has {} functions", latent.n_functions()));
 }

@@ -46,6 +46,7 @@ struct LatentSpec {
   std::vector<std::vector<std::string>> directions = {};  // B(x): nq rows of p expressions of state and parameters
   std::vector<std::string> direction_names = {};          // of code, its columns (p)
   StateCode direction_code = {};                          // B(x) column-major (nq·p × N); neither: B = I
+  bool is_potential = false;  // it acts as the force −Jᵀ∇V of a potential V of its features; without directions
   Latent::Range lengthscale = {}, signal_stddev = {};
   /// Whether each direction has lengthscales, and all else of the kernel, of its own: p latents of one direction. Not given: where
   /// the kernel is not given either and PriorOptions::per_direction says so.
