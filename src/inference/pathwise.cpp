@@ -8,6 +8,7 @@
 #include "base/lapack.hpp"
 #include "base/simd.hpp"
 #include "gp2/error.hpp"
+#include "inference/potential_cross.hpp"
 #include "inference/query.hpp"
 #include "inference/requirements.hpp"
 #include "prior/gradient_columns.hpp"
@@ -78,6 +79,9 @@ struct PathwiseSamples::Implementation {
     std::vector<LatentPath> paths;                               // per latent
   };
   std::vector<Sample> samples;
+
+  /// @throws InputError when there is none.
+  [[nodiscard]] const Sample& at(int sample) const;
 };
 
 PathwiseSamples::PathwiseSamples(std::shared_ptr<const Implementation> implementation)
@@ -89,11 +93,34 @@ const PathwiseSamples::Implementation& PathwiseSamples::implementation() const {
 
 int PathwiseSamples::n_samples() const { return static_cast<int>(implementation().samples.size()); }
 
-MatrixXd PathwiseSamples::evaluate(int sample, const View& view, const Ref<const MatrixXd>& states) const {
-  if (sample < 0 || sample >= n_samples()) {
-    throw InputError(fmt::format("sample {}: there are {} samples, 0 is the first", sample, n_samples()));
+const PathwiseSamples::Implementation::Sample& PathwiseSamples::Implementation::at(int sample) const {
+  const int n = static_cast<int>(samples.size());
+  if (sample < 0 || sample >= n) throw InputError(fmt::format("sample {}: there are {} samples, 0 is the first", sample, n));
+  return samples[static_cast<std::size_t>(sample)];
+}
+
+VectorXd PathwiseSamples::potential(int sample, int latent, const Ref<const MatrixXd>& states,
+                                    const Ref<const VectorXd>& reference) const {
+  const auto& [component, paths] = implementation().at(sample);
+  require_potential(component->prior, latent);
+  component->prior.system->require_states(states);
+  component->prior.system->require_states(reference);
+  const auto a = static_cast<std::size_t>(latent);
+  const LatentPath& path = paths[a];
+  const MatrixXd features = evaluate_features(component->prior, a, states);
+  const VectorXd at_reference = evaluate_features(component->prior, a, reference).row(0).transpose();
+  PotentialCross cross(component->latents->latents()[a], features, at_reference);
+  VectorXd psi(path.features.size()), psi_reference(psi.size()), energy(states.cols());
+  path.features.evaluate(at_reference, psi_reference);
+  for (Index i = 0; i < energy.size(); ++i) {
+    path.features.evaluate(features.row(i).transpose(), psi);
+    energy[i] = path.weights.col(0).dot(psi - psi_reference) + cross.column(i).cwiseProduct(path.beta).sum();
   }
-  const auto& [component, paths] = implementation().samples[static_cast<std::size_t>(sample)];
+  return component->values.signal_stddev[a][0] * energy;
+}
+
+MatrixXd PathwiseSamples::evaluate(int sample, const View& view, const Ref<const MatrixXd>& states) const {
+  const auto& [component, paths] = implementation().at(sample);
   const Posterior::Implementation& posterior = *component;
   const Query query = make_query(posterior, view, states);
   std::vector<MatrixXd> f(paths.size());

@@ -200,6 +200,36 @@ void GradientColumns::of_function(Workspace& w) const {
   }
 }
 
+// 2 (k(0) − k(s))
+double GradientColumns::variance_of_difference(const Ref<const VectorXd>& difference) const {
+  double variance = 0;
+  for (const Kernel::Term& term : columns_->kernel().terms()) {
+    const double square = (inverse_lengthscales(term) * difference.array()).square().sum();
+    const Kernel::Factor& factor = term.factors.front();
+    double of_term = 0;
+    switch (factor.primitive) {
+      case Primitive::matern52: {
+        const double r = std::sqrt(5 * square);
+        of_term = -2 * (std::expm1(-r) + (r + square * (5.0 / 3.0)) * std::exp(-r));
+        break;
+      }
+      case Primitive::rq: {
+        const double alpha = columns_->values()[factor.first_parameter + n_features()];
+        of_term = -2 * std::expm1(-alpha * std::log1p(square / (2 * alpha)));
+        break;
+      }
+      case Primitive::linear:
+        of_term = square;
+        break;
+      default:  // se
+        of_term = -2 * std::expm1(-square / 2);
+        break;
+    }
+    variance += amplitude(term) * of_term;
+  }
+  return variance;
+}
+
 VectorXd GradientColumns::variance() const {
   VectorXd variance = VectorXd::Zero(n_features());
   for (const Kernel::Term& term : columns_->kernel().terms()) {

@@ -62,6 +62,10 @@ class GradientColumns {
   /// cov(g(φ_i), f(φ')) for every point, but for a constant of each point, to w.out (n × D).
   void of_function(Workspace& w) const;
 
+  /// The variance of f(φ) − f(φ'), without cancellation.
+  /// @param difference  φ − φ' (D)
+  [[nodiscard]] double variance_of_difference(const Eigen::Ref<const Eigen::VectorXd>& difference) const;
+
   /// cov(g, g) at a point, a diagonal (D).
   [[nodiscard]] Eigen::VectorXd variance() const;
 
