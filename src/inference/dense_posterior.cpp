@@ -20,8 +20,7 @@ using Eigen::VectorXd;
 DensePosterior::DensePosterior(const LatentRows& like) {
   for (const LatentRows::OfLatent& latent : like.latents) {
     const KernelColumns& kernel = latent.kernel;
-    latents_.push_back(
-        {KernelColumns(kernel.kernel(), MatrixXd(0, kernel.features().cols()), kernel.values()),
+    latents_.push_back({KernelColumns(kernel.kernel(), MatrixXd(0, kernel.features().cols()), kernel.values()),
                         {},
                         {},
                         latent.n_functions,

@@ -118,7 +118,8 @@ void Likelihood::Workspace::Implementation::update_rows(const Likelihood::Implem
     const std::vector<MatrixXd> features = sorted_features(self.prior, self.features, reduction);
     rows.latents.clear();
     for (std::size_t a = 0; a < n_latents; ++a) {
-      rows.latents.push_back({KernelColumns(self.prior.latents[a].kernel, features[a]), {}, 0, self.prior.latents[a].is_potential});
+      rows.latents.push_back(
+          {KernelColumns(self.prior.latents[a].kernel, features[a]), {}, 0, self.prior.latents[a].is_potential});
     }
     sample_ids = std::move(ids);
   }

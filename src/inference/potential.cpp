@@ -44,7 +44,7 @@ MatrixXd PotentialCross::column(Index i) { return at(features_.row(i).transpose(
 namespace {
 
 Posterior::Potential energy_of(const Posterior::Implementation& self, std::size_t a, const Ref<const MatrixXd>& states,
-                          const Ref<const VectorXd>& reference) {
+                               const Ref<const VectorXd>& reference) {
   const LatentPosterior& latents = *self.latents;
   const LatentPosterior::Basis& basis = latents.latents()[a];
   const MatrixXd features = evaluate_features(self.prior, a, states), at_reference = evaluate_features(self.prior, a, reference);

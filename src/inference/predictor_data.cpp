@@ -249,9 +249,8 @@ void PredictorData<T>::add_products(const PredictorTerm& term, std::size_t a, st
     GradientColumns(term.kernel).multiply(all, w);
     const Index n_points = term.kernel.n_points();
     for (Index f = 0; f < all.size(); ++f) {
-      memory.products.head(n_points).array() +=
-          Z.col(static_cast<Index>(component) * all.size() + f).head(n_points).array() *
-          w.out.col(f).head(n_points).template cast<T>();
+      memory.products.head(n_points).array() += Z.col(static_cast<Index>(component) * all.size() + f).head(n_points).array() *
+                                                w.out.col(f).head(n_points).template cast<T>();
     }
     return;
   }

@@ -13,9 +13,9 @@ namespace gp2 {
 /// A latent that the view of a predictor needs.
 struct PredictorTerm {
   std::size_t latent = 0;
-  KernelColumns kernel;  // k between the samples and a state
-  Eigen::MatrixXd C;     // loading (p × F)
-  bool is_potential = false;  // its functions are a gradient: GradientColumns in the place of k
+  KernelColumns kernel;           // k between the samples and a state
+  Eigen::MatrixXd C;              // loading (p × F)
+  bool is_potential = false;      // its functions are a gradient: GradientColumns in the place of k
   Eigen::VectorXd variance = {};  // of each function of a potential (F)
 
   [[nodiscard]] Eigen::Index size() const { return C.rows(); }         // p

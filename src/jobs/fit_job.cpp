@@ -84,7 +84,8 @@ int settled_inducing(const FitRequest& request, const FitProblem& problem, const
     if (has_sums) throw InputError("`inducing` is not for windows of a raw log: `windows=none` learns from its rows");
     if (const auto potential = std::ranges::find(problem.prior.latents, true, &Latent::is_potential);
         potential != problem.prior.latents.end()) {
-      throw InputError(fmt::format("`inducing` is not for the potential '{}': leave it out, or `inducing=none`", potential->name));
+      throw InputError(
+          fmt::format("`inducing` is not for the potential '{}': leave it out, or `inducing=none`", potential->name));
     }
     const auto most = static_cast<int>(*request.inducing);
     return most < fit_memory(problem, options).reduced_size ? most : 0;  // else it is exact that takes less

@@ -144,9 +144,10 @@ std::vector<Option> options(PredictRequest& request) {
       {"inverse_dynamics", &request.inverse_dynamics, "",
        "instead of a view: the inputs that produce the accelerations ddq1 … which the CSV has, u1 …, and ddq1_missed …, "
        "what is missed of them"});
-  table.push_back({"potential", &request.potential, "NAME",
-                   "instead of a view: the energy of the latent of this name, which the model has as a potential, less that at the "
-                   "first row: potential@NAME [J], known up to a constant"});
+  table.push_back(
+      {"potential", &request.potential, "NAME",
+       "instead of a view: the energy of the latent of this name, which the model has as a potential, less that at the "
+       "first row: potential@NAME [J], known up to a constant"});
   table.push_back(columns_option(request.columns));
   return table;
 }
@@ -159,7 +160,8 @@ PredictOutcome predict_potential(const FitFile& fit, const Posterior& posterior,
   if (view.quantity != View::Quantity::constrained_acceleration || view.latent || view.time_step || view.system ||
       request.n_samples || request.inverse_dynamics) {
     throw InputError(
-        "`potential` stands in the place of a view: leave `view`, `latent`, `dt`, `system`, `samples` and `inverse_dynamics` out");
+        "`potential` stands in the place of a view: leave `view`, `latent`, `dt`, `system`, `samples` and `inverse_dynamics` "
+        "out");
   }
   if (request.covariance == PredictRequest::Covariance::full) throw InputError("`potential` goes with `cov=none` or `cov=std`");
   const LatentRange range = latents_called(posterior.prior(), *request.potential, "`potential`");

@@ -906,6 +906,10 @@ class ModelReader : private TomlReader {
         fail(entry.contains("kernel") ? *entry.get("kernel") : node, "latent.kernel", error.what());
       }
       if (entry.contains("lengthscales")) read_lengthscales(*entry.get("lengthscales"), latent);
+      if (latent.is_potential && latent.per_direction.value_or(false)) {
+        fail(*entry.get("lengthscales"), "latent.lengthscales",
+             "a potential is one function, whose lengthscales all directions share; leave \"per direction\" out");
+      }
       model_.latents.push_back(std::move(latent));
     }
     if (model_.latents.empty()) add_default_latent();
@@ -926,13 +930,15 @@ class ModelReader : private TomlReader {
     }
     if (!entry.contains("kernel")) return;
     const toml::node& kernel = *entry.get("kernel");
-    std::optional<std::string> text;
+    bool is_possible = false;
     try {
-      text = what_hinders_gradient(Kernel::parse(latent.kernel, latent.features));
+      is_possible = has_gradient(Kernel::parse(latent.kernel, latent.features));
     } catch (const InputError& error) {
       fail(kernel, "latent.kernel", error.what());
     }
-    if (text) fail(kernel, "latent.kernel", fmt::format("\"{}\" {}", shortened(latent.kernel), *text));
+    if (is_possible) return;
+    fail(kernel, "latent.kernel",
+         fmt::format("the kernel of a potential is a sum of se, matern52, rq and linear, got \"{}\"", shortened(latent.kernel)));
   }
 
   // [expressions], or { code = [names] }

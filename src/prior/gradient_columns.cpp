@@ -1,8 +1,7 @@
 #include "prior/gradient_columns.hpp"
 
+#include <algorithm>
 #include <cmath>
-
-#include <fmt/format.h>
 
 #include "prior/primitive.hpp"
 
@@ -16,24 +15,12 @@ using Eigen::Ref;
 using Eigen::VectorXd;
 using Primitive = Kernel::Primitive;
 
-namespace {
-
-bool has_gradient(Primitive primitive) {
-  return primitive == Primitive::se || primitive == Primitive::matern52 || primitive == Primitive::rq ||
-         primitive == Primitive::linear;
-}
-
-}  // namespace
-
-std::optional<std::string> what_hinders_gradient(const Kernel& kernel) {
-  for (const Kernel::Term& term : kernel.terms()) {
-    if (term.factors.size() > 1) return "has a product, and that of a potential is a sum of se, matern52, rq and linear";
+bool has_gradient(const Kernel& kernel) {
+  return std::ranges::all_of(kernel.terms(), [](const Kernel::Term& term) {
     const Primitive primitive = term.factors.front().primitive;
-    if (has_gradient(primitive)) continue;
-    return fmt::format("has the term '{}', and that of a potential is a sum of se, matern52, rq and linear",
-                       primitive_names()[static_cast<std::size_t>(primitive)]);
-  }
-  return std::nullopt;
+    return term.factors.size() == 1 && (primitive == Primitive::se || primitive == Primitive::matern52 ||
+                                        primitive == Primitive::rq || primitive == Primitive::linear);
+  });
 }
 
 double GradientColumns::amplitude(const Kernel::Term& term) const {
@@ -55,7 +42,8 @@ void GradientColumns::evaluate(Index first, Index n, const VectorXd& point, Work
     term.delta.resize(n, D);
     w.half_square.setZero();
     for (Index d = 0; d < D; ++d) {
-      term.delta.col(d) = columns_->scaled().col(factor.first_column + d).segment(first, n).array() - point[factor.first_column + d];
+      term.delta.col(d) =
+          columns_->scaled().col(factor.first_column + d).segment(first, n).array() - point[factor.first_column + d];
       w.half_square += 0.5 * term.delta.col(d).square();
     }
     switch (factor.primitive) {
@@ -75,8 +63,7 @@ void GradientColumns::evaluate(Index first, Index n, const VectorXd& point, Work
         term.k2 = -(alpha + 1) / alpha * term.k1 / w.base;
         term.k3 = -(alpha + 2) / alpha * term.k2 / w.base;
         term.k1_alpha = term.k1 * ((alpha + 1) / alpha * w.half_square / w.base - alpha * w.product);
-        term.k2_alpha =
-            term.k2 * ((alpha + 2) / alpha * w.half_square / w.base - alpha * w.product - 1 / (alpha + 1));
+        term.k2_alpha = term.k2 * ((alpha + 2) / alpha * w.half_square / w.base - alpha * w.product - 1 / (alpha + 1));
         break;
       }
       case Primitive::linear:

@@ -1,7 +1,5 @@
 #pragma once
 
-#include <optional>
-#include <string>
 #include <vector>
 
 #include <Eigen/Core>
@@ -10,9 +8,8 @@
 
 namespace gp2 {
 
-/// Why the gradient of a function of this kernel is not known here, as the rest of a sentence about the kernel; nothing where it is:
-/// every term is one se, matern52, rq or linear factor.
-std::optional<std::string> what_hinders_gradient(const Kernel& kernel);
+/// Whether the functions of a kernel have a gradient that is known here: it is a sum of se, matern52, rq and linear.
+[[nodiscard]] bool has_gradient(const Kernel& kernel);
 
 /// The gradient g = ∇f of a function f ~ GP(k), between n points and one more at a time (theory.md, T44). Of a term k(s) of the
 /// kernel, s = ½ δᵀδ, δ = Λ^{1/2}(φ − φ'), Λ = diag(1/ℓ²):
@@ -25,8 +22,8 @@ class GradientColumns {
   /// Memory of the functions below, and the point that `evaluate` moved to; one per thread.
   struct Workspace {
     struct Term {
-      Eigen::ArrayXXd delta;             // δ (n × D)
-      Eigen::ArrayXd k1, k2, k3;         // times the amplitude's square; k₃ = dk₂/ds
+      Eigen::ArrayXXd delta;              // δ (n × D)
+      Eigen::ArrayXd k1, k2, k3;          // times the amplitude's square; k₃ = dk₂/ds
       Eigen::ArrayXd k1_alpha, k2_alpha;  // derivatives in log α of rq
     };
     std::vector<Term> terms;

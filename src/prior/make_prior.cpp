@@ -22,6 +22,8 @@ using Eigen::MatrixXd;
 
 namespace {
 
+const std::string potential_kernel = "rq + linear";  // where a potential gives none; docs/priors.md says how it was chosen
+
 // an error says of which latent it is
 template <typename Work>
 auto named(const LatentSpec& spec, const Work& work) {
@@ -59,8 +61,9 @@ class LatentMaker {
     latent.lengthscale = spec.lengthscale;
     latent.signal_stddev = spec.signal_stddev;
     set_features(spec, latent);
+    const std::string& by_default = latent.is_potential ? potential_kernel : options_.kernel;
     latent.kernel =
-        named(spec, [&] { return Kernel::parse(spec.kernel.empty() ? options_.kernel : spec.kernel, latent.feature_names); });
+        named(spec, [&] { return Kernel::parse(spec.kernel.empty() ? by_default : spec.kernel, latent.feature_names); });
     if (latent.is_potential) require_potential(spec, latent);
     latent.feature_lengthscales =
         named(spec, [&] { return lengthscales_of(spec, latent.kernel, latent.feature_names, system_->coordinates()); });
@@ -111,9 +114,9 @@ class LatentMaker {
       throw InputError(fmt::format("latent '{}': a potential depends on coordinates and t alone, but the feature '{}' reads more",
                                    spec.name, latent.feature_names[d]));
     }
-    if (const std::optional<std::string> text = what_hinders_gradient(latent.kernel)) {
-      throw InputError(fmt::format("latent '{}': the kernel \"{}\" {}", spec.name, latent.kernel.text(), *text));
-    }
+    if (has_gradient(latent.kernel)) return;
+    throw InputError(fmt::format("latent '{}': the kernel of a potential is a sum of se, matern52, rq and linear, got \"{}\"",
+                                 spec.name, latent.kernel.text()));
   }
 
   /// −Jᵀ, J = ∂φ/∂q.
@@ -264,7 +267,8 @@ void require_well_formed(const LatentSpec& spec, const System& system) {
     if (spec.direction_names.empty()) fail("directions that are code need a name for each column");
     return;
   }
-  if (spec.is_potential && !spec.directions.empty()) fail("the directions of a potential follow from its features; leave them out");
+  if (spec.is_potential && !spec.directions.empty())
+    fail("the directions of a potential follow from its features; leave them out");
   if (spec.directions.empty()) return;
   if (std::ssize(spec.directions) != system.nq()) {
     fail(fmt::format("directions: expected {} rows, one per coordinate, got {}", system.nq(), spec.directions.size()));

@@ -70,11 +70,8 @@ void require_latent(const Latent& latent, Index nq) {
       (latent.base != Latent::Base::force || latent.size() != n_features || !latent.directions || latent.free_loading)) {
     fail("is a potential without one direction on forces for each feature");
   }
-  if (latent.is_potential) {
-    if (const std::optional<std::string> text = what_hinders_gradient(latent.kernel)) {
-      fail(fmt::format("is a potential, but its kernel {}", *text));
-    }
-  }
+  if (latent.is_potential && !has_gradient(latent.kernel))
+    fail("is a potential of a kernel that is no sum of se, matern52, rq and linear");
   if (latent.n_functions() < 1) fail(fmt::format("has {} functions", latent.n_functions()));
 }
 

@@ -68,7 +68,7 @@ class Gradient {
 template <typename Signal>
 struct SignalOfAll {
   explicit SignalOfAll(Signal& of) : signal(of) {}
-  operator double() const { return signal[0]; }  // NOLINT(google-explicit-constructor)
+  operator double() const { return signal[0]; }                // NOLINT(google-explicit-constructor)
   void operator=(double value) { signal.setConstant(value); }  // NOLINT(misc-unconventional-assign-operator)
   Signal& signal;
 };
@@ -103,8 +103,9 @@ void expect_gradient(const Problem& p) {
           gradient.analytic().log_kernel[a][k], [&](auto& v) -> auto& { return v.kernel[a][k]; }, true);
     }
     if (p.prior.latents[a].is_potential) {
-      gradient.expect_match(p.prior.latents[a].name + ": signal", gradient.analytic().log_signal_stddev[a].sum(),
-                            [&](auto& v) { return SignalOfAll(v.signal_stddev[a]); }, true);
+      gradient.expect_match(
+          p.prior.latents[a].name + ": signal", gradient.analytic().log_signal_stddev[a].sum(),
+          [&](auto& v) { return SignalOfAll(v.signal_stddev[a]); }, true);
     }
     for (Index l = 0; l < p.values.signal_stddev[a].size() && !p.prior.latents[a].is_potential; ++l) {
       gradient.expect_match(

@@ -193,7 +193,9 @@ directions = "potential"
 
 const Model& another_swing() {
   static const Model other = Model::parse(
-      changed(model_with_potentials().text, {{"m = 2.0", "m = 2.6"}, {"c = 0.7", "c = { value = 0.7, estimate = true }"}, {"z - h*x^2", "z - h*x^2 + 0.1*x^3"}}),
+      changed(
+          model_with_potentials().text,
+          {{"m = 2.0", "m = 2.6"}, {"c = 0.7", "c = { value = 0.7, estimate = true }"}, {"z - h*x^2", "z - h*x^2 + 0.1*x^3"}}),
       "another swing");
   return other;
 }

@@ -39,7 +39,7 @@ struct StateCode {
 /// What a latent is made from: words, as in the [[latent]] of a model file (docs/model-files.md), or code.
 struct LatentSpec {
   std::string name;
-  std::string kernel = {};            // empty: PriorOptions::kernel
+  std::string kernel = {};            // empty: PriorOptions::kernel; of a potential rq + linear
   std::vector<std::string> features;  // φ(x): expressions of the state; of code, what its numbers are called
   StateCode feature_code = {};        // empty: features are expressions
   Latent::Base base = Latent::Base::acceleration;
