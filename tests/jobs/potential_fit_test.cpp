@@ -40,7 +40,7 @@ directions = "potential"
 name       = "friction"
 kernel     = "se"
 features   = ["dx"]
-directions = { force = [["1"], ["0"]] }
+directions = { force = [["-dx"], ["0"]] }
 [noise]
 ddq = { value = 0.03, estimate = true }
 [truth]
