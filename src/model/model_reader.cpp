@@ -889,13 +889,11 @@ class ModelReader : private TomlReader {
       if (latent.name == "discrepancy")
         fail(node, "latent.name", "'discrepancy' is the name of the latent that gp2 adds; take another");
       latent.kernel = entry.contains("kernel") ? text(*entry.get("kernel"), "latent.kernel") : "";
+      if (entry.contains("features")) read_features(*entry.get("features"), latent);
       if (entry.contains("directions")) read_directions(*entry.get("directions"), latent);
-      if (entry.contains("features")) {
-        read_features(*entry.get("features"), latent);
-      } else if (latent.is_potential) {
+      if (latent.features.empty()) {
+        if (!latent.is_potential) fail(node, "latent", R"(missing features = ["q1", …])");
         for (const Coordinate& coordinate : definition_.coordinates) latent.features.push_back(coordinate.name);
-      } else {
-        fail(node, "latent", R"(missing features = ["q1", …])");
       }
       if (latent.is_potential) require_potential(entry, node, latent);
       latent.lengthscale = relative_range(entry, "lengthscale");
