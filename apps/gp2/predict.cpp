@@ -73,6 +73,7 @@ void run(PredictArguments& arguments) {
     });
     if (row != n_rows || file_version(arguments.states) != version) throw_changed(arguments.states);
   });
+  if (request.potential) return print_notes({fmt::format("{}: the potential at {} states", arguments.output, n_rows)});
   print_notes({request.inverse_dynamics
                    ? fmt::format("{}: inputs at {} states", arguments.output, n_rows)
                    : fmt::format("{}: {} predictions, view {}", arguments.output, n_rows, request.view.quantity->word())});

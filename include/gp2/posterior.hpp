@@ -100,6 +100,18 @@ class Posterior {
                                                    int n_threads = 1) const;
   static constexpr double far_from_data = 1.5;
 
+  struct Potential {
+    Eigen::VectorXd mean;    // E[V(φ(x)) − V(φ(x₀))]  (N) [J]
+    Eigen::VectorXd stddev;  // its deviation          (N) [J]
+  };
+  /// The energy V of a latent that is a potential, less that at a reference: accelerations say nothing of a constant in it
+  /// (theory.md, T45).
+  /// @param latent     numbered from 0, as in the prior
+  /// @param reference  the state x₀ (layout size)
+  /// @throws InputError when there is no such latent or it is no potential, or as System::require_states.
+  [[nodiscard]] Potential potential(int latent, const Eigen::Ref<const Eigen::MatrixXd>& states,
+                                    const Eigen::Ref<const Eigen::VectorXd>& reference) const;
+
   struct Joint {
     Eigen::VectorXd mean;        // quantity after quantity, in each state after state
     Eigen::MatrixXd covariance;  // as large

@@ -18,6 +18,9 @@ namespace gp2 GP2_API {
 /// A group of independent zero-mean scalar Gaussian processes f(φ(x)) that share one kernel and act on ā through the p directions
 /// E(x) (nq × p) and a loading C: they add E(x) C f(φ(x)) to ā. C is diag(s), the signal standard deviations s_1 … s_p of p
 /// processes, or a free matrix (p × functions): E C CᵀEᵀ is then the coregionalisation matrix of multi-output models.
+///
+/// Or a potential V ~ GP(s² k): f is the gradient of a process of covariance k, one function for each feature and correlated, E =
+/// −M⁻¹Jᵀ with J = ∂φ/∂q, and C = s I; what it adds to the applied force is −Jᵀ∇V(φ(q)).
 struct Latent {
   enum class Base {
     acceleration,  // E = B
@@ -44,6 +47,7 @@ struct Latent {
   std::vector<bool> is_of_place;                  // per feature: reads coordinates and t alone (D); of code all are or none
   std::vector<int> feature_parameters;            // the system's parameters that φ uses: they cannot be estimated
   Base base = Base::acceleration;
+  bool is_potential = false;                        // a potential of its features, with directions −Jᵀ on forces
   std::vector<std::string> column_names;            // p of them, for the names of the signal standard deviations
   std::shared_ptr<const StateFunction> directions;  // B (nq × p), column-major; null: B = I, p = nq
   std::optional<int> free_loading;                  // columns of a free loading C; not given: C = diag(s)

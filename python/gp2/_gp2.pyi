@@ -383,6 +383,13 @@ class Posterior:
         dt: float | None = None,
         columns: Mapping[str, str] | None = None,
     ) -> _Array: ...
+    def potential(
+        self,
+        states: npt.ArrayLike | _Table,
+        latent: str,
+        *,
+        columns: Mapping[str, str] | None = None,
+    ) -> tuple[_Array, _Array]: ...
     def inverse_dynamics(
         self,
         states: npt.ArrayLike | _Table,

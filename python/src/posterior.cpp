@@ -149,6 +149,21 @@ py::array sample(const PyPosterior& self, const py::object& data, int n_samples,
   return to_rows(std::move(samples)).attr("reshape")(n_samples, n, d);
 }
 
+// the energy of a potential, less that at the first state, and its deviation
+py::tuple potential_of(const PyPosterior& self, const py::object& data, const std::string& latent, const py::object& columns) {
+  const Prior& prior = self.posterior.prior();
+  const LatentRange range = latents_called(prior, latent, "`latent`");
+  const PredictedView at = predicted_view(self.file, prior, ViewRequest());
+  const States states(data, at.prior, at.view, *at.model, at.actuators, columns);
+  if (states.matrix().cols() == 0) return py::make_tuple(to_vector(VectorXd()), to_vector(VectorXd()));
+  const Posterior posterior = self.posterior;
+  Posterior::Potential energy = states.named([&] {
+    const py::gil_scoped_release release;
+    return posterior.potential(range.first, states.matrix(), states.matrix().col(0));
+  });
+  return py::make_tuple(to_vector(std::move(energy.mean)), to_vector(std::move(energy.stddev)));
+}
+
 // ---------------------------------------------------------------- inverse dynamics
 
 /// gp2.Inputs
@@ -828,6 +843,14 @@ void define_joint_and_sample(py::class_<PyPosterior>& posterior) {
           "Draws of a view at all states together (n_samples, n, d). Each obeys A ddq = b. Same seed, same samples.");
 }
 
+void define_potential(py::class_<PyPosterior>& posterior) {
+  using namespace py::literals;
+  posterior.def("potential", &potential_of, "states"_a, "latent"_a, py::kw_only(), "columns"_a = py::none(),
+                R"(The energy of a latent with directions = "potential", and its deviation: two arrays (n).
+
+It is relative to the first state, for accelerations say nothing of a constant in it.)");
+}
+
 void define_inverse_dynamics(py::class_<PyPosterior>& posterior) {
   using namespace py::literals;
   posterior.def("inverse_dynamics", &inverse_dynamics_of, "states"_a, "accelerations"_a = py::none(), py::kw_only(),
@@ -999,6 +1022,7 @@ void add_posterior(py::module_& module) {
   define_files_and_facts(posterior);
   define_predict(posterior);
   define_joint_and_sample(posterior);
+  define_potential(posterior);
   define_inverse_dynamics(posterior);
   define_evaluate_and_update(posterior);
   posterior.def("__repr__", [](const PyPosterior& self) { return fmt::format("<gp2.Posterior of '{}'>", self.system().name()); });

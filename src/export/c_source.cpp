@@ -211,6 +211,9 @@ Writer::Writer(const Posterior& posterior, std::vector<Component> components, Vi
   for (std::size_t a = 0; a < prior_.latents.size(); ++a) {
     if (!view_.has_latent(a)) continue;
     const Latent& of = prior_.latents[a];
+    if (of.is_potential) {
+      throw InputError(fmt::format("export to C: the latent '{}' is a potential, whose gradient is not written yet", of.name));
+    }
     Term& term = terms_.emplace_back();
     term.latent = a;
     term.of = &of;

@@ -874,7 +874,8 @@ std::string difference_of_latents(const Prior& made, const Prior& fitted) {
     const auto differ = [&](const char* what) { return fmt::format("{} of the latent '{}'", what, its.name); };
     if (mine.kernel.text() != its.kernel.text()) return differ("the kernel");
     if (mine.feature_names != its.feature_names) return differ("the features");
-    if (mine.base != its.base || mine.column_names != its.column_names || mine.free_loading != its.free_loading) {
+    if (mine.base != its.base || mine.column_names != its.column_names || mine.free_loading != its.free_loading ||
+        mine.is_potential != its.is_potential) {
       return differ("the directions");
     }
     if (mine.kernel_is_fixed != its.kernel_is_fixed || mine.has_one_signal != its.has_one_signal) {

@@ -3,6 +3,7 @@
 #include <algorithm>
 
 #include "base/parallel.hpp"
+#include "inference/potential_pairs.hpp"
 
 namespace gp2 {
 
@@ -47,6 +48,7 @@ class TileColumn {
 
   void evaluate_kernels(Index I, Index ni) {
     for (std::size_t a = 0; a < rows_.latents.size(); ++a) {
+      if (rows_.latents[a].is_potential) continue;
       const KernelColumns& kernel = rows_.latents[a].kernel;
       for (Index j = 0; j < nj_; ++j) {
         const Index skip = I == J_ ? whole_vectors_before(j) : 0;
@@ -62,6 +64,7 @@ class TileColumn {
                     Index other) {
     std::fill_n(out_.data() + skip, n - skip, 0.0);
     for (std::size_t a = 0; a < rows_.latents.size(); ++a) {
+      if (rows_.latents[a].is_potential) continue;
       const MatrixXd& Z = rows_.latents[a].Z;
       const Index m = rows_.latents[a].n_functions;
       for (Index l = 0; l < m; ++l) z_[l] = Z(other, right * m + l);
@@ -113,6 +116,7 @@ void assemble(const LatentRows& rows, int n_threads, Ref<MatrixXd> K, const std:
     TileColumn tiles(rows, J, K);
     for (Index I = J; I < rows.n_samples() && !is_set(stop); I += tile_size) tiles.write_tile(I);
   });
+  if (has_potential(rows)) add_potentials(rows, n_threads, K, stop);
 }
 
 }  // namespace gp2

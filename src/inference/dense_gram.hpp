@@ -48,7 +48,7 @@ class DensePosterior final : public LatentPosterior {
 
   [[nodiscard]] Eigen::Index size() const override { return factor_.size(); }
   [[nodiscard]] GramValue value() const override;
-  [[nodiscard]] double squared_weight(std::size_t latent) const override { return latents_[latent].Z.squaredNorm(); }
+  [[nodiscard]] double squared_weight(std::size_t latent) const override;
   void whiten(Eigen::Ref<Eigen::MatrixXd> c) const override;
   [[nodiscard]] Eigen::MatrixXd whitening_columns(Eigen::Index first, Eigen::Index n) const override;
   void keep_root() override;

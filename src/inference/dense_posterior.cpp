@@ -7,6 +7,7 @@
 #include "inference/assemble.hpp"
 #include "inference/dense_gram.hpp"
 #include "inference/latent_sums.hpp"
+#include "prior/gradient_columns.hpp"
 #include "prior/padded_rows.hpp"
 
 namespace gp2 {
@@ -19,9 +20,23 @@ using Eigen::VectorXd;
 DensePosterior::DensePosterior(const LatentRows& like) {
   for (const LatentRows::OfLatent& latent : like.latents) {
     const KernelColumns& kernel = latent.kernel;
-    latents_.push_back(
-        {KernelColumns(kernel.kernel(), MatrixXd(0, kernel.features().cols()), kernel.values()), {}, {}, latent.n_functions});
+    latents_.push_back({KernelColumns(kernel.kernel(), MatrixXd(0, kernel.features().cols()), kernel.values()),
+                        {},
+                        {},
+                        latent.n_functions,
+                        latent.is_potential});
   }
+}
+
+double DensePosterior::squared_weight(std::size_t latent) const {
+  const Basis& basis = latents_[latent];
+  if (!basis.is_potential) return basis.Z.squaredNorm();
+  const VectorXd variance = GradientColumns(basis.kernel).variance();
+  double sum = 0;
+  for (Index column = 0; column < basis.Z.cols(); ++column) {
+    sum += variance[column % variance.size()] * basis.Z.col(column).squaredNorm();
+  }
+  return sum;
 }
 
 std::unique_ptr<LatentPosterior> DensePosterior::clone() const { return std::make_unique<DensePosterior>(*this); }

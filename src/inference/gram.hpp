@@ -59,6 +59,7 @@ class LatentPosterior {
     Eigen::MatrixXd Z;             // column c·F + l: weight of f_l(φ_j) in component c of point j, 0 where there is none
     Eigen::MatrixXd beta;          // β  (n_rows × F)
     Eigen::Index n_functions = 0;  // F
+    bool is_potential = false;     // the functions are a gradient: GradientColumns in the place of k_a
   };
 
   virtual ~LatentPosterior() = default;
@@ -74,7 +75,7 @@ class LatentPosterior {
 
   [[nodiscard]] virtual Eigen::Index size() const = 0;  // basis variables
   [[nodiscard]] virtual GramValue value() const = 0;
-  /// Σ ‖Z_i,a‖² over the observed samples.
+  /// Σ ‖Z_i,a‖² over the observed samples; of a potential each entry times the deviation of its function.
   [[nodiscard]] virtual double squared_weight(std::size_t latent) const = 0;
 
   /// c ← X c.

@@ -81,6 +81,7 @@ InducingChoice choose_inducing_points(const Prior& prior, const std::vector<Obse
     throw InputError(fmt::format("inducing: n_candidates must be 1 or more, got {}", options.n_candidates));
   require_observations(prior, observations);
   require_values(prior, observations, values);
+  require_no_potential(prior);
   const int n_all = n_states(observations);
   const std::vector<Observations> some = n_all > options.n_candidates ? evenly(observations, options.n_candidates) : observations;
   Reduction reduction;

@@ -18,7 +18,7 @@ LatentRows latent_rows(const Prior& prior, const std::vector<MatrixXd>& features
   for (std::size_t a = 0; a < prior.latents.size(); ++a) {
     const MatrixXd C = values.loading(a);
     rows.latents.push_back({KernelColumns(prior.latents[a].kernel, features[a], values.kernel[a]),
-                            by_component(reduction, reduction.directions[a] * C), C.cols()});
+                            by_component(reduction, reduction.directions[a] * C), C.cols(), prior.latents[a].is_potential});
   }
   return rows;
 }

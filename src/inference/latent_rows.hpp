@@ -17,6 +17,7 @@ struct LatentRows {
     KernelColumns kernel;          // k_a between the samples and a point
     Eigen::MatrixXd Z;             // R_i E_a(x_i) C_a, by component
     Eigen::Index n_functions = 0;  // columns of C_a
+    bool is_potential = false;     // the functions are a gradient: see potential_pairs.hpp
   };
   const Reduction* reduction = nullptr;
   std::vector<OfLatent> latents;

@@ -48,6 +48,13 @@ void LatentSums::add_chunk(std::size_t a, Index first, Index n, Index i) {
   const LatentPosterior::Basis& basis = posterior_.latents()[a];
   k_.resize(chunk, static_cast<Index>(posterior_.latents().size()));
   sums_.resize(basis.n_functions);
+  if (basis.is_potential) {
+    gradients_.resize(posterior_.latents().size());
+    const GradientColumns gradient(basis.kernel);
+    gradient.evaluate(first, n, point(a, i), gradients_[a]);
+    gradient.add_sums(basis.beta.middleRows(first, n), mean_[a].col(i), gradients_[a]);
+    return;
+  }
   double* const k = k_.col(static_cast<Index>(a)).data();
   basis.kernel.evaluate(first, n, point(a, i), k, kernel_);
   simd::loops().weighted_sums(n, basis.n_functions, k, basis.beta.data() + first, basis.beta.rows(), sums_.data());
@@ -66,6 +73,14 @@ void LatentSums::write_cross(Index first, Index n, Index i, const std::vector<Ma
         if (!needs(a)) continue;
         const LatentPosterior::Basis& basis = posterior_.latents()[a];
         const Index n_functions = basis.n_functions;
+        if (basis.is_potential) {
+          GradientColumns(basis.kernel).multiply(loadings[a].col(i).segment(e * n_functions, n_functions), gradients_[a]);
+          for (Index l = 0; l < n_functions; ++l) {
+            products_.head(n).array() +=
+                basis.Z.col(static_cast<Index>(c) * n_functions + l).segment(first, n).array() * gradients_[a].out.col(l);
+          }
+          continue;
+        }
         simd::loops().add_scaled_products(n, n_functions, k_.col(static_cast<Index>(a)).data(),
                                           basis.Z.col(static_cast<Index>(c) * n_functions).data() + first, basis.Z.rows(),
                                           loadings[a].col(i).data() + e * n_functions, products_.data());

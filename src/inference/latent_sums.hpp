@@ -6,6 +6,7 @@
 #include <Eigen/Core>
 
 #include "inference/gram.hpp"
+#include "prior/gradient_columns.hpp"
 
 namespace gp2 {
 
@@ -37,6 +38,7 @@ class LatentSums {
   Eigen::VectorXd products_, sums_;
   std::vector<Eigen::MatrixXd> mean_;
   KernelColumns::Workspace kernel_;
+  std::vector<GradientColumns::Workspace> gradients_;  // per latent: of potentials
   std::optional<LatentRange> latent_;
 };
 

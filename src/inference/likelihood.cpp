@@ -119,7 +119,8 @@ void Likelihood::Workspace::Implementation::update_rows(const Likelihood::Implem
     const std::vector<MatrixXd> features = sorted_features(self.prior, self.features, reduction);
     rows.latents.clear();
     for (std::size_t a = 0; a < n_latents; ++a) {
-      rows.latents.push_back({KernelColumns(self.prior.latents[a].kernel, features[a]), {}, 0});
+      rows.latents.push_back(
+          {KernelColumns(self.prior.latents[a].kernel, features[a]), {}, 0, self.prior.latents[a].is_potential});
     }
     sample_ids = std::move(ids);
   }
@@ -214,7 +215,7 @@ std::vector<GramGradientParts> Likelihood::Implementation::parts(const Reduction
     const Latent& latent = prior.latents[a];
     GramGradientParts& part = parts.emplace_back();
     part.kernel = !latent.kernel_is_fixed && values.kernel[a].size() > 0;
-    part.alike = reduction != nullptr && reduction->same_directions[a] && !differentiates_samples();
+    part.alike = reduction != nullptr && reduction->same_directions[a] && !differentiates_samples() && !latent.is_potential;
     part.V = differentiates_samples() || (values.has_free_loading(a) && !part.alike);
     part.mean = differentiates_samples();
   }

@@ -6,6 +6,7 @@
 #include "base/parallel.hpp"
 #include "base/simd.hpp"
 #include "inference/assemble.hpp"
+#include "inference/potential_pairs.hpp"
 
 namespace gp2 {
 
@@ -123,6 +124,7 @@ class PairSweep {
       const auto skipped = [diagonal](Index j) { return diagonal ? whole_vectors_before(j) : 0; };
 
       for (std::size_t a = 0; a < k.size(); ++a) {
+        if (sweep.latent(a).is_potential) continue;
         H[a].setZero();
         for (Index j = 0; j < nj; ++j) {
           sweep.latent(a).kernel.scale(J + j, point);
@@ -141,6 +143,7 @@ class PairSweep {
           load(left, I, n_rows, n, right, J, n_columns, diagonal);
           for (std::size_t a = 0; a < k.size(); ++a) {
             const GramGradientParts& parts = sweep.parts_[a];
+            if (sweep.latent(a).is_potential) continue;
             if (parts.alike) {
               contract_alike(a, left, I, n, right, J, n_columns, diagonal,
                              sums.latents[a].columns.col(left * n_components + right));
@@ -152,7 +155,7 @@ class PairSweep {
       }
 
       for (std::size_t a = 0; a < k.size(); ++a) {
-        if (!sweep.parts_[a].kernel) continue;
+        if (!sweep.parts_[a].kernel || sweep.latent(a).is_potential) continue;
         for (Index j = 0; j < nj; ++j) {
           const Index skip = skipped(j);
           sweep.latent(a).kernel.scale(J + j, point);
@@ -261,6 +264,7 @@ GramGradient sweep_pairs(const LatentRows& rows, const Ref<const MatrixXd>& P, c
     gradient.latents.push_back({0.5 * of.kernel.colwise().sum().transpose(), of.columns.colwise().sum().transpose(),
                                 std::move(of.V), std::move(of.mean)});
   }
+  if (has_potential(rows)) add_potential_gradients(rows, P, parts, n_threads, gradient, stop);
   return gradient;
 }
 

@@ -8,8 +8,10 @@
 #include "base/lapack.hpp"
 #include "base/simd.hpp"
 #include "gp2/error.hpp"
+#include "inference/potential_cross.hpp"
 #include "inference/query.hpp"
 #include "inference/requirements.hpp"
+#include "prior/gradient_columns.hpp"
 #include "prior/random_features.hpp"
 
 namespace gp2 {
@@ -21,7 +23,7 @@ using Eigen::VectorXd;
 
 namespace {
 
-// The functions of one latent in one sample: f(φ) = Wᵀψ(φ) + βᵀk(φ).
+// The functions of one latent in one sample: f(φ) = Wᵀψ(φ) + βᵀk(φ). Those of a potential are the gradient of one of these.
 struct LatentPath {
   RandomFeatures features;
   MatrixXd weights;  // W (features × functions)
@@ -31,18 +33,40 @@ struct LatentPath {
 LatentPath draw_prior_path(const Posterior::Implementation& posterior, std::size_t a, int n_features, RandomStream& random) {
   const Latent& latent = posterior.prior.latents[a];
   LatentPath path{RandomFeatures(latent.kernel, posterior.values.kernel[a], n_features, random), {}, {}};
-  path.weights.resize(path.features.size(), latent.n_functions());
+  path.weights.resize(path.features.size(), latent.is_potential ? 1 : latent.n_functions());
   for (double& weight : path.weights.reshaped()) weight = random.normal();
   return path;
 }
 
 // a function of the prior at the points of a basis (functions × points)
-MatrixXd evaluate_prior_path(const LatentPath& path, const KernelColumns& kernel) {
-  MatrixXd f(path.weights.cols(), kernel.n_points());
+MatrixXd evaluate_prior_path(const LatentPath& path, const LatentPosterior::Basis& basis) {
+  const KernelColumns& kernel = basis.kernel;
+  MatrixXd f(basis.n_functions, kernel.n_points());
+  if (basis.is_potential) {
+    for (Index j = 0; j < kernel.n_points(); ++j) {
+      f.col(j) = path.features.gradient(path.weights.col(0), kernel.features().row(j).transpose());
+    }
+    return f;
+  }
   VectorXd psi(path.features.size());
   for (Index j = 0; j < kernel.n_points(); ++j) {
     path.features.evaluate(kernel.features().row(j).transpose(), psi);
     f.col(j) = path.weights.transpose() * psi;
+  }
+  return f;
+}
+
+// the gradient of a potential at states (D × states)
+MatrixXd evaluate_gradient(const LatentPath& path, const KernelColumns& kernel, const MatrixXd& features) {
+  const GradientColumns columns(kernel);
+  GradientColumns::Workspace w;
+  VectorXd point;
+  MatrixXd f(features.cols(), features.rows());
+  for (Index i = 0; i < features.rows(); ++i) {
+    f.col(i) = path.features.gradient(path.weights.col(0), features.row(i).transpose());
+    kernel.scale(features.row(i).transpose(), point);
+    columns.evaluate(0, kernel.n_rows(), point, w);
+    columns.add_sums(path.beta, f.col(i), w);
   }
   return f;
 }
@@ -55,6 +79,9 @@ struct PathwiseSamples::Implementation {
     std::vector<LatentPath> paths;                               // per latent
   };
   std::vector<Sample> samples;
+
+  /// @throws InputError when there is none.
+  [[nodiscard]] const Sample& at(int sample) const;
 };
 
 PathwiseSamples::PathwiseSamples(std::shared_ptr<const Implementation> implementation)
@@ -66,11 +93,34 @@ const PathwiseSamples::Implementation& PathwiseSamples::implementation() const {
 
 int PathwiseSamples::n_samples() const { return static_cast<int>(implementation().samples.size()); }
 
-MatrixXd PathwiseSamples::evaluate(int sample, const View& view, const Ref<const MatrixXd>& states) const {
-  if (sample < 0 || sample >= n_samples()) {
-    throw InputError(fmt::format("sample {}: there are {} samples, 0 is the first", sample, n_samples()));
+const PathwiseSamples::Implementation::Sample& PathwiseSamples::Implementation::at(int sample) const {
+  const int n = static_cast<int>(samples.size());
+  if (sample < 0 || sample >= n) throw InputError(fmt::format("sample {}: there are {} samples, 0 is the first", sample, n));
+  return samples[static_cast<std::size_t>(sample)];
+}
+
+VectorXd PathwiseSamples::potential(int sample, int latent, const Ref<const MatrixXd>& states,
+                                    const Ref<const VectorXd>& reference) const {
+  const auto& [component, paths] = implementation().at(sample);
+  require_potential(component->prior, latent);
+  component->prior.system->require_states(states);
+  component->prior.system->require_states(reference);
+  const auto a = static_cast<std::size_t>(latent);
+  const LatentPath& path = paths[a];
+  const MatrixXd features = evaluate_features(component->prior, a, states);
+  const VectorXd at_reference = evaluate_features(component->prior, a, reference).row(0).transpose();
+  PotentialCross cross(component->latents->latents()[a], features, at_reference);
+  VectorXd psi(path.features.size()), psi_reference(psi.size()), energy(states.cols());
+  path.features.evaluate(at_reference, psi_reference);
+  for (Index i = 0; i < energy.size(); ++i) {
+    path.features.evaluate(features.row(i).transpose(), psi);
+    energy[i] = path.weights.col(0).dot(psi - psi_reference) + cross.column(i).cwiseProduct(path.beta).sum();
   }
-  const auto& [component, paths] = implementation().samples[static_cast<std::size_t>(sample)];
+  return component->values.signal_stddev[a][0] * energy;
+}
+
+MatrixXd PathwiseSamples::evaluate(int sample, const View& view, const Ref<const MatrixXd>& states) const {
+  const auto& [component, paths] = implementation().at(sample);
   const Posterior::Implementation& posterior = *component;
   Query query = make_query(posterior, view, states);
   std::vector<MatrixXd> f(paths.size());
@@ -80,6 +130,10 @@ MatrixXd PathwiseSamples::evaluate(int sample, const View& view, const Ref<const
     if (query.needed && !query.needed->has(a)) continue;
     const LatentPath& path = paths[a];
     const KernelColumns& kernel = posterior.latents->latents()[a].kernel;
+    if (posterior.prior.latents[a].is_potential) {
+      f[a] = evaluate_gradient(path, kernel, query.features[a]);
+      continue;
+    }
     psi.resize(path.features.size());
     k.resize(kernel.n_rows());
     sums.resize(path.weights.cols());
@@ -122,7 +176,7 @@ PathwiseSamples sample_paths(const Posterior& posterior, int n_samples, const Pa
         std::vector<MatrixXd> f;
         for (std::size_t a = 0; a < component->prior.latents.size(); ++a) {
           sample.paths.push_back(draw_prior_path(*component, a, options.n_features, random));
-          f.push_back(evaluate_prior_path(sample.paths.back(), latents.latents()[a].kernel));
+          f.push_back(evaluate_prior_path(sample.paths.back(), latents.latents()[a]));
         }
         misfits.col(static_cast<Index>(b)) = latents.misfit(f, random);
       }

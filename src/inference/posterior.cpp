@@ -16,6 +16,7 @@
 #include "inference/latent_sums.hpp"
 #include "inference/query.hpp"
 #include "inference/requirements.hpp"
+#include "prior/gradient_columns.hpp"
 #include "prior/padded_rows.hpp"
 
 namespace gp2 {
@@ -191,6 +192,14 @@ class MarginalBlock {
     const auto covariance_at = [&](Index i) { return Map<MatrixXd>(marginal.covariance.col(column + i).data(), d, d); };
     for (std::size_t a = 0; a < loadings.size(); ++a) {
       if (!query_.needs(a)) continue;
+      if (posterior_.prior.latents[a].is_potential) {
+        const VectorXd variance = GradientColumns(posterior_.latents->latents()[a].kernel).variance();
+        for (Index i = 0; i < n; ++i) {
+          const Map<const MatrixXd> loading(loadings[a].col(i).data(), variance.size(), d);
+          covariance_at(i).noalias() += loading.transpose() * variance.asDiagonal() * loading;
+        }
+        continue;
+      }
       const VectorXd variances = prior_variances(a);
       for (Index i = 0; i < n; ++i) {
         const double* const loading = loadings[a].col(i).data();
@@ -328,12 +337,38 @@ VectorXd Posterior::distance_from_data(const View& view, const Ref<const MatrixX
 
 namespace {
 
+// what a potential adds to that, all states
+void add_potential_covariance(const Posterior::Implementation& self, std::size_t a, const Query& left,
+                              const MatrixXd& left_loadings, const Query& right, const MatrixXd& right_loadings,
+                              Ref<MatrixXd> covariance) {
+  const Index d = left.n_rows(), e = right.n_rows(), n_functions = self.C[a].cols();
+  const KernelColumns points(self.prior.latents[a].kernel, left.features[a], self.values.kernel[a]);
+  const GradientColumns columns(points);
+  GradientColumns::Workspace w;
+  VectorXd point;
+  for (Index j = 0; j < right.size(); ++j) {
+    points.scale(right.features[a].row(j).transpose(), point);
+    columns.evaluate(0, left.size(), point, w);
+    for (Index s = 0; s < e; ++s) {
+      columns.multiply(right_loadings.col(j).segment(s * n_functions, n_functions), w);
+      for (Index i = 0; i < left.size(); ++i) {
+        const Map<const MatrixXd> loading(left_loadings.col(i).data(), n_functions, d);
+        covariance.col(e * j + s).segment(d * i, d) += loading.transpose() * w.out.row(i).matrix().transpose();
+      }
+    }
+  }
+}
+
 // between two queries, to their block; of one with itself the lower triangle of states
 void add_prior_covariance(const Posterior::Implementation& self, const Query& left, const std::vector<MatrixXd>& left_loadings,
                           const Query& right, const std::vector<MatrixXd>& right_loadings, Ref<MatrixXd> covariance) {
   const Index d = left.n_rows(), e = right.n_rows();
   for (std::size_t a = 0; a < self.C.size(); ++a) {
     if (!left.needs(a) || !right.needs(a)) continue;
+    if (self.prior.latents[a].is_potential) {
+      add_potential_covariance(self, a, left, left_loadings[a], right, right_loadings[a], covariance);
+      continue;
+    }
     const MatrixXd k = self.prior.latents[a].kernel.evaluate(left.features[a], right.features[a], self.values.kernel[a]);
     for (Index i = 0; i < left.size(); ++i) {
       const Index end = &left == &right ? i + 1 : right.size();

@@ -6,6 +6,7 @@
 #include "gp2/posterior.hpp"
 #include "inference/latent_sums.hpp"
 #include "inference/query.hpp"
+#include "prior/gradient_columns.hpp"
 
 // Samples of a posterior at given states.
 namespace gp2 {
@@ -57,6 +58,25 @@ struct LatentGaussian {
   MatrixXd covariance;
 };
 
+// of the gradient of a potential at the points, function by function
+MatrixXd potential_covariance(const Posterior::Implementation& self, std::size_t a, const MatrixXd& features) {
+  const KernelColumns points(self.prior.latents[a].kernel, features, self.values.kernel[a]);
+  const GradientColumns columns(points);
+  GradientColumns::Workspace w;
+  const Index n = features.rows(), D = features.cols();
+  MatrixXd covariance(n * D, n * D);
+  VectorXd point;
+  for (Index j = 0; j < n; ++j) {
+    points.scale(j, point);
+    columns.evaluate(0, n, point, w);
+    for (Index l = 0; l < D; ++l) {
+      columns.multiply(VectorXd::Unit(D, l), w);
+      covariance.col(l * n + j) = w.out.reshaped();
+    }
+  }
+  return covariance;
+}
+
 // the posterior of every latent function at the points
 LatentGaussian latent_posterior(const Posterior::Implementation& self, const LatentPoints& points) {
   LatentGaussian out{VectorXd::Zero(points.size), MatrixXd::Zero(points.size, points.size)};
@@ -69,10 +89,16 @@ LatentGaussian latent_posterior(const Posterior::Implementation& self, const Lat
     loadings[a] = MatrixXd::Identity(n_functions, n_functions).reshaped().replicate(1, n_points);
     MatrixXd cross_of_latent(cross.rows(), n_functions * n_points);
     sums.evaluate(points.features, static_cast<int>(a), &loadings, &cross_of_latent);
-    const MatrixXd k = self.prior.latents[a].kernel.evaluate(points.features[a], points.features[a], self.values.kernel[a]);
+    MatrixXd k;
+    if (self.prior.latents[a].is_potential) {
+      const Index all = n_functions * n_points;
+      out.covariance.block(points.first[a], points.first[a], all, all) = potential_covariance(self, a, points.features[a]);
+    } else {
+      k = self.prior.latents[a].kernel.evaluate(points.features[a], points.features[a], self.values.kernel[a]);
+    }
     for (Index l = 0; l < n_functions; ++l) {
       const Index first = points.first[a] + l * n_points;
-      out.covariance.block(first, first, n_points, n_points) = k;
+      if (k.size() > 0) out.covariance.block(first, first, n_points, n_points) = k;
       out.mean.segment(first, n_points) = sums.mean()[a].row(l).transpose();
       for (Index j = 0; j < n_points; ++j) cross.col(first + j) = cross_of_latent.col(j * n_functions + l);
     }

@@ -222,7 +222,8 @@ Predictor::Implementation::Implementation(const Posterior::Implementation& poste
   }
   for (std::size_t a = 0; a < prior.latents.size(); ++a) {
     if (!view.has_latent(a)) continue;
-    terms.push_back({a, posterior.latents->latents()[a].kernel, posterior.C[a]});
+    terms.push_back({a, posterior.latents->latents()[a].kernel, posterior.C[a], prior.latents[a].is_potential});
+    if (terms.back().is_potential) terms.back().variance = GradientColumns(terms.back().kernel).variance();
     has_forced_latent = has_forced_latent || prior.latents[a].base == Latent::Base::force;
   }
   has_force = has_mean_force() || has_forced_latent;
@@ -489,7 +490,7 @@ void Predictor::Implementation::write_loadings(Workspace::Implementation& w) con
     const PredictorTerm& term = terms[a];
     const VectorXd& B = w.terms[a].directions;
     const MatrixXd& Gt = latent(term).base == Latent::Base::force ? w.M_inverse_Gt : w.Gt;
-    const double k = term.kernel.variance(w.terms[a].point);
+    const double k = term.is_potential ? 0 : term.kernel.variance(w.terms[a].point);
     // (Bᵀ Gᵀ)_lr
     const auto along = [&](Index l, Index r) {
       if (B.size() == 0) return Gt(l, r);
@@ -504,7 +505,11 @@ void Predictor::Implementation::write_loadings(Workspace::Implementation& w) con
         const double value = along(l, r) * (latent(term).is_positive ? w.terms[a].signal[l] : 1);
         for (Index f = 0; f < term.n_functions(); ++f) loading(f, r) += term.C(l, f) * value;
       }
-      w.variance[r] += k * loading.col(r).squaredNorm();
+      if (term.is_potential) {
+        for (Index f = 0; f < term.n_functions(); ++f) w.variance[r] += term.variance[f] * loading(f, r) * loading(f, r);
+      } else {
+        w.variance[r] += k * loading.col(r).squaredNorm();
+      }
     }
   }
 }

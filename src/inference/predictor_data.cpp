@@ -50,7 +50,9 @@ void PredictorData<T>::store(const LatentPosterior& posterior, const std::vector
     const LatentPosterior::Basis& from = posterior.latents()[term.latent];
     const Index n = from.kernel.n_points(), n_rows = simd::padded<T>(n);
     LatentData& latent = latents_.emplace_back();
-    if (term.kernel.is_squared_exponential()) {
+    if (term.is_potential) {
+      latent.exact_weights = from.beta * term.C.transpose();
+    } else if (term.kernel.is_squared_exponential()) {
       MatrixXd points = term.kernel.scaled().topRows(n);
       latent.centre = VectorXd::Zero(points.cols());
       if (std::is_same_v<T, float> && n > 0) latent.centre = points.colwise().mean();
@@ -110,6 +112,11 @@ typename PredictorData<T>::Memory PredictorData<T>::make_memory(const std::vecto
     const Index D = term.kernel.features().cols(), p = term.size();
     memory.point.setZero(std::max(memory.point.size(), D));
     widest = std::max({widest, D * p, term.n_functions()});
+    memory.gradients.emplace_back();
+    if (term.is_potential) {
+      reserve_gradient(term, memory);
+      continue;
+    }
     if (term.kernel.is_squared_exponential()) continue;
     // once, so that the kernel's own memory is there
     const Index n = term.kernel.n_rows();
@@ -130,6 +137,23 @@ typename PredictorData<T>::Memory PredictorData<T>::make_memory(const std::vecto
     memory.rows.setZero(sums_.cols(), n_columns);
   }
   return memory;
+}
+
+// calls everything once, so that the memory is there
+template <typename T>
+void PredictorData<T>::reserve_gradient(const PredictorTerm& term, Memory& memory) {
+  const GradientColumns columns(term.kernel);
+  const Index D = term.size(), n = term.kernel.n_rows();
+  if (memory.loading_of_gradient.size() < D) memory.loading_of_gradient.setZero(D);
+  VectorXd sums = VectorXd::Zero(D);
+  MatrixXd derivative = MatrixXd::Zero(D, D);
+  const VectorXd point = VectorXd::Zero(term.kernel.n_scaled());
+  const MatrixXd weights = MatrixXd::Zero(n, D);
+  GradientColumns::Workspace& w = memory.gradients.back();
+  columns.evaluate(0, n, point, w);
+  columns.add_sums(weights, sums, w);
+  columns.add_derivative(weights, derivative, w);
+  columns.multiply(sums, w);
 }
 
 template <typename T>
@@ -160,6 +184,14 @@ void PredictorData<T>::evaluate_kernel(const PredictorTerm& term, std::size_t a,
 template <typename T>
 void PredictorData<T>::evaluate_signal(const PredictorTerm& term, std::size_t a, const VectorXd& point, Memory& memory,
                                        VectorXd& signal) const {
+  if (term.is_potential) {
+    GradientColumns::Workspace& w = memory.gradients[a];
+    const GradientColumns columns(term.kernel);
+    columns.evaluate(0, term.kernel.n_rows(), point, w);
+    signal.setZero();
+    columns.add_sums(latents_[a].exact_weights, signal, w);
+    return;
+  }
   T* const k = memory.k.col(static_cast<Index>(a)).data();
   evaluate_kernel(term, a, point, memory, k);
   const Matrix& weights = latents_[a].weights;
@@ -171,6 +203,11 @@ template <typename T>
 void PredictorData<T>::differentiate_signal(const PredictorTerm& term, std::size_t a, const VectorXd& point, Memory& memory,
                                             MatrixXd& dsignal) const {
   const LatentData& data = latents_[a];
+  if (term.is_potential) {
+    dsignal.setZero();
+    GradientColumns(term.kernel).add_derivative(data.exact_weights, dsignal, memory.gradients[a]);
+    return;
+  }
   const T* const k = memory.k.col(static_cast<Index>(a)).data();
   const Index D = dsignal.rows(), p = dsignal.cols(), n = data.weights.rows();
   if (term.kernel.is_squared_exponential()) {
@@ -204,6 +241,19 @@ template <typename T>
 void PredictorData<T>::add_products(const PredictorTerm& term, std::size_t a, std::size_t component, Index first, Index n,
                                     const T* loading, Memory& memory) const {
   const Matrix& Z = latents_[a].Z;
+  if (term.is_potential) {
+    GradientColumns::Workspace& w = memory.gradients[a];
+    auto all = memory.loading_of_gradient.head(term.n_functions());
+    all.setZero();
+    for (Index f = 0; f < n; ++f) all[first + f] = static_cast<double>(loading[f]);
+    GradientColumns(term.kernel).multiply(all, w);
+    const Index n_points = term.kernel.n_points();
+    for (Index f = 0; f < all.size(); ++f) {
+      memory.products.head(n_points).array() += Z.col(static_cast<Index>(component) * all.size() + f).head(n_points).array() *
+                                                w.out.col(f).head(n_points).template cast<T>();
+    }
+    return;
+  }
   loops<T>().add_scaled_products(Z.rows(), n, memory.k.col(static_cast<Index>(a)).data(),
                                  Z.col(static_cast<Index>(component) * term.n_functions() + first).data(), Z.rows(), loading,
                                  memory.products.data());

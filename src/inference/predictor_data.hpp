@@ -5,6 +5,7 @@
 #include <Eigen/Core>
 
 #include "inference/gram.hpp"
+#include "prior/gradient_columns.hpp"
 #include "prior/kernel_columns.hpp"
 
 namespace gp2 {
@@ -12,8 +13,10 @@ namespace gp2 {
 /// A latent that the view of a predictor needs.
 struct PredictorTerm {
   std::size_t latent = 0;
-  KernelColumns kernel;  // k between the samples and a state
-  Eigen::MatrixXd C;     // loading (p × F)
+  KernelColumns kernel;           // k between the samples and a state
+  Eigen::MatrixXd C;              // loading (p × F)
+  bool is_potential = false;      // its functions are a gradient: GradientColumns in the place of k
+  Eigen::VectorXd variance = {};  // of each function of a potential (F)
 
   [[nodiscard]] Eigen::Index size() const { return C.rows(); }         // p
   [[nodiscard]] Eigen::Index n_functions() const { return C.cols(); }  // F
@@ -39,6 +42,8 @@ class PredictorData {
 
     Eigen::VectorXd k_in_double;  // of a kernel that is no se
     KernelColumns::Workspace kernel;
+    std::vector<GradientColumns::Workspace> gradients;  // per term: of potentials
+    Eigen::VectorXd loading_of_gradient;                // (the largest D of these)
   };
 
   /// @param stddev  whether subtract_explained is wanted
@@ -64,10 +69,11 @@ class PredictorData {
     Matrix points;                  // of se: scaled features, less their centre (n_rows × D)
     Eigen::VectorXd centre;         // (D)
     Matrix weights;                 // β Cᵀ (n_rows × p)
-    Eigen::MatrixXd exact_weights;  // of another kernel: the same in double precision, where T is single
+    Eigen::MatrixXd exact_weights;  // of another kernel: the same in double precision, where T is single; of a potential
     Matrix Z;                       // as in LatentPosterior (n_rows × components·F)
   };
 
+  static void reserve_gradient(const PredictorTerm& term, Memory& memory);
   void store_inverse(const LatentPosterior& posterior);
   void store_root(const InverseRoot& root);
   void evaluate_kernel(const PredictorTerm& term, std::size_t a, const Eigen::VectorXd& point, Memory& memory, T* k) const;

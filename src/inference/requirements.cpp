@@ -41,6 +41,13 @@ void require_measured(const std::vector<Observations>& observations, const char*
                                observations.empty() ? "no observations are given" : "every value is NaN, not measured"));
 }
 
+void require_no_potential(const Prior& prior) {
+  for (const Latent& latent : prior.latents) {
+    if (!latent.is_potential) continue;
+    throw InputError(fmt::format("the latent '{}' is a potential, which is not learned through inducing points", latent.name));
+  }
+}
+
 namespace {
 
 enum class Sign { any, not_negative, positive };
@@ -69,6 +76,7 @@ void require_count(const char* member, std::size_t got, std::size_t wanted, cons
 
 void require_inducing(const Prior& prior, const std::vector<Observations>& observations, const InducingPoints& points) {
   require_count("inducing", points.features.size(), prior.latents.size(), "latents");
+  require_no_potential(prior);
   for (std::size_t a = 0; a < points.features.size(); ++a) {
     const MatrixXd& features = points.features[a];
     if (features.cols() == prior.latents[a].n_features() && features.allFinite()) continue;
@@ -93,6 +101,9 @@ void require_values(const Prior& prior, const std::vector<Observations>& observa
     };
     require_numbers(values.kernel[a], std::ssize(latent.kernel.parameters()), Sign::positive, of("kernel"));
     require_numbers(values.signal_stddev[a], latent.size(), Sign::not_negative, of("signal_stddev"));
+    if (latent.is_potential && (values.signal_stddev[a].array() != values.signal_stddev[a][0]).any()) {
+      throw InputError(fmt::format("values: {} must be one number for all, that of its potential", of("signal_stddev")()));
+    }
     const Index n_functions = latent.free_loading.value_or(0), n_rows = n_functions > 0 ? latent.size() : 0;
     const MatrixXd none;
     const MatrixXd& C = values.has_free_loading(a) ? values.free_loading[a] : none;

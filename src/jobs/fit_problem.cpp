@@ -147,7 +147,7 @@ bool is_of_accelerations(const Observations& group) { return group.view().quanti
 bool has_discrepancy(const Model& model, const FitProblem& problem, const FitProblemOptions& options) {
   const bool standard = options.protocol.name == Protocol::Name::standard && options.protocol.hyperprior;
   const bool acts_everywhere = std::ranges::any_of(model.latents, [&](const LatentSpec& latent) {
-    return options.base || (latent.directions.empty() && !latent.direction_code);
+    return options.base || (latent.directions.empty() && !latent.direction_code && !latent.is_potential);
   });
   return options.discrepancy && standard && acts_everywhere &&
          std::any_of(problem.observations.begin(), problem.observations.end(), is_of_accelerations) &&

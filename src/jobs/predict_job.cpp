@@ -144,11 +144,39 @@ std::vector<Option> options(PredictRequest& request) {
       {"inverse_dynamics", &request.inverse_dynamics, "",
        "instead of a view: the inputs that produce the accelerations ddq1 … which the CSV has, u1 …, and ddq1_missed …, "
        "what is missed of them"});
+  table.push_back(
+      {"potential", &request.potential, "NAME",
+       "instead of a view: the energy of the latent of this name, which the model has as a potential, less that at the "
+       "first row: potential@NAME [J], known up to a constant"});
   table.push_back(columns_option(request.columns));
   return table;
 }
 
 namespace {
+
+PredictOutcome predict_potential(const FitFile& fit, const Posterior& posterior, const CsvTable& table,
+                                 const PredictRequest& request) {
+  const ViewRequest& view = request.view;
+  if (view.quantity != View::Quantity::constrained_acceleration || view.latent || view.time_step || view.system ||
+      request.n_samples || request.inverse_dynamics) {
+    throw InputError(
+        "`potential` stands in the place of a view: leave `view`, `latent`, `dt`, `system`, `samples` and `inverse_dynamics` "
+        "out");
+  }
+  if (request.covariance == PredictRequest::Covariance::full) throw InputError("`potential` goes with `cov=none` or `cov=std`");
+  const LatentRange range = latents_called(posterior.prior(), *request.potential, "`potential`");
+  const PredictedView at = predicted_view(fit, posterior.prior(), view);
+  const LogStates log = read_log_states(at.prior, at.view, *at.model, table, request.columns, {}, at.actuators);
+  PredictOutcome out{{"potential@" + *request.potential}, {}, log.notes};
+  if (log.states.cols() == 0) return out;
+  const Posterior::Potential energy = posterior.potential(range.first, log.states, log.states.col(0));
+  const bool has_stddev = request.covariance == PredictRequest::Covariance::stddev;
+  if (has_stddev) out.names.push_back(out.names.front() + "_std");
+  out.values.resize(std::ssize(out.names), log.states.cols());
+  out.values.row(0) = energy.mean.transpose();
+  if (has_stddev) out.values.row(1) = energy.stddev.transpose();
+  return out;
+}
 
 PredictOutcome predict_inputs(const FitFile& fit, const Posterior& posterior, const CsvTable& log,
                               const PredictRequest& request) {
@@ -197,6 +225,7 @@ PredictOutcome predict(const FitFile& fit, CsvTable states, const PredictRequest
     throw InputError(fmt::format("`samples`: must be at least 1, got {}", *request.n_samples));
   }
   const Posterior posterior = request.unconditioned ? fit.posterior().without_data() : fit.posterior();
+  if (request.potential) return predict_potential(fit, posterior, states, request);
   if (request.inverse_dynamics) return predict_inputs(fit, posterior, states, request);
   const PredictedView at = predicted_view(fit, posterior.prior(), request.view);
   LogStates log = read_log_states(at.prior, at.view, *at.model, states, request.columns, {}, at.actuators);

@@ -145,9 +145,10 @@ void for_each_latent(const Model& model, const Use& use) {
 std::string latents_text(const Model& model, bool full) {
   std::string text;
   for_each_latent(model, [&](const LatentSpec& spec, const Latent& latent, const std::vector<std::string>& columns) {
-    text += fmt::format("\nlatent '{}'\n  kernel      {}{}\n  features    {}\n  acts on     {}\n", latent.name,
-                        latent.kernel.text(), latent.direction.empty() ? "" : "   one for each direction",
-                        fmt::join(latent.feature_names, ", "), fmt::join(columns, ", "));
+    text +=
+        fmt::format("\nlatent '{}'\n  kernel      {}{}\n  features    {}\n  acts on     {}\n", latent.name, latent.kernel.text(),
+                    latent.direction.empty() ? "" : "   one for each direction", fmt::join(latent.feature_names, ", "),
+                    latent.is_potential ? "forces, as their potential" : fmt::format("{}", fmt::join(columns, ", ")));
     for (const auto& [feature, range] : spec.lengthscales) {
       text += fmt::format("  lengthscale {} {}\n", feature, range_text(range));
     }

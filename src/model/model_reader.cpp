@@ -15,6 +15,7 @@
 #include "mechanics/known_multipliers.hpp"
 #include "model/name_order.hpp"
 #include "model/toml_reader.hpp"
+#include "prior/gradient_columns.hpp"
 #include "prior/make_prior.hpp"
 #include "robots/robot_expressions.hpp"
 
@@ -889,10 +890,14 @@ class ModelReader : private TomlReader {
       if (latent.name == "discrepancy")
         fail(node, "latent.name", "'discrepancy' is the name of the latent that gp2 adds; take another");
       latent.kernel = entry.contains("kernel") ? text(*entry.get("kernel"), "latent.kernel") : "";
-      if (!entry.contains("features")) fail(node, "latent", R"(missing features = ["q1", …])");
-      read_features(*entry.get("features"), latent);
+      if (entry.contains("features")) read_features(*entry.get("features"), latent);
       if (entry.contains("directions")) read_directions(*entry.get("directions"), latent);
       if (entry.contains("positive")) read_positive(*entry.get("positive"), latent);
+      if (latent.features.empty()) {
+        if (!latent.is_potential) fail(node, "latent", R"(missing features = ["q1", …])");
+        for (const Coordinate& coordinate : definition_.coordinates) latent.features.push_back(coordinate.name);
+      }
+      if (latent.is_potential) require_potential(entry, node, latent);
       latent.lengthscale = relative_range(entry, "lengthscale");
       latent.signal_stddev = relative_range(entry, "signal_stddev");
       try {
@@ -901,9 +906,39 @@ class ModelReader : private TomlReader {
         fail(entry.contains("kernel") ? *entry.get("kernel") : node, "latent.kernel", error.what());
       }
       if (entry.contains("lengthscales")) read_lengthscales(*entry.get("lengthscales"), latent);
+      if (latent.is_potential && latent.per_direction.value_or(false)) {
+        fail(*entry.get("lengthscales"), "latent.lengthscales",
+             "a potential is one function, whose lengthscales all directions share; leave \"per direction\" out");
+      }
       model_.latents.push_back(std::move(latent));
     }
     if (model_.latents.empty()) add_default_latent();
+  }
+
+  // V(φ(q, t)), which the force −Jᵀ∇V is of
+  void require_potential(const toml::table& entry, const toml::node& at, const LatentSpec& latent) const {
+    const toml::node& features = entry.contains("features") ? *entry.get("features") : at;
+    if (latent.feature_code) {
+      fail(features, "latent.features", "a potential needs features that are expressions, so that they can be differentiated");
+    }
+    if (features.is_array()) {
+      for (const toml::node& feature : array(features, "latent.features")) {
+        const Expression value = expression_with_load(feature, "latent.features", "a feature may not depend on accelerations");
+        refuse_load(feature, "latent.features", value);
+        allow_only(feature, "latent.features", value, of_motion(), "a potential depends on coordinates and t alone");
+      }
+    }
+    if (!entry.contains("kernel")) return;
+    const toml::node& kernel = *entry.get("kernel");
+    bool is_possible = false;
+    try {
+      is_possible = has_gradient(Kernel::parse(latent.kernel, latent.features));
+    } catch (const InputError& error) {
+      fail(kernel, "latent.kernel", error.what());
+    }
+    if (is_possible) return;
+    fail(kernel, "latent.kernel",
+         fmt::format("the kernel of a potential is a sum of se, matern52, rq and linear, got \"{}\"", shortened(latent.kernel)));
   }
 
   // [expressions], or { code = [names] }
@@ -984,11 +1019,13 @@ class ModelReader : private TomlReader {
     const toml::node* matrix = &node;
     if (node.is_string()) {
       const std::string value = text(node, key);
-      if (value != "acceleration" && value != "force") {
+      if (value != "acceleration" && value != "force" && value != "potential") {
         fail(node, key,
-             fmt::format(R"(expected "acceleration", "force" or a matrix of expressions [[…], …], got "{}")", shortened(value)));
+             fmt::format(R"(expected "acceleration", "force", "potential" or a matrix of expressions [[…], …], got "{}")",
+                         shortened(value)));
       }
-      latent.base = value == "force" ? Latent::Base::force : Latent::Base::acceleration;
+      latent.is_potential = value == "potential";
+      latent.base = value != "acceleration" ? Latent::Base::force : Latent::Base::acceleration;
       return;
     }
     if (node.is_table() && !node.as_table()->contains("code")) {

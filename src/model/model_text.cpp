@@ -77,6 +77,7 @@ std::string directions_text(const LatentSpec& spec) {
   if (spec.direction_code) {
     return fmt::format("directions = {{ {} = {{ code = {} }} }}\n", base, quoted_list(spec.direction_names));
   }
+  if (spec.is_potential) return "directions = \"potential\"\n";
   if (spec.directions.empty()) return fmt::format("directions = \"{}\"\n", base);
   std::vector<std::string> rows;
   for (const std::vector<std::string>& row : spec.directions) rows.push_back(quoted_list(row));

@@ -37,6 +37,7 @@ std::string difference(const Prior& home, const Prior& other) {
       return written;
     };
     const auto directions = [](const Latent& latent) {
+      if (latent.is_potential) return std::string("\"potential\"");
       if (latent.directions) return fmt::format("{} of its own", latent.size());
       return std::string(latent.base == Latent::Base::force ? "\"force\"" : "\"acceleration\"");
     };

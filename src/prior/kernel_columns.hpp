@@ -41,6 +41,8 @@ class KernelColumns {
   void scale(const Eigen::Ref<const Eigen::VectorXd>& features, Eigen::VectorXd& point) const;
   void scale(Eigen::Index fixed_point, Eigen::VectorXd& point) const;
   [[nodiscard]] const Eigen::MatrixXd& scaled() const { return scaled_; }  // of the fixed points (n_rows × n_scaled)
+  /// What a feature is multiplied by there, of each column (n_scaled()).
+  [[nodiscard]] const Eigen::VectorXd& scales() const { return scales_; }
   [[nodiscard]] bool is_squared_exponential() const { return is_squared_exponential_; }
 
   /// Memory of the functions below; one per thread.

@@ -12,6 +12,7 @@
 #include "mechanics/known_multipliers.hpp"
 #include "prior/code_function.hpp"
 #include "prior/expression_function.hpp"
+#include "prior/gradient_columns.hpp"
 #include "symbolic/graph.hpp"
 
 namespace gp2 {
@@ -20,6 +21,8 @@ using Eigen::Index;
 using Eigen::MatrixXd;
 
 namespace {
+
+const std::string potential_kernel = "rq + linear";  // where a potential gives none; docs/priors.md says how it was chosen
 
 // an error says of which latent it is
 template <typename Work>
@@ -53,15 +56,22 @@ class LatentMaker {
   [[nodiscard]] std::vector<Latent> make(const LatentSpec& spec) {
     Latent latent;
     latent.name = spec.name;
-    latent.base = options_.base.value_or(spec.base);
+    latent.is_potential = spec.is_potential && !options_.base;
+    latent.base = latent.is_potential ? Latent::Base::force : options_.base.value_or(spec.base);
     latent.lengthscale = spec.lengthscale;
     latent.signal_stddev = spec.signal_stddev;
     latent.is_positive = spec.is_positive;
     set_features(spec, latent);
+    const std::string& by_default = latent.is_potential ? potential_kernel : options_.kernel;
     latent.kernel =
-        named(spec, [&] { return Kernel::parse(spec.kernel.empty() ? options_.kernel : spec.kernel, latent.feature_names); });
+        named(spec, [&] { return Kernel::parse(spec.kernel.empty() ? by_default : spec.kernel, latent.feature_names); });
+    if (latent.is_potential) require_potential(spec, latent);
     latent.feature_lengthscales =
         named(spec, [&] { return lengthscales_of(spec, latent.kernel, latent.feature_names, system_->coordinates()); });
+    if (latent.is_potential) {
+      set_potential_directions(spec, latent);
+      return {std::move(latent)};
+    }
     if (!spec.per_direction.value_or(spec.kernel.empty() && options_.per_direction)) {
       set_directions(spec, latent);
       return {std::move(latent)};
@@ -99,6 +109,28 @@ class LatentMaker {
   }
 
  private:
+  static void require_potential(const LatentSpec& spec, const Latent& latent) {
+    for (std::size_t d = 0; d < latent.feature_names.size(); ++d) {
+      if (latent.is_of_place[d]) continue;
+      throw InputError(fmt::format("latent '{}': a potential depends on coordinates and t alone, but the feature '{}' reads more",
+                                   spec.name, latent.feature_names[d]));
+    }
+    if (has_gradient(latent.kernel)) return;
+    throw InputError(fmt::format("latent '{}': the kernel of a potential is a sum of se, matern52, rq and linear, got \"{}\"",
+                                 spec.name, latent.kernel.text()));
+  }
+
+  /// −Jᵀ, J = ∂φ/∂q.
+  void set_potential_directions(const LatentSpec& spec, Latent& latent) {
+    std::vector<Expression> entries;
+    for (const std::string& name : latent.feature_names) {
+      latent.column_names.push_back("d/d " + name);
+      const Expression value = words_.with_values(named(spec, [&] { return words_.parse(name); }), *system_);
+      for (const Expression q : words_.symbols.q) entries.push_back(-words_.graph.differentiate(value, q));
+    }
+    latent.directions = ExpressionFunction::of_state_and_parameters(entries, words_.symbols, words_.graph, system_);
+  }
+
   /// @param unit  of each feature; null: 1
   void set_features(const LatentSpec& spec, Latent& latent, const Eigen::VectorXd* unit = nullptr) {
     if (spec.feature_code) {
@@ -229,11 +261,16 @@ std::vector<std::string> entries_read_by_latents(const Prior& prior) {
 void require_well_formed(const LatentSpec& spec, const System& system) {
   const auto fail = [&](const std::string& text) { throw InputError(fmt::format("latent '{}': {}", spec.name, text)); };
   if (spec.features.empty()) fail("it needs at least one feature; code needs a name for each of its numbers");
+  if (spec.is_potential && (spec.feature_code || spec.direction_code)) {
+    fail("a potential needs features that are expressions, so that they can be differentiated");
+  }
   if (spec.direction_code) {
     if (!spec.directions.empty()) fail("its directions are given twice, as expressions and as code; leave out one");
     if (spec.direction_names.empty()) fail("directions that are code need a name for each column");
     return;
   }
+  if (spec.is_potential && !spec.directions.empty())
+    fail("the directions of a potential follow from its features; leave them out");
   if (spec.directions.empty() && spec.is_positive) fail("a positive latent needs directions of its own, which it acts along");
   if (spec.directions.empty()) return;
   if (std::ssize(spec.directions) != system.nq()) {

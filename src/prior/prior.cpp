@@ -9,6 +9,7 @@
 #include "gp2/error.hpp"
 #include "mechanics/describe_fault.hpp"
 #include "prior/admissible_directions.hpp"
+#include "prior/gradient_columns.hpp"
 
 namespace gp2 {
 
@@ -75,6 +76,12 @@ void require_latent(const Latent& latent, Index nq) {
   if (latent.size() == 0 || n_directions != nq * latent.size()) {
     fail(fmt::format("has {} columns, but directions of {} numbers for {} coordinates", latent.size(), n_directions, nq));
   }
+  if (latent.is_potential &&
+      (latent.base != Latent::Base::force || latent.size() != n_features || !latent.directions || latent.free_loading)) {
+    fail("is a potential without one direction on forces for each feature");
+  }
+  if (latent.is_potential && !has_gradient(latent.kernel))
+    fail("is a potential of a kernel that is no sum of se, matern52, rq and linear");
   if (latent.n_functions() < 1) fail(fmt::format("has {} functions", latent.n_functions()));
 }
 

@@ -109,4 +109,24 @@ void RandomFeatures::evaluate(const Ref<const VectorXd>& point, Ref<VectorXd> ou
   }
 }
 
+VectorXd RandomFeatures::gradient(const Ref<const VectorXd>& weights, const Ref<const VectorXd>& point) const {
+  VectorXd gradient = VectorXd::Zero(point.size());
+  Index first = 0;
+  for (const Term& term : terms_) {
+    const Index n = term.frequencies.rows();
+    if (n == 0) {
+      // the features of one linear factor are its monomials
+      gradient += term.scale * weights.segment(first, term.n_monomials).cwiseProduct(term.inverse_lengthscale.front());
+      first += term.n_monomials;
+      continue;
+    }
+    VectorXd cosines = term.frequencies * point, sines(n);
+    cos_sin_of_turns(cosines, sines);
+    const VectorXd slopes = weights.segment(first + n, n).cwiseProduct(cosines) - weights.segment(first, n).cwiseProduct(sines);
+    gradient += 2 * std::numbers::pi * term.scale * (term.frequencies.transpose() * slopes);
+    first += 2 * n;
+  }
+  return gradient;
+}
+
 }  // namespace gp2

@@ -36,6 +36,10 @@ class RandomFeatures {
   /// @param out    (size())
   void evaluate(const Eigen::Ref<const Eigen::VectorXd>& point, Eigen::Ref<Eigen::VectorXd> out) const;
 
+  /// The gradient of wᵀψ(φ), of a kernel without products (D).
+  [[nodiscard]] Eigen::VectorXd gradient(const Eigen::Ref<const Eigen::VectorXd>& weights,
+                                         const Eigen::Ref<const Eigen::VectorXd>& point) const;
+
  private:
   struct Term {
     double scale = 1;                                  // of each feature

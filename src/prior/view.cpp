@@ -45,7 +45,7 @@ void require_other_system(const Prior& home, const OtherSystem& other) {
       return text;
     };
     if (kernel(its) != kernel(mine) || its.n_features() != mine.n_features() || its.size() != mine.size() ||
-        its.n_functions() != mine.n_functions() || its.is_positive != mine.is_positive) {
+        its.n_functions() != mine.n_functions() || its.is_positive != mine.is_positive || its.is_potential != mine.is_potential) {
       throw InputError(
           fmt::format("view: the latent '{}' of its other system is of another kind than '{}' at home; "
                       "make_other_system makes one that fits",

@@ -122,6 +122,17 @@ Hyperparameter column_signal(const Latent& latent, std::size_t owner, std::size_
   return h;
 }
 
+// of the potential itself, which has one for all the columns of its gradient
+Hyperparameter signal_of_potential(const Latent& latent, std::size_t owner, const Scales& scales, const Protocol& protocol) {
+  Hyperparameter h = Hyperparameter::of(Kind::shared_signal_stddev, owner, 0);
+  h.unit = "unit of energy";
+  h.column_scale = VectorXd::Ones(latent.size());
+  const Latent::Range standard = {Standard::signal_initial, Standard::signal_lower, Standard::signal_upper,
+                                  Standard::signal_median, Standard::signal_log_stddev};
+  set_range(h, scaled(filled(latent.signal_stddev, standard, protocol), scales.signal_stddev[owner][0]), protocol);
+  return h;
+}
+
 void add_latent(const Latent& latent, std::size_t owner, const std::string& prefix, const Scales& scales,
                 const Protocol& protocol, std::vector<Hyperparameter>& out) {
   for (std::size_t p = 0; p < latent.kernel.parameters().size(); ++p) {
@@ -131,6 +142,11 @@ void add_latent(const Latent& latent, std::size_t owner, const std::string& pref
   if (protocol.name == Protocol::Name::paper) {
     out.push_back(shared_signal(latent, owner, scales, protocol));
     out.back().name = prefix + "signal_stddev";
+    return;
+  }
+  if (latent.is_potential) {
+    out.push_back(signal_of_potential(latent, owner, scales, protocol));
+    out.back().name = prefix + "signal_stddev(potential)";
     return;
   }
   for (std::size_t l = 0; l < latent.column_names.size(); ++l) {

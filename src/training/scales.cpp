@@ -156,6 +156,14 @@ VectorXd signal_scales(const Latent& latent, const MatrixXd& directions, const V
   return signal;
 }
 
+// Of a potential the standard deviation under which its force, at the lengthscales that a fit starts with, moves the coordinates
+// by their σ.
+VectorXd potential_scales(const VectorXd& of_gradient, const VectorXd& feature_stddev, Index nq) {
+  const VectorXd lengthscale = Protocol::Standard::lengthscale_initial * feature_stddev;
+  const double square = of_gradient.cwiseProduct(lengthscale).array().square().inverse().sum();
+  return VectorXd::Constant(of_gradient.size(), std::sqrt(static_cast<double>(nq) / square));
+}
+
 // the spread of each row that is observed, or its size, or that of its acceleration
 VectorXd output_scales(const Observations& group, const VectorXd& sigma) {
   VectorXd stddev = spread_of_rows(group.values());
@@ -183,6 +191,10 @@ Scales default_scales(const Prior& prior, const std::vector<Observations>& obser
     scales.feature_range.push_back(usable_spreads(features.rowwise().maxCoeff() - features.rowwise().minCoeff(), features));
     scales.signal_stddev.push_back(
         signal_scales(prior.latents[a], pooled.directions[a], pooled.mass_diagonal, scales.acceleration_stddev));
+    if (prior.latents[a].is_potential) {
+      VectorXd& signal = scales.signal_stddev.back();
+      signal = potential_scales(signal, scales.feature_stddev.back(), prior.system->nq());
+    }
   }
   for (const Observations& group : observations) {
     scales.output_stddev.push_back(output_scales(group, scales.acceleration_stddev));

@@ -205,6 +205,50 @@ directions = { force = [["-load*dx", "0"], ["0.4*load", "0"], ["0", "1"], ["0", 
   return model;
 }
 
+const Model& model_with_potentials() {
+  static const Model model = Model::parse(R"toml(
+name        = "swing on springs"
+coordinates = ["x", { name = "q", angle = true }, "z"]
+inputs      = ["u"]
+[parameters]
+m = 2.0
+e = 0.3
+h = 0.4
+c = 0.7
+[mechanics]
+mass  = [["m", "m*e*cos(q)", "0"], ["m*e*cos(q)", "1", "0.1*m"], ["0", "0.1*m", "m"]]
+force = ["u - c*dx", "-c*dq", "-9.81*m"]
+[constraints]
+position = ["z - h*x^2 - 0.2*x"]
+[[latent]]
+name       = "springs"
+kernel     = "se + linear + matern52"
+features   = ["x", "q", "z^2 - x*t"]
+directions = "potential"
+[[latent]]
+name       = "friction"
+kernel     = "se"
+features   = ["dx", "dq"]
+directions = { force = [["-dx", "0"], ["c", "-dq"], ["m", "0"]] }
+[[latent]]
+name       = "twist"
+kernel     = "rq"
+features   = ["x*q"]
+directions = "potential"
+)toml",
+                                          "swing on springs");
+  return model;
+}
+
+const Model& another_swing() {
+  static const Model other = Model::parse(
+      changed(
+          model_with_potentials().text,
+          {{"m = 2.0", "m = 2.6"}, {"c = 0.7", "c = { value = 0.7, estimate = true }"}, {"z - h*x^2", "z - h*x^2 + 0.1*x^3"}}),
+      "another swing");
+  return other;
+}
+
 std::string changed(std::string text, const std::vector<std::pair<std::string, std::string>>& changes) {
   for (const auto& [from, to] : changes) {
     const std::size_t place = text.find(from);
@@ -264,6 +308,7 @@ ModelValues random_values(const Prior& prior, const std::vector<Observations>& o
     }
     VectorXd& signal = values.signal_stddev.emplace_back(latent.size());
     for (double& s : signal) s = 0.5 + random.uniform();
+    if (latent.is_potential) signal.setConstant(signal[0]);
   }
   for (const Observations& group : observations) values.noise_stddev.push_back(group.noise().stddev());
   values.parameters = prior.system->parameter_values();
@@ -428,8 +473,97 @@ std::vector<Problem> problems(int n, std::uint64_t seed) {
     add("contacts, multipliers and a force of constraints", m, options, states,
         {View::all(Quantity::multipliers, *m.system), View{Quantity::constraint_force, {0, 2}}});
   }
+  for (Prior::Mean mean : {Prior::Mean::zero, Prior::Mean::force}) {
+    const Model& m = model_with_potentials();
+    const PriorOptions options{mean, std::nullopt, false};
+    const View ddq = View::all(Quantity::constrained_acceleration, *m.system);
+    const auto elsewhere = make_other_system(m, another_swing(), options);
+    View alone = View::all(Quantity::learned_force, *m.system);
+    alone.latent = 0;
+    add("a potential, pooled with another swing", m, options, random_states(m), {ddq, under(ddq, elsewhere), alone});
+    add("a potential, two rows", m, options, random_states(m), {View{Quantity::constrained_acceleration, {2, 0}}});
+  }
   return all;
 }
+
+namespace {
+
+// v + a ε₁ + b ε₂ + ab ε₁ε₂, ε₁² = ε₂² = 0: the last is a mixed derivative, without a formula of it
+struct Dual {
+  long double v = 0, a = 0, b = 0, ab = 0;
+
+  friend Dual operator+(const Dual& x, const Dual& y) { return {x.v + y.v, x.a + y.a, x.b + y.b, x.ab + y.ab}; }
+  friend Dual operator*(const Dual& x, const Dual& y) {
+    return {x.v * y.v, x.v * y.a + x.a * y.v, x.v * y.b + x.b * y.v, x.v * y.ab + x.a * y.b + x.b * y.a + x.ab * y.v};
+  }
+  // a function of this, given its value and two derivatives
+  [[nodiscard]] Dual map(long double f, long double df, long double ddf) const {
+    return {f, df * a, df * b, df * ab + ddf * a * b};
+  }
+};
+
+Dual exp(const Dual& x) { return x.map(std::exp(x.v), std::exp(x.v), std::exp(x.v)); }
+Dual pow(const Dual& x, long double p) {
+  return x.map(std::pow(x.v, p), p * std::pow(x.v, p - 1), p * (p - 1) * std::pow(x.v, p - 2));
+}
+
+// k(x, y) as kernel.hpp prints it
+Dual printed_kernel(const Kernel& kernel, const VectorXd& v, const std::vector<Dual>& x, const std::vector<Dual>& y) {
+  Dual sum;
+  for (const Kernel::Term& term : kernel.terms()) {
+    Dual r2, product;
+    const Kernel::Factor& factor = term.factors.front();
+    for (std::size_t d = 0; d < x.size(); ++d) {
+      const Dual inverse{1 / static_cast<long double>(v[factor.first_parameter + static_cast<Index>(d)])};
+      const Dual delta = inverse * (x[d] + Dual{-1} * y[d]);
+      r2 = r2 + delta * delta;
+      product = product + inverse * x[d] * inverse * y[d];
+    }
+    Dual k;
+    switch (factor.primitive) {
+      case Kernel::Primitive::se:
+        k = exp(Dual{-0.5L} * r2);
+        break;
+      case Kernel::Primitive::matern52:
+        if (r2.v == 0) {  // its series
+          k = Dual{1} + Dual{-5.0L / 6.0L} * r2;
+        } else {
+          const Dual r = Dual{std::sqrt(5.0L)} * pow(r2, 0.5L);
+          k = (Dual{1} + r + Dual{5.0L / 3.0L} * r2) * exp(Dual{-1} * r);
+        }
+        break;
+      case Kernel::Primitive::rq: {
+        const long double alpha = v[factor.first_parameter + static_cast<Index>(x.size())];
+        k = pow(Dual{1} + Dual{1 / (2 * alpha)} * r2, -alpha);
+        break;
+      }
+      default:
+        k = product;
+        break;
+    }
+    const long double amplitude = term.amplitude < 0 ? 1 : v[term.amplitude];
+    sum = sum + Dual{amplitude * amplitude} * k;
+  }
+  return sum;
+}
+
+// ∂²k/∂φ∂φ'
+Extended gradient_covariance(const Kernel& kernel, const VectorXd& values, const VectorXd& x, const VectorXd& y) {
+  Extended covariance(x.size(), y.size());
+  for (Index i = 0; i < x.size(); ++i) {
+    for (Index j = 0; j < y.size(); ++j) {
+      std::vector<Dual> left, right;
+      for (Index d = 0; d < x.size(); ++d) {
+        left.push_back({x[d], d == i ? 1.0L : 0.0L});
+        right.push_back({y[d], 0, d == j ? 1.0L : 0.0L});
+      }
+      covariance(i, j) = printed_kernel(kernel, values, left, right).ab;
+    }
+  }
+  return covariance;
+}
+
+}  // namespace
 
 Extended pseudo_inverse(const Extended& matrix) {
   const Eigen::JacobiSVD<Extended> svd(matrix, Eigen::ComputeThinU | Eigen::ComputeThinV);
@@ -520,6 +654,17 @@ Extended dense_covariance(const Prior& prior, const ModelValues& values, const D
   const Index dx = x.mean.size() / n, dy = y.mean.size() / m;
   Extended covariance = Extended::Zero(x.mean.size(), y.mean.size());
   for (std::size_t a = 0; a < prior.latents.size(); ++a) {
+    if (prior.latents[a].is_potential) {
+      for (Index j = 0; j < m; ++j) {
+        for (Index i = 0; i < n; ++i) {
+          covariance.block(i * dx, j * dy, dx, dy) +=
+              x.loading[static_cast<std::size_t>(i)][a] *
+              gradient_covariance(prior.latents[a].kernel, values.kernel[a], x.features[a].row(i), y.features[a].row(j)) *
+              y.loading[static_cast<std::size_t>(j)][a].transpose();
+        }
+      }
+      continue;
+    }
     const MatrixXd k = prior.latents[a].kernel.evaluate(x.features[a], y.features[a], values.kernel[a]);
     for (Index j = 0; j < m; ++j) {
       for (Index i = 0; i < n; ++i) {
@@ -662,6 +807,11 @@ std::pair<VectorXd, MatrixXd> dense_posterior(const Problem& p, const View& view
   const ExtendedVector mean = at.mean + cross.transpose() * factor.solve(dense.residual);
   const Extended covariance = dense_covariance(p.prior, p.values, at, at) - cross.transpose() * factor.solve(cross);
   return {mean.cast<double>(), covariance.cast<double>()};
+}
+
+std::vector<Problem> without_potentials(std::vector<Problem> problems) {
+  std::erase_if(problems, [](const Problem& p) { return std::ranges::any_of(p.prior.latents, &Latent::is_potential); });
+  return problems;
 }
 
 double condition(const Problem& p) {

@@ -58,6 +58,12 @@ const Model& model_with_a_slipping_wheel();
 /// Constraints of all levels that come and go by an input and by the state, one of which slips, and a load that reads their λ₀.
 const Model& model_with_contacts();
 
+/// Two potentials of sums of kernels, one of which reads t, friction beside them, and parameters everywhere.
+const Model& model_with_potentials();
+
+/// The same on another track, with another mass.
+const Model& another_swing();
+
 /// Another, heavier particle on another surface; m, p1 and p5 are those of models/surface.toml.
 const Model& another_surface();
 
@@ -113,6 +119,9 @@ double dense_negative_log_likelihood(const Problem& p);
 
 /// Mean and covariance of a view at states, given the observations, by the textbook formulas.
 std::pair<VectorXd, MatrixXd> dense_posterior(const Problem& p, const View& view, const MatrixXd& states);
+
+/// Those without a potential, which inducing points and the export to C are not for.
+std::vector<Problem> without_potentials(std::vector<Problem> problems);
 
 /// Largest over smallest eigenvalue of K̃ + I, or a little more: the signal to noise ratio. Bounds the loss of accuracy.
 double condition(const Problem& p);

@@ -566,7 +566,8 @@ std::vector<Complaint> complaints() {
        "periodic linear "
        "constant"},
       {"UnknownDirections", latent + features + "directions = \"forces\"\n",
-       "9: latent.directions: expected \"acceleration\", \"force\" or a matrix of expressions [[…], …], got \"forces\""},
+       "9: latent.directions: expected \"acceleration\", \"force\", \"potential\" or a matrix of expressions [[…], …], got "
+       "\"forces\""},
       {"DirectionsOfTooFewRows", latent + features + "directions = [[\"1\"]]\n",
        "9: latent.directions: expected 2 rows, one per coordinate, got 1"},
       {"DirectionsWithRaggedRows", latent + features + "directions = [[\"1\"],\n[\"1\", \"0\"]]\n",

@@ -108,6 +108,11 @@ Json prior_json(const FitFile& fit) {
       add("latent " + latent.name, "small and fixed: what the kernel would rule out without reason");
       continue;
     }
+    if (latent.is_potential) {
+      add("latent " + latent.name,
+          fmt::format("{} of {}; the potential of a force", latent.kernel.text(), fmt::join(latent.feature_names, ", ")));
+      continue;
+    }
     add("latent " + latent.name + (latent.direction.empty() ? "" : ", " + latent.direction),
         fmt::format("{} of {}; acts on {}{}", latent.kernel.text(), fmt::join(latent.feature_names, ", "),
                     fmt::join(latent.column_names, ", "), latent.base == Latent::Base::force ? " (forces)" : ""));

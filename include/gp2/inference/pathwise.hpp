@@ -28,6 +28,11 @@ class PathwiseSamples {
   /// @throws InputError when there is no such sample, or as Posterior::mean.
   [[nodiscard]] Eigen::MatrixXd evaluate(int sample, const View& view, const Eigen::Ref<const Eigen::MatrixXd>& states) const;
 
+  /// A sample of a potential at N states, less that at a reference: what `evaluate` gives is the force of this function (N).
+  /// @throws InputError as Posterior::potential, or when there is no such sample.
+  [[nodiscard]] Eigen::VectorXd potential(int sample, int latent, const Eigen::Ref<const Eigen::MatrixXd>& states,
+                                          const Eigen::Ref<const Eigen::VectorXd>& reference) const;
+
  private:
   struct Implementation;
   explicit PathwiseSamples(std::shared_ptr<const Implementation> implementation);

@@ -63,11 +63,13 @@ struct PredictRequest {
   bool unconditioned = false;  // from the prior, as if there had been no data
   /// Instead of the view: the inputs that produce the accelerations which the states come with (inference/inverse_dynamics.hpp).
   bool inverse_dynamics = false;
+  /// Instead of the view: the potential of this latent, less that at the first state (Posterior::potential).
+  std::optional<std::string> potential;
 };
 std::vector<Option> options(PredictRequest& request);
 
 struct PredictOutcome {
-  /// NAME of the view or of an input, NAME_std, cov_NAME1_NAME2, ddqJ_missed of inverse dynamics, NAME_sample1, …, distance_from_data
+  /// NAME of the view or of an input, potential@LATENT, NAME_std, cov_NAME1_NAME2, ddqJ_missed of inverse dynamics, NAME_sample1, …, distance_from_data
   std::vector<std::string> names;
   Eigen::MatrixXd values;  // (names × N)
   std::vector<std::string> notes;

@@ -39,7 +39,7 @@ struct StateCode {
 /// What a latent is made from: words, as in the [[latent]] of a model file (docs/model-files.md), or code.
 struct LatentSpec {
   std::string name;
-  std::string kernel = {};            // empty: PriorOptions::kernel
+  std::string kernel = {};            // empty: PriorOptions::kernel; of a potential rq + linear
   std::vector<std::string> features;  // φ(x): expressions of the state; of code, what its numbers are called
   StateCode feature_code = {};        // empty: features are expressions
   Latent::Base base = Latent::Base::acceleration;
@@ -47,6 +47,7 @@ struct LatentSpec {
   std::vector<std::string> direction_names = {};          // of code, its columns (p)
   StateCode direction_code = {};                          // B(x) column-major (nq·p × N); neither: B = I
   bool is_positive = false;                               // Latent::is_positive; directions are then given
+  bool is_potential = false;  // it acts as the force −Jᵀ∇V of a potential V of its features; without directions
   Latent::Range lengthscale = {}, signal_stddev = {};
   /// Whether each direction has lengthscales, and all else of the kernel, of its own: p latents of one direction. Not given: where
   /// the kernel is not given either and PriorOptions::per_direction says so.

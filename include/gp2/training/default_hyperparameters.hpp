@@ -42,9 +42,9 @@ struct Scales {
   std::vector<Eigen::VectorXd> feature_mean;    // per latent (D)
   std::vector<Eigen::VectorXd> feature_stddev;  // per latent (D)
   std::vector<Eigen::VectorXd> feature_range;   // per latent (D), largest minus smallest
-  std::vector<Eigen::VectorXd> signal_stddev;   // per latent (p): σ_j, M_jj σ_j, or σ̄ / rms(E column)
-  std::vector<Eigen::VectorXd> output_stddev;   // per Observations (d)
-  Eigen::VectorXd acceleration_stddev;          // σ (nq)
+  std::vector<Eigen::VectorXd> signal_stddev;  // per latent (p): σ_j, M_jj σ_j, or σ̄ / rms(E column); of a potential all alike
+  std::vector<Eigen::VectorXd> output_stddev;  // per Observations (d)
+  Eigen::VectorXd acceleration_stddev;         // σ (nq)
 };
 
 /// σ_j = std of the observed ddq_j, or the size of its values where they do not vary; where there are none, or all are 0,
