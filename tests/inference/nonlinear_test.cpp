@@ -14,6 +14,7 @@
 #include "inference/nonlinear_motion.hpp"
 #include "inference/problems.hpp"
 #include "input_error.hpp"
+#include "training/objective.hpp"
 
 // Latents that act through the multipliers that they change, or by their exponential.
 namespace gp2 {
@@ -416,6 +417,26 @@ force = ["-(0.2 + 0.1*q^2)*dq"]
   EXPECT_NEAR(mean[0], found.posterior.mean(view, states.leftCols(1))(0, 0), 1e-11);
 }
 
+// The spring of a bead that rubs: its energy and the coefficient of friction together.
+TEST(NonlinearPosterior, LearnsAPotentialBesideAFriction) {
+  std::string text = rubbing_bead("lambda", "se + constant").text;
+  text.replace(text.find("[sampling]"), 10,
+               "[[latent]]\nname = \"spring\"\nfeatures = [\"x\"]\ndirections = \"potential\"\n[sampling]");
+  text.replace(text.find("[\"-mu*load*dx/v\""), 17, "[\"-mu*load*dx/v - 2*sin(2*x)\"");
+  const Fitted fitted(Model::parse(text, "bead on a spring"), 80);
+  const Fit found =
+      fit(fitted.prior, fitted.observations, default_hyperparameters(fitted.prior, fitted.observations, {}, {}), FitOptions());
+  const MatrixXd states = test::draw(fitted.model, 100, nonlinear_seed + 1).states;
+  const View view = View::constrained_acceleration(*fitted.model.system);
+  const MatrixXd truth = ModelMotion(fitted.model).acceleration(states);
+  EXPECT_LE((found.posterior.mean(view, states) - truth).norm(), 0.01 * truth.norm());
+  const VectorXd energy = found.posterior.potential(1, states, states.col(0)).mean;
+  // V = 1 − cos 2x
+  for (Index i = 0; i < states.cols(); ++i) {
+    EXPECT_NEAR(energy[i], std::cos(2 * states(0, 0)) - std::cos(2 * states(0, i)), 0.02);
+  }
+}
+
 TEST(NonlinearPosterior, GoesToAnotherSystem) {
   const Fitted fitted(rubbing_bead("lambda", "se + constant"), 60);
   const Fit found =
@@ -452,6 +473,31 @@ TEST(NonlinearFit, FindsACoefficientThatKnownMultipliersGetWrong) {
   EXPECT_LT(of_own, 0.01);
   EXPECT_GT(coverage, 0.8);
   EXPECT_LT(of_own, 0.2 * error(known).first);
+}
+
+// Training leaves out how the evidence moves with the posterior mean itself: what a Newton step in each hyperparameter would gain.
+TEST(NonlinearFit, EndsWhereLaplacesEvidenceHasNothingToGain) {
+  for (const Fitted& fitted : {Fitted(rubbing_bead("lambda", "constant + matern32"), 60), Fitted(test::model_that_rubs(), 60)}) {
+    SCOPED_TRACE(fitted.model.name);
+    const std::vector<Observations>& observations = fitted.observations;
+    const Fit found = fit(fitted.prior, observations, default_hyperparameters(fitted.prior, observations, {}, {}), FitOptions());
+    const auto objective = [&](const std::vector<Hyperparameter>& at) {
+      const Posterior posterior(fitted.prior, observations, model_values(fitted.prior, observations, at));
+      return posterior.negative_log_likelihood() + negative_log_hyperpriors(at, nullptr);
+    };
+    const std::vector<Hyperparameter>& best = found.report.hyperparameters;
+    const double here = objective(best);
+    double gain = 0;
+    for (std::size_t k = 0; k < best.size(); ++k) {
+      const double step = 0.05;
+      std::vector<Hyperparameter> above = best, below = best;
+      above[k].value = best[k].value * (1 + step), below[k].value = best[k].value / (1 + step);
+      if (above[k].value > best[k].upper || below[k].value < best[k].lower) continue;
+      const double up = objective(above), down = objective(below), curvature = up + down - 2 * here;
+      if (curvature > 0) gain += 0.125 * (up - down) * (up - down) / curvature;
+    }
+    EXPECT_LT(gain, 2);
+  }
 }
 
 TEST(NonlinearPrior, IsRefusedByNameWhereItCannotBe) {
