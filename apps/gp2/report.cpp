@@ -4,8 +4,7 @@
 
 #include "command.hpp"
 #include "gp2/base/file.hpp"
-#include "gp2/error.hpp"
-#include "report/report_page.hpp"
+#include "gp2/report/report_page.hpp"
 
 namespace gp2::command {
 
@@ -19,13 +18,10 @@ struct ReportArguments {
 void run(const ReportArguments& arguments) {
   const ReportOptions& options = arguments.options;
   require_output(arguments.output, {options.fit, options.data, options.system, options.truth});
-  if (!options.columns.empty() && options.data.empty()) {
-    throw InputError("--map names columns of --data, which is not given; the fit has its own data");
-  }
   std::vector<std::string> notes;
   const Report report = collect_report(options, notes);
   print_notes(notes);
-  const std::string page = report_page(report);
+  const std::string page = report_page(report, with_flags);
   write_file(arguments.output, page);
   print_notes({fmt::format("{}: report of '{}', {:.0f} kB; open it in a browser", arguments.output,
                            report.fit.model.system->name(), static_cast<double>(page.size()) / 1e3)});

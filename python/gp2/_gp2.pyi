@@ -654,6 +654,15 @@ def show(
     json: bool = False,
     # end of options
 ) -> str: ...
+def report(
+    fit: Posterior | _Path,
+    path: _Path | None = None,
+    *,
+    data: _Table | None = None,
+    system: System | _Path | None = None,
+    truth: System | _Path | None = None,
+    columns: Mapping[str, str] | None = None,
+) -> str: ...
 def simulate(
     system: System,
     start: Mapping[str, float] | npt.ArrayLike,

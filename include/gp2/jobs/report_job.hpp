@@ -1,12 +1,15 @@
 #pragma once
 
+#include <filesystem>
 #include <map>
+#include <memory>
 #include <optional>
 #include <string>
 #include <vector>
 
 #include <Eigen/Core>
 
+#include "gp2/data/csv.hpp"
 #include "gp2/export.hpp"
 #include "gp2/files/fit_file.hpp"
 #include "gp2/inference/evaluation.hpp"
@@ -104,7 +107,7 @@ struct Advice {
 struct Report {
   FitFile fit;
   std::string library;    // the version that fitted
-  std::string file_date;  // of the fit file, YYYY-MM-DD
+  std::string file_date;  // of the fit file, YYYY-MM-DD; empty: it is in no file
   std::vector<ReportData> data;
   CrossValidation cross_validation;  // of the training data
   std::vector<Relevance> relevance;
@@ -124,9 +127,21 @@ struct ReportOptions {
 /// data, system, truth, map.
 std::vector<Option> options(ReportOptions& options);
 
+/// The same as what was read.
+struct ReportRequest {
+  std::optional<CsvTable> data;
+  std::shared_ptr<const Model> truth, system;
+  std::map<std::string, std::string> columns;
+};
+
 /// Predicts, evaluates and collects.
+/// @param fit    with the data of the posterior (FitFile::take_data)
 /// @param notes  receives what a person should know
-/// @throws InputError for files that cannot be read or do not fit each other.
+/// @throws InputError for data and models that do not fit the fit.
+Report collect_report(FitFile fit, const Posterior& posterior, const ReportRequest& request, std::vector<std::string>& notes);
+/// The same of a FIT.json.
+Report collect_report(const std::filesystem::path& fit, const ReportRequest& request, std::vector<std::string>& notes);
+/// The same from files. @throws InputError also for files that cannot be read.
 Report collect_report(const ReportOptions& options, std::vector<std::string>& notes);
 
 /// What the figures say about how to go on, most pressing first.

@@ -1,3 +1,5 @@
+#include "gp2/report/report_page.hpp"
+
 #include <algorithm>
 #include <cmath>
 #include <cstdlib>
@@ -7,7 +9,6 @@
 #include <fmt/ranges.h>
 #include <nlohmann/json.hpp>
 
-#include "command.hpp"
 #include "gp2/base/statistics.hpp"
 #include "gp2/base/version.hpp"
 #include "gp2/data/csv.hpp"
@@ -15,9 +16,8 @@
 #include "gp2/jobs/show_job.hpp"
 #include "gp2/training/laplace.hpp"
 #include "report/assets.hpp"
-#include "report/report_page.hpp"
 
-namespace gp2::command {
+namespace gp2 {
 
 using Eigen::Index;
 using Eigen::MatrixXd;
@@ -321,11 +321,11 @@ Json surface_json(const ConstraintSurface& surface) {
           {"sheets", sheets}};
 }
 
-Json advice_json(const std::vector<Advice>& all) {
+Json advice_json(const std::vector<Advice>& all, const Spelling& spelled) {
   Json rows = Json::array();
   for (const Advice& one : all) {
     const char* level = one.level == Advice::Level::warning ? "warning" : one.level == Advice::Level::note ? "note" : "good";
-    rows.push_back({{"level", level}, {"text", with_flags(one.text)}, {"mend", with_flags(one.mend)}});
+    rows.push_back({{"level", level}, {"text", spelled(one.text)}, {"mend", spelled(one.mend)}});
   }
   return rows;
 }
@@ -346,7 +346,7 @@ std::string html_text(std::string text) {
 
 }  // namespace
 
-std::string report_json(const Report& report) {
+std::string report_json(const Report& report, const Spelling& spelled) {
   Json json = {{"version", version()},
                {"library", report.library},
                {"date", report.file_date},
@@ -359,7 +359,7 @@ std::string report_json(const Report& report) {
                {"hyperparameters", hyperparameters_json(report.fit.report)},
                {"fit", fit_json(report.fit.report)},
                {"left_out", report.data.empty() ? "" : report.cross_validation.text()},
-               {"advice", advice_json(learning_advice(report))},
+               {"advice", advice_json(learning_advice(report), spelled)},
                {"relevance", relevance_json(report.relevance)},
                {"learned", learned_json(report.learned)},
                {"data", Json::array()}};
@@ -371,7 +371,7 @@ std::string report_json(const Report& report) {
   return text;
 }
 
-std::string report_page(const Report& report) {
+std::string report_page(const Report& report, const Spelling& spelled) {
   const std::vector<std::pair<std::string_view, std::string>> parts = {
       {"{{title}}", html_text(report.fit.model.system->name())},
       {"{{uplot_css}}", std::string(assets::uplot_css)},
@@ -379,7 +379,7 @@ std::string report_page(const Report& report) {
       {"{{uplot_license}}", std::string(assets::uplot_license)},
       {"{{uplot}}", std::string(assets::uplot_js)},
       {"{{script}}", std::string(assets::report_js)},
-      {"{{data}}", report_json(report)},
+      {"{{data}}", report_json(report, spelled)},
   };
   // one pass over the template, so that what is put in is never read for marks
   std::string page;
@@ -400,4 +400,4 @@ std::string report_page(const Report& report) {
   return page;
 }
 
-}  // namespace gp2::command
+}  // namespace gp2

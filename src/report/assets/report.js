@@ -91,7 +91,7 @@
 
   function fillHeader() {
     const rows = report.observations.reduce((sum, group) => sum + group.n, 0);
-    byId("lead").textContent = `Fitted to ${rows} rows of ${report.source} by gp2 ${report.library}; file of ${report.date}.`;
+    byId("lead").textContent = `Fitted to ${rows} rows of ${report.source} by gp2 ${report.library}${report.date ? `; file of ${report.date}` : ""}.`;
     const tiles = [["Optimiser", fit.converged ? "converged" : fit.iterations === 0 ? "did not run" : "not converged", `${fit.iterations} iterations, best of ${fit.restarts.length} restarts`],
       ["Negative log likelihood", format(fit.nll), `of ${rows} rows`]];
     const shown = test || report.data[0];
@@ -168,7 +168,7 @@
 
   function fillFigures() {
     if (!report.data.length) {
-      byId("figures").append(make("p", { class: "muted", text: "The fit learned from no acceleration; give --data to compare with one." }));
+      byId("figures").append(make("p", { class: "muted", text: "The fit learned from no acceleration, and no test data were given." }));
       return;
     }
     const outputs = [...new Set(report.data.flatMap((data) => data.outputs))];
@@ -720,7 +720,7 @@
   function start() {
     if (!data) {
       for (const part of document.querySelectorAll("#data-choice, #pictures section:not(#relevance)")) part.remove();
-      byId("pictures").append(make("p", { class: "muted", text: "No pictures: the fit learned from no acceleration, and no --data was given." }));
+      byId("pictures").append(make("p", { class: "muted", text: "No pictures: the fit learned from no acceleration, and no test data were given." }));
     }
     if (!report.learned.length) byId("learned").remove();
     fillHeader();
