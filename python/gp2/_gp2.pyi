@@ -655,7 +655,7 @@ def show(
     # end of options
 ) -> str: ...
 def report(
-    fit: Posterior | _Path,
+    fit: Posterior | _Path | Sequence[Posterior | _Path] | Mapping[str, Posterior | _Path],
     path: _Path | None = None,
     *,
     data: _Table | None = None,

@@ -31,6 +31,23 @@ Report collected(const py::object& fit, const ReportRequest& request, std::vecto
   return collect_report(std::move(file), posterior, request, notes);
 }
 
+// each fit, under the name it has on the page
+std::vector<Report> all_collected(const py::object& fit, const ReportRequest& request, std::vector<std::string>& notes) {
+  std::vector<Report> reports;
+  if (py::isinstance<py::dict>(fit)) {
+    for (const auto& [name, one] : fit.cast<py::dict>()) {
+      reports.push_back(collected(py::reinterpret_borrow<py::object>(one), request, notes));
+      reports.back().label = py::str(name);
+    }
+  } else if (py::isinstance<py::list>(fit) || py::isinstance<py::tuple>(fit)) {
+    for (const py::handle one : fit) reports.push_back(collected(py::reinterpret_borrow<py::object>(one), request, notes));
+  } else {
+    reports.push_back(collected(fit, request, notes));
+  }
+  if (reports.empty()) throw InputError("report: there is no fit");
+  return reports;
+}
+
 std::string report(const py::object& fit, const py::object& path, const py::object& data, const py::object& system,
                    const py::object& truth, const py::object& columns) {
   ReportRequest request;
@@ -39,7 +56,7 @@ std::string report(const py::object& fit, const py::object& path, const py::obje
   request.truth = model_argument(truth);
   request.columns = columns_argument(columns);
   std::vector<std::string> notes;
-  const Report found = collected(fit, request, notes);
+  const std::vector<Report> found = all_collected(fit, request, notes);
   tell(notes);
   std::string page = report_page(found, [](const std::string& message) { return with_keywords(message); });
   if (!path.is_none()) write_file(path_argument(path), page);
@@ -54,7 +71,7 @@ void add_report(py::module_& module) {
              "truth"_a = py::none(), "columns"_a = py::none(),
              R"(The page of gp2 report as text, which is also written where a path is given: HTML that needs nothing else.
 
-fit      a Posterior, or the path of a FIT.json
+fit      a Posterior, or the path of a FIT.json; a list of them, or a dict by names, stands side by side on the page
 path     of the page
 data     a table with states and accelerations that the fit has not seen: a test
 system   another system with the same coordinates, inputs and latents, which data and truth are of

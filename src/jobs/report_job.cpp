@@ -282,7 +282,7 @@ std::vector<LearnedForce> learned_forces(const Posterior& posterior) {
       along.row(static_cast<Index>(k)) = at.transpose();
       try {
         const Posterior::Marginal marginal = posterior.marginal(view, along);
-        of_latent.push_back({latent.name, entries[k], names, at, marginal.mean, marginal.stddev()});
+        of_latent.push_back({latent.name, entries[k], names, at, marginal.mean, marginal.stddev(), row.transpose()});
       } catch (const InputError&) {  // where no data are a feature may have no value
       }
     }
@@ -461,6 +461,7 @@ Report collect_report(FitFile fit, const Posterior& posterior, const ReportReque
   }
   if (!request.data && request.system) throw InputError("`system` is that of `data`, which is not given");
   Report report;
+  report.label = fit.model.system->name();
   report.fit = std::move(fit);
   report.library = version();
   report.data = training_data(report.fit, posterior);
@@ -486,12 +487,13 @@ Report collect_report(const std::filesystem::path& fit, const ReportRequest& req
   FitFile file = FitFile::parse(text, fit.string());
   const Posterior posterior = file.posterior();
   Report report = collect_report(std::move(file), posterior, request, notes);
+  report.label = fit.string();
   report.library = nlohmann::json::parse(text).value("library", "");
   report.file_date = date_of(fit);
   return report;
 }
 
-Report collect_report(const ReportOptions& options, std::vector<std::string>& notes) {
+std::vector<Report> collect_reports(const ReportOptions& options, std::vector<std::string>& notes) {
   const auto model = [](const std::string& path) {
     return path.empty() ? nullptr : std::make_shared<const Model>(Model::read(path));
   };
@@ -500,7 +502,16 @@ Report collect_report(const ReportOptions& options, std::vector<std::string>& no
   request.truth = model(options.truth);
   request.system = model(options.system);
   request.columns = options.columns;
-  return collect_report(std::filesystem::path(options.fit), request, notes);
+  std::vector<Report> reports;
+  for (const std::string& fit : options.fits) {
+    std::vector<std::string> of_this;
+    reports.push_back(collect_report(std::filesystem::path(fit), request, of_this));
+    // the log is read for each fit, but what is said of it is said once
+    for (std::string& note : of_this) {
+      if (std::ranges::find(notes, note) == notes.end()) notes.push_back(std::move(note));
+    }
+  }
+  return reports;
 }
 
 }  // namespace gp2

@@ -29,6 +29,8 @@ using Json = nlohmann::ordered_json;
 
 // more points than these are not drawn: an even selection is
 constexpr Index max_drawn = 2000;
+// of marks along an axis
+constexpr Index max_ticks = 200;
 
 Json number(double value) { return std::isfinite(value) ? Json(value) : Json(); }
 
@@ -304,7 +306,8 @@ Json learned_json(const std::vector<LearnedForce>& all) {
                         {"along", one.along},
                         {"at", row_json(one.at)},
                         {"mean", row_json(one.mean.row(k))},
-                        {"stddev", row_json(one.stddev.row(k))}});
+                        {"stddev", row_json(one.stddev.row(k))},
+                        {"data", row_json(one.data, (one.data.size() + max_ticks - 1) / max_ticks)}});
     }
   }
   return curves;
@@ -344,10 +347,9 @@ std::string html_text(std::string text) {
   return text;
 }
 
-}  // namespace
-
-std::string report_json(const Report& report, const Spelling& spelled) {
+Json page_json(const Report& report, const Spelling& spelled) {
   Json json = {{"version", version()},
+               {"label", report.label},
                {"library", report.library},
                {"date", report.file_date},
                {"source", report.fit.data_source},
@@ -365,21 +367,29 @@ std::string report_json(const Report& report, const Spelling& spelled) {
                {"data", Json::array()}};
   for (const ReportData& data : report.data) json["data"].push_back(data_json(report, data));
   if (report.surface) json["surface"] = surface_json(*report.surface);
+  return json;
+}
+
+}  // namespace
+
+std::string report_json(const std::vector<Report>& reports, const Spelling& spelled) {
+  Json json = Json::array();
+  for (const Report& report : reports) json.push_back(page_json(report, spelled));
   std::string text = json.dump(-1, ' ', /*ensure_ascii=*/true, Json::error_handler_t::replace);
   // a < stands in strings only; written so it can neither end the element nor open a comment
   replace_all(text, "<", "\\u003c");
   return text;
 }
 
-std::string report_page(const Report& report, const Spelling& spelled) {
+std::string report_page(const std::vector<Report>& reports, const Spelling& spelled) {
   const std::vector<std::pair<std::string_view, std::string>> parts = {
-      {"{{title}}", html_text(report.fit.model.system->name())},
+      {"{{title}}", html_text(reports.front().fit.model.system->name())},
       {"{{uplot_css}}", std::string(assets::uplot_css)},
       {"{{style}}", std::string(assets::report_css)},
       {"{{uplot_license}}", std::string(assets::uplot_license)},
       {"{{uplot}}", std::string(assets::uplot_js)},
       {"{{script}}", std::string(assets::report_js)},
-      {"{{data}}", report_json(report, spelled)},
+      {"{{data}}", report_json(reports, spelled)},
   };
   // one pass over the template, so that what is put in is never read for marks
   std::string page;

@@ -10,7 +10,7 @@ import gp2
 
 
 def data_of(page):
-    return json.loads(re.search(r'<script type="application/json" id="report">(.*?)</script>', page, re.S)[1])
+    return json.loads(re.search(r'<script type="application/json" id="report">(.*?)</script>', page, re.S)[1])[0]
 
 
 def test_a_posterior_and_its_file_have_the_page_of_the_command(posterior, arm, command, tmp_path):
@@ -38,6 +38,17 @@ def test_what_grew_is_on_the_page_and_options_have_pythons_names(posterior, arm)
     found = data_of(gp2.report(grown))
     assert found["data"][0]["n"] == 35
     assert any("max_iterations=0" in one["mend"] for one in found["advice"])
+
+
+def test_several_fits_stand_side_by_side_under_their_names(posterior, arm, arm_fit_file):
+    def labels(page):
+        found = re.search(r'<script type="application/json" id="report">(.*?)</script>', page, re.S)[1]
+        return [one["label"] for one in json.loads(found)]
+
+    assert labels(gp2.report({"a": posterior, "b": arm_fit_file})) == ["a", "b"]
+    assert labels(gp2.report([posterior, arm_fit_file])) == [arm.name, str(arm_fit_file)]
+    with pytest.raises(gp2.InputError, match="there is no fit"):
+        gp2.report([])
 
 
 def test_columns_and_a_system_without_data_are_refused(posterior, arm, tmp_path):

@@ -37,6 +37,7 @@ struct LearnedForce {
   std::vector<std::string> names;  // force_NAME, with @LATENT behind where there are several (d)
   Eigen::VectorXd at;              // evenly over what the training data hold (n)
   Eigen::MatrixXd mean, stddev;    // (d × n)
+  Eigen::VectorXd data;            // where the training data are (N)
 };
 
 /// What each latent has learned, along the entries of the state that it reads and that change it most.
@@ -105,6 +106,7 @@ struct Advice {
 
 /// Everything on the page.
 struct Report {
+  std::string label;  // what it is called beside others: its file, or its system
   FitFile fit;
   std::string library;    // the version that fitted
   std::string file_date;  // of the fit file, YYYY-MM-DD; empty: it is in no file
@@ -117,7 +119,7 @@ struct Report {
 };
 
 struct ReportOptions {
-  std::string fit;                             // FIT.json
+  std::vector<std::string> fits;               // FIT.json
   std::string data;                            // CSV of a test; empty: none
   std::string truth;                           // model file that tells the true acceleration; empty: none
   std::map<std::string, std::string> columns;  // model's name -> log's name, of `data`
@@ -141,8 +143,8 @@ struct ReportRequest {
 Report collect_report(FitFile fit, const Posterior& posterior, const ReportRequest& request, std::vector<std::string>& notes);
 /// The same of a FIT.json.
 Report collect_report(const std::filesystem::path& fit, const ReportRequest& request, std::vector<std::string>& notes);
-/// The same from files. @throws InputError also for files that cannot be read.
-Report collect_report(const ReportOptions& options, std::vector<std::string>& notes);
+/// The same from files, one for each fit. @throws InputError also for files that cannot be read.
+std::vector<Report> collect_reports(const ReportOptions& options, std::vector<std::string>& notes);
 
 /// What the figures say about how to go on, most pressing first.
 std::vector<Advice> learning_advice(const Report& report);
