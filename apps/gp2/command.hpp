@@ -37,6 +37,7 @@ Command evaluate_command();
 Command update_command();
 Command export_command();
 Command report_command();
+Command plot_command();
 Command reproduce_command();
 Command completion_command();
 Command help_command(const std::vector<std::string>& names);

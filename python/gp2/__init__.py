@@ -9,6 +9,7 @@ Every prediction obeys the constraint A(q, dq, t) ddq = b(q, dq, t) to rounding 
 """
 
 from gp2 import _objects as _objects
+from gp2 import _plots as _plots
 from gp2._gp2 import (
     FAR_FROM_DATA,
     Calibration,
@@ -42,6 +43,7 @@ from gp2._gp2 import (
     fit_again,
     fit_raw,
     load,
+    plot,
     read_csv,
     report,
     resample,
@@ -82,6 +84,7 @@ __all__ = [
     "fit_again",
     "fit_raw",
     "load",
+    "plot",
     "read_csv",
     "report",
     "resample",

@@ -1,9 +1,11 @@
-#include "gp2/report/report_page.hpp"
-
 #include <filesystem>
+
+#include <pybind11/stl.h>
 
 #include "bindings.hpp"
 #include "gp2/base/file.hpp"
+#include "gp2/report/plot.hpp"
+#include "gp2/report/report_page.hpp"
 #include "options.hpp"
 
 namespace gp2::python {
@@ -63,6 +65,71 @@ std::string report(const py::object& fit, const py::object& path, const py::obje
   return page;
 }
 
+std::string plot_fit(const py::object& fit, const py::object& path, const py::kwargs& keywords) {
+  PlotRequest request;
+  read_keywords("plot", keywords, options(request));
+  const auto picture = [&request](const Posterior& posterior, const std::string& title) {
+    const py::gil_scoped_release release;
+    return plot(learned_curve(posterior, request), title);
+  };
+  std::string svg;
+  if (py::isinstance<PyPosterior>(fit)) {
+    const auto& self = fit.cast<const PyPosterior&>();
+    const Posterior posterior = self.posterior;
+    svg = picture(posterior, self.system().name());
+  } else {
+    const FitFile file = FitFile::read(path_argument(fit));
+    svg = picture(file.posterior(), file.model.system->name());
+  }
+  if (!path.is_none()) write_file(path_argument(path), svg);
+  return svg;
+}
+
+// ---------------------------------------------------------------- what matplotlib draws (gp2/_plots.py)
+
+py::dict curve_of(const PyPosterior& self, const py::kwargs& keywords) {
+  using namespace py::literals;
+  PlotRequest request;
+  read_keywords("plot_learned", keywords, options(request));
+  const Posterior posterior = self.posterior;
+  LearnedCurve curve;
+  {
+    const py::gil_scoped_release release;
+    curve = learned_curve(posterior, request);
+  }
+  const LearnedForce& force = curve.force;
+  return py::dict("latent"_a = force.latent, "along"_a = force.along, "name"_a = force.names[static_cast<std::size_t>(curve.row)],
+                  "at"_a = to_vector(force.at), "mean"_a = to_vector(force.mean.row(curve.row)),
+                  "std"_a = to_vector(force.stddev.row(curve.row)), "data"_a = to_vector(force.data));
+}
+
+py::dict compared(const PyPosterior& self, const py::object& data, const PySystem* system, const py::object& columns) {
+  using namespace py::literals;
+  ReportRequest request;
+  request.data = to_table(data, "data");
+  request.system = system == nullptr ? nullptr : system->model;
+  request.columns = columns_argument(columns);
+  const Posterior posterior = self.posterior;
+  std::vector<std::string> notes;
+  ReportData found;
+  Eigen::VectorXd levels = Eigen::VectorXd::LinSpaced(100, 0, 0.99);
+  Eigen::MatrixXd shares;
+  {
+    const py::gil_scoped_release release;
+    found = compare(self.file, posterior, request, notes);
+    shares = coverage(found, levels);
+  }
+  tell(notes);
+  const auto of_outputs = [&](const Eigen::MatrixXd& all) {
+    Eigen::MatrixXd rows(std::ssize(found.rows), all.cols());
+    for (std::size_t k = 0; k < found.rows.size(); ++k) rows.row(static_cast<Eigen::Index>(k)) = all.row(found.rows[k]);
+    return to_rows(std::move(rows));
+  };
+  return py::dict("outputs"_a = found.outputs, "measured"_a = to_rows(found.measured), "mean"_a = of_outputs(found.predicted),
+                  "std"_a = of_outputs(found.stddev), "levels"_a = to_vector(std::move(levels)),
+                  "coverage"_a = to_vector(shares.col(shares.cols() - 1)));
+}
+
 }  // namespace
 
 void add_report(py::module_& module) {
@@ -79,6 +146,22 @@ truth    a system whose [truth] is the true acceleration, shown beside the predi
 columns  columns of data by other names: {"q1": "theta"}
 
 Raises InputError for data and models that do not fit the fit.)");
+  module.def("_learned_curve", &curve_of, "posterior"_a);
+  module.def("_compared", &compared, "posterior"_a, "data"_a, "system"_a, "columns"_a);
+
+  PlotRequest request;
+  py::options own_signature;
+  own_signature.disable_function_signatures();
+  module.def("plot", &plot_fit, "fit"_a, "path"_a = py::none(),
+             (signature("plot", "fit: Posterior | str | os.PathLike, path: str | os.PathLike | None = None, *,", options(request),
+                        "", "str") +
+              R"(
+The picture of gp2 plot as text, which is also written where a path is given: one learned force with its 95 % band, as SVG.
+
+)" + documentation(options(request)) +
+              R"(
+Posterior.plot_learned draws the same by matplotlib.)")
+                 .c_str());
 }
 
 }  // namespace gp2::python

@@ -128,41 +128,6 @@ std::vector<ReportData> training_data(const FitFile& fit, const Posterior& poste
   return all;
 }
 
-ReportData test_data(const CsvTable& table, const ReportRequest& request, const FitFile& fit, const Posterior& posterior,
-                     std::vector<std::string>& notes) {
-  ViewRequest constrained;
-  constrained.system = request.system;
-  const PredictedView at = predicted_view(fit, posterior.prior(), constrained);
-  const System& system = *at.model->system;
-  const std::vector<int> rows =
-      acceleration_rows(system, outputs_to_compare(posterior, *at.model, table, request.columns, notes), "`data`");
-  const std::vector<std::string> outputs = View{View::Quantity::constrained_acceleration, rows}.names(system);
-  const LogStates log = read_log_states(at.prior, at.view, *at.model, table, request.columns, outputs, at.actuators);
-  notes.insert(notes.end(), log.notes.begin(), log.notes.end());
-  ReportData data = at_states_of(table.name(), [&] {
-    MatrixXd noise = measurement_noise(posterior, rows, log.states.cols(), log.stated_stddev);
-    return data_at(posterior, log.states, rows, log.accelerations, std::move(noise), at.other_system);
-  });
-  data.name = "test";
-  data.source = at.other_system ? fmt::format("{}, of '{}'", table.name(), system.name()) : table.name();
-  data.is_test = true;
-  data.is_of_other_system = at.other_system != nullptr;
-  // what the fit does not read may still be drawn, and be read by the truth
-  LogReader reader = open_log(*at.model, table, request.columns);
-  const std::vector<std::string> names = system.state_names();
-  for (std::size_t k = 0; k < names.size(); ++k) {
-    if (!data.states.row(static_cast<Index>(k)).hasNaN() || !reader.has(names[k])) continue;
-    std::vector<bool> only(names.size(), false);
-    only[k] = true;
-    try {
-      data.states.row(static_cast<Index>(k)) = reader.states(only).row(static_cast<Index>(k));
-    } catch (const InputError&) {
-      // not numbers: then it is not drawn
-    }
-  }
-  return data;
-}
-
 void add_truth(const ReportRequest& request, Report& report) {
   const Model& truth = *request.truth;
   const System& home = *report.fit.model.system;
@@ -253,7 +218,7 @@ VectorXd usual_state(const Prior& prior, const MatrixXd& states) {
 }  // namespace
 
 std::vector<LearnedForce> learned_forces(const Posterior& posterior) {
-  constexpr Index n_points = 61;
+  constexpr Index n_points = 101;
   constexpr std::size_t most = 6;        // entries of the state, of a latent
   constexpr double worth_a_look = 0.02;  // of what the entry does that does most
   const Prior& prior = posterior.prior();
@@ -455,6 +420,42 @@ std::vector<Option> options(ReportOptions& options) {
   };
 }
 
+ReportData compare(const FitFile& fit, const Posterior& posterior, const ReportRequest& request,
+                   std::vector<std::string>& notes) {
+  const CsvTable& table = *request.data;
+  ViewRequest constrained;
+  constrained.system = request.system;
+  const PredictedView at = predicted_view(fit, posterior.prior(), constrained);
+  const System& system = *at.model->system;
+  const std::vector<int> rows =
+      acceleration_rows(system, outputs_to_compare(posterior, *at.model, table, request.columns, notes), "`data`");
+  const std::vector<std::string> outputs = View{View::Quantity::constrained_acceleration, rows}.names(system);
+  const LogStates log = read_log_states(at.prior, at.view, *at.model, table, request.columns, outputs, at.actuators);
+  notes.insert(notes.end(), log.notes.begin(), log.notes.end());
+  ReportData data = at_states_of(table.name(), [&] {
+    MatrixXd noise = measurement_noise(posterior, rows, log.states.cols(), log.stated_stddev);
+    return data_at(posterior, log.states, rows, log.accelerations, std::move(noise), at.other_system);
+  });
+  data.name = "test";
+  data.source = at.other_system ? fmt::format("{}, of '{}'", table.name(), system.name()) : table.name();
+  data.is_test = true;
+  data.is_of_other_system = at.other_system != nullptr;
+  // what the fit does not read may still be drawn, and be read by the truth
+  LogReader reader = open_log(*at.model, table, request.columns);
+  const std::vector<std::string> names = system.state_names();
+  for (std::size_t k = 0; k < names.size(); ++k) {
+    if (!data.states.row(static_cast<Index>(k)).hasNaN() || !reader.has(names[k])) continue;
+    std::vector<bool> only(names.size(), false);
+    only[k] = true;
+    try {
+      data.states.row(static_cast<Index>(k)) = reader.states(only).row(static_cast<Index>(k));
+    } catch (const InputError&) {
+      // not numbers: then it is not drawn
+    }
+  }
+  return data;
+}
+
 Report collect_report(FitFile fit, const Posterior& posterior, const ReportRequest& request, std::vector<std::string>& notes) {
   if (!request.data && !request.columns.empty()) {
     throw InputError("`map` names columns of `data`, which is not given; the fit has its own data");
@@ -468,7 +469,7 @@ Report collect_report(FitFile fit, const Posterior& posterior, const ReportReque
   report.cross_validation = cross_validate(report.fit, posterior);
   report.relevance = relevance_of(posterior);
   report.learned = learned_forces(posterior);
-  if (request.data) report.data.push_back(test_data(*request.data, request, report.fit, posterior, notes));
+  if (request.data) report.data.push_back(compare(report.fit, posterior, request, notes));
   if (request.truth) add_truth(request, report);
   if (const SymbolicSystem* system = report.fit.model.symbolic_system(); system != nullptr && !report.data.empty()) {
     MatrixXd q(system->layout().size(), 0);

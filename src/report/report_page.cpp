@@ -16,6 +16,7 @@
 #include "gp2/jobs/show_job.hpp"
 #include "gp2/training/laplace.hpp"
 #include "report/assets.hpp"
+#include "report/markup.hpp"
 
 namespace gp2 {
 
@@ -333,20 +334,6 @@ Json advice_json(const std::vector<Advice>& all, const Spelling& spelled) {
   return rows;
 }
 
-void replace_all(std::string& text, std::string_view from, std::string_view to) {
-  for (std::size_t at = text.find(from); at != std::string::npos; at = text.find(from, at + to.size())) {
-    text.replace(at, from.size(), to);
-  }
-}
-
-// text between tags
-std::string html_text(std::string text) {
-  replace_all(text, "&", "&amp;");
-  replace_all(text, "<", "&lt;");
-  replace_all(text, ">", "&gt;");
-  return text;
-}
-
 Json page_json(const Report& report, const Spelling& spelled) {
   Json json = {{"version", version()},
                {"label", report.label},
@@ -383,7 +370,7 @@ std::string report_json(const std::vector<Report>& reports, const Spelling& spel
 
 std::string report_page(const std::vector<Report>& reports, const Spelling& spelled) {
   const std::vector<std::pair<std::string_view, std::string>> parts = {
-      {"{{title}}", html_text(reports.front().fit.model.system->name())},
+      {"{{title}}", markup_text(reports.front().fit.model.system->name())},
       {"{{uplot_css}}", std::string(assets::uplot_css)},
       {"{{style}}", std::string(assets::report_css)},
       {"{{uplot_license}}", std::string(assets::uplot_license)},

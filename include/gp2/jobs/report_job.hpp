@@ -136,6 +136,10 @@ struct ReportRequest {
   std::map<std::string, std::string> columns;
 };
 
+/// The test of a request, which it has, and what the fit says there.
+/// @param fit, notes  as collect_report
+ReportData compare(const FitFile& fit, const Posterior& posterior, const ReportRequest& request, std::vector<std::string>& notes);
+
 /// Predicts, evaluates and collects.
 /// @param fit    with the data of the posterior (FitFile::take_data)
 /// @param notes  receives what a person should know
