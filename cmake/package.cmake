@@ -4,7 +4,9 @@
 #   gp2           the command, its man pages and completions, models, documentation
 #   python3-gp2   the Python package
 set(CPACK_GENERATOR DEB)
-set(CPACK_PACKAGE_CONTACT "the authors of gp2 <gp2@localhost>")
+set(GP2_PACKAGE_CONTACT "the authors of gp2 <gp2@localhost>" CACHE STRING "Who answers for Debian packages: NAME <MAIL>")
+set(CPACK_PACKAGE_CONTACT ${GP2_PACKAGE_CONTACT})
+set(CPACK_PRE_BUILD_SCRIPTS ${CMAKE_CURRENT_LIST_DIR}/debian_files.cmake)
 set(CPACK_PACKAGING_INSTALL_PREFIX /usr)
 set(CPACK_STRIP_FILES ON)
 set(CPACK_PACKAGE_DIRECTORY ${PROJECT_BINARY_DIR}/packages)

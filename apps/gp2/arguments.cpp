@@ -165,11 +165,21 @@ std::pair<std::string, std::string> split_at_system(const std::string& text) {
   return {text.substr(0, last), text.substr(last + 1)};
 }
 
-Option argument(const std::string& flag, std::string& value, const std::string& text) {
-  Option option{"", &value, "", text};
+namespace {
+
+Option positional(const std::string& flag, const OptionValue& value, const std::string& text) {
+  Option option{"", value, "", text};
   for (const char c : flag) option.name += static_cast<char>(std::tolower(static_cast<unsigned char>(c)));
   option.flag = flag;
   return required(std::move(option));
+}
+
+}  // namespace
+
+Option argument(const std::string& flag, std::string& value, const std::string& text) { return positional(flag, &value, text); }
+
+Option arguments(const std::string& flag, std::vector<std::string>& values, const std::string& text) {
+  return positional(flag, Repeated{&values}, text);
 }
 
 Option output(std::string& value, const std::string& sample, const std::string& text) {

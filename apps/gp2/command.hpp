@@ -37,6 +37,7 @@ Command evaluate_command();
 Command update_command();
 Command export_command();
 Command report_command();
+Command plot_command();
 Command reproduce_command();
 Command completion_command();
 Command help_command(const std::vector<std::string>& names);
@@ -46,6 +47,8 @@ std::vector<Command> all_commands();
 
 /// An argument by its position, which must be given: MODEL.
 Option argument(const std::string& flag, std::string& value, const std::string& text);
+/// Arguments that stand one behind the other, one at least: FIT.json OTHER.json.
+Option arguments(const std::string& flag, std::vector<std::string>& values, const std::string& text);
 /// -o, --output, which must be given.
 /// @param sample  CSV, say
 Option output(std::string& value, const std::string& sample, const std::string& text);

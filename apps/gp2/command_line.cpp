@@ -173,7 +173,9 @@ class Parsing {
               return app_.add_option(flag, *value, help)->check(not_negative())->capture_default_str();
             },
             [&](std::optional<std::uint64_t>* value) { return app_.add_option(flag, *value, help)->check(not_negative()); },
-            [&](const Repeated& one) { return app_.add_option(flag, *one.values, help)->allow_extra_args(false); },
+            [&](const Repeated& one) {
+              return app_.add_option(flag, *one.values, help)->allow_extra_args(!flag.starts_with('-'));
+            },
             [&](const Choice& one) { return add_words(option, one.words, one.get()); },
             [&](const Switch& one) {
               return add_words(option, {one.on, one.off}, *one.value ? one.on : one.off);

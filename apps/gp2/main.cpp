@@ -94,7 +94,7 @@ std::vector<Command> all_commands() {
   std::vector<std::string> names;
   for (const auto command : {show_command, check_command, generate_command, derive_command, resample_command, fit_command,
                              predict_command, simulate_command, excite_command, evaluate_command, update_command, shoot_command,
-                             report_command, export_command, reproduce_command, completion_command}) {
+                             report_command, plot_command, export_command, reproduce_command, completion_command}) {
     commands.push_back(command());
     names.push_back(commands.back().name);
   }

@@ -66,7 +66,8 @@ std::string usage_of(const Command& command) {
   bool has_options = false;
   for (const Option& option : command.options) {
     if (is_positional(option)) {
-      positional += option.is_required ? " " + flag_of(option) : " [" + flag_of(option) + "]";
+      const std::string name = flag_of(option) + (std::holds_alternative<Repeated>(option.value) ? "…" : "");
+      positional += option.is_required ? " " + name : " [" + name + "]";
     } else if (option.is_required) {
       required += fmt::format(" {} {}", spellings_of(option)[0], value_of(option));
     } else {

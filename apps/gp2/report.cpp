@@ -1,11 +1,11 @@
 #include <memory>
 
 #include <fmt/format.h>
+#include <fmt/ranges.h>
 
 #include "command.hpp"
 #include "gp2/base/file.hpp"
-#include "gp2/error.hpp"
-#include "report/report_page.hpp"
+#include "gp2/report/report_page.hpp"
 
 namespace gp2::command {
 
@@ -18,17 +18,18 @@ struct ReportArguments {
 
 void run(const ReportArguments& arguments) {
   const ReportOptions& options = arguments.options;
-  require_output(arguments.output, {options.fit, options.data, options.system, options.truth});
-  if (!options.columns.empty() && options.data.empty()) {
-    throw InputError("--map names columns of --data, which is not given; the fit has its own data");
-  }
+  std::vector<std::string> inputs = options.fits;
+  inputs.insert(inputs.end(), {options.data, options.system, options.truth});
+  require_output(arguments.output, inputs);
   std::vector<std::string> notes;
-  const Report report = collect_report(options, notes);
+  const std::vector<Report> reports = collect_reports(options, notes);
   print_notes(notes);
-  const std::string page = report_page(report);
+  const std::string page = report_page(reports, with_flags);
   write_file(arguments.output, page);
-  print_notes({fmt::format("{}: report of '{}', {:.0f} kB; open it in a browser", arguments.output,
-                           report.fit.model.system->name(), static_cast<double>(page.size()) / 1e3)});
+  std::vector<std::string> names;
+  for (const Report& report : reports) names.push_back(report.fit.model.system->name());
+  print_notes({fmt::format("{}: report of '{}', {:.0f} kB; open it in a browser", arguments.output, fmt::join(names, "' and '"),
+                           static_cast<double>(page.size()) / 1e3)});
 }
 
 }  // namespace
@@ -42,7 +43,7 @@ Command report_command() {
       "gp2 report fit.json --data test.csv -o report.html",
       {},
       {}};
-  command.options = {argument("FIT.json", a->options.fit, "file written by gp2 fit")};
+  command.options = {arguments("FIT.json", a->options.fits, "file written by gp2 fit; several stand side by side on the page")};
   for (Option& option : options(a->options)) command.options.push_back(std::move(option));
   command.options.push_back(output(a->output, "HTML", "HTML file to write; it needs no network"));
   command.run = [a](const std::set<std::string>&) { run(*a); };

@@ -160,7 +160,7 @@ struct Fit {
 std::vector<ModelValues> values_of(const Prior& prior, const std::vector<Observations>& observations, const FitReport& report);
 
 /// The posterior under the fitted hyperparameters, or the mixture over their draws.
-/// @throws InputError, NumericalError  as Posterior and model_values.
+/// @throws InputError and NumericalError, as Posterior and model_values.
 /// @param observations  where the report has a summary those that the posterior has kept
 Posterior posterior_of(const Prior& prior, const std::vector<Observations>& observations, const FitReport& report,
                        const Workers& workers = {});
@@ -175,7 +175,7 @@ inline constexpr int draw_evaluations = 3600;
 /// Same seed, same bits, for any number of threads. With n_draws hyperparameters are drawn about the optima then, at the cost of
 /// at most `draw_evaluations` more gradients, and the posterior is the mixture.
 ///
-/// @throws InputError, NumericalError  as Likelihood, Posterior and require_hyperparameters; InputError when nothing is measured,
+/// @throws InputError and NumericalError, as Likelihood, Posterior and require_hyperparameters; InputError when nothing is measured,
 /// a start lies outside its bounds, or an option has no meaning; NumericalError when no restart reached a finite likelihood, or
 /// `stop` was set before one did.
 Fit fit(const Prior& prior, const std::vector<Observations>& observations, const std::vector<Hyperparameter>& hyperparameters,

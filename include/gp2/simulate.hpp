@@ -161,7 +161,7 @@ class UnfinishedMotion : public NumericalError {
 /// @param start       [q; dq; …] (layout size), t and u are set from the options. Off the constraint it is projected, or taken as
 ///                    it is without `project`; the trajectory reports both.
 /// @throws InputError when sizes, times or tolerances are wrong.
-/// @throws UnfinishedMotion, with the time, when a projection does not converge, the acceleration is not finite or cannot be
+/// @throws UnfinishedMotion with the time, when a projection does not converge, the acceleration is not finite or cannot be
 ///   computed, the step size underflows, or max_steps is reached.
 Trajectory simulate(const System& system, const Eigen::VectorXd& parameters, const Acceleration& acceleration,
                     const Eigen::Ref<const Eigen::VectorXd>& start, const SimulateOptions& options);
@@ -169,7 +169,7 @@ Trajectory simulate(const System& system, const Eigen::VectorXd& parameters, con
 /// Moves a state onto the position and velocity constraints, by the least distance in the metric of M, without changing the
 /// coordinates and velocities that are held.
 /// @param held  entries of the state that stay as they are (layout size); none when empty
-/// @throws NumericalError, naming the time and the residual, when Newton's method does not reach the constraints.
+/// @throws NumericalError naming the time and the residual, when Newton's method does not reach the constraints.
 Eigen::VectorXd project_onto_constraints(const System& system, const Eigen::VectorXd& parameters,
                                          const Eigen::Ref<const Eigen::VectorXd>& state, const std::vector<bool>& held = {});
 

@@ -74,7 +74,7 @@ struct View {
   /// The same rows of the same quantity, under the same OtherSystem object.
   bool operator==(const View&) const = default;
   /// ddq1 … (constrained), abar_q1 … (unconstrained), fc_q1 … (constraint force), lambda1 … (multipliers), dq1_next … (next
-  /// velocity), force_q1 … (learned force), with @LATENT behind where one latent is viewed alone.
+  /// velocity), force_q1 … (learned force), with `@LATENT` behind where one latent is viewed alone.
   /// @param latent_name  of that latent
   [[nodiscard]] std::vector<std::string> names(const System& system, const std::string& latent_name = "") const;
 };

@@ -9,6 +9,7 @@ Every prediction obeys the constraint A(q, dq, t) ddq = b(q, dq, t) to rounding 
 """
 
 from gp2 import _objects as _objects
+from gp2 import _plots as _plots
 from gp2._gp2 import (
     FAR_FROM_DATA,
     Calibration,
@@ -42,7 +43,9 @@ from gp2._gp2 import (
     fit_again,
     fit_raw,
     load,
+    plot,
     read_csv,
+    report,
     resample,
     show,
     simulate,
@@ -81,7 +84,9 @@ __all__ = [
     "fit_again",
     "fit_raw",
     "load",
+    "plot",
     "read_csv",
+    "report",
     "resample",
     "show",
     "simulate",

@@ -284,6 +284,7 @@ class Motion:
     @property
     def table(self) -> Table: ...
     def to_frame(self) -> Any: ...
+    def plot(self, *, ax: Any = None) -> Any: ...
     @property
     def steps(self) -> int: ...
     @property
@@ -407,6 +408,15 @@ class Posterior:
         columns: Mapping[str, str] | None = None,
         threads: int = 0,
     ) -> Evaluation: ...
+    def plot_learned(
+        self, what: str | None = None, *, along: str | None = None, force: str | None = None, ax: Any = None
+    ) -> Any: ...
+    def plot_predictions(
+        self, data: _Table, system: System | None = None, columns: Mapping[str, str] | None = None, *, ax: Any = None
+    ) -> Any: ...
+    def plot_calibration(
+        self, data: _Table, system: System | None = None, columns: Mapping[str, str] | None = None, *, ax: Any = None
+    ) -> Any: ...
     def shoot(
         self,
         data: _Table,
@@ -659,6 +669,25 @@ def show(
     latex: bool = False,
     full: bool = False,
     json: bool = False,
+    # end of options
+) -> str: ...
+def report(
+    fit: Posterior | _Path | Sequence[Posterior | _Path] | Mapping[str, Posterior | _Path],
+    path: _Path | None = None,
+    *,
+    data: _Table | None = None,
+    system: System | _Path | None = None,
+    truth: System | _Path | None = None,
+    columns: Mapping[str, str] | None = None,
+) -> str: ...
+def plot(
+    fit: Posterior | _Path,
+    path: _Path | None = None,
+    *,
+    # options of plot: written by scripts/options
+    what: str | None = None,
+    along: str | None = None,
+    force: str | None = None,
     # end of options
 ) -> str: ...
 def simulate(

@@ -29,6 +29,7 @@ void add_system(py::module_& module);
 void add_posterior(py::module_& module);
 void add_fit(py::module_& module);
 void add_predictor(py::module_& module);
+void add_report(py::module_& module);
 
 /// gp2.System: a model file.
 struct PySystem {

@@ -14,6 +14,7 @@
 #include "gp2/jobs/resample.hpp"
 #include "gp2/jobs/show_job.hpp"
 #include "gp2/jobs/simulate_job.hpp"
+#include "gp2/report/plot.hpp"
 #include "options.hpp"
 
 namespace gp2::python {
@@ -294,11 +295,13 @@ void add_fit(py::module_& module) {
         ShowRequest show;
         ExciteRequest excite;
         ExportRequest exported;
+        PlotRequest plot;
         const std::map<std::string, std::vector<Option>> tables = {
             {"fit", options(fit)},           {"simulate", options(simulate)},
             {"derive", options(derive)},     {"fit_raw", options(fit_of_raw, raw)},
             {"resample", options(resample)}, {"show", options(show)},
-            {"excite", options(excite)},     {"export", options(exported)}};
+            {"excite", options(excite)},     {"export", options(exported)},
+            {"plot", options(plot)}};
         return stub_lines(tables.at(job));
       },
       "job"_a);

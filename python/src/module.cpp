@@ -28,6 +28,7 @@ PYBIND11_MODULE(_gp2, module) {
   gp2::python::add_posterior(module);
   gp2::python::add_fit(module);
   gp2::python::add_predictor(module);
+  gp2::python::add_report(module);
   module.def(
       "blas_report",
       [] {

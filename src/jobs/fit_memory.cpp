@@ -13,6 +13,7 @@
 #include "gp2/error.hpp"
 #include "gp2/inference/evaluation.hpp"
 #include "inference/gram.hpp"
+#include "inference/piece_sums.hpp"
 
 namespace gp2 {
 

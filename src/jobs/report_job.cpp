@@ -15,6 +15,7 @@
 
 #include "base/not_a_number.hpp"
 #include "gp2/base/statistics.hpp"
+#include "gp2/base/version.hpp"
 #include "gp2/error.hpp"
 #include "gp2/jobs/fit_job.hpp"
 #include "gp2/jobs/fit_problem.hpp"
@@ -127,57 +128,21 @@ std::vector<ReportData> training_data(const FitFile& fit, const Posterior& poste
   return all;
 }
 
-ReportData test_data(const ReportOptions& options, const FitFile& fit, const Posterior& posterior,
-                     std::vector<std::string>& notes) {
-  const CsvTable table = CsvTable::read(options.data, CsvTable::Keep::numbers);
-  ViewRequest constrained;
-  if (!options.system.empty()) constrained.system = std::make_shared<const Model>(Model::read(options.system));
-  const PredictedView at = predicted_view(fit, posterior.prior(), constrained);
-  const System& system = *at.model->system;
-  const std::vector<int> rows =
-      acceleration_rows(system, outputs_to_compare(posterior, *at.model, table, options.columns, notes), "`data`");
-  const std::vector<std::string> outputs = View{View::Quantity::constrained_acceleration, rows}.names(system);
-  const LogStates log = read_log_states(at.prior, at.view, *at.model, table, options.columns, outputs, at.actuators);
-  notes.insert(notes.end(), log.notes.begin(), log.notes.end());
-  ReportData data = at_states_of(table.name(), [&] {
-    MatrixXd noise = measurement_noise(posterior, rows, log.states.cols(), log.stated_stddev);
-    return data_at(posterior, log.states, rows, log.accelerations, std::move(noise), at.other_system);
-  });
-  data.name = "test";
-  data.source = at.other_system ? fmt::format("{}, of '{}'", options.data, system.name()) : options.data;
-  data.is_test = true;
-  data.is_of_other_system = at.other_system != nullptr;
-  // what the fit does not read may still be drawn, and be read by the truth
-  LogReader reader = open_log(*at.model, table, options.columns);
-  const std::vector<std::string> names = system.state_names();
-  for (std::size_t k = 0; k < names.size(); ++k) {
-    if (!data.states.row(static_cast<Index>(k)).hasNaN() || !reader.has(names[k])) continue;
-    std::vector<bool> only(names.size(), false);
-    only[k] = true;
-    try {
-      data.states.row(static_cast<Index>(k)) = reader.states(only).row(static_cast<Index>(k));
-    } catch (const InputError&) {
-      // not numbers: then it is not drawn
-    }
-  }
-  return data;
-}
-
-void add_truth(const ReportOptions& options, Report& report) {
-  const Model truth = Model::read(options.truth);
+void add_truth(const ReportRequest& request, Report& report) {
+  const Model& truth = *request.truth;
   const System& home = *report.fit.model.system;
   if (truth.truth.empty()) {
     throw InputError(
-        fmt::format("`truth={}`: has no [truth]; give a model file that says what the true acceleration is", options.truth));
+        fmt::format("`truth={}`: has no [truth]; give a model file that says what the true acceleration is", truth.name));
   }
   if (truth.system->state_names() != home.state_names()) {
     throw InputError(fmt::format("`truth={}`: its state is {}, that of the fit is {}; coordinates and inputs must be the same",
-                                 options.truth, fmt::join(truth.system->state_names(), " "), fmt::join(home.state_names(), " ")));
+                                 truth.name, fmt::join(truth.system->state_names(), " "), fmt::join(home.state_names(), " ")));
   }
   const ModelMotion motion(truth);
   bool any = false;
   for (ReportData& data : report.data) {
-    if (!options.system.empty() && !data.is_test) continue;  // it is the truth of that system
+    if (request.system && !data.is_test) continue;  // it is the truth of that system
     data.truth = motion.acceleration(data.states);
     for (Index i = 0; i < data.truth.cols(); ++i) {
       if (data.truth.col(i).allFinite()) {
@@ -191,7 +156,7 @@ void add_truth(const ReportOptions& options, Report& report) {
     throw InputError(
         fmt::format("`truth={}`: not finite at any state of the data; the fit keeps only the columns its model reads, "
                     "so give a `data` with all that the truth reads",
-                    options.truth));
+                    truth.name));
   }
   report.truth_source = truth.system->name();
 }
@@ -253,7 +218,7 @@ VectorXd usual_state(const Prior& prior, const MatrixXd& states) {
 }  // namespace
 
 std::vector<LearnedForce> learned_forces(const Posterior& posterior) {
-  constexpr Index n_points = 61;
+  constexpr Index n_points = 101;
   constexpr std::size_t most = 6;        // entries of the state, of a latent
   constexpr double worth_a_look = 0.02;  // of what the entry does that does most
   const Prior& prior = posterior.prior();
@@ -282,7 +247,7 @@ std::vector<LearnedForce> learned_forces(const Posterior& posterior) {
       along.row(static_cast<Index>(k)) = at.transpose();
       try {
         const Posterior::Marginal marginal = posterior.marginal(view, along);
-        of_latent.push_back({latent.name, entries[k], names, at, marginal.mean, marginal.stddev()});
+        of_latent.push_back({latent.name, entries[k], names, at, marginal.mean, marginal.stddev(), row.transpose()});
       } catch (const InputError&) {  // where no data are a feature may have no value
       }
     }
@@ -455,21 +420,57 @@ std::vector<Option> options(ReportOptions& options) {
   };
 }
 
-Report collect_report(const ReportOptions& options, std::vector<std::string>& notes) {
+ReportData compare(const FitFile& fit, const Posterior& posterior, const ReportRequest& request,
+                   std::vector<std::string>& notes) {
+  const CsvTable& table = *request.data;
+  ViewRequest constrained;
+  constrained.system = request.system;
+  const PredictedView at = predicted_view(fit, posterior.prior(), constrained);
+  const System& system = *at.model->system;
+  const std::vector<int> rows =
+      acceleration_rows(system, outputs_to_compare(posterior, *at.model, table, request.columns, notes), "`data`");
+  const std::vector<std::string> outputs = View{View::Quantity::constrained_acceleration, rows}.names(system);
+  const LogStates log = read_log_states(at.prior, at.view, *at.model, table, request.columns, outputs, at.actuators);
+  notes.insert(notes.end(), log.notes.begin(), log.notes.end());
+  ReportData data = at_states_of(table.name(), [&] {
+    MatrixXd noise = measurement_noise(posterior, rows, log.states.cols(), log.stated_stddev);
+    return data_at(posterior, log.states, rows, log.accelerations, std::move(noise), at.other_system);
+  });
+  data.name = "test";
+  data.source = at.other_system ? fmt::format("{}, of '{}'", table.name(), system.name()) : table.name();
+  data.is_test = true;
+  data.is_of_other_system = at.other_system != nullptr;
+  // what the fit does not read may still be drawn, and be read by the truth
+  LogReader reader = open_log(*at.model, table, request.columns);
+  const std::vector<std::string> names = system.state_names();
+  for (std::size_t k = 0; k < names.size(); ++k) {
+    if (!data.states.row(static_cast<Index>(k)).hasNaN() || !reader.has(names[k])) continue;
+    std::vector<bool> only(names.size(), false);
+    only[k] = true;
+    try {
+      data.states.row(static_cast<Index>(k)) = reader.states(only).row(static_cast<Index>(k));
+    } catch (const InputError&) {
+      // not numbers: then it is not drawn
+    }
+  }
+  return data;
+}
+
+Report collect_report(FitFile fit, const Posterior& posterior, const ReportRequest& request, std::vector<std::string>& notes) {
+  if (!request.data && !request.columns.empty()) {
+    throw InputError("`map` names columns of `data`, which is not given; the fit has its own data");
+  }
+  if (!request.data && request.system) throw InputError("`system` is that of `data`, which is not given");
   Report report;
-  const std::string text = read_file(options.fit);
-  report.fit = FitFile::parse(text, options.fit);
-  report.library = nlohmann::json::parse(text).value("library", "");
-  report.file_date = date_of(options.fit);
-  const Posterior posterior = report.fit.posterior();
+  report.label = fit.model.system->name();
+  report.fit = std::move(fit);
+  report.library = version();
   report.data = training_data(report.fit, posterior);
   report.cross_validation = cross_validate(report.fit, posterior);
   report.relevance = relevance_of(posterior);
   report.learned = learned_forces(posterior);
-  if (!options.data.empty()) {
-    report.data.push_back(test_data(options, report.fit, posterior, notes));
-  }
-  if (!options.truth.empty()) add_truth(options, report);
+  if (request.data) report.data.push_back(compare(report.fit, posterior, request, notes));
+  if (request.truth) add_truth(request, report);
   if (const SymbolicSystem* system = report.fit.model.symbolic_system(); system != nullptr && !report.data.empty()) {
     MatrixXd q(system->layout().size(), 0);
     for (const ReportData& data : report.data) {
@@ -480,6 +481,38 @@ Report collect_report(const ReportOptions& options, std::vector<std::string>& no
     report.surface = constraint_surface(*system, posterior.values().parameters, q);
   }
   return report;
+}
+
+Report collect_report(const std::filesystem::path& fit, const ReportRequest& request, std::vector<std::string>& notes) {
+  const std::string text = read_file(fit);
+  FitFile file = FitFile::parse(text, fit.string());
+  const Posterior posterior = file.posterior();
+  Report report = collect_report(std::move(file), posterior, request, notes);
+  report.label = fit.string();
+  report.library = nlohmann::json::parse(text).value("library", "");
+  report.file_date = date_of(fit);
+  return report;
+}
+
+std::vector<Report> collect_reports(const ReportOptions& options, std::vector<std::string>& notes) {
+  const auto model = [](const std::string& path) {
+    return path.empty() ? nullptr : std::make_shared<const Model>(Model::read(path));
+  };
+  ReportRequest request;
+  if (!options.data.empty()) request.data = CsvTable::read(options.data, CsvTable::Keep::numbers);
+  request.truth = model(options.truth);
+  request.system = model(options.system);
+  request.columns = options.columns;
+  std::vector<Report> reports;
+  for (const std::string& fit : options.fits) {
+    std::vector<std::string> of_this;
+    reports.push_back(collect_report(std::filesystem::path(fit), request, of_this));
+    // the log is read for each fit, but what is said of it is said once
+    for (std::string& note : of_this) {
+      if (std::ranges::find(notes, note) == notes.end()) notes.push_back(std::move(note));
+    }
+  }
+  return reports;
 }
 
 }  // namespace gp2

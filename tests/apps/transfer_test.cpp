@@ -119,11 +119,11 @@ TEST_F(Transfer, ReportsOnATestOfTheOtherSystem) {
   static_cast<void>(fit("--data train.csv"));
   const nlohmann::json figures = desk.done("gp2 evaluate fit.json --data test.csv --system other.toml --json").json();
   ReportOptions options;
-  options.fit = desk / "fit.json";
+  options.fits = {desk / "fit.json"};
   options.data = desk / "test.csv";
   options.system = options.truth = desk / "other.toml";
   std::vector<std::string> notes;
-  const Report report = collect_report(options, notes);
+  const Report report = collect_reports(options, notes).front();
   ASSERT_EQ(report.data.size(), 2U);
   EXPECT_EQ(report.data[1].evaluation.nrmse, figures["nrmse"]);
   EXPECT_LT(report.data[1].constraint_error.maxCoeff(), 1e-11);

@@ -422,7 +422,7 @@ TEST(NonlinearPosterior, LearnsAPotentialBesideAFriction) {
   std::string text = rubbing_bead("lambda", "se + constant").text;
   text.replace(text.find("[sampling]"), 10,
                "[[latent]]\nname = \"spring\"\nfeatures = [\"x\"]\ndirections = \"potential\"\n[sampling]");
-  text.replace(text.find("[\"-mu*load*dx/v\""), 17, "[\"-mu*load*dx/v - 2*sin(2*x)\"");
+  text.replace(text.find("[\"-mu*load*dx/v\""), 16, "[\"-mu*load*dx/v - 2*sin(2*x)\"");
   const Fitted fitted(Model::parse(text, "bead on a spring"), 80);
   const Fit found =
       fit(fitted.prior, fitted.observations, default_hyperparameters(fitted.prior, fitted.observations, {}, {}), FitOptions());

@@ -41,11 +41,9 @@ bool is_alarm(const std::string& text) {
 // The page that gp2 report would write of a fit.
 std::vector<Advice> advice_on(const FitOutcome& fit) {
   const test::TemporaryFolder folder;
-  ReportOptions options;
-  options.fit = folder / "fit.json";
-  fit.file.write(options.fit);
+  fit.file.write(folder / "fit.json");
   std::vector<std::string> notes;
-  return learning_advice(collect_report(options, notes));
+  return learning_advice(collect_report(std::filesystem::path(folder / "fit.json"), ReportRequest(), notes));
 }
 
 // what check, fit and report say against a log: warnings, errors, refusals

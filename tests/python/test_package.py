@@ -1,5 +1,6 @@
 """What is in the package, wherever it is imported from: the build tree, an install prefix, or what pip built."""
 
+import json
 import re
 from importlib import metadata
 from pathlib import Path
@@ -23,6 +24,8 @@ def test_the_version_is_the_projects():
     project = (ROOT / "CMakeLists.txt").read_text(encoding="utf-8")
     version = re.search(r"^project\(gp2 VERSION ([\d.]+)", project, re.MULTILINE)[1]
     assert gp2.__version__ == version
+    port = json.loads((ROOT / "packaging/vcpkg/gp2/vcpkg.json").read_text(encoding="utf-8"))
+    assert port["version"] == version
     for distribution in metadata.distributions(name="gp2"):  # none, but where pip installed it
         assert distribution.version == version
         files = {path.name for path in distribution.files}

@@ -27,7 +27,7 @@ def test_mypy_is_content_with_stub_package_and_a_users_code(tmp_path):
     for file in ("_gp2.pyi", "_model_text.py", "__init__.py", "py.typed"):
         assert (PACKAGE / file).exists()
     strict = ["mypy", "--strict", "--warn-unused-ignores", f"--cache-dir={tmp_path}"]
-    mypy(*strict, "-m", "gp2", "-m", "gp2._gp2", "-m", "gp2._model_text", "-m", "gp2._objects")
+    mypy(*strict, "-m", "gp2", "-m", "gp2._gp2", "-m", "gp2._model_text", "-m", "gp2._objects", "-m", "gp2._plots")
     mypy(*strict, str(Path(__file__).with_name("typed_usage.py")))
 
 

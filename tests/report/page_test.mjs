@@ -90,7 +90,7 @@ for (const model of ["surface", "duffing", "unicycle"]) {
       const { page, close } = await open(`${model}.html`, { scheme });
       const outputs = json(`${model}.json`).observations[0].rows.length;
       const charts = await inked(page);
-      const learned = await page.evaluate(() => JSON.parse(document.getElementById("report").textContent).learned);
+      const learned = await page.evaluate(() => JSON.parse(document.getElementById("report").textContent)[0].learned);
       const shown = learned.filter((one) => one.name === learned[0].name);
       assert.equal(charts.length, 2 * outputs + 6 + shown.length, "residuals and scatter per output, calibration, PIT, constraint error, two accelerations, motion, learned forces");
       assert.deepEqual(new Set(await page.locator("#learned-force option").evaluateAll((all) => all.map((one) => one.value))), new Set(learned.map((one) => one.name)));
@@ -139,6 +139,41 @@ for (const model of ["surface", "duffing", "unicycle"]) {
     await close();
   });
 }
+
+test("two fits stand side by side, and each has the page below", async () => {
+  const file = join(models, "surface.toml");
+  gp2("fit", file, "--data", "surface.csv", "--restarts", "1", "-o", "plain.json");
+  gp2("report", "surface.json", "plain.json", "--data", "surface_test.csv", "-o", "both.html");
+  const told = ["surface", "plain"].map((name) => JSON.parse(gp2("evaluate", `${name}.json`, "--data", "surface_test.csv", "--json")));
+  for (const [scheme, width] of [["light", 1200], ["dark", 360]]) {
+    const { page, close } = await open("both.html", { scheme, width });
+    const scores = await numbers(page, "comparison-scores");
+    assert.deepEqual(scores["negative log likelihood"], ["surface", "plain"].map((name) => json(`${name}.json`).report.nll));
+    for (const [row, key] of [["nrmse", "nrmse"], ["nlpd, with noise", "nlpd"], ["95 % coverage, with noise", "coverage95"]]) {
+      scores[row].forEach((value, k) => assert.ok(Math.abs(value - told[k][key]) <= 1e-9 * Math.abs(value), row));
+    }
+    const best = await page.locator("#comparison-scores tr", { hasText: "nrmse" }).locator(".best").getAttribute("data-value");
+    assert.equal(Number(best), Math.min(...scores.nrmse));
+    assert.ok((await page.locator("#comparison-charts canvas").count()) > 0);
+    assert.equal(await page.locator("#comparison-parameters").count(), 0, "no parameter was estimated");
+    assert.equal(await page.evaluate(() => document.documentElement.scrollWidth), width);
+    // the page of the other fit, and back
+    for (const [label, name] of [["plain.json", "plain"], ["surface.json", "surface"]]) {
+      await page.getByLabel(label, { exact: true }).check();
+      await settled(page);
+      const hyperparameters = await numbers(page, "hyperparameters");
+      for (const one of json(`${name}.json`).hyperparameters) assert.deepEqual(hyperparameters[one.name], [one.value, one.lower, one.upper], one.name);
+      assert.equal(await page.locator("#tiles div").count(), 5);
+      assert.equal(await page.locator("main section").count(), await page.locator("#sections li").count());
+      const charts = (await inked(page)).filter(({ title }) => !title.startsWith("force_"));
+      for (const { title, count } of charts) assert.ok(count > 20, `${title}: ${count} pixels of ${label}`);
+      await page.emulateMedia({ colorScheme: scheme === "light" ? "dark" : "light" });
+      await settled(page);
+      await page.emulateMedia({ colorScheme: scheme });
+    }
+    await close();
+  }
+});
 
 test("the derived constraint is typeset", async () => {
   const { page, close } = await open("surface.html");

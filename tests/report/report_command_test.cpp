@@ -39,6 +39,15 @@ TEST_F(ReportCommand, IsTheSameForTheSameFiles) {
   EXPECT_EQ(desk.read("a.html"), desk.read("b.html"));
 }
 
+TEST_F(ReportCommand, PutsSeveralFitsOnOnePage) {
+  desk.done("gp2 fit models/unicycle.toml --data train.csv --mean force --max-iterations 0 -o other.json");
+  const Outcome outcome = desk.done("gp2 report fit.json other.json --data train.csv -o report.html");
+  EXPECT_THAT(outcome.err, HasSubstr("report of 'unicycle' and 'unicycle'"));
+  for (const char* label : {"\"label\":\"fit.json\"", "\"label\":\"other.json\""})
+    EXPECT_THAT(desk.read("report.html"), HasSubstr(label));
+  EXPECT_THAT(desk.run("gp2 report fit.json other.json -o other.json").err, HasSubstr("is the input"));
+}
+
 TEST_F(ReportCommand, SaysWithinWhatHyperparametersWereDrawn) {
   desk.done("gp2 generate models/duffing.toml --n 12 -o duffing.csv");
   desk.done("gp2 fit models/duffing.toml --data duffing.csv --restarts 1 --hyperparameters integrate -o drawn.json");

@@ -1,4 +1,4 @@
-#include "report/report_page.hpp"
+#include "gp2/report/report_page.hpp"
 
 #include <cmath>
 #include <limits>
@@ -8,6 +8,7 @@
 #include <nlohmann/json.hpp>
 
 #include "apps/command_line.hpp"
+#include "command.hpp"
 
 namespace gp2::command {
 namespace {
@@ -103,11 +104,12 @@ class ReportOf : public testing::Test {
     desk.done("gp2 generate models/" + model + ".toml --n 30 --seed 2 -o test.csv");
     desk.done("gp2 fit models/" + model + ".toml --data train.csv --restarts 1 " + fit + " -o fit.json");
     std::vector<std::string> notes;
-    return collect_report({(desk / "fit.json").string(),
-                           with_test ? (desk / "test.csv").string() : "",
-                           (desk / ("models/" + model + ".toml")).string(),
-                           {}},
-                          notes);
+    return collect_reports({{(desk / "fit.json").string()},
+                            with_test ? (desk / "test.csv").string() : "",
+                            (desk / ("models/" + model + ".toml")).string(),
+                            {}},
+                           notes)
+        .front();
   }
   test::Desk desk;
 };
@@ -115,7 +117,7 @@ class ReportOf : public testing::Test {
 TEST_F(ReportOf, HasTheVeryFiguresOfEvaluate) {
   const Report r = report("surface", "", "--mean force");
   ASSERT_EQ(r.data.size(), 2u);
-  const auto json = nlohmann::json::parse(report_json(r));
+  const auto json = nlohmann::json::parse(report_json({r}, with_flags))[0];
   for (const auto& [k, file] : {std::pair(0, "train.csv"), std::pair(1, "test.csv")}) {
     const auto told = desk.done(std::string("gp2 evaluate fit.json --json --data ") + file).json();
     const auto& figures = json["data"][static_cast<std::size_t>(k)]["figures"];
@@ -186,7 +188,7 @@ TEST_F(ReportOf, ShowsTheForceThatWasLearnedAlongWhatItDependsOn) {
     EXPECT_LE(effect, largest);
     largest = effect;
   }
-  const auto curves = nlohmann::json::parse(report_json(r))["learned"];
+  const auto curves = nlohmann::json::parse(report_json({r}, with_flags))[0]["learned"];
   EXPECT_EQ(curves.size(), 3 * r.learned.size());
   EXPECT_NEAR(curves[1]["mean"][60], r.learned[0].mean(1, 60), 1e-5 * std::abs(r.learned[0].mean(1, 60)));
 }
@@ -200,7 +202,7 @@ TEST_F(ReportOf, SeesThatComputedAccelerationsFollowFromEachOther) {
 TEST_F(ReportOf, ABaselineAndACoordinateThatIsNotReadHaveOneToo) {
   const Report r = report("unicycle", "", "--baseline se --max-iterations 5");
   EXPECT_GT(r.data[1].constraint_error.maxCoeff(), 1e-6) << "a baseline knows no constraint";
-  const auto json = nlohmann::json::parse(report_json(r));
+  const auto json = nlohmann::json::parse(report_json({r}, with_flags))[0];
   EXPECT_FALSE(json.contains("surface"));
   EXPECT_FALSE(json["data"][0]["columns"].contains("q1")) << "the fit does not keep it";
 }
@@ -210,10 +212,10 @@ TEST_F(ReportOf, TextOfAModelCannotLeaveTheData) {
   desk.done("gp2 generate hostile.toml --n 20 -o train.csv");
   desk.done("gp2 fit hostile.toml --data train.csv --max-iterations 0 -o fit.json");
   std::vector<std::string> notes;
-  const Report r = collect_report({(desk / "fit.json").string(), "", "", {}}, notes);
-  EXPECT_THAT(report_json(r), Not(HasSubstr("<")));
-  EXPECT_EQ(nlohmann::json::parse(report_json(r))["model"]["name"], "</script><b>{{data}}");
-  const std::string page = report_page(r);
+  const std::vector<Report> r = collect_reports({{(desk / "fit.json").string()}, "", "", {}}, notes);
+  EXPECT_THAT(report_json(r, with_flags), Not(HasSubstr("<")));
+  EXPECT_EQ(nlohmann::json::parse(report_json(r, with_flags))[0]["model"]["name"], "</script><b>{{data}}");
+  const std::string page = report_page(r, with_flags);
   EXPECT_THAT(page, HasSubstr("<h1 id=\"title\">&lt;/script&gt;&lt;b&gt;{{data}}</h1>"));
   EXPECT_THAT(page, Not(HasSubstr("<b>")));
 }

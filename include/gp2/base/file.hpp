@@ -51,7 +51,7 @@ struct FileVersion {
 /// Nothing of a pipe or device, which is read once, nor where there is no such file.
 std::optional<FileVersion> file_version(const std::filesystem::path& path);
 
-/// @throws InputError, that the file is another one than when it was read first.
+/// @throws InputError that the file is another one than when it was read first.
 [[noreturn]] void throw_changed(const std::filesystem::path& path);
 
 /// The shortest text that reads back to the same double.

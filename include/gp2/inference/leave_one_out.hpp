@@ -30,7 +30,7 @@ struct LeaveOneOut {
 ///     mean_k = Σ_i w_i mean_ki,    variance_k = Σ_i w_i (variance_ki + (mean_ki − mean_k)²),
 ///     w_i ∝ 1/p_i(y_k | others),    Σ_i w_i = 1.
 ///
-/// @throws InputError, NumericalError  as Posterior.
+/// @throws InputError and NumericalError, as Posterior.
 std::vector<LeaveOneOut> leave_one_out(const Posterior& posterior);
 
 /// Every value as predicted without itself, and without the stretch of time around it.
@@ -52,7 +52,7 @@ struct LeftOut {
 /// which Q brings to the whitened values e and S^{1/2} to the values. The variance holds what slips where constraints are soft. Of a
 /// mixture all components count alike.
 /// @param n_stretches  0: none; through inducing points none, or LeftOut::n_stretches
-/// @throws InputError, NumericalError  as Posterior.
+/// @throws InputError and NumericalError, as Posterior.
 LeftOut leave_out(const Posterior& posterior, int n_stretches);
 
 }  // namespace gp2

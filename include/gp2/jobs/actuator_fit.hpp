@@ -16,7 +16,7 @@ inline constexpr int largest_actuator_size = 400;
 /// with fast commands there may be more than one optimum. Derivatives in the hyperparameters are exact, those in delays and lags
 /// differences over a hundredth of their deviations. Standard errors are those of Laplace's approximation, the hyperparameters
 /// not known; NaN at a bound, and where the density has no peak, as of a lag near 0.
-/// @throws InputError, NumericalError  as fit()
+/// @throws InputError and NumericalError, as fit()
 std::vector<ActuatorEstimate> estimate_actuators(const FitProblem& problem, const FitOptions& options);
 
 /// What a person should know of them: at a bound, or not determined.

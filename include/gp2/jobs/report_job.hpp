@@ -1,12 +1,15 @@
 #pragma once
 
+#include <filesystem>
 #include <map>
+#include <memory>
 #include <optional>
 #include <string>
 #include <vector>
 
 #include <Eigen/Core>
 
+#include "gp2/data/csv.hpp"
 #include "gp2/export.hpp"
 #include "gp2/files/fit_file.hpp"
 #include "gp2/inference/evaluation.hpp"
@@ -34,6 +37,7 @@ struct LearnedForce {
   std::vector<std::string> names;  // force_NAME, with @LATENT behind where there are several (d)
   Eigen::VectorXd at;              // evenly over what the training data hold (n)
   Eigen::MatrixXd mean, stddev;    // (d × n)
+  Eigen::VectorXd data;            // where the training data are (N)
 };
 
 /// What each latent has learned, along the entries of the state that it reads and that change it most.
@@ -102,9 +106,10 @@ struct Advice {
 
 /// Everything on the page.
 struct Report {
+  std::string label;  // what it is called beside others: its file, or its system
   FitFile fit;
   std::string library;    // the version that fitted
-  std::string file_date;  // of the fit file, YYYY-MM-DD
+  std::string file_date;  // of the fit file, YYYY-MM-DD; empty: it is in no file
   std::vector<ReportData> data;
   CrossValidation cross_validation;  // of the training data
   std::vector<Relevance> relevance;
@@ -114,7 +119,7 @@ struct Report {
 };
 
 struct ReportOptions {
-  std::string fit;                             // FIT.json
+  std::vector<std::string> fits;               // FIT.json
   std::string data;                            // CSV of a test; empty: none
   std::string truth;                           // model file that tells the true acceleration; empty: none
   std::map<std::string, std::string> columns;  // model's name -> log's name, of `data`
@@ -124,10 +129,26 @@ struct ReportOptions {
 /// data, system, truth, map.
 std::vector<Option> options(ReportOptions& options);
 
+/// The same as what was read.
+struct ReportRequest {
+  std::optional<CsvTable> data;
+  std::shared_ptr<const Model> truth, system;
+  std::map<std::string, std::string> columns;
+};
+
+/// The test of a request, which it has, and what the fit says there.
+/// @param fit, notes  as collect_report
+ReportData compare(const FitFile& fit, const Posterior& posterior, const ReportRequest& request, std::vector<std::string>& notes);
+
 /// Predicts, evaluates and collects.
+/// @param fit    with the data of the posterior (FitFile::take_data)
 /// @param notes  receives what a person should know
-/// @throws InputError for files that cannot be read or do not fit each other.
-Report collect_report(const ReportOptions& options, std::vector<std::string>& notes);
+/// @throws InputError for data and models that do not fit the fit.
+Report collect_report(FitFile fit, const Posterior& posterior, const ReportRequest& request, std::vector<std::string>& notes);
+/// The same of a FIT.json.
+Report collect_report(const std::filesystem::path& fit, const ReportRequest& request, std::vector<std::string>& notes);
+/// The same from files, one for each fit. @throws InputError also for files that cannot be read.
+std::vector<Report> collect_reports(const ReportOptions& options, std::vector<std::string>& notes);
 
 /// What the figures say about how to go on, most pressing first.
 std::vector<Advice> learning_advice(const Report& report);

@@ -87,7 +87,7 @@ class QuantityKind {
   [[nodiscard]] virtual bool is_per_coordinate() const { return true; }
   /// What a unit of acceleration of coordinate j adds to row j, in size, where M is diagonal and rows are of coordinates.
   /// @param mass  M_jj
-  [[nodiscard]] virtual double per_acceleration(double /*mass*/, double /*time_step*/) const { return 1; }
+  [[nodiscard]] virtual double per_acceleration([[maybe_unused]] double mass, double /*time_step*/) const { return 1; }
   /// The entry of the state that is added to a row, where there is one: part of d.
   [[nodiscard]] virtual std::optional<int> added_entry(const StateLayout& layout, int row) const;
   /// @throws InputError where there is no derivative in the parameters at this state.

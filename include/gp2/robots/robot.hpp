@@ -112,7 +112,7 @@ bool can_read_robots();
 /// for nothing else. Bodies, joints and sites without a name get one: body_3, joint_2, site_1, counted as MuJoCo does (the world
 /// is body 0). Entries of axes and rotations within 1e-9 of 0 or ±1 are taken as exact (a right angle written as 1.5707963268);
 /// a note says so when that is more than rounding. Of a URDF file, links fixed to others stay bodies of their own (unless it asks
-/// MuJoCo for `fusestatic`), and a joint's <mimic> becomes a coupling. Meshes need not be there where inertias are.
+/// MuJoCo for `fusestatic`), and a joint's `mimic` becomes a coupling. Meshes need not be there where inertias are.
 ///
 /// @throws InputError when this build has no MuJoCo, with MuJoCo's own words when it refuses the file, and naming what has no
 ///   place in a RobotDescription: springs of ball and free joints, tendons held by an equality that wrap around geoms, springs, dampers,

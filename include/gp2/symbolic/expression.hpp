@@ -157,7 +157,7 @@ Expression parse_condition(std::string_view text, ExpressionGraph& graph,
 enum class Notation : std::uint8_t { text, latex, c, mathml };
 
 /// e written out with no more parentheses than needed; `text` reads back to the same expression. In LaTeX q1 → q_{1}, dq1 →
-/// \dot{q}_{1}, ddq1 → \ddot{q}_{1}, greek names → symbols, and so in MathML, where the elements of one <mrow> are given.
+/// the same with a dot, ddq1 → with two, greek names → symbols, and so in MathML, where the elements of one `mrow` are given.
 /// multiply_or_zero prints as a product, in C with its guard.
 ///
 /// @throws InputError when the text would exceed 16 777 216 characters.

@@ -13,7 +13,7 @@ namespace gp2 GP2_API {
 ///
 /// @param hyperparameters  fitted, as a FitReport has them
 /// @param n_threads        0: as many as the machine has; results do not depend on it
-/// @throws InputError, NumericalError  as Likelihood; NumericalError when the likelihood is not finite about the fit
+/// @throws InputError and NumericalError, as Likelihood; NumericalError when the likelihood is not finite about the fit
 LaplaceUncertainty laplace_uncertainty(const Prior& prior, const std::vector<Observations>& observations,
                                        const std::vector<Hyperparameter>& hyperparameters, int n_threads = 0);
 

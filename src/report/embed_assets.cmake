@@ -1,5 +1,5 @@
 # Writes text files into a C++ source as raw string literals:  cmake -DOUTPUT=… "-DASSETS=NAME=FILE;NAME=FILE" -P embed_assets.cmake
-set(source "#include \"report/assets.hpp\"\n\nnamespace gp2::command::assets {\n\n")
+set(source "#include \"report/assets.hpp\"\n\nnamespace gp2::assets {\n\n")
 foreach(asset IN LISTS ASSETS)
   string(REGEX MATCH "^([^=]+)=(.+)$" matched "${asset}")
   set(name ${CMAKE_MATCH_1})
@@ -15,5 +15,5 @@ foreach(asset IN LISTS ASSETS)
   endif()
   string(APPEND source "const std::string_view ${name} = R\"__asset(${content})__asset\";\n\n")
 endforeach()
-string(APPEND source "}  // namespace gp2::command::assets\n")
+string(APPEND source "}  // namespace gp2::assets\n")
 file(WRITE ${OUTPUT} "${source}")

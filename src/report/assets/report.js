@@ -1,7 +1,8 @@
 "use strict";
 // Fills the page from the JSON in #report. Text enters through textContent only, formulas as parsed XML.
 (() => {
-  const report = JSON.parse(document.getElementById("report").textContent);
+  const reports = JSON.parse(document.getElementById("report").textContent);
+  let report = reports[0];  // that is shown
   const byId = (id) => document.getElementById(id);
 
   /** An element with attributes (class, text, …) and children; what is null is left out. */
@@ -86,12 +87,12 @@
 
   // ---- what was fitted ----------------------------------------------------------------------------------------------------
 
-  const { fit, model } = report;
-  const test = report.data.find((data) => data.test);
+  let { fit, model } = report;
+  let test = report.data.find((data) => data.test);
 
   function fillHeader() {
     const rows = report.observations.reduce((sum, group) => sum + group.n, 0);
-    byId("lead").textContent = `Fitted to ${rows} rows of ${report.source} by gp2 ${report.library}; file of ${report.date}.`;
+    byId("lead").textContent = `Fitted to ${rows} rows of ${report.source} by gp2 ${report.library}${report.date ? `; file of ${report.date}` : ""}.`;
     const tiles = [["Optimiser", fit.converged ? "converged" : fit.iterations === 0 ? "did not run" : "not converged", `${fit.iterations} iterations, best of ${fit.restarts.length} restarts`],
       ["Negative log likelihood", format(fit.nll), `of ${rows} rows`]];
     const shown = test || report.data[0];
@@ -168,7 +169,7 @@
 
   function fillFigures() {
     if (!report.data.length) {
-      byId("figures").append(make("p", { class: "muted", text: "The fit learned from no acceleration; give --data to compare with one." }));
+      byId("figures").append(make("p", { class: "muted", text: "The fit learned from no acceleration, and no test data were given." }));
       return;
     }
     const outputs = [...new Set(report.data.flatMap((data) => data.outputs))];
@@ -207,6 +208,8 @@
   // ---- charts -------------------------------------------------------------------------------------------------------------
 
   const live = new Map();  // host -> what to do to take its chart away
+  let redrawn = [];  // what draws the charts of the fit that is shown
+  const lasting = [];  // what draws the charts of all fits
   const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
   const font = '12px system-ui, -apple-system, "Segoe UI", Roboto, "Noto Sans", "DejaVu Sans", sans-serif';
 
@@ -225,7 +228,7 @@
   function frame(host, spec) {
     const legend = spec.series.length > 1 || spec.band ? make("ul", { class: "legend" }, ...spec.series.flatMap((series) => {
       const items = [make("li", {}, make("span", { class: `swatch ${series.kind === "line" ? "line" : series.hollow ? "hollow" : ""}`, style: `background:${colour(series.colour)};border-color:${colour(series.colour)}` }), series.label)];
-      if (series.low) items.push(make("li", {}, make("span", { class: "swatch band", style: `background:${colour("--band")}` }), "±2 std"));
+      if (series.low) items.push(make("li", {}, make("span", { class: "swatch band", style: `background:${colour(series.band || "--band")}` }), "±2 std"));
       return items;
     })) : null;
     const plot = make("div", { class: "plot", role: "img", "aria-label": `${spec.title}. ${spec.summary}` });
@@ -237,7 +240,7 @@
   /**
    * A chart by uPlot. spec: {title, summary, x: {label, values}, y: {label, log, zero}, square, diagonal, height, trace,
    * series: [{label, values, colour, kind: "points" | "line", hollow, steps, low, high}]}; low and high are a band or error bars.
-   * trace: a line from point to point in the order of the data.
+   * trace: a line from point to point in the order of the data; marks: values of x that are marked at the foot.
    */
   function chart(host, spec) {
     clear(host);
@@ -253,15 +256,15 @@
       const ink = colour(one.colour);
       const size = (order.length > 400 ? 0.7 : 1) * (one.size || 5);
       if (one.low) {
-        const hidden = { points: { show: false }, stroke: "transparent", width: 0 };
+        const hidden = { points: { show: false }, stroke: "transparent", width: 0, spanGaps: true, pxAlign: 0 };
         if (one.kind !== "line") hidden.paths = () => null;
         series.push({ ...hidden, label: "" }, { ...hidden, label: "" });
         data.push(pick(one.high), pick(one.low));
-        if (one.kind === "line") bands.push({ series: [series.length - 2, series.length - 1], fill: colour("--band") });
+        if (one.kind === "line") bands.push({ series: [series.length - 2, series.length - 1], fill: colour(one.band || "--band") });
         else bars.push({ high: series.length - 2, low: series.length - 1, ink });
       }
       series.push(one.kind === "line"
-        ? { label: one.label, stroke: ink, width: 1.75, dash: one.dash, points: { show: false }, ...(one.steps ? { paths: uPlot.paths.stepped({ align: 1 }) } : {}) }
+        ? { label: one.label, stroke: ink, width: 1.75, dash: one.dash, spanGaps: one.spanned, pxAlign: 0, points: { show: false }, ...(one.steps ? { paths: uPlot.paths.stepped({ align: 1 }) } : {}) }
         : { label: one.label, stroke: ink, paths: () => null, points: { show: true, space: 0, size, width: one.hollow ? 1.4 : 0, stroke: ink, fill: one.hollow ? "transparent" : ink } });
       data.push(pick(one.values));
     }
@@ -287,6 +290,18 @@
         ctx.globalAlpha = 0.5;
         ctx.beginPath();
         spec.x.values.forEach((x, i) => ctx.lineTo(u.valToPos(x, "x", true), u.valToPos(spec.series[0].values[i], "y", true)));
+        ctx.stroke();
+      }
+      if (spec.marks) {
+        ctx.strokeStyle = colour("--muted");
+        ctx.globalAlpha = 0.6;
+        ctx.beginPath();
+        const foot = u.bbox.top + u.bbox.height;
+        for (const x of spec.marks) {
+          const at = u.valToPos(x, "x", true);
+          ctx.moveTo(at, foot - 7 * ratio());
+          ctx.lineTo(at, foot);
+        }
         ctx.stroke();
       }
       for (const { high, low, ink } of bars) {
@@ -380,11 +395,11 @@
   function drawLearned() {
     const shown = report.learned.filter((one) => one.name === byId("learned-force").value).sort((a, b) => reach(b) - reach(a));
     const range = shown.flatMap((one) => [...band(one.mean, one.stddev, -1), ...band(one.mean, one.stddev, 1)]);
-    const y = { label: shown[0].name, range: padded(Math.min(...range), Math.max(...range), 0.08) };
+    const y = { label: shown[0].name.split("@")[0], range: padded(Math.min(...range), Math.max(...range), 0.08) };
     const host = keep(byId("learned-charts"), shown.length);
     shown.forEach((one, k) => chart(host.children[k], {
       title: `${one.name} along ${one.along}`, summary: `From ${format(Math.min(...one.mean), 3)} to ${format(Math.max(...one.mean), 3)}, band of ±${format(2 * rms(one.stddev), 3)} on average.`,
-      x: { label: one.along, values: one.at }, y, band: true,
+      x: { label: one.along, values: one.at }, y, band: true, marks: one.data,
       series: [{ label: "learned", values: one.mean, colour: "--c1", kind: "line", low: band(one.mean, one.stddev, -1), high: band(one.mean, one.stddev, 1) }],
     }));
   }
@@ -397,7 +412,7 @@
     options(byId("learned-force"), [...names].map((name) => [name, name]));
     byId("learned-force").addEventListener("change", drawLearned);
     drawLearned();
-    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", drawLearned);
+    redrawn.push(drawLearned);
   }
 
   function drawResiduals() {
@@ -691,6 +706,125 @@
     host.append(built);
   }
 
+  // ---- several fits side by side ------------------------------------------------------------------------------------------
+
+  /** The data on which fits are compared: the test, else what they were trained on. */
+  const judged = (one) => one.data.find((data) => data.test) || one.data[0];
+
+  /** The label of a fit, short where its folder is that of all. */
+  function labels() {
+    const names = reports.map((one) => one.label.replace(/^.*\//, ""));
+    return reports.map((one, k) => {
+      const name = new Set(names).size === names.length ? names[k] : one.label;
+      const before = reports.slice(0, k).filter((other) => other.label === one.label).length;
+      return before ? `${name} (${before + 1})` : name;
+    });
+  }
+
+  function compareScores(names) {
+    const all = (get) => reports.map((one) => get(one));
+    const figure = (get) => all((one) => { const data = judged(one); return data ? get(data.figures) : null; });
+    const outputs = [...new Set(reports.flatMap((one) => (judged(one) ? judged(one).outputs : [])))];
+    const rmse = (output) => figure((e) => { const k = e.outputs.indexOf(output); return k < 0 ? null : e.rmse[k]; });
+    const low = (values) => values.map((value) => value);
+    const rows = [
+      ["rows learned from", all((one) => one.observations.reduce((sum, group) => sum + group.n, 0))],
+      ["optimiser", all((one) => (one.fit.converged ? "converged" : one.fit.iterations === 0 ? "did not run" : "not converged"))],
+      ["negative log likelihood", all((one) => one.fit.nll)],
+      ...outputs.map((output) => [`rmse ${output}`, rmse(output), low]),
+      ["nrmse", figure((e) => e.nrmse), low],
+      ["nlpd, with noise", figure((e) => e.nlpd), low],
+      ["95 % coverage, with noise", figure((e) => e.coverage95), (values) => values.map((value) => Math.abs(value - 0.95))],
+      ["nlpd, without noise", figure((e) => e.nlpd_latent), low],
+      ["95 % coverage, without noise", figure((e) => e.coverage95_latent), (values) => values.map((value) => Math.abs(value - 0.95))],
+      ["points far from the data", figure((e) => e.n_far)],
+      ["max |A q̈ − b|, fitted", figure((e) => e.max_constraint_error_fitted)],
+    ];
+    const built = table("Scores of the fits", [{ label: "" }, ...names.map((label) => ({ label, number: true }))], rows.map(([label, values]) => [label, ...values]));
+    // the best of a row, where one is better than the others
+    rows.forEach(([, values, cost], r) => {
+      if (!cost || values.some((value) => value === null)) return;
+      const costs = cost(values), least = Math.min(...costs);
+      if (costs.filter((one) => one === least).length > 1) return;
+      built.querySelectorAll("tbody tr")[r].children[1 + costs.indexOf(least)].classList.add("best");
+    });
+    byId("comparison-scores").append(built);
+    const data = [...new Set(reports.map((one) => { const used = judged(one); return used ? `${used.name}: ${used.source}` : "none"; }))];
+    byId("comparison-scores").append(make("p", { class: "muted", text: `Compared on – ${data.join("; ")}. The better of a row is green and bold. Likelihoods compare where the rows learned from are the same.` }));
+  }
+
+  function compareParameters(names) {
+    const estimated = [...new Set(reports.flatMap((one) => one.parameters.filter((row) => row.fitted !== undefined).map((row) => row.name)))];
+    const host = byId("comparison-parameters");
+    if (!estimated.length) return host.previousElementSibling.remove(), host.remove();
+    const columns = [{ label: "parameter" }, ...names.flatMap((name) => [{ label: name, number: true }, { label: "standard error", number: true }])];
+    host.append(table("Estimated parameters of the fits", columns, estimated.map((name) => [name, ...reports.flatMap((one) => {
+      const row = one.parameters.find((candidate) => candidate.name === name);
+      if (!row) return [null, null];
+      return row.fitted === undefined ? [row.model, "held"] : [row.fitted, row.stddev];
+    })])));
+  }
+
+  const palette = [["--c1", "--band"], ["--c2", "--band2"], ["--c3", "--band3"], ["--c4", "--band4"]];
+
+  function drawComparison(names) {
+    const chosen = byId("comparison-force").value;
+    const curves = reports.map((one) => one.learned.filter((curve) => curve.name === chosen));
+    const span = (along) => Math.max(...curves.flat().filter((curve) => curve.along === along).map(reach));
+    const alongs = [...new Set(curves.flat().map((curve) => curve.along))].sort((a, b) => span(b) - span(a));
+    const range = curves.flat().flatMap((one) => [...band(one.mean, one.stddev, -1), ...band(one.mean, one.stddev, 1)]);
+    const y = { label: chosen.split("@")[0], range: padded(Math.min(...range), Math.max(...range), 0.08) };
+    const host = keep(byId("comparison-charts"), alongs.length);
+    alongs.forEach((along, k) => {
+      const shown = curves.map((of) => of.find((curve) => curve.along === along));
+      // each fit has values of its own along the axis
+      const x = [...new Set(shown.flatMap((curve) => (curve ? curve.at : [])))].sort((a, b) => a - b);
+      const series = shown.flatMap((curve, i) => {
+        if (!curve) return [];
+        const placed = (values) => { const at = new Map(curve.at.map((value, p) => [value, values[p]])); return x.map((value) => at.get(value) ?? null); };
+        const [ink, fill] = palette[i % palette.length];
+        return [{ label: names[i], values: placed(curve.mean), colour: ink, band: fill, kind: "line", spanned: true, low: placed(band(curve.mean, curve.stddev, -1)), high: placed(band(curve.mean, curve.stddev, 1)) }];
+      });
+      chart(host.children[k], { title: `${chosen} along ${along}`, summary: `Learned by ${series.map((one) => one.label).join(" and ")}.`, x: { label: along, values: x }, y, series, band: true });
+    });
+  }
+
+  /** The page of another fit, below the comparison. */
+  function show(next) {
+    for (const host of [...live.keys()].filter((one) => !byId("comparison").contains(one))) clear(host);
+    redrawn = [];
+    for (const id of ["tiles", "sections"]) byId(id).replaceChildren();
+    for (const part of [...byId("content").children].filter((one) => one.id !== "comparison")) part.remove();
+    byId("content").append(...blank.map((part) => part.cloneNode(true)));
+    report = next;
+    ({ fit, model } = report);
+    test = report.data.find((one) => one.test);
+    data = test || report.data[0];
+    byId("title").textContent = model.name;
+    start();
+  }
+  const blank = [...byId("content").children].filter((one) => one.id !== "comparison").map((part) => part.cloneNode(true));
+
+  function fillComparison() {
+    const names = labels();
+    compareScores(names);
+    compareParameters(names);
+    const forces = [...new Set(reports.flatMap((one) => one.learned.map((curve) => curve.name)))];
+    if (forces.length) {
+      options(byId("comparison-force"), forces.map((name) => [name, name]));
+      const draw = () => drawComparison(names);
+      byId("comparison-force").addEventListener("change", draw);
+      lasting.push(draw);
+      draw();
+    } else byId("comparison-learned").remove();
+    reports.forEach((one, k) => {
+      const input = make("input", { type: "radio", name: "fit", value: String(k), id: `fit-${k}` });
+      input.checked = k === 0;
+      input.addEventListener("change", () => show(one));
+      byId("fit-choice").append(make("label", { for: `fit-${k}` }, input, names[k]));
+    });
+  }
+
   // ---- controls -----------------------------------------------------------------------------------------------------------
 
   function drawAll() {
@@ -720,7 +854,7 @@
   function start() {
     if (!data) {
       for (const part of document.querySelectorAll("#data-choice, #pictures section:not(#relevance)")) part.remove();
-      byId("pictures").append(make("p", { class: "muted", text: "No pictures: the fit learned from no acceleration, and no --data was given." }));
+      byId("pictures").append(make("p", { class: "muted", text: "No pictures: the fit learned from no acceleration, and no test data were given." }));
     }
     if (!report.learned.length) byId("learned").remove();
     fillHeader();
@@ -743,8 +877,11 @@
       byId(id).addEventListener("change", draw);
     }
     drawAll();
-    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", drawAll);
+    redrawn.push(drawAll);
   }
 
+  if (reports.length > 1) fillComparison();
+  else byId("comparison").remove();
   start();
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { for (const draw of [...lasting, ...redrawn]) draw(); });
 })();

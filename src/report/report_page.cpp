@@ -1,3 +1,5 @@
+#include "gp2/report/report_page.hpp"
+
 #include <algorithm>
 #include <cmath>
 #include <cstdlib>
@@ -7,7 +9,6 @@
 #include <fmt/ranges.h>
 #include <nlohmann/json.hpp>
 
-#include "command.hpp"
 #include "gp2/base/statistics.hpp"
 #include "gp2/base/version.hpp"
 #include "gp2/data/csv.hpp"
@@ -15,9 +16,9 @@
 #include "gp2/jobs/show_job.hpp"
 #include "gp2/training/laplace.hpp"
 #include "report/assets.hpp"
-#include "report/report_page.hpp"
+#include "report/markup.hpp"
 
-namespace gp2::command {
+namespace gp2 {
 
 using Eigen::Index;
 using Eigen::MatrixXd;
@@ -29,6 +30,8 @@ using Json = nlohmann::ordered_json;
 
 // more points than these are not drawn: an even selection is
 constexpr Index max_drawn = 2000;
+// of marks along an axis
+constexpr Index max_ticks = 200;
 
 Json number(double value) { return std::isfinite(value) ? Json(value) : Json(); }
 
@@ -309,7 +312,8 @@ Json learned_json(const std::vector<LearnedForce>& all) {
                         {"along", one.along},
                         {"at", row_json(one.at)},
                         {"mean", row_json(one.mean.row(k))},
-                        {"stddev", row_json(one.stddev.row(k))}});
+                        {"stddev", row_json(one.stddev.row(k))},
+                        {"data", row_json(one.data, (one.data.size() + max_ticks - 1) / max_ticks)}});
     }
   }
   return curves;
@@ -326,33 +330,18 @@ Json surface_json(const ConstraintSurface& surface) {
           {"sheets", sheets}};
 }
 
-Json advice_json(const std::vector<Advice>& all) {
+Json advice_json(const std::vector<Advice>& all, const Spelling& spelled) {
   Json rows = Json::array();
   for (const Advice& one : all) {
     const char* level = one.level == Advice::Level::warning ? "warning" : one.level == Advice::Level::note ? "note" : "good";
-    rows.push_back({{"level", level}, {"text", with_flags(one.text)}, {"mend", with_flags(one.mend)}});
+    rows.push_back({{"level", level}, {"text", spelled(one.text)}, {"mend", spelled(one.mend)}});
   }
   return rows;
 }
 
-void replace_all(std::string& text, std::string_view from, std::string_view to) {
-  for (std::size_t at = text.find(from); at != std::string::npos; at = text.find(from, at + to.size())) {
-    text.replace(at, from.size(), to);
-  }
-}
-
-// text between tags
-std::string html_text(std::string text) {
-  replace_all(text, "&", "&amp;");
-  replace_all(text, "<", "&lt;");
-  replace_all(text, ">", "&gt;");
-  return text;
-}
-
-}  // namespace
-
-std::string report_json(const Report& report) {
+Json page_json(const Report& report, const Spelling& spelled) {
   Json json = {{"version", version()},
+               {"label", report.label},
                {"library", report.library},
                {"date", report.file_date},
                {"source", report.fit.data_source},
@@ -364,27 +353,35 @@ std::string report_json(const Report& report) {
                {"hyperparameters", hyperparameters_json(report.fit.report)},
                {"fit", fit_json(report.fit.report)},
                {"left_out", report.data.empty() ? "" : report.cross_validation.text()},
-               {"advice", advice_json(learning_advice(report))},
+               {"advice", advice_json(learning_advice(report), spelled)},
                {"relevance", relevance_json(report.relevance)},
                {"learned", learned_json(report.learned)},
                {"data", Json::array()}};
   for (const ReportData& data : report.data) json["data"].push_back(data_json(report, data));
   if (report.surface) json["surface"] = surface_json(*report.surface);
+  return json;
+}
+
+}  // namespace
+
+std::string report_json(const std::vector<Report>& reports, const Spelling& spelled) {
+  Json json = Json::array();
+  for (const Report& report : reports) json.push_back(page_json(report, spelled));
   std::string text = json.dump(-1, ' ', /*ensure_ascii=*/true, Json::error_handler_t::replace);
   // a < stands in strings only; written so it can neither end the element nor open a comment
   replace_all(text, "<", "\\u003c");
   return text;
 }
 
-std::string report_page(const Report& report) {
+std::string report_page(const std::vector<Report>& reports, const Spelling& spelled) {
   const std::vector<std::pair<std::string_view, std::string>> parts = {
-      {"{{title}}", html_text(report.fit.model.system->name())},
+      {"{{title}}", markup_text(reports.front().fit.model.system->name())},
       {"{{uplot_css}}", std::string(assets::uplot_css)},
       {"{{style}}", std::string(assets::report_css)},
       {"{{uplot_license}}", std::string(assets::uplot_license)},
       {"{{uplot}}", std::string(assets::uplot_js)},
       {"{{script}}", std::string(assets::report_js)},
-      {"{{data}}", report_json(report)},
+      {"{{data}}", report_json(reports, spelled)},
   };
   // one pass over the template, so that what is put in is never read for marks
   std::string page;
@@ -405,4 +402,4 @@ std::string report_page(const Report& report) {
   return page;
 }
 
-}  // namespace gp2::command
+}  // namespace gp2

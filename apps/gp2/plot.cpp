@@ -1,0 +1,45 @@
+#include "gp2/report/plot.hpp"
+
+#include <memory>
+
+#include <fmt/format.h>
+
+#include "command.hpp"
+#include "gp2/base/file.hpp"
+#include "gp2/files/fit_file.hpp"
+
+namespace gp2::command {
+
+namespace {
+
+struct PlotArguments {
+  std::string fit, output;
+  PlotRequest request;
+};
+
+void run(const PlotArguments& arguments) {
+  require_output(arguments.output, {arguments.fit});
+  const FitFile fit = FitFile::read(arguments.fit);
+  const LearnedCurve curve = learned_curve(fit.posterior(), arguments.request);
+  write_file(arguments.output, plot(curve, fit.model.system->name()));
+  print_notes({fmt::format("{}: {} along {}", arguments.output, curve.force.names[static_cast<std::size_t>(curve.row)],
+                           curve.force.along)});
+}
+
+}  // namespace
+
+Command plot_command() {
+  const auto a = std::make_shared<PlotArguments>();
+  Command command{"plot",
+                  "Draw what a fit has learned: one force along one variable, with its 95 % band and where the data are",
+                  "gp2 plot fit.json --what friction -o friction.svg",
+                  {},
+                  {}};
+  command.options = {argument("FIT.json", a->fit, "file written by gp2 fit")};
+  for (Option& option : options(a->request)) command.options.push_back(std::move(option));
+  command.options.push_back(output(a->output, "SVG", "SVG file to write; it needs no network"));
+  command.run = [a](const std::set<std::string>&) { run(*a); };
+  return command;
+}
+
+}  // namespace gp2::command

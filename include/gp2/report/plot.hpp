@@ -1,0 +1,37 @@
+#pragma once
+
+#include <optional>
+#include <string>
+#include <vector>
+
+#include "gp2/export.hpp"
+#include "gp2/jobs/option.hpp"
+#include "gp2/jobs/report_job.hpp"
+#include "gp2/posterior.hpp"
+
+namespace gp2 GP2_API {
+
+/// Which of the learned forces. What is not given is chosen: what the data determine best, where it changes most.
+struct PlotRequest {
+  std::optional<std::string> what;   // latent
+  std::optional<std::string> along;  // entry of the state
+  std::optional<std::string> force;  // coordinate on which the force acts
+};
+
+/// what, along, force.
+std::vector<Option> options(PlotRequest& request);
+
+/// One of learned_forces: the curve, and its row.
+struct LearnedCurve {
+  LearnedForce force;
+  Eigen::Index row = 0;
+};
+
+/// @throws InputError where there is no such curve, naming those there are.
+LearnedCurve learned_curve(const Posterior& posterior, const PlotRequest& request);
+
+/// The curve with its 95 % band, and the training data along the axis, as an SVG image that needs nothing else.
+/// @param title  of the picture: the system's name
+std::string plot(const LearnedCurve& curve, const std::string& title);
+
+}  // namespace gp2
