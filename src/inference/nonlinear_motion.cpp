@@ -94,13 +94,14 @@ class NonlinearMotion::Directions {
   MatrixXd forced_slope_;
 };
 
-NonlinearMotion::NonlinearMotion(const Prior& prior, MatrixXd states, VectorXd parameters, const MechanicsBatch& mechanics)
+NonlinearMotion::NonlinearMotion(const Prior& prior, MatrixXd states, VectorXd parameters, const MechanicsBatch& mechanics,
+                                 PriorValues at_known_load)
     : prior_(prior),
       states_(std::move(states)),
       parameters_(std::move(parameters)),
       mechanics_(mechanics),
       of_multipliers_(View::multipliers(*prior.system)),
-      at_known_load_(require_prior_values(prior, states_, parameters_, mechanics)),
+      at_known_load_(std::move(at_known_load)),
       multipliers_(evaluate_view(of_multipliers_, mechanics, states_)) {}
 
 Linearisation::OfGroup NonlinearMotion::without_signals() const {
@@ -124,7 +125,7 @@ std::optional<MechanicsBatch::Fault> NonlinearMotion::solve(Linearisation::OfGro
       at.multipliers.col(i) = solver.lambda();
     } else {
       at.multipliers.col(i).setConstant(not_a_number);
-      if (!fault) fault = no_multipliers(i);
+      if (!fault) fault = solver.fault(i);
     }
   }
   return fault;
@@ -133,7 +134,7 @@ std::optional<MechanicsBatch::Fault> NonlinearMotion::solve(Linearisation::OfGro
 void NonlinearMotion::linearise(const View& view, const Linearisation::OfGroup& at, ViewValues& viewed,
                                 PriorValues& prior) const {
   const std::vector<MatrixXd> c = amplitudes_of(prior_, at.signals);
-  prior = require_prior_values(prior_, states_, parameters_, mechanics_, &at.multipliers);
+  prior = evaluate_prior(prior_, states_, parameters_, mechanics_, &at.multipliers);
   keep_viewed(view, prior);
   Directions directions(*this);
   VectorXd a_bar;
@@ -161,7 +162,7 @@ void NonlinearMotion::linearise(const View& view, const Linearisation::OfGroup& 
 void NonlinearMotion::differentiate(const Linearisation::OfGroup& at, const SystemValues& derivative, int index,
                                     const ViewValues& viewed, ViewValues& d_viewed, PriorValues& d_prior) const {
   const std::vector<MatrixXd> c = amplitudes_of(prior_, at.signals);
-  const PriorValues values = require_prior_values(prior_, states_, parameters_, mechanics_, &at.multipliers);
+  const PriorValues values = evaluate_prior(prior_, states_, parameters_, mechanics_, &at.multipliers);
   const ViewValues d_multipliers = differentiate_view(of_multipliers_, mechanics_, derivative);
   d_prior = differentiate_prior(prior_, states_, parameters_, mechanics_, values, derivative, index, &at.multipliers);
   const Index nq = prior_.system->nq();

@@ -24,15 +24,17 @@ namespace gp2 {
 /// T47), and exact at s_a*. As A G = 0 of an acceleration, A G̃ = 0.
 class NonlinearMotion {
  public:
-  /// @param prior       where the states are (prior_of); outlives it
-  /// @param mechanics   at the states; outlives it
-  NonlinearMotion(const Prior& prior, Eigen::MatrixXd states, Eigen::VectorXd parameters, const MechanicsBatch& mechanics);
+  /// @param prior          where the states are (prior_of); outlives it
+  /// @param mechanics      at the states; outlives it
+  /// @param at_known_load  of evaluate_prior there, without a fault
+  NonlinearMotion(const Prior& prior, Eigen::MatrixXd states, Eigen::VectorXd parameters, const MechanicsBatch& mechanics,
+                  PriorValues at_known_load);
 
   /// λ under the signals; NaN at the state of a fault, which is returned.
   [[nodiscard]] std::optional<MechanicsBatch::Fault> solve(Linearisation::OfGroup& at) const;
 
   /// The linear prior and view in the place of those at λ₀.
-  /// @param prior  as evaluate_prior gives it
+  /// @param prior  receives it; with a fault where a direction is not finite at λ*
   void linearise(const View& view, const Linearisation::OfGroup& at, ViewValues& viewed, PriorValues& prior) const;
 
   /// ∂/∂p of what linearise gives for a view of everything, at held s_a* and λ*, in parameters that directions which read λ do not
@@ -54,8 +56,8 @@ class NonlinearMotion {
   Eigen::VectorXd parameters_;
   const MechanicsBatch& mechanics_;
   View of_multipliers_;
-  PriorValues at_known_load_;  // of evaluate_prior at λ₀
-  ViewValues multipliers_;     // G_λ, d_λ
+  PriorValues at_known_load_;
+  ViewValues multipliers_;  // G_λ, d_λ
 };
 
 }  // namespace gp2

@@ -55,7 +55,8 @@ class NonlinearFit {
       const Prior& there = prior_of(self.prior, group.view());
       of.parameters = parameters_of(group.view(), self.values.parameters);
       of.mechanics = std::make_unique<MechanicsBatch>(require_mechanics(there, group.view(), group.states(), of.parameters));
-      of.motion = std::make_unique<NonlinearMotion>(there, group.states(), of.parameters, *of.mechanics);
+      of.motion = std::make_unique<NonlinearMotion>(there, group.states(), of.parameters, *of.mechanics,
+                                                    require_prior_values(there, group.states(), of.parameters, *of.mechanics));
       of.view = evaluate_view(group.view(), *of.mechanics, group.states());
     }
   }
@@ -89,6 +90,7 @@ class NonlinearFit {
       ViewValues view = groups_[g].view;
       PriorValues prior;
       groups_[g].motion->linearise(group.view(), about.groups[g], view, prior);
+      if (prior.fault) return std::numeric_limits<double>::infinity();
       for (int i = 0; i < group.n_data(); ++i) {
         VectorXd a_bar = prior.mean.col(i);
         for (std::size_t a = 0; a < self_.C.size(); ++a) a_bar += prior.E(a, i) * about.groups[g].signals[a].col(i);

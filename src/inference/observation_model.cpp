@@ -51,10 +51,11 @@ bool model_observations(const Prior& prior, const std::vector<Observations>& obs
     std::optional<NonlinearMotion> nonlinear;
     Linearisation::OfGroup at;
     if (there.is_nonlinear()) {
-      nonlinear.emplace(there, group.states(), theta, model.mechanics);
+      nonlinear.emplace(there, group.states(), theta, model.mechanics, model.values.prior);
       at = about != nullptr ? about->groups[g] : nonlinear->without_signals();
       if (about == nullptr && nonlinear->solve(at)) return false;
       nonlinear->linearise(group.view(), at, model.values.view, model.values.prior);
+      if (model.values.prior.fault) return false;
     }
     model.derivatives.clear();
     for (int parameter : gradient_parameters) {
@@ -87,9 +88,9 @@ std::vector<ObservationModel> require_models(const Prior& prior, const std::vect
     const Prior& there = prior_of(prior, group.view());
     const VectorXd theta = parameters_of(group.view(), parameters);
     const MechanicsBatch mechanics = require_mechanics(there, group.view(), group.states(), theta);
-    static_cast<void>(require_prior_values(there, group.states(), theta, mechanics));
+    PriorValues values = require_prior_values(there, group.states(), theta, mechanics);
     if (!there.is_nonlinear()) continue;
-    const NonlinearMotion nonlinear(there, group.states(), theta, mechanics);
+    const NonlinearMotion nonlinear(there, group.states(), theta, mechanics, std::move(values));
     Linearisation::OfGroup at = nonlinear.without_signals();
     if (const auto fault = nonlinear.solve(at)) {
       throw InputError(internal::describe_fault(*there.system, group.states(), *fault));

@@ -27,7 +27,7 @@ void Query::evaluate(const Posterior::Implementation& posterior, const View& vie
   if (there.is_nonlinear()) {
     nonlinear_ = std::make_shared<Nonlinear>();
     nonlinear_->mechanics = std::move(mechanics);
-    nonlinear_->motion = std::make_unique<NonlinearMotion>(there, block, parameters, nonlinear_->mechanics);
+    nonlinear_->motion = std::make_unique<NonlinearMotion>(there, block, parameters, nonlinear_->mechanics, prior);
     nonlinear_->view = view;
     nonlinear_->of = viewed;
     nonlinear_->states = states;
@@ -51,12 +51,15 @@ void Query::linearise(const Posterior::Implementation& posterior, const std::vec
   if (!nonlinear_) return;
   Linearisation::OfGroup at;
   for (std::size_t a = 0; a < f.size(); ++a) at.signals.push_back(posterior.C[a] * f[a]);
-  if (auto fault = nonlinear_->motion->solve(at)) {
-    fault->state += static_cast<int>(nonlinear_->first);
-    throw InputError(internal::describe_fault(*prior_of(posterior.prior, nonlinear_->of).system, nonlinear_->states, *fault));
+  std::optional<MechanicsBatch::Fault> fault = nonlinear_->motion->solve(at);
+  if (!fault) {
+    view = nonlinear_->view;
+    nonlinear_->motion->linearise(nonlinear_->of, at, view, prior);
+    fault = prior.fault;
   }
-  view = nonlinear_->view;
-  nonlinear_->motion->linearise(nonlinear_->of, at, view, prior);
+  if (!fault) return;
+  fault->state += static_cast<int>(nonlinear_->first);
+  throw InputError(internal::describe_fault(*prior_of(posterior.prior, nonlinear_->of).system, nonlinear_->states, *fault));
 }
 
 void Query::view_of(const Posterior::Implementation& posterior, const std::vector<MatrixXd>& f, Ref<MatrixXd> values) const {

@@ -135,7 +135,7 @@ class LoadCheck {
 
   // the least coefficient that leaves a state without a motion
   void add_jam(const std::string& name, std::size_t a, int l, std::vector<Finding>& findings) const {
-    const NonlinearMotion motion(prior_, states_, parameters_, mechanics_);
+    const NonlinearMotion motion(prior_, states_, parameters_, mechanics_, values_);
     const auto fault = [&](double coefficient) {
       Linearisation::OfGroup at = motion.without_signals();
       at.signals[a].row(l).setConstant(prior_.latents[a].is_positive ? std::log(coefficient) : coefficient);

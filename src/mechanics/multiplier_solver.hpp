@@ -38,6 +38,8 @@ class MultiplierSolver {
   }
 
   [[nodiscard]] const Eigen::VectorXd& lambda() const { return lambda_; }
+  /// What is wrong where there is none.
+  [[nodiscard]] MechanicsBatch::Fault fault(int state) const;
 
  private:
   template <typename Matrix, typename Vector, typename Motion>
@@ -57,6 +59,8 @@ class MultiplierSolver {
     for (int step = 0; step < most; ++step) {
       motion(lambda_, a_bar_, slope_);
       if (lambda_.size() == 0) return true;
+      is_finite_ = a_bar_.allFinite() && slope_.allFinite();
+      if (!is_finite_) return false;
       D_.setIdentity();
       D_.noalias() -= tau * G.lazyProduct(slope_);
       lu_.compute(D_);
@@ -77,9 +81,7 @@ class MultiplierSolver {
   Eigen::MatrixXd slope_, D_;
   Eigen::PartialPivLU<Eigen::MatrixXd> lu_;
   double size_ = 0;
+  bool is_finite_ = true;
 };
-
-/// What is wrong with a state that has no solution.
-MechanicsBatch::Fault no_multipliers(int state);
 
 }  // namespace gp2

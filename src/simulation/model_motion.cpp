@@ -68,7 +68,7 @@ MatrixXd ModelMotion::with_load(const Eigen::Ref<const MatrixXd>& states, const 
       slope = projection.solve_mass(slopes(truth_force_slopes_)) + slopes(truth_slopes_);
     };
     if (!solver.solve(multipliers.G(i), multipliers.offset.col(i), motion)) {
-      throw InputError(internal::describe_fault(*system_, states, no_multipliers(i)));
+      throw InputError(internal::describe_fault(*system_, states, solver.fault(i)));
     }
     x.col(i).tail(nc) = solver.lambda();
   }

@@ -191,7 +191,8 @@ TEST(LikelihoodGradientTest, MatchesDifferencesWhereAPriorIsMadeLinear) {
   Linearisation about;
   for (const Observations& group : p.observations) {
     const MechanicsBatch mechanics = require_mechanics(*model.system, group.states(), p.values.parameters);
-    const NonlinearMotion motion(p.prior, group.states(), p.values.parameters, mechanics);
+    const NonlinearMotion motion(p.prior, group.states(), p.values.parameters, mechanics,
+                                 evaluate_prior(p.prior, group.states(), p.values.parameters, mechanics));
     about.groups.push_back(motion.without_signals());
     for (MatrixXd& signals : about.groups.back().signals) {
       for (double& one : signals.reshaped()) one = 0.1 * random.normal();

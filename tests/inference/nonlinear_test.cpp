@@ -97,6 +97,14 @@ TEST(Multipliers, ThatGrowFasterThanTheForceTheyNeedAreAnErrorThatNamesTheState)
   expect_says([&] { static_cast<void>(ModelMotion(model).acceleration(states)); }, {"Painlevé", "x = "});
 }
 
+TEST(Multipliers, ThatGiveNoFiniteForceAreAnErrorOfTheirOwn) {
+  std::string text = rubbing_bead("lambda").text;
+  text.replace(text.find("abs(lambda(1))"), 14, "sqrt(-lambda(1) - 100)");
+  const Model model = Model::parse(text, "bead");
+  const MatrixXd states = test::draw(rubbing_bead("lambda"), 3, nonlinear_seed).states;
+  expect_says([&] { static_cast<void>(ModelMotion(model).acceleration(states)); }, {"not a finite number", "x = "});
+}
+
 TEST(CheckOfALoad, SaysWhatTheKnownForceLeavesOutAndFromWhereOnTheContactJams) {
   const auto finding = [](const Model& model) {
     for (const Finding& one : check(model, nullptr, {})) {
@@ -135,10 +143,11 @@ struct Rubs {
   MatrixXd states = test::draw(model, 6, nonlinear_seed).states;
   VectorXd parameters = model.system->parameter_values();
   MechanicsBatch mechanics = evaluate_mechanics(*model.system, states, parameters);
+  PriorValues values = evaluate_prior(prior, states, parameters, mechanics);
 
   [[nodiscard]] Linearisation::OfGroup signals(double size) const {
     RandomStream random(nonlinear_seed);
-    Linearisation::OfGroup at = NonlinearMotion(prior, states, parameters, mechanics).without_signals();
+    Linearisation::OfGroup at = NonlinearMotion(prior, states, parameters, mechanics, values).without_signals();
     for (MatrixXd& s : at.signals) {
       for (double& one : s.reshaped()) one = size * random.normal();
     }
@@ -161,7 +170,7 @@ TEST(NonlinearMotion, IsTangentToTheMotionAndItsAccelerationsHoldTheConstraints)
   for (const View& view : {View::constrained_acceleration(*rubs.model.system), View::constraint_force(*rubs.model.system),
                            View::multipliers(*rubs.model.system), View::learned_force(*rubs.model.system)}) {
     SCOPED_TRACE(view.quantity->word());
-    const NonlinearMotion motion(rubs.prior, rubs.states, rubs.parameters, rubs.mechanics);
+    const NonlinearMotion motion(rubs.prior, rubs.states, rubs.parameters, rubs.mechanics, rubs.values);
     const auto exact = [&](Linearisation::OfGroup at) {
       EXPECT_FALSE(motion.solve(at));
       ViewValues viewed = evaluate_view(view, rubs.mechanics, rubs.states);
@@ -222,7 +231,8 @@ TEST(NonlinearPosterior, OfOneNumberIsLaplacesApproximation) {
     values.kernel[0] = VectorXd::Ones(std::ssize(prior.latents[0].kernel.parameters()));
 
     const MechanicsBatch mechanics = evaluate_mechanics(*model.system, states, values.parameters);
-    const NonlinearMotion motion(prior, states, values.parameters, mechanics);
+    const NonlinearMotion motion(prior, states, values.parameters, mechanics,
+                                 evaluate_prior(prior, states, values.parameters, mechanics));
     const auto ddq = [&](double signal) {
       Linearisation::OfGroup at = motion.without_signals();
       at.signals[0].setConstant(signal);
