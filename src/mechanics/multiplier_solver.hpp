@@ -24,6 +24,8 @@ class MultiplierSolver {
   template <typename Matrix, typename Vector, typename Motion>
   bool solve(const Matrix& G, const Vector& d, const Motion& motion) {
     const Eigen::Index nc = G.rows(), nq = G.cols();
+    lambda_.resize(nc);
+    if (nc == 0) return true;
     slope_.resize(nq, nc);
     a_bar_.resize(nq);
     D_.resize(nc, nc);
@@ -58,7 +60,6 @@ class MultiplierSolver {
     constexpr double enough = 64 * std::numeric_limits<double>::epsilon();
     for (int step = 0; step < most; ++step) {
       motion(lambda_, a_bar_, slope_);
-      if (lambda_.size() == 0) return true;
       is_finite_ = a_bar_.allFinite() && slope_.allFinite();
       if (!is_finite_) return false;
       D_.setIdentity();
