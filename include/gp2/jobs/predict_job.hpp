@@ -69,7 +69,7 @@ struct PredictRequest {
 std::vector<Option> options(PredictRequest& request);
 
 struct PredictOutcome {
-  /// NAME of the view or of an input, potential@LATENT, NAME_std, cov_NAME1_NAME2, ddqJ_missed of inverse dynamics, NAME_sample1, …, distance_from_data
+  /// NAME of the view or of an input, `potential@LATENT`, NAME_std, cov_NAME1_NAME2, ddqJ_missed of inverse dynamics, NAME_sample1, …, distance_from_data
   std::vector<std::string> names;
   Eigen::MatrixXd values;  // (names × N)
   std::vector<std::string> notes;
