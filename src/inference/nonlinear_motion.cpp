@@ -1,11 +1,9 @@
 #include "inference/nonlinear_motion.hpp"
 
-#include <memory>
 #include <utility>
 
-#include <Eigen/LU>
-
 #include "base/not_a_number.hpp"
+#include "inference/motion_under_load.hpp"
 #include "mechanics/multiplier_solver.hpp"
 
 namespace gp2 {
@@ -17,10 +15,6 @@ using Eigen::VectorXd;
 
 namespace {
 
-const StateFunction* of_multipliers(const Latent& latent) {
-  return latent.directions ? latent.directions->of_multipliers() : nullptr;
-}
-
 std::vector<MatrixXd> amplitudes_of(const Prior& prior, const std::vector<MatrixXd>& signals) {
   std::vector<MatrixXd> c = signals;
   for (std::size_t a = 0; a < c.size(); ++a) {
@@ -31,67 +25,44 @@ std::vector<MatrixXd> amplitudes_of(const Prior& prior, const std::vector<Matrix
 
 }  // namespace
 
-/// ā(λ) and ∂ā/∂λ at one state after another.
-class NonlinearMotion::Directions {
+/// The motion at one state after another.
+class NonlinearMotion::Under {
  public:
-  explicit Directions(const NonlinearMotion& of) : of_(of), x_(of.states_.rows() + of.prior_.system->nc()) {
-    for (const Latent& latent : of.prior_.latents) {
-      const StateFunction* const function = of_multipliers(latent);
-      evaluators_.push_back(function != nullptr ? function->make_evaluator(of.parameters_) : nullptr);
-    }
-  }
+  explicit Under(const NonlinearMotion& of, const std::vector<MatrixXd>& c)
+      : of_(of),
+        c_(c),
+        load_(of.prior_, of.parameters_),
+        a_bar_(of.prior_.system->nq()),
+        J_(a_bar_.size(), of.prior_.system->nc()) {}
 
-  /// @param c  amplitudes, per latent
-  void move_to(int i, const std::vector<MatrixXd>& c) {
-    i_ = i;
-    c_ = &c;
+  void move_to(int i) {
     without_load_ = of_.at_known_load_.mean.col(i);
-    for (std::size_t a = 0; a < c.size(); ++a) {
-      if (!evaluators_[a]) without_load_ += of_.at_known_load_.E(a, i) * c[a].col(i);
+    auto loaded = load_.latents().begin();
+    for (std::size_t a = 0; a < c_.size(); ++a) {
+      if (loaded != load_.latents().end() && loaded->latent == a) {
+        loaded++->c = c_[a].col(i);
+      } else {
+        without_load_ += of_.at_known_load_.E(a, i) * c_[a].col(i);
+      }
     }
+    load_.move_to(of_.states_.col(i), of_.mechanics_.projections[static_cast<std::size_t>(i)], without_load_);
   }
 
-  void evaluate(const VectorXd& lambda, VectorXd& a_bar, MatrixXd& slope) {
-    const Index nq = without_load_.size(), n_state = of_.states_.rows();
-    const UdwadiaKalaba& projection = of_.mechanics_.projections[static_cast<std::size_t>(i_)];
-    x_ << of_.states_.col(i_), lambda;
-    a_bar = without_load_;
-    slope.setZero(nq, lambda.size());
-    forced_slope_ = slope;
-    for (std::size_t a = 0; a < evaluators_.size(); ++a) {
-      if (!evaluators_[a]) continue;
-      const auto c = (*c_)[a].col(i_);
-      const auto& entries = evaluators_[a]->entries();
-      B_.resize(nq * c.size());
-      dB_.resize(std::ssize(entries));
-      evaluators_[a]->evaluate(x_, B_);
-      evaluators_[a]->differentiate(x_, dB_);
-      VectorXd added = Map<const MatrixXd>(B_.data(), nq, c.size()) * c;
-      MatrixXd change = MatrixXd::Zero(nq, lambda.size());
-      for (std::size_t e = 0; e < entries.size(); ++e) {
-        const Index row = entries[e].state_index - n_state, j = entries[e].output % nq, l = entries[e].output / nq;
-        if (row >= 0) change(j, row) += dB_[static_cast<Index>(e)] * c[l];
-      }
-      if (of_.prior_.latents[a].base == Latent::Base::force) {
-        projection.solve_mass_in_place(added);
-        projection.solve_mass_in_place(change);
-      }
-      a_bar += added;
-      slope += change;
-      if (of_.prior_.latents[a].base == Latent::Base::force) forced_slope_ += change;
-    }
-  }
+  void evaluate(const VectorXd& lambda, VectorXd& a_bar, MatrixXd& slope) { load_.evaluate(lambda, a_bar, slope); }
 
-  /// The part of the slope that has been multiplied by M⁻¹.
-  [[nodiscard]] const MatrixXd& forced_slope() const { return forced_slope_; }
+  /// J at λ, and its part that has been multiplied by M⁻¹.
+  const MatrixXd& slope(const VectorXd& lambda) {
+    evaluate(lambda, a_bar_, J_);
+    return J_;
+  }
+  [[nodiscard]] const MatrixXd& forced_slope() const { return load_.forced_slope(); }
 
  private:
   const NonlinearMotion& of_;
-  std::vector<std::unique_ptr<StateFunction::Evaluator>> evaluators_;  // null where λ is not read
-  int i_ = 0;
-  const std::vector<MatrixXd>* c_ = nullptr;
-  VectorXd without_load_, x_, B_, dB_;
-  MatrixXd forced_slope_;
+  const std::vector<MatrixXd>& c_;
+  MotionUnderLoad load_;
+  VectorXd without_load_, a_bar_;
+  MatrixXd J_;
 };
 
 NonlinearMotion::NonlinearMotion(const Prior& prior, MatrixXd states, VectorXd parameters, const MechanicsBatch& mechanics,
@@ -112,15 +83,13 @@ Linearisation::OfGroup NonlinearMotion::without_signals() const {
 
 std::optional<MechanicsBatch::Fault> NonlinearMotion::solve(Linearisation::OfGroup& at) const {
   const std::vector<MatrixXd> c = amplitudes_of(prior_, at.signals);
-  Directions directions(*this);
+  Under under(*this, c);
   MultiplierSolver solver;
   at.multipliers.resize(prior_.system->nc(), n_states());
   std::optional<MechanicsBatch::Fault> fault;
   for (int i = 0; i < n_states(); ++i) {
-    directions.move_to(i, c);
-    const auto motion = [&](const VectorXd& lambda, VectorXd& a_bar, MatrixXd& slope) {
-      directions.evaluate(lambda, a_bar, slope);
-    };
+    under.move_to(i);
+    const auto motion = [&](const VectorXd& lambda, VectorXd& a_bar, MatrixXd& slope) { under.evaluate(lambda, a_bar, slope); };
     if (solver.solve(multipliers_.G(i), multipliers_.offset.col(i), motion)) {
       at.multipliers.col(i) = solver.lambda();
     } else {
@@ -131,31 +100,35 @@ std::optional<MechanicsBatch::Fault> NonlinearMotion::solve(Linearisation::OfGro
   return fault;
 }
 
+// Ẽ_a and o of positive latents, c' = c, from E_a and μ; or their derivatives
+void NonlinearMotion::linearise_amplitudes(const Linearisation::OfGroup& at, const std::vector<MatrixXd>& c, int i,
+                                           PriorValues& prior) const {
+  for (std::size_t a = 0; a < c.size(); ++a) {
+    if (!prior_.latents[a].is_positive) continue;
+    Map<MatrixXd> E(prior.directions[a].col(i).data(), prior.mean.rows(), c[a].rows());
+    prior.mean.col(i) += E * (c[a].col(i) - c[a].col(i).cwiseProduct(at.signals[a].col(i)));
+    E = E * c[a].col(i).asDiagonal();
+  }
+}
+
 void NonlinearMotion::linearise(const View& view, const Linearisation::OfGroup& at, ViewValues& viewed,
                                 PriorValues& prior) const {
   const std::vector<MatrixXd> c = amplitudes_of(prior_, at.signals);
   prior = evaluate_prior(prior_, states_, parameters_, mechanics_, &at.multipliers);
   keep_viewed(view, prior);
-  Directions directions(*this);
-  VectorXd a_bar;
-  MatrixXd J;
+  // μ that the view has none of acts on λ all the same
+  const MatrixXd hidden = at_known_load_.mean - prior.mean;
+  Under under(*this, c);
+  LoadResponse response;
   for (int i = 0; i < n_states(); ++i) {
-    // μ that the view has none of acts on λ all the same
-    const VectorXd hidden = at_known_load_.mean.col(i) - prior.mean.col(i);
-    for (std::size_t a = 0; a < c.size(); ++a) {
-      if (!prior_.latents[a].is_positive) continue;
-      Map<MatrixXd> E(prior.directions[a].col(i).data(), prior.mean.rows(), c[a].rows());
-      prior.mean.col(i) += E * (c[a].col(i) - c[a].col(i).cwiseProduct(at.signals[a].col(i)));
-      E = E * c[a].col(i).asDiagonal();
-    }
+    linearise_amplitudes(at, c, i, prior);
     if (view.latent || at.multipliers.rows() == 0) continue;  // of one latent: at λ*, of which all are part
-    directions.move_to(i, c);
-    directions.evaluate(at.multipliers.col(i), a_bar, J);
+    under.move_to(i);
     const auto G_lambda = multipliers_.G(i);
-    const MatrixXd D = MatrixXd::Identity(J.cols(), J.cols()) - G_lambda * J;
-    const MatrixXd GK = viewed.G(i) * D.transpose().partialPivLu().solve(J.transpose()).transpose();
-    viewed.offset.col(i) += GK * (G_lambda * hidden + multipliers_.offset.col(i) - at.multipliers.col(i));
-    Map<MatrixXd>(viewed.matrix.col(i).data(), viewed.offset.rows(), J.rows()) += GK * G_lambda;
+    response.compute(under.slope(at.multipliers.col(i)), G_lambda);
+    const MatrixXd GK = viewed.G(i) * response.K();
+    viewed.offset.col(i) += GK * (G_lambda * hidden.col(i) + multipliers_.offset.col(i) - at.multipliers.col(i));
+    Map<MatrixXd>(viewed.matrix.col(i).data(), viewed.offset.rows(), prior.mean.rows()) += GK * G_lambda;
   }
 }
 
@@ -165,33 +138,25 @@ void NonlinearMotion::differentiate(const Linearisation::OfGroup& at, const Syst
   const PriorValues values = evaluate_prior(prior_, states_, parameters_, mechanics_, &at.multipliers);
   const ViewValues d_multipliers = differentiate_view(of_multipliers_, mechanics_, derivative);
   d_prior = differentiate_prior(prior_, states_, parameters_, mechanics_, values, derivative, index, &at.multipliers);
-  const Index nq = prior_.system->nq();
-  Directions directions(*this);
-  VectorXd a_bar;
-  MatrixXd J;
+  Under under(*this, c);
+  LoadResponse response;
   for (int i = 0; i < n_states(); ++i) {
-    for (std::size_t a = 0; a < c.size(); ++a) {
-      if (!prior_.latents[a].is_positive) continue;
-      Map<MatrixXd> dE(d_prior.directions[a].col(i).data(), nq, c[a].rows());
-      d_prior.mean.col(i) += dE * (c[a].col(i) - c[a].col(i).cwiseProduct(at.signals[a].col(i)));
-      dE = dE * c[a].col(i).asDiagonal();
-    }
+    linearise_amplitudes(at, c, i, d_prior);
     if (at.multipliers.rows() == 0) continue;
+    under.move_to(i);
+    const MatrixXd& J = under.slope(at.multipliers.col(i));
     // dJ = −M⁻¹dM J; of a J on the acceleration it is 0
     const UdwadiaKalaba& projection = mechanics_.projections[static_cast<std::size_t>(i)];
-    directions.move_to(i, c);
-    directions.evaluate(at.multipliers.col(i), a_bar, J);
     const MatrixXd dJ =
-        -projection.solve_mass(projection.differentiate_mass(derivative.M(i), derivative.A(i)) * directions.forced_slope());
+        -projection.solve_mass(projection.differentiate_mass(derivative.M(i), derivative.A(i)) * under.forced_slope());
     const auto G = viewed.G(i), G_lambda = multipliers_.G(i);
     const auto dG = d_viewed.G(i), dG_lambda = d_multipliers.G(i);
-    const Eigen::PartialPivLU<MatrixXd> D_T((MatrixXd::Identity(J.cols(), J.cols()) - G_lambda * J).transpose());
-    const auto over_D = [&](const MatrixXd& X) -> MatrixXd { return D_T.solve(X.transpose()).transpose(); };
-    const MatrixXd K = over_D(J), dK = over_D(dJ + K * (dG_lambda * J + G_lambda * dJ));
+    response.compute(J, G_lambda);
+    const MatrixXd &K = response.K(), dK = response.over_D(dJ + K * (dG_lambda * J + G_lambda * dJ));
     const VectorXd gap = multipliers_.offset.col(i) - at.multipliers.col(i);
     d_viewed.offset.col(i) += dG * (K * gap) + G * (dK * gap + K * d_multipliers.offset.col(i));
     const MatrixXd d_matrix = dG + dG * K * G_lambda + G * (dK * G_lambda + K * dG_lambda);
-    Map<MatrixXd>(d_viewed.matrix.col(i).data(), d_viewed.offset.rows(), nq) = d_matrix;
+    Map<MatrixXd>(d_viewed.matrix.col(i).data(), d_viewed.offset.rows(), G.cols()) = d_matrix;
   }
 }
 

@@ -44,12 +44,15 @@ class NonlinearMotion {
   void differentiate(const Linearisation::OfGroup& at, const SystemValues& derivative, int index, const ViewValues& viewed,
                      ViewValues& d_viewed, PriorValues& d_prior) const;
 
+  [[nodiscard]] const Eigen::MatrixXd& states() const { return states_; }
   [[nodiscard]] int n_states() const { return static_cast<int>(states_.cols()); }
   /// Signals of size 0.
   [[nodiscard]] Linearisation::OfGroup without_signals() const;
 
  private:
-  class Directions;
+  class Under;
+  void linearise_amplitudes(const Linearisation::OfGroup& at, const std::vector<Eigen::MatrixXd>& c, int i,
+                            PriorValues& prior) const;
 
   const Prior& prior_;
   Eigen::MatrixXd states_;

@@ -84,17 +84,18 @@ std::vector<ObservationModel> require_models(const Prior& prior, const std::vect
   std::vector<ObservationModel> models;
   if (model_observations(prior, observations, parameters, {}, about, models)) return models;
   // the error names the state
-  for (const Observations& group : observations) {
+  for (std::size_t g = 0; g < observations.size(); ++g) {
+    const Observations& group = observations[g];
     const Prior& there = prior_of(prior, group.view());
     const VectorXd theta = parameters_of(group.view(), parameters);
     const MechanicsBatch mechanics = require_mechanics(there, group.view(), group.states(), theta);
     PriorValues values = require_prior_values(there, group.states(), theta, mechanics);
     if (!there.is_nonlinear()) continue;
     const NonlinearMotion nonlinear(there, group.states(), theta, mechanics, std::move(values));
-    Linearisation::OfGroup at = nonlinear.without_signals();
-    if (const auto fault = nonlinear.solve(at)) {
-      throw InputError(internal::describe_fault(*there.system, group.states(), *fault));
-    }
+    Linearisation::OfGroup at = about != nullptr ? about->groups[g] : nonlinear.without_signals();
+    std::optional<MechanicsBatch::Fault> fault = about != nullptr ? std::nullopt : nonlinear.solve(at);
+    if (!fault) fault = evaluate_prior(there, group.states(), theta, mechanics, &at.multipliers).fault;
+    if (fault) throw InputError(internal::describe_fault(*there.system, group.states(), *fault));
   }
   return models;
 }

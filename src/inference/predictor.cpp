@@ -1,5 +1,6 @@
 #include "gp2/predictor.hpp"
 
+#include <algorithm>
 #include <cmath>
 #include <optional>
 #include <string_view>
@@ -12,6 +13,7 @@
 #include "gp2/error.hpp"
 #include "gp2/mechanics/state_evaluator.hpp"
 #include "inference/data_distance.hpp"
+#include "inference/motion_under_load.hpp"
 #include "inference/posterior_implementation.hpp"
 #include "inference/predictor_data.hpp"
 #include "inference/requirements.hpp"
@@ -61,7 +63,7 @@ struct Predictor::Implementation {
 
   [[nodiscard]] double distance_at(const Ref<const VectorXd>& state, Workspace::Implementation& w) const;
 
-  // E at λ, and c in the place of the signals
+  // λ, and what the latents that read it add to the force and to ā
   [[nodiscard]] bool evaluate_load(const Ref<const VectorXd>& state, const StateEvaluator& at,
                                    Workspace::Implementation& w) const;
   // G of every row, with what its change with λ adds, and G J D⁻¹
@@ -93,11 +95,11 @@ struct Predictor::Workspace::Implementation {
   AffineMotion affine_motion;
 
   struct AtState {
-    std::unique_ptr<StateFunction::Evaluator> of_features, of_directions;  // directions that read λ: at [x; λ]
-    bool reads_multipliers = false;
-    VectorXd features;    // φ (D)
-    VectorXd point;       // scaled
-    VectorXd directions;  // B or B Π (nq·p), none where B = I
+    std::unique_ptr<StateFunction::Evaluator> of_features, of_directions;
+    MotionUnderLoad::OfLatent* under_load = nullptr;  // in the place of of_directions where they read λ
+    VectorXd features;                                // φ (D)
+    VectorXd point;                                   // scaled
+    VectorXd directions;                              // B or B Π (nq·p), none where B = I
     std::optional<AdmissibleDirections> admissible;
     VectorXd dfeatures, ddirections;  // their derivatives that do not vanish
     VectorXd signal;                  // C g (p)
@@ -105,38 +107,38 @@ struct Predictor::Workspace::Implementation {
     MatrixXd E_dsignal;               // B d(C g)/dφ (nq × D)
   };
   std::vector<AtState> terms;
-  VectorXd a_bar;            // ā
-  VectorXd force;            // what is multiplied by M⁻¹ in it …
-  VectorXd a_of_force;       // … and the product
-  VectorXd a;                // ddq, or T ā of one latent alone
-  VectorXd gap;              // a − ā
-  VectorXd of_constraint;    // Aᵀλ = M (a − ā)
-  VectorXd applied;          // F̄ = M ā
-  VectorXd lambda;           // λ (nc)
-  MatrixXd L;                // (nq × nc)
-  MatrixXd d_of_rest;        // of dā, what is not multiplied by M⁻¹ (nq × layout size)
-  MatrixXd d_force;          // what is
-  MatrixXd d_forced;         // … in da alone
-  MatrixXd d_rows;           // db − dA a (nc × layout size)
-  MatrixXd d_a_bar, d_a;     // dā, da
-  MatrixXd d_mass_a_bar;     // M dā
-  MatrixXd d_of_constraint;  // dM (a − ā), then d(Aᵀλ)
-  MatrixXd d_applied;        // dM ā, then dF̄
-  MatrixXd value, d_value;   // every row of the quantity (× 1), (× layout size)
-  MatrixXd G;                // every row (× nq)
-  VectorXd x;                // [x; λ] where λ is read
+  VectorXd a_bar;                       // ā
+  VectorXd force;                       // what is multiplied by M⁻¹ in it …
+  VectorXd a_of_force;                  // … and the product
+  VectorXd a;                           // ddq, or T ā of one latent alone
+  VectorXd gap;                         // a − ā
+  VectorXd of_constraint;               // Aᵀλ = M (a − ā)
+  VectorXd applied;                     // F̄ = M ā
+  VectorXd lambda;                      // λ (nc)
+  MatrixXd L;                           // (nq × nc)
+  MatrixXd d_of_rest;                   // of dā, what is not multiplied by M⁻¹ (nq × layout size)
+  MatrixXd d_force;                     // what is
+  MatrixXd d_forced;                    // … in da alone
+  MatrixXd d_rows;                      // db − dA a (nc × layout size)
+  MatrixXd d_a_bar, d_a;                // dā, da
+  MatrixXd d_mass_a_bar;                // M dā
+  MatrixXd d_of_constraint;             // dM (a − ā), then d(Aᵀλ)
+  MatrixXd d_applied;                   // dM ā, then dF̄
+  MatrixXd value, d_value;              // every row of the quantity (× 1), (× layout size)
+  MatrixXd G;                           // every row (× nq)
+  std::optional<MotionUnderLoad> load;  // where λ is read, and for it:
   MultiplierSolver solver;
-  VectorXd without_load;  // ā without the latents that read λ
-  MatrixXd slope, slope_transposed, K_transposed, G_lambda, d_lambda, D;
-  MatrixXd GK;             // G J D⁻¹ of every row (× nc)
-  MatrixXd d_multipliers;  // ∂(G_λ ā + d_λ)/∂x at held λ (nc × layout size)
-  Eigen::PartialPivLU<MatrixXd> D_transposed;
-  MatrixXd Gt, M_inverse_Gt;       // Gᵀ of the view (nq × d)
-  std::vector<MatrixXd> loadings;  // ℓ, per term (F × d)
-  VectorXd variance;               // (d)
-  VectorXd coordinates;            // of the distance from the data
-  VectorXd mean, stddev;           // of a component of a mixture (d)
-  MatrixXd jacobian;               // likewise (d × layout size)
+  LoadResponse response;
+  VectorXd without_load;               // ā without the latents that read λ
+  MatrixXd slope, G_lambda, d_lambda;  // J, G_λ, d_λ
+  MatrixXd GK;                         // G K of every row (× nc)
+  MatrixXd d_multipliers;              // ∂(G_λ ā + d_λ)/∂x at held λ (nc × layout size)
+  MatrixXd Gt, M_inverse_Gt;           // Gᵀ of the view (nq × d)
+  std::vector<MatrixXd> loadings;      // ℓ, per term (F × d)
+  VectorXd variance;                   // (d)
+  VectorXd coordinates;                // of the distance from the data
+  VectorXd mean, stddev;               // of a component of a mixture (d)
+  MatrixXd jacobian;                   // likewise (d × layout size)
   PredictorData<double>::Memory in_double;
   PredictorData<float>::Memory in_single;
 
@@ -261,15 +263,6 @@ void Predictor::Workspace::Implementation::reserve_mechanics() {
   value.setZero(n_rows, 1);
   d_value.setZero(n_rows, n_state);
   G.setZero(n_rows, nq);
-  x.setZero(n_state + nc);
-  slope.setZero(nq, nc);
-  slope_transposed = K_transposed = slope.transpose();
-  G_lambda.setZero(nc, nq);
-  d_lambda.setZero(nc, 1);
-  D.setZero(nc, nc);
-  GK.setZero(n_rows, nc);
-  d_multipliers.setZero(nc, n_state);
-  without_load = a_bar;
   Gt.setZero(nq, d);
   M_inverse_Gt = Gt;
   variance.setZero(d);
@@ -283,6 +276,21 @@ void Predictor::Workspace::Implementation::reserve_mechanics() {
   const StateMechanics at = mechanics({rows.data(), nc, nq});
   predictor->view.quantity->evaluate(at, motion(), value, quantity);
   predictor->view.quantity->differentiate(at, motion(), dmotion(), StateChange(*values), d_value, quantity);
+  if (!predictor->reads_multipliers) return;
+  load.emplace(predictor->prior, predictor->parameters);
+  without_load = a_bar;
+  slope.setZero(nq, nc);
+  G_lambda.setZero(nc, nq);
+  d_lambda.setZero(nc, 1);
+  GK.setZero(n_rows, nc);
+  d_multipliers.setZero(nc, n_state);
+  Quantity::multipliers->evaluate(at, affine_motion.linear(), G_lambda, quantity);
+  Quantity::multipliers->differentiate(at, motion(), dmotion(), StateChange(*values), d_multipliers, quantity);
+  solver.solve(G_lambda, d_lambda.col(0), [](const VectorXd&, VectorXd& free, MatrixXd& change) {
+    free.setZero();
+    change.setZero();
+  });
+  response.compute(slope, G_lambda);
 }
 
 void Predictor::Workspace::Implementation::reserve_term(const PredictorTerm& term) {
@@ -298,10 +306,12 @@ void Predictor::Workspace::Implementation::reserve_term(const PredictorTerm& ter
   loadings.emplace_back(MatrixXd::Zero(term.n_functions(), predictor->view.size()));
   at.dfeatures.setZero(static_cast<Index>(at.of_features->entries().size()));
   if (!latent.directions) return;
-  const StateFunction* const of_multipliers = latent.directions->of_multipliers();
-  at.reads_multipliers = of_multipliers != nullptr;
-  at.of_directions = (at.reads_multipliers ? of_multipliers : latent.directions.get())->make_evaluator(predictor->parameters);
   at.directions.setZero(nq * p);
+  if (latent.directions->of_multipliers() != nullptr) {
+    at.under_load = &*std::ranges::find(load->latents(), term.latent, &MotionUnderLoad::OfLatent::latent);
+    return;
+  }
+  at.of_directions = latent.directions->make_evaluator(predictor->parameters);
   at.ddirections.setZero(static_cast<Index>(at.of_directions->entries().size()));
   if (latent.base != Latent::Base::admissible) return;
   at.of_directions->evaluate(VectorXd::Zero(predictor->prior.system->layout().size()), at.directions);
@@ -362,7 +372,7 @@ Status Predictor::Implementation::evaluate_prior(const Ref<const VectorXd>& stat
       term.kernel.scale(here.features, here.point);
       data.evaluate_signal(term, a, here.point, memory, here.signal);
       if (of.is_positive) here.signal = here.signal.array().exp();
-      if (here.reads_multipliers) continue;
+      if (here.under_load != nullptr) continue;
       if (here.admissible) {
         here.directions = here.admissible->compute(at.A()).reshaped();
       } else if (here.of_directions) {
@@ -382,49 +392,24 @@ Status Predictor::Implementation::evaluate_prior(const Ref<const VectorXd>& stat
 
 bool Predictor::Implementation::evaluate_load(const Ref<const VectorXd>& state, const StateEvaluator& at,
                                               Workspace::Implementation& w) const {
-  const Index n_state = state.size(), nq = w.a_bar.size();
   w.affine_motion.evaluate(w.projection, at.M(), parts);
   Quantity::multipliers->evaluate(w.mechanics(at.A()), w.affine_motion.linear(), w.G_lambda, w.quantity);
   Quantity::multipliers->evaluate(w.mechanics(at.A()), w.affine_motion.constant(), w.d_lambda, w.quantity);
   w.without_load = w.force;
   if (has_force) w.projection.solve_mass_in_place(w.without_load);
   w.without_load += w.a_bar;
-  // B c, or with `slopes` its change with λ, of what acts on forces or on the acceleration
-  const auto add = [&](bool on_forces, bool slopes, auto&& sum) {
-    for (std::size_t a = 0; a < terms.size(); ++a) {
-      Workspace::Implementation::AtState& here = w.terms[a];
-      if (!here.reads_multipliers || (latent(terms[a]).base == Latent::Base::force) != on_forces) continue;
-      for (Index l = 0; !slopes && l < here.signal.size(); ++l)
-        sum.col(0) += here.signal[l] * here.directions.segment(l * nq, nq);
-      const auto& entries = here.of_directions->entries();
-      for (std::size_t e = 0; slopes && e < entries.size(); ++e) {
-        const Index row = entries[e].state_index - n_state, output = entries[e].output;
-        if (row >= 0) sum(output % nq, row) += here.ddirections[static_cast<Index>(e)] * here.signal[output / nq];
-      }
-    }
-  };
-  w.x.head(n_state) = state;
-  const auto motion = [&](const VectorXd& lambda, VectorXd& a_bar, MatrixXd& slope) {
-    w.x.tail(lambda.size()) = lambda;
-    for (Workspace::Implementation::AtState& here : w.terms) {
-      if (!here.reads_multipliers) continue;
-      here.of_directions->evaluate(w.x, here.directions);
-      here.of_directions->differentiate(w.x, here.ddirections);
-    }
-    a_bar.setZero();
-    slope.setZero();
-    add(true, false, a_bar);
-    add(true, true, slope);
-    w.projection.solve_mass_in_place(a_bar);
-    w.projection.solve_mass_in_place(slope);
-    a_bar += w.without_load;
-    add(false, false, a_bar);
-    add(false, true, slope);
-  };
+  for (Workspace::Implementation::AtState& here : w.terms) {
+    if (here.under_load != nullptr) here.under_load->c = here.signal;
+  }
+  w.load->move_to(state, w.projection, w.without_load);
+  const auto motion = [&](const VectorXd& lambda, VectorXd& a_bar, MatrixXd& slope) { w.load->evaluate(lambda, a_bar, slope); };
   if (!w.solver.solve(w.G_lambda, w.d_lambda.col(0), motion)) return false;
-  motion(w.solver.lambda(), w.a_of_force, w.slope);  // leaves directions, their derivatives and the slope at λ
-  add(true, false, w.force);
-  add(false, false, w.a_bar);
+  motion(w.solver.lambda(), w.a_of_force, w.slope);
+  for (Workspace::Implementation::AtState& here : w.terms) {
+    if (here.under_load == nullptr) continue;
+    here.directions = here.under_load->B;
+    add_product(here.directions, here.signal, here.under_load->acts_on_forces ? w.force : w.a_bar);
+  }
   return true;
 }
 
@@ -432,12 +417,8 @@ void Predictor::Implementation::write_G(const StateEvaluator& at, Workspace::Imp
   w.affine_motion.evaluate(w.projection, at.M(), parts);
   view.quantity->evaluate(w.mechanics(at.A()), w.affine_motion.linear(), w.G, w.quantity);
   if (!reads_multipliers) return;
-  w.D.setIdentity();
-  w.D.noalias() -= w.slope.transpose().lazyProduct(w.G_lambda.transpose());
-  w.D_transposed.compute(w.D);
-  w.slope_transposed = w.slope.transpose();
-  w.K_transposed = w.D_transposed.solve(w.slope_transposed);
-  w.GK.noalias() = w.G.lazyProduct(w.K_transposed.transpose());
+  w.response.compute(w.slope, w.G_lambda);
+  w.GK.noalias() = w.G.lazyProduct(w.response.K());
   w.G.noalias() += w.GK.lazyProduct(w.G_lambda);
 }
 
@@ -572,14 +553,18 @@ void Predictor::Implementation::differentiate_prior(const Ref<const VectorXd>& s
       }
       continue;
     }
-    // dB C g
+    // dB C g, at held λ where it is read
+    const auto add = [&](const StateFunction::Evaluator& directions, const VectorXd& dB) {
+      for (std::size_t e = 0; e < directions.entries().size(); ++e) {
+        const StateDerivatives::Entry& entry = directions.entries()[e];
+        if (entry.state_index >= sum.cols()) break;  // in λ, which follows the state
+        sum(entry.output % nq, entry.state_index) += dB[static_cast<Index>(e)] * here.signal[entry.output / nq];
+      }
+    };
+    if (here.under_load != nullptr) add(*here.under_load->directions, here.under_load->dB);
     if (!here.of_directions) continue;
-    if (!here.reads_multipliers) here.of_directions->differentiate(state, here.ddirections);
-    for (std::size_t e = 0; e < here.of_directions->entries().size(); ++e) {
-      const StateDerivatives::Entry& entry = here.of_directions->entries()[e];
-      if (entry.state_index >= sum.cols()) break;  // in λ, which follows
-      sum(entry.output % nq, entry.state_index) += here.ddirections[static_cast<Index>(e)] * here.signal[entry.output / nq];
-    }
+    here.of_directions->differentiate(state, here.ddirections);
+    add(*here.of_directions, here.ddirections);
   }
 }
 

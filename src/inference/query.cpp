@@ -25,13 +25,13 @@ void Query::evaluate(const Posterior::Implementation& posterior, const View& vie
   needed = there.is_nonlinear() ? std::nullopt : latent;
   nonlinear_.reset();
   if (there.is_nonlinear()) {
-    nonlinear_ = std::make_shared<Nonlinear>();
-    nonlinear_->mechanics = std::move(mechanics);
-    nonlinear_->motion = std::make_unique<NonlinearMotion>(there, block, parameters, nonlinear_->mechanics, prior);
-    nonlinear_->view = view;
-    nonlinear_->of = viewed;
-    nonlinear_->states = states;
-    nonlinear_->first = first;
+    const auto nonlinear = std::make_shared<Nonlinear>();
+    nonlinear->mechanics = std::move(mechanics);
+    nonlinear->motion = std::make_unique<NonlinearMotion>(there, block, parameters, nonlinear->mechanics, prior);
+    nonlinear->view = view;
+    nonlinear->of = viewed;
+    nonlinear->first = first;
+    nonlinear_ = nonlinear;
   }
   keep_viewed(viewed, prior);
   features.resize(there.latents.size());
@@ -58,8 +58,8 @@ void Query::linearise(const Posterior::Implementation& posterior, const std::vec
     fault = prior.fault;
   }
   if (!fault) return;
-  fault->state += static_cast<int>(nonlinear_->first);
-  throw InputError(internal::describe_fault(*prior_of(posterior.prior, nonlinear_->of).system, nonlinear_->states, *fault));
+  throw InputError(internal::describe_fault(*prior_of(posterior.prior, nonlinear_->of).system, nonlinear_->motion->states(),
+                                            *fault, nonlinear_->first));
 }
 
 void Query::view_of(const Posterior::Implementation& posterior, const std::vector<MatrixXd>& f, Ref<MatrixXd> values) const {

@@ -47,10 +47,9 @@ struct Query {
     std::unique_ptr<NonlinearMotion> motion;
     ViewValues view;  // without latents
     View of;
-    Eigen::MatrixXd states;  // all that were asked for, for the message
-    Eigen::Index first = 0;
+    Eigen::Index first = 0;  // number of the first state among all, for the message
   };
-  std::shared_ptr<Nonlinear> nonlinear_;
+  std::shared_ptr<const Nonlinear> nonlinear_;  // null of a linear prior
 };
 
 /// evaluate_features at the states first … first + n − 1.

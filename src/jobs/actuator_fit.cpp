@@ -12,6 +12,7 @@
 #include "base/parallel.hpp"
 #include "gp2/jobs/fit_memory.hpp"
 #include "gp2/training/robust.hpp"
+#include "inference/requirements.hpp"
 #include "training/curvature.hpp"
 #include "training/lbfgsb.hpp"
 #include "training/objective.hpp"
@@ -336,7 +337,9 @@ class ActuatorTraining {
 }  // namespace
 
 std::vector<ActuatorEstimate> estimate_actuators(const FitProblem& problem, const FitOptions& options) {
-  return problem.late.empty() ? std::vector<ActuatorEstimate>() : ActuatorTraining(problem, options).run();
+  if (problem.late.empty()) return {};
+  require_linear(problem.prior, "the estimate of a delay or a lag");
+  return ActuatorTraining(problem, options).run();
 }
 
 std::vector<std::string> actuator_notes(const std::vector<ActuatorEstimate>& estimates) {

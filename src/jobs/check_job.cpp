@@ -18,6 +18,7 @@
 #include "gp2/simulation/projected_states.hpp"
 #include "inference/nonlinear_motion.hpp"
 #include "jobs/read_observations.hpp"
+#include "mechanics/known_multipliers.hpp"
 
 namespace gp2 {
 
@@ -94,24 +95,33 @@ class LoadCheck {
         rows_(std::move(rows)),
         parameters_(prior_.system->parameter_values()),
         mechanics_(require_mechanics(*prior_.system, states_, parameters_)),
-        multipliers_(evaluate_view(View::multipliers(*prior_.system), mechanics_, states_)),
-        values_(require_prior_values(prior_, states_, parameters_, mechanics_)) {}
+        values_(evaluate_prior(prior_, states_, parameters_, mechanics_)) {}
 
   void run(std::vector<Finding>& findings) const {
+    if (values_.fault) {
+      const Eigen::Index row = rows_[static_cast<std::size_t>(values_.fault->state)];
+      findings.push_back({Level::error, fmt::format("{} at state {}", values_.fault->text, row + 1)});
+      return;
+    }
     for (std::size_t a = 0; a < prior_.latents.size(); ++a) {
       const Latent& latent = prior_.latents[a];
-      if (!latent.directions) continue;
+      if (!reads_load(latent, parameters_)) continue;
       for (int l = 0; l < latent.size(); ++l) {
         const std::string name =
             latent.size() == 1 ? fmt::format("latent '{}'", latent.name)
                                : fmt::format("latent '{}', {}", latent.name, latent.column_names[static_cast<std::size_t>(l)]);
         if (latent.directions->of_multipliers() != nullptr) {
           add_jam(name, a, l, findings);
-        } else if (latent.directions->make_evaluator(parameters_)->tapes().n_loads > 0) {
+        } else {
           add_left_out(name, a, l, findings);
         }
       }
     }
+  }
+
+  /// Whether directions read λ₀ or λ.
+  static bool reads_load(const Latent& latent, const Eigen::VectorXd& parameters) {
+    return latent.directions && latent.directions->make_evaluator(parameters)->tapes().n_loads > 0;
   }
 
  private:
@@ -119,12 +129,14 @@ class LoadCheck {
 
   // how much of the load under the known force a coefficient of 1 changes (theory.md, T46: κ)
   void add_left_out(const std::string& name, std::size_t a, int l, std::vector<Finding>& findings) const {
+    const ViewValues multipliers = evaluate_view(View::multipliers(*prior_.system), mechanics_, states_);
+    const Eigen::MatrixXd known = with_known_multipliers(*prior_.system, states_, parameters_).bottomRows(prior_.system->nc());
+    // beside a load that is hardly there everything is large
+    const double least = 0.1 * std::sqrt(known.colwise().squaredNorm().mean());
     double largest = 0;
     for (int i = 0; i < states_.cols(); ++i) {
-      const UdwadiaKalaba& projection = mechanics_.projections[static_cast<std::size_t>(i)];
-      const Eigen::VectorXd known =
-          multipliers_.G(i) * projection.solve_mass(mechanics_.values.F(i)) + multipliers_.offset.col(i);
-      if (known.norm() > 0) largest = std::max(largest, (multipliers_.G(i) * values_.E(a, i).col(l)).norm() / known.norm());
+      const double load = known.col(i).norm();
+      if (load > least) largest = std::max(largest, (multipliers.G(i) * values_.E(a, i).col(l)).norm() / load);
     }
     if (largest < 1e-6) return;
     findings.push_back({largest > enough ? Level::warning : Level::good,
@@ -160,7 +172,6 @@ class LoadCheck {
   std::vector<Eigen::Index> rows_;
   Eigen::VectorXd parameters_;
   MechanicsBatch mechanics_;
-  ViewValues multipliers_;
   PriorValues values_;
 };
 
@@ -169,6 +180,8 @@ void check_load(const Model& model, const Eigen::MatrixXd& states, std::vector<F
   PriorOptions options;
   options.mean = Prior::Mean::force;
   const Prior prior = make_prior(model, options);
+  const Eigen::VectorXd parameters = prior.system->parameter_values();
+  if (std::ranges::none_of(prior.latents, [&](const Latent& one) { return LoadCheck::reads_load(one, parameters); })) return;
   const std::vector<bool> reads = prior.reads();
   std::vector<Eigen::Index> rows;
   for (Eigen::Index i = 0; i < states.cols(); i += std::max<Eigen::Index>(1, states.cols() / enough)) {

@@ -85,4 +85,28 @@ class MultiplierSolver {
   bool is_finite_ = true;
 };
 
+/// How ā answers to a change of λ where λ answers to ā: K = J D⁻¹, J = ∂ā/∂λ, D = I − G J (theory.md, T47). Allocates nothing where the
+/// sizes are those of the call before.
+class LoadResponse {
+ public:
+  /// @param J  (nq × nc)
+  /// @param G  of the multipliers (nc × nq)
+  void compute(const Eigen::MatrixXd& J, const Eigen::Ref<const Eigen::MatrixXd>& G) {
+    D_transposed_.setIdentity(J.cols(), J.cols());
+    D_transposed_.noalias() -= J.transpose().lazyProduct(G.transpose());
+    lu_.compute(D_transposed_);
+    J_transposed_ = J.transpose();
+    K_transposed_ = lu_.solve(J_transposed_);
+    K_ = K_transposed_.transpose();
+  }
+
+  [[nodiscard]] const Eigen::MatrixXd& K() const { return K_; }
+  /// X D⁻¹
+  [[nodiscard]] Eigen::MatrixXd over_D(const Eigen::MatrixXd& X) const { return lu_.solve(X.transpose()).transpose(); }
+
+ private:
+  Eigen::MatrixXd D_transposed_, J_transposed_, K_transposed_, K_;
+  Eigen::PartialPivLU<Eigen::MatrixXd> lu_;
+};
+
 }  // namespace gp2

@@ -480,8 +480,8 @@ std::string internal::unknown_entries(const System& system, const Ref<const Matr
   return unknown.empty() ? "" : ", and of what the equations read " + unknown;
 }
 
-std::string internal::describe_fault(const System& system, const Ref<const MatrixXd>& states,
-                                     const MechanicsBatch::Fault& fault) {
+std::string internal::describe_fault(const System& system, const Ref<const MatrixXd>& states, const MechanicsBatch::Fault& fault,
+                                     Index first) {
   const std::vector<std::string> names = system.state_names();
   std::string where;
   for (Index row = 0; row < states.rows(); ++row) {
@@ -489,7 +489,7 @@ std::string internal::describe_fault(const System& system, const Ref<const Matri
     if (std::isnan(value)) continue;
     where += fmt::format("{}{} = {:.6g}", where.empty() ? "" : ", ", names[static_cast<std::size_t>(row)], value);
   }
-  return fmt::format("system '{}': {} at state {} ({})", system.name(), fault.text, fault.state + 1, where);
+  return fmt::format("system '{}': {} at state {} ({})", system.name(), fault.text, first + fault.state + 1, where);
 }
 
 int MechanicsBatch::first_singular() const {
