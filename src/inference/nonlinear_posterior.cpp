@@ -158,7 +158,12 @@ void Posterior::Implementation::condition_nonlinear() {
   if (!linearisation) static_cast<void>(require_models(prior, observations, values.parameters, nullptr));  // names the state
   double objective = fit.objective(at, *linearisation);
   for (int step = 0; step < most; ++step) {
-    fit.condition(linearisation);
+    try {
+      fit.condition(linearisation);
+    } catch (const NumericalError&) {
+      if (step == 0) throw;
+      break;  // next to a jam slopes have no bound
+    }
     const LatentValues target = fit.mean();
     const double distance = std::sqrt(target.squared_distance(at) / (1 + target.squared_distance(fit.zero())));
     if (distance <= enough) return;
@@ -179,10 +184,13 @@ void Posterior::Implementation::condition_nonlinear() {
     if (distance <= 1e-4) return;  // rounding of the objective
     break;
   }
+  Index n_values = 0;
+  for (const Observations& group : observations) n_values += group.values().size();
   throw NumericalError(fmt::format(
-      "the posterior of latents that enter nonlinearly was not found in {} Gauss–Newton steps: write the directions so "
+      "the posterior of latents that enter nonlinearly was not found: Gauss–Newton steps leave {:.3g} times the "
+      "noise unexplained: do the signs of the directions, and what is known, fit the machine? Else write the directions so "
       "that the coefficients are small, or start from smaller signal standard deviations",
-      most));
+      std::sqrt(2 * objective / static_cast<double>(n_values))));
 }
 
 std::shared_ptr<const Linearisation> linearisation_of(const Prior& prior, const std::vector<Observations>& observations,

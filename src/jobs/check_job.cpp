@@ -5,6 +5,7 @@
 #include <iterator>
 #include <mutex>
 #include <numbers>
+#include <set>
 #include <utility>
 
 #include <fmt/format.h>
@@ -13,6 +14,7 @@
 #include "base/not_a_number.hpp"
 #include "gp2/base/statistics.hpp"
 #include "gp2/jobs/fit_problem.hpp"
+#include "gp2/mechanics/udwadia_kalaba.hpp"
 #include "gp2/prior.hpp"
 #include "gp2/simulation/generate.hpp"
 #include "gp2/simulation/projected_states.hpp"
@@ -175,6 +177,41 @@ class LoadCheck {
   PriorValues values_;
 };
 
+// Rows whose multipliers latents read, and which follow from others: which share of the load is theirs is a choice.
+void check_shares(const Model& model, const Eigen::MatrixXd& states, std::vector<Finding>& findings) {
+  constexpr double rounding = 1e-6;
+  const System& system = *model.system;
+  std::set<std::string> read;
+  for (const LatentSpec& latent : model.latents) {
+    const auto add = [&](const std::string& text) {
+      for (const std::string& variable : model.graph->variables_of(model.expression(text))) read.insert(variable);
+    };
+    if (!latent.feature_code) std::for_each(latent.features.begin(), latent.features.end(), add);
+    if (latent.direction_code) continue;
+    for (const std::vector<std::string>& row : latent.directions) std::for_each(row.begin(), row.end(), add);
+  }
+  const SystemValues values = system.evaluate(states, system.parameter_values());
+  std::vector<bool> is_shared(static_cast<std::size_t>(system.nc()), false);
+  for (int i = 0; i < states.cols(); ++i) {
+    const UdwadiaKalaba projection(values.M(i), values.A(i), values.b(i));
+    if (!projection.motion_is_determined()) continue;
+    const Eigen::MatrixXd shares =
+        projection.multipliers_of_force() * values.A(i).transpose();  // the identity of independent rows
+    for (int row = 0; row < system.nc(); ++row)
+      if (!values.A(i).row(row).isZero(0) && shares(row, row) < 1 - rounding) is_shared[static_cast<std::size_t>(row)] = true;
+  }
+  for (int row = 0; row < system.nc(); ++row) {
+    for (const char* name : {"lambda0", "lambda"}) {
+      const std::string variable = fmt::format("{}({})", name, row + 1);
+      if (!is_shared[static_cast<std::size_t>(row)] || !read.contains(variable)) continue;
+      findings.push_back({Level::warning,
+                          fmt::format("{}: the constraint '{}' follows from others, so that nothing tells its share of the load: "
+                                      "remove the rows that repeat others",
+                                      variable, system.constraint_labels()[static_cast<std::size_t>(row)])});
+    }
+  }
+}
+
 void check_load(const Model& model, const Eigen::MatrixXd& states, std::vector<Finding>& findings) {
   constexpr Eigen::Index enough = 300;  // states, evenly taken
   PriorOptions options;
@@ -190,7 +227,9 @@ void check_load(const Model& model, const Eigen::MatrixXd& states, std::vector<F
       is_known = is_known && !(reads[k] && std::isnan(states(static_cast<Eigen::Index>(k), i)));
     if (is_known) rows.push_back(i);
   }
-  if (!rows.empty()) LoadCheck(prior, states(Eigen::all, rows), rows).run(findings);
+  if (rows.empty()) return;
+  check_shares(model, states(Eigen::all, rows), findings);
+  LoadCheck(prior, states(Eigen::all, rows), rows).run(findings);
 }
 
 // The system, and where that is sound what the prior asks of it.

@@ -53,6 +53,7 @@ class ModelReader : private TomlReader {
     read_parameters();
     declare_symbols();
     read_derived_parameters();
+    declare_rows();
     read_let();
     if (model_.code.mechanics) {
       ask_for_mechanics();
@@ -693,11 +694,9 @@ class ModelReader : private TomlReader {
     return symbols;
   }
 
-  void read_constraints() {
-    if (robot()) {
-      for (auto& [c, name] : robot()->constraints())
-        definition_.constraints.push_back(derive(Level::position, c, std::move(name)));
-    }
+  // calls f(level, entry, key) for each constraint of the file, in the order of the rows
+  template <class Function>
+  void for_each_constraint(Function f) const {
     if (!root_.contains("constraints")) return;
     const toml::table& constraints = table(*root_.get("constraints"), "constraints");
     only_keys(constraints, "constraints", {"position", "velocity", "acceleration"});
@@ -706,18 +705,44 @@ class ModelReader : private TomlReader {
     for (const auto& [level_name, level] : levels) {
       if (!constraints.contains(level_name)) continue;
       const toml::array& rows = array(*constraints.get(level_name), fmt::format("constraints.{}", level_name));
-      for (std::size_t k = 0; k < rows.size(); ++k) {
-        definition_.constraints.push_back(
-            read_constraint(level, *rows.get(k), fmt::format("constraints.{} entry {}", level_name, k + 1)));
-      }
+      for (std::size_t k = 0; k < rows.size(); ++k)
+        f(level, *rows.get(k), fmt::format("constraints.{} entry {}", level_name, k + 1));
     }
+  }
+
+  // lambda(NAME) is lambda(i) of the row i that is called so
+  void declare_rows() {
+    if (model_.code.mechanics) return;
+    std::size_t row = 0;
+    for_each_constraint([&](Level, const toml::node& entry, const std::string& key) {
+      ++row;
+      const toml::node* const node = entry.is_table() ? entry.as_table()->get("name") : nullptr;
+      if (node == nullptr) return;
+      const std::string name = text(*node, key + ".name");
+      declare(name, *node, key + ".name");
+      const std::size_t of_robot = robot() ? robot()->constraints().size() : 0;
+      for (const char* symbol : {"lambda0", "lambda"}) {
+        const Expression multiplier = definition_.graph->variable(fmt::format("{}({})", symbol, of_robot + row));
+        model_.symbols_.emplace(fmt::format("{}({})", symbol, name), multiplier);
+      }
+    });
+  }
+
+  void read_constraints() {
+    if (robot()) {
+      for (auto& [c, name] : robot()->constraints())
+        definition_.constraints.push_back(derive(Level::position, c, std::move(name)));
+    }
+    for_each_constraint([&](Level level, const toml::node& entry, const std::string& key) {
+      definition_.constraints.push_back(read_constraint(level, entry, key));
+    });
   }
 
   // "c", or { expr = "c", noise = 0.05, when = "gap <= 0" }, or { expr = "c", contact = "touch", restitution = 0.8 }
   ConstraintRow read_constraint(Level level, const toml::node& entry, const std::string& key) const {
     if (!entry.is_table()) return read_exact_constraint(level, entry, key);
     const toml::table& more = *entry.as_table();
-    only_keys(more, key, {"expr", "noise", "when", "contact", "restitution"});
+    only_keys(more, key, {"expr", "name", "noise", "when", "contact", "restitution"});
     if (!more.contains("expr") || more.size() < 2) {
       fail(entry, key,
            "expected { expr = \"dx*sin(heading) - dy*cos(heading)\", noise = 0.05 }, or when = \"gap <= 0\", or contact = "

@@ -42,7 +42,7 @@ std::string joined(const Names& names, std::string_view separator) {
 ///     power   = atom [ "^" factor ]
 ///     atom    = number | symbol | function "(" sum { "," sum } ")" | quantity | multiplier | "(" sum ")"
 ///     quantity = symbol "(" name in quotes { "," number } ")" "." symbol
-///     multiplier = ("lambda0" | "lambda") "(" number ")"
+///     multiplier = ("lambda0" | "lambda") "(" (number | word) ")"
 class Parser {
  public:
   Parser(std::string_view text, ExpressionGraph& graph, const std::function<std::optional<Expression>(std::string_view)>& resolve,
@@ -187,11 +187,18 @@ class Parser {
     return graph_.constant(value);
   }
 
-  Expression symbol_or_call() {
+  // letters and digits, and the space behind them
+  std::string_view word() {
     const std::size_t start = position_;
     while (position_ < text_.size() && (is_letter(text_[position_]) || is_digit(text_[position_]))) ++position_;
-    const std::string_view name = text_.substr(start, position_ - start);
+    const std::string_view found = text_.substr(start, position_ - start);
     skip_space();
+    return found;
+  }
+
+  Expression symbol_or_call() {
+    const std::size_t start = position_;
+    const std::string_view name = word();
     if (name == "lambda0" || (name == "lambda" && peek() == '(')) return multiplier(name, start);
     if (peek() == '(') {
       const std::size_t inside = text_.find_first_not_of(" \t\n\r", position_ + 1);
@@ -228,10 +235,7 @@ class Parser {
     close(open);
     if (peek() != '.') fail(position_, fmt::format("found {} where a component must stand, as in {}).x", found(), symbol));
     ++position_;
-    const std::size_t component = position_;
-    while (position_ < text_.size() && (is_letter(text_[position_]) || is_digit(text_[position_]))) ++position_;
-    symbol += fmt::format(").{}", text_.substr(component, position_ - component));
-    skip_space();
+    symbol += fmt::format(").{}", word());
     std::optional<Expression> resolved;
     try {
       resolved = resolve_(symbol);
@@ -242,21 +246,26 @@ class Parser {
     return *resolved;
   }
 
-  /// lambda0(1) or lambda(1), a symbol that is resolved by its text without spaces.
+  /// lambda0(1), lambda(1) or lambda(wall), a symbol that is resolved by its text without spaces.
   Expression multiplier(std::string_view name, std::size_t start) {
     constexpr double most = 1e6;
     const std::size_t open = position_;
-    double row = 0;
+    std::string row;
     if (peek() == '(') {
       take();
-      const Expression number = factor();
-      if (number.is_constant()) row = number.constant_value();
+      if (is_letter(peek())) {
+        row = word();
+      } else if (const Expression number = factor(); number.is_constant()) {
+        const double value = number.constant_value();
+        if (value >= 1 && value <= most && value == std::floor(value)) row = fmt::format("{}", static_cast<int>(value));
+      }
     }
-    if (!(row >= 1 && row <= most) || row != std::floor(row)) {
-      fail(start, fmt::format("{0} takes the number of a row of the constraints, counted from 1; write {0}(1)", name));
+    if (row.empty()) {
+      fail(start,
+           fmt::format("{0} takes the number of a row of the constraints, counted from 1, or its name; write {0}(1)", name));
     }
     close(open);
-    const auto resolved = resolve_(fmt::format("{}({})", name, static_cast<int>(row)));
+    const auto resolved = resolve_(fmt::format("{}({})", name, row));
     if (!resolved)
       fail(start, fmt::format("{} is a multiplier of the constraints of a model, of which there is none here", name));
     return *resolved;

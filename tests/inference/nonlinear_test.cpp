@@ -131,6 +131,21 @@ TEST(CheckOfALoad, SaysWhatTheKnownForceLeavesOutAndFromWhereOnTheContactJams) {
   EXPECT_THAT(finding(model).text, testing::HasSubstr(fmt::format("from a coefficient of {:.3g} on it jams", jam)));
 }
 
+TEST(CheckOfALoad, WarnsOfARowWhoseShareOfItNothingTells) {
+  const auto warnings = [](const std::string& rows) {
+    std::string text = rubbing_bead("lambda").text;
+    const std::string alone = R"(["z - h*x^2"])";
+    text.replace(text.find(alone), alone.size(), rows);
+    std::vector<std::string> found;
+    for (const Finding& one : check(Model::parse(text, "bead"), nullptr, {}))
+      if (one.level == Finding::Level::warning) found.push_back(one.text);
+    return found;
+  };
+  EXPECT_THAT(warnings(R"(["z - h*x^2"])"), testing::IsEmpty());
+  EXPECT_THAT(warnings(R"(["z - h*x^2", "2*z - 2*h*x^2"])"),
+              testing::ElementsAre(testing::StartsWith("lambda(1): the constraint 'z - h*x^2' follows from others")));
+}
+
 // ---------------------------------------------------------------- the linear prior
 
 struct Rubs {

@@ -480,9 +480,15 @@ std::vector<Complaint> complaints() {
        "10: latent.features: lambda0(2): there is no such row of the constraints, of which there are 1"},
       {"LoadWithoutConstraints", base + "[truth]\nforce = [\"0\", \"lambda0(1)\"]\n",
        "8: truth.force entry 2: lambda0(1): there is no such row of the constraints, of which there are 0"},
-      {"LoadWithoutARow", base + "[let]\nload = \"2*lambda0(q1)\"\n",
-       "8: let.load: \"2*lambda0(q1)\", column 3: lambda0 takes the number of a row of the constraints, counted from 1; write "
-       "lambda0(1)"},
+      {"LoadWithoutARow", base + "[let]\nload = \"2*lambda0(1.5)\"\n",
+       "8: let.load: \"2*lambda0(1.5)\", column 3: lambda0 takes the number of a row of the constraints, counted from 1, or its "
+       "name; write lambda0(1)"},
+      {"LoadOfARowWithoutName",
+       base + "[constraints]\nposition = [{ expr = \"q1\", name = \"wall\" }]\n"
+              "[[latent]]\nfeatures = [\"lambda0(wal)\"]\n",
+       "10: latent.features: lambda0(wal): there is no such row of the constraints, of which there are 1"},
+      {"NameOfARowTaken", base + "[constraints]\nposition = [{ expr = \"q1\", name = \"q2\" }]\n",
+       "8: constraints.position entry 1.name: the name 'q2' is taken already; choose another"},
       {"NameOfTheLoad", base + "[let]\nlambda0 = \"1\"\n",
        "8: let.lambda0: 'lambda0' is the name of a function or constant; choose another"},
       // what may not stand there is not listed as known
@@ -639,6 +645,21 @@ std::vector<Complaint> complaints() {
 
 INSTANTIATE_TEST_SUITE_P(For, RefusedModel, testing::ValuesIn(complaints()),
                          [](const auto& complaint) { return complaint.param.what; });
+
+TEST(Model, ARowGoesByItsName) {
+  const Model model = Model::parse(R"toml(
+coordinates = ["x", "y"]
+[mechanics]
+mass = [["1", "0"], ["0", "1"]]
+[let]
+load = "abs(lambda(wall)) + lambda0( floor )"
+[constraints]
+acceleration = [{ expr = "ddy", name = "floor" }]
+position     = ["x - y", { expr = "x", name = "wall" }]
+)toml",
+                                   "named");
+  EXPECT_EQ(model.expression("load"), model.expression("abs(lambda(2)) + lambda0(3)"));
+}
 
 TEST(Model, BrokenTomlIsRefusedWithItsLine) {
   EXPECT_THAT(error_of(base + "\nforce = [\"0\"\n[let]\n"), StartsWith("m.toml:9: not valid TOML: "));

@@ -115,7 +115,7 @@ TEST(LoadFunctionTest, ARowThatIsNotThereIsAnError) {
   EXPECT_THAT(error_of("2*lambda0(2)"), testing::StartsWith("latent 'wear': lambda0(2): there is no such row"));
   EXPECT_THAT(error_of("lambda0"), testing::HasSubstr("write lambda0(1)"));
   EXPECT_THAT(error_of("lambda0(0)"), testing::HasSubstr("counted from 1"));
-  EXPECT_THAT(error_of("lambda0(q1)"), testing::HasSubstr("counted from 1"));
+  EXPECT_THAT(error_of("lambda0(q1)"), testing::HasSubstr("lambda0(q1): there is no such row"));
   EXPECT_THAT(error_of("lambda0(1.5)"), testing::HasSubstr("counted from 1"));
 }
 
