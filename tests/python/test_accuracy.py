@@ -26,15 +26,17 @@ def test_halves_are_apart_and_whole(bench):
 
 
 def test_the_default_prior_is_sharper_and_more_honest_than_one_kernel_for_all_directions(bench):
-    ratios, fast_ratios, covered = [], [], []
+    ratios, fast_ratios, covered, of_motions = [], [], [], []
     for file in bench.mechanisms("report"):
         if file.stem not in {"pulley", "surface", "two_link_tip"}:
             continue
-        today, default = (bench.cell(file, prior, 20, 3, 2) for prior in ("today", "default"))
+        today, default = (bench.cell(file, prior, 20, 3, 2, motions) for prior, motions in (("today", 0), ("default", 3)))
         ratios.append(default[0] / today[0])
         fast_ratios.append(default[2] / today[2])
         covered.append(default[1])
+        of_motions.append(default[5])
     assert len(ratios) == 3
     assert math.exp(statistics.fmean(map(math.log, ratios))) < 1
     assert math.exp(statistics.fmean(map(math.log, fast_ratios))) < 0.9
     assert statistics.fmean(covered) > 0.85
+    assert statistics.fmean(of_motions) > 0.6
