@@ -119,13 +119,13 @@ struct Term {
   Index first = 0;            // of its functions among all
   Index n_points = 0;         // the most of all components
   std::unique_ptr<StateFunction::Evaluator> features, directions;
-  VectorXd admissible;  // s, of directions that the constraint changes; else empty
+  VectorXd admissible;             // s, of directions that the constraint changes; else empty
+  bool reads_multipliers = false;  // λ, in directions
 
   [[nodiscard]] bool has_directions() const { return of->directions != nullptr; }
   [[nodiscard]] bool is_admissible() const { return admissible.size() > 0; }
-  [[nodiscard]] bool reads_load() const {
-    return features->tapes().n_loads > 0 || (has_directions() && directions->tapes().n_loads > 0);
-  }
+  [[nodiscard]] bool features_read_load() const { return features->tapes().n_loads > 0; }
+  [[nodiscard]] bool directions_read_load() const { return has_directions() && directions->tapes().n_loads > 0; }  // λ₀
   [[nodiscard]] bool reads_features() const {
     return std::any_of(kernel.terms().begin(), kernel.terms().end(), [](const Kernel::Term& term) {
       return std::any_of(term.factors.begin(), term.factors.end(),
@@ -157,11 +157,12 @@ class Writer {
   [[nodiscard]] std::string inverse_of(const LatentPosterior& latents, std::size_t k);
   void write_expressions();
   [[nodiscard]] std::string program(const Tape& tape, const std::vector<std::string>& results, bool with_parameters,
-                                    int n_loads = 0) const;
+                                    const std::vector<std::string>& loads = {}) const;
   void write_kernels();
   [[nodiscard]] std::string factor_call(const std::string& verb, const Kernel::Factor& factor, Index D,
                                         const std::string& value) const;
   void write_signals();
+  void write_under_load();
   void write_view();
   void write_stddev();
   void write_jacobian();
@@ -179,8 +180,8 @@ class Writer {
   CSourceOptions options_;
   Prior prior_;  // where the view looks
   StateLayout layout_;
-  std::vector<std::string> inputs_;  // what C calls the entries of a state, then the parameters
-  std::vector<std::string> loads_;   // and the multipliers λ₀
+  std::vector<std::string> inputs_;                           // what C calls the entries of a state, then the parameters
+  std::vector<std::string> known_multipliers_, multipliers_;  // and λ₀, λ
   std::vector<Term> terms_;
   std::unique_ptr<StateEvaluator> values_, derivatives_;
   bool all_rows_ = true;
@@ -226,7 +227,9 @@ Writer::Writer(const Posterior& posterior, std::vector<Component> components, Vi
     term.features = of.features->make_evaluator(VectorXd());
     require_expressions(term.features->tapes().values, fmt::format("features of latent '{}'", of.name));
     if (!term.has_directions()) continue;
-    term.directions = of.directions->make_evaluator(parameters);
+    const StateFunction* const of_multipliers = of.directions->of_multipliers();
+    term.reads_multipliers = of_multipliers != nullptr;
+    term.directions = (of_multipliers != nullptr ? *of_multipliers : *of.directions).make_evaluator(parameters);
     require_expressions(term.directions->tapes().values, fmt::format("directions of latent '{}'", of.name));
     if (of.base != Latent::Base::admissible || system().nc() == 0) continue;
     VectorXd B(term.p * term.p);
@@ -244,7 +247,8 @@ Writer::Writer(const Posterior& posterior, std::vector<Component> components, Vi
   };
   for (const std::string& name : system().state_names()) add_name(name, inputs_);
   for (const Parameter& parameter : system().parameters()) add_name(parameter.name, inputs_);
-  for (int k = 1; k <= system().nc(); ++k) add_name(fmt::format("lambda0_{}", k), loads_);
+  for (int k = 1; k <= system().nc(); ++k) add_name(fmt::format("lambda0_{}", k), known_multipliers_);
+  for (int k = 1; k <= system().nc(); ++k) add_name(fmt::format("lambda_{}", k), multipliers_);
   for (std::size_t r = 0; r < view_.rows.size(); ++r) all_rows_ = all_rows_ && view_.rows[r] == static_cast<int>(r);
   set_conditions();
   set_sizes();
@@ -265,19 +269,22 @@ void Writer::set_conditions() {
   set("constant", view_.has_mean() && prior_.mean == Prior::Mean::constant);
   set("forced_latent", has_forced_latent);
   set("forced", has_forced_latent || has("known"));
-  set("moved", parts.constrained_acceleration || parts.constraint_force);
+  set("nonlinear", std::any_of(terms_.begin(), terms_.end(), [](const Term& term) { return term.reads_multipliers; }));
+  set("moved", parts.constrained_acceleration || parts.constraint_force || has("nonlinear"));
   set("reaction", parts.constraint_force);
   set("abar", parts.unconstrained_acceleration);
   set("applied", parts.applied_force);
   set("multipliers", view_.quantity == View::Quantity::multipliers);
-  set("load", std::any_of(terms_.begin(), terms_.end(), [](const Term& term) { return term.reads_load(); }));
-  set("least_norm", has("multipliers") || has("load"));
+  set("load", std::any_of(terms_.begin(), terms_.end(),
+                          [](const Term& term) { return term.features_read_load() || term.directions_read_load(); }));
+  set("loaded", has("load") || has("nonlinear"));
+  set("least_norm", has("multipliers") || has("loaded"));
   set("stddev", options_.stddev);
   set("jacobian", options_.jacobian);
   set("mixture", components_.size() > 1);
   set("sums", options_.stddev && components_.front()->latents->sums() != nullptr);
   set("by_function", n_functions_ < view_.size());
-  set("forced_solves", has("forced") || has("load") || (options_.jacobian && has("moved")));
+  set("forced_solves", has("forced") || has("loaded") || (options_.jacobian && has("moved")));
   set("solves", has("rows") || has("forced_solves"));
 }
 
@@ -316,6 +323,7 @@ void Writer::set_sizes() {
       {"well_conditioned", single ? "1e-2f" : "1e-4"},
       {"small_norm", single ? "1e-15f" : "1e-140"},
       {"large_norm", single ? "1e15f" : "1e140"},
+      {"newton", single ? "4e-6f" : "1.5e-14"},
       {"smallest_row", single ? "1.17549435e-38f" : "2.2250738585072014e-308"},
       {"if_singular", what_needs_acceleration(prior_, view_) ? "NO_UNCONSTRAINED_ACCELERATION" : "OK"},
   };
@@ -342,6 +350,12 @@ void Writer::set_sizes() {
   }
   add(fmt::format("a_bar[{0}], force[{0}], a_of_force[{0}]", nq));
   if (has("load")) add(fmt::format("x[{}], a0[{}]", nx + nc, nq));
+  if (has("nonlinear")) {
+    add(fmt::format("y[{}], G_lambda[{}], d_lambda[{}], D_lambda[{}]", nx + nc, nc * nq, nc, nc * nc));
+    add(fmt::format("without_load[{0}], rest_of_load[{0}], force_of_load[{0}], a_under_load[{0}], a_at_zero[{0}]", nq));
+    add(fmt::format("slope[{0}], rest_slope[{0}], force_slope[{0}]", nq * nc));
+    add_workspace(fmt::format("int order_lambda[{}];", nc));
+  }
   if (has("moved")) add(fmt::format("a[{0}], gap[{0}], of_constraint[{0}]", nq));
   if (has("applied")) add(fmt::format("applied[{}]", nq));
   Index widest = 0, most_points = 1, most_derivatives = 1;
@@ -371,9 +385,10 @@ void Writer::set_sizes() {
     if (has("sums")) add(fmt::format("rows[{}]", n_cross_rows_ * n_columns));
     if (has("mixture")) add(fmt::format("means[{0}], stddevs[{0}]", std::ssize(components_) * nr));
   }
+  if (has("jacobian") || has("nonlinear")) add(fmt::format("derivative[{}]", most_derivatives));
   if (has("jacobian")) {
     const Index n = nq * nx;
-    add(fmt::format("dsignal[{}], derivative[{}]", widest, most_derivatives));
+    add(fmt::format("dsignal[{}]", widest));
     add(fmt::format("d_of_rest[{0}], d_force[{0}]", n));
     if (has("abar")) add(fmt::format("d_a_bar[{}]", n));
     if (has("applied")) add(fmt::format("d_applied[{}]", n));
@@ -381,7 +396,8 @@ void Writer::set_sizes() {
     if (has("moved") && has("rows")) add(fmt::format("d_forced[{}], d_rows[{}]", n, nc * nx));
     if (has("reaction")) add(fmt::format("d_mass_a_bar[{}]", n));
     if (has("multipliers")) add(fmt::format("of_rows[{}]", nc * nx));
-    if (has("load")) add(fmt::format("d_forced0[{0}], d_rows0[{1}], d_along[{1}], d_lambda0[{1}]", n, nc * nx));
+    if (has("loaded")) add(fmt::format("d_along[{}]", nc * nx));
+    if (has("load")) add(fmt::format("d_forced0[{0}], d_rows0[{1}], d_lambda0[{1}]", n, nc * nx));
   }
   if (has("mixture")) add(has("jacobian") ? fmt::format("mean[{}], jacobian[{}]", nr, nr * nx) : fmt::format("mean[{}]", nr));
 }
@@ -530,12 +546,13 @@ std::string Writer::function(const std::string& wanted, const std::string& head,
   return known->second;
 }
 
-// @param n_loads  of λ₀, which stand behind the state
-std::string Writer::program(const Tape& tape, const std::vector<std::string>& results, bool with_parameters, int n_loads) const {
+// @param loads  what stands behind the state
+std::string Writer::program(const Tape& tape, const std::vector<std::string>& results, bool with_parameters,
+                            const std::vector<std::string>& loads) const {
   std::string text;
-  const int n_varying = layout_.size() + n_loads;
   std::vector<std::string> inputs(inputs_.begin(), inputs_.begin() + layout_.size());
-  inputs.insert(inputs.end(), loads_.begin(), loads_.begin() + n_loads);
+  inputs.insert(inputs.end(), loads.begin(), loads.end());
+  const int n_varying = static_cast<int>(inputs.size());
   if (with_parameters) inputs.insert(inputs.end(), inputs_.begin() + layout_.size(), inputs_.end());
   bool reads_state = false, reads_parameters = false;
   for (int i = 0; i < static_cast<int>(inputs.size()); ++i) {
@@ -592,14 +609,17 @@ void Writer::write_expressions() {
     return entries;
   };
   const auto write = [&](const std::string& name, StateFunction::Evaluator& of, Index n, bool with_parameters,
-                         bool is_differentiated) {
+                         bool is_differentiated, bool reads_multipliers) {
     const std::string arguments = std::string(with_parameters ? "const real *parameters, " : "") + "const real *state, real *out";
     const StateFunction::Evaluator::Tapes tapes = of.tapes();
-    texts_[name] = function(name, arguments, program(*tapes.values, vector("out", n), with_parameters, tapes.n_loads));
+    const std::vector<std::string> loads = reads_multipliers   ? multipliers_
+                                           : tapes.n_loads > 0 ? known_multipliers_
+                                                               : std::vector<std::string>();
+    texts_[name] = function(name, arguments, program(*tapes.values, vector("out", n), with_parameters, loads));
     const Index n_entries = std::ssize(*tapes.entries);
     if (!is_differentiated || n_entries == 0) return;
     texts_["d_" + name] =
-        function("d_" + name, arguments, program(*tapes.derivatives, vector("out", n_entries), with_parameters, tapes.n_loads));
+        function("d_" + name, arguments, program(*tapes.derivatives, vector("out", n_entries), with_parameters, loads));
     std::vector<std::string> entries;
     for (const StateDerivatives::Entry& entry : *tapes.entries) {
       entries.push_back(with_parameters ? fmt::format("{{{}, {}, {}}}", entry.output % nq, entry.output / nq, entry.state_index)
@@ -615,11 +635,13 @@ void Writer::write_expressions() {
     texts_["of_" + name] = known->second;
   };
   for (std::size_t a = 0; a < terms_.size(); ++a) {
-    write(fmt::format("features_{}", a), *terms_[a].features, terms_[a].D, false, has("jacobian") && terms_[a].reads_features());
-    if (terms_[a].is_admissible()) {
-      texts_["admissible"] = table("admissible", terms_[a].admissible.data(), terms_[a].p);
-    } else if (terms_[a].has_directions()) {
-      write(fmt::format("directions_{}", a), *terms_[a].directions, nq * terms_[a].p, true, has("jacobian"));
+    const Term& term = terms_[a];
+    write(fmt::format("features_{}", a), *term.features, term.D, false, has("jacobian") && term.reads_features(), false);
+    if (term.is_admissible()) {
+      texts_["admissible"] = table("admissible", term.admissible.data(), term.p);
+    } else if (term.has_directions()) {
+      write(fmt::format("directions_{}", a), *term.directions, nq * term.p, true, has("jacobian") || term.reads_multipliers,
+            term.reads_multipliers);
     }
   }
   // what they call
@@ -753,7 +775,10 @@ void Writer::write_kernels() {
 // ---------------------------------------------------------------- mean
 
 // where a function finds its state
-const char* state_of(const StateFunction::Evaluator& function) { return function.tapes().n_loads > 0 ? "w->x" : "state"; }
+const char* state_of_features(const Term& term) { return term.features_read_load() ? "w->x" : "state"; }
+const char* state_of_directions(const Term& term) {
+  return term.reads_multipliers ? "w->y" : term.directions_read_load() ? "w->x" : "state";
+}
 
 void Writer::write_signals() {
   std::string& text = texts_["signals"];
@@ -763,7 +788,7 @@ void Writer::write_signals() {
     text +=
         fmt::format("\n  /* latent {}: {} of {} */\n", in_comment(term.of->name.empty() ? std::to_string(a + 1) : term.of->name),
                     in_comment(term.kernel.text()), in_comment(fmt::format("{}", fmt::join(term.of->feature_names, ", "))));
-    text += fmt::format("  {}({}, w->phi_{});\n", texts_[fmt::format("features_{}", a)], state_of(*term.features), a);
+    text += fmt::format("  {}({}, w->phi_{});\n", texts_[fmt::format("features_{}", a)], state_of_features(term), a);
     text += fmt::format("  if (!is_finite({}, w->phi_{})) return {}_NOT_FINITE;\n", term.D, a, options_.name);
     text +=
         fmt::format("  {0}(&c->latents[{1}], w->phi_{1}, w->k_{1}, w->scratch);\n", texts_[fmt::format("covariance_{}", a)], a);
@@ -771,11 +796,14 @@ void Writer::write_signals() {
         "  for (int l = 0; l < {1}; ++l) {{\n    const latent *const a = &c->latents[{0}];\n"
         "    w->signal_{0}[l] = weighted_sum(a->n, w->k_{0}, a->weights + a->n * l);\n  }}\n",
         a, term.p);
+    if (term.of->is_positive)
+      text += fmt::format("  for (int l = 0; l < {1}; ++l) w->signal_{0}[l] = exp(w->signal_{0}[l]);\n", a, term.p);
+    if (term.reads_multipliers) continue;
     if (term.has_directions()) {
       text += term.is_admissible() ? fmt::format("  for (int i = 0; i < NQ * NQ; ++i) w->B_{}[i] = w->P[i] * {}[i / NQ];\n", a,
                                                  texts_["admissible"])
                                    : fmt::format("  {}(c->parameters, {}, w->B_{});\n", texts_[fmt::format("directions_{}", a)],
-                                                 state_of(*term.directions), a);
+                                                 state_of_directions(term), a);
       text += fmt::format("  for (int l = 0; l < {}; ++l) {{\n", term.p);
       text +=
           fmt::format("    for (int i = 0; i < NQ; ++i) w->{0}[i] += w->B_{1}[i + NQ * l] * w->signal_{1}[l];\n  }}\n", to, a);
@@ -785,6 +813,26 @@ void Writer::write_signals() {
   }
   if (!terms_.empty()) text += "\n";
   if (has("constant")) texts_["mu"] = numbers(prior_.constant_mean.data(), prior_.constant_mean.size());
+}
+
+// The latents whose directions read λ, at w->y = [state; λ]
+void Writer::write_under_load() {
+  std::string& text = texts_["under_load"];
+  for (std::size_t a = 0; a < terms_.size(); ++a) {
+    const Term& term = terms_[a];
+    if (!term.reads_multipliers) continue;
+    const std::string directions = fmt::format("directions_{}", a), part = term.is_forced() ? "force" : "rest";
+    text += fmt::format(
+        "  {0}(c->parameters, w->y, w->B_{1});\n  for (int l = 0; l < {2}; ++l) {{\n"
+        "    for (int i = 0; i < NQ; ++i) w->{3}_of_load[i] += w->B_{1}[i + NQ * l] * w->signal_{1}[l];\n  }}\n",
+        texts_[directions], a, term.p, part);
+    if (term.directions->tapes().entries->empty()) continue;
+    text += fmt::format(
+        "  {0}(c->parameters, w->y, w->derivative);\n  for (int e = 0; e < {1}; ++e) {{\n"
+        "    const int i = {2}[e][0], l = {2}[e][1], k = {2}[e][2] - NX;\n"
+        "    if (k >= 0) w->{3}_slope[i + NQ * k] += w->derivative[e] * w->signal_{4}[l];\n  }}\n",
+        texts_["d_" + directions], term.directions->tapes().entries->size(), texts_["of_" + directions], part, a);
+  }
 }
 
 // What each quantity is of the motion: value, G transposed and derivative.
@@ -888,7 +936,8 @@ void Writer::write_stddev() {
     } else {
       loadings += fmt::format("        const real along = w->{}[l + NQ * r];\n", G);
     }
-    loadings += fmt::format("        sum += c->latents[{}].loading[l + {} * f] * along;\n      }}\n", a, term.p);
+    loadings += fmt::format("        sum += c->latents[{0}].loading[l + {1} * f] * along{2};\n      }}\n", a, term.p,
+                            term.of->is_positive ? fmt::format(" * w->signal_{}[l]", a) : "");
     loadings +=
         fmt::format("      w->loading[{} * r + {} + f] = sum;\n      variance[r] += prior_{} * sum * sum;\n    }}\n  }}\n",
                     n_functions_, term.first, a);
@@ -909,13 +958,14 @@ void Writer::write_stddev() {
 // ---------------------------------------------------------------- Jacobian
 
 // the change by entry e of the derivatives of a function, of what stands for ā in `to`
-std::string added_change(const StateFunction::Evaluator& function, const std::string& to, const std::string& slope) {
-  return function.tapes().n_loads > 0 ? fmt::format("add_change(w->{}, i, k, {}, w);\n", to, slope)
-                                      : fmt::format("w->{}[i + NQ * k] += {};\n", to, slope);
+std::string added_change(bool reads_load, const std::string& to, const std::string& slope) {
+  return reads_load ? fmt::format("add_change(w->{}, i, k, {}, w);\n", to, slope)
+                    : fmt::format("w->{}[i + NQ * k] += {};\n", to, slope);
 }
 
 void Writer::write_jacobian() {
-  std::string &signals = texts_["dsignals"], &mechanics = texts_["dmechanics"], &load = texts_["dload"];
+  std::string &signals = texts_["dsignals"], &mechanics = texts_["dmechanics"], &load = texts_["dload"],
+              &along = texts_["dalong"];
   if (!has("jacobian")) return;
   bool reads_state = false, reads_component = false;
   for (std::size_t a = 0; a < terms_.size(); ++a) {
@@ -924,21 +974,25 @@ void Writer::write_jacobian() {
     const std::string features = fmt::format("features_{}", a), directions = fmt::format("directions_{}", a);
     if (const std::size_t n = term.features->tapes().entries->size(); n > 0 && term.reads_features()) {
       reads_component = true;
-      reads_state = reads_state || term.features->tapes().n_loads == 0;
+      reads_state = reads_state || !term.features_read_load();
       signals += fmt::format("  {0}(&c->latents[{1}], w->phi_{1}, w->k_{1}, w->scratch, w->dsignal);\n",
                              texts_[fmt::format("gradient_{}", a)], a);
+      if (term.of->is_positive) {
+        signals +=
+            fmt::format("  for (int j = 0; j < {0}; ++j) w->dsignal[j] *= w->signal_{1}[j / {2}];\n", term.D * term.p, a, term.D);
+      }
       signals += fmt::format("  {}({}, w->derivative);\n  for (int e = 0; e < {}; ++e) {{\n", texts_["d_" + features],
-                             state_of(*term.features), n);
+                             state_of_features(term), n);
       signals += fmt::format("    const int d = {0}[e][0], k = {0}[e][1];\n    for (int i = 0; i < NQ; ++i) {{\n",
                              texts_["of_" + features]);
       if (term.has_directions()) {
         signals += fmt::format(
             "      real sum = 0;\n      for (int l = 0; l < {}; ++l) sum += w->B_{}[i + NQ * l] * w->dsignal[d + {} * l];\n",
             term.p, a, term.D);
-        signals += "      " + added_change(*term.features, to, "sum * w->derivative[e]") + "    }\n  }\n";
+        signals += "      " + added_change(term.features_read_load(), to, "sum * w->derivative[e]") + "    }\n  }\n";
       } else {
         const std::string slope = fmt::format("w->dsignal[d + {} * i] * w->derivative[e]", term.D);
-        signals += "      " + added_change(*term.features, to, slope) + "    }\n  }\n";
+        signals += "      " + added_change(term.features_read_load(), to, slope) + "    }\n  }\n";
       }
     }
     if (term.is_admissible() && has("d_A")) {
@@ -957,11 +1011,13 @@ void Writer::write_jacobian() {
     }
     if (!term.has_directions() || term.directions->tapes().entries->empty()) continue;
     reads_component = true;
-    reads_state = reads_state || term.directions->tapes().n_loads == 0;
+    reads_state = reads_state || !(term.directions_read_load() || term.reads_multipliers);
     signals += fmt::format("  {}(c->parameters, {}, w->derivative);\n  for (int e = 0; e < {}; ++e) {{\n",
-                           texts_["d_" + directions], state_of(*term.directions), term.directions->tapes().entries->size());
+                           texts_["d_" + directions], state_of_directions(term), term.directions->tapes().entries->size());
     signals += fmt::format("    const int i = {0}[e][0], l = {0}[e][1], k = {0}[e][2];\n", texts_["of_" + directions]);
-    signals += "    " + added_change(*term.directions, to, fmt::format("w->derivative[e] * w->signal_{}[l]", a)) + "  }\n";
+    if (term.reads_multipliers) signals += "    if (k >= NX) continue; /* in lambda, which follows the state */\n";
+    const std::string slope = fmt::format("w->derivative[e] * w->signal_{}[l]", a);
+    signals += "    " + added_change(term.directions_read_load(), to, slope) + "  }\n";
   }
   if (!reads_state) signals += "  (void)state;\n";
   if (!reads_component) signals += "  (void)c;\n";
@@ -992,6 +1048,7 @@ void Writer::write_jacobian() {
     each(load, "d_b", {"w->d_rows0[i + NC * k] += w->d_b[e];"});
     each(load, "d_F", {"w->d_forced0[i + NQ * k] += w->d_F[e];"});
   }
+  if (has("nonlinear")) each(along, "d_A", {"w->d_along[i + NC * k] += w->d_A[e] * along[j];"});
   if (mechanics.empty() && !has("moved")) mechanics = "  (void)w;\n";
 }
 
@@ -1153,6 +1210,7 @@ CSource Writer::write() {
   write_expressions();
   write_kernels();
   write_signals();
+  write_under_load();
   write_view();
   write_stddev();
   write_jacobian();
@@ -1170,7 +1228,7 @@ CSource Writer::write() {
 
 CSource export_c(const Posterior& posterior, const View& view, const CSourceOptions& options) {
   require_view(posterior.prior(), view);
-  require_linear(posterior.prior(), "export to C");
+  if (view.latent || !view.has_mean()) require_linear(prior_of(posterior.prior(), view), "export to C of a part of the motion");
   if (!is_identifier(options.name)) {
     throw InputError(fmt::format("`name`: must be a name of C, of letters, digits and _, got '{}'", options.name));
   }

@@ -13,7 +13,7 @@
 //     applied             it is of the learned force
 //     all                 mu and b are part of it: it is not of one latent alone
 //     known, constant     mu = M^-1 F; mu is constant
-//     load                a latent reads lambda0; multipliers or it: least_norm
+//     load, nonlinear     a latent reads lambda0; lambda. Either: loaded; multipliers or these: least_norm
 //     solves              triangular systems of M are solved; of M itself (forced_solves)
 //     stddev, jacobian    these functions are asked for
 //     mixture             there are several components
@@ -827,7 +827,136 @@ static void add_features(int n, int d, int m, const real *x, const real *scale, 
 
 // the mean, its deviation and its Jacobian
 inline constexpr std::string_view prediction_template =
-    R"c(/* ---------------------------------------------------------------- mean */
+    R"c({nonlinear}/* ---------------------------------------------------------------- multipliers that forces read which they make
+{nonlinear} *
+{nonlinear} * lambda = G abar(lambda) + d, G = -(A M^-1 A')^+ A, d = (A M^-1 A')^+ b, by Newton's method; w->y is the state and lambda.
+{nonlinear} */
+{nonlinear}
+{nonlinear}/* abar at this lambda, and J, its slope there */
+{nonlinear}static void evaluate_load(const component *c, workspace *w)
+{nonlinear}{
+{nonlinear}  for (int i = 0; i < NQ; ++i) w->rest_of_load[i] = w->force_of_load[i] = 0;
+{nonlinear}  for (int i = 0; i < NQ * NC; ++i) w->rest_slope[i] = w->force_slope[i] = 0;
+@under_load@
+{nonlinear}  for (int i = 0; i < NQ; ++i) w->a_under_load[i] = w->force_of_load[i];
+{nonlinear}  for (int i = 0; i < NQ * NC; ++i) w->slope[i] = w->force_slope[i];
+{nonlinear}  solve_mass(w->C, 1, w->a_under_load);
+{nonlinear}  solve_mass(w->C, NC, w->slope);
+{nonlinear}  for (int i = 0; i < NQ; ++i) w->a_under_load[i] += w->without_load[i] + w->rest_of_load[i];
+{nonlinear}  for (int i = 0; i < NQ * NC; ++i) w->slope[i] += w->rest_slope[i];
+{nonlinear}}
+{nonlinear}
+{nonlinear}/* D = I - share G J to its triangles, rows exchanged by order_lambda. Returns its determinant. */
+{nonlinear}static real factorise_load(real share, workspace *w)
+{nonlinear}{
+{nonlinear}  real *const D = w->D_lambda, determinant = 1;
+{nonlinear}  for (int j = 0; j < NC; ++j) {
+{nonlinear}    for (int k = 0; k < NC; ++k) {
+{nonlinear}      real sum = 0;
+{nonlinear}      for (int i = 0; i < NQ; ++i) sum += w->G_lambda[k + NC * i] * w->slope[i + NQ * j];
+{nonlinear}      D[k + NC * j] = (k == j) - share * sum;
+{nonlinear}    }
+{nonlinear}  }
+{nonlinear}  for (int k = 0; k < NC; ++k) {
+{nonlinear}    int pivot = k;
+{nonlinear}    for (int i = k + 1; i < NC; ++i) {
+{nonlinear}      if (fabs(D[i + NC * k]) > fabs(D[pivot + NC * k])) pivot = i;
+{nonlinear}    }
+{nonlinear}    w->order_lambda[k] = pivot;
+{nonlinear}    if (pivot != k) determinant = -determinant;
+{nonlinear}    for (int j = 0; pivot != k && j < NC; ++j) {
+{nonlinear}      const real entry = D[k + NC * j];
+{nonlinear}      D[k + NC * j] = D[pivot + NC * j];
+{nonlinear}      D[pivot + NC * j] = entry;
+{nonlinear}    }
+{nonlinear}    determinant *= D[k + NC * k];
+{nonlinear}    for (int i = k + 1; i < NC; ++i) {
+{nonlinear}      D[i + NC * k] /= D[k + NC * k];
+{nonlinear}      for (int j = k + 1; j < NC; ++j) D[i + NC * j] -= D[i + NC * k] * D[k + NC * j];
+{nonlinear}    }
+{nonlinear}  }
+{nonlinear}  return determinant;
+{nonlinear}}
+{nonlinear}
+{nonlinear}/* X := D^-1 X, n columns */
+{nonlinear}static void solve_load(const workspace *w, int n, real *X)
+{nonlinear}{
+{nonlinear}  const real *const D = w->D_lambda;
+{nonlinear}  for (int column = 0; column < n; ++column) {
+{nonlinear}    real *const x = X + NC * column;
+{nonlinear}    for (int k = 0; k < NC; ++k) {
+{nonlinear}      const real entry = x[w->order_lambda[k]];
+{nonlinear}      x[w->order_lambda[k]] = x[k];
+{nonlinear}      x[k] = entry;
+{nonlinear}    }
+{nonlinear}    for (int k = 0; k < NC; ++k) {
+{nonlinear}      for (int i = k + 1; i < NC; ++i) x[i] -= D[i + NC * k] * x[k];
+{nonlinear}    }
+{nonlinear}    for (int k = NC - 1; k >= 0; --k) {
+{nonlinear}      x[k] /= D[k + NC * k];
+{nonlinear}      for (int i = 0; i < k; ++i) x[i] -= D[i + NC * k] * x[k];
+{nonlinear}    }
+{nonlinear}  }
+{nonlinear}}
+{nonlinear}
+{nonlinear}/* Newton's method where only a share of what the load adds acts. Returns whether it ended. */
+{nonlinear}static int reach_load(const component *c, real share, real size, workspace *w)
+{nonlinear}{
+{nonlinear}  real *const lambda = w->y + NX;
+{nonlinear}  for (int step = 0; step < 40; ++step) {
+{nonlinear}    evaluate_load(c, w);
+{nonlinear}    if (!is_finite(NQ, w->a_under_load) || !is_finite(NQ * NC, w->slope)) return 0;
+{nonlinear}    if (!(factorise_load(share, w) > 0)) return 0;
+{nonlinear}    real change[NC];
+{nonlinear}    for (int k = 0; k < NC; ++k) {
+{nonlinear}      change[k] = lambda[k] - w->d_lambda[k];
+{nonlinear}      for (int i = 0; i < NQ; ++i) {
+{nonlinear}        change[k] -= w->G_lambda[k + NC * i] * (w->a_at_zero[i] + share * (w->a_under_load[i] - w->a_at_zero[i]));
+{nonlinear}      }
+{nonlinear}    }
+{nonlinear}    const real rest = sqrt(dot(NC, change, change));
+{nonlinear}    solve_load(w, 1, change);
+{nonlinear}    for (int k = 0; k < NC; ++k) lambda[k] -= change[k];
+{nonlinear}    const real enough = @newton@ * (size + sqrt(dot(NC, lambda, lambda)));
+{nonlinear}    if (sqrt(dot(NC, change, change)) <= enough || rest <= enough / 10) return is_finite(NC, lambda);
+{nonlinear}  }
+{nonlinear}  return 0;
+{nonlinear}}
+{nonlinear}
+{nonlinear}/* The load of the motion, let in at once or bit by bit. Returns 0 where it grows as fast as the force that it causes. */
+{nonlinear}static int find_load(const component *c, const real *state, workspace *w)
+{nonlinear}{
+{nonlinear}  real *const lambda = w->y + NX;
+{nonlinear}  multipliers_of_force(w);
+{nonlinear}  for (int j = 0; j <= NQ; ++j) { /* G = K (M T - mass), d = K M L b */
+{nonlinear}    real column[NQ], *const to = j < NQ ? w->G_lambda + NC * j : w->d_lambda;
+{nonlinear}    for (int i = 0; i < NQ; ++i) {
+{nonlinear}      column[i] = j < NQ ? -w->mass[i + NQ * j] : 0;
+{nonlinear}      for (int l = 0; l < NQ; ++l) column[i] += w->M[i + NQ * l] * (j < NQ ? w->T[l + NQ * j] : w->Lb[l]);
+{nonlinear}    }
+{nonlinear}    for (int k = 0; k < NC; ++k) {
+{nonlinear}      to[k] = 0;
+{nonlinear}      for (int i = 0; i < NQ; ++i) to[k] += w->K[k + NC * i] * column[i];
+{nonlinear}    }
+{nonlinear}  }
+{nonlinear}  for (int i = 0; i < NX; ++i) w->y[i] = state[i];
+{nonlinear}  for (int steps = 1; steps <= 16; steps += 15) {
+{nonlinear}    for (int k = 0; k < NC; ++k) lambda[k] = 0;
+{nonlinear}    evaluate_load(c, w);
+{nonlinear}    for (int i = 0; i < NQ; ++i) w->a_at_zero[i] = w->a_under_load[i];
+{nonlinear}    for (int k = 0; k < NC; ++k) {
+{nonlinear}      lambda[k] = w->d_lambda[k];
+{nonlinear}      for (int i = 0; i < NQ; ++i) lambda[k] += w->G_lambda[k + NC * i] * w->a_at_zero[i];
+{nonlinear}    }
+{nonlinear}    const real size = sqrt(dot(NC, lambda, lambda));
+{nonlinear}    int step = 1;
+{nonlinear}    while (step <= steps && reach_load(c, (real)step / (real)steps, size, w)) ++step;
+{nonlinear}    if (step > steps) return 1;
+{nonlinear}  }
+{nonlinear}  return 0;
+{nonlinear}}
+{nonlinear}
+/* ---------------------------------------------------------------- mean */
 
 /* abar = mu + sum E C f of the latents' means; `force` is what of it is multiplied by M^-1 */
 static status evaluate_prior(const component *c, const real *state, workspace *w)
@@ -840,7 +969,17 @@ static status evaluate_prior(const component *c, const real *state, workspace *w
 {!known}    w->force[i] = 0;
   }
 {load}  known_multipliers(state, w);
-@signals@  for (int i = 0; i < NQ; ++i) w->a_of_force[i] = w->force[i];
+@signals@
+{nonlinear}  for (int i = 0; i < NQ; ++i) w->without_load[i] = w->force[i];
+{nonlinear}  solve_mass(w->C, 1, w->without_load);
+{nonlinear}  for (int i = 0; i < NQ; ++i) w->without_load[i] += w->a_bar[i];
+{nonlinear}  if (!find_load(c, state, w)) return @name@_NOT_FINITE;
+{nonlinear}  evaluate_load(c, w);
+{nonlinear}  for (int i = 0; i < NQ; ++i) {
+{nonlinear}    w->force[i] += w->force_of_load[i];
+{nonlinear}    w->a_bar[i] += w->rest_of_load[i];
+{nonlinear}  }
+  for (int i = 0; i < NQ; ++i) w->a_of_force[i] = w->force[i];
 {forced}  solve_mass(w->C, 1, w->a_of_force);
 {forced}  for (int i = 0; i < NQ; ++i) w->a_bar[i] += w->a_of_force[i];
   return is_finite(NQ, w->a_bar) ? @name@_OK : @name@_NOT_FINITE;
@@ -924,6 +1063,16 @@ status @name@_mean(const real *state, real *mean, workspace *w)
 {stddev}static void evaluate_view(workspace *w)
 {stddev}{
 @view_matrix@
+{stddev,nonlinear}  /* G (I + J D^-1 G_lambda): lambda answers */
+{stddev,nonlinear}  real answer[NC * NQ];
+{stddev,nonlinear}  for (int i = 0; i < NC * NQ; ++i) answer[i] = w->G_lambda[i];
+{stddev,nonlinear}  (void)factorise_load(1, w);
+{stddev,nonlinear}  solve_load(w, NQ, answer);
+{stddev,nonlinear}  for (int r = 0; r < NR; ++r) {
+{stddev,nonlinear}    real through[NC];
+{stddev,nonlinear}    for (int k = 0; k < NC; ++k) through[k] = dot(NQ, w->Gt + NQ * r, w->slope + NQ * k);
+{stddev,nonlinear}    for (int j = 0; j < NQ; ++j) w->Gt[j + NQ * r] += dot(NC, through, answer + NC * j);
+{stddev,nonlinear}  }
 {stddev}}
 {stddev}
 {stddev}static void evaluate_stddev(const component *c, real *stddev, workspace *w)
@@ -1008,40 +1157,54 @@ status @name@_mean(const real *state, real *mean, workspace *w)
 {jacobian} *     dddq  = T (P + M^-1 (R + dM (abar - ddq - a_of_force) + dA' lambda)) + L (db - dA ddq)
 {jacobian} */
 {jacobian}
-{jacobian,load}/* d lambda0 = K (M da0 - r) + (I - K A') dA K' lambda0, da0 = T M^-1 r + L (db - dA a0), r = dF + dA' lambda0 - dM a0 */
+{jacobian,loaded}/* d lambda = K (M da - r) + (I - K A') dA K' lambda, da = T M^-1 r + L (db - dA a), of one entry of the state
+{jacobian,loaded} *   r       dF + dA' lambda - dM a; it is lost
+{jacobian,loaded} *   d_rows  db - dA a
+{jacobian,loaded} *   d_along dA K' lambda; it is lost */
+{jacobian,loaded}static void change_of_multipliers(real *r, const real *d_rows, real *d_along, const workspace *w, real *d_lambda)
+{jacobian,loaded}{
+{jacobian,loaded}  real solved[NQ], da[NQ];
+{jacobian,loaded}  for (int i = 0; i < NQ; ++i) solved[i] = r[i];
+{jacobian,loaded}  solve_mass(w->C, 1, solved);
+{jacobian,loaded}  for (int i = 0; i < NQ; ++i) {
+{jacobian,loaded}    da[i] = 0;
+{jacobian,loaded}    for (int j = 0; j < NQ; ++j) da[i] += w->T[i + NQ * j] * solved[j];
+{jacobian,loaded}    for (int j = 0; j < NC; ++j) da[i] += w->L[i + NQ * j] * w->row_scale[j] * d_rows[j];
+{jacobian,loaded}  }
+{jacobian,loaded}  for (int i = 0; i < NQ; ++i) {
+{jacobian,loaded}    r[i] = -r[i];
+{jacobian,loaded}    for (int j = 0; j < NQ; ++j) r[i] += w->M[i + NQ * j] * da[j];
+{jacobian,loaded}  }
+{jacobian,loaded}  for (int i = 0; i < NC; ++i) {
+{jacobian,loaded}    if (w->rank == NC) d_along[i] = 0; /* K A' = I */
+{jacobian,loaded}    for (int j = 0; j < NQ; ++j) r[j] -= w->A[i + NC * j] * d_along[i];
+{jacobian,loaded}  }
+{jacobian,loaded}  for (int i = 0; i < NC; ++i) {
+{jacobian,loaded}    d_lambda[i] = d_along[i];
+{jacobian,loaded}    for (int j = 0; j < NQ; ++j) d_lambda[i] += w->K[i + NC * j] * r[j];
+{jacobian,loaded}  }
+{jacobian,loaded}}
+{jacobian,loaded}
+{jacobian,loaded}/* K' lambda */
+{jacobian,loaded}static void along_multipliers(const real *lambda, const workspace *w, real *along)
+{jacobian,loaded}{
+{jacobian,loaded}  for (int j = 0; j < NQ; ++j) {
+{jacobian,loaded}    along[j] = 0;
+{jacobian,loaded}    for (int i = 0; i < NC; ++i) along[j] += w->K[i + NC * j] * lambda[i];
+{jacobian,loaded}  }
+{jacobian,loaded}}
+{jacobian,loaded}
+{jacobian,load}/* d lambda0 of M a0 = F + A' lambda0, A a0 = b */
 {jacobian,load}static void differentiate_known_multipliers(workspace *w)
 {jacobian,load}{
 {jacobian,load}  const real *const lambda0 = w->x + NX;
-{jacobian,load}  real along[NQ]; /* K' lambda0 */
-{jacobian,load}  for (int j = 0; j < NQ; ++j) {
-{jacobian,load}    along[j] = 0;
-{jacobian,load}    for (int i = 0; i < NC; ++i) along[j] += w->K[i + NC * j] * lambda0[i];
-{jacobian,load}  }
+{jacobian,load}  real along[NQ];
+{jacobian,load}  along_multipliers(lambda0, w, along);
 {jacobian,load}  for (int i = 0; i < NQ * NX; ++i) w->d_forced0[i] = 0;
 {jacobian,load}  for (int i = 0; i < NC * NX; ++i) w->d_rows0[i] = w->d_along[i] = 0;
 @dload@
 {jacobian,load}  for (int k = 0; k < NX; ++k) {
-{jacobian,load}    real *const r = w->d_forced0 + NQ * k, *const d_along = w->d_along + NC * k;
-{jacobian,load}    real solved[NQ], da0[NQ];
-{jacobian,load}    for (int i = 0; i < NQ; ++i) solved[i] = r[i];
-{jacobian,load}    solve_mass(w->C, 1, solved);
-{jacobian,load}    for (int i = 0; i < NQ; ++i) {
-{jacobian,load}      da0[i] = 0;
-{jacobian,load}      for (int j = 0; j < NQ; ++j) da0[i] += w->T[i + NQ * j] * solved[j];
-{jacobian,load}      for (int j = 0; j < NC; ++j) da0[i] += w->L[i + NQ * j] * w->row_scale[j] * w->d_rows0[j + NC * k];
-{jacobian,load}    }
-{jacobian,load}    for (int i = 0; i < NQ; ++i) {
-{jacobian,load}      r[i] = -r[i];
-{jacobian,load}      for (int j = 0; j < NQ; ++j) r[i] += w->M[i + NQ * j] * da0[j];
-{jacobian,load}    }
-{jacobian,load}    for (int i = 0; i < NC; ++i) {
-{jacobian,load}      if (w->rank == NC) d_along[i] = 0; /* K A' = I */
-{jacobian,load}      for (int j = 0; j < NQ; ++j) r[j] -= w->A[i + NC * j] * d_along[i];
-{jacobian,load}    }
-{jacobian,load}    for (int i = 0; i < NC; ++i) {
-{jacobian,load}      w->d_lambda0[i + NC * k] = d_along[i];
-{jacobian,load}      for (int j = 0; j < NQ; ++j) w->d_lambda0[i + NC * k] += w->K[i + NC * j] * r[j];
-{jacobian,load}    }
+{jacobian,load}    change_of_multipliers(w->d_forced0 + NQ * k, w->d_rows0 + NC * k, w->d_along + NC * k, w, w->d_lambda0 + NC * k);
 {jacobian,load}  }
 {jacobian,load}}
 {jacobian,load}
@@ -1074,6 +1237,32 @@ status @name@_mean(const real *state, real *mean, workspace *w)
 @dmechanics@
 {jacobian}}
 {jacobian}
+{jacobian,nonlinear}/* What follows from the change of lambda with the state, D dlambda = the change of G abar + d at held lambda */
+{jacobian,nonlinear}static void differentiate_load(workspace *w)
+{jacobian,nonlinear}{
+{jacobian,nonlinear}  const real *const lambda = w->y + NX;
+{jacobian,nonlinear}  real along[NQ];
+{jacobian,nonlinear}  along_multipliers(lambda, w, along);
+{jacobian,nonlinear}  for (int i = 0; i < NC * NX; ++i) w->d_along[i] = 0;
+@dalong@
+{jacobian,nonlinear}  (void)factorise_load(1, w);
+{jacobian,nonlinear}  for (int k = 0; k < NX; ++k) {
+{jacobian,nonlinear}    real r[NQ], d_lambda[NC];
+{jacobian,nonlinear}    for (int i = 0; i < NQ; ++i) {
+{jacobian,nonlinear}      r[i] = w->d_force[i + NQ * k] + w->d_forced[i + NQ * k] - w->d_of_constraint[i + NQ * k];
+{jacobian,nonlinear}      for (int j = 0; j < NQ; ++j) r[i] += w->M[i + NQ * j] * w->d_of_rest[j + NQ * k];
+{jacobian,nonlinear}    }
+{jacobian,nonlinear}    change_of_multipliers(r, w->d_rows + NC * k, w->d_along + NC * k, w, d_lambda);
+{jacobian,nonlinear}    solve_load(w, 1, d_lambda);
+{jacobian,nonlinear}    for (int j = 0; j < NC; ++j) {
+{jacobian,nonlinear}      for (int i = 0; i < NQ; ++i) {
+{jacobian,nonlinear}        w->d_of_rest[i + NQ * k] += w->rest_slope[i + NQ * j] * d_lambda[j];
+{jacobian,nonlinear}        w->d_force[i + NQ * k] += w->force_slope[i + NQ * j] * d_lambda[j];
+{jacobian,nonlinear}      }
+{jacobian,nonlinear}    }
+{jacobian,nonlinear}  }
+{jacobian,nonlinear}}
+{jacobian,nonlinear}
 {jacobian}/* dabar, d(M abar), dddq and d(A' lambda), those that the prediction needs */
 {jacobian}static void differentiate_motion(workspace *w)
 {jacobian}{
@@ -1122,6 +1311,7 @@ status @name@_mean(const real *state, real *mean, workspace *w)
 {jacobian}  if (s != @name@_OK) return s;
 {jacobian}  differentiate_prior(c, state, w);
 {jacobian}  differentiate_mechanics(w);
+{jacobian,nonlinear}  differentiate_load(w);
 {jacobian}  differentiate_motion(w);
 @dvalue@
 {jacobian}  return is_finite(NR * NX, jacobian) ? @name@_OK : @name@_NOT_FINITE;

@@ -13,9 +13,11 @@
 
 #include "export/compiled.hpp"
 #include "gp2/error.hpp"
+#include "gp2/fit.hpp"
 #include "gp2/mechanics/state_evaluator.hpp"
 #include "gp2/predictor.hpp"
 #include "gp2/prior/latent_spec.hpp"
+#include "gp2/simulation/model_motion.hpp"
 #include "inference/problems.hpp"
 #include "input_error.hpp"
 
@@ -177,6 +179,41 @@ directions = "force"
 )toml",
                                           "every kernel");
   return model;
+}
+
+// Latents that read λ and that are positive, beside a linear one; with a row that repeats another; and with none that reads λ.
+TEST(CSourceTest, IsThePredictorOfNonlinearLatents) {
+  std::string damped = test::model_that_rubs().text;
+  for (std::size_t at = damped.find("lambda("); at != std::string::npos; at = damped.find("lambda(", at))
+    damped.insert(at + 6, "0");
+  const std::string repeated =
+      test::changed(test::model_that_rubs().text, {{"0.2*y^2\"]", "0.2*y^2\", \"2*z - 2*h*x^2 - 0.4*y^2\"]"}});
+  const Model models[] = {test::model_that_rubs(), Model::parse(repeated, "repeated"), Model::parse(damped, "damped")};
+  std::size_t turn = 0;
+  for (const Model& model : models) {
+    PriorOptions options;
+    options.mean = Prior::Mean::force;
+    Problem p{model.name, make_prior(model, options), {}, {}, test::draw(model, 25, export_seed).states, {}};
+    const MatrixXd y = ModelMotion(model).acceleration(p.queries);
+    p.observations.push_back(
+        {p.queries, View::constrained_acceleration(*model.system), y, VectorXd::Constant(model.system->nq(), 0.01)});
+    p.values = model_values(p.prior, p.observations, default_hyperparameters(p.prior, p.observations, {}, {}));
+    const Posterior posterior(p.prior, p.observations, p.values);
+    for (const View::Quantity quantity : Quantity::all()) {
+      View view = View::all(quantity, *model.system);
+      if (!view.has_mean()) continue;  // a part of the motion
+      if (view.quantity->needs_time_step()) view.time_step = 0.1;
+      if (turn % 3 == 2) view.rows = {view.rows.back(), 0};
+      SCOPED_TRACE(fmt::format("{}, {} rows of {}, seed {}", model.name, view.size(), view.quantity->word(), export_seed));
+      Exported c(export_c(posterior, view), "gp2_model", compiler(turn++));
+      EXPECT_EQ(c.self_test(c.workspace()), 0);
+      EXPECT_GT(expect_predictor(posterior, view, c, random_states(p.queries, 100, export_seed), p), 50);
+    }
+    View part = View::constrained_acceleration(*model.system);
+    part.latent = 0;
+    EXPECT_THAT(input_error_of([&] { static_cast<void>(export_c(posterior, part)); }),
+                HasSubstr("export to C of a part of the motion"));
+  }
 }
 
 TEST(CSourceTest, HasEveryKernelAndEveryOperation) {
