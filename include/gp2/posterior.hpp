@@ -166,7 +166,7 @@ class Posterior {
 
 /// The posterior of more observations, by extending its factor: O(n²) operations for each new number, where the reduced size is n
 /// and a posterior built anew takes O(n³). The same as that one to rounding. Hyperparameters and parameters of the system are
-/// held, and with them all scales.
+/// held, and with them all scales. A nonlinear prior is conditioned anew: where its latents are linearised moves with every state.
 ///
 ///     posterior = update(std::move(posterior), {x, ddq, y, sigma});
 ///
@@ -191,7 +191,8 @@ class Posterior {
 /// after group. Rows leave the factor by plane rotations, O(n²) operations each, as stable as a posterior built anew. A group that
 /// update() added goes with its last state; one that was given to the constructor stays, without states, and keeps its noise,
 /// since hyperparameters call it by its number. In place and otherwise as update.
-/// @throws InputError when there are fewer, or what was learned went through inducing points; `posterior` is left as it was.
+/// @throws InputError when there are fewer, what was learned went through inducing points, or a nonlinear prior has several groups;
+/// `posterior` is left as it was.
 [[nodiscard]] Posterior remove_oldest(Posterior&& posterior, int n);
 
 }  // namespace gp2

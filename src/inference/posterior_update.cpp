@@ -35,13 +35,15 @@ void add(Posterior::Implementation& self, const Observations& added) {
     self.add_through_points(added, group);
     return;
   }
-  self.add_samples({added}, {added.noise().stddev()}, static_cast<int>(group));
+  if (!self.prior.is_nonlinear()) self.add_samples({added}, {added.noise().stddev()}, static_cast<int>(group));
   if (group < self.observations.size()) {
     self.observations[group].append(added);
   } else {
     self.values.noise_stddev.push_back(added.noise().stddev());
     self.observations.push_back(added);
   }
+  // where latents are linearised moves with every observation
+  if (self.prior.is_nonlinear()) self.condition(1);
 }
 
 void remove_oldest_of(Posterior::Implementation& self, int n) {
@@ -57,9 +59,10 @@ void remove_oldest_of(Posterior::Implementation& self, int n) {
   // in each group the oldest stand first
   std::vector<int> n_gone(self.observations.size());
   for (const Index sample : gone) ++n_gone[static_cast<std::size_t>(self.samples[static_cast<std::size_t>(sample)].group)];
-  self.erase_samples(gone);
+  if (!self.prior.is_nonlinear()) self.erase_samples(gone);
   for (std::size_t group = 0; group < n_gone.size(); ++group) self.observations[group].remove_first(n_gone[group]);
   self.erase_empty_groups();
+  if (self.prior.is_nonlinear()) self.condition(1);
 }
 
 }  // namespace
@@ -67,8 +70,8 @@ void remove_oldest_of(Posterior::Implementation& self, int n) {
 std::vector<std::shared_ptr<Posterior::Implementation>> Posterior::own_components() const {
   std::vector<std::shared_ptr<Implementation>> own;
   for (const auto& component : conditioned()) {
-    // of several, one that fails must leave the others as they were
-    if (components_.size() > 1 || component.use_count() > 1) {
+    // of several, one that fails must leave the others as they were; what is conditioned anew must stay if it fails
+    if (components_.size() > 1 || component.use_count() > 1 || component->prior.is_nonlinear()) {
       own.push_back(copy_of(*component));
       continue;
     }
@@ -81,7 +84,6 @@ std::vector<std::shared_ptr<Posterior::Implementation>> Posterior::own_component
 }
 
 Posterior update(Posterior&& posterior, Observations added) {
-  require_linear(posterior.prior(), "update");
   require_observations(posterior.prior(), added);
   added.require_no_sums();
   const lapack::SingleThread single_thread;
@@ -104,7 +106,6 @@ Posterior forget(Posterior&& posterior, double share) {
 }
 
 Posterior remove_oldest(Posterior&& posterior, int n) {
-  require_linear(posterior.prior(), "remove_oldest");
   if (posterior.implementation().kept) {
     throw InputError("what was learned through inducing points cannot be taken away: the observations themselves are not kept");
   }
@@ -114,6 +115,7 @@ Posterior remove_oldest(Posterior&& posterior, int n) {
         fmt::format("remove_oldest: there are {} observed states, so n must be 0 … {}, got {}", n_samples, n_samples, n));
   }
   for (const Observations& group : posterior.observations()) group.require_no_sums();
+  if (posterior.observations().size() > 1) require_linear(posterior.prior(), "remove_oldest from several groups of observations");
   const lapack::SingleThread single_thread;
   const auto own = posterior.own_components();
   for (const auto& component : own) remove_oldest_of(*component, n);

@@ -525,6 +525,37 @@ TEST(NonlinearFit, EndsWhereLaplacesEvidenceHasNothingToGain) {
   }
 }
 
+TEST(NonlinearPosterior, OfDataThatComeAndGoIsTheOneOfThoseThatAreThere) {
+  const Fitted fitted(test::model_that_rubs(), 40);
+  const Observations& all = fitted.observations.front();
+  const ModelValues values =
+      model_values(fitted.prior, fitted.observations, default_hyperparameters(fitted.prior, fitted.observations, {}, {}));
+  const auto rows = [&](Index first, Index n) {
+    return Observations(all.states().middleCols(first, n), all.view(), all.values().middleCols(first, n), all.noise().stddev());
+  };
+  const auto of = [&](Index first, Index n) { return Posterior(fitted.prior, {rows(first, n)}, values); };
+  const View view = View::constrained_acceleration(*fitted.model.system);
+  const MatrixXd states = test::draw(fitted.model, 10, nonlinear_seed + 1).states;
+  // as near as Gauss–Newton steps come to the posterior mean
+  const auto expect_same = [&](const Posterior& grown, const Posterior& whole) {
+    const Posterior::Marginal a = grown.marginal(view, states), b = whole.marginal(view, states);
+    EXPECT_LE((a.mean - b.mean).norm(), 1e-6 * b.mean.norm());
+    EXPECT_LE((a.covariance - b.covariance).norm(), 1e-5 * b.covariance.norm());
+    EXPECT_NEAR(grown.negative_log_likelihood(), whole.negative_log_likelihood(), 1e-6);
+  };
+  const Posterior first = of(0, 25), before = first;
+  const Posterior grown = update(Posterior(first), rows(25, 15));
+  EXPECT_EQ(grown.n_states(), 40);
+  expect_same(grown, of(0, 40));
+  expect_same(remove_oldest(Posterior(grown), 10), of(10, 30));
+  expect_same(first, before);
+  // several groups: which is the oldest is not known any more
+  const Posterior two(fitted.prior, {rows(0, 10), rows(10, 10)},
+                      model_values(fitted.prior, {rows(0, 10), rows(10, 10)},
+                                   default_hyperparameters(fitted.prior, {rows(0, 10), rows(10, 10)}, {}, {})));
+  expect_says([&] { static_cast<void>(remove_oldest(Posterior(two), 1)); }, {"several groups", "lambda0"});
+}
+
 TEST(NonlinearPrior, IsRefusedByNameWhereItCannotBe) {
   const Fitted fitted(rubbing_bead("lambda"), 10);
   const Posterior posterior(
@@ -532,7 +563,6 @@ TEST(NonlinearPrior, IsRefusedByNameWhereItCannotBe) {
       model_values(fitted.prior, fitted.observations, default_hyperparameters(fitted.prior, fitted.observations, {}, {})));
   const View learned = View::learned_force(*fitted.model.system);
   expect_says([&] { static_cast<void>(Predictor(posterior, learned)); }, {"Predictor", "lambda0"});
-  expect_says([&] { static_cast<void>(update(Posterior(posterior), fitted.observations.front())); }, {"update", "lambda0"});
   const std::string latent = "[[latent]]\nname = \"x\"\nfeatures = ";
   expect_says([&] { static_cast<void>(make_prior(rubbing_bead("lambda", "constant", latent + "[\"lambda(1)\"]"))); },
               {"only directions"});
