@@ -251,14 +251,15 @@ std::size_t help_width() {
 
 std::string unknown_option(const CLI::App& app) {
   for (const CLI::App* command : app.get_subcommands()) {
-    std::vector<std::string> flags;
+    std::vector<std::string> names;
     for (const CLI::Option* option : command->get_options()) {
-      for (const std::string& name : option->get_lnames()) flags.push_back("--" + name);
+      for (const std::string& name : option->get_lnames()) names.push_back(name);
     }
     for (const std::string& given : command->remaining()) {
       if (given.size() < 2 || given[0] != '-') continue;
       const std::string flag = given.substr(0, given.find('='));
-      return fmt::format("gp2 {} has no option {}{}", command->get_name(), flag, suggestion(flag, flags));
+      const std::string name = flag.substr(std::min(flag.find_first_not_of('-'), flag.size()));
+      return fmt::format("gp2 {} has no option {}{}", command->get_name(), flag, suggestion(name, names, "--"));
     }
   }
   return "";

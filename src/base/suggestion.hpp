@@ -36,8 +36,9 @@ inline std::size_t edit_distance(std::string_view a, std::string_view b) {
 
 /// ", did you mean 'dq3'?" for the candidate nearest to `name`; at a tie the one with more of its beginning, then the later one.
 /// Empty if none is near.
+/// @param prefix  what stands before each of them, and says nothing of which was meant
 template <class Names>
-std::string suggestion(std::string_view name, const Names& candidates) {
+std::string suggestion(std::string_view name, const Names& candidates, std::string_view prefix = "") {
   if (name.empty() || name.size() > 64) return "";
   // a name that shares nothing with it is none that was meant
   std::size_t nearest = std::min((name.size() + 2) / 3, name.size() - 1), longest_start = 0;
@@ -52,7 +53,7 @@ std::string suggestion(std::string_view name, const Names& candidates) {
     longest_start = start;
     best = candidate;
   }
-  return best.empty() ? "" : fmt::format(", did you mean '{}'?", best);
+  return best.empty() ? "" : fmt::format(", did you mean '{}{}'?", prefix, best);
 }
 
 }  // namespace gp2

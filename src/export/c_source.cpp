@@ -22,6 +22,7 @@
 #include "gp2/predictor.hpp"
 #include "inference/posterior_implementation.hpp"
 #include "inference/requirements.hpp"
+#include "prior/gradient_columns.hpp"
 #include "prior/primitive.hpp"
 
 namespace gp2 {
@@ -100,7 +101,7 @@ void use_portable_functions(std::string& source, const std::string& name) {
   std::string pieces;
   for (auto piece = std::rbegin(c_export::portable_pieces); piece != std::rend(c_export::portable_pieces); ++piece) {
     if (users.find(std::string(piece->name) + "(") == std::string::npos) continue;
-    pieces = "\n" + std::string(piece->text) + pieces;
+    pieces = fmt::format("\n{}{}", piece->text, pieces);
     users += piece->text;
   }
   std::string head(c_export::portable_head);
@@ -159,6 +160,7 @@ class Writer {
   [[nodiscard]] std::string program(const Tape& tape, const std::vector<std::string>& results, bool with_parameters,
                                     const std::vector<std::string>& loads = {}) const;
   void write_kernels();
+  void write_potential(std::size_t a);
   [[nodiscard]] std::string factor_call(const std::string& verb, const Kernel::Factor& factor, Index D,
                                         const std::string& value) const;
   void write_signals();
@@ -212,9 +214,6 @@ Writer::Writer(const Posterior& posterior, std::vector<Component> components, Vi
   for (std::size_t a = 0; a < prior_.latents.size(); ++a) {
     if (!view_.has_latent(a)) continue;
     const Latent& of = prior_.latents[a];
-    if (of.is_potential) {
-      throw InputError(fmt::format("export to C: the latent '{}' is a potential, whose gradient is not written yet", of.name));
-    }
     Term& term = terms_.emplace_back();
     term.latent = a;
     term.of = &of;
@@ -275,6 +274,8 @@ void Writer::set_conditions() {
   set("abar", parts.unconstrained_acceleration);
   set("applied", parts.applied_force);
   set("multipliers", view_.quantity == View::Quantity::multipliers);
+  set("potential", std::any_of(terms_.begin(), terms_.end(), [](const Term& term) { return term.of->is_potential; }));
+  set("other", std::any_of(terms_.begin(), terms_.end(), [](const Term& term) { return !term.of->is_potential; }));
   set("load", std::any_of(terms_.begin(), terms_.end(),
                           [](const Term& term) { return term.features_read_load() || term.directions_read_load(); }));
   set("loaded", has("load") || has("nonlinear"));
@@ -361,7 +362,13 @@ void Writer::set_sizes() {
   Index widest = 0, most_points = 1, most_derivatives = 1;
   for (std::size_t a = 0; a < terms_.size(); ++a) {
     const Term& term = terms_[a];
-    add(fmt::format("phi_{0}[{1}], k_{0}[{2}], signal_{0}[{3}]", a, term.D, term.n_points, term.p));
+    add(fmt::format("phi_{0}[{1}], signal_{0}[{2}]", a, term.D, term.p));
+    if (term.of->is_potential) {
+      add(fmt::format("pairs_{}[{}]", a, std::ssize(term.kernel.terms()) * (3 + term.D) * term.n_points));
+      if (has("stddev")) add(fmt::format("gradient_{}[{}]", a, term.D * term.n_points));
+    } else {
+      add(fmt::format("k_{}[{}]", a, term.n_points));
+    }
     if (term.has_directions()) add(fmt::format("B_{}[{}]", a, nq * term.p));
     if (term.is_admissible()) add(fmt::format("stated_M[{0}], P[{0}], L_P[{1}]", nq * nq, nc * nq));
     widest = std::max(widest, term.D * term.p);
@@ -381,7 +388,7 @@ void Writer::set_sizes() {
   if (has("stddev")) {
     add(fmt::format("Gt[{0}], M_inverse_Gt[{0}], loading[{1}], cross[{2}]", nq * nr, n_functions_ * nr,
                     n_variables_ * n_columns));
-    if (!has("by_function")) add(fmt::format("products[{}]", terms_.empty() ? 1 : terms_[0].n_points));
+    if (!has("by_function") || has("potential")) add(fmt::format("products[{}]", terms_.empty() ? 1 : terms_[0].n_points));
     if (has("sums")) add(fmt::format("rows[{}]", n_cross_rows_ * n_columns));
     if (has("mixture")) add(fmt::format("means[{0}], stddevs[{0}]", std::ssize(components_) * nr));
   }
@@ -679,6 +686,43 @@ std::string Writer::factor_call(const std::string& verb, const Kernel::Factor& f
                      has_parameters_in_c(factor.primitive) ? fmt::format(" a->kernel + {},", factor.first_parameter) : "", value);
 }
 
+// The gradient of a potential, kernel by kernel of its sum (theory.md, T44)
+void Writer::write_potential(std::size_t a) {
+  const Term& term = terms_[a];
+  std::string pairs, sums, slopes, products, variance;
+  for (std::size_t t = 0; t < term.kernel.terms().size(); ++t) {
+    const Kernel::Term& of = term.kernel.terms()[t];
+    const Kernel::Factor& factor = of.factors.front();
+    const std::string square = of.amplitude < 0 ? std::string("1") : fmt::format("a->kernel[{0}] * a->kernel[{0}]", of.amplitude),
+                      at = fmt::format("pairs + {} * a->n", static_cast<Index>(t) * (3 + term.D)),
+                      scale = fmt::format("a->scale + {}", factor.first_column);
+    const bool is_rq = factor.primitive == Kernel::Primitive::rq;
+    pairs += fmt::format("  compare_points(a->n, {}, a->points, p, {}, {});\n", term.D, scale, at);
+    pairs += fmt::format("  slopes_{}(a->n, {},{} {});\n", primitive_name(factor.primitive), square,
+                         is_rq ? fmt::format(" a->kernel[{}],", factor.first_parameter + term.D) : "", at);
+    sums += fmt::format("  add_gradients(a->n, {}, {}, {}, a->weights, scratch, out);\n", term.D, at, scale);
+    slopes += fmt::format("  add_hessians(a->n, {}, {}, {}, a->weights, scratch, out);\n", term.D, at, scale);
+    products += fmt::format("  multiply_pairs(a->n, {}, {}, {}, loading, scratch, out);\n", term.D, at, scale);
+    variance += fmt::format("  for (int j = 0; j < {0}; ++j) out[j] += {1} * a->scale[{2} + j] * a->scale[{2} + j]{3};\n", term.D,
+                            square, factor.first_column, factor.primitive == Kernel::Primitive::matern52 ? " * 5 / 3" : "");
+  }
+  const auto from_zero = [](const std::string& n, const std::string& body) {
+    return fmt::format("  for (int j = 0; j < {}; ++j) out[j] = 0;\n{}", n, body);
+  };
+  const std::string to_out = "const latent *a, const real *pairs, real *scratch, real *out";
+  const auto name = [&](const char* what) { return fmt::format("{}_{}", what, a); };
+  const auto write = [&](const char* what, const std::string& head, const std::string& body) {
+    texts_[name(what)] = function(name(what), head, body);
+  };
+  write("pairs", "const latent *a, const real *p, real *pairs", pairs);
+  write("sums", to_out, from_zero(std::to_string(term.D), sums));
+  if (has("jacobian")) write("gradient", to_out, from_zero(std::to_string(term.D * term.D), slopes));
+  if (!has("stddev")) return;
+  write("products", "const latent *a, const real *pairs, const real *loading, real *scratch, real *out",
+        from_zero(fmt::format("{} * a->n", term.D), products));
+  write("variance", "const latent *a, real *out", from_zero(std::to_string(term.D), variance));
+}
+
 void Writer::write_kernels() {
   texts_["expressions"] += "@kernel_pieces@";
   const auto amplitude = [](const Kernel::Term& term) {
@@ -704,6 +748,10 @@ void Writer::write_kernels() {
   for (std::size_t a = 0; a < terms_.size(); ++a) {
     const Term& term = terms_[a];
     const Index D = term.D;
+    if (term.of->is_potential) {
+      write_potential(a);
+      continue;
+    }
     std::string k, gradient, variance = "  real sum = 0;\n";
     bool is_constant = true;
     for (std::size_t t = 0; t < term.kernel.terms().size(); ++t) {
@@ -766,7 +814,7 @@ void Writer::write_kernels() {
     std::string body = is_float_exponential
                            ? "static void exponentials(int n, float *x)\n{\n  for (int i = 0; i < n; ++i) x[i] = expf(x[i]);\n}\n"
                            : std::string(piece->text);
-    pieces = "\n" + body + pieces;
+    pieces = fmt::format("\n{}{}", body, pieces);
     users += body;
   }
   text.replace(text.find("@kernel_pieces@"), std::string("@kernel_pieces@").size(), pieces);
@@ -790,12 +838,18 @@ void Writer::write_signals() {
                     in_comment(term.kernel.text()), in_comment(fmt::format("{}", fmt::join(term.of->feature_names, ", "))));
     text += fmt::format("  {}({}, w->phi_{});\n", texts_[fmt::format("features_{}", a)], state_of_features(term), a);
     text += fmt::format("  if (!is_finite({}, w->phi_{})) return {}_NOT_FINITE;\n", term.D, a, options_.name);
-    text +=
-        fmt::format("  {0}(&c->latents[{1}], w->phi_{1}, w->k_{1}, w->scratch);\n", texts_[fmt::format("covariance_{}", a)], a);
-    text += fmt::format(
-        "  for (int l = 0; l < {1}; ++l) {{\n    const latent *const a = &c->latents[{0}];\n"
-        "    w->signal_{0}[l] = weighted_sum(a->n, w->k_{0}, a->weights + a->n * l);\n  }}\n",
-        a, term.p);
+    if (term.of->is_potential) {
+      text += fmt::format("  {0}(&c->latents[{1}], w->phi_{1}, w->pairs_{1});\n", texts_[fmt::format("pairs_{}", a)], a);
+      text += fmt::format("  {0}(&c->latents[{1}], w->pairs_{1}, w->scratch, w->signal_{1});\n",
+                          texts_[fmt::format("sums_{}", a)], a);
+    } else {
+      text +=
+          fmt::format("  {0}(&c->latents[{1}], w->phi_{1}, w->k_{1}, w->scratch);\n", texts_[fmt::format("covariance_{}", a)], a);
+      text += fmt::format(
+          "  for (int l = 0; l < {1}; ++l) {{\n    const latent *const a = &c->latents[{0}];\n"
+          "    w->signal_{0}[l] = weighted_sum(a->n, w->k_{0}, a->weights + a->n * l);\n  }}\n",
+          a, term.p);
+    }
     if (term.of->is_positive)
       text += fmt::format("  for (int l = 0; l < {1}; ++l) w->signal_{0}[l] = exp(w->signal_{0}[l]);\n", a, term.p);
     if (term.reads_multipliers) continue;
@@ -924,8 +978,10 @@ void Writer::write_stddev() {
   for (std::size_t a = 0; a < terms_.size(); ++a) {
     const Term& term = terms_[a];
     const std::string G = term.is_forced() ? "M_inverse_Gt" : "Gt";
-    loadings += fmt::format("  real prior_{0};\n  {1}(&c->latents[{0}], w->phi_{0}, &prior_{0});\n", a,
-                            texts_[fmt::format("variance_{}", a)]);
+    const std::string variance = texts_[fmt::format("variance_{}", a)];
+    loadings += term.of->is_potential
+                    ? fmt::format("  real prior_{0}[{2}];\n  {1}(&c->latents[{0}], prior_{0});\n", a, variance, term.F)
+                    : fmt::format("  real prior_{0};\n  {1}(&c->latents[{0}], w->phi_{0}, &prior_{0});\n", a, variance);
     loadings +=
         fmt::format("  for (int r = 0; r < NR; ++r) {{\n    for (int f = 0; f < {}; ++f) {{\n      real sum = 0;\n", term.F);
     loadings += fmt::format("      for (int l = 0; l < {}; ++l) {{\n", term.p);
@@ -939,9 +995,26 @@ void Writer::write_stddev() {
     loadings += fmt::format("        sum += c->latents[{0}].loading[l + {1} * f] * along{2};\n      }}\n", a, term.p,
                             term.of->is_positive ? fmt::format(" * w->signal_{}[l]", a) : "");
     loadings +=
-        fmt::format("      w->loading[{} * r + {} + f] = sum;\n      variance[r] += prior_{} * sum * sum;\n    }}\n  }}\n",
-                    n_functions_, term.first, a);
-    if (has("by_function")) {
+        fmt::format("      w->loading[{} * r + {} + f] = sum;\n      variance[r] += prior_{}{} * sum * sum;\n    }}\n  }}\n",
+                    n_functions_, term.first, a, term.of->is_potential ? "[f]" : "");
+    if (term.of->is_potential) {
+      const auto multiplied = [&](const std::string& indent, const std::string& loading, const std::string& products) {
+        return fmt::format(
+            "{0}{1}(&c->latents[{2}], w->pairs_{2}, {3}, w->scratch, w->gradient_{2});\n"
+            "{0}add_gradient_products(&c->latents[{2}], {4}, row, w->gradient_{2}, {5});\n",
+            indent, texts_[fmt::format("products_{}", a)], a, loading, term.F, products);
+      };
+      if (!has("by_function")) {
+        by_row += multiplied("      ", fmt::format("w->loading + {} * r + {}", n_functions_, term.first), "w->products");
+        continue;
+      }
+      by_function += fmt::format(
+          "    for (int f = 0; f < {0}; ++f) {{\n      real unit[{0}] = {{0}};\n      unit[f] = 1;\n"
+          "      real *const cross = w->{1} + {2} * ({3} + f);\n      for (int j = 0; j < n; ++j) w->products[j] = 0;\n{4}"
+          "      for (int j = 0; j < n; ++j) {{\n        if (row_of[j] >= 0) cross[row_of[j]] = w->products[j];\n      }}\n    "
+          "}}\n",
+          term.F, texts_["cross"], texts_["cross_rows"], term.first, multiplied("      ", "unit", "w->products"));
+    } else if (has("by_function")) {
       by_function += fmt::format(
           "    for (int f = 0; f < {0}; ++f) {{\n      const real *const rows = c->latents[{1}].rows + n * ({0} * row + f);\n"
           "      real *const cross = w->{2} + {3} * ({4} + f);\n      for (int j = 0; j < n; ++j) {{\n"
@@ -975,8 +1048,9 @@ void Writer::write_jacobian() {
     if (const std::size_t n = term.features->tapes().entries->size(); n > 0 && term.reads_features()) {
       reads_component = true;
       reads_state = reads_state || !term.features_read_load();
-      signals += fmt::format("  {0}(&c->latents[{1}], w->phi_{1}, w->k_{1}, w->scratch, w->dsignal);\n",
-                             texts_[fmt::format("gradient_{}", a)], a);
+      const std::string at = term.of->is_potential ? fmt::format("w->pairs_{}", a) : fmt::format("w->phi_{0}, w->k_{0}", a);
+      signals +=
+          fmt::format("  {}(&c->latents[{}], {}, w->scratch, w->dsignal);\n", texts_[fmt::format("gradient_{}", a)], a, at);
       if (term.of->is_positive) {
         signals +=
             fmt::format("  for (int j = 0; j < {0}; ++j) w->dsignal[j] *= w->signal_{1}[j / {2}];\n", term.D * term.p, a, term.D);
@@ -1061,26 +1135,41 @@ struct FunctionsAt {
 };
 FunctionsAt functions_at(const LatentPosterior& latents, std::size_t latent, const VectorXd& features) {
   const LatentPosterior::Basis& basis = latents.latents()[latent];
-  VectorXd point, k(basis.kernel.n_rows());
-  KernelColumns::Workspace memory;
+  const Index F = basis.n_functions, n = basis.kernel.n_rows();
+  VectorXd point, k(n), variance(F);
   basis.kernel.scale(features, point);
-  basis.kernel.evaluate(0, k.size(), point, k.data(), memory);
-  const Index F = basis.n_functions;
+  const GradientColumns gradient(basis.kernel);
+  GradientColumns::Workspace of_gradient;
+  if (basis.is_potential) {
+    gradient.evaluate(0, n, point, of_gradient);
+    variance = gradient.variance();
+  } else {
+    KernelColumns::Workspace memory;
+    basis.kernel.evaluate(0, n, point, k.data(), memory);
+    variance.setConstant(basis.kernel.variance(point));
+  }
+  FunctionsAt out{VectorXd(F), VectorXd(F), std::sqrt(variance.maxCoeff())};
   MatrixXd rows = MatrixXd::Zero(latents.n_rows(), F);
-  for (std::size_t c = 0; c < latents.row_of().size(); ++c) {
-    const std::vector<Index>& row_of = latents.row_of()[c];
-    for (std::size_t j = 0; j < row_of.size(); ++j) {
-      const Index i = static_cast<Index>(j);
-      if (row_of[j] >= 0) rows.row(row_of[j]) = k[i] * basis.Z.row(i).segment(static_cast<Index>(c) * F, F);
+  for (Index f = 0; f < F; ++f) {
+    MatrixXd K = MatrixXd::Zero(n, F);  // of every function at each point with this one
+    if (basis.is_potential) {
+      gradient.multiply(VectorXd::Unit(F, f), of_gradient);
+      K = of_gradient.out;
+    } else {
+      K.col(f) = k;
+    }
+    out.sizes[f] = K.cwiseProduct(basis.beta).cwiseAbs().sum();
+    for (std::size_t c = 0; c < latents.row_of().size(); ++c) {
+      const std::vector<Index>& row_of = latents.row_of()[c];
+      const VectorXd of_points = K.cwiseProduct(basis.Z.middleCols(static_cast<Index>(c) * F, F)).rowwise().sum();
+      for (std::size_t j = 0; j < row_of.size(); ++j) {
+        if (row_of[j] >= 0) rows(row_of[j], f) = of_points[static_cast<Index>(j)];
+      }
     }
   }
   MatrixXd cross = latents.sums() != nullptr ? MatrixXd(latents.sums()->D * rows) : std::move(rows);
   latents.whiten(cross);
-  FunctionsAt out{VectorXd(F), VectorXd(F), std::sqrt(basis.kernel.variance(point))};
-  for (Index f = 0; f < F; ++f) {
-    out.stddev[f] = std::sqrt(std::max(0.0, basis.kernel.variance(point) - cross.col(f).squaredNorm()));
-    out.sizes[f] = k.cwiseProduct(basis.beta.col(f)).cwiseAbs().sum();
-  }
+  out.stddev = (variance - cross.colwise().squaredNorm().transpose()).cwiseMax(0).cwiseSqrt();
   return out;
 }
 

@@ -15,6 +15,7 @@
 //     known, constant     mu = M^-1 F; mu is constant
 //     load, nonlinear     a latent reads lambda0; lambda. Either: loaded; multipliers or these: least_norm
 //     solves              triangular systems of M are solved; of M itself (forced_solves)
+//     potential, other    a latent is a potential; one is none
 //     stddev, jacobian    these functions are asked for
 //     mixture             there are several components
 //     by_function         covariances are kept by latent functions, which are fewer than the rows of the view
@@ -823,6 +824,125 @@ static void add_features(int n, int d, int m, const real *x, const real *scale, 
   }
 }
 )c"},
+    {"compare_points",
+     R"c(/* Of pairs of points x and p: k1, k2, k3 (n each), which slopes_... make of s = |delta|^2/2 in the place of k1, and delta (n x d).
+ * The covariance of the gradients of a potential is scale (k1 I + k2 delta delta') scale, and dk2/ds = k3. */
+static void compare_points(int n, int d, const real *x, const real *p, const real *scale, real *pairs)
+{
+  real *const s = pairs, *const delta = pairs + 3 * n;
+  for (int i = 0; i < n; ++i) s[i] = 0;
+  for (int j = 0; j < d; ++j) {
+    for (int i = 0; i < n; ++i) {
+      delta[n * j + i] = (x[n * j + i] - p[j]) * scale[j];
+      s[i] += delta[n * j + i] * delta[n * j + i] / 2;
+    }
+  }
+}
+)c"},
+    {"slopes_se", R"c(static void slopes_se(int n, real square, real *pairs)
+{
+  real *const k1 = pairs, *const k2 = pairs + n, *const k3 = pairs + 2 * n;
+  for (int i = 0; i < n; ++i) k1[i] = -k1[i];
+  exponentials(n, k1);
+  for (int i = 0; i < n; ++i) {
+    k1[i] *= square;
+    k2[i] = -k1[i];
+    k3[i] = k1[i];
+  }
+}
+)c"},
+    {"slopes_matern52", R"c(static void slopes_matern52(int n, real square, real *pairs)
+{
+  real *const k1 = pairs, *const k2 = pairs + n, *const k3 = pairs + 2 * n;
+  for (int i = 0; i < n; ++i) k3[i] = -sqrt(10 * k1[i]);
+  for (int i = 0; i < n; ++i) k2[i] = -k3[i];
+  exponentials(n, k3);
+  for (int i = 0; i < n; ++i) {
+    const real r = k2[i], e = square * k3[i];
+    k1[i] = 5 * (1 + r) * e / 3;
+    k2[i] = -25 * e / 3;
+    k3[i] = r > 0 ? 125 * e / (3 * r) : 0;
+  }
+}
+)c"},
+    {"slopes_rq", R"c(static void slopes_rq(int n, real square, real alpha, real *pairs)
+{
+  real *const k1 = pairs, *const k2 = pairs + n, *const k3 = pairs + 2 * n;
+  for (int i = 0; i < n; ++i) {
+    const real base = 1 + k1[i] / alpha;
+    k1[i] = square * exp(-(alpha + 1) * log(base));
+    k2[i] = -(alpha + 1) / alpha * k1[i] / base;
+    k3[i] = -(alpha + 2) / alpha * k2[i] / base;
+  }
+}
+)c"},
+    {"slopes_linear", R"c(static void slopes_linear(int n, real square, real *pairs)
+{
+  for (int i = 0; i < n; ++i) {
+    pairs[i] = square;
+    pairs[n + i] = pairs[2 * n + i] = 0;
+  }
+}
+)c"},
+    {"along_pairs", R"c(/* along_i = delta_i' scale weights_i */
+static void along_pairs(int n, int d, const real *delta, const real *scale, const real *weights, real *along)
+{
+  for (int i = 0; i < n; ++i) along[i] = 0;
+  for (int j = 0; j < d; ++j) {
+    for (int i = 0; i < n; ++i) along[i] += delta[n * j + i] * weights[n * j + i] * scale[j];
+  }
+}
+)c"},
+    {"add_gradients", R"c(/* out (d) += the covariances times weights (n x d) */
+static void add_gradients(int n, int d, const real *pairs, const real *scale, const real *weights, real *along, real *out)
+{
+  const real *const k1 = pairs, *const k2 = pairs + n, *const delta = pairs + 3 * n;
+  along_pairs(n, d, delta, scale, weights, along);
+  for (int j = 0; j < d; ++j) {
+    real sums[LANES] = {0};
+    for (int i = 0; i < n; i += LANES) {
+      for (int e = i; e < i + LANES; ++e) {
+        sums[e - i] += k1[e] * weights[n * j + e] * scale[j] + k2[e] * along[e] * delta[n * j + e];
+      }
+    }
+    out[j] += scale[j] * total(sums);
+  }
+}
+)c"},
+    {"add_hessians", R"c(/* out (d x d) += the derivative of these sums in the features of the state */
+static void add_hessians(int n, int d, const real *pairs, const real *scale, const real *weights, real *along, real *out)
+{
+  const real *const k2 = pairs + n, *const k3 = pairs + 2 * n, *const delta = pairs + 3 * n;
+  along_pairs(n, d, delta, scale, weights, along);
+  for (int j = 0; j < d; ++j) {
+    for (int l = 0; l < d; ++l) {
+      real sums[LANES] = {0};
+      for (int i = 0; i < n; i += LANES) {
+        for (int e = i; e < i + LANES; ++e) {
+          sums[e - i] += k2[e] * (delta[n * j + e] * weights[n * l + e] * scale[l] + delta[n * l + e] * weights[n * j + e] * scale[j] +
+              (j == l) * along[e]) + k3[e] * along[e] * delta[n * j + e] * delta[n * l + e];
+        }
+      }
+      out[j + d * l] -= scale[j] * scale[l] * total(sums);
+    }
+  }
+}
+)c"},
+    {"multiply_pairs", R"c(/* out (n x d) += the covariances times loading (d) */
+static void multiply_pairs(int n, int d, const real *pairs, const real *scale, const real *loading, real *along, real *out)
+{
+  const real *const k1 = pairs, *const k2 = pairs + n, *const delta = pairs + 3 * n;
+  for (int i = 0; i < n; ++i) along[i] = 0;
+  for (int j = 0; j < d; ++j) {
+    for (int i = 0; i < n; ++i) along[i] += delta[n * j + i] * (scale[j] * loading[j]);
+  }
+  for (int j = 0; j < d; ++j) {
+    for (int i = 0; i < n; ++i) {
+      out[n * j + i] += scale[j] * (k1[i] * scale[j] * loading[j] + k2[i] * along[i] * delta[n * j + i]);
+    }
+  }
+}
+)c"},
 };
 
 // the mean, its deviation and its Jacobian
@@ -1050,15 +1170,24 @@ status @name@_mean(const real *state, real *mean, workspace *w)
 {stddev}
 {stddev}/* ---------------------------------------------------------------- standard deviation */
 {stddev}
-{stddev,!by_function}/* products_j += k_j times the rows of functions at point j, times their loading */
-{stddev,!by_function}static void add_products(const latent *a, int n_functions, int row, const real *k, const real *loading, real *products)
-{stddev,!by_function}{
-{stddev,!by_function}  for (int f = 0; f < n_functions; ++f) {
-{stddev,!by_function}    const real *const rows = a->rows + a->n * (n_functions * row + f);
-{stddev,!by_function}    for (int j = 0; j < a->n; ++j) products[j] += k[j] * rows[j] * loading[f];
-{stddev,!by_function}  }
-{stddev,!by_function}}
-{stddev,!by_function}
+{stddev,potential}/* products_j += the rows of gradients at point j, times their covariance with what is predicted */
+{stddev,potential}static void add_gradient_products(const latent *a, int d, int row, const real *gradient, real *products)
+{stddev,potential}{
+{stddev,potential}  for (int f = 0; f < d; ++f) {
+{stddev,potential}    const real *const rows = a->rows + a->n * (d * row + f);
+{stddev,potential}    for (int j = 0; j < a->n; ++j) products[j] += gradient[a->n * f + j] * rows[j];
+{stddev,potential}  }
+{stddev,potential}}
+{stddev,potential}
+{stddev,!by_function,other}/* products_j += k_j times the rows of functions at point j, times their loading */
+{stddev,!by_function,other}static void add_products(const latent *a, int n_functions, int row, const real *k, const real *loading, real *products)
+{stddev,!by_function,other}{
+{stddev,!by_function,other}  for (int f = 0; f < n_functions; ++f) {
+{stddev,!by_function,other}    const real *const rows = a->rows + a->n * (n_functions * row + f);
+{stddev,!by_function,other}    for (int j = 0; j < a->n; ++j) products[j] += k[j] * rows[j] * loading[f];
+{stddev,!by_function,other}  }
+{stddev,!by_function,other}}
+{stddev,!by_function,other}
 {stddev}/* G of the view, transposed (NQ x NR): the prediction is G abar + d */
 {stddev}static void evaluate_view(workspace *w)
 {stddev}{

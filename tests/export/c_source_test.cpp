@@ -99,7 +99,7 @@ std::string compiler(std::size_t turn) {
 TEST(CSourceTest, IsThePredictorInEveryView) {
   int n_good = 0;
   std::size_t turn = 0;
-  for (const Problem& p : test::without_potentials(test::problems(21, export_seed))) {
+  for (const Problem& p : test::problems(21, export_seed)) {
     const Posterior posterior(p.prior, p.observations, p.values);
     View view = View::all(Quantity::all()[turn++ % Quantity::all().size()], *p.prior.system);
     if (view.size() == 0) view = View::constrained_acceleration(*p.prior.system);
@@ -119,7 +119,7 @@ TEST(CSourceTest, IsThePredictorInEveryView) {
 
 // the first problem of a name
 Problem problem_of(const std::string& name) {
-  for (const Problem& p : test::without_potentials(test::problems(21, export_seed))) {
+  for (const Problem& p : test::problems(21, export_seed)) {
     if (p.name.find(name) != std::string::npos) return p;
   }
   throw std::runtime_error("no problem " + name);
@@ -215,6 +215,34 @@ TEST(CSourceTest, IsThePredictorOfNonlinearLatents) {
                 HasSubstr("export to C of a part of the motion"));
   }
 }
+
+class EveryModel : public testing::TestWithParam<std::string> {};
+
+// Of a fit by the file's prior; of models with an even number of coordinates a mixture.
+TEST_P(EveryModel, ExportedIsThePredictorAtTenThousandStates) {
+  const Model& model = test::model(GetParam());
+  const GeneratedData data = test::draw(model, 40, export_seed);
+  RandomStream random(export_seed);
+  const double size = std::sqrt(data.accelerations.array().square().mean());
+  const MatrixXd noise = 0.01 * size * test::random_matrix(data.accelerations.rows(), data.accelerations.cols(), random);
+  PriorOptions prior_options;
+  prior_options.mean = Prior::Mean::force;
+  Problem p{GetParam(), make_prior(model, prior_options), {}, {}, data.states, {}};
+  p.observations.push_back({data.states, View::constrained_acceleration(*model.system), data.accelerations + noise,
+                            VectorXd::Constant(model.system->nq(), 0.01 * size)});
+  FitOptions options;
+  options.n_restarts = 2;
+  options.n_draws = model.system->nq() % 2 == 0 ? 4 : 0;
+  const Posterior posterior =
+      fit(p.prior, p.observations, default_hyperparameters(p.prior, p.observations, {}, {}), options).posterior;
+  p.values = posterior.values();
+  const View view = View::constrained_acceleration(*model.system);
+  Exported c(export_c(posterior, view), "gp2_model", compiler(static_cast<std::size_t>(model.system->nq())));
+  EXPECT_EQ(c.self_test(c.workspace()), 0);
+  EXPECT_GT(expect_predictor(posterior, view, c, random_states(p.queries, 10000, export_seed), p), 5000);
+}
+INSTANTIATE_TEST_SUITE_P(CSourceTest, EveryModel, testing::ValuesIn(test::model_files({"models", "experiments/mechanisms"})),
+                         test::model_test_name);
 
 TEST(CSourceTest, HasEveryKernelAndEveryOperation) {
   const Model& model = model_with_every_kernel();
