@@ -132,7 +132,7 @@ std::optional<std::string> contacts_note(const Trajectory& motion) {
 double largest_change(const Eigen::VectorXd& energy) { return (energy.array() - energy[0]).abs().maxCoeff(); }
 
 // the worst of several motions, their sums where that says more
-nlohmann::ordered_json report_of(const std::vector<Motion>& motions, const System& system) {
+nlohmann::ordered_json report_of(const std::vector<Motion>& motions, const System& system, const SimulateJob& job) {
   Trajectory total;
   double energy_drift = 0;
   std::size_t n_lower_rank = 0;
@@ -171,6 +171,13 @@ nlohmann::ordered_json report_of(const std::vector<Motion>& motions, const Syste
                       {"energy_loss", event.energy_loss}});
   }
   report["contact_events"] = std::move(events);
+  nlohmann::ordered_json sticks = nlohmann::ordered_json::array();
+  for (const StickEvent& event : motions[0].trajectory.sticks) {
+    sticks.push_back({{"t", event.time},
+                      {"surface", job.options.switching.names()[static_cast<std::size_t>(event.surface)]},
+                      {"kind", event.sticks ? "sticks" : "slips"}});
+  }
+  report["stick_events"] = std::move(sticks);
   report["multiplier_sign_changes"] = nlohmann::ordered_json::object();
   const std::vector<std::vector<double>> changes = multiplier_sign_changes(motions[0].trajectory);
   for (std::size_t k = 0; k < changes.size(); ++k) {
@@ -180,7 +187,8 @@ nlohmann::ordered_json report_of(const std::vector<Motion>& motions, const Syste
   return report;
 }
 
-std::vector<std::string> notes_of(const std::vector<Motion>& motions, const System& system, const SimulateArguments& arguments) {
+std::vector<std::string> notes_of(const std::vector<Motion>& motions, const System& system, const SimulateJob& job,
+                                  const SimulateArguments& arguments) {
   std::vector<std::string> notes;
   const Trajectory& first = motions[0].trajectory;
   constexpr double worth_saying = 1e-9;
@@ -212,7 +220,7 @@ std::vector<std::string> notes_of(const std::vector<Motion>& motions, const Syst
                     motion.trajectory.times[lower.states.front()]));
     break;  // as above
   }
-  const nlohmann::ordered_json report = report_of(motions, system);
+  const nlohmann::ordered_json report = report_of(motions, system, job);
   Eigen::Index n_rows = 0;
   for (const Motion& motion : motions) n_rows += motion.trajectory.times.size();
   notes.push_back(fmt::format("{}: {} rows, {} steps; drift |c| ≤ {:.3g}, |dc/dt| ≤ {:.3g}", arguments.output, n_rows,
@@ -270,8 +278,8 @@ void run(const SimulateArguments& arguments) {
   write_csv(arguments.output, [&](CsvWriter& csv) {
     print_motions(motions, subject, job, request.n_samples.has_value(), subject.posterior.has_value() && !request.n_samples, csv);
   });
-  print_notes(notes_of(motions, subject.system(), arguments));
-  if (arguments.json) print_result("{}\n", report_of(motions, subject.system()).dump(2));
+  print_notes(notes_of(motions, subject.system(), job, arguments));
+  if (arguments.json) print_result("{}\n", report_of(motions, subject.system(), job).dump(2));
   if (!unfinished.empty()) throw NumericalError(fmt::format("{}; {} holds what was reached", unfinished, arguments.output));
 }
 

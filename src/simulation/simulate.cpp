@@ -376,17 +376,43 @@ class Integration {
     std::swap(x_, x_new_);
     std::swap(dxdt_, dxdt_new_);
     t_ = t_new;
-    if (has_crossed && !contacts_.is_empty()) settle_contacts(/*at_start=*/false);
     const bool switches = !switching_.is_empty() && (has_crossed || switching_.is_sliding());
+    const std::vector<int> sides = switching_.sides();
     if (switches) {
       expand(x_, t_);
       switching_.cross(state_);
       switching_.hold(state_);
       std::copy_n(state_.begin(), x_.size(), x_.begin());
     }
+    const std::size_t n_events = out_.events.size();
+    if (has_crossed && !contacts_.is_empty()) settle_contacts(/*at_start=*/false);
+    const bool has_met = out_.events.size() > n_events;
     const bool moved = options_.project && project(x_, t_);
-    if (switches) switch_or_throw([&] { switching_.settle(state_, counted()); });
+    if (switches) {
+      switch_or_throw([&] {
+        if (has_met) {
+          switching_.start(state_, counted());
+        } else {
+          switching_.settle(state_, counted());
+        }
+      });
+      note_sticks(sides);
+    }
     if (moved || switches || (has_crossed && !contacts_.is_empty())) derivative_or_throw();
+  }
+
+  // where the motion is on a surface now, and was beside it, or the other way round
+  void note_sticks(const std::vector<int>& before) {
+    const std::vector<int>& after = switching_.sides();
+    for (std::size_t k = 0; k < after.size(); ++k) {
+      if ((before[k] == 0) != (after[k] == 0)) out_.sticks.push_back({t_, static_cast<int>(k), after[k] == 0});
+    }
+  }
+
+  [[nodiscard]] Acceleration of_sides_anew() {
+    return [this](const Ref<const VectorXd>& state) -> VectorXd {
+      return switching_.is_empty() ? counted()(state) : switching_.acceleration_anew(state, counted());
+    };
   }
 
   // impacts and releases at (x_, t_)
@@ -394,9 +420,9 @@ class Integration {
     expand(x_, t_);
     try {
       if (at_start) {
-        contacts_.start(state_, of_motion(), out_.events);
+        contacts_.start(state_, of_sides_anew(), out_.events);
       } else {
-        contacts_.settle(state_, of_motion(), out_.events);
+        contacts_.settle(state_, of_sides_anew(), out_.events);
       }
     } catch (const Error& error) {
       if (at_start) throw;
