@@ -59,7 +59,7 @@ Subject read_subject(const SimulateArguments& arguments) {
 struct Motion {
   Trajectory trajectory;
   std::optional<MotionUncertainty> uncertainty;  // of a fit
-  std::optional<Eigen::VectorXd> energy;         // of a model with a potential
+  std::optional<MotionEnergy> energy;            // of a model with a potential
 };
 
 /// The inputs are written as commanded, and those of contacts as the motion made them, so that the file reads as a log does.
@@ -82,7 +82,9 @@ void print_motions(const std::vector<Motion>& motions, const Subject& subject, c
   }
   for (std::size_t j = 0; with_stddev && j < accelerations.size(); ++j) csv.add(accelerations[j] + "_std");
   if (with_stddev) csv.add("distance_from_data");
-  if (subject.model->potential) csv.add("energy");
+  if (!job.energies.empty()) csv.add("energy");
+  const bool with_energy_stddev = motions[0].energy && motions[0].energy->stddev.size() > 0;
+  if (with_energy_stddev) csv.add("energy_std");
   csv.end_line();
 
   for (std::size_t k = 0; k < motions.size(); ++k) {
@@ -103,7 +105,8 @@ void print_motions(const std::vector<Motion>& motions, const Subject& subject, c
         add(motions[k].uncertainty->stddev.col(i));
         csv.add(motions[k].uncertainty->distance[i]);
       }
-      if (motions[k].energy) csv.add((*motions[k].energy)[i]);
+      if (motions[k].energy) csv.add(motions[k].energy->values[i]);
+      if (with_energy_stddev) csv.add(motions[k].energy->stddev[i]);
       csv.end_line();
     }
   }
@@ -146,7 +149,7 @@ nlohmann::ordered_json report_of(const std::vector<Motion>& motions, const Syste
     total.evaluations += one.evaluations;
     total.seconds += one.seconds;
     n_lower_rank += one.lower_rank.states.size();
-    if (motion.energy) energy_drift = std::max(energy_drift, largest_change(*motion.energy));
+    if (motion.energy) energy_drift = std::max(energy_drift, largest_change(motion.energy->values));
     const std::optional<double> left = motion.uncertainty ? motion.uncertainty->leaves_data : std::nullopt;
     if (left && (!leaves_data || *left < *leaves_data)) leaves_data = left;
   }
@@ -228,7 +231,7 @@ std::vector<std::string> notes_of(const std::vector<Motion>& motions, const Syst
                               report["max_velocity_drift"].get<double>()));
   if (const std::optional<std::string> note = contacts_note(first)) notes.push_back(*note);
   if (motions[0].energy) {
-    const Eigen::VectorXd& energy = *motions[0].energy;
+    const Eigen::VectorXd& energy = motions[0].energy->values;
     notes.push_back(fmt::format("energy: {:.6g} J at the start, {:.6g} J at the end, largest change {:.3g} J", energy[0],
                                 energy[energy.size() - 1], largest_change(energy)));
   }
@@ -247,13 +250,14 @@ SimulateRequest read_request(const SimulateArguments& arguments, const Model& mo
 
 std::vector<Motion> with_uncertainty(std::vector<Trajectory> trajectories, const Subject& subject, const SimulateJob& job) {
   std::vector<Motion> motions;
-  for (Trajectory& trajectory : trajectories) {
+  for (std::size_t k = 0; k < trajectories.size(); ++k) {
+    Trajectory& trajectory = trajectories[k];
     if (trajectory.times.size() == 0) continue;
     Motion& motion = motions.emplace_back(Motion{std::move(trajectory), {}, {}});
     if (subject.posterior) {
       motion.uncertainty = motion_uncertainty(*subject.posterior, motion.trajectory, subject.asked->other_system);
     }
-    if (subject.model->potential) motion.energy = mechanical_energy(*subject.model, job.parameters, motion.trajectory.states);
+    if (!job.energies.empty()) motion.energy = job.energies[k](motion.trajectory.states);
   }
   return motions;
 }
