@@ -80,9 +80,11 @@ struct Contact {
   int row = 0;             // of A
   int input = 0;           // of the inputs: 1 in contact, 0 apart
   double restitution = 0;  // e ∈ [0, 1]: an impact changes the rate of the gap from ċ to −e ċ
+  /// e where it depends on the state before the impact, in the place of the number.
+  std::function<double(const Eigen::Ref<const Eigen::VectorXd>& state)> restitution_at = {};
 };
 
-/// The contacts of a model. @throws InputError when a restitution is outside [0, 1].
+/// The contacts of a model. @throws InputError when a restitution that no state changes is outside [0, 1].
 std::vector<Contact> contacts_of(const Model& model, const Eigen::Ref<const Eigen::VectorXd>& parameters);
 
 /// What happened to a contact in a motion.
@@ -165,7 +167,7 @@ class UnfinishedMotion : public NumericalError {
 ///
 /// A contact ends a step where its gap closes, found on the dense output. It is an impact of Newton's law along M⁻¹Aᵀ, during which
 /// all other active constraints hold; where the rebound is over within `shortest_flight` the contact stays closed, so that the
-/// accumulating bounces of a ball end. It has no impulse of friction. A closed contact is released where the motion without it would open the gap, which is where
+/// accumulating bounces of a ball end; a restitution outside [0, 1] there is an error. It has no impulse of friction. A closed contact is released where the motion without it would open the gap, which is where
 /// its multiplier would pull. One at a time: where several contacts close or open together, those whose impulse would pull are let
 /// go one after the other, which is not the complementarity problem of many contacts.
 ///
