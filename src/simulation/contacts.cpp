@@ -139,6 +139,14 @@ bool Contacts::is_released(const VectorXd& state, const Acceleration& accelerati
   return false;
 }
 
+VectorXd Contacts::margins(const VectorXd& state, const Acceleration& acceleration) const {
+  VectorXd out = VectorXd::Ones(static_cast<Index>(contacts_.size()));
+  for (std::size_t k = 0; k < contacts_.size(); ++k) {
+    if (is_closed_[k]) out[static_cast<Index>(k)] = -opening(state, k, acceleration);
+  }
+  return out;
+}
+
 void Contacts::release(VectorXd& state, const Acceleration& acceleration, std::vector<ContactEvent>& events) {
   for (bool has_changed = true; has_changed;) {
     has_changed = false;

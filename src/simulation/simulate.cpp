@@ -118,9 +118,17 @@ class Integration {
         require_step(step);
         continue;
       }
-      step = to_limit ? std::max(step, tried) : tried;
       if (to_limit) t_new = limit;
       const std::optional<double> crossing = find_crossing(t_new);
+      if (!crossing && is_hold_unresolved(t_new)) {
+        step = longest_holding_step_ = (t_new - t_) / 2;
+        --out_.steps;
+        ++out_.rejected_steps;
+        continue;
+      }
+      step = to_limit ? std::max(step, tried) : tried;
+      constexpr double growth = 1.5;
+      step = std::min(step, longest_holding_step_ *= growth);
       write_within(next, crossing.value_or(t_new), t_new);
       if (crossing) {
         x_new_ = x_crossing_;
@@ -344,6 +352,31 @@ class Integration {
     return std::nullopt;
   }
 
+  // Whether a motion that is held may have been let go, and held again, within the step to t_new. What is held at rest has no error
+  // however long the step is, and forces of time may come and go in it. Their margins are looked at at both ends and between.
+  bool is_hold_unresolved(double t_new) {
+    constexpr double rounding = 1e-6, shortest = 1e3;
+    if (!switching_.is_sliding() && !contacts_.is_any_closed()) return false;
+    if (t_new - t_ <= shortest * smallest_step()) return false;
+    const auto margins_at = [&](double t) -> VectorXd {
+      x_crossing_.resize(x_.size());
+      stepper_.stepper().calc_state(t, x_crossing_, x_, dxdt_, t_, x_new_, dxdt_new_, t_new);
+      expand(x_crossing_, t);
+      if (options_.project || project_stages_) projection_.apply(state_);
+      VectorXd margins(options_.contacts.size() + static_cast<std::size_t>(options_.switching.size()));
+      margins << contacts_.margins(state_, of_motion()), switching_.margins(state_, counted());
+      return margins;
+    };
+    try {
+      const VectorXd start = margins_at(t_), middle = margins_at(std::midpoint(t_, t_new)), end = margins_at(t_new);
+      const VectorXd bend = (middle - (start + end) / 2).cwiseAbs(), least = start.cwiseMin(middle).cwiseMin(end);
+      const VectorXd size = start.cwiseAbs().cwiseMax(middle.cwiseAbs()).cwiseMax(end.cwiseAbs());
+      return (bend.array() > rounding * size.array() && least.array() < 2 * bend.array()).any();
+    } catch (const Error&) {
+      return false;
+    }
+  }
+
   // whether a surface that the motion slides on, or a contact, does not hold it at state_
   bool is_let_go() {
     if (!switching_.is_sliding() && contacts_.is_empty()) return false;
@@ -467,6 +500,7 @@ class Integration {
   Contacts contacts_;
   ControlledStepper stepper_;
   bool project_stages_ = false;
+  double longest_holding_step_ = std::numeric_limits<double>::infinity();
   VectorXd state_;  // scratch
   double t_ = 0;
   Phase x_, dxdt_, x_new_, dxdt_new_, x_crossing_;

@@ -224,6 +224,16 @@ bool Switching::is_let_go(const VectorXd& state, const Acceleration& acceleratio
   return (sigma_.array().abs() > 1).any();
 }
 
+VectorXd Switching::margins(const VectorXd& state, const Acceleration& acceleration) {
+  static_cast<void>(this->acceleration(state, acceleration));
+  VectorXd out = VectorXd::Ones(static_cast<Index>(sides_.size()));
+  Index next = 0;
+  for (std::size_t k = 0; k < sides_.size(); ++k) {
+    if (sides_[k] == 0) out[static_cast<Index>(k)] = 1 - std::abs(sigma_[next++]);
+  }
+  return out;
+}
+
 void Switching::settle(const VectorXd& state, const Acceleration& acceleration) {
   bool has_changed = true;
   while (has_changed && is_sliding()) {

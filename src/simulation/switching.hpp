@@ -42,6 +42,8 @@ class Switching {
   void hold(Eigen::VectorXd& state) const;
   /// Whether one of the surfaces slid on does not hold the motion.
   bool is_let_go(const Eigen::VectorXd& state, const Acceleration& acceleration);
+  /// How far each surface is from letting the motion go, 1 − |σ|; 1 of those not slid on.
+  Eigen::VectorXd margins(const Eigen::VectorXd& state, const Acceleration& acceleration);
   /// Leaves the surfaces that do not hold the motion any more.
   void settle(const Eigen::VectorXd& state, const Acceleration& acceleration);
   /// Of each surface: 1, −1; 0 where the motion slides on it.

@@ -493,6 +493,38 @@ force = ["-{4}*abs(lambda(1))*sign(dx - {5})", "0"]
   expect_constraints(model, motion);
 }
 
+// What rests has no error, however long a step is: the forces of time that let it go are looked for all the same.
+TEST(ContactFriction, AtRestIsLetGoEachTimeThatItsLoadIsLifted) {
+  const std::string text = R"toml(
+coordinates = ["x", "z"]
+inputs      = ["touch"]
+[mechanics]
+mass  = [["1.3", "0"], ["0", "1.3"]]
+force = ["0", "-1.3*9.81 + 16*sin(1.7*t)"]
+[constraints]
+position = [{ expr = "z", contact = "touch" }]
+[truth]
+force = ["-0.6*abs(lambda(1))*sign(dx)", "0"]
+)toml";
+  const double first = std::asin(1.3 * g / 16) / 1.7, period = 2 * std::numbers::pi / 1.7;
+  const Trajectory motion = motion_of(Model::parse(text, "at rest"), {0, 0, 0, 0}, 37, 2);
+  const std::vector<ContactEvent> released = of_kind(motion, Kind::released);
+  ASSERT_EQ(released.size(), 10U);
+  for (std::size_t k = 0; k < released.size(); ++k) {
+    EXPECT_NEAR(released[k].time, first + static_cast<double>(k) * period, of_event) << k;
+  }
+  // and a body on rough ground under a force that comes and goes
+  std::string pushed = text;
+  pushed.replace(pushed.find("\"0\", \"-1.3*9.81 + 16*sin(1.7*t)\""), 32, "\"8*sin(1.7*t)\", \"-1.3*9.81\"");
+  const Trajectory pulled = motion_of(Model::parse(pushed, "pushed"), {0, 0, 0, 0}, 37, 2);
+  ASSERT_GE(pulled.sticks.size(), 38U);  // twice in each of ten periods, but for the last
+  const double limit = std::asin(0.6 * 1.3 * g / 8) / 1.7;
+  for (std::size_t k = 0; k < pulled.sticks.size(); k += 2) {
+    EXPECT_FALSE(pulled.sticks[k].sticks);
+    EXPECT_NEAR(pulled.sticks[k].time, limit + static_cast<double>(k) / 4 * period, of_event) << k;
+  }
+}
+
 // A holds B up against its side, as a hand holds a book against a shelf; each friction changes the load of the other.
 Model book(const std::string& press) {
   return Model::parse(fmt::format(R"toml(
@@ -565,8 +597,8 @@ force = ["-0.4*abs(lambda(1))*sign(dx)", "0", "0"]
   }
 }
 
-// three thousand bounces, slips and rides
-TEST(ContactFriction, KeepsItsConstraintsForAnHour) {
+// hundreds of bounces, slips and rides
+TEST(ContactFriction, KeepsItsConstraintsForTenMinutes) {
   const Model model = Model::parse(R"toml(
 coordinates = ["x", "z"]
 inputs      = ["touch"]
@@ -578,9 +610,9 @@ position = [{ expr = "z", contact = "touch", restitution = 0.3 }]
 [truth]
 force = ["-0.4*abs(lambda(1))*sign(dx - 0.3)", "0"]
 )toml",
-                                   "an hour");
-  const Trajectory motion = motion_of(model, {0, 0, 0.3, 0}, 3600, 7201);
-  const auto periods = static_cast<std::size_t>(3600 * 1.7 / (2 * std::numbers::pi));
+                                   "long");
+  const Trajectory motion = motion_of(model, {0, 0, 0.3, 0}, 600, 1201);
+  const auto periods = static_cast<std::size_t>(600 * 1.7 / (2 * std::numbers::pi));
   EXPECT_NEAR(static_cast<double>(of_kind(motion, Kind::made).size()), static_cast<double>(periods), 1);
   EXPECT_NEAR(static_cast<double>(of_kind(motion, Kind::released).size()), static_cast<double>(periods), 1);
   EXPECT_GT(of_kind(motion, Kind::impact).size(), 3 * periods);
