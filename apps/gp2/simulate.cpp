@@ -59,7 +59,7 @@ Subject read_subject(const SimulateArguments& arguments) {
 struct Motion {
   Trajectory trajectory;
   std::optional<MotionUncertainty> uncertainty;  // of a fit
-  std::optional<Eigen::VectorXd> energy;         // of a model with a potential
+  std::optional<MotionEnergy> energy;            // of a model with a potential
 };
 
 /// The inputs are written as commanded, and those of contacts as the motion made them, so that the file reads as a log does.
@@ -82,7 +82,9 @@ void print_motions(const std::vector<Motion>& motions, const Subject& subject, c
   }
   for (std::size_t j = 0; with_stddev && j < accelerations.size(); ++j) csv.add(accelerations[j] + "_std");
   if (with_stddev) csv.add("distance_from_data");
-  if (subject.model->potential) csv.add("energy");
+  if (!job.energies.empty()) csv.add("energy");
+  const bool with_energy_stddev = motions[0].energy && motions[0].energy->stddev.size() > 0;
+  if (with_energy_stddev) csv.add("energy_std");
   csv.end_line();
 
   for (std::size_t k = 0; k < motions.size(); ++k) {
@@ -103,7 +105,8 @@ void print_motions(const std::vector<Motion>& motions, const Subject& subject, c
         add(motions[k].uncertainty->stddev.col(i));
         csv.add(motions[k].uncertainty->distance[i]);
       }
-      if (motions[k].energy) csv.add((*motions[k].energy)[i]);
+      if (motions[k].energy) csv.add(motions[k].energy->values[i]);
+      if (with_energy_stddev) csv.add(motions[k].energy->stddev[i]);
       csv.end_line();
     }
   }
@@ -132,7 +135,7 @@ std::optional<std::string> contacts_note(const Trajectory& motion) {
 double largest_change(const Eigen::VectorXd& energy) { return (energy.array() - energy[0]).abs().maxCoeff(); }
 
 // the worst of several motions, their sums where that says more
-nlohmann::ordered_json report_of(const std::vector<Motion>& motions, const System& system) {
+nlohmann::ordered_json report_of(const std::vector<Motion>& motions, const System& system, const SimulateJob& job) {
   Trajectory total;
   double energy_drift = 0;
   std::size_t n_lower_rank = 0;
@@ -146,7 +149,7 @@ nlohmann::ordered_json report_of(const std::vector<Motion>& motions, const Syste
     total.evaluations += one.evaluations;
     total.seconds += one.seconds;
     n_lower_rank += one.lower_rank.states.size();
-    if (motion.energy) energy_drift = std::max(energy_drift, largest_change(*motion.energy));
+    if (motion.energy) energy_drift = std::max(energy_drift, largest_change(motion.energy->values));
     const std::optional<double> left = motion.uncertainty ? motion.uncertainty->leaves_data : std::nullopt;
     if (left && (!leaves_data || *left < *leaves_data)) leaves_data = left;
   }
@@ -171,6 +174,13 @@ nlohmann::ordered_json report_of(const std::vector<Motion>& motions, const Syste
                       {"energy_loss", event.energy_loss}});
   }
   report["contact_events"] = std::move(events);
+  nlohmann::ordered_json sticks = nlohmann::ordered_json::array();
+  for (const StickEvent& event : motions[0].trajectory.sticks) {
+    sticks.push_back({{"t", event.time},
+                      {"surface", job.options.switching.names()[static_cast<std::size_t>(event.surface)]},
+                      {"kind", event.sticks ? "sticks" : "slips"}});
+  }
+  report["stick_events"] = std::move(sticks);
   report["multiplier_sign_changes"] = nlohmann::ordered_json::object();
   const std::vector<std::vector<double>> changes = multiplier_sign_changes(motions[0].trajectory);
   for (std::size_t k = 0; k < changes.size(); ++k) {
@@ -180,7 +190,8 @@ nlohmann::ordered_json report_of(const std::vector<Motion>& motions, const Syste
   return report;
 }
 
-std::vector<std::string> notes_of(const std::vector<Motion>& motions, const System& system, const SimulateArguments& arguments) {
+std::vector<std::string> notes_of(const std::vector<Motion>& motions, const System& system, const SimulateJob& job,
+                                  const SimulateArguments& arguments) {
   std::vector<std::string> notes;
   const Trajectory& first = motions[0].trajectory;
   constexpr double worth_saying = 1e-9;
@@ -212,7 +223,7 @@ std::vector<std::string> notes_of(const std::vector<Motion>& motions, const Syst
                     motion.trajectory.times[lower.states.front()]));
     break;  // as above
   }
-  const nlohmann::ordered_json report = report_of(motions, system);
+  const nlohmann::ordered_json report = report_of(motions, system, job);
   Eigen::Index n_rows = 0;
   for (const Motion& motion : motions) n_rows += motion.trajectory.times.size();
   notes.push_back(fmt::format("{}: {} rows, {} steps; drift |c| ≤ {:.3g}, |dc/dt| ≤ {:.3g}", arguments.output, n_rows,
@@ -220,7 +231,7 @@ std::vector<std::string> notes_of(const std::vector<Motion>& motions, const Syst
                               report["max_velocity_drift"].get<double>()));
   if (const std::optional<std::string> note = contacts_note(first)) notes.push_back(*note);
   if (motions[0].energy) {
-    const Eigen::VectorXd& energy = *motions[0].energy;
+    const Eigen::VectorXd& energy = motions[0].energy->values;
     notes.push_back(fmt::format("energy: {:.6g} J at the start, {:.6g} J at the end, largest change {:.3g} J", energy[0],
                                 energy[energy.size() - 1], largest_change(energy)));
   }
@@ -239,13 +250,14 @@ SimulateRequest read_request(const SimulateArguments& arguments, const Model& mo
 
 std::vector<Motion> with_uncertainty(std::vector<Trajectory> trajectories, const Subject& subject, const SimulateJob& job) {
   std::vector<Motion> motions;
-  for (Trajectory& trajectory : trajectories) {
+  for (std::size_t k = 0; k < trajectories.size(); ++k) {
+    Trajectory& trajectory = trajectories[k];
     if (trajectory.times.size() == 0) continue;
     Motion& motion = motions.emplace_back(Motion{std::move(trajectory), {}, {}});
     if (subject.posterior) {
       motion.uncertainty = motion_uncertainty(*subject.posterior, motion.trajectory, subject.asked->other_system);
     }
-    if (subject.model->potential) motion.energy = mechanical_energy(*subject.model, job.parameters, motion.trajectory.states);
+    if (!job.energies.empty()) motion.energy = job.energies[k](motion.trajectory.states);
   }
   return motions;
 }
@@ -270,8 +282,8 @@ void run(const SimulateArguments& arguments) {
   write_csv(arguments.output, [&](CsvWriter& csv) {
     print_motions(motions, subject, job, request.n_samples.has_value(), subject.posterior.has_value() && !request.n_samples, csv);
   });
-  print_notes(notes_of(motions, subject.system(), arguments));
-  if (arguments.json) print_result("{}\n", report_of(motions, subject.system()).dump(2));
+  print_notes(notes_of(motions, subject.system(), job, arguments));
+  if (arguments.json) print_result("{}\n", report_of(motions, subject.system(), job).dump(2));
   if (!unfinished.empty()) throw NumericalError(fmt::format("{}; {} holds what was reached", unfinished, arguments.output));
 }
 

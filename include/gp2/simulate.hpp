@@ -57,6 +57,8 @@ class SwitchingFunctions {
   SwitchingFunctions(std::span<const Expression> functions, const SystemSymbols& symbols);
 
   [[nodiscard]] int size() const { return size_; }
+  /// g as texts.
+  [[nodiscard]] const std::vector<std::string>& names() const { return names_; }
   /// @param values     g (size)
   /// @param gradients  ∂g/∂[q; dq; t] (size × 2 nq + 1)
   void evaluate(const Eigen::Ref<const Eigen::VectorXd>& state, const Eigen::Ref<const Eigen::VectorXd>& parameters,
@@ -65,6 +67,7 @@ class SwitchingFunctions {
  private:
   Tape tape_;
   int size_ = 0;
+  std::vector<std::string> names_;
 };
 
 /// The arguments of sign() that read velocities, in a model's force, and in its [truth] or in features and directions of its
@@ -77,9 +80,11 @@ struct Contact {
   int row = 0;             // of A
   int input = 0;           // of the inputs: 1 in contact, 0 apart
   double restitution = 0;  // e ∈ [0, 1]: an impact changes the rate of the gap from ċ to −e ċ
+  /// e where it depends on the state before the impact, in the place of the number.
+  std::function<double(const Eigen::Ref<const Eigen::VectorXd>& state)> restitution_at = {};
 };
 
-/// The contacts of a model. @throws InputError when a restitution is outside [0, 1].
+/// The contacts of a model. @throws InputError when a restitution that no state changes is outside [0, 1].
 std::vector<Contact> contacts_of(const Model& model, const Eigen::Ref<const Eigen::VectorXd>& parameters);
 
 /// What happened to a contact in a motion.
@@ -90,6 +95,13 @@ struct ContactEvent {
   Kind kind = Kind::impact;
   double approach = 0;     // −ċ before an impact, 0 of a release
   double energy_loss = 0;  // kinetic energy that the impact took [J]
+};
+
+/// A zero of a switching function that starts to hold a motion, as dry friction does a body that sticks, or lets it go.
+struct StickEvent {
+  double time = 0;
+  int surface = 0;     // of the switching functions
+  bool sticks = true;  // or slips
 };
 
 inline constexpr double least_relative_tolerance = 1e-14;
@@ -123,6 +135,7 @@ struct Trajectory {
   double start_displacement = 0;  // by how much the projection of the start changed an entry of q or dq, at most
 
   std::vector<ContactEvent> events;  // in the order of time
+  std::vector<StickEvent> sticks;    // in the order of time; none of the start
 
   int steps = 0;           // accepted
   int rejected_steps = 0;  // error above the tolerance, or no finite acceleration
@@ -149,11 +162,12 @@ class UnfinishedMotion : public NumericalError {
 ///
 /// A zero of a switching function ends a step. There the motion crosses to the other side; or, where both sides drive it back, it
 /// stays on the zero with the mixture of both accelerations that keeps it there (Filippov), until that mixture leaves what lies
-/// between them: a body under dry friction rests, and breaks loose.
+/// between them: a body under dry friction rests, and breaks loose. Friction may be proportional to a load that it changes itself:
+/// |λ_t| ≤ μ |λ_n| holds of each of several contacts, whose accelerations are those of all combinations of sides, mixed.
 ///
 /// A contact ends a step where its gap closes, found on the dense output. It is an impact of Newton's law along M⁻¹Aᵀ, during which
 /// all other active constraints hold; where the rebound is over within `shortest_flight` the contact stays closed, so that the
-/// accumulating bounces of a ball end. A closed contact is released where the motion without it would open the gap, which is where
+/// accumulating bounces of a ball end; a restitution outside [0, 1] there is an error. It has no impulse of friction. A closed contact is released where the motion without it would open the gap, which is where
 /// its multiplier would pull. One at a time: where several contacts close or open together, those whose impulse would pull are let
 /// go one after the other, which is not the complementarity problem of many contacts.
 ///
@@ -188,6 +202,10 @@ Eigen::VectorXd complete_start(const Model& model, const Eigen::VectorXd& parame
 
 /// The acceleration of a model as it is written: L b + T (M⁻¹F + truth), truth = 0 without [truth].
 Acceleration model_acceleration(const Model& model);
+
+/// Kinetic energy ½ dqᵀM dq of a system, at N states (N) [J].
+Eigen::VectorXd kinetic_energy(const System& system, const Eigen::VectorXd& parameters,
+                               const Eigen::Ref<const Eigen::MatrixXd>& states);
 
 /// Kinetic and potential energy ½ dqᵀM dq + V of a model with [mechanics] potential, at N states (N) [J].
 /// @throws InputError when the model has none.

@@ -116,11 +116,6 @@ class Shooter {
   }
 
   void read(const CsvTable& log, const std::map<std::string, std::string>& columns, std::vector<std::string>& notes) {
-    if (!contacts_of(fit_.model, system_.parameter_values()).empty()) {
-      throw InputError(fmt::format(
-          "'{}' has contacts, at whose impacts errors of a start jump: parameters are estimated from motions without them",
-          system_.name()));
-    }
     LogReader reader = open_log(fit_.model, log, columns);
     states_ = reader.states(std::vector<bool>(static_cast<std::size_t>(system_.layout().size()), true));
     static_cast<void>(take_commands(system_, fit_.model.actuators, reader, std::nullopt, columns, states_, notes));
@@ -143,6 +138,7 @@ class Shooter {
     }
     const double usual = steps.empty() ? 0 : median(steps);
     const int episode = log.find("episode");
+    find_clearance();
     std::vector<std::pair<Index, Index>> parts;
     for (Index i = 0; i < n; ++i) {
       const double step = i == 0 ? 0 : times()[i] - times()[i - 1];
@@ -159,7 +155,11 @@ class Shooter {
     const auto size = static_cast<Index>(std::floor(duration_ / std::max(usual, std::numeric_limits<double>::min()) + 1e-9)) + 1;
     std::vector<Stretch> found;
     for (const auto& [first, rows] : parts) {
-      for (Index i = first; i + size <= first + rows; i += size) found.push_back({i, size, states_.col(i)});
+      for (Index i = first; i + size <= first + rows;) {
+        const bool starts = can_start(i);
+        if (starts) found.push_back({i, size, states_.col(i)});
+        i += starts ? size : 1;
+      }
     }
     if (size < least_rows || found.empty()) {
       throw InputError(
@@ -174,6 +174,49 @@ class Shooter {
       const double spread = row_stddev(states_.row(e))[0];
       spread_[e] = spread > 0 ? spread : 1;
     }
+  }
+
+  /// The gaps of contacts at a state, whether they are open or closed.
+  [[nodiscard]] VectorXd gaps_at(VectorXd state, const VectorXd& parameters, const std::vector<Contact>& contacts) const {
+    for (const Contact& contact : contacts) state[system_.layout().u(contact.input)] = 1;
+    const VectorXd residuals = system_.residuals(state, parameters).col(0);
+    const std::vector<System::Residual>& labels = system_.residual_labels();
+    VectorXd gaps(contacts.size());
+    for (std::size_t k = 0; k < contacts.size(); ++k) {
+      const auto is_gap = [&](const System::Residual& one) { return one.row == contacts[k].row && !one.velocity; };
+      gaps[static_cast<Index>(k)] = residuals[std::find_if(labels.begin(), labels.end(), is_gap) - labels.begin()];
+    }
+    return gaps;
+  }
+  [[nodiscard]] bool is_closed(const Contact& contact, Index row) const {
+    return states_(system_.layout().u(contact.input), row) > 0.5;
+  }
+
+  /// How far a gap must be open for the errors of a log not to hide it: twice the largest |gap| of what is closed, or beyond 0.
+  void find_clearance() {
+    const VectorXd parameters = system_.parameter_values();
+    const std::vector<Contact> contacts = contacts_of(fit_.model, parameters);
+    clearance_.setZero(static_cast<Index>(contacts.size()));
+    gaps_.resize(clearance_.size(), states_.cols());
+    for (Index i = 0; i < states_.cols() && !contacts.empty(); ++i) {
+      gaps_.col(i) = gaps_at(states_.col(i), parameters, contacts);
+      for (std::size_t k = 0; k < contacts.size(); ++k) {
+        const auto row = static_cast<Index>(k);
+        const double off = is_closed(contacts[k], i) ? std::abs(gaps_(row, i)) : -gaps_(row, i);
+        clearance_[row] = std::max(clearance_[row], 2 * off);
+      }
+    }
+  }
+
+  /// A motion starts where each contact is surely closed or open: not at an impact, nor where its gap is lost in noise.
+  [[nodiscard]] bool can_start(Index row) const {
+    const std::vector<Contact> contacts = contacts_of(fit_.model, system_.parameter_values());
+    for (std::size_t k = 0; k < contacts.size(); ++k) {
+      const bool closed = is_closed(contacts[k], row);
+      if (row + 1 < states_.cols() && closed != is_closed(contacts[k], row + 1)) return false;
+      if (!closed && !(gaps_(static_cast<Index>(k), row) > clearance_[static_cast<Index>(k)])) return false;
+    }
+    return true;
   }
 
   /// 2/ω of the middle coordinate, the best of 1, 2, 4 on simulated logs: rms of its velocity over that of its changes in velocity.
@@ -212,6 +255,11 @@ class Shooter {
     options.absolute_tolerance = 1e-11;
     options.max_steps = most_steps_per_row * static_cast<int>(stretch.size);  // a motion that runs away takes ever more
     options.switching = switching_;
+    options.contacts = contacts_of(fit_.model, parameters);
+    const VectorXd gaps = gaps_at(start, parameters, options.contacts);
+    for (std::size_t k = 0; k < options.contacts.size(); ++k) {
+      if (!is_closed(options.contacts[k], stretch.first) && !(gaps[static_cast<Index>(k)] > 0)) return std::nullopt;
+    }
     const StateLayout layout = system_.layout();
     if (layout.nu > 0) options.inputs = {options.times, states_.block(layout.u(0), stretch.first, layout.nu, stretch.size)};
     MatrixXd off(compared_.size(), stretch.size);
@@ -313,13 +361,15 @@ class Shooter {
           h.map().is_logarithm
               ? relative_width
               : relative_width * std::max(std::abs(h.value), relative_width * (h.upper - h.lower)) / h.map().unit;
+      // a difference to one side where a bound, as that of a restitution, forbids the other
+      const double more = std::min(x + width, h.upper_coordinate()), less = std::max(x - width, h.lower_coordinate());
       const auto moved = [&](double to) {
         std::vector<Hyperparameter> all = hyperparameters_;
         all[k].value = h.map().value(to);
         return posterior_at(all);
       };
-      beside.emplace_back(moved(x + width), moved(x - width));
-      widths.push_back(width);
+      beside.emplace_back(moved(more), moved(less));
+      widths.push_back((more - less) / 2);
     }
     std::vector<Linearised> all(stretches_.size());
     parallel_for(static_cast<int>(stretches_.size()), n_threads_, [&](int k, int) {
@@ -469,6 +519,8 @@ class Shooter {
   std::vector<int> compared_;            // coordinates
   MatrixXd states_;                      // of the log
   VectorXd spread_;                      // of q and dq over it (2 nq)
+  MatrixXd gaps_;                        // of contacts in the log (contacts × rows)
+  VectorXd clearance_;                   // beyond which they are surely open
   double duration_ = 0;
   std::vector<Stretch> stretches_;
   std::vector<std::string> notes_;

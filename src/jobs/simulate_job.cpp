@@ -246,12 +246,35 @@ SimulateJob prepare_simulation(const Model& model, const SimulateRequest& reques
   SimulateJob job = prepare(model, model.actuators, model.system->parameter_values(), request);
   job.accelerations = {model_acceleration(model)};
   job.options.switching = switching_functions(model, /*of_latents=*/false);
+  if (model.potential)
+    job.energies = {[&model, parameters = job.parameters](const MatrixXd& states) -> MotionEnergy {
+      return {mechanical_energy(model, parameters, states), {}};
+    }};
   if (model.system->nc() > 0) {
     job.records = {
         [motion = ModelMotion(model)](const Eigen::Ref<const VectorXd>& x) -> VectorXd { return motion.multipliers(x).col(0); }};
   }
   return job;
 }
+
+namespace {
+
+/// T22 with what each of the latents numbered adds to V. The known potential acts beside it only where the prior's mean has its force.
+MotionEnergy energy_with_learned(const Model& model, const VectorXd& parameters, Prior::Mean mean,
+                                 const std::vector<int>& latents, const MatrixXd& states,
+                                 const std::function<Posterior::Potential(int latent)>& learned) {
+  MotionEnergy out;
+  const bool is_known = model.potential && (latents.empty() || mean == Prior::Mean::force);
+  out.values = is_known ? mechanical_energy(model, parameters, states) : kinetic_energy(*model.system, parameters, states);
+  for (const int latent : latents) {
+    const Posterior::Potential V = learned(latent);
+    out.values += V.mean;
+    if (latents.size() == 1) out.stddev = V.stddev;
+  }
+  return out;
+}
+
+}  // namespace
 
 SimulateJob prepare_simulation(const FitSystem& system, const Posterior& posterior, const SimulateRequest& request) {
   const Model& model = *system.model;
@@ -267,13 +290,30 @@ SimulateJob prepare_simulation(const FitSystem& system, const Posterior& posteri
     job.accelerations.push_back(of_view(View::constrained_acceleration(*model.system)));
     if (model.system->nc() > 0) job.records.push_back(of_view(View::multipliers(*model.system)));
   };
+  std::vector<int> potentials;
+  for (int a = 0; a < static_cast<int>(posterior.prior().latents.size()); ++a) {
+    if (posterior.prior().latents[static_cast<std::size_t>(a)].is_potential) potentials.push_back(a);
+  }
+  // learned potentials are functions of states of the fit's own system
+  const bool has_energy = potentials.empty() ? model.potential.has_value() : system.other_system == nullptr;
+  const auto add_energy = [&](auto learned) {
+    if (!has_energy) return;
+    job.energies.push_back(
+        [&model, parameters = job.parameters, mean = posterior.prior().mean, potentials, learned](const MatrixXd& states) {
+          return energy_with_learned(model, parameters, mean, potentials, states, [&](int a) { return learned(a, states); });
+        });
+  };
   if (!request.n_samples) {
+    add_energy([posterior](int a, const MatrixXd& states) { return posterior.potential(a, states, states.col(0)); });
     add([posterior](const View& view, const Eigen::Ref<const VectorXd>& x) { return posterior.mean(view, x); });
     return job;
   }
   const auto samples =
       std::make_shared<const PathwiseSamples>(sample_paths(posterior, *request.n_samples, {.seed = request.seed}));
   for (int k = 0; k < samples->n_samples(); ++k) {
+    add_energy([samples, k](int a, const MatrixXd& states) {
+      return Posterior::Potential{samples->potential(k, a, states, states.col(0)), {}};
+    });
     add([samples, k](const View& view, const Eigen::Ref<const VectorXd>& x) { return samples->evaluate(k, view, x); });
   }
   return job;

@@ -792,8 +792,10 @@ class ModelReader : private TomlReader {
     row.contact = {static_cast<int>(index), definition_.graph->constant(0)};
     if (!more.contains("restitution")) return;
     const toml::node& restitution = *more.get("restitution");
-    row.contact->restitution =
-        expression_without(restitution, key + ".restitution", symbols_->state(), "a restitution is a number, or of parameters");
+    std::vector<Expression> forbidden = symbols_->u;
+    forbidden.insert(forbidden.end(), symbols_->ddq.begin(), symbols_->ddq.end());
+    row.contact->restitution = expression_without(restitution, key + ".restitution", forbidden,
+                                                  "a restitution may not depend on inputs or accelerations");
     const Expression& e = row.contact->restitution;
     if (e.is_constant() && !(e.constant_value() >= 0 && e.constant_value() <= 1)) {
       fail(restitution, key + ".restitution", fmt::format("must lie between 0 and 1, got {}", e.constant_value()));

@@ -23,15 +23,24 @@ std::vector<Contact> contacts_of(const Model& model, const Eigen::Ref<const Vect
   const std::vector<ConstraintRow>& rows = system->definition().constraints;
   for (std::size_t k = 0; k < rows.size(); ++k) {
     if (!rows[k].contact) continue;
-    MatrixXd restitution;
-    Tape(std::span(&rows[k].contact->restitution, 1), model.symbols().state_and_parameters())
-        .evaluate(VectorXd::Zero(system->layout().size()), parameters, restitution);
-    const double e = restitution(0, 0);
-    if (!(e >= 0 && e <= 1)) {
+    const Expression e = rows[k].contact->restitution;
+    const SystemSymbols symbols = model.symbols();
+    const auto restitution = [tape = Tape(std::span(&e, 1), symbols.state_and_parameters()), theta = VectorXd(parameters),
+                              name = model.name, text = rows[k].text](const Eigen::Ref<const VectorXd>& state) {
+      MatrixXd value;
+      tape.evaluate(state, theta, value);
+      if (value(0, 0) >= 0 && value(0, 0) <= 1) return value(0, 0);
       throw InputError(
-          fmt::format("{}: the restitution of the contact '{}' must lie between 0 and 1, got {}", model.name, rows[k].text, e));
+          fmt::format("{}: the restitution of the contact '{}' must lie between 0 and 1, got {}", name, text, value(0, 0)));
+    };
+    Contact contact = {static_cast<int>(k), rows[k].contact->input};
+    const std::vector<Expression> of_state = symbols.state();
+    if (std::any_of(of_state.begin(), of_state.end(), [&](const Expression& x) { return model.graph->depends_on(e, x); })) {
+      contact.restitution_at = restitution;
+    } else {
+      contact.restitution = restitution(VectorXd::Zero(system->layout().size()));
     }
-    contacts.push_back({static_cast<int>(k), rows[k].contact->input, e});
+    contacts.push_back(std::move(contact));
   }
   return contacts;
 }
@@ -130,6 +139,14 @@ bool Contacts::is_released(const VectorXd& state, const Acceleration& accelerati
   return false;
 }
 
+VectorXd Contacts::margins(const VectorXd& state, const Acceleration& acceleration) const {
+  VectorXd out = VectorXd::Ones(static_cast<Index>(contacts_.size()));
+  for (std::size_t k = 0; k < contacts_.size(); ++k) {
+    if (is_closed_[k]) out[static_cast<Index>(k)] = -opening(state, k, acceleration);
+  }
+  return out;
+}
+
 void Contacts::release(VectorXd& state, const Acceleration& acceleration, std::vector<ContactEvent>& events) {
   for (bool has_changed = true; has_changed;) {
     has_changed = false;
@@ -184,11 +201,13 @@ void Contacts::settle(VectorXd& state, const Acceleration& acceleration, std::ve
   const Gaps gaps = gaps_at(state);
   const auto n = static_cast<Index>(contacts_.size());
   std::vector<bool> hit(contacts_.size(), false);
-  VectorXd restitution(n);
+  VectorXd restitution = VectorXd::Zero(n);
   for (Index k = 0; k < n; ++k) {
     const auto contact = static_cast<std::size_t>(k);
     hit[contact] = !is_closed_[contact] && gaps.value[k] < -gaps.margin[k] && gaps.rate[k] < 0;
-    restitution[k] = contacts_[contact].restitution;
+    if (!hit[contact]) continue;
+    const Contact& of = contacts_[contact];
+    restitution[k] = of.restitution_at ? of.restitution_at(state) : of.restitution;
   }
   if (std::find(hit.begin(), hit.end(), true) == hit.end()) {
     release(state, acceleration, events);

@@ -1,5 +1,6 @@
 #pragma once
 
+#include <algorithm>
 #include <vector>
 
 #include <Eigen/Core>
@@ -25,6 +26,9 @@ class Contacts {
   [[nodiscard]] Eigen::VectorXd rates(const Eigen::VectorXd& state) const { return gaps_at(state).rate; }
   /// Whether a contact that is closed would open without its constraint.
   [[nodiscard]] bool is_released(const Eigen::VectorXd& state, const Acceleration& acceleration) const;
+  /// How far each contact is from being released, −c̈ of the gap without its constraint; 1 of those that are open (n).
+  [[nodiscard]] Eigen::VectorXd margins(const Eigen::VectorXd& state, const Acceleration& acceleration) const;
+  [[nodiscard]] bool is_any_closed() const { return std::find(is_closed_.begin(), is_closed_.end(), true) != is_closed_.end(); }
   /// Impacts of the contacts that are hit, then releases.
   void settle(Eigen::VectorXd& state, const Acceleration& acceleration, std::vector<ContactEvent>& events);
 

@@ -118,9 +118,17 @@ class Integration {
         require_step(step);
         continue;
       }
-      step = to_limit ? std::max(step, tried) : tried;
       if (to_limit) t_new = limit;
       const std::optional<double> crossing = find_crossing(t_new);
+      if (!crossing && is_hold_unresolved(t_new)) {
+        step = longest_holding_step_ = (t_new - t_) / 2;
+        --out_.steps;
+        ++out_.rejected_steps;
+        continue;
+      }
+      step = to_limit ? std::max(step, tried) : tried;
+      constexpr double growth = 1.5;
+      step = std::min(step, longest_holding_step_ *= growth);
       write_within(next, crossing.value_or(t_new), t_new);
       if (crossing) {
         x_new_ = x_crossing_;
@@ -344,6 +352,31 @@ class Integration {
     return std::nullopt;
   }
 
+  // Whether a motion that is held may have been let go, and held again, within the step to t_new. What is held at rest has no error
+  // however long the step is, and forces of time may come and go in it. Their margins are looked at at both ends and between.
+  bool is_hold_unresolved(double t_new) {
+    constexpr double rounding = 1e-6, shortest = 1e3;
+    if (!switching_.is_sliding() && !contacts_.is_any_closed()) return false;
+    if (t_new - t_ <= shortest * smallest_step()) return false;
+    const auto margins_at = [&](double t) -> VectorXd {
+      x_crossing_.resize(x_.size());
+      stepper_.stepper().calc_state(t, x_crossing_, x_, dxdt_, t_, x_new_, dxdt_new_, t_new);
+      expand(x_crossing_, t);
+      if (options_.project || project_stages_) projection_.apply(state_);
+      VectorXd margins(options_.contacts.size() + static_cast<std::size_t>(options_.switching.size()));
+      margins << contacts_.margins(state_, of_motion()), switching_.margins(state_, counted());
+      return margins;
+    };
+    try {
+      const VectorXd start = margins_at(t_), middle = margins_at(std::midpoint(t_, t_new)), end = margins_at(t_new);
+      const VectorXd bend = (middle - (start + end) / 2).cwiseAbs(), least = start.cwiseMin(middle).cwiseMin(end);
+      const VectorXd size = start.cwiseAbs().cwiseMax(middle.cwiseAbs()).cwiseMax(end.cwiseAbs());
+      return (bend.array() > rounding * size.array() && least.array() < 2 * bend.array()).any();
+    } catch (const Error&) {
+      return false;
+    }
+  }
+
   // whether a surface that the motion slides on, or a contact, does not hold it at state_
   bool is_let_go() {
     if (!switching_.is_sliding() && contacts_.is_empty()) return false;
@@ -376,17 +409,43 @@ class Integration {
     std::swap(x_, x_new_);
     std::swap(dxdt_, dxdt_new_);
     t_ = t_new;
-    if (has_crossed && !contacts_.is_empty()) settle_contacts(/*at_start=*/false);
     const bool switches = !switching_.is_empty() && (has_crossed || switching_.is_sliding());
+    const std::vector<int> sides = switching_.sides();
     if (switches) {
       expand(x_, t_);
       switching_.cross(state_);
       switching_.hold(state_);
       std::copy_n(state_.begin(), x_.size(), x_.begin());
     }
+    const std::size_t n_events = out_.events.size();
+    if (has_crossed && !contacts_.is_empty()) settle_contacts(/*at_start=*/false);
+    const bool has_met = out_.events.size() > n_events;
     const bool moved = options_.project && project(x_, t_);
-    if (switches) switch_or_throw([&] { switching_.settle(state_, counted()); });
+    if (switches) {
+      switch_or_throw([&] {
+        if (has_met) {
+          switching_.start(state_, counted());
+        } else {
+          switching_.settle(state_, counted());
+        }
+      });
+      note_sticks(sides);
+    }
     if (moved || switches || (has_crossed && !contacts_.is_empty())) derivative_or_throw();
+  }
+
+  // where the motion is on a surface now, and was beside it, or the other way round
+  void note_sticks(const std::vector<int>& before) {
+    const std::vector<int>& after = switching_.sides();
+    for (std::size_t k = 0; k < after.size(); ++k) {
+      if ((before[k] == 0) != (after[k] == 0)) out_.sticks.push_back({t_, static_cast<int>(k), after[k] == 0});
+    }
+  }
+
+  [[nodiscard]] Acceleration of_sides_anew() {
+    return [this](const Ref<const VectorXd>& state) -> VectorXd {
+      return switching_.is_empty() ? counted()(state) : switching_.acceleration_anew(state, counted());
+    };
   }
 
   // impacts and releases at (x_, t_)
@@ -394,9 +453,9 @@ class Integration {
     expand(x_, t_);
     try {
       if (at_start) {
-        contacts_.start(state_, of_motion(), out_.events);
+        contacts_.start(state_, of_sides_anew(), out_.events);
       } else {
-        contacts_.settle(state_, of_motion(), out_.events);
+        contacts_.settle(state_, of_sides_anew(), out_.events);
       }
     } catch (const Error& error) {
       if (at_start) throw;
@@ -441,6 +500,7 @@ class Integration {
   Contacts contacts_;
   ControlledStepper stepper_;
   bool project_stages_ = false;
+  double longest_holding_step_ = std::numeric_limits<double>::infinity();
   VectorXd state_;  // scratch
   double t_ = 0;
   Phase x_, dxdt_, x_new_, dxdt_new_, x_crossing_;
@@ -528,18 +588,21 @@ Acceleration model_acceleration(const Model& model) {
       [motion = ModelMotion(model)](const Ref<const VectorXd>& state) -> VectorXd { return motion.acceleration(state).col(0); };
 }
 
-VectorXd mechanical_energy(const Model& model, const VectorXd& parameters, const Ref<const MatrixXd>& states) {
-  const System& system = *model.system;
-  if (!model.potential) throw InputError(fmt::format("{}: no energy without [mechanics] potential = \"…\"", model.name));
-  MatrixXd potential;
-  Tape(std::span(&*model.potential, 1), model.symbols().state_and_parameters()).evaluate(states, parameters, potential);
-  VectorXd energy = potential.row(0).transpose();
+VectorXd kinetic_energy(const System& system, const VectorXd& parameters, const Ref<const MatrixXd>& states) {
+  VectorXd energy(states.cols());
   const SystemValues values = system.evaluate(states, parameters);
   for (int i = 0; i < static_cast<int>(states.cols()); ++i) {
     const auto dq = states.col(i).segment(system.layout().dq(0), system.nq());
-    energy[i] += 0.5 * dq.dot(values.M(i) * dq);
+    energy[i] = 0.5 * dq.dot(values.M(i) * dq);
   }
   return energy;
+}
+
+VectorXd mechanical_energy(const Model& model, const VectorXd& parameters, const Ref<const MatrixXd>& states) {
+  if (!model.potential) throw InputError(fmt::format("{}: no energy without [mechanics] potential = \"…\"", model.name));
+  MatrixXd potential;
+  Tape(std::span(&*model.potential, 1), model.symbols().state_and_parameters()).evaluate(states, parameters, potential);
+  return kinetic_energy(*model.system, parameters, states) + potential.row(0).transpose();
 }
 
 }  // namespace gp2

@@ -23,6 +23,7 @@ using Eigen::VectorXd;
 SwitchingFunctions::SwitchingFunctions(std::span<const Expression> functions, const SystemSymbols& symbols)
     : size_(static_cast<int>(functions.size())) {
   if (functions.empty()) return;
+  for (const Expression& g : functions) names_.push_back(to_string(g));
   std::vector<Expression> outputs(functions.begin(), functions.end());
   std::vector<Expression> moving = symbols.q;
   moving.insert(moving.end(), symbols.dq.begin(), symbols.dq.end());
@@ -43,8 +44,8 @@ void SwitchingFunctions::evaluate(const Eigen::Ref<const VectorXd>& state, const
 
 namespace {
 
-// The arguments of sign() in expressions, and of |·| in denominators, that read a velocity and no input, each once, without constant
-// factors: sign(v), sign(−2 v) and v/|v| are of one surface.
+// The arguments of sign() in expressions, and of |·| in denominators, that read a velocity and no input, each once and each factor by
+// itself, without constants: sign(v), sign(−2 v), sign(lambda(1) v) and v/|v| are of one surface.
 class ArgumentsOfSign {
  public:
   ArgumentsOfSign(ExpressionGraph& graph, const SystemSymbols& symbols) : graph_(graph), symbols_(symbols) {}
@@ -78,7 +79,12 @@ class ArgumentsOfSign {
         break;
       }
     }
-    // λ₀ is no expression of the state: where it changes its sign is not looked for
+    if (g.operation() == Operation::multiply || g.operation() == Operation::divide) {
+      add_surface(g.left());
+      add_surface(g.right());
+      return;
+    }
+    // λ₀ and λ are no expressions of the state: where they change their sign is not looked for
     const std::vector<std::string> variables = graph_.variables_of(g);
     if (std::any_of(variables.begin(), variables.end(), is_multiplier)) return;
     const auto reads = [&](const Expression& x) { return graph_.depends_on(g, x); };
@@ -218,6 +224,16 @@ bool Switching::is_let_go(const VectorXd& state, const Acceleration& acceleratio
   return (sigma_.array().abs() > 1).any();
 }
 
+VectorXd Switching::margins(const VectorXd& state, const Acceleration& acceleration) {
+  static_cast<void>(this->acceleration(state, acceleration));
+  VectorXd out = VectorXd::Ones(static_cast<Index>(sides_.size()));
+  Index next = 0;
+  for (std::size_t k = 0; k < sides_.size(); ++k) {
+    if (sides_[k] == 0) out[static_cast<Index>(k)] = 1 - std::abs(sigma_[next++]);
+  }
+  return out;
+}
+
 void Switching::settle(const VectorXd& state, const Acceleration& acceleration) {
   bool has_changed = true;
   while (has_changed && is_sliding()) {
@@ -233,34 +249,93 @@ void Switching::settle(const VectorXd& state, const Acceleration& acceleration) 
   }
 }
 
-void Switching::evaluate(const VectorXd& state, const Surfaces& surfaces, const Function& function, VectorXd& value,
-                         MatrixXd& jumps) const {
+Switching::Values Switching::evaluate(const VectorXd& state, const Surfaces& surfaces, const Function& function) const {
   std::vector<int> sides = sides_;
   std::replace(sides.begin(), sides.end(), 0, 1);
-  value = function(beside(state, surfaces, sides));
   const std::vector<int> slid_on = sliding();
-  jumps.resize(value.size(), static_cast<Index>(slid_on.size()));
-  for (std::size_t k = 0; k < slid_on.size(); ++k) {
-    int& side = sides[static_cast<std::size_t>(slid_on[k])];
-    side = -1;
-    jumps.col(static_cast<Index>(k)) = (value - function(beside(state, surfaces, sides))) / 2;
-    side = 1;
+  const auto side_of = [&](std::size_t k) -> int& { return sides[static_cast<std::size_t>(slid_on[k])]; };
+  const auto value = [&] { return function(beside(state, surfaces, sides)); };
+  const std::size_t n = slid_on.size();
+  Values out;
+  out.above = value();
+  out.jumps.resize(out.above.size(), static_cast<Index>(n));
+  for (std::size_t k = 0; k < n; ++k) {
+    side_of(k) = -1;
+    out.jumps.col(static_cast<Index>(k)) = (out.above - value()) / 2;
+    side_of(k) = 1;
   }
+  // more surfaces at a time than this are taken for ones whose jumps add up
+  constexpr std::size_t most = 8;
+  if (n < 2 || n > most) return out;
+  for (std::size_t k = 0; k < n; ++k) side_of(k) = -1;
+  const VectorXd below = value();
+  constexpr double rounding = 1e-9;
+  const double size = out.above.norm() + out.jumps.norm();
+  if (!((out.above - 2 * out.jumps.rowwise().sum() - below).norm() > rounding * size)) return out;
+  const Index n_corners = Index{1} << n;
+  out.corners.resize(out.above.size(), n_corners);
+  out.corners.col(0) = out.above;
+  out.corners.col(n_corners - 1) = below;
+  for (Index corner = 1; corner < n_corners - 1; ++corner) {
+    const bool is_of_one = (corner & (corner - 1)) == 0;
+    Index first = 0;
+    for (std::size_t k = 0; k < n; ++k) {
+      const bool is_below = ((corner >> k) & 1) != 0;
+      side_of(k) = is_below ? -1 : 1;
+      if (is_below) first = static_cast<Index>(k);
+    }
+    out.corners.col(corner) = is_of_one ? VectorXd(out.above - 2 * out.jumps.col(first)) : VectorXd(value());
+  }
+  return out;
 }
 
-// ġ = drift + N (f − J s) = 0 for s = 1 − σ of each surface that is slid on, exact where jumps add up, as those of forces do. A
-// surface that would need s outside [0, 2] cannot hold the motion: s stays at the end of the range, and the others are solved anew.
+namespace {
+
+// of the corner among those that differ in other surfaces than `without`; all when −1
+double weight(Index corner, const VectorXd& share, Index without) {
+  double product = 1;
+  for (Index k = 0; k < share.size(); ++k) {
+    if (k == without) continue;
+    product *= ((corner >> k) & 1) != 0 ? share[k] / 2 : 1 - share[k] / 2;
+  }
+  return product;
+}
+
+}  // namespace
+
+VectorXd Switching::mixture(const Values& values, const VectorXd& share) {
+  if (values.corners.size() == 0) return values.above - values.jumps * share;
+  VectorXd sum = VectorXd::Zero(values.above.size());
+  for (Index corner = 0; corner < values.corners.cols(); ++corner) sum += weight(corner, share, -1) * values.corners.col(corner);
+  return sum;
+}
+
+MatrixXd Switching::slopes(const Values& values, const VectorXd& share) {
+  if (values.corners.size() == 0) return values.jumps;
+  MatrixXd out = MatrixXd::Zero(values.jumps.rows(), values.jumps.cols());
+  for (Index corner = 0; corner < values.corners.cols(); ++corner) {
+    for (Index k = 0; k < share.size(); ++k) {
+      const double sign = ((corner >> k) & 1) != 0 ? -1 : 1;
+      out.col(k) += sign / 2 * weight(corner, share, k) * values.corners.col(corner);
+    }
+  }
+  return out;
+}
+
+// ġ = drift + N f = 0 for s = 1 − σ of each surface that is slid on: in one step of Newton's method where jumps add up, as those of
+// most forces do. A surface that would need s outside [0, 2] cannot hold the motion: s stays at the end of the range, and the others
+// are solved anew.
 VectorXd Switching::acceleration(const VectorXd& state, const Acceleration& acceleration) {
   const Surfaces surfaces = surfaces_at(state);
-  VectorXd value;
-  MatrixXd jumps;
-  evaluate(state, surfaces, acceleration, value, jumps);
+  const Values values = evaluate(state, surfaces, acceleration);
   std::vector<int> slid_on = sliding();
   const auto n = static_cast<Index>(slid_on.size());
   share_.setZero(n);
   sigma_.setOnes(n);
-  const MatrixXd gain = surfaces.normals(slid_on, Eigen::all) * jumps;
-  const VectorXd rate = surfaces.drift(slid_on) + surfaces.normals(slid_on, Eigen::all) * value;
+  const MatrixXd normals = surfaces.normals(slid_on, Eigen::all);
+  const VectorXd drift = surfaces.drift(slid_on);
+  const MatrixXd gain = normals * values.jumps;
+  const VectorXd rate = drift + normals * values.above;
   std::vector<int> open;
   for (int k = 0; k < static_cast<int>(n); ++k) {
     if (gain(k, k) < 0) {
@@ -271,8 +346,19 @@ VectorXd Switching::acceleration(const VectorXd& state, const Acceleration& acce
     }
   }
   while (!open.empty()) {
-    const VectorXd rest = rate(open) - gain(open, Eigen::all) * share_;
-    const VectorXd solved = share_(open) + gain(open, open).completeOrthogonalDecomposition().solve(rest);
+    VectorXd solved = share_(open);
+    constexpr int most_steps = 30;
+    constexpr double enough = 1e-14, farthest = 4;
+    for (int step = 0; step < most_steps; ++step) {
+      VectorXd share = share_;
+      share(open) = solved;
+      const VectorXd rest = (drift + normals * mixture(values, share))(open);
+      const MatrixXd slope = (normals * slopes(values, share))(open, open);
+      const VectorXd change = slope.completeOrthogonalDecomposition().solve(rest);
+      solved += change;
+      if (values.corners.size() == 0 || change.norm() <= enough) break;
+      solved = solved.cwiseMax(-farthest).cwiseMin(2 + farthest);
+    }
     std::size_t worst = 0;
     double excess = 0;
     for (std::size_t k = 0; k < open.size(); ++k) {
@@ -290,15 +376,20 @@ VectorXd Switching::acceleration(const VectorXd& state, const Acceleration& acce
     open.erase(open.begin() + static_cast<std::ptrdiff_t>(worst));
     for (const int other : open) share_[other] = 0;
   }
-  return value - jumps * share_;
+  return mixture(values, share_);
+}
+
+VectorXd Switching::acceleration_anew(const VectorXd& state, const Acceleration& acceleration) {
+  const std::vector<int> before = sides_;
+  start(state, acceleration);
+  VectorXd ddq = this->acceleration(state, acceleration);
+  sides_ = before;
+  return ddq;
 }
 
 VectorXd Switching::mixed(const VectorXd& state, const Function& function) const {
   if (is_empty()) return function(state);
-  VectorXd value;
-  MatrixXd jumps;
-  evaluate(state, surfaces_at(state), function, value, jumps);
-  return value - jumps * share_;
+  return mixture(evaluate(state, surfaces_at(state), function), share_);
 }
 
 }  // namespace gp2

@@ -13,7 +13,9 @@ namespace gp2 {
 /// A motion across the surfaces g(x) = 0 at which its acceleration jumps (Filippov 1988, Differential Equations with Discontinuous
 /// Righthand Sides). On each side of a surface the acceleration f₊ or f₋ of that side holds, continued smoothly over the surface
 /// until the motion is found to have crossed it. A motion that both sides drive onto the surface slides along it, as a body that
-/// dry friction holds at rest does: by f₊ − ½ (1 − σ)(f₊ − f₋), with σ ∈ [−1, 1] such that ġ = 0.
+/// dry friction holds at rest does: by f₊ − ½ (1 − σ)(f₊ − f₋), with σ ∈ [−1, 1] such that ġ = 0. On n surfaces at a time it is
+/// the mean of the accelerations of all 2ⁿ combinations of sides, weighed by Π ½ (1 ± σ_k) (Alexander & Seidman 1998, blending).
+/// Where friction changes the loads that it is proportional to, each face σ_k = ±1 is Coulomb's limit of contact k exactly.
 class Switching {
  public:
   using Function = std::function<Eigen::VectorXd(const Eigen::Ref<const Eigen::VectorXd>& state)>;
@@ -40,11 +42,17 @@ class Switching {
   void hold(Eigen::VectorXd& state) const;
   /// Whether one of the surfaces slid on does not hold the motion.
   bool is_let_go(const Eigen::VectorXd& state, const Acceleration& acceleration);
+  /// How far each surface is from letting the motion go, 1 − |σ|; 1 of those not slid on.
+  Eigen::VectorXd margins(const Eigen::VectorXd& state, const Acceleration& acceleration);
   /// Leaves the surfaces that do not hold the motion any more.
   void settle(const Eigen::VectorXd& state, const Acceleration& acceleration);
+  /// Of each surface: 1, −1; 0 where the motion slides on it.
+  [[nodiscard]] const std::vector<int>& sides() const { return sides_; }
 
   /// ddq on the sides taken, and on the surfaces that the motion slides on.
   Eigen::VectorXd acceleration(const Eigen::VectorXd& state, const Acceleration& acceleration);
+  /// The same on the sides that a state is on, whatever it was on before: an impact may have changed them.
+  Eigen::VectorXd acceleration_anew(const Eigen::VectorXd& state, const Acceleration& acceleration);
   /// Another function of the state, mixed as the last acceleration was.
   [[nodiscard]] Eigen::VectorXd mixed(const Eigen::VectorXd& state, const Function& function) const;
 
@@ -57,9 +65,17 @@ class Switching {
   };
   [[nodiscard]] Surfaces surfaces_at(const Eigen::VectorXd& state) const;
   [[nodiscard]] Eigen::VectorXd beside(Eigen::VectorXd state, const Surfaces& surfaces, const std::vector<int>& sides) const;
-  /// f on the sides taken, and ½ (f₊ − f₋) of each surface that the motion slides on.
-  void evaluate(const Eigen::VectorXd& state, const Surfaces& surfaces, const Function& function, Eigen::VectorXd& value,
-                Eigen::MatrixXd& jumps) const;
+  /// What a function is on the sides of the surfaces that the motion slides on.
+  struct Values {
+    Eigen::VectorXd above;    // f₊, beyond all of them
+    Eigen::MatrixXd jumps;    // ½ (f₊ − f₋) of each, above all others  (· × n)
+    Eigen::MatrixXd corners;  // of every combination of sides, bit k set below surface k; empty where jumps add up  (· × 2ⁿ)
+  };
+  [[nodiscard]] Values evaluate(const Eigen::VectorXd& state, const Surfaces& surfaces, const Function& function) const;
+  /// f for shares 1 − σ.
+  static Eigen::VectorXd mixture(const Values& values, const Eigen::VectorXd& share);
+  /// −∂f/∂(1 − σ).
+  static Eigen::MatrixXd slopes(const Values& values, const Eigen::VectorXd& share);
   [[nodiscard]] std::vector<int> sliding() const;
 
   SwitchingFunctions functions_;

@@ -53,6 +53,48 @@ TEST(SimulateModelCommand, WritesAHundredRowsOnTheConstraint) {
   EXPECT_GT(report["max_energy_drift"], 0);
 }
 
+// Friction that reads its load, learned from rows that slip: the motion of the fit sticks where that of the truth does.
+TEST(SimulateCommand, OfAFitSticksAndSlipsUnderTheLoadOfItsContact) {
+  const Desk desk;
+  desk.write("belt.toml", R"toml(
+coordinates = ["x", "z"]
+inputs      = ["touch"]
+[mechanics]
+mass  = [["1", "0"], ["0", "1"]]
+force = ["-5*x", "-(9.81 - 4*sin(2.2*t))"]
+[constraints]
+position = [{ expr = "z", contact = "touch" }]
+[truth]
+force = ["-0.5*abs(lambda(1))*sign(dx - 0.6)", "0"]
+[sampling]
+x = [-1, 1]
+z = 0
+dx = [-1, 1]
+dz = 0
+t = [0, 3]
+touch = 1
+[noise]
+ddq = 0.001
+[[latent]]
+kernel = "constant"
+features = ["1"]
+directions = { force = [["-0.1*abs(lambda(1))*sign(lambda(1)*(dx - 0.6))"], ["0"]] }
+)toml");
+  desk.done("gp2 generate belt.toml --n 40 --seed 1 -o train.csv");
+  desk.done("gp2 fit belt.toml --data train.csv --mean force -o fit.json");
+  const std::string motion = " --start x=0,z=0,dx=0.6,dz=0 --t-end 10 --json -o motion.csv";
+  const auto truth = desk.done("gp2 simulate belt.toml" + motion).json()["stick_events"];
+  const auto learned = desk.done("gp2 simulate fit.json" + motion).json()["stick_events"];
+  ASSERT_EQ(truth.size(), 5U);
+  ASSERT_EQ(learned.size(), truth.size());
+  for (std::size_t k = 0; k < truth.size(); ++k) {
+    EXPECT_EQ(learned[k]["kind"], k % 2 == 0 ? "slips" : "sticks");
+    EXPECT_EQ(learned[k]["surface"], "dx - 0.6");
+    // μ is known to 0.001/√40 of m/s² in a friction of 5, and events move by it in parts
+    EXPECT_NEAR(learned[k]["t"], truth[k]["t"], 1e-3) << k;
+  }
+}
+
 TEST(SimulateModelCommand, WithoutProjectionDriftsAndSaysSo) {
   const Desk desk;
   const auto drift = [&](const std::string& options) -> double {

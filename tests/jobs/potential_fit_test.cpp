@@ -5,6 +5,7 @@
 #include "data_of_model.hpp"
 #include "gp2/jobs/fit_job.hpp"
 #include "gp2/jobs/predict_job.hpp"
+#include "gp2/jobs/simulate_job.hpp"
 #include "gp2/jobs/update_job.hpp"
 #include "gp2/predictor.hpp"
 #include "gp2/simulation/generate.hpp"
@@ -132,6 +133,63 @@ TEST(PotentialFit, PredictGivesTheEnergyRelativeToTheFirstRow) {
   asked.view.time_step = 0.1;
   EXPECT_THAT(input_error_of([&] { static_cast<void>(predict(outcome.file, table, asked)); }),
               HasSubstr("in the place of a view"));
+}
+
+// A spring that is known, with its potential, and one that is not: their sum is the energy that the learned motion keeps.
+TEST(PotentialFit, MotionsKeepTheEnergyOfTheKnownAndTheLearnedPotential) {
+  const Model model = Model::parse(R"toml(
+coordinates = ["x", "y"]
+[mechanics]
+mass      = [["2", "0"], ["0", "1"]]
+force     = ["-3*x", "0"]
+potential = "1.5*x^2"
+[[latent]]
+directions = "potential"
+[noise]
+ddq = 0.01
+[truth]
+force = ["-2*(x - y)", "2*(x - y) - y^3"]
+[sampling]
+x  = [-1, 1]
+y  = [-1, 1]
+dx = [-1, 1]
+dy = [-1, 1]
+)toml",
+                                   "springs");
+  for (const Prior::Mean mean : {Prior::Mean::force, Prior::Mean::zero}) {
+    FitRequest request;
+    request.model = model;
+    const GeneratedData data = test::draw(model, 30, 1);
+    request.logs = {{test::LogData{&model, data.states, data.accelerations}.table(), nullptr}};
+    request.problem.mean = mean;
+    request.restarts = 1;
+    const FitOutcome outcome = run_fit(prepare_fit(std::move(request)));
+    SimulateRequest asked;
+    asked.start = VectorXd((VectorXd(4) << 0.8, 0, 0, 0.3).finished());
+    asked.times = VectorXd::LinSpaced(101, 0, 20);
+    asked.relative_tolerance = 1e-9;
+    const FitSystem system = system_of(outcome.file, outcome.posterior.prior(), nullptr);
+    for (const int n_samples : {0, 2}) {
+      asked.n_samples = n_samples > 0 ? std::optional(n_samples) : std::nullopt;
+      const SimulateJob job = prepare_simulation(system, outcome.posterior, asked);
+      ASSERT_EQ(job.energies.size(), job.accelerations.size());
+      const std::vector<Trajectory> motions = run_simulation(job);
+      for (std::size_t k = 0; k < motions.size(); ++k) {
+        const MatrixXd& states = motions[k].states;
+        const MotionEnergy energy = job.energies[k](states);
+        const VectorXd kinetic = kinetic_energy(*model.system, job.parameters, states);
+        EXPECT_GT(kinetic.maxCoeff() - kinetic.minCoeff(), 0.5);
+        EXPECT_LE((energy.values.array() - energy.values[0]).abs().maxCoeff(), 1e-6) << k;
+        const double known = mean == Prior::Mean::force ? 1.5 * 0.8 * 0.8 : 0;
+        EXPECT_NEAR(energy.values[0], 0.5 * 0.3 * 0.3 + known, 1e-12);
+        if (n_samples > 0) {
+          EXPECT_EQ(energy.stddev.size(), 0);
+        } else {
+          EXPECT_EQ(energy.stddev, outcome.posterior.potential(0, states, states.col(0)).stddev);
+        }
+      }
+    }
+  }
 }
 
 TEST(PotentialFit, RefusesInducingPointsByItsName) {

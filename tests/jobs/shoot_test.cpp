@@ -168,6 +168,116 @@ TEST(Shoot, StretchesEndWhereTheLogDoes) {
               HasSubstr("motion.csv: no stretch of 1.9 s with at least 8 rows without a break; rows are 0.01 s apart"));
 }
 
+// ---- a ball that bounces down a slope through air that brakes it: impacts say what its restitution is
+
+Model ball(const std::string& restitution) {
+  return Model::parse(fmt::format(R"toml(
+name = "ball"
+coordinates = ["x", "z"]
+inputs = ["touch"]
+[parameters]
+e = {}
+[mechanics]
+mass = [["1", "0"], ["0", "1"]]
+force = ["0", "-9.81"]
+[constraints]
+position = [{{ expr = "z + 0.2*x", contact = "touch", restitution = "e" }}]
+[[latent]]
+name = "air"
+kernel = "constant"
+features = ["1"]
+directions = {{ force = [["-dx*sqrt(dx^2 + dz^2)"], ["-dz*sqrt(dx^2 + dz^2)"]] }}
+[noise]
+ddq = 0.05
+[truth]
+force = ["-0.1*dx*sqrt(dx^2 + dz^2)", "-0.1*dz*sqrt(dx^2 + dz^2)"]
+)toml",
+                                  restitution),
+                      "ball.toml");
+}
+
+/// Two throws of 2.5 s, the second of which comes to roll, measured 100 times a second.
+CsvTable throws(double noise_stddev, std::uint64_t seed) {
+  const Model model = ball("0.7");
+  const System& system = *model.system;
+  RandomStream random(seed);
+  const std::vector<std::string> names = {"t", "x", "z", "dx", "dz", "ddx", "ddz", "touch", "episode"};
+  std::vector<std::vector<double>> values(names.size());
+  for (const int episode : {0, 1}) {
+    SimulateOptions options;
+    options.times = VectorXd::LinSpaced(251, 0, 2.5);
+    options.relative_tolerance = 1e-10;
+    options.absolute_tolerance = 1e-12;
+    options.contacts = contacts_of(model, system.parameter_values());
+    VectorXd start = VectorXd::Zero(system.layout().size());
+    start.head(4) << 0, (episode == 0 ? 1.0 : 0.2), 0.5, 0;
+    const Trajectory out = simulate(system, system.parameter_values(), model_acceleration(model), start, options);
+    for (Index i = 0; i < out.times.size(); ++i) {
+      std::vector<double> row = {out.times[i]};
+      for (Index k = 0; k < 2; ++k) row.push_back(out.states(k, i) + noise_stddev * random.normal());
+      for (Index k = 2; k < 4; ++k) row.push_back(out.states(k, i) + 5 * noise_stddev * random.normal());
+      for (Index k = 0; k < 2; ++k) row.push_back(out.accelerations(k, i) + 0.05 * random.normal());
+      row.push_back(out.states(system.layout().u(0), i));
+      row.push_back(episode);
+      for (std::size_t c = 0; c < row.size(); ++c) values[c].push_back(row[c]);
+    }
+  }
+  std::vector<CsvTable::Column> columns;
+  for (std::size_t c = 0; c < names.size(); ++c) columns.push_back({names[c], std::move(values[c])});
+  return CsvTable::from_columns("throws.csv", std::move(columns));
+}
+
+FitFile fit_of_throws(const CsvTable& log) {
+  FitRequest request;
+  request.model = ball("{ value = 0.5, estimate = true, bounds = [0, 1] }");
+  request.logs = {{log}};
+  request.problem.mean = Prior::Mean::force;
+  request.problem.max_points = 100;
+  request.hyperparameters = HyperparameterChoice::optimise;
+  return run_fit(prepare_fit(std::move(request))).file;
+}
+
+TEST(ShootThroughImpacts, FindsTheRestitution) {
+  const CsvTable log = throws(0, 1);
+  const ShootOutcome out = shoot(fit_of_throws(log), log, {.duration = 0.5});
+  EXPECT_TRUE(out.converged);
+  EXPECT_GE(out.n_stretches, 6);
+  ASSERT_EQ(out.parameters.size(), 1U);
+  // what 100 accelerations of deviation 0.05 say of the air is what is wrong
+  EXPECT_NEAR(out.parameters[0].value, 0.7, 1e-3);
+  EXPECT_LT(out.parameters[0].stddev, 2e-3);
+  EXPECT_LT(out.rms_after[1], out.rms_before[1] / 20);
+}
+
+TEST(ShootThroughImpacts, DeviationsHoldTheErrors) {
+  int held = 0;
+  constexpr int n_seeds = 6;
+  for (std::uint64_t seed = 1; seed <= n_seeds; ++seed) {
+    const CsvTable log = throws(2e-3, seed);
+    const ShootOutcome out = shoot(fit_of_throws(log), log, {.duration = 0.5});
+    const ShotParameter& e = out.parameters[0];
+    EXPECT_NEAR(e.value, 0.7, 0.01) << seed;
+    EXPECT_LT(e.stddev, 0.005) << seed;
+    held += std::abs(e.value - 0.7) < 2.5 * e.stddev ? 1 : 0;
+    EXPECT_LT(out.rms_after[1], 1.5 * 2e-3) << seed;
+  }
+  EXPECT_GE(held, 5);
+}
+
+TEST(ShootThroughImpacts, NeedsAnImpactInAStretch) {
+  const CsvTable log = throws(0, 1);
+  const FitFile fit = fit_of_throws(log);
+  std::vector<int> rolls;
+  for (int i = log.n_rows() - 60; i < log.n_rows(); ++i) rolls.push_back(i);
+  ASSERT_EQ(log.number(rolls.front(), log.find("touch")), 1);
+  try {
+    static_cast<void>(shoot(fit, log.take(rolls), {.duration = 0.2}));
+    FAIL() << "no error";
+  } catch (const NumericalError& error) {
+    EXPECT_THAT(error.what(), HasSubstr("the motions do not tell apart: e"));
+  }
+}
+
 TEST(Shoot, SaysWhatIsWrong) {
   const FitFile fit = fit_of(0);
   const CsvTable log = motion(1e-3, 2, 400);

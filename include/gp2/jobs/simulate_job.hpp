@@ -2,6 +2,7 @@
 
 #include <atomic>
 #include <cstdint>
+#include <functional>
 #include <map>
 #include <memory>
 #include <optional>
@@ -47,6 +48,12 @@ std::optional<double> start_time(const Model& model, const MotionStart& start, c
 /// @throws InputError for an end that is not after the start, or more than 1e7 times.
 Eigen::VectorXd motion_times(double t_start, double t_end, const std::optional<double>& time_step);
 
+/// ½ dqᵀM dq + V along a motion (theory.md, T22).
+struct MotionEnergy {
+  Eigen::VectorXd values;  // (N) [J]
+  Eigen::VectorXd stddev;  // of the potential that a fit learned, against the first state; empty where that is not one function
+};
+
 /// A motion that is to be integrated.
 struct SimulateJob {
   std::shared_ptr<const System> system;
@@ -54,6 +61,8 @@ struct SimulateJob {
   Eigen::VectorXd start;                    // the whole state
   std::vector<Acceleration> accelerations;  // one for each motion
   std::vector<Acceleration> records;        // the multipliers λ of each motion; none without constraints
+  /// The energy of each motion at its states; none without a potential, known or learned.
+  std::vector<std::function<MotionEnergy(const Eigen::MatrixXd& states)>> energies;
   SimulateOptions options;
   InputSignal commands;            // of which options.inputs is what acts
   std::vector<std::string> notes;  // how the start was completed

@@ -38,7 +38,7 @@ struct ConstraintRow {
   /// Of a unilateral contact c ≥ 0, which holds c = 0 where its input is above ½.
   struct Contact {
     int input = 0;           // of the system's inputs: 1 in contact, 0 apart
-    Expression restitution;  // e of the impact, of parameters
+    Expression restitution;  // e of the impact, at the state before it
   };
   std::optional<Contact> contact = {};
 };
