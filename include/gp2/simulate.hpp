@@ -189,6 +189,10 @@ Eigen::VectorXd complete_start(const Model& model, const Eigen::VectorXd& parame
 /// The acceleration of a model as it is written: L b + T (M⁻¹F + truth), truth = 0 without [truth].
 Acceleration model_acceleration(const Model& model);
 
+/// Kinetic energy ½ dqᵀM dq at N states (N) [J].
+Eigen::VectorXd kinetic_energy(const System& system, const Eigen::VectorXd& parameters,
+                               const Eigen::Ref<const Eigen::MatrixXd>& states);
+
 /// Kinetic and potential energy ½ dqᵀM dq + V of a model with [mechanics] potential, at N states (N) [J].
 /// @throws InputError when the model has none.
 Eigen::VectorXd mechanical_energy(const Model& model, const Eigen::VectorXd& parameters,

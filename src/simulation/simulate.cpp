@@ -528,18 +528,21 @@ Acceleration model_acceleration(const Model& model) {
       [motion = ModelMotion(model)](const Ref<const VectorXd>& state) -> VectorXd { return motion.acceleration(state).col(0); };
 }
 
-VectorXd mechanical_energy(const Model& model, const VectorXd& parameters, const Ref<const MatrixXd>& states) {
-  const System& system = *model.system;
-  if (!model.potential) throw InputError(fmt::format("{}: no energy without [mechanics] potential = \"…\"", model.name));
-  MatrixXd potential;
-  Tape(std::span(&*model.potential, 1), model.symbols().state_and_parameters()).evaluate(states, parameters, potential);
-  VectorXd energy = potential.row(0).transpose();
+VectorXd kinetic_energy(const System& system, const VectorXd& parameters, const Ref<const MatrixXd>& states) {
+  VectorXd energy(states.cols());
   const SystemValues values = system.evaluate(states, parameters);
   for (int i = 0; i < static_cast<int>(states.cols()); ++i) {
     const auto dq = states.col(i).segment(system.layout().dq(0), system.nq());
-    energy[i] += 0.5 * dq.dot(values.M(i) * dq);
+    energy[i] = 0.5 * dq.dot(values.M(i) * dq);
   }
   return energy;
+}
+
+VectorXd mechanical_energy(const Model& model, const VectorXd& parameters, const Ref<const MatrixXd>& states) {
+  if (!model.potential) throw InputError(fmt::format("{}: no energy without [mechanics] potential = \"…\"", model.name));
+  MatrixXd potential;
+  Tape(std::span(&*model.potential, 1), model.symbols().state_and_parameters()).evaluate(states, parameters, potential);
+  return kinetic_energy(*model.system, parameters, states) + potential.row(0).transpose();
 }
 
 }  // namespace gp2

@@ -516,6 +516,60 @@
     });
   }
 
+  // ---- the motion that the fit makes of the measured start -------------------------------------------------------------------
+
+  function rolloutLead(motion) {
+    if (motion.reason) return `There is none for the ${data.name} data: ${motion.reason}.`;
+    const [start, end] = [motion.t[0], motion.t[motion.t.length - 1]];
+    const within = `within its band, or 5 % of the measured range,`;
+    const parts = [motion.leaves === null
+      ? `Over the ${format(end - start, 4)} s shown the simulated motion stays with the measured one of the ${data.name} data: ${within} to the end.`
+      : `The simulated motion stays with the measured one of the ${data.name} data ${within} for ${format(motion.leaves - start, 3)} s; ${model.coordinates[motion.leaving]} leaves first, at t = ${format(motion.leaves, 4)}.`];
+    if (motion.far_from !== null) parts.push(`From t = ${format(motion.far_from, 4)} on it is far from the training data.`);
+    if (motion.ended) parts.push(`It ended early: ${motion.ended}.`);
+    return parts.join(" ");
+  }
+
+  function drawRollout() {
+    const motion = data.rollout;
+    byId("rollout-lead").textContent = rolloutLead(motion);
+    byId("rollout-parts").hidden = Boolean(motion.reason);
+    const hosts = ["rollout-charts", "rollout-force-charts", "rollout-energy-charts"].map(byId);
+    if (motion.reason) {
+      for (const host of hosts) keep(host, 0);
+      return;
+    }
+    const x = { label: "t [s]", values: motion.t };
+    const measured = (values) => ({ label: "measured", values, colour: "--c2", kind: "points", size: 4 });
+    const simulated = (values, std) => ({ label: "simulated", values, colour: "--c1", kind: "line", ...(std ? { low: band(values, std, -1), high: band(values, std, 1) } : {}) });
+    const away = (a, b) => format(rms(a.map((value, i) => (value === null || b[i] === null ? null : value - b[i]))), 3);
+    keep(hosts[0], model.coordinates.length);
+    model.coordinates.forEach((name, j) => chart(hosts[0].children[j], {
+      title: name, summary: `${away(motion.measured[j], motion.simulated[j])} apart (rms), band of ±${format(2 * rms(motion.stddev[j]), 3)} on average`, x, y: { label: name },
+      series: [measured(motion.measured[j]), simulated(motion.simulated[j], motion.stddev[j])],
+    }));
+    byId("rollout-forces").hidden = !motion.multipliers.length;
+    keep(hosts[1], motion.multipliers.length);
+    motion.multipliers.forEach((name, k) => chart(hosts[1].children[k], {
+      title: name, summary: model.constraints[k] ? `of ${model.constraints[k].text} = 0` : "", x, y: { label: name },
+      series: [{ label: "at the measured states", values: motion.lambda[k], colour: "--c2", band: "--band2", kind: "line", low: band(motion.lambda[k], motion.lambda_stddev[k], -1), high: band(motion.lambda[k], motion.lambda_stddev[k], 1) },
+        { ...simulated(motion.lambda_simulated[k]), dash: [6, 3] }],
+    }));
+    const energies = motion.energy.length > 0;
+    byId("rollout-energies").hidden = !energies;
+    keep(hosts[2], energies ? 1 + motion.potentials.length : 0);
+    if (!energies) return;
+    const change = (values) => { const known = values.filter((value) => value !== null); return format(known[known.length - 1] - known[0], 3); };
+    chart(hosts[2].children[0], {
+      title: "Kinetic + potential energy", summary: `changes by ${change(motion.energy)} J as measured, ${change(motion.energy_simulated)} J as simulated${motion.potentials.length ? "; learned potentials are among it" : ""}`,
+      x, y: { label: "energy [J]" }, series: [measured(motion.energy), simulated(motion.energy_simulated)],
+    });
+    motion.potentials.forEach((one, k) => chart(hosts[2].children[1 + k], {
+      title: `Learned potential ${one.latent}`, summary: "at the measured states, less that at the first", x, y: { label: "V [J]" }, band: true,
+      series: [{ label: "V", values: one.mean, colour: "--c1", kind: "line", low: band(one.mean, one.stddev, -1), high: band(one.mean, one.stddev, 1) }],
+    }));
+  }
+
   // ---- where the data are: phase planes, and three coordinates in space ---------------------------------------------------
 
   let yaw = -0.7, pitch = 0.42;
@@ -833,6 +887,7 @@
     drawCalibration();
     drawConstraint();
     drawAccelerations();
+    drawRollout();
     drawMotion();
   }
 
