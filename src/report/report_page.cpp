@@ -91,6 +91,7 @@ Json model_json(const FitFile& fit) {
           {"file", fit.model.name},
           {"coordinates", coordinates},
           {"inputs", system.inputs()},
+          {"units", Json(fit.model.units)},
           {"constraints", constraints},
           {"A", A.empty() ? "" : matrix_mathml("A", A)},
           {"b", b.empty() ? "" : matrix_mathml("b", b)}};
@@ -163,15 +164,16 @@ Json parameters_json(const FitFile& fit) {
   return rows;
 }
 
-Json hyperparameters_json(const FitReport& report) {
+Json hyperparameters_json(const FitReport& report, const Model& model) {
   Json rows = Json::array();
   for (std::size_t k = 0; k < report.hyperparameters.size(); ++k) {
     const Hyperparameter& h = report.hyperparameters[k];
+    const std::string unit = unit_of(h, model);
     rows.push_back({{"name", h.name},
                     {"value", h.value},
                     {"lower", h.lower},
                     {"upper", h.upper},
-                    {"unit", h.unit},
+                    {"unit", unit.empty() ? h.unit : unit},
                     {"at_bound", h.at_bound()}});
     const auto own = static_cast<Eigen::Index>(k);
     if (report.draws) rows.back()["drawn95"] = {number(report.draws->lower[own]), number(report.draws->upper[own])};
@@ -377,7 +379,7 @@ Json page_json(const Report& report, const Spelling& spelled) {
                {"prior", prior_json(report.fit)},
                {"observations", observations_json(report.fit)},
                {"parameters", parameters_json(report.fit)},
-               {"hyperparameters", hyperparameters_json(report.fit.report)},
+               {"hyperparameters", hyperparameters_json(report.fit.report, report.fit.model)},
                {"fit", fit_json(report.fit.report)},
                {"left_out", report.data.empty() ? "" : report.cross_validation.text()},
                {"advice", advice_json(learning_advice(report), spelled)},

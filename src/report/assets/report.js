@@ -88,6 +88,11 @@
   // ---- what was fitted ----------------------------------------------------------------------------------------------------
 
   let { fit, model } = report;
+  /** A quantity with the unit that the model file states, of a label its last word. */
+  function withUnit(label, quantity = label.split(" ").pop()) {
+    const name = quantity.split("@")[0];
+    return Object.hasOwn(model.units, name) ? `${label} [${model.units[name]}]` : label;
+  }
   let test = report.data.find((data) => data.test);
 
   function fillHeader() {
@@ -107,7 +112,7 @@
     for (const section of document.querySelectorAll("main section")) {
       byId("sections").append(make("li", {}, make("a", { href: `#${section.id}`, text: section.querySelector("h2").textContent })));
     }
-    byId("colophon").textContent = `Written by gp2 ${report.version}. Model files carry no units: axes are in the units of the log. This file is complete; it loads nothing.`;
+    byId("colophon").textContent = `Written by gp2 ${report.version}. ${Object.keys(model.units).length ? "Units are labels of the model file." : "The model file states no units: axes are in those of the log."} This file is complete; it loads nothing.`;
   }
 
   function fillAdvice() {
@@ -118,8 +123,8 @@
   }
 
   function fillModel() {
-    const rows = [["model file", make("code", { text: model.file })], ["coordinates", model.coordinates.join(", ")]];
-    if (model.inputs.length) rows.push(["inputs", model.inputs.join(", ")]);
+    const rows = [["model file", make("code", { text: model.file })], ["coordinates", model.coordinates.map((name) => withUnit(name)).join(", ")]];
+    if (model.inputs.length) rows.push(["inputs", model.inputs.map((name) => withUnit(name)).join(", ")]);
     rows.push(...report.prior);
     for (const group of report.observations) {
       const noise = group.noise.map((value) => format(value, 4));
@@ -147,10 +152,10 @@
     if (!report.parameters.length) {
       parameters.append(make("p", { class: "muted", text: "None." }));
     } else if (!estimated) {
-      parameters.append(table("Parameters of the system", [{ label: "parameter" }, { label: "held at", number: true }], report.parameters.map((row) => [row.name, row.model])));
+      parameters.append(table("Parameters of the system", [{ label: "parameter" }, { label: "held at", number: true }], report.parameters.map((row) => [withUnit(row.name), row.model])));
     } else {
       parameters.append(table("Parameters of the system", [{ label: "parameter" }, { label: "in the model file", number: true }, { label: "fitted", number: true }, { label: "standard error", number: true }, { label: "lower bound", number: true }, { label: "upper bound", number: true }, { label: "" }],
-        report.parameters.map((row) => [row.name, row.model, row.fitted === undefined ? "held" : row.fitted, row.stddev, row.lower, row.upper, bound(row)]), (r) => report.parameters[r].at_bound));
+        report.parameters.map((row) => [withUnit(row.name), row.model, row.fitted === undefined ? "held" : row.fitted, row.stddev, row.lower, row.upper, bound(row)]), (r) => report.parameters[r].at_bound));
     }
     const drawn = fit.draws ? [{ label: "2.5 % of draws", number: true }, { label: "97.5 % of draws", number: true }] : [];
     byId("hyperparameters").append(table("Hyperparameters", [{ label: "name" }, { label: "value", number: true }, ...drawn, { label: "lower bound", number: true }, { label: "upper bound", number: true }, { label: "unit" }, { label: "" }],
@@ -176,8 +181,8 @@
     const of = (get) => report.data.map((data) => get(data.figures));
     const at = (list, output) => of((e) => { const k = e.outputs.indexOf(output); return k < 0 ? null : e[list][k]; });
     const rows = [["points", ...of((e) => e.n)]];
-    for (const output of outputs) rows.push([`rmse ${output}`, ...at("rmse", output)]);
-    if (report.truth) for (const output of outputs) rows.push([`rmse ${output}, truth`, ...at("rmse_to_truth", output)]);
+    for (const output of outputs) rows.push([`rmse ${withUnit(output)}`, ...at("rmse", output)]);
+    if (report.truth) for (const output of outputs) rows.push([`rmse ${withUnit(output)}, truth`, ...at("rmse_to_truth", output)]);
     rows.push(["rmse / training std", ...of((e) => e.rmse_normalised)],
       ["nrmse", ...of((e) => e.nrmse)],
       ["nlpd, with noise", ...of((e) => e.nlpd)],
@@ -238,7 +243,7 @@
   }
 
   /**
-   * A chart by uPlot. spec: {title, summary, x: {label, values}, y: {label, log, zero}, square, diagonal, height, trace,
+   * A chart by uPlot. spec: {title, summary, x: {label, values}, y: {label, log, zero, quantity}, square, diagonal, height, trace,
    * series: [{label, values, colour, kind: "points" | "line", hollow, steps, low, high}]}; low and high are a band or error bars.
    * trace: a line from point to point in the order of the data; marks: values of x that are marked at the foot.
    */
@@ -342,7 +347,7 @@
       legend: { show: false },
       cursor: { drag: { x: true, y: false }, points: { size: 8 } },
       scales: { x: { time: false, range: (u, min, max) => both || spec.x.range || padded(min, max, 0.03) }, y: spec.y.log ? { distr: 3 } : { range: yRange } },
-      axes: [axis(spec.x.label, { size: 34 }), axis(spec.y.label, spec.y.log ? { size: 50, splits: decades } : { size: 50 })],
+      axes: [axis(withUnit(spec.x.label), { size: 34 }), axis(withUnit(spec.y.label, spec.y.quantity), spec.y.log ? { size: 50, splits: decades } : { size: 50 })],
       hooks: {
         drawAxes: [behind],
         setCursor: [(u) => {
@@ -512,7 +517,7 @@
     }
     chart(unconstrained, {
       title: `Unconstrained acceleration ā of ${coordinate}`, summary: `Band of ±${format(2 * rms(data.unconstrained_stddev[j]), 3)} on average. What the constraint hides of ā the data cannot show.`,
-      x, y: { label: `ā ${coordinate}` }, series: [withBand("ā", data.unconstrained[j], data.unconstrained_stddev[j])], band: true,
+      x, y: { label: `ā ${coordinate}`, quantity: `abar_${coordinate}` }, series: [withBand("ā", data.unconstrained[j], data.unconstrained_stddev[j])], band: true,
     });
   }
 
@@ -812,7 +817,7 @@
     const host = byId("comparison-parameters");
     if (!estimated.length) return host.previousElementSibling.remove(), host.remove();
     const columns = [{ label: "parameter" }, ...names.flatMap((name) => [{ label: name, number: true }, { label: "standard error", number: true }])];
-    host.append(table("Estimated parameters of the fits", columns, estimated.map((name) => [name, ...reports.flatMap((one) => {
+    host.append(table("Estimated parameters of the fits", columns, estimated.map((name) => [withUnit(name), ...reports.flatMap((one) => {
       const row = one.parameters.find((candidate) => candidate.name === name);
       if (!row) return [null, null];
       return row.fitted === undefined ? [row.model, "held"] : [row.fitted, row.stddev];
