@@ -127,7 +127,7 @@ class Model {
   /// coordinates and velocities.
   [[nodiscard]] Expression expression(std::string_view text) const;
 
-  /// The unit of a quantity, of the view of one latent too (force_x@friction). Empty: not known.
+  /// The unit of a quantity, of the view of one latent too (`force_x@friction`). Empty: not known.
   [[nodiscard]] std::string unit_of(std::string_view quantity) const;
   /// The quantity with its unit, for an axis: "dx [m/s]"; alone where that is not known.
   [[nodiscard]] std::string labelled(const std::string& quantity) const;
