@@ -203,6 +203,32 @@ test("a measured motion stands beside the simulated one, with its forces and ene
   }
 });
 
+test("fits side by side are told apart by how far their motions are off", async () => {
+  const file = join(models, "surface.toml");
+  const run = (of, out) => gp2("simulate", of, "--start", "q1=0.4,q2=0.8,dq1=0.8,dq2=1", "--t-end", "2", "--dt", "0.05", "-o", out);
+  gp2("fit", file, "--data", "surface.csv", "--max-points", "5", "--restarts", "1", "-o", "few.json");
+  run(file, "truth.csv");
+  gp2("report", "few.json", "surface.json", "--data", "truth.csv", "-o", "off.html");
+  const column = (csv, name) => {
+    const lines = readFileSync(join(folder, csv), "utf8").trim().split("\n").map((line) => line.split(","));
+    return lines.slice(1).map((line) => Number(line[lines[0].indexOf(name)]));
+  };
+  const expected = ["few", "surface"].map((name) => {
+    run(`${name}.json`, "own.csv");
+    const shares = ["q1", "q2", "q3"].map((q) => {
+      const [measured, own] = [column("truth.csv", q), column("own.csv", q)];
+      const squares = measured.map((value, i) => (value - own[i]) ** 2);
+      return squares.reduce((a, b) => a + b) / squares.length / (Math.max(...measured) - Math.min(...measured)) ** 2;
+    });
+    return Math.sqrt(shares.reduce((a, b) => a + b) / 3);
+  });
+  const { page, close } = await open("off.html");
+  const off = (await numbers(page, "comparison-scores"))["simulated motion, rms error / range"];
+  off.forEach((value, k) => assert.ok(Math.abs(value - expected[k]) <= 1e-3 * expected[k], `${off}, ${expected}`));
+  assert.ok(off[1] < off[0], String(off));
+  await close();
+});
+
 test("the derived constraint is typeset", async () => {
   const { page, close } = await open("surface.html");
   const formulas = await page.locator(".formula math").evaluateAll((all) => all.map((one) => [one.namespaceURI, one.textContent, one.getBoundingClientRect().height]));

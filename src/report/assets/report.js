@@ -799,6 +799,13 @@
       ["points far from the data", figure((e) => e.n_far)],
       ["max |A q̈ − b|, fitted", figure((e) => e.max_constraint_error_fitted)],
     ];
+    // not the time within the band: a fit that knows little has a wide one
+    const off = all((one) => {
+      const motion = judged(one)?.rollout;
+      if (!motion || motion.reason || motion.ended) return null;
+      return rms(motion.measured.map((values, j) => rms(values.map((value, i) => value - motion.simulated[j][i])) / (Math.max(...values) - Math.min(...values) || 1)));
+    });
+    if (off.some((value) => value !== null)) rows.push(["simulated motion, rms error / range", off, low]);
     const built = table("Scores of the fits", [{ label: "" }, ...names.map((label) => ({ label, number: true }))], rows.map(([label, values]) => [label, ...values]));
     // the best of a row, where one is better than the others
     rows.forEach(([, values, cost], r) => {
