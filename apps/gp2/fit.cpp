@@ -101,11 +101,12 @@ Json to_json(const FitProblem& problem, const FitOutcome& outcome) {
   Json errors = Json::array();  // of parameters, with their correlations
   for (std::size_t k = 0; k < report.hyperparameters.size(); ++k) {
     const Hyperparameter& h = report.hyperparameters[k];
+    const std::string unit = unit_of(h, outcome.file.model);
     hyperparameters.push_back({{"name", h.name},
                                {"value", h.value},
                                {"lower", h.lower},
                                {"upper", h.upper},
-                               {"unit", h.unit},
+                               {"unit", unit.empty() ? h.unit : unit},
                                {"at_bound", h.at_bound()}});
     if (h.kind != Hyperparameter::Kind::parameter || !(report.uncertainty || report.draws)) continue;
     Json correlation = Json::object();
@@ -285,7 +286,7 @@ void run(FitArguments& arguments, const std::set<std::string>& given) {
     if (arguments.json) {
       print_result("{}\n", to_json(job.problem, outcome).dump(2));
     } else {
-      print_result("{}", text_of(file.report));
+      print_result("{}", text_of(file.report, file.model));
       if (outcome.cross_validation) print_result("{}\n", outcome.cross_validation->text());
     }
   };

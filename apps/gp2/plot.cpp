@@ -21,7 +21,7 @@ void run(const PlotArguments& arguments) {
   require_output(arguments.output, {arguments.fit});
   const FitFile fit = FitFile::read(arguments.fit);
   const LearnedCurve curve = learned_curve(fit.posterior(), arguments.request);
-  write_file(arguments.output, plot(curve, fit.model.system->name()));
+  write_file(arguments.output, plot(curve, fit.model));
   print_notes({fmt::format("{}: {} along {}", arguments.output, curve.force.names[static_cast<std::size_t>(curve.row)],
                            curve.force.along)});
 }

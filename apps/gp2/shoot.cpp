@@ -28,7 +28,7 @@ void run(const ShootArguments& arguments) {
   print_notes(outcome.notes);
   print_result("{:<20} {:<26} {}\n", "", "one by one", "by the motion");
   for (const ShotParameter& one : outcome.parameters) {
-    print_result("{:<20} {:<26} {}\n", one.name, with_stddev(one.one_step, one.one_step_stddev),
+    print_result("{:<20} {:<26} {}\n", outcome.fit.model.labelled(one.name), with_stddev(one.one_step, one.one_step_stddev),
                  with_stddev(one.value, one.stddev));
   }
   for (std::size_t c = 0; c < outcome.coordinates.size(); ++c) {

@@ -119,10 +119,18 @@ class Model {
   std::map<std::string, double> newton_start;  // [sampling] start
   std::optional<Motion> motion;                // instead of sampling
   std::map<std::string, std::string> columns;  // the model's name -> the name in logs
+  /// Labels by the name of a quantity, which nothing computes with: [units], and what follows from a coordinate's for its velocity,
+  /// its accelerations and, where it is in m or rad, its forces.
+  std::map<std::string, std::string> units;
 
   /// An expression of the model's symbols and [let] names. Points of its robot, site("tip").z say, become what they are in
   /// coordinates and velocities.
   [[nodiscard]] Expression expression(std::string_view text) const;
+
+  /// The unit of a quantity, of the view of one latent too (`force_x@friction`). Empty: not known.
+  [[nodiscard]] std::string unit_of(std::string_view quantity) const;
+  /// The quantity with its unit, for an axis: "dx [m/s]"; alone where that is not known.
+  [[nodiscard]] std::string labelled(const std::string& quantity) const;
 
   /// The variables of the system in `graph`.
   [[nodiscard]] SystemSymbols symbols() const;

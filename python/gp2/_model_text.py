@@ -28,6 +28,7 @@ def model_text(
     sampling: Mapping[str, Any] | None = None,
     motion: Mapping[str, Any] | None = None,
     columns: Mapping[str, str] | None = None,
+    units: Mapping[str, str] | None = None,
 ) -> str:
     mechanics = {"mass": mass, "force": force, "force_on": force_on, "potential": potential}
     if not isinstance(constraints, Mapping):
@@ -53,6 +54,7 @@ def model_text(
         "sampling": sampling,
         "motion": motion,
         "columns": columns,
+        "units": units,
     }
     for table, entries in tables.items():
         if written := _entries(entries or {}):

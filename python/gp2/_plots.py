@@ -31,7 +31,7 @@ def _plot_learned(self: _gp2.Posterior, what: Any = None, *, along: Any = None, 
     (line,) = ax.plot(curve["at"], curve["mean"], label=curve["latent"])
     ax.fill_between(curve["at"], curve["mean"] - half, curve["mean"] + half, color=line.get_color(), alpha=0.2, lw=0)
     ax.plot(curve["data"], np.zeros(len(curve["data"])), "|", color="gray", alpha=0.5, transform=ax.get_xaxis_transform(), ms=12)
-    ax.set(xlabel=curve["along"], ylabel=curve["name"].split("@")[0], title=curve["latent"])
+    ax.set(xlabel=curve["along"], ylabel=curve["name"], title=curve["latent"])
     return ax
 
 

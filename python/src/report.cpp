@@ -68,18 +68,18 @@ std::string report(const py::object& fit, const py::object& path, const py::obje
 std::string plot_fit(const py::object& fit, const py::object& path, const py::kwargs& keywords) {
   PlotRequest request;
   read_keywords("plot", keywords, options(request));
-  const auto picture = [&request](const Posterior& posterior, const std::string& title) {
+  const auto picture = [&request](const Posterior& posterior, const Model& model) {
     const py::gil_scoped_release release;
-    return plot(learned_curve(posterior, request), title);
+    return plot(learned_curve(posterior, request), model);
   };
   std::string svg;
   if (py::isinstance<PyPosterior>(fit)) {
     const auto& self = fit.cast<const PyPosterior&>();
     const Posterior posterior = self.posterior;
-    svg = picture(posterior, self.system().name());
+    svg = picture(posterior, self.file.model);
   } else {
     const FitFile file = FitFile::read(path_argument(fit));
-    svg = picture(file.posterior(), file.model.system->name());
+    svg = picture(file.posterior(), file.model);
   }
   if (!path.is_none()) write_file(path_argument(path), svg);
   return svg;
@@ -98,9 +98,11 @@ py::dict curve_of(const PyPosterior& self, const py::kwargs& keywords) {
     curve = learned_curve(posterior, request);
   }
   const LearnedForce& force = curve.force;
-  return py::dict("latent"_a = force.latent, "along"_a = force.along, "name"_a = force.names[static_cast<std::size_t>(curve.row)],
-                  "at"_a = to_vector(force.at), "mean"_a = to_vector(force.mean.row(curve.row)),
-                  "std"_a = to_vector(force.stddev.row(curve.row)), "data"_a = to_vector(force.data));
+  const std::string& name = force.names[static_cast<std::size_t>(curve.row)];
+  return py::dict("latent"_a = force.latent, "along"_a = self.file.model.labelled(force.along),
+                  "name"_a = self.file.model.labelled(name.substr(0, name.find('@'))), "at"_a = to_vector(force.at),
+                  "mean"_a = to_vector(force.mean.row(curve.row)), "std"_a = to_vector(force.stddev.row(curve.row)),
+                  "data"_a = to_vector(force.data));
 }
 
 py::dict compared(const PyPosterior& self, const py::object& data, const PySystem* system, const py::object& columns) {

@@ -263,6 +263,9 @@ void define_names_and_parameters(py::class_<PySystem>& system) {
       .def_property_readonly(
           "parameters", [](const PySystem& self) { return parameters_of(self.system()); }, "Name to value.")
       .def_property_readonly(
+          "units", [](const PySystem& self) { return self.model->units; },
+          "Name of a quantity to its label: those of [units], and of velocities, accelerations and forces that follow.")
+      .def_property_readonly(
           "constraints", [](const PySystem& self) { return self.system().constraint_labels(); }, "As written; one per row of A.")
       .def_property_readonly(
           "state_names", [](const PySystem& self) { return self.system().state_names(); },
@@ -358,7 +361,7 @@ System.load("surface.toml") reads a model file; System(coordinates=…, mass=…
         noise=0.05,                              # standard deviation of a measured ddq
     )
 
-Further keywords: name, let, potential, truth, sampling, motion, columns. Each is the table of that name in a model file.
+Further keywords: name, let, potential, truth, sampling, motion, columns, units. Each is the table of that name in a model file.
 Features and directions of a latent may be functions, of a contact Jacobian say:
 
     {"name": "contact",

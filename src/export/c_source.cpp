@@ -1279,10 +1279,16 @@ CSource Writer::write() {
         "1e6\n"
         " * are NaN.\n";
   for (const std::string& label : system().constraint_labels()) about += in_comment(fmt::format(" * It obeys {} = 0.\n", label));
+  const auto stated = [&](const std::string& name) -> std::string {
+    const auto found = options_.units.find(name.substr(0, name.find('@')));
+    return found == options_.units.end() ? "" : fmt::format(" [{}]", found->second);
+  };
   const auto unit = [&](int k) -> std::string {
     const int nq = layout_.nq;
+    const std::string label = stated(system().state_names()[static_cast<std::size_t>(k)]);
+    if (k > layout_.t()) return label + " (what acts now, where commands act late)";
+    if (!label.empty()) return label;
     if (k == layout_.t()) return " [s]";
-    if (k > layout_.t()) return " (what acts now, where commands act late)";
     const Coordinate& coordinate = system().coordinates()[static_cast<std::size_t>(k % nq)];
     return coordinate.angle ? (k < nq ? " [rad]" : " [rad/s]") : "";
   };
@@ -1290,9 +1296,10 @@ CSource Writer::write() {
     texts_["state"] +=
         in_comment(fmt::format(" *   [{}] {}{}\n", k, system().state_names()[static_cast<std::size_t>(k)], unit(k)));
   }
-  for (std::size_t r = 0; r < names.size(); ++r) texts_["view"] += in_comment(fmt::format(" *   [{}] {}\n", r, names[r]));
+  for (std::size_t r = 0; r < names.size(); ++r)
+    texts_["view"] += in_comment(fmt::format(" *   [{}] {}{}\n", r, names[r], stated(names[r])));
   std::vector<std::string> parameters;
-  for (const Parameter& parameter : system().parameters()) parameters.push_back(parameter.name);
+  for (const Parameter& parameter : system().parameters()) parameters.push_back(parameter.name + stated(parameter.name));
   texts_["parameters"] = in_comment(parameters.empty() ? "none" : fmt::format("{}", fmt::join(parameters, ", ")));
 
   write_tables();

@@ -210,7 +210,8 @@ ExportOutcome export_fit(const FitFile& fit, const Posterior& posterior, const E
       request.jacobian,
       request.single_precision,
       request.portable_math,
-      {fmt::format("Model '{}', CRC-64 of its text {}.", at.model->system->name(), checksum(at.model->text))}};
+      {fmt::format("Model '{}', CRC-64 of its text {}.", at.model->system->name(), checksum(at.model->text))},
+      at.model->units};
   const CSource c = export_c(exported, at.view, options);
   if (request.to == Target::acados) {
     const std::vector<bool> reads = at.prior.reads();

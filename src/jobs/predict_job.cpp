@@ -205,10 +205,14 @@ PredictOutcome predict_inputs(const FitFile& fit, const Posterior& posterior, co
     out.values.middleRows(row, block.rows()) = block;
     row += block.rows();
   }
+  // of the size of what is wanted and of what happens without inputs: what is wanted may be 0
+  constexpr double produced = 1e-6;
+  wanted.states.bottomRows(system.layout().nu).setZero();
+  const MatrixXd idle = posterior.mean(wanted.view, wanted.states, /*n_threads=*/0);
+  const auto is_missed =
+      found.missed.colwise().norm().array() > produced * (wanted.accelerations.colwise().norm() + idle.colwise().norm()).array();
   wanted.states.bottomRows(system.layout().nu) = found.inputs;
   if (!request.unconditioned) add_distance(posterior, wanted.view, wanted.states, out);
-  constexpr double produced = 1e-6;  // of the size of what is wanted
-  const auto is_missed = found.missed.colwise().norm().array() > produced * wanted.accelerations.colwise().norm().array();
   if (const Index n = is_missed.count(); n > 0) {
     out.notes.push_back(
         fmt::format("warning: {}: no inputs produce the accelerations at {} of {} rows; those that come nearest are given, "

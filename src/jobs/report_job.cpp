@@ -22,6 +22,7 @@
 #include "gp2/jobs/predict_job.hpp"
 #include "gp2/simulation/generate.hpp"
 #include "jobs/read_observations.hpp"
+#include "jobs/rollout.hpp"
 
 namespace gp2 {
 
@@ -123,6 +124,12 @@ std::vector<ReportData> training_data(const FitFile& fit, const Posterior& poste
     data.source = elsewhere ? fmt::format("measured on '{}'", fit.systems[g]->system->name()) : fit.data_source;
     data.independent = independent_outputs(prior_of(posterior.prior(), group.view()).reference_system(),
                                            parameters_of(group.view(), posterior.values().parameters), data);
+    const Model& model = elsewhere ? *fit.systems[g] : fit.model;
+    data.rollout =
+        roll_out({&model, {}, group.view().other_system, prior_of(posterior.prior(), group.view())}, posterior, data.states, {});
+    if (data.rollout.reason.starts_with("the data lack")) {
+      data.rollout.reason += ", which the model does not read and the fit does not keep; the log as `data` has them";
+    }
     all.push_back(std::move(data));
   }
   return all;
@@ -453,6 +460,11 @@ ReportData compare(const FitFile& fit, const Posterior& posterior, const ReportR
       // not numbers: then it is not drawn
     }
   }
+  std::vector<std::string> episodes;
+  if (const int column = reader.episode_column(); column >= 0) {
+    for (int row = 0; row < table.n_rows(); ++row) episodes.push_back(table.cell(row, column));
+  }
+  data.rollout = roll_out(at, posterior, data.states, episodes);
   return data;
 }
 

@@ -82,9 +82,12 @@ std::string robot_text(const RobotDescription& robot) {
   return text;
 }
 
-// "  0.1   in [0, 1]   estimated"
-std::string parameter_text(const Parameter& parameter) {
-  std::string text = fmt::format("  {:<12} {}", parameter.name, parameter.value);
+// " kg", or nothing
+std::string spaced(const std::string& unit) { return unit.empty() ? "" : " " + unit; }
+
+// "  0.1 kg   in [0, 1]   estimated"
+std::string parameter_text(const Parameter& parameter, const std::string& unit = "") {
+  std::string text = fmt::format("  {:<12} {}{}", parameter.name, parameter.value, spaced(unit));
   if (parameter.bounds) text += fmt::format("   in [{}, {}]", parameter.bounds->first, parameter.bounds->second);
   return text + (parameter.estimate ? "   estimated\n" : "\n");
 }
@@ -100,11 +103,20 @@ std::string actuators_text(const Model& model) {
 
 std::string parameters_text(const Model& model, const System& system) {
   std::string text = "\nparameters\n";
-  for (const Parameter& parameter : system.parameters()) text += parameter_text(parameter);
+  for (const Parameter& parameter : system.parameters()) text += parameter_text(parameter, model.unit_of(parameter.name));
   for (const Model::DerivedParameter& derived : model.derived_parameters) {
-    text += fmt::format("  {:<12} {}   = {}\n", derived.name, derived.value, derived.text);
+    text += fmt::format("  {:<12} {}{}   = {}\n", derived.name, derived.value, spaced(model.unit_of(derived.name)), derived.text);
   }
   return text;
+}
+
+// of coordinates, velocities and inputs; nothing where the model states none
+std::string units_text(const Model& model, const System& system) {
+  std::string text;
+  for (const std::string& name : system.state_names()) {
+    if (const std::string unit = model.unit_of(name); !unit.empty()) text += fmt::format("  {:<12} {}\n", name, unit);
+  }
+  return text.empty() ? text : "\nunits\n" + text;
 }
 
 std::string directions_text(const Model& model, const LatentSpec& latent, bool full) {
@@ -164,6 +176,7 @@ std::string whole_text(const Model& model, const SymbolicSystem& system, bool fu
   std::string text = fmt::format("{}\n  {} coordinates, {} inputs, {} constraints\n", system.name(), system.nq(),
                                  system.inputs().size(), system.nc());
   if (model.robot) text += robot_text(*model.robot);
+  text += units_text(model, system);
   text += fmt::format("\nmass matrix M\n{}", matrix_text(derived.M, full));
   text += fmt::format("\nknown force F\n{}", matrix_text(derived.F, full));
   text += "\nconstraints A ddq = b\n";
@@ -222,16 +235,18 @@ OrderedJson model_json(const Model& model, const SymbolicSystem& system) {
                        {"features", latent.feature_names},
                        {"acts_on", columns}});
   });
-  return {{"name", system.name()},       {"coordinates", coordinates},  {"inputs", system.inputs()},
-          {"M", matrix_json(derived.M)}, {"F", column_json(derived.F)}, {"constraints", constraints},
-          {"A", matrix_json(derived.A)}, {"b", column_json(derived.b)}, {"parameters", parameters},
+  return {{"name", system.name()},       {"coordinates", coordinates},
+          {"inputs", system.inputs()},   {"units", OrderedJson(model.units)},
+          {"M", matrix_json(derived.M)}, {"F", column_json(derived.F)},
+          {"constraints", constraints},  {"A", matrix_json(derived.A)},
+          {"b", column_json(derived.b)}, {"parameters", parameters},
           {"latents", latents}};
 }
 
 // "0.1 ± 0.02   [0, 1]   at its bound"
-std::string estimate_line(const std::string& name, double value, const std::string& error, double lower, double upper,
-                          const char* remark) {
-  return fmt::format("  {:<34} {:>13.6g}{}   [{:.3g}, {:.3g}]{}\n", name, value, error, lower, upper, remark);
+std::string estimate_line(const std::string& name, double value, const std::string& error, const std::string& unit, double lower,
+                          double upper, const char* remark) {
+  return fmt::format("  {:<34} {:>13.6g}{}{}   [{:.3g}, {:.3g}]{}\n", name, value, error, spaced(unit), lower, upper, remark);
 }
 
 // "", " ± ∞" or " ± 0.02"
@@ -270,7 +285,8 @@ std::string show(const FitFile& fit, const ShowRequest& request) {
   const std::vector<std::int64_t> n = fit.n_states();
   const std::int64_t n_states = std::accumulate(n.begin(), n.end(), std::int64_t{0});
   if (!request.json) {
-    return fmt::format("learned from {} states of {}\n{}\n{}", n_states, fit.data_source, text_of(fit.report), of_model);
+    return fmt::format("learned from {} states of {}\n{}\n{}", n_states, fit.data_source, text_of(fit.report, fit.model),
+                       of_model);
   }
   OrderedJson json = OrderedJson::parse(of_model), hyperparameters = OrderedJson::object();
   for (const Hyperparameter& h : fit.report.hyperparameters) hyperparameters[h.name] = h.value;
@@ -289,14 +305,19 @@ const char* word_of(ConstraintRow::Level level) {
                                                    : "acceleration";
 }
 
-std::string text_of(const FitReport& report) {
+std::string unit_of(const Hyperparameter& h, const Model& model) {
+  constexpr std::string_view of = "unit of ";  // as default hyperparameters have it
+  return model.unit_of(h.unit.starts_with(of) ? h.unit.substr(of.size()) : h.is_system_parameter() ? h.name : "");
+}
+
+std::string text_of(const FitReport& report, const Model& model) {
   std::string text = fmt::format("negative log likelihood {:.6f}\n{} after {} iterations ({} restarts, best: {})",
                                  report.negative_log_likelihood, report.termination, report.iterations, report.restarts.size(),
                                  report.best_restart + 1);
   text += report.seconds > 0 ? fmt::format(", {:.2f} s\n", report.seconds) : "\n";  // no file holds how long it took
   if (report.draws) text += draws_text(report);
   for (const ActuatorEstimate& one : report.actuators) {
-    text += estimate_line(one.name, one.value, error_text(one.stddev), one.lower, one.upper,
+    text += estimate_line(one.name, one.value, error_text(one.stddev), model.units.empty() ? "" : "s", one.lower, one.upper,
                           one.at_lower() || one.at_upper() ? "   at its bound" : "");
   }
   for (std::size_t k = 0; k < report.hyperparameters.size(); ++k) {
@@ -307,7 +328,7 @@ std::string text_of(const FitReport& report) {
       error = error_text(known.stddev);
       if (known.is_of_draws) error += fmt::format(" (mean {:.6g}, 95 % {:.4g} … {:.4g})", known.mean, known.lower, known.upper);
     }
-    text += estimate_line(h.name, h.value, error, h.lower, h.upper,
+    text += estimate_line(h.name, h.value, error, unit_of(h, model), h.lower, h.upper,
                           h.is_fixed()   ? "   held"
                           : h.at_bound() ? "   at its bound"
                                          : "");

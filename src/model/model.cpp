@@ -135,6 +135,16 @@ Expression Model::expression(std::string_view written) const {
   return robot_expressions_ ? robot_expressions_->expand(value) : value;
 }
 
+std::string Model::unit_of(std::string_view quantity) const {
+  const auto found = units.find(std::string(quantity.substr(0, quantity.find('@'))));
+  return found == units.end() ? "" : found->second;
+}
+
+std::string Model::labelled(const std::string& quantity) const {
+  const std::string unit = unit_of(quantity);
+  return unit.empty() ? quantity : fmt::format("{} [{}]", quantity, unit);
+}
+
 SystemSymbols Model::symbols() const { return {*graph, system->coordinates(), system->inputs(), system->parameters()}; }
 
 const SymbolicSystem* Model::symbolic_system() const {

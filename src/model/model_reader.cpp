@@ -43,7 +43,7 @@ class ModelReader : private TomlReader {
   void read() {
     only_keys(root_, "",
               {"name", "robot", "coordinates", "inputs", "parameters", "let", "mechanics", "constraints", "latent", "noise",
-               "truth", "sampling", "motion", "columns"});
+               "truth", "sampling", "motion", "columns", "units"});
     definition_.graph = model_.graph = std::make_shared<ExpressionGraph>();
     definition_.name = root_.contains("name") ? text(*root_.get("name"), "name") : model_.name;
     read_robot();
@@ -70,6 +70,7 @@ class ModelReader : private TomlReader {
     read_sampling();
     read_motion();
     read_columns();
+    read_units();
     if (!model_.code.mechanics) read_potential();
   }
 
@@ -1313,6 +1314,48 @@ class ModelReader : private TomlReader {
       if (!taken.insert(column).second) fail(*node, key, fmt::format("the column '{}' is another name's already", column));
       model_.columns[name] = column;
     }
+  }
+
+  void read_units() {
+    if (!root_.contains("units")) return;
+    constexpr std::size_t longest = 30;
+    std::set<std::string> known(definition_.inputs.begin(), definition_.inputs.end());
+    for (const Coordinate& coordinate : definition_.coordinates) {
+      known.insert(coordinate.name);
+      if (coordinate.angle) model_.units[coordinate.name] = "rad";
+    }
+    for (const Parameter& parameter : definition_.parameters) known.insert(parameter.name);
+    for (const Model::DerivedParameter& derived : model_.derived_parameters) known.insert(derived.name);
+    for (const auto& [name, node] : entries_of(table(*root_.get("units"), "units"))) {
+      const std::string key = fmt::format("units.{}", name);
+      if (!known.contains(name)) {
+        fail(*node, key,
+             fmt::format("not a coordinate, input or parameter of this model; units of velocities and accelerations follow{}",
+                         suggestion(name, known)));
+      }
+      const std::string unit = text(*node, key);
+      const bool is_label = !unit.empty() && unit.size() <= longest &&
+                            std::none_of(unit.begin(), unit.end(), [](unsigned char c) { return c < 32 || c == 127; });
+      if (!is_label) fail(*node, key, R"(expected a short text, as in x = "m")");
+      model_.units[name] = unit;
+    }
+    model_.units["t"] = "s";
+    for (const Coordinate& coordinate : definition_.coordinates) derive_units(coordinate);
+  }
+
+  // m: m/s, m/s², N
+  void derive_units(const Coordinate& coordinate) const {
+    const auto stated = model_.units.find(coordinate.name);
+    if (stated == model_.units.end()) return;
+    const std::string unit = stated->second;
+    const std::string numerator = unit.find_first_of("/ *") == std::string::npos ? unit : fmt::format("({})", unit);
+    for (const std::string& velocity : {coordinate.velocity(), coordinate.velocity() + "_next"})
+      model_.units[velocity] = numerator + "/s";
+    for (const std::string& acceleration : {coordinate.acceleration(), "abar_" + coordinate.name})
+      model_.units[acceleration] = numerator + "/s²";
+    const char* const force = unit == "m" ? "N" : unit == "rad" ? "N m" : nullptr;
+    if (force == nullptr) return;
+    for (const char* view : {"force_", "fc_"}) model_.units[view + coordinate.name] = force;
   }
 
   const toml::table& root_;

@@ -123,7 +123,7 @@ LearnedCurve learned_curve(const Posterior& posterior, const PlotRequest& reques
   return *std::ranges::max_element(curves, {}, [](const LearnedCurve& one) { return clearness(one.force, one.row); });
 }
 
-std::string plot(const LearnedCurve& curve, const std::string& title) {
+std::string plot(const LearnedCurve& curve, const Model& model) {
   constexpr double width = 640, height = 400, left = 76, right = 620, top = 62, bottom = 336;
   constexpr Index max_marks = 300;
   constexpr double within95 = 1.96;
@@ -133,8 +133,8 @@ std::string plot(const LearnedCurve& curve, const std::string& title) {
   const Axis across = axis_over(force.at.minCoeff(), force.at.maxCoeff(), 0.03, left, right);
   const Axis up = axis_over(low.minCoeff(), high.maxCoeff(), 0.08, bottom, top);
   const std::string name = force.names[static_cast<std::size_t>(curve.row)];
-  const std::string label = name.substr(0, name.find('@'));
-  const std::string heading = shortened(fmt::format("{} – {}", force.latent, title), 62);
+  const std::string label = model.labelled(name.substr(0, name.find('@')));
+  const std::string heading = shortened(fmt::format("{} – {}", force.latent, model.system->name()), 62);
 
   std::string svg = fmt::format(
       "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"{0}\" height=\"{1}\" viewBox=\"0 0 {0} {1}\" role=\"img\" "
@@ -180,7 +180,7 @@ std::string plot(const LearnedCurve& curve, const std::string& title) {
       "of training</text>\n",
       left, left + 26, left + 96, left + 122, left + 208, left + 228, force.data.size());
   svg += fmt::format("<text x=\"{:.0f}\" y=\"{:.0f}\" text-anchor=\"middle\" fill=\"#1d2327\">{}</text>\n", (left + right) / 2,
-                     bottom + 48, markup_text(force.along));
+                     bottom + 48, markup_text(model.labelled(force.along)));
   svg += fmt::format(
       "<text transform=\"translate(20,{:.0f}) rotate(-90)\" text-anchor=\"middle\" fill=\"#1d2327\">{}</text>\n</svg>\n",
       (top + bottom) / 2, markup_text(label));

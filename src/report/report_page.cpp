@@ -91,6 +91,7 @@ Json model_json(const FitFile& fit) {
           {"file", fit.model.name},
           {"coordinates", coordinates},
           {"inputs", system.inputs()},
+          {"units", Json(fit.model.units)},
           {"constraints", constraints},
           {"A", A.empty() ? "" : matrix_mathml("A", A)},
           {"b", b.empty() ? "" : matrix_mathml("b", b)}};
@@ -163,15 +164,16 @@ Json parameters_json(const FitFile& fit) {
   return rows;
 }
 
-Json hyperparameters_json(const FitReport& report) {
+Json hyperparameters_json(const FitReport& report, const Model& model) {
   Json rows = Json::array();
   for (std::size_t k = 0; k < report.hyperparameters.size(); ++k) {
     const Hyperparameter& h = report.hyperparameters[k];
+    const std::string unit = unit_of(h, model);
     rows.push_back({{"name", h.name},
                     {"value", h.value},
                     {"lower", h.lower},
                     {"upper", h.upper},
-                    {"unit", h.unit},
+                    {"unit", unit.empty() ? h.unit : unit},
                     {"at_bound", h.at_bound()}});
     const auto own = static_cast<Eigen::Index>(k);
     if (report.draws) rows.back()["drawn95"] = {number(report.draws->lower[own]), number(report.draws->upper[own])};
@@ -238,13 +240,39 @@ Json figures_json(const ReportData& data) {
           {"n", e.n}};
 }
 
+Json rollout_json(const System& system, const Rollout& rollout, const Spelling& spelled) {
+  if (!rollout.reason.empty()) return {{"reason", spelled(rollout.reason)}};
+  Json potentials = Json::array();
+  for (std::size_t k = 0; k < rollout.potentials.size(); ++k) {
+    const auto row = static_cast<Index>(k);
+    potentials.push_back({{"latent", rollout.potentials[k]},
+                          {"mean", row_json(rollout.potential.row(row))},
+                          {"stddev", row_json(rollout.potential_stddev.row(row))}});
+  }
+  return {{"t", row_json(rollout.times)},
+          {"measured", rows_json(rollout.measured)},
+          {"simulated", rows_json(rollout.simulated)},
+          {"stddev", rows_json(rollout.stddev)},
+          {"ended", spelled(rollout.ended)},
+          {"leaves", rollout.leaves ? number(*rollout.leaves) : Json()},
+          {"leaving", rollout.leaving},
+          {"far_from", rollout.far_from ? number(*rollout.far_from) : Json()},
+          {"multipliers", View::multipliers(system).names(system)},
+          {"lambda", rows_json(rollout.multipliers)},
+          {"lambda_stddev", rows_json(rollout.multipliers_stddev)},
+          {"lambda_simulated", rows_json(rollout.simulated_multipliers)},
+          {"energy", row_json(rollout.energy)},
+          {"energy_simulated", row_json(rollout.simulated_energy)},
+          {"potentials", potentials}};
+}
+
 VectorXd nominal_levels() {
   VectorXd levels(21);
   levels << VectorXd::LinSpaced(20, 0, 0.95), 0.99;
   return levels;
 }
 
-Json data_json(const Report& report, const ReportData& data) {
+Json data_json(const Report& report, const ReportData& data, const Spelling& spelled) {
   const System& system = *report.fit.model.system;
   const Index n = data.measured.cols();
   const Index stride = (n + max_drawn - 1) / max_drawn;
@@ -283,7 +311,8 @@ Json data_json(const Report& report, const ReportData& data) {
                {"stddev", rows_json(data.stddev, stride)},
                {"unconstrained", rows_json(data.unconstrained, stride)},
                {"unconstrained_stddev", rows_json(data.unconstrained_stddev, stride)},
-               {"constraint_error", rows_json(data.constraint_error, stride)}};
+               {"constraint_error", rows_json(data.constraint_error, stride)},
+               {"rollout", rollout_json(system, data.rollout, spelled)}};
   if (data.truth.cols() > 0) json["truth"] = rows_json(data.truth, stride);
   return json;
 }
@@ -350,14 +379,14 @@ Json page_json(const Report& report, const Spelling& spelled) {
                {"prior", prior_json(report.fit)},
                {"observations", observations_json(report.fit)},
                {"parameters", parameters_json(report.fit)},
-               {"hyperparameters", hyperparameters_json(report.fit.report)},
+               {"hyperparameters", hyperparameters_json(report.fit.report, report.fit.model)},
                {"fit", fit_json(report.fit.report)},
                {"left_out", report.data.empty() ? "" : report.cross_validation.text()},
                {"advice", advice_json(learning_advice(report), spelled)},
                {"relevance", relevance_json(report.relevance)},
                {"learned", learned_json(report.learned)},
                {"data", Json::array()}};
-  for (const ReportData& data : report.data) json["data"].push_back(data_json(report, data));
+  for (const ReportData& data : report.data) json["data"].push_back(data_json(report, data, spelled));
   if (report.surface) json["surface"] = surface_json(*report.surface);
   return json;
 }

@@ -33,6 +33,30 @@ INSTANTIATE_TEST_SUITE_P(OfEveryCommand, Help,
                          testing::Values("", "show", "check", "generate", "fit", "predict", "evaluate", "help"),
                          [](const auto& one) { return one.param.empty() ? "gp2" : one.param; });
 
+TEST(Units, StandBehindTheValuesThatACommandPrints) {
+  Desk desk;
+  desk.write("cart.toml",
+             "name = 'cart'\ncoordinates = ['x']\ninputs = ['f']\n[parameters]\nm = { value = 1, bounds = [0.5, 4], estimate = "
+             "true }\n[mechanics]\nmass = [['m']]\nforce = ['f']\n[[latent]]\nname = 'drag'\nkernel = 'se'\nfeatures = ['dx']\n"
+             "directions = 'force'\n[truth]\nforce = ['-dx^3']\n[noise]\nddq = 0.05\n[sampling]\ndx = [-1, 1]\nf = [-1, 1]\n"
+             "[units]\nx = 'm'\nf = 'N'\nm = 'kg'\n");
+  desk.done("gp2 generate cart.toml --n 30 -o train.csv");
+  const Outcome fit = desk.done("gp2 fit cart.toml --data train.csv --mean force --restarts 1 -o fit.json");
+  EXPECT_THAT(fit.out, testing::ContainsRegex("m  +[0-9.]+ ± [0-9.]+ kg   \\[0.5, 4\\]"));
+  EXPECT_THAT(fit.out, testing::ContainsRegex("lengthscale\\(dx\\) +[0-9.]+ m/s  "));
+  const std::string shown = desk.done("gp2 show cart.toml").out;
+  EXPECT_THAT(shown, testing::AllOf(HasSubstr("\n  m            1 kg   in [0.5, 4]"),
+                                    HasSubstr("\nunits\n  x            m\n  dx           m/s\n")));
+  EXPECT_EQ(desk.done("gp2 show cart.toml --json").json()["units"]["ddx"], "m/s²");
+  desk.done("gp2 plot fit.json -o drag.svg");
+  EXPECT_THAT(desk.read("drag.svg"), testing::AllOf(HasSubstr(">dx [m/s]<"), HasSubstr(">force_x [N]<")));
+  desk.done("gp2 export fit.json --to c --name cart -o .");
+  EXPECT_THAT(desk.read("cart.h"), testing::AllOf(HasSubstr("] x [m]\n"), HasSubstr("] dx [m/s]\n"), HasSubstr("] ddx [m/s²]\n"),
+                                                  HasSubstr("] f [N]")));
+  desk.done("gp2 report fit.json -o report.html");
+  EXPECT_THAT(desk.read("report.html"), HasSubstr("\"m\":\"kg\""));
+}
+
 TEST(CommandLine, VersionIsTheLibrarys) {
   for (const char* line : {"gp2 --version", "gp2 -V"}) {
     const Outcome outcome = Desk().run(line);

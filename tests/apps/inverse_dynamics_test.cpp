@@ -48,6 +48,14 @@ TEST_F(InverseDynamicsCommand, SaysWhatIsMissed) {
   EXPECT_GT(columns(desk.table("inputs.csv"), {"ddshoulder_missed"}).norm(), 1e-3);
 }
 
+TEST_F(InverseDynamicsCommand, AnAccelerationOfZeroIsProducedToRounding) {
+  desk.done(
+      "sed 's/ddshoulder/a/;s/ddelbow/b/' wanted.csv | awk -F, 'NR==1{print $0\",ddshoulder\"} NR>1{print $0\",0\"}' >still.csv");
+  const Outcome outcome = desk.done("gp2 predict fit.json --states still.csv --inverse-dynamics -o inputs.csv");
+  EXPECT_THAT(outcome.err, testing::Not(HasSubstr("no inputs produce")));
+  EXPECT_LE(columns(desk.table("inputs.csv"), {"ddshoulder_missed"}).cwiseAbs().maxCoeff(), 1e-9);
+}
+
 TEST_F(InverseDynamicsCommand, RefusesWhatDoesNotGoWithIt) {
   const auto refusal = [&](const std::string& options) {
     const Outcome outcome = desk.run("gp2 predict fit.json --inverse-dynamics -o inputs.csv " + options);

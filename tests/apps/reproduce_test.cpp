@@ -301,6 +301,15 @@ TEST_F(Reproduce, ANoteStandsBesideItsCell) {
 
 // ---- figures
 
+TEST_F(Reproduce, QuietWritesTheSameAndSaysNothing) {
+  const Outcome loud = reproduce("fig3a");
+  EXPECT_TRUE(loud.said("fig3a is done")) << loud.err;
+  const json rows = table("fig3a_same_surface");
+  const Outcome quiet = reproduce("fig3a -q");
+  EXPECT_FALSE(quiet.said("fig3a is done")) << quiet.err;
+  EXPECT_EQ(table("fig3a_same_surface"), rows);
+}
+
 TEST_F(Reproduce, Figure3aPredictsAlongALineOnBothSurfaces) {
   reproduce("fig3a");
   for (const char* name : {"fig3a_same_surface", "fig3a_other_surface"}) {

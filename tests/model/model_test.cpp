@@ -355,7 +355,7 @@ std::vector<Complaint> complaints() {
       {"Empty", "", "1: coordinates: missing; write coordinates = [\"q1\", \"q2\"]"},
       {"UnknownTable", base + "[friction]\nc = 1\n",
        "7: friction: unknown key; known here: name, robot, coordinates, inputs, parameters, let, mechanics, constraints, latent, "
-       "noise, truth, sampling, motion, columns"},
+       "noise, truth, sampling, motion, columns, units"},
       {"FirstOfSeveralUnknownKeys", base + "zeta = 1\nalpha = 2\n",
        "7: mechanics.zeta: unknown key; known here: mass, force, coriolis, potential"},
       {"NameIsNoText", "name = 3\n" + base, "1: name: expected a text in quotes, got 3"},
@@ -635,6 +635,12 @@ std::vector<Complaint> complaints() {
       {"StartOfAnInput", base + "[sampling]\nstart = { u1 = 1 }\n",
        "8: sampling.start.u1: 'u1' is neither a coordinate nor a velocity of this model"},
       {"StartIsANumber", base + "[sampling]\nstart = 1\n", "8: sampling.start: expected a table, got 1"},
+      // units
+      {"UnitOfAVelocity", base + "[units]\ndq1 = \"m/s\"\n",
+       "8: units.dq1: not a coordinate, input or parameter of this model; units of velocities and accelerations follow, did you "
+       "mean 'q1'?"},
+      {"UnitIsANumber", base + "[units]\nq1 = 3\n", "8: units.q1: expected a text in quotes, got 3"},
+      {"UnitIsNoLabel", base + "[units]\nq1 = \"\"\n", "8: units.q1: expected a short text, as in x = \"m\""},
       // columns
       {"ColumnOfAParameter", base + "[columns]\nm = \"mass\"\n",
        "8: columns.m: not a coordinate, velocity, acceleration, input or t of this model"},
@@ -666,6 +672,28 @@ TEST(Model, BrokenTomlIsRefusedWithItsLine) {
   EXPECT_THAT(error_of("coordinates = [\"q1]\n"), StartsWith("m.toml:1: not valid TOML: "));
   EXPECT_THAT(error_of(base + "mass = 3\n"), StartsWith("m.toml:7: not valid TOML: "));
   EXPECT_THAT(error_of("name = \"\xff\"\n"), StartsWith("m.toml:1: not valid TOML: "));
+}
+
+TEST(Model, UnitsOfWhatFollowsFromACoordinateAreDerived) {
+  const Model model = parse(
+      "coordinates = ['x', { name = 'phi', angle = true }, 's', 'w']\ninputs = ['f']\n[parameters]\nm = 1\nm2 = '2*m'\n"
+      "[mechanics]\nmass = [['m','0','0','0'],['0','m','0','0'],['0','0','m','0'],['0','0','0','m']]\n"
+      "[units]\nx = 'm'\ns = 'm/min'\nf = 'N'\nm = 'kg'\nm2 = 'kg'\n");
+  const std::pair<const char*, const char*> units[] = {{"x", "m"},         {"dx", "m/s"},       {"ddx", "m/s²"},
+                                                       {"abar_x", "m/s²"}, {"dx_next", "m/s"},  {"force_x", "N"},
+                                                       {"phi", "rad"},     {"dphi", "rad/s"},   {"force_phi@drag", "N m"},
+                                                       {"fc_x", "N"},      {"ds", "(m/min)/s"}, {"force_s", ""},
+                                                       {"f", "N"},         {"m", "kg"},         {"m2", "kg"},
+                                                       {"t", "s"},         {"w", ""},           {"dw", ""},
+                                                       {"lambda1", ""}};
+  for (const auto& [quantity, unit] : units) EXPECT_EQ(model.unit_of(quantity), unit) << quantity;
+  EXPECT_EQ(model.labelled("ddx"), "ddx [m/s²]");
+  EXPECT_EQ(model.labelled("w"), "w");
+}
+
+TEST(Model, WithoutUnitsThereAreNone) {
+  const Model model = parse("coordinates = [{ name = 'phi', angle = true }]\n[mechanics]\nmass = [['1']]\n");
+  EXPECT_THAT(model.units, testing::IsEmpty());
 }
 
 TEST(Model, AFileThatCannotBeReadIsNamed) {

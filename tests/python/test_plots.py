@@ -30,6 +30,16 @@ def test_plot_is_the_picture_of_the_command(posterior, arm, command, tmp_path):
     assert gp2.plot(tmp_path / "fit.json") == gp2.plot(gp2.load(tmp_path / "fit.json"))
 
 
+def test_units_stand_at_the_axes():
+    cart = gp2.System(
+        coordinates=["x"], mass=[["1"]], latents=[{"name": "drag", "features": ["dx"], "directions": "force"}], noise=0.05,
+        truth=["-dx"], sampling={"dx": [-1, 1]}, units={"x": "m"},
+    )
+    assert cart.units["ddx"] == "m/s²" and cart.units["force_x"] == "N"
+    ax = gp2.fit(cart, cart.generate(20), restarts=1).plot_learned("drag")
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("dx [m/s]", "force_x [N]")
+
+
 def test_band_and_marks_are_what_the_posterior_says(posterior, arm_log):
     svg = gp2.plot(posterior, what="friction of the tip", along="dshoulder", force="shoulder")
     mean, band = points_of(svg, "mean"), points_of(svg, "band")

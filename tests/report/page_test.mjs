@@ -175,6 +175,60 @@ test("two fits stand side by side, and each has the page below", async () => {
   }
 });
 
+test("a measured motion stands beside the simulated one, with its forces and energy", async () => {
+  const file = join(models, "surface.toml");
+  gp2("simulate", file, "--start", "q1=0.4,q2=0.8,dq1=0.8,dq2=1", "--t-end", "6", "--dt", "0.05", "-o", "motion.csv");
+  gp2("simulate", "surface.json", "--start", "motion.csv", "--t-end", "6", "--dt", "0.05", "-o", "simulated.csv");
+  gp2("report", "surface.json", "--data", "motion.csv", "-o", "motion.html");
+  const lines = readFileSync(join(folder, "simulated.csv"), "utf8").trim().split("\n").map((line) => line.split(","));
+  const column = (name) => lines.slice(1).map((line) => Number(line[lines[0].indexOf(name)]));
+  for (const [scheme, width] of [["light", 1200], ["dark", 360]]) {
+    const { page, close } = await open("motion.html", { scheme, width });
+    const motion = await page.evaluate(() => JSON.parse(document.getElementById("report").textContent)[0].data[1].rollout);
+    for (const [told, name] of [[motion.simulated[0], "q1"], [motion.simulated[2], "q3"], [motion.lambda_simulated[0], "lambda1"], [motion.energy_simulated, "energy"]]) {
+      column(name).forEach((value, i) => assert.ok(Math.abs(value - told[i]) <= 1e-5 * Math.max(1, Math.abs(value)), `${name} ${i}`));
+    }
+    const lead = await page.locator("#rollout-lead").textContent();
+    assert.ok(motion.leaves === null ? lead.includes("to the end") : lead.includes(`at t = ${Number(motion.leaves.toPrecision(4))}.`), lead);
+    const shown = new Set(await page.locator("#rollout figcaption strong").allTextContents());
+    assert.deepEqual(shown, new Set(["q1", "q2", "q3", "lambda1", "Kinetic + potential energy"]));
+    for (const { title, count } of (await inked(page)).filter((one) => shown.has(one.title))) assert.ok(count > 20, `${title}: ${count} pixels in ${scheme}`);
+    assert.equal(await page.evaluate(() => document.documentElement.scrollWidth), width);
+    // the training data have no time
+    await page.getByLabel(/^training/).check();
+    await settled(page);
+    assert.equal(await page.locator("#rollout canvas").count(), 0);
+    assert.match(await page.locator("#rollout-lead").textContent(), /^There is none for the training data: the data lack t, which the model does not read/);
+    await close();
+  }
+});
+
+test("fits side by side are told apart by how far their motions are off", async () => {
+  const file = join(models, "surface.toml");
+  const run = (of, out) => gp2("simulate", of, "--start", "q1=0.4,q2=0.8,dq1=0.8,dq2=1", "--t-end", "2", "--dt", "0.05", "-o", out);
+  gp2("fit", file, "--data", "surface.csv", "--max-points", "5", "--restarts", "1", "-o", "few.json");
+  run(file, "truth.csv");
+  gp2("report", "few.json", "surface.json", "--data", "truth.csv", "-o", "off.html");
+  const column = (csv, name) => {
+    const lines = readFileSync(join(folder, csv), "utf8").trim().split("\n").map((line) => line.split(","));
+    return lines.slice(1).map((line) => Number(line[lines[0].indexOf(name)]));
+  };
+  const expected = ["few", "surface"].map((name) => {
+    run(`${name}.json`, "own.csv");
+    const shares = ["q1", "q2", "q3"].map((q) => {
+      const [measured, own] = [column("truth.csv", q), column("own.csv", q)];
+      const squares = measured.map((value, i) => (value - own[i]) ** 2);
+      return squares.reduce((a, b) => a + b) / squares.length / (Math.max(...measured) - Math.min(...measured)) ** 2;
+    });
+    return Math.sqrt(shares.reduce((a, b) => a + b) / 3);
+  });
+  const { page, close } = await open("off.html");
+  const off = (await numbers(page, "comparison-scores"))["simulated motion, rms error / range"];
+  off.forEach((value, k) => assert.ok(Math.abs(value - expected[k]) <= 1e-3 * expected[k], `${off}, ${expected}`));
+  assert.ok(off[1] < off[0], String(off));
+  await close();
+});
+
 test("the derived constraint is typeset", async () => {
   const { page, close } = await open("surface.html");
   const formulas = await page.locator(".formula math").evaluateAll((all) => all.map((one) => [one.namespaceURI, one.textContent, one.getBoundingClientRect().height]));

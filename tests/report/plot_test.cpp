@@ -83,7 +83,11 @@ TEST(Plot, IsAPictureOfACurveThatIsFlatAndCertain) {
                  Eigen::MatrixXd::Zero(1, 3),
                  Eigen::MatrixXd::Zero(1, 3),
                  Eigen::VectorXd::Zero(2)};
-  EXPECT_THAT(plot(curve, "a & b"), testing::AllOf(HasSubstr("a &amp; b"), Not(HasSubstr("nan")), Not(HasSubstr("inf"))));
+  const Model model =
+      Model::parse("name = 'a & b'\ncoordinates = ['x']\n[mechanics]\nmass = [['1']]\n[units]\nx = 'm'\n", "model.toml");
+  const std::string picture = plot(curve, model);
+  EXPECT_THAT(picture, testing::AllOf(HasSubstr("a &amp; b"), Not(HasSubstr("nan")), Not(HasSubstr("inf"))));
+  EXPECT_THAT(picture, testing::AllOf(HasSubstr(">dx [m/s]<"), HasSubstr(">force_x [N]<")));
 }
 
 }  // namespace

@@ -2,13 +2,16 @@
 
 #include <cmath>
 #include <limits>
+#include <numbers>
 
+#include <fmt/format.h>
 #include <gmock/gmock.h>
 #include <gtest/gtest.h>
 #include <nlohmann/json.hpp>
 
 #include "apps/command_line.hpp"
 #include "command.hpp"
+#include "gp2/data/csv.hpp"
 
 namespace gp2::command {
 namespace {
@@ -205,6 +208,133 @@ TEST_F(ReportOf, ABaselineAndACoordinateThatIsNotReadHaveOneToo) {
   const auto json = nlohmann::json::parse(report_json({r}, with_flags))[0];
   EXPECT_FALSE(json.contains("surface"));
   EXPECT_FALSE(json["data"][0]["columns"].contains("q1")) << "the fit does not keep it";
+}
+
+class RolloutOf : public testing::Test {
+ protected:
+  // of the test, against a fit
+  Rollout of(const std::string& test, const std::string& fit = "fit.json") {
+    std::vector<std::string> notes;
+    return collect_reports({{(desk / fit).string()}, (desk / test).string(), "", {}}, notes).front().data.back().rollout;
+  }
+  VectorXd column(const std::string& file, const char* name) {
+    const CsvTable table = CsvTable::read(desk / file);
+    VectorXd values(table.n_rows());
+    for (int i = 0; i < table.n_rows(); ++i) values[i] = table.number(i, table.find(name));
+    return values;
+  }
+  void fit_surface() {
+    desk.done("gp2 generate models/surface.toml --n 60 --noise-std 0.05 -o train.csv");
+    desk.done("gp2 fit models/surface.toml --data train.csv --mean force --restarts 1 -o fit.json");
+  }
+  test::Desk desk;
+};
+
+TEST_F(RolloutOf, AMeasuredMotionIsThatOfSimulate) {
+  fit_surface();
+  desk.done("gp2 simulate models/surface.toml --start q1=0.4,q2=0.8,dq1=0.8,dq2=1 --t-end 2 --dt 0.05 -o test.csv");
+  desk.done("gp2 simulate fit.json --start test.csv --t-end 2 --dt 0.05 -o simulated.csv");
+  const Rollout motion = of("test.csv");
+  ASSERT_EQ(motion.reason, "");
+  ASSERT_EQ(motion.times.size(), 41);
+  for (int j = 0; j < 3; ++j) {
+    const std::string name = fmt::format("q{}", j + 1);
+    EXPECT_TRUE(motion.measured.row(j).transpose().isApprox(column("test.csv", name.c_str()), 1e-14));
+    EXPECT_TRUE(motion.simulated.row(j).transpose().isApprox(column("simulated.csv", name.c_str()), 1e-12)) << name;
+    EXPECT_EQ(motion.stddev(j, 0), 0) << "all begin at the measured state";
+    EXPECT_GT(motion.stddev(j, 40), 0);
+  }
+  EXPECT_TRUE(motion.simulated_multipliers.row(0).transpose().isApprox(column("simulated.csv", "lambda1"), 1e-12));
+  EXPECT_TRUE(motion.simulated_energy.isApprox(column("simulated.csv", "energy"), 1e-12));
+  EXPECT_TRUE(motion.energy.isApprox(column("test.csv", "energy"), 1e-12));
+  EXPECT_NEAR(motion.multipliers(0, 0), motion.simulated_multipliers(0, 0), 1e-9) << "at the same state";
+}
+
+TEST_F(RolloutOf, AMotionOfTheFitItselfIsNeverLeft) {
+  fit_surface();
+  const std::string start = " --start q1=0.4,q2=0.8,dq1=0.8,dq2=1 --t-end 4 --dt 0.05 -o ";
+  desk.done("gp2 simulate fit.json" + start + "own.csv");
+  EXPECT_FALSE(of("own.csv").leaves);
+  // of a surface without gravity it is another motion
+  desk.write("weightless.toml", test::replaced(desk.read("models/surface.toml"), "g  = 9.81", "g  = 0.01"));
+  desk.done("gp2 simulate weightless.toml" + start + "other.csv");
+  const Rollout other = of("other.csv");
+  ASSERT_TRUE(other.leaves);
+  const auto at = std::find(other.times.begin(), other.times.end(), *other.leaves) - other.times.begin();
+  for (Eigen::Index j = 0; j < 3; ++j) {
+    const auto row = other.measured.row(j);
+    const double visible = 0.05 * (row.maxCoeff() - row.minCoeff());
+    for (Eigen::Index i = 0; i < at; ++i)
+      EXPECT_LE(std::abs(row[i] - other.simulated(j, i)), std::max(visible, 2 * other.stddev(j, i)));
+  }
+  const double range = other.measured.row(other.leaving).maxCoeff() - other.measured.row(other.leaving).minCoeff();
+  EXPECT_GT(std::abs(other.measured(other.leaving, at) - other.simulated(other.leaving, at)), 0.05 * range);
+}
+
+TEST_F(RolloutOf, LearnedPotentialsKeepTheEnergyOfASimulatedMotion) {
+  desk.write("springs.toml",
+             "coordinates = ['x', 'y']\n[mechanics]\nmass = [['2', '0'], ['0', '1']]\n[constraints]\nposition = []\n"
+             "[[latent]]\nname = 'spring'\nkernel = 'se'\ndirections = 'potential'\n[truth]\nforce = ['-4*x - 2*x^3 + y', "
+             "'-3*y + x']\n[noise]\nddq = 0.05\n[sampling]\nx = [-1, 1]\ny = [-1, 1]\n");
+  desk.done("gp2 generate springs.toml --n 40 -o train.csv");
+  desk.done("gp2 fit springs.toml --data train.csv --restarts 1 -o fit.json");
+  desk.done("gp2 simulate springs.toml --start x=0.6,y=-0.3,dx=0,dy=0 --t-end 5 --dt 0.05 -o test.csv");
+  const Rollout motion = of("test.csv");
+  ASSERT_EQ(motion.potentials, std::vector<std::string>{"spring"});
+  const double exchanged = motion.potential.maxCoeff() - motion.potential.minCoeff();
+  EXPECT_GT(exchanged, 0.5);
+  EXPECT_LT(motion.simulated_energy.maxCoeff() - motion.simulated_energy.minCoeff(), 1e-4 * exchanged);
+  EXPECT_GT(motion.energy.maxCoeff() - motion.energy.minCoeff(), 1e-3 * exchanged) << "what was learned is not the truth";
+}
+
+TEST_F(RolloutOf, WhatIsNoMotionSaysWhy) {
+  fit_surface();
+  desk.done("gp2 generate models/surface.toml --n 20 --seed 2 -o random.csv");
+  EXPECT_EQ(of("random.csv").reason, "the data lack t");
+  std::vector<std::string> notes;
+  const Report report = collect_reports({{(desk / "fit.json").string()}, "", "", {}}, notes).front();
+  EXPECT_THAT(report.data.front().rollout.reason, HasSubstr("the data lack t, which the model does not read"));
+  desk.done("awk 'NR == 1 { print $0 \",t\" } NR > 1 { print $0 \",\" 7 * NR % 20 }' random.csv > shuffled.csv");
+  EXPECT_THAT(of("shuffled.csv").reason, HasSubstr("no 8 of them follow each other in time"));
+}
+
+TEST_F(RolloutOf, AMotionThatRunsAwayIsDrawnAsFarAsItWent) {
+  desk.write("away.toml",
+             "coordinates = ['x']\n[mechanics]\nmass = [['1']]\nforce = ['x^3']\n[constraints]\nposition = []\n[[latent]]\n"
+             "kernel = 'se'\nfeatures = ['x']\n[truth]\nforce = ['0']\n[noise]\nddq = 0.1\n[sampling]\nx = [-1, 1]\n");
+  desk.done("gp2 generate away.toml --n 20 -o train.csv");
+  desk.done("gp2 fit away.toml --data train.csv --mean force --restarts 1 --max-iterations 0 -o fit.json");
+  std::string log = "t,x,dx,ddx\n";
+  for (int i = 0; i < 40; ++i) log += fmt::format("{},{},3,0\n", 0.05 * i, 3 + 0.15 * i);
+  desk.write("test.csv", log);
+  const Rollout motion = of("test.csv");
+  EXPECT_EQ(motion.reason, "");
+  EXPECT_NE(motion.ended, "");
+  EXPECT_EQ(motion.simulated(0, 0), 3);
+  EXPECT_TRUE(std::isnan(motion.simulated(0, 39)));
+}
+
+TEST_F(RolloutOf, TheLongestEpisodeIsShownAndAnAngleThatWrapsGoesOn) {
+  desk.write("wheel.toml",
+             "coordinates = [{ name = 'phi', angle = true }]\n[mechanics]\nmass = [['1']]\n[constraints]\nposition = []\n"
+             "[[latent]]\nkernel = 'se'\nfeatures = ['dphi']\n[truth]\nforce = ['-0.1*dphi']\n[noise]\nddq = 0.01\n"
+             "[sampling]\ndphi = [-6, 6]\n");
+  desk.done("gp2 generate wheel.toml --n 30 -o train.csv");
+  desk.done("gp2 fit wheel.toml --data train.csv --restarts 1 -o fit.json");
+  // dphi = 5 exp(−0.1 t), phi = 50 (1 − exp(−0.1 t)) as a sensor with one turn tells it
+  std::string log = "t,episode,phi,dphi,ddphi\n";
+  for (int i = 0; i < 10; ++i) log += fmt::format("{},0,0,0,0\n", 0.1 * i);
+  for (int i = 10; i < 70; ++i) {
+    const double t = 0.1 * i, dphi = 5 * std::exp(-0.1 * (t - 1));
+    log += fmt::format("{},1,{},{},{}\n", t, std::remainder(50 - 10 * dphi + 2, 2 * std::numbers::pi), dphi, -0.1 * dphi);
+  }
+  desk.write("test.csv", log);
+  const Rollout motion = of("test.csv");
+  ASSERT_EQ(motion.times.size(), 60);
+  EXPECT_DOUBLE_EQ(motion.times[0], 1);
+  EXPECT_NEAR(motion.measured(0, 59), 52 - 50 * std::exp(-0.59), 1e-4);
+  EXPECT_NEAR(motion.simulated(0, 59), motion.measured(0, 59), 0.1);
+  EXPECT_FALSE(motion.leaves);
 }
 
 TEST_F(ReportOf, TextOfAModelCannotLeaveTheData) {

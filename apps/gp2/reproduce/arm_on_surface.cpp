@@ -206,7 +206,7 @@ void reproduce_arm_on_surface(const ReproduceOptions& options) {
     const std::size_t first_row = table.rows().size();
     for (std::size_t m = 0; m < methods.size(); ++m) {
       const Method& method = methods[m];
-      talk_over(fmt::format("arm-on-surface: n = {}: {}", n, method.name));
+      if (progress_is_due()) print_progress(fmt::format("arm-on-surface: n = {}: {}", n, method.name));
       const auto start = std::chrono::steady_clock::now();
       const Trained trained = train(models[m], {}, method, Protocol::Name::standard, log.first_rows(n), 0, options.threads,
                                     method.baseline ? fitted[method.name] : std::vector<Hyperparameter>{});
@@ -233,7 +233,7 @@ void reproduce_arm_on_surface(const ReproduceOptions& options) {
     add_ratios(definition, k, methods, table, first_row);
     table.write(options.output / "arm_on_surface");  // an hour's work is kept
   }
-  talk_over("");
+  end_progress();
   print(table.rows());
   plot(options, "arm_on_surface");
 }
@@ -256,11 +256,11 @@ void reproduce_arm_mass(const ReproduceOptions& options) {
     method.reduction_tolerance = stop.number("reduction_tolerance");
     method.max_escapes = 0;
     method.standard_errors = true;
-    talk_over(fmt::format("arm-mass: {}", method.name));
+    if (progress_is_due()) print_progress(fmt::format("arm-mass: {}", method.name));
     const auto start = std::chrono::steady_clock::now();
     const Trained trained = train(model, truth.keys(), method, Protocol::Name::standard, log, 0, options.threads);
     const double seconds = seconds_since(start);
-    talk_over("");
+    end_progress();
     const std::vector<Hyperparameter>& fitted = trained.fit.report.hyperparameters;
     const LaplaceUncertainty& uncertainty = trained.fit.report.uncertainty.value();
     for (std::size_t k = 0; k < fitted.size(); ++k) {

@@ -140,9 +140,6 @@ class PictureError : public InputError {
 /// @throws PictureError when there is no gnuplot, or it fails.
 void plot(const ReproduceOptions& options, const std::string& name);
 
-/// A line of progress that the next one overwrites; on a terminal only. "" ends it.
-void talk_over(const std::string& text);
-
 // One function per experiment.
 void reproduce_table1(const ReproduceOptions& options);
 void reproduce_learning_curve(const ReproduceOptions& options);

@@ -6,6 +6,7 @@
 #include "command.hpp"
 #include "reproduce/experiment.hpp"
 #include "reproduce/table.hpp"
+#include "streams.hpp"
 
 // Error against the number of observations.
 namespace gp2::command {
@@ -62,7 +63,9 @@ void reproduce_learning_curve(const ReproduceOptions& options) {
       for (std::size_t k = 0; k < sizes.size(); ++k) {
         const auto n = static_cast<int>(sizes[k]);
         for (std::size_t m = 0; m < methods.size(); ++m) {
-          talk_over(fmt::format("learning-curve: {} run {}/{}, n = {}: {}", system.name, run + 1, n_runs, n, methods[m].name));
+          if (progress_is_due())
+            print_progress(
+                fmt::format("learning-curve: {} run {}/{}, n = {}: {}", system.name, run + 1, n_runs, n, methods[m].name));
           const Score score = score_of(system, methods[m], protocol, log.first_rows(n), run, options.threads,
                                        definition.integer("train_at_most"));
           errors[m][k].push_back(score.rmse_normalised);
@@ -78,7 +81,7 @@ void reproduce_learning_curve(const ReproduceOptions& options) {
     }
     add_summary(system.name, methods, sizes, std::move(errors), summary);
   }
-  talk_over("");
+  end_progress();
   runs.write(options.output / "learning_curve_runs");
   summary.write(options.output / "learning_curve");
   plot(options, "learning_curve");

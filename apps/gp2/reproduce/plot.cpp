@@ -61,9 +61,4 @@ void plot(const ReproduceOptions& options, const std::string& name) {
   }
 }
 
-void talk_over(const std::string& text) {
-  if (isatty(STDERR_FILENO) == 0) return;
-  print_message("\r\033[K{}", text);
-}
-
 }  // namespace gp2::command

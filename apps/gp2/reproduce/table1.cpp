@@ -159,7 +159,8 @@ void reproduce_table1(const ReproduceOptions& options) {
     for (int run = 0; run < n_runs[s]; ++run) {
       const CsvTable log = observations_of(system.model, sections[s].text("data"), options.data, run, n);
       for (const Method& method : methods) {
-        talk_over(fmt::format("table1: {} run {}/{}: {}", system.name, run + 1, n_runs[s], method.name));
+        if (progress_is_due())
+          print_progress(fmt::format("table1: {} run {}/{}: {}", system.name, run + 1, n_runs[s], method.name));
         // a method that knows no protocol is trained once, and stands under each
         std::optional<Score> score;
         for (const Protocol::Name protocol : options.protocols) {
@@ -169,7 +170,7 @@ void reproduce_table1(const ReproduceOptions& options) {
       }
     }
   }
-  talk_over("");
+  end_progress();
 
   Table runs, summary;
   for (const Cell& cell : cells) runs.add(row_of(cell));

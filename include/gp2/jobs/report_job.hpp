@@ -43,6 +43,24 @@ struct LearnedForce {
 /// What each latent has learned, along the entries of the state that it reads and that change it most.
 std::vector<LearnedForce> learned_forces(const Posterior& posterior);
 
+/// The motion of the fit beside a measured one, from the same start: N rows of the log where it goes on longest without a break.
+struct Rollout {
+  std::string reason;              // why there is none; empty: there is one
+  Eigen::VectorXd times;           // (N) [s]
+  Eigen::MatrixXd measured;        // q, angles without jumps (nq × N)
+  Eigen::MatrixXd simulated;       // q of the mean motion; NaN beyond what it reached (nq × N)
+  Eigen::MatrixXd stddev;          // of sample motions about it; NaN beyond what the first of them to end reached (nq × N)
+  std::string ended;               // why the mean motion ended early; empty: it did not
+  std::optional<double> leaves;    // first time at which they are apart by more than 2 stddev and 5 % of the measured range
+  int leaving = 0;                 // the coordinate that is
+  std::optional<double> far_from;  // first time at which the mean motion is far from the training data
+  Eigen::MatrixXd multipliers, multipliers_stddev;  // λ at the measured states (nc × N)
+  Eigen::MatrixXd simulated_multipliers;            // λ of the mean motion (nc × N)
+  Eigen::VectorXd energy, simulated_energy;         // kinetic + potential, learned ones too (N) [J]; empty: no potential
+  std::vector<std::string> potentials;              // latents that are one (p)
+  Eigen::MatrixXd potential, potential_stddev;      // of each less that at the start, at the measured states (p × N) [J]
+};
+
 /// Measured accelerations at N states, d outputs of them, and what the fit says there. Standard deviations are without noise.
 struct ReportData {
   std::string name;    // "training", "training 2", "test"
@@ -66,6 +84,7 @@ struct ReportData {
   std::vector<ConstraintResidual> constraint_residuals;  // of the measured accelerations
   LowerRank lower_rank;                                  // states at which constraints let go, or follow from each other
   std::vector<std::string> independent;  // accelerations to observe instead, where the outputs follow from each other
+  Rollout rollout;
 
   /// Root mean square of truth − predicted per output (d); NaN where the truth is not known.
   [[nodiscard]] Eigen::VectorXd rmse_to_truth() const;

@@ -28,7 +28,10 @@ std::string show(const FitFile& fit, const ShowRequest& request = {});
 /// "position", "velocity" or "acceleration".
 const char* word_of(ConstraintRow::Level level);
 
-/// How a fit ended, and its hyperparameters with their standard errors, a line each.
-std::string text_of(const FitReport& report);
+/// How a fit ended, and its hyperparameters with their standard errors and the model's units, a line each.
+std::string text_of(const FitReport& report, const Model& model);
+
+/// The unit of a hyperparameter where the model states it; empty: it does not.
+std::string unit_of(const Hyperparameter& h, const Model& model);
 
 }  // namespace gp2

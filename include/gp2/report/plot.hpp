@@ -31,7 +31,7 @@ struct LearnedCurve {
 LearnedCurve learned_curve(const Posterior& posterior, const PlotRequest& request);
 
 /// The curve with its 95 % band, and the training data along the axis, as an SVG image that needs nothing else.
-/// @param title  of the picture: the system's name
-std::string plot(const LearnedCurve& curve, const std::string& title);
+/// @param model  of the fit: its name is the title, its units stand at the axes
+std::string plot(const LearnedCurve& curve, const Model& model);
 
 }  // namespace gp2

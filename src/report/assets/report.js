@@ -88,6 +88,11 @@
   // ---- what was fitted ----------------------------------------------------------------------------------------------------
 
   let { fit, model } = report;
+  /** A quantity with the unit that the model file states, of a label its last word. */
+  function withUnit(label, quantity = label.split(" ").pop()) {
+    const name = quantity.split("@")[0];
+    return Object.hasOwn(model.units, name) ? `${label} [${model.units[name]}]` : label;
+  }
   let test = report.data.find((data) => data.test);
 
   function fillHeader() {
@@ -107,7 +112,7 @@
     for (const section of document.querySelectorAll("main section")) {
       byId("sections").append(make("li", {}, make("a", { href: `#${section.id}`, text: section.querySelector("h2").textContent })));
     }
-    byId("colophon").textContent = `Written by gp2 ${report.version}. Model files carry no units: axes are in the units of the log. This file is complete; it loads nothing.`;
+    byId("colophon").textContent = `Written by gp2 ${report.version}. ${Object.keys(model.units).length ? "Units are labels of the model file." : "The model file states no units: axes are in those of the log."} This file is complete; it loads nothing.`;
   }
 
   function fillAdvice() {
@@ -118,8 +123,8 @@
   }
 
   function fillModel() {
-    const rows = [["model file", make("code", { text: model.file })], ["coordinates", model.coordinates.join(", ")]];
-    if (model.inputs.length) rows.push(["inputs", model.inputs.join(", ")]);
+    const rows = [["model file", make("code", { text: model.file })], ["coordinates", model.coordinates.map((name) => withUnit(name)).join(", ")]];
+    if (model.inputs.length) rows.push(["inputs", model.inputs.map((name) => withUnit(name)).join(", ")]);
     rows.push(...report.prior);
     for (const group of report.observations) {
       const noise = group.noise.map((value) => format(value, 4));
@@ -147,10 +152,10 @@
     if (!report.parameters.length) {
       parameters.append(make("p", { class: "muted", text: "None." }));
     } else if (!estimated) {
-      parameters.append(table("Parameters of the system", [{ label: "parameter" }, { label: "held at", number: true }], report.parameters.map((row) => [row.name, row.model])));
+      parameters.append(table("Parameters of the system", [{ label: "parameter" }, { label: "held at", number: true }], report.parameters.map((row) => [withUnit(row.name), row.model])));
     } else {
       parameters.append(table("Parameters of the system", [{ label: "parameter" }, { label: "in the model file", number: true }, { label: "fitted", number: true }, { label: "standard error", number: true }, { label: "lower bound", number: true }, { label: "upper bound", number: true }, { label: "" }],
-        report.parameters.map((row) => [row.name, row.model, row.fitted === undefined ? "held" : row.fitted, row.stddev, row.lower, row.upper, bound(row)]), (r) => report.parameters[r].at_bound));
+        report.parameters.map((row) => [withUnit(row.name), row.model, row.fitted === undefined ? "held" : row.fitted, row.stddev, row.lower, row.upper, bound(row)]), (r) => report.parameters[r].at_bound));
     }
     const drawn = fit.draws ? [{ label: "2.5 % of draws", number: true }, { label: "97.5 % of draws", number: true }] : [];
     byId("hyperparameters").append(table("Hyperparameters", [{ label: "name" }, { label: "value", number: true }, ...drawn, { label: "lower bound", number: true }, { label: "upper bound", number: true }, { label: "unit" }, { label: "" }],
@@ -176,8 +181,8 @@
     const of = (get) => report.data.map((data) => get(data.figures));
     const at = (list, output) => of((e) => { const k = e.outputs.indexOf(output); return k < 0 ? null : e[list][k]; });
     const rows = [["points", ...of((e) => e.n)]];
-    for (const output of outputs) rows.push([`rmse ${output}`, ...at("rmse", output)]);
-    if (report.truth) for (const output of outputs) rows.push([`rmse ${output}, truth`, ...at("rmse_to_truth", output)]);
+    for (const output of outputs) rows.push([`rmse ${withUnit(output)}`, ...at("rmse", output)]);
+    if (report.truth) for (const output of outputs) rows.push([`rmse ${withUnit(output)}, truth`, ...at("rmse_to_truth", output)]);
     rows.push(["rmse / training std", ...of((e) => e.rmse_normalised)],
       ["nrmse", ...of((e) => e.nrmse)],
       ["nlpd, with noise", ...of((e) => e.nlpd)],
@@ -238,7 +243,7 @@
   }
 
   /**
-   * A chart by uPlot. spec: {title, summary, x: {label, values}, y: {label, log, zero}, square, diagonal, height, trace,
+   * A chart by uPlot. spec: {title, summary, x: {label, values}, y: {label, log, zero, quantity}, square, diagonal, height, trace,
    * series: [{label, values, colour, kind: "points" | "line", hollow, steps, low, high}]}; low and high are a band or error bars.
    * trace: a line from point to point in the order of the data; marks: values of x that are marked at the foot.
    */
@@ -342,7 +347,7 @@
       legend: { show: false },
       cursor: { drag: { x: true, y: false }, points: { size: 8 } },
       scales: { x: { time: false, range: (u, min, max) => both || spec.x.range || padded(min, max, 0.03) }, y: spec.y.log ? { distr: 3 } : { range: yRange } },
-      axes: [axis(spec.x.label, { size: 34 }), axis(spec.y.label, spec.y.log ? { size: 50, splits: decades } : { size: 50 })],
+      axes: [axis(withUnit(spec.x.label), { size: 34 }), axis(withUnit(spec.y.label, spec.y.quantity), spec.y.log ? { size: 50, splits: decades } : { size: 50 })],
       hooks: {
         drawAxes: [behind],
         setCursor: [(u) => {
@@ -512,8 +517,62 @@
     }
     chart(unconstrained, {
       title: `Unconstrained acceleration ā of ${coordinate}`, summary: `Band of ±${format(2 * rms(data.unconstrained_stddev[j]), 3)} on average. What the constraint hides of ā the data cannot show.`,
-      x, y: { label: `ā ${coordinate}` }, series: [withBand("ā", data.unconstrained[j], data.unconstrained_stddev[j])], band: true,
+      x, y: { label: `ā ${coordinate}`, quantity: `abar_${coordinate}` }, series: [withBand("ā", data.unconstrained[j], data.unconstrained_stddev[j])], band: true,
     });
+  }
+
+  // ---- the motion that the fit makes of the measured start -------------------------------------------------------------------
+
+  function rolloutLead(motion) {
+    if (motion.reason) return `There is none for the ${data.name} data: ${motion.reason}.`;
+    const [start, end] = [motion.t[0], motion.t[motion.t.length - 1]];
+    const within = `within its band, or 5 % of the measured range,`;
+    const parts = [motion.leaves === null
+      ? `Over the ${format(end - start, 4)} s shown the simulated motion stays with the measured one of the ${data.name} data: ${within} to the end.`
+      : `The simulated motion stays with the measured one of the ${data.name} data ${within} for ${format(motion.leaves - start, 3)} s; ${model.coordinates[motion.leaving]} leaves first, at t = ${format(motion.leaves, 4)}.`];
+    if (motion.far_from !== null) parts.push(`From t = ${format(motion.far_from, 4)} on it is far from the training data.`);
+    if (motion.ended) parts.push(`It ended early: ${motion.ended}.`);
+    return parts.join(" ");
+  }
+
+  function drawRollout() {
+    const motion = data.rollout;
+    byId("rollout-lead").textContent = rolloutLead(motion);
+    byId("rollout-parts").hidden = Boolean(motion.reason);
+    const hosts = ["rollout-charts", "rollout-force-charts", "rollout-energy-charts"].map(byId);
+    if (motion.reason) {
+      for (const host of hosts) keep(host, 0);
+      return;
+    }
+    const x = { label: "t [s]", values: motion.t };
+    const measured = (values) => ({ label: "measured", values, colour: "--c2", kind: "points", size: 4 });
+    const simulated = (values, std) => ({ label: "simulated", values, colour: "--c1", kind: "line", ...(std ? { low: band(values, std, -1), high: band(values, std, 1) } : {}) });
+    const away = (a, b) => format(rms(a.map((value, i) => (value === null || b[i] === null ? null : value - b[i]))), 3);
+    keep(hosts[0], model.coordinates.length);
+    model.coordinates.forEach((name, j) => chart(hosts[0].children[j], {
+      title: name, summary: `${away(motion.measured[j], motion.simulated[j])} apart (rms), band of ±${format(2 * rms(motion.stddev[j]), 3)} on average`, x, y: { label: name },
+      series: [measured(motion.measured[j]), simulated(motion.simulated[j], motion.stddev[j])],
+    }));
+    byId("rollout-forces").hidden = !motion.multipliers.length;
+    keep(hosts[1], motion.multipliers.length);
+    motion.multipliers.forEach((name, k) => chart(hosts[1].children[k], {
+      title: name, summary: model.constraints[k] ? `of ${model.constraints[k].text} = 0` : "", x, y: { label: name },
+      series: [{ label: "at the measured states", values: motion.lambda[k], colour: "--c2", band: "--band2", kind: "line", low: band(motion.lambda[k], motion.lambda_stddev[k], -1), high: band(motion.lambda[k], motion.lambda_stddev[k], 1) },
+        { ...simulated(motion.lambda_simulated[k]), dash: [6, 3] }],
+    }));
+    const energies = motion.energy.length > 0;
+    byId("rollout-energies").hidden = !energies;
+    keep(hosts[2], energies ? 1 + motion.potentials.length : 0);
+    if (!energies) return;
+    const change = (values) => { const known = values.filter((value) => value !== null); return format(known[known.length - 1] - known[0], 3); };
+    chart(hosts[2].children[0], {
+      title: "Kinetic + potential energy", summary: `changes by ${change(motion.energy)} J as measured, ${change(motion.energy_simulated)} J as simulated${motion.potentials.length ? "; learned potentials are among it" : ""}`,
+      x, y: { label: "energy [J]" }, series: [measured(motion.energy), simulated(motion.energy_simulated)],
+    });
+    motion.potentials.forEach((one, k) => chart(hosts[2].children[1 + k], {
+      title: `Learned potential ${one.latent}`, summary: "at the measured states, less that at the first", x, y: { label: "V [J]" }, band: true,
+      series: [{ label: "V", values: one.mean, colour: "--c1", kind: "line", low: band(one.mean, one.stddev, -1), high: band(one.mean, one.stddev, 1) }],
+    }));
   }
 
   // ---- where the data are: phase planes, and three coordinates in space ---------------------------------------------------
@@ -740,6 +799,13 @@
       ["points far from the data", figure((e) => e.n_far)],
       ["max |A q̈ − b|, fitted", figure((e) => e.max_constraint_error_fitted)],
     ];
+    // not the time within the band: a fit that knows little has a wide one
+    const off = all((one) => {
+      const motion = judged(one)?.rollout;
+      if (!motion || motion.reason || motion.ended) return null;
+      return rms(motion.measured.map((values, j) => rms(values.map((value, i) => value - motion.simulated[j][i])) / (Math.max(...values) - Math.min(...values) || 1)));
+    });
+    if (off.some((value) => value !== null)) rows.push(["simulated motion, rms error / range", off, low]);
     const built = table("Scores of the fits", [{ label: "" }, ...names.map((label) => ({ label, number: true }))], rows.map(([label, values]) => [label, ...values]));
     // the best of a row, where one is better than the others
     rows.forEach(([, values, cost], r) => {
@@ -758,7 +824,7 @@
     const host = byId("comparison-parameters");
     if (!estimated.length) return host.previousElementSibling.remove(), host.remove();
     const columns = [{ label: "parameter" }, ...names.flatMap((name) => [{ label: name, number: true }, { label: "standard error", number: true }])];
-    host.append(table("Estimated parameters of the fits", columns, estimated.map((name) => [name, ...reports.flatMap((one) => {
+    host.append(table("Estimated parameters of the fits", columns, estimated.map((name) => [withUnit(name), ...reports.flatMap((one) => {
       const row = one.parameters.find((candidate) => candidate.name === name);
       if (!row) return [null, null];
       return row.fitted === undefined ? [row.model, "held"] : [row.fitted, row.stddev];
@@ -833,6 +899,7 @@
     drawCalibration();
     drawConstraint();
     drawAccelerations();
+    drawRollout();
     drawMotion();
   }
 

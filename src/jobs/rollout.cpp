@@ -1,0 +1,301 @@
+#include "jobs/rollout.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <numbers>
+#include <utility>
+
+#include <fmt/format.h>
+#include <fmt/ranges.h>
+
+#include "base/not_a_number.hpp"
+#include "base/parallel.hpp"
+#include "gp2/base/statistics.hpp"
+#include "gp2/error.hpp"
+#include "gp2/jobs/simulate_job.hpp"
+
+namespace gp2 {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+
+namespace {
+
+struct RolloutLimits {
+  static constexpr Index least_rows = 8, most_rows = 400;  // of the picture
+  static constexpr int n_samples = 16;
+  static constexpr int most_steps = 3000;     // of one motion: a report is to take seconds
+  static constexpr double longest_break = 5;  // usual steps, beyond which a log does not go on
+  static constexpr double window = 30;        // of rms displacement / rms velocity: five oscillations of the slowest coordinate
+  static constexpr double visible_share =
+      0.05;  // of the measured range: below it is the noise of a start, above it what an eye sees
+};
+
+// States of a motion that goes on: the first row of it, and how many.
+using Part = std::pair<Index, Index>;
+
+// Entries of the state that a motion needs and the data lack.
+std::vector<std::string> missing_entries(const System& system, const std::vector<Contact>& contacts, const MatrixXd& states) {
+  const std::vector<std::string> names = system.state_names();
+  std::vector<std::string> missing;
+  for (int k = 0; k < system.layout().size(); ++k) {
+    const bool follows =
+        std::any_of(contacts.begin(), contacts.end(), [&](const Contact& one) { return system.layout().u(one.input) == k; });
+    if (!follows && !states.row(k).allFinite()) missing.push_back(names[static_cast<std::size_t>(k)]);
+  }
+  return missing;
+}
+
+Part longest_part(const Eigen::Ref<const VectorXd>& times, const std::vector<std::string>& episodes) {
+  std::vector<double> steps;
+  for (Index i = 1; i < times.size(); ++i) {
+    if (times[i] > times[i - 1]) steps.push_back(times[i] - times[i - 1]);
+  }
+  const double usual = steps.empty() ? 0 : median(std::move(steps));
+  Part longest{0, 0}, current{0, 1};
+  const auto end = [&](Index next) {
+    if (current.second > longest.second) longest = current;
+    current = {next, 1};
+  };
+  for (Index i = 1; i < times.size(); ++i) {
+    const double step = times[i] - times[i - 1];
+    const auto k = static_cast<std::size_t>(i);
+    const bool goes_on =
+        step > 0 && step < RolloutLimits::longest_break * usual && (episodes.empty() || episodes[k] == episodes[k - 1]);
+    if (goes_on) {
+      ++current.second;
+    } else {
+      end(i);
+    }
+  }
+  end(times.size());
+  return longest;
+}
+
+// How much of a part is simulated: errors of a start grow, and of more oscillations a picture shows nothing.
+Index rows_to_follow(const System& system, const Eigen::Ref<const MatrixXd>& states) {
+  double duration = 0;
+  for (int j = 0; j < system.nq(); ++j) {
+    const double speed = std::sqrt(states.row(system.layout().dq(j)).squaredNorm() / static_cast<double>(states.cols()));
+    if (speed > 0) duration = std::max(duration, RolloutLimits::window * row_stddev(states.row(system.layout().q(j)))[0] / speed);
+  }
+  const auto times = states.row(system.layout().t());
+  const Index rows = std::upper_bound(times.begin(), times.end(), times[0] + duration) - times.begin();
+  return std::clamp(rows, std::min<Index>(RolloutLimits::least_rows, states.cols()), states.cols());
+}
+
+// An angle that a sensor wraps goes on.
+void unwrap(Eigen::Ref<Eigen::RowVectorXd, 0, Eigen::InnerStride<>> angles) {
+  double last = angles[0], whole = 0;
+  for (Index i = 1; i < angles.size(); ++i) {
+    const double step = angles[i] - last;
+    last = angles[i];
+    whole += std::remainder(step, 2 * std::numbers::pi) - step;
+    angles[i] += whole;
+  }
+}
+
+// A motion at all times, NaN beyond what it reached; empty where it did not begin.
+struct Reached {
+  MatrixXd states, multipliers;
+  int steps = 0;
+  std::string ended;
+};
+Reached follow(SimulateJob job, std::size_t motion) {
+  job.accelerations = {job.accelerations[motion]};
+  if (!job.records.empty()) job.records = {job.records[motion]};
+  const auto placed = [&](const MatrixXd& values) {
+    MatrixXd all = MatrixXd::Constant(values.rows(), job.options.times.size(), not_a_number);
+    all.leftCols(values.cols()) = values;
+    return all;
+  };
+  // an unfinished motion also holds the state at which it stopped, which is at none of the times
+  const auto reached = [&](const Trajectory& one, const std::string& ended) -> Reached {
+    Index n = 0;
+    while (n < one.times.size() && n < job.options.times.size() && one.times[n] == job.options.times[n]) ++n;
+    return {placed(one.states.leftCols(n)), placed(one.records.leftCols(std::min(n, one.records.cols()))),
+            one.steps + one.rejected_steps, ended};
+  };
+  try {
+    return reached(run_simulation(job).front(), "");
+  } catch (const UnfinishedMotion& unfinished) {
+    return reached(unfinished.motions.front(), unfinished.what());
+  }
+}
+
+class Roll {
+ public:
+  Roll(const FitSystem& asked, const Posterior& posterior)
+      : asked_(asked), posterior_(posterior), system_(*asked.model->system) {}
+
+  void run(const MatrixXd& states, const std::vector<std::string>& episodes, Rollout& out) {
+    const StateLayout layout = system_.layout();
+    const VectorXd& at_home = posterior_.values().parameters;
+    parameters_ = asked_.other_system ? asked_.other_system->parameters(at_home) : at_home;
+    const std::vector<Contact> contacts = contacts_of(*asked_.model, parameters_);
+    if (const std::vector<std::string> missing = missing_entries(system_, contacts, states); !missing.empty()) {
+      out.reason = fmt::format("the data lack {}", fmt::join(missing, ", "));
+      return;
+    }
+    const Part part = longest_part(states.row(layout.t()).transpose(), episodes);
+    if (part.second < RolloutLimits::least_rows) {
+      out.reason = fmt::format("the rows are no motion: no {} of them follow each other in time without a break",
+                               RolloutLimits::least_rows);
+      return;
+    }
+    const MatrixXd whole = states.middleCols(part.first, part.second);
+    const MatrixXd followed = whole.leftCols(rows_to_follow(system_, whole));
+    const Index stride = (followed.cols() + RolloutLimits::most_rows - 1) / RolloutLimits::most_rows;
+    const MatrixXd measured = followed(Eigen::all, Eigen::seqN(0, (followed.cols() - 1) / stride + 1, stride));
+    out.times = measured.row(layout.t()).transpose();
+    out.measured = measured.topRows(layout.nq);
+    for (int j = 0; j < layout.nq; ++j) {
+      if (system_.coordinates()[static_cast<std::size_t>(j)].angle) unwrap(out.measured.row(j));
+    }
+    simulate_beside(measured, followed, out);
+    if (!out.reason.empty()) return;
+    find_horizon(out);
+    add_forces(measured, out);
+    add_energies(measured, out);
+  }
+
+ private:
+  [[nodiscard]] SimulateJob job(const MatrixXd& measured, const MatrixXd& followed, std::optional<int> samples) const {
+    const StateLayout layout = system_.layout();
+    SimulateRequest request;
+    request.start = VectorXd(measured.col(0).head(2 * layout.nq));
+    request.times = measured.row(layout.t()).transpose();
+    request.max_steps = std::max(RolloutLimits::most_steps / posterior_.n_components(), 200);
+    request.n_samples = samples;
+    SimulateJob job = prepare_simulation(asked_, posterior_, request);
+    // states hold what acts, not what was commanded
+    if (layout.nu > 0) {
+      MatrixXd acting = followed.middleRows(layout.u(0), layout.nu);
+      for (const Contact& contact : job.options.contacts) acting.row(contact.input).setZero();
+      job.options.inputs = {followed.row(layout.t()).transpose(), std::move(acting)};
+    }
+    return job;
+  }
+
+  void simulate_beside(const MatrixXd& measured, const MatrixXd& followed, Rollout& out) {
+    const Index nq = system_.nq();
+    Reached mean = follow(job(measured, followed, std::nullopt), 0);
+    out.ended = mean.ended;
+    simulated_ = std::move(mean.states);
+    if (simulated_.rows() == 0 || !simulated_.col(0).head(nq).allFinite()) {
+      out.reason = out.ended;
+      return;
+    }
+    out.simulated = simulated_.topRows(nq);
+    // a measured angle is beside the simulated one, not a turn away
+    for (Index j = 0; j < nq; ++j) {
+      if (!system_.coordinates()[static_cast<std::size_t>(j)].angle) continue;
+      const double turn = out.measured(j, 0) - out.simulated(j, 0);
+      out.measured.row(j).array() -= turn - std::remainder(turn, 2 * std::numbers::pi);
+    }
+    out.simulated_multipliers = std::move(mean.multipliers);
+    SimulateJob samples = job(measured, followed, RolloutLimits::n_samples);
+    samples.options.max_steps = std::min(samples.options.max_steps, 100 + 3 * mean.steps);
+    std::vector<MatrixXd> squares(RolloutLimits::n_samples);
+    parallel_for(RolloutLimits::n_samples, thread_count(0), [&](int s, int) {
+      const MatrixXd one = follow(samples, static_cast<std::size_t>(s)).states;
+      squares[static_cast<std::size_t>(s)] = one.rows() > 0 ? MatrixXd((one.topRows(nq) - out.simulated).cwiseAbs2())
+                                                            : MatrixXd::Constant(nq, out.times.size(), not_a_number);
+    });
+    MatrixXd sum = MatrixXd::Zero(nq, out.times.size());
+    for (const MatrixXd& one : squares) sum += one;
+    out.stddev = (sum / RolloutLimits::n_samples).cwiseSqrt();
+  }
+
+  void find_horizon(Rollout& out) const {
+    for (Index i = 0; i < out.times.size() && !out.leaves; ++i) {
+      for (Index j = 0; j < out.measured.rows() && !out.leaves; ++j) {
+        const double range = out.measured.row(j).maxCoeff() - out.measured.row(j).minCoeff();
+        const double error = std::abs(out.measured(j, i) - out.simulated(j, i));
+        const double band = std::isnan(out.stddev(j, i)) ? 0 : 2 * out.stddev(j, i);
+        if (!(error > std::max(band, RolloutLimits::visible_share * range))) continue;
+        out.leaves = out.times[i];
+        out.leaving = static_cast<int>(j);
+      }
+    }
+    const Index reached = n_reached();
+    View view = View::constrained_acceleration(*posterior_.prior().system);
+    view.other_system = asked_.other_system;
+    const VectorXd distance = posterior_.distance_from_data(view, simulated_.leftCols(reached), /*n_threads=*/0);
+    const auto far = std::find_if(distance.begin(), distance.end(), [](double d) { return d > Posterior::far_from_data; });
+    if (far != distance.end()) out.far_from = out.times[far - distance.begin()];
+  }
+
+  void add_forces(const MatrixXd& measured, Rollout& out) const {
+    if (system_.nc() == 0) return;
+    View view = View::multipliers(system_);
+    view.other_system = asked_.other_system;
+    const Posterior::Marginal forces = posterior_.marginal(view, measured, /*n_threads=*/0);
+    out.multipliers = forces.mean;
+    out.multipliers_stddev = forces.stddev();
+  }
+
+  void add_energies(const MatrixXd& measured, Rollout& out) const {
+    const std::vector<Latent>& latents = posterior_.prior().latents;
+    std::vector<int> learned;
+    for (std::size_t a = 0; a < latents.size(); ++a) {
+      if (latents[a].is_potential && !latents[a].kernel_is_fixed) learned.push_back(static_cast<int>(a));
+    }
+    // a learned potential is one of the fit's own features
+    if (asked_.other_system && !learned.empty()) return;
+    if (learned.empty() && !asked_.model->potential) return;
+    const MatrixXd reached = simulated_.leftCols(n_reached());
+    out.energy = energy(measured);
+    out.simulated_energy = VectorXd::Constant(measured.cols(), not_a_number);
+    out.simulated_energy.head(reached.cols()) = energy(reached);
+    out.potential.resize(std::ssize(learned), measured.cols());
+    out.potential_stddev.resize(std::ssize(learned), measured.cols());
+    for (std::size_t k = 0; k < learned.size(); ++k) {
+      const Posterior::Potential there = posterior_.potential(learned[k], measured, measured.col(0));
+      const Posterior::Potential beside = posterior_.potential(learned[k], reached, measured.col(0));
+      out.potentials.push_back(latents[static_cast<std::size_t>(learned[k])].name);
+      out.potential.row(static_cast<Index>(k)) = there.mean.transpose();
+      out.potential_stddev.row(static_cast<Index>(k)) = there.stddev.transpose();
+      out.energy += there.mean;
+      out.simulated_energy.head(reached.cols()) += beside.mean;
+    }
+  }
+
+  // Kinetic energy, with the potential of the model where it has one.
+  [[nodiscard]] VectorXd energy(const MatrixXd& states) const {
+    return asked_.model->potential ? mechanical_energy(*asked_.model, parameters_, states)
+                                   : kinetic_energy(system_, parameters_, states);
+  }
+
+  [[nodiscard]] Index n_reached() const {
+    Index n = 0;
+    while (n < simulated_.cols() && !std::isnan(simulated_(0, n))) ++n;
+    return n;
+  }
+
+  const FitSystem& asked_;
+  const Posterior& posterior_;
+  const System& system_;
+  VectorXd parameters_;
+  MatrixXd simulated_;  // states of the mean motion
+};
+
+}  // namespace
+
+Rollout roll_out(const FitSystem& system, const Posterior& posterior, const MatrixXd& states,
+                 const std::vector<std::string>& episodes) {
+  Rollout out;
+  try {
+    Roll(system, posterior).run(states, episodes, out);
+  } catch (const InputError& error) {
+    out = {};
+    out.reason = error.what();
+  } catch (const NumericalError& error) {
+    out = {};
+    out.reason = error.what();
+  }
+  return out;
+}
+
+}  // namespace gp2
