@@ -147,7 +147,7 @@ class Shooter {
       if (!goes_on) parts.emplace_back(i, 0);
       ++parts.back().second;
     }
-    duration_ = request.duration.value_or(usual_duration(parts));
+    duration_ = request.duration.value_or(std::max(usual_duration(parts), (least_rows - 1) * usual));
     if (!(duration_ > 0) || !std::isfinite(duration_))
       throw InputError(fmt::format("`duration`: must be positive and finite, got {}", duration_));
     if (request.most_stretches < 1)
@@ -529,7 +529,8 @@ class Shooter {
 }  // namespace
 
 std::vector<Option> options(ShootRequest& request) {
-  return {{"duration", &request.duration, "S", "of a stretch [s]", "twice the time in which velocities change by their own size"},
+  return {{"duration", &request.duration, "S", "of a stretch [s]",
+           "twice the time in which velocities change by their own size, 8 rows at least"},
           {"stretches", &request.most_stretches, "K", "at most so many, evenly taken"},
           {"map", &request.columns, "LOGNAME=NAME,…", "columns by other names", "", "columns"},
           threads_option(request.threads)};
