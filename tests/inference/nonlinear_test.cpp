@@ -478,6 +478,30 @@ TEST(NonlinearPosterior, GoesToAnotherSystem) {
   EXPECT_LE((found.posterior.mean(view, states) - truth).norm(), 0.01 * truth.norm());
 }
 
+TEST(NonlinearPosterior, FindsANamedRowWhereverAnotherSystemHasIt) {
+  const std::string ladder = test::model("experiments/mechanisms/ladder.toml").text;
+  const std::string floor = R"toml({ expr = "z - l*cos(a)", name = "ground" })toml",
+                    wall = R"toml({ expr = "x - l*sin(a)", name = "side" })toml";
+  const auto with = [&](const std::string& rows) {
+    const std::string unnamed = R"toml("z - l*cos(a)", "x - l*sin(a)")toml";
+    return Model::parse(test::changed(ladder, {{"lambda(1)", "lambda(ground)"}, {"lambda(2)", "lambda(side)"}, {unnamed, rows}}),
+                        "ladder");
+  };
+  const Fitted fitted(with(floor + ", " + wall), 30);
+  const Model turned = with(wall + ", " + floor);
+  const Posterior posterior(
+      fitted.prior, fitted.observations,
+      model_values(fitted.prior, fitted.observations, default_hyperparameters(fitted.prior, fitted.observations, {}, {})));
+  PriorOptions options;
+  options.mean = Prior::Mean::force;
+  const View own = View::constrained_acceleration(*fitted.model.system);
+  const View other =
+      test::under(View::constrained_acceleration(*turned.system), make_other_system(fitted.model, turned, options));
+  const MatrixXd states = test::draw(fitted.model, 20, nonlinear_seed + 1).states;
+  const MatrixXd mean = posterior.mean(own, states);
+  EXPECT_LE((posterior.mean(other, states) - mean).norm(), 1e-11 * mean.norm());
+}
+
 TEST(NonlinearFit, FindsACoefficientThatKnownMultipliersGetWrong) {
   const std::string kernel = "constant + matern32";
   const Fitted own(rubbing_bead("lambda", kernel), 60), known(rubbing_bead("lambda0", kernel), 60);
