@@ -39,7 +39,7 @@ class AdmissibleDirections {
 
   /// What dE f needs of f (nq), and then adds to `out` where A_ij changes by `change`.
   void set_functions(const Eigen::VectorXd& f) {
-    if (L_.size() != stddev_.size() * b_.size()) L_.resize(stddev_.size(), b_.size());
+    L_.resize(stddev_.size(), b_.size());
     projection_.write_L(L_);
     Ef_.noalias() = E_ * f;
     scaled_ = f.cwiseQuotient(stddev_);
