@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <functional>
 #include <numbers>
 #include <utility>
 
@@ -28,8 +29,8 @@ struct RolloutLimits {
   static constexpr int most_steps = 3000;     // of one motion: a report is to take seconds
   static constexpr double longest_break = 5;  // usual steps, beyond which a log does not go on
   static constexpr double window = 30;        // of rms displacement / rms velocity: five oscillations of the slowest coordinate
-  static constexpr double visible_share =
-      0.05;  // of the measured range: below it is the noise of a start, above it what an eye sees
+  // of the measured range: below it is the noise of a start, above it what an eye sees
+  static constexpr double visible_share = 0.05;
 };
 
 // States of a motion that goes on: the first row of it, and how many.
@@ -132,8 +133,8 @@ class Roll {
   void run(const MatrixXd& states, const std::vector<std::string>& episodes, Rollout& out) {
     const StateLayout layout = system_.layout();
     const VectorXd& at_home = posterior_.values().parameters;
-    parameters_ = asked_.other_system ? asked_.other_system->parameters(at_home) : at_home;
-    const std::vector<Contact> contacts = contacts_of(*asked_.model, parameters_);
+    const VectorXd parameters = asked_.other_system ? asked_.other_system->parameters(at_home) : at_home;
+    const std::vector<Contact> contacts = contacts_of(*asked_.model, parameters);
     if (const std::vector<std::string> missing = missing_entries(system_, contacts, states); !missing.empty()) {
       out.reason = fmt::format("the data lack {}", fmt::join(missing, ", "));
       return;
@@ -180,7 +181,9 @@ class Roll {
 
   void simulate_beside(const MatrixXd& measured, const MatrixXd& followed, Rollout& out) {
     const Index nq = system_.nq();
-    Reached mean = follow(job(measured, followed, std::nullopt), 0);
+    const SimulateJob of_mean = job(measured, followed, std::nullopt);
+    if (!of_mean.energies.empty()) energy_ = of_mean.energies.front();
+    Reached mean = follow(of_mean, 0);
     out.ended = mean.ended;
     simulated_ = std::move(mean.states);
     if (simulated_.rows() == 0 || !simulated_.col(0).head(nq).allFinite()) {
@@ -237,35 +240,27 @@ class Roll {
   }
 
   void add_energies(const MatrixXd& measured, Rollout& out) const {
+    if (!energy_) return;
+    const Index n = measured.cols(), reached = n_reached();
+    MatrixXd both(measured.rows(), n + reached);  // against one and the same state
+    both << measured, simulated_.leftCols(reached);
+    const VectorXd energy = energy_(both).values;
+    out.energy = energy.head(n);
+    out.simulated_energy = VectorXd::Constant(n, not_a_number);
+    out.simulated_energy.head(reached) = energy.tail(reached);
     const std::vector<Latent>& latents = posterior_.prior().latents;
-    std::vector<int> learned;
+    std::vector<Posterior::Potential> learned;
     for (std::size_t a = 0; a < latents.size(); ++a) {
-      if (latents[a].is_potential && !latents[a].kernel_is_fixed) learned.push_back(static_cast<int>(a));
+      if (!latents[a].is_potential) continue;
+      out.potentials.push_back(latents[a].name);
+      learned.push_back(posterior_.potential(static_cast<int>(a), measured, measured.col(0)));
     }
-    // a learned potential is one of the fit's own features
-    if (asked_.other_system && !learned.empty()) return;
-    if (learned.empty() && !asked_.model->potential) return;
-    const MatrixXd reached = simulated_.leftCols(n_reached());
-    out.energy = energy(measured);
-    out.simulated_energy = VectorXd::Constant(measured.cols(), not_a_number);
-    out.simulated_energy.head(reached.cols()) = energy(reached);
-    out.potential.resize(std::ssize(learned), measured.cols());
-    out.potential_stddev.resize(std::ssize(learned), measured.cols());
+    out.potential.resize(std::ssize(learned), n);
+    out.potential_stddev.resize(std::ssize(learned), n);
     for (std::size_t k = 0; k < learned.size(); ++k) {
-      const Posterior::Potential there = posterior_.potential(learned[k], measured, measured.col(0));
-      const Posterior::Potential beside = posterior_.potential(learned[k], reached, measured.col(0));
-      out.potentials.push_back(latents[static_cast<std::size_t>(learned[k])].name);
-      out.potential.row(static_cast<Index>(k)) = there.mean.transpose();
-      out.potential_stddev.row(static_cast<Index>(k)) = there.stddev.transpose();
-      out.energy += there.mean;
-      out.simulated_energy.head(reached.cols()) += beside.mean;
+      out.potential.row(static_cast<Index>(k)) = learned[k].mean.transpose();
+      out.potential_stddev.row(static_cast<Index>(k)) = learned[k].stddev.transpose();
     }
-  }
-
-  // Kinetic energy, with the potential of the model where it has one.
-  [[nodiscard]] VectorXd energy(const MatrixXd& states) const {
-    return asked_.model->potential ? mechanical_energy(*asked_.model, parameters_, states)
-                                   : kinetic_energy(system_, parameters_, states);
   }
 
   [[nodiscard]] Index n_reached() const {
@@ -277,8 +272,8 @@ class Roll {
   const FitSystem& asked_;
   const Posterior& posterior_;
   const System& system_;
-  VectorXd parameters_;
   MatrixXd simulated_;  // states of the mean motion
+  std::function<MotionEnergy(const MatrixXd& states)> energy_;
 };
 
 }  // namespace

@@ -273,13 +273,16 @@ TEST_F(RolloutOf, AMotionOfTheFitItselfIsNeverLeft) {
 
 TEST_F(RolloutOf, LearnedPotentialsKeepTheEnergyOfASimulatedMotion) {
   desk.write("springs.toml",
-             "coordinates = ['x', 'y']\n[mechanics]\nmass = [['2', '0'], ['0', '1']]\n[constraints]\nposition = []\n"
-             "[[latent]]\nname = 'spring'\nkernel = 'se'\ndirections = 'potential'\n[truth]\nforce = ['-4*x - 2*x^3 + y', "
-             "'-3*y + x']\n[noise]\nddq = 0.05\n[sampling]\nx = [-1, 1]\ny = [-1, 1]\n");
+             "coordinates = ['x', 'y']\n[mechanics]\nmass = [['2', '0'], ['0', '1']]\npotential = '2*x^2 + 0.5*x^4 - x*y + "
+             "1.5*y^2'\n[constraints]\nposition = []\n[[latent]]\nname = 'spring'\nkernel = 'se'\ndirections = 'potential'\n"
+             "[truth]\nforce = ['-4*x - 2*x^3 + y', '-3*y + x']\n[noise]\nddq = 0.05\n[sampling]\nx = [-1, 1]\ny = [-1, 1]\n");
   desk.done("gp2 generate springs.toml --n 40 -o train.csv");
   desk.done("gp2 fit springs.toml --data train.csv --restarts 1 -o fit.json");
   desk.done("gp2 simulate springs.toml --start x=0.6,y=-0.3,dx=0,dy=0 --t-end 5 --dt 0.05 -o test.csv");
+  desk.done("gp2 simulate fit.json --start test.csv --t-end 5 --dt 0.05 -o simulated.csv");
   const Rollout motion = of("test.csv");
+  // what the file says of a force that the fit does not use is no energy of its motion
+  EXPECT_TRUE(motion.simulated_energy.isApprox(column("simulated.csv", "energy"), 1e-12));
   ASSERT_EQ(motion.potentials, std::vector<std::string>{"spring"});
   const double exchanged = motion.potential.maxCoeff() - motion.potential.minCoeff();
   EXPECT_GT(exchanged, 0.5);
