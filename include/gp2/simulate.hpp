@@ -166,10 +166,11 @@ class UnfinishedMotion : public NumericalError {
 /// |λ_t| ≤ μ |λ_n| holds of each of several contacts, whose accelerations are those of all combinations of sides, mixed.
 ///
 /// A contact ends a step where its gap closes, found on the dense output. It is an impact of Newton's law along M⁻¹Aᵀ, during which
-/// all other active constraints hold; where the rebound is over within `shortest_flight` the contact stays closed, so that the
-/// accumulating bounces of a ball end; a restitution outside [0, 1] there is an error. It has no impulse of friction. A closed contact is released where the motion without it would open the gap, which is where
-/// its multiplier would pull. One at a time: where several contacts close or open together, those whose impulse would pull are let
-/// go one after the other, which is not the complementarity problem of many contacts.
+/// all other active constraints hold, and which has no impulse of friction; where the rebound is over within `shortest_flight` the
+/// contact stays closed, so that the accumulating bounces of a ball end. A restitution outside [0, 1] is an error. A closed contact is
+/// released where the motion without it would open the gap, which is where its multiplier would pull. One at a time: where several
+/// contacts close or open together, those whose impulse would pull are let go one after the other, which is not the complementarity
+/// problem of many contacts.
 ///
 /// @param parameters  of the system's constraints and mass matrix (system.parameters().size())
 /// @param start       [q; dq; …] (layout size), t and u are set from the options. Off the constraint it is projected, or taken as

@@ -18,7 +18,7 @@ namespace {
 
 std::shared_ptr<Posterior::Implementation> copy_of(const Posterior::Implementation& of) {
   auto copy = std::make_shared<Posterior::Implementation>(of);
-  copy->latents = of.latents->clone();
+  if (!of.prior.is_nonlinear()) copy->latents = of.latents->clone();  // else it is conditioned anew
   return copy;
 }
 

@@ -14,7 +14,6 @@
 #include "base/not_a_number.hpp"
 #include "gp2/base/statistics.hpp"
 #include "gp2/jobs/fit_problem.hpp"
-#include "gp2/mechanics/udwadia_kalaba.hpp"
 #include "gp2/prior.hpp"
 #include "gp2/simulation/generate.hpp"
 #include "gp2/simulation/projected_states.hpp"
@@ -91,8 +90,9 @@ int first_singular_mass(const System& system, const Eigen::MatrixXd& states) {
 class LoadCheck {
  public:
   /// @param rows  of the log, that the states are
-  LoadCheck(Prior prior, Eigen::MatrixXd states, std::vector<Eigen::Index> rows)
-      : prior_(std::move(prior)),
+  LoadCheck(const Model& model, Prior prior, Eigen::MatrixXd states, std::vector<Eigen::Index> rows)
+      : model_(model),
+        prior_(std::move(prior)),
         states_(std::move(states)),
         rows_(std::move(rows)),
         parameters_(prior_.system->parameter_values()),
@@ -100,6 +100,7 @@ class LoadCheck {
         values_(evaluate_prior(prior_, states_, parameters_, mechanics_)) {}
 
   void run(std::vector<Finding>& findings) const {
+    add_shares(findings);
     if (values_.fault) {
       const Eigen::Index row = rows_[static_cast<std::size_t>(values_.fault->state)];
       findings.push_back({Level::error, fmt::format("{} at state {}", values_.fault->text, row + 1)});
@@ -107,7 +108,7 @@ class LoadCheck {
     }
     for (std::size_t a = 0; a < prior_.latents.size(); ++a) {
       const Latent& latent = prior_.latents[a];
-      if (!reads_load(latent, parameters_)) continue;
+      if (!latent.directions || !reads_load(*latent.directions, parameters_)) continue;
       for (int l = 0; l < latent.size(); ++l) {
         const std::string name =
             latent.size() == 1 ? fmt::format("latent '{}'", latent.name)
@@ -121,13 +122,51 @@ class LoadCheck {
     }
   }
 
-  /// Whether directions read λ₀ or λ.
+  /// Whether features or directions read λ₀ or λ.
   static bool reads_load(const Latent& latent, const Eigen::VectorXd& parameters) {
-    return latent.directions && latent.directions->make_evaluator(parameters)->tapes().n_loads > 0;
+    return reads_load(*latent.features, Eigen::VectorXd()) || (latent.directions && reads_load(*latent.directions, parameters));
   }
 
  private:
   static constexpr double enough = 0.1;  // of the load, that a coefficient of 1 makes
+
+  static bool reads_load(const StateFunction& function, const Eigen::VectorXd& parameters) {
+    return function.make_evaluator(parameters)->tapes().n_loads > 0;
+  }
+
+  // rows whose multipliers latents read, and which follow from others: which share of the load is theirs is a choice
+  void add_shares(std::vector<Finding>& findings) const {
+    constexpr double rounding = 1e-6;
+    const System& system = *prior_.system;
+    std::set<std::string> read;
+    for (const LatentSpec& latent : model_.latents) {
+      const auto add = [&](const std::string& text) {
+        for (const std::string& variable : model_.graph->variables_of(model_.expression(text))) read.insert(variable);
+      };
+      if (!latent.feature_code) std::for_each(latent.features.begin(), latent.features.end(), add);
+      if (latent.direction_code) continue;
+      for (const std::vector<std::string>& row : latent.directions) std::for_each(row.begin(), row.end(), add);
+    }
+    std::vector<bool> is_shared(static_cast<std::size_t>(system.nc()), false);
+    for (int i = 0; i < states_.cols(); ++i) {
+      const auto A = mechanics_.values.A(i);
+      // the identity of independent rows
+      const Eigen::MatrixXd shares = mechanics_.projections[static_cast<std::size_t>(i)].multipliers_of_force() * A.transpose();
+      for (int row = 0; row < system.nc(); ++row)
+        if (!A.row(row).isZero(0) && shares(row, row) < 1 - rounding) is_shared[static_cast<std::size_t>(row)] = true;
+    }
+    for (int row = 0; row < system.nc(); ++row) {
+      for (const char* name : {"lambda0", "lambda"}) {
+        const std::string variable = fmt::format("{}({})", name, row + 1);
+        if (!is_shared[static_cast<std::size_t>(row)] || !read.contains(variable)) continue;
+        findings.push_back(
+            {Level::warning,
+             fmt::format("{}: the constraint '{}' follows from others, so that nothing tells its share of the load: "
+                         "remove the rows that repeat others",
+                         variable, system.constraint_labels()[static_cast<std::size_t>(row)])});
+      }
+    }
+  }
 
   // how much of the load under the known force a coefficient of 1 changes (theory.md, T46: κ)
   void add_left_out(const std::string& name, std::size_t a, int l, std::vector<Finding>& findings) const {
@@ -169,6 +208,7 @@ class LoadCheck {
                                   name, jammed, rows_[static_cast<std::size_t>(fault(jammed)->state)] + 1)});
   }
 
+  const Model& model_;
   Prior prior_;
   Eigen::MatrixXd states_;
   std::vector<Eigen::Index> rows_;
@@ -176,41 +216,6 @@ class LoadCheck {
   MechanicsBatch mechanics_;
   PriorValues values_;
 };
-
-// Rows whose multipliers latents read, and which follow from others: which share of the load is theirs is a choice.
-void check_shares(const Model& model, const Eigen::MatrixXd& states, std::vector<Finding>& findings) {
-  constexpr double rounding = 1e-6;
-  const System& system = *model.system;
-  std::set<std::string> read;
-  for (const LatentSpec& latent : model.latents) {
-    const auto add = [&](const std::string& text) {
-      for (const std::string& variable : model.graph->variables_of(model.expression(text))) read.insert(variable);
-    };
-    if (!latent.feature_code) std::for_each(latent.features.begin(), latent.features.end(), add);
-    if (latent.direction_code) continue;
-    for (const std::vector<std::string>& row : latent.directions) std::for_each(row.begin(), row.end(), add);
-  }
-  const SystemValues values = system.evaluate(states, system.parameter_values());
-  std::vector<bool> is_shared(static_cast<std::size_t>(system.nc()), false);
-  for (int i = 0; i < states.cols(); ++i) {
-    const UdwadiaKalaba projection(values.M(i), values.A(i), values.b(i));
-    if (!projection.motion_is_determined()) continue;
-    const Eigen::MatrixXd shares =
-        projection.multipliers_of_force() * values.A(i).transpose();  // the identity of independent rows
-    for (int row = 0; row < system.nc(); ++row)
-      if (!values.A(i).row(row).isZero(0) && shares(row, row) < 1 - rounding) is_shared[static_cast<std::size_t>(row)] = true;
-  }
-  for (int row = 0; row < system.nc(); ++row) {
-    for (const char* name : {"lambda0", "lambda"}) {
-      const std::string variable = fmt::format("{}({})", name, row + 1);
-      if (!is_shared[static_cast<std::size_t>(row)] || !read.contains(variable)) continue;
-      findings.push_back({Level::warning,
-                          fmt::format("{}: the constraint '{}' follows from others, so that nothing tells its share of the load: "
-                                      "remove the rows that repeat others",
-                                      variable, system.constraint_labels()[static_cast<std::size_t>(row)])});
-    }
-  }
-}
 
 void check_load(const Model& model, const Eigen::MatrixXd& states, std::vector<Finding>& findings) {
   constexpr Eigen::Index enough = 300;  // states, evenly taken
@@ -228,8 +233,7 @@ void check_load(const Model& model, const Eigen::MatrixXd& states, std::vector<F
     if (is_known) rows.push_back(i);
   }
   if (rows.empty()) return;
-  check_shares(model, states(Eigen::all, rows), findings);
-  LoadCheck(prior, states(Eigen::all, rows), rows).run(findings);
+  LoadCheck(model, prior, states(Eigen::all, rows), rows).run(findings);
 }
 
 // The system, and where that is sound what the prior asks of it.

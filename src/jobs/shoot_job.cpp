@@ -21,6 +21,7 @@
 #include "gp2/simulate.hpp"
 #include "gp2/training/laplace.hpp"
 #include "jobs/read_observations.hpp"
+#include "simulation/contacts.hpp"
 
 namespace gp2 {
 
@@ -176,44 +177,29 @@ class Shooter {
     }
   }
 
-  /// The gaps of contacts at a state, whether they are open or closed.
-  [[nodiscard]] VectorXd gaps_at(VectorXd state, const VectorXd& parameters, const std::vector<Contact>& contacts) const {
-    for (const Contact& contact : contacts) state[system_.layout().u(contact.input)] = 1;
-    const VectorXd residuals = system_.residuals(state, parameters).col(0);
-    const std::vector<System::Residual>& labels = system_.residual_labels();
-    VectorXd gaps(contacts.size());
-    for (std::size_t k = 0; k < contacts.size(); ++k) {
-      const auto is_gap = [&](const System::Residual& one) { return one.row == contacts[k].row && !one.velocity; };
-      gaps[static_cast<Index>(k)] = residuals[std::find_if(labels.begin(), labels.end(), is_gap) - labels.begin()];
-    }
-    return gaps;
-  }
   [[nodiscard]] bool is_closed(const Contact& contact, Index row) const {
     return states_(system_.layout().u(contact.input), row) > 0.5;
   }
 
   /// How far a gap must be open for the errors of a log not to hide it: twice the largest |gap| of what is closed, or beyond 0.
   void find_clearance() {
-    const VectorXd parameters = system_.parameter_values();
-    const std::vector<Contact> contacts = contacts_of(fit_.model, parameters);
-    clearance_.setZero(static_cast<Index>(contacts.size()));
-    gaps_.resize(clearance_.size(), states_.cols());
-    for (Index i = 0; i < states_.cols() && !contacts.empty(); ++i) {
-      gaps_.col(i) = gaps_at(states_.col(i), parameters, contacts);
-      for (std::size_t k = 0; k < contacts.size(); ++k) {
-        const auto row = static_cast<Index>(k);
-        const double off = is_closed(contacts[k], i) ? std::abs(gaps_(row, i)) : -gaps_(row, i);
-        clearance_[row] = std::max(clearance_[row], 2 * off);
+    contacts_ = contacts_of(fit_.model, system_.parameter_values());
+    clearance_.setZero(std::ssize(contacts_));
+    gaps_ = gaps_of(system_, contacts_, states_, system_.parameter_values());
+    for (std::size_t k = 0; k < contacts_.size(); ++k) {
+      const auto contact = static_cast<Index>(k);
+      for (Index i = 0; i < states_.cols(); ++i) {
+        const double off = is_closed(contacts_[k], i) ? std::abs(gaps_(contact, i)) : -gaps_(contact, i);
+        clearance_[contact] = std::max(clearance_[contact], 2 * off);
       }
     }
   }
 
   /// A motion starts where each contact is surely closed or open: not at an impact, nor where its gap is lost in noise.
   [[nodiscard]] bool can_start(Index row) const {
-    const std::vector<Contact> contacts = contacts_of(fit_.model, system_.parameter_values());
-    for (std::size_t k = 0; k < contacts.size(); ++k) {
-      const bool closed = is_closed(contacts[k], row);
-      if (row + 1 < states_.cols() && closed != is_closed(contacts[k], row + 1)) return false;
+    for (std::size_t k = 0; k < contacts_.size(); ++k) {
+      const bool closed = is_closed(contacts_[k], row);
+      if (row + 1 < states_.cols() && closed != is_closed(contacts_[k], row + 1)) return false;
       if (!closed && !(gaps_(static_cast<Index>(k), row) > clearance_[static_cast<Index>(k)])) return false;
     }
     return true;
@@ -256,9 +242,9 @@ class Shooter {
     options.max_steps = most_steps_per_row * static_cast<int>(stretch.size);  // a motion that runs away takes ever more
     options.switching = switching_;
     options.contacts = contacts_of(fit_.model, parameters);
-    const VectorXd gaps = gaps_at(start, parameters, options.contacts);
-    for (std::size_t k = 0; k < options.contacts.size(); ++k) {
-      if (!is_closed(options.contacts[k], stretch.first) && !(gaps[static_cast<Index>(k)] > 0)) return std::nullopt;
+    const MatrixXd gaps = gaps_of(system_, contacts_, start, parameters);
+    for (std::size_t k = 0; k < contacts_.size(); ++k) {
+      if (!is_closed(contacts_[k], stretch.first) && !(gaps(static_cast<Index>(k), 0) > 0)) return std::nullopt;
     }
     const StateLayout layout = system_.layout();
     if (layout.nu > 0) options.inputs = {options.times, states_.block(layout.u(0), stretch.first, layout.nu, stretch.size)};
@@ -519,7 +505,8 @@ class Shooter {
   std::vector<int> compared_;            // coordinates
   MatrixXd states_;                      // of the log
   VectorXd spread_;                      // of q and dq over it (2 nq)
-  MatrixXd gaps_;                        // of contacts in the log (contacts × rows)
+  std::vector<Contact> contacts_;        // at the parameters where the search starts
+  MatrixXd gaps_;                        // of them in the log (contacts × rows)
   VectorXd clearance_;                   // beyond which they are surely open
   double duration_ = 0;
   std::vector<Stretch> stretches_;

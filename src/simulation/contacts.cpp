@@ -45,25 +45,36 @@ std::vector<Contact> contacts_of(const Model& model, const Eigen::Ref<const Vect
   return contacts;
 }
 
+std::vector<int> gap_residuals(const System& system, const std::vector<Contact>& contacts) {
+  const std::vector<System::Residual>& labels = system.residual_labels();
+  std::vector<int> residuals;
+  for (const Contact& contact : contacts) {
+    const auto is_gap = [&](const System::Residual& one) { return one.row == contact.row && !one.velocity; };
+    const auto gap = std::find_if(labels.begin(), labels.end(), is_gap);
+    if (gap == labels.end() || contact.input < 0 || contact.input >= system.layout().nu) {
+      throw InputError(
+          fmt::format("simulate: the contact of row {} of A needs a position-level constraint and one of the {} inputs",
+                      contact.row + 1, system.layout().nu));
+    }
+    residuals.push_back(static_cast<int>(gap - labels.begin()));
+  }
+  return residuals;
+}
+
+MatrixXd gaps_of(const System& system, const std::vector<Contact>& contacts, MatrixXd states, const VectorXd& parameters) {
+  if (contacts.empty()) return {0, states.cols()};
+  for (const Contact& contact : contacts) states.row(system.layout().u(contact.input)).setOnes();
+  return system.residuals(states, parameters)(gap_residuals(system, contacts), Eigen::all);
+}
+
 Contacts::Contacts(const System& system, const VectorXd& parameters, const SimulateOptions& options)
     : system_(system),
       parameters_(parameters),
       layout_(system.layout()),
       contacts_(options.contacts),
+      residuals_(gap_residuals(system, options.contacts)),
       shortest_flight_(options.shortest_flight),
-      is_closed_(contacts_.size(), false) {
-  const std::vector<System::Residual>& labels = system.residual_labels();
-  for (const Contact& contact : contacts_) {
-    const auto is_gap = [&](const System::Residual& one) { return one.row == contact.row && !one.velocity; };
-    const auto gap = std::find_if(labels.begin(), labels.end(), is_gap);
-    if (gap == labels.end() || contact.input < 0 || contact.input >= layout_.nu) {
-      throw InputError(
-          fmt::format("simulate: the contact of row {} of A needs a position-level constraint and one of the {} inputs",
-                      contact.row + 1, layout_.nu));
-    }
-    residuals_.push_back(static_cast<int>(gap - labels.begin()));
-  }
-}
+      is_closed_(contacts_.size(), false) {}
 
 void Contacts::mark(VectorXd& state, const std::vector<bool>& closed) const {
   for (std::size_t k = 0; k < contacts_.size(); ++k) state[layout_.u(contacts_[k].input)] = closed[k] ? 1 : 0;

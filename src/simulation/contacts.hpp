@@ -9,6 +9,14 @@
 
 namespace gp2 {
 
+/// The gap c of each contact among the residuals of the system, followed by ċ.
+/// @throws InputError where a contact is of no position-level constraint, or its input is none.
+std::vector<int> gap_residuals(const System& system, const std::vector<Contact>& contacts);
+
+/// c of each contact at N states, whether they are open or closed (contacts × N).
+Eigen::MatrixXd gaps_of(const System& system, const std::vector<Contact>& contacts, Eigen::MatrixXd states,
+                        const Eigen::VectorXd& parameters);
+
 /// Contacts that are made and released along a motion: which of them are closed, and what an impact makes of the velocities.
 class Contacts {
  public:
@@ -51,7 +59,7 @@ class Contacts {
   const Eigen::VectorXd& parameters_;
   const StateLayout layout_;
   std::vector<Contact> contacts_;
-  std::vector<int> residuals_;  // of each contact: its c among the residuals of the system, followed by ċ
+  std::vector<int> residuals_;  // gap_residuals
   double shortest_flight_;
   std::vector<bool> is_closed_;
 };

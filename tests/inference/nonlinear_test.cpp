@@ -132,18 +132,23 @@ TEST(CheckOfALoad, SaysWhatTheKnownForceLeavesOutAndFromWhereOnTheContactJams) {
 }
 
 TEST(CheckOfALoad, WarnsOfARowWhoseShareOfItNothingTells) {
-  const auto warnings = [](const std::string& rows) {
-    std::string text = rubbing_bead("lambda").text;
-    const std::string alone = R"(["z - h*x^2"])";
-    text.replace(text.find(alone), alone.size(), rows);
+  const std::string alone = R"(["z - h*x^2"])", repeated = R"(["z - h*x^2", "2*z - 2*h*x^2"])";
+  const auto warnings = [&](const std::string& text, const std::string& rows) {
     std::vector<std::string> found;
-    for (const Finding& one : check(Model::parse(text, "bead"), nullptr, {}))
+    for (const Finding& one : check(Model::parse(test::changed(text, {{alone, rows}}), "bead"), nullptr, {}))
       if (one.level == Finding::Level::warning) found.push_back(one.text);
     return found;
   };
-  EXPECT_THAT(warnings(R"(["z - h*x^2"])"), testing::IsEmpty());
-  EXPECT_THAT(warnings(R"(["z - h*x^2", "2*z - 2*h*x^2"])"),
-              testing::ElementsAre(testing::StartsWith("lambda(1): the constraint 'z - h*x^2' follows from others")));
+  const std::string of_directions = rubbing_bead("lambda").text;
+  const std::string of_features = test::changed(
+      of_directions,
+      {{R"x(["v"])x", R"x(["lambda0(1)"])x"}, {R"x({ force = [["-load*dx/v"], ["-load*dz/v"]] })x", R"x("force")x"}});
+  for (const auto& [text, name] : {std::pair(of_directions, "lambda(1)"), std::pair(of_features, "lambda0(1)")}) {
+    EXPECT_THAT(warnings(text, alone), testing::IsEmpty());
+    EXPECT_THAT(
+        warnings(text, repeated),
+        testing::ElementsAre(testing::StartsWith(fmt::format("{}: the constraint 'z - h*x^2' follows from others", name))));
+  }
 }
 
 // ---------------------------------------------------------------- the linear prior

@@ -17,8 +17,8 @@ struct CSourceOptions {
   bool single_precision = false;        // everything in float
   bool portable_math = false;           // the same bits on every machine: functions of its own for those of <math.h>
   std::vector<std::string> about = {};  // lines at the head of the header
-  std::map<std::string, std::string> units =
-      {};  // by the names of the state, of what is predicted and of parameters, for comments
+  /// For comments, by the names of the state, of what is predicted and of parameters.
+  std::map<std::string, std::string> units = {};
 };
 
 /// A predictor as C99.
