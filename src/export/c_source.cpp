@@ -148,6 +148,7 @@ class Writer {
  private:
   void set_conditions();
   void set_sizes();
+  void declare_workspace();
   void add_workspace(const std::string& text) { texts_["workspace"] += "  " + text + "\n"; }
   [[nodiscard]] std::string number(double value) const;
   [[nodiscard]] std::string numbers(const double* values, Index n, Index stride = 1) const;
@@ -251,6 +252,7 @@ Writer::Writer(const Posterior& posterior, std::vector<Component> components, Vi
   for (std::size_t r = 0; r < view_.rows.size(); ++r) all_rows_ = all_rows_ && view_.rows[r] == static_cast<int>(r);
   set_conditions();
   set_sizes();
+  declare_workspace();
 }
 
 void Writer::set_conditions() {
@@ -331,8 +333,12 @@ void Writer::set_sizes() {
   std::string guard = options_.name + "_H";
   std::transform(guard.begin(), guard.end(), guard.begin(), [](unsigned char c) { return std::toupper(c); });
   texts_["guard"] = guard;
+}
 
-  // the workspace: what each function of the C reads and writes
+// What each function of the C reads and writes
+void Writer::declare_workspace() {
+  const Index nq = system().nq(), nc = system().nc(), nx = layout_.size(), nr = view_.size();
+  const Index n_columns = std::min<Index>(nr, n_functions_);
   const std::string real = options_.name + "_real ";
   const auto add = [&](const std::string& names) { add_workspace(real + names + ";"); };
   const auto size = [](auto... factors) { return std::to_string((Index{factors} * ...)); };
@@ -402,8 +408,7 @@ void Writer::set_sizes() {
     if (has("moved")) add(fmt::format("d_a[{0}], d_of_constraint[{0}]", n));
     if (has("moved") && has("rows")) add(fmt::format("d_forced[{}], d_rows[{}]", n, nc * nx));
     if (has("reaction")) add(fmt::format("d_mass_a_bar[{}]", n));
-    if (has("multipliers")) add(fmt::format("of_rows[{}]", nc * nx));
-    if (has("loaded")) add(fmt::format("d_along[{}]", nc * nx));
+    if (has("least_norm")) add(fmt::format("d_along[{}]", nc * nx));
     if (has("load")) add(fmt::format("d_forced0[{0}], d_rows0[{1}], d_lambda0[{1}]", n, nc * nx));
   }
   if (has("mixture")) add(has("jacobian") ? fmt::format("mean[{}], jacobian[{}]", nr, nr * nx) : fmt::format("mean[{}]", nr));
@@ -940,7 +945,6 @@ void Writer::write_view() {
         "j];\n"
         "        product += w->K[{} + NC * l] * sum;\n      }}\n      w->Gt[j + NQ * r] = product;\n    }}\n  }}\n",
         each_row, r);
-    // d lambda = K (df - dA' lambda), and where rows are redundant + (I - K A') dA K' lambda
     const auto of_dA = [&](const std::string& statement) {
       return has("d_A")
                  ? fmt::format(
@@ -950,21 +954,13 @@ void Writer::write_view() {
                  : "";
     };
     change = of_dA("w->d_of_constraint[j + NQ * k] -= w->d_A[e] * w->lambda[i];");
-    change += "  for (int i = 0; i < NC * NX; ++i) w->of_rows[i] = 0;\n";
-    if (has("several")) {
-      change +=
-          "  real a[NQ];\n  for (int j = 0; j < NQ; ++j) {\n    a[j] = 0;\n    for (int i = 0; i < NC; ++i) a[j] += w->K[i + NC "
-          "* j] * w->lambda[i];\n  }\n";
-      const std::string add = of_dA("w->of_rows[i + NC * k] += w->d_A[e] * a[j];");
-      change += "  if (w->rank < NC) {\n" + add + "  }\n";
-    }
     change += fmt::format(
-        "  for (int k = 0; k < NX; ++k) {{\n    for (int j = 0; j < NQ; ++j) {{\n      for (int i = 0; i < NC; ++i) "
-        "w->d_of_constraint[j + NQ * k] -= w->A[i + NC * j] * w->of_rows[i + NC * k];\n    }}\n    {0}{{\n"
-        "      real sum = w->of_rows[{1} + NC * k];\n      for (int j = 0; j < NQ; ++j) sum += w->K[{1} + NC * j] * "
-        "w->d_of_constraint[j + NQ * k];\n"
-        "      jacobian[r + NR * k] = sum;\n    }}\n  }}\n",
-        each_row, r);
+        "  real along[NQ];\n  along_multipliers(w->lambda, w, along);\n"
+        "  for (int i = 0; i < NC * NX; ++i) w->d_along[i] = 0;\n{}"
+        "  for (int k = 0; k < NX; ++k) {{\n    real d_lambda[NC];\n"
+        "    change_of_multipliers(w->d_of_constraint + NQ * k, w->d_along + NC * k, w, d_lambda);\n"
+        "    {}jacobian[r + NR * k] = d_lambda[{}];\n  }}\n",
+        of_dA("w->d_along[i + NC * k] += w->d_A[e] * along[j];"), each_row, r);
   }
   if (!has("stddev")) matrix.clear();
   if (!has("jacobian")) change.clear();

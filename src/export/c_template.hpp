@@ -15,7 +15,7 @@
 //     known, constant     mu = M^-1 F; mu is constant
 //     load, nonlinear     a latent reads lambda0; lambda. Either: loaded; multipliers or these: least_norm
 //     solves              triangular systems of M are solved; of M itself (forced_solves)
-//     potential, other    a latent is a potential; one is none
+//     potential, other    a latent is a potential; one is not
 //     stddev, jacobian    these functions are asked for
 //     mixture             there are several components
 //     by_function         covariances are kept by latent functions, which are fewer than the rows of the view
@@ -1286,11 +1286,34 @@ status @name@_mean(const real *state, real *mean, workspace *w)
 {jacobian} *     dddq  = T (P + M^-1 (R + dM (abar - ddq - a_of_force) + dA' lambda)) + L (db - dA ddq)
 {jacobian} */
 {jacobian}
-{jacobian,loaded}/* d lambda = K (M da - r) + (I - K A') dA K' lambda, da = T M^-1 r + L (db - dA a), of one entry of the state
-{jacobian,loaded} *   r       dF + dA' lambda - dM a; it is lost
-{jacobian,loaded} *   d_rows  db - dA a
-{jacobian,loaded} *   d_along dA K' lambda; it is lost */
-{jacobian,loaded}static void change_of_multipliers(real *r, const real *d_rows, real *d_along, const workspace *w, real *d_lambda)
+{jacobian,least_norm}/* d lambda = K (df - dA' lambda) + (I - K A') dA K' lambda, f = A' lambda, of one entry of the state
+{jacobian,least_norm} *   df       df - dA' lambda; it is lost
+{jacobian,least_norm} *   d_along  dA K' lambda; it is lost */
+{jacobian,least_norm}static void change_of_multipliers(real *df, real *d_along, const workspace *w, real *d_lambda)
+{jacobian,least_norm}{
+{jacobian,least_norm}  for (int i = 0; i < NC; ++i) {
+{jacobian,least_norm}    if (w->rank == NC) d_along[i] = 0; /* K A' = I */
+{jacobian,least_norm}    for (int j = 0; j < NQ; ++j) df[j] -= w->A[i + NC * j] * d_along[i];
+{jacobian,least_norm}  }
+{jacobian,least_norm}  for (int i = 0; i < NC; ++i) {
+{jacobian,least_norm}    d_lambda[i] = d_along[i];
+{jacobian,least_norm}    for (int j = 0; j < NQ; ++j) d_lambda[i] += w->K[i + NC * j] * df[j];
+{jacobian,least_norm}  }
+{jacobian,least_norm}}
+{jacobian,least_norm}
+{jacobian,least_norm}/* K' lambda */
+{jacobian,least_norm}static void along_multipliers(const real *lambda, const workspace *w, real *along)
+{jacobian,least_norm}{
+{jacobian,least_norm}  for (int j = 0; j < NQ; ++j) {
+{jacobian,least_norm}    along[j] = 0;
+{jacobian,least_norm}    for (int i = 0; i < NC; ++i) along[j] += w->K[i + NC * j] * lambda[i];
+{jacobian,least_norm}  }
+{jacobian,least_norm}}
+{jacobian,least_norm}
+{jacobian,loaded}/* The same of M a = F + A' lambda and A a = b: df - dA' lambda = M da - r, da = T M^-1 r + L (db - dA a)
+{jacobian,loaded} *   r        dF + dA' lambda - dM a; it is lost
+{jacobian,loaded} *   d_rows   db - dA a */
+{jacobian,loaded}static void change_of_load(real *r, const real *d_rows, real *d_along, const workspace *w, real *d_lambda)
 {jacobian,loaded}{
 {jacobian,loaded}  real solved[NQ], da[NQ];
 {jacobian,loaded}  for (int i = 0; i < NQ; ++i) solved[i] = r[i];
@@ -1304,23 +1327,7 @@ status @name@_mean(const real *state, real *mean, workspace *w)
 {jacobian,loaded}    r[i] = -r[i];
 {jacobian,loaded}    for (int j = 0; j < NQ; ++j) r[i] += w->M[i + NQ * j] * da[j];
 {jacobian,loaded}  }
-{jacobian,loaded}  for (int i = 0; i < NC; ++i) {
-{jacobian,loaded}    if (w->rank == NC) d_along[i] = 0; /* K A' = I */
-{jacobian,loaded}    for (int j = 0; j < NQ; ++j) r[j] -= w->A[i + NC * j] * d_along[i];
-{jacobian,loaded}  }
-{jacobian,loaded}  for (int i = 0; i < NC; ++i) {
-{jacobian,loaded}    d_lambda[i] = d_along[i];
-{jacobian,loaded}    for (int j = 0; j < NQ; ++j) d_lambda[i] += w->K[i + NC * j] * r[j];
-{jacobian,loaded}  }
-{jacobian,loaded}}
-{jacobian,loaded}
-{jacobian,loaded}/* K' lambda */
-{jacobian,loaded}static void along_multipliers(const real *lambda, const workspace *w, real *along)
-{jacobian,loaded}{
-{jacobian,loaded}  for (int j = 0; j < NQ; ++j) {
-{jacobian,loaded}    along[j] = 0;
-{jacobian,loaded}    for (int i = 0; i < NC; ++i) along[j] += w->K[i + NC * j] * lambda[i];
-{jacobian,loaded}  }
+{jacobian,loaded}  change_of_multipliers(r, d_along, w, d_lambda);
 {jacobian,loaded}}
 {jacobian,loaded}
 {jacobian,load}/* d lambda0 of M a0 = F + A' lambda0, A a0 = b */
@@ -1333,7 +1340,7 @@ status @name@_mean(const real *state, real *mean, workspace *w)
 {jacobian,load}  for (int i = 0; i < NC * NX; ++i) w->d_rows0[i] = w->d_along[i] = 0;
 @dload@
 {jacobian,load}  for (int k = 0; k < NX; ++k) {
-{jacobian,load}    change_of_multipliers(w->d_forced0 + NQ * k, w->d_rows0 + NC * k, w->d_along + NC * k, w, w->d_lambda0 + NC * k);
+{jacobian,load}    change_of_load(w->d_forced0 + NQ * k, w->d_rows0 + NC * k, w->d_along + NC * k, w, w->d_lambda0 + NC * k);
 {jacobian,load}  }
 {jacobian,load}}
 {jacobian,load}
@@ -1381,7 +1388,7 @@ status @name@_mean(const real *state, real *mean, workspace *w)
 {jacobian,nonlinear}      r[i] = w->d_force[i + NQ * k] + w->d_forced[i + NQ * k] - w->d_of_constraint[i + NQ * k];
 {jacobian,nonlinear}      for (int j = 0; j < NQ; ++j) r[i] += w->M[i + NQ * j] * w->d_of_rest[j + NQ * k];
 {jacobian,nonlinear}    }
-{jacobian,nonlinear}    change_of_multipliers(r, w->d_rows + NC * k, w->d_along + NC * k, w, d_lambda);
+{jacobian,nonlinear}    change_of_load(r, w->d_rows + NC * k, w->d_along + NC * k, w, d_lambda);
 {jacobian,nonlinear}    solve_load(w, 1, d_lambda);
 {jacobian,nonlinear}    for (int j = 0; j < NC; ++j) {
 {jacobian,nonlinear}      for (int i = 0; i < NQ; ++i) {
