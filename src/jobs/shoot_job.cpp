@@ -148,7 +148,10 @@ class Shooter {
       if (!goes_on) parts.emplace_back(i, 0);
       ++parts.back().second;
     }
-    duration_ = request.duration.value_or(std::max(usual_duration(parts), (least_rows - 1) * usual));
+    Index longest = 0;
+    for (const auto& [first, rows] : parts) longest = std::max(longest, rows);
+    const auto most_rows = static_cast<double>(std::max(longest / 2, least_rows));
+    duration_ = request.duration.value_or(std::clamp(usual_duration(parts), (least_rows - 1) * usual, (most_rows - 1) * usual));
     if (!(duration_ > 0) || !std::isfinite(duration_))
       throw InputError(fmt::format("`duration`: must be positive and finite, got {}", duration_));
     if (request.most_stretches < 1)
@@ -517,7 +520,8 @@ class Shooter {
 
 std::vector<Option> options(ShootRequest& request) {
   return {{"duration", &request.duration, "S", "of a stretch [s]",
-           "twice the time in which velocities change by their own size, 8 rows at least"},
+           "twice the time in which velocities change by their own size; 8 rows at least, half of the longest part of the log at "
+           "most"},
           {"stretches", &request.most_stretches, "K", "at most so many, evenly taken"},
           {"map", &request.columns, "LOGNAME=NAME,…", "columns by other names", "", "columns"},
           threads_option(request.threads)};

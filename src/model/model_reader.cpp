@@ -1337,6 +1337,8 @@ class ModelReader : private TomlReader {
       const bool is_label = !unit.empty() && unit.size() <= longest &&
                             std::none_of(unit.begin(), unit.end(), [](unsigned char c) { return c < 32 || c == 127; });
       if (!is_label) fail(*node, key, R"(expected a short text, as in x = "m")");
+      if (model_.units.contains(name) && unit != model_.units[name])
+        fail(*node, key, "this coordinate is an angle, whose sine and cosine are features: it is in rad");
       model_.units[name] = unit;
     }
     model_.units["t"] = "s";

@@ -3,6 +3,7 @@
 #include <cmath>
 #include <functional>
 #include <numbers>
+#include <numeric>
 
 #include <fmt/format.h>
 #include <gmock/gmock.h>
@@ -166,6 +167,16 @@ TEST(Shoot, StretchesEndWhereTheLogDoes) {
   EXPECT_EQ(shoot(fit, log, {.duration = 0.4, .most_stretches = 3}).n_stretches, 3);
   EXPECT_THAT(input_error_of([&] { shoot(fit, log.take(rows), {.duration = 1.9}); }),
               HasSubstr("motion.csv: no stretch of 1.9 s with at least 8 rows without a break; rows are 0.01 s apart"));
+}
+
+TEST(Shoot, StretchesOfAShortOrASparseLogFitIntoIt) {
+  const FitFile fit = fit_of(0);
+  const CsvTable log = motion(1e-3, 2, 400);
+  std::vector<int> first(20), few;
+  std::iota(first.begin(), first.end(), 0);
+  for (int i = 0; i < 240; i += 20) few.push_back(i);
+  EXPECT_NEAR(shoot(fit, log.take(first)).duration, 0.09, 1e-12);  // half of the log
+  EXPECT_NEAR(shoot(fit, log.take(few)).duration, 1.4, 1e-12);     // 8 rows
 }
 
 // ---- a ball that bounces down a slope through air that brakes it: impacts say what its restitution is

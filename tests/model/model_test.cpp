@@ -640,6 +640,8 @@ std::vector<Complaint> complaints() {
        "8: units.dq1: not a coordinate, input or parameter of this model; units of velocities and accelerations follow, did you "
        "mean 'q1'?"},
       {"UnitIsANumber", base + "[units]\nq1 = 3\n", "8: units.q1: expected a text in quotes, got 3"},
+      {"AngleInDegrees", "coordinates = [{ name = \"a\", angle = true }]\n[mechanics]\nmass = [[\"1\"]]\n[units]\na = \"deg\"\n",
+       "5: units.a: this coordinate is an angle, whose sine and cosine are features: it is in rad"},
       {"UnitIsNoLabel", base + "[units]\nq1 = \"\"\n", "8: units.q1: expected a short text, as in x = \"m\""},
       // columns
       {"ColumnOfAParameter", base + "[columns]\nm = \"mass\"\n",
