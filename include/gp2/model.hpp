@@ -102,6 +102,13 @@ class Model {
     std::map<std::string, double> start;  // where it begins, before it is moved onto the constraints
   };
 
+  /// [drawing]: points of the mechanism, and lines through some of them, for pictures of its motion.
+  struct Drawing {
+    std::vector<std::string> names;               // of the points
+    std::vector<std::vector<Expression>> points;  // of q, t and parameters: two entries each, or three [m]
+    std::vector<std::vector<int>> lines;          // points, one after the other
+  };
+
   std::string name;                        // for messages
   std::string text;                        // the file's content
   ModelCode code;                          // what the text leaves to it
@@ -118,6 +125,7 @@ class Model {
   std::vector<SamplingRule> sampling;          // in an order in which each can be computed; empty without [sampling]
   std::map<std::string, double> newton_start;  // [sampling] start
   std::optional<Motion> motion;                // instead of sampling
+  std::optional<Drawing> drawing;
   std::map<std::string, std::string> columns;  // the model's name -> the name in logs
   /// Labels by the name of a quantity, which nothing computes with: [units], and what follows from a coordinate's for its velocity,
   /// its accelerations and, where it is in m or rad, its forces.

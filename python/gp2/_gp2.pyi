@@ -74,6 +74,7 @@ class System:
         motion: Mapping[str, Any] | None = None,
         columns: Mapping[str, str] | None = None,
         units: Mapping[str, str] | None = None,
+        drawing: Mapping[str, Any] | None = None,
     ) -> None: ...
     @staticmethod
     def load(path: _Path) -> System: ...

@@ -29,6 +29,7 @@ def model_text(
     motion: Mapping[str, Any] | None = None,
     columns: Mapping[str, str] | None = None,
     units: Mapping[str, str] | None = None,
+    drawing: Mapping[str, Any] | None = None,
 ) -> str:
     mechanics = {"mass": mass, "force": force, "force_on": force_on, "potential": potential}
     if not isinstance(constraints, Mapping):
@@ -55,6 +56,7 @@ def model_text(
         "motion": motion,
         "columns": columns,
         "units": units,
+        "drawing": drawing,
     }
     for table, entries in tables.items():
         if written := _entries(entries or {}):

@@ -180,10 +180,13 @@ Prior make_prior(const Model& model, const FitPriorOptions& options) {
 
 std::shared_ptr<const OtherSystem> make_other_system(const Model& home, const Model& other, const FitPriorOptions& options) {
   if (!options.baseline) return make_other_system(home, other, static_cast<const PriorOptions&>(options));
-  const Prior at_home = make_baseline_prior(home, *options.baseline);
-  Prior there = make_baseline_prior(other, *options.baseline);
-  require_same_latents(home, at_home, other, there);
-  return share_parameters(home, at_home, other, std::move(there));
+  // means and deviations are of the features at home: first see whether they are the same there
+  const auto unscaled = [&](const Model& model) {
+    return make_baseline_prior(model, unstandardised(model, options.baseline->kind));
+  };
+  require_same_latents(home, unscaled(home), other, unscaled(other));
+  return share_parameters(home, make_baseline_prior(home, *options.baseline), other,
+                          make_baseline_prior(other, *options.baseline));
 }
 
 }  // namespace gp2

@@ -125,6 +125,30 @@ Reached follow(SimulateJob job, std::size_t motion) {
   }
 }
 
+// Of a robot without [drawing]: its bodies, its sites and where loops close, each with a line from the bodies that carry it.
+std::optional<Model::Drawing> drawing_of(const Model& model) {
+  if (model.drawing || !model.robot) return model.drawing;
+  const RobotDescription& robot = *model.robot;
+  Model::Drawing drawing;
+  const auto add = [&](const std::string& name, const std::string& symbol, std::initializer_list<int> carriers) {
+    for (const int body : carriers) {
+      if (body >= 0) drawing.lines.push_back({body, static_cast<int>(drawing.points.size())});
+    }
+    drawing.names.push_back(name);
+    drawing.points.emplace_back();
+    for (const char axis : {'x', 'y', 'z'}) drawing.points.back().push_back(model.expression(fmt::format("{}.{}", symbol, axis)));
+  };
+  for (const RobotDescription::Body& body : robot.bodies) add(body.name, fmt::format("body(\"{}\")", body.name), {body.parent});
+  for (const RobotDescription::Site& site : robot.sites) add(site.name, fmt::format("site(\"{}\")", site.name), {site.body});
+  for (const RobotDescription::Connect& joint : robot.connects) {
+    const std::size_t of = joint.bodies[0] >= 0 ? 0 : 1;
+    const std::string& body = robot.bodies[static_cast<std::size_t>(joint.bodies[of])].name;
+    add(joint.name, fmt::format("point(\"{}\", {})", body, fmt::join(joint.anchors[of], ", ")),
+        {joint.bodies[0], joint.bodies[1]});
+  }
+  return drawing;
+}
+
 class Roll {
  public:
   Roll(const FitSystem& asked, const Posterior& posterior)
@@ -159,6 +183,7 @@ class Roll {
     find_horizon(out);
     add_forces(measured, out);
     add_energies(measured, out);
+    add_points(measured, parameters, out);
   }
 
  private:
@@ -261,6 +286,18 @@ class Roll {
       out.potential.row(static_cast<Index>(k)) = learned[k].mean.transpose();
       out.potential_stddev.row(static_cast<Index>(k)) = learned[k].stddev.transpose();
     }
+  }
+
+  void add_points(const MatrixXd& measured, const VectorXd& parameters, Rollout& out) const {
+    std::optional<Model::Drawing> drawing = drawing_of(*asked_.model);
+    if (!drawing) return;
+    std::vector<Expression> entries;
+    for (const std::vector<Expression>& point : drawing->points) entries.insert(entries.end(), point.begin(), point.end());
+    const Tape tape(entries, asked_.model->symbols().state_and_parameters());
+    tape.evaluate(measured, parameters, out.measured_points);
+    tape.evaluate(simulated_, parameters, out.simulated_points);
+    out.points = std::move(drawing->names);
+    out.lines = std::move(drawing->lines);
   }
 
   [[nodiscard]] Index n_reached() const {

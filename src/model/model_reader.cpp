@@ -43,7 +43,7 @@ class ModelReader : private TomlReader {
   void read() {
     only_keys(root_, "",
               {"name", "robot", "coordinates", "inputs", "parameters", "let", "mechanics", "constraints", "latent", "noise",
-               "truth", "sampling", "motion", "columns", "units"});
+               "truth", "sampling", "motion", "columns", "units", "drawing"});
     definition_.graph = model_.graph = std::make_shared<ExpressionGraph>();
     definition_.name = root_.contains("name") ? text(*root_.get("name"), "name") : model_.name;
     read_robot();
@@ -71,7 +71,9 @@ class ModelReader : private TomlReader {
     read_motion();
     read_columns();
     read_units();
+    // last, so that M, A, b and F are built the same way with these and without
     if (!model_.code.mechanics) read_potential();
+    read_drawing();
   }
 
  private:
@@ -632,7 +634,6 @@ class ModelReader : private TomlReader {
     fail(node, key, "expected a point of the robot, such as 'site(\"tip\").x'");
   }
 
-  // last, so that M, A, b and F are built the same way with it and without
   void read_potential() {
     if (robot()) model_.potential = robot()->potential();
     if (!root_.contains("mechanics")) return;
@@ -642,6 +643,45 @@ class ModelReader : private TomlReader {
     const Expression potential = expression_without(node, "mechanics.potential", of_motion(),
                                                     "the potential may depend on coordinates, t and parameters only");
     model_.potential = model_.potential ? *model_.potential + potential : potential;
+  }
+
+  void read_drawing() {
+    if (!root_.contains("drawing")) return;
+    const toml::table& drawing = table(*root_.get("drawing"), "drawing");
+    only_keys(drawing, "drawing", {"points", "lines"});
+    if (!drawing.contains("points")) fail(drawing, "drawing", R"(missing points, as in points = { tip = ["x", "y"] })");
+    Model::Drawing out;
+    for (const auto& [name, node] : entries_of(table(*drawing.get("points"), "drawing.points"))) {
+      const std::string key = fmt::format("drawing.points.{}", name);
+      const toml::array& entries = array(*node, key);
+      const std::size_t size = out.points.empty() ? entries.size() : out.points.front().size();
+      if (entries.size() != size || size < 2 || size > 3) {
+        fail(*node, key, fmt::format("expected two coordinates [m], or three, of every point alike, got {}", entries.size()));
+      }
+      out.names.push_back(name);
+      out.points.emplace_back();
+      for (const toml::node& entry : entries) {
+        out.points.back().push_back(
+            expression_without(entry, key, of_motion(), "a point may depend on coordinates, t and parameters only"));
+      }
+    }
+    if (drawing.contains("lines")) {
+      for (const toml::node& node : array(*drawing.get("lines"), "drawing.lines"))
+        out.lines.push_back(line_through(node, out.names));
+    }
+    model_.drawing = std::move(out);
+  }
+
+  [[nodiscard]] std::vector<int> line_through(const toml::node& node, const std::vector<std::string>& points) const {
+    std::vector<int> line;
+    for (const toml::node& entry : array(node, "drawing.lines")) {
+      const std::string name = text(entry, "drawing.lines");
+      const auto found = std::find(points.begin(), points.end(), name);
+      if (found == points.end())
+        fail(entry, "drawing.lines", fmt::format("'{}' is none of drawing.points{}", name, suggestion(name, points)));
+      line.push_back(static_cast<int>(found - points.begin()));
+    }
+    return line;
   }
 
   void allow_only(const toml::node& node, const std::string& key, Expression e, const std::vector<Expression>& forbidden,

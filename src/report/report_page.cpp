@@ -263,7 +263,11 @@ Json rollout_json(const System& system, const Rollout& rollout, const Spelling& 
           {"lambda_simulated", rows_json(rollout.simulated_multipliers)},
           {"energy", row_json(rollout.energy)},
           {"energy_simulated", row_json(rollout.simulated_energy)},
-          {"potentials", potentials}};
+          {"potentials", potentials},
+          {"points", rollout.points},
+          {"lines", rollout.lines},
+          {"measured_points", rows_json(rollout.measured_points)},
+          {"simulated_points", rows_json(rollout.simulated_points)}};
 }
 
 VectorXd nominal_levels() {

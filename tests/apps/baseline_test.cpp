@@ -55,6 +55,17 @@ TEST_F(BaselineCommand, RefusesWhatOnlyMechanicsHas) {
   EXPECT_THAT(unknown.err, AllOf(HasSubstr("--baseline"), HasSubstr("gp"), HasSubstr("lmc")));
 }
 
+TEST_F(BaselineCommand, ASystemOfOtherFeaturesIsRefused) {
+  desk.done("gp2 fit models/surface.toml --data train.csv --baseline icm --restarts 1 --max-iterations 2 -o fit.json");
+  desk.write("more.toml", replaced(desk.read("models/surface.toml"), R"("u3"]
+directions)",
+                                   R"("u3", "dq1*dq2"]
+directions)"));
+  const Outcome outcome = desk.run("gp2 evaluate fit.json --data test.csv --system more.toml");
+  EXPECT_EQ(outcome.status, 2);
+  EXPECT_THAT(outcome.err, HasSubstr("the features of its latent 1, 'se', are"));
+}
+
 TEST_F(BaselineCommand, IsTheSameUnderBothProtocols) {
   for (const std::string protocol : {"default", "paper"}) {
     desk.done("gp2 fit models/surface.toml --data train.csv --baseline icm --restarts 2 --max-iterations 5 --protocol " +

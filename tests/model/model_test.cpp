@@ -355,7 +355,7 @@ std::vector<Complaint> complaints() {
       {"Empty", "", "1: coordinates: missing; write coordinates = [\"q1\", \"q2\"]"},
       {"UnknownTable", base + "[friction]\nc = 1\n",
        "7: friction: unknown key; known here: name, robot, coordinates, inputs, parameters, let, mechanics, constraints, latent, "
-       "noise, truth, sampling, motion, columns, units"},
+       "noise, truth, sampling, motion, columns, units, drawing"},
       {"FirstOfSeveralUnknownKeys", base + "zeta = 1\nalpha = 2\n",
        "7: mechanics.zeta: unknown key; known here: mass, force, coriolis, potential"},
       {"NameIsNoText", "name = 3\n" + base, "1: name: expected a text in quotes, got 3"},
@@ -642,6 +642,14 @@ std::vector<Complaint> complaints() {
       {"UnitIsANumber", base + "[units]\nq1 = 3\n", "8: units.q1: expected a text in quotes, got 3"},
       {"AngleInDegrees", "coordinates = [{ name = \"a\", angle = true }]\n[mechanics]\nmass = [[\"1\"]]\n[units]\na = \"deg\"\n",
        "5: units.a: this coordinate is an angle, whose sine and cosine are features: it is in rad"},
+      {"DrawingWithoutPoints", base + "[drawing]\nlines = []\n",
+       "7: drawing: missing points, as in points = { tip = [\"x\", \"y\"] }"},
+      {"PointsOfTwoKinds", base + "[drawing.points]\na = [\"q1\", \"0\"]\nb = [\"q1\", \"0\", \"0\"]\n",
+       "9: drawing.points.b: expected two coordinates [m], or three, of every point alike, got 3"},
+      {"PointThatDependsOnAVelocity", base + "[drawing.points]\na = [\"q1\", \"dq1\"]\n",
+       "8: drawing.points.a: a point may depend on coordinates, t and parameters only, but this entry depends on 'dq1'"},
+      {"LineThroughNoPoint", base + "[drawing]\npoints = { tip = [\"q1\", \"0\"] }\nlines = [[\"tip\", \"tap\"]]\n",
+       "9: drawing.lines: 'tap' is none of drawing.points, did you mean 'tip'?"},
       {"UnitIsNoLabel", base + "[units]\nq1 = \"\"\n", "8: units.q1: expected a short text, as in x = \"m\""},
       // columns
       {"ColumnOfAParameter", base + "[columns]\nm = \"mass\"\n",

@@ -191,7 +191,7 @@ test("a measured motion stands beside the simulated one, with its forces and ene
     const lead = await page.locator("#rollout-lead").textContent();
     assert.ok(motion.leaves === null ? lead.includes("to the end") : lead.includes(`at t = ${Number(motion.leaves.toPrecision(4))}.`), lead);
     const shown = new Set(await page.locator("#rollout figcaption strong").allTextContents());
-    assert.deepEqual(shown, new Set(["q1", "q2", "q3", "lambda1", "Kinetic + potential energy"]));
+    assert.deepEqual(shown, new Set(["The mechanism", "q1", "q2", "q3", "lambda1", "Kinetic + potential energy"]));
     for (const { title, count } of (await inked(page)).filter((one) => shown.has(one.title))) assert.ok(count > 20, `${title}: ${count} pixels in ${scheme}`);
     assert.equal(await page.evaluate(() => document.documentElement.scrollWidth), width);
     // the training data have no time
@@ -199,6 +199,35 @@ test("a measured motion stands beside the simulated one, with its forces and ene
     await settled(page);
     assert.equal(await page.locator("#rollout canvas").count(), 0);
     assert.match(await page.locator("#rollout-lead").textContent(), /^There is none for the training data: the data lack t, which the model does not read/);
+    await close();
+  }
+});
+
+test("the mechanism moves, its points where the model has them", async () => {
+  const file = join(models, "../examples/crank.toml"), log = join(models, "../examples/crank_log.csv");
+  gp2("derive", log, "--model", file, "-o", "crank.csv");
+  gp2("fit", file, "--data", "crank.csv", "--observe", "ddphi", "--mean", "force", "--max-points", "50", "--restarts", "1", "-o", "crank.json");
+  gp2("report", "crank.json", "--data", "crank.csv", "-o", "crank.html");
+  for (const [scheme, width] of [["light", 1200], ["dark", 360]]) {
+    const { page, close } = await open("crank.html", { scheme, width });
+    const motion = await page.evaluate(() => JSON.parse(document.getElementById("report").textContent)[0].data[1].rollout);
+    assert.deepEqual(motion.points, ["axle", "pin", "slide"]);
+    const slider = page.locator(".mechanism + .controls input"), clock = page.locator(".mechanism + .controls output");
+    for (const i of [0, Math.floor(motion.t.length / 2)]) {
+      await slider.fill(String(i));
+      assert.equal(await clock.textContent(), `t = ${Number(motion.t[i].toPrecision(4))} s`);
+      const [axle, pin, slide] = (await page.locator(".mechanism path.measured").getAttribute("d")).split(/[ML]/).slice(1).map((point) => point.split(" ").map(Number));
+      // one scale along both axes, y up: the crank's r = 0.06, the rod's l = 0.18
+      const scale = Math.hypot(pin[0] - axle[0], pin[1] - axle[1]) / 0.06;
+      const at = [pin[0] - axle[0], axle[1] - pin[1], slide[0] - axle[0], slide[1] - axle[1]];
+      const told = [motion.measured_points[2][i], motion.measured_points[3][i], motion.measured_points[4][i], 0];
+      at.forEach((value, k) => assert.ok(Math.abs(value - scale * told[k]) < 1e-3, `${value} beside ${scale * told[k]}`));
+      assert.ok(Math.abs(told[0] - 0.06 * Math.cos(motion.measured[0][i])) < 1e-6);
+    }
+    await page.getByRole("button", { name: "Play" }).click();
+    await page.waitForFunction((before) => document.querySelector(".mechanism + .controls output").textContent !== before, await clock.textContent());
+    await page.getByRole("button", { name: "Pause" }).click();
+    assert.equal(await page.evaluate(() => document.documentElement.scrollWidth), width);
     await close();
   }
 });

@@ -248,6 +248,26 @@ TEST_F(RolloutOf, AMeasuredMotionIsThatOfSimulate) {
   EXPECT_TRUE(motion.simulated_energy.isApprox(column("simulated.csv", "energy"), 1e-12));
   EXPECT_TRUE(motion.energy.isApprox(column("test.csv", "energy"), 1e-12));
   EXPECT_NEAR(motion.multipliers(0, 0), motion.simulated_multipliers(0, 0), 1e-9) << "at the same state";
+  EXPECT_EQ(motion.points, std::vector<std::string>{"particle"});
+  EXPECT_EQ(motion.measured_points, motion.measured);
+  EXPECT_EQ(motion.simulated_points, motion.simulated);
+}
+
+TEST_F(RolloutOf, ARobotIsDrawnByItsBodies) {
+  if (desk.run("gp2 show models/four_bar.toml").status != 0) GTEST_SKIP() << "built without MuJoCo";
+  desk.done("gp2 generate models/four_bar.toml --n 40 -o train.csv");
+  desk.done("gp2 fit models/four_bar.toml --data train.csv --restarts 1 --max-iterations 5 -o fit.json");
+  desk.done("gp2 simulate models/four_bar.toml --start train.csv --t-end 0.5 --dt 0.05 -o test.csv");
+  const Rollout motion = of("test.csv");
+  ASSERT_EQ(motion.reason, "");
+  EXPECT_EQ(motion.points,
+            (std::vector<std::string>{"crank", "coupler", "rocker", "middle", "end", "joint of coupler and rocker"}));
+  EXPECT_EQ(motion.lines, (std::vector<std::vector<int>>{{0, 1}, {1, 3}, {1, 4}, {1, 5}, {2, 5}}));
+  ASSERT_EQ(motion.measured_points.rows(), 18);
+  // upright at 0, about y
+  EXPECT_TRUE(motion.measured_points.row(3).isApprox(0.1 * motion.measured.row(0).array().sin().matrix(), 1e-12));
+  EXPECT_TRUE(motion.measured_points.row(5).isApprox(0.1 * motion.measured.row(0).array().cos().matrix(), 1e-12));
+  EXPECT_TRUE(motion.measured_points.bottomRows(3).isApprox(motion.measured_points.middleRows(12, 3), 1e-12));
 }
 
 TEST_F(RolloutOf, AMotionOfTheFitItselfIsNeverLeft) {

@@ -54,11 +54,14 @@ struct Rollout {
   std::optional<double> leaves;    // first time at which they are apart by more than 2 stddev and 5 % of the measured range
   int leaving = 0;                 // the coordinate that is
   std::optional<double> far_from;  // first time at which the mean motion is far from the training data
-  Eigen::MatrixXd multipliers, multipliers_stddev;  // λ at the measured states (nc × N)
-  Eigen::MatrixXd simulated_multipliers;            // λ of the mean motion (nc × N)
-  Eigen::VectorXd energy, simulated_energy;         // kinetic + potential, learned ones too (N) [J]; empty: no potential
-  std::vector<std::string> potentials;              // latents that are one (p)
-  Eigen::MatrixXd potential, potential_stddev;      // of each less that at the start, at the measured states (p × N) [J]
+  Eigen::MatrixXd multipliers, multipliers_stddev;    // λ at the measured states (nc × N)
+  Eigen::MatrixXd simulated_multipliers;              // λ of the mean motion (nc × N)
+  Eigen::VectorXd energy, simulated_energy;           // kinetic + potential, learned ones too (N) [J]; empty: no potential
+  std::vector<std::string> potentials;                // latents that are one (p)
+  Eigen::MatrixXd potential, potential_stddev;        // of each less that at the start, at the measured states (p × N) [J]
+  std::vector<std::string> points;                    // of the mechanism, as [drawing] of the model has them, or a robot's
+  std::vector<std::vector<int>> lines;                // through points
+  Eigen::MatrixXd measured_points, simulated_points;  // two coordinates of each point after the other, or three (· × N) [m]
 };
 
 /// Measured accelerations at N states, d outputs of them, and what the fit says there. Standard deviations are without noise.

@@ -539,6 +539,7 @@
     const motion = data.rollout;
     byId("rollout-lead").textContent = rolloutLead(motion);
     byId("rollout-parts").hidden = Boolean(motion.reason);
+    drawMechanism(motion);
     const hosts = ["rollout-charts", "rollout-force-charts", "rollout-energy-charts"].map(byId);
     if (motion.reason) {
       for (const host of hosts) keep(host, 0);
@@ -575,9 +576,127 @@
     }));
   }
 
-  // ---- where the data are: phase planes, and three coordinates in space ---------------------------------------------------
+  // ---- in space: the mechanism as it moves ------------------------------------------------------------------------------------
 
   let yaw = -0.7, pitch = 0.42;
+
+  /** By dragging and by the arrow keys. */
+  function letTurn(element, draw) {
+    const turn = (right, up) => { yaw += right; pitch = Math.max(-1.5, Math.min(1.5, pitch + up)); draw(); };
+    element.addEventListener("keydown", (event) => {
+      const step = { ArrowLeft: [-0.09, 0], ArrowRight: [0.09, 0], ArrowUp: [0, 0.09], ArrowDown: [0, -0.09] }[event.key];
+      if (!step) return;
+      event.preventDefault();
+      turn(...step);
+    });
+    element.addEventListener("pointerdown", (event) => element.setPointerCapture(event.pointerId));
+    element.addEventListener("pointermove", (event) => {
+      if (element.hasPointerCapture(event.pointerId)) turn(event.movementX * 0.008, event.movementY * 0.008);
+    });
+  }
+
+  const svg = (tag, attributes = {}) => {
+    const element = document.createElementNS("http://www.w3.org/2000/svg", tag);
+    for (const [name, value] of Object.entries(attributes)) element.setAttribute(name, value);
+    return element;
+  };
+
+  function drawMechanism(motion) {
+    const host = byId("rollout-mechanism");
+    clear(host);
+    host.hidden = Boolean(motion.reason) || !motion.measured_points.flat().some((value) => value !== null);
+    if (host.hidden) return;
+    const dimensions = motion.measured_points.length / motion.points.length;
+    const inSpace = dimensions === 3;
+    // where a point is in the picture [m], whose y points down
+    const place = (rows, k, i) => {
+      const at = Array.from({ length: dimensions }, (_, axis) => rows[dimensions * k + axis][i]);
+      if (at.includes(null)) return null;
+      if (!inSpace) return [at[0], -at[1]];
+      const away = Math.sin(yaw) * at[0] + Math.cos(yaw) * at[1];
+      return [Math.cos(yaw) * at[0] - Math.sin(yaw) * at[1], -(Math.sin(pitch) * away + Math.cos(pitch) * at[2])];
+    };
+    const path = (places) => {
+      let pen = "M";
+      return places.map((at) => { const step = at ? `${pen}${at[0].toPrecision(6)} ${at[1].toPrecision(6)}` : ""; pen = at ? "L" : "M"; return step; }).join("");
+    };
+
+    const title = "The mechanism";
+    const summary = `${motion.points.join(", ")}${inSpace ? ". Drag, or focus and press the arrow keys, to turn." : ""}`;
+    const picture = svg("svg", { class: "mechanism", role: "img", "aria-label": `${title}: ${summary}`, ...(inSpace ? { tabindex: "0" } : {}) });
+    const play = make("button", { type: "button", text: "Play" });
+    const slider = make("input", { type: "range", min: "0", max: String(motion.t.length - 1), value: "0", step: "1", "aria-label": "time" });
+    const clock = make("output");
+    const legend = make("ul", { class: "legend" }, ...[["measured", "--c2"], ["simulated", "--c1"]].map(([label, ink]) => make("li", {}, make("span", { class: "swatch line", style: `background:${colour(ink)};border-color:${colour(ink)}` }), label)));
+    host.append(make("figure", {}, make("figcaption", {}, make("strong", { text: title }), make("span", { class: "summary", text: summary })), legend, picture, make("div", { class: "controls" }, play, slider, clock)));
+
+    const all = motion.points.map((_, k) => k);
+    const traces = all.map(() => svg("path", { class: "trace" }));
+    const bodies = ["measured", "simulated"].map((kind) => ({
+      rows: motion[`${kind}_points`],
+      lines: motion.lines.map(() => svg("path", { class: kind })),
+      dots: all.map((k) => {
+        const dot = svg("circle", { class: kind });
+        const name = svg("title");
+        name.textContent = `${motion.points[k]}, ${kind}`;
+        dot.append(name);
+        return dot;
+      }),
+    }));
+    picture.append(...traces, ...bodies.flatMap(({ lines, dots }) => [...lines, ...dots]));
+
+    function drawAt(i) {
+      slider.value = String(i);
+      clock.textContent = `t = ${format(motion.t[i], 4)} s`;
+      for (const { rows, lines, dots } of bodies) {
+        motion.lines.forEach((line, l) => lines[l].setAttribute("d", path(line.map((k) => place(rows, k, i)))));
+        dots.forEach((dot, k) => {
+          const at = place(rows, k, i);
+          dot.style.display = at ? "" : "none";
+          if (at) { dot.setAttribute("cx", at[0].toPrecision(6)); dot.setAttribute("cy", at[1].toPrecision(6)); }
+        });
+      }
+    }
+    function draw() {
+      const paths = all.map((k) => motion.t.map((_, i) => place(motion.measured_points, k, i)));
+      all.forEach((k) => traces[k].setAttribute("d", path(paths[k])));
+      // as large as what was measured
+      const [low, high] = [Math.min, Math.max].map((most) => [0, 1].map((axis) => paths.flat().filter(Boolean).reduce((best, at) => most(best, at[axis]), most === Math.min ? Infinity : -Infinity)));
+      const largest = Math.max(high[0] - low[0], high[1] - low[1]) || 1;
+      const [width, height] = [0, 1].map((axis) => Math.max(high[axis] - low[axis], 0.3 * largest) + 0.12 * largest);
+      picture.setAttribute("viewBox", `${(low[0] + high[0] - width) / 2} ${(low[1] + high[1] - height) / 2} ${width} ${height}`);
+      picture.style.aspectRatio = `${width} / ${height}`;
+      for (const { dots } of bodies) for (const dot of dots) dot.setAttribute("r", String(0.011 * largest));
+      drawAt(Number(slider.value));
+    }
+    // as fast as it was, but neither too fast nor too slow to watch
+    const [start, end] = [motion.t[0], motion.t[motion.t.length - 1]];
+    const rate = (end - start) / Math.max(3, Math.min(20, end - start));
+    if (rate !== 1) clock.title = `played at ${format(rate, 2)} times its speed`;
+    let frame = 0;
+    const stop = () => { cancelAnimationFrame(frame); frame = 0; play.textContent = "Play"; };
+    play.addEventListener("click", () => {
+      if (frame) return stop();
+      const from = Number(slider.value) === motion.t.length - 1 ? 0 : Number(slider.value);
+      let begun = null;
+      play.textContent = "Pause";
+      const step = (now) => {
+        begun ??= now;
+        const t = motion.t[from] + (rate * (now - begun)) / 1000;
+        const next = motion.t.findIndex((time) => time > t);
+        drawAt(next < 0 ? motion.t.length - 1 : Math.max(next - 1, 0));
+        if (next < 0) return stop();
+        frame = requestAnimationFrame(step);
+      };
+      frame = requestAnimationFrame(step);
+    });
+    slider.addEventListener("input", () => { stop(); drawAt(Number(slider.value)); });
+    if (inSpace) letTurn(picture, draw);
+    live.set(host, stop);
+    draw();
+  }
+
+  // ---- where the data are: phase planes, and three coordinates in space ---------------------------------------------------
 
   function drawSpace(host, names, surface) {
     clear(host);
@@ -701,17 +820,7 @@
         }
       });
     }
-    const turn = (right, up) => { yaw += right; pitch = Math.max(-1.5, Math.min(1.5, pitch + up)); draw(); };
-    canvas.addEventListener("keydown", (event) => {
-      const step = { ArrowLeft: [-0.09, 0], ArrowRight: [0.09, 0], ArrowUp: [0, 0.09], ArrowDown: [0, -0.09] }[event.key];
-      if (!step) return;
-      event.preventDefault();
-      turn(...step);
-    });
-    canvas.addEventListener("pointerdown", (event) => canvas.setPointerCapture(event.pointerId));
-    canvas.addEventListener("pointermove", (event) => {
-      if (canvas.hasPointerCapture(event.pointerId)) turn(event.movementX * 0.008, event.movementY * 0.008);
-    });
+    letTurn(canvas, draw);
     const watch = new ResizeObserver(draw);
     watch.observe(canvas);
     live.set(host, () => watch.disconnect());
@@ -937,7 +1046,7 @@
       const input = make("input", { type: "radio", name: "data", value: String(k), id: `data-${k}` });
       input.checked = one === data;
       input.addEventListener("change", () => { data = one; fillControls(); drawAll(); });
-      choice.append(make("label", { for: `data-${k}` }, input, `${one.name} (${one.n}${one.stride > 1 ? `, every ${one.stride}th drawn` : ""})`));
+      choice.append(make("label", { for: `data-${k}` }, input, `${one.name} (${one.n}${one.stride > 1 ? `, one in ${one.stride} drawn` : ""})`));
     });
     fillControls();
     for (const [id, draw] of [["residual-feature", drawResiduals], ["scatter-against", drawScatter], ["calibration-output", drawCalibration], ["acceleration-output", drawAccelerations], ["motion-view", drawMotion]]) {
