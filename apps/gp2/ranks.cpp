@@ -86,8 +86,34 @@ class MpiRanks final : public Ranks {
       MPI_Bcast(numbers.data() + first, static_cast<int>(n), MPI_DOUBLE, from, MPI_COMM_WORLD);
     }
   }
+  void exchange(const std::vector<std::vector<double>>& to, std::vector<std::vector<double>>& from) const override {
+    Messages sent(to), received(from);
+    for (std::size_t rank = 0; rank < to.size(); ++rank) {
+      std::copy(to[rank].begin(), to[rank].end(), sent.numbers.begin() + sent.first[rank]);
+    }
+    MPI_Alltoallv(sent.numbers.data(), sent.count.data(), sent.first.data(), MPI_DOUBLE, received.numbers.data(),
+                  received.count.data(), received.first.data(), MPI_DOUBLE, MPI_COMM_WORLD);
+    for (std::size_t rank = 0; rank < from.size(); ++rank) {
+      std::copy_n(received.numbers.begin() + received.first[rank], from[rank].size(), from[rank].begin());
+    }
+  }
 
  private:
+  // one after the other, as MPI wants them
+  struct Messages {
+    std::vector<int> count, first;
+    std::vector<double> numbers;
+
+    explicit Messages(const std::vector<std::vector<double>>& all) {
+      int n = 0;
+      for (const std::vector<double>& one : all) {
+        count.push_back(static_cast<int>(one.size()));
+        first.push_back(std::exchange(n, n + count.back()));
+      }
+      numbers.resize(static_cast<std::size_t>(n));
+    }
+  };
+
   int rank_ = 0, size_ = 1;
 };
 

@@ -30,6 +30,17 @@ struct Pieces {
   [[nodiscard]] Eigen::Index first(int piece) const { return piece * n_blocks / n; }
 };
 
+/// A sum of vectors.
+struct VectorSum {
+  Eigen::VectorXd sum;
+
+  void add(const VectorSum& other) { sum += other.sum; }
+  template <typename Work>
+  void for_each(const Work& work) {
+    work(sum.data(), sum.size());
+  }
+};
+
 /// A sum over all pieces that has the same bits however many threads and processes there are: pieces of one eighth of all are added
 /// pairwise, then the pairs, and so on; eighths one after another. As soon as two that belong together are there they become one, so
 /// that few sums are in memory.
@@ -58,30 +69,92 @@ class PieceSums {
     nodes_[node] = std::move(sum);
   }
 
-  /// The sum of what all processes have put.
+  /// The sum of what all processes have put. Each of them adds up a slice of all numbers, and hands it to the others.
   [[nodiscard]] Sum total(const Workers& workers) {
-    Sum all = zero_;
-    const int per_part = n_pieces_ / Pieces::n_parts;
-    for (int part = 0; part < Pieces::n_parts; ++part) {
-      all.add(take(size(Pieces::n_parts + part), part * per_part, per_part, workers));
+    if (!workers.ranks) {
+      return added_up(zero_, workers, [&](std::size_t node, int) { return take(node); });
     }
+    const Ranks& ranks = *workers.ranks;
+    const std::size_t own = size(ranks.rank());
+    std::vector<std::vector<double>> to(size(ranks.size())), from(to.size());
+    VectorXd numbers = numbers_of(zero_);
+    const auto slice = [&](VectorXd& of, std::size_t rank) {
+      const auto first = [&](std::size_t k) { return static_cast<Index>(k) * of.size() / ranks.size(); };
+      return of.segment(first(rank), first(rank + 1) - first(rank));
+    };
+    const Index n_own = slice(numbers, own).size();
+
+    added_up(VectorSum{}, workers, [&](std::size_t node, int owner) {
+      std::vector<double>& expected = from[size(owner)];
+      expected.resize(expected.size() + static_cast<std::size_t>(n_own));
+      if (size(owner) == own) {
+        VectorXd sum = numbers_of(take(node));
+        for (std::size_t rank = 0; rank < to.size(); ++rank) {
+          const auto part = slice(sum, rank);
+          to[rank].insert(to[rank].end(), part.begin(), part.end());
+        }
+      }
+      return VectorSum{};
+    });
+    ranks.exchange(to, from);
+
+    std::vector<const double*> next;
+    for (const std::vector<double>& one : from) next.push_back(one.data());
+    const VectorXd sum = added_up(VectorSum{slice(numbers, own)}, workers, [&](std::size_t, int owner) {
+                           const double* const first = std::exchange(next[size(owner)], next[size(owner)] + n_own);
+                           return VectorSum{Eigen::Map<const VectorXd>(first, n_own)};
+                         }).sum;
+    for (std::size_t rank = 0; rank < to.size(); ++rank) {
+      to[rank].assign(sum.begin(), sum.end());
+      from[rank].resize(static_cast<std::size_t>(slice(numbers, rank).size()));
+    }
+    ranks.exchange(to, from);
+    for (std::size_t rank = 0; rank < from.size(); ++rank)
+      std::copy(from[rank].begin(), from[rank].end(), slice(numbers, rank).begin());
+
+    Sum all = zero_;
+    const double* rest = numbers.data();
+    all.for_each([&](double* values, Index count) {
+      std::copy_n(rest, count, values);
+      rest += count;
+    });
     return all;
   }
 
  private:
+  using Index = Eigen::Index;
+  using VectorXd = Eigen::VectorXd;
+
   static std::size_t size(int n) { return static_cast<std::size_t>(n); }
 
-  // The sum of n pieces from the first on, which stand below a node: from the process that has it, or of both halves.
-  Sum take(std::size_t node, int first, int n, const Workers& workers) {
-    if (!workers.have_one_owner(first, first + n - 1, n_pieces_)) {
-      Sum sum = take(2 * node, first, n / 2, workers);
-      sum.add(take(2 * node + 1, first + n / 2, n / 2, workers));
-      return sum;
+  static VectorXd numbers_of(Sum sum) {
+    Index n = 0;
+    sum.for_each([&](const double*, Index count) { n += count; });
+    VectorXd numbers(n);
+    double* next = numbers.data();
+    sum.for_each([&](const double* values, Index count) { next = std::copy_n(values, count, next); });
+    return numbers;
+  }
+
+  Sum take(std::size_t node) { return nodes_[node] ? *std::exchange(nodes_[node], std::nullopt) : zero_; }
+
+  /// `sum` and what all parts sum up to, where of(node, owner) is what stands below a node that one process has.
+  template <typename T, typename Of>
+  T added_up(T sum, const Workers& workers, const Of& of) const {
+    const int per_part = n_pieces_ / Pieces::n_parts;
+    for (int part = 0; part < Pieces::n_parts; ++part) {
+      sum.add(below<T>(size(Pieces::n_parts + part), part * per_part, per_part, workers, of));
     }
-    Sum sum = nodes_[node] ? *std::exchange(nodes_[node], std::nullopt) : zero_;
-    sum.for_each([&](double* numbers, Eigen::Index count) {
-      workers.share({numbers, static_cast<std::size_t>(count)}, first, n_pieces_);
-    });
+    return sum;
+  }
+
+  // n pieces from the first on stand below the node
+  template <typename T, typename Of>
+  T below(std::size_t node, int first, int n, const Workers& workers, const Of& of) const {
+    if (workers.have_one_owner(first, first + n - 1, n_pieces_))
+      return of(node, workers.ranks ? workers.ranks->owner(first, n_pieces_) : 0);
+    T sum = below<T>(2 * node, first, n / 2, workers, of);
+    sum.add(below<T>(2 * node + 1, first + n / 2, n / 2, workers, of));
     return sum;
   }
 
@@ -90,17 +163,6 @@ class PieceSums {
   std::vector<std::optional<Sum>>
       nodes_;  // of a binary tree: node k has 2k and 2k + 1 below it, the last n_pieces are the pieces
   std::mutex mutex_;
-};
-
-/// A sum of vectors.
-struct VectorSum {
-  Eigen::VectorXd sum;
-
-  void add(const VectorSum& other) { sum += other.sum; }
-  template <typename Work>
-  void for_each(const Work& work) {
-    work(sum.data(), sum.size());
-  }
 };
 
 }  // namespace gp2

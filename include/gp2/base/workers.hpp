@@ -4,6 +4,7 @@
 #include <memory>
 #include <span>
 #include <utility>
+#include <vector>
 
 #include "gp2/export.hpp"
 
@@ -18,6 +19,8 @@ class Ranks {
   [[nodiscard]] virtual int size() const = 0;
   /// The numbers of one rank, to all.
   virtual void broadcast(std::span<double> numbers, int from) const = 0;
+  /// What each rank has for each other: to[k] goes to rank k, and what rank k has for this one into from[k], which has its size.
+  virtual void exchange(const std::vector<std::vector<double>>& to, std::vector<std::vector<double>>& from) const = 0;
 
   /// The rank that works on one of so many parts.
   [[nodiscard]] int owner(int part, int n_parts) const { return size() < n_parts ? part * size() / n_parts : part; }
