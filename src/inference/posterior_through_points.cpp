@@ -87,8 +87,7 @@ void Posterior::Implementation::linearise_kept(const Workers& workers) {
   if (about) return;
   throw NumericalError(
       "at a state that was observed there is no motion under the posterior mean of the latents: the load grows with the force "
-      "that it "
-      "makes");
+      "that it makes");
 }
 
 namespace {

@@ -668,8 +668,12 @@ class TrainingThroughPoints {
 
   [[nodiscard]] InducingChoice chosen(const std::vector<Observations>& observations,
                                       const std::vector<Hyperparameter>& hyperparameters) const {
-    return choose_inducing_points(prior_, observations, model_values(prior_, observations, hyperparameters),
-                                  {.most = options_.n_inducing});
+    ModelValues values = model_values(prior_, observations, hyperparameters);
+    const InducingOptions options{.most = options_.n_inducing};
+    const InducingChoice choice = choose_inducing_points(prior_, observations, values, options);
+    // how strongly a latent acts that is not linear is known through points alone, and decides where they should be
+    values.about = linearised(observations, hyperparameters, choice.points, all_workers());
+    return values.about ? choose_inducing_points(prior_, observations, values, options) : choice;
   }
 
   // With the signals as they were at first that have all but vanished; none: there are no such.
