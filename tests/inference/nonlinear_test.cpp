@@ -640,6 +640,7 @@ TEST(NonlinearInducing, PointsAtEveryStateChangeNothing) {
     const auto evaluate = [&](const ModelValues& values, ModelGradient& gradient) {
       Likelihood::Options options;
       options.noise_gradient = true;
+      options.gradient_parameters = {0};
       const Likelihood likelihood(fitted.prior, fitted.observations, values, options);
       Likelihood::Workspace workspace;
       return likelihood.evaluate(values, &gradient, workspace);
@@ -652,6 +653,8 @@ TEST(NonlinearInducing, PointsAtEveryStateChangeNothing) {
       EXPECT_LE(test::largest(of_points.log_signal_stddev[a] - of_exact.log_signal_stddev[a]), 1e-6 * std::abs(nll));
     }
     EXPECT_LE(test::largest(of_points.log_noise_stddev[0] - of_exact.log_noise_stddev[0]), 1e-6 * std::abs(nll));
+    EXPECT_NEAR(of_points.parameters[0], of_exact.parameters[0], 1e-6 * (std::abs(nll) + std::abs(of_exact.parameters[0])));
+    EXPECT_NE(of_points.parameters[0], 0);
   }
 }
 
@@ -741,8 +744,7 @@ TEST(NonlinearInducing, MoreObservationsAddToTheSums) {
   EXPECT_EQ(grown.marginal(p.ddq(), states).covariance, got.covariance);
 }
 
-TEST(NonlinearInducing, AFitIsNearlyTheExactOne) {
-  const Fitted fitted(rubbing_bead("lambda", "constant + matern32"), 500);
+void expect_nearly_exact(const Fitted& fitted) {
   const std::vector<Hyperparameter> start = default_hyperparameters(fitted.prior, fitted.observations, {}, {});
   FitOptions options;
   options.n_restarts = 1;
@@ -756,6 +758,46 @@ TEST(NonlinearInducing, AFitIsNearlyTheExactOne) {
   const MatrixXd states = test::draw(fitted.model, 100, nonlinear_seed + 1).states;
   const Posterior::Marginal got = through.posterior.marginal(view, states), wanted = exact.posterior.marginal(view, states);
   EXPECT_LE(test::largest(got.mean - wanted.mean), 0.5 * test::largest(wanted.stddev()));
+}
+
+TEST(NonlinearInducing, AFitIsNearlyTheExactOne) {
+  expect_nearly_exact(Fitted(rubbing_bead("lambda", "constant + matern32"), 500));
+}
+
+TEST(NonlinearInducing, AFitStoppedAnywhereHasWhatWasFoundExactlyToo) {
+  const Fitted fitted(rubbing_bead("lambda", "constant + matern32"), 120);
+  const std::vector<Hyperparameter> start = default_hyperparameters(fitted.prior, fitted.observations, {}, {});
+  for (const int n_inducing : {0, 20}) {
+    FitOptions options;
+    options.n_restarts = 1;
+    options.n_threads = 1;
+    options.n_inducing = n_inducing;
+    int n_calls = 0;
+    options.progress = [&](const Progress&) { ++n_calls; };
+    static_cast<void>(fit(fitted.prior, fitted.observations, start, options));
+    for (const int call : {1, n_calls / 2, n_calls - 1}) {
+      SCOPED_TRACE(fmt::format("{} points, after {} of {}", n_inducing, call, n_calls));
+      std::atomic<bool> stop = false;
+      int n = 0;
+      options.stop = &stop;
+      options.progress = [&](const Progress&) { stop = ++n >= call; };
+      const Fit found = fit(fitted.prior, fitted.observations, start, options);
+      EXPECT_EQ(found.report.termination, FitReport::interrupted);
+      EXPECT_FALSE(found.report.converged);
+      EXPECT_TRUE(std::isfinite(found.report.objective));
+      const Observations& group = fitted.observations.front();
+      EXPECT_TRUE(found.posterior.mean(group.view(), group.states()).allFinite());
+    }
+  }
+}
+
+// Points are chosen by how strongly the latent acts where it is: here 30 times as strongly as where nothing is known.
+TEST(NonlinearInducing, AFitOfAPositiveLatentFarFromOneIsNearlyTheExactOne) {
+  std::string text = rubbing_bead("lambda", "constant + matern32", "positive = true").text;
+  for (const char* row : {"\"-load*dx/v\"", "\"-load*dz/v\""}) {
+    text.insert(text.find(row) + 2, "0.01*");
+  }
+  expect_nearly_exact(Fitted(Model::parse(text, "bead"), 500));
 }
 
 TEST(NonlinearPrior, IsRefusedByNameWhereItCannotBe) {
