@@ -166,7 +166,7 @@ class Posterior {
 
 /// The posterior of more observations, by extending its factor: O(n²) operations for each new number, where the reduced size is n
 /// and a posterior built anew takes O(n³). The same as that one to rounding. Hyperparameters and parameters of the system are
-/// held, and with them all scales. A nonlinear prior is conditioned anew: where its latents are linearised moves with every state.
+/// held, and with them all scales. A nonlinear prior is conditioned anew, or through inducing points what was there stays linearised.
 ///
 ///     posterior = update(std::move(posterior), {x, ddq, y, sigma});
 ///

@@ -83,9 +83,13 @@ InducingChoice choose_inducing_points(const Prior& prior, const std::vector<Obse
   require_values(prior, observations, values);
   require_no_potential(prior);
   const int n_all = n_states(observations);
-  const std::vector<Observations> some = n_all > options.n_candidates ? evenly(observations, options.n_candidates) : observations;
+  const bool are_all = n_all <= options.n_candidates;
+  const std::vector<Observations> some = are_all ? observations : evenly(observations, options.n_candidates);
+  Linearisation about;  // where that is known; else where no latent acts
+  if (values.about) about = are_all ? *values.about : take(*values.about, evenly_taken(observations, options.n_candidates));
   Reduction reduction;
-  reduce(prior, some, require_models(prior, some, values.parameters, nullptr), values.noise_stddev, reduction);
+  reduce(prior, some, require_models(prior, some, values.parameters, values.about ? &about : nullptr), values.noise_stddev,
+         reduction);
   const LatentRows rows = latent_rows(prior, some, reduction, values);
   const Index n = rows.n_samples();
   std::vector<Candidates> latents;
@@ -126,9 +130,10 @@ VectorXd left_out_by_points(const Prior& prior, const std::vector<Observations>&
       sum.sum[static_cast<Index>(a)] += (block.weight_product(f, f) * left).sum();
     }
   };
-  std::optional<VectorSum> all = sum_over_blocks(latents, BlocksOfStates(prior, observations, values), false, workers, nullptr,
-                                                 VectorSum{VectorXd::Zero(std::ssize(prior.latents))}, add);
-  if (!all) static_cast<void>(require_models(prior, observations, values.parameters, nullptr));  // names the state
+  const BlocksOfStates blocks(prior, observations, values, values.about.get());
+  std::optional<VectorSum> all =
+      sum_over_blocks(latents, blocks, false, workers, nullptr, VectorSum{VectorXd::Zero(std::ssize(prior.latents))}, add);
+  if (!all) static_cast<void>(require_models(prior, observations, values.parameters, values.about.get()));  // names the state
   return std::move(all->sum);
 }
 

@@ -52,6 +52,8 @@ class InducingPosterior final : public LatentPosterior {
   /// Whether B is positive definite in double precision.
   [[nodiscard]] bool factorise();
   [[nodiscard]] const InducingLatents& inducing() const { return inducing_; }
+  /// B⁻¹c
+  [[nodiscard]] const Eigen::VectorXd& mean() const { return mean_; }
   /// What all observations say.
   [[nodiscard]] const InducingStatistics& all() const { return all_; }
   [[nodiscard]] std::unique_ptr<LatentPosterior> clone() const override { return std::make_unique<InducingPosterior>(*this); }

@@ -52,6 +52,27 @@ void InducingLatents::solve(bool transposed, Ref<MatrixXd> c) const {
   }
 }
 
+std::vector<MatrixXd> InducingLatents::at(const std::vector<MatrixXd>& features, const Ref<const VectorXd>& m) const {
+  std::vector<MatrixXd> f;
+  VectorXd point;
+  KernelColumns::Workspace workspace;
+  Index first = 0;
+  for (std::size_t a = 0; a < latents_.size(); ++a) {
+    const OfLatent& latent = latents_[a];
+    MatrixXd k(latent.kernel.n_rows(), features[a].rows());
+    for (Index i = 0; i < k.cols(); ++i) {
+      latent.kernel.scale(features[a].row(i).transpose(), point);
+      latent.kernel.evaluate(0, k.rows(), point, k.col(i).data(), workspace);
+    }
+    MatrixXd w = k.topRows(latent.n_points());
+    lapack::solve_lower(latent.L, false, w);
+    const Index n_variables = latent.n_points() * latent.n_functions;
+    f.emplace_back(m.segment(first, n_variables).reshaped(latent.n_points(), latent.n_functions).transpose() * w);
+    first += n_variables;
+  }
+  return f;
+}
+
 InducingBlock::InducingBlock(const InducingLatents& latents)
     : latents_(&latents), k_(latents.latents().size()), w_(k_.size()), variance_(k_.size()), left_(k_.size()) {}
 

@@ -51,6 +51,10 @@ class InducingLatents {
   [[nodiscard]] const std::vector<Function>& functions() const { return functions_; }
   [[nodiscard]] const OfLatent& latent_of(const Function& function) const { return latents_[function.latent]; }
 
+  /// f_a at n states where the whitened inducing variables are m, per latent (F × n).
+  /// @param features  per latent (n × D)
+  [[nodiscard]] std::vector<Eigen::MatrixXd> at(const std::vector<Eigen::MatrixXd>& features,
+                                                const Eigen::Ref<const Eigen::VectorXd>& m) const;
   /// c ← L⁻¹c, or L⁻ᵀc, of all functions.
   void solve(bool transposed, Eigen::Ref<Eigen::MatrixXd> c) const;
 

@@ -173,7 +173,7 @@ void Likelihood::Implementation::prepare(const ModelValues& initial) {
 }
 
 void Likelihood::Implementation::prepare_blocks(const ModelValues& initial) {
-  const BlocksOfStates blocks(prior, observations, initial);
+  const BlocksOfStates blocks(prior, observations, initial, about.get());
   const Index n = blocks.n_blocks();
   std::vector<BlocksOfStates::Kept> kept(static_cast<std::size_t>(n));
   std::atomic<std::size_t> bytes = 0;
@@ -195,7 +195,7 @@ void Likelihood::Implementation::prepare_blocks(const ModelValues& initial) {
       bytes += of_block.bytes();
     }
   });
-  if (!is_sound) static_cast<void>(require_models(prior, observations, initial.parameters, nullptr));  // names the state
+  if (!is_sound) static_cast<void>(require_models(prior, observations, initial.parameters, about.get()));  // names the state
   initial_size = static_cast<int>(options.workers.sum(size));
   if (options.gradient_parameters.empty() && bytes <= BlocksOfStates::most_kept_bytes) kept_blocks = std::move(kept);
 }
@@ -275,7 +275,8 @@ double Likelihood::evaluate(const ModelValues& values, ModelGradient* gradient, 
   std::unique_ptr<RowBlocks> blocks;
   std::unique_ptr<InducingGram> through_points;
   if (values.inducing) {
-    blocks = std::make_unique<BlocksOfStates>(self.prior, self.observations, values, self.options.gradient_parameters,
+    blocks = std::make_unique<BlocksOfStates>(self.prior, self.observations, values, self.about.get(),
+                                              self.options.gradient_parameters,
                                               self.kept_blocks.empty() ? nullptr : &self.kept_blocks);
     through_points = std::make_unique<InducingGram>(InducingLatents(self.prior, values), work.workers, work.stop);
   } else {

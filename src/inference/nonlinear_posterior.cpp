@@ -1,11 +1,16 @@
 #include <algorithm>
+#include <atomic>
 #include <cmath>
+#include <functional>
 #include <limits>
 
 #include <fmt/format.h>
 
+#include "base/lapack.hpp"
+#include "base/parallel.hpp"
 #include "gp2/error.hpp"
 #include "inference/dense_gram.hpp"
+#include "inference/inducing_gram.hpp"
 #include "inference/latent_sums.hpp"
 #include "inference/nonlinear_motion.hpp"
 #include "inference/posterior_implementation.hpp"
@@ -46,10 +51,12 @@ struct LatentValues {
   }
 };
 
-/// What observations say of the latents of a nonlinear prior.
-class NonlinearFit {
+/// What observations say of the latents of a nonlinear prior, exactly: `self` is conditioned under the linear one.
+class ExactFit {
  public:
-  explicit NonlinearFit(Posterior::Implementation& self) : self_(self) {
+  using Point = LatentValues;
+
+  explicit ExactFit(Posterior::Implementation& self) : self_(self) {
     for (const Observations& group : self.observations) {
       OfGroup& of = groups_.emplace_back();
       const Prior& there = prior_of(self.prior, group.view());
@@ -104,7 +111,7 @@ class NonlinearFit {
     return 0.5 * sum;
   }
 
-  // The posterior mean of the linear prior that `self` is conditioned under.
+  // The posterior mean of the linear prior that condition() was given.
   [[nodiscard]] LatentValues mean() const {
     LatentValues mean = zero();
     std::vector<MatrixXd> features;
@@ -147,13 +154,88 @@ class NonlinearFit {
   std::vector<std::int64_t> first_of_;
 };
 
-}  // namespace
+/// Whitened inducing variables m.
+struct InducingValues {
+  VectorXd m;
 
-void Posterior::Implementation::condition_nonlinear() {
+  [[nodiscard]] InducingValues towards(const InducingValues& to, double t) const { return {m + t * (to.m - m)}; }
+  [[nodiscard]] double squared_distance(const InducingValues& other) const { return (m - other.m).squaredNorm(); }
+};
+
+/// What observations say of the inducing variables of a nonlinear prior. Rows about m are those of a linear prior, exact at m, so that
+/// one pass over them has the objective there and all that the step from there needs.
+class FitThroughPoints {
+ public:
+  using Point = InducingValues;
+
+  FitThroughPoints(const Prior& prior, const std::vector<Observations>& observations, const ModelValues& values,
+                   const InducingLatents& latents, const Workers& workers)
+      : prior_(prior), observations_(observations), values_(values), latents_(latents), workers_(workers) {}
+
+  [[nodiscard]] InducingValues zero() const { return {VectorXd::Zero(latents_.size())}; }
+
+  // Nothing where some state has no motion.
+  [[nodiscard]] std::shared_ptr<const Linearisation> about(const InducingValues& at) const {
+    return linearise_through_points(prior_, observations_, values_, latents_, at.m, workers_);
+  }
+
+  // ½ |m|² + ½ Σ |S^{-1/2}(y − v(m))|², S enlarged by what points leave of local latents
+  [[nodiscard]] double objective(const InducingValues& at, const Linearisation& about) {
+    struct Sum {
+      InducingStatistics of_blocks;
+      double misfit = 0;
+      MatrixXd memory = {};
+      void add(const Sum& other) {
+        of_blocks.add(other.of_blocks);
+        misfit += other.misfit;
+      }
+      void for_each(const std::function<void(double*, Index)>& take) {
+        of_blocks.for_each(take);
+        take(&misfit, 1);
+      }
+    };
+    std::optional<Sum> sum = sum_over_blocks(latents_, BlocksOfStates(prior_, observations_, values_, &about), false, workers_,
+                                             nullptr, Sum{InducingStatistics(latents_)},
+                                             [&](Sum& of_piece, int, const RowBlock& rows, const InducingBlock& block) {
+                                               of_piece.of_blocks.add(latents_, block, of_piece.memory);
+                                               of_piece.misfit += block.misfit(at.m).squaredNorm();
+                                               for (const Reduction::Sample& sample : rows.rows.reduction->samples)
+                                                 of_piece.misfit += sample.e_out.squaredNorm();
+                                             });
+    if (!sum) return std::numeric_limits<double>::infinity();
+    linear_ = std::move(sum->of_blocks);
+    return 0.5 * (at.m.squaredNorm() + sum->misfit);
+  }
+
+  [[nodiscard]] InducingValues mean() const { return {mean_}; }
+
+  // of the linear prior whose objective was the last
+  void condition(const std::shared_ptr<const Linearisation>& /*about*/) {
+    linear_.B.diagonal().array() += 1;
+    if (!lapack::factorise(linear_.B)) throw_not_definite();
+    mean_ = std::move(linear_.c);
+    lapack::solve_lower(linear_.B, false, mean_);
+    lapack::solve_lower(linear_.B, true, mean_);
+  }
+
+ private:
+  const Prior& prior_;
+  const std::vector<Observations>& observations_;
+  const ModelValues& values_;
+  const InducingLatents& latents_;
+  const Workers& workers_;
+  InducingStatistics linear_;
+  VectorXd mean_;
+};
+
+// Gauss–Newton steps to the posterior mean, each to the one of the linear prior about where the last has led. Returns where the prior is
+// linear in the end.
+template <typename NonlinearFit>
+std::shared_ptr<const Linearisation> find_mean(NonlinearFit& fit, const Prior& prior,
+                                               const std::vector<Observations>& observations, const ModelValues& values) {
   constexpr int most = 100;
   constexpr double enough = 1e-7;  // of the size of the latents, as the prior measures it, which knows hardly more digits
-  NonlinearFit fit(*this);
-  LatentValues at = fit.zero();
+  typename NonlinearFit::Point at = fit.zero();
   std::shared_ptr<const Linearisation> linearisation = fit.about(at);
   if (!linearisation) static_cast<void>(require_models(prior, observations, values.parameters, nullptr));  // names the state
   double objective = fit.objective(at, *linearisation);
@@ -164,13 +246,13 @@ void Posterior::Implementation::condition_nonlinear() {
       if (step == 0) throw;
       break;  // next to a jam slopes have no bound
     }
-    const LatentValues target = fit.mean();
+    const typename NonlinearFit::Point target = fit.mean();
     const double distance = std::sqrt(target.squared_distance(at) / (1 + target.squared_distance(fit.zero())));
-    if (distance <= enough) return;
+    if (distance <= enough) return linearisation;
     // as far towards the optimum of the linear one as the nonlinear one gets better
     double t = 1;
     for (; t > 1e-10; t /= 2) {
-      LatentValues next = at.towards(target, t);
+      typename NonlinearFit::Point next = at.towards(target, t);
       const auto there = fit.about(next);
       if (!there) continue;
       const double lower = fit.objective(next, *there);
@@ -181,7 +263,7 @@ void Posterior::Implementation::condition_nonlinear() {
       break;
     }
     if (t > 1e-10) continue;
-    if (distance <= 1e-4) return;  // rounding of the objective
+    if (distance <= 1e-4) return linearisation;  // rounding of the objective
     break;
   }
   Index n_values = 0;
@@ -193,8 +275,49 @@ void Posterior::Implementation::condition_nonlinear() {
       std::sqrt(2 * objective / static_cast<double>(n_values))));
 }
 
+}  // namespace
+
+void Posterior::Implementation::condition_nonlinear() {
+  ExactFit fit(*this);
+  static_cast<void>(find_mean(fit, prior, observations, values));
+}
+
+std::shared_ptr<const Linearisation> linearise_through_points(const Prior& prior, const std::vector<Observations>& observations,
+                                                              const ModelValues& values, const InducingLatents& latents,
+                                                              const VectorXd& m, const Workers& workers) {
+  auto linearisation = std::make_shared<Linearisation>();
+  for (const Observations& group : observations) {
+    const Prior& there = prior_of(prior, group.view());
+    Linearisation::OfGroup& of_group = linearisation->groups.emplace_back();
+    for (const Latent& latent : there.latents) of_group.signals.emplace_back(latent.size(), group.n_data());
+    of_group.multipliers.resize(there.system->nc(), group.n_data());
+  }
+  const BlocksOfStates blocks(prior, observations, values, nullptr);
+  std::atomic<bool> is_sound = true;
+  parallel_for(static_cast<int>(blocks.n_blocks()), workers.n_threads, [&](int b, int) {
+    if (!is_sound) return;
+    const auto& [g, first, n] = blocks.states(b);
+    const Prior& there = prior_of(prior, observations[g].view());
+    const auto states = observations[g].states().middleCols(first, n);
+    std::vector<MatrixXd> features;
+    for (std::size_t a = 0; a < there.latents.size(); ++a) features.push_back(evaluate_features(there, a, states));
+    const std::vector<MatrixXd> f = latents.at(features, m);
+    for (std::size_t a = 0; a < f.size(); ++a) {
+      linearisation->groups[g].signals[a].middleCols(first, n).noalias() = values.loading(a) * f[a];
+    }
+    if (!blocks.solve_multipliers(b, *linearisation)) is_sound = false;
+  });
+  return is_sound ? linearisation : nullptr;
+}
+
 std::shared_ptr<const Linearisation> linearisation_of(const Prior& prior, const std::vector<Observations>& observations,
-                                                      const ModelValues& values) {
+                                                      const ModelValues& values, const Workers& workers) {
+  const lapack::SingleThread single_thread;
+  if (values.inducing) {
+    const InducingLatents latents(prior, values);
+    FitThroughPoints fit(prior, observations, values, latents, workers);
+    return find_mean(fit, prior, observations, values);
+  }
   Posterior::Implementation self(prior, observations, values);
   self.condition(1);
   return self.about;

@@ -33,6 +33,16 @@ ObservationModel::Values zero_like(ObservationModel::Values values) {
 
 }  // namespace
 
+Linearisation take(const Linearisation& of, const std::vector<std::vector<int>>& states) {
+  Linearisation taken;
+  for (std::size_t g = 0; g < of.groups.size(); ++g) {
+    Linearisation::OfGroup& group = taken.groups.emplace_back();
+    for (const MatrixXd& s : of.groups[g].signals) group.signals.emplace_back(s(Eigen::all, states[g]));
+    group.multipliers = of.groups[g].multipliers(Eigen::all, states[g]);
+  }
+  return taken;
+}
+
 bool model_observations(const Prior& prior, const std::vector<Observations>& observations, const VectorXd& parameters,
                         const std::vector<int>& gradient_parameters, const Linearisation* about,
                         std::vector<ObservationModel>& models) {

@@ -22,6 +22,9 @@ struct ObservationModel {
   MechanicsBatch mechanics;         // that they come from
 };
 
+/// Of some states of each Observations, [group][state].
+Linearisation take(const Linearisation& of, const std::vector<std::vector<int>>& states);
+
 /// @param about   where a nonlinear prior is linearised; null: where no latent acts
 /// @param models  receives one per Observations; what it held is memory to be used again
 /// @returns whether neither the mechanics nor the prior have a fault at any state.

@@ -49,9 +49,12 @@ struct Posterior::Implementation {
   /// @param first_group   the group of `observations` that groups[0] is, or is going to be
   /// @throws as the constructor of Posterior.
   void add_samples(const std::vector<Observations>& groups, const std::vector<Eigen::VectorXd>& noise_stddev, int first_group);
-  /// What condition and add_samples are through inducing points: of many observations some are kept.
+  /// What condition and add_samples are through inducing points: of many observations some are kept. What is added to a nonlinear prior
+  /// is linearised at the posterior mean of all; what was there stays as it was.
   void condition_through_points(const Workers& workers);
   void add_through_points(const Observations& more, std::size_t group);
+  /// Sets `about` for the observations that are here, of a nonlinear prior through points.
+  void linearise_kept(const Workers& workers);
   /// Takes samples away, at rising indices; `observations` stay as they are.
   void erase_samples(const std::vector<Eigen::Index>& gone);
   /// Groups without states go, but for those that the constructor was given.
@@ -60,9 +63,15 @@ struct Posterior::Implementation {
 
 [[noreturn]] void throw_not_definite();
 
-/// Where a nonlinear prior is linearised under these values: at its posterior mean. @throws as Posterior
+/// Where a nonlinear prior is linearised under these values: at its posterior mean, through their inducing points where they have some.
+/// @throws as Posterior
 std::shared_ptr<const Linearisation> linearisation_of(const Prior& prior, const std::vector<Observations>& observations,
-                                                      const ModelValues& values);
+                                                      const ModelValues& values, const Workers& workers = {});
+
+/// Where a nonlinear prior is linearised about whitened inducing variables m; null where some state has no motion.
+std::shared_ptr<const Linearisation> linearise_through_points(const Prior& prior, const std::vector<Observations>& observations,
+                                                              const ModelValues& values, const InducingLatents& latents,
+                                                              const Eigen::VectorXd& m, const Workers& workers);
 
 /// Which samples are of which component: each of one that chance chooses, by the seed and its number alone.
 std::vector<std::vector<Eigen::Index>> samples_of_components(int n_components, int n_samples, std::uint64_t seed);

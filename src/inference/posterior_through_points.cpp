@@ -1,3 +1,4 @@
+#include <cmath>
 #include <numeric>
 #include <utility>
 
@@ -13,14 +14,17 @@
 // Posteriors through inducing points: sums over all observations, of which some are kept.
 namespace gp2 {
 
+using Eigen::VectorXd;
+
 namespace {
 
 /// @throws InputError as require_models
 InducingStatistics require_statistics(const Prior& prior, const std::vector<Observations>& observations,
-                                      const ModelValues& values, const InducingLatents& latents, const Workers& workers) {
+                                      const ModelValues& values, const Linearisation* about, const InducingLatents& latents,
+                                      const Workers& workers) {
   std::optional<InducingStatistics> statistics =
-      InducingStatistics::of(latents, BlocksOfStates(prior, observations, values), workers);
-  if (!statistics) static_cast<void>(require_models(prior, observations, values.parameters, nullptr));  // names the state
+      InducingStatistics::of(latents, BlocksOfStates(prior, observations, values, about), workers);
+  if (!statistics) static_cast<void>(require_models(prior, observations, values.parameters, about));  // names the state
   return *std::move(statistics);
 }
 
@@ -44,6 +48,8 @@ void keep_some(std::vector<Observations>& observations, KeptStates& kept) {
 
 void Posterior::Implementation::condition_through_points(const Workers& workers) {
   constexpr std::size_t n_stretches = LeftOut::n_stretches;
+  const std::shared_ptr<const Linearisation> linearisation =
+      prior.is_nonlinear() ? linearisation_of(prior, observations, values, workers) : nullptr;
   KeptStates all;
   std::vector<std::vector<std::vector<int>>> states;  // by Observations and stretch
   for (const Observations& group : observations) {
@@ -58,21 +64,64 @@ void Posterior::Implementation::condition_through_points(const Workers& workers)
   std::vector<InducingStatistics> stretches;
   for (std::size_t k = 0; k < n_stretches; ++k) {
     std::vector<Observations> stretch;
-    for (std::size_t g = 0; g < observations.size(); ++g) stretch.push_back(observations[g].take(states[g][k]));
-    stretches.push_back(require_statistics(prior, stretch, values, inducing, workers));
+    std::vector<std::vector<int>> of_stretch;
+    for (std::size_t g = 0; g < observations.size(); ++g) {
+      stretch.push_back(observations[g].take(states[g][k]));
+      of_stretch.push_back(states[g][k]);
+    }
+    const Linearisation about = linearisation ? take(*linearisation, of_stretch) : Linearisation();
+    stretches.push_back(require_statistics(prior, stretch, values, linearisation ? &about : nullptr, inducing, workers));
   }
   auto through = std::make_shared<InducingPosterior>(std::move(inducing), std::move(stretches));
   if (!through->factorise()) throw_not_definite();
   latents = std::move(through);
   kept = std::move(all);
   keep_some(observations, *kept);
+  linearise_kept(workers);
 }
+
+void Posterior::Implementation::linearise_kept(const Workers& workers) {
+  if (!prior.is_nonlinear()) return;
+  const auto& through = static_cast<const InducingPosterior&>(*latents);
+  about = linearise_through_points(prior, observations, values, through.inducing(), through.mean(), workers.n_threads);
+  if (about) return;
+  throw NumericalError(
+      "at a state that was observed there is no motion under the posterior mean of the latents: the load grows with the force "
+      "that it makes");
+}
+
+namespace {
+
+// Of more observations, at the posterior mean of all: rows about it move it, and about where it has moved they are others.
+// Returns the latents given all.
+std::shared_ptr<LatentPosterior> nonlinear_with(const InducingPosterior& before, const Prior& prior,
+                                                const std::vector<Observations>& added, const ModelValues& values) {
+  constexpr int most = 50;
+  constexpr double enough = 1e-7;  // of the size of the latents, as of the first fit
+  VectorXd mean = before.mean();
+  for (int step = 0; step < most; ++step) {
+    const auto about = linearise_through_points(prior, added, values, before.inducing(), mean, 1);
+    if (!about) break;
+    auto all = std::make_shared<InducingPosterior>(before);
+    if (!all->append(BlocksOfStates(prior, added, values, about.get()))) throw_not_definite();
+    const double distance = (all->mean() - mean).norm() / std::sqrt(1 + mean.squaredNorm());
+    if (distance <= enough) return all;
+    mean = all->mean();
+  }
+  throw NumericalError(
+      "update: the posterior of latents that enter nonlinearly was not found from the sums of the observations before: fit all "
+      "observations together");
+}
+
+}  // namespace
 
 void Posterior::Implementation::add_through_points(const Observations& more, std::size_t group) {
   const std::vector<Observations> added = {more};
   ModelValues under = values;
   under.noise_stddev = {more.noise().stddev()};
-  if (!latents->append(BlocksOfStates(prior, added, under))) {
+  if (prior.is_nonlinear()) {
+    latents = nonlinear_with(static_cast<const InducingPosterior&>(*latents), prior, added, under);
+  } else if (!latents->append(BlocksOfStates(prior, added, under, nullptr))) {
     static_cast<void>(require_models(prior, added, values.parameters, nullptr));  // names the state
     throw_not_definite();
   }
@@ -90,6 +139,7 @@ void Posterior::Implementation::add_through_points(const Observations& more, std
   }
   observations[group].append(more.take(states));
   keep_some(observations, *kept);
+  linearise_kept(1);
 }
 
 Posterior Posterior::of_summary(const Prior& prior, const std::vector<Observations>& observations,
@@ -106,6 +156,7 @@ Posterior Posterior::of_summary(const Prior& prior, const std::vector<Observatio
     if (!through->factorise()) throw_not_definite();
     self->latents = std::move(through);
     self->kept = summary.kept;
+    self->linearise_kept(1);
     components.push_back(std::move(self));
   }
   return Posterior(std::move(components));

@@ -18,7 +18,7 @@ namespace {
 
 std::shared_ptr<Posterior::Implementation> copy_of(const Posterior::Implementation& of) {
   auto copy = std::make_shared<Posterior::Implementation>(of);
-  if (!of.prior.is_nonlinear()) copy->latents = of.latents->clone();  // else it is conditioned anew
+  if (!of.prior.is_nonlinear() || of.kept) copy->latents = of.latents->clone();  // else it is conditioned anew
   return copy;
 }
 
@@ -100,7 +100,10 @@ Posterior forget(Posterior&& posterior, double share) {
   }
   const lapack::SingleThread single_thread;
   const auto own = posterior.own_components();
-  for (const auto& component : own) component->latents->forget(share);
+  for (const auto& component : own) {
+    component->latents->forget(share);
+    component->linearise_kept(1);
+  }
   posterior.components_.clear();
   return Posterior(Posterior::Components(own.begin(), own.end()));
 }

@@ -143,7 +143,6 @@ void require_learnable(const Prior& prior, const std::vector<Observations>& obse
   const auto fail = [](const std::string& text) {
     throw InputError(fmt::format("a latent that is positive or reads lambda is not linear: {}", text));
   };
-  if (values.inducing) fail("it is not learned through inducing points; use `inducing=none` and fewer rows");
   for (const Observations& group : observations) {
     const Prior& there = prior_of(prior, group.view());
     if (group.has_sums()) fail("it is not learned from sums over states");

@@ -4,6 +4,7 @@
 #include <utility>
 
 #include "data/evenly.hpp"
+#include "inference/nonlinear_motion.hpp"
 
 namespace gp2 {
 
@@ -41,10 +42,11 @@ double largest_b(const Prior& prior, const Observations& group, const Eigen::Vec
 }  // namespace
 
 BlocksOfStates::BlocksOfStates(const Prior& prior, const std::vector<Observations>& observations, const ModelValues& values,
-                               std::vector<int> gradient_parameters, const std::vector<Kept>* kept)
+                               const Linearisation* about, std::vector<int> gradient_parameters, const std::vector<Kept>* kept)
     : prior_(prior),
       observations_(observations),
       values_(values),
+      about_(about),
       gradient_parameters_(std::move(gradient_parameters)),
       kept_(kept) {
   const bool makes_blocks =
@@ -77,7 +79,17 @@ const RowBlock* BlocksOfStates::block(Index b, bool with_derivatives, Memory& me
     memory.models.resize(1);
     memory.models.front().mechanics.size_of_b_elsewhere = size_of_b_[group];
     const std::vector<int> in = with_derivatives ? gradient_parameters_ : std::vector<int>{};
-    if (!model_observations(prior_, memory.observations, values_.parameters, in, nullptr, memory.models)) return nullptr;
+    const Linearisation* about = nullptr;
+    if (about_ != nullptr) {
+      const Linearisation::OfGroup& of_group = about_->groups[group];
+      memory.about.groups.resize(1);
+      Linearisation::OfGroup& of_block = memory.about.groups.front();
+      of_block.signals.resize(of_group.signals.size());
+      for (std::size_t a = 0; a < of_group.signals.size(); ++a) of_block.signals[a] = of_group.signals[a].middleCols(first, n);
+      of_block.multipliers = of_group.multipliers.middleCols(first, n);
+      about = &memory.about;
+    }
+    if (!model_observations(prior_, memory.observations, values_.parameters, in, about, memory.models)) return nullptr;
     block.models = &memory.models;
   }
   reduce(prior_, memory.observations, *block.models, {values_.noise_stddev[group]}, memory.reduction);
@@ -85,6 +97,26 @@ const RowBlock* BlocksOfStates::block(Index b, bool with_derivatives, Memory& me
                    ? latent_rows(prior_, memory.observations, memory.reduction, values_)
                    : latent_rows(prior_, sorted_features(prior_, {kept->features}, memory.reduction), memory.reduction, values_);
   return &block;
+}
+
+bool BlocksOfStates::solve_multipliers(Index b, Linearisation& at) const {
+  const auto& [g, first, n] = states(b);
+  const Observations& group = observations_[g];
+  const Prior& there = prior_of(prior_, group.view());
+  const Eigen::VectorXd parameters = parameters_of(group.view(), values_.parameters);
+  const auto states = group.states().middleCols(first, n);
+  MechanicsBatch mechanics;
+  mechanics.size_of_b_elsewhere = size_of_b_[g];
+  evaluate_mechanics(there, group.view(), states, parameters, mechanics);
+  if (mechanics.fault) return false;
+  PriorValues at_known_load = evaluate_prior(there, states, parameters, mechanics);
+  if (at_known_load.fault) return false;
+  Linearisation::OfGroup& of_group = at.groups[g];
+  Linearisation::OfGroup of_block;
+  for (const Eigen::MatrixXd& s : of_group.signals) of_block.signals.emplace_back(s.middleCols(first, n));
+  if (NonlinearMotion(there, states, parameters, mechanics, std::move(at_known_load)).solve(of_block)) return false;
+  of_group.multipliers.middleCols(first, n) = of_block.multipliers;
+  return true;
 }
 
 BlocksOfStates::Kept BlocksOfStates::keep(const RowBlock& block, bool with_reduction) const {

@@ -25,6 +25,7 @@ class RowBlocks {
   struct Memory {
     std::vector<Observations> observations;
     std::vector<ObservationModel> models;
+    Linearisation about;
     Reduction reduction;
     RowBlock block;
   };
@@ -62,26 +63,33 @@ class BlocksOfStates final : public RowBlocks {
     [[nodiscard]] std::size_t bytes() const;
   };
 
+  struct States {
+    std::size_t group;
+    int first, n;
+  };
+
   /// What it is given by reference must outlive it.
+  /// @param about                where a nonlinear prior is linear, at all states; null: where no latent acts
   /// @param gradient_parameters  in which the models may have derivatives
   /// @param kept                 of keep(), for the same observations; null: every block is made anew each time
   BlocksOfStates(const Prior& prior, const std::vector<Observations>& observations, const ModelValues& values,
-                 std::vector<int> gradient_parameters = {}, const std::vector<Kept>* kept = nullptr);
+                 const Linearisation* about, std::vector<int> gradient_parameters = {}, const std::vector<Kept>* kept = nullptr);
 
   [[nodiscard]] Eigen::Index n_blocks() const override { return std::ssize(states_); }
   [[nodiscard]] const RowBlock* block(Eigen::Index b, bool with_derivatives, Memory& memory) const override;
+
+  [[nodiscard]] const States& states(Eigen::Index b) const { return states_[static_cast<std::size_t>(b)]; }
+  /// Of a nonlinear prior: writes λ under the signals that `at` has, at the states of a block. Whether all of them have a motion.
+  [[nodiscard]] bool solve_multipliers(Eigen::Index b, Linearisation& at) const;
 
   /// @param with_reduction  whether the noise stays too
   [[nodiscard]] Kept keep(const RowBlock& block, bool with_reduction) const;
 
  private:
-  struct States {
-    std::size_t group;
-    int first, n;
-  };
   const Prior& prior_;
   const std::vector<Observations>& observations_;
   const ModelValues& values_;
+  const Linearisation* about_;
   std::vector<int> gradient_parameters_;
   const std::vector<Kept>* kept_;
   std::vector<States> states_;

@@ -90,10 +90,9 @@ int settled_inducing(const FitRequest& request, const FitProblem& problem, const
     const auto most = static_cast<int>(*request.inducing);
     return most < fit_memory(problem, options).reduced_size ? most : 0;  // else it is exact that takes less
   }
-  const bool has_potential = std::ranges::any_of(problem.prior.latents, &Latent::is_potential),
-             is_linear = !problem.prior.is_nonlinear();
-  const bool is_possible = !problem.prior_options.baseline && !has_sums && !has_potential && is_linear &&
-                           request.problem.protocol.name == Protocol::Name::standard;
+  const bool has_potential = std::ranges::any_of(problem.prior.latents, &Latent::is_potential);
+  const bool is_possible =
+      !problem.prior_options.baseline && !has_sums && !has_potential && request.problem.protocol.name == Protocol::Name::standard;
   if (request.is_exact || !is_possible) return 0;
   return fit_memory(problem, options).reduced_size > largest_exact_size
              ? automatic_inducing_variables(n_states(problem.observations))

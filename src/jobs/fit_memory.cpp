@@ -52,6 +52,7 @@ double reduced_size(const FitProblem& problem, std::size_t g, ModelValues values
 struct PerState {
   double shared = 0, evaluation = 0;  // numbers
   double observed = 0;                // of them in the observations themselves
+  double linearised = 0;              // where a nonlinear prior is linear
   double n_parts = 1;                 // that are fitted one after the other, each with its share of the reduced size
 };
 
@@ -66,6 +67,7 @@ PerState per_state(const FitProblem& problem, double rank) {
   PerState count;
   count.observed = static_cast<double>(system.state_names().size()) + d;
   count.shared = 3 * count.observed;
+  if (problem.prior.is_nonlinear()) count.linearised = m;
   // M and its factor, A, L, T and what they are made of; G
   double model = 3 * n * n + 4 * m * n + 4 * n + d * n;
   // Q, R, e, ỹ of a sample, with what the allocator adds
@@ -74,6 +76,7 @@ PerState per_state(const FitProblem& problem, double rank) {
   for (const Latent& latent : problem.prior.latents) {
     const double p = latent.size(), features = latent.n_features();
     count.shared += features;
+    if (problem.prior.is_nonlinear()) count.linearised += p;
     model += n * p;
     count.evaluation += 3 * features + rank * p * 3 + tasks * (rank + 1) * p;
   }
@@ -96,7 +99,8 @@ FitMemory memory_of(double n_states, double r, const PerState& count, const FitO
     // and of each stretch, with what is made of them
     constexpr double n_copies = 1.5;
     const double square = number * std::pow(std::min<double>(options.n_inducing, r), 2);
-    memory.shared = number * n_states * n_copies * count.observed;
+    constexpr double n_linearisations = 3;  // the one that is held, the best so far and the next
+    memory.shared = number * n_states * (n_copies * count.observed + n_linearisations * count.linearised);
     memory.evaluation = (Pieces::n_parts + thread_count(options.n_threads) + 6) * square +
                         std::min<double>(BlocksOfStates::most_kept_bytes, number * n_states * count.evaluation) + blas;
     memory.posterior =

@@ -492,6 +492,58 @@ FitReport trained(const Prior& prior, const std::vector<Observations>& observati
   return report;
 }
 
+// Of a nonlinear prior: the hyperparameters under the linear one about the posterior mean of the latents, then that mean under these, and
+// so on. Where they stand still the objective is Laplace's evidence, its own dependence on the mean left out (theory.md, T47).
+// @param approximation  may have inducing points, and where the prior is linear at first
+FitReport trained_nonlinear(const Prior& prior, const std::vector<Observations>& observations,
+                            std::vector<Hyperparameter> hyperparameters, const FitOptions& options,
+                            Approximation approximation = {}) {
+  constexpr int most = 20;
+  constexpr double enough = 1e-3;  // nats
+  FitOptions once = options;
+  once.n_draws = 0;
+  once.standard_errors = false;
+  const Workers workers = Evaluators(options, approximation.points != nullptr).alone;
+  std::optional<FitReport> first, last;
+  double objective = std::numeric_limits<double>::infinity();
+  bool stands = options.max_iterations == 0;
+  for (int round = 0; round < most && !stands; ++round) {
+    FitReport report = trained(prior, observations, hyperparameters, once, approximation);
+    hyperparameters = report.hyperparameters;
+    stands = std::abs(report.objective - objective) < enough;
+    objective = report.objective;
+    if (!first) first = report;
+    last = std::move(report);
+    if (is_set(options.stop)) break;
+    ModelValues values = model_values(prior, observations, hyperparameters);
+    values.inducing = approximation.points;
+    approximation.about = linearisation_of(prior, observations, values, workers);
+    once.n_restarts = 1;
+    once.max_escapes = 0;
+  }
+  once.n_draws = options.n_draws;
+  once.standard_errors = options.standard_errors;
+  FitReport report =
+      last && is_set(options.stop) ? *std::move(last) : trained(prior, observations, hyperparameters, once, approximation);
+  if (!first) return report;
+  // the run that searched is told of, not those that stood where it ended
+  report.restarts = std::move(first->restarts);
+  report.best_restart = first->best_restart;
+  report.iterations = first->iterations;
+  report.n_escapes = first->n_escapes;
+  report.converged = first->converged && stands;
+  report.termination = is_set(options.stop) ? FitReport::interrupted
+                       : stands             ? first->termination
+                                : fmt::format("the posterior mean of the latents still changed after {} rounds", most);
+  return report;
+}
+
+FitReport trained_exactly(const Prior& prior, const std::vector<Observations>& observations,
+                          const std::vector<Hyperparameter>& hyperparameters, const FitOptions& options) {
+  return prior.is_nonlinear() ? trained_nonlinear(prior, observations, hyperparameters, options)
+                              : trained(prior, observations, hyperparameters, options);
+}
+
 // Hyperparameters from few states, exactly, then through inducing points from more and more. The points stay while the optimiser
 // runs, are chosen anew where it has ended, and kept where the bound rises. What few states cannot see they turn off, and from
 // there no slope leads back: so the first run through points starts from the first values as well, and from what it has ended
@@ -525,7 +577,7 @@ class TrainingThroughPoints {
         if (best && is_set(options_.stop)) return;
         try {
           FitReport found = unless_stopped(best ? best : report, [&] {
-            return is_exact ? trained(prior_, of_stage, start, options) : through_points(of_stage, start, options);
+            return is_exact ? trained_exactly(prior_, of_stage, start, options) : through_points(of_stage, start, options);
           });
           if (!best || found.objective < best->objective) best = std::move(found);
         } catch (const NumericalError&) {
@@ -543,8 +595,7 @@ class TrainingThroughPoints {
     }
     if (!report->inducing || n_train < n_all) report->inducing = points_of(chosen(observations_, hyperparameters));
     report->inducing->left_out =
-        is_set(options_.stop) ? left_out_as_some_tell(*report)
-                              : left_out(observations_, *report, Workers(thread_count(options_.n_threads), options_.ranks));
+        is_set(options_.stop) ? left_out_as_some_tell(*report) : left_out(observations_, *report, all_workers());
     report->inducing->n_start = stages.size() > 1 ? n_exact : 0;
     if (draws && !is_set(options_.stop))
       report->draws = drawn(evenly(observations_, n_exact), report->hyperparameters, of_stage(stages.size(), n_stages));
@@ -577,7 +628,7 @@ class TrainingThroughPoints {
       h.lower = h.upper = h.value;
     }
     try {
-      return trained(prior_, some, hyperparameters, options).draws;
+      return trained_exactly(prior_, some, hyperparameters, options).draws;
     } catch (const NumericalError&) {  // or stopped: the fit stands, without draws
       return std::nullopt;
     }
@@ -617,8 +668,12 @@ class TrainingThroughPoints {
 
   [[nodiscard]] InducingChoice chosen(const std::vector<Observations>& observations,
                                       const std::vector<Hyperparameter>& hyperparameters) const {
-    return choose_inducing_points(prior_, observations, model_values(prior_, observations, hyperparameters),
-                                  {.most = options_.n_inducing});
+    ModelValues values = model_values(prior_, observations, hyperparameters);
+    const InducingOptions options{.most = options_.n_inducing};
+    const InducingChoice choice = choose_inducing_points(prior_, observations, values, options);
+    // how strongly a latent acts that is not linear is known through points alone, and decides where they should be
+    values.about = linearised(observations, hyperparameters, choice.points, all_workers());
+    return values.about ? choose_inducing_points(prior_, observations, values, options) : choice;
   }
 
   // With the signals as they were at first that have all but vanished; none: there are no such.
@@ -652,7 +707,10 @@ class TrainingThroughPoints {
         };
       }
       FitReport next = unless_stopped(best, [&] {
-        FitReport report = trained(prior_, observations, from, options, {choice.points, nullptr});
+        FitReport report = prior_.is_nonlinear()
+                               ? trained_nonlinear(prior_, observations, from, options,
+                                                   {choice.points, linearised(observations, from, choice.points, all_workers())})
+                               : trained(prior_, observations, from, options, {choice.points, nullptr});
         report.inducing = points_of(choice);
         return report;
       });
@@ -670,7 +728,25 @@ class TrainingThroughPoints {
                                   const Workers& workers) const {
     ModelValues values = model_values(prior_, observations, report.hyperparameters);
     values.inducing = report.inducing->points;
+    values.about = linearised(observations, report.hyperparameters, report.inducing->points, workers);
     return left_out_by_points(prior_, observations, values, workers);
+  }
+
+  [[nodiscard]] Workers all_workers() const { return {thread_count(options_.n_threads), options_.ranks}; }
+
+  // Where a nonlinear prior is linear under these points; null, where no latent acts, as long as the mean is not found.
+  [[nodiscard]] std::shared_ptr<const Linearisation> linearised(const std::vector<Observations>& observations,
+                                                                const std::vector<Hyperparameter>& hyperparameters,
+                                                                const std::shared_ptr<const InducingPoints>& points,
+                                                                const Workers& workers) const {
+    if (!prior_.is_nonlinear()) return nullptr;
+    ModelValues values = model_values(prior_, observations, hyperparameters);
+    values.inducing = points;
+    try {
+      return linearisation_of(prior_, observations, values, workers);
+    } catch (const NumericalError&) {
+      return nullptr;
+    }
   }
 
   // Of all states, while nothing else is under way on other processes.
@@ -685,46 +761,6 @@ class TrainingThroughPoints {
   const std::vector<Observations>& observations_;
   const FitOptions& options_;
 };
-
-// Of a nonlinear prior: the hyperparameters under the linear one about the posterior mean of the latents, then that mean under these, and
-// so on. Where they stand still the objective is Laplace's evidence, its own dependence on the mean left out (theory.md, T47).
-FitReport trained_nonlinear(const Prior& prior, const std::vector<Observations>& observations,
-                            std::vector<Hyperparameter> hyperparameters, const FitOptions& options) {
-  constexpr int most = 20;
-  constexpr double enough = 1e-3;  // nats
-  FitOptions once = options;
-  once.n_draws = 0;
-  once.standard_errors = false;
-  Approximation approximation;
-  std::optional<FitReport> first;
-  double objective = std::numeric_limits<double>::infinity();
-  bool stands = options.max_iterations == 0;
-  for (int round = 0; round < most && !stands; ++round) {
-    FitReport report = trained(prior, observations, hyperparameters, once, approximation);
-    hyperparameters = report.hyperparameters;
-    stands = std::abs(report.objective - objective) < enough;
-    objective = report.objective;
-    if (!first) first = std::move(report);
-    if (is_set(options.stop)) break;
-    approximation.about = linearisation_of(prior, observations, model_values(prior, observations, hyperparameters));
-    once.n_restarts = 1;
-    once.max_escapes = 0;
-  }
-  once.n_draws = options.n_draws;
-  once.standard_errors = options.standard_errors;
-  FitReport report = trained(prior, observations, hyperparameters, once, approximation);
-  if (!first) return report;
-  // the run that searched is told of, not those that stood where it ended
-  report.restarts = std::move(first->restarts);
-  report.best_restart = first->best_restart;
-  report.iterations = first->iterations;
-  report.n_escapes = first->n_escapes;
-  report.converged = first->converged && stands;
-  report.termination = is_set(options.stop) ? FitReport::interrupted
-                       : stands             ? first->termination
-                                : fmt::format("the posterior mean of the latents still changed after {} rounds", most);
-  return report;
-}
 
 }  // namespace
 
@@ -741,8 +777,7 @@ Fit fit(const Prior& prior, const std::vector<Observations>& observations, const
     if (options.n_inducing > 0) return TrainingThroughPoints(prior, observations, options).run(hyperparameters);
     const std::vector<Observations> part = is_part ? evenly(observations, options.n_train) : std::vector<Observations>();
     const std::vector<Observations>& of = is_part ? part : observations;
-    return prior.is_nonlinear() ? trained_nonlinear(prior, of, hyperparameters, options)
-                                : trained(prior, of, hyperparameters, options);
+    return trained_exactly(prior, of, hyperparameters, options);
   }();
   Posterior posterior = report.termination == FitReport::interrupted && !report.draws
                             ? Posterior::lazy(prior, observations, values_of(prior, observations, report).front())

@@ -6,12 +6,15 @@
 
 #include "allocation_count.hpp"
 #include "gp2/fit.hpp"
+#include "gp2/inference/inducing.hpp"
+#include "gp2/inference/leave_one_out.hpp"
 #include "gp2/inference/pathwise.hpp"
 #include "gp2/jobs/check_job.hpp"
 #include "gp2/predictor.hpp"
 #include "gp2/simulation/generate.hpp"
 #include "gp2/simulation/model_motion.hpp"
 #include "inference/nonlinear_motion.hpp"
+#include "inference/posterior_implementation.hpp"
 #include "inference/problems.hpp"
 #include "input_error.hpp"
 #include "training/objective.hpp"
@@ -583,6 +586,218 @@ TEST(NonlinearPosterior, OfDataThatComeAndGoIsTheOneOfThoseThatAreThere) {
                       model_values(fitted.prior, {rows(0, 10), rows(10, 10)},
                                    default_hyperparameters(fitted.prior, {rows(0, 10), rows(10, 10)}, {}, {})));
   expect_says([&] { static_cast<void>(remove_oldest(Posterior(two), 1)); }, {"several groups", "lambda0"});
+}
+
+// ---------------------------------------------------------------- through inducing points
+
+/// The same at the start of a fit, exactly and with points among the observed states.
+struct ThroughPoints {
+  Fitted fitted;
+  ModelValues exact, values;
+
+  explicit ThroughPoints(Fitted of, int most = 100'000) : fitted(std::move(of)) {
+    exact = model_values(fitted.prior, fitted.observations, default_hyperparameters(fitted.prior, fitted.observations, {}, {}));
+    values = exact;
+    values.inducing = choose_inducing_points(fitted.prior, fitted.observations, exact, {.most = most, .left_out = 1e-12}).points;
+  }
+  [[nodiscard]] Posterior posterior(const Workers& workers = {}) const {
+    return Posterior(fitted.prior, fitted.observations, values, workers);
+  }
+  [[nodiscard]] View ddq() const { return View::constrained_acceleration(*fitted.model.system); }
+};
+
+std::vector<Fitted> that_are_nonlinear(int n) {
+  return {Fitted(test::model_that_rubs(), n), Fitted(rubbing_bead("lambda", "se + constant"), n),
+          Fitted(rubbing_bead("lambda", "matern32 + constant", "positive = true"), n)};
+}
+
+// Both take the same steps, so that only rounding is between them: 1e-15 of what is left of k(φ, φ), in units of the noise.
+TEST(NonlinearInducing, PointsAtEveryStateChangeNothing) {
+  for (const Fitted& fitted : that_are_nonlinear(30)) {
+    SCOPED_TRACE(fitted.model.name);
+    const ThroughPoints p(fitted);
+    const Posterior exact(fitted.prior, fitted.observations, p.exact), through = p.posterior();
+    const double nll = exact.negative_log_likelihood();
+    EXPECT_NEAR(through.negative_log_likelihood(), nll, 1e-9 * std::abs(nll));
+    const System& system = *fitted.model.system;
+    const MatrixXd states = test::draw(fitted.model, 20, nonlinear_seed + 1).states;
+    for (const View& view : {p.ddq(), View::multipliers(system), View::learned_force(system)}) {
+      SCOPED_TRACE(view.quantity->word());
+      const Posterior::Joint got = through.joint(view, states), wanted = exact.joint(view, states);
+      EXPECT_LE(test::largest(got.mean - wanted.mean), 1e-8 * (1 + test::largest(wanted.mean)));
+      EXPECT_LE(test::largest(got.covariance - wanted.covariance), 1e-8 * (1 + test::largest(wanted.covariance)));
+    }
+    const LeftOut got = leave_out(through, LeftOut::n_stretches), wanted = leave_out(exact, LeftOut::n_stretches);
+    for (const auto part : {&LeaveOneOut::mean, &LeaveOneOut::variance}) {
+      EXPECT_LE(test::largest(got.values[0].*part - wanted.values[0].*part), 1e-6 * (1 + test::largest(wanted.values[0].*part)));
+      EXPECT_LE(test::largest(got.stretches[0].*part - wanted.stretches[0].*part),
+                1e-6 * (1 + test::largest(wanted.stretches[0].*part)));
+    }
+    // the likelihood there, with its gradient
+    ModelValues at_mean = p.exact, through_points = p.values;
+    at_mean.about = linearisation_of(fitted.prior, fitted.observations, p.exact);
+    through_points.about = linearisation_of(fitted.prior, fitted.observations, p.values);
+    const auto evaluate = [&](const ModelValues& values, ModelGradient& gradient) {
+      Likelihood::Options options;
+      options.noise_gradient = true;
+      options.gradient_parameters = {0};
+      const Likelihood likelihood(fitted.prior, fitted.observations, values, options);
+      Likelihood::Workspace workspace;
+      return likelihood.evaluate(values, &gradient, workspace);
+    };
+    ModelGradient of_exact, of_points;
+    EXPECT_NEAR(evaluate(at_mean, of_exact), nll, 1e-9 * std::abs(nll));
+    EXPECT_NEAR(evaluate(through_points, of_points), nll, 1e-9 * std::abs(nll));
+    for (std::size_t a = 0; a < of_exact.log_kernel.size(); ++a) {
+      EXPECT_LE(test::largest(of_points.log_kernel[a] - of_exact.log_kernel[a]), 1e-6 * std::abs(nll));
+      EXPECT_LE(test::largest(of_points.log_signal_stddev[a] - of_exact.log_signal_stddev[a]), 1e-6 * std::abs(nll));
+    }
+    EXPECT_LE(test::largest(of_points.log_noise_stddev[0] - of_exact.log_noise_stddev[0]), 1e-6 * std::abs(nll));
+    EXPECT_NEAR(of_points.parameters[0], of_exact.parameters[0], 1e-6 * (std::abs(nll) + std::abs(of_exact.parameters[0])));
+    EXPECT_NE(of_points.parameters[0], 0);
+  }
+}
+
+// A discrepancy that no two states share is a larger noise, of the nonlinear steps too.
+TEST(NonlinearInducing, WhatPointsLeaveOutOfADiscrepancyIsNoise) {
+  Fitted fitted(test::model_that_rubs(), 25);
+  PriorOptions options;
+  options.mean = Prior::Mean::force;
+  options.discrepancy = Discrepancy{};
+  options.discrepancy->stddev = VectorXd::Constant(fitted.model.system->nq(), 0.01);
+  fitted.prior = make_prior(fitted.model, options);
+  ThroughPoints p(fitted);
+  for (ModelValues* values : {&p.exact, &p.values}) {
+    values->kernel.back().setConstant(1e-3);
+    values->signal_stddev.back().setConstant(0.7);
+  }
+  auto points = std::make_shared<InducingPoints>(*p.values.inducing);
+  points->features.back().conservativeResize(0, Eigen::NoChange);
+  p.values.inducing = points;
+  const Posterior exact(fitted.prior, fitted.observations, p.exact), through = p.posterior();
+  const double nll = exact.negative_log_likelihood();
+  EXPECT_NEAR(through.negative_log_likelihood(), nll, 1e-8 * std::abs(nll));
+  const MatrixXd states = test::draw(fitted.model, 20, nonlinear_seed + 1).states;
+  const Posterior::Joint got = through.joint(p.ddq(), states), wanted = exact.joint(p.ddq(), states);
+  EXPECT_LE(test::largest(got.mean - wanted.mean), 1e-7 * (1 + test::largest(wanted.mean)));
+  EXPECT_LE(test::largest(got.covariance - wanted.covariance), 1e-7 * (1 + test::largest(wanted.covariance)));
+}
+
+TEST(NonlinearInducing, FewPointsHoldTheConstraintsInMeansSamplesPathsAndThePredictor) {
+  const ThroughPoints p(Fitted(test::model_that_rubs(), 300), 40);
+  const Posterior posterior = p.posterior();
+  const System& system = *p.fitted.model.system;
+  const MatrixXd states = test::draw(p.fitted.model, 12, nonlinear_seed + 1).states;
+  const MechanicsBatch mechanics = evaluate_mechanics(system, states, p.values.parameters);
+  const auto expect_constraint = [&](const MatrixXd& ddq) {
+    for (int i = 0; i < static_cast<int>(states.cols()); ++i) {
+      const auto A = mechanics.values.A(i);
+      EXPECT_LE(test::largest(A * ddq.col(i) - mechanics.values.b(i)), 1e-12 * (1 + A.norm() * ddq.col(i).norm()));
+    }
+  };
+  const Posterior::Marginal marginal = posterior.marginal(p.ddq(), states);
+  expect_constraint(marginal.mean);
+  const PathwiseSamples paths = sample_paths(posterior, 3, {.seed = 3});
+  for (int s = 0; s < 3; ++s) expect_constraint(paths.evaluate(s, p.ddq(), states));
+  const MatrixXd samples = posterior.sample({{p.ddq(), states}}, 3, 5);
+  for (Index s = 0; s < 3; ++s) expect_constraint(samples.col(s).reshaped(system.nq(), states.cols()));
+  const Predictor predictor(posterior, p.ddq());
+  auto memory = predictor.make_workspace();
+  VectorXd mean(system.nq()), stddev(system.nq());
+  for (Index i = 0; i < states.cols(); ++i) {
+    ASSERT_EQ(predictor.mean_and_stddev(states.col(i), mean, stddev, memory), Predictor::Status::ok);
+    EXPECT_LE(test::largest(mean - marginal.mean.col(i)), 1e-10 * (1 + mean.norm()));
+    EXPECT_LE(test::largest(stddev - marginal.stddev().col(i)), 1e-7 * (1 + mean.norm()));
+  }
+}
+
+TEST(NonlinearInducing, ManyStatesAreLearnedFromInBlocksWithTheSameBitsForAnyNumberOfThreads) {
+  const ThroughPoints p(Fitted(rubbing_bead("lambda", "se + constant"), 5'200), 20);
+  const Posterior posterior = p.posterior();
+  EXPECT_EQ(posterior.n_states(), 5'200);
+  EXPECT_EQ(posterior.observations().front().n_data(), 2600);
+  const MatrixXd states = test::draw(p.fitted.model, 50, nonlinear_seed + 1).states;
+  const Posterior::Marginal marginal = posterior.marginal(p.ddq(), states);
+  EXPECT_EQ(p.posterior(3).marginal(p.ddq(), states).covariance, marginal.covariance);
+  // the coefficient is 0.3 everywhere
+  EXPECT_LE(test::largest(marginal.mean - ModelMotion(p.fitted.model).acceleration(states)), 2e-3);
+  // what is kept of a fit
+  const Posterior again = Posterior::of_summary(p.fitted.prior, posterior.observations(), {p.values}, *posterior.summary());
+  EXPECT_EQ(again.marginal(p.ddq(), states).covariance, marginal.covariance);
+  EXPECT_EQ(leave_one_out(again)[0].mean, leave_one_out(posterior)[0].mean);
+}
+
+// The rows that were there before stay linear where they were, which is near where all rows together are.
+TEST(NonlinearInducing, MoreObservationsAddToTheSums) {
+  const ThroughPoints p(Fitted(rubbing_bead("lambda", "se + constant"), 400), 20);
+  const Observations& all = p.fitted.observations.front();
+  const Posterior first(p.fitted.prior, {all.slice(0, 300)}, p.values), anew = p.posterior();
+  const MatrixXd states = test::draw(p.fitted.model, 20, nonlinear_seed + 1).states;
+  const MatrixXd before = first.mean(p.ddq(), states);
+  const Posterior grown = update(Posterior(first), all.slice(300, 100));
+  EXPECT_EQ(grown.n_states(), 400);
+  const Posterior::Marginal got = grown.marginal(p.ddq(), states), wanted = anew.marginal(p.ddq(), states);
+  EXPECT_LE(test::largest(got.mean - wanted.mean), 0.02 * test::largest(before - wanted.mean));
+  EXPECT_LE(test::largest(got.stddev() - wanted.stddev()), 0.02 * test::largest(wanted.stddev()));
+  EXPECT_EQ(first.mean(p.ddq(), states), before);
+  static_cast<void>(forget(Posterior(grown), 0.5));
+  EXPECT_EQ(grown.marginal(p.ddq(), states).covariance, got.covariance);
+}
+
+void expect_nearly_exact(const Fitted& fitted) {
+  const std::vector<Hyperparameter> start = default_hyperparameters(fitted.prior, fitted.observations, {}, {});
+  FitOptions options;
+  options.n_restarts = 1;
+  const Fit exact = fit(fitted.prior, fitted.observations, start, options);
+  options.n_inducing = 60;
+  const Fit through = fit(fitted.prior, fitted.observations, start, options);
+  ASSERT_TRUE(through.report.inducing.has_value());
+  EXPECT_LE(through.report.inducing->left_out.sum(), 2);
+  EXPECT_NEAR(through.report.objective, exact.report.objective, 3);
+  const View view = View::constrained_acceleration(*fitted.model.system);
+  const MatrixXd states = test::draw(fitted.model, 100, nonlinear_seed + 1).states;
+  const Posterior::Marginal got = through.posterior.marginal(view, states), wanted = exact.posterior.marginal(view, states);
+  EXPECT_LE(test::largest(got.mean - wanted.mean), 0.5 * test::largest(wanted.stddev()));
+}
+
+TEST(NonlinearInducing, AFitIsNearlyTheExactOne) {
+  expect_nearly_exact(Fitted(rubbing_bead("lambda", "constant + matern32"), 500));
+}
+
+TEST(NonlinearInducing, AFitStoppedAnywhereHasWhatWasFoundExactlyToo) {
+  const Fitted fitted(rubbing_bead("lambda", "constant + matern32"), 120);
+  const std::vector<Hyperparameter> start = default_hyperparameters(fitted.prior, fitted.observations, {}, {});
+  for (const int n_inducing : {0, 20}) {
+    FitOptions options;
+    options.n_restarts = 1;
+    options.n_threads = 1;
+    options.n_inducing = n_inducing;
+    int n_calls = 0;
+    options.progress = [&](const Progress&) { ++n_calls; };
+    static_cast<void>(fit(fitted.prior, fitted.observations, start, options));
+    for (const int call : {1, n_calls / 2, n_calls - 1}) {
+      SCOPED_TRACE(fmt::format("{} points, after {} of {}", n_inducing, call, n_calls));
+      std::atomic<bool> stop = false;
+      int n = 0;
+      options.stop = &stop;
+      options.progress = [&](const Progress&) { stop = ++n >= call; };
+      const Fit found = fit(fitted.prior, fitted.observations, start, options);
+      EXPECT_EQ(found.report.termination, FitReport::interrupted);
+      EXPECT_FALSE(found.report.converged);
+      EXPECT_TRUE(std::isfinite(found.report.objective));
+      const Observations& group = fitted.observations.front();
+      EXPECT_TRUE(found.posterior.mean(group.view(), group.states()).allFinite());
+    }
+  }
+}
+
+// Points are chosen by how strongly the latent acts where it is: here 30 times as strongly as where nothing is known.
+TEST(NonlinearInducing, AFitOfAPositiveLatentFarFromOneIsNearlyTheExactOne) {
+  std::string text = rubbing_bead("lambda", "constant + matern32", "positive = true").text;
+  for (const char* row : {"\"-load*dx/v\"", "\"-load*dz/v\""}) {
+    text.insert(text.find(row) + 2, "0.01*");
+  }
+  expect_nearly_exact(Fitted(Model::parse(text, "bead"), 500));
 }
 
 TEST(NonlinearPrior, IsRefusedByNameWhereItCannotBe) {

@@ -22,10 +22,10 @@ using testing::HasSubstr;
 
 constexpr const char* surface = "models/surface.toml";  // two of three directions are free
 
-FitRequest request_of_rows(int n) {
+FitRequest request_of_rows(int n, const char* model = surface) {
   FitRequest request;
-  request.model = test::model(surface);
-  request.logs = {{test::drawn_log(surface, n, 4).table(), nullptr}};
+  request.model = test::model(model);
+  request.logs = {{test::drawn_log(model, n, 4).table(), nullptr}};
   request.problem.mean = Prior::Mean::force;
   request.restarts = 1;
   request.max_escapes = 0;
@@ -149,6 +149,43 @@ TEST(InducingFit, AFileOfManyRowsHoldsWhatTheySayAndSomeOfThem) {
   const FitFile more = FitFile::read(folder / "more.json");
   EXPECT_THAT(more.n_states(), testing::ElementsAre(6200));
   EXPECT_FALSE(more.report.inducing->stretches) << "they were of other data";
+  EXPECT_LE(more.posterior().marginal(view, states).stddev().mean(), posterior.marginal(view, states).stddev().mean());
+}
+
+constexpr const char* bead =
+    "experiments/mechanisms/rubbing_bead.toml";  // friction presses on its constraint; one direction is free
+
+TEST(InducingFit, AutoIsThroughPointsWherePriorsAreNotLinear) {
+  const auto n_inducing_of_bead = [](int n) { return prepare_fit(request_of_rows(n, bead)).options.n_inducing; };
+  EXPECT_EQ(n_inducing_of_bead(largest_exact_size), 0);
+  EXPECT_EQ(n_inducing_of_bead(largest_exact_size + 1), most_inducing_variables);
+}
+
+TEST(InducingFit, OfFrictionThatPressesOnItsConstraintGoesOnFromItsFile) {
+  FitRequest request = request_of_rows(6000, bead);
+  request.inducing = 30;
+  request.train_on = 300;
+  const FitOutcome outcome = run_fit(prepare_fit(std::move(request)));
+  EXPECT_EQ(outcome.posterior.n_states(), 6000);
+  EXPECT_EQ(outcome.file.report.negative_log_likelihood, outcome.posterior.negative_log_likelihood()) << "of all rows";
+  ASSERT_TRUE(outcome.cross_validation && outcome.cross_validation->stretches);
+  EXPECT_NEAR(outcome.cross_validation->stretches->coverage95, 0.95, 0.02);
+  const test::TemporaryFolder folder;
+  outcome.file.write(folder / "fit.json");
+  const FitFile read = FitFile::read(folder / "fit.json");
+  const Posterior posterior = read.posterior();
+  const View view = View::constrained_acceleration(*outcome.file.model.system);
+  const MatrixXd states = outcome.posterior.observations().front().states().leftCols(50);
+  EXPECT_EQ(posterior.marginal(view, states).covariance, outcome.posterior.marginal(view, states).covariance);
+  const CrossValidation scores = cross_validate(read, posterior);
+  EXPECT_EQ(scores.one_by_one.nrmse, outcome.cross_validation->one_by_one.nrmse);
+  EXPECT_EQ(scores.stretches->nrmse, outcome.cross_validation->stretches->nrmse);
+
+  const UpdateOutcome updated = update(read, {test::drawn_log(bead, 200, 5).table()}, {});
+  EXPECT_EQ(updated.n_states, 6200);
+  updated.fit.write(folder / "more.json");
+  const FitFile more = FitFile::read(folder / "more.json");
+  EXPECT_THAT(more.n_states(), testing::ElementsAre(6200));
   EXPECT_LE(more.posterior().marginal(view, states).stddev().mean(), posterior.marginal(view, states).stddev().mean());
 }
 
