@@ -18,7 +18,7 @@ namespace gp2 {
 /// its sums cost little beside them.
 struct Pieces {
   static constexpr int n_parts = 8, most = 256;
-  static constexpr Eigen::Index fewest_blocks = 32;  // of a piece where there are more than eight
+  static constexpr Eigen::Index fewest_blocks = 8;  // of a piece where there are more than eight
 
   Eigen::Index n_blocks;
   int n = n_parts;
@@ -69,54 +69,15 @@ class PieceSums {
     nodes_[node] = std::move(sum);
   }
 
-  /// The sum of what all processes have put. Each of them adds up a slice of all numbers, and hands it to the others.
+  /// The sum of what all processes have put.
   [[nodiscard]] Sum total(const Workers& workers) {
-    if (!workers.ranks) {
-      return added_up(zero_, workers, [&](std::size_t node, int) { return take(node); });
-    }
-    const Ranks& ranks = *workers.ranks;
-    const std::size_t own = size(ranks.rank());
-    std::vector<std::vector<double>> to(size(ranks.size())), from(to.size());
-    VectorXd numbers = numbers_of(zero_);
-    const auto slice = [&](VectorXd& of, std::size_t rank) {
-      const auto first = [&](std::size_t k) { return static_cast<Index>(k) * of.size() / ranks.size(); };
-      return of.segment(first(rank), first(rank + 1) - first(rank));
-    };
-    const Index n_own = slice(numbers, own).size();
-
-    added_up(VectorSum{}, workers, [&](std::size_t node, int owner) {
-      std::vector<double>& expected = from[size(owner)];
-      expected.resize(expected.size() + static_cast<std::size_t>(n_own));
-      if (size(owner) == own) {
-        VectorXd sum = numbers_of(take(node));
-        for (std::size_t rank = 0; rank < to.size(); ++rank) {
-          const auto part = slice(sum, rank);
-          to[rank].insert(to[rank].end(), part.begin(), part.end());
-        }
-      }
-      return VectorSum{};
-    });
-    ranks.exchange(to, from);
-
-    std::vector<const double*> next;
-    for (const std::vector<double>& one : from) next.push_back(one.data());
-    const VectorXd sum = added_up(VectorSum{slice(numbers, own)}, workers, [&](std::size_t, int owner) {
-                           const double* const first = std::exchange(next[size(owner)], next[size(owner)] + n_own);
-                           return VectorSum{Eigen::Map<const VectorXd>(first, n_own)};
-                         }).sum;
-    for (std::size_t rank = 0; rank < to.size(); ++rank) {
-      to[rank].assign(sum.begin(), sum.end());
-      from[rank].resize(static_cast<std::size_t>(slice(numbers, rank).size()));
-    }
-    ranks.exchange(to, from);
-    for (std::size_t rank = 0; rank < from.size(); ++rank)
-      std::copy(from[rank].begin(), from[rank].end(), slice(numbers, rank).begin());
-
+    if (!workers.ranks) return added_up(zero_, workers, [&](std::size_t node, int) { return take(node); });
+    const VectorXd numbers = total_of_ranks(workers, *workers.ranks);
     Sum all = zero_;
-    const double* rest = numbers.data();
+    const double* next = numbers.data();
     all.for_each([&](double* values, Index count) {
-      std::copy_n(rest, count, values);
-      rest += count;
+      std::copy_n(next, count, values);
+      next += count;
     });
     return all;
   }
@@ -133,6 +94,51 @@ class PieceSums {
     VectorXd numbers(n);
     double* next = numbers.data();
     sum.for_each([&](const double* values, Index count) { next = std::copy_n(values, count, next); });
+    return numbers;
+  }
+
+  // Each process adds up a slice of the numbers, and hands it to the others; few numbers each adds up by itself.
+  VectorXd total_of_ranks(const Workers& workers, const Ranks& ranks) {
+    constexpr Index few = 1000;
+    VectorXd numbers = numbers_of(zero_);
+    const bool is_sliced = numbers.size() > few;
+    const auto slice = [&](VectorXd& of, std::size_t rank) {
+      const auto first = [&](std::size_t k) { return static_cast<Index>(k) * of.size() / ranks.size(); };
+      return is_sliced ? of.segment(first(rank), first(rank + 1) - first(rank)) : of.segment(0, of.size());
+    };
+    const std::size_t own = size(ranks.rank());
+    const Index n_own = slice(numbers, own).size();
+
+    // by who has the sums below nodes, and who adds them up, in the order of the tree
+    std::vector<std::vector<double>> to(size(ranks.size())), from(to.size());
+    added_up(VectorSum{}, workers, [&](std::size_t node, int owner) {
+      std::vector<double>& expected = from[size(owner)];
+      expected.resize(expected.size() + static_cast<std::size_t>(n_own));
+      if (size(owner) == own) {
+        VectorXd sum = numbers_of(take(node));
+        for (std::size_t rank = 0; rank < to.size(); ++rank) {
+          const auto part = slice(sum, rank);
+          to[rank].insert(to[rank].end(), part.begin(), part.end());
+        }
+      }
+      return VectorSum{};
+    });
+    ranks.exchange(to, from);
+    std::vector<const double*> next;
+    for (const std::vector<double>& one : from) next.push_back(one.data());
+    slice(numbers, own) = added_up(VectorSum{slice(numbers, own)}, workers, [&](std::size_t, int owner) {
+                            const double* const first = std::exchange(next[size(owner)], next[size(owner)] + n_own);
+                            return VectorSum{Eigen::Map<const VectorXd>(first, n_own)};
+                          }).sum;
+    if (!is_sliced) return numbers;
+
+    for (std::size_t rank = 0; rank < to.size(); ++rank) {
+      to[rank].assign(slice(numbers, own).begin(), slice(numbers, own).end());
+      from[rank].resize(static_cast<std::size_t>(slice(numbers, rank).size()));
+    }
+    ranks.exchange(to, from);
+    for (std::size_t rank = 0; rank < from.size(); ++rank)
+      std::copy(from[rank].begin(), from[rank].end(), slice(numbers, rank).begin());
     return numbers;
   }
 
