@@ -729,6 +729,7 @@ def excite(
     duration: float,
     inputs_within: Mapping[str, tuple[float, float]],
     within: Mapping[str, tuple[float, float]] | None = None,
+    system: System | None = None,
     *,
     # options of excite: written by scripts/options
     target: Literal["auto", "parameters", "accelerations"] = "auto",
