@@ -447,7 +447,7 @@ class Posterior:
         system: System | None = None,
         *,
         # options of export: written by scripts/options
-        to: Literal["c", "casadi", "acados", "mjcf"] = "c",
+        to: Literal["c", "casadi", "acados", "mjcf", "urdf"] = "c",
         name: str = "",
         robot: str = "",
         view: Literal["constrained", "unconstrained", "constraint-force", "multipliers", "next-velocity", "force"] = "constrained",
