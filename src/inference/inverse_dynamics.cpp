@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <limits>
 #include <utility>
 #include <vector>
 
@@ -202,9 +203,9 @@ struct InverseDynamicsSolver::Workspace::Implementation {
   }
 
   [[nodiscard]] bool search() {
-    constexpr int most_steps = 100;
+    constexpr int most_steps = 100, most_trials = 30;
     const Index nu = solver->nu();
-    double size = size_of(usual) + size_of(wanted);
+    double size = size_of(usual) + size_of(wanted), gain_before = std::numeric_limits<double>::infinity();
     for (int step = 0; step < most_steps; ++step) {
       size = std::max(size, size_of(mean));
       J.noalias() = root.lazyProduct(jacobian.rightCols(nu));
@@ -214,18 +215,20 @@ struct InverseDynamicsSolver::Workspace::Implementation {
       change.noalias() = pseudo_inverse.lazyProduct(weighted);
       weighted.noalias() = J.lazyProduct(change);
       const double gain = weighted.norm();
-      if (gain <= rounding * size) return true;
-      if (!improve(before)) return gain <= close_enough * size;
+      // a Newton step that leaves half of what the one before gained was one of rounding
+      const bool is_close = gain <= close_enough * size;
+      if (gain <= rounding * size || (is_close && gain > gain_before / 2)) return true;
+      gain_before = gain;
+      if (!improve(before, is_close ? 1 : most_trials)) return is_close;
     }
     return false;
   }
 
-  // The first of the steps change, change/2, change/4, … that misses less than before. False where none does: the state stays.
-  [[nodiscard]] bool improve(double before) {
-    constexpr int most_halvings = 30;
+  // The first of n steps change, change/2, change/4, … that misses less than before. False where none does: the state stays.
+  [[nodiscard]] bool improve(double before, int n) {
     auto inputs = state.tail(solver->nu());
     start = inputs;
-    for (int k = 0; k < most_halvings; ++k) {
+    for (int k = 0; k < n; ++k) {
       inputs = start + std::ldexp(1.0, -k) * change;
       if (evaluate() && size_of(missed) < before) return true;
     }

@@ -41,7 +41,7 @@ struct InverseDynamics {
                                                const Eigen::Ref<const Eigen::MatrixXd>& accelerations);
 
 /// The same at one state after another, for control loops: as a Predictor it allocates nothing, takes no locks and calls no BLAS.
-/// Where v is affine in u a call costs two predictions of v with its Jacobian; their covariance is a third.
+/// Where v is affine in u a call costs two to four predictions of v with its Jacobian; their covariance is one more.
 ///
 /// Immutable, cheap to copy, thread-safe. Every member function throws InputError when the object was moved away.
 class InverseDynamicsSolver {
