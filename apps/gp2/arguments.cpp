@@ -165,6 +165,12 @@ std::pair<std::string, std::string> split_at_system(const std::string& text) {
   return {text.substr(0, last), text.substr(last + 1)};
 }
 
+void require_own_system(const std::string& text, const std::string& why) {
+  const std::string model = split_at_system(text).second;
+  if (model.empty()) return;
+  throw InputError(fmt::format("--data: '{}' is of another system, '{}', than the fit: {}", text, model, why));
+}
+
 namespace {
 
 Option positional(const std::string& flag, const OptionValue& value, const std::string& text) {

@@ -108,6 +108,11 @@ inline constexpr const char* system_help =
 /// text does not end in .toml.
 std::pair<std::string, std::string> split_at_system(const std::string& text);
 
+/// @param text  LOG
+/// @param why   the command takes no log of another system, as the end of a sentence
+/// @throws InputError where it is LOG@OTHER.toml
+void require_own_system(const std::string& text, const std::string& why);
+
 /// Prints notes to stderr, a line each.
 void print_notes(const std::vector<std::string>& notes);
 

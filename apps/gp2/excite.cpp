@@ -19,7 +19,7 @@ namespace {
 using Json = nlohmann::ordered_json;
 
 struct ExciteArguments {
-  std::string fit, start, inputs_within, within, output;
+  std::string fit, system, start, inputs_within, within, output;
   ExciteRequest request;
   bool json = false;
 };
@@ -102,8 +102,11 @@ void print_search(const ExciteProgress& p) {
 }
 
 void run(ExciteArguments& arguments) {
-  require_output(arguments.output, {arguments.fit, arguments.start});
+  require_output(arguments.output, {arguments.fit, arguments.start, arguments.system});
   const FitFile fit = FitFile::read(arguments.fit);
+  const Posterior posterior = fit.posterior();
+  const std::shared_ptr<const Model> other = read_other_system(arguments.system);
+  const FitSystem driven = system_of(fit, posterior.prior(), other);
   arguments.request.start = read_start(arguments.start);
   arguments.request.inputs_within = parse_limits(arguments.inputs_within, "--inputs-within");
   arguments.request.within = parse_limits(arguments.within, "--within");
@@ -111,7 +114,7 @@ void run(ExciteArguments& arguments) {
   const Interruption interruption;
   const Excitation found = [&] {
     try {
-      return excite(fit.model, fit.posterior(), fit.report.hyperparameters, arguments.request, print_search, interruption.stop());
+      return excite(driven, posterior, fit.report.hyperparameters, arguments.request, print_search, interruption.stop());
     } catch (const NumericalError&) {
       if (interruption.signal() == 0) throw;
       print_notes({fmt::format("{} before there was a motion: nothing is written", interruption.text())});
@@ -120,7 +123,7 @@ void run(ExciteArguments& arguments) {
   }();
   end_progress();
 
-  as_table(found.motion, *fit.model.system, arguments.output).write(arguments.output);
+  as_table(found.motion, *driven.model->system, arguments.output).write(arguments.output);
   print_notes(notes_of(found, arguments));
   if (arguments.json) print_result("{}\n", to_json(found).dump(2));
   if (!found.interrupted) return;
@@ -139,6 +142,7 @@ Command excite_command() {
                   {}};
   command.options = {
       argument("FIT", a->fit, "file written by gp2 fit"),
+      {"system", &a->system, "OTHER.toml", system_help},
       start_option(a->start),
       required({"duration", &a->request.duration, "SECONDS", "of the motion [s]"}),
       required({"inputs_within", &a->inputs_within, "NAME=LOWEST:HIGHEST,…", "limits of every input, which it never leaves"}),

@@ -22,7 +22,7 @@ void run(ExportArguments& arguments) {
   const FitFile fit = FitFile::read(arguments.fit);
   arguments.request.view.system = read_other_system(arguments.system);
   // a robot's file is one, and is called as it is asked for
-  const bool is_robot = arguments.request.to == ExportRequest::Target::mjcf;
+  const bool is_robot = arguments.request.is_of_robot();
   const ExportOutcome outcome =
       is_robot ? export_robot(fit, arguments.request) : export_fit(fit, fit.posterior(), arguments.request);
   if (is_robot) {
@@ -55,7 +55,7 @@ Command export_command() {
   command.options = {argument("FIT.json", a->fit, "file written by gp2 fit"), {"system", &a->system, "OTHER.toml", system_help}};
   for (Option& option : options(a->request)) command.options.push_back(std::move(option));
   command.options.push_back(
-      output(a->output, "OUT", "folder for the files, which is made where there is none; of mjcf the file"));
+      output(a->output, "OUT", "folder for the files, which is made where there is none; of mjcf and urdf the file"));
   command.run = [a](const std::set<std::string>&) { run(*a); };
   return command;
 }

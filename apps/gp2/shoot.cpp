@@ -22,6 +22,7 @@ std::string with_stddev(double value, double stddev) {
 }
 
 void run(const ShootArguments& arguments) {
+  require_own_system(arguments.data, "the motion that is compared with the log is that of the fit's own system");
   require_output(arguments.output, {arguments.fit, arguments.data});
   const ShootOutcome outcome = shoot(FitFile::read(arguments.fit), CsvTable::read(arguments.data), arguments.request);
   outcome.fit.write(arguments.output);

@@ -19,7 +19,12 @@ struct UpdateArguments {
 void run(const UpdateArguments& arguments) {
   require_output(arguments.output, arguments.data);  // the fit itself may be replaced
   std::vector<CsvTable> logs;
-  for (const std::string& path : arguments.data) logs.push_back(CsvTable::read(path));
+  for (const std::string& path : arguments.data) {
+    require_own_system(path,
+                       "hyperparameters are held, and those of another system's data are not known: fit to all logs, gp2 fit "
+                       "--data LOG --data LOG@OTHER.toml");
+    logs.push_back(CsvTable::read(path));
+  }
   const UpdateOutcome outcome = update(FitFile::read(arguments.fit), logs, arguments.request);
   outcome.fit.write(arguments.output);
   print_notes(outcome.notes);

@@ -49,7 +49,7 @@ class Predictor {
     single_precision,
   };
   struct Options {
-    bool stddev = true;    // whether mean_and_stddev is wanted: stores X, n²/2 numbers
+    bool stddev = true;    // whether mean_and_stddev or mean_and_covariance is wanted: stores X, n²/2 numbers
     bool jacobian = true;  // whether mean_and_jacobian is wanted
     Storage storage = Storage::double_precision;
   };
@@ -102,6 +102,11 @@ class Predictor {
   [[nodiscard]] Status mean_and_stddev(const Eigen::Ref<const Eigen::VectorXd>& state, Eigen::Ref<Eigen::VectorXd> mean,
                                        Eigen::Ref<Eigen::VectorXd> stddev, Workspace& workspace) const;
 
+  /// And the covariance of the rows (d × d) in the place of their standard deviations.
+  /// @throws InputError as mean_and_stddev.
+  [[nodiscard]] Status mean_and_covariance(const Eigen::Ref<const Eigen::VectorXd>& state, Eigen::Ref<Eigen::VectorXd> mean,
+                                           Eigen::Ref<Eigen::MatrixXd> covariance, Workspace& workspace) const;
+
   /// And the derivative of the mean in the state, through M, A, b, F, directions and features. With the multipliers λ,
   /// Aᵀλ = M (ddq − ā),
   ///
@@ -124,6 +129,8 @@ class Predictor {
 
  private:
   [[nodiscard]] const Implementation& implementation() const;  // of the first component; throws when it was moved away
+  Status evaluate_covariance(const Eigen::Ref<const Eigen::VectorXd>& state, Eigen::Ref<Eigen::VectorXd>& mean,
+                             Workspace& workspace) const;
   template <typename Evaluate>
   Status for_each_component(Workspace& workspace, Eigen::Ref<Eigen::VectorXd>& mean, const Evaluate& evaluate) const;
 

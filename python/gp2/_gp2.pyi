@@ -448,7 +448,7 @@ class Posterior:
         system: System | None = None,
         *,
         # options of export: written by scripts/options
-        to: Literal["c", "casadi", "acados", "mjcf"] = "c",
+        to: Literal["c", "casadi", "acados", "mjcf", "urdf"] = "c",
         name: str = "",
         robot: str = "",
         view: Literal["constrained", "unconstrained", "constraint-force", "multipliers", "next-velocity", "force"] = "constrained",
@@ -509,8 +509,22 @@ class Predictor:
     ) -> None: ...
     def mean(self, state: npt.ArrayLike) -> _Array: ...
     def mean_and_std(self, state: npt.ArrayLike) -> tuple[_Array, _Array]: ...
+    def mean_and_cov(self, state: npt.ArrayLike) -> tuple[_Array, _Array]: ...
     def mean_and_jacobian(self, state: npt.ArrayLike) -> tuple[_Array, _Array]: ...
     def distance_from_data(self, state: npt.ArrayLike) -> float: ...
+
+class InverseDynamicsSolver:
+    def __init__(
+        self,
+        posterior: Posterior,
+        *,
+        outputs: Sequence[str] = [],
+        system: System | None = None,
+        cov: bool = True,
+        storage: Literal["double", "single"] = "double",
+    ) -> None: ...
+    def inputs(self, state: npt.ArrayLike, accelerations: npt.ArrayLike) -> _Array: ...
+    def inputs_and_cov(self, state: npt.ArrayLike, accelerations: npt.ArrayLike) -> tuple[_Array, _Array]: ...
 
 class Log:
     def __init__(self, data: _Table, system: System | None = None) -> None: ...
@@ -716,6 +730,7 @@ def excite(
     duration: float,
     inputs_within: Mapping[str, tuple[float, float]],
     within: Mapping[str, tuple[float, float]] | None = None,
+    system: System | None = None,
     *,
     # options of excite: written by scripts/options
     target: Literal["auto", "parameters", "accelerations"] = "auto",

@@ -390,18 +390,19 @@ Limits limits_argument(const py::object& limits, const std::string& name) {
 }
 
 PyExcitation excite_posterior(const PyPosterior& self, const py::object& start, double duration, const py::object& inputs_within,
-                              const py::object& within, const py::kwargs& keywords) {
+                              const py::object& within, const PySystem* system, const py::kwargs& keywords) {
   ExciteRequest request;
   read_keywords("excite", keywords, options(request));
-  request.start = start_argument(start, self.system());
+  request.start = start_argument(start, system == nullptr ? self.system() : *system->model->system);
   request.duration = duration;
   request.inputs_within = limits_argument(inputs_within, "inputs_within");
   request.within = limits_argument(within, "within");
   const Posterior posterior = self.posterior;
+  const FitSystem driven = system_of(self.file, posterior.prior(), system == nullptr ? nullptr : system->model);
   const auto search = [&](const std::atomic<bool>* stop) {
-    Excitation found = excite(self.file.model, posterior, self.file.report.hyperparameters, request, {}, stop);
-    MotionUncertainty uncertainty = motion_uncertainty(posterior, found.motion);
-    return PyExcitation{found, {found.motion, std::move(uncertainty), self.file.model.system}, self.file.model.system};
+    Excitation found = excite(driven, posterior, self.file.report.hyperparameters, request, {}, stop);
+    MotionUncertainty uncertainty = motion_uncertainty(posterior, found.motion, driven.other_system);
+    return PyExcitation{found, {found.motion, std::move(uncertainty), driven.model->system}, driven.model->system};
   };
   std::atomic<bool> stop = false;
   std::exception_ptr raised;
@@ -950,10 +951,12 @@ void define_excite(py::module_& module) {
   own_signature.disable_function_signatures();
   module.def(
       "excite", &excite_posterior, "posterior"_a, "start"_a, "duration"_a, "inputs_within"_a, "within"_a = py::none(),
-      (signature("excite",
-                 "posterior: Posterior, start: Mapping[str, float] | ArrayLike, duration: float, inputs_within: Mapping[str, "
-                 "tuple[float, float]], within: Mapping[str, tuple[float, float]] | None = None, *,",
-                 options(request), "", "Excitation") +
+      "system"_a = nullptr,
+      (signature(
+           "excite",
+           "posterior: Posterior, start: Mapping[str, float] | ArrayLike, duration: float, inputs_within: Mapping[str, "
+           "tuple[float, float]], within: Mapping[str, tuple[float, float]] | None = None, system: System | None = None, *,",
+           options(request), "", "Excitation") +
        R"(
 Find the motion, within limits, that measuring will tell most of what is not known: which experiment next.
 
@@ -961,6 +964,7 @@ start          as of Posterior.simulate
 duration       [s]
 inputs_within  {"u": (-5, 5)}: lowest and highest value of every input
 within         {"q": (-1, 1), "dq": (-3, 3)}: of coordinates, velocities and accelerations; default: they may go anywhere
+system         another System with the same coordinates, inputs and latents, which is driven
 
 )" + documentation(options(request)) +
        R"(

@@ -6,11 +6,41 @@
 #include "arrays.hpp"
 #include "bindings.hpp"
 #include "gp2/error.hpp"
+#include "gp2/inference/inverse_dynamics.hpp"
+#include "gp2/jobs/fit_problem.hpp"
 #include "gp2/jobs/predict_job.hpp"
 
 namespace gp2::python {
 
 namespace {
+
+using Numbers = py::array_t<double, py::array::c_style>;
+
+// the array itself where it is one of doubles
+Numbers numbers_of(const py::object& given, Eigen::Index size, const char* name) {
+  if (Numbers::check_(given)) {
+    auto x = py::reinterpret_borrow<Numbers>(given);
+    if (x.ndim() == 1 && x.shape(0) == size) return x;
+  }
+  return vector_argument(given, size, name);
+}
+
+Eigen::Map<const Eigen::VectorXd> map(const Numbers& x) { return {x.data(), x.size()}; }
+Eigen::Map<Eigen::VectorXd> map_out(py::array_t<double>& x) { return {x.mutable_data(), x.size()}; }
+
+/// A square matrix in the memory of an array; one that is symmetric, so that rows may be columns.
+struct Symmetric {
+  explicit Symmetric(Eigen::Index size) : array({size, size}), matrix(array.mutable_data(), size, size) {}
+  py::array_t<double> array;
+  Eigen::Map<Eigen::MatrixXd> matrix;
+};
+
+Predictor::Storage storage_argument(const std::string& storage) {
+  if (storage != "double" && storage != "single") {
+    throw InputError(fmt::format("storage: expected 'double' or 'single', got '{}'", storage));
+  }
+  return storage == "single" ? Predictor::Storage::single_precision : Predictor::Storage::double_precision;
+}
 
 /// A predictor and the memory of its caller. Python threads take turns, unless Python functions of the model let go of the
 /// interpreter's lock: then each call has its own memory.
@@ -38,6 +68,16 @@ class PyPredictor {
     return py::make_tuple(mean, stddev);
   }
 
+  py::tuple mean_and_cov(const py::object& state) {
+    const auto x = state_of(state);
+    py::array_t<double> mean(rows());
+    Symmetric covariance(rows());
+    require([&](Predictor::Workspace& workspace) {
+      return predictor_.mean_and_covariance(map(x), map_out(mean), covariance.matrix, workspace);
+    });
+    return py::make_tuple(mean, covariance.array);
+  }
+
   py::tuple mean_and_jacobian(const py::object& state) {
     const auto x = state_of(state);
     py::array_t<double, py::array::f_style> jacobian({static_cast<py::ssize_t>(rows()), static_cast<py::ssize_t>(size_)});
@@ -59,21 +99,9 @@ class PyPredictor {
   }
 
  private:
-  using State = py::array_t<double, py::array::c_style>;
-
   [[nodiscard]] Eigen::Index rows() const { return predictor_.view().size(); }
 
-  // the array itself where it is one of doubles
-  [[nodiscard]] State state_of(const py::object& state) const {
-    if (State::check_(state)) {
-      auto x = py::reinterpret_borrow<State>(state);
-      if (x.ndim() == 1 && x.shape(0) == size_) return x;
-    }
-    return vector_argument(state, size_, "state");
-  }
-
-  static Eigen::Map<const Eigen::VectorXd> map(const State& x) { return {x.data(), x.size()}; }
-  static Eigen::Map<Eigen::VectorXd> map_out(py::array_t<double>& x) { return {x.mutable_data(), x.size()}; }
+  [[nodiscard]] Numbers state_of(const py::object& state) const { return numbers_of(state, size_, "state"); }
 
   template <typename Call>
   void require(const Call& call) {
@@ -114,11 +142,70 @@ PyPredictor make(const PyPosterior& posterior, const std::string& quantity, cons
                  const std::string& storage) {
   const ViewRequest request{quantity_argument(quantity), dt, latent, system == nullptr ? nullptr : system->model};
   const View view = predicted_view(posterior.file, posterior.posterior.prior(), request).view;
-  if (storage != "double" && storage != "single") {
-    throw InputError(fmt::format("storage: expected 'double' or 'single', got '{}'", storage));
+  return {posterior, view, {std, jacobian, storage_argument(storage)}};
+}
+
+/// Inverse dynamics and the memory of its caller, as PyPredictor.
+class PySolver {
+ public:
+  PySolver(const PyPosterior& posterior, const View& view, const InverseDynamicsSolver::Options& options)
+      : solver_(posterior.posterior, view, options),
+        workspace_(solver_.make_workspace()),
+        model_has_code_(posterior.file.model.code),
+        layout_(posterior.system().layout()) {}
+
+  py::array_t<double> inputs(const py::object& state, const py::object& accelerations) {
+    py::array_t<double> inputs(layout_.nu);
+    require(state, accelerations, [&](const auto& x, const auto& wanted, InverseDynamicsSolver::Workspace& workspace) {
+      return solver_.inputs(x, wanted, map_out(inputs), workspace);
+    });
+    return inputs;
   }
-  const auto precision = storage == "single" ? Predictor::Storage::single_precision : Predictor::Storage::double_precision;
-  return {posterior, view, {std, jacobian, precision}};
+
+  py::tuple inputs_and_cov(const py::object& state, const py::object& accelerations) {
+    py::array_t<double> inputs(layout_.nu);
+    Symmetric covariance(layout_.nu);
+    require(state, accelerations, [&](const auto& x, const auto& wanted, InverseDynamicsSolver::Workspace& workspace) {
+      return solver_.inputs_and_covariance(x, wanted, map_out(inputs), covariance.matrix, workspace);
+    });
+    return py::make_tuple(inputs, covariance.array);
+  }
+
+ private:
+  template <typename Call>
+  void require(const py::object& state, const py::object& accelerations, const Call& call) {
+    const Numbers x = numbers_of(state, layout_.size(), "state");
+    const Numbers wanted = numbers_of(accelerations, solver_.view().size(), "accelerations");
+    if (!model_has_code_) return require_ok(call(map(x), map(wanted), workspace_));
+    InverseDynamicsSolver::Workspace own = solver_.make_workspace();
+    require_ok(call(map(x), map(wanted), own));
+  }
+
+  static void require_ok(InverseDynamicsSolver::Status status) {
+    switch (status) {
+      case InverseDynamicsSolver::Status::ok:
+        return;
+      case InverseDynamicsSolver::Status::no_prediction:
+        throw InputError("state: there is no prediction with these inputs; Predictor.mean_and_jacobian says why");
+      case InverseDynamicsSolver::Status::not_finite:
+        throw InputError("accelerations: one that is wanted is not a finite number");
+      case InverseDynamicsSolver::Status::not_found:
+        throw NumericalError("state: no inputs are found that produce the accelerations, or come nearest to them");
+    }
+  }
+
+  InverseDynamicsSolver solver_;
+  InverseDynamicsSolver::Workspace workspace_;
+  bool model_has_code_ = false;
+  StateLayout layout_;
+};
+
+PySolver make_solver(const PyPosterior& posterior, const std::vector<std::string>& outputs, const PySystem* system, bool cov,
+                     const std::string& storage) {
+  const FitSystem at = system_of(posterior.file, posterior.posterior.prior(), system == nullptr ? nullptr : system->model);
+  View view{View::Quantity::constrained_acceleration, acceleration_rows(*at.model->system, outputs, "`outputs`")};
+  view.other_system = at.other_system;
+  return {posterior, view, {cov, storage_argument(storage)}};
 }
 
 }  // namespace
@@ -136,10 +223,25 @@ A state is (len(state_names)). A state without a prediction raises InputError.)"
            "dt"_a = py::none(), "std"_a = true, "jacobian"_a = true, "storage"_a = "double")
       .def("mean", &PyPredictor::mean, "state"_a, "(d)")
       .def("mean_and_std", &PyPredictor::mean_and_std, "state"_a, "(d), (d)")
+      .def("mean_and_cov", &PyPredictor::mean_and_cov, "state"_a, "(d), (d, d)")
       .def("mean_and_jacobian", &PyPredictor::mean_and_jacobian, "state"_a,
            "(d), and its exact derivative in the state (d, len(state_names)).")
       .def("distance_from_data", &PyPredictor::distance_from_data, "state"_a,
            "As of Prediction; nan where a feature is not finite.");
+
+  py::class_<PySolver>(module, "InverseDynamicsSolver",
+                       R"(Posterior.inverse_dynamics at one state after another, for control loops: microseconds a call.
+
+outputs  which accelerations are wanted; default: all
+system   another System with the same coordinates, inputs and latents
+cov      whether it will be asked for
+storage  as of Predictor
+
+A state is (len(state_names)); its inputs are where the search begins. Raises NumericalError where no inputs are found.)")
+      .def(py::init(&make_solver), "posterior"_a, py::kw_only(), "outputs"_a = std::vector<std::string>(), "system"_a = nullptr,
+           "cov"_a = true, "storage"_a = "double")
+      .def("inputs", &PySolver::inputs, "state"_a, "accelerations"_a, "(len(system.inputs))")
+      .def("inputs_and_cov", &PySolver::inputs_and_cov, "state"_a, "accelerations"_a, "And their covariance, a square array.");
 }
 
 }  // namespace gp2::python

@@ -2,16 +2,20 @@
 
 #include <algorithm>
 #include <cmath>
+#include <limits>
+#include <utility>
+#include <vector>
 
 #include <fmt/format.h>
 
 #include <Eigen/Cholesky>
-#include <Eigen/QR>
 
+#include "base/not_a_number.hpp"
 #include "gp2/error.hpp"
-#include "gp2/predictor.hpp"
+#include "gp2/mechanics/state_evaluator.hpp"
 #include "inference/requirements.hpp"
 #include "mechanics/describe_fault.hpp"
+#include "mechanics/pivoted_qr.hpp"
 
 namespace gp2 {
 
@@ -19,6 +23,7 @@ using Eigen::Index;
 using Eigen::MatrixXd;
 using Eigen::Ref;
 using Eigen::VectorXd;
+using Eigen::VectorXi;
 
 namespace {
 
@@ -26,79 +31,214 @@ constexpr double rank_tolerance = 1e-10;  // as that of constraints
 constexpr double rounding = 1e-13;        // of accelerations, beside their size
 constexpr double close_enough = 1e-8;     // where rounding lets no step help any more
 
-// The pseudo-inverse of J whose columns are scaled first, so that units of inputs do not decide the rank.
-MatrixXd scaled_pseudo_inverse(const MatrixXd& J) {
-  const VectorXd size = J.colwise().norm();
-  const VectorXd scale = (size.array() > 0).select(size.cwiseInverse(), 0);
-  Eigen::CompleteOrthogonalDecomposition<MatrixXd> decomposition;
-  decomposition.setThreshold(rank_tolerance);
-  decomposition.compute(J * scale.asDiagonal());
-  return scale.asDiagonal() * decomposition.pseudoInverse();
+void require_inputs_of(const Posterior& posterior, const View& view) {
+  require_view(posterior.prior(), view);
+  require_linear(posterior.prior(), "inverse_dynamics");
+  if (!view.is_of_ddq()) throw InputError("inverse_dynamics: the view must be of the constrained acceleration ddq");
+  const System& system = *prior_of(posterior.prior(), view).system;
+  if (system.layout().nu == 0) throw InputError(fmt::format("inverse_dynamics: '{}' has no inputs", system.name()));
 }
 
-/// Finds the inputs at one state after another.
-class InputSearch {
+/// The pseudo-inverse of matrices of one size whose columns are scaled first, so that units of inputs do not decide the rank.
+/// With J D P = Q [R; 0], D the scales, and Rᵀ P' = Q' [S; 0],
+///
+///     (J D)⁺ = P Q' [S⁻ᵀ P'ᵀ 0; 0] Qᵀ.
+class ScaledPseudoInverse {
  public:
-  InputSearch(const Posterior& posterior, const View& view)
-      : nu_(posterior.prior().system->layout().nu),
-        predictor_(posterior, view, Predictor::Options{.stddev = false, .jacobian = true}),
-        workspace_(predictor_.make_workspace()),
-        mean_(view.size()),
-        jacobian_(view.size(), posterior.prior().system->layout().size()) {}
-
-  /// @param metric  of the rows (d × d)
-  /// @param usual   how large accelerations are (d), beside which rounding is judged
-  /// @param state   its inputs are where the search begins, and become those found
-  /// @returns whether they were found
-  [[nodiscard]] bool run(const VectorXd& wanted, const MatrixXd& metric, const VectorXd& usual, VectorXd& state) {
-    constexpr int most_steps = 100;
-    wanted_ = wanted;
-    root_ = metric.llt().matrixU();
-    if (!evaluate(state)) return false;
-    double size = (root_ * usual).norm() + (root_ * wanted_).norm();
-    for (int step = 0; step < most_steps; ++step) {
-      const VectorXd rest = root_ * missed();
-      const MatrixXd J = root_ * jacobian_.rightCols(nu_);
-      pseudo_inverse_ = scaled_pseudo_inverse(J);
-      const VectorXd change = pseudo_inverse_ * rest;
-      const double gain = (J * change).norm();
-      size = std::max(size, (root_ * mean_).norm());
-      if (gain <= rounding * size) return true;
-      if (!improve(change, rest.norm(), state)) return gain <= close_enough * size;
-    }
-    return false;
+  ScaledPseudoInverse(Index d, Index nu)
+      : scaled_(d, nu), Q_transposed_(d, d), R_transposed_(nu, std::min(d, nu)), inverse_(nu, d), out_(nu, d), scale_(nu) {
+    reflection_.setZero(std::min(d, nu));
+    reflection2_ = reflection_;
+    order_.setZero(nu);
+    order2_.setZero(std::min(d, nu));
   }
 
-  // of the state that was found
-  [[nodiscard]] VectorXd missed() const { return wanted_ - mean_; }
-  [[nodiscard]] MatrixXd pseudo_inverse() const { return pseudo_inverse_ * root_; }  // J⁺ (nu × d)
+  /// D (J D)⁺ (nu × d).
+  const MatrixXd& compute(const MatrixXd& J) {
+    for (Index k = 0; k < J.cols(); ++k) {
+      const double size = J.col(k).norm();
+      scale_[k] = size > 0 ? 1 / size : 0;
+      scaled_.col(k) = J.col(k) * scale_[k];
+    }
+    const Index rank = internal::pivoted_qr(scaled_, reflection_, order_, rank_tolerance);
+    Q_transposed_.setIdentity();
+    internal::apply_Q_transposed(scaled_, reflection_, rank, Q_transposed_);
+    auto S = R_transposed_.leftCols(rank);
+    for (Index k = 0; k < rank; ++k) {
+      S.col(k).head(k).setZero();
+      S.col(k).tail(J.cols() - k) = scaled_.row(k).tail(J.cols() - k);
+    }
+    internal::pivoted_qr(S, reflection2_.head(rank), order2_.head(rank), 0);
+    inverse_.setZero();
+    for (Index k = 0; k < rank; ++k) {
+      inverse_.row(k) = Q_transposed_.row(order2_[k]);
+      for (Index j = 0; j < k; ++j) inverse_.row(k) -= S(j, k) * inverse_.row(j);
+      inverse_.row(k) /= S(k, k);
+    }
+    internal::apply_Q(S, reflection2_, rank, inverse_);
+    for (Index k = 0; k < J.cols(); ++k) out_.row(order_[k]) = scale_[order_[k]] * inverse_.row(k);
+    return out_;
+  }
 
  private:
-  [[nodiscard]] bool evaluate(const VectorXd& state) {
-    return predictor_.mean_and_jacobian(state, mean_, jacobian_, workspace_) == Predictor::Status::ok;
-  }
-
-  // The first of the steps change, change/2, change/4, … that misses less than before. False where none does: the state stays.
-  [[nodiscard]] bool improve(const VectorXd& change, double before, VectorXd& state) {
-    constexpr int most_halvings = 30;
-    const VectorXd inputs = state.tail(nu_);
-    for (int k = 0; k < most_halvings; ++k) {
-      state.tail(nu_) = inputs + std::ldexp(1.0, -k) * change;
-      if (evaluate(state) && (root_ * missed()).norm() < before) return true;
-    }
-    state.tail(nu_) = inputs;
-    static_cast<void>(evaluate(state));
-    return false;
-  }
-
-  int nu_;
-  Predictor predictor_;
-  Predictor::Workspace workspace_;
-  VectorXd wanted_, mean_;
-  MatrixXd jacobian_, root_, pseudo_inverse_;
+  MatrixXd scaled_, Q_transposed_, R_transposed_, inverse_, out_;
+  VectorXd scale_, reflection_, reflection2_;
+  VectorXi order_, order2_;
 };
 
 }  // namespace
+
+struct InverseDynamicsSolver::Implementation {
+  Prior prior;          // where the view looks
+  VectorXd parameters;  // there
+  Options options;
+  Predictor predictor;
+  Predictor without_data;
+
+  Implementation(const Posterior& posterior, const View& view, Options given)
+      : prior(prior_of(posterior.prior(), view)),
+        parameters(parameters_of(view, posterior.values().parameters)),
+        options(given),
+        predictor(posterior, view, {.stddev = options.covariance, .jacobian = true, .storage = options.storage}),
+        without_data(posterior.without_data(), view, {.stddev = true, .jacobian = false}) {}
+
+  [[nodiscard]] Index nu() const { return prior.system->layout().nu; }
+};
+
+/// The search at one state after another.
+struct InverseDynamicsSolver::Workspace::Implementation {
+  std::shared_ptr<const InverseDynamicsSolver::Implementation> solver;
+  Predictor::Workspace memory, memory_without_data;
+  std::unique_ptr<StateEvaluator> mechanics;
+  UdwadiaKalaba projection;
+  Eigen::LLT<MatrixXd> llt;
+  ScaledPseudoInverse inverse;
+  VectorXd state;                // its inputs are those found so far
+  VectorXd wanted;               // (d)
+  VectorXd mean;                 // of ddq under these inputs (d)
+  MatrixXd jacobian;             // (d × layout size)
+  VectorXd missed;               // (d)
+  VectorXd usual;                // how large accelerations are, beside which rounding is judged (d)
+  VectorXd usual_mean;           // of the prior (d)
+  MatrixXd metric;               // M' of the view's rows (d × d)
+  MatrixXd root;                 // of the metric, upper triangular (d × d)
+  MatrixXd J;                    // ∂v/∂u in the metric (d × nu)
+  VectorXd weighted;             // root times a vector (d)
+  VectorXd change;               // of the inputs (nu)
+  VectorXd start;                // of a step (nu)
+  MatrixXd covariance;           // of the view (d × d)
+  MatrixXd weighted_covariance;  // (nu × d)
+  MatrixXd J_inverse;            // J⁺ of v itself (nu × d)
+
+  explicit Implementation(std::shared_ptr<const InverseDynamicsSolver::Implementation> owner)
+      : solver(std::move(owner)),
+        memory(solver->predictor.make_workspace()),
+        memory_without_data(solver->without_data.make_workspace()),
+        mechanics(solver->prior.system->make_evaluator(solver->parameters, false)),
+        llt(solver->predictor.view().size()),
+        inverse(solver->predictor.view().size(), solver->nu()) {
+    const Index d = solver->predictor.view().size(), nu = solver->nu(), n_state = solver->prior.system->layout().size();
+    state.setZero(n_state);
+    wanted.setZero(d);
+    mean = missed = usual = usual_mean = weighted = wanted;
+    jacobian.setZero(d, n_state);
+    metric.setZero(d, d);
+    root = covariance = metric;
+    J.setZero(d, nu);
+    change.setZero(nu);
+    start = change;
+    J_inverse.setZero(nu, d);
+    weighted_covariance = J_inverse;
+    // rows that are all the same, so that the memory for redundant ones is there too
+    const Index nq = solver->prior.system->nq(), nc = solver->prior.system->nc();
+    projection.compute(MatrixXd::Identity(nq, nq), MatrixXd::Ones(nc, nq), VectorXd::Zero(nc));
+  }
+
+  [[nodiscard]] Status run(const Ref<const VectorXd>& at, const Ref<const VectorXd>& accelerations) {
+    state = at;
+    for (double& input : state.tail(solver->nu())) input = std::isnan(input) ? 0 : input;
+    wanted = accelerations;
+    missed.setConstant(not_a_number);
+    if (!wanted.allFinite()) return Status::not_finite;
+    if (!evaluate() ||
+        solver->without_data.mean_and_stddev(state, usual_mean, usual, memory_without_data) != Predictor::Status::ok) {
+      return Status::no_prediction;
+    }
+    write_root();
+    if (search()) return Status::ok;
+    missed.setConstant(not_a_number);
+    return Status::not_found;
+  }
+
+  // J⁺ Σ J⁺ᵀ, where Σ is the view's
+  void write_covariance(const Ref<const MatrixXd>& of_view, Ref<MatrixXd> of_inputs) {
+    weighted_covariance.noalias() = J_inverse.lazyProduct(of_view);
+    of_inputs.noalias() = weighted_covariance.lazyProduct(J_inverse.transpose());
+  }
+
+ private:
+  [[nodiscard]] bool evaluate() {
+    const bool is_ok = solver->predictor.mean_and_jacobian(state, mean, jacobian, memory) == Predictor::Status::ok;
+    missed = wanted - mean;
+    return is_ok;
+  }
+
+  void write_root() {
+    mechanics->evaluate(state);
+    projection.compute(mechanics->M(), mechanics->A(), mechanics->b());
+    const std::vector<int>& rows = solver->predictor.view().rows;
+    for (std::size_t i = 0; i < rows.size(); ++i) {
+      for (std::size_t j = 0; j < rows.size(); ++j) {
+        metric(static_cast<Index>(i), static_cast<Index>(j)) = projection.mass()(rows[i], rows[j]);
+      }
+    }
+    llt.compute(metric);
+    root = llt.matrixU();
+  }
+
+  // |v| in the metric, and v as it is there in `weighted`
+  double size_of(const VectorXd& v) {
+    weighted.noalias() = root.lazyProduct(v);
+    return weighted.norm();
+  }
+
+  [[nodiscard]] bool search() {
+    constexpr int most_steps = 100, most_trials = 30;
+    const Index nu = solver->nu();
+    double size = size_of(usual) + size_of(wanted), gain_before = std::numeric_limits<double>::infinity();
+    for (int step = 0; step < most_steps; ++step) {
+      size = std::max(size, size_of(mean));
+      J.noalias() = root.lazyProduct(jacobian.rightCols(nu));
+      const MatrixXd& pseudo_inverse = inverse.compute(J);
+      J_inverse.noalias() = pseudo_inverse.lazyProduct(root);
+      const double before = size_of(missed);
+      change.noalias() = pseudo_inverse.lazyProduct(weighted);
+      weighted.noalias() = J.lazyProduct(change);
+      const double gain = weighted.norm();
+      // a Newton step that leaves half of what the one before gained was one of rounding
+      const bool is_close = gain <= close_enough * size;
+      if (gain <= rounding * size || (is_close && gain > gain_before / 2)) return true;
+      gain_before = gain;
+      if (!improve(before, is_close ? 1 : most_trials)) return is_close;
+    }
+    return false;
+  }
+
+  // The first of n steps change, change/2, change/4, … that misses less than before. False where none does: the state stays.
+  [[nodiscard]] bool improve(double before, int n) {
+    auto inputs = state.tail(solver->nu());
+    start = inputs;
+    for (int k = 0; k < n; ++k) {
+      inputs = start + std::ldexp(1.0, -k) * change;
+      if (evaluate() && size_of(missed) < before) return true;
+    }
+    inputs = start;
+    static_cast<void>(evaluate());
+    return false;
+  }
+};
+
+// ---------------------------------------------------------------- many states
 
 MatrixXd InverseDynamics::stddev() const {
   MatrixXd stddev(inputs.rows(), inputs.cols());
@@ -108,13 +248,9 @@ MatrixXd InverseDynamics::stddev() const {
 
 InverseDynamics inverse_dynamics(const Posterior& posterior, const View& view, const Ref<const MatrixXd>& states,
                                  const Ref<const MatrixXd>& accelerations) {
-  require_view(posterior.prior(), view);
-  require_linear(posterior.prior(), "inverse_dynamics");
-  if (!view.is_of_ddq()) throw InputError("inverse_dynamics: the view must be of the constrained acceleration ddq");
-  const Prior& prior = prior_of(posterior.prior(), view);
-  const System& system = *prior.system;
+  require_inputs_of(posterior, view);
+  const System& system = *prior_of(posterior.prior(), view).system;
   const Index nu = system.layout().nu, d = view.size(), n = states.cols();
-  if (nu == 0) throw InputError(fmt::format("inverse_dynamics: '{}' has no inputs", system.name()));
   if (accelerations.rows() != d || accelerations.cols() != n) {
     throw InputError(fmt::format("inverse_dynamics: expected accelerations of {} rows at {} states, got {} × {}", d, n,
                                  accelerations.rows(), accelerations.cols()));
@@ -123,36 +259,108 @@ InverseDynamics inverse_dynamics(const Posterior& posterior, const View& view, c
   MatrixXd found = states;
   found.bottomRows(nu) = states.bottomRows(nu).array().isNaN().select(0, states.bottomRows(nu));
   static_cast<void>(posterior.mean(view, found));  // names a state without a prediction
-  const MechanicsBatch mechanics = require_mechanics(prior, view, found, parameters_of(view, posterior.values().parameters));
-  const auto fail = [&](Index i, const char* text) {
-    return internal::describe_fault(system, found, {static_cast<int>(i), text});
-  };
 
   InverseDynamics out{MatrixXd(nu, n), MatrixXd(nu * nu, n), MatrixXd(d, n)};
-  const MatrixXd usual = posterior.without_data().marginal(view, found).stddev();
-  std::vector<MatrixXd> pseudo_inverses;
-  InputSearch search(posterior, view);
+  std::vector<MatrixXd> inverses;
+  InverseDynamicsSolver::Workspace::Implementation search(std::make_shared<const InverseDynamicsSolver::Implementation>(
+      posterior, view, InverseDynamicsSolver::Options{.covariance = false}));
   for (Index i = 0; i < n; ++i) {
-    if (!accelerations.col(i).allFinite()) {
-      throw InputError(fail(i, "inverse_dynamics: an acceleration that is wanted is not a finite number"));
+    const auto fail = [&](const char* text) { return internal::describe_fault(system, found, {static_cast<int>(i), text}); };
+    switch (search.run(found.col(i), accelerations.col(i))) {
+      case InverseDynamicsSolver::Status::ok:
+        break;
+      case InverseDynamicsSolver::Status::not_finite:
+        throw InputError(fail("inverse_dynamics: an acceleration that is wanted is not a finite number"));
+      case InverseDynamicsSolver::Status::no_prediction:
+      case InverseDynamicsSolver::Status::not_found:
+        throw NumericalError(
+            fail("inverse_dynamics: no inputs are found that produce the accelerations, or come nearest to them"));
     }
-    const MatrixXd& mass = mechanics.projections[static_cast<std::size_t>(i)].mass();
-    VectorXd state = found.col(i);
-    if (!search.run(accelerations.col(i), mass(view.rows, view.rows), usual.col(i), state)) {
-      throw NumericalError(
-          fail(i, "inverse_dynamics: no inputs are found that produce the accelerations, or come nearest to them"));
-    }
-    found.col(i) = state;
-    out.missed.col(i) = search.missed();
-    pseudo_inverses.push_back(search.pseudo_inverse());
+    found.col(i) = search.state;
+    out.missed.col(i) = search.missed;
+    inverses.push_back(search.J_inverse);
   }
   out.inputs = found.bottomRows(nu);
   const Posterior::Marginal marginal = posterior.marginal(view, found);
   for (Index i = 0; i < n; ++i) {
-    const MatrixXd& J = pseudo_inverses[static_cast<std::size_t>(i)];
-    out.covariance.col(i) = (J * marginal.covariance.col(i).reshaped(d, d) * J.transpose()).reshaped();
+    search.J_inverse = inverses[static_cast<std::size_t>(i)];
+    search.write_covariance(marginal.covariance.col(i).reshaped(d, d), out.covariance.col(i).reshaped(nu, nu));
   }
   return out;
+}
+
+// ---------------------------------------------------------------- one state at a time
+
+InverseDynamicsSolver::InverseDynamicsSolver(const Posterior& posterior)
+    : InverseDynamicsSolver(posterior, View::constrained_acceleration(*posterior.prior().system)) {}
+InverseDynamicsSolver::InverseDynamicsSolver(const Posterior& posterior, const View& view)
+    : InverseDynamicsSolver(posterior, view, Options()) {}
+InverseDynamicsSolver::InverseDynamicsSolver(const Posterior& posterior, const View& view, Options options) {
+  require_inputs_of(posterior, view);
+  implementation_ = std::make_shared<const Implementation>(posterior, view, options);
+}
+
+const InverseDynamicsSolver::Implementation& InverseDynamicsSolver::implementation() const {
+  return require_held(implementation_, "InverseDynamicsSolver");
+}
+const View& InverseDynamicsSolver::view() const { return implementation().predictor.view(); }
+const InverseDynamicsSolver::Options& InverseDynamicsSolver::options() const { return implementation().options; }
+
+InverseDynamicsSolver::Workspace::Workspace(const InverseDynamicsSolver& solver) {
+  static_cast<void>(solver.implementation());  // it was not moved away
+  implementation_ = std::make_unique<Implementation>(solver.implementation_);
+}
+InverseDynamicsSolver::Workspace::~Workspace() = default;
+InverseDynamicsSolver::Workspace::Workspace(Workspace&&) noexcept = default;
+InverseDynamicsSolver::Workspace& InverseDynamicsSolver::Workspace::operator=(Workspace&&) noexcept = default;
+
+const VectorXd& InverseDynamicsSolver::Workspace::missed() const {
+  return require_held(implementation_, "InverseDynamicsSolver::Workspace").missed;
+}
+
+InverseDynamicsSolver::Status InverseDynamicsSolver::find(const Ref<const VectorXd>& state,
+                                                          const Ref<const VectorXd>& accelerations, Ref<VectorXd>& inputs,
+                                                          Workspace& workspace) const {
+  const Implementation& self = implementation();
+  if (!workspace.implementation_ || workspace.implementation_->solver.get() != &self) {
+    throw InputError("InverseDynamicsSolver: the workspace is of another solver; use make_workspace() of this one");
+  }
+  require_size("InverseDynamicsSolver", "a state", state.size(), self.prior.system->layout().size());
+  require_size("InverseDynamicsSolver", "the vector of accelerations", accelerations.size(), view().size());
+  require_size("InverseDynamicsSolver", "the vector of inputs", inputs.size(), self.nu());
+  Workspace::Implementation& search = *workspace.implementation_;
+  const Status status = search.run(state, accelerations);
+  if (status == Status::ok) {
+    inputs = search.state.tail(self.nu());
+  } else {
+    inputs.setConstant(not_a_number);
+  }
+  return status;
+}
+
+InverseDynamicsSolver::Status InverseDynamicsSolver::inputs(const Ref<const VectorXd>& state,
+                                                            const Ref<const VectorXd>& accelerations, Ref<VectorXd> inputs,
+                                                            Workspace& workspace) const {
+  return find(state, accelerations, inputs, workspace);
+}
+
+InverseDynamicsSolver::Status InverseDynamicsSolver::inputs_and_covariance(const Ref<const VectorXd>& state,
+                                                                           const Ref<const VectorXd>& accelerations,
+                                                                           Ref<VectorXd> inputs, Ref<MatrixXd> covariance,
+                                                                           Workspace& workspace) const {
+  if (!options().covariance) throw InputError("InverseDynamicsSolver: it was made without Options::covariance");
+  require_size("InverseDynamicsSolver", "a column of the covariance", covariance.rows(), implementation().nu());
+  require_size("InverseDynamicsSolver", "a row of the covariance", covariance.cols(), implementation().nu());
+  const Status status = find(state, accelerations, inputs, workspace);
+  if (status != Status::ok) {
+    covariance.setConstant(not_a_number);
+    return status;
+  }
+  Workspace::Implementation& search = *workspace.implementation_;
+  // at the state that the search has just evaluated, so that there is a prediction
+  static_cast<void>(implementation().predictor.mean_and_covariance(search.state, search.mean, search.covariance, search.memory));
+  search.write_covariance(search.covariance, covariance);
+  return status;
 }
 
 }  // namespace gp2

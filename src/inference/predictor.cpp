@@ -3,7 +3,6 @@
 #include <algorithm>
 #include <cmath>
 #include <optional>
-#include <string_view>
 #include <utility>
 #include <vector>
 
@@ -57,7 +56,7 @@ struct Predictor::Implementation {
   Status write_mean(const Ref<const VectorXd>& state, StateEvaluator& at, Workspace::Implementation& w,
                     Ref<VectorXd>& mean) const;
   // these follow the mean at the same state
-  void write_stddev(const StateEvaluator& at, Workspace::Implementation& w, Ref<VectorXd> stddev) const;
+  void write_covariance(const StateEvaluator& at, Workspace::Implementation& w) const;
   void write_jacobian(const Ref<const VectorXd>& state, const StateEvaluator& at, Workspace::Implementation& w,
                       Ref<MatrixXd> jacobian) const;
 
@@ -135,9 +134,9 @@ struct Predictor::Workspace::Implementation {
   MatrixXd d_multipliers;              // ∂(G_λ ā + d_λ)/∂x at held λ (nc × layout size)
   MatrixXd Gt, M_inverse_Gt;           // Gᵀ of the view (nq × d)
   std::vector<MatrixXd> loadings;      // ℓ, per term (F × d)
-  VectorXd variance;                   // (d)
+  MatrixXd covariance;                 // of the view, its lower triangle (d × d)
   VectorXd coordinates;                // of the distance from the data
-  VectorXd mean, stddev;               // of a component of a mixture (d)
+  VectorXd mean;                       // of a component of a mixture (d)
   MatrixXd jacobian;                   // likewise (d × layout size)
   PredictorData<double>::Memory in_double;
   PredictorData<float>::Memory in_single;
@@ -174,10 +173,6 @@ bool is_finite(const Numbers& numbers) {
   double sum = 0;
   for (const double number : numbers.reshaped()) sum += 0 * number;
   return sum == 0;
-}
-
-void check_size(std::string_view what, Index got, Index wanted) {
-  if (got != wanted) throw InputError(fmt::format("Predictor: {} is of size {}, got {}", what, wanted, got));
 }
 
 // dA in each entry of the state
@@ -265,8 +260,8 @@ void Predictor::Workspace::Implementation::reserve_mechanics() {
   G.setZero(n_rows, nq);
   Gt.setZero(nq, d);
   M_inverse_Gt = Gt;
-  variance.setZero(d);
-  mean = stddev = variance;
+  covariance.setZero(d, d);
+  mean.setZero(d);
   jacobian.setZero(d, n_state);
   // rows that are all the same, so that the memory for redundant ones is there too
   const MatrixXd rows = MatrixXd::Ones(nc, nq);
@@ -461,12 +456,12 @@ Status Predictor::Implementation::write_mean(const Ref<const VectorXd>& state, S
   return status;
 }
 
-// ---------------------------------------------------------------- standard deviation
+// ---------------------------------------------------------------- covariance
 
-// ℓ = Cᵀ Bᵀ Gᵀ, or with M⁻¹, and the prior's variance
+// ℓ = Cᵀ Bᵀ Gᵀ, or with M⁻¹, and the prior's covariance
 void Predictor::Implementation::write_loadings(Workspace::Implementation& w) const {
   const Index nq = w.Gt.rows();
-  w.variance.setZero();
+  w.covariance.setZero();
   for (std::size_t a = 0; a < terms.size(); ++a) {
     const PredictorTerm& term = terms[a];
     const VectorXd& B = w.terms[a].directions;
@@ -486,16 +481,18 @@ void Predictor::Implementation::write_loadings(Workspace::Implementation& w) con
         const double value = along(l, r) * (latent(term).is_positive ? w.terms[a].signal[l] : 1);
         for (Index f = 0; f < term.n_functions(); ++f) loading(f, r) += term.C(l, f) * value;
       }
-      if (term.is_potential) {
-        for (Index f = 0; f < term.n_functions(); ++f) w.variance[r] += term.variance[f] * loading(f, r) * loading(f, r);
-      } else {
-        w.variance[r] += k * loading.col(r).squaredNorm();
+      for (Index s = 0; s <= r; ++s) {
+        if (term.is_potential) {
+          for (Index f = 0; f < term.n_functions(); ++f) w.covariance(r, s) += term.variance[f] * loading(f, r) * loading(f, s);
+        } else {
+          w.covariance(r, s) += k * loading.col(r).dot(loading.col(s));
+        }
       }
     }
   }
 }
 
-void Predictor::Implementation::write_stddev(const StateEvaluator& at, Workspace::Implementation& w, Ref<VectorXd> stddev) const {
+void Predictor::Implementation::write_covariance(const StateEvaluator& at, Workspace::Implementation& w) const {
   write_G(at, w);
   for (int r = 0; r < view.size(); ++r) w.Gt.col(r) = w.G.row(view.rows[static_cast<std::size_t>(r)]);
   if (has_forced_latent) {
@@ -503,8 +500,7 @@ void Predictor::Implementation::write_stddev(const StateEvaluator& at, Workspace
     w.projection.solve_mass_in_place(w.M_inverse_Gt);
   }
   write_loadings(w);
-  with_data(w, [&](const auto& data, auto& memory) { data.subtract_explained(terms, w.loadings, memory, w.variance); });
-  for (Index r = 0; r < stddev.size(); ++r) stddev[r] = w.variance[r] < 0 ? 0 : std::sqrt(w.variance[r]);
+  with_data(w, [&](const auto& data, auto& memory) { data.subtract_explained(terms, w.loadings, memory, w.covariance); });
 }
 
 // ---------------------------------------------------------------- Jacobian
@@ -699,12 +695,22 @@ void check_arguments(const Predictor::Implementation& predictor, const Ref<const
   if (workspace.empty() || workspace.front()->predictor.get() != &predictor) {
     throw InputError("Predictor: the workspace is of another predictor; use make_workspace() of this one");
   }
-  check_size("a state", state.size(), predictor.prior.system->layout().size());
+  require_size("Predictor", "a state", state.size(), predictor.prior.system->layout().size());
 }
 void check_arguments(const Predictor::Implementation& predictor, const Ref<const VectorXd>& state, const Ref<VectorXd>& mean,
                      const WorkspaceParts& workspace) {
   check_arguments(predictor, state, workspace);
-  check_size("the mean", mean.size(), predictor.view.size());
+  require_size("Predictor", "the mean", mean.size(), predictor.view.size());
+}
+
+// of rows r and s ≤ r of the view: of one component, or of their mixture, whose mean is given
+double covariance_of(const WorkspaceParts& components, const Ref<VectorXd>& mean, Index r, Index s) {
+  double sum = 0;
+  for (const auto& w : components) {
+    sum += w->covariance(r, s);
+    if (components.size() > 1) sum += (w->mean[r] - mean[r]) * (w->mean[s] - mean[s]);
+  }
+  return r == s && sum < 0 ? 0 : sum / static_cast<double>(components.size());
 }
 
 }  // namespace
@@ -734,24 +740,39 @@ Status Predictor::mean(const Ref<const VectorXd>& state, Ref<VectorXd> mean, Wor
   });
 }
 
+Status Predictor::evaluate_covariance(const Ref<const VectorXd>& state, Ref<VectorXd>& mean, Workspace& workspace) const {
+  if (!options().stddev) throw InputError("Predictor: it was made without Options::stddev");
+  check_arguments(implementation(), state, mean, workspace.components_);
+  return for_each_component(workspace, mean, [&](const Implementation& self, Workspace::Implementation& w, Ref<VectorXd> mean_k) {
+    const Status status = self.write_mean(state, *w.values, w, mean_k);
+    if (status == Status::ok) self.write_covariance(*w.values, w);
+    return status;
+  });
+}
+
 Status Predictor::mean_and_stddev(const Ref<const VectorXd>& state, Ref<VectorXd> mean, Ref<VectorXd> stddev,
                                   Workspace& workspace) const {
-  if (!options().stddev) throw InputError("Predictor: it was made without Options::stddev");
-  check_size("the standard deviation", stddev.size(), view().size());
-  check_arguments(implementation(), state, mean, workspace.components_);
-  const bool is_mixture = components_.size() > 1;
-  const Status status =
-      for_each_component(workspace, mean, [&](const Implementation& self, Workspace::Implementation& w, Ref<VectorXd> mean_k) {
-        const Status of_one = self.write_mean(state, *w.values, w, mean_k);
-        if (of_one == Status::ok) self.write_stddev(*w.values, w, is_mixture ? Ref<VectorXd>(w.stddev) : stddev);
-        return of_one;
-      });
+  require_size("Predictor", "the standard deviation", stddev.size(), view().size());
+  const Status status = evaluate_covariance(state, mean, workspace);
   if (status != Status::ok) {
     stddev.setConstant(not_a_number);
-  } else if (is_mixture) {
-    stddev.setZero();
-    for (const auto& w : workspace.components_) stddev.array() += w->stddev.array().square() + (w->mean - mean).array().square();
-    stddev = (stddev / static_cast<double>(components_.size())).cwiseSqrt();
+    return status;
+  }
+  for (Index r = 0; r < stddev.size(); ++r) stddev[r] = std::sqrt(covariance_of(workspace.components_, mean, r, r));
+  return status;
+}
+
+Status Predictor::mean_and_covariance(const Ref<const VectorXd>& state, Ref<VectorXd> mean, Ref<MatrixXd> covariance,
+                                      Workspace& workspace) const {
+  require_size("Predictor", "a column of the covariance", covariance.rows(), view().size());
+  require_size("Predictor", "a row of the covariance", covariance.cols(), view().size());
+  const Status status = evaluate_covariance(state, mean, workspace);
+  if (status != Status::ok) {
+    covariance.setConstant(not_a_number);
+    return status;
+  }
+  for (Index r = 0; r < covariance.rows(); ++r) {
+    for (Index s = 0; s <= r; ++s) covariance(r, s) = covariance(s, r) = covariance_of(workspace.components_, mean, r, s);
   }
   return status;
 }
@@ -760,8 +781,8 @@ Status Predictor::mean_and_jacobian(const Ref<const VectorXd>& state, Ref<Vector
                                     Workspace& workspace) const {
   if (!options().jacobian) throw InputError("Predictor: it was made without Options::jacobian");
   check_arguments(implementation(), state, mean, workspace.components_);
-  check_size("a column of the Jacobian", jacobian.rows(), view().size());
-  check_size("a row of the Jacobian", jacobian.cols(), state.size());
+  require_size("Predictor", "a column of the Jacobian", jacobian.rows(), view().size());
+  require_size("Predictor", "a row of the Jacobian", jacobian.cols(), state.size());
   const bool is_mixture = components_.size() > 1;
   if (is_mixture) jacobian.setZero();
   Status status =

@@ -133,6 +133,7 @@ typename PredictorData<T>::Memory PredictorData<T>::make_memory(const std::vecto
   memory.loading.setZero(widest);
   if (stddev) {
     memory.products.setZero(n_padded);
+    memory.explained.setZero(n_rows);
     memory.cross.setZero(simd::padded<T>(reduced_size_), n_columns);
     memory.rows.setZero(sums_.cols(), n_columns);
   }
@@ -315,8 +316,8 @@ void PredictorData<T>::write_cross_of_rows(const std::vector<PredictorTerm>& ter
 
 template <typename T>
 void PredictorData<T>::subtract_explained(const std::vector<PredictorTerm>& terms, const std::vector<MatrixXd>& loadings,
-                                          Memory& memory, VectorXd& variance) const {
-  const Index d = variance.size(), n_columns = memory.cross.cols();
+                                          Memory& memory, MatrixXd& covariance) const {
+  const Index d = covariance.rows(), n_columns = memory.cross.cols();
   const bool by_function = is_by_function(terms, d);
   if (by_function) {
     write_cross_of_functions(terms, memory);
@@ -340,8 +341,8 @@ void PredictorData<T>::subtract_explained(const std::vector<PredictorTerm>& term
     loops<T>().weighted_sums(n, n_columns, row, memory.cross.data(), memory.cross.rows(), memory.sums.data());
     row += n;
     for (Index r = 0; r < d; ++r) {
-      const double value = entry(r);
-      variance[r] -= value * value;
+      memory.explained[r] = entry(r);
+      for (Index s = 0; s <= r; ++s) covariance(r, s) -= memory.explained[r] * memory.explained[s];
     }
   }
 }

@@ -40,6 +40,7 @@ class PredictorData {
     Matrix rows;      // where there are sums: cov of each row of a sample with · (rows × columns)
     Matrix cross;     // cov(basis variables, ·) (basis variables, padded × columns)
 
+    Eigen::VectorXd explained;    // a row of X c (rows of the view)
     Eigen::VectorXd k_in_double;  // of a kernel that is no se
     KernelColumns::Workspace kernel;
     std::vector<GradientColumns::Workspace> gradients;  // per term: of potentials
@@ -59,10 +60,10 @@ class PredictorData {
   void differentiate_signal(const PredictorTerm& term, std::size_t a, const Eigen::VectorXd& point, Memory& memory,
                             Eigen::MatrixXd& dsignal) const;
 
-  /// variance_r −= |X c_r|², c_r the covariance of ỹ with row r of the view.
+  /// covariance_rs −= (X c_r)ᵀ(X c_s) for s ≤ r, c_r the covariance of ỹ with row r of the view.
   /// @param loadings  ℓ, per term (F × rows of the view)
   void subtract_explained(const std::vector<PredictorTerm>& terms, const std::vector<Eigen::MatrixXd>& loadings, Memory& memory,
-                          Eigen::VectorXd& variance) const;
+                          Eigen::MatrixXd& covariance) const;
 
  private:
   struct LatentData {

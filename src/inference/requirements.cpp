@@ -167,6 +167,10 @@ void require_linear(const Prior& prior, const char* who) {
       "{}: not of a model with a latent that is positive or reads lambda; lambda0 in its place makes it linear", who));
 }
 
+void require_size(const char* type, const char* what, Index got, Index wanted) {
+  if (got != wanted) throw InputError(fmt::format("{}: {} is of size {}, got {}", type, what, wanted, got));
+}
+
 void throw_moved(const char* type) {
   throw InputError(fmt::format("{}: it was moved away; use the one that it was moved to", type));
 }

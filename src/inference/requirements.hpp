@@ -35,6 +35,10 @@ void require_learnable(const Prior& prior, const std::vector<Observations>& obse
 /// @param who  that cannot do with a nonlinear prior, for the message
 void require_linear(const Prior& prior, const char* who);
 
+/// A vector or a side of a matrix has this size.
+/// @param type  of the object that takes it, for the message
+void require_size(const char* type, const char* what, Eigen::Index got, Eigen::Index wanted);
+
 /// @param type  of what was moved away
 [[noreturn]] void throw_moved(const char* type);
 

@@ -464,6 +464,13 @@ std::vector<Option> options(ExciteRequest& request) {
 Excitation excite(const Model& model, const Posterior& posterior, const std::vector<Hyperparameter>& hyperparameters,
                   const ExciteRequest& request, const std::function<void(const ExciteProgress&)>& progress,
                   const std::atomic<bool>* stop) {
+  return excite({&model, model.actuators, nullptr, posterior.prior()}, posterior, hyperparameters, request, progress, stop);
+}
+
+Excitation excite(const FitSystem& driven, const Posterior& posterior, const std::vector<Hyperparameter>& hyperparameters,
+                  const ExciteRequest& request, const std::function<void(const ExciteProgress&)>& progress,
+                  const std::atomic<bool>* stop) {
+  const Model& model = *driven.model;
   const System& system = *model.system;
   require_options(request);
   if (posterior.prior().reference) throw InputError("excite: a baseline knows no constraints, so that it has no motion to plan");
@@ -473,7 +480,7 @@ Excitation excite(const Model& model, const Posterior& posterior, const std::vec
   const std::vector<Limit> inputs = input_limits(system, request.inputs_within), limits = state_limits(system, request.within);
 
   const lapack::SingleThread single_thread;
-  const ExpectedInformation information(posterior.prior(), posterior.observations(), hyperparameters,
+  const ExpectedInformation information(posterior.prior(), posterior.observations(), hyperparameters, driven.other_system,
                                         thread_count(request.threads), stop);
   Excitation out;
   out.target = target_of(request, information);
@@ -483,9 +490,7 @@ Excitation excite(const Model& model, const Posterior& posterior, const std::vec
   const double t_start = start_time(model, request.start, request.columns).value_or(0);
   of_motion.times = VectorXd::LinSpaced(request.n_rows, t_start, t_start + request.duration);
   of_motion.max_steps = most_steps_per_row * request.n_rows;
-  const Posterior& posterior_of_motion = information.posterior();
-  SimulateJob motion =
-      prepare_simulation({&model, model.actuators, nullptr, posterior_of_motion.prior()}, posterior_of_motion, of_motion);
+  SimulateJob motion = prepare_simulation(driven, information.posterior(), of_motion);
   motion.records.clear();
   require_start_within(motion.start, limits);
   out.notes = motion.notes;
@@ -494,7 +499,7 @@ Excitation excite(const Model& model, const Posterior& posterior, const std::vec
                                     n_states(posterior.observations()), posterior.n_states()));
   }
 
-  Search search(std::move(motion), information, InputFamily(inputs, of_motion.times, request.n_harmonics, model.actuators),
+  Search search(std::move(motion), information, InputFamily(inputs, of_motion.times, request.n_harmonics, driven.actuators),
                 limits, out.target, request, stop);
   search.run(progress);
   require_within(search.best(), limits, search.n_motions());
@@ -521,7 +526,7 @@ Excitation excite(const Model& model, const Posterior& posterior, const std::vec
   out.n_motions = search.n_motions();
   out.n_failed = search.n_failed();
   out.highest_frequency = request.n_harmonics / request.duration;
-  out.leaves_data = motion_uncertainty(information.posterior(), out.motion).leaves_data;
+  out.leaves_data = motion_uncertainty(information.posterior(), out.motion, driven.other_system).leaves_data;
   out.motion.states.bottomRows(system.layout().nu) = search.commands();  // what a logger writes, and `simulate` reads
   out.limits = limit_uses(out.motion, all);
   out.interrupted = is_set(stop);

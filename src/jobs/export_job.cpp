@@ -10,7 +10,7 @@
 #include <fmt/format.h>
 
 #include "base/checksum.hpp"
-#include "export/mjcf.hpp"
+#include "export/fitted_robot.hpp"
 #include "export/shims.hpp"
 #include "gp2/base/file.hpp"
 #include "gp2/error.hpp"
@@ -37,16 +37,19 @@ std::string name_of(const System& system) {
   return name.empty() || std::isdigit(static_cast<unsigned char>(name.front())) ? "model_" + name : name;
 }
 
+const char* word(Target robot) { return robot == Target::urdf ? "urdf" : "mjcf"; }
+
 void require_options(const ExportRequest& request, const std::string& name) {
-  if (request.to == Target::mjcf) {
+  if (request.is_of_robot()) {
     const ViewRequest whole;
     if (request.view.quantity != whole.quantity || request.view.latent || request.view.time_step || request.view.system ||
         request.single_precision || request.portable_math || request.draws_within || !request.stddev || !request.jacobian) {
-      throw InputError("`to=mjcf` writes parameters, no functions: it goes with `robot` and `name` alone");
+      throw InputError(
+          fmt::format("`to={}` writes parameters, no functions: it goes with `robot` and `name` alone", word(request.to)));
     }
     return;
   }
-  if (!request.robot.empty()) throw InputError("`robot` goes with `to=mjcf`");
+  if (!request.robot.empty()) throw InputError("`robot` goes with `to=mjcf` and `to=urdf`");
   if (request.to == Target::c) return;
   if (request.single_precision) {
     throw InputError("`float` goes with `to=c`: CasADi and acados compute in double precision");
@@ -120,55 +123,62 @@ std::optional<NumberDifference> first_difference(const RobotDescription& robot, 
 ExportOutcome export_robot(const FitFile& fit, const ExportRequest& request) {
   const std::string name = request.name.empty() ? name_of(*fit.model.system) : request.name;
   require_options(request, name);
-  if (!fit.model.robot) throw InputError("`to=mjcf` writes into the file of a robot, but the model has none");
+  const char* const to = word(request.to);
+  if (!fit.model.robot) throw InputError(fmt::format("`to={}` writes into the file of a robot, but the model has none", to));
   const RobotNames names = robot_names(fit.model);
   const std::filesystem::path path = request.robot.empty() ? std::filesystem::path(fit.model.name).parent_path() / names.file
                                                            : std::filesystem::path(request.robot);
   const std::vector<FittedNumber> numbers = fitted_numbers(fit, names.parameters);
   if (numbers.empty()) {
     throw InputError(
-        "`to=mjcf`: the model has no number of its robot as a parameter that differs; write [parameters] m7 = { of = "
-        "'mass(\"link7\")', estimate = true } and fit again");
+        fmt::format("`to={}`: the model has no number of its robot as a parameter that differs; write [parameters] m7 = {{ of = "
+                    "'mass(\"link7\")', estimate = true }} and fit again",
+                    to));
   }
   if (request.robot.empty() && !std::filesystem::exists(path)) {
     throw InputError(
         fmt::format("`robot`: the robot's file is not at '{}', where the model had it; say where it is", path.string()));
   }
   const std::string text = read_file(path);
-  if (read_robot_xml(text, path).is_urdf) {
-    throw InputError(
-        fmt::format("`to=mjcf`: '{}' is a URDF file, which is not written into; convert it to MJCF with MuJoCo and fit "
-                    "with that",
-                    path.string()));
+  const bool is_urdf = read_robot_xml(text, path).is_urdf;
+  if (is_urdf != (request.to == Target::urdf)) {
+    throw InputError(fmt::format("`to={}`: '{}' is a file of the other format, and is written into by `to={}`", to, path.string(),
+                                 word(is_urdf ? Target::urdf : Target::mjcf)));
   }
   if (const auto other = first_difference(read_robot(path), *fit.model.robot)) {
     throw InputError(fmt::format("`robot`: '{}' is not the robot of the fit: its {} is {}, there it is {}", path.string(),
                                  other->name, other->is, other->expected));
   }
-  FittedMjcf written = fitted_mjcf(text, path.string(), *fit.model.robot, numbers);
+  FittedRobot written = (is_urdf ? fitted_urdf : fitted_mjcf)(text, path.string(), *fit.model.robot, numbers);
   if (written.is_physical) {
     if (const auto other = first_difference(read_robot(path, written.text), written.robot)) {
       throw InputError(
           fmt::format("{}: MuJoCo would read {} = {} where {} is written: its compiler changes it by settotalmass, boundmass, "
-                      "boundinertia or balanceinertia; remove these",
+                      "boundinertia or balanceinertia, or fuses bodies by fusestatic; remove these",
                       path.string(), other->name, other->is, other->expected));
     }
   }
-  if (text.find(" file=") != std::string::npos) {
+  if (text.find(is_urdf ? " filename=" : " file=") != std::string::npos) {
     written.notes.push_back(fmt::format("the file names others: it belongs into the folder of {}", path.string()));
   }
-  return {{{name + ".xml", std::move(written.text)}}, std::move(written.notes), path.string()};
+  return {{{name + (is_urdf ? ".urdf" : ".xml"), std::move(written.text)}}, std::move(written.notes), path.string()};
 }
 
 std::vector<Option> options(ExportRequest& request) {
   std::vector<Option> table = {
       {"to",
-       choice(request.to, {{"c", Target::c}, {"casadi", Target::casadi}, {"acados", Target::acados}, {"mjcf", Target::mjcf}}), "",
+       choice(request.to, {{"c", Target::c},
+                           {"casadi", Target::casadi},
+                           {"acados", Target::acados},
+                           {"mjcf", Target::mjcf},
+                           {"urdf", Target::urdf}}),
+       "",
        "c: NAME.h and NAME.c, C99 that needs <math.h> alone; casadi: also NAME_casadi.c, an external function with its Jacobian; "
-       "acados: NAME_acados.c, a generic discrete step of `dt` with its sensitivities; mjcf: the robot's own file with the "
-       "numbers that the model has as parameters"},
+       "acados: NAME_acados.c, a generic discrete step of `dt` with its sensitivities; mjcf, urdf: the robot's own file with "
+       "the numbers that the model has as parameters"},
       {"name", &request.name, "NAME", "what the files and every name in them begin with", "that of the system"},
-      {"robot", &request.robot, "FILE", "of mjcf: the robot's file", "the one that the model names, beside the model's"}};
+      {"robot", &request.robot, "FILE", "of mjcf and urdf: the robot's file",
+       "the one that the model names, beside the model's"}};
   for (Option& option : options(request.view)) {
     if (option.name == "dt")
       option = {"dt", option.value, option.sample, "time step of next-velocity, or of the step for acados [s]"};
@@ -195,7 +205,7 @@ ExportOutcome export_fit(const FitFile& fit, const Posterior& posterior, const E
   ExportOutcome out;
   const std::string name = request.name.empty() ? name_of(*fit.model.system) : request.name;
   require_options(request, name);
-  if (request.to == Target::mjcf) return export_robot(fit, request);
+  if (request.is_of_robot()) return export_robot(fit, request);
   ViewRequest viewed = request.view;
   if (request.to == Target::acados) viewed.time_step.reset();
   const PredictedView at = predicted_view(fit, posterior.prior(), viewed);

@@ -59,12 +59,14 @@ MatrixXd information_of_fit(const Prior& prior, const std::vector<Observations>&
 }  // namespace
 
 ExpectedInformation::ExpectedInformation(const Prior& prior, const std::vector<Observations>& observations,
-                                         const std::vector<Hyperparameter>& hyperparameters, int n_threads,
+                                         const std::vector<Hyperparameter>& hyperparameters,
+                                         std::shared_ptr<const OtherSystem> other_system, int n_threads,
                                          const std::atomic<bool>* stop)
     : posterior_(prior, observations, model_values(prior, observations, hyperparameters)),
       view_(View::constrained_acceleration(*prior.system)) {
   const lapack::SingleThread single_thread;
   view_.rows = observed_rows(posterior_);
+  view_.other_system = std::move(other_system);
   noise_stddev_ = measurement_noise(posterior_, view_.rows, 1);
   const std::vector<int> theta = estimated_parameters(hyperparameters);
   information_ = information_of_fit(prior, observations, hyperparameters, theta, n_threads, stop);
@@ -107,9 +109,10 @@ ExpectedInformation::Known ExpectedInformation::after(const MatrixXd& states, co
   const VectorXd scale = noise_stddev_.cwiseInverse().replicate(all.cols(), 1);
   covariance = scale.asDiagonal() * covariance * scale.asDiagonal();
   MatrixXd of_measured = covariance.topLeftCorner(n, n) + MatrixXd::Identity(n, n);
-  if (posterior_.prior().system->has_constraint_noise() && n > 0) {
-    const VectorXd& parameters = posterior_.values().parameters;
-    const ViewValues values = evaluate_view(view_, require_mechanics(posterior_.prior(), view_, states, parameters), states);
+  const Prior& measured = prior_of(posterior_.prior(), view_);
+  if (measured.system->has_constraint_noise() && n > 0) {
+    const VectorXd parameters = parameters_of(view_, posterior_.values().parameters);
+    const ViewValues values = evaluate_view(view_, require_mechanics(measured, view_, states, parameters), states);
     for (Index i = 0; i < states.cols(); ++i) {
       const MatrixXd slip = noise_stddev_.cwiseInverse().asDiagonal() * values.N(static_cast<int>(i));
       of_measured.block(i * d, i * d, d, d) += slip * slip.transpose();

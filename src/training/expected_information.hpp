@@ -1,6 +1,7 @@
 #pragma once
 
 #include <atomic>
+#include <memory>
 #include <vector>
 
 #include <Eigen/Core>
@@ -25,10 +26,12 @@ class ExpectedInformation {
  public:
   /// @param observations     of some ddq; what is measured, and with which noise, is as in these
   /// @param hyperparameters  fitted to them
+  /// @param other_system     on which is measured; null: that of the prior
   /// @param stop             set: throws NumericalError
   /// @throws InputError, NumericalError  as Posterior and laplace_uncertainty
   ExpectedInformation(const Prior& prior, const std::vector<Observations>& observations,
-                      const std::vector<Hyperparameter>& hyperparameters, int n_threads, const std::atomic<bool>* stop);
+                      const std::vector<Hyperparameter>& hyperparameters, std::shared_ptr<const OtherSystem> other_system,
+                      int n_threads, const std::atomic<bool>* stop);
 
   [[nodiscard]] const Posterior& posterior() const { return posterior_; }
   [[nodiscard]] const View& view() const { return view_; }                                // ddq as measured, d rows

@@ -76,6 +76,15 @@ TEST_F(ExciteCommand, IsTheSameForTheSameSeedAndAnyNumberOfThreads) {
   EXPECT_NE(desk.read("next.csv"), one);
 }
 
+TEST_F(ExciteCommand, DrivesAnotherSystem) {
+  desk.done("sed 's/k = {.*/k = 20.0/' spring.toml >stiff.toml");
+  const Outcome outcome = desk.done(command + "--for accelerations --system stiff.toml");
+  desk.done("gp2 simulate fit.json --system stiff.toml --start next.csv --inputs next.csv --t-end 6 --dt 0.1 -o motion.csv");
+  EXPECT_NEAR(columns(desk.table("motion.csv"), {"x"})(0, 60), columns(desk.table("next.csv"), {"x"})(0, 59), 1e-5);
+  desk.done("sed 's/\\[\"dx\"\\]/[\"x\"]/' spring.toml >other.toml");
+  EXPECT_TRUE(desk.run(command + "--system other.toml").said("must have the same coordinates, inputs and latents"));
+}
+
 TEST_F(ExciteCommand, TellsWhatIsWrong) {
   const auto error = [&](const std::string& options) {
     const Outcome outcome = desk.run("gp2 excite fit.json -o next.csv --duration 2 " + options);

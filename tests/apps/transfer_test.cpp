@@ -192,6 +192,16 @@ TEST_F(Transfer, JoinsKnowledgeToTheObservations) {
   EXPECT_EQ(more.observations[3].view().latent, 0);
 }
 
+TEST_F(Transfer, WhatTakesLogsOfTheFitsOwnSystemSaysWhy) {
+  static_cast<void>(fit("--data train.csv"));
+  EXPECT_THAT(
+      refusal("gp2 update fit.json --data other.csv@other.toml -o next.json"),
+      HasSubstr("--data: 'other.csv@other.toml' is of another system, 'other.toml', than the fit: hyperparameters are held"));
+  EXPECT_THAT(refusal("gp2 shoot fit.json --data other.csv@other.toml -o next.json"),
+              HasSubstr("the motion that is compared with the log is that of the fit's own system"));
+  EXPECT_FALSE(desk.has("next.json"));
+}
+
 TEST_F(Transfer, RefusesWhatDoesNotFit) {
   desk.write("kernel.toml", replaced(desk.read("models/surface.toml"), "kernel     = \"se\"", "kernel     = \"matern52\""));
   EXPECT_THAT(

@@ -4,6 +4,7 @@
 #include <gtest/gtest.h>
 #include <Eigen/QR>
 
+#include "allocation_count.hpp"
 #include "gp2/error.hpp"
 #include "gp2/predictor.hpp"
 #include "inference/problems.hpp"
@@ -178,6 +179,147 @@ TEST(InverseDynamicsTest, IsFoundByNewtonsMethodWhereTheInputsAreNotAffine) {
     // δu = δddq / (dddq/du), and the prior's deviation of ddq is 1
     EXPECT_NEAR(found.stddev()(0, i), 2 / (1 + 15 * u * u), 1e-9);
   }
+}
+
+using Solver = InverseDynamicsSolver;
+
+// one state at a time gives what many give, and allocates nothing
+void expect_the_same_of_one_state(const Posterior& posterior, const View& view, const MatrixXd& states, const MatrixXd& wanted,
+                                  double tolerance) {
+  const InverseDynamics expected = inverse_dynamics(posterior, view, states, wanted);
+  const Solver solver(posterior, view);
+  Solver::Workspace workspace = solver.make_workspace();
+  const Index nu = expected.inputs.rows();
+  VectorXd inputs(nu), again(nu);
+  MatrixXd covariance(nu, nu);
+  // covariances are differences of numbers of the size of the prior's
+  const MatrixXd before = inverse_dynamics(posterior.without_data(), view, with_inputs(states, expected.inputs),
+                                           posterior.without_data().mean(view, with_inputs(states, expected.inputs)))
+                              .covariance;
+  for (Index i = 0; i < states.cols(); ++i) {
+    Solver::Status of_inputs{}, of_both{};
+    EXPECT_EQ(test::allocations_of([&] {
+                of_inputs = solver.inputs(states.col(i), wanted.col(i), again, workspace);
+                of_both = solver.inputs_and_covariance(states.col(i), wanted.col(i), inputs, covariance, workspace);
+              }),
+              0U);
+    ASSERT_EQ(of_inputs, Solver::Status::ok);
+    ASSERT_EQ(of_both, Solver::Status::ok);
+    EXPECT_EQ(inputs, again);
+    EXPECT_LE(largest(inputs - expected.inputs.col(i)), tolerance * (1 + largest(expected.inputs)));
+    EXPECT_LE(largest(covariance.reshaped() - expected.covariance.col(i)), tolerance * (1 + largest(before)));
+    EXPECT_LE(largest(workspace.missed() - expected.missed.col(i)), tolerance * (1 + largest(wanted)));
+  }
+}
+
+TEST(InverseDynamicsSolverTest, IsInverseDynamicsOfOneStateAndAllocatesNothing) {
+  int n = 0;
+  for (const Problem& p : test::problems(15, inverse_seed)) {
+    if (p.prior.system->layout().nu == 0) continue;
+    ++n;
+    SCOPED_TRACE(fmt::format("{}, seed {}", p.name, inverse_seed));
+    const Posterior posterior(p.prior, p.observations, p.values);
+    const View view = View::constrained_acceleration(*p.prior.system);
+    const MatrixXd states = p.queries.array().isNaN().select(0, p.queries);
+    expect_the_same_of_one_state(posterior, view, states, posterior.mean(view, states), 1e-11 + 100 * test::rounding(p));
+  }
+  EXPECT_GT(n, 20);
+}
+
+TEST(InverseDynamicsSolverTest, StartsAtZeroWhereInputsAreNotKnownAndMissesTheLeast) {
+  const Arm arm;
+  RandomStream random(inverse_seed, 5);
+  const MatrixXd states = with_inputs(arm.states, MatrixXd::Constant(2, arm.states.cols(), std::nan("")));
+  expect_the_same_of_one_state(arm.posterior, arm.view, states, arm.posterior.mean(arm.view, arm.states), 1e-11);
+  expect_the_same_of_one_state(arm.posterior, arm.view, states, test::random_matrix(2, 4, random), 1e-11);
+}
+
+TEST(InverseDynamicsSolverTest, OfSomeAccelerationsUnderAnotherSystem) {
+  const Arm arm;
+  const Model faster = Model::parse(test::changed(arm.model.text, {{"w  = 4.0", "w  = 5.0"}}), "faster.toml");
+  const View elbow = test::under({Quantity::constrained_acceleration, {1}},
+                                 make_other_system(arm.model, faster, {Prior::Mean::force, std::nullopt}));
+  expect_the_same_of_one_state(arm.posterior, elbow, arm.states, MatrixXd::Constant(1, 4, 2.5), 1e-11);
+}
+
+TEST(InverseDynamicsSolverTest, OfAMixtureProducesItsMean) {
+  const Arm arm;
+  std::vector<ModelValues> values(3, arm.posterior.values());
+  values[1].kernel[0] *= 1.7;
+  values[2].signal_stddev[0] *= 0.6;
+  const Posterior mixture = Posterior::mixture(arm.prior, arm.posterior.observations(), values);
+  const MatrixXd wanted = mixture.mean(arm.view, arm.states);
+  MatrixXd states = arm.states;
+  states.bottomRows(2).array() += 1;
+  expect_the_same_of_one_state(mixture, arm.view, states, wanted, 1e-9);
+  const InverseDynamics found = inverse_dynamics(mixture, arm.view, states, wanted);
+  EXPECT_LE(largest(mixture.mean(arm.view, with_inputs(states, found.inputs)) - wanted), 1e-10 * (1 + largest(wanted)));
+}
+
+TEST(InverseDynamicsSolverTest, FindsInputsByNewtonsMethodAndSaysWhyThereAreNone) {
+  const auto posterior_of = [](const std::string& force) {
+    const Model model = cart(force);
+    return Posterior(make_prior(model, {Prior::Mean::force, std::nullopt}), {},
+                     {{VectorXd::Ones(1)}, {VectorXd::Ones(1)}, {}, {}, {}});
+  };
+  const Posterior cubic = posterior_of("u + 5*u^3 - x");
+  const View view = View::constrained_acceleration(*cubic.prior().system);
+  expect_the_same_of_one_state(cubic, view, Eigen::Vector4d(1, 0, 0, 0), MatrixXd::Constant(1, 1, 40), 1e-11);
+
+  const auto status_of = [&](const std::string& force, const Eigen::Vector4d& state, double wanted) {
+    const Solver solver(posterior_of(force));
+    Solver::Workspace workspace = solver.make_workspace();
+    VectorXd inputs(1);
+    MatrixXd covariance(1, 1);
+    const VectorXd accelerations = VectorXd::Constant(1, wanted);
+    Solver::Status status{};
+    EXPECT_EQ(
+        test::allocations_of([&] { status = solver.inputs_and_covariance(state, accelerations, inputs, covariance, workspace); }),
+        0U);
+    EXPECT_EQ(std::isnan(inputs[0]), status != Solver::Status::ok);
+    EXPECT_EQ(std::isnan(covariance(0, 0)), status != Solver::Status::ok);
+    EXPECT_EQ(std::isnan(workspace.missed()[0]), status != Solver::Status::ok);
+    return status;
+  };
+  const double unknown = std::nan("");
+  EXPECT_EQ(status_of("u", {0, 0, 0, 0}, 1), Solver::Status::ok);
+  EXPECT_EQ(status_of("u", {0, 0, 0, unknown}, 1), Solver::Status::ok);
+  EXPECT_EQ(status_of("u^2", {0, 0, 0, 1}, -1), Solver::Status::not_found);
+  EXPECT_EQ(status_of("u", {0, 0, 0, 0}, unknown), Solver::Status::not_finite);
+  EXPECT_EQ(status_of("u - x", {unknown, 0, 0, 0}, 1), Solver::Status::no_prediction);
+}
+
+TEST(InverseDynamicsSolverTest, NamesWhatIsWrongWithAnArgument) {
+  const Arm arm;
+  const auto refusal = [](const auto& call) { return test::input_error_of([&] { static_cast<void>(call()); }); };
+  EXPECT_THAT(refusal([&] { return Solver(arm.posterior, View::unconstrained_acceleration(*arm.model.system)); }),
+              HasSubstr("must be of the constrained acceleration"));
+  const Solver bare(arm.posterior, arm.view, {.covariance = false});
+  Solver other(arm.posterior);
+  EXPECT_EQ(other.view().size(), 2);
+  EXPECT_TRUE(other.options().covariance);
+  Solver::Workspace workspace = other.make_workspace();
+  const VectorXd state = arm.states.col(0), wanted = VectorXd::Zero(2);
+  VectorXd inputs(2), three(3);
+  MatrixXd covariance(2, 2), low(1, 2), narrow(2, 1);
+  EXPECT_THAT(refusal([&] { return bare.inputs(state, wanted, inputs, workspace); }),
+              HasSubstr("the workspace is of another solver"));
+  EXPECT_THAT(refusal([&] { return bare.inputs_and_covariance(state, wanted, inputs, covariance, workspace); }),
+              HasSubstr("it was made without Options::covariance"));
+  EXPECT_THAT(refusal([&] { return other.inputs(state.head(3), wanted, inputs, workspace); }),
+              HasSubstr("a state is of size 7, got 3"));
+  EXPECT_THAT(refusal([&] { return other.inputs(state, three, inputs, workspace); }),
+              HasSubstr("the vector of accelerations is of size 2, got 3"));
+  EXPECT_THAT(refusal([&] { return other.inputs(state, wanted, three, workspace); }),
+              HasSubstr("the vector of inputs is of size 2, got 3"));
+  EXPECT_THAT(refusal([&] { return other.inputs_and_covariance(state, wanted, inputs, low, workspace); }),
+              HasSubstr("a column of the covariance is of size 2, got 1"));
+  EXPECT_THAT(refusal([&] { return other.inputs_and_covariance(state, wanted, inputs, narrow, workspace); }),
+              HasSubstr("a row of the covariance is of size 2, got 1"));
+  // the workspace keeps its solver alive
+  const Solver moved = std::move(other);
+  EXPECT_EQ(moved.inputs(state, wanted, inputs, workspace), Solver::Status::ok);
+  EXPECT_THAT(refusal([&] { return other.make_workspace(); }), HasSubstr("moved"));  // NOLINT(bugprone-use-after-move)
 }
 
 TEST(InverseDynamicsTest, SaysWhatCannotBe) {

@@ -113,6 +113,10 @@ TEST(Mixture, ThePredictorSaysTheSameAndAllocatesNothing) {
       const double tolerance = test::rounding(p) * (1 + test::largest(expected) + test::largest(marginal.mean));
       EXPECT_LE(test::largest(mean - marginal.mean.col(i)), tolerance);
       EXPECT_LE(test::largest(stddev - expected.col(i)), std::sqrt(tolerance) * 1e-3 + tolerance);
+      MatrixXd covariance(view.size(), view.size());
+      EXPECT_EQ(test::allocations_of([&] { status = predictor.mean_and_covariance(state, mean, covariance, workspace); }), 0);
+      EXPECT_LE(test::largest(covariance.reshaped() - marginal.covariance.col(i)),
+                test::rounding(p) * (1 + test::largest(marginal.covariance)));
       EXPECT_EQ(test::allocations_of([&] { status = predictor.mean_and_jacobian(state, mean, jacobian, workspace); }), 0);
       MatrixXd sum = MatrixXd::Zero(jacobian.rows(), jacobian.cols());
       for (int k = 0; k < 3; ++k) {

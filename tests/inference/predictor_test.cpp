@@ -67,13 +67,17 @@ MatrixXd known(const MatrixXd& states) { return states.array().isNaN().select(0,
 // one prediction of each kind
 struct Prediction {
   VectorXd mean, stddev;
-  MatrixXd jacobian;
+  MatrixXd covariance, jacobian;
   Status status;
 
   Prediction(const Predictor& predictor, const VectorXd& state, Predictor::Workspace& workspace)
-      : mean(predictor.view().size()), stddev(mean.size()), jacobian(mean.size(), state.size()) {
+      : mean(predictor.view().size()),
+        stddev(mean.size()),
+        covariance(mean.size(), mean.size()),
+        jacobian(mean.size(), state.size()) {
     VectorXd again(mean.size());
     status = predictor.mean_and_jacobian(state, mean, jacobian, workspace);
+    EXPECT_EQ(predictor.mean_and_covariance(state, again, covariance, workspace), status);
     EXPECT_EQ(predictor.mean_and_stddev(state, again, stddev, workspace), status);
     if (status == Status::ok) {
       EXPECT_EQ(again, mean);
@@ -100,6 +104,10 @@ TEST(PredictorTest, IsThePosteriorInEveryView) {
           for (Index r = 0; r < view.size(); ++r) {
             EXPECT_NEAR(prediction.stddev[r] * prediction.stddev[r], expected.covariance(r * (view.size() + 1), 0),
                         1e4 * eps * (prior(r) * prior(r) + eps));
+            for (int s = 0; s < view.size(); ++s) {
+              EXPECT_NEAR(prediction.covariance(r, s), expected.covariance(r + s * view.size(), 0),
+                          1e4 * eps * (largest(prior) * largest(prior) + eps));
+            }
           }
         }
       }
@@ -283,17 +291,18 @@ TEST(PredictorTest, AllocatesNothing) {
         Predictor::Workspace workspace = predictor.make_workspace();
         const MatrixXd states = known(p.queries);
         VectorXd mean(view.size()), stddev(view.size());
-        MatrixXd jacobian(view.size(), states.rows());
+        MatrixXd covariance(view.size(), view.size()), jacobian(view.size(), states.rows());
         int n_good = 0;
         const std::size_t n_allocations = test::allocations_of([&] {
           for (Index i = 0; i < states.cols(); ++i) {
             n_good += predictor.mean_and_jacobian(states.col(i), mean, jacobian, workspace) == Status::ok ? 1 : 0;
             n_good += predictor.mean_and_stddev(states.col(i), mean, stddev, workspace) == Status::ok ? 1 : 0;
+            n_good += predictor.mean_and_covariance(states.col(i), mean, covariance, workspace) == Status::ok ? 1 : 0;
             n_good += predictor.mean(states.col(i), mean, workspace) == Status::ok ? 1 : 0;
           }
         });
         EXPECT_EQ(n_allocations, 0U);
-        EXPECT_EQ(n_good, 3 * states.cols());
+        EXPECT_EQ(n_good, 4 * states.cols());
       }
     }
   }
@@ -417,7 +426,7 @@ TEST(PredictorTest, TellsWhatIsWrongWithAStateAndGoesOn) {
     const Predictor predictor(posterior);
     Predictor::Workspace workspace = predictor.make_workspace();
     VectorXd mean(2), stddev(2);
-    MatrixXd jacobian(2, 5);
+    MatrixXd covariance(2, 2), jacobian(2, 5);
     const VectorXd good = VectorXd::Ones(5);
     EXPECT_EQ(predictor.mean(good, mean, workspace), Status::ok);
     const VectorXd before = mean;
@@ -426,7 +435,8 @@ TEST(PredictorTest, TellsWhatIsWrongWithAStateAndGoesOn) {
       EXPECT_TRUE(mean.array().isNaN().all());
       mean.setZero();
       EXPECT_EQ(predictor.mean_and_stddev(bad, mean, stddev, workspace), status);
-      EXPECT_TRUE(mean.array().isNaN().all() && stddev.array().isNaN().all());
+      EXPECT_EQ(predictor.mean_and_covariance(bad, mean, covariance, workspace), status);
+      EXPECT_TRUE(mean.array().isNaN().all() && stddev.array().isNaN().all() && covariance.array().isNaN().all());
       mean.setZero();
       EXPECT_EQ(predictor.mean_and_jacobian(bad, mean, jacobian, workspace), status);
       EXPECT_TRUE(mean.array().isNaN().all() && jacobian.array().isNaN().all());
@@ -481,6 +491,11 @@ TEST(PredictorTest, NamesWhatIsWrongWithAnArgument) {
   Predictor::Workspace full = other.make_workspace();
   EXPECT_THAT(test::input_error_of([&] { ignore(other.mean_and_stddev(state, mean, two, full)); }),
               HasSubstr("the standard deviation is of size 3, got 2"));
+  MatrixXd low_square(2, 3), narrow_square(3, 2);
+  EXPECT_THAT(test::input_error_of([&] { ignore(other.mean_and_covariance(state, mean, low_square, full)); }),
+              HasSubstr("a column of the covariance is of size 3, got 2"));
+  EXPECT_THAT(test::input_error_of([&] { ignore(other.mean_and_covariance(state, mean, narrow_square, full)); }),
+              HasSubstr("a row of the covariance is of size 3, got 2"));
   EXPECT_THAT(test::input_error_of([&] { ignore(other.mean_and_jacobian(state, mean, low, full)); }),
               HasSubstr("a column of the Jacobian is of size 3, got 2"));
   EXPECT_THAT(test::input_error_of([&] { ignore(other.mean_and_jacobian(state, mean, narrow, full)); }),

@@ -13,6 +13,7 @@
 #include "gp2/jobs/fit_job.hpp"
 #include "gp2/simulation/generate.hpp"
 #include "gp2/simulation/model_motion.hpp"
+#include "inference/problems.hpp"
 #include "input_error.hpp"
 
 namespace gp2 {
@@ -92,10 +93,10 @@ u1    = [-0.05, 0.05]
 start = { q2 = 0, q3 = 0.3 }
 )toml";
 
-FitOutcome fit_to(const Model& model, std::vector<CsvTable> logs, bool estimate = true) {
+FitOutcome fit_to(const Model& model, std::vector<Log> logs, bool estimate = true) {
   FitRequest request;
   request.model = model;
-  for (CsvTable& log : logs) request.logs.push_back({std::move(log), nullptr});
+  request.logs = std::move(logs);
   request.problem.mean = Prior::Mean::force;
   if (!estimate) request.problem.estimate = std::vector<std::string>();
   request.restarts = 1;
@@ -124,7 +125,7 @@ struct Bench {
 Bench make_bench(const char* text, int n, ExciteRequest request) {
   Model model = Model::parse(text, "bench.toml");
   CsvTable log = as_table(generate(model, {n, excite_seed, noise_stddev(model)}), *model.system, "first.csv");
-  FitOutcome fit = fit_to(model, {log});
+  FitOutcome fit = fit_to(model, {{log, nullptr}});
   request.threads = 2;
   return {std::move(model), std::move(log), std::move(fit), std::move(request)};
 }
@@ -176,8 +177,10 @@ CsvTable measured_along(const Model& model, Trajectory motion, std::uint64_t see
   return as_table(motion, *model.system, "next.csv");
 }
 
-void expect_what_a_fit_finds(const Bench& bench, const Excitation& found) {
-  const FitOutcome again = fit_to(bench.model, {bench.log, measured_along(bench.model, found.motion, excite_seed + 1)});
+/// @param other  on which is measured; null: the mechanism of the bench
+void expect_what_a_fit_finds(const Bench& bench, const Excitation& found, const std::shared_ptr<const Model>& other = nullptr) {
+  const CsvTable measured = measured_along(other ? *other : bench.model, found.motion, excite_seed + 1);
+  const FitOutcome again = fit_to(bench.model, {{bench.log, nullptr}, {measured, other}});
   const FitReport& before = bench.fit.file.report;
   const FitReport& after = again.file.report;
   ASSERT_EQ(found.parameters.size(), 3U);
@@ -197,6 +200,21 @@ void expect_what_a_fit_finds(const Bench& bench, const Excitation& found) {
 TEST(Excitation, TellsOfParametersWhatAFitThenFinds) {
   expect_what_a_fit_finds(crane_bench(), crane_excitation());
   expect_what_a_fit_finds(slider_bench(), slider_excitation());
+}
+
+// the same load on a longer rod
+TEST(Excitation, OfAnotherSystemKeepsItsConstraintAndTellsWhatAFitOfBothThenFinds) {
+  const Bench& bench = crane_bench();
+  const auto longer = std::make_shared<const Model>(Model::parse(
+      test::changed(crane, {{"l = 0.5", "l = 0.7"}, {"start = { y = -0.5 }", "start = { y = -0.7 }"}}), "longer.toml"));
+  const FitSystem driven = system_of(bench.fit.file, bench.fit.posterior.prior(), longer);
+  ExciteRequest request = bench.request;
+  request.n_motions = 100;
+  const Excitation found = excite(driven, bench.fit.posterior, bench.fit.file.report.hyperparameters, request);
+  for (const auto& state : found.motion.states.colwise()) {
+    EXPECT_NEAR(std::hypot(state[1] - state[0], state[2]), 0.7, 1e-9);
+  }
+  expect_what_a_fit_finds(bench, found, longer);
 }
 
 double gain(const Excitation::Known& one) { return one.after / one.random; }
@@ -270,7 +288,7 @@ TEST(Excitation, IsTheSameForAnyNumberOfThreadsAndAnotherForAnotherSeed) {
 TEST(Excitation, OfAccelerationsMakesThemKnownWhereMotionsGo) {
   ExciteRequest request = short_request();
   request.n_motions = 150;
-  const FitOutcome fit = fit_to(crane_bench().model, {crane_bench().log}, /*estimate=*/false);
+  const FitOutcome fit = fit_to(crane_bench().model, {{crane_bench().log, nullptr}}, /*estimate=*/false);
   const Excitation found = excite(crane_bench().model, fit.posterior, fit.file.report.hyperparameters, request);
   EXPECT_EQ(found.target, ExcitationTarget::accelerations);
   EXPECT_TRUE(found.parameters.empty());
@@ -384,7 +402,7 @@ TEST(Excitation, IsRefusedOfFitsThatKnowNothingToAskFor) {
   const Bench& bench = crane_bench();
   ExciteRequest request = short_request();
   request.target = ExcitationTarget::parameters;
-  const FitOutcome fit = fit_to(bench.model, {bench.log}, /*estimate=*/false);
+  const FitOutcome fit = fit_to(bench.model, {{bench.log, nullptr}}, /*estimate=*/false);
   EXPECT_EQ(test::input_error_of([&] { excite(bench.model, fit.posterior, fit.file.report.hyperparameters, request); }),
             "`for=parameters`: the fit estimates no parameters; mark some with estimate = true in the model, or ask "
             "`for=accelerations`");
@@ -421,7 +439,8 @@ force = ["-dx"]
 dx = [-1, 1]
 )toml",
                                   "weight.toml");
-  const FitOutcome fit = fit_to(free, {as_table(generate(free, {12, excite_seed, noise_stddev(free)}), *free.system, "log.csv")});
+  const FitOutcome fit =
+      fit_to(free, {{as_table(generate(free, {12, excite_seed, noise_stddev(free)}), *free.system, "log.csv"), nullptr}});
   ExciteRequest request;
   request.start = std::map<std::string, double>{{"x", 0}};
   request.duration = 1;

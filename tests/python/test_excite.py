@@ -9,17 +9,21 @@ LIMITS = {"inputs_within": {"u": (-1, 1)}, "within": {"x": (-0.5, 0.5)}}
 FEW = {"n_rows": 60, "n_motions": 80}
 
 
-@pytest.fixture(scope="module")
-def spring():
+def spring_of(k):
     return gp2.System(
         coordinates=["x"],
         inputs=["u"],
-        parameters={"k": {"value": 9.0, "bounds": [1, 30], "estimate": True}},
+        parameters={"k": k},
         mass=[["1"]],
         force=["u - k*x"],
         latents=[{"kernel": "se", "features": ["dx"]}],
         noise=0.1,
     )
+
+
+@pytest.fixture(scope="module")
+def spring():
+    return spring_of({"value": 9.0, "bounds": [1, 30], "estimate": True})
 
 
 @pytest.fixture(scope="module")
@@ -45,6 +49,14 @@ def test_a_plan_tells_more_than_a_random_motion_within_its_limits(posterior):
     assert plan.n_motions >= 80
     driven = posterior.simulate({"x": 0}, plan.motion.t, inputs=plan.table)
     np.testing.assert_allclose(driven.q, plan.motion.q, atol=1e-6)
+
+
+def test_another_system_is_driven(posterior):
+    stiff = spring_of(20.0)
+    plan = gp2.excite(posterior, {"x": 0}, 6, **LIMITS, system=stiff, target="accelerations", **FEW)
+    motion = plan.motion
+    there = posterior.predict(motion.states, system=stiff).mean
+    np.testing.assert_allclose(motion.ddq, there, rtol=0, atol=1e-9 * np.abs(there).max())
 
 
 def test_the_seed_alone_decides(posterior):

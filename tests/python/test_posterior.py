@@ -259,6 +259,37 @@ def test_forward_of_the_inverse_dynamics_is_what_was_wanted(arm, posterior, arm_
         posterior.inverse_dynamics(table, wanted)
 
 
+def test_inverse_dynamics_in_a_loop_is_that_of_many_states(arm, posterior, arm_states):
+    faster = gp2.System.parse(arm.text.replace("w  = 4.0", "w  = 5.0"))
+    start = arm_states.copy()
+    start[:, -2:] = 0
+    for outputs, system in [([], None), (["ddelbow"], faster)]:
+        wanted = posterior.predict(arm_states, system=system).mean[:, -len(outputs) :]
+        found = posterior.inverse_dynamics(start, wanted, outputs=outputs, system=system)
+        solver = gp2.InverseDynamicsSolver(posterior, outputs=outputs, system=system)
+        predictor = gp2.Predictor(posterior)
+        for k, state in enumerate(start):
+            inputs, cov = solver.inputs_and_cov(state, wanted[k])
+            np.testing.assert_array_equal(inputs, solver.inputs(state, wanted[k]))
+            np.testing.assert_allclose(inputs, found.inputs[k], rtol=1e-9, atol=1e-9)
+            np.testing.assert_allclose(cov, found.cov[k], rtol=1e-6, atol=1e-9 * np.abs(found.cov).max())
+            state[-2:] = inputs
+            mean, ddq_cov = predictor.mean_and_cov(state)
+            np.testing.assert_array_equal(mean, predictor.mean(state))
+            np.testing.assert_allclose(np.diagonal(ddq_cov), predictor.mean_and_std(state)[1] ** 2, rtol=1e-9, atol=1e-15)
+
+    solver = gp2.InverseDynamicsSolver(posterior, cov=False)
+    for match, call in [
+        ("accelerations", lambda: solver.inputs(start[0], [0.0])),
+        ("not a finite number", lambda: solver.inputs(start[0], [np.nan, 0.0])),
+        ("there is no prediction", lambda: solver.inputs(np.full_like(start[0], np.nan), [0.0, 0.0])),
+        ("cov", lambda: solver.inputs_and_cov(start[0], [0.0, 0.0])),
+        ("outputs", lambda: gp2.InverseDynamicsSolver(posterior, outputs=["ddknee"])),
+    ]:
+        with pytest.raises(gp2.InputError, match=match):
+            call()
+
+
 def test_the_predictors_jacobian_is_the_derivative(posterior, arm_states):
     predictor = gp2.Predictor(posterior)
     state, step = arm_states[0], 1e-6

@@ -11,6 +11,8 @@
 #include "gp2/data/csv.hpp"
 #include "gp2/error.hpp"
 #include "gp2/files/fit_file.hpp"
+#include "gp2/fit.hpp"
+#include "gp2/inference/inverse_dynamics.hpp"
 #include "gp2/jobs/fit_problem.hpp"
 #include "gp2/mechanics/udwadia_kalaba.hpp"
 #include "gp2/model.hpp"
@@ -57,6 +59,26 @@ TEST(Motion, OfTheArmKeepsItsTipOnThePlaneAndPointingDown) {
     const VectorXd error = mechanics.values.A(i) * data.accelerations.col(i) - mechanics.values.b(i);
     EXPECT_LE(error.cwiseAbs().maxCoeff(), 1e-12 * (1 + data.accelerations.col(i).cwiseAbs().maxCoeff()));
   }
+}
+
+// where rounding of a hundred terms leaves no step that helps
+TEST(InverseDynamicsOfTheArm, IsFoundAtEveryStateOfAMotion) {
+  const Model model = read_model("experiments/arm_on_surface/arm.toml");
+  const Prior prior = make_prior(model, {Prior::Mean::force, std::nullopt});
+  const View view = View::constrained_acceleration(*model.system);
+  const GeneratedData data = motion_of(model, 60, 0.1);
+  const std::vector<Observations> observations{{data.states, view, data.accelerations, VectorXd::Constant(7, 0.1), false}};
+  const Posterior posterior(prior, observations,
+                            model_values(prior, observations, default_hyperparameters(prior, observations, {}, {})));
+  MatrixXd states = motion_of(model, 60, 0, 2).states;
+  const MatrixXd wanted = posterior.mean(view, states);
+  states.bottomRows(7).setZero();
+  const InverseDynamics found = inverse_dynamics(posterior, view, states, wanted);
+  states.bottomRows(7) = found.inputs;
+  // beside the accelerations that its light joints may have
+  const double tolerance = 1e-8 * posterior.without_data().marginal(view, states).stddev().maxCoeff();
+  EXPECT_LE(found.missed.cwiseAbs().maxCoeff(), tolerance);
+  EXPECT_LE((posterior.mean(view, states) - wanted).cwiseAbs().maxCoeff(), tolerance);
 }
 
 TEST(Motion, ReachesItsTargetsWhereTheControllerKnowsEverything) {

@@ -6,7 +6,7 @@
 
 #include "gp2/fit.hpp"
 #include "gp2/training/laplace.hpp"
-#include "test_models.hpp"
+#include "inference/problems.hpp"
 
 namespace gp2 {
 namespace {
@@ -86,7 +86,7 @@ MatrixXd none(const Problem& problem) { return MatrixXd(problem.prior.system->la
 TEST(ExpectedInformation, OfParametersThatEnterLinearlyIsWhatTheLikelihoodOfAllDataHas) {
   const Problem problem({0, 1});
   const Observations first = problem.measured(15, information_seed), second = problem.measured(12, information_seed + 1);
-  const ExpectedInformation information(problem.prior, {first}, problem.hyperparameters, 1, nullptr);
+  const ExpectedInformation information(problem.prior, {first}, problem.hyperparameters, nullptr, 1, nullptr);
   const auto is_of = [&](const ExpectedInformation::Known& known, const std::vector<Observations>& data) {
     const LaplaceUncertainty laplace = laplace_uncertainty(problem.prior, data, problem.hyperparameters, 1);
     for (int k = 0; k < 2; ++k) EXPECT_NEAR(known.stddev[k] / laplace.stddev[2 + k], 1, 2e-4) << k;
@@ -103,7 +103,7 @@ TEST(ExpectedInformation, OfAccelerationsIsWhatAPosteriorWithTheMeasurementsHasW
   const Problem problem({});
   const Observations first = problem.measured(15, information_seed), second = problem.measured(12, information_seed + 1);
   const MatrixXd region = problem.measured(7, information_seed + 2).states();
-  const ExpectedInformation information(problem.prior, {first}, problem.hyperparameters, 1, nullptr);
+  const ExpectedInformation information(problem.prior, {first}, problem.hyperparameters, nullptr, 1, nullptr);
   ModelValues values = information.posterior().values();
   values.noise_stddev.push_back(values.noise_stddev[0]);
   const Posterior posterior(problem.prior, {first, second.with_values(5 * second.values())}, values);
@@ -118,12 +118,36 @@ TEST(ExpectedInformation, OfAccelerationsIsWhatAPosteriorWithTheMeasurementsHasW
   EXPECT_GT(information.after(none(problem), region).region.sum(), 1.1 * found.sum());
 }
 
+TEST(ExpectedInformation, OnAnotherSystemIsWhatAPosteriorOfBothHas) {
+  const Problem problem({0});
+  const Model steeper = Model::parse(test::changed(wire().text, {{"0.3*x^2", "0.5*x^2"}}), "steeper.toml");
+  const auto other = make_other_system(wire(), steeper, {Prior::Mean::force, std::nullopt});
+  const Observations first = problem.measured(15, information_seed);
+  const GeneratedData data = generate(steeper, {12, information_seed + 1, Eigen::Vector2d(0.3, 0.1)});
+  const MatrixXd region = generate(steeper, {7, information_seed + 2, Eigen::Vector2d::Zero()}).states;
+  const ExpectedInformation information(problem.prior, {first}, {problem.hyperparameters[0], problem.hyperparameters[1]}, other,
+                                        1, nullptr);
+  EXPECT_EQ(information.view().other_system, other);
+  ModelValues values = information.posterior().values();
+  values.noise_stddev.push_back(values.noise_stddev[0]);
+  const Posterior posterior(problem.prior,
+                            {first, {data.states, information.view(), data.accelerations, information.noise_stddev()}}, values);
+  const Posterior::Marginal expected = posterior.marginal(information.view(), region);
+  const MatrixXd found = information.after(data.states, region).region;
+  for (Index i = 0; i < region.cols(); ++i) {
+    for (Index j = 0; j < 2; ++j) {
+      const double sigma = information.noise_stddev()[j];
+      EXPECT_NEAR(found(j, i) * sigma * sigma / expected.covariance(3 * j, i), 1, 1e-9) << i << ' ' << j;
+    }
+  }
+}
+
 TEST(ExpectedInformation, OfAccelerationsCountsWhatIsNotKnownOfParameters) {
   const Problem with({0, 1}), without({});
   const Observations first = with.measured(15, information_seed);
   const MatrixXd region = with.measured(7, information_seed + 2).states();
-  const ExpectedInformation open(with.prior, {first}, with.hyperparameters, 1, nullptr),
-      known(without.prior, {first}, without.hyperparameters, 1, nullptr);
+  const ExpectedInformation open(with.prior, {first}, with.hyperparameters, nullptr, 1, nullptr),
+      known(without.prior, {first}, without.hyperparameters, nullptr, 1, nullptr);
   EXPECT_GT(open.after(none(with), region).region.minCoeff(), 0);
   EXPECT_TRUE((open.after(none(with), region).region.array() > known.after(none(with), region).region.array()).all());
 }
@@ -131,7 +155,7 @@ TEST(ExpectedInformation, OfAccelerationsCountsWhatIsNotKnownOfParameters) {
 TEST(ExpectedInformation, AParameterOfWhichTheDataSayNothingMayBeAnywhereInItsBounds) {
   const Problem problem({0, 2});
   const Observations first = problem.measured(15, information_seed);
-  const ExpectedInformation information(problem.prior, {first}, problem.hyperparameters, 1, nullptr);
+  const ExpectedInformation information(problem.prior, {first}, problem.hyperparameters, nullptr, 1, nullptr);
   ASSERT_EQ(information.parameters().size(), 2U);
   EXPECT_EQ(information.parameters()[1].name, "unread");
   const VectorXd stddev = information.after(first.states(), none(problem)).stddev;

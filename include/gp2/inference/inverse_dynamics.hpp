@@ -1,9 +1,12 @@
 #pragma once
 
+#include <memory>
+
 #include <Eigen/Core>
 
 #include "gp2/export.hpp"
 #include "gp2/posterior.hpp"
+#include "gp2/predictor.hpp"
 #include "gp2/view.hpp"
 
 namespace gp2 GP2_API {
@@ -36,5 +39,79 @@ struct InverseDynamics {
 [[nodiscard]] InverseDynamics inverse_dynamics(const Posterior& posterior, const View& view,
                                                const Eigen::Ref<const Eigen::MatrixXd>& states,
                                                const Eigen::Ref<const Eigen::MatrixXd>& accelerations);
+
+/// The same at one state after another, for control loops: as a Predictor it allocates nothing, takes no locks and calls no BLAS.
+/// Where v is affine in u a call costs two to four predictions of v with its Jacobian; their covariance is one more.
+///
+/// Immutable, cheap to copy, thread-safe. Every member function throws InputError when the object was moved away.
+class InverseDynamicsSolver {
+ public:
+  struct Options {
+    bool covariance = true;  // whether inputs_and_covariance is wanted: stores as Predictor::Options::stddev does
+    Predictor::Storage storage = Predictor::Storage::double_precision;
+  };
+
+  /// For every row of ddq.
+  explicit InverseDynamicsSolver(const Posterior& posterior);
+  /// @throws InputError as inverse_dynamics.
+  InverseDynamicsSolver(const Posterior& posterior, const View& view);
+  InverseDynamicsSolver(const Posterior& posterior, const View& view, Options options);
+
+  struct Implementation;
+
+  /// Memory of the functions below; one per thread. It keeps what it needs of its solver alive.
+  class Workspace {
+   public:
+    explicit Workspace(const InverseDynamicsSolver& solver);
+    ~Workspace();
+    Workspace(Workspace&&) noexcept;
+    Workspace& operator=(Workspace&&) noexcept;
+
+    /// Wanted − E[ddq] under the inputs found by the last call  (d); NaN where none were found.
+    [[nodiscard]] const Eigen::VectorXd& missed() const;
+
+    struct Implementation;
+
+   private:
+    friend class InverseDynamicsSolver;
+    std::unique_ptr<Implementation> implementation_;
+  };
+  [[nodiscard]] Workspace make_workspace() const { return Workspace(*this); }
+
+  /// Where there are no inputs they are NaN, and this says why.
+  enum class Status {
+    ok,
+    no_prediction,  // at the state and the inputs where the search begins: Predictor::mean_and_jacobian says why
+    not_finite,     // an acceleration that is wanted
+    not_found,      // inputs that produce the accelerations, or come nearest to them
+  };
+
+  /// u at a state.
+  /// @param state          (layout size), contiguous; its inputs are where the search begins, 0 where they are NaN
+  /// @param accelerations  w (d)
+  /// @param inputs         u (nu), which may be those of `state`
+  /// @throws InputError when a size is wrong or `workspace` is of another solver; so does the function below.
+  [[nodiscard]] Status inputs(const Eigen::Ref<const Eigen::VectorXd>& state,
+                              const Eigen::Ref<const Eigen::VectorXd>& accelerations, Eigen::Ref<Eigen::VectorXd> inputs,
+                              Workspace& workspace) const;
+
+  /// And their covariance (nu × nu).
+  /// @throws InputError when options().covariance is false.
+  [[nodiscard]] Status inputs_and_covariance(const Eigen::Ref<const Eigen::VectorXd>& state,
+                                             const Eigen::Ref<const Eigen::VectorXd>& accelerations,
+                                             Eigen::Ref<Eigen::VectorXd> inputs, Eigen::Ref<Eigen::MatrixXd> covariance,
+                                             Workspace& workspace) const;
+
+  [[nodiscard]] const View& view() const;
+  [[nodiscard]] const Options& options() const;
+
+ private:
+  [[nodiscard]] const Implementation& implementation() const;  // throws when it was moved away
+  [[nodiscard]] Status find(const Eigen::Ref<const Eigen::VectorXd>& state,
+                            const Eigen::Ref<const Eigen::VectorXd>& accelerations, Eigen::Ref<Eigen::VectorXd>& inputs,
+                            Workspace& workspace) const;
+
+  std::shared_ptr<const Implementation> implementation_;
+};
 
 }  // namespace gp2

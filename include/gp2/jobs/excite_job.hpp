@@ -15,6 +15,7 @@
 #include "gp2/export.hpp"
 #include "gp2/fit.hpp"
 #include "gp2/jobs/option.hpp"
+#include "gp2/jobs/predict_job.hpp"
 #include "gp2/jobs/simulate_job.hpp"
 #include "gp2/model.hpp"
 #include "gp2/posterior.hpp"
@@ -98,12 +99,18 @@ struct Excitation {
 /// (theory.md, T33), for accelerations measured at its rows as the fit's data were. First come random series, each as large as
 /// the limits allow; from the best of them an evolution strategy goes on. Same seed, same bits, for any number of threads.
 ///
-/// @param hyperparameters  of the fit that the posterior is of (FitReport)
+/// @param system           that is driven, the fit's own or another one (system_of)
+/// @param hyperparameters  of the fit that the posterior is of (FitReport); of another system those count that both have
 /// @param progress         called between generations
 /// @param stop             set: ends with the best so far, as interrupted
 /// @throws InputError when the system has no inputs, limits are missing, reversed, or of no input or state; for a start outside of
 ///   them; when the target is parameters and none is estimated; of a baseline; and when no motion stays within the limits
 /// @throws NumericalError when no motion could be integrated; when stopped before there was one within the limits
+Excitation excite(const FitSystem& system, const Posterior& posterior, const std::vector<Hyperparameter>& hyperparameters,
+                  const ExciteRequest& request, const std::function<void(const ExciteProgress&)>& progress = {},
+                  const std::atomic<bool>* stop = nullptr);
+
+/// Of the fit's own system.
 Excitation excite(const Model& model, const Posterior& posterior, const std::vector<Hyperparameter>& hyperparameters,
                   const ExciteRequest& request, const std::function<void(const ExciteProgress&)>& progress = {},
                   const std::atomic<bool>* stop = nullptr);

@@ -2,7 +2,7 @@
 #include <gmock/gmock.h>
 #include <Eigen/Dense>
 
-#include "export/mjcf.hpp"
+#include "export/fitted_robot.hpp"
 #include "export/xml_text.hpp"
 #include "gp2/base/file.hpp"
 #include "gp2/jobs/export_job.hpp"
@@ -89,7 +89,7 @@ RobotDescription described(const std::string& text) {
   return read_robot(folder.write("robot.xml", text));
 }
 
-FittedMjcf fitted(const std::vector<FittedNumber>& numbers, const std::string& text = robot_text) {
+FittedRobot fitted(const std::vector<FittedNumber>& numbers, const std::string& text = robot_text) {
   return fitted_mjcf(text, "robot.xml", described(text), numbers);
 }
 
@@ -113,12 +113,12 @@ std::string undone(std::string text, const std::vector<std::pair<std::string, st
   return text;
 }
 
-TEST(FittedMjcf, NumbersOfJointsAreAttributesAndEveryOtherByteStays) {
-  const FittedMjcf out = fitted({{R"(damping("a"))", 1.0 / 3, true, 0.0123},
-                                 {R"(armature("a"))", 0.1 + 0.2, false, 0},
-                                 {R"(damping("b"))", 2.0 / 7, true, std::nan("")},
-                                 {R"(friction("b"))", 1e-7 / 3, true, 1},
-                                 {R"(stiffness("c"))", 12.5, true, 0.5}});
+TEST(FittedRobot, NumbersOfJointsAreAttributesAndEveryOtherByteStays) {
+  const FittedRobot out = fitted({{R"(damping("a"))", 1.0 / 3, true, 0.0123},
+                                  {R"(armature("a"))", 0.1 + 0.2, false, 0},
+                                  {R"(damping("b"))", 2.0 / 7, true, std::nan("")},
+                                  {R"(friction("b"))", 1e-7 / 3, true, 1},
+                                  {R"(stiffness("c"))", 12.5, true, 0.5}});
   EXPECT_EQ(undone(out.text, {{"", R"( damping="0.3333333333333333" armature="0.30000000000000004")"},
                               {"0.25", "0.2857142857142857"},
                               {"", R"( frictionloss="3.3333333333333334e-08")"},
@@ -139,16 +139,16 @@ TEST(FittedMjcf, NumbersOfJointsAreAttributesAndEveryOtherByteStays) {
   EXPECT_EQ(to_json(robot), to_json(out.robot));
 }
 
-TEST(FittedMjcf, MassAndCentreStandInTheInertial) {
-  const FittedMjcf out = fitted({{R"(mass("upper"))", 1.6180339887498949, true, 0.01},
-                                 {R"(com("upper").x)", 0.1 / 3, true, 0.002},
-                                 {R"(com("upper").z)", 0.2, false, 0}});
+TEST(FittedRobot, MassAndCentreStandInTheInertial) {
+  const FittedRobot out = fitted({{R"(mass("upper"))", 1.6180339887498949, true, 0.01},
+                                  {R"(com("upper").x)", 0.1 / 3, true, 0.002},
+                                  {R"(com("upper").z)", 0.2, false, 0}});
   EXPECT_EQ(undone(out.text, {{"0 0 0.15", "0.03333333333333333 0 0.2"}, {"\"1.5\"", "\"1.618033988749895\""}}), robot_text);
   EXPECT_EQ(to_json(described(out.text)), to_json(out.robot));
 }
 
 // the inertia as MuJoCo has it, and that which was fitted
-void expect_inertia(const FittedMjcf& out, const char* body) {
+void expect_inertia(const FittedRobot& out, const char* body) {
   const RobotDescription robot = described(out.text);
   const auto k = static_cast<std::size_t>(robot.body_index(body));
   const Matrix3d& expected = out.robot.bodies[k].inertia;
@@ -158,25 +158,25 @@ void expect_inertia(const FittedMjcf& out, const char* body) {
   EXPECT_EQ(to_json(same), to_json(out.robot)) << body;
 }
 
-TEST(FittedMjcf, AnInertiaStandsAsMomentsAndAxes) {
-  const FittedMjcf along = fitted({{R"(inertia("upper").yy)", 0.1 / 3, true, 0.001}});
+TEST(FittedRobot, AnInertiaStandsAsMomentsAndAxes) {
+  const FittedRobot along = fitted({{R"(inertia("upper").yy)", 0.1 / 3, true, 0.001}});
   EXPECT_EQ(undone(along.text, {{"0.02 0.03 0.025", "0.02 0.03333333333333333 0.025"}}), robot_text);
   expect_inertia(along, "upper");
   // turned ones
   expect_inertia(fitted({{R"(inertia("upper").xz)", -0.003, true, 0.001}, {R"(inertia("upper").xx)", 0.021, true, 0.001}}),
                  "upper");
-  const FittedMjcf turned = fitted({{R"(inertia("tool").yz)", 0, true, 0.001}});
+  const FittedRobot turned = fitted({{R"(inertia("tool").yz)", 0, true, 0.001}});
   expect_inertia(turned, "tool");
   EXPECT_THAT(turned.text, Not(HasSubstr("quat")));
   std::string text = robot_text;
   text.replace(text.find(R"(diaginertia="0.02)"), 29, R"(fullinertia="0.02 0.03 0.025 0.001 0.002 0.003")");
-  const FittedMjcf other = fitted({{R"(inertia("upper").xy)", 0.002, true, 0.001}}, text);
+  const FittedRobot other = fitted({{R"(inertia("upper").xy)", 0.002, true, 0.001}}, text);
   EXPECT_THAT(other.text, Not(HasSubstr("fullinertia")));
   expect_inertia(other, "upper");
 }
 
-TEST(FittedMjcf, ABodyOfShapesGetsAnInertial) {
-  const FittedMjcf out = fitted({{R"(mass("lower"))", 0.4, true, 0.01}});
+TEST(FittedRobot, ABodyOfShapesGetsAnInertial) {
+  const FittedRobot out = fitted({{R"(mass("lower"))", 0.4, true, 0.01}});
   EXPECT_THAT(out.notes, ElementsAre("body 'lower' has an <inertial> now; before, its shapes gave mass and inertia"));
   EXPECT_THAT(out.text, HasSubstr(R"(<body name="lower" pos="0 0 0.3"><inertial pos=")"));
   const std::size_t begin = out.text.find("<inertial", out.text.find("lower")), end = out.text.find("<joint", begin);
@@ -184,8 +184,8 @@ TEST(FittedMjcf, ABodyOfShapesGetsAnInertial) {
   expect_inertia(out, "lower");
 }
 
-TEST(FittedMjcf, WhatIsNoRigidBodyIsSaidToBeNone) {
-  const FittedMjcf out = fitted({{R"(inertia("upper").zz)", 0.06, true, 0.01}});
+TEST(FittedRobot, WhatIsNoRigidBodyIsSaidToBeNone) {
+  const FittedRobot out = fitted({{R"(inertia("upper").zz)", 0.06, true, 0.01}});
   EXPECT_FALSE(out.is_physical);
   EXPECT_THAT(
       out.notes,
@@ -198,7 +198,7 @@ TEST(FittedMjcf, WhatIsNoRigidBodyIsSaidToBeNone) {
   EXPECT_TRUE(fitted({{R"(inertia("upper").zz)", 0.0499, true, 0.01}}).is_physical);
 }
 
-TEST(FittedMjcf, WhatTheFileItselfCannotTakeIsRefused) {
+TEST(FittedRobot, WhatTheFileItselfCannotTakeIsRefused) {
   std::string unnamed = robot_text;
   unnamed.replace(unnamed.find("name=\"c\" axis"), 9, "");
   EXPECT_EQ(
@@ -217,6 +217,105 @@ TEST(FittedMjcf, WhatTheFileItselfCannotTakeIsRefused) {
         fitted({{R"(mass("upper"))", 1, true, 0}}, of_shapes);
       }),
       "robot.xml: its compiler takes masses and inertias from shapes whatever <inertial> says: set inertiafromgeom to auto");
+}
+
+// ---- of URDF
+
+constexpr const char* urdf_text = R"(<?xml version="1.0"?>
+<robot name="arm">  <!-- link name="upper" -->
+  <link name="base"/>
+  <link name='upper'>
+	<inertial>
+      <origin xyz="0 0 0.15" rpy="0.0 0 0"/>
+      <mass value="1.5"/><inertia ixx="0.02" ixy="0" ixz="0" iyy="0.03" iyz="0" izz="0.025"/>
+    </inertial>
+  </link>
+  <link name="lower"><inertial><origin rpy="0.5 0 0.1" xyz="0 0.01 0.1"/>
+    <mass value="0.5" /><inertia ixx="0.004" ixy="0.0001" ixz="0" iyy="0.005" iyz="0" izz="0.003"></inertia></inertial>
+  </link>
+  <joint name="a" type="continuous"><parent link="base"/><child link="upper"/><axis xyz="0 1 0"/></joint>
+  <joint name="b" type="revolute"><parent link="upper"/><child link="lower"/><origin xyz="0 0 0.3"/><axis xyz="0 1 0"/>
+    <limit lower="-1" upper="1" effort="5" velocity="3"/><dynamics damping="0.25"/></joint>
+  <transmission name="t"><joint name="a"/></transmission>
+</robot>
+)";
+
+RobotDescription described_urdf(const std::string& text) {
+  const TemporaryFolder folder;
+  return read_robot(folder.write("robot.urdf", text));
+}
+
+FittedRobot fitted_link(const std::vector<FittedNumber>& numbers, const std::string& text = urdf_text) {
+  return fitted_urdf(text, "robot.urdf", described_urdf(text), numbers);
+}
+
+void expect_read_back(const FittedRobot& out) {
+  const RobotDescription robot = described_urdf(out.text);
+  const auto numbers = robot_numbers(robot), expected = robot_numbers(out.robot);
+  ASSERT_EQ(numbers.size(), expected.size());
+  for (std::size_t k = 0; k < numbers.size(); ++k) {
+    EXPECT_EQ(numbers[k].first, expected[k].first);
+    // MuJoCo takes the moments and axes of an inertia from its components to some ten digits
+    EXPECT_NEAR(numbers[k].second, expected[k].second, 1e-11) << numbers[k].first;
+  }
+}
+
+TEST(FittedUrdf, NumbersOfJointsStandInTheirDynamicsAndEveryOtherByteStays) {
+  const FittedRobot out = fitted_link({{R"(damping("a"))", 1.0 / 3, true, 0.0123},
+                                       {R"(damping("b"))", 2.0 / 7, true, std::nan("")},
+                                       {R"(friction("b"))", 0.125, false, 0}});
+  EXPECT_EQ(undone(out.text, {{"", R"(<dynamics damping="0.3333333333333333"/>)"},
+                              {"0.25\"/></joint>", R"(0.2857142857142857" friction="0.125"/></joint>)"}}),
+            urdf_text);
+  EXPECT_THAT(out.text, HasSubstr(R"(type="continuous"><dynamics damping="0.3333333333333333"/> <!-- fitted: damping = )"
+                                  "0.3333333333333333 (standard error 0.012) --><parent"));
+  EXPECT_THAT(out.text, HasSubstr("damping = 0.2857142857142857 (standard error not known), friction = 0.125 (held)"));
+  EXPECT_THAT(out.notes, IsEmpty());
+  const RobotDescription robot = described_urdf(out.text);
+  EXPECT_EQ(number_of(robot, R"(damping("a"))"), 1.0 / 3);
+  EXPECT_EQ(number_of(robot, R"(damping("b"))"), 2.0 / 7);
+  EXPECT_EQ(number_of(robot, R"(friction("b"))"), 0.125);
+}
+
+TEST(FittedUrdf, MassCentreAndInertiaStandInTheInertial) {
+  const FittedRobot out = fitted_link({{R"(mass("upper"))", 1.6180339887498949, true, 0.01},
+                                       {R"(com("upper").x)", 0.1 / 3, true, 0.002},
+                                       {R"(inertia("upper").xz)", -0.003, true, 0.001}});
+  EXPECT_EQ(undone(out.text, {{"0 0 0.15", "0.03333333333333333 0 0.15"},
+                              {"value=\"1.5\"", "value=\"1.618033988749895\""},
+                              {"ixz=\"0\"", "ixz=\"-0.003\""}}),
+            urdf_text);
+  EXPECT_TRUE(out.is_physical);
+  expect_read_back(out);
+}
+
+TEST(FittedUrdf, AnInertiaAboutOtherAxesIsThenAboutThoseOfTheLink) {
+  const FittedRobot mass = fitted_link({{R"(mass("lower"))", 0.4, true, 0.01}});
+  EXPECT_EQ(undone(mass.text, {{"\"0.5\" />", "\"0.4\" />"}}), urdf_text);
+  expect_read_back(mass);
+  const FittedRobot turned = fitted_link({{R"(inertia("lower").xx)", 0.0045, true, 0.001}});
+  EXPECT_THAT(turned.text, HasSubstr(R"(<origin rpy="0 0 0" xyz="0 0.01 0.1"/>)"));
+  EXPECT_THAT(turned.text, HasSubstr("ixx=\"0.0045\""));
+  expect_read_back(turned);
+}
+
+TEST(FittedUrdf, ALinkOfShapesGetsAnInertial) {
+  std::string text = urdf_text;
+  const std::size_t begin = text.find("<inertial><origin rpy"), end = text.find("</inertial>", begin) + 11;
+  text.replace(begin, end - begin, "<collision><geometry><sphere radius=\"0.05\"/></geometry></collision>");
+  const FittedRobot out = fitted_link({{R"(mass("lower"))", 0.6, true, 0.01}}, text);
+  EXPECT_THAT(out.notes, ElementsAre("link 'lower' has an <inertial> now; before, its shapes gave mass and inertia"));
+  expect_read_back(out);
+}
+
+TEST(FittedUrdf, SaysWhatUrdfCannotHoldAndWhatIsNoRigidBody) {
+  const FittedRobot out = fitted_link({{R"(armature("a"))", 0.25, true, 0.01}, {R"(stiffness("b"))", 2, false, 0}});
+  EXPECT_EQ(out.text, urdf_text);
+  EXPECT_THAT(out.notes, ElementsAre("warning: URDF has no place for armature(\"a\") = 0.25, which is left out",
+                                     "warning: URDF has no place for stiffness(\"b\") = 2, which is left out"));
+  const FittedRobot no_body = fitted_link({{R"(inertia("upper").zz)", 0.06, true, 0.01}});
+  EXPECT_FALSE(no_body.is_physical);
+  EXPECT_THAT(no_body.notes, ElementsAre(HasSubstr("that were fitted for link 'upper', and MuJoCo will refuse the file")));
 }
 
 // ---- of a fit
@@ -301,8 +400,8 @@ TEST_F(RobotExport, ACompilerThatChangesTheNumbersIsFound) {
   std::string changed = robot_text;
   changed.replace(changed.find("angle="), 6, "settotalmass=\"4\" angle=");
   make(changed);
-  EXPECT_THAT(error(),
-              HasSubstr("its compiler changes it by settotalmass, boundmass, boundinertia or balanceinertia; remove these"));
+  EXPECT_THAT(error(), HasSubstr("its compiler changes it by settotalmass, boundmass, boundinertia or balanceinertia, or fuses "
+                                 "bodies by fusestatic; remove these"));
 }
 
 TEST_F(RobotExport, IncludedFilesStayWhereTheyAre) {
@@ -336,18 +435,32 @@ TEST_F(RobotExport, WhatDoesNotGoTogetherIsRefused) {
   EXPECT_EQ(error(), "`to=mjcf` writes into the file of a robot, but the model has none");
 }
 
-TEST_F(RobotExport, AUrdfFileIsRefused) {
-  folder_.write("robot.urdf", R"(<robot name="r"><link name="base"/><link name="arm"><inertial><mass value="1"/>
-      <inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
-      <joint name="a" type="continuous"><parent link="base"/><child link="arm"/></joint></robot>)");
+TEST_F(RobotExport, AUrdfFileIsWrittenInto) {
+  folder_.write("robot.urdf", urdf_text);
   fit_.model = Model::read(folder_.write("model.toml", R"toml(name = "r"
 robot = "robot.urdf"
+coordinates = ["q1", "q2"]
 [parameters]
-m = { of = "mass('arm')", estimate = true, bounds = [1, 2] }
+m = { of = "mass('upper')", estimate = true, bounds = [1, 3] }
+d = { of = "damping('b')", value = 0.3 }
 )toml"));
-  fit_.report.hyperparameters = {hyperparameter("m", 0, 1, 2, 1.5)};
+  fit_.report.uncertainty.emplace();
+  fit_.report.uncertainty->stddev = Eigen::VectorXd::Constant(1, 0.02);
+  fit_.report.hyperparameters = {hyperparameter("m", 0, 1, 3, 1.7)};
   request_.to = ExportRequest::Target::mjcf;
-  EXPECT_THAT(error(), HasSubstr("robot.urdf' is a URDF file, which is not written into"));
+  EXPECT_THAT(error(), EndsWith("robot.urdf' is a file of the other format, and is written into by `to=urdf`"));
+  request_.to = ExportRequest::Target::urdf;
+  const ExportOutcome out = outcome();
+  EXPECT_THAT(out.notes, IsEmpty());
+  ASSERT_EQ(out.files.size(), 1U);
+  EXPECT_EQ(out.files[0].first, "r.urdf");
+  const RobotDescription robot = described(out.files[0].second);
+  EXPECT_EQ(number_of(robot, R"(mass("upper"))"), 1.7);
+  EXPECT_EQ(number_of(robot, R"(damping("b"))"), 0.3);
+  EXPECT_THAT(out.files[0].second, HasSubstr("<!-- fitted: mass = 1.7 (standard error 0.02) -->"));
+  make();
+  request_.to = ExportRequest::Target::urdf;
+  EXPECT_THAT(error(), EndsWith("robot.xml' is a file of the other format, and is written into by `to=mjcf`"));
 }
 
 }  // namespace

@@ -15,7 +15,7 @@ struct FittedNumber {
   double stddev = 0;  // standard error of an estimate; not finite where it is not known
 };
 
-struct FittedMjcf {
+struct FittedRobot {
   std::string text;
   RobotDescription robot;   // as the text now has it
   bool is_physical = true;  // whether all inertias written are those of rigid bodies
@@ -30,7 +30,13 @@ struct FittedMjcf {
 /// @param robot  as the text has it
 /// @throws InputError naming a joint or body that the text itself does not have by name, or where inertias are of shapes whatever
 ///   <inertial> says.
-FittedMjcf fitted_mjcf(const std::string& text, const std::string& file, RobotDescription robot,
-                       const std::vector<FittedNumber>& numbers);
+FittedRobot fitted_mjcf(const std::string& text, const std::string& file, RobotDescription robot,
+                        const std::vector<FittedNumber>& numbers);
+
+/// The same of a URDF file: damping and friction in <dynamics> of a joint; mass, centre and inertia in <inertial> of a link, whose
+/// axes become those of the link where a component of the inertia is fitted. Notes name what the format has no place for, armature and
+/// stiffness, which is left out of the text and of `robot`.
+FittedRobot fitted_urdf(const std::string& text, const std::string& file, RobotDescription robot,
+                        const std::vector<FittedNumber>& numbers);
 
 }  // namespace gp2
