@@ -1018,6 +1018,12 @@ void FitFile::write(const std::filesystem::path& path) const {
     if (observations[g].view().other_system && other == nullptr) {
       throw InputError(fmt::format("{}: the model file of the system of observations {} is not given", path.string(), g + 1));
     }
+    if (observations[g].n_data() == 0) {
+      throw InputError(
+          fmt::format("{}: none of the observations {} of '{}' is left, and the file keeps their noise: leave one at "
+                      "least (a larger window), or fit anew to the others",
+                      path.string(), g + 1, (other != nullptr ? *other : model).name));
+    }
     json["observations"].push_back(observations_json(observations[g], home, other));
   }
   json["checksum"] = checksum_of(ParsedJson(json));

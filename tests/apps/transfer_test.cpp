@@ -202,6 +202,15 @@ TEST_F(Transfer, WhatTakesLogsOfTheFitsOwnSystemSaysWhy) {
   EXPECT_FALSE(desk.has("next.json"));
 }
 
+TEST_F(Transfer, AWindowDoesNotLeaveAFileThatCannotBeRead) {
+  static_cast<void>(fit("--data other.csv@other.toml --data train.csv"));
+  EXPECT_THAT(refusal("gp2 update fit.json --data train.csv --window 10 -o next.json"),
+              HasSubstr("none of the observations 1 of 'other.toml' is left"));
+  EXPECT_FALSE(desk.has("next.json"));
+  desk.done("gp2 update fit.json --data train.csv --window 10000 -o next.json");
+  desk.done("gp2 show next.json");
+}
+
 TEST_F(Transfer, RefusesWhatDoesNotFit) {
   desk.write("kernel.toml", replaced(desk.read("models/surface.toml"), "kernel     = \"se\"", "kernel     = \"matern52\""));
   EXPECT_THAT(
