@@ -402,8 +402,8 @@ std::vector<Option> options(FitRequest& request) {
                fmt::format(
                    "optimise: take the likeliest as known; integrate: draw them given the data, and mix the predictions of {} "
                    "draws (docs/theory.md, T31), through inducing points of {}, at about {} evaluations of the likelihood; auto: "
-                   "integrate where the directions of a latent have their own, as in the default prior, and rows times free "
-                   "directions of motion are at most {}",
+                   "integrate where the directions of a latent have their own, as in the default prior, or it is a potential, and "
+                   "rows times free directions of motion are at most {}",
                    n_mixed_draws, n_mixed_draws_through_points, draw_evaluations, largest_integrated_size)},
               {"standard_errors", YesByDefault{&request.standard_errors}, "",
                "the standard errors of estimated parameters, which take a few dozen gradients"},
@@ -429,7 +429,7 @@ std::vector<Option> options(FitRequest& request) {
 
 bool integration_pays(const FitProblem& problem, const FitOptions& options) {
   const bool has_many = std::any_of(problem.prior.latents.begin(), problem.prior.latents.end(),
-                                    [](const Latent& latent) { return !latent.direction.empty(); });
+                                    [](const Latent& latent) { return !latent.direction.empty() || latent.is_potential; });
   return has_many && options.max_iterations > 0 && !problem.prior_options.baseline &&
          fit_memory(problem, options).reduced_size <= largest_integrated_size;
 }
