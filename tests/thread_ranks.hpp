@@ -14,11 +14,11 @@ namespace gp2::test {
 class ThreadRanks final : public Ranks {
  public:
   struct Meeting {
-    explicit Meeting(int n) : size(n), barrier(n) {}
+    explicit Meeting(int n) : size(n), barrier(n), exchanged(static_cast<std::size_t>(n)) {}
     const int size;
     std::barrier<> barrier;
     std::span<double> sent;
-    std::vector<const std::vector<std::vector<double>>*> exchanged = std::vector<const std::vector<std::vector<double>>*>(size);
+    std::vector<const std::vector<std::vector<double>>*> exchanged;
   };
   ThreadRanks(Meeting& meeting, int rank) : meeting_(meeting), rank_(rank) {}
   [[nodiscard]] int rank() const override { return rank_; }

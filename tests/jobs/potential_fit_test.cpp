@@ -192,6 +192,13 @@ dy = [-1, 1]
   }
 }
 
+TEST(PotentialFit, IntegratesByItself) {
+  FitRequest request = request_of_swing();
+  EXPECT_EQ(prepare_fit(request).options.n_draws, 0);
+  request.hyperparameters = HyperparameterChoice::automatic;
+  EXPECT_EQ(prepare_fit(request).options.n_draws, n_mixed_draws);
+}
+
 TEST(PotentialFit, RefusesInducingPointsByItsName) {
   FitRequest request = request_of_swing();
   request.inducing = 10;
