@@ -20,9 +20,9 @@ struct CText {
   std::string text;
   Holds binding = Holds::alone;
 
-  [[nodiscard]] std::string where(Holds needed) const { return binding < needed ? "(" + text + ")" : text; }
+  [[nodiscard]] std::string where(Holds needed) const { return binding < needed ? fmt::format("({})", text) : text; }
   // behind an operator: no sign stands there by itself
-  [[nodiscard]] std::string behind(Holds needed) const { return text.starts_with('-') ? "(" + text + ")" : where(needed); }
+  [[nodiscard]] std::string behind(Holds needed) const { return text.starts_with('-') ? fmt::format("({})", text) : where(needed); }
   [[nodiscard]] bool is_name() const { return binding == Holds::alone && text.find('(') == std::string::npos; }
 };
 
@@ -46,7 +46,7 @@ CText write_c(Operation operation, int exponent, const CText& a, const CText& b,
     case Operation::divide:
       return {a.where(Holds::as_product) + "/" + b.behind(Holds::alone), Holds::as_product};
     case Operation::negate:
-      return {"-" + a.behind(Holds::alone), Holds::as_product};
+      return {fmt::format("-{}", a.behind(Holds::alone)), Holds::as_product};
     case Operation::power:
       if (exponent == 2) return a.is_name() ? CText{a.text + "*" + a.text, Holds::as_product} : call("square", a.text);
       if (exponent != 0) return call("integer_power", fmt::format("{}, {}", a.text, exponent));
