@@ -22,7 +22,9 @@ struct CText {
 
   [[nodiscard]] std::string where(Holds needed) const { return binding < needed ? fmt::format("({})", text) : text; }
   // behind an operator: no sign stands there by itself
-  [[nodiscard]] std::string behind(Holds needed) const { return text.starts_with('-') ? fmt::format("({})", text) : where(needed); }
+  [[nodiscard]] std::string behind(Holds needed) const {
+    return text.starts_with('-') ? fmt::format("({})", text) : where(needed);
+  }
   [[nodiscard]] bool is_name() const { return binding == Holds::alone && text.find('(') == std::string::npos; }
 };
 
