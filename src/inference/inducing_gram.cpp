@@ -57,12 +57,12 @@ std::optional<GramValue> InducingGram::differentiate(const RowBlocks& rows, cons
   MatrixXd explained = -MatrixXd(P.selfadjointView<Eigen::Lower>());  // I − B⁻¹
   explained.diagonal().array() += 1;
 
-  struct Sums {
+  struct GradientSums {
     std::vector<MatrixXd> kernel;   // (lanes × parameters)
     std::vector<VectorXd> columns;  // (functions)
     double misfit = 0;
 
-    void add(const Sums& other) {
+    void add(const GradientSums& other) {
       misfit += other.misfit;
       for (std::size_t a = 0; a < kernel.size(); ++a) {
         kernel[a] += other.kernel[a];
@@ -75,14 +75,14 @@ std::optional<GramValue> InducingGram::differentiate(const RowBlocks& rows, cons
       for (VectorXd& one : columns) take(one.data(), one.size());
     }
   };
-  Sums zero;
+  GradientSums zero;
   for (const InducingLatents::OfLatent& latent : latents_.latents()) {
     zero.kernel.emplace_back(MatrixXd::Zero(simd::lanes<double>, latent.kernel.values().size()));
     zero.columns.emplace_back(VectorXd::Zero(latent.n_functions));
   }
-  std::optional<Sums> all = sum_over_blocks(
+  std::optional<GradientSums> all = sum_over_blocks(
       latents_, rows, true, workers_, stop_, zero,
-      [&](Sums& sum, int piece, const RowBlock& row_block, const InducingBlock& block) {
+      [&](GradientSums& sum, int piece, const RowBlock& row_block, const InducingBlock& block) {
         const Index n = block.n();
         const MatrixXd alpha = block.misfit(mean_);
         const Index n_components = alpha.cols();

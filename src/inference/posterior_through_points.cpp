@@ -69,8 +69,8 @@ void Posterior::Implementation::condition_through_points(const Workers& workers)
       stretch.push_back(observations[g].take(states[g][k]));
       of_stretch.push_back(states[g][k]);
     }
-    const Linearisation about = linearisation ? take(*linearisation, of_stretch) : Linearisation();
-    stretches.push_back(require_statistics(prior, stretch, values, linearisation ? &about : nullptr, inducing, workers));
+    const Linearisation of_rows = linearisation ? take(*linearisation, of_stretch) : Linearisation();
+    stretches.push_back(require_statistics(prior, stretch, values, linearisation ? &of_rows : nullptr, inducing, workers));
   }
   auto through = std::make_shared<InducingPosterior>(std::move(inducing), std::move(stretches));
   if (!through->factorise()) throw_not_definite();

@@ -2,6 +2,7 @@
 
 #include <vector>
 
+#include "gp2/jobs/predict_job.hpp"
 #include "gp2/jobs/report_job.hpp"
 
 namespace gp2 {
