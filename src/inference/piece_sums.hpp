@@ -44,7 +44,7 @@ struct VectorSum {
 /// A sum over all pieces that has the same bits however many threads and processes there are: pieces of one eighth of all are added
 /// pairwise, then the pairs, and so on; eighths one after another. As soon as two that belong together are there they become one, so
 /// that few sums are in memory.
-/// @tparam Sum  has add(other), and for_each(work) that calls work(first number, how many)
+/// @tparam Sum  has add(other), which adds number by number, and for_each(work) that calls work(first number, how many)
 template <typename Sum>
 class PieceSums {
  public:

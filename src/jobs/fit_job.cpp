@@ -403,8 +403,7 @@ std::vector<Option> options(FitRequest& request) {
                    "optimise: take the likeliest as known; integrate: draw them given the data, and mix the predictions of {} "
                    "draws (docs/theory.md, T31), through inducing points of {}, at about {} evaluations of the likelihood; auto: "
                    "integrate where the directions of a latent have their own, as in the default prior, or it is a potential, "
-                   "and "
-                   "rows times free directions of motion are at most {}",
+                   "and rows times free directions of motion are at most {}",
                    n_mixed_draws, n_mixed_draws_through_points, draw_evaluations, largest_integrated_size)},
               {"standard_errors", YesByDefault{&request.standard_errors}, "",
                "the standard errors of estimated parameters, which take a few dozen gradients"},
