@@ -10,7 +10,7 @@
 #include "base/parallel.hpp"
 #include "gp2/error.hpp"
 #include "inference/dense_gram.hpp"
-#include "inference/inducing_gram.hpp"
+#include "inference/inducing_latents.hpp"
 #include "inference/latent_sums.hpp"
 #include "inference/nonlinear_motion.hpp"
 #include "inference/posterior_implementation.hpp"
