@@ -229,6 +229,11 @@ void solve_lower(const Eigen::Ref<const Eigen::MatrixXd>& L, bool transposed, Ei
   dtrsm_("L", "L", transposition, "N", &n, &n_columns, &one, L.data(), &lda, B.data(), &ldb, 1, 1, 1, 1);
 }
 
+void solve_factored(const Eigen::Ref<const Eigen::MatrixXd>& L, Eigen::Ref<Eigen::MatrixXd> B) {
+  solve_lower(L, false, B);
+  solve_lower(L, true, B);
+}
+
 void multiply_lower(const Eigen::Ref<const Eigen::MatrixXd>& L, Eigen::Ref<Eigen::MatrixXd> B) {
   const BufferInUse buffer;
   const int n = static_cast<int>(L.rows()), n_columns = static_cast<int>(B.cols()), lda = static_cast<int>(L.outerStride()),

@@ -54,6 +54,9 @@ void invert_factored(Eigen::Ref<Eigen::MatrixXd> L, const Pieces& pieces = {});
 /// B ← L⁻¹ B, or L⁻ᵀ B.
 void solve_lower(const Eigen::Ref<const Eigen::MatrixXd>& L, bool transposed, Eigen::Ref<Eigen::MatrixXd> B);
 
+/// B ← (L Lᵀ)⁻¹ B.
+void solve_factored(const Eigen::Ref<const Eigen::MatrixXd>& L, Eigen::Ref<Eigen::MatrixXd> B);
+
 /// B ← L B.
 void multiply_lower(const Eigen::Ref<const Eigen::MatrixXd>& L, Eigen::Ref<Eigen::MatrixXd> B);
 

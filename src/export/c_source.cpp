@@ -73,27 +73,27 @@ void use_float_functions(std::string& source) {
   }
 }
 
-// sin(x) -> portable_sin(x), but not in comments, and these functions for @portable@
+// sin(x) -> portable_sin(x), but not in comments, and these functions for @portable@; sinf rounds what portable_sin finds
 void use_portable_functions(std::string& source, const std::string& name) {
   const auto is_of_name = [](char c) { return std::isalnum(static_cast<unsigned char>(c)) != 0 || c == '_'; };
   const std::string_view prefix = "portable_";
+  std::set<std::string> of_floats;
   std::string users;
   for (std::size_t at = 0; at < source.size();) {
     const bool is_comment = source.compare(at, 2, "/*") == 0;
     std::size_t end = is_comment ? source.find("*/", at) + 2 : at + 1;
     while (!is_comment && is_of_name(source[at]) && end < source.size() && is_of_name(source[end])) ++end;
-    const std::string word = source.substr(at, end - at) + "(";
     if (!is_comment && source[end] == '(') {
-      if (word == "pow(") {
-        throw InputError("`portable_math`: the model has a power whose exponent is no whole number; write x^y as exp(y*log(x))");
-      }
-      const bool is_ours =
-          std::any_of(std::begin(c_export::portable_pieces), std::end(c_export::portable_pieces),
-                      [&](const auto& piece) { return word == std::string(piece.name.substr(prefix.size())) + "("; });
-      if (is_ours) {
+      const std::string word = source.substr(at, end - at);
+      for (const c_export::Piece& piece : c_export::portable_pieces) {
+        if (!piece.name.starts_with(prefix)) continue;
+        const std::string_view function = piece.name.substr(prefix.size());
+        const bool is_of_floats = word == fmt::format("{}f", function);
+        if (word != function && !is_of_floats) continue;
         source.insert(at, prefix);
-        users += std::string(prefix) + word;
         end += prefix.size();
+        users += std::string(piece.name) + "(";
+        if (is_of_floats) of_floats.emplace(function);
       }
     }
     at = end;
@@ -103,6 +103,11 @@ void use_portable_functions(std::string& source, const std::string& name) {
     if (users.find(std::string(piece->name) + "(") == std::string::npos) continue;
     pieces = fmt::format("\n{}{}", piece->text, pieces);
     users += piece->text;
+  }
+  for (const std::string& function : of_floats) {
+    const bool is_binary = function == "atan2" || function == "pow";
+    pieces += fmt::format("\nstatic float portable_{0}f(float x{1})\n{{\n  return (float)portable_{0}(x{2});\n}}\n", function,
+                          is_binary ? ", float y" : "", is_binary ? ", y" : "");
   }
   std::string head(c_export::portable_head);
   head.replace(head.find("@name@"), 6, name);
@@ -1324,8 +1329,6 @@ CSource export_c(const Posterior& posterior, const View& view, const CSourceOpti
   if (!is_identifier(options.name)) {
     throw InputError(fmt::format("`name`: must be a name of C, of letters, digits and _, got '{}'", options.name));
   }
-  if (options.portable_math && options.single_precision)
-    throw InputError("`portable_math` is of double precision: leave `float` out");
   const auto& components = posterior.conditioned();
   if (posterior.n_states() == 0) throw InputError("export to C: nothing was observed, so there is nothing to export");
   return Writer(posterior, components, view, options).write();

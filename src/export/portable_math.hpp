@@ -3,7 +3,7 @@
 #include "export/c_template.hpp"
 
 // Elementary functions in C that needs no library but for what IEEE 754 defines to the bit: sqrt, fabs, and frexp, ldexp, copysign,
-// which are exact. So all compilers and machines compute the same, where sums and products are not contracted. Their polynomials are
+// floor, which are exact. So all compilers and machines compute the same, where sums and products are not contracted. Their polynomials are
 // those of Taylor. A function comes after those that it calls.
 namespace gp2::c_export {
 
@@ -22,8 +22,10 @@ inline constexpr std::string_view portable_head =
 static int products_are_fused(void)
 {
   const volatile double x = 1.0000000009313226; /* 1 + 2^-30, whose square is rounded to 1 + 2^-29 */
+  const volatile float a = 1.00012207f;         /* 1 + 2^-13, to 1 + 2^-12 */
   const double y = x, z = x;
-  return y * z - 1.0000000018626451 != 0;
+  const float b = a, c = a;
+  return y * z - 1.0000000018626451 != 0 || b * c - 1.00024414f != 0;
 }
 )c";
 
@@ -82,6 +84,84 @@ static double portable_log(double x)
   p = p * z + 2.0 / 3;
   half = f * f / 2;
   return k * 0.6931471804855391 + (f - (half - (s * (half + z * p) + k * 7.440617110012397e-11)));
+}
+)c"},
+    {"portable_pow", R"c(/* a + b and a b as a double and what it leaves, both exact */
+static double two_sum(double a, double b, double *rest)
+{
+  const double sum = a + b, of_b = sum - a;
+  *rest = (a - (sum - of_b)) + (b - of_b);
+  return sum;
+}
+
+static double two_product(double a, double b, double *rest)
+{
+  const double product = a * b, big_a = a * 134217729, big_b = b * 134217729; /* 2^27 + 1 */
+  const double a1 = big_a - (big_a - a), a2 = a - a1, b1 = big_b - (big_b - b), b2 = b - b1;
+  *rest = ((a1 * b1 - product) + a1 * b2 + a2 * b1) + a2 * b2;
+  return product;
+}
+
+/* x^y of x > 0 as e^(y log x), log x = k log 2 + 2 s + 2 s^3/3 + ... with s = (f - 1)/(f + 1), to twice the digits */
+static double power_of_positive(double x, double y)
+{
+  int k;
+  double f, s, s_rest, below, below_rest, rest, z, z_rest, cube, cube_rest, sum, sum_rest, p;
+  f = frexp(x, &k);
+  if (f < 0.7071067811865476) {
+    f *= 2;
+    --k;
+  }
+  below = two_sum(f, 1, &below_rest);
+  s = (f - 1) / below;
+  z = two_product(s, below, &rest);
+  s_rest = (((f - 1) - z) - rest - s * below_rest) / below;
+  z = two_product(s, s, &rest);
+  z_rest = rest + 2 * s * s_rest;
+  p = 2.0 / 25;
+  p = p * z + 2.0 / 23;
+  p = p * z + 2.0 / 21;
+  p = p * z + 2.0 / 19;
+  p = p * z + 2.0 / 17;
+  p = p * z + 2.0 / 15;
+  p = p * z + 2.0 / 13;
+  p = p * z + 2.0 / 11;
+  p = p * z + 2.0 / 9;
+  p = p * z + 2.0 / 7;
+  p = p * z + 2.0 / 5;
+  p = p * z; /* to 2/3, which no double is, what follows */
+  z = two_sum(z, z_rest, &z_rest);
+  cube = two_product(s, z, &rest);
+  cube_rest = rest + s * z_rest + s_rest * z;
+  p += 3.700743415417189e-17; /* 2/3 less its double */
+  below = two_product(cube, 0.6666666666666666, &rest);
+  rest += cube_rest * 0.6666666666666666 + cube * p;
+  sum = two_sum(k * 0.6931471804855391, 2 * s, &sum_rest); /* that product is exact */
+  sum = two_sum(sum, below, &z_rest);
+  sum_rest += z_rest + rest + 2 * s_rest + k * 7.440617110012397e-11;
+  sum = two_sum(sum, sum_rest, &sum_rest);
+  if (!(fabs(y * sum) < 800)) return portable_exp(y * sum);
+  p = two_product(y, sum, &rest);
+  s = portable_exp(p);
+  return s > 1.7976931348623157e308 ? s : s + s * (rest + y * sum_rest);
+}
+
+static double portable_pow(double x, double y)
+{
+  const double a = fabs(x), b = fabs(y), infinity = HUGE_VAL;
+  const int is_whole = b >= 9007199254740992 || floor(y) == y, is_odd = is_whole && floor(y / 2) != y / 2;
+  double power;
+  if (x == 1 || y == 0) return 1;
+  if (x != x || y != y) return x + y;
+  if (x < 0 && a < infinity && !is_whole) return (x - x) / (x - x);
+  if (a == 0 || !(a < infinity)) {
+    power = (a == 0) == (y < 0) ? infinity : 0;
+  } else if (a == 1) {
+    power = 1;
+  } else {
+    power = power_of_positive(a, y);
+  }
+  return is_odd ? copysign(power, x) : power;
 }
 )c"},
     {"turned_by",

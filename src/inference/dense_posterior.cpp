@@ -91,8 +91,7 @@ VectorXd DensePosterior::misfit(const std::vector<MatrixXd>& f, RandomStream& ra
 
 std::vector<std::vector<MatrixXd>> DensePosterior::weights(MatrixXd misfits) const {
   MatrixXd& alpha = misfits;
-  lapack::solve_lower(factor_.L(), false, alpha);
-  lapack::solve_lower(factor_.L(), true, alpha);
+  lapack::solve_factored(factor_.L(), alpha);
   std::vector<std::vector<MatrixXd>> weights;
   for (Index column = 0; column < alpha.cols(); ++column) {
     std::vector<MatrixXd>& of_column = weights.emplace_back();

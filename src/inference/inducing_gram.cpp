@@ -24,8 +24,7 @@ bool InducingGram::factorise(const RowBlocks& rows) {
   L_ = B_;
   if (is_set(stop_) || !lapack::factorise(L_, {.stop = stop_})) return false;
   mean_ = std::move(sums->c);
-  lapack::solve_lower(L_, false, mean_);
-  lapack::solve_lower(L_, true, mean_);
+  lapack::solve_factored(L_, mean_);
   log_det_half_ = L_.diagonal().array().log().sum();
   trace_ = sums->trace;
   constant_ = sums->constant;

@@ -69,8 +69,7 @@ bool InducingPosterior::factorise() {
   all_ = std::move(all);
   L_ = std::move(L);
   mean_ = all_.c;
-  lapack::solve_lower(L_, false, mean_);
-  lapack::solve_lower(L_, true, mean_);
+  lapack::solve_factored(L_, mean_);
   // X = T L⁻¹, from its transpose
   MatrixXd transposed = root_of_explained(all_.B).transpose();
   inducing_.solve(true, transposed);
@@ -179,8 +178,7 @@ LatentPosterior::Inverse InducingPosterior::invert(const LatentRows& rows, const
     }
     others.B.diagonal().array() += 1;
     if (!lapack::factorise(others.B)) return {std::move(inverse.alpha), std::move(inverse.blocks), {}};
-    lapack::solve_lower(others.B, false, others.c);
-    lapack::solve_lower(others.B, true, others.c);
+    lapack::solve_factored(others.B, others.c);
     const MatrixXd pull = block.misfit(others.c);
     const std::vector<MatrixXd> of_others = halves(others.B);
     WithoutSet& without = inverse.without.emplace_back();

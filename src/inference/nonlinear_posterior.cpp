@@ -214,8 +214,7 @@ class FitThroughPoints {
     linear_.B.diagonal().array() += 1;
     if (!lapack::factorise(linear_.B)) throw_not_definite();
     mean_ = std::move(linear_.c);
-    lapack::solve_lower(linear_.B, false, mean_);
-    lapack::solve_lower(linear_.B, true, mean_);
+    lapack::solve_factored(linear_.B, mean_);
   }
 
  private:

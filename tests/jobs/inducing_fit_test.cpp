@@ -115,34 +115,33 @@ TEST(InducingFit, ItsCheckpointIsTheBestSoFarOfAllRows) {
   EXPECT_NEAR(last.posterior().negative_log_likelihood(), last.report.negative_log_likelihood, 1e-3);
 }
 
-TEST(InducingFit, AFileOfManyRowsHoldsWhatTheySayAndSomeOfThem) {
-  FitRequest request = request_of_rows(6000);
-  request.inducing = 40;
+FitOutcome fit_of_6000_rows(const char* model, int n_inducing) {
+  FitRequest request = request_of_rows(6000, model);
+  request.inducing = n_inducing;
   request.train_on = 300;
-  const FitOutcome outcome = run_fit(prepare_fit(std::move(request)));
+  return run_fit(prepare_fit(std::move(request)));
+}
+
+// A fit of 6000 rows is as good from its file as it was, and goes on from there.
+void expect_goes_on_from_its_file(const FitOutcome& outcome, const char* model, const test::TemporaryFolder& folder) {
   EXPECT_EQ(outcome.posterior.n_states(), 6000);
   EXPECT_EQ(outcome.file.report.negative_log_likelihood, outcome.posterior.negative_log_likelihood()) << "of all rows";
   ASSERT_TRUE(outcome.cross_validation && outcome.cross_validation->stretches);
   EXPECT_NEAR(outcome.cross_validation->stretches->coverage95, 0.95, 0.02);
-  const test::TemporaryFolder folder;
   outcome.file.write(folder / "fit.json");
   const FitFile read = FitFile::read(folder / "fit.json");
   EXPECT_THAT(read.n_states(), testing::ElementsAre(6000));
-  EXPECT_EQ(read.observations.front().n_data(), 3000);
   const Posterior posterior = read.posterior();
   EXPECT_EQ(posterior.n_states(), 6000);
   const View view = View::constrained_acceleration(*outcome.file.model.system);
   const MatrixXd states = outcome.posterior.observations().front().states().leftCols(50);
   EXPECT_EQ(posterior.marginal(view, states).covariance, outcome.posterior.marginal(view, states).covariance);
-  EXPECT_EQ(posterior.distance_from_data(view, states), outcome.posterior.distance_from_data(view, states));
   const CrossValidation scores = cross_validate(read, posterior);
   EXPECT_EQ(scores.one_by_one.nrmse, outcome.cross_validation->one_by_one.nrmse);
   EXPECT_EQ(scores.stretches->nrmse, outcome.cross_validation->stretches->nrmse);
-  EXPECT_THAT(input_error_of([&] { static_cast<void>(prepare_fit_again(read)); }),
-              HasSubstr("`again`: the file holds what 6000 rows say, and 3000 of them; give its logs by `data`"));
 
   // more of the same, kept in a file too
-  const UpdateOutcome updated = update(read, {test::drawn_log(surface, 200, 5).table()}, {});
+  const UpdateOutcome updated = update(read, {test::drawn_log(model, 200, 5).table()}, {});
   EXPECT_EQ(updated.n_added, 200);
   EXPECT_EQ(updated.n_states, 6200);
   updated.fit.write(folder / "more.json");
@@ -150,6 +149,19 @@ TEST(InducingFit, AFileOfManyRowsHoldsWhatTheySayAndSomeOfThem) {
   EXPECT_THAT(more.n_states(), testing::ElementsAre(6200));
   EXPECT_FALSE(more.report.inducing->stretches) << "they were of other data";
   EXPECT_LE(more.posterior().marginal(view, states).stddev().mean(), posterior.marginal(view, states).stddev().mean());
+}
+
+TEST(InducingFit, AFileOfManyRowsHoldsWhatTheySayAndSomeOfThem) {
+  const test::TemporaryFolder folder;
+  const FitOutcome outcome = fit_of_6000_rows(surface, 40);
+  expect_goes_on_from_its_file(outcome, surface, folder);
+  const FitFile read = FitFile::read(folder / "fit.json");
+  EXPECT_EQ(read.observations.front().n_data(), 3000);
+  const View view = View::constrained_acceleration(*outcome.file.model.system);
+  const MatrixXd states = outcome.posterior.observations().front().states().leftCols(50);
+  EXPECT_EQ(read.posterior().distance_from_data(view, states), outcome.posterior.distance_from_data(view, states));
+  EXPECT_THAT(input_error_of([&] { static_cast<void>(prepare_fit_again(read)); }),
+              HasSubstr("`again`: the file holds what 6000 rows say, and 3000 of them; give its logs by `data`"));
 }
 
 constexpr const char* bead =
@@ -162,31 +174,7 @@ TEST(InducingFit, AutoIsThroughPointsWherePriorsAreNotLinear) {
 }
 
 TEST(InducingFit, OfFrictionThatPressesOnItsConstraintGoesOnFromItsFile) {
-  FitRequest request = request_of_rows(6000, bead);
-  request.inducing = 30;
-  request.train_on = 300;
-  const FitOutcome outcome = run_fit(prepare_fit(std::move(request)));
-  EXPECT_EQ(outcome.posterior.n_states(), 6000);
-  EXPECT_EQ(outcome.file.report.negative_log_likelihood, outcome.posterior.negative_log_likelihood()) << "of all rows";
-  ASSERT_TRUE(outcome.cross_validation && outcome.cross_validation->stretches);
-  EXPECT_NEAR(outcome.cross_validation->stretches->coverage95, 0.95, 0.02);
-  const test::TemporaryFolder folder;
-  outcome.file.write(folder / "fit.json");
-  const FitFile read = FitFile::read(folder / "fit.json");
-  const Posterior posterior = read.posterior();
-  const View view = View::constrained_acceleration(*outcome.file.model.system);
-  const MatrixXd states = outcome.posterior.observations().front().states().leftCols(50);
-  EXPECT_EQ(posterior.marginal(view, states).covariance, outcome.posterior.marginal(view, states).covariance);
-  const CrossValidation scores = cross_validate(read, posterior);
-  EXPECT_EQ(scores.one_by_one.nrmse, outcome.cross_validation->one_by_one.nrmse);
-  EXPECT_EQ(scores.stretches->nrmse, outcome.cross_validation->stretches->nrmse);
-
-  const UpdateOutcome updated = update(read, {test::drawn_log(bead, 200, 5).table()}, {});
-  EXPECT_EQ(updated.n_states, 6200);
-  updated.fit.write(folder / "more.json");
-  const FitFile more = FitFile::read(folder / "more.json");
-  EXPECT_THAT(more.n_states(), testing::ElementsAre(6200));
-  EXPECT_LE(more.posterior().marginal(view, states).stddev().mean(), posterior.marginal(view, states).stddev().mean());
+  expect_goes_on_from_its_file(fit_of_6000_rows(bead, 30), bead, test::TemporaryFolder());
 }
 
 TEST(InducingFit, HyperparametersDrawnFromSomeRowsMixWhatAllTell) {

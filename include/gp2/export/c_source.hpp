@@ -35,8 +35,7 @@ struct CSource {
 /// (n/8 + 16) ε Σ_j |k_j β_j| of each latent function, is held against the standard deviation of that function at observed states.
 ///
 /// @throws InputError as require_view; when the name is no C identifier, there are no observations, the system, features or
-///   directions are code and not expressions, or single precision is off by more than a hundredth of a standard deviation; when
-///   portable_math meets single precision, or a power whose exponent is no whole number.
+///   directions are code and not expressions, or single precision is off by more than a hundredth of a standard deviation.
 [[nodiscard]] CSource export_c(const Posterior& posterior, const View& view, const CSourceOptions& options = {});
 
 }  // namespace gp2
