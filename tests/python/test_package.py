@@ -26,6 +26,8 @@ def test_the_version_is_the_projects():
     assert gp2.__version__ == version
     port = json.loads((ROOT / "packaging/vcpkg/gp2/vcpkg.json").read_text(encoding="utf-8"))
     assert port["version"] == version
+    consumer = (ROOT / "tests/package/CMakeLists.txt").read_text(encoding="utf-8")
+    assert f"find_package(gp2 {version.rsplit('.', 1)[0]} REQUIRED)" in consumer, "its minor version must be asked for"
     for distribution in metadata.distributions(name="gp2"):  # none, but where pip installed it
         assert distribution.version == version
         files = {path.name for path in distribution.files}
