@@ -215,7 +215,7 @@ class Training {
       if (std::isfinite(reports_[restart].objective)) optima.push_back(results_[restart]);
     }
     if (optima.empty()) return;
-    const std::vector<bool> held = enter_the_constraint(prior_, observations_, optima.front());
+    const std::vector<bool> held = held_in_draws(prior_, observations_, optima.front());
     bool is_any_drawn = false;
     for (std::size_t k = 0; k < held.size(); ++k) is_any_drawn = is_any_drawn || !(held[k] || hyperparameters_[k].is_fixed());
     if (!is_any_drawn) return;
