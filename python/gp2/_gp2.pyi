@@ -66,6 +66,7 @@ class System:
         force: Sequence[_Text] | None = None,
         force_on: Mapping[str, _Text] | None = None,
         potential: _Text | None = None,
+        coriolis: bool | None = None,
         constraints: Sequence[_Text] | Mapping[str, Sequence[_Text]] = (),
         latents: Sequence[Mapping[str, Any]] = (),
         noise: float | Sequence[float] | Mapping[str, Any] | None = None,

@@ -4,9 +4,19 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
 from numbers import Integral, Real
 from os import PathLike, fspath
 from typing import Any
+
+
+def text_of_system(**keywords: Any) -> str:
+    known = model_text.__kwdefaults__ or {}
+    for key in keywords:
+        if key not in known:
+            near = get_close_matches(key, known, 1)
+            raise TypeError(f"System() got an unexpected keyword argument '{key}'" + (f"; did you mean '{near[0]}'?" if near else ""))
+    return model_text(**keywords)
 
 
 def model_text(
@@ -21,6 +31,7 @@ def model_text(
     force: Sequence[Any] | None = None,
     force_on: Mapping[str, Any] | None = None,
     potential: Any = None,
+    coriolis: bool | None = None,
     constraints: Any = (),
     latents: Sequence[Mapping[str, Any]] = (),
     noise: Any = None,
@@ -31,7 +42,7 @@ def model_text(
     units: Mapping[str, str] | None = None,
     drawing: Mapping[str, Any] | None = None,
 ) -> str:
-    mechanics = {"mass": mass, "force": force, "force_on": force_on, "potential": potential}
+    mechanics = {"mass": mass, "force": force, "force_on": force_on, "potential": potential, "coriolis": coriolis}
     if not isinstance(constraints, Mapping):
         constraints = {"position": constraints} if constraints else {}
     if noise is not None and not (isinstance(noise, Mapping) and "ddq" in noise):
@@ -59,11 +70,20 @@ def model_text(
         "drawing": drawing,
     }
     for table, entries in tables.items():
+        _require_mapping(table, entries or {})
         if written := _entries(entries or {}):
             lines += ["", f"[{table}]", *written]
+    if isinstance(latents, (str, Mapping)):
+        raise TypeError(f"latents: expected a list of mappings, one for each latent, got {latents!r}")
     for latent in latents:
+        _require_mapping("latents", latent)
         lines += ["", "[[latent]]", *_entries(latent)]
     return "\n".join(lines) + "\n"
+
+
+def _require_mapping(name: str, value: Any) -> None:
+    if not isinstance(value, Mapping):
+        raise TypeError(f"{name}: expected a mapping of names to values, got {value!r}")
 
 
 def _entries(table: Mapping[str, Any]) -> list[str]:

@@ -284,7 +284,7 @@ std::map<std::string, ModelCode::OfLatent> latents_code(const py::kwargs& kwargs
 }
 
 PySystem from_keywords(const py::kwargs& kwargs, const char* name, ModelCode code) {
-  const py::object text = py::module_::import("gp2._model_text").attr("model_text")(**kwargs);
+  const py::object text = py::module_::import("gp2._model_text").attr("text_of_system")(**kwargs);
   code.latents = latents_code(kwargs);
   return {std::make_shared<const Model>(Model::parse(text.cast<std::string>(), name, code))};
 }

@@ -89,7 +89,7 @@ class ExactFit {
     return linearisation;
   }
 
-  // ½ |f|² + ½ Σ |S^{-1/2}(y − v(f))|²
+  // ½ |f|² + ½ Σ |S^{-1/2}(y − v(f))|², v linear about `about`: of a linearisation about f itself the nonlinear one
   [[nodiscard]] double objective(const LatentValues& at, const Linearisation& about) const {
     double sum = at.squared_distance(zero());
     for (std::size_t g = 0; g < groups_.size(); ++g) {
@@ -98,9 +98,11 @@ class ExactFit {
       PriorValues prior;
       groups_[g].motion->linearise(group.view(), about.groups[g], view, prior);
       if (prior.fault) return std::numeric_limits<double>::infinity();
+      std::vector<MatrixXd> signals;
+      for (std::size_t a = 0; a < self_.C.size(); ++a) signals.push_back(self_.C[a] * at.f[g][a]);
       for (int i = 0; i < group.n_data(); ++i) {
         VectorXd a_bar = prior.mean.col(i);
-        for (std::size_t a = 0; a < self_.C.size(); ++a) a_bar += prior.E(a, i) * about.groups[g].signals[a].col(i);
+        for (std::size_t a = 0; a < self_.C.size(); ++a) a_bar += prior.E(a, i) * signals[a].col(i);
         const VectorXd missing = group.values().col(i) - view.G(i) * a_bar - view.offset.col(i);
         const VectorXd noise = group.noise_at(self_.values.noise_stddev[g], i);
         for (Index k = 0; k < noise.size(); ++k) {
@@ -179,7 +181,7 @@ class FitThroughPoints {
     return linearise_through_points(prior_, observations_, values_, latents_, at.m, workers_);
   }
 
-  // ½ |m|² + ½ Σ |S^{-1/2}(y − v(m))|², S enlarged by what points leave of local latents
+  // ½ |m|² + ½ Σ |S^{-1/2}(y − v(m))|², v as in ExactFit, S enlarged by what points leave of local latents
   [[nodiscard]] double objective(const InducingValues& at, const Linearisation& about) {
     struct Sum {
       InducingStatistics of_blocks;
@@ -238,6 +240,7 @@ std::shared_ptr<const Linearisation> find_mean(NonlinearFit& fit, const Prior& p
   std::shared_ptr<const Linearisation> linearisation = fit.about(at);
   if (!linearisation) static_cast<void>(require_models(prior, observations, values.parameters, nullptr));  // names the state
   double objective = fit.objective(at, *linearisation);
+  bool is_in_kink = false;
   for (int step = 0; step < most; ++step) {
     try {
       fit.condition(linearisation);
@@ -262,16 +265,27 @@ std::shared_ptr<const Linearisation> find_mean(NonlinearFit& fit, const Prior& p
       break;
     }
     if (t > 1e-10) continue;
-    if (distance <= 1e-4) return linearisation;  // rounding of the objective
+    // rounding of the objective, or a kink, where a load changes its sign at an observed state: right to a fifth of a deviation
+    constexpr double little = 0.02;  // nats
+    if (distance <= 1e-4 || std::abs(objective - fit.objective(target, *linearisation)) <= little) return linearisation;
+    is_in_kink = true;
     break;
   }
   Index n_values = 0;
   for (const Observations& group : observations) n_values += group.values().size();
+  const double left = std::sqrt(2 * objective / static_cast<double>(n_values));
+  if (is_in_kink && left < 2) {
+    throw NumericalError(
+        fmt::format("the posterior of latents that enter nonlinearly was not found: Gauss–Newton steps explain the data, but for "
+                    "{:.3g} times the noise, and go back and forth where a load changes its sign: write directions without a "
+                    "kink there, sqrt(lambda(1)^2 + 0.01) in place of abs(lambda(1)), say",
+                    left));
+  }
   throw NumericalError(fmt::format(
       "the posterior of latents that enter nonlinearly was not found: Gauss–Newton steps leave {:.3g} times the "
       "noise unexplained: do the signs of the directions, and what is known, fit the machine? Else write the directions so "
       "that the coefficients are small, or start from smaller signal standard deviations",
-      std::sqrt(2 * objective / static_cast<double>(n_values))));
+      left));
 }
 
 }  // namespace

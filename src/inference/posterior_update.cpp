@@ -118,7 +118,8 @@ Posterior remove_oldest(Posterior&& posterior, int n) {
         fmt::format("remove_oldest: there are {} observed states, so n must be 0 … {}, got {}", n_samples, n_samples, n));
   }
   for (const Observations& group : posterior.observations()) group.require_no_sums();
-  if (posterior.observations().size() > 1) require_linear(posterior.prior(), "remove_oldest from several groups of observations");
+  if (posterior.observations().size() > 1)
+    require_linear(posterior.prior(), "leaving out the oldest of several groups of observations");
   const lapack::SingleThread single_thread;
   const auto own = posterior.own_components();
   for (const auto& component : own) remove_oldest_of(*component, n);

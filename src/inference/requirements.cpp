@@ -162,9 +162,13 @@ void require_learnable(const Prior& prior, const std::vector<Observations>& obse
 }
 
 void require_linear(const Prior& prior, const char* who) {
-  if (!prior.is_nonlinear()) return;
-  throw InputError(fmt::format(
-      "{}: not of a model with a latent that is positive or reads lambda; lambda0 in its place makes it linear", who));
+  for (const Latent& latent : prior.latents) {
+    const bool reads_load = latent.directions && latent.directions->of_multipliers() != nullptr;
+    if (!latent.is_positive && !reads_load) continue;
+    throw InputError(fmt::format("{}: only of latents that are linear, but '{}' {}{}{}", who, latent.name,
+                                 latent.is_positive ? "is positive" : "", latent.is_positive && reads_load ? " and " : "",
+                                 reads_load ? "reads lambda, where lambda0 would be linear" : ""));
+  }
 }
 
 void require_size(const char* type, const char* what, Index got, Index wanted) {

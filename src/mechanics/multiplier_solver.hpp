@@ -51,7 +51,10 @@ class MultiplierSolver {
     free_ = a_bar_;
     lambda_ = d;
     lambda_.noalias() += G.lazyProduct(free_);
-    size_ = lambda_.norm();
+    // λ is rounded as its terms are, which cancel where the load is about to change its sign
+    change_ = d.cwiseAbs();
+    for (Eigen::Index j = 0; j < G.cols(); ++j) change_ += (free_[j] * G.col(j)).cwiseAbs();
+    size_ = change_.norm();
   }
 
   template <typename Matrix, typename Vector, typename Motion>
@@ -81,7 +84,7 @@ class MultiplierSolver {
   Eigen::VectorXd free_, lambda_, a_bar_, residual_, change_;
   Eigen::MatrixXd slope_, D_;
   Eigen::PartialPivLU<Eigen::MatrixXd> lu_;
-  double size_ = 0;
+  double size_ = 0;  // of the terms of λ
   bool is_finite_ = true;
 };
 

@@ -151,8 +151,17 @@ class Integration {
     if (options_.record) out_.records.conservativeResize(Eigen::NoChange, next);
   }
 
-  void require_progress() const {
-    if (out_.steps + out_.rejected_steps >= options_.max_steps) {
+  void require_progress() {
+    const int taken = out_.steps + out_.rejected_steps;
+    if (taken <= options_.max_steps / 2) t_halfway_ = t_;
+    if (taken >= options_.max_steps) {
+      if (t_ - t_halfway_ < 0.25 * (t_halfway_ - options_.times[0])) {
+        throw NumericalError(fmt::format(
+            "simulate: {} steps reach no further than t = {:.6g} of {:.6g}, half of them from t = {:.6g} on: a force that "
+            "jumps, as -v/|v| does where a body comes to rest, is to be smoothed, say -tanh(|v|/0.01)*v/|v|; else loosen "
+            "the tolerances, or allow more steps (`max_steps`)",
+            options_.max_steps, t_, t_end(), t_halfway_));
+      }
       throw NumericalError(
           fmt::format("simulate: {} steps reach no further than t = {:.6g} of {:.6g}: loosen the tolerances, or "
                       "allow more steps (`max_steps`)",
@@ -501,8 +510,8 @@ class Integration {
   ControlledStepper stepper_;
   bool project_stages_ = false;
   double longest_holding_step_ = std::numeric_limits<double>::infinity();
-  VectorXd state_;  // scratch
-  double t_ = 0;
+  VectorXd state_;                // scratch
+  double t_ = 0, t_halfway_ = 0;  // … when half of the steps were taken
   Phase x_, dxdt_, x_new_, dxdt_new_, x_crossing_;
   std::optional<StageFault> fault_;  // of the last try
   Trajectory out_;

@@ -141,26 +141,29 @@ bool has_one_constraint(const System& system, const MatrixXd& states, const Vect
 
 }  // namespace
 
-std::vector<bool> enter_the_constraint(const Prior& prior, const std::vector<Observations>& observations,
-                                       const std::vector<Hyperparameter>& hyperparameters) {
+std::vector<bool> held_in_draws(const Prior& prior, const std::vector<Observations>& observations,
+                                const std::vector<Hyperparameter>& hyperparameters) {
   VectorXd parameters = prior.system->parameter_values();
   for (const Hyperparameter& h : hyperparameters) {
     if (h.is_system_parameter()) parameters[h.index] = h.value;
   }
-  std::vector<bool> enters(hyperparameters.size());
-  for (std::size_t k = 0; k < enters.size(); ++k) {
+  const std::vector<const Observations*> home = at_home(observations);
+  std::vector<bool> held(hyperparameters.size());
+  for (std::size_t k = 0; k < held.size(); ++k) {
     const Hyperparameter& h = hyperparameters[k];
     if (!h.is_system_parameter() || h.is_fixed()) continue;
     VectorXd moved = parameters;
     moved[h.index] += 1e-6 * (h.value < (h.lower + h.upper) / 2 ? 1 : -1) * (h.upper - h.lower);
-    enters[k] = std::any_of(observations.begin(), observations.end(), [&](const Observations& group) {
+    const auto moves_the_constraint = [&](const Observations& group) {
       const View& view = group.view();
       return !has_one_constraint(*prior.system, group.states(), parameters, moved) ||
              (view.other_system && !has_one_constraint(*prior_of(prior, view).system, group.states(),
                                                        parameters_of(view, parameters), parameters_of(view, moved)));
-    });
+    };
+    held[k] = std::any_of(observations.begin(), observations.end(), moves_the_constraint) ||
+              (home.size() == observations.size() && !moves_the_system(prior, home, parameters, h.index));
   }
-  return enters;
+  return held;
 }
 
 }  // namespace gp2

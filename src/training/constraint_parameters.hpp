@@ -16,8 +16,8 @@ void weigh_by_residuals(const Prior& prior, const std::vector<Observations>& obs
                         std::vector<Hyperparameter>& hyperparameters);
 
 /// Which hyperparameters are parameters that A or b depend on, of the prior's own system or another one of the observations, at
-/// their states.
-std::vector<bool> enter_the_constraint(const Prior& prior, const std::vector<Observations>& observations,
-                                       const std::vector<Hyperparameter>& hyperparameters);
+/// their states; or that nothing depends on there, as on a restitution: draws of them would be chance, by which motions bounce.
+std::vector<bool> held_in_draws(const Prior& prior, const std::vector<Observations>& observations,
+                                const std::vector<Hyperparameter>& hyperparameters);
 
 }  // namespace gp2

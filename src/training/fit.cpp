@@ -215,7 +215,7 @@ class Training {
       if (std::isfinite(reports_[restart].objective)) optima.push_back(results_[restart]);
     }
     if (optima.empty()) return;
-    const std::vector<bool> held = enter_the_constraint(prior_, observations_, optima.front());
+    const std::vector<bool> held = held_in_draws(prior_, observations_, optima.front());
     bool is_any_drawn = false;
     for (std::size_t k = 0; k < held.size(); ++k) is_any_drawn = is_any_drawn || !(held[k] || hyperparameters_[k].is_fixed());
     if (!is_any_drawn) return;
@@ -504,6 +504,27 @@ FitReport trained_nonlinear(const Prior& prior, const std::vector<Observations>&
   once.n_draws = 0;
   once.standard_errors = false;
   const Workers workers = Evaluators(options, approximation.points != nullptr).alone;
+  // The linear prior about the posterior mean. What is found about another mean may have none itself: then one step back, half of the
+  // way to the last that had, and again.
+  std::vector<Hyperparameter> last_with_mean = hyperparameters;
+  const auto linearise = [&](std::vector<Hyperparameter>& at) {
+    constexpr int most_halvings = 6;
+    for (int halvings = 0;; ++halvings) {
+      try {
+        ModelValues values = model_values(prior, observations, at);
+        values.inducing = approximation.points;
+        approximation.about = linearisation_of(prior, observations, values, workers);
+        last_with_mean = at;
+        return halvings == 0;
+      } catch (const NumericalError&) {
+        if (halvings == most_halvings || is_set(options.stop)) throw;
+      }
+      for (std::size_t k = 0; k < at.size(); ++k) {
+        const double middle = at[k].value_at(0.5 * (at[k].coordinate() + last_with_mean[k].coordinate()));
+        at[k].value = std::clamp(middle, at[k].lower, at[k].upper);
+      }
+    }
+  };
   std::optional<FitReport> first, last;
   double objective = std::numeric_limits<double>::infinity();
   bool stands = options.max_iterations == 0;
@@ -515,9 +536,10 @@ FitReport trained_nonlinear(const Prior& prior, const std::vector<Observations>&
     if (!first) first = report;
     last = std::move(report);
     if (is_set(options.stop)) break;
-    ModelValues values = model_values(prior, observations, hyperparameters);
-    values.inducing = approximation.points;
-    approximation.about = linearisation_of(prior, observations, values, workers);
+    if (!linearise(hyperparameters)) {
+      objective = std::numeric_limits<double>::infinity();
+      stands = false;
+    }
     once.n_restarts = 1;
     once.max_escapes = 0;
   }
@@ -779,12 +801,17 @@ Fit fit(const Prior& prior, const std::vector<Observations>& observations, const
     const std::vector<Observations>& of = is_part ? part : observations;
     return trained_exactly(prior, of, hyperparameters, options);
   }();
+  const Workers workers(thread_count(options.n_threads), options.ranks);
   Posterior posterior = report.termination == FitReport::interrupted && !report.draws
                             ? Posterior::lazy(prior, observations, values_of(prior, observations, report).front())
-                            : posterior_of(prior, observations, report, Workers(thread_count(options.n_threads), options.ranks));
+                            : posterior_of(prior, observations, report, workers);
   if (report.inducing) report.inducing->summary = posterior.summary();
   if (is_part || prior.is_nonlinear()) {  // what is said of the part is not of all
-    const double of_part = std::exchange(report.negative_log_likelihood, posterior.negative_log_likelihood());
+    FitReport optimum = report;           // … nor what is said of the likeliest draw
+    optimum.draws.reset();
+    if (optimum.inducing) optimum.inducing->summary = nullptr;
+    const Posterior told = report.draws ? posterior_of(prior, observations, optimum, workers) : posterior;
+    const double of_part = std::exchange(report.negative_log_likelihood, told.negative_log_likelihood());
     report.objective += report.negative_log_likelihood - of_part;
   }
   report.seconds = std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();

@@ -220,6 +220,37 @@ TEST(CSourceTest, IsThePredictorOfNonlinearLatents) {
   }
 }
 
+// What is left of terms that cancel is rounded as these are.
+TEST(CSourceTest, IsThePredictorWhereALoadIsAboutToChangeItsSign) {
+  const Model& model = test::model("experiments/mechanisms/rubbing_bead.toml");
+  PriorOptions options;
+  options.mean = Prior::Mean::force;
+  Problem p{model.name, make_prior(model, options), {}, {}, test::draw(model, 25, export_seed).states, {}};
+  const View ddq = View::constrained_acceleration(*model.system), load = View::multipliers(*model.system);
+  p.observations.push_back({p.queries, ddq, ModelMotion(model).acceleration(p.queries), VectorXd::Constant(2, 0.01)});
+  p.values = model_values(p.prior, p.observations, default_hyperparameters(p.prior, p.observations, {}, {}));
+  const Posterior posterior(p.prior, p.observations, p.values);
+  const Predictor predictor(posterior, load);
+  Predictor::Workspace workspace = predictor.make_workspace();
+  // of each state the push at which nothing is left of the load, nearly
+  MatrixXd states = p.queries.replicate(1, 4);
+  const Index push = states.rows() - 1;
+  for (Index i = 0; i < states.cols(); ++i) {
+    VectorXd low = states.col(i), high = low, at(1);
+    low[push] = -100;
+    high[push] = 100;
+    ASSERT_EQ(predictor.mean(low, at, workspace), Status::ok);
+    if (at[0] > 0) low.swap(high);
+    for (Index step = 0; step < 12 + 3 * (i / p.queries.cols()); ++step) {
+      states.col(i) = 0.5 * (low + high);
+      ASSERT_EQ(predictor.mean(states.col(i), at, workspace), Status::ok);
+      (at[0] < 0 ? low : high) = states.col(i);
+    }
+  }
+  Exported c(export_c(posterior, ddq), "gp2_model", compiler(0));
+  EXPECT_EQ(expect_predictor(posterior, ddq, c, states, p), states.cols());
+}
+
 class EveryModel : public testing::TestWithParam<std::string> {};
 
 // Of a fit by the file's prior; of models with an even number of coordinates a mixture.

@@ -92,6 +92,22 @@ TEST(Multipliers, OfATruthThatReadsThemAreThoseOfOneSlidingContact) {
   EXPECT_GT((ModelMotion(known).acceleration(states) - ddq).cwiseAbs().maxCoeff(), 0.05);
 }
 
+// What is left of terms that cancel is rounded as these are: no sign of a load that has no solution.
+TEST(Multipliers, AreFoundWhereTheLoadIsAboutToChangeItsSign) {
+  const Model model = rubbing_bead("lambda");
+  constexpr int n_loads = 400;
+  MatrixXd states = test::draw(model, 1, nonlinear_seed).states.replicate(1, n_loads);
+  const double m = 0.2, x = states(0, 0), dx = states(2, 0), free = -m * (dx * dx + 9.81 * m / (m + 0.3)) / x;
+  for (int i = 0; i < n_loads; ++i) states(states.rows() - 1, i) = free * (1 + std::pow(10, -3 - i / 40) * (0.1 + i % 40));
+  MatrixXd lambda;
+  ASSERT_NO_THROW(lambda = ModelMotion(model).multipliers(states));
+  for (int i = 0; i < n_loads; ++i) {
+    // the load is proportional to how far the push is from the one that needs none
+    const double beyond = states(states.rows() - 1, i) - free, farthest = states(states.rows() - 1, 39) - free;
+    EXPECT_NEAR(lambda(0, i), lambda(0, 39) * beyond / farthest, 1e-13) << i;
+  }
+}
+
 TEST(Multipliers, ThatGrowFasterThanTheForceTheyNeedAreAnErrorThatNamesTheState) {
   std::string text = rubbing_bead("lambda").text;
   text.replace(text.find("\"0.3\""), 5, "\"30\"");
@@ -287,6 +303,42 @@ TEST(NonlinearPosterior, OfOneNumberIsLaplacesApproximation) {
     const auto marginal = posterior.marginal(view, elsewhere);
     const MatrixXd slope = (ddq(best + step) - ddq(best - step)) / (2 * step);
     EXPECT_LE(test::largest(marginal.stddev() - slope.cwiseAbs() / std::sqrt(curvature)), 1e-6);
+  }
+}
+
+// Data that want less than no friction: the best is a load of 0, where |λ| has a kink and no step of a linear prior ends.
+TEST(NonlinearPosterior, IsFoundInAWeakKinkAndAStrongOneIsToldAsWhatItIs) {
+  const Model model = rubbing_bead("lambda", "constant", R"toml(positive = true
+[[latent]]
+name       = "lift"
+kernel     = "constant"
+features   = ["v"]
+directions = { force = [["0"], ["1"]] }
+)toml");
+  PriorOptions options;
+  options.mean = Prior::Mean::force;
+  const Prior prior = make_prior(model, options);
+  View ddx = View::constrained_acceleration(*model.system);
+  ddx.rows = {0};
+  VectorXd bottom = VectorXd::Zero(model.system->layout().size());
+  bottom[2] = 1;
+  const double sigma = 0.1, lift = 5;
+  ModelValues values{{VectorXd(), VectorXd()},
+                     {VectorXd::Ones(1), VectorXd::Constant(1, lift)},
+                     {},
+                     {VectorXd::Constant(1, sigma)},
+                     model.system->parameter_values()};
+  for (std::size_t a = 0; a < 2; ++a) values.kernel[a] = VectorXd::Ones(std::ssize(prior.latents[a].kernel.parameters()));
+  const auto posterior = [&](double too_fast) {
+    return Posterior(prior, {Observations(bottom, ddx, MatrixXd::Constant(1, 1, too_fast), VectorXd::Constant(1, sigma))},
+                     values);
+  };
+  EXPECT_NEAR(posterior(0.01).mean(View::multipliers(*model.system), bottom)(0, 0), 0, 0.2 * sigma);
+  try {
+    static_cast<void>(posterior(0.15));
+    FAIL() << "a posterior in a kink";
+  } catch (const NumericalError& error) {
+    EXPECT_THAT(error.what(), testing::HasSubstr("go back and forth where a load changes its sign"));
   }
 }
 
@@ -530,6 +582,74 @@ TEST(NonlinearFit, FindsACoefficientThatKnownMultipliersGetWrong) {
   EXPECT_LT(of_own, 0.01);
   EXPECT_GT(coverage, 0.8);
   EXPECT_LT(of_own, 0.2 * error(known).first);
+}
+
+// What is found where no latent acts may have no posterior mean.
+TEST(NonlinearFit, GoesOnFromWhereThereIsAPosteriorMean) {
+  const Model model = Model::parse(R"toml(
+name        = "rubbing bead on a spring"
+coordinates = ["x", "z"]
+inputs      = ["push"]
+[parameters]
+m = { value = 0.2, bounds = [0.1, 0.4], estimate = true }
+[let]
+v    = "sqrt(dx^2 + dz^2 + 1e-6)"
+load = "abs(lambda(1))*sqrt(1 + x^2)"
+mu   = "0.15 + 0.25*exp(-(v/0.4)^2)"
+[mechanics]
+mass  = [["m", "0"], ["0", "m + 0.3"]]
+force = ["push", "-9.81*(m + 0.3)"]
+[constraints]
+position = ["z - 0.5*x^2"]
+[[latent]]
+name       = "coefficient"
+kernel     = "constant + matern32"
+features   = ["exp(-v/0.3)"]
+directions = { force = [["-0.2*load*dx/v"], ["-0.2*load*dz/v"]] }
+positive   = true
+[[latent]]
+name       = "spring"
+features   = ["x"]
+directions = "potential"
+[noise]
+ddq = 0.05
+[truth]
+force = ["-mu*load*dx/v - 5*x", "-mu*load*dz/v"]
+[sampling]
+x    = [-0.8, 0.8]
+dx   = [-1.5, 1.5]
+push = [-1, 1]
+)toml",
+                                   "spring");
+  PriorOptions prior_options;
+  prior_options.mean = Prior::Mean::force;
+  const Prior prior = make_prior(model, prior_options);
+  FitOptions options;
+  options.standard_errors = false;
+  for (const std::uint64_t seed : {2U, 4U}) {
+    const MatrixXd states = test::draw(model, 60, seed).states;
+    MatrixXd y = ModelMotion(model).acceleration(states);
+    RandomStream random(seed);
+    for (double& one : y.reshaped()) one += 0.05 * random.normal();
+    const std::vector<Observations> observations{
+        {states, View::constrained_acceleration(*model.system), y, VectorXd::Constant(2, 0.05)}};
+    const FitReport report =
+        fit(prior, observations, default_hyperparameters(prior, observations, {"m"}, Protocol()), options).report;
+    EXPECT_LT(report.negative_log_likelihood, -120) << "seed " << seed;
+  }
+}
+
+TEST(NonlinearFit, TellsTheLikelihoodOfTheHyperparametersThatItTellsAndNotOfADraw) {
+  const Fitted fitted(rubbing_bead("lambda", "constant + matern32"), 40);
+  const std::vector<Observations>& observations = fitted.observations;
+  FitOptions options;
+  options.n_restarts = 1;
+  options.n_draws = 3;
+  const FitReport report =
+      fit(fitted.prior, observations, default_hyperparameters(fitted.prior, observations, {}, {}), options).report;
+  ASSERT_TRUE(report.draws);
+  const Posterior optimum(fitted.prior, observations, model_values(fitted.prior, observations, report.hyperparameters));
+  EXPECT_NEAR(report.negative_log_likelihood, optimum.negative_log_likelihood(), 1e-9);
 }
 
 // Training leaves out how the evidence moves with the posterior mean itself: what a Newton step in each hyperparameter would gain.
@@ -806,7 +926,15 @@ TEST(NonlinearPrior, IsRefusedByNameWhereItCannotBe) {
       fitted.prior, fitted.observations,
       model_values(fitted.prior, fitted.observations, default_hyperparameters(fitted.prior, fitted.observations, {}, {})));
   const View learned = View::learned_force(*fitted.model.system);
-  expect_says([&] { static_cast<void>(Predictor(posterior, learned)); }, {"Predictor", "lambda0"});
+  expect_says([&] { static_cast<void>(Predictor(posterior, learned)); },
+              {"Predictor", "'friction coefficient' reads lambda, where lambda0 would be linear"});
+  const Fitted positive(rubbing_bead("lambda0", "constant", "positive = true"), 10);
+  const Posterior damped(positive.prior, positive.observations,
+                         model_values(positive.prior, positive.observations,
+                                      default_hyperparameters(positive.prior, positive.observations, {}, {})));
+  const std::string error =
+      test::input_error_of([&] { static_cast<void>(Predictor(damped, View::learned_force(*positive.model.system))); });
+  EXPECT_TRUE(error.ends_with("only of latents that are linear, but 'friction coefficient' is positive")) << error;
   const std::string latent = "[[latent]]\nname = \"x\"\nfeatures = ";
   expect_says([&] { static_cast<void>(make_prior(rubbing_bead("lambda", "constant", latent + "[\"lambda(1)\"]"))); },
               {"only directions"});

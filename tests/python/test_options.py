@@ -3,6 +3,7 @@
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
 import gp2
@@ -20,6 +21,24 @@ def test_an_unknown_keyword_is_refused_with_the_nearest(arm, arm_log):
         gp2.fit(arm, arm_log, noise_sd=0.1)
     with pytest.raises(TypeError, match=r"unexpected keyword argument 'qqq'$"):
         gp2.fit(arm, arm_log, qqq=1)
+    with pytest.raises(TypeError, match=r"System\(\) got an unexpected keyword argument 'unit'; did you mean 'units'\?"):
+        gp2.System(coordinates=["x"], mass=[[1]], unit={"x": "m"})
+
+
+@pytest.mark.parametrize(
+    ("keyword", "value"),
+    [("drawing", [1]), ("units", "m"), ("parameters", ["m"]), ("latents", {"features": ["x"]}), ("latents", ["x"])],
+)
+def test_a_table_of_a_system_that_is_none_is_named(keyword, value):
+    with pytest.raises(TypeError, match=rf"{keyword}: expected a (mapping|list) of .*, got "):
+        gp2.System(coordinates=["x"], mass=[[1]], **{keyword: value})
+
+
+def test_a_system_takes_the_coriolis_force_of_its_mass():
+    rod = {"coordinates": ["q"], "mass": [["1 + q^2"]]}
+    state = np.array([[0.5, 2.0, 0.0]])
+    assert gp2.System(**rod).evaluate(state).F[0, 0] == 0
+    assert gp2.System(**rod, coriolis=True).evaluate(state).F[0, 0] == pytest.approx(-0.5 * 2.0**2)
 
 
 @pytest.mark.parametrize(

@@ -696,6 +696,14 @@ TEST(SimulateFaults, TooManyStepsNameTheTimeReached) {
                     HasSubstr("of 100: loosen the tolerances, or allow more steps")));
 }
 
+TEST(SimulateFaults, AJumpThatHoldsABodyAtRestIsToldWithItsMend) {
+  SimulateOptions options = with_tolerance(times(100, 3), 1e-6);
+  options.max_steps = 4000;
+  EXPECT_THAT(fault_of([](const VectorXd& x) { return -x[1] / std::abs(x[1]); }, options),
+              AllOf(StartsWith("simulate: 4000 steps reach no further than t = 1."),
+                    HasSubstr("of 100, half of them from t = 1."), HasSubstr("is to be smoothed, say -tanh")));
+}
+
 TEST(SimulateFaults, ASmallerStepIsTriedBeforeGivingUp) {
   // stages of the first, far too large step lie where there is no acceleration
   const Model model = oscillator();

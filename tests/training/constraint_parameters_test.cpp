@@ -103,5 +103,25 @@ TEST(ConstraintParameters, KeepTheirStartWhereNothingKnowsThem) {
   EXPECT_GT(found[1].stddev, 1) << "nothing is known of it";
 }
 
+// Else motions went by one draw of what is anywhere in its bounds.
+TEST(ConstraintParameters, AreNotDrawnWhereNothingKnowsThem) {
+  const Model model = bead("x^2 + y^2 - l^2");
+  const Observations data = observe(model, 1e-3, 5);
+  PriorOptions options;
+  options.mean = Prior::Mean::force;
+  const Prior prior = make_prior(model, options);
+  FitOptions fit_options;
+  fit_options.n_restarts = 1;
+  fit_options.max_iterations = 20;
+  fit_options.n_draws = 4;
+  const Fit found = fit(prior, {data}, default_hyperparameters(prior, {data}, {"l", "p"}, Protocol()), fit_options);
+  const std::vector<Hyperparameter>& hyperparameters = found.report.hyperparameters;
+  for (std::size_t k = 0; k < hyperparameters.size(); ++k) {
+    const auto draws = found.report.draws->values.row(static_cast<Eigen::Index>(k));
+    const bool is_same = (draws.array() == hyperparameters[k].value).all();
+    EXPECT_EQ(is_same, hyperparameters[k].is_system_parameter()) << hyperparameters[k].name;
+  }
+}
+
 }  // namespace
 }  // namespace gp2
