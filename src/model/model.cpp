@@ -13,7 +13,7 @@
 #include "model/model_text.hpp"
 #include "model/prior_words.hpp"
 #include "model/toml.hpp"
-#include "model/toml_reader.hpp"
+#include "model/toml_value.hpp"
 #include "prior/make_prior.hpp"
 #include "robots/robot_expressions.hpp"
 #include "symbolic/graph.hpp"

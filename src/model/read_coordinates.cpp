@@ -1,0 +1,127 @@
+#include <fmt/format.h>
+#include <fmt/ranges.h>
+
+#include "gp2/error.hpp"
+#include "model/name_order.hpp"
+#include "model/table_readers.hpp"
+#include "model/tuned.hpp"
+
+// robot = "FILE", coordinates = [ … ] and inputs = [ … ]
+
+namespace gp2 {
+
+void read_robot(ModelReader& reader, const RobotSource& robot) {
+  const std::optional<TomlValue> file = reader.file.get("robot");
+  if (!file) return;
+  if (reader.model.code.mechanics) file->fail("the mechanics of this model are given as code: remove it");
+  try {
+    reader.model.robot = robot(file->text());
+  } catch (const InputError& error) {
+    file->fail(error.what());
+  }
+  if (reader.model.robot->joints().empty()) file->fail("this robot has no joints: there is nothing that moves");
+}
+
+namespace {
+
+void declare_coordinate(ModelReader& reader, const Coordinate& coordinate, const TomlValue& at) {
+  for (const std::string& name : {coordinate.name, coordinate.velocity(), coordinate.acceleration()}) reader.declare(name, at);
+  reader.definition.coordinates.push_back(coordinate);
+}
+
+// the joints of the robot, unless the file has names of its own for them
+void take_coordinates_of_robot(ModelReader& reader, const TomlValue& robot) {
+  for (const std::string& coordinate : reader.model.robot->coordinates()) {
+    if (!is_identifier(coordinate)) {
+      robot.fail(fmt::format(
+          "its joint '{}' has a name that cannot stand in an expression: give names of your own, one per joint in the order of "
+          "the file, with coordinates = [\"q1\", …]",
+          coordinate));
+    }
+    declare_coordinate(reader, {coordinate, false}, robot);
+  }
+}
+
+// "q1", or { name = "q1", angle = true }
+Coordinate read_coordinate(const TomlValue& entry) {
+  if (!entry.is_table()) return {entry.text(), false};
+  entry.only_keys({"name", "angle"});
+  if (!entry.has("name")) entry.fail(R"(expected { name = "q1", angle = true })");
+  Coordinate coordinate;
+  coordinate.name = entry.get("name")->text();
+  if (const auto angle = entry.get("angle")) coordinate.angle = angle->boolean();
+  return coordinate;
+}
+
+// delay = 0.02, or { value = 0.02, bounds = [0, 0.1], estimate = true }
+void read_lateness(const TomlValue& input, const std::string& word, Parameter& out) {
+  const std::optional<TomlValue> lateness = input.get(word);
+  if (!lateness) return;
+  const Tuned entry = read_tuned(*lateness, {"value", "bounds", "estimate", "prior"});
+  if (entry.value) out.value = entry.value->number();
+  const auto require_not_negative = [&](double seconds) {
+    if (seconds >= 0) return;
+    lateness->fail(fmt::format("a {} [s] must not be negative, got {}: nothing acts before it is commanded", word, seconds));
+  };
+  require_not_negative(out.value);
+  out.estimate = entry.estimate.value_or(false);
+  out.bounds = entry.bounds;
+  if (out.bounds) require_not_negative(out.bounds->first);
+  require_within(out.value, out.bounds, *lateness);
+  out.prior = entry.prior;
+}
+
+}  // namespace
+
+void read_coordinates(ModelReader& reader) {
+  const std::optional<RobotDescription>& robot = reader.model.robot;
+  const std::optional<TomlValue> coordinates = reader.file.get("coordinates");
+  if (!coordinates) {
+    if (!robot) reader.file.fail_at(1, "coordinates", R"(missing; write coordinates = ["q1", "q2"])");
+    take_coordinates_of_robot(reader, *reader.file.get("robot"));
+    return;
+  }
+  for (const TomlValue& entry : coordinates->array()) declare_coordinate(reader, read_coordinate(entry), entry);
+  if (reader.nq() == 0) coordinates->fail("a system needs at least one coordinate");
+  if (!robot) return;
+  const std::vector<std::string> of_robot = robot->coordinates();
+  if (of_robot.size() != reader.nq()) {
+    coordinates->fail(fmt::format("{} names for the {} coordinates of the robot; they are, in this order: {}", reader.nq(),
+                                  of_robot.size(), fmt::join(of_robot, ", ")));
+  }
+}
+
+void read_inputs(ModelReader& reader, const TomlValue& inputs) {
+  for (const TomlValue& entry : inputs.array()) {
+    if (entry.is_table()) {
+      entry.only_keys({"name", "delay", "lag"});
+      if (!entry.has("name")) entry.fail(R"(expected { name = "u", delay = 0.02, lag = 0.05 })");
+    }
+    const std::string name = (entry.is_table() ? *entry.get("name") : entry).text();
+    reader.definition.inputs.push_back(name);
+    reader.declare(name, entry);
+    Actuator& actuator = reader.model.actuators.emplace_back(Actuator::direct(name));
+    if (!entry.is_table()) continue;
+    read_lateness(entry, "delay", actuator.delay);
+    read_lateness(entry, "lag", actuator.lag);
+  }
+}
+
+void refuse_names_of_other_columns(const ModelReader& reader) {
+  const auto refuse = [&](const std::string& column, const std::string& of) {
+    if (!reader.is_declared(column)) return;
+    reader.file.fail_at(1, reader.file.has("coordinates") ? "coordinates" : "inputs",
+                        fmt::format("the column {} would be a name of this model and what logs and predictions call a quantity "
+                                    "of '{}'; choose another name",
+                                    column, of));
+  };
+  for (const Coordinate& coordinate : reader.definition.coordinates) {
+    for (const std::string& name : {coordinate.name, coordinate.velocity(), coordinate.acceleration()}) {
+      refuse(name + "_std", coordinate.name);
+    }
+    refuse(coordinate.velocity() + "_next", coordinate.name);
+    for (const char* prefix : {"abar_", "fc_"}) refuse(prefix + coordinate.name, coordinate.name);
+  }
+}
+
+}  // namespace gp2
