@@ -4,19 +4,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from difflib import get_close_matches
 from numbers import Integral, Real
 from os import PathLike, fspath
 from typing import Any
-
-
-def text_of_system(**keywords: Any) -> str:
-    known = model_text.__kwdefaults__ or {}
-    for key in keywords:
-        if key not in known:
-            near = get_close_matches(key, known, 1)
-            raise TypeError(f"System() got an unexpected keyword argument '{key}'" + (f"; did you mean '{near[0]}'?" if near else ""))
-    return model_text(**keywords)
 
 
 def model_text(

@@ -11,6 +11,7 @@
 #include "arrays.hpp"
 #include "bindings.hpp"
 #include "gp2/error.hpp"
+#include "options.hpp"
 
 namespace gp2::python {
 
@@ -284,7 +285,12 @@ std::map<std::string, ModelCode::OfLatent> latents_code(const py::kwargs& kwargs
 }
 
 PySystem from_keywords(const py::kwargs& kwargs, const char* name, ModelCode code) {
-  const py::object text = py::module_::import("gp2._model_text").attr("text_of_system")(**kwargs);
+  const py::object model_text = py::module_::import("gp2._model_text").attr("model_text");
+  const py::dict known = model_text.attr("__kwdefaults__");
+  for (const auto& [keyword, value] : kwargs) {
+    if (!known.contains(keyword)) refuse_keyword("System", keyword.cast<std::string>(), py::list(known));
+  }
+  const py::object text = model_text(**kwargs);
   code.latents = latents_code(kwargs);
   return {std::make_shared<const Model>(Model::parse(text.cast<std::string>(), name, code))};
 }

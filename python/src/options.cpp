@@ -227,6 +227,12 @@ std::string value_text(const Option& option, const std::string& value) {
 
 const std::string& keyword_of(const Option& option) { return option.keyword.empty() ? option.name : option.keyword; }
 
+void refuse_keyword(const std::string& function, const std::string& name, const py::list& known) {
+  const py::list near = py::module_::import("difflib").attr("get_close_matches")(name, known, 1);
+  throw py::type_error(fmt::format("{}() got an unexpected keyword argument '{}'{}", function, name,
+                                   near.empty() ? "" : fmt::format("; did you mean '{}'?", near[0].cast<std::string>())));
+}
+
 void read_keywords(const std::string& function, const py::dict& keywords, const std::vector<Option>& options) {
   for (const auto& [key, value] : keywords) {
     const auto name = key.cast<std::string>();
@@ -237,9 +243,7 @@ void read_keywords(const std::string& function, const py::dict& keywords, const 
     }
     py::list known;
     for (const Option& one : options) known.append(keyword_of(one));
-    const py::list near = py::module_::import("difflib").attr("get_close_matches")(name, known, 1);
-    throw py::type_error(fmt::format("{}() got an unexpected keyword argument '{}'{}", function, name,
-                                     near.empty() ? "" : fmt::format("; did you mean '{}'?", near[0].cast<std::string>())));
+    refuse_keyword(function, name, known);
   }
 }
 

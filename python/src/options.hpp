@@ -18,6 +18,9 @@ T take(py::dict& keywords, const char* name, T otherwise) {
   return keywords.attr("pop")(name).cast<T>();
 }
 
+/// @throws py::type_error of an unknown keyword of `function`, with the nearest there is
+[[noreturn]] void refuse_keyword(const std::string& function, const std::string& name, const py::list& known);
+
 /// Reads what is left of the keywords of a call into the options of a job.
 /// @param function  for messages: fit
 /// @throws py::type_error for an unknown keyword, with the nearest there is, or a value of the wrong type; InputError for a

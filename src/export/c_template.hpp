@@ -1064,17 +1064,18 @@ inline constexpr std::string_view prediction_template =
 {nonlinear}    for (int k = 0; k < NC; ++k) lambda[k] = 0;
 {nonlinear}    evaluate_load(c, w);
 {nonlinear}    for (int i = 0; i < NQ; ++i) w->a_at_zero[i] = w->a_under_load[i];
-{nonlinear}    real terms[NC]; /* lambda is rounded as its terms are, which may cancel */
+{nonlinear}    real size = 0; /* lambda is rounded as its terms are, which may cancel */
 {nonlinear}    for (int k = 0; k < NC; ++k) {
 {nonlinear}      lambda[k] = w->d_lambda[k];
-{nonlinear}      terms[k] = fabs(w->d_lambda[k]);
+{nonlinear}      real terms = fabs(w->d_lambda[k]);
 {nonlinear}      for (int i = 0; i < NQ; ++i) {
 {nonlinear}        const real term = w->G_lambda[k + NC * i] * w->a_at_zero[i];
 {nonlinear}        lambda[k] += term;
-{nonlinear}        terms[k] += fabs(term);
+{nonlinear}        terms += fabs(term);
 {nonlinear}      }
+{nonlinear}      size += terms * terms;
 {nonlinear}    }
-{nonlinear}    const real size = sqrt(dot(NC, terms, terms));
+{nonlinear}    size = sqrt(size);
 {nonlinear}    int step = 1;
 {nonlinear}    while (step <= steps && reach_load(c, (real)step / (real)steps, size, w)) ++step;
 {nonlinear}    if (step > steps) return 1;

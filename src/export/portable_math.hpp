@@ -3,8 +3,8 @@
 #include "export/c_template.hpp"
 
 // Elementary functions in C that needs no library but for what IEEE 754 defines to the bit: sqrt, fabs, and frexp, ldexp, copysign,
-// floor, which are exact. So all compilers and machines compute the same, where sums and products are not contracted. Their polynomials are
-// those of Taylor. A function comes after those that it calls.
+// floor, which are exact. So all compilers and machines compute the same, where sums and products are not contracted. Their
+// polynomials are those of Taylor. A function comes after those that it calls.
 namespace gp2::c_export {
 
 inline constexpr std::string_view portable_head =
@@ -53,24 +53,19 @@ static double portable_exp(double x)
   return ldexp(1 + (r + (r * r * p + rest)), m);
 }
 )c"},
-    {"portable_log",
-     R"c(/* k log 2 + log(1 + f), f between sqrt(1/2) - 1 and sqrt(2) - 1; log(1 + f) = 2 artanh s with s = f/(2 + f) */
-static double portable_log(double x)
+    {"mantissa", R"c(/* x = 2^k f with f between sqrt(1/2) and sqrt(2) */
+static double mantissa(double x, int *k)
 {
-  int k;
-  double f, s, z, p, half;
-  if (x != x || x > 1.7976931348623157e308) return x;
-  if (x == 0) return -HUGE_VAL;
-  if (x < 0) return (x - x) / (x - x);
-  f = frexp(x, &k);
-  if (f < 0.7071067811865476) {
-    f *= 2;
-    --k;
-  }
-  f -= 1;
-  s = f / (2 + f);
-  z = s * s;
-  p = 2.0 / 25;
+  const double f = frexp(x, k);
+  if (f >= 0.7071067811865476) return f;
+  --*k;
+  return 2 * f;
+}
+
+/* 2/5 + 2/7 z + 2/9 z^2 + ... of 2 artanh s = 2 s + s^3 (2/3 + z (2/5 + ...)), z = s^2 */
+static double artanh_series(double z)
+{
+  double p = 2.0 / 25;
   p = p * z + 2.0 / 23;
   p = p * z + 2.0 / 21;
   p = p * z + 2.0 / 19;
@@ -81,7 +76,23 @@ static double portable_log(double x)
   p = p * z + 2.0 / 9;
   p = p * z + 2.0 / 7;
   p = p * z + 2.0 / 5;
-  p = p * z + 2.0 / 3;
+  return p;
+}
+)c"},
+    {"portable_log",
+     R"c(/* k log 2 + log(1 + f), f between sqrt(1/2) - 1 and sqrt(2) - 1; log(1 + f) = 2 artanh s with s = f/(2 + f) */
+static double portable_log(double x)
+{
+  int k;
+  double f, s, z, p, half;
+  if (x != x || x > 1.7976931348623157e308) return x;
+  if (x == 0) return -HUGE_VAL;
+  if (x < 0) return (x - x) / (x - x);
+  f = mantissa(x, &k);
+  f -= 1;
+  s = f / (2 + f);
+  z = s * s;
+  p = artanh_series(z) * z + 2.0 / 3;
   half = f * f / 2;
   return k * 0.6931471804855391 + (f - (half - (s * (half + z * p) + k * 7.440617110012397e-11)));
 }
@@ -107,29 +118,14 @@ static double power_of_positive(double x, double y)
 {
   int k;
   double f, s, s_rest, below, below_rest, rest, z, z_rest, cube, cube_rest, sum, sum_rest, p;
-  f = frexp(x, &k);
-  if (f < 0.7071067811865476) {
-    f *= 2;
-    --k;
-  }
+  f = mantissa(x, &k);
   below = two_sum(f, 1, &below_rest);
   s = (f - 1) / below;
   z = two_product(s, below, &rest);
   s_rest = (((f - 1) - z) - rest - s * below_rest) / below;
   z = two_product(s, s, &rest);
   z_rest = rest + 2 * s * s_rest;
-  p = 2.0 / 25;
-  p = p * z + 2.0 / 23;
-  p = p * z + 2.0 / 21;
-  p = p * z + 2.0 / 19;
-  p = p * z + 2.0 / 17;
-  p = p * z + 2.0 / 15;
-  p = p * z + 2.0 / 13;
-  p = p * z + 2.0 / 11;
-  p = p * z + 2.0 / 9;
-  p = p * z + 2.0 / 7;
-  p = p * z + 2.0 / 5;
-  p = p * z; /* to 2/3, which no double is, what follows */
+  p = artanh_series(z) * z; /* to 2/3, which no double is, what follows */
   z = two_sum(z, z_rest, &z_rest);
   cube = two_product(s, z, &rest);
   cube_rest = rest + s * z_rest + s_rest * z;

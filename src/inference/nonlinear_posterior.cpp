@@ -277,13 +277,14 @@ std::shared_ptr<const Linearisation> find_mean(NonlinearFit& fit, const Prior& p
   if (is_in_kink && left < 2) {
     throw NumericalError(
         fmt::format("the posterior of latents that enter nonlinearly was not found: Gauss–Newton steps explain the data, but for "
-                    "{:.3g} times the noise, and go back and forth where a load changes its sign: write directions without a "
-                    "kink there, sqrt(lambda(1)^2 + 0.01) in place of abs(lambda(1)), say",
+                    "{:.3g} times the noise, and go back and forth: where a load changes its sign write directions without a "
+                    "kink, sqrt(lambda(1)^2 + 0.01) in place of abs(lambda(1)), say",
                     left));
   }
   throw NumericalError(fmt::format(
       "the posterior of latents that enter nonlinearly was not found: Gauss–Newton steps leave {:.3g} times the "
-      "noise unexplained: do the signs of the directions, and what is known, fit the machine? Else write the directions so "
+      "noise unexplained: do the signs of the directions, and what is known, fit the machine (known forces count with `mean` "
+      "force)? Else write the directions so "
       "that the coefficients are small, or start from smaller signal standard deviations",
       left));
 }

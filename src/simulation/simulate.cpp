@@ -155,7 +155,9 @@ class Integration {
     const int taken = out_.steps + out_.rejected_steps;
     if (taken <= options_.max_steps / 2) t_halfway_ = t_;
     if (taken >= options_.max_steps) {
-      if (t_ - t_halfway_ < 0.25 * (t_halfway_ - options_.times[0])) {
+      // steps that shrink: the second half of them came a quarter as far as the first, or less
+      const bool is_held_up = t_ - t_halfway_ < 0.25 * (t_halfway_ - options_.times[0]);
+      if (is_held_up) {
         throw NumericalError(fmt::format(
             "simulate: {} steps reach no further than t = {:.6g} of {:.6g}, half of them from t = {:.6g} on: a force that "
             "jumps, as -v/|v| does where a body comes to rest, is to be smoothed, say -tanh(|v|/0.01)*v/|v|; else loosen "

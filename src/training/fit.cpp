@@ -806,8 +806,9 @@ Fit fit(const Prior& prior, const std::vector<Observations>& observations, const
                             ? Posterior::lazy(prior, observations, values_of(prior, observations, report).front())
                             : posterior_of(prior, observations, report, workers);
   if (report.inducing) report.inducing->summary = posterior.summary();
-  if (is_part || prior.is_nonlinear()) {  // what is said of the part is not of all
-    FitReport optimum = report;           // … nor what is said of the likeliest draw
+  // what is said is of all rows, not of the part, and of the hyperparameters that are told, not of the likeliest draw
+  if (is_part || prior.is_nonlinear()) {
+    FitReport optimum = report;
     optimum.draws.reset();
     if (optimum.inducing) optimum.inducing->summary = nullptr;
     const Posterior told = report.draws ? posterior_of(prior, observations, optimum, workers) : posterior;

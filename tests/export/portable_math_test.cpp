@@ -20,6 +20,7 @@ using test::Problem;
 using testing::HasSubstr;
 
 constexpr std::uint64_t portable_seed = 424243;
+constexpr double infinity = HUGE_VAL;
 
 // what a function of C may be off, and where
 struct Accuracy {
@@ -27,6 +28,37 @@ struct Accuracy {
   long double (*exact)(long double);
   double lower, upper, ulps;
 };
+
+// call_exp(x), call_pow(x, y), … of the functions alone
+test::Library portable_functions() {
+  std::string source = "#include <math.h>\n";
+  for (const auto& piece : c_export::portable_pieces) source += fmt::format("\n{}", piece.text);
+  for (const char* name : {"exp", "log", "sin", "cos", "tan", "atan", "asin", "acos", "sinh", "cosh", "tanh"}) {
+    source += fmt::format("double call_{0}(double x);\ndouble call_{0}(double x)\n{{\n  return portable_{0}(x);\n}}\n", name);
+  }
+  for (const char* name : {"atan2", "pow"}) {
+    source += fmt::format(
+        "double call_{0}(double x, double y);\ndouble call_{0}(double x, double y)\n{{\n  return portable_{0}(x, y);\n}}\n",
+        name);
+  }
+  return {{{"functions.c", source}}, "gcc -O2"};
+}
+
+double ulps(double is, long double exact) {
+  return static_cast<double>(std::abs(is - exact) / std::ldexp(1.0L, std::ilogb(static_cast<double>(exact)) - 52));
+}
+
+// at the ends of what a function takes: not finite, or 0, to the sign; else to rounding
+void expect_at_end(double is, double expected, double smallest, const std::string& what) {
+  EXPECT_EQ(std::isnan(is), std::isnan(expected)) << what;
+  if (std::isnan(expected)) return;
+  EXPECT_EQ(std::signbit(is), std::signbit(expected)) << what;
+  if (std::isinf(expected) || std::abs(expected) <= smallest) {
+    EXPECT_EQ(is, expected) << what;
+  } else {
+    EXPECT_NEAR(is / expected, 1, 1e-15) << what;
+  }
+}
 
 TEST(PortableMath, IsAccurateAsItsDocumentationSays) {
   using Exact = long double (*)(long double);
@@ -40,20 +72,7 @@ TEST(PortableMath, IsAccurateAsItsDocumentationSays) {
       {"acos", static_cast<Exact>(std::acos), -1, 1, 4},     {"sinh", static_cast<Exact>(std::sinh), -2, 2, 4},
       {"sinh", static_cast<Exact>(std::sinh), -710, 710, 4}, {"cosh", static_cast<Exact>(std::cosh), -2, 2, 4},
       {"cosh", static_cast<Exact>(std::cosh), -710, 710, 4}, {"tanh", static_cast<Exact>(std::tanh), -2, 2, 4}};
-  std::string source = "#include <math.h>\n";
-  for (const auto& piece : c_export::portable_pieces) source += fmt::format("\n{}", piece.text);
-  for (const char* name : {"exp", "log", "sin", "cos", "tan", "atan", "asin", "acos", "sinh", "cosh", "tanh"}) {
-    source += fmt::format("double call_{0}(double x);\ndouble call_{0}(double x)\n{{\n  return portable_{0}(x);\n}}\n", name);
-  }
-  for (const char* name : {"atan2", "pow"}) {
-    source += fmt::format(
-        "double call_{0}(double x, double y);\ndouble call_{0}(double x, double y)\n{{\n  return portable_{0}(x, y);\n}}\n",
-        name);
-  }
-  const test::Library library({{"functions.c", source}}, "gcc -O2");
-  const auto ulps = [](double is, long double exact) {
-    return static_cast<double>(std::abs(is - exact) / std::ldexp(1.0L, std::ilogb(static_cast<double>(exact)) - 52));
-  };
+  const test::Library library = portable_functions();
   RandomStream random(portable_seed);
   for (const Accuracy& of : all) {
     auto* const function = library.get<double(double)>(fmt::format("call_{}", of.name));
@@ -70,6 +89,38 @@ TEST(PortableMath, IsAccurateAsItsDocumentationSays) {
     const double y = random.normal(), x = random.normal();
     ASSERT_LE(ulps(atan2(y, x), std::atan2(static_cast<long double>(y), static_cast<long double>(x))), 4) << y << ", " << x;
   }
+}
+
+TEST(PortableMath, IsRightAtTheEnds) {
+  const test::Library library = portable_functions();
+  const auto at = [&](const char* name, double x) { return library.get<double(double)>(fmt::format("call_{}", name))(x); };
+  for (const auto& [name, exact] : std::map<const char*, double (*)(double)>{{"exp", std::exp},
+                                                                             {"log", std::log},
+                                                                             {"sin", std::sin},
+                                                                             {"atan", std::atan},
+                                                                             {"asin", std::asin},
+                                                                             {"acos", std::acos},
+                                                                             {"sinh", std::sinh},
+                                                                             {"cosh", std::cosh},
+                                                                             {"tanh", std::tanh}}) {
+    for (const double x : {0.0, -0.0, 1.0, -1.0, infinity, -infinity, 5e-324, -1e-310, 720.0, -750.0}) {
+      expect_at_end(at(name, x), exact(x), 0, fmt::format("{} of {}", name, x));
+    }
+    EXPECT_TRUE(std::isnan(at(name, std::nan("")))) << name;
+  }
+  auto* const atan2 = library.get<double(double, double)>("call_atan2");
+  for (const double y : {0.0, -0.0, 1.0, -1.0, infinity, -infinity}) {
+    for (const double x : {0.0, -0.0, 1.0, -1.0, infinity, -infinity}) {
+      EXPECT_NEAR(atan2(y, x), std::atan2(y, x), 1e-15);
+      EXPECT_EQ(std::signbit(atan2(y, x)), std::signbit(std::atan2(y, x)));
+    }
+  }
+  EXPECT_TRUE(std::isnan(at("sin", 1.1e6))) << "told, not wrong";
+}
+
+TEST(PortableMath, HasPowersAsItsDocumentationSays) {
+  const test::Library library = portable_functions();
+  RandomStream random(portable_seed);
   auto* const pow = library.get<double(double, double)>("call_pow");
   const auto pow_ulps = [&](double x, double y) {
     return ulps(pow(x, y), std::pow(static_cast<long double>(x), static_cast<long double>(y)));
@@ -84,53 +135,12 @@ TEST(PortableMath, IsAccurateAsItsDocumentationSays) {
   }
   EXPECT_LE(worst, 2);
   EXPECT_GT(worst, 0.1);
-
-  // at their ends
-  const auto at = [&](const char* name, double x) { return library.get<double(double)>(fmt::format("call_{}", name))(x); };
-  const double infinity = HUGE_VAL;
-  for (const auto& [name, exact] : std::map<const char*, double (*)(double)>{{"exp", std::exp},
-                                                                             {"log", std::log},
-                                                                             {"sin", std::sin},
-                                                                             {"atan", std::atan},
-                                                                             {"asin", std::asin},
-                                                                             {"acos", std::acos},
-                                                                             {"sinh", std::sinh},
-                                                                             {"cosh", std::cosh},
-                                                                             {"tanh", std::tanh}}) {
-    for (const double x : {0.0, -0.0, 1.0, -1.0, infinity, -infinity, 5e-324, -1e-310, 720.0, -750.0}) {
-      const double is = at(name, x), expected = exact(x);
-      EXPECT_EQ(std::isnan(is), std::isnan(expected)) << name << " of " << x;
-      if (std::isnan(expected)) continue;
-      EXPECT_EQ(std::signbit(is), std::signbit(expected)) << name << " of " << x;
-      if (std::isinf(expected) || expected == 0) {
-        EXPECT_EQ(is, expected) << name << " of " << x;
-      } else {
-        EXPECT_NEAR(is / expected, 1, 1e-15) << name << " of " << x;
-      }
-    }
-    EXPECT_TRUE(std::isnan(at(name, std::nan("")))) << name;
-  }
-  for (const double y : {0.0, -0.0, 1.0, -1.0, infinity, -infinity}) {
-    for (const double x : {0.0, -0.0, 1.0, -1.0, infinity, -infinity}) {
-      EXPECT_NEAR(atan2(y, x), std::atan2(y, x), 1e-15);
-      EXPECT_EQ(std::signbit(atan2(y, x)), std::signbit(std::atan2(y, x)));
-    }
-  }
   for (const double x : {0.0, -0.0, 1.0, -1.0, 2.0, -2.0, 0.3, -0.3, 5e-324, -1e300, infinity, -infinity, std::nan("")}) {
     for (const double y :
          {0.0, -0.0, 1.0, -1.0, 2.0, -3.0, 0.5, -1.5, 1e15 + 1, 1e17, -1e300, 1e-300, infinity, -infinity, std::nan("")}) {
-      const double is = pow(x, y), expected = std::pow(x, y);
-      EXPECT_EQ(std::isnan(is), std::isnan(expected)) << x << "^" << y;
-      if (std::isnan(expected)) continue;
-      EXPECT_EQ(std::signbit(is), std::signbit(expected)) << x << "^" << y;
-      if (std::isinf(expected) || std::abs(expected) < 1e-300) {
-        EXPECT_EQ(is, expected) << x << "^" << y;
-      } else {
-        EXPECT_NEAR(is / expected, 1, 1e-15) << x << "^" << y;
-      }
+      expect_at_end(pow(x, y), std::pow(x, y), 1e-300, fmt::format("{}^{}", x, y));
     }
   }
-  EXPECT_TRUE(std::isnan(at("sin", 1.1e6))) << "told, not wrong";
 }
 
 const Model& model_with_every_function() {

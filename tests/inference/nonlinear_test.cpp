@@ -338,7 +338,7 @@ directions = { force = [["0"], ["1"]] }
     static_cast<void>(posterior(0.15));
     FAIL() << "a posterior in a kink";
   } catch (const NumericalError& error) {
-    EXPECT_THAT(error.what(), testing::HasSubstr("go back and forth where a load changes its sign"));
+    EXPECT_THAT(error.what(), testing::HasSubstr("go back and forth: where a load changes its sign"));
   }
 }
 
