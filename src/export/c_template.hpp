@@ -206,7 +206,10 @@ static int is_semidefinite(const real *M, real *rest)
         if (i != pivot) rest[i + NQ * j] -= rest[i + NQ * pivot] * factor;
       }
     }
-    for (int j = 0; j < NQ; ++j) rest[pivot + NQ * j] = rest[j + NQ * pivot] = 0;
+    for (int j = 0; j < NQ; ++j) {
+      rest[pivot + NQ * j] = 0;
+      rest[j + NQ * pivot] = 0;
+    }
   }
   for (int j = 0; j < NQ; ++j) {
     for (int i = 0; i < NQ; ++i) {

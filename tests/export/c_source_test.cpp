@@ -220,6 +220,39 @@ TEST(CSourceTest, IsThePredictorOfNonlinearLatents) {
   }
 }
 
+// Loops over one coordinate, and no constraint, are C without a warning too.
+TEST(CSourceTest, IsThePredictorOfOneCoordinate) {
+  const Model model = Model::parse(R"toml(
+name        = "a power"
+coordinates = ["x"]
+[mechanics]
+mass  = [["2"]]
+force = ["-(1 + x^2)^1.3 - (1 + abs(x))^(0.5 + 0.1*dx)"]
+[[latent]]
+features   = ["x", "dx"]
+directions = "force"
+[truth]
+force = ["-dx"]
+[sampling]
+x  = [-1, 1]
+dx = [-1, 1]
+)toml",
+                                   "power");
+  PriorOptions options;
+  options.mean = Prior::Mean::force;
+  const View view = View::constrained_acceleration(*model.system);
+  const MatrixXd states = test::draw(model, 20, export_seed).states;
+  Problem p{model.name, make_prior(model, options), {}, {}, states, {}};
+  RandomStream random(export_seed);
+  p.observations.push_back(test::observe(model, view, states, random));
+  p.values = test::random_values(p.prior, p.observations, random);
+  const Posterior posterior = test::posterior_of(p);
+  for (std::size_t turn = 0; turn < 2; ++turn) {
+    Exported c(export_c(posterior, view), "gp2_model", compiler(turn));
+    EXPECT_GT(expect_predictor(posterior, view, c, random_states(states, 400, export_seed), p), 300);
+  }
+}
+
 // What is left of terms that cancel is rounded as these are.
 TEST(CSourceTest, IsThePredictorWhereALoadIsAboutToChangeItsSign) {
   const Model& model = test::model("experiments/mechanisms/rubbing_bead.toml");
