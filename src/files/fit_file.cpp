@@ -730,7 +730,8 @@ InducingSummary::Component component_from(const ParsedJson& json, const Prior& p
   std::vector<lapack::PivotedFactor> factors;
   for (const ParsedJson& of_latent : array(json.at("factors"))) {
     if (factors.size() == prior.latents.size()) throw InputError("factors of more latents than there are");
-    const Index n_points = values.inducing->features[factors.size()].rows();
+    const Latent& latent = prior.latents[factors.size()];
+    const Index n_points = values.inducing->features[factors.size()].rows() * (latent.is_potential ? latent.n_features() : 1);
     lapack::PivotedFactor factor;
     for (const ParsedJson& point : array(of_latent.at("points"))) {
       factor.rows.push_back(integer(point));

@@ -10,6 +10,7 @@
 #include "gp2/error.hpp"
 #include "inference/inducing_latents.hpp"
 #include "inference/requirements.hpp"
+#include "prior/gradient_columns.hpp"
 
 namespace gp2 {
 
@@ -19,56 +20,90 @@ using Eigen::VectorXd;
 
 namespace {
 
-// One latent at the candidates: what its points so far leave of its variance, and the factor that tells.
+// One latent at the candidates: what its points so far leave of its covariance there, and the factor that tells. A point of a
+// potential has the E derivatives, which are taken together; of all else E = 1, for each function alike.
 class Candidates {
  public:
-  Candidates(const LatentRows& rows, std::size_t a) : latent_(rows.latents[a]), kernel_(latent_.kernel) {
+  Candidates(const LatentRows& rows, std::size_t a)
+      : latent_(rows.latents[a]), kernel_(latent_.kernel), E_(latent_.is_potential ? latent_.n_functions : 1) {
     const Index n = kernel_.n_points();
-    weight_.setZero(n);
-    left_.resize(n);
+    weight_.setZero(n, E_ * E_);
+    left_.setZero(n, E_ * E_);
     VectorXd point;
+    const VectorXd of_gradient = latent_.is_potential ? GradientColumns(kernel_).variance() : VectorXd();
     for (Index i = 0; i < n; ++i) {
-      weight_[i] = latent_.Z.row(i).squaredNorm();
+      if (latent_.is_potential) {
+        const MatrixXd Gamma = latent_.Z.row(i).reshaped(E_, latent_.Z.cols() / E_).transpose();
+        weight_.row(i) = (Gamma.transpose() * Gamma).reshaped().transpose();
+        left_.row(i).reshaped(E_, E_).diagonal() = of_gradient;
+        continue;
+      }
+      weight_(i, 0) = latent_.Z.row(i).squaredNorm();
       kernel_.scale(i, point);
-      left_[i] = kernel_.variance(point);
+      left_(i, 0) = kernel_.variance(point);
     }
     smallest_ = smallest_pivot * (n > 0 ? left_.maxCoeff() : 0);
   }
 
   [[nodiscard]] Index n_functions() const { return latent_.n_functions; }
-  [[nodiscard]] double trace() const { return weight_.dot(left_); }
+  [[nodiscard]] double trace() const { return weight_.cwiseProduct(left_).sum(); }
   [[nodiscard]] MatrixXd points() const { return kernel_.features()(chosen_, Eigen::all); }
 
   // what the best candidate would take from the trace at least: its own part
   double largest() {
-    const double largest = weight_.cwiseProduct(left_).maxCoeff(&next_);
-    return left_[next_] > smallest_ ? largest : 0;
+    const double largest = weight_.cwiseProduct(left_).rowwise().sum().maxCoeff(&next_);
+    return left_.row(next_).maxCoeff() > smallest_ ? largest : 0;
   }
 
   void take() {
-    const Index n = kernel_.n_points(), m = std::ssize(chosen_);
-    VectorXd point, k(kernel_.n_rows());
-    kernel_.scale(next_, point);
-    kernel_.evaluate(0, k.size(), point, k.data(), workspace_);
-    if (factor_.cols() == m) factor_.conservativeResize(n, std::max<Index>(32, 2 * m));
-    VectorXd column = k.head(n);
-    column.noalias() -= factor_.leftCols(m) * factor_.row(next_).head(m).transpose();
-    column /= std::sqrt(left_[next_]);
-    left_ = (left_ - column.cwiseAbs2()).cwiseMax(0);
-    left_[next_] = 0;
-    factor_.col(m) = column;
     chosen_.push_back(next_);
+    for (Index taken = 0; taken < E_; ++taken) {
+      Index e = 0;
+      if (!(left_.row(next_).reshaped(E_, E_).diagonal().maxCoeff(&e) > smallest_)) return;
+      add_column(e);
+    }
   }
 
  private:
+  void add_column(Index e) {
+    const Index n = kernel_.n_points(), m = n_columns_++;
+    VectorXd point;
+    kernel_.scale(next_, point);
+    MatrixXd k(latent_.is_potential ? n : kernel_.n_rows(), E_);
+    if (latent_.is_potential) {
+      const GradientColumns columns(kernel_);
+      columns.evaluate(0, n, point, gradient_);
+      columns.multiply(VectorXd::Unit(E_, e), gradient_);
+      k = gradient_.out;
+    } else {
+      kernel_.evaluate(0, k.rows(), point, k.data(), workspace_);
+    }
+    if (factor_.cols() == m) factor_.conservativeResize(n * E_, std::max<Index>(32, 2 * m));
+    VectorXd column = k.topRows(n).reshaped();
+    column.noalias() -= factor_.leftCols(m) * factor_.row(e * n + next_).head(m).transpose();
+    column /= std::sqrt(left_(next_, e * E_ + e));
+    for (Index d = 0; d < E_; ++d) {
+      for (Index c = 0; c < E_; ++c) {
+        const auto product = column.segment(c * n, n).cwiseProduct(column.segment(d * n, n));
+        left_.col(d * E_ + c) -= product;
+        if (c == d) left_.col(d * E_ + c) = left_.col(d * E_ + c).cwiseMax(0);
+      }
+    }
+    left_.row(next_).reshaped(E_, E_).row(e).setZero();
+    left_.row(next_).reshaped(E_, E_).col(e).setZero();
+    factor_.col(m) = column;
+  }
+
   const LatentRows::OfLatent& latent_;
   const KernelColumns& kernel_;
-  VectorXd weight_, left_;  // Σ_f ‖Γ_i,f‖²; k(φ_i, φ_i) − ‖w_i‖²
+  Index E_;
+  MatrixXd weight_, left_;  // Σ_c Γ_ic Γ_icᵀ, of all functions alike Σ_f ‖Γ_i,f‖²; k(φ_i, φ_i) − w_iᵀw_i  (n × E²)
   double smallest_ = 0;
-  Index next_ = 0;
+  Index next_ = 0, n_columns_ = 0;
   std::vector<Index> chosen_;
-  MatrixXd factor_;  // column j: wᵀ of every candidate for point j
+  MatrixXd factor_;  // column j: wᵀ of every candidate for variable j, derivative after derivative
   KernelColumns::Workspace workspace_;
+  GradientColumns::Workspace gradient_;
 };
 
 }  // namespace
@@ -81,7 +116,6 @@ InducingChoice choose_inducing_points(const Prior& prior, const std::vector<Obse
     throw InputError(fmt::format("inducing: n_candidates must be 1 or more, got {}", options.n_candidates));
   require_observations(prior, observations);
   require_values(prior, observations, values);
-  require_no_potential(prior);
   const int n_all = n_states(observations);
   const bool are_all = n_all <= options.n_candidates;
   const std::vector<Observations> some = are_all ? observations : evenly(observations, options.n_candidates);
@@ -125,9 +159,7 @@ VectorXd left_out_by_points(const Prior& prior, const std::vector<Observations>&
   const InducingLatents latents(prior, values);
   const auto add = [&](VectorSum& sum, int, const RowBlock&, const InducingBlock& block) {
     for (std::size_t f = 0; f < latents.functions().size(); ++f) {
-      const std::size_t a = latents.functions()[f].latent;
-      const Eigen::ArrayXd left = block.variance(a) - block.w(a).colwise().squaredNorm().transpose();
-      sum.sum[static_cast<Index>(a)] += (block.weight_product(f, f) * left).sum();
+      sum.sum[static_cast<Index>(latents.functions()[f].latent)] += block.left_out(f);
     }
   };
   const BlocksOfStates blocks(prior, observations, values, values.about.get());

@@ -2,10 +2,12 @@
 
 #include <algorithm>
 #include <functional>
+#include <iterator>
 #include <utility>
 
 #include "base/lapack.hpp"
 #include "base/simd.hpp"
+#include "prior/gradient_columns.hpp"
 
 namespace gp2 {
 
@@ -13,6 +15,45 @@ using Eigen::ArrayXd;
 using Eigen::Index;
 using Eigen::MatrixXd;
 using Eigen::VectorXd;
+
+namespace {
+
+/// Gradients of covariances of a potential's variables with its derivatives at a point.
+class PotentialGradient {
+ public:
+  explicit PotentialGradient(const InducingLatents::OfLatent& latent)
+      : latent_(latent), columns_(latent.kernel), weights_(latent.n_points(), latent.n_functions) {}
+
+  void move_to(const VectorXd& point) { columns_.evaluate(0, latent_.n_points(), point, workspace_); }
+  /// Adds uᵀ ∂cov(variables, ∂_d V)/∂log v.
+  void add(Index d, const Eigen::Ref<const VectorXd>& u, MatrixXd& sums) {
+    weights_.setZero();
+    weights_.reshaped()(latent_.chosen) = u;
+    VectorXd sum = VectorXd::Zero(sums.cols());
+    columns_.add_gradient(weights_, VectorXd::Unit(latent_.n_functions, d), sum, workspace_);
+    sums.row(0) += sum;
+  }
+
+ private:
+  const InducingLatents::OfLatent& latent_;
+  GradientColumns columns_;
+  GradientColumns::Workspace workspace_;
+  MatrixXd weights_;
+};
+
+// Adds `weight` times the derivatives of the variance of ∂_d V, which is the same at every point.
+void add_gradient_of_variance(const KernelColumns& kernel, Index d, double weight, MatrixXd& sums) {
+  const Index D = kernel.kernel().n_features();
+  const GradientColumns columns(kernel);
+  GradientColumns::Workspace workspace;
+  VectorXd point, sum = VectorXd::Zero(sums.cols());
+  kernel.scale(0, point);
+  columns.evaluate(0, 1, point, workspace);
+  columns.add_gradient(weight * MatrixXd::Identity(D, D).row(d), VectorXd::Unit(D, d), sum, workspace);
+  sums.row(0) += sum;
+}
+
+}  // namespace
 
 bool InducingGram::factorise(const RowBlocks& rows) {
   std::optional<InducingStatistics> sums = InducingStatistics::of(latents_, rows, workers_, stop_);
@@ -90,25 +131,25 @@ std::optional<GramValue> InducingGram::differentiate(const RowBlocks& rows, cons
         std::vector<MatrixXd> U, V;
         std::vector<VectorXd> mean;
         for (const InducingLatents::Function& f : functions) {
-          const MatrixXd& w = block.w(f.latent);
           const std::size_t at = U.size();
+          const MatrixXd& w = block.w(at);
           mean.emplace_back(w.transpose() * mean_.segment(f.first, w.rows()));
           ArrayXd beta = ArrayXd::Zero(n);
           V.emplace_back(n, n_components);
           for (Index c = 0; c < n_components; ++c) {
             const ArrayXd alpha_c = alpha.col(c).array(), weight = block.weight(at, c).array();
             beta += weight * alpha_c;
-            V.back().col(c) = weight * block.variance(f.latent).array() - alpha_c * mean.back().array();
+            V.back().col(c) = weight * block.variance(at).array() - alpha_c * mean.back().array();
           }
           U.emplace_back(mean_.segment(f.first, w.rows()) * beta.matrix().transpose());
         }
         MatrixXd product;
         for (std::size_t g = 0; g < functions.size(); ++g) {
-          const MatrixXd& w = block.w(functions[g].latent);
+          const MatrixXd& w = block.w(g);
           product.setZero(latents_.size(), n);
           lapack::add_product(explained.middleCols(functions[g].first, w.rows()), false, w, false, product);
           for (std::size_t f = 0; f < functions.size(); ++f) {
-            const MatrixXd& v = block.w(functions[f].latent);
+            const MatrixXd& v = block.w(f);
             const auto of_f = product.middleRows(functions[f].first, v.rows());
             U[f] += of_f * block.weight_product(f, g).matrix().asDiagonal();
             const VectorXd explained_by_g = of_f.cwiseProduct(v).colwise().sum();
@@ -143,26 +184,19 @@ std::optional<GramValue> InducingGram::differentiate(const RowBlocks& rows, cons
             if (parts[a].V) out.V.col(c * latent.n_functions + l) = V[f].col(c);
           }
           if (parts[a].mean) out.mean.col(l) = mean[f];
-          if (l > 0) U[f - static_cast<std::size_t>(l)] += U[f];
+          if (l > 0 && !latent.is_potential) U[f - static_cast<std::size_t>(l)] += U[f];
         }
         for (std::size_t a = 0; a < parts.size(); ++a) {
           if (parts[a].mean && latents_.latents()[a].is_local) block.add_mean_of_noise(a, alpha_before, of_block.latents[a].mean);
         }
         of_rows(piece, row_block, of_block);
-        KernelColumns::Workspace workspace;
-        VectorXd point;
         for (std::size_t f = 0; f < functions.size(); ++f) {
           const std::size_t a = functions[f].latent;
           if (functions[f].index > 0 || !parts[a].kernel) continue;
-          const InducingLatents::OfLatent& latent = latents_.latents()[a];
-          lapack::solve_lower(latent.L, true, U[f]);
-          MatrixXd H = MatrixXd::Zero(latent.kernel.n_rows(), n);
-          H.topRows(latent.n_points()) = -U[f];
-          for (Index i = 0; i < n; ++i) {
-            latent.kernel.scale(block.rows().latents[a].kernel.features().row(i).transpose(), point);
-            latent.kernel.add_gradient(0, H.rows(), point, block.k(a).col(i).data(), H.col(i).data(), sum.kernel[a], workspace);
-          }
-          add_variance_gradient(a, block, sum.kernel[a], workspace);
+          const auto first = U.begin() + static_cast<std::ptrdiff_t>(f);
+          const auto n_crosses = static_cast<std::ptrdiff_t>(latents_.latents()[a].n_crosses());
+          add_cross_gradient(a, block, {std::move_iterator(first), std::move_iterator(first + n_crosses)}, sum.kernel[a]);
+          add_variance_gradient(a, block, sum.kernel[a]);
         }
       });
   if (!all || is_set(stop_)) return std::nullopt;
@@ -175,14 +209,49 @@ std::optional<GramValue> InducingGram::differentiate(const RowBlocks& rows, cons
   return value_of(all->misfit);
 }
 
+void InducingGram::add_cross_gradient(std::size_t a, const InducingBlock& block, const std::vector<MatrixXd>& U,
+                                      MatrixXd& sums) const {
+  const InducingLatents::OfLatent& latent = latents_.latents()[a];
+  const MatrixXd& features = block.rows().latents[a].kernel.features();
+  std::vector<MatrixXd> H;
+  for (const MatrixXd& of_cross : U) {
+    H.emplace_back(MatrixXd::Zero(latent.is_potential ? latent.n_variables() : latent.kernel.n_rows(), block.n()));
+    auto variables = H.back().topRows(latent.n_variables());
+    variables = -of_cross;
+    lapack::solve_lower(latent.L, true, variables);
+  }
+  VectorXd point;
+  if (!latent.is_potential) {
+    KernelColumns::Workspace workspace;
+    for (Index i = 0; i < block.n(); ++i) {
+      latent.kernel.scale(features.row(i).transpose(), point);
+      latent.kernel.add_gradient(0, H[0].rows(), point, block.k(a).col(i).data(), H[0].col(i).data(), sums, workspace);
+    }
+    return;
+  }
+  PotentialGradient gradient(latent);
+  for (Index i = 0; i < block.n(); ++i) {
+    latent.kernel.scale(features.row(i).transpose(), point);
+    gradient.move_to(point);
+    for (std::size_t d = 0; d < H.size(); ++d) gradient.add(static_cast<Index>(d), H[d].col(i), sums);
+  }
+}
+
 // ½ Σ_i Σ_f ‖Γ_i,f‖² ∂k(φ_i, φ_i)/∂log v of a latent
-void InducingGram::add_variance_gradient(std::size_t a, const InducingBlock& block, MatrixXd& sums,
-                                         KernelColumns::Workspace& workspace) const {
+void InducingGram::add_variance_gradient(std::size_t a, const InducingBlock& block, MatrixXd& sums) const {
+  const KernelColumns& kernel = block.rows().latents[a].kernel;
+  KernelColumns::Workspace workspace;
   ArrayXd weights = ArrayXd::Zero(block.n());
   for (std::size_t f = 0; f < latents_.functions().size(); ++f) {
-    if (latents_.functions()[f].latent == a) weights += block.weight_product(f, f);
+    if (latents_.functions()[f].latent != a) continue;
+    if (latents_.latents()[a].is_potential) {
+      const double weight = 0.5 * (1 + smallest_pivot) * block.weight_product(f, f).sum();
+      add_gradient_of_variance(kernel, latents_.functions()[f].index, weight, sums);
+      continue;
+    }
+    weights += block.weight_product(f, f);
   }
-  const KernelColumns& kernel = block.rows().latents[a].kernel;
+  if (latents_.latents()[a].is_potential) return;
   VectorXd point, k(simd::lanes<double>), w = VectorXd::Zero(simd::lanes<double>);
   for (Index i = 0; i < block.n(); ++i) {
     const Index before = i - i % simd::lanes<double>;
@@ -197,10 +266,10 @@ void InducingGram::add_variance_gradient(std::size_t a, const InducingBlock& blo
 // ∂NLL/∂k_a(Z, Z) = −½ Σ_f L⁻ᵀ(2I − B⁻¹ − B − B⁻¹c(B⁻¹c)ᵀ)_ff L⁻¹, to each ∂k/∂log v
 void InducingGram::add_points_gradient(std::size_t a, const MatrixXd& P, MatrixXd& sums) const {
   const InducingLatents::OfLatent& latent = latents_.latents()[a];
-  const Index m = latent.n_points();
+  const Index m = latent.n_variables();
   MatrixXd of_points = MatrixXd::Zero(m, m);
   for (const InducingLatents::Function& f : latents_.functions()) {
-    if (f.latent != a) continue;
+    if (f.latent != a || (latent.is_potential && f.index > 0)) continue;
     const auto mean = mean_.segment(f.first, m);
     MatrixXd block = P.block(f.first, f.first, m, m) + B_.block(f.first, f.first, m, m) + mean * mean.transpose();
     block.diagonal().array() -= 2;
@@ -209,10 +278,21 @@ void InducingGram::add_points_gradient(std::size_t a, const MatrixXd& P, MatrixX
   lapack::solve_lower(latent.L, true, of_points);
   of_points.transposeInPlace();
   lapack::solve_lower(latent.L, true, of_points);
+  VectorXd point;
+  if (latent.is_potential) {
+    PotentialGradient gradient(latent);
+    for (Index j = 0; j < m; ++j) {
+      const auto [d, at] = latent.derivative_at(j);
+      latent.kernel.scale(at, point);
+      gradient.move_to(point);
+      gradient.add(d, of_points.col(j), sums);
+    }
+    return;
+  }
   MatrixXd weights = MatrixXd::Zero(latent.kernel.n_rows(), m);
   weights.topRows(m) = of_points;
   KernelColumns::Workspace workspace;
-  VectorXd point, k(weights.rows());
+  VectorXd k(weights.rows());
   for (Index j = 0; j < m; ++j) {
     latent.kernel.scale(j, point);
     latent.kernel.evaluate(0, k.size(), point, k.data(), workspace);

@@ -29,8 +29,11 @@ class InducingGram final : public Gram {
   [[nodiscard]] bool factorise(const RowBlocks& rows);
   /// @param misfit  Σ ‖α̃‖²
   [[nodiscard]] GramValue value_of(double misfit) const;
-  void add_variance_gradient(std::size_t a, const InducingBlock& block, Eigen::MatrixXd& sums,
-                             KernelColumns::Workspace& workspace) const;
+  /// Adds −Σ_f tr(∂k_f(Z, φ_i)/∂log v ᵀ U_f) of a latent and a block.
+  /// @param U  of each of its covariances (variables × n)
+  void add_cross_gradient(std::size_t a, const InducingBlock& block, const std::vector<Eigen::MatrixXd>& U,
+                          Eigen::MatrixXd& sums) const;
+  void add_variance_gradient(std::size_t a, const InducingBlock& block, Eigen::MatrixXd& sums) const;
   void add_points_gradient(std::size_t a, const Eigen::MatrixXd& P, Eigen::MatrixXd& sums) const;
 
   InducingLatents latents_;

@@ -7,6 +7,7 @@
 
 #include "base/lapack.hpp"
 #include "base/simd.hpp"
+#include "prior/gradient_columns.hpp"
 
 namespace gp2 {
 
@@ -18,12 +19,33 @@ using Eigen::VectorXd;
 
 namespace {
 
+// of the derivatives of a potential at its points, all points of one derivative after another
+MatrixXd covariance_of_gradients(const KernelColumns& points) {
+  const Index n = points.n_points(), D = points.kernel().n_features();
+  const GradientColumns columns(points);
+  GradientColumns::Workspace workspace;
+  VectorXd point;
+  MatrixXd covariance(n * D, n * D);
+  for (Index j = 0; j < n; ++j) {
+    points.scale(j, point);
+    columns.evaluate(0, n, point, workspace);
+    for (Index d = 0; d < D; ++d) {
+      columns.multiply(VectorXd::Unit(D, d), workspace);
+      covariance.col(d * n + j) = workspace.out.reshaped();
+    }
+  }
+  return covariance;
+}
+
 std::vector<lapack::PivotedFactor> factors_of(const Prior& prior, const ModelValues& values) {
   std::vector<lapack::PivotedFactor> factors;
   for (std::size_t a = 0; a < prior.latents.size(); ++a) {
     const MatrixXd& Z = values.inducing->features[a];
-    lapack::PivotedFactor& factor = factors.emplace_back(
-        lapack::factorise_semidefinite(prior.latents[a].kernel.evaluate(Z, Z, values.kernel[a]), smallest_pivot));
+    const Kernel& kernel = prior.latents[a].kernel;
+    lapack::PivotedFactor& factor = factors.emplace_back(lapack::factorise_semidefinite(
+        prior.latents[a].is_potential ? covariance_of_gradients(KernelColumns(kernel, Z, values.kernel[a]))
+                                      : kernel.evaluate(Z, Z, values.kernel[a]),
+        smallest_pivot));
     factor.rows.resize(static_cast<std::size_t>(factor.L.cols()));
     factor.L = factor.L.topRows(factor.L.cols()).eval();
   }
@@ -36,61 +58,102 @@ InducingLatents::InducingLatents(const Prior& prior, const ModelValues& values)
     : InducingLatents(prior, values, factors_of(prior, values)) {}
 
 InducingLatents::InducingLatents(const Prior& prior, const ModelValues& values, std::vector<lapack::PivotedFactor> factors) {
+  std::size_t n_crosses = 0;
   for (std::size_t a = 0; a < prior.latents.size(); ++a) {
-    const MatrixXd Z = values.inducing->features[a](factors[a].rows, Eigen::all);
-    OfLatent& latent = latents_.emplace_back(OfLatent{
-        KernelColumns(prior.latents[a].kernel, Z, values.kernel[a]), std::move(factors[a].L), std::move(factors[a].rows),
-        values.loading(a).cols(), prior.latents[a].kernel_is_fixed && prior.latents[a].base == Latent::Base::admissible});
-    for (Index l = 0; l < latent.n_functions; ++l, size_ += latent.n_points()) functions_.push_back({a, l, size_});
+    const Latent& of = prior.latents[a];
+    const MatrixXd& given = values.inducing->features[a];
+    const MatrixXd Z = of.is_potential ? given : given(factors[a].rows, Eigen::all);
+    const OfLatent& latent = latents_.emplace_back(OfLatent{
+        KernelColumns(of.kernel, Z, values.kernel[a]), std::move(factors[a].L), std::move(factors[a].rows),
+        values.loading(a).cols(), of.kernel_is_fixed && of.base == Latent::Base::admissible, of.is_potential, n_crosses});
+    for (Index l = 0; l < latent.n_functions; ++l) {
+      functions_.push_back({a, l, size_, n_crosses + (of.is_potential ? static_cast<std::size_t>(l) : 0)});
+      if (!of.is_potential) size_ += latent.n_variables();
+    }
+    if (of.is_potential) size_ += latent.n_variables();
+    n_crosses += latent.n_crosses();
+  }
+}
+
+void InducingLatents::evaluate(std::size_t a, const Ref<const MatrixXd>& features, std::vector<MatrixXd>& k) const {
+  const OfLatent& latent = latents_[a];
+  const Index n = features.rows();
+  VectorXd point;
+  if (!latent.is_potential) {
+    KernelColumns::Workspace workspace;
+    MatrixXd& to = k[latent.first_cross];
+    to.resize(latent.kernel.n_rows(), n);
+    for (Index i = 0; i < n; ++i) {
+      latent.kernel.scale(features.row(i).transpose(), point);
+      latent.kernel.evaluate(0, to.rows(), point, to.col(i).data(), workspace);
+    }
+    return;
+  }
+  const GradientColumns columns(latent.kernel);
+  GradientColumns::Workspace workspace;
+  for (Index d = 0; d < latent.n_functions; ++d)
+    k[latent.first_cross + static_cast<std::size_t>(d)].resize(latent.n_variables(), n);
+  for (Index i = 0; i < n; ++i) {
+    latent.kernel.scale(features.row(i).transpose(), point);
+    columns.evaluate(0, latent.n_points(), point, workspace);
+    for (Index d = 0; d < latent.n_functions; ++d) {
+      columns.multiply(VectorXd::Unit(latent.n_functions, d), workspace);
+      k[latent.first_cross + static_cast<std::size_t>(d)].col(i) = workspace.out.reshaped()(latent.chosen);
+    }
   }
 }
 
 void InducingLatents::solve(bool transposed, Ref<MatrixXd> c) const {
   for (const Function& function : functions_) {
     const OfLatent& latent = latent_of(function);
-    lapack::solve_lower(latent.L, transposed, c.middleRows(function.first, latent.n_points()));
+    if (latent.is_potential && function.index > 0) continue;
+    lapack::solve_lower(latent.L, transposed, c.middleRows(function.first, latent.n_variables()));
   }
 }
 
 std::vector<MatrixXd> InducingLatents::at(const std::vector<MatrixXd>& features, const Ref<const VectorXd>& m) const {
-  std::vector<MatrixXd> f;
-  VectorXd point;
-  KernelColumns::Workspace workspace;
-  Index first = 0;
+  std::vector<MatrixXd> f, k(n_crosses());
   for (std::size_t a = 0; a < latents_.size(); ++a) {
     const OfLatent& latent = latents_[a];
-    MatrixXd k(latent.kernel.n_rows(), features[a].rows());
-    for (Index i = 0; i < k.cols(); ++i) {
-      latent.kernel.scale(features[a].row(i).transpose(), point);
-      latent.kernel.evaluate(0, k.rows(), point, k.col(i).data(), workspace);
+    evaluate(a, features[a], k);
+    f.emplace_back(latent.n_functions, features[a].rows());
+    for (std::size_t c = latent.first_cross; c < latent.first_cross + latent.n_crosses(); ++c) {
+      k[c].conservativeResize(latent.n_variables(), Eigen::NoChange);
+      lapack::solve_lower(latent.L, false, k[c]);
     }
-    MatrixXd w = k.topRows(latent.n_points());
-    lapack::solve_lower(latent.L, false, w);
-    const Index n_variables = latent.n_points() * latent.n_functions;
-    f.emplace_back(m.segment(first, n_variables).reshaped(latent.n_points(), latent.n_functions).transpose() * w);
-    first += n_variables;
+  }
+  for (const Function& function : functions_) {
+    const MatrixXd& w = k[function.cross];
+    f[function.latent].row(function.index) = m.segment(function.first, w.rows()).transpose() * w;
   }
   return f;
 }
 
 InducingBlock::InducingBlock(const InducingLatents& latents)
-    : latents_(&latents), k_(latents.latents().size()), w_(k_.size()), variance_(k_.size()), left_(k_.size()) {}
+    : latents_(&latents), k_(latents.n_crosses()), w_(k_.size()), variance_(k_.size()), left_(latents.latents().size()) {}
 
 void InducingBlock::move_to(const LatentRows& rows) {
   rows_ = &rows;
   y_ = by_component(*rows.reduction, rows.reduction->y);
-  for (std::size_t a = 0; a < k_.size(); ++a) {
+  VectorXd point;
+  for (std::size_t a = 0; a < left_.size(); ++a) {
     const InducingLatents::OfLatent& latent = latents_->latents()[a];
     const MatrixXd& features = rows.latents[a].kernel.features();
-    k_[a].resize(latent.kernel.n_rows(), n());
-    variance_[a].resize(n());
-    for (Index i = 0; i < n(); ++i) {
-      latent.kernel.scale(features.row(i).transpose(), point_);
-      latent.kernel.evaluate(0, k_[a].rows(), point_, k_[a].col(i).data(), workspace_);
-      variance_[a][i] = (1 + smallest_pivot) * latent.kernel.variance(point_);
+    latents_->evaluate(a, features.topRows(n()), k_);
+    const VectorXd of_gradient = latent.is_potential ? GradientColumns(latent.kernel).variance() : VectorXd();
+    for (std::size_t c = latent.first_cross; c < latent.first_cross + latent.n_crosses(); ++c) {
+      w_[c] = k_[c].topRows(latent.n_variables());
+      lapack::solve_lower(latent.L, false, w_[c]);
+      variance_[c].resize(n());
+      for (Index i = 0; i < n(); ++i) {
+        if (latent.is_potential) {
+          variance_[c][i] = (1 + smallest_pivot) * of_gradient[static_cast<Index>(c - latent.first_cross)];
+          continue;
+        }
+        latent.kernel.scale(features.row(i).transpose(), point);
+        variance_[c][i] = (1 + smallest_pivot) * latent.kernel.variance(point);
+      }
     }
-    w_[a] = k_[a].topRows(latent.n_points());
-    lapack::solve_lower(latent.L, false, w_[a]);
   }
   add_noise();
 }
@@ -101,10 +164,12 @@ void InducingBlock::add_noise() {
   for (Index i = 0; i < n(); ++i) rank_[i] = static_cast<double>(rows_->reduction->samples[static_cast<std::size_t>(i)].R.rows());
   noise_.setOnes(n());
   for (std::size_t a = 0; a < left_.size(); ++a) {
-    if (!latents_->latents()[a].is_local) continue;
-    const VectorXd held = w_[a].colwise().squaredNorm();
-    left_[a] = (variance_[a] - held).cwiseMax(0);
-    variance_[a] = held;
+    const InducingLatents::OfLatent& latent = latents_->latents()[a];
+    if (!latent.is_local) continue;
+    VectorXd& variance = variance_[latent.first_cross];
+    const VectorXd held = w_[latent.first_cross].colwise().squaredNorm();
+    left_[a] = (variance - held).cwiseMax(0);
+    variance = held;
     noise_.array() += left_[a] * rows_->latents[a].Z.topRows(n()).rowwise().squaredNorm().array() / rank_.array().max(1);
   }
   noise_ = noise_.cwiseSqrt();
@@ -135,12 +200,21 @@ ArrayXd InducingBlock::weight_product(std::size_t f, std::size_t g) const {
   return sum;
 }
 
+double InducingBlock::left_out(std::size_t f) const {
+  const InducingLatents::Function& function = latents_->functions()[f];
+  double sum = (weight_product(f, f) * (variance(f).array() - w(f).colwise().squaredNorm().transpose().array())).sum();
+  if (!latents_->latent_of(function).is_potential) return sum;
+  // derivatives at one point are independent under the prior
+  for (std::size_t g = f - static_cast<std::size_t>(function.index); g < f; ++g) {
+    sum -= 2 * (weight_product(f, g) * w(f).cwiseProduct(w(g)).colwise().sum().transpose().array()).sum();
+  }
+  return sum;
+}
+
 MatrixXd InducingBlock::loadings(Index component) const {
-  MatrixXd Psi(latents_->size(), n());
+  MatrixXd Psi = MatrixXd::Zero(latents_->size(), n());
   for (std::size_t f = 0; f < latents_->functions().size(); ++f) {
-    const InducingLatents::Function& function = latents_->functions()[f];
-    const MatrixXd& w = w_[function.latent];
-    Psi.middleRows(function.first, w.rows()) = w * weight(f, component).asDiagonal();
+    Psi.middleRows(latents_->functions()[f].first, w(f).rows()) += w(f) * weight(f, component).asDiagonal();
   }
   return Psi;
 }
@@ -148,9 +222,7 @@ MatrixXd InducingBlock::loadings(Index component) const {
 MatrixXd InducingBlock::misfit(const Ref<const VectorXd>& m) const {
   MatrixXd misfit = y();
   for (std::size_t f = 0; f < latents_->functions().size(); ++f) {
-    const InducingLatents::Function& function = latents_->functions()[f];
-    const MatrixXd& w = w_[function.latent];
-    const VectorXd mean = w.transpose() * m.segment(function.first, w.rows());
+    const VectorXd mean = w(f).transpose() * m.segment(latents_->functions()[f].first, w(f).rows());
     for (Index c = 0; c < misfit.cols(); ++c) misfit.col(c) -= weight(f, c).cwiseProduct(mean);
   }
   return misfit;
@@ -188,21 +260,40 @@ void InducingStatistics::add(const InducingStatistics& other, double share) {
 
 void InducingStatistics::add(const InducingLatents& latents, const InducingBlock& block, MatrixXd& memory) {
   const std::vector<InducingLatents::Function>& functions = latents.functions();
+  const auto is_potential = [&](std::size_t f) { return latents.latent_of(functions[f]).is_potential; };
+  // what the functions of a potential weigh differs by component, so that it is not the weights alone that are summed
+  std::vector<MatrixXd> Psi;
+  for (Index k = 0; k < block.y().cols() && std::ranges::any_of(latents.latents(), &InducingLatents::OfLatent::is_potential); ++k)
+    Psi.push_back(block.loadings(k));
   for (std::size_t f = 0; f < functions.size(); ++f) {
-    const MatrixXd& w = block.w(functions[f].latent);
+    const MatrixXd& w = block.w(f);
     const ArrayXd square = block.weight_product(f, f);
-    trace += (square * (block.variance(functions[f].latent).array() - w.colwise().squaredNorm().transpose().array())).sum();
-    weight[static_cast<Index>(functions[f].latent)] += square.sum();
+    trace += block.left_out(f);
+    weight[static_cast<Index>(functions[f].latent)] += is_potential(f) ? square.matrix().dot(block.variance(f)) : square.sum();
     if (w.rows() == 0) continue;
     ArrayXd of_y = ArrayXd::Zero(block.n());
     for (Index k = 0; k < block.y().cols(); ++k) of_y += block.weight(f, k).array() * block.y().col(k).array();
     c.segment(functions[f].first, w.rows()).noalias() += w * of_y.matrix();
+    if (is_potential(f) && functions[f].index > 0) continue;
     for (std::size_t g = 0; g <= f; ++g) {
-      const MatrixXd& v = block.w(functions[g].latent);
-      const ArrayXd product = f == g ? ArrayXd(square.sqrt()) : block.weight_product(f, g);
-      if (v.rows() == 0 || (product == 0).all()) continue;
-      memory = v * product.matrix().asDiagonal();
+      const MatrixXd& v = block.w(g);
+      if (v.rows() == 0) continue;
       auto to = B.block(functions[f].first, functions[g].first, w.rows(), v.rows());
+      if (is_potential(f) || is_potential(g)) {
+        if (is_potential(g) && functions[g].index > 0) continue;
+        for (const MatrixXd& of_component : Psi) {
+          memory = of_component.middleRows(functions[g].first, v.rows());
+          if (f == g) {
+            lapack::add_square(memory, to);
+          } else {
+            lapack::add_product(of_component.middleRows(functions[f].first, w.rows()), false, memory, true, to);
+          }
+        }
+        continue;
+      }
+      const ArrayXd product = f == g ? ArrayXd(square.sqrt()) : block.weight_product(f, g);
+      if ((product == 0).all()) continue;
+      memory = v * product.matrix().asDiagonal();
       if (f == g) {
         lapack::add_square(memory, to);
       } else {

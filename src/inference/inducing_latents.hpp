@@ -22,22 +22,33 @@ namespace gp2 {
 constexpr double smallest_pivot = 1e-15;
 
 /// Latents at their inducing points Z_a under one set of values. The inducing variables are f_a,l(Z_j), point after point of
-/// function after function of latent after latent; whitened they are L_a⁻¹ times that.
+/// function after function of latent after latent; whitened they are L_a⁻¹ times that. The functions of a potential are the
+/// derivatives of one function, so that they share their variables: ∂_d V(Z_j), of all those that tell something.
 class InducingLatents {
  public:
   struct OfLatent {
     KernelColumns kernel;     // k_a between the points and another
-    Eigen::MatrixXd L;        // k_a(Z, Z) = L Lᵀ
-    std::vector<int> chosen;  // which of the points that were given Z are, in order
+    Eigen::MatrixXd L;        // k_a(Z, Z) = L Lᵀ, of a potential the covariance of its derivatives
+    std::vector<int> chosen;  // which of the points that were given Z are, in order; of a potential d·points + j of its variables
     Eigen::Index n_functions = 0;
     bool is_local = false;  // what points leave out of it counts as noise: they cannot hold what has short, fixed lengthscales
+    bool is_potential = false;
+    std::size_t first_cross = 0;  // of its covariances among those of all latents, of a potential one for each derivative
 
-    [[nodiscard]] Eigen::Index n_points() const { return L.rows(); }
+    [[nodiscard]] Eigen::Index n_points() const { return kernel.n_points(); }
+    [[nodiscard]] Eigen::Index n_variables() const { return L.rows(); }  // of each function, of a potential of all together
+    [[nodiscard]] std::size_t n_crosses() const { return is_potential ? static_cast<std::size_t>(n_functions) : 1; }
+    /// Of a variable of a potential, the derivative and the point.
+    [[nodiscard]] std::pair<Eigen::Index, Eigen::Index> derivative_at(Eigen::Index variable) const {
+      const Eigen::Index entry = chosen[static_cast<std::size_t>(variable)];
+      return {entry / n_points(), entry % n_points()};
+    }
   };
   struct Function {
     std::size_t latent = 0;
     Eigen::Index index = 0;  // in its latent
     Eigen::Index first = 0;  // its first variable
+    std::size_t cross = 0;   // which of the covariances are its own
   };
 
   InducingLatents() = default;
@@ -50,7 +61,11 @@ class InducingLatents {
   [[nodiscard]] const std::vector<OfLatent>& latents() const { return latents_; }
   [[nodiscard]] const std::vector<Function>& functions() const { return functions_; }
   [[nodiscard]] const OfLatent& latent_of(const Function& function) const { return latents_[function.latent]; }
+  [[nodiscard]] std::size_t n_crosses() const { return latents_.back().first_cross + latents_.back().n_crosses(); }
 
+  /// k_a between the variables of a function and the functions at n states (variables, padded × n), to k[first_cross], ….
+  /// @param features  (n × D)
+  void evaluate(std::size_t a, const Eigen::Ref<const Eigen::MatrixXd>& features, std::vector<Eigen::MatrixXd>& k) const;
   /// f_a at n states where the whitened inducing variables are m, per latent (F × n).
   /// @param features  per latent (n × D)
   [[nodiscard]] std::vector<Eigen::MatrixXd> at(const std::vector<Eigen::MatrixXd>& features,
@@ -77,9 +92,9 @@ class InducingBlock {
   [[nodiscard]] Eigen::Index n() const { return rows_->n_samples(); }
   /// ỹ, by component (n × components)
   [[nodiscard]] auto y() const { return y_.topRows(n()); }
-  /// k_a(Z, φ_i) (points, padded × n), and w = L⁻¹k (points × n).
-  [[nodiscard]] const Eigen::MatrixXd& k(std::size_t latent) const { return k_[latent]; }
-  [[nodiscard]] const Eigen::MatrixXd& w(std::size_t latent) const { return w_[latent]; }
+  /// k_a(Z, φ_i) (points, padded × n), and of a function w = L⁻¹k (variables × n).
+  [[nodiscard]] const Eigen::MatrixXd& k(std::size_t latent) const { return k_[latents_->latents()[latent].first_cross]; }
+  [[nodiscard]] const Eigen::MatrixXd& w(std::size_t f) const { return w_[latents_->functions()[f].cross]; }
   /// s (n)
   [[nodiscard]] const Eigen::VectorXd& noise() const { return noise_; }
   /// Σ log s_i over the components of all samples
@@ -91,8 +106,8 @@ class InducingBlock {
   /// Adds to the mean of a local latent's functions at the samples (n × functions) what it has where it counts as noise: m with
   /// Γ_i m = (s_i² − 1) α̃_i, α̃ (n × components) in units of the noise without it.
   void add_mean_of_noise(std::size_t a, const Eigen::MatrixXd& alpha, Eigen::MatrixXd& mean) const;
-  /// k_a(φ_i, φ_i) at most (n); of a local latent what the points hold of it
-  [[nodiscard]] const Eigen::VectorXd& variance(std::size_t latent) const { return variance_[latent]; }
+  /// Variance of a function at most (n); of a local latent what the points hold of it
+  [[nodiscard]] const Eigen::VectorXd& variance(std::size_t f) const { return variance_[latents_->functions()[f].cross]; }
   [[nodiscard]] auto weight(std::size_t f, Eigen::Index component) const {
     const InducingLatents::Function& function = latents_->functions()[f];
     const LatentRows::OfLatent& latent = rows_->latents[function.latent];
@@ -100,6 +115,8 @@ class InducingBlock {
   }
   /// Σ_c Γ_i,f Γ_i,g (n)
   [[nodiscard]] Eigen::ArrayXd weight_product(std::size_t f, std::size_t g) const;
+  /// What the points leave of the samples' variance: the part of a function, with that of those before it that share its variables.
+  [[nodiscard]] double left_out(std::size_t f) const;
   /// Ψᵀ of one component (M × n).
   [[nodiscard]] Eigen::MatrixXd loadings(Eigen::Index component) const;
   /// ỹ − Ψ m, by component (n × components)
@@ -111,12 +128,10 @@ class InducingBlock {
   const InducingLatents* latents_;
   const LatentRows* rows_ = nullptr;
   Eigen::MatrixXd y_;
-  std::vector<Eigen::MatrixXd> k_, w_;
-  std::vector<Eigen::VectorXd> variance_;
+  std::vector<Eigen::MatrixXd> k_, w_;     // by cross
+  std::vector<Eigen::VectorXd> variance_;  // by cross
   Eigen::VectorXd rank_, noise_;
   std::vector<Eigen::ArrayXd> left_;  // of local latents: k_a(φ_i, φ_i) − ‖w_i‖² (n)
-  Eigen::VectorXd point_;
-  KernelColumns::Workspace workspace_;
 };
 
 /// The sum of what work(sum, piece, RowBlock, InducingBlock) adds for every block of rows, in PieceSums.
@@ -155,7 +170,7 @@ struct InducingStatistics {
   double yy = 0;           // Σ ỹᵀỹ
   double trace = 0;        // t
   double constant = 0;     // of the reductions
-  Eigen::VectorXd weight;  // per latent: Σ ‖Γ‖²
+  Eigen::VectorXd weight;  // per latent: Σ ‖Γ‖², of a potential times the variances of its derivatives
 
   InducingStatistics() = default;
   explicit InducingStatistics(const InducingLatents& latents);  // of no samples

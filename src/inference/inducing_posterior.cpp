@@ -42,15 +42,19 @@ InducingPosterior::InducingPosterior(InducingLatents inducing, std::vector<Induc
   for (const InducingLatents::OfLatent& latent : inducing_.latents()) n_points = std::max(n_points, latent.n_points());
   for (const InducingLatents::Function& function : inducing_.functions()) {
     std::vector<Index>& rows = row_of_.emplace_back(static_cast<std::size_t>(n_points), -1);
-    for (Index j = 0; j < inducing_.latent_of(function).n_points(); ++j) rows[static_cast<std::size_t>(j)] = function.first + j;
+    const InducingLatents::OfLatent& latent = inducing_.latent_of(function);
+    for (Index v = 0; v < latent.n_variables(); ++v) {
+      const auto [index, j] = latent.is_potential ? latent.derivative_at(v) : std::pair(function.index, v);
+      if (index == function.index) rows[static_cast<std::size_t>(j)] = function.first + v;
+    }
   }
   for (std::size_t a = 0; a < inducing_.latents().size(); ++a) {
     // all have as many points; those that a latent lacks have no weight
     const InducingLatents::OfLatent& latent = inducing_.latents()[a];
     MatrixXd points = MatrixXd::Zero(n_points, latent.kernel.features().cols());
     points.topRows(latent.n_points()) = latent.kernel.features().topRows(latent.n_points());
-    Basis& basis = latents_.emplace_back(
-        Basis{KernelColumns(latent.kernel.kernel(), points, latent.kernel.values()), {}, {}, latent.n_functions});
+    Basis& basis = latents_.emplace_back(Basis{
+        KernelColumns(latent.kernel.kernel(), points, latent.kernel.values()), {}, {}, latent.n_functions, latent.is_potential});
     basis.Z.setZero(basis.kernel.n_rows(), std::ssize(inducing_.functions()) * latent.n_functions);
     for (std::size_t f = 0; f < inducing_.functions().size(); ++f) {
       const InducingLatents::Function& function = inducing_.functions()[f];
@@ -84,9 +88,11 @@ bool InducingPosterior::factorise() {
 std::vector<MatrixXd> InducingPosterior::latent_weights(const Ref<const VectorXd>& of_variables) const {
   std::vector<MatrixXd> weights;
   for (const Basis& latent : latents_) weights.emplace_back(MatrixXd::Zero(latent.kernel.n_rows(), latent.n_functions));
-  for (const InducingLatents::Function& function : inducing_.functions()) {
-    const Index n = inducing_.latent_of(function).n_points();
-    weights[function.latent].col(function.index).head(n) = of_variables.segment(function.first, n);
+  for (std::size_t f = 0; f < row_of_.size(); ++f) {
+    const InducingLatents::Function& function = inducing_.functions()[f];
+    for (std::size_t j = 0; j < row_of_[f].size(); ++j) {
+      if (row_of_[f][j] >= 0) weights[function.latent](static_cast<Index>(j), function.index) = of_variables[row_of_[f][j]];
+    }
   }
   return weights;
 }
@@ -107,9 +113,11 @@ VectorXd InducingPosterior::misfit(const std::vector<MatrixXd>& f, RandomStream&
   VectorXd drawn(size()), of_prior(size());
   for (double& entry : drawn) entry = random.normal();
   lapack::solve_lower(L_, true, drawn);
-  for (const InducingLatents::Function& function : inducing_.functions()) {
-    const Index n = inducing_.latent_of(function).n_points();
-    of_prior.segment(function.first, n) = f[function.latent].row(function.index).head(n).transpose();
+  for (std::size_t k = 0; k < row_of_.size(); ++k) {
+    const InducingLatents::Function& function = inducing_.functions()[k];
+    for (std::size_t j = 0; j < row_of_[k].size(); ++j) {
+      if (row_of_[k][j] >= 0) of_prior[row_of_[k][j]] = f[function.latent](function.index, static_cast<Index>(j));
+    }
   }
   inducing_.solve(false, of_prior);
   return mean_ + drawn - of_prior;

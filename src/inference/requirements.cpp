@@ -41,13 +41,6 @@ void require_measured(const std::vector<Observations>& observations, const char*
                                observations.empty() ? "no observations are given" : "every value is NaN, not measured"));
 }
 
-void require_no_potential(const Prior& prior) {
-  for (const Latent& latent : prior.latents) {
-    if (!latent.is_potential) continue;
-    throw InputError(fmt::format("the latent '{}' is a potential, which is not learned through inducing points", latent.name));
-  }
-}
-
 namespace {
 
 enum class Sign { any, not_negative, positive };
@@ -76,7 +69,6 @@ void require_count(const char* member, std::size_t got, std::size_t wanted, cons
 
 void require_inducing(const Prior& prior, const std::vector<Observations>& observations, const InducingPoints& points) {
   require_count("inducing", points.features.size(), prior.latents.size(), "latents");
-  require_no_potential(prior);
   for (std::size_t a = 0; a < points.features.size(); ++a) {
     const MatrixXd& features = points.features[a];
     if (features.cols() == prior.latents[a].n_features() && features.allFinite()) continue;

@@ -20,9 +20,6 @@ void require_observations(const Prior& prior, const std::vector<Observations>& o
 /// @param function  for the message
 void require_measured(const std::vector<Observations>& observations, const char* function);
 
-/// No latent is a potential, which inducing points are not for.
-void require_no_potential(const Prior& prior);
-
 /// There are as many values as the prior and its observations have places for, finite and, where they are positive by nature, so.
 void require_values(const Prior& prior, const std::vector<Observations>& observations, const ModelValues& values);
 

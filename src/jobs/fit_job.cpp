@@ -82,17 +82,11 @@ int settled_inducing(const FitRequest& request, const FitProblem& problem, const
   if (request.inducing) {
     if (problem.prior_options.baseline) throw InputError("`inducing` is not for a `baseline`");
     if (has_sums) throw InputError("`inducing` is not for windows of a raw log: `windows=none` learns from its rows");
-    if (const auto potential = std::ranges::find(problem.prior.latents, true, &Latent::is_potential);
-        potential != problem.prior.latents.end()) {
-      throw InputError(
-          fmt::format("`inducing` is not for the potential '{}': leave it out, or `inducing=none`", potential->name));
-    }
     const auto most = static_cast<int>(*request.inducing);
     return most < fit_memory(problem, options).reduced_size ? most : 0;  // else it is exact that takes less
   }
-  const bool has_potential = std::ranges::any_of(problem.prior.latents, &Latent::is_potential);
   const bool is_possible =
-      !problem.prior_options.baseline && !has_sums && !has_potential && request.problem.protocol.name == Protocol::Name::standard;
+      !problem.prior_options.baseline && !has_sums && request.problem.protocol.name == Protocol::Name::standard;
   if (request.is_exact || !is_possible) return 0;
   return fit_memory(problem, options).reduced_size > largest_exact_size
              ? automatic_inducing_variables(n_states(problem.observations))

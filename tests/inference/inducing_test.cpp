@@ -28,7 +28,7 @@ using test::Quantity;
 
 constexpr std::uint64_t inducing_seed = 51117;
 
-std::vector<Problem> exact_problems(int n = 9) { return test::without_potentials(test::problems(n, inducing_seed)); }
+std::vector<Problem> exact_problems(int n = 9) { return test::problems(n, inducing_seed); }
 
 InducingChoice chosen(const Problem& p, int most) {
   return choose_inducing_points(p.prior, p.observations, p.values, {.most = most, .left_out = 1e-12});

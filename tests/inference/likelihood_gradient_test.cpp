@@ -170,7 +170,7 @@ TEST(LikelihoodGradientTest, MatchesDifferencesWhereSumsAreMeasured) {
 }
 
 TEST(LikelihoodGradientTest, MatchesDifferencesThroughInducingPoints) {
-  for (Problem p : test::without_potentials(test::problems(40, likelihood_gradient_seed))) {
+  for (Problem p : test::problems(40, likelihood_gradient_seed)) {
     p.values.inducing = choose_inducing_points(p.prior, p.observations, p.values, {.most = 25, .left_out = 1e-12}).points;
     expect_gradient(p);
   }

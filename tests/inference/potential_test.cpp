@@ -209,10 +209,8 @@ TEST(Potential, ItsFeaturesAreTheCoordinatesWhereNoneAreGiven) {
   EXPECT_EQ(make_prior(model).latents[0].feature_names, (std::vector<std::string>{"sin(q1)", "cos(q1)", "sin(q2)", "cos(q2)"}));
 }
 
-TEST(Potential, HasOneSignalAndNoInducingPoints) {
+TEST(Potential, HasOneSignal) {
   Problem p = potential_problem();
-  EXPECT_THAT(input_error_of([&] { static_cast<void>(choose_inducing_points(p.prior, p.observations, p.values, {.most = 9})); }),
-              HasSubstr("is a potential, which is not learned through inducing points"));
   EXPECT_THAT(input_error_of([&] { static_cast<void>(test::posterior_of(p).potential(1, p.queries, p.queries.col(0))); }),
               HasSubstr("the latent 'friction' is none"));
   EXPECT_THAT(input_error_of([&] { static_cast<void>(test::posterior_of(p).potential(3, p.queries, p.queries.col(0))); }),

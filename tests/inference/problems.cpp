@@ -809,11 +809,6 @@ std::pair<VectorXd, MatrixXd> dense_posterior(const Problem& p, const View& view
   return {mean.cast<double>(), covariance.cast<double>()};
 }
 
-std::vector<Problem> without_potentials(std::vector<Problem> problems) {
-  std::erase_if(problems, [](const Problem& p) { return std::ranges::any_of(p.prior.latents, &Latent::is_potential); });
-  return problems;
-}
-
 double condition(const Problem& p) {
   const DenseObservations dense = dense_observations(p);
   const Eigen::LLT<Extended> noise(dense.noise);

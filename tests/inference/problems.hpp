@@ -120,9 +120,6 @@ double dense_negative_log_likelihood(const Problem& p);
 /// Mean and covariance of a view at states, given the observations, by the textbook formulas.
 std::pair<VectorXd, MatrixXd> dense_posterior(const Problem& p, const View& view, const MatrixXd& states);
 
-/// Those without a potential, which inducing points and the export to C are not for.
-std::vector<Problem> without_potentials(std::vector<Problem> problems);
-
 /// Largest over smallest eigenvalue of K̃ + I, or a little more: the signal to noise ratio. Bounds the loss of accuracy.
 double condition(const Problem& p);
 

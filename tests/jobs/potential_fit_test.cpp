@@ -72,8 +72,8 @@ FitRequest request_of_swing() {
   return request;
 }
 
-TEST(PotentialFit, LearnsEnergyBesideFrictionAndItsFileGivesItAgain) {
-  const FitOutcome outcome = run_fit(prepare_fit(request_of_swing()));
+void expect_energy_learned(FitRequest request) {
+  const FitOutcome outcome = run_fit(prepare_fit(std::move(request)));
   std::vector<std::string> names;
   for (const Hyperparameter& h : outcome.file.report.hyperparameters) names.push_back(h.name);
   EXPECT_THAT(names, Contains("energy.signal_stddev(potential)"));
@@ -110,6 +110,15 @@ TEST(PotentialFit, LearnsEnergyBesideFrictionAndItsFileGivesItAgain) {
   const UpdateOutcome updated = update(read, {log_of(10, 3)}, {});
   EXPECT_EQ(updated.n_states, 50);
   EXPECT_LT(updated.fit.posterior().potential(0, states, states.col(0)).stddev.sum(), learned.stddev.sum());
+}
+
+TEST(PotentialFit, LearnsEnergyBesideFrictionAndItsFileGivesItAgain) { expect_energy_learned(request_of_swing()); }
+
+TEST(PotentialFit, LearnsEnergyThroughInducingPoints) {
+  FitRequest request = request_of_swing();
+  request.inducing = 60;
+  ASSERT_EQ(prepare_fit(request).options.n_inducing, 60);
+  expect_energy_learned(std::move(request));
 }
 
 TEST(PotentialFit, PredictGivesTheEnergyRelativeToTheFirstRow) {
@@ -197,13 +206,6 @@ TEST(PotentialFit, IntegratesByItself) {
   EXPECT_EQ(prepare_fit(request).options.n_draws, 0);
   request.hyperparameters = HyperparameterChoice::automatic;
   EXPECT_EQ(prepare_fit(request).options.n_draws, n_mixed_draws);
-}
-
-TEST(PotentialFit, RefusesInducingPointsByItsName) {
-  FitRequest request = request_of_swing();
-  request.inducing = 10;
-  EXPECT_THAT(input_error_of([&] { static_cast<void>(prepare_fit(std::move(request))); }),
-              HasSubstr("is not for the potential 'energy'"));
 }
 
 }  // namespace
