@@ -194,13 +194,6 @@ Option output(std::string& value, const std::string& sample, const std::string& 
   return required(std::move(option));
 }
 
-Option quiet_option() {
-  static bool quiet = false;
-  Option option{"quiet", &quiet, "", "neither progress nor notes on stderr; warnings and errors remain"};
-  option.flag = "-q,--quiet";
-  return option;
-}
-
 Option required(Option option) {
   option.is_required = true;
   return option;

@@ -42,7 +42,7 @@ Command reproduce_command();
 Command completion_command();
 Command help_command(const std::vector<std::string>& names);
 
-/// In the order of --help.
+/// In the order of --help. All that may say something beside their result have -q.
 std::vector<Command> all_commands();
 
 /// An argument by its position, which must be given: MODEL.
@@ -52,8 +52,6 @@ Option arguments(const std::string& flag, std::vector<std::string>& values, cons
 /// -o, --output, which must be given.
 /// @param sample  CSV, say
 Option output(std::string& value, const std::string& sample, const std::string& text);
-/// -q, --quiet, of commands that say how far they are.
-Option quiet_option();
 /// An option that must be given.
 Option required(Option option);
 

@@ -277,6 +277,7 @@ void add_command(CLI::App& app, Command command) {
 std::string markdown_table(const Command& command) {
   std::string table = "| option | default | |\n|---|---|---|\n";
   for (const Option& option : command.options) {
+    if (option.name == "quiet") continue;  // of all commands, said once
     const std::string usage = usage_of(option);
     std::string otherwise = option.is_required ? "required" : option.otherwise;
     if (otherwise.empty()) {

@@ -117,7 +117,6 @@ Command derive_command() {
                       "tested on the other has gone through one filter",
                       "models of its own"}};
   for (Option& option : options(a->options)) command.options.push_back(std::move(option));
-  command.options.push_back(quiet_option());
   command.options.push_back(output(a->output, "CSV", "CSV file to write"));
   command.run = [a](const std::set<std::string>&) { run(*a); };
   return command;

@@ -151,7 +151,6 @@ Command excite_command() {
   };
   for (Option& option : options(a->request)) command.options.push_back(std::move(option));
   command.options.push_back({"json", &a->json, "", "report on stdout as JSON"});
-  command.options.push_back(quiet_option());
   command.options.push_back(
       output(a->output, "CSV", "CSV file to write: t, the planned q, dq and ddq, and the inputs, for gp2 simulate too"));
   command.run = [a](const std::set<std::string>&) { run(*a); };

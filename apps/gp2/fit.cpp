@@ -337,7 +337,6 @@ Command fit_command() {
               {{"again", &a->again, "FIT.json",
                 "instead of MODEL and options: those of an earlier fit, and its data unless others are given. Same bits"},
                {"json", &a->json, "", "report as JSON on stdout"},
-               quiet_option(),
                output(a->output, "FIT.json", "fitted model to write (JSON)")}});
   command.options.front().is_required = false;  // --again stands for it
   command.run = [a](const std::set<std::string>& given) { run(*a, given); };

@@ -85,6 +85,13 @@ int usage_error(const std::string& text) {
   return failed(exit_bad_input, fmt::format("error: {}\nRun gp2 --help, or gp2 COMMAND --help.", text));
 }
 
+gp2::Option quiet_option() {
+  static bool quiet = false;
+  gp2::Option option{"quiet", &quiet, "", "neither progress nor notes on stderr; warnings and errors remain"};
+  option.flag = "-q,--quiet";
+  return option;
+}
+
 }  // namespace
 
 namespace gp2::command {
@@ -96,6 +103,7 @@ std::vector<Command> all_commands() {
                              predict_command, simulate_command, excite_command, evaluate_command, update_command, shoot_command,
                              report_command, plot_command, export_command, reproduce_command, completion_command}) {
     commands.push_back(command());
+    if (command != completion_command) commands.back().options.push_back(quiet_option());
     names.push_back(commands.back().name);
   }
   names.emplace_back("help");

@@ -27,6 +27,8 @@ TEST_P(Help, ExplainsTheCommandWithAnExample) {
   EXPECT_EQ(outcome.status, 0);
   EXPECT_EQ(outcome.err, "");
   EXPECT_THAT(outcome.out, HasSubstr("Example:\n  gp2 " + (GetParam().empty() ? "generate" : GetParam())));
+  const bool may_say_more = !GetParam().empty() && GetParam() != "help";
+  EXPECT_EQ(outcome.said("-q, --quiet"), may_say_more);
 }
 
 INSTANTIATE_TEST_SUITE_P(OfEveryCommand, Help,
@@ -224,7 +226,7 @@ TEST(CommandLine, TalkGoesToStderrAndResultsToStdout) {
 
 TEST(CommandLine, QuietKeepsWarningsAndDropsNotesAndProgress) {
   const Desk desk;
-  desk.done("gp2 generate models/surface.toml --n 20 -o train.csv");
+  EXPECT_EQ(desk.done("gp2 generate models/surface.toml --n 20 -q -o train.csv").err, "");
   const std::string line = "gp2 fit models/surface.toml --data train.csv --restarts 1 --max-iterations 3 -o fit.json";
   const Outcome loud = desk.done(line), quiet = desk.done(line + " -q");
   EXPECT_TRUE(loud.said("fit.json: fit of"));
@@ -232,6 +234,8 @@ TEST(CommandLine, QuietKeepsWarningsAndDropsNotesAndProgress) {
   EXPECT_THAT(quiet.out, HasSubstr("negative log likelihood"));
   EXPECT_TRUE(desk.run("gp2 fit models/surface.toml --data none.csv --quiet -o fit.json").said("error: none.csv"));
   desk.done("gp2 fit --again fit.json -q -o again.json");
+  EXPECT_EQ(desk.done("gp2 predict fit.json --states train.csv -q -o prediction.csv").err, "");
+  EXPECT_EQ(desk.done("gp2 simulate fit.json --start q1=0.1 --t-end 0.1 --quiet -o motion.csv").err, "");
 }
 
 TEST(CommandLine, CheckTellsItsFindingsAsJson) {

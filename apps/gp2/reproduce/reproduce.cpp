@@ -101,7 +101,6 @@ Command reproduce_command() {
       {"runs", &a->runs, "R", "data sets", "10, or those that --data holds"},
       threads_option(a->threads),
       {"experiments", &a->experiments, "DIR", "folder of the definitions", "those of gp2"},
-      quiet_option(),
       output(a->output, "DIR", "folder for numbers (CSV, JSON) and pictures (SVG, PNG)"),
   };
   command.run = [a](const std::set<std::string>&) { run(*a); };
