@@ -1,5 +1,6 @@
 #include <cstdint>
 
+#include "base/not_a_number.hpp"
 #include "files/fit_json.hpp"
 #include "inference/inducing_summary.hpp"
 #include "inference/requirements.hpp"
@@ -31,7 +32,7 @@ Evaluation::Part part_from(const ParsedJson& json) {
   const VectorXd coverage = numbers("coverage", 3);
   part.coverage50 = coverage[0], part.coverage80 = coverage[1], part.coverage95 = coverage[2];
   part.pit = numbers("pit", Calibration::n_bins);
-  part.coverage50_latent = part.coverage80_latent = part.coverage95_latent = std::numeric_limits<double>::quiet_NaN();
+  part.coverage50_latent = part.coverage80_latent = part.coverage95_latent = not_a_number;
   return part;
 }
 

@@ -8,6 +8,7 @@
 #include <limits>
 
 #include "base/checksum.hpp"
+#include "base/not_a_number.hpp"
 
 namespace gp2::fit_json {
 
@@ -51,9 +52,7 @@ double number(const ParsedJson& json) {
   return json.get<double>();
 }
 
-double number_or_missing(const ParsedJson& json) {
-  return json.is_null() ? std::numeric_limits<double>::quiet_NaN() : number(json);
-}
+double number_or_missing(const ParsedJson& json) { return json.is_null() ? not_a_number : number(json); }
 
 double number_or_infinity(const ParsedJson& json) {
   return json.is_null() ? std::numeric_limits<double>::infinity() : number(json);
@@ -98,7 +97,7 @@ MatrixXd rows_from(const ParsedJson& json, const std::vector<std::string>& names
   for (std::size_t k = 0; k < names.size(); ++k) {
     if (needed[k] && !json.contains(names[k])) throw InputError(fmt::format("the values of '{}' are missing", names[k]));
   }
-  MatrixXd matrix = MatrixXd::Constant(static_cast<Index>(names.size()), n, std::numeric_limits<double>::quiet_NaN());
+  MatrixXd matrix = MatrixXd::Constant(static_cast<Index>(names.size()), n, not_a_number);
   for (std::size_t k = 0; k < names.size(); ++k) {
     if (!json.contains(names[k])) continue;
     const Json& values = json.at(names[k]);

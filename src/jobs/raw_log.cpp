@@ -15,6 +15,7 @@
 #include "base/not_a_number.hpp"
 #include "gp2/base/statistics.hpp"
 #include "gp2/error.hpp"
+#include "gp2/jobs/fit_problem.hpp"
 #include "gp2/simulate.hpp"
 
 namespace gp2 {
