@@ -5,6 +5,18 @@
 // Frames around the exported C, in the form of fill_template.hpp. Conditions: stddev, jacobian, inputs, timed.
 namespace gp2::c_export {
 
+// What CasADi looks for by the name of a function.
+inline constexpr std::string_view casadi_declarations =
+    R"c(int @function@(const casadi_real **arg, casadi_real **res, casadi_int *iw, casadi_real *w, int mem);
+casadi_int @function@_n_in(void);
+casadi_int @function@_n_out(void);
+const char *@function@_name_in(casadi_int i);
+const char *@function@_name_out(casadi_int i);
+const casadi_int *@function@_sparsity_in(casadi_int i);
+const casadi_int *@function@_sparsity_out(casadi_int i);
+int @function@_work(casadi_int *sz_arg, casadi_int *sz_res, casadi_int *sz_iw, casadi_int *sz_w);
+)c";
+
 inline constexpr std::string_view casadi_template = R"c(/* @name@ as functions of CasADi (3.6 and later):
  *
 {jacobian} *     @name@(q, dq, t, u) -> mean, with its exact Jacobian
@@ -63,14 +75,7 @@ static int set_work(casadi_int *sz_arg, casadi_int *sz_res, casadi_int *sz_iw, c
 
 /* ---------------------------------------------------------------- @name@ */
 
-int @name@(const casadi_real **arg, casadi_real **res, casadi_int *iw, casadi_real *w, int mem);
-casadi_int @name@_n_in(void);
-casadi_int @name@_n_out(void);
-const char *@name@_name_in(casadi_int i);
-const char *@name@_name_out(casadi_int i);
-const casadi_int *@name@_sparsity_in(casadi_int i);
-const casadi_int *@name@_sparsity_out(casadi_int i);
-int @name@_work(casadi_int *sz_arg, casadi_int *sz_res, casadi_int *sz_iw, casadi_int *sz_w);
+@declarations@
 
 int @name@(const casadi_real **arg, casadi_real **res, casadi_int *iw, casadi_real *w, int mem)
 {
@@ -101,14 +106,7 @@ static const casadi_int rows_by_coordinates[] = {@pattern_rows_q@};
 static const casadi_int rows_by_time[] = {@pattern_rows_t@};
 static const casadi_int rows_by_inputs[] = {@pattern_rows_u@};
 
-int jac_@name@(const casadi_real **arg, casadi_real **res, casadi_int *iw, casadi_real *w, int mem);
-casadi_int jac_@name@_n_in(void);
-casadi_int jac_@name@_n_out(void);
-const char *jac_@name@_name_in(casadi_int i);
-const char *jac_@name@_name_out(casadi_int i);
-const casadi_int *jac_@name@_sparsity_in(casadi_int i);
-const casadi_int *jac_@name@_sparsity_out(casadi_int i);
-int jac_@name@_work(casadi_int *sz_arg, casadi_int *sz_res, casadi_int *sz_iw, casadi_int *sz_w);
+@declarations_jac@
 
 int jac_@name@(const casadi_real **arg, casadi_real **res, casadi_int *iw, casadi_real *w, int mem)
 {
@@ -150,14 +148,7 @@ int jac_@name@_work(casadi_int *sz_arg, casadi_int *sz_res, casadi_int *sz_iw, c
 
 /* ---------------------------------------------------------------- @name@_std */
 
-int @name@_std(const casadi_real **arg, casadi_real **res, casadi_int *iw, casadi_real *w, int mem);
-casadi_int @name@_std_n_in(void);
-casadi_int @name@_std_n_out(void);
-const char *@name@_std_name_in(casadi_int i);
-const char *@name@_std_name_out(casadi_int i);
-const casadi_int *@name@_std_sparsity_in(casadi_int i);
-const casadi_int *@name@_std_sparsity_out(casadi_int i);
-int @name@_std_work(casadi_int *sz_arg, casadi_int *sz_res, casadi_int *sz_iw, casadi_int *sz_w);
+@declarations_std@
 
 int @name@_std(const casadi_real **arg, casadi_real **res, casadi_int *iw, casadi_real *w, int mem)
 {

@@ -25,8 +25,14 @@ std::string casadi_source(const std::string& name, const StateLayout& layout, in
   if (options.stddev) conditions.insert("stddev");
   if (options.jacobian) conditions.insert("jacobian");
   if (layout.nu > 0) conditions.insert("inputs");
+  const auto declared = [](const std::string& function) {
+    return c_export::filled(c_export::casadi_declarations, {{}, {{"function", function}}});
+  };
   return c_export::filled(c_export::casadi_template, {conditions,
                                                       {{"name", name},
+                                                       {"declarations", declared(name)},
+                                                       {"declarations_jac", declared("jac_" + name)},
+                                                       {"declarations_std", declared(name + "_std")},
                                                        {"nq", std::to_string(layout.nq)},
                                                        {"nu", std::to_string(layout.nu)},
                                                        {"n_state", std::to_string(layout.size())},
