@@ -28,6 +28,9 @@ void add_table(py::module_& module);
 void add_system(py::module_& module);
 void add_posterior(py::module_& module);
 void add_fit(py::module_& module);
+void add_fit_report(py::module_& module);
+void add_motion(py::module_& module);
+void add_excitation(py::module_& module);
 void add_predictor(py::module_& module);
 void add_report(py::module_& module);
 
@@ -44,6 +47,8 @@ void add_callables(py::class_<PySystem>& system);
 /// Code of a system; none without one.
 inline ModelCode code_of(const PySystem* system) { return system == nullptr ? ModelCode() : system->model->code; }
 
+inline std::shared_ptr<const Model> model_of(const PySystem* system) { return system == nullptr ? nullptr : system->model; }
+
 /// gp2.Posterior: what a fit file holds, conditioned.
 struct PyPosterior {
   FitFile file;  // without observations: those of `posterior`, which may grow
@@ -52,6 +57,17 @@ struct PyPosterior {
 
   [[nodiscard]] const System& system() const { return *file.model.system; }
 };
+
+/// Methods of a posterior that move, and the functions gp2.simulate and gp2.excite. They have their keywords in signatures of our own.
+void define_simulate(py::class_<PyPosterior>& posterior, py::module_& module);
+void define_excite(py::module_& module);
+
+/// work() without the interpreter's lock.
+template <typename Work>
+auto unlocked(const Work& work) {
+  const py::gil_scoped_release release;
+  return work();
+}
 
 /// A str, bytes or os.PathLike.
 std::string path_argument(const py::object& path);

@@ -1,7 +1,6 @@
 #include <algorithm>
 #include <cmath>
 #include <filesystem>
-#include <limits>
 #include <thread>
 
 #include <fmt/format.h>
@@ -13,15 +12,12 @@
 #include "gp2/base/file.hpp"
 #include "gp2/error.hpp"
 #include "gp2/inference/inverse_dynamics.hpp"
-#include "gp2/jobs/excite_job.hpp"
 #include "gp2/jobs/export_job.hpp"
 #include "gp2/jobs/fit_job.hpp"
 #include "gp2/jobs/fit_problem.hpp"
 #include "gp2/jobs/predict_job.hpp"
 #include "gp2/jobs/shoot_job.hpp"
-#include "gp2/jobs/simulate_job.hpp"
 #include "gp2/jobs/update_job.hpp"
-#include "gp2/training/laplace.hpp"
 #include "options.hpp"
 
 namespace gp2::python {
@@ -42,11 +38,27 @@ struct ViewArguments {
   std::optional<double> time_step;
 };
 
-/// The model of another system keeps alive what a view looks at.
 ViewRequest view_request(const ViewArguments& arguments) {
-  return {quantity_argument(arguments.quantity), arguments.time_step, arguments.latent,
-          arguments.system == nullptr ? nullptr : arguments.system->model};
+  return {quantity_argument(arguments.quantity), arguments.time_step, arguments.latent, model_of(arguments.system)};
 }
+
+/// A view, and the states at which it is asked for.
+struct Asked {
+  ViewRequest request;  // whose model of another system keeps alive what the view looks at
+  PredictedView at;
+  States states;
+
+  Asked(const PyPosterior& self, ViewRequest request_of_view, const py::object& data, const py::object& columns)
+      : request(std::move(request_of_view)),
+        at(predicted_view(self.file, self.posterior.prior(), request)),
+        states(data, at.prior, at.view, *at.model, at.actuators, columns) {}
+
+  /// What `work` says without the interpreter's lock, with the table named in what it throws.
+  template <typename Work>
+  auto unlocked_and_named(const Work& work) const {
+    return states.named([&] { return unlocked(work); });
+  }
+};
 
 // ---------------------------------------------------------------- predictions
 
@@ -70,24 +82,22 @@ Index states_between_signals(const Posterior& posterior, bool mean_only, Index d
 Prediction predict(const PyPosterior& self, const py::object& data, const ViewArguments& arguments, bool mean_only,
                    const py::object& columns, int n_threads) {
   require_at_least(0, n_threads, "threads");
-  const ViewRequest request = view_request(arguments);
-  const PredictedView at = predicted_view(self.file, self.posterior.prior(), request);
-  const States states(data, at.prior, at.view, *at.model, at.actuators, columns);
-  const auto x = states.matrix();
-  const Index d = at.view.size(), n = x.cols();
+  const Asked asked(self, view_request(arguments), data, columns);
+  const View& view = asked.at.view;
+  const auto x = asked.states.matrix();
+  const Index d = view.size(), n = x.cols();
   MatrixXd mean(d, n), stddev(mean_only ? 0 : d, n), covariance(mean_only ? 0 : d * d, n);
   Prediction out;
   const Posterior posterior = self.posterior;  // stays as it is, whatever another Python thread does with self
   const Index most = states_between_signals(posterior, mean_only, d, n_threads);
   for (Index first = 0; first < n; first += most) {
     const Index size = std::min(most, n - first);
-    states.named([&] {
-      const py::gil_scoped_release release;
+    asked.unlocked_and_named([&] {
       try {
         if (mean_only) {
-          mean.middleCols(first, size) = posterior.mean(at.view, x.middleCols(first, size), n_threads);
+          mean.middleCols(first, size) = posterior.mean(view, x.middleCols(first, size), n_threads);
         } else {
-          const Posterior::Marginal block = posterior.marginal(at.view, x.middleCols(first, size), n_threads);
+          const Posterior::Marginal block = posterior.marginal(view, x.middleCols(first, size), n_threads);
           mean.middleCols(first, size) = block.mean;
           stddev.middleCols(first, size) = block.stddev();
           covariance.middleCols(first, size) = block.covariance;
@@ -95,19 +105,14 @@ Prediction predict(const PyPosterior& self, const py::object& data, const ViewAr
         }
       } catch (const InputError&) {
         // once more, to name the state by its number among all
-        static_cast<void>(posterior.mean(at.view, x.leftCols(first + size), n_threads));
+        static_cast<void>(posterior.mean(view, x.leftCols(first + size), n_threads));
         throw;
       }
     });
     if (PyErr_CheckSignals() != 0) throw py::error_already_set();
   }
-  VectorXd distance;
-  {
-    const py::gil_scoped_release release;
-    distance = posterior.distance_from_data(at.view, x, n_threads);
-  }
-  out.distance_from_data = to_vector(std::move(distance));
-  out.names = at.names;
+  out.distance_from_data = to_vector(unlocked([&] { return posterior.distance_from_data(view, x, n_threads); }));
+  out.names = asked.at.names;
   out.mean = to_rows(std::move(mean));
   if (!mean_only) {
     out.std = to_rows(std::move(stddev));
@@ -122,14 +127,9 @@ py::array asked_for(const std::optional<py::array>& values) {
 }
 
 py::tuple joint(const PyPosterior& self, const py::object& data, const ViewArguments& arguments, const py::object& columns) {
-  const ViewRequest request = view_request(arguments);
-  const PredictedView at = predicted_view(self.file, self.posterior.prior(), request);
-  const States states(data, at.prior, at.view, *at.model, at.actuators, columns);
+  const Asked asked(self, view_request(arguments), data, columns);
   const Posterior posterior = self.posterior;
-  Posterior::Joint result = states.named([&] {
-    const py::gil_scoped_release release;
-    return posterior.joint(at.view, states.matrix());
-  });
+  Posterior::Joint result = asked.unlocked_and_named([&] { return posterior.joint(asked.at.view, asked.states.matrix()); });
   const Index size = result.mean.size();
   return py::make_tuple(to_vector(std::move(result.mean)), to_rows(std::move(result.covariance.reshaped(size, size))));
 }
@@ -137,15 +137,12 @@ py::tuple joint(const PyPosterior& self, const py::object& data, const ViewArgum
 py::array sample(const PyPosterior& self, const py::object& data, int n_samples, std::uint64_t seed,
                  const ViewArguments& arguments, const py::object& columns) {
   require_at_least(1, n_samples, "n_samples");
-  const ViewRequest request = view_request(arguments);
-  const PredictedView at = predicted_view(self.file, self.posterior.prior(), request);
-  const States states(data, at.prior, at.view, *at.model, at.actuators, columns);
+  const Asked asked(self, view_request(arguments), data, columns);
   const Posterior posterior = self.posterior;
-  MatrixXd samples = states.named([&] {
-    const py::gil_scoped_release release;
-    return posterior.sample({{at.view, states.matrix()}}, n_samples, seed);
+  MatrixXd samples = asked.unlocked_and_named([&] {
+    return posterior.sample({{asked.at.view, asked.states.matrix()}}, n_samples, seed);
   });
-  const Index d = at.view.size(), n = states.matrix().cols();
+  const Index d = asked.at.view.size(), n = asked.states.matrix().cols();
   return to_rows(std::move(samples)).attr("reshape")(n_samples, n, d);
 }
 
@@ -153,14 +150,11 @@ py::array sample(const PyPosterior& self, const py::object& data, int n_samples,
 py::tuple potential_of(const PyPosterior& self, const py::object& data, const std::string& latent, const py::object& columns) {
   const Prior& prior = self.posterior.prior();
   const LatentRange range = latents_called(prior, latent, "`latent`");
-  const PredictedView at = predicted_view(self.file, prior, ViewRequest());
-  const States states(data, at.prior, at.view, *at.model, at.actuators, columns);
-  if (states.matrix().cols() == 0) return py::make_tuple(to_vector(VectorXd()), to_vector(VectorXd()));
+  const Asked asked(self, ViewRequest(), data, columns);
+  const auto x = asked.states.matrix();
+  if (x.cols() == 0) return py::make_tuple(to_vector(VectorXd()), to_vector(VectorXd()));
   const Posterior posterior = self.posterior;
-  Posterior::Potential energy = states.named([&] {
-    const py::gil_scoped_release release;
-    return posterior.potential(range.first, states.matrix(), states.matrix().col(0));
-  });
+  Posterior::Potential energy = asked.unlocked_and_named([&] { return posterior.potential(range.first, x, x.col(0)); });
   return py::make_tuple(to_vector(std::move(energy.mean)), to_vector(std::move(energy.stddev)));
 }
 
@@ -174,7 +168,7 @@ struct Inputs {
 
 Inputs inverse_dynamics_of(const PyPosterior& self, const py::object& data, const py::object& accelerations,
                            const std::vector<std::string>& outputs, const PySystem* system, const py::object& columns) {
-  const FitSystem at = system_of(self.file, self.posterior.prior(), system == nullptr ? nullptr : system->model);
+  const FitSystem at = system_of(self.file, self.posterior.prior(), model_of(system));
   const System& there = *at.model->system;
   WantedMotion wanted;
   if (is_array(data)) {
@@ -221,14 +215,10 @@ void add_inputs(py::module_& module) {
 
 Evaluation evaluate_posterior(const PyPosterior& self, const py::object& data, const PySystem* system,
                               const std::vector<std::string>& outputs, const py::object& columns, int n_threads) {
-  const EvaluateRequest request{outputs, system == nullptr ? nullptr : system->model, columns_argument(columns), n_threads};
+  const EvaluateRequest request{outputs, model_of(system), columns_argument(columns), n_threads};
   const CsvTable table = to_table(data, "data");
   const Posterior posterior = self.posterior;
-  EvaluateOutcome outcome;
-  {
-    const py::gil_scoped_release release;
-    outcome = evaluate(self.file, posterior, table, request);
-  }
+  EvaluateOutcome outcome = unlocked([&] { return evaluate(self.file, posterior, table, request); });
   tell(outcome.notes);
   return std::move(outcome.evaluation);
 }
@@ -240,13 +230,8 @@ py::tuple shoot_posterior(const PyPosterior& self, const py::object& data, std::
   const CsvTable table = to_table(data, "data", CsvTable::Keep::text);
   FitFile file = self.file;
   file.take_data(self.posterior);
-  ShootOutcome shot;
-  std::optional<Posterior> posterior;
-  {
-    const py::gil_scoped_release release;
-    shot = shoot(file, table, request);
-    posterior = shot.fit.posterior();
-  }
+  ShootOutcome shot = unlocked([&] { return shoot(file, table, request); });
+  Posterior posterior = unlocked([&] { return shot.fit.posterior(); });
   tell(shot.notes);
   py::dict parameters, rms;
   for (const ShotParameter& one : shot.parameters) {
@@ -260,7 +245,7 @@ py::tuple shoot_posterior(const PyPosterior& self, const py::object& data, std::
   shot.fit.observations.clear();
   py::dict report("parameters"_a = parameters, "rms"_a = rms, "duration"_a = shot.duration, "stretches"_a = shot.n_stretches,
                   "iterations"_a = shot.iterations, "converged"_a = shot.converged);
-  return py::make_tuple(PyPosterior{std::move(shot.fit), std::move(*posterior), {}}, report);
+  return py::make_tuple(PyPosterior{std::move(shot.fit), std::move(posterior), {}}, report);
 }
 
 // ---------------------------------------------------------------- data that grow
@@ -291,181 +276,6 @@ void update_with(PyPosterior& self, const py::object& data, const std::vector<st
   self.posterior = std::move(next);
 }
 
-// ---------------------------------------------------------------- motion
-
-struct Motion {
-  Trajectory trajectory;
-  std::optional<MotionUncertainty> uncertainty;
-  std::shared_ptr<const System> system;
-};
-
-MotionStart start_argument(const py::object& start, const System& system) {
-  if (is_array(start)) {
-    const auto values = vector_argument(start, 2 * system.nq(), "start");
-    return VectorXd(Eigen::Map<const VectorXd>(values.data(), 2 * system.nq()));
-  }
-  try {
-    return start.cast<std::map<std::string, double>>();
-  } catch (const py::cast_error&) {
-    throw py::type_error(
-        fmt::format("start: expected a dict of names to numbers, or all of q and dq, got {}", std::string(py::repr(start))));
-  }
-}
-
-SimulateRequest simulate_request(const System& system, const py::object& start, const py::object& times, const py::object& inputs,
-                                 const py::dict& keywords) {
-  SimulateRequest request;
-  read_keywords("simulate", keywords, options(request));
-  request.start = start_argument(start, system);
-  const auto points = vector_argument(times, "times");
-  request.times = Eigen::Map<const VectorXd>(points.data(), points.size());
-  if (!inputs.is_none()) request.inputs = to_table(inputs, "inputs");
-  return request;
-}
-
-/// Motions one after the other; Ctrl-C ends them.
-std::vector<Motion> run_motions(const SimulateJob& job, const std::shared_ptr<const System>& system) {
-  tell(job.notes);
-  std::atomic<bool> stop = false;
-  std::exception_ptr raised;
-  std::vector<Motion> motions;
-  try {
-    for (Trajectory& trajectory : run_interruptibly([&] { return run_simulation(job, &stop); }, stop, raised, [] {})) {
-      motions.push_back({std::move(trajectory), std::nullopt, system});
-    }
-  } catch (const SimulationStopped&) {
-  }
-  if (raised) std::rethrow_exception(raised);
-  return motions;
-}
-
-Motion simulate_model(const PySystem& system, const py::object& start, const py::object& times, const py::object& inputs,
-                      const py::kwargs& keywords) {
-  const SimulateRequest request = simulate_request(system.system(), start, times, inputs, keywords);
-  return run_motions(prepare_simulation(*system.model, request), system.model->system).front();
-}
-
-py::object simulate_posterior(const PyPosterior& self, const py::object& start, const py::object& times, const py::object& inputs,
-                              const PySystem* system, const py::kwargs& keywords) {
-  const SimulateRequest request = simulate_request(self.system(), start, times, inputs, keywords);
-  const Posterior posterior = self.posterior;
-  const FitSystem asked = system_of(self.file, posterior.prior(), system == nullptr ? nullptr : system->model);
-  const SimulateJob job = [&] {
-    const py::gil_scoped_release release;
-    return prepare_simulation(asked, posterior, request);
-  }();
-  std::vector<Motion> motions = run_motions(job, system == nullptr ? self.file.model.system : system->model->system);
-  if (request.n_samples) return py::cast(std::move(motions));
-  {
-    const py::gil_scoped_release release;
-    motions[0].uncertainty = motion_uncertainty(posterior, motions[0].trajectory, asked.other_system);
-  }
-  return py::cast(std::move(motions[0]));
-}
-
-std::string simulate_documentation(const std::string& first, const std::string& last, const std::string& result) {
-  SimulateRequest request;
-  return signature("simulate",
-                   first + "start: Mapping[str, float] | ArrayLike, times: ArrayLike, inputs: object = None, " + last + "*,",
-                   options(request), "", result);
-}
-
-// ---------------------------------------------------------------- the next experiment
-
-/// gp2.Excitation
-struct PyExcitation {
-  Excitation found;
-  Motion motion;
-  std::shared_ptr<const System> system;
-};
-
-Limits limits_argument(const py::object& limits, const std::string& name) {
-  if (limits.is_none()) return {};
-  try {
-    return limits.cast<Limits>();
-  } catch (const py::cast_error&) {
-    throw py::type_error(
-        fmt::format("{}: expected a dict of names to (lowest, highest), got {}", name, std::string(py::repr(limits))));
-  }
-}
-
-PyExcitation excite_posterior(const PyPosterior& self, const py::object& start, double duration, const py::object& inputs_within,
-                              const py::object& within, const PySystem* system, const py::kwargs& keywords) {
-  ExciteRequest request;
-  read_keywords("excite", keywords, options(request));
-  request.start = start_argument(start, system == nullptr ? self.system() : *system->model->system);
-  request.duration = duration;
-  request.inputs_within = limits_argument(inputs_within, "inputs_within");
-  request.within = limits_argument(within, "within");
-  const Posterior posterior = self.posterior;
-  const FitSystem driven = system_of(self.file, posterior.prior(), system == nullptr ? nullptr : system->model);
-  const auto search = [&](const std::atomic<bool>* stop) {
-    Excitation found = excite(driven, posterior, self.file.report.hyperparameters, request, {}, stop);
-    MotionUncertainty uncertainty = motion_uncertainty(posterior, found.motion, driven.other_system);
-    return PyExcitation{found, {found.motion, std::move(uncertainty), driven.model->system}, driven.model->system};
-  };
-  std::atomic<bool> stop = false;
-  std::exception_ptr raised;
-  std::optional<PyExcitation> out;
-  try {
-    out = run_interruptibly([&] { return search(&stop); }, stop, raised, [] {});
-  } catch (const NumericalError&) {
-    if (!raised) throw;
-  }
-  if (raised) std::rethrow_exception(raised);
-  tell(out->found.notes);
-  return std::move(*out);
-}
-
-py::dict known_dict(const std::vector<Excitation::Known>& known) {
-  using namespace py::literals;
-  py::dict out;
-  for (const Excitation::Known& one : known) {
-    out[py::str(one.name)] = py::dict("now"_a = one.now, "after"_a = one.after, "random"_a = one.random);
-  }
-  return out;
-}
-
-py::dict limits_dict(const std::vector<Excitation::LimitUse>& limits) {
-  using namespace py::literals;
-  py::dict out;
-  for (const Excitation::LimitUse& one : limits) {
-    out[py::str(one.name)] = py::dict("lower"_a = one.lower, "upper"_a = one.upper, "lowest"_a = one.lowest,
-                                      "highest"_a = one.highest, "share"_a = one.share);
-  }
-  return out;
-}
-
-void add_excitation(py::module_& module) {
-  py::class_<PyExcitation>(module, "Excitation", "A motion to drive a system along, and what measuring it is expected to tell.")
-      .def_readonly("motion", &PyExcitation::motion, "As the fit predicts it.")
-      .def_property_readonly(
-          "table", [](const PyExcitation& e) { return as_table(e.found.motion, *e.system, "excitation"); },
-          "t, q, dq, ddq and the inputs: simulate takes it as inputs.")
-      .def_property_readonly(
-          "parameters", [](const PyExcitation& e) { return known_dict(e.found.parameters); },
-          "Standard deviation of each estimated parameter: now, after this motion, after a random one (median).")
-      .def_property_readonly(
-          "accelerations", [](const PyExcitation& e) { return known_dict(e.found.accelerations); },
-          "The same of accelerations, root mean square where motions within the limits go; of target='accelerations'.")
-      .def_property_readonly(
-          "limits", [](const PyExcitation& e) { return limits_dict(e.found.limits); },
-          "Of each limit: lower, upper; lowest and highest of the motion; the share that it uses.")
-      .def_property_readonly(
-          "factor", [](const PyExcitation& e) { return e.found.factor; }, "By what factor deviations fall.")
-      .def_property_readonly(
-          "random_factor", [](const PyExcitation& e) { return e.found.random_factor; }, "By a random motion (median).")
-      .def_property_readonly(
-          "highest_frequency", [](const PyExcitation& e) { return e.found.highest_frequency; }, "Of inputs [Hz].")
-      .def_property_readonly(
-          "leaves_data", [](const PyExcitation& e) { return e.found.leaves_data; },
-          "When the motion first is far from the data [s]; None: never.")
-      .def_property_readonly("n_motions", [](const PyExcitation& e) { return e.found.n_motions; })
-      .def_property_readonly("n_random", [](const PyExcitation& e) { return e.found.n_random; })
-      .def_property_readonly("n_failed", [](const PyExcitation& e) { return e.found.n_failed; })
-      .def_property_readonly("seconds", [](const PyExcitation& e) { return e.found.seconds; });
-}
-
 // ---------------------------------------------------------------- files
 
 // what is Python functions in a fit is that of `system`
@@ -480,168 +290,6 @@ void save(const PyPosterior& self, const py::object& path) {
   FitFile file = self.file;
   file.take_data(self.posterior);
   file.write(path_argument(path));
-}
-
-// ---------------------------------------------------------------- report
-
-py::list actuators_of(const FitReport& self) {
-  py::list out;
-  for (const ActuatorEstimate& one : self.actuators) {
-    py::dict entry;
-    entry["name"] = one.name;
-    entry["value"] = one.value;
-    entry["stddev"] = one.stddev;
-    entry["lower"] = one.lower;
-    entry["upper"] = one.upper;
-    out.append(entry);
-  }
-  return out;
-}
-
-py::object inducing_of(const FitReport& self) {
-  if (!self.inducing) return py::none();
-  py::dict entry;
-  entry["n_variables"] = self.inducing->n_variables;
-  entry["left_out"] = to_vector(self.inducing->left_out);
-  entry["n_start"] = self.inducing->n_start;
-  return entry;
-}
-
-py::list distrusted_values(const FitReport& self) {
-  py::list list;
-  for (const DistrustedValue& value : self.distrusted) {
-    py::dict entry;
-    entry["log"] = value.group;
-    entry["row"] = value.row;
-    entry["state"] = value.state;
-    entry["distance"] = value.distance;
-    entry["noise_factor"] = value.noise_factor;
-    list.append(entry);
-  }
-  return list;
-}
-
-py::dict standard_errors(const FitReport& self) {
-  py::dict errors;
-  for (std::size_t k = 0; (self.uncertainty || self.draws) && k < self.hyperparameters.size(); ++k) {
-    const Hyperparameter& h = self.hyperparameters[k];
-    if (h.is_system_parameter()) errors[py::str(h.name)] = parameter_uncertainty(self, k).stddev;
-  }
-  return errors;
-}
-
-double correlation(const FitReport& self, const std::string& a, const std::string& b) {
-  const auto index = [&](const std::string& name) {
-    for (std::size_t k = 0; k < self.hyperparameters.size(); ++k) {
-      if (self.hyperparameters[k].name == name) return k;
-    }
-    throw py::key_error(name);
-  };
-  return parameter_correlation(self, index(a), index(b));
-}
-
-// name -> what the draws say of a hyperparameter; None where there are none
-py::object draws_of(const FitReport& self) {
-  if (!self.draws) return py::none();
-  py::dict all;
-  for (std::size_t h = 0; h < self.hyperparameters.size(); ++h) {
-    const auto k = static_cast<Eigen::Index>(h);
-    py::dict one;
-    one["values"] = to_vector(Eigen::VectorXd(self.draws->values.row(k)));
-    one["mean"] = self.draws->mean[k];
-    one["std"] = self.draws->stddev[k];
-    one["interval95"] = py::make_tuple(self.draws->lower[k], self.draws->upper[k]);
-    one["r_hat"] = self.draws->r_hat[k];
-    one["effective_size"] = self.draws->effective_size[k];
-    all[py::str(self.hyperparameters[h].name)] = one;
-  }
-  return all;
-}
-
-double value_of(const FitReport& self, const std::string& name) {
-  for (const Hyperparameter& h : self.hyperparameters) {
-    if (h.name == name) return h.value;
-  }
-  throw py::key_error(name);
-}
-
-std::string text_of(const FitReport& self) {
-  std::string text = fmt::format("negative log likelihood {:.6f}\n{} after {} iterations ({} restarts, best: {}), {:.2f} s",
-                                 self.negative_log_likelihood, self.termination, self.iterations, self.restarts.size(),
-                                 self.best_restart + 1, self.seconds);
-  for (std::size_t k = 0; k < self.hyperparameters.size(); ++k) {
-    const Hyperparameter& h = self.hyperparameters[k];
-    const double stddev = h.is_system_parameter() ? parameter_uncertainty(self, k).stddev : std::nan("");
-    const std::string error = std::isnan(stddev) ? "" : fmt::format(" ± {:.2g}", stddev);
-    text += fmt::format("\n  {:<34} {:>13.6g}{}   [{:.3g}, {:.3g}]{}", h.name, h.value, error, h.lower, h.upper,
-                        h.is_fixed()   ? "   held"
-                        : h.at_bound() ? "   at its bound"
-                                       : "");
-  }
-  return text;
-}
-
-void define_report(py::class_<FitReport>& report) {
-  using namespace py::literals;
-  report.def_readonly("hyperparameters", &FitReport::hyperparameters, "Fitted values, list of Hyperparameter.")
-      .def_readonly("negative_log_likelihood", &FitReport::negative_log_likelihood,
-                    "-log p(y), physical units, all constants, without hyper-prior.")
-      .def_readonly("objective", &FitReport::objective, "With hyper-priors: what was minimised.")
-      .def_readonly("converged", &FitReport::converged)
-      .def_readonly("termination", &FitReport::termination, "Which inequality stopped the optimiser.")
-      .def_readonly("iterations", &FitReport::iterations, "Of the best restart.")
-      .def_readonly("best_restart", &FitReport::best_restart)
-      .def_readonly("restarts", &FitReport::restarts, "How each run ended, list of RestartReport.")
-      .def_property_readonly(
-          "distrusted", &distrusted_values,
-          "Values that a robust fit distrusts, the farthest first: `log` and `state` count from 0, `row` among the observed.")
-      .def_property_readonly(
-          "actuators", &actuators_of,
-          "Delays and lags of inputs that were estimated, in s: dicts of name, value, stddev (nan at a bound, inf "
-          "where the data do not determine it), lower and upper.")
-      .def_property_readonly(
-          "inducing", &inducing_of,
-          "Of a fit through inducing points: n_variables, left_out, of each latent what they leave of its variance at all "
-          "rows, in units of the noise (twice the nats by which the likelihood is too low, about), and n_start, the rows "
-          "that hyperparameters were fitted to before all; else None.")
-      .def_readonly("seconds", &FitReport::seconds)
-      .def_property_readonly("standard_errors", &standard_errors,
-                             "Of estimated parameters, by name: inf where the data do not determine one, nan where it is at a "
-                             "bound. Of the draws, where "
-                             "all that are estimated were drawn.")
-      .def_property_readonly(
-          "draws", &draws_of,
-          "Of hyperparameters='integrate': by name a dict of values (one for each component of the posterior), mean, "
-          "std, interval95, r_hat and effective_size; else None.")
-      .def("correlation", &correlation, "a"_a, "b"_a, "Of the errors of two hyperparameters; nan where one is not determined.")
-      .def("__getitem__", &value_of)
-      .def("__repr__", &text_of);
-}
-
-void add_reports(py::module_& module) {
-  py::class_<Hyperparameter>(module, "Hyperparameter", "One number that training adjusts, in physical units.")
-      .def_readonly("name", &Hyperparameter::name)
-      .def_readonly("unit", &Hyperparameter::unit)
-      .def_readonly("value", &Hyperparameter::value)
-      .def_readonly("lower", &Hyperparameter::lower)
-      .def_readonly("upper", &Hyperparameter::upper)
-      .def_property_readonly("at_bound", &Hyperparameter::at_bound)
-      .def("__repr__", [](const Hyperparameter& h) {
-        return fmt::format("<{} = {:.6g} in [{:.3g}, {:.3g}]{}>", h.name, h.value, h.lower, h.upper,
-                           h.is_fixed()   ? ", held"
-                           : h.at_bound() ? ", at its bound"
-                                          : "");
-      });
-  py::class_<RestartReport>(module, "RestartReport", "How one run of the optimiser ended.")
-      .def_readonly("objective", &RestartReport::objective)
-      .def_readonly("negative_log_likelihood", &RestartReport::negative_log_likelihood)
-      .def_readonly("iterations", &RestartReport::iterations)
-      .def_readonly("evaluations", &RestartReport::evaluations)
-      .def_readonly("failed_evaluations", &RestartReport::failed_evaluations)
-      .def_readonly("converged", &RestartReport::converged)
-      .def_readonly("termination", &RestartReport::termination);
-  py::class_<FitReport> report(module, "FitReport", "How a fit went; report['name'] is a fitted hyperparameter.");
-  define_report(report);
 }
 
 // ---------------------------------------------------------------- classes of results
@@ -710,52 +358,6 @@ void add_evaluation(py::module_& module) {
         return fmt::format("<gp2.Evaluation at {} points: {}; nrmse {:.4g}; max |A ddq - b| {:.2g}>", e.n, rmse, e.nrmse,
                            e.max_constraint_error_fitted);
       });
-}
-
-void add_motion(py::module_& module) {
-  py::class_<Motion>(module, "Motion", "A motion at the times asked for.")
-      .def_property_readonly(
-          "t", [](const Motion& m) { return to_vector(m.trajectory.times); }, "(n) [s]")
-      .def_property_readonly(
-          "states", [](const Motion& m) { return to_rows(m.trajectory.states); }, "(n, len(state_names))")
-      .def_property_readonly(
-          "q", [](const Motion& m) { return to_rows(m.trajectory.states.topRows(m.trajectory.accelerations.rows())); }, "(n, nq)")
-      .def_property_readonly(
-          "dq",
-          [](const Motion& m) {
-            const Index nq = m.trajectory.accelerations.rows();
-            return to_rows(m.trajectory.states.middleRows(nq, nq));
-          },
-          "(n, nq)")
-      .def_property_readonly(
-          "ddq", [](const Motion& m) { return to_rows(m.trajectory.accelerations); }, "(n, nq)")
-      .def_property_readonly(
-          "std",
-          [](const Motion& m) -> py::object {
-            if (!m.uncertainty) return py::none();
-            return to_rows(m.uncertainty->stddev);
-          },
-          "Of ddq along the mean's motion (n, nq); None of a model's own motion or a sample's.")
-      .def_property_readonly(
-          "distance_from_data",
-          [](const Motion& m) -> py::object {
-            if (!m.uncertainty) return py::none();
-            return to_vector(m.uncertainty->distance);
-          },
-          "As of Prediction, along the mean's motion (n); None as std.")
-      .def_property_readonly(
-          "multipliers", [](const Motion& m) { return to_rows(m.trajectory.records); }, "lambda of the constraints (n, nc)")
-      .def_property_readonly("max_position_drift", [](const Motion& m) { return m.trajectory.max_position_drift; })
-      .def_property_readonly("max_velocity_drift", [](const Motion& m) { return m.trajectory.max_velocity_drift; })
-      .def_property_readonly(
-          "n_lower_rank", [](const Motion& m) { return m.trajectory.lower_rank.states.size(); },
-          "Times at which the constraints have a lower rank than at others.")
-      .def_property_readonly(
-          "table", [](const Motion& m) { return as_table(m.trajectory, *m.system, "motion"); },
-          "t, q, dq, ddq and the inputs: fit takes it as a log, simulate as inputs.")
-      .def_property_readonly("steps", [](const Motion& m) { return m.trajectory.steps; })
-      .def_property_readonly("rejected_steps", [](const Motion& m) { return m.trajectory.rejected_steps; })
-      .def_property_readonly("evaluations", [](const Motion& m) { return m.trajectory.evaluations; });
 }
 
 // ---------------------------------------------------------------- methods of a posterior
@@ -918,61 +520,6 @@ void define_evaluate_and_update(py::class_<PyPosterior>& posterior) {
           "The prior under the same hyperparameters.");
 }
 
-/// These have their keywords in signatures of our own; the setting for that ends with this function.
-void define_simulate(py::class_<PyPosterior>& posterior, py::module_& module) {
-  using namespace py::literals;
-  SimulateRequest motion;
-  const std::string motion_options = documentation(options(motion));
-  py::options own_signature;
-  own_signature.disable_function_signatures();
-  posterior.def("simulate", &simulate_posterior, "start"_a, "times"_a, "inputs"_a = py::none(), "system"_a = nullptr,
-                (simulate_documentation("self: Posterior, ", "system: System | None = None, ", "Motion | list[Motion]") + R"(
-Integrate the mean's motion, or n_samples motions, each of one function drawn from the posterior.
-
-start   {"q1": 0.4, "dq1": 1.0}: what is not named follows from the constraints; or all of q and dq
-times   at which states are wanted (n) [s]; the first is the start
-inputs  a table with t and every input, linear in between, that covers the motion; default: zero
-system  another System with the same coordinates, inputs and latents: its motion
-
-)" + motion_options +
-                 R"(
-Returns a Motion, or with n_samples a list of them. Raises NumericalError, with the time, when it cannot go on.)")
-                    .c_str());
-  module.def("simulate", &simulate_model, "system"_a, "start"_a, "times"_a, "inputs"_a = py::none(),
-             (simulate_documentation("system: System, ", "", "Motion") +
-              "\nIntegrate a system by its own force and [truth]. As Posterior.simulate.")
-                 .c_str());
-}
-
-void define_excite(py::module_& module) {
-  using namespace py::literals;
-  ExciteRequest request;
-  py::options own_signature;
-  own_signature.disable_function_signatures();
-  module.def(
-      "excite", &excite_posterior, "posterior"_a, "start"_a, "duration"_a, "inputs_within"_a, "within"_a = py::none(),
-      "system"_a = nullptr,
-      (signature(
-           "excite",
-           "posterior: Posterior, start: Mapping[str, float] | ArrayLike, duration: float, inputs_within: Mapping[str, "
-           "tuple[float, float]], within: Mapping[str, tuple[float, float]] | None = None, system: System | None = None, *,",
-           options(request), "", "Excitation") +
-       R"(
-Find the motion, within limits, that measuring will tell most of what is not known: which experiment next.
-
-start          as of Posterior.simulate
-duration       [s]
-inputs_within  {"u": (-5, 5)}: lowest and highest value of every input
-within         {"q": (-1, 1), "dq": (-3, 3)}: of coordinates, velocities and accelerations; default: they may go anywhere
-system         another System with the same coordinates, inputs and latents, which is driven
-
-)" + documentation(options(request)) +
-       R"(
-Returns an Excitation. Same seed, same motion, for any number of threads; Ctrl-C ends the search.
-Raises InputError for limits that do not fit, or that no motion keeps; NumericalError when none could be integrated.)")
-          .c_str());
-}
-
 std::vector<std::string> export_posterior(const PyPosterior& self, const py::object& folder, const PySystem* system,
                                           const py::kwargs& keywords) {
   ExportRequest request;
@@ -980,11 +527,7 @@ std::vector<std::string> export_posterior(const PyPosterior& self, const py::obj
   if (system != nullptr) request.view.system = system->model;
   const std::filesystem::path to = path_argument(folder);
   const Posterior posterior = self.posterior;
-  ExportOutcome outcome;
-  {
-    const py::gil_scoped_release release;
-    outcome = export_fit(self.file, posterior, request);
-  }
+  const ExportOutcome outcome = unlocked([&] { return export_fit(self.file, posterior, request); });
   tell(outcome.notes);
   std::vector<std::string> written;
   for (const auto& [name, text] : outcome.files) {
@@ -1014,7 +557,7 @@ in a folder that exists.
 
 void add_posterior(py::module_& module) {
   // a class comes before the functions that return it, for their signatures to name it
-  add_reports(module);
+  add_fit_report(module);
   add_prediction(module);
   add_inputs(module);
   add_evaluation(module);

@@ -140,7 +140,7 @@ class PyPredictor {
 PyPredictor make(const PyPosterior& posterior, const std::string& quantity, const PySystem* system,
                  const std::optional<std::string>& latent, const std::optional<double>& dt, bool std, bool jacobian,
                  const std::string& storage) {
-  const ViewRequest request{quantity_argument(quantity), dt, latent, system == nullptr ? nullptr : system->model};
+  const ViewRequest request{quantity_argument(quantity), dt, latent, model_of(system)};
   const View view = predicted_view(posterior.file, posterior.posterior.prior(), request).view;
   return {posterior, view, {std, jacobian, storage_argument(storage)}};
 }
@@ -202,7 +202,7 @@ class PySolver {
 
 PySolver make_solver(const PyPosterior& posterior, const std::vector<std::string>& outputs, const PySystem* system, bool cov,
                      const std::string& storage) {
-  const FitSystem at = system_of(posterior.file, posterior.posterior.prior(), system == nullptr ? nullptr : system->model);
+  const FitSystem at = system_of(posterior.file, posterior.posterior.prior(), model_of(system));
   View view{View::Quantity::constrained_acceleration, acceleration_rows(*at.model->system, outputs, "`outputs`")};
   view.other_system = at.other_system;
   return {posterior, view, {cov, storage_argument(storage)}};

@@ -22,15 +22,13 @@ std::shared_ptr<const Model> model_argument(const py::object& system) {
 Report collected(const py::object& fit, const ReportRequest& request, std::vector<std::string>& notes) {
   if (!py::isinstance<PyPosterior>(fit)) {
     const std::filesystem::path path = path_argument(fit);
-    const py::gil_scoped_release release;
-    return collect_report(path, request, notes);
+    return unlocked([&] { return collect_report(path, request, notes); });
   }
   const auto& self = fit.cast<const PyPosterior&>();
   const Posterior posterior = self.posterior;
   FitFile file = self.file;
   file.take_data(posterior);
-  const py::gil_scoped_release release;
-  return collect_report(std::move(file), posterior, request, notes);
+  return unlocked([&] { return collect_report(std::move(file), posterior, request, notes); });
 }
 
 // each fit, under the name it has on the page
@@ -69,8 +67,7 @@ std::string plot_fit(const py::object& fit, const py::object& path, const py::kw
   PlotRequest request;
   read_keywords("plot", keywords, options(request));
   const auto picture = [&request](const Posterior& posterior, const Model& model) {
-    const py::gil_scoped_release release;
-    return plot(learned_curve(posterior, request), model);
+    return unlocked([&] { return plot(learned_curve(posterior, request), model); });
   };
   std::string svg;
   if (py::isinstance<PyPosterior>(fit)) {
@@ -92,11 +89,7 @@ py::dict curve_of(const PyPosterior& self, const py::kwargs& keywords) {
   PlotRequest request;
   read_keywords("plot_learned", keywords, options(request));
   const Posterior posterior = self.posterior;
-  LearnedCurve curve;
-  {
-    const py::gil_scoped_release release;
-    curve = learned_curve(posterior, request);
-  }
+  const LearnedCurve curve = unlocked([&] { return learned_curve(posterior, request); });
   const LearnedForce& force = curve.force;
   const std::string& name = force.names[static_cast<std::size_t>(curve.row)];
   return py::dict("latent"_a = force.latent, "along"_a = self.file.model.labelled(force.along),
@@ -109,7 +102,7 @@ py::dict compared(const PyPosterior& self, const py::object& data, const PySyste
   using namespace py::literals;
   ReportRequest request;
   request.data = to_table(data, "data");
-  request.system = system == nullptr ? nullptr : system->model;
+  request.system = model_of(system);
   request.columns = columns_argument(columns);
   const Posterior posterior = self.posterior;
   std::vector<std::string> notes;

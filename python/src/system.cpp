@@ -127,11 +127,7 @@ py::tuple derive_table(const PySystem& self, const py::object& data, const py::o
   read_keywords("derive", keywords, options(asked));
   if (!like.is_none()) asked.like = to_table(like, "like", CsvTable::Keep::text);
   const CsvTable table = to_table(data, "data", CsvTable::Keep::text);
-  DerivedData derived;
-  {
-    const py::gil_scoped_release release;
-    derived = derive(*self.model, table, asked);
-  }
+  const DerivedData derived = unlocked([&] { return derive(*self.model, table, asked); });
   return py::make_tuple(as_table(derived, self.system(), "derived data"), report_of(derived, self.system()));
 }
 
@@ -139,11 +135,7 @@ py::list check_system_and_log(const PySystem& self, const py::object& data, cons
   std::optional<CsvTable> table;
   if (!data.is_none()) table = to_table(data, "data");
   const CheckOptions options{columns_argument(columns)};
-  std::vector<Finding> findings;
-  {
-    const py::gil_scoped_release release;
-    findings = check(*self.model, table ? &*table : nullptr, options);
-  }
+  std::vector<Finding> findings = unlocked([&] { return check(*self.model, table ? &*table : nullptr, options); });
   py::list list;
   for (Finding& finding : findings) {
     finding.text = with_keywords(finding.text);

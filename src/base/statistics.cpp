@@ -2,7 +2,8 @@
 
 #include <algorithm>
 #include <cmath>
-#include <limits>
+
+#include "base/not_a_number.hpp"
 
 namespace gp2 {
 
@@ -18,8 +19,7 @@ VectorXd over_measured(const Eigen::Ref<const MatrixXd>& values, const Of& of) {
   VectorXd out(values.rows());
   for (Index k = 0; k < out.size(); ++k) {
     const std::vector<double> some = measured_entries(values, k);
-    out[k] = some.empty() ? std::numeric_limits<double>::quiet_NaN()
-                          : of(VectorXd(Eigen::Map<const VectorXd>(some.data(), std::ssize(some))));
+    out[k] = some.empty() ? not_a_number : of(VectorXd(Eigen::Map<const VectorXd>(some.data(), std::ssize(some))));
   }
   return out;
 }

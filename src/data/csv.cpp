@@ -4,7 +4,6 @@
 #include <array>
 #include <charconv>
 #include <cmath>
-#include <limits>
 #include <numeric>
 #include <optional>
 #include <set>
@@ -14,6 +13,7 @@
 #include <fmt/format.h>
 
 #include "base/checksum.hpp"
+#include "base/not_a_number.hpp"
 #include "gp2/error.hpp"
 
 namespace gp2 {
@@ -58,8 +58,6 @@ std::optional<std::string> take_cell(std::string_view& line) {
 // a cell to show in a message
 std::string shown(const std::string& cell) { return cell.size() <= 60 ? cell : cell.substr(0, 57) + "..."; }
 
-constexpr double nan = std::numeric_limits<double>::quiet_NaN();
-
 // What from_chars makes of a whole cell.
 struct Parsed {
   double value = 0;
@@ -83,7 +81,7 @@ Parsed parse_number(std::string_view cell) {
 // the number in a cell; NaN when it holds none
 double number_in(std::string_view cell) {
   const Parsed parsed = parse_number(cell);
-  return parsed.is_number() ? parsed.value : nan;
+  return parsed.is_number() ? parsed.value : not_a_number;
 }
 
 // throws the reason why a cell is no number
@@ -242,7 +240,7 @@ class CsvTable::Builder {
 
   // the cell at the front of `line`, which is left with what follows it
   void read_cell(std::string_view& line, std::size_t column) {
-    double value = nan;
+    double value = not_a_number;
     const char* const line_end = line.data() + line.size();
     const auto [end, error] = std::from_chars(line.data(), line_end, value);
     const bool is_plain = error == std::errc() && std::isfinite(value) && (end == line_end || *end == ',');
@@ -362,7 +360,7 @@ CsvTable CsvTable::from_columns(std::string name, std::vector<Column> columns) {
       if (columns[k].numbers.empty()) {
         content.texts.add(cell, columns[k].cells[row]);
       } else if (double& number = columns[k].numbers[row]; std::isinf(number)) {
-        content.texts.add(cell, shortest(std::exchange(number, nan)));
+        content.texts.add(cell, shortest(std::exchange(number, not_a_number)));
       }
     }
   }
@@ -536,14 +534,14 @@ double CsvTable::number(int row, int column) const {
   return value;
 }
 
-double CsvTable::number_or_empty(int row, int column) const { return is_empty(row, column) ? nan : number(row, column); }
+double CsvTable::number_or_empty(int row, int column) const { return is_empty(row, column) ? not_a_number : number(row, column); }
 
 double CsvTable::number_or_nan(int row, int column) const {
   const double value = content_->number(row, column);
   if (!std::isnan(value) || is_empty(row, column)) return value;
   const Parsed parsed = parse_number(cell(row, column));
   const bool is_gap = parsed.is_whole && parsed.error == std::errc() && !std::isfinite(parsed.value);
-  return is_gap ? nan : number(row, column);
+  return is_gap ? not_a_number : number(row, column);
 }
 
 }  // namespace gp2

@@ -1,11 +1,11 @@
 #include "gp2/data/log_reader.hpp"
 
 #include <algorithm>
-#include <limits>
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
+#include "base/not_a_number.hpp"
 #include "gp2/error.hpp"
 
 namespace gp2 {
@@ -124,8 +124,7 @@ MatrixXd LogReader::states_with_gaps(const std::vector<bool>& reads) { return re
 
 MatrixXd LogReader::read_states(const std::vector<bool>& reads, Number number) {
   const std::vector<std::string> names = system_.state_names();
-  MatrixXd states =
-      MatrixXd::Constant(static_cast<Index>(names.size()), table_.n_rows(), std::numeric_limits<double>::quiet_NaN());
+  MatrixXd states = MatrixXd::Constant(static_cast<Index>(names.size()), table_.n_rows(), not_a_number);
   for (std::size_t k = 0; k < names.size(); ++k) {
     if (!reads[k]) continue;
     const int column = require(names[k]);

@@ -1,6 +1,6 @@
 #pragma once
 
-#include "export/c_template.hpp"
+#include "export/fill_template.hpp"
 
 // Elementary functions in C that needs no library but for what IEEE 754 defines to the bit: sqrt, fabs, and frexp, ldexp, copysign,
 // floor, which are exact. So all compilers and machines compute the same, where sums and products are not contracted. Their

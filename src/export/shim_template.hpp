@@ -2,8 +2,20 @@
 
 #include <string_view>
 
-// Frames around the exported C, in the form of c_template.hpp. Conditions: stddev, jacobian, inputs, timed.
+// Frames around the exported C, in the form of fill_template.hpp. Conditions: stddev, jacobian, inputs, timed.
 namespace gp2::c_export {
+
+// What CasADi looks for by the name of a function.
+inline constexpr std::string_view casadi_declarations =
+    R"c(int @function@(const casadi_real **arg, casadi_real **res, casadi_int *iw, casadi_real *w, int mem);
+casadi_int @function@_n_in(void);
+casadi_int @function@_n_out(void);
+const char *@function@_name_in(casadi_int i);
+const char *@function@_name_out(casadi_int i);
+const casadi_int *@function@_sparsity_in(casadi_int i);
+const casadi_int *@function@_sparsity_out(casadi_int i);
+int @function@_work(casadi_int *sz_arg, casadi_int *sz_res, casadi_int *sz_iw, casadi_int *sz_w);
+)c";
 
 inline constexpr std::string_view casadi_template = R"c(/* @name@ as functions of CasADi (3.6 and later):
  *
@@ -63,14 +75,7 @@ static int set_work(casadi_int *sz_arg, casadi_int *sz_res, casadi_int *sz_iw, c
 
 /* ---------------------------------------------------------------- @name@ */
 
-int @name@(const casadi_real **arg, casadi_real **res, casadi_int *iw, casadi_real *w, int mem);
-casadi_int @name@_n_in(void);
-casadi_int @name@_n_out(void);
-const char *@name@_name_in(casadi_int i);
-const char *@name@_name_out(casadi_int i);
-const casadi_int *@name@_sparsity_in(casadi_int i);
-const casadi_int *@name@_sparsity_out(casadi_int i);
-int @name@_work(casadi_int *sz_arg, casadi_int *sz_res, casadi_int *sz_iw, casadi_int *sz_w);
+@declarations@
 
 int @name@(const casadi_real **arg, casadi_real **res, casadi_int *iw, casadi_real *w, int mem)
 {
@@ -92,95 +97,85 @@ int @name@_work(casadi_int *sz_arg, casadi_int *sz_res, casadi_int *sz_iw, casad
 {
   return set_work(sz_arg, sz_res, sz_iw, sz_w, 4, 1, WORK);
 }
-{jacobian}
-{jacobian}/* ---------------------------------------------------------------- jac_@name@(q, dq, t, u, out_mean) */
-{jacobian}
-{jacobian}static const casadi_int of_nothing[] = {@pattern_nothing@};
-{jacobian}static const casadi_int rows_by_coordinates[] = {@pattern_rows_q@};
-{jacobian}static const casadi_int rows_by_time[] = {@pattern_rows_t@};
-{jacobian}static const casadi_int rows_by_inputs[] = {@pattern_rows_u@};
-{jacobian}
-{jacobian}int jac_@name@(const casadi_real **arg, casadi_real **res, casadi_int *iw, casadi_real *w, int mem);
-{jacobian}casadi_int jac_@name@_n_in(void);
-{jacobian}casadi_int jac_@name@_n_out(void);
-{jacobian}const char *jac_@name@_name_in(casadi_int i);
-{jacobian}const char *jac_@name@_name_out(casadi_int i);
-{jacobian}const casadi_int *jac_@name@_sparsity_in(casadi_int i);
-{jacobian}const casadi_int *jac_@name@_sparsity_out(casadi_int i);
-{jacobian}int jac_@name@_work(casadi_int *sz_arg, casadi_int *sz_res, casadi_int *sz_iw, casadi_int *sz_w);
-{jacobian}
-{jacobian}int jac_@name@(const casadi_real **arg, casadi_real **res, casadi_int *iw, casadi_real *w, int mem)
-{jacobian}{
-{jacobian}  static const int first[] = {0, NQ, 2 * NQ, 2 * NQ + 1, NX}; /* columns of the Jacobian in each block */
-{jacobian}  casadi_real state[NX], mean[NR];
-{jacobian}  casadi_real *const jacobian = w + WORK;
-{jacobian}  (void)iw;
-{jacobian}  (void)mem;
-{jacobian}  if (!res[0] && !res[1] && !res[2] && !res[3]) return 0;
-{jacobian}  read_state(arg, state);
-{jacobian}  if (@name@_mean_and_jacobian(state, mean, jacobian, (@name@_workspace *)(void *)w) != @name@_OK) return 1;
-{jacobian}  for (int block = 0; block < 4; ++block) {
-{jacobian}    if (!res[block]) continue;
-{jacobian}    for (int i = NR * first[block]; i < NR * first[block + 1]; ++i) res[block][i - NR * first[block]] = jacobian[i];
-{jacobian}  }
-{jacobian}  return 0;
-{jacobian}}
-{jacobian}
-{jacobian}casadi_int jac_@name@_n_in(void) { return 5; }
-{jacobian}casadi_int jac_@name@_n_out(void) { return 4; }
-{jacobian}const char *jac_@name@_name_in(casadi_int i) { return i == 4 ? "out_mean" : @name@_name_in(i); }
-{jacobian}const char *jac_@name@_name_out(casadi_int i)
-{jacobian}{
-{jacobian}  static const char *const names[] = {"jac_mean_q", "jac_mean_dq", "jac_mean_t", "jac_mean_u"};
-{jacobian}  return i >= 0 && i < 4 ? names[i] : 0;
-{jacobian}}
-{jacobian}const casadi_int *jac_@name@_sparsity_in(casadi_int i) { return i == 4 ? of_nothing : @name@_sparsity_in(i); }
-{jacobian}const casadi_int *jac_@name@_sparsity_out(casadi_int i)
-{jacobian}{
-{jacobian}  static const casadi_int *const patterns[] = {rows_by_coordinates, rows_by_coordinates, rows_by_time, rows_by_inputs};
-{jacobian}  return i >= 0 && i < 4 ? patterns[i] : 0;
-{jacobian}}
-{jacobian}int jac_@name@_work(casadi_int *sz_arg, casadi_int *sz_res, casadi_int *sz_iw, casadi_int *sz_w)
-{jacobian}{
-{jacobian}  return set_work(sz_arg, sz_res, sz_iw, sz_w, 5, 4, WORK + NR * NX);
-{jacobian}}
-{stddev}
-{stddev}/* ---------------------------------------------------------------- @name@_std */
-{stddev}
-{stddev}int @name@_std(const casadi_real **arg, casadi_real **res, casadi_int *iw, casadi_real *w, int mem);
-{stddev}casadi_int @name@_std_n_in(void);
-{stddev}casadi_int @name@_std_n_out(void);
-{stddev}const char *@name@_std_name_in(casadi_int i);
-{stddev}const char *@name@_std_name_out(casadi_int i);
-{stddev}const casadi_int *@name@_std_sparsity_in(casadi_int i);
-{stddev}const casadi_int *@name@_std_sparsity_out(casadi_int i);
-{stddev}int @name@_std_work(casadi_int *sz_arg, casadi_int *sz_res, casadi_int *sz_iw, casadi_int *sz_w);
-{stddev}
-{stddev}int @name@_std(const casadi_real **arg, casadi_real **res, casadi_int *iw, casadi_real *w, int mem)
-{stddev}{
-{stddev}  casadi_real state[NX], mean[NR], stddev[NR];
-{stddev}  (void)iw;
-{stddev}  (void)mem;
-{stddev}  if (!res[0] && !res[1]) return 0;
-{stddev}  read_state(arg, state);
-{stddev}  if (@name@_mean_and_stddev(state, mean, stddev, (@name@_workspace *)(void *)w) != @name@_OK) return 1;
-{stddev}  for (int r = 0; r < NR; ++r) {
-{stddev}    if (res[0]) res[0][r] = mean[r];
-{stddev}    if (res[1]) res[1][r] = stddev[r];
-{stddev}  }
-{stddev}  return 0;
-{stddev}}
-{stddev}
-{stddev}casadi_int @name@_std_n_in(void) { return 4; }
-{stddev}casadi_int @name@_std_n_out(void) { return 2; }
-{stddev}const char *@name@_std_name_in(casadi_int i) { return @name@_name_in(i); }
-{stddev}const char *@name@_std_name_out(casadi_int i) { return i == 0 ? "mean" : i == 1 ? "std" : 0; }
-{stddev}const casadi_int *@name@_std_sparsity_in(casadi_int i) { return @name@_sparsity_in(i); }
-{stddev}const casadi_int *@name@_std_sparsity_out(casadi_int i) { return i == 0 || i == 1 ? of_rows : 0; }
-{stddev}int @name@_std_work(casadi_int *sz_arg, casadi_int *sz_res, casadi_int *sz_iw, casadi_int *sz_w)
-{stddev}{
-{stddev}  return set_work(sz_arg, sz_res, sz_iw, sz_w, 4, 2, WORK);
-{stddev}}
+{if jacobian}
+
+/* ---------------------------------------------------------------- jac_@name@(q, dq, t, u, out_mean) */
+
+static const casadi_int of_nothing[] = {@pattern_nothing@};
+static const casadi_int rows_by_coordinates[] = {@pattern_rows_q@};
+static const casadi_int rows_by_time[] = {@pattern_rows_t@};
+static const casadi_int rows_by_inputs[] = {@pattern_rows_u@};
+
+@declarations_jac@
+
+int jac_@name@(const casadi_real **arg, casadi_real **res, casadi_int *iw, casadi_real *w, int mem)
+{
+  static const int first[] = {0, NQ, 2 * NQ, 2 * NQ + 1, NX}; /* columns of the Jacobian in each block */
+  casadi_real state[NX], mean[NR];
+  casadi_real *const jacobian = w + WORK;
+  (void)iw;
+  (void)mem;
+  if (!res[0] && !res[1] && !res[2] && !res[3]) return 0;
+  read_state(arg, state);
+  if (@name@_mean_and_jacobian(state, mean, jacobian, (@name@_workspace *)(void *)w) != @name@_OK) return 1;
+  for (int block = 0; block < 4; ++block) {
+    if (!res[block]) continue;
+    for (int i = NR * first[block]; i < NR * first[block + 1]; ++i) res[block][i - NR * first[block]] = jacobian[i];
+  }
+  return 0;
+}
+
+casadi_int jac_@name@_n_in(void) { return 5; }
+casadi_int jac_@name@_n_out(void) { return 4; }
+const char *jac_@name@_name_in(casadi_int i) { return i == 4 ? "out_mean" : @name@_name_in(i); }
+const char *jac_@name@_name_out(casadi_int i)
+{
+  static const char *const names[] = {"jac_mean_q", "jac_mean_dq", "jac_mean_t", "jac_mean_u"};
+  return i >= 0 && i < 4 ? names[i] : 0;
+}
+const casadi_int *jac_@name@_sparsity_in(casadi_int i) { return i == 4 ? of_nothing : @name@_sparsity_in(i); }
+const casadi_int *jac_@name@_sparsity_out(casadi_int i)
+{
+  static const casadi_int *const patterns[] = {rows_by_coordinates, rows_by_coordinates, rows_by_time, rows_by_inputs};
+  return i >= 0 && i < 4 ? patterns[i] : 0;
+}
+int jac_@name@_work(casadi_int *sz_arg, casadi_int *sz_res, casadi_int *sz_iw, casadi_int *sz_w)
+{
+  return set_work(sz_arg, sz_res, sz_iw, sz_w, 5, 4, WORK + NR * NX);
+}
+{end}
+{if stddev}
+
+/* ---------------------------------------------------------------- @name@_std */
+
+@declarations_std@
+
+int @name@_std(const casadi_real **arg, casadi_real **res, casadi_int *iw, casadi_real *w, int mem)
+{
+  casadi_real state[NX], mean[NR], stddev[NR];
+  (void)iw;
+  (void)mem;
+  if (!res[0] && !res[1]) return 0;
+  read_state(arg, state);
+  if (@name@_mean_and_stddev(state, mean, stddev, (@name@_workspace *)(void *)w) != @name@_OK) return 1;
+  for (int r = 0; r < NR; ++r) {
+    if (res[0]) res[0][r] = mean[r];
+    if (res[1]) res[1][r] = stddev[r];
+  }
+  return 0;
+}
+
+casadi_int @name@_std_n_in(void) { return 4; }
+casadi_int @name@_std_n_out(void) { return 2; }
+const char *@name@_std_name_in(casadi_int i) { return @name@_name_in(i); }
+const char *@name@_std_name_out(casadi_int i) { return i == 0 ? "mean" : i == 1 ? "std" : 0; }
+const casadi_int *@name@_std_sparsity_in(casadi_int i) { return @name@_sparsity_in(i); }
+const casadi_int *@name@_std_sparsity_out(casadi_int i) { return i == 0 || i == 1 ? of_rows : 0; }
+int @name@_std_work(casadi_int *sz_arg, casadi_int *sz_res, casadi_int *sz_iw, casadi_int *sz_w)
+{
+  return set_work(sz_arg, sz_res, sz_iw, sz_w, 4, 2, WORK);
+}
+{end}
 )c";
 
 inline constexpr std::string_view acados_template = R"c(

@@ -25,20 +25,26 @@ std::string casadi_source(const std::string& name, const StateLayout& layout, in
   if (options.stddev) conditions.insert("stddev");
   if (options.jacobian) conditions.insert("jacobian");
   if (layout.nu > 0) conditions.insert("inputs");
-  return c_export::filled(c_export::casadi_template, conditions,
-                          {{"name", name},
-                           {"nq", std::to_string(layout.nq)},
-                           {"nu", std::to_string(layout.nu)},
-                           {"n_state", std::to_string(layout.size())},
-                           {"n_rows", std::to_string(n_rows)},
-                           {"pattern_q", pattern(layout.nq, 1)},
-                           {"pattern_t", pattern(1, 1)},
-                           {"pattern_u", pattern(layout.nu, 1)},
-                           {"pattern_rows", pattern(n_rows, 1)},
-                           {"pattern_nothing", pattern(n_rows, 1, false)},
-                           {"pattern_rows_q", pattern(n_rows, layout.nq)},
-                           {"pattern_rows_t", pattern(n_rows, 1)},
-                           {"pattern_rows_u", pattern(n_rows, layout.nu)}});
+  const auto declared = [](const std::string& function) {
+    return c_export::filled(c_export::casadi_declarations, {{}, {{"function", function}}});
+  };
+  return c_export::filled(c_export::casadi_template, {conditions,
+                                                      {{"name", name},
+                                                       {"declarations", declared(name)},
+                                                       {"declarations_jac", declared("jac_" + name)},
+                                                       {"declarations_std", declared(name + "_std")},
+                                                       {"nq", std::to_string(layout.nq)},
+                                                       {"nu", std::to_string(layout.nu)},
+                                                       {"n_state", std::to_string(layout.size())},
+                                                       {"n_rows", std::to_string(n_rows)},
+                                                       {"pattern_q", pattern(layout.nq, 1)},
+                                                       {"pattern_t", pattern(1, 1)},
+                                                       {"pattern_u", pattern(layout.nu, 1)},
+                                                       {"pattern_rows", pattern(n_rows, 1)},
+                                                       {"pattern_nothing", pattern(n_rows, 1, false)},
+                                                       {"pattern_rows_q", pattern(n_rows, layout.nq)},
+                                                       {"pattern_rows_t", pattern(n_rows, 1)},
+                                                       {"pattern_rows_u", pattern(n_rows, layout.nu)}}});
 }
 
 std::string acados_source(const CSource& model, const std::string& name, const StateLayout& layout, double time_step,
@@ -49,8 +55,8 @@ std::string acados_source(const CSource& model, const std::string& name, const S
   std::set<std::string> conditions;
   if (reads_time) conditions.insert("timed");
   return model.header + "\n" + source +
-         c_export::filled(c_export::acados_template, conditions,
-                          {{"name", name}, {"nu", std::to_string(layout.nu)}, {"time_step", shortest(time_step)}});
+         c_export::filled(c_export::acados_template,
+                          {conditions, {{"name", name}, {"nu", std::to_string(layout.nu)}, {"time_step", shortest(time_step)}}});
 }
 
 }  // namespace gp2

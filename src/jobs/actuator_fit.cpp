@@ -9,6 +9,7 @@
 
 #include "base/decompositions.hpp"
 #include "base/lapack.hpp"
+#include "base/not_a_number.hpp"
 #include "base/parallel.hpp"
 #include "gp2/jobs/fit_memory.hpp"
 #include "gp2/training/robust.hpp"
@@ -259,8 +260,7 @@ class ActuatorTraining {
     std::vector<ActuatorEstimate> out;
     std::vector<Index> free;
     for (Index k = 0; k < a_.size(); ++k) {
-      out.push_back({problem_.late[static_cast<std::size_t>(k)].name, a_[k], std::numeric_limits<double>::quiet_NaN(), lower_[k],
-                     upper_[k]});
+      out.push_back({problem_.late[static_cast<std::size_t>(k)].name, a_[k], not_a_number, lower_[k], upper_[k]});
       if (!out.back().at_lower() && !out.back().at_upper()) {
         free.push_back(k);
       } else if (is_open(k)) {
@@ -277,7 +277,7 @@ class ActuatorTraining {
       ActuatorEstimate& one = out[static_cast<std::size_t>(k)];
       if (has_peak) one.stddev = std::sqrt(covariance(f, f));
       // wider than a box that is believed evenly is no peak
-      if (one.stddev > (one.upper - one.lower) / std::sqrt(12.0)) one.stddev = std::numeric_limits<double>::quiet_NaN();
+      if (one.stddev > (one.upper - one.lower) / std::sqrt(12.0)) one.stddev = not_a_number;
       if (is_open(k)) one.stddev = infinity;
     }
     return out;

@@ -1,7 +1,6 @@
 #include "gp2/jobs/derive.hpp"
 
 #include <algorithm>
-#include <charconv>
 #include <cmath>
 #include <limits>
 #include <map>
@@ -10,19 +9,17 @@
 #include <numbers>
 #include <numeric>
 #include <optional>
-#include <set>
-#include <string_view>
-#include <system_error>
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
+#include "base/not_a_number.hpp"
 #include "base/parallel.hpp"
 #include "gp2/base/statistics.hpp"
-#include "gp2/data/log_reader.hpp"
 #include "gp2/error.hpp"
 #include "gp2/jobs/fit_problem.hpp"
 #include "gp2/simulate.hpp"
+#include "jobs/raw_log.hpp"
 #include "smoothing/constrained_states.hpp"
 
 namespace gp2 {
@@ -33,9 +30,7 @@ using Eigen::VectorXd;
 
 namespace {
 
-constexpr double nan = std::numeric_limits<double>::quiet_NaN();
 constexpr std::size_t least_for_own_model = 40;  // samples
-constexpr std::size_t least_rows = 5;
 constexpr double most_rows = 1e7;
 
 // Frees what a vector holds of a long log; `= {}` keeps its memory.
@@ -43,56 +38,6 @@ template <typename T>
 void release(std::vector<T>& values) {
   values = std::vector<T>();
 }
-
-/// An empty cell, or one of the words that loggers write instead.
-bool is_missing(const std::string& cell) {
-  std::string word = cell;
-  for (char& c : word) c = static_cast<char>(std::tolower(static_cast<unsigned char>(c)));
-  return word.empty() || word == "nan" || word == "-nan" || word == "na" || word == "null" || word == "none";
-}
-
-// A whole number, all of the text.
-std::optional<int> whole_number(std::string_view text) {
-  int number = 0;
-  const auto [end, error] = std::from_chars(text.data(), text.data() + text.size(), number);
-  return error == std::errc() && end == text.data() + text.size() ? std::optional(number) : std::nullopt;
-}
-
-// {"0-12", "15"} -> 0 … 12, 15; what is no range of whole numbers is a name.
-std::vector<std::string> without_ranges(const std::vector<std::string>& items) {
-  std::vector<std::string> episodes;
-  for (const std::string& item : items) {
-    const std::size_t dash = item.find('-', 1);
-    const auto first = whole_number(std::string_view(item).substr(0, dash));
-    const auto last = dash == std::string::npos ? std::nullopt : whole_number(std::string_view(item).substr(dash + 1));
-    if (!first || !last) {
-      episodes.push_back(item);
-      continue;
-    }
-    constexpr int most = 1'000'000;
-    if (*last < *first || *last - *first > most)
-      throw InputError(fmt::format("`episodes`: '{}' is not a range FIRST-LAST, say 0-12", item));
-    for (int k = *first; k <= *last; ++k) episodes.push_back(std::to_string(k));
-  }
-  return episodes;
-}
-
-/// Rows of one episode in the log, and their times.
-struct Episode {
-  std::string label;
-  std::vector<int> rows;
-  std::vector<double> times;  // from its first row on [s]
-  double start = 0;
-  std::vector<double> distinct;  // the times without repetitions
-};
-
-/// A column of the log in one episode.
-struct Channel {
-  std::vector<Measurement> measurements;  // about `mean`
-  double mean = 0;
-  int missing = 0, repeated = 0, wraps = 0;
-  double resolution = 0;
-};
 
 /// A coordinate of one episode: its report, and its motion at the times that are written.
 struct Task {
@@ -108,24 +53,13 @@ struct Task {
   Eigen::Matrix3Xd stddev;
 };
 
-std::string in_episode(const Episode& episode) {
-  return episode.label.empty() ? "" : fmt::format(" in episode {}", episode.label);
-}
-
 class Deriver {
  public:
   Deriver(const Model& model, const CsvTable& log, const DeriveOptions& options, const LearnedAccelerations* learned)
-      : model_(model),
-        system_(*model.system),
-        log_(log),
-        options_(options),
-        learned_(learned),
-        reader_(open_log(model, log, options.columns)) {
-    if (contacts_of(model, system_.parameter_values()).empty()) return;
-    throw InputError(fmt::format(
-        "{}: '{}' has contacts, at whose impacts velocities jump, so that positions are not smoothed across them: give a "
-        "log with velocities and accelerations, or raw logs of stretches without an impact and a model without contacts",
-        log.name(), system_.name()));
+      : model_(model), system_(*model.system), log_(log), options_(options), learned_(learned), raw_(model, log, options) {
+    data_.measured = raw_.measured();
+    data_.episode_column = raw_.episode_column();
+    for (const Episode& part : episodes_) data_.episodes.push_back(part.label);
   }
 
   DerivedData run() {
@@ -150,342 +84,21 @@ class Deriver {
   }
 
  private:
-  void check_options() const {
-    if (!(options_.rate >= 0) || !std::isfinite(options_.rate))
-      throw InputError(fmt::format("rate: must be positive, got {}", options_.rate));
-    if (options_.every < 1) throw InputError(fmt::format("every: must be at least 1, got {}", options_.every));
-    if (!(options_.outlier_threshold >= 0)) {
-      throw InputError(fmt::format("outlier threshold: must not be negative, got {}", options_.outlier_threshold));
-    }
-    if (options_.rate > 0 && !options_.keep.empty()) {
-      throw InputError("keep: rows of an even rate are not those of the log; leave out either");
-    }
-  }
-
-  void find_columns() {
-    if (!reader_.has("t")) static_cast<void>(reader_.values({"t"}));  // throws, and says what there is
-    time_column_ = reader_.column("t");
-    for (int j = 0; j < system_.nq(); ++j) {
-      const Coordinate& coordinate = system_.coordinates()[static_cast<std::size_t>(j)];
-      const int position = reader_.column(coordinate.name);
-      if (position >= 0) {
-        data_.measured.push_back(j);
-        position_column_[j] = position;
-        velocity_column_[j] = reader_.column(coordinate.velocity());
-      } else if (reader_.has(coordinate.velocity())) {
-        data_.notes.push_back(
-            fmt::format("{} is not used: without {} there is no motion to smooth", coordinate.velocity(), coordinate.name));
-      }
-    }
-    if (data_.measured.empty()) {
-      std::vector<std::string> names;
-      for (const Coordinate& coordinate : system_.coordinates()) names.push_back(coordinate.name);
-      throw InputError(
-          fmt::format("{}: no column is a coordinate of '{}' ({}); the file has: {}. Rename them, or give `map=LOGNAME={}`",
-                      log_.name(), system_.name(), fmt::join(names, ", "), fmt::join(log_.header(), ", "), names.front()));
-    }
-    for (int k = 0; k < static_cast<int>(system_.inputs().size()); ++k) {
-      const std::string& input = system_.inputs()[static_cast<std::size_t>(k)];
-      input_column_.push_back(reader_.column(input));
-      if (input_column_.back() < 0) data_.notes.push_back(fmt::format("the log has no input {}", input));
-    }
-    for (const std::string& name : options_.keep) {
-      if (log_.find(name) < 0) {
-        throw InputError(
-            fmt::format("keep: {} has no column '{}'; it has: {}", log_.name(), name, fmt::join(log_.header(), ", ")));
-      }
-    }
-    for (const auto& [name, found] : reader_.aliases_used())
-      data_.notes.push_back(fmt::format("{} is the column '{}'", name, found));
-  }
-
-  void find_episodes() {
-    const std::string name = options_.episode_column.empty() ? "episode" : options_.episode_column;
-    const int column = log_.find(name);
-    if (column < 0 && !options_.episode_column.empty()) {
-      throw InputError(
-          fmt::format("episode column: {} has no column '{}'; it has: {}", log_.name(), name, fmt::join(log_.header(), ", ")));
-    }
-    if (column < 0 && !options_.episodes.empty()) {
-      throw InputError(fmt::format("episodes: {} has no column 'episode' to choose from; name it", log_.name()));
-    }
-    if (column >= 0) data_.episode_column = name;
-    std::map<std::string, std::size_t> number;
-    std::vector<std::string> labels;
-    for (int row = 0; row < log_.n_rows(); ++row) {
-      const std::string label = column < 0 ? "" : log_.cell(row, column);
-      if (number.emplace(label, number.size()).second) labels.push_back(label);
-    }
-    const std::vector<std::string> all_wanted = without_ranges(options_.episodes);
-    for (const std::string& wanted : all_wanted) {
-      if (!number.contains(wanted)) {
-        throw InputError(
-            fmt::format("episodes: {} has no episode '{}'; it has: {}", log_.name(), wanted, fmt::join(labels, ", ")));
-      }
-    }
-    const std::set<std::string> taken(all_wanted.begin(), all_wanted.end());
-    std::map<std::string, std::size_t> place;
-    for (const std::string& label : labels) {
-      if (!taken.empty() && !taken.contains(label)) continue;
-      place[label] = episodes_.size();
-      episodes_.push_back({label, {}, {}, 0, {}});
-      data_.episodes.push_back(label);
-    }
-    for (int row = 0; row < log_.n_rows(); ++row) {
-      const auto found = place.find(column < 0 ? "" : log_.cell(row, column));
-      if (found == place.end()) continue;
-      Episode& episode = episodes_[found->second];
-      const double time = log_.number(row, time_column_);
-      if (episode.rows.empty()) episode.start = time;
-      const double since = time - episode.start;
-      if (!episode.times.empty() && since < episode.times.back()) {
-        throw InputError(fmt::format("{}: column '{}': time runs backwards{} at data row {}: {} after {}. Sort the rows{}",
-                                     log_.name(), log_.header()[static_cast<std::size_t>(time_column_)], in_episode(episode),
-                                     row + 1, time, episode.start + episode.times.back(),
-                                     column < 0 ? ", or give the column that numbers the episodes" : ""));
-      }
-      if (episode.times.empty() || since > episode.times.back()) episode.distinct.push_back(since);
-      episode.rows.push_back(row);
-      episode.times.push_back(since);
-    }
-  }
-
-  [[nodiscard]] std::string time_place() const {
-    return fmt::format("{}: column '{}'", log_.name(), log_.header()[static_cast<std::size_t>(time_column_)]);
-  }
-
-  /// Seconds in what the times count, by the usual step.
-  double unit_of(double usual_step) {
-    struct Unit {
-      TimeUnit unit;
-      const char* name;
-      double seconds, below;
-    };
-    static constexpr std::array<Unit, 4> units = {{{TimeUnit::seconds, "seconds", 1, 0.5},
-                                                   {TimeUnit::milliseconds, "milliseconds", 1e-3, 500},
-                                                   {TimeUnit::microseconds, "microseconds", 1e-6, 5e5},
-                                                   {TimeUnit::nanoseconds, "nanoseconds", 1e-9, HUGE_VAL}}};
-    const bool automatic = options_.time_unit == TimeUnit::automatic;
-    const Unit& unit = *std::find_if(units.begin(), units.end(), [&](const Unit& one) {
-      return automatic ? usual_step < one.below : one.unit == options_.time_unit;
-    });
-    if (automatic && unit.unit != TimeUnit::seconds) {
-      data_.notes.push_back(fmt::format("{} is taken to count {}: its usual step is {:.6g}; `time_unit=s` if these are seconds",
-                                        time_place(), unit.name, usual_step));
-    }
-    return unit.seconds;
-  }
-
-  // What comes after a long pause is no continuation: times from one start would lose digits, and nothing bridges it.
-  void split_at_pauses() {
-    constexpr double pause = 1000;  // usual steps
-    std::vector<double> steps;
-    for (const Episode& episode : episodes_) {
-      for (std::size_t k = 1; k < episode.distinct.size(); ++k) steps.push_back(episode.distinct[k] - episode.distinct[k - 1]);
-      if (episode.rows.size() >= least_rows && episode.distinct.size() == 1) {
-        throw InputError(fmt::format("{}: all {} rows{} have the time {}; without times there are no velocities", time_place(),
-                                     episode.rows.size(), in_episode(episode), episode.start));
-      }
-    }
-    if (steps.empty()) return;
-    const double usual = median(steps), unit = unit_of(usual);
-    std::vector<Episode> parts;
-    int n_pauses = 0, n_left_out = 0;
-    double longest = 0;
-    for (const Episode& episode : episodes_) {
-      std::vector<Episode> of_this;
-      for (std::size_t k = 0; k < episode.rows.size(); ++k) {
-        const double since = episode.times[k];
-        if (k == 0 || since - episode.times[k - 1] > pause * usual) {
-          if (k > 0) longest = std::max(longest, unit * (since - episode.times[k - 1]));
-          // the log's own number: a difference from the far start has lost digits
-          of_this.push_back({episode.label, {}, {}, log_.number(episode.rows[k], time_column_), {}});
-        }
-        Episode& part = of_this.back();
-        const double here = unit * (log_.number(episode.rows[k], time_column_) - part.start);
-        if (part.times.empty() || here > part.times.back()) part.distinct.push_back(here);
-        part.rows.push_back(episode.rows[k]);
-        part.times.push_back(here);
-      }
-      n_pauses += static_cast<int>(of_this.size()) - 1;
-      for (Episode& part : of_this) {
-        part.start *= unit;
-        if (of_this.size() > 1 && !moves(part)) {
-          n_left_out += static_cast<int>(part.rows.size());
-        } else {
-          parts.push_back(std::move(part));
-        }
-      }
-    }
-    if (n_pauses > 0) {
-      data_.notes.push_back(fmt::format(
-          "warning: {} pauses {}, for {:.3g} s at most: each part is smoothed by itself{}", time_place(),
-          n_pauses == 1 ? "once" : fmt::format("{} times", n_pauses), longest,
-          n_left_out > 0 ? fmt::format("; {} rows of parts that are too short, or where nothing moves, are left out", n_left_out)
-                         : ""));
-    }
-    if (parts.empty()) {
-      throw InputError(fmt::format(
-          "{}: in every part between pauses of more than {:g} usual steps there are too few samples, or nothing moves",
-          time_place(), pause));
-    }
-    episodes_ = std::move(parts);
-    data_.episodes.clear();
-    for (const Episode& part : episodes_) data_.episodes.push_back(part.label);
-  }
-
-  /// Whether every measured coordinate has enough samples in a part, and two of them differ.
-  [[nodiscard]] bool moves(const Episode& part) const {
-    return std::all_of(data_.measured.begin(), data_.measured.end(), [&](int j) {
-      std::size_t n = 0;
-      std::set<std::string> values;
-      for (const int row : part.rows) {
-        const std::string cell = log_.cell(row, position_column_.at(j));
-        if (is_missing(cell)) continue;
-        ++n;
-        if (values.size() < 2) values.insert(cell);
-      }
-      return n >= least_rows && values.size() > 1;
-    });
-  }
-
-  /// Where the samples before say that an angle is by now: on the line through the last few, whose medians no single one spoils.
-  class Course {
-   public:
-    [[nodiscard]] double at(double time) const {
-      if (last_.empty()) return nan;
-      std::vector<double> rates, values;
-      for (std::size_t k = 1; k < last_.size(); ++k)
-        rates.push_back((last_[k].second - last_[k - 1].second) / (last_[k].first - last_[k - 1].first));
-      // across a pause the rate says little
-      constexpr double reach = 20;
-      const double step = rates.empty() ? 0 : (last_.back().first - last_.front().first) / static_cast<double>(rates.size());
-      const double rate = rates.size() < 2 || time - last_.back().first > reach * step ? 0 : median(rates);
-      for (const auto& [before, value] : last_) values.push_back(value + rate * (time - before));
-      return last_.size() < 3 ? values.back() : median(values);
-    }
-
-    void add(double time, double value) {
-      constexpr std::size_t most = 5;
-      if (!last_.empty() && !(time > last_.back().first)) return;
-      last_.emplace_back(time, value);
-      if (last_.size() > most) last_.erase(last_.begin());
-    }
-
-   private:
-    std::vector<std::pair<double, double>> last_;  // time, value
-  };
-
-  /// Values of a column at the times of an episode, in the order of the log.
-  void read_column(const Episode& episode, int column, bool velocity, Channel& channel) const {
-    std::vector<double> at_one_time;
-    double time = nan;
-    for (std::size_t k = 0; k < episode.rows.size(); ++k) {
-      if (is_missing(log_.cell(episode.rows[k], column))) {
-        ++channel.missing;
-        continue;
-      }
-      const double value = log_.number(episode.rows[k], column);
-      if (episode.times[k] != time) at_one_time.clear();
-      time = episode.times[k];
-      if (std::find(at_one_time.begin(), at_one_time.end(), value) != at_one_time.end()) {
-        ++channel.repeated;
-        continue;
-      }
-      at_one_time.push_back(value);
-      channel.measurements.push_back({time, value, velocity, 1});
-    }
-  }
-
-  /// Takes the turns out of an angle that is written within one turn.
-  void unwrap(const Episode& episode, int column, Channel& channel) {
-    constexpr double turn = 2 * std::numbers::pi;
-    std::vector<double> values;
-    int jumps = 0;
-    for (const Measurement& one : channel.measurements) {
-      jumps += !values.empty() && std::abs(one.value - values.back()) > turn / 2 ? 1 : 0;
-      values.push_back(one.value);
-    }
-    if (jumps == 0) return;
-    // single errors do not count
-    std::sort(values.begin(), values.end());
-    const std::size_t aside = values.size() / 50;
-    const double range = values[values.size() - 1 - aside] - values[aside];
-    constexpr double little = 0.05;  // of a turn
-    if (range <= (1 + little) * turn) {
-      Course course;
-      double turns = 0;
-      for (Measurement& one : channel.measurements) {
-        const double expected = course.at(one.time);
-        const double here = std::isnan(expected) ? 0 : std::round((expected - one.value) / turn);
-        one.value += turn * here;
-        channel.wraps += here != turns ? 1 : 0;
-        turns = here;
-        course.add(one.time, one.value);
-      }
-      jumps = 0;
-      for (std::size_t k = 1; k < channel.measurements.size(); ++k)
-        jumps += std::abs(channel.measurements[k].value - channel.measurements[k - 1].value) > turn / 2 ? 1 : 0;
-      jumps = std::max(jumps, channel.wraps);
-    }
-    constexpr double often = 0.2;
-    if (jumps > often * static_cast<double>(values.size())) {
-      data_.notes.push_back(fmt::format(
-          "warning: {}: column '{}'{} moves by more than half a turn between {} of {} samples, over a range of {:.3g}: is "
-          "it in rad, and sampled often enough?",
-          log_.name(), log_.header()[static_cast<std::size_t>(column)], in_episode(episode), jumps, values.size(), range));
-    }
-  }
-
   void read_channels() {
     for (const int j : data_.measured) {
-      for (int e = 0; e < static_cast<int>(episodes_.size()); ++e) {
-        const Episode& episode = episodes_[static_cast<std::size_t>(e)];
+      for (int e = 0; e < std::ssize(episodes_); ++e) {
         Task& task = tasks_.emplace_back();
         task.coordinate = j;
         task.episode = e;
-        Channel& channel = task.channel;
-        read_column(episode, position_column_.at(j), false, channel);
-        require_motion(episode, position_column_.at(j), channel);
-        std::vector<double> values;
-        for (const Measurement& one : channel.measurements) values.push_back(one.value);
-        channel.resolution = resolution_of(values);
-        if (system_.coordinates()[static_cast<std::size_t>(j)].angle) unwrap(episode, position_column_.at(j), channel);
-        for (const Measurement& one : channel.measurements) channel.mean += one.value / static_cast<double>(values.size());
-        for (Measurement& one : channel.measurements) one.value -= channel.mean;
-        if (channel.resolution > 0) share_out_runs(channel.measurements);
-        if (velocity_column_.at(j) >= 0) {
-          read_column(episode, velocity_column_.at(j), true, channel);
-          std::stable_sort(channel.measurements.begin(), channel.measurements.end(),
-                           [](const Measurement& a, const Measurement& b) { return a.time < b.time; });
-        }
+        task.channel = raw_.motion(j, episode_of(e));
       }
     }
+    data_.notes = std::move(raw_.notes);
   }
 
-  /// Samples that an encoder gave the same value have one error between them, not one each.
-  static void share_out_runs(std::vector<Measurement>& positions) {
-    for (std::size_t first = 0, last = 0; first < positions.size(); first = last) {
-      while (last < positions.size() && positions[last].value == positions[first].value) ++last;
-      const double factor = std::sqrt(static_cast<double>(last - first));
-      for (std::size_t k = first; k < last; ++k) positions[k].noise_factor = factor;
-    }
-  }
-
-  void require_motion(const Episode& episode, int column, const Channel& channel) const {
-    const std::string where =
-        fmt::format("{}: column '{}'{}", log_.name(), log_.header()[static_cast<std::size_t>(column)], in_episode(episode));
-    const std::string way_out = episode.label.empty() ? "" : "; leave that episode out";
-    if (channel.measurements.size() < least_rows) {
-      throw InputError(fmt::format("{}: {} samples are too few to find a motion in; {} are needed{}", where,
-                                   channel.measurements.size(), least_rows, way_out));
-    }
-    const double first = channel.measurements.front().value;
-    if (std::all_of(channel.measurements.begin(), channel.measurements.end(),
-                    [&](const Measurement& one) { return one.value == first; })) {
-      throw InputError(fmt::format("{}: all {} values are {}: nothing moves, which tells neither velocity nor noise{}", where,
-                                   channel.measurements.size(), first, way_out));
-    }
+  [[nodiscard]] const Episode& episode_of(int e) const { return episodes_[static_cast<std::size_t>(e)]; }
+  [[nodiscard]] const std::string& name_of(int coordinate) const {
+    return system_.coordinates()[static_cast<std::size_t>(coordinate)].name;
   }
 
   [[nodiscard]] VectorXd times_to_write(const Episode& episode) const {
@@ -530,17 +143,12 @@ class Deriver {
     models_ = Deriver(model_, *options_.like, options, nullptr).models();
     for (const int j : data_.measured) {
       if (models_.contains(j)) continue;
-      throw InputError(fmt::format("like: {} has no column {}, which {} has", options_.like->name(),
-                                   system_.coordinates()[static_cast<std::size_t>(j)].name, log_.name()));
+      throw InputError(fmt::format("like: {} has no column {}, which {} has", options_.like->name(), name_of(j), log_.name()));
     }
   }
 
   // each series is fitted, then smoothed
   void fit_channels() {
-    check_options();
-    find_columns();
-    find_episodes();
-    split_at_pauses();
     read_channels();
     if (options_.like) find_models_to_be_like();
     parallel_for(static_cast<int>(tasks_.size()), thread_count(options_.n_threads), [&](int k, int) {
@@ -571,7 +179,7 @@ class Deriver {
     data_.series.resize(tasks_.size());
     parallel_for(static_cast<int>(tasks_.size()), thread_count(options_.n_threads), [&](int k, int) {
       Task& task = tasks_[static_cast<std::size_t>(k)];
-      const VectorXd times = times_to_write(episodes_[static_cast<std::size_t>(task.episode)]);
+      const VectorXd times = times_to_write(episode_of(task.episode));
       task.motion = smooth(task.fit.model, task.fit.trusted, times);
       task.motion.mean.row(0).array() += task.channel.mean;
       if (task.course.size() > 0) {
@@ -584,7 +192,7 @@ class Deriver {
       if (!options_.hold_constraints) release(task.motion.covariance);
       DerivedSeries& series = data_.series[static_cast<std::size_t>(k)];
       series = report_of(task, shared[static_cast<std::size_t>(k)]);
-      series.start = episodes_[static_cast<std::size_t>(task.episode)].start;
+      series.start = episode_of(task.episode).start;
       if (options_.keep_positions) series.positions = positions_of(task, times);
       release(task.fit.trusted);
       tell_progress();
@@ -613,8 +221,8 @@ class Deriver {
   /// @param weigh  takes as little of u, beside q̂, as their variances say
   [[nodiscard]] Eigen::Matrix3Xd course_of(const Task& task, const SmoothedMotion& plain, bool weigh) const {
     Index first = 0;
-    for (int e = 0; e < task.episode; ++e) first += static_cast<Index>(episodes_[static_cast<std::size_t>(e)].distinct.size());
-    const VectorXd times = times_to_write(episodes_[static_cast<std::size_t>(task.episode)]);
+    for (int e = 0; e < task.episode; ++e) first += static_cast<Index>(episode_of(e).distinct.size());
+    const VectorXd times = times_to_write(episode_of(task.episode));
     const Index n = times.size();
     Eigen::RowVectorXd misfit = plain.mean.row(2) - learned_->mean.row(task.coordinate).segment(first, n);
     for (Index i = 0; i < n && weigh; ++i) {
@@ -645,7 +253,7 @@ class Deriver {
 
   /// Positions about a course and their own mean there, velocities about its.
   [[nodiscard]] std::pair<std::vector<Measurement>, double> about(const Eigen::Matrix3Xd& course, const Task& task) const {
-    const std::vector<double>& times = episodes_[static_cast<std::size_t>(task.episode)].distinct;
+    const std::vector<double>& times = episode_of(task.episode).distinct;
     std::vector<Measurement> measurements = task.channel.measurements;
     Index at = 0;
     double sum = 0, n = 0;
@@ -661,7 +269,7 @@ class Deriver {
   /// Smooths a series about the learned motion where that makes its samples likelier, which u as it is tells: a motion that goes by
   /// variances has the noise of the samples wherever little is learned.
   void take_learned(Task& task, const SmootherFitOptions& options) const {
-    const VectorXd times = times_to_write(episodes_[static_cast<std::size_t>(task.episode)]);
+    const VectorXd times = times_to_write(episode_of(task.episode));
     SmoothedMotion plain = smooth(task.fit.model, task.fit.trusted, times);
     const SmootherFit tried = fit_smoother(about(course_of(task, plain, false), task).first, options);
     const double gain = score(tried, options) - score(task.fit, options);
@@ -701,8 +309,7 @@ class Deriver {
       data_.notes.push_back(
           fmt::format("warning: {}: {} moves too fast in places for {:.3g} samples per second{}: there its "
                       "accelerations are smoothed too much; log at a higher rate",
-                      log_.name(), system_.coordinates()[static_cast<std::size_t>(j)].name, rate,
-                      n > 1 ? fmt::format(", in {} of {} episodes", n_fast, n) : ""));
+                      log_.name(), name_of(j), rate, n > 1 ? fmt::format(", in {} of {} episodes", n_fast, n) : ""));
     }
   }
 
@@ -745,18 +352,18 @@ class Deriver {
   // rows of all episodes, one after another
   void collect_rows() {
     std::vector<double> times;
-    for (int e = 0; e < static_cast<int>(episodes_.size()); ++e) {
+    for (int e = 0; e < std::ssize(episodes_); ++e) {
       first_row_.push_back(static_cast<Index>(times.size()));
-      for (const double since : times_to_write(episodes_[static_cast<std::size_t>(e)])) {
-        times.push_back(episodes_[static_cast<std::size_t>(e)].start + since);
+      for (const double since : times_to_write(episode_of(e))) {
+        times.push_back(episode_of(e).start + since);
         data_.episode.push_back(e);
       }
     }
     const auto n = static_cast<Index>(times.size());
     const StateLayout layout = system_.layout();
-    data_.states = MatrixXd::Constant(layout.size(), n, nan);
-    data_.accelerations = MatrixXd::Constant(layout.nq, n, nan);
-    data_.stddev = MatrixXd::Constant(3 * Index{layout.nq}, n, nan);
+    data_.states = MatrixXd::Constant(layout.size(), n, not_a_number);
+    data_.accelerations = MatrixXd::Constant(layout.nq, n, not_a_number);
+    data_.stddev = MatrixXd::Constant(3 * Index{layout.nq}, n, not_a_number);
     data_.states.row(layout.t()) = Eigen::Map<const VectorXd>(times.data(), n).transpose();
     for (const Task& task : tasks_) {
       const Index first = first_row_[static_cast<std::size_t>(task.episode)];
@@ -770,7 +377,7 @@ class Deriver {
       data_.kept_names.push_back(name);
       std::vector<std::string>& cells = data_.kept.emplace_back();
       for (const Episode& episode : episodes_) {
-        double before = nan;
+        double before = not_a_number;
         for (std::size_t k = 0; k < episode.rows.size(); ++k) {
           if (episode.times[k] == before) continue;
           before = episode.times[k];
@@ -782,23 +389,15 @@ class Deriver {
 
   // each input goes through the filter of the slowest coordinate: a smoother of the same spectrum and noise is that filter
   void add_inputs() {
-    for (std::size_t u = 0; u < input_column_.size(); ++u) {
-      if (input_column_[u] < 0) continue;
-      for (int e = 0; e < static_cast<int>(episodes_.size()); ++e) {
-        const Episode& episode = episodes_[static_cast<std::size_t>(e)];
+    for (std::size_t u = 0; u < system_.inputs().size(); ++u) {
+      if (!raw_.has_input(u)) continue;
+      for (int e = 0; e < std::ssize(episodes_); ++e) {
+        const Episode& episode = episode_of(e);
         const DerivedSeries* slowest = nullptr;
         for (const DerivedSeries& series : data_.series) {
           if (series.episode == e && (!slowest || series.bandwidth < slowest->bandwidth)) slowest = &series;
         }
-        Channel channel;
-        read_column(episode, input_column_[u], false, channel);
-        if (channel.measurements.empty()) {
-          throw InputError(fmt::format("{}: column '{}'{}: there is no value", log_.name(),
-                                       log_.header()[static_cast<std::size_t>(input_column_[u])], in_episode(episode)));
-        }
-        for (const Measurement& one : channel.measurements)
-          channel.mean += one.value / static_cast<double>(channel.measurements.size());
-        for (Measurement& one : channel.measurements) one.value -= channel.mean;
+        const Channel channel = raw_.input(u, episode);
         const VectorXd times = times_to_write(episode);
         const SmoothedMotion motion = smooth(slowest->model, channel.measurements, times);
         data_.states.row(system_.layout().u(static_cast<int>(u))).segment(first_row_[static_cast<std::size_t>(e)], times.size()) =
@@ -809,10 +408,10 @@ class Deriver {
 
   // what acts late, by the model's delays and lags, for constraints that read it
   void let_inputs_act() {
-    for (std::size_t u = 0; u < input_column_.size(); ++u) {
-      if (input_column_[u] < 0 || model_.actuators[u].is_direct()) continue;
-      for (int e = 0; e < static_cast<int>(episodes_.size()); ++e) {
-        const VectorXd times = times_to_write(episodes_[static_cast<std::size_t>(e)]);
+    for (std::size_t u = 0; u < system_.inputs().size(); ++u) {
+      if (!raw_.has_input(u) || model_.actuators[u].is_direct()) continue;
+      for (int e = 0; e < std::ssize(episodes_); ++e) {
+        const VectorXd times = times_to_write(episode_of(e));
         auto acting = data_.states.row(system_.layout().u(static_cast<int>(u)))
                           .segment(first_row_[static_cast<std::size_t>(e)], times.size());
         const InputSignal signal(times, acting, {model_.actuators[u]});
@@ -837,7 +436,7 @@ class Deriver {
     const VectorXd start = start_of_newton();
     const int redundancy = redundancy_of(states, started(0, start));
     std::vector<std::string> completed;
-    for (const int j : data_.completed) completed.push_back(system_.coordinates()[static_cast<std::size_t>(j)].name);
+    for (const int j : data_.completed) completed.push_back(name_of(j));
     note_redundancy(redundancy, completed);
     const bool conditioned = options_.hold_constraints && redundancy > 0;
     parallel_for(static_cast<int>(episodes_.size()), thread_count(options_.n_threads),
@@ -956,12 +555,9 @@ class Deriver {
   const DeriveOptions& options_;
   const LearnedAccelerations* learned_;  // may be null
   std::map<int, SmootherModel> models_;  // of the log that this one is to be like
-  LogReader reader_;
+  RawLog raw_;
+  const std::vector<Episode>& episodes_ = raw_.episodes();
   DerivedData data_;
-  int time_column_ = -1;
-  std::map<int, int> position_column_, velocity_column_;  // of measured coordinates; −1: not logged
-  std::vector<int> input_column_;                         // −1: not logged
-  std::vector<Episode> episodes_;
   std::vector<Task> tasks_;
   std::vector<Index> first_row_;  // of each episode
   std::mutex progress_lock_;
@@ -1030,7 +626,7 @@ CsvTable as_table(const DerivedData& data, const System& system, std::string nam
       add(state_names[static_cast<std::size_t>(row)] + "_std", data.stddev, row);
     }
   }
-  const MatrixXd of_independent = data.is_independent.select(data.stddev.bottomRows(layout.nq), nan);
+  const MatrixXd of_independent = data.is_independent.select(data.stddev.bottomRows(layout.nq), not_a_number);
   for (const int j : data.independent) add(acceleration_names[static_cast<std::size_t>(j)] + "_std", of_independent, j);
   for (std::size_t k = 0; k < data.kept.size(); ++k) columns.push_back({data.kept_names[k], {}, data.kept[k]});
   return CsvTable::from_columns(std::move(name), std::move(columns));

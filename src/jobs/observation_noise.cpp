@@ -7,6 +7,7 @@
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
+#include "base/not_a_number.hpp"
 #include "gp2/error.hpp"
 #include "gp2/training/robust.hpp"
 
@@ -105,7 +106,7 @@ std::vector<std::string> stated_accelerations(std::vector<std::string> names, co
 }
 
 MatrixXd stated_stddevs(const Model& model, const std::vector<std::string>& names, LogReader& reader, Index n_rows) {
-  MatrixXd stddev = MatrixXd::Constant(std::ssize(names), n_rows, std::numeric_limits<double>::quiet_NaN());
+  MatrixXd stddev = MatrixXd::Constant(std::ssize(names), n_rows, not_a_number);
   const std::vector<std::string> every = model.system->acceleration_names();
   for (std::size_t k = 0; k < names.size(); ++k) {
     if (reader.stddev_column(names[k]).empty()) continue;

@@ -4,12 +4,12 @@
 #include <bit>
 #include <cmath>
 #include <cstdint>
-#include <limits>
 #include <numeric>
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
+#include "base/not_a_number.hpp"
 #include "base/random.hpp"
 #include "gp2/error.hpp"
 #include "gp2/inference/evaluation.hpp"
@@ -137,7 +137,7 @@ std::vector<int> measured_rows(Readings& readings, const std::vector<std::string
     if (readings.states_noise(k)) {
       for (Index i = 0; i < values.cols(); ++i) {
         if (std::isnan(values(k, i)) || !std::isnan(readings.stated_stddev(k, i))) continue;
-        values(k, i) = std::numeric_limits<double>::quiet_NaN();
+        values(k, i) = not_a_number;
         ++n_without;
       }
     }
@@ -189,7 +189,7 @@ void require_mechanics_at(const LoggedSystem& logged, const View& view, const Ma
 // Deviations of coordinates and velocities, of columns NAME_std; NaN where there are none. Empty where there is no such column.
 MatrixXd stated_state_deviations(const System& system, LogReader& reader, const CsvTable& log) {
   const std::vector<std::string> names = system.state_names();
-  MatrixXd stddevs = MatrixXd::Constant(2 * system.nq(), log.n_rows(), std::numeric_limits<double>::quiet_NaN());
+  MatrixXd stddevs = MatrixXd::Constant(2 * system.nq(), log.n_rows(), not_a_number);
   bool is_stated = false;
   for (Index k = 0; k < stddevs.rows(); ++k) {
     const std::string& name = names[static_cast<std::size_t>(k)];
@@ -543,7 +543,7 @@ LogStates read_log_states(const Prior& prior, const View& view, const Model& mod
   for (Index i = 0; commanded && i < out.states.cols(); ++i) {
     if (is_known(*commanded, static_cast<std::size_t>(i))) continue;
     ++n_unknown;
-    out.accelerations.col(i).setConstant(std::numeric_limits<double>::quiet_NaN());
+    out.accelerations.col(i).setConstant(not_a_number);
   }
   if (n_unknown > 0) {
     out.notes.push_back(
@@ -608,7 +608,7 @@ WholeLog read_whole_log(const Model& model, LogReader& reader) {
   log.states = reader.states(reads);
   std::vector<std::string> notes;
   take_commands(system, model.actuators, reader, std::nullopt, {}, log.states, notes);
-  log.accelerations = MatrixXd::Constant(system.nq(), log.states.cols(), std::numeric_limits<double>::quiet_NaN());
+  log.accelerations = MatrixXd::Constant(system.nq(), log.states.cols(), not_a_number);
   log.stddev = log.accelerations;
   Index row = 0;
   for (const std::string& name : system.acceleration_names()) {

@@ -13,6 +13,7 @@
 #include <Eigen/Eigenvalues>
 #include <Eigen/QR>
 
+#include "base/not_a_number.hpp"
 #include "base/parallel.hpp"
 #include "gp2/base/statistics.hpp"
 #include "gp2/error.hpp"
@@ -223,7 +224,7 @@ class Shooter {
       if (acceleration > 0) durations.push_back(std::sqrt(velocity / acceleration));
     }
     constexpr double factor = 2;
-    return durations.empty() ? std::numeric_limits<double>::quiet_NaN() : factor * median(std::move(durations));
+    return durations.empty() ? not_a_number : factor * median(std::move(durations));
   }
 
   [[nodiscard]] Posterior posterior_at(const std::vector<Hyperparameter>& hyperparameters) const {

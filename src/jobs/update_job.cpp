@@ -1,11 +1,11 @@
 #include "gp2/jobs/update_job.hpp"
 
 #include <algorithm>
-#include <limits>
 #include <utility>
 
 #include <fmt/format.h>
 
+#include "base/not_a_number.hpp"
 #include "gp2/data/log_reader.hpp"
 #include "gp2/error.hpp"
 #include "gp2/jobs/fit_problem.hpp"
@@ -39,7 +39,7 @@ Observations more_observations(const FitFile& fit, const Posterior& posterior, c
   LogStates read = read_log_states(posterior.prior(), view, fit.model, log, request.columns, names);
 
   // the noise that the fit has for these rows, unless told otherwise; where it is a factor of stated ones, the log states them
-  VectorXd stddev = VectorXd::Constant(view.size(), request.noise_stddev.value_or(std::numeric_limits<double>::quiet_NaN()));
+  VectorXd stddev = VectorXd::Constant(view.size(), request.noise_stddev.value_or(not_a_number));
   MatrixXd scale;
   if (!request.noise_stddev) {
     if (at_home == groups.end() || at_home->view().rows != view.rows) {

@@ -3,10 +3,7 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
-#include <functional>
-#include <limits>
 #include <mutex>
-#include <numeric>
 #include <tuple>
 #include <utility>
 
@@ -17,8 +14,8 @@
 #include "base/decompositions.hpp"
 #include "base/parallel.hpp"
 #include "gp2/error.hpp"
-#include "gp2/mechanics/symbolic_system.hpp"
 #include "gp2/mechanics/udwadia_kalaba.hpp"
+#include "mechanics/in_blocks.hpp"
 
 namespace gp2 {
 
@@ -26,160 +23,7 @@ using Eigen::Index;
 using Eigen::MatrixXd;
 using Eigen::Ref;
 using Eigen::VectorXd;
-
-namespace {
-
 using Level = Finding::Level;
-
-// work(first, states) for every block of states, so that a long log is looked at in the memory of a few rows. What a system has to
-// say against a state it says again of all together, by the number of the state among them.
-template <typename Work>
-void in_blocks(const Ref<const MatrixXd>& states, int n_threads, const Work& work) {
-  constexpr Index block_size = 256;
-  const auto visit = [&](Index first, const Ref<const MatrixXd>& block) { work(first, block); };
-  try {
-    for_each_block(states.cols(), block_size, thread_count(n_threads),
-                   [&](Index first, Index n, int) { visit(first, states.middleCols(first, n)); });
-  } catch (const InputError&) {
-    visit(0, states);
-    throw;
-  }
-}
-
-// standard deviation of a row, or its magnitude where it does not vary; 0 where it is not measured
-double spread(const Ref<const Eigen::RowVectorXd>& row) {
-  if (row.hasNaN() || row.size() == 0) return 0;
-  const double stddev = std::sqrt((row.array() - row.mean()).square().mean());
-  const double magnitude = row.cwiseAbs().maxCoeff();
-  return stddev > 1e-12 * magnitude ? stddev : magnitude;
-}
-
-// calls visit(subset) for every subset of `size` out of 0 … n − 1, in lexicographic order
-template <typename Visit>
-void for_each_subset(int n, int size, const Visit& visit) {
-  std::vector<int> subset(static_cast<std::size_t>(size));
-  std::iota(subset.begin(), subset.end(), 0);
-  while (true) {
-    visit(subset);
-    int k = size - 1;
-    while (k >= 0 && subset[static_cast<std::size_t>(k)] == n - size + k) --k;
-    if (k < 0) return;
-    ++subset[static_cast<std::size_t>(k)];
-    for (int later = k + 1; later < size; ++later)
-      subset[static_cast<std::size_t>(later)] = subset[static_cast<std::size_t>(later - 1)] + 1;
-  }
-}
-
-double binomial(int n, int k) {
-  double value = 1;
-  for (int i = 0; i < k; ++i) value *= static_cast<double>(n - i) / (i + 1);
-  return value;
-}
-
-// the smallest singular value of the given rows of T, in units of the spread, over the states
-double worst_conditioning(const std::vector<MatrixXd>& scaled_T, const std::vector<int>& rows) {
-  double worst = std::numeric_limits<double>::infinity();
-  for (const MatrixXd& T : scaled_T) {
-    const MatrixXd some = T(rows, Eigen::all);
-    worst = std::min(worst, Eigen::JacobiSVD<MatrixXd>(some).singularValues().minCoeff());
-  }
-  return worst;
-}
-
-// `size` rows of ddq that determine the others at every state, as well-conditioned as can be found
-std::vector<int> independent_rows(const std::vector<MatrixXd>& scaled_T, int size) {
-  const int nq = static_cast<int>(scaled_T.front().rows());
-  std::vector<int> best;
-  double best_value = -1;
-  constexpr double max_subsets = 2000;
-  if (binomial(nq, size) <= max_subsets) {
-    for_each_subset(nq, size, [&](const std::vector<int>& subset) {
-      const double value = worst_conditioning(scaled_T, subset);
-      if (value > best_value) {
-        best_value = value;
-        best = subset;
-      }
-    });
-    return best;
-  }
-  // too many subsets: grow one, row by row
-  while (static_cast<int>(best.size()) < size) {
-    int next = -1;
-    best_value = -1;
-    for (int row = 0; row < nq; ++row) {
-      if (std::find(best.begin(), best.end(), row) != best.end()) continue;
-      std::vector<int> candidate = best;
-      candidate.push_back(row);
-      const double value = worst_conditioning(scaled_T, candidate);
-      if (value > best_value) {
-        best_value = value;
-        next = row;
-      }
-    }
-    best.push_back(next);
-  }
-  std::sort(best.begin(), best.end());
-  return best;
-}
-
-// the states at which every acceleration is measured
-std::vector<int> complete_states(const Ref<const MatrixXd>& accelerations) {
-  std::vector<int> complete;
-  for (Index i = 0; i < accelerations.cols(); ++i) {
-    if (!accelerations.col(i).hasNaN()) complete.push_back(static_cast<int>(i));
-  }
-  return complete;
-}
-
-}  // namespace
-
-std::optional<ConstraintViolation> largest_violation(const System& system, const Ref<const MatrixXd>& states,
-                                                     const Ref<const VectorXd>& parameters) {
-  struct OfResidual {
-    double largest = -1, squares = 0;
-    Index at = 0;
-    bool is_measured = true;
-    VectorXd weights;  // largest |A|
-  };
-  const std::vector<System::Residual>& labels = system.residual_labels();
-  std::vector<OfResidual> all(labels.size());
-  for (OfResidual& one : all) one.weights.setZero(system.nq());
-  in_blocks(states, 1, [&](Index first, const Ref<const MatrixXd>& block) {
-    const MatrixXd residuals = system.residuals(block, parameters);
-    const SystemValues values = system.evaluate(block, parameters);
-    for (std::size_t k = 0; k < labels.size(); ++k) {
-      OfResidual& one = all[k];
-      for (Index i = 0; i < block.cols(); ++i) {
-        const double size = std::abs(residuals(static_cast<Index>(k), i));
-        one.is_measured = one.is_measured && !std::isnan(size);
-        one.squares += size * size;
-        if (size > one.largest) one.largest = size, one.at = first + i;
-        const auto A = values.A(static_cast<int>(i)).row(labels[k].row);
-        for (Index j = 0; j < A.size(); ++j) one.weights[j] = std::max(one.weights[j], std::abs(A[j]));
-      }
-    }
-  });
-  const StateLayout layout = system.layout();
-  VectorXd spreads = VectorXd::Constant(2 * layout.nq, -1);
-  const auto spread_of = [&](int row) {
-    if (spreads[row] < 0) spreads[row] = spread(states.row(row));
-    return spreads[row];
-  };
-  std::optional<ConstraintViolation> worst;
-  for (std::size_t k = 0; k < labels.size(); ++k) {
-    const OfResidual& one = all[k];
-    if (!one.is_measured) continue;
-    double scale = 0;
-    for (int j = 0; j < system.nq(); ++j) {
-      scale += one.weights[j] * spread_of(labels[k].velocity ? layout.dq(j) : layout.q(j));
-    }
-    if (scale == 0) scale = 1;
-    const double relative = one.largest / scale;
-    const double rms = std::sqrt(one.squares) / std::sqrt(static_cast<double>(states.cols())) / scale;
-    if (!worst || relative > worst->relative) worst = {relative, rms, one.largest, static_cast<int>(one.at), labels[k].text};
-  }
-  return worst;
-}
 
 std::vector<int> ranks_of(const System& system, const MechanicsBatch& mechanics) {
   std::vector<int> ranks;
@@ -221,148 +65,6 @@ LowerRank states_of_lower_rank(const System& system, const Ref<const MatrixXd>& 
     std::copy(here.begin(), here.end(), ranks.begin() + first);
   });
   return fault ? LowerRank{} : states_of_lower_rank(ranks);
-}
-
-namespace {
-
-// Whether A ddq = b holds to rounding wherever all accelerations are measured.
-bool obey_to_rounding(const System& system, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters,
-                      const Ref<const MatrixXd>& accelerations) {
-  // a log with 7 digits or more of a computed quantity; measured accelerations are never that good
-  constexpr double tolerance = 1e-6;
-  bool obey = true;
-  in_blocks(states, 1, [&](Index first, const Ref<const MatrixXd>& block) {
-    if (!obey) return;
-    const SystemValues values = system.evaluate(block, parameters);
-    for (int i = 0; i < values.n_states(); ++i) {
-      const auto ddq = accelerations.col(first + i);
-      if (ddq.hasNaN()) continue;
-      const VectorXd residual = values.A(i) * ddq - values.b(i);
-      const VectorXd size = values.A(i).cwiseAbs() * ddq.cwiseAbs() + values.b(i).cwiseAbs();
-      obey = obey && !((residual.array().abs() > tolerance * size.array())).any();
-    }
-  });
-  return obey;
-}
-
-}  // namespace
-
-std::optional<std::vector<int>> dependent_columns(const System& system, const Ref<const MatrixXd>& states,
-                                                  const Ref<const VectorXd>& parameters,
-                                                  const Ref<const MatrixXd>& accelerations) {
-  if (system.nc() == 0 || !obey_to_rounding(system, states, parameters, accelerations)) return std::nullopt;
-  if (accelerations.hasNaN()) {
-    const std::vector<int> complete = complete_states(accelerations);
-    if (complete.empty()) return std::nullopt;
-    return dependent_columns(system, states(Eigen::all, complete), parameters, accelerations(Eigen::all, complete));
-  }
-  VectorXd scale(system.nq());
-  for (Index j = 0; j < scale.size(); ++j) scale[j] = std::max(spread(accelerations.row(j)), 1e-300);
-  int rank = 0, lowest_rank = system.nq();
-  std::vector<MatrixXd> scaled_T;
-  constexpr Index max_states = 50;
-  const Index stride = std::max<Index>(1, states.cols() / max_states);
-  const auto fault = for_each_mechanics(system, states, parameters, 1, [&](Index first, const MechanicsBatch& mechanics) {
-    for (std::size_t i = 0; i < mechanics.projections.size(); ++i) {
-      const UdwadiaKalaba& projection = mechanics.projections[i];
-      rank = std::max(rank, projection.rank());
-      lowest_rank = std::min(lowest_rank, projection.rank());
-      if ((first + static_cast<Index>(i)) % stride != 0) continue;
-      scaled_T.emplace_back(scale.cwiseInverse().asDiagonal() * projection.T() * scale.asDiagonal());
-    }
-  });
-  if (fault || rank == 0) return std::nullopt;
-  // where a constraint is not active all columns are measurements
-  if (system.has_conditional_constraints() && lowest_rank < rank) return std::nullopt;
-  return independent_rows(scaled_T, system.nq() - rank);
-}
-
-bool ConstraintResidual::is_too_large() const {
-  if (n < 4) return false;
-  if (std::isfinite(expected)) {
-    // χ²/n of n normal values is 1 ± √(2/n)
-    const double ratio = rms / expected;
-    return ratio > 2 && ratio * ratio > 1 + 6 * std::sqrt(2.0 / n);
-  }
-  const double scatter = std::sqrt(std::max(0.0, rms * rms - mean * mean));
-  const bool is_offset = std::abs(mean) > scatter && std::abs(mean) * std::sqrt(n) > 6 * scatter && std::abs(mean) > 0.05 * size;
-  return is_offset || rms > 0.5 * size;
-}
-
-std::string ConstraintResidual::text() const {
-  const bool is_known = std::isfinite(expected);
-  if (!is_too_large()) {
-    if (!is_known) {
-      return fmt::format("measured ddq on A ddq = b: rms residual {:.3g} for '{}' (noise, if the model is right)", rms,
-                         constraint);
-    }
-    return fmt::format("measured ddq on A ddq = b: rms residual {:.3g} for '{}', expected {:.3g} from the noise", rms, constraint,
-                       expected);
-  }
-  std::vector<int> rows;
-  for (const int state : worst) rows.push_back(state + 1);
-  if (!is_known) {
-    return fmt::format(
-        "measured ddq on A ddq = b: rms residual {:.3g} for '{}', mean {:.3g}, is more than noise: a constraint, a "
-        "unit, a sign or gravity in a sensor is wrong (farthest off: row {})",
-        rms, constraint, mean, fmt::join(rows, ", "));
-  }
-  return fmt::format(
-      "measured ddq on A ddq = b: rms residual {:.3g} for '{}', mean {:.3g}, expected {:.2g} from the noise: {:.2g} ×; "
-      "a constraint, a unit, a sign or gravity in a sensor is wrong, or the noise is stated too small (farthest off: "
-      "row {})",
-      rms, constraint, mean, expected, rms / expected, fmt::join(rows, ", "));
-}
-
-std::vector<ConstraintResidual> constraint_residuals(const System& system, const Ref<const MatrixXd>& states,
-                                                     const Ref<const VectorXd>& parameters,
-                                                     const Ref<const MatrixXd>& accelerations,
-                                                     const Ref<const MatrixXd>& stddev) {
-  constexpr std::size_t n_worst = 3;
-  using Distances = std::vector<std::pair<double, int>>;  // of the worst states, the largest first
-  std::vector<ConstraintResidual> all(static_cast<std::size_t>(system.nc()));
-  std::vector<Distances> distances(all.size());
-  in_blocks(states, 1, [&](Index first, const Ref<const MatrixXd>& block) {
-    const SystemValues values = system.evaluate(block, parameters);
-    for (int row = 0; row < system.nc(); ++row) {
-      ConstraintResidual& one = all[static_cast<std::size_t>(row)];
-      Distances& worst = distances[static_cast<std::size_t>(row)];
-      for (int i = 0; i < values.n_states(); ++i) {
-        const Index state = first + i;
-        double r = -values.b(i)[row], size = std::abs(r), variance = 0;
-        for (int j = 0; j < system.nq(); ++j) {
-          const double a = values.A(i)(row, j);
-          if (a == 0) continue;
-          r += a * accelerations(j, state);
-          size += std::abs(a * accelerations(j, state));
-          variance += a * a * stddev(j, state) * stddev(j, state);
-        }
-        // a row that vanishes says nothing of ddq
-        if (!std::isfinite(r) || variance == 0) continue;
-        variance += std::pow(system.constraint_noise()[row], 2);
-        ++one.n;
-        one.rms += r * r;
-        one.mean += r;
-        one.size += size * size;
-        one.expected += variance;
-        const std::pair distance(std::isfinite(variance) ? std::abs(r) / std::sqrt(variance) : std::abs(r),
-                                 static_cast<int>(state));
-        if (worst.size() == n_worst && distance < worst.back()) continue;
-        worst.insert(std::upper_bound(worst.begin(), worst.end(), distance, std::greater<>()), distance);
-        worst.resize(std::min(worst.size(), n_worst));
-      }
-    }
-  });
-  for (std::size_t row = 0; row < all.size(); ++row) {
-    ConstraintResidual& one = all[row];
-    one.constraint = system.constraint_labels()[row];
-    if (one.n == 0) continue;
-    one.mean /= one.n;
-    for (double* const square : {&one.rms, &one.size, &one.expected}) *square = std::sqrt(*square / one.n);
-    for (const auto& [distance, state] : distances[row]) one.worst.push_back(state);
-  }
-  std::erase_if(all, [](const ConstraintResidual& one) { return one.n == 0; });
-  return all;
 }
 
 namespace {
@@ -743,47 +445,6 @@ void check_motion(const System& system, const Ref<const MatrixXd>& states, const
                                   worst > 1e-3 ? " (largest for '" + worst_label + "')" : "")});
 }
 
-// A contact only pushes, and its gap is positive where it is open.
-void check_contacts(const SymbolicSystem& system, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters,
-                    const Ref<const MatrixXd>& accelerations, std::vector<Finding>& findings) {
-  for (int row = 0; row < system.nc(); ++row) {
-    const ConstraintRow& constraint = system.definition().constraints[static_cast<std::size_t>(row)];
-    if (!constraint.contact) continue;
-    const int touch = system.layout().u(constraint.contact->input);
-    const auto& labels = system.residual_labels();
-    const auto gap = std::find_if(labels.begin(), labels.end(), [&](const auto& one) { return one.row == row; });
-    int n_closed = 0, n_pulling = 0, n_open = 0, n_beyond = 0;
-    const auto fault = for_each_mechanics(system, states, parameters, 1, [&](Index first, const MechanicsBatch& block) {
-      MatrixXd all_closed = states.middleCols(first, block.values.n_states());
-      all_closed.row(touch).setOnes();
-      const auto gaps = system.residuals(all_closed, parameters).row(gap - labels.begin()).eval();
-      for (int i = 0; i < block.values.n_states(); ++i) {
-        if (block.values.A(i).row(row).isZero(0)) {
-          ++n_open;
-          n_beyond += gaps[i] < 0 ? 1 : 0;
-          continue;
-        }
-        const VectorXd force = block.values.M(i) * accelerations.col(first + i) - block.values.F(i);
-        const double lambda = block.projections[static_cast<std::size_t>(i)].multipliers_of_force().row(row).dot(force);
-        if (!std::isfinite(lambda)) continue;
-        ++n_closed;
-        n_pulling += lambda < 0 ? 1 : 0;
-      }
-    });
-    if (fault) return;
-    const bool pulls = 2 * n_pulling > n_closed, is_beyond = 2 * n_beyond > n_open;
-    findings.push_back(
-        {pulls || is_beyond ? Level::warning : Level::good,
-         fmt::format(
-             "contact '{}': under the measured ddq and the known force it pulls at {} of {} states where it is closed, and its "
-             "gap is negative at {} of {} where it is open{}",
-             constraint.text, n_pulling, n_closed, n_beyond, n_open,
-             is_beyond ? "; a gap is not negative: change its sign, or the input that says where it is closed"
-             : pulls   ? "; a contact only pushes: change the sign of the gap, or give the force that presses it"
-                       : "")});
-  }
-}
-
 }  // namespace
 
 std::vector<Finding> check_system(const System& system, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters,
@@ -792,49 +453,6 @@ std::vector<Finding> check_system(const System& system, const Ref<const MatrixXd
   if (!check_mechanics(system, states, parameters, n_threads, findings)) return findings;
   check_parameter_derivatives(system, states, parameters, n_threads, findings);
   check_motion(system, states, parameters, n_threads, findings);
-  return findings;
-}
-
-std::vector<Finding> check_data(const System& system, const Ref<const MatrixXd>& states, const Ref<const VectorXd>& parameters,
-                                const Ref<const MatrixXd>& accelerations, const Ref<const MatrixXd>& stddev,
-                                const std::vector<int>& stated) {
-  const bool estimates =
-      std::any_of(system.parameters().begin(), system.parameters().end(), [](const auto& one) { return one.estimate; });
-  std::vector<Finding> findings;
-  if (const auto violation = largest_violation(system, states, parameters)) {
-    const Level level = violation->rms > 0.3                                   ? Level::error
-                        : violation->relative > constraint_violation_tolerance ? Level::warning
-                                                                               : Level::good;
-    findings.push_back({estimates ? std::min(level, Level::warning) : level,
-                        fmt::format("data on the constraint: off by {:.2g} at most, {:.1e} of its scale ('{}', row {})",
-                                    violation->value, violation->relative, violation->constraint, violation->state + 1)});
-  }
-  for (const ConstraintResidual& one : constraint_residuals(system, states, parameters, accelerations, stddev)) {
-    // as large as what should cancel: nothing that is learned from such data is of this system
-    const bool is_all = one.is_too_large() && one.rms > 0.3 * one.size && !estimates;
-    const std::string of_file = one.is_too_large() && estimates ? "; here with the parameters as in the model file" : "";
-    findings.push_back({is_all ? Level::error : one.is_too_large() ? Level::warning : Level::good, one.text() + of_file});
-  }
-  if (const auto* symbolic = dynamic_cast<const SymbolicSystem*>(&system)) {
-    check_contacts(*symbolic, states, parameters, accelerations, findings);
-  }
-  const std::vector<std::string> every = system.acceleration_names();
-  const auto rows = dependent_columns(system, states, parameters, accelerations);
-  if (rows && !stated.empty() && stated.size() <= rows->size()) {
-    std::vector<std::string> names;
-    for (int row : stated) names.push_back(every[static_cast<std::size_t>(row)]);
-    findings.push_back(
-        {Level::good, fmt::format("dependent columns: the {} accelerations obey A ddq = b to rounding; a fit observes "
-                                  "{}, whose deviations the log gives",
-                                  system.nq(), fmt::join(names, ", "))});
-  } else if (rows) {
-    std::vector<std::string> names;
-    for (int row : *rows) names.push_back(every[static_cast<std::size_t>(row)]);
-    findings.push_back(
-        {Level::warning, fmt::format("dependent columns: the {} accelerations obey A ddq = b to rounding, so only {} of them are "
-                                     "independent measurements: fit with `observe={}`",
-                                     system.nq(), rows->size(), fmt::join(names, ","))});
-  }
   return findings;
 }
 

@@ -3,7 +3,6 @@
 #include <algorithm>
 #include <cmath>
 #include <functional>
-#include <limits>
 #include <map>
 #include <optional>
 #include <span>
@@ -13,6 +12,7 @@
 #include <Eigen/QR>
 
 #include "base/decompositions.hpp"
+#include "base/not_a_number.hpp"
 #include "base/random.hpp"
 #include "gp2/error.hpp"
 #include "gp2/mechanics/udwadia_kalaba.hpp"
@@ -211,7 +211,7 @@ class Sampler {
   using Fraction = std::function<double(std::size_t rule)>;
 
   [[nodiscard]] VectorXd draw(const Fraction& fraction, int sample) const {
-    MatrixXd state = MatrixXd::Constant(n_varying_, 1, std::numeric_limits<double>::quiet_NaN());
+    MatrixXd state = MatrixXd::Constant(n_varying_, 1, not_a_number);
     apply_rules(Stage::before_positions, fraction, state, sample);
     positions_->solve(state, parameters_, sample);
     apply_rules(Stage::after_positions, fraction, state, sample);

@@ -10,6 +10,7 @@
 #include <Eigen/QR>
 
 #include "base/decompositions.hpp"
+#include "base/not_a_number.hpp"
 #include "gp2/error.hpp"
 
 namespace gp2 {
@@ -111,7 +112,7 @@ void ConstrainedStates::complete(VectorXd& state, Eigen::Ref<VectorXd> accelerat
   state = without_blind(state);
   projection_.apply(state);
   acceleration = completed_acceleration(state, acceleration);
-  for (const int j : blind_) state[system_.layout().q(j)] = std::numeric_limits<double>::quiet_NaN();
+  for (const int j : blind_) state[system_.layout().q(j)] = not_a_number;
 }
 
 void ConstrainedStates::approach(VectorXd& state, Eigen::Ref<VectorXd> acceleration) const {
@@ -141,7 +142,7 @@ void ConstrainedStates::approach(VectorXd& state, Eigen::Ref<VectorXd> accelerat
     for (std::size_t k = 0; k < free_.size(); ++k) state[system_.layout().dq(free_[k])] -= step[static_cast<Index>(k)];
   }
   acceleration = completed_acceleration(state, acceleration);
-  for (const int j : blind_) state[system_.layout().q(j)] = std::numeric_limits<double>::quiet_NaN();
+  for (const int j : blind_) state[system_.layout().q(j)] = not_a_number;
 }
 
 int ConstrainedStates::redundancy(const VectorXd& state) const {
@@ -325,7 +326,7 @@ void ConstrainedStates::condition(VectorXd& state, Eigen::Ref<VectorXd> accelera
       state.head(2 * nq) = z.head(2 * nq);
       acceleration = z.tail(nq);
       condition_covariance(next, W, measured_, covariance);
-      for (const int j : blind_) state[system_.layout().q(j)] = std::numeric_limits<double>::quiet_NaN();
+      for (const int j : blind_) state[system_.layout().q(j)] = not_a_number;
       return;
     }
     previous = size;

@@ -1,4 +1,5 @@
 #include "gp2/training/laplace.hpp"
+#include "base/not_a_number.hpp"
 #include "inference/posterior_implementation.hpp"
 
 #include <algorithm>
@@ -27,7 +28,7 @@ double unit_of(const Hyperparameter& h) { return h.map().is_logarithm ? 1 : h.ma
 }  // namespace
 
 LaplaceUncertainty laplace_uncertainty(const Curvature& curvature, const std::vector<Hyperparameter>& hyperparameters) {
-  constexpr double infinity = std::numeric_limits<double>::infinity(), nan = std::numeric_limits<double>::quiet_NaN();
+  constexpr double infinity = std::numeric_limits<double>::infinity();
   const std::vector<int>& free = curvature.free;
   const auto n = static_cast<Index>(hyperparameters.size()), n_free = static_cast<Index>(free.size());
   const Index n_flat = (curvature.eigenvalues.array() <= curvature.zero).count();
@@ -50,7 +51,7 @@ LaplaceUncertainty laplace_uncertainty(const Curvature& curvature, const std::ve
     for (Index l = 0; l < k; ++l) {
       const Index other = free[static_cast<std::size_t>(l)];
       const double both = std::sqrt(covariance(k, k) * covariance(l, l));
-      out.correlation(at, other) = out.correlation(other, at) = is_flat(k) || is_flat(l) ? nan : covariance(k, l) / both;
+      out.correlation(at, other) = out.correlation(other, at) = is_flat(k) || is_flat(l) ? not_a_number : covariance(k, l) / both;
     }
   }
   out.undetermined.colwise().normalize();
@@ -86,20 +87,19 @@ bool draws_know_parameters(const FitReport& report) {
 }  // namespace
 
 ParameterUncertainty parameter_uncertainty(const FitReport& report, std::size_t k) {
-  constexpr double nan = std::numeric_limits<double>::quiet_NaN();
   const Hyperparameter& h = report.hyperparameters[k];
   const auto at = static_cast<Index>(k);
   if (draws_know_parameters(report) && report.draws->is_drawn(at)) {
     const HyperparameterDraws& draws = *report.draws;
     return {true, draws.stddev[at], draws.mean[at], draws.lower[at], draws.upper[at]};
   }
-  return {.stddev = !report.uncertainty || h.at_bound() ? nan : report.uncertainty->stddev[at]};
+  return {.stddev = !report.uncertainty || h.at_bound() ? not_a_number : report.uncertainty->stddev[at]};
 }
 
 double parameter_correlation(const FitReport& report, std::size_t k, std::size_t l) {
   const auto a = static_cast<Index>(k), b = static_cast<Index>(l);
   if (draws_know_parameters(report)) return report.draws->correlation(a, b);
-  return report.uncertainty ? report.uncertainty->correlation(a, b) : std::numeric_limits<double>::quiet_NaN();
+  return report.uncertainty ? report.uncertainty->correlation(a, b) : not_a_number;
 }
 
 namespace {

@@ -1,4 +1,5 @@
 #include "gp2/training/robust.hpp"
+#include "base/not_a_number.hpp"
 #include "gp2/base/statistics.hpp"
 
 #include <algorithm>
@@ -87,7 +88,7 @@ MatrixXd without_far_values(MatrixXd near, double threshold) {
     const double spread = median(std::move(values)) / normal_median;
     if (spread == 0) continue;  // most values are the same
     for (double& value : near.row(k)) {
-      if (std::abs(value - middle) > threshold * spread) value = std::numeric_limits<double>::quiet_NaN();
+      if (std::abs(value - middle) > threshold * spread) value = not_a_number;
     }
   }
   return near;

@@ -28,7 +28,7 @@ TEST_P(Help, ExplainsTheCommandWithAnExample) {
   EXPECT_EQ(outcome.err, "");
   EXPECT_THAT(outcome.out, HasSubstr("Example:\n  gp2 " + (GetParam().empty() ? "generate" : GetParam())));
   const bool may_say_more = !GetParam().empty() && GetParam() != "help";
-  EXPECT_EQ(outcome.said("-q, --quiet"), may_say_more);
+  EXPECT_EQ(outcome.out.find("-q, --quiet") != std::string::npos, may_say_more);
 }
 
 INSTANTIATE_TEST_SUITE_P(OfEveryCommand, Help,

@@ -1,0 +1,161 @@
+#include <cmath>
+
+#include <fmt/format.h>
+#include <pybind11/stl.h>
+
+#include "arrays.hpp"
+#include "bindings.hpp"
+#include "gp2/training/laplace.hpp"
+
+namespace gp2::python {
+
+using namespace py::literals;
+
+namespace {
+
+py::list actuators_of(const FitReport& self) {
+  py::list out;
+  for (const ActuatorEstimate& one : self.actuators) {
+    out.append(py::dict("name"_a = one.name, "value"_a = one.value, "stddev"_a = one.stddev, "lower"_a = one.lower,
+                        "upper"_a = one.upper));
+  }
+  return out;
+}
+
+py::object inducing_of(const FitReport& self) {
+  if (!self.inducing) return py::none();
+  return py::dict("n_variables"_a = self.inducing->n_variables, "left_out"_a = to_vector(self.inducing->left_out),
+                  "n_start"_a = self.inducing->n_start);
+}
+
+py::list distrusted_values(const FitReport& self) {
+  py::list list;
+  for (const DistrustedValue& value : self.distrusted) {
+    list.append(py::dict("log"_a = value.group, "row"_a = value.row, "state"_a = value.state, "distance"_a = value.distance,
+                         "noise_factor"_a = value.noise_factor));
+  }
+  return list;
+}
+
+py::dict standard_errors(const FitReport& self) {
+  py::dict errors;
+  for (std::size_t k = 0; (self.uncertainty || self.draws) && k < self.hyperparameters.size(); ++k) {
+    const Hyperparameter& h = self.hyperparameters[k];
+    if (h.is_system_parameter()) errors[py::str(h.name)] = parameter_uncertainty(self, k).stddev;
+  }
+  return errors;
+}
+
+double correlation(const FitReport& self, const std::string& a, const std::string& b) {
+  const auto index = [&](const std::string& name) {
+    for (std::size_t k = 0; k < self.hyperparameters.size(); ++k) {
+      if (self.hyperparameters[k].name == name) return k;
+    }
+    throw py::key_error(name);
+  };
+  return parameter_correlation(self, index(a), index(b));
+}
+
+// name -> what the draws say of a hyperparameter; None where there are none
+py::object draws_of(const FitReport& self) {
+  if (!self.draws) return py::none();
+  py::dict all;
+  for (std::size_t h = 0; h < self.hyperparameters.size(); ++h) {
+    const auto k = static_cast<Eigen::Index>(h);
+    const HyperparameterDraws& draws = *self.draws;
+    all[py::str(self.hyperparameters[h].name)] =
+        py::dict("values"_a = to_vector(Eigen::VectorXd(draws.values.row(k))), "mean"_a = draws.mean[k],
+                 "std"_a = draws.stddev[k], "interval95"_a = py::make_tuple(draws.lower[k], draws.upper[k]),
+                 "r_hat"_a = draws.r_hat[k], "effective_size"_a = draws.effective_size[k]);
+  }
+  return all;
+}
+
+double value_of(const FitReport& self, const std::string& name) {
+  for (const Hyperparameter& h : self.hyperparameters) {
+    if (h.name == name) return h.value;
+  }
+  throw py::key_error(name);
+}
+
+std::string text_of(const FitReport& self) {
+  std::string text = fmt::format("negative log likelihood {:.6f}\n{} after {} iterations ({} restarts, best: {}), {:.2f} s",
+                                 self.negative_log_likelihood, self.termination, self.iterations, self.restarts.size(),
+                                 self.best_restart + 1, self.seconds);
+  for (std::size_t k = 0; k < self.hyperparameters.size(); ++k) {
+    const Hyperparameter& h = self.hyperparameters[k];
+    const double stddev = h.is_system_parameter() ? parameter_uncertainty(self, k).stddev : std::nan("");
+    const std::string error = std::isnan(stddev) ? "" : fmt::format(" ± {:.2g}", stddev);
+    text += fmt::format("\n  {:<34} {:>13.6g}{}   [{:.3g}, {:.3g}]{}", h.name, h.value, error, h.lower, h.upper,
+                        h.is_fixed()   ? "   held"
+                        : h.at_bound() ? "   at its bound"
+                                       : "");
+  }
+  return text;
+}
+
+void define_report(py::class_<FitReport>& report) {
+  report.def_readonly("hyperparameters", &FitReport::hyperparameters, "Fitted values, list of Hyperparameter.")
+      .def_readonly("negative_log_likelihood", &FitReport::negative_log_likelihood,
+                    "-log p(y), physical units, all constants, without hyper-prior.")
+      .def_readonly("objective", &FitReport::objective, "With hyper-priors: what was minimised.")
+      .def_readonly("converged", &FitReport::converged)
+      .def_readonly("termination", &FitReport::termination, "Which inequality stopped the optimiser.")
+      .def_readonly("iterations", &FitReport::iterations, "Of the best restart.")
+      .def_readonly("best_restart", &FitReport::best_restart)
+      .def_readonly("restarts", &FitReport::restarts, "How each run ended, list of RestartReport.")
+      .def_property_readonly(
+          "distrusted", &distrusted_values,
+          "Values that a robust fit distrusts, the farthest first: `log` and `state` count from 0, `row` among the observed.")
+      .def_property_readonly(
+          "actuators", &actuators_of,
+          "Delays and lags of inputs that were estimated, in s: dicts of name, value, stddev (nan at a bound, inf "
+          "where the data do not determine it), lower and upper.")
+      .def_property_readonly(
+          "inducing", &inducing_of,
+          "Of a fit through inducing points: n_variables, left_out, of each latent what they leave of its variance at all "
+          "rows, in units of the noise (twice the nats by which the likelihood is too low, about), and n_start, the rows "
+          "that hyperparameters were fitted to before all; else None.")
+      .def_readonly("seconds", &FitReport::seconds)
+      .def_property_readonly("standard_errors", &standard_errors,
+                             "Of estimated parameters, by name: inf where the data do not determine one, nan where it is at a "
+                             "bound. Of the draws, where "
+                             "all that are estimated were drawn.")
+      .def_property_readonly(
+          "draws", &draws_of,
+          "Of hyperparameters='integrate': by name a dict of values (one for each component of the posterior), mean, "
+          "std, interval95, r_hat and effective_size; else None.")
+      .def("correlation", &correlation, "a"_a, "b"_a, "Of the errors of two hyperparameters; nan where one is not determined.")
+      .def("__getitem__", &value_of)
+      .def("__repr__", &text_of);
+}
+
+}  // namespace
+
+void add_fit_report(py::module_& module) {
+  py::class_<Hyperparameter>(module, "Hyperparameter", "One number that training adjusts, in physical units.")
+      .def_readonly("name", &Hyperparameter::name)
+      .def_readonly("unit", &Hyperparameter::unit)
+      .def_readonly("value", &Hyperparameter::value)
+      .def_readonly("lower", &Hyperparameter::lower)
+      .def_readonly("upper", &Hyperparameter::upper)
+      .def_property_readonly("at_bound", &Hyperparameter::at_bound)
+      .def("__repr__", [](const Hyperparameter& h) {
+        return fmt::format("<{} = {:.6g} in [{:.3g}, {:.3g}]{}>", h.name, h.value, h.lower, h.upper,
+                           h.is_fixed()   ? ", held"
+                           : h.at_bound() ? ", at its bound"
+                                          : "");
+      });
+  py::class_<RestartReport>(module, "RestartReport", "How one run of the optimiser ended.")
+      .def_readonly("objective", &RestartReport::objective)
+      .def_readonly("negative_log_likelihood", &RestartReport::negative_log_likelihood)
+      .def_readonly("iterations", &RestartReport::iterations)
+      .def_readonly("evaluations", &RestartReport::evaluations)
+      .def_readonly("failed_evaluations", &RestartReport::failed_evaluations)
+      .def_readonly("converged", &RestartReport::converged)
+      .def_readonly("termination", &RestartReport::termination);
+  py::class_<FitReport> report(module, "FitReport", "How a fit went; report['name'] is a fitted hyperparameter.");
+  define_report(report);
+}
+
+}  // namespace gp2::python

@@ -1,0 +1,287 @@
+#include <fmt/format.h>
+#include <pybind11/stl.h>
+
+#include "arrays.hpp"
+#include "bindings.hpp"
+#include "gp2/error.hpp"
+#include "gp2/jobs/excite_job.hpp"
+#include "gp2/jobs/fit_problem.hpp"
+#include "gp2/jobs/simulate_job.hpp"
+#include "options.hpp"
+
+namespace gp2::python {
+
+using namespace py::literals;
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+
+namespace {
+
+struct Motion {
+  Trajectory trajectory;
+  std::optional<MotionUncertainty> uncertainty;
+  std::shared_ptr<const System> system;
+};
+
+MotionStart start_argument(const py::object& start, const System& system) {
+  if (is_array(start)) {
+    const auto values = vector_argument(start, 2 * system.nq(), "start");
+    return VectorXd(Eigen::Map<const VectorXd>(values.data(), 2 * system.nq()));
+  }
+  try {
+    return start.cast<std::map<std::string, double>>();
+  } catch (const py::cast_error&) {
+    throw py::type_error(
+        fmt::format("start: expected a dict of names to numbers, or all of q and dq, got {}", std::string(py::repr(start))));
+  }
+}
+
+SimulateRequest simulate_request(const System& system, const py::object& start, const py::object& times, const py::object& inputs,
+                                 const py::dict& keywords) {
+  SimulateRequest request;
+  read_keywords("simulate", keywords, options(request));
+  request.start = start_argument(start, system);
+  const auto points = vector_argument(times, "times");
+  request.times = Eigen::Map<const VectorXd>(points.data(), points.size());
+  if (!inputs.is_none()) request.inputs = to_table(inputs, "inputs");
+  return request;
+}
+
+/// Motions one after the other; Ctrl-C ends them.
+std::vector<Motion> run_motions(const SimulateJob& job, const std::shared_ptr<const System>& system) {
+  tell(job.notes);
+  std::atomic<bool> stop = false;
+  std::exception_ptr raised;
+  std::vector<Motion> motions;
+  try {
+    for (Trajectory& trajectory : run_interruptibly([&] { return run_simulation(job, &stop); }, stop, raised, [] {})) {
+      motions.push_back({std::move(trajectory), std::nullopt, system});
+    }
+  } catch (const SimulationStopped&) {
+  }
+  if (raised) std::rethrow_exception(raised);
+  return motions;
+}
+
+Motion simulate_model(const PySystem& system, const py::object& start, const py::object& times, const py::object& inputs,
+                      const py::kwargs& keywords) {
+  const SimulateRequest request = simulate_request(system.system(), start, times, inputs, keywords);
+  return run_motions(prepare_simulation(*system.model, request), system.model->system).front();
+}
+
+py::object simulate_posterior(const PyPosterior& self, const py::object& start, const py::object& times, const py::object& inputs,
+                              const PySystem* system, const py::kwargs& keywords) {
+  const SimulateRequest request = simulate_request(self.system(), start, times, inputs, keywords);
+  const Posterior posterior = self.posterior;
+  const FitSystem asked = system_of(self.file, posterior.prior(), model_of(system));
+  const SimulateJob job = unlocked([&] { return prepare_simulation(asked, posterior, request); });
+  std::vector<Motion> motions = run_motions(job, system == nullptr ? self.file.model.system : system->model->system);
+  if (request.n_samples) return py::cast(std::move(motions));
+  motions[0].uncertainty = unlocked([&] { return motion_uncertainty(posterior, motions[0].trajectory, asked.other_system); });
+  return py::cast(std::move(motions[0]));
+}
+
+std::string simulate_documentation(const std::string& first, const std::string& last, const std::string& result) {
+  SimulateRequest request;
+  return signature("simulate",
+                   first + "start: Mapping[str, float] | ArrayLike, times: ArrayLike, inputs: object = None, " + last + "*,",
+                   options(request), "", result);
+}
+
+// ---------------------------------------------------------------- the next experiment
+
+/// gp2.Excitation
+struct PyExcitation {
+  Excitation found;
+  Motion motion;
+  std::shared_ptr<const System> system;
+};
+
+Limits limits_argument(const py::object& limits, const std::string& name) {
+  if (limits.is_none()) return {};
+  try {
+    return limits.cast<Limits>();
+  } catch (const py::cast_error&) {
+    throw py::type_error(
+        fmt::format("{}: expected a dict of names to (lowest, highest), got {}", name, std::string(py::repr(limits))));
+  }
+}
+
+PyExcitation excite_posterior(const PyPosterior& self, const py::object& start, double duration, const py::object& inputs_within,
+                              const py::object& within, const PySystem* system, const py::kwargs& keywords) {
+  ExciteRequest request;
+  read_keywords("excite", keywords, options(request));
+  request.start = start_argument(start, system == nullptr ? self.system() : *system->model->system);
+  request.duration = duration;
+  request.inputs_within = limits_argument(inputs_within, "inputs_within");
+  request.within = limits_argument(within, "within");
+  const Posterior posterior = self.posterior;
+  const FitSystem driven = system_of(self.file, posterior.prior(), model_of(system));
+  const auto search = [&](const std::atomic<bool>* stop) {
+    Excitation found = excite(driven, posterior, self.file.report.hyperparameters, request, {}, stop);
+    MotionUncertainty uncertainty = motion_uncertainty(posterior, found.motion, driven.other_system);
+    return PyExcitation{found, {found.motion, std::move(uncertainty), driven.model->system}, driven.model->system};
+  };
+  std::atomic<bool> stop = false;
+  std::exception_ptr raised;
+  std::optional<PyExcitation> out;
+  try {
+    out = run_interruptibly([&] { return search(&stop); }, stop, raised, [] {});
+  } catch (const NumericalError&) {
+    if (!raised) throw;
+  }
+  if (raised) std::rethrow_exception(raised);
+  tell(out->found.notes);
+  return std::move(*out);
+}
+
+py::dict known_dict(const std::vector<Excitation::Known>& known) {
+  py::dict out;
+  for (const Excitation::Known& one : known) {
+    out[py::str(one.name)] = py::dict("now"_a = one.now, "after"_a = one.after, "random"_a = one.random);
+  }
+  return out;
+}
+
+py::dict limits_dict(const std::vector<Excitation::LimitUse>& limits) {
+  py::dict out;
+  for (const Excitation::LimitUse& one : limits) {
+    out[py::str(one.name)] = py::dict("lower"_a = one.lower, "upper"_a = one.upper, "lowest"_a = one.lowest,
+                                      "highest"_a = one.highest, "share"_a = one.share);
+  }
+  return out;
+}
+
+}  // namespace
+
+void add_motion(py::module_& module) {
+  py::class_<Motion>(module, "Motion", "A motion at the times asked for.")
+      .def_property_readonly(
+          "t", [](const Motion& m) { return to_vector(m.trajectory.times); }, "(n) [s]")
+      .def_property_readonly(
+          "states", [](const Motion& m) { return to_rows(m.trajectory.states); }, "(n, len(state_names))")
+      .def_property_readonly(
+          "q", [](const Motion& m) { return to_rows(m.trajectory.states.topRows(m.trajectory.accelerations.rows())); }, "(n, nq)")
+      .def_property_readonly(
+          "dq",
+          [](const Motion& m) {
+            const Index nq = m.trajectory.accelerations.rows();
+            return to_rows(m.trajectory.states.middleRows(nq, nq));
+          },
+          "(n, nq)")
+      .def_property_readonly(
+          "ddq", [](const Motion& m) { return to_rows(m.trajectory.accelerations); }, "(n, nq)")
+      .def_property_readonly(
+          "std",
+          [](const Motion& m) -> py::object {
+            if (!m.uncertainty) return py::none();
+            return to_rows(m.uncertainty->stddev);
+          },
+          "Of ddq along the mean's motion (n, nq); None of a model's own motion or a sample's.")
+      .def_property_readonly(
+          "distance_from_data",
+          [](const Motion& m) -> py::object {
+            if (!m.uncertainty) return py::none();
+            return to_vector(m.uncertainty->distance);
+          },
+          "As of Prediction, along the mean's motion (n); None as std.")
+      .def_property_readonly(
+          "multipliers", [](const Motion& m) { return to_rows(m.trajectory.records); }, "lambda of the constraints (n, nc)")
+      .def_property_readonly("max_position_drift", [](const Motion& m) { return m.trajectory.max_position_drift; })
+      .def_property_readonly("max_velocity_drift", [](const Motion& m) { return m.trajectory.max_velocity_drift; })
+      .def_property_readonly(
+          "n_lower_rank", [](const Motion& m) { return m.trajectory.lower_rank.states.size(); },
+          "Times at which the constraints have a lower rank than at others.")
+      .def_property_readonly(
+          "table", [](const Motion& m) { return as_table(m.trajectory, *m.system, "motion"); },
+          "t, q, dq, ddq and the inputs: fit takes it as a log, simulate as inputs.")
+      .def_property_readonly("steps", [](const Motion& m) { return m.trajectory.steps; })
+      .def_property_readonly("rejected_steps", [](const Motion& m) { return m.trajectory.rejected_steps; })
+      .def_property_readonly("evaluations", [](const Motion& m) { return m.trajectory.evaluations; });
+}
+
+void add_excitation(py::module_& module) {
+  py::class_<PyExcitation>(module, "Excitation", "A motion to drive a system along, and what measuring it is expected to tell.")
+      .def_readonly("motion", &PyExcitation::motion, "As the fit predicts it.")
+      .def_property_readonly(
+          "table", [](const PyExcitation& e) { return as_table(e.found.motion, *e.system, "excitation"); },
+          "t, q, dq, ddq and the inputs: simulate takes it as inputs.")
+      .def_property_readonly(
+          "parameters", [](const PyExcitation& e) { return known_dict(e.found.parameters); },
+          "Standard deviation of each estimated parameter: now, after this motion, after a random one (median).")
+      .def_property_readonly(
+          "accelerations", [](const PyExcitation& e) { return known_dict(e.found.accelerations); },
+          "The same of accelerations, root mean square where motions within the limits go; of target='accelerations'.")
+      .def_property_readonly(
+          "limits", [](const PyExcitation& e) { return limits_dict(e.found.limits); },
+          "Of each limit: lower, upper; lowest and highest of the motion; the share that it uses.")
+      .def_property_readonly(
+          "factor", [](const PyExcitation& e) { return e.found.factor; }, "By what factor deviations fall.")
+      .def_property_readonly(
+          "random_factor", [](const PyExcitation& e) { return e.found.random_factor; }, "By a random motion (median).")
+      .def_property_readonly(
+          "highest_frequency", [](const PyExcitation& e) { return e.found.highest_frequency; }, "Of inputs [Hz].")
+      .def_property_readonly(
+          "leaves_data", [](const PyExcitation& e) { return e.found.leaves_data; },
+          "When the motion first is far from the data [s]; None: never.")
+      .def_property_readonly("n_motions", [](const PyExcitation& e) { return e.found.n_motions; })
+      .def_property_readonly("n_random", [](const PyExcitation& e) { return e.found.n_random; })
+      .def_property_readonly("n_failed", [](const PyExcitation& e) { return e.found.n_failed; })
+      .def_property_readonly("seconds", [](const PyExcitation& e) { return e.found.seconds; });
+}
+
+/// These have their keywords in signatures of our own; the setting for that ends with this function.
+void define_simulate(py::class_<PyPosterior>& posterior, py::module_& module) {
+  SimulateRequest motion;
+  const std::string motion_options = documentation(options(motion));
+  py::options own_signature;
+  own_signature.disable_function_signatures();
+  posterior.def("simulate", &simulate_posterior, "start"_a, "times"_a, "inputs"_a = py::none(), "system"_a = nullptr,
+                (simulate_documentation("self: Posterior, ", "system: System | None = None, ", "Motion | list[Motion]") + R"(
+Integrate the mean's motion, or n_samples motions, each of one function drawn from the posterior.
+
+start   {"q1": 0.4, "dq1": 1.0}: what is not named follows from the constraints; or all of q and dq
+times   at which states are wanted (n) [s]; the first is the start
+inputs  a table with t and every input, linear in between, that covers the motion; default: zero
+system  another System with the same coordinates, inputs and latents: its motion
+
+)" + motion_options +
+                 R"(
+Returns a Motion, or with n_samples a list of them. Raises NumericalError, with the time, when it cannot go on.)")
+                    .c_str());
+  module.def("simulate", &simulate_model, "system"_a, "start"_a, "times"_a, "inputs"_a = py::none(),
+             (simulate_documentation("system: System, ", "", "Motion") +
+              "\nIntegrate a system by its own force and [truth]. As Posterior.simulate.")
+                 .c_str());
+}
+
+void define_excite(py::module_& module) {
+  ExciteRequest request;
+  py::options own_signature;
+  own_signature.disable_function_signatures();
+  module.def(
+      "excite", &excite_posterior, "posterior"_a, "start"_a, "duration"_a, "inputs_within"_a, "within"_a = py::none(),
+      "system"_a = nullptr,
+      (signature(
+           "excite",
+           "posterior: Posterior, start: Mapping[str, float] | ArrayLike, duration: float, inputs_within: Mapping[str, "
+           "tuple[float, float]], within: Mapping[str, tuple[float, float]] | None = None, system: System | None = None, *,",
+           options(request), "", "Excitation") +
+       R"(
+Find the motion, within limits, that measuring will tell most of what is not known: which experiment next.
+
+start          as of Posterior.simulate
+duration       [s]
+inputs_within  {"u": (-5, 5)}: lowest and highest value of every input
+within         {"q": (-1, 1), "dq": (-3, 3)}: of coordinates, velocities and accelerations; default: they may go anywhere
+system         another System with the same coordinates, inputs and latents, which is driven
+
+)" + documentation(options(request)) +
+       R"(
+Returns an Excitation. Same seed, same motion, for any number of threads; Ctrl-C ends the search.
+Raises InputError for limits that do not fit, or that no motion keeps; NumericalError when none could be integrated.)")
+          .c_str());
+}
+
+}  // namespace gp2::python

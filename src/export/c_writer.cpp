@@ -1,0 +1,271 @@
+#include "export/c_writer.hpp"
+
+#include <algorithm>
+#include <cctype>
+#include <set>
+
+#include <fmt/format.h>
+
+#include "gp2/base/file.hpp"
+#include "gp2/error.hpp"
+#include "inference/requirements.hpp"
+#include "prior/primitive.hpp"
+
+namespace gp2::c_export {
+
+using Eigen::Index;
+using Eigen::VectorXd;
+
+namespace {
+
+const std::set<std::string>& taken_names() {
+  static const std::set<std::string> names = {
+      "auto",   "break",  "case",   "char",   "const",  "continue",   "default", "do",        "double",   "else",     "enum",
+      "extern", "float",  "for",    "goto",   "if",     "inline",     "int",     "long",      "register", "restrict", "return",
+      "short",  "signed", "sizeof", "static", "struct", "switch",     "typedef", "union",     "unsigned", "void",     "volatile",
+      "while",  "state",  "w",      "real",   "out",    "parameters", "status",  "workspace", "NAN",      "INFINITY", "HUGE_VAL"};
+  return names;
+}
+
+}  // namespace
+
+bool is_identifier(const std::string& text) {
+  const auto is_letter = [](char c) { return (c >= 'a' && c <= 'z') || (c >= 'A' && c <= 'Z') || c == '_'; };
+  return !text.empty() && is_letter(text.front()) && !taken_names().contains(text) &&
+         std::all_of(text.begin(), text.end(), [&](char c) { return is_letter(c) || (c >= '0' && c <= '9'); });
+}
+
+std::string in_comment(std::string text) {
+  for (std::size_t at = text.find("*/"); at != std::string::npos; at = text.find("*/", at)) text.replace(at, 2, "* /");
+  return text;
+}
+
+bool Term::reads_features() const {
+  return std::any_of(kernel.terms().begin(), kernel.terms().end(), [](const Kernel::Term& term) {
+    return std::any_of(term.factors.begin(), term.factors.end(),
+                       [](const Kernel::Factor& factor) { return factor.primitive != Kernel::Primitive::constant; });
+  });
+}
+
+bool Term::is_se() const {
+  return kernel.terms().size() == 1 && kernel.terms()[0].factors.size() == 1 &&
+         kernel.terms()[0].factors[0].primitive == Kernel::Primitive::se;
+}
+
+VectorXd scales_of(const KernelColumns& columns) {
+  const Kernel& kernel = columns.kernel();
+  VectorXd scales(kernel.n_scaled_columns());
+  for (const Kernel::Term& product : kernel.terms()) {
+    for (const Kernel::Factor& factor : product.factors) {
+      if (factor.primitive == Kernel::Primitive::constant) continue;
+      for (Index d = 0; d < kernel.n_features(); ++d) {
+        const double* const values = columns.values().data() + factor.first_parameter;
+        scales[factor.first_column + d] = feature_scale(factor.primitive, values, kernel.n_features(), d);
+      }
+    }
+  }
+  return scales;
+}
+
+Writer::Writer(const Posterior& posterior, std::vector<Component> components, View view, const CSourceOptions& options)
+    : posterior_(posterior),
+      components_(std::move(components)),
+      view_(std::move(view)),
+      options_(options),
+      prior_(prior_of(posterior.prior(), view_)),
+      layout_(prior_.system->layout()) {
+  for (std::size_t r = 0; r < view_.rows.size(); ++r) all_rows_ = all_rows_ && view_.rows[r] == static_cast<int>(r);
+  add_terms();
+  set_names();
+  set_conditions();
+  set_sizes();
+  declare_workspace();
+}
+
+void Writer::add_terms() {
+  const VectorXd parameters = parameters_of(view_, components_.front()->values.parameters);
+  values_ = system().make_evaluator(parameters, false);
+  if (options_.jacobian) derivatives_ = system().make_evaluator(parameters, true);
+  const auto require_expressions = [](const Tape* tape, const std::string& what) {
+    if (tape != nullptr) return;
+    throw InputError(fmt::format("export to C: {} are code, which has no text; write them as expressions of a model file", what));
+  };
+  require_expressions(values_->tape(), "M, A, b or F of the system");
+  if (options_.jacobian && derivatives_->tape() == nullptr) {
+    throw InputError("export to C: the derivatives of the system are too large to be written; leave the Jacobian out");
+  }
+  for (std::size_t a = 0; a < prior_.latents.size(); ++a) {
+    if (!view_.has_latent(a)) continue;
+    const Latent& of = prior_.latents[a];
+    Term& term = terms_.emplace_back();
+    term.latent = a;
+    term.of = &of;
+    term.kernel = of.kernel;
+    term.D = of.n_features();
+    term.p = of.size();
+    term.F = of.n_functions();
+    term.first = n_functions_;
+    n_functions_ += term.F;
+    term.features = of.features->make_evaluator(VectorXd());
+    require_expressions(term.features->tapes().values, fmt::format("features of latent '{}'", of.name));
+    if (!term.has_directions()) continue;
+    const StateFunction* const of_multipliers = of.directions->of_multipliers();
+    term.reads_multipliers = of_multipliers != nullptr;
+    term.directions = (of_multipliers != nullptr ? *of_multipliers : *of.directions).make_evaluator(parameters);
+    require_expressions(term.directions->tapes().values, fmt::format("directions of latent '{}'", of.name));
+    if (of.base != Latent::Base::admissible || system().nc() == 0) continue;
+    VectorXd B(term.p * term.p);
+    term.directions->evaluate(VectorXd::Zero(layout_.size()), B);
+    term.admissible = B.reshaped(term.p, term.p).diagonal();
+  }
+}
+
+void Writer::set_names() {
+  std::set<std::string> taken = taken_names();
+  const auto add_name = [&](std::string name, std::vector<std::string>& names) {
+    for (char& c : name) {
+      if (!std::isalnum(static_cast<unsigned char>(c))) c = '_';
+    }
+    while (taken.contains(name)) name += '_';
+    taken.insert(name);
+    names.push_back(std::move(name));
+  };
+  for (const std::string& name : system().state_names()) add_name(name, inputs_);
+  for (const Parameter& parameter : system().parameters()) add_name(parameter.name, inputs_);
+  for (int k = 1; k <= system().nc(); ++k) add_name(fmt::format("lambda0_{}", k), known_multipliers_);
+  for (int k = 1; k <= system().nc(); ++k) add_name(fmt::format("lambda_{}", k), multipliers_);
+}
+
+void Writer::set_conditions() {
+  const MotionParts parts = view_.quantity->parts();
+  const auto set = [&](const std::string& name, bool holds) {
+    if (holds) filling_.conditions.insert(name);
+  };
+  const auto any = [&](const auto& holds) { return std::any_of(terms_.begin(), terms_.end(), holds); };
+  // the quantity of the view by its word, and what of the motion it reads
+  filling_.conditions.emplace(view_.quantity->word());
+  set("nonlinear", any([](const Term& term) { return term.reads_multipliers; }));
+  set("moved", parts.constrained_acceleration || parts.constraint_force || has("nonlinear"));
+  set("reaction", parts.constraint_force);
+  set("abar", parts.unconstrained_acceleration);
+  set("applied", parts.applied_force);
+  // mu and b are part of it: it is not of one latent alone; mu = M^-1 F, or is constant
+  set("all", view_.has_mean());
+  set("known", view_.has_mean() && prior_.mean == Prior::Mean::force);
+  set("constant", view_.has_mean() && prior_.mean == Prior::Mean::constant);
+  // constraints, more than one
+  set("rows", system().nc() > 0);
+  set("several", system().nc() > 1);
+  // a latent is multiplied by M^-1; or it or mu is
+  set("forced_latent", any([](const Term& term) { return term.is_forced(); }));
+  set("forced", has("forced_latent") || has("known"));
+  set("admissible", any([](const Term& term) { return term.is_admissible(); }));
+  set("potential", any([](const Term& term) { return term.of->is_potential; }));
+  set("other", any([](const Term& term) { return !term.of->is_potential; }));
+  // a latent reads λ₀; or λ (nonlinear); the multipliers of least norm are computed
+  set("load", any([](const Term& term) { return term.features_read_load() || term.directions_read_load(); }));
+  set("loaded", has("load") || has("nonlinear"));
+  set("least_norm", has("multipliers") || has("loaded"));
+  // functions that are asked for
+  set("stddev", options_.stddev);
+  set("jacobian", options_.jacobian);
+  set("portable", options_.portable_math);
+  set("mixture", components_.size() > 1);
+  // observations are sums of rows; covariances are kept by latent functions, which are fewer than the rows of the view
+  set("sums", options_.stddev && components_.front()->latents->sums() != nullptr);
+  set("by_function", n_functions_ < view_.size());
+  // triangular systems of M are solved, or M itself
+  set("forced_solves", has("forced") || has("loaded") || (options_.jacobian && has("moved")));
+  set("solves", has("rows") || has("forced_solves"));
+}
+
+void Writer::set_sizes() {
+  const Index nq = system().nq(), nc = system().nc(), nx = layout_.size(), nr = view_.size();
+  for (const Component& component : components_) {
+    const LatentPosterior& latents = *component->latents;
+    n_variables_ = std::max(n_variables_, whole(latents.size()));
+    n_cross_rows_ = std::max(n_cross_rows_, latents.n_rows());
+    for (Term& term : terms_) term.n_points = std::max(term.n_points, latents.latents()[term.latent].kernel.n_rows());
+  }
+  if (!has("sums")) n_cross_rows_ = n_variables_;
+  const bool single = options_.single_precision;
+  filling_.texts = {
+      {"name", options_.name},
+      {"real", single ? "float" : "double"},
+      {"r", all_rows_ ? "r" : "view_rows[r]"},
+      {"dt", view_.time_step ? number(*view_.time_step) : ""},
+      {"nq", std::to_string(nq)},
+      {"nc", std::to_string(nc)},
+      {"nmin", std::to_string(std::min(nq, nc))},
+      {"n_state", std::to_string(nx)},
+      {"n_rows", std::to_string(nr)},
+      {"n_components", std::to_string(components_.size())},
+      {"n_functions", std::to_string(n_functions_)},
+      {"n_variables", std::to_string(n_variables_)},
+      {"n_columns", std::to_string(std::min(nr, n_functions_))},
+      {"n_latents", std::to_string(terms_.size())},
+      {"index", n_cross_rows_ < 32767 ? "short" : "int"},
+      {"cross", has("sums") ? "rows" : "cross"},
+      {"cross_rows", std::to_string(n_cross_rows_)},
+      {"lost_pivot", single ? "1e-6f" : "1e-14"},
+      {"semidefinite", single ? "5e-6f" : "1e-13"},
+      {"singular", single ? "1e-4f" : number(UdwadiaKalaba::mass_tolerance)},
+      {"rank_tolerance", single ? "1e-5f" : number(UdwadiaKalaba::rank_tolerance)},
+      {"consistency", single ? "1e-3f" : number(UdwadiaKalaba::consistency_tolerance)},
+      {"well_conditioned", single ? "1e-2f" : "1e-4"},
+      {"small_norm", single ? "1e-15f" : "1e-140"},
+      {"large_norm", single ? "1e15f" : "1e140"},
+      {"newton", single ? "4e-6f" : "1.5e-14"},
+      {"smallest_row", single ? "1.17549435e-38f" : "2.2250738585072014e-308"},
+      {"if_singular", what_needs_acceleration(prior_, view_) ? "NO_UNCONSTRAINED_ACCELERATION" : "OK"},
+  };
+  std::string guard = options_.name + "_H";
+  std::transform(guard.begin(), guard.end(), guard.begin(), [](unsigned char c) { return std::toupper(c); });
+  text("guard") = guard;
+}
+
+std::string Writer::number(double value) const {
+  std::string text = options_.single_precision ? fmt::format("{}", static_cast<float>(value)) : shortest(value);
+  if (text.find_first_of(".e") == std::string::npos) text += ".0";
+  return options_.single_precision ? text + "f" : text;
+}
+
+std::string Writer::numbers(const double* values, Index n) const {
+  std::string text;
+  for (Index i = 0; i < n; ++i) text += (i == 0 ? "" : ", ") + number(values[i]);
+  return text;
+}
+
+// The name of a constant table, which stands in the file once however often it is asked for.
+std::string Writer::table(const std::string& type, const std::string& wanted, const std::vector<std::string>& entries) {
+  constexpr std::size_t width = 120;
+  std::string body;
+  std::size_t line = 0;  // where the last one begins
+  for (const std::string& entry : entries) {
+    if (body.empty() || body.size() + entry.size() - line > width) {
+      if (!body.empty()) body += '\n';
+      line = body.size();
+      body += ' ';
+    }
+    body += fmt::format(" {},", entry);
+  }
+  body += '\n';
+  const auto [known, is_new] = known_.try_emplace(type + body, wanted);
+  if (is_new) text("tables") += fmt::format("static const {} {}[{}] = {{\n{}}};\n\n", type, wanted, entries.size(), body);
+  return known->second;
+}
+
+std::string Writer::table(const std::string& wanted, const double* values, Index n) {
+  std::vector<std::string> entries;
+  for (Index i = 0; i < n; ++i) entries.push_back(number(values[i]));
+  return table("real", wanted, entries);
+}
+
+// The name of a static function; where there is one of the same body it is that one.
+std::string Writer::function(const std::string& wanted, const std::string& head, const std::string& body) {
+  const auto [known, is_new] = known_.try_emplace(head + body, wanted);
+  if (is_new) text("expressions") += fmt::format("\nstatic void {}({})\n{{\n{}}}\n", wanted, head, body);
+  return known->second;
+}
+
+}  // namespace gp2::c_export

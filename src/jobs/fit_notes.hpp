@@ -1,0 +1,36 @@
+#pragma once
+
+#include <string>
+#include <vector>
+
+#include "gp2/fit.hpp"
+#include "gp2/inference/evaluation.hpp"
+
+// What a person should know of a fit that has ended.
+namespace gp2 {
+
+// What the residuals say against the data, the constraints or the noise.
+void add_residual_notes(const Posterior& posterior, const std::vector<TrainingResidual>& residuals,
+                        std::vector<std::string>& notes);
+
+// Which residuals go on from row to row; empty where none do.
+std::string correlated_text(const std::vector<TrainingResidual>& residuals);
+
+// Whether the draws of the hyperparameters can be relied on.
+void add_draw_notes(const FitReport& report, std::vector<std::string>& notes);
+
+// Where the constraint turns a prior mean of zero into accelerations far above those measured: it shares out what the prior leaves
+// out by the mass matrix, so that where an inertia is small it is nearly all that coordinate's.
+void add_constraint_note(const Posterior& posterior, std::vector<std::string>& notes);
+
+// What inducing points leave out makes deviations larger than they need be; of the discrepancy it counts as noise.
+void add_inducing_note(const InducingReport& inducing, std::vector<std::string>& notes);
+
+// Where sums over windows of time deviate by far more than the noise of the positions makes them.
+void add_window_note(const Posterior& posterior, std::vector<std::string>& notes);
+
+// What this fit leaves out of the force that its model knows: that the latents cannot stand for it, or that the same data are far
+// more likely with it under the same hyperparameters.
+void add_force_note(const Posterior& posterior, std::vector<std::string>& notes);
+
+}  // namespace gp2
