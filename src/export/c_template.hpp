@@ -1285,6 +1285,7 @@ status @name@_mean(const real *state, real *mean, workspace *w)
 {stddev,mixture}    }
 {stddev,mixture}    stddev[r] = sqrt(stddev[r] / COMPONENTS);
 {stddev,mixture}  }
+{stddev}  if (!is_finite(NR, stddev)) return failed(failed(@name@_NOT_FINITE, NR, mean), NR, stddev);
 {stddev}  return @name@_OK;
 {stddev}}
 {jacobian}
