@@ -128,6 +128,7 @@ Option start_option(std::string& value) {
 }
 
 void require_output(const std::string& output, const std::vector<std::string>& inputs, const char* option) {
+  if (output.empty()) throw InputError(fmt::format("{}: expected the name of a file, got ''", option));
   const std::filesystem::path folder = std::filesystem::path(output).parent_path();
   if (!folder.empty() && !std::filesystem::is_directory(folder)) {
     throw InputError(fmt::format("{} {}: there is no folder '{}'; make it first", option, output, folder.string()));

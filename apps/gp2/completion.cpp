@@ -1,6 +1,7 @@
 #include <filesystem>
 #include <memory>
 #include <utility>
+#include <vector>
 
 #include <fmt/format.h>
 
@@ -22,15 +23,17 @@ struct CompletionArguments {
 void write_share(const std::string& folder) {
   const std::vector<Command> commands = all_commands();
   const std::filesystem::path share = folder;
-  const auto write = [&](const std::filesystem::path& path, const std::string& text) {
+  std::vector<std::pair<std::filesystem::path, std::string>> files;
+  const auto write = [&](const std::filesystem::path& path, std::string text) {
     make_folder((share / path.parent_path()).string());
-    write_file(share / path, text);
+    files.emplace_back(share / path, std::move(text));
   };
   write("man/man1/gp2.1", man_page(commands));
   for (const Command& command : commands) write(fmt::format("man/man1/gp2-{}.1", command.name), man_page(command));
   write("bash-completion/completions/gp2", completion_script("bash", commands));
   write("zsh/site-functions/_gp2", completion_script("zsh", commands));
   write("fish/vendor_completions.d/gp2.fish", completion_script("fish", commands));
+  write_files(files);
 }
 
 void run(const CompletionArguments& arguments) {

@@ -30,13 +30,15 @@ void run(ExportArguments& arguments) {
   } else {
     make_folder(arguments.output);
   }
+  std::vector<std::pair<std::filesystem::path, std::string>> files;
   std::vector<std::string> written;
   for (const auto& [name, text] : outcome.files) {
     std::filesystem::path path = arguments.output;
     if (!is_robot) path /= name;
-    write_file(path, text);
+    files.emplace_back(path, text);
     written.push_back(fmt::format("{} ({:.0f} kB)", path.string(), static_cast<double>(text.size()) / 1e3));
   }
+  write_files(files);
   print_notes(outcome.notes);
   print_notes({fmt::format("{}", fmt::join(written, ", "))});
 }

@@ -66,7 +66,7 @@ struct Motion {
 void print_motions(const std::vector<Motion>& motions, const Subject& subject, const SimulateJob& job, bool with_sample,
                    bool with_stddev, CsvWriter& csv) {
   const InputSignal& commands = job.commands;
-  const std::vector<Contact>& contacts = job.options.contacts;
+  const std::vector<Contact>& contacts = job.motions.front().contacts;
   const System& system = subject.system();
   const StateLayout layout = system.layout();
   const std::vector<std::string> names = system.state_names();
@@ -82,7 +82,7 @@ void print_motions(const std::vector<Motion>& motions, const Subject& subject, c
   }
   for (std::size_t j = 0; with_stddev && j < accelerations.size(); ++j) csv.add(accelerations[j] + "_std");
   if (with_stddev) csv.add("distance_from_data");
-  if (!job.energies.empty()) csv.add("energy");
+  if (job.motions.front().energy) csv.add("energy");
   const bool with_energy_stddev = motions[0].energy && motions[0].energy->stddev.size() > 0;
   if (with_energy_stddev) csv.add("energy_std");
   csv.end_line();
@@ -257,7 +257,7 @@ std::vector<Motion> with_uncertainty(std::vector<Trajectory> trajectories, const
     if (subject.posterior) {
       motion.uncertainty = motion_uncertainty(*subject.posterior, motion.trajectory, subject.asked->other_system);
     }
-    if (!job.energies.empty()) motion.energy = job.energies[k](motion.trajectory.states);
+    if (job.motions[k].energy) motion.energy = job.motions[k].energy(motion.trajectory.states);
   }
   return motions;
 }

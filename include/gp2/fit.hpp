@@ -103,6 +103,7 @@ struct HyperparameterDraws {
   Eigen::MatrixXd correlation;     // 0 where one is held (n × n)
   int n_chains = 0, evaluations = 0;
   double acceptance = 0;
+  int n_impossible = 0;  // draws that `values` has not, for there is no posterior under them; told by `fit`, in no file
 
   [[nodiscard]] int size() const { return static_cast<int>(values.cols()); }
   /// Whether hyperparameter k was drawn, not held.

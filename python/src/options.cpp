@@ -227,10 +227,15 @@ std::string value_text(const Option& option, const std::string& value) {
 
 const std::string& keyword_of(const Option& option) { return option.keyword.empty() ? option.name : option.keyword; }
 
-void refuse_keyword(const std::string& function, const std::string& name, const py::list& known) {
+std::string nearest(const std::string& name, const py::list& known) {
   const py::list near = py::module_::import("difflib").attr("get_close_matches")(name, known, 1);
+  return near.empty() ? "" : near[0].cast<std::string>();
+}
+
+void refuse_keyword(const std::string& function, const std::string& name, const py::list& known) {
+  const std::string near = nearest(name, known);
   throw py::type_error(fmt::format("{}() got an unexpected keyword argument '{}'{}", function, name,
-                                   near.empty() ? "" : fmt::format("; did you mean '{}'?", near[0].cast<std::string>())));
+                                   near.empty() ? "" : fmt::format("; did you mean '{}'?", near)));
 }
 
 void read_keywords(const std::string& function, const py::dict& keywords, const std::vector<Option>& options) {

@@ -18,6 +18,9 @@ T take(py::dict& keywords, const char* name, T otherwise) {
   return keywords.attr("pop")(name).cast<T>();
 }
 
+/// The one of `known` that is nearest to a name; "" where none is near.
+std::string nearest(const std::string& name, const py::list& known);
+
 /// @throws py::type_error of an unknown keyword of `function`, with the nearest there is
 [[noreturn]] void refuse_keyword(const std::string& function, const std::string& name, const py::list& known);
 

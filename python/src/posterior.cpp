@@ -529,11 +529,13 @@ std::vector<std::string> export_posterior(const PyPosterior& self, const py::obj
   const Posterior posterior = self.posterior;
   const ExportOutcome outcome = unlocked([&] { return export_fit(self.file, posterior, request); });
   tell(outcome.notes);
+  std::vector<std::pair<std::filesystem::path, std::string>> files;
   std::vector<std::string> written;
   for (const auto& [name, text] : outcome.files) {
-    write_file(to / name, text);
+    files.emplace_back(to / name, text);
     written.push_back((to / name).string());
   }
+  write_files(files);
   return written;
 }
 

@@ -1,5 +1,7 @@
 #include "gp2/predictor.hpp"
 
+#include <cmath>
+
 #include <fmt/format.h>
 #include <pybind11/stl.h>
 
@@ -93,7 +95,9 @@ class PyPredictor {
     double distance = 0;
     require([&](Predictor::Workspace& workspace) {
       distance = predictor_.distance_from_data(map(x), workspace);
-      return Predictor::Status::ok;
+      if (!std::isnan(distance)) return Predictor::Status::ok;
+      Eigen::VectorXd mean(rows());
+      return predictor_.mean(map(x), mean, workspace);
     });
     return distance;
   }

@@ -7,6 +7,7 @@
 #include <charconv>
 #include <cstdio>
 #include <cstring>
+#include <deque>
 #include <functional>
 #include <optional>
 #include <system_error>
@@ -303,10 +304,14 @@ class Output {
 
   void put(std::string_view content) const { require_written(path_, write_all(file_, content)); }
 
+  /// All that may fail for want of space.
+  void settle() {
+    if (is_new_file()) require_written(path_, fsync(file_) == 0 && give_name(file_, target_.path, temporary_));
+  }
+
   void finish() {
     if (is_new_file()) {
-      require_written(path_, fsync(file_) == 0 && give_name(file_, target_.path, temporary_) &&
-                                 std::rename(temporary_.c_str(), target_.path.c_str()) == 0);
+      require_written(path_, std::rename(temporary_.c_str(), target_.path.c_str()) == 0);
       temporary_.clear();
     }
     require_written(path_, close(std::exchange(file_, -1)) == 0);
@@ -328,7 +333,19 @@ void write_blocks(const std::filesystem::path& path,
   Output output(path);
   output.begin();
   produce([&](std::string_view block) { output.put(block); });
+  output.settle();
   output.finish();
+}
+
+void write_files(const std::vector<std::pair<std::filesystem::path, std::string>>& files) {
+  std::deque<Output> outputs;
+  for (const auto& [path, content] : files) {
+    Output& output = outputs.emplace_back(path);
+    output.begin();
+    output.put(content);
+    output.settle();
+  }
+  for (Output& output : outputs) output.finish();
 }
 
 void write_file(const std::filesystem::path& path, std::string_view content) {

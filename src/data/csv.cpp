@@ -182,6 +182,10 @@ class CsvTable::Builder {
     if (line_number_ == 1 && line.starts_with(byte_order_mark)) line.remove_prefix(byte_order_mark.size());
     line = trim(line);
     if (line.empty()) return;
+    if (line.find('\0') != std::string_view::npos) {
+      throw InputError(fmt::format(
+          "{}: a zero byte is in no text; the file is damaged, binary, or UTF-16 (iconv -f UTF-16LE -t UTF-8)", where()));
+    }
     if (content_.header.empty()) {
       read_header(line);
     } else {

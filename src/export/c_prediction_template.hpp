@@ -408,6 +408,7 @@ status @name@_mean_and_stddev(const real *state, real *mean, real *stddev, works
     stddev[r] = sqrt(stddev[r] / COMPONENTS);
   }
 {end}
+  if (!is_finite(NR, stddev)) return failed(failed(@name@_NOT_FINITE, NR, mean), NR, stddev);
   return @name@_OK;
 }
 {end}

@@ -147,8 +147,8 @@ void Writer::require_single_precision() const {
   if (worst <= largest_share) return;
   throw InputError(fmt::format(
       "export to C: in single precision latent '{}' would be off by up to {:.2g} of its standard deviation at an observed state, "
-      "where {:.2g} is allowed: its weights cancel. Fewer inducing points or a larger noise help, or leave `float` out",
-      where, worst, largest_share));
+      "where {:.2g} is allowed: its weights cancel. Fewer {} or a larger noise help, or leave `float` out",
+      where, worst, largest_share, posterior_.values().inducing ? "inducing points" : "rows"));
 }
 
 }  // namespace gp2::c_export

@@ -49,9 +49,12 @@ Discrepancy discrepancy_from(const ParsedJson& json) {
   if (json.contains("directions")) {  // since format 11
     discrepancy.base = choice_from(json.at("directions"), discrepancy_directions, "direction of a discrepancy");
   }
-  if (discrepancy.lengthscale.size() == 0 || !(discrepancy.lengthscale.array() > 0).all() ||
-      !(discrepancy.stddev.array() > 0).all()) {
-    throw InputError("lengthscale and stddev of the discrepancy must be positive");
+  const auto are_scales = [](const Eigen::VectorXd& values) {
+    return (values.array() >= smallest_scale && values.array() <= largest_number).all();
+  };
+  if (discrepancy.lengthscale.size() == 0 || !are_scales(discrepancy.lengthscale) || !are_scales(discrepancy.stddev)) {
+    throw InputError(
+        fmt::format("lengthscale and stddev of the discrepancy must be from {} to {}", smallest_scale, largest_number));
   }
   return discrepancy;
 }

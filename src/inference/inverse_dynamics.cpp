@@ -208,6 +208,7 @@ struct InverseDynamicsSolver::Workspace::Implementation {
     double size = size_of(usual) + size_of(wanted), gain_before = std::numeric_limits<double>::infinity();
     for (int step = 0; step < most_steps; ++step) {
       size = std::max(size, size_of(mean));
+      if (!std::isfinite(size)) return false;  // beside which anything would pass for rounding
       J.noalias() = root.lazyProduct(jacobian.rightCols(nu));
       const MatrixXd& pseudo_inverse = inverse.compute(J);
       J_inverse.noalias() = pseudo_inverse.lazyProduct(root);

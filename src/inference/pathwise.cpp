@@ -99,6 +99,8 @@ const PathwiseSamples::Implementation::Sample& PathwiseSamples::Implementation::
   return samples[static_cast<std::size_t>(sample)];
 }
 
+const VectorXd& PathwiseSamples::parameters(int sample) const { return implementation().at(sample).posterior->values.parameters; }
+
 VectorXd PathwiseSamples::potential(int sample, int latent, const Ref<const MatrixXd>& states,
                                     const Ref<const VectorXd>& reference) const {
   const auto& [component, paths] = implementation().at(sample);
@@ -116,7 +118,9 @@ VectorXd PathwiseSamples::potential(int sample, int latent, const Ref<const Matr
     path.features.evaluate(features.row(i).transpose(), psi);
     energy[i] = path.weights.col(0).dot(psi - psi_reference) + cross.column(i).cwiseProduct(path.beta).sum();
   }
-  return component->values.signal_stddev[a][0] * energy;
+  energy *= component->values.signal_stddev[a][0];
+  require_finite(*component->prior.system, states, energy.transpose());
+  return energy;
 }
 
 MatrixXd PathwiseSamples::evaluate(int sample, const View& view, const Ref<const MatrixXd>& states) const {
@@ -150,6 +154,7 @@ MatrixXd PathwiseSamples::evaluate(int sample, const View& view, const Ref<const
   MatrixXd values(view.size(), query.size());
   query.linearise(posterior, f);
   query.view_of(posterior, f, values);
+  require_finite(*prior_of(posterior.prior, view).system, states, values);
   return values;
 }
 

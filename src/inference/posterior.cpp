@@ -146,6 +146,7 @@ MatrixXd mean_of(const Posterior::Implementation& self, const View& view, const 
     query.linearise(self, sum.mean());
     query.view_of(self, sum.mean(), mean.middleCols(first, n));
   });
+  require_finite(*prior_of(self.prior, view).system, states, mean);
   return mean;
 }
 
@@ -278,6 +279,9 @@ Posterior::Marginal marginal_of(const Posterior::Implementation& self, const Vie
     n_clipped[own] += blocks[own].evaluate(view, states, first + start, size, marginal, start);
   });
   marginal.n_clipped = std::accumulate(n_clipped.begin(), n_clipped.end(), 0);
+  const System& system = *prior_of(self.prior, view).system;
+  require_finite(system, states.middleCols(first, n), marginal.mean, first);
+  require_finite(system, states.middleCols(first, n), marginal.covariance, first);
   return marginal;
 }
 
@@ -419,6 +423,13 @@ Posterior::Joint joint_of(const Posterior::Implementation& self, const std::vect
   }
   self.latents->subtract_explained(std::move(cross), joint.covariance);
   joint.covariance.triangularView<Eigen::StrictlyUpper>() = joint.covariance.transpose();
+  const VectorXd variances = joint.covariance.diagonal();  // which overflow first
+  for (std::size_t q = 0; q < quantities.size(); ++q) {
+    const Index d = queries[q].n_rows(), n = queries[q].size();
+    const System& system = *prior_of(self.prior, quantities[q].view).system;
+    require_finite(system, quantities[q].states, Map<const MatrixXd>(joint.mean.data() + first[q], d, n));
+    require_finite(system, quantities[q].states, Map<const MatrixXd>(variances.data() + first[q], d, n));
+  }
   return joint;
 }
 

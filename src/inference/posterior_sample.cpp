@@ -1,8 +1,11 @@
 #include <map>
 #include <utility>
 
+#include <fmt/format.h>
+
 #include "base/lapack.hpp"
 #include "base/random.hpp"
+#include "gp2/error.hpp"
 #include "gp2/posterior.hpp"
 #include "inference/latent_sums.hpp"
 #include "inference/query.hpp"
@@ -107,9 +110,27 @@ LatentGaussian latent_posterior(const Posterior::Implementation& self, const Lat
   return out;
 }
 
+// One point that overflows would spoil the samples of all.
+void require_finite_at(const Posterior::Implementation& self, const LatentPoints& points, const std::vector<ViewAt>& quantities,
+                       const LatentGaussian& latents) {
+  const VectorXd size = latents.mean.cwiseAbs() + latents.covariance.diagonal();
+  for (std::size_t q = 0; q < quantities.size(); ++q) {
+    const std::vector<int>& of_state = points.of_state[q];
+    MatrixXd sizes = MatrixXd::Zero(1, static_cast<Index>(of_state.size()));
+    for (std::size_t a = 0; a < self.C.size(); ++a) {
+      const Index n_points = points.features[a].rows();
+      for (Index l = 0; l < self.C[a].cols(); ++l) {
+        sizes += size.segment(points.first[a] + l * n_points, n_points)(of_state).transpose();
+      }
+    }
+    require_finite(*prior_of(self.prior, quantities[q].view).system, quantities[q].states, sizes);
+  }
+}
+
 // The views of query q of a nonlinear prior, sample by sample.
+// @param numbers  of the samples among all
 Index view_samples(const Posterior::Implementation& self, const LatentPoints& points, std::size_t q, const MatrixXd& samples_of_f,
-                   Query& query, Ref<MatrixXd> out) {
+                   const std::vector<Index>& numbers, Query& query, Ref<MatrixXd> out) {
   std::vector<MatrixXd> f(self.C.size());
   for (Index s = 0; s < out.cols(); ++s) {
     for (std::size_t a = 0; a < f.size(); ++a) {
@@ -121,14 +142,20 @@ Index view_samples(const Posterior::Implementation& self, const LatentPoints& po
         }
       }
     }
-    query.linearise(self, f);
+    try {
+      query.linearise(self, f);
+    } catch (const InputError& error) {
+      throw InputError(fmt::format("sample {} of the {}: {}", numbers[static_cast<std::size_t>(s)] + 1,
+                                   self.observations.empty() ? "prior" : "posterior", error.what()));
+    }
     query.view_of(self, f, Map<MatrixXd>(out.col(s).data(), query.n_rows(), query.size()));
   }
   return out.rows();
 }
 
-MatrixXd sample_of(const Posterior::Implementation& self, const std::vector<ViewAt>& quantities, int n_samples,
-                   RandomStream random) {
+MatrixXd sample_of(const Posterior::Implementation& self, const std::vector<ViewAt>& quantities,
+                   const std::vector<Index>& numbers, RandomStream random) {
+  const Index n_samples = std::ssize(numbers);
   std::vector<Query> queries;
   Index n_rows = 0;
   for (const ViewAt& quantity : quantities) {
@@ -137,6 +164,7 @@ MatrixXd sample_of(const Posterior::Implementation& self, const std::vector<View
   }
   const LatentPoints points(self, queries);
   const LatentGaussian latents = latent_posterior(self, points);
+  require_finite_at(self, points, quantities, latents);
 
   // f = mean + P L ξ, of a covariance Pᵀ Σ P = L Lᵀ that may be singular
   const lapack::PivotedFactor factor = lapack::factorise_semidefinite(latents.covariance);
@@ -151,7 +179,7 @@ MatrixXd sample_of(const Posterior::Implementation& self, const std::vector<View
   for (std::size_t q = 0; q < queries.size(); ++q) {
     Query& query = queries[q];
     if (self.prior.is_nonlinear()) {
-      row += view_samples(self, points, q, f, query, samples.middleRows(row, query.n_rows() * query.size()));
+      row += view_samples(self, points, q, f, numbers, query, samples.middleRows(row, query.n_rows() * query.size()));
       continue;
     }
     for (int i = 0; i < static_cast<int>(query.size()); ++i, row += query.n_rows()) {
@@ -163,6 +191,15 @@ MatrixXd sample_of(const Posterior::Implementation& self, const std::vector<View
       }
       samples.middleRows(row, query.n_rows()) = (query.view.G(i) * a_bar).colwise() + query.view.offset.col(i);
     }
+  }
+  row = 0;
+  for (std::size_t q = 0; q < queries.size(); ++q) {
+    const Index d = queries[q].n_rows(), n = queries[q].size();
+    const System& system = *prior_of(self.prior, quantities[q].view).system;
+    for (const auto& sample : samples.middleRows(row, d * n).colwise()) {
+      require_finite(system, quantities[q].states, sample.reshaped(d, n));
+    }
+    row += d * n;
   }
   return samples;
 }
@@ -185,8 +222,7 @@ MatrixXd Posterior::sample(const std::vector<ViewAt>& quantities, int n_samples,
   MatrixXd samples;
   for (std::size_t k = 0; k < samples_of.size(); ++k) {
     if (samples_of[k].empty() && k > 0) continue;
-    const MatrixXd of_one =
-        sample_of(*conditioned()[k], quantities, static_cast<int>(samples_of[k].size()), RandomStream(seed, k));
+    const MatrixXd of_one = sample_of(*conditioned()[k], quantities, samples_of[k], RandomStream(seed, k));
     samples.resize(of_one.rows(), n_samples);
     samples(Eigen::all, samples_of[k]) = of_one;
   }

@@ -8,6 +8,7 @@
 #include "gp2/posterior.hpp"
 #include "inference/posterior_implementation.hpp"
 #include "inference/potential_cross.hpp"
+#include "inference/query.hpp"
 
 namespace gp2 {
 
@@ -72,6 +73,8 @@ Posterior::Potential energy_of(const Posterior::Implementation& self, std::size_
     const double prior = signal * signal * columns.variance_of_difference(features.row(i) - at_reference.row(0));
     energy.stddev[i] = std::sqrt(std::max(0.0, prior - cross.col(i).squaredNorm()));
   }
+  require_finite(*self.prior.system, states, energy.mean.transpose());
+  require_finite(*self.prior.system, states, energy.stddev.transpose());
   return energy;
 }
 

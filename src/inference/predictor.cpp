@@ -74,6 +74,14 @@ double covariance_of(const WorkspaceParts& components, const Ref<VectorXd>& mean
   return r == s && sum < 0 ? 0 : sum / static_cast<double>(components.size());
 }
 
+// NaN in the place of numbers of which one overflowed
+Status finite_or_none(Ref<VectorXd> mean, Ref<MatrixXd> uncertainty) {
+  if (is_finite(mean) && is_finite(uncertainty)) return Status::ok;
+  mean.setConstant(not_a_number);
+  uncertainty.setConstant(not_a_number);
+  return Status::not_finite;
+}
+
 }  // namespace
 
 // evaluate(component, its memory, its mean) of each, and the mean of their means; NaN where one has none
@@ -120,7 +128,7 @@ Status Predictor::mean_and_stddev(const Ref<const VectorXd>& state, Ref<VectorXd
     return status;
   }
   for (Index r = 0; r < stddev.size(); ++r) stddev[r] = std::sqrt(covariance_of(workspace.components_, mean, r, r));
-  return status;
+  return finite_or_none(mean, stddev);
 }
 
 Status Predictor::mean_and_covariance(const Ref<const VectorXd>& state, Ref<VectorXd> mean, Ref<MatrixXd> covariance,
@@ -135,7 +143,7 @@ Status Predictor::mean_and_covariance(const Ref<const VectorXd>& state, Ref<Vect
   for (Index r = 0; r < covariance.rows(); ++r) {
     for (Index s = 0; s <= r; ++s) covariance(r, s) = covariance(s, r) = covariance_of(workspace.components_, mean, r, s);
   }
-  return status;
+  return finite_or_none(mean, covariance);
 }
 
 Status Predictor::mean_and_jacobian(const Ref<const VectorXd>& state, Ref<VectorXd> mean, Ref<MatrixXd> jacobian,

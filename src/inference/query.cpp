@@ -93,6 +93,15 @@ void require_query(const Posterior::Implementation& posterior, const View& view,
   prior_of(posterior.prior, view).system->require_states(states);
 }
 
+void require_finite(const System& system, const Ref<const MatrixXd>& states, const Ref<const MatrixXd>& computed, Index first) {
+  for (int i = 0; i < static_cast<int>(computed.cols()); ++i) {
+    if (computed.col(i).allFinite()) continue;
+    MechanicsBatch::Fault fault{i, {}};
+    fault.text = "the prediction overflows double precision (correct the state, or leave it out)";
+    throw InputError(internal::describe_fault(system, states, fault, first));
+  }
+}
+
 Query make_query(const Posterior::Implementation& posterior, const View& view, const Ref<const MatrixXd>& states) {
   require_query(posterior, view, states);
   Query query;

@@ -60,6 +60,13 @@ Eigen::MatrixXd features_of_block(const Prior& prior, std::size_t a, const Eigen
 /// @throws InputError as require_view and System::require_states.
 void require_query(const Posterior::Implementation& posterior, const View& view, const Eigen::Ref<const Eigen::MatrixXd>& states);
 
+/// What was computed of a view at states: d numbers, or more, of each.
+/// @param system  where the states are
+/// @param first   number of the first of the states among all, from 0
+/// @throws InputError naming the first state at which one of them overflowed.
+void require_finite(const System& system, const Eigen::Ref<const Eigen::MatrixXd>& states,
+                    const Eigen::Ref<const Eigen::MatrixXd>& computed, Eigen::Index first = 0);
+
 /// @throws InputError as require_query and Query::evaluate.
 Query make_query(const Posterior::Implementation& posterior, const View& view, const Eigen::Ref<const Eigen::MatrixXd>& states);
 

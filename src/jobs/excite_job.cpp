@@ -491,7 +491,7 @@ Excitation excite(const FitSystem& driven, const Posterior& posterior, const std
   of_motion.times = VectorXd::LinSpaced(request.n_rows, t_start, t_start + request.duration);
   of_motion.max_steps = most_steps_per_row * request.n_rows;
   SimulateJob motion = prepare_simulation(driven, information.posterior(), of_motion);
-  motion.records.clear();
+  motion.motions.front().multipliers = nullptr;
   require_start_within(motion.start, limits);
   out.notes = motion.notes;
   if (posterior.n_states() > n_states(posterior.observations())) {

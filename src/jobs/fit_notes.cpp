@@ -52,6 +52,10 @@ void add_draw_notes(const FitReport& report, std::vector<std::string>& notes) {
         "fit is that of the optimum");
     return;
   }
+  if (report.draws->n_impossible > 0) {
+    notes.push_back(fmt::format("warning: {} of {} draws of the hyperparameters are left out: there is no posterior under them",
+                                report.draws->n_impossible, report.draws->n_impossible + report.draws->size()));
+  }
   Eigen::Index k = 0;
   const double worst = report.draws->r_hat.maxCoeff(&k);
   if (!(worst > HyperparameterDraws::largest_r_hat)) return;

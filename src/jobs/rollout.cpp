@@ -104,8 +104,7 @@ struct Reached {
   std::string ended;
 };
 Reached follow(SimulateJob job, std::size_t motion) {
-  job.accelerations = {job.accelerations[motion]};
-  if (!job.records.empty()) job.records = {job.records[motion]};
+  job.motions = {job.motions[motion]};
   const auto placed = [&](const MatrixXd& values) {
     MatrixXd all = MatrixXd::Constant(values.rows(), job.options.times.size(), not_a_number);
     all.leftCols(values.cols()) = values;
@@ -198,7 +197,7 @@ class Roll {
     // states hold what acts, not what was commanded
     if (layout.nu > 0) {
       MatrixXd acting = followed.middleRows(layout.u(0), layout.nu);
-      for (const Contact& contact : job.options.contacts) acting.row(contact.input).setZero();
+      for (const Contact& contact : job.motions.front().contacts) acting.row(contact.input).setZero();
       job.options.inputs = {followed.row(layout.t()).transpose(), std::move(acting)};
     }
     return job;
@@ -207,7 +206,7 @@ class Roll {
   void simulate_beside(const MatrixXd& measured, const MatrixXd& followed, Rollout& out) {
     const Index nq = system_.nq();
     const SimulateJob of_mean = job(measured, followed, std::nullopt);
-    if (!of_mean.energies.empty()) energy_ = of_mean.energies.front();
+    energy_ = of_mean.motions.front().energy;
     Reached mean = follow(of_mean, 0);
     out.ended = mean.ended;
     simulated_ = std::move(mean.states);

@@ -168,8 +168,8 @@ InputSignal input_signal(const Model& model, const std::vector<Actuator>& actuat
   }
 }
 
-// All but the accelerations.
-SimulateJob prepare(const Model& model, const std::vector<Actuator>& actuators, VectorXd parameters,
+// All but the motions.
+SimulateJob prepare(const Model& model, const std::vector<Actuator>& actuators, const VectorXd& parameters,
                     const SimulateRequest& request) {
   require_in_range(request);
   std::vector<const CsvTable*> tables;
@@ -184,10 +184,8 @@ SimulateJob prepare(const Model& model, const std::vector<Actuator>& actuators, 
   job.options.max_steps = request.max_steps;
   job.options.project = request.project;
   job.options.inputs = input_signal(model, actuators, request, columns);
-  job.options.contacts = contacts_of(model, parameters);
   job.commands = input_signal(model, {}, request, columns);
   job.start = start_state(model, parameters, request, columns, job.notes);
-  job.parameters = std::move(parameters);
   return job;
 }
 
@@ -243,17 +241,21 @@ VectorXd motion_times(double t_start, double t_end, const std::optional<double>&
 SimulateJob prepare_simulation(const Model& model, const SimulateRequest& request) {
   require_in_range(request);
   if (request.n_samples) throw InputError("`samples`: a model has no posterior to draw from; give a FIT.json");
-  SimulateJob job = prepare(model, model.actuators, model.system->parameter_values(), request);
-  job.accelerations = {model_acceleration(model)};
+  const VectorXd parameters = model.system->parameter_values();
+  SimulateJob job = prepare(model, model.actuators, parameters, request);
   job.options.switching = switching_functions(model, /*of_latents=*/false);
-  if (model.potential)
-    job.energies = {[&model, parameters = job.parameters](const MatrixXd& states) -> MotionEnergy {
+  SimulateJob::Motion motion{parameters, model_acceleration(model), {}, {}, contacts_of(model, parameters)};
+  if (model.potential) {
+    motion.energy = [&model, parameters](const MatrixXd& states) -> MotionEnergy {
       return {mechanical_energy(model, parameters, states), {}};
-    }};
-  if (model.system->nc() > 0) {
-    job.records = {
-        [motion = ModelMotion(model)](const Eigen::Ref<const VectorXd>& x) -> VectorXd { return motion.multipliers(x).col(0); }};
+    };
   }
+  if (model.system->nc() > 0) {
+    motion.multipliers = [motion = ModelMotion(model)](const Eigen::Ref<const VectorXd>& x) -> VectorXd {
+      return motion.multipliers(x).col(0);
+    };
+  }
+  job.motions = {std::move(motion)};
   return job;
 }
 
@@ -274,47 +276,81 @@ MotionEnergy energy_with_learned(const Model& model, const VectorXd& parameters,
   return out;
 }
 
+/// Mean and deviation of a mixture of equal weights (theory.md, T31).
+MotionEnergy mixed(const std::vector<MotionEnergy>& components) {
+  if (components.size() == 1) return components.front();
+  const double n = static_cast<double>(components.size());
+  MotionEnergy out{VectorXd::Zero(components.front().values.size()), {}};
+  for (const MotionEnergy& one : components) out.values += one.values / n;
+  if (components.front().stddev.size() == 0) return out;
+  VectorXd variance = VectorXd::Zero(out.values.size());
+  for (const MotionEnergy& one : components) {
+    variance += (one.stddev.cwiseAbs2() + (one.values - out.values).cwiseAbs2()) / n;
+  }
+  out.stddev = variance.cwiseSqrt();
+  return out;
+}
+
 }  // namespace
 
 SimulateJob prepare_simulation(const FitSystem& system, const Posterior& posterior, const SimulateRequest& request) {
   const Model& model = *system.model;
-  const VectorXd& at_home = posterior.values().parameters;
-  SimulateJob job =
-      prepare(model, system.actuators, system.other_system ? system.other_system->parameters(at_home) : at_home, request);
-  job.options.switching = switching_functions(model, /*of_latents=*/true);
-  const auto add = [&](const auto& function) {
-    const auto of_view = [&](View view) -> Acceleration {
-      view.other_system = system.other_system;
-      return [function, view](const Eigen::Ref<const VectorXd>& x) -> VectorXd { return function(view, x).col(0); };
-    };
-    job.accelerations.push_back(of_view(View::constrained_acceleration(*model.system)));
-    if (model.system->nc() > 0) job.records.push_back(of_view(View::multipliers(*model.system)));
+  const auto parameters_of = [&](const VectorXd& at_home) -> VectorXd {
+    return system.other_system ? system.other_system->parameters(at_home) : at_home;
   };
+  const VectorXd likeliest = parameters_of(posterior.values().parameters);
+  SimulateJob job = prepare(model, system.actuators, likeliest, request);
+  job.options.switching = switching_functions(model, /*of_latents=*/true);
   std::vector<int> potentials;
   for (int a = 0; a < static_cast<int>(posterior.prior().latents.size()); ++a) {
     if (posterior.prior().latents[static_cast<std::size_t>(a)].is_potential) potentials.push_back(a);
   }
   // learned potentials are functions of states of the fit's own system
   const bool has_energy = potentials.empty() ? model.potential.has_value() : system.other_system == nullptr;
-  const auto add_energy = [&](auto learned) {
-    if (!has_energy) return;
-    job.energies.push_back(
-        [&model, parameters = job.parameters, mean = posterior.prior().mean, potentials, learned](const MatrixXd& states) {
-          return energy_with_learned(model, parameters, mean, potentials, states, [&](int a) { return learned(a, states); });
-        });
+  const auto energy_under = [&model, mean = posterior.prior().mean, potentials](const VectorXd& parameters,
+                                                                                const MatrixXd& states, const auto& learned) {
+    return energy_with_learned(model, parameters, mean, potentials, states, [&](int a) { return learned(a, states); });
+  };
+  const auto add = [&](const VectorXd& parameters, const auto& function, const auto& energy) {
+    const auto of_view = [&](View view) -> Acceleration {
+      view.other_system = system.other_system;
+      return [function, view](const Eigen::Ref<const VectorXd>& x) -> VectorXd { return function(view, x).col(0); };
+    };
+    SimulateJob::Motion motion{
+        parameters, of_view(View::constrained_acceleration(*model.system)), {}, {}, contacts_of(model, parameters)};
+    if (model.system->nc() > 0) motion.multipliers = of_view(View::multipliers(*model.system));
+    if (has_energy) motion.energy = energy;
+    job.motions.push_back(std::move(motion));
   };
   if (!request.n_samples) {
-    add_energy([posterior](int a, const MatrixXd& states) { return posterior.potential(a, states, states.col(0)); });
-    add([posterior](const View& view, const Eigen::Ref<const VectorXd>& x) { return posterior.mean(view, x); });
+    std::vector<std::pair<VectorXd, Posterior>> components;
+    for (int k = 0; k < posterior.n_components(); ++k) {
+      const Posterior component = posterior.component(k);
+      components.emplace_back(parameters_of(component.values().parameters), component);
+    }
+    add(
+        likeliest, [posterior](const View& view, const Eigen::Ref<const VectorXd>& x) { return posterior.mean(view, x); },
+        [energy_under, components](const MatrixXd& states) {
+          std::vector<MotionEnergy> energies;
+          for (const auto& [parameters, component] : components) {
+            energies.push_back(energy_under(
+                parameters, states, [&component](int a, const MatrixXd& at) { return component.potential(a, at, at.col(0)); }));
+          }
+          return mixed(energies);
+        });
     return job;
   }
   const auto samples =
       std::make_shared<const PathwiseSamples>(sample_paths(posterior, *request.n_samples, {.seed = request.seed}));
   for (int k = 0; k < samples->n_samples(); ++k) {
-    add_energy([samples, k](int a, const MatrixXd& states) {
-      return Posterior::Potential{samples->potential(k, a, states, states.col(0)), {}};
-    });
-    add([samples, k](const View& view, const Eigen::Ref<const VectorXd>& x) { return samples->evaluate(k, view, x); });
+    const VectorXd parameters = parameters_of(samples->parameters(k));
+    add(
+        parameters, [samples, k](const View& view, const Eigen::Ref<const VectorXd>& x) { return samples->evaluate(k, view, x); },
+        [energy_under, parameters, samples, k](const MatrixXd& states) {
+          return energy_under(parameters, states, [&](int a, const MatrixXd& at) {
+            return Posterior::Potential{samples->potential(k, a, at, at.col(0)), {}};
+          });
+        });
   }
   return job;
 }
@@ -322,17 +358,19 @@ SimulateJob prepare_simulation(const FitSystem& system, const Posterior& posteri
 std::vector<Trajectory> run_simulation(const SimulateJob& job, const std::atomic<bool>* stop) {
   std::vector<Trajectory> motions;
   SimulateOptions options = job.options;
-  for (std::size_t k = 0; k < job.accelerations.size(); ++k) {
+  for (const SimulateJob::Motion& motion : job.motions) {
     const Acceleration stoppable = [&](const Eigen::Ref<const VectorXd>& x) {
       if (stop != nullptr && *stop) throw SimulationStopped();
-      return job.accelerations[k](x);
+      return motion.acceleration(x);
     };
-    if (!job.records.empty()) options.record = job.records[k];
+    options.record = motion.multipliers;
+    options.contacts = motion.contacts;
     try {
-      motions.push_back(simulate(*job.system, job.parameters, stoppable, job.start, options));
+      motions.push_back(simulate(*job.system, motion.parameters, stoppable, job.start, options));
     } catch (UnfinishedMotion& unfinished) {
+      const std::string which = job.motions.size() > 1 ? fmt::format("sample {}: ", motions.size()) : "";
       motions.push_back(std::move(unfinished.motions.front()));
-      throw UnfinishedMotion(unfinished.what(), std::move(motions));
+      throw UnfinishedMotion(which + unfinished.what(), std::move(motions));
     }
   }
   return motions;

@@ -1,6 +1,7 @@
 #include "gp2/jobs/update_job.hpp"
 
 #include <algorithm>
+#include <cmath>
 #include <utility>
 
 #include <fmt/format.h>
@@ -26,6 +27,9 @@ std::vector<Option> options(UpdateRequest& request) {
 
 Observations more_observations(const FitFile& fit, const Posterior& posterior, const CsvTable& log, const UpdateRequest& request,
                                std::vector<std::string>& notes) {
+  if (request.noise_stddev && !(*request.noise_stddev > 0 && std::isfinite(*request.noise_stddev))) {
+    throw InputError(fmt::format("`noise_std`: must be positive and finite, got {}", *request.noise_stddev));
+  }
   const System& system = *posterior.prior().system;
   const std::vector<Observations>& groups = posterior.observations();
   const auto at_home = std::find_if(groups.begin(), groups.end(), [](const Observations& group) {
@@ -34,7 +38,7 @@ Observations more_observations(const FitFile& fit, const Posterior& posterior, c
   View view = View::constrained_acceleration(system);
   std::vector<std::string> names = request.observe;
   if (names.empty() && at_home != groups.end()) names = at_home->view().names(system);
-  view.rows = acceleration_rows(system, names, "observe");
+  view.rows = acceleration_rows(system, names, "`observe`");
   if (names.empty()) names = view.names(system);
   LogStates read = read_log_states(posterior.prior(), view, fit.model, log, request.columns, names);
 

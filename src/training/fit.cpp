@@ -44,6 +44,28 @@ void require_starts(const std::vector<Hyperparameter>& hyperparameters) {
 
 }  // namespace
 
+Posterior possible_posterior(const Prior& prior, const std::vector<Observations>& observations, FitReport& report,
+                             const Workers& workers) {
+  try {
+    return posterior_of(prior, observations, report, workers);
+  } catch (const Error&) {
+    if (!report.draws) throw;
+    const std::vector<ModelValues> values = values_of(prior, observations, report);
+    std::vector<Eigen::Index> possible;
+    for (std::size_t k = 0; k < values.size(); ++k) {
+      try {
+        static_cast<void>(Posterior(prior, observations, values[k], workers));
+        possible.push_back(static_cast<Eigen::Index>(k));
+      } catch (const Error&) {  // one more that is impossible
+      }
+    }
+    if (possible.empty() || possible.size() == values.size()) throw;
+    report.draws->values = Eigen::MatrixXd(report.draws->values(Eigen::all, possible));
+    report.draws->n_impossible = static_cast<int>(values.size() - possible.size());
+  }
+  return posterior_of(prior, observations, report, workers);
+}
+
 Fit fit(const Prior& prior, const std::vector<Observations>& observations, const std::vector<Hyperparameter>& hyperparameters,
         const FitOptions& options) {
   const auto start = std::chrono::steady_clock::now();
@@ -62,7 +84,7 @@ Fit fit(const Prior& prior, const std::vector<Observations>& observations, const
   const Workers workers(thread_count(options.n_threads), options.ranks);
   Posterior posterior = report.termination == FitReport::interrupted && !report.draws
                             ? Posterior::lazy(prior, observations, values_of(prior, observations, report).front())
-                            : posterior_of(prior, observations, report, workers);
+                            : possible_posterior(prior, observations, report, workers);
   if (report.inducing) report.inducing->summary = posterior.summary();
   // what is said is of all rows, not of the part, and of the hyperparameters that are told, not of the likeliest draw
   if (is_part || prior.is_nonlinear()) {

@@ -49,4 +49,10 @@ HamiltonianDraws draw_coordinates(const Objective& objective, const std::vector<
 HyperparameterDraws draw_about(const Objective& objective, const std::vector<std::vector<Hyperparameter>>& optima,
                                const std::vector<bool>& held, int n_draws, const HamiltonianOptions& options);
 
+/// posterior_of the draws under which there is one: of a nonlinear prior next to a jam there may be none. The others are dropped
+/// from the report, and counted.
+/// @throws as posterior_of, where all are such.
+Posterior possible_posterior(const Prior& prior, const std::vector<Observations>& observations, FitReport& report,
+                             const Workers& workers);
+
 }  // namespace gp2

@@ -28,6 +28,19 @@ TEST(ExportedLoopExample, FollowsItsPathBetterByWhatWasLearned) {
 
 using testing::HasSubstr;
 
+// A header of one fit with the source of another would compile, and answer wrongly.
+TEST(ExportCommand, ReplacesNoneOfItsFilesWhereOneCannotBeWritten) {
+  const Desk desk;
+  desk.done("gp2 generate models/duffing.toml --n 10 --seed 1 -o log.csv");
+  desk.done("gp2 fit models/duffing.toml --data log.csv --restarts 1 --max-iterations 1 -o fit.json");
+  desk.done("mkdir -p out/duffing.c");
+  desk.write("out/duffing.h", "old");
+  const Outcome outcome = desk.run("gp2 export fit.json --name duffing -o out");
+  EXPECT_EQ(outcome.status, 2);
+  EXPECT_THAT(outcome.err, HasSubstr("out/duffing.c: cannot be written: Is a directory"));
+  EXPECT_EQ(desk.read("out/duffing.h"), "old");
+}
+
 // A fitted mass and damping of a linkage in a copy of its file.
 class RobotExportCommand : public testing::Test {
  protected:

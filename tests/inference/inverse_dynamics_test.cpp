@@ -285,6 +285,7 @@ TEST(InverseDynamicsSolverTest, FindsInputsByNewtonsMethodAndSaysWhyThereAreNone
   EXPECT_EQ(status_of("u", {0, 0, 0, 0}, 1), Solver::Status::ok);
   EXPECT_EQ(status_of("u", {0, 0, 0, unknown}, 1), Solver::Status::ok);
   EXPECT_EQ(status_of("u^2", {0, 0, 0, 1}, -1), Solver::Status::not_found);
+  EXPECT_EQ(status_of("u", {0, 0, 0, 0}, 1e200), Solver::Status::not_found) << "its square overflows";
   EXPECT_EQ(status_of("u", {0, 0, 0, 0}, unknown), Solver::Status::not_finite);
   EXPECT_EQ(status_of("u - x", {unknown, 0, 0, 0}, 1), Solver::Status::no_prediction);
 }

@@ -116,6 +116,23 @@ TEST(Multipliers, ThatGrowFasterThanTheForceTheyNeedAreAnErrorThatNamesTheState)
   expect_says([&] { static_cast<void>(ModelMotion(model).acceleration(states)); }, {"Painlevé", "x = "});
 }
 
+TEST(Multipliers, ThatOneSampleMakesGrowTooFastAreAnErrorThatNamesTheSample) {
+  const Model model = rubbing_bead("lambda");
+  const Prior prior = make_prior(model, {});
+  const MatrixXd states = test::draw(model, 5, nonlinear_seed).states;
+  const std::vector<Observations> observed = {{states, View::constrained_acceleration(*model.system),
+                                               ModelMotion(model).acceleration(states), VectorXd::Constant(2, 0.01)}};
+  ModelValues values = model_values(prior, observed, default_hyperparameters(prior, observed, {}, {}));
+  values.signal_stddev[0] *= 100;
+  values.noise_stddev.clear();
+  const Posterior no_data(prior, {}, values);
+  expect_says(
+      [&] {
+        static_cast<void>(no_data.sample({{observed[0].view(), states}}, 20, 1));
+      },
+      {"sample ", " of the prior: system 'rubbing bead': ", "Painlevé", "x = "});
+}
+
 TEST(Multipliers, ThatGiveNoFiniteForceAreAnErrorOfTheirOwn) {
   std::string text = rubbing_bead("lambda").text;
   text.replace(text.find("abs(lambda(1))"), 14, "sqrt(-lambda(1) - 100)");

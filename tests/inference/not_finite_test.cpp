@@ -115,5 +115,48 @@ TEST_P(NotFinite, IsAStatusOfThePredictor) {
   }
 }
 
+// Everything that the model says is a number, but not what is predicted of it.
+TEST(Overflow, IsRefusedAtEveryDoorByItsState) {
+  const Prior prior = prior_of({"Overflow", "linear", "x", "x", "0", ""});
+  const View view = View::constrained_acceleration(*prior.system);
+  const MatrixXd sound = states_from(prior, 3), huge = states_from(prior, 1e200);
+  const std::vector<Observations> observed = {{sound, view, MatrixXd::Random(2, 3), VectorXd::Constant(2, 0.1)}};
+  const Posterior posterior(prior, observed,
+                            model_values(prior, observed, default_hyperparameters(prior, observed, {}, Protocol())));
+  const std::vector<std::pair<std::string, std::function<void()>>> doors = {
+      {"mean", [&] { static_cast<void>(posterior.mean(view, huge)); }},
+      {"marginal", [&] { static_cast<void>(posterior.marginal(view, huge)); }},
+      {"joint", [&] { static_cast<void>(posterior.joint(view, huge)); }},
+      {"sample",
+       [&] {
+         static_cast<void>(posterior.sample({{view, huge}}, 2, 1));
+       }},
+      {"paths", [&] { static_cast<void>(sample_paths(posterior, 1).evaluate(0, view, huge)); }},
+  };
+  for (const auto& [name, use] : doors) {
+    EXPECT_THAT(input_error_of(use), HasSubstr("system 'particle': the prediction overflows double precision (correct the state, "
+                                               "or leave it out) at state 2 (x = 1e+200"))
+        << name;
+  }
+}
+
+// The variance is a square, and overflows before the mean does.
+TEST(Overflow, IsAStatusOfThePredictor) {
+  const Prior prior = prior_of({"Overflow", "linear", "x", "1", "0", ""});
+  const MatrixXd sound = states_from(prior, 3), huge = states_from(prior, 1e200);
+  const std::vector<Observations> observed = {
+      {sound, View::constrained_acceleration(*prior.system), MatrixXd::Random(2, 3), VectorXd::Constant(2, 0.1)}};
+  const Predictor predictor(
+      Posterior(prior, observed, model_values(prior, observed, default_hyperparameters(prior, observed, {}, Protocol()))));
+  Predictor::Workspace workspace = predictor.make_workspace();
+  VectorXd mean(2), stddev(2);
+  MatrixXd covariance(2, 2);
+  EXPECT_EQ(predictor.mean(huge.col(1), mean, workspace), Predictor::Status::ok);
+  EXPECT_EQ(predictor.mean_and_stddev(huge.col(1), mean, stddev, workspace), Predictor::Status::not_finite);
+  EXPECT_TRUE(mean.array().isNaN().all() && stddev.array().isNaN().all());
+  EXPECT_EQ(predictor.mean_and_covariance(huge.col(1), mean, covariance, workspace), Predictor::Status::not_finite);
+  EXPECT_TRUE(mean.array().isNaN().all() && covariance.array().isNaN().all());
+}
+
 }  // namespace
 }  // namespace gp2

@@ -4,6 +4,7 @@
 
 #include "data_of_model.hpp"
 #include "gp2/jobs/fit_job.hpp"
+#include "gp2/jobs/simulate_job.hpp"
 #include "input_error.hpp"
 #include "io_testing.hpp"
 #include "test_models.hpp"
@@ -103,6 +104,65 @@ TEST(IntegratedFit, IsRefusedWhereItHasNoMeaning) {
   request.max_iterations = 0;
   EXPECT_EQ(test::input_error_of([&] { prepare_fit(request); }),
             "`hyperparameters=integrate` draws about the optimum: it cannot be with `max_iterations=0`");
+}
+
+// A bead on a wire whose slope and mass were drawn.
+TEST(IntegratedFit, MovesASampleUnderTheParametersOfItsDraw) {
+  const Model model = Model::parse(R"toml(
+coordinates = ["x", "y"]
+[parameters]
+m = { value = 1, bounds = [0.1, 10], estimate = true }
+s = { value = 0.5, bounds = [0.1, 1], estimate = true }
+[mechanics]
+mass      = [["m", "0"], ["0", "m"]]
+force     = ["0", "-9.81*m"]
+potential = "9.81*m*y"
+[constraints]
+position = ["y - s*x"]
+[noise]
+ddq = 0.1
+[truth]
+force = ["-0.2*dx", "0"]
+[sampling]
+x  = [-1, 1]
+dx = [-1, 1]
+)toml",
+                                   "wire.toml");
+  FitRequest request;
+  request.model = model;
+  const GeneratedData data = test::draw(model, 12, 1);
+  request.logs = {{test::LogData{&model, data.states, data.accelerations}.table(), nullptr}};
+  request.problem.mean = Prior::Mean::force;
+  request.max_iterations = 0;
+  const FitOutcome fit = run_fit(prepare_fit(std::move(request)));
+  std::vector<ModelValues> values(2, fit.posterior.values());
+  values[1].parameters << 3, 0.7;
+  const Posterior posterior = Posterior::mixture(fit.posterior.prior(), fit.posterior.observations(), values);
+  const auto energy_of = [&](const Eigen::VectorXd& parameters, const MatrixXd& states) {
+    return mechanical_energy(model, parameters, states);
+  };
+  SimulateRequest asked;
+  asked.start = std::map<std::string, double>{{"x", 0.4}};
+  asked.times = Eigen::VectorXd::LinSpaced(11, 0, 0.5);
+  const FitSystem system = system_of(fit.file, posterior.prior(), nullptr);
+  asked.n_samples = 4;
+  SimulateJob job = prepare_simulation(system, posterior, asked);
+  std::vector<Trajectory> motions = run_simulation(job);
+  std::set<double> masses;
+  for (std::size_t k = 0; k < motions.size(); ++k) {
+    const Eigen::VectorXd& own = job.motions[k].parameters;
+    masses.insert(own[0]);
+    const MatrixXd& states = motions[k].states;
+    EXPECT_EQ(job.motions[k].energy(states).values, energy_of(own, states));
+    EXPECT_LE((states.row(1) - own[1] * states.row(0)).cwiseAbs().maxCoeff(), 1e-9) << own.transpose();
+  }
+  EXPECT_THAT(masses, testing::ElementsAre(1, 3));
+
+  asked.n_samples.reset();
+  job = prepare_simulation(system, posterior, asked);
+  const MatrixXd states = run_simulation(job).front().states;
+  const Eigen::VectorXd mean = 0.5 * (energy_of(values[0].parameters, states) + energy_of(values[1].parameters, states));
+  EXPECT_TRUE(job.motions.front().energy(states).values.isApprox(mean, 1e-12));
 }
 
 TEST(IntegratedFit, SaysWhereNothingIsDrawnAndWhereChainsHaveNotMixed) {

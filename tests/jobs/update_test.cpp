@@ -72,7 +72,11 @@ TEST(UpdateJob, WhatCannotBeIsAnError) {
   const auto refused = [&](const UpdateRequest& request) {
     return input_error_of([&] { static_cast<void>(update(fit, {log_of(3, 2)}, request)); });
   };
-  UpdateRequest none_left, fading, other;
+  UpdateRequest none_left, fading, other, silent, unknown;
+  silent.noise_stddev = 0;
+  unknown.observe = {"ddq9"};
+  EXPECT_EQ(refused(silent), "`noise_std`: must be positive and finite, got 0");
+  EXPECT_THAT(refused(unknown), HasSubstr("`observe`: 'ddq9' is not an acceleration of "));
   none_left.window = 0;
   fading.forget = 0.5;
   other.observe = {"ddq1"};

@@ -560,14 +560,15 @@ TEST(Discrepancy, ThatIsNoneInAFitFileIsRefused) {
   EXPECT_EQ(error_after([](Json& of) { of["lengthscale"].erase(0); }),
             "a discrepancy must hold 3 lengthscales and 2 standard deviations, got 2 and 2");
   EXPECT_EQ(error_after([](Json& of) { of["lengthscale"] = Json::array(); }),
-            "lengthscale and stddev of the discrepancy must be positive");
+            "lengthscale and stddev of the discrepancy must be from 1e-100 to 1e+100");
   EXPECT_EQ(error_after([](Json& of) { of["stddev"].push_back(1); }),
             "a discrepancy must hold 3 lengthscales and 2 standard deviations, got 3 and 3");
   EXPECT_EQ(error_after([](Json& of) { of["stddev"] = Json::array(); }),
             "a discrepancy must hold 3 lengthscales and 2 standard deviations, got 3 and 0");
   for (const char* key : {"lengthscale", "stddev"}) {
-    for (const double value : {0.0, -0.1}) {
-      EXPECT_EQ(error_after([&](Json& of) { of[key][1] = value; }), "lengthscale and stddev of the discrepancy must be positive");
+    for (const double value : {0.0, -0.1, 1e-320, 1e300}) {
+      EXPECT_EQ(error_after([&](Json& of) { of[key][1] = value; }),
+                "lengthscale and stddev of the discrepancy must be from 1e-100 to 1e+100");
     }
     EXPECT_EQ(error_after([&](Json& of) { of[key][1] = nullptr; }), "null stands where a number must");
     EXPECT_EQ(error_after([&](Json& of) { of[key] = 1; }), "1 stands where an array must");

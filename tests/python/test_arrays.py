@@ -90,6 +90,8 @@ def test_the_distance_from_the_data_is_that_of_the_predictor(posterior, arm_stat
     predictor = gp2.Predictor(posterior)
     np.testing.assert_allclose([predictor.distance_from_data(x) for x in arm_states], distance, rtol=1e-12)
     assert (posterior.predict(100 * arm_states).distance_from_data > gp2.FAR_FROM_DATA).all()
+    with pytest.raises(gp2.InputError, match="a number that is read, or what the model makes of it, is not finite"):
+        predictor.distance_from_data(np.full(arm_states.shape[1], np.nan))
 
 
 def test_two_predictions_share_no_memory(posterior, arm_states):

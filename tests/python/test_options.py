@@ -1,7 +1,9 @@
 """Keywords, stub and pages come from the tables of options of the library."""
 
+import re
 import subprocess
 import sys
+import types
 
 import numpy as np
 import pytest
@@ -113,3 +115,27 @@ def test_messages_speak_of_keywords(arm, arm_log, tmp_path):
         posterior = gp2.fit(arm, arm_log, restarts=1, max_iterations=0)
         posterior.save(tmp_path / "fit.json")
         gp2.fit_again(tmp_path / "fit.json", also=[gp2.SideInformation("unconstrained", arm_log)])
+
+
+def functions_with_keywords():
+    """Every function and constructor of the package that takes arguments by their names, and the first of these."""
+    owners = [gp2] + [one for name, one in vars(gp2).items() if isinstance(one, type) and not name.startswith("_")]
+    for owner in owners:
+        for name in vars(owner):
+            function = getattr(owner, name)
+            signature = next(iter((getattr(function, "__doc__", None) or "").splitlines()), "")
+            if not callable(function) or isinstance(function, (type, types.FunctionType)) or name.startswith("_") and name != "__init__":
+                continue
+            known = [word for word in re.findall(r"(\w+): ", signature.split(" -> ")[0]) if word != "self" and len(word) > 2]
+            if known:
+                yield pytest.param(owner, name, known[0], id=f"{owner.__name__}.{name}")
+
+
+@pytest.mark.parametrize(("owner", "name", "keyword"), functions_with_keywords())
+def test_every_function_names_a_misspelt_keyword_and_the_nearest(owner, name, keyword):
+    function = owner if name == "__init__" else getattr(owner, name)
+    called = owner.__name__ if name == "__init__" else name
+    misspelt = keyword[1] + keyword[0] + keyword[2:]
+    arguments = [object()] if isinstance(owner, type) and not isinstance(vars(owner)[name], staticmethod) and name != "__init__" else []
+    with pytest.raises(TypeError, match=rf"{called}\(\) got an unexpected keyword argument '{misspelt}'; did you mean '{keyword}'"):
+        function(*arguments, **{misspelt: 1})

@@ -86,6 +86,7 @@ TEST_F(ReportCommand, RefusesWhatDoesNotFitAndWritesNothing) {
       {"fit.json --truth untrue.toml -o report.html", "has no [truth]"},
       {"fit.json --map a=q1 -o report.html", "--map names columns of --data"},
       {"fit.json -o nowhere/report.html", "there is no folder 'nowhere'"},
+      {"fit.json -o ''", "-o: expected the name of a file, got ''"},
   };
   for (const auto& [arguments, text] : cases) {
     const Outcome outcome = desk.run(std::string("gp2 report ") + arguments);

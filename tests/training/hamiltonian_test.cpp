@@ -2,11 +2,13 @@
 
 #include <atomic>
 #include <cmath>
+#include <limits>
 #include <vector>
 
 #include <gtest/gtest.h>
 #include <Eigen/Dense>
 
+#include "gp2/error.hpp"
 #include "gp2/inference/evaluation.hpp"
 #include "gp2/inference/leave_one_out.hpp"
 #include "gp2/training/laplace.hpp"
@@ -296,6 +298,20 @@ TEST(HamiltonianTest, LeftOutValuesAreWeighedByWhatTheyDoToEachDraw) {
     const VectorXd deviation = mean.array() - weight.dot(mean);
     EXPECT_NEAR(left_out.variance(0, i), weight.dot(VectorXd(variance + deviation.cwiseAbs2())), 1e-9);
   }
+}
+
+TEST(HamiltonianTest, DrawsWithoutAPosteriorAreLeftOutUnlessAllAreSuch) {
+  const DrawProblem p = only(make_problem(sloped_line(), 12, {"p", "r"}), Kind::parameter, Kind::parameter);
+  FitReport report = fit_of(p, drawing(3)).report;
+  const MatrixXd values = report.draws->values;
+  const double largest = std::numeric_limits<double>::max();  // of which p x + r overflows
+  report.draws->values.col(1).setConstant(largest);
+  const Posterior posterior = possible_posterior(p.prior, p.observations, report, {});
+  EXPECT_EQ(posterior.n_components(), 2);
+  EXPECT_EQ(report.draws->n_impossible, 1);
+  EXPECT_EQ(report.draws->values, MatrixXd(values(Eigen::all, {0, 2})));
+  report.draws->values.setConstant(largest);
+  EXPECT_THROW(static_cast<void>(possible_posterior(p.prior, p.observations, report, {})), InputError);
 }
 
 }  // namespace

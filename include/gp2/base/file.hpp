@@ -7,6 +7,8 @@
 #include <optional>
 #include <string>
 #include <string_view>
+#include <utility>
+#include <vector>
 
 #include "gp2/export.hpp"
 
@@ -18,6 +20,9 @@ namespace gp2 GP2_API {
 /// replaced; a device or pipe is written to as it is, and so is /dev/stdout, whatever it leads to.
 /// @throws InputError naming the path and the system's reason when that fails; an old file at `path` is then intact.
 void write_file(const std::filesystem::path& path, std::string_view content);
+
+/// Several files that belong together: none of them is replaced before all are written.
+void write_files(const std::vector<std::pair<std::filesystem::path, std::string>>& files);
 
 /// The same of what `produce` hands on block after block, so that a long text need not be in memory as a whole.
 /// @throws InputError as write_file, and what `produce` throws.

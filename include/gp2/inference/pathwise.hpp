@@ -28,6 +28,10 @@ class PathwiseSamples {
   /// @throws InputError when there is no such sample, or as Posterior::mean.
   [[nodiscard]] Eigen::MatrixXd evaluate(int sample, const View& view, const Eigen::Ref<const Eigen::MatrixXd>& states) const;
 
+  /// The parameters that a sample was drawn under: of a mixture those of its component.
+  /// @throws InputError when there is no such sample.
+  [[nodiscard]] const Eigen::VectorXd& parameters(int sample) const;
+
   /// A sample of a potential at N states, less that at a reference: what `evaluate` gives is the force of this function (N).
   /// @throws InputError as Posterior::potential, or when there is no such sample.
   [[nodiscard]] Eigen::VectorXd potential(int sample, int latent, const Eigen::Ref<const Eigen::MatrixXd>& states,

@@ -54,16 +54,19 @@ struct MotionEnergy {
   Eigen::VectorXd stddev;  // of the potential that a fit learned, against the first state; empty where that is not one function
 };
 
-/// A motion that is to be integrated.
+/// Motions that are to be integrated.
 struct SimulateJob {
+  struct Motion {
+    Eigen::VectorXd parameters;  // of its constraints and contacts
+    Acceleration acceleration;
+    Acceleration multipliers;                                           // λ; none without constraints
+    std::function<MotionEnergy(const Eigen::MatrixXd& states)> energy;  // none without a potential, known or learned
+    std::vector<Contact> contacts;
+  };
   std::shared_ptr<const System> system;
-  Eigen::VectorXd parameters;
-  Eigen::VectorXd start;                    // the whole state
-  std::vector<Acceleration> accelerations;  // one for each motion
-  std::vector<Acceleration> records;        // the multipliers λ of each motion; none without constraints
-  /// The energy of each motion at its states; none without a potential, known or learned.
-  std::vector<std::function<MotionEnergy(const Eigen::MatrixXd& states)>> energies;
-  SimulateOptions options;
+  Eigen::VectorXd start;           // the whole state
+  std::vector<Motion> motions;     // of samples each under the parameters that it was drawn with
+  SimulateOptions options;         // but for what each motion has of its own
   InputSignal commands;            // of which options.inputs is what acts
   std::vector<std::string> notes;  // how the start was completed
 };
