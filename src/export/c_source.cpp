@@ -618,7 +618,9 @@ void Writer::write_expressions() {
                                       names[quantity], n, fmt::join(entries[quantity], ", "));
       texts_["expressions"] += "\n" + table;
     }
-    function("evaluate_system_and_derivatives", head, program(*derivatives_->tape(), results, true));
+    // where nothing depends on the state it is evaluate_system
+    texts_["system_and_derivatives"] =
+        function("evaluate_system_and_derivatives", head, program(*derivatives_->tape(), results, true));
   }
   const auto vector = [](const char* what, Index n) {
     std::vector<std::string> entries;

@@ -1453,7 +1453,7 @@ status @name@_mean(const real *state, real *mean, workspace *w)
 {jacobian}
 {jacobian}static status evaluate_with_jacobian(const component *c, const real *state, real *mean, real *jacobian, workspace *w)
 {jacobian}{
-{jacobian}  evaluate_system_and_derivatives(c->parameters, state, w);
+{jacobian}  @system_and_derivatives@(c->parameters, state, w);
 {jacobian}  const status s = evaluate_mean(c, state, mean, w);
 {jacobian}  if (s != @name@_OK) return s;
 {jacobian}  differentiate_prior(c, state, w);
