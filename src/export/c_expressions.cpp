@@ -109,7 +109,9 @@ void Writer::write_system() {
         fmt::format("\nstatic const short of_{}[{}][3] = {{ /* row, column, entry of the state */\n  {}\n}};\n", name, n,
                     fmt::join(entries[quantity], ", "));
   }
-  function("evaluate_system_and_derivatives", head, program(*derivatives_->tape(), results, true));
+  // where nothing depends on the state it is evaluate_system
+  texts_["system_and_derivatives"] =
+      function("evaluate_system_and_derivatives", head, program(*derivatives_->tape(), results, true));
 }
 
 // Features or directions of a latent and, where asked, their derivatives; their names go to the texts of the latent.

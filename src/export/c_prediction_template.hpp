@@ -662,7 +662,7 @@ static void differentiate_motion(workspace *w)
 
 static status evaluate_with_jacobian(const component *c, const real *state, real *mean, real *jacobian, workspace *w)
 {
-  evaluate_system_and_derivatives(c->parameters, state, w);
+  @system_and_derivatives@(c->parameters, state, w);
   const status s = evaluate_mean(c, state, mean, w);
   if (s != @name@_OK) return s;
   differentiate_prior(c, state, w);

@@ -391,6 +391,33 @@ directions = "force"
   EXPECT_GE(seen.size(), 4U);
 }
 
+// The variance is a square, and overflows before the mean does.
+TEST(CSourceTest, AnOverflowOfTheDeviationAloneIsAStatus) {
+  const Model model = Model::parse(R"toml(
+name        = "cart"
+coordinates = ["x"]
+[mechanics]
+mass = [["1"]]
+[[latent]]
+kernel     = "linear"
+features   = ["x"]
+directions = "force"
+)toml",
+                                   "cart");
+  Problem p;
+  p.prior = make_prior(model, {});
+  RandomStream random(export_seed);
+  p.observations = {{test::random_matrix(3, 6, random), View::constrained_acceleration(*model.system),
+                     MatrixXd(test::random_matrix(1, 6, random)), VectorXd::Constant(1, 0.3), false}};
+  p.values = test::random_values(p.prior, p.observations, random);
+  Exported c(export_c(test::posterior_of(p), View::constrained_acceleration(*model.system)), "gp2_model", "gcc -O2");
+  const VectorXd state = Eigen::Vector3d(1e200, 0, 0);
+  double mean = 0, stddev = 0;
+  EXPECT_EQ(c.mean(state.data(), &mean, c.workspace()), static_cast<int>(Status::ok));
+  EXPECT_EQ(c.mean_and_stddev(state.data(), &mean, &stddev, c.workspace()), static_cast<int>(Status::not_finite));
+  EXPECT_TRUE(std::isnan(mean) && std::isnan(stddev));
+}
+
 TEST(CSourceTest, TestsItself) {
   Problem p = problem_of("surface");
   const View view = View::constrained_acceleration(*p.prior.system);
