@@ -110,7 +110,7 @@ void Writer::write_system() {
                     fmt::join(entries[quantity], ", "));
   }
   // where nothing depends on the state it is evaluate_system
-  texts_["system_and_derivatives"] =
+  text("system_and_derivatives") =
       function("evaluate_system_and_derivatives", head, program(*derivatives_->tape(), results, true));
 }
 
