@@ -332,9 +332,9 @@ SimulateJob prepare_simulation(const FitSystem& system, const Posterior& posteri
         likeliest, [posterior](const View& view, const Eigen::Ref<const VectorXd>& x) { return posterior.mean(view, x); },
         [energy_under, components](const MatrixXd& states) {
           std::vector<MotionEnergy> energies;
-          for (const auto& [parameters, component] : components) {
-            energies.push_back(energy_under(
-                parameters, states, [&component](int a, const MatrixXd& at) { return component.potential(a, at, at.col(0)); }));
+          for (const auto& component : components) {
+            const auto learned = [&](int a, const MatrixXd& at) { return component.second.potential(a, at, at.col(0)); };
+            energies.push_back(energy_under(component.first, states, learned));
           }
           return mixed(energies);
         });
