@@ -6,7 +6,6 @@
 #include <Eigen/Cholesky>
 
 #include "base/lapack.hpp"
-#include "base/simd.hpp"
 #include "prior/gradient_columns.hpp"
 
 namespace gp2 {
@@ -261,10 +260,10 @@ void InducingStatistics::add(const InducingStatistics& other, double share) {
 void InducingStatistics::add(const InducingLatents& latents, const InducingBlock& block, MatrixXd& memory) {
   const std::vector<InducingLatents::Function>& functions = latents.functions();
   const auto is_potential = [&](std::size_t f) { return latents.latent_of(functions[f]).is_potential; };
-  // what the functions of a potential weigh differs by component, so that it is not the weights alone that are summed
+  // each component of a sample sees another combination of a potential's derivatives: its variables have loadings by component
   std::vector<MatrixXd> Psi;
-  for (Index k = 0; k < block.y().cols() && std::ranges::any_of(latents.latents(), &InducingLatents::OfLatent::is_potential); ++k)
-    Psi.push_back(block.loadings(k));
+  const bool has_potential = std::ranges::any_of(latents.latents(), &InducingLatents::OfLatent::is_potential);
+  for (Index k = 0; has_potential && k < block.y().cols(); ++k) Psi.push_back(block.loadings(k));
   for (std::size_t f = 0; f < functions.size(); ++f) {
     const MatrixXd& w = block.w(f);
     const ArrayXd square = block.weight_product(f, f);
