@@ -49,29 +49,32 @@ class InputSignal {
   std::vector<double> kinks_;
 };
 
-/// Functions g(x) of the state at whose zeros an acceleration jumps, as dry friction −μ sign(v) does at v = 0.
+/// Surfaces of the state at which an acceleration jumps: zeros of a function g(x), as of v where dry friction is −μ sign(v), or common
+/// zeros of several, as of v and w where dry friction in a plane is −μ (v, w)/√(v² + w²).
 class SwitchingFunctions {
  public:
   SwitchingFunctions() = default;  // none
-  /// @param functions  g; each reads a velocity and no input
-  SwitchingFunctions(std::span<const Expression> functions, const SystemSymbols& symbols);
+  /// @param surfaces  the functions g of each, which read velocities and no input
+  SwitchingFunctions(std::span<const std::vector<Expression>> surfaces, const SystemSymbols& symbols);
 
-  [[nodiscard]] int size() const { return size_; }
-  /// g as texts.
+  [[nodiscard]] int size() const { return static_cast<int>(names_.size()); }
+  /// Of each surface: its functions as texts, "v" or "v, w".
   [[nodiscard]] const std::vector<std::string>& names() const { return names_; }
-  /// @param values     g (size)
-  /// @param gradients  ∂g/∂[q; dq; t] (size × 2 nq + 1)
+  /// The functions of surface k are those from first[k] on, before first[k + 1].  (size + 1)
+  [[nodiscard]] const std::vector<int>& first() const { return first_; }
+  /// @param values     g of all surfaces, one after the other (first[size])
+  /// @param gradients  ∂g/∂[q; dq; t] (first[size] × 2 nq + 1)
   void evaluate(const Eigen::Ref<const Eigen::VectorXd>& state, const Eigen::Ref<const Eigen::VectorXd>& parameters,
                 Eigen::VectorXd& values, Eigen::MatrixXd& gradients) const;
 
  private:
   Tape tape_;
-  int size_ = 0;
+  std::vector<int> first_ = {0};
   std::vector<std::string> names_;
 };
 
-/// The arguments of sign() that read velocities, in a model's force, and in its [truth] or in features and directions of its
-/// latents. Not to be called from several threads for one model: its expression graph grows.
+/// The arguments of sign() that read velocities, and those that stand over their own length, v/|v| or v/√(v² + w²), in a model's force,
+/// and in its [truth] or in features and directions of its latents. Not to be called from several threads for one model: its expression graph grows.
 SwitchingFunctions switching_functions(const Model& model, bool of_latents);
 
 /// A constraint c(q, t) = 0 that can only push: the gap c is never negative. The input that its row of A and b is switched by says
@@ -97,7 +100,7 @@ struct ContactEvent {
   double energy_loss = 0;  // kinetic energy that the impact took [J]
 };
 
-/// A zero of a switching function that starts to hold a motion, as dry friction does a body that sticks, or lets it go.
+/// A surface at which the acceleration jumps that starts to hold a motion, as dry friction does a body that sticks, or lets it go.
 struct StickEvent {
   double time = 0;
   int surface = 0;     // of the switching functions
@@ -160,8 +163,8 @@ class UnfinishedMotion : public NumericalError {
 /// steps, are projected too. Steps end at the kinks of the inputs, so that no pulse is stepped over. Redundant constraints mean
 /// nothing off the constraint: the stages of such systems are evaluated at their projections, with `project` or without.
 ///
-/// A zero of a switching function ends a step. There the motion crosses to the other side; or, where both sides drive it back, it
-/// stays on the zero with the mixture of both accelerations that keeps it there (Filippov), until that mixture leaves what lies
+/// A zero of a switching function ends a step. There the motion crosses to the other side; or, where all sides drive it back, it
+/// stays on the zero with the mixture of their accelerations that keeps it there (Filippov), until that mixture leaves what lies
 /// between them: a body under dry friction rests, and breaks loose. Friction may be proportional to a load that it changes itself:
 /// |λ_t| ≤ μ |λ_n| holds of each of several contacts, whose accelerations are those of all combinations of sides, mixed.
 ///

@@ -420,13 +420,16 @@ class Integration {
     std::swap(x_, x_new_);
     std::swap(dxdt_, dxdt_new_);
     t_ = t_new;
-    const bool switches = !switching_.is_empty() && (has_crossed || switching_.is_sliding());
-    const std::vector<int> sides = switching_.sides();
-    if (switches) {
+    const bool switches = !switching_.is_empty() && (has_crossed || switching_.is_guided());
+    const std::vector<bool> was_held = held_surfaces();
+    if (!switching_.is_empty()) {
       expand(x_, t_);
-      switching_.cross(state_);
-      switching_.hold(state_);
-      std::copy_n(state_.begin(), x_.size(), x_.begin());
+      if (switches) {
+        switching_.cross(state_);
+        switching_.put(state_);
+        std::copy_n(state_.begin(), x_.size(), x_.begin());
+      }
+      switching_.turn(state_);
     }
     const std::size_t n_events = out_.events.size();
     if (has_crossed && !contacts_.is_empty()) settle_contacts(/*at_start=*/false);
@@ -440,17 +443,23 @@ class Integration {
           switching_.settle(state_, counted());
         }
       });
-      note_sticks(sides);
+      note_sticks(was_held);
     }
     if (moved || switches || (has_crossed && !contacts_.is_empty())) derivative_or_throw();
   }
 
   // where the motion is on a surface now, and was beside it, or the other way round
-  void note_sticks(const std::vector<int>& before) {
-    const std::vector<int>& after = switching_.sides();
+  void note_sticks(const std::vector<bool>& before) {
+    const std::vector<bool> after = held_surfaces();
     for (std::size_t k = 0; k < after.size(); ++k) {
-      if ((before[k] == 0) != (after[k] == 0)) out_.sticks.push_back({t_, static_cast<int>(k), after[k] == 0});
+      if (before[k] != after[k]) out_.sticks.push_back({t_, static_cast<int>(k), after[k]});
     }
+  }
+
+  [[nodiscard]] std::vector<bool> held_surfaces() const {
+    std::vector<bool> out;
+    for (int k = 0; k < options_.switching.size(); ++k) out.push_back(switching_.is_held(k));
+    return out;
   }
 
   [[nodiscard]] Acceleration of_sides_anew() {

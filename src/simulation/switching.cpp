@@ -4,10 +4,15 @@
 #include <array>
 #include <cmath>
 #include <cstdint>
+#include <optional>
 #include <set>
+#include <string>
 #include <utility>
 
+#include <fmt/format.h>
+#include <fmt/ranges.h>
 #include <Eigen/QR>
+#include <Eigen/SVD>
 
 #include "gp2/model.hpp"
 #include "mechanics/known_multipliers.hpp"
@@ -20,11 +25,17 @@ using Eigen::VectorXd;
 
 // ---------------------------------------------------------------- where the accelerations of a model jump
 
-SwitchingFunctions::SwitchingFunctions(std::span<const Expression> functions, const SystemSymbols& symbols)
-    : size_(static_cast<int>(functions.size())) {
-  if (functions.empty()) return;
-  for (const Expression& g : functions) names_.push_back(to_string(g));
-  std::vector<Expression> outputs(functions.begin(), functions.end());
+SwitchingFunctions::SwitchingFunctions(std::span<const std::vector<Expression>> surfaces, const SystemSymbols& symbols) {
+  if (surfaces.empty()) return;
+  std::vector<Expression> outputs;
+  for (const std::vector<Expression>& functions : surfaces) {
+    std::vector<std::string> texts;
+    for (const Expression& g : functions) texts.push_back(to_string(g));
+    names_.push_back(fmt::format("{}", fmt::join(texts, ", ")));
+    outputs.insert(outputs.end(), functions.begin(), functions.end());
+    first_.push_back(static_cast<int>(outputs.size()));
+  }
+  const std::vector<Expression> functions = outputs;
   std::vector<Expression> moving = symbols.q;
   moving.insert(moving.end(), symbols.dq.begin(), symbols.dq.end());
   moving.push_back(symbols.t);
@@ -36,38 +47,42 @@ SwitchingFunctions::SwitchingFunctions(std::span<const Expression> functions, co
 
 void SwitchingFunctions::evaluate(const Eigen::Ref<const VectorXd>& state, const Eigen::Ref<const VectorXd>& parameters,
                                   VectorXd& values, MatrixXd& gradients) const {
+  const Index n = first_.back();
   MatrixXd results;
   tape_.evaluate(state, parameters, results);
-  values = results.topRows(size_);
-  gradients = results.bottomRows(results.rows() - size_).reshaped(size_, results.rows() / size_ - 1);
+  values = results.topRows(n);
+  gradients = results.bottomRows(results.rows() - n).reshaped(n, results.rows() / n - 1);
 }
 
 namespace {
 
-// The arguments of sign() in expressions, and of |·| in denominators, that read a velocity and no input, each once and each factor by
-// itself, without constants: sign(v), sign(−2 v), sign(lambda(1) v) and v/|v| are of one surface.
-class ArgumentsOfSign {
+constexpr bool is_binary(Operation operation) {
+  constexpr std::array binary = {Operation::add,    Operation::subtract, Operation::multiply,
+                                 Operation::divide, Operation::power,    Operation::atan2,
+                                 Operation::min,    Operation::max,      Operation::multiply_or_zero};
+  return std::find(binary.begin(), binary.end(), operation) != binary.end();
+}
+
+// The surfaces at which expressions jump: arguments of sign(), and those whose length is a denominator, |v| or √(v² + w²), that read a
+// velocity and no input, each once and each factor by itself, without constants: sign(v), sign(−2 v), sign(lambda(1) v) and v/|v| are
+// of one surface.
+class JumpsOf {
  public:
-  ArgumentsOfSign(ExpressionGraph& graph, const SystemSymbols& symbols) : graph_(graph), symbols_(symbols) {}
+  JumpsOf(ExpressionGraph& graph, const SystemSymbols& symbols) : graph_(graph), symbols_(symbols) {}
 
   void add(Expression e) {
     if (!seen_.insert(e.id()).second || e.operation() <= Operation::variable) return;
-    if (e.operation() == Operation::sign) add_surface(e.left());
-    if (e.operation() == Operation::divide && e.right().operation() == Operation::abs) add_surface(e.right().left());
+    if (e.operation() == Operation::sign) add_factors(e.left());
+    if (e.operation() == Operation::divide && e.right().operation() == Operation::abs) add_factors(e.right().left());
+    if (e.operation() == Operation::divide && e.right().operation() == Operation::sqrt) add_length(e.right().left());
+    if (e.operation() == Operation::power && e.right().is_constant(-0.5)) add_length(e.left());
     add(e.left());
     if (is_binary(e.operation())) add(e.right());
   }
-  [[nodiscard]] const std::vector<Expression>& found() const { return found_; }
+  [[nodiscard]] const std::vector<std::vector<Expression>>& found() const { return found_; }
 
  private:
-  static bool is_binary(Operation operation) {
-    constexpr std::array binary = {Operation::add,    Operation::subtract, Operation::multiply,
-                                   Operation::divide, Operation::power,    Operation::atan2,
-                                   Operation::min,    Operation::max,      Operation::multiply_or_zero};
-    return std::find(binary.begin(), binary.end(), operation) != binary.end();
-  }
-
-  void add_surface(Expression g) {
+  void add_factors(Expression g) {
     while (true) {
       if (g.operation() == Operation::negate) {
         g = g.left();
@@ -80,104 +95,163 @@ class ArgumentsOfSign {
       }
     }
     if (g.operation() == Operation::multiply || g.operation() == Operation::divide) {
-      add_surface(g.left());
-      add_surface(g.right());
+      add_factors(g.left());
+      add_factors(g.right());
       return;
     }
-    // λ₀ and λ are no expressions of the state: where they change their sign is not looked for
+    if (reads_velocity(g)) add_surface({g});
+  }
+
+  // the terms of a sum of squares, each alone 0 where the sum is
+  void add_length(const Expression& sum) {
+    std::vector<Expression> functions;
+    if (!add_squares(sum, functions)) return;
+    if (functions.size() == 1) {
+      add_factors(functions.front());
+    } else {
+      add_surface(std::move(functions));
+    }
+  }
+
+  bool add_squares(const Expression& e, std::vector<Expression>& roots) {
+    if (e.operation() == Operation::add) return add_squares(e.left(), roots) && add_squares(e.right(), roots);
+    const std::optional<Expression> root = root_of(e);
+    if (!root || !reads_velocity(*root)) return false;
+    roots.push_back(*root);
+    return true;
+  }
+
+  // of a square, or of one times what reads no velocity
+  std::optional<Expression> root_of(const Expression& e) {
+    if (e.operation() == Operation::power && e.right().is_constant(2)) return e.left();
+    if (e.operation() == Operation::divide && !reads_velocity(e.right())) {
+      const std::optional<Expression> root = root_of(e.left());
+      return root ? std::optional(*root / graph_.apply(Operation::sqrt, e.right())) : std::nullopt;
+    }
+    if (e.operation() != Operation::multiply) return std::nullopt;
+    if (e.left() == e.right()) return e.left();
+    for (const auto& [factor, square] : {std::pair(e.left(), e.right()), std::pair(e.right(), e.left())}) {
+      if (reads_velocity(factor)) continue;
+      if (const std::optional<Expression> root = root_of(square)) return graph_.apply(Operation::sqrt, factor) * *root;
+    }
+    return std::nullopt;
+  }
+
+  // λ₀ and λ are no expressions of the state: where they change their sign is not looked for
+  bool reads_velocity(const Expression& g) {
     const std::vector<std::string> variables = graph_.variables_of(g);
-    if (std::any_of(variables.begin(), variables.end(), is_multiplier)) return;
+    if (std::any_of(variables.begin(), variables.end(), is_multiplier)) return false;
     const auto reads = [&](const Expression& x) { return graph_.depends_on(g, x); };
-    if (std::none_of(symbols_.dq.begin(), symbols_.dq.end(), reads)) return;
-    if (std::any_of(symbols_.u.begin(), symbols_.u.end(), reads)) return;
-    if (std::find(found_.begin(), found_.end(), g) == found_.end()) found_.push_back(g);
+    return std::any_of(symbols_.dq.begin(), symbols_.dq.end(), reads) &&
+           std::none_of(symbols_.u.begin(), symbols_.u.end(), reads);
+  }
+
+  void add_surface(std::vector<Expression> functions) {
+    if (std::find(found_.begin(), found_.end(), functions) == found_.end()) found_.push_back(std::move(functions));
   }
 
   ExpressionGraph& graph_;
   const SystemSymbols& symbols_;
   std::set<std::uint32_t> seen_;
-  std::vector<Expression> found_;
+  std::vector<std::vector<Expression>> found_;
 };
 
 }  // namespace
 
 SwitchingFunctions switching_functions(const Model& model, bool of_latents) {
   const SystemSymbols symbols = model.symbols();
-  ArgumentsOfSign arguments(*model.graph, symbols);
+  JumpsOf jumps(*model.graph, symbols);
   const auto add = [&](const std::vector<Expression>& expressions) {
-    for (const Expression& e : expressions) arguments.add(e);
+    for (const Expression& e : expressions) jumps.add(e);
   };
   if (const SymbolicSystem* system = model.symbolic_system()) add(system->definition().force);
   if (!of_latents) {
     add(model.truth);
     add(model.truth_force);
-    return {arguments.found(), symbols};
+    return {jumps.found(), symbols};
   }
   for (const LatentSpec& latent : model.latents) {
     if (!latent.feature_code) {
-      for (const std::string& feature : latent.features) arguments.add(model.expression(feature));
+      for (const std::string& feature : latent.features) jumps.add(model.expression(feature));
     }
     if (latent.direction_code) continue;
     for (const std::vector<std::string>& row : latent.directions) {
-      for (const std::string& direction : row) arguments.add(model.expression(direction));
+      for (const std::string& direction : row) jumps.add(model.expression(direction));
     }
   }
-  return {arguments.found(), symbols};
+  return {jumps.found(), symbols};
 }
 
 // ---------------------------------------------------------------- motion across surfaces
+
+// Where the constraints hardly let the motion leave a surface, as a slider at its dead centre, its sides hardly act on the motion.
+constexpr double least_way_out = 1e-4;
 
 Switching::Switching(const SwitchingFunctions& functions, VectorXd parameters, StateLayout layout, double tolerance)
     : functions_(functions),
       parameters_(std::move(parameters)),
       layout_(layout),
       tolerance_(tolerance),
-      sides_(static_cast<std::size_t>(functions.size()), 1) {}
+      hold_(static_cast<std::size_t>(functions.size()), Hold::none),
+      toward_(VectorXd::Zero(functions.first().back())) {
+  for (int k = 0; k < functions_.size(); ++k) toward_[first_of(k)] = 1;
+}
 
-bool Switching::is_sliding() const { return std::find(sides_.begin(), sides_.end(), 0) != sides_.end(); }
+bool Switching::is_sliding() const { return std::find(hold_.begin(), hold_.end(), Hold::rest) != hold_.end(); }
+
+bool Switching::is_guided() const {
+  return std::any_of(hold_.begin(), hold_.end(), [](Hold hold) { return hold != Hold::none; });
+}
 
 std::vector<int> Switching::sliding() const {
   std::vector<int> surfaces;
-  for (std::size_t k = 0; k < sides_.size(); ++k) {
-    if (sides_[k] == 0) surfaces.push_back(static_cast<int>(k));
+  for (int k = 0; k < functions_.size(); ++k) {
+    if (hold(k) == Hold::rest) surfaces.push_back(k);
   }
   return surfaces;
 }
 
 Switching::Surfaces Switching::surfaces_at(const VectorXd& state) const {
-  constexpr double of_tolerance = 1e-3, of_rounding = 1e-12;
+  // A line is crossed wherever the motion meets it. How near it comes to a point is left to the tolerances.
+  constexpr double to_line = 1e-3, to_point = 10, of_rounding = 1e-12;
   Surfaces out;
   MatrixXd gradients;
   functions_.evaluate(state, parameters_, out.g, gradients);
   const auto dq = state.segment(layout_.dq(0), layout_.nq);
   out.normals = gradients.middleCols(layout_.dq(0), layout_.nq);
   out.drift = gradients.leftCols(layout_.nq) * dq + gradients.col(layout_.t());
-  out.margin =
-      of_tolerance * tolerance_ * out.normals.rowwise().lpNorm<1>() + of_rounding * (out.normals.cwiseAbs() * dq.cwiseAbs());
+  const VectorXd size = tolerance_ * out.normals.rowwise().lpNorm<1>(), rounding = out.normals.cwiseAbs() * dq.cwiseAbs();
+  out.margin.resize(functions_.size());
+  for (int k = 0; k < functions_.size(); ++k) {
+    const double of_tolerance = part(size, k).size() == 1 ? to_line : to_point;
+    out.margin[k] = of_tolerance * part(size, k).maxCoeff() + of_rounding * part(rounding, k).maxCoeff();
+  }
   return out;
 }
 
-// The state with velocities changed, the least that is needed, so that it is on the given side of every surface; where the side
-// is 0, on the surface.
-VectorXd Switching::beside(VectorXd state, const Surfaces& surfaces, const std::vector<int>& sides) const {
+// The state with velocities changed, the least that is needed, so that it is toward the given side of every surface; of those that
+// hold it, there exactly, or on the surface where `toward` is 0.
+VectorXd Switching::beside(VectorXd state, const Surfaces& surfaces, const VectorXd& toward) const {
   std::vector<int> rows;
   std::vector<double> changes;
-  for (std::size_t k = 0; k < sides.size(); ++k) {
-    const auto row = static_cast<Index>(k);
-    const double wanted = sides[k] * surfaces.margin[row], g = surfaces.g[row];
-    if (sides[k] != 0 && !(sides[k] * g < surfaces.margin[row])) continue;
-    rows.push_back(static_cast<int>(k));
-    changes.push_back(wanted - g);
+  for (int k = 0; k < functions_.size(); ++k) {
+    const auto d = part(toward, k);
+    const auto g = part(surfaces.g, k);
+    const double along = d.dot(g), margin = surfaces.margin[k];
+    if (hold(k) == Hold::none && !(along < margin)) continue;
+    const VectorXd change = hold(k) == Hold::none   ? VectorXd((margin - along) * d)
+                            : hold(k) == Hold::rest ? VectorXd(margin * d - g)
+                                                    : VectorXd(std::max(margin, along) * d - g);
+    changes.insert(changes.end(), change.begin(), change.end());
+    for (Index j = 0; j < d.size(); ++j) rows.push_back(first_of(k) + static_cast<int>(j));
   }
   if (rows.empty()) return state;
   const MatrixXd normals = surfaces.normals(rows, Eigen::all);
   if (!normals.allFinite()) return state;
   const MatrixXd T = tangent_ ? tangent_(state) : MatrixXd::Identity(layout_.nq, layout_.nq);
   MatrixXd along = normals * T;
-  // Where the constraints hardly let the motion leave a surface, as a slider at its dead centre, its sides hardly act on the motion.
-  constexpr double least = 1e-4;
   for (Index k = 0; k < along.rows(); ++k) {
-    if (along.row(k).norm() <= least * normals.row(k).norm()) along.row(k).setZero();
+    if (along.row(k).norm() <= least_way_out * normals.row(k).norm()) along.row(k).setZero();
   }
   state.segment(layout_.dq(0), layout_.nq) += T * along.completeOrthogonalDecomposition().solve(Eigen::Map<const VectorXd>(
                                                       changes.data(), static_cast<Index>(rows.size())));
@@ -187,36 +261,59 @@ VectorXd Switching::beside(VectorXd state, const Surfaces& surfaces, const std::
 
 void Switching::start(const VectorXd& state, const Acceleration& acceleration) {
   const Surfaces surfaces = surfaces_at(state);
-  for (std::size_t k = 0; k < sides_.size(); ++k) {
-    const auto row = static_cast<Index>(k);
-    sides_[k] = !(std::abs(surfaces.g[row]) > surfaces.margin[row]) ? 0 : surfaces.g[row] > 0 ? 1 : -1;
+  for (int k = 0; k < functions_.size(); ++k) {
+    const double length = part(surfaces.g, k).norm();
+    hold(k) = length > surfaces.margin[k] ? Hold::none : Hold::rest;
+    if (hold(k) == Hold::none) part(toward_, k) = part(surfaces.g, k) / length;
   }
   settle(state, acceleration);
 }
 
+bool Switching::has_crossed(const Surfaces& surfaces, int k) const {
+  return hold(k) != Hold::rest && part(toward_, k).dot(part(surfaces.g, k)) < -surfaces.margin[k];
+}
+
 bool Switching::has_crossed(const VectorXd& state) const {
   const Surfaces surfaces = surfaces_at(state);
-  for (std::size_t k = 0; k < sides_.size(); ++k) {
-    if (sides_[k] * surfaces.g[static_cast<Index>(k)] < -surfaces.margin[static_cast<Index>(k)]) return true;
+  for (int k = 0; k < functions_.size(); ++k) {
+    if (has_crossed(surfaces, k)) return true;
   }
   return false;
 }
 
 void Switching::cross(const VectorXd& state) {
+  constexpr double fast = 1e3;  // margins
   const Surfaces surfaces = surfaces_at(state);
-  for (std::size_t k = 0; k < sides_.size(); ++k) {
-    if (sides_[k] * surfaces.g[static_cast<Index>(k)] < -surfaces.margin[static_cast<Index>(k)]) sides_[k] = 0;
+  for (int k = 0; k < functions_.size(); ++k) {
+    if (hold(k) == Hold::direction && part(surfaces.g, k).norm() > fast * surfaces.margin[k]) hold(k) = Hold::none;
+    if (!has_crossed(surfaces, k)) continue;
+    const auto d = part(toward_, k);
+    const auto g = part(surfaces.g, k);
+    // it may have turned, beside a point, as it may not beside a line
+    hold(k) = (g - d.dot(g) * d).norm() <= surfaces.margin[k] ? Hold::rest : Hold::none;
   }
 }
 
-void Switching::hold(VectorXd& state) const {
-  std::vector<int> sides = sides_;
+void Switching::turn(const VectorXd& state) {
+  if (toward_.size() == functions_.size()) return;
   const Surfaces surfaces = surfaces_at(state);
-  // those that are not slid on stay where they are
-  for (std::size_t k = 0; k < sides.size(); ++k) {
-    if (sides[k] != 0) sides[k] = surfaces.g[static_cast<Index>(k)] < 0 ? -1 : 1;
+  for (int k = 0; k < functions_.size(); ++k) {
+    const double length = part(surfaces.g, k).norm();
+    if (hold(k) == Hold::none && length > surfaces.margin[k]) part(toward_, k) = part(surfaces.g, k) / length;
   }
-  state = beside(std::move(state), surfaces, sides);
+}
+
+void Switching::put(VectorXd& state) const {
+  VectorXd toward = toward_;
+  Surfaces surfaces = surfaces_at(state);
+  for (int k = 0; k < functions_.size(); ++k) {
+    const double length = part(surfaces.g, k).norm();
+    if (hold(k) == Hold::rest) part(toward, k).setZero();
+    if (hold(k) == Hold::direction) surfaces.margin[k] = 0;
+    // those that hold nothing stay where they are
+    if (hold(k) == Hold::none && length > 0) part(toward, k) = part(surfaces.g, k) / length;
+  }
+  state = beside(std::move(state), surfaces, toward);
 }
 
 bool Switching::is_let_go(const VectorXd& state, const Acceleration& acceleration) {
@@ -226,11 +323,9 @@ bool Switching::is_let_go(const VectorXd& state, const Acceleration& acceleratio
 
 VectorXd Switching::margins(const VectorXd& state, const Acceleration& acceleration) {
   static_cast<void>(this->acceleration(state, acceleration));
-  VectorXd out = VectorXd::Ones(static_cast<Index>(sides_.size()));
+  VectorXd out = VectorXd::Ones(functions_.size());
   Index next = 0;
-  for (std::size_t k = 0; k < sides_.size(); ++k) {
-    if (sides_[k] == 0) out[static_cast<Index>(k)] = 1 - std::abs(sigma_[next++]);
-  }
+  for (const int k : sliding()) out[k] = 1 - std::abs(sigma_[next++]);
   return out;
 }
 
@@ -239,35 +334,35 @@ void Switching::settle(const VectorXd& state, const Acceleration& acceleration) 
   while (has_changed && is_sliding()) {
     static_cast<void>(this->acceleration(state, acceleration));
     has_changed = false;
-    const std::vector<int> surfaces = sliding();
-    for (std::size_t k = 0; k < surfaces.size(); ++k) {
-      const double sigma = sigma_[static_cast<Index>(k)];
+    Index next = 0;
+    for (const int k : sliding()) {
+      const double sigma = sigma_[next++];
       if (std::abs(sigma) <= 1) continue;
-      sides_[static_cast<std::size_t>(surfaces[k])] = sigma > 0 ? 1 : -1;
+      hold(k) = part(toward_, k).size() == 1 ? Hold::none : Hold::direction;
+      if (sigma < 0) part(toward_, k) *= -1;
       has_changed = true;
     }
   }
 }
 
 Switching::Values Switching::evaluate(const VectorXd& state, const Surfaces& surfaces, const Function& function) const {
-  std::vector<int> sides = sides_;
-  std::replace(sides.begin(), sides.end(), 0, 1);
+  VectorXd toward = toward_;
   const std::vector<int> slid_on = sliding();
-  const auto side_of = [&](std::size_t k) -> int& { return sides[static_cast<std::size_t>(slid_on[k])]; };
-  const auto value = [&] { return function(beside(state, surfaces, sides)); };
+  const auto flip = [&](std::size_t k) { part(toward, slid_on[k]) *= -1; };
+  const auto value = [&] { return function(beside(state, surfaces, toward)); };
   const std::size_t n = slid_on.size();
   Values out;
   out.above = value();
   out.jumps.resize(out.above.size(), static_cast<Index>(n));
   for (std::size_t k = 0; k < n; ++k) {
-    side_of(k) = -1;
+    flip(k);
     out.jumps.col(static_cast<Index>(k)) = (out.above - value()) / 2;
-    side_of(k) = 1;
+    flip(k);
   }
   // more surfaces at a time than this are taken for ones whose jumps add up
   constexpr std::size_t most = 8;
   if (n < 2 || n > most) return out;
-  for (std::size_t k = 0; k < n; ++k) side_of(k) = -1;
+  for (std::size_t k = 0; k < n; ++k) flip(k);
   const VectorXd below = value();
   constexpr double rounding = 1e-9;
   const double size = out.above.norm() + out.jumps.norm();
@@ -278,11 +373,12 @@ Switching::Values Switching::evaluate(const VectorXd& state, const Surfaces& sur
   out.corners.col(n_corners - 1) = below;
   for (Index corner = 1; corner < n_corners - 1; ++corner) {
     const bool is_of_one = (corner & (corner - 1)) == 0;
+    toward = toward_;
     Index first = 0;
     for (std::size_t k = 0; k < n; ++k) {
-      const bool is_below = ((corner >> k) & 1) != 0;
-      side_of(k) = is_below ? -1 : 1;
-      if (is_below) first = static_cast<Index>(k);
+      if (((corner >> k) & 1) == 0) continue;
+      flip(k);
+      first = static_cast<Index>(k);
     }
     out.corners.col(corner) = is_of_one ? VectorXd(out.above - 2 * out.jumps.col(first)) : VectorXd(value());
   }
@@ -322,18 +418,22 @@ MatrixXd Switching::slopes(const Values& values, const VectorXd& share) {
   return out;
 }
 
-// ġ = drift + N f = 0 for s = 1 − σ of each surface that is slid on: in one step of Newton's method where jumps add up, as those of
-// most forces do. A surface that would need s outside [0, 2] cannot hold the motion: s stays at the end of the range, and the others
-// are solved anew.
-VectorXd Switching::acceleration(const VectorXd& state, const Acceleration& acceleration) {
-  const Surfaces surfaces = surfaces_at(state);
-  const Values values = evaluate(state, surfaces, acceleration);
-  std::vector<int> slid_on = sliding();
+// ġ = drift + N f = 0 along `toward` for s = 1 − σ of each surface that is slid on: in one step of Newton's method where jumps add up,
+// as those of most forces do. A surface that would need s outside [0, 2] cannot hold the motion: s stays at the end of the range, and
+// the others are solved anew.
+VectorXd Switching::acceleration_along(const Surfaces& surfaces, const Values& values) {
+  const std::vector<int> slid_on = sliding();
   const auto n = static_cast<Index>(slid_on.size());
   share_.setZero(n);
   sigma_.setOnes(n);
-  const MatrixXd normals = surfaces.normals(slid_on, Eigen::all);
-  const VectorXd drift = surfaces.drift(slid_on);
+  MatrixXd normals(n, layout_.nq);
+  VectorXd drift(n);
+  for (Index k = 0; k < n; ++k) {
+    const int surface = slid_on[static_cast<std::size_t>(k)];
+    const auto d = part(toward_, surface);
+    normals.row(k) = d.transpose() * surfaces.normals.middleRows(first_of(surface), d.size());
+    drift[k] = d.dot(part(surfaces.drift, surface));
+  }
   const MatrixXd gain = normals * values.jumps;
   const VectorXd rate = drift + normals * values.above;
   std::vector<int> open;
@@ -371,19 +471,120 @@ VectorXd Switching::acceleration(const VectorXd& state, const Acceleration& acce
       break;
     }
     const int k = open[worst];
+    constexpr double least = 1e-9;
     share_[k] = solved[static_cast<Index>(worst)] > 2 ? 2 : 0;
-    sigma_[k] = share_[k] > 0 ? -2 : 2;
+    sigma_[k] = (share_[k] > 0 ? -1 : 1) * (1 + std::max(excess, least));
     open.erase(open.begin() + static_cast<std::ptrdiff_t>(worst));
     for (const int other : open) share_[other] = 0;
   }
   return mixture(values, share_);
 }
 
+// The directions in which the constraints let a motion leave each surface that holds it, an orthonormal basis of each that begins with
+// `toward`, which is turned into them: in a plane a bead leaves rest along its wire alone.
+std::vector<MatrixXd> Switching::ways_out(const VectorXd& state, const Surfaces& surfaces) {
+  std::vector<MatrixXd> out(hold_.size());
+  const MatrixXd T = tangent_ ? tangent_(state) : MatrixXd::Identity(layout_.nq, layout_.nq);
+  for (int k = 0; k < functions_.size(); ++k) {
+    auto d = part(toward_, k);
+    if (hold(k) == Hold::none) continue;
+    MatrixXd& ways = out[static_cast<std::size_t>(k)];
+    ways = d;
+    if (d.size() == 1) continue;
+    Eigen::JacobiSVD<MatrixXd> svd(surfaces.normals.middleRows(first_of(k), d.size()) * T, Eigen::ComputeFullU);
+    svd.setThreshold(least_way_out);
+    if (svd.rank() == 0) continue;
+    const MatrixXd basis = svd.matrixU().leftCols(svd.rank());
+    VectorXd within = basis.transpose() * d;
+    if (!(within.norm() > least_way_out)) within = VectorXd::Unit(within.size(), 0);
+    ways = basis * MatrixXd(within.householderQr().householderQ());
+    d = (basis * within).normalized();
+    ways.col(0) = d;
+  }
+  return out;
+}
+
+// Of friction in a plane the direction is found as well: of a body at rest the one that leaves ġ = 0, of one that is let go or creeps
+// the one that it is accelerated in. One step for σd of Broyden's method, whose first slope, of the sides along and across, is exact
+// where jumps add up; whether any direction has changed.
+bool Switching::turn_along(const VectorXd& state, const Surfaces& surfaces, const Values& values, const VectorXd& ddq,
+                           const Acceleration& acceleration, Turn& turn) {
+  const Index n = toward_.size();
+  MatrixXd free = MatrixXd::Zero(n, n);  // a basis of what may change of σd, and columns of 0
+  VectorXd at = toward_;                 // σd
+  Index next = 0;
+  for (int k = 0; k < functions_.size(); ++k) {
+    const double sigma = hold(k) == Hold::rest ? sigma_[next++] : 2;
+    part(at, k) *= std::clamp(sigma, -1.0, 1.0);
+    if (hold(k) == Hold::none) continue;
+    const MatrixXd& ways = turn.ways[static_cast<std::size_t>(k)];
+    block(free, k).leftCols(ways.cols()) = ways;
+    if (std::abs(sigma) > 1) block(free, k).col(0).setZero();
+  }
+  if (free.isZero()) return false;
+
+  const VectorXd rate = surfaces.normals * ddq + surfaces.drift;
+  if (turn.slope.size() == 0) {
+    turn.slope.setZero(n, n);
+    next = 0;
+    for (int k = 0; k < functions_.size(); ++k) {
+      if (hold(k) == Hold::none) continue;
+      const MatrixXd& ways = turn.ways[static_cast<std::size_t>(k)];
+      MatrixXd jumps = MatrixXd::Zero(layout_.nq, ways.cols());
+      if (hold(k) == Hold::rest) jumps.col(0) = values.jumps.col(next++);
+      VectorXd toward = toward_;
+      for (Index j = 1; j < ways.cols(); ++j) {
+        part(toward, k) = ways.col(j);
+        const VectorXd above = acceleration(beside(state, surfaces, toward));
+        part(toward, k) *= -1;
+        jumps.col(j) = (above - acceleration(beside(state, surfaces, toward))) / 2;
+      }
+      columns(turn.slope, k) += surfaces.normals * jumps * ways.transpose();
+      // what it is accelerated by turns with it
+      if (block(free, k).col(0).isZero()) block(turn.slope, k).diagonal().array() -= part(at, k).dot(part(rate, k));
+    }
+  } else {
+    const VectorXd step = at - turn.at;
+    turn.slope += (rate - turn.rate - turn.slope * step) * step.transpose() / step.squaredNorm();
+  }
+  turn.at = at;
+  turn.rate = rate;
+
+  constexpr double enough = 1e-10;
+  bool has_turned = false;
+  const MatrixXd slope = free.transpose() * turn.slope * free;
+  const VectorXd step = -free * slope.completeOrthogonalDecomposition().solve(free.transpose() * rate);
+  if (!step.allFinite()) return false;
+  for (int k = 0; k < functions_.size(); ++k) {
+    if (hold(k) == Hold::none || part(toward_, k).size() == 1) continue;
+    const VectorXd wanted = part(at, k) + part(step, k), d = part(toward_, k);
+    if (!((wanted - d.dot(wanted) * d).norm() > enough)) continue;
+    part(toward_, k) = wanted.normalized();
+    has_turned = true;
+  }
+  return has_turned;
+}
+
+VectorXd Switching::acceleration(const VectorXd& state, const Acceleration& acceleration) {
+  constexpr int most_turns = 30;
+  const Surfaces surfaces = surfaces_at(state);
+  const bool may_turn = is_guided() && toward_.size() > functions_.size();
+  Turn turn;
+  if (may_turn) turn.ways = ways_out(state, surfaces);
+  for (int n = 0;; ++n) {
+    const Values values = evaluate(state, surfaces, acceleration);
+    VectorXd ddq = acceleration_along(surfaces, values);
+    if (!may_turn || n == most_turns || !turn_along(state, surfaces, values, ddq, acceleration, turn)) return ddq;
+  }
+}
+
 VectorXd Switching::acceleration_anew(const VectorXd& state, const Acceleration& acceleration) {
-  const std::vector<int> before = sides_;
+  const std::vector<Hold> hold = hold_;
+  const VectorXd toward = toward_;
   start(state, acceleration);
   VectorXd ddq = this->acceleration(state, acceleration);
-  sides_ = before;
+  hold_ = hold;
+  toward_ = toward;
   return ddq;
 }
 

@@ -16,6 +16,11 @@ namespace gp2 {
 /// dry friction holds at rest does: by f₊ − ½ (1 − σ)(f₊ − f₋), with σ ∈ [−1, 1] such that ġ = 0. On n surfaces at a time it is
 /// the mean of the accelerations of all 2ⁿ combinations of sides, weighed by Π ½ (1 ± σ_k) (Alexander & Seidman 1998, blending).
 /// Where friction changes the loads that it is proportional to, each face σ_k = ±1 is Coulomb's limit of contact k exactly.
+///
+/// A surface of several functions g, as the velocities (v, w) of friction in a plane, is a point of their space. Beside it a state is
+/// toward a direction d, |d| = 1, of which ±1 are those of one function. A motion that is held there is so by f_d and f₋d, mixed with σ,
+/// along the d that leaves nothing across it. One that is let go creeps at first, faster at right angles to its way than any step
+/// resolves: as long as it does, it moves in the direction in which it is accelerated.
 class Switching {
  public:
   using Function = std::function<Eigen::VectorXd(const Eigen::Ref<const Eigen::VectorXd>& state)>;
@@ -31,23 +36,27 @@ class Switching {
 
   [[nodiscard]] bool is_empty() const { return functions_.size() == 0; }
   [[nodiscard]] bool is_sliding() const;
+  /// Whether the motion slides on a surface, or creeps from one.
+  [[nodiscard]] bool is_guided() const;
 
   /// Takes the sides that a state is on; on a surface it slides or leaves.
   void start(const Eigen::VectorXd& state, const Acceleration& acceleration);
   /// Whether a state is past a surface, which is then no more on the side taken.
   [[nodiscard]] bool has_crossed(const Eigen::VectorXd& state) const;
-  /// Takes the surfaces that a state is past as those it slides on, until settle() decides.
+  /// Takes the surfaces that a state is past as those it slides on, until settle() decides. What is fast creeps no more.
   void cross(const Eigen::VectorXd& state);
-  /// Moves velocities by the least change onto the surfaces that the motion slides on.
-  void hold(Eigen::VectorXd& state) const;
+  /// Takes the directions beside surfaces that a state has.
+  void turn(const Eigen::VectorXd& state);
+  /// Moves velocities by the least change onto the surfaces that the motion slides on, and into the directions that it creeps in.
+  void put(Eigen::VectorXd& state) const;
   /// Whether one of the surfaces slid on does not hold the motion.
   bool is_let_go(const Eigen::VectorXd& state, const Acceleration& acceleration);
   /// How far each surface is from letting the motion go, 1 − |σ|; 1 of those not slid on.
   Eigen::VectorXd margins(const Eigen::VectorXd& state, const Acceleration& acceleration);
   /// Leaves the surfaces that do not hold the motion any more.
   void settle(const Eigen::VectorXd& state, const Acceleration& acceleration);
-  /// Of each surface: 1, −1; 0 where the motion slides on it.
-  [[nodiscard]] const std::vector<int>& sides() const { return sides_; }
+  /// Whether the motion slides on a surface.
+  [[nodiscard]] bool is_held(int surface) const { return hold(surface) == Hold::rest; }
 
   /// ddq on the sides taken, and on the surfaces that the motion slides on.
   Eigen::VectorXd acceleration(const Eigen::VectorXd& state, const Acceleration& acceleration);
@@ -57,14 +66,16 @@ class Switching {
   [[nodiscard]] Eigen::VectorXd mixed(const Eigen::VectorXd& state, const Function& function) const;
 
  private:
+  enum class Hold { none /* beside it */, rest /* on it */, direction /* beside it, along its acceleration */ };
   struct Surfaces {
-    Eigen::VectorXd g;        // (n)
-    Eigen::MatrixXd normals;  // ∂g/∂dq  (n × nq)
-    Eigen::VectorXd drift;    // ∂g/∂q dq + ∂g/∂t  (n)
-    Eigen::VectorXd margin;   // |g| of a state that is beside a surface  (n)
+    Eigen::VectorXd g;        // of all surfaces
+    Eigen::MatrixXd normals;  // ∂g/∂dq  (· × nq)
+    Eigen::VectorXd drift;    // ∂g/∂q dq + ∂g/∂t
+    Eigen::VectorXd margin;   // |g| of a state that is beside each
   };
   [[nodiscard]] Surfaces surfaces_at(const Eigen::VectorXd& state) const;
-  [[nodiscard]] Eigen::VectorXd beside(Eigen::VectorXd state, const Surfaces& surfaces, const std::vector<int>& sides) const;
+  [[nodiscard]] Eigen::VectorXd beside(Eigen::VectorXd state, const Surfaces& surfaces, const Eigen::VectorXd& toward) const;
+  [[nodiscard]] bool has_crossed(const Surfaces& surfaces, int surface) const;
   /// What a function is on the sides of the surfaces that the motion slides on.
   struct Values {
     Eigen::VectorXd above;    // f₊, beyond all of them
@@ -76,7 +87,31 @@ class Switching {
   static Eigen::VectorXd mixture(const Values& values, const Eigen::VectorXd& share);
   /// −∂f/∂(1 − σ).
   static Eigen::MatrixXd slopes(const Values& values, const Eigen::VectorXd& share);
+  Eigen::VectorXd acceleration_along(const Surfaces& surfaces, const Values& values);
+  /// A search for directions: those there are, the last σd, its ġ, and ∂ġ/∂(σd).
+  struct Turn {
+    std::vector<Eigen::MatrixXd> ways;
+    Eigen::VectorXd at, rate;
+    Eigen::MatrixXd slope;
+  };
+  bool turn_along(const Eigen::VectorXd& state, const Surfaces& surfaces, const Values& values, const Eigen::VectorXd& ddq,
+                  const Acceleration& acceleration, Turn& turn);
+  std::vector<Eigen::MatrixXd> ways_out(const Eigen::VectorXd& state, const Surfaces& surfaces);
   [[nodiscard]] std::vector<int> sliding() const;
+  [[nodiscard]] Hold hold(int surface) const { return hold_[static_cast<std::size_t>(surface)]; }
+  Hold& hold(int surface) { return hold_[static_cast<std::size_t>(surface)]; }
+  [[nodiscard]] int first_of(int surface) const { return functions_.first()[static_cast<std::size_t>(surface)]; }
+  /// What belongs to the functions of one surface.
+  template <typename Vector>
+  auto part(Vector& of_functions, int surface) const {
+    return of_functions.segment(first_of(surface), first_of(surface + 1) - first_of(surface));
+  }
+  auto columns(Eigen::MatrixXd& of_functions, int surface) const {
+    return of_functions.middleCols(first_of(surface), first_of(surface + 1) - first_of(surface));
+  }
+  auto block(Eigen::MatrixXd& of_functions, int surface) const {
+    return columns(of_functions, surface).middleRows(first_of(surface), first_of(surface + 1) - first_of(surface));
+  }
 
   SwitchingFunctions functions_;
   Eigen::VectorXd parameters_;
@@ -84,7 +119,8 @@ class Switching {
   double tolerance_;
   std::function<Eigen::MatrixXd(const Eigen::VectorXd&)> tangent_;
   std::function<void(Eigen::VectorXd&)> constraints_;
-  std::vector<int> sides_;  // of each surface: 1, −1; 0: the motion slides on it
+  std::vector<Hold> hold_;  // of each surface
+  Eigen::VectorXd toward_;  // d of each surface, one after the other
   Eigen::VectorXd share_;   // 1 − σ of each surface slid on, within [0, 2]
   Eigen::VectorXd sigma_;   // beyond [−1, 1] where the surface does not hold the motion
 };

@@ -444,6 +444,70 @@ force = ["-{3}*lambda(1)*cos(a)*sign(lambda(1)*(dx*cos(a) - dz*sin(a)))",
   expect_constraints(model, motion);
 }
 
+// On a slope friction along the floor plan presses as well: the more it pushes up the slope, the less the block weighs on it. At rest
+// the load is the weight, and friction all that a growing force is not borne by.
+TEST(ContactFriction, InAPlaneKnowsTheLoadThatItChangesItself) {
+  const double slope = 0.4, mu = 0.7;
+  for (const double direction : {0.0, 1.0, 2.5, -2.0}) {
+    SCOPED_TRACE(direction);
+    const auto model_of = [&](double smoothing) {
+      return Model::parse(fmt::format(R"toml(
+coordinates = ["x", "y", "z"]
+[let]
+v = "sqrt(dx^2 + dy^2 + {4})"
+[mechanics]
+mass  = [["1", "0", "0"], ["0", "1", "0"], ["0", "0", "1"]]
+force = ["{0}*t", "{1}*t", "-9.81"]
+[constraints]
+position = ["z - {2}*x"]
+[truth]
+force = ["-{3}*abs(lambda(1))*dx/v", "-{3}*abs(lambda(1))*dy/v", "0"]
+)toml",
+                                      std::cos(direction), std::sin(direction), slope, mu, smoothing),
+                          "slope");
+    };
+    const Model model = model_of(0);
+    const double goes = first_zero(
+        [&](double t) { return mu * g - std::hypot(slope * g - t * std::cos(direction), t * std::sin(direction)); }, 0);
+    const Trajectory motion = motion_of(model, {0, 0, 0, 0, 0, 0}, goes + 1, 41);
+    expect_friction(motion, {{goes, false}});
+    for (Index i = 0; i < motion.times.size(); ++i) {
+      if (motion.times[i] > goes) continue;
+      EXPECT_LT(motion.states.col(i).head(6).norm(), 1e-9);
+      EXPECT_NEAR(motion.records(0, i), g, 1e-8);
+    }
+    const Trajectory nearly = motion_of(model_of(1e-6), {0, 0, 0, 0, 0, 0}, goes + 1, 41);
+    EXPECT_LT((motion.states - nearly.states).cwiseAbs().maxCoeff(), 0.02);
+    expect_constraints(model, motion);
+  }
+}
+
+// a bead on a wire moves along it alone, whatever the number of coordinates that its velocity is written in
+TEST(ContactFriction, OverTheLengthOfAVelocityIsThatOfItsSignOnAWire) {
+  const auto bead = [](const std::string& direction_x, const std::string& direction_z) {
+    return Model::parse(fmt::format(R"toml(
+coordinates = ["x", "y", "z"]
+[mechanics]
+mass  = [["1", "0", "0"], ["0", "1", "0"], ["0", "0", "1"]]
+force = ["4*sin(t)", "0", "-9.81"]
+[constraints]
+position = ["z - x^2/2", "y - x/2"]
+[truth]
+force = ["-0.3*sqrt(1.25 + x^2)*lambda(1)*{0}", "-0.3*sqrt(1.25 + x^2)*lambda(1)*{0}/2", "-0.3*sqrt(1.25 + x^2)*lambda(1)*{1}"]
+)toml",
+                                    direction_x, direction_z),
+                        "bead");
+  };
+  const std::string length = "sqrt(dx^2 + dy^2 + dz^2)";
+  const Trajectory of_sign =
+      motion_of(bead("sign(dx)/sqrt(1.25 + x^2)", "x*sign(dx)/sqrt(1.25 + x^2)"), {1, 0.5, 0.5, 0, 0, 0}, 12, 121, 1e-9);
+  const Trajectory of_length = motion_of(bead("dx/" + length, "dz/" + length), {1, 0.5, 0.5, 0, 0, 0}, 12, 121, 1e-9);
+  EXPECT_LT((of_sign.states - of_length.states).cwiseAbs().maxCoeff(), 1e-6);
+  ASSERT_EQ(of_sign.sticks.size(), of_length.sticks.size());
+  EXPECT_GE(of_sign.sticks.size(), 4);
+  for (std::size_t k = 0; k < of_sign.sticks.size(); ++k) EXPECT_NEAR(of_sign.sticks[k].time, of_length.sticks[k].time, 1e-6);
+}
+
 // rides on a belt, slips as its load falls, is lifted off, lands, bounces, slips and rides again
 TEST(ContactFriction, OfABlockThatIsLiftedOffAndLandsAgain) {
   const Pressed body = {.m = 1.3, .h = 1.5, .mu = 0.6, .w = 1.3 * g, .L = 16, .rate = 1.7};

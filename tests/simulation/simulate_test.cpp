@@ -284,6 +284,101 @@ TEST(SimulateDryFriction, IsFoundInForcesTruthAndLatents) {
   EXPECT_EQ(switching_functions(model, false).size(), 2);  // dx, dx + dy
   EXPECT_EQ(switching_functions(model, true).size(), 2);   // dx, dy
   EXPECT_EQ(switching_functions(oscillator(0.1), false).size(), 0);
+  // over their length, of one velocity or several; not over one that is rounded off
+  const Model lengths =
+      bodies({"x", "y"}, {"-dx/sqrt(dx^2) - 2*dy/sqrt(4*dy*dy + (x*(dx - dy))^2/3)",
+                          "-dy*(dx^2 + 1e-6)^(-1/2) + (dx^2 + dy^2)^(-1/2)/sqrt(dx^2 + x^2) + sqrt(dx^2 + dy^2)"});
+  EXPECT_EQ(switching_functions(lengths, false).names(),
+            (std::vector<std::string>{"dx", "2*dy, x*(dx - dy)/1.7320508075688772", "dx, dy"}));
+}
+
+// ---- dry friction in a plane
+
+TEST(SimulateDryFriction, BringsABodyToRestInAPlaneAndHoldsItThere) {
+  const Model model = bodies({"x", "y"}, {"-2*dx/sqrt(dx^2 + dy^2)", "-2*dy/sqrt(dx^2 + dy^2)"});
+  const Trajectory out =
+      simulate_switching(model, state_of(model, {{"dx", 0.6}, {"dy", -0.8}}), with_tolerance(times(10, 101), 1e-9));
+  EXPECT_LT(out.steps + out.rejected_steps, 100);
+  for (int i = 0; i < out.states.cols(); ++i) {
+    const double t = std::min(out.times[i], 0.5), way = t - t * t;
+    EXPECT_NEAR(out.states(0, i), 0.6 * way, 1e-9);
+    EXPECT_NEAR(out.states(1, i), -0.8 * way, 1e-9);
+    EXPECT_NEAR(out.accelerations.col(i).norm(), out.times[i] < 0.5 ? 2 : 0, out.times[i] == 0.5 ? 2 : 1e-9);
+  }
+  ASSERT_EQ(out.sticks.size(), 1);
+  EXPECT_TRUE(out.sticks[0].sticks);
+  EXPECT_NEAR(out.sticks[0].time, 0.5, 1e-8);
+  EXPECT_EQ(switching_functions(model, false).names(), std::vector<std::string>{"dx, dy"});
+}
+
+TEST(SimulateDryFriction, LetsABodyGoInThePlaneAlongTheForce) {
+  // at rest until the force 0.6 t, 0.8 t exceeds 2, though the force at the start is along another direction
+  const Model model = bodies({"x", "y"}, {"max(0.6*t, 0.5) - 2*dx/sqrt(dx^2 + dy^2)", "0.8*t - 2*dy/sqrt(dx^2 + dy^2)"});
+  const Trajectory out = simulate_switching(model, state_of(model, {}), with_tolerance(times(4, 41), 1e-9));
+  for (int i = 0; i < out.states.cols(); ++i) {
+    const double t = std::max(out.times[i] - 2, 0.0);
+    EXPECT_NEAR(out.states(0, i), 0.6 * t * t * t / 6, 1e-7) << out.times[i];
+    EXPECT_NEAR(out.states(1, i), 0.8 * t * t * t / 6, 1e-7) << out.times[i];
+  }
+}
+
+/// A body on a slope in y, that a weight 1 pulls down it, with friction of limits `limit_x`, `limit_y` along the axes.
+Model body_on_slope(double limit_x, double limit_y, double smoothing = 0) {
+  const std::string length = fmt::format("sqrt({}*dx^2 + dy^2*{} + {})", limit_x * limit_x, limit_y * limit_y, smoothing);
+  return bodies({"x", "y"},
+                {fmt::format("-{}*dx/{}", limit_x * limit_x, length), fmt::format("-1 - {}*dy/{}", limit_y * limit_y, length)});
+}
+
+TEST(SimulateDryFriction, TurnsABodyOnASlopeDownwardsUntilItRests) {
+  for (const auto& [limit_x, limit_y] : {std::pair(1.3, 1.3), {2.0, 1.5}, {0.5, 4.0}, {3.0, 1.4}}) {
+    for (const double angle : {0.7, 1.57, -1.5707}) {
+      SCOPED_TRACE(fmt::format("limits {}, {}, angle {}", limit_x, limit_y, angle));
+      const Model rough = body_on_slope(limit_x, limit_y), nearly = body_on_slope(limit_x, limit_y, 1e-6);
+      const VectorXd start = state_of(rough, {{"dx", std::cos(angle)}, {"dy", std::sin(angle)}});
+      const SimulateOptions options = with_tolerance(times(5, 51), 1e-9);
+      const Trajectory out = simulate_switching(rough, start, options);
+      EXPECT_LT(out.steps + out.rejected_steps, 2000);
+      EXPECT_LT(out.states.col(50).segment(2, 2).norm(), 1e-12);
+      EXPECT_LT(out.accelerations.col(50).norm(), 1e-9);
+      // with friction rounded off at 1e-3, the body creeps at some such velocity where it should rest
+      const Trajectory creeping = simulate_model(nearly, start, with_tolerance(options.times, 1e-6));
+      EXPECT_LT((out.states - creeping.states).cwiseAbs().maxCoeff(), 10 * 5 * 1e-3);
+      EXPECT_LT(out.steps, creeping.steps);
+    }
+  }
+}
+
+TEST(SimulateDryFriction, LetsABodyGoWhereTheEllipseOfItsLimitsEnds) {
+  // limits 2 along x and 1 along y: a force (0.8 t, 0.3 t) is held until (0.4 t)² + (0.3 t)² = 1
+  const Model model = bodies({"x", "y"}, {"0.8*t - 4*dx/sqrt(4*dx^2 + dy^2)", "0.3*t - dy/sqrt(4*dx^2 + dy^2)"});
+  const Trajectory out = simulate_switching(model, state_of(model, {}), with_tolerance(times(4, 41), 1e-9));
+  ASSERT_EQ(out.sticks.size(), 1);
+  EXPECT_NEAR(out.sticks[0].time, 2, 1e-7);
+}
+
+TEST(SimulateDryFriction, InAPlaneOfTwoContactsHoldsEachByItsOwnLimit) {
+  // a body on a body on the ground, both free in the plane: the lower one stops first
+  const std::string upper = "sqrt((dx - du)^2 + (dy - dv)^2)", lower = "sqrt(du^2 + dv^2)";
+  const auto model_of = [&](const std::string& more) {
+    const auto between = [&](const std::string& d) {
+      return fmt::format("({})/{}", d, more.empty() ? upper : upper.substr(0, upper.size() - 1) + more);
+    };
+    const auto ground = [&](const std::string& d) {
+      return fmt::format("{}/{}", d, more.empty() ? lower : lower.substr(0, lower.size() - 1) + more);
+    };
+    return bodies({"x", "y", "u", "v"},
+                  {"-" + between("dx - du"), "-" + between("dy - dv"), between("dx - du") + " - 0.5*" + ground("du"),
+                   between("dy - dv") + " - 0.5*" + ground("dv")});
+  };
+  const Model rough = model_of(""), nearly = model_of(" + 1e-8)");
+  const VectorXd start = state_of(rough, {{"dx", 2}, {"dy", 1}, {"dv", -1}});
+  const SimulateOptions options = with_tolerance(times(10, 101), 1e-9);
+  const Trajectory out = simulate_switching(rough, start, options), creeping = simulate_model(nearly, start, options);
+  EXPECT_LT(out.steps + out.rejected_steps, 1000);
+  EXPECT_LT((out.states - creeping.states).cwiseAbs().maxCoeff(), 10 * 10 * 1e-4);
+  EXPECT_LT(out.states.col(100).segment(4, 4).norm(), 1e-12);
+  // together first, and at rest together then
+  ASSERT_EQ(out.sticks.size(), 2);
 }
 
 TEST(SimulateUnfinished, SaysWhatWasReached) {
