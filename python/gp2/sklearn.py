@@ -6,6 +6,8 @@
 
 from __future__ import annotations
 
+import os
+import re
 from typing import Any
 
 import numpy as np
@@ -107,21 +109,23 @@ class GP2Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         names = self.system_.acceleration_names
         accelerations = np.full((len(rows), len(names)), np.nan)
         accelerations[:, self._rows_of_view()] = rows
-        self.posterior_ = gp2.fit(
-            self.system_,
-            (self._states(X), accelerations),
-            observe=self.outputs_ if len(self.outputs_) < len(names) else [],
-            mean=self.mean,
-            prior=self.prior,
-            baseline=self.baseline,
-            noise_std=self.noise_std,
-            estimate=self.estimate,
-            discrepancy=self.discrepancy,
-            restarts=self.n_restarts,
-            max_iterations=self.max_iterations,
-            threads=self.n_threads,
-            seed=_seed(self.random_state),
-        )
+        options = {
+            "observe": self.outputs_ if len(self.outputs_) < len(names) else [],
+            "mean": self.mean,
+            "prior": self.prior,
+            "baseline": self.baseline,
+            "noise_std": self.noise_std,
+            "estimate": self.estimate,
+            "discrepancy": self.discrepancy,
+            "restarts": self.n_restarts,
+            "max_iterations": self.max_iterations,
+            "threads": self.n_threads,
+            "seed": _seed(self.random_state),
+        }
+        try:
+            self.posterior_ = gp2.fit(self.system_, (self._states(X), accelerations), **options)
+        except (gp2.InputError, TypeError) as error:
+            raise type(error)(re.sub("^(restarts|threads):", r"n_\1:", str(error))) from None
         self.log_marginal_likelihood_value_ = -self.posterior_.negative_log_likelihood
         return self
 
@@ -157,7 +161,11 @@ class GP2Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         return super().score(X, y if self.system is None else _columns_by_name(y, self.outputs_), sample_weight)
 
     def _given_system(self) -> gp2.System | None:
-        return self.system if self.system is None or isinstance(self.system, gp2.System) else gp2.System.load(self.system)
+        if self.system is None or isinstance(self.system, gp2.System):
+            return self.system
+        if not isinstance(self.system, (str, os.PathLike)):
+            raise TypeError(f"system: expected a gp2.System, the path of a model file or None, got {self.system!r}")
+        return gp2.System.load(self.system)
 
     def _outputs(self, system: gp2.System, y) -> list[str]:
         names = system.acceleration_names

@@ -1,6 +1,13 @@
 // The extension module gp2._gp2. The logic is the library's; here arrays, names and exceptions change sides.
 
+#include <algorithm>
+#include <array>
+#include <string>
+#include <utility>
+
+#include <fmt/format.h>
 #include <pybind11/pybind11.h>
+#include <pybind11/stl.h>
 
 #include "bindings.hpp"
 #include "gp2/base/blas.hpp"
@@ -14,12 +21,15 @@ namespace py = pybind11;
 
 PyCFunctionWithKeywords dispatch = nullptr;  // pybind's own way into all of its functions
 
-// Of arguments that fit no signature pybind tells the signatures, from which a keyword that none of them has is found. One that ends in
-// **kwargs has others too: there a keyword that is near a parameter is taken for it.
-void refuse_unknown_keyword(const std::string& text, const py::dict& keywords) {
+// Of arguments that fit no signature pybind tells the signatures; "" where it is not that.
+std::string signatures_in(const std::string& text) {
   const std::size_t first = text.find(" 1. "), end = text.find("\nInvoked with:");
-  if (text.find("The following argument types are supported:") == std::string::npos || first >= end) return;
-  const std::string signatures = text.substr(first, end - first);
+  if (text.find("The following argument types are supported:") == std::string::npos || first >= end) return "";
+  return text.substr(first, end - first);
+}
+
+// A keyword that no signature has. One that ends in **kwargs has others too: there a keyword that is near a parameter is taken for it.
+void refuse_unknown_keyword(const std::string& text, const std::string& signatures, const py::dict& keywords) {
   const bool has_others = signatures.find("**") != std::string::npos;
   const py::module_ re = py::module_::import("re");
   const py::list known = re.attr("findall")(R"((\w+): )", signatures);
@@ -27,17 +37,65 @@ void refuse_unknown_keyword(const std::string& text, const py::dict& keywords) {
   const std::string name = of_class.is_none() ? text.substr(0, text.find('(')) : of_class.attr("group")(1).cast<std::string>();
   for (const auto& [keyword, value] : keywords) {
     if (known.contains(keyword)) continue;
-    if (has_others && gp2::python::nearest(keyword.cast<std::string>(), known).empty()) continue;
-    gp2::python::refuse_keyword(name, keyword.cast<std::string>(), known);
+    const auto given = keyword.cast<std::string>();
+    if (has_others && (gp2::python::is_keyword(given) || gp2::python::nearest(given, known).empty())) continue;
+    gp2::python::refuse_keyword(name, given, known);
   }
 }
 
-PyObject* dispatch_with_known_keywords(PyObject* self, PyObject* arguments, PyObject* keywords) {
+/// What a parameter of a type takes, and whether a value is one; nothing of types whose values tell of themselves.
+struct Takes {
+  const char* type;
+  const char* words;
+  bool (*fits)(py::handle value);
+};
+bool is_index(py::handle value) { return PyIndex_Check(value.ptr()) != 0; }
+bool is_text(py::handle value) { return py::isinstance<py::str>(value); }
+bool is_list_of_text(py::handle value) {
+  if (is_text(value) || !py::isinstance<py::sequence>(value)) return false;
+  const auto items = py::reinterpret_borrow<py::sequence>(value);
+  return std::all_of(items.begin(), items.end(), [](py::handle item) { return is_text(item); });
+}
+constexpr std::array takes = {
+    Takes{"int", "a whole number", &is_index},
+    Takes{"float", "a number", [](py::handle value) { return PyNumber_Check(value.ptr()) != 0; }},
+    Takes{"bool", "True or False", [](py::handle value) { return py::isinstance<py::bool_>(value) || is_index(value); }},
+    Takes{"str", "a str", &is_text},
+    Takes{"List[str]", "a list of names", &is_list_of_text},
+};
+
+// A value of another type than its parameter's, where there is one signature.
+void refuse_wrong_type(const std::string& text, const std::string& signatures, const py::tuple& arguments,
+                       const py::dict& keywords) {
+  if (signatures.find(" 2. ") != std::string::npos) return;
+  const py::object re = py::module_::import("re");
+  std::size_t position = text.find("__init__()") == 0 ? 1 : 0;  // whose signature does not have the object
+  for (const py::handle parameter : re.attr("findall")(R"((\w+): ([\w.]+(?:\[\w+\])?))", signatures)) {
+    const auto [name, type] = parameter.cast<std::pair<std::string, std::string>>();
+    py::object value;
+    if (keywords.contains(name)) {
+      value = keywords[name.c_str()];
+    } else if (position < arguments.size()) {
+      value = arguments[position];
+    }
+    ++position;
+    const auto* const known = std::find_if(takes.begin(), takes.end(), [&](const Takes& one) { return one.type == type; });
+    if (!value || known == takes.end() || known->fits(value)) continue;
+    throw py::type_error(fmt::format("{}: expected {}, got {}", name, known->words, py::repr(value).cast<std::string>()));
+  }
+}
+
+PyObject* dispatch_or_say_why(PyObject* self, PyObject* arguments, PyObject* keywords) {
   PyObject* const result = dispatch(self, arguments, keywords);
-  if (result != nullptr || keywords == nullptr || PyErr_ExceptionMatches(PyExc_TypeError) == 0) return result;
+  if (result != nullptr || PyErr_ExceptionMatches(PyExc_TypeError) == 0) return result;
   py::error_already_set error;
   try {
-    refuse_unknown_keyword(py::str(error.value()), py::reinterpret_borrow<py::dict>(keywords));
+    const std::string text = py::str(error.value()), signatures = signatures_in(text);
+    const auto given = keywords == nullptr ? py::dict() : py::reinterpret_borrow<py::dict>(keywords);
+    if (!signatures.empty()) {
+      refuse_unknown_keyword(text, signatures, given);
+      refuse_wrong_type(text, signatures, py::reinterpret_borrow<py::tuple>(arguments), given);
+    }
     error.restore();
   } catch (const py::builtin_exception& refusal) {
     refusal.set_error();
@@ -55,16 +113,16 @@ PyCFunctionWithKeywords dispatch_of(const PyMethodDef& method) {
   return reinterpret_cast<PyCFunctionWithKeywords>(reinterpret_cast<void (*)()>(method.ml_meth));
 }
 
-// Of all functions of a module and its classes.
-void refuse_unknown_keywords(const py::handle& scope) {
+// For all functions of a module and its classes.
+void say_why_arguments_do_not_fit(const py::handle& scope) {
   const py::dict members(scope.attr("__dict__"));
   for (const auto& [name, member] : members) {
-    if (py::isinstance<py::type>(member)) refuse_unknown_keywords(member);
+    if (py::isinstance<py::type>(member)) say_why_arguments_do_not_fit(member);
     const py::object held = py::getattr(member, "__func__", member);  // of a static method
     const py::handle function = py::detail::get_function(held);
     if (PyCFunction_Check(function.ptr()) == 0) continue;
     PyMethodDef& method = *reinterpret_cast<PyCFunctionObject*>(function.ptr())->m_ml;
-    if (dispatch_of(method) == dispatch) method.ml_meth = as_plain(&dispatch_with_known_keywords);
+    if (dispatch_of(method) == dispatch) method.ml_meth = as_plain(&dispatch_or_say_why);
   }
 }
 
@@ -107,5 +165,5 @@ PYBIND11_MODULE(_gp2, module) {
   module.attr("__version__") = gp2::version();
   const py::object fit = module.attr("fit");
   dispatch = dispatch_of(*reinterpret_cast<PyCFunctionObject*>(fit.ptr())->m_ml);
-  refuse_unknown_keywords(module);
+  say_why_arguments_do_not_fit(module);
 }

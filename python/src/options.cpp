@@ -227,6 +227,11 @@ std::string value_text(const Option& option, const std::string& value) {
 
 const std::string& keyword_of(const Option& option) { return option.keyword.empty() ? option.name : option.keyword; }
 
+bool is_keyword(const std::string& name) {
+  const std::vector<Option>& all = every_option();
+  return std::any_of(all.begin(), all.end(), [&](const Option& one) { return keyword_of(one) == name; });
+}
+
 std::string nearest(const std::string& name, const py::list& known) {
   const py::list near = py::module_::import("difflib").attr("get_close_matches")(name, known, 1);
   return near.empty() ? "" : near[0].cast<std::string>();

@@ -18,6 +18,9 @@ T take(py::dict& keywords, const char* name, T otherwise) {
   return keywords.attr("pop")(name).cast<T>();
 }
 
+/// Whether some command has an option of this name in Python.
+bool is_keyword(const std::string& name);
+
 /// The one of `known` that is nearest to a name; "" where none is near.
 std::string nearest(const std::string& name, const py::list& known);
 

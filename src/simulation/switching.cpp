@@ -104,8 +104,21 @@ class JumpsOf {
 
   // the terms of a sum of squares, each alone 0 where the sum is
   void add_length(const Expression& sum) {
-    std::vector<Expression> functions;
-    if (!add_squares(sum, functions)) return;
+    std::vector<Expression> functions, open = {sum};
+    std::set<std::uint32_t> seen;
+    while (!open.empty()) {
+      const Expression e = open.back();
+      open.pop_back();
+      if (!seen.insert(e.id()).second) continue;
+      if (e.operation() == Operation::add) {
+        open.push_back(e.right());
+        open.push_back(e.left());
+      } else if (const std::optional<Expression> root = root_of(e)) {
+        functions.push_back(*root);
+      } else {
+        return;
+      }
+    }
     if (functions.size() == 1) {
       add_factors(functions.front());
     } else {
@@ -113,16 +126,9 @@ class JumpsOf {
     }
   }
 
-  bool add_squares(const Expression& e, std::vector<Expression>& roots) {
-    if (e.operation() == Operation::add) return add_squares(e.left(), roots) && add_squares(e.right(), roots);
-    const std::optional<Expression> root = root_of(e);
-    if (!root || !reads_velocity(*root)) return false;
-    roots.push_back(*root);
-    return true;
-  }
-
-  // of a square, or of one times what reads no velocity
+  // of the square of what reads a velocity, or of one times what reads none
   std::optional<Expression> root_of(const Expression& e) {
+    if (!reads_velocity(e)) return std::nullopt;
     if (e.operation() == Operation::power && e.right().is_constant(2)) return e.left();
     if (e.operation() == Operation::divide && !reads_velocity(e.right())) {
       const std::optional<Expression> root = root_of(e.left());

@@ -1,8 +1,13 @@
 #include <algorithm>
 #include <charconv>
 #include <cmath>
+#include <cstdint>
+#include <functional>
 #include <numbers>
+#include <optional>
+#include <set>
 #include <utility>
+#include <vector>
 
 #include <fmt/format.h>
 
@@ -32,6 +37,45 @@ std::string joined(const Names& names, std::string_view separator) {
   std::string text;
   for (const std::string_view name : names) text.append(text.empty() ? "" : separator).append(name);
   return text;
+}
+
+// what a product, and with `of_sum` a sum of products, is made of: all operands on the way down to its factors
+void parts_of(Expression e, bool of_sum, const std::function<void(Expression)>& visit) {
+  std::set<std::uint32_t> seen;
+  std::vector<Expression> open = {e};
+  while (!open.empty()) {
+    const Expression part = open.back();
+    open.pop_back();
+    if (!seen.insert(part.id()).second) continue;
+    visit(part);
+    const Operation operation = part.operation();
+    const bool has_two = operation == Operation::multiply || (of_sum && operation == Operation::add);
+    if (has_two || operation == Operation::divide || operation == Operation::negate) open.push_back(part.left());
+    if (has_two) open.push_back(part.right());
+  }
+}
+
+// whether a factor of a product is a component g of a length |g| or √(g² + …)
+bool has_component(Expression product, Expression length) {
+  std::set<std::uint32_t> components;
+  if (length.operation() == Operation::abs) components.insert(length.left().id());
+  if (length.operation() == Operation::sqrt) {
+    parts_of(length.left(), /*of_sum=*/true, [&](Expression e) {
+      const bool is_square = (e.operation() == Operation::power && e.right().is_constant(2)) ||
+                             (e.operation() == Operation::multiply && e.left() == e.right());
+      if (is_square) components.insert(e.left().id());
+    });
+  }
+  if (components.empty()) return false;
+  bool found = false;
+  parts_of(product, /*of_sum=*/false, [&](Expression e) { found = found || components.count(e.id()) > 0; });
+  return found;
+}
+
+// A component over its length jumps where both are 0, and is 0 there as sign(0) is, the mean of all directions.
+Expression quotient(Expression a, Expression b) {
+  if (!has_component(a, b)) return a / b;
+  return a.graph().apply(Operation::multiply_or_zero, a, a.graph().constant(1) / b);
 }
 
 /// Recursive descent, one function per rule of the grammar:
@@ -125,7 +169,7 @@ class Parser {
       if (text_.substr(position_, 2) == "**") fail(position_, "found '**'; a power is written ^");
       const char sign = take();
       const Expression right = factor();
-      result = sign == '*' ? result * right : result / right;
+      result = sign == '*' ? result * right : quotient(result, right);
     }
     return result;
   }

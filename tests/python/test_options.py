@@ -139,3 +139,22 @@ def test_every_function_names_a_misspelt_keyword_and_the_nearest(owner, name, ke
     arguments = [object()] if isinstance(owner, type) and not isinstance(vars(owner)[name], staticmethod) and name != "__init__" else []
     with pytest.raises(TypeError, match=rf"{called}\(\) got an unexpected keyword argument '{misspelt}'; did you mean '{keyword}'"):
         function(*arguments, **{misspelt: 1})
+
+
+EXPECTED = {"int": "a whole number", "float": "a number", "bool": "True or False", "str": "a str", "List[str]": "a list of names"}
+
+
+@pytest.mark.parametrize(("owner", "name", "keyword"), functions_with_keywords())
+def test_every_function_names_a_value_of_the_wrong_type(owner, name, keyword):
+    function = owner if name == "__init__" else getattr(owner, name)
+    documentation = getattr(owner, name).__doc__
+    if "Overloaded function." in documentation:
+        return
+    for parameter, kind in re.findall(r"(\w+): ([\w.]+(?:\[\w+\])?)", documentation.splitlines()[0].split(" -> ")[0]):
+        if kind not in EXPECTED:
+            continue
+        for wrong in [object(), "ddq1"][: 2 if kind == "List[str]" else 1]:
+            with pytest.raises(TypeError) as error:
+                function(**{parameter: wrong})
+            if "**kwargs" not in str(error.value):  # options are read once the first arguments fit
+                assert str(error.value) == f"{parameter}: expected {EXPECTED[kind]}, got {wrong!r}"

@@ -257,5 +257,11 @@ def test_faults_of_the_user_are_told(data):
         GP2Regressor(WIRE).fit(pd.DataFrame({"x": X[:, 0], "height": X[:, 1]}), y)
     with pytest.raises(gp2.InputError, match="mean: expected one of 'zero', 'force', got 'none'"):
         GP2Regressor(WIRE, mean="none").fit(X, y)
+    with pytest.raises(TypeError, match=r"^system: expected a gp2.System, the path of a model file or None, got 3$"):
+        GP2Regressor(3).fit(X, y)
+    with pytest.raises(TypeError, match=r"^n_restarts: expected a whole number, got 'many'$"):
+        GP2Regressor(WIRE, n_restarts="many").fit(X, y)
+    with pytest.raises(gp2.InputError, match=r"^n_restarts: "):
+        GP2Regressor(WIRE, n_restarts=-1).fit(X, y)
     with pytest.raises(gp2.InputError, match="missing column 'dz'"):
         GP2Regressor(WIRE).fit(pd.DataFrame({"x": X[:, 0], "dx": X[:, 2]}), y)

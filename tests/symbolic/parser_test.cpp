@@ -271,5 +271,28 @@ TEST_F(ParserTest, CIsValidAndNeverDividesIntegers) {
   EXPECT_EQ(to_string(guarded), "q1*q2");
 }
 
+TEST_F(ParserTest, AComponentOverItsLengthIsZeroAtZero) {
+  for (const std::string text :
+       {"q1/abs(q1)", "-q2*q1/sqrt(q1^2 + q2^2)", "3*(q1/q2*dq1)/sqrt(q1*q1 + 4*dq1^2)", "q1*dq1/sqrt(q2^2*q1^2/3 + dq1^2)"}) {
+    SCOPED_TRACE(text);
+    const auto value = [&](double q1, double q2, double dq1) {
+      return test::evaluate(read(text), {{"q1", q1}, {"q2", q2}, {"dq1", dq1}});
+    };
+    EXPECT_EQ(value(0, 0.5, 0), 0);
+    EXPECT_EQ(value(0, 2, 0), 0);
+    EXPECT_FALSE(std::isnan(value(1e-200, 1, 1e-200)));
+  }
+  EXPECT_DOUBLE_EQ(test::evaluate(read("-2*q2*q1/sqrt(q1^2 + q2^2)"), {{"q1", 3}, {"q2", 4}}), -24.0 / 5);
+  // parts that are shared are looked at once
+  Expression shared = graph.variable("q1");
+  for (int k = 0; k < 100; ++k) shared = shared * shared + shared;
+  const auto resolve = [&](std::string_view name) { return std::optional(name == "s" ? shared : graph.variable("q1")); };
+  EXPECT_EQ(parse_expression("s*q1/sqrt(s + q1^2)", graph, resolve, {}).operation(), Operation::multiply_or_zero);
+  // other quotients have no value there
+  for (const std::string text : {"sin(q1)/abs(q1)", "q1/sqrt(q1)", "(q1 + q2)/abs(q1)"}) {
+    EXPECT_TRUE(std::isnan(test::evaluate(read(text), {{"q1", 0}, {"q2", 0}}))) << text;
+  }
+}
+
 }  // namespace
 }  // namespace gp2
