@@ -71,7 +71,8 @@ void refuse_wrong_type(const std::string& text, const std::string& signatures, c
   const py::object re = py::module_::import("re");
   std::size_t position = text.find("__init__()") == 0 ? 1 : 0;  // whose signature does not have the object
   for (const py::handle parameter : re.attr("findall")(R"((\w+): ([\w.]+(?:\[\w+\])?))", signatures)) {
-    const auto [name, type] = parameter.cast<std::pair<std::string, std::string>>();
+    const auto pair = parameter.cast<std::pair<std::string, std::string>>();
+    const std::string &name = pair.first, &type = pair.second;
     py::object value;
     if (keywords.contains(name)) {
       value = keywords[name.c_str()];
