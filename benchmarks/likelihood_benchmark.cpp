@@ -153,7 +153,10 @@ BENCHMARK(known_parameters)->ArgsProduct({sizes})->Unit(benchmark::kMillisecond)
 BENCHMARK(known_parameters_two_threads)->Arg(1000)->Arg(3000)->UseRealTime()->Unit(benchmark::kMillisecond);
 BENCHMARK(estimated_noise)->ArgsProduct({sizes})->Unit(benchmark::kMillisecond);
 BENCHMARK(estimated_parameters)->ArgsProduct({sizes})->Unit(benchmark::kMillisecond);
-BENCHMARK(inducing_points)->ArgsProduct({{256, 10'000, 100'000, 1'000'000}, {1, 2}})->UseRealTime()->Unit(benchmark::kMillisecond);
+BENCHMARK(inducing_points)
+    ->ArgsProduct({{256, 10'000, 100'000, 1'000'000}, {1, 2}})
+    ->UseRealTime()
+    ->Unit(benchmark::kMillisecond);
 BENCHMARK(assembly)->Args({1000, 1})->Args({1000, 2})->Args({3000, 1})->Args({3000, 2})->UseRealTime()->Unit(
     benchmark::kMillisecond);
 

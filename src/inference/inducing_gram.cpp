@@ -53,6 +53,86 @@ void add_gradient_of_variance(const KernelColumns& kernel, Index d, double weigh
   sums.row(0) += sum;
 }
 
+/// Sums over rows of which the gradient consists.
+struct GradientSums {
+  std::vector<MatrixXd> kernel;   // (lanes × parameters)
+  std::vector<VectorXd> columns;  // (functions)
+  double misfit = 0;
+
+  void add(const GradientSums& other) {
+    misfit += other.misfit;
+    for (std::size_t a = 0; a < kernel.size(); ++a) {
+      kernel[a] += other.kernel[a];
+      columns[a] += other.columns[a];
+    }
+  }
+  void for_each(const std::function<void(double*, Index)>& take) {
+    take(&misfit, 1);
+    for (MatrixXd& one : kernel) take(one.data(), one.size());
+    for (VectorXd& one : columns) take(one.data(), one.size());
+  }
+};
+
+/// What the bound's derivatives by covariances of one block of rows with the variables are made of, for each function.
+struct BlockDerivatives {
+  MatrixXd alpha;              // the misfit  (n × components)
+  std::vector<MatrixXd> U;     // −L_aᵀ ∂NLL/∂k(Z, φ_i)  (variables × n)
+  std::vector<MatrixXd> V;     // (n × components)
+  std::vector<VectorXd> mean;  // (n)
+};
+
+/// @param mean       B⁻¹c
+/// @param explained  I − B⁻¹
+BlockDerivatives derivatives(const InducingLatents& latents, const InducingBlock& block, const VectorXd& mean,
+                             const MatrixXd& explained) {
+  const std::vector<InducingLatents::Function>& functions = latents.functions();
+  const Index n = block.n();
+  BlockDerivatives out;
+  out.alpha = block.misfit(mean);
+  const Index n_components = out.alpha.cols();
+  for (std::size_t f = 0; f < functions.size(); ++f) {
+    const MatrixXd& w = block.w(f);
+    const auto mean_of_f = mean.segment(functions[f].first, w.rows());
+    out.mean.emplace_back(w.transpose() * mean_of_f);
+    ArrayXd beta = ArrayXd::Zero(n);
+    out.V.emplace_back(n, n_components);
+    for (Index c = 0; c < n_components; ++c) {
+      const ArrayXd alpha_c = out.alpha.col(c).array(), weight = block.weight(f, c).array();
+      beta += weight * alpha_c;
+      out.V[f].col(c) = weight * block.variance(f).array() - alpha_c * out.mean[f].array();
+    }
+    out.U.emplace_back(mean_of_f * beta.matrix().transpose());
+  }
+  MatrixXd product;
+  for (std::size_t g = 0; g < functions.size(); ++g) {
+    const MatrixXd& w = block.w(g);
+    product.setZero(latents.size(), n);
+    lapack::add_product(explained.middleCols(functions[g].first, w.rows()), false, w, false, product);
+    for (std::size_t f = 0; f < functions.size(); ++f) {
+      const MatrixXd& v = block.w(f);
+      const auto of_f = product.middleRows(functions[f].first, v.rows());
+      out.U[f] += of_f * block.weight_product(f, g).matrix().asDiagonal();
+      const VectorXd explained_by_g = of_f.cwiseProduct(v).colwise().sum();
+      for (Index c = 0; c < n_components; ++c) out.V[f].col(c) -= block.weight(g, c).cwiseProduct(explained_by_g);
+    }
+  }
+  return out;
+}
+
+/// V from the units of the enlarged noise to those without it.
+void without_enlarged_noise(const InducingLatents& latents, const InducingBlock& block, BlockDerivatives& of) {
+  const Index n_components = of.alpha.cols();
+  ArrayXd of_noise = block.rank().array() - (of.alpha.array() * block.y().array()).rowwise().sum();
+  for (std::size_t f = 0; f < of.V.size(); ++f) {
+    for (Index c = 0; c < n_components; ++c) of_noise -= of.V[f].col(c).array() * block.weight(f, c).array();
+  }
+  for (std::size_t f = 0; f < of.V.size(); ++f) {
+    of.V[f].array().colwise() /= block.noise().array();
+    if (!latents.latent_of(latents.functions()[f]).is_local) continue;
+    for (Index c = 0; c < n_components; ++c) of.V[f].col(c).array() += block.of_noise(f, c, of_noise);
+  }
+}
+
 }  // namespace
 
 bool InducingGram::factorise(const RowBlocks& rows) {
@@ -97,24 +177,6 @@ std::optional<GramValue> InducingGram::differentiate(const RowBlocks& rows, cons
   MatrixXd explained = -MatrixXd(P.selfadjointView<Eigen::Lower>());  // I − B⁻¹
   explained.diagonal().array() += 1;
 
-  struct GradientSums {
-    std::vector<MatrixXd> kernel;   // (lanes × parameters)
-    std::vector<VectorXd> columns;  // (functions)
-    double misfit = 0;
-
-    void add(const GradientSums& other) {
-      misfit += other.misfit;
-      for (std::size_t a = 0; a < kernel.size(); ++a) {
-        kernel[a] += other.kernel[a];
-        columns[a] += other.columns[a];
-      }
-    }
-    void for_each(const std::function<void(double*, Index)>& take) {
-      take(&misfit, 1);
-      for (MatrixXd& one : kernel) take(one.data(), one.size());
-      for (VectorXd& one : columns) take(one.data(), one.size());
-    }
-  };
   GradientSums zero;
   for (const InducingLatents::OfLatent& latent : latents_.latents()) {
     zero.kernel.emplace_back(MatrixXd::Zero(simd::lanes<double>, latent.kernel.values().size()));
@@ -124,49 +186,11 @@ std::optional<GramValue> InducingGram::differentiate(const RowBlocks& rows, cons
       latents_, rows, true, workers_, stop_, zero,
       [&](GradientSums& sum, int piece, const RowBlock& row_block, const InducingBlock& block) {
         const Index n = block.n();
-        const MatrixXd alpha = block.misfit(mean_);
-        const Index n_components = alpha.cols();
-        sum.misfit += alpha.squaredNorm();
-        // per function −L_aᵀ ∂NLL/∂k(Z, φ_i), and V by component
-        std::vector<MatrixXd> U, V;
-        std::vector<VectorXd> mean;
-        for (const InducingLatents::Function& f : functions) {
-          const std::size_t at = U.size();
-          const MatrixXd& w = block.w(at);
-          mean.emplace_back(w.transpose() * mean_.segment(f.first, w.rows()));
-          ArrayXd beta = ArrayXd::Zero(n);
-          V.emplace_back(n, n_components);
-          for (Index c = 0; c < n_components; ++c) {
-            const ArrayXd alpha_c = alpha.col(c).array(), weight = block.weight(at, c).array();
-            beta += weight * alpha_c;
-            V.back().col(c) = weight * block.variance(at).array() - alpha_c * mean.back().array();
-          }
-          U.emplace_back(mean_.segment(f.first, w.rows()) * beta.matrix().transpose());
-        }
-        MatrixXd product;
-        for (std::size_t g = 0; g < functions.size(); ++g) {
-          const MatrixXd& w = block.w(g);
-          product.setZero(latents_.size(), n);
-          lapack::add_product(explained.middleCols(functions[g].first, w.rows()), false, w, false, product);
-          for (std::size_t f = 0; f < functions.size(); ++f) {
-            const MatrixXd& v = block.w(f);
-            const auto of_f = product.middleRows(functions[f].first, v.rows());
-            U[f] += of_f * block.weight_product(f, g).matrix().asDiagonal();
-            const VectorXd explained_by_g = of_f.cwiseProduct(v).colwise().sum();
-            for (Index c = 0; c < n_components; ++c) V[f].col(c) -= block.weight(g, c).cwiseProduct(explained_by_g);
-          }
-        }
-        // from the units of the enlarged noise to those without it
-        ArrayXd of_noise = block.rank().array() - (alpha.array() * block.y().array()).rowwise().sum();
-        for (std::size_t f = 0; f < functions.size(); ++f) {
-          for (Index c = 0; c < n_components; ++c) of_noise -= V[f].col(c).array() * block.weight(f, c).array();
-        }
-        for (std::size_t f = 0; f < functions.size(); ++f) {
-          V[f].array().colwise() /= block.noise().array();
-          if (!latents_.latent_of(functions[f]).is_local) continue;
-          for (Index c = 0; c < n_components; ++c) V[f].col(c).array() += block.of_noise(f, c, of_noise);
-        }
-        const MatrixXd alpha_before = alpha.array().colwise() / block.noise().array();
+        BlockDerivatives of = derivatives(latents_, block, mean_, explained);
+        const Index n_components = of.alpha.cols();
+        sum.misfit += of.alpha.squaredNorm();
+        without_enlarged_noise(latents_, block, of);
+        const MatrixXd alpha_before = of.alpha.array().colwise() / block.noise().array();
         GramGradient of_block;
         of_block.alpha = in_rows(*block.rows().reduction, alpha_before);
         for (std::size_t a = 0; a < parts.size(); ++a) {
@@ -180,11 +204,11 @@ std::optional<GramValue> InducingGram::differentiate(const RowBlocks& rows, cons
           const Index l = functions[f].index;
           GramGradient::OfLatent& out = of_block.latents[a];
           for (Index c = 0; c < n_components; ++c) {
-            sum.columns[a][l] += V[f].col(c).dot(block.weight(f, c).cwiseProduct(block.noise()));
-            if (parts[a].V) out.V.col(c * latent.n_functions + l) = V[f].col(c);
+            sum.columns[a][l] += of.V[f].col(c).dot(block.weight(f, c).cwiseProduct(block.noise()));
+            if (parts[a].V) out.V.col(c * latent.n_functions + l) = of.V[f].col(c);
           }
-          if (parts[a].mean) out.mean.col(l) = mean[f];
-          if (l > 0 && !latent.is_potential) U[f - static_cast<std::size_t>(l)] += U[f];
+          if (parts[a].mean) out.mean.col(l) = of.mean[f];
+          if (l > 0 && !latent.is_potential) of.U[f - static_cast<std::size_t>(l)] += of.U[f];
         }
         for (std::size_t a = 0; a < parts.size(); ++a) {
           if (parts[a].mean && latents_.latents()[a].is_local) block.add_mean_of_noise(a, alpha_before, of_block.latents[a].mean);
@@ -193,7 +217,7 @@ std::optional<GramValue> InducingGram::differentiate(const RowBlocks& rows, cons
         for (std::size_t f = 0; f < functions.size(); ++f) {
           const std::size_t a = functions[f].latent;
           if (functions[f].index > 0 || !parts[a].kernel) continue;
-          const auto first = U.begin() + static_cast<std::ptrdiff_t>(f);
+          const auto first = of.U.begin() + static_cast<std::ptrdiff_t>(f);
           const auto n_crosses = static_cast<std::ptrdiff_t>(latents_.latents()[a].n_crosses());
           add_cross_gradient(a, block, {std::move_iterator(first), std::move_iterator(first + n_crosses)}, sum.kernel[a]);
           add_variance_gradient(a, block, sum.kernel[a]);
