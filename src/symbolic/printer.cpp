@@ -155,11 +155,17 @@ bool starts_with_number(Expression e) {
   return e.is_constant();
 }
 
+/// Whether e is a·(1/b) with 0 for a = 0. Outside C it is written a/b, which reads back to it where b is a length with component a.
+bool is_quotient_or_zero(Expression e) {
+  return e.operation() == Operation::multiply_or_zero && e.right().operation() == Operation::divide &&
+         e.right().left().is_constant(1);
+}
+
 /// Whether c*e, written without parentheses, reads back to c·e: e = u·v·… whose first factor is neither a quotient nor a number.
 bool continues_product(Expression e) {
   if (e.operation() != Operation::multiply) return false;
   while (e.operation() == Operation::multiply) e = e.left();
-  return e.operation() != Operation::divide && !e.is_constant();
+  return e.operation() != Operation::divide && !is_quotient_or_zero(e) && !e.is_constant();
 }
 
 /// Whether e is a product or quotient that starts with 0, as 0/0 does: of -0/0 a reader takes -0, which is 0, first.
@@ -172,6 +178,10 @@ bool starts_with_zero(Expression e) {
 /// Not stretchy: around indices and powers browsers make them taller than the eye needs.
 constexpr const char* mathml_open = "<mrow><mo stretchy=\"false\">(</mo>";
 constexpr const char* mathml_close = "<mo stretchy=\"false\">)</mo></mrow>";
+
+Written write_mathml_quotient(Expression a, Expression b) {
+  return {{"<mfrac><mrow>", {a, in_sum}, "</mrow><mrow>", {b, in_sum}, "</mrow></mfrac>"}, in_product};
+}
 
 /// e in terms of its operands, in MathML: what belongs together is an element, so fewer parentheses are needed.
 Written write_mathml(Expression e) {
@@ -188,12 +198,13 @@ Written write_mathml(Expression e) {
       return {{"<mrow><mo>−</mo>", {e.left(), in_product}, "</mrow>"}, in_product};
     case Operation::multiply:
     case Operation::multiply_or_zero: {
+      if (is_quotient_or_zero(e)) return write_mathml_quotient(e.left(), e.right().right());
       // a thin space around the invisible times; a dot between numbers
       const char* const times = starts_with_number(e.right()) ? "<mo>·</mo>" : "<mo lspace=\"0.16em\" rspace=\"0\">&#x2062;</mo>";
       return {{{e.left(), in_product}, times, {e.right(), in_product}}, in_product};
     }
     case Operation::divide:
-      return {{"<mfrac><mrow>", {e.left(), in_sum}, "</mrow><mrow>", {e.right(), in_sum}, "</mrow></mfrac>"}, in_product};
+      return write_mathml_quotient(e.left(), e.right());
     case Operation::power:
       return {{"<msup><mrow>", {e.left(), atomic}, "</mrow><mrow>", {e.right(), in_sum}, "</mrow></msup>"}, in_power};
     case Operation::sqrt:
@@ -208,6 +219,11 @@ Written write_mathml(Expression e) {
   const std::string close = std::string(mathml_close) + "</mrow>";
   if (!internal::is_binary(e.operation())) return {{open, {e.left(), in_sum}, close}, atomic};
   return {{open, {e.left(), in_sum}, "<mo>,</mo>", {e.right(), in_sum}, close}, atomic};
+}
+
+Written write_quotient(Expression a, Expression b, bool in_latex) {
+  if (in_latex) return {{"\\frac{", {a, in_sum}, "}{", {b, in_sum}, "}"}, in_product};
+  return {{{a, in_product}, "/", {b, in_power}}, in_product};
 }
 
 /// e in terms of its operands.
@@ -232,6 +248,7 @@ Written write(Expression e, Notation notation) {
       if (c) {
         return {{"(", {e.left(), in_sum}, " == 0.0 ? 0.0 : ", {e.left(), in_product}, "*", {e.right(), in_power}, ")"}, atomic};
       }
+      if (is_quotient_or_zero(e)) return write_quotient(e.left(), e.right().right(), latex);
       [[fallthrough]];
     case Operation::multiply: {
       const char* const times = !latex ? "*" : starts_with_number(e.right()) ? " \\cdot " : " \\, ";
@@ -240,8 +257,7 @@ Written write(Expression e, Notation notation) {
       return {{{e.left(), in_product}, times, {e.right(), plain_chain ? in_product : in_power}}, in_product};
     }
     case Operation::divide:
-      if (latex) return {{"\\frac{", {e.left(), in_sum}, "}{", {e.right(), in_sum}, "}"}, in_product};
-      return {{{e.left(), in_product}, "/", {e.right(), in_power}}, in_product};
+      return write_quotient(e.left(), e.right(), latex);
     case Operation::power:
       if (c) {
         // as the tape computes it

@@ -281,6 +281,8 @@ TEST_F(ParserTest, AComponentOverItsLengthIsZeroAtZero) {
     EXPECT_EQ(value(0, 0.5, 0), 0);
     EXPECT_EQ(value(0, 2, 0), 0);
     EXPECT_FALSE(std::isnan(value(1e-200, 1, 1e-200)));
+    EXPECT_EQ(read(to_string(read(text))), read(text));
+    EXPECT_EQ(read(to_string(graph.constant(3) * (read(text) * read("q2")))), graph.constant(3) * (read(text) * read("q2")));
   }
   EXPECT_DOUBLE_EQ(test::evaluate(read("-2*q2*q1/sqrt(q1^2 + q2^2)"), {{"q1", 3}, {"q2", 4}}), -24.0 / 5);
   // parts that are shared are looked at once

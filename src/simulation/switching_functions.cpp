@@ -1,0 +1,185 @@
+#include <algorithm>
+#include <array>
+#include <cstdint>
+#include <optional>
+#include <set>
+#include <string>
+#include <utility>
+
+#include <fmt/format.h>
+#include <fmt/ranges.h>
+
+#include "gp2/model.hpp"
+#include "gp2/simulate.hpp"
+#include "mechanics/known_multipliers.hpp"
+
+namespace gp2 {
+
+using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::VectorXd;
+
+SwitchingFunctions::SwitchingFunctions(std::span<const std::vector<Expression>> surfaces, const SystemSymbols& symbols) {
+  if (surfaces.empty()) return;
+  std::vector<Expression> outputs;
+  for (const std::vector<Expression>& functions : surfaces) {
+    std::vector<std::string> texts;
+    for (const Expression& g : functions) texts.push_back(to_string(g));
+    names_.push_back(fmt::format("{}", fmt::join(texts, ", ")));
+    outputs.insert(outputs.end(), functions.begin(), functions.end());
+    first_.push_back(static_cast<int>(outputs.size()));
+  }
+  const std::vector<Expression> functions = outputs;
+  std::vector<Expression> moving = symbols.q;
+  moving.insert(moving.end(), symbols.dq.begin(), symbols.dq.end());
+  moving.push_back(symbols.t);
+  for (const Expression& x : moving) {
+    for (const Expression& derivative : functions.front().graph().differentiate(functions, x)) outputs.push_back(derivative);
+  }
+  tape_ = Tape(outputs, symbols.state_and_parameters());
+}
+
+void SwitchingFunctions::evaluate(const Eigen::Ref<const VectorXd>& state, const Eigen::Ref<const VectorXd>& parameters,
+                                  VectorXd& values, MatrixXd& gradients) const {
+  const Index n = first_.back();
+  MatrixXd results;
+  tape_.evaluate(state, parameters, results);
+  values = results.topRows(n);
+  gradients = results.bottomRows(results.rows() - n).reshaped(n, results.rows() / n - 1);
+}
+
+namespace {
+
+constexpr bool is_binary(Operation operation) {
+  constexpr std::array binary = {Operation::add,    Operation::subtract, Operation::multiply,
+                                 Operation::divide, Operation::power,    Operation::atan2,
+                                 Operation::min,    Operation::max,      Operation::multiply_or_zero};
+  return std::find(binary.begin(), binary.end(), operation) != binary.end();
+}
+
+// The surfaces at which expressions jump: arguments of sign(), and those whose length is a denominator, |v| or √(v² + w²), that read a
+// velocity and no input, each once and each factor by itself, without constants: sign(v), sign(−2 v), sign(lambda(1) v) and v/|v| are
+// of one surface.
+class JumpsOf {
+ public:
+  JumpsOf(ExpressionGraph& graph, const SystemSymbols& symbols) : graph_(graph), symbols_(symbols) {}
+
+  void add(Expression e) {
+    if (!seen_.insert(e.id()).second || e.operation() <= Operation::variable) return;
+    if (e.operation() == Operation::sign) add_factors(e.left());
+    if (e.operation() == Operation::divide && e.right().operation() == Operation::abs) add_factors(e.right().left());
+    if (e.operation() == Operation::divide && e.right().operation() == Operation::sqrt) add_length(e.right().left());
+    if (e.operation() == Operation::power && e.right().is_constant(-0.5)) add_length(e.left());
+    add(e.left());
+    if (is_binary(e.operation())) add(e.right());
+  }
+  [[nodiscard]] const std::vector<std::vector<Expression>>& found() const { return found_; }
+
+ private:
+  void add_factors(Expression g) {
+    while (true) {
+      if (g.operation() == Operation::negate) {
+        g = g.left();
+      } else if (g.operation() == Operation::multiply && g.left().is_constant()) {
+        g = g.right();
+      } else if (g.operation() == Operation::divide && g.right().is_constant()) {
+        g = g.left();
+      } else {
+        break;
+      }
+    }
+    if (g.operation() == Operation::multiply || g.operation() == Operation::divide) {
+      add_factors(g.left());
+      add_factors(g.right());
+      return;
+    }
+    if (reads_velocity(g)) add_surface({g});
+  }
+
+  // the terms of a sum of squares, each alone 0 where the sum is
+  void add_length(const Expression& sum) {
+    std::vector<Expression> functions, open = {sum};
+    std::set<std::uint32_t> seen;
+    while (!open.empty()) {
+      const Expression e = open.back();
+      open.pop_back();
+      if (!seen.insert(e.id()).second) continue;
+      if (e.operation() == Operation::add) {
+        open.push_back(e.right());
+        open.push_back(e.left());
+      } else if (const std::optional<Expression> root = root_of(e)) {
+        functions.push_back(*root);
+      } else {
+        return;
+      }
+    }
+    if (functions.size() == 1) {
+      add_factors(functions.front());
+    } else {
+      add_surface(std::move(functions));
+    }
+  }
+
+  // of the square of what reads a velocity, or of one times what reads none
+  std::optional<Expression> root_of(const Expression& e) {
+    if (!reads_velocity(e)) return std::nullopt;
+    if (e.operation() == Operation::power && e.right().is_constant(2)) return e.left();
+    if (e.operation() == Operation::divide && !reads_velocity(e.right())) {
+      const std::optional<Expression> root = root_of(e.left());
+      return root ? std::optional(*root / graph_.apply(Operation::sqrt, e.right())) : std::nullopt;
+    }
+    if (e.operation() != Operation::multiply) return std::nullopt;
+    if (e.left() == e.right()) return e.left();
+    for (const auto& [factor, square] : {std::pair(e.left(), e.right()), std::pair(e.right(), e.left())}) {
+      if (reads_velocity(factor)) continue;
+      if (const std::optional<Expression> root = root_of(square)) return graph_.apply(Operation::sqrt, factor) * *root;
+    }
+    return std::nullopt;
+  }
+
+  // λ₀ and λ are no expressions of the state: where they change their sign is not looked for
+  bool reads_velocity(const Expression& g) {
+    const std::vector<std::string> variables = graph_.variables_of(g);
+    if (std::any_of(variables.begin(), variables.end(), is_multiplier)) return false;
+    const auto reads = [&](const Expression& x) { return graph_.depends_on(g, x); };
+    return std::any_of(symbols_.dq.begin(), symbols_.dq.end(), reads) &&
+           std::none_of(symbols_.u.begin(), symbols_.u.end(), reads);
+  }
+
+  void add_surface(std::vector<Expression> functions) {
+    if (std::find(found_.begin(), found_.end(), functions) == found_.end()) found_.push_back(std::move(functions));
+  }
+
+  ExpressionGraph& graph_;
+  const SystemSymbols& symbols_;
+  std::set<std::uint32_t> seen_;
+  std::vector<std::vector<Expression>> found_;
+};
+
+}  // namespace
+
+SwitchingFunctions switching_functions(const Model& model, bool of_latents) {
+  const SystemSymbols symbols = model.symbols();
+  JumpsOf jumps(*model.graph, symbols);
+  const auto add = [&](const std::vector<Expression>& expressions) {
+    for (const Expression& e : expressions) jumps.add(e);
+  };
+  if (const SymbolicSystem* system = model.symbolic_system()) add(system->definition().force);
+  if (!of_latents) {
+    add(model.truth);
+    add(model.truth_force);
+    return {jumps.found(), symbols};
+  }
+  for (const LatentSpec& latent : model.latents) {
+    if (!latent.feature_code) {
+      for (const std::string& feature : latent.features) jumps.add(model.expression(feature));
+    }
+    if (latent.direction_code) continue;
+    for (const std::vector<std::string>& row : latent.directions) {
+      for (const std::string& direction : row) jumps.add(model.expression(direction));
+    }
+  }
+  return {jumps.found(), symbols};
+}
+
+}  // namespace gp2
