@@ -482,6 +482,34 @@ force = ["-{3}*abs(lambda(1))*dx/v", "-{3}*abs(lambda(1))*dy/v", "0"]
   }
 }
 
+// thrown onto a table: falls, bounces at half the speed each time, slides on along its way and rests
+TEST(ContactFriction, BringsAPuckToRestThatIsThrownOntoATable) {
+  const double mu = 0.4, e = 0.5, height = 0.5, vx = 1, vy = 0.7;
+  const Model model = Model::parse(fmt::format(R"toml(
+coordinates = ["x", "y", "z"]
+inputs      = ["touch"]
+[let]
+v = "sqrt(dx^2 + dy^2)"
+[mechanics]
+mass  = [["1", "0", "0"], ["0", "1", "0"], ["0", "0", "1"]]
+force = ["0", "0", "-9.81"]
+[constraints]
+position = [{{ expr = "z", contact = "touch", restitution = {1} }}]
+[truth]
+force = ["-{0}*lambda(1)*dx/v", "-{0}*lambda(1)*dy/v", "0"]
+)toml",
+                                               mu, e),
+                                   "puck");
+  const Trajectory motion = motion_of(model, {0, 0, height, vx, vy, 0}, 4, 41);
+  const double fall = std::sqrt(2 * height / g), bounces = fall * (1 + 2 * e / (1 - e)), v = std::hypot(vx, vy);
+  const double slides = v / (mu * g), way = v * bounces + v * slides / 2;
+  expect_friction(motion, {{bounces + slides, true}});
+  EXPECT_NEAR(motion.states(0, 40), way * vx / v, 1e-6);
+  EXPECT_NEAR(motion.states(1, 40), way * vy / v, 1e-6);
+  EXPECT_LT(motion.states.col(40).segment(3, 3).norm(), 1e-12);
+  expect_constraints(model, motion);
+}
+
 // a bead on a wire moves along it alone, whatever the number of coordinates that its velocity is written in
 TEST(ContactFriction, OverTheLengthOfAVelocityIsThatOfItsSignOnAWire) {
   const auto bead = [](const std::string& direction_x, const std::string& direction_z) {
