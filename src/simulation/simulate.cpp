@@ -160,8 +160,8 @@ class Integration {
       if (is_held_up) {
         throw NumericalError(fmt::format(
             "simulate: {} steps reach no further than t = {:.6g} of {:.6g}, half of them from t = {:.6g} on: a force that "
-            "jumps, as -v/|v| does where a body comes to rest, is to be smoothed, say -tanh(|v|/0.01)*v/|v|; else loosen "
-            "the tolerances, or allow more steps (`max_steps`)",
+            "jumps where a body comes to rest is to be written with sign(v) or v/sqrt(v^2 + w^2), or smoothed, say "
+            "tanh(v/0.01); else loosen the tolerances, or allow more steps (`max_steps`)",
             options_.max_steps, t_, t_end(), t_halfway_));
       }
       throw NumericalError(

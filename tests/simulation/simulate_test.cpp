@@ -796,7 +796,7 @@ TEST(SimulateFaults, AJumpThatHoldsABodyAtRestIsToldWithItsMend) {
   options.max_steps = 4000;
   EXPECT_THAT(fault_of([](const VectorXd& x) { return -x[1] / std::abs(x[1]); }, options),
               AllOf(StartsWith("simulate: 4000 steps reach no further than t = 1."),
-                    HasSubstr("of 100, half of them from t = 1."), HasSubstr("is to be smoothed, say -tanh")));
+                    HasSubstr("of 100, half of them from t = 1."), HasSubstr("or smoothed, say tanh")));
 }
 
 TEST(SimulateFaults, ASmallerStepIsTriedBeforeGivingUp) {
