@@ -385,6 +385,8 @@ void check_log(const Model& model, const CsvTable& table, const CheckOptions& op
   const WholeLog log = read_whole_log(model, reader);
   check_columns_of(table, reader, log, system, findings);
   check_channels(log, system, findings);
+  const std::string rest = text_of_rest(model, system.parameter_values(), log.states, log.accelerations);
+  if (!rest.empty()) findings.push_back({Level::warning, rest});
   check_rates(log, system, findings);
   check_mechanics(model, log.states, findings);
   if (has_error(findings)) return;

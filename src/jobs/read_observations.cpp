@@ -5,6 +5,7 @@
 #include <cmath>
 #include <cstdint>
 #include <numeric>
+#include <set>
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
@@ -15,6 +16,7 @@
 #include "gp2/inference/evaluation.hpp"
 #include "gp2/mechanics/check.hpp"
 #include "gp2/mechanics/udwadia_kalaba.hpp"
+#include "gp2/simulate.hpp"
 #include "gp2/simulation/projected_states.hpp"
 #include "jobs/observation_noise.hpp"
 
@@ -291,6 +293,13 @@ void note_repeats(const Readings& readings, const CsvTable& log, std::vector<std
       log.name(), n_repeated, log.n_rows()));
 }
 
+// friction at rest is whatever holds, up to a limit
+void note_rest(const LoggedSystem& logged, const Readings& readings, const CsvTable& log, std::vector<std::string>& notes) {
+  if (logged.other) return;
+  const std::string text = text_of_rest(logged.model, logged.parameters, readings.states, readings.values);
+  if (!text.empty()) notes.push_back(fmt::format("warning: {}: {}", log.name(), text));
+}
+
 // the rows of a view whose columns are there
 std::vector<int> side_information_rows(const View& view, const std::vector<std::string>& every, const LogReader& reader,
                                        const std::string& option, const CsvTable& table, const System& system) {
@@ -364,6 +373,50 @@ std::optional<CommandedRows> take_commands(const System& system, const std::vect
   return out;
 }
 
+std::string text_of_rest(const Model& model, const VectorXd& parameters, const MatrixXd& states, const MatrixXd& values) {
+  const SwitchingFunctions surfaces = switching_functions(model, /*of_latents=*/true);
+  if (surfaces.size() == 0) return {};
+  const StateLayout layout = model.system->layout();
+  VectorXd small = VectorXd::Zero(values.rows());
+  for (Index k = 0; k < values.rows(); ++k) {
+    for (const double value : values.row(k)) small[k] = std::max(small[k], std::isnan(value) ? 0 : std::abs(value) / 4);
+  }
+  const auto is_or_unknown = [](double value, double wanted) { return value == wanted || std::isnan(value); };
+  const auto rests = [&](Index i) {
+    const auto dq = states.col(i).segment(layout.dq(0), layout.nq);
+    return std::all_of(dq.begin(), dq.end(), [&](double one) { return is_or_unknown(one, 0); }) &&
+           !(values.col(i).array().abs() > small.array()).any();
+  };
+  const auto stays = [&](Index i, Index next) {
+    if (next < 0 || next >= states.cols() || !rests(next)) return false;
+    for (Index k = 0; k < layout.nq; ++k) {
+      if (!is_or_unknown(states(k, next), states(k, i)) && !std::isnan(states(k, i))) return false;
+    }
+    return true;
+  };
+  int n = 0;
+  std::set<std::string> names;
+  VectorXd g;
+  MatrixXd gradients;
+  for (Index i = 0; i < states.cols(); ++i) {
+    if (!rests(i) || !(stays(i, i - 1) || stays(i, i + 1))) continue;
+    surfaces.evaluate(states.col(i), parameters, g, gradients);
+    bool is_held = false;
+    for (std::size_t k = 0; k < surfaces.names().size(); ++k) {
+      const int first = surfaces.first()[k];
+      if (!g.segment(first, surfaces.first()[k + 1] - first).isZero(0)) continue;
+      names.insert(surfaces.names()[k]);
+      is_held = true;
+    }
+    n += is_held ? 1 : 0;
+  }
+  if (n * 20 <= states.cols()) return {};
+  return fmt::format(
+      "{} of {} rows are at rest where dry friction jumps, at {} = 0: what holds a body there is no function of its state; "
+      "leave them out",
+      n, states.cols(), fmt::join(names, "; "));
+}
+
 int n_repeated_rows(const MatrixXd& states, const MatrixXd& values) {
   // NaN is not equal to itself, and −0 is 0
   const auto entry = [&](Index k, int i) {
@@ -428,6 +481,7 @@ Observations read_log(const LoggedSystem& logged, const Log& log, const FitProbl
   note_violation(system, readings.states, logged.parameters, log.table, notes);
   note_dependence(logged, readings.states, std::move(all_values), observed.size(), log.table, notes);
   note_repeats(readings, log.table, notes);
+  note_rest(logged, readings, log.table, notes);
 
   const int n_rows = log.table.n_rows();
   std::vector<int> measured = measured_rows(readings, observed, log.table, notes);

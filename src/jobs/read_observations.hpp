@@ -49,6 +49,12 @@ Observations read_side_information(const LoggedSystem& logged, const Prior& fitt
 /// How many states, with the values measured there, are those of an earlier one to the last bit.
 int n_repeated_rows(const Eigen::MatrixXd& states, const Eigen::MatrixXd& values);
 
+/// What is wrong with rows, if more than a twentieth, that are at rest where dry friction of a model jumps: there and in the row before or
+/// behind all velocities are 0 and the coordinates the same, as far as they are known, and measured values a quarter of the largest of
+/// their column at most. Empty where nothing is.
+std::string text_of_rest(const Model& model, const Eigen::VectorXd& parameters, const Eigen::MatrixXd& states,
+                         const Eigen::MatrixXd& values);
+
 /// The accelerations to compare predictions with where none are asked for: those that any observation of the fit has, as far as the
 /// log has them.
 /// @param notes  receives what is left out

@@ -1,5 +1,6 @@
 #include <gmock/gmock.h>
 
+#include "gp2/jobs/check_job.hpp"
 #include "gp2/jobs/fit_problem.hpp"
 #include "hyperparameter.hpp"
 #include "io_testing.hpp"
@@ -59,6 +60,38 @@ TEST(FitNotes, TellWhichStatesTheConstraintsDoNotKnow) {
   EXPECT_THAT(input_error_of([&] { problem_of(model, log); }),
               AllOf(StartsWith("`project`: log.csv: 1 of 2 states have no state on the constraints near them (line 3): "),
                     HasSubstr("the constraint \"y - sqrt(x)\" is not a number there")));
+}
+
+// whatever holds a body at rest, a function of its state does not
+TEST(FitNotes, TellOfRowsThatDryFrictionHolds) {
+  const auto model_of = [](const std::string& friction) {
+    return Model::parse(
+        "coordinates = ['x', 'y']\n[mechanics]\nmass = [['2', '0'], ['0', '1']]\nforce = ['3', '0']\n[[latent]]\nkernel = "
+        "'se'\nfeatures = ['y']\ndirections = [['" +
+            friction + "'], ['0']]\n",
+        "cart");
+  };
+  const auto notes_and_findings = [&](const Model& model, const std::string& rows) {
+    const CsvTable log = CsvTable::parse("x,y,dx,dy,ddx,ddy\n1,2,3,4,5,0\n2,3,4,5,6,0\n" + rows, "log.csv");
+    FitProblemOptions options;
+    options.noise_stddev = 0.1;
+    std::vector<std::string> texts = make_fit_problem(model, log, options).notes;
+    for (const Finding& one : check(model, &log)) texts.push_back(one.text);
+    return texts;
+  };
+  const std::string at_rest = "3,3,0,0,0.01,0\n3,3,0,0,-0.02,0\n3,3,0,0,0.01,0\n";
+  const auto told = [](const std::string& surface) {
+    const std::string text = "3 of 5 rows are at rest where dry friction jumps, at " + surface + " = 0: what holds";
+    return AllOf(Contains(StartsWith("warning: log.csv: " + text)), Contains(StartsWith(text)));
+  };
+  EXPECT_THAT(notes_and_findings(model_of("sign(dx)"), at_rest), told("dx"));
+  EXPECT_THAT(notes_and_findings(model_of("dx/sqrt(dx^2 + dy^2)"), at_rest), told("dx, dy"));
+  // neither where a motion turns, nor where friction does not jump
+  const auto silent = testing::Not(Contains(HasSubstr("at rest")));
+  EXPECT_THAT(notes_and_findings(model_of("sign(dx)"), "3,3,0,0,0.01,0\n3.5,3,0,0,-2,0\n3.25,3,0,1,-2,0\n"), silent);
+  EXPECT_THAT(notes_and_findings(model_of("dx/sqrt(dx^2 + dy^2)"), "3,3,0,0,3,0\n3,3,0,0,-2,0\n4,3,0,0,0,0\n3,3,0,1,0,0\n"),
+              silent);
+  EXPECT_THAT(notes_and_findings(model_of("tanh(9*dx)"), at_rest), silent);
 }
 
 // a column that does not vary gives no scale for its noise
