@@ -74,7 +74,8 @@ class SwitchingFunctions {
 };
 
 /// The arguments of sign() that read velocities, and those that stand over their own length, v/|v| or v/√(v² + w²), in a model's force,
-/// and in its [truth] or in features and directions of its latents. Not to be called from several threads for one model: its expression graph grows.
+/// and in its [truth] or in features and directions of its latents. Not to be called from several threads for one model: its
+/// expression graph grows.
 SwitchingFunctions switching_functions(const Model& model, bool of_latents);
 
 /// A constraint c(q, t) = 0 that can only push: the gap c is never negative. The input that its row of A and b is switched by says
@@ -100,7 +101,7 @@ struct ContactEvent {
   double energy_loss = 0;  // kinetic energy that the impact took [J]
 };
 
-/// A surface at which the acceleration jumps that starts to hold a motion, as dry friction does a body that sticks, or lets it go.
+/// A surface at which the acceleration jumps starts to hold a motion, as dry friction does a body that sticks, or lets it go.
 struct StickEvent {
   double time = 0;
   int surface = 0;     // of the switching functions

@@ -142,6 +142,7 @@ void Switching::put(VectorXd& state) const {
   for (int k = 0; k < functions_.size(); ++k) {
     const double length = part(surfaces.g, k).norm();
     if (hold(k) == Hold::rest) part(toward, k).setZero();
+    // what creeps may be slower than the margin, beside which it is evaluated
     if (hold(k) == Hold::direction) surfaces.margin[k] = 0;
     // those that hold nothing stay where they are
     if (hold(k) == Hold::none && length > 0) part(toward, k) = part(surfaces.g, k) / length;
