@@ -107,10 +107,10 @@ class JumpsOf {
       if (e.operation() == Operation::add) {
         open.push_back(e.right());
         open.push_back(e.left());
-      } else if (const std::optional<Expression> root = root_of(e)) {
-        functions.push_back(*root);
       } else {
-        return;
+        const std::optional<Expression> root = reads_velocity(e) ? root_of(e) : std::nullopt;
+        if (!root) return;
+        functions.push_back(*root);
       }
     }
     if (functions.size() == 1) {
@@ -120,21 +120,18 @@ class JumpsOf {
     }
   }
 
-  // of the square of what reads a velocity, or of one times what reads none
+  // of a square, or of one times what reads no velocity; right operands first, which are short where a text has many
   std::optional<Expression> root_of(const Expression& e) {
-    if (!reads_velocity(e)) return std::nullopt;
     if (e.operation() == Operation::power && e.right().is_constant(2)) return e.left();
-    if (e.operation() == Operation::divide && !reads_velocity(e.right())) {
-      const std::optional<Expression> root = root_of(e.left());
-      return root ? std::optional(*root / graph_.apply(Operation::sqrt, e.right())) : std::nullopt;
-    }
-    if (e.operation() != Operation::multiply) return std::nullopt;
-    if (e.left() == e.right()) return e.left();
-    for (const auto& [factor, square] : {std::pair(e.left(), e.right()), std::pair(e.right(), e.left())}) {
-      if (reads_velocity(factor)) continue;
-      if (const std::optional<Expression> root = root_of(square)) return graph_.apply(Operation::sqrt, factor) * *root;
-    }
-    return std::nullopt;
+    if (e.operation() == Operation::multiply && e.left() == e.right()) return e.left();
+    const bool is_product = e.operation() == Operation::multiply;
+    if (!is_product && e.operation() != Operation::divide) return std::nullopt;
+    const bool is_square_left = !reads_velocity(e.right());
+    if (!is_square_left && (!is_product || reads_velocity(e.left()))) return std::nullopt;
+    const std::optional<Expression> root = root_of(is_square_left ? e.left() : e.right());
+    if (!root) return std::nullopt;
+    const Expression factor = graph_.apply(Operation::sqrt, is_square_left ? e.right() : e.left());
+    return is_product ? factor * *root : *root / factor;
   }
 
   // λ₀ and λ are no expressions of the state: where they change their sign is not looked for
