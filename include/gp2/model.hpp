@@ -163,7 +163,7 @@ class Model {
 /// The system of a model as expressions. @throws InputError where its mechanics are code.
 const SymbolicSystem& require_symbolic_system(const Model& model);
 
-/// The prior of a model file. Not to be called from several threads for one model: its expression graph grows.
+/// The prior of a model file.
 /// @throws InputError when a kernel or feature is wrong, or `base` is asked for and the model has several latents.
 Prior make_prior(const Model& model, const PriorOptions& options = {});
 
@@ -171,8 +171,8 @@ Prior make_prior(const Model& model, const PriorOptions& options = {});
 std::vector<Actuator> shared_actuators(const std::vector<Actuator>& home, const Model& other);
 
 /// The system of `other` for the latents of `home` to act in. A parameter that `other` marks `estimate = true` and `home` has
-/// by the same name is one and the same; every other keeps the value of its own file. As make_prior, not to be called from
-/// several threads for one model.
+/// by the same name is one and the same; every other keeps the value of its own file.
+/// @param options  those of the prior at home
 /// @throws InputError naming what differs: coordinates, inputs, the number of latents, or a latent's kernel, features or
 ///   directions; and when a parameter that is one and the same stands in a feature of `other`.
 std::shared_ptr<const OtherSystem> make_other_system(const Model& home, const Model& other, const PriorOptions& options = {});

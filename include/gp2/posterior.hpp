@@ -191,8 +191,7 @@ class Posterior {
 /// after group. Rows leave the factor by plane rotations, O(n²) operations each, as stable as a posterior built anew. A group that
 /// update() added goes with its last state; one that was given to the constructor stays, without states, and keeps its noise,
 /// since hyperparameters call it by its number. In place and otherwise as update.
-/// @throws InputError when there are fewer, what was learned went through inducing points, or a nonlinear prior has several groups;
-/// `posterior` is left as it was.
+/// @throws InputError when there are fewer, or what was learned went through inducing points; `posterior` is left as it was.
 [[nodiscard]] Posterior remove_oldest(Posterior&& posterior, int n);
 
 }  // namespace gp2

@@ -60,6 +60,8 @@ struct Latent {
   [[nodiscard]] int size() const { return static_cast<int>(column_names.size()); }  // p
   [[nodiscard]] int n_features() const { return static_cast<int>(feature_names.size()); }
   [[nodiscard]] int n_functions() const { return free_loading.value_or(size()); }  // columns of C
+  /// Whether its directions are those of [x; λ].
+  [[nodiscard]] bool reads_multipliers() const { return directions && directions->of_multipliers() != nullptr; }
 };
 
 /// A Gaussian process prior on the unconstrained acceleration (Geist & Trimpe 2020, sec. 4):

@@ -74,8 +74,8 @@ class SwitchingFunctions {
 };
 
 /// The arguments of sign() that read velocities, and those that stand over their own length, v/|v| or v/√(v² + w²), in a model's force,
-/// and in its [truth] or in features and directions of its latents. Not to be called from several threads for one model: its
-/// expression graph grows.
+/// and in its [truth] or in features and directions of its latents.
+/// @param of_latents  the latter, for the motion of a fit; else [truth], for that of a model
 SwitchingFunctions switching_functions(const Model& model, bool of_latents);
 
 /// A constraint c(q, t) = 0 that can only push: the gap c is never negative. The input that its row of A and b is switched by says

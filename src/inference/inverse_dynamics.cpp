@@ -33,7 +33,6 @@ constexpr double close_enough = 1e-8;     // where rounding lets no step help an
 
 void require_inputs_of(const Posterior& posterior, const View& view) {
   require_view(posterior.prior(), view);
-  require_linear(posterior.prior(), "inverse dynamics");
   if (!view.is_of_ddq()) throw InputError("inverse_dynamics: the view must be of the constrained acceleration ddq");
   const System& system = *prior_of(posterior.prior(), view).system;
   if (system.layout().nu == 0) throw InputError(fmt::format("inverse_dynamics: '{}' has no inputs", system.name()));

@@ -153,7 +153,7 @@ Likelihood::Likelihood(Prior prior, std::vector<Observations> observations, cons
   self.observations = std::move(observations);
   self.options = std::move(options);
   self.about = initial.about;
-  require_learnable(self.prior, self.observations, initial, self.options.gradient_parameters);
+  require_learnable(self.prior, self.observations);
   if (initial.inducing) {
     self.prepare_blocks(initial);
   } else {

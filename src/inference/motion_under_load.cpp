@@ -8,15 +8,16 @@ using Eigen::MatrixXd;
 using Eigen::Ref;
 using Eigen::VectorXd;
 
-MotionUnderLoad::MotionUnderLoad(const Prior& prior, const VectorXd& parameters)
+MotionUnderLoad::MotionUnderLoad(const Prior& prior, const VectorXd& parameters, std::optional<int> derivative_in)
     : n_state_(prior.system->layout().size()),
       x_(n_state_ + prior.system->nc()),
       force_(prior.system->nq()),
       forced_slope_(prior.system->nq(), prior.system->nc()) {
   for (std::size_t a = 0; a < prior.latents.size(); ++a) {
     const Latent& latent = prior.latents[a];
-    const StateFunction* const directions = latent.directions ? latent.directions->of_multipliers() : nullptr;
-    if (directions == nullptr) continue;
+    if (!latent.reads_multipliers()) continue;
+    const StateFunction* directions = latent.directions->of_multipliers();
+    if (derivative_in) directions = directions->parameter_derivative(*derivative_in);
     OfLatent& of = latents_.emplace_back();
     of.latent = a;
     of.acts_on_forces = latent.base == Latent::Base::force;

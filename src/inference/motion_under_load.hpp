@@ -1,6 +1,7 @@
 #pragma once
 
 #include <memory>
+#include <optional>
 #include <vector>
 
 #include <Eigen/Core>
@@ -22,7 +23,8 @@ class MotionUnderLoad {
     Eigen::VectorXd B, dB;  // directions and their derivatives at [x; λ], as `directions` gives them
   };
 
-  MotionUnderLoad(const Prior& prior, const Eigen::VectorXd& parameters);
+  /// @param derivative_in  of directions in a parameter, in the place of directions
+  MotionUnderLoad(const Prior& prior, const Eigen::VectorXd& parameters, std::optional<int> derivative_in = std::nullopt);
 
   /// Those latents, in the order of the prior.
   [[nodiscard]] std::vector<OfLatent>& latents() { return latents_; }

@@ -28,10 +28,11 @@ std::vector<MatrixXd> amplitudes_of(const Prior& prior, const std::vector<Matrix
 /// The motion at one state after another.
 class NonlinearMotion::Under {
  public:
-  explicit Under(const NonlinearMotion& of, const std::vector<MatrixXd>& c)
+  /// @param derivative_in  of E in a parameter, in the place of E
+  Under(const NonlinearMotion& of, const std::vector<MatrixXd>& c, std::optional<int> derivative_in = std::nullopt)
       : of_(of),
         c_(c),
-        load_(of.prior_, of.parameters_),
+        load_(of.prior_, of.parameters_, derivative_in),
         a_bar_(of.prior_.system->nq()),
         J_(a_bar_.size(), of.prior_.system->nc()) {}
 
@@ -120,6 +121,7 @@ void NonlinearMotion::linearise(const View& view, const Linearisation::OfGroup& 
   const MatrixXd hidden = at_known_load_.mean - prior.mean;
   Under under(*this, c);
   LoadResponse response;
+  if (viewed.has_slip()) add_to_slip(at.noise_about ? *at.noise_about : at, viewed);
   for (int i = 0; i < n_states(); ++i) {
     linearise_amplitudes(at, c, i, prior);
     if (view.latent || at.multipliers.rows() == 0) continue;  // of one latent: at λ*, of which all are part
@@ -132,28 +134,44 @@ void NonlinearMotion::linearise(const View& view, const Linearisation::OfGroup& 
   }
 }
 
+void NonlinearMotion::add_to_slip(const Linearisation::OfGroup& at, ViewValues& viewed) const {
+  const std::vector<MatrixXd> c = amplitudes_of(prior_, at.signals);
+  Under under(*this, c);
+  LoadResponse response;
+  for (int i = 0; i < n_states(); ++i) {
+    under.move_to(i);
+    response.compute(under.slope(at.multipliers.col(i)), multipliers_.G(i));
+    viewed.slip.col(i) += (viewed.G(i) * response.K() * multipliers_.N(i)).reshaped();
+  }
+}
+
 void NonlinearMotion::differentiate(const Linearisation::OfGroup& at, const SystemValues& derivative, int index,
                                     const ViewValues& viewed, ViewValues& d_viewed, PriorValues& d_prior) const {
   const std::vector<MatrixXd> c = amplitudes_of(prior_, at.signals);
   const PriorValues values = evaluate_prior(prior_, states_, parameters_, mechanics_, &at.multipliers);
   const ViewValues d_multipliers = differentiate_view(of_multipliers_, mechanics_, derivative);
   d_prior = differentiate_prior(prior_, states_, parameters_, mechanics_, values, derivative, index, &at.multipliers);
-  Under under(*this, c);
+  Under under(*this, c), derivative_under(*this, c, index);
   LoadResponse response;
   for (int i = 0; i < n_states(); ++i) {
     linearise_amplitudes(at, c, i, d_prior);
     if (at.multipliers.rows() == 0) continue;
     under.move_to(i);
+    derivative_under.move_to(i);
     const MatrixXd& J = under.slope(at.multipliers.col(i));
-    // dJ = −M⁻¹dM J; of a J on the acceleration it is 0
+    // dJ = ∂(∂E/∂p c)/∂λ − M⁻¹dM J, the latter of the part of J that acts on forces
     const UdwadiaKalaba& projection = mechanics_.projections[static_cast<std::size_t>(i)];
     const MatrixXd dJ =
-        -projection.solve_mass(projection.differentiate_mass(derivative.M(i), derivative.A(i)) * under.forced_slope());
+        derivative_under.slope(at.multipliers.col(i)) -
+        projection.solve_mass(projection.differentiate_mass(derivative.M(i), derivative.A(i)) * under.forced_slope());
     const auto G = viewed.G(i), G_lambda = multipliers_.G(i);
     const auto dG = d_viewed.G(i), dG_lambda = d_multipliers.G(i);
     response.compute(J, G_lambda);
     const MatrixXd &K = response.K(), dK = response.over_D(dJ + K * (dG_lambda * J + G_lambda * dJ));
     const VectorXd gap = multipliers_.offset.col(i) - at.multipliers.col(i);
+    if (viewed.has_slip()) {
+      d_viewed.slip.col(i) += ((dG * K + G * dK) * multipliers_.N(i) + G * (K * d_multipliers.N(i))).reshaped();
+    }
     d_viewed.offset.col(i) += dG * (K * gap) + G * (dK * gap + K * d_multipliers.offset.col(i));
     const MatrixXd d_matrix = dG + dG * K * G_lambda + G * (dK * G_lambda + K * dG_lambda);
     Map<MatrixXd>(d_viewed.matrix.col(i).data(), d_viewed.offset.rows(), G.cols()) = d_matrix;

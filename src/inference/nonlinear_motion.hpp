@@ -18,7 +18,7 @@ namespace gp2 {
 ///
 /// G_λ and d_λ those of the view of the multipliers. To first order in the signals about s_a*, λ* every view v = G ā + d is
 ///
-///     v = G̃ (μ + Σ_a Ẽ_a s_a + o) + d̃,    G̃ = G (I + J D⁻¹G_λ),    d̃ = d + G J D⁻¹(d_λ − λ*),
+///     v = G̃ (μ + Σ_a Ẽ_a s_a + o) + d̃,    G̃ = G (I + J D⁻¹G_λ),    d̃ = d + G J D⁻¹(d_λ − λ*),    Ñ = N + G J D⁻¹N_λ,
 ///
 /// with J = Σ_a ∂E_a/∂λ c_a, D = I − G_λ J, Ẽ_a = E_a(x, λ*) diag(c_a'), o = Σ_a E_a(x, λ*)(c_a − c_a' ∘ s_a*): a linear prior (theory.md,
 /// T47), and exact at s_a*. As A G = 0 of an acceleration, A G̃ = 0.
@@ -37,8 +37,7 @@ class NonlinearMotion {
   /// @param prior  receives it; with a fault where a direction is not finite at λ*
   void linearise(const View& view, const Linearisation::OfGroup& at, ViewValues& viewed, PriorValues& prior) const;
 
-  /// ∂/∂p of what linearise gives for a view of everything, at held s_a* and λ*, in parameters that directions which read λ do not
-  /// depend on.
+  /// ∂/∂p of what linearise gives for a view of everything, at held s_a* and λ*.
   /// @param viewed, d_viewed  before and after: evaluate_view and differentiate_view
   /// @param d_prior           receives that of the prior
   void differentiate(const Linearisation::OfGroup& at, const SystemValues& derivative, int index, const ViewValues& viewed,
@@ -51,6 +50,8 @@ class NonlinearMotion {
 
  private:
   class Under;
+  // Ñ = N + G J D⁻¹N_λ
+  void add_to_slip(const Linearisation::OfGroup& at, ViewValues& viewed) const;
   void linearise_amplitudes(const Linearisation::OfGroup& at, const std::vector<Eigen::MatrixXd>& c, int i,
                             PriorValues& prior) const;
 

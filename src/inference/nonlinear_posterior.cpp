@@ -3,6 +3,7 @@
 #include <cmath>
 #include <functional>
 #include <limits>
+#include <optional>
 
 #include <fmt/format.h>
 
@@ -14,6 +15,7 @@
 #include "inference/latent_sums.hpp"
 #include "inference/nonlinear_motion.hpp"
 #include "inference/posterior_implementation.hpp"
+#include "inference/reduction.hpp"
 
 // The posterior of a prior that is nonlinear in its latents, by Laplace's approximation.
 namespace gp2 {
@@ -66,6 +68,7 @@ class ExactFit {
                                                     require_prior_values(there, group.states(), of.parameters, *of.mechanics));
       of.view = evaluate_view(group.view(), *of.mechanics, group.states());
     }
+    linear_.resize(groups_.size());
   }
 
   [[nodiscard]] LatentValues zero() const {
@@ -90,27 +93,31 @@ class ExactFit {
   }
 
   // ½ |f|² + ½ Σ |S^{-1/2}(y − v(f))|², v linear about `about`: of a linearisation about f itself the nonlinear one
-  [[nodiscard]] double objective(const LatentValues& at, const Linearisation& about) const {
-    double sum = at.squared_distance(zero());
+  [[nodiscard]] double objective(const LatentValues& at, const Linearisation& about) {
     for (std::size_t g = 0; g < groups_.size(); ++g) {
-      const Observations& group = self_.observations[g];
-      ViewValues view = groups_[g].view;
-      PriorValues prior;
-      groups_[g].motion->linearise(group.view(), about.groups[g], view, prior);
-      if (prior.fault) return std::numeric_limits<double>::infinity();
-      std::vector<MatrixXd> signals;
-      for (std::size_t a = 0; a < self_.C.size(); ++a) signals.push_back(self_.C[a] * at.f[g][a]);
-      for (int i = 0; i < group.n_data(); ++i) {
-        VectorXd a_bar = prior.mean.col(i);
-        for (std::size_t a = 0; a < self_.C.size(); ++a) a_bar += prior.E(a, i) * signals[a].col(i);
-        const VectorXd missing = group.values().col(i) - view.G(i) * a_bar - view.offset.col(i);
-        const VectorXd noise = group.noise_at(self_.values.noise_stddev[g], i);
-        for (Index k = 0; k < noise.size(); ++k) {
-          if (std::isfinite(noise[k]) && !std::isnan(missing[k])) sum += std::pow(missing[k] / noise[k], 2);
-        }
-      }
+      ObservationModel::Values& values = linear_[g].values;
+      values.view = groups_[g].view;
+      groups_[g].motion->linearise(self_.observations[g].view(), about.groups[g], values.view, values.prior);
+      if (values.prior.fault) return std::numeric_limits<double>::infinity();
     }
-    return 0.5 * sum;
+    reduce(self_.prior, self_.observations, linear_, self_.values.noise_stddev, reduction_);
+    VectorXd missing = VectorXd::Zero(reduction_.size());
+    if (!reduction_.sums) missing = reduction_.y;
+    double sum = at.squared_distance(zero());
+    for (Index s = 0; s < reduction_.n_samples(); ++s) {
+      const Reduction::Sample& sample = reduction_.samples[static_cast<std::size_t>(s)];
+      for (std::size_t a = 0; a < self_.C.size(); ++a) {
+        const VectorXd signal = self_.C[a] * at.f[static_cast<std::size_t>(sample.group)][a].col(sample.index);
+        for (const Index row : rows_of_samples(reduction_, {s})) missing[row] -= reduction_.directions[a].row(row).dot(signal);
+      }
+      sum += sample.e_out.squaredNorm();
+    }
+    if (reduction_.sums) {
+      missing = (reduction_.sums->D * missing).eval();
+      reduction_.sums->whiten(missing);
+      missing += reduction_.y;
+    }
+    return 0.5 * (sum + missing.squaredNorm());
   }
 
   // The posterior mean of the linear prior that condition() was given.
@@ -153,6 +160,8 @@ class ExactFit {
 
   Posterior::Implementation& self_;
   std::vector<OfGroup> groups_;
+  std::vector<ObservationModel> linear_;  // of the last objective, and its rows
+  Reduction reduction_;
   std::vector<std::int64_t> first_of_;
 };
 
@@ -229,6 +238,14 @@ class FitThroughPoints {
   VectorXd mean_;
 };
 
+// `at` with the noise of soft constraints about another.
+Linearisation with_noise_about(Linearisation at, const Linearisation& other) {
+  for (std::size_t g = 0; g < at.groups.size(); ++g) {
+    at.groups[g].noise_about = std::make_shared<const Linearisation::OfGroup>(other.groups[g]);
+  }
+  return at;
+}
+
 // Gauss–Newton steps to the posterior mean, each to the one of the linear prior about where the last has led. Returns where the prior is
 // linear in the end.
 template <typename NonlinearFit>
@@ -240,6 +257,8 @@ std::shared_ptr<const Linearisation> find_mean(NonlinearFit& fit, const Prior& p
   std::shared_ptr<const Linearisation> linearisation = fit.about(at);
   if (!linearisation) static_cast<void>(require_models(prior, observations, values.parameters, nullptr));  // names the state
   double objective = fit.objective(at, *linearisation);
+  const bool is_soft = std::ranges::any_of(
+      observations, [&](const Observations& group) { return prior_of(prior, group.view()).system->has_constraint_noise(); });
   bool is_in_kink = false;
   for (int step = 0; step < most; ++step) {
     try {
@@ -257,11 +276,13 @@ std::shared_ptr<const Linearisation> find_mean(NonlinearFit& fit, const Prior& p
       typename NonlinearFit::Point next = at.towards(target, t);
       const auto there = fit.about(next);
       if (!there) continue;
-      const double lower = fit.objective(next, *there);
+      // the noise of soft constraints follows f, but within a step it stays
+      const std::optional<Linearisation> held = is_soft ? std::optional(with_noise_about(*there, *linearisation)) : std::nullopt;
+      const double lower = fit.objective(next, held ? *held : *there);
       if (!(lower < objective)) continue;
       at = std::move(next);
       linearisation = there;
-      objective = lower;
+      objective = is_soft ? fit.objective(at, *linearisation) : lower;
       break;
     }
     if (t > 1e-10) continue;

@@ -10,6 +10,7 @@
 
 namespace gp2 {
 
+using Eigen::Index;
 using Eigen::MatrixXd;
 using Eigen::VectorXd;
 
@@ -21,6 +22,15 @@ int index_there(const View& view, int parameter) {
   const std::vector<int>& shared = view.other_system->shared;
   const auto found = std::find(shared.begin(), shared.end(), parameter);
   return found == shared.end() ? -1 : static_cast<int>(found - shared.begin());
+}
+
+template <typename Which>
+Linearisation::OfGroup columns(const Linearisation::OfGroup& of, const Which& which) {
+  Linearisation::OfGroup out;
+  for (const MatrixXd& s : of.signals) out.signals.emplace_back(s(Eigen::all, which));
+  out.multipliers = of.multipliers(Eigen::all, which);
+  if (of.noise_about) out.noise_about = std::make_shared<const Linearisation::OfGroup>(columns(*of.noise_about, which));
+  return out;
 }
 
 ObservationModel::Values zero_like(ObservationModel::Values values) {
@@ -35,12 +45,12 @@ ObservationModel::Values zero_like(ObservationModel::Values values) {
 
 Linearisation take(const Linearisation& of, const std::vector<std::vector<int>>& states) {
   Linearisation taken;
-  for (std::size_t g = 0; g < of.groups.size(); ++g) {
-    Linearisation::OfGroup& group = taken.groups.emplace_back();
-    for (const MatrixXd& s : of.groups[g].signals) group.signals.emplace_back(s(Eigen::all, states[g]));
-    group.multipliers = of.groups[g].multipliers(Eigen::all, states[g]);
-  }
+  for (std::size_t g = 0; g < of.groups.size(); ++g) taken.groups.push_back(columns(of.groups[g], states[g]));
   return taken;
+}
+
+Linearisation::OfGroup slice(const Linearisation::OfGroup& of, Index first, Index n) {
+  return columns(of, Eigen::seqN(first, n));
 }
 
 bool model_observations(const Prior& prior, const std::vector<Observations>& observations, const VectorXd& parameters,

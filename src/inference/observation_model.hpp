@@ -24,6 +24,8 @@ struct ObservationModel {
 
 /// Of some states of each Observations, [group][state].
 Linearisation take(const Linearisation& of, const std::vector<std::vector<int>>& states);
+/// Of one group, states first … first + n − 1.
+Linearisation::OfGroup slice(const Linearisation::OfGroup& of, Eigen::Index first, Eigen::Index n);
 
 /// @param about   where a nonlinear prior is linearised; null: where no latent acts
 /// @param models  receives one per Observations; what it held is memory to be used again

@@ -65,7 +65,7 @@ Posterior::Implementation::Implementation(Prior of, std::vector<Observations> ob
     : prior(std::move(of)), observations(std::move(observed)), values(std::move(under)), n_given_groups(observations.size()) {
   require_observations(prior, observations);
   require_values(prior, observations, values);
-  require_learnable(prior, observations, values, {});
+  require_learnable(prior, observations);
   for (std::size_t a = 0; a < prior.latents.size(); ++a) C.push_back(values.loading(a));
 }
 

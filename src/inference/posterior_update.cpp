@@ -1,5 +1,8 @@
 #include <algorithm>
 #include <numeric>
+#include <ranges>
+#include <utility>
+#include <vector>
 
 #include <fmt/format.h>
 
@@ -22,6 +25,25 @@ std::shared_ptr<Posterior::Implementation> copy_of(const Posterior::Implementati
   return copy;
 }
 
+// Numbers of the samples, group after group.
+std::vector<std::int64_t> numbers_of(const Posterior::Implementation& self) {
+  std::vector<std::pair<int, std::int64_t>> numbers;
+  for (const Posterior::Implementation::Sample& sample : self.samples) numbers.emplace_back(sample.group, sample.number);
+  std::ranges::sort(numbers);
+  std::vector<std::int64_t> out;
+  for (const auto& [group, number] : numbers) out.push_back(number);
+  return out;
+}
+
+// Where latents are linearised moves with every observation. Samples are numbered 0, 1, … by that, group after group.
+void condition_anew(Posterior::Implementation& self, const std::vector<std::int64_t>& numbers) {
+  self.condition(1);
+  for (Posterior::Implementation::Sample& sample : self.samples) {
+    sample.number = numbers[static_cast<std::size_t>(sample.number)];
+    self.next_number = std::max(self.next_number, sample.number + 1);
+  }
+}
+
 void add(Posterior::Implementation& self, const Observations& added) {
   // the group that has this view and noise, or one of its own
   std::size_t group = 0;
@@ -35,15 +57,16 @@ void add(Posterior::Implementation& self, const Observations& added) {
     self.add_through_points(added, group);
     return;
   }
-  if (!self.prior.is_nonlinear()) self.add_samples({added}, {added.noise().stddev()}, static_cast<int>(group));
+  const bool is_linear = !self.prior.is_nonlinear();
+  for (int i = 0; i < added.n_data() && !is_linear; ++i) self.samples.push_back({static_cast<int>(group), self.next_number + i});
+  if (is_linear) self.add_samples({added}, {added.noise().stddev()}, static_cast<int>(group));
   if (group < self.observations.size()) {
     self.observations[group].append(added);
   } else {
     self.values.noise_stddev.push_back(added.noise().stddev());
     self.observations.push_back(added);
   }
-  // where latents are linearised moves with every observation
-  if (self.prior.is_nonlinear()) self.condition(1);
+  if (!is_linear) condition_anew(self, numbers_of(self));
 }
 
 void remove_oldest_of(Posterior::Implementation& self, int n) {
@@ -59,10 +82,14 @@ void remove_oldest_of(Posterior::Implementation& self, int n) {
   // in each group the oldest stand first
   std::vector<int> n_gone(self.observations.size());
   for (const Index sample : gone) ++n_gone[static_cast<std::size_t>(self.samples[static_cast<std::size_t>(sample)].group)];
-  if (!self.prior.is_nonlinear()) self.erase_samples(gone);
+  if (self.prior.is_nonlinear()) {
+    for (const Index sample : gone | std::views::reverse) self.samples.erase(self.samples.begin() + sample);
+  } else {
+    self.erase_samples(gone);
+  }
   for (std::size_t group = 0; group < n_gone.size(); ++group) self.observations[group].remove_first(n_gone[group]);
   self.erase_empty_groups();
-  if (self.prior.is_nonlinear()) self.condition(1);
+  if (self.prior.is_nonlinear()) condition_anew(self, numbers_of(self));
 }
 
 }  // namespace
@@ -118,8 +145,6 @@ Posterior remove_oldest(Posterior&& posterior, int n) {
         fmt::format("remove_oldest: there are {} observed states, so n must be 0 … {}, got {}", n_samples, n_samples, n));
   }
   for (const Observations& group : posterior.observations()) group.require_no_sums();
-  if (posterior.observations().size() > 1)
-    require_linear(posterior.prior(), "leaving out the oldest of several groups of observations");
   const lapack::SingleThread single_thread;
   const auto own = posterior.own_components();
   for (const auto& component : own) remove_oldest_of(*component, n);

@@ -24,7 +24,6 @@ Predictor::Predictor(const Posterior& posterior)
 Predictor::Predictor(const Posterior& posterior, View view) : Predictor(posterior, std::move(view), Options()) {}
 Predictor::Predictor(const Posterior& posterior, View view, Options options) {
   require_view(posterior.prior(), view);
-  if (view.latent || !view.has_mean()) require_linear(prior_of(posterior.prior(), view), "Predictor of a part of the motion");
   for (const auto& component : posterior.conditioned()) {
     const auto own = std::make_shared<Implementation>(*component, view, options);
     if (components_.empty()) own->distance = DataDistance(*component, view);

@@ -51,12 +51,18 @@ Predictor::Implementation::Implementation(const Posterior::Implementation& poste
       is_constrained(parts.constrained_acceleration || parts.constraint_force) {
   for (int r = 0; r < view.size(); ++r) added_entries.push_back(view.added_entry(prior.system->layout(), r));
   needs_acceleration = what_needs_acceleration(prior, view).has_value();
-  for (const Latent& latent : prior.latents) {
-    reads_multipliers = reads_multipliers || (latent.directions && latent.directions->of_multipliers() != nullptr);
+  for (std::size_t a = 0; a < prior.latents.size(); ++a) {
+    reads_multipliers = reads_multipliers || (view.has_latent(a) && prior.latents[a].reads_multipliers());
   }
   if (reads_multipliers) {
     parts.constrained_acceleration = parts.constraint_force = parts.unconstrained_acceleration = true;
     is_constrained = true;
+  }
+  if (reads_multipliers && !view.has_mean()) {
+    View of_whole = View::multipliers(*prior.system);
+    of_whole.other_system = view.other_system;
+    multipliers = std::make_shared<const Implementation>(
+        posterior, of_whole, Options{.stddev = false, .jacobian = options.jacobian, .storage = options.storage});
   }
   for (std::size_t a = 0; a < prior.latents.size(); ++a) {
     if (!view.has_latent(a)) continue;
@@ -76,6 +82,7 @@ Predictor::Workspace::Implementation::Implementation(std::shared_ptr<const Predi
     : predictor(std::move(owner)) {
   const Predictor::Implementation& self = *predictor;
   values = self.prior.system->make_evaluator(self.parameters, false);
+  if (self.multipliers) multipliers = std::make_unique<Implementation>(self.multipliers);
   if (self.options.jacobian) values_and_derivatives = self.prior.system->make_evaluator(self.parameters, true);
   reserve_mechanics();
   for (const PredictorTerm& term : self.terms) reserve_term(term);
@@ -143,7 +150,7 @@ void Predictor::Workspace::Implementation::reserve_term(const PredictorTerm& ter
   at.dfeatures.setZero(static_cast<Index>(at.of_features->entries().size()));
   if (!latent.directions) return;
   at.directions.setZero(nq * p);
-  if (latent.directions->of_multipliers() != nullptr) {
+  if (latent.reads_multipliers()) {
     at.under_load = &*std::ranges::find(load->latents(), term.latent, &MotionUnderLoad::OfLatent::latent);
     return;
   }
@@ -217,7 +224,9 @@ Status Predictor::Implementation::evaluate_prior(const Ref<const VectorXd>& stat
       add_product(here.directions, here.signal, of.base == Latent::Base::force ? w.force : w.a_bar);
     }
   });
-  if (reads_multipliers && !evaluate_load(state, at, w)) return Status::not_finite;
+  if (reads_multipliers) {
+    if (const Status status = evaluate_load(state, at, w); status != Status::ok) return status;
+  }
   w.a_of_force = w.force;
   if (has_force) {
     w.projection.solve_mass_in_place(w.a_of_force);
@@ -226,8 +235,8 @@ Status Predictor::Implementation::evaluate_prior(const Ref<const VectorXd>& stat
   return is_finite(w.a_bar) && all_features ? Status::ok : Status::not_finite;
 }
 
-bool Predictor::Implementation::evaluate_load(const Ref<const VectorXd>& state, const StateEvaluator& at,
-                                              Workspace::Implementation& w) const {
+Status Predictor::Implementation::evaluate_load(const Ref<const VectorXd>& state, const StateEvaluator& at,
+                                                Workspace::Implementation& w) const {
   w.affine_motion.evaluate(w.projection, at.M(), parts);
   Quantity::multipliers->evaluate(w.mechanics(at.A()), w.affine_motion.linear(), w.G_lambda, w.quantity);
   Quantity::multipliers->evaluate(w.mechanics(at.A()), w.affine_motion.constant(), w.d_lambda, w.quantity);
@@ -239,20 +248,29 @@ bool Predictor::Implementation::evaluate_load(const Ref<const VectorXd>& state, 
   }
   w.load->move_to(state, w.projection, w.without_load);
   const auto motion = [&](const VectorXd& lambda, VectorXd& a_bar, MatrixXd& slope) { w.load->evaluate(lambda, a_bar, slope); };
-  if (!w.solver.solve(w.G_lambda, w.d_lambda.col(0), motion)) return false;
-  motion(w.solver.lambda(), w.a_of_force, w.slope);
+  if (multipliers) {
+    Workspace::Implementation& whole = *w.multipliers;
+    Ref<VectorXd> lambda = whole.mean;
+    const Status status = multipliers->write_mean(state, *whole.values, whole, lambda);
+    if (status != Status::ok) return status;
+  } else if (!w.solver.solve(w.G_lambda, w.d_lambda.col(0), motion)) {
+    return Status::not_finite;
+  }
+  motion(multipliers ? w.multipliers->mean : w.solver.lambda(), w.a_of_force, w.slope);
   for (Workspace::Implementation::AtState& here : w.terms) {
     if (here.under_load == nullptr) continue;
     here.directions = here.under_load->B;
     add_product(here.directions, here.signal, here.under_load->acts_on_forces ? w.force : w.a_bar);
   }
-  return true;
+  return Status::ok;
 }
 
 void Predictor::Implementation::write_G(const StateEvaluator& at, Workspace::Implementation& w) const {
   w.affine_motion.evaluate(w.projection, at.M(), parts);
   view.quantity->evaluate(w.mechanics(at.A()), w.affine_motion.linear(), w.G, w.quantity);
-  if (!reads_multipliers) return;
+}
+
+void Predictor::Implementation::add_response(Workspace::Implementation& w) const {
   w.response.compute(w.slope, w.G_lambda);
   w.GK.noalias() = w.G.lazyProduct(w.response.K());
   w.G.noalias() += w.GK.lazyProduct(w.G_lambda);
@@ -335,6 +353,7 @@ void Predictor::Implementation::write_loadings(Workspace::Implementation& w) con
 
 void Predictor::Implementation::write_covariance(const StateEvaluator& at, Workspace::Implementation& w) const {
   write_G(at, w);
+  if (reads_multipliers && !view.latent) add_response(w);  // one latent is that under this load
   for (int r = 0; r < view.size(); ++r) w.Gt.col(r) = w.G.row(view.rows[static_cast<std::size_t>(r)]);
   if (has_forced_latent) {
     w.M_inverse_Gt = w.Gt;
@@ -469,9 +488,18 @@ void Predictor::Implementation::write_jacobian(const Ref<const VectorXd>& state,
   differentiate_mechanics(at, w);
   differentiate_motion(at, w);
   view.quantity->differentiate(w.mechanics(at.A()), w.motion(), w.dmotion(), StateChange(at), w.d_value, w.quantity);
-  if (reads_multipliers) {
+  if (multipliers) {
+    Workspace::Implementation& whole = *w.multipliers;
+    Ref<VectorXd> lambda = whole.mean;
+    static_cast<void>(multipliers->write_mean(state, *whole.values_and_derivatives, whole, lambda));
+    multipliers->write_jacobian(state, *whole.values_and_derivatives, whole, whole.jacobian);
+    write_G(at, w);
+    w.GK.noalias() = w.G.lazyProduct(w.slope);
+    w.d_value.noalias() += w.GK.lazyProduct(whole.jacobian);
+  } else if (reads_multipliers) {
     // dv = ∂v/∂x + G J dλ, D dλ = ∂(G_λ ā + d_λ)/∂x
     write_G(at, w);
+    add_response(w);
     Quantity::multipliers->differentiate(w.mechanics(at.A()), w.motion(), w.dmotion(), StateChange(at), w.d_multipliers,
                                          w.quantity);
     w.d_value.noalias() += w.GK.lazyProduct(w.d_multipliers);

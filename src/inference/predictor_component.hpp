@@ -40,10 +40,12 @@ struct Predictor::Implementation {
   bool has_force = false;                         // μ or a direction that is multiplied by M⁻¹ …
   bool has_forced_latent = false;                 // … of which the deviation needs the directions
   bool needs_acceleration = false;                // ā itself, which is none where M is singular
-  bool reads_multipliers = false;                 // a direction reads λ
+  bool reads_multipliers = false;                 // a direction of a latent that is viewed reads λ
   PredictorData<double> in_double;
   PredictorData<float> in_single;
   DataDistance distance;  // of the first component of a mixture alone
+  // Of a part of the motion that reads λ: what predicts λ, with which the whole moves.
+  std::shared_ptr<const Implementation> multipliers;
 
   Implementation(const Posterior::Implementation& posterior, View viewed, Options given);
 
@@ -62,10 +64,11 @@ struct Predictor::Implementation {
   [[nodiscard]] double distance_at(const Eigen::Ref<const Eigen::VectorXd>& state, Workspace::Implementation& w) const;
 
   // λ, and what the latents that read it add to the force and to ā
-  [[nodiscard]] bool evaluate_load(const Eigen::Ref<const Eigen::VectorXd>& state, const StateEvaluator& at,
-                                   Workspace::Implementation& w) const;
-  // G of every row, with what its change with λ adds, and G J D⁻¹
+  [[nodiscard]] Status evaluate_load(const Eigen::Ref<const Eigen::VectorXd>& state, const StateEvaluator& at,
+                                     Workspace::Implementation& w) const;
+  // G of every row at held λ; then what its change with λ adds, and G J D⁻¹
   void write_G(const StateEvaluator& at, Workspace::Implementation& w) const;
+  void add_response(Workspace::Implementation& w) const;
 
   [[nodiscard]] const Latent& latent(const PredictorTerm& term) const { return prior.latents[term.latent]; }
   [[nodiscard]] bool has_mean_force() const { return view.has_mean() && prior.mean == Prior::Mean::force; }
@@ -107,37 +110,38 @@ struct Predictor::Workspace::Implementation {
     Eigen::MatrixXd E_dsignal;               // B d(C g)/dφ (nq × D)
   };
   std::vector<AtState> terms;
-  Eigen::VectorXd a_bar;                // ā
-  Eigen::VectorXd force;                // what is multiplied by M⁻¹ in it …
-  Eigen::VectorXd a_of_force;           // … and the product
-  Eigen::VectorXd a;                    // ddq, or T ā of one latent alone
-  Eigen::VectorXd gap;                  // a − ā
-  Eigen::VectorXd of_constraint;        // Aᵀλ = M (a − ā)
-  Eigen::VectorXd applied;              // F̄ = M ā
-  Eigen::VectorXd lambda;               // λ (nc)
-  Eigen::MatrixXd L;                    // (nq × nc)
-  Eigen::MatrixXd d_of_rest;            // of dā, what is not multiplied by M⁻¹ (nq × layout size)
-  Eigen::MatrixXd d_force;              // what is
-  Eigen::MatrixXd d_forced;             // … in da alone
-  Eigen::MatrixXd d_rows;               // db − dA a (nc × layout size)
-  Eigen::MatrixXd d_a_bar, d_a;         // dā, da
-  Eigen::MatrixXd d_mass_a_bar;         // M dā
-  Eigen::MatrixXd d_of_constraint;      // dM (a − ā), then d(Aᵀλ)
-  Eigen::MatrixXd d_applied;            // dM ā, then dF̄
-  Eigen::MatrixXd value, d_value;       // every row of the quantity (× 1), (× layout size)
-  Eigen::MatrixXd G;                    // every row (× nq)
-  std::optional<MotionUnderLoad> load;  // where λ is read, and for it:
+  Eigen::VectorXd a_bar;                        // ā
+  Eigen::VectorXd force;                        // what is multiplied by M⁻¹ in it …
+  Eigen::VectorXd a_of_force;                   // … and the product
+  Eigen::VectorXd a;                            // ddq, or T ā of one latent alone
+  Eigen::VectorXd gap;                          // a − ā
+  Eigen::VectorXd of_constraint;                // Aᵀλ = M (a − ā)
+  Eigen::VectorXd applied;                      // F̄ = M ā
+  Eigen::VectorXd lambda;                       // λ (nc)
+  Eigen::MatrixXd L;                            // (nq × nc)
+  Eigen::MatrixXd d_of_rest;                    // of dā, what is not multiplied by M⁻¹ (nq × layout size)
+  Eigen::MatrixXd d_force;                      // what is
+  Eigen::MatrixXd d_forced;                     // … in da alone
+  Eigen::MatrixXd d_rows;                       // db − dA a (nc × layout size)
+  Eigen::MatrixXd d_a_bar, d_a;                 // dā, da
+  Eigen::MatrixXd d_mass_a_bar;                 // M dā
+  Eigen::MatrixXd d_of_constraint;              // dM (a − ā), then d(Aᵀλ)
+  Eigen::MatrixXd d_applied;                    // dM ā, then dF̄
+  Eigen::MatrixXd value, d_value;               // every row of the quantity (× 1), (× layout size)
+  Eigen::MatrixXd G;                            // every row (× nq)
+  std::unique_ptr<Implementation> multipliers;  // of what predicts λ
+  std::optional<MotionUnderLoad> load;          // where λ is read, and for it:
   MultiplierSolver solver;
   LoadResponse response;
   Eigen::VectorXd without_load;               // ā without the latents that read λ
   Eigen::MatrixXd slope, G_lambda, d_lambda;  // J, G_λ, d_λ
-  Eigen::MatrixXd GK;                         // G K of every row (× nc)
+  Eigen::MatrixXd GK;                         // G K of every row, of a part G J (× nc)
   Eigen::MatrixXd d_multipliers;              // ∂(G_λ ā + d_λ)/∂x at held λ (nc × layout size)
   Eigen::MatrixXd Gt, M_inverse_Gt;           // Gᵀ of the view (nq × d)
   std::vector<Eigen::MatrixXd> loadings;      // ℓ, per term (F × d)
   Eigen::MatrixXd covariance;                 // of the view, its lower triangle (d × d)
   Eigen::VectorXd coordinates;                // of the distance from the data
-  Eigen::VectorXd mean;                       // of a component of a mixture (d)
+  Eigen::VectorXd mean;                       // of a component of a mixture, or of λ (d)
   Eigen::MatrixXd jacobian;                   // likewise (d × layout size)
   PredictorData<double>::Memory in_double;
   PredictorData<float>::Memory in_single;

@@ -115,51 +115,16 @@ void require_values(const Prior& prior, const std::vector<Observations>& observa
                   [&] { return fmt::format("parameters of '{}'", prior.system->name()); });
 }
 
-namespace {
-
-// whether directions that read λ depend on a parameter at one of the states
-bool depends_under_load(const Latent& latent, const Observations& group, const Prior& there, const VectorXd& parameters,
-                        int index) {
-  const StateFunction* const directions = latent.directions ? latent.directions->of_multipliers() : nullptr;
-  if (directions == nullptr) return false;
-  MatrixXd x = MatrixXd::Ones(group.states().rows() + there.system->nc(), group.n_data());
-  x.topRows(group.states().rows()) = group.states();
-  return !directions->differentiate(x, parameters, index).isZero(0);
-}
-
-}  // namespace
-
-void require_learnable(const Prior& prior, const std::vector<Observations>& observations, const ModelValues& values,
-                       const std::vector<int>& gradient_parameters) {
+void require_learnable(const Prior& prior, const std::vector<Observations>& observations) {
   if (!prior.is_nonlinear()) return;
   const auto fail = [](const std::string& text) {
     throw InputError(fmt::format("a latent that is positive or reads lambda is not linear: {}", text));
   };
   for (const Observations& group : observations) {
-    const Prior& there = prior_of(prior, group.view());
-    if (group.has_sums()) fail("it is not learned from sums over states");
-    if (there.system->has_constraint_noise()) fail("its constraints must be exact, without noise");
     if (group.view().latent || !group.view().quantity->has_mean()) fail("it is learned from the whole motion, not from a part");
-    for (const int index : gradient_parameters) {
-      for (const Latent& latent : there.latents) {
-        if (!depends_under_load(latent, group, there, parameters_of(group.view(), values.parameters), index)) continue;
-        fail(fmt::format("the directions of latent '{}' depend on '{}', which then cannot be estimated", latent.name,
-                         prior.system->parameters()[static_cast<std::size_t>(index)].name));
-      }
-    }
   }
   for (const Latent& latent : prior.latents) {
     if (latent.free_loading) fail("its loadings are not free");
-  }
-}
-
-void require_linear(const Prior& prior, const char* who) {
-  for (const Latent& latent : prior.latents) {
-    const bool reads_load = latent.directions && latent.directions->of_multipliers() != nullptr;
-    if (!latent.is_positive && !reads_load) continue;
-    throw InputError(fmt::format("{}: only of latents that are linear, but '{}' {}{}{}", who, latent.name,
-                                 latent.is_positive ? "is positive" : "", latent.is_positive && reads_load ? " and " : "",
-                                 reads_load ? "reads lambda, where lambda0 would be linear" : ""));
   }
 }
 

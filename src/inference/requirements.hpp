@@ -23,14 +23,8 @@ void require_measured(const std::vector<Observations>& observations, const char*
 /// There are as many values as the prior and its observations have places for, finite and, where they are positive by nature, so.
 void require_values(const Prior& prior, const std::vector<Observations>& observations, const ModelValues& values);
 
-/// A nonlinear prior is learned from values of ddq, or of what else has the whole motion in it, exactly and where no constraint is
-/// soft; and no parameter is estimated that its directions along λ depend on.
-/// @param gradient_parameters  those that are estimated
-void require_learnable(const Prior& prior, const std::vector<Observations>& observations, const ModelValues& values,
-                       const std::vector<int>& gradient_parameters);
-
-/// @param who  that cannot do with a nonlinear prior, for the message
-void require_linear(const Prior& prior, const char* who);
+/// A nonlinear prior is learned from values of ddq, or of what else has the whole motion in it.
+void require_learnable(const Prior& prior, const std::vector<Observations>& observations);
 
 /// A vector or a side of a matrix has this size.
 /// @param type  of the object that takes it, for the message

@@ -81,12 +81,7 @@ const RowBlock* BlocksOfStates::block(Index b, bool with_derivatives, Memory& me
     const std::vector<int> in = with_derivatives ? gradient_parameters_ : std::vector<int>{};
     const Linearisation* about = nullptr;
     if (about_ != nullptr) {
-      const Linearisation::OfGroup& of_group = about_->groups[group];
-      memory.about.groups.resize(1);
-      Linearisation::OfGroup& of_block = memory.about.groups.front();
-      of_block.signals.resize(of_group.signals.size());
-      for (std::size_t a = 0; a < of_group.signals.size(); ++a) of_block.signals[a] = of_group.signals[a].middleCols(first, n);
-      of_block.multipliers = of_group.multipliers.middleCols(first, n);
+      memory.about.groups = {slice(about_->groups[group], first, n)};
       about = &memory.about;
     }
     if (!model_observations(prior_, memory.observations, values_.parameters, in, about, memory.models)) return nullptr;

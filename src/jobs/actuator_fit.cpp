@@ -13,7 +13,7 @@
 #include "base/parallel.hpp"
 #include "gp2/jobs/fit_memory.hpp"
 #include "gp2/training/robust.hpp"
-#include "inference/requirements.hpp"
+#include "inference/posterior_implementation.hpp"
 #include "training/curvature.hpp"
 #include "training/lbfgsb.hpp"
 #include "training/objective.hpp"
@@ -104,15 +104,37 @@ class ActuatorTraining {
       x_ = x;
       a_ = a;
     }
+    if (problem_.prior.is_nonlinear()) follow_posterior_mean();
     return estimates();
   }
 
  private:
+  // The prior is linear about the posterior mean under the delays found, until these stand.
+  void follow_posterior_mean() {
+    constexpr int most = 5;
+    for (int round = 0; round < most && !is_set(options_.stop); ++round) {
+      const std::vector<Observations> observations = rows_.under(a_);
+      try {
+        about_ = linearisation_of(problem_.prior, observations,
+                                  model_values(problem_.prior, observations, objective_of(observations).at(x_)), n_threads_);
+      } catch (const NumericalError&) {
+        return;  // where it is linear already there is none; the fit that follows says so if it finds none either
+      }
+      const VectorXd before = a_;
+      search();
+      if (((a_ - before).array().abs() <= 0.1 * unit_.array()).all()) return;
+    }
+  }
+
+  [[nodiscard]] Objective objective_of(const std::vector<Observations>& observations) const {
+    return Objective(problem_.prior, observations, problem_.hyperparameters, {.points = nullptr, .about = about_});
+  }
+
   /// J, and where it is asked for ∂J/∂x.
   double value(const VectorXd& x, const VectorXd& a, VectorXd* gradient = nullptr) const {
     // a lag that rounding takes below 0 would be none
     const std::vector<Observations> observations = rows_.under(a.cwiseMax(lower_).cwiseMin(upper_));
-    const Objective objective(problem_.prior, observations, problem_.hyperparameters);
+    const Objective objective = objective_of(observations);
     Likelihood::Workspace workspace(1, options_.stop);
     double J = objective(x, gradient, workspace);
     for (Index k = 0; k < a.size(); ++k) {
@@ -222,7 +244,7 @@ class ActuatorTraining {
     const std::vector<Hyperparameter>& hyperparameters = problem_.hyperparameters;
     const Index n = x_.size(), m = hyperparameters_only ? 0 : a_.size();
     const std::vector<Observations> observations = rows_.under(a_);
-    const Objective objective(problem_.prior, observations, hyperparameters);
+    const Objective objective = objective_of(observations);
     Likelihood::Workspace workspace(n_threads_, options_.stop);
     VectorXd scales(n + m), lower(n + m), upper(n + m), start(n + m);
     scales << scales_of_parameters(objective, x_, hyperparameters, options_.stop, workspace), unit_.head(m);
@@ -306,7 +328,7 @@ class ActuatorTraining {
   // J_aa − J_ax J_xx⁻¹ J_xa: the curvature of J over a where x is the likeliest there.
   [[nodiscard]] MatrixXd information_of(const std::vector<Index>& free) const {
     const std::vector<Observations> observations = rows_.under(a_);
-    const Objective objective(problem_.prior, observations, problem_.hyperparameters);
+    const Objective objective = objective_of(observations);
     const Curvature of_x = curvature_at(objective, x_, objective.at(x_), n_threads_, options_.stop);
     const auto m = std::ssize(free);
     MatrixXd of_a(m, m), mixed(x_.size(), m);
@@ -329,16 +351,16 @@ class ActuatorTraining {
   const FitOptions& options_;
   ThinnedProblem rows_;
   int n_threads_;
-  VectorXd x_, a_;          // where the search stands
-  VectorXd lower_, upper_;  // of a
-  VectorXd unit_;           // of a: what the optimiser sees it in
+  VectorXd x_, a_;                              // where the search stands
+  std::shared_ptr<const Linearisation> about_;  // of a nonlinear prior; null: where no latent acts
+  VectorXd lower_, upper_;                      // of a
+  VectorXd unit_;                               // of a: what the optimiser sees it in
 };
 
 }  // namespace
 
 std::vector<ActuatorEstimate> estimate_actuators(const FitProblem& problem, const FitOptions& options) {
   if (problem.late.empty()) return {};
-  require_linear(problem.prior, "the estimate of a delay or a lag");
   return ActuatorTraining(problem, options).run();
 }
 

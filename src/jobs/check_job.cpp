@@ -113,7 +113,7 @@ class LoadCheck {
         const std::string name =
             latent.size() == 1 ? fmt::format("latent '{}'", latent.name)
                                : fmt::format("latent '{}', {}", latent.name, latent.column_names[static_cast<std::size_t>(l)]);
-        if (latent.directions->of_multipliers() != nullptr) {
+        if (latent.reads_multipliers()) {
           add_jam(name, a, l, findings);
         } else {
           add_left_out(name, a, l, findings);

@@ -13,10 +13,10 @@ using Eigen::Ref;
 using Eigen::VectorXd;
 
 ExpressionFunction::ExpressionFunction(std::span<const Expression> expressions, std::span<const Expression> inputs,
-                                       std::size_t n_states)
+                                       std::size_t n_states, std::size_t n_derivatives)
     : n_states_(static_cast<Eigen::Index>(n_states)),
       values_(expressions, inputs),
-      state_derivatives_(expressions, inputs, static_cast<int>(n_states)) {}
+      state_derivatives_(expressions, inputs, static_cast<int>(n_derivatives)) {}
 
 std::shared_ptr<const StateFunction> ExpressionFunction::of_state(std::span<const Expression> expressions,
                                                                   const SystemSymbols& symbols,
@@ -27,7 +27,7 @@ std::shared_ptr<const StateFunction> ExpressionFunction::of_state(std::span<cons
     throw InputError("lambda is what the latents make it, so that only directions and [truth] may read it; write lambda0");
   }
   inputs.insert(inputs.end(), load.variables.begin(), load.variables.end());
-  std::shared_ptr<const StateFunction> function(new ExpressionFunction(expressions, inputs, inputs.size()));
+  std::shared_ptr<const StateFunction> function(new ExpressionFunction(expressions, inputs, inputs.size(), inputs.size()));
   if (load.variables.empty()) return function;
   return std::make_shared<LoadFunction>(std::move(function), system);
 }
@@ -38,12 +38,13 @@ std::shared_ptr<const StateFunction> ExpressionFunction::of_state_and_parameters
                                                                                  const std::shared_ptr<const System>& system) {
   const Multipliers load = multipliers_in(expressions, *system);
   const std::vector<Expression> inputs = symbols.state_and_parameters(load.variables);
-  std::shared_ptr<ExpressionFunction> function(
-      new ExpressionFunction(expressions, inputs, inputs.size() - symbols.parameters.size()));
+  const std::size_t n_states = inputs.size() - symbols.parameters.size();
+  std::shared_ptr<ExpressionFunction> function(new ExpressionFunction(expressions, inputs, n_states, n_states));
   for (const Expression parameter : symbols.parameters) {
     std::vector<Expression> derivatives;
     for (const Expression expression : expressions) derivatives.push_back(graph.differentiate(expression, parameter));
-    function->parameter_derivatives_.emplace_back(derivatives, inputs);
+    function->parameter_derivatives_.emplace_back(
+        new ExpressionFunction(derivatives, inputs, n_states, load.are_of_motion ? n_states : 0));
   }
   if (load.variables.empty()) return function;
   return std::make_shared<LoadFunction>(std::move(function), system, load.are_of_motion);
@@ -60,9 +61,11 @@ MatrixXd ExpressionFunction::evaluate(const States& states, const Parameters& pa
 }
 
 MatrixXd ExpressionFunction::differentiate(const States& states, const Parameters& parameters, int index) const {
-  MatrixXd derivatives;
-  parameter_derivatives_[static_cast<std::size_t>(index)].evaluate(states, parameters, derivatives);
-  return derivatives;
+  return parameter_derivatives_[static_cast<std::size_t>(index)]->evaluate(states, parameters);
+}
+
+const StateFunction* ExpressionFunction::parameter_derivative(int index) const {
+  return parameter_derivatives_[static_cast<std::size_t>(index)].get();
 }
 
 class ExpressionFunction::TapeEvaluator final : public Evaluator {

@@ -22,17 +22,20 @@ class ExpressionFunction final : public StateFunction {
   [[nodiscard]] int size() const override { return values_.n_outputs(); }
   [[nodiscard]] Eigen::MatrixXd evaluate(const States& states, const Parameters& parameters) const override;
   [[nodiscard]] Eigen::MatrixXd differentiate(const States& states, const Parameters& parameters, int index) const override;
+  [[nodiscard]] const StateFunction* parameter_derivative(int index) const override;
   [[nodiscard]] bool reads(int state_index) const override { return values_.uses_input(state_index); }
   [[nodiscard]] std::unique_ptr<Evaluator> make_evaluator(const Parameters& parameters) const override;
 
  private:
-  ExpressionFunction(std::span<const Expression> expressions, std::span<const Expression> inputs, std::size_t n_states);
+  // @param n_derivatives  of the entries of a state, the first ones, in which there are derivatives
+  ExpressionFunction(std::span<const Expression> expressions, std::span<const Expression> inputs, std::size_t n_states,
+                     std::size_t n_derivatives);
   class TapeEvaluator;
 
   Eigen::Index n_states_;  // entries of a state
   Tape values_;
   StateDerivatives state_derivatives_;
-  std::vector<Tape> parameter_derivatives_;  // one per parameter of the system
+  std::vector<std::shared_ptr<const ExpressionFunction>> parameter_derivatives_;  // one per parameter of the system
 };
 
 }  // namespace gp2

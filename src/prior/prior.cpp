@@ -97,9 +97,7 @@ void require_prior(const Prior& prior) {
 }
 
 bool Prior::is_nonlinear() const {
-  return std::ranges::any_of(latents, [](const Latent& latent) {
-    return latent.is_positive || (latent.directions && latent.directions->of_multipliers() != nullptr);
-  });
+  return std::ranges::any_of(latents, [](const Latent& latent) { return latent.is_positive || latent.reads_multipliers(); });
 }
 
 std::vector<bool> Prior::reads() const {

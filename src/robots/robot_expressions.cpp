@@ -326,6 +326,7 @@ Expression RobotExpressions::potential() {
 }
 
 const std::vector<RobotExpressions::Motion>& RobotExpressions::motions() {
+  const std::scoped_lock lock(growing_);
   if (!motions_.empty()) return motions_;
   const ExpressionVector zero = constant(graph_, Vector3d(Vector3d::Zero()));
   const Motion world{constant(graph_, Matrix3d(Matrix3d::Identity())), zero, zero, zero, zero, zero, zero};
@@ -448,6 +449,7 @@ std::string names_of(const Things& things) {
 }  // namespace
 
 const RobotQuantity& RobotExpressions::quantity(const std::string& name) {
+  const std::scoped_lock lock(growing_);
   if (const auto known = quantities_.find(name); known != quantities_.end()) return known->second;
   const QuantityName parts = parse_quantity(name);
 

@@ -1,6 +1,7 @@
 #pragma once
 
 #include <map>
+#include <mutex>
 #include <optional>
 #include <string>
 #include <utility>
@@ -137,6 +138,7 @@ class RobotExpressions {
   std::vector<Link> links_;                                 // one per axis of a joint
   std::vector<std::pair<std::size_t, std::size_t>> balls_;  // first coordinate and first link of each quaternion
   std::vector<Frame> frames_;                               // one per body
+  std::recursive_mutex growing_;                            // of what is made where it is asked for first:
   std::vector<Motion> motions_;
   std::map<std::string, RobotQuantity> quantities_;
 };

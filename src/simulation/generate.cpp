@@ -409,18 +409,6 @@ GeneratedData draw_states(const Model& model, const GenerateOptions& options, Ra
   return data;
 }
 
-// what soft constraints let measured accelerations deviate
-void add_slip(const System& system, RandomStream& random, GeneratedData& data) {
-  const ViewValues values = evaluate_view(View::constrained_acceleration(system),
-                                          require_mechanics(system, data.states, system.parameter_values()), data.states);
-  for (int i = 0; i < data.states.cols(); ++i) {
-    const auto N = values.N(i);
-    VectorXd slip(N.cols());
-    for (double& one : slip) one = random.normal();
-    data.accelerations.col(i) += N * slip;
-  }
-}
-
 }  // namespace
 
 GeneratedData generate(const Model& model, const GenerateOptions& options) {
@@ -444,15 +432,18 @@ GeneratedData generate(const Model& model, const GenerateOptions& options) {
   RandomStream random(options.seed);
   GeneratedData data = model.motion ? GeneratedData{generate_motion(model, options.n, random), {}, every_entry(system)}
                                     : draw_states(model, options, random);
-  data.accelerations = true_acceleration(model, data.states);
-  if (options.noise_stddev.isZero(0)) return data;
   // noise comes last, so that states are the same for any noise
-  for (Index i = 0; i < data.accelerations.cols(); ++i) {
-    for (Index j = 0; j < data.accelerations.rows(); ++j) {
-      if (options.noise_stddev[j] > 0) data.accelerations(j, i) += options.noise_stddev[j] * random.normal();
+  MatrixXd noise = MatrixXd::Zero(system.nq(), data.states.cols()), slip;
+  for (Index i = 0; i < noise.cols(); ++i) {
+    for (Index j = 0; j < noise.rows(); ++j) {
+      if (options.noise_stddev[j] > 0) noise(j, i) = options.noise_stddev[j] * random.normal();
     }
   }
-  if (system.has_constraint_noise()) add_slip(system, random, data);
+  if (!options.noise_stddev.isZero(0)) {
+    slip.resize((system.constraint_noise().array() > 0).count(), noise.cols());
+    for (double& one : slip.reshaped()) one = random.normal();
+  }
+  data.accelerations = true_acceleration(model, data.states, slip) + noise;
   return data;
 }
 

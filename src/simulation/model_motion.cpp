@@ -38,7 +38,8 @@ ModelMotion::ModelMotion(const Model& model) : system_(model.system), parameters
 }
 
 // [states; λ]
-MatrixXd ModelMotion::with_load(const Eigen::Ref<const MatrixXd>& states, const MechanicsBatch& mechanics) const {
+MatrixXd ModelMotion::with_load(const Eigen::Ref<const MatrixXd>& states, const MechanicsBatch& mechanics,
+                                const MatrixXd& slip) const {
   const Eigen::Index n_state = states.rows(), nq = system_->nq(), nc = system_->nc();
   const ViewValues multipliers = evaluate_view(View::multipliers(*system_), mechanics, states);
   MatrixXd x(n_state + nc, states.cols());
@@ -67,7 +68,9 @@ MatrixXd ModelMotion::with_load(const Eigen::Ref<const MatrixXd>& states, const 
       a_bar = projection.solve_mass(mechanics.values.F(i) + values(truth_force_, nq)) + values(truth_, nq);
       slope = projection.solve_mass(slopes(truth_force_slopes_)) + slopes(truth_slopes_);
     };
-    if (!solver.solve(multipliers.G(i), multipliers.offset.col(i), motion)) {
+    VectorXd d = multipliers.offset.col(i);
+    if (slip.size() > 0) d += multipliers.N(i) * slip.col(i);
+    if (!solver.solve(multipliers.G(i), d, motion)) {
       throw InputError(internal::describe_fault(*system_, states, solver.fault(i)));
     }
     x.col(i).tail(nc) = solver.lambda();
@@ -75,7 +78,8 @@ MatrixXd ModelMotion::with_load(const Eigen::Ref<const MatrixXd>& states, const 
   return x;
 }
 
-MatrixXd ModelMotion::unconstrained(const Eigen::Ref<const MatrixXd>& states, const MechanicsBatch& mechanics) const {
+MatrixXd ModelMotion::unconstrained(const Eigen::Ref<const MatrixXd>& states, const MechanicsBatch& mechanics,
+                                    const MatrixXd& slip) const {
   MatrixXd truth = MatrixXd::Zero(system_->nq(), states.cols()), truth_force = truth;
   const auto evaluate = [&](const Eigen::Ref<const MatrixXd>& x) {
     if (truth_.n_outputs() > 0) truth_.evaluate(x, parameters_, truth);
@@ -89,7 +93,7 @@ MatrixXd ModelMotion::unconstrained(const Eigen::Ref<const MatrixXd>& states, co
       evaluate(with_known_multipliers(*system_, states, parameters_));
       break;
     case Load::of_motion:
-      evaluate(with_load(states, mechanics));
+      evaluate(with_load(states, mechanics, slip));
       break;
   }
   MatrixXd accelerations(system_->nq(), states.cols());
@@ -109,12 +113,15 @@ MatrixXd ModelMotion::unconstrained_acceleration(const Eigen::Ref<const MatrixXd
   return unconstrained(states, require_mechanics(*system_, states, parameters_));
 }
 
-MatrixXd ModelMotion::acceleration(const Eigen::Ref<const MatrixXd>& states) const {
+MatrixXd ModelMotion::acceleration(const Eigen::Ref<const MatrixXd>& states, const MatrixXd& slip) const {
   const MechanicsBatch mechanics = require_mechanics(*system_, states, parameters_);
-  MatrixXd accelerations = unconstrained(states, mechanics);
+  MatrixXd accelerations = unconstrained(states, mechanics, slip);
   for (Eigen::Index i = 0; i < states.cols(); ++i) {
     accelerations.col(i) = mechanics.projections[static_cast<std::size_t>(i)].constrain(accelerations.col(i));
   }
+  if (slip.size() == 0) return accelerations;
+  const ViewValues view = evaluate_view(View::constrained_acceleration(*system_), mechanics, states);
+  for (int i = 0; i < static_cast<int>(states.cols()); ++i) accelerations.col(i) += view.N(i) * slip.col(i);
   return accelerations;
 }
 
@@ -134,9 +141,9 @@ MatrixXd ModelMotion::multipliers(const Eigen::Ref<const MatrixXd>& states) cons
   return multipliers;
 }
 
-MatrixXd true_acceleration(const Model& model, const Eigen::Ref<const MatrixXd>& states) {
+MatrixXd true_acceleration(const Model& model, const Eigen::Ref<const MatrixXd>& states, const MatrixXd& slip) {
   require_truth(model);
-  MatrixXd accelerations = ModelMotion(model).acceleration(states);
+  MatrixXd accelerations = ModelMotion(model).acceleration(states, slip);
   for (int i = 0; i < static_cast<int>(states.cols()); ++i) {
     if (!accelerations.col(i).allFinite()) {
       throw InputError(fmt::format("{}: the true acceleration is not a finite number at sample {}", model.name, i + 1));

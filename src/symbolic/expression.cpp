@@ -49,6 +49,25 @@ void internal::StepLimit::count(std::size_t steps) {
 }
 
 std::uint32_t ExpressionGraph::Implementation::intern(const Node& node) {
+  const std::scoped_lock lock(growing_);
+  return intern_alone(node);
+}
+
+std::uint32_t ExpressionGraph::Implementation::intern(std::string_view name) {
+  const std::scoped_lock lock(growing_);
+  if (const auto found = variable_ids_.find(name); found != variable_ids_.end()) return found->second;
+  const std::uint32_t id = intern_alone({Operation::variable, static_cast<std::uint32_t>(names.size()), 0, 0});
+  names.push_back(std::string(name));
+  variable_ids_.emplace(name, id);
+  return id;
+}
+
+std::size_t ExpressionGraph::Implementation::size() const {
+  const std::scoped_lock lock(growing_);
+  return nodes.size();
+}
+
+std::uint32_t ExpressionGraph::Implementation::intern_alone(const Node& node) {
   internal::StepLimit::count(1);
   Key key{node.operation, node.a, node.b, std::bit_cast<std::uint64_t>(node.value)};
   if (internal::is_commutative(node.operation) && key.a > key.b) std::swap(key.a, key.b);
@@ -200,7 +219,7 @@ std::optional<Expression> simplify(Operation operation, Expression a, Expression
 ExpressionGraph::ExpressionGraph() : implementation_(std::make_unique<Implementation>()) {}
 ExpressionGraph::~ExpressionGraph() = default;
 
-std::size_t ExpressionGraph::size() const { return implementation_->nodes.size(); }
+std::size_t ExpressionGraph::size() const { return implementation_->size(); }
 
 Expression ExpressionGraph::constant(double value) {
   if (!std::isfinite(value)) throw InputError(fmt::format("expressions: a constant must be finite, got {}", value));
@@ -208,15 +227,7 @@ Expression ExpressionGraph::constant(double value) {
   return {this, implementation_->intern({Operation::constant, 0, 0, value == 0 ? 0.0 : value})};
 }
 
-Expression ExpressionGraph::variable(std::string_view name) {
-  auto& ids = implementation_->variable_ids;
-  if (const auto found = ids.find(name); found != ids.end()) return {this, found->second};
-  const auto index = static_cast<std::uint32_t>(implementation_->names.size());
-  const std::uint32_t id = implementation_->intern({Operation::variable, index, 0, 0});
-  implementation_->names.emplace_back(name);
-  ids.emplace(name, id);
-  return {this, id};
-}
+Expression ExpressionGraph::variable(std::string_view name) { return {this, implementation_->intern(name)}; }
 
 Expression ExpressionGraph::apply(Operation operation, Expression a) {
   assert(!is_leaf(operation) && !is_binary(operation));

@@ -2,14 +2,17 @@
 
 // The inside of an ExpressionGraph, and the arithmetic that constant folding and the evaluation tape share.
 
+#include <array>
 #include <bit>
 #include <cmath>
 #include <cstdlib>
-#include <deque>
 #include <map>
+#include <memory>
+#include <mutex>
 #include <optional>
 #include <span>
 #include <string>
+#include <string_view>
 #include <unordered_map>
 #include <utility>
 #include <vector>
@@ -38,6 +41,33 @@ class StepLimit {
 
  private:
   bool is_outermost_;
+};
+
+/// Values that are added at the end and never change: what has been added is read while another thread adds more. Block k holds
+/// 64·2ᵏ of them.
+template <typename Value>
+class Growing {
+ public:
+  [[nodiscard]] std::size_t size() const { return size_; }
+  const Value& operator[](std::size_t i) const {
+    const int block = block_of(i);
+    return blocks_[static_cast<std::size_t>(block)][i - first_of(block)];
+  }
+  /// By one thread at a time.
+  void push_back(Value value) {
+    const int block = block_of(size_);
+    std::unique_ptr<Value[]>& values = blocks_.at(static_cast<std::size_t>(block));
+    if (!values) values = std::make_unique<Value[]>(first << block);
+    values[size_ - first_of(block)] = std::move(value);
+    ++size_;
+  }
+
+ private:
+  static constexpr std::size_t first = 64;
+  static int block_of(std::size_t i) { return std::bit_width((i + first) / first) - 1; }
+  static std::size_t first_of(int block) { return (first << block) - first; }
+  std::array<std::unique_ptr<Value[]>, 15> blocks_;  // more than ExpressionGraph::max_nodes
+  std::size_t size_ = 0;
 };
 
 struct Node {
@@ -159,12 +189,13 @@ void with_arithmetic(Operation operation, Use&& use) {
 }  // namespace internal
 
 struct ExpressionGraph::Implementation {
-  std::vector<internal::Node> nodes;  // operands come before what uses them
-  std::deque<std::string> names;      // of the variables, in order of appearance; references to them stay valid
-  std::map<std::string, std::uint32_t, std::less<>> variable_ids;
+  internal::Growing<internal::Node> nodes;  // operands come before what uses them
+  internal::Growing<std::string> names;     // of the variables, in order of appearance
 
-  /// The id of `node`, which is stored unless an equal one is there already.
+  /// The id of `node`, which is stored unless an equal one is there already; and of a variable.
   std::uint32_t intern(const internal::Node& node);
+  std::uint32_t intern(std::string_view name);
+  [[nodiscard]] std::size_t size() const;
 
   /// Ids of everything the roots are made of, themselves included, ascending: operands before what uses them.
   [[nodiscard]] std::vector<std::uint32_t> reachable(std::span<const std::uint32_t> roots) const;
@@ -185,7 +216,11 @@ struct ExpressionGraph::Implementation {
       return static_cast<std::size_t>(hash ^ (hash >> 32));
     }
   };
+  std::uint32_t intern_alone(const internal::Node& node);  // while the mutex is held
+
+  mutable std::mutex growing_;
   std::unordered_map<Key, std::uint32_t, KeyHash> ids_;  // looked up, never iterated
+  std::map<std::string, std::uint32_t, std::less<>> variable_ids_;
 };
 
 }  // namespace gp2

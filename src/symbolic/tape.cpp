@@ -21,6 +21,7 @@ namespace {
 constexpr Index block_size = 64;  // points evaluated together
 
 using Node = internal::Node;
+using Nodes = internal::Growing<Node>;
 
 // by id of the variable
 std::unordered_map<std::uint32_t, std::uint32_t> index_inputs(std::span<const Expression> inputs, const ExpressionGraph& graph) {
@@ -44,17 +45,17 @@ std::vector<std::uint32_t> roots_of(std::span<const Expression> outputs, const E
 }
 
 // of a power with a small constant integer as exponent; else 0
-int exponent_of(const std::vector<Node>& nodes, const Node& node) {
+int exponent_of(const Nodes& nodes, const Node& node) {
   const bool constant_exponent = node.operation == Operation::power && nodes[node.b].operation == Operation::constant;
   return constant_exponent ? internal::small_integer(nodes[node.b].value).value_or(0) : 0;
 }
 
-bool reads_b(const std::vector<Node>& nodes, const Node& node) {
+bool reads_b(const Nodes& nodes, const Node& node) {
   return internal::is_binary(node.operation) && exponent_of(nodes, node) == 0;
 }
 
 // the position in `order` at which each value is read last; outputs are kept to the end
-std::unordered_map<std::uint32_t, std::size_t> last_reads(const std::vector<Node>& nodes, const std::vector<std::uint32_t>& order,
+std::unordered_map<std::uint32_t, std::size_t> last_reads(const Nodes& nodes, const std::vector<std::uint32_t>& order,
                                                           const std::vector<std::uint32_t>& roots) {
   std::unordered_map<std::uint32_t, std::size_t> last_read;
   for (std::size_t k = 0; k < order.size(); ++k) {
@@ -72,7 +73,7 @@ Tape::Tape(std::span<const Expression> outputs, std::span<const Expression> inpu
   internal::StepLimit::count(inputs.size() + outputs.size());
   if (outputs.empty()) return;
   ExpressionGraph& graph = outputs.front().graph();
-  const std::vector<Node>& nodes = graph.implementation_->nodes;
+  const Nodes& nodes = graph.implementation_->nodes;
   const std::unordered_map<std::uint32_t, std::uint32_t> input_index = index_inputs(inputs, graph);
   const std::vector<std::uint32_t> roots = roots_of(outputs, graph);
   const std::vector<std::uint32_t> order = graph.implementation_->reachable(roots);

@@ -9,7 +9,7 @@
 #include "base/lapack.hpp"
 #include "base/parallel.hpp"
 #include "gp2/inference/evaluation.hpp"
-#include "inference/requirements.hpp"
+#include "inference/posterior_implementation.hpp"
 #include "training/curvature.hpp"
 
 namespace gp2 {
@@ -36,8 +36,11 @@ MatrixXd information_of_fit(const Prior& prior, const std::vector<Observations>&
                             const std::vector<Hyperparameter>& hyperparameters, const std::vector<int>& theta, int n_threads,
                             const std::atomic<bool>* stop) {
   if (theta.empty()) return MatrixXd(0, 0);
-  require_linear(prior, "the next experiment");
-  const Objective objective(prior, observations, hyperparameters);
+  Approximation approximation;
+  if (prior.is_nonlinear()) {
+    approximation.about = linearisation_of(prior, observations, model_values(prior, observations, hyperparameters));
+  }
+  const Objective objective(prior, observations, hyperparameters, approximation);
   const Curvature curvature = curvature_at(objective, coordinates(hyperparameters), hyperparameters, n_threads, stop);
   // parameters at a bound are not free, and known by nothing else than their bounds
   std::vector<int> all = curvature.free;

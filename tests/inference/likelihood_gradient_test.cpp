@@ -178,29 +178,31 @@ TEST(LikelihoodGradientTest, MatchesDifferencesThroughInducingPoints) {
 
 // every latent acts nonlinearly there, about signals that are not those of a posterior
 TEST(LikelihoodGradientTest, MatchesDifferencesWhereAPriorIsMadeLinear) {
-  const Model& model = test::model_that_rubs();
-  PriorOptions options;
-  options.mean = Prior::Mean::force;
-  Problem p{"runner that rubs", make_prior(model, options), {}, {}, {}, {}};
-  RandomStream random(likelihood_gradient_seed);
-  const MatrixXd states = test::draw(model, 9, likelihood_gradient_seed).states;
-  for (const View& view : {View::constrained_acceleration(*model.system), View::constraint_force(*model.system)}) {
-    p.observations.push_back(test::observe(model, view, states, random));
-  }
-  p.values = test::random_values(p.prior, p.observations, random);
-  Linearisation about;
-  for (const Observations& group : p.observations) {
-    const MechanicsBatch mechanics = require_mechanics(*model.system, group.states(), p.values.parameters);
-    const NonlinearMotion motion(p.prior, group.states(), p.values.parameters, mechanics,
-                                 evaluate_prior(p.prior, group.states(), p.values.parameters, mechanics));
-    about.groups.push_back(motion.without_signals());
-    for (MatrixXd& signals : about.groups.back().signals) {
-      for (double& one : signals.reshaped()) one = 0.1 * random.normal();
+  for (const Model& model : {test::model_that_rubs(), test::model_that_rubs_softly()}) {
+    PriorOptions options;
+    options.mean = Prior::Mean::force;
+    Problem p{model.name, make_prior(model, options), {}, {}, {}, {}};
+    RandomStream random(likelihood_gradient_seed);
+    const MatrixXd states = test::draw(model, 9, likelihood_gradient_seed).states;
+    for (const View& view : {View::constrained_acceleration(*model.system), View::constraint_force(*model.system)}) {
+      p.observations.push_back(test::observe(model, view, states, random));
     }
-    ASSERT_FALSE(motion.solve(about.groups.back()));
+    p.values = test::random_values(p.prior, p.observations, random);
+    Linearisation about;
+    for (const Observations& group : p.observations) {
+      const MechanicsBatch mechanics = require_mechanics(*model.system, group.states(), p.values.parameters);
+      const NonlinearMotion motion(p.prior, group.states(), p.values.parameters, mechanics,
+                                   evaluate_prior(p.prior, group.states(), p.values.parameters, mechanics));
+      about.groups.push_back(motion.without_signals());
+      for (MatrixXd& signals : about.groups.back().signals) {
+        for (double& one : signals.reshaped()) one = 0.1 * random.normal();
+      }
+      ASSERT_FALSE(motion.solve(about.groups.back()));
+    }
+    p.values.about = std::make_shared<Linearisation>(about);
+    expect_gradient(p);
+    if (!model.system->has_constraint_noise()) expect_gradient(test::with_sums(p, true, likelihood_gradient_seed));
   }
-  p.values.about = std::make_shared<Linearisation>(about);
-  expect_gradient(p);
 }
 
 // the sums over pairs of samples go tile by tile: here are several, and samples whose ranks differ

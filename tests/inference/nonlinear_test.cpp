@@ -5,8 +5,11 @@
 #include <gtest/gtest.h>
 
 #include "allocation_count.hpp"
+#include "base/not_a_number.hpp"
+#include "gp2/export/c_source.hpp"
 #include "gp2/fit.hpp"
 #include "gp2/inference/inducing.hpp"
+#include "gp2/inference/inverse_dynamics.hpp"
 #include "gp2/inference/leave_one_out.hpp"
 #include "gp2/inference/pathwise.hpp"
 #include "gp2/jobs/check_job.hpp"
@@ -190,7 +193,8 @@ TEST(CheckOfALoad, WarnsOfARowWhoseShareOfItNothingTells) {
 // ---------------------------------------------------------------- the linear prior
 
 struct Rubs {
-  Model model = test::model_that_rubs();
+  Model model;
+  explicit Rubs(Model of = test::model_that_rubs()) : model(std::move(of)) {}
   Prior prior = [&] {
     PriorOptions options;
     options.mean = Prior::Mean::force;
@@ -265,13 +269,58 @@ TEST(NonlinearMotion, IsTangentToTheMotionAndItsAccelerationsHoldTheConstraints)
   }
 }
 
+// As b grows with a slip, so do the load and what it causes.
+TEST(NonlinearMotion, HasTheNoiseOfSoftConstraintsAsItChangesWithB) {
+  const Rubs rubs(test::model_that_rubs_softly());
+  const Linearisation::OfGroup signals = rubs.signals(0.1);
+  for (const View& view : {View::constrained_acceleration(*rubs.model.system), View::constraint_force(*rubs.model.system),
+                           View::multipliers(*rubs.model.system)}) {
+    SCOPED_TRACE(view.quantity->word());
+    const auto at_offset = [&](const char* name, double offset, ViewValues& viewed) {
+      VectorXd parameters = rubs.parameters;
+      parameters[rubs.model.system->parameter_index(name)] = offset;
+      const MechanicsBatch mechanics = evaluate_mechanics(*rubs.model.system, rubs.states, parameters);
+      const NonlinearMotion motion(rubs.prior, rubs.states, parameters, mechanics, rubs.values);
+      Linearisation::OfGroup at = signals;
+      EXPECT_FALSE(motion.solve(at));
+      viewed = evaluate_view(view, mechanics, rubs.states);
+      PriorValues prior;
+      motion.linearise(view, at, viewed, prior);
+      return view_at(viewed, prior, at.signals);
+    };
+    const double step = 1e-4;
+    for (const auto& [name, column, stddev] : {std::tuple("bank", 0, 0.4), std::tuple("turn", 1, 0.3)}) {
+      ViewValues viewed;
+      const MatrixXd slope = (at_offset(name, step, viewed) - at_offset(name, -step, viewed)) / (2 * step);
+      static_cast<void>(at_offset(name, 0, viewed));
+      for (int i = 0; i < 6; ++i) {
+        EXPECT_LE(test::largest(viewed.N(i).col(column) - stddev * slope.col(i)), 1e-6 * (1 + test::largest(slope)));
+      }
+    }
+  }
+}
+
+TEST(Multipliers, OfATruthAnswerToASlip) {
+  const Model& model = test::model_that_rubs_softly();
+  const MatrixXd states = test::draw(model, 20, nonlinear_seed).states;
+  const MatrixXd slip = MatrixXd::Constant(2, 1, 0.7).replicate(1, states.cols());
+  const std::string moved = test::changed(model.text, {{"bank = 0", "bank = 0.28"}, {"turn = 0", "turn = 0.21"}});
+  const MatrixXd expected = ModelMotion(Model::parse(moved, "moved")).acceleration(states);
+  EXPECT_LE(test::largest(ModelMotion(model).acceleration(states, slip) - expected), 1e-11 * (1 + test::largest(expected)));
+}
+
 // ---------------------------------------------------------------- the posterior
 
 // One unknown number: Laplace's approximation is that of a function of one variable.
 TEST(NonlinearPosterior, OfOneNumberIsLaplacesApproximation) {
-  for (const bool is_positive : {false, true}) {
-    SCOPED_TRACE(is_positive ? "positive" : "of the multiplier");
-    const Model model = rubbing_bead("lambda", "constant", is_positive ? "positive = true" : "");
+  for (const auto& [is_positive, is_soft, has_sums] :
+       {std::tuple(false, false, false), std::tuple(true, false, false), std::tuple(false, true, false),
+        std::tuple(true, true, false), std::tuple(false, false, true), std::tuple(true, false, true)}) {
+    SCOPED_TRACE(
+        fmt::format("{}{}{}", is_positive ? "positive" : "of the multiplier", is_soft ? ", soft" : "", has_sums ? ", sums" : ""));
+    const std::string hard = rubbing_bead("lambda", "constant", is_positive ? "positive = true" : "").text,
+                      soft = "[{ expr = \"z - h*x^2\", noise = 0.6 }]";
+    const Model model = Model::parse(is_soft ? test::changed(hard, {{"[\"z - h*x^2\"]", soft}}) : hard, "bead");
     PriorOptions options;
     options.mean = Prior::Mean::force;
     const Prior prior = make_prior(model, options);
@@ -281,7 +330,19 @@ TEST(NonlinearPosterior, OfOneNumberIsLaplacesApproximation) {
     RandomStream random(nonlinear_seed);
     MatrixXd y = ModelMotion(model).acceleration(states);
     for (double& one : y.reshaped()) one += sigma * random.normal();
-    const std::vector<Observations> observations{Observations(states, view, y, VectorXd::Constant(2, sigma))};
+    std::vector<Observations> observations{Observations(states, view, y, VectorXd::Constant(2, sigma))};
+    // of both rows at each state but the last: 0.8 of its value less 0.3 of the next one's
+    MatrixXd D = MatrixXd::Identity(50, 50);
+    if (has_sums) {
+      D.setZero(48, 50);
+      std::vector<WeightedSum> sums;
+      for (int k = 0; k < 48; ++k) {
+        D(k, k) = 0.8;
+        D(k, k + 2) = -0.3;
+        sums.push_back({k % 2, k / 2, Eigen::Vector2d(0.8, -0.3), D.row(k).dot(y.reshaped()), VectorXd::Ones(1)});
+      }
+      observations[0] = observations[0].with_sums(sums);
+    }
     ModelValues values{
         {VectorXd()}, {VectorXd::Constant(1, s)}, {}, {VectorXd::Constant(2, sigma)}, model.system->parameter_values()};
     values.kernel[0] = VectorXd::Ones(std::ssize(prior.latents[0].kernel.parameters()));
@@ -289,37 +350,52 @@ TEST(NonlinearPosterior, OfOneNumberIsLaplacesApproximation) {
     const MechanicsBatch mechanics = evaluate_mechanics(*model.system, states, values.parameters);
     const NonlinearMotion motion(prior, states, values.parameters, mechanics,
                                  evaluate_prior(prior, states, values.parameters, mechanics));
+    ViewValues viewed;
     const auto ddq = [&](double signal) {
       Linearisation::OfGroup at = motion.without_signals();
       at.signals[0].setConstant(signal);
       EXPECT_FALSE(motion.solve(at));
-      ViewValues viewed = evaluate_view(view, mechanics, states);
+      viewed = evaluate_view(view, mechanics, states);
       PriorValues linear;
       motion.linearise(view, at, viewed, linear);
       return view_at(viewed, linear, at.signals);
     };
-    const auto objective = [&](double signal) {
-      return 0.5 * std::pow(signal / s, 2) + 0.5 * ((y - ddq(signal)) / sigma).squaredNorm();
+    // S, which follows the signal where constraints are soft
+    Eigen::LLT<MatrixXd> S;
+    const auto set_noise = [&](double signal) {
+      static_cast<void>(ddq(signal));
+      MatrixXd noise = sigma * sigma * MatrixXd::Identity(D.rows(), D.rows());
+      for (int i = 0; is_soft && i < 25; ++i) noise.block(2 * i, 2 * i, 2, 2) += viewed.N(i) * viewed.N(i).transpose();
+      S.compute(noise);
     };
-    // golden section, from a bracket
-    double low = -3, high = 0.9;
-    for (int step = 0; step < 90; ++step) {
-      const double left = high - 0.618034 * (high - low), right = low + 0.618034 * (high - low);
-      (objective(left) < objective(right) ? high : low) = objective(left) < objective(right) ? right : left;
+    const auto whitened = [&](const MatrixXd& of) { return VectorXd(S.matrixL().solve(D * of.reshaped())); };
+    const auto objective = [&](double signal) {
+      return 0.5 * std::pow(signal / s, 2) + 0.5 * whitened(y - ddq(signal)).squaredNorm();
+    };
+    double best = 0;
+    for (int round = 0; round < (is_soft ? 12 : 1); ++round) {
+      set_noise(best);
+      // golden section, from a bracket
+      double low = -3, high = 0.9;
+      for (int step = 0; step < 90; ++step) {
+        const double left = high - 0.618034 * (high - low), right = low + 0.618034 * (high - low);
+        (objective(left) < objective(right) ? high : low) = objective(left) < objective(right) ? right : left;
+      }
+      best = 0.5 * (low + high);
     }
-    const double best = 0.5 * (low + high), step = 1e-5;
-    const double curvature = 1 / (s * s) + ((ddq(best + step) - ddq(best - step)) / (2 * step * sigma)).squaredNorm();
-    const double n = static_cast<double>(y.size());
-    const double laplace =
-        objective(best) + 0.5 * std::log(curvature * s * s) + n * std::log(sigma) + 0.5 * n * std::log(2 * std::numbers::pi);
+    set_noise(best);
+    const double step = 1e-5;
+    const MatrixXd slope_there = (ddq(best + step) - ddq(best - step)) / (2 * step);
+    const double curvature = 1 / (s * s) + whitened(slope_there).squaredNorm();
+    const double laplace = objective(best) + 0.5 * std::log(curvature * s * s) + S.matrixLLT().diagonal().array().log().sum() +
+                           0.5 * static_cast<double>(D.rows()) * std::log(2 * std::numbers::pi);
 
     const Posterior posterior(prior, observations, values);
     EXPECT_NEAR(posterior.negative_log_likelihood(), laplace, 1e-6 * (1 + std::abs(laplace)));
     const MatrixXd elsewhere = test::draw(model, 25, nonlinear_seed).states;
     EXPECT_LE(test::largest(posterior.mean(view, elsewhere) - ddq(best)), 2e-6);
     const auto marginal = posterior.marginal(view, elsewhere);
-    const MatrixXd slope = (ddq(best + step) - ddq(best - step)) / (2 * step);
-    EXPECT_LE(test::largest(marginal.stddev() - slope.cwiseAbs() / std::sqrt(curvature)), 1e-6);
+    EXPECT_LE(test::largest(marginal.stddev() - slope_there.cwiseAbs() / std::sqrt(curvature)), 1e-6);
   }
 }
 
@@ -428,17 +504,24 @@ TEST(NonlinearPosterior, MeansSamplesAndPathsHoldTheConstraintsAndTheFixedPoint)
 }
 
 TEST(NonlinearPredictor, IsThePosteriorWithItsJacobianAndAllocatesNothing) {
-  for (const bool rubs : {true, false}) {
-    const Fitted fitted(rubs ? test::model_that_rubs() : rubbing_bead("lambda", "se + constant"), 25);
-    SCOPED_TRACE(fitted.model.name);
+  for (const Fitted& fitted : {Fitted(test::model_that_rubs(), 25), Fitted(rubbing_bead("lambda", "se + constant"), 25),
+                               Fitted(rubbing_bead("lambda0", "se + constant", "positive = true"), 25)}) {
+    SCOPED_TRACE(fitted.model.text);
     const Posterior posterior(
         fitted.prior, fitted.observations,
         model_values(fitted.prior, fitted.observations, default_hyperparameters(fitted.prior, fitted.observations, {}, {})));
     const MatrixXd states = test::draw(fitted.model, 12, nonlinear_seed + 1).states;
     const System& system = *fitted.model.system;
-    for (const View& view : {View::constrained_acceleration(system), View::multipliers(system), View::constraint_force(system),
-                             View::unconstrained_acceleration(system)}) {
-      SCOPED_TRACE(view.quantity->word());
+    std::vector<View> views = {View::constrained_acceleration(system), View::multipliers(system), View::constraint_force(system),
+                               View::unconstrained_acceleration(system), View::learned_force(system)};
+    for (std::size_t k = 0; k < 5; ++k) {
+      for (std::size_t a = 0; a < fitted.prior.latents.size(); ++a) {
+        views.push_back(views[k]);
+        views.back().latent = static_cast<int>(a);
+      }
+    }
+    for (const View& view : views) {
+      SCOPED_TRACE(fmt::format("{}, latent {}", view.quantity->word(), view.latent ? view.latent->first : -1));
       const Predictor predictor(posterior, view);
       auto memory = predictor.make_workspace();
       const auto marginal = posterior.marginal(view, states);
@@ -465,6 +548,35 @@ TEST(NonlinearPredictor, IsThePosteriorWithItsJacobianAndAllocatesNothing) {
           EXPECT_LE(test::largest(jacobian.col(k) - (above - below) / (2 * step)), 1e-6 * (size + jacobian.norm()));
         }
       }
+    }
+  }
+}
+
+TEST(NonlinearInverseDynamics, FindsInputsWhoseForceChangesTheFriction) {
+  for (const Fitted& fitted : {Fitted(test::model_that_rubs(), 25), Fitted(rubbing_bead("lambda", "se + constant"), 25)}) {
+    SCOPED_TRACE(fitted.model.name);
+    const Posterior posterior(
+        fitted.prior, fitted.observations,
+        model_values(fitted.prior, fitted.observations, default_hyperparameters(fitted.prior, fitted.observations, {}, {})));
+    const View view = View::constrained_acceleration(*fitted.model.system);
+    const MatrixXd states = test::draw(fitted.model, 20, nonlinear_seed + 2).states;
+    MatrixXd start = states;
+    start.bottomRows(1).setConstant(not_a_number);
+    const MatrixXd wanted = posterior.mean(view, states);
+    const InverseDynamics found = inverse_dynamics(posterior, view, start, wanted);
+    EXPECT_LE(test::largest(found.missed), 1e-10 * (1 + test::largest(wanted)));
+    MatrixXd there = states;
+    there.bottomRows(1) = found.inputs;
+    EXPECT_LE(test::largest(posterior.mean(view, there) - wanted), 1e-10 * (1 + test::largest(wanted)));
+    EXPECT_TRUE((found.stddev().array() > 0).all());
+    const InverseDynamicsSolver solver(posterior, view);
+    auto memory = solver.make_workspace();
+    VectorXd inputs(1);
+    for (Index i = 0; i < states.cols(); ++i) {
+      const std::size_t n_allocations = test::allocations_of(
+          [&] { EXPECT_EQ(solver.inputs(start.col(i), wanted.col(i), inputs, memory), InverseDynamicsSolver::Status::ok); });
+      EXPECT_EQ(n_allocations, 0U);
+      EXPECT_NEAR(inputs[0], found.inputs(0, i), 1e-9 * (1 + std::abs(inputs[0])));
     }
   }
 }
@@ -703,6 +815,7 @@ TEST(NonlinearPosterior, OfDataThatComeAndGoIsTheOneOfThoseThatAreThere) {
     return Observations(all.states().middleCols(first, n), all.view(), all.values().middleCols(first, n), all.noise().stddev());
   };
   const auto of = [&](Index first, Index n) { return Posterior(fitted.prior, {rows(first, n)}, values); };
+  const std::vector<int> first_and_last = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 20, 21, 22, 23, 24};
   const View view = View::constrained_acceleration(*fitted.model.system);
   const MatrixXd states = test::draw(fitted.model, 10, nonlinear_seed + 1).states;
   // as near as Gauss–Newton steps come to the posterior mean
@@ -718,11 +831,20 @@ TEST(NonlinearPosterior, OfDataThatComeAndGoIsTheOneOfThoseThatAreThere) {
   expect_same(grown, of(0, 40));
   expect_same(remove_oldest(Posterior(grown), 10), of(10, 30));
   expect_same(first, before);
-  // several groups: which is the oldest is not known any more
-  const Posterior two(fitted.prior, {rows(0, 10), rows(10, 10)},
-                      model_values(fitted.prior, {rows(0, 10), rows(10, 10)},
-                                   default_hyperparameters(fitted.prior, {rows(0, 10), rows(10, 10)}, {}, {})));
-  expect_says([&] { static_cast<void>(remove_oldest(Posterior(two), 1)); }, {"several groups", "lambda0"});
+  // of two groups, by their noise, to which data were added by turns
+  const auto noisier = [&](Index from, Index n) {
+    return Observations(all.states().middleCols(from, n), all.view(), all.values().middleCols(from, n), 2 * all.noise().stddev());
+  };
+  const Posterior two = update(update(Posterior(of(0, 10)), noisier(10, 10)), rows(20, 5));
+  ModelValues of_both = values;
+  of_both.noise_stddev.push_back(2 * all.noise().stddev());
+  expect_same(two, Posterior(fitted.prior,
+                             {Observations(all.states()(Eigen::all, first_and_last), all.view(),
+                                           all.values()(Eigen::all, first_and_last), all.noise().stddev()),
+                              noisier(10, 10)},
+                             of_both));
+  expect_same(remove_oldest(Posterior(two), 15), Posterior(fitted.prior, {rows(20, 5), noisier(15, 5)}, of_both));
+  expect_same(remove_oldest(remove_oldest(Posterior(two), 12), 3), remove_oldest(Posterior(two), 15));
 }
 
 // ---------------------------------------------------------------- through inducing points
@@ -942,16 +1064,8 @@ TEST(NonlinearPrior, IsRefusedByNameWhereItCannotBe) {
   const Posterior posterior(
       fitted.prior, fitted.observations,
       model_values(fitted.prior, fitted.observations, default_hyperparameters(fitted.prior, fitted.observations, {}, {})));
-  const View learned = View::learned_force(*fitted.model.system);
-  expect_says([&] { static_cast<void>(Predictor(posterior, learned)); },
-              {"Predictor", "'friction coefficient' reads lambda, where lambda0 would be linear"});
-  const Fitted positive(rubbing_bead("lambda0", "constant", "positive = true"), 10);
-  const Posterior damped(positive.prior, positive.observations,
-                         model_values(positive.prior, positive.observations,
-                                      default_hyperparameters(positive.prior, positive.observations, {}, {})));
-  const std::string error =
-      test::input_error_of([&] { static_cast<void>(Predictor(damped, View::learned_force(*positive.model.system))); });
-  EXPECT_TRUE(error.ends_with("only of latents that are linear, but 'friction coefficient' is positive")) << error;
+  expect_says([&] { static_cast<void>(export_c(posterior, View::learned_force(*fitted.model.system))); },
+              {"export to C", "'friction coefficient' does"});
   const std::string latent = "[[latent]]\nname = \"x\"\nfeatures = ";
   expect_says([&] { static_cast<void>(make_prior(rubbing_bead("lambda", "constant", latent + "[\"lambda(1)\"]"))); },
               {"only directions"});

@@ -106,7 +106,7 @@ e = 0.3
 h = 0.4
 c = 0.7
 [let]
-load = "sqrt(lambda(1)^2 + 0.5)"
+load = "sqrt(lambda(1)^2 + 0.7*c)"
 [mechanics]
 mass  = [["m", "0", "0", "e*cos(heading)"], ["0", "m", "0", "e"], ["0", "0", "m + 1", "0"], ["e*cos(heading)", "e", "0", "1"]]
 force = ["u*cos(heading) - c*dx*abs(dx)", "u*sin(heading)", "-9.81*m", "-m*dheading"]
@@ -141,6 +141,18 @@ u        = [-2, 2]
 force = ["-0.1*load*dx", "-0.1*load*dy", "-0.1*load*dz", "-0.3*dheading"]
 )toml",
                                           "runner that rubs");
+  return model;
+}
+
+const Model& model_that_rubs_softly() {
+  static const Model model =
+      Model::parse(changed(model_that_rubs().text,
+                           {{"c = 0.7\n", "c = 0.7\nbank = 0\nturn = 0\n"},
+                            {"[\"z - h*x^2 - 0.2*y^2\"]", "[{ expr = \"z - h*x^2 - 0.2*y^2 - bank*t^2/2\", noise = 0.4 }]"},
+                            {"[\"dx*sin(heading) - dy*cos(heading) + e*dheading\"]",
+                             "[{ expr = \"dx*sin(heading) - dy*cos(heading) + e*dheading - turn*t\", noise = 0.3 }]"},
+                            {"[sampling]\n", "[sampling]\nt = 0\n"}}),
+                   "runner that rubs softly");
   return model;
 }
 

@@ -45,6 +45,8 @@ const Model& model_with_a_load();
 /// The same runner, whose friction is as large as the multipliers that it changes, beside a damping that is never negative and a latent
 /// that is linear: none but the last is linear.
 const Model& model_that_rubs();
+/// The same where both constraints are soft, and b is larger by `bank`, `turn`, 0, where t is.
+const Model& model_that_rubs_softly();
 
 /// The same on another bank, with another mass.
 const Model& another_bank();

@@ -69,6 +69,28 @@ TEST(ActuatorFit, FindsDelayAndLagWithinTheirErrorsAndLearnsAsIfTheyWereKnown) {
   EXPECT_GT(std::exp((ignored - known) / (n / 2.0)), 5);
 }
 
+// which no delay and no lag is linear in
+TEST(ActuatorFit, FindsThemBesideALatentThatIsPositive) {
+  int n_within = 0, n = 0;
+  for (std::uint64_t seed = 31; seed < 35; ++seed) {
+    FitRequest request = request_for(estimated, late_cart_log(0.02, 0.05, 250, 6, seed));
+    std::string text = request.model.text;
+    const std::string linear = "[\"dx\"]\ndirections = \"force\"";
+    text.replace(text.find(linear), linear.size(), "[\"abs(dx)\"]\ndirections = { force = [[\"-dx\"]] }\npositive = true");
+    request.model = Model::parse(text, "late_cart.toml");
+    const FitOutcome fit = run_fit(prepare_fit(std::move(request)));
+    ASSERT_EQ(fit.file.report.actuators.size(), 2);
+    for (const ActuatorEstimate& one : fit.file.report.actuators) {
+      const double off = std::abs(one.value - (one.name == "u.delay" ? 0.02 : 0.05));
+      EXPECT_LT(one.stddev, 0.004) << one.name;
+      EXPECT_LT(off, 4 * one.stddev) << one.name << " of seed " << seed;
+      n_within += off < 2 * one.stddev ? 1 : 0;
+      ++n;
+    }
+  }
+  EXPECT_GE(n_within, 0.75 * n);
+}
+
 TEST(ActuatorFit, SameSeedSameBitsForAnyNumberOfThreads) {
   const CsvTable log = late_cart_log(0.02, 0.05, 100, 4, 3);
   std::vector<FitOutcome> fits;

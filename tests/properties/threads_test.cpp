@@ -9,6 +9,7 @@
 #include "gp2/inference/pathwise.hpp"
 #include "gp2/mechanics/state_evaluator.hpp"
 #include "gp2/predictor.hpp"
+#include "gp2/simulate.hpp"
 #include "test_models.hpp"
 
 // Everything that is const, from many threads at once: the same bits as from one, and no race (run under the thread sanitizer).
@@ -90,6 +91,31 @@ TEST_P(Threads, PredictorsAndPosteriorsAreSharedByMany) {
   const VectorXd alone = everything(posterior, predictor, queries);
   EXPECT_TRUE(alone.allFinite());
   for (const VectorXd& result : results) EXPECT_EQ(result, alone);
+}
+
+// The expressions of a model grow with what is made of it.
+TEST_P(Threads, PriorsAndSwitchingFunctionsAreMadeOfOneModelSideBySide) {
+  const auto numbers = [&](const Model& model, const MatrixXd& states) {
+    const Prior prior = make_prior(model);
+    const MechanicsBatch mechanics = require_mechanics(*model.system, states, model.system->parameter_values());
+    const PriorValues values = evaluate_prior(prior, states, model.system->parameter_values(), mechanics);
+    double sum = values.mean.sum() + switching_functions(model, true).size();
+    for (const MatrixXd& E : values.directions) sum += E.sum();
+    const Coordinate& first = model.system->coordinates().front();
+    const Expression more = model.expression("sin(" + first.name + ")*" + first.velocity() + "^3");
+    for (const Expression& state : model.symbols().state())
+      sum += static_cast<double>(model.graph->differentiate(more, state).operation());
+    return sum;
+  };
+  const Model& known = test::model(GetParam());
+  const MatrixXd drawn = test::draw(known, 10, threads_seed).states, states = drawn.array().isNaN().select(0, drawn);
+  const double alone = numbers(known, states);
+  for (int round = 0; round < 5; ++round) {
+    const Model model = Model::parse(known.text, known.name);
+    std::vector<double> results(n_threads);
+    in_parallel([&](int k) { results[static_cast<std::size_t>(k)] = numbers(model, states); });
+    for (const double result : results) EXPECT_EQ(result, alone);
+  }
 }
 
 TEST_P(Threads, FitsOfOnePriorRunSideBySide) {

@@ -99,6 +99,34 @@ TEST(ExpectedInformation, OfParametersThatEnterLinearlyIsWhatTheLikelihoodOfAllD
   EXPECT_LT(after.log_volume, now.log_volume);
 }
 
+// Friction that presses on what it rubs on is not linear in what is learned: to first order about what is known already.
+TEST(ExpectedInformation, OfLatentsThatAreNotLinearIsNearlyWhatTheLikelihoodOfAllDataHas) {
+  const Model model = Model::parse(
+      test::changed(wire().text, {{"force = [[\"1\"], [\"0\"]] }", "force = [[\"-0.1*abs(lambda(1))*dx\"], [\"0\"]] }"},
+                                  {"-0.4*tanh(dx)", "-0.05*abs(lambda(1))*dx"}}),
+      "wire.toml");
+  PriorOptions options;
+  options.mean = Prior::Mean::force;
+  const Prior prior = make_prior(model, options);
+  const std::vector<Hyperparameter> hyperparameters = Problem({0, 1}).hyperparameters;
+  const VectorXd noise = Eigen::Vector2d(0.03, 0.01);
+  const auto measured = [&](int n, std::uint64_t seed) {
+    const GeneratedData data = generate(model, {n, seed, noise});
+    return Observations{data.states, View::constrained_acceleration(*prior.system), data.accelerations, noise};
+  };
+  const Observations first = measured(40, information_seed), second = measured(40, information_seed + 1);
+  const ExpectedInformation information(prior, {first}, hyperparameters, nullptr, 1, nullptr);
+  const MatrixXd nowhere(prior.system->layout().size(), 0);
+  const ExpectedInformation::Known now = information.after(nowhere, nowhere), after = information.after(second.states(), nowhere);
+  const LaplaceUncertainty of_first = laplace_uncertainty(prior, {first}, hyperparameters, 1),
+                           of_both = laplace_uncertainty(prior, {first, second}, hyperparameters, 1);
+  for (int k = 0; k < 2; ++k) {
+    EXPECT_NEAR(now.stddev[k] / of_first.stddev[2 + k], 1, 1e-3) << k;
+    EXPECT_NEAR(after.stddev[k] / of_both.stddev[2 + k], 1, 0.1) << k;
+    EXPECT_LT(after.stddev[k], 0.9 * now.stddev[k]) << k;
+  }
+}
+
 TEST(ExpectedInformation, OfAccelerationsIsWhatAPosteriorWithTheMeasurementsHasWhateverTheyAre) {
   const Problem problem({});
   const Observations first = problem.measured(15, information_seed), second = problem.measured(12, information_seed + 1);

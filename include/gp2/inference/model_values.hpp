@@ -20,6 +20,8 @@ struct Linearisation {
   struct OfGroup {
     std::vector<Eigen::MatrixXd> signals;  // C_a f_a at each state, per latent (p_a × N)
     Eigen::MatrixXd multipliers;           // λ at each state (nc × N)
+    /// Where the noise is taken to which soft constraints give rise; null: here.
+    std::shared_ptr<const OfGroup> noise_about = {};
   };
   std::vector<OfGroup> groups;  // one per Observations
 };

@@ -59,6 +59,9 @@ class StateFunction {
   /// exact. All else here is then at λ₀, the multipliers under the known force. Null elsewhere.
   [[nodiscard]] virtual const StateFunction* of_multipliers() const { return nullptr; }
 
+  /// Of a function of [x; λ]: its derivative in one parameter of the system, as such a function itself. Null elsewhere.
+  [[nodiscard]] virtual const StateFunction* parameter_derivative(int /*index*/) const { return nullptr; }
+
   /// Whether they depend on an entry of the state, which a log must have then.
   [[nodiscard]] virtual bool reads(int state_index) const = 0;
 

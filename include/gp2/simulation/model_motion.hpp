@@ -21,23 +21,26 @@ class ModelMotion {
   explicit ModelMotion(const Model& model);
 
   /// @param states  (layout size × N)
+  /// @param slip    ε of the soft constraints, A ddq = b + ς ε, of those of each state (soft rows × N); empty: none slips
   /// @return (nq × N), not finite where the truth is not
   /// @throws InputError as require_mechanics, where M is singular while truth.acceleration is not 0, and where the load has no
   /// solution.
-  [[nodiscard]] Eigen::MatrixXd acceleration(const Eigen::Ref<const Eigen::MatrixXd>& states) const;
+  [[nodiscard]] Eigen::MatrixXd acceleration(const Eigen::Ref<const Eigen::MatrixXd>& states,
+                                             const Eigen::MatrixXd& slip = {}) const;
   /// ā = M⁻¹(F + truth.force) + truth.acceleration, which nothing constrains (nq × N). @throws as acceleration.
   [[nodiscard]] Eigen::MatrixXd unconstrained_acceleration(const Eigen::Ref<const Eigen::MatrixXd>& states) const;
   /// The multipliers λ of that motion (nc × N).
   [[nodiscard]] Eigen::MatrixXd multipliers(const Eigen::Ref<const Eigen::MatrixXd>& states) const;
 
  private:
-  [[nodiscard]] Eigen::MatrixXd unconstrained(const Eigen::Ref<const Eigen::MatrixXd>& states,
-                                              const MechanicsBatch& mechanics) const;
+  [[nodiscard]] Eigen::MatrixXd unconstrained(const Eigen::Ref<const Eigen::MatrixXd>& states, const MechanicsBatch& mechanics,
+                                              const Eigen::MatrixXd& slip = {}) const;
 
   std::shared_ptr<const System> system_;
   Eigen::VectorXd parameters_;
   // what each gives at [states; multipliers], and where they are those of the motion, the multipliers
-  [[nodiscard]] Eigen::MatrixXd with_load(const Eigen::Ref<const Eigen::MatrixXd>& states, const MechanicsBatch& mechanics) const;
+  [[nodiscard]] Eigen::MatrixXd with_load(const Eigen::Ref<const Eigen::MatrixXd>& states, const MechanicsBatch& mechanics,
+                                          const Eigen::MatrixXd& slip) const;
 
   Tape truth_, truth_force_;
   StateDerivatives truth_slopes_, truth_force_slopes_;  // in [state; λ]
@@ -45,7 +48,9 @@ class ModelMotion {
 };
 
 /// The true acceleration L b + T (M⁻¹F + truth) at given states (nq × N).
+/// @param slip  as ModelMotion::acceleration
 /// @throws InputError when there is no [truth], or it is not finite at a state.
-Eigen::MatrixXd true_acceleration(const Model& model, const Eigen::Ref<const Eigen::MatrixXd>& states);
+Eigen::MatrixXd true_acceleration(const Model& model, const Eigen::Ref<const Eigen::MatrixXd>& states,
+                                  const Eigen::MatrixXd& slip = {});
 
 }  // namespace gp2

@@ -84,7 +84,7 @@ class Expression {
 /// every run. Local simplification only (0·x, 1·x, x + 0, x − x, 0/x, constants, −(−x), x^0, x^1, √ for x^0.5); signs rise out of
 /// sums and products (a + (−b) = a − b, (−a)·b = −(a·b)), which is exact in floating point, and constant factors to the front of
 /// products, where they become one (u·(c·v) = c·(u·v)); nothing else is expanded or reordered. What would fold to ∞ or NaN stays,
-/// so that evaluation shows it.
+/// so that evaluation shows it. Every member function may be called from several threads at once.
 ///
 /// @throws InputError from any operation that would grow the graph past `max_nodes`, from a constant that is not finite, and from
 ///   operands of different graphs.
