@@ -44,15 +44,25 @@ void condition_anew(Posterior::Implementation& self, const std::vector<std::int6
   }
 }
 
-void add(Posterior::Implementation& self, const Observations& added) {
-  // the group that has this view and noise, or one of its own
+// The group that has this view and noise, or one of its own. The noise of a mixture is that of its components only in the mean: each
+// has its own for what is added to the group.
+std::size_t group_of(const Posterior& posterior, const Observations& added) {
+  const std::vector<Observations>& groups = posterior.observations();
   std::size_t group = 0;
   const auto belongs = [&] {
-    const Observations& there = self.observations[group];
-    return !there.has_sums() && there.view() == added.view() && self.values.noise_stddev[group] == added.noise().stddev() &&
-           there.noise().has_scale() == added.noise().has_scale();
+    const Observations& there = groups[group];
+    constexpr double rounding = 1e-12;
+    return !there.has_sums() && there.view() == added.view() && there.noise().has_scale() == added.noise().has_scale() &&
+           posterior.noise_stddev(group).isApprox(added.noise().stddev(), rounding);
   };
-  while (group < self.observations.size() && !belongs()) ++group;
+  while (group < groups.size() && !belongs()) ++group;
+  return group;
+}
+
+void add(Posterior::Implementation& self, Observations added, std::size_t group) {
+  if (group < self.observations.size()) {
+    added = added.with_noise(Noise(self.values.noise_stddev[group], added.noise().is_estimated(), added.noise().scale()));
+  }
   if (self.kept) {
     self.add_through_points(added, group);
     return;
@@ -114,8 +124,9 @@ Posterior update(Posterior&& posterior, Observations added) {
   require_observations(posterior.prior(), added);
   added.require_no_sums();
   const lapack::SingleThread single_thread;
+  const std::size_t group = group_of(posterior, added);
   const auto own = posterior.own_components();
-  for (const auto& component : own) add(*component, added);
+  for (const auto& component : own) add(*component, added, group);
   posterior.components_.clear();
   return Posterior(Posterior::Components(own.begin(), own.end()));
 }

@@ -50,13 +50,13 @@ class Growing {
  public:
   [[nodiscard]] std::size_t size() const { return size_; }
   const Value& operator[](std::size_t i) const {
-    const int block = block_of(i);
-    return blocks_[static_cast<std::size_t>(block)][i - first_of(block)];
+    const std::size_t block = block_of(i);
+    return blocks_[block][i - first_of(block)];
   }
   /// By one thread at a time.
   void push_back(Value value) {
-    const int block = block_of(size_);
-    std::unique_ptr<Value[]>& values = blocks_.at(static_cast<std::size_t>(block));
+    const std::size_t block = block_of(size_);
+    std::unique_ptr<Value[]>& values = blocks_.at(block);
     if (!values) values = std::make_unique<Value[]>(first << block);
     values[size_ - first_of(block)] = std::move(value);
     ++size_;
@@ -64,8 +64,8 @@ class Growing {
 
  private:
   static constexpr std::size_t first = 64;
-  static int block_of(std::size_t i) { return std::bit_width((i + first) / first) - 1; }
-  static std::size_t first_of(int block) { return (first << block) - first; }
+  static std::size_t block_of(std::size_t i) { return static_cast<std::size_t>(std::bit_width((i + first) / first)) - 1; }
+  static std::size_t first_of(std::size_t block) { return (first << block) - first; }
   std::array<std::unique_ptr<Value[]>, 15> blocks_;  // more than ExpressionGraph::max_nodes
   std::size_t size_ = 0;
 };
