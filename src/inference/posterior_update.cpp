@@ -1,6 +1,5 @@
 #include <algorithm>
 #include <numeric>
-#include <ranges>
 #include <utility>
 #include <vector>
 
@@ -93,7 +92,7 @@ void remove_oldest_of(Posterior::Implementation& self, int n) {
   std::vector<int> n_gone(self.observations.size());
   for (const Index sample : gone) ++n_gone[static_cast<std::size_t>(self.samples[static_cast<std::size_t>(sample)].group)];
   if (self.prior.is_nonlinear()) {
-    for (const Index sample : gone | std::views::reverse) self.samples.erase(self.samples.begin() + sample);
+    for (auto sample = gone.rbegin(); sample != gone.rend(); ++sample) self.samples.erase(self.samples.begin() + *sample);
   } else {
     self.erase_samples(gone);
   }

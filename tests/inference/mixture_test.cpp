@@ -39,6 +39,32 @@ Posterior mixture_of(const Problem& p) { return Posterior::mixture(p.prior, p.ob
 
 View constrained(const Problem& p) { return View::constrained_acceleration(*p.prior.system); }
 
+// Each component has its own noise for what is added with the noise of the mixture.
+TEST(Mixture, WhatIsAddedWithItsNoiseJoinsTheGroupAndOldDataLeaveIt) {
+  for (const Problem& p : test::problems(9, mixture_seed)) {
+    const Observations& all = p.observations.front();
+    if (p.observations.size() > 1 || all.n_data() < 3) continue;
+    SCOPED_TRACE(p.name);
+    std::vector<ModelValues> values = drawn_values(p);
+    for (std::size_t k = 0; k < values.size(); ++k) values[k].noise_stddev.front() *= 1 + 0.2 * static_cast<double>(k);
+    const auto mixture = [&](int first, int n) { return Posterior::mixture(p.prior, {all.slice(first, n)}, values); };
+    const int n = all.n_data() - 1;
+    Posterior grown = mixture(0, n);
+    Observations last = all.slice(n, 1);
+    last = last.with_noise(Noise(grown.noise_stddev(0), false, last.noise().scale()));
+    grown = update(std::move(grown), last);
+    ASSERT_EQ(grown.observations().size(), 1U);
+    const View view = test::every_acceleration(p);
+    const auto expect_same = [&](const Posterior& is, const Posterior& expected) {
+      const auto a = is.marginal(view, p.queries), b = expected.marginal(view, p.queries);
+      EXPECT_LE(test::largest(a.mean - b.mean), test::rounding(p) * (1 + test::largest(b.mean)));
+      EXPECT_LE(test::largest(a.covariance - b.covariance), test::rounding(p) * (1 + test::largest(b.covariance)));
+    };
+    expect_same(grown, mixture(0, n + 1));
+    expect_same(remove_oldest(std::move(grown), n), mixture(n, 1));
+  }
+}
+
 TEST(Mixture, OfOneComponentIsItToTheBit) {
   for (const Problem& p : test::problems(9, mixture_seed)) {
     SCOPED_TRACE(p.name);

@@ -313,9 +313,8 @@ TEST(Multipliers, OfATruthAnswerToASlip) {
 
 // One unknown number: Laplace's approximation is that of a function of one variable.
 TEST(NonlinearPosterior, OfOneNumberIsLaplacesApproximation) {
-  for (const auto& [is_positive, is_soft, has_sums] :
-       {std::tuple(false, false, false), std::tuple(true, false, false), std::tuple(false, true, false),
-        std::tuple(true, true, false), std::tuple(false, false, true), std::tuple(true, false, true)}) {
+  for (const int kind : {0, 1, 2, 3, 4, 5}) {
+    const bool is_positive = kind % 2 == 1, is_soft = kind / 2 == 1, has_sums = kind / 2 == 2;
     SCOPED_TRACE(
         fmt::format("{}{}{}", is_positive ? "positive" : "of the multiplier", is_soft ? ", soft" : "", has_sums ? ", sums" : ""));
     const std::string hard = rubbing_bead("lambda", "constant", is_positive ? "positive = true" : "").text,

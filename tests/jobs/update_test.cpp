@@ -67,6 +67,26 @@ TEST(UpdateJob, AWindowLeavesTheNewest) {
   EXPECT_EQ(updated.fit.observations.front().values(), more_of(fit, log).values().rightCols(8));
 }
 
+// of every draw of the hyperparameters, each with a noise of its own
+TEST(UpdateJob, AWindowLetsTheFirstRowsGoWhereHyperparametersAreIntegrated) {
+  FitRequest request;
+  request.model = test::model(surface);
+  request.logs = {{log_of(30, 1), nullptr}};
+  request.restarts = 1;
+  request.hyperparameters = HyperparameterChoice::integrate;
+  const test::TemporaryFolder folder;
+  FitFile fit = run_fit(prepare_fit(std::move(request))).file;
+  UpdateRequest newest;
+  newest.window = 12;
+  for (std::uint64_t seed = 2; seed < 4; ++seed) {
+    UpdateOutcome updated = update(std::move(fit), {log_of(12, seed)}, newest);
+    EXPECT_EQ(updated.n_states, 12);
+    ASSERT_EQ(updated.fit.observations.size(), 1U);
+    updated.fit.write(folder / "fit.json");
+    fit = FitFile::read(folder / "fit.json");
+  }
+}
+
 TEST(UpdateJob, WhatCannotBeIsAnError) {
   const FitFile fit = fit_of(log_of(30, 1));
   const auto refused = [&](const UpdateRequest& request) {
