@@ -354,6 +354,12 @@ FitProblem start_problem(const Model& model, const FitProblemOptions& options) {
     problem.prior_options.per_direction = false;
   }
   problem.prior = make_prior(model, problem.prior_options);
+  const bool has_directions = std::ranges::any_of(
+      model.latents, [](const LatentSpec& latent) { return !latent.directions.empty() || latent.direction_code; });
+  if (paper && has_directions) {
+    problem.notes.push_back(
+        "warning: `protocol=paper` has its prior on the acceleration: the directions of the model's latent are not taken");
+  }
   return problem;
 }
 

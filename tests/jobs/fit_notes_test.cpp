@@ -46,6 +46,19 @@ FitProblem problem_of(const Model& model, const CsvTable& log) {
   return make_fit_problem(model, log, options);
 }
 
+TEST(FitNotes, TellThatThePapersProtocolTakesNoDirections) {
+  const CsvTable log = CsvTable::parse("x,y,dx,dy,ddx,ddy\n1,2,3,4,5,0\n2,3,4,5,6,0\n", "log.csv");
+  FitProblemOptions options;
+  options.protocol.name = Protocol::Name::paper;
+  options.noise_stddev = 0.1;
+  const Model plain = constrained_cart("");
+  std::string text = plain.text;
+  text.replace(text.find("'acceleration'"), 14, "{ force = [['-dx'], ['0']] }");
+  const testing::Matcher<std::vector<std::string>> told = Contains(HasSubstr("directions of the model's latent are not taken"));
+  EXPECT_THAT(make_fit_problem(plain, log, options).notes, testing::Not(told));
+  EXPECT_THAT(make_fit_problem(Model::parse(text, "cart"), log, options).notes, told);
+}
+
 TEST(FitNotes, TellThatThereIsNothingToProjectOnto) {
   const CsvTable log = CsvTable::parse("x,y,dx,dy,ddx,ddy\n1,2,3,4,5,0\n2,3,4,5,6,0\n", "log.csv");
   for (const char* constraints : {"", "[constraints]\nacceleration = ['ddx - ddy']\n"}) {
