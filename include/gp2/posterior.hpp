@@ -170,7 +170,7 @@ class Posterior {
 ///
 ///     posterior = update(std::move(posterior), {x, ddq, y, sigma});
 ///
-/// The noise of the new observations is their own, as it stands; that of earlier ones is by values().noise_stddev.
+/// The noise of new observations is their own, or where they join a group that of each component; of earlier ones values().noise_stddev.
 /// Where both view and noise_stddev(g) are those of an earlier group of observations() the new ones join it behind its last, if both
 /// have a noise of each value or neither has; else they are a new group, with its noise in values(). So Posterior(prior(),
 /// observations(), values()) is always the posterior built anew.

@@ -106,9 +106,10 @@ class ExactFit {
     double sum = at.squared_distance(zero());
     for (Index s = 0; s < reduction_.n_samples(); ++s) {
       const Reduction::Sample& sample = reduction_.samples[static_cast<std::size_t>(s)];
+      const std::vector<Index> rows = rows_of_samples(reduction_, {s});
       for (std::size_t a = 0; a < self_.C.size(); ++a) {
         const VectorXd signal = self_.C[a] * at.f[static_cast<std::size_t>(sample.group)][a].col(sample.index);
-        for (const Index row : rows_of_samples(reduction_, {s})) missing[row] -= reduction_.directions[a].row(row).dot(signal);
+        for (const Index row : rows) missing[row] -= reduction_.directions[a].row(row).dot(signal);
       }
       sum += sample.e_out.squaredNorm();
     }

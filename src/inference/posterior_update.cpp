@@ -24,21 +24,15 @@ std::shared_ptr<Posterior::Implementation> copy_of(const Posterior::Implementati
   return copy;
 }
 
-// Numbers of the samples, group after group.
-std::vector<std::int64_t> numbers_of(const Posterior::Implementation& self) {
+// Of a nonlinear prior, where latents are linearised moves with every observation: `samples` say which there are, no matter in what
+// order. Conditioning numbers them 0, 1, … group after group; they keep the numbers that they had.
+void condition_anew(Posterior::Implementation& self) {
   std::vector<std::pair<int, std::int64_t>> numbers;
   for (const Posterior::Implementation::Sample& sample : self.samples) numbers.emplace_back(sample.group, sample.number);
   std::ranges::sort(numbers);
-  std::vector<std::int64_t> out;
-  for (const auto& [group, number] : numbers) out.push_back(number);
-  return out;
-}
-
-// Where latents are linearised moves with every observation. Samples are numbered 0, 1, … by that, group after group.
-void condition_anew(Posterior::Implementation& self, const std::vector<std::int64_t>& numbers) {
   self.condition(1);
   for (Posterior::Implementation::Sample& sample : self.samples) {
-    sample.number = numbers[static_cast<std::size_t>(sample.number)];
+    sample.number = numbers[static_cast<std::size_t>(sample.number)].second;
     self.next_number = std::max(self.next_number, sample.number + 1);
   }
 }
@@ -50,9 +44,10 @@ std::size_t group_of(const Posterior& posterior, const Observations& added) {
   std::size_t group = 0;
   const auto belongs = [&] {
     const Observations& there = groups[group];
+    if (there.has_sums() || there.view() != added.view() || there.noise().has_scale() != added.noise().has_scale()) return false;
     constexpr double rounding = 1e-12;
-    return !there.has_sums() && there.view() == added.view() && there.noise().has_scale() == added.noise().has_scale() &&
-           posterior.noise_stddev(group).isApprox(added.noise().stddev(), rounding);
+    const Eigen::VectorXd stddev = posterior.noise_stddev(group);
+    return ((added.noise().stddev() - stddev).array().abs() <= rounding * stddev.array()).all();
   };
   while (group < groups.size() && !belongs()) ++group;
   return group;
@@ -75,7 +70,7 @@ void add(Posterior::Implementation& self, Observations added, std::size_t group)
     self.values.noise_stddev.push_back(added.noise().stddev());
     self.observations.push_back(added);
   }
-  if (!is_linear) condition_anew(self, numbers_of(self));
+  if (!is_linear) condition_anew(self);
 }
 
 void remove_oldest_of(Posterior::Implementation& self, int n) {
@@ -98,7 +93,7 @@ void remove_oldest_of(Posterior::Implementation& self, int n) {
   }
   for (std::size_t group = 0; group < n_gone.size(); ++group) self.observations[group].remove_first(n_gone[group]);
   self.erase_empty_groups();
-  if (self.prior.is_nonlinear()) condition_anew(self, numbers_of(self));
+  if (self.prior.is_nonlinear()) condition_anew(self);
 }
 
 }  // namespace

@@ -13,7 +13,6 @@
 #include "base/parallel.hpp"
 #include "gp2/jobs/fit_memory.hpp"
 #include "gp2/training/robust.hpp"
-#include "inference/posterior_implementation.hpp"
 #include "training/curvature.hpp"
 #include "training/lbfgsb.hpp"
 #include "training/objective.hpp"
@@ -115,10 +114,9 @@ class ActuatorTraining {
     for (int round = 0; round < most && !is_set(options_.stop); ++round) {
       const std::vector<Observations> observations = rows_.under(a_);
       try {
-        about_ = linearisation_of(problem_.prior, observations,
-                                  model_values(problem_.prior, observations, objective_of(observations).at(x_)), n_threads_);
+        about_ = about_posterior_mean(problem_.prior, observations, objective_of(observations).at(x_)).about;
       } catch (const NumericalError&) {
-        return;  // where it is linear already there is none; the fit that follows says so if it finds none either
+        return;  // there is none to follow; the fit that comes after says so if it finds none either
       }
       const VectorXd before = a_;
       search();

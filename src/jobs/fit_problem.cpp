@@ -354,8 +354,10 @@ FitProblem start_problem(const Model& model, const FitProblemOptions& options) {
     problem.prior_options.per_direction = false;
   }
   problem.prior = make_prior(model, problem.prior_options);
-  const bool has_directions = std::ranges::any_of(
-      model.latents, [](const LatentSpec& latent) { return !latent.directions.empty() || latent.direction_code; });
+  const bool has_directions = std::ranges::any_of(model.latents, [](const LatentSpec& latent) {
+    return latent.base != Latent::Base::acceleration || !latent.directions.empty() || latent.direction_code ||
+           latent.is_potential;
+  });
   if (paper && has_directions) {
     problem.notes.push_back(
         "warning: `protocol=paper` has its prior on the acceleration: the directions of the model's latent are not taken");

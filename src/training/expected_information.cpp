@@ -9,7 +9,6 @@
 #include "base/lapack.hpp"
 #include "base/parallel.hpp"
 #include "gp2/inference/evaluation.hpp"
-#include "inference/posterior_implementation.hpp"
 #include "training/curvature.hpp"
 
 namespace gp2 {
@@ -36,11 +35,7 @@ MatrixXd information_of_fit(const Prior& prior, const std::vector<Observations>&
                             const std::vector<Hyperparameter>& hyperparameters, const std::vector<int>& theta, int n_threads,
                             const std::atomic<bool>* stop) {
   if (theta.empty()) return MatrixXd(0, 0);
-  Approximation approximation;
-  if (prior.is_nonlinear()) {
-    approximation.about = linearisation_of(prior, observations, model_values(prior, observations, hyperparameters));
-  }
-  const Objective objective(prior, observations, hyperparameters, approximation);
+  const Objective objective(prior, observations, hyperparameters, about_posterior_mean(prior, observations, hyperparameters));
   const Curvature curvature = curvature_at(objective, coordinates(hyperparameters), hyperparameters, n_threads, stop);
   // parameters at a bound are not free, and known by nothing else than their bounds
   std::vector<int> all = curvature.free;

@@ -1,6 +1,5 @@
 #include "gp2/training/laplace.hpp"
 #include "base/not_a_number.hpp"
-#include "inference/posterior_implementation.hpp"
 
 #include <algorithm>
 #include <cmath>
@@ -64,11 +63,7 @@ LaplaceUncertainty laplace_uncertainty(const Prior& prior, const std::vector<Obs
   require_observations(prior, observations);
   require_hyperparameters(prior, observations, hyperparameters);
   const lapack::SingleThread single_thread;
-  Approximation approximation;
-  if (prior.is_nonlinear()) {
-    approximation.about = linearisation_of(prior, observations, model_values(prior, observations, hyperparameters));
-  }
-  const Objective objective(prior, observations, hyperparameters, approximation);
+  const Objective objective(prior, observations, hyperparameters, about_posterior_mean(prior, observations, hyperparameters));
   return laplace_uncertainty(curvature_at(objective, coordinates(hyperparameters), hyperparameters, thread_count(n_threads)),
                              hyperparameters);
 }

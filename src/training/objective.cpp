@@ -6,6 +6,8 @@
 #include <string_view>
 #include <utility>
 
+#include "inference/posterior_implementation.hpp"
+
 namespace gp2 {
 
 using Eigen::Index;
@@ -51,6 +53,12 @@ Likelihood::Options likelihood_options(const std::vector<Hyperparameter>& hyperp
 }
 
 }  // namespace
+
+Approximation about_posterior_mean(const Prior& prior, const std::vector<Observations>& observations,
+                                   const std::vector<Hyperparameter>& hyperparameters) {
+  if (!prior.is_nonlinear()) return {};
+  return {.points = nullptr, .about = linearisation_of(prior, observations, model_values(prior, observations, hyperparameters))};
+}
 
 Objective::Objective(const Prior& prior, const std::vector<Observations>& observations,
                      const std::vector<Hyperparameter>& hyperparameters, Approximation approximation, const Workers& workers)

@@ -24,6 +24,11 @@ struct Approximation {
   std::shared_ptr<const Linearisation> about = nullptr;    // of a nonlinear prior; null: where no latent acts
 };
 
+/// Exact, and of a nonlinear prior about the posterior mean of its latents.
+/// @throws NumericalError where there is none.
+Approximation about_posterior_mean(const Prior& prior, const std::vector<Observations>& observations,
+                                   const std::vector<Hyperparameter>& hyperparameters);
+
 /// What training minimises: the negative log likelihood plus hyper-priors. Thread-safe.
 class Objective {
  public:

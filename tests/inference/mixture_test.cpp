@@ -41,9 +41,11 @@ View constrained(const Problem& p) { return View::constrained_acceleration(*p.pr
 
 // Each component has its own noise for what is added with the noise of the mixture.
 TEST(Mixture, WhatIsAddedWithItsNoiseJoinsTheGroupAndOldDataLeaveIt) {
+  int n_problems = 0;
   for (const Problem& p : test::problems(9, mixture_seed)) {
     const Observations& all = p.observations.front();
     if (p.observations.size() > 1 || all.n_data() < 3) continue;
+    ++n_problems;
     SCOPED_TRACE(p.name);
     std::vector<ModelValues> values = drawn_values(p);
     for (std::size_t k = 0; k < values.size(); ++k) values[k].noise_stddev.front() *= 1 + 0.2 * static_cast<double>(k);
@@ -63,6 +65,7 @@ TEST(Mixture, WhatIsAddedWithItsNoiseJoinsTheGroupAndOldDataLeaveIt) {
     expect_same(grown, mixture(0, n + 1));
     expect_same(remove_oldest(std::move(grown), n), mixture(n, 1));
   }
+  EXPECT_GT(n_problems, 5);
 }
 
 TEST(Mixture, OfOneComponentIsItToTheBit) {

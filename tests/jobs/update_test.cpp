@@ -74,6 +74,7 @@ TEST(UpdateJob, AWindowLetsTheFirstRowsGoWhereHyperparametersAreIntegrated) {
   request.logs = {{log_of(30, 1), nullptr}};
   request.restarts = 1;
   request.hyperparameters = HyperparameterChoice::integrate;
+  request.problem.estimate_noise = true;
   const test::TemporaryFolder folder;
   FitFile fit = run_fit(prepare_fit(std::move(request))).file;
   UpdateRequest newest;
