@@ -154,7 +154,7 @@ BENCHMARK(known_parameters_two_threads)->Arg(1000)->Arg(3000)->UseRealTime()->Un
 BENCHMARK(estimated_noise)->ArgsProduct({sizes})->Unit(benchmark::kMillisecond);
 BENCHMARK(estimated_parameters)->ArgsProduct({sizes})->Unit(benchmark::kMillisecond);
 BENCHMARK(inducing_points)
-    ->ArgsProduct({{256, 10'000, 100'000, 1'000'000}, {1, 2}})
+    ->ArgsProduct({{256, 10'000, 100'000, 1'000'000}, {1, 2, 16}})
     ->UseRealTime()
     ->Unit(benchmark::kMillisecond);
 BENCHMARK(assembly)->Args({1000, 1})->Args({1000, 2})->Args({3000, 1})->Args({3000, 2})->UseRealTime()->Unit(

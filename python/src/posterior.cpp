@@ -467,7 +467,8 @@ outputs        which they are; default: all
 system         another System with the same coordinates, inputs and latents
 
 Returns Inputs. Where no inputs produce the accelerations it is those that come nearest, in the sense of Gauss' principle; where several
-inputs do the same, the least change of them. Raises NumericalError where none are found.)");
+inputs do the same, the least change of them. Where an input turns around what it does its deviation is immense or NaN.
+Raises NumericalError where none are found.)");
 }
 
 /// What takes measured data, or gives them up.

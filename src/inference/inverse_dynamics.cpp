@@ -52,6 +52,8 @@ class ScaledPseudoInverse {
     order2_.setZero(std::min(d, nu));
   }
 
+  Index rank = 0;  // of what was computed last
+
   /// D (J D)⁺ (nu × d).
   const MatrixXd& compute(const MatrixXd& J) {
     for (Index k = 0; k < J.cols(); ++k) {
@@ -59,7 +61,7 @@ class ScaledPseudoInverse {
       scale_[k] = size > 0 ? 1 / size : 0;
       scaled_.col(k) = J.col(k) * scale_[k];
     }
-    const Index rank = internal::pivoted_qr(scaled_, reflection_, order_, rank_tolerance);
+    rank = internal::pivoted_qr(scaled_, reflection_, order_, rank_tolerance);
     Q_transposed_.setIdentity();
     internal::apply_Q_transposed(scaled_, reflection_, rank, Q_transposed_);
     auto S = R_transposed_.leftCols(rank);
@@ -110,7 +112,7 @@ struct InverseDynamicsSolver::Workspace::Implementation {
   Predictor::Workspace memory, memory_without_data;
   std::unique_ptr<StateEvaluator> mechanics;
   UdwadiaKalaba projection;
-  Eigen::LLT<MatrixXd> llt;
+  Eigen::LLT<MatrixXd> llt, damped_llt;
   ScaledPseudoInverse inverse;
   VectorXd state;                // its inputs are those found so far
   VectorXd wanted;               // (d)
@@ -125,6 +127,13 @@ struct InverseDynamicsSolver::Workspace::Implementation {
   VectorXd weighted;             // root times a vector (d)
   VectorXd change;               // of the inputs (nu)
   VectorXd start;                // of a step (nu)
+  VectorXd pull;                 // M' of what is missed (d)
+  VectorXd slope;                // of −½ |missed|² (nu)
+  VectorXd largest;              // effect of each input so far (nu)
+  MatrixXd curvature;            // of ½ |missed|² (nu × nu)
+  MatrixXd damped;               // with more on its diagonal (nu × nu)
+  bool is_nearest = false;       // no inputs about these miss less
+  Index most_rank = 0;           // of J in this search
   MatrixXd covariance;           // of the view (d × d)
   MatrixXd weighted_covariance;  // (nu × d)
   MatrixXd J_inverse;            // J⁺ of v itself (nu × d)
@@ -135,17 +144,20 @@ struct InverseDynamicsSolver::Workspace::Implementation {
         memory_without_data(solver->without_data.make_workspace()),
         mechanics(solver->prior.system->make_evaluator(solver->parameters, false)),
         llt(solver->predictor.view().size()),
+        damped_llt(solver->nu()),
         inverse(solver->predictor.view().size(), solver->nu()) {
     const Index d = solver->predictor.view().size(), nu = solver->nu(), n_state = solver->prior.system->layout().size();
     state.setZero(n_state);
     wanted.setZero(d);
-    mean = missed = usual = usual_mean = weighted = wanted;
+    mean = missed = usual = usual_mean = weighted = pull = wanted;
     jacobian.setZero(d, n_state);
     metric.setZero(d, d);
     root = covariance = metric;
     J.setZero(d, nu);
     change.setZero(nu);
-    start = change;
+    start = slope = largest = change;
+    curvature.setZero(nu, nu);
+    damped = curvature;
     J_inverse.setZero(nu, d);
     weighted_covariance = J_inverse;
     // rows that are all the same, so that the memory for redundant ones is there too
@@ -164,7 +176,12 @@ struct InverseDynamicsSolver::Workspace::Implementation {
       return Status::no_prediction;
     }
     write_root();
-    if (search()) return Status::ok;
+    most_rank = 0;
+    if (search()) {
+      // about a turn the inputs are known by the curvature there, of which the covariance of v does not tell
+      if (inverse.rank < most_rank) J_inverse.setConstant(not_a_number);
+      return Status::ok;
+    }
     missed.setConstant(not_a_number);
     return Status::not_found;
   }
@@ -204,6 +221,7 @@ struct InverseDynamicsSolver::Workspace::Implementation {
   [[nodiscard]] bool search() {
     constexpr int most_steps = 100, most_trials = 30;
     const Index nu = solver->nu();
+    largest.setZero();
     double size = size_of(usual) + size_of(wanted), gain_before = std::numeric_limits<double>::infinity();
     for (int step = 0; step < most_steps; ++step) {
       size = std::max(size, size_of(mean));
@@ -211,6 +229,7 @@ struct InverseDynamicsSolver::Workspace::Implementation {
       J.noalias() = root.lazyProduct(jacobian.rightCols(nu));
       const MatrixXd& pseudo_inverse = inverse.compute(J);
       J_inverse.noalias() = pseudo_inverse.lazyProduct(root);
+      most_rank = std::max(most_rank, inverse.rank);
       const double before = size_of(missed);
       change.noalias() = pseudo_inverse.lazyProduct(weighted);
       weighted.noalias() = J.lazyProduct(change);
@@ -219,22 +238,61 @@ struct InverseDynamicsSolver::Workspace::Implementation {
       const bool is_close = gain <= close_enough * size;
       if (gain <= rounding * size || (is_close && gain > gain_before / 2)) return true;
       gain_before = gain;
-      if (!improve(before, is_close ? 1 : most_trials)) return is_close;
+      largest = largest.cwiseMax(J.colwise().norm().transpose());
+      if (!improve(before, size, is_close ? 1 : most_trials)) return is_close || is_nearest;
     }
     return false;
   }
 
-  // The first of n steps change, change/2, change/4, … that misses less than before. False where none does: the state stays.
-  [[nodiscard]] bool improve(double before, int n) {
+  // The first step that misses less than before by a part of what its slope promises: that of Gauss and Newton, then Newton's own and
+  // shorter ones (Levenberg 1944), inputs being told apart by the largest effect that each has had (Moré 1978). False where none does:
+  // the state stays. Where the promise of the last one is rounding, these inputs come nearest to what is wanted, as where an input
+  // turns around what it does and J vanishes.
+  [[nodiscard]] bool improve(double before, double size, int n) {
+    constexpr double part = 0.25;
     auto inputs = state.tail(solver->nu());
     start = inputs;
-    for (int k = 0; k < n; ++k) {
-      inputs = start + std::ldexp(1.0, -k) * change;
-      if (evaluate() && size_of(missed) < before) return true;
+    pull.noalias() = metric.lazyProduct(missed);
+    slope.noalias() = jacobian.rightCols(solver->nu()).transpose().lazyProduct(pull);
+    double damping = 0;
+    is_nearest = false;
+    for (int k = 0; k < n && !is_nearest; ++k) {
+      if (k == 1) write_curvature(size);
+      if (k > 0) {
+        damped = curvature;
+        damped.diagonal().array() += damping * (largest.array() > 0).select(largest.array().square(), 1);
+        damping = std::max(5 * damping, 1e-3);
+        damped_llt.compute(damped);
+        if (damped_llt.info() != Eigen::Success) continue;
+        change = slope;
+        damped_llt.solveInPlace(change);
+      }
+      inputs = start + change;
+      const bool is_predicted = evaluate();
+      const double promised = 2 * slope.dot(change), after = size_of(missed);
+      if (is_predicted && (before - after) * (before + after) > (n == 1 ? 0 : part * promised)) return true;
+      is_nearest = is_predicted && promised <= rounding * before * before;
     }
     inputs = start;
     static_cast<void>(evaluate());
     return false;
+  }
+
+  // of ½ |missed|²: JᵀJ − (w − v)ᵀ M' ∂²v/∂u², the latter by differences of the slope, which need only be good enough for a step
+  void write_curvature(double size) {
+    auto inputs = state.tail(solver->nu());
+    curvature.noalias() = J.transpose().lazyProduct(J);
+    for (Index k = 0; k < solver->nu(); ++k) {
+      if (!(largest[k] > 0)) continue;
+      const double h = 1e-6 * size / largest[k];
+      inputs = start;
+      inputs[k] += h;
+      if (!evaluate()) continue;
+      change.noalias() = jacobian.rightCols(solver->nu()).transpose().lazyProduct(pull);
+      curvature.col(k) -= (change - slope) / h;
+    }
+    damped = curvature.transpose();
+    curvature = 0.5 * (curvature + damped);
   }
 };
 
@@ -242,7 +300,10 @@ struct InverseDynamicsSolver::Workspace::Implementation {
 
 MatrixXd InverseDynamics::stddev() const {
   MatrixXd stddev(inputs.rows(), inputs.cols());
-  for (Index k = 0; k < inputs.rows(); ++k) stddev.row(k) = covariance.row(k * (inputs.rows() + 1)).cwiseMax(0).cwiseSqrt();
+  for (Index k = 0; k < inputs.rows(); ++k) {
+    const auto variance = covariance.row(k * (inputs.rows() + 1)).array();
+    stddev.row(k) = (variance < 0).select(0, variance).sqrt();  // NaN stays NaN
+  }
   return stddev;
 }
 

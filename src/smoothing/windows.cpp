@@ -156,11 +156,11 @@ std::vector<WeightedSum> windowed_accelerations(const std::vector<Measurement>& 
       }
     }
   }
-  const Eigen::LLT<MatrixXd> factor(covariance);
+  const MatrixXd L = covariance.llt().matrixL();
   for (Index r = 0; r < n; ++r) {
     Index from = 0;
     while (from < r && covariance(r, from) == 0) ++from;
-    sums[static_cast<std::size_t>(r)].noise = MatrixXd(factor.matrixL()).row(r).segment(from, r - from + 1).transpose();
+    sums[static_cast<std::size_t>(r)].noise = L.row(r).segment(from, r - from + 1).transpose();
   }
   return sums;
 }
