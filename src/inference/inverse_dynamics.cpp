@@ -38,6 +38,18 @@ void require_inputs_of(const Posterior& posterior, const View& view) {
   if (system.layout().nu == 0) throw InputError(fmt::format("inverse_dynamics: '{}' has no inputs", system.name()));
 }
 
+// Of each input the root of its mean square in the observations; 1 where they tell nothing.
+VectorXd usual_inputs_of(const Posterior& posterior) {
+  const Index nu = posterior.prior().system->layout().nu;
+  VectorXd squares = VectorXd::Zero(nu), n = squares;
+  for (const Observations& group : posterior.observations()) {
+    const auto inputs = group.states().bottomRows(nu).array();
+    squares.array() += inputs.isFinite().select(inputs.square(), 0).rowwise().sum();
+    n.array() += inputs.isFinite().cast<double>().rowwise().sum();
+  }
+  return (squares.array() > 0).select((squares.array() / n.array()).sqrt(), 1);
+}
+
 /// The pseudo-inverse of matrices of one size whose columns are scaled first, so that units of inputs do not decide the rank.
 /// With J D P = Q [R; 0], D the scales, and Rᵀ P' = Q' [S; 0],
 ///
@@ -90,8 +102,9 @@ class ScaledPseudoInverse {
 }  // namespace
 
 struct InverseDynamicsSolver::Implementation {
-  Prior prior;          // where the view looks
-  VectorXd parameters;  // there
+  Prior prior;            // where the view looks
+  VectorXd parameters;    // there
+  VectorXd usual_inputs;  // how large each was as a rule
   Options options;
   Predictor predictor;
   Predictor without_data;
@@ -99,6 +112,7 @@ struct InverseDynamicsSolver::Implementation {
   Implementation(const Posterior& posterior, const View& view, Options given)
       : prior(prior_of(posterior.prior(), view)),
         parameters(parameters_of(view, posterior.values().parameters)),
+        usual_inputs(usual_inputs_of(posterior)),
         options(given),
         predictor(posterior, view, {.stddev = options.covariance, .jacobian = true, .storage = options.storage}),
         without_data(posterior.without_data(), view, {.stddev = true, .jacobian = false}) {}
@@ -176,6 +190,7 @@ struct InverseDynamicsSolver::Workspace::Implementation {
       return Status::no_prediction;
     }
     write_root();
+    begin_beside_turns();
     most_rank = 0;
     if (search()) {
       // about a turn the inputs are known by the curvature there, of which the covariance of v does not tell
@@ -210,6 +225,27 @@ struct InverseDynamicsSolver::Workspace::Implementation {
     }
     llt.compute(metric);
     root = llt.matrixU();
+  }
+
+  // An input that does nothing where it starts, while not all is produced, may be one whose effect is even, as that of a propeller at
+  // rest: it begins beside. One that does nothing there either stays.
+  void begin_beside_turns() {
+    auto inputs = state.tail(solver->nu());
+    auto effects = jacobian.rightCols(solver->nu());
+    if (size_of(missed) <= close_enough * (size_of(usual) + size_of(wanted))) return;
+    start = inputs;
+    for (Index k = 0; k < start.size(); ++k) {
+      if (effects.col(k).isZero(0)) inputs[k] += solver->usual_inputs[k];
+    }
+    if (inputs == start) return;
+    if (evaluate()) {
+      for (Index k = 0; k < start.size(); ++k) {
+        if (effects.col(k).isZero(0)) inputs[k] = start[k];
+      }
+    } else {
+      inputs = start;
+    }
+    static_cast<void>(evaluate());
   }
 
   // |v| in the metric, and v as it is there in `weighted`

@@ -290,6 +290,23 @@ TEST(InverseDynamicsSolverTest, FindsInputsByNewtonsMethodAndSaysWhyThereAreNone
   EXPECT_EQ(status_of("u - x", {unknown, 0, 0, 0}, 1), Solver::Status::no_prediction);
 }
 
+// The thrust of a propeller is even in its speed: at rest it does nothing, and Newton's method would stay there.
+TEST(InverseDynamicsSolverTest, LeavesAStartAtWhichAnInputDoesNothingYet) {
+  const Model model = cart("3*u^2");
+  const Posterior posterior(make_prior(model, {Prior::Mean::force, std::nullopt}), {},
+                            {{VectorXd::Ones(1)}, {VectorXd::Ones(1)}, {}, {}, {}});
+  const View view = View::constrained_acceleration(*model.system);
+  const MatrixXd at_rest = MatrixXd::Zero(model.system->layout().size(), 1);
+  const InverseDynamics found = inverse_dynamics(posterior, view, at_rest, MatrixXd::Constant(1, 1, 6));
+  EXPECT_NEAR(found.inputs(0, 0), 2, 1e-12);
+  EXPECT_NEAR(found.missed(0, 0), 0, 1e-12);
+  EXPECT_EQ(inverse_dynamics(posterior, view, at_rest, MatrixXd::Zero(1, 1)).inputs(0, 0), 0) << "all is produced";
+  const InverseDynamics idle =
+      inverse_dynamics(Posterior(make_prior(cart("2"), {Prior::Mean::force, std::nullopt}), {}, posterior.values()), view,
+                       at_rest, MatrixXd::Constant(1, 1, 6));
+  EXPECT_EQ(idle.inputs(0, 0), 0) << "it never does anything";
+}
+
 // What a sine cannot produce is missed by the least, where its slope vanishes; the other input does all it can meanwhile, which is more
 // where both act on one thing.
 TEST(InverseDynamicsSolverTest, ComesNearestWhereAnInputTurnsAround) {

@@ -32,7 +32,7 @@ struct InverseDynamics {
 /// order in Σ else. Where an input turns around what it does J loses rank, and it is immense or NaN.
 ///
 /// @param view           rows of ddq, of another system too
-/// @param states         (layout size × N); their inputs are where the search begins, 0 where they are NaN
+/// @param states         (layout size × N); their inputs are where the search begins: 0 where NaN, beside it where one does nothing
 /// @param accelerations  w (d × N)
 /// @throws InputError when the view is of something else, or the system has no inputs; and as Posterior::mean.
 /// @throws NumericalError naming a state at which no inputs are found.
