@@ -344,6 +344,10 @@ FitProblem start_problem(const Model& model, const FitProblemOptions& options) {
   if (paper && options.base == Latent::Base::force) {
     throw InputError("`protocol=paper` has its prior on the acceleration: leave out `prior=force`");
   }
+  if (paper && model.latents.size() > 1) {
+    throw InputError(fmt::format("`protocol=paper` has one latent, on the acceleration, but '{}' has {}", model.system->name(),
+                                 model.latents.size()));
+  }
   FitProblem problem;
   problem.robust = options.robust;
   problem.prior_options.mean = options.mean;

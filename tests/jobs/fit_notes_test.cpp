@@ -57,6 +57,9 @@ TEST(FitNotes, TellThatThePapersProtocolTakesNoDirections) {
   const testing::Matcher<std::vector<std::string>> told = Contains(HasSubstr("directions of the model's latent are not taken"));
   EXPECT_THAT(make_fit_problem(plain, log, options).notes, testing::Not(told));
   EXPECT_THAT(make_fit_problem(Model::parse(text, "cart"), log, options).notes, told);
+  const Model two = Model::parse(plain.text + "[[latent]]\nkernel = 'se'\nfeatures = ['dy']\n", "cart");
+  EXPECT_THAT(input_error_of([&] { make_fit_problem(two, log, options); }),
+              HasSubstr("`protocol=paper` has one latent, on the acceleration, but 'cart' has 2"));
 }
 
 TEST(FitNotes, TellThatThereIsNothingToProjectOnto) {
