@@ -12,6 +12,7 @@ import concurrent.futures
 import csv
 import json
 import math
+import os
 import pathlib
 import random
 import statistics
@@ -118,12 +119,11 @@ def main():
     parser.add_argument("--gp2", default="gp2")
     parser.add_argument("--seeds", type=int, nargs="+", default=[1])
     parser.add_argument("--mechanisms", nargs="+", default=list(LOGS))
-    parser.add_argument("--side-by-side", type=int, default=2, help="cells at a time")
     parser.add_argument("--out", required=True)
     parser.add_argument("options", nargs="*", help="of gp2 fit, after --")
     asked = parser.parse_args()
     rows = []
-    with open(asked.out, "w") as file, concurrent.futures.ThreadPoolExecutor(asked.side_by_side) as pool:
+    with open(asked.out, "w") as file, concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
         cells = [pool.submit(cell, asked.gp2, name, level, seed, asked.options)
                  for name in asked.mechanisms for level in LEVELS for seed in asked.seeds]
         for future in cells:

@@ -1,10 +1,10 @@
 """The bound of inducing points as it is usually written, with a jitter, in NumPy and in GPyTorch: its time and its failures beside gp2's.
 
     PYTHONPATH=build/test/python python3 experiments/sgpr.py write problems.npz
-    python3 experiments/sgpr.py time problems.npz build/release/benchmarks/likelihood_benchmark
+    OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 python3 experiments/sgpr.py time problems.npz build/release/benchmarks/likelihood_benchmark
     python3 experiments/sgpr.py noise problems.npz
 
-Both evaluate the same number: the bound of Titsias (2009) for the particle on a surface, in the reduced space of docs/theory.md, T37,
+All evaluate the same number: the bound of Titsias (2009) for the particle on a surface, in the reduced space of docs/theory.md, T37,
 at the same inducing points. In NumPy all 3m inducing variables stand beside all 2N reduced measurements as one matrix, K(Z, Z) is
 factored with a jitter on its diagonal, and the gradient is written by hand. GPyTorch, where it is installed, has the same model: a row
 of T37 and a direction of an inducing variable are three columns more, and the kernel is a squared exponential times a scalar product.
@@ -237,7 +237,8 @@ def milliseconds(evaluate):
 
 def compare_time(file, benchmark, size, threads, rounds):
     """Value and gradient of each, one after the other; OPENBLAS_NUM_THREADS and OMP_NUM_THREADS are to be `threads`."""
-    assert os.environ.get("OPENBLAS_NUM_THREADS") == os.environ.get("OMP_NUM_THREADS") == str(threads)
+    if not os.environ.get("OPENBLAS_NUM_THREADS") == os.environ.get("OMP_NUM_THREADS") == str(threads):
+        raise SystemExit(f"set OPENBLAS_NUM_THREADS and OMP_NUM_THREADS to {threads}: BLAS reads them when it is loaded")
     arrays, reduced = read(file, f"time/{size}")
     X, Z = arrays["X"], arrays["X"][:: size // 200][:200]
     lengthscales = 3 * X.std(0)

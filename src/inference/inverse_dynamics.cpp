@@ -190,9 +190,10 @@ struct InverseDynamicsSolver::Workspace::Implementation {
       return Status::no_prediction;
     }
     write_root();
-    begin_beside_turns();
+    const double size = size_of(usual) + size_of(wanted);
+    begin_beside_turns(size);
     most_rank = 0;
-    if (search()) {
+    if (search(size)) {
       // about a turn the inputs are known by the curvature there, of which the covariance of v does not tell
       if (inverse.rank < most_rank) J_inverse.setConstant(not_a_number);
       return Status::ok;
@@ -229,10 +230,10 @@ struct InverseDynamicsSolver::Workspace::Implementation {
 
   // An input that does nothing where it starts, while not all is produced, may be one whose effect is even, as that of a propeller at
   // rest: it begins beside. One that does nothing there either stays.
-  void begin_beside_turns() {
+  void begin_beside_turns(double size) {
     auto inputs = state.tail(solver->nu());
     auto effects = jacobian.rightCols(solver->nu());
-    if (size_of(missed) <= close_enough * (size_of(usual) + size_of(wanted))) return;
+    if (size_of(missed) <= close_enough * size) return;
     start = inputs;
     for (Index k = 0; k < start.size(); ++k) {
       if (effects.col(k).isZero(0)) inputs[k] += solver->usual_inputs[k];
@@ -254,11 +255,12 @@ struct InverseDynamicsSolver::Workspace::Implementation {
     return weighted.norm();
   }
 
-  [[nodiscard]] bool search() {
+  // size: of accelerations, beside which rounding is judged
+  [[nodiscard]] bool search(double size) {
     constexpr int most_steps = 100, most_trials = 30;
     const Index nu = solver->nu();
     largest.setZero();
-    double size = size_of(usual) + size_of(wanted), gain_before = std::numeric_limits<double>::infinity();
+    double gain_before = std::numeric_limits<double>::infinity();
     for (int step = 0; step < most_steps; ++step) {
       size = std::max(size, size_of(mean));
       if (!std::isfinite(size)) return false;  // beside which anything would pass for rounding

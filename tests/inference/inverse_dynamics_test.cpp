@@ -285,6 +285,7 @@ TEST(InverseDynamicsSolverTest, FindsInputsByNewtonsMethodAndSaysWhyThereAreNone
   EXPECT_EQ(status_of("u", {0, 0, 0, 0}, 1), Solver::Status::ok);
   EXPECT_EQ(status_of("u", {0, 0, 0, unknown}, 1), Solver::Status::ok);
   EXPECT_EQ(status_of("u^2", {0, 0, 0, 1}, -1), Solver::Status::ok);
+  EXPECT_EQ(status_of("u^2", {0, 0, 0, 0}, 1), Solver::Status::ok);
   EXPECT_EQ(status_of("u", {0, 0, 0, 0}, 1e200), Solver::Status::not_found) << "its square overflows";
   EXPECT_EQ(status_of("u", {0, 0, 0, 0}, unknown), Solver::Status::not_finite);
   EXPECT_EQ(status_of("u - x", {unknown, 0, 0, 0}, 1), Solver::Status::no_prediction);
@@ -307,8 +308,8 @@ TEST(InverseDynamicsSolverTest, LeavesAStartAtWhichAnInputDoesNothingYet) {
   EXPECT_EQ(idle.inputs(0, 0), 0) << "it never does anything";
 }
 
-// What a sine cannot produce is missed by the least, where its slope vanishes; the other input does all it can meanwhile, which is more
-// where both act on one thing.
+// What a sine cannot produce is missed by the least, where its slope vanishes. The other input still produces all of y, on which the
+// first acts too: at the turn both columns of J are parallel.
 TEST(InverseDynamicsSolverTest, ComesNearestWhereAnInputTurnsAround) {
   const Model model = Model::parse(R"toml(
 name        = "two carts"

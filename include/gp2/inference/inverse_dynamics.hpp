@@ -26,7 +26,7 @@ struct InverseDynamics {
 ///
 /// the inputs of which w comes where it can be produced, and else what is nearest to it in the sense of Gauss' principle. Where several inputs do
 /// the same, the least change of them from where they start, each weighed by the acceleration that it makes. One solve where v is affine in
-/// u; else the method of Levenberg and Marquardt from where they start, so that u is the nearest of those about it.
+/// u; else Newton's method from where they start, with steps damped where they do not help: the nearest of those about it.
 ///
 /// The covariance is J⁺ Σ J⁺ᵀ, Σ that of v, and J⁺ the inverse of J = ∂v/∂u in the same metric: exact where u enters no latent, of first
 /// order in Σ else. Where an input turns around what it does J loses rank, and it is immense or NaN.
