@@ -20,6 +20,9 @@ namespace gp2 GP2_API {
 /// ddq at one state [q; dq; t; u]: a model's own, a posterior mean, or one sample of a posterior.
 using Acceleration = std::function<Eigen::VectorXd(const Eigen::Ref<const Eigen::VectorXd>& state)>;
 
+/// The same under A ddq = b + push, given a push of each row of A (nc), which is 0 of those that are not there.
+using PushedAcceleration = std::function<Acceleration(const Eigen::VectorXd& push)>;
+
 /// Inputs over time: zero, or a table of commands that is linear in between and held at its ends, as their actuators follow it,
 /// exactly; they are at rest before the table.
 class InputSignal {
@@ -120,6 +123,7 @@ struct SimulateOptions {
   SwitchingFunctions switching;      // where the acceleration jumps
   std::vector<Contact> contacts;     // that are made and released
   double shortest_flight = 1e-7;     // a rebound that would last no longer ends in contact [s]
+  PushedAcceleration pushed;         // what says how the friction of an impact follows from its load; none: it has no friction
   Acceleration record;               // another function of the state, of any size, that is wanted at the times; none
   double initial_step = 0;           // [s]; 0: found from the first two accelerations
 };
@@ -169,12 +173,12 @@ class UnfinishedMotion : public NumericalError {
 /// between them: a body under dry friction rests, and breaks loose. Friction may be proportional to a load that it changes itself:
 /// |λ_t| ≤ μ |λ_n| holds of each of several contacts, whose accelerations are those of all combinations of sides, mixed.
 ///
-/// A contact ends a step where its gap closes, found on the dense output. It is an impact of Newton's law along M⁻¹Aᵀ, during which
-/// all other active constraints hold, and which has no impulse of friction; where the rebound is over within `shortest_flight` the
-/// contact stays closed, so that the accumulating bounces of a ball end. A restitution outside [0, 1] is an error. A closed contact is
+/// A contact ends a step where its gap closes, found on the dense output. It is an impact of Newton's law, during which all other
+/// active constraints hold: along M⁻¹Aᵀ, or with the impulses of friction that the loads bring about; where the rebound is over
+/// within `shortest_flight` the contact stays closed, so that the accumulating bounces of a ball end. A restitution outside [0, 1] is an error. A closed contact is
 /// released where the motion without it would open the gap, which is where its multiplier would pull. One at a time: where several
-/// contacts close or open together, those whose impulse would pull are let go one after the other, which is not the complementarity
-/// problem of many contacts.
+/// contacts close or open together, those that would pull are let go one after the other, which is not the complementarity problem
+/// of many contacts.
 ///
 /// @param parameters  of the system's constraints and mass matrix (system.parameters().size())
 /// @param start       [q; dq; …] (layout size), t and u are set from the options. Off the constraint it is projected, or taken as
@@ -207,6 +211,14 @@ Eigen::VectorXd complete_start(const Model& model, const Eigen::VectorXd& parame
 
 /// The acceleration of a model as it is written: L b + T (M⁻¹F + truth), truth = 0 without [truth].
 Acceleration model_acceleration(const Model& model);
+/// The same under pushes; none where its truth reads no load, so that its impacts have no friction.
+PushedAcceleration pushed_acceleration(const Model& model);
+/// Of the mean of a posterior, or a sample; none where its prior reads no load.
+/// @param function  what a view of the prior is at states: Posterior::mean, or PathwiseSamples::evaluate of one sample
+/// @param view      of ddq
+PushedAcceleration pushed_acceleration(
+    const Prior& prior, const View& view,
+    std::function<Eigen::MatrixXd(const View& view, const Eigen::Ref<const Eigen::MatrixXd>& states)> function);
 
 /// Kinetic energy ½ dqᵀM dq of a system, at N states (N) [J].
 Eigen::VectorXd kinetic_energy(const System& system, const Eigen::VectorXd& parameters,

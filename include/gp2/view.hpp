@@ -79,6 +79,13 @@ struct View {
   [[nodiscard]] std::vector<std::string> names(const System& system, const std::string& latent_name = "") const;
 };
 
+/// Whether what a prior says of ddq depends on the loads of the constraints: features or directions of a latent read λ or λ₀.
+bool reads_loads(const Prior& prior);
+
+/// A view as it is under A ddq = b + push.
+/// @param push  (nc), 0 of rows that are not there
+View pushed(const Prior& home, View view, const Eigen::VectorXd& push);
+
 /// What a view looks at: the prior of its other system, or the one at home; and the parameters there.
 const Prior& prior_of(const Prior& home, const View& view);
 Eigen::VectorXd parameters_of(const View& view, const Eigen::Ref<const Eigen::VectorXd>& home);

@@ -234,11 +234,13 @@ class Shooter {
   /// Measured less predicted positions, row after row; nothing where the motion does not reach the end.
   [[nodiscard]] std::optional<VectorXd> residual(const Posterior& posterior, const Stretch& stretch,
                                                  const VectorXd& start) const {
-    const Acceleration mean = [&](const Eigen::Ref<const VectorXd>& x) -> VectorXd { return posterior.mean(view_, x).col(0); };
+    const auto mean = [&](const View& view, const Eigen::Ref<const MatrixXd>& x) { return posterior.mean(view, x); };
     return residual(mean, posterior.values().parameters, stretch, start);
   }
-  [[nodiscard]] std::optional<VectorXd> residual(const Acceleration& acceleration, const VectorXd& parameters,
-                                                 const Stretch& stretch, const VectorXd& start) const {
+  template <typename Function>
+  [[nodiscard]] std::optional<VectorXd> residual(const Function& function, const VectorXd& parameters, const Stretch& stretch,
+                                                 const VectorXd& start) const {
+    const Acceleration acceleration = [&](const Eigen::Ref<const VectorXd>& x) -> VectorXd { return function(view_, x).col(0); };
     SimulateOptions options;
     options.times = times().segment(stretch.first, stretch.size).transpose();
     options.relative_tolerance = 1e-8;
@@ -246,6 +248,7 @@ class Shooter {
     options.max_steps = most_steps_per_row * static_cast<int>(stretch.size);  // a motion that runs away takes ever more
     options.switching = switching_;
     options.contacts = contacts_of(fit_.model, parameters);
+    if (!options.contacts.empty()) options.pushed = pushed_acceleration(prior_, view_, function);
     const MatrixXd gaps = gaps_of(system_, contacts_, start, parameters);
     for (std::size_t k = 0; k < contacts_.size(); ++k) {
       if (!is_closed(contacts_[k], stretch.first) && !(gaps(static_cast<Index>(k), 0) > 0)) return std::nullopt;
@@ -441,9 +444,7 @@ class Shooter {
     parallel_for(static_cast<int>(stretches_.size()), n_threads_, [&](int k, int) {
       const auto at = static_cast<std::size_t>(k);
       for (int s = 0; s < n_samples; ++s) {
-        const Acceleration drawn = [&](const Eigen::Ref<const VectorXd>& x) -> VectorXd {
-          return samples.evaluate(s, view_, x).col(0);
-        };
+        const auto drawn = [&](const View& view, const Eigen::Ref<const MatrixXd>& x) { return samples.evaluate(s, view, x); };
         const std::optional<VectorXd> there =
             residual(drawn, posterior.values().parameters, stretches_[at], stretches_[at].start);
         if (!there) continue;

@@ -244,7 +244,8 @@ SimulateJob prepare_simulation(const Model& model, const SimulateRequest& reques
   const VectorXd parameters = model.system->parameter_values();
   SimulateJob job = prepare(model, model.actuators, parameters, request);
   job.options.switching = switching_functions(model, /*of_latents=*/false);
-  SimulateJob::Motion motion{parameters, model_acceleration(model), {}, {}, contacts_of(model, parameters)};
+  SimulateJob::Motion motion{parameters, model_acceleration(model),      {},
+                             {},         contacts_of(model, parameters), pushed_acceleration(model)};
   if (model.potential) {
     motion.energy = [&model, parameters](const MatrixXd& states) -> MotionEnergy {
       return {mechanical_energy(model, parameters, states), {}};
@@ -312,12 +313,22 @@ SimulateJob prepare_simulation(const FitSystem& system, const Posterior& posteri
     return energy_with_learned(model, parameters, mean, potentials, states, [&](int a) { return learned(a, states); });
   };
   const auto add = [&](const VectorXd& parameters, const auto& function, const auto& energy) {
-    const auto of_view = [&](View view) -> Acceleration {
+    const auto at_system = [&](View view) {
       view.other_system = system.other_system;
-      return [function, view](const Eigen::Ref<const VectorXd>& x) -> VectorXd { return function(view, x).col(0); };
+      return view;
     };
-    SimulateJob::Motion motion{
-        parameters, of_view(View::constrained_acceleration(*model.system)), {}, {}, contacts_of(model, parameters)};
+    const auto of_view = [&](View view) -> Acceleration {
+      return [function, view = at_system(view)](const Eigen::Ref<const VectorXd>& x) -> VectorXd {
+        return function(view, x).col(0);
+      };
+    };
+    const View ddq = View::constrained_acceleration(*model.system);
+    SimulateJob::Motion motion{parameters,
+                               of_view(ddq),
+                               {},
+                               {},
+                               contacts_of(model, parameters),
+                               pushed_acceleration(posterior.prior(), at_system(ddq), function)};
     if (model.system->nc() > 0) motion.multipliers = of_view(View::multipliers(*model.system));
     if (has_energy) motion.energy = energy;
     job.motions.push_back(std::move(motion));
@@ -329,7 +340,7 @@ SimulateJob prepare_simulation(const FitSystem& system, const Posterior& posteri
       components.emplace_back(parameters_of(component.values().parameters), component);
     }
     add(
-        likeliest, [posterior](const View& view, const Eigen::Ref<const VectorXd>& x) { return posterior.mean(view, x); },
+        likeliest, [posterior](const View& view, const Eigen::Ref<const MatrixXd>& x) { return posterior.mean(view, x); },
         [energy_under, components](const MatrixXd& states) {
           std::vector<MotionEnergy> energies;
           for (const auto& component : components) {
@@ -345,7 +356,7 @@ SimulateJob prepare_simulation(const FitSystem& system, const Posterior& posteri
   for (int k = 0; k < samples->n_samples(); ++k) {
     const VectorXd parameters = parameters_of(samples->parameters(k));
     add(
-        parameters, [samples, k](const View& view, const Eigen::Ref<const VectorXd>& x) { return samples->evaluate(k, view, x); },
+        parameters, [samples, k](const View& view, const Eigen::Ref<const MatrixXd>& x) { return samples->evaluate(k, view, x); },
         [energy_under, parameters, samples, k](const MatrixXd& states) {
           return energy_under(parameters, states, [&](int a, const MatrixXd& at) {
             return Posterior::Potential{samples->potential(k, a, at, at.col(0)), {}};
@@ -365,6 +376,7 @@ std::vector<Trajectory> run_simulation(const SimulateJob& job, const std::atomic
     };
     options.record = motion.multipliers;
     options.contacts = motion.contacts;
+    options.pushed = motion.pushed;
     try {
       motions.push_back(simulate(*job.system, motion.parameters, stoppable, job.start, options));
     } catch (UnfinishedMotion& unfinished) {

@@ -1,6 +1,7 @@
 #pragma once
 
 #include <memory>
+#include <utility>
 
 #include "gp2/prior/state_function.hpp"
 #include "gp2/system.hpp"
@@ -22,6 +23,10 @@ class LoadFunction final : public StateFunction {
   [[nodiscard]] bool reads(int state_index) const override;
   [[nodiscard]] const StateFunction* of_multipliers() const override { return is_of_motion_ ? function_.get() : nullptr; }
   [[nodiscard]] std::unique_ptr<Evaluator> make_evaluator(const Parameters& parameters) const override;
+  /// The same function of the load in another system of the same rows.
+  [[nodiscard]] std::shared_ptr<const LoadFunction> under(std::shared_ptr<const System> system) const {
+    return std::make_shared<const LoadFunction>(function_, std::move(system), is_of_motion_);
+  }
 
  private:
   class ChainEvaluator;

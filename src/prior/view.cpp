@@ -8,6 +8,8 @@
 
 #include "gp2/error.hpp"
 #include "mechanics/describe_fault.hpp"
+#include "mechanics/pushed_system.hpp"
+#include "prior/load_function.hpp"
 
 namespace gp2 {
 
@@ -86,6 +88,34 @@ VectorXd OtherSystem::parameters(const Ref<const VectorXd>& home) const {
     if (shared[k] >= 0) parameters[static_cast<Index>(k)] = home[shared[k]];
   }
   return parameters;
+}
+
+namespace {
+
+std::shared_ptr<const LoadFunction> load_function(const std::shared_ptr<const StateFunction>& function) {
+  return std::dynamic_pointer_cast<const LoadFunction>(function);
+}
+
+}  // namespace
+
+bool reads_loads(const Prior& prior) {
+  return std::any_of(prior.latents.begin(), prior.latents.end(), [](const Latent& latent) {
+    return load_function(latent.features) != nullptr || load_function(latent.directions) != nullptr;
+  });
+}
+
+View pushed(const Prior& home, View view, const VectorXd& push) {
+  std::vector<int> own(home.system->parameters().size());
+  std::iota(own.begin(), own.end(), 0);
+  OtherSystem there = view.other_system ? *view.other_system : OtherSystem{home, std::move(own)};
+  there.prior.system = std::make_shared<const PushedSystem>(there.prior.system, push);
+  for (Latent& latent : there.prior.latents) {
+    for (std::shared_ptr<const StateFunction>* function : {&latent.features, &latent.directions}) {
+      if (const auto of_load = load_function(*function)) *function = of_load->under(there.prior.system);
+    }
+  }
+  view.other_system = std::make_shared<const OtherSystem>(std::move(there));
+  return view;
 }
 
 View View::all(Quantity quantity, const System& system) {

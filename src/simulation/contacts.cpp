@@ -171,39 +171,57 @@ void Contacts::release(VectorXd& state, const Acceleration& acceleration, std::v
   mark(state);
 }
 
-// Δdq = M⁻¹Aᵀ(A M⁻¹Aᵀ)⁺ r, with r = −(1 + e) ċ of the rows that are hit and 0 of all others that are active: L b of T2 with r for b.
+// Δdq = M⁻¹Aᵀ(A M⁻¹Aᵀ)⁺ r: L b of T2 with r for b
+std::optional<VectorXd> Contacts::jump(const VectorXd& state, const VectorXd& r) const {
+  const SystemValues values = system_.evaluate(state, parameters_);
+  const UdwadiaKalaba projection(values.M(0), values.A(0), r);
+  if (!projection.motion_is_determined()) return std::nullopt;
+  return jump_ ? jump_(state, r) : projection.Lb();
+}
+
 double Contacts::impact(VectorXd& state, const std::vector<bool>& hit, const VectorXd& restitution) {
   const Gaps gaps = gaps_at(state);
+  VectorXd wanted = VectorXd::Zero(std::ssize(contacts_));  // changes of the rates of gaps
   std::vector<bool> active = is_closed_;
-  for (std::size_t k = 0; k < active.size(); ++k) active[k] = active[k] || hit[k];
-  while (true) {
-    mark(state, active);
-    const SystemValues values = system_.evaluate(state, parameters_);
+  for (std::size_t k = 0; k < active.size(); ++k) {
+    const auto row = static_cast<Index>(k);
+    if (hit[k]) wanted[row] = -(1 + restitution[row]) * gaps.rate[row];
+    active[k] = active[k] || hit[k];
+  }
+  const auto change_with = [&](const std::vector<bool>& closed) {
+    mark(state, closed);
     VectorXd r = VectorXd::Zero(system_.nc());
-    for (std::size_t k = 0; k < contacts_.size(); ++k) {
-      const auto row = static_cast<Index>(k);
-      if (hit[k] && active[k]) r[contacts_[k].row] = -(1 + restitution[row]) * gaps.rate[row];
+    for (std::size_t k = 0; k < closed.size(); ++k) {
+      if (closed[k]) r[contacts_[k].row] = wanted[static_cast<Index>(k)];
     }
-    const UdwadiaKalaba projection(values.M(0), values.A(0), r);
-    if (!projection.motion_is_determined()) throw NumericalError("nothing determines what an impact does to the velocities");
-    const VectorXd change = projection.Lb();
-    const VectorXd impulses = projection.multipliers_of_force() * (values.M(0) * change);
-    // a contact only pushes
-    constexpr double rounding = 1e-12;
+    return jump(state, r);
+  };
+  while (true) {
+    // a contact only pushes: one whose gap would open more without it is let go
     std::size_t worst = contacts_.size();
-    double least = -rounding * impulses.cwiseAbs().maxCoeff();
-    for (std::size_t k = 0; k < contacts_.size(); ++k) {
-      if (!active[k] || !(impulses[contacts_[k].row] < least)) continue;
-      least = impulses[contacts_[k].row];
+    double most = 0;
+    for (std::size_t k = 0; k < contacts_.size() && std::count(active.begin(), active.end(), true) > 1; ++k) {
+      constexpr double rounding = 1e-9;
+      if (!active[k]) continue;
+      std::vector<bool> others = active;
+      others[k] = false;
+      const std::optional<VectorXd> change = change_with(others);
+      if (!change) continue;
+      const auto row = static_cast<Index>(k);
+      const double more = gaps.A.row(row).dot(*change) - wanted[row];
+      if (more <= most + rounding * gaps.A.row(row).cwiseAbs().dot(change->cwiseAbs())) continue;
+      most = more;
       worst = k;
     }
     if (worst < contacts_.size()) {
       active[worst] = is_closed_[worst] = false;
       continue;
     }
+    const std::optional<VectorXd> change = change_with(active);
+    if (!change) throw NumericalError("nothing determines what an impact does to the velocities");
     auto dq = state.segment(layout_.dq(0), layout_.nq);
-    const double loss = -change.dot(values.M(0) * (dq + change / 2));
-    dq += change;
+    const double loss = -change->dot(system_.evaluate(state, parameters_).M(0) * (dq + *change / 2));
+    dq += *change;
     return loss;
   }
 }
@@ -224,6 +242,8 @@ void Contacts::settle(VectorXd& state, const Acceleration& acceleration, std::ve
     release(state, acceleration, events);
     return;
   }
+  const VectorXd before = state;
+  const std::vector<bool> was_closed = is_closed_;
   double loss = impact(state, hit, restitution);
   mark(state);
   // a rebound that is over at once is none
@@ -234,13 +254,17 @@ void Contacts::settle(VectorXd& state, const Acceleration& acceleration, std::ve
     if (!hit[contact]) continue;
     const double back = opening(state, contact, acceleration);
     stays[contact] = restitution[k] == 0 || (back < 0 && 2 * rate[k] <= -back * shortest_flight_);
+    if (stays[contact]) restitution[k] = 0;
   }
   if (std::find(stays.begin(), stays.end(), true) != stays.end()) {
-    loss += impact(state, stays, VectorXd::Zero(n));
+    state = before;
+    is_closed_ = was_closed;
+    loss = impact(state, hit, restitution);
     for (std::size_t k = 0; k < contacts_.size(); ++k) is_closed_[k] = is_closed_[k] || stays[k];
     mark(state);
   }
   for (std::size_t k = 0; k < contacts_.size(); ++k) {
+    if (was_closed[k] && !is_closed_[k]) events.push_back({state[layout_.t()], contacts_[k].row, Kind::released, 0, 0});
     if (!hit[k]) continue;
     events.push_back({state[layout_.t()], contacts_[k].row, stays[k] ? Kind::made : Kind::impact,
                       -gaps.rate[static_cast<Index>(k)], std::exchange(loss, 0)});

@@ -1,6 +1,9 @@
 #pragma once
 
 #include <algorithm>
+#include <functional>
+#include <optional>
+#include <utility>
 #include <vector>
 
 #include <Eigen/Core>
@@ -25,6 +28,11 @@ class Contacts {
   [[nodiscard]] bool is_empty() const { return contacts_.empty(); }
   /// Writes to the inputs of a state which contacts are closed.
   void mark(Eigen::VectorXd& state) const { mark(state, is_closed_); }
+
+  /// What impacts with friction make of the velocities.
+  /// @param jump  Δdq that changes A dq of the active rows by r (nc), given a state and r; none: it is along M⁻¹Aᵀ
+  using Jump = std::function<Eigen::VectorXd(const Eigen::VectorXd& state, const Eigen::VectorXd& r)>;
+  void jump_by(Jump jump) { jump_ = std::move(jump); }
 
   /// Closes the contacts in which a motion starts. @throws InputError where it starts beyond a surface.
   void start(Eigen::VectorXd& state, const Acceleration& acceleration, std::vector<ContactEvent>& events);
@@ -53,6 +61,8 @@ class Contacts {
   [[nodiscard]] double opening(Eigen::VectorXd state, std::size_t contact, const Acceleration& acceleration) const;
   /// Takes the rates of the gaps in `hit` to −restitution times what they are, and gives the kinetic energy that this takes.
   double impact(Eigen::VectorXd& state, const std::vector<bool>& hit, const Eigen::VectorXd& restitution);
+  /// Δdq that changes A dq of the active rows by r; none where nothing determines it.
+  [[nodiscard]] std::optional<Eigen::VectorXd> jump(const Eigen::VectorXd& state, const Eigen::VectorXd& r) const;
   void release(Eigen::VectorXd& state, const Acceleration& acceleration, std::vector<ContactEvent>& events);
 
   const System& system_;
@@ -61,6 +71,7 @@ class Contacts {
   std::vector<Contact> contacts_;
   std::vector<int> residuals_;  // gap_residuals
   double shortest_flight_;
+  Jump jump_;
   std::vector<bool> is_closed_;
 };
 

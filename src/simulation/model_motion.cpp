@@ -9,6 +9,7 @@
 #include "mechanics/describe_fault.hpp"
 #include "mechanics/known_multipliers.hpp"
 #include "mechanics/multiplier_solver.hpp"
+#include "mechanics/pushed_system.hpp"
 
 namespace gp2 {
 
@@ -35,6 +36,12 @@ ModelMotion::ModelMotion(const Model& model) : system_(model.system), parameters
   const int n_states = system_->layout().size() + system_->nc();
   truth_slopes_ = StateDerivatives(model.truth, inputs, n_states);
   truth_force_slopes_ = StateDerivatives(model.truth_force, inputs, n_states);
+}
+
+ModelMotion ModelMotion::pushed(const VectorXd& push) const {
+  ModelMotion motion = *this;
+  motion.system_ = std::make_shared<const PushedSystem>(system_, push);
+  return motion;
 }
 
 // [states; λ]

@@ -72,7 +72,9 @@ class Integration {
         switching_(options.switching, parameters, layout_, options.absolute_tolerance),
         contacts_(system, parameters, options),
         stepper_(ErrorChecker(options.absolute_tolerance, options.relative_tolerance, 1, 0)),
-        state_(VectorXd::Zero(layout_.size())) {}
+        state_(VectorXd::Zero(layout_.size())) {
+    if (options.pushed) contacts_.jump_by([this](const VectorXd& state, const VectorXd& r) { return jump(state, r); });
+  }
 
   Trajectory run(const Ref<const VectorXd>& start, bool redundant) {
     project_stages_ = redundant;
@@ -198,6 +200,11 @@ class Integration {
 
   // [q; dq; t; u(t)] in state_
   void expand(const Phase& x, double t) {
+    if (instant_) {
+      state_ = *instant_;
+      std::copy(x.begin() + layout_.nq, x.end(), state_.begin() + layout_.dq(0));
+      return;
+    }
     std::copy(x.begin(), x.end(), state_.begin());
     state_[layout_.t()] = t;
     options_.inputs.evaluate(t, state_.tail(layout_.nu));
@@ -468,6 +475,38 @@ class Integration {
     };
   }
 
+  // Δdq of an impact with friction, whose gaps open at rates that change evenly by r: a motion of the velocities alone, within a
+  // time so short that no surface moves, under loads so large that no other force counts (theory.md, T49).
+  VectorXd jump(const VectorXd& at, const VectorXd& r) {
+    constexpr double duration = 1e-12, large = 1e3 / duration, same = 1e-6;
+    if (r.isZero(0)) return VectorXd::Zero(layout_.nq);
+    const auto between = [this, &r](double less, double more) -> Acceleration {
+      return [below = options_.pushed(less * r), above = options_.pushed(more * r), scale = duration * (more - less)](
+                 const Ref<const VectorXd>& state) -> VectorXd { return (above(state) - below(state)) / scale; };
+    };
+    const Acceleration impulse = between(large, 2 * large);
+    const VectorXd ddq = impulse(at);
+    if (!((ddq - between(2 * large, 4 * large)(at)).norm() <= same * ddq.norm())) {
+      throw NumericalError("the friction of an impact grows faster than its load, so that its impulse is not finite");
+    }
+    SimulateOptions options = options_;
+    options.times = Eigen::Vector2d(0, duration);
+    options.relative_tolerance = std::min(options.relative_tolerance, 1e-9);
+    options.project = false;
+    options.contacts.clear();
+    options.record = {};
+    options.initial_step = 0;
+    Integration motion(system_, parameters_, impulse, options);
+    motion.instant_ = at;
+    try {
+      const Trajectory velocities = motion.run(at, /*redundant=*/false);
+      out_.evaluations += 2 * velocities.evaluations;
+      return velocities.states.col(1).segment(layout_.dq(0), layout_.nq) - at.segment(layout_.dq(0), layout_.nq);
+    } catch (const UnfinishedMotion& unfinished) {
+      throw NumericalError(motion.fault_ ? motion.fault_->text : unfinished.what());
+    }
+  }
+
   // impacts and releases at (x_, t_)
   void settle_contacts(bool at_start) {
     expand(x_, t_);
@@ -525,6 +564,7 @@ class Integration {
   double t_ = 0, t_halfway_ = 0;  // … when half of the steps were taken
   Phase x_, dxdt_, x_new_, dxdt_new_, x_crossing_;
   std::optional<StageFault> fault_;  // of the last try
+  std::optional<VectorXd> instant_;  // the state of which velocities alone move
   Trajectory out_;
 };
 
@@ -606,6 +646,26 @@ Trajectory simulate(const System& system, const VectorXd& parameters, const Acce
 Acceleration model_acceleration(const Model& model) {
   return
       [motion = ModelMotion(model)](const Ref<const VectorXd>& state) -> VectorXd { return motion.acceleration(state).col(0); };
+}
+
+PushedAcceleration pushed_acceleration(const Model& model) {
+  const ModelMotion motion(model);
+  if (!motion.reads_load()) return {};
+  return [motion](const VectorXd& push) -> Acceleration {
+    return [pushed = motion.pushed(push)](const Ref<const VectorXd>& state) -> VectorXd {
+      return pushed.acceleration(state).col(0);
+    };
+  };
+}
+
+PushedAcceleration pushed_acceleration(const Prior& prior, const View& view,
+                                       std::function<MatrixXd(const View& view, const Ref<const MatrixXd>& states)> function) {
+  if (!reads_loads(prior)) return {};
+  return [prior, view, function = std::move(function)](const VectorXd& push) -> Acceleration {
+    return [function, view = pushed(prior, view, push)](const Ref<const VectorXd>& state) -> VectorXd {
+      return function(view, state).col(0);
+    };
+  };
 }
 
 VectorXd kinetic_energy(const System& system, const VectorXd& parameters, const Ref<const MatrixXd>& states) {

@@ -20,6 +20,12 @@ class ModelMotion {
  public:
   explicit ModelMotion(const Model& model);
 
+  /// Whether the truth reads the load.
+  [[nodiscard]] bool reads_load() const { return load_ != Load::none; }
+  /// The motion under A ddq = b + push.
+  /// @param push  (nc), 0 of rows that are not there
+  [[nodiscard]] ModelMotion pushed(const Eigen::VectorXd& push) const;
+
   /// @param states  (layout size × N)
   /// @param slip    ε of the soft constraints, A ddq = b + ς ε, of those of each state (soft rows × N); empty: none slips
   /// @return (nq × N), not finite where the truth is not
