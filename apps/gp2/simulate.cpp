@@ -125,11 +125,20 @@ std::optional<std::string> contacts_note(const Trajectory& motion) {
   double loss = 0;
   for (const ContactEvent& event : motion.events) loss += event.energy_loss;
   const ContactEvent& last = motion.events.back();
+  const auto least = std::min_element(motion.events.begin(), motion.events.end(),
+                                      [](const auto& one, const auto& other) { return one.energy_loss < other.energy_loss; });
+  constexpr double rounding = 1e-9;
+  const std::string gain = least->energy_loss < -rounding * (1 + std::abs(loss))
+                               ? fmt::format(
+                                     "; the one at t = {:.6g} gave {:.3g} J, as Newton's restitution does where friction turns "
+                                     "the slip: a smaller restitution gives none",
+                                     least->time, -least->energy_loss)
+                               : "";
   return fmt::format(
       "contacts: {} impacts, made {} and released {} times, the first event at t = {:.6g}, the last, {}, at {:.6g}; "
-      "impacts took {:.6g} J",
+      "impacts took {:.6g} J{}",
       count(ContactEvent::Kind::impact), count(ContactEvent::Kind::made), count(ContactEvent::Kind::released),
-      motion.events.front().time, word_of(last.kind), last.time, loss);
+      motion.events.front().time, word_of(last.kind), last.time, loss, gain);
 }
 
 double largest_change(const Eigen::VectorXd& energy) { return (energy.array() - energy[0]).abs().maxCoeff(); }

@@ -475,14 +475,14 @@ static void project_admissible(workspace *w)
 static void constrain(workspace *w)
 {
   for (int i = 0; i < NQ; ++i) {
-{all}    real sum = w->Lb[i];
+{all}    real sum = @of_whole@w->Lb[i];
 {!all}    real sum = 0;
     for (int j = 0; j < NQ; ++j) sum += w->T[i + NQ * j] * w->a_bar[j];
     w->a[i] = sum;
   }
 {if all}
   for (int k = 0; k < NC; ++k) {
-    real sum = w->b_unit[k];
+    real sum = @of_whole@w->b_unit[k];
     for (int i = 0; i < NQ; ++i) sum -= w->A_unit[k + NC * i] * w->a[i];
     w->residual[k] = sum;
   }

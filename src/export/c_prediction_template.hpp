@@ -152,9 +152,9 @@ static status evaluate_prior(const component *c, const real *state, workspace *w
 {
 {constant}  static const real mu[NQ] = {@mu@};
   for (int i = 0; i < NQ; ++i) {
-{constant}    w->a_bar[i] = mu[i];
+{constant}    w->a_bar[i] = @of_whole@mu[i];
 {!constant}    w->a_bar[i] = 0;
-{known}    w->force[i] = w->F[i];
+{known}    w->force[i] = @of_whole@w->F[i];
 {!known}    w->force[i] = 0;
   }
 {load}  known_multipliers(state, w);
@@ -163,7 +163,8 @@ static status evaluate_prior(const component *c, const real *state, workspace *w
   for (int i = 0; i < NQ; ++i) w->without_load[i] = w->force[i];
   solve_mass(w->C, 1, w->without_load);
   for (int i = 0; i < NQ; ++i) w->without_load[i] += w->a_bar[i];
-  if (!find_load(c, state, w)) return @name@_NOT_FINITE;
+{!partial}  if (!find_load(c, state, w)) return @name@_NOT_FINITE;
+{partial}  if (!w->is_part && !find_load(c, state, w)) return @name@_NOT_FINITE;
   evaluate_load(c, w);
   for (int i = 0; i < NQ; ++i) {
     w->force[i] += w->force_of_load[i];
@@ -203,20 +204,30 @@ static void evaluate_motion(workspace *w)
 }
 {end}
 
-/* The mean after the mechanics at a state stand in the workspace. */
-static status evaluate_mean(const component *c, const real *state, real *mean, workspace *w)
+/* What the mean needs after the mechanics at a state stand in the workspace. */
+static status start(@start_parameters@)
 {
 {admissible}  project_admissible(w);
-  status s = project(w);
-  if (s == @name@_OK) s = evaluate_prior(c, state, w);
+{!partial}  return project(w);
+{if partial}
+  const status s = project(w);
+  w->is_part = 0; /* the load is that of the whole motion */
+  return s == @name@_OK ? evaluate_prior(c, state, w) : s;
+{end}
+}
+
+static status evaluate_mean(const component *c, const real *state, real *mean, workspace *w)
+{
+{partial}  w->is_part = 1;
+  status s = evaluate_prior(c, state, w);
   if (s == @name@_OK) {
 {moved}    evaluate_motion(w);
 {applied}    evaluate_applied_force(w);
 {constrained}    for (int r = 0; r < NR; ++r) mean[r] = w->a[@r@];
 {unconstrained}    for (int r = 0; r < NR; ++r) mean[r] = w->a_bar[@r@];
 {force}    for (int r = 0; r < NR; ++r) mean[r] = w->applied[@r@];
-{next-velocity,all}    for (int r = 0; r < NR; ++r) mean[r] = state[NQ + @r@] + @dt@ * w->a[@r@];
-{next-velocity,!all}    for (int r = 0; r < NR; ++r) mean[r] = @dt@ * w->a[@r@];
+{next-velocity,has_mean}    for (int r = 0; r < NR; ++r) mean[r] = state[NQ + @r@] + @dt@ * w->a[@r@];
+{next-velocity,!has_mean}    for (int r = 0; r < NR; ++r) mean[r] = @dt@ * w->a[@r@];
 {constraint-force}    for (int r = 0; r < NR; ++r) mean[r] = w->of_constraint[@r@];
 {if multipliers}
     multipliers_of_force(w);
@@ -234,7 +245,8 @@ static status evaluate_mean(const component *c, const real *state, real *mean, w
 static status evaluate(const component *c, const real *state, real *mean, workspace *w)
 {
   evaluate_system(c->parameters, state, w);
-  return evaluate_mean(c, state, mean, w);
+  const status s = start(@start_arguments@);
+  return s == @name@_OK ? evaluate_mean(c, state, mean, w) : s;
 }
 
 static status failed(status s, int n, real *numbers)
@@ -315,7 +327,7 @@ static void evaluate_view(workspace *w)
     }
 {end}
   }
-{if nonlinear}
+{if responds}
   /* G (I + J D^-1 G_lambda): lambda answers */
   real answer[NC * NQ];
   for (int i = 0; i < NC * NQ; ++i) answer[i] = w->G_lambda[i];
@@ -562,14 +574,14 @@ static void differentiate_mechanics(workspace *w)
 {if all,d_b}
   for (int e = 0; e < @n_d_b@; ++e) {
     const int i = of_d_b[e][0], k = of_d_b[e][2];
-    w->d_rows[i + NC * k] += w->d_b[e];
+    w->d_rows[i + NC * k] += @of_whole@w->d_b[e];
   }
 {end}
 {end}
 {if known,d_F}
   for (int e = 0; e < @n_d_F@; ++e) {
     const int i = of_d_F[e][0], k = of_d_F[e][2];
-    w->d_force[i + NQ * k] += w->d_F[e];
+    w->d_force[i + NQ * k] += @of_whole@w->d_F[e];
   }
 {end}
 {!moved,!d_M,!d_F}  (void)w;
@@ -577,7 +589,7 @@ static void differentiate_mechanics(workspace *w)
 }
 
 {if nonlinear}
-/* What follows from the change of lambda with the state, D dlambda = the change of G abar + d at held lambda */
+/* The change of lambda with the state, D dlambda = the change of G abar + d at held lambda */
 static void differentiate_load(workspace *w)
 {
   const real *const lambda = w->y + NX;
@@ -592,17 +604,24 @@ static void differentiate_load(workspace *w)
 {end}
   (void)factorise_load(1, w);
   for (int k = 0; k < NX; ++k) {
-    real r[NQ], d_lambda[NC];
+    real r[NQ];
     for (int i = 0; i < NQ; ++i) {
       r[i] = w->d_force[i + NQ * k] + w->d_forced[i + NQ * k] - w->d_of_constraint[i + NQ * k];
       for (int j = 0; j < NQ; ++j) r[i] += w->M[i + NQ * j] * w->d_of_rest[j + NQ * k];
     }
-    change_of_load(r, w->d_rows + NC * k, w->d_along + NC * k, w, d_lambda);
-    solve_load(w, 1, d_lambda);
+    change_of_load(r, w->d_rows + NC * k, w->d_along + NC * k, w, w->d_load + NC * k);
+    solve_load(w, 1, w->d_load + NC * k);
+  }
+}
+
+/* What follows from it */
+static void add_change_of_load(workspace *w)
+{
+  for (int k = 0; k < NX; ++k) {
     for (int j = 0; j < NC; ++j) {
       for (int i = 0; i < NQ; ++i) {
-        w->d_of_rest[i + NQ * k] += w->rest_slope[i + NQ * j] * d_lambda[j];
-        w->d_force[i + NQ * k] += w->force_slope[i + NQ * j] * d_lambda[j];
+        w->d_of_rest[i + NQ * k] += w->rest_slope[i + NQ * j] * w->d_load[j + NC * k];
+        w->d_force[i + NQ * k] += w->force_slope[i + NQ * j] * w->d_load[j + NC * k];
       }
     }
   }
@@ -663,11 +682,21 @@ static void differentiate_motion(workspace *w)
 static status evaluate_with_jacobian(const component *c, const real *state, real *mean, real *jacobian, workspace *w)
 {
   @system_and_derivatives@(c->parameters, state, w);
-  const status s = evaluate_mean(c, state, mean, w);
+  status s = start(@start_arguments@);
+{if partial}
+  if (s == @name@_OK) {
+    evaluate_motion(w);
+    differentiate_prior(c, state, w);
+    differentiate_mechanics(w);
+    differentiate_load(w);
+  }
+{end}
+  if (s == @name@_OK) s = evaluate_mean(c, state, mean, w);
   if (s != @name@_OK) return s;
   differentiate_prior(c, state, w);
   differentiate_mechanics(w);
-{nonlinear}  differentiate_load(w);
+{nonlinear,!partial}  differentiate_load(w);
+{nonlinear}  add_change_of_load(w);
   differentiate_motion(w);
 {if multipliers}
 {if d_A}
@@ -690,8 +719,8 @@ static status evaluate_with_jacobian(const component *c, const real *state, real
 {constrained}    for (int r = 0; r < NR; ++r) jacobian[r + NR * k] = w->d_a[@r@ + NQ * k];
 {unconstrained}    for (int r = 0; r < NR; ++r) jacobian[r + NR * k] = w->d_a_bar[@r@ + NQ * k];
 {force}    for (int r = 0; r < NR; ++r) jacobian[r + NR * k] = w->d_applied[@r@ + NQ * k];
-{next-velocity,all}    for (int r = 0; r < NR; ++r) jacobian[r + NR * k] = (k == NQ + @r@) + @dt@ * w->d_a[@r@ + NQ * k];
-{next-velocity,!all}    for (int r = 0; r < NR; ++r) jacobian[r + NR * k] = @dt@ * w->d_a[@r@ + NQ * k];
+{next-velocity,has_mean}    for (int r = 0; r < NR; ++r) jacobian[r + NR * k] = (k == NQ + @r@) + @dt@ * w->d_a[@r@ + NQ * k];
+{next-velocity,!has_mean}    for (int r = 0; r < NR; ++r) jacobian[r + NR * k] = @dt@ * w->d_a[@r@ + NQ * k];
 {constraint-force}    for (int r = 0; r < NR; ++r) jacobian[r + NR * k] = w->d_of_constraint[@r@ + NQ * k];
 {multipliers}    real d_lambda[NC];
 {multipliers}    change_of_multipliers(w->d_of_constraint + NQ * k, w->d_along + NC * k, w, d_lambda);

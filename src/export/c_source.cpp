@@ -69,15 +69,6 @@ CSource Writer::write() {
 
 CSource export_c(const Posterior& posterior, const View& view, const CSourceOptions& options) {
   require_view(posterior.prior(), view);
-  const Prior& prior = prior_of(posterior.prior(), view);
-  for (std::size_t a = 0; a < prior.latents.size() && !view.has_mean(); ++a) {
-    const Latent& latent = prior.latents[a];
-    if (!view.has_latent(a) || !latent.reads_multipliers()) continue;
-    throw InputError(
-        fmt::format("export to C of a part of the motion: only of latents that do not read lambda, but '{}' does; "
-                    "a Predictor has it",
-                    latent.name));
-  }
   if (!c_export::is_identifier(options.name)) {
     throw InputError(fmt::format("`name`: must be a name of C, of letters, digits and _, got '{}'", options.name));
   }

@@ -32,7 +32,7 @@ void Writer::declare_workspace() {
     add(fmt::format("y[{}], G_lambda[{}], d_lambda[{}], D_lambda[{}]", nx + nc, nc * nq, nc, nc * nc));
     add(fmt::format("without_load[{0}], rest_of_load[{0}], force_of_load[{0}], a_under_load[{0}], a_at_zero[{0}]", nq));
     add(fmt::format("slope[{0}], rest_slope[{0}], force_slope[{0}]", nq * nc));
-    add_workspace(fmt::format("int order_lambda[{}];", nc));
+    add_workspace(fmt::format("int {}order_lambda[{}];", is_partial_ ? "is_part, " : "", nc));
   }
   if (has("moved")) add(fmt::format("a[{0}], gap[{0}], of_constraint[{0}]", nq));
   if (has("applied")) add(fmt::format("applied[{}]", nq));
@@ -80,6 +80,7 @@ void Writer::declare_workspace() {
     if (has("moved") && has("rows")) add(fmt::format("d_forced[{}], d_rows[{}]", n, nc * nx));
     if (has("reaction")) add(fmt::format("d_mass_a_bar[{}]", n));
     if (has("least_norm")) add(fmt::format("d_along[{}]", nc * nx));
+    if (has("nonlinear")) add(fmt::format("d_load[{}]", nc * nx));
     if (has("load")) add(fmt::format("d_forced0[{0}], d_rows0[{1}], d_lambda0[{1}]", n, nc * nx));
   }
   if (has("mixture")) add(has("jacobian") ? fmt::format("mean[{}], jacobian[{}]", nr, nr * nx) : fmt::format("mean[{}]", nr));

@@ -94,18 +94,22 @@ void Writer::add_terms() {
   if (options_.jacobian && derivatives_->tape() == nullptr) {
     throw InputError("export to C: the derivatives of the system are too large to be written; leave the Jacobian out");
   }
+  for (std::size_t a = 0; a < prior_.latents.size() && !view_.has_mean(); ++a) {
+    is_partial_ = is_partial_ || (view_.has_latent(a) && prior_.latents[a].reads_multipliers());
+  }
   for (std::size_t a = 0; a < prior_.latents.size(); ++a) {
-    if (!view_.has_latent(a)) continue;
+    if (!view_.has_latent(a) && !is_partial_) continue;
     const Latent& of = prior_.latents[a];
     Term& term = terms_.emplace_back();
     term.latent = a;
     term.of = &of;
+    term.is_viewed = view_.has_latent(a);
     term.kernel = of.kernel;
     term.D = of.n_features();
     term.p = of.size();
     term.F = of.n_functions();
     term.first = n_functions_;
-    n_functions_ += term.F;
+    if (term.is_viewed) n_functions_ += term.F;
     term.features = of.features->make_evaluator(VectorXd());
     require_expressions(term.features->tapes().values, fmt::format("features of latent '{}'", of.name));
     if (!term.has_directions()) continue;
@@ -149,19 +153,23 @@ void Writer::set_conditions() {
   set("reaction", parts.constraint_force);
   set("abar", parts.unconstrained_acceleration);
   set("applied", parts.applied_force);
-  // mu and b are part of it: it is not of one latent alone; mu = M^-1 F, or is constant
-  set("all", view_.has_mean());
-  set("known", view_.has_mean() && prior_.mean == Prior::Mean::force);
-  set("constant", view_.has_mean() && prior_.mean == Prior::Mean::constant);
+  // mu and b are part of it: it is not of latents alone; or the load of a part is looked for; mu = M^-1 F, or is constant
+  set("partial", is_partial_);
+  set("has_mean", view_.has_mean());
+  set("all", view_.has_mean() || is_partial_);
+  set("known", has("all") && prior_.mean == Prior::Mean::force);
+  set("constant", has("all") && prior_.mean == Prior::Mean::constant);
+  // the load answers to what it is viewed by; one latent is that under this load
+  set("responds", has("nonlinear") && !view_.latent);
   // constraints, more than one
   set("rows", system().nc() > 0);
   set("several", system().nc() > 1);
-  // a latent is multiplied by M^-1; or it or mu is
-  set("forced_latent", any([](const Term& term) { return term.is_forced(); }));
-  set("forced", has("forced_latent") || has("known"));
+  // a latent that is viewed is multiplied by M^-1; or any or mu is
+  set("forced_latent", any([](const Term& term) { return term.is_viewed && term.is_forced(); }));
+  set("forced", has("known") || any([](const Term& term) { return term.is_forced(); }));
   set("admissible", any([](const Term& term) { return term.is_admissible(); }));
-  set("potential", any([](const Term& term) { return term.of->is_potential; }));
-  set("other", any([](const Term& term) { return !term.of->is_potential; }));
+  set("potential", any([](const Term& term) { return term.is_viewed && term.of->is_potential; }));
+  set("other", any([](const Term& term) { return term.is_viewed && !term.of->is_potential; }));
   // a latent reads λ₀; or λ (nonlinear); the multipliers of least norm are computed
   set("load", any([](const Term& term) { return term.features_read_load() || term.directions_read_load(); }));
   set("loaded", has("load") || has("nonlinear"));
@@ -193,6 +201,9 @@ void Writer::set_sizes() {
       {"name", options_.name},
       {"real", single ? "float" : "double"},
       {"r", all_rows_ ? "r" : "view_rows[r]"},
+      {"start_parameters", is_partial_ ? "const component *c, const real *state, workspace *w" : "workspace *w"},
+      {"start_arguments", is_partial_ ? "c, state, w" : "w"},
+      {"of_whole", is_partial_ ? "w->is_part ? 0 : " : ""},
       {"dt", view_.time_step ? number(*view_.time_step) : ""},
       {"nq", std::to_string(nq)},
       {"nc", std::to_string(nc)},

@@ -22,6 +22,7 @@ inline Eigen::Index whole(Eigen::Index n) { return (n + lanes - 1) / lanes * lan
 struct Term {
   std::size_t latent = 0;      // of the prior
   const Latent* of = nullptr;  // there
+  bool is_viewed = true;       // or acts on the load of the motion alone, a part of which is viewed
   Kernel kernel;
   Eigen::Index D = 0, p = 0, F = 0;  // features, directions, functions
   Eigen::Index first = 0;            // of its functions among all
@@ -116,6 +117,7 @@ class Writer {
   std::vector<std::string> inputs_;                           // what C calls the entries of a state, then the parameters
   std::vector<std::string> known_multipliers_, multipliers_;  // and λ₀, λ
   std::vector<Term> terms_;
+  bool is_partial_ = false;  // a part of the motion whose load the whole of it makes
   std::unique_ptr<StateEvaluator> values_, derivatives_;
   bool all_rows_ = true;
   Eigen::Index n_functions_ = 0, n_variables_ = 0, n_cross_rows_ = 0;

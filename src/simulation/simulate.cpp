@@ -247,12 +247,17 @@ class Integration {
     std::copy(ddq.begin(), ddq.end(), dxdt.begin() + layout_.nq);
   }
 
+  [[nodiscard]] NumericalError no_acceleration(double t, const std::string& text) const {
+    if (instant_) return NumericalError(text);
+    return NumericalError(fmt::format("simulate: no acceleration at t = {:.6g}: {}", t, text));
+  }
+
   // at (x_, t_), where there is no smaller step to try
   void derivative_or_throw() {
     try {
       derivative(x_, dxdt_, t_);
     } catch (const StageFault& fault) {
-      throw NumericalError(fmt::format("simulate: no acceleration at t = {:.6g}: {}", t_, fault.text));
+      throw no_acceleration(t_, fault.text);
     }
   }
 
@@ -417,7 +422,7 @@ class Integration {
       try {
         derivative(x, dxdt, t);
       } catch (const StageFault& fault) {
-        throw NumericalError(fmt::format("simulate: no acceleration at t = {:.6g}: {}", t, fault.text));
+        throw no_acceleration(t, fault.text);
       }
       write(next, t, x, dxdt);
     }
@@ -503,7 +508,7 @@ class Integration {
       out_.evaluations += 2 * velocities.evaluations;
       return velocities.states.col(1).segment(layout_.dq(0), layout_.nq) - at.segment(layout_.dq(0), layout_.nq);
     } catch (const UnfinishedMotion& unfinished) {
-      throw NumericalError(motion.fault_ ? motion.fault_->text : unfinished.what());
+      throw NumericalError(unfinished.what());
     }
   }
 
@@ -518,7 +523,7 @@ class Integration {
       }
     } catch (const Error& error) {
       if (at_start) throw;
-      throw NumericalError(fmt::format("simulate: no acceleration at t = {:.6g}: {}", t_, error.what()));
+      throw no_acceleration(t_, error.what());
     }
     project_stages_ = has_redundant_rows(system_, parameters_, projection_, state_);
     if (at_start && options_.project) projection_.apply(state_);
@@ -534,7 +539,7 @@ class Integration {
       if (project_stages_) projection_.apply(state_);
       work();
     } catch (const Error& error) {
-      throw NumericalError(fmt::format("simulate: no acceleration at t = {:.6g}: {}", t_, error.what()));
+      throw no_acceleration(t_, error.what());
     }
   }
 
