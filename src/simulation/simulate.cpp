@@ -247,9 +247,9 @@ class Integration {
     std::copy(ddq.begin(), ddq.end(), dxdt.begin() + layout_.nq);
   }
 
-  [[nodiscard]] NumericalError no_acceleration(double t, const std::string& text) const {
-    if (instant_) return NumericalError(text);
-    return NumericalError(fmt::format("simulate: no acceleration at t = {:.6g}: {}", t, text));
+  [[noreturn]] void stop(double t, const std::string& text) const {
+    if (instant_) throw NumericalError(text);
+    throw NumericalError(fmt::format("simulate: no acceleration at t = {:.6g}: {}", t, text));
   }
 
   // at (x_, t_), where there is no smaller step to try
@@ -257,7 +257,7 @@ class Integration {
     try {
       derivative(x_, dxdt_, t_);
     } catch (const StageFault& fault) {
-      throw no_acceleration(t_, fault.text);
+      stop(t_, fault.text);
     }
   }
 
@@ -422,7 +422,7 @@ class Integration {
       try {
         derivative(x, dxdt, t);
       } catch (const StageFault& fault) {
-        throw no_acceleration(t, fault.text);
+        stop(t, fault.text);
       }
       write(next, t, x, dxdt);
     }
@@ -523,7 +523,7 @@ class Integration {
       }
     } catch (const Error& error) {
       if (at_start) throw;
-      throw no_acceleration(t_, error.what());
+      stop(t_, error.what());
     }
     project_stages_ = has_redundant_rows(system_, parameters_, projection_, state_);
     if (at_start && options_.project) projection_.apply(state_);
@@ -539,7 +539,7 @@ class Integration {
       if (project_stages_) projection_.apply(state_);
       work();
     } catch (const Error& error) {
-      throw no_acceleration(t_, error.what());
+      stop(t_, error.what());
     }
   }
 
