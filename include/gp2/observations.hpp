@@ -125,7 +125,7 @@ class Observations {
   /// Whether the values of row k came with standard deviations of their own, of which σ_k is a factor. A robust fit enlarges some
   /// scales and leaves the others at 1 where they did not.
   [[nodiscard]] bool states_noise(Eigen::Index k) const;
-  /// s of the values of row k that are measured.
+  /// s of the values of row k that are measured; 1 where none have one.
   [[nodiscard]] std::vector<double> measured_scales(Eigen::Index k) const;
   /// The noise of a usual value (d): σ times the median of s over the measured values of its row.
   [[nodiscard]] Eigen::VectorXd usual_noise(const Eigen::Ref<const Eigen::VectorXd>& stddev) const;

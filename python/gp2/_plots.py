@@ -19,6 +19,11 @@ def _axes(given: Any, n: int = 1, width: float = 5.5) -> Any:
     return pyplot.subplots(1, n, figsize=(width * n, 4), layout="constrained")[1]
 
 
+def _text(name: str) -> str:
+    # matplotlib reads what stands between two of them as mathematics
+    return name.replace("$", r"\$")
+
+
 def _plot_learned(self: _gp2.Posterior, what: Any = None, *, along: Any = None, force: Any = None, ax: Any = None) -> Any:
     """plot_learned(self: Posterior, what: str | None = None, *, along: str | None = None, force: str | None = None, ax=None)
 
@@ -28,10 +33,10 @@ def _plot_learned(self: _gp2.Posterior, what: Any = None, *, along: Any = None, 
     curve = _gp2._learned_curve(self, what=what, along=along, force=force)  # type: ignore[attr-defined]
     ax = _axes(ax)
     half = _BAND * curve["std"]
-    (line,) = ax.plot(curve["at"], curve["mean"], label=curve["latent"])
+    (line,) = ax.plot(curve["at"], curve["mean"], label=_text(curve["latent"]))
     ax.fill_between(curve["at"], curve["mean"] - half, curve["mean"] + half, color=line.get_color(), alpha=0.2, lw=0)
     ax.plot(curve["data"], np.zeros(len(curve["data"])), "|", color="gray", alpha=0.5, transform=ax.get_xaxis_transform(), ms=12)
-    ax.set(xlabel=curve["along"], ylabel=curve["name"], title=curve["latent"])
+    ax.set(xlabel=_text(curve["along"]), ylabel=_text(curve["name"]), title=_text(curve["latent"]))
     return ax
 
 
@@ -43,7 +48,9 @@ def _plot_predictions(self: _gp2.Posterior, data: Any, system: Any = None, colum
     """
     found = _gp2._compared(self, data, system, columns)  # type: ignore[attr-defined]
     axes = np.atleast_1d(_axes(ax, len(found["outputs"]), 4))
-    for k, output in enumerate(found["outputs"]):
+    if axes.size != len(found["outputs"]):
+        raise _gp2.InputError(f"ax: expected {len(found['outputs'])} axes, of {', '.join(found['outputs'])}; got {axes.size}")
+    for k, output in enumerate(map(_text, found["outputs"])):
         measured, mean, half = found["measured"][:, k], found["mean"][:, k], _BAND * found["std"][:, k]
         axes[k].errorbar(measured, mean, half, fmt=".", elinewidth=0.8, ecolor="lightgray")
         axes[k].axline((float(np.nanmean(measured)),) * 2, slope=1, color="gray", lw=0.8)
@@ -73,7 +80,7 @@ def _plot_motion(self: _gp2.Motion, *, ax: Any = None) -> Any:
     ax = _axes(ax)
     names = self.table.columns[1 : 1 + self.q.shape[1]]  # after t
     for name, values in zip(names, self.q.T):
-        ax.plot(self.t, values, label=name)
+        ax.plot(self.t, values, label=_text(name))
     ax.set(xlabel="t [s]")
     ax.legend()
     return ax

@@ -97,7 +97,7 @@ class GP2Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if system is not None:
             outputs = self._outputs(system, y)
             y = _columns_by_name(y, outputs)
-        X, y = validate_data(self, X, y, dtype=np.float64, multi_output=True, y_numeric=True, ensure_min_samples=2)
+        X, y = validate_data(self, _without_mask(X), _without_mask(y), dtype=np.float64, multi_output=True, y_numeric=True, ensure_min_samples=2)
         rows = y.reshape(len(y), -1).astype(np.float64)
         self.system_ = _system_without_mechanics(X.shape[1], rows) if system is None else system
         self.outputs_ = self.system_.acceleration_names if system is None else outputs
@@ -174,6 +174,9 @@ class GP2Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         else:
             what, outputs = "y", list(y.columns) if hasattr(y, "columns") else names
         unknown = [str(name) for name in outputs if name not in names]
+        twice = sorted({str(name) for name in outputs if outputs.count(name) > 1})
+        if twice:
+            raise gp2.InputError(f"{what}: {', '.join(twice)}: given twice")
         if unknown:
             raise gp2.InputError(f"{what}: {', '.join(unknown)}: no acceleration of '{system.name}': {', '.join(names)}")
         return outputs
@@ -197,7 +200,7 @@ class GP2Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     def _checked_states(self, X) -> np.ndarray:
         check_is_fitted(self)
-        return self._states(validate_data(self, X, dtype=np.float64, reset=False))
+        return self._states(validate_data(self, _without_mask(X), dtype=np.float64, reset=False))
 
     def _rows_of_view(self) -> list[int]:
         return [self.system_.acceleration_names.index(name) for name in self.outputs_]
@@ -218,6 +221,11 @@ def _system_without_mechanics(n_features: int, y: np.ndarray) -> gp2.System:
         latents=[{"features": features}],
         noise={"estimate": True, "initial": 0.1 * (y.std() or 1.0)},
     )
+
+
+def _without_mask(values):
+    """A masked array as one that is NaN where it is masked: scikit-learn would take what is behind the mask."""
+    return values.astype(np.float64).filled(np.nan) if np.ma.isMaskedArray(values) else values
 
 
 def _columns_by_name(y, names: list[str]):

@@ -1,5 +1,6 @@
 #include "arrays.hpp"
 
+#include <limits>
 #include <memory>
 #include <new>
 
@@ -21,7 +22,7 @@ std::string shape_text(const py::array& array) {
 
 // itself where it holds C-contiguous doubles
 DoubleArray doubles(const py::object& object, const std::string& what) {
-  const py::array array = py::array::ensure(object);
+  const py::array array = py::array::ensure(without_mask(object));
   if (!array) {
     PyErr_Clear();
     throw py::type_error(fmt::format("{}: expected an array of numbers, got {}", what, std::string(py::str(object.get_type()))));
@@ -45,6 +46,13 @@ py::array own(Values values, const std::vector<py::ssize_t>& shape) {
 }
 
 }  // namespace
+
+py::object without_mask(const py::object& array) {
+  if (!py::hasattr(array, "mask") || !py::hasattr(array, "filled") || !py::hasattr(array, "dtype")) return array;
+  const auto kind = array.attr("dtype").attr("kind").cast<std::string>();
+  if (kind != "f" && kind != "i" && kind != "u") return array;
+  return array.attr("astype")("float64").attr("filled")(std::numeric_limits<double>::quiet_NaN());
+}
 
 Rows::Rows(const py::object& array, const std::vector<std::string>& names, const std::string& what)
     : array_(doubles(array, what)) {

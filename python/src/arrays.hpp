@@ -27,6 +27,9 @@ class Rows {
   py::array_t<double, py::array::c_style> array_;
 };
 
+/// A masked array as one that is NaN where it is masked; all else as it is.
+py::object without_mask(const py::object& array);
+
 /// A vector of `size` numbers. @throws as Rows.
 py::array_t<double, py::array::c_style> vector_argument(const py::object& array, Eigen::Index size, const std::string& what);
 

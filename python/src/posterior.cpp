@@ -172,6 +172,7 @@ Inputs inverse_dynamics_of(const PyPosterior& self, const py::object& data, cons
   const System& there = *at.model->system;
   WantedMotion wanted;
   if (is_array(data)) {
+    if (accelerations.is_none()) throw InputError("accelerations: needed beside an array of states");
     wanted.view = {View::Quantity::constrained_acceleration, acceleration_rows(there, outputs, "`outputs`")};
     const Rows states(data, there.state_names(), "states"), values(accelerations, wanted.view.names(there), "accelerations");
     wanted.states = states.matrix();
@@ -367,7 +368,8 @@ void define_files_and_facts(py::class_<PyPosterior>& posterior) {
   posterior
       .def_static("load", &load, "path"_a, "system"_a = nullptr,
                   "As gp2.load.\n\nRaises InputError naming the file and what is wrong.")
-      .def("save", &save, "path"_a, "Write a FIT.json, whole or not at all. Loaded again it gives the same bits.")
+      .def("save", &save, "path"_a,
+           "Write a FIT.json, whole or not at all. Loaded again it gives the same bits, after an update the same to rounding.")
       .def_property_readonly("system",
                              [](const PyPosterior& self) { return PySystem{std::make_shared<const Model>(self.file.model)}; })
       .def_property_readonly(

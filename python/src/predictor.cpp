@@ -230,8 +230,7 @@ A state is (len(state_names)). A state without a prediction raises InputError.)"
       .def("mean_and_cov", &PyPredictor::mean_and_cov, "state"_a, "(d), (d, d)")
       .def("mean_and_jacobian", &PyPredictor::mean_and_jacobian, "state"_a,
            "(d), and its exact derivative in the state (d, len(state_names)).")
-      .def("distance_from_data", &PyPredictor::distance_from_data, "state"_a,
-           "As of Prediction; nan where a feature is not finite.");
+      .def("distance_from_data", &PyPredictor::distance_from_data, "state"_a, "As of Prediction.");
 
   py::class_<PySolver>(module, "InverseDynamicsSolver",
                        R"(Posterior.inverse_dynamics at one state after another, for control loops: microseconds a call.

@@ -20,7 +20,7 @@ bool is_missing(const py::handle& cell) {
 
 // a column of a table; NaN stands for an empty cell, as pandas reads one
 CsvTable::Column to_column(std::string name, const py::object& values, const std::string& what) {
-  const py::array array = py::array::ensure(values);
+  const py::array array = py::array::ensure(without_mask(values));
   if (!array || array.ndim() != 1) {
     PyErr_Clear();
     throw InputError(fmt::format("{}: expected one-dimensional", what));

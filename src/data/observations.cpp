@@ -192,7 +192,7 @@ bool Observations::states_noise(Index k) const {
 std::vector<double> Observations::measured_scales(Index k) const {
   std::vector<double> scales;
   for (Index i = 0; i < values().cols(); ++i) {
-    if (!std::isnan(values()(k, i))) scales.push_back(noise_.scale()(k, i));
+    if (!std::isnan(values()(k, i))) scales.push_back(noise_.has_scale() ? noise_.scale()(k, i) : 1);
   }
   return scales;
 }

@@ -74,7 +74,7 @@ Model model_from(const ParsedJson& json, const ModelCode& given) {
   if ((mechanics && !given.mechanics) || (latents && given.latents.empty())) {
     throw InputError(
         fmt::format("the {} of its model '{}' are code, which a file cannot hold: read it where that code is, with "
-                    "FitFile::read(path, code)",
+                    "FitFile::read(path, code) or gp2.load(path, system=…)",
                     mechanics && !given.mechanics ? "mechanics" : "latents", json.at("name").get<std::string>()));
   }
   if (mechanics)

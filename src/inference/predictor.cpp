@@ -109,7 +109,7 @@ Status Predictor::mean(const Ref<const VectorXd>& state, Ref<VectorXd> mean, Wor
 }
 
 Status Predictor::evaluate_covariance(const Ref<const VectorXd>& state, Ref<VectorXd>& mean, Workspace& workspace) const {
-  if (!options().stddev) throw InputError("Predictor: it was made without Options::stddev");
+  if (!options().stddev) throw InputError("Predictor: it was made without standard deviations");
   check_arguments(implementation(), state, mean, workspace.components_);
   return for_each_component(workspace, mean, [&](const Implementation& self, Workspace::Implementation& w, Ref<VectorXd> mean_k) {
     const Status status = self.write_mean(state, *w.values, w, mean_k);
@@ -147,7 +147,7 @@ Status Predictor::mean_and_covariance(const Ref<const VectorXd>& state, Ref<Vect
 
 Status Predictor::mean_and_jacobian(const Ref<const VectorXd>& state, Ref<VectorXd> mean, Ref<MatrixXd> jacobian,
                                     Workspace& workspace) const {
-  if (!options().jacobian) throw InputError("Predictor: it was made without Options::jacobian");
+  if (!options().jacobian) throw InputError("Predictor: it was made without its Jacobian");
   check_arguments(implementation(), state, mean, workspace.components_);
   require_size("Predictor", "a column of the Jacobian", jacobian.rows(), view().size());
   require_size("Predictor", "a row of the Jacobian", jacobian.cols(), state.size());

@@ -154,21 +154,36 @@ bool has_discrepancy(const Model& model, const FitProblem& problem, const FitPro
          !has_singular_mass(problem);
 }
 
+// σ of values that are all as good as these are in the mean, 1/σ² the mean of theirs: what hardly says anything changes nothing.
+double mean_noise(const std::vector<double>& stddevs) {
+  const double least = *std::min_element(stddevs.begin(), stddevs.end());
+  double sum = 0;
+  for (const double one : stddevs) sum += std::pow(least / one, 2);
+  return least / std::sqrt(sum / static_cast<double>(stddevs.size()));
+}
+
 // As large as the noise that the fit starts with; of an acceleration that is not measured, in proportion to the spreads.
 Discrepancy discrepancy_of(const FitProblem& problem) {
   const Scales scales = default_scales(problem.prior, trusted_observations(problem));
-  VectorXd noise = VectorXd::Zero(scales.acceleration_stddev.size()), n_groups = noise;
+  std::vector<std::vector<double>> stddevs(static_cast<std::size_t>(scales.acceleration_stddev.size()));
   for (const Observations& group : problem.observations) {
     if (!is_of_accelerations(group)) continue;
-    const VectorXd usual = group.usual_noise(group.noise().stddev());
-    noise(group.view().rows) += usual;
-    n_groups(group.view().rows).array() += 1;
+    for (Index k = 0; k < group.view().size(); ++k) {
+      const auto row = static_cast<std::size_t>(k);
+      for (const double scale : group.measured_scales(k)) {
+        stddevs[static_cast<std::size_t>(group.view().rows[row])].push_back(group.noise().stddev()[k] * scale);
+      }
+    }
   }
-  const auto measured = n_groups.array() > 0;
-  const VectorXd shares = noise.cwiseQuotient(n_groups.cwiseProduct(scales.acceleration_stddev));
-  const double share = measured.select(shares, 0).sum() / static_cast<double>(measured.count());
+  VectorXd noise = VectorXd::Zero(scales.acceleration_stddev.size());
+  for (Index j = 0; j < noise.size(); ++j) {
+    const std::vector<double>& of = stddevs[static_cast<std::size_t>(j)];
+    if (!of.empty()) noise[j] = mean_noise(of);
+  }
+  const auto measured = noise.array() > 0;
+  const double share = noise.cwiseQuotient(scales.acceleration_stddev).sum() / static_cast<double>(measured.count());
   return {Protocol::Standard::discrepancy_lengthscale * scales.feature_stddev.back(),
-          measured.select(noise.cwiseQuotient(n_groups), share * scales.acceleration_stddev)};
+          measured.select(noise, share * scales.acceleration_stddev)};
 }
 
 // Where the noise is estimated, the discrepancy is in proportion to it: one of a guess would take its place. An acceleration that no
@@ -455,9 +470,11 @@ void centre_features(const Model& model, FitProblem& problem) {
     const auto spec = std::ranges::find(model.latents, latent.name, &LatentSpec::name);
     if (!spec->kernel.empty()) continue;
     for (std::size_t d = 0; d < latent.feature_names.size(); ++d) {
-      if (!latent.is_of_place[d]) continue;
-      problem.prior_options.feature_centres.emplace(latent.feature_names[d],
-                                                    scales.feature_mean[a][static_cast<Eigen::Index>(d)]);
+      const auto row = static_cast<Index>(d);
+      // one that does not vary has its magnitude for both: centred, it would be rounding and be scaled by that
+      const bool varies = scales.feature_stddev[a][row] < scales.feature_range[a][row];
+      if (!latent.is_of_place[d] || !varies) continue;
+      problem.prior_options.feature_centres.emplace(latent.feature_names[d], scales.feature_mean[a][row]);
     }
   }
   if (!problem.prior_options.feature_centres.empty()) remake_prior(model, problem);
@@ -509,6 +526,11 @@ FitProblem make_fit_problem(const Model& model, const std::vector<Log>& logs, co
     problem.observations.push_back(
         read_log(add_system(model, log, options, estimated, problem), log, options, rows, problem.notes));
     add_rows(std::move(rows), problem);
+  }
+  const auto states_noise = [](const Observations& group) { return group.noise().has_scale(); };
+  if (options.trust_stated_noise && !logs.empty() && std::ranges::none_of(problem.observations, states_noise)) {
+    throw InputError(
+        fmt::format("{}: `noise_std=stated`: no measured acceleration has a column NAME_std beside it", logs[0].table.name()));
   }
   add_side_information(model, also, options, estimated, problem);
   add_late(model, options, problem);

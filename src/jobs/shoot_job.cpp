@@ -75,12 +75,12 @@ class Shooter {
       const std::vector<Linearised> all = linearise(residuals);
       step = gauss_newton(all, weights);
       // an iteration that would change θ by a hundredth of its deviation is none
-      out.converged = step.of_theta.cwiseAbs2().cwiseQuotient(step.covariance.diagonal()).maxCoeff() < 1e-4;
+      out.converged = step.of_theta.cwiseAbs2().cwiseQuotient(step.inverse.diagonal()).maxCoeff() < 1e-4;
       if (out.converged || out.iterations == most_iterations || !advance(all, weights, step.of_theta, objective, residuals))
         break;
       ++out.iterations;
     }
-    const MatrixXd covariance = step.covariance + covariance_by_latents(step, weights, residuals);
+    const VectorXd variance = step.variance + variance_by_latents(step, weights, residuals);
     out.rms_after = rms_of(residuals);
     out.duration = duration_;
     out.n_stretches = static_cast<int>(stretches_.size());
@@ -91,7 +91,7 @@ class Shooter {
       const Hyperparameter& after = hyperparameters_[k];
       const auto i = static_cast<Index>(a);
       out.parameters.push_back({before.name, before.unit, before.value, parameter_uncertainty(fit_.report, k).stddev, after.value,
-                                std::sqrt(covariance(i, i)) * std::abs(after.map().value_slope(after.value))});
+                                std::sqrt(variance[i]) * std::abs(after.map().value_slope(after.value))});
       if (after.at_bound()) out.notes.push_back(fmt::format("warning: {} ended at a bound", after.name));
     }
     if (!out.converged) out.notes.emplace_back("warning: the last step still changed the parameters: shorter stretches may help");
@@ -399,25 +399,22 @@ class Shooter {
   struct Step {
     std::vector<MatrixXd> J;  // per stretch: weighed derivatives by θ, without what those by its start explain
     MatrixXd inverse;         // A⁻¹, A = Σ JᵀJ
-    MatrixXd covariance;      // of errors that stretches do not share
+    VectorXd variance;        // by errors that stretches do not share
     VectorXd of_theta;
   };
 
   [[nodiscard]] Step gauss_newton(const std::vector<Linearised>& all, const VectorXd& weights) const {
     const auto p = static_cast<Index>(parameters_.size());
     Step step;
-    MatrixXd A = MatrixXd::Zero(p, p), scatter = A;
-    VectorXd g = VectorXd::Zero(p);
+    MatrixXd A = MatrixXd::Zero(p, p), gradients(p, std::ssize(all));
     for (const Linearised& one : all) {
       const VectorXd w = row_weights(weights, one.residual.size());
       const Eigen::ColPivHouseholderQR<MatrixXd> qr(w.asDiagonal() * one.by_start);
       MatrixXd J = qr.householderQ().adjoint() * (w.asDiagonal() * one.by_theta);
       J.topRows(qr.rank()).setZero();
       J = qr.householderQ() * J;
-      const VectorXd gradient = J.transpose() * w.cwiseProduct(one.residual);
       A += J.transpose() * J;
-      g += gradient;
-      scatter += gradient * gradient.transpose();
+      gradients.col(std::ssize(step.J)) = J.transpose() * w.cwiseProduct(one.residual);
       step.J.push_back(std::move(J));
     }
     const VectorXd unit = A.diagonal().cwiseSqrt();
@@ -428,16 +425,22 @@ class Shooter {
     if (!(Eigen::SelfAdjointEigenSolver<MatrixXd>(correlation).eigenvalues()[0] > determined))
       throw NumericalError(fmt::format("the motions do not tell apart: {}", fmt::join(names(), ", ")));
     step.inverse = scaled * correlation.inverse() * scaled;
+    // the jackknife; of what one stretch alone says it knows nothing
+    VectorXd scatter = VectorXd::Zero(p);
+    for (std::size_t k = 0; k < step.J.size(); ++k) {
+      const MatrixXd others = A - step.J[k].transpose() * step.J[k];
+      scatter += others.completeOrthogonalDecomposition().solve(gradients.col(static_cast<Index>(k))).cwiseAbs2();
+    }
     const auto K = static_cast<double>(all.size());
-    step.covariance = step.inverse * scatter * step.inverse * (K / std::max(K - static_cast<double>(p), 1.0));
-    step.of_theta = step.inverse * g;
+    step.variance = ((K - 1) / K * scatter).cwiseMax(step.inverse.diagonal());
+    step.of_theta = step.inverse * gradients.rowwise().sum();
     return step;
   }
 
-  /// What is not known of the latents bends the motions of all stretches alike: the covariance of the steps that motions of functions
+  /// What is not known of the latents bends the motions of all stretches alike: the variance of the steps that motions of functions
   /// drawn from the posterior would ask for.
-  [[nodiscard]] MatrixXd covariance_by_latents(const Step& step, const VectorXd& weights,
-                                               const std::vector<VectorXd>& residuals) const {
+  [[nodiscard]] VectorXd variance_by_latents(const Step& step, const VectorXd& weights,
+                                             const std::vector<VectorXd>& residuals) const {
     const Posterior posterior = posterior_at(hyperparameters_);
     const PathwiseSamples samples = sample_paths(posterior, n_samples, {.seed = 1});
     std::vector<MatrixXd> asked(stretches_.size(), MatrixXd::Zero(static_cast<Index>(parameters_.size()), n_samples));
@@ -453,8 +456,7 @@ class Shooter {
     });
     MatrixXd sum = MatrixXd::Zero(static_cast<Index>(parameters_.size()), n_samples);
     for (const MatrixXd& one : asked) sum += one;
-    const MatrixXd steps = step.inverse * sum;
-    return steps * steps.transpose() / n_samples;
+    return (step.inverse * sum).rowwise().squaredNorm() / n_samples;
   }
 
   [[nodiscard]] std::vector<std::string> names() const {

@@ -33,6 +33,13 @@ Eigen::VectorXd complete_start(const Model& model, const Eigen::VectorXd& parame
     if (newton_start != model.newton_start.end() && start.state[k] == 0) start.state[k] = newton_start->second;
   }
   if (open.empty()) return start.state;
+  if (model.symbolic_system() == nullptr && system.nc() > 0 && system.residual_labels().empty()) {
+    notes.push_back(
+        fmt::format("warning: `start`: {}, as '{}' has no residuals to solve its constraints by: name all "
+                    "coordinates and velocities",
+                    listed(names, start.state, open), system.name()));
+    return start.state;
+  }
   Eigen::VectorXd state;
   try {
     state = project_onto_constraints(system, parameters, start.state, start.given);

@@ -6,7 +6,6 @@
 
 #include "allocation_count.hpp"
 #include "base/not_a_number.hpp"
-#include "gp2/export/c_source.hpp"
 #include "gp2/fit.hpp"
 #include "gp2/inference/inducing.hpp"
 #include "gp2/inference/inverse_dynamics.hpp"
@@ -1059,12 +1058,6 @@ TEST(NonlinearInducing, AFitOfAPositiveLatentFarFromOneIsNearlyTheExactOne) {
 }
 
 TEST(NonlinearPrior, IsRefusedByNameWhereItCannotBe) {
-  const Fitted fitted(rubbing_bead("lambda"), 10);
-  const Posterior posterior(
-      fitted.prior, fitted.observations,
-      model_values(fitted.prior, fitted.observations, default_hyperparameters(fitted.prior, fitted.observations, {}, {})));
-  expect_says([&] { static_cast<void>(export_c(posterior, View::learned_force(*fitted.model.system))); },
-              {"export to C", "'friction coefficient' does"});
   const std::string latent = "[[latent]]\nname = \"x\"\nfeatures = ";
   expect_says([&] { static_cast<void>(make_prior(rubbing_bead("lambda", "constant", latent + "[\"lambda(1)\"]"))); },
               {"only directions"});

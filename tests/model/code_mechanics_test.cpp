@@ -323,7 +323,7 @@ TEST(CodeMechanics, AreToldAFitFileAgain) {
   EXPECT_EQ(
       input_error_of([&] { FitFile::read(folder / "fit.json"); }),
       fmt::format("{}: the mechanics of its model 'surface.toml' are code, which a file cannot hold: read it where that code "
-                  "is, with FitFile::read(path, code)",
+                  "is, with FitFile::read(path, code) or gp2.load(path, system=…)",
                   (folder / "fit.json").string()));
 }
 

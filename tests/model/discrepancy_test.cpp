@@ -341,6 +341,24 @@ TEST(Discrepancy, TakesTheNoiseThatIsKnown) {
   EXPECT_LE((variance.array() / (start * start) - 1).abs().maxCoeff(), 1e-12);
 }
 
+// Rows that hardly say anything change nothing.
+TEST(Discrepancy, IsOfTheRowsThatSaySomething) {
+  const auto with = [](double second) {
+    const CsvTable log = log_of(bead());
+    std::vector<double> stddev(static_cast<std::size_t>(log.n_rows()), 0.02);
+    for (std::size_t i = 1; i < stddev.size(); i += 2) stddev[i] = second;
+    std::vector<CsvTable::Column> columns = {{"ddx_std", stddev}, {"ddy_std", stddev}};
+    for (const std::string& name : log.header()) {
+      CsvTable::Column& column = columns.emplace_back(CsvTable::Column{name, {}});
+      for (int i = 0; i < log.n_rows(); ++i) column.numbers.push_back(log.number(i, log.find(name)));
+    }
+    const FitProblem problem = make_fit_problem(bead(), CsvTable::from_columns("log.csv", std::move(columns)), {});
+    return problem.prior_options.discrepancy->stddev;
+  };
+  const VectorXd good = with(0.02), poor = with(1e6);
+  EXPECT_LE((poor.array() / (std::sqrt(2) * good.array()) - 1).abs().maxCoeff(), 1e-12);
+}
+
 TEST(Discrepancy, StaysAShareOfTheNoiseThatIsEstimated) {
   FitProblemOptions options;
   options.estimate_noise = true;

@@ -199,6 +199,36 @@ acceleration = ["-0.4*dx", "0"]
   EXPECT_TRUE(problem_of_data(stated).prior_options.feature_centres.empty());
 }
 
+// Where its mean is rounded it is not 0 about it, and a spread of rounding would be its lengthscale.
+TEST(DefaultPrior, OfAFeatureThatDoesNotVaryIsScaledByItsSize) {
+  const Model model = Model::parse(R"toml(
+coordinates = ["a", "b"]
+[mechanics]
+mass  = [["1", "0"], ["0", "1"]]
+force = ["0", "0"]
+[[latent]]
+features = ["a", "b", "da"]
+[noise]
+ddq = 0.05
+[sampling]
+a  = [-1, 1]
+da = [-1, 1]
+[truth]
+acceleration = ["-sin(a) - 0.3*da", "0"]
+)toml",
+                                   "locked.toml");
+  for (const double locked : {0.7, -0.9, 0.1, 1e-3}) {
+    for (const int n : {20, 59, 60}) {
+      GeneratedData data = generate(model, {n, 4, VectorXd::Constant(2, 0.05), {}});
+      data.states.row(1).setConstant(locked);
+      const FitProblem problem = make_fit_problem(model, as_table(data, *model.system, "log.csv"), FitProblemOptions());
+      EXPECT_THAT(problem.prior_options.feature_centres, ElementsAre(Pair("a", testing::_)));
+      const Scales scales = default_scales(problem.prior, problem.observations);
+      EXPECT_NEAR(scales.feature_stddev[0][1], std::abs(locked), 1e-12) << locked << ", " << n;
+    }
+  }
+}
+
 TEST(DefaultPrior, OfThePapersProtocolIsOneSquaredExponential) {
   const Model model = sledge("[[latent]]\nfeatures = [\"x\"]\n");
   const GeneratedData data = generate(model, {15, 4, VectorXd::Constant(2, 0.05), {}});

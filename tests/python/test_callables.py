@@ -106,6 +106,17 @@ def test_simulate_stays_on_constraints_with_residuals(surface):
     np.testing.assert_allclose(motion.q, gp2.simulate(text, {"x": 0.9}, np.linspace(0, 5, 11)).q, atol=1e-9)
 
 
+def test_start_that_is_not_named_whole_is_told_of_without_residuals():
+    def mechanics(states, _):
+        x, dx = states[:, 0], states[:, 2]
+        n = len(states)
+        return np.tile(0.2 * np.eye(2), (n, 1, 1)), np.stack([-x, np.ones(n)], 1)[:, None], dx[:, None] ** 2, np.zeros((n, 2))
+
+    wire = gp2.System.from_callables(mechanics, constraints=["wire"], reads=["x", "dx"], coordinates=["x", "z"])
+    with pytest.warns(UserWarning, match="z = 0, dz = 0, as .* has no residuals"):
+        gp2.simulate(wire, {"x": 0.7, "dx": 1.0}, [0, 0.5])
+
+
 def test_fit_is_saved_without_the_functions_and_loaded_with_them(surface, log, tmp_path):
     system = as_functions(surface)
     posterior = gp2.fit(system, log, max_iterations=0)

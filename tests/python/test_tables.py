@@ -37,6 +37,21 @@ def test_every_kind_of_table_is_the_same_log(arm, arm_log, arm_states, frame, tm
         np.testing.assert_array_equal(cov_of(arm, data, arm_states), expected, err_msg=what)
 
 
+def test_what_is_masked_is_missing(arm, arm_log, arm_states):
+    columns = columns_of(arm_log)
+    name = arm.acceleration_names[0]
+    missing, masked = dict(columns), dict(columns)
+    missing[name] = np.where(np.arange(len(columns[name])) < 3, np.nan, columns[name])
+    masked[name] = np.ma.masked_array(np.where(np.isnan(missing[name]), 1e20, columns[name]), mask=np.isnan(missing[name]))
+    np.testing.assert_array_equal(cov_of(arm, masked, arm_states), cov_of(arm, missing, arm_states))
+    rows = np.ma.masked_array(arm_states, mask=np.zeros(arm_states.shape, bool))
+    fitted = gp2.fit(arm, missing, max_iterations=0)
+    np.testing.assert_array_equal(fitted.predict(rows).mean, fitted.predict(arm_states).mean)
+    rows[0, 0] = np.ma.masked
+    with pytest.raises(gp2.InputError, match="not finite"):
+        fitted.predict(rows)
+
+
 def test_states_are_found_by_name(posterior, arm, frame):
     expected = posterior.predict(arm.states(frame)).mean
     np.testing.assert_array_equal(posterior.predict(frame).mean, expected)
