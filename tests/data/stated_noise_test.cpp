@@ -174,12 +174,11 @@ TEST(StatedNoise, FollowsTheRowsThatAreTaken) {
   }
 }
 
-TEST(StatedNoise, SizesTheDiscrepancyByTheUsualDeviation) {
+TEST(StatedNoise, SizesTheDiscrepancyByWhatTheRowsSay) {
   const FitProblem problem = make_fit_problem(slope_with(), log_of({"ddx_std"}), trusting());
   ASSERT_TRUE(problem.prior_options.discrepancy.has_value());
-  // one free direction, (2, 1)/√5 of ddq: of ā the share T of masses 1 and 2 is passed on
-  const Eigen::Vector2d passed_on = Eigen::Vector2d(1, 1) / 1.5;
-  EXPECT_NEAR(passed_on.cwiseProduct(problem.prior_options.discrepancy->stddev).norm(), 0.21, 0.05);
+  const Eigen::RowVectorXd stddev = problem.observations.front().noise().scale().row(0);
+  EXPECT_NEAR(problem.prior_options.discrepancy->stddev[0], 1 / std::sqrt(stddev.array().square().inverse().mean()), 1e-12);
 }
 
 TEST(StatedNoise, ThatIsNotAPositiveNumberIsNamedByFileLineAndColumn) {

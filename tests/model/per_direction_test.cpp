@@ -212,6 +212,7 @@ features = ["a", "b", "da"]
 ddq = 0.05
 [sampling]
 a  = [-1, 1]
+b  = [-1, 1]
 da = [-1, 1]
 [truth]
 acceleration = ["-sin(a) - 0.3*da", "0"]

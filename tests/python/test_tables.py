@@ -48,7 +48,7 @@ def test_what_is_masked_is_missing(arm, arm_log, arm_states):
     fitted = gp2.fit(arm, missing, max_iterations=0)
     np.testing.assert_array_equal(fitted.predict(rows).mean, fitted.predict(arm_states).mean)
     rows[0, 0] = np.ma.masked
-    with pytest.raises(gp2.InputError, match="not finite"):
+    with pytest.raises(gp2.InputError, match="nan is not a finite number"):
         fitted.predict(rows)
 
 
