@@ -133,11 +133,23 @@ PooledStates pooled_states(const Prior& prior, const std::vector<Observations>& 
   return pooled;
 }
 
-// a feature that is constant to rounding has no spread of its own, but a magnitude
-VectorXd usable_spreads(VectorXd spreads, const MatrixXd& features) {
+bool is_linear(const Kernel& kernel) {
+  return std::ranges::any_of(kernel.terms(), [](const Kernel::Term& term) {
+    return std::ranges::any_of(term.factors,
+                               [](const Kernel::Factor& one) { return one.primitive == Kernel::Primitive::linear; });
+  });
+}
+
+// A feature that is constant to rounding has no spread of its own, but a magnitude. Where squares of it are summed, half of its digits
+// are lost: those of a place are taken about its mean.
+VectorXd usable_spreads(VectorXd spreads, const MatrixXd& features, const Latent& latent) {
+  constexpr double of_rounding = 1e-12, of_squares = 1e-7;
+  const bool sums_squares = is_linear(latent.kernel);
   for (Index d = 0; d < spreads.size(); ++d) {
     const double magnitude = usable(features.row(d).cwiseAbs().maxCoeff(), 1);
-    if (!(spreads[d] > 1e-12 * magnitude)) spreads[d] = magnitude;
+    const auto feature = static_cast<std::size_t>(d);
+    const bool is_of_place = feature < latent.is_of_place.size() && latent.is_of_place[feature];
+    if (!(spreads[d] > (sums_squares && !is_of_place ? of_squares : of_rounding) * magnitude)) spreads[d] = magnitude;
   }
   return spreads;
 }
@@ -187,8 +199,9 @@ Scales default_scales(const Prior& prior, const std::vector<Observations>& obser
   for (std::size_t a = 0; a < prior.latents.size(); ++a) {
     const MatrixXd& features = pooled.features[a];
     scales.feature_mean.push_back(row_mean(features));
-    scales.feature_stddev.push_back(usable_spreads(row_stddev(features), features));
-    scales.feature_range.push_back(usable_spreads(features.rowwise().maxCoeff() - features.rowwise().minCoeff(), features));
+    scales.feature_stddev.push_back(usable_spreads(row_stddev(features), features, prior.latents[a]));
+    scales.feature_range.push_back(
+        usable_spreads(features.rowwise().maxCoeff() - features.rowwise().minCoeff(), features, prior.latents[a]));
     scales.signal_stddev.push_back(
         signal_scales(prior.latents[a], pooled.directions[a], pooled.mass_diagonal, scales.acceleration_stddev));
     if (prior.latents[a].is_potential) {

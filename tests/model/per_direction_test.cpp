@@ -1,4 +1,6 @@
 // Latents whose directions have hyperparameters of their own, and the prior of a latent that says nothing of its kernel.
+#include <cmath>
+
 #include <fmt/format.h>
 #include <gmock/gmock.h>
 
@@ -228,6 +230,14 @@ acceleration = ["-sin(a) - 0.3*da", "0"]
       EXPECT_NEAR(scales.feature_stddev[0][1], std::abs(locked), 1e-12) << locked << ", " << n;
     }
   }
+  // of a velocity, whose zero is one, squares are summed
+  GeneratedData data = generate(model, {20, 4, VectorXd::Constant(2, 0.05), {}});
+  for (Index i = 0; i < 20; ++i) data.states(2, i) = 0.7 * (1 + 1e-10 * std::sin(static_cast<double>(i)));
+  const FitProblem problem = make_fit_problem(model, as_table(data, *model.system, "log.csv"), FitProblemOptions());
+  EXPECT_NEAR(default_scales(problem.prior, problem.observations).feature_stddev[0][2], 0.7, 1e-9);
+  const Posterior start(problem.prior, problem.observations,
+                        model_values(problem.prior, problem.observations, problem.hyperparameters));
+  EXPECT_TRUE(std::isfinite(start.negative_log_likelihood()));
 }
 
 TEST(DefaultPrior, OfThePapersProtocolIsOneSquaredExponential) {
