@@ -174,11 +174,11 @@ class UnfinishedMotion : public NumericalError {
 /// |λ_t| ≤ μ |λ_n| holds of each of several contacts, whose accelerations are those of all combinations of sides, mixed.
 ///
 /// A contact ends a step where its gap closes, found on the dense output. It is an impact of Newton's law, during which all other
-/// active constraints hold: along M⁻¹Aᵀ, or with the impulses of friction that the loads bring about; where the rebound is over
-/// within `shortest_flight` the contact stays closed, so that the accumulating bounces of a ball end. A restitution outside [0, 1] is an error. A closed contact is
-/// released where the motion without it would open the gap, which is where its multiplier would pull. One at a time: where several
-/// contacts close or open together, those that would pull are let go one after the other, which is not the complementarity problem
-/// of many contacts.
+/// active constraints hold, along M⁻¹Aᵀ and with the friction that its load brings about. Where the rebound is over within
+/// `shortest_flight` the contact stays closed, so that the accumulating bounces of a ball end. A restitution outside [0, 1] is an error.
+/// A closed contact is released where the motion without it would open the gap, which is where its multiplier would pull. One at a
+/// time: where several close or open together, those that would pull are let go one after the other, which is not the
+/// complementarity problem of many contacts.
 ///
 /// @param parameters  of the system's constraints and mass matrix (system.parameters().size())
 /// @param start       [q; dq; …] (layout size), t and u are set from the options. Off the constraint it is projected, or taken as

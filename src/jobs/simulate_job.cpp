@@ -244,8 +244,9 @@ SimulateJob prepare_simulation(const Model& model, const SimulateRequest& reques
   const VectorXd parameters = model.system->parameter_values();
   SimulateJob job = prepare(model, model.actuators, parameters, request);
   job.options.switching = switching_functions(model, /*of_latents=*/false);
-  SimulateJob::Motion motion{parameters, model_acceleration(model),      {},
-                             {},         contacts_of(model, parameters), pushed_acceleration(model)};
+  SimulateJob::Motion motion{parameters, model_acceleration(model)};
+  motion.contacts = contacts_of(model, parameters);
+  motion.pushed = pushed_acceleration(model);
   if (model.potential) {
     motion.energy = [&model, parameters](const MatrixXd& states) -> MotionEnergy {
       return {mechanical_energy(model, parameters, states), {}};
@@ -323,12 +324,9 @@ SimulateJob prepare_simulation(const FitSystem& system, const Posterior& posteri
       };
     };
     const View ddq = View::constrained_acceleration(*model.system);
-    SimulateJob::Motion motion{parameters,
-                               of_view(ddq),
-                               {},
-                               {},
-                               contacts_of(model, parameters),
-                               pushed_acceleration(posterior.prior(), at_system(ddq), function)};
+    SimulateJob::Motion motion{parameters, of_view(ddq)};
+    motion.contacts = contacts_of(model, parameters);
+    motion.pushed = pushed_acceleration(posterior.prior(), at_system(ddq), function);
     if (model.system->nc() > 0) motion.multipliers = of_view(View::multipliers(*model.system));
     if (has_energy) motion.energy = energy;
     job.motions.push_back(std::move(motion));

@@ -58,11 +58,11 @@ struct MotionEnergy {
 struct SimulateJob {
   struct Motion {
     Eigen::VectorXd parameters;  // of its constraints and contacts
-    Acceleration acceleration;
-    Acceleration multipliers;                                           // λ; none without constraints
-    std::function<MotionEnergy(const Eigen::MatrixXd& states)> energy;  // none without a potential, known or learned
-    std::vector<Contact> contacts;
-    PushedAcceleration pushed;  // of their impacts
+    Acceleration acceleration = {};
+    Acceleration multipliers = {};                                           // λ; none without constraints
+    std::function<MotionEnergy(const Eigen::MatrixXd& states)> energy = {};  // none without a potential, known or learned
+    std::vector<Contact> contacts = {};
+    PushedAcceleration pushed = {};  // of their impacts
   };
   std::shared_ptr<const System> system;
   Eigen::VectorXd start;           // the whole state
