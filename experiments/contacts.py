@@ -2,8 +2,7 @@
 
     PYTHONPATH=build/test/python python3 experiments/contacts.py --seeds 1 10
 
-edge     a puck slides over a table, leaves it at its rounded edge, falls and bounces on the floor, rubbing on both. The true contact is
-         rigid.
+edge     a puck slides over a table, leaves it at its rounded edge, falls and bounces on the floor. The true contact is rigid.
 cushion  a puck slides against a cushion, comes back and sticks. The true cushion is a spring that stiffens, about 10 ms of contact, which gives
          back 0.4 of its energy (hysteresis), or loses more the faster it is hit (Hunt & Crossley); of the latter gp2 has e = 1 − c|ẋ|.
 
@@ -26,7 +25,7 @@ e = 0.6
 h  = "0.8/(1 + exp(x/0.01))"
 hx = "-80*exp(x/0.01)/(1 + exp(x/0.01))^2"
 v  = "(dx + hx*dz)/sqrt(1 + hx^2)"
-press = "abs(lambda(1))*sqrt(1 + hx^2)"
+press = "abs(lambda(1))*sqrt(1 + hx^2)*h/0.8"
 [mechanics]
 mass  = [["0.2", "0"], ["0", "0.2"]]
 force = ["0", "-0.2*9.81"]
@@ -107,7 +106,7 @@ def smooth_motions(is_edge, coefficient, start, stiffness, ratio, times, dt=2e-4
         # normal to the table and along it
         gap, opening, v = (z - 0.8 * s) / root, (dz - slope * dx) / root, (dx + slope * dz) / root
         push = np.maximum(0, -k * gap - damping * opening) * (gap < 0)
-        friction = np.interp(np.abs(v), speeds, values) * push * v / np.sqrt(v**2 + 1e-6)
+        friction = np.interp(np.abs(v), speeds, values) * push * s * v / np.sqrt(v**2 + 1e-6)
         return np.stack([dx, dz, (-push * slope - friction) / root / MASS, (push - friction * slope) / root / MASS - GRAVITY])
 
     out = np.empty((len(stiffness), len(start), len(times), 2))
