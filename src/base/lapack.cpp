@@ -255,6 +255,17 @@ void add_product(const Eigen::Ref<const Eigen::MatrixXd>& A, bool transposed_A, 
          &ldc, 1, 1);
 }
 
+void add_symmetric_product(const Eigen::Ref<const Eigen::MatrixXd>& A, const Eigen::Ref<const Eigen::MatrixXd>& B,
+                           Eigen::Ref<Eigen::MatrixXd> C) {
+  constexpr Eigen::Index strip = 64;  // columns; of fewer a product is slow
+  for (Eigen::Index first = 0; first < C.cols(); first += strip) {
+    const Eigen::Index n = std::min(strip, C.cols() - first), below = C.rows() - first;
+    add_product(A.bottomRows(below), false, B.middleRows(first, n), true, C.block(first, first, below, n));
+    const Eigen::Index left = below - n;
+    C.block(first, first + n, n, left) = C.block(first + n, first, left, n).transpose();
+  }
+}
+
 void add_square(const Eigen::Ref<const Eigen::MatrixXd>& A, Eigen::Ref<Eigen::MatrixXd> C) {
   const BufferInUse buffer;
   const int n = static_cast<int>(A.rows()), k = static_cast<int>(A.cols()), lda = static_cast<int>(A.outerStride()),

@@ -64,6 +64,10 @@ void multiply_lower(const Eigen::Ref<const Eigen::MatrixXd>& L, Eigen::Ref<Eigen
 void add_product(const Eigen::Ref<const Eigen::MatrixXd>& A, bool transposed_A, const Eigen::Ref<const Eigen::MatrixXd>& B,
                  bool transposed_B, Eigen::Ref<Eigen::MatrixXd> C);
 
+/// C ← C + A Bᵀ where A Bᵀ and C are symmetric, by little more than half the operations.
+void add_symmetric_product(const Eigen::Ref<const Eigen::MatrixXd>& A, const Eigen::Ref<const Eigen::MatrixXd>& B,
+                           Eigen::Ref<Eigen::MatrixXd> C);
+
 /// The lower triangle of C ← C + A Aᵀ.
 void add_square(const Eigen::Ref<const Eigen::MatrixXd>& A, Eigen::Ref<Eigen::MatrixXd> C);
 

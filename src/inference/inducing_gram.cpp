@@ -2,7 +2,7 @@
 
 #include <algorithm>
 #include <functional>
-#include <iterator>
+#include <span>
 #include <utility>
 
 #include "base/lapack.hpp"
@@ -53,11 +53,94 @@ void add_gradient_of_variance(const KernelColumns& kernel, Index d, double weigh
   sums.row(0) += sum;
 }
 
+/// What the bound's derivatives by covariances of one block of rows with the variables are made of, in memory that the next block
+/// uses again.
+struct BlockDerivatives {
+  MatrixXd alpha;              // the misfit  (n × components)
+  std::vector<MatrixXd> U;     // per cross: L_aᵀ ∂NLL/∂k(Z, φ_i)  (variables, padded as k is × n)
+  std::vector<MatrixXd> V;     // per function (n × components)
+  std::vector<VectorXd> mean;  // per function (n)
+  MatrixXd product;
+
+  /// @param mean_of_variables  B⁻¹c
+  /// @param explained          in_pairs(I − B⁻¹)
+  void move_to(const InducingLatents& latents, const InducingBlock& block, const VectorXd& mean_of_variables,
+               const MatrixXd& explained);
+};
+
+// Two functions f < g with the same w need E_fg w and E_gf w = E_fgᵀ w in the same sums: E_fg + E_fgᵀ in the place of E_fg.
+MatrixXd in_pairs(const InducingLatents& latents, MatrixXd E) {
+  const std::vector<InducingLatents::Function>& functions = latents.functions();
+  for (std::size_t g = 0; g < functions.size(); ++g) {
+    const Index m = latents.latent_of(functions[g]).n_variables();
+    for (std::size_t f = 0; f < g; ++f) {
+      if (functions[f].cross != functions[g].cross) continue;
+      auto pair = E.block(functions[f].first, functions[g].first, m, m);
+      pair += pair.transpose().eval();
+    }
+  }
+  return E;
+}
+
+void BlockDerivatives::move_to(const InducingLatents& latents, const InducingBlock& block, const VectorXd& mean_of_variables,
+                               const MatrixXd& explained) {
+  const std::vector<InducingLatents::Function>& functions = latents.functions();
+  const Index n = block.n();
+  alpha = block.misfit(mean_of_variables);
+  const Index n_components = alpha.cols();
+  U.resize(latents.n_crosses());
+  V.resize(functions.size());
+  mean.resize(functions.size());
+  for (std::size_t f = 0; f < functions.size(); ++f) {
+    const MatrixXd& w = block.w(f);
+    const InducingLatents::OfLatent& latent = latents.latent_of(functions[f]);
+    const auto mean_of_f = mean_of_variables.segment(functions[f].first, w.rows());
+    mean[f].noalias() = w.transpose() * mean_of_f;
+    ArrayXd beta = ArrayXd::Zero(n);
+    V[f].resize(n, n_components);
+    for (Index c = 0; c < n_components; ++c) {
+      const ArrayXd alpha_c = alpha.col(c).array(), weight = block.weight(f, c).array();
+      beta += weight * alpha_c;
+      V[f].col(c) = weight * block.variance(f).array() - alpha_c * mean[f].array();
+    }
+    MatrixXd& u = U[functions[f].cross];
+    if (f == 0 || functions[f - 1].cross != functions[f].cross)
+      u.setZero(latent.is_potential ? w.rows() : latent.kernel.n_rows(), n);
+    u.topRows(w.rows()).noalias() -= mean_of_f * beta.matrix().transpose();
+  }
+  product.resize(latents.size(), n);
+  for (std::size_t g = 0; g < functions.size(); ++g) {
+    const MatrixXd& w = block.w(g);
+    const auto add_rows = [&](Index first, Index end) {
+      auto rows = product.middleRows(first, end - first);
+      rows.setZero();
+      lapack::add_product(explained.block(first, functions[g].first, end - first, w.rows()), false, w, false, rows);
+    };
+    const auto next_latent = std::ranges::find_if(functions, [&](const auto& f) { return f.latent > functions[g].latent; });
+    add_rows(0, functions[g].first + w.rows());
+    if (next_latent != functions.end()) add_rows(next_latent->first, latents.size());
+    for (std::size_t f = 0; f < functions.size(); ++f) {
+      const bool is_pair = f != g && functions[f].cross == functions[g].cross;
+      if (is_pair && f > g) continue;
+      const MatrixXd& v = block.w(f);
+      const auto of_f = product.middleRows(functions[f].first, v.rows());
+      U[functions[f].cross].topRows(v.rows()) -= of_f * block.weight_product(f, g).matrix().asDiagonal();
+      VectorXd explained_by_g = of_f.cwiseProduct(v).colwise().sum();
+      if (is_pair) explained_by_g *= 0.5;
+      for (Index c = 0; c < n_components; ++c) {
+        V[f].col(c) -= block.weight(g, c).cwiseProduct(explained_by_g);
+        if (is_pair) V[g].col(c) -= block.weight(f, c).cwiseProduct(explained_by_g);
+      }
+    }
+  }
+}
+
 /// Sums over rows of which the gradient consists.
 struct GradientSums {
   std::vector<MatrixXd> kernel;   // (lanes × parameters)
   std::vector<VectorXd> columns;  // (functions)
   double misfit = 0;
+  BlockDerivatives memory = {};
 
   void add(const GradientSums& other) {
     misfit += other.misfit;
@@ -72,52 +155,6 @@ struct GradientSums {
     for (VectorXd& one : columns) take(one.data(), one.size());
   }
 };
-
-/// What the bound's derivatives by covariances of one block of rows with the variables are made of, for each function.
-struct BlockDerivatives {
-  MatrixXd alpha;              // the misfit  (n × components)
-  std::vector<MatrixXd> U;     // −L_aᵀ ∂NLL/∂k(Z, φ_i)  (variables × n)
-  std::vector<MatrixXd> V;     // (n × components)
-  std::vector<VectorXd> mean;  // (n)
-};
-
-/// @param mean       B⁻¹c
-/// @param explained  I − B⁻¹
-BlockDerivatives derivatives(const InducingLatents& latents, const InducingBlock& block, const VectorXd& mean,
-                             const MatrixXd& explained) {
-  const std::vector<InducingLatents::Function>& functions = latents.functions();
-  const Index n = block.n();
-  BlockDerivatives out;
-  out.alpha = block.misfit(mean);
-  const Index n_components = out.alpha.cols();
-  for (std::size_t f = 0; f < functions.size(); ++f) {
-    const MatrixXd& w = block.w(f);
-    const auto mean_of_f = mean.segment(functions[f].first, w.rows());
-    out.mean.emplace_back(w.transpose() * mean_of_f);
-    ArrayXd beta = ArrayXd::Zero(n);
-    out.V.emplace_back(n, n_components);
-    for (Index c = 0; c < n_components; ++c) {
-      const ArrayXd alpha_c = out.alpha.col(c).array(), weight = block.weight(f, c).array();
-      beta += weight * alpha_c;
-      out.V[f].col(c) = weight * block.variance(f).array() - alpha_c * out.mean[f].array();
-    }
-    out.U.emplace_back(mean_of_f * beta.matrix().transpose());
-  }
-  MatrixXd product;
-  for (std::size_t g = 0; g < functions.size(); ++g) {
-    const MatrixXd& w = block.w(g);
-    product.setZero(latents.size(), n);
-    lapack::add_product(explained.middleCols(functions[g].first, w.rows()), false, w, false, product);
-    for (std::size_t f = 0; f < functions.size(); ++f) {
-      const MatrixXd& v = block.w(f);
-      const auto of_f = product.middleRows(functions[f].first, v.rows());
-      out.U[f] += of_f * block.weight_product(f, g).matrix().asDiagonal();
-      const VectorXd explained_by_g = of_f.cwiseProduct(v).colwise().sum();
-      for (Index c = 0; c < n_components; ++c) out.V[f].col(c) -= block.weight(g, c).cwiseProduct(explained_by_g);
-    }
-  }
-  return out;
-}
 
 /// V from the units of the enlarged noise to those without it.
 void without_enlarged_noise(const InducingLatents& latents, const InducingBlock& block, BlockDerivatives& of) {
@@ -176,6 +213,7 @@ std::optional<GramValue> InducingGram::differentiate(const RowBlocks& rows, cons
   lapack::invert_factored(P, {.stop = stop_});
   MatrixXd explained = -MatrixXd(P.selfadjointView<Eigen::Lower>());  // I − B⁻¹
   explained.diagonal().array() += 1;
+  explained = in_pairs(latents_, std::move(explained));
 
   GradientSums zero;
   for (const InducingLatents::OfLatent& latent : latents_.latents()) {
@@ -186,7 +224,8 @@ std::optional<GramValue> InducingGram::differentiate(const RowBlocks& rows, cons
       latents_, rows, true, workers_, stop_, zero,
       [&](GradientSums& sum, int piece, const RowBlock& row_block, const InducingBlock& block) {
         const Index n = block.n();
-        BlockDerivatives of = derivatives(latents_, block, mean_, explained);
+        BlockDerivatives& of = sum.memory;
+        of.move_to(latents_, block, mean_, explained);
         const Index n_components = of.alpha.cols();
         sum.misfit += of.alpha.squaredNorm();
         without_enlarged_noise(latents_, block, of);
@@ -208,18 +247,15 @@ std::optional<GramValue> InducingGram::differentiate(const RowBlocks& rows, cons
             if (parts[a].V) out.V.col(c * latent.n_functions + l) = of.V[f].col(c);
           }
           if (parts[a].mean) out.mean.col(l) = of.mean[f];
-          if (l > 0 && !latent.is_potential) of.U[f - static_cast<std::size_t>(l)] += of.U[f];
         }
         for (std::size_t a = 0; a < parts.size(); ++a) {
           if (parts[a].mean && latents_.latents()[a].is_local) block.add_mean_of_noise(a, alpha_before, of_block.latents[a].mean);
         }
         of_rows(piece, row_block, of_block);
-        for (std::size_t f = 0; f < functions.size(); ++f) {
-          const std::size_t a = functions[f].latent;
-          if (functions[f].index > 0 || !parts[a].kernel) continue;
-          const auto first = of.U.begin() + static_cast<std::ptrdiff_t>(f);
-          const auto n_crosses = static_cast<std::ptrdiff_t>(latents_.latents()[a].n_crosses());
-          add_cross_gradient(a, block, {std::move_iterator(first), std::move_iterator(first + n_crosses)}, sum.kernel[a]);
+        for (std::size_t a = 0; a < parts.size(); ++a) {
+          if (!parts[a].kernel) continue;
+          const InducingLatents::OfLatent& latent = latents_.latents()[a];
+          add_cross_gradient(a, block, std::span(of.U).subspan(latent.first_cross, latent.n_crosses()), sum.kernel[a]);
           add_variance_gradient(a, block, sum.kernel[a]);
         }
       });
@@ -233,23 +269,16 @@ std::optional<GramValue> InducingGram::differentiate(const RowBlocks& rows, cons
   return value_of(all->misfit);
 }
 
-void InducingGram::add_cross_gradient(std::size_t a, const InducingBlock& block, const std::vector<MatrixXd>& U,
-                                      MatrixXd& sums) const {
+void InducingGram::add_cross_gradient(std::size_t a, const InducingBlock& block, std::span<MatrixXd> U, MatrixXd& sums) const {
   const InducingLatents::OfLatent& latent = latents_.latents()[a];
   const MatrixXd& features = block.rows().latents[a].kernel.features();
-  std::vector<MatrixXd> H;
-  for (const MatrixXd& of_cross : U) {
-    H.emplace_back(MatrixXd::Zero(latent.is_potential ? latent.n_variables() : latent.kernel.n_rows(), block.n()));
-    auto variables = H.back().topRows(latent.n_variables());
-    variables = -of_cross;
-    lapack::solve_lower(latent.L, true, variables);
-  }
+  for (MatrixXd& of_cross : U) lapack::solve_lower(latent.L, true, of_cross.topRows(latent.n_variables()));
   VectorXd point;
   if (!latent.is_potential) {
     KernelColumns::Workspace workspace;
     for (Index i = 0; i < block.n(); ++i) {
       latent.kernel.scale(features.row(i).transpose(), point);
-      latent.kernel.add_gradient(0, H[0].rows(), point, block.k(a).col(i).data(), H[0].col(i).data(), sums, workspace);
+      latent.kernel.add_gradient(0, U[0].rows(), point, block.k(a).col(i).data(), U[0].col(i).data(), sums, workspace);
     }
     return;
   }
@@ -257,7 +286,7 @@ void InducingGram::add_cross_gradient(std::size_t a, const InducingBlock& block,
   for (Index i = 0; i < block.n(); ++i) {
     latent.kernel.scale(features.row(i).transpose(), point);
     gradient.move_to(point);
-    for (std::size_t d = 0; d < H.size(); ++d) gradient.add(static_cast<Index>(d), H[d].col(i), sums);
+    for (std::size_t d = 0; d < U.size(); ++d) gradient.add(static_cast<Index>(d), U[d].col(i), sums);
   }
 }
 

@@ -3,6 +3,7 @@
 #include <atomic>
 #include <cassert>
 #include <memory>
+#include <span>
 #include <utility>
 #include <vector>
 
@@ -29,10 +30,9 @@ class InducingGram final : public Gram {
   [[nodiscard]] bool factorise(const RowBlocks& rows);
   /// @param misfit  Σ ‖α̃‖²
   [[nodiscard]] GramValue value_of(double misfit) const;
-  /// Adds −Σ_f tr(∂k_f(Z, φ_i)/∂log v ᵀ U_f) of a latent and a block.
-  /// @param U  of each of its covariances (variables × n)
-  void add_cross_gradient(std::size_t a, const InducingBlock& block, const std::vector<Eigen::MatrixXd>& U,
-                          Eigen::MatrixXd& sums) const;
+  /// Adds Σ tr(∂k(Z, φ_i)/∂log v ᵀ L⁻ᵀU) of a latent's covariances with a block.
+  /// @param U  of each of them (variables, padded × n); becomes L⁻ᵀU
+  void add_cross_gradient(std::size_t a, const InducingBlock& block, std::span<Eigen::MatrixXd> U, Eigen::MatrixXd& sums) const;
   void add_variance_gradient(std::size_t a, const InducingBlock& block, Eigen::MatrixXd& sums) const;
   void add_points_gradient(std::size_t a, const Eigen::MatrixXd& P, Eigen::MatrixXd& sums) const;
 

@@ -295,6 +295,8 @@ void InducingStatistics::add(const InducingLatents& latents, const InducingBlock
       memory = v * product.matrix().asDiagonal();
       if (f == g) {
         lapack::add_square(memory, to);
+      } else if (functions[f].cross == functions[g].cross) {
+        lapack::add_symmetric_product(w, memory, to);
       } else {
         lapack::add_product(w, false, memory, true, to);
       }

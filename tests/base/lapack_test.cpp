@@ -36,6 +36,24 @@ TEST(Lapack, InPiecesIsTheSameAsInOneToRounding) {
   }
 }
 
+TEST(Lapack, ASymmetricProductIsTheProductInBothTriangles) {
+  RandomStream random(72);
+  for (const Index n : {0, 1, 63, 64, 65, 200}) {
+    SCOPED_TRACE(n);
+    const Index k = 50;
+    MatrixXd A(n, k);
+    Eigen::VectorXd weights(k);
+    for (double& entry : A.reshaped()) entry = random.normal();
+    for (double& weight : weights) weight = random.normal();
+    const MatrixXd B = A * weights.asDiagonal();
+    MatrixXd sum = n == 0 ? MatrixXd(0, 0) : random_positive_definite(n);
+    const MatrixXd expected = sum + A * B.transpose();
+    lapack::add_symmetric_product(A, B, sum);
+    // k products of normal numbers and a sum of n: of each entry some ε times their absolute values
+    EXPECT_TRUE((sum - expected).isZero(1e-12 * (1 + static_cast<double>(n))));
+  }
+}
+
 TEST(Lapack, AMatrixThatIsNotPositiveDefiniteIsFoundInEveryPiece) {
   const Index n = 200;
   for (const Index bad : {0, 99, 100, 199}) {
