@@ -71,8 +71,8 @@ void estimated_parameters(benchmark::State& state) { likelihood_and_gradient(sta
 void inducing_points(benchmark::State& state) {
   constexpr int n_points = 200, n_functions = 3;
   likelihood_and_gradient(state, {}, false, static_cast<int>(state.range(1)), n_functions * n_points);
-  // of each pair of functions one product for B, of one with itself half of one, and one for the gradient
-  constexpr double n_products = 0.5 * n_functions * n_functions + n_functions * n_functions;
+  // of each pair of functions, and of one with itself, half a product for B and one for the gradient
+  constexpr double n_products = 1.5 * n_functions * (n_functions + 1) / 2;
   state.counters["Gflop/s"] = benchmark::Counter(2e-9 * n_products * n_points * n_points * static_cast<double>(state.range(0)),
                                                  benchmark::Counter::kIsIterationInvariantRate);
 }

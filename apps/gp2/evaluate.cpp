@@ -76,11 +76,10 @@ void print_text(const Evaluation& e) {
   print_result("nlpd; 50, 80, 95 % coverage {:.4g}; {}   (with measurement noise)\n", e.nlpd, coverages(e));
   print_result("the same, noise-free        {:.4g}; {:.3g}, {:.3g}, {:.3g}   ({} marginals without variance left out)\n",
                e.nlpd_latent, e.coverage50_latent, e.coverage80_latent, e.coverage95_latent, e.n_zero_variance);
-  if (e.far.n > 0) {
-    print_result("near the data               {:.3g} % of the points: nrmse {:.4g}; coverage {}\n", 100.0 * e.near.n / e.n,
-                 e.near.nrmse, coverages(e.near));
-    print_result("far from them               {:.3g} % of the points: nrmse {:.4g}; coverage {}\n", 100.0 * e.far.n / e.n,
-                 e.far.nrmse, coverages(e.far));
+  for (const auto& [name, part] : {std::pair("near the data  ", &e.near), std::pair("far from them  ", &e.far)}) {
+    if (e.far.n == 0 || part->n == 0) continue;
+    print_result("{}             {:.3g} % of the points: nrmse {:.4g}; coverage {}\n", name, 100.0 * part->n / e.n, part->nrmse,
+                 coverages(*part));
   }
   print_result("points                      {}{}\n", e.n,
                e.n_missing > 0 ? fmt::format("   ({} values not measured)", e.n_missing) : "");

@@ -262,19 +262,22 @@ void update_with(PyPosterior& self, const py::object& data, const std::vector<st
                  const std::optional<int>& window) {
   const UpdateRequest request{observe, noise_stddev, columns_argument(columns), share, window};
   std::vector<std::string> notes;
-  Observations more = more_observations(self.file, self.posterior, to_table(data, "data"), request, notes);
-  tell(notes);
+  const CsvTable log = to_table(data, "data");
+  Observations more = more_observations(self.file, self.posterior, log, request, notes);
+  tell(std::exchange(notes, {}));
   const std::optional<Posterior> kept = kept_by_others(self);
   if (!share && !window) {
-    self.posterior = update(std::move(self.posterior), std::move(more));
+    self.posterior = with_more(std::move(self.posterior), std::move(more), log, notes);
+    tell(notes);
     return;
   }
   // a step that is refused undoes those before it
   Posterior next = self.posterior;
   if (share) next = forget(std::move(next), *share);
-  next = update(std::move(next), std::move(more));
+  next = with_more(std::move(next), std::move(more), log, notes);
   keep_newest(next, request);
   self.posterior = std::move(next);
+  tell(notes);
 }
 
 // ---------------------------------------------------------------- files

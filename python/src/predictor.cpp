@@ -18,9 +18,9 @@ namespace {
 
 using Numbers = py::array_t<double, py::array::c_style>;
 
-// the array itself where it is one of doubles
+// the array itself where it is one of doubles, all of which may be looked at
 Numbers numbers_of(const py::object& given, Eigen::Index size, const char* name) {
-  if (Numbers::check_(given)) {
+  if (Numbers::check_(given) && !py::hasattr(given, "mask")) {
     auto x = py::reinterpret_borrow<Numbers>(given);
     if (x.ndim() == 1 && x.shape(0) == size) return x;
   }

@@ -232,8 +232,13 @@ void read_start_values(const std::filesystem::path& path, std::vector<Hyperparam
   std::map<std::string, double> values;
   if (is_fit(json)) {
     // a fit may have had more to tune than this one; a hand-written value must mean something
-    for (const Hyperparameter& h : hyperparameters_of(path, json)) {
+    const std::vector<Hyperparameter> of_fit = hyperparameters_of(path, json);
+    for (const Hyperparameter& h : of_fit) {
       if (find_named(hyperparameters, h.name) != hyperparameters.end()) values[h.name] = h.value;
+    }
+    if (values.empty() && !of_fit.empty() && !hyperparameters.empty()) {
+      throw InputError(fmt::format("{}: none of its hyperparameters, '{}' and so on, is one of this fit, '{}' and so on",
+                                   path.string(), of_fit.front().name, hyperparameters.front().name));
     }
   } else if (json.is_object()) {
     for (const auto& [name, value] : json.items()) {

@@ -125,11 +125,8 @@ void Posterior::Implementation::add_through_points(const Observations& more, std
     static_cast<void>(require_models(prior, added, values.parameters, nullptr));  // names the state
     throw_not_definite();
   }
-  if (group == observations.size()) {
-    observations.push_back(more.take({}));
-    values.noise_stddev.push_back(more.noise().stddev());
-    kept->n_states.push_back(0);
-  }
+  const bool is_new = group == observations.size();
+  if (is_new) kept->n_states.push_back(0);
   kept->stretch_of.clear();  // what is new is of none
   // every so manieth of all
   std::int64_t& n_states = kept->n_states[group];
@@ -137,7 +134,12 @@ void Posterior::Implementation::add_through_points(const Observations& more, std
   for (int i = 0; i < more.n_data(); ++i, ++n_states) {
     if (n_states % kept->step == 0) states.push_back(i);
   }
-  observations[group].append(more.take(states));
+  if (is_new) {
+    observations.push_back(more.take(states));
+    values.noise_stddev.push_back(more.noise().stddev());
+  } else if (!states.empty()) {
+    observations[group].append(more.take(states));
+  }
   keep_some(observations, *kept);
   linearise_kept(1);
 }

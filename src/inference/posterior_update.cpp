@@ -117,6 +117,7 @@ std::vector<std::shared_ptr<Posterior::Implementation>> Posterior::own_component
 Posterior update(Posterior&& posterior, Observations added) {
   require_observations(posterior.prior(), added);
   added.require_no_sums();
+  if (added.n_data() == 0) return std::move(posterior);
   const lapack::SingleThread single_thread;
   const std::size_t group = group_of(posterior, added);
   const auto own = posterior.own_components();

@@ -305,6 +305,9 @@ FitRequest request_of(const FitFile& fit) {
   return request;
 }
 
+// How a checkpoint ended that was written without all rows.
+static constexpr const char* has_some_rows = "interrupted, with some of the rows";
+
 FitJob prepare_fit_again(const FitFile& fit, int threads) {
   FitRequest request = request_of(fit);
   request.threads = threads;
@@ -317,6 +320,9 @@ FitJob prepare_fit_again(const FitFile& fit, int threads) {
   if (n_all > n_states(fit.observations)) {
     throw InputError(fmt::format("`again`: the file holds what {} rows say, and {} of them; give its logs by `data`: {}", n_all,
                                  n_states(fit.observations), fit.data_source));
+  }
+  if (fit.report.termination == has_some_rows) {
+    throw InputError(fmt::format("`again`: the checkpoint holds some of the rows; give its logs by `data`: {}", fit.data_source));
   }
   FitProblem problem;
   problem.prior_options = fit.prior_options;
@@ -403,6 +409,7 @@ void save_checkpoint(const FitJob& job, const FitReport& report, const std::vect
   file.observations = n_states(observations) > KeptStates::most ? evenly(observations, KeptStates::most) : observations;
   file.report = report;
   file.report.actuators = job.actuators;
+  if (n_states(file.observations) < n_states(job.problem.observations)) file.report.termination = has_some_rows;
   file.write(job.checkpoint);
 }
 

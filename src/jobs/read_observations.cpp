@@ -601,7 +601,7 @@ LogStates read_log_states(const Prior& prior, const View& view, const Model& mod
   }
   if (n_unknown > 0) {
     out.notes.push_back(
-        unknown_text(log, n_unknown, accelerations.empty() ? "as if the inputs had been at rest before" : "not compared"));
+        unknown_text(log, n_unknown, accelerations.empty() ? "as if the inputs had been at rest before" : "left out"));
   }
   note_reading(reader, log, out.notes);
   note_violation(*prior.system, out.states, prior.system->parameter_values(), log, out.notes);

@@ -2,28 +2,107 @@
 
 #include <algorithm>
 #include <cmath>
+#include <limits>
 #include <utility>
 
 #include <fmt/format.h>
+#include <fmt/ranges.h>
 
 #include "base/not_a_number.hpp"
 #include "gp2/data/log_reader.hpp"
 #include "gp2/error.hpp"
 #include "gp2/jobs/fit_problem.hpp"
+#include "inference/inducing_summary.hpp"
+#include "jobs/observation_noise.hpp"
 
 namespace gp2 {
 
+using Eigen::Index;
 using Eigen::MatrixXd;
 using Eigen::VectorXd;
 
 std::vector<Option> options(UpdateRequest& request) {
-  return {{"observe", &request.observe, "ddq3,ddq6", "accelerations to learn from", "those that the fit observed"},
-          {"noise_std", &request.noise_stddev, "S", "noise standard deviation of each", "as in the fit"},
-          {"map", &request.columns, "LOGNAME=NAME,…", "columns by other names", "", "columns"},
-          {"forget", &request.forget, "W",
-           "first of all let what was learned count as a share W of it, 0 < W ≤ 1; of fits through inducing points", "1"},
-          {"window", &request.window, "N", "leave the newest N rows; of exact fits", "all"}};
+  return {
+      {"observe", &request.observe, "ddq3,ddq6", "accelerations to learn from", "those that the fit observed"},
+      {"noise_std", &request.noise_stddev, "S", "noise standard deviation of each", "as the log states it, else as in the fit"},
+      {"map", &request.columns, "LOGNAME=NAME,…", "columns by other names", "", "columns"},
+      {"forget", &request.forget, "W",
+       "first of all let what was learned count as a share W of it, 0 < W ≤ 1; of fits through inducing points", "1"},
+      {"window", &request.window, "N", "leave the newest N rows; of exact fits", "all"}};
 }
+
+namespace {
+
+// The noise of more rows: what the log states, as the fit does, times its factor where it has one; else that of the fit. Of several
+// logs with a noise each the largest. A value that should have a deviation in the log and has none counts as not measured.
+Noise noise_of_more(const FitFile& fit, const Posterior& posterior, const View& view, const std::vector<std::string>& names,
+                    LogStates& read, const UpdateRequest& request, const CsvTable& log, std::vector<std::string>& notes) {
+  const std::vector<std::string> stated = stated_accelerations(names, open_log(fit.model, log, request.columns));
+  if (request.noise_stddev) {
+    if (!stated.empty()) {
+      notes.push_back(fmt::format("{}: `noise_std={}` stands for the deviations in {}", log.name(), *request.noise_stddev,
+                                  fmt::join(stated, ", ")));
+    }
+    return Noise(VectorXd::Constant(view.size(), *request.noise_stddev));
+  }
+  VectorXd stddev(view.size());
+  MatrixXd scale = MatrixXd::Ones(view.size(), read.states.cols());
+  const std::vector<Observations>& groups = posterior.observations();
+  for (Index k = 0; k < stddev.size(); ++k) {
+    const std::string& name = names[static_cast<std::size_t>(k)];
+    const bool states_noise = std::ranges::find(stated, name) != stated.end();
+    double least = std::numeric_limits<double>::infinity(), most = 0;
+    bool is_observed = false;
+    for (std::size_t g = 0; g < groups.size(); ++g) {
+      const View& there = groups[g].view();
+      const auto row = std::ranges::find(there.rows, view.rows[static_cast<std::size_t>(k)]);
+      if (!there.is_of_ddq() || there.other_system != nullptr || row == there.rows.end()) continue;
+      is_observed = true;
+      const Index at = row - there.rows.begin();
+      if (groups[g].states_noise(at) != states_noise) continue;
+      const double sigma = posterior.noise_stddev(g)[at];
+      least = std::min(least, sigma);
+      most = std::max(most, sigma);
+    }
+    if (states_noise) {
+      scale.row(k) = read.stated_stddev.row(k);
+      for (Index i = 0; i < scale.cols(); ++i) {
+        if (std::isnan(scale(k, i))) read.accelerations(k, i) = not_a_number;
+      }
+    } else if (!is_observed) {
+      throw InputError(fmt::format("`noise_std`: {} was not observed in the fit; give its noise standard deviation", name));
+    } else if (most == 0) {
+      throw InputError(
+          fmt::format("`noise_std`: in the fit each value of {} has a noise of its own; give that of these in a column "
+                      "{}_std, or one for all",
+                      name, name));
+    }
+    stddev[k] = most > 0 ? most : 1;
+    constexpr double alike = 1.2;
+    if (most > alike * least) {
+      notes.push_back(
+          fmt::format("warning: {}: the logs of the fit have noises of their own, {} {} {:.3g} to {:.3g}: the largest "
+                      "is taken for these rows; `noise_std` gives another",
+                      log.name(), name, states_noise ? "stated deviations times" : "from", least, most));
+    }
+  }
+  if (!stated.empty()) {
+    notes.push_back(fmt::format("{}: the noise of each value of {} is the stated one{}", log.name(), fmt::join(stated, ", "),
+                                fit.model.noise.floor.empty() ? "" : " and the floor of [noise]"));
+  }
+  return Noise(std::move(stddev), false, stated.empty() ? MatrixXd() : std::move(scale));
+}
+
+// Nats by which inducing points may miss what the observations say (theory.md, T37): of a mixture, the most of any component.
+double left_out(const Posterior& posterior) {
+  double most = 0;
+  if (const auto summary = posterior.summary()) {
+    for (const InducingSummary::Component& component : summary->components) most = std::max(most, 0.5 * component.all.trace);
+  }
+  return most;
+}
+
+}  // namespace
 
 Observations more_observations(const FitFile& fit, const Posterior& posterior, const CsvTable& log, const UpdateRequest& request,
                                std::vector<std::string>& notes) {
@@ -42,33 +121,42 @@ Observations more_observations(const FitFile& fit, const Posterior& posterior, c
   if (names.empty()) names = view.names(system);
   LogStates read = read_log_states(posterior.prior(), view, fit.model, log, request.columns, names);
 
-  // the noise that the fit has for these rows, unless told otherwise; where it is a factor of stated ones, the log states them
-  VectorXd stddev = VectorXd::Constant(view.size(), request.noise_stddev.value_or(not_a_number));
-  MatrixXd scale;
-  if (!request.noise_stddev) {
-    if (at_home == groups.end() || at_home->view().rows != view.rows) {
-      throw InputError("`noise_std`: these accelerations were not observed in the fit; give their noise standard deviation");
-    }
-    stddev = posterior.noise_stddev(static_cast<std::size_t>(at_home - groups.begin()));
-    bool states_noise = false;
-    for (int k = 0; k < view.size(); ++k) states_noise = states_noise || at_home->states_noise(k);
-    if (states_noise) {
-      LogReader reader = open_log(fit.model, log, request.columns);
-      for (const std::string& name : names) {
-        if (!reader.stddev_column(name).empty()) continue;
-        throw InputError(
-            fmt::format("`noise_std`: in the fit each value of {} has a noise of its own; give that of these in a column "
-                        "{}_std, or one for all",
-                        name, name));
-      }
-      scale = reader.stddevs(names);
-    }
-  }
+  Noise noise = noise_of_more(fit, posterior, view, names, read, request, log, notes);
   notes.insert(notes.end(), read.notes.begin(), read.notes.end());
   if (log.file() && fit.has_learned(*log.file())) {
     notes.push_back(fmt::format("warning: {} was learned from already: its rows count twice", log.name()));
   }
-  return {std::move(read.states), std::move(view), std::move(read.accelerations), std::move(stddev), false, std::move(scale)};
+  std::vector<int> rows;  // that measure something
+  for (int i = 0; i < static_cast<int>(read.accelerations.cols()); ++i) {
+    if (!read.accelerations.col(i).array().isNaN().all()) rows.push_back(i);
+  }
+  if (rows.empty()) {
+    notes.push_back(
+        fmt::format("warning: {}: nothing is learned from it: no row measures anything where what acts is known", log.name()));
+  }
+  noise = noise.take(rows);
+  return {read.states(Eigen::all, rows),
+          std::move(view),
+          read.accelerations(Eigen::all, rows),
+          noise.stddev(),
+          false,
+          noise.has_scale() ? noise.scale() : MatrixXd()};
+}
+
+Posterior with_more(Posterior&& posterior, Observations more, const CsvTable& log, std::vector<std::string>& notes) {
+  const double before = left_out(posterior);
+  const auto n_before = static_cast<double>(posterior.n_states());
+  const int n_more = more.n_data();
+  Posterior all = update(std::move(posterior), std::move(more));
+  const double of_more = left_out(all) - before;
+  constexpr double much = 1, usual = 3;  // nats; times as much as of as many rows before
+  if (of_more > much && of_more > usual * before * n_more / n_before) {
+    notes.push_back(fmt::format(
+        "warning: {}: what the fit's inducing points leave out of its rows is worth about {:.2g} nats: they lie where "
+        "none or few were learned from; a fit of all logs chooses points there too",
+        log.name(), of_more));
+  }
+  return all;
 }
 
 void keep_newest(Posterior& posterior, const UpdateRequest& request) {
@@ -86,7 +174,7 @@ UpdateOutcome update(FitFile fit, const std::vector<CsvTable>& logs, const Updat
     Observations more = more_observations(fit, posterior, log, request, outcome.notes);
     outcome.n_added += more.n_data();
     if (log.file()) fit.logs.push_back(*log.file());
-    posterior = update(std::move(posterior), std::move(more));
+    posterior = with_more(std::move(posterior), std::move(more), log, outcome.notes);
   }
   keep_newest(posterior, request);
   fit.take_data(posterior);

@@ -86,8 +86,9 @@ Fit fit(const Prior& prior, const std::vector<Observations>& observations, const
                             ? Posterior::lazy(prior, observations, values_of(prior, observations, report).front())
                             : possible_posterior(prior, observations, report, workers);
   if (report.inducing) report.inducing->summary = posterior.summary();
-  // what is said is of all rows, not of the part, and of the hyperparameters that are told, not of the likeliest draw
-  if (is_part || prior.is_nonlinear()) {
+  // what is said is of all rows, not of the part or of the few that a fit begins with, and of the hyperparameters that are told, not
+  // of the likeliest draw
+  if (is_part || prior.is_nonlinear() || (report.inducing && report.termination == FitReport::interrupted)) {
     FitReport optimum = report;
     optimum.draws.reset();
     if (optimum.inducing) optimum.inducing->summary = nullptr;

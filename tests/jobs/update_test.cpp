@@ -1,10 +1,13 @@
 // More data for a fit, as a command and Python ask for it.
 #include "gp2/jobs/update_job.hpp"
 
+#include <algorithm>
+#include <cmath>
 #include <cstdint>
 #include <string>
 #include <vector>
 
+#include <fmt/format.h>
 #include <gmock/gmock.h>
 #include <gtest/gtest.h>
 
@@ -20,6 +23,7 @@ namespace {
 
 using Eigen::MatrixXd;
 using test::input_error_of;
+using testing::Contains;
 using testing::HasSubstr;
 
 constexpr const char* surface = "models/surface.toml";
@@ -93,17 +97,139 @@ TEST(UpdateJob, WhatCannotBeIsAnError) {
   const auto refused = [&](const UpdateRequest& request) {
     return input_error_of([&] { static_cast<void>(update(fit, {log_of(3, 2)}, request)); });
   };
-  UpdateRequest none_left, fading, other, silent, unknown;
+  UpdateRequest none_left, fading, silent, unknown;
   silent.noise_stddev = 0;
   unknown.observe = {"ddq9"};
   EXPECT_EQ(refused(silent), "`noise_std`: must be positive and finite, got 0");
   EXPECT_THAT(refused(unknown), HasSubstr("`observe`: 'ddq9' is not an acceleration of "));
   none_left.window = 0;
   fading.forget = 0.5;
-  other.observe = {"ddq1"};
   EXPECT_EQ(refused(none_left), "`window`: must be positive, got 0");
   EXPECT_THAT(refused(fading), HasSubstr("the oldest go by `window`"));
-  EXPECT_THAT(refused(other), HasSubstr("give their noise standard deviation"));
+  FitRequest of_one;
+  of_one.model = test::model(surface);
+  of_one.logs = {{log_of(30, 1), nullptr}};
+  of_one.problem.observe = {"ddq1"};
+  of_one.max_iterations = 0;
+  const FitFile one = run_fit(prepare_fit(std::move(of_one))).file;
+  UpdateRequest other;
+  other.observe = {"ddq1", "ddq2"};
+  EXPECT_EQ(input_error_of([&] { static_cast<void>(update(one, {log_of(3, 2)}, other)); }),
+            "`noise_std`: ddq2 was not observed in the fit; give its noise standard deviation");
+}
+
+// A block that is pushed late and rubs; `noise` is that of [noise].
+Model block(const std::string& noise, const std::string& lateness = "") {
+  return Model::parse(fmt::format(R"toml(
+name = "block"
+coordinates = ["x"]
+inputs = [{{ name = "push"{} }}]
+[mechanics]
+mass = [["2"]]
+force = ["push"]
+[noise]
+ddq = {}
+[[latent]]
+name = "friction"
+kernel = "se"
+features = ["dx"]
+directions = {{ force = [["1"]] }}
+)toml",
+                                  lateness, noise),
+                      "block.toml");
+}
+
+// n rows of velocities from `first` to 3 m/s more, 0.01 s apart; a deviation of ddx where it is not empty
+CsvTable block_log(const std::string& name, int n, double first, const std::string& stddev) {
+  std::string text = stddev.empty() ? "t,x,dx,push,ddx\n" : "t,x,dx,push,ddx,ddx_std\n";
+  for (int i = 0; i < n; ++i) {
+    const double dx = first + 3. * i / n;
+    text += fmt::format("{},0,{},0.3,{}", 0.01 * i, dx, 0.15 - std::tanh(dx) + 0.05 * std::sin(31.0 * i));
+    text += stddev.empty() ? "\n" : fmt::format(",{}\n", i == 1 ? "" : stddev);
+  }
+  return CsvTable::parse(text, name);
+}
+
+FitFile fit_of_block(const Model& model, std::vector<CsvTable> logs, bool estimates_noise = false) {
+  FitRequest request;
+  request.model = model;
+  for (CsvTable& log : logs) request.logs.push_back({std::move(log), nullptr});
+  request.restarts = 1;
+  request.max_iterations = 3;
+  request.max_escapes = 0;
+  request.problem.estimate_noise = estimates_noise;
+  request.problem.mean = Prior::Mean::force;
+  return run_fit(prepare_fit(std::move(request))).file;
+}
+
+TEST(UpdateJob, TheNoiseOfMoreIsWhatItsLogStatesAsInTheFit) {
+  const double stated = 0.02, floor = 0.1;
+  for (const bool fit_states : {false, true}) {
+    SCOPED_TRACE(fit_states);
+    const FitFile fit =
+        fit_of_block(block("{ value = 0.3, floor = 0.1 }"), {block_log("first.csv", 30, -1, fit_states ? "0.02" : "")});
+    std::vector<std::string> notes;
+    const Posterior before = fit.posterior();
+    const Observations more = more_observations(fit, before, block_log("more.csv", 5, -1, "0.02"), {}, notes);
+    EXPECT_EQ(more.n_data(), 4) << "a value without a deviation is not measured";
+    const double factor = fit_states ? before.noise_stddev(0)[0] : 1;
+    EXPECT_DOUBLE_EQ(more.noise().at(more.noise().stddev(), 0)[0], factor * std::hypot(stated, floor));
+    EXPECT_THAT(notes, Contains(HasSubstr("the noise of each value of ddx is the stated one and the floor of [noise]")));
+    UpdateRequest told;
+    told.noise_stddev = 0.4;
+    const Observations otherwise = more_observations(fit, before, block_log("more.csv", 5, -1, "0.02"), told, notes);
+    EXPECT_EQ(otherwise.noise().at(otherwise.noise().stddev(), 0)[0], 0.4);
+    EXPECT_THAT(notes, Contains("more.csv: `noise_std=0.4` stands for the deviations in ddx"));
+  }
+  const FitFile factors = fit_of_block(block("0.3"), {block_log("first.csv", 30, -1, "0.02")});
+  EXPECT_THAT(input_error_of([&] { static_cast<void>(more_of(factors, block_log("more.csv", 5, -1, ""))); }),
+              HasSubstr("has a noise of its own; give that of these in a column ddx_std"));
+}
+
+TEST(UpdateJob, OfSeveralLogsTheLargestNoiseIsTakenAndSaid) {
+  for (const bool is_first : {false, true}) {
+    std::string rough = "t,x,dx,push,ddx\n";
+    for (int i = 0; i < 40; ++i) rough += fmt::format("{},0,{},0.3,{}\n", 0.01 * i, 0.05 * i, 2 * std::sin(31.0 * i));
+    std::vector<CsvTable> logs = {block_log("fine.csv", 40, -1, "")};
+    logs.insert(is_first ? logs.begin() : logs.end(), CsvTable::parse(rough, "rough.csv"));
+    const FitFile fit = fit_of_block(block("0.1"), std::move(logs), true);
+    const Posterior before = fit.posterior();
+    std::vector<std::string> notes;
+    const Observations more = more_observations(fit, before, block_log("more.csv", 5, -1, ""), {}, notes);
+    EXPECT_EQ(more.noise().stddev()[0], std::max(before.noise_stddev(0)[0], before.noise_stddev(1)[0]));
+    EXPECT_THAT(notes, Contains(HasSubstr("warning: more.csv: the logs of the fit have noises of their own, ddx from ")));
+  }
+}
+
+TEST(UpdateJob, RowsWhoseCommandsAreNotKnownAreLeftOutAndSaid) {
+  const FitFile fit = fit_of_block(block("0.05", ", delay = 0.03"), {block_log("first.csv", 30, -1, "")});
+  const UpdateOutcome some = update(fit, {block_log("more.csv", 10, -1, "")}, {});
+  EXPECT_EQ(some.n_added, 7);
+  EXPECT_THAT(some.notes,
+              Contains(HasSubstr("more.csv: 3 of 10 rows left out: what acts there depends on commands before the log")));
+  const UpdateOutcome none = update(fit, {block_log("short.csv", 2, -1, "")}, {});
+  EXPECT_EQ(none.n_added, 0);
+  EXPECT_EQ(none.n_states, fit.posterior().n_states());
+  EXPECT_THAT(none.notes, Contains(HasSubstr("warning: short.csv: nothing is learned from it")));
+}
+
+TEST(UpdateJob, RowsFarFromAllInducingPointsAreSaid) {
+  FitRequest request;
+  request.model = block("0.05");
+  request.logs = {{block_log("first.csv", 1200, -1, ""), nullptr}};
+  request.inducing = 40;
+  request.thin = false;
+  const FitFile fit = run_fit(prepare_fit(std::move(request))).file;
+  ASSERT_TRUE(fit.report.inducing);
+  const auto is_said = [](const UpdateOutcome& outcome) {
+    return testing::Matches(Contains(HasSubstr("what the fit's inducing points leave out of its rows is worth about")))(
+        outcome.notes);
+  };
+  EXPECT_FALSE(is_said(update(fit, {block_log("near.csv", 50, -0.97, "")}, {})));
+  EXPECT_TRUE(is_said(update(fit, {block_log("far.csv", 50, 40, "")}, {})));
+  // rows with deviations of their own are a group of their own
+  const UpdateOutcome grown = update(fit, {block_log("stated.csv", 5, -1, "0.02"), block_log("one.csv", 1, -1, "0.02")}, {});
+  EXPECT_EQ(grown.n_states, 1200 + 4 + 1);
 }
 
 }  // namespace

@@ -16,7 +16,7 @@ namespace gp2 GP2_API {
 /// How more data are added to a fit, its hyperparameters held.
 struct UpdateRequest {
   std::vector<std::string> observe;            // accelerations; empty: those that the fit observed
-  std::optional<double> noise_stddev;          // of each; not given: as in the fit
+  std::optional<double> noise_stddev;          // of each; not given: as the log states it, else as in the fit
   std::map<std::string, std::string> columns;  // model's name -> log's name, before the model's own [columns]
   std::optional<double> forget;                // before: what was learned counts as this share of it
   std::optional<int> window;                   // after: the newest states that are left
@@ -25,10 +25,13 @@ std::vector<Option> options(UpdateRequest& request);
 
 /// What a log adds to the observations of a fit.
 /// @param posterior  of the fit
-/// @param notes      receives what the reading has to say
+/// @param notes      receives what the reading has to say; rows that measure nothing are left out
 /// @throws InputError when the log lacks a column, or the noise of what it measures is not known.
 Observations more_observations(const FitFile& fit, const Posterior& posterior, const CsvTable& log, const UpdateRequest& request,
                                std::vector<std::string>& notes);
+
+/// update(), with a word where what went through inducing points has none near the new observations.
+Posterior with_more(Posterior&& posterior, Observations more, const CsvTable& log, std::vector<std::string>& notes);
 
 /// Leaves the newest states that a window asks for.
 /// @throws InputError as remove_oldest, and for a window that is not positive.
