@@ -203,9 +203,8 @@ MatrixXd stated_state_deviations(const System& system, LogReader& reader, const 
 }
 
 // --project: the states of a log moved onto the constraints, at the model's parameters
-void project(const LoggedSystem& logged, const CsvTable& log, const MatrixXd& stddevs, MatrixXd& states,
+void project(const System& system, const VectorXd& parameters, const CsvTable& log, const MatrixXd& stddevs, MatrixXd& states,
              std::vector<std::string>& notes) {
-  const System& system = logged.system();
   if (system.residual_labels().empty()) {
     notes.push_back(
         fmt::format("{}: nothing to project: '{}' has no position or velocity constraints", log.name(), system.name()));
@@ -213,7 +212,7 @@ void project(const LoggedSystem& logged, const CsvTable& log, const MatrixXd& st
   }
   ProjectedStates projected = [&] {
     try {
-      return project_states(system, logged.parameters, states, stddevs);
+      return project_states(system, parameters, states, stddevs);
     } catch (const InputError& error) {
       throw InputError(fmt::format("`project`: {}: {}", log.name(), error.what()));
     }
@@ -477,7 +476,7 @@ Observations read_log(const LoggedSystem& logged, const Log& log, const FitProbl
   MatrixXd all_values = all_accelerations(system, reader, log.table);
   const MatrixXd state_stddevs = options.project ? stated_state_deviations(system, reader, log.table) : MatrixXd();
   note_reading(reader, log.table, notes);
-  if (options.project) project(logged, log.table, state_stddevs, readings.states, notes);
+  if (options.project) project(system, logged.parameters, log.table, state_stddevs, readings.states, notes);
   note_violation(system, readings.states, logged.parameters, log.table, notes);
   note_dependence(logged, readings.states, std::move(all_values), observed.size(), log.table, notes);
   note_repeats(readings, log.table, notes);
@@ -535,7 +534,7 @@ Observations read_side_information(const LoggedSystem& logged, const Prior& fitt
       take_commands(system, logged.actuators, reader, options.commands, columns, readings.states, notes);
   const MatrixXd state_stddevs = options.project ? stated_state_deviations(system, reader, table) : MatrixXd();
   note_reading(reader, table, notes);
-  if (options.project) project(logged, table, state_stddevs, readings.states, notes);
+  if (options.project) project(system, logged.parameters, table, state_stddevs, readings.states, notes);
   note_violation(system, readings.states, logged.parameters, table, notes);
   std::vector<int> measured = measured_rows(readings, names, table, notes);
   keep_known(commanded, table, measured, notes);
@@ -586,9 +585,9 @@ LogReader open_log(const Model& model, const CsvTable& log, const std::map<std::
 
 LogStates read_log_states(const Prior& prior, const View& view, const Model& model, const CsvTable& log,
                           const std::map<std::string, std::string>& columns, const std::vector<std::string>& accelerations,
-                          const std::optional<std::vector<Actuator>>& actuators) {
+                          const std::optional<std::vector<Actuator>>& actuators, bool projects) {
   LogReader reader = open_log(model, log, columns);
-  LogStates out{states_of(prior, view, reader), reader.measurements(accelerations), {}, {}};
+  LogStates out{states_of(prior, view, reader, projects), reader.measurements(accelerations), {}, {}};
   const std::vector<std::string> stated = stated_accelerations(accelerations, reader);
   if (!stated.empty()) out.stated_stddev = stated_stddevs(model, accelerations, reader, log.n_rows());
   const std::optional<CommandedRows> commanded =
@@ -603,8 +602,11 @@ LogStates read_log_states(const Prior& prior, const View& view, const Model& mod
     out.notes.push_back(
         unknown_text(log, n_unknown, accelerations.empty() ? "as if the inputs had been at rest before" : "left out"));
   }
+  const MatrixXd state_stddevs = projects ? stated_state_deviations(*prior.system, reader, log) : MatrixXd();
   note_reading(reader, log, out.notes);
-  note_violation(*prior.system, out.states, prior.system->parameter_values(), log, out.notes);
+  const VectorXd parameters = prior.system->parameter_values();
+  if (projects) project(*prior.system, parameters, log, state_stddevs, out.states, out.notes);
+  note_violation(*prior.system, out.states, parameters, log, out.notes);
   return out;
 }
 

@@ -11,6 +11,7 @@
 #include "base/not_a_number.hpp"
 #include "gp2/data/log_reader.hpp"
 #include "gp2/error.hpp"
+#include "gp2/jobs/fit_job.hpp"
 #include "gp2/jobs/fit_problem.hpp"
 #include "inference/inducing_summary.hpp"
 #include "jobs/observation_noise.hpp"
@@ -119,7 +120,8 @@ Observations more_observations(const FitFile& fit, const Posterior& posterior, c
   if (names.empty() && at_home != groups.end()) names = at_home->view().names(system);
   view.rows = acceleration_rows(system, names, "`observe`");
   if (names.empty()) names = view.names(system);
-  LogStates read = read_log_states(posterior.prior(), view, fit.model, log, request.columns, names);
+  const bool projects = !fit.options.empty() && request_of(fit).problem.project;
+  LogStates read = read_log_states(posterior.prior(), view, fit.model, log, request.columns, names, {}, projects);
 
   Noise noise = noise_of_more(fit, posterior, view, names, read, request, log, notes);
   notes.insert(notes.end(), read.notes.begin(), read.notes.end());

@@ -186,6 +186,23 @@ TEST(UpdateJob, TheNoiseOfMoreIsWhatItsLogStatesAsInTheFit) {
               HasSubstr("has a noise of its own; give that of these in a column ddx_std"));
 }
 
+TEST(UpdateJob, ProjectsWhereTheFitDid) {
+  test::LogData log = test::drawn_log(surface, 20, 1), more = test::drawn_log(surface, 5, 2);
+  for (test::LogData* one : {&log, &more}) one->states.row(2).array() += 0.01;
+  for (const bool projects : {false, true}) {
+    FitRequest request;
+    request.model = test::model(surface);
+    request.logs = {{log.table(), nullptr}};
+    request.problem.project = projects;
+    request.max_iterations = 0;
+    const FitFile fit = run_fit(prepare_fit(std::move(request))).file;
+    std::vector<std::string> notes;
+    const Observations added = more_observations(fit, fit.posterior(), more.table(), {}, notes);
+    const System& system = *fit.model.system;
+    EXPECT_EQ(system.residuals(added.states(), system.parameter_values()).cwiseAbs().maxCoeff() < 1e-9, projects);
+  }
+}
+
 TEST(UpdateJob, OfSeveralLogsTheLargestNoiseIsTakenAndSaid) {
   for (const bool is_first : {false, true}) {
     std::string rough = "t,x,dx,push,ddx\n";

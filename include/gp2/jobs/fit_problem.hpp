@@ -137,6 +137,7 @@ LogReader open_log(const Model& model, const CsvTable& log, const std::map<std::
 /// States of a log for a prior and a view, with the columns that only the constraint residuals read where the log has them. Its
 /// inputs are commands; where what acts depends on some before the log, accelerations count as not measured.
 /// @param actuators  not given: the model's
+/// @param projects   whether states are moved onto the constraints, as by a fit with `project`
 struct LogStates {
   Eigen::MatrixXd states;
   Eigen::MatrixXd accelerations;  // those asked for (accelerations × N); NaN: not measured
@@ -145,7 +146,7 @@ struct LogStates {
 };
 LogStates read_log_states(const Prior& prior, const View& view, const Model& model, const CsvTable& log,
                           const std::map<std::string, std::string>& columns, const std::vector<std::string>& accelerations = {},
-                          const std::optional<std::vector<Actuator>>& actuators = {});
+                          const std::optional<std::vector<Actuator>>& actuators = {}, bool projects = false);
 
 /// States of a log and the accelerations that are wanted there: those of ddq for which it has columns.
 struct WantedMotion {
