@@ -97,8 +97,11 @@ void note_parameters(const Model& home, const LoggedSystem& logged, const std::v
   }
 }
 
-// @throws InputError for a parameter that follows from others.
+// @throws InputError for a parameter that follows from others, or is named twice.
 void require_own_parameters(const Model& model, const std::vector<std::string>& names) {
+  for (const std::string& name : names) {
+    if (std::ranges::count(names, name) > 1) throw InputError(fmt::format("`estimate`: '{}' stands twice", name));
+  }
   for (const Model::DerivedParameter& derived : model.derived_parameters) {
     if (std::find(names.begin(), names.end(), derived.name) == names.end()) continue;
     throw InputError(

@@ -133,6 +133,8 @@ TEST(FitNotes, AParameterThatFollowsFromOthersIsNotEstimated) {
   const CsvTable log = CsvTable::parse("x,dx,ddx\n1,2,3\n2,3,4\n", "log.csv");
   EXPECT_EQ(input_error_of([&] { make_fit_problem(model, log, options); }),
             "`estimate`: the parameter 'w' of 'cart' follows from others: w = 2*m; estimate those, and it follows them");
+  options.estimate = {"m", "m"};
+  EXPECT_EQ(input_error_of([&] { make_fit_problem(model, log, options); }), "`estimate`: 'm' stands twice");
 }
 
 }  // namespace
