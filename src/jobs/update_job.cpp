@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <memory>
 #include <utility>
 
 #include <fmt/format.h>
@@ -94,13 +95,11 @@ Noise noise_of_more(const FitFile& fit, const Posterior& posterior, const View& 
   return Noise(std::move(stddev), false, stated.empty() ? MatrixXd() : std::move(scale));
 }
 
-// Nats by which inducing points may miss what the observations say (theory.md, T37): of a mixture, the most of any component.
+// Nats by which inducing points may miss what the observations say (theory.md, T37): of a mixture, of its first component, since what
+// a summary holds is copied.
 double left_out(const Posterior& posterior) {
-  double most = 0;
-  if (const auto summary = posterior.summary()) {
-    for (const InducingSummary::Component& component : summary->components) most = std::max(most, 0.5 * component.all.trace);
-  }
-  return most;
+  const std::shared_ptr<const InducingSummary> summary = posterior.component(0).summary();
+  return summary ? 0.5 * summary->components.front().all.trace : 0;
 }
 
 }  // namespace
