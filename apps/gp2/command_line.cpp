@@ -117,7 +117,10 @@ class Parsing {
       if (added_.at(option.name)->count() == 0) continue;
       given.insert(option.name);
       const auto text = texts_.find(option.name);
-      if (text != texts_.end()) set_from_text(option, text->second);
+      if (text == texts_.end()) continue;
+      // of a shell variable that is not set
+      if (text->second.empty()) throw UsageError{fmt::format("{}: expected {}, got ''", flag_of(option), option.sample)};
+      set_from_text(option, text->second);
     }
     if (given.contains("quiet")) be_quiet();
     take_streams(given);

@@ -274,6 +274,27 @@ Evaluation::Part scores_of(const Posterior& posterior, const std::vector<LeaveOn
   return scores.part(spread.norm());
 }
 
+// rms noise of the measured values of ddq over their spread, as scores_of has the error.
+double nrmse_of_noise(const Posterior& posterior) {
+  double squares = 0, spreads = 0;
+  for (const int row : observed_rows(posterior)) {
+    double of_row = 0;
+    int n = 0;
+    for_each_observed(posterior, row, [&](std::size_t g, Index k) {
+      const Observations& group = posterior.observations()[g];
+      const VectorXd noise = posterior.noise_stddev(g);
+      for (Index i = 0; i < group.n_data(); ++i) {
+        if (std::isnan(group.values()(k, i))) continue;
+        of_row += std::pow(group.noise_at(noise, i)[k], 2);
+        ++n;
+      }
+    });
+    squares += of_row / n;
+    spreads += std::pow(training_spread(posterior, row), 2);
+  }
+  return std::sqrt(squares / spreads);
+}
+
 // Whether stretches of the observations are stretches of time.
 bool has_stretches(const Posterior& posterior, bool has_time_order) {
   const int t = posterior.prior().system->layout().t();
@@ -287,7 +308,8 @@ bool has_stretches(const Posterior& posterior, bool has_time_order) {
 
 CrossValidation cross_validate(const Posterior& posterior, bool has_time_order) {
   const LeftOut left_out = leave_out(posterior, has_stretches(posterior, has_time_order) ? CrossValidation::n_stretches : 0);
-  CrossValidation out{scores_of(posterior, left_out.values), std::nullopt, training_residuals(posterior, left_out.values)};
+  CrossValidation out{scores_of(posterior, left_out.values), std::nullopt, training_residuals(posterior, left_out.values),
+                      nrmse_of_noise(posterior)};
   if (!left_out.stretches.empty()) out.stretches = scores_of(posterior, left_out.stretches);
   return out;
 }
@@ -299,6 +321,12 @@ std::string CrossValidation::text() const {
     text += fmt::format("; in {} stretches of the log: {:.3g}, {:.3g}", n_stretches, stretches->nrmse, stretches->coverage95);
   }
   return text;
+}
+
+bool CrossValidation::predicts_little() const {
+  if (!stretches) return false;
+  const double noise = nrmse_of_noise * nrmse_of_noise, chance = 3 * noise * std::sqrt(2.0 / stretches->n);
+  return stretches->nrmse * stretches->nrmse > noise + chance + 0.25 * std::max(0.0, 1 - noise);
 }
 
 std::vector<ConstraintResidual> constraint_residuals(const Posterior& posterior,

@@ -134,7 +134,9 @@ InducingChoice choose_inducing_points(const Prior& prior, const std::vector<Obse
     choice.left_out = 0;
     Candidates* best = nullptr;
     double largest = 0;
-    for (Candidates& latent : latents) {
+    for (std::size_t a = 0; a < latents.size(); ++a) {
+      if (is_local(prior.latents[a])) continue;  // no number of points holds it
+      Candidates& latent = latents[a];
       choice.left_out += scale * latent.trace();
       if (n == 0 || choice.n_variables + latent.n_functions() > options.most) continue;
       const double part = latent.largest();

@@ -62,9 +62,9 @@ InducingLatents::InducingLatents(const Prior& prior, const ModelValues& values, 
     const Latent& of = prior.latents[a];
     const MatrixXd& given = values.inducing->features[a];
     const MatrixXd Z = of.is_potential ? given : given(factors[a].rows, Eigen::all);
-    const OfLatent& latent = latents_.emplace_back(OfLatent{
-        KernelColumns(of.kernel, Z, values.kernel[a]), std::move(factors[a].L), std::move(factors[a].rows),
-        values.loading(a).cols(), of.kernel_is_fixed && of.base == Latent::Base::admissible, of.is_potential, n_crosses});
+    const OfLatent& latent = latents_.emplace_back(OfLatent{KernelColumns(of.kernel, Z, values.kernel[a]),
+                                                            std::move(factors[a].L), std::move(factors[a].rows),
+                                                            values.loading(a).cols(), is_local(of), of.is_potential, n_crosses});
     for (Index l = 0; l < latent.n_functions; ++l) {
       functions_.push_back({a, l, size_, n_crosses + (of.is_potential ? static_cast<std::size_t>(l) : 0)});
       if (!of.is_potential) size_ += latent.n_variables();

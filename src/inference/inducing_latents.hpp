@@ -21,6 +21,9 @@ namespace gp2 {
 /// more, and t counts as much more as left out, so that the bound is one and no optimiser gains by rounding.
 constexpr double smallest_pivot = 1e-15;
 
+/// Whether what points leave out of a latent counts as noise: they cannot hold what has short, fixed lengthscales (theory.md, T38).
+inline bool is_local(const Latent& latent) { return latent.kernel_is_fixed && latent.base == Latent::Base::admissible; }
+
 /// Latents at their inducing points Z_a under one set of values. The inducing variables are f_a,l(Z_j), point after point of
 /// function after function of latent after latent; whitened they are L_a⁻¹ times that. The functions of a potential are the
 /// derivatives of one function, so that they share their variables: ∂_d V(Z_j), of all those that tell something.
@@ -31,7 +34,7 @@ class InducingLatents {
     Eigen::MatrixXd L;        // k_a(Z, Z) = L Lᵀ, of a potential the covariance of its derivatives
     std::vector<int> chosen;  // which of the points that were given Z are, in order; of a potential d·points + j of its variables
     Eigen::Index n_functions = 0;
-    bool is_local = false;  // what points leave out of it counts as noise: they cannot hold what has short, fixed lengthscales
+    bool is_local = false;
     bool is_potential = false;
     std::size_t first_cross = 0;  // of its covariances among those of all latents, of a potential one for each derivative
 

@@ -290,10 +290,13 @@ void check_channels(const WholeLog& log, const System& system, std::vector<Findi
 // Two columns of a log, value and rate, over the steps from row to row: y = Δvalue, x = mean rate · Δt.
 struct Steps {
   double xx = 0, yy = 0, xy = 0;
-  int n = 0;
+  double xxxx = 0, changes = 0;  // Σ (Δrate · Δt)²
+  int n = 0, n_turns = 0;        // of an angle, steps of more than a quarter turn
 
   [[nodiscard]] double correlation() const { return xx > 0 && yy > 0 ? xy / std::sqrt(xx * yy) : 0; }
   [[nodiscard]] double slope() const { return xx > 0 ? xy / xx : 0; }
+  /// Whether they tell anything: many count, and rates change little from row to row (an oscillation has six rows a period or more).
+  [[nodiscard]] bool tell() const { return n >= 20 && xx * xx > 8 * xxxx && changes < xx && 10 * n_turns < n; }
 };
 
 /// The lengths of a log's steps, NaN where it pauses.
@@ -310,14 +313,18 @@ std::vector<double> lengths_of_steps(const Eigen::RowVectorXd& t) {
 /// @param lag  rows by which the rate is late
 Steps steps_of(const std::vector<double>& lengths, const Eigen::RowVectorXd& value, const Eigen::RowVectorXd& rate, bool is_angle,
                int lag) {
+  const bool may_be_wrapped = is_angle && value.maxCoeff() - value.minCoeff() <= 2 * std::numbers::pi;
   Steps steps;
   for (Eigen::Index i = 0; i + 1 < value.size(); ++i) {
     const double dt = lengths[static_cast<std::size_t>(i)];
     if (i + lag < 0 || i + 1 + lag >= value.size() || std::isnan(dt)) continue;
     const double x = 0.5 * (rate[i + lag] + rate[i + 1 + lag]) * dt;
     double y = value[i + 1] - value[i];
-    if (is_angle) y = std::remainder(y, 2 * std::numbers::pi);
+    if (may_be_wrapped) y = std::remainder(y, 2 * std::numbers::pi);
     if (!std::isfinite(x) || !std::isfinite(y)) continue;
+    if (may_be_wrapped && std::abs(y) > 0.5 * std::numbers::pi) ++steps.n_turns;
+    steps.xxxx += x * x * x * x;
+    steps.changes += std::pow((rate[i + 1 + lag] - rate[i + lag]) * dt, 2);
     steps.xx += x * x;
     steps.yy += y * y;
     steps.xy += x * y;
@@ -332,7 +339,7 @@ std::string better_rate(const std::vector<double>& lengths, const Eigen::RowVect
                         bool is_angle) {
   constexpr double sure = 0.95;
   const Steps now = steps_of(lengths, value, rates[own], is_angle, 0);
-  if (now.n < 20) return "";
+  if (!now.tell()) return "";
   if (std::abs(now.correlation()) > sure) {
     const double slope = now.slope();
     return std::abs(slope - 1) < 0.3 ? "" : fmt::format("it is {:.3g} × what is measured: a unit or a sign, or the clock", slope);
@@ -346,7 +353,7 @@ std::string better_rate(const std::vector<double>& lengths, const Eigen::RowVect
   for (std::size_t other = 0; other < rates.size(); ++other) {
     if (other == own || rates[other].hasNaN()) continue;
     const Steps steps = steps_of(lengths, value, rates[other], is_angle, 0);
-    if (std::abs(steps.correlation()) > sure && std::abs(now.correlation()) < 0.5) {
+    if (steps.tell() && std::abs(steps.correlation()) > sure && std::abs(now.correlation()) < 0.5) {
       return fmt::format("it is measured by the column of {}: swapped?", names[other]);
     }
   }

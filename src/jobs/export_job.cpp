@@ -49,6 +49,9 @@ void require_options(const ExportRequest& request, const std::string& name) {
     }
     return;
   }
+  if (request.draws_within && !(*request.draws_within > 0)) {
+    throw InputError(fmt::format("`draws_within`: must be positive, got {}", *request.draws_within));
+  }
   if (!request.robot.empty()) throw InputError("`robot` goes with `to=mjcf` and `to=urdf`");
   if (request.to == Target::c) return;
   if (request.single_precision) {

@@ -123,15 +123,17 @@ std::string source_of(const FitRequest& request) {
   return fmt::format("{}", fmt::join(names, ", "));
 }
 
-std::vector<LogFile> logs_of(const FitRequest& request) {
-  std::vector<LogFile> logs;
+void take_logs(const FitRequest& request, FitFile& file, std::vector<std::string>& notes) {
   for (const Log& log : request.logs) {
-    if (log.table.file()) logs.push_back(*log.table.file());
+    if (!log.table.file()) continue;
+    if (file.has_learned(*log.table.file())) {
+      notes.push_back(fmt::format("warning: {} was learned from already: its rows count twice", log.table.name()));
+    }
+    file.logs.push_back(*log.table.file());
   }
   for (const SideInformation& one : request.also) {
-    if (one.log.table.file()) logs.push_back(*one.log.table.file());
+    if (one.log.table.file()) file.logs.push_back(*one.log.table.file());
   }
-  return logs;
 }
 
 constexpr int rows_of_stretch = 200;
@@ -172,7 +174,7 @@ FitJob job_of(FitRequest request, FitProblem problem) {
   job.file.prior_options = problem.prior_options;
   job.file.systems = problem.systems;
   job.file.data_source = source_of(request);
-  job.file.logs = logs_of(request);
+  take_logs(request, job.file, job.notes);
   job.file.model = std::move(request.model);
   job.problem = std::move(problem);
   return job;
@@ -439,11 +441,13 @@ FitOutcome run_once(const FitJob& job, const std::function<void(const Progress&)
     // a fit that has taken hours is not lost to what is said of it
     try {
       add_force_note(outcome.posterior, outcome.notes);
+      add_input_notes(outcome.posterior, outcome.notes);
       add_constraint_note(outcome.posterior, outcome.notes);
       add_window_note(outcome.posterior, outcome.notes);
       outcome.cross_validation = cross_validate(outcome.posterior, keeps_row_order(outcome.file, job.problem.observations));
       if (result.report.inducing) result.report.inducing->stretches = outcome.cross_validation->stretches;
       add_residual_notes(outcome.posterior, outcome.cross_validation->residuals, outcome.notes);
+      add_stretch_note(*outcome.cross_validation, outcome.notes);
       const std::string correlated = correlated_text(outcome.cross_validation->residuals);
       if (!correlated.empty()) outcome.notes.push_back(fmt::format("warning: {}: deviations are too small", correlated));
     } catch (const std::exception& error) {

@@ -2,15 +2,18 @@
 
 #include <algorithm>
 #include <cmath>
+#include <functional>
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
+#include "data/evenly.hpp"
 #include "inference/posterior_implementation.hpp"
 
 namespace gp2 {
 
 using Eigen::MatrixXd;
+using Eigen::VectorXd;
 
 void add_residual_notes(const Posterior& posterior, const std::vector<TrainingResidual>& residuals,
                         std::vector<std::string>& notes) {
@@ -30,6 +33,115 @@ void add_residual_notes(const Posterior& posterior, const std::vector<TrainingRe
         fmt::format("warning: values lie farther than noise from what all others predict: {}: the noise is stated too small, a "
                     "column is wrong or lags, or the constraints or features miss something; see gp2 check and gp2 report",
                     fmt::join(large, ", ")));
+  }
+}
+
+void add_stretch_note(const CrossValidation& cross_validation, std::vector<std::string>& notes) {
+  if (!cross_validation.predicts_little()) return;
+  notes.push_back(fmt::format(
+      "warning: of stretches of the log that it has not seen the fit says little: nrmse {:.2g}, of which the noise makes "
+      "{:.2g}. An input, a mass or a constraint is wrong or missing, or the rows are too few for what the model leaves "
+      "open",
+      cross_validation.stretches->nrmse, cross_validation.nrmse_of_noise));
+}
+
+namespace {
+
+// By which factor an input would act under which the data are most likely.
+struct InputFactor {
+  int input = -1;
+  double factor = 1, stddev = 0;
+  double gain = 0;  // in log likelihood
+};
+
+// What factors of the inputs change of the prior mean of observations (d × N).
+MatrixXd change_of_mean(const Posterior& posterior, const Observations& group, const VectorXd& factors) {
+  const Prior& prior = posterior.prior();
+  const StateLayout layout = prior.system->layout();
+  const View& view = group.view();
+  const VectorXd parameters = parameters_of(view, posterior.values().parameters);
+  const auto mechanics_of = [&](const MatrixXd& states) { return require_mechanics(prior, view, states, parameters); };
+  MatrixXd states = group.states();
+  const MechanicsBatch mechanics = mechanics_of(states);
+  const ViewValues viewed = evaluate_view(view, mechanics, states);
+  const MatrixXd as_logged = require_prior_values(prior, states, parameters, mechanics).mean;
+  states.middleRows(layout.u(0), layout.nu).array().colwise() *= factors.array();
+  const MatrixXd change = require_prior_values(prior, states, parameters, mechanics_of(states)).mean - as_logged;
+  MatrixXd of_view(view.size(), group.n_data());
+  for (int i = 0; i < group.n_data(); ++i) of_view.col(i) = viewed.G(i) * change.col(i);
+  return of_view;
+}
+
+Observations less(const Observations& group, const MatrixXd& values) {
+  const Observations out = group.with_values(group.values() - values);
+  if (!group.has_sums()) return out;
+  std::vector<WeightedSum> sums = group.sums();
+  for (WeightedSum& sum : sums) sum.value -= values.row(sum.row).segment(sum.first, sum.weights.size()).dot(sum.weights);
+  return out.with_sums(std::move(sums));
+}
+
+// The mean is affine in each factor, so that three values of the log likelihood tell where it is largest.
+// @param cost  negative log likelihood under factors of all inputs
+InputFactor likeliest_factor(const std::function<double(const VectorXd&)>& cost, VectorXd factors, int input) {
+  const auto at = [&](double factor) {
+    factors[input] = factor;
+    return cost(factors);
+  };
+  const double without = at(0), as_logged = at(1), twice = at(2), curvature = without - 2 * as_logged + twice;
+  if (!(curvature > 0)) return {};
+  const double factor = 1 - 0.5 * (twice - without) / curvature;
+  return {input, factor, 1 / std::sqrt(curvature), as_logged - at(factor)};
+}
+
+}  // namespace
+
+void add_input_notes(const Posterior& posterior, std::vector<std::string>& notes) {
+  constexpr int enough = 1500;                       // values: a sign or a unit needs no more
+  constexpr double far = 0.5, sure = 5, least = 10;  // from a factor of 1; deviations; nats
+  const Prior& prior = posterior.prior();
+  const System& system = *prior.system;
+  const StateLayout layout = system.layout();
+  const std::vector<Observations>& all = posterior.observations();
+  const auto any = [&](const auto& is) { return std::any_of(all.begin(), all.end(), is); };
+  if (prior.mean != Prior::Mean::force || prior.reference ||
+      any([](const auto& group) { return bool(group.view().other_system); }))
+    return;
+  const std::vector<bool> force = system.reads(SystemPart::force), elsewhere = system.reads(SystemPart::mechanics);
+  std::vector<int> in_mean;
+  for (int j = 0; j < layout.nu; ++j) {
+    const auto row = static_cast<std::size_t>(layout.u(j));
+    if (!force[row]) continue;
+    const double first = all.front().states()(layout.u(j), 0);
+    if (!any([&](const auto& group) { return (group.states().row(layout.u(j)).array() != first).any(); })) {
+      notes.push_back(fmt::format("the input {} is {:.4g} in every row: was it logged?",
+                                  system.inputs()[static_cast<std::size_t>(j)], first));
+    } else if (!elsewhere[row]) {
+      in_mean.push_back(j);
+    }
+  }
+  if (prior.is_nonlinear()) return;
+  const bool has_sums = any([](const auto& group) { return group.has_sums(); });
+  const std::vector<Observations> some = has_sums ? all : evenly(all, enough / system.nq());
+  const auto cost = [&](const VectorXd& factors) {
+    std::vector<Observations> moved;
+    for (const Observations& group : some) moved.push_back(less(group, change_of_mean(posterior, group, factors)));
+    return Posterior(prior, moved, posterior.values()).negative_log_likelihood();
+  };
+  // a wrong one makes others seem wrong: the most doubtful first, the others beside it as it should be
+  VectorXd factors = VectorXd::Ones(layout.nu);
+  while (!in_mean.empty()) {
+    InputFactor worst;
+    for (const int j : in_mean) {
+      const InputFactor one = likeliest_factor(cost, factors, j);
+      if (std::abs(one.factor - 1) > std::max(far, sure * one.stddev) && one.gain > std::max(least, worst.gain)) worst = one;
+    }
+    if (worst.input < 0) return;
+    factors[worst.input] = worst.factor;
+    std::erase(in_mean, worst.input);
+    notes.push_back(
+        fmt::format("warning: the data deny the input {}: they are most likely where it acts {:.2g} ± {:.2g} times as logged, "
+                    "by {:.2g} in log likelihood. A sign or a unit is wrong, or an inertia that it moves, or it acts late",
+                    system.inputs()[static_cast<std::size_t>(worst.input)], worst.factor, worst.stddev, worst.gain));
   }
 }
 
@@ -119,9 +231,7 @@ void add_window_note(const Posterior& posterior, std::vector<std::string>& notes
 void add_force_note(const Posterior& posterior, std::vector<std::string>& notes) {
   Prior prior = posterior.prior();
   const std::vector<Observations>& observations = posterior.observations();
-  const bool is_elsewhere =
-      std::any_of(observations.begin(), observations.end(), [](const auto& group) { return group.view().other_system; });
-  if (prior.mean != Prior::Mean::zero || prior.reference || is_elsewhere) return;
+  if (prior.mean != Prior::Mean::zero || prior.reference) return;
   const std::vector<bool> known = prior.reads(), force = prior.system->reads(SystemPart::force);
   const std::vector<std::string> names = prior.system->state_names();
   std::vector<std::string> unknown;
@@ -137,6 +247,7 @@ void add_force_note(const Posterior& posterior, std::vector<std::string>& notes)
   }
   bool is_zero = true;
   for (const Observations& group : observations) {
+    if (group.view().other_system) return;
     const MatrixXd F = prior.system->evaluate(group.states(), posterior.values().parameters).force;
     if (!F.allFinite()) return;
     is_zero = is_zero && F.isZero(0);

@@ -13,6 +13,12 @@ namespace gp2 {
 void add_residual_notes(const Posterior& posterior, const std::vector<TrainingResidual>& residuals,
                         std::vector<std::string>& notes);
 
+// Whether the fit says little of what it has not seen.
+void add_stretch_note(const CrossValidation& cross_validation, std::vector<std::string>& notes);
+
+// Inputs that never move, and inputs that act otherwise than the model says.
+void add_input_notes(const Posterior& posterior, std::vector<std::string>& notes);
+
 // Which residuals go on from row to row; empty where none do.
 std::string correlated_text(const std::vector<TrainingResidual>& residuals);
 

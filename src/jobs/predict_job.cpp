@@ -3,6 +3,7 @@
 #include <utility>
 
 #include <fmt/format.h>
+#include <fmt/ranges.h>
 
 #include "gp2/error.hpp"
 #include "gp2/inference/inverse_dynamics.hpp"
@@ -88,6 +89,35 @@ void add_distance(const Posterior& posterior, const View& view, const MatrixXd& 
       fmt::format("{} of {} states are far from the data, where deviations are too small as a rule: "
                   "distance_from_data is above {:.3g}, up to {:.3g}",
                   n_far, distance.size(), Posterior::far_from_data, distance.maxCoeff()));
+}
+
+// What the data tell little of has the deviation that the prior assumes, by sizes learned from what they do tell.
+void note_what_is_not_told(const Posterior& posterior, const View& view, const MatrixXd& states, PredictOutcome& out) {
+  constexpr std::size_t enough = 200;  // states
+  constexpr double little = 0.5, exact = 1e-9;
+  const auto distance = out.values.row(out.values.rows() - 1);
+  std::vector<Index> near;
+  for (Index i = 0; i < states.cols(); ++i) {
+    if (distance(i) <= Posterior::far_from_data) near.push_back(i);
+  }
+  if (near.empty()) return;
+  std::vector<Index> some;
+  for (std::size_t k = 0; k < std::min(enough, near.size()); ++k)
+    some.push_back(near[k * near.size() / std::min(enough, near.size())]);
+  const auto mean_variance = [&](const Posterior& one) -> Eigen::VectorXd {
+    return one.marginal(view, states(Eigen::all, some), /*n_threads=*/0).stddev().array().square().rowwise().mean();
+  };
+  const Eigen::VectorXd assumed = mean_variance(posterior.without_data()), left = mean_variance(posterior);
+  std::vector<std::string> names;
+  for (Index k = 0; k < assumed.size(); ++k) {
+    if (assumed[k] <= exact * exact * assumed.maxCoeff() || left[k] <= little * assumed[k]) continue;
+    names.push_back(fmt::format("{} ({:.0f} %)", out.names[static_cast<std::size_t>(k)], 100 * left[k] / assumed[k]));
+  }
+  if (names.empty()) return;
+  out.notes.push_back(
+      fmt::format("the data tell little of {}: so much is left of the variance that the prior assumes, by sizes learned from "
+                  "what they do tell, and deviations are no better than that assumption",
+                  fmt::join(names, ", ")));
 }
 
 Option columns_option(std::map<std::string, std::string>& columns) {
@@ -238,7 +268,9 @@ PredictOutcome predict(const FitFile& fit, CsvTable states, const PredictRequest
   PredictOutcome out{at.names, {}, std::move(log.notes)};
   at_states_of(name, [&] { predict_marginals(posterior, at.view, log.states, request.covariance, out); });
   if (request.n_samples) add_samples(posterior, at.view, log.states, *request.n_samples, request.seed, out);
-  if (!request.unconditioned) add_distance(posterior, at.view, log.states, out);
+  if (request.unconditioned) return out;
+  add_distance(posterior, at.view, log.states, out);
+  if (request.covariance != PredictRequest::Covariance::none) note_what_is_not_told(posterior, at.view, log.states, out);
   return out;
 }
 

@@ -53,8 +53,9 @@ void note_violation(const System& system, const MatrixXd& states, const VectorXd
   const auto violation = largest_violation(system, states, parameters);
   if (!violation || violation->relative <= constraint_violation_tolerance) return;
   notes.push_back(
-      fmt::format("warning: {}: states are off the constraint: '{}' is {:.3g} at data row {}, {:.1e} of its scale; see gp2 check",
-                  log.name(), violation->constraint, violation->value, violation->state + 1, violation->relative));
+      fmt::format("{}{}: states are off the constraint: '{}' is {:.3g} at data row {}, {:.1e} of its scale; see gp2 check",
+                  violation->relative > large_constraint_violation ? "warning: " : "", log.name(), violation->constraint,
+                  violation->value, violation->state + 1, violation->relative));
 }
 
 // The states, of the columns that a prior and a view need, and of those that only tell whether a state or a prediction is on the
@@ -268,13 +269,13 @@ MatrixXd all_accelerations(const System& system, LogReader& reader, const CsvTab
   return complete ? reader.measurements(every) : MatrixXd();
 }
 
-// accelerations that follow from others are no measurements
-void note_dependence(const LoggedSystem& logged, const MatrixXd& states, MatrixXd accelerations, std::size_t n_observed,
-                     const CsvTable& log, std::vector<std::string>& notes) {
+// accelerations that follow from others are no measurements; which of them count may change from row to row
+void note_dependence(const LoggedSystem& logged, const Readings& readings, const MatrixXd& accelerations, const CsvTable& log,
+                     std::vector<std::string>& notes) {
   if (accelerations.size() == 0) return;
   const std::vector<std::string> every = logged.system().acceleration_names();
-  const auto independent = dependent_columns(logged.system(), states, logged.parameters, accelerations);
-  if (!independent || n_observed <= independent->size()) return;
+  const auto independent = dependent_columns(logged.system(), readings.states, logged.parameters, accelerations);
+  if (!independent || (!readings.values.array().isNaN()).colwise().count().maxCoeff() <= std::ssize(*independent)) return;
   std::vector<std::string> names;
   for (int row : *independent) names.push_back(every[static_cast<std::size_t>(row)]);
   notes.push_back(
@@ -473,17 +474,17 @@ Observations read_log(const LoggedSystem& logged, const Log& log, const FitProbl
   const std::vector<std::string> observed = readings.view.names(system);
   readings.values = reader.measurements(observed);
   readings.stated_stddev = stated_noise(logged.model, observed, options, reader, log.table, notes);
-  MatrixXd all_values = all_accelerations(system, reader, log.table);
+  const MatrixXd all_values = all_accelerations(system, reader, log.table);
   const MatrixXd state_stddevs = options.project ? stated_state_deviations(system, reader, log.table) : MatrixXd();
   note_reading(reader, log.table, notes);
   if (options.project) project(system, logged.parameters, log.table, state_stddevs, readings.states, notes);
   note_violation(system, readings.states, logged.parameters, log.table, notes);
-  note_dependence(logged, readings.states, std::move(all_values), observed.size(), log.table, notes);
   note_repeats(readings, log.table, notes);
   note_rest(logged, readings, log.table, notes);
 
   const int n_rows = log.table.n_rows();
   std::vector<int> measured = measured_rows(readings, observed, log.table, notes);
+  note_dependence(logged, readings, all_values, log.table, notes);
   keep_known(commanded, log.table, measured, notes);
   const std::vector<int> rows = chosen_rows(measured, options.max_points.value_or(n_rows), options.seed);
   if (rows.size() < measured.size()) {

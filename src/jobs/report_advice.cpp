@@ -137,7 +137,7 @@ void constraint_advice(const Report& report, std::vector<Advice>& advice) {
   if (worst == nullptr) return;
   const ConstraintViolation& violation = *worst->violation;
   advice.push_back(
-      {violation.relative > 1e-2 ? Level::warning : Level::note,
+      {violation.relative > large_constraint_violation ? Level::warning : Level::note,
        fmt::format("States of the {} data are off the constraint. The farthest, row {} of {}: {} = {:.3g}, {:.2g} of "
                    "its scale.",
                    fmt::join(names, " and "), violation.state + 1, worst->name, violation.constraint, violation.value,
@@ -180,6 +180,15 @@ void residual_advice(const Report& report, std::vector<Advice>& advice) {
            "Until that is found nothing else on this page means much: look at the rows named, at units, signs and frames "
            "of the columns, and at the constants of the constraint."});
     }
+  }
+  if (report.cross_validation.predicts_little()) {
+    advice.push_back(
+        {Level::warning,
+         fmt::format("Of stretches of the training data that it has not seen the fit says little: nrmse {:.2g}, of which the "
+                     "noise makes {:.2g}.",
+                     report.cross_validation.stretches->nrmse, report.cross_validation.nrmse_of_noise),
+         "An input, a mass or a constraint is wrong or missing, or the rows are too few for what the model leaves open. "
+         "Residuals against time, each feature and each input show which."});
   }
   for (const TrainingResidual& one : report.cross_validation.residuals) {
     if (one.is_too_large()) {

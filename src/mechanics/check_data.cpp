@@ -345,9 +345,9 @@ std::vector<Finding> check_data(const System& system, const Ref<const MatrixXd>&
       std::any_of(system.parameters().begin(), system.parameters().end(), [](const auto& one) { return one.estimate; });
   std::vector<Finding> findings;
   if (const auto violation = largest_violation(system, states, parameters)) {
-    const Level level = violation->rms > 0.3                                   ? Level::error
-                        : violation->relative > constraint_violation_tolerance ? Level::warning
-                                                                               : Level::good;
+    const Level level = violation->rms > 0.3                               ? Level::error
+                        : violation->relative > large_constraint_violation ? Level::warning
+                                                                           : Level::good;
     findings.push_back({estimates ? std::min(level, Level::warning) : level,
                         fmt::format("data on the constraint: off by {:.2g} at most, {:.1e} of its scale ('{}', row {})",
                                     violation->value, violation->relative, violation->constraint, violation->state + 1)});
@@ -367,7 +367,9 @@ std::vector<Finding> check_data(const System& system, const Ref<const MatrixXd>&
     return names;
   };
   const auto rows = dependent_columns(system, states, parameters, accelerations);
-  if (rows && !stated.empty() && stated.size() <= rows->size()) {
+  // which of them a fit observes may change from row to row
+  const auto most_stated = [&] { return (!stddev(stated, Eigen::all).array().isNaN()).colwise().count().maxCoeff(); };
+  if (rows && !stated.empty() && most_stated() <= std::ssize(*rows)) {
     findings.push_back(
         {Level::good, fmt::format("dependent columns: the {} accelerations obey A ddq = b to rounding; a fit observes "
                                   "{}, whose deviations the log gives",

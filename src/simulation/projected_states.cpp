@@ -103,13 +103,14 @@ std::vector<Finding> check_states(const System& system, const Ref<const MatrixXd
   const MatrixXd residuals = system.residuals(states, parameters);
   if (residuals.hasNaN()) return {};
   using Level = Finding::Level;
+  const Level level = violation->relative > large_constraint_violation ? Level::warning : Level::good;
   std::vector<Finding> findings;
   for (Index k = 0; k < residuals.rows(); ++k) {
     const System::Residual& label = system.residual_labels()[static_cast<std::size_t>(k)];
     const SizeSummary size = summarise_sizes(residuals.row(k).cwiseAbs());
-    findings.push_back({Level::warning, fmt::format("off the {} constraint '{}' by {:.2g} in the median, {:.2g} at most (row {})",
-                                                    label.velocity ? "velocity" : "position", label.text, size.median,
-                                                    size.largest, size.at + 1)});
+    findings.push_back(
+        {level, fmt::format("off the {} constraint '{}' by {:.2g} in the median, {:.2g} at most (row {})",
+                            label.velocity ? "velocity" : "position", label.text, size.median, size.largest, size.at + 1)});
   }
   const ProjectedStates projected = project_states(system, parameters, states);
   const std::vector<std::string> names = system.state_names();

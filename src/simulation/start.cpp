@@ -1,5 +1,6 @@
 #include <algorithm>
 #include <iterator>
+#include <optional>
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
@@ -40,17 +41,27 @@ Eigen::VectorXd complete_start(const Model& model, const Eigen::VectorXd& parame
                     listed(names, start.state, open), system.name()));
     return start.state;
   }
-  Eigen::VectorXd state;
-  try {
-    state = project_onto_constraints(system, parameters, start.state, start.given);
-  } catch (const NumericalError& error) {
-    notes.push_back(fmt::format("`start`: what is given leaves no solution of the constraints ({})", error.what()));
+  std::optional<Eigen::VectorXd> state;
+  std::string why;
+  // where a constraint has no slope in what is open, as a circle at its highest point, Newton's method leaves another start
+  for (const double aside : {0.0, 1e-3, 1.0, -1.0}) {
+    Eigen::VectorXd from = start.state;
+    for (const int k : open) from[k] += k < system.nq() ? aside : 0;
+    try {
+      state = project_onto_constraints(system, parameters, from, start.given);
+      break;
+    } catch (const NumericalError& error) {
+      if (why.empty()) why = error.what();
+    }
+  }
+  if (!state) {
+    notes.push_back(fmt::format("`start`: what is given leaves no solution of the constraints ({})", why));
     return start.state;
   }
   std::vector<int> solved;
-  std::copy_if(open.begin(), open.end(), std::back_inserter(solved), [&](int k) { return state[k] != start.state[k]; });
-  if (!solved.empty()) notes.push_back(fmt::format("start: from the constraints {}", listed(names, state, solved)));
-  return state;
+  std::copy_if(open.begin(), open.end(), std::back_inserter(solved), [&](int k) { return (*state)[k] != start.state[k]; });
+  if (!solved.empty()) notes.push_back(fmt::format("start: from the constraints {}", listed(names, *state, solved)));
+  return *state;
 }
 
 }  // namespace gp2

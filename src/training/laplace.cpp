@@ -24,6 +24,21 @@ namespace {
 // of x in LaplaceUncertainty: its coordinate's unit, and 1 of logarithms
 double unit_of(const Hyperparameter& h) { return h.map().is_logarithm ? 1 : h.map().unit; }
 
+// Standard deviations, in shares of their boxes, where along directions of no curvature the box is all that is known.
+VectorXd shares_of_box(const Curvature& curvature, const std::vector<Hyperparameter>& hyperparameters) {
+  VectorXd unit_in_box = curvature.unit;
+  for (Index k = 0; k < unit_in_box.size(); ++k) {
+    const Hyperparameter& h = hyperparameters[static_cast<std::size_t>(curvature.free[static_cast<std::size_t>(k)])];
+    // bounds that are no more than limits are no box
+    if (h.positive || h.size == 0) unit_in_box[k] /= h.upper_coordinate() - h.lower_coordinate();
+  }
+  const VectorXd known = (curvature.eigenvalues.array() > curvature.zero).select(curvature.eigenvalues, 0);
+  MatrixXd information = curvature.eigenvectors * known.asDiagonal() * curvature.eigenvectors.transpose();
+  information.diagonal() += unit_in_box.array().square().matrix();
+  return unit_in_box.cwiseProduct(
+      information.ldlt().solve(MatrixXd::Identity(known.size(), known.size())).diagonal().cwiseSqrt());
+}
+
 }  // namespace
 
 LaplaceUncertainty laplace_uncertainty(const Curvature& curvature, const std::vector<Hyperparameter>& hyperparameters) {
@@ -41,7 +56,9 @@ LaplaceUncertainty laplace_uncertainty(const Curvature& curvature, const std::ve
   for (Index k = 0; k < n; ++k) {
     if (std::find(free.begin(), free.end(), k) == free.end()) out.held.push_back(static_cast<int>(k));
   }
-  const auto is_flat = [&](Index k) { return flat.row(k).squaredNorm() > 1e-4; };
+  // what moves along with another, and hardly before that has gone through its box, is known all the same
+  const VectorXd in_box = n_flat > 0 ? shares_of_box(curvature, hyperparameters) : VectorXd();
+  const auto is_flat = [&](Index k) { return flat.row(k).squaredNorm() > 1e-4 && !(in_box[k] < 1e-2); };
   for (Index k = 0; k < n_free; ++k) {
     const Index at = free[static_cast<std::size_t>(k)];
     const double to_unit = curvature.unit[k] * unit_of(hyperparameters[static_cast<std::size_t>(at)]);

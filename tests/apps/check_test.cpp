@@ -47,7 +47,7 @@ TEST(Check, WarnsOfStatesOffTheConstraint) {
   std::string csv = "q1,q2,q3,dq1,dq2,dq3,u1,u2,u3,ddq1,ddq2,ddq3\n";
   for (int i = 0; i < good.n_rows(); ++i) {
     for (int column = 0; column < good.n_columns(); ++column) {
-      const double lift = i == 3 && column == good.find("q3") ? 0.01 : 0;
+      const double lift = i == 3 && column == good.find("q3") ? 0.1 : 0;
       csv += column == 0 ? "" : ",";
       csv += shortest(good.number(i, column) + lift);
     }
@@ -55,12 +55,12 @@ TEST(Check, WarnsOfStatesOffTheConstraint) {
   }
   desk.write("log.csv", csv);
   const Outcome checked = desk.done("gp2 check models/surface.toml --data log.csv");
-  EXPECT_THAT(checked.out, testing::ContainsRegex("warning +data on the constraint: off by 0.01 .*row 4"));
+  EXPECT_THAT(checked.out, testing::ContainsRegex("warning +data on the constraint: off by 0.1 .*row 4"));
   desk.done("gp2 fit models/surface.toml --data good.csv --max-iterations 0 -o fit.json");
   for (const char* line : {"gp2 fit models/surface.toml --data log.csv --max-iterations 0 -o other.json",
                            "gp2 predict fit.json --states log.csv -o prediction.csv", "gp2 evaluate fit.json --data log.csv"}) {
     EXPECT_THAT(desk.done(line).err,
-                testing::ContainsRegex("warning: log.csv: states are off the constraint: .* -?0.01 at data row 4"));
+                testing::ContainsRegex("warning: log.csv: states are off the constraint: .* -?0.1 at data row 4"));
   }
 }
 

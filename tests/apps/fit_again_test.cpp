@@ -51,7 +51,11 @@ TEST_F(FitAgain, SaysWhichLogIsNotTheOneThatWasLearnedFrom) {
   EXPECT_THAT(desk.done(again + "--data train.csv --data copy.csv --data new.csv").err,
               HasSubstr("warning: new.csv is not a log that the fit was learned from"));
 
-  // an update knows what was learned, and what it adds
+  // a fit, of what it is given twice; an update, of what was learned and what it adds
+  EXPECT_THAT(desk.done("gp2 fit models/surface.toml --data more.csv --data copy.csv --max-iterations 0 -o two.json").err,
+              Not(HasSubstr("already")));
+  EXPECT_THAT(desk.done("gp2 fit models/surface.toml --data copy.csv --data copy.csv --max-iterations 0 -o two.json").err,
+              HasSubstr("warning: copy.csv was learned from already: its rows count twice"));
   EXPECT_THAT(desk.done("gp2 update fit.json --data new.csv -o more.json").err, Not(HasSubstr("already")));
   for (const std::string log : {"new.csv", "copy.csv"}) {
     EXPECT_THAT(desk.done("gp2 update more.json --data " + log + " -o twice.json").err,

@@ -9,6 +9,8 @@
 #include <gtest/gtest.h>
 
 #include "gp2/error.hpp"
+#include "gp2/jobs/check_job.hpp"
+#include "gp2/jobs/fit_job.hpp"
 #include "input_error.hpp"
 #include "smoothing/simulated_logs.hpp"
 #include "test_models.hpp"
@@ -23,6 +25,7 @@ using testing::Contains;
 using testing::Each;
 using testing::ElementsAre;
 using testing::HasSubstr;
+using testing::Not;
 
 const std::vector<std::array<double, 4>> two_starts = {{3.5, 3.6, 0, 0}, {3.0, 2.5, 1, -1}};
 
@@ -135,6 +138,13 @@ TEST(Derive, ConstraintsAmongMeasuredCoordinatesAreHeldAndMakeThemMoreExact) {
     const std::string name = system.acceleration_names()[static_cast<std::size_t>(j)] + "_std";
     for (const int row : {0, 100, 200}) EXPECT_EQ(table.is_empty(row, table.find(name)), !held.is_independent(j, row));
   }
+  // and nobody who learns from them is told to choose two
+  for (const Finding& finding : check(pendulum(), &table))
+    EXPECT_THAT(finding.text, Not(HasSubstr("are independent measurements")));
+  FitRequest request;
+  request.model = pendulum();
+  request.logs = {{table}};
+  EXPECT_THAT(prepare_fit(std::move(request)).problem.notes, Not(Contains(HasSubstr("to rounding"))));
 
   const VectorXd parameters = system.parameter_values();
   EXPECT_GT(test::largest(system.residuals(free.states, parameters)), 1e-6);

@@ -172,6 +172,19 @@ bool leave_out_coriolis(LogData& data, int) {
   return true;
 }
 
+// An input that the log's force reads, another one for each seed, times a factor.
+bool scale_input(LogData& data, int seed, double factor) {
+  const StateLayout layout = layout_of(data);
+  const std::vector<bool> read = data.model->system->reads(SystemPart::force);
+  std::vector<int> inputs;
+  for (int j = 0; j < layout.nu; ++j) {
+    if (read[static_cast<std::size_t>(layout.u(j))]) inputs.push_back(layout.u(j));
+  }
+  if (inputs.empty()) return false;
+  data.states.row(inputs[static_cast<std::size_t>(seed) % inputs.size()]) *= factor;
+  return true;
+}
+
 template <typename Row>
 void roll(Row&& row, int by) {
   const RowVectorXd before = row;
@@ -255,6 +268,8 @@ const std::vector<Fault>& faults() {
        true},
       {"wrong constraint constant", spoil_constraint_constant},
       {"missing Coriolis", leave_out_coriolis},
+      {"sign of an input", [](LogData& data, int seed) { return scale_input(data, seed, -1); }},
+      {"input in milli-units", [](LogData& data, int seed) { return scale_input(data, seed, 1000); }},
       {"stuck channel",
        [](LogData& data, int seed) {
          const int j = constrained_coordinate(data, seed);

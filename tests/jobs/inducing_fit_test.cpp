@@ -111,7 +111,9 @@ TEST(InducingFit, ItsCheckpointIsTheBestSoFarOfAllRows) {
   const FitFile last = FitFile::read(folder / "last.json");
   EXPECT_EQ(last.report.termination, FitReport::interrupted);
   EXPECT_EQ(last.n_states(), outcome.file.n_states());
-  EXPECT_EQ(last.report.objective, outcome.file.report.objective);
+  // of fits that are as good to half a nat the one through fewer points is taken
+  EXPECT_LE(last.report.objective, outcome.file.report.objective);
+  EXPECT_NEAR(last.report.objective, outcome.file.report.objective, 0.5);
   EXPECT_NEAR(last.posterior().negative_log_likelihood(), last.report.negative_log_likelihood, 1e-3);
 }
 

@@ -201,6 +201,126 @@ dy = [-2, 2]
               Contains(HasSubstr("warning: the known force of [mechanics] is not used, and no feature reads u1, u2, u3")));
 }
 
+// a puck on a bent sheet that is pushed and turned, with friction that a latent learns
+struct Driven {
+  Model model = Model::parse(R"toml(
+coordinates = ["x", "y", "z"]
+inputs = ["u", "w"]
+[mechanics]
+mass  = [["1", "0", "0"], ["0", "1", "0"], ["0", "0", "1"]]
+force = ["u - w*y", "w*x", "-9.81"]
+[constraints]
+position = ["z - 0.3*x - 0.1*x^2"]
+[noise]
+ddq = 0.05
+[[latent]]
+kernel     = "se"
+features   = ["dx", "dy", "dz"]
+directions = { force = [["-dx"], ["-dy"], ["-dz"]] }
+[truth]
+force = ["-0.5*dx - 0.2*dx*abs(dx)", "-0.5*dy - 0.2*dy*abs(dy)", "-0.5*dz"]
+[sampling]
+x  = [-1, 1]
+y  = [-1, 1]
+z  = "0.3*x + 0.1*x^2"
+dx = [-2, 2]
+dy = [-2, 2]
+dz = "0.3*dx + 0.2*x*dx"
+u  = [-3, 3]
+w  = [-3, 3]
+)toml",
+                             "driven.toml");
+
+  [[nodiscard]] Data data(std::uint64_t seed) const {
+    GeneratedData drawn = generate(model, GenerateOptions{60, seed, test::noise_of(model)});
+    return {&model, std::move(drawn.states), std::move(drawn.accelerations)};
+  }
+  [[nodiscard]] Eigen::Index row_of(int input) const { return model.system->layout().u(input); }
+};
+
+std::vector<std::string> notes_of(const std::vector<std::string>& notes, const std::string& about) {
+  std::vector<std::string> out;
+  std::copy_if(notes.begin(), notes.end(), std::back_inserter(out),
+               [&](const std::string& note) { return note.find(about) != std::string::npos; });
+  return out;
+}
+
+TEST(Residuals, TellOfAnInputThatActsOtherwiseThanLogged) {
+  const Driven driven;
+  constexpr const char* denied = "the data deny the input";
+  constexpr const char* little = "the fit says little";
+  for (const std::uint64_t seed : {31U, 32U}) {
+    Data data = driven.data(seed);
+    std::vector<std::string> notes = notes_of_fit(data);
+    EXPECT_THAT(notes, Not(Contains(HasSubstr("input"))));
+    EXPECT_THAT(notes, Not(Contains(HasSubstr(little))));
+    // a sign, a unit, and both of them, each with its factor and without the input that is right
+    data.states.row(driven.row_of(0)) *= -1;
+    EXPECT_THAT(notes_of(notes_of_fit(data), denied),
+                testing::ElementsAre(testing::AllOf(testing::StartsWith("warning: "), HasSubstr("input u: "),
+                                                    testing::ContainsRegex("acts -(1|0.9)"))));
+    data = driven.data(seed);
+    data.states.row(driven.row_of(1)) *= 1000;
+    EXPECT_THAT(notes_of(notes_of_fit(data), denied),
+                testing::ElementsAre(testing::AllOf(HasSubstr("input w: "), testing::ContainsRegex("acts 0.00(1|09)"))));
+    data.states.row(driven.row_of(0)) *= -1;
+    notes = notes_of_fit(data);
+    EXPECT_THAT(notes_of(notes, denied), testing::UnorderedElementsAre(HasSubstr("input u: "), HasSubstr("input w: ")));
+    EXPECT_THAT(notes, Contains(testing::AllOf(testing::StartsWith("warning: "), HasSubstr(little))));
+  }
+}
+
+TEST(Residuals, TellOfAnInputThatNeverMoves) {
+  const Driven driven;
+  Data data = driven.data(33);
+  data.states.row(driven.row_of(1)).setZero();
+  const std::vector<std::string> notes = notes_of_fit(data);
+  EXPECT_THAT(notes_of(notes, "the input "), testing::ElementsAre("the input w is 0 in every row: was it logged?"));
+  EXPECT_THAT(notes, Contains(HasSubstr("the fit says little")));
+}
+
+TEST(Residuals, OfAForceAcrossAConstraintThereAreNone) {
+  // each coordinate has a force of its own; the sheet is nearly level, so that the vertical one moves nothing
+  Driven driven;
+  std::string text = driven.model.text;
+  const std::size_t first = text.find("directions = {"), last = text.find('}', first);
+  text.replace(first, last + 1 - first, R"(directions = "force")");
+  driven.model = Model::parse(text, "driven.toml");
+  const Data data = driven.data(35);
+  FitRequest fit;
+  fit.model = driven.model;
+  fit.logs = {{data.table()}};
+  fit.problem.mean = Prior::Mean::force;
+  fit.restarts = 1;
+  const FitOutcome outcome = run_fit(prepare_fit(std::move(fit)));
+  PredictRequest request;
+  request.covariance = PredictRequest::Covariance::stddev;
+  EXPECT_THAT(predict(outcome.file, data.table(), request).notes, Not(Contains(HasSubstr("the data tell little"))));
+  request.view.quantity = View::Quantity::learned_force;
+  EXPECT_THAT(predict(outcome.file, data.table(), request).notes,
+              Contains(testing::AllOf(HasSubstr("the data tell little of force_z ("), Not(HasSubstr("force_y")))));
+  request.unconditioned = true;
+  EXPECT_THAT(predict(outcome.file, data.table(), request).notes, Not(Contains(HasSubstr("the data tell little"))));
+}
+
+TEST(Residuals, OfPureNoiseAreNotHeldAgainstTheModel) {
+  // noise that hides all the motion and is stated as such: nothing can be predicted, and nothing is wrong
+  Driven driven;
+  Data data = driven.data(34);
+  FitRequest request;
+  request.problem.noise_stddev = 50;
+  RandomStream random(34, 1);
+  for (double& one : data.accelerations.reshaped()) one += 50 * random.normal();
+  request.model = driven.model;
+  request.logs = {{data.table()}};
+  request.problem.mean = Prior::Mean::force;
+  request.restarts = 1;
+  const FitOutcome outcome = run_fit(prepare_fit(std::move(request)));
+  EXPECT_GT(outcome.cross_validation->stretches->nrmse, 0.8);
+  EXPECT_FALSE(outcome.cross_validation->predicts_little());
+  EXPECT_THAT(outcome.notes, Not(Contains(HasSubstr("input"))));
+}
+
 // a car whose axle is behind its centre of mass, driven such that it does not turn faster; its inertia is that of a coin
 TEST(Residuals, TellOfAConstraintThatSpinsWhatIsLight) {
   const auto car = [](const char* inertia) {

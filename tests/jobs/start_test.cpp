@@ -60,5 +60,30 @@ TEST(StartOfALog, IsTakenAsItIsWhereItIsOnTheConstraints) {
   EXPECT_EQ(job.start[0], 1.1 * std::sin(0.8));
 }
 
+TEST(StartOfALog, IsFoundWhereNewtonsMethodHasNoSlopeToBeginWith) {
+  // x² + y² = l² at y = 0 has none in y
+  const Model model = Model::parse(R"toml(
+coordinates = ["x", "y"]
+[parameters]
+l = 1.1
+[mechanics]
+mass  = [["1", "0"], ["0", "1"]]
+force = ["0", "-9.81"]
+[constraints]
+position = ["x^2 + y^2 - l^2"]
+)toml",
+                                   "circle.toml");
+  SimulateRequest request;
+  request.start = std::map<std::string, double>{{"x", 0.1}};
+  request.times = VectorXd::LinSpaced(2, 0, 0.1);
+  SimulateJob job = prepare_simulation(model, request);
+  EXPECT_EQ(job.start[0], 0.1);
+  EXPECT_NEAR(job.start[1], std::sqrt(1.21 - 0.01), 1e-14);
+  EXPECT_THAT(job.notes, Contains(HasSubstr("start: from the constraints y = 1.0954")));
+  request.start = std::map<std::string, double>{{"x", 1.2}};
+  job = prepare_simulation(model, request);
+  EXPECT_THAT(job.notes, Contains(HasSubstr("`start`: what is given leaves no solution of the constraints")));
+}
+
 }  // namespace
 }  // namespace gp2

@@ -10,6 +10,7 @@
 #include "gp2/error.hpp"
 #include "observations_testing.hpp"
 #include "test_models.hpp"
+#include "training/curvature.hpp"
 
 namespace gp2 {
 namespace {
@@ -152,6 +153,30 @@ TEST(LaplaceTest, ParametersThatEnterByTheirSumOnlyAreNamedUndetermined) {
   ASSERT_EQ(uncertainty.undetermined.cols(), 1);
   // p + 2 r stays as it is along (2, −1)
   EXPECT_NEAR(uncertainty.undetermined(0, 0) / uncertainty.undetermined(1, 0), -2, 1e-4);
+}
+
+// A direction of no curvature is one of a lengthscale, to rounding; a parameter that is known to a millionth has a part of it.
+TEST(LaplaceTest, WhatHardlyMovesAlongAnOpenDirectionIsKnown) {
+  std::vector<Hyperparameter> hyperparameters = {Hyperparameter::of(Kind::kernel, 0, 0),
+                                                 Hyperparameter::of(Kind::parameter, 0, 0)};
+  for (Hyperparameter& h : hyperparameters) h.value = 1, h.lower = 0.5, h.upper = 2;
+  const double part = 0.05;
+  Curvature curvature;
+  curvature.free = {0, 1};
+  curvature.gradient = VectorXd::Zero(2);
+  curvature.eigenvalues = Eigen::Vector2d(1e-12, 1);
+  curvature.eigenvectors = Eigen::Rotation2Dd(std::asin(part)).toRotationMatrix();
+  curvature.zero = 1e-7;
+  for (const double unit : {1e-6, 1.0}) {
+    curvature.unit = Eigen::Vector2d(1, unit);
+    const LaplaceUncertainty found = laplace_uncertainty(curvature, hyperparameters);
+    EXPECT_TRUE(std::isinf(found.stddev[0]));
+    if (unit == 1) {
+      EXPECT_TRUE(std::isinf(found.stddev[1]));
+    } else {
+      EXPECT_NEAR(found.stddev[1], 1.5 * unit * std::sqrt(1 - part * part), 1e-9 * unit);  // of a box of 1.5
+    }
+  }
 }
 
 TEST(LaplaceTest, IsTheSameForAnyNumberOfThreads) {

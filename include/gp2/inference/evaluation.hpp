@@ -104,8 +104,11 @@ struct CrossValidation {
   Evaluation::Part one_by_one;                // each from all others: between the data
   std::optional<Evaluation::Part> stretches;  // leave_out in n_stretches: what a motion elsewhere would meet
   std::vector<TrainingResidual> residuals;    // one for each row of each observation of ddq
+  double nrmse_of_noise = 0;                  // which the noise alone would give both scores
 
   [[nodiscard]] std::string text() const;
+  /// Whether half of the spread of stretches that were left out, or more, is neither predicted nor noise.
+  [[nodiscard]] bool predicts_little() const;
 };
 
 /// Costs a factorisation and an inverse, with a tenth of that for the stretches.

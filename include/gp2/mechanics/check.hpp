@@ -27,8 +27,10 @@ struct ConstraintViolation {
   std::string constraint;
 };
 
-/// States that are off the constraint by more than this fraction of its scale deserve a warning.
+/// By this fraction of its scale states may be off the constraint before that is told: more is noise, or the log's last digit.
 inline constexpr double constraint_violation_tolerance = 1e-6;
+/// From this on it deserves a warning.
+inline constexpr double large_constraint_violation = 1e-2;
 
 /// @returns nothing when the system has no such constraint, or the states lack what it reads.
 std::optional<ConstraintViolation> largest_violation(const System& system, const Eigen::Ref<const Eigen::MatrixXd>& states,
