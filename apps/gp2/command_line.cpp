@@ -116,11 +116,9 @@ class Parsing {
     for (const Option& option : command_.options) {
       if (added_.at(option.name)->count() == 0) continue;
       given.insert(option.name);
+      require_value(option);
       const auto text = texts_.find(option.name);
-      if (text == texts_.end()) continue;
-      // of a shell variable that is not set
-      if (text->second.empty()) throw UsageError{fmt::format("{}: expected {}, got ''", flag_of(option), option.sample)};
-      set_from_text(option, text->second);
+      if (text != texts_.end()) set_from_text(option, text->second);
     }
     if (given.contains("quiet")) be_quiet();
     take_streams(given);
@@ -128,6 +126,15 @@ class Parsing {
   }
 
  private:
+  // An empty one, as of a shell variable that is not set, would count as not given. Of a file to write that is told elsewhere.
+  void require_value(const Option& option) const {
+    const std::string flag = flag_of(option);
+    if (!flag.starts_with('-') || option.sample.empty() || option.name == "output") return;
+    for (const std::string& value : added_.at(option.name)->results()) {
+      if (value.empty()) throw UsageError{fmt::format("{}: expected a value such as {}, got ''", flag, option.sample)};
+    }
+  }
+
   // - is standard input or, of a file that is written, standard output; also in --data -@OTHER.toml and --also VIEW:-.
   void take_streams(const std::set<std::string>& given) const {
     int n_read = 0, n_written = 0;

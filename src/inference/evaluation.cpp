@@ -276,20 +276,28 @@ Evaluation::Part scores_of(const Posterior& posterior, const std::vector<LeaveOn
 
 // rms noise of the measured values of ddq over their spread, as scores_of has the error.
 double nrmse_of_noise(const Posterior& posterior) {
+  const std::vector<Observations>& observations = posterior.observations();
+  std::vector<MatrixXd> noise(observations.size());
+  for (std::size_t g = 0; g < noise.size(); ++g) {
+    const Observations& group = observations[g];
+    if (!group.view().is_of_ddq()) continue;
+    const VectorXd stddev = posterior.noise_stddev(g);
+    noise[g].resize(group.view().size(), group.n_data());
+    for (Index i = 0; i < group.n_data(); ++i) noise[g].col(i) = group.noise_at(stddev, i);
+    noise[g] = with_slip(posterior, group.view(), group.states(), std::move(noise[g]));
+  }
   double squares = 0, spreads = 0;
   for (const int row : observed_rows(posterior)) {
     double of_row = 0;
     int n = 0;
     for_each_observed(posterior, row, [&](std::size_t g, Index k) {
-      const Observations& group = posterior.observations()[g];
-      const VectorXd noise = posterior.noise_stddev(g);
-      for (Index i = 0; i < group.n_data(); ++i) {
-        if (std::isnan(group.values()(k, i))) continue;
-        of_row += std::pow(group.noise_at(noise, i)[k], 2);
+      for (Index i = 0; i < noise[g].cols(); ++i) {
+        if (std::isnan(observations[g].values()(k, i))) continue;
+        of_row += noise[g](k, i) * noise[g](k, i);
         ++n;
       }
     });
-    squares += of_row / n;
+    squares += of_row / std::max(1, n);
     spreads += std::pow(training_spread(posterior, row), 2);
   }
   return std::sqrt(squares / spreads);

@@ -313,16 +313,17 @@ std::vector<double> lengths_of_steps(const Eigen::RowVectorXd& t) {
 /// @param lag  rows by which the rate is late
 Steps steps_of(const std::vector<double>& lengths, const Eigen::RowVectorXd& value, const Eigen::RowVectorXd& rate, bool is_angle,
                int lag) {
-  const bool may_be_wrapped = is_angle && value.maxCoeff() - value.minCoeff() <= 2 * std::numbers::pi;
+  constexpr double turn = 2 * std::numbers::pi, noise = 0.5;
+  const bool may_be_wrapped = is_angle && value.maxCoeff() - value.minCoeff() <= turn + noise;
   Steps steps;
   for (Eigen::Index i = 0; i + 1 < value.size(); ++i) {
     const double dt = lengths[static_cast<std::size_t>(i)];
     if (i + lag < 0 || i + 1 + lag >= value.size() || std::isnan(dt)) continue;
     const double x = 0.5 * (rate[i + lag] + rate[i + 1 + lag]) * dt;
     double y = value[i + 1] - value[i];
-    if (may_be_wrapped) y = std::remainder(y, 2 * std::numbers::pi);
+    if (may_be_wrapped) y = std::remainder(y, turn);
     if (!std::isfinite(x) || !std::isfinite(y)) continue;
-    if (may_be_wrapped && std::abs(y) > 0.5 * std::numbers::pi) ++steps.n_turns;
+    if (may_be_wrapped && std::abs(y) > turn / 4) ++steps.n_turns;
     steps.xxxx += x * x * x * x;
     steps.changes += std::pow((rate[i + 1 + lag] - rate[i + lag]) * dt, 2);
     steps.xx += x * x;

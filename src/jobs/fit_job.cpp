@@ -441,13 +441,13 @@ FitOutcome run_once(const FitJob& job, const std::function<void(const Progress&)
     // a fit that has taken hours is not lost to what is said of it
     try {
       add_force_note(outcome.posterior, outcome.notes);
-      add_input_notes(outcome.posterior, outcome.notes);
       add_constraint_note(outcome.posterior, outcome.notes);
       add_window_note(outcome.posterior, outcome.notes);
       outcome.cross_validation = cross_validate(outcome.posterior, keeps_row_order(outcome.file, job.problem.observations));
       if (result.report.inducing) result.report.inducing->stretches = outcome.cross_validation->stretches;
       add_residual_notes(outcome.posterior, outcome.cross_validation->residuals, outcome.notes);
       add_stretch_note(*outcome.cross_validation, outcome.notes);
+      add_input_notes(outcome.posterior, outcome.notes);
       const std::string correlated = correlated_text(outcome.cross_validation->residuals);
       if (!correlated.empty()) outcome.notes.push_back(fmt::format("warning: {}: deviations are too small", correlated));
     } catch (const std::exception& error) {

@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <functional>
+#include <optional>
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
@@ -39,37 +40,49 @@ void add_residual_notes(const Posterior& posterior, const std::vector<TrainingRe
 void add_stretch_note(const CrossValidation& cross_validation, std::vector<std::string>& notes) {
   if (!cross_validation.predicts_little()) return;
   notes.push_back(fmt::format(
-      "warning: of stretches of the log that it has not seen the fit says little: nrmse {:.2g}, of which the noise makes "
-      "{:.2g}. An input, a mass or a constraint is wrong or missing, or the rows are too few for what the model leaves "
-      "open",
-      cross_validation.stretches->nrmse, cross_validation.nrmse_of_noise));
+      "{}of stretches of the log that it has not seen the fit says little: nrmse {:.2g}, of which the noise makes {:.2g}. An "
+      "input, a mass or a constraint is wrong or missing, or the rows are too few for what the model leaves open",
+      cross_validation.predicts_nothing() ? "warning: " : "", cross_validation.stretches->nrmse,
+      cross_validation.nrmse_of_noise));
 }
 
 namespace {
 
-// By which factor an input would act under which the data are most likely.
+// By which factor what an input does would have to be larger for the data to be most likely.
 struct InputFactor {
   int input = -1;
   double factor = 1, stddev = 0;
   double gain = 0;  // in log likelihood
 };
 
-// What factors of the inputs change of the prior mean of observations (d × N).
-MatrixXd change_of_mean(const Posterior& posterior, const Observations& group, const VectorXd& factors) {
+// The prior mean of observations, or where an input is 0 (d × N); nothing where that is no number.
+std::optional<MatrixXd> mean_of(const Posterior& posterior, const Observations& group, std::optional<int> without = {}) {
   const Prior& prior = posterior.prior();
-  const StateLayout layout = prior.system->layout();
   const View& view = group.view();
+  MatrixXd states = group.states(), of_view(view.size(), group.n_data());
+  if (without) states.row(*without).setZero();
   const VectorXd parameters = parameters_of(view, posterior.values().parameters);
-  const auto mechanics_of = [&](const MatrixXd& states) { return require_mechanics(prior, view, states, parameters); };
-  MatrixXd states = group.states();
-  const MechanicsBatch mechanics = mechanics_of(states);
+  MechanicsBatch mechanics;
+  evaluate_mechanics(prior, view, states, parameters, mechanics);
+  if (mechanics.fault) return std::nullopt;
+  PriorValues values = evaluate_prior(prior, states, parameters, mechanics);
+  if (values.fault) return std::nullopt;
+  keep_viewed(view, values);
   const ViewValues viewed = evaluate_view(view, mechanics, states);
-  const MatrixXd as_logged = require_prior_values(prior, states, parameters, mechanics).mean;
-  states.middleRows(layout.u(0), layout.nu).array().colwise() *= factors.array();
-  const MatrixXd change = require_prior_values(prior, states, parameters, mechanics_of(states)).mean - as_logged;
-  MatrixXd of_view(view.size(), group.n_data());
-  for (int i = 0; i < group.n_data(); ++i) of_view.col(i) = viewed.G(i) * change.col(i);
+  for (int i = 0; i < group.n_data(); ++i) of_view.col(i) = viewed.G(i) * values.mean.col(i);
   return of_view;
+}
+
+// What an input adds to the prior mean of observations; nothing where that is no number without it.
+std::optional<std::vector<MatrixXd>> effect_of(const Posterior& posterior, const std::vector<Observations>& observations,
+                                               int row) {
+  std::vector<MatrixXd> effect;
+  for (const Observations& group : observations) {
+    std::optional<MatrixXd> as_logged = mean_of(posterior, group), without = mean_of(posterior, group, row);
+    if (!as_logged || !without) return std::nullopt;
+    effect.emplace_back(*as_logged - *without);
+  }
+  return effect;
 }
 
 Observations less(const Observations& group, const MatrixXd& values) {
@@ -80,68 +93,80 @@ Observations less(const Observations& group, const MatrixXd& values) {
   return out.with_sums(std::move(sums));
 }
 
-// The mean is affine in each factor, so that three values of the log likelihood tell where it is largest.
-// @param cost  negative log likelihood under factors of all inputs
-InputFactor likeliest_factor(const std::function<double(const VectorXd&)>& cost, VectorXd factors, int input) {
-  const auto at = [&](double factor) {
-    factors[input] = factor;
-    return cost(factors);
-  };
-  const double without = at(0), as_logged = at(1), twice = at(2), curvature = without - 2 * as_logged + twice;
+// Three values of the log likelihood, which is quadratic in the factor of an effect, tell where it is largest.
+// @param cost  negative log likelihood where what the input does is so much larger
+InputFactor likeliest_factor(const std::function<double(double)>& cost, int input) {
+  const double without = cost(0), as_logged = cost(1), twice = cost(2), curvature = without - 2 * as_logged + twice;
   if (!(curvature > 0)) return {};
-  const double factor = 1 - 0.5 * (twice - without) / curvature;
-  return {input, factor, 1 / std::sqrt(curvature), as_logged - at(factor)};
+  const double step = -0.5 * (twice - without) / curvature;
+  return {input, 1 + step, 1 / std::sqrt(curvature), 0.5 * curvature * step * step};
 }
 
 }  // namespace
 
 void add_input_notes(const Posterior& posterior, std::vector<std::string>& notes) {
-  constexpr int enough = 1500;                       // values: a sign or a unit needs no more
+  constexpr int enough = 1500, fewest = 10;          // values: a sign or a unit needs no more; states
   constexpr double far = 0.5, sure = 5, least = 10;  // from a factor of 1; deviations; nats
   const Prior& prior = posterior.prior();
   const System& system = *prior.system;
   const StateLayout layout = system.layout();
   const std::vector<Observations>& all = posterior.observations();
   const auto any = [&](const auto& is) { return std::any_of(all.begin(), all.end(), is); };
-  if (prior.mean != Prior::Mean::force || prior.reference ||
+  if (prior.mean != Prior::Mean::force || prior.reference || n_states(all) < fewest ||
       any([](const auto& group) { return bool(group.view().other_system); }))
     return;
   const std::vector<bool> force = system.reads(SystemPart::force), elsewhere = system.reads(SystemPart::mechanics);
+  // a latent that reads an input takes up what it does otherwise
+  const auto is_learned = [&](int row) {
+    return std::any_of(prior.latents.begin(), prior.latents.end(), [&](const Latent& one) { return one.features->reads(row); });
+  };
+  const auto name_of = [&](int j) { return system.inputs()[static_cast<std::size_t>(j)]; };
   std::vector<int> in_mean;
   for (int j = 0; j < layout.nu; ++j) {
     const auto row = static_cast<std::size_t>(layout.u(j));
     if (!force[row]) continue;
     const double first = all.front().states()(layout.u(j), 0);
     if (!any([&](const auto& group) { return (group.states().row(layout.u(j)).array() != first).any(); })) {
-      notes.push_back(fmt::format("the input {} is {:.4g} in every row: was it logged?",
-                                  system.inputs()[static_cast<std::size_t>(j)], first));
-    } else if (!elsewhere[row]) {
+      notes.push_back(fmt::format("the input {} is {:.4g} in every row: was it logged?", name_of(j), first));
+    } else if (!elsewhere[row] && !is_learned(layout.u(j))) {
       in_mean.push_back(j);
     }
   }
-  if (prior.is_nonlinear()) return;
   const bool has_sums = any([](const auto& group) { return group.has_sums(); });
-  const std::vector<Observations> some = has_sums ? all : evenly(all, enough / system.nq());
-  const auto cost = [&](const VectorXd& factors) {
+  if (prior.is_nonlinear() || in_mean.empty() || (has_sums && n_states(all) * system.nq() > 2 * enough)) return;
+  std::vector<Observations> some = has_sums ? all : evenly(all, enough / system.nq());
+  std::vector<std::vector<MatrixXd>> effects;
+  std::erase_if(in_mean, [&](int j) {
+    std::optional<std::vector<MatrixXd>> effect = effect_of(posterior, some, layout.u(j));
+    if (effect) effects.push_back(*std::move(effect));
+    return !effect;
+  });
+  const auto with = [&](std::size_t k, double factor) {
     std::vector<Observations> moved;
-    for (const Observations& group : some) moved.push_back(less(group, change_of_mean(posterior, group, factors)));
-    return Posterior(prior, moved, posterior.values()).negative_log_likelihood();
+    for (std::size_t g = 0; g < some.size(); ++g) moved.push_back(less(some[g], (factor - 1) * effects[k][g]));
+    return moved;
   };
   // a wrong one makes others seem wrong: the most doubtful first, the others beside it as it should be
-  VectorXd factors = VectorXd::Ones(layout.nu);
   while (!in_mean.empty()) {
     InputFactor worst;
-    for (const int j : in_mean) {
-      const InputFactor one = likeliest_factor(cost, factors, j);
-      if (std::abs(one.factor - 1) > std::max(far, sure * one.stddev) && one.gain > std::max(least, worst.gain)) worst = one;
+    std::size_t at = 0;
+    for (std::size_t k = 0; k < in_mean.size(); ++k) {
+      const auto cost = [&](double factor) {
+        return Posterior(prior, with(k, factor), posterior.values()).negative_log_likelihood();
+      };
+      const InputFactor one = likeliest_factor(cost, in_mean[k]);
+      if (!(std::abs(one.factor - 1) > std::max(far, sure * one.stddev) && one.gain > std::max(least, worst.gain))) continue;
+      worst = one;
+      at = k;
     }
     if (worst.input < 0) return;
-    factors[worst.input] = worst.factor;
-    std::erase(in_mean, worst.input);
+    some = with(at, worst.factor);
+    in_mean.erase(in_mean.begin() + static_cast<std::ptrdiff_t>(at));
+    effects.erase(effects.begin() + static_cast<std::ptrdiff_t>(at));
     notes.push_back(
         fmt::format("warning: the data deny the input {}: they are most likely where it acts {:.2g} ± {:.2g} times as logged, "
                     "by {:.2g} in log likelihood. A sign or a unit is wrong, or an inertia that it moves, or it acts late",
-                    system.inputs()[static_cast<std::size_t>(worst.input)], worst.factor, worst.stddev, worst.gain));
+                    name_of(worst.input), worst.factor, worst.stddev, worst.gain));
   }
 }
 

@@ -104,10 +104,10 @@ void note_what_is_not_told(const Posterior& posterior, const View& view, const M
   std::vector<Index> some;
   for (std::size_t k = 0; k < std::min(enough, near.size()); ++k)
     some.push_back(near[k * near.size() / std::min(enough, near.size())]);
-  const auto mean_variance = [&](const Posterior& one) -> Eigen::VectorXd {
-    return one.marginal(view, states(Eigen::all, some), /*n_threads=*/0).stddev().array().square().rowwise().mean();
-  };
-  const Eigen::VectorXd assumed = mean_variance(posterior.without_data()), left = mean_variance(posterior);
+  const auto mean_variance = [](const MatrixXd& stddev) -> Eigen::VectorXd { return stddev.array().square().rowwise().mean(); };
+  const Eigen::VectorXd left = mean_variance(out.values.middleRows(view.size(), view.size())(Eigen::all, some)),
+                        assumed = mean_variance(
+                            posterior.without_data().marginal(view, states(Eigen::all, some), /*n_threads=*/0).stddev());
   std::vector<std::string> names;
   for (Index k = 0; k < assumed.size(); ++k) {
     if (assumed[k] <= exact * exact * assumed.maxCoeff() || left[k] <= little * assumed[k]) continue;

@@ -183,7 +183,7 @@ void residual_advice(const Report& report, std::vector<Advice>& advice) {
   }
   if (report.cross_validation.predicts_little()) {
     advice.push_back(
-        {Level::warning,
+        {report.cross_validation.predicts_nothing() ? Level::warning : Level::note,
          fmt::format("Of stretches of the training data that it has not seen the fit says little: nrmse {:.2g}, of which the "
                      "noise makes {:.2g}.",
                      report.cross_validation.stretches->nrmse, report.cross_validation.nrmse_of_noise),

@@ -1,4 +1,5 @@
 #include <algorithm>
+#include <functional>
 #include <iterator>
 #include <optional>
 
@@ -43,16 +44,22 @@ Eigen::VectorXd complete_start(const Model& model, const Eigen::VectorXd& parame
   }
   std::optional<Eigen::VectorXd> state;
   std::string why;
-  // where a constraint has no slope in what is open, as a circle at its highest point, Newton's method leaves another start
-  for (const double aside : {0.0, 1e-3, 1.0, -1.0}) {
+  const auto try_from = [&](double aside) {
     Eigen::VectorXd from = start.state;
     for (const int k : open) from[k] += k < system.nq() ? aside : 0;
     try {
-      state = project_onto_constraints(system, parameters, from, start.given);
-      break;
+      const Eigen::VectorXd found = project_onto_constraints(system, parameters, from, start.given);
+      if (!state || (found - start.state).norm() < (*state - start.state).norm()) state = found;
     } catch (const NumericalError& error) {
       if (why.empty()) why = error.what();
     }
+  };
+  try_from(0);
+  // where a constraint has no slope in what is open, as a circle at its highest point, Newton's method leaves other starts
+  const bool is_of_velocities =
+      std::any_of(start.given.begin() + system.nq(), start.given.begin() + 2 * system.nq(), std::identity());
+  if (!state && !is_of_velocities) {
+    for (const double aside : {0.3, 1.0, -1.0}) try_from(aside);
   }
   if (!state) {
     notes.push_back(fmt::format("`start`: what is given leaves no solution of the constraints ({})", why));

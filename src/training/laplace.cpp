@@ -24,19 +24,25 @@ namespace {
 // of x in LaplaceUncertainty: its coordinate's unit, and 1 of logarithms
 double unit_of(const Hyperparameter& h) { return h.map().is_logarithm ? 1 : h.map().unit; }
 
-// Standard deviations, in shares of their boxes, where along directions of no curvature the box is all that is known.
-VectorXd shares_of_box(const Curvature& curvature, const std::vector<Hyperparameter>& hyperparameters) {
-  VectorXd unit_in_box = curvature.unit;
-  for (Index k = 0; k < unit_in_box.size(); ++k) {
+constexpr double wider = 1e6;
+
+// Widths of the boxes in units of Curvature; bounds that are no more than limits are no box. Those of parameters are taken as wider:
+// where two of them are known only together, the box of one says nothing of the other.
+VectorXd boxes_of(const Curvature& curvature, const std::vector<Hyperparameter>& hyperparameters) {
+  VectorXd width = curvature.unit.cwiseInverse();
+  for (Index k = 0; k < width.size(); ++k) {
     const Hyperparameter& h = hyperparameters[static_cast<std::size_t>(curvature.free[static_cast<std::size_t>(k)])];
-    // bounds that are no more than limits are no box
-    if (h.positive || h.size == 0) unit_in_box[k] /= h.upper_coordinate() - h.lower_coordinate();
+    if (h.positive || h.size == 0) width[k] *= h.upper_coordinate() - h.lower_coordinate();
+    if (h.is_system_parameter()) width[k] *= wider;
   }
-  const VectorXd known = (curvature.eigenvalues.array() > curvature.zero).select(curvature.eigenvalues, 0);
-  MatrixXd information = curvature.eigenvectors * known.asDiagonal() * curvature.eigenvectors.transpose();
-  information.diagonal() += unit_in_box.array().square().matrix();
-  return unit_in_box.cwiseProduct(
-      information.ldlt().solve(MatrixXd::Identity(known.size(), known.size())).diagonal().cwiseSqrt());
+  return width;
+}
+
+// Variances that directions of no curvature, F (n × n_flat), add where boxes are all that is known along them: F (FᵀB⁻²F)⁻¹Fᵀ.
+VectorXd variances_within(const VectorXd& boxes, const MatrixXd& flat) {
+  const MatrixXd in_boxes = boxes.cwiseInverse().asDiagonal() * flat;
+  const MatrixXd root = MatrixXd(in_boxes.transpose() * in_boxes).llt().matrixL().solve(MatrixXd(flat.transpose()));
+  return root.colwise().squaredNorm();
 }
 
 }  // namespace
@@ -56,13 +62,20 @@ LaplaceUncertainty laplace_uncertainty(const Curvature& curvature, const std::ve
   for (Index k = 0; k < n; ++k) {
     if (std::find(free.begin(), free.end(), k) == free.end()) out.held.push_back(static_cast<int>(k));
   }
-  // what moves along with another, and hardly before that has gone through its box, is known all the same
-  const VectorXd in_box = n_flat > 0 ? shares_of_box(curvature, hyperparameters) : VectorXd();
-  const auto is_flat = [&](Index k) { return flat.row(k).squaredNorm() > 1e-4 && !(in_box[k] < 1e-2); };
+  // a parameter that moves by a small part of its box before others, as a lengthscale that runs away, have gone through theirs is known
+  constexpr double part = 1e-2;
+  const VectorXd boxes = boxes_of(curvature, hyperparameters);
+  VectorXd within = covariance.diagonal();
+  if (n_flat > 0) within += variances_within(boxes, flat);
+  within = within.cwiseSqrt();
+  const auto is_flat = [&](Index k) {
+    const bool is_parameter = hyperparameters[static_cast<std::size_t>(free[static_cast<std::size_t>(k)])].is_system_parameter();
+    return flat.row(k).squaredNorm() > 1e-4 && !(is_parameter && within[k] * wider < part * boxes[k]);
+  };
   for (Index k = 0; k < n_free; ++k) {
     const Index at = free[static_cast<std::size_t>(k)];
     const double to_unit = curvature.unit[k] * unit_of(hyperparameters[static_cast<std::size_t>(at)]);
-    out.stddev[at] = is_flat(k) ? infinity : to_unit * std::sqrt(covariance(k, k));
+    out.stddev[at] = is_flat(k) ? infinity : to_unit * within[k];
     out.undetermined.row(at) = to_unit * flat.row(k);
     for (Index l = 0; l < k; ++l) {
       const Index other = free[static_cast<std::size_t>(l)];

@@ -172,13 +172,16 @@ bool leave_out_coriolis(LogData& data, int) {
   return true;
 }
 
-// An input that the log's force reads, another one for each seed, times a factor.
+// An input that the log's force reads and no latent, which would take it up; another one for each seed, times a factor.
 bool scale_input(LogData& data, int seed, double factor) {
   const StateLayout layout = layout_of(data);
   const std::vector<bool> read = data.model->system->reads(SystemPart::force);
   std::vector<int> inputs;
+  const std::vector<Latent> latents = make_prior(*data.model).latents;
   for (int j = 0; j < layout.nu; ++j) {
-    if (read[static_cast<std::size_t>(layout.u(j))]) inputs.push_back(layout.u(j));
+    const bool is_learned =
+        std::any_of(latents.begin(), latents.end(), [&](const Latent& one) { return one.features->reads(layout.u(j)); });
+    if (read[static_cast<std::size_t>(layout.u(j))] && !is_learned) inputs.push_back(layout.u(j));
   }
   if (inputs.empty()) return false;
   data.states.row(inputs[static_cast<std::size_t>(seed) % inputs.size()]) *= factor;

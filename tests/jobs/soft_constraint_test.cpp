@@ -73,6 +73,8 @@ TEST(SoftConstraint, IsTakenForNoiseInsteadOfForcesAndHeldInPredictions) {
   const FitOutcome hard = fit(test::model("models/unicycle.toml"), log);
   EXPECT_THAT(hard.notes, Contains(HasSubstr("measured ddq on A ddq = b")));
 
+  // the slip is as good as noise
+  EXPECT_GT(soft.cross_validation->nrmse_of_noise, 5 * hard.cross_validation->nrmse_of_noise);
   const MatrixXd states = slipping_log(200, 7).states;
   const View view = View::constrained_acceleration(*slipping_unicycle().system);
   const MatrixXd truth = true_acceleration(slipping_unicycle(), states);

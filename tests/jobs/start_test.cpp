@@ -80,6 +80,11 @@ position = ["x^2 + y^2 - l^2"]
   EXPECT_EQ(job.start[0], 0.1);
   EXPECT_NEAR(job.start[1], std::sqrt(1.21 - 0.01), 1e-14);
   EXPECT_THAT(job.notes, Contains(HasSubstr("start: from the constraints y = 1.0954")));
+  // nor has cos(a) at a = 0, from where it is not far
+  request.start = std::map<std::string, double>{{"y", 0.3}};
+  job = prepare_simulation(wire_pendulum(""), request);
+  EXPECT_NEAR(std::cos(job.start[2]), -0.3 / 1.1, 1e-14);
+  EXPECT_LE(std::abs(job.start[2]), 3.2);
   request.start = std::map<std::string, double>{{"x", 1.2}};
   job = prepare_simulation(model, request);
   EXPECT_THAT(job.notes, Contains(HasSubstr("`start`: what is given leaves no solution of the constraints")));

@@ -109,6 +109,8 @@ struct CrossValidation {
   [[nodiscard]] std::string text() const;
   /// Whether half of the spread of stretches that were left out, or more, is neither predicted nor noise.
   [[nodiscard]] bool predicts_little() const;
+  /// Whether their mean would be the better prediction.
+  [[nodiscard]] bool predicts_nothing() const { return stretches && stretches->nrmse >= 1; }
 };
 
 /// Costs a factorisation and an inverse, with a tenth of that for the stretches.
