@@ -2,7 +2,6 @@
 
 #include <algorithm>
 #include <cmath>
-#include <functional>
 #include <optional>
 
 #include <fmt/format.h>
@@ -48,13 +47,6 @@ void add_stretch_note(const CrossValidation& cross_validation, std::vector<std::
 
 namespace {
 
-// By which factor what an input does would have to be larger for the data to be most likely.
-struct InputFactor {
-  int input = -1;
-  double factor = 1, stddev = 0;
-  double gain = 0;  // in log likelihood
-};
-
 // The prior mean of observations, or where an input is 0 (d × N); nothing where that is no number.
 std::optional<MatrixXd> mean_of(const Posterior& posterior, const Observations& group, std::optional<int> without = {}) {
   const Prior& prior = posterior.prior();
@@ -73,14 +65,20 @@ std::optional<MatrixXd> mean_of(const Posterior& posterior, const Observations& 
   return of_view;
 }
 
-// What an input adds to the prior mean of observations; nothing where that is no number without it.
-std::optional<std::vector<MatrixXd>> effect_of(const Posterior& posterior, const std::vector<Observations>& observations,
-                                               int row) {
-  std::vector<MatrixXd> effect;
+// What an input adds to the prior mean of each of some observations.
+struct InputEffect {
+  std::string name;
+  std::vector<MatrixXd> added;  // (d × N)
+};
+
+// @returns nothing where there is no number without the input
+std::optional<InputEffect> effect_of(const Posterior& posterior, const std::vector<Observations>& observations, int input) {
+  const System& system = *posterior.prior().system;
+  InputEffect effect{system.inputs()[static_cast<std::size_t>(input)], {}};
   for (const Observations& group : observations) {
-    std::optional<MatrixXd> as_logged = mean_of(posterior, group), without = mean_of(posterior, group, row);
+    const auto as_logged = mean_of(posterior, group), without = mean_of(posterior, group, system.layout().u(input));
     if (!as_logged || !without) return std::nullopt;
-    effect.emplace_back(*as_logged - *without);
+    effect.added.emplace_back(*as_logged - *without);
   }
   return effect;
 }
@@ -93,20 +91,59 @@ Observations less(const Observations& group, const MatrixXd& values) {
   return out.with_sums(std::move(sums));
 }
 
-// Three values of the log likelihood, which is quadratic in the factor of an effect, tell where it is largest.
-// @param cost  negative log likelihood where what the input does is so much larger
-InputFactor likeliest_factor(const std::function<double(double)>& cost, int input) {
-  const double without = cost(0), as_logged = cost(1), twice = cost(2), curvature = without - 2 * as_logged + twice;
+// What is left to explain where an input does `factor` times as much.
+std::vector<Observations> with_factor(const std::vector<Observations>& observations, const InputEffect& effect, double factor) {
+  std::vector<Observations> out;
+  for (std::size_t g = 0; g < observations.size(); ++g) out.push_back(less(observations[g], (factor - 1) * effect.added[g]));
+  return out;
+}
+
+// By which factor an input would have to do more for the data to be most likely.
+struct InputFactor {
+  double factor = 1, stddev = 0;
+  double gain = 0;  // in log likelihood
+};
+
+// The log likelihood is quadratic in the factor: three values tell where it is largest.
+InputFactor likeliest_factor(double cost_without, double cost_as_logged, double cost_twice) {
+  const double curvature = cost_without - 2 * cost_as_logged + cost_twice;
   if (!(curvature > 0)) return {};
-  const double step = -0.5 * (twice - without) / curvature;
-  return {input, 1 + step, 1 / std::sqrt(curvature), 0.5 * curvature * step * step};
+  const double step = 0.5 * (cost_without - cost_twice) / curvature;
+  return {1 + step, 1 / std::sqrt(curvature), 0.5 * curvature * step * step};
+}
+
+// A wrong one makes others seem wrong: the most doubtful first, the others beside it as it should be.
+void note_denied_inputs(const Posterior& posterior, std::vector<Observations> observations, std::vector<InputEffect> inputs,
+                        std::vector<std::string>& notes) {
+  constexpr double far = 0.5, sure = 5, least = 10;  // from a factor of 1; deviations; nats
+  const auto cost = [&](const std::vector<Observations>& some) {
+    return Posterior(posterior.prior(), some, posterior.values()).negative_log_likelihood();
+  };
+  while (!inputs.empty()) {
+    const double as_logged = cost(observations);
+    auto worst = inputs.end();
+    InputFactor of_worst{.gain = least};
+    for (auto input = inputs.begin(); input != inputs.end(); ++input) {
+      const InputFactor one =
+          likeliest_factor(cost(with_factor(observations, *input, 0)), as_logged, cost(with_factor(observations, *input, 2)));
+      if (!(std::abs(one.factor - 1) > std::max(far, sure * one.stddev) && one.gain > of_worst.gain)) continue;
+      worst = input;
+      of_worst = one;
+    }
+    if (worst == inputs.end()) return;
+    notes.push_back(
+        fmt::format("warning: the data deny the input {}: they are most likely where it acts {:.2g} ± {:.2g} times as logged, "
+                    "by {:.2g} in log likelihood. A sign or a unit is wrong, or an inertia that it moves, or it acts late",
+                    worst->name, of_worst.factor, of_worst.stddev, of_worst.gain));
+    observations = with_factor(observations, *worst, of_worst.factor);
+    inputs.erase(worst);
+  }
 }
 
 }  // namespace
 
 void add_input_notes(const Posterior& posterior, std::vector<std::string>& notes) {
-  constexpr int enough = 1500, fewest = 10;          // values: a sign or a unit needs no more; states
-  constexpr double far = 0.5, sure = 5, least = 10;  // from a factor of 1; deviations; nats
+  constexpr int enough = 1500, fewest = 10;  // values: a sign or a unit needs no more; states
   const Prior& prior = posterior.prior();
   const System& system = *prior.system;
   const StateLayout layout = system.layout();
@@ -115,59 +152,27 @@ void add_input_notes(const Posterior& posterior, std::vector<std::string>& notes
   if (prior.mean != Prior::Mean::force || prior.reference || n_states(all) < fewest ||
       any([](const auto& group) { return bool(group.view().other_system); }))
     return;
+  const bool has_sums = any([](const auto& group) { return group.has_sums(); });
+  const bool asks = !prior.is_nonlinear() && !(has_sums && n_states(all) * system.nq() > 2 * enough);
+  const std::vector<Observations> some = has_sums ? all : evenly(all, enough / system.nq());
   const std::vector<bool> force = system.reads(SystemPart::force), elsewhere = system.reads(SystemPart::mechanics);
   // a latent that reads an input takes up what it does otherwise
   const auto is_learned = [&](int row) {
     return std::any_of(prior.latents.begin(), prior.latents.end(), [&](const Latent& one) { return one.features->reads(row); });
   };
-  const auto name_of = [&](int j) { return system.inputs()[static_cast<std::size_t>(j)]; };
-  std::vector<int> in_mean;
+  std::vector<InputEffect> inputs;
   for (int j = 0; j < layout.nu; ++j) {
-    const auto row = static_cast<std::size_t>(layout.u(j));
-    if (!force[row]) continue;
-    const double first = all.front().states()(layout.u(j), 0);
-    if (!any([&](const auto& group) { return (group.states().row(layout.u(j)).array() != first).any(); })) {
-      notes.push_back(fmt::format("the input {} is {:.4g} in every row: was it logged?", name_of(j), first));
-    } else if (!elsewhere[row] && !is_learned(layout.u(j))) {
-      in_mean.push_back(j);
+    const int row = layout.u(j);
+    if (!force[static_cast<std::size_t>(row)]) continue;
+    const double first = all.front().states()(row, 0);
+    if (!any([&](const auto& group) { return (group.states().row(row).array() != first).any(); })) {
+      notes.push_back(fmt::format("the input {} is {:.4g} in every row: was it logged?",
+                                  system.inputs()[static_cast<std::size_t>(j)], first));
+    } else if (asks && !elsewhere[static_cast<std::size_t>(row)] && !is_learned(row)) {
+      if (std::optional<InputEffect> effect = effect_of(posterior, some, j)) inputs.push_back(*std::move(effect));
     }
   }
-  const bool has_sums = any([](const auto& group) { return group.has_sums(); });
-  if (prior.is_nonlinear() || in_mean.empty() || (has_sums && n_states(all) * system.nq() > 2 * enough)) return;
-  std::vector<Observations> some = has_sums ? all : evenly(all, enough / system.nq());
-  std::vector<std::vector<MatrixXd>> effects;
-  std::erase_if(in_mean, [&](int j) {
-    std::optional<std::vector<MatrixXd>> effect = effect_of(posterior, some, layout.u(j));
-    if (effect) effects.push_back(*std::move(effect));
-    return !effect;
-  });
-  const auto with = [&](std::size_t k, double factor) {
-    std::vector<Observations> moved;
-    for (std::size_t g = 0; g < some.size(); ++g) moved.push_back(less(some[g], (factor - 1) * effects[k][g]));
-    return moved;
-  };
-  // a wrong one makes others seem wrong: the most doubtful first, the others beside it as it should be
-  while (!in_mean.empty()) {
-    InputFactor worst;
-    std::size_t at = 0;
-    for (std::size_t k = 0; k < in_mean.size(); ++k) {
-      const auto cost = [&](double factor) {
-        return Posterior(prior, with(k, factor), posterior.values()).negative_log_likelihood();
-      };
-      const InputFactor one = likeliest_factor(cost, in_mean[k]);
-      if (!(std::abs(one.factor - 1) > std::max(far, sure * one.stddev) && one.gain > std::max(least, worst.gain))) continue;
-      worst = one;
-      at = k;
-    }
-    if (worst.input < 0) return;
-    some = with(at, worst.factor);
-    in_mean.erase(in_mean.begin() + static_cast<std::ptrdiff_t>(at));
-    effects.erase(effects.begin() + static_cast<std::ptrdiff_t>(at));
-    notes.push_back(
-        fmt::format("warning: the data deny the input {}: they are most likely where it acts {:.2g} ± {:.2g} times as logged, "
-                    "by {:.2g} in log likelihood. A sign or a unit is wrong, or an inertia that it moves, or it acts late",
-                    name_of(worst.input), worst.factor, worst.stddev, worst.gain));
-  }
+  note_denied_inputs(posterior, some, std::move(inputs), notes);
 }
 
 std::string correlated_text(const std::vector<TrainingResidual>& residuals) {
