@@ -252,21 +252,17 @@ std::vector<TrainingResidual> training_residuals(const Posterior& posterior, con
   return residuals;
 }
 
-// Of the measured values of ddq, row by row over all observations.
-Evaluation::Part scores_of(const Posterior& posterior, const std::vector<LeaveOneOut>& left_out) {
+// Of the measured values of ddq, row by row over all observations: add(scores, row, group number, row of its view, state).
+template <typename Add>
+Evaluation::Part scores_of(const Posterior& posterior, const Add& add) {
   const std::vector<int> rows = observed_rows(posterior);
   Scores scores(std::ssize(rows));
   VectorXd spread(std::ssize(rows));
   for (Index r = 0; r < spread.size(); ++r) {
     spread[r] = training_spread(posterior, rows[static_cast<std::size_t>(r)]);
     for_each_observed(posterior, rows[static_cast<std::size_t>(r)], [&](std::size_t g, Index k) {
-      const Observations& group = posterior.observations()[g];
-      const VectorXd noise = posterior.noise_stddev(g);
-      for (Index i = 0; i < group.n_data(); ++i) {
-        const double error = group.values()(k, i) - left_out[g].mean(k, i);
-        if (std::isnan(error)) continue;
-        scores.add(r, error, std::sqrt(left_out[g].variance(k, i)), group.noise_at(noise, i)[k],
-                   /*has_variance=*/false);
+      for (Index i = 0; i < posterior.observations()[g].n_data(); ++i) {
+        if (!std::isnan(posterior.observations()[g].values()(k, i))) add(scores, r, g, k, i);
       }
     });
   }
@@ -274,33 +270,36 @@ Evaluation::Part scores_of(const Posterior& posterior, const std::vector<LeaveOn
   return scores.part(spread.norm());
 }
 
-// rms noise of the measured values of ddq over their spread, as scores_of has the error.
-double nrmse_of_noise(const Posterior& posterior) {
-  const std::vector<Observations>& observations = posterior.observations();
-  std::vector<MatrixXd> noise(observations.size());
-  for (std::size_t g = 0; g < noise.size(); ++g) {
-    const Observations& group = observations[g];
-    if (!group.view().is_of_ddq()) continue;
+// As measured, without slip: of each group of ddq (d × N).
+std::vector<MatrixXd> noise_of_groups(const Posterior& posterior) {
+  std::vector<MatrixXd> noise;
+  for (std::size_t g = 0; g < posterior.observations().size(); ++g) {
+    const Observations& group = posterior.observations()[g];
+    MatrixXd& one = noise.emplace_back(group.view().size(), group.n_data());
     const VectorXd stddev = posterior.noise_stddev(g);
-    noise[g].resize(group.view().size(), group.n_data());
-    for (Index i = 0; i < group.n_data(); ++i) noise[g].col(i) = group.noise_at(stddev, i);
-    noise[g] = with_slip(posterior, group.view(), group.states(), std::move(noise[g]));
+    for (Index i = 0; i < group.n_data(); ++i) one.col(i) = group.noise_at(stddev, i);
   }
-  double squares = 0, spreads = 0;
-  for (const int row : observed_rows(posterior)) {
-    double of_row = 0;
-    int n = 0;
-    for_each_observed(posterior, row, [&](std::size_t g, Index k) {
-      for (Index i = 0; i < noise[g].cols(); ++i) {
-        if (std::isnan(observations[g].values()(k, i))) continue;
-        of_row += noise[g](k, i) * noise[g](k, i);
-        ++n;
-      }
-    });
-    squares += of_row / std::max(1, n);
-    spreads += std::pow(training_spread(posterior, row), 2);
+  return noise;
+}
+
+Evaluation::Part scores_of(const Posterior& posterior, const std::vector<LeaveOneOut>& left_out,
+                           const std::vector<MatrixXd>& noise) {
+  return scores_of(posterior, [&](Scores& scores, Index r, std::size_t g, Index k, Index i) {
+    scores.add(r, posterior.observations()[g].values()(k, i) - left_out[g].mean(k, i), std::sqrt(left_out[g].variance(k, i)),
+               noise[g](k, i), /*has_variance=*/false);
+  });
+}
+
+// That the noise would have as errors, slip among it.
+double nrmse_of_noise(const Posterior& posterior, std::vector<MatrixXd> noise) {
+  for (std::size_t g = 0; g < noise.size(); ++g) {
+    const Observations& group = posterior.observations()[g];
+    if (group.view().is_of_ddq()) noise[g] = with_slip(posterior, group.view(), group.states(), std::move(noise[g]));
   }
-  return std::sqrt(squares / spreads);
+  const auto add = [&](Scores& scores, Index r, std::size_t g, Index k, Index i) {
+    scores.add(r, noise[g](k, i), 0, not_a_number, /*has_variance=*/false);
+  };
+  return scores_of(posterior, add).nrmse;
 }
 
 // Whether stretches of the observations are stretches of time.
@@ -316,9 +315,10 @@ bool has_stretches(const Posterior& posterior, bool has_time_order) {
 
 CrossValidation cross_validate(const Posterior& posterior, bool has_time_order) {
   const LeftOut left_out = leave_out(posterior, has_stretches(posterior, has_time_order) ? CrossValidation::n_stretches : 0);
-  CrossValidation out{scores_of(posterior, left_out.values), std::nullopt, training_residuals(posterior, left_out.values),
-                      nrmse_of_noise(posterior)};
-  if (!left_out.stretches.empty()) out.stretches = scores_of(posterior, left_out.stretches);
+  const std::vector<MatrixXd> noise = noise_of_groups(posterior);
+  CrossValidation out{scores_of(posterior, left_out.values, noise), std::nullopt, training_residuals(posterior, left_out.values),
+                      nrmse_of_noise(posterior, noise)};
+  if (!left_out.stretches.empty()) out.stretches = scores_of(posterior, left_out.stretches, noise);
   return out;
 }
 
