@@ -203,8 +203,9 @@ struct StartingPoint {
 };
 
 /// The state at which a motion starts: coordinates and velocities that are not given follow from the constraints, the given ones
-/// held; Newton's method starts for them at the model's newton_start, or at what `start` has. Where what is given leaves no
-/// solution the start stays as it is, for simulate() to project or not.
+/// held; Newton's method starts for them at the model's newton_start, or at what `start` has, and where coordinates alone are given
+/// and constraints have no slope there, beside it. Where what is given leaves no solution the start stays as it is, for simulate() to
+/// project or not.
 /// @param notes  what was solved for, or why not, is added
 Eigen::VectorXd complete_start(const Model& model, const Eigen::VectorXd& parameters, StartingPoint start,
                                std::vector<std::string>& notes);

@@ -290,12 +290,13 @@ void check_channels(const WholeLog& log, const System& system, std::vector<Findi
 // Two columns of a log, value and rate, over the steps from row to row: y = Δvalue, x = mean rate · Δt.
 struct Steps {
   double xx = 0, yy = 0, xy = 0;
-  double xxxx = 0, changes = 0;  // Σ (Δrate · Δt)²
-  int n = 0, n_turns = 0;        // of an angle, steps of more than a quarter turn
+  double xxxx = 0;         // Σ x⁴
+  double changes = 0;      // Σ (Δrate · Δt)²
+  int n = 0, n_turns = 0;  // of an angle, steps of more than a quarter turn
 
   [[nodiscard]] double correlation() const { return xx > 0 && yy > 0 ? xy / std::sqrt(xx * yy) : 0; }
   [[nodiscard]] double slope() const { return xx > 0 ? xy / xx : 0; }
-  /// Whether they tell anything: many count, and rates change little from row to row (an oscillation has six rows a period or more).
+  /// Whether they tell anything: many count, and rates change little from row to row (an oscillation has seven rows a period or more).
   [[nodiscard]] bool tell() const { return n >= 20 && xx * xx > 8 * xxxx && changes < xx && 10 * n_turns < n; }
 };
 

@@ -209,6 +209,8 @@ const std::vector<BadInput> bad_inputs = {
      nothing,
      "gp2 show model.toml > /dev/full",
      {"standard output: cannot be written: No space left on device"}},
+    {"AnEmptyList", nothing, fit_line + " --observe ''", {"--observe: expected a value such as", "got ''"}},
+    {"AnEmptyNumber", nothing, fit_line + " --max-points ''", {"--max-points: expected a value such as N"}},
     {"GenerateNone", nothing, "gp2 generate model.toml --n 0 -o old.csv", {"--n: must be positive, got 0"}},
     {"GenerateNegativeNoise",
      nothing,

@@ -24,7 +24,8 @@ struct InducingChoice {
 };
 
 /// Inducing points among the observed states, one after another: the latent and the state that reduce t of the bound most (greedy
-/// pivoted Cholesky factorisation; theory.md, T37), until t is small, nothing is left in double precision, or there are enough.
+/// pivoted Cholesky factorisation; theory.md, T37), until t is small, nothing is left in double precision, or there are enough; none for
+/// a discrepancy, which has no part in t (T38).
 /// @throws InputError where the options make no sense; and as Likelihood.
 InducingChoice choose_inducing_points(const Prior& prior, const std::vector<Observations>& observations,
                                       const ModelValues& values, const InducingOptions& options = {});

@@ -27,9 +27,9 @@ struct ConstraintViolation {
   std::string constraint;
 };
 
-/// By this fraction of its scale states may be off the constraint before that is told: more is noise, or the log's last digit.
+/// States that are off the constraint by more than this fraction of its scale are told: mostly it is noise, or a log's last digit.
 inline constexpr double constraint_violation_tolerance = 1e-6;
-/// From this on it deserves a warning.
+/// By more than this they deserve a warning.
 inline constexpr double large_constraint_violation = 1e-2;
 
 /// @returns nothing when the system has no such constraint, or the states lack what it reads.
