@@ -12,6 +12,10 @@ int n_states(const std::vector<Observations>& observations) {
   return n;
 }
 
+bool has_sums(const std::vector<Observations>& observations) {
+  return std::any_of(observations.begin(), observations.end(), [](const Observations& group) { return group.has_sums(); });
+}
+
 std::vector<std::vector<int>> evenly_taken(const std::vector<Observations>& observations, int n) {
   const double share = static_cast<double>(n) / n_states(observations);
   std::vector<std::vector<int>> states;

@@ -70,7 +70,8 @@ CSource Writer::write() {
 CSource export_c(const Posterior& posterior, const View& view, const CSourceOptions& options) {
   require_view(posterior.prior(), view);
   if (!c_export::is_identifier(options.name)) {
-    throw InputError(fmt::format("`name`: must be a name of C, of letters, digits and _, got '{}'", options.name));
+    throw InputError(fmt::format(
+        "`name`: must be a name of C, of letters, digits and _, that the code does not use itself, got '{}'", options.name));
   }
   const auto& components = posterior.conditioned();
   if (posterior.n_states() == 0) throw InputError("export to C: nothing was observed, so there is nothing to export");

@@ -211,6 +211,8 @@ bool TrainingResidual::is_too_large() const {
   return n >= 10 && rms > 2 && coverage95 < 0.85 && rms * rms > 1 + 6 * std::sqrt(2.0 / n);
 }
 
+bool TrainingResidual::is_too_small() const { return n >= 20 && rms_in_noise < 0.5; }
+
 bool TrainingResidual::is_correlated() const {
   return n >= 30 && serial_correlation > 0.5 && serial_correlation > 4 / std::sqrt(n);
 }
@@ -231,22 +233,33 @@ std::vector<TrainingResidual> training_residuals(const Posterior& posterior, con
       one.group = g;
       one.output = names[static_cast<std::size_t>(k)];
       double before = not_a_number, products = 0;
+      std::vector<double> distances;
       StandardisedErrors errors;
       for (Index i = 0; i < group.n_data(); ++i) {
         const double error = group.values()(k, i) - left_out[g].mean(k, i);
         if (std::isnan(error)) continue;
-        const double stddev = std::hypot(std::sqrt(left_out[g].variance(k, i)), group.noise_at(noise, i)[k]);
+        const double of_noise = group.noise_at(noise, i)[k], stddev = std::hypot(std::sqrt(left_out[g].variance(k, i)), of_noise);
         const double z = error / stddev;
         errors.add(error, stddev);
         one.rms += z * z;
+        one.rms_in_noise += std::pow(error / of_noise, 2);
         if (!std::isnan(before)) products += before * z;
         before = z;
+        distances.push_back(std::abs(z));
+        if (!(std::abs(z) > one.farthest)) continue;
+        one.farthest = std::abs(z);
+        one.farthest_state = are_all ? static_cast<int>(i) : -1;
       }
       one.n = errors.n;
+      if (one.n > 0) {
+        constexpr double half_within = 0.6745, far = 6;  // deviations; of normal values one in 10⁹ is farther
+        const double distance = far * std::max(1.0, median(distances) / half_within);
+        one.n_far = static_cast<int>(std::ranges::count_if(distances, [&](double z) { return z > distance; }));
+      }
       one.coverage95 = errors.within.shares()[2];
       // values that sums stand for are smoothed, and so their errors
       one.serial_correlation = one.rms > 0 && are_all && !group.has_sums() ? products / one.rms : 0;
-      one.rms = std::sqrt(one.rms / std::max(1, one.n));
+      for (double* const square : {&one.rms, &one.rms_in_noise}) *square = std::sqrt(*square / std::max(1, one.n));
     }
   }
   return residuals;

@@ -2,6 +2,9 @@
 
 #include <algorithm>
 #include <cmath>
+#include <map>
+#include <numeric>
+#include <optional>
 
 #include <fmt/format.h>
 
@@ -24,7 +27,8 @@ namespace {
 // potential has the E derivatives, which are taken together; of all else E = 1, for each function alike.
 class Candidates {
  public:
-  Candidates(const LatentRows& rows, std::size_t a)
+  /// @param counts  of states for which each candidate stands
+  Candidates(const LatentRows& rows, std::size_t a, const VectorXd& counts)
       : latent_(rows.latents[a]), kernel_(latent_.kernel), E_(latent_.is_potential ? latent_.n_functions : 1) {
     const Index n = kernel_.n_points();
     weight_.setZero(n, E_ * E_);
@@ -42,6 +46,7 @@ class Candidates {
       kernel_.scale(i, point);
       left_(i, 0) = kernel_.variance(point);
     }
+    weight_.array().colwise() *= counts.array();
     smallest_ = smallest_pivot * (n > 0 ? left_.maxCoeff() : 0);
   }
 
@@ -106,29 +111,55 @@ class Candidates {
   GradientColumns::Workspace gradient_;
 };
 
-}  // namespace
+// Which states of each Observations are looked at, and for how many each of them stands.
+struct Some {
+  std::vector<std::vector<int>> states;
+  std::vector<VectorXd> counts;
+};
 
-InducingChoice choose_inducing_points(const Prior& prior, const std::vector<Observations>& observations,
-                                      const ModelValues& values, const InducingOptions& options) {
-  if (options.most < 1) throw InputError(fmt::format("inducing: there must be 1 point or more, got {}", options.most));
-  if (!(options.left_out > 0)) throw InputError(fmt::format("inducing: left_out must be positive, got {}", options.left_out));
-  if (options.n_candidates < 1)
-    throw InputError(fmt::format("inducing: n_candidates must be 1 or more, got {}", options.n_candidates));
-  require_observations(prior, observations);
-  require_values(prior, observations, values);
-  const int n_all = n_states(observations);
-  const bool are_all = n_all <= options.n_candidates;
-  const std::vector<Observations> some = are_all ? observations : evenly(observations, options.n_candidates);
+Some even(const std::vector<Observations>& observations, int n) {
+  Some some{evenly_taken(observations, n), {}};
+  std::ptrdiff_t taken = 0;
+  for (const std::vector<int>& states : some.states) taken += std::ssize(states);
+  for (const std::vector<int>& states : some.states) {
+    some.counts.emplace_back(
+        VectorXd::Constant(std::ssize(states), static_cast<double>(n_states(observations)) / static_cast<double>(taken)));
+  }
+  return some;
+}
+
+// Stands for itself alone what is added.
+void add(const BlocksOfStates::States& block, Some& some) {
+  std::vector<int>& states = some.states[block.group];
+  VectorXd& counts = some.counts[block.group];
+  std::map<int, double> all;
+  for (std::size_t k = 0; k < states.size(); ++k) all[states[k]] = counts[static_cast<Index>(k)];
+  for (int i = block.first; i < block.first + block.n; ++i) all.emplace(i, 1);
+  states.clear();
+  counts.resize(std::ssize(all));
+  for (const auto& [state, count] : all) {
+    counts[std::ssize(states)] = count;
+    states.push_back(state);
+  }
+}
+
+InducingChoice chosen_among(const Some& some, const Prior& prior, const std::vector<Observations>& observations,
+                            const ModelValues& values, const InducingOptions& options) {
+  std::vector<Observations> candidates;
+  for (std::size_t g = 0; g < observations.size(); ++g) candidates.push_back(observations[g].take(some.states[g]));
   Linearisation about;  // where that is known; else where no latent acts
-  if (values.about) about = are_all ? *values.about : take(*values.about, evenly_taken(observations, options.n_candidates));
+  if (values.about) about = take(*values.about, some.states);
   Reduction reduction;
-  reduce(prior, some, require_models(prior, some, values.parameters, values.about ? &about : nullptr), values.noise_stddev,
-         reduction);
-  const LatentRows rows = latent_rows(prior, some, reduction, values);
-  const Index n = rows.n_samples();
+  reduce(prior, candidates, require_models(prior, candidates, values.parameters, values.about ? &about : nullptr),
+         values.noise_stddev, reduction);
+  const LatentRows rows = latent_rows(prior, candidates, reduction, values);
+  VectorXd counts(rows.n_samples());
+  for (Index i = 0; i < counts.size(); ++i) {
+    const Reduction::Sample& sample = reduction.samples[static_cast<std::size_t>(i)];
+    counts[i] = some.counts[static_cast<std::size_t>(sample.group)][sample.index];
+  }
   std::vector<Candidates> latents;
-  for (std::size_t a = 0; a < rows.latents.size(); ++a) latents.emplace_back(rows, a);
-  const double scale = n == 0 ? 0 : static_cast<double>(n_all) / static_cast<double>(n);
+  for (std::size_t a = 0; a < rows.latents.size(); ++a) latents.emplace_back(rows, a, counts);
   InducingChoice choice;
   for (;;) {
     choice.left_out = 0;
@@ -137,8 +168,8 @@ InducingChoice choose_inducing_points(const Prior& prior, const std::vector<Obse
     for (std::size_t a = 0; a < latents.size(); ++a) {
       if (is_local(prior.latents[a])) continue;  // no number of points holds it
       Candidates& latent = latents[a];
-      choice.left_out += scale * latent.trace();
-      if (n == 0 || choice.n_variables + latent.n_functions() > options.most) continue;
+      choice.left_out += latent.trace();
+      if (counts.size() == 0 || choice.n_variables + latent.n_functions() > options.most) continue;
       const double part = latent.largest();
       if (part > largest) largest = part, best = &latent;
     }
@@ -152,23 +183,63 @@ InducingChoice choose_inducing_points(const Prior& prior, const std::vector<Obse
   return choice;
 }
 
+// t by latent and block; nothing where a block has a fault.
+std::optional<MatrixXd> left_out_of_blocks(const Prior& prior, const BlocksOfStates& blocks, const ModelValues& values,
+                                           const Workers& workers) {
+  const lapack::SingleThread single_thread;
+  const InducingLatents latents(prior, values);
+  const Index n_latents = std::ssize(prior.latents);
+  const auto add = [&](VectorSum& sum, int, const RowBlock& rows, const InducingBlock& block) {
+    for (std::size_t f = 0; f < latents.functions().size(); ++f) {
+      sum.sum[rows.number * n_latents + static_cast<Index>(latents.functions()[f].latent)] += block.left_out(f);
+    }
+  };
+  std::optional<VectorSum> all =
+      sum_over_blocks(latents, blocks, false, workers, nullptr, VectorSum{VectorXd::Zero(n_latents * blocks.n_blocks())}, add);
+  if (!all) return std::nullopt;
+  return all->sum.reshaped(n_latents, blocks.n_blocks());
+}
+
+}  // namespace
+
+InducingChoice choose_inducing_points(const Prior& prior, const std::vector<Observations>& observations,
+                                      const ModelValues& values, const InducingOptions& options, const Workers& workers) {
+  if (options.most < 1) throw InputError(fmt::format("inducing: there must be 1 point or more, got {}", options.most));
+  if (!(options.left_out > 0)) throw InputError(fmt::format("inducing: left_out must be positive, got {}", options.left_out));
+  if (options.n_candidates < 1)
+    throw InputError(fmt::format("inducing: n_candidates must be 1 or more, got {}", options.n_candidates));
+  require_observations(prior, observations);
+  require_values(prior, observations, values);
+  Some some = even(observations, std::min(n_states(observations), options.n_candidates));
+  InducingChoice choice = chosen_among(some, prior, observations, values, options);
+  if (n_states(observations) <= options.n_candidates) return choice;
+  // What is seldom, as a fast move among hours of slow ones, is not among few states that are taken evenly.
+  ModelValues through = values;
+  through.inducing = choice.points;
+  const BlocksOfStates blocks(prior, observations, through, values.about.get());
+  const std::optional<MatrixXd> left_out = left_out_of_blocks(prior, blocks, through, workers);
+  if (!left_out) return choice;
+  const VectorXd of_block = left_out->colwise().sum();
+  constexpr double as_expected = 1.5;
+  if (!(of_block.sum() > as_expected * choice.left_out + options.left_out)) return choice;
+  std::vector<Index> worst(static_cast<std::size_t>(of_block.size()));
+  std::iota(worst.begin(), worst.end(), 0);
+  std::stable_sort(worst.begin(), worst.end(), [&](Index a, Index b) { return of_block[a] > of_block[b]; });
+  const Index n_more = std::max(1, options.n_candidates / (2 * BlocksOfStates::block_size));
+  for (Index k = 0; k < std::min(n_more, of_block.size()); ++k) add(blocks.states(worst[static_cast<std::size_t>(k)]), some);
+  return chosen_among(some, prior, observations, values, options);
+}
+
 VectorXd left_out_by_points(const Prior& prior, const std::vector<Observations>& observations, const ModelValues& values,
                             const Workers& workers) {
   if (!values.inducing) throw InputError("left_out_by_points: the values have no inducing points");
   require_observations(prior, observations);
   require_values(prior, observations, values);
-  const lapack::SingleThread single_thread;
-  const InducingLatents latents(prior, values);
-  const auto add = [&](VectorSum& sum, int, const RowBlock&, const InducingBlock& block) {
-    for (std::size_t f = 0; f < latents.functions().size(); ++f) {
-      sum.sum[static_cast<Index>(latents.functions()[f].latent)] += block.left_out(f);
-    }
-  };
   const BlocksOfStates blocks(prior, observations, values, values.about.get());
-  std::optional<VectorSum> all =
-      sum_over_blocks(latents, blocks, false, workers, nullptr, VectorSum{VectorXd::Zero(std::ssize(prior.latents))}, add);
-  if (!all) static_cast<void>(require_models(prior, observations, values.parameters, values.about.get()));  // names the state
-  return std::move(all->sum);
+  const std::optional<MatrixXd> left_out = left_out_of_blocks(prior, blocks, values, workers);
+  if (!left_out)
+    static_cast<void>(require_models(prior, observations, values.parameters, values.about.get()));  // names the state
+  return left_out->rowwise().sum();
 }
 
 }  // namespace gp2

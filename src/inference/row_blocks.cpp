@@ -64,6 +64,7 @@ const RowBlock* BlocksOfStates::block(Index b, bool with_derivatives, Memory& me
   if (kept != nullptr && kept->features.empty()) kept = nullptr;  // another process has kept it
   RowBlock& block = memory.block;
   block.first_group = group;
+  block.number = b;
   block.observations = nullptr;
   block.models = nullptr;
   if (kept != nullptr && kept->reduction) {

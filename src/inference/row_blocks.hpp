@@ -16,6 +16,7 @@ struct RowBlock {
   const std::vector<Observations>* observations = nullptr;
   const std::vector<ObservationModel>* models = nullptr;  // null where nothing but the rows is kept
   std::size_t first_group = 0;                            // of all Observations, that observations->front() is of
+  Eigen::Index number = 0;                                // of the blocks
 };
 
 /// Observations as a solver is given them: block after block, each perhaps made when it is asked for.

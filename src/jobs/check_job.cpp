@@ -1,23 +1,20 @@
 #include "gp2/jobs/check_job.hpp"
 
 #include <algorithm>
-#include <cmath>
 #include <iterator>
 #include <mutex>
-#include <numbers>
 #include <set>
 #include <utility>
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
-#include "base/not_a_number.hpp"
-#include "gp2/base/statistics.hpp"
 #include "gp2/jobs/fit_problem.hpp"
 #include "gp2/prior.hpp"
 #include "gp2/simulation/generate.hpp"
 #include "gp2/simulation/projected_states.hpp"
 #include "inference/nonlinear_motion.hpp"
+#include "jobs/rate_check.hpp"
 #include "jobs/read_observations.hpp"
 #include "mechanics/known_multipliers.hpp"
 
@@ -277,7 +274,7 @@ void check_channels(const WholeLog& log, const System& system, std::vector<Findi
     if (is_stuck(q) && !log.states.row(layout.dq(j)).hasNaN() && !is_stuck(log.states.row(layout.dq(j))))
       add(system.coordinates()[static_cast<std::size_t>(j)].name);
   }
-  const int n_repeated = n_repeated_rows(log.states, log.accelerations);
+  const int n_repeated = n_repeated_rows({{log.states, log.accelerations}});
   if (n_repeated * 20 > log.states.cols()) {
     findings.push_back(
         {Level::warning,
@@ -287,88 +284,12 @@ void check_channels(const WholeLog& log, const System& system, std::vector<Findi
   }
 }
 
-// Two columns of a log, value and rate, over the steps from row to row: y = Δvalue, x = mean rate · Δt.
-struct Steps {
-  double xx = 0, yy = 0, xy = 0;
-  double xxxx = 0;         // Σ x⁴
-  double changes = 0;      // Σ (Δrate · Δt)²
-  int n = 0, n_turns = 0;  // of an angle, steps of more than a quarter turn
-
-  [[nodiscard]] double correlation() const { return xx > 0 && yy > 0 ? xy / std::sqrt(xx * yy) : 0; }
-  [[nodiscard]] double slope() const { return xx > 0 ? xy / xx : 0; }
-  /// Whether they tell anything: many count, and rates change little from row to row (an oscillation has seven rows a period or more).
-  [[nodiscard]] bool tell() const { return n >= 20 && xx * xx > 8 * xxxx && changes < xx && 10 * n_turns < n; }
-};
-
-/// The lengths of a log's steps, NaN where it pauses.
-std::vector<double> lengths_of_steps(const Eigen::RowVectorXd& t) {
-  std::vector<double> lengths;
-  for (Eigen::Index i = 0; i + 1 < t.size(); ++i) lengths.push_back(t[i + 1] - t[i]);
-  const double usual = median(lengths);
-  for (double& length : lengths) {
-    if (length > 1.5 * usual) length = not_a_number;
-  }
-  return lengths;
-}
-
-/// @param lag  rows by which the rate is late
-Steps steps_of(const std::vector<double>& lengths, const Eigen::RowVectorXd& value, const Eigen::RowVectorXd& rate, bool is_angle,
-               int lag) {
-  constexpr double turn = 2 * std::numbers::pi, noise = 0.5;
-  const bool may_be_wrapped = is_angle && value.maxCoeff() - value.minCoeff() <= turn + noise;
-  Steps steps;
-  for (Eigen::Index i = 0; i + 1 < value.size(); ++i) {
-    const double dt = lengths[static_cast<std::size_t>(i)];
-    if (i + lag < 0 || i + 1 + lag >= value.size() || std::isnan(dt)) continue;
-    const double x = 0.5 * (rate[i + lag] + rate[i + 1 + lag]) * dt;
-    double y = value[i + 1] - value[i];
-    if (may_be_wrapped) y = std::remainder(y, turn);
-    if (!std::isfinite(x) || !std::isfinite(y)) continue;
-    if (may_be_wrapped && std::abs(y) > turn / 4) ++steps.n_turns;
-    steps.xxxx += x * x * x * x;
-    steps.changes += std::pow((rate[i + 1 + lag] - rate[i + lag]) * dt, 2);
-    steps.xx += x * x;
-    steps.yy += y * y;
-    steps.xy += x * y;
-    ++steps.n;
-  }
-  return steps;
-}
-
-// What else the rate would have to be for the values to follow from it; empty where it is right, or nothing explains them better.
-std::string better_rate(const std::vector<double>& lengths, const Eigen::RowVectorXd& value,
-                        const std::vector<Eigen::RowVectorXd>& rates, const std::vector<std::string>& names, std::size_t own,
-                        bool is_angle) {
-  constexpr double sure = 0.95;
-  const Steps now = steps_of(lengths, value, rates[own], is_angle, 0);
-  if (!now.tell()) return "";
-  if (std::abs(now.correlation()) > sure) {
-    const double slope = now.slope();
-    return std::abs(slope - 1) < 0.3 ? "" : fmt::format("it is {:.3g} × what is measured: a unit or a sign, or the clock", slope);
-  }
-  for (const int lag : {1, -1, 2, -2, 3, -3}) {
-    const double correlation = steps_of(lengths, value, rates[own], is_angle, lag).correlation();
-    if (correlation > sure && 1 - correlation < 0.1 * (1 - now.correlation())) {
-      return fmt::format("the column {} by {} row{}", lag > 0 ? "lags" : "leads", std::abs(lag), std::abs(lag) == 1 ? "" : "s");
-    }
-  }
-  for (std::size_t other = 0; other < rates.size(); ++other) {
-    if (other == own || rates[other].hasNaN()) continue;
-    const Steps steps = steps_of(lengths, value, rates[other], is_angle, 0);
-    if (steps.tell() && std::abs(steps.correlation()) > sure && std::abs(now.correlation()) < 0.5) {
-      return fmt::format("it is measured by the column of {}: swapped?", names[other]);
-    }
-  }
-  return "";
-}
-
 // Of a log in the order of time: velocities are the rates of coordinates, accelerations those of velocities.
 void check_rates(const WholeLog& log, const System& system, std::vector<Finding>& findings) {
   const StateLayout layout = system.layout();
   const Eigen::RowVectorXd t = log.states.row(layout.t());
   constexpr Eigen::Index fewest = 30;
   if (t.hasNaN() || t.size() < fewest || !((t.tail(t.size() - 1) - t.head(t.size() - 1)).array() > 0).all()) return;
-  const std::vector<double> lengths = lengths_of_steps(t);
   std::vector<Eigen::RowVectorXd> q, dq, ddq;
   std::vector<std::string> velocities;
   for (int j = 0; j < system.nq(); ++j) {
@@ -377,14 +298,19 @@ void check_rates(const WholeLog& log, const System& system, std::vector<Finding>
     ddq.emplace_back(log.accelerations.row(j));
     velocities.push_back(system.coordinates()[static_cast<std::size_t>(j)].velocity());
   }
+  const auto is_wrong = [&](const RateColumns& columns) {
+    const std::string text = columns.value.hasNaN() ? "" : better_rate(columns);
+    if (text.empty()) return false;
+    findings.push_back(
+        {Level::warning, fmt::format("{} is not the rate of {} over t: {}", columns.names[columns.own], columns.name, text)});
+    return true;
+  };
   const std::vector<std::string> accelerations = system.acceleration_names();
   for (std::size_t j = 0; j < q.size(); ++j) {
     const Coordinate& coordinate = system.coordinates()[j];
-    const auto add = [&](const std::string& of, const std::string& rate, const std::string& text) {
-      if (!text.empty()) findings.push_back({Level::warning, fmt::format("{} is not the rate of {} over t: {}", rate, of, text)});
-    };
-    if (!q[j].hasNaN()) add(coordinate.name, velocities[j], better_rate(lengths, q[j], dq, velocities, j, coordinate.angle));
-    if (!dq[j].hasNaN()) add(velocities[j], accelerations[j], better_rate(lengths, dq[j], ddq, accelerations, j, false));
+    // a velocity that is wrong says nothing of the acceleration
+    if (!is_wrong({t, coordinate.name, q[j], coordinate.angle, dq, velocities, j}))
+      is_wrong({t, velocities[j], dq[j], false, ddq, accelerations, j});
   }
 }
 

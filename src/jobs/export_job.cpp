@@ -10,6 +10,7 @@
 #include <fmt/format.h>
 
 #include "base/checksum.hpp"
+#include "export/c_writer.hpp"
 #include "export/fitted_robot.hpp"
 #include "export/shims.hpp"
 #include "gp2/base/file.hpp"
@@ -34,7 +35,7 @@ std::string name_of(const System& system) {
     if (fits || (!name.empty() && name.back() != '_')) name += fits ? c : '_';
   }
   while (name.ends_with('_')) name.pop_back();
-  return name.empty() || std::isdigit(static_cast<unsigned char>(name.front())) ? "model_" + name : name;
+  return c_export::is_identifier(name) ? name : "model_" + name;
 }
 
 const char* word(Target robot) { return robot == Target::urdf ? "urdf" : "mjcf"; }

@@ -19,6 +19,7 @@
 #include "gp2/jobs/fit_time.hpp"
 #include "inference/inducing_summary.hpp"
 #include "jobs/fit_notes.hpp"
+#include "jobs/read_observations.hpp"
 
 namespace gp2 {
 
@@ -75,10 +76,6 @@ int automatic_inducing_variables(std::int64_t n_rows) {
 
 namespace {
 
-bool has_sums(const std::vector<Observations>& observations) {
-  return std::ranges::any_of(observations, [](const Observations& group) { return group.has_sums(); });
-}
-
 // How many inducing variables there may be; 0: none, exact.
 int settled_inducing(const FitRequest& request, const FitProblem& problem, const FitOptions& options) {
   const bool of_windows = has_sums(problem.observations);
@@ -123,10 +120,13 @@ std::string source_of(const FitRequest& request) {
   return fmt::format("{}", fmt::join(names, ", "));
 }
 
-void take_logs(const FitRequest& request, FitFile& file, std::vector<std::string>& notes) {
+void take_logs(const FitRequest& request, const std::vector<Observations>& observations, FitFile& file,
+               std::vector<std::string>& notes) {
+  bool is_known = false;
   for (const Log& log : request.logs) {
     if (!log.table.file()) continue;
     if (file.has_learned(*log.table.file())) {
+      is_known = true;
       notes.push_back(fmt::format("warning: {} was learned from already: its rows count twice", log.table.name()));
     }
     file.logs.push_back(*log.table.file());
@@ -134,6 +134,7 @@ void take_logs(const FitRequest& request, FitFile& file, std::vector<std::string
   for (const SideInformation& one : request.also) {
     if (one.log.table.file()) file.logs.push_back(*one.log.table.file());
   }
+  if (!is_known) note_shared_rows({}, observations, notes);
 }
 
 constexpr int rows_of_stretch = 200;
@@ -174,7 +175,7 @@ FitJob job_of(FitRequest request, FitProblem problem) {
   job.file.prior_options = problem.prior_options;
   job.file.systems = problem.systems;
   job.file.data_source = source_of(request);
-  take_logs(request, job.file, job.notes);
+  take_logs(request, problem.observations, job.file, job.notes);
   job.file.model = std::move(request.model);
   job.problem = std::move(problem);
   return job;
@@ -443,11 +444,23 @@ FitOutcome run_once(const FitJob& job, const std::function<void(const Progress&)
       add_force_note(outcome.posterior, outcome.notes);
       add_constraint_note(outcome.posterior, outcome.notes);
       add_window_note(outcome.posterior, outcome.notes);
-      outcome.cross_validation = cross_validate(outcome.posterior, keeps_row_order(outcome.file, job.problem.observations));
+      const bool has_row_order = keeps_row_order(outcome.file, job.problem.observations);
+      outcome.cross_validation = cross_validate(outcome.posterior, has_row_order);
       if (result.report.inducing) result.report.inducing->stretches = outcome.cross_validation->stretches;
       add_residual_notes(outcome.posterior, outcome.cross_validation->residuals, outcome.notes);
       add_stretch_note(*outcome.cross_validation, outcome.notes);
-      add_input_notes(outcome.posterior, outcome.notes);
+      FitOptions quick;
+      quick.n_restarts = 1;
+      quick.max_iterations = 50;
+      quick.max_escapes = 0;
+      quick.n_threads = options.n_threads;
+      quick.stop = stop;
+      add_doubts(
+          outcome.posterior, has_row_order,
+          [&](const std::vector<Observations>& some) {
+            return fit(job.problem.prior, some, job.problem.hyperparameters, quick).posterior.values();
+          },
+          outcome.notes);
       const std::string correlated = correlated_text(outcome.cross_validation->residuals);
       if (!correlated.empty()) outcome.notes.push_back(fmt::format("warning: {}: deviations are too small", correlated));
     } catch (const std::exception& error) {

@@ -1,10 +1,13 @@
 #include "gp2/jobs/predict_job.hpp"
 
+#include <algorithm>
+#include <map>
 #include <utility>
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
+#include "data/evenly.hpp"
 #include "gp2/error.hpp"
 #include "gp2/inference/inverse_dynamics.hpp"
 #include "gp2/jobs/fit_problem.hpp"
@@ -91,10 +94,31 @@ void add_distance(const Posterior& posterior, const View& view, const MatrixXd& 
                   n_far, distance.size(), Posterior::far_from_data, distance.maxCoeff()));
 }
 
+// Some of the same data, where every direction of a latent may be what the largest of them is: a fit makes those small, or smooth, of
+// which the data tell nothing, and is sure of them then.
+Posterior with_equal_directions(const Posterior& posterior) {
+  constexpr int enough = 1500;  // values
+  ModelValues values = posterior.component(0).values();
+  const std::vector<Latent>& latents = posterior.prior().latents;
+  std::map<std::string, std::size_t> largest;
+  const auto size_of = [&](std::size_t a) { return values.signal_stddev[a].maxCoeff(); };
+  for (std::size_t a = 0; a < latents.size(); ++a) {
+    std::size_t& one = largest.emplace(latents[a].name, a).first->second;
+    if (size_of(a) > size_of(one)) one = a;
+  }
+  for (std::size_t a = 0; a < latents.size(); ++a) {
+    const std::size_t as = largest[latents[a].name];
+    values.signal_stddev[a].setConstant(size_of(as));
+    values.kernel[a] = values.kernel[as];
+  }
+  values.inducing = nullptr;
+  return {posterior.prior(), evenly(posterior.observations(), enough / posterior.prior().system->nq()), std::move(values)};
+}
+
 // What the data tell little of has the deviation that the prior assumes, by sizes learned from what they do tell.
 void note_what_is_not_told(const Posterior& posterior, const View& view, const MatrixXd& states, PredictOutcome& out) {
   constexpr std::size_t enough = 200;  // states
-  constexpr double little = 0.5, exact = 1e-9;
+  constexpr double little = 0.5, small = 0.1, exact = 1e-9;
   const auto distance = out.values.row(out.values.rows() - 1);
   std::vector<Index> near;
   for (Index i = 0; i < states.cols(); ++i) {
@@ -104,14 +128,26 @@ void note_what_is_not_told(const Posterior& posterior, const View& view, const M
   std::vector<Index> some;
   for (std::size_t k = 0; k < std::min(enough, near.size()); ++k)
     some.push_back(near[k * near.size() / std::min(enough, near.size())]);
-  const auto mean_variance = [](const MatrixXd& stddev) -> Eigen::VectorXd { return stddev.array().square().rowwise().mean(); };
-  const Eigen::VectorXd left = mean_variance(out.values.middleRows(view.size(), view.size())(Eigen::all, some)),
-                        assumed = mean_variance(
-                            posterior.without_data().marginal(view, states(Eigen::all, some), /*n_threads=*/0).stddev());
+  const auto mean_square = [](const MatrixXd& of) -> Eigen::VectorXd { return of.array().square().rowwise().mean(); };
+  const Eigen::VectorXd predicted = mean_square(out.values.topRows(view.size())(Eigen::all, some));
+  // where the deviation is small beside what is predicted, the prior is not asked
+  const auto share_left = [&](const Posterior& of) -> Eigen::VectorXd {
+    const auto variance = [&](const Posterior& one) {
+      return mean_square(one.marginal(view, states(Eigen::all, some), /*n_threads=*/0).stddev());
+    };
+    const Eigen::VectorXd assumed = variance(of.without_data()), of_data = variance(of);
+    const auto counts =
+        assumed.array() > exact * exact * assumed.maxCoeff() && of_data.array() > small * small * predicted.array();
+    return counts.select(of_data.cwiseQuotient(assumed), 0);
+  };
+  Eigen::VectorXd left = share_left(posterior);
+  if (view.quantity != View::Quantity::constrained_acceleration && !posterior.prior().is_nonlinear() &&
+      !has_sums(posterior.observations()))
+    left = left.cwiseMax(share_left(with_equal_directions(posterior)));
   std::vector<std::string> names;
-  for (Index k = 0; k < assumed.size(); ++k) {
-    if (assumed[k] <= exact * exact * assumed.maxCoeff() || left[k] <= little * assumed[k]) continue;
-    names.push_back(fmt::format("{} ({:.0f} %)", out.names[static_cast<std::size_t>(k)], 100 * left[k] / assumed[k]));
+  for (Index k = 0; k < left.size(); ++k) {
+    if (left[k] <= little) continue;
+    names.push_back(fmt::format("{} ({:.0f} %)", out.names[static_cast<std::size_t>(k)], 100 * left[k]));
   }
   if (names.empty()) return;
   out.notes.push_back(

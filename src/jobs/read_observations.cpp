@@ -12,6 +12,7 @@
 
 #include "base/not_a_number.hpp"
 #include "base/random.hpp"
+#include "data/evenly.hpp"
 #include "gp2/error.hpp"
 #include "gp2/inference/evaluation.hpp"
 #include "gp2/mechanics/check.hpp"
@@ -286,7 +287,7 @@ void note_dependence(const LoggedSystem& logged, const Readings& readings, const
 
 // rows that are copies are no measurements
 void note_repeats(const Readings& readings, const CsvTable& log, std::vector<std::string>& notes) {
-  const int n_repeated = n_repeated_rows(readings.states, readings.values);
+  const int n_repeated = n_repeated_rows({{readings.states, readings.values}});
   if (n_repeated * 20 <= log.n_rows()) return;
   notes.push_back(fmt::format(
       "warning: {}: {} of {} rows repeat another one to the last digit: deviations come out too small; keep each once",
@@ -417,34 +418,63 @@ std::string text_of_rest(const Model& model, const VectorXd& parameters, const M
       n, states.cols(), fmt::join(names, "; "));
 }
 
-int n_repeated_rows(const MatrixXd& states, const MatrixXd& values) {
-  // NaN is not equal to itself, and −0 is 0
-  const auto entry = [&](Index k, int i) {
-    const double one = k < states.rows() ? states(k, i) : values(k - states.rows(), i);
-    return std::isnan(one) || one == 0 ? 0.0 : one;
-  };
-  const Index n_entries = states.rows() + values.rows();
-  // negative, 0 or positive as row a comes before b, repeats it, or comes behind it: rows are sorted by a hash of their bits first
-  std::vector<std::uint64_t> hashes(static_cast<std::size_t>(states.cols()), 0);
-  for (int i = 0; i < static_cast<int>(states.cols()); ++i) {
-    std::uint64_t& hash = hashes[static_cast<std::size_t>(i)];
-    for (Index k = 0; k < n_entries; ++k) {
-      hash = (std::rotl(hash, 23) ^ std::bit_cast<std::uint64_t>(entry(k, i))) * 0x9e3779b97f4a7c15U;
+int n_repeated_rows(const std::vector<MeasuredRows>& logs) {
+  struct Row {
+    const MeasuredRows* log;
+    Index i;
+    std::uint64_t hash = 0;
+    // NaN is not equal to itself, and −0 is 0
+    [[nodiscard]] double entry(Index k) const {
+      const double one = k < log->states.rows() ? log->states(k, i) : log->values(k - log->states.rows(), i);
+      return std::isnan(one) || one == 0 ? 0.0 : one;
     }
-  }
-  const auto compare = [&](int a, int b) {
-    const std::uint64_t hash_a = hashes[static_cast<std::size_t>(a)], hash_b = hashes[static_cast<std::size_t>(b)];
-    if (hash_a != hash_b) return hash_a < hash_b ? -1 : 1;
-    for (Index k = 0; k < n_entries; ++k) {
-      if (entry(k, a) != entry(k, b)) return entry(k, a) < entry(k, b) ? -1 : 1;
+    [[nodiscard]] Index size() const { return log->states.rows() + log->values.rows(); }
+  };
+  // negative, 0 or positive as row a comes before b, repeats it, or comes behind it: rows are sorted by a hash of their bits first
+  const auto compare = [](const Row& a, const Row& b) {
+    if (a.hash != b.hash) return a.hash < b.hash ? -1 : 1;
+    if (a.size() != b.size()) return a.size() < b.size() ? -1 : 1;
+    for (Index k = 0; k < a.size(); ++k) {
+      if (a.entry(k) != b.entry(k)) return a.entry(k) < b.entry(k) ? -1 : 1;
     }
     return 0;
   };
-  std::vector<int> order = counted(states.cols());
-  std::sort(order.begin(), order.end(), [&](int a, int b) { return compare(a, b) < 0; });
+  std::vector<Row> rows;
+  for (const MeasuredRows& log : logs) {
+    for (Index i = 0; i < log.states.cols(); ++i) {
+      Row& row = rows.emplace_back(Row{&log, i});
+      for (Index k = 0; k < row.size(); ++k) {
+        row.hash = (std::rotl(row.hash, 23) ^ std::bit_cast<std::uint64_t>(row.entry(k))) * 0x9e3779b97f4a7c15U;
+      }
+    }
+  }
+  std::sort(rows.begin(), rows.end(), [&](const Row& a, const Row& b) { return compare(a, b) < 0; });
   int n = 0;
-  for (std::size_t k = 1; k < order.size(); ++k) n += compare(order[k - 1], order[k]) == 0 ? 1 : 0;
+  for (std::size_t k = 1; k < rows.size(); ++k) n += compare(rows[k - 1], rows[k]) == 0 ? 1 : 0;
   return n;
+}
+
+void note_shared_rows(const std::vector<Observations>& known, const std::vector<Observations>& more,
+                      std::vector<std::string>& notes) {
+  const auto n_shared = [](const std::vector<const Observations*>& groups) {
+    std::vector<MeasuredRows> all;
+    int n = 0;
+    for (const Observations* const group : groups) {
+      if (group->has_sums()) continue;
+      all.push_back({group->states(), group->values()});
+      n -= n_repeated_rows({all.back()});
+    }
+    return all.size() < 2 ? 0 : n + n_repeated_rows(all);
+  };
+  std::vector<const Observations*> groups;
+  for (const Observations& group : known) groups.push_back(&group);
+  const int n_before = n_shared(groups);
+  for (const Observations& group : more) groups.push_back(&group);
+  const int n = n_shared(groups) - n_before;
+  if (n * 20 <= n_states(more)) return;
+  notes.push_back(fmt::format(
+      "warning: {} of {} rows stand in another log too, to the last digit: deviations come out too small; give each once", n,
+      n_states(more)));
 }
 
 LoggedSystem logged_system(const Model& fitted, const std::vector<Actuator>& actuators, const Prior& prior,

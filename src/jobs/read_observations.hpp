@@ -46,8 +46,17 @@ Observations read_side_information(const LoggedSystem& logged, const Prior& fitt
                                    const FitProblemOptions& options, const std::vector<Eigen::VectorXd>& signal_stddev,
                                    LogRows& rows, std::vector<std::string>& notes);
 
-/// How many states, with the values measured there, are those of an earlier one to the last bit.
-int n_repeated_rows(const Eigen::MatrixXd& states, const Eigen::MatrixXd& values);
+/// States, and the values measured there.
+struct MeasuredRows {
+  const Eigen::MatrixXd &states, &values;
+};
+
+/// How many rows of some logs are those of an earlier one to the last bit.
+int n_repeated_rows(const std::vector<MeasuredRows>& logs);
+
+/// Warns where more than a twentieth of the rows of more logs are those of another of them, or of a log that is known, in whatever order.
+void note_shared_rows(const std::vector<Observations>& known, const std::vector<Observations>& more,
+                      std::vector<std::string>& notes);
 
 /// What is wrong with rows, if more than a twentieth, that are at rest where dry friction of a model jumps: there and in the row before or
 /// behind all velocities are 0 and the coordinates the same, as far as they are known, and measured values a quarter of the largest of

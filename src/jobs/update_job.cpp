@@ -16,6 +16,7 @@
 #include "gp2/jobs/fit_problem.hpp"
 #include "inference/inducing_summary.hpp"
 #include "jobs/observation_noise.hpp"
+#include "jobs/read_observations.hpp"
 
 namespace gp2 {
 
@@ -124,9 +125,6 @@ Observations more_observations(const FitFile& fit, const Posterior& posterior, c
 
   Noise noise = noise_of_more(fit, posterior, view, names, read, request, log, notes);
   notes.insert(notes.end(), read.notes.begin(), read.notes.end());
-  if (log.file() && fit.has_learned(*log.file())) {
-    notes.push_back(fmt::format("warning: {} was learned from already: its rows count twice", log.name()));
-  }
   std::vector<int> rows;  // that measure something
   for (int i = 0; i < static_cast<int>(read.accelerations.cols()); ++i) {
     if (!read.accelerations.col(i).array().isNaN().all()) rows.push_back(i);
@@ -136,12 +134,18 @@ Observations more_observations(const FitFile& fit, const Posterior& posterior, c
         fmt::format("warning: {}: nothing is learned from it: no row measures anything where what acts is known", log.name()));
   }
   noise = noise.take(rows);
-  return {read.states(Eigen::all, rows),
-          std::move(view),
-          read.accelerations(Eigen::all, rows),
-          noise.stddev(),
-          false,
-          noise.has_scale() ? noise.scale() : MatrixXd()};
+  Observations more{read.states(Eigen::all, rows),
+                    std::move(view),
+                    read.accelerations(Eigen::all, rows),
+                    noise.stddev(),
+                    false,
+                    noise.has_scale() ? noise.scale() : MatrixXd()};
+  if (log.file() && fit.has_learned(*log.file())) {
+    notes.push_back(fmt::format("warning: {} was learned from already: its rows count twice", log.name()));
+  } else {
+    note_shared_rows(groups, {more}, notes);
+  }
+  return more;
 }
 
 Posterior with_more(Posterior&& posterior, Observations more, const CsvTable& log, std::vector<std::string>& notes) {

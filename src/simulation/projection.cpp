@@ -46,7 +46,9 @@ ConstraintProjection::Level ConstraintProjection::level_of(bool velocity, const 
   }
   for (int j = 0; j < system_.nq(); ++j) {
     const int entry = level.first + j;
-    if (held.empty() || !held[static_cast<std::size_t>(entry)]) level.free.push_back(j);
+    if (!held.empty() && held[static_cast<std::size_t>(entry)]) continue;
+    level.free.push_back(j);
+    level.entries.push_back(entry);
   }
   return level;
 }
@@ -58,9 +60,7 @@ bool ConstraintProjection::apply(VectorXd& state) const {
 
 MatrixXd ConstraintProjection::metric(const Level& level, const MatrixXd& M) const {
   if (weights_.size() == 0) return M(level.free, level.free);
-  std::vector<int> entries = level.free;
-  for (int& entry : entries) entry += level.first;
-  return VectorXd(weights_(entries)).asDiagonal();
+  return VectorXd(weights_(level.entries)).asDiagonal();
 }
 
 bool ConstraintProjection::apply(const Level& level, VectorXd& state) const {
@@ -74,20 +74,30 @@ bool ConstraintProjection::apply(const Level& level, VectorXd& state) const {
   // the constraint as well; that part is taken back: x ← x + T (x_before − x). Repeated this leads to the nearest state, where
   // the way back is across the constraint.
   const auto n_rows = static_cast<Index>(level.rows.size());
-  std::vector<int> entries = level.free;
-  for (int& entry : entries) entry += level.first;
   constexpr int most_repetitions = 50;
   constexpr double nearest = 1e-10;  // of the way to the constraint
   for (int k = 0; k < (to_nearest ? most_repetitions : 1); ++k) {
     const SystemValues values = system_.evaluate(state, parameters_);
     const UdwadiaKalaba here = step_onto(metric(level, values.M(0)), values.A(0)(level.rows, level.free), VectorXd::Zero(n_rows));
     if (!here.motion_is_determined() || (here.rank() == n_rows && !to_nearest)) return true;
-    const VectorXd way = before(entries) - state(entries), back = here.T() * way;
-    state(entries) += back;
+    const VectorXd way = before(level.entries) - state(level.entries), back = here.T() * way;
+    state(level.entries) += back;
     newton(level, state);
     if (back.norm() <= nearest * way.norm()) break;
   }
   return true;
+}
+
+// Far from a solution a step may be many turns of an angle long, and end at one of them: the first turns none by more than a radian,
+// and each later one by twice as much at most.
+double ConstraintProjection::share_of_step(const Level& level, const Ref<const VectorXd>& step, int iteration) const {
+  if (level.first != system_.layout().q(0)) return 1;
+  double longest = 0;
+  for (std::size_t k = 0; k < level.free.size(); ++k) {
+    if (system_.coordinates()[static_cast<std::size_t>(level.free[k])].angle)
+      longest = std::max(longest, std::abs(step[static_cast<Index>(k)]));
+  }
+  return 1 / std::max(1.0, std::ldexp(longest, -iteration));
 }
 
 // x ← x − M⁻¹Aᵀ(A M⁻¹Aᵀ)⁺c, until c is rounding; x is q or dq, A = ∂c/∂q, which is also ∂ċ/∂dq
@@ -119,9 +129,7 @@ bool ConstraintProjection::newton(const Level& level, VectorXd& state) const {
 
     const UdwadiaKalaba step = step_onto(metric(level, values.M(0)), A(Eigen::all, level.free), c);
     if (!step.motion_is_determined()) fail(level, state);
-    for (std::size_t j = 0; j < level.free.size(); ++j) {
-      state[level.first + level.free[j]] -= step.Lb()[static_cast<Index>(j)];
-    }
+    state(level.entries) -= share_of_step(level, step.Lb(), iteration) * step.Lb();
   }
   fail(level, state);
 }

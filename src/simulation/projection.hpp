@@ -32,12 +32,14 @@ class ConstraintProjection {
     std::vector<int> residuals;  // among the system's
     std::vector<int> rows;       // of A, one per residual
     std::vector<int> free;       // coordinates whose q, or dq, may change
+    std::vector<int> entries;    // of the state, of these
     int first = 0;               // entry of the state of the first q, or dq
   };
   [[nodiscard]] Level level_of(bool velocity, const std::vector<bool>& held) const;
   bool apply(const Level& level, Eigen::VectorXd& state) const;
   /// M, or the weights of measured states, between the entries of a level that may change.
   [[nodiscard]] Eigen::MatrixXd metric(const Level& level, const Eigen::MatrixXd& M) const;
+  [[nodiscard]] double share_of_step(const Level& level, const Eigen::Ref<const Eigen::VectorXd>& step, int iteration) const;
   bool newton(const Level& level, Eigen::VectorXd& state) const;
   [[noreturn]] void fail(const Level& level, const Eigen::VectorXd& state) const;
 

@@ -1,5 +1,5 @@
 #include <algorithm>
-#include <functional>
+#include <cmath>
 #include <iterator>
 #include <optional>
 
@@ -42,27 +42,41 @@ Eigen::VectorXd complete_start(const Model& model, const Eigen::VectorXd& parame
                     listed(names, start.state, open), system.name()));
     return start.state;
   }
+  // coordinates first, then velocities there: what is given of one level says nothing against a solution of the other
+  const Eigen::Index nq = system.nq();
+  std::vector<bool> held = start.given;
+  std::fill(held.begin() + nq, held.begin() + 2 * nq, false);
   std::optional<Eigen::VectorXd> state;
   std::string why;
   const auto try_from = [&](double aside) {
     Eigen::VectorXd from = start.state;
-    for (const int k : open) from[k] += k < system.nq() ? aside : 0;
+    for (std::size_t n = 0; n < open.size() && open[n] < nq; ++n) from[open[n]] += aside * std::cos(2.0 * static_cast<double>(n));
     try {
-      const Eigen::VectorXd found = project_onto_constraints(system, parameters, from, start.given);
-      if (!state || (found - start.state).norm() < (*state - start.state).norm()) state = found;
+      const Eigen::VectorXd found = project_onto_constraints(system, parameters, from, held);
+      const auto distance = [&](const Eigen::VectorXd& one) { return (one - start.state).head(nq).norm(); };
+      if (!state || distance(found) < distance(*state)) state = found;
     } catch (const NumericalError& error) {
       if (why.empty()) why = error.what();
     }
   };
   try_from(0);
   // where a constraint has no slope in what is open, as a circle at its highest point, Newton's method leaves other starts
-  const bool is_of_velocities =
-      std::any_of(start.given.begin() + system.nq(), start.given.begin() + 2 * system.nq(), std::identity());
-  if (!state && !is_of_velocities) {
+  if (!state) {
     for (const double aside : {0.3, 1.0, -1.0}) try_from(aside);
   }
+  if (state) {
+    state->segment(nq, nq) = start.state.segment(nq, nq);
+    held = start.given;
+    std::fill(held.begin(), held.begin() + nq, true);
+    try {
+      state = project_onto_constraints(system, parameters, *state, held);
+    } catch (const NumericalError& error) {
+      state.reset();
+      why = error.what();
+    }
+  }
   if (!state) {
-    notes.push_back(fmt::format("`start`: what is given leaves no solution of the constraints ({})", why));
+    notes.push_back(fmt::format("warning: `start`: what is given leaves no solution of the constraints ({})", why));
     return start.state;
   }
   std::vector<int> solved;

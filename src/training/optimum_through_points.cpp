@@ -140,10 +140,10 @@ class TrainingThroughPoints {
                                       const std::vector<Hyperparameter>& hyperparameters) const {
     ModelValues values = model_values(prior_, observations, hyperparameters);
     const InducingOptions options{.most = options_.n_inducing};
-    const InducingChoice choice = choose_inducing_points(prior_, observations, values, options);
+    const InducingChoice choice = choose_inducing_points(prior_, observations, values, options, all_workers());
     // how strongly a latent acts that is not linear is known through points alone, and decides where they should be
     values.about = linearised(observations, hyperparameters, choice.points, all_workers());
-    return values.about ? choose_inducing_points(prior_, observations, values, options) : choice;
+    return values.about ? choose_inducing_points(prior_, observations, values, options, all_workers()) : choice;
   }
 
   // With the signals as they were at first that have all but vanished; none: there are no such.

@@ -1,6 +1,7 @@
 #include <cstdio>
 #include <regex>
 
+#include <fmt/format.h>
 #include <gmock/gmock.h>
 #include <gtest/gtest.h>
 
@@ -27,6 +28,20 @@ TEST(ExportedLoopExample, FollowsItsPathBetterByWhatWasLearned) {
 }
 
 using testing::HasSubstr;
+
+TEST(ExportCommand, NamesFunctionsAfterTheModelUnlessTheNameIsTaken) {
+  const Desk desk;
+  for (const auto& [system, name] : {std::pair("cart", "cart"), std::pair("w", "model_w"), std::pair("float", "model_float"),
+                                     std::pair("2 carts", "model_2_carts")}) {
+    desk.write("m.toml", fmt::format("name = '{}'\ncoordinates = ['x']\n[mechanics]\nmass = [['1']]\n[noise]\nddq = 0.1\n"
+                                     "[[latent]]\nfeatures = ['dx']\n",
+                                     system));
+    desk.write("log.csv", "x,dx,ddx\n0,1,2\n1,2,3\n2,4,3\n");
+    desk.done("gp2 fit m.toml --data log.csv --max-iterations 0 -o fit.json");
+    desk.done("gp2 export fit.json --no-std -o .");
+    EXPECT_THAT(desk.read(std::string(name) + ".h"), testing::HasSubstr(std::string(name) + "_mean("));
+  }
+}
 
 // A header of one fit with the source of another would compile, and answer wrongly.
 TEST(ExportCommand, ReplacesNoneOfItsFilesWhereOneCannotBeWritten) {

@@ -294,6 +294,28 @@ TEST(Inducing, AllOfManyStatesAreLearnedFromAndSomeAreKept) {
   EXPECT_TRUE(leave_out(grown, LeftOut::n_stretches).stretches.empty()) << "what came later is of no stretch";
 }
 
+// A fast move of a few states among many slow ones, of which those taken evenly are none.
+TEST(Inducing, WhatIsRareHasPointsOfItsOwn) {
+  Problem p = of_many_states(4'000);
+  const Observations& all = p.observations.front();
+  MatrixXd states = all.states();
+  const MatrixXd fast = states.middleCols(1'001, 9);
+  states *= 0.02;
+  states.middleCols(1'001, 9) = fast;
+  p.observations = {Observations(states, all.view(), all.values(), all.noise())};
+  const InducingOptions options{.n_candidates = 400};
+  const auto left_out = [&](const InducingChoice& choice) {
+    p.values.inducing = choice.points;
+    return left_out_by_points(p.prior, p.observations, p.values).sum();
+  };
+  const InducingChoice choice = choose_inducing_points(p.prior, p.observations, p.values, options);
+  EXPECT_LE(left_out(choice), 2 * options.left_out);
+  EXPECT_NEAR(choice.left_out, left_out(choice), options.left_out);
+  std::vector<int> slow;
+  for (int i = 0; i < 4'000; i += 10) slow.push_back(i);
+  EXPECT_GT(left_out(choose_inducing_points(p.prior, {p.observations.front().take(slow)}, p.values, options)), 10);
+}
+
 // The power of a Gaussian density is one of a larger noise, but for a constant.
 TEST(Inducing, WhatIsForgottenCountsAsIfItsNoiseHadBeenLarger) {
   int n_forgotten = 0;

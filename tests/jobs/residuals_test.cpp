@@ -6,9 +6,11 @@
 #include "gp2/jobs/check_job.hpp"
 #include "gp2/jobs/fit_job.hpp"
 #include "gp2/jobs/predict_job.hpp"
+#include "gp2/jobs/update_job.hpp"
 #include "gp2/simulation/generate.hpp"
 #include "gp2/simulation/model_motion.hpp"
 #include "jobs/data_of_model.hpp"
+#include "jobs/late_cart.hpp"
 #include "test_models.hpp"
 
 namespace gp2 {
@@ -292,6 +294,109 @@ TEST(Residuals, TellOfAnInputThatActsByItsSquareOrItsLogarithm) {
   EXPECT_THAT(notes, Not(Contains(HasSubstr("were not tested"))));
   data.states.row(driven.row_of(1)) *= -1;
   EXPECT_THAT(notes_of(notes_of_fit(data), "the input "), testing::ElementsAre(HasSubstr("input w: ")));
+}
+
+TEST(Residuals, TellOfNoiseThatIsStatedTooLarge) {
+  const Driven driven;
+  const Data data = driven.data(46);
+  const auto notes_under = [&](double noise) {
+    FitRequest request;
+    request.model = driven.model;
+    request.logs = {{data.table()}};
+    request.problem.mean = Prior::Mean::force;
+    request.problem.noise_stddev = noise;
+    request.restarts = 1;
+    return notes_of(run_fit(prepare_fit(std::move(request))).notes, "than the noise that is stated");
+  };
+  EXPECT_THAT(notes_under(0.05), testing::IsEmpty());
+  EXPECT_THAT(notes_under(0.05 * 0.2), testing::IsEmpty());
+  EXPECT_THAT(notes_under(0.05 * 5), testing::ElementsAre(testing::ContainsRegex("ddx \\(0.[1-4][0-9]* of the noise\\), ddy")));
+}
+
+TEST(Residuals, TellOfAnInputThatIsWrongInOneOfSeveralLogs) {
+  const Driven driven;
+  const std::vector<Data> sound = {driven.data(41), driven.data(42), driven.data(43)};
+  const auto notes_with = [&](const Data& second) {
+    FitRequest request;
+    request.model = driven.model;
+    request.logs = {{sound[0].table()}, {second.table()}, {sound[2].table()}};
+    request.problem.mean = Prior::Mean::force;
+    request.restarts = 1;
+    return notes_of(run_fit(prepare_fit(std::move(request))).notes, "warning: ");
+  };
+  EXPECT_THAT(notes_with(sound[1]), testing::IsEmpty());
+  Data turned = sound[1];
+  turned.states.row(driven.row_of(0)) *= -1;
+  EXPECT_THAT(notes_of(notes_with(turned), "likelihood"),
+              testing::ElementsAre(testing::AllOf(HasSubstr("input u of log 2: "), testing::ContainsRegex("acts -(1|0.9)"))));
+  Data lost = sound[1];
+  lost.states.row(driven.row_of(0)).setZero();
+  EXPECT_THAT(notes_of(notes_with(lost), "likelihood"),
+              testing::ElementsAre(testing::AllOf(HasSubstr("log 2 contradicts the others"),
+                                                  HasSubstr("Its input u is 0 in every row: was it logged?"))));
+  Data heavier = sound[1];  // by a half
+  heavier.accelerations /= 1.5;
+  EXPECT_THAT(notes_of(notes_with(heavier), "likelihood"), Contains(HasSubstr("log 2 contradicts the others")));
+  // nobody turned the motor on
+  std::string text = driven.model.text;
+  text.replace(text.find("u  = [-3, 3]"), 12, "u  = \"0\"");
+  Driven idle;
+  idle.model = Model::parse(text, "driven.toml");
+  EXPECT_THAT(notes_with(idle.data(42)), testing::IsEmpty());
+}
+
+TEST(Residuals, TellOfSingleValuesThatAreFarOff) {
+  for (const std::uint64_t seed : {48U, 49U}) {
+    Data data = test::drawn_log("models/surface.toml", 150, seed);
+    EXPECT_THAT(notes_of_fit(data), Not(Contains(HasSubstr("of the values lie"))));
+    data.accelerations(1, 17) += 20 * 0.1;
+    EXPECT_THAT(notes_of(notes_of_fit(data), "of the values lie"),
+                testing::ElementsAre(testing::AllOf(testing::StartsWith("warning: "),
+                                                    HasSubstr("(ddq2, at row 18 of what is learned from log 1)"))));
+  }
+}
+
+TEST(Residuals, TellOfAnInputThatActsLate) {
+  const auto notes_of_delay = [](double delay, double lag, std::optional<int> max_points = {}) {
+    FitRequest request;
+    request.model = test::late_cart("'u'");
+    request.logs = {{test::late_cart_log(delay, lag, 100, 2, 47)}};
+    request.problem.mean = Prior::Mean::force;
+    request.problem.max_points = max_points;
+    request.restarts = 1;
+    return notes_of(run_fit(prepare_fit(std::move(request))).notes, "the input ");
+  };
+  EXPECT_THAT(notes_of_delay(0, 0), testing::IsEmpty());
+  EXPECT_THAT(notes_of_delay(0.001, 0), testing::IsEmpty()) << "a tenth of a row";
+  EXPECT_THAT(notes_of_delay(0.04, 0), testing::ElementsAre(HasSubstr("where it acts 4 rows later than logged")));
+  EXPECT_THAT(notes_of_delay(0.02, 0.02), testing::ElementsAre(HasSubstr("where it acts 4 rows later than logged")));
+  EXPECT_THAT(notes_of_delay(0.04, 0, 150), Not(Contains(HasSubstr("rows later")))) << "rows in no order";
+}
+
+TEST(Residuals, TellOfRowsThatStandInTwoLogs) {
+  const Driven driven;
+  const Data data = driven.data(44), other = driven.data(45);
+  const auto notes_with = [&](const Data& second) {
+    FitRequest request;
+    request.model = driven.model;
+    request.logs = {{data.table()}, {second.table()}};
+    request.max_iterations = 0;
+    return notes_of(prepare_fit(std::move(request)).notes, "stand in another log");
+  };
+  EXPECT_THAT(notes_with(other), testing::IsEmpty());
+  // the second half from its end, as a log of its own
+  Data half = data;
+  half.states = data.states.rightCols(30).rowwise().reverse();
+  half.accelerations = data.accelerations.rightCols(30).rowwise().reverse();
+  EXPECT_THAT(notes_with(half), testing::ElementsAre(testing::StartsWith("warning: 30 of 90 rows stand in another log too")));
+  FitRequest request;
+  request.model = driven.model;
+  request.logs = {{data.table()}};
+  request.max_iterations = 0;
+  const FitOutcome outcome = run_fit(prepare_fit(std::move(request)));
+  EXPECT_THAT(update(outcome.file, {half.table()}, {}).notes,
+              Contains(testing::StartsWith("warning: 30 of 30 rows stand in another log too")));
+  EXPECT_THAT(update(outcome.file, {other.table()}, {}).notes, Not(Contains(HasSubstr("stand in another log"))));
 }
 
 TEST(Residuals, TellOfAnInputBesideViewsThatHaveNoMean) {

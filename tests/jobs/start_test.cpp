@@ -87,7 +87,39 @@ position = ["x^2 + y^2 - l^2"]
   EXPECT_LE(std::abs(job.start[2]), 3.2);
   request.start = std::map<std::string, double>{{"x", 1.2}};
   job = prepare_simulation(model, request);
-  EXPECT_THAT(job.notes, Contains(HasSubstr("`start`: what is given leaves no solution of the constraints")));
+  EXPECT_THAT(job.notes, Contains(HasSubstr("warning: `start`: what is given leaves no solution of the constraints")));
+}
+
+// what is given of a velocity says nothing against a solution of the coordinates
+TEST(StartOfALog, IsFoundWhereACoordinateAndVelocitiesAreGiven) {
+  SimulateRequest request;
+  request.times = VectorXd::LinSpaced(2, 0, 0.1);
+  for (const double da : {0.0, 0.7}) {
+    request.start = std::map<std::string, double>{{"y", -0.3}, {"da", da}};
+    const SimulateJob job = prepare_simulation(wire_pendulum(""), request);
+    EXPECT_EQ(job.start[1], -0.3);
+    EXPECT_EQ(job.start[5], da);
+    EXPECT_NEAR(std::cos(job.start[2]), 0.3 / 1.1, 1e-14);
+    EXPECT_NEAR(job.start[3], 0.3 * da, 1e-14);
+    EXPECT_THAT(job.notes, testing::Not(Contains(HasSubstr("no solution"))));
+  }
+}
+
+// an angle of many turns where that is the solution
+TEST(StartOfALog, MayBeManyTurnsAway) {
+  const Model model = Model::parse(R"toml(
+coordinates = ["z", { name = "a", angle = true }]
+[mechanics]
+mass  = [["1", "0"], ["0", "1"]]
+force = ["0", "0"]
+[constraints]
+position = ["z - 0.01*a"]
+)toml",
+                                   "winch.toml");
+  SimulateRequest request;
+  request.start = std::map<std::string, double>{{"z", 30}};
+  request.times = VectorXd::LinSpaced(2, 0, 0.1);
+  EXPECT_NEAR(prepare_simulation(model, request).start[1], 3000, 1e-10);
 }
 
 }  // namespace

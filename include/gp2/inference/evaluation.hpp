@@ -90,11 +90,17 @@ struct TrainingResidual {
   double rms = 0;                 // of z
   double coverage95 = 0;          // share of |z| below 1.96
   double serial_correlation = 0;  // of z from one state to the next, in the order of the observations
+  double rms_in_noise = 0;        // of (y − mean)/σ, of which the noise alone makes 1
+  int n_far = 0;                  // values that are farther off than six times what half of them are within makes of a deviation
+  double farthest = 0;            // of |z|
+  int farthest_state = -1;        // of the observations; −1 where only some states are kept
 
   /// Whether z is larger than chance and fitted hyperparameters make it.
   [[nodiscard]] bool is_too_large() const;
   /// Whether z goes on from state to state: the states follow each other in time, and something is missing that lasts longer.
   [[nodiscard]] bool is_correlated() const;
+  /// Whether the errors are far smaller than the noise that they have in them is said to be.
+  [[nodiscard]] bool is_too_small() const;
 };
 
 /// How well a fit predicts its own data where it has not seen them, under the hyperparameters that it has from all of them.

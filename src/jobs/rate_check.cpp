@@ -1,0 +1,194 @@
+#include "jobs/rate_check.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <numbers>
+#include <optional>
+
+#include <fmt/format.h>
+#include <fmt/ranges.h>
+
+#include "base/not_a_number.hpp"
+#include "gp2/base/statistics.hpp"
+
+namespace gp2 {
+
+using Eigen::ArrayXd;
+using Eigen::Index;
+using Eigen::RowVectorXd;
+
+namespace {
+
+constexpr double surely_correlated = 0.95;
+constexpr Index enough_steps = 50;  // that a lag stands out
+
+// What nine of ten numbers are not above, by size.
+double most_are_below(const ArrayXd& numbers) {
+  if (numbers.size() == 0) return 0;
+  std::vector<double> sizes(static_cast<std::size_t>(numbers.size()));
+  ArrayXd::Map(sizes.data(), numbers.size()) = numbers.abs();
+  const auto at = sizes.begin() + static_cast<std::ptrdiff_t>(0.9 * static_cast<double>(sizes.size() - 1));
+  std::nth_element(sizes.begin(), at, sizes.end());
+  return *at;
+}
+
+// Column and rate over steps of some rows: y = Δvalue, x = ∫ rate dt, d = Δrate, h = Δt.
+struct Steps {
+  ArrayXd y, x, d, h;
+  Index n_turns = 0;  // of an angle, rows that are more than a quarter turn apart
+
+  [[nodiscard]] Index n() const { return y.size(); }
+  /// One wrong value in a thousand may make more than all others together: steps go that are far larger than those before and behind.
+  void leave_out_jumps() {
+    constexpr double far = 5,
+                     alone = 3;  // times what nine of ten steps are below; times the neighbours, past the step next to it
+    ArrayXd size = ArrayXd::Zero(n());
+    for (const ArrayXd* const one : {&x, &y, &d}) {
+      const double usual = most_are_below(*one);
+      if (usual > 0) size = size.max(one->abs() / usual);
+    }
+    std::vector<Index> kept;
+    for (Index i = 0; i < n(); ++i) {
+      double beside = 0;
+      for (const Index k : {i - 3, i - 2, i + 2, i + 3}) beside = std::max(beside, k < 0 || k >= n() ? 0 : size[k]);
+      if (size[i] <= std::max(far, alone * beside)) kept.push_back(i);
+    }
+    for (ArrayXd* const one : {&y, &x, &d, &h}) *one = ArrayXd((*one)(kept));
+  }
+  [[nodiscard]] double correlation() const {
+    const double scale = std::sqrt(x.square().sum() * y.square().sum());
+    return scale > 0 ? (x * y).sum() / scale : 0;
+  }
+  [[nodiscard]] double slope() const { return (x * y).sum() / x.square().sum(); }
+  /// Whether they tell anything: many count, and the rate changes by less than a share of its size from step to step. With all of it an
+  /// oscillation has six steps a period, with half of it twelve.
+  [[nodiscard]] bool tell(double share) const {
+    const double xx = x.square().sum();
+    return n() >= 20 && xx * xx > 8 * x.pow(4).sum() && (d * h).square().sum() < share * share * xx && 10 * n_turns < n();
+  }
+};
+
+class RateRows {
+ public:
+  explicit RateRows(const RateColumns& columns) : columns_(columns) {
+    const RowVectorXd& t = columns.t;
+    const Index n = t.size() - 1;
+    lengths_ = (t.tail(n) - t.head(n)).transpose();
+    usual_length_ = median({lengths_.begin(), lengths_.end()});
+    changes_ = (columns.value.tail(n) - columns.value.head(n)).transpose();
+    constexpr double turn = 2 * std::numbers::pi, noise = 0.5;
+    if (!columns.is_angle || columns.value.maxCoeff() - columns.value.minCoeff() > turn + noise) return;
+    for (double& change : changes_) change = std::remainder(change, turn);
+    is_large_turn_ = changes_.abs() > turn / 4;
+  }
+
+  [[nodiscard]] double usual_length() const { return usual_length_; }
+  /// Whether so many rows are so long a time.
+  [[nodiscard]] bool are_regular() const { return 10 * ((lengths_ / usual_length_ - 1).abs() > 0.1).count() < lengths_.size(); }
+
+  /// @param lag  rows by which the rate is late
+  [[nodiscard]] Steps steps(std::size_t rate, Index lag, Index rows) const {
+    const RowVectorXd& r = columns_.rates[rate];
+    const Index first = std::max<Index>(0, -lag), end = changes_.size() - std::max<Index>(0, lag);
+    Steps steps;
+    for (ArrayXd* const one : {&steps.y, &steps.x, &steps.d, &steps.h}) one->resize(changes_.size() / rows);
+    Index n = 0;
+    for (Index i = first; i + rows <= end; i += rows) {
+      double integral = 0;
+      for (Index k = i; k < i + rows; ++k) integral += 0.5 * (r[k + lag] + r[k + 1 + lag]) * length(k);
+      const double change = changes_.segment(i, rows).sum();
+      if (!std::isfinite(integral) || !std::isfinite(change)) continue;
+      if (is_large_turn_.size() > 0) steps.n_turns += is_large_turn_.segment(i, rows).count();
+      steps.y[n] = change;
+      steps.x[n] = integral;
+      steps.d[n] = r[i + rows + lag] - r[i + lag];
+      steps.h[n] = lengths_.segment(i, rows).sum();
+      ++n;
+    }
+    for (ArrayXd* const one : {&steps.y, &steps.x, &steps.d, &steps.h}) one->conservativeResize(n);
+    steps.leave_out_jumps();
+    return steps;
+  }
+
+ private:
+  /// NaN where the log pauses
+  [[nodiscard]] double length(Index row) const { return lengths_[row] > 1.5 * usual_length_ ? not_a_number : lengths_[row]; }
+
+  const RateColumns& columns_;
+  ArrayXd lengths_, changes_;
+  Eigen::Array<bool, Eigen::Dynamic, 1> is_large_turn_;
+  double usual_length_ = 0;
+};
+
+// The time τ by which a rate is late: y = s (x + τ d), to first order. Nothing where it does not stand out of its deviation, by
+// stretches of the log, changes the rate by less than a tenth of its size, or is no longer than the least: where a rate jumps, rows do
+// not tell when between them.
+std::optional<double> lateness(const Steps& steps, double least) {
+  constexpr Index n_stretches = 10;
+  constexpr double large = 0.1, deviations = 5;
+  if (steps.n() < enough_steps) return std::nullopt;
+  const auto beside = [&](const ArrayXd& of) -> ArrayXd { return of - (of * steps.x).sum() / steps.x.square().sum() * steps.x; };
+  const ArrayXd y = beside(steps.y) / steps.slope(), d = beside(steps.d);
+  const double dd = d.square().sum(), tau = (y * d).sum() / dd;
+  double variance = 0;
+  for (Index k = 0; k < n_stretches; ++k) {
+    const Index first = k * steps.n() / n_stretches, n = (k + 1) * steps.n() / n_stretches - first;
+    variance += std::pow(((y - tau * d) * d).segment(first, n).sum() / dd, 2);
+  }
+  const double changed = std::abs(tau) * std::sqrt(dd / steps.x.square().sum());
+  if (!(changed > large && std::abs(tau) > std::max(least, deviations * std::sqrt(variance)))) return std::nullopt;
+  return tau;
+}
+
+// Whether y = s x with s far from 1: beyond what noise of x, and integrals by trapezoids, make of it.
+bool is_scaled(const Steps& steps) {
+  constexpr double large = 0.1;
+  const double of_noise = 1 - std::pow(steps.correlation(), 2);
+  const double of_trapezoids = (steps.d * steps.h).square().sum() / (12 * steps.x.square().sum());
+  return std::abs(steps.slope() - 1) > large + 2 * (of_noise + of_trapezoids);
+}
+
+}  // namespace
+
+std::string better_rate(const RateColumns& columns) {
+  const std::size_t own = columns.own;
+  const RateRows rows(columns);
+  // noise hides less of a longer step
+  Index length = 1;
+  while (columns.t.size() > 2 * length * enough_steps && rows.steps(own, 0, 2 * length).tell(0.5)) length *= 2;
+  const Steps now = rows.steps(own, 0, length);
+  if (!now.tell(1)) return "";
+  const auto is_sure = [](const Steps& steps) { return steps.tell(1) && std::abs(steps.correlation()) > surely_correlated; };
+  std::optional<Index> lag;
+  if (is_sure(now)) lag = 0;
+  double best = 1 - 0.1 * (1 - std::abs(now.correlation()));
+  const Index stride = std::max<Index>(1, length / 2);
+  for (Index other = -12 * stride; other <= 12 * stride && lag != 0 && rows.are_regular(); other += stride) {
+    const Steps steps = rows.steps(own, other, length);
+    if (!is_sure(steps) || std::abs(steps.correlation()) <= best) continue;
+    best = std::abs(steps.correlation());
+    lag = other;
+  }
+  if (lag) {
+    const Steps steps = rows.steps(own, *lag, length);
+    const double tau = static_cast<double>(*lag) * rows.usual_length() + lateness(steps, 0.75 * rows.usual_length()).value_or(0);
+    std::vector<std::string> texts;
+    if (is_scaled(steps))
+      texts.push_back(fmt::format("it is {:.3g} × what is measured: a unit or a sign, or the clock", steps.slope()));
+    if (tau != 0) {
+      texts.push_back(fmt::format("the column {} by {:.2g} s, {:.2g} of the log's steps, or {} {}", tau > 0 ? "lags" : "leads",
+                                  std::abs(tau), std::abs(tau) / rows.usual_length(), columns.name, tau > 0 ? "leads" : "lags"));
+    }
+    return fmt::format("{}", fmt::join(texts, "; "));
+  }
+  for (std::size_t other = 0; other < columns.rates.size(); ++other) {
+    if (other == own || columns.rates[other].hasNaN()) continue;
+    const Steps steps = rows.steps(other, 0, length);
+    if (is_sure(steps) && std::abs(now.correlation()) < 0.5) {
+      return fmt::format("it is measured by the column of {}: swapped?", columns.names[other]);
+    }
+  }
+  return "";
+}
+
+}  // namespace gp2

@@ -1,0 +1,109 @@
+#include "jobs/rate_check.hpp"
+
+#include <cmath>
+#include <numbers>
+#include <random>
+
+#include <gmock/gmock.h>
+#include <gtest/gtest.h>
+
+#include "base/not_a_number.hpp"
+
+namespace gp2 {
+
+namespace {
+
+using Eigen::Index;
+using Eigen::RowVectorXd;
+using testing::HasSubstr;
+using testing::IsEmpty;
+
+// Two seconds' and five seconds' swings, and what logs make of them.
+struct Swing {
+  double dt = 0.01;
+  Index n = 3000;
+  double noise = 0;  // of value and rate
+  double late = 0;   // the rate [s]
+  double factor = 1;
+  unsigned seed = 1;
+  double outliers = 0;  // of value, at three rows
+
+  [[nodiscard]] std::string text(bool wraps = false) const {
+    std::mt19937 random(seed);
+    std::normal_distribution<double> normal(0, noise);
+    const double fast = std::numbers::pi, slow = 0.4 * std::numbers::pi;
+    RowVectorXd t(n), value(n);
+    std::vector<RowVectorXd> rates(2, RowVectorXd(n));
+    for (Index i = 0; i < n; ++i) {
+      const double now = t[i] = dt * static_cast<double>(i), then = now - late;
+      value[i] = std::sin(fast * now) + std::cos(slow * now) + (wraps ? now : 0) + normal(random);
+      rates[0][i] = std::cos(now * now / 9);
+      rates[1][i] = factor * (fast * std::cos(fast * then) - slow * std::sin(slow * then) + (wraps ? 1 : 0)) + normal(random);
+      if (i % 1'000 == 500) value[i] += outliers;
+      if (wraps) value[i] = std::remainder(value[i], 2 * std::numbers::pi);
+    }
+    const std::vector<std::string> names = {"dx", "dy"};
+    return better_rate({t, "y", value, wraps, rates, names, 1});
+  }
+};
+
+TEST(RateCheck, SoundColumnsPass) {
+  for (const double dt : {0.001, 0.01, 0.1}) {
+    for (const double noise : {0.0, 0.01, 0.1}) {
+      for (unsigned seed = 1; seed <= 10; ++seed) {
+        EXPECT_THAT((Swing{.dt = dt, .noise = noise, .seed = seed}.text()), IsEmpty()) << dt << ' ' << noise << ' ' << seed;
+      }
+    }
+  }
+  EXPECT_THAT((Swing{.noise = 0.01}.text(true)), IsEmpty());
+  EXPECT_THAT((Swing{.dt = 0.5}.text()), IsEmpty()) << "four rows a period tell nothing";
+}
+
+TEST(RateCheck, ALagIsNamedHoweverFineTheLog) {
+  for (const double late : {0.08, -0.08, 0.2, -0.2}) {
+    for (const double dt : {0.001, 0.01, 0.04}) {
+      for (const double noise : {0.0, 0.01}) {
+        const std::string text = Swing{.dt = dt, .noise = noise, .late = late}.text();
+        EXPECT_THAT(text, HasSubstr(late > 0 ? "the column lags by" : "the column leads by"))
+            << dt << ' ' << noise << ' ' << late;
+        const double found = std::stod(text.substr(text.find("by") + 2));
+        EXPECT_NEAR(found, std::abs(late), 0.3 * std::abs(late)) << dt << ' ' << noise << ' ' << text;
+      }
+    }
+  }
+  EXPECT_THAT((Swing{.late = 0.005}.text()), IsEmpty()) << "half a row of a fine log changes nothing";
+}
+
+TEST(RateCheck, AFactorIsNamedUnderNoiseThatHidesSingleRows) {
+  EXPECT_THAT((Swing{.dt = 0.001, .noise = 0.01, .factor = -1}.text()), HasSubstr("it is -"));
+  EXPECT_THAT((Swing{.dt = 0.001, .noise = 0.01, .factor = 180 / std::numbers::pi}.text()), HasSubstr("it is 0.017"));
+}
+
+TEST(RateCheck, FewWrongValuesSayNothingOfTheirColumn) {
+  for (const double outliers : {0.5, -3.0, 30.0, 1e4}) {
+    EXPECT_THAT((Swing{.noise = 0.01, .outliers = outliers}.text()), IsEmpty()) << outliers;
+    EXPECT_THAT((Swing{.noise = 0.01, .factor = 57, .outliers = outliers}.text()), HasSubstr("it is 0.017")) << outliers;
+    EXPECT_THAT((Swing{.noise = 0.01, .late = 0.1, .outliers = outliers}.text()), HasSubstr("lags by 0.1")) << outliers;
+  }
+}
+
+TEST(RateCheck, AFactorAndALagAreBothNamed) {
+  EXPECT_THAT((Swing{.factor = 1.2}.text()), HasSubstr("it is 0.83"));
+  EXPECT_THAT((Swing{.factor = 1.02}.text()), IsEmpty());
+  EXPECT_THAT((Swing{.late = 0.1, .factor = 57}.text()),
+              testing::AllOf(HasSubstr("it is 0.016"), HasSubstr("; the column lags by 0.1")));
+}
+
+TEST(RateCheck, AnotherColumnIsNamed) {
+  const RowVectorXd t = RowVectorXd::LinSpaced(1000, 0, 10);
+  const RowVectorXd value = (3 * t.array()).sin();
+  std::vector<RowVectorXd> rates = {3 * (3 * t.array()).cos(), (7 * t.array()).cos()};
+  const std::vector<std::string> names = {"dx", "dy"};
+  EXPECT_THAT(better_rate({t, "y", value, false, rates, names, 1}), HasSubstr("dx: swapped?"));
+  rates[1].segment(300, 100).setConstant(not_a_number);
+  EXPECT_THAT(better_rate({t, "y", value, false, rates, names, 0}), IsEmpty()) << "of another column";
+}
+
+}  // namespace
+
+}  // namespace gp2
