@@ -485,8 +485,9 @@ TEST(CSourceTest, SaysWhatCannotBeWritten) {
   const View view = View::constrained_acceleration(*p.prior.system);
   CSourceOptions options;
   options.name = "double";
-  EXPECT_THAT(input_error_of([&] { static_cast<void>(export_c(test::posterior_of(p), view, options)); }),
-              HasSubstr("`name`: must be a name of C, of letters, digits and _, got 'double'"));
+  EXPECT_THAT(
+      input_error_of([&] { static_cast<void>(export_c(test::posterior_of(p), view, options)); }),
+      HasSubstr("`name`: must be a name of C, of letters, digits and _, that the code does not use itself, got 'double'"));
   EXPECT_THAT(input_error_of([&] { static_cast<void>(export_c(test::posterior_of(p).without_data(), view)); }),
               HasSubstr("export to C: nothing was observed"));
 
