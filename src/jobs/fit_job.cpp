@@ -453,6 +453,7 @@ FitOutcome run_once(const FitJob& job, const std::function<void(const Progress&)
       quick.n_restarts = 1;
       quick.max_iterations = 50;
       quick.max_escapes = 0;
+      quick.standard_errors = false;
       quick.n_threads = options.n_threads;
       quick.stop = stop;
       add_doubts(

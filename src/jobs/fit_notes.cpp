@@ -95,13 +95,14 @@ struct InputEffect {
     int rows;
     std::vector<MatrixXd> changed;  // (d × N)
   };
+  int input;
   std::string name;
   std::vector<MatrixXd> added;  // (d × N)
   std::vector<Late> late = {};
 
   // of one log
   [[nodiscard]] InputEffect in_log(std::size_t group) const {
-    InputEffect one{fmt::format("{} of log {}", name, group + 1), added};
+    InputEffect one{input, fmt::format("{} of log {}", name, group + 1), added};
     for (std::size_t g = 0; g < added.size(); ++g) {
       if (g != group) one.added[g].setZero();
     }
@@ -124,7 +125,7 @@ std::optional<InputEffect> effect_of(const Posterior& posterior, const std::vect
   const System& system = *posterior.prior().system;
   const int row = system.layout().u(input);
   const std::vector<Observations>& all = posterior.observations();
-  InputEffect effect{system.inputs()[static_cast<std::size_t>(input)], {}};
+  InputEffect effect{input, system.inputs()[static_cast<std::size_t>(input)], {}};
   std::vector<MatrixXd> as_logged;
   for (const Observations& group : some) {
     MatrixXd states = group.states();
@@ -195,10 +196,9 @@ struct Doubt {
 using Cost = std::function<double(const std::vector<Observations>&)>;
 
 // The most that can be said of an input; no gain: nothing.
-Doubt doubt_of(const InputEffect& input, const std::vector<Observations>& observations, const Cost& cost) {
+Doubt doubt_of(const InputEffect& input, const std::vector<Observations>& observations, double as_logged, const Cost& cost) {
   constexpr double far = 0.5, sure = 5;  // from a factor of 1; deviations
   const auto with_factor = [&](double factor) { return without_change(observations, input.added, factor - 1); };
-  const double as_logged = cost(observations);
   Doubt doubt;
   const InputFactor one = likeliest_factor(cost(with_factor(0)), as_logged, cost(with_factor(2)));
   if (std::abs(one.factor - 1) > std::max(far, sure * one.stddev)) {
@@ -212,7 +212,9 @@ Doubt doubt_of(const InputEffect& input, const std::vector<Observations>& observ
     doubt = {gain,
              fmt::format("{} row{} {} than logged", std::abs(late.rows), std::abs(late.rows) == 1 ? "" : "s",
                          late.rows > 0 ? "later" : "earlier"),
-             "It has a delay or a lag that the model lacks, or a column lags", std::move(mended)};
+             late.rows > 0 ? "It has a delay or a lag that the model lacks, or its column leads"
+                           : "Its column lags, or the others lead",
+             std::move(mended)};
   }
   return doubt;
 }
@@ -227,12 +229,15 @@ std::vector<Observations> with_log(const std::vector<Observations>& observations
   return out;
 }
 
-// By how much a log and the others are likelier under functions of their own than under one.
-double gain_of_contradiction(const std::vector<Observations>& observations, std::size_t log, const Cost& cost) {
+// Whether a log and another one measure something.
+bool can_contradict(const std::vector<Observations>& observations, std::size_t log) {
   const auto tells = [](const Observations& group) { return group.view().is_of_ddq() && !group.values().array().isNaN().all(); };
-  if (!tells(observations[log]) || std::ranges::count_if(observations, tells) < 2) return 0;
-  return cost(observations) - cost(with_log(observations, log, /*alone=*/false)) -
-         cost(with_log(observations, log, /*alone=*/true));
+  return tells(observations[log]) && std::ranges::count_if(observations, tells) > 1;
+}
+
+// By how much a log and the others are likelier under functions of their own than under one.
+double gain_of_contradiction(const std::vector<Observations>& observations, std::size_t log, double together, const Cost& cost) {
+  return together - cost(with_log(observations, log, /*alone=*/false)) - cost(with_log(observations, log, /*alone=*/true));
 }
 
 // An input of the known force that is the same in all rows of a log and moves in others; none: −1.
@@ -242,8 +247,10 @@ int resting_input(const Posterior& posterior, std::size_t log) {
   const std::vector<bool> force = system.reads(SystemPart::force);
   for (int j = 0; j < system.layout().nu; ++j) {
     const int row = system.layout().u(j);
-    const double u = all[log].states()(row, 0);
-    const auto moves = [&](const Observations& group) { return (group.states().row(row).array() != u).any(); };
+    const auto moves = [&](const Observations& group) {
+      const auto u = group.states().row(row);
+      return u.size() > 0 && (u.array() != u[0]).any();
+    };
     if (force[static_cast<std::size_t>(row)] && !moves(all[log]) && std::any_of(all.begin(), all.end(), moves)) return j;
   }
   return -1;
@@ -273,9 +280,10 @@ Cost cost_under(const Prior& prior, ModelValues values) {
 void note_lost_inputs(const Posterior& posterior, std::vector<Observations>& observations, const FittedValues& fitted_values,
                       std::vector<std::string>& notes) {
   for (std::size_t g = 0; g < observations.size(); ++g) {
-    if (resting_input(posterior, g) < 0) continue;
+    if (!can_contradict(observations, g) || resting_input(posterior, g) < 0) continue;
     std::vector<Observations> others = with_log(observations, g, /*alone=*/false);
-    const double gain = gain_of_contradiction(observations, g, cost_under(posterior.prior(), fitted_values(others)));
+    const Cost cost = cost_under(posterior.prior(), fitted_values(others));
+    const double gain = gain_of_contradiction(observations, g, cost(observations), cost);
     if (gain <= least_gain) continue;
     note_contradiction(posterior, g, gain, notes);
     observations = std::move(others);
@@ -287,17 +295,19 @@ void note_doubts(const Posterior& posterior, std::vector<Observations> observati
                  bool asks_logs, std::vector<std::string>& notes) {
   const Cost cost = cost_under(posterior.prior(), posterior.values());
   for (;;) {
+    const double as_logged = cost(observations);
     Doubt worst;
     worst.gain = least_gain;
     std::ptrdiff_t of_input = -1, of_log = -1;
     for (std::size_t k = 0; k < inputs.size(); ++k) {
-      Doubt doubt = doubt_of(inputs[k], observations, cost);
+      Doubt doubt = doubt_of(inputs[k], observations, as_logged, cost);
       if (!(doubt.gain > worst.gain)) continue;
       worst = std::move(doubt);
       of_input = static_cast<std::ptrdiff_t>(k);
     }
     for (std::size_t g = 0; g < observations.size() && asks_logs; ++g) {
-      const double gain = gain_of_contradiction(observations, g, cost);
+      if (!can_contradict(observations, g)) continue;
+      const double gain = gain_of_contradiction(observations, g, as_logged, cost);
       if (!(gain > worst.gain)) continue;
       worst.gain = gain;
       of_log = static_cast<std::ptrdiff_t>(g);
@@ -306,12 +316,13 @@ void note_doubts(const Posterior& posterior, std::vector<Observations> observati
       note_contradiction(posterior, static_cast<std::size_t>(of_log), worst.gain, notes);
       observations = with_log(observations, static_cast<std::size_t>(of_log), /*alone=*/false);
     } else if (of_input >= 0) {
-      const auto input = inputs.begin() + of_input;
+      const InputEffect& input = inputs[static_cast<std::size_t>(of_input)];
       notes.push_back(fmt::format(
           "warning: the data deny the input {}: they are most likely where it acts {}, by {:.2g} in log likelihood. {}",
-          input->name, worst.how, worst.gain, worst.cause));
+          input.name, worst.how, worst.gain, worst.cause));
       observations = std::move(worst.mended);
-      inputs.erase(input);
+      // what else is said of it is said of an input that acts so
+      std::erase_if(inputs, [said = input.input](const InputEffect& one) { return one.input == said; });
     } else {
       return;
     }
@@ -335,7 +346,9 @@ void add_doubts(const Posterior& posterior, bool has_row_order, const FittedValu
   const bool asks_logs = asks && !of_windows && all.size() > 1 && all.size() <= most_logs;
   const int n_some = enough / system.nq();
   std::vector<Observations> some = of_windows ? all : evenly(all, n_some);
-  const auto taken = has_row_order && !of_windows ? evenly_taken(all, n_some) : std::vector<std::vector<int>>();
+  // of many states some are kept, which do not follow each other
+  const bool are_all = posterior.n_states() == n_states(all);
+  const auto taken = has_row_order && are_all && !of_windows ? evenly_taken(all, n_some) : std::vector<std::vector<int>>();
   const std::vector<bool> force = system.reads(SystemPart::force), elsewhere = system.reads(SystemPart::mechanics);
   // a latent that reads an input takes up what it does otherwise
   const auto is_learned = [&](int row) {
@@ -345,7 +358,7 @@ void add_doubts(const Posterior& posterior, bool has_row_order, const FittedValu
   for (int j = 0; j < layout.nu && prior.mean == Prior::Mean::force; ++j) {
     const int row = layout.u(j);
     if (!force[static_cast<std::size_t>(row)]) continue;
-    const double first = all.front().states()(row, 0);
+    const double first = all.front().n_data() > 0 ? all.front().states()(row, 0) : 0;
     if (!any([&](const auto& group) { return (group.states().row(row).array() != first).any(); })) {
       notes.push_back(fmt::format("the input {} is {:.4g} in every row: was it logged?",
                                   system.inputs()[static_cast<std::size_t>(j)], first));

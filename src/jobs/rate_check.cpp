@@ -161,12 +161,13 @@ std::string better_rate(const RateColumns& columns) {
   const auto is_sure = [](const Steps& steps) { return steps.tell(1) && std::abs(steps.correlation()) > surely_correlated; };
   std::optional<Index> lag;
   if (is_sure(now)) lag = 0;
-  double best = 1 - 0.1 * (1 - std::abs(now.correlation()));
+  double best = 1 - 0.1 * (1 - now.correlation());
   const Index stride = std::max<Index>(1, length / 2);
   for (Index other = -12 * stride; other <= 12 * stride && lag != 0 && rows.are_regular(); other += stride) {
     const Steps steps = rows.steps(own, other, length);
-    if (!is_sure(steps) || std::abs(steps.correlation()) <= best) continue;
-    best = std::abs(steps.correlation());
+    // half a period and the other sign are alike: the sign is believed
+    if (!is_sure(steps) || steps.correlation() <= std::max(best, 0.0)) continue;
+    best = steps.correlation();
     lag = other;
   }
   if (lag) {

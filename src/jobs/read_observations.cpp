@@ -440,6 +440,9 @@ int n_repeated_rows(const std::vector<MeasuredRows>& logs) {
     return 0;
   };
   std::vector<Row> rows;
+  std::ptrdiff_t n_rows = 0;
+  for (const MeasuredRows& log : logs) n_rows += log.states.cols();
+  rows.reserve(static_cast<std::size_t>(n_rows));
   for (const MeasuredRows& log : logs) {
     for (Index i = 0; i < log.states.cols(); ++i) {
       Row& row = rows.emplace_back(Row{&log, i});
@@ -466,6 +469,7 @@ void note_shared_rows(const std::vector<Observations>& known, const std::vector<
     }
     return all.size() < 2 ? 0 : n + n_repeated_rows(all);
   };
+  if (known.size() + more.size() < 2) return;
   std::vector<const Observations*> groups;
   for (const Observations& group : known) groups.push_back(&group);
   const int n_before = n_shared(groups);

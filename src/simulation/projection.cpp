@@ -88,8 +88,8 @@ bool ConstraintProjection::apply(const Level& level, VectorXd& state) const {
   return true;
 }
 
-// Far from a solution a step may be many turns of an angle long, and end at one of them: the first turns none by more than a radian,
-// and each later one by twice as much at most.
+// Far from a solution a Newton step may turn an angle many times and end at a distant solution. The first step turns no angle by more
+// than 1 rad, each later one by at most twice as much as the one before.
 double ConstraintProjection::share_of_step(const Level& level, const Ref<const VectorXd>& step, int iteration) const {
   if (level.first != system_.layout().q(0)) return 1;
   double longest = 0;

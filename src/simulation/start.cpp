@@ -48,6 +48,7 @@ Eigen::VectorXd complete_start(const Model& model, const Eigen::VectorXd& parame
   std::fill(held.begin() + nq, held.begin() + 2 * nq, false);
   std::optional<Eigen::VectorXd> state;
   std::string why;
+  // each is moved by another share of `aside`: equal ones may keep a symmetry that has no slope
   const auto try_from = [&](double aside) {
     Eigen::VectorXd from = start.state;
     for (std::size_t n = 0; n < open.size() && open[n] < nq; ++n) from[open[n]] += aside * std::cos(2.0 * static_cast<double>(n));
