@@ -121,14 +121,12 @@ Some even(const std::vector<Observations>& observations, int n) {
   Some some{evenly_taken(observations, n), {}};
   std::ptrdiff_t taken = 0;
   for (const std::vector<int>& states : some.states) taken += std::ssize(states);
-  for (const std::vector<int>& states : some.states) {
-    some.counts.emplace_back(
-        VectorXd::Constant(std::ssize(states), static_cast<double>(n_states(observations)) / static_cast<double>(taken)));
-  }
+  const double count = static_cast<double>(n_states(observations)) / static_cast<double>(taken);
+  for (const std::vector<int>& states : some.states) some.counts.emplace_back(VectorXd::Constant(std::ssize(states), count));
   return some;
 }
 
-// Stands for itself alone what is added.
+// Each added state stands for itself alone.
 void add(const BlocksOfStates::States& block, Some& some) {
   std::vector<int>& states = some.states[block.group];
   VectorXd& counts = some.counts[block.group];

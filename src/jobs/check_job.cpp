@@ -299,7 +299,7 @@ void check_rates(const WholeLog& log, const System& system, std::vector<Finding>
     ddq.emplace_back(log.accelerations.row(j).head(n));
     velocities.push_back(system.coordinates()[static_cast<std::size_t>(j)].velocity());
   }
-  const auto is_wrong = [&](const RateColumns& columns) {
+  const auto note_if_wrong = [&](const RateColumns& columns) {
     const std::string text = columns.value.hasNaN() ? "" : better_rate(columns);
     if (text.empty()) return false;
     findings.push_back(
@@ -310,8 +310,8 @@ void check_rates(const WholeLog& log, const System& system, std::vector<Finding>
   for (std::size_t j = 0; j < q.size(); ++j) {
     const Coordinate& coordinate = system.coordinates()[j];
     // a velocity that is wrong says nothing of the acceleration
-    if (!is_wrong({t, coordinate.name, q[j], coordinate.angle, dq, velocities, j}))
-      is_wrong({t, velocities[j], dq[j], false, ddq, accelerations, j});
+    if (!note_if_wrong({t, coordinate.name, q[j], coordinate.angle, dq, velocities, j}))
+      note_if_wrong({t, velocities[j], dq[j], false, ddq, accelerations, j});
   }
 }
 

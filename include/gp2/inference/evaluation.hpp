@@ -91,7 +91,7 @@ struct TrainingResidual {
   double coverage95 = 0;          // share of |z| below 1.96
   double serial_correlation = 0;  // of z from one state to the next, in the order of the observations
   double rms_in_noise = 0;        // of (y − mean)/σ, of which the noise alone makes 1
-  int n_far = 0;                  // values that are farther off than six times what half of them are within makes of a deviation
+  int n_far = 0;                  // values with |z| above six times the larger of 1 and the median |z|/0.6745
   double farthest = 0;            // of |z|
   int farthest_state = -1;        // of the observations; −1 where only some states are kept
 
