@@ -21,6 +21,8 @@ namespace {
 
 constexpr double surely_correlated = 0.95;
 constexpr Index enough_steps = 50;  // that a lag stands out
+constexpr double large = 0.1;       // share of a rate that is worth a word
+constexpr double deviations = 5;    // of what stands out
 
 // What nine of ten numbers are not above, by size.
 double most_are_below(const ArrayXd& numbers) {
@@ -120,32 +122,39 @@ class RateRows {
   double usual_length_ = 0;
 };
 
-// The time τ by which a rate is late: y = s (x + τ d), to first order. Nothing where it does not stand out of its deviation, by
-// stretches of the log, changes the rate by less than a tenth of its size, or is no longer than the least: where a rate jumps, rows do
-// not tell when between them.
+// Of the sum of these errors: such of one sign in a row are one, as where a motion is sampled too coarsely.
+double deviation(const ArrayXd& errors) {
+  double variance = 0, run = 0;
+  for (const double error : errors) {
+    if (error * run < 0) {
+      variance += run * run;
+      run = 0;
+    }
+    run += error;
+  }
+  return std::sqrt(variance + run * run);
+}
+
+// The time τ by which a rate is late: y = s (x + τ d), to first order. Nothing where it does not stand out of its deviation, changes
+// the rate by less than a tenth of its size, or is no longer than the least: where a rate jumps, rows do not tell when between them.
 std::optional<double> lateness(const Steps& steps, double least) {
-  constexpr Index n_stretches = 10;
-  constexpr double large = 0.1, deviations = 5;
   if (steps.n() < enough_steps) return std::nullopt;
-  const auto beside = [&](const ArrayXd& of) -> ArrayXd { return of - (of * steps.x).sum() / steps.x.square().sum() * steps.x; };
+  const double xx = steps.x.square().sum();
+  const auto beside = [&](const ArrayXd& of) -> ArrayXd { return of - (of * steps.x).sum() / xx * steps.x; };
   const ArrayXd y = beside(steps.y) / steps.slope(), d = beside(steps.d);
   const double dd = d.square().sum(), tau = (y * d).sum() / dd;
-  double variance = 0;
-  for (Index k = 0; k < n_stretches; ++k) {
-    const Index first = k * steps.n() / n_stretches, n = (k + 1) * steps.n() / n_stretches - first;
-    variance += std::pow(((y - tau * d) * d).segment(first, n).sum() / dd, 2);
-  }
-  const double changed = std::abs(tau) * std::sqrt(dd / steps.x.square().sum());
-  if (!(changed > large && std::abs(tau) > std::max(least, deviations * std::sqrt(variance)))) return std::nullopt;
+  const double changed = std::abs(tau) * std::sqrt(dd / xx);
+  if (!(changed > large && std::abs(tau) > std::max(least, deviations * deviation((y - tau * d) * d / dd)))) return std::nullopt;
   return tau;
 }
 
-// Whether y = s x with s far from 1: beyond what noise of x, and integrals by trapezoids, make of it.
+// Whether y = s x with s far from 1: beyond its deviation, and what noise of x, and integrals by trapezoids, make of it.
 bool is_scaled(const Steps& steps) {
-  constexpr double large = 0.1;
+  const double xx = steps.x.square().sum(), s = steps.slope();
   const double of_noise = 1 - std::pow(steps.correlation(), 2);
-  const double of_trapezoids = (steps.d * steps.h).square().sum() / (12 * steps.x.square().sum());
-  return std::abs(steps.slope() - 1) > large + 2 * (of_noise + of_trapezoids);
+  const double of_trapezoids = (steps.d * steps.h).square().sum() / (12 * xx);
+  const double by_chance = deviations * deviation((steps.y - s * steps.x) * steps.x / xx);
+  return std::abs(s - 1) > std::max(large, by_chance) + 2 * (of_noise + of_trapezoids);
 }
 
 }  // namespace
@@ -166,7 +175,7 @@ std::string better_rate(const RateColumns& columns) {
   for (Index other = -12 * stride; other <= 12 * stride && lag != 0 && rows.are_regular(); other += stride) {
     const Steps steps = rows.steps(own, other, length);
     // half a period and the other sign are alike: the sign is believed
-    if (!is_sure(steps) || steps.correlation() <= std::max(best, 0.0)) continue;
+    if (steps.n() < enough_steps || !is_sure(steps) || steps.correlation() <= std::max(best, 0.0)) continue;
     best = steps.correlation();
     lag = other;
   }
