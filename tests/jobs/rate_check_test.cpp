@@ -59,6 +59,24 @@ TEST(RateCheck, SoundColumnsPass) {
   EXPECT_THAT((Swing{.dt = 0.5}.text()), IsEmpty()) << "four rows a period tell nothing";
 }
 
+TEST(RateCheck, ErrorsThatGoTogetherInFewRowsAreNoFactor) {
+  constexpr Index n = 40;
+  for (unsigned seed = 1; seed <= 200; ++seed) {
+    std::mt19937 random(seed);
+    std::normal_distribution<double> normal;
+    const RowVectorXd t = RowVectorXd::LinSpaced(n, 0, 0.02 * (n - 1));
+    RowVectorXd rate = (4 * t.array()).cos();
+    double error = 0;
+    for (double& one : rate) {
+      error = 0.9 * error + 0.05 * normal(random);
+      one += error;
+    }
+    const std::vector<RowVectorXd> rates = {rate};
+    const std::vector<std::string> names = {"dx"};
+    EXPECT_THAT(better_rate({t, "x", (4 * t.array()).sin() / 4, false, rates, names, 0}), IsEmpty()) << seed;
+  }
+}
+
 TEST(RateCheck, ALagIsNamedHoweverFineTheLog) {
   for (const double late : {0.08, -0.08, 0.2, -0.2}) {
     for (const double dt : {0.001, 0.01, 0.04}) {
