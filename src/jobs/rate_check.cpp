@@ -20,9 +20,10 @@ using Eigen::RowVectorXd;
 namespace {
 
 constexpr double surely_correlated = 0.95;
-constexpr Index enough_steps = 50;  // that a lag stands out
-constexpr double large = 0.1;       // share of a rate that is worth a word
-constexpr double deviations = 5;    // of what stands out
+constexpr Index enough_steps = 50;    // that a lag, or a small factor, stands out
+constexpr double worth_a_word = 0.1;  // share of a rate
+constexpr double few_tell = 0.3;      // the same, of fewer steps than enough: their deviation is hardly known
+constexpr double surely_apart = 5;    // deviations
 
 // What nine of ten numbers are not above, by size.
 double most_are_below(const ArrayXd& numbers) {
@@ -122,7 +123,8 @@ class RateRows {
   double usual_length_ = 0;
 };
 
-// Of the sum of these errors: such of one sign in a row are one, as where a motion is sampled too coarsely.
+// The deviation of the sum of these errors. Neighbours of one sign count as one error: where a motion is sampled too coarsely errors go
+// together.
 double deviation(const ArrayXd& errors) {
   double variance = 0, run = 0;
   for (const double error : errors) {
@@ -144,7 +146,8 @@ std::optional<double> lateness(const Steps& steps, double least) {
   const ArrayXd y = beside(steps.y) / steps.slope(), d = beside(steps.d);
   const double dd = d.square().sum(), tau = (y * d).sum() / dd;
   const double changed = std::abs(tau) * std::sqrt(dd / xx);
-  if (!(changed > large && std::abs(tau) > std::max(least, deviations * deviation((y - tau * d) * d / dd)))) return std::nullopt;
+  if (!(changed > worth_a_word && std::abs(tau) > std::max(least, surely_apart * deviation((y - tau * d) * d / dd))))
+    return std::nullopt;
   return tau;
 }
 
@@ -153,8 +156,9 @@ bool is_scaled(const Steps& steps) {
   const double xx = steps.x.square().sum(), s = steps.slope();
   const double of_noise = 1 - std::pow(steps.correlation(), 2);
   const double of_trapezoids = (steps.d * steps.h).square().sum() / (12 * xx);
-  const double by_chance = deviations * deviation((steps.y - s * steps.x) * steps.x / xx);
-  return std::abs(s - 1) > std::max(large, by_chance) + 2 * (of_noise + of_trapezoids);
+  const double by_chance = surely_apart * deviation((steps.y - s * steps.x) * steps.x / xx);
+  const double least = steps.n() < enough_steps ? few_tell : worth_a_word;
+  return std::abs(s - 1) > std::max(least, by_chance) + 2 * (of_noise + of_trapezoids);
 }
 
 }  // namespace

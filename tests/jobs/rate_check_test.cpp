@@ -17,6 +17,7 @@ using Eigen::Index;
 using Eigen::RowVectorXd;
 using testing::HasSubstr;
 using testing::IsEmpty;
+using testing::Not;
 
 // Two seconds' and five seconds' swings, and what logs make of them.
 struct Swing {
@@ -59,21 +60,25 @@ TEST(RateCheck, SoundColumnsPass) {
   EXPECT_THAT((Swing{.dt = 0.5}.text()), IsEmpty()) << "four rows a period tell nothing";
 }
 
-TEST(RateCheck, ErrorsThatGoTogetherInFewRowsAreNoFactor) {
-  constexpr Index n = 40;
-  for (unsigned seed = 1; seed <= 200; ++seed) {
-    std::mt19937 random(seed);
-    std::normal_distribution<double> normal;
-    const RowVectorXd t = RowVectorXd::LinSpaced(n, 0, 0.02 * (n - 1));
-    RowVectorXd rate = (4 * t.array()).cos();
-    double error = 0;
-    for (double& one : rate) {
-      error = 0.9 * error + 0.05 * normal(random);
-      one += error;
-    }
-    const std::vector<RowVectorXd> rates = {rate};
-    const std::vector<std::string> names = {"dx"};
-    EXPECT_THAT(better_rate({t, "x", (4 * t.array()).sin() / 4, false, rates, names, 0}), IsEmpty()) << seed;
+// What is said of 40 rows of a swing whose rate has errors that go together.
+std::string text_of_few_rows(double error_size, unsigned seed) {
+  std::mt19937 random(seed);
+  std::normal_distribution<double> normal(0, error_size);
+  const RowVectorXd t = RowVectorXd::LinSpaced(40, 0, 0.02 * 39);
+  RowVectorXd rate = (4 * t.array()).cos();
+  double error = 0;
+  for (double& one : rate) {
+    error = 0.9 * error + normal(random);
+    one += error;
+  }
+  const std::vector<std::string> names = {"dx"};
+  return better_rate({t, "x", (4 * t.array()).sin() / 4, false, {rate}, names, 0});
+}
+
+TEST(RateCheck, ErrorsThatGoTogetherInFewRowsAreNoFactorAndNoLag) {
+  for (unsigned seed = 1; seed <= 400; ++seed) {
+    EXPECT_THAT(text_of_few_rows(0.05, seed), IsEmpty()) << seed;
+    EXPECT_THAT(text_of_few_rows(0.15, seed), Not(HasSubstr("the column"))) << "errors as large as the rate, " << seed;
   }
 }
 
