@@ -79,7 +79,7 @@ void Writer::write_potential(Term& term) {
   write("pairs", "const latent *a, const real *p, real *pairs", pairs);
   write("sums", to_out, from_zero(std::to_string(term.D), sums));
   if (has("jacobian")) write("gradient", to_out, from_zero(std::to_string(term.D * term.D), slopes));
-  if (!has("stddev") || !term.is_viewed) return;
+  if (!has("stddev")) return;
   write("products", "const latent *a, const real *pairs, const real *loading, real *scratch, real *out",
         from_zero(fmt::format("{} * a->n", term.D), products));
   write("variance", "const latent *a, real *out", from_zero(std::to_string(term.D), variance));
@@ -126,7 +126,7 @@ void Writer::write_kernel(Term& term) {
     term.filling.texts[what] = function(fmt::format("{}_{}", what, &term - terms_.data()), head, body);
   };
   write("covariance", "const latent *a, const real *p, real *k, real *scratch", whole_body(k));
-  if (has("stddev") && term.is_viewed) {
+  if (has("stddev")) {
     const bool reads_a = variance.find("a->") != std::string::npos;
     write("variance", "const latent *a, const real *p, real *out",
           fmt::format("{}{}{}  *out = sum;\n", reads_a ? "" : "  (void)a;\n", is_constant ? "  (void)p;\n" : "", variance));

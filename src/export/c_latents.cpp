@@ -43,7 +43,7 @@ void Writer::write_latents() {
         {"to", term.is_forced() ? "force" : "a_bar"},
         {"d_to", term.is_forced() ? "d_force" : "d_of_rest"},
         {"part", term.is_forced() ? "force" : "rest"},
-        {"G", term.is_forced() ? "M_inverse_Gt" : "Gt"},
+        {"G", fmt::format("{}Gt{}", term.is_forced() ? "M_inverse_" : "", term.is_viewed ? "" : "_of_others")},
         {"slope", term.has_directions() ? "sum" : fmt::format("w->dsignal[d + {} * i]", term.D)},
     });
     ++a;
@@ -51,7 +51,7 @@ void Writer::write_latents() {
   const auto write = [&](const std::string& name, std::string_view form, bool is_asked) {
     std::string& of_all = text(name);
     for (const Term& term : terms_) {
-      if (is_asked && term.is_viewed) of_all += filled(form, term.filling);
+      if (is_asked) of_all += filled(form, term.filling);
     }
   };
   // what acts on the load is there beside what is viewed

@@ -55,7 +55,7 @@ void Writer::write_learned() {
       };
       list += fmt::format("    {{{}, {}, {}, {}, {}", basis.kernel.n_rows(), of("points", points), of("scale", scales),
                           of("kernel", values), of("weights", weights));
-      if (has("stddev")) list += term.is_viewed ? fmt::format(", {}, {}", of("loading", C), of("rows", basis.Z)) : ", 0, 0";
+      if (has("stddev")) list += fmt::format(", {}, {}", of("loading", C), of("rows", basis.Z));
       list += "},\n";
     }
     list += "  }";

@@ -210,9 +210,11 @@ static status start(@start_parameters@)
 {admissible}  project_admissible(w);
 {!partial}  return project(w);
 {if partial}
-  const status s = project(w);
+  status s = project(w);
   w->is_part = 0; /* the load is that of the whole motion */
-  return s == @name@_OK ? evaluate_prior(c, state, w) : s;
+  if (s == @name@_OK) s = evaluate_prior(c, state, w);
+{by_load}  for (int i = 0; i < NQ * NC; ++i) w->whole_slope[i] = w->slope[i];
+  return s;
 {end}
 }
 
@@ -327,16 +329,29 @@ static void evaluate_view(workspace *w)
     }
 {end}
   }
-{if responds}
-  /* G (I + J D^-1 G_lambda): lambda answers */
+{if answers}
+{responds}  /* G (I + J D^-1 G_lambda): lambda answers */
+{by_load}  /* G J D^-1 G_lambda of every latent, J of the part and D of the whole: lambda answers */
   real answer[NC * NQ];
   for (int i = 0; i < NC * NQ; ++i) answer[i] = w->G_lambda[i];
+{if by_load}
+  real of_part[NC * NQ];
+  for (int i = 0; i < NC * NQ; ++i) {
+    of_part[i] = w->slope[i];
+    w->slope[i] = w->whole_slope[i];
+  }
+{end}
   (void)factorise_load(1, w);
   solve_load(w, NQ, answer);
+{by_load}  for (int i = 0; i < NC * NQ; ++i) w->slope[i] = of_part[i];
   for (int r = 0; r < NR; ++r) {
     real through[NC];
     for (int k = 0; k < NC; ++k) through[k] = dot(NQ, w->Gt + NQ * r, w->slope + NQ * k);
-    for (int j = 0; j < NQ; ++j) w->Gt[j + NQ * r] += dot(NC, through, answer + NC * j);
+    for (int j = 0; j < NQ; ++j) {
+{responds}      w->Gt[j + NQ * r] += dot(NC, through, answer + NC * j);
+{by_load}      w->Gt_of_others[j + NQ * r] = dot(NC, through, answer + NC * j);
+{by_load}      w->Gt[j + NQ * r] += w->Gt_of_others[j + NQ * r];
+    }
   }
 {end}
 }
@@ -347,6 +362,8 @@ static void evaluate_stddev(const component *c, real *stddev, workspace *w)
   evaluate_view(w);
 {forced_latent}  for (int i = 0; i < NQ * NR; ++i) w->M_inverse_Gt[i] = w->Gt[i];
 {forced_latent}  solve_mass(w->C, NR, w->M_inverse_Gt);
+{forced_latent,by_load}  for (int i = 0; i < NQ * NR; ++i) w->M_inverse_Gt_of_others[i] = w->Gt_of_others[i];
+{forced_latent,by_load}  solve_mass(w->C, NR, w->M_inverse_Gt_of_others);
 
   /* the variance of the prior, and loadings of the latent functions on each row (FUNCTIONS x NR) */
 @loadings@

@@ -65,6 +65,7 @@ void Writer::declare_workspace() {
   if (has("stddev")) {
     add(fmt::format("Gt[{0}], M_inverse_Gt[{0}], loading[{1}], cross[{2}]", nq * nr, n_functions_ * nr,
                     n_variables_ * n_columns));
+    if (has("by_load")) add(fmt::format("whole_slope[{0}], Gt_of_others[{1}], M_inverse_Gt_of_others[{1}]", nq * nc, nq * nr));
     if (!has("by_function") || has("potential")) add(fmt::format("products[{}]", terms_.empty() ? 1 : terms_[0].n_points));
     if (has("sums")) add(fmt::format("rows[{}]", n_cross_rows_ * n_columns));
     if (has("mixture")) add(fmt::format("means[{0}], stddevs[{0}]", std::ssize(components_) * nr));

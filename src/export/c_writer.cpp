@@ -109,7 +109,7 @@ void Writer::add_terms() {
     term.p = of.size();
     term.F = of.n_functions();
     term.first = n_functions_;
-    if (term.is_viewed) n_functions_ += term.F;
+    n_functions_ += term.F;
     term.features = of.features->make_evaluator(VectorXd());
     require_expressions(term.features->tapes().values, fmt::format("features of latent '{}'", of.name));
     if (!term.has_directions()) continue;
@@ -159,17 +159,19 @@ void Writer::set_conditions() {
   set("all", view_.has_mean() || is_partial_);
   set("known", has("all") && prior_.mean == Prior::Mean::force);
   set("constant", has("all") && prior_.mean == Prior::Mean::constant);
-  // the load answers to what it is viewed by; one latent is that under this load
+  // the load answers to what it is viewed by, or to all latents where some of them are viewed, whose deviation has a part of it
   set("responds", has("nonlinear") && !view_.latent);
+  set("by_load", has("nonlinear") && view_.latent && options_.stddev);
+  set("answers", has("responds") || has("by_load"));
   // constraints, more than one
   set("rows", system().nc() > 0);
   set("several", system().nc() > 1);
-  // a latent that is viewed is multiplied by M^-1; or any or mu is
-  set("forced_latent", any([](const Term& term) { return term.is_viewed && term.is_forced(); }));
-  set("forced", has("known") || any([](const Term& term) { return term.is_forced(); }));
+  // a latent is multiplied by M^-1; or it or mu is
+  set("forced_latent", any([](const Term& term) { return term.is_forced(); }));
+  set("forced", has("known") || has("forced_latent"));
   set("admissible", any([](const Term& term) { return term.is_admissible(); }));
-  set("potential", any([](const Term& term) { return term.is_viewed && term.of->is_potential; }));
-  set("other", any([](const Term& term) { return term.is_viewed && !term.of->is_potential; }));
+  set("potential", any([](const Term& term) { return term.of->is_potential; }));
+  set("other", any([](const Term& term) { return !term.of->is_potential; }));
   // a latent reads λ₀; or λ (nonlinear); the multipliers of least norm are computed
   set("load", any([](const Term& term) { return term.features_read_load() || term.directions_read_load(); }));
   set("loaded", has("load") || has("nonlinear"));

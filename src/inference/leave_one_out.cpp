@@ -222,7 +222,7 @@ class WithoutSums {
       const Query query = make_query(self_, group.view(), group.states());
       const std::vector<MatrixXd> loadings = query.loadings(self_);
       MatrixXd cross(self_.latents->size(), query.n_rows() * query.size());
-      LatentSums(*self_.latents).evaluate(query.features, query.latent, &loadings, &cross);
+      LatentSums(*self_.latents).evaluate(query.features, query.needed, &loadings, &cross);
       out.push_back({posterior_.marginal(group.view(), group.states()), P_ * cross});
     }
     return out;

@@ -116,6 +116,7 @@ void NonlinearMotion::linearise(const View& view, const Linearisation::OfGroup& 
                                 PriorValues& prior) const {
   const std::vector<MatrixXd> c = amplitudes_of(prior_, at.signals);
   prior = evaluate_prior(prior_, states_, parameters_, mechanics_, &at.multipliers);
+  if (view.latent) return linearise_part(view, at, c, prior);
   keep_viewed(view, prior);
   // μ that the view has none of acts on λ all the same
   const MatrixXd hidden = at_known_load_.mean - prior.mean;
@@ -124,13 +125,39 @@ void NonlinearMotion::linearise(const View& view, const Linearisation::OfGroup& 
   if (viewed.has_slip()) add_to_slip(at.noise_about ? *at.noise_about : at, viewed);
   for (int i = 0; i < n_states(); ++i) {
     linearise_amplitudes(at, c, i, prior);
-    if (view.latent || at.multipliers.rows() == 0) continue;  // of one latent: at λ*, of which all are part
+    if (at.multipliers.rows() == 0) continue;
     under.move_to(i);
     const auto G_lambda = multipliers_.G(i);
     response.compute(under.slope(at.multipliers.col(i)), G_lambda);
     const MatrixXd GK = viewed.G(i) * response.K();
     viewed.offset.col(i) += GK * (G_lambda * hidden.col(i) + multipliers_.offset.col(i) - at.multipliers.col(i));
     Map<MatrixXd>(viewed.matrix.col(i).data(), viewed.offset.rows(), prior.mean.rows()) += GK * G_lambda;
+  }
+}
+
+void NonlinearMotion::linearise_part(const View& view, const Linearisation::OfGroup& at, const std::vector<MatrixXd>& c,
+                                     PriorValues& prior) const {
+  PriorValues whole = prior;
+  keep_viewed(view, prior);
+  std::vector<MatrixXd> c_viewed = c;
+  for (std::size_t a = 0; a < c.size(); ++a) {
+    if (!view.has_latent(a)) c_viewed[a].setZero();
+  }
+  Under under(*this, c), under_viewed(*this, c_viewed);
+  LoadResponse response;
+  for (int i = 0; i < n_states(); ++i) {
+    linearise_amplitudes(at, c, i, prior);
+    linearise_amplitudes(at, c, i, whole);
+    if (at.multipliers.rows() == 0) continue;
+    under.move_to(i);
+    under_viewed.move_to(i);
+    const auto G_lambda = multipliers_.G(i);
+    response.compute(under.slope(at.multipliers.col(i)), G_lambda, under_viewed.slope(at.multipliers.col(i)));
+    const MatrixXd& K = response.K();
+    prior.mean.col(i) += K * (G_lambda * whole.mean.col(i) + multipliers_.offset.col(i) - at.multipliers.col(i));
+    for (std::size_t a = 0; a < c.size(); ++a) {
+      Map<MatrixXd>(prior.directions[a].col(i).data(), prior.mean.rows(), c[a].rows()) += K * (G_lambda * whole.E(a, i));
+    }
   }
 }
 

@@ -21,7 +21,9 @@ namespace gp2 {
 ///     v = G̃ (μ + Σ_a Ẽ_a s_a + o) + d̃,    G̃ = G (I + J D⁻¹G_λ),    d̃ = d + G J D⁻¹(d_λ − λ*),    Ñ = N + G J D⁻¹N_λ,
 ///
 /// with J = Σ_a ∂E_a/∂λ c_a, D = I − G_λ J, Ẽ_a = E_a(x, λ*) diag(c_a'), o = Σ_a E_a(x, λ*)(c_a − c_a' ∘ s_a*): a linear prior (theory.md,
-/// T47), and exact at s_a*. As A G = 0 of an acceleration, A G̃ = 0.
+/// T47), and exact at s_a*. As A G = 0 of an acceleration, A G̃ = 0. What some latents S add alone depends on the others through λ:
+///
+///     v_S = G (Σ_S (Ẽ_a s_a + o_a) + J_S D⁻¹(G_λ (μ + Σ_a Ẽ_a s_a + o) + d_λ − λ*)),    J_S = Σ_S ∂E_a/∂λ c_a.
 class NonlinearMotion {
  public:
   /// @param prior          where the states are (prior_of); outlives it
@@ -50,6 +52,9 @@ class NonlinearMotion {
 
  private:
   class Under;
+  // of a view of some latents alone; `prior` is that of all at λ*
+  void linearise_part(const View& view, const Linearisation::OfGroup& at, const std::vector<Eigen::MatrixXd>& c,
+                      PriorValues& prior) const;
   // Ñ = N + G J D⁻¹N_λ
   void add_to_slip(const Linearisation::OfGroup& at, ViewValues& viewed) const;
   void linearise_amplitudes(const Linearisation::OfGroup& at, const std::vector<Eigen::MatrixXd>& c, int i,

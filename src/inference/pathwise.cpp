@@ -131,7 +131,7 @@ MatrixXd PathwiseSamples::evaluate(int sample, const View& view, const Ref<const
   KernelColumns::Workspace workspace;
   VectorXd psi, point, k, sums;
   for (std::size_t a = 0; a < paths.size(); ++a) {
-    if (query.needed && !query.needed->has(a)) continue;
+    if (!query.needs(a)) continue;
     const LatentPath& path = paths[a];
     const KernelColumns& kernel = posterior.latents->latents()[a].kernel;
     if (posterior.prior.latents[a].is_potential) {

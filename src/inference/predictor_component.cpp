@@ -41,7 +41,8 @@ class StateChange final : public ConstraintChange {
 
 }  // namespace
 
-Predictor::Implementation::Implementation(const Posterior::Implementation& posterior, View viewed, Options given)
+Predictor::Implementation::Implementation(const Posterior::Implementation& posterior, View viewed, Options given,
+                                          const View* part)
     : prior(prior_of(posterior.prior, viewed)),
       parameters(parameters_of(viewed, posterior.values.parameters)),
       view(std::move(viewed)),
@@ -62,8 +63,10 @@ Predictor::Implementation::Implementation(const Posterior::Implementation& poste
     View of_whole = View::multipliers(*prior.system);
     of_whole.other_system = view.other_system;
     multipliers = std::make_shared<const Implementation>(
-        posterior, of_whole, Options{.stddev = false, .jacobian = options.jacobian, .storage = options.storage});
+        posterior, of_whole,
+        Options{.stddev = options.stddev && view.latent, .jacobian = options.jacobian, .storage = options.storage}, &view);
   }
+  n_covariance_rows = part != nullptr ? part->size() : view.size();
   for (std::size_t a = 0; a < prior.latents.size(); ++a) {
     if (!view.has_latent(a)) continue;
     terms.push_back({a, posterior.latents->latents()[a].kernel, posterior.C[a], prior.latents[a].is_potential});
@@ -71,10 +74,11 @@ Predictor::Implementation::Implementation(const Posterior::Implementation& poste
     has_forced_latent = has_forced_latent || prior.latents[a].base == Latent::Base::force;
   }
   has_force = has_mean_force() || has_forced_latent;
+  const bool stores_factor = options.stddev && !depends_on_others();
   if (options.storage == Storage::single_precision) {
-    in_single.store(*posterior.latents, terms, options.stddev);
+    in_single.store(*posterior.latents, terms, stores_factor);
   } else {
-    in_double.store(*posterior.latents, terms, options.stddev);
+    in_double.store(*posterior.latents, terms, stores_factor);
   }
 }
 
@@ -88,13 +92,13 @@ Predictor::Workspace::Implementation::Implementation(std::shared_ptr<const Predi
   for (const PredictorTerm& term : self.terms) reserve_term(term);
   coordinates.setZero(self.distance.n_coordinates());
   self.with_data(*this, [&](const auto& data, auto& memory) {
-    memory = data.make_memory(self.terms, self.view.size(), self.options.stddev);
+    memory = data.make_memory(self.terms, self.n_covariance_rows, self.options.stddev && !self.depends_on_others());
   });
 }
 
 void Predictor::Workspace::Implementation::reserve_mechanics() {
   const System& system = *predictor->prior.system;
-  const Index nq = system.nq(), nc = system.nc(), n_state = system.layout().size(), d = predictor->view.size();
+  const Index nq = system.nq(), nc = system.nc(), n_state = system.layout().size(), d = predictor->n_covariance_rows;
   const Index n_rows = predictor->n_quantity_rows();
   a_bar.setZero(nq);
   force = a_of_force = a = gap = of_constraint = applied = a_bar;
@@ -109,8 +113,8 @@ void Predictor::Workspace::Implementation::reserve_mechanics() {
   Gt.setZero(nq, d);
   M_inverse_Gt = Gt;
   covariance.setZero(d, d);
-  mean.setZero(d);
-  jacobian.setZero(d, n_state);
+  mean.setZero(predictor->view.size());
+  jacobian.setZero(predictor->view.size(), n_state);
   // rows that are all the same, so that the memory for redundant ones is there too
   const MatrixXd rows = MatrixXd::Ones(nc, nq);
   projection.compute(MatrixXd::Identity(nq, nq), rows, VectorXd::Zero(nc));
@@ -146,7 +150,7 @@ void Predictor::Workspace::Implementation::reserve_term(const PredictorTerm& ter
   at.signal.setZero(p);
   at.dsignal.setZero(D, p);
   at.E_dsignal.setZero(nq, D);
-  loadings.emplace_back(MatrixXd::Zero(term.n_functions(), predictor->view.size()));
+  loadings.emplace_back(MatrixXd::Zero(term.n_functions(), predictor->n_covariance_rows));
   at.dfeatures.setZero(static_cast<Index>(at.of_features->entries().size()));
   if (!latent.directions) return;
   at.directions.setZero(nq * p);
@@ -318,13 +322,15 @@ Status Predictor::Implementation::write_mean(const Ref<const VectorXd>& state, S
 // ---------------------------------------------------------------- covariance
 
 // ℓ = Cᵀ Bᵀ Gᵀ, or with M⁻¹, and the prior's covariance
-void Predictor::Implementation::write_loadings(Workspace::Implementation& w) const {
+void Predictor::Implementation::write_loadings(const View& of, const Workspace::Implementation& viewed,
+                                               Workspace::Implementation& w) const {
   const Index nq = w.Gt.rows();
   w.covariance.setZero();
   for (std::size_t a = 0; a < terms.size(); ++a) {
     const PredictorTerm& term = terms[a];
     const VectorXd& B = w.terms[a].directions;
-    const MatrixXd& Gt = latent(term).base == Latent::Base::force ? w.M_inverse_Gt : w.Gt;
+    const Workspace::Implementation& from = of.has_latent(term.latent) ? viewed : w;
+    const MatrixXd& Gt = latent(term).base == Latent::Base::force ? from.M_inverse_Gt : from.Gt;
     const double k = term.is_potential ? 0 : term.kernel.variance(w.terms[a].point);
     // (Bᵀ Gᵀ)_lr
     const auto along = [&](Index l, Index r) {
@@ -353,14 +359,30 @@ void Predictor::Implementation::write_loadings(Workspace::Implementation& w) con
 
 void Predictor::Implementation::write_covariance(const StateEvaluator& at, Workspace::Implementation& w) const {
   write_G(at, w);
-  if (reads_multipliers && !view.latent) add_response(w);  // one latent is that under this load
+  if (reads_multipliers && !view.latent) add_response(w);
   for (int r = 0; r < view.size(); ++r) w.Gt.col(r) = w.G.row(view.rows[static_cast<std::size_t>(r)]);
-  if (has_forced_latent) {
-    w.M_inverse_Gt = w.Gt;
-    w.projection.solve_mass_in_place(w.M_inverse_Gt);
+  const Implementation& whole = depends_on_others() ? *multipliers : *this;
+  Workspace::Implementation& all = depends_on_others() ? *w.multipliers : w;
+  if (depends_on_others()) {
+    // G J_S D⁻¹G_λ of every latent
+    w.response.compute(all.slope, all.G_lambda, w.slope);
+    w.GK.noalias() = w.G.lazyProduct(w.response.K());
+    for (int r = 0; r < view.size(); ++r) {
+      all.Gt.col(r).noalias() =
+          all.G_lambda.transpose().lazyProduct(w.GK.row(view.rows[static_cast<std::size_t>(r)]).transpose());
+    }
+    w.Gt += all.Gt;
   }
-  write_loadings(w);
-  with_data(w, [&](const auto& data, auto& memory) { data.subtract_explained(terms, w.loadings, memory, w.covariance); });
+  const auto solve_mass = [&](Workspace::Implementation& one) {
+    one.M_inverse_Gt = one.Gt;
+    w.projection.solve_mass_in_place(one.M_inverse_Gt);
+  };
+  if (whole.has_forced_latent) solve_mass(w);
+  if (whole.has_forced_latent && depends_on_others()) solve_mass(all);
+  whole.write_loadings(view, w, all);
+  whole.with_data(
+      all, [&](const auto& data, auto& memory) { data.subtract_explained(whole.terms, all.loadings, memory, all.covariance); });
+  if (depends_on_others()) w.covariance = all.covariance;
 }
 
 // ---------------------------------------------------------------- Jacobian

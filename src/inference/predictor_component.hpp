@@ -46,8 +46,10 @@ struct Predictor::Implementation {
   DataDistance distance;  // of the first component of a mixture alone
   // Of a part of the motion that reads λ: what predicts λ, with which the whole moves.
   std::shared_ptr<const Implementation> multipliers;
+  Eigen::Index n_covariance_rows = 0;  // d: of the view, or of the part that this is the whole of
 
-  Implementation(const Posterior::Implementation& posterior, View viewed, Options given);
+  /// @param part  of which this is to be the whole
+  Implementation(const Posterior::Implementation& posterior, View viewed, Options given, const View* part = nullptr);
 
   // work(data, memory) in the precision of the storage
   template <typename Work>
@@ -69,6 +71,8 @@ struct Predictor::Implementation {
   // G of every row at held λ; then what its change with λ adds, and G J D⁻¹
   void write_G(const StateEvaluator& at, Workspace::Implementation& w) const;
   void add_response(Workspace::Implementation& w) const;
+  // whether other latents than those that are viewed are part of its deviation, by the load that they make
+  [[nodiscard]] bool depends_on_others() const { return multipliers && view.latent; }
 
   [[nodiscard]] const Latent& latent(const PredictorTerm& term) const { return prior.latents[term.latent]; }
   [[nodiscard]] bool has_mean_force() const { return view.has_mean() && prior.mean == Prior::Mean::force; }
@@ -82,7 +86,8 @@ struct Predictor::Implementation {
                         Workspace::Implementation& w) const;
   // those of F̄, ddq and Aᵀλ that the view or the Jacobian needs
   void evaluate_motion(const StateEvaluator& at, Workspace::Implementation& w) const;
-  void write_loadings(Workspace::Implementation& w) const;
+  // of a view's rows, whose Gᵀ for the latents that it has stands in `viewed`, for others in w
+  void write_loadings(const View& of, const Workspace::Implementation& viewed, Workspace::Implementation& w) const;
   void differentiate_prior(const Eigen::Ref<const Eigen::VectorXd>& state, const StateEvaluator& at,
                            Workspace::Implementation& w) const;
   void differentiate_mechanics(const StateEvaluator& at, Workspace::Implementation& w) const;
@@ -137,7 +142,7 @@ struct Predictor::Workspace::Implementation {
   Eigen::MatrixXd slope, G_lambda, d_lambda;  // J, G_λ, d_λ
   Eigen::MatrixXd GK;                         // G K of every row, of a part G J (× nc)
   Eigen::MatrixXd d_multipliers;              // ∂(G_λ ā + d_λ)/∂x at held λ (nc × layout size)
-  Eigen::MatrixXd Gt, M_inverse_Gt;           // Gᵀ of the view (nq × d)
+  Eigen::MatrixXd Gt, M_inverse_Gt;           // Gᵀ of the view (nq × d), of the whole of a part for what that has not
   std::vector<Eigen::MatrixXd> loadings;      // ℓ, per term (F × d)
   Eigen::MatrixXd covariance;                 // of the view, its lower triangle (d × d)
   Eigen::VectorXd coordinates;                // of the distance from the data

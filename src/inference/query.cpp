@@ -21,8 +21,7 @@ void Query::evaluate(const Posterior::Implementation& posterior, const View& vie
   if (mechanics.fault) static_cast<void>(require_mechanics(there, viewed, states, parameters));
   view = evaluate_view(viewed, mechanics, block);
   prior = require_prior_values(there, block, parameters, mechanics);
-  latent = viewed.latent;
-  needed = there.is_nonlinear() ? std::nullopt : latent;
+  needed = there.is_nonlinear() ? std::nullopt : viewed.latent;
   nonlinear_.reset();
   if (there.is_nonlinear()) {
     const auto nonlinear = std::make_shared<Nonlinear>();

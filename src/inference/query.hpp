@@ -17,12 +17,11 @@ struct Query {
   ViewValues view;
   PriorValues prior;
   std::vector<Eigen::MatrixXd> features;  // per latent (n × D)
-  std::optional<LatentRange> latent;      // the one that is viewed alone
-  std::optional<LatentRange> needed;      // those that it takes: of a nonlinear prior all, as λ does
+  std::optional<LatentRange> needed;      // those that are viewed; of a nonlinear prior all, as λ takes them
 
   [[nodiscard]] Eigen::Index size() const { return view.offset.cols(); }    // n
   [[nodiscard]] Eigen::Index n_rows() const { return view.offset.rows(); }  // d
-  [[nodiscard]] bool needs(std::size_t a) const { return !latent || latent->has(a); }
+  [[nodiscard]] bool needs(std::size_t a) const { return !needed || needed->has(a); }
 
   /// Of the states first … first + n − 1, in the memory of what was there.
   /// @throws InputError as require_mechanics of the prior for all states.
@@ -38,7 +37,7 @@ struct Query {
   void view_of(const Posterior::Implementation& posterior, const std::vector<Eigen::MatrixXd>& f,
                Eigen::Ref<Eigen::MatrixXd> values) const;
 
-  /// (G E_a C_a)ᵀ per latent: of v = … + Σ_a ℓ_aᵀ f_a at each state (F·d × n). Zero where the latent is not viewed.
+  /// (G E_a C_a)ᵀ per latent: of v = … + Σ_a ℓ_aᵀ f_a at each state (F·d × n). Zero where the latent is not needed.
   [[nodiscard]] std::vector<Eigen::MatrixXd> loadings(const Posterior::Implementation& posterior) const;
 
  private:

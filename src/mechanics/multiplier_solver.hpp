@@ -94,11 +94,13 @@ class LoadResponse {
  public:
   /// @param J  (nq × nc)
   /// @param G  of the multipliers (nc × nq)
-  void compute(const Eigen::MatrixXd& J, const Eigen::Ref<const Eigen::MatrixXd>& G) {
+  void compute(const Eigen::MatrixXd& J, const Eigen::Ref<const Eigen::MatrixXd>& G) { compute(J, G, J); }
+  /// @param J_part  of a part of the motion, whose K is J_part D⁻¹
+  void compute(const Eigen::MatrixXd& J, const Eigen::Ref<const Eigen::MatrixXd>& G, const Eigen::MatrixXd& J_part) {
     D_transposed_.setIdentity(J.cols(), J.cols());
     D_transposed_.noalias() -= J.transpose().lazyProduct(G.transpose());
     lu_.compute(D_transposed_);
-    J_transposed_ = J.transpose();
+    J_transposed_ = J_part.transpose();
     K_transposed_ = lu_.solve(J_transposed_);
     K_ = K_transposed_.transpose();
   }

@@ -222,6 +222,39 @@ TEST(CSourceTest, IsThePredictorOfNonlinearLatents) {
   }
 }
 
+// Friction along a wire does not press on it, so that what it adds to the constraint's force is rounding, and so is its deviation.
+TEST(CSourceTest, TestsItselfWhereNothingOfALatentActs) {
+  const Model model = Model::parse(R"toml(
+coordinates = ["x", "z"]
+[mechanics]
+mass  = [["0.2", "0"], ["0", "0.2"]]
+force = ["0", "-1.962"]
+[constraints]
+position = ["z - 0.5*x^2"]
+[[latent]]
+features   = ["dx"]
+directions = { force = [["-dx"], ["-dz"]] }
+[sampling]
+x  = [-1, 1]
+dx = [-1, 1]
+[truth]
+force = ["-0.1*dx", "-0.1*dz"]
+)toml",
+                                   "bead");
+  PriorOptions options;
+  options.mean = Prior::Mean::force;
+  const Prior prior = make_prior(model, options);
+  const MatrixXd states = test::draw(model, 20, export_seed).states, y = true_acceleration(model, states);
+  const std::vector<Observations> observations = {
+      {states, View::constrained_acceleration(*model.system), y, VectorXd::Constant(2, 0.01)}};
+  const Posterior posterior(prior, observations,
+                            model_values(prior, observations, default_hyperparameters(prior, observations, {}, {})));
+  for (const View& view : {View::constraint_force(*model.system), View::multipliers(*model.system)}) {
+    Exported c(export_c(posterior, view), "gp2_model", compiler(0));
+    EXPECT_EQ(c.self_test(c.workspace()), 0) << view.quantity->word();
+  }
+}
+
 // Loops over one coordinate, and no constraint, are C without a warning too.
 TEST(CSourceTest, IsThePredictorOfOneCoordinate) {
   const Model model = Model::parse(R"toml(
