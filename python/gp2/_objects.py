@@ -18,11 +18,37 @@ def _read_system(text: str, name: str, robot: str | None = None) -> _gp2.System:
 
 # a system travels as text
 def _reduce_system(system: _gp2.System) -> tuple[Any, ...]:
+    if not _is_text(system):
+        raise TypeError(f"'{system.name}' cannot be pickled: it has functions, which are code")
+    return _read_system, (system.text, system.name, system.robot)
+
+
+def _is_text(system: _gp2.System) -> bool:
     try:
         _read_system(system.text, system.name, system.robot)
-    except _gp2.InputError as error:  # it has functions
-        raise TypeError(f"'{system.name}' cannot be pickled: it has functions, which are code") from error
-    return _read_system, (system.text, system.name, system.robot)
+        return True
+    except _gp2.InputError:  # it has functions
+        return False
+
+
+def _are_equal(self: _gp2.System, other: object) -> Any:
+    """__eq__(self: System, other: object) -> bool
+
+    Whether their texts are equal; a system with functions is equal to itself alone.
+    """
+    if not isinstance(other, _gp2.System):
+        return NotImplemented
+    if self is other:
+        return True
+    return (self.name, self.text, self.robot) == (other.name, other.text, other.robot) and _is_text(self) and _is_text(other)
+
+
+def _hash_of(self: _gp2.System) -> int:
+    """__hash__(self: System) -> int
+
+    Of its text.
+    """
+    return hash((self.name, self.text, self.robot))
 
 
 def _read_posterior(content: bytes) -> _gp2.Posterior:
@@ -108,6 +134,8 @@ def _prepare() -> None:
     # a system never changes: it is its own copy
     setattr(_gp2.System, "__copy__", lambda self: self)
     setattr(_gp2.System, "__deepcopy__", lambda self, memo: self)
+    setattr(_gp2.System, "__eq__", _are_equal)
+    setattr(_gp2.System, "__hash__", _hash_of)
     copyreg.pickle(_gp2.System, _reduce_system)  # type: ignore[arg-type]
     copyreg.pickle(_gp2.Posterior, _reduce_posterior)  # type: ignore[arg-type]
     for shown in (_gp2.System, _gp2.Posterior):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import re
+import warnings
 from typing import Any
 
 import numpy as np
@@ -45,6 +46,7 @@ class GP2Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     max_iterations : of each run; 0 keeps the starting values.
     n_threads : 0 stands for all cores. The result does not depend on it.
     random_state : int, RandomState or None: the starts of the runs. Same int, same bits.
+    fit_options : the other options of gp2.fit by name, say {"hyperparameters": "optimise", "robust": True}.
 
     Attributes
     ----------
@@ -74,6 +76,7 @@ class GP2Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         max_iterations=1000,
         n_threads=0,
         random_state=0,
+        fit_options=None,
     ):
         self.system = system
         self.mean = mean
@@ -87,6 +90,7 @@ class GP2Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self.max_iterations = max_iterations
         self.n_threads = n_threads
         self.random_state = random_state
+        self.fit_options = fit_options
 
     def fit(self, X, y) -> GP2Regressor:
         """Fit to states X (n, len(state_names)) and accelerations y (n, nq) or (n,).
@@ -99,6 +103,8 @@ class GP2Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             y = _columns_by_name(y, outputs)
         X, y = validate_data(self, _without_mask(X), _without_mask(y), dtype=np.float64, multi_output=True, y_numeric=True, ensure_min_samples=2)
         rows = y.reshape(len(y), -1).astype(np.float64)
+        if system is not None:
+            _warn_of_scaled(X)
         self.system_ = _system_without_mechanics(X.shape[1], rows) if system is None else system
         self.outputs_ = self.system_.acceleration_names if system is None else outputs
         self._is_flat = y.ndim == 1
@@ -122,8 +128,11 @@ class GP2Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             "threads": self.n_threads,
             "seed": _seed(self.random_state),
         }
+        others = dict(self.fit_options or {})
+        for name in sorted(others.keys() & options.keys()):
+            raise gp2.InputError(f"fit_options: '{name}' is an argument of GP2Regressor itself")
         try:
-            self.posterior_ = gp2.fit(self.system_, (self._states(X), accelerations), **options)
+            self.posterior_ = gp2.fit(self.system_, (self._states(X), accelerations), **options, **others)
         except (gp2.InputError, TypeError) as error:
             raise type(error)(re.sub("^(restarts|threads):", r"n_\1:", str(error))) from None
         self.log_marginal_likelihood_value_ = -self.posterior_.negative_log_likelihood
@@ -221,6 +230,22 @@ def _system_without_mechanics(n_features: int, y: np.ndarray) -> gp2.System:
         latents=[{"features": features}],
         noise={"estimate": True, "initial": 0.1 * (y.std() or 1.0)},
     )
+
+
+def _warn_of_scaled(X: np.ndarray) -> None:
+    """States have the units of their system: what a scaler makes of them are others."""
+    varied = X[:, np.ptp(X, axis=0) > 0]
+    if varied.shape[1] < 2:
+        return
+
+    def all_are(values, wanted):
+        return np.allclose(values, wanted, rtol=0, atol=1e-6)
+
+    is_standard = all_are(varied.mean(axis=0), 0) and all_are(varied.std(axis=0), 1)
+    if is_standard or (all_are(varied.min(axis=0), 0) and all_are(varied.max(axis=0), 1)):
+        warnings.warn(
+            "X: every column is scaled alike, as by a scaler: the system's equations take states in their own units; leave it out",
+            UserWarning, stacklevel=3)
 
 
 def _without_mask(values):

@@ -82,7 +82,17 @@ py::array_t<double, py::array::c_style> vector_argument(const py::object& array,
 
 bool is_array(const py::object& data) {
   if (py::isinstance<py::list>(data) || py::isinstance<py::tuple>(data)) return true;
-  return py::hasattr(data, "shape") && !py::hasattr(data, "keys");
+  return py::hasattr(data, "shape") && !column_names(data);
+}
+
+std::optional<py::list> column_names(const py::object& data) {
+  if (py::hasattr(data, "keys")) return py::list(data.attr("keys")());
+  if (py::isinstance<py::array>(data)) {
+    const py::object names = data.attr("dtype").attr("names");
+    return names.is_none() ? std::nullopt : std::optional(py::list(names));
+  }
+  if (py::hasattr(data, "columns")) return py::list(data.attr("columns"));
+  return std::nullopt;
 }
 
 py::array to_rows(Eigen::MatrixXd columns) {

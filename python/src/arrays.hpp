@@ -1,5 +1,6 @@
 #pragma once
 
+#include <optional>
 #include <string>
 #include <vector>
 
@@ -35,6 +36,9 @@ py::array_t<double, py::array::c_style> vector_argument(const py::object& array,
 
 /// The same of any size.
 py::array_t<double, py::array::c_style> vector_argument(const py::object& array, const std::string& what);
+
+/// The names of the columns of a mapping, a frame or a structured array, keys as they are; nothing of what is no table.
+std::optional<py::list> column_names(const py::object& data);
 
 /// Whether an argument is an array rather than a table: a list or tuple, or what has a shape, but no named columns.
 bool is_array(const py::object& data);

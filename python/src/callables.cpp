@@ -89,12 +89,24 @@ SystemValues values_of(const py::object& result, const char* function, Index n, 
   }
   const py::sequence parts = result;
   SystemValues values;
+  // of A and b where no constraint is named
+  const auto require_nothing = [&](const py::object& part, const char* quantity) {
+    if (part.is_none() || py::len(part) == 0 || py::array::ensure(part).size() == 0) return;
+    throw InputError(fmt::format(
+        "{}: {} is not empty, but no constraint is named: give constraints=[…], a name for each row of A", function, quantity));
+  };
   const auto matrices = [&](const py::object& part, const char* quantity, const char* wanted, Index rows) {
-    if (rows == 0) return MatrixXd(0, n);  // of A where nothing constrains: may be None
+    if (rows == 0) {
+      require_nothing(part, quantity);
+      return MatrixXd(0, n);
+    }
     return column_major(returned(part, function, quantity, wanted, {n, rows, nq}));
   };
   const auto vectors = [&](const py::object& part, const char* quantity, const char* wanted, Index rows) {
-    if (rows == 0) return MatrixXd(0, n);
+    if (rows == 0) {
+      require_nothing(part, quantity);
+      return MatrixXd(0, n);
+    }
     const auto array = returned(part, function, quantity, wanted, {n, rows});
     return MatrixXd(Eigen::Map<const MatrixXd>(array.data(), rows, n));
   };

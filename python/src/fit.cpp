@@ -39,7 +39,7 @@ Log log_of(const py::object& data, const std::optional<PySystem>& system, const 
   return {to_table(data, what), system ? system->model : nullptr};
 }
 
-// a table of states and accelerations, columns by the model's names; NaN is an empty cell, and a column of it is left out
+// a table of states and accelerations, columns by the model's names; NaN is an empty cell, and a state's column of it is left out
 CsvTable table_of(const py::tuple& arrays, const System& system) {
   if (arrays.size() != 2) throw InputError(fmt::format("data: expected (states, accelerations), got {} arrays", arrays.size()));
   const std::vector<std::string> accelerations = system.acceleration_names();
@@ -47,15 +47,17 @@ CsvTable table_of(const py::tuple& arrays, const System& system) {
   if (states.matrix().cols() != ddq.matrix().cols()) {
     throw InputError(fmt::format("data: {} states, but {} accelerations", states.matrix().cols(), ddq.matrix().cols()));
   }
+  if (states.matrix().cols() == 0) throw InputError("data: there are no rows");
   std::vector<CsvTable::Column> columns;
-  const auto add = [&](const std::vector<std::string>& names, const Eigen::Map<const Eigen::MatrixXd>& rows) {
-    for (std::size_t k = 0; k < names.size(); ++k) {
-      const auto values = rows.row(static_cast<Eigen::Index>(k));
-      if (!values.array().isNaN().all()) columns.push_back({names[k], {values.begin(), values.end()}});
-    }
+  const auto add = [&](const std::string& name, const auto& values) {
+    columns.push_back({name, {values.begin(), values.end()}});
   };
-  add(system.state_names(), states.matrix());
-  add(accelerations, ddq.matrix());
+  const std::vector<std::string> names = system.state_names();
+  for (std::size_t k = 0; k < names.size(); ++k) {
+    const auto values = states.matrix().row(static_cast<Eigen::Index>(k));
+    if (!values.array().isNaN().all()) add(names[k], values);
+  }
+  for (std::size_t k = 0; k < accelerations.size(); ++k) add(accelerations[k], ddq.matrix().row(static_cast<Eigen::Index>(k)));
   return CsvTable::from_columns("data", std::move(columns));
 }
 
@@ -97,10 +99,16 @@ class LastProgress {
   std::optional<Progress> last_;
 };
 
-std::vector<SideInformation> side_information_of(const std::vector<PySideInformation>& also) {
+std::vector<SideInformation> side_information_of(const py::object& also) {
+  if (py::isinstance<PySideInformation>(also)) return side_information_of(py::make_tuple(also));
   std::vector<SideInformation> out;
-  for (const PySideInformation& one : also) {
+  for (const py::handle entry : also) {
     const std::string what = fmt::format("also[{}]", out.size());
+    if (!py::isinstance<PySideInformation>(entry)) {
+      throw py::type_error(
+          fmt::format("{}: expected a gp2.SideInformation, got {}", what, std::string(py::str(py::type::handle_of(entry)))));
+    }
+    const auto& one = entry.cast<const PySideInformation&>();
     out.push_back({quantity_argument(one.view), one.latent, log_of(one.data, one.system, what)});
   }
   return out;
@@ -147,7 +155,7 @@ PyPosterior fit_model(const PySystem& system, const py::object& data, const py::
   py::dict keywords = kwargs;
   FitRequest request;
   const auto progress = take<py::object>(keywords, "progress", py::none());
-  const auto also = take<std::vector<PySideInformation>>(keywords, "also", {});
+  const auto also = take<py::object>(keywords, "also", py::tuple());
   const auto commands = take<py::object>(keywords, "commands", py::none());
   read_keywords("fit", keywords, options(request));
   if (!commands.is_none()) request.problem.commands = to_table(commands, "commands");
@@ -196,7 +204,7 @@ PyPosterior fit_again(const py::object& path, const py::object& data, const std:
   request.threads = threads;
   request.data_source.clear();
   request.logs = logs_of(data, *request.model.system);
-  request.also = side_information_of(also);
+  request.also = side_information_of(py::cast(also));
   return run(prepare_fit(std::move(request)), progress);
 }
 

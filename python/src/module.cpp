@@ -62,6 +62,8 @@ constexpr std::array takes = {
     Takes{"bool", "True or False", [](py::handle value) { return py::isinstance<py::bool_>(value) || is_index(value); }},
     Takes{"str", "a str", &is_text},
     Takes{"List[str]", "a list of names", &is_list_of_text},
+    Takes{"gp2._gp2.System", "a gp2.System (gp2.System.load reads one from a file)",
+          [](py::handle value) { return value.is_none() || py::isinstance<gp2::python::PySystem>(value); }},
 };
 
 // A value of another type than its parameter's, where there is one signature.
@@ -70,6 +72,7 @@ void refuse_wrong_type(const std::string& text, const std::string& signatures, c
   if (signatures.find(" 2. ") != std::string::npos) return;
   const py::object re = py::module_::import("re");
   std::size_t position = text.find("__init__()") == 0 ? 1 : 0;  // whose signature does not have the object
+  std::string negative;  // a whole number below 0, which is what is wrong where nothing else is
   for (const py::handle parameter : re.attr("findall")(R"((\w+): ([\w.]+(?:\[\w+\])?))", signatures)) {
     const auto pair = parameter.cast<std::pair<std::string, std::string>>();
     const std::string &name = pair.first, &type = pair.second;
@@ -81,9 +84,15 @@ void refuse_wrong_type(const std::string& text, const std::string& signatures, c
     }
     ++position;
     const auto* const known = std::find_if(takes.begin(), takes.end(), [&](const Takes& one) { return one.type == type; });
-    if (!value || known == takes.end() || known->fits(value)) continue;
-    throw py::type_error(fmt::format("{}: expected {}, got {}", name, known->words, py::repr(value).cast<std::string>()));
+    if (!value || known == takes.end()) continue;
+    const auto got = [&](const char* expected) {
+      return fmt::format("{}: expected {}, got {}", name, expected, py::repr(value).cast<std::string>());
+    };
+    if (!known->fits(value)) throw py::type_error(got(known->words));
+    const bool is_negative = type == "int" && value.attr("__lt__")(0).cast<bool>();
+    if (is_negative) negative = got("a whole number that is not negative");
   }
+  if (!negative.empty()) throw py::type_error(negative);
 }
 
 PyObject* dispatch_or_say_why(PyObject* self, PyObject* arguments, PyObject* keywords) {

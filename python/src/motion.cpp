@@ -67,7 +67,9 @@ std::vector<Motion> run_motions(const SimulateJob& job, const std::shared_ptr<co
 Motion simulate_model(const PySystem& system, const py::object& start, const py::object& times, const py::object& inputs,
                       const py::kwargs& keywords) {
   const SimulateRequest request = simulate_request(system.system(), start, times, inputs, keywords);
-  return run_motions(prepare_simulation(*system.model, request), system.model->system).front();
+  std::vector<Motion> motions = run_motions(prepare_simulation(*system.model, request), system.model->system);
+  tell(motion_notes(motions[0].trajectory, {}));
+  return std::move(motions[0]);
 }
 
 py::object simulate_posterior(const PyPosterior& self, const py::object& start, const py::object& times, const py::object& inputs,
@@ -79,6 +81,8 @@ py::object simulate_posterior(const PyPosterior& self, const py::object& start, 
   std::vector<Motion> motions = run_motions(job, system == nullptr ? self.file.model.system : system->model->system);
   if (request.n_samples) return py::cast(std::move(motions));
   motions[0].uncertainty = unlocked([&] { return motion_uncertainty(posterior, motions[0].trajectory, asked.other_system); });
+  // without data all is far from them
+  tell(motion_notes(motions[0].trajectory, posterior.n_states() == 0 ? std::nullopt : motions[0].uncertainty));
   return py::cast(std::move(motions[0]));
 }
 
@@ -160,7 +164,8 @@ void add_motion(py::module_& module) {
       .def_property_readonly(
           "t", [](const Motion& m) { return to_vector(m.trajectory.times); }, "(n) [s]")
       .def_property_readonly(
-          "states", [](const Motion& m) { return to_rows(m.trajectory.states); }, "(n, len(state_names))")
+          "states", [](const Motion& m) { return to_rows(m.trajectory.states); },
+          "(n, len(state_names)); of inputs that act late what acts.")
       .def_property_readonly(
           "q", [](const Motion& m) { return to_rows(m.trajectory.states.topRows(m.trajectory.accelerations.rows())); }, "(n, nq)")
       .def_property_readonly(
@@ -195,7 +200,7 @@ void add_motion(py::module_& module) {
           "Times at which the constraints have a lower rank than at others.")
       .def_property_readonly(
           "table", [](const Motion& m) { return as_table(m.trajectory, *m.system, "motion"); },
-          "t, q, dq, ddq and the inputs: fit takes it as a log, simulate as inputs.")
+          "t, q, dq, ddq and the inputs as commanded: fit takes it as a log, simulate as inputs.")
       .def_property_readonly("steps", [](const Motion& m) { return m.trajectory.steps; })
       .def_property_readonly("rejected_steps", [](const Motion& m) { return m.trajectory.rejected_steps; })
       .def_property_readonly("evaluations", [](const Motion& m) { return m.trajectory.evaluations; });

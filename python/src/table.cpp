@@ -20,7 +20,8 @@ bool is_missing(const py::handle& cell) {
 
 // a column of a table; NaN stands for an empty cell, as pandas reads one
 CsvTable::Column to_column(std::string name, const py::object& values, const std::string& what) {
-  const py::array array = py::array::ensure(without_mask(values));
+  py::array array = py::array::ensure(without_mask(values));
+  if (array && array.ndim() == 2 && (array.shape(0) == 1 || array.shape(1) == 1)) array = array.attr("ravel")();  // of MATLAB
   if (!array || array.ndim() != 1) {
     PyErr_Clear();
     throw InputError(fmt::format("{}: expected one-dimensional", what));
@@ -55,15 +56,18 @@ CsvTable to_table(const py::object& data, const std::string& what, CsvTable::Kee
   if (py::isinstance<CsvTable>(data)) return data.cast<CsvTable>();
   const bool is_path = py::isinstance<py::str>(data) || py::hasattr(data, "__fspath__");
   if (is_path) return CsvTable::read(path_argument(data), keep);
-  if (!py::hasattr(data, "keys")) {
+  const std::optional<py::list> names = column_names(data);
+  if (!names) {
     throw py::type_error(
-        fmt::format("{}: expected a gp2.Table, the path of a CSV file, a pandas frame, or a mapping of column "
-                    "names to arrays; got {}",
+        fmt::format("{}: expected a gp2.Table, the path of a CSV file, a frame of pandas or polars, a structured array, or a "
+                    "mapping of column names to arrays; got {}",
                     what, std::string(py::str(py::type::of(data)))));
   }
   std::vector<CsvTable::Column> columns;
-  for (const py::handle key : data.attr("keys")()) {
+  for (const py::handle key : *names) {
     std::string name = py::str(key);
+    // what scipy.io.loadmat says of the file itself
+    if (name == "__header__" || name == "__version__" || name == "__globals__") continue;
     const std::string column = fmt::format("{}['{}']", what, name);
     columns.push_back(to_column(std::move(name), data[key], column));
   }
@@ -75,7 +79,8 @@ void add_table(py::module_& module) {
       .def(py::init(
                [](const py::object& columns, const std::string& name) { return to_table(columns, name, CsvTable::Keep::text); }),
            py::arg("columns"), py::arg("name") = "data",
-           "From a pandas frame, a mapping of column names to arrays of one length, or the path of a CSV file.")
+           "From a frame of pandas or polars, a structured array, a mapping of column names to arrays of one length, say of\n"
+           "scipy.io.loadmat, or the path of a CSV file.")
       .def_property_readonly("name", &CsvTable::name, "Stands for the table in messages.")
       .def_property_readonly("columns", &CsvTable::header, "Names of the columns, in their order.")
       .def("keys", &CsvTable::header, "Names of the columns, in their order.")

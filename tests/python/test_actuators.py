@@ -49,6 +49,26 @@ def test_arrays_are_what_acts_and_tables_what_is_commanded():
     np.testing.assert_array_equal(posterior.predict(log).mean, posterior.predict(system.states(log)).mean)
 
 
+def test_a_motion_is_a_log_of_commands():
+    system, t = cart({"name": "u", "delay": 0.03, "lag": 0.05}), np.linspace(0, 1, 101)
+    commands = {"t": t, "u": 1.5 * np.sin(9 * t)}
+    motion = gp2.simulate(system, {"x": 0, "dx": 0}, t, inputs=commands)
+    np.testing.assert_allclose(motion.table["u"], commands["u"], rtol=0, atol=1e-15)
+    assert np.abs(motion.states[:, system.state_names.index("u")] - commands["u"]).max() > 0.1  # what acts
+    np.testing.assert_allclose(system.states(motion.table), motion.states, rtol=0, atol=1e-12)
+
+
+def test_a_fit_again_tells_of_the_delay_that_it_was_given(tmp_path):
+    posterior = gp2.fit(cart(LATE), log_of(0.03, 0.05), mean="force", max_points=60, restarts=1, hyperparameters="optimise")
+    posterior.save(tmp_path / "fit.json")
+    again = gp2.fit_again(tmp_path / "fit.json")
+    assert again.report.actuators == posterior.report.actuators
+    again.save(tmp_path / "again.json")
+    # but for the seconds that it took
+    first, second = (open(tmp_path / name).read() for name in ("fit.json", "again.json"))
+    assert len(first) == pytest.approx(len(second), abs=40)
+
+
 def test_a_log_without_times_is_refused():
     log = log_of(0.03, 0.05, seconds=1)
     del log["t"]

@@ -167,7 +167,6 @@ def test_integers_are_numbers(oscillator):
         (lambda x: x.astype(str), "dtype <U"),
         (lambda x: x > 0, "dtype bool"),
         (lambda x: x.astype("datetime64[s]"), "dtype datetime64[s]"),
-        (lambda x: x.view([("a", float)]), "dtype [('a', '<f8')]"),
     ],
 )
 def test_what_is_no_real_number_is_refused(change, got, posterior, arm, arm_states):

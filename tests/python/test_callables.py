@@ -41,6 +41,11 @@ def as_functions(surface, constraints=("surface",), mechanics=None, **keywords):
     return gp2.System.from_callables(mechanics or evaluate, constraints, **keywords)
 
 
+def test_rows_of_constraints_that_nobody_names_are_refused(surface, log):
+    with pytest.raises(gp2.InputError, match="mechanics: A is not empty, but no constraint is named: give constraints="):
+        gp2.fit(as_functions(surface, constraints=()), log, max_iterations=0)
+
+
 def test_functions_give_the_same_fit_as_text(surface, log):
     system = as_functions(surface)
     options = {"mean": "force", "restarts": 2, "estimate": []}

@@ -162,6 +162,12 @@ def test_names_are_checked(posterior, arm, arm_log, arm_states):
         assert text in text_of(call)
     with pytest.raises(TypeError, match="noise_std: expected a positive number, 'estimate' or 'stated', got \\[1\\]"):
         gp2.fit(arm, arm_log, noise_std=[1])
+    with pytest.raises(TypeError, match="system: expected a gp2.System .gp2.System.load reads one from a file., got 'arm.toml'"):
+        gp2.fit("arm.toml", arm_log)
+    with pytest.raises(TypeError, match="seed: expected a whole number that is not negative, got -1"):
+        posterior.sample(arm_states, 2, seed=-1)
+    with pytest.raises(TypeError, match=r"also\[0\]: expected a gp2.SideInformation, got <class 'dict'>"):
+        gp2.fit(arm, arm_log, also=[{}])
     with pytest.raises(TypeError, match="a model holds text, numbers, lists and mappings, not set"):
         gp2.System(coordinates=["x"], mass=[{1}])
 

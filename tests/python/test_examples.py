@@ -31,7 +31,8 @@ def run(tmp_path):
         environment = os.environ | {"PYTHONPATH": str(Path(gp2.__file__).resolve().parents[1]), "MPLBACKEND": "Agg"}
         result = subprocess.run([sys.executable, script], cwd=folder, env=environment, capture_output=True, text=True, timeout=120)
         assert result.returncode == 0, result.stderr
-        assert "Warning" not in result.stderr
+        # a motion may leave the data, which is said
+    assert "Warning" not in result.stderr.replace("UserWarning: the motion leaves the region of the data", "")
         return result.stdout
 
     return run

@@ -26,12 +26,21 @@ def test_system_is_its_own_copy_and_travels_as_text(arm):
     assert pickle.loads(pickle.dumps(arm)).text == arm.text
 
 
+def test_systems_of_one_text_are_equal(arm, posterior):
+    again = gp2.System.parse(arm.text, arm.name)
+    assert again is not arm and again == arm and len({again, arm}) == 1
+    assert posterior.system == posterior.system
+    assert gp2.System.parse(arm.text + "# another", arm.name) != arm and arm != arm.text
+
+
 def test_what_holds_functions_cannot_be_pickled():
     def free_mass(states, parameters):
         n = len(states)
         return np.ones((n, 1, 1)), None, None, np.zeros((n, 1))
 
     system = gp2.System.from_callables(free_mass, name="a mass", coordinates=["x"], noise=0.1, reads=["x", "dx"])
+    again = gp2.System.from_callables(free_mass, name="a mass", coordinates=["x"], noise=0.1, reads=["x", "dx"])
+    assert system == system and again != system  # nobody knows what they compute
     posterior = gp2.fit(system, {"x": [0.0, 1.0], "dx": [1.0, 0.5], "ddx": [0.1, 0.2]}, max_iterations=0)
     for thing in [system, posterior]:
         with pytest.raises(TypeError, match="'a mass' cannot be pickled: it has functions, which are code"):

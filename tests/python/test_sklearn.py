@@ -1,6 +1,7 @@
 """gp2.sklearn: the checks that scikit-learn has for its own estimators, and what they cannot bring: states of a machine."""
 
 import pickle
+import warnings
 
 import numpy as np
 import pandas as pd
@@ -9,7 +10,7 @@ from sklearn.base import clone
 from sklearn.exceptions import NotFittedError
 from sklearn.model_selection import GridSearchCV, cross_val_score
 from sklearn.pipeline import make_pipeline
-from sklearn.preprocessing import FunctionTransformer
+from sklearn.preprocessing import FunctionTransformer, MinMaxScaler, StandardScaler
 from sklearn.utils.estimator_checks import check_estimator, parametrize_with_checks
 
 import gp2
@@ -234,6 +235,32 @@ def test_options_reach_the_fit(data):
     assert abs(model.posterior_.parameters["h"] - 0.5) < 0.05
     baseline = GP2Regressor(WIRE, baseline="se", n_restarts=1).fit(X, y)
     assert baseline.log_marginal_likelihood_value_ < model.log_marginal_likelihood_value_
+
+
+def test_every_option_of_fit_reaches_it(data):
+    X, y = data
+    options = {"hyperparameters": "optimise", "robust": True, "restarts": 2}
+    with pytest.raises(gp2.InputError, match="fit_options: 'restarts' is an argument of GP2Regressor itself"):
+        GP2Regressor(WIRE, fit_options=options).fit(X, y)
+    del options["restarts"]
+    model = GP2Regressor(WIRE, mean="force", n_restarts=1, fit_options=options)
+    assert clone(model).get_params()["fit_options"] == options
+    asked = model.fit(X, y).posterior_.options
+    assert asked["robust"] is True and asked["hyperparameters"] == "optimise"
+    with pytest.raises(TypeError, match="did you mean 'robust'"):
+        GP2Regressor(WIRE, fit_options={"robst": True}).fit(X, y)
+
+
+@pytest.mark.parametrize("scaler", [StandardScaler(), MinMaxScaler()])
+def test_a_scaler_before_a_system_is_warned_of(data, scaler):
+    X, y = data
+    estimator = GP2Regressor(WIRE, n_restarts=1, max_iterations=0)
+    with pytest.warns(UserWarning, match="X: every column is scaled alike"):
+        make_pipeline(scaler, estimator).fit(X, y)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        estimator.fit(X, y)
+        make_pipeline(scaler, GP2Regressor(n_restarts=1, max_iterations=0)).fit(X, y)  # without mechanics it may be
 
 
 # ---------------------------------------------------------------- what is refused

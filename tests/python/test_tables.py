@@ -134,8 +134,8 @@ def test_numbers_go_through_a_table_unchanged():
     ("columns", "error", "text"),
     [
         ({"x": [1, 2], "y": [1]}, gp2.InputError, "data: the columns differ in length: 'x' has 2, 'y' has 1"),
-        ({"x": [[1, 2]]}, gp2.InputError, "data['x']: expected one-dimensional"),
-        (3, TypeError, "data: expected a gp2.Table, the path of a CSV file, a pandas frame, or a mapping"),
+        ({"x": [[1, 2], [3, 4]]}, gp2.InputError, "data['x']: expected one-dimensional"),
+        (3, TypeError, "data: expected a gp2.Table, the path of a CSV file, a frame of pandas or polars, a structured array, or a mapping"),
         (np.zeros((2, 2)), TypeError, "got <class 'numpy.ndarray'>"),
     ],
 )
@@ -260,6 +260,33 @@ def test_results_are_pandas_frames(arm, arm_log, arm_fit_file, arm_states):
     # a motion is a log, whose deviations are not those of a measurement
     assert list(motion.table.columns) == [c for c in frame.columns if not c.endswith("_std") and c != "distance_from_data"]
     assert list(gp2.simulate(arm, start, [0, 0.1]).to_frame().columns) == motion.table.columns
+
+
+class Polars:
+    """What a frame of polars shows of itself: columns by name, a shape, no keys."""
+
+    def __init__(self, columns):
+        self._columns = columns
+
+    columns = property(lambda self: list(self._columns))
+    shape = property(lambda self: (len(next(iter(self._columns.values()))), len(self._columns)))
+
+    def __getitem__(self, name):
+        return self._columns[name]
+
+
+def test_a_table_is_what_has_named_columns(arm, arm_log, arm_fit_file):
+    columns = {name: np.asarray(values) for name, values in columns_of(arm_log).items()}
+    shuffled = dict(reversed(columns.items()))  # found by their names, wherever they stand
+    structured = np.rec.fromarrays(list(shuffled.values()), names=",".join(shuffled))
+    matlab = {"__header__": b"MATLAB 5.0", "__version__": "1.0", "__globals__": [],
+              **{name: values[None, :] for name, values in columns.items()}}
+    posterior = gp2.load(arm_fit_file)
+    expected = posterior.predict(columns).mean
+    for table in (structured, np.asarray(structured), matlab, Polars(shuffled)):
+        assert sorted(gp2.Table(table).columns) == sorted(columns)
+        np.testing.assert_array_equal(posterior.predict(table).mean, expected)
+        np.testing.assert_array_equal(arm.states(table), arm.states(columns))
 
 
 def test_notebooks_show_systems_and_fits(arm, arm_fit_file):
