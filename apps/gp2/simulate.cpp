@@ -62,15 +62,10 @@ struct Motion {
   std::optional<MotionEnergy> energy;            // of a model with a potential
 };
 
-/// The inputs are written as commanded, and those of contacts as the motion made them, so that the file reads as a log does.
-void print_motions(const std::vector<Motion>& motions, const Subject& subject, const SimulateJob& job, bool with_sample,
-                   bool with_stddev, CsvWriter& csv) {
-  const InputSignal& commands = job.commands;
-  const std::vector<Contact>& contacts = job.motions.front().contacts;
-  const System& system = subject.system();
+/// The file reads as a log does: inputs are as commanded.
+void print_motions(const std::vector<Motion>& motions, const System& system, bool with_sample, bool with_stddev, CsvWriter& csv) {
   const StateLayout layout = system.layout();
   const std::vector<std::string> names = system.state_names();
-  Eigen::VectorXd command(layout.nu);
   const std::vector<std::string> accelerations = system.acceleration_names();
   if (with_sample) csv.add("sample");
   csv.add("t");
@@ -82,7 +77,7 @@ void print_motions(const std::vector<Motion>& motions, const Subject& subject, c
   }
   for (std::size_t j = 0; with_stddev && j < accelerations.size(); ++j) csv.add(accelerations[j] + "_std");
   if (with_stddev) csv.add("distance_from_data");
-  if (job.motions.front().energy) csv.add("energy");
+  if (motions.front().energy) csv.add("energy");
   const bool with_energy_stddev = motions[0].energy && motions[0].energy->stddev.size() > 0;
   if (with_energy_stddev) csv.add("energy_std");
   csv.end_line();
@@ -97,9 +92,7 @@ void print_motions(const std::vector<Motion>& motions, const Subject& subject, c
       csv.add(trajectory.times[i]);
       add(trajectory.states.col(i).head(2 * layout.nq));
       add(trajectory.accelerations.col(i));
-      commands.evaluate(trajectory.times[i], command);
-      for (const Contact& contact : contacts) command[contact.input] = trajectory.states(layout.u(contact.input), i);
-      add(command);
+      add(trajectory.commands.col(i));
       if (system.nc() > 0) add(trajectory.records.col(i));
       if (with_stddev) {
         add(motions[k].uncertainty->stddev.col(i));
@@ -117,7 +110,7 @@ const char* word_of(ContactEvent::Kind kind) {
 }
 
 // "contacts: 12 impacts, made 1, released 0 times, the first at t = 0.45; the impacts took 3.2 J"
-std::optional<std::string> contacts_note(const Trajectory& motion) {
+std::optional<std::string> contacts_note(const Trajectory& motion, const System& system) {
   if (motion.events.empty()) return std::nullopt;
   const auto count = [&](ContactEvent::Kind kind) {
     return std::count_if(motion.events.begin(), motion.events.end(), [&](const ContactEvent& one) { return one.kind == kind; });
@@ -128,12 +121,13 @@ std::optional<std::string> contacts_note(const Trajectory& motion) {
   const auto least = std::min_element(motion.events.begin(), motion.events.end(),
                                       [](const auto& one, const auto& other) { return one.energy_loss < other.energy_loss; });
   constexpr double rounding = 1e-9;
-  const std::string gain = least->energy_loss < -rounding * (1 + std::abs(loss))
-                               ? fmt::format(
-                                     "; the one at t = {:.6g} gave {:.3g} J, as Newton's restitution does where friction turns "
-                                     "the slip: a smaller restitution gives none",
-                                     least->time, -least->energy_loss)
-                               : "";
+  const bool moves = system.reads(SystemPart::residuals)[static_cast<std::size_t>(system.layout().t())];
+  const std::string gain =
+      least->energy_loss < -rounding * (1 + std::abs(loss))
+          ? fmt::format("; the one at t = {:.6g} gave {:.3g} J, as {}", least->time, -least->energy_loss,
+                        moves ? "a surface that moves does"
+                              : "Newton's restitution does where friction turns the slip: a smaller restitution gives none")
+          : "";
   return fmt::format(
       "contacts: {} impacts, made {} and released {} times, the first event at t = {:.6g}, the last, {}, at {:.6g}; "
       "impacts took {:.6g} J{}",
@@ -214,23 +208,10 @@ std::vector<std::string> notes_of(const std::vector<Motion>& motions, const Syst
                                 first.start_position_residual, first.start_velocity_residual));
   }
   for (std::size_t k = 0; k < motions.size(); ++k) {
-    if (!motions[k].uncertainty || !motions[k].uncertainty->leaves_data) continue;
-    notes.push_back(
-        fmt::format("warning: {}leaves the region of the data at t = {:.6g}: at its farthest it is {:.3g} times as far from the "
-                    "observed states as those are from each other",
-                    motions.size() > 1 ? fmt::format("sample {} ", k) : "the motion ", *motions[k].uncertainty->leaves_data,
-                    motions[k].uncertainty->distance.maxCoeff()));
-    break;  // the first sample stands for the others
-  }
-  for (const Motion& motion : motions) {
-    const LowerRank& lower = motion.trajectory.lower_rank;
-    if (lower.states.empty()) continue;
-    notes.push_back(
-        fmt::format("warning: the constraints have rank {} but at {} of {} rows of the motion, where it is as low as {}, first "
-                    "at t = {:.6g}; the motion may branch there",
-                    lower.usual, lower.states.size(), motion.trajectory.times.size(), lower.lowest,
-                    motion.trajectory.times[lower.states.front()]));
-    break;  // as above
+    const std::string called = motions.size() > 1 ? fmt::format("sample {}", k) : "the motion";
+    const std::vector<std::string> of_motion = motion_notes(motions[k].trajectory, motions[k].uncertainty, called);
+    notes.insert(notes.end(), of_motion.begin(), of_motion.end());
+    if (!of_motion.empty()) break;  // this one stands for the others
   }
   const nlohmann::ordered_json report = report_of(motions, system, job);
   Eigen::Index n_rows = 0;
@@ -238,7 +219,7 @@ std::vector<std::string> notes_of(const std::vector<Motion>& motions, const Syst
   notes.push_back(fmt::format("{}: {} rows, {} steps; drift |c| ≤ {:.3g}, |dc/dt| ≤ {:.3g}", arguments.output, n_rows,
                               report["steps"].get<int>(), report["max_position_drift"].get<double>(),
                               report["max_velocity_drift"].get<double>()));
-  if (const std::optional<std::string> note = contacts_note(first)) notes.push_back(*note);
+  if (const std::optional<std::string> note = contacts_note(first, system)) notes.push_back(*note);
   if (motions[0].energy) {
     const Eigen::VectorXd& energy = motions[0].energy->values;
     notes.push_back(fmt::format("energy: {:.6g} J at the start, {:.6g} J at the end, largest change {:.3g} J", energy[0],
@@ -289,7 +270,8 @@ void run(const SimulateArguments& arguments) {
   const std::vector<Motion> motions = with_uncertainty(std::move(trajectories), subject, job);
   if (motions.empty()) throw NumericalError(unfinished);
   write_csv(arguments.output, [&](CsvWriter& csv) {
-    print_motions(motions, subject, job, request.n_samples.has_value(), subject.posterior.has_value() && !request.n_samples, csv);
+    print_motions(motions, subject.system(), request.n_samples.has_value(), subject.posterior.has_value() && !request.n_samples,
+                  csv);
   });
   print_notes(notes_of(motions, subject.system(), job, arguments));
   if (arguments.json) print_result("{}\n", report_of(motions, subject.system(), job).dump(2));

@@ -133,6 +133,8 @@ struct InducingReport {
 
 struct FitReport {
   static constexpr const char* interrupted = "interrupted";  // termination of a fit that was stopped on request
+  /// … of one whose hyperparameters and mean of latents that are not linear, found in turn, did not settle
+  static constexpr const char* unsettled = "the posterior mean of the latents still changed";
 
   std::vector<Hyperparameter> hyperparameters;  // fitted values
   double negative_log_likelihood = 0;           // physical units, all constants, without hyper-prior

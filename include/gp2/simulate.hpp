@@ -39,11 +39,20 @@ class InputSignal {
 
   /// What acts at t.
   void evaluate(double t, Eigen::Ref<Eigen::VectorXd> u) const;
+  /// What is commanded at t.
+  void command(double t, Eigen::Ref<Eigen::VectorXd> u) const;
   /// The first time after t at which a slope changes; +∞ when there is none.
   [[nodiscard]] double next_kink(double t) const;
 
  private:
   void find_kinks();
+  /// At t, between two commands of the table.
+  struct Place {
+    Eigen::Index before = 0;
+    double since = 0;    // that one [s]; negative: before the table
+    double command = 0;  // there
+  };
+  [[nodiscard]] Place place(Eigen::Index input, double t) const;
 
   Eigen::VectorXd times_;
   Eigen::MatrixXd values_;
@@ -133,10 +142,14 @@ struct Trajectory {
   Eigen::VectorXd times;          // (N) [s]
   Eigen::MatrixXd states;         // [q; dq; t; u] (layout size × N)
   Eigen::MatrixXd accelerations;  // ddq there (nq × N)
-  Eigen::MatrixXd records;        // options.record there
+  Eigen::MatrixXd
+      commands;  // inputs as a log has them, where states hold what acts: as commanded, of contacts as they were (nu × N)
+  Eigen::MatrixXd records;  // options.record there
 
   double max_position_drift = 0;       // largest |c| of position constraints at the written times
   double max_velocity_drift = 0;       // largest |dc/dt|, or |c| of velocity constraints, there
+  double largest_jump = 0;             // by which a constraint that takes hold (`when`) moved a coordinate onto itself
+  double jump_time = 0;                // then [s]
   LowerRank lower_rank;                // written times at which constraints let go, or follow from each other
   double start_position_residual = 0;  // the drift at the start as it was given
   double start_velocity_residual = 0;

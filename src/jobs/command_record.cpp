@@ -98,6 +98,14 @@ bool CommandRecord::knows(const Place& place, double reach) const {
   return place.part >= 0 && place.time - parts_[static_cast<std::size_t>(place.part)].times.front() >= (1 - rounding) * reach;
 }
 
+bool CommandRecord::begins_at_rest(const Place& place, double reach) const {
+  if (place.part < 0) return false;
+  const Part& part = parts_[static_cast<std::size_t>(place.part)];
+  if (part.commands.col(0).isZero(0)) return true;
+  const Index n = std::upper_bound(part.times.begin(), part.times.end(), part.times.front() + reach) - part.times.begin();
+  return n > 1 && (part.commands.leftCols(n).colwise() - part.commands.col(0)).isZero(0);
+}
+
 void CommandRecord::act(const std::vector<Actuator>& actuators, const std::vector<Place>& places, const StateLayout& layout,
                         MatrixXd& states) const {
   std::vector<Actuator> of_inputs;

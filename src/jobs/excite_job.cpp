@@ -190,10 +190,10 @@ bool is_better(const Candidate& a, const Candidate& b) {
   return std::pair(a.violation, a.merit) < std::pair(b.violation, b.merit);
 }
 
-// q, dq, t, u and ddq
+// q, dq, t, u as commanded, and ddq
 MatrixXd quantities(const Trajectory& motion) {
   MatrixXd all(motion.states.rows() + motion.accelerations.rows(), motion.states.cols());
-  all << motion.states, motion.accelerations;
+  all << motion.states.topRows(motion.states.rows() - motion.commands.rows()), motion.commands, motion.accelerations;
   return all;
 }
 
@@ -235,9 +235,6 @@ class Search {
     if (!is_of_parameters_) return std::sqrt(one.known.region.sum() / now_.region.sum());
     return std::exp((one.known.log_volume - now_.log_volume) / static_cast<double>(now_.stddev.size()));
   }
-
-  /// Of the best motion (nu × rows).
-  [[nodiscard]] MatrixXd commands() const { return inputs_.commands(best().coefficients); }
 
  private:
   using Clock = std::chrono::steady_clock;
@@ -527,7 +524,6 @@ Excitation excite(const FitSystem& driven, const Posterior& posterior, const std
   out.n_failed = search.n_failed();
   out.highest_frequency = request.n_harmonics / request.duration;
   out.leaves_data = motion_uncertainty(information.posterior(), out.motion, driven.other_system).leaves_data;
-  out.motion.states.bottomRows(system.layout().nu) = search.commands();  // what a logger writes, and `simulate` reads
   out.limits = limit_uses(out.motion, all);
   out.interrupted = is_set(stop);
   out.seconds = search.seconds();

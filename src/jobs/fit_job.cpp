@@ -337,6 +337,7 @@ FitJob prepare_fit_again(const FitFile& fit, int threads) {
   problem.hyperparameters = starting_hyperparameters(fit.model, problem, request.problem);
   FitJob job = job_of(std::move(request), std::move(problem));
   job.file.logs = fit.logs;
+  job.actuators = fit.report.actuators;
   return job;
 }
 

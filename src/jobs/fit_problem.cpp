@@ -274,6 +274,11 @@ std::vector<std::string> notes_of(const FitReport& report) {
   for (const UncertaintyNote& note : uncertainty_notes(report)) {
     notes.push_back(fmt::format("{}{}. {}", note.is_warning ? "warning: " : "", note.text, note.mend));
   }
+  if (report.termination == FitReport::unsettled) {
+    notes.emplace_back(
+        "warning: the fit has not settled: hyperparameters and the mean of latents that are not linear still changed each other. "
+        "Deviations may be far too small. Of a load and its coefficient the data may tell the product alone: give one of them");
+  }
   if (!collapsed.empty()) {
     notes.push_back(
         fmt::format("warning: {} ended at the lower bound: the columns may not be independent measurements; see gp2 check",

@@ -77,12 +77,14 @@ MatrixXd states_of(const Prior& prior, const View& view, LogReader& reader, bool
   return reader.states(reads);
 }
 
-// Whether what acts is known at a row, not resting on commands before the log.
-bool is_known(const CommandedRows& rows, std::size_t row) {
+double reach_of(const CommandedRows& rows) {
   double reach = 0;
   for (const int k : rows.record->inputs()) reach = std::max(reach, rows.actuators[static_cast<std::size_t>(k)].reach());
-  return rows.record->knows(rows.places[row], reach);
+  return reach;
 }
+
+// Whether what acts is known at a row, not resting on commands before the log.
+bool is_known(const CommandedRows& rows, std::size_t row) { return rows.record->knows(rows.places[row], reach_of(rows)); }
 
 std::string unknown_text(const CsvTable& log, std::size_t n, const char* consequence) {
   return fmt::format("{}: {} of {} rows {}: what acts there depends on commands before the log", log.name(), n, log.n_rows(),
@@ -362,7 +364,8 @@ std::optional<CommandedRows> take_commands(const System& system, const std::vect
     out.record = std::make_shared<const CommandRecord>(system, of_whole, late);
   } else {
     out.record = std::make_shared<const CommandRecord>(system, reader, late);
-    if (out.record->usual_step() > lateness) {
+    constexpr double little = 0.1;  // steps by which inputs may be late without a word
+    if (out.record->usual_step() > lateness && lateness > little * out.record->usual_step()) {
       notes.push_back(
           fmt::format("warning: {}: rows are {:.3g} s apart as a rule, inputs at most {:.3g} s late: what acts in between is not "
                       "known; log faster, or, where these are rows of a longer log, give that as `commands`",
@@ -372,6 +375,11 @@ std::optional<CommandedRows> take_commands(const System& system, const std::vect
   out.places = out.record->places(reader);
   out.record->act(actuators, out.places, system.layout(), states);
   return out;
+}
+
+std::vector<Actuator> found(std::vector<Actuator> actuators) {
+  for (Actuator& actuator : actuators) actuator.delay.estimate = actuator.lag.estimate = false;
+  return actuators;
 }
 
 std::string text_of_rest(const Model& model, const VectorXd& parameters, const MatrixXd& states, const MatrixXd& values) {
@@ -625,15 +633,22 @@ LogStates read_log_states(const Prior& prior, const View& view, const Model& mod
   LogStates out{states_of(prior, view, reader, projects), reader.measurements(accelerations), {}, {}};
   const std::vector<std::string> stated = stated_accelerations(accelerations, reader);
   if (!stated.empty()) out.stated_stddev = stated_stddevs(model, accelerations, reader, log.n_rows());
-  const std::optional<CommandedRows> commanded =
-      take_commands(*prior.system, actuators.value_or(model.actuators), reader, std::nullopt, columns, out.states, out.notes);
+  const std::optional<CommandedRows> commanded = take_commands(*prior.system, found(actuators.value_or(model.actuators)), reader,
+                                                               std::nullopt, columns, out.states, out.notes);
   std::size_t n_unknown = 0;
-  for (Index i = 0; commanded && i < out.states.cols(); ++i) {
-    if (is_known(*commanded, static_cast<std::size_t>(i))) continue;
+  bool begins_at_rest = true;
+  for (std::size_t i = 0; commanded && i < commanded->places.size(); ++i) {
+    if (is_known(*commanded, i)) continue;
     ++n_unknown;
-    out.accelerations.col(i).setConstant(not_a_number);
+    begins_at_rest = begins_at_rest && commanded->record->begins_at_rest(commanded->places[i], reach_of(*commanded));
+    out.accelerations.col(static_cast<Index>(i)).setConstant(not_a_number);
   }
-  if (n_unknown > 0) {
+  if (n_unknown > 0 && accelerations.empty() && !begins_at_rest) {
+    out.notes.push_back(fmt::format(
+        "warning: {}: {} of {} rows are predicted as if the inputs had been at rest before, but they do not begin so: "
+        "what acts there depends on commands before the log",
+        log.name(), n_unknown, log.n_rows()));
+  } else if (n_unknown > 0) {
     out.notes.push_back(
         unknown_text(log, n_unknown, accelerations.empty() ? "as if the inputs had been at rest before" : "left out"));
   }

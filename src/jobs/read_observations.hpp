@@ -14,7 +14,9 @@ namespace gp2 {
 void check_columns(const System& system, const std::vector<const CsvTable*>& logs,
                    const std::map<std::string, std::string>& columns);
 
-/// @param fitted  the model that is fitted, with its prior
+/// As a fit found them: nothing of them is estimated any more.
+std::vector<Actuator> found(std::vector<Actuator> actuators);
+
 /// What acts takes the place of what was commanded, in the states of a whole log.
 /// @param actuators  of the log's system
 /// @param reader     of the log

@@ -120,7 +120,7 @@ class Shooter {
   void read(const CsvTable& log, const std::map<std::string, std::string>& columns, std::vector<std::string>& notes) {
     LogReader reader = open_log(fit_.model, log, columns);
     states_ = reader.states(std::vector<bool>(static_cast<std::size_t>(system_.layout().size()), true));
-    static_cast<void>(take_commands(system_, fit_.model.actuators, reader, std::nullopt, columns, states_, notes));
+    static_cast<void>(take_commands(system_, found(fit_.model.actuators), reader, std::nullopt, columns, states_, notes));
     for (int j = 0; j < system_.nq(); ++j) {
       if (!reader.stddev_column(system_.coordinates()[static_cast<std::size_t>(j)].name).empty()) compared_.push_back(j);
     }

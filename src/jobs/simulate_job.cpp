@@ -184,7 +184,6 @@ SimulateJob prepare(const Model& model, const std::vector<Actuator>& actuators, 
   job.options.max_steps = request.max_steps;
   job.options.project = request.project;
   job.options.inputs = input_signal(model, actuators, request, columns);
-  job.commands = input_signal(model, {}, request, columns);
   job.start = start_state(model, parameters, request, columns, job.notes);
   return job;
 }
@@ -410,6 +409,31 @@ MotionUncertainty motion_uncertainty(const Posterior& posterior, const Trajector
   const auto far = std::find_if(out.distance.begin(), out.distance.end(), [](double d) { return d > Posterior::far_from_data; });
   if (far != out.distance.end()) out.leaves_data = trajectory.times[far - out.distance.begin()];
   return out;
+}
+
+std::vector<std::string> motion_notes(const Trajectory& trajectory, const std::optional<MotionUncertainty>& uncertainty,
+                                      const std::string& called) {
+  std::vector<std::string> notes;
+  if (uncertainty && uncertainty->leaves_data) {
+    notes.push_back(
+        fmt::format("warning: {} leaves the region of the data at t = {:.6g}: at its farthest it is {:.3g} times as far from the "
+                    "observed states as those are from each other",
+                    called, *uncertainty->leaves_data, uncertainty->distance.maxCoeff()));
+  }
+  constexpr double much = 1e-3;  // of a coordinate
+  if (trajectory.largest_jump > much) {
+    notes.push_back(fmt::format(
+        "warning: {} is moved by {:.3g} at once at t = {:.6g}, where a constraint takes hold off its surface: what meets "
+        "a surface is a contact",
+        called, trajectory.largest_jump, trajectory.jump_time));
+  }
+  if (const LowerRank& lower = trajectory.lower_rank; !lower.states.empty()) {
+    notes.push_back(fmt::format(
+        "warning: the constraints have rank {} but at {} of {} rows of the motion, where it is as low as {}, first "
+        "at t = {:.6g}; the motion may branch there",
+        lower.usual, lower.states.size(), trajectory.times.size(), lower.lowest, trajectory.times[lower.states.front()]));
+  }
+  return notes;
 }
 
 }  // namespace gp2

@@ -10,8 +10,10 @@
 #include <fmt/ranges.h>
 
 #include "base/not_a_number.hpp"
+#include "data/evenly.hpp"
 #include "gp2/data/log_reader.hpp"
 #include "gp2/error.hpp"
+#include "gp2/inference/evaluation.hpp"
 #include "gp2/jobs/fit_job.hpp"
 #include "gp2/jobs/fit_problem.hpp"
 #include "inference/inducing_summary.hpp"
@@ -103,6 +105,33 @@ double left_out(const Posterior& posterior) {
   return summary ? 0.5 * summary->components.front().all.trace : 0;
 }
 
+// Values that the fit, at states near its own data, is sure to be others: a sign, a unit, a column of something else.
+void note_unexpected(const Posterior& posterior, const Observations& more, const CsvTable& log, std::vector<std::string>& notes) {
+  constexpr int most_states = 200, fewest_values = 10;
+  constexpr std::int64_t fewest_learned = 30;  // fits of fewer states are sure of too much
+  constexpr double far = 6, sound_share = 0.1;
+  if (posterior.n_states() < fewest_learned || more.n_data() * more.view().size() < fewest_values) return;
+  const Observations some = evenly({more}, most_states).front();
+  const VectorXd distance = posterior.distance_from_data(some.view(), some.states(), /*n_threads=*/0);
+  const Posterior::Marginal predicted = posterior.marginal(some.view(), some.states(), /*n_threads=*/0);
+  MatrixXd noise(some.values().rows(), some.n_data());
+  for (Index i = 0; i < noise.cols(); ++i) noise.col(i) = some.noise_at(some.noise().stddev(), i);
+  noise = with_slip(posterior, some.view(), some.states(), std::move(noise));
+  const MatrixXd variance = predicted.stddev().cwiseAbs2() + noise.cwiseAbs2();
+  const MatrixXd z = (some.values() - predicted.mean).cwiseAbs().cwiseQuotient(variance.cwiseSqrt());
+  int n = 0, n_far = 0;
+  for (Index i = 0; i < z.cols(); ++i) {
+    if (distance[i] > Posterior::far_from_data) continue;
+    n += static_cast<int>((z.col(i).array() >= 0).count());  // not of those that were not measured
+    n_far += static_cast<int>((z.col(i).array() > far).count());
+  }
+  if (n < fewest_values || n_far <= sound_share * n) return;
+  notes.push_back(fmt::format(
+      "warning: {}: {} of {} values near the fit's data lie more than six deviations from what it predicts there: is a "
+      "sign, a unit or a column other than in its own logs? Else it predicts poorly; see gp2 evaluate",
+      log.name(), n_far, n));
+}
+
 }  // namespace
 
 Observations more_observations(const FitFile& fit, const Posterior& posterior, const CsvTable& log, const UpdateRequest& request,
@@ -145,6 +174,7 @@ Observations more_observations(const FitFile& fit, const Posterior& posterior, c
   } else {
     note_shared_rows(groups, {more}, notes);
   }
+  note_unexpected(posterior, more, log, notes);
   return more;
 }
 

@@ -222,7 +222,7 @@ void report_rank(const System& system, const std::vector<int>& ranks, const Mech
                                                  system.has_conditional_constraints() ? " where they are active" : "")});
   }
   report_independence(mechanics, std::ssize(ranks), findings);
-  if (highest >= system.nq()) {
+  if (highest >= system.nq() && !system.has_conditional_constraints()) {
     findings.push_back(
         {Level::warning, "constraints: they leave no freedom (rank = number of coordinates): nothing is left to learn"});
   }

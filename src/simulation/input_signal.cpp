@@ -62,21 +62,28 @@ void InputSignal::find_kinks() {
   kinks_.erase(std::unique(kinks_.begin(), kinks_.end()), kinks_.end());
 }
 
+InputSignal::Place InputSignal::place(Index input, double t) const {
+  const Index after = std::upper_bound(times_.begin(), times_.end(), t) - times_.begin();
+  if (after == 0) return {0, t - times_[0], values_(input, 0)};
+  const double since = t - times_[after - 1], before = values_(input, after - 1);
+  if (after == times_.size()) return {after - 1, since, before};
+  const double share = since / (times_[after] - times_[after - 1]);
+  return {after - 1, since, (1 - share) * before + share * values_(input, after)};
+}
+
 void InputSignal::evaluate(double t, Eigen::Ref<VectorXd> u) const {
-  const Index n = times_.size();
-  if (n == 0) u.setZero();
+  if (is_zero()) u.setZero();
   for (Index j = 0; j < values_.rows(); ++j) {
-    const double sent = t - delay_[j];  // the command that arrives
-    const Index after = std::upper_bound(times_.begin(), times_.end(), sent) - times_.begin();
-    if (after == 0) {
-      u[j] = values_(j, 0);
-      continue;
-    }
-    const double since = sent - times_[after - 1], before = values_(j, after - 1);
-    const double share = after == n ? 0 : since / (times_[after] - times_[after - 1]);
-    const double command = after == n ? before : (1 - share) * before + share * values_(j, after);
-    u[j] = lagged(acting_(j, after - 1), before, command, since, lag_[j]);
+    const Place arriving = place(j, t - delay_[j]);
+    u[j] = arriving.since < 0
+               ? arriving.command
+               : lagged(acting_(j, arriving.before), values_(j, arriving.before), arriving.command, arriving.since, lag_[j]);
   }
+}
+
+void InputSignal::command(double t, Eigen::Ref<VectorXd> u) const {
+  if (is_zero()) u.setZero();
+  for (Index j = 0; j < values_.rows(); ++j) u[j] = place(j, t).command;
 }
 
 double InputSignal::next_kink(double t) const {

@@ -84,6 +84,7 @@ class Integration {
     out_.times = options_.times;
     out_.states.resize(layout_.size(), n);
     out_.accelerations.resize(layout_.nq, n);
+    out_.commands.resize(layout_.nu, n);
     t_ = options_.times[0];
     x_.assign(start.begin(), start.begin() + layout_.t());  // t follows q and dq
     dxdt_.resize(x_.size());
@@ -100,6 +101,10 @@ class Integration {
     } catch (const NumericalError& error) {
       keep(next);
       throw UnfinishedMotion(error.what(), {std::move(out_)});
+    } catch (const InputError& error) {
+      if (next == 0) throw;  // of the start, which was given
+      keep(next);
+      throw UnfinishedMotion(fmt::format("simulate: no acceleration at t = {:.6g}: {}", t_, error.what()), {std::move(out_)});
     }
     return std::move(out_);
   }
@@ -150,6 +155,7 @@ class Integration {
     out_.times.conservativeResize(next);
     out_.states.conservativeResize(Eigen::NoChange, next);
     out_.accelerations.conservativeResize(Eigen::NoChange, next);
+    out_.commands.conservativeResize(Eigen::NoChange, next);
     if (options_.record) out_.records.conservativeResize(Eigen::NoChange, next);
   }
 
@@ -163,8 +169,10 @@ class Integration {
         throw NumericalError(fmt::format(
             "simulate: {} steps reach no further than t = {:.6g} of {:.6g}, half of them from t = {:.6g} on: a force that "
             "jumps where a body comes to rest is to be written with sign(v) or v/sqrt(v^2 + w^2), or smoothed, say "
-            "tanh(v/0.01); else loosen the tolerances, or allow more steps (`max_steps`)",
-            options_.max_steps, t_, t_end(), t_halfway_));
+            "tanh(v/0.01){}; else loosen the tolerances, or allow more steps (`max_steps`)",
+            options_.max_steps, t_, t_end(), t_halfway_,
+            system_.has_conditional_constraints() ? "; a constraint that holds at the very edge of its condition is to be a contact"
+                                                  : ""));
       }
       throw NumericalError(
           fmt::format("simulate: {} steps reach no further than t = {:.6g} of {:.6g}: loosen the tolerances, or "
@@ -446,7 +454,7 @@ class Integration {
     const std::size_t n_events = out_.events.size();
     if (has_crossed && !contacts_.is_empty()) settle_contacts(/*at_start=*/false);
     const bool has_met = out_.events.size() > n_events;
-    const bool moved = options_.project && project(x_, t_);
+    const bool moved = options_.project && project_and_note_jump();
     if (switches) {
       switch_or_throw([&] {
         if (has_met) {
@@ -458,6 +466,20 @@ class Integration {
       note_sticks(was_held);
     }
     if (moved || switches || (has_crossed && !contacts_.is_empty())) derivative_or_throw();
+  }
+
+  // projects the state; by a constraint that takes hold off its surface a body is moved there at once
+  bool project_and_note_jump() {
+    const Phase before = x_;
+    if (!project(x_, t_)) return false;
+    for (Index j = 0; system_.has_conditional_constraints() && j < layout_.nq; ++j) {
+      const auto k = static_cast<std::size_t>(j);
+      const double jump = std::abs(x_[k] - before[k]);
+      if (jump <= out_.largest_jump) continue;
+      out_.largest_jump = jump;
+      out_.jump_time = t_;
+    }
+    return true;
   }
 
   // where the motion is on a surface now, and was beside it, or the other way round
@@ -548,6 +570,8 @@ class Integration {
     expand(x, t);
     out_.states.col(row) = state_;
     std::copy(dxdt.begin() + layout_.nq, dxdt.end(), out_.accelerations.col(row).begin());
+    options_.inputs.command(t, out_.commands.col(row));
+    for (const Contact& contact : options_.contacts) out_.commands(contact.input, row) = state_[layout_.u(contact.input)];
     if (!options_.record) return;
     const VectorXd recorded = switching_.mixed(state_, options_.record);
     if (out_.records.size() == 0) out_.records.resize(recorded.size(), options_.times.size());

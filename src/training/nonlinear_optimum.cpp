@@ -70,9 +70,7 @@ FitReport trained_nonlinear(const Prior& prior, const std::vector<Observations>&
   report.iterations = first->iterations;
   report.n_escapes = first->n_escapes;
   report.converged = first->converged && stands;
-  report.termination = is_set(options.stop) ? FitReport::interrupted
-                       : stands             ? first->termination
-                                : fmt::format("the posterior mean of the latents still changed after {} rounds", most);
+  report.termination = is_set(options.stop) ? FitReport::interrupted : stands ? first->termination : FitReport::unsettled;
   return report;
 }
 

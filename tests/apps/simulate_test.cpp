@@ -333,6 +333,39 @@ TEST(SimulateModelCommand, TellsWhenAMultiplierChangesItsSign) {
   EXPECT_NEAR(number(desk.table("motion.csv"), 0, "lambda1"), 9.81, 1e-12);
 }
 
+// What takes hold by `when` is there at once, wherever the body is: that is said, and what holds at the edge of its own `when` too.
+TEST(SimulateModelCommand, SaysWhatAConditionDoesThatIsAContact) {
+  const Desk desk;
+  const auto write = [&](const std::string& constraint) {
+    desk.write("held.toml",
+               "coordinates = [\"x\", \"z\"]\n[mechanics]\nmass = [[1, 0], [0, 1]]\nforce = [\"0\", \"-1\"]\n"
+               "[constraints]\nposition = [" +
+                   constraint + "]\n");
+  };
+  write(R"({ expr = "z - 0.5*x", when = "x > 1" })");
+  const Outcome jump = desk.done("gp2 simulate held.toml --start x=0,z=2,dx=1,dz=0 --t-end 2 --dt 0.1 -o motion.csv");
+  EXPECT_TRUE(jump.said("warning: the motion is moved by 0.")) << jump.err;
+  EXPECT_TRUE(jump.said("where a constraint takes hold off its surface: what meets a surface is a contact")) << jump.err;
+  const Outcome before = desk.done("gp2 simulate held.toml --start x=0,z=2,dx=1,dz=0 --t-end 0.9 --dt 0.1 -o motion.csv");
+  EXPECT_FALSE(before.said("takes hold")) << before.err;
+  write(R"({ expr = "x^2 + z^2 - 1", when = "x^2 + z^2 >= 1" })");
+  const Outcome rope = desk.run("gp2 simulate held.toml --start x=0.5,z=0 --t-end 5 --dt 0.2 --max-steps 2000 -o motion.csv");
+  EXPECT_EQ(rope.status, 1);
+  EXPECT_TRUE(rope.said("a constraint that holds at the very edge of its condition is to be a contact")) << rope.err;
+}
+
+// A plate that goes up gives a ball energy, without friction and at every restitution.
+TEST(SimulateModelCommand, AMovingSurfaceGivesEnergyInAnImpact) {
+  const Desk desk;
+  desk.write(
+      "plate.toml",
+      "coordinates = [\"z\"]\ninputs = [\"touch\"]\n[mechanics]\nmass = [[1]]\nforce = [\"-9.81\"]\npotential = \"9.81*z\"\n"
+      "[constraints]\nposition = [{ expr = \"z - t\", contact = \"touch\", restitution = 0.9 }]\n");
+  const Outcome outcome = desk.done("gp2 simulate plate.toml --start z=0.5,dz=0 --t-end 0.4 --dt 0.1 -o motion.csv");
+  EXPECT_TRUE(outcome.said(" J, as a surface that moves does")) << outcome.err;
+  EXPECT_FALSE(outcome.said("restitution")) << outcome.err;
+}
+
 TEST_F(SimulateFit, MapRefusesNamesThatNobodyHas) {
   const auto refusal = [&](const std::string& options) {
     const Outcome outcome = desk.run("gp2 simulate fit.json --t-end 0.1 -o motion.csv " + options);

@@ -129,8 +129,42 @@ TEST(CommandRecord, WhatDependsOnWhatWasBeforeIsPredictedAndNotCompared) {
                   compared = read_log_states(prior, view, model, log, {}, {"ddx"});
   EXPECT_EQ(predicted.states.cols(), log.n_rows());
   EXPECT_TRUE(predicted.states.row(3).allFinite());
-  EXPECT_THAT(predicted.notes, Contains(HasSubstr("22 of 201 rows as if the inputs had been at rest before")));
+  EXPECT_THAT(predicted.notes,
+              Contains(HasSubstr("warning: late cart: 22 of 201 rows are predicted as if the inputs had been at rest")));
   EXPECT_EQ(compared.accelerations.array().isNaN().count(), 22);
+  // one that begins at 0, or rests at first, may have been at rest before
+  const auto notes_from = [&](double first, int n_resting) {
+    std::vector<CsvTable::Column> columns;
+    for (const std::string& name : log.header()) {
+      columns.push_back({name, {}});
+      for (int row = 0; row < log.n_rows(); ++row) {
+        const bool is_set = name == "u" && row < n_resting;
+        columns.back().numbers.push_back(is_set ? first : log.number(row, log.find(name)));
+      }
+    }
+    return read_log_states(prior, view, model, CsvTable::from_columns("log", std::move(columns)), {}).notes;
+  };
+  const std::string note =
+      "log: 22 of 201 rows as if the inputs had been at rest before: what acts there depends on commands before the log";
+  EXPECT_THAT(notes_from(0, 1), Contains(note));
+  EXPECT_THAT(notes_from(0.7, 30), Contains(note));
+  EXPECT_THAT(notes_from(0.7, 5), Contains(HasSubstr("warning: log: 22 of 201 rows are predicted")));
+}
+
+// A fit has found its delays and lags: what is predicted by it reaches back as far as these do, not as far as they might.
+TEST(CommandRecord, OfAFitReachesAsFarAsWhatWasFound) {
+  const CsvTable log = late_cart_log(0.02, 0.04, 100, 2, 1);
+  const Model model =
+      late_cart(R"({ name = "u", delay = { value = 0.02, estimate = true }, lag = { value = 0.04, estimate = true } })");
+  PriorOptions options;
+  options.mean = Prior::Mean::force;
+  const Prior prior = make_prior(model, options);
+  const View view = View::constrained_acceleration(*model.system);
+  EXPECT_EQ(read_log_states(prior, view, model, log, {}, {"ddx"}).accelerations.array().isNaN().count(), 22);
+  std::vector<int> tenth;
+  for (int row = 0; row < log.n_rows(); row += 10) tenth.push_back(row);
+  EXPECT_THAT(read_log_states(prior, view, model, log.take(tenth), {}).notes,
+              Contains(HasSubstr("rows are 0.1 s apart as a rule, inputs at most 0.06 s late")));
 }
 
 TEST(CommandRecord, AnotherSystemSharesWhatItMarks) {

@@ -92,6 +92,27 @@ TEST(UpdateJob, AWindowLetsTheFirstRowsGoWhereHyperparametersAreIntegrated) {
   }
 }
 
+// A sign, a unit, a swapped column: a fit is sure that these values are others.
+TEST(UpdateJob, SaysWhatTheFitIsSureIsOtherwise) {
+  const FitFile fit = fit_of(log_of(60, 1));
+  const CsvTable sound = log_of(40, 2);
+  const auto notes_under = [&](const std::string& column, double factor) {
+    std::vector<CsvTable::Column> columns;
+    for (const std::string& name : sound.header()) {
+      columns.push_back({name, {}});
+      for (int row = 0; row < sound.n_rows(); ++row) {
+        columns.back().numbers.push_back((name == column ? factor : 1) * sound.number_or_empty(row, sound.find(name)));
+      }
+    }
+    return update(fit, {CsvTable::from_columns("next", std::move(columns))}, {}).notes;
+  };
+  EXPECT_THAT(notes_under("", 1), testing::Not(Contains(HasSubstr("deviations from what it predicts"))));
+  for (const auto& [column, factor] : {std::pair("ddq1", -1.0), std::pair("ddq2", 1000.0), std::pair("ddq1", 0.0)}) {
+    EXPECT_THAT(notes_under(column, factor), Contains(HasSubstr("values near the fit's data lie more than six deviations")))
+        << column;
+  }
+}
+
 TEST(UpdateJob, WhatCannotBeIsAnError) {
   const FitFile fit = fit_of(log_of(30, 1));
   const auto refused = [&](const UpdateRequest& request) {

@@ -90,6 +90,7 @@ TEST(ActuatedMotion, IsThatOfAMassUnderALateForce) {
   EXPECT_NEAR(motion.accelerations(0, 4), r * (s - lag * forgotten), 1e-12);
   EXPECT_NEAR(motion.states(1, 4), r * (s * s / 2 - lag * s + lag * lag * forgotten), 1e-9);
   EXPECT_EQ(motion.states(3, 1), motion.accelerations(0, 1));  // the input of a state is what acts
+  EXPECT_LE((motion.commands.row(0) - r * motion.times.transpose()).cwiseAbs().maxCoeff(), 1e-15);
 }
 
 }  // namespace

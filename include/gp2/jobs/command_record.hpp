@@ -37,6 +37,8 @@ class CommandRecord {
 
   /// Whether what acts there depends on no command from before its part: `reach` [s] have passed.
   [[nodiscard]] bool knows(const Place& place, double reach) const;
+  /// Whether the part of a place looks as if it began at rest: at 0, or with commands that stay as they are for that time.
+  [[nodiscard]] bool begins_at_rest(const Place& place, double reach) const;
 
   /// Writes what acts at some places into states; where a place is in no part the command stays.
   /// @param actuators  of every input of the system

@@ -68,7 +68,6 @@ struct SimulateJob {
   Eigen::VectorXd start;           // the whole state
   std::vector<Motion> motions;     // of samples each under the parameters that it was drawn with
   SimulateOptions options;         // but for what each motion has of its own
-  InputSignal commands;            // of which options.inputs is what acts
   std::vector<std::string> notes;  // how the start was completed
 };
 
@@ -98,5 +97,10 @@ struct MotionUncertainty {
 /// @param other_system  that moved; null: the fit's own
 MotionUncertainty motion_uncertainty(const Posterior& posterior, const Trajectory& trajectory,
                                      const std::shared_ptr<const OtherSystem>& other_system = nullptr);
+
+/// Warnings of where a motion leaves the region of the data, and where its constraints lose rank.
+/// @param called  what messages call it
+std::vector<std::string> motion_notes(const Trajectory& trajectory, const std::optional<MotionUncertainty>& uncertainty,
+                                      const std::string& called = "the motion");
 
 }  // namespace gp2
