@@ -171,8 +171,9 @@ class Integration {
             "jumps where a body comes to rest is to be written with sign(v) or v/sqrt(v^2 + w^2), or smoothed, say "
             "tanh(v/0.01){}; else loosen the tolerances, or allow more steps (`max_steps`)",
             options_.max_steps, t_, t_end(), t_halfway_,
-            system_.has_conditional_constraints() ? "; a constraint that holds at the very edge of its condition is to be a contact"
-                                                  : ""));
+            system_.has_conditional_constraints()
+                ? "; a constraint that holds at the very edge of its condition is to be a contact"
+                : ""));
       }
       throw NumericalError(
           fmt::format("simulate: {} steps reach no further than t = {:.6g} of {:.6g}: loosen the tolerances, or "

@@ -32,7 +32,7 @@ def run(tmp_path):
         result = subprocess.run([sys.executable, script], cwd=folder, env=environment, capture_output=True, text=True, timeout=120)
         assert result.returncode == 0, result.stderr
         # a motion may leave the data, which is said
-    assert "Warning" not in result.stderr.replace("UserWarning: the motion leaves the region of the data", "")
+        assert "Warning" not in result.stderr.replace("UserWarning: the motion leaves the region of the data", "")
         return result.stdout
 
     return run
