@@ -125,7 +125,7 @@ std::optional<std::string> contacts_note(const Trajectory& motion, const System&
   const std::string gain =
       least->energy_loss < -rounding * (1 + std::abs(loss))
           ? fmt::format("; the one at t = {:.6g} gave {:.3g} J, as {}", least->time, -least->energy_loss,
-                        moves ? "a surface that moves does"
+                        moves ? "a surface that moves does, or Newton's restitution where friction turns the slip"
                               : "Newton's restitution does where friction turns the slip: a smaller restitution gives none")
           : "";
   return fmt::format(
@@ -207,12 +207,13 @@ std::vector<std::string> notes_of(const std::vector<Motion>& motions, const Syst
     notes.push_back(fmt::format("start: off the constraints by |c| = {:.3g}, |dc/dt| = {:.3g}, and left there",
                                 first.start_position_residual, first.start_velocity_residual));
   }
-  for (std::size_t k = 0; k < motions.size(); ++k) {
-    const std::string called = motions.size() > 1 ? fmt::format("sample {}", k) : "the motion";
-    const std::vector<std::string> of_motion = motion_notes(motions[k].trajectory, motions[k].uncertainty, called);
-    notes.insert(notes.end(), of_motion.begin(), of_motion.end());
-    if (!of_motion.empty()) break;  // this one stands for the others
+  std::vector<Trajectory> trajectories;
+  std::vector<std::optional<MotionUncertainty>> uncertainties;
+  for (const Motion& motion : motions) {
+    trajectories.push_back(motion.trajectory);
+    uncertainties.push_back(motion.uncertainty);
   }
+  for (std::string& note : motion_notes(trajectories, uncertainties)) notes.push_back(std::move(note));
   const nlohmann::ordered_json report = report_of(motions, system, job);
   Eigen::Index n_rows = 0;
   for (const Motion& motion : motions) n_rows += motion.trajectory.times.size();

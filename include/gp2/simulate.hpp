@@ -142,13 +142,12 @@ struct Trajectory {
   Eigen::VectorXd times;          // (N) [s]
   Eigen::MatrixXd states;         // [q; dq; t; u] (layout size × N)
   Eigen::MatrixXd accelerations;  // ddq there (nq × N)
-  Eigen::MatrixXd
-      commands;  // inputs as a log has them, where states hold what acts: as commanded, of contacts as they were (nu × N)
-  Eigen::MatrixXd records;  // options.record there
+  Eigen::MatrixXd commands;       // inputs as a log has them, states hold what acts; of contacts as they were (nu × N)
+  Eigen::MatrixXd records;        // options.record there
 
   double max_position_drift = 0;       // largest |c| of position constraints at the written times
   double max_velocity_drift = 0;       // largest |dc/dt|, or |c| of velocity constraints, there
-  double largest_jump = 0;             // by which a constraint that takes hold (`when`) moved a coordinate onto itself
+  double largest_jump = 0;             // by which a constraint that takes hold (`when`) moved a coordinate; 0: by little
   double jump_time = 0;                // then [s]
   LowerRank lower_rank;                // written times at which constraints let go, or follow from each other
   double start_position_residual = 0;  // the drift at the start as it was given

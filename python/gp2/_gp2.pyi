@@ -12,9 +12,14 @@ class _Columns(Protocol):  # a pandas frame, say
     def keys(self) -> Iterable[Any]: ...
     def __getitem__(self, name: Any, /) -> Any: ...
 
+class _Frame(Protocol):  # of polars, say
+    @property
+    def columns(self) -> Sequence[str]: ...
+    def __getitem__(self, name: Any, /) -> Any: ...
+
 _Array = npt.NDArray[np.float64]
 _Path = Union[str, bytes, os.PathLike[str], os.PathLike[bytes]]
-_Table = Union[Table, str, os.PathLike[str], os.PathLike[bytes], _Columns]
+_Table = Union[Table, str, os.PathLike[str], os.PathLike[bytes], _Columns, _Frame, npt.NDArray[np.void]]
 _Arrays = tuple[npt.ArrayLike, npt.ArrayLike]  # states, accelerations
 _Text = Union[str, float]  # an expression or a number
 _View = Literal["constrained", "unconstrained", "constraint-force", "multipliers", "next-velocity", "force"]
@@ -565,7 +570,7 @@ def fit(
     data: _Table | Log | _Arrays | list[Any],  # of these
     *,
     commands: _Table | None = None,
-    also: Sequence[SideInformation] = [],
+    also: SideInformation | Sequence[SideInformation] = [],
     # options of fit: written by scripts/options
     also_noise_std: float | None = None,
     dt: float | None = None,
@@ -647,7 +652,7 @@ def fit_again(
     path: _Path,
     data: _Table | Log | _Arrays | list[Any] | None = None,
     *,
-    also: Sequence[SideInformation] = [],
+    also: SideInformation | Sequence[SideInformation] = [],
     system: System | None = None,
     threads: int = 0,
     progress: Callable[[Progress], object] | None = None,

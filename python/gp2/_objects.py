@@ -40,7 +40,7 @@ def _are_equal(self: _gp2.System, other: object) -> Any:
         return NotImplemented
     if self is other:
         return True
-    return (self.name, self.text, self.robot) == (other.name, other.text, other.robot) and _is_text(self) and _is_text(other)
+    return (self.name, self.text, self.robot) == (other.name, other.text, other.robot) and _is_text(self)
 
 
 def _hash_of(self: _gp2.System) -> int:

@@ -129,7 +129,7 @@ class GP2Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             "seed": _seed(self.random_state),
         }
         others = dict(self.fit_options or {})
-        for name in sorted(others.keys() & options.keys()):
+        for name in sorted(others.keys() & (options.keys() | self.get_params().keys() | {"data"})):
             raise gp2.InputError(f"fit_options: '{name}' is an argument of GP2Regressor itself")
         try:
             self.posterior_ = gp2.fit(self.system_, (self._states(X), accelerations), **options, **others)
@@ -242,7 +242,8 @@ def _warn_of_scaled(X: np.ndarray) -> None:
         return np.allclose(values, wanted, rtol=0, atol=1e-6)
 
     is_standard = all_are(varied.mean(axis=0), 0) and all_are(varied.std(axis=0), 1)
-    if is_standard or (all_are(varied.min(axis=0), 0) and all_are(varied.max(axis=0), 1)):
+    is_between = varied.shape[1] > 2 and all_are(varied.min(axis=0), 0) and all_are(varied.max(axis=0), 1)  # two may be a grid's
+    if is_standard or is_between:
         warnings.warn(
             "X: every column is scaled alike, as by a scaler: the system's equations take states in their own units; leave it out",
             UserWarning, stacklevel=3)

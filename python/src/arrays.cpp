@@ -86,13 +86,15 @@ bool is_array(const py::object& data) {
 }
 
 std::optional<py::list> column_names(const py::object& data) {
-  if (py::hasattr(data, "keys")) return py::list(data.attr("keys")());
   if (py::isinstance<py::array>(data)) {
     const py::object names = data.attr("dtype").attr("names");
     return names.is_none() ? std::nullopt : std::optional(py::list(names));
   }
-  if (py::hasattr(data, "columns")) return py::list(data.attr("columns"));
-  return std::nullopt;
+  if (py::hasattr(data, "keys")) return py::list(data.attr("keys")());
+  if (!py::hasattr(data, "columns")) return std::nullopt;
+  py::list names(data.attr("columns"));
+  const bool are_names = std::all_of(names.begin(), names.end(), [](py::handle name) { return py::isinstance<py::str>(name); });
+  return are_names ? std::optional(std::move(names)) : std::nullopt;
 }
 
 py::array to_rows(Eigen::MatrixXd columns) {

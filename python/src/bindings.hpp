@@ -75,7 +75,7 @@ std::string path_argument(const py::object& path);
 /// What became of each column of a raw log.
 pybind11::dict report_of(const DerivedData& derived, const System& system);
 
-/// A table from a gp2.Table, a path, a pandas frame, or a mapping of column names to arrays.
+/// A table from a gp2.Table, a path, a frame of pandas or polars, a structured array, or a mapping of column names to arrays.
 /// @param what  stands for the argument in messages
 /// @param keep  of a file; a gp2.Table is as it was read
 CsvTable to_table(const py::object& data, const std::string& what, CsvTable::Keep keep = CsvTable::Keep::numbers);

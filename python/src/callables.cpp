@@ -91,7 +91,10 @@ SystemValues values_of(const py::object& result, const char* function, Index n, 
   SystemValues values;
   // of A and b where no constraint is named
   const auto require_nothing = [&](const py::object& part, const char* quantity) {
-    if (part.is_none() || py::len(part) == 0 || py::array::ensure(part).size() == 0) return;
+    if (part.is_none()) return;
+    const py::array array = py::array::ensure(part);
+    if (array && array.size() == 0) return;
+    PyErr_Clear();
     throw InputError(fmt::format(
         "{}: {} is not empty, but no constraint is named: give constraints=[…], a name for each row of A", function, quantity));
   };

@@ -193,34 +193,36 @@ py::tuple fit_raw(const PySystem& system, const py::object& data, const py::kwar
   return py::make_tuple(run(prepare_fit(std::move(request)), progress), std::move(smoothed), std::move(report));
 }
 
-PyPosterior fit_again(const py::object& path, const py::object& data, const std::vector<PySideInformation>& also,
-                      const PySystem* system, int threads, const py::object& progress) {
+PyPosterior fit_again(const py::object& path, const py::object& data, const py::object& also, const PySystem* system, int threads,
+                      const py::object& progress) {
   const FitFile file = FitFile::read(path_argument(path), code_of(system));
   if (data.is_none()) {
-    if (!also.empty()) throw InputError("`again`: `also` goes with `data`");
+    if (!side_information_of(also).empty()) throw InputError("`again`: `also` goes with `data`");
     return run(prepare_fit_again(file, threads), progress);
   }
   FitRequest request = request_of(file);
   request.threads = threads;
   request.data_source.clear();
   request.logs = logs_of(data, *request.model.system);
-  request.also = side_information_of(py::cast(also));
+  request.also = side_information_of(also);
   return run(prepare_fit(std::move(request)), progress);
 }
 
 std::string fit_documentation() {
   FitRequest request;
   const std::vector<Option> table = options(request);
-  return signature("fit", "system: System, data: object, *, commands: object = None, also: Sequence[SideInformation] = [],",
-                   table, ", progress: Callable[[Progress], object] | None = None", "Posterior") +
+  return signature(
+             "fit",
+             "system: System, data: object, *, commands: object = None, also: SideInformation | Sequence[SideInformation] = [],",
+             table, ", progress: Callable[[Progress], object] | None = None", "Posterior") +
          R"(
 Fit a system to measured accelerations.
 
-data        a path, Table, pandas frame or mapping with columns named as the model's (or aliases); or (states, accelerations),
+data        a path, Table, frame of pandas or polars, structured array or mapping with columns named as the model's (or aliases); or (states, accelerations),
             arrays (n, len(state_names)) and (n, nq); or a list of these and of Log, empty where `also` is all there is. NaN, or None, of an acceleration is "not measured"
 commands    where inputs act late and `data` are rows of a longer log: that log, t and inputs, and `episode` where there is one.
             Inputs of tables are commands; those of arrays are what acts
-also        list of SideInformation: other quantities, measured or known
+also        a SideInformation, or a list of them: other quantities, measured or known
 progress    called with a Progress some times a second
 
 )" + documentation(table) +
@@ -242,7 +244,7 @@ Fit a system to a raw log of t and positions, as `gp2 fit --raw` does it: smooth
 positions tell of accelerations over windows of time. Gives the Posterior; the log smoothed, a Table; and a report (dict) as that of
 derive, with `gains`, the log likelihood of positions that the fits have not seen, of each pass that was kept. docs/raw-logs.md.
 
-data        a path, Table, pandas frame or mapping: t, positions, inputs
+data        a path, Table, frame, structured array or mapping: t, positions, inputs
 progress    as in fit
 
 )" + documentation(table);
@@ -287,8 +289,8 @@ void add_fit(py::module_& module) {
     module.def("fit_raw", &fit_raw, "system"_a, "data"_a, fit_raw_documentation().c_str());
   }
   module.def(
-      "fit_again", &fit_again, "path"_a, "data"_a = py::none(), py::kw_only(), "also"_a = std::vector<PySideInformation>(),
-      "system"_a = nullptr, "threads"_a = 0, "progress"_a = py::none(),
+      "fit_again", &fit_again, "path"_a, "data"_a = py::none(), py::kw_only(), "also"_a = py::list(), "system"_a = nullptr,
+      "threads"_a = 0, "progress"_a = py::none(),
       "Repeat the fit in a FIT.json with the options it was made with, from its data or from those given: the same bits.\n\n"
       "system: as in gp2.load. A robust fit needs its data.");
   module.def(

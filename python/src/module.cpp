@@ -63,7 +63,7 @@ constexpr std::array takes = {
     Takes{"str", "a str", &is_text},
     Takes{"List[str]", "a list of names", &is_list_of_text},
     Takes{"gp2._gp2.System", "a gp2.System (gp2.System.load reads one from a file)",
-          [](py::handle value) { return value.is_none() || py::isinstance<gp2::python::PySystem>(value); }},
+          [](py::handle value) { return py::isinstance<gp2::python::PySystem>(value); }},
 };
 
 // A value of another type than its parameter's, where there is one signature.
@@ -88,9 +88,12 @@ void refuse_wrong_type(const std::string& text, const std::string& signatures, c
     const auto got = [&](const char* expected) {
       return fmt::format("{}: expected {}, got {}", name, expected, py::repr(value).cast<std::string>());
     };
-    if (!known->fits(value)) throw py::type_error(got(known->words));
-    const bool is_negative = type == "int" && value.attr("__lt__")(0).cast<bool>();
-    if (is_negative) negative = got("a whole number that is not negative");
+    const bool is_left_out = value.is_none() && signatures.find(fmt::format("{}: {} = None", name, type)) != std::string::npos;
+    if (!is_left_out && !known->fits(value)) throw py::type_error(got(known->words));
+    if (type != "int") continue;
+    const auto number = py::reinterpret_steal<py::object>(PyNumber_Index(value.ptr()));
+    if (!number) throw py::type_error((PyErr_Clear(), got(known->words)));  // an array may only seem to be one
+    if (number < py::int_(0)) negative = got("a whole number that is not negative");
   }
   if (!negative.empty()) throw py::type_error(negative);
 }

@@ -55,7 +55,9 @@ std::vector<Motion> run_motions(const SimulateJob& job, const std::shared_ptr<co
   std::exception_ptr raised;
   std::vector<Motion> motions;
   try {
-    for (Trajectory& trajectory : run_interruptibly([&] { return run_simulation(job, &stop); }, stop, raised, [] {})) {
+    std::vector<Trajectory> trajectories = run_interruptibly([&] { return run_simulation(job, &stop); }, stop, raised, [] {});
+    if (!raised) tell(motion_notes(trajectories));
+    for (Trajectory& trajectory : trajectories) {
       motions.push_back({std::move(trajectory), std::nullopt, system});
     }
   } catch (const SimulationStopped&) {
@@ -67,9 +69,7 @@ std::vector<Motion> run_motions(const SimulateJob& job, const std::shared_ptr<co
 Motion simulate_model(const PySystem& system, const py::object& start, const py::object& times, const py::object& inputs,
                       const py::kwargs& keywords) {
   const SimulateRequest request = simulate_request(system.system(), start, times, inputs, keywords);
-  std::vector<Motion> motions = run_motions(prepare_simulation(*system.model, request), system.model->system);
-  tell(motion_notes(motions[0].trajectory, {}));
-  return std::move(motions[0]);
+  return run_motions(prepare_simulation(*system.model, request), system.model->system).front();
 }
 
 py::object simulate_posterior(const PyPosterior& self, const py::object& start, const py::object& times, const py::object& inputs,
@@ -81,8 +81,7 @@ py::object simulate_posterior(const PyPosterior& self, const py::object& start, 
   std::vector<Motion> motions = run_motions(job, system == nullptr ? self.file.model.system : system->model->system);
   if (request.n_samples) return py::cast(std::move(motions));
   motions[0].uncertainty = unlocked([&] { return motion_uncertainty(posterior, motions[0].trajectory, asked.other_system); });
-  // without data all is far from them
-  tell(motion_notes(motions[0].trajectory, posterior.n_states() == 0 ? std::nullopt : motions[0].uncertainty));
+  if (motions[0].uncertainty->leaves_data) tell({motion_notes({motions[0].trajectory}, {motions[0].uncertainty}).front()});
   return py::cast(std::move(motions[0]));
 }
 

@@ -21,6 +21,10 @@ bool is_missing(const py::handle& cell) {
 // a column of a table; NaN stands for an empty cell, as pandas reads one
 CsvTable::Column to_column(std::string name, const py::object& values, const std::string& what) {
   py::array array = py::array::ensure(without_mask(values));
+  // a field of a struct of MATLAB's is an array within one of a single object
+  if (array && array.size() == 1 && array.dtype().kind() == 'O') {
+    if (const py::object inside = array.attr("item")(); py::isinstance<py::array>(inside)) array = inside;
+  }
   if (array && array.ndim() == 2 && (array.shape(0) == 1 || array.shape(1) == 1)) array = array.attr("ravel")();  // of MATLAB
   if (!array || array.ndim() != 1) {
     PyErr_Clear();
@@ -67,7 +71,7 @@ CsvTable to_table(const py::object& data, const std::string& what, CsvTable::Kee
   for (const py::handle key : *names) {
     std::string name = py::str(key);
     // what scipy.io.loadmat says of the file itself
-    if (name == "__header__" || name == "__version__" || name == "__globals__") continue;
+    if (name.starts_with("__") && name.ends_with("__")) continue;
     const std::string column = fmt::format("{}['{}']", what, name);
     columns.push_back(to_column(std::move(name), data[key], column));
   }

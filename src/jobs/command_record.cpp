@@ -1,6 +1,7 @@
 #include "gp2/jobs/command_record.hpp"
 
 #include <algorithm>
+#include <cmath>
 #include <optional>
 
 #include <fmt/format.h>
@@ -101,9 +102,27 @@ bool CommandRecord::knows(const Place& place, double reach) const {
 bool CommandRecord::begins_at_rest(const Place& place, double reach) const {
   if (place.part < 0) return false;
   const Part& part = parts_[static_cast<std::size_t>(place.part)];
-  if (part.commands.col(0).isZero(0)) return true;
-  const Index n = std::upper_bound(part.times.begin(), part.times.end(), part.times.front() + reach) - part.times.begin();
-  return n > 1 && (part.commands.leftCols(n).colwise() - part.commands.col(0)).isZero(0);
+  const Index within = std::upper_bound(part.times.begin(), part.times.end(), part.times.front() + reach) - part.times.begin();
+  const Index n = std::min(std::max<Index>(within, 2), part.commands.cols());
+  return std::ranges::all_of(part.commands.rowwise(), [&](const auto& command) {
+    return command[0] == 0 || (n > 1 && (command.head(n).array() == command[0]).all());
+  });
+}
+
+double CommandRecord::usual_change() const {
+  double most = 0;
+  for (Index k = 0; k < std::ssize(inputs_); ++k) {
+    std::vector<double> changes, values;
+    for (const Part& part : parts_) {
+      const auto command = part.commands.row(k);
+      values.insert(values.end(), command.begin(), command.end());
+      for (Index i = 1; i < command.size(); ++i) changes.push_back(std::abs(command[i] - command[i - 1]));
+    }
+    const Eigen::Map<const VectorXd> all(values.data(), std::ssize(values));
+    const double spread = std::sqrt((all.array() - all.mean()).square().mean());
+    if (spread > 0 && !changes.empty()) most = std::max(most, median(std::move(changes)) / spread);
+  }
+  return most;
 }
 
 void CommandRecord::act(const std::vector<Actuator>& actuators, const std::vector<Place>& places, const StateLayout& layout,

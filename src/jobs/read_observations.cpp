@@ -364,8 +364,9 @@ std::optional<CommandedRows> take_commands(const System& system, const std::vect
     out.record = std::make_shared<const CommandRecord>(system, of_whole, late);
   } else {
     out.record = std::make_shared<const CommandRecord>(system, reader, late);
-    constexpr double little = 0.1;  // steps by which inputs may be late without a word
-    if (out.record->usual_step() > lateness && lateness > little * out.record->usual_step()) {
+    constexpr double little = 0.01;  // of the spread of what acts
+    const double step = out.record->usual_step();
+    if (step > lateness && out.record->usual_change() * lateness > little * step) {
       notes.push_back(
           fmt::format("warning: {}: rows are {:.3g} s apart as a rule, inputs at most {:.3g} s late: what acts in between is not "
                       "known; log faster, or, where these are rows of a longer log, give that as `commands`",

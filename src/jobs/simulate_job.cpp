@@ -407,31 +407,37 @@ MotionUncertainty motion_uncertainty(const Posterior& posterior, const Trajector
   out.stddev = posterior.marginal(view, trajectory.states, /*n_threads=*/0).stddev();
   out.distance = posterior.distance_from_data(view, trajectory.states, /*n_threads=*/0);
   const auto far = std::find_if(out.distance.begin(), out.distance.end(), [](double d) { return d > Posterior::far_from_data; });
-  if (far != out.distance.end()) out.leaves_data = trajectory.times[far - out.distance.begin()];
+  // without data all is far from them
+  if (posterior.n_states() > 0 && far != out.distance.end()) out.leaves_data = trajectory.times[far - out.distance.begin()];
   return out;
 }
 
-std::vector<std::string> motion_notes(const Trajectory& trajectory, const std::optional<MotionUncertainty>& uncertainty,
-                                      const std::string& called) {
+std::vector<std::string> motion_notes(const std::vector<Trajectory>& motions,
+                                      const std::vector<std::optional<MotionUncertainty>>& uncertainties) {
   std::vector<std::string> notes;
-  if (uncertainty && uncertainty->leaves_data) {
-    notes.push_back(
-        fmt::format("warning: {} leaves the region of the data at t = {:.6g}: at its farthest it is {:.3g} times as far from the "
-                    "observed states as those are from each other",
-                    called, *uncertainty->leaves_data, uncertainty->distance.maxCoeff()));
-  }
-  constexpr double much = 1e-3;  // of a coordinate
-  if (trajectory.largest_jump > much) {
-    notes.push_back(fmt::format(
-        "warning: {} is moved by {:.3g} at once at t = {:.6g}, where a constraint takes hold off its surface: what meets "
-        "a surface is a contact",
-        called, trajectory.largest_jump, trajectory.jump_time));
-  }
-  if (const LowerRank& lower = trajectory.lower_rank; !lower.states.empty()) {
-    notes.push_back(fmt::format(
-        "warning: the constraints have rank {} but at {} of {} rows of the motion, where it is as low as {}, first "
-        "at t = {:.6g}; the motion may branch there",
-        lower.usual, lower.states.size(), trajectory.times.size(), lower.lowest, trajectory.times[lower.states.front()]));
+  bool has_left = false, has_jumped = false, has_lost_rank = false;  // one before
+  for (std::size_t k = 0; k < motions.size(); ++k) {
+    const Trajectory& motion = motions[k];
+    const std::string called = motions.size() > 1 ? fmt::format("sample {}", k) : "the motion";
+    const std::optional<MotionUncertainty> uncertainty = uncertainties.empty() ? std::nullopt : uncertainties[k];
+    if (uncertainty && uncertainty->leaves_data && !std::exchange(has_left, true)) {
+      notes.push_back(fmt::format(
+          "warning: {} leaves the region of the data at t = {:.6g}: at its farthest it is {:.3g} times as far from the "
+          "observed states as those are from each other",
+          called, *uncertainty->leaves_data, uncertainty->distance.maxCoeff()));
+    }
+    if (motion.largest_jump > 0 && !std::exchange(has_jumped, true)) {
+      notes.push_back(
+          fmt::format("warning: {} is moved by {:.3g} at once at t = {:.6g}, where a constraint takes hold off its surface: what "
+                      "meets a surface is a contact",
+                      called, motion.largest_jump, motion.jump_time));
+    }
+    if (const LowerRank& lower = motion.lower_rank; !lower.states.empty() && !std::exchange(has_lost_rank, true)) {
+      notes.push_back(
+          fmt::format("warning: the constraints have rank {} but at {} of {} rows of the motion, where it is as low as {}, first "
+                      "at t = {:.6g}; the motion may branch there",
+                      lower.usual, lower.states.size(), motion.times.size(), lower.lowest, motion.times[lower.states.front()]));
+    }
   }
   return notes;
 }

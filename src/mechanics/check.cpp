@@ -222,7 +222,9 @@ void report_rank(const System& system, const std::vector<int>& ranks, const Mech
                                                  system.has_conditional_constraints() ? " where they are active" : "")});
   }
   report_independence(mechanics, std::ssize(ranks), findings);
-  if (highest >= system.nq() && !system.has_conditional_constraints()) {
+  int n_conditional = 0;
+  for (int row = 0; row < system.nc(); ++row) n_conditional += system.is_conditional(row) ? 1 : 0;
+  if (highest - n_conditional >= system.nq()) {
     findings.push_back(
         {Level::warning, "constraints: they leave no freedom (rank = number of coordinates): nothing is left to learn"});
   }

@@ -103,7 +103,7 @@ class Integration {
       throw UnfinishedMotion(error.what(), {std::move(out_)});
     } catch (const InputError& error) {
       if (next == 0) throw;  // of the start, which was given
-      keep(next);
+      shorten(next);
       throw UnfinishedMotion(fmt::format("simulate: no acceleration at t = {:.6g}: {}", t_, error.what()), {std::move(out_)});
     }
     return std::move(out_);
@@ -149,9 +149,18 @@ class Integration {
   // Leaves what was written, and the state that was reached.
   void keep(Index next) {
     if (next > 0 && t_ > options_.times[next - 1]) {
-      write(next, t_, x_, dxdt_);
-      out_.times[next++] = t_;
+      try {
+        write(next, t_, x_, dxdt_);
+        out_.times[next++] = t_;
+      } catch (const InputError&) {
+        // there is nothing to record where there is no motion
+      }
     }
+    shorten(next);
+  }
+
+  // Leaves what was written.
+  void shorten(Index next) {
     out_.times.conservativeResize(next);
     out_.states.conservativeResize(Eigen::NoChange, next);
     out_.accelerations.conservativeResize(Eigen::NoChange, next);
@@ -471,16 +480,33 @@ class Integration {
 
   // projects the state; by a constraint that takes hold off its surface a body is moved there at once
   bool project_and_note_jump() {
+    if (!system_.has_conditional_constraints()) return project(x_, t_);
     const Phase before = x_;
-    if (!project(x_, t_)) return false;
-    for (Index j = 0; system_.has_conditional_constraints() && j < layout_.nq; ++j) {
-      const auto k = static_cast<std::size_t>(j);
-      const double jump = std::abs(x_[k] - before[k]);
-      if (jump <= out_.largest_jump) continue;
+    expand(x_, t_);
+    const std::vector<bool> active = active_rows(), were_active = std::exchange(active_, active);
+    const bool has_moved = project(x_, t_);
+    const Eigen::Map<const VectorXd> q(x_.data(), layout_.nq);
+    lowest_ = lowest_.size() == 0 ? VectorXd(q) : VectorXd(lowest_.cwiseMin(q));
+    highest_ = highest_.size() == 0 ? VectorXd(q) : VectorXd(highest_.cwiseMax(q));
+    constexpr double much = 1e-3;  // of the way that a coordinate has come
+    for (Index j = 0; has_moved && active != were_active && j < layout_.nq; ++j) {
+      const double jump = std::abs(q[j] - before[static_cast<std::size_t>(j)]);
+      if (jump <= std::max(out_.largest_jump, much * (highest_[j] - lowest_[j]))) continue;
       out_.largest_jump = jump;
       out_.jump_time = t_;
     }
-    return true;
+    return has_moved;
+  }
+
+  // of rows that come and go by themselves, at state_
+  [[nodiscard]] std::vector<bool> active_rows() const {
+    const SystemValues values = system_.evaluate(state_, parameters_);
+    std::vector<bool> active;
+    for (int row = 0; row < system_.nc(); ++row) {
+      const bool is_contact = std::ranges::any_of(options_.contacts, [&](const Contact& one) { return one.row == row; });
+      active.push_back(system_.is_conditional(row) && !is_contact && !values.A(0).row(row).isZero(0));
+    }
+    return active;
   }
 
   // where the motion is on a surface now, and was beside it, or the other way round
@@ -595,6 +621,8 @@ class Integration {
   Phase x_, dxdt_, x_new_, dxdt_new_, x_crossing_;
   std::optional<StageFault> fault_;  // of the last try
   std::optional<VectorXd> instant_;  // the state of which velocities alone move
+  std::vector<bool> active_;         // rows that come and go, at the last step
+  VectorXd lowest_, highest_;        // coordinates up to then, where rows do
   Trajectory out_;
 };
 

@@ -108,7 +108,8 @@ TEST(UpdateJob, SaysWhatTheFitIsSureIsOtherwise) {
   };
   EXPECT_THAT(notes_under("", 1), testing::Not(Contains(HasSubstr("deviations from what it predicts"))));
   for (const auto& [column, factor] : {std::pair("ddq1", -1.0), std::pair("ddq2", 1000.0), std::pair("ddq1", 0.0)}) {
-    EXPECT_THAT(notes_under(column, factor), Contains(HasSubstr("values near the fit's data lie more than six deviations")))
+    EXPECT_THAT(notes_under(column, factor),
+                Contains(HasSubstr(fmt::format("of {} near the fit's data lie more than six deviations", column))))
         << column;
   }
 }

@@ -44,6 +44,14 @@ def as_functions(surface, constraints=("surface",), mechanics=None, **keywords):
 def test_rows_of_constraints_that_nobody_names_are_refused(surface, log):
     with pytest.raises(gp2.InputError, match="mechanics: A is not empty, but no constraint is named: give constraints="):
         gp2.fit(as_functions(surface, constraints=()), log, max_iterations=0)
+    for rows in ([[1.0], [1.0, 2.0]], 0.0, np.array(0.0)):
+
+        def mechanics(states, values, rows=rows):
+            at = surface.evaluate(states, values)
+            return at.M, rows, None, at.F
+
+        with pytest.raises(gp2.InputError, match="mechanics: A is not empty"):
+            gp2.fit(as_functions(surface, (), mechanics), log, max_iterations=0)
 
 
 def test_functions_give_the_same_fit_as_text(surface, log):

@@ -166,6 +166,10 @@ def test_names_are_checked(posterior, arm, arm_log, arm_states):
         gp2.fit("arm.toml", arm_log)
     with pytest.raises(TypeError, match="seed: expected a whole number that is not negative, got -1"):
         posterior.sample(arm_states, 2, seed=-1)
+    with pytest.raises(TypeError, match="n_samples: expected a whole number, got array"):
+        posterior.sample(arm_states, np.array([1, 2]))
+    with pytest.raises(TypeError, match="system: expected a gp2.System .gp2.System.load reads one from a file., got None"):
+        gp2.fit(None, arm_log)
     with pytest.raises(TypeError, match=r"also\[0\]: expected a gp2.SideInformation, got <class 'dict'>"):
         gp2.fit(arm, arm_log, also=[{}])
     with pytest.raises(TypeError, match="a model holds text, numbers, lists and mappings, not set"):

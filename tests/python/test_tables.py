@@ -283,10 +283,19 @@ def test_a_table_is_what_has_named_columns(arm, arm_log, arm_fit_file):
               **{name: values[None, :] for name, values in columns.items()}}
     posterior = gp2.load(arm_fit_file)
     expected = posterior.predict(columns).mean
-    for table in (structured, np.asarray(structured), matlab, Polars(shuffled)):
+    struct = np.empty((1, 1), dtype=[(name, object) for name in columns])  # of MATLAB's
+    for name, values in columns.items():
+        struct[name][0, 0] = values[:, None]
+    for table in (structured, np.asarray(structured), matlab, struct, Polars(shuffled)):
         assert sorted(gp2.Table(table).columns) == sorted(columns)
         np.testing.assert_array_equal(posterior.predict(table).mean, expected)
         np.testing.assert_array_equal(arm.states(table), arm.states(columns))
+
+
+def test_what_only_looks_like_a_table_is_none():
+    assert gp2.Table(np.rec.fromarrays([[1.0], [2.0]], names="keys,x")).columns == ["keys", "x"]
+    with pytest.raises(TypeError, match="expected a gp2.Table"):
+        gp2.Table(Polars({3: [1.0]}))  # of columns without names
 
 
 def test_notebooks_show_systems_and_fits(arm, arm_fit_file):

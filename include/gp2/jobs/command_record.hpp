@@ -37,7 +37,9 @@ class CommandRecord {
 
   /// Whether what acts there depends on no command from before its part: `reach` [s] have passed.
   [[nodiscard]] bool knows(const Place& place, double reach) const;
-  /// Whether the part of a place looks as if it began at rest: at 0, or with commands that stay as they are for that time.
+  /// By what share of its spread a command changes from row to row, the median of the input that changes most.
+  [[nodiscard]] double usual_change() const;
+  /// Whether each input looks as if it had been at rest before the part of a place: it begins at 0, or stays as it is for that time.
   [[nodiscard]] bool begins_at_rest(const Place& place, double reach) const;
 
   /// Writes what acts at some places into states; where a place is in no part the command stays.

@@ -98,9 +98,10 @@ struct MotionUncertainty {
 MotionUncertainty motion_uncertainty(const Posterior& posterior, const Trajectory& trajectory,
                                      const std::shared_ptr<const OtherSystem>& other_system = nullptr);
 
-/// Warnings of where a motion leaves the region of the data, and where its constraints lose rank.
-/// @param called  what messages call it
-std::vector<std::string> motion_notes(const Trajectory& trajectory, const std::optional<MotionUncertainty>& uncertainty,
-                                      const std::string& called = "the motion");
+/// Warnings of where motions leave the region of the data, where a constraint moves them at once, and where their constraints lose
+/// rank: of each what the first of them does.
+/// @param uncertainties  of each; empty: none is known
+std::vector<std::string> motion_notes(const std::vector<Trajectory>& motions,
+                                      const std::vector<std::optional<MotionUncertainty>>& uncertainties = {});
 
 }  // namespace gp2
