@@ -55,15 +55,9 @@ Subject read_subject(const SimulateArguments& arguments) {
   return {model, posterior, std::move(asked)};
 }
 
-/// One motion and what goes with it.
-struct Motion {
-  Trajectory trajectory;
-  std::optional<MotionUncertainty> uncertainty;  // of a fit
-  std::optional<MotionEnergy> energy;            // of a model with a potential
-};
-
 /// The file reads as a log does: inputs are as commanded.
-void print_motions(const std::vector<Motion>& motions, const System& system, bool with_sample, bool with_stddev, CsvWriter& csv) {
+void print_motions(const std::vector<SimulatedMotion>& motions, const System& system, bool with_sample, bool with_stddev,
+                   CsvWriter& csv) {
   const StateLayout layout = system.layout();
   const std::vector<std::string> names = system.state_names();
   const std::vector<std::string> accelerations = system.acceleration_names();
@@ -138,12 +132,12 @@ std::optional<std::string> contacts_note(const Trajectory& motion, const System&
 double largest_change(const Eigen::VectorXd& energy) { return (energy.array() - energy[0]).abs().maxCoeff(); }
 
 // the worst of several motions, their sums where that says more
-nlohmann::ordered_json report_of(const std::vector<Motion>& motions, const System& system, const SimulateJob& job) {
+nlohmann::ordered_json report_of(const std::vector<SimulatedMotion>& motions, const System& system, const SimulateJob& job) {
   Trajectory total;
   double energy_drift = 0;
   std::size_t n_lower_rank = 0;
   std::optional<double> leaves_data;
-  for (const Motion& motion : motions) {
+  for (const SimulatedMotion& motion : motions) {
     const Trajectory& one = motion.trajectory;
     total.max_position_drift = std::max(total.max_position_drift, one.max_position_drift);
     total.max_velocity_drift = std::max(total.max_velocity_drift, one.max_velocity_drift);
@@ -193,7 +187,7 @@ nlohmann::ordered_json report_of(const std::vector<Motion>& motions, const Syste
   return report;
 }
 
-std::vector<std::string> notes_of(const std::vector<Motion>& motions, const System& system, const SimulateJob& job,
+std::vector<std::string> notes_of(const std::vector<SimulatedMotion>& motions, const System& system, const SimulateJob& job,
                                   const SimulateArguments& arguments) {
   std::vector<std::string> notes;
   const Trajectory& first = motions[0].trajectory;
@@ -207,16 +201,10 @@ std::vector<std::string> notes_of(const std::vector<Motion>& motions, const Syst
     notes.push_back(fmt::format("start: off the constraints by |c| = {:.3g}, |dc/dt| = {:.3g}, and left there",
                                 first.start_position_residual, first.start_velocity_residual));
   }
-  std::vector<Trajectory> trajectories;
-  std::vector<std::optional<MotionUncertainty>> uncertainties;
-  for (const Motion& motion : motions) {
-    trajectories.push_back(motion.trajectory);
-    uncertainties.push_back(motion.uncertainty);
-  }
-  for (std::string& note : motion_notes(trajectories, uncertainties)) notes.push_back(std::move(note));
+  for (std::string& note : motion_notes(motions)) notes.push_back(std::move(note));
   const nlohmann::ordered_json report = report_of(motions, system, job);
   Eigen::Index n_rows = 0;
-  for (const Motion& motion : motions) n_rows += motion.trajectory.times.size();
+  for (const SimulatedMotion& motion : motions) n_rows += motion.trajectory.times.size();
   notes.push_back(fmt::format("{}: {} rows, {} steps; drift |c| ≤ {:.3g}, |dc/dt| ≤ {:.3g}", arguments.output, n_rows,
                               report["steps"].get<int>(), report["max_position_drift"].get<double>(),
                               report["max_velocity_drift"].get<double>()));
@@ -239,12 +227,13 @@ SimulateRequest read_request(const SimulateArguments& arguments, const Model& mo
   return request;
 }
 
-std::vector<Motion> with_uncertainty(std::vector<Trajectory> trajectories, const Subject& subject, const SimulateJob& job) {
-  std::vector<Motion> motions;
+std::vector<SimulatedMotion> with_uncertainty(std::vector<Trajectory> trajectories, const Subject& subject,
+                                              const SimulateJob& job) {
+  std::vector<SimulatedMotion> motions;
   for (std::size_t k = 0; k < trajectories.size(); ++k) {
     Trajectory& trajectory = trajectories[k];
     if (trajectory.times.size() == 0) continue;
-    Motion& motion = motions.emplace_back(Motion{std::move(trajectory), {}, {}});
+    SimulatedMotion& motion = motions.emplace_back(SimulatedMotion{std::move(trajectory)});
     if (subject.posterior) {
       motion.uncertainty = motion_uncertainty(*subject.posterior, motion.trajectory, subject.asked->other_system);
     }
@@ -268,7 +257,7 @@ void run(const SimulateArguments& arguments) {
     trajectories = motion.motions;
     unfinished = motion.what();
   }
-  const std::vector<Motion> motions = with_uncertainty(std::move(trajectories), subject, job);
+  const std::vector<SimulatedMotion> motions = with_uncertainty(std::move(trajectories), subject, job);
   if (motions.empty()) throw NumericalError(unfinished);
   write_csv(arguments.output, [&](CsvWriter& csv) {
     print_motions(motions, subject.system(), request.n_samples.has_value(), subject.posterior.has_value() && !request.n_samples,

@@ -18,9 +18,7 @@ using Eigen::VectorXd;
 
 namespace {
 
-struct Motion {
-  Trajectory trajectory;
-  std::optional<MotionUncertainty> uncertainty;
+struct Motion : SimulatedMotion {
   std::shared_ptr<const System> system;
 };
 
@@ -49,16 +47,14 @@ SimulateRequest simulate_request(const System& system, const py::object& start, 
 }
 
 /// Motions one after the other; Ctrl-C ends them.
-std::vector<Motion> run_motions(const SimulateJob& job, const std::shared_ptr<const System>& system) {
+std::vector<SimulatedMotion> run_motions(const SimulateJob& job) {
   tell(job.notes);
   std::atomic<bool> stop = false;
   std::exception_ptr raised;
-  std::vector<Motion> motions;
+  std::vector<SimulatedMotion> motions;
   try {
-    std::vector<Trajectory> trajectories = run_interruptibly([&] { return run_simulation(job, &stop); }, stop, raised, [] {});
-    if (!raised) tell(motion_notes(trajectories));
-    for (Trajectory& trajectory : trajectories) {
-      motions.push_back({std::move(trajectory), std::nullopt, system});
+    for (Trajectory& trajectory : run_interruptibly([&] { return run_simulation(job, &stop); }, stop, raised, [] {})) {
+      motions.push_back({std::move(trajectory)});
     }
   } catch (const SimulationStopped&) {
   }
@@ -69,7 +65,9 @@ std::vector<Motion> run_motions(const SimulateJob& job, const std::shared_ptr<co
 Motion simulate_model(const PySystem& system, const py::object& start, const py::object& times, const py::object& inputs,
                       const py::kwargs& keywords) {
   const SimulateRequest request = simulate_request(system.system(), start, times, inputs, keywords);
-  return run_motions(prepare_simulation(*system.model, request), system.model->system).front();
+  std::vector<SimulatedMotion> motions = run_motions(prepare_simulation(*system.model, request));
+  tell(motion_notes(motions));
+  return {std::move(motions[0]), system.model->system};
 }
 
 py::object simulate_posterior(const PyPosterior& self, const py::object& start, const py::object& times, const py::object& inputs,
@@ -78,11 +76,14 @@ py::object simulate_posterior(const PyPosterior& self, const py::object& start, 
   const Posterior posterior = self.posterior;
   const FitSystem asked = system_of(self.file, posterior.prior(), model_of(system));
   const SimulateJob job = unlocked([&] { return prepare_simulation(asked, posterior, request); });
-  std::vector<Motion> motions = run_motions(job, system == nullptr ? self.file.model.system : system->model->system);
-  if (request.n_samples) return py::cast(std::move(motions));
-  motions[0].uncertainty = unlocked([&] { return motion_uncertainty(posterior, motions[0].trajectory, asked.other_system); });
-  if (motions[0].uncertainty->leaves_data) tell({motion_notes({motions[0].trajectory}, {motions[0].uncertainty}).front()});
-  return py::cast(std::move(motions[0]));
+  std::vector<SimulatedMotion> motions = run_motions(job);
+  if (!request.n_samples) {
+    motions[0].uncertainty = unlocked([&] { return motion_uncertainty(posterior, motions[0].trajectory, asked.other_system); });
+  }
+  tell(motion_notes(motions));
+  std::vector<Motion> out;
+  for (SimulatedMotion& motion : motions) out.push_back({std::move(motion), asked.model->system});
+  return request.n_samples ? py::cast(std::move(out)) : py::cast(std::move(out[0]));
 }
 
 std::string simulate_documentation(const std::string& first, const std::string& last, const std::string& result) {
@@ -124,7 +125,7 @@ PyExcitation excite_posterior(const PyPosterior& self, const py::object& start, 
   const auto search = [&](const std::atomic<bool>* stop) {
     Excitation found = excite(driven, posterior, self.file.report.hyperparameters, request, {}, stop);
     MotionUncertainty uncertainty = motion_uncertainty(posterior, found.motion, driven.other_system);
-    return PyExcitation{found, {found.motion, std::move(uncertainty), driven.model->system}, driven.model->system};
+    return PyExcitation{found, {{found.motion, std::move(uncertainty)}, driven.model->system}, driven.model->system};
   };
   std::atomic<bool> stop = false;
   std::exception_ptr raised;

@@ -412,14 +412,13 @@ MotionUncertainty motion_uncertainty(const Posterior& posterior, const Trajector
   return out;
 }
 
-std::vector<std::string> motion_notes(const std::vector<Trajectory>& motions,
-                                      const std::vector<std::optional<MotionUncertainty>>& uncertainties) {
+std::vector<std::string> motion_notes(const std::vector<SimulatedMotion>& motions) {
   std::vector<std::string> notes;
   bool has_left = false, has_jumped = false, has_lost_rank = false;  // one before
   for (std::size_t k = 0; k < motions.size(); ++k) {
-    const Trajectory& motion = motions[k];
+    const Trajectory& motion = motions[k].trajectory;
+    const std::optional<MotionUncertainty>& uncertainty = motions[k].uncertainty;
     const std::string called = motions.size() > 1 ? fmt::format("sample {}", k) : "the motion";
-    const std::optional<MotionUncertainty> uncertainty = uncertainties.empty() ? std::nullopt : uncertainties[k];
     if (uncertainty && uncertainty->leaves_data && !std::exchange(has_left, true)) {
       notes.push_back(fmt::format(
           "warning: {} leaves the region of the data at t = {:.6g}: at its farthest it is {:.3g} times as far from the "

@@ -94,6 +94,8 @@ class Integration {
       switch_or_throw([&] { switching_.start(state_, counted()); });
       derivative_or_throw();
       write(next++, t_, x_, dxdt_);
+      note_extent();
+      is_active_ = active_conditions();
       integrate(next);
     } catch (const WrongSize& wrong) {
       throw InputError(
@@ -101,10 +103,6 @@ class Integration {
     } catch (const NumericalError& error) {
       keep(next);
       throw UnfinishedMotion(error.what(), {std::move(out_)});
-    } catch (const InputError& error) {
-      if (next == 0) throw;  // of the start, which was given
-      shorten(next);
-      throw UnfinishedMotion(fmt::format("simulate: no acceleration at t = {:.6g}: {}", t_, error.what()), {std::move(out_)});
     }
     return std::move(out_);
   }
@@ -156,11 +154,6 @@ class Integration {
         // there is nothing to record where there is no motion
       }
     }
-    shorten(next);
-  }
-
-  // Leaves what was written.
-  void shorten(Index next) {
     out_.times.conservativeResize(next);
     out_.states.conservativeResize(Eigen::NoChange, next);
     out_.accelerations.conservativeResize(Eigen::NoChange, next);
@@ -180,9 +173,7 @@ class Integration {
             "jumps where a body comes to rest is to be written with sign(v) or v/sqrt(v^2 + w^2), or smoothed, say "
             "tanh(v/0.01){}; else loosen the tolerances, or allow more steps (`max_steps`)",
             options_.max_steps, t_, t_end(), t_halfway_,
-            system_.has_conditional_constraints()
-                ? "; a constraint that holds at the very edge of its condition is to be a contact"
-                : ""));
+            !conditions_.empty() ? "; a constraint that holds at the very edge of its condition is to be a contact" : ""));
       }
       throw NumericalError(
           fmt::format("simulate: {} steps reach no further than t = {:.6g} of {:.6g}: loosen the tolerances, or "
@@ -480,17 +471,18 @@ class Integration {
 
   // projects the state; by a constraint that takes hold off its surface a body is moved there at once
   bool project_and_note_jump() {
-    if (!system_.has_conditional_constraints()) return project(x_, t_);
+    if (conditions_.empty()) return project(x_, t_);
     const Phase before = x_;
     expand(x_, t_);
-    const std::vector<bool> active = active_rows(), were_active = std::exchange(active_, active);
+    const std::vector<bool> is_active = active_conditions(), was_active = std::exchange(is_active_, is_active);
     const bool has_moved = project(x_, t_);
-    const Eigen::Map<const VectorXd> q(x_.data(), layout_.nq);
-    lowest_ = lowest_.size() == 0 ? VectorXd(q) : VectorXd(lowest_.cwiseMin(q));
-    highest_ = highest_.size() == 0 ? VectorXd(q) : VectorXd(highest_.cwiseMax(q));
+    note_extent();
+    bool takes_hold = false;
+    for (std::size_t k = 0; k < is_active.size(); ++k) takes_hold = takes_hold || (is_active[k] && !was_active[k]);
     constexpr double much = 1e-3;  // of the way that a coordinate has come
-    for (Index j = 0; has_moved && active != were_active && j < layout_.nq; ++j) {
-      const double jump = std::abs(q[j] - before[static_cast<std::size_t>(j)]);
+    for (Index j = 0; has_moved && takes_hold && j < layout_.nq; ++j) {
+      const auto k = static_cast<std::size_t>(j);
+      const double jump = std::abs(x_[k] - before[k]);
       if (jump <= std::max(out_.largest_jump, much * (highest_[j] - lowest_[j]))) continue;
       out_.largest_jump = jump;
       out_.jump_time = t_;
@@ -498,15 +490,29 @@ class Integration {
     return has_moved;
   }
 
-  // of rows that come and go by themselves, at state_
-  [[nodiscard]] std::vector<bool> active_rows() const {
-    const SystemValues values = system_.evaluate(state_, parameters_);
+  void note_extent() {
+    const Eigen::Map<const VectorXd> q(x_.data(), layout_.nq);
+    lowest_ = lowest_.size() == 0 ? VectorXd(q) : VectorXd(lowest_.cwiseMin(q));
+    highest_ = highest_.size() == 0 ? VectorXd(q) : VectorXd(highest_.cwiseMax(q));
+  }
+
+  // which of conditions_ hold at state_
+  [[nodiscard]] std::vector<bool> active_conditions() const {
     std::vector<bool> active;
+    if (conditions_.empty()) return active;
+    const SystemValues values = system_.evaluate(state_, parameters_);
+    for (const int row : conditions_) active.push_back(!values.A(0).row(row).isZero(0));
+    return active;
+  }
+
+  // rows of A that come and go by themselves, not as contacts
+  [[nodiscard]] std::vector<int> conditional_rows() const {
+    std::vector<int> rows;
     for (int row = 0; row < system_.nc(); ++row) {
       const bool is_contact = std::ranges::any_of(options_.contacts, [&](const Contact& one) { return one.row == row; });
-      active.push_back(system_.is_conditional(row) && !is_contact && !values.A(0).row(row).isZero(0));
+      if (system_.is_conditional(row) && !is_contact) rows.push_back(row);
     }
-    return active;
+    return rows;
   }
 
   // where the motion is on a surface now, and was beside it, or the other way round
@@ -621,8 +627,9 @@ class Integration {
   Phase x_, dxdt_, x_new_, dxdt_new_, x_crossing_;
   std::optional<StageFault> fault_;  // of the last try
   std::optional<VectorXd> instant_;  // the state of which velocities alone move
-  std::vector<bool> active_;         // rows that come and go, at the last step
-  VectorXd lowest_, highest_;        // coordinates up to then, where rows do
+  const std::vector<int> conditions_ = conditional_rows();
+  std::vector<bool> is_active_;  // of conditions_, at the last step
+  VectorXd lowest_, highest_;    // coordinates up to then
   Trajectory out_;
 };
 

@@ -373,6 +373,13 @@ TEST(SimulateModelCommand, SaysWhatAConditionDoesThatIsAContact) {
   EXPECT_TRUE(jump.said("where a constraint takes hold off its surface: what meets a surface is a contact")) << jump.err;
   const Outcome before = desk.done("gp2 simulate held.toml --start x=0,z=2,dx=1,dz=0 --t-end 0.9 --dt 0.1 -o motion.csv");
   EXPECT_FALSE(before.said("takes hold")) << before.err;
+  // a constraint that holds all the time drifts by itself, beside a condition that is never met and one that always is
+  for (const char* constraint :
+       {R"("x^2 + z^2 - 4", { expr = "z - 9", when = "x > 4000" })", R"({ expr = "x^2 + z^2 - 4", when = "x < 4000" })"}) {
+    write(constraint);
+    const Outcome drift = desk.done("gp2 simulate held.toml --start x=2,z=0 --t-end 3 --dt 0.1 --rtol 1e-4 -o motion.csv");
+    EXPECT_FALSE(drift.said("takes hold")) << drift.err;
+  }
   write(R"({ expr = "x^2 + z^2 - 1", when = "x^2 + z^2 >= 1" })");
   const Outcome rope = desk.run("gp2 simulate held.toml --start x=0.5,z=0 --t-end 5 --dt 0.2 --max-steps 2000 -o motion.csv");
   EXPECT_EQ(rope.status, 1);

@@ -98,10 +98,15 @@ struct MotionUncertainty {
 MotionUncertainty motion_uncertainty(const Posterior& posterior, const Trajectory& trajectory,
                                      const std::shared_ptr<const OtherSystem>& other_system = nullptr);
 
+/// One motion and what goes with it.
+struct SimulatedMotion {
+  Trajectory trajectory;
+  std::optional<MotionUncertainty> uncertainty = {};  // of a fit
+  std::optional<MotionEnergy> energy = {};            // of a model with a potential
+};
+
 /// Warnings of where motions leave the region of the data, where a constraint moves them at once, and where their constraints lose
 /// rank: of each what the first of them does.
-/// @param uncertainties  of each; empty: none is known
-std::vector<std::string> motion_notes(const std::vector<Trajectory>& motions,
-                                      const std::vector<std::optional<MotionUncertainty>>& uncertainties = {});
+std::vector<std::string> motion_notes(const std::vector<SimulatedMotion>& motions);
 
 }  // namespace gp2
