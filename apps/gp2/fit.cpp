@@ -37,14 +37,14 @@ struct FitArguments {
 };
 
 // LOG or LOG@OTHER.toml
-Log read_log(const std::string& text) {
+Log read_log(const std::string& text, const Workers& workers) {
   const auto [path, model] = split_at_system(text);
-  return {CsvTable::read(path, CsvTable::Keep::numbers),
+  return {CsvTable::read(path, CsvTable::Keep::numbers, workers),
           model.empty() ? nullptr : std::make_shared<const Model>(Model::read(model))};
 }
 
 // VIEW:LOG or VIEW@LATENT:LOG
-SideInformation read_side_information(const std::string& text) {
+SideInformation read_side_information(const std::string& text, const Workers& workers) {
   const std::size_t colon = text.find(':');
   const std::string view = text.substr(0, std::min(colon, text.size()));
   const std::size_t at = view.find('@');
@@ -53,7 +53,7 @@ SideInformation read_side_information(const std::string& text) {
     throw InputError(fmt::format("`also`: '{}' is not VIEW:FILE.csv or VIEW@LATENT:FILE.csv with VIEW one of {}", text,
                                  fmt::join(View::Quantity::words(), ", ")));
   }
-  return {*quantity, at == std::string::npos ? "" : view.substr(at + 1), read_log(text.substr(colon + 1))};
+  return {*quantity, at == std::string::npos ? "" : view.substr(at + 1), read_log(text.substr(colon + 1), workers)};
 }
 
 void say_how_far(const Progress& p) {
@@ -201,12 +201,14 @@ std::string data_source_of(const FitArguments& arguments) {
   return fmt::format("{}", fmt::join(sources, ", "));
 }
 
-void read_data(FitArguments& arguments) {
+void read_data(FitArguments& arguments, const Workers& workers) {
   FitRequest& request = arguments.request;
   request.data_source = data_source_of(arguments);
-  for (const std::string& text : arguments.data) request.logs.push_back(read_log(text));
-  if (!arguments.commands.empty()) request.problem.commands = CsvTable::read(arguments.commands, CsvTable::Keep::numbers);
-  for (const std::string& text : arguments.also) request.also.push_back(read_side_information(text));
+  for (const std::string& text : arguments.data) request.logs.push_back(read_log(text, workers));
+  if (!arguments.commands.empty()) {
+    request.problem.commands = CsvTable::read(arguments.commands, CsvTable::Keep::numbers, workers);
+  }
+  for (const std::string& text : arguments.also) request.also.push_back(read_side_information(text, workers));
 }
 
 // The rows of a raw log, which learning and smoothing by turns finds.
@@ -221,10 +223,11 @@ void read_raw(FitArguments& arguments, const std::atomic<bool>* stop) {
   arguments.request = log.request(std::move(arguments.request), arguments.raw);
 }
 
-FitJob prepare(FitArguments& arguments, const Interruption& interruption) {
+FitJob prepare(FitArguments& arguments, const std::shared_ptr<const Ranks>& ranks, const Interruption& interruption) {
+  const Workers readers(arguments.request.threads, ranks);
   if (arguments.again.empty()) {
     arguments.request.model = Model::read(arguments.model);
-    read_data(arguments);
+    read_data(arguments, readers);
     if (!arguments.raw.empty()) read_raw(arguments, interruption.stop());
     return prepare_fit(std::move(arguments.request));
   }
@@ -233,7 +236,7 @@ FitJob prepare(FitArguments& arguments, const Interruption& interruption) {
   if (arguments.data.empty()) return prepare_fit_again(fit, threads);
   arguments.request = request_of(fit);
   arguments.request.threads = threads;
-  read_data(arguments);
+  read_data(arguments, readers);
   return prepare_fit_again(fit, std::move(arguments.request));
 }
 
@@ -265,7 +268,7 @@ void run(FitArguments& arguments, const std::set<std::string>& given) {
   const std::shared_ptr<const Ranks> ranks = join_ranks();
   const LastWord last_word(checkpoint);
   const Interruption interruption(!ranks, checkpoint.empty() ? nullptr : &last_word);  // mpirun ends its processes
-  FitJob job = unless_interrupted(interruption, [&] { return prepare(arguments, interruption); });
+  FitJob job = unless_interrupted(interruption, [&] { return prepare(arguments, ranks, interruption); });
   if (ranks) require_same_data(*ranks, job.problem.observations);
   job.options.ranks = ranks;
   job.checkpoint = checkpoint;

@@ -270,11 +270,11 @@ void add_fit(py::module_& module) {
            }),
            "view"_a, "data"_a, "latent"_a = "", "system"_a = py::none());
   py::class_<Progress>(module, "Progress", "What the optimiser tells while it runs.")
-      .def_readonly("restart", &Progress::restart)
-      .def_readonly("n_restarts", &Progress::n_restarts)
-      .def_readonly("iteration", &Progress::iteration)
+      .def_readonly("restart", &Progress::restart, "From 0.")
+      .def_readonly("n_restarts", &Progress::n_restarts, "How many runs of the optimiser there are.")
+      .def_readonly("iteration", &Progress::iteration, "Of this run.")
       .def_readonly("best", &Progress::best, "Lowest objective so far.")
-      .def_readonly("seconds", &Progress::seconds)
+      .def_readonly("seconds", &Progress::seconds, "Since the fit began.")
       .def_readonly("is_drawing", &Progress::is_drawing, "Whether hyperparameters are drawn, after the restarts.")
       .def_readonly("fraction", &Progress::fraction, "Of the work, estimated.");
 

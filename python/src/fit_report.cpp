@@ -99,10 +99,10 @@ void define_report(py::class_<FitReport>& report) {
       .def_readonly("negative_log_likelihood", &FitReport::negative_log_likelihood,
                     "-log p(y), physical units, all constants, without hyper-prior.")
       .def_readonly("objective", &FitReport::objective, "With hyper-priors: what was minimised.")
-      .def_readonly("converged", &FitReport::converged)
+      .def_readonly("converged", &FitReport::converged, "Whether the optimiser met its tolerances.")
       .def_readonly("termination", &FitReport::termination, "Which inequality stopped the optimiser.")
       .def_readonly("iterations", &FitReport::iterations, "Of the best restart.")
-      .def_readonly("best_restart", &FitReport::best_restart)
+      .def_readonly("best_restart", &FitReport::best_restart, "Number of the run, from 0, that ended lowest.")
       .def_readonly("restarts", &FitReport::restarts, "How each run ended, list of RestartReport.")
       .def_property_readonly(
           "distrusted", &distrusted_values,
@@ -116,7 +116,7 @@ void define_report(py::class_<FitReport>& report) {
           "Of a fit through inducing points: n_variables, left_out, of each latent what they leave of its variance at all "
           "rows, in units of the noise (twice the nats by which the likelihood is too low, about), and n_start, the rows "
           "that hyperparameters were fitted to before all; else None.")
-      .def_readonly("seconds", &FitReport::seconds)
+      .def_readonly("seconds", &FitReport::seconds, "That the fit took.")
       .def_property_readonly("standard_errors", &standard_errors,
                              "Of estimated parameters, by name: inf where the data do not determine one, nan where it is at a "
                              "bound. Of the draws, where "
@@ -134,12 +134,12 @@ void define_report(py::class_<FitReport>& report) {
 
 void add_fit_report(py::module_& module) {
   py::class_<Hyperparameter>(module, "Hyperparameter", "One number that training adjusts, in physical units.")
-      .def_readonly("name", &Hyperparameter::name)
-      .def_readonly("unit", &Hyperparameter::unit)
-      .def_readonly("value", &Hyperparameter::value)
-      .def_readonly("lower", &Hyperparameter::lower)
-      .def_readonly("upper", &Hyperparameter::upper)
-      .def_property_readonly("at_bound", &Hyperparameter::at_bound)
+      .def_readonly("name", &Hyperparameter::name, "As report[name] takes it.")
+      .def_readonly("unit", &Hyperparameter::unit, "Of the value; empty: none.")
+      .def_readonly("value", &Hyperparameter::value, "Fitted.")
+      .def_readonly("lower", &Hyperparameter::lower, "Bound of the search.")
+      .def_readonly("upper", &Hyperparameter::upper, "Bound of the search.")
+      .def_property_readonly("at_bound", &Hyperparameter::at_bound, "Whether the value lies at a bound.")
       .def("__repr__", [](const Hyperparameter& h) {
         return fmt::format("<{} = {:.6g} in [{:.3g}, {:.3g}]{}>", h.name, h.value, h.lower, h.upper,
                            h.is_fixed()   ? ", held"
@@ -147,13 +147,13 @@ void add_fit_report(py::module_& module) {
                                           : "");
       });
   py::class_<RestartReport>(module, "RestartReport", "How one run of the optimiser ended.")
-      .def_readonly("objective", &RestartReport::objective)
-      .def_readonly("negative_log_likelihood", &RestartReport::negative_log_likelihood)
-      .def_readonly("iterations", &RestartReport::iterations)
-      .def_readonly("evaluations", &RestartReport::evaluations)
-      .def_readonly("failed_evaluations", &RestartReport::failed_evaluations)
-      .def_readonly("converged", &RestartReport::converged)
-      .def_readonly("termination", &RestartReport::termination);
+      .def_readonly("objective", &RestartReport::objective, "-log p(y) with hyper-priors, at its end.")
+      .def_readonly("negative_log_likelihood", &RestartReport::negative_log_likelihood, "-log p(y) at its end.")
+      .def_readonly("iterations", &RestartReport::iterations, "Of the optimiser.")
+      .def_readonly("evaluations", &RestartReport::evaluations, "Of the objective and its gradient.")
+      .def_readonly("failed_evaluations", &RestartReport::failed_evaluations, "That gave no number.")
+      .def_readonly("converged", &RestartReport::converged, "Whether it met its tolerances.")
+      .def_readonly("termination", &RestartReport::termination, "Which inequality stopped it.");
   py::class_<FitReport> report(module, "FitReport", "How a fit went; report['name'] is a fitted hyperparameter.");
   define_report(report);
 }

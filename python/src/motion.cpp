@@ -193,17 +193,25 @@ void add_motion(py::module_& module) {
           "As of Prediction, along the mean's motion (n); None as std.")
       .def_property_readonly(
           "multipliers", [](const Motion& m) { return to_rows(m.trajectory.records); }, "lambda of the constraints (n, nc)")
-      .def_property_readonly("max_position_drift", [](const Motion& m) { return m.trajectory.max_position_drift; })
-      .def_property_readonly("max_velocity_drift", [](const Motion& m) { return m.trajectory.max_velocity_drift; })
+      .def_property_readonly(
+          "max_position_drift", [](const Motion& m) { return m.trajectory.max_position_drift; },
+          "Largest |c| of position constraints at the times of `t`.")
+      .def_property_readonly(
+          "max_velocity_drift", [](const Motion& m) { return m.trajectory.max_velocity_drift; },
+          "Largest |dc/dt| of these, or |c| of velocity constraints, there.")
       .def_property_readonly(
           "n_lower_rank", [](const Motion& m) { return m.trajectory.lower_rank.states.size(); },
           "Times at which the constraints have a lower rank than at others.")
       .def_property_readonly(
           "table", [](const Motion& m) { return as_table(m.trajectory, *m.system, "motion"); },
           "t, q, dq, ddq and the inputs as commanded: fit takes it as a log, simulate as inputs.")
-      .def_property_readonly("steps", [](const Motion& m) { return m.trajectory.steps; })
-      .def_property_readonly("rejected_steps", [](const Motion& m) { return m.trajectory.rejected_steps; })
-      .def_property_readonly("evaluations", [](const Motion& m) { return m.trajectory.evaluations; });
+      .def_property_readonly(
+          "steps", [](const Motion& m) { return m.trajectory.steps; }, "Of the integrator.")
+      .def_property_readonly(
+          "rejected_steps", [](const Motion& m) { return m.trajectory.rejected_steps; },
+          "Whose error was above the tolerance, or that had no finite acceleration.")
+      .def_property_readonly(
+          "evaluations", [](const Motion& m) { return m.trajectory.evaluations; }, "Of the acceleration.");
 }
 
 void add_excitation(py::module_& module) {
@@ -230,10 +238,15 @@ void add_excitation(py::module_& module) {
       .def_property_readonly(
           "leaves_data", [](const PyExcitation& e) { return e.found.leaves_data; },
           "When the motion first is far from the data [s]; None: never.")
-      .def_property_readonly("n_motions", [](const PyExcitation& e) { return e.found.n_motions; })
-      .def_property_readonly("n_random", [](const PyExcitation& e) { return e.found.n_random; })
-      .def_property_readonly("n_failed", [](const PyExcitation& e) { return e.found.n_failed; })
-      .def_property_readonly("seconds", [](const PyExcitation& e) { return e.found.seconds; });
+      .def_property_readonly(
+          "n_motions", [](const PyExcitation& e) { return e.found.n_motions; }, "That were tried.")
+      .def_property_readonly(
+          "n_random", [](const PyExcitation& e) { return e.found.n_random; },
+          "Random ones within the limits, which stand beside it.")
+      .def_property_readonly(
+          "n_failed", [](const PyExcitation& e) { return e.found.n_failed; }, "That could not be integrated.")
+      .def_property_readonly(
+          "seconds", [](const PyExcitation& e) { return e.found.seconds; }, "That the search took.");
 }
 
 /// These have their keywords in signatures of our own; the setting for that ends with this function.

@@ -320,16 +320,16 @@ void add_evaluation(py::module_& module) {
   py::class_<Calibration>(module, "Calibration",
                           "How errors lie within their predicted Gaussian marginals; NaN where there are none.")
       .def_readonly("coverage50", &Calibration::coverage50, "Share of measurements in their 50 % intervals.")
-      .def_readonly("coverage80", &Calibration::coverage80)
-      .def_readonly("coverage95", &Calibration::coverage95)
+      .def_readonly("coverage80", &Calibration::coverage80, "In their 80 % intervals.")
+      .def_readonly("coverage95", &Calibration::coverage95, "In their 95 % intervals.")
       .def_readonly("coverage50_latent", &Calibration::coverage50_latent, "The same of noise-free targets.")
-      .def_readonly("coverage80_latent", &Calibration::coverage80_latent)
-      .def_readonly("coverage95_latent", &Calibration::coverage95_latent)
+      .def_readonly("coverage80_latent", &Calibration::coverage80_latent, "In their 80 % intervals.")
+      .def_readonly("coverage95_latent", &Calibration::coverage95_latent, "In their 95 % intervals.")
       .def_property_readonly(
           "pit", [](const Calibration& c) { return to_vector(c.pit); },
           "Share of measurements in each tenth of their predictive distributions: all 0.1 where errors are as predicted.");
   py::class_<Evaluation::Part, Calibration>(module, "EvaluationPart", "Figures of some of the points.")
-      .def_readonly("n", &Evaluation::Part::n)
+      .def_readonly("n", &Evaluation::Part::n, "Of these points.")
       .def_readonly("nrmse", &Evaluation::Part::nrmse, "Rms error over rms of the test spreads of all points.");
   py::class_<CrossValidation>(module, "CrossValidation", "Scores of the data of a fit, where it has not seen them.")
       .def_readonly("one_by_one", &CrossValidation::one_by_one, "Each value from all others.")
@@ -339,7 +339,7 @@ void add_evaluation(py::module_& module) {
           "no order of time.")
       .def("__repr__", [](const CrossValidation& c) { return fmt::format("<gp2.CrossValidation: {}>", c.text()); });
   py::class_<Evaluation, Calibration>(module, "Evaluation", "How well a posterior predicts measured accelerations.")
-      .def_readonly("outputs", &Evaluation::outputs)
+      .def_readonly("outputs", &Evaluation::outputs, "Names of the accelerations.")
       .def_property_readonly(
           "rmse", [](const Evaluation& e) { return to_vector(e.rmse); }, "Per output, physical units.")
       .def_readonly("rmse_normalised", &Evaluation::rmse_normalised, "Mean over outputs of rmse / training std.")
@@ -352,7 +352,7 @@ void add_evaluation(py::module_& module) {
                     "Marginals without variance, left out of the latent figures.")
       .def_readonly("near", &Evaluation::near, "Of the points near the data.")
       .def_readonly("far", &Evaluation::far, "Of those farther from the data than FAR_FROM_DATA.")
-      .def_readonly("n", &Evaluation::n)
+      .def_readonly("n", &Evaluation::n, "Points.")
       .def_readonly("n_missing", &Evaluation::n_missing, "Targets that are not measured, left out of all figures.")
       .def("__repr__", [](const Evaluation& e) {
         std::string rmse;
@@ -373,8 +373,9 @@ void define_files_and_facts(py::class_<PyPosterior>& posterior) {
                   "As gp2.load.\n\nRaises InputError naming the file and what is wrong.")
       .def("save", &save, "path"_a,
            "Write a FIT.json, whole or not at all. Loaded again it gives the same bits, after an update the same to rounding.")
-      .def_property_readonly("system",
-                             [](const PyPosterior& self) { return PySystem{std::make_shared<const Model>(self.file.model)}; })
+      .def_property_readonly(
+          "system", [](const PyPosterior& self) { return PySystem{std::make_shared<const Model>(self.file.model)}; },
+          "What was fitted, with the model file's values of parameters.")
       .def_property_readonly(
           "report", [](const PyPosterior& self) { return self.file.report; }, "How the fit went.")
       .def_property_readonly(
@@ -385,9 +386,11 @@ void define_files_and_facts(py::class_<PyPosterior>& posterior) {
           },
           "What the fit was asked, a dict under the names of the options of gp2 fit; None where a file does not say.")
       .def_readonly("notes", &PyPosterior::notes, "What the reading of the data had to say.")
-      .def_property_readonly("n_data", [](const PyPosterior& self) { return self.posterior.n_states(); })
-      .def_property_readonly("negative_log_likelihood",
-                             [](const PyPosterior& self) { return self.posterior.negative_log_likelihood(); })
+      .def_property_readonly(
+          "n_data", [](const PyPosterior& self) { return self.posterior.n_states(); }, "Observed states.")
+      .def_property_readonly(
+          "negative_log_likelihood", [](const PyPosterior& self) { return self.posterior.negative_log_likelihood(); },
+          "-log p(y) of the observations, physical units, without hyper-prior.")
       .def_property_readonly(
           "parameters",
           [](const PyPosterior& self) {

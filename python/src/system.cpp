@@ -221,7 +221,7 @@ void add_mechanics_and_finding(py::module_& module) {
   py::class_<Finding>(module, "Finding", "One thing a check looked at.")
       .def_property_readonly(
           "level", [](const Finding& finding) { return word(finding.level); }, "'ok', 'warning' or 'error'.")
-      .def_readonly("text", &Finding::text)
+      .def_readonly("text", &Finding::text, "What was found, and the mend where there is one.")
       .def("__repr__", [](const Finding& finding) { return fmt::format("{}: {}", word(finding.level), finding.text); });
 }
 
@@ -247,11 +247,15 @@ void define_model_files(py::class_<PySystem>& system) {
 }
 
 void define_names_and_parameters(py::class_<PySystem>& system) {
-  system.def_property_readonly("name", [](const PySystem& self) { return self.system().name(); })
+  system
+      .def_property_readonly(
+          "name", [](const PySystem& self) { return self.system().name(); }, "Of the model.")
       .def_property_readonly(
           "text", [](const PySystem& self) { return self.model->text; }, "The model file's text.")
-      .def_property_readonly("coordinates", [](const PySystem& self) { return coordinate_names(self.system()); })
-      .def_property_readonly("inputs", [](const PySystem& self) { return self.system().inputs(); })
+      .def_property_readonly(
+          "coordinates", [](const PySystem& self) { return coordinate_names(self.system()); }, "Names, in the order of q.")
+      .def_property_readonly(
+          "inputs", [](const PySystem& self) { return self.system().inputs(); }, "Names, in the order of u.")
       .def_property_readonly(
           "parameters", [](const PySystem& self) { return parameters_of(self.system()); }, "Name to value.")
       .def_property_readonly(

@@ -29,7 +29,10 @@ namespace {
 constexpr int patience = 3000;                                 // how long a pipe may lack a writer [ms]
 constexpr std::size_t max_device_size = std::size_t{1} << 24;  // /dev/zero has no end; a person at a terminal types less
 
-struct OpenFile {
+}  // namespace
+
+class OpenFile {
+ public:
   explicit OpenFile(const std::filesystem::path& path) : descriptor(open(path.c_str(), O_RDONLY | O_CLOEXEC | O_NONBLOCK)) {}
   ~OpenFile() {
     if (descriptor >= 0) close(descriptor);
@@ -45,41 +48,6 @@ struct OpenFile {
 
   const int descriptor;
 };
-
-}  // namespace
-
-namespace {
-
-// Reads what a descriptor that does not wait has, block after block, to its end.
-template <typename Require, typename Fail>
-void read_to_end(const OpenFile& file, bool is_pipe, const std::function<void(std::string_view)>& take, const Require& require,
-                 const Fail& fail) {
-  std::array<char, 1 << 16> block;
-  bool has_writer = !is_pipe, was_patient = false;
-  while (true) {
-    const ssize_t n = read(file.descriptor, block.data(), block.size());
-    if (n > 0) {
-      take({block.data(), static_cast<std::size_t>(n)});
-      has_writer = true;
-    } else if (n == 0) {
-      if (has_writer) return;
-      // no one has opened the pipe for writing yet
-      if (was_patient) fail("cannot be read: a pipe that nothing writes to");
-      if (file.wait(patience)) {
-        has_writer = true;
-      } else {
-        was_patient = true;
-      }
-    } else if (errno == EAGAIN) {
-      has_writer = true;
-      static_cast<void>(file.wait(-1));
-    } else {
-      require(errno == EINTR);
-    }
-  }
-}
-
-}  // namespace
 
 namespace {
 
@@ -116,38 +84,103 @@ std::optional<FileVersion> file_version(const std::filesystem::path& path) {
   return version_of(status);
 }
 
+namespace {
+
+[[noreturn]] void refuse(const std::filesystem::path& path, const std::string& why) {
+  throw InputError(fmt::format("{}: {}", path.string(), why));
+}
+
+// `good` is what a call of the system says.
+void require(bool good, const std::filesystem::path& path) {
+  if (!good) refuse(path, fmt::format("cannot be read: {}", std::strerror(errno)));
+}
+
+struct stat status_of(const OpenFile& file, const std::filesystem::path& path) {
+  require(file.descriptor >= 0, path);
+  struct stat status = {};
+  require(fstat(file.descriptor, &status) == 0, path);
+  return status;
+}
+
+void require_size(std::uint64_t size, const std::filesystem::path& path, std::size_t max_size) {
+  if (size > max_size) refuse(path, fmt::format("{} bytes; at most {} are read", size, max_size));
+}
+
+void require_text(std::string_view begin, const std::filesystem::path& path) {
+  if (const std::optional<std::string> kind = other_than_text(begin)) refuse(path, *kind);
+}
+
+// Reads what a descriptor that does not wait has, block after block, to its end.
+void read_to_end(const OpenFile& file, bool is_pipe, const std::filesystem::path& path,
+                 const std::function<void(std::string_view)>& take) {
+  std::array<char, 1 << 16> block;
+  bool has_writer = !is_pipe, was_patient = false;
+  while (true) {
+    const ssize_t n = read(file.descriptor, block.data(), block.size());
+    if (n > 0) {
+      take({block.data(), static_cast<std::size_t>(n)});
+      has_writer = true;
+    } else if (n == 0) {
+      if (has_writer) return;
+      // no one has opened the pipe for writing yet
+      if (was_patient) refuse(path, "cannot be read: a pipe that nothing writes to");
+      if (file.wait(patience)) {
+        has_writer = true;
+      } else {
+        was_patient = true;
+      }
+    } else if (errno == EAGAIN) {
+      has_writer = true;
+      static_cast<void>(file.wait(-1));
+    } else {
+      require(errno == EINTR, path);
+    }
+  }
+}
+
+}  // namespace
+
+FileParts::FileParts(std::filesystem::path path)
+    : path_(std::move(path)), file_(std::make_unique<const OpenFile>(path_)), version_(version_of(status_of(*file_, path_))) {
+  require_size(size(), path_, max_file_size);
+  require_text(read(0, 4), path_);
+}
+
+FileParts::~FileParts() = default;
+
+std::string FileParts::read(std::uint64_t first, std::size_t n) const {
+  std::string part(n, '\0');
+  std::size_t n_read = 0;
+  while (n_read < n) {
+    const ssize_t now = pread(file_->descriptor, part.data() + n_read, n - n_read, static_cast<off_t>(first + n_read));
+    if (now == 0) break;
+    require(now > 0 || errno == EINTR, path_);
+    if (now > 0) n_read += static_cast<std::size_t>(now);
+  }
+  part.resize(n_read);
+  return part;
+}
+
+void FileParts::require_unchanged() const {
+  if (version_of(status_of(*file_, path_)) != version_) throw_changed(path_);
+}
+
 void read_blocks(const std::filesystem::path& path, const std::function<void(std::string_view)>& take, std::size_t max_size) {
-  const auto fail = [&](const std::string& why) { throw InputError(fmt::format("{}: {}", path.string(), why)); };
-  const auto require = [&](bool good) {
-    if (!good) fail(fmt::format("cannot be read: {}", std::strerror(errno)));
-  };
   // opened without waiting, for a pipe may never get a writer
   const OpenFile file(path);
-  require(file.descriptor >= 0);
-  struct stat status = {};
-  require(fstat(file.descriptor, &status) == 0);
+  const struct stat status = status_of(file, path);
   const bool is_pipe = S_ISFIFO(status.st_mode);
   if (!S_ISREG(status.st_mode) && !is_pipe) max_size = std::min(max_size, max_device_size);
-  if (S_ISREG(status.st_mode) && static_cast<std::size_t>(status.st_size) > max_size) {
-    fail(fmt::format("{} bytes; at most {} are read", status.st_size, max_size));
-  }
+  if (S_ISREG(status.st_mode)) require_size(static_cast<std::uint64_t>(status.st_size), path, max_size);
   std::size_t size = 0;
-  const auto take_counted = [&](std::string_view block) {
-    size += block.size();
-    if (size > max_size) fail(fmt::format("more than {} bytes, which is all that is read", max_size));
-    take(block);
-  };
   bool is_begin = true;
-  const auto take_text = [&](std::string_view block) {
-    if (std::exchange(is_begin, false)) {
-      if (const std::optional<std::string> kind = other_than_text(block)) fail(*kind);
-    }
-    take_counted(block);
-  };
-  read_to_end(file, is_pipe, take_text, require, fail);
-  struct stat after = {};
-  require(fstat(file.descriptor, &after) == 0);
-  if (S_ISREG(status.st_mode) && version_of(after) != version_of(status)) throw_changed(path);
+  read_to_end(file, is_pipe, path, [&](std::string_view block) {
+    if (std::exchange(is_begin, false)) require_text(block, path);
+    size += block.size();
+    if (size > max_size) refuse(path, fmt::format("more than {} bytes, which is all that is read", max_size));
+    take(block);
+  });
+  if (S_ISREG(status.st_mode) && version_of(status_of(file, path)) != version_of(status)) throw_changed(path);
 }
 
 std::string read_file(const std::filesystem::path& path, std::size_t max_size) {

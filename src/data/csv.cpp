@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <array>
+#include <bit>
 #include <charconv>
 #include <cmath>
 #include <numeric>
@@ -14,6 +15,7 @@
 
 #include "base/checksum.hpp"
 #include "base/not_a_number.hpp"
+#include "base/parallel.hpp"
 #include "gp2/error.hpp"
 
 namespace gp2 {
@@ -194,6 +196,15 @@ class CsvTable::Builder {
     }
   }
 
+  /// The lines that follow, of rows as plain_cells finds them.
+  void add_rows(const std::vector<double>& cells) {
+    const std::size_t n_columns = content_.columns.size();
+    for (std::size_t k = 0; k < cells.size(); ++k) content_.columns[k % n_columns].push_back(cells[k]);
+    for (std::size_t row = 0; row < cells.size() / n_columns; ++row) content_.lines.push_back(++line_number_);
+  }
+  /// 0 before there is a header.
+  [[nodiscard]] std::size_t n_columns() const { return content_.columns.size(); }
+
   /// @param file  that the lines are of
   CsvTable finish(std::optional<LogFile> file = std::nullopt) {
     if (content_.header.empty()) {
@@ -279,7 +290,8 @@ namespace {
 
 // Calls take(line) for every line of a file, without its end, and begin(block) before those of a block.
 template <typename Take>
-void for_each_line(const std::filesystem::path& path, const Take& take, const std::function<void(std::string_view)>& begin = {}) {
+void for_each_line_of(const std::filesystem::path& path, const Take& take,
+                      const std::function<void(std::string_view)>& begin = {}) {
   std::string rest;  // of a line that goes on in the next block
   read_blocks(path, [&](std::string_view block) {
     if (begin) begin(block);
@@ -296,11 +308,158 @@ void for_each_line(const std::filesystem::path& path, const Take& take, const st
 
 }  // namespace
 
-CsvTable CsvTable::read(const std::filesystem::path& path, Keep keep) {
+namespace {
+
+constexpr std::size_t piece_size = std::size_t{1} << 20;
+constexpr int pieces_at_once = 64;  // whose numbers are in memory twice
+
+/// The lines of a file that begin within one stretch of its bytes, and the checksum of these bytes.
+struct Piece {
+  std::string text;
+  std::size_t begin = 0;  // of the first of these lines
+  Checksum checksum;
+
+  Piece(const FileParts& file, std::uint64_t first) {
+    const std::uint64_t before = first == 0 ? 0 : 1;  // byte, which tells whether a line begins at the first
+    text = file.read(first - before, piece_size + before);
+    checksum.add(std::string_view(text).substr(std::min<std::size_t>(before, text.size())));  // empty where a file has shrunk
+    if (before == 1) begin = std::min(text.find('\n'), text.size() - 1) + 1;
+    constexpr std::size_t next = 1 << 12;
+    while (begin < text.size() && text.back() != '\n') {  // the last line goes on
+      std::string rest = file.read(first - before + text.size(), next);
+      if (rest.empty()) break;
+      rest.resize(std::min(rest.find('\n'), rest.size() - 1) + 1);
+      text += rest;
+    }
+  }
+  [[nodiscard]] std::string_view lines() const { return std::string_view(text).substr(begin); }
+};
+
+template <typename Take>
+void for_each_line(std::string_view text, const Take& take) {
+  while (!text.empty()) {
+    const std::size_t end = text.find('\n');
+    take(text.substr(0, end));
+    text.remove_prefix(end == std::string_view::npos ? text.size() : end + 1);
+  }
+}
+
+// The cells of lines that have n_columns each, all of them numbers or empty, row after row: nearly all lines of a log are such. Nothing
+// where one is not: what is to be said or kept of it is for Builder::add_line.
+std::optional<std::vector<double>> plain_cells(std::string_view lines, std::size_t n_columns) {
+  std::vector<double> cells;
+  bool is_plain = true;
+  for_each_line(lines, [&](std::string_view line) {
+    line = trim(line);
+    const char* at = line.data();
+    const char* const end = at + line.size();
+    const auto skip_space = [&] {
+      while (at != end && (*at == ' ' || *at == '\t')) ++at;
+    };
+    is_plain = is_plain && !line.empty();
+    for (std::size_t column = 0; column < n_columns && is_plain; ++column) {
+      skip_space();
+      double value = not_a_number;
+      if (at != end && *at != ',') {
+        const auto [after, error] = std::from_chars(at, end, value);
+        is_plain = error == std::errc() && std::isfinite(value);
+        at = after;
+        skip_space();
+      }
+      cells.push_back(value);
+      const bool is_last = column + 1 == n_columns;
+      is_plain = is_plain && (is_last ? at == end : at != end && *at++ == ',');
+    }
+  });
+  if (!is_plain) return std::nullopt;
+  return cells;
+}
+
+// What who reads a piece tells the others.
+struct ReadPiece {
+  Checksum checksum;
+  std::optional<std::vector<double>> cells;
+
+  ReadPiece() = default;
+  ReadPiece(const Piece& piece, std::size_t n_columns) : checksum(piece.checksum), cells(plain_cells(piece.lines(), n_columns)) {}
+
+  void share(const Workers& workers, int part, int n_parts) {
+    std::array<double, 2> head = {std::bit_cast<double>(checksum.remainder()), cells ? static_cast<double>(cells->size()) : -1.0};
+    workers.share(head, part, n_parts);
+    checksum = Checksum(std::bit_cast<std::uint64_t>(head[0]));
+    if (head[1] < 0) return cells.reset();
+    if (!cells) cells.emplace();
+    cells->resize(static_cast<std::size_t>(head[1]));
+    workers.share(*cells, part, n_parts);
+  }
+};
+
+// @throws InputError where one of several processes has another size of a file than the first, or has seen that another's differs
+void require_one_file(const Workers& workers, const std::filesystem::path& path, double size, bool is_same = true) {
+  double first = size;
+  if (workers.ranks) workers.ranks->broadcast({&first, 1}, 0);
+  if (workers.sum(is_same && first == size ? 0 : 1) > 0) {
+    throw InputError(
+        fmt::format("{}: the processes of mpirun have read different data: give all of them the same files", path.string()));
+  }
+}
+
+}  // namespace
+
+// Pieces are taken in by lines in their order, so that whoever reads them the table is the same, and so is an error.
+CsvTable CsvTable::read_pieces(const std::filesystem::path& path, const Workers& workers) {
+  const FileParts file(path);
+  const auto n_pieces = static_cast<int>((file.size() + piece_size - 1) / piece_size);
+  const auto first_of = [](int piece) { return static_cast<std::uint64_t>(piece) * piece_size; };
+  const auto add_lines = [](Builder& builder, const Piece& piece) {
+    for_each_line(piece.lines(), [&](std::string_view line) { builder.add_line(line); });
+  };
+
+  Builder builder(path.string(), Keep::numbers);
+  const Piece head(file, 0);
+  add_lines(builder, head);
+  Checksum checksum = head.checksum;
+  bool is_same = true;
+  for (int first = 1; first < n_pieces; first += pieces_at_once) {
+    const int n = std::min(pieces_at_once, n_pieces - first);
+    std::vector<ReadPiece> pieces(static_cast<std::size_t>(n));
+    std::vector<std::optional<Checksum>> seen(pieces.size());  // of what the next process reads
+    parallel_for(n, thread_count(workers.n_threads), [&](int k, int) {
+      const auto part = static_cast<std::size_t>(k);
+      if (workers.owns(k, n)) {
+        pieces[part] = ReadPiece(Piece(file, first_of(first + k)), builder.n_columns());
+      } else if (workers.ranks->owner(k, n) == (workers.ranks->rank() + 1) % workers.ranks->size()) {
+        seen[part] = Piece(file, first_of(first + k)).checksum;
+      }
+    });
+    for (int k = 0; k < n; ++k) {
+      const auto part = static_cast<std::size_t>(k);
+      ReadPiece& piece = pieces[part];
+      piece.share(workers, k, n);
+      is_same = is_same && (!seen[part] || *seen[part] == piece.checksum);
+      checksum.append(piece.checksum, std::min<std::uint64_t>(piece_size, file.size() - first_of(first + k)));
+      if (piece.cells) {
+        builder.add_rows(*std::exchange(piece.cells, {}));
+      } else {
+        add_lines(builder, Piece(file, first_of(first + k)));
+      }
+    }
+  }
+  file.require_unchanged();
+  require_one_file(workers, path, static_cast<double>(file.size()), is_same);
+  return builder.finish(LogFile{path.string(), file.size(), 0, checksum.text()});
+}
+
+CsvTable CsvTable::read(const std::filesystem::path& path, Keep keep, const Workers& workers) {
+  const std::optional<FileVersion> version = file_version(path);
+  const std::uint64_t size = version ? version->size : 0;
+  require_one_file(workers, path, static_cast<double>(size));
+  if (keep == Keep::numbers && size > piece_size) return read_pieces(path, workers);
+
   Builder builder(path.string(), keep);
   LogFile file{path.string()};
   Checksum checksum;
-  for_each_line(
+  for_each_line_of(
       path, [&](std::string_view line) { builder.add_line(line); },
       [&](std::string_view block) {
         file.bytes += block.size();
@@ -312,11 +471,7 @@ CsvTable CsvTable::read(const std::filesystem::path& path, Keep keep) {
 
 CsvTable CsvTable::parse(std::string_view text, std::string name, Keep keep) {
   Builder builder(std::move(name), keep);
-  while (!text.empty()) {
-    const std::size_t end = text.find('\n');
-    builder.add_line(text.substr(0, end));
-    text.remove_prefix(end == std::string_view::npos ? text.size() : end + 1);
-  }
+  for_each_line(text, [&](std::string_view line) { builder.add_line(line); });
   return builder.finish();
 }
 
@@ -471,7 +626,7 @@ void CsvWriter::add_printed(std::string_view cells) {
 void for_each_row(const std::filesystem::path& path, const std::function<void(std::string_view)>& take) {
   bool is_first_line = true, is_header = true;
   std::string printed;
-  for_each_line(path, [&](std::string_view line) {
+  for_each_line_of(path, [&](std::string_view line) {
     if (std::exchange(is_first_line, false) && line.starts_with(byte_order_mark)) line.remove_prefix(byte_order_mark.size());
     line = trim(line);
     if (line.empty() || std::exchange(is_header, false)) return;

@@ -1,6 +1,7 @@
 #include <algorithm>
 #include <atomic>
 #include <cmath>
+#include <exception>
 #include <functional>
 #include <limits>
 #include <optional>
@@ -58,7 +59,7 @@ class ExactFit {
  public:
   using Point = LatentValues;
 
-  explicit ExactFit(Posterior::Implementation& self) : self_(self) {
+  explicit ExactFit(Posterior::Implementation& self) : self_(self), noise_stddev_(self.values.noise_stddev) {
     for (const Observations& group : self.observations) {
       OfGroup& of = groups_.emplace_back();
       const Prior& there = prior_of(self.prior, group.view());
@@ -69,6 +70,12 @@ class ExactFit {
       of.view = evaluate_view(group.view(), *of.mechanics, group.states());
     }
     linear_.resize(groups_.size());
+  }
+
+  /// Of the values that are given.
+  void scale_noise(double factor) {
+    noise_stddev_ = self_.values.noise_stddev;
+    for (VectorXd& stddev : noise_stddev_) stddev *= factor;
   }
 
   [[nodiscard]] LatentValues zero() const {
@@ -100,7 +107,7 @@ class ExactFit {
       groups_[g].motion->linearise(self_.observations[g].view(), about.groups[g], values.view, values.prior);
       if (values.prior.fault) return std::numeric_limits<double>::infinity();
     }
-    reduce(self_.prior, self_.observations, linear_, self_.values.noise_stddev, reduction_);
+    reduce(self_.prior, self_.observations, linear_, noise_stddev_, reduction_);
     VectorXd missing = VectorXd::Zero(reduction_.size());
     if (!reduction_.sums) missing = reduction_.y;
     double sum = at.squared_distance(zero());
@@ -146,7 +153,7 @@ class ExactFit {
     self_.latents = nullptr;
     self_.samples.clear();
     self_.next_number = 0;
-    self_.add_samples(self_.observations, self_.values.noise_stddev, 0);
+    self_.add_samples(self_.observations, noise_stddev_, 0);
     first_of_.assign(1, 0);
     for (const Observations& group : self_.observations) first_of_.push_back(first_of_.back() + group.n_data());
   }
@@ -160,6 +167,7 @@ class ExactFit {
   };
 
   Posterior::Implementation& self_;
+  std::vector<VectorXd> noise_stddev_;
   std::vector<OfGroup> groups_;
   std::vector<ObservationModel> linear_;  // of the last objective, and its rows
   Reduction reduction_;
@@ -182,7 +190,12 @@ class FitThroughPoints {
 
   FitThroughPoints(const Prior& prior, const std::vector<Observations>& observations, const ModelValues& values,
                    const InducingLatents& latents, const Workers& workers)
-      : prior_(prior), observations_(observations), values_(values), latents_(latents), workers_(workers) {}
+      : prior_(prior), observations_(observations), given_(values), values_(values), latents_(latents), workers_(workers) {}
+
+  void scale_noise(double factor) {
+    values_.noise_stddev = given_.noise_stddev;
+    for (VectorXd& stddev : values_.noise_stddev) stddev *= factor;
+  }
 
   [[nodiscard]] InducingValues zero() const { return {VectorXd::Zero(latents_.size())}; }
 
@@ -232,7 +245,8 @@ class FitThroughPoints {
  private:
   const Prior& prior_;
   const std::vector<Observations>& observations_;
-  const ModelValues& values_;
+  const ModelValues& given_;
+  ModelValues values_;
   const InducingLatents& latents_;
   const Workers& workers_;
   InducingStatistics linear_;
@@ -247,17 +261,32 @@ Linearisation with_noise_about(Linearisation at, const Linearisation& other) {
   return at;
 }
 
-// Gauss–Newton steps to the posterior mean, each to the one of the linear prior about where the last has led. Returns where the prior is
-// linear in the end.
+// A posterior mean of a nonlinear prior.
+struct NonlinearMean {
+  std::shared_ptr<const Linearisation> about;
+  double left = 0;  // of the data, in spreads of a value, the prior's share among it: about one at most where the prior is right
+};
+
+// Gauss–Newton steps to a posterior mean, each to the one of the linear prior about where the last has led.
+// @param from  where they begin: at the mean of the linear prior there; null: where no latent acts
 template <typename NonlinearFit>
-std::shared_ptr<const Linearisation> find_mean(NonlinearFit& fit, const Prior& prior,
-                                               const std::vector<Observations>& observations, const ModelValues& values) {
+NonlinearMean step_to_mean(NonlinearFit& fit, const Prior& prior, const std::vector<Observations>& observations,
+                           const ModelValues& values, const std::shared_ptr<const Linearisation>& from) {
   constexpr int most = 100;
   constexpr double enough = 1e-7;  // of the size of the latents, as the prior measures it, which knows hardly more digits
   typename NonlinearFit::Point at = fit.zero();
-  std::shared_ptr<const Linearisation> linearisation = fit.about(at);
+  std::shared_ptr<const Linearisation> linearisation;
+  if (from) {
+    static_cast<void>(fit.objective(at, *from));
+    fit.condition(from);
+    if (typename NonlinearFit::Point mean = fit.mean(); (linearisation = fit.about(mean))) at = std::move(mean);
+  }
+  if (!linearisation) linearisation = fit.about(at);
   if (!linearisation) static_cast<void>(require_models(prior, observations, values.parameters, nullptr));  // names the state
   double objective = fit.objective(at, *linearisation);
+  Index n_values = 0;
+  for (const Observations& group : observations) n_values += (!group.values().array().isNaN()).count() + std::ssize(group.sums());
+  const auto found = [&] { return NonlinearMean{linearisation, std::sqrt(2 * objective / static_cast<double>(n_values))}; };
   const bool is_soft = std::ranges::any_of(
       observations, [&](const Observations& group) { return prior_of(prior, group.view()).system->has_constraint_noise(); });
   bool is_in_kink = false;
@@ -270,7 +299,7 @@ std::shared_ptr<const Linearisation> find_mean(NonlinearFit& fit, const Prior& p
     }
     const typename NonlinearFit::Point target = fit.mean();
     const double distance = std::sqrt(target.squared_distance(at) / (1 + target.squared_distance(fit.zero())));
-    if (distance <= enough) return linearisation;
+    if (distance <= enough) return found();
     // as far towards the optimum of the linear one as the nonlinear one gets better
     double t = 1;
     for (; t > 1e-10; t /= 2) {
@@ -289,13 +318,11 @@ std::shared_ptr<const Linearisation> find_mean(NonlinearFit& fit, const Prior& p
     if (t > 1e-10) continue;
     // rounding of the objective, or a kink, where a load changes its sign at an observed state: right to a fifth of a deviation
     constexpr double little = 0.02;  // nats
-    if (distance <= 1e-4 || std::abs(objective - fit.objective(target, *linearisation)) <= little) return linearisation;
+    if (distance <= 1e-4 || std::abs(objective - fit.objective(target, *linearisation)) <= little) return found();
     is_in_kink = true;
     break;
   }
-  Index n_values = 0;
-  for (const Observations& group : observations) n_values += group.values().size();
-  const double left = std::sqrt(2 * objective / static_cast<double>(n_values));
+  const double left = found().left;
   if (is_in_kink && left < 2) {
     throw NumericalError(
         fmt::format("the posterior of latents that enter nonlinearly was not found: Gauss–Newton steps explain the data, but for "
@@ -309,6 +336,38 @@ std::shared_ptr<const Linearisation> find_mean(NonlinearFit& fit, const Prior& p
       "force)? Else write the directions so "
       "that the coefficients are small, or start from smaller signal standard deviations",
       left));
+}
+
+// The posterior mean, that `fit` is conditioned at in the end. There may be several; steps from where no latent acts end at one that leaves
+// much of the data to noise where a load is far from that of known forces. Under more noise there are fewer, and the one of less noise lies
+// near that of more.
+template <typename NonlinearFit>
+std::shared_ptr<const Linearisation> find_mean(NonlinearFit& fit, const Prior& prior,
+                                               const std::vector<Observations>& observations, const ModelValues& values) {
+  constexpr double much = 1.5;
+  const auto steps = [&](const std::shared_ptr<const Linearisation>& from) {
+    return step_to_mean(fit, prior, observations, values, from);
+  };
+  std::optional<NonlinearMean> direct;
+  std::exception_ptr failure;
+  try {
+    direct = steps(nullptr);
+  } catch (const NumericalError&) {
+    failure = std::current_exception();
+  }
+  if (direct && direct->left <= much) return direct->about;
+  try {
+    NonlinearMean along;
+    for (const double more : {30, 10, 3, 1}) {
+      fit.scale_noise(more);
+      along = steps(along.about);
+    }
+    if (!direct || along.left < direct->left) return along.about;
+  } catch (const NumericalError&) {
+    fit.scale_noise(1);
+    if (!direct) std::rethrow_exception(failure);
+  }
+  return steps(direct->about).about;
 }
 
 }  // namespace

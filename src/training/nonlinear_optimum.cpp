@@ -20,16 +20,19 @@ FitReport trained_nonlinear(const Prior& prior, const std::vector<Observations>&
   once.n_draws = 0;
   once.standard_errors = false;
   const Workers workers = Evaluators(options, approximation.points != nullptr).alone;
-  // The linear prior about the posterior mean. What is found about another mean may have none itself: then one step back, half of the
-  // way to the last that had, and again.
+  // the linear prior about the posterior mean
+  const auto linearise_at_mean = [&](const std::vector<Hyperparameter>& at) {
+    ModelValues values = model_values(prior, observations, at);
+    values.inducing = approximation.points;
+    approximation.about = linearisation_of(prior, observations, values, workers);
+  };
+  // What is found about another mean may have none itself: then one step back, half of the way to the last that had, and again.
   std::vector<Hyperparameter> last_with_mean = hyperparameters;
   const auto linearise = [&](std::vector<Hyperparameter>& at) {
     constexpr int most_halvings = 6;
     for (int halvings = 0;; ++halvings) {
       try {
-        ModelValues values = model_values(prior, observations, at);
-        values.inducing = approximation.points;
-        approximation.about = linearisation_of(prior, observations, values, workers);
+        linearise_at_mean(at);
         last_with_mean = at;
         return halvings == 0;
       } catch (const NumericalError&) {
@@ -44,6 +47,14 @@ FitReport trained_nonlinear(const Prior& prior, const std::vector<Observations>&
   std::optional<FitReport> first, last;
   double objective = std::numeric_limits<double>::infinity();
   bool stands = options.max_iterations == 0;
+  // Where no latent acts the load is that of known forces. Beside it what presses on a constraint and what rubs there are found both wrong, and
+  // each holds the other so.
+  if (!approximation.about) {
+    try {
+      linearise_at_mean(hyperparameters);
+    } catch (const NumericalError&) {  // about no latent then
+    }
+  }
   for (int round = 0; round < most && !stands; ++round) {
     FitReport report = trained(prior, observations, hyperparameters, once, approximation);
     hyperparameters = report.hyperparameters;

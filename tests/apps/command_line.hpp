@@ -11,6 +11,7 @@
 #include <Eigen/Core>
 #include <nlohmann/json.hpp>
 
+#include "gp2/base/blas.hpp"
 #include "gp2/data/csv.hpp"
 #include "io_testing.hpp"
 
@@ -35,11 +36,13 @@ class Desk {
     }
   }
 
-  /// Runs a line of shell.
+  /// Runs a line of shell. Under the kernel of OpenBLAS that this process has: gp2 would choose a better one, which rounds differently.
   Outcome run(const std::string& line) const {
     const std::string path = std::filesystem::path(GP2_COMMAND).parent_path().string();
-    const std::string script =
-        "cd '" + folder_.path().string() + "' && PATH='" + path + "':$PATH && { " + line + "\n} >.stdout 2>.stderr </dev/null";
+    const std::string kernel = blas_report().kernel;
+    const std::string script = "cd '" + folder_.path().string() + "' && PATH='" + path + "':$PATH && " +
+                               (kernel.empty() ? "" : "export OPENBLAS_CORETYPE=${OPENBLAS_CORETYPE-" + kernel + "} && ") + "{ " +
+                               line + "\n} >.stdout 2>.stderr </dev/null";
     const int status = std::system(script.c_str());
     if (!WIFEXITED(status)) throw std::runtime_error("not ended by itself: " + line);
     return {WEXITSTATUS(status), read(".stdout"), read(".stderr")};

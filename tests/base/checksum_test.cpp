@@ -18,6 +18,11 @@ TEST(Checksum, DoesNotDependOnTheCuts) {
     in_two.add(std::string_view(text).substr(0, cut));
     in_two.add(std::string_view(text).substr(cut));
     EXPECT_EQ(in_two.text(), checksum(text)) << cut;
+    Checksum first, second;
+    first.add(std::string_view(text).substr(0, cut));
+    second.add(std::string_view(text).substr(cut));
+    first.append(second, text.size() - cut);
+    EXPECT_EQ(first.text(), checksum(text)) << cut;
   }
 }
 

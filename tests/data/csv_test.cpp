@@ -19,6 +19,7 @@
 #include "base/checksum.hpp"
 #include "gp2/error.hpp"
 #include "io_testing.hpp"
+#include "thread_ranks.hpp"
 
 namespace gp2 {
 namespace {
@@ -307,6 +308,102 @@ TEST(Csv, LinesThatLieAcrossBlocksOfAFileAreReadWhole) {
     EXPECT_EQ(table.n_rows(), 3001);
     EXPECT_EQ(table.text(), parsed.text());
     for (int row = 0; row < table.n_rows(); ++row) ASSERT_EQ(table.line(row), parsed.line(row));
+  }
+}
+
+// ---- long files, of which several read pieces
+
+// Lines of three columns, most of them of numbers alone, over three megabytes; one of `lines` after each so many.
+std::string long_log(const std::vector<std::string>& lines, int distance) {
+  std::mt19937 random(5);
+  std::uniform_real_distribution<double> number(-1e3, 1e3);
+  std::string log = "\xef\xbb\xbfx, \"y\",z\r\n";
+  for (int k = 0; log.size() < 3'300'000; ++k) {
+    log += k % 5 == 0 ? fmt::format("{},,{}\n", number(random), k)
+                      : fmt::format("{}, {} ,{:e}\r\n", number(random), k, number(random));
+    if (!lines.empty() && k % distance == distance - 1)
+      log += lines[static_cast<std::size_t>(k / distance) % lines.size()] + "\n";
+  }
+  return log;
+}
+
+// read(rank's workers) by each of some processes, for which threads stand
+template <typename Read>
+void read_by_ranks(int n_ranks, const Read& read) {
+  test::ThreadRanks::Meeting meeting(n_ranks);
+  std::vector<std::jthread> ranks;
+  for (int rank = 0; rank < n_ranks; ++rank) {
+    ranks.emplace_back([&, rank] { read(Workers(2, std::make_shared<test::ThreadRanks>(meeting, rank)), rank); });
+  }
+}
+
+TEST(CsvPieces, WhoeverReadsThemTheTableIsTheSame) {
+  const TemporaryFolder folder;
+  const std::vector<std::string> odd = {
+      "1,2,inf", "\"1\",\"a, b\"\"\",+3",           "", "   ", " ,\t, ", "1,2e999,3", "1,2,3 4", "nan,-0,1.",
+      "1,\r2,3", std::string(10'000, ' ') + "1,2,3"};
+  for (const int distance : {2, 997, 30'011, 1'000'000}) {
+    const std::string log = long_log(odd, distance) + (distance == 2 ? "1,2,3" : "");
+    const auto path = folder.write("log.csv", log);
+    const CsvTable expected = CsvTable::parse(log, path.string(), CsvTable::Keep::numbers);
+    const auto expect_table = [&](const Workers& workers, const std::string& by) {
+      const CsvTable table = CsvTable::read(path, CsvTable::Keep::numbers, workers);
+      ASSERT_EQ(table.n_rows(), expected.n_rows()) << by << ", one odd line of " << distance;
+      EXPECT_EQ(table.text(), expected.text()) << by << ", one odd line of " << distance;
+      for (int row = 0; row < table.n_rows(); ++row) ASSERT_EQ(table.line(row), expected.line(row)) << by << ", row " << row;
+      EXPECT_EQ(table.file()->checksum, checksum(log)) << by;
+      EXPECT_EQ(table.file()->bytes, log.size()) << by;
+      EXPECT_EQ(table.file()->rows, expected.n_rows()) << by;
+    };
+    for (const int n_threads : {1, 3}) expect_table(n_threads, fmt::format("{} threads", n_threads));
+    for (const int n_ranks : {2, 7}) {
+      read_by_ranks(n_ranks, [&](const Workers& workers, int rank) {
+        expect_table(workers, fmt::format("process {} of {}", rank, n_ranks));
+      });
+    }
+  }
+}
+
+TEST(CsvPieces, LinesMayBeLongerThanThem) {
+  const TemporaryFolder folder;
+  std::string log = "x,y\n1,2\n";
+  for (const int n : {1'100'000, 5, 3'000'000, 7}) log += "3," + std::string(static_cast<std::size_t>(n), '0') + "1\n";
+  const auto path = folder.write("log.csv", log);
+  const CsvTable table = CsvTable::read(path, CsvTable::Keep::numbers, 2);
+  ASSERT_EQ(table.n_rows(), 5);
+  for (int row = 1; row < 5; ++row) EXPECT_EQ(table.number(row, 1), 1);
+  EXPECT_EQ(table.file()->checksum, checksum(log));
+}
+
+TEST(CsvPieces, AnErrorIsThatOfTheFirstLineThatHasOne) {
+  const TemporaryFolder folder;
+  std::string log = long_log({}, 1);
+  const std::string error = "1,2\n";
+  for (const std::size_t place : {log.size() / 2, log.size() - 100}) log.insert(log.find('\n', place) + 1, error);
+  const auto path = folder.write("log.csv", log);
+  const std::string expected = input_error_of([&] { CsvTable::parse(log, path.string(), CsvTable::Keep::numbers); });
+  EXPECT_THAT(expected, HasSubstr("ragged row"));
+  EXPECT_EQ(input_error_of([&] { CsvTable::read(path, CsvTable::Keep::numbers, 2); }), expected);
+  read_by_ranks(3, [&](const Workers& workers, int) {
+    EXPECT_EQ(input_error_of([&] { CsvTable::read(path, CsvTable::Keep::numbers, workers); }), expected);
+  });
+}
+
+TEST(CsvPieces, ProcessesThatHaveDifferentFilesAreRefused) {
+  const TemporaryFolder folder;
+  std::string log = long_log({}, 1);
+  const auto path = folder.write("log.csv", log);
+  const std::size_t digit = log.find_first_of("123456789", log.size() - 1000);
+  log[digit] = log[digit] == '1' ? '2' : '1';
+  const auto one_digit = folder.write("one_digit.csv", log), longer = folder.write("longer.csv", log + "1,2,3\n"),
+             short_one = folder.write("short.csv", "x,y,z\n1,2,3\n");
+  for (const auto& other : {one_digit, longer, short_one}) {
+    read_by_ranks(3, [&](const Workers& workers, int rank) {
+      // the last of three reads the last pieces, where the digit is
+      const std::string error =
+          input_error_of([&] { CsvTable::read(rank == 2 ? other : path, CsvTable::Keep::numbers, workers); });
+      EXPECT_THAT(error, HasSubstr("the processes of mpirun have read different data")) << other << " " << rank;
+    });
   }
 }
 

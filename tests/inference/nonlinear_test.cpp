@@ -725,6 +725,64 @@ TEST(NonlinearFit, FindsACoefficientThatKnownMultipliersGetWrong) {
   EXPECT_LT(of_own, 0.2 * error(known).first);
 }
 
+// Known forces tell little of the load: about it a fit takes friction for a force that changes from place to place, and at good hyperparameters
+// Gauss–Newton steps end far from the data.
+TEST(NonlinearFit, FindsALoadAndTheCoefficientOfItsFriction) {
+  const Model model = Model::parse(R"toml(
+name        = "bead on a wire, with a magnet below"
+coordinates = ["x", "z"]
+inputs      = ["push"]
+[parameters]
+m = 0.2
+h = 0.5
+[let]
+v    = "sqrt(dx^2 + dz^2 + 1e-4)"
+load = "sqrt(lambda(1)^2*(1 + 4*h^2*x^2) + 0.01)"
+mu   = "0.15 + 0.25*exp(-(v/0.4)^2)"
+[mechanics]
+mass  = [["m", "0"], ["0", "m"]]
+force = ["push", "-9.81*m"]
+[constraints]
+position = ["z - h*x^2"]
+[[latent]]
+name       = "magnet"
+kernel     = "constant + matern52"
+features   = ["x"]
+directions = { force = [["0"], ["1"]] }
+[[latent]]
+name       = "coefficient"
+kernel     = "constant + matern32"
+features   = ["exp(-v/0.3)"]
+directions = { force = [["-load*dx/v"], ["-load*dz/v"]] }
+[noise]
+ddq = 0.05
+[truth]
+force = ["-mu*load*dx/v", "-6*sin(2*x) - mu*load*dz/v"]
+[sampling]
+x    = [-0.8, 0.8]
+dx   = [-1.5, 1.5]
+push = [-1, 1]
+)toml",
+                                   "magnet");
+  PriorOptions prior_options;
+  prior_options.mean = Prior::Mean::force;
+  const Prior prior = make_prior(model, prior_options);
+  const View view = View::constrained_acceleration(*model.system);
+  for (const std::uint64_t seed : {15U, 17U, 18U, 19U, 25U, 26U}) {
+    const MatrixXd states = test::draw(model, 60, seed).states, elsewhere = test::draw(model, 200, seed + 1000).states;
+    MatrixXd y = ModelMotion(model).acceleration(states);
+    RandomStream random(seed);
+    for (double& one : y.reshaped()) one += 0.05 * random.normal();
+    const std::vector<Observations> observations{{states, view, y, VectorXd::Constant(2, 0.05)}};
+    FitOptions options;
+    options.standard_errors = false;
+    const Fit found = fit(prior, observations, default_hyperparameters(prior, observations, {}, Protocol()), options);
+    EXPECT_NE(found.report.termination, FitReport::unsettled) << "seed " << seed;
+    const MatrixXd error = found.posterior.mean(view, elsewhere) - ModelMotion(model).acceleration(elsewhere);
+    EXPECT_LT(std::sqrt(error.array().square().mean()), 0.05) << "seed " << seed;
+  }
+}
+
 // What is found where no latent acts may have no posterior mean.
 TEST(NonlinearFit, GoesOnFromWhereThereIsAPosteriorMean) {
   const Model model = Model::parse(R"toml(

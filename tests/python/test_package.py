@@ -16,7 +16,7 @@ def test_every_file_of_the_package_is_there():
     wanted = {path.name for path in source.iterdir() if path.suffix in {".py", ".pyi"} or path.name == "py.typed"}
     assert wanted >= {"__init__.py", "_gp2.pyi", "py.typed", "sklearn.py"}
     assert wanted <= {path.name for path in PACKAGE.iterdir()}
-    for name in wanted:
+    for name in wanted - {"_gp2.pyi"}:  # which has docstrings there
         assert (PACKAGE / name).read_bytes() == (source / name).read_bytes(), f"{name} is not the checkout's: build again"
 
 

@@ -1,6 +1,7 @@
 """The types that editors and mypy read are those of the module."""
 
 import ast
+import functools
 import inspect
 import re
 import subprocess
@@ -53,6 +54,24 @@ def test_every_public_name_is_in_the_stub():
         inherited = public(dir(getattr(_gp2, name).__base__))
         members = {member.name for member in node.body if isinstance(member, ast.FunctionDef)}
         assert public(members) == public(dir(getattr(_gp2, name))) - inherited, name
+
+
+def test_editors_read_in_the_stub_what_help_tells():
+    told = {}
+    for node in ast.walk(STUB):
+        if isinstance(node, ast.ClassDef):
+            told[node.name] = ast.get_docstring(node)
+            for member in node.body:
+                if isinstance(member, ast.FunctionDef):
+                    told.setdefault(f"{node.name}.{member.name}", ast.get_docstring(member))
+    told |= {node.name: ast.get_docstring(node) for node in reversed(STUB.body) if isinstance(node, ast.FunctionDef)}
+    named = [name for name in told if not re.search(r"(^|\.)_", name)]
+    assert not [name for name in named if not told[name]]
+    for name in named:
+        lines = [line.strip() for line in told[name].splitlines()]
+        help_of = functools.reduce(getattr, name.split("."), _gp2).__doc__
+        assert all(line in help_of for line in lines), name
+        assert not any(re.match(r"\w+\(.*\) ->", line) for line in lines), name
 
 
 # ---------------------------------------------------------------- parameters

@@ -4,6 +4,7 @@
 #include <cstdint>
 #include <filesystem>
 #include <functional>
+#include <memory>
 #include <optional>
 #include <string>
 #include <string_view>
@@ -55,6 +56,29 @@ struct FileVersion {
 
 /// Nothing of a pipe or device, which is read once, nor where there is no such file.
 std::optional<FileVersion> file_version(const std::filesystem::path& path);
+
+class OpenFile;
+
+/// A file, no pipe or device, of which several threads may read parts at once.
+class FileParts {
+ public:
+  /// @throws InputError as read_file.
+  explicit FileParts(std::filesystem::path path);
+  ~FileParts();
+  FileParts(const FileParts&) = delete;
+  FileParts& operator=(const FileParts&) = delete;
+
+  [[nodiscard]] std::uint64_t size() const { return version_.size; }
+  /// Fewer than n bytes at the end of the file. @throws InputError when it cannot be read.
+  [[nodiscard]] std::string read(std::uint64_t first, std::size_t n) const;
+  /// @throws InputError when the file has changed since it was opened.
+  void require_unchanged() const;
+
+ private:
+  std::filesystem::path path_;
+  std::unique_ptr<const OpenFile> file_;
+  FileVersion version_;
+};
 
 /// @throws InputError that the file is another one than when it was read first.
 [[noreturn]] void throw_changed(const std::filesystem::path& path);

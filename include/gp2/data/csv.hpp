@@ -11,6 +11,7 @@
 #include <vector>
 
 #include "gp2/base/file.hpp"
+#include "gp2/base/workers.hpp"
 #include "gp2/export.hpp"
 
 namespace gp2 GP2_API {
@@ -49,9 +50,10 @@ class CsvTable {
 
   CsvTable();
 
+  /// @param workers  share out the pieces of a long file of numbers, each process gets the whole table; 0: all threads of the machine
   /// @throws InputError naming file and line: unreadable or empty file, no data rows, ragged row, too many columns, a column
-  ///   name that is empty, repeated or too long.
-  static CsvTable read(const std::filesystem::path& path, Keep keep = Keep::text);
+  ///   name that is empty, repeated or too long; processes that have different files.
+  static CsvTable read(const std::filesystem::path& path, Keep keep = Keep::text, const Workers& workers = 0);
   /// @param name  stands for the file in messages
   static CsvTable parse(std::string_view text, std::string name, Keep keep = Keep::text);
   /// From cells, row after row; a row's place in messages is the line it would have in a file.
@@ -96,6 +98,7 @@ class CsvTable {
  private:
   struct Content;
   class Builder;
+  static CsvTable read_pieces(const std::filesystem::path& path, const Workers& workers);
   void print(CsvWriter& csv) const;
   explicit CsvTable(std::shared_ptr<const Content> content);
 
