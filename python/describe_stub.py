@@ -8,12 +8,12 @@ import sys
 from pathlib import Path
 
 
-def text_of(member):
-    """The docstring without the signatures that pybind11 writes before it."""
+def text_of(member, name):
+    """The docstring without the signatures before it, which are those of the stub."""
     text = inspect.cleandoc(getattr(member, "__doc__", None) or "")
     if inspect.isroutine(member):
         text = re.sub(r"\A\w+\(\*args, \*\*kwargs\)\nOverloaded function\.\n+", "", text)
-        text = re.sub(r"^(\d+\. )?\w+\(.*\) -> .*\n*", "", text, flags=re.MULTILINE)
+        text = re.sub(rf"^(\d+\. )?{name}\(.*\)( -> .*)?$\n*", "", text, flags=re.MULTILINE)
     return text.strip()
 
 
@@ -27,7 +27,7 @@ def described(stub, module):
         if member is None or (id(owner), node.name) in seen:
             return
         seen.add((id(owner), node.name))
-        if text := text_of(member):
+        if text := text_of(member, node.name):
             insertions.append((node, text))
         if isinstance(node, ast.ClassDef):
             visit_all(node.body, member)
