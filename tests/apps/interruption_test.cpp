@@ -1,5 +1,6 @@
 #include <array>
 #include <chrono>
+#include <cmath>
 #include <csignal>
 #include <fstream>
 #include <functional>
@@ -140,7 +141,8 @@ TEST(Killed, AFitLeavesItsCheckpointWhichAnotherGoesOnFrom) {
   desk.done(
       "gp2 fit models/surface.toml --data train.csv --restarts 1 --hyperparameters optimise --start last.json "
       "--checkpoint last.json -o last.json");
-  EXPECT_LE(FitFile::read(desk / "last.json").report.objective, saved.report.objective);
+  // the one that was killed may have had another kernel of OpenBLAS, see Desk::run
+  EXPECT_LE(FitFile::read(desk / "last.json").report.objective, saved.report.objective + 1e-9 * std::abs(saved.report.objective));
 }
 
 TEST(InterruptedTwice, AFitSaysWhereItsCheckpointIs) {
