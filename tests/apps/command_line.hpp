@@ -31,18 +31,18 @@ struct Outcome {
 class Desk {
  public:
   Desk() {
+    // commands have the kernel of OpenBLAS that this process has: gp2 would choose a better one, which rounds differently
+    if (const std::string kernel = blas_report().kernel; !kernel.empty()) setenv("OPENBLAS_CORETYPE", kernel.c_str(), 0);
     for (const char* name : {"models", "experiments"}) {
       std::filesystem::create_directory_symlink(std::filesystem::path(GP2_SOURCE_DIR) / name, folder_ / name);
     }
   }
 
-  /// Runs a line of shell. Under the kernel of OpenBLAS that this process has: gp2 would choose a better one, which rounds differently.
+  /// Runs a line of shell.
   Outcome run(const std::string& line) const {
     const std::string path = std::filesystem::path(GP2_COMMAND).parent_path().string();
-    const std::string kernel = blas_report().kernel;
-    const std::string script = "cd '" + folder_.path().string() + "' && PATH='" + path + "':$PATH && " +
-                               (kernel.empty() ? "" : "export OPENBLAS_CORETYPE=${OPENBLAS_CORETYPE-" + kernel + "} && ") + "{ " +
-                               line + "\n} >.stdout 2>.stderr </dev/null";
+    const std::string script =
+        "cd '" + folder_.path().string() + "' && PATH='" + path + "':$PATH && { " + line + "\n} >.stdout 2>.stderr </dev/null";
     const int status = std::system(script.c_str());
     if (!WIFEXITED(status)) throw std::runtime_error("not ended by itself: " + line);
     return {WEXITSTATUS(status), read(".stdout"), read(".stderr")};

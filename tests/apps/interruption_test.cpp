@@ -1,6 +1,5 @@
 #include <array>
 #include <chrono>
-#include <cmath>
 #include <csignal>
 #include <fstream>
 #include <functional>
@@ -141,8 +140,7 @@ TEST(Killed, AFitLeavesItsCheckpointWhichAnotherGoesOnFrom) {
   desk.done(
       "gp2 fit models/surface.toml --data train.csv --restarts 1 --hyperparameters optimise --start last.json "
       "--checkpoint last.json -o last.json");
-  // the one that was killed may have had another kernel of OpenBLAS, see Desk::run
-  EXPECT_LE(FitFile::read(desk / "last.json").report.objective, saved.report.objective + 1e-9 * std::abs(saved.report.objective));
+  EXPECT_LE(FitFile::read(desk / "last.json").report.objective, saved.report.objective);
 }
 
 TEST(InterruptedTwice, AFitSaysWhereItsCheckpointIs) {
