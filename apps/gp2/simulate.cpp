@@ -103,7 +103,7 @@ const char* word_of(ContactEvent::Kind kind) {
   return kind == ContactEvent::Kind::impact ? "impact" : kind == ContactEvent::Kind::made ? "made" : "released";
 }
 
-// "contacts: 12 impacts, made 1, released 0 times, the first at t = 0.45; the impacts took 3.2 J"
+// "contacts: 12 rebounds, made 1 and released 0 times, the first at t = 0.45; the impacts took 3.2 J"
 std::optional<std::string> contacts_note(const Trajectory& motion, const System& system) {
   if (motion.events.empty()) return std::nullopt;
   const auto count = [&](ContactEvent::Kind kind) {
@@ -123,7 +123,7 @@ std::optional<std::string> contacts_note(const Trajectory& motion, const System&
                               : "Newton's restitution does where friction turns the slip: a smaller restitution gives none")
           : "";
   return fmt::format(
-      "contacts: {} impacts, made {} and released {} times, the first event at t = {:.6g}, the last, {}, at {:.6g}; "
+      "contacts: {} rebounds, made {} and released {} times, the first event at t = {:.6g}, the last, {}, at {:.6g}; "
       "impacts took {:.6g} J{}",
       count(ContactEvent::Kind::impact), count(ContactEvent::Kind::made), count(ContactEvent::Kind::released),
       motion.events.front().time, word_of(last.kind), last.time, loss, gain);

@@ -192,6 +192,9 @@ class UnfinishedMotion : public NumericalError {
 /// time: where several close or open together, those that would pull are let go one after the other, which is not the
 /// complementarity problem of many contacts.
 ///
+/// A constraint with a condition comes or goes at the end of a step, where the condition turns, found on the dense output at eight
+/// places of a step and at the written times.
+///
 /// @param parameters  of the system's constraints and mass matrix (system.parameters().size())
 /// @param start       [q; dq; …] (layout size), t and u are set from the options. Off the constraint it is projected, or taken as
 ///                    it is without `project`; the trajectory reports both.
@@ -216,9 +219,9 @@ struct StartingPoint {
 
 /// The state at which a motion starts: coordinates and velocities that are not given follow from the constraints, the given ones
 /// held; Newton's method starts for them at the model's newton_start, or at what `start` has, and where coordinates alone are given
-/// and constraints have no slope there, beside it. Where what is given leaves no solution the start stays as it is, for simulate() to
-/// project or not.
-/// @param notes  what was solved for, or why not, is added
+/// and constraints have no slope there, beside it. Where what is given leaves no solution it stays as it is, for simulate() to
+/// project or not; what is not given follows at the nearest coordinates that have one, with the given velocities held if they allow it.
+/// @param notes  what was solved for, or why not and what is nearest, is added
 Eigen::VectorXd complete_start(const Model& model, const Eigen::VectorXd& parameters, StartingPoint start,
                                std::vector<std::string>& notes);
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
 from sklearn.utils import check_random_state
-from sklearn.utils.validation import check_is_fitted
+from sklearn.utils.validation import check_array, check_is_fitted
 
 import gp2
 
@@ -29,10 +29,11 @@ except ImportError:  # scikit-learn before 1.6
 class GP2Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     """Learn accelerations ddq = f(q, dq, t, u) that obey the constraints of a mechanical system (Geist & Trimpe 2020).
 
-    X holds states. An array has the columns of `system.state_names`: q, dq, t, u. A pandas frame has columns by these names, in
-    any order; one that the system does not read may be missing. y holds measured accelerations: an array with the columns of
+    X holds states. An array has the columns of `system.state_names`: q, dq, t, u. A frame has columns by these names, in any
+    order; one that the system does not read may be missing. `fit` and `predict` each take either, whatever the other was given;
+    a frame whose columns have no names is an array. y holds measured accelerations: an array with the columns of
     `system.acceleration_names` or of `observe`, (n,) where it is one, or a frame by name, whose columns are what is observed.
-    Predictions have the shape and the columns of y.
+    Predictions have the shape and the columns of y. Without a system the columns of X are those of `fit`, as in scikit-learn.
 
     Parameters
     ----------
@@ -54,7 +55,7 @@ class GP2Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     system_ : gp2.System
     outputs_ : names of the columns of y
     log_marginal_likelihood_value_ : log p(y) at the fitted values, without hyper-prior
-    n_features_in_, feature_names_in_ : as scikit-learn has them
+    n_features_in_, feature_names_in_ : number and names of the columns that `fit` was given, as scikit-learn has them
 
     Where it differs from sklearn.gaussian_process.GaussianProcessRegressor: y (n, 1) is predicted as (n, 1), not (n,); before
     fit, predict raises NotFittedError; samples of several outputs belong together, so that each obeys the constraint;
@@ -101,6 +102,7 @@ class GP2Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if system is not None:
             outputs = self._outputs(system, y)
             y = _columns_by_name(y, outputs)
+        given = None if system is None else _column_names("X", X)  # before it becomes an array
         X, y = validate_data(self, _without_mask(X), _without_mask(y), dtype=np.float64, multi_output=True, y_numeric=True, ensure_min_samples=2)
         rows = y.reshape(len(y), -1).astype(np.float64)
         if system is not None:
@@ -108,7 +110,7 @@ class GP2Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self.system_ = _system_without_mechanics(X.shape[1], rows) if system is None else system
         self.outputs_ = self.system_.acceleration_names if system is None else outputs
         self._is_flat = y.ndim == 1
-        self._columns = self._columns_in_state(X)
+        states = self._states(X, given)
         if rows.shape[1] != len(self.outputs_):
             raise gp2.InputError(f"y: expected columns {', '.join(self.outputs_)}; got shape {y.shape}")
 
@@ -132,7 +134,7 @@ class GP2Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         for name in sorted(others.keys() & (options.keys() | self.get_params().keys() | {"data"})):
             raise gp2.InputError(f"fit_options: '{name}' is an argument of GP2Regressor itself")
         try:
-            self.posterior_ = gp2.fit(self.system_, (self._states(X), accelerations), **options, **others)
+            self.posterior_ = gp2.fit(self.system_, (states, accelerations), **options, **others)
         except (gp2.InputError, TypeError) as error:
             raise type(error)(re.sub("^(restarts|threads):", r"n_\1:", str(error))) from None
         self.log_marginal_likelihood_value_ = -self.posterior_.negative_log_likelihood
@@ -181,35 +183,37 @@ class GP2Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if self.observe is not None:
             what, outputs = "observe", [self.observe] if isinstance(self.observe, str) else list(self.observe)
         else:
-            what, outputs = "y", list(y.columns) if hasattr(y, "columns") else names
+            what, outputs = "y", _column_names("y", y) or names
+        _refuse_twice(what, [str(name) for name in outputs])
         unknown = [str(name) for name in outputs if name not in names]
-        twice = sorted({str(name) for name in outputs if outputs.count(name) > 1})
-        if twice:
-            raise gp2.InputError(f"{what}: {', '.join(twice)}: given twice")
         if unknown:
             raise gp2.InputError(f"{what}: {', '.join(unknown)}: no acceleration of '{system.name}': {', '.join(names)}")
         return outputs
 
-    def _columns_in_state(self, X: np.ndarray) -> list[int]:
+    def _columns_in_state(self, X: np.ndarray, given: list[str] | None) -> list[int]:
         names = self.system_.state_names
         if self.system is None:
             return [names.index(name) for name in self.system_.inputs]
-        given = getattr(self, "feature_names_in_", names)
-        unknown = [name for name in given if name not in names]
+        unknown = [name for name in given or [] if name not in names]
         if unknown:
             raise gp2.InputError(f"X: {', '.join(unknown)}: no part of a state of '{self.system_.name}': {', '.join(names)}")
-        if X.shape[1] != len(given):
+        if given is None and X.shape[1] != len(names):
             raise gp2.InputError(f"X: expected {len(names)} columns, {', '.join(names)}; got {X.shape[1]} feature(s)")
-        return [names.index(name) for name in given]
+        return [names.index(name) for name in given or names]
 
-    def _states(self, X: np.ndarray) -> np.ndarray:
+    def _states(self, X: np.ndarray, given: list[str] | None) -> np.ndarray:
+        """States from X with columns of the names `given`, or, where there are none, of all states in order."""
         states = np.full((len(X), len(self.system_.state_names)), np.nan)
-        states[:, self._columns] = X
+        states[:, self._columns_in_state(X, given)] = X
         return states
 
     def _checked_states(self, X) -> np.ndarray:
         check_is_fitted(self)
-        return self._states(validate_data(self, _without_mask(X), dtype=np.float64, reset=False))
+        if self.system is None:
+            return self._states(validate_data(self, _without_mask(X), dtype=np.float64, reset=False), None)
+        # scikit-learn would compare number and order of the columns with those of fit, but the system says what they are
+        given = _column_names("X", X)
+        return self._states(check_array(_without_mask(X), dtype=np.float64, estimator=self, input_name="X"), given)
 
     def _rows_of_view(self) -> list[int]:
         return [self.system_.acceleration_names.index(name) for name in self.outputs_]
@@ -254,12 +258,29 @@ def _without_mask(values):
     return values.astype(np.float64).filled(np.nan) if np.ma.isMaskedArray(values) else values
 
 
+def _column_names(what: str, table) -> list[str] | None:
+    """The names of a frame's columns; None where they are but numbers, or it is no frame."""
+    names = list(getattr(table, "columns", []))
+    if not any(isinstance(name, str) for name in names):
+        return None
+    names = [str(name) for name in names]
+    _refuse_twice(what, names)
+    return names
+
+
+def _refuse_twice(what: str, names: list[str]) -> None:
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise gp2.InputError(f"{what}: {', '.join(twice)}: given twice")
+
+
 def _columns_by_name(y, names: list[str]):
-    if not hasattr(y, "columns"):
+    given = _column_names("y", y)
+    if given is None:
         return y
-    missing = [name for name in names if name not in y.columns]
+    missing = [name for name in names if name not in given]
     if missing:
-        raise gp2.InputError(f"y: no column {', '.join(missing)}; it has: {', '.join(map(str, y.columns))}")
+        raise gp2.InputError(f"y: no column {', '.join(missing)}; it has: {', '.join(given)}")
     return y[names]
 
 

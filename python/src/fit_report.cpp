@@ -1,10 +1,9 @@
-#include <cmath>
-
 #include <fmt/format.h>
 #include <pybind11/stl.h>
 
 #include "arrays.hpp"
 #include "bindings.hpp"
+#include "gp2/jobs/show_job.hpp"
 #include "gp2/training/laplace.hpp"
 
 namespace gp2::python {
@@ -78,19 +77,10 @@ double value_of(const FitReport& self, const std::string& name) {
   throw py::key_error(name);
 }
 
+// As `gp2 fit` prints it, but for the model's units, which a report does not hold.
 std::string text_of(const FitReport& self) {
-  std::string text = fmt::format("negative log likelihood {:.6f}\n{} after {} iterations ({} restarts, best: {}), {:.2f} s",
-                                 self.negative_log_likelihood, self.termination, self.iterations, self.restarts.size(),
-                                 self.best_restart + 1, self.seconds);
-  for (std::size_t k = 0; k < self.hyperparameters.size(); ++k) {
-    const Hyperparameter& h = self.hyperparameters[k];
-    const double stddev = h.is_system_parameter() ? parameter_uncertainty(self, k).stddev : std::nan("");
-    const std::string error = std::isnan(stddev) ? "" : fmt::format(" ± {:.2g}", stddev);
-    text += fmt::format("\n  {:<34} {:>13.6g}{}   [{:.3g}, {:.3g}]{}", h.name, h.value, error, h.lower, h.upper,
-                        h.is_fixed()   ? "   held"
-                        : h.at_bound() ? "   at its bound"
-                                       : "");
-  }
+  std::string text = gp2::text_of(self, Model{});
+  text.pop_back();  // the end of the last line
   return text;
 }
 

@@ -186,8 +186,9 @@ Inputs inverse_dynamics_of(const PyPosterior& self, const py::object& data, cons
   }
   wanted.view.other_system = at.other_system;
   const Posterior posterior = self.posterior;
-  const py::gil_scoped_release release;
-  return {inverse_dynamics(posterior, wanted.view, wanted.states, wanted.accelerations), there.inputs()};
+  InverseDynamics found = unlocked([&] { return inverse_dynamics(posterior, wanted.view, wanted.states, wanted.accelerations); });
+  if (const auto note = note_of_open_inputs(found, *at.model, "states")) tell({*note});
+  return {std::move(found), there.inputs()};
 }
 
 void add_inputs(py::module_& module) {
@@ -267,15 +268,17 @@ void update_with(PyPosterior& self, const py::object& data, const std::vector<st
   tell(std::exchange(notes, {}));
   const std::optional<Posterior> kept = kept_by_others(self);
   if (!share && !window) {
-    self.posterior = with_more(std::move(self.posterior), std::move(more), log, notes);
+    self.posterior = with_more(std::move(self.posterior), self.file, std::move(more), log, notes);
     tell(notes);
     return;
   }
   // a step that is refused undoes those before it
   Posterior next = self.posterior;
+  FitFile file = self.file;
   if (share) next = forget(std::move(next), *share);
-  next = with_more(std::move(next), std::move(more), log, notes);
+  next = with_more(std::move(next), file, std::move(more), log, notes);
   keep_newest(next, request);
+  self.file = std::move(file);
   self.posterior = std::move(next);
   tell(notes);
 }
@@ -475,7 +478,7 @@ outputs        which they are; default: all
 system         another System with the same coordinates, inputs and latents
 
 Returns Inputs. Where no inputs produce the accelerations it is those that come nearest, in the sense of Gauss' principle; where several
-inputs do the same, the least change of them. Where an input turns around what it does its deviation is immense or NaN.
+inputs do the same, or one does nothing, the least change of them, and a note names these inputs. Where an input turns around what it does its deviation is immense or NaN.
 Raises NumericalError where none are found.)");
 }
 

@@ -202,6 +202,14 @@ struct InverseDynamicsSolver::Workspace::Implementation {
     return Status::not_found;
   }
 
+  // Which inputs the null space of J reaches: row k of 1 − J⁺J is not 0. About a turn there is none to tell.
+  [[nodiscard]] Eigen::Array<bool, Eigen::Dynamic, 1> open_inputs() const {
+    constexpr double none = 1e-6;  // of 1, the diagonal entry of a projection, where the rank has been decided
+    const Index nu = solver->nu();
+    if (inverse.rank == nu) return Eigen::Array<bool, Eigen::Dynamic, 1>::Constant(nu, false);
+    return 1 - J_inverse.cwiseProduct(jacobian.rightCols(nu).transpose()).rowwise().sum().array() > none;
+  }
+
   // J⁺ Σ J⁺ᵀ, where Σ is the view's
   void write_covariance(const Ref<const MatrixXd>& of_view, Ref<MatrixXd> of_inputs) {
     weighted_covariance.noalias() = J_inverse.lazyProduct(of_view);
@@ -359,7 +367,8 @@ InverseDynamics inverse_dynamics(const Posterior& posterior, const View& view, c
   found.bottomRows(nu) = states.bottomRows(nu).array().isNaN().select(0, states.bottomRows(nu));
   static_cast<void>(posterior.mean(view, found));  // names a state without a prediction
 
-  InverseDynamics out{MatrixXd(nu, n), MatrixXd(nu * nu, n), MatrixXd(d, n)};
+  InverseDynamics out{MatrixXd(nu, n), MatrixXd(nu * nu, n), MatrixXd(d, n), {}};
+  out.open.resize(nu, n);
   std::vector<MatrixXd> inverses;
   InverseDynamicsSolver::Workspace::Implementation search(std::make_shared<const InverseDynamicsSolver::Implementation>(
       posterior, view, InverseDynamicsSolver::Options{.covariance = false}));
@@ -377,6 +386,7 @@ InverseDynamics inverse_dynamics(const Posterior& posterior, const View& view, c
     }
     found.col(i) = search.state;
     out.missed.col(i) = search.missed;
+    out.open.col(i) = search.open_inputs();
     inverses.push_back(search.J_inverse);
   }
   out.inputs = found.bottomRows(nu);

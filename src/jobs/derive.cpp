@@ -39,6 +39,56 @@ void release(std::vector<T>& values) {
   values = std::vector<T>();
 }
 
+/// How samples of one time differ, beside how fast the motion passes there: d = δ q̇ + noise. Two measurements of one time have δ = 0;
+/// a clock that is coarser than the samples gives one time to samples that are δ apart.
+struct SameTimes {
+  double n_pairs = 0, n_times = 0, d_d = 0, d_rate = 0, rate_rate = 0;
+
+  SameTimes& operator+=(const SameTimes& more) {
+    n_pairs += more.n_pairs, n_times += more.n_times;
+    d_d += more.d_d, d_rate += more.d_rate, rate_rate += more.rate_rate;
+    return *this;
+  }
+  [[nodiscard]] double delay() const { return rate_rate > 0 ? d_rate / rate_rate : 0; }
+  /// Whether δ is certain, at times that are not few, and makes more of the differences than noise does.
+  [[nodiscard]] bool tell_of_a_coarse_clock() const {
+    constexpr double least_pairs = 20, share = 0.1, certain = 6, much = 2;
+    if (n_pairs < least_pairs || n_pairs < share * n_times || !(delay() > 0)) return false;
+    const double noise = std::max(0.0, d_d - delay() * d_rate) / n_pairs;  // variance of a difference
+    return d_rate * d_rate > certain * certain * noise * rate_rate && delay() * d_rate / n_pairs > much * much * noise / 2;
+  }
+};
+
+/// @param used  in order of time, and at one time in that of the log
+SameTimes same_times_of(const std::vector<Measurement>& used) {
+  struct Instant {
+    double time = 0, sum = 0, n = 0;
+    [[nodiscard]] double mean() const { return sum / n; }
+  };
+  std::vector<Instant> instants;
+  for (const Measurement& one : used) {
+    if (one.velocity) continue;
+    if (instants.empty() || one.time > instants.back().time) instants.push_back({one.time, 0, 0});
+    instants.back().sum += one.value, ++instants.back().n;
+  }
+  SameTimes out;
+  out.n_times = static_cast<double>(instants.size());
+  const Measurement* before = nullptr;
+  std::size_t at = 0;
+  for (const Measurement& one : used) {
+    if (one.velocity) continue;
+    while (instants[at].time < one.time) ++at;
+    if (before && before->time == one.time && at > 0 && at + 1 < instants.size()) {
+      // from the times beside, whose noise is not that of the difference
+      const double rate = (instants[at + 1].mean() - instants[at - 1].mean()) / (instants[at + 1].time - instants[at - 1].time);
+      const double d = one.value - before->value;
+      ++out.n_pairs, out.d_d += d * d, out.d_rate += d * rate, out.rate_rate += rate * rate;
+    }
+    before = &one;
+  }
+  return out;
+}
+
 /// A coordinate of one episode: its report, and its motion at the times that are written.
 struct Task {
   int coordinate = 0, episode = 0;
@@ -46,6 +96,7 @@ struct Task {
   SmootherFit fit;
   SmootherModel model;  // of the positions about their mean
   double kurtosis = 0;
+  SameTimes same_times;
   Eigen::Matrix3Xd course;                  // the learned motion that the fit is about; empty: the mean
   double gain = 0;                          // by it, in log likelihood
   std::vector<Eigen::Matrix3d> covariance;  // of the motion smoothed without it
@@ -161,6 +212,7 @@ class Deriver {
       task.fit = fit_smoother(task.channel.measurements, own);
       task.model = task.fit.model;
       task.kurtosis = task.fit.kurtosis;
+      task.same_times = same_times_of(task.fit.trusted);
       if (learned_ && !is_short(task)) take_learned(task, own);
       release(task.channel.measurements);  // a long log is told once
       tell_progress();
@@ -197,7 +249,29 @@ class Deriver {
       release(task.fit.trusted);
       tell_progress();
     });
-    warn_of_fast_motions();
+    if (!warn_of_a_coarse_clock()) warn_of_fast_motions();
+  }
+
+  // whether there is one; samples of one time that lie apart by the motion's speed are no noise
+  bool warn_of_a_coarse_clock() {
+    std::vector<std::string> moved;
+    SameTimes largest;
+    for (const int j : data_.measured) {
+      SameTimes all;
+      for (const Task& task : tasks_) {
+        if (task.coordinate == j) all += task.same_times;
+      }
+      if (!all.tell_of_a_coarse_clock()) continue;
+      moved.push_back(name_of(j));
+      if (all.n_pairs > largest.n_pairs) largest = all;
+    }
+    if (moved.empty()) return false;
+    data_.notes.push_back(
+        fmt::format("warning: {}: the clock is coarser than the samples: {:.0f} samples have the time of the one before, and {} "
+                    "moved on between, by about {:.2g} s; log times as exactly as positions, or where samples are evenly spaced "
+                    "give an evenly spaced t",
+                    log_.name(), largest.n_pairs, fmt::join(moved, ", "), largest.delay()));
+    return true;
   }
 
   /// The positions that are trusted, from what they are about a course and a mean.
@@ -437,7 +511,8 @@ class Deriver {
     const int redundancy = redundancy_of(states, started(0, start));
     std::vector<std::string> completed;
     for (const int j : data_.completed) completed.push_back(name_of(j));
-    note_redundancy(redundancy, completed);
+    note_redundancy(redundancy, completed,
+                    redundancy > 0 ? contradiction(misfits(states, start), system_.state_names()) : std::nullopt);
     const bool conditioned = options_.hold_constraints && redundancy > 0;
     parallel_for(static_cast<int>(episodes_.size()), thread_count(options_.n_threads),
                  [&](int e, int) { put_episode_together(states, e, conditioned, start); });
@@ -468,28 +543,125 @@ class Deriver {
     return state;
   }
 
+  /// What the measured coordinates of an episode are off the constraints among them, in the median over its rows.
+  struct Misfit {
+    double size = 0;  // standard deviations
+    VectorXd move;    // to where they meet them, as that of ConstrainedStates::Contradiction (2 nq)
+    VectorXd stddev;  // usual, of the same
+    int n_constraints = 0;
+
+    /// Beyond what noise does that is twice what was found, and motions that are smoothed a little too much.
+    [[nodiscard]] bool is_clear() const {
+      constexpr double deviations = 4;
+      return size > deviations;
+    }
+  };
+
+  /// @param stddev  of q, dq (2 nq × N)
+  [[nodiscard]] Misfit misfit_of(const ConstrainedStates& states, int e, const VectorXd& start, const MatrixXd& stddev) const {
+    const Index first = first_row_[static_cast<std::size_t>(e)], n = last_row(e) - first;
+    constexpr Index most_looked_at = 500;
+    const Index step = std::max<Index>(1, n / most_looked_at);
+    int n_constraints = 0;
+    std::vector<double> sizes;
+    std::vector<std::vector<double>> moves(static_cast<std::size_t>(stddev.rows()));
+    VectorXd from = start;
+    for (Index i = 0; i < n; ++i) {
+      // what is solved for starts at its predecessor
+      const bool looked_at = i % step == 0;
+      if (!looked_at && data_.completed.empty()) continue;
+      VectorXd state = started(first + i, from), acceleration = data_.accelerations.col(first + i);
+      states.approach(state, acceleration);
+      from = state.head(2 * Index{system_.nq()});
+      if (!looked_at) continue;
+      const ConstrainedStates::Contradiction here = states.contradiction(state, acceleration, stddev.col(first + i));
+      if (!std::isfinite(here.size) || !here.move.allFinite()) continue;
+      n_constraints = std::max(n_constraints, here.n_constraints);
+      sizes.push_back(here.size);
+      for (std::size_t k = 0; k < moves.size(); ++k) moves[k].push_back(std::abs(here.move[static_cast<Index>(k)]));
+    }
+    Misfit out{0, VectorXd::Zero(stddev.rows()), stddev.middleCols(first, n).rowwise().mean(), n_constraints};
+    if (sizes.empty()) return out;
+    out.size = median(sizes);
+    for (std::size_t k = 0; k < moves.size(); ++k) out.move[static_cast<Index>(k)] = median(moves[k]);
+    return out;
+  }
+
+  /// Of q, dq (2 nq × N), where measured; not below what files and models round.
+  [[nodiscard]] MatrixXd stddev_of_states() const {
+    constexpr double rounding = 1e-4;  // of the spread
+    const Index nq = system_.nq();
+    MatrixXd stddev = MatrixXd::Zero(2 * nq, data_.states.cols());
+    for (const Task& task : tasks_) {
+      const Index first = first_row_[static_cast<std::size_t>(task.episode)];
+      for (int d = 0; d < 2; ++d) {
+        const Eigen::RowVectorXd course = task.motion.mean.row(d);
+        const double spread = std::sqrt((course.array() - course.mean()).square().mean());
+        stddev.row(d * nq + task.coordinate).segment(first, course.size()) = task.stddev.row(d).cwiseMax(rounding * spread);
+      }
+    }
+    return stddev;
+  }
+
+  [[nodiscard]] std::vector<Misfit> misfits(const ConstrainedStates& states, const VectorXd& start) const {
+    const MatrixXd stddev = stddev_of_states();
+    std::vector<Misfit> out(episodes_.size());
+    parallel_for(static_cast<int>(episodes_.size()), thread_count(options_.n_threads),
+                 [&](int e, int) { out[static_cast<std::size_t>(e)] = misfit_of(states, e, start, stddev); });
+    return out;
+  }
+
+  /// Says so where measured coordinates contradict the constraints among them by more than noise does.
+  static std::optional<std::string> contradiction(const std::vector<Misfit>& of_episodes, const std::vector<std::string>& names) {
+    const auto n_clear = std::count_if(of_episodes.begin(), of_episodes.end(), [](const Misfit& one) { return one.is_clear(); });
+    if (n_clear == 0) return std::nullopt;
+    const Misfit& worst = *std::max_element(of_episodes.begin(), of_episodes.end(),
+                                            [](const Misfit& a, const Misfit& b) { return a.size < b.size; });
+    // where all move together some hardly do
+    std::vector<std::string> moves;
+    for (Index k = 0; k < worst.move.size(); ++k) {
+      if (worst.move[k] > worst.stddev[k] && worst.stddev[k] > 0)
+        moves.push_back(fmt::format("{} by {:.2g}", names[static_cast<std::size_t>(k)], worst.move[k]));
+    }
+    const bool alone = worst.n_constraints == 1;
+    return fmt::format(
+        "measured coordinates contradict the constraints among them, by {:.2g} standard deviations in the median{}; to meet them "
+        "{} would have to move, {}: are their units and zeros those of the model?",
+        worst.size, of_episodes.size() > 1 ? fmt::format(", in {} of {} episodes", n_clear, of_episodes.size()) : "",
+        alone ? "one" : "all", fmt::join(moves, alone ? " or " : ", "));
+  }
+
   /// Says what the constraints mean for measured coordinates alone, and throws where noise would contradict them.
-  void note_redundancy(int redundancy, const std::vector<std::string>& completed) {
+  /// @param contradicted  by what, beyond noise
+  void note_redundancy(int redundancy, const std::vector<std::string>& completed,
+                       const std::optional<std::string>& contradicted) {
     if (redundancy > 0 && !options_.hold_constraints) {
       const std::string fact = fmt::format("{} of the constraints hold{} among the measured coordinates alone", redundancy,
                                            redundancy == 1 ? "s" : "");
+      if (!completed.empty() && contradicted) {
+        throw InputError(fmt::format("{}: {} cannot be solved for: {}", log_.name(), fmt::join(completed, ", "), *contradicted));
+      }
       if (!completed.empty()) {
         throw InputError(fmt::format(
             "{}: {}, which noise contradicts, so that {} cannot be solved for; hold the constraints (`hold_constraints`)",
             log_.name(), fact, fmt::join(completed, ", ")));
       }
-      data_.notes.push_back(fact + ": `hold_constraints` makes use of that");
+      if (!contradicted) data_.notes.push_back(fact + ": `hold_constraints` makes use of that");
     }
+    if (contradicted) data_.notes.push_back(fmt::format("warning: {}: {}", log_.name(), *contradicted));
     if (options_.hold_constraints && redundancy == 0)
       data_.notes.emplace_back("no constraint holds among the measured coordinates alone: there is nothing to hold");
+  }
+
+  [[nodiscard]] Index last_row(int e) const {
+    return e + 1 < static_cast<int>(episodes_.size()) ? first_row_[static_cast<std::size_t>(e) + 1] : data_.states.cols();
   }
 
   // rows of an episode follow one another: each starts at its predecessor
   void put_episode_together(const ConstrainedStates& states, int e, bool conditioned, VectorXd from) {
     const StateLayout layout = system_.layout();
     const Index first = first_row_[static_cast<std::size_t>(e)];
-    const Index last =
-        e + 1 < static_cast<int>(episodes_.size()) ? first_row_[static_cast<std::size_t>(e) + 1] : data_.states.cols();
+    const Index last = last_row(e);
     std::vector<const Task*> tasks;
     for (const Task& task : tasks_) {
       if (task.episode == e) tasks.push_back(&task);

@@ -3,7 +3,9 @@
 #include <algorithm>
 #include <cmath>
 #include <functional>
+#include <map>
 #include <optional>
+#include <utility>
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
@@ -17,6 +19,37 @@ namespace gp2 {
 using Eigen::MatrixXd;
 using Eigen::VectorXd;
 
+namespace {
+
+// A log that contradicts the others may be taken for one of much noise.
+void note_noises(const Posterior& posterior, std::vector<std::string>& notes) {
+  constexpr double much = 20;
+  const std::vector<Observations>& all = posterior.observations();
+  struct Found {
+    double stddev;
+    std::size_t log;
+  };
+  std::map<std::pair<std::string, bool>, std::vector<Found>> found;  // by what is observed, and whether the log states its noise
+  for (std::size_t g = 0; g < all.size(); ++g) {
+    if (!all[g].noise().is_estimated() || !all[g].view().is_of_ddq() || all[g].view().other_system) continue;
+    const std::vector<std::string> names = all[g].view().names(*posterior.prior().system);
+    const VectorXd stddev = posterior.noise_stddev(g);
+    for (Eigen::Index k = 0; k < stddev.size(); ++k) {
+      found[{names[static_cast<std::size_t>(k)], all[g].states_noise(k)}].push_back({stddev[k], g});
+    }
+  }
+  for (const auto& [of, ones] : found) {
+    const auto [least, most] = std::ranges::minmax_element(ones, {}, &Found::stddev);
+    if (!(most->stddev > much * least->stddev)) continue;
+    notes.push_back(
+        fmt::format("warning: the noise of {} is found {:.2g} times as large in log {} as in log {}: what it says may not be "
+                    "noise, but contradict the others; see gp2 check",
+                    of.first, most->stddev / least->stddev, most->log + 1, least->log + 1));
+  }
+}
+
+}  // namespace
+
 void add_residual_notes(const Posterior& posterior, const std::vector<TrainingResidual>& residuals,
                         std::vector<std::string>& notes) {
   for (std::size_t g = 0; g < posterior.observations().size(); ++g) {
@@ -25,6 +58,7 @@ void add_residual_notes(const Posterior& posterior, const std::vector<TrainingRe
       if (one.is_too_large()) notes.push_back("warning: " + one.text());
     }
   }
+  note_noises(posterior, notes);
   std::vector<std::string> large, small;
   const TrainingResidual* farthest = nullptr;
   int n_far = 0;
@@ -259,7 +293,8 @@ int resting_input(const Posterior& posterior, std::size_t log) {
 void note_contradiction(const Posterior& posterior, std::size_t log, double gain, std::vector<std::string>& notes) {
   const int resting = resting_input(posterior, log);
   const std::string cause =
-      resting < 0 ? "A unit, a sign or a parameter is another there, or something acts that the model does not know"
+      resting < 0 ? fmt::format("A unit, a sign or a parameter is another {}, or something acts that the model does not know",
+                                posterior.observations().size() == 2 ? "in one of the two" : "there")
                   : fmt::format("Its input {} is {:.4g} in every row: was it logged?",
                                 posterior.prior().system->inputs()[static_cast<std::size_t>(resting)],
                                 posterior.observations()[log].states()(posterior.prior().system->layout().u(resting), 0));
@@ -388,6 +423,12 @@ std::string correlated_text(const std::vector<TrainingResidual>& residuals) {
       fmt::join(correlated, ", "));
 }
 
+void add_impossible_note(const HyperparameterDraws& draws, std::vector<std::string>& notes) {
+  if (draws.n_impossible == 0) return;
+  notes.push_back(fmt::format("warning: {} of {} draws of the hyperparameters are left out: there is no posterior under them",
+                              draws.n_impossible, draws.n_impossible + draws.size()));
+}
+
 void add_draw_notes(const FitReport& report, std::vector<std::string>& notes) {
   if (!report.draws) {
     notes.push_back(
@@ -395,10 +436,7 @@ void add_draw_notes(const FitReport& report, std::vector<std::string>& notes) {
         "fit is that of the optimum");
     return;
   }
-  if (report.draws->n_impossible > 0) {
-    notes.push_back(fmt::format("warning: {} of {} draws of the hyperparameters are left out: there is no posterior under them",
-                                report.draws->n_impossible, report.draws->n_impossible + report.draws->size()));
-  }
+  add_impossible_note(*report.draws, notes);
   Eigen::Index k = 0;
   const double worst = report.draws->r_hat.maxCoeff(&k);
   if (!(worst > HyperparameterDraws::largest_r_hat)) return;

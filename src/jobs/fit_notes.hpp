@@ -28,6 +28,9 @@ void add_doubts(const Posterior& posterior, bool has_row_order, const FittedValu
 // Which residuals go on from row to row; empty where none do.
 std::string correlated_text(const std::vector<TrainingResidual>& residuals);
 
+// How many draws are left out, where there is no posterior under them.
+void add_impossible_note(const HyperparameterDraws& draws, std::vector<std::string>& notes);
+
 // Whether the draws of the hyperparameters can be relied on.
 void add_draw_notes(const FitReport& report, std::vector<std::string>& notes);
 

@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <numeric>
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
@@ -63,6 +64,19 @@ struct NoiseRule {
     }
   }
 };
+
+// Where noise is small beside a spread that single values make, these are what is wrong.
+void require_no_gross_errors(const Eigen::RowVectorXd& values, const std::string& name) {
+  const double spread = row_stddev(values)[0], without = row_stddev(without_gross_errors(values))[0];
+  if (without > 0.1 * spread) return;
+  const std::vector<double> measured = measured_entries(values, 0);
+  const double middle = median(measured);
+  const double farthest = *std::ranges::max_element(measured, {}, [middle](double value) { return std::abs(value - middle); });
+  throw InputError(
+      fmt::format("single values of {} lie far from all others, which spread by {:.3g}, not by {:.3g}: mend or leave out what "
+                  "cannot be, such as {:.6g}, or fit with `robust`",
+                  name, without, spread, farthest));
+}
 
 std::vector<std::string> stddev_columns(const std::vector<std::string>& names, const LogReader& reader) {
   std::vector<std::string> columns;
@@ -165,7 +179,9 @@ VectorXd noise_of(const Model& model, const FitProblemOptions& options, const Re
                       "`noise_std=estimate`",
                       model.name, name));
     }
-    NoiseRule{source, name, spread[k], static_cast<int>(readings.states.cols())}.require(stddev[k], estimate);
+    const NoiseRule rule{source, name, spread[k], static_cast<int>(readings.states.cols())};
+    if (!estimate && stddev[k] < rule.smallest()) require_no_gross_errors(readings.values.row(k), name);
+    rule.require(stddev[k], estimate);
   }
   return stddev;
 }
@@ -187,6 +203,12 @@ MatrixXd noise_scale_of(const Readings& readings, const std::vector<std::string>
         .require_each(is_measured.select(scale.row(k), std::numeric_limits<double>::infinity()), rows);
   }
   return scale;
+}
+
+void require_noise(const std::string& source, const std::string& name, double signal, const Eigen::RowVectorXd& stddev) {
+  std::vector<int> rows(static_cast<std::size_t>(stddev.size()));
+  std::iota(rows.begin(), rows.end(), 0);
+  NoiseRule{source, name, signal, static_cast<int>(stddev.size())}.require_each(stddev, rows);
 }
 
 VectorXd noise_of_side_information(const LoggedSystem& logged, const SideInformation& side_information,

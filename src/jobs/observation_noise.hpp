@@ -31,6 +31,10 @@ Eigen::VectorXd noise_of(const Model& model, const FitProblemOptions& options, c
 Eigen::MatrixXd noise_scale_of(const Readings& readings, const std::vector<std::string>& names, const FitProblemOptions& options,
                                const LogReader& reader, const CsvTable& log, const std::vector<int>& rows);
 
+/// @param stddev  of each value of a row whose values spread by `signal`
+/// @throws InputError where one is too small for double precision.
+void require_noise(const std::string& source, const std::string& name, double signal, const Eigen::RowVectorXd& stddev);
+
 /// σ of each row of side information, held against the size of its signal.
 /// @param signal_stddev  of each latent
 Eigen::VectorXd noise_of_side_information(const LoggedSystem& logged, const SideInformation& side_information,

@@ -11,6 +11,7 @@
 #include "gp2/error.hpp"
 #include "gp2/inference/inverse_dynamics.hpp"
 #include "gp2/jobs/fit_problem.hpp"
+#include "gp2/simulate.hpp"
 #include "jobs/read_observations.hpp"
 
 namespace gp2 {
@@ -285,10 +286,27 @@ PredictOutcome predict_inputs(const FitFile& fit, const Posterior& posterior, co
                     "and what is missed: see the columns {}_missed …",
                     log.name(), n, is_missed.size(), wanted.view.names(system).front()));
   }
+  if (auto note = note_of_open_inputs(found, *at.model, log.name())) out.notes.push_back(std::move(*note));
   return out;
 }
 
 }  // namespace
+
+std::optional<std::string> note_of_open_inputs(const InverseDynamics& found, const Model& model, const std::string& states) {
+  const System& system = *model.system;
+  Eigen::Array<bool, Eigen::Dynamic, Eigen::Dynamic> open = found.open;
+  // whether there is contact follows from the motion
+  for (const Contact& contact : contacts_of(model, system.parameter_values())) open.row(contact.input) = false;
+  std::vector<std::string> names;
+  for (Index k = 0; k < open.rows(); ++k) {
+    if (open.row(k).any()) names.push_back(system.inputs()[static_cast<std::size_t>(k)]);
+  }
+  if (names.empty()) return std::nullopt;
+  return fmt::format(
+      "{}: the accelerations that are wanted do not determine {} at {} of {} rows; the least change of inputs is "
+      "given, and its deviations tell nothing of other inputs that do the same",
+      states, fmt::join(names, ", "), open.colwise().any().count(), open.cols());
+}
 
 PredictOutcome predict(const FitFile& fit, CsvTable states, const PredictRequest& request) {
   if (request.n_samples && *request.n_samples < 1) {

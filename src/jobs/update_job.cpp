@@ -4,6 +4,7 @@
 #include <cmath>
 #include <limits>
 #include <memory>
+#include <string_view>
 #include <utility>
 
 #include <fmt/format.h>
@@ -11,12 +12,14 @@
 
 #include "base/not_a_number.hpp"
 #include "data/evenly.hpp"
+#include "gp2/base/statistics.hpp"
 #include "gp2/data/log_reader.hpp"
 #include "gp2/error.hpp"
 #include "gp2/inference/evaluation.hpp"
 #include "gp2/jobs/fit_job.hpp"
 #include "gp2/jobs/fit_problem.hpp"
 #include "inference/inducing_summary.hpp"
+#include "jobs/fit_notes.hpp"
 #include "jobs/observation_noise.hpp"
 #include "jobs/read_observations.hpp"
 
@@ -105,37 +108,118 @@ double left_out(const Posterior& posterior) {
   return summary ? 0.5 * summary->components.front().all.trace : 0;
 }
 
-// Values that the fit, at states near its own data, is sure to be others: a sign, a unit, a column of something else.
+// σ of each value, ∞ where nothing is measured (d × n).
+MatrixXd noise_of_values(const Observations& observations) {
+  MatrixXd noise(observations.values().rows(), observations.n_data());
+  for (Index i = 0; i < noise.cols(); ++i) noise.col(i) = observations.noise_at(observations.noise().stddev(), i);
+  return observations.values().array().isNaN().select(std::numeric_limits<double>::infinity(), noise);
+}
+
+// As of a fit, whose accelerations tell how far they spread.
+void require_usable_noise(const Posterior& posterior, const Observations& more, const std::string& source) {
+  const std::vector<std::string> names = more.view().names(*posterior.prior().system);
+  const MatrixXd noise = noise_of_values(more);
+  for (const Observations& group : posterior.observations()) {
+    if (!(group.view() == more.view()) || group.n_data() < 2) continue;
+    const VectorXd spread = row_stddev(group.values());
+    for (Index k = 0; k < noise.rows(); ++k) require_noise(source, names[static_cast<std::size_t>(k)], spread[k], noise.row(k));
+  }
+}
+
+// Values that the fit is sure to be others: many of a column near its data (a sign, a unit, a column of something else) or single ones;
+// and rows far from its data, of which it cannot tell.
 void note_unexpected(const Posterior& posterior, const Observations& more, const CsvTable& log, std::vector<std::string>& notes) {
-  constexpr int most_states = 200, fewest_values = 10;  // of each column
-  constexpr std::int64_t fewest_learned = 30;           // fits of fewer states are sure of too much
-  constexpr double far = 6, sound_share = 0.2;
-  if (posterior.n_states() < fewest_learned || more.n_data() < fewest_values) return;
+  constexpr int most_states = 1000, fewest_values = 10;  // of each column
+  constexpr std::int64_t fewest_learned = 30;            // fits of fewer states are sure of too much
+  constexpr double unexpected = 6, sound_share = 0.2;
+  constexpr double wrong = 30, wrong_far = 100;  // also by a fit that is too sure of itself, near its data and far from them
+  constexpr double quartile = 0.6745;            // of |z| under a normal distribution the median
+  constexpr double another_unit = 5;             // times as far as the observed states are from each other
+  if (posterior.n_states() < fewest_learned) return;
   const Observations some = evenly({more}, most_states).front();
   const VectorXd distance = posterior.distance_from_data(some.view(), some.states(), /*n_threads=*/0);
   const Posterior::Marginal predicted = posterior.marginal(some.view(), some.states(), /*n_threads=*/0);
-  MatrixXd noise(some.values().rows(), some.n_data());
-  for (Index i = 0; i < noise.cols(); ++i) noise.col(i) = some.noise_at(some.noise().stddev(), i);
-  noise = with_slip(posterior, some.view(), some.states(), std::move(noise));
+  const MatrixXd noise = with_slip(posterior, some.view(), some.states(), noise_of_values(some));
   const MatrixXd variance = predicted.stddev().cwiseAbs2() + noise.cwiseAbs2();
   const MatrixXd z = (some.values() - predicted.mean).cwiseAbs().cwiseQuotient(variance.cwiseSqrt());
   const std::vector<std::string> names = some.view().names(*posterior.prior().system);
   std::vector<std::string> others;
+  int n_wrong = 0;
+  double worst = 0;
+  std::string where;
   for (Index k = 0; k < z.rows(); ++k) {
-    int n = 0, n_far = 0;
+    std::vector<double> near, all;
     for (Index i = 0; i < z.cols(); ++i) {
-      if (distance[i] > Posterior::far_from_data || !(z(k, i) >= 0)) continue;  // not of those that were not measured
-      ++n;
-      n_far += z(k, i) > far ? 1 : 0;
+      if (!(z(k, i) >= 0)) continue;  // not measured
+      all.push_back(z(k, i));
+      if (distance[i] <= Posterior::far_from_data) near.push_back(z(k, i));
     }
-    if (n < fewest_values || n_far <= sound_share * n) continue;
-    others.push_back(fmt::format("{} of {} of {}", n_far, n, names[static_cast<std::size_t>(k)]));
+    const auto n_near = static_cast<int>(near.size());
+    const auto n_far = static_cast<int>(std::ranges::count_if(near, [](double one) { return one > unexpected; }));
+    if (n_near >= fewest_values && n_far > sound_share * n_near) {
+      others.push_back(fmt::format("{} of {} of {}", n_far, n_near, names[static_cast<std::size_t>(k)]));
+      continue;
+    }
+    // where the fit is off everywhere, single values are not told from the others
+    const double usual = std::ssize(all) < fewest_values ? 1 : std::max(1.0, median(all) / quartile);
+    for (Index i = 0; i < z.cols(); ++i) {
+      if (!(z(k, i) > usual * (distance[i] <= Posterior::far_from_data ? wrong : wrong_far))) continue;
+      ++n_wrong;
+      if (z(k, i) <= worst) continue;
+      worst = z(k, i);
+      where = names[static_cast<std::size_t>(k)];
+      if (some.n_data() == more.n_data()) where += fmt::format(", at row {} of what is learned from it", i + 1);
+    }
   }
-  if (others.empty()) return;
-  notes.push_back(fmt::format(
-      "warning: {}: {} near the fit's data lie more than six deviations from what it predicts there: is a sign, a unit "
-      "or a column other than in its own logs? Else it predicts poorly; see gp2 evaluate",
-      log.name(), fmt::join(others, ", ")));
+  if (!others.empty()) {
+    notes.push_back(fmt::format(
+        "warning: {}: {} near the fit's data lie more than six deviations from what it predicts there: is a sign, a unit "
+        "or a column other than in its own logs? Else it predicts poorly; see gp2 evaluate",
+        log.name(), fmt::join(others, ", ")));
+  }
+  if (n_wrong > 0) {
+    notes.push_back(fmt::format(
+        "warning: {}: {} of the values cannot be what the fit predicts, up to {:.2g} deviations away ({}): outliers of the log, "
+        "or "
+        "something acts that the model does not know. They are learned from as all others: leave them out, or fit all logs "
+        "with `robust`",
+        log.name(), n_wrong, worst, where));
+  }
+  const auto n_outside = (distance.array() > Posterior::far_from_data).count();
+  if (2 * n_outside > distance.size()) {
+    const double typical = median({distance.begin(), distance.end()});
+    const bool is_other = typical > another_unit;
+    notes.push_back(
+        (is_other ? "warning: " : "") +
+        fmt::format("{}: {} of {} rows are far from the fit's data, half of them {:.2g} times as far or more as those are "
+                    "from each other: whether they agree with it is not known{}",
+                    log.name(), n_outside, distance.size(), typical, is_other ? ". Is the unit of a column another?" : ""));
+  }
+}
+
+// Of draws of the hyperparameters those under which there is no posterior of all are left out, as by a fit.
+Posterior update_where_possible(Posterior&& posterior, FitReport& report, const Observations& more) {
+  try {
+    return update(std::move(posterior), more);
+  } catch (const NumericalError&) {
+    if (!report.draws || posterior.summary()) throw;
+    std::vector<Index> possible;
+    std::vector<ModelValues> values;
+    std::vector<Observations> all;
+    for (int k = 0; k < posterior.n_components(); ++k) {
+      try {
+        const Posterior one = update(Posterior(posterior.component(k)), more);
+        values.push_back(one.values());
+        all = one.observations();
+        possible.push_back(k);
+      } catch (const NumericalError&) {  // one more that is impossible
+      }
+    }
+    if (possible.empty()) throw;
+    report.draws->n_impossible = posterior.n_components() - static_cast<int>(possible.size());
+    report.draws->values = MatrixXd(report.draws->values(Eigen::all, possible));
+    return Posterior::mixture(posterior.prior(), all, values);
+  }
 }
 
 }  // namespace
@@ -175,11 +259,14 @@ Observations more_observations(const FitFile& fit, const Posterior& posterior, c
                     noise.stddev(),
                     false,
                     noise.has_scale() ? noise.scale() : MatrixXd()};
-  if (log.file() && fit.has_learned(*log.file())) {
-    notes.push_back(fmt::format("warning: {} was learned from already: its rows count twice", log.name()));
-  } else {
-    note_shared_rows(groups, {more}, notes);
+  require_usable_noise(posterior, more, request.noise_stddev ? "`noise_std`" : log.name());
+  // what a window has let go of an exact fit does not count twice
+  std::vector<std::string> shared;
+  note_shared_rows(groups, {more}, shared);
+  if (log.file() && fit.has_learned(*log.file()) && (posterior.summary() || !shared.empty())) {
+    shared = {fmt::format("warning: {} was learned from already: its rows count twice", log.name())};
   }
+  notes.insert(notes.end(), shared.begin(), shared.end());
   try {
     note_unexpected(posterior, more, log, notes);
   } catch (const Error&) {
@@ -188,11 +275,15 @@ Observations more_observations(const FitFile& fit, const Posterior& posterior, c
   return more;
 }
 
-Posterior with_more(Posterior&& posterior, Observations more, const CsvTable& log, std::vector<std::string>& notes) {
+Posterior with_more(Posterior&& posterior, FitFile& fit, Observations more, const CsvTable& log,
+                    std::vector<std::string>& notes) {
   const double before = left_out(posterior);
   const auto n_before = static_cast<double>(posterior.n_states());
-  const int n_more = more.n_data();
-  Posterior all = update(std::move(posterior), std::move(more));
+  const int n_more = more.n_data(), n_draws = posterior.n_components();
+  Posterior all = update_where_possible(std::move(posterior), fit.report, more);
+  if (all.n_components() < n_draws) add_impossible_note(*fit.report.draws, notes);
+  if (log.file()) fit.logs.push_back(*log.file());
+  fit.data_source += (fit.data_source.empty() ? "" : ", ") + log.name();
   const double of_more = left_out(all) - before;
   constexpr double much = 1, usual = 3;  // nats; times as much as of as many rows before
   if (of_more > much && of_more > usual * before * n_more / n_before) {
@@ -214,14 +305,19 @@ void keep_newest(Posterior& posterior, const UpdateRequest& request) {
 UpdateOutcome update(FitFile fit, const std::vector<CsvTable>& logs, const UpdateRequest& request) {
   UpdateOutcome outcome;
   Posterior posterior = fit.posterior();
+  const auto n_logs = std::ssize(fit.logs);
+  const std::size_t source = fit.data_source.size();
   if (request.forget) posterior = forget(std::move(posterior), *request.forget);
   for (const CsvTable& log : logs) {
     Observations more = more_observations(fit, posterior, log, request, outcome.notes);
     outcome.n_added += more.n_data();
-    if (log.file()) fit.logs.push_back(*log.file());
-    posterior = with_more(std::move(posterior), std::move(more), log, outcome.notes);
+    posterior = with_more(std::move(posterior), fit, std::move(more), log, outcome.notes);
   }
   keep_newest(posterior, request);
+  if (request.window && outcome.n_added >= *request.window) {  // nothing is left of what was before
+    fit.logs.erase(fit.logs.begin(), fit.logs.begin() + n_logs);
+    fit.data_source.erase(0, source + (source > 0 ? std::string_view(", ").size() : 0));
+  }
   fit.take_data(posterior);
   outcome.n_states = posterior.n_states();
   outcome.fit = std::move(fit);

@@ -124,13 +124,21 @@ class Integration {
         continue;
       }
       if (to_limit) t_new = limit;
-      const std::optional<double> crossing = find_crossing(t_new);
+      const std::optional<double> crossing = find_crossing(t_new, next);
       if (!crossing && is_hold_unresolved(t_new)) {
         step = longest_holding_step_ = (t_new - t_) / 2;
         --out_.steps;
         ++out_.rejected_steps;
         continue;
       }
+      if (crossing && is_to_stop_before(*crossing, t_new)) {
+        step = (1 - shortfall_) * (*crossing - t_);
+        shortfall_ *= 10;
+        --out_.steps;
+        ++out_.rejected_steps;
+        continue;
+      }
+      shortfall_ = least_shortfall;
       step = to_limit ? std::max(step, tried) : tried;
       constexpr double growth = 1.5;
       step = std::min(step, longest_holding_step_ *= growth);
@@ -325,41 +333,68 @@ class Integration {
     return std::min({100 * h0, h1, span});
   }
 
+  // The times at which the step to t_new is looked at. Where constraints come and go the written ones are among them, so that what is
+  // written is under the constraints that the motion is under.
+  [[nodiscard]] std::vector<double> places(double t_new, Index next) const {
+    constexpr int parts = 8;
+    std::vector<double> out;
+    for (int k = 1; k < parts; ++k) out.push_back(t_ + (t_new - t_) * k / parts);
+    if (looks_at_conditions()) {
+      for (; next < options_.times.size() && options_.times[next] < t_new; ++next) out.push_back(options_.times[next]);
+      std::sort(out.begin(), out.end());
+    }
+    out.push_back(t_new);
+    return out;
+  }
+
   // The first time in the step to t_new at which the motion has crossed a surface where the acceleration jumps, has hit a contact,
-  // or is let go by one of them; x_crossing_ is the state then.
-  std::optional<double> find_crossing(double t_new) {
-    if (switching_.is_empty() && contacts_.is_empty()) return std::nullopt;
+  // or is let go by one of them, or at which a constraint has come or gone; x_crossing_ is the state then.
+  std::optional<double> find_crossing(double t_new, Index next) {
+    if (switching_.is_empty() && contacts_.is_empty() && !looks_at_conditions()) return std::nullopt;
     x_crossing_.resize(x_.size());
+    // whether the constraints are other ones there than at the start of the step
     const auto move_to = [&](double t) {
       stepper_.stepper().calc_state(t, x_crossing_, x_, dxdt_, t_, x_new_, dxdt_new_, t_new);
       expand(x_crossing_, t);
+      if (looks_at_conditions() && active_conditions() != is_active_) return true;
       // a contact that is released leaves at rate 0, not at what interpolation makes of it
       if (!contacts_.is_empty() && options_.project) project(x_crossing_, t);
+      return false;
     };
     const auto has_left = [&](double t, bool is_end) {
-      move_to(t);
-      return (!switching_.is_empty() && switching_.has_crossed(state_)) || (!contacts_.is_empty() && contacts_.is_hit(state_)) ||
-             (is_end && is_let_go());
+      return move_to(t) || (!switching_.is_empty() && switching_.has_crossed(state_)) ||
+             (!contacts_.is_empty() && contacts_.is_hit(state_)) || (is_end && is_let_go());
     };
-    constexpr int parts = 8;
     double before = t_, after = t_;
-    for (int k = 1; k <= parts; ++k) {
+    const std::vector<double> looked_at = places(t_new, next);
+    for (std::size_t k = 0; k < looked_at.size(); ++k) {
+      const bool is_end = k + 1 == looked_at.size();
       const double start = after;
-      before = k == parts ? t_ : start;  // whether the motion is let go is asked at the end alone
-      after = k == parts ? t_new : t_ + (t_new - t_) * k / parts;
-      if (has_left(after, k == parts)) break;
+      before = is_end ? t_ : start;  // whether the motion is let go is asked at the end alone
+      after = looked_at[k];
+      if (has_left(after, is_end)) break;
       if (const std::optional<double> dip = find_dip(start, after, move_to)) {
         before = start;
         after = *dip;
         break;
       }
-      if (k == parts) return std::nullopt;
+      if (is_end) return std::nullopt;
     }
     for (double middle = std::midpoint(before, after); before < middle && middle < after; middle = std::midpoint(before, after)) {
       (has_left(middle, true) ? after : before) = middle;
     }
     has_left(after, true);
     return after;
+  }
+
+  // Whether stages of the step are under constraints that come or go at `crossing`, so that the motion up to there is found less well
+  // than the tolerances ask: the step is to be taken again, to just before.
+  bool is_to_stop_before(double crossing, double t_new) {
+    constexpr double at_start = 0.01;
+    if (!looks_at_conditions() || shortfall_ >= 1 || is_at_once(crossing - t_) || crossing - t_ < at_start * (t_new - t_))
+      return false;
+    expand(x_crossing_, crossing);
+    return active_conditions() != is_active_;
   }
 
   // A time between two at which a gap that opens again is past its surface, where it is least.
@@ -440,7 +475,7 @@ class Integration {
   void advance(double t_new, bool has_crossed) {
     std::swap(x_, x_new_);
     std::swap(dxdt_, dxdt_new_);
-    t_ = t_new;
+    const double duration = t_new - std::exchange(t_, t_new);
     const bool switches = !switching_.is_empty() && (has_crossed || switching_.is_guided());
     const std::vector<bool> was_held = held_surfaces();
     if (!switching_.is_empty()) {
@@ -455,10 +490,11 @@ class Integration {
     const std::size_t n_events = out_.events.size();
     if (has_crossed && !contacts_.is_empty()) settle_contacts(/*at_start=*/false);
     const bool has_met = out_.events.size() > n_events;
-    const bool moved = options_.project && project_and_note_jump();
+    const bool moved = project_and_note_jump();
+    count_turns(duration);
     if (switches) {
       switch_or_throw([&] {
-        if (has_met) {
+        if (has_met || (moved && has_turned_)) {
           switching_.start(state_, counted());
         } else {
           switching_.settle(state_, counted());
@@ -466,16 +502,20 @@ class Integration {
       });
       note_sticks(was_held);
     }
-    if (moved || switches || (has_crossed && !contacts_.is_empty())) derivative_or_throw();
+    if (moved || switches || has_crossed) derivative_or_throw();
   }
 
-  // projects the state; by a constraint that takes hold off its surface a body is moved there at once
+  // Projects the state; by a constraint that takes hold off its surface a body is moved there at once. That may undo its condition:
+  // the motion goes on under those that are there afterwards.
   bool project_and_note_jump() {
-    if (conditions_.empty()) return project(x_, t_);
+    if (conditions_.empty() || instant_) return options_.project && project(x_, t_);
     const Phase before = x_;
     expand(x_, t_);
     const std::vector<bool> is_active = active_conditions(), was_active = std::exchange(is_active_, is_active);
+    has_turned_ = is_active != was_active;
+    if (!options_.project) return false;
     const bool has_moved = project(x_, t_);
+    if (has_moved) is_active_ = active_conditions();
     note_extent();
     bool takes_hold = false;
     for (std::size_t k = 0; k < is_active.size(); ++k) takes_hold = takes_hold || (is_active[k] && !was_active[k]);
@@ -488,6 +528,23 @@ class Integration {
       out_.jump_time = t_;
     }
     return has_moved;
+  }
+
+  // Whether steps end where a constraint comes or goes. One that turns again and again within no time, as it does at the very edge of
+  // its condition, would hold the motion up: then a step is taken across all that.
+  [[nodiscard]] bool looks_at_conditions() const {
+    return !conditions_.empty() && !instant_ && turns_at_once_ < most_turns_at_once();
+  }
+  [[nodiscard]] int most_turns_at_once() const { return 10 * static_cast<int>(conditions_.size()); }
+  void count_turns(double duration) {
+    const bool is_one_more = has_turned_ && (!looks_at_conditions() || is_at_once(duration));
+    const int change = is_one_more ? 1 : is_at_once(duration) ? 0 : -1;
+    turns_at_once_ = std::clamp(turns_at_once_ + change, 0, most_turns_at_once());
+  }
+  // of the motion what the tolerance is of a state
+  [[nodiscard]] bool is_at_once(double duration) const {
+    constexpr double shortest = 1e3;
+    return duration <= std::max(shortest * smallest_step(), options_.relative_tolerance * (t_end() - options_.times[0]));
   }
 
   void note_extent() {
@@ -628,8 +685,12 @@ class Integration {
   std::optional<StageFault> fault_;  // of the last try
   std::optional<VectorXd> instant_;  // the state of which velocities alone move
   const std::vector<int> conditions_ = conditional_rows();
-  std::vector<bool> is_active_;  // of conditions_, at the last step
-  VectorXd lowest_, highest_;    // coordinates up to then
+  std::vector<bool> is_active_;  // of conditions_, at t_
+  bool has_turned_ = false;      // whether one of them did at t_
+  int turns_at_once_ = 0;        // one after the other, until t_
+  static constexpr double least_shortfall = 1e-4;
+  double shortfall_ = least_shortfall;  // of a step that is to end before a condition turns
+  VectorXd lowest_, highest_;           // coordinates up to then
   Trajectory out_;
 };
 

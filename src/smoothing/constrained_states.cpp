@@ -23,9 +23,9 @@ namespace {
 
 constexpr double rank_tolerance = 1e-10;
 
-Eigen::CompleteOrthogonalDecomposition<MatrixXd> decomposition_of(const MatrixXd& A) {
+Eigen::CompleteOrthogonalDecomposition<MatrixXd> decomposition_of(const MatrixXd& A, double tolerance = rank_tolerance) {
   Eigen::CompleteOrthogonalDecomposition<MatrixXd> decomposition;
-  decomposition.setThreshold(rank_tolerance);
+  decomposition.setThreshold(tolerance);
   decomposition.compute(A);
   return decomposition;
 }
@@ -259,12 +259,14 @@ VectorXd row_scale_of(const MatrixXd& J_measured, const MatrixXd& jacobian) {
 // A step to the most likely z that meets the linearised constraints, and what they say of w: B w is given.
 struct ConditionedStep {
   VectorXd step;
+  VectorXd known;  // w
   MatrixXd B;
   Eigen::CompleteOrthogonalDecomposition<MatrixXd> constraints;  // of B
 };
 
 ConditionedStep conditioned_step(const VectorXd& residual, const MatrixXd& jacobian, const MatrixXd& W,
-                                 const std::vector<Index>& unknown, const VectorXd& known_off) {
+                                 const std::vector<Index>& unknown, const VectorXd& known_off,
+                                 double tolerance = rank_tolerance) {
   MatrixXd J_measured = jacobian * W;
   const VectorXd scale = row_scale_of(J_measured, jacobian);
   J_measured = scale.asDiagonal() * J_measured;
@@ -273,11 +275,11 @@ ConditionedStep conditioned_step(const VectorXd& residual, const MatrixXd& jacob
   ConditionedStep out;
   out.B = U.transpose() * J_measured;
   const VectorXd wanted = -scale.cwiseProduct(residual + jacobian * known_off);
-  out.constraints = decomposition_of(out.B);
-  const VectorXd w = out.B.rows() > 0 ? VectorXd(out.constraints.solve(U.transpose() * wanted)) : VectorXd::Zero(W.cols());
-  out.step = known_off + W * w;
+  out.constraints = decomposition_of(out.B, tolerance);
+  out.known = out.B.rows() > 0 ? VectorXd(out.constraints.solve(U.transpose() * wanted)) : VectorXd::Zero(W.cols());
+  out.step = known_off + W * out.known;
   if (!unknown.empty()) {
-    const VectorXd left = wanted - J_measured * w;
+    const VectorXd left = wanted - J_measured * out.known;
     const VectorXd solved = decomposition_of(J_unknown).solve(left);
     out.step(unknown) = solved;
   }
@@ -299,6 +301,45 @@ void condition_covariance(const ConditionedStep& at, const MatrixXd& W, const st
 }
 
 }  // namespace
+
+ConstrainedStates::Contradiction ConstrainedStates::contradiction(const VectorXd& state, const VectorXd& acceleration,
+                                                                  const VectorXd& stddev) const {
+  const Index nq = system_.nq();
+  const VectorXd x = without_blind(state);
+  const Linearisation at = linearise(x, acceleration);
+  // c, and of the constraints of velocities those that are no ċ
+  std::vector<Index> rows;
+  const auto n_position = static_cast<Index>(position_rows_.size());
+  for (Index k = 0; k < n_position; ++k) rows.push_back(k);
+  for (std::size_t k = 0; k < velocity_rows_.size(); ++k) {
+    if (std::find(position_rows_.begin(), position_rows_.end(), velocity_rows_[k]) == position_rows_.end())
+      rows.push_back(n_position + static_cast<Index>(k));
+  }
+  Contradiction out{.move = VectorXd::Zero(2 * nq)};
+  const VectorXd residual = at.residual(rows);
+  const MatrixXd jacobian = at.jacobian(rows, Eigen::all);
+  if (rows.empty() || !residual.allFinite() || !jacobian.allFinite()) return out;
+  MatrixXd W = MatrixXd::Zero(3 * nq, 2 * static_cast<Index>(measured_.size()));
+  Index column = 0;
+  for (const int j : measured_) {
+    for (const Index entry : {Index{j}, nq + j}) W(entry, column++) = stddev[entry];
+  }
+  const std::vector<Index> unknown = unknown_entries(free_, seen_, nq);
+  // rows that depend on each other where the constraints are met do no longer where they are not: what is then left of their
+  // gradients is small, as is what is left of their residuals, and says nothing
+  constexpr double dependent = 0.1;
+  const ConditionedStep step = conditioned_step(residual, jacobian, W, unknown, VectorXd::Zero(3 * nq), dependent);
+  if (step.B.rows() == 0 || step.constraints.rank() == 0) return out;
+  out.n_constraints = static_cast<int>(step.constraints.rank());
+  out.size = step.known.norm() / std::sqrt(static_cast<double>(out.n_constraints));
+  VectorXd w = step.known;
+  if (out.n_constraints == 1) {
+    // B w = c, of which the likeliest is w = Bᵀ c/(B Bᵀ): entry k alone would be c/B_k = |w|²/w_k
+    for (double& one : w) one = one != 0 ? step.known.squaredNorm() / one : 0;
+  }
+  out.move = (W * w).head(2 * nq);
+  return out;
+}
 
 void ConstrainedStates::condition(VectorXd& state, Eigen::Ref<VectorXd> acceleration,
                                   std::vector<Eigen::Matrix3d>& covariance) const {

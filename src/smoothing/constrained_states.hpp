@@ -32,6 +32,19 @@ class ConstrainedStates {
   /// @throws InputError naming what the constraints leave open at that state.
   [[nodiscard]] int redundancy(const Eigen::VectorXd& state) const;
 
+  /// How far what was measured is off the constraints that hold among it alone.
+  struct Contradiction {
+    int n_constraints = 0;
+    double size = 0;  // in standard deviations: the root mean square over these constraints
+    /// Of q and dq of all coordinates, to where they would meet the constraints: one alone where there is one constraint, else all
+    /// together, as likely as can be (2 nq).
+    Eigen::VectorXd move = {};
+  };
+  /// c = 0 and the constraints of velocities, linearised at a state whose other entries are those of `approach`.
+  /// @param stddev  of q and dq of all coordinates, read where they are measured (2 nq)
+  [[nodiscard]] Contradiction contradiction(const Eigen::VectorXd& state, const Eigen::VectorXd& acceleration,
+                                            const Eigen::VectorXd& stddev) const;
+
   /// n − rank A accelerations of measured coordinates that are far from depending on each other at that state.
   /// @param stddev  of the measured ones' accelerations
   [[nodiscard]] std::vector<int> independent_accelerations(const Eigen::VectorXd& state, const Eigen::VectorXd& stddev) const;

@@ -24,7 +24,7 @@ constexpr double median_of_normal = 0.6745;  // of |x|, x standard normal
 
 double square(double x) { return x * x; }
 
-/// How far each inner position is off the cubic through two neighbours on either side,
+/// How far each inner position is off the cubic through those of the two times before and the two after,
 /// in units that noise of deviation 1 gives it.
 struct Roughness {
   std::vector<int> measurement;
@@ -71,23 +71,35 @@ Spacing spacing_of(const std::vector<Measurement>& measurements) {
 
 Roughness roughness_of(const std::vector<Measurement>& all, const std::vector<int>& positions) {
   Roughness out;
-  for (std::size_t k = 2; k + 2 < positions.size(); ++k) {
-    const auto at = [&](std::size_t i) -> const Measurement& { return all[static_cast<std::size_t>(positions[i])]; };
-    const std::array<std::size_t, 4> nodes = {k - 2, k - 1, k + 1, k + 2};
+  const auto n = static_cast<int>(positions.size());
+  const auto at = [&](int i) -> const Measurement& {
+    return all[static_cast<std::size_t>(positions[static_cast<std::size_t>(i)])];
+  };
+  // the next position in a direction of another time, beyond the ends where there is none: where all times are there twice, what
+  // stands next to a position in the list tells nothing of its motion
+  const auto of_another_time = [&](int from, int direction) {
+    int i = from;
+    while (i >= 0 && i < n && at(i).time == at(from).time) i += direction;
+    return i;
+  };
+  for (int k = 0; k < n; ++k) {
+    std::array<int, 4> nodes{};
+    nodes[1] = of_another_time(k, -1);
+    nodes[2] = of_another_time(k, 1);
+    if (nodes[1] < 0 || nodes[2] >= n) continue;
+    nodes[0] = of_another_time(nodes[1], -1);
+    nodes[3] = of_another_time(nodes[2], 1);
+    if (nodes[0] < 0 || nodes[3] >= n) continue;
     double predicted = 0, variance = 1;
-    bool distinct = true;
-    for (const std::size_t i : nodes) {
+    for (const int i : nodes) {
       double weight = 1;
-      for (const std::size_t j : nodes) {
-        if (j == i) continue;
-        distinct = distinct && at(i).time != at(j).time;
-        weight *= (at(k).time - at(j).time) / (at(i).time - at(j).time);
+      for (const int j : nodes) {
+        if (j != i) weight *= (at(k).time - at(j).time) / (at(i).time - at(j).time);
       }
       predicted += weight * at(i).value;
       variance += weight * weight;
     }
-    if (!distinct) continue;
-    out.measurement.push_back(positions[k]);
+    out.measurement.push_back(positions[static_cast<std::size_t>(k)]);
     out.residual.push_back((at(k).value - predicted) / std::sqrt(variance));
   }
   return out;

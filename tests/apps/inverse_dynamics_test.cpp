@@ -56,6 +56,17 @@ TEST_F(InverseDynamicsCommand, AnAccelerationOfZeroIsProducedToRounding) {
   EXPECT_LE(columns(desk.table("inputs.csv"), {"ddshoulder_missed"}).cwiseAbs().maxCoeff(), 1e-9);
 }
 
+TEST_F(InverseDynamicsCommand, NamesInputsThatTheAccelerationsLeaveOpen) {
+  EXPECT_THAT(desk.done("gp2 predict fit.json --states wanted.csv --inverse-dynamics -o inputs.csv").err,
+              HasSubstr("wanted.csv: the accelerations that are wanted do not determine tau1, tau2 at 8 of 8 rows"));
+  desk.done("gp2 generate models/unicycle.toml --n 8 --seed 1 -o log.csv");
+  desk.done("gp2 fit models/unicycle.toml --data log.csv --mean force --restarts 1 --max-iterations 5 -o unicycle.json");
+  const auto said = [&] { return desk.done("gp2 predict unicycle.json --states log.csv --inverse-dynamics -o inputs.csv").err; };
+  EXPECT_THAT(said(), testing::Not(HasSubstr("do not determine")));
+  desk.done("sed -i '1s/ddq[12]/x&/g' log.csv");  // the turn alone, of which both inputs are read
+  EXPECT_THAT(said(), HasSubstr("do not determine u1, u2 at 8 of 8 rows"));
+}
+
 TEST_F(InverseDynamicsCommand, RefusesWhatDoesNotGoWithIt) {
   const auto refusal = [&](const std::string& options) {
     const Outcome outcome = desk.run("gp2 predict fit.json --inverse-dynamics -o inputs.csv " + options);

@@ -149,6 +149,36 @@ TEST(InverseDynamicsTest, OfSomeAccelerationsUnderAnotherSystem) {
   EXPECT_GT(largest(arm.posterior.mean(elbow, with_inputs(arm.states, found.inputs)) - wanted), 1e-6);
 }
 
+TEST(InverseDynamicsTest, SaysWhichInputsAreLeftOpen) {
+  // two forces on a, in another proportion on b, and a torque
+  const Model model = Model::parse(R"toml(
+name        = "three inputs"
+coordinates = ["a", "b", "c"]
+inputs      = ["u", "v", "w"]
+[mechanics]
+mass  = [["1", "0", "0"], ["0", "1", "0"], ["0", "0", "0.1"]]
+force = ["u + 1e-3*v", "1e4*u - v", "w - c"]
+)toml",
+                                   "three_inputs.toml");
+  const Prior by_force = make_prior(model, {Prior::Mean::force, std::nullopt});
+  RandomStream random(inverse_seed, 6);
+  const Posterior prior(by_force, {}, test::random_values(by_force, {}, random));
+  const MatrixXd states = MatrixXd::Ones(10, 2);
+  const auto open = [&](const std::vector<int>& rows) {
+    const MatrixXd wanted = MatrixXd::Constant(std::ssize(rows), 2, 0.5);
+    return inverse_dynamics(prior, {Quantity::constrained_acceleration, rows}, states, wanted).open;
+  };
+  const auto expected = [](bool u, bool v, bool w) -> decltype(InverseDynamics::open) {
+    return Eigen::Array<bool, 3, 1>(u, v, w).replicate(1, 2);
+  };
+  EXPECT_TRUE((open({0, 1, 2}) == expected(false, false, false)).all());
+  EXPECT_TRUE((open({0, 1}) == expected(false, false, true)).all());
+  EXPECT_TRUE((open({1, 2}) == expected(true, true, false)).all());
+  EXPECT_TRUE((open({2}) == expected(true, true, false)).all());
+  const Arm arm;
+  EXPECT_TRUE(arm.inverse(arm.posterior.mean(arm.view, arm.states)).open.all());
+}
+
 Model cart(const std::string& force) {
   return Model::parse(R"toml(
 name        = "cart"
@@ -179,6 +209,7 @@ TEST(InverseDynamicsTest, IsFoundByNewtonsMethodWhereTheInputsAreNotAffine) {
     // δu = δddq / (dddq/du), and the prior's deviation of ddq is 1
     EXPECT_NEAR(found.stddev()(0, i), 2 / (1 + 15 * u * u), 1e-9);
   }
+  EXPECT_FALSE(found.open.any());
 }
 
 using Solver = InverseDynamicsSolver;

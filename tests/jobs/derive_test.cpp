@@ -180,6 +180,80 @@ TEST(Derive, OfRedundantAndMissingCoordinatesTheConstraintsAreHeld) {
                             "so that q2, q4, q5 cannot be solved for; hold the constraints (`hold_constraints`)")));
 }
 
+/// The first motion of short_log with some of its positions measured, with noise, and of those q1 off by some.
+CsvTable log_of_many(const std::vector<int>& measured, double noise_stddev, double off = 0, double unit = 1) {
+  static const SimulatedLog simulated = short_log();
+  const Trajectory& truth = simulated.episodes[0];
+  RandomStream random(7);
+  std::vector<std::string> header = {"t"}, cells;
+  for (const int j : measured) header.push_back(fmt::format("q{}", j + 1));
+  for (Index i = 0; i < truth.times.size(); ++i) {
+    cells.push_back(shortest(truth.times[i]));
+    for (const int j : measured) {
+      const double value = truth.states(j, i) + noise_stddev * random.normal() + (j == 0 ? off : 0);
+      cells.push_back(shortest(j == 0 ? unit * value : value));
+    }
+  }
+  return CsvTable::from_cells("log", std::move(header), cells);
+}
+
+const auto contradicts = HasSubstr("contradict the constraints");  // NOLINT(cert-err58-cpp)
+
+TEST(Derive, SaysThatMeasuredCoordinatesContradictAConstraint) {
+  const std::vector<int> all = {0, 1, 2, 3, 4, 5}, upper = {0, 1, 2};
+  constexpr double noise = 1e-4;
+  for (const bool hold : {false, true}) {
+    for (const double sound : {0.0, 1e-6, noise, 1e-2})
+      EXPECT_THAT(derive(pendulum(), log_of_many(all, sound), {.hold_constraints = hold}).notes, Each(Not(contradicts))) << sound;
+    // an encoder's zero, and millimetres
+    for (const CsvTable& log : {log_of_many(all, noise, 10 * noise), log_of_many(all, noise, 0, 1000)}) {
+      DerivedData data;
+      try {
+        data = derive(pendulum(), log, {.hold_constraints = hold});
+      } catch (const NumericalError& error) {
+        EXPECT_THAT(error.what(), HasSubstr("do not meet the constraints"));
+        continue;
+      }
+      EXPECT_THAT(data.notes, Contains(contradicts));
+      EXPECT_THAT(data.notes, Each(Not(HasSubstr("makes use of that"))));
+    }
+  }
+  const auto fault = [](const CsvTable& log) { return input_error_of([&] { derive(pendulum(), log); }); };
+  const std::vector<int> some = {0, 2, 5};
+  EXPECT_THAT(fault(log_of_many(some, noise)), HasSubstr("which noise contradicts, so that q2, q4, q5 cannot be solved for"));
+  // one constraint: how far each alone would have to move
+  EXPECT_THAT(fault(log_of_many(some, noise, 100 * noise)),
+              testing::AllOf(HasSubstr("log: q2, q4, q5 cannot be solved for: measured coordinates contradict the constraints "
+                                       "among them, by "),
+                             HasSubstr("; to meet them one would have to move, q1 by 0.01 or q3 by "),
+                             HasSubstr(": are their units and zeros those of the model?")));
+}
+
+TEST(Derive, TellsAClockThatIsCoarserThanTheSamplesFromSecondMeasurements) {
+  const auto coarse = HasSubstr("the clock is coarser than the samples");
+  const auto ticks = [](std::vector<Row>& rows) {
+    for (std::size_t k = 0; k < rows.size(); ++k) rows[k][0] = shortest(0.02 * static_cast<double>(k / 2));
+  };
+  const DerivedData late = derive(cart(), cart_log(ticks));
+  EXPECT_THAT(late.notes, Contains(HasSubstr("warning: log.csv: the clock is coarser than the samples: 98 samples have the time "
+                                             "of the one before, and q1 moved on between, by about 0.01 s; log times")));
+  EXPECT_EQ(late.series[0].outliers, 0);
+  for (Index i = 10; i < 90; ++i)
+    EXPECT_NEAR(late.accelerations(0, i), -9 * std::sin(3 * (0.02 * static_cast<double>(i) + 0.005)), 1);
+  RandomStream random(5);
+  const DerivedData twice = derive(cart(), cart_log([&](std::vector<Row>& rows) {
+                                     std::vector<Row> all;
+                                     for (const Row& row : rows) {
+                                       all.push_back(row);
+                                       all.push_back({row[0], shortest(std::stod(row[1]) + 1e-4 * random.normal())});
+                                     }
+                                     rows = all;
+                                   }));
+  EXPECT_THAT(twice.notes, Each(Not(coarse)));
+  EXPECT_EQ(twice.series[0].outliers, 0);
+  EXPECT_THAT(derive(cart(), cart_log()).notes, Each(Not(coarse)));
+}
+
 TEST(Derive, GapsMissingCellsAndRepeatedRowsAreCountedAndBridged) {
   const CsvTable log = cart_log([](std::vector<Row>& rows) {
     rows.erase(rows.begin() + 100, rows.begin() + 110);

@@ -105,6 +105,77 @@ TEST(StartOfALog, IsFoundWhereACoordinateAndVelocitiesAreGiven) {
   }
 }
 
+Model slider_crank() {
+  return Model::parse(R"toml(
+coordinates = [{ name = "phi", angle = true }, "x"]
+[parameters]
+r = 0.08
+l = 0.22
+[mechanics]
+mass  = [["0.01", "0"], ["0", "1"]]
+force = ["0", "0"]
+[constraints]
+position = ["(x - r*cos(phi))^2 + (r*sin(phi))^2 - l^2"]
+)toml",
+                      "slider_crank.toml");
+}
+
+// dx/dphi along the constraint
+double slope_of_slider(double phi) {
+  const double r = 0.08, s = r * std::sin(phi), c = r * std::cos(phi);
+  return -s - s * c / std::sqrt(0.22 * 0.22 - s * s);
+}
+
+// what simulate() makes of a start
+VectorXd begun(const SimulateJob& job) { return run_simulation(job)[0].states.col(0); }
+
+TEST(StartOfALog, OfRoundedCoordinatesKeepsTheVelocityThatIsGiven) {
+  SimulateRequest request;
+  request.times = VectorXd::LinSpaced(2, 0, 0.01);
+  for (const double x : {0.2952, 0.295, 0.3}) {
+    request.start = std::map<std::string, double>{{"phi", 0.3}, {"x", x}, {"dphi", 2}};
+    const SimulateJob job = prepare_simulation(slider_crank(), request);
+    EXPECT_EQ(job.start.head(2), Eigen::Vector2d(0.3, x));  // as `project = false` wants them
+    const VectorXd at = begun(job);
+    EXPECT_NEAR(at[2], 2, 1e-12);
+    EXPECT_NEAR(at[3], 2 * slope_of_slider(at[0]), 1e-12);
+    EXPECT_LE(std::abs(at[1] - x), 1e-2);
+    EXPECT_THAT(job.notes, Contains(HasSubstr(fmt::format("; the nearest that has one is phi = {:.9g} for 0.3, x = {:.9g} for {}",
+                                                          at[0], at[1], x))));
+    EXPECT_THAT(job.notes, Contains(HasSubstr("start: from the constraints dx = ")));
+  }
+}
+
+TEST(StartOfALog, MovesVelocitiesWhereTheyContradictTheConstraintsAndNamesThem) {
+  SimulateRequest request;
+  request.times = VectorXd::LinSpaced(2, 0, 0.01);
+  request.start = std::map<std::string, double>{{"phi", 0.3}, {"dphi", 2}, {"dx", 0.1}};
+  const SimulateJob job = prepare_simulation(slider_crank(), request);
+  EXPECT_EQ(job.start[0], 0.3);
+  EXPECT_EQ(job.start[2], 2);
+  EXPECT_EQ(job.start[3], 0.1);
+  const VectorXd at = begun(job);
+  EXPECT_EQ(at[0], 0.3);
+  EXPECT_EQ(at[1], job.start[1]);
+  EXPECT_THAT(
+      job.notes,
+      Contains(HasSubstr(fmt::format("; the nearest that has one is dphi = {:.9g} for 2, dx = {:.9g} for 0.1", at[2], at[3]))));
+}
+
+// y is open, x and a are given too many
+TEST(StartOfALog, OfRoundedCoordinatesSolvesForTheOthersNearThem) {
+  SimulateRequest request;
+  request.times = VectorXd::LinSpaced(2, 0, 0.01);
+  request.start = std::map<std::string, double>{{"x", 0.789}, {"a", 0.8}, {"da", 0.5}};
+  const SimulateJob job = prepare_simulation(wire_pendulum(""), request);
+  const VectorXd at = begun(job);
+  EXPECT_LE((at.head(3) - Eigen::Vector3d(0.789, -1.1 * std::cos(0.8), 0.8)).cwiseAbs().maxCoeff(), 1e-3);
+  EXPECT_NEAR(at[5], 0.5, 1e-12);
+  EXPECT_NEAR(at[3], 1.1 * std::cos(at[2]) * 0.5, 1e-12);
+  EXPECT_NEAR(at[4], 1.1 * std::sin(at[2]) * 0.5, 1e-12);
+  EXPECT_THAT(job.notes, Contains(HasSubstr("; the nearest that has one is x = 0.789")));
+}
+
 // an angle of many turns where that is the solution
 TEST(StartOfALog, MayBeManyTurnsAway) {
   const Model model = Model::parse(R"toml(

@@ -69,6 +69,7 @@ TEST(UpdateJob, AWindowLeavesTheNewest) {
   const UpdateOutcome updated = update(fit, {log}, request);
   EXPECT_EQ(updated.n_states, 8);
   EXPECT_EQ(updated.fit.observations.front().values(), more_of(fit, log).values().rightCols(8));
+  EXPECT_EQ(updated.fit.data_source, log.name()) << "nothing is left of what was before";
 }
 
 // of every draw of the hyperparameters, each with a noise of its own
@@ -114,6 +115,35 @@ TEST(UpdateJob, SaysWhatTheFitIsSureIsOtherwise) {
   }
 }
 
+// One value, or a log of few rows, is enough where no noise makes it.
+TEST(UpdateJob, SaysWhichValuesCannotBe) {
+  const FitFile fit = fit_of(log_of(60, 1));
+  const auto notes_of = [&](int n, const std::string& column, int every, double added, double factor) {
+    const CsvTable sound = log_of(n, 2);
+    std::vector<CsvTable::Column> columns;
+    for (const std::string& name : sound.header()) {
+      columns.push_back({name, {}});
+      for (int row = 0; row < sound.n_rows(); ++row) {
+        const double value = sound.number_or_empty(row, sound.find(name));
+        columns.back().numbers.push_back(name == column && row % every == 0 ? factor * value + added : value);
+      }
+    }
+    return update(fit, {CsvTable::from_columns("next", std::move(columns))}, {}).notes;
+  };
+  constexpr const char *cannot_be = "cannot be what the fit predicts", *are_far = "rows are far from the fit's data";
+  for (const int n : {1, 5, 40}) {
+    EXPECT_THAT(notes_of(n, "", 1, 0, 1), testing::Not(Contains(HasSubstr("warning")))) << n;
+    EXPECT_THAT(notes_of(n, "ddq3", n, 500, 1),
+                Contains(testing::AllOf(HasSubstr("warning: next: 1 of the values"), HasSubstr(cannot_be),
+                                        HasSubstr("(ddq3, at row 1 of what is learned from it)"))))
+        << n;
+  }
+  EXPECT_THAT(notes_of(5, "ddq1", 1, 0, -1), Contains(HasSubstr(cannot_be)));
+  EXPECT_THAT(notes_of(40, "ddq1", 8, 100, 1), Contains(HasSubstr("5 of the values")));
+  EXPECT_THAT(notes_of(40, "dq1", 1, 0, 1000),
+              Contains(testing::AllOf(HasSubstr("warning: next: 40 of 40"), HasSubstr(are_far))));
+}
+
 TEST(UpdateJob, WhatCannotBeIsAnError) {
   const FitFile fit = fit_of(log_of(30, 1));
   const auto refused = [&](const UpdateRequest& request) {
@@ -123,6 +153,8 @@ TEST(UpdateJob, WhatCannotBeIsAnError) {
   silent.noise_stddev = 0;
   unknown.observe = {"ddq9"};
   EXPECT_EQ(refused(silent), "`noise_std`: must be positive and finite, got 0");
+  silent.noise_stddev = 1e-12;
+  EXPECT_THAT(refused(silent), HasSubstr("the noise standard deviation 1e-12 of ddq1 is too small for double precision"));
   EXPECT_THAT(refused(unknown), HasSubstr("`observe`: 'ddq9' is not an acceleration of "));
   none_left.window = 0;
   fading.forget = 0.5;

@@ -1,5 +1,7 @@
 """Inputs that act later than they are commanded."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -31,6 +33,9 @@ def test_a_delay_is_estimated_and_reported():
     (estimate,) = posterior.report.actuators
     assert estimate["name"] == "u.delay"
     assert abs(estimate["value"] - 0.03) < 3 * estimate["stddev"] < 0.01
+    text = str(posterior.report)
+    assert re.search(rf"^  u\.delay +{estimate['value']:.6g} ± {estimate['stddev']:.2g} +\[", text, re.MULTILINE)
+    assert text == text.strip() and text in gp2.show(posterior)
 
 
 def test_rows_are_told_by_the_whole_log_what_acts():

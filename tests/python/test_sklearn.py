@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from sklearn.base import clone
+from sklearn.compose import ColumnTransformer
 from sklearn.exceptions import NotFittedError
 from sklearn.model_selection import GridSearchCV, cross_val_score
 from sklearn.pipeline import make_pipeline
@@ -172,8 +173,65 @@ def test_frames_are_read_by_their_names(data, model):
     assert by_name.outputs_ == ["ddz", "ddx"]
     np.testing.assert_allclose(by_name.predict(X)[:, ::-1], model.predict(data[0]), rtol=1e-6, atol=1e-6)
     assert by_name.score(X, y) == by_name.score(X, y[["ddx", "ddz"]]) > 0.99
-    with pytest.raises(ValueError, match="feature names should match"):
-        by_name.predict(X[["x", "z", "dx", "dz", "push"]])
+
+
+@pytest.mark.parametrize("reversed_in_fit", [None, False, True])
+def test_frames_go_by_name_and_arrays_by_position_whatever_fit_was_given(data, model, reversed_in_fit):
+    X, y = data
+    frame = pd.DataFrame(X, columns=WIRE.state_names)
+    backwards = frame[frame.columns[::-1]]
+    given = {None: X, False: frame, True: backwards}[reversed_in_fit]
+    again = GP2Regressor(WIRE, mean="force", n_restarts=2).fit(given, y)
+    assert hasattr(again, "feature_names_in_") == (reversed_in_fit is not None) and again.n_features_in_ == 6
+    expected = model.predict(X)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for asked in (X, frame, backwards, pd.DataFrame(X), frame.drop(columns="t"), backwards.drop(columns="t")):
+            assert np.array_equal(again.predict(asked), expected)
+        assert np.array_equal(again.sample_y(backwards, 2), model.sample_y(X, 2))
+        assert again.score(backwards, y) == model.score(X, y)
+
+
+def test_an_array_has_all_columns_after_a_frame_without_some(data, model):
+    X, y = data
+    frame = pd.DataFrame(X, columns=WIRE.state_names).drop(columns="t")
+    by_name = GP2Regressor(WIRE, mean="force", n_restarts=2).fit(frame, y)
+    assert np.array_equal(by_name.predict(X), model.predict(X))
+    with pytest.raises(gp2.InputError, match=r"^X: expected 6 columns, x, z, dx, dz, t, push; got 5 feature"):
+        by_name.predict(frame.to_numpy())
+
+
+def test_transformers_may_give_frames_in_their_own_order_and_arrays_in_that_of_the_states(data, model):
+    X, y = data
+    frame = pd.DataFrame(X, columns=WIRE.state_names)
+    estimator = GP2Regressor(WIRE, mean="force", n_restarts=2)
+    push_first = ColumnTransformer([("push", "passthrough", ["push"])], remainder="passthrough", verbose_feature_names_out=False)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        of_frames = make_pipeline(push_first.set_output(transform="pandas"), estimator).fit(frame, y)
+        assert list(of_frames[-1].feature_names_in_)[0] == "push"
+        assert np.array_equal(of_frames.predict(frame), model.predict(X))
+        of_arrays = make_pipeline(FunctionTransformer(np.asarray), estimator).fit(frame, y)
+        assert np.array_equal(of_arrays.predict(frame), model.predict(X))
+
+
+def test_columns_of_frames_are_unknown_missing_or_given_twice(data, model):
+    X, y = data
+    frame = pd.DataFrame(X, columns=WIRE.state_names)
+    estimator = GP2Regressor(WIRE, n_restarts=1, max_iterations=0)
+    twice = pd.concat([frame, 0 * frame[["x"]]], axis=1)
+    for use in (model.predict, model.sample_y, lambda X: model.score(X, y), lambda X: estimator.fit(X, y)):
+        with pytest.raises(gp2.InputError, match="^X: x: given twice$"):
+            use(twice)
+        with pytest.raises(gp2.InputError, match="^X: episode: no part of a state of 'bead on a wire': x, z, dx, dz, t, push$"):
+            use(frame.assign(episode=0))
+    with pytest.raises(gp2.InputError, match="dz"):
+        model.predict(frame.drop(columns="dz"))
+    accelerations = pd.DataFrame(y[:, [0, 1, 1]], columns=["ddx", "ddz", "ddz"])
+    for use in (model.score, estimator.fit, GP2Regressor(WIRE, observe="ddx").fit):
+        with pytest.raises(gp2.InputError, match="^y: ddz: given twice$"):
+            use(frame, accelerations)
+    assert model.score(frame, pd.DataFrame(y)) == model.score(frame, pd.DataFrame(y, columns=["ddx", "ddz"])[["ddz", "ddx"]])
 
 
 def test_a_system_may_be_the_path_of_a_model_file(tmp_path, data, model):

@@ -608,6 +608,155 @@ TEST(SimulateDuffing, FollowsAConstraintThatMovesWithTime) {
   EXPECT_LE(out.max_velocity_drift, 1e-13);
 }
 
+// ---- constraints that come and go
+
+/// Two coordinates, unit masses, and velocity constraints.
+Model switched(const std::string& force, const std::string& constraints) {
+  return Model::parse("coordinates = [\"x\", \"y\"]\ninputs = [\"grip\"]\n[mechanics]\nmass = [[1, 0], [0, 1]]\nforce = [" +
+                          force + "]\n[constraints]\nvelocity = [" + constraints + "]\n",
+                      "switched.toml");
+}
+Model coupled(const std::string& force, const std::string& when) {
+  return switched(force, "{ expr = \"dx - dy\", when = \"" + when + "\" }");
+}
+
+SimulateOptions at_times(const VectorXd& times) {
+  SimulateOptions options;
+  options.times = times;
+  return options;
+}
+
+// Free of forces a step grows past any gate. Momentum gives both coordinates half the velocity at its edge, which they keep.
+TEST(SimulateConditions, AGateIsNotSteppedOverWhateverItsWidth) {
+  for (const double width : {0.004, 0.02, 0.1, 0.3, 1.0}) {
+    const Model model = coupled(R"("0", "0")", fmt::format("abs(x - 2.925) < {}", width / 2));
+    const Trajectory out = simulate_model(model, state_of(model, {{"dx", 5}}), at_times(times(1, 1001)));
+    const double t_edge = (2.925 - width / 2) / 5;
+    for (int i = 0; i < out.states.cols(); ++i) {
+      const double since = std::max(0.0, out.times[i] - t_edge);
+      EXPECT_NEAR(out.states(0, i), 5 * out.times[i] - 2.5 * since, 1e-12) << width << ", " << out.times[i];
+      EXPECT_NEAR(out.states(1, i), 2.5 * since, 1e-12) << width << ", " << out.times[i];
+      if (std::abs(out.times[i] - t_edge) < 1e-12) continue;
+      EXPECT_NEAR(out.states(2, i), since > 0 ? 2.5 : 5, 1e-12) << width << ", " << out.times[i];
+      EXPECT_NEAR(out.states(3, i), since > 0 ? 2.5 : 0, 1e-12) << width << ", " << out.times[i];
+    }
+    EXPECT_LT(out.steps, 15);
+    // a wide one is found between two times as well
+    if (width < 1) continue;
+    const Trajectory ends = simulate_model(model, state_of(model, {{"dx", 5}}), at_times(times(1, 2)));
+    EXPECT_NEAR(ends.states(3, 1), 2.5, 1e-12);
+  }
+}
+
+// Stages beyond an edge are under other constraints; the motion up to the edge has none of that.
+TEST(SimulateConditions, UnderForcesAGateIsEnteredAndLeftWithinTheTolerances) {
+  const Model model = coupled(R"("2", "-1")", "abs(x - 2) < 0.25");
+  const Trajectory out = simulate_model(model, state_of(model, {{"dx", 1}}), at_times(times(2, 41)));
+  // x = t + t² up to 1.75, then x″ = y″ = 1/2 up to 2.25, then as before
+  const double t1 = (std::sqrt(8.0) - 1) / 2, v1 = (1 + 2 * t1 - t1) / 2, y1 = -t1 * t1 / 2;
+  const double t2 = t1 + 2 * (std::sqrt(v1 * v1 + 0.5) - v1), v2 = v1 + (t2 - t1) / 2, y2 = y1 + 0.5;
+  ASSERT_LT(t2, 1.9);
+  for (int i = 0; i < out.states.cols(); ++i) {
+    const double t = out.times[i], held = t - t1, after = t - t2;
+    Eigen::Vector4d x(t + t * t, -t * t / 2, 1 + 2 * t, -t);
+    if (held > 0) x << 1.75 + v1 * held + held * held / 4, y1 + v1 * held + held * held / 4, v1 + held / 2, v1 + held / 2;
+    if (after > 0) x << 2.25 + v2 * after + after * after, y2 + v2 * after - after * after / 2, v2 + 2 * after, v2 - after;
+    EXPECT_LT((out.states.col(i).head(4) - x).lpNorm<Eigen::Infinity>(), 1e-6) << t;
+  }
+}
+
+TEST(SimulateConditions, AWindowOfTimeTakesHoldAndLetsGoAtItsEnds) {
+  const Model model = coupled(R"("1", "0")", "abs(t - 1.1) < 0.1");
+  const Trajectory out = simulate_model(model, state_of(model, {{"dx", 5}}), at_times(times(2, 18)));
+  for (int i = 0; i < out.states.cols(); ++i) {
+    const double t = out.times[i];                               // none of which is an end
+    const double apart = t < 1 ? 5 + t : t < 1.2 ? 0 : t - 1.2;  // dx − dy
+    EXPECT_NEAR(out.states(2, i) - out.states(3, i), apart, 1e-9) << t;
+    EXPECT_NEAR(out.states(2, i) + out.states(3, i), 5 + t, 1e-9) << t;
+  }
+  // one that an input opens, half way up its ramp
+  const Model gripped = coupled(R"("1", "0")", "grip > 0.5");
+  SimulateOptions options = at_times(times(2, 21));
+  options.inputs = InputSignal(Eigen::Vector3d(0, 0.5, 0.6), Eigen::RowVector3d(0, 0, 1));
+  const Trajectory grip = simulate_model(gripped, state_of(gripped, {{"dx", 5}}), options);
+  const double free = 0.55, v = (5 + free) / 2, held = 2 - free;
+  EXPECT_NEAR(grip.states(1, 20), v * held + held * held / 4, 1e-9);
+  EXPECT_NEAR(grip.states(3, 20), v + held / 2, 1e-9);
+}
+
+TEST(SimulateConditions, OneThatNeverTurnsChangesNothing) {
+  const std::string force = R"x("-x - 0.3*dy", "-4*sin(y)")x";
+  const auto motion = [](const Model& model) {
+    return simulate_model(model, state_of(model, {{"x", 1}, {"dx", 0.5}, {"dy", 0.5}}), at_times(times(3, 31)));
+  };
+  const Trajectory always = motion(coupled(force, "t > -1")), never = motion(coupled(force, "t < -1"));
+  const Trajectory with = motion(switched(force, R"("dx - dy")"));
+  EXPECT_EQ(always.states, with.states);
+  EXPECT_EQ(always.evaluations, with.evaluations);
+  const Model free = Model::parse(
+      "coordinates = [\"x\", \"y\"]\ninputs = [\"grip\"]\n[mechanics]\nmass = [[1, 0], [0, 1]]\nforce = [" + force + "]\n",
+      "free.toml");
+  const Trajectory without = motion(free);
+  EXPECT_EQ(never.states, without.states);
+  EXPECT_EQ(never.evaluations, without.evaluations);
+}
+
+TEST(SimulateConditions, SeveralTakeHoldAtOneEdge) {
+  const Model model = switched(R"("1", "0")", R"({ expr = "dx - 2", when = "x > 1" }, { expr = "dy - 1", when = "x >= 1" })");
+  const Trajectory out = simulate_model(model, state_of(model, {{"dx", 1}}), at_times(times(3, 4)));
+  const double t_edge = std::sqrt(3.0) - 1;
+  EXPECT_NEAR(out.states(0, 3), 1 + 2 * (3 - t_edge), 1e-9);
+  EXPECT_NEAR(out.states(1, 3), 3 - t_edge, 1e-9);
+}
+
+// A governor that takes away what is above 3 undoes its own condition, at once and again and again.
+TEST(SimulateConditions, OneThatItsConstraintUndoesHoldsNothingUp) {
+  const Model model = switched(R"("4", "0")", R"({ expr = "dx - 3", when = "dx > 3" })");
+  const Trajectory out = simulate_model(model, state_of(model, {}), at_times(times(1.5, 16)));
+  EXPECT_NEAR(out.states(0, 15), 1.125 + 2.25, 1e-3);
+  EXPECT_NEAR(out.states(2, 15), 3, 1e-3);
+  EXPECT_LT(out.steps, 10000);
+}
+
+// What is thrown back at the edge slides the other way then, and dry friction turns with it.
+TEST(SimulateConditions, DryFrictionTurnsWithWhatTakesHold) {
+  const Model model = coupled(R"x("-sign(dx)", "0")x", "abs(x - 1) < 0.05");
+  SimulateOptions options = at_times(times(4, 401));
+  options.switching = switching_functions(model, /*of_latents=*/false);
+  const Trajectory out = simulate_model(model, state_of(model, {{"dx", 2.5}, {"dy", -6}}), options);
+  const double back = (6 - std::sqrt(2.5 * 2.5 - 2 * 0.95)) / 2;
+  EXPECT_NEAR(out.states(0, 400), 0.95 - back * back / 2, 1e-6);
+  EXPECT_EQ(out.states(2, 400), 0);
+  EXPECT_NEAR(out.states(3, 400), -back, 1e-6);
+}
+
+// A ball that bounces and rubs on, past the gate of a coupling.
+TEST(SimulateConditions, StandBesideContactsAndDryFriction) {
+  const Model model = Model::parse(R"toml(
+coordinates = ["x", "z", "s"]
+inputs = ["touch"]
+[mechanics]
+mass  = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
+force = ["-0.1*sign(dx)", "-9.81", "0"]
+[constraints]
+velocity = [{ expr = "dx - ds", when = "abs(x - 1.5) < 0.05" }]
+position = [{ expr = "z", contact = "touch", restitution = 0.5 }]
+)toml",
+                                   "ball.toml");
+  SimulateOptions options = at_times(times(2, 401));
+  options.switching = switching_functions(model, /*of_latents=*/false);
+  options.contacts = contacts_of(model, model.system->parameter_values());
+  const Trajectory out = simulate_model(model, state_of(model, {{"z", 0.5}, {"dx", 2}}), options);
+  // the deceleration of 0.1 is shared within the gate
+  const double v1 = std::sqrt(4 - 0.2 * 1.45), t1 = (2 - v1) / 0.1, v2 = std::sqrt(v1 * v1 / 4 - 2 * 0.05 * 0.1);
+  const double t2 = t1 + (v1 / 2 - v2) / 0.05, since = 2 - t2;
+  EXPECT_NEAR(out.states(0, 400), 1.55 + v2 * since - 0.05 * since * since, 1e-7);
+  EXPECT_NEAR(out.states(1, 400), 0, 1e-12);
+  EXPECT_NEAR(out.states(2, 400), 0.1 + v2 * since, 1e-7);
+  EXPECT_NEAR(out.states(5, 400), v2, 1e-7);
+  EXPECT_EQ(out.events.size(), 23);
+}
+
 // ---- energy
 
 Model pendulum() {

@@ -252,6 +252,22 @@ TEST(Smoother, FindsLengthscaleNoiseAndTimingOfAMotion) {
   EXPECT_GT(fit.log_likelihood, punctual.log_likelihood + 100);
 }
 
+TEST(Smoother, FindsTheNoiseWhereEveryPositionIsMeasuredTwiceAtItsTime) {
+  for (const int times : {1, 2, 3}) {
+    RandomStream random(11);
+    std::vector<Measurement> measurements;
+    for (int k = 0; k < 1000; ++k) {
+      const double t = k / 100.0, q = 0.5 * std::sin(2 * t) + 0.2 * std::sin(5 * t);
+      for (int i = 0; i < times; ++i) measurements.push_back({t, q + 1e-3 * random.normal()});
+    }
+    measurements[400].value += 0.05;
+    measurements[700].value += 1;
+    const SmootherFit fit = fit_smoother(measurements);
+    EXPECT_NEAR(fit.model.noise_stddev, 1e-3, 1e-4) << times;
+    EXPECT_THAT(fit.outliers, ElementsAre(400, 700)) << times;
+  }
+}
+
 TEST(Smoother, TakesFastPlacesOfAMotionForNoTiming) {
   // bursts between which it hardly moves, a few samples each
   std::vector<Measurement> measurements;

@@ -16,6 +16,8 @@ struct InverseDynamics {
   Eigen::MatrixXd inputs;      // u: what acts       (nu × N)
   Eigen::MatrixXd covariance;  // of u at each state  (nu² × N), column-major blocks
   Eigen::MatrixXd missed;      // wanted − E[ddq] under these inputs  (d × N), rounding where the wanted can be produced
+  /// Whether w leaves an input open: others do the same, or none is needed  (nu × N). Its covariance says nothing of them.
+  Eigen::Array<bool, Eigen::Dynamic, Eigen::Dynamic> open;
 
   [[nodiscard]] Eigen::MatrixXd stddev() const;  // (nu × N)
 };
@@ -41,6 +43,7 @@ struct InverseDynamics {
                                                const Eigen::Ref<const Eigen::MatrixXd>& accelerations);
 
 /// The same at one state after another, for control loops: as a Predictor it allocates nothing, takes no locks and calls no BLAS.
+/// Which inputs are left open, as InverseDynamics::open says, it does not tell.
 /// Where v is affine in u a call costs two to four predictions of v with its Jacobian; their covariance is one more.
 ///
 /// Immutable, cheap to copy, thread-safe. Every member function throws InputError when the object was moved away.

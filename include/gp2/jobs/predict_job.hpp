@@ -13,6 +13,7 @@
 #include "gp2/export.hpp"
 #include "gp2/files/fit_file.hpp"
 #include "gp2/inference/evaluation.hpp"
+#include "gp2/inference/inverse_dynamics.hpp"
 #include "gp2/jobs/option.hpp"
 #include "gp2/posterior.hpp"
 #include "gp2/view.hpp"
@@ -78,6 +79,11 @@ struct PredictOutcome {
 /// @throws InputError for states that are missing, not finite or contradict the constraints, with the table's name; NumericalError as
 ///   inverse_dynamics.
 PredictOutcome predict(const FitFile& fit, CsvTable states, const PredictRequest& request);
+
+/// A warning where wanted accelerations leave inputs open (InverseDynamics::open), but for those that say whether there is contact.
+/// @param model   of the inputs
+/// @param states  what the rows are called
+std::optional<std::string> note_of_open_inputs(const InverseDynamics& found, const Model& model, const std::string& states);
 
 struct EvaluateRequest {
   std::vector<std::string> outputs;               // accelerations; empty: those observed in the fit

@@ -31,7 +31,8 @@ Observations more_observations(const FitFile& fit, const Posterior& posterior, c
                                std::vector<std::string>& notes);
 
 /// update(), with a word where what went through inducing points has none near the new observations.
-Posterior with_more(Posterior&& posterior, Observations more, const CsvTable& log, std::vector<std::string>& notes);
+/// @param fit  whose report loses the draws of the hyperparameters under which there is no posterior of all; and learns the log's name
+Posterior with_more(Posterior&& posterior, FitFile& fit, Observations more, const CsvTable& log, std::vector<std::string>& notes);
 
 /// Leaves the newest states that a window asks for.
 /// @throws InputError as remove_oldest, and for a window that is not positive.
