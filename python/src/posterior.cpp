@@ -273,12 +273,20 @@ void update_with(PyPosterior& self, const py::object& data, const std::vector<st
     return;
   }
   // a step that is refused undoes those before it
+  const auto undo = [&self, draws = self.file.report.draws, logs = self.file.logs, source = self.file.data_source] {
+    self.file.report.draws = draws;
+    self.file.logs = logs;
+    self.file.data_source = source;
+  };
   Posterior next = self.posterior;
-  FitFile file = self.file;
-  if (share) next = forget(std::move(next), *share);
-  next = with_more(std::move(next), file, std::move(more), log, notes);
-  keep_newest(next, request);
-  self.file = std::move(file);
+  try {
+    if (share) next = forget(std::move(next), *share);
+    next = with_more(std::move(next), self.file, std::move(more), log, notes);
+    keep_newest(next, self.file, request);
+  } catch (...) {
+    undo();
+    throw;
+  }
   self.posterior = std::move(next);
   tell(notes);
 }

@@ -448,6 +448,7 @@ FitOutcome run_once(const FitJob& job, const std::function<void(const Progress&)
       const bool has_row_order = keeps_row_order(outcome.file, job.problem.observations);
       outcome.cross_validation = cross_validate(outcome.posterior, has_row_order);
       if (result.report.inducing) result.report.inducing->stretches = outcome.cross_validation->stretches;
+      if (result.report.iterations > 0) add_noise_notes(outcome.posterior, outcome.notes);
       add_residual_notes(outcome.posterior, outcome.cross_validation->residuals, outcome.notes);
       add_stretch_note(*outcome.cross_validation, outcome.notes);
       FitOptions quick;

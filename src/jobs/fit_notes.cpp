@@ -19,10 +19,7 @@ namespace gp2 {
 using Eigen::MatrixXd;
 using Eigen::VectorXd;
 
-namespace {
-
-// A log that contradicts the others may be taken for one of much noise.
-void note_noises(const Posterior& posterior, std::vector<std::string>& notes) {
+void add_noise_notes(const Posterior& posterior, std::vector<std::string>& notes) {
   constexpr double much = 20;
   const std::vector<Observations>& all = posterior.observations();
   struct Found {
@@ -31,7 +28,7 @@ void note_noises(const Posterior& posterior, std::vector<std::string>& notes) {
   };
   std::map<std::pair<std::string, bool>, std::vector<Found>> found;  // by what is observed, and whether the log states its noise
   for (std::size_t g = 0; g < all.size(); ++g) {
-    if (!all[g].noise().is_estimated() || !all[g].view().is_of_ddq() || all[g].view().other_system) continue;
+    if (!all[g].noise().is_estimated() || all[g].has_sums() || !all[g].view().is_of_ddq() || all[g].view().other_system) continue;
     const std::vector<std::string> names = all[g].view().names(*posterior.prior().system);
     const VectorXd stddev = posterior.noise_stddev(g);
     for (Eigen::Index k = 0; k < stddev.size(); ++k) {
@@ -48,8 +45,6 @@ void note_noises(const Posterior& posterior, std::vector<std::string>& notes) {
   }
 }
 
-}  // namespace
-
 void add_residual_notes(const Posterior& posterior, const std::vector<TrainingResidual>& residuals,
                         std::vector<std::string>& notes) {
   for (std::size_t g = 0; g < posterior.observations().size(); ++g) {
@@ -58,7 +53,6 @@ void add_residual_notes(const Posterior& posterior, const std::vector<TrainingRe
       if (one.is_too_large()) notes.push_back("warning: " + one.text());
     }
   }
-  note_noises(posterior, notes);
   std::vector<std::string> large, small;
   const TrainingResidual* farthest = nullptr;
   int n_far = 0;
@@ -423,10 +417,10 @@ std::string correlated_text(const std::vector<TrainingResidual>& residuals) {
       fmt::join(correlated, ", "));
 }
 
-void add_impossible_note(const HyperparameterDraws& draws, std::vector<std::string>& notes) {
-  if (draws.n_impossible == 0) return;
+void add_impossible_note(int n_impossible, int n_draws, std::vector<std::string>& notes) {
+  if (n_impossible == 0) return;
   notes.push_back(fmt::format("warning: {} of {} draws of the hyperparameters are left out: there is no posterior under them",
-                              draws.n_impossible, draws.n_impossible + draws.size()));
+                              n_impossible, n_draws));
 }
 
 void add_draw_notes(const FitReport& report, std::vector<std::string>& notes) {
@@ -436,7 +430,8 @@ void add_draw_notes(const FitReport& report, std::vector<std::string>& notes) {
         "fit is that of the optimum");
     return;
   }
-  add_impossible_note(*report.draws, notes);
+  const int n_impossible = report.draws->n_impossible;
+  add_impossible_note(n_impossible, n_impossible + static_cast<int>(report.draws->size()), notes);
   Eigen::Index k = 0;
   const double worst = report.draws->r_hat.maxCoeff(&k);
   if (!(worst > HyperparameterDraws::largest_r_hat)) return;

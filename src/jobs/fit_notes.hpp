@@ -10,6 +10,9 @@
 // What a person should know of a fit that has ended.
 namespace gp2 {
 
+// Logs whose estimated noise is much larger than that of others: a log that contradicts them may be taken for that.
+void add_noise_notes(const Posterior& posterior, std::vector<std::string>& notes);
+
 // What the residuals say against the data, the constraints or the noise.
 void add_residual_notes(const Posterior& posterior, const std::vector<TrainingResidual>& residuals,
                         std::vector<std::string>& notes);
@@ -29,7 +32,7 @@ void add_doubts(const Posterior& posterior, bool has_row_order, const FittedValu
 std::string correlated_text(const std::vector<TrainingResidual>& residuals);
 
 // How many draws are left out, where there is no posterior under them.
-void add_impossible_note(const HyperparameterDraws& draws, std::vector<std::string>& notes);
+void add_impossible_note(int n_impossible, int n_draws, std::vector<std::string>& notes);
 
 // Whether the draws of the hyperparameters can be relied on.
 void add_draw_notes(const FitReport& report, std::vector<std::string>& notes);

@@ -3,7 +3,6 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
-#include <numeric>
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
@@ -205,10 +204,11 @@ MatrixXd noise_scale_of(const Readings& readings, const std::vector<std::string>
   return scale;
 }
 
-void require_noise(const std::string& source, const std::string& name, double signal, const Eigen::RowVectorXd& stddev) {
-  std::vector<int> rows(static_cast<std::size_t>(stddev.size()));
-  std::iota(rows.begin(), rows.end(), 0);
-  NoiseRule{source, name, signal, static_cast<int>(stddev.size())}.require_each(stddev, rows);
+void require_noise(const std::string& source, const std::string& name, double signal, const Eigen::RowVectorXd& stddev,
+                   const std::vector<int>& rows) {
+  const NoiseRule rule{source, name, signal, static_cast<int>(stddev.size())};
+  if (rows.empty()) return rule.require(stddev.minCoeff(), /*estimated=*/false);
+  rule.require_each(stddev, rows);
 }
 
 VectorXd noise_of_side_information(const LoggedSystem& logged, const SideInformation& side_information,

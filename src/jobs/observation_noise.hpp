@@ -32,8 +32,10 @@ Eigen::MatrixXd noise_scale_of(const Readings& readings, const std::vector<std::
                                const LogReader& reader, const CsvTable& log, const std::vector<int>& rows);
 
 /// @param stddev  of each value of a row whose values spread by `signal`
+/// @param rows    of the log, of each value; empty where all have one noise
 /// @throws InputError where one is too small for double precision.
-void require_noise(const std::string& source, const std::string& name, double signal, const Eigen::RowVectorXd& stddev);
+void require_noise(const std::string& source, const std::string& name, double signal, const Eigen::RowVectorXd& stddev,
+                   const std::vector<int>& rows);
 
 /// σ of each row of side information, held against the size of its signal.
 /// @param signal_stddev  of each latent

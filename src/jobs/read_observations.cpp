@@ -527,7 +527,8 @@ Observations read_log(const LoggedSystem& logged, const Log& log, const FitProbl
 
   const int n_rows = log.table.n_rows();
   std::vector<int> measured = measured_rows(readings, observed, log.table, notes);
-  note_dependence(logged, readings, all_values, log.table, notes);
+  // what is learned from windows are sums over each position by itself, not these rows
+  if (!log.windows) note_dependence(logged, readings, all_values, log.table, notes);
   keep_known(commanded, log.table, measured, notes);
   const std::vector<int> rows = chosen_rows(measured, options.max_points.value_or(n_rows), options.seed);
   if (rows.size() < measured.size()) {

@@ -4,7 +4,6 @@
 #include <cmath>
 #include <limits>
 #include <memory>
-#include <string_view>
 #include <utility>
 
 #include <fmt/format.h>
@@ -115,15 +114,40 @@ MatrixXd noise_of_values(const Observations& observations) {
   return observations.values().array().isNaN().select(std::numeric_limits<double>::infinity(), noise);
 }
 
-// As of a fit, whose accelerations tell how far they spread.
-void require_usable_noise(const Posterior& posterior, const Observations& more, const std::string& source) {
+// Noise that is given or stated must be usable, as that of a fit, whose accelerations tell how far they spread. Points that stand for
+// observations need no such limit.
+void require_usable_noise(const Posterior& posterior, const Observations& more, const CsvTable& log, const std::vector<int>& rows,
+                          bool is_given) {
+  if (posterior.summary() || more.n_data() == 0) return;
   const std::vector<std::string> names = more.view().names(*posterior.prior().system);
   const MatrixXd noise = noise_of_values(more);
   for (const Observations& group : posterior.observations()) {
-    if (!(group.view() == more.view()) || group.n_data() < 2) continue;
+    if (!(group.view() == more.view()) || group.has_sums() || group.n_data() < 2) continue;
     const VectorXd spread = row_stddev(group.values());
-    for (Index k = 0; k < noise.rows(); ++k) require_noise(source, names[static_cast<std::size_t>(k)], spread[k], noise.row(k));
+    for (Index k = 0; k < noise.rows(); ++k) {
+      if (!is_given && !more.states_noise(k)) continue;
+      require_noise(is_given ? "`noise_std`" : log.name(), names[static_cast<std::size_t>(k)], spread[k], noise.row(k),
+                    is_given ? std::vector<int>() : rows);
+    }
   }
+}
+
+// Some states, evenly taken, and those of the least and the greatest value of each row.
+std::vector<int> evenly_and_extreme(const Observations& observations, int n) {
+  std::vector<int> taken = evenly_taken({observations}, n).front();
+  const MatrixXd& values = observations.values();
+  for (Index k = 0; k < values.rows(); ++k) {
+    const auto is_measured = !values.row(k).array().isNaN();
+    if (!is_measured.any()) continue;
+    const double middle = median(measured_entries(values, k));
+    Index least = 0, greatest = 0;
+    is_measured.select(values.row(k), middle).minCoeff(&least);
+    is_measured.select(values.row(k), middle).maxCoeff(&greatest);
+    taken.insert(taken.end(), {static_cast<int>(least), static_cast<int>(greatest)});
+  }
+  std::ranges::sort(taken);
+  taken.erase(std::unique(taken.begin(), taken.end()), taken.end());
+  return taken;
 }
 
 // Values that the fit is sure to be others: many of a column near its data (a sign, a unit, a column of something else) or single ones;
@@ -135,13 +159,16 @@ void note_unexpected(const Posterior& posterior, const Observations& more, const
   constexpr double wrong = 30, wrong_far = 100;  // also by a fit that is too sure of itself, near its data and far from them
   constexpr double quartile = 0.6745;            // of |z| under a normal distribution the median
   constexpr double another_unit = 5;             // times as far as the observed states are from each other
-  if (posterior.n_states() < fewest_learned) return;
-  const Observations some = evenly({more}, most_states).front();
-  const VectorXd distance = posterior.distance_from_data(some.view(), some.states(), /*n_threads=*/0);
+  if (posterior.n_states() < fewest_learned || more.n_data() == 0) return;
+  const std::vector<int> taken = evenly_and_extreme(more, most_states);
+  const Observations some = more.take(taken);
   const Posterior::Marginal predicted = posterior.marginal(some.view(), some.states(), /*n_threads=*/0);
   const MatrixXd noise = with_slip(posterior, some.view(), some.states(), noise_of_values(some));
   const MatrixXd variance = predicted.stddev().cwiseAbs2() + noise.cwiseAbs2();
   const MatrixXd z = (some.values() - predicted.mean).cwiseAbs().cwiseQuotient(variance.cwiseSqrt());
+  // what follows a machine row by row does not wait for distances without a cause
+  if (some.n_data() < fewest_values && !(z.array() > wrong).any()) return;
+  const VectorXd distance = posterior.distance_from_data(some.view(), some.states(), /*n_threads=*/0);
   const std::vector<std::string> names = some.view().names(*posterior.prior().system);
   std::vector<std::string> others;
   int n_wrong = 0;
@@ -167,8 +194,8 @@ void note_unexpected(const Posterior& posterior, const Observations& more, const
       ++n_wrong;
       if (z(k, i) <= worst) continue;
       worst = z(k, i);
-      where = names[static_cast<std::size_t>(k)];
-      if (some.n_data() == more.n_data()) where += fmt::format(", at row {} of what is learned from it", i + 1);
+      where = fmt::format("{}, at row {} of what is learned from it", names[static_cast<std::size_t>(k)],
+                          taken[static_cast<std::size_t>(i)] + 1);
     }
   }
   if (!others.empty()) {
@@ -186,7 +213,7 @@ void note_unexpected(const Posterior& posterior, const Observations& more, const
         log.name(), n_wrong, worst, where));
   }
   const auto n_outside = (distance.array() > Posterior::far_from_data).count();
-  if (2 * n_outside > distance.size()) {
+  if (distance.size() >= fewest_values && 2 * n_outside > distance.size()) {
     const double typical = median({distance.begin(), distance.end()});
     const bool is_other = typical > another_unit;
     notes.push_back(
@@ -216,9 +243,9 @@ Posterior update_where_possible(Posterior&& posterior, FitReport& report, const 
       }
     }
     if (possible.empty()) throw;
-    report.draws->n_impossible = posterior.n_components() - static_cast<int>(possible.size());
+    Posterior rest = Posterior::mixture(posterior.prior(), all, values);
     report.draws->values = MatrixXd(report.draws->values(Eigen::all, possible));
-    return Posterior::mixture(posterior.prior(), all, values);
+    return rest;
   }
 }
 
@@ -259,14 +286,12 @@ Observations more_observations(const FitFile& fit, const Posterior& posterior, c
                     noise.stddev(),
                     false,
                     noise.has_scale() ? noise.scale() : MatrixXd()};
-  require_usable_noise(posterior, more, request.noise_stddev ? "`noise_std`" : log.name());
-  // what a window has let go of an exact fit does not count twice
-  std::vector<std::string> shared;
-  note_shared_rows(groups, {more}, shared);
-  if (log.file() && fit.has_learned(*log.file()) && (posterior.summary() || !shared.empty())) {
-    shared = {fmt::format("warning: {} was learned from already: its rows count twice", log.name())};
+  require_usable_noise(posterior, more, log, rows, request.noise_stddev.has_value());
+  if (log.file() && fit.has_learned(*log.file())) {
+    notes.push_back(fmt::format("warning: {} was learned from already: its rows count twice", log.name()));
+  } else {
+    note_shared_rows(groups, {more}, notes);
   }
-  notes.insert(notes.end(), shared.begin(), shared.end());
   try {
     note_unexpected(posterior, more, log, notes);
   } catch (const Error&) {
@@ -281,9 +306,9 @@ Posterior with_more(Posterior&& posterior, FitFile& fit, Observations more, cons
   const auto n_before = static_cast<double>(posterior.n_states());
   const int n_more = more.n_data(), n_draws = posterior.n_components();
   Posterior all = update_where_possible(std::move(posterior), fit.report, more);
-  if (all.n_components() < n_draws) add_impossible_note(*fit.report.draws, notes);
-  if (log.file()) fit.logs.push_back(*log.file());
-  fit.data_source += (fit.data_source.empty() ? "" : ", ") + log.name();
+  add_impossible_note(n_draws - all.n_components(), n_draws, notes);
+  if (n_more > 0 && log.file()) fit.logs.push_back(*log.file());
+  if (n_more > 0 && !fit.data_source.ends_with(log.name())) fit.data_source += (fit.data_source.empty() ? "" : ", ") + log.name();
   const double of_more = left_out(all) - before;
   constexpr double much = 1, usual = 3;  // nats; times as much as of as many rows before
   if (of_more > much && of_more > usual * before * n_more / n_before) {
@@ -295,29 +320,30 @@ Posterior with_more(Posterior&& posterior, FitFile& fit, Observations more, cons
   return all;
 }
 
-void keep_newest(Posterior& posterior, const UpdateRequest& request) {
+void keep_newest(Posterior& posterior, FitFile& fit, const UpdateRequest& request) {
   if (!request.window) return;
   if (*request.window < 1) throw InputError(fmt::format("`window`: must be positive, got {}", *request.window));
   const std::int64_t n_old = posterior.n_states() - *request.window;
   if (n_old > 0) posterior = remove_oldest(std::move(posterior), static_cast<int>(n_old));
+  // logs of which nothing is left
+  auto oldest = fit.logs.end();
+  for (std::int64_t n_rows = 0; oldest != fit.logs.begin() && n_rows < *request.window;) n_rows += (--oldest)->rows;
+  if (oldest == fit.logs.begin()) return;
+  fit.logs.erase(fit.logs.begin(), oldest);
+  fit.data_source.clear();
+  for (const LogFile& log : fit.logs) fit.data_source += (fit.data_source.empty() ? "" : ", ") + log.name;
 }
 
 UpdateOutcome update(FitFile fit, const std::vector<CsvTable>& logs, const UpdateRequest& request) {
   UpdateOutcome outcome;
   Posterior posterior = fit.posterior();
-  const auto n_logs = std::ssize(fit.logs);
-  const std::size_t source = fit.data_source.size();
   if (request.forget) posterior = forget(std::move(posterior), *request.forget);
   for (const CsvTable& log : logs) {
     Observations more = more_observations(fit, posterior, log, request, outcome.notes);
     outcome.n_added += more.n_data();
     posterior = with_more(std::move(posterior), fit, std::move(more), log, outcome.notes);
   }
-  keep_newest(posterior, request);
-  if (request.window && outcome.n_added >= *request.window) {  // nothing is left of what was before
-    fit.logs.erase(fit.logs.begin(), fit.logs.begin() + n_logs);
-    fit.data_source.erase(0, source + (source > 0 ? std::string_view(", ").size() : 0));
-  }
+  keep_newest(posterior, fit, request);
   fit.take_data(posterior);
   outcome.n_states = posterior.n_states();
   outcome.fit = std::move(fit);

@@ -146,6 +146,38 @@ TEST(LearnedLog, WindowsAreOfAllPositionsWhateverConstraintsHoldAmongThem) {
   EXPECT_TRUE(says_noise("ddq6_std"));
 }
 
+// rows on which a constraint holds depend on each other, but windows are of each position by itself
+TEST(LearnAndSmooth, WindowsOfAllCoordinatesAreNotSaidToDepend) {
+  FitRequest asked;
+  asked.model = Model::parse(R"(
+coordinates = ["x", "z"]
+[mechanics]
+mass = [[1, 0], [0, 1]]
+[constraints]
+position = ["z - x^2/2"]
+[[latent]]
+features = ["x", "dx"]
+)",
+                             "bead");
+  asked.restarts = 1;
+  asked.max_escapes = asked.max_iterations = 0;
+  asked.problem.max_points = 200;
+  RandomStream random(1);
+  std::vector<CsvTable::Column> columns = {{"t", {}}, {"x", {}}, {"z", {}}};
+  for (int i = 0; i < 1000; ++i) {
+    const double t = i / 250.0, x = 0.4 * std::sin(3 * t) + 0.1 * std::sin(7 * t);
+    columns[0].numbers.push_back(t);
+    columns[1].numbers.push_back(x + 5e-4 * random.normal());
+    columns[2].numbers.push_back(x * x / 2 + 5e-4 * random.normal());
+  }
+  const CsvTable log = CsvTable::from_columns("log", std::move(columns));
+  for (const bool windows : {true, false}) {
+    const LearnedLog learned = learn_and_smooth(asked, log, {.most_passes = 0, .windows = windows});
+    ASSERT_EQ(learned.windows != nullptr, windows);
+    EXPECT_THAT(prepare_fit(learned.request(asked, "log")).notes, testing::Not(testing::Contains(HasSubstr("to rounding"))));
+  }
+}
+
 // from as many states as rows
 TEST(LearnAndSmooth, LearnsMoreFromWindowsThanFromRows) {
   for (const int n_states : {200, 400}) {

@@ -69,7 +69,6 @@ TEST(UpdateJob, AWindowLeavesTheNewest) {
   const UpdateOutcome updated = update(fit, {log}, request);
   EXPECT_EQ(updated.n_states, 8);
   EXPECT_EQ(updated.fit.observations.front().values(), more_of(fit, log).values().rightCols(8));
-  EXPECT_EQ(updated.fit.data_source, log.name()) << "nothing is left of what was before";
 }
 
 // of every draw of the hyperparameters, each with a noise of its own

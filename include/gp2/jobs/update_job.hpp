@@ -34,9 +34,9 @@ Observations more_observations(const FitFile& fit, const Posterior& posterior, c
 /// @param fit  whose report loses the draws of the hyperparameters under which there is no posterior of all; and learns the log's name
 Posterior with_more(Posterior&& posterior, FitFile& fit, Observations more, const CsvTable& log, std::vector<std::string>& notes);
 
-/// Leaves the newest states that a window asks for.
+/// Leaves the newest states that a window asks for, and the names of the logs that they are of, by the rows of these.
 /// @throws InputError as remove_oldest, and for a window that is not positive.
-void keep_newest(Posterior& posterior, const UpdateRequest& request);
+void keep_newest(Posterior& posterior, FitFile& fit, const UpdateRequest& request);
 
 struct UpdateOutcome {
   FitFile fit;
