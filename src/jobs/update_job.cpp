@@ -150,15 +150,27 @@ std::vector<int> evenly_and_extreme(const Observations& observations, int n) {
   return taken;
 }
 
-// Values that the fit is sure to be others: many of a column near its data (a sign, a unit, a column of something else) or single ones;
-// and rows far from its data, of which it cannot tell.
+// Rows of whose values the fit cannot tell, most of a log.
+void note_far_rows(const VectorXd& distance, const CsvTable& log, std::vector<std::string>& notes) {
+  constexpr double another_unit = 5;  // times as far as the observed states are from each other
+  const auto n_outside = (distance.array() > Posterior::far_from_data).count();
+  if (2 * n_outside <= distance.size()) return;
+  const double typical = median({distance.begin(), distance.end()});
+  const bool is_other = typical > another_unit;
+  notes.push_back(
+      (is_other ? "warning: " : "") +
+      fmt::format("{}: {} of {} rows are far from the fit's data, half of them {:.2g} times as far or more as those are "
+                  "from each other: whether they agree with it is not known{}",
+                  log.name(), n_outside, distance.size(), typical, is_other ? ". Is the unit of a column another?" : ""));
+}
+
+// Values that the fit is sure to be others: many of a column near its data (a sign, a unit, a column of something else) or single ones.
 void note_unexpected(const Posterior& posterior, const Observations& more, const CsvTable& log, std::vector<std::string>& notes) {
   constexpr int most_states = 1000, fewest_values = 10;  // of each column
   constexpr std::int64_t fewest_learned = 30;            // fits of fewer states are sure of too much
   constexpr double unexpected = 6, sound_share = 0.2;
   constexpr double wrong = 30, wrong_far = 100;  // also by a fit that is too sure of itself, near its data and far from them
   constexpr double quartile = 0.6745;            // of |z| under a normal distribution the median
-  constexpr double another_unit = 5;             // times as far as the observed states are from each other
   if (posterior.n_states() < fewest_learned || more.n_data() == 0) return;
   const std::vector<int> taken = evenly_and_extreme(more, most_states);
   const Observations some = more.take(taken);
@@ -207,21 +219,11 @@ void note_unexpected(const Posterior& posterior, const Observations& more, const
   if (n_wrong > 0) {
     notes.push_back(fmt::format(
         "warning: {}: {} of the values cannot be what the fit predicts, up to {:.2g} deviations away ({}): outliers of the log, "
-        "or "
-        "something acts that the model does not know. They are learned from as all others: leave them out, or fit all logs "
-        "with `robust`",
+        "or something acts that the model does not know. They are learned from as all others: leave them out, or fit all "
+        "logs with `robust`",
         log.name(), n_wrong, worst, where));
   }
-  const auto n_outside = (distance.array() > Posterior::far_from_data).count();
-  if (distance.size() >= fewest_values && 2 * n_outside > distance.size()) {
-    const double typical = median({distance.begin(), distance.end()});
-    const bool is_other = typical > another_unit;
-    notes.push_back(
-        (is_other ? "warning: " : "") +
-        fmt::format("{}: {} of {} rows are far from the fit's data, half of them {:.2g} times as far or more as those are "
-                    "from each other: whether they agree with it is not known{}",
-                    log.name(), n_outside, distance.size(), typical, is_other ? ". Is the unit of a column another?" : ""));
-  }
+  if (distance.size() >= fewest_values) note_far_rows(distance, log, notes);
 }
 
 // Of draws of the hyperparameters those under which there is no posterior of all are left out, as by a fit.
