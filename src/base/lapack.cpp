@@ -211,6 +211,11 @@ void invert_factored(Eigen::Ref<Eigen::MatrixXd> L, const Pieces& pieces) {
   if (n > 0 && invert_triangle(n, block, pieces)) square_triangle(n, block, pieces);
 }
 
+void invert_lower(Eigen::Ref<Eigen::MatrixXd> L) {
+  const BufferInUse buffer;
+  if (L.rows() > 0) static_cast<void>(invert_triangle(static_cast<int>(L.rows()), {L.data(), static_cast<int>(L.outerStride())}, {}));
+}
+
 void solve_lower(const Eigen::Ref<const Eigen::MatrixXd>& L, bool transposed, Eigen::Ref<Eigen::MatrixXd> B) {
   const BufferInUse buffer;
   const int n = static_cast<int>(L.rows());

@@ -50,6 +50,11 @@ void DensePosterior::whiten(Ref<MatrixXd> c) const {
 
 MatrixXd DensePosterior::whitening_columns(Index first, Index n) const {
   const Index below = size() - first;
+  if (n == size() && !sums_) {
+    MatrixXd X = factor_.L().triangularView<Eigen::Lower>();
+    lapack::invert_lower(X);
+    return X;
+  }
   MatrixXd columns = MatrixXd::Identity(below, n);
   if (sums_) {
     MatrixXd whole = MatrixXd::Zero(size(), n);

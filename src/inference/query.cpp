@@ -1,7 +1,10 @@
 #include "inference/query.hpp"
 
+#include <algorithm>
+
 #include "gp2/error.hpp"
 #include "mechanics/describe_fault.hpp"
+#include "mechanics/pivoted_qr.hpp"
 
 namespace gp2 {
 
@@ -75,16 +78,51 @@ void Query::view_of(const Posterior::Implementation& posterior, const std::vecto
   }
 }
 
-std::vector<MatrixXd> Query::loadings(const Posterior::Implementation& posterior) const {
+std::vector<MatrixXd> Query::loadings(const Posterior::Implementation& posterior) const { return loadings(posterior, view.matrix); }
+
+std::vector<MatrixXd> Query::loadings(const Posterior::Implementation& posterior, const MatrixXd& B) const {
+  const Index nq = prior.mean.rows(), n_rows = B.rows() / nq;
   std::vector<MatrixXd> loadings;
   for (std::size_t a = 0; a < posterior.C.size(); ++a) {
     const MatrixXd& C = posterior.C[a];
-    MatrixXd& of_latent = loadings.emplace_back(MatrixXd::Zero(C.cols() * n_rows(), size()));
+    MatrixXd& of_latent = loadings.emplace_back(MatrixXd::Zero(C.cols() * n_rows, size()));
     for (int i = 0; needs(a) && i < static_cast<int>(size()); ++i) {
-      Map<MatrixXd>(of_latent.col(i).data(), C.cols(), n_rows()) = C.transpose() * (view.G(i) * prior.E(a, i)).transpose();
+      const Map<const MatrixXd> of_state(B.col(i).data(), n_rows, nq);
+      Map<MatrixXd>(of_latent.col(i).data(), C.cols(), n_rows) = C.transpose() * (of_state * prior.E(a, i)).transpose();
     }
   }
   return loadings;
+}
+
+Query::Fewer Query::fewer_loadings(const Posterior::Implementation& posterior) const {
+  constexpr double rounding = 1e-12;  // of rows of unit norm: none that matters is lost, whatever its unit
+  const Index d = n_rows(), nq = prior.mean.rows(), most = std::min(d, nq);
+  Fewer out;
+  MatrixXd bases = MatrixXd::Zero(nq * most, size());  // Wᵀ, zero beyond the rank
+  MatrixXd rows(nq, d);
+  VectorXd reflection(most);
+  Eigen::VectorXi order(d);
+  for (int i = 0; i < static_cast<int>(size()); ++i) {
+    rows = view.G(i).transpose();
+    for (auto row : rows.colwise()) {
+      if (const double norm = row.stableNorm(); norm > 0) row /= norm;
+    }
+    const Index rank = internal::pivoted_qr(rows, reflection, order, rounding);
+    auto basis = Map<MatrixXd>(bases.col(i).data(), nq, most).leftCols(rank);
+    basis.setIdentity();
+    internal::apply_Q(rows, reflection, rank, basis);
+    out.n_rows = std::max(out.n_rows, rank);
+  }
+  const Index r = out.n_rows;
+  out.U.resize(d * r, size());
+  MatrixXd W(r * nq, size());
+  for (int i = 0; i < static_cast<int>(size()); ++i) {
+    const auto basis = Map<const MatrixXd>(bases.col(i).data(), nq, most).leftCols(r);
+    Map<MatrixXd>(out.U.col(i).data(), d, r) = view.G(i).lazyProduct(basis);
+    Map<MatrixXd>(W.col(i).data(), r, nq) = basis.transpose();
+  }
+  out.loadings = loadings(posterior, W);
+  return out;
 }
 
 void require_query(const Posterior::Implementation& posterior, const View& view, const Ref<const MatrixXd>& states) {
