@@ -311,7 +311,6 @@ void for_each_line_of(const std::filesystem::path& path, const Take& take,
 namespace {
 
 constexpr std::size_t piece_size = std::size_t{1} << 20;
-constexpr int pieces_at_once = 64;  // whose numbers are in memory twice
 
 /// The lines of a file that begin within one stretch of its bytes, and the checksum of these bytes.
 struct Piece {
@@ -415,6 +414,8 @@ CsvTable CsvTable::read_pieces(const std::filesystem::path& path, const Workers&
     for_each_line(piece.lines(), [&](std::string_view line) { builder.add_line(line); });
   };
 
+  // whose numbers are in memory twice
+  const int pieces_at_once = std::max(16, workers.ranks ? 2 * workers.ranks->size() : 0);
   Builder builder(path.string(), Keep::numbers);
   const Piece head(file, 0);
   add_lines(builder, head);
