@@ -201,6 +201,21 @@ std::string data_source_of(const FitArguments& arguments) {
   return fmt::format("{}", fmt::join(sources, ", "));
 }
 
+// A whole log tells nothing more where what acts at a row does not depend on commands before.
+void require_late_inputs(const FitRequest& request) {
+  const std::vector<std::string> estimated = request.problem.estimate.value_or(std::vector<std::string>());
+  const auto is_asked_for = [&](const Parameter& one) { return one.estimate || std::ranges::count(estimated, one.name) > 0; };
+  const auto has_late = [&](const Model& model) {
+    return std::ranges::any_of(model.actuators, [&](const Actuator& one) {
+      return !one.is_direct() || is_asked_for(one.delay) || is_asked_for(one.lag);
+    });
+  };
+  const auto is_of_late = [&](const Log& log) { return log.model != nullptr && has_late(*log.model); };
+  const bool is_late = has_late(request.model) || std::ranges::any_of(request.logs, is_of_late) ||
+                       std::ranges::any_of(request.also, [&](const SideInformation& one) { return is_of_late(one.log); });
+  if (!is_late) throw InputError("`commands`: no input of the model acts late: leave it out");
+}
+
 void read_data(FitArguments& arguments, const Workers& workers) {
   FitRequest& request = arguments.request;
   request.data_source = data_source_of(arguments);
@@ -209,6 +224,7 @@ void read_data(FitArguments& arguments, const Workers& workers) {
     request.problem.commands = CsvTable::read(arguments.commands, CsvTable::Keep::numbers, workers);
   }
   for (const std::string& text : arguments.also) request.also.push_back(read_side_information(text, workers));
+  if (!arguments.commands.empty()) require_late_inputs(request);
 }
 
 // The rows of a raw log, which learning and smoothing by turns finds.
@@ -240,11 +256,27 @@ FitJob prepare(FitArguments& arguments, const std::shared_ptr<const Ranks>& rank
   return prepare_fit_again(fit, std::move(arguments.request));
 }
 
+// Hyper-priors and a discrepancy that are asked for, but that another option leaves out.
+void require_what_is_asked(const FitProblemOptions& options, const std::set<std::string>& given) {
+  const bool is_baseline = options.baseline.has_value();
+  const bool is_paper = options.protocol.name == Protocol::Name::paper;
+  const std::string fit = is_baseline ? fmt::format("`baseline={}`", Baseline::word(*options.baseline)) : "`protocol=paper`";
+  const bool has_hyperpriors = !is_baseline && !is_paper;
+  if (given.contains("hyperprior") && options.protocol.hyperprior && !has_hyperpriors) {
+    throw InputError(fmt::format("{} has no hyper-priors: leave out `hyperprior=default`", fit));
+  }
+  if (given.contains("discrepancy") && options.discrepancy && !(has_hyperpriors && options.protocol.hyperprior)) {
+    throw InputError(
+        fmt::format("{} has no discrepancy: leave out `discrepancy=default`", has_hyperpriors ? "`hyperprior=none`" : fit));
+  }
+}
+
 // A fit needs a model and data, or another fit whose options it takes.
 void require_inputs(const FitArguments& arguments, const std::set<std::string>& given) {
   if (arguments.again.empty()) {
     if (arguments.model.empty()) throw UsageError{"MODEL is required"};
     if (!arguments.raw.empty() && !arguments.data.empty()) throw UsageError{"--raw stands for --data: leave out one of them"};
+    if (!arguments.raw.empty() && !arguments.commands.empty()) throw UsageError{"--raw is the whole log: leave out --commands"};
     if (arguments.data.empty() && arguments.also.empty() && arguments.raw.empty())
       throw UsageError{"--data or --raw is required, or --also alone"};
     return;
@@ -257,10 +289,12 @@ void require_inputs(const FitArguments& arguments, const std::set<std::string>& 
     }
   }
   if (arguments.data.empty() && !arguments.also.empty()) throw InputError("`again`: `also` goes with `data`");
+  if (arguments.data.empty() && !arguments.commands.empty()) throw InputError("`again`: `commands` goes with `data`");
 }
 
 void run(FitArguments& arguments, const std::set<std::string>& given) {
   require_inputs(arguments, given);
+  require_what_is_asked(arguments.request.problem, given);
   require_output(arguments.output, inputs_of(arguments));
   if (!arguments.smoothed.empty()) require_output(arguments.smoothed, inputs_of(arguments), "--smoothed");
   const std::string checkpoint = arguments.request.checkpoint;

@@ -192,12 +192,16 @@ std::vector<std::string> notes_of(const std::vector<SimulatedMotion>& motions, c
   std::vector<std::string> notes;
   const Trajectory& first = motions[0].trajectory;
   constexpr double worth_saying = 1e-9;
-  if (first.start_displacement > worth_saying) {
+  // a warning that names the moves has told of the projection
+  const bool is_told =
+      std::ranges::any_of(job.notes, [](const std::string& note) { return note.starts_with("warning: `start`"); });
+  const bool is_moved = first.start_displacement > worth_saying;
+  if (is_moved && !is_told) {
     notes.push_back(
         fmt::format("start: projected onto the constraints, which moves it by up to {:.3g}; it was off by |c| = {:.3g}, "
                     "|dc/dt| = {:.3g}",
                     first.start_displacement, first.start_position_residual, first.start_velocity_residual));
-  } else if (std::max(first.start_position_residual, first.start_velocity_residual) > worth_saying) {
+  } else if (!is_moved && std::max(first.start_position_residual, first.start_velocity_residual) > worth_saying) {
     notes.push_back(fmt::format("start: off the constraints by |c| = {:.3g}, |dc/dt| = {:.3g}, and left there",
                                 first.start_position_residual, first.start_velocity_residual));
   }

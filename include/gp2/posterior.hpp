@@ -3,6 +3,7 @@
 #include <cstdint>
 #include <functional>
 #include <memory>
+#include <optional>
 #include <vector>
 
 #include <Eigen/Core>
@@ -64,11 +65,13 @@ class Posterior {
   /// @throws InputError when there are none, or one of them does not exist.
   [[nodiscard]] Posterior components(const std::vector<int>& which) const;
   /// Few components, in ascending order, whose mixture is within `largest_error` of this one: a prediction costs so many times that
-  /// of one component. The error is the root mean square, over the constrained accelerations at up to 300 of the observed states, of
-  /// the difference of means and of that of standard deviations, in units of the standard deviation. Found one by one, each the one
-  /// that lowers the error most; all where the error stays larger.
+  /// of one component. The error is the root mean square, over the view at up to 300 of the observed states, of the difference of
+  /// means and of that of standard deviations, in units of the standard deviation: at a single state it may be larger, and away from
+  /// the data too. Entries without a deviation, but for rounding, do not count. Found one by one, each the one that lowers the error
+  /// most; all where the error stays larger.
+  /// @param view  what the few are to predict; not given: the constrained accelerations of the prior's own system
   /// @throws InputError when the error is not above 0; as marginal().
-  [[nodiscard]] std::vector<int> fewest_components(double largest_error) const;
+  [[nodiscard]] std::vector<int> fewest_components(double largest_error, const std::optional<View>& view = {}) const;
 
   /// E[view] at N states (d × N). A state's result is the same, to the bit, whatever other states are asked for and however many
   /// threads work.

@@ -15,17 +15,18 @@ namespace gp2 GP2_API {
 /// the state. They allocate nothing, take no locks and call no BLAS, as long as the system is a SymbolicSystem (which every
 /// [mechanics] of a model file is); any other may allocate where it evaluates M, A, b, F.
 ///
-/// With β of posterior.hpp and X = L⁻¹ of the factored matrix L Lᵀ = K̃ + I,
+/// With β of posterior.hpp and the factored matrix L Lᵀ = K̃ + I,
 ///
 ///     mean     = G (μ + Σ_a E_a C_a Σ_j k_a(φ, φ_j) β_j,a) + d
-///     variance = Σ_a ℓ_aᵀ ℓ_a k_a(φ, φ) − |X c|²,    ℓ_a = (G E_a C_a)ᵀ,  c = Σ_a k̃_a ℓ_a the covariance with ỹ.
+///     variance = Σ_a ℓ_aᵀ ℓ_a k_a(φ, φ) − |L⁻¹c|²,    ℓ_a = (G E_a C_a)ᵀ,  c = Σ_a k̃_a ℓ_a the covariance with ỹ.
 ///
 /// A ddq = b of a constrained mean, and dA ddq + A dddq = db of its Jacobian, hold to rounding.
 ///
-/// The explicit inverse costs n²/2 multiplications per row of the view, as a triangular solve does, but no row waits for another.
-/// Its error is of the same order: |X c| is off by O(n ε κ) ‖c‖ where the solve is off by O(n ε κ) |X c| (Higham 2002, ch. 8 and
-/// 14), κ the condition number of L, and ‖X‖ ≤ 1 since no eigenvalue of K̃ + I is below 1. A variance that rounding makes negative
-/// is 0.
+/// L is solved with, by whole vectors of entries that are known: n²/2 multiplications per row of the view, as many as a product with an
+/// explicit inverse, which would be off by κ(L) times as much. What the solution finds is |L⁻¹c|² of an L Lᵀ that is off by rounding
+/// (Higham 2002, ch. 8): by n ε αᵀ|L||Lᵀ|α, α = (L Lᵀ)⁻¹c, little where the data are near and the noise far below the signal, so that the
+/// variance is a small difference. Through inducing points |X c|² stands in its place (theory.md, T37). A variance that rounding makes
+/// negative is 0.
 ///
 /// Of a mixture they are its moments, at the cost of one prediction for each of its components.
 ///
@@ -35,7 +36,7 @@ class Predictor {
  public:
   enum class Storage {
     double_precision,
-    /// The features, β and X of the observations in single precision, and the sums over them too: half the memory, and faster
+    /// The features, β and L of the observations in single precision, and the sums over them too: half the memory, and faster
     /// where the observations are many. Mechanics and constraints stay in double precision: A ddq = b holds as before. Kernels
     /// other than `se` are evaluated in double precision, then rounded. With e = 6e-8, half the spacing of floats at 1, D
     /// features, and r_j the distance of observation j in lengthscales, Σ_j k_j β_j of one latent function is off by at most
@@ -49,7 +50,7 @@ class Predictor {
     single_precision,
   };
   struct Options {
-    bool stddev = true;    // whether mean_and_stddev or mean_and_covariance is wanted: stores X, n²/2 numbers
+    bool stddev = true;    // whether mean_and_stddev or mean_and_covariance is wanted: stores L, n²/2 numbers
     bool jacobian = true;  // whether mean_and_jacobian is wanted
     Storage storage = Storage::double_precision;
   };

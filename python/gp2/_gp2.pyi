@@ -20,7 +20,7 @@ class _Frame(Protocol):  # of polars, say
 _Array = npt.NDArray[np.float64]
 _Path = Union[str, bytes, os.PathLike[str], os.PathLike[bytes]]
 _Table = Union[Table, str, os.PathLike[str], os.PathLike[bytes], _Columns, _Frame, npt.NDArray[np.void]]
-_Arrays = tuple[npt.ArrayLike, npt.ArrayLike]  # states, accelerations
+_Arrays = tuple[npt.ArrayLike | _Table, npt.ArrayLike | _Table]  # states, accelerations
 _Text = Union[str, float]  # an expression or a number
 _View = Literal["constrained", "unconstrained", "constraint-force", "multipliers", "next-velocity", "force"]
 _Parameters = dict[str, float]
@@ -115,8 +115,8 @@ class System:
     def state_names(self) -> list[str]: ...
     @property
     def acceleration_names(self) -> list[str]: ...
-    def evaluate(self, states: npt.ArrayLike, parameters: Mapping[str, float] = {}) -> Mechanics: ...
-    def true_acceleration(self, states: npt.ArrayLike) -> _Array: ...
+    def evaluate(self, states: npt.ArrayLike | _Table, parameters: Mapping[str, float] = {}) -> Mechanics: ...
+    def true_acceleration(self, states: npt.ArrayLike | _Table) -> _Array: ...
     def generate(
         self, n: int, seed: int = 1, noise_std: float | None = None, grid: Mapping[str, int] = {}
     ) -> Table: ...
@@ -406,9 +406,9 @@ class Posterior:
     def inverse_dynamics(
         self,
         states: npt.ArrayLike | _Table,
-        accelerations: npt.ArrayLike | None = None,
+        accelerations: npt.ArrayLike | _Table | None = None,
         *,
-        outputs: Sequence[str] = [],
+        outputs: Sequence[str] | None = None,
         system: System | None = None,
         columns: Mapping[str, str] | None = None,
     ) -> Inputs: ...
@@ -416,7 +416,7 @@ class Posterior:
         self,
         data: _Table,
         system: System | None = None,
-        outputs: Sequence[str] = [],
+        outputs: Sequence[str] | None = None,
         columns: Mapping[str, str] | None = None,
         threads: int = 0,
     ) -> Evaluation: ...
@@ -438,11 +438,19 @@ class Posterior:
         threads: int = 0,
     ) -> tuple[Posterior, dict[str, Any]]: ...
     def cross_validate(self) -> CrossValidation: ...
-    def fewest_components(self, largest_error: float) -> Posterior: ...
+    def fewest_components(
+        self,
+        largest_error: float,
+        view: _View = "constrained",
+        *,
+        system: System | None = None,
+        latent: str | None = None,
+        dt: float | None = None,
+    ) -> Posterior: ...
     def update(
         self,
         data: _Table,
-        observe: Sequence[str] = [],
+        observe: Sequence[str] | None = None,
         noise_std: float | None = None,
         columns: Mapping[str, str] | None = None,
         forget: float | None = None,
@@ -515,24 +523,24 @@ class Predictor:
         jacobian: bool = True,
         storage: Literal["double", "single"] = "double",
     ) -> None: ...
-    def mean(self, state: npt.ArrayLike) -> _Array: ...
-    def mean_and_std(self, state: npt.ArrayLike) -> tuple[_Array, _Array]: ...
-    def mean_and_cov(self, state: npt.ArrayLike) -> tuple[_Array, _Array]: ...
-    def mean_and_jacobian(self, state: npt.ArrayLike) -> tuple[_Array, _Array]: ...
-    def distance_from_data(self, state: npt.ArrayLike) -> float: ...
+    def mean(self, state: npt.ArrayLike | Mapping[str, float]) -> _Array: ...
+    def mean_and_std(self, state: npt.ArrayLike | Mapping[str, float]) -> tuple[_Array, _Array]: ...
+    def mean_and_cov(self, state: npt.ArrayLike | Mapping[str, float]) -> tuple[_Array, _Array]: ...
+    def mean_and_jacobian(self, state: npt.ArrayLike | Mapping[str, float]) -> tuple[_Array, _Array]: ...
+    def distance_from_data(self, state: npt.ArrayLike | Mapping[str, float]) -> float: ...
 
 class InverseDynamicsSolver:
     def __init__(
         self,
         posterior: Posterior,
         *,
-        outputs: Sequence[str] = [],
+        outputs: Sequence[str] | None = None,
         system: System | None = None,
         cov: bool = True,
         storage: Literal["double", "single"] = "double",
     ) -> None: ...
-    def inputs(self, state: npt.ArrayLike, accelerations: npt.ArrayLike) -> _Array: ...
-    def inputs_and_cov(self, state: npt.ArrayLike, accelerations: npt.ArrayLike) -> tuple[_Array, _Array]: ...
+    def inputs(self, state: npt.ArrayLike | Mapping[str, float], accelerations: npt.ArrayLike | Mapping[str, float]) -> _Array: ...
+    def inputs_and_cov(self, state: npt.ArrayLike | Mapping[str, float], accelerations: npt.ArrayLike | Mapping[str, float]) -> tuple[_Array, _Array]: ...
 
 class Log:
     def __init__(self, data: _Table, system: System | None = None) -> None: ...
@@ -575,7 +583,7 @@ def fit(
     also_noise_std: float | None = None,
     dt: float | None = None,
     columns: Mapping[str, str] | None = None,
-    observe: Sequence[str] = [],
+    observe: Sequence[str] | None = None,
     noise_std: float | Literal["estimate", "stated"] | None = None,
     max_points: int | None = None,
     thin: bool = True,
@@ -612,7 +620,7 @@ def fit_raw(
     also_noise_std: float | None = None,
     dt: float | None = None,
     columns: Mapping[str, str] | None = None,
-    observe: Sequence[str] = [],
+    observe: Sequence[str] | None = None,
     noise_std: float | Literal["estimate", "stated"] | None = None,
     max_points: int | None = None,
     thin: bool = True,
@@ -641,7 +649,7 @@ def fit_raw(
     passes: int = 4,
     windows: bool = True,
     episode: str = "",
-    episodes: Sequence[str] = [],
+    episodes: Sequence[str] | None = None,
     time_unit: Literal["auto", "s", "ms", "us", "ns"] = "auto",
     outlier_threshold: float = 5.0,
     smoothness: Literal["auto", "5/2", "7/2", "9/2"] = "auto",
@@ -666,7 +674,7 @@ def derive(
     *,
     # options of derive: written by scripts/options
     episode: str = "",
-    episodes: Sequence[str] = [],
+    episodes: Sequence[str] | None = None,
     time_unit: Literal["auto", "s", "ms", "us", "ns"] = "auto",
     rate: float = 0.0,
     every: int = 1,
@@ -683,7 +691,7 @@ def resample(
     n: int,
     *,
     # options of resample: written by scripts/options
-    features: Sequence[str] = [],
+    features: Sequence[str] | None = None,
     seed: int | None = None,
     columns: Mapping[str, str] | None = None,
     # end of options

@@ -118,7 +118,7 @@ class GP2Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         accelerations = np.full((len(rows), len(names)), np.nan)
         accelerations[:, self._rows_of_view()] = rows
         options = {
-            "observe": self.outputs_ if len(self.outputs_) < len(names) else [],
+            "observe": self.outputs_ if len(self.outputs_) < len(names) else None,
             "mean": self.mean,
             "prior": self.prior,
             "baseline": self.baseline,
@@ -184,27 +184,29 @@ class GP2Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             what, outputs = "observe", [self.observe] if isinstance(self.observe, str) else list(self.observe)
         else:
             what, outputs = "y", _column_names("y", y) or names
+        if not outputs:
+            raise gp2.InputError(f"{what}: expected at least one name, got []")
         _refuse_twice(what, [str(name) for name in outputs])
         unknown = [str(name) for name in outputs if name not in names]
         if unknown:
             raise gp2.InputError(f"{what}: {', '.join(unknown)}: no acceleration of '{system.name}': {', '.join(names)}")
         return outputs
 
-    def _columns_in_state(self, X: np.ndarray, given: list[str] | None) -> list[int]:
+    def _columns_in_state(self, n_columns: int, given: list[str] | None) -> list[int]:
         names = self.system_.state_names
         if self.system is None:
             return [names.index(name) for name in self.system_.inputs]
         unknown = [name for name in given or [] if name not in names]
         if unknown:
             raise gp2.InputError(f"X: {', '.join(unknown)}: no part of a state of '{self.system_.name}': {', '.join(names)}")
-        if given is None and X.shape[1] != len(names):
-            raise gp2.InputError(f"X: expected {len(names)} columns, {', '.join(names)}; got {X.shape[1]} feature(s)")
+        if given is None and n_columns != len(names):
+            raise gp2.InputError(f"X: expected {len(names)} columns, {', '.join(names)}; got {n_columns} feature(s)")
         return [names.index(name) for name in given or names]
 
     def _states(self, X: np.ndarray, given: list[str] | None) -> np.ndarray:
         """States from X with columns of the names `given`, or, where there are none, of all states in order."""
         states = np.full((len(X), len(self.system_.state_names)), np.nan)
-        states[:, self._columns_in_state(X, given)] = X
+        states[:, self._columns_in_state(X.shape[1], given)] = X
         return states
 
     def _checked_states(self, X) -> np.ndarray:

@@ -1,12 +1,15 @@
 #include "arrays.hpp"
 
+#include <algorithm>
 #include <limits>
 #include <memory>
 #include <new>
+#include <set>
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
+#include "bindings.hpp"
 #include "gp2/error.hpp"
 
 namespace gp2::python {
@@ -45,17 +48,39 @@ py::array own(Values values, const std::vector<py::ssize_t>& shape) {
   return py::array_t<double>(shape, kept->data(), owner);
 }
 
+constexpr double not_a_number = std::numeric_limits<double>::quiet_NaN();
+
+void require_known(const std::string& name, const std::vector<std::string>& names, const std::string& what) {
+  if (std::ranges::count(names, name) > 0) return;
+  throw InputError(fmt::format("{}: unknown column '{}'; there may be: {}", what, name, fmt::join(names, ", ")));
+}
+
+// An array as it is; of a table its columns in the order of `names`.
+py::object in_order(const py::object& data, const std::vector<std::string>& names, const std::string& what) {
+  if (!column_names(data)) return data;
+  const CsvTable table = to_table(data, what);
+  for (const std::string& name : table.header()) require_known(name, names, what);
+  Eigen::MatrixXd values = Eigen::MatrixXd::Constant(std::ssize(names), table.n_rows(), not_a_number);
+  for (std::size_t k = 0; k < names.size(); ++k) {
+    const int column = table.find(names[k]);
+    for (int i = 0; column >= 0 && i < table.n_rows(); ++i) {
+      values(static_cast<Eigen::Index>(k), i) = table.number_or_empty(i, column);
+    }
+  }
+  return to_rows(std::move(values));
+}
+
 }  // namespace
 
 py::object without_mask(const py::object& array) {
   if (!py::hasattr(array, "mask") || !py::hasattr(array, "filled") || !py::hasattr(array, "dtype")) return array;
   const auto kind = array.attr("dtype").attr("kind").cast<std::string>();
   if (kind != "f" && kind != "i" && kind != "u") return array;
-  return array.attr("astype")("float64").attr("filled")(std::numeric_limits<double>::quiet_NaN());
+  return array.attr("astype")("float64").attr("filled")(not_a_number);
 }
 
 Rows::Rows(const py::object& array, const std::vector<std::string>& names, const std::string& what)
-    : array_(doubles(array, what)) {
+    : array_(doubles(in_order(array, names, what), what)) {
   const auto d = static_cast<py::ssize_t>(names.size());
   if (array_.ndim() != 2 || array_.shape(1) != d) {
     const bool one = array_.ndim() == 1 && array_.shape(0) == d;
@@ -80,6 +105,25 @@ py::array_t<double, py::array::c_style> vector_argument(const py::object& array,
   return values;
 }
 
+py::array_t<double, py::array::c_style> vector_argument(const py::object& array, const std::vector<std::string>& names,
+                                                        const std::string& what) {
+  const std::optional<py::list> given = column_names(array);
+  if (!given) return vector_argument(array, std::ssize(names), what);
+  require_once(*given, what);
+  Eigen::VectorXd values = Eigen::VectorXd::Constant(std::ssize(names), not_a_number);
+  for (const py::handle key : *given) {
+    const std::string name = py::str(key);
+    require_known(name, names, what);
+    const py::object value = array[key];
+    try {
+      values[std::ranges::find(names, name) - names.begin()] = value.cast<double>();
+    } catch (const py::cast_error&) {
+      throw py::type_error(fmt::format("{}['{}']: expected a number, got {}", what, name, std::string(py::repr(value))));
+    }
+  }
+  return to_vector(std::move(values));
+}
+
 bool is_array(const py::object& data) {
   if (py::isinstance<py::list>(data) || py::isinstance<py::tuple>(data)) return true;
   return py::hasattr(data, "shape") && !column_names(data);
@@ -90,11 +134,24 @@ std::optional<py::list> column_names(const py::object& data) {
     const py::object names = data.attr("dtype").attr("names");
     return names.is_none() ? std::nullopt : std::optional(py::list(names));
   }
-  if (py::hasattr(data, "keys")) return py::list(data.attr("keys")());
-  if (!py::hasattr(data, "columns")) return std::nullopt;
-  py::list names(data.attr("columns"));
-  const bool are_names = std::all_of(names.begin(), names.end(), [](py::handle name) { return py::isinstance<py::str>(name); });
-  return are_names ? std::optional(std::move(names)) : std::nullopt;
+  py::list names;
+  if (py::hasattr(data, "keys")) {
+    names = py::list(data.attr("keys")());
+  } else if (py::hasattr(data, "columns")) {
+    names = py::list(data.attr("columns"));
+  } else {
+    return std::nullopt;
+  }
+  const bool are_names = std::any_of(names.begin(), names.end(), [](py::handle name) { return py::isinstance<py::str>(name); });
+  return are_names || names.empty() ? std::optional(std::move(names)) : std::nullopt;
+}
+
+void require_once(const py::list& names, const std::string& what) {
+  std::set<std::string> seen;
+  for (const py::handle one : names) {
+    const std::string name = py::str(one);
+    if (!seen.insert(name).second) throw InputError(fmt::format("{}: the column '{}' stands twice", what, name));
+  }
 }
 
 py::array to_rows(Eigen::MatrixXd columns) {

@@ -15,11 +15,12 @@ namespace gp2::python {
 namespace py = pybind11;
 
 /// Numbers as the library takes them: column i is row i of a NumPy array (n, d). C-contiguous doubles are looked at in place, all
-/// else that holds real numbers is converted.
+/// else that holds real numbers is converted. The columns of a table are found by their names; one that it lacks is NaN.
 class Rows {
  public:
   /// @param what  stands for the argument in messages
-  /// @throws py::type_error when the array does not hold real numbers; InputError when it is not (n, names.size()).
+  /// @throws py::type_error when the array does not hold real numbers; InputError when it is not (n, names.size()), or when a table
+  ///   has a column of another name, or one twice.
   Rows(const py::object& array, const std::vector<std::string>& names, const std::string& what);
 
   [[nodiscard]] Eigen::Map<const Eigen::MatrixXd> matrix() const;  // (d × n)
@@ -34,11 +35,20 @@ py::object without_mask(const py::object& array);
 /// A vector of `size` numbers. @throws as Rows.
 py::array_t<double, py::array::c_style> vector_argument(const py::object& array, Eigen::Index size, const std::string& what);
 
+/// A vector of one number for each name; those of a mapping or a pandas Series are found by their names, as columns by Rows.
+/// @throws as Rows.
+py::array_t<double, py::array::c_style> vector_argument(const py::object& array, const std::vector<std::string>& names,
+                                                        const std::string& what);
+
 /// The same of any size.
 py::array_t<double, py::array::c_style> vector_argument(const py::object& array, const std::string& what);
 
-/// The names of the columns of a mapping, a frame or a structured array, keys as they are; nothing of what is no table.
+/// The names of the columns of a mapping, a frame or a structured array, keys as they are; nothing of what is no table, or has only
+/// numbers for names.
 std::optional<py::list> column_names(const py::object& data);
+
+/// @throws InputError for a name that stands twice.
+void require_once(const py::list& names, const std::string& what);
 
 /// Whether an argument is an array rather than a table: a list or tuple, or what has a shape, but no named columns.
 bool is_array(const py::object& data);

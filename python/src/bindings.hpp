@@ -83,6 +83,11 @@ CsvTable to_table(const py::object& data, const std::string& what, CsvTable::Kee
 /// The model's name -> the log's name. @throws py::type_error
 std::map<std::string, std::string> columns_argument(const py::object& columns);
 
+/// Names that an argument lists; None where it is not given.
+using GivenNames = std::optional<std::vector<std::string>>;
+/// No names stand for all. @throws InputError for an empty list, whose caller does not mean all.
+std::vector<std::string> names_or_all(const GivenNames& names, const char* what);
+
 /// @throws InputError when there is a value and it is smaller.
 void require_at_least(int smallest, const std::optional<int>& value, const char* what);
 

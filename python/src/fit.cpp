@@ -219,7 +219,7 @@ std::string fit_documentation() {
 Fit a system to measured accelerations.
 
 data        a path, Table, frame of pandas or polars, structured array or mapping with columns named as the model's (or aliases); or (states, accelerations),
-            arrays (n, len(state_names)) and (n, nq); or a list of these and of Log, empty where `also` is all there is. NaN, or None, of an acceleration is "not measured"
+            arrays (n, len(state_names)) and (n, nq), or frames and mappings with columns of these names; or a list of these and of Log, empty where `also` is all there is. NaN, or None, of an acceleration is "not measured"
 commands    where inputs act late and `data` are rows of a longer log: that log, t and inputs, and `episode` where there is one.
             Inputs of tables are commands; those of arrays are what acts
 also        a SideInformation, or a list of them: other quantities, measured or known
@@ -251,6 +251,13 @@ progress    as in fit
 }
 
 }  // namespace
+
+std::vector<std::string> names_or_all(const GivenNames& names, const char* what) {
+  if (names && names->empty()) {
+    throw InputError(fmt::format("{}: expected at least one name, got []; None stands for the default", what));
+  }
+  return names.value_or(std::vector<std::string>());
+}
 
 void require_at_least(int smallest, const std::optional<int>& value, const char* what) {
   if (value && *value < smallest) throw InputError(fmt::format("{}: must be at least {}, got {}", what, smallest, *value));

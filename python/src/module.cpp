@@ -73,9 +73,9 @@ void refuse_wrong_type(const std::string& text, const std::string& signatures, c
   const py::object re = py::module_::import("re");
   std::size_t position = text.find("__init__()") == 0 ? 1 : 0;  // whose signature does not have the object
   std::string negative;  // a whole number below 0, which is what is wrong where nothing else is
-  for (const py::handle parameter : re.attr("findall")(R"((\w+): ([\w.]+(?:\[\w+\])?))", signatures)) {
-    const auto pair = parameter.cast<std::pair<std::string, std::string>>();
-    const std::string &name = pair.first, &type = pair.second;
+  for (const py::handle parameter : re.attr("findall")(R"((\w+): (Optional\[)?([\w.]+(?:\[\w+\])?))", signatures)) {
+    const auto parts = parameter.cast<std::array<std::string, 3>>();
+    const std::string &name = parts[0], &optional = parts[1], &type = parts[2];
     py::object value;
     if (keywords.contains(name)) {
       value = keywords[name.c_str()];
@@ -88,7 +88,8 @@ void refuse_wrong_type(const std::string& text, const std::string& signatures, c
     const auto got = [&](const char* expected) {
       return fmt::format("{}: expected {}, got {}", name, expected, py::repr(value).cast<std::string>());
     };
-    const bool is_left_out = value.is_none() && signatures.find(fmt::format("{}: {} = None", name, type)) != std::string::npos;
+    const bool may_be_none = !optional.empty() || signatures.find(fmt::format("{}: {} = None", name, type)) != std::string::npos;
+    const bool is_left_out = value.is_none() && may_be_none;
     if (!is_left_out && !known->fits(value)) throw py::type_error(got(known->words));
     if (type != "int") continue;
     const auto number = py::reinterpret_steal<py::object>(PyNumber_Index(value.ptr()));

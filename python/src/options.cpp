@@ -67,19 +67,25 @@ void read_named_numbers(py::handle given, NamedNumbers& numbers, const std::stri
   }
 }
 
+// Whether an empty list stands for something else than no names.
+bool is_list_with_default(const Option& option) {
+  return std::holds_alternative<std::vector<std::string>*>(option.value) && !option.otherwise.empty();
+}
+
 // None stands for "not given" wherever that is possible.
-bool has_none(const OptionValue& value) {
-  return std::visit(
-      Overloaded{[]<typename T>(std::optional<T>*) { return true; }, [](std::map<std::string, std::string>*) { return true; },
-                 [](std::map<std::string, int>*) { return true; }, [](NamedNumbers*) { return true; },
-                 [](const Choice& one) { return one.get().empty(); }, [](const NumberOrWord&) { return true; },
-                 [](const auto&) { return false; }},
-      value);
+bool has_none(const Option& option) {
+  return is_list_with_default(option) ||
+         std::visit(Overloaded{[]<typename T>(std::optional<T>*) { return true; },
+                               [](std::map<std::string, std::string>*) { return true; },
+                               [](std::map<std::string, int>*) { return true; }, [](NamedNumbers*) { return true; },
+                               [](const Choice& one) { return one.get().empty(); }, [](const NumberOrWord&) { return true; },
+                               [](const auto&) { return false; }},
+                    option.value);
 }
 
 void read_keyword(py::handle given, const Option& option) {
   const std::string& name = keyword_of(option);
-  if (given.is_none() && has_none(option.value)) return;
+  if (given.is_none() && has_none(option)) return;
   std::visit(
       Overloaded{
           [&](bool* flag) { *flag = cast<bool>(given, name, "True or False"); },
@@ -98,7 +104,10 @@ void read_keyword(py::handle given, const Option& option) {
           },
           [&](std::optional<double>* value) { *value = cast<double>(given, name, "a number"); },
           [&](std::optional<std::string>* value) { *value = cast<std::string>(given, name, "a str"); },
-          [&](std::vector<std::string>* list) { *list = cast<std::vector<std::string>>(given, name, "a list of names"); },
+          [&](std::vector<std::string>* list) {
+            *list = cast<std::vector<std::string>>(given, name, "a list of names");
+            if (is_list_with_default(option)) *list = names_or_all(*list, name.c_str());
+          },
           [&](std::optional<std::vector<std::string>>* list) {
             *list = cast<std::vector<std::string>>(given, name, "a list of names");
           },
@@ -171,8 +180,8 @@ std::string default_of(const OptionValue& value) {
 }
 
 std::string declaration(const Option& option) {
-  return fmt::format("{}: {}{} = {}", keyword_of(option), type_of(option.value), has_none(option.value) ? " | None" : "",
-                     default_of(option.value));
+  return fmt::format("{}: {}{} = {}", keyword_of(option), type_of(option.value), has_none(option) ? " | None" : "",
+                     is_list_with_default(option) ? "None" : default_of(option.value));
 }
 
 // Every option that a message may name, with its kind.
@@ -249,6 +258,10 @@ void read_keywords(const std::string& function, const py::dict& keywords, const 
     const auto option = std::find_if(options.begin(), options.end(), [&](const Option& one) { return keyword_of(one) == name; });
     if (option != options.end()) {
       read_keyword(value, *option);
+      const Option* needed = find_option(options, option->needs);
+      if (needed != nullptr && !keywords.contains(keyword_of(*needed))) {
+        throw InputError(fmt::format("{}: goes with {}, without which it means nothing", name, keyword_of(*needed)));
+      }
       continue;
     }
     py::list known;

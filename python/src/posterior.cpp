@@ -167,7 +167,8 @@ struct Inputs {
 };
 
 Inputs inverse_dynamics_of(const PyPosterior& self, const py::object& data, const py::object& accelerations,
-                           const std::vector<std::string>& outputs, const PySystem* system, const py::object& columns) {
+                           const GivenNames& given_outputs, const PySystem* system, const py::object& columns) {
+  const std::vector<std::string> outputs = names_or_all(given_outputs, "outputs");
   const FitSystem at = system_of(self.file, self.posterior.prior(), model_of(system));
   const System& there = *at.model->system;
   WantedMotion wanted;
@@ -215,9 +216,9 @@ void add_inputs(py::module_& module) {
 
 // ---------------------------------------------------------------- figures
 
-Evaluation evaluate_posterior(const PyPosterior& self, const py::object& data, const PySystem* system,
-                              const std::vector<std::string>& outputs, const py::object& columns, int n_threads) {
-  const EvaluateRequest request{outputs, model_of(system), columns_argument(columns), n_threads};
+Evaluation evaluate_posterior(const PyPosterior& self, const py::object& data, const PySystem* system, const GivenNames& outputs,
+                              const py::object& columns, int n_threads) {
+  const EvaluateRequest request{names_or_all(outputs, "outputs"), model_of(system), columns_argument(columns), n_threads};
   const CsvTable table = to_table(data, "data");
   const Posterior posterior = self.posterior;
   EvaluateOutcome outcome = unlocked([&] { return evaluate(self.file, posterior, table, request); });
@@ -258,10 +259,9 @@ std::optional<Posterior> kept_by_others(const PyPosterior& self) {
   return self.file.model.code ? std::optional(self.posterior) : std::nullopt;
 }
 
-void update_with(PyPosterior& self, const py::object& data, const std::vector<std::string>& observe,
-                 const std::optional<double>& noise_stddev, const py::object& columns, const std::optional<double>& share,
-                 const std::optional<int>& window) {
-  const UpdateRequest request{observe, noise_stddev, columns_argument(columns), share, window};
+void update_with(PyPosterior& self, const py::object& data, const GivenNames& observe, const std::optional<double>& noise_stddev,
+                 const py::object& columns, const std::optional<double>& share, const std::optional<int>& window) {
+  const UpdateRequest request{names_or_all(observe, "observe"), noise_stddev, columns_argument(columns), share, window};
   std::vector<std::string> notes;
   const CsvTable log = to_table(data, "data");
   Observations more = more_observations(self.file, self.posterior, log, request, notes);
@@ -476,7 +476,7 @@ It is relative to the first state, for accelerations say nothing of a constant i
 void define_inverse_dynamics(py::class_<PyPosterior>& posterior) {
   using namespace py::literals;
   posterior.def("inverse_dynamics", &inverse_dynamics_of, "states"_a, "accelerations"_a = py::none(), py::kw_only(),
-                "outputs"_a = std::vector<std::string>(), "system"_a = nullptr, "columns"_a = py::none(),
+                "outputs"_a = py::none(), "system"_a = nullptr, "columns"_a = py::none(),
                 R"(The inputs that produce wanted accelerations under the constraints, with their deviation.
 
 states         (n, len(state_names)), whose inputs are where the search begins; or a table with the states and, as its columns
@@ -494,8 +494,8 @@ Raises NumericalError where none are found.)");
 void define_evaluate_and_update(py::class_<PyPosterior>& posterior) {
   using namespace py::literals;
   posterior
-      .def("evaluate", &evaluate_posterior, "data"_a, "system"_a = nullptr, "outputs"_a = std::vector<std::string>(),
-           "columns"_a = py::none(), "threads"_a = 0, "Compare with measured or true accelerations: the figures of gp2 evaluate.")
+      .def("evaluate", &evaluate_posterior, "data"_a, "system"_a = nullptr, "outputs"_a = py::none(), "columns"_a = py::none(),
+           "threads"_a = 0, "Compare with measured or true accelerations: the figures of gp2 evaluate.")
       .def("shoot", &shoot_posterior, "data"_a, "duration"_a = py::none(), "stretches"_a = ShootRequest().most_stretches,
            "columns"_a = py::none(), "threads"_a = 0,
            "The estimated parameters anew, by multiple shooting over stretches of a log of consecutive rows (t, coordinates,\n"
@@ -507,19 +507,26 @@ void define_evaluate_and_update(py::class_<PyPosterior>& posterior) {
           "How well the data predict themselves: each value from all others, and each of five stretches of time from the rest.")
       .def(
           "fewest_components",
-          [](const PyPosterior& self, double largest_error) {
-            const std::vector<int> few = self.posterior.fewest_components(largest_error);
+          [](const PyPosterior& self, double largest_error, const std::string& view, const PySystem* system,
+             const std::optional<std::string>& latent, const std::optional<double>& dt) {
+            const ViewRequest request = view_request({view, system, latent, dt});
+            const py::gil_scoped_release released;
+            const PredictedView at = predicted_view(self.file, self.posterior.prior(), request);
+            const std::vector<int> few = self.posterior.fewest_components(largest_error, at.view);
             PyPosterior out{self.file, self.posterior.components(few), {}};
             std::optional<HyperparameterDraws>& draws = out.file.report.draws;
             if (draws) draws->values = MatrixXd(draws->values(Eigen::all, few));
             return out;
           },
-          "largest_error"_a, py::call_guard<py::gil_scoped_release>(),
-          "The mixture of few of its components, for loops that cannot wait for all: at the observed states within this share of "
-          "a "
-          "standard deviation of it, root mean square over means and deviations.")
-      .def("update", &update_with, "data"_a, "observe"_a = std::vector<std::string>(), "noise_std"_a = py::none(),
-           "columns"_a = py::none(), "forget"_a = py::none(), "window"_a = py::none(),
+          "largest_error"_a, "view"_a = "constrained", py::kw_only(), "system"_a = nullptr, "latent"_a = py::none(),
+          "dt"_a = py::none(),
+          "The mixture of few of its components, for loops that cannot wait for all: of this view, as in predict, within this "
+          "share of "
+          "a standard deviation, root mean square of means and deviations over up to 300 observed states. Single states may be "
+          "off "
+          "by more.")
+      .def("update", &update_with, "data"_a, "observe"_a = py::none(), "noise_std"_a = py::none(), "columns"_a = py::none(),
+           "forget"_a = py::none(), "window"_a = py::none(),
            "Add measured accelerations, in place: O(N²) per row, or O(M²) through M inducing variables. Hyperparameters, "
            "parameters "
            "and scales are held. `forget`: first let what was learned count as this share of it, through inducing points; "

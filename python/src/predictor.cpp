@@ -19,12 +19,12 @@ namespace {
 using Numbers = py::array_t<double, py::array::c_style>;
 
 // the array itself where it is one of doubles, all of which may be looked at
-Numbers numbers_of(const py::object& given, Eigen::Index size, const char* name) {
+Numbers numbers_of(const py::object& given, const std::vector<std::string>& names, const char* what) {
   if (Numbers::check_(given) && !py::hasattr(given, "mask")) {
     auto x = py::reinterpret_borrow<Numbers>(given);
-    if (x.ndim() == 1 && x.shape(0) == size) return x;
+    if (x.ndim() == 1 && x.shape(0) == std::ssize(names)) return x;
   }
-  return vector_argument(given, size, name);
+  return vector_argument(given, names, what);
 }
 
 Eigen::Map<const Eigen::VectorXd> map(const Numbers& x) { return {x.data(), x.size()}; }
@@ -52,7 +52,7 @@ class PyPredictor {
       : predictor_(posterior.posterior, view, options),
         workspace_(predictor_.make_workspace()),
         model_has_code_(posterior.file.model.code),
-        size_(posterior.system().layout().size()) {}
+        names_(posterior.system().state_names()) {}
 
   py::array_t<double> mean(const py::object& state) {
     const auto x = state_of(state);
@@ -82,9 +82,9 @@ class PyPredictor {
 
   py::tuple mean_and_jacobian(const py::object& state) {
     const auto x = state_of(state);
-    py::array_t<double, py::array::f_style> jacobian({static_cast<py::ssize_t>(rows()), static_cast<py::ssize_t>(size_)});
+    py::array_t<double, py::array::f_style> jacobian({static_cast<py::ssize_t>(rows()), std::ssize(names_)});
     py::array_t<double> mean(rows());
-    Eigen::Map<Eigen::MatrixXd> columns(jacobian.mutable_data(), rows(), size_);
+    Eigen::Map<Eigen::MatrixXd> columns(jacobian.mutable_data(), rows(), std::ssize(names_));
     require(
         [&](Predictor::Workspace& workspace) { return predictor_.mean_and_jacobian(map(x), map_out(mean), columns, workspace); });
     return py::make_tuple(mean, jacobian);
@@ -105,7 +105,7 @@ class PyPredictor {
  private:
   [[nodiscard]] Eigen::Index rows() const { return predictor_.view().size(); }
 
-  [[nodiscard]] Numbers state_of(const py::object& state) const { return numbers_of(state, size_, "state"); }
+  [[nodiscard]] Numbers state_of(const py::object& state) const { return numbers_of(state, names_, "state"); }
 
   template <typename Call>
   void require(const Call& call) {
@@ -138,7 +138,7 @@ class PyPredictor {
   Predictor predictor_;
   Predictor::Workspace workspace_;
   bool model_has_code_ = false;
-  Eigen::Index size_ = 0;
+  std::vector<std::string> names_;  // of a state
 };
 
 PyPredictor make(const PyPosterior& posterior, const std::string& quantity, const PySystem* system,
@@ -156,10 +156,12 @@ class PySolver {
       : solver_(posterior.posterior, view, options),
         workspace_(solver_.make_workspace()),
         model_has_code_(posterior.file.model.code),
-        layout_(posterior.system().layout()) {}
+        names_(posterior.system().state_names()),
+        wanted_names_(view.names(posterior.system())),
+        nu_(posterior.system().layout().nu) {}
 
   py::array_t<double> inputs(const py::object& state, const py::object& accelerations) {
-    py::array_t<double> inputs(layout_.nu);
+    py::array_t<double> inputs(nu_);
     require(state, accelerations, [&](const auto& x, const auto& wanted, InverseDynamicsSolver::Workspace& workspace) {
       return solver_.inputs(x, wanted, map_out(inputs), workspace);
     });
@@ -167,8 +169,8 @@ class PySolver {
   }
 
   py::tuple inputs_and_cov(const py::object& state, const py::object& accelerations) {
-    py::array_t<double> inputs(layout_.nu);
-    Symmetric covariance(layout_.nu);
+    py::array_t<double> inputs(nu_);
+    Symmetric covariance(nu_);
     require(state, accelerations, [&](const auto& x, const auto& wanted, InverseDynamicsSolver::Workspace& workspace) {
       return solver_.inputs_and_covariance(x, wanted, map_out(inputs), covariance.matrix, workspace);
     });
@@ -178,8 +180,8 @@ class PySolver {
  private:
   template <typename Call>
   void require(const py::object& state, const py::object& accelerations, const Call& call) {
-    const Numbers x = numbers_of(state, layout_.size(), "state");
-    const Numbers wanted = numbers_of(accelerations, solver_.view().size(), "accelerations");
+    const Numbers x = numbers_of(state, names_, "state");
+    const Numbers wanted = numbers_of(accelerations, wanted_names_, "accelerations");
     if (!model_has_code_) return require_ok(call(map(x), map(wanted), workspace_));
     InverseDynamicsSolver::Workspace own = solver_.make_workspace();
     require_ok(call(map(x), map(wanted), own));
@@ -201,13 +203,15 @@ class PySolver {
   InverseDynamicsSolver solver_;
   InverseDynamicsSolver::Workspace workspace_;
   bool model_has_code_ = false;
-  StateLayout layout_;
+  std::vector<std::string> names_, wanted_names_;  // of a state, and of its accelerations
+  Eigen::Index nu_ = 0;
 };
 
-PySolver make_solver(const PyPosterior& posterior, const std::vector<std::string>& outputs, const PySystem* system, bool cov,
+PySolver make_solver(const PyPosterior& posterior, const GivenNames& outputs, const PySystem* system, bool cov,
                      const std::string& storage) {
   const FitSystem at = system_of(posterior.file, posterior.posterior.prior(), model_of(system));
-  View view{View::Quantity::constrained_acceleration, acceleration_rows(*at.model->system, outputs, "`outputs`")};
+  View view{View::Quantity::constrained_acceleration,
+            acceleration_rows(*at.model->system, names_or_all(outputs, "outputs"), "`outputs`")};
   view.other_system = at.other_system;
   return {posterior, view, {cov, storage_argument(storage)}};
 }
@@ -241,8 +245,8 @@ cov      whether it will be asked for
 storage  as of Predictor
 
 A state is (len(state_names)); its inputs are where the search begins. Raises NumericalError where no inputs are found.)")
-      .def(py::init(&make_solver), "posterior"_a, py::kw_only(), "outputs"_a = std::vector<std::string>(), "system"_a = nullptr,
-           "cov"_a = true, "storage"_a = "double")
+      .def(py::init(&make_solver), "posterior"_a, py::kw_only(), "outputs"_a = py::none(), "system"_a = nullptr, "cov"_a = true,
+           "storage"_a = "double")
       .def("inputs", &PySolver::inputs, "state"_a, "accelerations"_a, "(len(system.inputs))")
       .def("inputs_and_cov", &PySolver::inputs_and_cov, "state"_a, "accelerations"_a, "And their covariance, a square array.");
 }

@@ -86,9 +86,21 @@ struct Mechanics {
   py::array M, A, b, F;
 };
 
+// The states of a table by its column names, what the model does not read NaN where there is no column of it.
+py::array states_of_table(const PySystem& self, const py::object& data, const py::object& columns, const char* what) {
+  const CsvTable table = to_table(data, what);
+  LogReader reader = open_log(*self.model, table, columns_argument(columns));
+  return to_rows(read_whole_log(*self.model, reader).states);
+}
+
+Rows states_of(const PySystem& self, const py::object& states) {
+  const bool is_table = !is_array(states);
+  return {is_table ? states_of_table(self, states, py::none(), "states") : states, self.system().state_names(), "states"};
+}
+
 Mechanics evaluate(const PySystem& self, const py::object& states, const std::map<std::string, double>& parameters) {
   const System& system = self.system();
-  const Rows rows(states, system.state_names(), "states");
+  const Rows rows = states_of(self, states);
   SystemValues values = system.evaluate(rows.matrix(), parameter_values(system, parameters));
   return {to_matrices(values.mass, system.nq(), system.nq()), to_matrices(values.constraint_matrix, system.nc(), system.nq()),
           to_rows(std::move(values.constraint_vector)), to_rows(std::move(values.force))};
@@ -275,14 +287,17 @@ void define_names_and_parameters(py::class_<PySystem>& system) {
 void define_evaluate_and_generate(py::class_<PySystem>& system) {
   system
       .def("evaluate", &evaluate, py::arg("states"), py::arg("parameters") = py::dict(),
-           "M, A, b, F at states (n, len(state_names)), with parameters by name where they are not the model's own.")
+           "M, A, b, F at states (n, len(state_names)), or at those of a table by column names, with parameters by name where "
+           "they\n"
+           "are not the model's own.")
       .def(
           "true_acceleration",
           [](const PySystem& self, const py::object& states) {
-            return to_rows(true_acceleration(*self.model, Rows(states, self.system().state_names(), "states").matrix()));
+            return to_rows(true_acceleration(*self.model, states_of(self, states).matrix()));
           },
           py::arg("states"),
-          "ddq of the model as it is written, with its [truth] (n, nq).\n\nRaises InputError when there is no [truth].")
+          "ddq of the model as it is written, with its [truth] (n, nq), at states as of evaluate.\n\n"
+          "Raises InputError when there is no [truth].")
       .def("generate", &generate_table, py::arg("n"), py::arg("seed") = 1, py::arg("noise_std") = py::none(),
            py::arg("grid") = py::dict(),
            "Draw states from the model's [sampling] and measure ddq: a Table.\n\n"
@@ -290,9 +305,7 @@ void define_evaluate_and_generate(py::class_<PySystem>& system) {
       .def(
           "states",
           [](const PySystem& self, const py::object& data, const py::object& columns) {
-            const CsvTable table = to_table(data, "data");
-            LogReader reader = open_log(*self.model, table, columns_argument(columns));
-            return to_rows(read_whole_log(*self.model, reader).states);
+            return states_of_table(self, data, columns, "data");
           },
           py::arg("data"), py::arg("columns") = py::none(),
           "States (n, len(state_names)) of a table by its column names. What the model does not read may be missing: NaN.");

@@ -67,6 +67,7 @@ CsvTable to_table(const py::object& data, const std::string& what, CsvTable::Kee
                     "mapping of column names to arrays; got {}",
                     what, std::string(py::str(py::type::of(data)))));
   }
+  require_once(*names, what);
   std::vector<CsvTable::Column> columns;
   for (const py::handle key : *names) {
     std::string name = py::str(key);

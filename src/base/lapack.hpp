@@ -51,9 +51,6 @@ PivotedFactor factorise_semidefinite(Eigen::MatrixXd A, std::optional<double> sm
 /// size of some hundred. When stopped what stands there is neither.
 void invert_factored(Eigen::Ref<Eigen::MatrixXd> L, const Pieces& pieces = {});
 
-/// L ← L⁻¹, in the lower triangle.
-void invert_lower(Eigen::Ref<Eigen::MatrixXd> L);
-
 /// B ← L⁻¹ B, or L⁻ᵀ B.
 void solve_lower(const Eigen::Ref<const Eigen::MatrixXd>& L, bool transposed, Eigen::Ref<Eigen::MatrixXd> B);
 

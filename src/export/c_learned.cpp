@@ -10,24 +10,20 @@ using Eigen::Index;
 using Eigen::MatrixXd;
 using Eigen::VectorXd;
 
-// X of a component by rows, each in whole lanes
-std::string Writer::inverse_of(const LatentPosterior& latents, std::size_t k) {
-  const Index n = latents.size();
+// The triangle of a component by rows, each in whole lanes, as PredictorData stores it.
+std::string Writer::triangle_of(const LatentPosterior& latents, std::size_t k) {
   constexpr Index block = 64;
-  std::vector<std::vector<std::string>> rows(static_cast<std::size_t>(n));
-  for (Index j = 0; j < n; j += block) {
-    const Index m = std::min(block, n - j);
-    const MatrixXd columns = latents.whitening_columns(j, m);
-    for (Index i = j; i < n; ++i) {
-      for (Index l = 0; l < std::min(m, i - j + 1); ++l) rows[static_cast<std::size_t>(i)].push_back(number(columns(i - j, l)));
+  std::vector<std::string> entries;
+  for (Index first = 0; first < latents.size(); first += block) {
+    const MatrixXd rows = latents.triangle_rows(first, std::min(block, latents.size() - first));
+    for (Index i = 0; i < rows.rows(); ++i) {
+      const Index n = first + i + 1;
+      for (Index j = 0; j + 1 < n; ++j) entries.push_back(number(rows(i, j)));
+      entries.push_back(number(latents.whitens_by_factor() ? 1 / rows(i, n - 1) : rows(i, n - 1)));
+      for (Index j = n; j < whole(n); ++j) entries.emplace_back("0");
     }
   }
-  std::vector<std::string> entries;
-  for (std::vector<std::string>& row : rows) {
-    row.resize(static_cast<std::size_t>(whole(std::ssize(row))), "0");
-    std::move(row.begin(), row.end(), std::back_inserter(entries));
-  }
-  return table("real", fmt::format("inverse_{}", k), entries);
+  return table("real", fmt::format("triangle_{}", k), entries);
 }
 
 void Writer::write_learned() {
@@ -67,7 +63,7 @@ void Writer::write_learned() {
           row_of.push_back(std::to_string(j < std::ssize(rows) ? rows[static_cast<std::size_t>(j)] : -1));
       }
       list += fmt::format(", {}, {}, {}, {}", latents.size(), latents.row_of().size(),
-                          table(text("index"), fmt::format("row_of_{}", k), row_of), inverse_of(latents, k));
+                          table(text("index"), fmt::format("row_of_{}", k), row_of), triangle_of(latents, k));
     }
     if (has("sums")) {
       const auto& D = latents.sums()->D;

@@ -50,7 +50,8 @@ typedef struct {
   latent latents[@n_latents@];
 {stddev}  int n_variables, n_row_components;
 {stddev}  const @index@ *row_of;  /* which row is component r of point j: row_of[j + n r], -1: none */
-{stddev}  const real *inverse;    /* L^-1, L L' the covariance of the observations: a triangle by rows, each in whole LANES */
+{stddev,factor}  const real *triangle;   /* L, L L' the covariance of the observations, by rows, each in whole LANES; 1/L_ii for L_ii */
+{stddev,!factor}  const real *triangle;   /* X, X'X what the observations explain, by rows, each in whole LANES */
 {sums}  const int *sum_begin;     /* observations are sums of rows: their entries, */
 {sums}  const int *sum_column;
 {sums}  const real *sum_value;

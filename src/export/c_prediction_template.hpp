@@ -397,11 +397,20 @@ static void evaluate_stddev(const component *c, real *stddev, workspace *w)
   for (int column = 0; column < COLUMNS; ++column) {
     for (int i = c->n_variables; i < VARIABLES; ++i) w->cross[VARIABLES * column + i] = 0;
   }
-  const real *row = c->inverse;
+  const real *row = c->triangle;
   for (int i = 0; i < c->n_variables; ++i) {
     real explained[COLUMNS];
     const int length = (i / LANES + 1) * LANES;
-    for (int k = 0; k < COLUMNS; ++k) explained[k] = weighted_sum(length, row, w->cross + VARIABLES * k);
+{!factor}    for (int k = 0; k < COLUMNS; ++k) explained[k] = weighted_sum(length, row, w->cross + VARIABLES * k);
+{if factor}
+    const int before = length - LANES;
+    for (int k = 0; k < COLUMNS; ++k) {
+      real *const v = w->cross + VARIABLES * k;
+      real rest = v[i] - weighted_sum(before, row, v);
+      for (int j = before; j < i; ++j) rest -= row[j] * v[j];
+      explained[k] = v[i] = rest * row[i];
+    }
+{end}
     row += length;
 {!by_function}    for (int r = 0; r < NR; ++r) variance[r] -= explained[r] * explained[r];
 {if by_function}

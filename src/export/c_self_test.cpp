@@ -116,7 +116,9 @@ void Writer::write_tests() {
     std::vector<std::string> errors = {number(precision * largest + rounding)};
     // a latent along which nothing of a view acts has a deviation of rounding there
     const double cancelled = 32 * roundoff(options_.single_precision) * largest;
-    if (has("stddev")) errors.push_back(number(precision * size * size + cancelled * cancelled));
+    // what double precision leaves of a variance that the observations take from the prior's
+    const double of_variance = options_.single_precision ? precision : 1e-11;
+    if (has("stddev")) errors.push_back(number(of_variance * size * size + cancelled * cancelled));
     if (has("jacobian"))
       errors.push_back(number(precision * std::max(1.0, jacobian.cwiseAbs().maxCoeff()) + rounding * steepest));
     tests += fmt::format("     {}}},\n", fmt::join(errors, ", "));

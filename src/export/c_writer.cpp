@@ -184,6 +184,7 @@ void Writer::set_conditions() {
   // observations are sums of rows; covariances are kept by latent functions, which are fewer than the rows of the view
   set("sums", options_.stddev && components_.front()->latents->sums() != nullptr);
   set("by_function", n_functions_ < view_.size());
+  set("factor", components_.front()->latents->whitens_by_factor());
   // triangular systems of M are solved, or M itself
   set("forced_solves", has("forced") || has("loaded") || (options_.jacobian && has("moved")));
   set("solves", has("rows") || has("forced_solves"));

@@ -83,7 +83,7 @@ class Writer {
 
   // c_learned.cpp
   void write_learned();
-  [[nodiscard]] std::string inverse_of(const LatentPosterior& latents, std::size_t k);
+  [[nodiscard]] std::string triangle_of(const LatentPosterior& latents, std::size_t k);
 
   // c_expressions.cpp
   void write_expressions();

@@ -50,9 +50,8 @@ class DensePosterior final : public LatentPosterior {
   [[nodiscard]] GramValue value() const override;
   [[nodiscard]] double squared_weight(std::size_t latent) const override;
   void whiten(Eigen::Ref<Eigen::MatrixXd> c) const override;
-  [[nodiscard]] Eigen::MatrixXd whitening_columns(Eigen::Index first, Eigen::Index n) const override;
-  void keep_root() override;
-  [[nodiscard]] const InverseRoot* root() const override { return root_ ? &*root_ : nullptr; }
+  [[nodiscard]] bool whitens_by_factor() const override { return true; }
+  [[nodiscard]] Eigen::MatrixXd triangle_rows(Eigen::Index first, Eigen::Index n) const override;
   [[nodiscard]] Eigen::VectorXd misfit(const std::vector<Eigen::MatrixXd>& f, RandomStream& random) const override;
   [[nodiscard]] std::vector<std::vector<Eigen::MatrixXd>> weights(Eigen::MatrixXd misfits) const override;
   [[nodiscard]] bool append(const RowBlocks& more) override;
@@ -75,7 +74,6 @@ class DensePosterior final : public LatentPosterior {
   Eigen::Index n_samples_ = 0;
   Eigen::VectorXd y_;       // ỹ
   GrowingCholesky factor_;  // with L⁻¹ỹ
-  std::optional<InverseRoot> root_;
 };
 
 }  // namespace gp2

@@ -48,28 +48,12 @@ void DensePosterior::whiten(Ref<MatrixXd> c) const {
   lapack::solve_lower(factor_.L(), false, c);
 }
 
-MatrixXd DensePosterior::whitening_columns(Index first, Index n) const {
-  const Index below = size() - first;
-  if (n == size() && !sums_) {
-    MatrixXd X = factor_.L().triangularView<Eigen::Lower>();
-    lapack::invert_lower(X);
-    return X;
-  }
-  MatrixXd columns = MatrixXd::Identity(below, n);
-  if (sums_) {
-    MatrixXd whole = MatrixXd::Zero(size(), n);
-    whole.bottomRows(below) = columns;
-    sums_->whiten(whole);
-    columns = whole.bottomRows(below);
-  }
-  lapack::solve_lower(factor_.L().bottomRightCorner(below, below), false, columns);
-  return columns;
-}
-
-void DensePosterior::keep_root() {
-  // of sums X has the factor of their noise too
-  if (root_ || sums_) return;
-  root_.emplace().append(factor_.L());
+MatrixXd DensePosterior::triangle_rows(Index first, Index n) const {
+  const auto L = factor_.L();
+  if (!sums_) return L.block(first, 0, n, first + n);
+  // (L_D L)⁻¹ = L⁻¹L_D⁻¹
+  const MatrixXd of_sums = sums_->L;
+  return of_sums.block(first, 0, n, first + n) * L.topLeftCorner(first + n, first + n).triangularView<Eigen::Lower>();
 }
 
 // ỹ − Σ_a Z_a f̃_a − ε
@@ -149,8 +133,6 @@ bool DensePosterior::append(const RowBlocks& more) {
 
 bool DensePosterior::append(const LatentRows& more) {
   if (!(size() == 0 ? factorise(more) : extend(more))) return false;
-  if (sums_) root_.reset();
-  if (root_) root_->append(factor_.L());
   append_basis(more);
   refresh_weights();
   return true;
@@ -236,7 +218,6 @@ void DensePosterior::erase(const std::vector<Index>& samples) {
   }
   std::sort(rows.begin(), rows.end());
   factor_.erase(rows);
-  if (root_) root_->erase(rows);
   std::vector<Index> kept(static_cast<std::size_t>(y_.size())), moved(kept.size());
   std::iota(kept.begin(), kept.end(), Index{0});
   kept.resize(static_cast<std::size_t>(close_gaps(kept.data(), y_.size(), rows)));

@@ -8,7 +8,6 @@
 #include <Eigen/Core>
 
 #include "base/random.hpp"
-#include "inference/inverse_root.hpp"
 #include "inference/row_blocks.hpp"
 
 // The seam between reduced observations and all that is inferred from them. How K̃ + I is solved stands behind it and nowhere
@@ -80,8 +79,12 @@ class LatentPosterior {
 
   /// c ← X c.
   virtual void whiten(Eigen::Ref<Eigen::MatrixXd> c) const = 0;
-  /// Columns first … first + n − 1 of X, a lower triangle, from row `first` on (size() − first × n).
-  [[nodiscard]] virtual Eigen::MatrixXd whitening_columns(Eigen::Index first, Eigen::Index n) const = 0;
+  /// Whether c is whitened by solving with a factor, X = L⁻¹, and not by a product. Where the noise is far below the signal a product
+  /// with L⁻¹ would lose the digits in which X c differs from the prior.
+  [[nodiscard]] virtual bool whitens_by_factor() const = 0;
+  /// Rows first … first + n − 1 of that lower triangle, L or X, up to the last diagonal entry (n × first + n); what
+  /// stands above the diagonal is undefined.
+  [[nodiscard]] virtual Eigen::MatrixXd triangle_rows(Eigen::Index first, Eigen::Index n) const = 0;
 
   /// Σ − (X c)ᵀ X c in the lower triangle, Σ the prior's covariance and c of the same quantities.
   void subtract_explained(Eigen::MatrixXd c, Eigen::MatrixXd& covariance) const;
@@ -91,11 +94,6 @@ class LatentPosterior {
   [[nodiscard]] virtual Eigen::VectorXd misfit(const std::vector<Eigen::MatrixXd>& f, RandomStream& random) const = 0;
   /// The weights in place of β that explain such misfits: [column of misfits][latent].
   [[nodiscard]] virtual std::vector<std::vector<Eigen::MatrixXd>> weights(Eigen::MatrixXd misfits) const = 0;
-
-  /// From here on X is kept as it grows and shrinks, so that root() has it at once. Nothing where it would take no less to keep.
-  virtual void keep_root() {}
-  /// X, or an orthogonal matrix times it; null where it is not kept.
-  [[nodiscard]] virtual const InverseRoot* root() const { return nullptr; }
 
   /// Conditions on more observations. False, and nothing has changed, where the covariance is not positive definite.
   [[nodiscard]] virtual bool append(const RowBlocks& more) = 0;

@@ -67,7 +67,8 @@ class InducingPosterior final : public LatentPosterior {
     return all_.weight[static_cast<Eigen::Index>(latent)];
   }
   void whiten(Eigen::Ref<Eigen::MatrixXd> c) const override;
-  [[nodiscard]] Eigen::MatrixXd whitening_columns(Eigen::Index first, Eigen::Index n) const override;
+  [[nodiscard]] bool whitens_by_factor() const override { return false; }
+  [[nodiscard]] Eigen::MatrixXd triangle_rows(Eigen::Index first, Eigen::Index n) const override;
   [[nodiscard]] Eigen::VectorXd misfit(const std::vector<Eigen::MatrixXd>& f, RandomStream& random) const override;
   [[nodiscard]] std::vector<std::vector<Eigen::MatrixXd>> weights(Eigen::MatrixXd misfits) const override;
   [[nodiscard]] bool append(const RowBlocks& more) override;

@@ -104,9 +104,7 @@ GramValue InducingPosterior::value() const {
 
 void InducingPosterior::whiten(Ref<MatrixXd> c) const { lapack::multiply_lower(X_, c); }
 
-MatrixXd InducingPosterior::whitening_columns(Index first, Index n) const {
-  return X_.block(first, first, size() - first, n).triangularView<Eigen::Lower>();
-}
+MatrixXd InducingPosterior::triangle_rows(Index first, Index n) const { return X_.block(first, 0, n, first + n); }
 
 // B⁻¹c + L_B⁻ᵀε − L⁻¹f̃(Z): of the whitened variables, those of the function drawn from the posterior less those of f̃
 VectorXd InducingPosterior::misfit(const std::vector<MatrixXd>& f, RandomStream& random) const {

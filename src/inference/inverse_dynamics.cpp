@@ -1,4 +1,4 @@
-#include "gp2/inference/inverse_dynamics.hpp"
+#include "inference/inverse_dynamics.hpp"
 
 #include <algorithm>
 #include <cmath>
@@ -12,7 +12,9 @@
 
 #include "base/not_a_number.hpp"
 #include "gp2/error.hpp"
+#include "gp2/inference/inverse_dynamics.hpp"
 #include "gp2/mechanics/state_evaluator.hpp"
+#include "gp2/mechanics/symbolic_system.hpp"
 #include "inference/requirements.hpp"
 #include "mechanics/describe_fault.hpp"
 #include "mechanics/pivoted_qr.hpp"
@@ -30,6 +32,7 @@ namespace {
 constexpr double rank_tolerance = 1e-10;  // as that of constraints
 constexpr double rounding = 1e-13;        // of accelerations, beside their size
 constexpr double close_enough = 1e-8;     // where rounding lets no step help any more
+constexpr double last_resort = 0.1;       // of a usual effect: of an input that the data hold at 0
 
 void require_inputs_of(const Posterior& posterior, const View& view) {
   require_view(posterior.prior(), view);
@@ -38,7 +41,7 @@ void require_inputs_of(const Posterior& posterior, const View& view) {
   if (system.layout().nu == 0) throw InputError(fmt::format("inverse_dynamics: '{}' has no inputs", system.name()));
 }
 
-// Of each input the root of its mean square in the observations; 1 where they tell nothing.
+// Of each input the root of its mean square in the observations; 0 where it never acted there.
 VectorXd usual_inputs_of(const Posterior& posterior) {
   const Index nu = posterior.prior().system->layout().nu;
   VectorXd squares = VectorXd::Zero(nu), n = squares;
@@ -47,13 +50,17 @@ VectorXd usual_inputs_of(const Posterior& posterior) {
     squares.array() += inputs.isFinite().select(inputs.square(), 0).rowwise().sum();
     n.array() += inputs.isFinite().cast<double>().rowwise().sum();
   }
-  return (squares.array() > 0).select((squares.array() / n.array()).sqrt(), 1);
+  return (squares.array() > 0).select((squares.array() / n.array()).sqrt(), 0);
 }
 
-/// The pseudo-inverse of matrices of one size whose columns are scaled first, so that units of inputs do not decide the rank.
-/// With J D P = Q [R; 0], D the scales, and Rᵀ P' = Q' [S; 0],
+/// The pseudo-inverse of matrices J of one size, inputs being measured by scales D, so that their units decide nothing. With
+/// J D P = Q [R; 0] and Rᵀ P' = Q' [S; 0],
 ///
 ///     (J D)⁺ = P Q' [S⁻ᵀ P'ᵀ 0; 0] Qᵀ.
+///
+/// The scale of an input is its usual size: of changes that do the same the least is taken, each beside what is usual, and an input
+/// that does next to nothing is not asked for immense ones. One whose size is not known is weighed by its effect: where others have a
+/// size, as one that does little.
 class ScaledPseudoInverse {
  public:
   ScaledPseudoInverse(Index d, Index nu)
@@ -67,12 +74,11 @@ class ScaledPseudoInverse {
   Index rank = 0;  // of what was computed last
 
   /// D (J D)⁺ (nu × d).
-  const MatrixXd& compute(const MatrixXd& J) {
-    for (Index k = 0; k < J.cols(); ++k) {
-      const double size = J.col(k).norm();
-      scale_[k] = size > 0 ? 1 / size : 0;
-      scaled_.col(k) = J.col(k) * scale_[k];
-    }
+  /// @param sizes    usual ones (nu); 0: not known
+  /// @param nothing  an effect of a usual size that is rounding
+  const MatrixXd& compute(const MatrixXd& J, const VectorXd& sizes, double nothing) {
+    write_scale(J, sizes, nothing);
+    scaled_.noalias() = J * scale_.asDiagonal();
     rank = internal::pivoted_qr(scaled_, reflection_, order_, rank_tolerance);
     Q_transposed_.setIdentity();
     internal::apply_Q_transposed(scaled_, reflection_, rank, Q_transposed_);
@@ -94,6 +100,19 @@ class ScaledPseudoInverse {
   }
 
  private:
+  void write_scale(const MatrixXd& J, const VectorXd& sizes, double nothing) {
+    double largest = 0;
+    for (Index k = 0; k < J.cols(); ++k) {
+      const double effect = sizes[k] * J.col(k).norm();
+      scale_[k] = effect > nothing ? sizes[k] : 0;
+      if (scale_[k] > 0) largest = std::max(largest, effect);
+    }
+    for (Index k = 0; k < J.cols(); ++k) {
+      const double slope = J.col(k).norm();
+      if (sizes[k] == 0 && slope > 0) scale_[k] = (largest > 0 ? last_resort * largest : 1) / slope;
+    }
+  }
+
   MatrixXd scaled_, Q_transposed_, R_transposed_, inverse_, out_;
   VectorXd scale_, reflection_, reflection2_;
   VectorXi order_, order2_;
@@ -101,10 +120,33 @@ class ScaledPseudoInverse {
 
 }  // namespace
 
+Eigen::Array<bool, Eigen::Dynamic, 1> inputs_of_sensors(const System& system) {
+  const StateLayout layout = system.layout();
+  Eigen::Array<bool, Eigen::Dynamic, 1> out = Eigen::Array<bool, Eigen::Dynamic, 1>::Constant(layout.nu, false);
+  const auto* symbolic = dynamic_cast<const SymbolicSystem*>(&system);
+  if (symbolic == nullptr) return out;
+  const std::vector<bool> of_force = system.reads(SystemPart::force);
+  for (const ConstraintRow& row : symbolic->definition().constraints) {
+    if (row.contact) out[row.contact->input] = true;
+    if (row.condition.empty()) continue;
+    for (const Expression& entry : row.A) {
+      // an entry is its condition times what it is where that holds
+      const Expression condition = entry.operation() == Operation::multiply_or_zero ? entry.left() : entry;
+      const std::vector<std::string> read = entry.graph().variables_of(condition);
+      for (int k = 0; k < layout.nu; ++k) {
+        const bool is_read = std::binary_search(read.begin(), read.end(), system.inputs()[static_cast<std::size_t>(k)]);
+        out[k] = out[k] || (is_read && !of_force[static_cast<std::size_t>(layout.u(k))]);
+      }
+    }
+  }
+  return out;
+}
+
 struct InverseDynamicsSolver::Implementation {
-  Prior prior;            // where the view looks
-  VectorXd parameters;    // there
-  VectorXd usual_inputs;  // how large each was as a rule
+  Prior prior;                                     // where the view looks
+  VectorXd parameters;                             // there
+  VectorXd usual_inputs;                           // how large each was as a rule; 0 where that is not known
+  Eigen::Array<bool, Eigen::Dynamic, 1> is_given;  // whether an input is a sensor's, which stays where it is
   Options options;
   Predictor predictor;
   Predictor without_data;
@@ -113,11 +155,14 @@ struct InverseDynamicsSolver::Implementation {
       : prior(prior_of(posterior.prior(), view)),
         parameters(parameters_of(view, posterior.values().parameters)),
         usual_inputs(usual_inputs_of(posterior)),
+        is_given(inputs_of_sensors(*prior.system)),
         options(given),
         predictor(posterior, view, {.stddev = options.covariance, .jacobian = true, .storage = options.storage}),
         without_data(posterior.without_data(), view, {.stddev = true, .jacobian = false}) {}
 
   [[nodiscard]] Index nu() const { return prior.system->layout().nu; }
+  // whether the data hold some inputs at 0, and others not
+  [[nodiscard]] bool has_idle_inputs() const { return (usual_inputs.array() > 0).any() && !(usual_inputs.array() > 0).all(); }
 };
 
 /// The search at one state after another.
@@ -144,22 +189,28 @@ struct InverseDynamicsSolver::Workspace::Implementation {
   VectorXd pull;                 // M' of what is missed (d)
   VectorXd slope;                // of −½ |missed|² (nu)
   VectorXd largest;              // effect of each input so far (nu)
+  VectorXd weights;              // of the inputs where steps are damped (nu)
   MatrixXd curvature;            // of ½ |missed|² (nu × nu)
   MatrixXd damped;               // with more on its diagonal (nu × nu)
   bool is_nearest = false;       // no inputs about these miss less
   Index most_rank = 0;           // of J in this search
+  double nothing = 0;            // an effect of an input's usual size that is rounding, in the metric
   MatrixXd covariance;           // of the view (d × d)
   MatrixXd weighted_covariance;  // (nu × d)
   MatrixXd J_inverse;            // J⁺ of v itself (nu × d)
+  Eigen::LLT<MatrixXd> mass_llt;
+  VectorXd sizes;        // usual ones of the inputs (nu); 0: not known
+  VectorXd force_slope;  // ∂F/∂u_k (nq)
 
   explicit Implementation(std::shared_ptr<const InverseDynamicsSolver::Implementation> owner)
       : solver(std::move(owner)),
         memory(solver->predictor.make_workspace()),
         memory_without_data(solver->without_data.make_workspace()),
-        mechanics(solver->prior.system->make_evaluator(solver->parameters, false)),
+        mechanics(solver->prior.system->make_evaluator(solver->parameters, solver->has_idle_inputs())),
         llt(solver->predictor.view().size()),
         damped_llt(solver->nu()),
-        inverse(solver->predictor.view().size(), solver->nu()) {
+        inverse(solver->predictor.view().size(), solver->nu()),
+        mass_llt(solver->prior.system->nq()) {
     const Index d = solver->predictor.view().size(), nu = solver->nu(), n_state = solver->prior.system->layout().size();
     state.setZero(n_state);
     wanted.setZero(d);
@@ -169,7 +220,8 @@ struct InverseDynamicsSolver::Workspace::Implementation {
     root = covariance = metric;
     J.setZero(d, nu);
     change.setZero(nu);
-    start = slope = largest = change;
+    start = slope = largest = weights = sizes = change;
+    force_slope.setZero(solver->prior.system->nq());
     curvature.setZero(nu, nu);
     damped = curvature;
     J_inverse.setZero(nu, d);
@@ -190,6 +242,9 @@ struct InverseDynamicsSolver::Workspace::Implementation {
       return Status::no_prediction;
     }
     write_root();
+    const double expected = size_of(usual) + size_of(mean);
+    nothing = rank_tolerance * expected;
+    write_sizes(expected);
     const double size = size_of(usual) + size_of(wanted);
     begin_beside_turns(size);
     most_rank = 0;
@@ -202,12 +257,12 @@ struct InverseDynamicsSolver::Workspace::Implementation {
     return Status::not_found;
   }
 
-  // Which inputs the null space of J reaches: row k of 1 − J⁺J is not 0. About a turn there is none to tell.
+  // Which inputs the null space of J reaches: row k of 1 − J⁺J is not 0. About a turn there is none to tell, nor of sensors.
   [[nodiscard]] Eigen::Array<bool, Eigen::Dynamic, 1> open_inputs() const {
     constexpr double none = 1e-6;  // of 1, the diagonal entry of a projection, where the rank has been decided
     const Index nu = solver->nu();
     if (inverse.rank == nu) return Eigen::Array<bool, Eigen::Dynamic, 1>::Constant(nu, false);
-    return 1 - J_inverse.cwiseProduct(jacobian.rightCols(nu).transpose()).rowwise().sum().array() > none;
+    return 1 - J_inverse.cwiseProduct(jacobian.rightCols(nu).transpose()).rowwise().sum().array() > none && !solver->is_given;
   }
 
   // J⁺ Σ J⁺ᵀ, where Σ is the view's
@@ -219,6 +274,9 @@ struct InverseDynamicsSolver::Workspace::Implementation {
  private:
   [[nodiscard]] bool evaluate() {
     const bool is_ok = solver->predictor.mean_and_jacobian(state, mean, jacobian, memory) == Predictor::Status::ok;
+    for (Index k = 0; k < solver->nu(); ++k) {
+      if (solver->is_given[k]) jacobian.rightCols(solver->nu()).col(k).setZero();
+    }
     missed = wanted - mean;
     return is_ok;
   }
@@ -236,15 +294,37 @@ struct InverseDynamicsSolver::Workspace::Implementation {
     root = llt.matrixU();
   }
 
+  // The data tell no size of an input that they hold at 0. It is given the one at which its force alone makes a part of the accelerations
+  // that are expected: its column of J may be no more than what a latent makes of data without it.
+  void write_sizes(double expected) {
+    sizes = solver->usual_inputs;
+    if (!solver->has_idle_inputs()) return;
+    mass_llt.compute(projection.mass());
+    for (int k = 0; k < sizes.size(); ++k) {
+      if (sizes[k] > 0) continue;
+      force_slope.setZero();
+      for (std::size_t i = 0; i < mechanics->derivatives().size(); ++i) {
+        const StateEvaluator::Derivative& one = mechanics->derivatives()[i];
+        if (one.quantity != StateEvaluator::Quantity::force || one.state_index != solver->prior.system->layout().u(k)) continue;
+        force_slope[one.row] = mechanics->derivative_values()[static_cast<Index>(i)];
+      }
+      mass_llt.matrixL().solveInPlace(force_slope);
+      const double effect = force_slope.norm();
+      if (effect > 0) sizes[k] = last_resort * expected / effect;
+    }
+  }
+
   // An input that does nothing where it starts, while not all is produced, may be one whose effect is even, as that of a propeller at
-  // rest: it begins beside. One that does nothing there either stays.
+  // rest: it begins beside. One that does nothing there either stays, and one that the data hold at 0 though its force is not even.
   void begin_beside_turns(double size) {
     auto inputs = state.tail(solver->nu());
     auto effects = jacobian.rightCols(solver->nu());
     if (size_of(missed) <= close_enough * size) return;
     start = inputs;
     for (Index k = 0; k < start.size(); ++k) {
-      if (effects.col(k).isZero(0)) inputs[k] += solver->usual_inputs[k];
+      const double usual_input = solver->usual_inputs[k];
+      if (!effects.col(k).isZero(0) || solver->is_given[k] || (usual_input == 0 && sizes[k] > 0)) continue;
+      inputs[k] += usual_input > 0 ? usual_input : 1;
     }
     if (inputs == start) return;
     if (evaluate()) {
@@ -263,6 +343,16 @@ struct InverseDynamicsSolver::Workspace::Implementation {
     return weighted.norm();
   }
 
+  // An input is weighed by the largest effect that any has had, over its own usual size; one without by the largest effect that it has had
+  // itself (Moré 1978).
+  void write_damping_weights() {
+    const double of_usual = sizes.cwiseProduct(largest).maxCoeff();
+    for (Index k = 0; k < solver->nu(); ++k) {
+      weights[k] = sizes[k] > 0 ? of_usual / sizes[k] : largest[k];
+      if (weights[k] == 0) weights[k] = 1;
+    }
+  }
+
   // size: of accelerations, beside which rounding is judged
   [[nodiscard]] bool search(double size) {
     constexpr int most_steps = 100, most_trials = 30;
@@ -273,7 +363,7 @@ struct InverseDynamicsSolver::Workspace::Implementation {
       size = std::max(size, size_of(mean));
       if (!std::isfinite(size)) return false;  // beside which anything would pass for rounding
       J.noalias() = root.lazyProduct(jacobian.rightCols(nu));
-      const MatrixXd& pseudo_inverse = inverse.compute(J);
+      const MatrixXd& pseudo_inverse = inverse.compute(J, sizes, nothing);
       J_inverse.noalias() = pseudo_inverse.lazyProduct(root);
       most_rank = std::max(most_rank, inverse.rank);
       const double before = size_of(missed);
@@ -285,14 +375,14 @@ struct InverseDynamicsSolver::Workspace::Implementation {
       if (gain <= rounding * size || (is_close && gain > gain_before / 2)) return true;
       gain_before = gain;
       largest = largest.cwiseMax(J.colwise().norm().transpose());
+      write_damping_weights();
       if (!improve(before, size, is_close ? 1 : most_trials)) return is_close || is_nearest;
     }
     return false;
   }
 
   // The first step that misses less than before by a part of what its slope promises: that of Gauss and Newton, then Newton's own and
-  // shorter ones (Levenberg 1944), inputs being told apart by the largest effect that each has had (Moré 1978). False where none does:
-  // the state stays. Where the promise of the last one is rounding, these inputs come nearest to what is wanted, as where an input
+  // shorter ones (Levenberg 1944), inputs being told apart by `weights`. False where none does: the state stays. Where the promise of the last one is rounding, these inputs come nearest to what is wanted, as where an input
   // turns around what it does and J vanishes.
   [[nodiscard]] bool improve(double before, double size, int n) {
     constexpr double part = 0.25;
@@ -306,7 +396,7 @@ struct InverseDynamicsSolver::Workspace::Implementation {
       if (k == 1) write_curvature(size);
       if (k > 0) {
         damped = curvature;
-        damped.diagonal().array() += damping * (largest.array() > 0).select(largest.array().square(), 1);
+        damped.diagonal().array() += damping * weights.array().square();
         damping = std::max(5 * damping, 1e-3);
         damped_llt.compute(damped);
         if (damped_llt.info() != Eigen::Success) continue;
@@ -330,7 +420,7 @@ struct InverseDynamicsSolver::Workspace::Implementation {
     curvature.noalias() = J.transpose().lazyProduct(J);
     for (Index k = 0; k < solver->nu(); ++k) {
       if (!(largest[k] > 0)) continue;
-      const double h = 1e-6 * size / largest[k];
+      const double h = 1e-6 * (sizes[k] > 0 ? sizes[k] : size / largest[k]);
       inputs = start;
       inputs[k] += h;
       if (!evaluate()) continue;

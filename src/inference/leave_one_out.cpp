@@ -167,7 +167,8 @@ class WithoutSums {
  public:
   WithoutSums(const Posterior& posterior, const Posterior::Implementation& self, const Reduction& reduction)
       : posterior_(posterior), self_(self), reduction_(reduction) {
-    const MatrixXd X = self_.latents->whitening_columns(0, self_.latents->size());
+    MatrixXd X = MatrixXd::Identity(self_.latents->size(), self_.latents->size());
+    self_.latents->whiten(X);
     P_.noalias() = X.triangularView<Eigen::Lower>().transpose() * X;
     alpha_ = P_ * (reduction.sums->L * reduction.y);
   }

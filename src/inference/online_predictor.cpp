@@ -28,9 +28,6 @@ void OnlinePredictor::remove_oldest(int n) { posterior_ = gp2::remove_oldest(std
 void OnlinePredictor::replace(Posterior posterior) {
   require_view(posterior.prior(), view_);
   auto own = posterior.own_components();
-  if (options_.stddev) {
-    for (const auto& component : own) component->latents->keep_root();
-  }
   posterior_ = Posterior(Posterior::Components(own.begin(), own.end()));
 }
 

@@ -171,9 +171,7 @@ namespace {
 // The marginals of a block of states, and the memory for it, of one thread.
 class MarginalBlock {
  public:
-  // X: of posterior.latents, or null
-  MarginalBlock(const Posterior::Implementation& posterior, const MatrixXd* X)
-      : posterior_(posterior), X_(X), sums_(*posterior.latents) {}
+  explicit MarginalBlock(const Posterior::Implementation& posterior) : posterior_(posterior), sums_(*posterior.latents) {}
 
   // Of the states first … first + n − 1, to the columns of `marginal` from `column` on. Returns how many variances it set to 0.
   int evaluate(const View& view, const Ref<const MatrixXd>& states, Index first, Index n, Posterior::Marginal& marginal,
@@ -188,11 +186,7 @@ class MarginalBlock {
     cross_.resize(posterior_.latents->size(), r * n);
     sums_.evaluate(query_.features, query_.needed, &fewer.loadings, &cross_);
     query_.view_of(posterior_, sums_.mean(), marginal.mean.middleCols(column, n));
-    if (X_ != nullptr) {
-      lapack::multiply_lower(*X_, cross_);
-    } else {
-      posterior_.latents->whiten(cross_);
-    }
+    posterior_.latents->whiten(cross_);
 
     // of w (Query::Fewer): the prior's covariance at each state, less what the data explain
     MatrixXd covariances = MatrixXd::Zero(r * r, n);
@@ -246,7 +240,6 @@ class MarginalBlock {
   }
 
   const Posterior::Implementation& posterior_;
-  const MatrixXd* X_;
   Query query_;
   LatentSums sums_;
   MatrixXd cross_;  // cov(basis variables, w), then X times it
@@ -279,15 +272,9 @@ Posterior::Marginal marginal_of(const Posterior::Implementation& self, const Vie
                                 Index first, Index n, int n_threads) {
   require_query(self, view, states);
   constexpr Index block_size = 64;
-  // A product with X takes down to half the time of a solution with L, by the kernel of OpenBLAS. To have it costs as much as a third
-  // of so many columns as it has.
-  constexpr Index pays = 8;
   n_threads = thread_count(n_threads);
   const Index d = view.size();
-  MatrixXd X;
-  const Index size = self.latents->size();
-  if (d * n >= pays * size) X = self.latents->whitening_columns(0, size);
-  std::vector<MarginalBlock> blocks(static_cast<std::size_t>(n_threads), MarginalBlock(self, X.size() > 0 ? &X : nullptr));
+  std::vector<MarginalBlock> blocks(static_cast<std::size_t>(n_threads), MarginalBlock(self));
   std::vector<int> n_clipped(static_cast<std::size_t>(n_threads));
   Posterior::Marginal marginal{MatrixXd(d, n), MatrixXd(d * d, n), 0};
   for_each_block(n, block_size, n_threads, [&](Index start, Index size, int thread) {

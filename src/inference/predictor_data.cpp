@@ -64,40 +64,21 @@ void PredictorData<T>::store(const LatentPosterior& posterior, const std::vector
     latent.weights = stored<T>((from.beta * term.C.transpose()).topRows(n), n_rows);
     if (stddev) latent.Z = stored<T>(from.Z.topRows(n), n_rows);
   }
-  if (stddev) store_inverse(posterior);
+  if (stddev) store_triangle(posterior);
 }
 
 template <typename T>
-void PredictorData<T>::store_inverse(const LatentPosterior& posterior) {
-  const Index n = posterior.size();
-  if (const InverseRoot* const root = posterior.root()) {
-    store_root(*root);
-    return;
-  }
-  std::vector<Index> first{0};  // of each row
-  for (Index i = 0; i < n; ++i) first.push_back(first.back() + simd::padded<T>(i + 1));
-  inverse_.resize(static_cast<std::size_t>(first.back()));
-  // by blocks of columns, which begin with zeros
-  constexpr Index block = 64;
-  for (Index j = 0; j < n; j += block) {
-    const Index m = std::min(block, n - j), below = n - j;
-    const MatrixXd columns = posterior.whitening_columns(j, m);
-    for (Index i = 0; i < below; ++i) {
-      T* const row = inverse_.data() + first[static_cast<std::size_t>(j + i)] + j;
-      for (Index l = 0; l < std::min(m, i + 1); ++l) row[l] = static_cast<T>(columns(i, l));
-    }
-  }
-}
-
-template <typename T>
-void PredictorData<T>::store_root(const InverseRoot& root) {
-  if constexpr (std::is_same_v<T, double>) {
-    inverse_ = root.numbers();
-  } else {
-    for (Index i = 0; i < root.size(); ++i) {
-      const auto first = static_cast<Index>(inverse_.size());
-      inverse_.resize(static_cast<std::size_t>(first + simd::padded<T>(i + 1)));
-      std::transform(root.row(i), root.row(i) + i + 1, inverse_.data() + first, [](double x) { return static_cast<T>(x); });
+void PredictorData<T>::store_triangle(const LatentPosterior& posterior) {
+  constexpr Index block = 64;  // rows
+  whitens_by_factor_ = posterior.whitens_by_factor();
+  for (Index first = 0; first < posterior.size(); first += block) {
+    const MatrixXd rows = posterior.triangle_rows(first, std::min(block, posterior.size() - first));
+    for (Index i = 0; i < rows.rows(); ++i) {
+      const Index n = first + i + 1;
+      const std::size_t begin = triangle_.size();
+      triangle_.resize(begin + static_cast<std::size_t>(simd::padded<T>(n)));
+      for (Index j = 0; j < n; ++j) triangle_[begin + static_cast<std::size_t>(j)] = static_cast<T>(rows(i, j));
+      if (whitens_by_factor_) triangle_[begin + static_cast<std::size_t>(n - 1)] = static_cast<T>(1 / rows(i, n - 1));
     }
   }
 }
@@ -314,10 +295,30 @@ void PredictorData<T>::write_cross_of_rows(const std::vector<PredictorTerm>& ter
   }
 }
 
+// Entry i of what is whitened, to memory.sums, of each column of `cross`; row i of the triangle.
+template <typename T>
+void PredictorData<T>::whiten(Index i, const T* row, Memory& memory) const {
+  const Index n_columns = memory.cross.cols();
+  if (!whitens_by_factor_) {
+    loops<T>().weighted_sums(simd::padded<T>(i + 1), n_columns, row, memory.cross.data(), memory.cross.rows(),
+                             memory.sums.data());
+    return;
+  }
+  // whole vectors of entries before it, then those that were found just now
+  const Index before = i - i % simd::lanes<T>;
+  loops<T>().weighted_sums(before, n_columns, row, memory.cross.data(), memory.cross.rows(), memory.sums.data());
+  for (Index column = 0; column < n_columns; ++column) {
+    T* const v = memory.cross.col(column).data();
+    T rest = v[i] - memory.sums[column];
+    for (Index j = before; j < i; ++j) rest -= row[j] * v[j];
+    memory.sums[column] = v[i] = rest * row[i];
+  }
+}
+
 template <typename T>
 void PredictorData<T>::subtract_explained(const std::vector<PredictorTerm>& terms, const std::vector<MatrixXd>& loadings,
                                           Memory& memory, MatrixXd& covariance) const {
-  const Index d = covariance.rows(), n_columns = memory.cross.cols();
+  const Index d = covariance.rows();
   const bool by_function = is_by_function(terms, d);
   if (by_function) {
     write_cross_of_functions(terms, memory);
@@ -325,7 +326,7 @@ void PredictorData<T>::subtract_explained(const std::vector<PredictorTerm>& term
     write_cross_of_rows(terms, loadings, memory);
   }
   if (sums_.size() > 0) sum_up(memory);
-  // entry i of X c for row r of the view, from the sums of row i of X with the columns of `cross`
+  // an entry of X c for row r of the view, from that of each column of `cross`
   const auto entry = [&](Index r) {
     if (!by_function) return static_cast<double>(memory.sums[r]);
     double sum = 0;
@@ -335,11 +336,10 @@ void PredictorData<T>::subtract_explained(const std::vector<PredictorTerm>& term
     }
     return sum;
   };
-  const T* row = inverse_.data();
+  const T* row = triangle_.data();
   for (Index i = 0; i < reduced_size_; ++i) {
-    const Index n = simd::padded<T>(i + 1);
-    loops<T>().weighted_sums(n, n_columns, row, memory.cross.data(), memory.cross.rows(), memory.sums.data());
-    row += n;
+    whiten(i, row, memory);
+    row += simd::padded<T>(i + 1);
     for (Index r = 0; r < d; ++r) {
       memory.explained[r] = entry(r);
       for (Index s = 0; s <= r; ++s) covariance(r, s) -= memory.explained[r] * memory.explained[s];

@@ -38,7 +38,7 @@ class PredictorData {
     Vector products;  // (n_rows)
     Vector loading;   // (F)
     Matrix rows;      // where there are sums: cov of each row of a sample with · (rows × columns)
-    Matrix cross;     // cov(basis variables, ·) (basis variables, padded × columns)
+    Matrix cross;     // cov(basis variables, ·), whitened in place by a factor (basis variables, padded × columns)
 
     Eigen::VectorXd explained;    // a row of X c (rows of the view)
     Eigen::VectorXd k_in_double;  // of a kernel that is no se
@@ -75,8 +75,8 @@ class PredictorData {
   };
 
   static void reserve_gradient(const PredictorTerm& term, Memory& memory);
-  void store_inverse(const LatentPosterior& posterior);
-  void store_root(const InverseRoot& root);
+  void store_triangle(const LatentPosterior& posterior);
+  void whiten(Eigen::Index i, const T* row, Memory& memory) const;
   void evaluate_kernel(const PredictorTerm& term, std::size_t a, const Eigen::VectorXd& point, Memory& memory, T* k) const;
   void move_point(const LatentData& data, const Eigen::VectorXd& point, Memory& memory) const;
   [[nodiscard]] bool is_by_function(const std::vector<PredictorTerm>& terms, Eigen::Index n_rows) const;
@@ -92,7 +92,9 @@ class PredictorData {
   std::vector<std::vector<Eigen::Index>> row_of_;  // [component][sample], as in LatentPosterior
   Eigen::SparseMatrix<T, Eigen::RowMajor> sums_;   // D, as in LatentPosterior; empty: there are none
   Eigen::Index n_samples_ = 0, reduced_size_ = 0;
-  std::vector<T> inverse_;  // X row by row, each padded with zeros to whole vectors
+  bool whitens_by_factor_ = false;
+  std::vector<T>
+      triangle_;  // of LatentPosterior, row by row, each padded with zeros to whole vectors; of a factor 1/L_ii for L_ii
 };
 
 extern template class PredictorData<double>;

@@ -78,50 +78,79 @@ void Query::view_of(const Posterior::Implementation& posterior, const std::vecto
   }
 }
 
-std::vector<MatrixXd> Query::loadings(const Posterior::Implementation& posterior) const { return loadings(posterior, view.matrix); }
-
-std::vector<MatrixXd> Query::loadings(const Posterior::Implementation& posterior, const MatrixXd& B) const {
-  const Index nq = prior.mean.rows(), n_rows = B.rows() / nq;
+std::vector<MatrixXd> Query::loadings(const Posterior::Implementation& posterior) const {
   std::vector<MatrixXd> loadings;
   for (std::size_t a = 0; a < posterior.C.size(); ++a) {
     const MatrixXd& C = posterior.C[a];
-    MatrixXd& of_latent = loadings.emplace_back(MatrixXd::Zero(C.cols() * n_rows, size()));
+    MatrixXd& of_latent = loadings.emplace_back(MatrixXd::Zero(C.cols() * n_rows(), size()));
     for (int i = 0; needs(a) && i < static_cast<int>(size()); ++i) {
-      const Map<const MatrixXd> of_state(B.col(i).data(), n_rows, nq);
-      Map<MatrixXd>(of_latent.col(i).data(), C.cols(), n_rows) = C.transpose() * (of_state * prior.E(a, i)).transpose();
+      Map<MatrixXd>(of_latent.col(i).data(), C.cols(), n_rows()) = C.transpose() * (view.G(i) * prior.E(a, i)).transpose();
     }
   }
   return loadings;
 }
 
-Query::Fewer Query::fewer_loadings(const Posterior::Implementation& posterior) const {
-  constexpr double rounding = 1e-12;  // of rows of unit norm: none that matters is lost, whatever its unit
-  const Index d = n_rows(), nq = prior.mean.rows(), most = std::min(d, nq);
-  Fewer out;
-  MatrixXd bases = MatrixXd::Zero(nq * most, size());  // Wᵀ, zero beyond the rank
-  MatrixXd rows(nq, d);
-  VectorXd reflection(most);
+namespace {
+
+struct IndependentColumns {
+  std::vector<int> columns;  // rising
+  MatrixXd U;                // all are these times Uᵀ  (d × r)
+};
+
+// Those of a matrix of d columns, each in a unit of its own, that the others depend on.
+IndependentColumns independent_columns(MatrixXd X) {
+  constexpr double rounding = 1e-12;  // of columns of unit norm
+  const Index d = X.cols();
+  VectorXd norms(d), reflection(std::min(X.rows(), d));
+  for (Index k = 0; k < d; ++k) {
+    norms[k] = X.col(k).stableNorm();
+    if (norms[k] > 0) X.col(k) /= norms[k];
+  }
   Eigen::VectorXi order(d);
-  for (int i = 0; i < static_cast<int>(size()); ++i) {
-    rows = view.G(i).transpose();
-    for (auto row : rows.colwise()) {
-      if (const double norm = row.stableNorm(); norm > 0) row /= norm;
+  const Index r = internal::pivoted_qr(X, reflection, order, rounding);
+  IndependentColumns out{{order.begin(), order.begin() + r}, MatrixXd::Zero(d, r)};
+  std::ranges::sort(out.columns);
+  const auto place = [&](int column) { return std::ranges::lower_bound(out.columns, column) - out.columns.begin(); };
+  for (Index j = 0; j < r; ++j) out.U(order[j], place(order[j])) = 1;
+  for (Index k = r; k < d; ++k) {
+    const VectorXd of_chosen = X.topLeftCorner(r, r).triangularView<Eigen::Upper>().solve(X.col(k).head(r));
+    for (Index j = 0; j < r; ++j) out.U(order[k], place(order[j])) = of_chosen[j] * norms[order[k]] / norms[order[j]];
+  }
+  return out;
+}
+
+}  // namespace
+
+Query::Fewer Query::fewer_loadings(const Posterior::Implementation& posterior) const {
+  const std::vector<MatrixXd> all = loadings(posterior);
+  const Index d = n_rows(), n = size();
+  if (d == 0) return {0, MatrixXd(0, n), all};
+  Index n_stacked = 0;
+  for (const MatrixXd& C : posterior.C) n_stacked += C.cols();
+  std::vector<IndependentColumns> of_state;
+  Fewer out;
+  for (Index i = 0; i < n; ++i) {
+    Index first = 0;
+    MatrixXd stacked(n_stacked, d);
+    for (const MatrixXd& of_latent : all) {
+      const Map<const MatrixXd> loading(of_latent.col(i).data(), of_latent.rows() / d, d);
+      stacked.middleRows(first, loading.rows()) = loading;
+      first += loading.rows();
     }
-    const Index rank = internal::pivoted_qr(rows, reflection, order, rounding);
-    auto basis = Map<MatrixXd>(bases.col(i).data(), nq, most).leftCols(rank);
-    basis.setIdentity();
-    internal::apply_Q(rows, reflection, rank, basis);
-    out.n_rows = std::max(out.n_rows, rank);
+    of_state.push_back(independent_columns(std::move(stacked)));
+    out.n_rows = std::max(out.n_rows, of_state.back().U.cols());
   }
   const Index r = out.n_rows;
-  out.U.resize(d * r, size());
-  MatrixXd W(r * nq, size());
-  for (int i = 0; i < static_cast<int>(size()); ++i) {
-    const auto basis = Map<const MatrixXd>(bases.col(i).data(), nq, most).leftCols(r);
-    Map<MatrixXd>(out.U.col(i).data(), d, r) = view.G(i).lazyProduct(basis);
-    Map<MatrixXd>(W.col(i).data(), r, nq) = basis.transpose();
+  out.U = MatrixXd::Zero(d * r, n);
+  for (const MatrixXd& of_latent : all) out.loadings.emplace_back(MatrixXd::Zero(of_latent.rows() / d * r, n));
+  for (Index i = 0; i < n; ++i) {
+    const auto& [chosen, U] = of_state[static_cast<std::size_t>(i)];
+    out.U.col(i).head(U.size()) = U.reshaped();
+    for (std::size_t a = 0; a < all.size(); ++a) {
+      const Map<const MatrixXd> loading(all[a].col(i).data(), all[a].rows() / d, d);
+      out.loadings[a].col(i).head(loading.rows() * U.cols()) = loading(Eigen::all, chosen).reshaped();
+    }
   }
-  out.loadings = loadings(posterior, W);
   return out;
 }
 

@@ -40,12 +40,12 @@ struct Query {
   /// (G E_a C_a)ᵀ per latent: of v = … + Σ_a ℓ_aᵀ f_a at each state (F·d × n). Zero where the latent is not needed.
   [[nodiscard]] std::vector<Eigen::MatrixXd> loadings(const Posterior::Implementation& posterior) const;
 
-  /// The same of w, v = … + U w with fewer rows than v where constraints leave G a smaller rank: U = G Wᵀ of an orthonormal W with
-  /// G = G WᵀW. Of as many rows at each state as the largest rank among them.
+  /// The same of w, some rows of v of which the latents' part of all others is made, v = … + U w: as many at each state as the most at
+  /// any of them need, zeros beyond its own. Constraints leave some rows to others.
   struct Fewer {
     Eigen::Index n_rows = 0;                // r
     Eigen::MatrixXd U;                      // (d·r × n), column-major blocks
-    std::vector<Eigen::MatrixXd> loadings;  // (W E_a C_a)ᵀ  (F·r × n)
+    std::vector<Eigen::MatrixXd> loadings;  // per latent (F·r × n)
   };
   [[nodiscard]] Fewer fewer_loadings(const Posterior::Implementation& posterior) const;
 
@@ -57,8 +57,6 @@ struct Query {
     View of;
     Eigen::Index first = 0;  // number of the first state among all, for the message
   };
-  // (B E_a C_a)ᵀ of a B (r × nq) of each state, column-major blocks
-  [[nodiscard]] std::vector<Eigen::MatrixXd> loadings(const Posterior::Implementation& posterior, const Eigen::MatrixXd& B) const;
   std::shared_ptr<const Nonlinear> nonlinear_;  // null of a linear prior
 };
 

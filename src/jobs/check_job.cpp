@@ -284,34 +284,29 @@ void check_channels(const WholeLog& log, const System& system, std::vector<Findi
   }
 }
 
-// Of a log in the order of time: velocities are the rates of coordinates, accelerations those of velocities.
-void check_rates(const WholeLog& log, const System& system, std::vector<Finding>& findings) {
+// Columns that look clipped, and angles in degrees.
+void check_values(const WholeLog& log, const System& system, std::vector<Finding>& findings) {
   const StateLayout layout = system.layout();
-  constexpr Eigen::Index fewest = 30, enough = 300'000;
-  const Eigen::Index n = std::min(log.states.cols(), enough);
-  const Eigen::RowVectorXd t = log.states.row(layout.t()).head(n);
-  if (t.hasNaN() || t.size() < fewest || !((t.tail(t.size() - 1) - t.head(t.size() - 1)).array() > 0).all()) return;
-  std::vector<Eigen::RowVectorXd> q, dq, ddq;
-  std::vector<std::string> velocities;
-  for (int j = 0; j < system.nq(); ++j) {
-    q.emplace_back(log.states.row(layout.q(j)).head(n));
-    dq.emplace_back(log.states.row(layout.dq(j)).head(n));
-    ddq.emplace_back(log.accelerations.row(j).head(n));
-    velocities.push_back(system.coordinates()[static_cast<std::size_t>(j)].velocity());
-  }
-  const auto note_if_wrong = [&](const RateColumns& columns) {
-    const std::string text = columns.value.hasNaN() ? "" : better_rate(columns);
-    if (text.empty()) return false;
-    findings.push_back(
-        {Level::warning, fmt::format("{} is not the rate of {} over t: {}", columns.names[columns.own], columns.name, text)});
-    return true;
+  const auto add = [&](Level level, const std::string& name, const Eigen::RowVectorXd& values, const char* meaning) {
+    if (const std::optional<PileUp> found = pile_up(values)) {
+      findings.push_back({level, fmt::format("{} is exactly {:.4g}, its extreme, in {:.0f} % of the rows, and else takes many "
+                                             "values: {}",
+                                             name, found->value, 100 * found->share, meaning)});
+    }
   };
+  for (int k = 0; k < layout.nu; ++k) {
+    add(Level::good, system.inputs()[static_cast<std::size_t>(k)], log.states.row(layout.u(k)),
+        "clipped? The log must have what acts");
+  }
   const std::vector<std::string> accelerations = system.acceleration_names();
-  for (std::size_t j = 0; j < q.size(); ++j) {
-    const Coordinate& coordinate = system.coordinates()[j];
-    // a velocity that is wrong says nothing of the acceleration
-    if (!note_if_wrong({t, coordinate.name, q[j], coordinate.angle, dq, velocities, j}))
-      note_if_wrong({t, velocities[j], dq[j], false, ddq, accelerations, j});
+  for (int j = 0; j < system.nq(); ++j) {
+    add(Level::warning, accelerations[static_cast<std::size_t>(j)], log.accelerations.row(j),
+        "a sensor at the end of its range?");
+    const Coordinate& coordinate = system.coordinates()[static_cast<std::size_t>(j)];
+    const auto q = log.states.row(layout.q(j));
+    if (!coordinate.angle || !is_wrapped_in_degrees({q.begin(), q.end()})) continue;
+    findings.push_back({Level::error, fmt::format("{} jumps by 360 from row to row: it is in degrees, and an angle is in rad",
+                                                  coordinate.name)});
   }
 }
 
@@ -323,7 +318,9 @@ void check_log(const Model& model, const CsvTable& table, const CheckOptions& op
   check_channels(log, system, findings);
   const std::string rest = text_of_rest(model, system.parameter_values(), log.states, log.accelerations);
   if (!rest.empty()) findings.push_back({Level::warning, rest});
-  check_rates(log, system, findings);
+  check_values(log, system, findings);
+  for (std::string& text : wrong_rates(system, log.states, log.accelerations))
+    findings.push_back({Level::warning, std::move(text)});
   check_mechanics(model, log.states, findings);
   if (has_error(findings)) return;
   append(findings, check_data(system, log.states, system.parameter_values(), log.accelerations, log.stddev, log.stated));

@@ -16,6 +16,7 @@
 #include "base/parallel.hpp"
 #include "base/random.hpp"
 #include "data/evenly.hpp"
+#include "gp2/base/statistics.hpp"
 #include "gp2/error.hpp"
 #include "gp2/inference/evaluation.hpp"
 #include "training/evolution.hpp"
@@ -388,12 +389,6 @@ void require_within(const Candidate& best, const std::vector<Limit>& limits, int
       n_motions, worst->name, value, worst->excess(value), worst->lower, worst->upper));
 }
 
-double median_of(std::vector<double> values) {
-  const auto middle = values.begin() + std::ssize(values) / 2;
-  std::nth_element(values.begin(), middle, values.end());
-  return *middle;
-}
-
 VectorXd region_stddev(const ExpectedInformation::Known& known, const VectorXd& noise_stddev) {
   return noise_stddev.cwiseProduct(known.region.rowwise().mean().cwiseSqrt());
 }
@@ -408,7 +403,7 @@ void add_known(const Search& search, const std::vector<std::string>& names, cons
     for (const Candidate& one : search.random()) {
       if (one.is_within()) random.push_back(of(one.known)[at]);
     }
-    out.push_back({names[k], now[at], after[at], random.empty() ? not_a_number : median_of(std::move(random))});
+    out.push_back({names[k], now[at], after[at], random.empty() ? not_a_number : median(std::move(random))});
   }
 }
 
@@ -508,7 +503,7 @@ Excitation excite(const FitSystem& driven, const Posterior& posterior, const std
     if (one.is_within()) random.push_back(search.factor(one));
   }
   out.n_random = static_cast<int>(random.size());
-  out.random_factor = random.empty() ? not_a_number : median_of(std::move(random));
+  out.random_factor = random.empty() ? not_a_number : median(std::move(random));
   std::vector<std::string> names;
   for (const Hyperparameter& h : information.parameters()) names.push_back(h.name);
   add_known(

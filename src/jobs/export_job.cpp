@@ -200,7 +200,7 @@ std::vector<Option> options(ExportRequest& request) {
   table.push_back(
       {"draws_within", &request.draws_within, "E",
        "of a fit whose hyperparameters are integrated: few draws, which stand for all within this share of a standard "
-       "deviation",
+       "deviation of the exported view: root mean square over up to 300 observed states, of which single ones may be off by more",
        "all draws"});
   return table;
 }
@@ -214,7 +214,7 @@ ExportOutcome export_fit(const FitFile& fit, const Posterior& posterior, const E
   if (request.to == Target::acados) viewed.time_step.reset();
   const PredictedView at = predicted_view(fit, posterior.prior(), viewed);
   const bool few = request.draws_within && posterior.n_components() > 1;
-  const Posterior exported = few ? posterior.components(posterior.fewest_components(*request.draws_within)) : posterior;
+  const Posterior exported = few ? posterior.components(posterior.fewest_components(*request.draws_within, at.view)) : posterior;
   if (few) {
     out.notes.push_back(fmt::format("{} of {} draws stand for all", exported.n_components(), posterior.n_components()));
   }

@@ -10,6 +10,7 @@
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
+#include "base/not_a_number.hpp"
 #include "base/parallel.hpp"
 #include "data/evenly.hpp"
 #include "gp2/error.hpp"
@@ -377,8 +378,26 @@ bool keeps_row_order(const FitFile& fit, const std::vector<Observations>& observ
   return keeps_row_order(fit, n_states);
 }
 
+namespace {
+
+// The posterior to judge a fit by: of a robust one without the values that it distrusts, which are no measure of its predictions.
+// Inducing points keep what all values said in one sum, from which none can be taken.
+Posterior without_distrusted(const Posterior& posterior, const FitReport& report) {
+  if (report.distrusted.empty() || report.inducing) return posterior;
+  std::vector<Observations> trusted = posterior.observations();
+  std::vector<Eigen::MatrixXd> values;
+  for (const Observations& group : trusted) values.push_back(group.values());
+  for (const DistrustedValue& one : report.distrusted) {
+    values[static_cast<std::size_t>(one.group)](one.row, one.state) = not_a_number;
+  }
+  for (std::size_t g = 0; g < trusted.size(); ++g) trusted[g] = trusted[g].with_values(values[g]);
+  return posterior_of(posterior.prior(), trusted, report);
+}
+
+}  // namespace
+
 CrossValidation cross_validate(const FitFile& fit, const Posterior& posterior) {
-  CrossValidation scores = cross_validate(posterior, keeps_row_order(fit, fit.n_states()));
+  CrossValidation scores = cross_validate(without_distrusted(posterior, fit.report), keeps_row_order(fit, fit.n_states()));
   if (!scores.stretches && fit.report.inducing) scores.stretches = fit.report.inducing->stretches;
   return scores;
 }
@@ -417,6 +436,17 @@ void save_checkpoint(const FitJob& job, const FitReport& report, const std::vect
   file.write(job.checkpoint);
 }
 
+// A fit that fails where single values are far off fails for them more often than for what it says.
+Fit fit_and_name_gross_errors(const FitProblem& problem, const FitOptions& options) {
+  try {
+    return fit(problem, options);
+  } catch (const NumericalError& error) {
+    const std::string text = problem.robust || is_set(options.stop) ? "" : gross_errors_text(problem);
+    if (text.empty()) throw;
+    throw NumericalError(fmt::format("{}; the reason may be that {}", error.what(), text));
+  }
+}
+
 FitOutcome run_once(const FitJob& job, const std::function<void(const Progress&)>& progress, const std::atomic<bool>* stop) {
   FitOptions options = job.options;
   options.progress = progress;
@@ -433,7 +463,7 @@ FitOutcome run_once(const FitJob& job, const std::function<void(const Progress&)
       }
     };
   }
-  Fit result = fit(job.problem, options);
+  Fit result = fit_and_name_gross_errors(job.problem, options);
   FitOutcome outcome{job.file, std::move(result.posterior), distrust_notes(job.problem, result.report), std::nullopt};
   if (!unsaved.empty()) outcome.notes.push_back(fmt::format("warning: a checkpoint was not saved: {}", unsaved));
   for (std::string& note : notes_of(result.report)) outcome.notes.push_back(std::move(note));
@@ -446,10 +476,12 @@ FitOutcome run_once(const FitJob& job, const std::function<void(const Progress&)
       add_constraint_note(outcome.posterior, outcome.notes);
       add_window_note(outcome.posterior, outcome.notes);
       const bool has_row_order = keeps_row_order(outcome.file, job.problem.observations);
-      outcome.cross_validation = cross_validate(outcome.posterior, has_row_order);
+      const Posterior judged = without_distrusted(outcome.posterior, result.report);
+      outcome.cross_validation = cross_validate(judged, has_row_order);
       if (result.report.inducing) result.report.inducing->stretches = outcome.cross_validation->stretches;
       if (result.report.iterations > 0) add_noise_notes(outcome.posterior, outcome.notes);
-      add_residual_notes(outcome.posterior, outcome.cross_validation->residuals, outcome.notes);
+      add_residual_notes(judged, outcome.cross_validation->residuals, outcome.notes);
+      add_pile_up_notes(judged.observations(), *judged.prior().system, outcome.notes);
       add_stretch_note(*outcome.cross_validation, outcome.notes);
       FitOptions quick;
       quick.n_restarts = 1;

@@ -12,7 +12,9 @@
 
 #include "base/not_a_number.hpp"
 #include "data/evenly.hpp"
+#include "gp2/training/robust.hpp"
 #include "inference/posterior_implementation.hpp"
+#include "jobs/rate_check.hpp"
 
 namespace gp2 {
 
@@ -45,13 +47,99 @@ void add_noise_notes(const Posterior& posterior, std::vector<std::string>& notes
   }
 }
 
+void add_pile_up_notes(const std::vector<Observations>& observations, const System& system, std::vector<std::string>& notes) {
+  for (std::size_t g = 0; g < observations.size(); ++g) {
+    const Observations& group = observations[g];
+    const View& view = group.view();
+    if (!view.is_of_ddq() || view.other_system) continue;
+    const std::string of_log = observations.size() > 1 ? fmt::format(" of log {}", g + 1) : "";
+    for (int k = 0; k < system.layout().nu; ++k) {
+      if (const std::optional<PileUp> found = pile_up(group.states().row(system.layout().u(k)))) {
+        notes.push_back(
+            fmt::format("the input {}{} is exactly {:.4g}, its extreme, in {:.0f} % of the rows, and else takes many "
+                        "values: clipped? The log must have what acts",
+                        system.inputs()[static_cast<std::size_t>(k)], of_log, found->value, 100 * found->share));
+      }
+    }
+    const std::vector<std::string> names = view.names(system);
+    for (int k = 0; k < view.size(); ++k) {
+      if (const std::optional<PileUp> found = pile_up(group.values().row(k))) {
+        notes.push_back(
+            fmt::format("warning: {}{} is exactly {:.4g}, its extreme, in {:.0f} % of the rows, and else takes many "
+                        "values: a sensor at the end of its range?",
+                        names[static_cast<std::size_t>(k)], of_log, found->value, 100 * found->share));
+      }
+    }
+  }
+}
+
+std::string gross_errors_text(const FitProblem& problem) {
+  constexpr double few = 0.05;  // of a column's values
+  constexpr std::size_t most_shown = 6;
+  std::vector<std::string> far;
+  for (std::size_t g = 0; g < problem.observations.size(); ++g) {
+    const Observations& group = problem.observations[g];
+    const View& view = group.view();
+    const MatrixXd near = without_gross_errors(group.values());
+    const std::vector<std::string> names = view.names(*prior_of(problem.prior, view).system);
+    for (Eigen::Index k = 0; k < near.rows(); ++k) {
+      const auto n = (!group.values().row(k).array().isNaN()).count(), n_near = (!near.row(k).array().isNaN()).count();
+      if (static_cast<double>(n - n_near) > few * static_cast<double>(n)) continue;
+      for (Eigen::Index i = 0; i < near.cols(); ++i) {
+        if (std::isnan(group.values()(k, i)) || !std::isnan(near(k, i))) continue;
+        const auto state = static_cast<std::size_t>(i);
+        const std::string line =
+            state < problem.lines[g].size() ? fmt::format("line {}", problem.lines[g][state]) : fmt::format("row {}", i + 1);
+        far.push_back(fmt::format("{} = {:.6g} in {}{}", names[static_cast<std::size_t>(k)], group.values()(k, i), line,
+                                  problem.observations.size() > 1 ? fmt::format(" of log {}", g + 1) : ""));
+      }
+    }
+  }
+  if (far.empty()) return "";
+  if (far.size() > most_shown) {
+    far.resize(most_shown);
+    far.emplace_back("…");
+  }
+  return fmt::format("single values lie far from all others: {}. Mend or empty these cells, or fit with `robust`",
+                     fmt::join(far, ", "));
+}
+
+namespace {
+
+// The accelerations of a group against A ddq = b. An estimated noise takes up what denies a constraint: beside it they are judged by
+// the terms that should cancel, as where no noise is known. A row of one term alone has nothing to cancel, and a soft one need not.
+std::vector<ConstraintResidual> residuals_to_judge(const Posterior& posterior, std::size_t group) {
+  const Observations& of = posterior.observations()[group];
+  const Prior& prior = prior_of(posterior.prior(), of.view());
+  std::vector<ConstraintResidual> residuals = constraint_residuals(posterior, group);
+  if (!of.noise().is_estimated() || of.has_sums() || prior.system->has_constraint_noise()) return residuals;
+  constexpr double rounding = 1e-9;
+  for (ConstraintResidual& one : residuals) {
+    if (!one.is_too_large() && one.rms < (1 - rounding) * one.size) one.expected = not_a_number;
+  }
+  return residuals;
+}
+
+// Where measured accelerations, or the velocities beside them, are not the rates of what they should be.
+void add_rate_notes(const Posterior& posterior, std::size_t group, std::vector<std::string>& notes) {
+  const Observations& of = posterior.observations()[group];
+  const System& system = *prior_of(posterior.prior(), of.view()).system;
+  MatrixXd accelerations = MatrixXd::Constant(system.nq(), of.n_data(), not_a_number);
+  accelerations(of.view().rows, Eigen::all) = of.values();
+  for (const std::string& text : wrong_rates(system, of.states(), accelerations)) notes.push_back("warning: " + text);
+}
+
+}  // namespace
+
 void add_residual_notes(const Posterior& posterior, const std::vector<TrainingResidual>& residuals,
                         std::vector<std::string>& notes) {
   for (std::size_t g = 0; g < posterior.observations().size(); ++g) {
     if (!posterior.observations()[g].view().is_of_ddq()) continue;
-    for (const ConstraintResidual& one : constraint_residuals(posterior, g)) {
+    const std::size_t n_before = notes.size();
+    for (const ConstraintResidual& one : residuals_to_judge(posterior, g)) {
       if (one.is_too_large()) notes.push_back("warning: " + one.text());
     }
+    if (notes.size() > n_before) add_rate_notes(posterior, g, notes);
   }
   std::vector<std::string> large, small;
   const TrainingResidual* farthest = nullptr;
@@ -89,8 +177,35 @@ void add_residual_notes(const Posterior& posterior, const std::vector<TrainingRe
       fmt::join(small, ", ")));
 }
 
+namespace {
+
+// Whether stretches that were left out are predicted much worse than the noise and rows left out one by one, or somewhat worse while
+// the fit is too sure of itself. What the model lacks is taken up between rows that are known, and told by stretches that are not.
+bool predicts_stretches_worse(const CrossValidation& of) {
+  constexpr double several = 3, worth_a_word = 0.01;  // times the noise or the error of single rows; of the spread
+  constexpr double somewhat = 1.3, low_coverage = 0.9;
+  constexpr int enough = 100;  // rows, for a coverage
+  if (!of.stretches) return false;
+  const double usual = std::max(of.nrmse_of_noise, of.one_by_one.nrmse), error = of.stretches->nrmse;
+  return (error > several * usual && error > worth_a_word) ||
+         (error > somewhat * usual && of.stretches->coverage95 < low_coverage && of.stretches->n >= enough);
+}
+
+}  // namespace
+
 void add_stretch_note(const CrossValidation& cross_validation, std::vector<std::string>& notes) {
-  if (!cross_validation.predicts_little()) return;
+  if (!cross_validation.predicts_little()) {
+    if (!predicts_stretches_worse(cross_validation)) return;
+    const Evaluation::Part& stretches = *cross_validation.stretches;
+    notes.push_back(fmt::format(
+        "stretches of the log that were left out are predicted worse than rows left out one by one: nrmse {:.2g}, not {:.2g}, of "
+        "which the noise makes {:.2g}, with {:.0f} % within 95 %. Something acts otherwise than the model has it (an input that "
+        "is "
+        "clipped, late or scaled, an inertia that is off), or the rows are too few, or of one motion, for what the model leaves "
+        "open",
+        stretches.nrmse, cross_validation.one_by_one.nrmse, cross_validation.nrmse_of_noise, 100 * stretches.coverage95));
+    return;
+  }
   notes.push_back(fmt::format(
       "{}of stretches of the log that it has not seen the fit says little: nrmse {:.2g}, of which the noise makes {:.2g}. An "
       "input, a mass or a constraint is wrong or missing, or the rows are too few for what the model leaves open",

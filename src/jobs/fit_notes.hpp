@@ -6,12 +6,19 @@
 
 #include "gp2/fit.hpp"
 #include "gp2/inference/evaluation.hpp"
+#include "gp2/jobs/fit_problem.hpp"
 
 // What a person should know of a fit that has ended.
 namespace gp2 {
 
 // Logs whose estimated noise is much larger than that of others: a log that contradicts them may be taken for that.
 void add_noise_notes(const Posterior& posterior, std::vector<std::string>& notes);
+
+// Input and acceleration columns whose values pile up at an extreme, as clipped ones do.
+void add_pile_up_notes(const std::vector<Observations>& observations, const System& system, std::vector<std::string>& notes);
+
+// Which measured values lie so far from all others that a fit may fail for them; empty where none do, or many.
+std::string gross_errors_text(const FitProblem& problem);
 
 // What the residuals say against the data, the constraints or the noise.
 void add_residual_notes(const Posterior& posterior, const std::vector<TrainingResidual>& residuals,

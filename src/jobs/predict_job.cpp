@@ -11,7 +11,6 @@
 #include "gp2/error.hpp"
 #include "gp2/inference/inverse_dynamics.hpp"
 #include "gp2/jobs/fit_problem.hpp"
-#include "gp2/simulate.hpp"
 #include "jobs/read_observations.hpp"
 
 namespace gp2 {
@@ -274,7 +273,6 @@ PredictOutcome predict_inputs(const FitFile& fit, const Posterior& posterior, co
   }
   // of the size of what is wanted and of what happens without inputs: what is wanted may be 0
   constexpr double produced = 1e-6;
-  wanted.states.bottomRows(system.layout().nu).setZero();
   const MatrixXd idle = posterior.mean(wanted.view, wanted.states, /*n_threads=*/0);
   const auto is_missed =
       found.missed.colwise().norm().array() > produced * (wanted.accelerations.colwise().norm() + idle.colwise().norm()).array();
@@ -294,9 +292,7 @@ PredictOutcome predict_inputs(const FitFile& fit, const Posterior& posterior, co
 
 std::optional<std::string> note_of_open_inputs(const InverseDynamics& found, const Model& model, const std::string& states) {
   const System& system = *model.system;
-  Eigen::Array<bool, Eigen::Dynamic, Eigen::Dynamic> open = found.open;
-  // whether there is contact follows from the motion
-  for (const Contact& contact : contacts_of(model, system.parameter_values())) open.row(contact.input) = false;
+  const auto& open = found.open;
   std::vector<std::string> names;
   for (Index k = 0; k < open.rows(); ++k) {
     if (open.row(k).any()) names.push_back(system.inputs()[static_cast<std::size_t>(k)]);

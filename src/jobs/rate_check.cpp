@@ -2,8 +2,10 @@
 
 #include <algorithm>
 #include <cmath>
+#include <iterator>
 #include <numbers>
 #include <optional>
+#include <utility>
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
@@ -15,6 +17,8 @@ namespace gp2 {
 
 using Eigen::ArrayXd;
 using Eigen::Index;
+using Eigen::MatrixXd;
+using Eigen::Ref;
 using Eigen::RowVectorXd;
 
 namespace {
@@ -203,6 +207,76 @@ std::string better_rate(const RateColumns& columns) {
     }
   }
   return "";
+}
+
+std::vector<std::string> wrong_rates(const System& system, const Ref<const MatrixXd>& states,
+                                     const Ref<const MatrixXd>& accelerations) {
+  const StateLayout layout = system.layout();
+  constexpr Index fewest = 30, enough = 300'000;
+  const Index n = std::min(states.cols(), enough);
+  const RowVectorXd t = states.row(layout.t()).head(n);
+  if (t.hasNaN() || t.size() < fewest || !((t.tail(t.size() - 1) - t.head(t.size() - 1)).array() > 0).all()) return {};
+  std::vector<RowVectorXd> q, dq, ddq;
+  std::vector<std::string> velocities;
+  for (int j = 0; j < system.nq(); ++j) {
+    q.emplace_back(states.row(layout.q(j)).head(n));
+    dq.emplace_back(states.row(layout.dq(j)).head(n));
+    ddq.emplace_back(accelerations.row(j).head(n));
+    velocities.push_back(system.coordinates()[static_cast<std::size_t>(j)].velocity());
+  }
+  std::vector<std::string> notes;
+  const auto add_if_wrong = [&](const RateColumns& columns) {
+    const std::string text = columns.value.hasNaN() ? "" : better_rate(columns);
+    if (text.empty()) return false;
+    notes.push_back(fmt::format("{} is not the rate of {} over t: {}", columns.names[columns.own], columns.name, text));
+    return true;
+  };
+  const std::vector<std::string> acceleration_names = system.acceleration_names();
+  for (std::size_t j = 0; j < q.size(); ++j) {
+    const Coordinate& coordinate = system.coordinates()[j];
+    // a velocity that is wrong says nothing of the acceleration
+    if (!add_if_wrong({t, coordinate.name, q[j], coordinate.angle, dq, velocities, j}))
+      add_if_wrong({t, velocities[j], dq[j], false, ddq, acceleration_names, j});
+  }
+  return notes;
+}
+
+std::optional<PileUp> pile_up(const Ref<const RowVectorXd>& values) {
+  constexpr std::ptrdiff_t fewest = 8;
+  constexpr double least = 0.03, continuous = 0.8;  // shares: of all rows, of different values among the others
+  std::vector<double> sorted;
+  std::copy_if(values.begin(), values.end(), std::back_inserter(sorted), [](double one) { return std::isfinite(one); });
+  if (sorted.empty()) return std::nullopt;
+  std::sort(sorted.begin(), sorted.end());
+  const auto n = std::ssize(sorted);
+  const auto n_least = std::upper_bound(sorted.begin(), sorted.end(), sorted.front()) - sorted.begin();
+  const auto n_most = sorted.end() - std::lower_bound(sorted.begin(), sorted.end(), sorted.back());
+  const auto n_others = n - n_least - n_most;
+  if (n_others < n / 4) return std::nullopt;
+  const auto others = sorted.begin() + n_least;
+  std::ptrdiff_t n_different = 1;
+  for (auto one = others + 1; one < others + n_others; ++one) n_different += *one != *(one - 1) ? 1 : 0;
+  if (static_cast<double>(n_different) < continuous * static_cast<double>(n_others)) return std::nullopt;
+  const auto [at_end, value] = n_most >= n_least ? std::pair(n_most, sorted.back()) : std::pair(n_least, sorted.front());
+  if (value == 0 || at_end < fewest || static_cast<double>(at_end) < least * static_cast<double>(n)) return std::nullopt;
+  return PileUp{value, static_cast<double>(at_end) / static_cast<double>(n)};
+}
+
+bool is_wrapped_in_degrees(const std::vector<double>& angles) {
+  constexpr double turn = 360, near = 30, few = 0.02;  // degrees; share of the samples
+  const auto are_ends = [&](double a, double b) {
+    const auto [low, high] = std::minmax(a, b);
+    return std::abs(high - low - turn) < near && (std::abs(low) < near || std::abs(low + turn / 2) < near);
+  };
+  int n_wraps = 0, n_others = 0;
+  for (std::size_t k = 1; k < angles.size(); ++k) {
+    if (are_ends(angles[k - 1], angles[k])) {
+      ++n_wraps;
+    } else if (std::abs(angles[k] - angles[k - 1]) > near) {
+      ++n_others;
+    }
+  }
+  return n_wraps > 0 && n_others <= few * static_cast<double>(angles.size());
 }
 
 }  // namespace gp2

@@ -1,9 +1,12 @@
 #pragma once
 
+#include <optional>
 #include <string>
 #include <vector>
 
 #include <Eigen/Core>
+
+#include "gp2/system.hpp"
 
 namespace gp2 {
 
@@ -22,5 +25,26 @@ struct RateColumns {
 /// where nothing explains the values better, or where rows are too far apart to tell.
 /// @param columns  t increases
 std::string better_rate(const RateColumns& columns);
+
+/// Of a log in the order of time: which velocities are not the rates of their coordinates, and which accelerations not those of
+/// their velocities, a sentence each. Empty where t is not known.
+/// @param states         (layout size × N)
+/// @param accelerations  (nq × N); NaN: not measured
+std::vector<std::string> wrong_rates(const System& system, const Eigen::Ref<const Eigen::MatrixXd>& states,
+                                     const Eigen::Ref<const Eigen::MatrixXd>& accelerations);
+
+/// What a column looks like that was clipped.
+struct PileUp {
+  double value = 0;  // the largest or the smallest
+  double share = 0;  // of the rows
+};
+
+/// The extreme at which values of a continuous column pile up, neither 0 nor of one that takes a few values only, as one does that is
+/// switched, held or coarsely rounded.
+std::optional<PileUp> pile_up(const Eigen::Ref<const Eigen::RowVectorXd>& values);
+
+/// Whether an angle in degrees is wrapped: from sample to sample it jumps by nearly 360, between -180 and 180 or 0 and 360, and
+/// moves little else.
+bool is_wrapped_in_degrees(const std::vector<double>& angles);
 
 }  // namespace gp2

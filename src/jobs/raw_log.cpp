@@ -17,6 +17,7 @@
 #include "gp2/error.hpp"
 #include "gp2/jobs/fit_problem.hpp"
 #include "gp2/simulate.hpp"
+#include "jobs/rate_check.hpp"
 
 namespace gp2 {
 
@@ -354,6 +355,12 @@ void RawLog::unwrap(const Episode& episode, int column, Channel& channel) {
   int jumps = jumps_of(channel.measurements);
   if (jumps == 0) return;
   std::vector<double> values = values_of(channel.measurements);
+  if (is_wrapped_in_degrees(values)) {
+    throw InputError(
+        fmt::format("{}{} jumps by 360 from sample to sample: it is in degrees, and an angle is in rad. "
+                    "Convert it",
+                    place_of(column), in_episode(episode)));
+  }
   // single errors do not count
   std::sort(values.begin(), values.end());
   const std::size_t aside = values.size() / 50;

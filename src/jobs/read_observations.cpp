@@ -19,6 +19,7 @@
 #include "gp2/mechanics/udwadia_kalaba.hpp"
 #include "gp2/simulate.hpp"
 #include "gp2/simulation/projected_states.hpp"
+#include "inference/inverse_dynamics.hpp"
 #include "jobs/observation_noise.hpp"
 
 namespace gp2 {
@@ -676,10 +677,14 @@ WantedMotion read_wanted_motion(const Prior& prior, const Model& model, const Cs
     throw InputError(fmt::format("{}: has none of the columns {}, the accelerations that are wanted; it has: {}", log.name(),
                                  fmt::join(every, ", "), fmt::join(log.header(), ", ")));
   }
+  // inputs are what is looked for, but for those of sensors
+  const auto is_given = inputs_of_sensors(system);
   std::vector<bool> reads = prior.reads();
-  std::fill(reads.end() - layout.nu, reads.end(), false);
+  std::copy(is_given.begin(), is_given.end(), reads.end() - layout.nu);
   WantedMotion out{reader.states(reads), view, reader.values(view.names(system)), {}};
-  out.states.bottomRows(layout.nu).setZero();
+  for (int k = 0; k < layout.nu; ++k) {
+    if (!is_given[k]) out.states.row(layout.u(k)).setZero();
+  }
   note_violation(system, out.states, system.parameter_values(), log, out.notes);
   return out;
 }

@@ -45,6 +45,17 @@ StartingPoint empty_start(const System& system) {
   return {VectorXd::Zero(size), std::vector<bool>(static_cast<std::size_t>(size), false)};
 }
 
+// All of q and dq.
+StartingPoint start_by_values(const System& system, const VectorXd& values) {
+  const Index n = 2 * system.nq();
+  if (values.size() != n) throw InputError(fmt::format("`start`: expected {} numbers, got {}", n, values.size()));
+  if (!values.allFinite()) throw InputError("`start`: not all numbers are finite");
+  StartingPoint start = empty_start(system);
+  start.state.head(n) = values;
+  std::fill_n(start.given.begin(), n, true);
+  return start;
+}
+
 StartingPoint start_by_names(const System& system, const std::map<std::string, double>& given) {
   const std::vector<std::string> names = system.state_names();
   const auto end = names.begin() + system.layout().t();  // coordinates and velocities come first
@@ -114,23 +125,13 @@ void free_what_depends(const Model& model, const VectorXd& parameters, StartingP
 VectorXd start_state(const Model& model, const VectorXd& parameters, const SimulateRequest& request,
                      const std::map<std::string, std::string>& columns, std::vector<std::string>& notes) {
   const System& system = *model.system;
-  const StateLayout layout = system.layout();
-  const double t_start = request.times[0];
-  if (const auto* whole = std::get_if<VectorXd>(&request.start)) {
-    if (whole->size() != 2 * layout.nq) {
-      throw InputError(fmt::format("`start`: expected {} numbers, got {}", 2 * layout.nq, whole->size()));
-    }
-    if (!whole->allFinite()) throw InputError("`start`: not all numbers are finite");
-    VectorXd state = VectorXd::Zero(layout.size());
-    state.head(2 * layout.nq) = *whole;
-    state[layout.t()] = t_start;
-    return state;
-  }
-  const auto* table = std::get_if<CsvTable>(&request.start);
-  StartingPoint start = table != nullptr ? start_of_log(model, *table, columns)
-                                         : start_by_names(system, std::get<std::map<std::string, double>>(request.start));
-  start.state[layout.t()] = t_start;
-  if (table != nullptr) free_what_depends(model, parameters, start);
+  StartingPoint start =
+      std::visit(Overloaded{[&](const VectorXd& values) { return start_by_values(system, values); },
+                            [&](const CsvTable& table) { return start_of_log(model, table, columns); },
+                            [&](const std::map<std::string, double>& given) { return start_by_names(system, given); }},
+                 request.start);
+  start.state[system.layout().t()] = request.times[0];
+  if (std::holds_alternative<CsvTable>(request.start)) free_what_depends(model, parameters, start);
   return complete_start(model, parameters, std::move(start), notes);
 }
 
@@ -198,7 +199,7 @@ std::vector<Option> options(SimulateRequest& request) {
       {"project", Switch{&request.project, "on", "off"}, "",
        "onto the constraints, after each step and where states are written; off shows how far an integrator drifts"},
       {"samples", &request.n_samples, "S", "that many functions drawn from the posterior, instead of its mean", "", "n_samples"},
-      {"seed", &request.seed, "K", "of `samples`; same seed, same samples"},
+      {"seed", &request.seed, "K", "of the samples; same seed, same samples", "", "", "", "samples"},
       {"map", &request.columns, "LOGNAME=NAME,…", "columns by other names, in all logs together", "", "columns"},
   };
 }
@@ -386,12 +387,15 @@ std::vector<Trajectory> run_simulation(const SimulateJob& job, const std::atomic
 }
 
 std::vector<std::vector<double>> multiplier_sign_changes(const Trajectory& trajectory) {
+  const auto are_opposite = [](double a, double b) { return (a < 0 && b > 0) || (a > 0 && b < 0); };
   std::vector<std::vector<double>> changes;
   for (const auto& lambda : trajectory.records.rowwise()) {
     std::vector<double>& times = changes.emplace_back();
     for (Index i = 1; i < lambda.size(); ++i) {
       const double before = lambda[i - 1], after = lambda[i];
-      if ((before < 0) == (after < 0)) continue;
+      // a zero alone is one on the way; where a constraint does not hold, its multiplier is 0 row after row
+      if (after == 0 && i + 1 < lambda.size() && are_opposite(before, lambda[i + 1])) times.push_back(trajectory.times[i]);
+      if (!are_opposite(before, after)) continue;
       const double dt = trajectory.times[i] - trajectory.times[i - 1];
       times.push_back(trajectory.times[i - 1] + dt * before / (before - after));
     }

@@ -21,6 +21,17 @@ std::string listed(const std::vector<std::string>& names, const Eigen::VectorXd&
   return fmt::format("{}", fmt::join(parts, ", "));
 }
 
+// Whether a move of the coordinates, or of the velocities, is more than the last digits of a state that is written down as a whole.
+bool is_beyond_rounding(const System& system, const Eigen::VectorXd& from, const Eigen::VectorXd& to) {
+  constexpr double much = 1e-3;  // of the size of all coordinates, or of all velocities
+  const Eigen::Index nq = system.nq();
+  const auto is_moved = [&](Eigen::Index first) {
+    const auto before = from.segment(first, nq), after = to.segment(first, nq);
+    return (after - before).norm() > much * std::max(before.norm(), after.norm());
+  };
+  return is_moved(0) || is_moved(nq);
+}
+
 // "phi = 0.299864 for 0.3", of what is given and is something else in a state
 std::string listed_moves(const std::vector<std::string>& names, const StartingPoint& start, const Eigen::VectorXd& state) {
   std::vector<std::string> parts;
@@ -56,6 +67,73 @@ Nearest nearest_to(const System& system, const Eigen::VectorXd& parameters, cons
   return found;
 }
 
+// The nearest solution for the coordinates, with those that are given as they are, that Newton's method finds.
+// @throws NumericalError where it finds none
+Eigen::VectorXd solve_coordinates(const System& system, const Eigen::VectorXd& parameters, const StartingPoint& start) {
+  const Eigen::Index nq = system.nq();
+  std::vector<bool> held = start.given;
+  std::fill(held.begin() + nq, held.begin() + 2 * nq, false);
+  // each is moved by another share of `aside`: equal ones may keep a symmetry that has no slope
+  const auto solve_from = [&](double aside) {
+    Eigen::VectorXd from = start.state;
+    int n_open = 0;
+    for (Eigen::Index k = 0; k < nq; ++k) {
+      if (!held[static_cast<std::size_t>(k)]) from[k] += aside * std::cos(2.0 * n_open++);
+    }
+    return project_onto_constraints(system, parameters, from, held);
+  };
+  try {
+    return solve_from(0);
+  } catch (const NumericalError&) {
+    // where a constraint has no slope in what is open, as a circle at its highest point, Newton's method leaves other starts
+    const auto distance = [&](const Eigen::VectorXd& one) { return (one - start.state).head(nq).norm(); };
+    std::optional<Eigen::VectorXd> nearest;
+    for (const double aside : {0.3, 1.0, -1.0}) {
+      try {
+        const Eigen::VectorXd found = solve_from(aside);
+        if (!nearest || distance(found) < distance(*nearest)) nearest = found;
+      } catch (const NumericalError&) {  // perhaps from another
+      }
+    }
+    if (!nearest) throw;
+    return *nearest;
+  }
+}
+
+// A start on the constraints: coordinates first, then velocities there, since what is given of one level says nothing against a solution
+// of the other. Where what is given leaves none, `why` says so, and the nearest stands for it.
+// @throws NumericalError where there is none near
+Nearest solve_start(const System& system, const Eigen::VectorXd& parameters, const StartingPoint& start, std::string& why) {
+  const Eigen::Index nq = system.nq();
+  const auto is_impossible = [&](const NumericalError& error) {
+    if (why.empty()) why = error.what();
+  };
+  Nearest found;
+  try {
+    found.projected = solve_coordinates(system, parameters, start);
+    found.start = found.projected;
+  } catch (const NumericalError& error) {
+    is_impossible(error);
+    found = nearest_to(system, parameters, start, false);
+  }
+  found.projected.segment(nq, nq) = start.state.segment(nq, nq);
+  const Eigen::VectorXd at = found.projected;
+  Eigen::VectorXd velocities;
+  try {
+    std::vector<bool> held = start.given;
+    std::fill(held.begin(), held.begin() + nq, true);
+    found.projected = project_onto_constraints(system, parameters, at, held);
+    velocities = found.projected;
+  } catch (const NumericalError& error) {
+    is_impossible(error);
+    const Nearest nearest = nearest_to(system, parameters, {at, start.given}, true);
+    velocities = nearest.start;
+    found.projected = nearest.projected;
+  }
+  found.start.segment(nq, nq) = velocities.segment(nq, nq);
+  return found;
+}
+
 }  // namespace
 
 Eigen::VectorXd complete_start(const Model& model, const Eigen::VectorXd& parameters, StartingPoint start,
@@ -70,7 +148,8 @@ Eigen::VectorXd complete_start(const Model& model, const Eigen::VectorXd& parame
     // an entry that is known from elsewhere is the better start
     if (newton_start != model.newton_start.end() && start.state[k] == 0) start.state[k] = newton_start->second;
   }
-  if (open.empty()) return start.state;
+  const bool is_whole = open.empty();
+  if (is_whole && system.residual_labels().empty()) return start.state;
   if (model.symbolic_system() == nullptr && system.nc() > 0 && system.residual_labels().empty()) {
     notes.push_back(
         fmt::format("warning: `start`: {}, as '{}' has no residuals to solve its constraints by: name all "
@@ -78,65 +157,25 @@ Eigen::VectorXd complete_start(const Model& model, const Eigen::VectorXd& parame
                     listed(names, start.state, open), system.name()));
     return start.state;
   }
-  // coordinates first, then velocities there: what is given of one level says nothing against a solution of the other
-  const Eigen::Index nq = system.nq();
-  std::vector<bool> held = start.given;
-  std::fill(held.begin() + nq, held.begin() + 2 * nq, false);
-  std::optional<Eigen::VectorXd> state;      // on the constraints
-  std::optional<Eigen::VectorXd> completed;  // where that is not what is given: with what is given as it is
+  Nearest found;
   std::string why;
-  // each is moved by another share of `aside`: equal ones may keep a symmetry that has no slope
-  const auto try_from = [&](double aside) {
-    Eigen::VectorXd from = start.state;
-    for (std::size_t n = 0; n < open.size() && open[n] < nq; ++n) from[open[n]] += aside * std::cos(2.0 * static_cast<double>(n));
-    try {
-      const Eigen::VectorXd found = project_onto_constraints(system, parameters, from, held);
-      const auto distance = [&](const Eigen::VectorXd& one) { return (one - start.state).head(nq).norm(); };
-      if (!state || distance(found) < distance(*state)) state = found;
-    } catch (const NumericalError& error) {
-      if (why.empty()) why = error.what();
-    }
-  };
-  try_from(0);
-  // where a constraint has no slope in what is open, as a circle at its highest point, Newton's method leaves other starts
-  if (!state) {
-    for (const double aside : {0.3, 1.0, -1.0}) try_from(aside);
-  }
-  if (state) why.clear();
   try {
-    if (!state) {
-      const Nearest nearest = nearest_to(system, parameters, start, false);
-      completed = nearest.start;
-      state = nearest.projected;
-    }
-    state->segment(nq, nq) = start.state.segment(nq, nq);
-    const Eigen::VectorXd at = *state;
-    held = start.given;
-    std::fill(held.begin(), held.begin() + nq, true);
-    try {
-      state = project_onto_constraints(system, parameters, at, held);
-      if (completed) completed->segment(nq, nq) = state->segment(nq, nq);
-    } catch (const NumericalError& error) {
-      if (why.empty()) why = error.what();
-      const Nearest nearest = nearest_to(system, parameters, {at, start.given}, true);
-      if (!completed) completed = at;
-      completed->segment(nq, nq) = nearest.start.segment(nq, nq);
-      state = nearest.projected;
-    }
+    found = solve_start(system, parameters, start, why);
   } catch (const NumericalError& error) {
     if (why.empty()) why = error.what();
     notes.push_back(fmt::format("warning: `start`: what is given leaves no solution of the constraints ({})", why));
     return start.state;
   }
-  if (const std::string moves = listed_moves(names, start, *state); !moves.empty()) {
+  const std::string moves = listed_moves(names, start, found.projected);
+  if (!moves.empty() && (!is_whole || is_beyond_rounding(system, start.state, found.projected))) {
     notes.push_back(
         fmt::format("warning: `start`: what is given leaves no solution of the constraints ({}); the nearest that has one is {}",
                     why, moves));
   }
   std::vector<int> solved;
-  std::copy_if(open.begin(), open.end(), std::back_inserter(solved), [&](int k) { return (*state)[k] != start.state[k]; });
-  if (!solved.empty()) notes.push_back(fmt::format("start: from the constraints {}", listed(names, *state, solved)));
-  return completed.value_or(*state);
+  std::ranges::copy_if(open, std::back_inserter(solved), [&](int k) { return found.projected[k] != start.state[k]; });
+  if (!solved.empty()) notes.push_back(fmt::format("start: from the constraints {}", listed(names, found.projected, solved)));
+  return found.start;
 }
 
 }  // namespace gp2

@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <optional>
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
@@ -22,6 +23,9 @@ using Eigen::VectorXd;
 namespace {
 
 constexpr double rank_tolerance = 1e-10;
+// Rows that depend on each other where the constraints are met do no longer where they are not: what is then left of their gradients is
+// small, as is what is left of their residuals, and says nothing.
+constexpr double dependent = 0.1;
 
 Eigen::CompleteOrthogonalDecomposition<MatrixXd> decomposition_of(const MatrixXd& A, double tolerance = rank_tolerance) {
   Eigen::CompleteOrthogonalDecomposition<MatrixXd> decomposition;
@@ -265,8 +269,7 @@ struct ConditionedStep {
 };
 
 ConditionedStep conditioned_step(const VectorXd& residual, const MatrixXd& jacobian, const MatrixXd& W,
-                                 const std::vector<Index>& unknown, const VectorXd& known_off,
-                                 double tolerance = rank_tolerance) {
+                                 const std::vector<Index>& unknown, const VectorXd& known_off, double tolerance) {
   MatrixXd J_measured = jacobian * W;
   const VectorXd scale = row_scale_of(J_measured, jacobian);
   J_measured = scale.asDiagonal() * J_measured;
@@ -325,9 +328,6 @@ ConstrainedStates::Contradiction ConstrainedStates::contradiction(const VectorXd
     for (const Index entry : {Index{j}, nq + j}) W(entry, column++) = stddev[entry];
   }
   const std::vector<Index> unknown = unknown_entries(free_, seen_, nq);
-  // rows that depend on each other where the constraints are met do no longer where they are not: what is then left of their
-  // gradients is small, as is what is left of their residuals, and says nothing
-  constexpr double dependent = 0.1;
   const ConditionedStep step = conditioned_step(residual, jacobian, W, unknown, VectorXd::Zero(3 * nq), dependent);
   if (step.B.rows() == 0 || step.constraints.rank() == 0) return out;
   out.n_constraints = static_cast<int>(step.constraints.rank());
@@ -348,34 +348,45 @@ void ConstrainedStates::condition(VectorXd& state, Eigen::Ref<VectorXd> accelera
   const std::vector<Index> unknown = unknown_entries(free_, seen_, nq);
   approach(state, acceleration);
   VectorXd x = without_blind(state);
-  VectorXd z(3 * nq);
-  z << x.head(2 * nq), acceleration;
-  const VectorXd estimate = z;
-
-  constexpr int max_iterations = 50;
-  constexpr double converged = 1e-9, at_rounding = 1e-14;
-  double previous = std::numeric_limits<double>::infinity();
-  for (int iteration = 0; iteration < max_iterations; ++iteration) {
-    x.head(2 * nq) = z.head(2 * nq);
-    const Linearisation at = linearise(x, z.tail(nq));
-    if (!at.residual.allFinite() || !at.jacobian.allFinite()) break;
-    const VectorXd known_off = offset_of_measured(measured_, estimate, z);
-    const ConditionedStep next = conditioned_step(at.residual, at.jacobian, W, unknown, known_off);
-    z += next.step;
-    const double size = (next.step.array() / z.array().abs().max(1)).abs().maxCoeff();
-    if (size <= at_rounding || (size <= converged && size >= previous / 2)) {
-      state.head(2 * nq) = z.head(2 * nq);
-      acceleration = z.tail(nq);
-      condition_covariance(next, W, measured_, covariance);
-      for (const int j : blind_) state[system_.layout().q(j)] = not_a_number;
-      return;
+  VectorXd estimate(3 * nq);
+  estimate << x.head(2 * nq), acceleration;
+  struct Solution {
+    VectorXd z;
+    ConditionedStep last;
+  };
+  const auto solve = [&](double tolerance) -> std::optional<Solution> {
+    constexpr int max_iterations = 50;
+    constexpr double converged = 1e-9, at_rounding = 1e-14;
+    Solution out{estimate, {}};
+    double previous = std::numeric_limits<double>::infinity();
+    for (int iteration = 0; iteration < max_iterations; ++iteration) {
+      x.head(2 * nq) = out.z.head(2 * nq);
+      const Linearisation at = linearise(x, out.z.tail(nq));
+      if (!at.residual.allFinite() || !at.jacobian.allFinite()) break;
+      const VectorXd size_of_z = out.z.cwiseAbs().cwiseMax(1);
+      // those that a coarse tolerance takes for dependent and that are not are not met
+      const bool are_met = (at.residual.array().abs() <= converged * (at.jacobian.cwiseAbs() * size_of_z).array()).all();
+      out.last =
+          conditioned_step(at.residual, at.jacobian, W, unknown, offset_of_measured(measured_, estimate, out.z), tolerance);
+      out.z += out.last.step;
+      const double size = (out.last.step.array() / size_of_z.array()).abs().maxCoeff();
+      if (are_met && (size <= at_rounding || (size <= converged && size >= previous / 2))) return out;
+      previous = size;
     }
-    previous = size;
+    return std::nullopt;
+  };
+  std::optional<Solution> found = solve(rank_tolerance);
+  if (!found) found = solve(dependent);
+  if (!found) {
+    throw NumericalError(
+        fmt::format("system '{}': the measured positions do not meet the constraints at t = {:.6g}; are their units and zeros "
+                    "those of the model?",
+                    system_.name(), state[system_.layout().t()]));
   }
-  throw NumericalError(
-      fmt::format("system '{}': the measured positions do not meet the constraints at t = {:.6g}; are their units and zeros "
-                  "those of the model?",
-                  system_.name(), state[system_.layout().t()]));
+  state.head(2 * nq) = found->z.head(2 * nq);
+  acceleration = found->z.tail(nq);
+  condition_covariance(found->last, W, measured_, covariance);
+  for (const int j : blind_) state[system_.layout().q(j)] = not_a_number;
 }
 
 }  // namespace gp2

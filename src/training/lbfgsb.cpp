@@ -24,7 +24,8 @@ double relative_reduction(double from, double to) { return (from - to) / std::ma
 // What L-BFGS-B calls, and what becomes of it.
 class Minimisation {
  public:
-  Minimisation(const Objective& f, const LbfgsbOptions& options) : f_(f), options_(options) {}
+  Minimisation(const Objective& f, const VectorXd& lower, const VectorXd& upper, const LbfgsbOptions& options)
+      : f_(f), lower_(lower), upper_(upper), options_(options) {}
 
   /// Evaluates the objective at the start; false when there is nothing to be done from there.
   bool start(const VectorXd& x) {
@@ -75,9 +76,9 @@ class Minimisation {
     result_.converged = true;
     if (outcome == Outcome::gradient_below_tolerance) {
       result_.termination = "the projected gradient fell below its tolerance";
-    } else if (is_at_edge_) {
+    } else if (is_at_edge_ && !is_flat()) {
       result_.converged = false;
-      result_.termination = "the objective is infinite just beyond the best point, which is no optimum";
+      result_.termination = "the objective cannot be computed just beyond the best point, where it still falls";
     } else if (outcome == Outcome::reduction_below_tolerance) {
       result_.termination = "the relative reduction of the objective fell below its tolerance";
     } else if (last_reduction_ <= rounding_level) {
@@ -103,6 +104,13 @@ class Minimisation {
     return std::isfinite(point.value) && point.gradient.allFinite();
   }
 
+  // Whether the projected gradient says that this is an optimum, if not as exactly as was asked for.
+  [[nodiscard]] bool is_flat() const {
+    constexpr double flat = 1e-2;  // nats for a factor e of a hyperparameter, whose deviation is mostly less
+    const VectorXd descended = (best_.x - best_.gradient).cwiseMax(lower_).cwiseMin(upper_);
+    return (descended - best_.x).lpNorm<Eigen::Infinity>() <= flat;
+  }
+
   // Little is known of curvature at first, and a steep slope points into a corner of the box: where even that is better than the
   // start, what is on the way is better still.
   [[nodiscard]] bool leaps(const Point& trial) const {
@@ -126,6 +134,8 @@ class Minimisation {
   }
 
   const Objective& f_;
+  const VectorXd& lower_;
+  const VectorXd& upper_;
   const LbfgsbOptions& options_;
   LbfgsbResult result_;
   Point best_;
@@ -138,7 +148,7 @@ class Minimisation {
 
 LbfgsbResult minimise(const Objective& f, const VectorXd& start, const VectorXd& lower, const VectorXd& upper,
                       const LbfgsbOptions& options) {
-  Minimisation minimisation(f, options);
+  Minimisation minimisation(f, lower, upper, options);
   if (minimisation.start(start.cwiseMax(lower).cwiseMin(upper))) {
     const lbfgsb::Problem problem = {
         lower, upper, [&](Point& trial) { return minimisation.evaluate(trial); },

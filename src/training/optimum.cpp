@@ -123,6 +123,17 @@ class Training {
   }
   [[nodiscard]] const std::vector<RestartReport>& reports() const { return reports_; }
   [[nodiscard]] const std::vector<Hyperparameter>& result(std::size_t restart) const { return results_[restart]; }
+  // results of finite objectives, the best first
+  [[nodiscard]] std::vector<std::vector<Hyperparameter>> optima() const {
+    std::vector<std::size_t> order(reports_.size());
+    std::iota(order.begin(), order.end(), std::size_t{0});
+    std::stable_sort(order.begin(), order.end(), [&](auto a, auto b) { return reports_[a].objective < reports_[b].objective; });
+    std::vector<std::vector<Hyperparameter>> optima;
+    for (const std::size_t restart : order) {
+      if (std::isfinite(reports_[restart].objective)) optima.push_back(results_[restart]);
+    }
+    return optima;
+  }
   [[nodiscard]] int n_escapes() const { return n_escapes_; }
   [[nodiscard]] const std::optional<LaplaceUncertainty>& uncertainty() const { return uncertainty_; }
   [[nodiscard]] const std::optional<HyperparameterDraws>& draws() const { return draws_; }
@@ -202,13 +213,7 @@ class Training {
 
   // Draws about the optima of the restarts, the best one first.
   void draw_from_posterior() {
-    std::vector<std::size_t> order(reports_.size());
-    std::iota(order.begin(), order.end(), std::size_t{0});
-    std::stable_sort(order.begin(), order.end(), [&](auto a, auto b) { return reports_[a].objective < reports_[b].objective; });
-    std::vector<std::vector<Hyperparameter>> optima;
-    for (const std::size_t restart : order) {
-      if (std::isfinite(reports_[restart].objective)) optima.push_back(results_[restart]);
-    }
+    const std::vector<std::vector<Hyperparameter>> optima = this->optima();
     if (optima.empty()) return;
     const std::vector<bool> held = held_in_draws(prior_, observations_, optima.front());
     bool is_any_drawn = false;
@@ -220,7 +225,7 @@ class Training {
       draws_ = draw_about(objective_, optima, held, options_.n_draws, options);
     } catch (const NumericalError& error) {
       // the fit stands, and says why it has none
-      reports_[order.front()].termination += fmt::format("; {}", error.what());
+      reports_[best()].termination += fmt::format("; {}", error.what());
     }
   }
 
@@ -435,7 +440,8 @@ class Training {
 }  // namespace
 
 FitReport trained(const Prior& prior, const std::vector<Observations>& observations,
-                  const std::vector<Hyperparameter>& hyperparameters, const FitOptions& options, Approximation approximation) {
+                  const std::vector<Hyperparameter>& hyperparameters, const FitOptions& options, Approximation approximation,
+                  std::vector<std::vector<Hyperparameter>>* optima) {
   Training training(prior, observations, hyperparameters, options, std::move(approximation));
   training.run();
   const std::size_t best = training.best();
@@ -444,6 +450,7 @@ FitReport trained(const Prior& prior, const std::vector<Observations>& observati
     if (training.stopped()) throw NumericalError("stopped before the likelihood was evaluated once: there is no fit");
     throw NumericalError("no restart reached a finite likelihood: check the bounds of the estimated parameters and the noise");
   }
+  if (optima != nullptr) *optima = training.optima();
   FitReport report;
   report.hyperparameters = training.result(best);
   report.negative_log_likelihood = winner.negative_log_likelihood;

@@ -31,6 +31,18 @@ TEST_F(DiscrepancyOption, IsOnByDefaultAndLeftOutWhereAskedTo) {
     fit(options);
     EXPECT_FALSE(fit_has_one()) << options;
   }
+  const auto refusal = [&](const std::string& options) {
+    const Outcome refused = desk.run("gp2 fit models/surface.toml --data train.csv " + options + " -o no.json");
+    EXPECT_EQ(refused.status, 2) << options;
+    return refused.err;
+  };
+  EXPECT_THAT(refusal("--protocol paper --discrepancy default"),
+              testing::HasSubstr("--protocol paper has no discrepancy: leave out --discrepancy default"));
+  EXPECT_THAT(refusal("--hyperprior none --discrepancy default"), testing::HasSubstr("--hyperprior none has no discrepancy"));
+  EXPECT_THAT(refusal("--baseline se --discrepancy default"), testing::HasSubstr("--baseline se has no discrepancy"));
+  EXPECT_THAT(refusal("--protocol paper --hyperprior default"),
+              testing::HasSubstr("--protocol paper has no hyper-priors: leave out --hyperprior default"));
+  EXPECT_THAT(refusal("--baseline se --hyperprior default"), testing::HasSubstr("--baseline se has no hyper-priors"));
   const Outcome outcome = desk.run("gp2 fit models/surface.toml --data train.csv --discrepancy some -o no.json");
   EXPECT_EQ(outcome.status, 2);
   EXPECT_TRUE(outcome.said("--discrepancy")) << outcome.err;

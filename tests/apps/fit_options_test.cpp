@@ -370,6 +370,7 @@ TEST_F(FitCommand, ThreadsChangeNoBitOfTheFit) {
 
 TEST_F(FitCommand, NumbersOutOfRangeAreRefused) {
   EXPECT_THAT(refusal("--restarts 0"), HasSubstr("--restarts: must be positive, got 0"));
+  EXPECT_THAT(refusal("--commands train.csv"), HasSubstr("--commands: no input of the model acts late: leave it out"));
   EXPECT_THAT(refusal("--max-iterations -1"), HasSubstr("--max-iterations: must not be negative, got -1"));
   EXPECT_THAT(refusal("--max-points 0"), HasSubstr("--max-points: must be positive, got 0"));
   EXPECT_THAT(refusal("--threads -2"), HasSubstr("--threads: must be positive"));

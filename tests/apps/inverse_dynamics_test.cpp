@@ -67,6 +67,60 @@ TEST_F(InverseDynamicsCommand, NamesInputsThatTheAccelerationsLeaveOpen) {
   EXPECT_THAT(said(), HasSubstr("do not determine u1, u2 at 8 of 8 rows"));
 }
 
+TEST_F(InverseDynamicsCommand, AsksForNothingUnusualWhereOneInputDoesWhatIsWanted) {
+  desk.done("gp2 generate models/unicycle.toml --n 50 --seed 1 -o log.csv");
+  desk.done("gp2 fit models/unicycle.toml --data log.csv --mean force -o unicycle.json");
+  desk.done("gp2 generate models/unicycle.toml --n 30 --seed 2 --noise-std 0 -o other.csv");
+  desk.done("sed -i '1s/ddq[23]/x&/g' other.csv");
+  desk.done("gp2 predict unicycle.json --states other.csv --inverse-dynamics --cov std -o inputs.csv");
+  const CsvTable found = desk.table("inputs.csv");
+  // the torque was 0.5 N m at most, and turns the wheel alone
+  EXPECT_LE(columns(found, {"u2"}).cwiseAbs().maxCoeff(), 0.05);
+  EXPECT_LE(columns(found, {"u2_std"}).cwiseAbs().maxCoeff(), 0.05);
+  desk.done("gp2 predict unicycle.json --states inputs.csv -o reached.csv");
+  const MatrixXd wanted = columns(desk.table("other.csv"), {"ddq1"});
+  EXPECT_LE((wanted - columns(desk.table("reached.csv"), {"ddq1"})).cwiseAbs().maxCoeff(), 1e-10);
+}
+
+TEST_F(InverseDynamicsCommand, ReadsWhatSensorsOfConstraintsSay) {
+  desk.done(R"sh(cat >floor.toml <<'END'
+coordinates = ["x", "z"]
+inputs      = ["touch", "u"]
+[mechanics]
+mass  = [["1", "0"], ["0", "1"]]
+force = ["u", "-9.81"]
+[constraints]
+position = [{ expr = "z", contact = "touch" }]
+[[latent]]
+kernel   = "se"
+features = ["dx"]
+[noise]
+ddq = 0.01
+[truth]
+force = ["-0.5*dx", "0"]
+[sampling]
+x     = [-1, 1]
+z     = 0
+dx    = [-1, 1]
+dz    = 0
+touch = [0, 1]
+u     = [-1, 1]
+END
+gp2 generate floor.toml --n 30 --seed 1 -o log.csv
+gp2 fit floor.toml --data log.csv --mean force -o floor.json
+gp2 predict floor.json --states log.csv -o predicted.csv
+sed '1s/ddx_input,ddz_input/measured1,measured2/' predicted.csv >wanted.csv)sh");
+  const Outcome outcome = desk.done("gp2 predict floor.json --states wanted.csv --inverse-dynamics -o inputs.csv");
+  EXPECT_THAT(outcome.err, testing::Not(HasSubstr("no inputs produce")));
+  EXPECT_THAT(outcome.err, testing::Not(HasSubstr("do not determine")));
+  const MatrixXd expected = columns(desk.table("log.csv"), {"touch", "u"});
+  EXPECT_LE((columns(desk.table("inputs.csv"), {"touch", "u"}) - expected).cwiseAbs().maxCoeff(), 1e-9);
+  desk.done("sed '1s/touch/untold/' wanted.csv >blind.csv");
+  const Outcome blind = desk.run("gp2 predict floor.json --states blind.csv --inverse-dynamics -o inputs.csv");
+  EXPECT_EQ(blind.status, 2);
+  EXPECT_THAT(blind.err, HasSubstr("blind.csv: missing column 'touch'"));
+}
+
 TEST_F(InverseDynamicsCommand, RefusesWhatDoesNotGoWithIt) {
   const auto refusal = [&](const std::string& options) {
     const Outcome outcome = desk.run("gp2 predict fit.json --inverse-dynamics -o inputs.csv " + options);

@@ -148,13 +148,41 @@ TEST(SimulateModelCommand, AStartOffTheConstraintsIsProjectedOrLeftAndReported) 
   const std::string command = "gp2 simulate models/surface.toml --start q1=0.4,q2=0.8,q3=0.2 --t-end 0.1 --json -o motion.csv ";
   const Outcome projected = desk.done(command);
   EXPECT_TRUE(projected.said("leaves no solution of the constraints")) << projected.err;
-  EXPECT_TRUE(projected.said("start: projected onto the constraints, which moves it by up to")) << projected.err;
+  EXPECT_FALSE(projected.said("start: projected")) << projected.err;  // which the warning has said
   EXPECT_GT(projected.json()["start_displacement"], 0.01);
   EXPECT_NEAR(projected.json()["start_position_residual"], 0.2 - 0.0970358, 1e-6);
   const Outcome left = desk.done(command + "--project off");
   EXPECT_TRUE(left.said("start: off the constraints by |c| = 0.103, |dc/dt| = 0, and left there")) << left.err;
   EXPECT_EQ(number(desk.table("motion.csv"), 0, "q3"), 0.2);
   EXPECT_EQ(left.json()["start_displacement"], 0);
+}
+
+TEST(SimulateModelCommand, AWholeStartOffTheConstraintsIsAWarningUnlessItIsOfRoundedDigits) {
+  const Desk desk;
+  desk.write("sphere.toml",
+             "coordinates = [\"x\", \"y\", \"z\"]\n[mechanics]\nmass = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]\n"
+             "force = [\"0\", \"0\", \"-9.81\"]\n[constraints]\nposition = [\"x^2 + y^2 + z^2 - 1\"]\n");
+  const auto simulated = [&](const std::string& start) {
+    return desk.done("gp2 simulate sphere.toml --start " + start + " --t-end 0.1 -o motion.csv");
+  };
+  const Outcome moved = simulated("x=0.3,y=0.3,z=-0.2,dx=1,dy=1,dz=1");
+  EXPECT_TRUE(moved.said("warning: --start: what is given leaves no solution of the constraints")) << moved.err;
+  EXPECT_TRUE(moved.said("x = 0.639602149 for 0.3, y = 0.639602149 for 0.3, z = -0.426401433 for -0.2")) << moved.err;
+  EXPECT_FALSE(moved.said("start: projected")) << moved.err;
+  const Outcome fast = simulated("x=0,y=0,z=-1,dx=1,dy=0,dz=0.01");
+  EXPECT_TRUE(fast.said("the nearest that has one is dz = 0 for 0.01") ||
+              fast.said("the nearest that has one is dz = -0 for 0.01"))
+      << fast.err;
+  const Outcome rounded = simulated("x=0.6,y=0.6,z=-0.5292,dx=0,dy=0,dz=0");
+  EXPECT_FALSE(rounded.said("warning")) << rounded.err;
+  EXPECT_TRUE(rounded.said("start: projected onto the constraints, which moves it by up to")) << rounded.err;
+}
+
+TEST(SimulateModelCommand, RefusesASeedOfNoSamples) {
+  const Desk desk;
+  const Outcome outcome = desk.run("gp2 simulate models/surface.toml --start q1=0.4,q2=0.8 --t-end 0.1 --seed 3 -o motion.csv");
+  EXPECT_EQ(outcome.status, 2);
+  EXPECT_TRUE(outcome.said("--seed requires --samples")) << outcome.err;
 }
 
 TEST(SimulateModelCommand, AssemblesAMechanismFromTheStartOfItsSampling) {
@@ -331,6 +359,20 @@ TEST(SimulateModelCommand, TellsWhenAMultiplierChangesItsSign) {
   ASSERT_EQ(report["multiplier_sign_changes"]["lambda1"].size(), 1);
   EXPECT_NEAR(report["multiplier_sign_changes"]["lambda1"][0].get<double>(), M_PI / 2, 1e-4);
   EXPECT_NEAR(number(desk.table("motion.csv"), 0, "lambda1"), 9.81, 1e-12);
+}
+
+// The multiplier is 0 where the floor does not hold, and of one sign where it does.
+TEST(SimulateModelCommand, AConstraintThatTakesHoldOrLetsGoChangesNoSign) {
+  const Desk desk;
+  for (const char* load : {"-9.81", "9.81"}) {
+    desk.write("floor.toml",
+               std::string("coordinates = [\"x\", \"y\"]\n[mechanics]\nmass = [[1, 0], [0, 1]]\nforce = [\"0\", \"") + load +
+                   "\"]\n[constraints]\nvelocity = [{ expr = \"dy\", when = \"abs(x - 1) < 0.5\" }]\n");
+    const auto report = desk.done("gp2 simulate floor.toml --start dx=1 --t-end 2 --dt 0.05 --json -o motion.csv").json();
+    EXPECT_TRUE(report["multiplier_sign_changes"]["lambda1"].empty()) << report["multiplier_sign_changes"];
+    EXPECT_EQ(number(desk.table("motion.csv"), 0, "lambda1"), 0);
+    EXPECT_NEAR(std::abs(number(desk.table("motion.csv"), 20, "lambda1")), 9.81, 1e-9);
+  }
 }
 
 // A rod that slides on a rough floor until its end jams: there is no motion from then on, and no load to record.

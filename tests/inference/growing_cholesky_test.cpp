@@ -1,5 +1,4 @@
 #include "inference/growing_cholesky.hpp"
-#include "inference/inverse_root.hpp"
 
 #include <Eigen/Cholesky>
 
@@ -65,54 +64,6 @@ TEST(GrowingCholeskyTest, AppendedRowsAreFactoredWithTheOthers) {
       expect_factor_of(e, rows_to(n + m), factor);
     }
   }
-}
-
-// X is a lower triangle whose XᵀX is the inverse; κ(K) is below 1e3
-void expect_root_of(const Equations& e, const std::vector<Index>& rows, const InverseRoot& root) {
-  const Index n = std::ssize(rows);
-  ASSERT_EQ(root.size(), n);
-  ASSERT_EQ(std::ssize(root.numbers()), InverseRoot::begin_of(n));
-  MatrixXd X = MatrixXd::Zero(n, n);
-  for (Index i = 0; i < n; ++i) {
-    X.row(i).head(i + 1) = Eigen::Map<const Eigen::RowVectorXd>(root.row(i), i + 1);
-    EXPECT_GT(X(i, i), 0);
-    // what pads a row
-    for (Index k = InverseRoot::begin_of(i) + i + 1; k < InverseRoot::begin_of(i + 1); ++k) {
-      EXPECT_EQ(root.numbers()[static_cast<std::size_t>(k)], 0);
-    }
-  }
-  EXPECT_LE((X.transpose() * X * e.K(rows, rows) - MatrixXd::Identity(n, n)).norm(), 1e-11);
-}
-
-TEST(InverseRootTest, GrowsAndShrinksWithTheMatrix) {
-  const Equations e(200);
-  RandomStream random(growing_cholesky_seed, 1);
-  std::vector<Index> rows = rows_to(150);
-  GrowingCholesky factor = factor_of(e, rows);
-  InverseRoot root;
-  root.append(factor.L());
-  expect_root_of(e, rows, root);
-  for (int step = 0; step < 60; ++step) {
-    std::vector<Index> gone;
-    for (Index i = 0; i < std::ssize(rows); ++i) {
-      if (random.uniform() < 0.03 || (step % 7 == 0 && i == 0)) gone.push_back(i);
-    }
-    factor.erase(gone);
-    root.erase(gone);
-    for (auto i = gone.rbegin(); i != gone.rend(); ++i) rows.erase(rows.begin() + *i);
-    std::vector<Index> more;
-    for (Index row = 0; row < 200; ++row) {
-      if (std::find(rows.begin(), rows.end(), row) == rows.end() && random.uniform() < 0.1) more.push_back(row);
-    }
-    ASSERT_TRUE(append(e, rows, more, factor));
-    root.append(factor.L());
-    rows.insert(rows.end(), more.begin(), more.end());
-    if (step % 10 == 9) expect_root_of(e, rows, root);
-  }
-  const std::vector<Index> all = rows_to(std::ssize(rows));
-  factor.erase(all);
-  root.erase(all);
-  EXPECT_EQ(root.size(), 0);
 }
 
 TEST(GrowingCholeskyTest, WhatIsLeftOfErasedRowsIsFactored) {

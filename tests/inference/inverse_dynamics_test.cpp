@@ -1,12 +1,12 @@
-#include "gp2/inference/inverse_dynamics.hpp"
-
 #include <gmock/gmock.h>
 #include <gtest/gtest.h>
 #include <Eigen/QR>
 
 #include "allocation_count.hpp"
 #include "gp2/error.hpp"
+#include "gp2/inference/inverse_dynamics.hpp"
 #include "gp2/predictor.hpp"
+#include "inference/inverse_dynamics.hpp"
 #include "inference/problems.hpp"
 #include "input_error.hpp"
 
@@ -85,14 +85,80 @@ TEST(InverseDynamicsTest, OfInputsThatDoTheSameIsTheLeastChange) {
   const MatrixXd wanted = arm.posterior.mean(arm.view, arm.states);
   const InverseDynamics found = arm.inverse(wanted);
   EXPECT_LE(largest(found.missed), 1e-11 * (1 + largest(wanted)));
-  const MechanicsBatch mechanics = require_mechanics(*arm.model.system, arm.states, arm.posterior.values().parameters);
+  const VectorXd usual = arm.posterior.observations()[0].states().bottomRows(2).rowwise().squaredNorm() / 12;  // squared
   for (int i = 0; i < 4; ++i) {
     const MatrixXd J = slope_at(arm.posterior, arm.view, arm.states.col(i), 2);
     const VectorXd idle = Eigen::FullPivLU<MatrixXd>(J).setThreshold(1e-9).kernel().col(0);
-    const VectorXd effect = (J.transpose() * mechanics.values.M(i) * J).diagonal();  // squared
-    const VectorXd u = found.inputs.col(i);
-    EXPECT_LE(std::abs(u.cwiseProduct(effect).dot(idle)), 1e-11 * u.cwiseProduct(effect).norm() * idle.norm());
+    const VectorXd u = found.inputs.col(i).cwiseQuotient(usual);
+    EXPECT_LE(std::abs(u.dot(idle)), 1e-11 * u.norm() * idle.norm());
   }
+}
+
+// Two forces on x, the first in a unit of so many newtons, and one on y.
+struct Forces {
+  Model model;
+  Posterior posterior;
+
+  Forces(double unit, const Eigen::Vector3d& usual)
+      : model(Model::parse(fmt::format(R"toml(
+name        = "three forces"
+coordinates = ["x", "y"]
+inputs      = ["u", "v", "w"]
+[mechanics]
+mass  = [["1", "0"], ["0", "1"]]
+force = ["{}*u + 1e-6*v", "w"]
+[[latent]]
+kernel   = "se"
+features = ["dx"]
+)toml",
+                                       unit),
+                           "forces.toml")),
+        posterior(posterior_of(model, usual)) {}
+
+  static Posterior posterior_of(const Model& model, const Eigen::Vector3d& usual) {
+    MatrixXd states = MatrixXd::Zero(8, 2);
+    states.bottomRows(3) << usual, -usual;
+    const View view = View::constrained_acceleration(*model.system);
+    return {make_prior(model, {Prior::Mean::force, std::nullopt}),
+            {Observations(states, view, MatrixXd::Zero(2, 2), VectorXd::Ones(2))},
+            {{VectorXd::Ones(1)}, {VectorXd::Ones(2)}, {}, {VectorXd::Ones(2)}, {}}};
+  }
+
+  // for so much more than comes at rest without inputs
+  [[nodiscard]] InverseDynamics inverse(const std::vector<int>& rows, const VectorXd& more) const {
+    const View view{Quantity::constrained_acceleration, rows};
+    const MatrixXd rest = MatrixXd::Zero(8, 1);
+    return inverse_dynamics(posterior, view, rest, posterior.mean(view, rest) + more);
+  }
+};
+
+TEST(InverseDynamicsTest, AnInputThatDoesNextToNothingIsNotAskedForWhatAnotherDoes) {
+  const Forces forces(1, {1, 1, 1});
+  const InverseDynamics found = forces.inverse({0}, VectorXd::Constant(1, 0.5));
+  EXPECT_NEAR(found.inputs(0, 0), 0.5, 1e-11);
+  EXPECT_NEAR(found.inputs(1, 0), 0.5e-6, 1e-11);
+  EXPECT_LE(std::abs(found.missed(0, 0)), 1e-14);
+  EXPECT_TRUE(found.open(1, 0));
+}
+
+TEST(InverseDynamicsTest, UnitsOfInputsDoNotDecideWhichOfThemAct) {
+  const VectorXd more = VectorXd::Constant(1, 0.5);
+  const MatrixXd in_newtons = Forces(1, {2e-6, 3, 1}).inverse({0}, more).inputs;
+  const MatrixXd in_nanonewtons = Forces(1e-9, {2e3, 3, 1}).inverse({0}, more).inputs;
+  EXPECT_GT(std::abs(in_newtons(0, 0)), 0.1) << "both act";
+  EXPECT_GT(std::abs(in_newtons(1, 0)), 1e4) << "both act";
+  EXPECT_NEAR(in_nanonewtons(0, 0), 1e9 * in_newtons(0, 0), 1e-3);
+  EXPECT_NEAR(in_nanonewtons(1, 0), in_newtons(1, 0), 1e-6);
+}
+
+TEST(InverseDynamicsTest, AnInputThatTheDataHoldAtZeroIsAskedForLittleButWhatTheOthersCannotDo) {
+  const Forces forces(1, {0, 1e6, 0});
+  // the second makes nearly all of x
+  const InverseDynamics found = forces.inverse({0, 1}, Eigen::Vector2d(0.5, 0.25));
+  EXPECT_NEAR(found.inputs(0, 0), 0, 0.02);
+  EXPECT_NEAR(found.inputs(1, 0), 0.5e6, 0.02e6);
+  EXPECT_NEAR(found.inputs(2, 0), 0.25, 1e-7);
+  EXPECT_LE(largest(found.missed), 1e-14);
 }
 
 TEST(InverseDynamicsTest, WhatNoInputsProduceIsMissedByTheLeastInTheSenseOfGauss) {
@@ -179,6 +245,49 @@ force = ["u + 1e-3*v", "1e4*u - v", "w - c"]
   EXPECT_TRUE(arm.inverse(arm.posterior.mean(arm.view, arm.states)).open.all());
 }
 
+// A body on a floor that a sensor tells of, and a brake that a comparison of its own input closes.
+constexpr const char* sensed = R"toml(
+name        = "sensed"
+coordinates = ["x", "z"]
+inputs      = ["u", "touch", "load", "push"]
+[mechanics]
+mass  = [["1", "0"], ["0", "1"]]
+force = ["u", "push - 9.81"]
+[constraints]
+position = [{ expr = "z", contact = "touch" }]
+velocity = [{ expr = "dx - 1", when = "abs(load) > 3" }, { expr = "dx + dz", when = "push > 100" }]
+[[latent]]
+kernel   = "se"
+features = ["dx", "touch", "load"]
+)toml";
+
+TEST(InverseDynamicsTest, InputsOfSensorsStayWhereTheyAre) {
+  const Model model = Model::parse(sensed, "sensed.toml");
+  EXPECT_TRUE((inputs_of_sensors(*model.system) == Eigen::Array<bool, 4, 1>(false, true, true, false)).all());
+  EXPECT_FALSE(inputs_of_sensors(*test::model("models/arm_on_moving_plane.toml").system).any());
+  const Prior prior = make_prior(model, {Prior::Mean::force, std::nullopt});
+  const View view = View::constrained_acceleration(*model.system);
+  RandomStream random(inverse_seed, 8);
+  MatrixXd states = test::random_matrix(9, 12, random);
+  states.row(6) = (states.row(6).array() > 0).cast<double>();
+  const Posterior posterior(prior, {test::observe(model, view, states, random)},
+                            {{VectorXd::Ones(3)}, {VectorXd::Ones(2)}, {}, {VectorXd::Constant(2, 0.1)}, {}});
+  for (const double touch : {0.0, 1.0}) {
+    MatrixXd there = test::random_matrix(9, 4, random), start = there;
+    there.row(6).setConstant(touch);
+    start.row(6).setConstant(touch);
+    const MatrixXd wanted = posterior.mean(view, there);
+    start.row(5).setZero();
+    start.row(8).setZero();
+    const InverseDynamics found = inverse_dynamics(posterior, view, start, wanted);
+    EXPECT_EQ(found.inputs.middleRows(1, 2), there.middleRows(6, 2));
+    EXPECT_LE(largest(found.inputs.row(0) - there.bottomRows(4).row(0)), 1e-9);
+    EXPECT_LE(largest(found.missed), 1e-11 * (1 + largest(wanted)));
+    EXPECT_FALSE(found.open.middleRows(1, 2).any());
+    EXPECT_EQ(largest(found.stddev().middleRows(1, 2)), 0);
+  }
+}
+
 Model cart(const std::string& force) {
   return Model::parse(R"toml(
 name        = "cart"
@@ -192,6 +301,19 @@ kernel   = "se"
 features = ["dx"]
 )toml",
                       "cart.toml");
+}
+
+TEST(InverseDynamicsTest, AnEffectOfRoundingIsNotTakenForOne) {
+  const Model model = cart("1e-14*u - x");
+  const View view = View::constrained_acceleration(*model.system);
+  const std::vector<Observations> observations = {
+      {MatrixXd(Eigen::Vector4d(0, 0, 0, 1)), view, MatrixXd::Zero(1, 1), VectorXd::Ones(1)}};
+  const Posterior posterior(make_prior(model, {Prior::Mean::force, std::nullopt}), observations,
+                            {{VectorXd::Ones(1)}, {VectorXd::Ones(1)}, {}, {VectorXd::Ones(1)}, {}});
+  const InverseDynamics found = inverse_dynamics(posterior, view, MatrixXd::Zero(4, 1), MatrixXd::Ones(1, 1));
+  EXPECT_EQ(found.inputs(0, 0), 0);
+  EXPECT_NEAR(found.missed(0, 0), 1, 1e-12);
+  EXPECT_TRUE(found.open(0, 0));
 }
 
 TEST(InverseDynamicsTest, IsFoundByNewtonsMethodWhereTheInputsAreNotAffine) {
@@ -354,15 +476,20 @@ kernel   = "se"
 features = ["dx"]
 )toml",
                                    "carts.toml");
-  const Posterior prior(make_prior(model, {Prior::Mean::force, std::nullopt}), {},
-                        {{VectorXd::Ones(1)}, {VectorXd::Ones(2)}, {}, {}, {}});
   const View view = View::constrained_acceleration(*model.system);
+  // what the data say at rest is what the model says: they tell the usual sizes of the inputs, and nothing else
+  MatrixXd states = MatrixXd::Zero(7, 1);
+  states.bottomRows(2) << 0.3, 2;
+  const Prior by_force = make_prior(model, {Prior::Mean::force, std::nullopt});
+  const Posterior prior(by_force, {}, {{VectorXd::Ones(1)}, {VectorXd::Ones(2)}, {}, {}, {}});
+  const Posterior with_data(by_force, {Observations(states, view, prior.mean(view, states), VectorXd::Ones(2))},
+                            {{VectorXd::Ones(1)}, {VectorXd::Ones(2)}, {}, {VectorXd::Ones(2)}, {}});
   RandomStream random(inverse_seed, 7);
-  for (int k = 0; k < 100; ++k) {
+  for (int k = 0; k < 200; ++k) {
     const VectorXd state = test::random_vector(model.system->layout().size(), random);
     const double v = 2 * random.normal(), u = std::numbers::pi / 2;
     const Eigen::Vector2d wanted(3, v + v * v * v - std::exp(-(u - 1) * (u - 1)));
-    const InverseDynamics found = inverse_dynamics(prior, view, state, wanted);
+    const InverseDynamics found = inverse_dynamics(k % 2 == 0 ? prior : with_data, view, state, wanted);
     // sin(u) is 1, to rounding, as far from u as the root of rounding
     const double at = found.inputs(0, 0);
     EXPECT_NEAR(std::sin(at), 1, 1e-12) << k;

@@ -1,5 +1,6 @@
 #include "gp2/predictor.hpp"
 
+#include <algorithm>
 #include <cmath>
 #include <limits>
 #include <optional>
@@ -84,6 +85,34 @@ struct Prediction {
     }
   }
 };
+
+// Noise 2e6 times below the signal, as a fit of models/duffing.toml finds it: a product with the inverse of the factor is off by 200 ε of
+// the prior's variance, a fifth of a deviation.
+TEST(PredictorTest, ADeviationFarBelowThePriorsIsThatOfThePosterior) {
+  std::vector<Problem> problems = test::problems(60, predictor_seed);
+  const auto found = std::ranges::find(problems, "duffing, every row", &Problem::name);
+  ASSERT_NE(found, problems.end());
+  Problem& p = *found;
+  ASSERT_EQ(p.values.kernel[0].size(), 5);
+  p.values.kernel[0].setConstant(1e6);
+  p.values.kernel[0][1] = 7;
+  p.values.signal_stddev[0] << 40, 2200;
+  p.values.noise_stddev[0].setConstant(1e-3);
+  const Posterior posterior(p.prior, p.observations, p.values);
+  const View view = View::all(Quantity::constrained_acceleration, *p.prior.system);
+  const Predictor predictor(posterior, view);
+  Predictor::Workspace workspace = predictor.make_workspace();
+  const MatrixXd& states = p.observations[0].states();
+  const MatrixXd prior = posterior.without_data().marginal(view, states).stddev();
+  for (Index i = 0; i < states.cols(); ++i) {
+    const VectorXd expected = posterior.marginal(view, states.col(i)).stddev();
+    const Prediction prediction(predictor, states.col(i), workspace);
+    for (Index r = 0; r < view.size(); ++r) {
+      EXPECT_LT(expected[r], 1e-5 * prior(r, i));
+      EXPECT_NEAR(std::pow(prediction.stddev[r], 2), std::pow(expected[r], 2), 30 * eps * std::pow(prior(r, i), 2));
+    }
+  }
+}
 
 TEST(PredictorTest, IsThePosteriorInEveryView) {
   for (const Problem& p : predictor_problems()) {

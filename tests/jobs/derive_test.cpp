@@ -180,6 +180,32 @@ TEST(Derive, OfRedundantAndMissingCoordinatesTheConstraintsAreHeld) {
                             "so that q2, q4, q5 cannot be solved for; hold the constraints (`hold_constraints`)")));
 }
 
+// Its third constraint follows from the two others where these are met, and nowhere else.
+TEST(Derive, NoiseDoesNotMakeARedundantConstraintAnother) {
+  const Model& crank = model("models/slider_crank.toml");
+  for (const double noise : {1e-5, 1e-3, 1e-2}) {
+    SCOPED_TRACE(noise);
+    RandomStream random(5);
+    std::vector<std::string> cells;
+    std::vector<Eigen::Vector3d> truth;
+    for (int k = 0; k < 200; ++k) {
+      const double t = 0.005 * k, q1 = 0.4 + 3 * t, q2 = -std::asin(std::sin(q1) / 3);
+      truth.emplace_back(q1, q2, 0.1 * std::cos(q1) + 0.3 * std::cos(q2));
+      cells.push_back(shortest(t));
+      for (int j = 0; j < 3; ++j) cells.push_back(shortest(truth.back()[j] + (j == 2 ? 0.1 : 1) * noise * random.normal()));
+      cells.emplace_back("0");
+    }
+    const CsvTable log = CsvTable::from_cells("log", {"t", "q1", "q2", "q3", "u1"}, cells);
+    const DerivedData held = derive(crank, log, {.hold_constraints = true});
+    EXPECT_LE(test::largest(crank.system->residuals(held.states, crank.system->parameter_values())), 1e-11);
+    ASSERT_EQ(held.states.cols(), std::ssize(truth));
+    for (Index i = 0; i < held.states.cols(); ++i) {
+      EXPECT_LE(std::abs(held.states(0, i) - truth[static_cast<std::size_t>(i)][0]), 4 * noise);
+      EXPECT_LE(std::abs(held.states(2, i) - truth[static_cast<std::size_t>(i)][2]), 0.4 * noise);
+    }
+  }
+}
+
 /// The first motion of short_log with some of its positions measured, with noise, and of those q1 off by some.
 CsvTable log_of_many(const std::vector<int>& measured, double noise_stddev, double off = 0, double unit = 1) {
   static const SimulatedLog simulated = short_log();
@@ -329,6 +355,14 @@ TEST(Derive, AnAngleThatIsOffByHalfATurnOnceIsAnOutlier) {
   });
   EXPECT_THAT(derive(wheel(), degrees).notes,
               Contains(HasSubstr("warning: log.csv: column 'q1' moves by more than half a turn between")));
+}
+
+TEST(Derive, AnAngleInDegreesThatIsWrappedIsRefused) {
+  const CsvTable log = cart_log([](std::vector<Row>& rows) {
+    for (std::size_t k = 0; k < rows.size(); ++k) rows[k][1] = shortest(std::remainder(4.6 * static_cast<double>(k), 360));
+  });
+  EXPECT_THAT(test::input_error_of([&] { derive(wheel(), log); }),
+              HasSubstr("column 'q1' jumps by 360 from sample to sample: it is in degrees"));
 }
 
 TEST(Derive, AWrongFirstOrLastSampleIsLeftOut) {

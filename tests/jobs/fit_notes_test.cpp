@@ -4,6 +4,7 @@
 #include "gp2/jobs/fit_problem.hpp"
 #include "hyperparameter.hpp"
 #include "io_testing.hpp"
+#include "jobs/fit_notes.hpp"
 
 // What a fit says before it begins and after it has ended.
 namespace gp2 {
@@ -135,6 +136,36 @@ TEST(FitNotes, AParameterThatFollowsFromOthersIsNotEstimated) {
             "`estimate`: the parameter 'w' of 'cart' follows from others: w = 2*m; estimate those, and it follows them");
   options.estimate = {"m", "m"};
   EXPECT_EQ(input_error_of([&] { make_fit_problem(model, log, options); }), "`estimate`: 'm' stands twice");
+}
+
+std::vector<std::string> note_of_stretches(double one_by_one, double stretches, double coverage95, int n = 200) {
+  CrossValidation scores;
+  scores.nrmse_of_noise = 0.01;
+  scores.one_by_one.nrmse = one_by_one;
+  scores.stretches.emplace();
+  scores.stretches->nrmse = stretches;
+  scores.stretches->coverage95 = coverage95;
+  scores.stretches->n = n;
+  std::vector<std::string> notes;
+  add_stretch_note(scores, notes);
+  return notes;
+}
+
+TEST(FitNotes, TellWhereStretchesArePredictedWorseThanRows) {
+  const auto told = ElementsAre(AllOf(StartsWith("stretches of the log"), HasSubstr("clipped, late or scaled")));
+  EXPECT_THAT(note_of_stretches(0.011, 0.085, 0.925), told);
+  EXPECT_THAT(note_of_stretches(0.011, 0.02, 0.8), told) << "too sure of itself";
+  EXPECT_THAT(note_of_stretches(0.011, 0.02, 0.8, 50), testing::IsEmpty()) << "too few rows for a coverage";
+  EXPECT_THAT(note_of_stretches(0.011, 0.02, 0.95), testing::IsEmpty());
+  EXPECT_THAT(note_of_stretches(0.08, 0.085, 0.95), testing::IsEmpty()) << "rows are no better";
+}
+
+TEST(FitNotes, NameGrossErrorsByTheirLines) {
+  std::string log = "x,y,dx,dy,ddx,ddy\n";
+  for (int k = 0; k < 40; ++k)
+    log += k == 7 ? "1,2,3,4,-9999,0.5\n" : "1,2,3," + std::to_string(k) + ",5." + std::to_string(k) + ",0.5\n";
+  const FitProblem problem = problem_of(constrained_cart(""), CsvTable::parse(log, "log.csv"));
+  EXPECT_THAT(gross_errors_text(problem), AllOf(HasSubstr("ddx = -9999 in line 9."), HasSubstr("`robust`")));
 }
 
 }  // namespace

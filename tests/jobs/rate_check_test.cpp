@@ -127,6 +127,40 @@ TEST(RateCheck, AnotherColumnIsNamed) {
   EXPECT_THAT(better_rate({t, "y", value, false, rates, names, 1}), IsEmpty()) << "a column with gaps is not offered";
 }
 
+TEST(PileUp, IsOfAClippedColumnAndOfNoSwitchedOne) {
+  std::mt19937 random(3);
+  std::normal_distribution<double> normal(0, 1);
+  RowVectorXd smooth(300), held(300), starts_late(300);
+  for (Index i = 0; i < 300; ++i) smooth[i] = 2 * std::sin(0.05 * static_cast<double>(i)) + 0.1 * normal(random);
+  for (Index i = 0; i < 300; ++i) held[i] = smooth[i / 10 * 10];
+  for (Index i = 0; i < 300; ++i) starts_late[i] = i < 100 ? 0 : std::abs(smooth[i]);
+  EXPECT_FALSE(pile_up(smooth));
+  const auto found = pile_up(smooth.cwiseMin(1).cwiseMax(-1.2));
+  ASSERT_TRUE(found);
+  EXPECT_EQ(found->value, 1);
+  EXPECT_GT(found->share, 0.2);
+  EXPECT_FALSE(pile_up(held)) << "held";
+  EXPECT_FALSE(pile_up(smooth.array().sign())) << "switched";
+  EXPECT_FALSE(pile_up((4 * smooth.array()).round())) << "coarsely rounded";
+  EXPECT_FALSE(pile_up(starts_late)) << "0 is no end of a range";
+  EXPECT_FALSE(pile_up(RowVectorXd::Constant(300, 2))) << "constant";
+}
+
+TEST(WrappedDegrees, AreToldFromRadAndFromDegreesThatDoNotWrap) {
+  std::vector<double> degrees, positive, unwrapped, rad;
+  for (int k = 0; k < 400; ++k) {
+    const double angle = 0.04 * k, in_degrees = angle * 180 / std::numbers::pi;
+    unwrapped.push_back(in_degrees);
+    degrees.push_back(std::remainder(in_degrees, 360));
+    positive.push_back(std::fmod(in_degrees, 360));
+    rad.push_back(std::remainder(angle, 2 * std::numbers::pi));
+  }
+  EXPECT_TRUE(is_wrapped_in_degrees(degrees));
+  EXPECT_TRUE(is_wrapped_in_degrees(positive));
+  EXPECT_FALSE(is_wrapped_in_degrees(unwrapped));
+  EXPECT_FALSE(is_wrapped_in_degrees(rad));
+}
+
 }  // namespace
 
 }  // namespace gp2

@@ -296,6 +296,39 @@ TEST(Residuals, TellOfAnInputThatActsByItsSquareOrItsLogarithm) {
   EXPECT_THAT(notes_of(notes_of_fit(data), "the input "), testing::ElementsAre(HasSubstr("input w: ")));
 }
 
+TEST(Residuals, AnEstimatedNoiseDoesNotHideAUnit) {
+  const Driven driven;
+  const auto notes_with = [&](const Data& data) {
+    FitRequest request;
+    request.model = driven.model;
+    request.logs = {{data.table()}};
+    request.problem.mean = Prior::Mean::force;
+    request.problem.estimate_noise = true;
+    request.restarts = 1;
+    return notes_of(run_fit(prepare_fit(std::move(request))).notes, of_constraint);
+  };
+  Data data = driven.data(51);
+  EXPECT_THAT(notes_with(data), testing::IsEmpty());
+  data.accelerations.row(2) *= 57.3;
+  EXPECT_THAT(notes_with(data), testing::ElementsAre(testing::StartsWith("warning: ")));
+}
+
+TEST(Residuals, OfARobustFitLeaveOutWhatItDistrusts) {
+  Data data = test::drawn_log("models/surface.toml", 60, 52);
+  for (const Eigen::Index row : {5, 31}) data.accelerations(0, row) = -9999;
+  FitRequest request;
+  request.model = *data.model;
+  request.logs = {{data.table()}};
+  request.problem.mean = Prior::Mean::force;
+  request.problem.robust = true;
+  request.restarts = 1;
+  const FitOutcome outcome = run_fit(prepare_fit(std::move(request)));
+  EXPECT_GE(outcome.file.report.distrusted.size(), 2U);
+  EXPECT_LT(outcome.cross_validation->one_by_one.nrmse, 0.3);
+  EXPECT_EQ(cross_validate(outcome.file, outcome.posterior).one_by_one.nrmse, outcome.cross_validation->one_by_one.nrmse);
+  EXPECT_THAT(outcome.notes, Not(Contains(HasSubstr(of_constraint))));
+}
+
 TEST(Residuals, TellOfNoiseThatIsStatedTooLarge) {
   const Driven driven;
   const Data data = driven.data(46);

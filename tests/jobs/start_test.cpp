@@ -1,5 +1,6 @@
 // Where a motion starts whose log was written by other lengths.
 #include <cmath>
+#include <tuple>
 
 #include <fmt/format.h>
 #include <gmock/gmock.h>
@@ -160,6 +161,33 @@ TEST(StartOfALog, MovesVelocitiesWhereTheyContradictTheConstraintsAndNamesThem) 
   EXPECT_THAT(
       job.notes,
       Contains(HasSubstr(fmt::format("; the nearest that has one is dphi = {:.9g} for 2, dx = {:.9g} for 0.1", at[2], at[3]))));
+}
+
+// All are given: what is off by more than their last digits is a warning, and less is left to who tells of the projection.
+TEST(StartOfALog, WarnsOfAWholeStartThatContradictsTheConstraints) {
+  SimulateRequest request;
+  request.times = VectorXd::LinSpaced(2, 0, 0.01);
+  const double phi = 0.3, s = 0.08 * std::sin(phi), x = 0.08 * std::cos(phi) + std::sqrt(0.22 * 0.22 - s * s);
+  const auto notes = [&](const MotionStart& start) {
+    request.start = start;
+    const SimulateJob job = prepare_simulation(slider_crank(), request);
+    EXPECT_EQ(job.start[0], phi);
+    return job.notes;
+  };
+  const auto warns = Contains(HasSubstr("warning: `start`: what is given leaves no solution of the constraints"));
+  const double dx = 2 * slope_of_slider(phi);
+  for (const auto& [off_x, off_dx, is_warned] :
+       {std::tuple(0.05, 0.0, true), {0.0, 0.1, true}, {1e-6, 0.0, false}, {0.0, 1e-6, false}}) {
+    const VectorXd values = Eigen::Vector4d(phi, x + off_x, 2, dx + off_dx);
+    const std::map<std::string, double> named = {{"phi", phi}, {"x", values[1]}, {"dphi", 2}, {"dx", values[3]}};
+    for (const MotionStart& start : {MotionStart(values), MotionStart(named)}) {
+      if (is_warned) {
+        EXPECT_THAT(notes(start), warns) << off_x << ", " << off_dx;
+      } else {
+        EXPECT_THAT(notes(start), IsEmpty()) << off_x << ", " << off_dx;
+      }
+    }
+  }
 }
 
 // y is open, x and a are given too many

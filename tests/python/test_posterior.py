@@ -261,8 +261,8 @@ def test_inverse_dynamics_in_a_loop_is_that_of_many_states(arm, posterior, arm_s
     faster = gp2.System.parse(arm.text.replace("w  = 4.0", "w  = 5.0"))
     start = arm_states.copy()
     start[:, -2:] = 0
-    for outputs, system in [([], None), (["ddelbow"], faster)]:
-        wanted = posterior.predict(arm_states, system=system).mean[:, -len(outputs) :]
+    for outputs, system in [(None, None), (["ddelbow"], faster)]:
+        wanted = posterior.predict(arm_states, system=system).mean[:, -len(outputs or []) :]
         found = posterior.inverse_dynamics(start, wanted, outputs=outputs, system=system)
         solver = gp2.InverseDynamicsSolver(posterior, outputs=outputs, system=system)
         predictor = gp2.Predictor(posterior)
@@ -365,6 +365,16 @@ def test_a_motion_that_cannot_start_says_why(start, times, error, text, posterio
     with pytest.raises(error) as caught:
         posterior.simulate(start, times)
     assert text in str(caught.value)
+
+
+def test_a_whole_start_off_the_constraints_is_warned_of(posterior):
+    with pytest.warns(UserWarning, match="start: what is given leaves no solution of the constraints"):
+        posterior.simulate([0.9, 0.5, 1, 1], [0, 0.01])
+
+
+def test_a_seed_goes_with_samples(posterior):
+    with pytest.raises(gp2.InputError, match="^seed: goes with n_samples, without which it means nothing"):
+        posterior.simulate({"shoulder": 0.9}, [0, 0.1], seed=1)
 
 
 # ---------------------------------------------------------------- systems

@@ -301,3 +301,65 @@ def test_what_only_looks_like_a_table_is_none():
 def test_notebooks_show_systems_and_fits(arm, arm_fit_file):
     assert arm._repr_html_().startswith("<pre>") and "mass matrix M" in arm._repr_html_()
     assert "learned from 30 states" in gp2.load(arm_fit_file)._repr_html_()
+
+
+def test_frames_of_states_and_accelerations_go_by_name_wherever_they_are_taken(arm, frame, arm_states):
+    states, ddq = frame[arm.state_names], frame[arm.acceleration_names]
+    backwards = states[states.columns[::-1]], ddq[ddq.columns[::-1]]
+    arrays = (states.to_numpy(), ddq.to_numpy())
+    for pair in (backwards, tuple(part.to_dict("list") for part in backwards), tuple(part.to_records(index=False) for part in backwards)):
+        np.testing.assert_array_equal(cov_of(arm, pair, arm_states), cov_of(arm, arrays, arm_states))
+    posterior = gp2.fit(arm, arrays, max_iterations=0)
+    for name in ("M", "A", "b", "F"):
+        np.testing.assert_array_equal(getattr(arm.evaluate(backwards[0]), name), getattr(arm.evaluate(arrays[0]), name))
+    np.testing.assert_array_equal(arm.true_acceleration(backwards[0]), arm.true_acceleration(arrays[0]))
+    np.testing.assert_array_equal(posterior.inverse_dynamics(arrays[0], backwards[1]).inputs, posterior.inverse_dynamics(*arrays).inputs)
+    of_one = gp2.Predictor(posterior), gp2.InverseDynamicsSolver(posterior)
+    for state, wanted in ((backwards[0].iloc[0], backwards[1].iloc[0]), tuple(dict(part.iloc[0]) for part in backwards)):
+        np.testing.assert_array_equal(of_one[0].mean(state), of_one[0].mean(arrays[0][0]))
+        np.testing.assert_array_equal(of_one[1].inputs(state, wanted), of_one[1].inputs(arrays[0][0], arrays[1][0]))
+
+
+def test_frames_of_states_and_accelerations_have_no_unknown_columns(arm, frame):
+    states, ddq = frame[arm.state_names], frame[arm.acceleration_names]
+    known = ", ".join(arm.state_names)
+    with pytest.raises(gp2.InputError, match=f"^states: unknown column 'ddshoulder'; there may be: {known}$"):
+        gp2.fit(arm, (frame, ddq))
+    with pytest.raises(gp2.InputError, match="^accelerations: unknown column 'shoulder'"):
+        gp2.fit(arm, (states, frame))
+    with pytest.raises(gp2.InputError, match="missing column 'elbow'"):
+        gp2.fit(arm, (states.drop(columns="elbow"), ddq))
+    with pytest.raises(gp2.InputError, match="^state: unknown column 'wrist'"):
+        gp2.Predictor(gp2.fit(arm, frame, max_iterations=0)).mean({"wrist": 1.0})
+
+
+def test_a_column_that_stands_twice_is_named(arm, frame, posterior):
+    twice = pd.concat([frame, frame[["elbow"]]], axis=1)
+    states = twice[[*arm.state_names]]
+    for name, call in {
+        "data": lambda: gp2.fit(arm, twice),
+        "states": lambda: posterior.predict(twice),
+        "state": lambda: gp2.Predictor(posterior).mean(states.iloc[0]),
+    }.items():
+        with pytest.raises(gp2.InputError, match=f"^{name}: the column 'elbow' stands twice"):
+            call()
+    with pytest.raises(gp2.InputError, match="^states: the column 'elbow' stands twice"):
+        gp2.fit(arm, (states, frame[arm.acceleration_names]))
+
+
+@pytest.mark.parametrize("name", ["observe", "outputs"])
+def test_an_empty_list_of_names_is_not_all_of_them(name, arm, frame, posterior):
+    calls = {
+        "observe": [lambda names: gp2.fit(arm, frame, observe=names, max_iterations=0), lambda names: posterior.update(frame, observe=names)],
+        "outputs": [
+            lambda names: posterior.evaluate(frame, outputs=names),
+            lambda names: gp2.InverseDynamicsSolver(posterior, outputs=names),
+            lambda names: posterior.inverse_dynamics(arm.states(frame), frame[arm.acceleration_names], outputs=names),
+        ],
+    }
+    for call in calls[name]:
+        with pytest.raises(gp2.InputError, match=rf"^{name}: expected at least one name, got \[\]; None stands for the default"):
+            call([])
+        with pytest.raises(TypeError, match=f"{name}: expected a list of names, got 3"):
+            call(3)
+        call(None)

@@ -152,12 +152,24 @@ TEST(LbfgsbTest, EndsAtTheEdgeOfAnInfiniteRegionWithTheBestPointItSaw) {
     const Eigen::Vector2d start(-0.5 + 0.004 * k, -0.5);
     const LbfgsbResult result = minimise(cut, start, constant(2, -3), constant(2, 3), {});
     EXPECT_FALSE(result.converged) << "start " << k << ": " << result.termination;
-    EXPECT_EQ(result.termination, "the objective is infinite just beyond the best point, which is no optimum");
+    EXPECT_EQ(result.termination, "the objective cannot be computed just beyond the best point, where it still falls");
     EXPECT_LE(result.x[0], 0.5);
     VectorXd gradient(2);
     EXPECT_EQ(result.value, rosenbrock(result.x, gradient)) << "value and point belong together";
     EXPECT_LT(result.value, 0.5) << "close to the edge, where it is a quarter";
     EXPECT_GE(result.value, best);
+  }
+}
+
+TEST(LbfgsbTest, AnOptimumAtTheEdgeOfAnInfiniteRegionIsOne) {
+  LbfgsbOptions options;
+  options.gradient_tolerance = 0;
+  for (int k = 0; k < 50; ++k) {
+    const auto half = [](const VectorXd& x, VectorXd& gradient) { return x[0] > 1 ? infinity : rosenbrock(x, gradient); };
+    const LbfgsbResult result = minimise(half, Eigen::Vector2d(-1.2 + 0.01 * k, -2.9), constant(2, -3), constant(2, 30), options);
+    EXPECT_GT(result.failed_evaluations, 0) << "nothing was tested";
+    EXPECT_TRUE(result.converged) << "start " << k << ": " << result.termination;
+    EXPECT_LE((result.x - constant(2, 1)).cwiseAbs().maxCoeff(), 1e-2);
   }
 }
 

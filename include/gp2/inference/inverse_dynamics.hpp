@@ -27,7 +27,9 @@ struct InverseDynamics {
 ///     u = argmin (w − v(u))ᵀ M' (w − v(u)),
 ///
 /// the inputs of which w comes where it can be produced, and else what is nearest to it in the sense of Gauss' principle. Where several inputs do
-/// the same, the least change of them from where they start, each weighed by the acceleration that it makes. One solve where v is affine in
+/// the same, the least change of them from where they start, each beside its usual size, the root of its mean square in the data; one that
+/// is 0 in all data is asked for little but what the others cannot do, and without data each is weighed by the acceleration that it makes. Inputs that
+/// say whether a constraint holds, those of contacts and those that a condition reads and no force does, stay. One solve where v is affine in
 /// u; else Newton's method from where they start, with steps damped where they do not help: the nearest of those about it.
 ///
 /// The covariance is J⁺ Σ J⁺ᵀ, Σ that of v, and J⁺ the inverse of J = ∂v/∂u in the same metric: exact where u enters no latent, of first

@@ -23,10 +23,8 @@ namespace gp2 GP2_API {
 /// `latest` is wait-free and neither allocates nor frees: the two threads exchange places in a triple buffer by one atomic index, and
 /// what the loop gives back the other thread destroys. What the loop has taken stays as it is until its next `latest`.
 ///
-/// A refresh takes O(n²) operations for each new or removed number, where the reduced size is n and a Predictor made anew takes
-/// O(n³): the inverse factor X of predictor.hpp grows and shrinks along with the posterior. The same as a Predictor of the same posterior
-/// to rounding. Through M inducing values a refresh takes O(M³), as `update` does; a posterior of sums (Observations::with_sums) has its
-/// factor inverted anew.
+/// A refresh takes O(n²) operations for each new or removed number, where the reduced size is n and a posterior made anew takes O(n³).
+/// The same as a Predictor of the same posterior to rounding. Through M inducing values a refresh takes O(M³), as `update` does.
 class OnlinePredictor {
  public:
   /// Publishes what the posterior predicts so far.
@@ -41,7 +39,7 @@ class OnlinePredictor {
   /// As gp2::update and gp2::remove_oldest. @throws as they do; what was learned is left as it was.
   void update(Observations added);
   void remove_oldest(int n);
-  /// Goes on from another posterior, of new hyperparameters say: in O(n³) operations.
+  /// Goes on from another posterior, of new hyperparameters say.
   /// @throws InputError as the constructor; what was learned is left as it was.
   void replace(Posterior posterior);
   /// What was learned, published or not. Where a copy of it is held, the next update copies it too.

@@ -150,12 +150,12 @@ LogStates read_log_states(const Prior& prior, const View& view, const Model& mod
 
 /// States of a log and the accelerations that are wanted there: those of ddq for which it has columns.
 struct WantedMotion {
-  Eigen::MatrixXd states;         // their inputs are 0
+  Eigen::MatrixXd states;         // their inputs are 0, but for those that say whether a constraint holds
   View view;                      // of the accelerations
   Eigen::MatrixXd accelerations;  // (view × N)
   std::vector<std::string> notes;
 };
-/// @throws InputError as read_log_states, but that inputs need not be there; and where there is no acceleration.
+/// @throws InputError as read_log_states, but that other inputs need not be there; and where there is no acceleration.
 WantedMotion read_wanted_motion(const Prior& prior, const Model& model, const CsvTable& log,
                                 const std::map<std::string, std::string>& columns);
 
