@@ -382,8 +382,8 @@ struct InverseDynamicsSolver::Workspace::Implementation {
   }
 
   // The first step that misses less than before by a part of what its slope promises: that of Gauss and Newton, then Newton's own and
-  // shorter ones (Levenberg 1944), inputs being told apart by `weights`. False where none does: the state stays. Where the promise of the last one is rounding, these inputs come nearest to what is wanted, as where an input
-  // turns around what it does and J vanishes.
+  // shorter ones (Levenberg 1944), inputs being told apart by `weights`. False where none does: the state stays. Where the promise of
+  // the last one is rounding, these inputs come nearest to what is wanted, as where an input turns around what it does and J vanishes.
   [[nodiscard]] bool improve(double before, double size, int n) {
     constexpr double part = 0.25;
     auto inputs = state.tail(solver->nu());

@@ -200,9 +200,8 @@ void add_stretch_note(const CrossValidation& cross_validation, std::vector<std::
     notes.push_back(fmt::format(
         "stretches of the log that were left out are predicted worse than rows left out one by one: nrmse {:.2g}, not {:.2g}, of "
         "which the noise makes {:.2g}, with {:.0f} % within 95 %. Something acts otherwise than the model has it (an input that "
-        "is "
-        "clipped, late or scaled, an inertia that is off), or the rows are too few, or of one motion, for what the model leaves "
-        "open",
+        "is clipped, late or scaled, an inertia that is off), or the rows are too few, or of one motion, for what the model "
+        "leaves open",
         stretches.nrmse, cross_validation.one_by_one.nrmse, cross_validation.nrmse_of_noise, 100 * stretches.coverage95));
     return;
   }
