@@ -59,11 +59,10 @@ SideInformation read_side_information(const std::string& text, const Workers& wo
 void say_how_far(const Progress& p) {
   if (!progress_is_due()) return;
   const double left = p.fraction > 0 ? p.seconds * (1 - p.fraction) / p.fraction : 0;
-  if (p.is_drawing) {
-    return print_progress(fmt::format("drawing hyperparameters  best {:.4f}  about {:.0f} s left", p.best, left));
-  }
-  print_progress(fmt::format("restart {}/{}  iteration {}  best {:.4f}  about {:.0f} s left", p.restart + 1, p.n_restarts,
-                             p.iteration, p.best, left));
+  const std::string place = p.is_drawing ? "drawing hyperparameters"
+                                         : fmt::format("restart {}/{}  iteration {}", p.restart + 1, p.n_restarts, p.iteration);
+  const std::string best = std::isfinite(p.best) ? fmt::format("{:.4f}", p.best) : "none yet";
+  print_progress(fmt::format("{}  best {}  about {:.0f} s left", place, best, left));
 }
 
 Json number_or_null(double value) { return std::isfinite(value) ? Json(value) : Json(); }
@@ -201,21 +200,6 @@ std::string data_source_of(const FitArguments& arguments) {
   return fmt::format("{}", fmt::join(sources, ", "));
 }
 
-// A whole log tells nothing more where what acts at a row does not depend on commands before.
-void require_late_inputs(const FitRequest& request) {
-  const std::vector<std::string> estimated = request.problem.estimate.value_or(std::vector<std::string>());
-  const auto is_asked_for = [&](const Parameter& one) { return one.estimate || std::ranges::count(estimated, one.name) > 0; };
-  const auto has_late = [&](const Model& model) {
-    return std::ranges::any_of(model.actuators, [&](const Actuator& one) {
-      return !one.is_direct() || is_asked_for(one.delay) || is_asked_for(one.lag);
-    });
-  };
-  const auto is_of_late = [&](const Log& log) { return log.model != nullptr && has_late(*log.model); };
-  const bool is_late = has_late(request.model) || std::ranges::any_of(request.logs, is_of_late) ||
-                       std::ranges::any_of(request.also, [&](const SideInformation& one) { return is_of_late(one.log); });
-  if (!is_late) throw InputError("`commands`: no input of the model acts late: leave it out");
-}
-
 void read_data(FitArguments& arguments, const Workers& workers) {
   FitRequest& request = arguments.request;
   request.data_source = data_source_of(arguments);
@@ -224,7 +208,7 @@ void read_data(FitArguments& arguments, const Workers& workers) {
     request.problem.commands = CsvTable::read(arguments.commands, CsvTable::Keep::numbers, workers);
   }
   for (const std::string& text : arguments.also) request.also.push_back(read_side_information(text, workers));
-  if (!arguments.commands.empty()) require_late_inputs(request);
+  require_use_of_commands(request);
 }
 
 // The rows of a raw log, which learning and smoothing by turns finds.

@@ -162,6 +162,7 @@ PyPosterior fit_model(const PySystem& system, const py::object& data, const py::
   request.model = *system.model;
   request.logs = logs_of(data, system.system());
   request.also = side_information_of(also);
+  require_use_of_commands(request);
   return run(prepare_fit(std::move(request)), progress);
 }
 

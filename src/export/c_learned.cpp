@@ -18,8 +18,7 @@ std::string Writer::triangle_of(const LatentPosterior& latents, std::size_t k) {
     const MatrixXd rows = latents.triangle_rows(first, std::min(block, latents.size() - first));
     for (Index i = 0; i < rows.rows(); ++i) {
       const Index n = first + i + 1;
-      for (Index j = 0; j + 1 < n; ++j) entries.push_back(number(rows(i, j)));
-      entries.push_back(number(latents.whitens_by_factor() ? 1 / rows(i, n - 1) : rows(i, n - 1)));
+      for (Index j = 0; j < n; ++j) entries.push_back(number(rows(i, j)));
       for (Index j = n; j < whole(n); ++j) entries.emplace_back("0");
     }
   }

@@ -50,10 +50,15 @@ void DensePosterior::whiten(Ref<MatrixXd> c) const {
 
 MatrixXd DensePosterior::triangle_rows(Index first, Index n) const {
   const auto L = factor_.L();
-  if (!sums_) return L.block(first, 0, n, first + n);
-  // (L_D L)⁻¹ = L⁻¹L_D⁻¹
-  const MatrixXd of_sums = sums_->L;
-  return of_sums.block(first, 0, n, first + n) * L.topLeftCorner(first + n, first + n).triangularView<Eigen::Lower>();
+  MatrixXd rows = L.block(first, 0, n, first + n);
+  if (sums_) {
+    // (L_D L)⁻¹ = L⁻¹L_D⁻¹
+    const MatrixXd of_sums = sums_->L;
+    rows = of_sums.block(first, 0, n, first + n) * L.topLeftCorner(first + n, first + n).triangularView<Eigen::Lower>();
+  }
+  auto diagonal = rows.diagonal(first);
+  diagonal = diagonal.cwiseInverse().eval();
+  return rows;
 }
 
 // ỹ − Σ_a Z_a f̃_a − ε

@@ -252,8 +252,8 @@ std::vector<TrainingResidual> training_residuals(const Posterior& posterior, con
       }
       one.n = errors.n;
       if (one.n > 0) {
-        constexpr double half_within = 0.6745, far = 6;  // deviations; of normal values one in 10⁹ is farther
-        const double distance = far * std::max(1.0, median(distances) / half_within);
+        constexpr double far = 6;  // deviations; of normal values one in 10⁹ is farther
+        const double distance = far * std::max(1.0, median(distances) / median_of_normal);
         one.n_far = static_cast<int>(std::ranges::count_if(distances, [&](double z) { return z > distance; }));
       }
       one.coverage95 = errors.within.shares()[2];

@@ -82,8 +82,8 @@ class LatentPosterior {
   /// Whether c is whitened by solving with a factor, X = L⁻¹, and not by a product. Where the noise is far below the signal a product
   /// with L⁻¹ would lose the digits in which X c differs from the prior.
   [[nodiscard]] virtual bool whitens_by_factor() const = 0;
-  /// Rows first … first + n − 1 of that lower triangle, L or X, up to the last diagonal entry (n × first + n); what
-  /// stands above the diagonal is undefined.
+  /// Rows first … first + n − 1 of that lower triangle, X, or L with 1/L_ii on its diagonal, so that a loop that solves with it
+  /// divides by nothing, up to the last diagonal entry (n × first + n); what stands above the diagonal is undefined.
   [[nodiscard]] virtual Eigen::MatrixXd triangle_rows(Eigen::Index first, Eigen::Index n) const = 0;
 
   /// Σ − (X c)ᵀ X c in the lower triangle, Σ the prior's covariance and c of the same quantities.

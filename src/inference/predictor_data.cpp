@@ -78,7 +78,6 @@ void PredictorData<T>::store_triangle(const LatentPosterior& posterior) {
       const std::size_t begin = triangle_.size();
       triangle_.resize(begin + static_cast<std::size_t>(simd::padded<T>(n)));
       for (Index j = 0; j < n; ++j) triangle_[begin + static_cast<std::size_t>(j)] = static_cast<T>(rows(i, j));
-      if (whitens_by_factor_) triangle_[begin + static_cast<std::size_t>(n - 1)] = static_cast<T>(1 / rows(i, n - 1));
     }
   }
 }

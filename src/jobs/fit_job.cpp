@@ -19,6 +19,7 @@
 #include "gp2/jobs/fit_memory.hpp"
 #include "gp2/jobs/fit_time.hpp"
 #include "inference/inducing_summary.hpp"
+#include "jobs/doubts.hpp"
 #include "jobs/fit_notes.hpp"
 #include "jobs/read_observations.hpp"
 
@@ -289,6 +290,21 @@ bool integration_pays(const FitProblem& problem, const FitOptions& options) {
          fit_memory(problem, options).reduced_size <= largest_integrated_size;
 }
 
+void require_use_of_commands(const FitRequest& request) {
+  if (!request.problem.commands) return;
+  const std::vector<std::string> estimated = request.problem.estimate.value_or(std::vector<std::string>());
+  const auto is_asked_for = [&](const Parameter& one) { return one.estimate || std::ranges::count(estimated, one.name) > 0; };
+  const auto has_late = [&](const Model& model) {
+    return std::ranges::any_of(model.actuators, [&](const Actuator& one) {
+      return !one.is_direct() || is_asked_for(one.delay) || is_asked_for(one.lag);
+    });
+  };
+  const auto is_of_late = [&](const Log& log) { return log.model != nullptr && has_late(*log.model); };
+  const bool is_late = has_late(request.model) || std::ranges::any_of(request.logs, is_of_late) ||
+                       std::ranges::any_of(request.also, [&](const SideInformation& one) { return is_of_late(one.log); });
+  if (!is_late) throw InputError("`commands`: no input of the model acts late: leave it out");
+}
+
 FitJob prepare_fit(FitRequest request) {
   require_in_range(request);
   FitProblem problem = make_fit_problem(request.model, request.logs, request.also, request.problem);
@@ -466,7 +482,7 @@ FitOutcome run_once(const FitJob& job, const std::function<void(const Progress&)
   Fit result = fit_and_name_gross_errors(job.problem, options);
   FitOutcome outcome{job.file, std::move(result.posterior), distrust_notes(job.problem, result.report), std::nullopt};
   if (!unsaved.empty()) outcome.notes.push_back(fmt::format("warning: a checkpoint was not saved: {}", unsaved));
-  for (std::string& note : notes_of(result.report)) outcome.notes.push_back(std::move(note));
+  for (std::string& note : notes_of(result.report, outcome.posterior)) outcome.notes.push_back(std::move(note));
   if (result.report.inducing) add_inducing_note(*result.report.inducing, outcome.notes);
   if (result.report.termination != FitReport::interrupted && !is_set(stop)) {
     if (options.n_draws > 0) add_draw_notes(result.report, outcome.notes);

@@ -1,6 +1,5 @@
 #pragma once
 
-#include <functional>
 #include <string>
 #include <vector>
 
@@ -26,14 +25,6 @@ void add_residual_notes(const Posterior& posterior, const std::vector<TrainingRe
 
 // Whether the fit says little of what it has not seen.
 void add_stretch_note(const CrossValidation& cross_validation, std::vector<std::string>& notes);
-
-// Fits the hyperparameters to some of the data.
-using FittedValues = std::function<ModelValues(const std::vector<Observations>&)>;
-
-// Inputs that never move, inputs that act otherwise than the model says, in all logs or in one, and logs that contradict each other.
-// @param has_row_order  whether the states of an observation follow each other as they were measured
-void add_doubts(const Posterior& posterior, bool has_row_order, const FittedValues& fitted_values,
-                std::vector<std::string>& notes);
 
 // Which residuals go on from row to row; empty where none do.
 std::string correlated_text(const std::vector<TrainingResidual>& residuals);

@@ -252,8 +252,19 @@ void read_start(const NamedNumbers& start, int max_iterations, FitProblem& probl
   }
 }
 
-std::vector<std::string> notes_of(const FitReport& report) {
-  std::vector<std::string> collapsed, notes;
+namespace {
+
+// Whether columns of a group may follow from each other: more are observed than the constraints leave free.
+bool may_depend(const Posterior& posterior, int group) {
+  const View& view = posterior.observations()[static_cast<std::size_t>(group)].view();
+  const System& system = prior_of(posterior.prior(), view).reference_system();
+  return view.size() > system.nq() - system.nc();
+}
+
+}  // namespace
+
+std::vector<std::string> notes_of(const FitReport& report, const Posterior& posterior) {
+  std::vector<std::string> dependent, without_noise, notes;
   for (const Hyperparameter& h : report.hyperparameters) {
     const bool at_lower = h.at_bound() && h.value < 2 * h.lower;
     if (h.kind != Hyperparameter::Kind::noise_stddev || !at_lower) continue;
@@ -263,7 +274,7 @@ std::vector<std::string> notes_of(const FitReport& report) {
                       "seem, or more",
                       h.name, 1 / h.lower));
     } else {
-      collapsed.push_back(h.name);
+      (may_depend(posterior, h.owner) ? dependent : without_noise).push_back(h.name);
     }
   }
   for (const Hyperparameter& h : report.hyperparameters) {
@@ -279,10 +290,14 @@ std::vector<std::string> notes_of(const FitReport& report) {
         "warning: the fit has not settled: hyperparameters and the mean of latents that are not linear still changed each other. "
         "Deviations may be far too small. Of a load and its coefficient the data may tell the product alone: give one of them");
   }
-  if (!collapsed.empty()) {
+  if (!dependent.empty()) {
     notes.push_back(
         fmt::format("warning: {} ended at the lower bound: the columns may not be independent measurements; see gp2 check",
-                    fmt::join(collapsed, ", ")));
+                    fmt::join(dependent, ", ")));
+  }
+  if (!without_noise.empty()) {
+    notes.push_back(fmt::format("{} ended at the lower bound: the log has less noise than the fit can tell from none",
+                                fmt::join(without_noise, ", ")));
   }
   return notes;
 }

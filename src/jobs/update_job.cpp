@@ -170,7 +170,6 @@ void note_unexpected(const Posterior& posterior, const Observations& more, const
   constexpr std::int64_t fewest_learned = 30;            // fits of fewer states are sure of too much
   constexpr double unexpected = 6, sound_share = 0.2;
   constexpr double wrong = 30, wrong_far = 100;  // also by a fit that is too sure of itself, near its data and far from them
-  constexpr double quartile = 0.6745;            // of |z| under a normal distribution the median
   if (posterior.n_states() < fewest_learned || more.n_data() == 0) return;
   const std::vector<int> taken = evenly_and_extreme(more, most_states);
   const Observations some = more.take(taken);
@@ -200,7 +199,7 @@ void note_unexpected(const Posterior& posterior, const Observations& more, const
       continue;
     }
     // where the fit is off everywhere, single values are not told from the others
-    const double usual = std::ssize(all) < fewest_values ? 1 : std::max(1.0, median(all) / quartile);
+    const double usual = std::ssize(all) < fewest_values ? 1 : std::max(1.0, median(all) / median_of_normal);
     for (Index i = 0; i < z.cols(); ++i) {
       if (!(z(k, i) > usual * (distance[i] <= Posterior::far_from_data ? wrong : wrong_far))) continue;
       ++n_wrong;

@@ -306,7 +306,7 @@ bool check_mechanics(const System& system, const Ref<const MatrixXd>& states, co
   report_mass(system, mechanics, states.cols(), findings);
   check_coriolis(system, states, parameters, mechanics, findings);
   if (system.nc() == 0) {
-    findings.push_back({Level::warning, "constraints: none; T = I, and ddq is the unconstrained acceleration"});
+    findings.push_back({Level::good, "constraints: none: ddq is the unconstrained acceleration"});
     return true;
   }
   report_rank(system, ranks, mechanics, findings);

@@ -45,8 +45,8 @@ ModelMotion ModelMotion::pushed(const VectorXd& push) const {
 }
 
 // [states; λ]
-MatrixXd ModelMotion::with_load(const Eigen::Ref<const MatrixXd>& states, const MechanicsBatch& mechanics,
-                                const MatrixXd& slip) const {
+MatrixXd ModelMotion::with_load(const Eigen::Ref<const MatrixXd>& states, const MechanicsBatch& mechanics, const MatrixXd& slip,
+                                Eigen::Index first) const {
   const Eigen::Index n_state = states.rows(), nq = system_->nq(), nc = system_->nc();
   const ViewValues multipliers = evaluate_view(View::multipliers(*system_), mechanics, states);
   MatrixXd x(n_state + nc, states.cols());
@@ -78,7 +78,7 @@ MatrixXd ModelMotion::with_load(const Eigen::Ref<const MatrixXd>& states, const 
     VectorXd d = multipliers.offset.col(i);
     if (slip.size() > 0) d += multipliers.N(i) * slip.col(i);
     if (!solver.solve(multipliers.G(i), d, motion)) {
-      throw InputError(internal::describe_fault(*system_, states, solver.fault(i)));
+      throw InputError(internal::describe_fault(*system_, states, solver.fault(i), first));
     }
     x.col(i).tail(nc) = solver.lambda();
   }
@@ -86,7 +86,7 @@ MatrixXd ModelMotion::with_load(const Eigen::Ref<const MatrixXd>& states, const 
 }
 
 MatrixXd ModelMotion::unconstrained(const Eigen::Ref<const MatrixXd>& states, const MechanicsBatch& mechanics,
-                                    const MatrixXd& slip) const {
+                                    const MatrixXd& slip, Eigen::Index first) const {
   MatrixXd truth = MatrixXd::Zero(system_->nq(), states.cols()), truth_force = truth;
   const auto evaluate = [&](const Eigen::Ref<const MatrixXd>& x) {
     if (truth_.n_outputs() > 0) truth_.evaluate(x, parameters_, truth);
@@ -100,7 +100,7 @@ MatrixXd ModelMotion::unconstrained(const Eigen::Ref<const MatrixXd>& states, co
       evaluate(with_known_multipliers(*system_, states, parameters_));
       break;
     case Load::of_motion:
-      evaluate(with_load(states, mechanics, slip));
+      evaluate(with_load(states, mechanics, slip, first));
       break;
   }
   MatrixXd accelerations(system_->nq(), states.cols());
@@ -109,7 +109,8 @@ MatrixXd ModelMotion::unconstrained(const Eigen::Ref<const MatrixXd>& states, co
     if (projection.mass_is_singular() && !truth.col(i).isZero(0)) {
       throw InputError(internal::describe_fault(
           *system_, states,
-          {i, "the mass matrix M is singular, so that [truth] acceleration cannot be added to M⁻¹F: write it as [truth] force"}));
+          {i, "the mass matrix M is singular, so that [truth] acceleration cannot be added to M⁻¹F: write it as [truth] force"},
+          first));
     }
     accelerations.col(i) = projection.solve_mass(mechanics.values.F(i) + truth_force.col(i)) + truth.col(i);
   }
@@ -121,14 +122,21 @@ MatrixXd ModelMotion::unconstrained_acceleration(const Eigen::Ref<const MatrixXd
 }
 
 MatrixXd ModelMotion::acceleration(const Eigen::Ref<const MatrixXd>& states, const MatrixXd& slip) const {
-  const MechanicsBatch mechanics = require_mechanics(*system_, states, parameters_);
-  MatrixXd accelerations = unconstrained(states, mechanics, slip);
-  for (Eigen::Index i = 0; i < states.cols(); ++i) {
-    accelerations.col(i) = mechanics.projections[static_cast<std::size_t>(i)].constrain(accelerations.col(i));
-  }
-  if (slip.size() == 0) return accelerations;
-  const ViewValues view = evaluate_view(View::constrained_acceleration(*system_), mechanics, states);
-  for (int i = 0; i < static_cast<int>(states.cols()); ++i) accelerations.col(i) += view.N(i) * slip.col(i);
+  MatrixXd accelerations(system_->nq(), states.cols());
+  const auto fault = for_each_mechanics(
+      *system_, states, parameters_, /*n_threads=*/1, [&](Eigen::Index first, const MechanicsBatch& mechanics) {
+        const Eigen::Index n = mechanics.values.n_states();
+        const auto some = states.middleCols(first, n);
+        const MatrixXd slips = slip.size() > 0 ? slip.middleCols(first, n) : MatrixXd();
+        const MatrixXd free = unconstrained(some, mechanics, slips, first);
+        for (Eigen::Index i = 0; i < n; ++i) {
+          accelerations.col(first + i) = mechanics.projections[static_cast<std::size_t>(i)].constrain(free.col(i));
+        }
+        if (slips.size() == 0) return;
+        const ViewValues view = evaluate_view(View::constrained_acceleration(*system_), mechanics, some);
+        for (int i = 0; i < static_cast<int>(n); ++i) accelerations.col(first + i) += view.N(i) * slips.col(i);
+      });
+  if (fault) throw InputError(internal::describe_fault(*system_, states, *fault));
   return accelerations;
 }
 

@@ -19,8 +19,7 @@ using Eigen::VectorXd;
 namespace {
 
 constexpr int least_positions = 5;
-constexpr int reach = 3;                     // measurements on either side whose residuals an outlier spoils
-constexpr double median_of_normal = 0.6745;  // of |x|, x standard normal
+constexpr int reach = 3;  // measurements on either side whose residuals an outlier spoils
 
 double square(double x) { return x * x; }
 

@@ -18,22 +18,6 @@ using testing::ElementsAre;
 using testing::HasSubstr;
 using testing::StartsWith;
 
-TEST(FitNotes, NameWhatEndedAtABound) {
-  FitReport report;
-  report.iterations = 10;
-  report.hyperparameters = {hyperparameter(Hyperparameter::Kind::parameter, "m", 2, 0.5, 2),
-                            hyperparameter(Hyperparameter::Kind::parameter, "k", 1, 0.5, 2),
-                            hyperparameter(Hyperparameter::Kind::noise_stddev, "noise of ddx", 1e-4, 1e-4, 1),
-                            hyperparameter(Hyperparameter::Kind::noise_stddev, "noise of ddy", 1e-4, 1e-4, 1)};
-  EXPECT_THAT(notes_of(report),
-              ElementsAre(HasSubstr("warning: m ended at its bound, 2."),
-                          HasSubstr("warning: noise of ddx, noise of ddy ended at the lower bound: the columns may not be")));
-  // where nothing was optimised nothing ended anywhere
-  report.iterations = 0;
-  report.hyperparameters.resize(2);
-  EXPECT_THAT(notes_of(report), testing::IsEmpty());
-}
-
 Model constrained_cart(const std::string& constraints) {
   return Model::parse("coordinates = ['x', 'y']\n[mechanics]\nmass = [['2', '0'], ['0', '1']]\n" + constraints +
                           "[[latent]]\nkernel = 'se'\nfeatures = ['dx']\ndirections = 'acceleration'\n",
@@ -45,6 +29,31 @@ FitProblem problem_of(const Model& model, const CsvTable& log) {
   options.project = true;
   options.estimate_noise = true;
   return make_fit_problem(model, log, options);
+}
+
+TEST(FitNotes, NameWhatEndedAtABound) {
+  const CsvTable log = CsvTable::parse("x,y,dx,dy,ddx,ddy\n1,2,3,4,5,0\n2,3,4,5,6,0\n", "log.csv");
+  FitOptions nothing;
+  nothing.max_iterations = 0;
+  const Posterior free = fit(problem_of(constrained_cart(""), log), nothing).posterior;
+  const Posterior bound = fit(problem_of(constrained_cart("[constraints]\nacceleration = ['ddy']\n"), log), nothing).posterior;
+  FitReport report;
+  report.iterations = 10;
+  report.hyperparameters = {hyperparameter(Hyperparameter::Kind::parameter, "m", 2, 0.5, 2),
+                            hyperparameter(Hyperparameter::Kind::parameter, "k", 1, 0.5, 2),
+                            hyperparameter(Hyperparameter::Kind::noise_stddev, "noise of ddx", 1e-4, 1e-4, 1),
+                            hyperparameter(Hyperparameter::Kind::noise_stddev, "noise of ddy", 1e-4, 1e-4, 1)};
+  EXPECT_THAT(notes_of(report, bound),
+              ElementsAre(HasSubstr("warning: m ended at its bound, 2."),
+                          HasSubstr("warning: noise of ddx, noise of ddy ended at the lower bound: the columns may not be")));
+  // without a constraint no column follows from another
+  EXPECT_THAT(
+      notes_of(report, free),
+      ElementsAre(HasSubstr("m ended"), StartsWith("noise of ddx, noise of ddy ended at the lower bound: the log has less")));
+  // where nothing was optimised nothing ended anywhere
+  report.iterations = 0;
+  report.hyperparameters.resize(2);
+  EXPECT_THAT(notes_of(report, free), testing::IsEmpty());
 }
 
 TEST(FitNotes, TellThatThePapersProtocolTakesNoDirections) {

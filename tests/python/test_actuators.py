@@ -46,6 +46,8 @@ def test_rows_are_told_by_the_whole_log_what_acts():
     acting = system.states(log)[rows]
     of_arrays = gp2.fit(system, (acting, log["ddx"][rows, None]), **options)
     assert of_rows.negative_log_likelihood == of_arrays.negative_log_likelihood
+    with pytest.raises(gp2.InputError, match="commands: no input of the model acts late: leave it out"):
+        gp2.fit(cart("u"), taken(log, rows), commands=log, **options)
 
 
 def test_arrays_are_what_acts_and_tables_what_is_commanded():

@@ -167,12 +167,12 @@ def test_a_start_out_of_bounds_is_taken_where_nothing_is_optimised(arm, arm_log,
         gp2.fit(arm, arm_log, estimate=["m2"], start=start)
 
 
-def test_noise_that_collapses_is_warned_of(oscillator):
+def test_noise_that_collapses_is_told(oscillator):
     exact = oscillator.generate(6, noise_std=0)
     twice = {name: np.repeat(exact[name], 2) for name in exact.columns}
-    with pytest.warns(UserWarning, match="ended at the lower bound: the columns may not be independent measurements"):
+    with pytest.warns(UserWarning, match="repeat another one"):
         posterior = gp2.fit(oscillator, twice, noise_std="estimate", restarts=1, hyperprior=False)
-    assert any("ended at the lower bound" in note for note in posterior.notes)
+    assert any("ended at the lower bound: the log has less noise" in note for note in posterior.notes)
 
 
 def test_the_report_tells_how_the_fit_went(posterior):

@@ -77,6 +77,10 @@ struct FitJob {
   std::string unaffordable;  // why not all of a long log can be fitted, if that is so: what it is worth may be less
 };
 
+/// @throws InputError where `commands` are given while no input of any model acts late: what acts at a row then depends on no
+/// commands before, and they tell nothing more.
+void require_use_of_commands(const FitRequest& request);
+
 /// @throws InputError for options out of range; as make_fit_problem, read_start and, where rows are not to be left out, within_memory.
 FitJob prepare_fit(FitRequest request);
 

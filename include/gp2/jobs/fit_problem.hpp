@@ -117,7 +117,7 @@ Fit fit(const FitProblem& problem, const FitOptions& options);
 void read_start(const NamedNumbers& start, int max_iterations, FitProblem& problem);
 
 /// What a person should know of a fit: parameters at a bound, uncertainty_notes, and noise at its lower bound.
-std::vector<std::string> notes_of(const FitReport& report);
+std::vector<std::string> notes_of(const FitReport& report, const Posterior& posterior);
 
 /// What a robust fit distrusts: how many values, and the worst of them with their lines in the log.
 std::vector<std::string> distrust_notes(const FitProblem& problem, const FitReport& report);

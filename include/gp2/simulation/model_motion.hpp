@@ -39,14 +39,15 @@ class ModelMotion {
   [[nodiscard]] Eigen::MatrixXd multipliers(const Eigen::Ref<const Eigen::MatrixXd>& states) const;
 
  private:
+  // of states of which the first has that number among all
   [[nodiscard]] Eigen::MatrixXd unconstrained(const Eigen::Ref<const Eigen::MatrixXd>& states, const MechanicsBatch& mechanics,
-                                              const Eigen::MatrixXd& slip = {}) const;
+                                              const Eigen::MatrixXd& slip = {}, Eigen::Index first = 0) const;
 
   std::shared_ptr<const System> system_;
   Eigen::VectorXd parameters_;
   // what each gives at [states; multipliers], and where they are those of the motion, the multipliers
   [[nodiscard]] Eigen::MatrixXd with_load(const Eigen::Ref<const Eigen::MatrixXd>& states, const MechanicsBatch& mechanics,
-                                          const Eigen::MatrixXd& slip) const;
+                                          const Eigen::MatrixXd& slip, Eigen::Index first) const;
 
   Tape truth_, truth_force_;
   StateDerivatives truth_slopes_, truth_force_slopes_;  // in [state; λ]
